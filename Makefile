@@ -1,0 +1,44 @@
+# Two commands on a fresh machine (Python 3.11, make):  make fleet   and   make test
+PYTHON ?= python3.11
+VENV := .venv
+BIN := $(VENV)/bin
+ARGS ?=
+export OPENBLAS_NUM_THREADS ?= 1
+export NUMBA_NUM_THREADS ?= 1
+
+.PHONY: help setup fleet test quick check bench schemas clean
+
+help:            ## list the targets
+	@grep -hE '^[a-z]+:.*##' $(MAKEFILE_LIST) | sed 's/:.*##/\t/'
+
+setup: $(VENV)/.ready  ## make .venv with the pinned versions
+
+$(VENV)/.ready: pyproject.toml constraints.txt
+	$(PYTHON) -m venv $(VENV)
+	$(BIN)/pip install --quiet --disable-pip-version-check -c constraints.txt -e '.[dev]'
+	@touch $@
+
+fleet: setup     ## run the fleet: make fleet ARGS="--agents 4 --link 3g"
+	$(BIN)/gnd fleet $(ARGS)
+
+test: setup      ## run every test
+	$(BIN)/pytest $(ARGS)
+
+quick: setup     ## run the tests that take less than five seconds each
+	$(BIN)/pytest -m "not slow" $(ARGS)
+
+check: setup     ## what CI runs beside the tests: style, types, layers, generated code
+	$(BIN)/ruff check .
+	$(BIN)/ruff format --check .
+	$(BIN)/mypy
+	$(BIN)/lint-imports
+	$(BIN)/python -m schemas.generate --check
+
+bench: setup     ## print the benchmarks with their commands
+	$(BIN)/python -m benchmarks $(ARGS)
+
+schemas: setup   ## generate Python from schemas/*.proto
+	$(BIN)/python -m schemas.generate
+
+clean:           ## remove what was made
+	rm -rf $(VENV) build *.egg-info .mypy_cache .ruff_cache .pytest_cache
