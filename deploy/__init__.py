@@ -1,1 +1,1 @@
-
+"""What runs the system: the `gnd` command, the local fleet launcher and its configuration files."""

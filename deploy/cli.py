@@ -1,0 +1,76 @@
+"""The command `gnd`: one table of subcommands, each loaded when it is called."""
+
+import importlib
+import os
+import sys
+from typing import Final
+
+import click
+
+from gnd_map.errors import GndError
+
+COMMANDS: Final[dict[str, tuple[str, str]]] = {
+    "fleet": ("deploy.fleet_cli:fleet", "Run a whole fleet on this machine and watch the map heal."),
+    "watch": ("deploy.watch_cli:watch", "Print the tile updates of a region as they are published."),
+    "traffic": ("fleet_bus.cli:traffic", "Account for the bytes of a run against 3G, 4G and 5G."),
+    "map": ("tile_store.cli:map_group", "Build, inspect, compare, export and roll back maps."),
+    "import": ("vehicle_agent.importer_cli:import_drives", "Turn a recording (KITTI, RADIATE, PCD) into a drive."),
+    "sim": ("fleet_sim.cli:sim", "Write and look at simulated worlds and drives."),
+    "router": ("fleet_bus.cli:router", "Run the Zenoh router alone."),
+    "store": ("tile_store.cli:store", "Run the tile server alone."),
+    "merger": ("cloud_merger.cli:merger", "Run one merger shard alone."),
+    "agent": ("vehicle_agent.cli:agent", "Run one vehicle agent alone."),
+}
+
+
+class LazyGroup(click.Group):
+    """A group whose commands are imported only when called, so that `gnd --help` answers at once."""
+
+    def list_commands(self, ctx: click.Context) -> list[str]:  # noqa: ARG002  (click's signature)
+        """Return the names of the commands, in the order of the table."""
+        return list(COMMANDS)
+
+    def get_command(self, ctx: click.Context, cmd_name: str) -> click.Command | None:  # noqa: ARG002  (click's)
+        """Import and return a command, or None when there is none of that name."""
+        if cmd_name not in COMMANDS:
+            return None
+        module, attribute = COMMANDS[cmd_name][0].split(":")
+        command: click.Command = getattr(importlib.import_module(module), attribute)
+        return command
+
+    def format_commands(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:  # noqa: ARG002  (click's)
+        """Write the table of commands without importing them."""
+        with formatter.section("Commands"):
+            formatter.write_dl([(name, text) for name, (_, text) in COMMANDS.items()])
+
+
+@click.group(cls=LazyGroup, context_settings={"help_option_names": ["-h", "--help"]})
+@click.version_option(package_name="gnd-fleet", prog_name="gnd")
+def gnd() -> None:
+    """Keep a LiDAR map up to date with a fleet of vehicles.
+
+    Vehicles download tiles of a Geodetic Normal Distribution map, localise on it, detect what changed and
+    upload only that; a sharded merger fuses the reports into new tile versions that every subscriber receives.
+    """
+
+
+def main() -> None:
+    """Run the command line; every error of ours becomes one line on standard error and exit code 2."""
+    try:
+        gnd.main(standalone_mode=False)
+    except click.ClickException as error:
+        error.show()
+        sys.exit(error.exit_code)
+    except GndError as error:
+        click.echo(f"gnd: {error}", err=True)
+        sys.exit(2)
+    except (KeyboardInterrupt, click.Abort):
+        click.echo("gnd: interrupted", err=True)
+        sys.exit(130)
+    except BrokenPipeError:
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        sys.exit(0)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,24 @@
+"""What the fork server holds ready: imported once, shared by every process of a run.
+
+Importing this module loads the libraries of the vehicle and the merger and their compiled kernels. It starts no
+thread and opens no Zenoh session, so forking afterwards is safe.
+"""
+
+import gc
+import logging
+
+import cloud_merger.merger
+import deploy.roles
+import tile_store.server
+import vehicle_agent.agent
+from vehicle_agent.warm import warm_up
+
+__all__ = ["cloud_merger", "deploy", "tile_store", "vehicle_agent"]
+
+try:
+    warm_up()
+except Exception:
+    # A process that needs the kernels compiles them itself and reports its own error.
+    logging.getLogger(__name__).exception("could not warm the kernels")
+gc.collect()
+gc.freeze()  # keeps the collector from touching, and so copying, the shared pages
