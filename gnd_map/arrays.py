@@ -1,0 +1,48 @@
+"""Array types and the one check that every value of this package makes of its arrays."""
+
+from typing import Any, TypeAlias
+
+import numpy as np
+import numpy.typing as npt
+
+from gnd_map.errors import ShapeError
+
+F64: TypeAlias = npt.NDArray[np.float64]
+F32: TypeAlias = npt.NDArray[np.float32]
+I64: TypeAlias = npt.NDArray[np.int64]
+I32: TypeAlias = npt.NDArray[np.int32]
+Array: TypeAlias = npt.NDArray[Any]
+
+
+def check_array(name: str, array: object, dtype: type[np.generic], shape: tuple[int | None, ...]) -> None:
+    """Refuse `array` unless it is a numpy array of `dtype` and `shape` (None = any length) with finite values only.
+
+    Raises:
+        ShapeError: names the array and says what was expected and found.
+    """
+    if not isinstance(array, np.ndarray):
+        raise ShapeError(f"{name}: expected a numpy array, got {type(array).__name__}")
+    if array.dtype != np.dtype(dtype):
+        raise ShapeError(f"{name}: expected dtype {np.dtype(dtype)}, got {array.dtype}")
+    if array.ndim != len(shape) or any(
+        want is not None and want != n for want, n in zip(shape, array.shape, strict=True)
+    ):
+        raise ShapeError(f"{name}: expected shape {shown_shape(shape)}, got {array.shape}")
+    if array.dtype.kind == "f" and not np.isfinite(array).all():
+        raise ShapeError(f"{name}: {int((~np.isfinite(array)).sum())} of {array.size} values are not finite")
+
+
+def shown_shape(shape: tuple[int | None, ...]) -> str:
+    """`shape` with N for "any length": "(N, 3)"."""
+    return "(" + ", ".join("N" if n is None else str(n) for n in shape) + ("," if len(shape) == 1 else "") + ")"
+
+
+def points_3d(name: str, points: object) -> F64:
+    """`points` as a C-contiguous float64 array of shape (N, 3) with finite values.
+
+    Raises:
+        ShapeError: it is none.
+    """
+    array = np.ascontiguousarray(points, dtype=np.float64)
+    check_array(name, array, np.float64, (None, 3))
+    return array
