@@ -52,7 +52,8 @@ def parse_region(text: str) -> Region:
 
 def _parse(text: str) -> Region:
     if "," in text:
-        return _circle(*(float(part) for part in text.split(",", 2)))
+        lat_deg, lon_deg, radius_m = (float(part) for part in text.split(","))
+        return _circle(lat_deg, lon_deg, radius_m)
     if text.isdecimal():
         return _single(TileId(int(text)))
     if text.endswith("**"):

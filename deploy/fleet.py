@@ -1,0 +1,187 @@
+"""A fleet run on one machine: the route from a stale map to a healed one, and its account.
+
+world -> base map -> router, store, shards, watcher -> agents drive, detect, upload -> merges settle -> evaluation
+"""
+
+import logging
+import threading
+import time
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack, contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+
+from rich.console import Console
+
+from cloud_merger.merger import ShardConfig
+from deploy import roles
+from deploy.errors import DeployError
+from deploy.fleet_config import FleetConfig
+from deploy.live import FleetState, View, live_view
+from deploy.ports import claim_port
+from deploy.prepare import PreparedRun
+from deploy.processes import ProcessSpec, Supervisor
+from deploy.run_folder import RunFolder
+from fleet_bus.bus import open_bus
+from fleet_bus.config import BusConfig
+from schemas.keys import traffic_keys
+from tile_store.sqlite import SqliteStore
+from vehicle_agent.agent import AgentConfig
+
+POLL_S = 0.2
+SETTLE_S = 60.0
+WATCHER_GRACE_S = 15.0
+
+_log = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True, slots=True)
+class FleetOutcome:
+    """What a run left behind for its summary.
+
+    Attributes:
+        wall_s: from the start of the first process to the settled map.
+        restarts: how often each process was started again.
+    """
+
+    wall_s: float
+    restarts: dict[str, int]
+
+
+def run_fleet(
+    config: FleetConfig, folder: RunFolder, prepared: PreparedRun, console: Console, stop: threading.Event
+) -> FleetOutcome:
+    """Run the processes of a fleet until every drive is done and every report is merged.
+
+    Args:
+        config: what to run.
+        folder: where the run writes.
+        prepared: the drives, and a store that holds the base map.
+        console: where the live table appears.
+        stop: ends the run early and in order.
+
+    Returns:
+        How long it took and what had to be restarted.
+
+    Raises:
+        DeployError: a process cannot be kept alive, the port is taken, or the deadline has passed.
+    """
+    started_s = time.monotonic()
+    connect = f"tcp/127.0.0.1:{claim_port(config.port)}"
+    state = FleetState()
+    with ExitStack() as stack:
+        supervisor = stack.enter_context(supervised(folder, state))
+        start_cloud(supervisor, config, folder, connect)
+        opened = stack.enter_context(SqliteStore(folder.store))
+        bus = stack.enter_context(open_bus(BusConfig(connect=(connect,)), name="fleet"))
+        stack.enter_context(bus.subscribe(traffic_keys(), state.on_traffic))
+        view = stack.enter_context(live_view(state, console))
+        run = _Run(config, folder, supervisor, opened, view, state, stop, started_s)
+        run.wait_until(run.watcher_ready, SETTLE_S, "the watcher did not start")
+        start_agents(supervisor, config, folder, prepared, connect)
+        run.wait_until(lambda: supervisor.finished("vehicle-"), config.deadline_s, "the agents did not finish")
+        run.wait_until(run.settled, SETTLE_S, "the merges did not settle")
+        run.wait_until(run.watcher_caught_up, WATCHER_GRACE_S, None)
+    return FleetOutcome(time.monotonic() - started_s, dict(supervisor.restarts))
+
+
+@contextmanager
+def supervised(folder: RunFolder, state: FleetState) -> Iterator[Supervisor]:
+    """Give a supervisor whose processes all end with the block: agents first, the router last."""
+    supervisor = Supervisor(
+        folder.logs, folder.pids, lambda name, code: state.note(f"{name} ended with code {code}, started again")
+    )
+    try:
+        yield supervisor
+    finally:
+        names = tuple(supervisor.pids())
+        for group in ("vehicle-", "merger-", "watcher", "store", "router"):
+            supervisor.stop(tuple(name for name in names if name.startswith(group)))
+
+
+def start_cloud(supervisor: Supervisor, config: FleetConfig, folder: RunFolder, connect: str) -> None:
+    """Start router, tile server, merger shards and watcher; each connects as soon as the router listens."""
+    supervisor.start(ProcessSpec("router", roles.router, (connect,)))
+    supervisor.start(ProcessSpec("store", roles.store, (folder.store, connect)))
+    for number in range(config.shards):
+        shard = shard_config(config, f"shard-{number}", folder.store, connect)
+        supervisor.start(ProcessSpec(f"merger-{number}", roles.merger, (shard,)))
+    supervisor.start(ProcessSpec("watcher", roles.watcher, (connect, folder.updates)))
+
+
+def start_agents(
+    supervisor: Supervisor, config: FleetConfig, folder: RunFolder, prepared: PreparedRun, connect: str
+) -> None:
+    """Start one agent process a drive."""
+    for number, drive in enumerate(prepared.agent_drives):
+        name = f"vehicle-{number:02d}"
+        supervisor.start(ProcessSpec(name, roles.agent, (agent_config(config, name, drive, folder, connect),)))
+
+
+def shard_config(config: FleetConfig, shard_id: str, store: Path, connect: str) -> ShardConfig:
+    """Return the configuration of one merger shard."""
+    return ShardConfig(shard_id=shard_id, store_path=store, connect=(connect,))
+
+
+def agent_config(config: FleetConfig, vehicle: str, drive: Path, folder: RunFolder, connect: str) -> AgentConfig:
+    """Return the configuration of one vehicle agent."""
+    return AgentConfig(
+        vehicle=vehicle, drive=drive, connect=(connect,), link=config.link, work_dir=folder.agents / vehicle
+    )
+
+
+@dataclass(slots=True)
+class _Run:
+    """What the waiting loops of a run look at."""
+
+    config: FleetConfig
+    folder: RunFolder
+    supervisor: Supervisor
+    store: SqliteStore
+    view: View
+    state: FleetState
+    stop: threading.Event
+    started_s: float
+
+    def wait_until(self, done: Callable[[], bool], timeout_s: float, complaint: str | None) -> None:
+        """Supervise and draw until a condition holds.
+
+        Raises:
+            DeployError: the time is over and `complaint` is given.
+            KeyboardInterrupt: the run was told to stop.
+        """
+        deadline_s = time.monotonic() + timeout_s
+        while not done():
+            if self.stop.wait(POLL_S):
+                raise KeyboardInterrupt
+            if time.monotonic() > deadline_s:
+                if complaint is None:
+                    return
+                raise DeployError(f"{complaint} within {timeout_s:.0f} s: read the logs in {self.folder.logs}")
+            self.supervisor.poll()
+            self._observe()
+
+    def watcher_ready(self) -> bool:
+        """Tell whether the watcher has opened its file, so that no update can precede it."""
+        return self.folder.updates.exists()
+
+    def settled(self) -> bool:
+        """Tell whether no tile waits for a merge."""
+        return self.store.dirty_count() == 0
+
+    def watcher_caught_up(self) -> bool:
+        """Tell whether the watcher has seen every published version."""
+        self._observe()
+        return self.state.updates >= self.state.published
+
+    def _observe(self) -> None:
+        counts = self.store.counts()
+        self.state.published, self.state.reports = counts.published, counts.reports
+        self.state.waiting = counts.dirty
+        self.state.updates = count_lines(self.folder.updates)
+        self.view.refresh()
+
+
+def count_lines(path: Path) -> int:
+    """Return the number of complete lines of a file, 0 where there is none."""
+    return path.read_bytes().count(b"\n") if path.exists() else 0

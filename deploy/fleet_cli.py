@@ -1,0 +1,106 @@
+"""`gnd fleet`: run a whole fleet on this machine."""
+
+import dataclasses
+import json
+import signal
+import threading
+from pathlib import Path
+from typing import Any
+
+import click
+from rich.console import Console
+
+from deploy.errors import DeployError
+from deploy.fleet_config import FleetConfig, load_fleet_config
+from deploy.run_folder import RunFolder, create_run_folder, default_run_path
+
+PATH = click.Path(path_type=Path)
+
+
+@click.command()
+@click.option("--agents", type=int, help="Vehicle agent processes.  [default: 8, or one a drive with --drives]")
+@click.option("--shards", type=int, help="Merger shard processes.  [default: 2]")
+@click.option("--link", help="Link of every vehicle: 3g, 4g, 5g, none, or a TOML file.  [default: 4g]")
+@click.option("--world-seed", type=int, help="Seed of the simulated world.  [default: 7]")
+@click.option("--drives", type=PATH, multiple=True, help="Recorded drives (MCAP, folders) instead of simulated ones.")
+@click.option("--map", "base_map", type=PATH, help="Store with the base map for --drives (`gnd map build`).")
+@click.option("--out", type=PATH, help="Folder of the run.  [default: runs/<UTC time>]")
+@click.option("--overwrite", is_flag=True, help="Replace an earlier run in that folder.")
+@click.option("--port", type=int, help="Port of the router; 0 takes a free one.  [default: 0]")
+@click.option("--merge-mode", type=click.Choice(["default", "paper"]), help="Rules of merging.  [default: default]")
+@click.option("--detect-mode", type=click.Choice(["default", "paper"]), help="Rules of detection.  [default: default]")
+@click.option("--config", "config_file", type=PATH, help="TOML file in the form of deploy/fleet.toml.")
+@click.option("--dump-config", is_flag=True, help="Print the effective configuration and end.")
+@click.option("--keep-drives", is_flag=True, help="Keep the simulated drives (some hundred MB) after the run.")
+@click.option("--json", "as_json", is_flag=True, help="Print the summary as JSON.")
+def fleet(
+    drives: tuple[Path, ...],
+    base_map: Path | None,
+    out: Path | None,
+    overwrite: bool,
+    config_file: Path | None,
+    dump_config: bool,
+    keep_drives: bool,
+    as_json: bool,
+    **options: Any,
+) -> None:
+    """Run a fleet: vehicles download the map, drive, detect changes and upload them; the cloud heals the map.
+
+    Without --drives a street that has changed since it was mapped is simulated, and the result is compared with the
+    truth. The folder of the run holds the logs, the traffic ledger, the store, three pictures and summary.json.
+    """
+    config = load_fleet_config(config_file, options)
+    if dump_config:
+        click.echo(json.dumps(dataclasses.asdict(config), indent=2))
+        return
+    if base_map is not None and not drives:
+        raise DeployError("--map goes with --drives: a simulated run builds its own map")
+    folder = create_run_folder(out or default_run_path(), overwrite=overwrite)
+    folder.write_mark({"config": dataclasses.asdict(config), "drives": [str(path) for path in drives]})
+    summary = _run(config, folder, drives, base_map, options["agents"], keep_drives)
+    click.echo(json.dumps(summary, indent=2) if as_json else summary_text(summary, folder))
+
+
+def _run(
+    config: FleetConfig,
+    folder: RunFolder,
+    drives: tuple[Path, ...],
+    base_map: Path | None,
+    agents: int | None,
+    keep_drives: bool,
+) -> dict[str, Any]:
+    # The heavy imports wait until the options have been found good.
+    from deploy import prepare, summary
+    from deploy.fleet import run_fleet
+    from deploy.live import progress_bars
+    from deploy.processes import start_fork_server
+
+    console = Console(stderr=True)
+    stop = _stop_on_sigterm()
+    with progress_bars(console) as progress:
+        warm = threading.Thread(target=start_fork_server, name="fork-server")
+        warm.start()  # the kernels are loaded while the world is made
+        prepared = (
+            prepare.prepare_recorded(config, folder, drives, base_map, agents)
+            if drives
+            else prepare.prepare_simulated(config, folder, progress)
+        )
+        warm.join()
+    outcome = run_fleet(config, folder, prepared, console, stop)
+    result = summary.write_summary(config, folder, prepared, outcome)
+    if not keep_drives:
+        prepare.remove_drives(folder)
+    return result
+
+
+def _stop_on_sigterm() -> threading.Event:
+    stop = threading.Event()
+    signal.signal(signal.SIGTERM, lambda *_: stop.set())
+    return stop
+
+
+def summary_text(summary: dict[str, Any], folder: RunFolder) -> str:
+    """Return the summary as a few lines for people."""
+    from deploy.summary import summary_lines
+
+    return "\n".join([*summary_lines(summary), f"everything else: {folder.root}"])

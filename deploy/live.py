@@ -1,0 +1,140 @@
+"""What a person sees while a fleet runs: a table of the agents, or plain lines where there is no terminal."""
+
+import threading
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+
+from rich.console import Console, Group
+from rich.live import Live
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
+from rich.table import Table
+from rich.text import Text
+
+from schemas.errors import SchemaError
+from schemas.traffic_sample import TrafficSample, decode_traffic_sample
+
+HEALTH_STYLE = {"good": "green", "degraded": "yellow", "lost": "red"}
+PLAIN_PERIOD_S = 10.0
+
+
+@dataclass(slots=True)
+class FleetState:
+    """The newest sample of every agent and the totals of the cloud.
+
+    Attributes:
+        samples: newest traffic sample by vehicle.
+        published: tile versions published so far.
+        reports: reports in the store so far.
+        updates: updates that the watcher has received.
+        waiting: tiles that wait for a merge.
+        events: the last things that happened, newest last.
+    """
+
+    samples: dict[str, TrafficSample] = field(default_factory=dict)
+    published: int = 0
+    reports: int = 0
+    updates: int = 0
+    waiting: int = 0
+    events: list[str] = field(default_factory=list)
+    lock: threading.Lock = field(default_factory=threading.Lock)
+
+    def on_traffic(self, key: str, payload: bytes) -> None:
+        """Take a traffic sample from the bus; an unreadable one is noted and left out."""
+        try:
+            sample = decode_traffic_sample(payload)
+        except SchemaError as error:
+            self.note(f"unreadable sample on {key}: {error}")
+            return
+        with self.lock:
+            known = self.samples.get(sample.vehicle)
+            if known is None or sample.t_ns >= known.t_ns:
+                self.samples[sample.vehicle] = sample
+
+    def note(self, text: str) -> None:
+        """Remember an event; the last three are shown."""
+        with self.lock:
+            self.events = [*self.events[-2:], f"{time.strftime('%H:%M:%S')} {text}"]
+
+
+def size_text(size: float) -> str:
+    """Return a number of bytes for people: 812 B, 4.1 kB, 2.35 MB."""
+    if size < 1000:
+        return f"{size:.0f} B"
+    return f"{size / 1e3:.1f} kB" if size < 1e6 else f"{size / 1e6:.2f} MB"
+
+
+def render(state: FleetState) -> Group:
+    """Draw the state as a table and a line of totals."""
+    table = Table(box=None, pad_edge=False, header_style="bold")
+    for name, justify in (
+        ("vehicle", "left"), ("position", "left"), ("driven", "right"), ("health", "left"), ("down", "right"),
+        ("up", "right"), ("tiles", "right"), ("reports", "right"),
+    ):  # fmt: skip
+        table.add_column(name, justify="right" if justify == "right" else "left")
+    with state.lock:
+        for vehicle in sorted(state.samples):
+            table.add_row(*_row(state.samples[vehicle]))
+        totals = (
+            f"store: {state.reports} reports, {state.waiting} tiles waiting, {state.published} versions published"
+            f"   watcher: {state.updates} updates"
+        )
+        return Group(table, Text(totals, style="bold"), *(Text(event, style="dim") for event in state.events))
+
+
+def _row(sample: TrafficSample) -> tuple[str | Text, ...]:
+    return (
+        sample.vehicle,
+        f"{sample.lat_deg:.6f} {sample.lon_deg:.6f}",
+        f"{sample.odometer_m:.0f} m",
+        Text(sample.health, style=HEALTH_STYLE.get(sample.health, "dim")),
+        size_text(sample.wire_down_bytes),
+        size_text(sample.wire_up_bytes),
+        str(sample.tiles),
+        str(sample.reports),
+    )
+
+
+@contextmanager
+def live_view(state: FleetState, console: Console) -> Iterator["View"]:
+    """Show the state while the block runs."""
+    if not console.is_terminal:
+        yield View(state, console, None)
+        return
+    with Live(render(state), console=console, refresh_per_second=2, transient=False) as live:
+        yield View(state, console, live)
+
+
+@dataclass(slots=True)
+class View:
+    """A place to redraw the state; on a plain stream it prints a line every ten seconds."""
+
+    state: FleetState
+    console: Console
+    live: Live | None
+    printed_s: float = 0.0
+
+    def refresh(self) -> None:
+        """Show the newest state."""
+        if self.live is not None:
+            self.live.update(render(self.state))
+        elif time.monotonic() - self.printed_s >= PLAIN_PERIOD_S:
+            self.printed_s = time.monotonic()
+            self.console.print(self._plain())
+
+    def _plain(self) -> str:
+        with self.state.lock:
+            driven_m = sum(sample.odometer_m for sample in self.state.samples.values())
+            return (
+                f"{len(self.state.samples)} agents, {driven_m:.0f} m driven, {self.state.reports} reports, "
+                f"{self.state.waiting} tiles waiting, {self.state.published} versions, {self.state.updates} updates"
+            )
+
+
+@contextmanager
+def progress_bars(console: Console) -> Iterator[Progress]:
+    """Show progress bars while the block runs."""
+    columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn())
+    with Progress(*columns, console=console, disable=not console.is_terminal) as progress:
+        yield progress

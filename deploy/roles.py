@@ -1,0 +1,45 @@
+"""What each process of a fleet run does: one module-level function a role, so that a fork server can call it."""
+
+import threading
+from pathlib import Path
+
+from cloud_merger.merger import ShardConfig, run_shard
+from deploy.region import Region
+from deploy.watch import record_updates
+from fleet_bus.bus import open_bus
+from fleet_bus.config import BusConfig
+from fleet_bus.router import run_router
+from tile_store.server import TileServer
+from tile_store.sqlite import SqliteStore
+from vehicle_agent.agent import AgentConfig, run_agent
+
+
+def router(listen: str, *, stop: threading.Event) -> None:
+    """Run the Zenoh router."""
+    run_router((listen,), stop=stop)
+
+
+def store(path: Path, connect: str, *, stop: threading.Event) -> None:
+    """Serve tiles and catalogs from the store."""
+    with (
+        SqliteStore(path) as opened,
+        open_bus(BusConfig(connect=(connect,)), name="store") as bus,
+        TileServer(opened, bus),
+    ):
+        stop.wait()
+
+
+def merger(config: ShardConfig, *, stop: threading.Event) -> None:
+    """Run one merger shard."""
+    run_shard(config, stop)
+
+
+def agent(config: AgentConfig, *, stop: threading.Event) -> None:
+    """Drive one vehicle to the end of its recording and upload what it found."""
+    run_agent(config, stop)
+
+
+def watcher(connect: str, path: Path, *, stop: threading.Event) -> None:
+    """Record every tile update of the world as a subscriber would."""
+    with open_bus(BusConfig(connect=(connect,)), name="watcher") as bus:
+        record_updates(bus, Region(prefix=""), path, stop)

@@ -1,0 +1,163 @@
+"""An ordinary subscriber of tile updates: what `gnd watch` prints and what a fleet run's watcher records.
+
+Notices can be lost while a router or a publisher is down (they are notices, the store is the truth), so a watch also
+compares the catalog of its region from time to time and reports what it missed.
+"""
+
+import json
+import logging
+import threading
+import time
+from collections.abc import Callable
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Final
+
+from deploy.region import Region
+from fleet_bus.bus import Bus
+from fleet_bus.errors import BusError
+from gnd_map.tile_id import TileId
+from schemas.catalog import decode_catalog
+from schemas.errors import SchemaError
+from schemas.keys import catalog_keys, update_keys
+from schemas.tile_update import TileUpdate, decode_tile_update
+
+LAYER: Final = "ndt"
+CATALOG_PERIOD_S: Final = 3.0
+
+_log = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True, slots=True)
+class WatchEvent:
+    """One update as a watcher sees it.
+
+    Attributes:
+        received_ns: time of arrival, ns UTC.
+        layer: map layer.
+        tile: Morton id of the tile.
+        path: the same as text path.
+        version: version that is now current.
+        previous_version: version that it follows.
+        reason: why: merged, base, rollback; or catalog when the notice itself was missed.
+        put: voxels written by this version, None where the notice carried no delta.
+        removed: voxels removed by this version, likewise.
+        size: bytes of the notice.
+    """
+
+    received_ns: int
+    layer: str
+    tile: int
+    path: str
+    version: int
+    previous_version: int
+    reason: str
+    put: int | None
+    removed: int | None
+    size: int
+
+    def line(self) -> str:
+        """Return the event as a line for people."""
+        clock = time.strftime("%H:%M:%S", time.gmtime(self.received_ns // 1_000_000_000))
+        change = "" if self.put is None else f"  +{self.put} -{self.removed} voxels"
+        return (
+            f"{clock}  {self.path}  v{self.previous_version} -> v{self.version}  {self.reason}{change}  {self.size} B"
+        )
+
+    def json(self) -> str:
+        """Return the event as one JSON object on one line."""
+        return json.dumps(asdict(self), separators=(",", ":"))
+
+
+class TileWatch:
+    """Follows the tile versions of a region.
+
+    Args:
+        bus: an open bus.
+        region: which tiles.
+        emit: called with each event, from one thread at a time.
+        layer: map layer.
+    """
+
+    def __init__(self, bus: Bus, region: Region, emit: Callable[[WatchEvent], None], layer: str = LAYER) -> None:
+        self._bus, self._region, self._emit, self._layer = bus, region, emit, layer
+        self._seen: set[tuple[int, int]] = set()
+        self._latest: dict[int, int] = {}
+        self._lock = threading.Lock()
+
+    def run(self, stop: threading.Event) -> None:
+        """Follow the region until `stop` is set."""
+        with self._bus.subscribe(update_keys(self._layer, self._region.prefix), self._on_update, history=True):
+            self._compare_catalog(report=False)
+            while not stop.wait(CATALOG_PERIOD_S):
+                self._compare_catalog(report=True)
+
+    def _on_update(self, key: str, payload: bytes) -> None:
+        try:
+            update = decode_tile_update(payload)
+        except SchemaError as error:
+            _log.warning("unreadable update on %s: %s", key, error)
+            return
+        if update.tile in self._region:
+            self._note(_event_of(update, len(payload)))
+
+    def _note(self, event: WatchEvent) -> None:
+        with self._lock:
+            if (event.tile, event.version) in self._seen:
+                return
+            self._seen.add((event.tile, event.version))
+            self._latest[event.tile] = max(event.version, self._latest.get(event.tile, 0))
+            self._emit(event)
+
+    def _compare_catalog(self, *, report: bool) -> None:
+        """Find versions whose notice never came; the first call only learns where the region stands."""
+        for tile, version, size in self._catalog():
+            known = self._latest.setdefault(tile.morton, 0 if report else version)
+            if version > known:
+                self._note(_missed(self._layer, tile, known, version, size))
+
+    def _catalog(self) -> list[tuple[TileId, int, int]]:
+        try:
+            replies = self._bus.request_many(catalog_keys(self._layer, self._region.prefix), b"", kind="catalog")
+        except BusError as error:
+            _log.warning("no catalog: %s", error)
+            return []
+        return [
+            (entry.tile, entry.version, len(payload))
+            for _, payload in replies
+            for entry in decode_catalog(payload).entries
+            if entry.tile in self._region
+        ]
+
+
+def _event_of(update: TileUpdate, size: int) -> WatchEvent:
+    delta = update.delta
+    return WatchEvent(
+        received_ns=time.time_ns(),
+        layer=update.layer,
+        tile=update.tile.morton,
+        path=update.tile.path,
+        version=update.version,
+        previous_version=update.previous_version,
+        reason=update.reason,
+        put=None if delta is None else len(delta.put.voxel_id),
+        removed=None if delta is None else len(delta.removed),
+        size=size,
+    )
+
+
+def _missed(layer: str, tile: TileId, known: int, version: int, size: int) -> WatchEvent:
+    return WatchEvent(time.time_ns(), layer, tile.morton, tile.path, version, known, "catalog", None, None, size)
+
+
+def record_updates(bus: Bus, region: Region, path: Path, stop: threading.Event) -> None:
+    """Write each update of a region as a JSON line until `stop` is set.
+
+    Args:
+        bus: an open bus.
+        region: which tiles.
+        path: file to append to; every line is complete or absent.
+        stop: ends the recording.
+    """
+    with path.open("a", encoding="utf-8", buffering=1) as lines:
+        TileWatch(bus, region, lambda event: print(event.json(), file=lines)).run(stop)

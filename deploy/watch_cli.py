@@ -1,0 +1,31 @@
+"""`gnd watch`: follow the tile updates of a region."""
+
+import signal
+import threading
+
+import click
+
+from deploy.region import parse_region
+from deploy.watch import TileWatch
+from fleet_bus.bus import open_bus
+from fleet_bus.config import BusConfig
+
+
+@click.command()
+@click.argument("region")
+@click.option("--connect", default="tcp/127.0.0.1:7447", show_default=True, help="Router to connect to.")
+@click.option("--layer", default="ndt", show_default=True, help="Map layer.")
+@click.option("--json", "as_json", is_flag=True, help="One JSON object a line.")
+def watch(region: str, connect: str, layer: str, as_json: bool) -> None:
+    """Print each tile update of REGION as it is published; Ctrl-C ends.
+
+    REGION is a wildcard (13033/03021/** or ** for the world), a tile id (497353963154), a tile path, or a circle
+    lat,lon,radius in degrees and metres.
+    """
+    chosen = parse_region(region)
+    stop = threading.Event()
+    signal.signal(signal.SIGTERM, lambda *_: stop.set())
+    signal.signal(signal.SIGINT, lambda *_: stop.set())
+    with open_bus(BusConfig(connect=(connect,)), name="watch") as bus:
+        click.echo(f"watching {chosen.prefix or 'the world'} on {connect}, Ctrl-C ends", err=True)
+        TileWatch(bus, chosen, lambda event: click.echo(event.json() if as_json else event.line()), layer).run(stop)

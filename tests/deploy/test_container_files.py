@@ -1,0 +1,37 @@
+"""Every command line in the container and systemd files is one that `gnd` understands."""
+
+import re
+import shlex
+from pathlib import Path
+from typing import Any
+
+import click
+import pytest
+import yaml
+
+from deploy.cli import gnd
+
+DEPLOY = Path(__file__).resolve().parents[2] / "deploy"
+
+
+def _compose_commands() -> list[list[str]]:
+    services: dict[str, Any] = yaml.safe_load((DEPLOY / "compose.yaml").read_text())["services"]
+    return [[str(word) for word in service["command"]] for service in services.values() if "command" in service]
+
+
+def _systemd_commands() -> list[list[str]]:
+    lines = [re.search(r"^ExecStart=(.*)$", path.read_text(), re.M) for path in (DEPLOY / "systemd").glob("*.service")]
+    return [shlex.split(line.group(1))[1:] for line in lines if line]
+
+
+@pytest.mark.parametrize("words", _compose_commands() + _systemd_commands(), ids=" ".join)
+def test_the_command_line_parses(words: list[str]) -> None:
+    context = click.Context(gnd)
+    command = gnd.get_command(context, words[0])
+    assert command is not None
+    command.make_context(words[0], words[1:], parent=context, resilient_parsing=False)
+
+
+def test_there_are_commands_to_check() -> None:
+    assert len(_compose_commands()) >= 6
+    assert len(_systemd_commands()) >= 3

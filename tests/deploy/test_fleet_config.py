@@ -1,0 +1,43 @@
+from pathlib import Path
+
+import pytest
+
+from deploy.errors import DeployError
+from deploy.fleet_config import FleetConfig, load_fleet_config
+from gnd_map.errors import GndError
+
+
+def test_the_shipped_file_holds_the_defaults() -> None:
+    assert load_fleet_config(None, {}) == FleetConfig()
+
+
+def test_options_override_the_file(tmp_path: Path) -> None:
+    path = tmp_path / "fleet.toml"
+    path.write_text('agents = 3\nlink = "3g"\n')
+    config = load_fleet_config(path, {"agents": 5, "link": None})
+    assert (config.agents, config.link) == (5, "3g")
+
+
+def test_an_unknown_key_is_named(tmp_path: Path) -> None:
+    path = tmp_path / "fleet.toml"
+    path.write_text("agentz = 3\n")
+    with pytest.raises(GndError, match="agentz"):
+        load_fleet_config(path, {})
+
+
+@pytest.mark.parametrize(
+    "overrides",
+    [{"agents": 0}, {"agents": 100_000}, {"shards": 0}, {"port": 70_000}, {"merge_mode": "magic"}, {"deadline_s": 0.0}],
+)
+def test_values_out_of_range_are_refused(overrides: dict[str, object]) -> None:
+    with pytest.raises(DeployError):
+        load_fleet_config(None, overrides)
+
+
+def test_a_broken_file_is_refused(tmp_path: Path) -> None:
+    path = tmp_path / "fleet.toml"
+    path.write_text("agents = = 3")
+    with pytest.raises(DeployError, match="no valid TOML"):
+        load_fleet_config(path, {})
+    with pytest.raises(DeployError, match="cannot read"):
+        load_fleet_config(tmp_path / "missing.toml", {})
