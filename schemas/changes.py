@@ -1,0 +1,307 @@
+"""Change reports: what a drive found out about the tiles that it left behind, and the merger's answer.
+
+A report is a statement about the world ("Gaussian G here", "nothing here", "as in version v"), so it keeps its meaning
+when the map has moved on. Every voxel that the drive has observed is named: the merger's votes need those who saw no
+change, too.
+"""
+
+from dataclasses import dataclass, replace
+from typing import Final, Literal
+
+import numpy as np
+import numpy.typing as npt
+
+from gnd_map.arrays import I32, check_array
+from gnd_map.classes import ChangeClass
+from gnd_map.codec import CODEC_FLOAT32, codec_of, encode_gaussians
+from gnd_map.gaussian import Gaussians
+from gnd_map.grid import VoxelGrid
+from gnd_map.tile_id import District, TileId
+from schemas import limits
+from schemas.bitmap import decode_observed, encode_observed
+from schemas.errors import BadValue, TooLarge
+from schemas.generated import change_ack_pb2, change_report_pb2, tile_change_pb2
+from schemas.report_id import check_report_id
+from schemas.wire import (
+    LAYER_PATTERN,
+    MAJOR,
+    PRINTABLE_PATTERN,
+    REASON_PATTERN,
+    VEHICLE_PATTERN,
+    check_length,
+    check_major,
+    check_pair,
+    check_text,
+    check_unsigned,
+    check_word,
+    number_of,
+    parse,
+    refusing,
+    serialise,
+    tile_id,
+    word_of,
+)
+
+U8 = npt.NDArray[np.uint8]
+
+AckStatus = Literal["stored", "duplicate", "quarantined"]
+_STATUS: Final[dict[int, AckStatus]] = {1: "stored", 2: "duplicate", 3: "quarantined"}
+_COUNTERS: Final = 4
+_ROUNDING: Final = 1e-5
+"""How negative an eigenvalue of a float32 covariance may be, relative to the largest: a plane's smallest is about 0."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class TileChange:
+    """What one drive found out about one tile."""
+
+    tile: TileId
+    base_version: int
+    """Version that the vehicle compared with; 0 = it had no map of this tile."""
+    base_sha: bytes
+    """SHA-256 of that version's content; empty = it had no map of this tile."""
+    observed: I32
+    """(K,) sorted ids of the voxels that this drive has observed."""
+    changed: Gaussians
+    """N voxels among the observed; count 0 = there is nothing now. Observed but not listed = as in the base."""
+    change_class: U8
+    """(N,) `ChangeClass` of each changed voxel."""
+    evidence: I32
+    """(N, 4) rays of each changed voxel: blocked inside (n_BI), outside (n_BO), in an empty one (n_BE), passed (n_PI)."""
+    pose_sigma_m: float
+    """Standard deviation of the refined position."""
+    pose_sigma_rad: float
+    """Standard deviation of the refined heading."""
+
+    def __post_init__(self) -> None:
+        with refusing(f"change of tile {self.tile}"):
+            check_pair("base", self.base_version, self.base_sha)
+            check_array("observed", self.observed, np.int32, (None,))
+            check_array("change_class", self.change_class, np.uint8, (len(self.changed),))
+            check_array("evidence", self.evidence, np.int32, (len(self.changed), _COUNTERS))
+            self._check_voxels()
+            self._check_values()
+            _check_covariances(self.changed)
+
+    def _check_voxels(self) -> None:
+        if (np.diff(self.observed.astype(np.int64)) <= 0).any():
+            raise BadValue(f"the {len(self.observed)} observed voxels are not strictly increasing")
+        outside = ~np.isin(self.changed.voxel_id, self.observed)
+        if outside.any():
+            first = self.changed.voxel_id[outside][0]
+            raise BadValue(f"{outside.sum()} changed voxels are not among the observed, first {first}")
+        if len(self.observed):
+            _check_floors(self.tile, self.observed[[0, -1]])
+
+    def _check_values(self) -> None:
+        if (self.change_class > max(ChangeClass)).any():
+            raise BadValue(f"change class {self.change_class.max()} is outside 0 .. {max(ChangeClass)}")
+        if (self.evidence < 0).any():
+            raise BadValue(f"evidence of {self.evidence.min()} rays is negative")
+        if not 0 <= self.pose_sigma_m <= limits.MAX_POSE_SIGMA_M:
+            raise BadValue(f"pose sigma {self.pose_sigma_m} m is outside 0 .. {limits.MAX_POSE_SIGMA_M}")
+        if not 0 <= self.pose_sigma_rad <= limits.MAX_POSE_SIGMA_RAD:
+            raise BadValue(f"pose sigma {self.pose_sigma_rad} rad is outside 0 .. {limits.MAX_POSE_SIGMA_RAD}")
+
+    def __eq__(self, other: object) -> bool:
+        return isinstance(other, TileChange) and self._scalars == other._scalars and self._same_arrays(other)
+
+    __hash__ = None  # type: ignore[assignment]
+
+    @property
+    def _scalars(self) -> tuple[TileId, int, bytes, float, float]:
+        return self.tile, self.base_version, self.base_sha, self.pose_sigma_m, self.pose_sigma_rad
+
+    def _same_arrays(self, other: "TileChange") -> bool:
+        return (
+            self.changed == other.changed
+            and np.array_equal(self.observed, other.observed)
+            and np.array_equal(self.change_class, other.change_class)
+            and np.array_equal(self.evidence, other.evidence)
+        )
+
+
+def _check_floors(tile: TileId, voxel_id: I32) -> None:
+    """Voxel ids of any number are voxels; those deep in the Earth or far above it are mistakes."""
+    _, _, floor = VoxelGrid.of(tile).unravel(voxel_id)
+    if floor.min() < limits.MIN_FLOOR or floor.max() > limits.MAX_FLOOR:
+        known = f"{limits.MIN_FLOOR} .. {limits.MAX_FLOOR} m"
+        raise BadValue(
+            f"observed voxels lie at heights {floor.min()} .. {floor.max()} m, the Earth's surface at {known}"
+        )
+
+
+def _check_covariances(gaussians: Gaussians) -> None:
+    """Refuse covariances that no points inside a voxel can have: not positive semi-definite, or too large."""
+    if len(gaussians) == 0:
+        return
+    eigenvalues = np.linalg.eigvalsh(gaussians.full_cov())
+    smallest, largest = eigenvalues[:, 0], eigenvalues[:, -1]
+    bad = (smallest < -_ROUNDING * largest) | (largest > limits.MAX_VARIANCE_M2)
+    if bad.any():
+        row = int(np.flatnonzero(bad)[0])
+        raise BadValue(
+            f"{bad.sum()} covariances are not positive or too large: voxel {gaussians.voxel_id[row]} has eigenvalues "
+            f"{smallest[row]:.4g} .. {largest[row]:.4g} m^2, expected 0 .. {limits.MAX_VARIANCE_M2}"
+        )
+
+
+@dataclass(frozen=True, slots=True)
+class ChangeReport:
+    """What a vehicle sends for the tiles of one district that it has left behind."""
+
+    report_id: str
+    """ULID; the same report keeps its id whenever it is sent again."""
+    vehicle: str
+    """Pseudonym."""
+    sensor_model: str
+    software: str
+    district: District
+    first_ns: int
+    """Time of the first scan that the report rests on, UTC."""
+    last_ns: int
+    """Time of the last scan."""
+    tiles: tuple[TileChange, ...]
+    """One entry a tile, ascending; at least one."""
+    layer: str = "ndt"
+
+    def __post_init__(self) -> None:
+        check_report_id(self.report_id)
+        check_text("vehicle", self.vehicle, VEHICLE_PATTERN)
+        check_text("sensor model", self.sensor_model, PRINTABLE_PATTERN)
+        check_text("software", self.software, PRINTABLE_PATTERN)
+        check_text("layer", self.layer, LAYER_PATTERN)
+        check_unsigned("first_ns", self.first_ns, bits=63)
+        check_unsigned("last_ns", self.last_ns, bits=63)
+        if self.first_ns > self.last_ns:
+            raise BadValue(f"report {self.report_id} begins at {self.first_ns} ns, after its end at {self.last_ns} ns")
+        self._check_tiles()
+
+    def _check_tiles(self) -> None:
+        check_length(f"report {self.report_id}", len(self.tiles), limits.MAX_TILES_OF_DISTRICT, "tiles")
+        if not self.tiles:
+            raise BadValue(f"report {self.report_id} has no tiles")
+        for before, after in zip(self.tiles, self.tiles[1:], strict=False):
+            if before.tile >= after.tile:
+                raise BadValue(
+                    f"report {self.report_id} lists tile {after.tile} after {before.tile}: ascending, none twice"
+                )
+        outside = [change.tile for change in self.tiles if not self.district.contains(change.tile)]
+        if outside:
+            raise BadValue(f"report {self.report_id}: tile {outside[0]} is not in district {self.district}")
+
+    def encode(self) -> bytes:
+        """Bytes of gnd.v1.ChangeReport."""
+        message = change_report_pb2.ChangeReport(
+            major=MAJOR,
+            report_id=self.report_id,
+            vehicle=self.vehicle,
+            sensor_model=self.sensor_model,
+            software=self.software,
+            layer=self.layer,
+            district=self.district.path,
+            first_ns=self.first_ns,
+            last_ns=self.last_ns,
+            tiles=map(_change_message, self.tiles),
+        )
+        return serialise(message, limits.MAX_CHANGE_REPORT_BYTES)
+
+    @classmethod
+    def decode(cls, data: bytes) -> "ChangeReport":
+        """The value in `data`; `SchemaError` when it is none."""
+        message = parse(change_report_pb2.ChangeReport, data, limits.MAX_CHANGE_REPORT_BYTES)
+        check_major(message, "ChangeReport")
+        check_length("ChangeReport", len(message.tiles), limits.MAX_TILES_OF_DISTRICT, "tiles")
+        with refusing("ChangeReport"):
+            district = District(message.district)
+        return cls(
+            report_id=message.report_id,
+            vehicle=message.vehicle,
+            sensor_model=message.sensor_model,
+            software=message.software,
+            layer=message.layer,
+            district=district,
+            first_ns=message.first_ns,
+            last_ns=message.last_ns,
+            tiles=_change_values(message),
+        )
+
+
+def _change_message(change: TileChange) -> tile_change_pb2.TileChange:
+    first, bitmap = encode_observed(change.observed)
+    return tile_change_pb2.TileChange(
+        tile=change.tile.morton,
+        base_version=change.base_version,
+        base_sha=change.base_sha,
+        observed_first=first,
+        observed_bitmap=bitmap,
+        codec_id=CODEC_FLOAT32,
+        changed=encode_gaussians(change.changed),
+        change_class=change.change_class.tobytes(),
+        evidence=change.evidence.ravel().tolist(),
+        pose_sigma_m=change.pose_sigma_m,
+        pose_sigma_rad=change.pose_sigma_rad,
+    )
+
+
+def _change_values(message: change_report_pb2.ChangeReport) -> tuple[TileChange, ...]:
+    """Tile by tile, so that a report made of many bitmaps that unpack to much is refused before it has unpacked all."""
+    changes: list[TileChange] = []
+    observed = 0
+    for change in message.tiles:
+        changes.append(_change_value(change))
+        observed += len(changes[-1].observed)
+        if observed > limits.MAX_OBSERVED_OF_REPORT:
+            raise TooLarge(f"report observes more than {limits.MAX_OBSERVED_OF_REPORT} voxels in {len(changes)} tiles")
+    return tuple(changes)
+
+
+def _change_value(message: tile_change_pb2.TileChange) -> TileChange:
+    tile = tile_id(message.tile)
+    with refusing(f"change of tile {tile}"):
+        return TileChange(
+            tile=tile,
+            base_version=message.base_version,
+            base_sha=message.base_sha,
+            observed=decode_observed(message.observed_first, message.observed_bitmap),
+            changed=codec_of(message.codec_id).decode(message.changed),
+            change_class=np.frombuffer(message.change_class, np.uint8).copy(),
+            evidence=np.array(message.evidence, np.int32).reshape(-1, _COUNTERS),
+            pose_sigma_m=message.pose_sigma_m,
+            pose_sigma_rad=message.pose_sigma_rad,
+        )
+
+
+def split(report: ChangeReport) -> tuple[tuple[TileId, bytes], ...]:
+    """One self-contained encoded report a tile, under the same report id: what the store keeps."""
+    return tuple((change.tile, replace(report, tiles=(change,)).encode()) for change in report.tiles)
+
+
+@dataclass(frozen=True, slots=True)
+class ChangeAck:
+    """The merger's answer to a report, sent only after the report is durable."""
+
+    report_id: str
+    """The report that is answered; empty when it was too broken to have an id."""
+    status: AckStatus
+    reason: str = ""
+    """Why it was quarantined, in one line with numbers."""
+
+    def __post_init__(self) -> None:
+        if self.report_id or self.status != "quarantined":
+            check_report_id(self.report_id)
+        check_word(self.status, _STATUS, "ChangeAck status")
+        check_text("reason", self.reason, REASON_PATTERN)
+
+    def encode(self) -> bytes:
+        """Bytes of gnd.v1.ChangeAck."""
+        message = change_ack_pb2.ChangeAck(major=MAJOR, report_id=self.report_id, reason=self.reason)
+        message.status = change_ack_pb2.ChangeAck.Status.ValueType(number_of(self.status, _STATUS))
+        return serialise(message, limits.MAX_CHANGE_ACK_BYTES)
+
+    @classmethod
+    def decode(cls, data: bytes) -> "ChangeAck":
+        """The value in `data`; `SchemaError` when it is none."""
+        message = parse(change_ack_pb2.ChangeAck, data, limits.MAX_CHANGE_ACK_BYTES)
+        check_major(message, "ChangeAck")
+        return cls(message.report_id, word_of(message.status, _STATUS, "ChangeAck status"), message.reason)

@@ -1,0 +1,222 @@
+"""The one table of key expressions; no key string stands anywhere else.
+
+A tile is written as its 20-level path in four chunks of five base-4 digits, `q5/q10/q15/q20` (about 1250 km, 39 km,
+1.2 km, 38 m), so that a prefix is a region and a wildcard over whole chunks a subscription to it.
+"""
+
+import re
+from dataclasses import dataclass
+from typing import Final
+
+from gnd_map.tile_id import District, TileId
+from schemas.errors import BadKey, WrongVersion
+from schemas.wire import LAYER_PATTERN, MAJOR, VEHICLE_PATTERN, WORD_PATTERN, refusing
+
+ROOT: Final = f"gnd/v{MAJOR}"
+
+
+@dataclass(frozen=True, slots=True)
+class KeySpec:
+    """One row of the table: what is said on a key, in which direction, how surely it arrives."""
+
+    pattern: str
+    kind: str
+    request: str
+    reply: str
+    reliability: str
+
+
+KEY_TABLE: Final = (
+    KeySpec(
+        pattern=f"{ROOT}/tile/<layer>/<q5>/<q10>/<q15>/<q20>",
+        kind="query, agent → tile server",
+        request="TileRequest",
+        reply="TileReply",
+        reliability="asked again until answered; a wildcard is answered with one reply a tile",
+    ),
+    KeySpec(
+        pattern=f"{ROOT}/catalog/<layer>/<q5>/<q10>/<q15>",
+        kind="query, any client → tile server",
+        request="–",
+        reply="Catalog",
+        reliability="asked again until answered",
+    ),
+    KeySpec(
+        pattern=f"{ROOT}/change/<layer>/<q5>/<q10>/<q15>",
+        kind="query with payload, agent → merger shard",
+        request="ChangeReport",
+        reply="ChangeAck",
+        reliability="durable before the ack; sent again under the same report id until acknowledged",
+    ),
+    KeySpec(
+        pattern=f"{ROOT}/update/<layer>/<q5>/<q10>/<q15>/<q20>",
+        kind="put, merger → anyone, after the commit",
+        request="TileUpdate",
+        reply="–",
+        reliability="blocks rather than drops; a late or lost one is found again through the catalog",
+    ),
+    KeySpec(
+        pattern=f"{ROOT}/traffic/<vehicle>",
+        kind="put, agent → anyone",
+        request="TrafficSample",
+        reply="–",
+        reliability="totals: the next one makes up for a lost one",
+    ),
+    KeySpec(
+        pattern=f"{ROOT}/alive/<role>/<id>",
+        kind="liveliness token",
+        request="–",
+        reply="–",
+        reliability="gone at once with its process, after the lease with its machine",
+    ),
+)
+
+_PREFIX = re.compile(r"(?:[01][0-3]{4}(?:/[0-3]{5}){0,3})?")
+
+
+def tile_key(layer: str, tile: TileId) -> str:
+    """Where one tile is asked for."""
+    return f"{ROOT}/tile/{_layer(layer)}/{tile.path}"
+
+
+def tiles_key(layer: str, prefix: str = "") -> str:
+    """Where every tile of a region is asked for; `prefix` = none to four chunks of a tile's path."""
+    return f"{ROOT}/tile/{_layer(layer)}/{_region(prefix)}"
+
+
+def catalog_key(layer: str, district: District) -> str:
+    """Where a district's catalog is asked for."""
+    return f"{ROOT}/catalog/{_layer(layer)}/{district.path}"
+
+
+def catalog_keys(layer: str) -> str:
+    """Every catalog of a layer (what the tile server serves)."""
+    return f"{ROOT}/catalog/{_layer(layer)}/**"
+
+
+def change_key(layer: str, district: District) -> str:
+    """Where a report over a district's tiles is sent."""
+    return f"{ROOT}/change/{_layer(layer)}/{district.path}"
+
+
+def change_keys(layer: str | None = None) -> str:
+    """Every report's key: of one layer, or of all."""
+    return f"{ROOT}/change/**" if layer is None else f"{ROOT}/change/{_layer(layer)}/**"
+
+
+def update_key(layer: str, tile: TileId) -> str:
+    """Where a tile's new versions are announced."""
+    return f"{ROOT}/update/{_layer(layer)}/{tile.path}"
+
+
+def update_keys(layer: str, prefix: str = "") -> str:
+    """The updates of a region; `prefix` = none to four chunks of a tile's path."""
+    return f"{ROOT}/update/{_layer(layer)}/{_region(prefix)}"
+
+
+def traffic_key(vehicle: str) -> str:
+    """Where a vehicle puts its traffic samples."""
+    return f"{ROOT}/traffic/{_matching('vehicle', vehicle, VEHICLE_PATTERN)}"
+
+
+def traffic_keys() -> str:
+    """The traffic samples of every vehicle."""
+    return f"{ROOT}/traffic/*"
+
+
+def alive_key(role: str, member: str) -> str:
+    """The liveliness token of one process: its role (`agent`, `merger`, `store` ...) and its name."""
+    return f"{ROOT}/alive/{_matching('role', role, WORD_PATTERN)}/{_matching('id', member, VEHICLE_PATTERN)}"
+
+
+def alive_keys(role: str) -> str:
+    """The liveliness tokens of every process in a role."""
+    return f"{ROOT}/alive/{_matching('role', role, WORD_PATTERN)}/*"
+
+
+def parse_tile_key(key: str) -> tuple[str, TileId]:
+    """Layer and tile of a tile key; `BadKey`, `WrongVersion`."""
+    return _layer_and_tile(key, "tile")
+
+
+def parse_update_key(key: str) -> tuple[str, TileId]:
+    """Layer and tile of an update key; `BadKey`, `WrongVersion`."""
+    return _layer_and_tile(key, "update")
+
+
+def parse_catalog_key(key: str) -> tuple[str, District]:
+    """Layer and district of a catalog key; `BadKey`, `WrongVersion`."""
+    return _layer_and_district(key, "catalog")
+
+
+def parse_change_key(key: str) -> tuple[str, District]:
+    """Layer and district of a change key; `BadKey`, `WrongVersion`."""
+    return _layer_and_district(key, "change")
+
+
+def parse_traffic_key(key: str) -> str:
+    """The vehicle of a traffic key; `BadKey`, `WrongVersion`."""
+    (vehicle,) = _chunks(key, "traffic", 1)
+    return _matching("vehicle", vehicle, VEHICLE_PATTERN)
+
+
+def parse_alive_key(key: str) -> tuple[str, str]:
+    """Role and name of a liveliness token; `BadKey`, `WrongVersion`."""
+    role, member = _chunks(key, "alive", 2)
+    return _matching("role", role, WORD_PATTERN), _matching("id", member, VEHICLE_PATTERN)
+
+
+def parse_tiles_key(key: str) -> tuple[str, str]:
+    """Layer and region prefix of a tile query, wildcard or not; `BadKey`, `WrongVersion`."""
+    layer, *rest = _chunks(key, "tile")
+    prefix = "/".join(rest[:-1] if rest[-1:] == ["**"] else rest)
+    if _region(prefix) != "/".join(rest):
+        raise BadKey(f"key {key[:160]!r}: a region is whole chunks of a tile's path, then /**")
+    return _layer(layer), prefix
+
+
+def _layer_and_tile(key: str, kind: str) -> tuple[str, TileId]:
+    layer, *path = _chunks(key, kind, 5)
+    with refusing(f"key {key[:160]!r}", BadKey):
+        return _layer(layer), TileId.from_path("/".join(path))
+
+
+def _layer_and_district(key: str, kind: str) -> tuple[str, District]:
+    layer, *path = _chunks(key, kind, 4)
+    with refusing(f"key {key[:160]!r}", BadKey):
+        return _layer(layer), District("/".join(path))
+
+
+def _chunks(key: str, kind: str, count: int | None = None) -> list[str]:
+    """The chunks of `key` behind its kind; `count` None = any number of them, at least one."""
+    chunks = key.split("/")
+    if _is_other_major(chunks):
+        raise WrongVersion(f"key {key[:160]!r} is of major version {chunks[1][1:]}; this program speaks {MAJOR}")
+    rest = chunks[3:]
+    if "/".join(chunks[:3]) != f"{ROOT}/{kind}" or not rest or count not in (None, len(rest)):
+        raise BadKey(f"key {key[:160]!r} is not {_pattern(kind)}")
+    return rest
+
+
+def _is_other_major(chunks: list[str]) -> bool:
+    return chunks[0] == "gnd" and len(chunks) > 1 and re.fullmatch(rf"v(?!{MAJOR}$)\d+", chunks[1]) is not None
+
+
+def _pattern(kind: str) -> str:
+    return next(spec.pattern for spec in KEY_TABLE if spec.pattern.startswith(f"{ROOT}/{kind}/"))
+
+
+def _layer(layer: str) -> str:
+    return _matching("layer", layer, LAYER_PATTERN)
+
+
+def _region(prefix: str) -> str:
+    """The key part for a region: the whole path of one tile, or a prefix of whole chunks and a wildcard."""
+    _matching("region prefix", prefix, _PREFIX)
+    return prefix if prefix.count("/") == 3 else f"{prefix}/**".removeprefix("/")
+
+
+def _matching(name: str, text: str, pattern: re.Pattern[str]) -> str:
+    if not pattern.fullmatch(text):
+        raise BadKey(f"{name} {text[:80]!r} does not match {pattern.pattern}")
+    return text

@@ -1,0 +1,44 @@
+"""How large each message may be. Checked on the bytes before they are parsed, and on what they unpack to.
+
+The figures allow about ten times what a dense city needs: a tile of 20,000 Gaussians, a report over every tile of a
+district of 1.2 km.
+"""
+
+from typing import Final
+
+KIB: Final = 1024
+MIB: Final = 1024 * KIB
+
+MAX_TILE_REQUEST_BYTES: Final = 1 * KIB
+MAX_TILE_BODY_BYTES: Final = 4 * MIB
+MAX_TILE_REPLY_BYTES: Final = MAX_TILE_BODY_BYTES + KIB
+MAX_CATALOG_BYTES: Final = 128 * KIB
+MAX_CHANGE_REPORT_BYTES: Final = 8 * MIB
+MAX_CHANGE_ACK_BYTES: Final = 4 * KIB
+MAX_TILE_UPDATE_BYTES: Final = MAX_TILE_BODY_BYTES + KIB
+MAX_TRAFFIC_SAMPLE_BYTES: Final = 16 * KIB
+
+# A district (q5/q10/q15) is 32 x 32 tiles.
+MAX_TILES_OF_DISTRICT: Final = 1024
+MAX_CODECS: Final = 16
+MAX_REASON_CHARACTERS: Final = 1024
+MAX_TEXT_CHARACTERS: Final = 128
+
+# One tile's bitmap of observed voxels once unpacked: 1 M voxels, 690 floors of 39 x 39.
+MAX_OBSERVED_BITMAP_BYTES: Final = 128 * KIB
+# Observed voxels of a whole report once unpacked (32 MB of ids): many small bombs are a bomb.
+MAX_OBSERVED_OF_REPORT: Final = 8 * MIB
+
+# No Gaussian of the map lies outside: the Dead Sea's shore is at -430 m, Chomolungma at 8,849 m.
+MIN_FLOOR: Final = -1_000
+MAX_FLOOR: Final = 10_000
+
+# Points inside a voxel of at most 1 m x 1 m x 1 m vary by at most (sqrt(3) / 2 m)^2 along any axis.
+MAX_VARIANCE_M2: Final = 1.0
+
+MAX_POSE_SIGMA_M: Final = 1_000.0
+MAX_POSE_SIGMA_RAD: Final = 3.15
+
+# A recorded drive: bytes of one unpacked chunk, points of one scan.
+MAX_CHUNK_BYTES: Final = 256 * MIB
+MAX_POINTS_OF_SCAN: Final = 4_000_000

@@ -1,0 +1,32 @@
+"""Report ids: ULIDs that a restarted agent makes again for the same report, so that sending twice applies once."""
+
+import hashlib
+
+from ulid import ULID
+
+from schemas.errors import BadValue
+from schemas.wire import refusing
+
+_RANDOM_BYTES = 10
+_TIME_BYTES = 6
+
+
+def deterministic_report_id(t_ms: int, *parts: str | bytes) -> str:
+    """The ULID of `t_ms` (milliseconds since 1970 UTC; sorts first) whose 80 random bits are a hash of `parts`.
+
+    The same arguments give the same id on every machine; `("ab", "c")` and `("a", "bc")` differ.
+    """
+    if not 0 <= t_ms < 2 ** (8 * _TIME_BYTES):
+        raise BadValue(f"report time {t_ms} ms is outside the 48 bits of a ULID")
+    digest = hashlib.blake2b(digest_size=_RANDOM_BYTES)
+    for part in parts:
+        data = part.encode() if isinstance(part, str) else part
+        digest.update(len(data).to_bytes(8, "little") + data)
+    return str(ULID.from_bytes(t_ms.to_bytes(_TIME_BYTES, "big") + digest.digest()))
+
+
+def check_report_id(report_id: str) -> None:
+    """`BadValue` unless `report_id` is a ULID in its one canonical spelling (26 upper-case characters)."""
+    with refusing(f"report id {report_id[:40]!r}"):
+        if str(ULID.from_str(report_id)) != report_id:
+            raise BadValue(f"report id {report_id[:40]!r} is not a ULID in canonical spelling")

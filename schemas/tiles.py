@@ -1,0 +1,190 @@
+"""Tiles on the bus: request, blob, reply, catalog. Each value checks itself; encode and decode stand side by side."""
+
+from dataclasses import dataclass
+from typing import Final, Literal
+
+from gnd_map.codec import CODEC_FLOAT32, codec_of, encode_gaussians
+from gnd_map.tile import Tile
+from gnd_map.tile_id import TileId
+from schemas import limits
+from schemas.errors import BadValue, WrongHash
+from schemas.generated import catalog_entry_pb2, catalog_pb2, tile_blob_pb2, tile_reply_pb2, tile_request_pb2
+from schemas.wire import (
+    MAJOR,
+    check_length,
+    check_major,
+    check_pair,
+    check_sha,
+    check_version,
+    check_word,
+    number_of,
+    parse,
+    refusing,
+    serialise,
+    tile_id,
+    word_of,
+)
+
+ReplyStatus = Literal["blob", "unchanged", "absent"]
+_STATUS: Final[dict[int, ReplyStatus]] = {1: "blob", 2: "unchanged", 3: "absent"}
+
+
+@dataclass(frozen=True, slots=True)
+class TileRequest:
+    """What a client holds already and which codecs it can read."""
+
+    cached_version: int = 0
+    """0 = none."""
+    cached_sha: bytes = b""
+    """32 bytes; empty = none."""
+    codecs: tuple[int, ...] = (CODEC_FLOAT32,)
+    """In order of preference, at least one."""
+
+    def __post_init__(self) -> None:
+        check_pair("cached", self.cached_version, self.cached_sha)
+        check_length("TileRequest", len(self.codecs), limits.MAX_CODECS, "codecs")
+        if not self.codecs or not all(0 <= codec < 2**32 for codec in self.codecs):
+            raise BadValue(f"TileRequest with codecs {self.codecs}: at least one, each in 0 .. 2^32 - 1")
+
+    def encode(self) -> bytes:
+        """Bytes of gnd.v1.TileRequest."""
+        message = tile_request_pb2.TileRequest(
+            major=MAJOR, cached_version=self.cached_version, cached_sha=self.cached_sha, codecs=self.codecs
+        )
+        return serialise(message, limits.MAX_TILE_REQUEST_BYTES)
+
+    @classmethod
+    def decode(cls, data: bytes) -> "TileRequest":
+        """The value in `data`; `SchemaError` when it is none."""
+        message = parse(tile_request_pb2.TileRequest, data, limits.MAX_TILE_REQUEST_BYTES)
+        check_major(message, "TileRequest")
+        return cls(message.cached_version, message.cached_sha, tuple(message.codecs))
+
+
+@dataclass(frozen=True, slots=True)
+class TileBlob:
+    """One version of one tile in one codec."""
+
+    tile: TileId
+    version: int
+    sha: bytes
+    """SHA-256 of the content, whatever the codec."""
+    codec_id: int
+    body: bytes
+
+    def __post_init__(self) -> None:
+        check_version("tile version", self.version, lowest=1)
+        check_sha("tile sha", self.sha)
+        check_version("codec id", self.codec_id, lowest=0)
+        check_length(f"tile {self.tile}", len(self.body), limits.MAX_TILE_BODY_BYTES, "bytes")
+
+    def encode(self) -> bytes:
+        """Bytes of gnd.v1.TileBlob."""
+        return serialise(_blob_message(self), limits.MAX_TILE_REPLY_BYTES)
+
+    @classmethod
+    def decode(cls, data: bytes) -> "TileBlob":
+        """The value in `data`; `SchemaError` when it is none. The body's hash is checked by `tile_of`."""
+        return _blob_value(parse(tile_blob_pb2.TileBlob, data, limits.MAX_TILE_REPLY_BYTES))
+
+
+def _blob_message(blob: TileBlob) -> tile_blob_pb2.TileBlob:
+    return tile_blob_pb2.TileBlob(
+        tile=blob.tile.morton, version=blob.version, sha=blob.sha, codec_id=blob.codec_id, body=blob.body
+    )
+
+
+def _blob_value(message: tile_blob_pb2.TileBlob) -> TileBlob:
+    return TileBlob(tile_id(message.tile), message.version, message.sha, message.codec_id, message.body)
+
+
+def blob_of(tile: Tile) -> TileBlob:
+    """The tile as float32 columns."""
+    return TileBlob(tile.tile_id, tile.version, tile.sha, CODEC_FLOAT32, encode_gaussians(tile.gaussians))
+
+
+def tile_of(blob: TileBlob) -> Tile:
+    """The tile in a blob.
+
+    Raises:
+        WrongHash: the content is not what the blob's sha says.
+        BadValue: a codec that this program does not know, or a body that is none of it.
+    """
+    with refusing(f"tile {blob.tile} version {blob.version}"):
+        tile = Tile(blob.tile, blob.version, codec_of(blob.codec_id).decode(blob.body))
+    if tile.sha != blob.sha:
+        raise WrongHash(
+            f"tile {blob.tile} version {blob.version}: content has sha {tile.sha.hex()[:16]}…, "
+            f"claimed is {blob.sha.hex()[:16]}…; fetch it again"
+        )
+    return tile
+
+
+@dataclass(frozen=True, slots=True)
+class TileReply:
+    """The tile server's answer."""
+
+    status: ReplyStatus
+    blob: TileBlob | None = None
+    """Set exactly when the status is "blob"."""
+
+    def __post_init__(self) -> None:
+        check_word(self.status, _STATUS, "TileReply status")
+        if (self.status == "blob") != (self.blob is not None):
+            raise BadValue(f"TileReply {self.status!r} {'without' if self.blob is None else 'with'} a blob")
+
+    def encode(self) -> bytes:
+        """Bytes of gnd.v1.TileReply."""
+        message = tile_reply_pb2.TileReply(major=MAJOR, blob=_blob_message(self.blob) if self.blob else None)
+        message.status = tile_reply_pb2.TileReply.Status.ValueType(number_of(self.status, _STATUS))
+        return serialise(message, limits.MAX_TILE_REPLY_BYTES)
+
+    @classmethod
+    def decode(cls, data: bytes) -> "TileReply":
+        """The value in `data`; `SchemaError` when it is none."""
+        message = parse(tile_reply_pb2.TileReply, data, limits.MAX_TILE_REPLY_BYTES)
+        check_major(message, "TileReply")
+        status = word_of(message.status, _STATUS, "TileReply status")
+        return cls(status, _blob_value(message.blob) if message.HasField("blob") else None)
+
+
+@dataclass(frozen=True, slots=True)
+class CatalogEntry:
+    """The newest version of one tile."""
+
+    tile: TileId
+    version: int
+    sha: bytes
+
+    def __post_init__(self) -> None:
+        check_version("tile version", self.version, lowest=1)
+        check_sha("tile sha", self.sha)
+
+
+@dataclass(frozen=True, slots=True)
+class Catalog:
+    """What a district holds: one entry a tile, ascending."""
+
+    entries: tuple[CatalogEntry, ...] = ()
+
+    def __post_init__(self) -> None:
+        check_length("Catalog", len(self.entries), limits.MAX_TILES_OF_DISTRICT, "entries")
+        for before, after in zip(self.entries, self.entries[1:], strict=False):
+            if before.tile >= after.tile:
+                raise BadValue(f"Catalog lists tile {after.tile} after {before.tile}: ascending, none twice")
+
+    def encode(self) -> bytes:
+        """Bytes of gnd.v1.Catalog."""
+        entries = (
+            catalog_entry_pb2.CatalogEntry(tile=entry.tile.morton, version=entry.version, sha=entry.sha)
+            for entry in self.entries
+        )
+        return serialise(catalog_pb2.Catalog(major=MAJOR, entries=entries), limits.MAX_CATALOG_BYTES)
+
+    @classmethod
+    def decode(cls, data: bytes) -> "Catalog":
+        """The value in `data`; `SchemaError` when it is none."""
+        message = parse(catalog_pb2.Catalog, data, limits.MAX_CATALOG_BYTES)
+        check_major(message, "Catalog")
+        check_length("Catalog", len(message.entries), limits.MAX_TILES_OF_DISTRICT, "entries")
+        return cls(tuple(CatalogEntry(tile_id(e.tile), e.version, e.sha) for e in message.entries))

@@ -1,0 +1,138 @@
+"""What a vehicle says about its traffic, position and health."""
+
+import math
+from dataclasses import dataclass
+from typing import Final, Literal
+
+from schemas import limits
+from schemas.errors import BadValue
+from schemas.generated import traffic_line_pb2, traffic_sample_pb2
+from schemas.wire import (
+    MAJOR,
+    VEHICLE_PATTERN,
+    WORD_PATTERN,
+    check_length,
+    check_major,
+    check_text,
+    check_unsigned,
+    check_word,
+    number_of,
+    parse,
+    serialise,
+    word_of,
+)
+
+Direction = Literal["up", "down"]
+_DIRECTION: Final[dict[int, Direction]] = {1: "up", 2: "down"}
+_MAX_LINES: Final = 64
+
+
+@dataclass(frozen=True, slots=True)
+class TrafficLine:
+    """Totals of one kind of message in one direction since the vehicle started."""
+
+    kind: str
+    """tile, delta, catalog, change, ack, update, control."""
+    direction: Direction
+    """"up" = from the vehicle to the cloud."""
+    messages: int
+    app_bytes: int
+    """Payload and key, before the transport adds its own."""
+
+    def __post_init__(self) -> None:
+        check_text("traffic kind", self.kind, WORD_PATTERN)
+        check_word(self.direction, _DIRECTION, "traffic direction")
+        check_unsigned("messages", self.messages, bits=63)
+        check_unsigned("app_bytes", self.app_bytes, bits=63)
+
+
+@dataclass(frozen=True, slots=True)
+class TrafficSample:
+    """A vehicle's ledger totals, position and health at one time of its drive."""
+
+    vehicle: str
+    t_ns: int
+    odometer_m: float
+    lines: tuple[TrafficLine, ...]
+    """No pair of kind and direction twice."""
+    wire_up_bytes: int
+    """Sent on the vehicle's own connection, transport included."""
+    wire_down_bytes: int
+    lat_rad: float
+    lon_rad: float
+    health: str
+    """good, degraded, lost, or another lower-case word."""
+    tiles: int
+    """Tiles downloaded so far."""
+    reports: int
+    """Reports acknowledged so far."""
+
+    def __post_init__(self) -> None:
+        check_text("vehicle", self.vehicle, VEHICLE_PATTERN)
+        check_text("health", self.health, WORD_PATTERN)
+        check_unsigned("t_ns", self.t_ns, bits=63)
+        check_unsigned("wire_up_bytes", self.wire_up_bytes, bits=63)
+        check_unsigned("wire_down_bytes", self.wire_down_bytes, bits=63)
+        check_unsigned("tiles", self.tiles, bits=32)
+        check_unsigned("reports", self.reports, bits=32)
+        self._check_position()
+        self._check_lines()
+
+    def _check_position(self) -> None:
+        if not (math.isfinite(self.odometer_m) and self.odometer_m >= 0):
+            raise BadValue(f"odometer {self.odometer_m} m is not a distance")
+        if not (abs(self.lat_rad) <= math.pi / 2 and abs(self.lon_rad) <= math.pi):
+            raise BadValue(f"position ({self.lat_rad}, {self.lon_rad}) rad is not on the Earth")
+
+    def _check_lines(self) -> None:
+        check_length("TrafficSample", len(self.lines), _MAX_LINES, "lines")
+        if len({(line.kind, line.direction) for line in self.lines}) < len(self.lines):
+            raise BadValue(f"TrafficSample of {self.vehicle} has two lines of one kind and direction")
+
+    def encode(self) -> bytes:
+        """Bytes of gnd.v1.TrafficSample."""
+        message = traffic_sample_pb2.TrafficSample(
+            major=MAJOR,
+            vehicle=self.vehicle,
+            t_ns=self.t_ns,
+            odometer_m=self.odometer_m,
+            lines=map(_line_message, self.lines),
+            wire_up_bytes=self.wire_up_bytes,
+            wire_down_bytes=self.wire_down_bytes,
+            lat_rad=self.lat_rad,
+            lon_rad=self.lon_rad,
+            health=self.health,
+            tiles=self.tiles,
+            reports=self.reports,
+        )
+        return serialise(message, limits.MAX_TRAFFIC_SAMPLE_BYTES)
+
+    @classmethod
+    def decode(cls, data: bytes) -> "TrafficSample":
+        """The value in `data`; `SchemaError` when it is none."""
+        m = parse(traffic_sample_pb2.TrafficSample, data, limits.MAX_TRAFFIC_SAMPLE_BYTES)
+        check_major(m, "TrafficSample")
+        return cls(
+            vehicle=m.vehicle,
+            t_ns=m.t_ns,
+            odometer_m=m.odometer_m,
+            lines=tuple(map(_line_value, m.lines)),
+            wire_up_bytes=m.wire_up_bytes,
+            wire_down_bytes=m.wire_down_bytes,
+            lat_rad=m.lat_rad,
+            lon_rad=m.lon_rad,
+            health=m.health,
+            tiles=m.tiles,
+            reports=m.reports,
+        )
+
+
+def _line_message(line: TrafficLine) -> traffic_line_pb2.TrafficLine:
+    message = traffic_line_pb2.TrafficLine(kind=line.kind, messages=line.messages, app_bytes=line.app_bytes)
+    message.direction = traffic_line_pb2.TrafficLine.Direction.ValueType(number_of(line.direction, _DIRECTION))
+    return message
+
+
+def _line_value(message: traffic_line_pb2.TrafficLine) -> TrafficLine:
+    direction = word_of(message.direction, _DIRECTION, "traffic direction")
+    return TrafficLine(message.kind, direction, message.messages, message.app_bytes)
