@@ -1,0 +1,231 @@
+"""The bus as the rest of the project sees it: the only door to zenoh."""
+
+import threading
+from typing import Self, TypeVar
+
+from fleet_bus import requesting, subscribing
+from fleet_bus.config import BusConfig
+from fleet_bus.connection import Connection
+from fleet_bus.ledger import Ledger
+from fleet_bus.part import Part
+from fleet_bus.requesting import RetryPolicy
+from fleet_bus.serving import Handler, Serving
+from fleet_bus.subscribing import AliveToken, AliveWatch, OnAlive, OnMessage, RecallingPublisher, Subscription, TileOf
+from fleet_bus.wire import WireBytes
+from gnd_map.tile_id import TileId
+
+_DEFAULT_RETRY = RetryPolicy()
+
+
+_P = TypeVar("_P", bound=Part)
+
+
+def open_bus(config: BusConfig | None = None, ledger: Ledger | None = None, name: str = "") -> "Bus":
+    """Joins the bus; use it in a `with` block.
+
+    Args:
+        config: settings; by default a client of a router on this machine.
+        ledger: account in which every message of this session is booked.
+        name: for logs and errors.
+
+    Raises:
+        NoRouter: nothing answers within `open_timeout_s`.
+        BusConfigError: a rule that protects data is broken.
+        PortInUse: an endpoint to listen at is taken.
+    """
+    return Bus(Connection.open(config or BusConfig(), ledger, name))
+
+
+class Bus:
+    """One session. Methods may be called from any thread; every waiting call ends when the bus is closed."""
+
+    def __init__(self, connection: Connection) -> None:
+        self._connection = connection
+        self._parts: list[Part] = []
+        self._lock = threading.Lock()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_exception: object) -> None:
+        self.close()
+
+    @property
+    def config(self) -> BusConfig:
+        """The settings of this session."""
+        return self._connection.config
+
+    @property
+    def ledger(self) -> Ledger | None:
+        """The account of this session."""
+        return self._connection.ledger
+
+    def request(
+        self,
+        key: str,
+        payload: bytes,
+        *,
+        kind: str,
+        tile: TileId | str | None = None,
+        retry: RetryPolicy = _DEFAULT_RETRY,
+        timeout_s: float = 30.0,
+    ) -> bytes:
+        """Asks until answered. The request may arrive more than once: it must be idempotent.
+
+        Args:
+            key: key expression of `schemas.keys`.
+            payload: encoded message.
+            kind: ledger kind.
+            tile: the tile it is about, for the ledger.
+            retry: pauses between the attempts.
+            timeout_s: deadline of the whole, s.
+
+        Returns:
+            Payload of the first answer that is ok.
+
+        Raises:
+            RequestFailed: no answer before the deadline, with the number of attempts and the last cause.
+            RequestRefused: the handler raised `Refused`.
+            MessageTooLarge: payload over the limit.
+            BusClosed: closed meanwhile.
+        """
+        return requesting.request(
+            self._connection, key, payload, kind=kind, tile=tile, retry=retry, timeout_s=timeout_s
+        )
+
+    def request_many(
+        self,
+        keyexpr: str,
+        payload: bytes,
+        *,
+        kind: str,
+        retry: RetryPolicy = _DEFAULT_RETRY,
+        timeout_s: float = 60.0,
+    ) -> list[tuple[str, bytes]]:
+        """Asks a region until all handlers that answer have come to their end.
+
+        Returns:
+            (key, payload) of every answer; empty when the handlers have nothing there.
+
+        Raises:
+            RequestFailed, RequestRefused, MessageTooLarge, BusClosed: as `request`.
+        """
+        return requesting.request_many(self._connection, keyexpr, payload, kind=kind, retry=retry, timeout_s=timeout_s)
+
+    def serve(
+        self, keyexpr: str, handler: Handler, *, complete: bool = False, workers: int = 4, kind: str = "control"
+    ) -> Serving:
+        """Answers requests in threads of our own, so that a handler may itself ask, wait or compute.
+
+        Args:
+            keyexpr: keys that are served.
+            handler: gives bytes (one answer on the asked key) or (key, payload) pairs (answers to a region). It may
+                raise `NotMine` (no reply), `Refused` (never ask again); any other exception makes the asker try again.
+            complete: whether this handler alone answers for all these keys; the router then asks no other.
+            workers: number of threads.
+            kind: ledger kind of requests and answers.
+        """
+        self._connection.check_open()
+        return self._keep(Serving(self._connection, keyexpr, handler, complete=complete, workers=workers, kind=kind))
+
+    def publish(
+        self, key: str, payload: bytes, *, kind: str, tile: TileId | str | None = None, wait_s: float | None = None
+    ) -> None:
+        """Publishes a notice that its receivers can also read again: delivery is not confirmed.
+
+        A full queue blocks instead of dropping. A lost router is waited for.
+
+        Args:
+            key: key expression of `schemas.keys`.
+            payload: encoded message.
+            kind: ledger kind.
+            tile: the tile it is about, for the ledger.
+            wait_s: how long to wait for a router, s; by default `BusConfig.publish_wait_s`.
+
+        Raises:
+            NoRouter: there was none, so nothing was published.
+            MessageTooLarge, BusClosed.
+        """
+        wait_s = self.config.publish_wait_s if wait_s is None else wait_s
+        subscribing.publish(self._connection, key, payload, kind=kind, tile=tile, wait_s=wait_s)
+
+    def advanced_publisher(self, key: str, *, kind: str = "update", remember: int = 1) -> RecallingPublisher:
+        """A publisher of one key that repeats its last `remember` notices to late or interrupted subscribers."""
+        self._connection.check_open()
+        return self._keep(RecallingPublisher(self._connection, key, kind=kind, remember=remember))
+
+    def subscribe(
+        self,
+        keyexpr: str,
+        callback: OnMessage,
+        *,
+        history: bool = False,
+        kind: str = "update",
+        tile_of: TileOf | None = None,
+    ) -> Subscription:
+        """Calls back with (key, payload) for every notice, in order, in one thread of our own.
+
+        Args:
+            keyexpr: keys of interest; whole chunks as wildcards.
+            callback: what it raises is logged and the next notice delivered.
+            history: also get what advanced publishers remember, and what was missed during an interruption.
+            kind: ledger kind.
+            tile_of: tile of a key, for the ledger.
+        """
+        self._connection.check_open()
+        return self._keep(
+            Subscription(self._connection, keyexpr, callback, history=history, kind=kind, tile_of=tile_of)
+        )
+
+    def declare_alive(self, key: str) -> AliveToken:
+        """Shows that this process lives, until closed, killed or cut off for longer than the lease."""
+        self._connection.check_open()
+        return self._keep(AliveToken(self._connection, key))
+
+    def watch_alive(self, keyexpr: str, callback: OnAlive) -> AliveWatch:
+        """Calls back with (key, True) for each token present or new and (key, False) for each that goes.
+
+        All go when the own connection is lost, and come again with it.
+        """
+        self._connection.check_open()
+        return self._keep(AliveWatch(self._connection, keyexpr, callback))
+
+    def wire(self) -> WireBytes:
+        """Bytes on the wire of this session so far, over all its connections; also noted in the ledger."""
+        wire = self._connection.meter.read()
+        if self.ledger is not None:
+            self.ledger.record_wire(wire)
+        return wire
+
+    def is_connected(self) -> bool:
+        """Whether a router is at the other end right now; a lost one is looked for without being asked."""
+        return self._connection.is_connected()
+
+    def wait_connected(self, timeout_s: float) -> bool:
+        """Waits for a router; False when there is none in time. Raises `BusClosed` when closed meanwhile."""
+        return self._connection.wait_connected(timeout_s)
+
+    @property
+    def is_closed(self) -> bool:
+        """Whether `close` was called."""
+        return self._connection.closed.is_set()
+
+    def close(self) -> None:
+        """Ends handlers, subscriptions, waiting calls and the session, then writes the ledger. May be called again."""
+        with self._lock:
+            parts, self._parts = self._parts[::-1], []
+            if self._connection.closed.is_set():
+                return
+            self._connection.closed.set()
+        for part in parts:
+            part.close()
+        self._connection.close()
+        if self.ledger is not None:
+            self.wire()
+            self.ledger.flush()
+
+    def _keep(self, part: _P) -> _P:
+        with self._lock:
+            self._parts = [other for other in self._parts if not other.is_closed]
+            self._parts.append(part)
+        return part

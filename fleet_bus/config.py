@@ -1,0 +1,134 @@
+"""Settings of a bus session, checked, and their translation for zenoh."""
+
+import json
+from dataclasses import dataclass
+from typing import Any, Final, Literal
+
+import zenoh
+
+from fleet_bus.errors import BusConfigError
+from fleet_bus.links import LinkProfile, load_link
+
+DEFAULT_ENDPOINT: Final = "tcp/127.0.0.1:7447"
+MAX_MESSAGE_BYTES: Final = 16 * 1024 * 1024
+
+
+@dataclass(frozen=True, slots=True)
+class BusConfig:
+    """How a process joins the bus.
+
+    Attributes:
+        mode: "client" for everything but the router itself.
+        connect: endpoints of routers, tried in order; a client fails over to the next.
+        listen: endpoints to open (routers only).
+        link: profile of the vehicle's link, by name, file or value; "none" paces nothing.
+        lease_ms: how long a silent session stays alive, ms; 0 takes the link's own.
+        open_timeout_s: how long `open_bus` tries to reach a router, s.
+        publish_wait_s: how long `Bus.publish` waits for a lost router to come back, s.
+        max_message_bytes: limit for every message, both directions, bytes.
+        max_sessions: how many sessions a router accepts.
+        queue_limit: how many received messages may wait for a handler, before some are refused or dropped.
+    """
+
+    mode: Literal["client", "router"] = "client"
+    connect: tuple[str, ...] = (DEFAULT_ENDPOINT,)
+    listen: tuple[str, ...] = ()
+    link: str | LinkProfile = "none"
+    lease_ms: int = 0
+    open_timeout_s: float = 10.0
+    publish_wait_s: float = 10.0
+    max_message_bytes: int = MAX_MESSAGE_BYTES
+    max_sessions: int = 10_000
+    queue_limit: int = 4096
+
+    def __post_init__(self) -> None:
+        if self.mode not in ("client", "router"):
+            raise BusConfigError(f"mode must be client or router, got {self.mode!r}")
+        if self.mode == "client" and not self.connect:
+            raise BusConfigError("a client needs at least one endpoint of a router in `connect`")
+        if self.mode == "client" and self.listen:
+            raise BusConfigError(f"a client does not listen, got {', '.join(self.listen)}")
+        for endpoint in (*self.connect, *self.listen):
+            check_endpoint(endpoint)
+        if self.lease_ms != 0 and self.lease_ms < 100:
+            raise BusConfigError(f"lease_ms must be 100 or more (or 0: the link's own), got {self.lease_ms}")
+        if min(self.max_message_bytes, self.max_sessions, self.queue_limit) < 1:
+            raise BusConfigError("max_message_bytes, max_sessions and queue_limit must be positive")
+
+    @property
+    def link_profile(self) -> LinkProfile:
+        """The profile that `link` names."""
+        return load_link(self.link)
+
+
+def check_endpoint(endpoint: str) -> None:
+    """Refuses what is not "protocol/host:port".
+
+    Raises:
+        BusConfigError: with an example of what is meant.
+    """
+    protocol, slash, address = endpoint.partition("/")
+    host, _, port = address.partition("#")[0].rpartition(":")
+    if not (slash and protocol and host and port.isdigit() and int(port) < 65_536):
+        raise BusConfigError(f"endpoint {endpoint!r} is not like {DEFAULT_ENDPOINT}")
+
+
+def zenoh_config(config: BusConfig) -> zenoh.Config:
+    """The zenoh configuration with every rule of DESIGN.md section 12.
+
+    Raises:
+        BusConfigError: zenoh did not take a setting.
+        LinkError: unknown link profile.
+    """
+    result = zenoh.Config()
+    for key, value in _settings(config, config.link_profile).items():
+        try:
+            result.insert_json5(key, json.dumps(value))
+        except zenoh.ZError as error:
+            raise BusConfigError(f"zenoh refuses {key} = {value!r}: {error}") from error
+    assert_rules(result, config)
+    return result
+
+
+def assert_rules(settings: zenoh.Config, config: BusConfig) -> None:
+    """Reads back the rules whose breach loses data or hides traffic without any error.
+
+    Raises:
+        BusConfigError: naming the rule.
+    """
+    for key, value in _settings(config, config.link_profile).items():
+        got = json.loads(settings.get_json(key))
+        if not _same(value, got):
+            raise BusConfigError(f"zenoh setting {key} must be {value!r}, but is {got!r}")
+
+
+def _same(want: Any, got: Any) -> bool:
+    if isinstance(want, dict) and isinstance(got, dict):
+        return all(_same(value, got.get(key)) for key, value in want.items())
+    return bool(want == got)
+
+
+def _settings(config: BusConfig, link: LinkProfile) -> dict[str, Any]:
+    settings: dict[str, Any] = {
+        "mode": config.mode,
+        "connect/endpoints": list(config.connect),
+        # Endpoints come back by themselves after a lost connection.
+        "connect/retry": {"period_init_ms": 50, "period_max_ms": 1000, "period_increase_factor": 1.5},
+        "listen/endpoints": list(config.listen),
+        "scouting/multicast/enabled": False,
+        "scouting/gossip/enabled": False,
+        # On by default; would carry messages past the socket and past the traffic account.
+        "transport/shared_memory/enabled": False,
+        "transport/unicast/max_sessions": config.max_sessions,
+        "transport/unicast/accept_pending": 1000,
+        # Has no fragmentation.
+        "transport/unicast/lowlatency": False,
+        "transport/link/tx/lease": config.lease_ms or link.lease_ms,
+        "transport/link/tx/batch_size": link.batch_bytes,
+        # A full queue closes the session after this long, and later puts would vanish: longer than any slow link needs.
+        "transport/link/tx/queue/congestion_control/block/wait_before_close": 60_000_000,
+        "transport/link/rx/max_message_size": config.max_message_bytes,
+    }
+    if link.send_buffer_bytes:
+        settings["transport/link/tcp/so_sndbuf"] = link.send_buffer_bytes
+    return settings

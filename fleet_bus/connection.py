@@ -1,0 +1,133 @@
+"""The open session behind a bus: state that all its parts share."""
+
+import logging
+import os
+import threading
+import time
+from typing import Final, Self
+
+import zenoh
+
+from fleet_bus.config import BusConfig, zenoh_config
+from fleet_bus.errors import BusClosed, BusConfigError, MessageTooLarge, NoRouter, PortInUse
+from fleet_bus.ledger import Ledger
+from fleet_bus.pacer import Pacer
+from fleet_bus.wire import WireMeter
+from gnd_map.tile_id import TileId
+
+_LOG = logging.getLogger(__name__)
+_POLL_S: Final = 0.02
+
+
+class Connection:
+    """A zenoh session with its pacer, its ledger and its wire meter.
+
+    Everything sent or received passes `outgoing` or `incoming`, which check, pace and account for it.
+    """
+
+    def __init__(self, session: zenoh.Session, config: BusConfig, ledger: Ledger | None, name: str) -> None:
+        self.session, self.config, self.ledger, self.name = session, config, ledger, name
+        self.closed = threading.Event()
+        self.meter = WireMeter()
+        self._pacer = Pacer(config.link_profile, self.closed)
+        self._pid = os.getpid()
+        self._links = session.info.declare_link_events_listener(self._on_link, history=True)
+
+    @classmethod
+    def open(cls, config: BusConfig, ledger: Ledger | None, name: str) -> Self:
+        """Opens a session, trying again until `open_timeout_s` has passed.
+
+        Raises:
+            NoRouter: nothing answers there.
+            PortInUse: an endpoint to listen at is taken.
+            BusConfigError: zenoh refuses the configuration.
+        """
+        deadline_s = time.monotonic() + config.open_timeout_s
+        wait_s = 0.05
+        while True:
+            try:
+                return cls(zenoh.open(zenoh_config(config)), config, ledger, name)
+            except zenoh.ZError as error:
+                _explain(error, config, out_of_time=time.monotonic() + wait_s > deadline_s)
+            time.sleep(wait_s)
+            wait_s = min(1.0, wait_s * 1.5)
+
+    def check_open(self) -> None:
+        """Raises `BusClosed` when the bus was closed, or belongs to the parent of a fork."""
+        if self.closed.is_set():
+            raise BusClosed(f"bus {self.name or 'session'} is closed")
+        if os.getpid() != self._pid:
+            raise BusClosed(f"bus {self.name or 'session'} was opened in process {self._pid}: open one after the fork")
+
+    def outgoing(self, payload: bytes, kind: str, tile: TileId | str | None) -> None:
+        """Checks, paces and accounts for a message that is about to be sent.
+
+        Raises:
+            MessageTooLarge: the receiver would drop it.
+            BusClosed: closed before or while waiting.
+        """
+        self.check_open()
+        if len(payload) > self.config.max_message_bytes:
+            limit = self.config.max_message_bytes
+            raise MessageTooLarge(f"a {kind} message has {len(payload)} bytes, more than max_message_bytes {limit}")
+        self._pacer.wait("up", len(payload))
+        if self.ledger is not None:
+            self.ledger.record("up", kind, len(payload), tile)
+
+    def incoming(self, payload: bytes, kind: str, tile: TileId | str | None) -> None:
+        """Paces and accounts for a message that has been received.
+
+        Raises:
+            BusClosed: closed before or while waiting.
+        """
+        self.check_open()
+        self._pacer.wait("down", len(payload))
+        if self.ledger is not None:
+            self.ledger.record("down", kind, len(payload), tile)
+
+    def is_connected(self) -> bool:
+        """Whether a router is at the other end right now."""
+        return not self.session.is_closed() and bool(self.session.info.routers_zid())
+
+    def wait_connected(self, timeout_s: float) -> bool:
+        """Waits for a router to be there; False when the time is over.
+
+        Raises:
+            BusClosed: closed while waiting.
+        """
+        deadline_s = time.monotonic() + timeout_s
+        while not self.is_connected():
+            if time.monotonic() >= deadline_s:
+                return False
+            if self.closed.wait(_POLL_S):
+                raise BusClosed(f"bus {self.name or 'session'} was closed while it waited for a router")
+        return True
+
+    def close(self) -> None:
+        """Ends the session and every waiting call; the wire meter keeps its total."""
+        self.closed.set()
+        self.session.close()  # type: ignore[no-untyped-call]  # zenoh's stub
+        self.meter.close()
+
+    def _on_link(self, event: zenoh.LinkEvent) -> None:
+        link = event.link
+        if event.kind == zenoh.SampleKind.PUT:
+            self.meter.attach(link.src, link.dst)
+        else:
+            self.meter.detach(link.src, link.dst)
+        _LOG.debug("%s: link %s -> %s %s", self.name, link.src, link.dst, event.kind)
+
+
+def _explain(error: zenoh.ZError, config: BusConfig, *, out_of_time: bool) -> None:
+    """Raises what the error means for the user; returns when another try may help."""
+    text = str(error)
+    if "Address already in use" in text:
+        where = ", ".join(config.listen)
+        raise PortInUse(
+            f"cannot listen at {where}: port in use; stop that process or choose another with --listen"
+        ) from error
+    if "nable to connect" not in text:
+        raise BusConfigError(f"zenoh cannot open a session: {text}") from error
+    if out_of_time:
+        where = ", ".join(config.connect)
+        raise NoRouter(f"no router at {where} for {config.open_timeout_s:g} s: start one with `gnd router`") from error

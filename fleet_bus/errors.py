@@ -1,0 +1,74 @@
+"""What can go wrong on the bus.
+
+BusError
+├── BusConfigError      a setting that would lose data, or makes no sense
+├── LinkError           a link profile that is unknown or malformed
+├── NoRouter            nothing answers at the endpoints
+├── PortInUse           the router's endpoint is taken
+├── BusClosed           the bus was closed while a call was waiting
+├── MessageTooLarge     over the limit that every session enforces
+├── RequestFailed       no answer before the deadline
+│   └── RequestRefused  the other side answered: never
+├── NotMine, Refused    raised by handlers: what they say to the asker
+└── LedgerError         a ledger file or run folder that cannot be read
+"""
+
+from gnd_map.errors import GndError
+
+
+class BusError(GndError):
+    """Base of every error of this package."""
+
+
+class BusConfigError(BusError):
+    """A bus setting is unusable or breaks a rule that protects data."""
+
+
+class LinkError(BusError):
+    """A link profile is unknown or malformed."""
+
+
+class NoRouter(BusError):
+    """No router can be reached at the configured endpoints."""
+
+
+class PortInUse(BusError):
+    """Another process listens at the endpoint that a router was told to open."""
+
+
+class BusClosed(BusError):
+    """The bus was closed before or during the call."""
+
+
+class MessageTooLarge(BusError):
+    """A payload exceeds `BusConfig.max_message_bytes`; the receiving session would drop it in silence."""
+
+
+class LedgerError(BusError):
+    """A ledger or a run folder cannot be read."""
+
+
+class RequestFailed(BusError):
+    """A request got no usable answer before its deadline.
+
+    Attributes:
+        key: key expression that was asked.
+        attempts: how often the request was sent.
+        cause: what happened at the last attempt.
+    """
+
+    def __init__(self, key: str, attempts: int, cause: str) -> None:
+        super().__init__(f"request to {key} failed after {attempts} attempts, last: {cause}")
+        self.key, self.attempts, self.cause = key, attempts, cause
+
+
+class RequestRefused(RequestFailed):
+    """The handler refused the request for good, so that retrying is useless."""
+
+
+class NotMine(BusError):
+    """Raised by a handler that leaves the request to others: it does not reply at all."""
+
+
+class Refused(BusError):
+    """Raised by a handler to say that the request can never succeed; the asker gets `RequestRefused` at once."""

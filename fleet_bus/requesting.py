@@ -1,0 +1,192 @@
+"""Requests that arrive: a query with payload, sent again until it is answered.
+
+Only `reply.ok` is an answer. No handler, a denied key, a handler that raised or was killed, a router that went away:
+zenoh reports all of them as an empty list of replies, so each of them is tried again until the deadline. Requests must
+therefore be idempotent.
+"""
+
+import itertools
+import queue
+import random
+import time
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from typing import Final
+
+import zenoh
+
+from fleet_bus.connection import Connection
+from fleet_bus.errors import BusClosed, BusConfigError, RequestFailed, RequestRefused
+from gnd_map.tile_id import TileId
+
+END_OF_ANSWERS: Final = "gnd/end"
+"""Encoding of the closing reply of a handler that gives many answers; its payload is their number in decimal."""
+REFUSED: Final = "gnd/refused"
+"""Encoding of a reply that says: do not ask again."""
+FAILED: Final = "gnd/failed"
+"""Encoding of a reply that says: the handler failed, ask again."""
+
+_REPLY_KIND: Final = {"change": "ack"}
+_POLL_S: Final = 0.2
+
+
+@dataclass(frozen=True, slots=True)
+class RetryPolicy:
+    """When a request is sent again.
+
+    Attributes:
+        first_wait_s: pause before the second attempt, s.
+        factor: by which the pause grows.
+        longest_wait_s: bound of the pause, s; up to half is taken off at random, lest a fleet knock in step.
+        attempt_timeout_s: how long one attempt may take, s.
+    """
+
+    first_wait_s: float = 0.05
+    factor: float = 2.0
+    longest_wait_s: float = 2.0
+    attempt_timeout_s: float = 10.0
+
+    def __post_init__(self) -> None:
+        if min(self.first_wait_s, self.longest_wait_s, self.attempt_timeout_s) <= 0 or self.factor < 1:
+            raise BusConfigError(f"times must be positive and factor at least 1: {self}")
+
+    def wait_s(self, attempt: int) -> float:
+        """Pause after that attempt (counted from 1), s."""
+        longest_s = min(self.longest_wait_s, self.first_wait_s * self.factor ** min(attempt - 1, 60))
+        return longest_s * random.uniform(0.5, 1.0)
+
+
+@dataclass(slots=True)
+class Answers:
+    """What one attempt brought back."""
+
+    ok: list[tuple[str, bytes]] = field(default_factory=list)
+    errors: list[str] = field(default_factory=list)
+    refusal: str | None = None
+    announced: int | None = None
+
+    def add_error(self, error: zenoh.ReplyError) -> None:
+        """Sorts a reply that is not an answer."""
+        encoding, text = str(error.encoding), error.payload.to_bytes().decode(errors="replace")
+        if encoding == END_OF_ANSWERS:
+            self.announced = (self.announced or 0) + int(text)
+        elif encoding == REFUSED:
+            self.refusal = text
+        else:
+            self.errors.append(text)
+
+    @property
+    def is_whole(self) -> bool:
+        """Whether every handler that began to answer also came to its end."""
+        return self.announced is not None and self.announced == len(self.ok)
+
+    def cause(self) -> str:
+        """Why this was no answer, in words."""
+        if self.errors:
+            return "; ".join(self.errors)
+        if self.ok:
+            return f"only {len(self.ok)} of {self.announced or 'an unknown number of'} answers came"
+        return "empty reply: nobody serves this key now, or the handler died"
+
+
+def request(
+    connection: Connection,
+    key: str,
+    payload: bytes,
+    *,
+    kind: str,
+    tile: TileId | str | None,
+    retry: RetryPolicy,
+    timeout_s: float,
+) -> bytes:
+    """The first answer to an idempotent request; see `Bus.request`."""
+    asking = _Asking(connection, key, payload, kind, tile)
+    answers = asking.until(lambda got: bool(got.ok), retry, timeout_s, first_only=True)
+    return answers.ok[0][1]
+
+
+def request_many(
+    connection: Connection, key: str, payload: bytes, *, kind: str, retry: RetryPolicy, timeout_s: float
+) -> list[tuple[str, bytes]]:
+    """All answers to an idempotent request; see `Bus.request_many`."""
+    asking = _Asking(connection, key, payload, kind, None)
+    return asking.until(lambda got: got.is_whole, retry, timeout_s, first_only=False).ok
+
+
+@dataclass(frozen=True, slots=True)
+class _Asking:
+    connection: Connection
+    key: str
+    payload: bytes
+    kind: str
+    tile: TileId | str | None
+
+    def until(
+        self, good: Callable[[Answers], bool], retry: RetryPolicy, timeout_s: float, *, first_only: bool
+    ) -> Answers:
+        """Sends the request again and again until the answers are good.
+
+        Raises:
+            RequestFailed, RequestRefused, BusClosed.
+        """
+        deadline_s = time.monotonic() + timeout_s
+        for attempt in itertools.count(1):
+            left_s = max(deadline_s - time.monotonic(), 0.001)
+            answers = self._once(min(left_s, retry.attempt_timeout_s), first_only=first_only)
+            if good(answers):
+                return answers
+            if answers.refusal is not None:
+                raise RequestRefused(self.key, attempt, f"refused: {answers.refusal}")
+            wait_s = retry.wait_s(attempt)
+            if time.monotonic() + wait_s >= deadline_s:
+                raise RequestFailed(self.key, attempt, f"{self._cause(answers)} (gave up after {timeout_s:g} s)")
+            if self.connection.closed.wait(wait_s):
+                raise BusClosed(f"the bus was closed while asking {self.key} for the {attempt + 1}th time")
+        raise AssertionError("unreachable")
+
+    def _once(self, timeout_s: float, *, first_only: bool) -> Answers:
+        connection = self.connection
+        connection.outgoing(self.payload, self.kind, self.tile)
+        inbox: queue.SimpleQueue[zenoh.Reply | None] = queue.SimpleQueue()
+        cancel = zenoh.CancellationToken()
+        connection.session.get(
+            self.key,
+            zenoh.handlers.Callback(inbox.put, lambda: inbox.put(None)),
+            payload=self.payload,
+            timeout=timeout_s,
+            # Answers pass at once and one by one; the default would hold all back until the last handler has finished.
+            consolidation=zenoh.ConsolidationMode.NONE,
+            congestion_control=zenoh.CongestionControl.BLOCK,
+            cancellation_token=cancel,
+        )
+        try:
+            return self._collect(inbox, first_only=first_only)
+        finally:
+            cancel.cancel()  # type: ignore[no-untyped-call]  # zenoh's stub
+
+    def _collect(self, inbox: "queue.SimpleQueue[zenoh.Reply | None]", *, first_only: bool) -> Answers:
+        answers = Answers()
+        while (reply := self._receive(inbox)) is not None:
+            if reply.ok is None:
+                if reply.err is not None:
+                    answers.add_error(reply.err)
+                continue
+            payload = reply.ok.payload.to_bytes()
+            self.connection.incoming(payload, _REPLY_KIND.get(self.kind, self.kind), self.tile)
+            answers.ok.append((str(reply.ok.key_expr), payload))
+            if first_only:
+                break
+        return answers
+
+    def _receive(self, inbox: "queue.SimpleQueue[zenoh.Reply | None]") -> zenoh.Reply | None:
+        while True:
+            self.connection.check_open()
+            try:
+                return inbox.get(timeout=_POLL_S)
+            except queue.Empty:
+                continue
+
+    def _cause(self, answers: Answers) -> str:
+        if not self.connection.is_connected():
+            return f"no router at {', '.join(self.connection.config.connect)}"
+        return answers.cause()

@@ -1,0 +1,148 @@
+"""Notices and signs of life, delivered in one thread of our own each."""
+
+import logging
+from collections.abc import Callable
+from typing import Any
+
+import zenoh
+from zenoh import ext
+
+from fleet_bus.connection import Connection
+from fleet_bus.errors import BusClosed, NoRouter
+from fleet_bus.part import Part
+from fleet_bus.workers import Workers
+from gnd_map.tile_id import TileId
+
+_LOG = logging.getLogger(__name__)
+OnMessage = Callable[[str, bytes], None]
+OnAlive = Callable[[str, bool], None]
+TileOf = Callable[[str], TileId | None]
+
+
+class Subscription(Part):
+    """A declared subscription; `close` ends it and throws away what waits for the callback.
+
+    Attributes:
+        dropped: how many notices were thrown away because the callback was too slow (they can be read again).
+    """
+
+    def __init__(
+        self,
+        connection: Connection,
+        keyexpr: str,
+        callback: OnMessage,
+        *,
+        history: bool,
+        kind: str,
+        tile_of: TileOf | None,
+    ) -> None:
+        super().__init__()
+        self.dropped = 0
+        self._connection, self._callback, self._kind = connection, callback, kind
+        self._tile_of = tile_of if tile_of is not None else lambda _key: None
+        limit = connection.config.queue_limit
+        self._workers: Workers[zenoh.Sample] = Workers(f"subscribe {keyexpr}", self._deliver, 1, limit)
+        self._subscriber = _declare(connection.session, keyexpr, self._accept, history=history)
+
+    def _end(self) -> None:
+        self._subscriber.undeclare()
+        self._workers.close()
+
+    def _accept(self, sample: zenoh.Sample) -> None:
+        if not self._workers.offer_newest(sample):
+            self.dropped += 1
+            if self.dropped & (self.dropped - 1) == 0:  # 1, 2, 4, 8 …: one line a doubling
+                _LOG.warning("slow subscriber: %d notices dropped, the last of %s", self.dropped, sample.key_expr)
+
+    def _deliver(self, sample: zenoh.Sample) -> None:
+        key, payload = str(sample.key_expr), sample.payload.to_bytes()
+        try:
+            self._connection.incoming(payload, self._kind, self._tile_of(key))
+        except BusClosed:
+            return
+        self._callback(key, payload)
+
+
+class AliveWatch(Part):
+    """A declared watch for signs of life; `close` ends it."""
+
+    def __init__(self, connection: Connection, keyexpr: str, callback: OnAlive) -> None:
+        super().__init__()
+        self._callback = callback
+        self._workers: Workers[zenoh.Sample] = Workers(f"alive {keyexpr}", self._deliver, 1, 1 << 20)
+        self._subscriber: Any = connection.session.liveliness().declare_subscriber(
+            keyexpr, self._workers.offer, history=True
+        )
+
+    def _end(self) -> None:
+        self._subscriber.undeclare()
+        self._workers.close()
+
+    def _deliver(self, sample: zenoh.Sample) -> None:
+        self._callback(str(sample.key_expr), sample.kind == zenoh.SampleKind.PUT)
+
+
+class AliveToken(Part):
+    """A sign of life of this session; `close` takes it back, which watchers see."""
+
+    def __init__(self, connection: Connection, key: str) -> None:
+        super().__init__()
+        self._token: Any = connection.session.liveliness().declare_token(key)
+
+    def _end(self) -> None:
+        self._token.undeclare()
+
+
+class RecallingPublisher(Part):
+    """Publishes on one key and repeats its last notices to those who come late or missed some.
+
+    The memory dies with the publisher: subscribers still compare the catalog.
+    """
+
+    def __init__(self, connection: Connection, key: str, *, kind: str, remember: int) -> None:
+        super().__init__()
+        self._connection, self._key, self._kind = connection, key, kind
+        self._publisher: Any = ext.declare_advanced_publisher(
+            connection.session,
+            key,
+            congestion_control=zenoh.CongestionControl.BLOCK,
+            cache=ext.CacheConfig(max_samples=remember),
+            sample_miss_detection=ext.MissDetectionConfig(heartbeat=None, sporadic_heartbeat=0.5),
+            publisher_detection=True,
+        )
+
+    def put(self, payload: bytes, *, tile: TileId | str | None = None) -> None:
+        """Publishes; without a router the notice is remembered and fetched by subscribers after the reconnection.
+
+        Raises:
+            MessageTooLarge, BusClosed.
+        """
+        self._connection.outgoing(payload, self._kind, tile)
+        self._publisher.put(payload)
+
+    def _end(self) -> None:
+        self._publisher.undeclare()
+
+
+def publish(
+    connection: Connection, key: str, payload: bytes, *, kind: str, tile: TileId | str | None, wait_s: float
+) -> None:
+    """Puts a notice; see `Bus.publish`."""
+    connection.outgoing(payload, kind, tile)
+    # A put without a router is silent, so look first.
+    if not connection.wait_connected(wait_s):
+        where = ", ".join(connection.config.connect)
+        raise NoRouter(f"no router at {where} for {wait_s:g} s: {len(payload)} bytes for {key} were not published")
+    connection.session.put(key, payload, congestion_control=zenoh.CongestionControl.BLOCK)
+
+
+def _declare(session: zenoh.Session, keyexpr: str, accept: Callable[[zenoh.Sample], Any], *, history: bool) -> Any:
+    if not history:
+        return session.declare_subscriber(keyexpr, accept)
+    return ext.declare_advanced_subscriber(
+        session,
+        keyexpr,
+        accept,
+        history=ext.HistoryConfig(detect_late_publishers=True),
+        recovery=ext.RecoveryConfig(periodic_queries=None, heartbeat=True),
+    )

@@ -1,0 +1,123 @@
+"""Bytes on the wire of a session's own connections, from the kernel's TCP_INFO.
+
+The zenoh wheel keeps no transport statistics, but Linux counts for every TCP socket. The counters die with the socket,
+so a duplicate of the descriptor is kept until the link is reported as gone, and its last reading is added to the past.
+"""
+
+import os
+import socket
+import struct
+import threading
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Final
+
+_TCP_INFO_BYTES: Final = 232
+_TIMESTAMPS: Final = 1  # TCPI_OPT_TIMESTAMPS of linux/tcp.h
+_OPTIONS_AT, _BYTES_RECEIVED_AT, _SEGMENTS_AT, _BYTES_SENT_AT = 5, 128, 136, 200  # offsets in struct tcp_info
+_FD_FOLDER: Final = Path("/proc/self/fd")
+
+
+@dataclass(frozen=True, slots=True)
+class WireBytes:
+    """IP bytes of all connections of a session: TCP payload with retransmissions, plus the headers of each packet.
+
+    Attributes:
+        up: sent, bytes.
+        down: received, bytes.
+        connections: how many connections these are.
+    """
+
+    up: int = 0
+    down: int = 0
+    connections: int = 0
+
+    def __add__(self, other: "WireBytes") -> "WireBytes":
+        return WireBytes(self.up + other.up, self.down + other.down, self.connections + other.connections)
+
+
+@dataclass(slots=True)
+class WireMeter:
+    """Follows the connections of one session. Thread-safe."""
+
+    _past: WireBytes = field(default_factory=WireBytes)
+    _open: dict[tuple[str, str], socket.socket] = field(default_factory=dict)
+    _lock: threading.Lock = field(default_factory=threading.Lock)
+
+    def attach(self, source: str, destination: str) -> None:
+        """Begins to count the connection between two locators ("tcp/host:port")."""
+        tap = _duplicate_of(source, destination)
+        if tap is None:
+            return
+        with self._lock:
+            old = self._open.pop((source, destination), None)
+            self._open[source, destination] = tap
+        if old is not None:
+            old.close()
+
+    def detach(self, source: str, destination: str) -> None:
+        """Adds the last reading of a connection to the past and lets its socket go."""
+        with self._lock:
+            tap = self._open.pop((source, destination), None)
+            if tap is not None:
+                self._past += _reading(tap)
+        if tap is not None:
+            tap.close()
+
+    def read(self) -> WireBytes:
+        """Total of the past and the present connections."""
+        with self._lock:
+            return sum((_reading(tap) for tap in self._open.values()), self._past)
+
+    def close(self) -> None:
+        """Detaches everything; `read` keeps giving the final total."""
+        for source, destination in tuple(self._open):
+            self.detach(source, destination)
+
+
+def _reading(tap: socket.socket) -> WireBytes:
+    info = tap.getsockopt(socket.IPPROTO_TCP, socket.TCP_INFO, _TCP_INFO_BYTES)
+    if len(info) < _TCP_INFO_BYTES:  # a kernel before 4.19 has no bytes_sent
+        return WireBytes(connections=1)
+    received = int(struct.unpack_from("=Q", info, _BYTES_RECEIVED_AT)[0])
+    segments_out, segments_in = struct.unpack_from("=II", info, _SEGMENTS_AT)
+    sent = int(struct.unpack_from("=Q", info, _BYTES_SENT_AT)[0])
+    header = (40 if tap.family == socket.AF_INET6 else 20) + 20 + (12 if info[_OPTIONS_AT] & _TIMESTAMPS else 0)
+    return WireBytes(sent + segments_out * header, received + segments_in * header, 1)
+
+
+def _duplicate_of(source: str, destination: str) -> socket.socket | None:
+    """A second descriptor of this process's socket between two locators; None where there is none."""
+    wanted = _address(source), _address(destination)
+    for entry in _FD_FOLDER.iterdir() if _FD_FOLDER.is_dir() else ():
+        tap = _tcp_socket(int(entry.name))
+        if tap is None:
+            continue
+        try:
+            if (_ends(tap.getsockname()), _ends(tap.getpeername())) == wanted:
+                return tap
+        except OSError:
+            pass
+        tap.close()
+    return None
+
+
+def _tcp_socket(descriptor: int) -> socket.socket | None:
+    try:
+        tap = socket.socket(fileno=os.dup(descriptor))
+    except OSError:
+        return None
+    if tap.family in (socket.AF_INET, socket.AF_INET6) and tap.type == socket.SOCK_STREAM:
+        return tap
+    tap.close()
+    return None
+
+
+def _ends(address: tuple[str, int] | tuple[str, int, int, int]) -> tuple[str, int]:
+    return address[0], address[1]
+
+
+def _address(locator: str) -> tuple[str, int]:
+    """("::1", 7447) of "tcp/[::1]:7447#options"."""
+    host, _, port = locator.partition("/")[2].partition("#")[0].rpartition(":")
+    return host.strip("[]"), int(port)
