@@ -1,0 +1,238 @@
+-- Statements of the SQLite store. Times are int ns UTC, tiles are 39-bit Morton integers, versions count from 1.
+
+-- name: schema
+-- One row a published version. The body is the last column, so that history never reads it.
+CREATE TABLE tile_version (
+  layer      TEXT    NOT NULL,
+  tile       INTEGER NOT NULL,
+  version    INTEGER NOT NULL CHECK (version > 0),
+  parent     INTEGER NOT NULL CHECK (parent >= 0 AND parent < version),
+  kind       TEXT    NOT NULL CHECK (kind IN ('base', 'merged', 'rollback')),
+  created_ns INTEGER NOT NULL,
+  merger     TEXT    NOT NULL,
+  n_reports  INTEGER NOT NULL CHECK (n_reports >= 0),
+  sha        BLOB    NOT NULL CHECK (length(sha) = 32),
+  codec_id   INTEGER NOT NULL,
+  size_bytes INTEGER NOT NULL CHECK (size_bytes >= 0),
+  provenance BLOB    NOT NULL,
+  body       BLOB    NOT NULL,
+  PRIMARY KEY (layer, tile, version)
+) STRICT;
+CREATE INDEX tile_version_sha ON tile_version (layer, tile, sha);
+
+-- The compare-and-swap happens on this row. `epoch` is the latest version whose kind is base or rollback (0: none).
+CREATE TABLE tile_head (
+  layer   TEXT    NOT NULL,
+  tile    INTEGER NOT NULL,
+  version INTEGER NOT NULL,
+  epoch   INTEGER NOT NULL,
+  sha     BLOB    NOT NULL,
+  PRIMARY KEY (layer, tile)
+) STRICT, WITHOUT ROWID;
+
+-- Versions whose update notice nobody has confirmed yet.
+CREATE TABLE notice (
+  layer      TEXT    NOT NULL,
+  tile       INTEGER NOT NULL,
+  version    INTEGER NOT NULL,
+  created_ns INTEGER NOT NULL,
+  PRIMARY KEY (layer, tile, version)
+) STRICT, WITHOUT ROWID;
+
+-- The inbox: one row a report and tile. `merged_in` is the head's version when the report was consumed (NULL: waiting).
+CREATE TABLE report (
+  arrival     INTEGER PRIMARY KEY,
+  layer       TEXT    NOT NULL,
+  tile        INTEGER NOT NULL,
+  report_id   TEXT    NOT NULL,
+  vehicle     TEXT    NOT NULL,
+  received_ns INTEGER NOT NULL,
+  seq         INTEGER NOT NULL,
+  merged_in   INTEGER,
+  base_sha    BLOB    NOT NULL,
+  body        BLOB    NOT NULL
+) STRICT;
+CREATE UNIQUE INDEX report_key ON report (layer, tile, report_id);
+CREATE INDEX report_waiting ON report (layer, tile, seq) WHERE merged_in IS NULL;
+
+-- The queue of tiles to merge. `seq` counts what arrived; `token` fences off holders of an expired lease.
+CREATE TABLE dirty (
+  layer    TEXT    NOT NULL,
+  tile     INTEGER NOT NULL,
+  seq      INTEGER NOT NULL,
+  waiting  INTEGER NOT NULL,
+  ready_ns INTEGER NOT NULL,
+  owner    TEXT,
+  token    INTEGER,
+  lease_ns INTEGER,
+  attempts INTEGER NOT NULL DEFAULT 0,
+  PRIMARY KEY (layer, tile)
+) STRICT, WITHOUT ROWID;
+CREATE INDEX dirty_ready ON dirty (ready_ns);
+
+-- What was refused, with its reason; the same bytes are kept once.
+CREATE TABLE quarantine (
+  sha         BLOB    NOT NULL PRIMARY KEY,
+  received_ns INTEGER NOT NULL,
+  source      TEXT    NOT NULL,
+  reason      TEXT    NOT NULL,
+  times       INTEGER NOT NULL,
+  body        BLOB    NOT NULL
+) STRICT;
+
+-- name: insert_report
+INSERT INTO report (layer, tile, report_id, vehicle, received_ns, seq, base_sha, body)
+SELECT :layer, :tile, :report_id, :vehicle, :received_ns,
+       COALESCE((SELECT seq FROM dirty WHERE layer = :layer AND tile = :tile), 0) + 1, :base_sha, :body
+WHERE true
+ON CONFLICT (layer, tile, report_id) DO NOTHING
+
+-- name: mark_dirty
+INSERT INTO dirty (layer, tile, seq, waiting, ready_ns)
+VALUES (:layer, :tile, 1, 1, CASE WHEN :merge_after <= 1 THEN :now ELSE :now + :delay END)
+ON CONFLICT (layer, tile) DO UPDATE SET
+  seq = seq + 1,
+  waiting = waiting + 1,
+  ready_ns = MIN(ready_ns, CASE WHEN waiting + 1 >= :merge_after THEN :now ELSE :now + :delay END)
+
+-- name: claimable
+SELECT layer, tile, seq, attempts FROM dirty
+WHERE ready_ns <= :now AND (owner IS NULL OR lease_ns <= :now) AND tile >= :first AND tile < :end
+ORDER BY ready_ns, layer, tile LIMIT :n
+
+-- name: take_lease
+UPDATE dirty SET owner = :owner, token = :token, lease_ns = :lease_ns, attempts = attempts + 1
+WHERE layer = :layer AND tile = :tile
+
+-- name: renew_lease
+UPDATE dirty SET lease_ns = :lease_ns WHERE layer = :layer AND tile = :tile AND token = :token
+
+-- name: release_owner
+UPDATE dirty SET owner = NULL, token = NULL, lease_ns = NULL WHERE owner = :owner
+
+-- name: release_token
+UPDATE dirty SET owner = NULL, token = NULL, lease_ns = NULL, ready_ns = :ready_ns
+WHERE layer = :layer AND tile = :tile AND token = :token
+
+-- name: dirty_row
+SELECT seq, token FROM dirty WHERE layer = :layer AND tile = :tile
+
+-- name: consume_reports
+UPDATE report SET merged_in = :version
+WHERE layer = :layer AND tile = :tile AND merged_in IS NULL AND seq <= :seq
+
+-- name: consume_report
+UPDATE report SET merged_in = :version
+WHERE layer = :layer AND tile = :tile AND report_id = :report_id AND merged_in IS NULL
+
+-- name: report_exists
+SELECT 1 FROM report WHERE layer = :layer AND tile = :tile AND report_id = :report_id
+
+-- name: clean
+DELETE FROM dirty WHERE layer = :layer AND tile = :tile AND seq = :seq
+
+-- name: still_dirty
+UPDATE dirty SET owner = NULL, token = NULL, lease_ns = NULL, attempts = 0,
+  waiting = (SELECT COUNT(*) FROM report WHERE layer = :layer AND tile = :tile AND merged_in IS NULL),
+  ready_ns = CASE WHEN (SELECT COUNT(*) FROM report WHERE layer = :layer AND tile = :tile AND merged_in IS NULL)
+                       >= :merge_after THEN :now ELSE :now + :delay END
+WHERE layer = :layer AND tile = :tile
+
+-- name: head
+SELECT version, epoch, sha FROM tile_head WHERE layer = :layer AND tile = :tile
+
+-- name: newest_created
+SELECT created_ns FROM tile_version WHERE layer = :layer AND tile = :tile ORDER BY version DESC LIMIT 1
+
+-- name: insert_version
+INSERT INTO tile_version (layer, tile, version, parent, kind, created_ns, merger, n_reports, sha, codec_id, size_bytes,
+                          provenance, body)
+VALUES (:layer, :tile, :version, :parent, :kind, :created_ns, :merger, :n_reports, :sha, :codec_id, :size_bytes,
+        :provenance, :body)
+
+-- name: insert_head
+INSERT INTO tile_head (layer, tile, version, epoch, sha) VALUES (:layer, :tile, :version, :epoch, :sha)
+ON CONFLICT (layer, tile) DO NOTHING
+
+-- name: swap_head
+UPDATE tile_head SET version = :version, epoch = :epoch, sha = :sha
+WHERE layer = :layer AND tile = :tile AND version = :parent
+
+-- name: insert_notice
+INSERT INTO notice (layer, tile, version, created_ns) VALUES (:layer, :tile, :version, :created_ns)
+
+-- name: delete_notice
+DELETE FROM notice WHERE layer = :layer AND tile = :tile AND version = :version
+
+-- name: notices
+SELECT layer, tile, version FROM notice WHERE created_ns <= :before ORDER BY created_ns, layer, tile, version LIMIT :n
+
+-- name: stored_version
+SELECT layer, tile, version, parent, kind, created_ns, merger, n_reports, sha, codec_id, body FROM tile_version
+WHERE layer = :layer AND tile = :tile AND version = :version
+
+-- name: stored_head
+SELECT v.layer, v.tile, v.version, v.parent, v.kind, v.created_ns, v.merger, v.n_reports, v.sha, v.codec_id, v.body
+FROM tile_head AS h JOIN tile_version AS v USING (layer, tile, version)
+WHERE h.layer = :layer AND h.tile = :tile
+
+-- name: stored_at
+SELECT layer, tile, version, parent, kind, created_ns, merger, n_reports, sha, codec_id, body FROM tile_version
+WHERE layer = :layer AND tile = :tile AND created_ns <= :at_ns ORDER BY version DESC LIMIT 1
+
+-- name: stored_by_sha
+SELECT layer, tile, version, parent, kind, created_ns, merger, n_reports, sha, codec_id, body FROM tile_version
+WHERE layer = :layer AND tile = :tile AND sha = :sha ORDER BY version DESC LIMIT 1
+
+-- name: heads
+SELECT tile, version, sha FROM tile_head WHERE layer = :layer AND tile >= :first AND tile < :end ORDER BY tile
+
+-- name: layers
+SELECT DISTINCT layer FROM tile_head ORDER BY layer
+
+-- name: history
+SELECT version, parent, kind, created_ns, merger, n_reports, sha, size_bytes FROM tile_version
+WHERE layer = :layer AND tile = :tile ORDER BY version
+
+-- name: provenance
+SELECT provenance FROM tile_version WHERE layer = :layer AND tile = :tile AND version = :version
+
+-- name: reports_in_play
+SELECT report_id, layer, tile, vehicle, received_ns, body, base_sha FROM report
+WHERE layer = :layer AND tile = :tile AND (merged_in IS NULL OR merged_in >= :epoch)
+ORDER BY report_id DESC LIMIT :n
+
+-- name: reports_page
+SELECT arrival, report_id, layer, tile, vehicle, received_ns, body, base_sha FROM report
+WHERE arrival > :after AND layer = :layer AND (:vehicle IS NULL OR vehicle = :vehicle) ORDER BY arrival LIMIT :n
+
+-- name: dirty_count
+SELECT COUNT(*) FROM dirty
+
+-- name: next_ready
+SELECT MIN(CASE WHEN owner IS NULL THEN ready_ns ELSE MAX(ready_ns, lease_ns) END) FROM dirty
+
+-- name: insert_quarantine
+INSERT INTO quarantine (sha, received_ns, source, reason, times, body)
+VALUES (:sha, :received_ns, :source, :reason, 1, :body)
+ON CONFLICT (sha) DO UPDATE SET times = times + 1, received_ns = excluded.received_ns
+
+-- name: quarantined
+SELECT received_ns, source, reason, times, body FROM quarantine ORDER BY received_ns, sha
+
+-- name: tiles_with_history
+SELECT layer, tile FROM tile_version GROUP BY layer, tile HAVING COUNT(*) > :keep
+
+-- name: delete_old_versions
+DELETE FROM tile_version WHERE layer = :layer AND tile = :tile
+  AND version < :oldest AND version <> :epoch
+  AND sha NOT IN (SELECT base_sha FROM report
+                  WHERE layer = :layer AND tile = :tile AND (merged_in IS NULL OR merged_in >= :epoch)
+                  ORDER BY report_id DESC LIMIT :max_reports)
+RETURNING size_bytes
+
+-- name: counts
+SELECT (SELECT COUNT(*) FROM tile_head), (SELECT COUNT(*) FROM tile_version),
+       (SELECT COUNT(*) FROM (SELECT DISTINCT report_id FROM report)), (SELECT COUNT(*) FROM report),
+       (SELECT COUNT(*) FROM report WHERE merged_in IS NULL), (SELECT COUNT(*) FROM dirty),
+       (SELECT COUNT(*) FROM quarantine)

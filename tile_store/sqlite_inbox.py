@@ -1,0 +1,104 @@
+"""The inbox and the queue in SQLite: each function runs inside the caller's transaction."""
+
+import secrets
+from collections.abc import Iterable, Sequence
+from typing import Any, Final
+
+import apsw
+
+from gnd_map.tile_id import TileId
+from tile_store.regions import ALL_TILES, morton_range
+from tile_store.sqlite_connection import change, fetch
+from tile_store.values import Claim, PutStatus, ReportRow, StoreConfig
+
+NS_PER_S: Final = 1_000_000_000
+
+
+def timing_of(config: StoreConfig, now: int) -> dict[str, Any]:
+    """When a dirty tile becomes ready: the statements' `now`, `delay` (both ns) and `merge_after` (reports)."""
+    return {"now": now, "delay": round(config.merge_delay_s * NS_PER_S), "merge_after": config.merge_after_reports}
+
+
+def put_reports(c: apsw.Connection, rows: Iterable[ReportRow], timing: dict[str, Any]) -> list[PutStatus]:
+    """Insert the rows that are new, and mark their tiles dirty."""
+    return [_put_report(c, row, timing) for row in rows]
+
+
+def _put_report(c: apsw.Connection, row: ReportRow, timing: dict[str, Any]) -> PutStatus:
+    place = {"layer": row.layer, "tile": row.tile.morton}
+    told = {"report_id": row.report_id, "vehicle": row.vehicle, "received_ns": row.received_ns}
+    if not change(c, "insert_report", place | told | {"base_sha": row.base_sha, "body": row.body}):
+        return "duplicate"
+    change(c, "mark_dirty", place | timing)
+    return "stored"
+
+
+def claim(c: apsw.Connection, owner: str, n: int, lease_s: float, prefer: Sequence[str], now: int) -> list[Claim]:
+    """Lease ready tiles: those of the preferred regions first, then any, each group oldest first."""
+    lease_ns = now + round(lease_s * NS_PER_S)
+    claims: list[Claim] = []
+    for first, end in [*map(morton_range, prefer), ALL_TILES]:
+        wanted = {"now": now, "first": first, "end": end, "n": n - len(claims)}
+        for layer, tile, seq, attempts in fetch(c, "claimable", wanted):
+            taken = Claim(layer, TileId(tile), seq, owner, secrets.randbits(62), attempts + 1)
+            change(c, "take_lease", _lease(taken) | {"owner": owner, "lease_ns": lease_ns})
+            claims.append(taken)
+    return claims
+
+
+def renew(c: apsw.Connection, claims: Iterable[Claim], lease_s: float, now: int) -> list[bool]:
+    """Prolong the leases that are still held by these claims."""
+    lease_ns = now + round(lease_s * NS_PER_S)
+    return [change(c, "renew_lease", _lease(one) | {"lease_ns": lease_ns}) == 1 for one in claims]
+
+
+def release(c: apsw.Connection, owner: str) -> int:
+    """Free an owner's leases; how many they were."""
+    return change(c, "release_owner", {"owner": owner})
+
+
+def postpone(c: apsw.Connection, claim: Claim, ready_ns: int) -> None:
+    """Free one lease; the tile is ready again at `ready_ns`."""
+    change(c, "release_token", _lease(claim) | {"ready_ns": ready_ns})
+
+
+def holds(c: apsw.Connection, claim: Claim) -> bool:
+    """Whether this claim still holds its lease; an expired one that nobody else has taken is still held."""
+    rows = fetch(c, "dirty_row", {"layer": claim.layer, "tile": claim.tile.morton})
+    return any(token == claim.token for _, token in rows)
+
+
+def consume(c: apsw.Connection, claim: Claim, report_ids: Iterable[str], version: int, timing: dict[str, Any]) -> None:
+    """The claim's reports are merged in `version`; the tile is clean unless a report has arrived since the claim."""
+    place: dict[str, Any] = {"layer": claim.layer, "tile": claim.tile.morton}
+    change(c, "consume_reports", place | {"version": version, "seq": claim.seq})
+    for report_id in report_ids:  # some may have arrived between claim and load
+        change(c, "consume_report", place | {"version": version, "report_id": report_id})
+    if not change(c, "clean", place | {"seq": claim.seq}):
+        change(c, "still_dirty", place | timing)
+
+
+def unknown_reports(c: apsw.Connection, claim: Claim, report_ids: Iterable[str]) -> list[str]:
+    """Those of the report ids that the inbox does not hold for the claim's tile."""
+    place: dict[str, Any] = {"layer": claim.layer, "tile": claim.tile.morton}
+    return [one for one in report_ids if not fetch(c, "report_exists", place | {"report_id": one})]
+
+
+def in_play(c: apsw.Connection, layer: str, tile: TileId, epoch: int, n: int) -> tuple[ReportRow, ...]:
+    """The newest `n` reports that count since the epoch, sorted by report id."""
+    rows = fetch(c, "reports_in_play", {"layer": layer, "tile": tile.morton, "epoch": epoch, "n": n})
+    return tuple(_row(*values) for values in reversed(rows))
+
+
+def page(c: apsw.Connection, layer: str, vehicle: str | None, after: int, n: int) -> tuple[int, list[ReportRow]]:
+    """Up to `n` reports that arrived after number `after`, and the last one's number."""
+    rows = fetch(c, "reports_page", {"layer": layer, "vehicle": vehicle, "after": after, "n": n})
+    return (rows[-1][0] if rows else after), [_row(*values[1:]) for values in rows]
+
+
+def _row(report_id: str, layer: str, tile: int, *rest: Any) -> ReportRow:
+    return ReportRow(report_id, layer, TileId(tile), *rest)
+
+
+def _lease(claim: Claim) -> dict[str, Any]:
+    return {"layer": claim.layer, "tile": claim.tile.morton, "token": claim.token}

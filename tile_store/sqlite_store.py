@@ -1,0 +1,263 @@
+"""The store in one SQLite file that several processes of a machine may open (WAL, every commit synced)."""
+
+import time
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from hashlib import sha256
+from pathlib import Path
+from types import TracebackType
+from typing import Any, Final
+
+import apsw
+
+from gnd_map.tile import Tile
+from gnd_map.tile_id import TileId
+from schemas.tiles import CatalogEntry
+from tile_store import sqlite_inbox as inbox
+from tile_store import sqlite_versions as versions
+from tile_store.errors import StoreError, UnknownVersion
+from tile_store.provenance import Provenance, decode_provenance
+from tile_store.regions import morton_range
+from tile_store.sqlite_connection import ReaderPool, change, fetch, open_writer
+from tile_store.values import (
+    DEFAULT_LAYER,
+    Claim,
+    Content,
+    GcResult,
+    Notice,
+    Publication,
+    PublishResult,
+    PutStatus,
+    Quarantined,
+    ReportRow,
+    StoreConfig,
+    StoreCounts,
+    StoredTile,
+    TileWork,
+    VersionInfo,
+    VersionKind,
+    check_layer,
+)
+from tile_store.writer import GroupWriter
+
+NS_PER_S: Final = 1_000_000_000
+REPORTS_A_PAGE: Final = 256
+
+
+class SqliteStore:
+    """`Store` in an SQLite file: one writer thread that groups commits, read-only connections for readers.
+
+    Args:
+        path: the file; with `create` it is made when missing (its folder must exist).
+        config: batching and waiting of this process.
+        now_ns: the clock, int ns UTC.
+
+    Raises:
+        StoreUnavailable: no such file or folder, no permission, not a store, written by a newer release.
+    """
+
+    def __init__(
+        self,
+        path: str | Path,
+        config: StoreConfig | None = None,
+        *,
+        create: bool = True,
+        now_ns: Callable[[], int] = time.time_ns,
+    ) -> None:
+        self.path = Path(path)
+        self._config = config or StoreConfig()
+        self._now_ns = now_ns
+        connection = open_writer(self.path, create=create, busy_timeout_s=self._config.busy_timeout_s)
+        self._writer = GroupWriter(connection, group_max=self._config.group_max)
+        self._readers = ReaderPool(self.path, busy_timeout_s=self._config.busy_timeout_s)
+
+    def __enter__(self) -> "SqliteStore":
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.close()
+
+    def close(self) -> None:
+        """Finish what is queued and close the file. Calling it twice is harmless."""
+        self._writer.close()
+        self._readers.close()
+
+    def _timing(self) -> dict[str, Any]:
+        return inbox.timing_of(self._config, self._now_ns())
+
+    # The inbox
+
+    def put_reports(self, rows: Sequence[ReportRow]) -> list[PutStatus]:
+        """See `Store.put_reports`."""
+        return self._writer.run(lambda c: inbox.put_reports(c, rows, self._timing()))
+
+    def reports(self, layer: str = DEFAULT_LAYER, vehicle: str | None = None) -> Iterator[ReportRow]:
+        """See `Store.reports`."""
+        after, page = self._report_page(layer, vehicle, 0)
+        while page:
+            yield from page
+            after, page = self._report_page(layer, vehicle, after)
+
+    def _report_page(self, layer: str, vehicle: str | None, after: int) -> tuple[int, list[ReportRow]]:
+        with self._readers.snapshot() as c:
+            return inbox.page(c, layer, vehicle, after, REPORTS_A_PAGE)
+
+    def quarantine(self, body: bytes, reason: str, source: str = "") -> None:
+        """See `Store.quarantine`."""
+        row = {"sha": sha256(body).digest(), "source": source, "reason": reason, "body": body}
+        self._writer.run(lambda c: change(c, "insert_quarantine", row | {"received_ns": self._now_ns()}))
+
+    def quarantined(self) -> list[Quarantined]:
+        """See `Store.quarantined`."""
+        with self._readers.snapshot() as c:
+            return [Quarantined(*row) for row in fetch(c, "quarantined")]
+
+    # The queue
+
+    def claim(self, owner: str, n: int, lease_s: float, prefer: Sequence[str] = ()) -> list[Claim]:
+        """See `Store.claim`."""
+        return self._writer.run(lambda c: inbox.claim(c, owner, n, lease_s, prefer, self._now_ns()))
+
+    def renew(self, claims: Sequence[Claim], lease_s: float) -> list[bool]:
+        """See `Store.renew`."""
+        return self._writer.run(lambda c: inbox.renew(c, claims, lease_s, self._now_ns()))
+
+    def release(self, owner: str) -> int:
+        """See `Store.release`."""
+        return self._writer.run(lambda c: inbox.release(c, owner))
+
+    def postpone(self, claim: Claim, delay_s: float) -> None:
+        """See `Store.postpone`."""
+        self._writer.run(lambda c: inbox.postpone(c, claim, self._now_ns() + round(delay_s * NS_PER_S)))
+
+    def dirty_count(self) -> int:
+        """See `Store.dirty_count`."""
+        with self._readers.snapshot() as c:
+            return int(fetch(c, "dirty_count")[0][0])
+
+    def next_ready_ns(self) -> int | None:
+        """See `Store.next_ready_ns`."""
+        with self._readers.snapshot() as c:
+            ready: int | None = fetch(c, "next_ready")[0][0]
+            return ready
+
+    # Merging and publishing
+
+    def load(self, claim: Claim, max_reports: int | None = None) -> TileWork:
+        """See `Store.load`."""
+        n = self._config.max_reports if max_reports is None else max_reports
+        with self._readers.snapshot() as c:
+            head = versions.stored(c, "stored_head", claim.layer, claim.tile)
+            epoch = versions.epoch_of(c, claim.layer, claim.tile)
+            base = versions.stored(c, "stored_version", claim.layer, claim.tile, version=epoch) if epoch else None
+            return TileWork(claim, head, base, inbox.in_play(c, claim.layer, claim.tile, epoch, n))
+
+    def publish(self, publications: Sequence[Publication]) -> list[PublishResult]:
+        """See `Store.publish`."""
+        pairs = [(one, None if one.tile is None else Content.of(one.tile)) for one in publications]
+
+        def work(c: apsw.Connection) -> list[PublishResult]:
+            return [versions.publish(c, one, content, self._timing()) for one, content in pairs]
+
+        return self._writer.run(work)
+
+    def put_tiles(
+        self, tiles: Iterable[Tile], reason: VersionKind = "base", layer: str = DEFAULT_LAYER
+    ) -> list[PublishResult]:
+        """See `Store.put_tiles`."""
+        check_layer(layer)
+        pairs = [(tile.tile_id, Content.of(tile)) for tile in tiles]
+
+        def work(c: apsw.Connection) -> list[PublishResult]:
+            now = self._now_ns()
+            return [versions.put_base(c, layer, tile, content, reason, now) for tile, content in pairs]
+
+        return self._writer.run(work)
+
+    def rollback(self, layer: str, tile: TileId, version: int) -> StoredTile:
+        """See `Store.rollback`."""
+        return self._writer.run(lambda c: versions.rollback(c, layer, tile, version, self._now_ns()))
+
+    def notices(self, older_than_s: float = 0.0, n: int = 1000) -> list[Notice]:
+        """See `Store.notices`."""
+        before = self._now_ns() - round(older_than_s * NS_PER_S)
+        with self._readers.snapshot() as c:
+            rows = fetch(c, "notices", {"before": before, "n": n})
+            return [Notice(layer, TileId(tile), version) for layer, tile, version in rows]
+
+    def announced(self, notices: Sequence[Notice]) -> None:
+        """See `Store.announced`."""
+        keys = [{"layer": one.layer, "tile": one.tile.morton, "version": one.version} for one in notices]
+        self._writer.run(lambda c: [change(c, "delete_notice", key) for key in keys])
+
+    # Reading
+
+    def get(self, layer: str, tile: TileId, version: int | None = None, at_ns: int | None = None) -> StoredTile | None:
+        """See `Store.get`."""
+        if version is not None and at_ns is not None:
+            raise StoreError(f"get {tile.path}: give a version ({version}) or a time ({at_ns}), not both")
+        with self._readers.snapshot() as c:
+            if version is not None:
+                return versions.stored(c, "stored_version", layer, tile, version=version)
+            if at_ns is not None:
+                return versions.stored(c, "stored_at", layer, tile, at_ns=at_ns)
+            return versions.stored(c, "stored_head", layer, tile)
+
+    def by_sha(self, layer: str, tile: TileId, sha: bytes) -> StoredTile | None:
+        """See `Store.by_sha`."""
+        with self._readers.snapshot() as c:
+            return versions.stored(c, "stored_by_sha", layer, tile, sha=sha)
+
+    def layers(self) -> list[str]:
+        """See `Store.layers`."""
+        with self._readers.snapshot() as c:
+            return [layer for (layer,) in fetch(c, "layers")]
+
+    def heads(self, layer: str = DEFAULT_LAYER, prefix: str = "") -> list[CatalogEntry]:
+        """See `Store.heads`."""
+        first, end = morton_range(prefix)
+        with self._readers.snapshot() as c:
+            rows = fetch(c, "heads", {"layer": layer, "first": first, "end": end})
+        return [CatalogEntry(TileId(tile), version, sha) for tile, version, sha in rows]
+
+    def history(self, layer: str, tile: TileId) -> list[VersionInfo]:
+        """See `Store.history`."""
+        with self._readers.snapshot() as c:
+            return [VersionInfo(*row) for row in fetch(c, "history", {"layer": layer, "tile": tile.morton})]
+
+    def provenance(self, layer: str, tile: TileId, version: int) -> tuple[str, ...]:
+        """See `Store.provenance`."""
+        return self._provenance(layer, tile, version).report_ids
+
+    def voxel_provenance(self, layer: str, tile: TileId, version: int) -> dict[int, tuple[str, ...]]:
+        """See `Store.voxel_provenance`."""
+        return self._provenance(layer, tile, version).of_voxels()
+
+    def _provenance(self, layer: str, tile: TileId, version: int) -> Provenance:
+        place = {"layer": layer, "tile": tile.morton, "version": version}
+        with self._readers.snapshot() as c:
+            rows = fetch(c, "provenance", place)
+        if not rows:
+            raise UnknownVersion(f"tile {tile.path} of layer {layer} has no version {version}")
+        return decode_provenance(rows[0][0])
+
+    def counts(self) -> StoreCounts:
+        """See `Store.counts`."""
+        with self._readers.snapshot() as c:
+            return StoreCounts(*fetch(c, "counts")[0])
+
+    # Upkeep
+
+    def gc(self, keep_versions: int) -> GcResult:
+        """See `Store.gc`."""
+        if keep_versions < 1:
+            raise StoreError(f"keep_versions is {keep_versions}; at least the newest version stays")
+        return self._writer.run(lambda c: versions.collect(c, keep_versions, self._config.max_reports))
+
+    def backup(self, path: str) -> None:
+        """See `Store.backup` (VACUUM INTO)."""
+        if Path(path).exists():
+            raise StoreError(f"{path}: exists; a backup never overwrites")
+        with self._readers.connection() as c:
+            c.execute("VACUUM INTO ?", (path,))

@@ -1,0 +1,141 @@
+"""Tile versions in SQLite: each function runs inside the caller's transaction."""
+
+from dataclasses import dataclass
+from typing import Any
+
+import apsw
+
+from gnd_map.tile_id import TileId
+from tile_store import sqlite_inbox as inbox
+from tile_store.errors import StoreError, UnknownReports, UnknownVersion
+from tile_store.provenance import NOTHING, Provenance, encode_provenance
+from tile_store.sqlite_connection import change, fetch
+from tile_store.values import Content, GcResult, Publication, PublishResult, StoredTile, VersionKind
+
+
+@dataclass(frozen=True, slots=True)
+class _Head:
+    version: int
+    epoch: int
+    sha: bytes
+
+
+@dataclass(frozen=True, slots=True)
+class _Origin:
+    """Why a version is made, by whom, from which reports."""
+
+    kind: VersionKind
+    merger: str = ""
+    provenance: Provenance = NOTHING
+
+
+def publish(
+    c: apsw.Connection, publication: Publication, content: Content | None, timing: dict[str, Any]
+) -> PublishResult:
+    """One publication: fence, compare-and-swap of the head, consumption of the reports."""
+    claim = publication.claim
+    head = _head(c, claim.layer, claim.tile)
+    if not inbox.holds(c, claim):
+        return PublishResult("stale", head.version)
+    if head.version != publication.base_version:
+        inbox.postpone(c, claim, timing["now"])  # ready at once, against the head as it is now
+        return PublishResult("stale", head.version)
+    provenance = _provenance(c, publication)
+    result = PublishResult("unchanged", head.version)
+    if content is not None and content.sha != head.sha:
+        origin = _Origin(publication.reason, claim.owner, provenance)
+        result = PublishResult("published", _append(c, claim.layer, claim.tile, content, origin, timing["now"]))
+    inbox.consume(c, claim, publication.report_ids, result.version, timing)
+    return result
+
+
+def put_base(
+    c: apsw.Connection, layer: str, tile: TileId, content: Content, kind: VersionKind, now: int
+) -> PublishResult:
+    """Import a tile: a new epoch, unless the head is an epoch of the same content."""
+    head = _head(c, layer, tile)
+    if head.version and head.version == head.epoch and head.sha == content.sha:
+        return PublishResult("unchanged", head.version)
+    return PublishResult("published", _append(c, layer, tile, content, _Origin(kind), now))
+
+
+def rollback(c: apsw.Connection, layer: str, tile: TileId, version: int, now: int) -> StoredTile:
+    """Publish the next version with the body of an older one."""
+    old = stored(c, "stored_version", layer, tile, version=version)
+    if old is None:
+        newest = _head(c, layer, tile).version
+        raise UnknownVersion(f"tile {tile.path} of layer {layer} has no version {version} (newest: {newest})")
+    _append(c, layer, tile, Content(old.sha, old.codec_id, old.body), _Origin("rollback"), now)
+    current = stored(c, "stored_head", layer, tile)
+    assert current is not None
+    return current
+
+
+def stored(c: apsw.Connection, statement: str, layer: str, tile: TileId, **values: int | bytes) -> StoredTile | None:
+    """The version that one of the `stored_…` statements finds."""
+    rows = fetch(c, statement, {"layer": layer, "tile": tile.morton, **values})
+    return StoredTile(rows[0][0], TileId(rows[0][1]), *rows[0][2:]) if rows else None
+
+
+def epoch_of(c: apsw.Connection, layer: str, tile: TileId) -> int:
+    """The latest version of a tile that is a base or a rollback; 0 when there is none."""
+    return _head(c, layer, tile).epoch
+
+
+def collect(c: apsw.Connection, keep_versions: int, max_reports: int) -> GcResult:
+    """Remove versions older than the newest `keep_versions` of each tile, but for epochs and what reports cite."""
+    sizes: list[int] = []
+    for layer, morton in fetch(c, "tiles_with_history", {"keep": keep_versions}):
+        head = _head(c, layer, TileId(morton))
+        wanted = {"layer": layer, "tile": morton, "epoch": head.epoch, "oldest": head.version - keep_versions + 1}
+        sizes += [size for (size,) in fetch(c, "delete_old_versions", wanted | {"max_reports": max_reports})]
+    return GcResult(len(sizes), sum(sizes))
+
+
+def _head(c: apsw.Connection, layer: str, tile: TileId) -> _Head:
+    rows = fetch(c, "head", {"layer": layer, "tile": tile.morton})
+    return _Head(*rows[0]) if rows else _Head(0, 0, b"")
+
+
+def _append(c: apsw.Connection, layer: str, tile: TileId, content: Content, origin: _Origin, now: int) -> int:
+    head = _head(c, layer, tile)
+    version = head.version + 1
+    row: dict[str, Any] = {
+        "layer": layer,
+        "tile": tile.morton,
+        "version": version,
+        "parent": head.version,
+        "kind": origin.kind,
+        "created_ns": _after_newest(c, layer, tile, now),
+        "merger": origin.merger,
+        "n_reports": len(origin.provenance.report_ids),
+        "sha": content.sha,
+        "codec_id": content.codec_id,
+        "size_bytes": len(content.body),
+        "provenance": encode_provenance(origin.provenance),
+        "body": content.body,
+        "epoch": head.epoch if origin.kind == "merged" else version,
+    }
+    change(c, "insert_version", row)
+    if change(c, "swap_head" if head.version else "insert_head", row) != 1:
+        raise StoreError(f"tile {tile.path} of layer {layer}: head {head.version} has moved inside a transaction")
+    if head.version or origin.kind == "merged":  # what an import adds to the map is found through the catalog
+        change(c, "insert_notice", row)
+    return version
+
+
+def _after_newest(c: apsw.Connection, layer: str, tile: TileId, now: int) -> int:
+    # Times of versions only grow, also when the clocks of two processes disagree: reading at a time depends on it.
+    newest = fetch(c, "newest_created", {"layer": layer, "tile": tile.morton})
+    return max(now, newest[0][0] + 1) if newest else now
+
+
+def _provenance(c: apsw.Connection, publication: Publication) -> Provenance:
+    provenance = Provenance.of(publication.report_ids, publication.voxel_reports)
+    unknown = inbox.unknown_reports(c, publication.claim, provenance.report_ids)
+    if unknown:
+        raise UnknownReports(
+            f"tile {publication.claim.tile.path} of layer {publication.claim.layer}: {len(unknown)} of"
+            f" {len(provenance.report_ids)} report ids are not in the store, first {unknown[0]}; nothing was published"
+        )
+    return provenance

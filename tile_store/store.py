@@ -1,0 +1,130 @@
+"""What a store of tiles and reports can do, whatever keeps it. `tests/tile_store/` holds every implementation to it."""
+
+from collections.abc import Iterable, Iterator, Sequence
+from typing import Protocol
+
+from gnd_map.tile import Tile
+from gnd_map.tile_id import TileId
+from schemas.tiles import CatalogEntry
+from tile_store.values import (
+    DEFAULT_LAYER,
+    Claim,
+    GcResult,
+    Notice,
+    Publication,
+    PublishResult,
+    PutStatus,
+    Quarantined,
+    ReportRow,
+    StoreCounts,
+    StoredTile,
+    TileWork,
+    VersionInfo,
+    VersionKind,
+)
+
+
+class Store(Protocol):
+    """Versioned tiles, the inbox of reports, and the queue of tiles to merge.
+
+    Every method may be called from any thread, and several processes may use one store at a time. What writes returns
+    only when the change is durable. Every method raises StoreError (one line) when the store cannot do it.
+    """
+
+    # The inbox
+
+    def put_reports(self, rows: Sequence[ReportRow]) -> list[PutStatus]:
+        """Keep reports, all of a call or none. A row whose (layer, tile, report id) is known is a "duplicate" and
+        changes nothing. Each new row makes its tile dirty.
+        """
+
+    def reports(self, layer: str = DEFAULT_LAYER, vehicle: str | None = None) -> Iterator[ReportRow]:
+        """All reports of a layer (and of one vehicle) in order of arrival, read in pages."""
+
+    def quarantine(self, body: bytes, reason: str, source: str = "") -> None:
+        """Keep refused bytes with the reason; the same bytes again are only counted."""
+
+    def quarantined(self) -> list[Quarantined]:
+        """What was refused, oldest first."""
+
+    # The queue
+
+    def claim(self, owner: str, n: int, lease_s: float, prefer: Sequence[str] = ()) -> list[Claim]:
+        """Lease up to `n` tiles that are ready to merge, those in the regions `prefer` (path prefixes) first."""
+
+    def renew(self, claims: Sequence[Claim], lease_s: float) -> list[bool]:
+        """Prolong leases; False where the lease has gone to another owner."""
+
+    def release(self, owner: str) -> int:
+        """Free all leases of an owner (it has died); the number freed."""
+
+    def postpone(self, claim: Claim, delay_s: float) -> None:
+        """Give a tile back, to be ready again after `delay_s` (its merge has failed)."""
+
+    def dirty_count(self) -> int:
+        """Tiles that wait to be merged, leased ones included."""
+
+    def next_ready_ns(self) -> int | None:
+        """When the next tile can be claimed (a lease's end included); None: nothing waits."""
+
+    # Merging and publishing
+
+    def load(self, claim: Claim, max_reports: int | None = None) -> TileWork:
+        """All that the merge of a claimed tile needs, read at one instant; only the newest `max_reports` reports."""
+
+    def publish(self, publications: Sequence[Publication]) -> list[PublishResult]:
+        """Publish merges in one transaction: each by compare-and-swap of the head from `base_version`, together with
+        the consumption of its reports. A tile stays dirty when a report has arrived since its claim. Stale: the head
+        has moved or the lease is another's; nothing of that publication is applied.
+        """
+
+    def put_tiles(
+        self, tiles: Iterable[Tile], reason: VersionKind = "base", layer: str = DEFAULT_LAYER
+    ) -> list[PublishResult]:
+        """Import tiles, all or none; each starts a new epoch. The same content over an equal epoch is "unchanged"."""
+
+    def rollback(self, layer: str, tile: TileId, version: int) -> StoredTile:
+        """Publish the next version with the body of `version`; it starts a new epoch: merged reports count no more."""
+
+    def notices(self, older_than_s: float = 0.0, n: int = 1000) -> list[Notice]:
+        """Versions published at least `older_than_s` ago whose notice is not confirmed, oldest first."""
+
+    def announced(self, notices: Sequence[Notice]) -> None:
+        """Confirm that the update notices of these versions have gone out."""
+
+    # Reading
+
+    def get(self, layer: str, tile: TileId, version: int | None = None, at_ns: int | None = None) -> StoredTile | None:
+        """A tile's newest version, or the one named, or the newest at a time; None: there is none."""
+
+    def by_sha(self, layer: str, tile: TileId, sha: bytes) -> StoredTile | None:
+        """The newest version of a tile with this content."""
+
+    def layers(self) -> list[str]:
+        """The layers that hold tiles."""
+
+    def heads(self, layer: str = DEFAULT_LAYER, prefix: str = "") -> list[CatalogEntry]:
+        """The newest versions of a region's tiles (a prefix of their path), sorted by tile."""
+
+    def history(self, layer: str, tile: TileId) -> list[VersionInfo]:
+        """The versions of a tile that retention has left, oldest first."""
+
+    def provenance(self, layer: str, tile: TileId, version: int) -> tuple[str, ...]:
+        """The report ids that a version comes from, sorted."""
+
+    def voxel_provenance(self, layer: str, tile: TileId, version: int) -> dict[int, tuple[str, ...]]:
+        """The report ids of each changed voxel of a version, where its publication gave them."""
+
+    def counts(self) -> StoreCounts:
+        """How much the store holds."""
+
+    # Upkeep
+
+    def gc(self, keep_versions: int) -> GcResult:
+        """Remove old versions. Kept: a tile's newest `keep_versions`, its epoch, and what counting reports cite."""
+
+    def backup(self, path: str) -> None:
+        """A consistent copy while the store is in use."""
+
+    def close(self) -> None:
+        """Finish what is queued and free the store. Calling it twice is harmless."""

@@ -1,0 +1,232 @@
+"""The values that go into a store and come out of it. Times are int ns UTC; the store never reads a report's body."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Final, Literal
+
+from gnd_map.codec import CODEC_FLOAT32, encode_gaussians
+from gnd_map.tile import Tile
+from gnd_map.tile_id import TileId
+from schemas.limits import MAX_TILE_BODY_BYTES
+from schemas.report_id import check_report_id
+from schemas.tiles import TileBlob, tile_of
+from schemas.wire import LAYER_PATTERN
+from tile_store.errors import StoreError
+
+VersionKind = Literal["base", "merged", "rollback"]
+PutStatus = Literal["stored", "duplicate"]
+PublishStatus = Literal["published", "unchanged", "stale"]
+
+SHA_BYTES: Final = 32
+DEFAULT_LAYER: Final = "ndt"
+
+
+def check_layer(layer: str) -> str:
+    """The layer's name itself; StoreError when it cannot be a chunk of a key."""
+    if not LAYER_PATTERN.fullmatch(layer):
+        raise StoreError(f"layer {layer[:80]!r} does not match {LAYER_PATTERN.pattern}")
+    return layer
+
+
+@dataclass(frozen=True, slots=True)
+class Content:
+    """A tile's content as a store keeps it: hash, codec and encoded bytes."""
+
+    sha: bytes
+    codec_id: int
+    body: bytes = field(repr=False)
+
+    @classmethod
+    def of(cls, tile: Tile) -> "Content":
+        """The content of a tile as float32 columns; StoreError when it is larger than any message may be."""
+        body = encode_gaussians(tile.gaussians)
+        if len(body) > MAX_TILE_BODY_BYTES:
+            raise StoreError(f"tile {tile.tile_id.path} has {len(body)} bytes, a message holds {MAX_TILE_BODY_BYTES}")
+        return cls(tile.sha, CODEC_FLOAT32, body)
+
+
+@dataclass(frozen=True, slots=True)
+class StoreConfig:
+    """How a store batches and waits; each process may use its own."""
+
+    merge_delay_s: float = 1.0
+    """A tile becomes ready to merge this long after its first waiting report,"""
+    merge_after_reports: int = 8
+    """or at once when so many reports wait."""
+    max_reports: int = 64
+    """`load` gives at most the newest so many reports of a tile (by report id)."""
+    busy_timeout_s: float = 30.0
+    """A writer waits this long for the writers of other processes."""
+    group_max: int = 256
+    """At most so many calls share one commit."""
+
+    def __post_init__(self) -> None:
+        if self.merge_delay_s < 0 or self.busy_timeout_s <= 0:
+            raise StoreError(
+                f"merge_delay_s {self.merge_delay_s} and busy_timeout_s {self.busy_timeout_s} must be >= 0"
+            )
+        if min(self.merge_after_reports, self.max_reports, self.group_max) < 1:
+            raise StoreError("merge_after_reports, max_reports and group_max must be at least 1")
+
+
+@dataclass(frozen=True, slots=True)
+class ReportRow:
+    """What one report says about one tile: the unit of the inbox.
+
+    `base_sha` is the content hash that the report refers to (b"": none); gc keeps that version while the report counts.
+    """
+
+    report_id: str
+    layer: str
+    tile: TileId
+    vehicle: str
+    received_ns: int
+    body: bytes = field(repr=False)
+    base_sha: bytes = b""
+
+    def __post_init__(self) -> None:
+        check_layer(self.layer)
+        check_report_id(self.report_id)
+        if len(self.base_sha) not in (0, SHA_BYTES):
+            raise StoreError(f"base_sha has {len(self.base_sha)} bytes, need 0 or {SHA_BYTES}")
+
+
+@dataclass(frozen=True, slots=True)
+class StoredTile:
+    """One version of a tile as it lies in the store; `parent` is the version that it replaced (0: none)."""
+
+    layer: str
+    tile: TileId
+    version: int
+    parent: int
+    kind: VersionKind
+    created_ns: int
+    merger: str
+    n_reports: int
+    sha: bytes
+    codec_id: int
+    body: bytes = field(repr=False)
+
+    def to_blob(self) -> TileBlob:
+        """What goes out on the bus."""
+        return TileBlob(self.tile, self.version, self.sha, self.codec_id, self.body)
+
+    def decode(self) -> Tile:
+        """The tile itself; WrongHash when the bytes are not what the hash says."""
+        return tile_of(self.to_blob())
+
+
+@dataclass(frozen=True, slots=True)
+class VersionInfo:
+    """A line of a tile's history: a version without its body of `size_bytes`."""
+
+    version: int
+    parent: int
+    kind: VersionKind
+    created_ns: int
+    merger: str
+    n_reports: int
+    sha: bytes
+    size_bytes: int
+
+
+@dataclass(frozen=True, slots=True)
+class Claim:
+    """A lease on a dirty tile. `seq` counts the reports that had arrived, `token` tells this lease from any other,
+    `attempts` says how often the tile was claimed since it was last published (1: the first time).
+    """
+
+    layer: str
+    tile: TileId
+    seq: int
+    owner: str
+    token: int = 0
+    attempts: int = 1
+
+
+@dataclass(frozen=True, slots=True)
+class TileWork:
+    """All that a merge needs, read at one instant: the newest version, the epoch's version (the latest base or
+    rollback) and the reports that count since then, merged or not, sorted by report id.
+    """
+
+    claim: Claim
+    head: StoredTile | None
+    epoch: StoredTile | None
+    reports: tuple[ReportRow, ...]
+
+    @property
+    def base_version(self) -> int:
+        """The version that a publication of this work replaces (0: the tile does not exist)."""
+        return self.head.version if self.head else 0
+
+
+@dataclass(frozen=True, slots=True)
+class Publication:
+    """A merge's result: the new content, or None when nothing visible has changed.
+
+    `report_ids` are the reports that it comes from. `voxel_reports` names them for each changed voxel, when known.
+    The store numbers versions itself: it publishes `base_version + 1`, whatever `tile.version` says.
+    """
+
+    claim: Claim
+    base_version: int
+    tile: Tile | None
+    reason: VersionKind = "merged"
+    report_ids: tuple[str, ...] = ()
+    voxel_reports: Mapping[int, tuple[str, ...]] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        if self.tile is not None and self.tile.tile_id != self.claim.tile:
+            raise StoreError(f"publication of {self.tile.tile_id.path} under a claim of {self.claim.tile.path}")
+        if self.base_version < 0:
+            raise StoreError(f"base_version {self.base_version} is negative")
+
+
+@dataclass(frozen=True, slots=True)
+class PublishResult:
+    """`published`: `version` is new. `unchanged`: it stays. `stale`: refused, `version` is the head's; claim again."""
+
+    status: PublishStatus
+    version: int
+
+
+@dataclass(frozen=True, slots=True)
+class Notice:
+    """A version whose update notice has not been confirmed by `announced`."""
+
+    layer: str
+    tile: TileId
+    version: int
+
+
+@dataclass(frozen=True, slots=True)
+class Quarantined:
+    """A refused message: when it came last, from where, why it was refused, how often, and its bytes."""
+
+    received_ns: int
+    source: str
+    reason: str
+    times: int
+    body: bytes = field(repr=False)
+
+
+@dataclass(frozen=True, slots=True)
+class GcResult:
+    """What retention has removed."""
+
+    versions: int
+    bytes: int
+
+
+@dataclass(frozen=True, slots=True)
+class StoreCounts:
+    """How much a store holds. `reports` counts report ids, `report_rows` one for each tile of a report."""
+
+    tiles: int
+    versions: int
+    reports: int
+    report_rows: int
+    waiting: int
+    dirty: int
+    quarantined: int
