@@ -1,0 +1,74 @@
+"""Tiles on disk: what was downloaded once is asked for only by its version and hash.
+
+Every read is verified against the hash that was published; a tile that fails is dropped, and the caller downloads it
+again. The cache may be deleted at any time.
+"""
+
+from pathlib import Path
+
+from gnd_map.errors import GndError
+from gnd_map.tile import Tile
+from gnd_map.tile_id import TileId
+from schemas.tiles import TileBlob, blob_of, tile_of
+from vehicle_agent.errors import CacheError
+from vehicle_agent.sqlite import Database
+
+SCHEMA = """
+CREATE TABLE IF NOT EXISTS tile (
+    layer    TEXT NOT NULL,
+    morton   INTEGER NOT NULL,
+    version  INTEGER NOT NULL,
+    sha      BLOB NOT NULL,
+    codec_id INTEGER NOT NULL,
+    body     BLOB NOT NULL,
+    PRIMARY KEY (layer, morton)
+) STRICT, WITHOUT ROWID;
+"""
+
+
+class TileCache:
+    """The newest version of each tile that this vehicle has seen, in one SQLite file; safe for several threads."""
+
+    def __init__(self, path: Path, layer: str = "ndt") -> None:
+        self.layer = layer
+        self.refused = 0
+        self._db = Database(path, SCHEMA, synchronous="NORMAL", error=CacheError)
+
+    def get(self, tile_id: TileId) -> Tile | None:
+        """The tile, or None when it is not here or no longer what its hash says (then it is dropped and counted)."""
+        sql = "SELECT version, sha, codec_id, body FROM tile WHERE layer = ? AND morton = ?"
+        rows = self._db.run(sql, self._of(tile_id))
+        if not rows:
+            return None
+        version, sha, codec_id, body = rows[0]
+        try:
+            return tile_of(TileBlob(tile_id, version, sha, codec_id, body))
+        except GndError:
+            self.drop(tile_id)
+            self.refused += 1
+            return None
+
+    def head(self, tile_id: TileId) -> tuple[int, bytes]:
+        """(version, sha) of the cached tile; (0, b"") where there is none."""
+        rows = self._db.run("SELECT version, sha FROM tile WHERE layer = ? AND morton = ?", self._of(tile_id))
+        return (int(rows[0][0]), bytes(rows[0][1])) if rows else (0, b"")
+
+    def put(self, tile: Tile) -> None:
+        """Keep `tile` in place of any older version."""
+        blob = blob_of(tile)
+        row = (*self._of(tile.tile_id), blob.version, blob.sha, blob.codec_id, blob.body)
+        self._db.run("INSERT OR REPLACE INTO tile VALUES (?, ?, ?, ?, ?, ?)", row)
+
+    def drop(self, tile_id: TileId) -> None:
+        """Forget a tile; not here: nothing happens."""
+        self._db.run("DELETE FROM tile WHERE layer = ? AND morton = ?", self._of(tile_id))
+
+    def __len__(self) -> int:
+        return int(self._db.run("SELECT count(*) FROM tile WHERE layer = ?", (self.layer,))[0][0])
+
+    def close(self) -> None:
+        """Close the file."""
+        self._db.close()
+
+    def _of(self, tile_id: TileId) -> tuple[str, int]:
+        return self.layer, tile_id.morton

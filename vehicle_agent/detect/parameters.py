@@ -1,0 +1,98 @@
+"""Parameters of change detection: the paper's own in `paper` mode, the measured improvements in `default` mode."""
+
+from dataclasses import dataclass, field
+from typing import Literal
+
+from gnd_map.evidence import MassParameters
+from vehicle_agent.errors import VehicleError
+
+Mode = Literal["paper", "default"]
+PassRule = Literal["ml", "ahead", "plane"]
+
+
+class DetectParameterError(VehicleError):
+    """A detection parameter lies outside its range."""
+
+
+@dataclass(frozen=True, slots=True)
+class DetectParameters:
+    """How rays become evidence and evidence becomes classes.
+
+    Paper mode is `DetectParameters.paper()`: Eq. (1) to (12) taken plainly. The defaults add what was measured to help.
+    """
+
+    mode: Mode = "default"
+    masses: MassParameters = field(default_factory=MassParameters)
+    eta_block: float = 0.95
+    """η_bound of Eq. (1) for points that end in a voxel."""
+    block_noise_m: float = 0.05
+    """Standard deviation added to the map's Gaussian for BI/BO: thin covariances turn 3 cm of noise into "outside"."""
+    passing_rule: PassRule = "plane"
+    """`ml`: Eq. (4) plainly; `ahead`: the same, only where the crossing lies `ahead_m` before the hit; `plane`: a
+    planar Gaussian counts as passed only where the ray crosses its plane and ends `beyond_m` behind it."""
+    eta_pass: float = 0.5
+    """η_bound of Eq. (4) for rays that pass."""
+    eta_plane: float = 0.9
+    """The same for the point where a ray crosses the plane of a planar Gaussian."""
+    pass_noise_m: float = 0.01
+    """Keeps the whitening of flat Gaussians finite."""
+    ahead_m: float = 1.0
+    beyond_m: float = 0.15
+    planar_ratio: float = 10.0
+    """λ2 / λ1 from which a Gaussian is planar (the paper's ratio, Eq. 16)."""
+    face_m: float = 0.10
+    """A blocked point this close to a face is ignored where the neighbour's Gaussian explains it; 0 switches off."""
+    face_sigma: float = 3.0
+    range_min_m: float = 2.0
+    """Nearer points are the vehicle itself."""
+    range_max_m: float = 50.0
+    """Farther hits are not used; their rays still pass what lies within the range."""
+    min_cells: int = 20
+    """Occupied 10 cm sub-cells that make a Gaussian, the same rule as the map's."""
+    weak_cells: int = 5
+    """From here to `min_cells` a voxel has hits, but too few for a Gaussian: it abstains."""
+    min_passes: int = 3
+    """Rays through an empty voxel before it counts as observed empty."""
+    min_pass_inside: int = 3
+    """PI rays that a deletion needs."""
+    similar: float = 0.5
+    """New and map Gaussian at least this similar: the voxel stays normal."""
+    min_coverage: float = 0.25
+    """Sub-cells of the new Gaussian over the map's, below which a sustained voxel is never called modified."""
+
+    def __post_init__(self) -> None:
+        """Each value within its range, or `DetectParameterError` with the value."""
+        for name in ("eta_block", "eta_pass", "eta_plane"):
+            _check(name, getattr(self, name), 0.0, 1.0, open_ends=True)
+        _check("face_m", self.face_m, 0.0, 0.4)
+        _check("pass_noise_m", self.pass_noise_m, 1e-4, 1.0)
+        _check("block_noise_m", self.block_noise_m, 1e-4, 1.0)
+        _check("range_max_m", self.range_max_m, self.range_min_m, 500.0, open_ends=True)
+        _check("similar", self.similar, 0.0, 1.0)
+        _check("weak_cells", self.weak_cells, 1, self.min_cells)
+
+    @classmethod
+    def paper(cls) -> "DetectParameters":
+        """Eq. (1) to (12) plainly: 1 cm keeps Σ invertible, every hit counts, evidence alone decides."""
+        return cls(
+            mode="paper",
+            masses=MassParameters(lambda_s_block=0.2, lambda_c_block=0.05, lambda_c_pass=0.01),
+            eta_block=0.95,
+            eta_pass=0.95,
+            block_noise_m=0.01,
+            passing_rule="ml",
+            face_m=0.0,
+            weak_cells=1,
+            min_passes=1,
+            min_pass_inside=1,
+            min_coverage=0.0,
+        )
+
+
+def _check(name: str, value: float, low: float, high: float, *, open_ends: bool = False) -> None:
+    inside = low < value < high if open_ends else low <= value <= high
+    if not inside:
+        raise DetectParameterError(f"{name} = {value} lies outside {low} ... {high}")
+
+
+__all__ = ["DetectParameterError", "DetectParameters", "Mode", "PassRule"]

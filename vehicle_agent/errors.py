@@ -1,0 +1,48 @@
+"""Errors of the vehicle's half of the loop. Messages carry numbers and say what to do."""
+
+from gnd_map.errors import GndError
+
+
+class VehicleError(GndError):
+    """Base of everything that `vehicle_agent` raises."""
+
+
+class WindowTooLarge(VehicleError):
+    """The tiles asked for do not fit a dense window of bounded memory."""
+
+
+class BadScan(VehicleError):
+    """A scan that cannot be used; `state` names why (`empty`, `not-finite`, `constant`, `time-backwards`)."""
+
+    def __init__(self, state: str, message: str) -> None:
+        """Keeps the state for counting beside the message for people."""
+        super().__init__(message)
+        self.state = state
+
+
+class CacheError(VehicleError):
+    """The tile cache on disk cannot be opened or holds a tile that is not what its name says."""
+
+
+class OutboxError(VehicleError):
+    """The outbox cannot be opened or written; nothing may be reported without it."""
+
+
+class AgentConfigError(VehicleError):
+    """The agent was started with values that cannot work."""
+
+
+class LocaliseError(VehicleError):
+    """Base of what localisation raises."""
+
+
+class RegistrationError(LocaliseError):
+    """A scan could not be matched with the map: too few of its points have a Gaussian nearby."""
+
+
+class MotionError(LocaliseError):
+    """The vehicle's motion is not known for the time asked for."""
+
+
+class ImportDriveError(VehicleError):
+    """A recording that cannot be read, or is not of the format that was named."""

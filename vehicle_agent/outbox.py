@@ -1,0 +1,104 @@
+"""The durable outbox: a report is on the disk before it is sent and stays until somebody acknowledged it.
+
+States of a report: `pending` -> `stored` | `duplicate` (acknowledged) or `quarantined` (refused by name, kept for
+people to look at). A restarted agent makes the same report ids again; whatever is in the outbox already keeps its first
+body, and what was acknowledged is not sent again (promise 1 of the design).
+"""
+
+from dataclasses import dataclass
+from pathlib import Path
+
+from vehicle_agent.errors import OutboxError
+from vehicle_agent.sqlite import Database
+
+SCHEMA = """
+CREATE TABLE IF NOT EXISTS report (
+    report_id TEXT PRIMARY KEY,
+    key       TEXT NOT NULL,
+    body      BLOB NOT NULL,
+    state     TEXT NOT NULL CHECK (state IN ('pending', 'stored', 'duplicate', 'quarantined')),
+    reason    TEXT NOT NULL,
+    attempts  INTEGER NOT NULL,
+    next_ns   INTEGER NOT NULL
+) STRICT, WITHOUT ROWID;
+CREATE INDEX IF NOT EXISTS report_pending ON report (next_ns) WHERE state = 'pending';
+"""
+ANSWERS = ("stored", "duplicate", "quarantined")
+FIRST_WAIT_S, LONGEST_WAIT_S = 0.5, 15.0
+
+
+@dataclass(frozen=True, slots=True)
+class Letter:
+    """One report on its way: the key it goes to, its encoded body, how often it was tried."""
+
+    report_id: str
+    key: str
+    body: bytes
+    attempts: int
+
+
+@dataclass(frozen=True, slots=True)
+class OutboxCounts:
+    """How many reports are in which state; `acknowledged` counts stored and duplicate."""
+
+    pending: int
+    acknowledged: int
+    quarantined: int
+
+    @property
+    def total(self) -> int:
+        """All reports that were ever put in."""
+        return self.pending + self.acknowledged + self.quarantined
+
+
+class Outbox:
+    """Reports in SQLite (WAL, synchronous FULL: `put` returns when the report survives a power cut)."""
+
+    def __init__(self, path: Path) -> None:
+        self._db = Database(path, SCHEMA, synchronous="FULL", error=OutboxError)
+
+    def put(self, report_id: str, key: str, body: bytes) -> bool:
+        """Make a report durable; False when its id is known already (the first body stays)."""
+        sql = "INSERT OR IGNORE INTO report VALUES (?, ?, ?, 'pending', '', 0, 0)"
+        return self._db.changes(sql, (report_id, key, body)) == 1
+
+    def due(self, now_ns: int, limit: int = 8) -> list[Letter]:
+        """Pending reports whose waiting time is over, the oldest id first."""
+        sql = (
+            "SELECT report_id, key, body, attempts FROM report"
+            " WHERE state = 'pending' AND next_ns <= ? ORDER BY report_id LIMIT ?"
+        )
+        return [Letter(*row) for row in self._db.run(sql, (now_ns, limit))]
+
+    def answered(self, report_id: str, status: str, reason: str = "") -> None:
+        """Record an acknowledgement (`stored`, `duplicate`) or a refusal (`quarantined` with its reason)."""
+        if status not in ANSWERS:
+            raise OutboxError(f"report {report_id}: unknown answer {status!r}, expected one of {', '.join(ANSWERS)}")
+        self._db.run("UPDATE report SET state = ?, reason = ? WHERE report_id = ?", (status, reason, report_id))
+
+    def failed(self, letter: Letter, now_ns: int, reason: str) -> int:
+        """Record a failed attempt; returns when to try again (ns): 0.5 s doubled each time, at most 15 s."""
+        wait_s = min(FIRST_WAIT_S * 2 ** min(letter.attempts, 8), LONGEST_WAIT_S)
+        next_ns = now_ns + int(wait_s * 1e9)
+        sql = "UPDATE report SET attempts = attempts + 1, next_ns = ?, reason = ? WHERE report_id = ?"
+        self._db.run(sql, (next_ns, reason, letter.report_id))
+        return next_ns
+
+    def retry_now(self) -> None:
+        """Forget all waiting times (the link is back, or the agent has restarted)."""
+        self._db.run("UPDATE report SET next_ns = 0 WHERE state = 'pending'")
+
+    def counts(self) -> OutboxCounts:
+        """How many reports are pending, acknowledged and quarantined."""
+        rows = self._db.run("SELECT state, count(*) FROM report GROUP BY state")
+        n = {str(state): int(count) for state, count in rows}
+        return OutboxCounts(n.get("pending", 0), n.get("stored", 0) + n.get("duplicate", 0), n.get("quarantined", 0))
+
+    def refused(self) -> list[tuple[str, str]]:
+        """(report id, reason) of the quarantined reports."""
+        rows = self._db.run("SELECT report_id, reason FROM report WHERE state = 'quarantined' ORDER BY report_id")
+        return [(str(report_id), str(reason)) for report_id, reason in rows]
+
+    def close(self) -> None:
+        """Close the file."""
+        self._db.close()
