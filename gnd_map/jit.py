@@ -1,0 +1,16 @@
+"""The one way in which this project compiles a kernel."""
+
+from collections.abc import Callable
+from typing import Any, TypeVar, cast
+
+import numba
+
+F = TypeVar("F", bound=Callable[..., Any])
+
+
+def kernel(function: F) -> F:
+    """Compile `function` with numba on its first call and keep the machine code on disk beside its module.
+
+    No fast-math: results must not depend on how a compiler orders sums. Division by zero gives inf or NaN, as in numpy.
+    """
+    return cast("F", numba.njit(cache=True, error_model="numpy")(function))

@@ -1,0 +1,101 @@
+"""Trajectories, and sweeps freed of the motion that the vehicle made while the LiDAR turned."""
+
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+from gnd_map.arrays import F64, I64, Array, check_array, points_3d
+from gnd_map.errors import MotionError
+from gnd_map.jit import kernel
+from gnd_map.se3 import T_inverse, interpolate_poses
+
+TOLERANCE_NS = 100_000_000  # one sweep at 10 Hz: its last points come after its last pose
+_KNOT_NS = 1_000_000  # at 1 rad/s, blending rotations over 1 ms is off by 1.3e-7 rad
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Trajectory:
+    """Where a vehicle was: poses of the vehicle in some frame dst, in time order."""
+
+    t_ns: I64
+    """(N,) UTC, strictly increasing."""
+    T_dst_vehicle: F64
+    """(N, 4, 4)."""
+
+    def __post_init__(self) -> None:
+        check_array("t_ns", self.t_ns, np.int64, (None,))
+        check_array("T_dst_vehicle", self.T_dst_vehicle, np.float64, (len(self.t_ns), 4, 4))
+        late = np.flatnonzero(np.diff(self.t_ns) <= 0)
+        if len(late):
+            raise MotionError(f"trajectory: pose {late[0] + 1} of {len(self.t_ns)} is not later than the one before")
+
+    def __len__(self) -> int:
+        return len(self.t_ns)
+
+    def at(self, t_ns: npt.ArrayLike, *, tolerance_ns: int = TOLERANCE_NS) -> F64:
+        """(M, 4, 4) poses T_dst_vehicle at times (M,), or (4, 4) at one time.
+
+        Raises:
+            MotionError: a time lies more than `tolerance_ns` outside; within it the motion is continued.
+        """
+        query = np.asarray(t_ns, dtype=np.int64)
+        poses = interpolate_poses(self.t_ns, self.T_dst_vehicle, np.atleast_1d(query), tolerance_ns=tolerance_ns)
+        return poses if query.ndim else poses[0]
+
+
+def deskew(
+    points_lidar_m: Array,
+    t_offset_ns: Array,
+    sweep_t_ns: int,
+    poses: Trajectory,
+    T_vehicle_lidar: F64,
+    reference_ns: int,
+) -> F64:
+    """(N, 3) float64 points in metres in the vehicle frame at `reference_ns`, order kept.
+
+    Args:
+        points_lidar_m: (N, 3) metres in the LiDAR frame, each at its own time.
+        t_offset_ns: (N,) integers, time of each point after `sweep_t_ns`.
+        sweep_t_ns: start of the sweep, UTC.
+        poses: the vehicle's trajectory in any frame.
+        T_vehicle_lidar: (4, 4) mount pose.
+        reference_ns: the time whose vehicle frame the result is in.
+
+    Raises:
+        MotionError: the trajectory does not cover the sweep.
+        ShapeError: wrong shapes, or points that are not finite.
+    """
+    points = points_3d("points_lidar_m", points_lidar_m)
+    offset = np.asarray(t_offset_ns).astype(np.int64)
+    check_array("t_offset_ns", offset, np.int64, (len(points),))
+    check_array("T_vehicle_lidar", T_vehicle_lidar, np.float64, (4, 4))
+    if not len(points):
+        return points
+    first, knots_ns = _knots(offset)
+    T_reference_dst = T_inverse(poses.at(reference_ns))
+    T_reference_lidar = T_reference_dst @ poses.at(sweep_t_ns + knots_ns) @ T_vehicle_lidar
+    return _blend(points, offset - first, np.ascontiguousarray(T_reference_lidar[:, :3, :]), _KNOT_NS)
+
+
+def _knots(offset_ns: I64) -> tuple[int, I64]:
+    """First offset, and times every millisecond from there to past the last one."""
+    first = int(offset_ns.min())
+    return first, first + _KNOT_NS * np.arange(int(offset_ns.max() - first) // _KNOT_NS + 2)
+
+
+@kernel
+def _blend(points: F64, offset_ns: I64, poses: F64, knot_ns: int) -> F64:
+    """Each point under the pose blended between the two knots around its time."""
+    out = np.empty_like(points)
+    for i in range(points.shape[0]):
+        k = offset_ns[i] // knot_ns
+        after = (offset_ns[i] - k * knot_ns) / knot_ns
+        before = 1.0 - after
+        x, y, z = points[i, 0], points[i, 1], points[i, 2]
+        for row in range(3):
+            a, b = poses[k, row], poses[k + 1, row]
+            out[i, row] = before * (a[0] * x + a[1] * y + a[2] * z + a[3]) + after * (
+                b[0] * x + b[1] * y + b[2] * z + b[3]
+            )
+    return out

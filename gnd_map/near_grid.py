@@ -1,0 +1,64 @@
+"""Grid coordinates of many points fast: the exact map expanded to second order about the middle of the points.
+
+Within RADIUS_M of the middle the error stays below 2 µm up to 80° of latitude (third order: d³·tan²|lat|/R²); points of
+wider clouds and nearer to a pole take `GridFrame.grid_of`. The tests compare the two.
+"""
+
+import numpy as np
+
+from gnd_map.arrays import F64
+from gnd_map.geodesy import WGS84_E2, enu_axes, meridian_radius_m, normal_radius_m
+from gnd_map.grid import VOXEL_M, GridFrame
+from gnd_map.jit import kernel
+from gnd_map.tile_id import TILE_RAD
+
+RADIUS_M = 300.0
+_MAX_LAT_RAD = np.radians(80.0)
+
+
+def grid_near(grid_frame: GridFrame, points_map_m: F64) -> F64:
+    """(N, 3) grid coordinates of points (N, 3), C-contiguous float64, finite, in metres in the map frame."""
+    if not len(points_map_m):
+        return np.empty((0, 3))
+    low, high = points_map_m.min(axis=0), points_map_m.max(axis=0)
+    middle = 0.5 * (low + high)
+    lat, _, _ = grid_frame.geodetic_of_grid(grid_frame.grid_of(middle[None, :])[0])
+    if float(np.linalg.norm(high - middle)) > RADIUS_M or abs(float(lat)) > _MAX_LAT_RAD:
+        return grid_frame.grid_of(points_map_m)
+    return _expand(points_map_m, middle, *_expansion(grid_frame, middle))
+
+
+def _expansion(grid_frame: GridFrame, middle: F64) -> tuple[F64, F64, F64, F64]:
+    """R_local_map (3, 3), g of the middle (3,), grid steps per radian and metre (3,), and what the curvature needs
+    (5,).
+    """
+    g = grid_frame.grid_of(middle[None, :])[0]
+    lat, lon, height = grid_frame.geodetic_of_grid(g)
+    R_local_map = enu_axes(lat, lon).T @ grid_frame.frame.R_ecef_enu
+    steps = np.array([grid_frame.nx / TILE_RAD, grid_frame.ny / TILE_RAD, 1.0 / VOXEL_M])
+    m = meridian_radius_m(lat)
+    dm_dlat = 3.0 * m * WGS84_E2 * np.sin(lat) * np.cos(lat) / (1.0 - WGS84_E2 * np.sin(lat) ** 2)
+    around_axis = (normal_radius_m(lat) + height) * np.cos(lat)
+    curvature = np.array([around_axis, m + height, np.sin(lat), np.cos(lat), dm_dlat], dtype=np.float64)
+    return np.ascontiguousarray(R_local_map), g, steps, curvature
+
+
+@kernel
+def _expand(points: F64, middle: F64, R_local_map: F64, g_middle: F64, steps: F64, curvature: F64) -> F64:
+    """Second-order geodetic coordinates of local east, north, up offsets (third order in longitude)."""
+    axis_m, meridian_m, sin_lat, cos_lat, dm_dlat = curvature
+    out = np.empty_like(points)
+    for i in range(points.shape[0]):
+        x, y, z = points[i, 0] - middle[0], points[i, 1] - middle[1], points[i, 2] - middle[2]
+        east = R_local_map[0, 0] * x + R_local_map[0, 1] * y + R_local_map[0, 2] * z
+        north = R_local_map[1, 0] * x + R_local_map[1, 1] * y + R_local_map[1, 2] * z
+        up = R_local_map[2, 0] * x + R_local_map[2, 1] * y + R_local_map[2, 2] * z
+        tangent = east / (axis_m + up * cos_lat - north * sin_lat)
+        bulge = 0.5 * east * east / axis_m  # how far the point moves out when it is turned back into the meridian plane
+        north -= bulge * sin_lat
+        up += bulge * cos_lat
+        arc = north / meridian_m
+        out[i, 0] = g_middle[0] + steps[0] * tangent * (1.0 - tangent * tangent / 3.0)
+        out[i, 1] = g_middle[1] + steps[1] * (arc * (1.0 - up / meridian_m) - 0.5 * dm_dlat / meridian_m * arc * arc)
+        out[i, 2] = g_middle[2] + steps[2] * (up + 0.5 * north * arc)
+    return out

@@ -1,0 +1,126 @@
+"""Rotations and rigid motions, vectorised. Poses are (4, 4) matrices T_dst_src: p_dst = T_dst_src @ p_src. Quaternions
+are x, y, z, w.
+
+Everything goes through unit quaternions, which stay exact near angles of 0 and π; scipy is the oracle of the tests.
+"""
+
+import numpy as np
+import numpy.typing as npt
+
+from gnd_map.arrays import F64, I64, check_array
+from gnd_map.errors import MotionError, ShapeError
+
+
+def R_from_quaternion_xyzw(q: npt.ArrayLike) -> F64:
+    """(..., 3, 3) rotations of quaternions (..., 4); they are normalised first.
+
+    Raises:
+        ShapeError: a quaternion has no length.
+    """
+    quaternion = np.asarray(q, dtype=np.float64)
+    length = np.linalg.norm(quaternion, axis=-1, keepdims=True)
+    if quaternion.shape[-1:] != (4,) or not (length > 0.0).all():
+        raise ShapeError(f"quaternions: expected (..., 4) of length > 0, got shape {quaternion.shape}")
+    x, y, z, w = np.moveaxis(quaternion / length, -1, 0)
+    rows = [
+        [1.0 - 2.0 * (y * y + z * z), 2.0 * (x * y - z * w), 2.0 * (x * z + y * w)],
+        [2.0 * (x * y + z * w), 1.0 - 2.0 * (x * x + z * z), 2.0 * (y * z - x * w)],
+        [2.0 * (x * z - y * w), 2.0 * (y * z + x * w), 1.0 - 2.0 * (x * x + y * y)],
+    ]
+    return np.stack([np.stack(row, axis=-1) for row in rows], axis=-2)
+
+
+def quaternion_xyzw_from_R(R: npt.ArrayLike) -> F64:
+    """(..., 4) unit quaternions, w >= 0, of rotations (..., 3, 3): of Shepperd's four forms the best conditioned."""
+    m = np.asarray(R, dtype=np.float64)
+    xx, yy, zz = m[..., 0, 0], m[..., 1, 1], m[..., 2, 2]
+    x, y, z = m[..., 2, 1] - m[..., 1, 2], m[..., 0, 2] - m[..., 2, 0], m[..., 1, 0] - m[..., 0, 1]
+    xy, xz, yz = m[..., 0, 1] + m[..., 1, 0], m[..., 0, 2] + m[..., 2, 0], m[..., 1, 2] + m[..., 2, 1]
+    forms = [
+        [1.0 + xx - yy - zz, xy, xz, x],
+        [xy, 1.0 - xx + yy - zz, yz, y],
+        [xz, yz, 1.0 - xx - yy + zz, z],
+        [x, y, z, 1.0 + xx + yy + zz],
+    ]
+    stacked = np.stack([np.stack(form, axis=-1) for form in forms], axis=-2)
+    best = np.argmax(np.stack([xx, yy, zz, xx + yy + zz], axis=-1), axis=-1)
+    q = np.take_along_axis(stacked, best[..., None, None], axis=-2)[..., 0, :]
+    q = q / np.linalg.norm(q, axis=-1, keepdims=True)
+    return np.asarray(np.where(q[..., 3:] < 0.0, -q, q))
+
+
+def exp_so3(rotation_vector: npt.ArrayLike) -> F64:
+    """(..., 3, 3) rotations about the vectors (..., 3) by their lengths in radians."""
+    v = np.asarray(rotation_vector, dtype=np.float64)
+    angle = np.linalg.norm(v, axis=-1, keepdims=True)
+    half_sine = 0.5 * np.sinc(angle / (2.0 * np.pi))  # sin(angle/2)/angle
+    return R_from_quaternion_xyzw(np.concatenate([half_sine * v, np.cos(0.5 * angle)], axis=-1))
+
+
+def log_so3(R: npt.ArrayLike) -> F64:
+    """(..., 3) rotation vectors, length 0 … π radians, of rotations (..., 3, 3)."""
+    q = quaternion_xyzw_from_R(R)
+    sine = np.linalg.norm(q[..., :3], axis=-1, keepdims=True)
+    angle = 2.0 * np.arctan2(sine, q[..., 3:])
+    return q[..., :3] * np.where(sine > 1e-12, angle / np.maximum(sine, 1e-12), 2.0)
+
+
+def T_from_R_t(R: npt.ArrayLike, t_m: npt.ArrayLike) -> F64:
+    """(..., 4, 4) poses of rotations (..., 3, 3) and translations (..., 3)."""
+    rotation, translation = np.asarray(R, dtype=np.float64), np.asarray(t_m, dtype=np.float64)
+    T = np.zeros((*rotation.shape[:-2], 4, 4))
+    T[..., :3, :3], T[..., :3, 3], T[..., 3, 3] = rotation, translation, 1.0
+    return T
+
+
+def T_inverse(T: npt.ArrayLike) -> F64:
+    """(..., 4, 4) inverse poses: T_src_dst of T_dst_src."""
+    pose = np.asarray(T, dtype=np.float64)
+    R = np.swapaxes(pose[..., :3, :3], -1, -2)
+    return T_from_R_t(R, -np.einsum("...ij,...j->...i", R, pose[..., :3, 3]))
+
+
+def transform(T_dst_src: npt.ArrayLike, points_src_m: npt.ArrayLike) -> F64:
+    """(N, 3) points in the frame dst of points (N, 3) in the frame src, for one pose (4, 4)."""
+    T = np.asarray(T_dst_src, dtype=np.float64)
+    return np.asarray(points_src_m, dtype=np.float64) @ T[:3, :3].T + T[:3, 3]
+
+
+def interpolate_poses(t_ns: I64, T: F64, query_ns: npt.ArrayLike, *, tolerance_ns: int = 0) -> F64:
+    """(M, 4, 4) poses at times (M,): translation linear, rotation along the shortest arc (slerp).
+
+    Args:
+        t_ns: (N,) int64, strictly increasing.
+        T: (N, 4, 4) poses at these times.
+        query_ns: (M,) int64.
+        tolerance_ns: how far outside the known times the first or last motion is continued.
+
+    Raises:
+        MotionError: a time lies further outside, or there are no poses.
+        ShapeError: wrong shapes.
+    """
+    query = np.asarray(query_ns, dtype=np.int64)
+    check_array("t_ns", t_ns, np.int64, (None,))
+    check_array("T", T, np.float64, (len(t_ns), 4, 4))
+    check_array("query_ns", query, np.int64, (None,))
+    _check_covered(t_ns, query, tolerance_ns)
+    if len(t_ns) == 1:
+        return np.repeat(T, len(query), axis=0)
+    k = np.clip(np.searchsorted(t_ns, query, side="right") - 1, 0, len(t_ns) - 2)
+    part = (query - t_ns[k]) / (t_ns[k + 1] - t_ns[k])
+    turn = log_so3(np.swapaxes(T[:-1, :3, :3], -1, -2) @ T[1:, :3, :3])
+    R = T[k, :3, :3] @ exp_so3(part[:, None] * turn[k])
+    return T_from_R_t(R, T[k, :3, 3] + part[:, None] * (T[k + 1, :3, 3] - T[k, :3, 3]))
+
+
+def _check_covered(t_ns: I64, query: I64, tolerance_ns: int) -> None:
+    if not len(t_ns):
+        raise MotionError("no poses to interpolate")
+    if not len(query):
+        return
+    before, after = int(t_ns[0] - query.min()), int(query.max() - t_ns[-1])
+    if max(before, after) > tolerance_ns:
+        raise MotionError(
+            f"times {query.min()} … {query.max()} ns lie up to {max(before, after) / 1e9:.3f} s outside the poses "
+            f"{t_ns[0]} … {t_ns[-1]} ns; {tolerance_ns / 1e9:.3f} s are allowed"
+        )
