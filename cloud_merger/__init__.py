@@ -1,1 +1,1 @@
-
+"""Merger shards: take reports in, merge tiles, publish versions (GND section 5)."""

@@ -1,0 +1,77 @@
+"""Update notices. The store keeps a mark for each version that nobody has announced, written in the version's own
+transaction; so a notice outlives the shard that published the version, and goes out at least once.
+"""
+
+import logging
+from collections import OrderedDict
+from typing import Final
+
+from cloud_merger.ownership import Members
+from fleet_bus.bus import Bus
+from fleet_bus.subscribing import RecallingPublisher
+from gnd_map.tile import Tile, diff
+from schemas.keys import update_key
+from schemas.tiles import TileBlob, tile_of
+from schemas.updates import TileUpdate
+from tile_store.store import Store
+from tile_store.values import Notice, StoredTile
+
+REMEMBERED_KEYS: Final = 256
+_LOG = logging.getLogger(__name__)
+
+
+class Announcer:
+    """Announces the versions of the districts that this shard owns, oldest first, then unmarks them.
+
+    The last notice of each of the newest `REMEMBERED_KEYS` tiles is repeated to late subscribers.
+    """
+
+    def __init__(self, store: Store, bus: Bus, members: Members) -> None:
+        self._store, self._bus, self._members = store, bus, members
+        self._publishers: OrderedDict[str, RecallingPublisher] = OrderedDict()
+
+    def announce(self, at_most: int) -> int:
+        """Announce what waits, up to `at_most` versions; the number announced (0 without a router)."""
+        if not self._bus.is_connected():
+            return 0  # a notice put without a router would vanish in silence
+        waiting = [one for one in self._store.notices(n=at_most) if self._members.is_mine(one.tile.district)]
+        for notice in waiting:
+            self._announce(notice)
+        if waiting:
+            self._store.announced(waiting)
+        return len(waiting)
+
+    def _announce(self, notice: Notice) -> None:
+        stored = self._store.get(notice.layer, notice.tile, notice.version)
+        if stored is None:
+            _LOG.info("%s version %d went before it was announced", notice.tile, notice.version)
+            return
+        parent = self._store.get(notice.layer, notice.tile, stored.parent) if stored.parent else None
+        key = update_key(notice.layer, notice.tile)
+        self._publisher(key).put(update_of(stored, parent).encode(), tile=notice.tile)
+
+    def _publisher(self, key: str) -> RecallingPublisher:
+        publisher = self._publishers.pop(key, None) or self._bus.advanced_publisher(key)
+        self._publishers[key] = publisher
+        if len(self._publishers) > REMEMBERED_KEYS:
+            self._publishers.popitem(last=False)[1].close()
+        return publisher
+
+
+def update_of(stored: StoredTile, parent: StoredTile | None) -> TileUpdate:
+    """The notice of a version; without its parent (new tile, or gone from the store) it carries no delta."""
+    return TileUpdate(
+        tile=stored.tile,
+        layer=stored.layer,
+        version=stored.version,
+        previous_version=parent.version if parent else 0,
+        sha=stored.sha,
+        previous_sha=parent.sha if parent else b"",
+        reason=stored.kind,
+        delta=diff(tile_from(parent).gaussians, tile_from(stored).gaussians) if parent else None,
+    )
+
+
+def tile_from(stored: StoredTile) -> Tile:
+    """The tile of a stored version, its hash verified. `SchemaError` when the body is not what the hash says."""
+    return tile_of(TileBlob(stored.tile, stored.version, stored.sha, stored.codec_id, stored.body))

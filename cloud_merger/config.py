@@ -1,0 +1,66 @@
+"""Settings of a shard; the defaults run."""
+
+import re
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, Final
+
+from cloud_merger.errors import MergerError
+from cloud_merger.ingest import IngestLimits
+from cloud_merger.merge import MergeParameters
+from fleet_bus.config import DEFAULT_ENDPOINT
+from gnd_map.config import from_mapping
+from tile_store.values import StoreConfig
+
+_SHARD_ID: Final = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,63}")
+
+
+@dataclass(frozen=True, slots=True)
+class ShardConfig:
+    """One merger shard.
+
+    Attributes:
+        shard_id: its name among the shards; each running shard needs its own.
+        store_path: file of the store, which all shards of a machine share.
+        connect: endpoints of routers.
+        bus_lease_ms: how long a silent shard counts as alive; 0: the bus's own.
+        merge: how statements become changes.
+        ingest: which reports are refused.
+        store: batching of the store.
+        tiles_at_once: tiles claimed and published together.
+        lease_s: how long a claim holds; longer than a merge of `tiles_at_once` tiles takes.
+        poll_s: how often to look for tiles and notices when nothing arrives here.
+        max_attempts: a tile whose merge fails so often is set aside.
+        retry_s: pause before a failed tile is tried again, times the number of attempts.
+        announce_at_once: publish a notice for at most so many versions in one round.
+    """
+
+    shard_id: str = "merger-1"
+    store_path: Path = Path("map.sqlite")
+    connect: tuple[str, ...] = (DEFAULT_ENDPOINT,)
+    bus_lease_ms: int = 0
+    merge: MergeParameters = field(default_factory=MergeParameters)
+    ingest: IngestLimits = field(default_factory=IngestLimits)
+    store: StoreConfig = field(default_factory=StoreConfig)
+    tiles_at_once: int = 16
+    lease_s: float = 30.0
+    poll_s: float = 0.2
+    max_attempts: int = 5
+    retry_s: float = 0.5
+    announce_at_once: int = 256
+
+    def __post_init__(self) -> None:
+        if not _SHARD_ID.fullmatch(self.shard_id):
+            raise MergerError(f"shard id {self.shard_id!r} must be 1 to 64 of letters, digits, '.', '_', '-'")
+        if min(self.tiles_at_once, self.max_attempts, self.announce_at_once) < 1:
+            raise MergerError("tiles_at_once, max_attempts and announce_at_once must be at least 1")
+        if min(self.lease_s, self.poll_s) <= 0 or self.retry_s < 0:
+            raise MergerError(
+                f"lease_s {self.lease_s} and poll_s {self.poll_s} must be positive, retry_s {self.retry_s} >= 0"
+            )
+
+    @classmethod
+    def from_mapping(cls, mapping: Mapping[str, Any]) -> "ShardConfig":
+        """From plain values, as read from TOML; `ConfigError` for an unknown key."""
+        return from_mapping(cls, mapping, where="merger")

@@ -1,0 +1,237 @@
+"""The cloud merge of a tile as a pure function (GND section 5).
+
+The merged tile depends on the epoch tile and on the set of all reports since the epoch, in the order of their ids, and
+on nothing else: in whatever batches and retries they came, the same reports give the same tile, bit for bit.
+"""
+
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cloud_merger.cluster import Index, dbscan
+from cloud_merger.errors import MergerError
+from cloud_merger.statements import Kind, Mode, Rows, Statements, states_at
+from gnd_map.gaussian import Gaussians
+from gnd_map.similarity import pairs_within, similarity
+from gnd_map.tile import TileDelta, apply
+
+PAIRS_AT_ONCE = 200_000  # bounds the memory of the similarities
+
+
+@dataclass(frozen=True, slots=True)
+class MergeParameters:
+    """How statements become changes.
+
+    Attributes:
+        mode: "paper": only uploaded changes count (GND as printed, with the corrections without which it cannot run);
+            "default": the votes are those of all who observed the voxel, and similarity is the smooth one.
+        eps: DBSCAN's neighbourhood on 1 - similarity.
+        min_samples: DBSCAN's core weight.
+        xi: a cluster must hold more than this share of the voxel's statements (ξ_update).
+        d_update: published when the candidate's similarity to the epoch's voxel is smaller than this.
+        noise_m: added (squared) to the covariances that the default similarity compares.
+    """
+
+    mode: Mode = "default"
+    eps: float = 0.5
+    min_samples: int = 1
+    xi: float = 0.6
+    d_update: float = 0.5
+    noise_m: float = 0.05
+
+    def __post_init__(self) -> None:
+        if self.mode not in ("paper", "default"):
+            raise MergerError(f"mode must be 'paper' or 'default', got {self.mode!r}")
+        if not 0 < self.eps < 1:
+            raise MergerError(
+                f"eps must lie in (0, 1), got {self.eps}: at 1 Gaussians that share nothing are neighbours"
+            )
+        if self.min_samples < 1:
+            raise MergerError(f"min_samples must be at least 1, got {self.min_samples}")
+        if not 0 <= self.xi < 1 or not 0 <= self.d_update <= 1:
+            raise MergerError(f"xi must lie in [0, 1) and d_update in [0, 1], got {self.xi} and {self.d_update}")
+
+
+@dataclass(frozen=True, slots=True)
+class MergedTile:
+    """A merged tile.
+
+    Attributes:
+        gaussians: the epoch's with the decided changes applied.
+        changed: int32 (C,) sorted ids of the voxels that differ from the epoch by decision.
+        provenance: for each changed voxel the ids of the reports in the cluster that won it.
+    """
+
+    gaussians: Gaussians
+    changed: NDArray[np.int32]
+    provenance: dict[int, tuple[str, ...]] = field(default_factory=dict)
+
+
+def merge_tile(epoch: Gaussians, statements: Statements, parameters: MergeParameters | None = None) -> MergedTile:
+    """Decide what the statements change in the epoch tile (GND 5.1 to 5.3).
+
+    Args:
+        epoch: the tile's Gaussians at its last base or rollback (empty for an unmapped tile).
+        statements: of `statements_of` with the same epoch and mode.
+        parameters: see `MergeParameters`.
+    """
+    parameters = parameters or MergeParameters()
+    rows = statements.rows
+    cluster = _clusters(rows, parameters)
+    winner = _winners(rows["voxel_id"], cluster, parameters.xi)
+    member = np.isin(cluster, winner)
+    rows, cluster = rows[member], np.searchsorted(winner, cluster[member])
+    candidate = _representatives(rows, cluster)
+    decided = _differs(epoch, candidate, parameters) & ~_confirmed(epoch, rows, cluster)
+    return _merged(epoch, candidate[decided], statements, rows[decided[cluster]])
+
+
+def _clusters(rows: Rows, parameters: MergeParameters) -> Index:
+    """GND 5.1: the cluster of each statement, numbered by voxel, then by the cluster's first report; -1 is noise."""
+    first, node = _nodes(rows)
+    nodes = rows[first]
+    i, j = pairs_within(nodes["voxel_id"])
+    there = (nodes["kind"][i] != Kind.NOTHING) & (nodes["kind"][j] != Kind.NOTHING)  # Eq. 14: else similarity 0
+    i, j = i[there], j[there]
+    label = dbscan(
+        np.bincount(node, minlength=len(first)).astype(np.int64),
+        i,
+        j,
+        1.0 - _similarities(nodes, i, j, parameters),
+        eps=parameters.eps,
+        min_samples=parameters.min_samples,
+    )
+    return label[node]
+
+
+def _nodes(rows: Rows) -> tuple[Index, Index]:
+    """Statements of a voxel that say the same are one node: (first row of each node, node of each row).
+
+    Equal statements have similarity 1, so this changes no cluster; it saves most of the pairs.
+    """
+    said = np.where(rows["kind"] == Kind.QUOTED, 1 + rows["base"].astype(np.int64), 0)
+    measured = rows["kind"] == Kind.MEASURED  # each its own node
+    said[measured] = 1 + said.max(initial=0) + np.flatnonzero(measured)
+    key = rows["voxel_id"].astype(np.int64) * (1 << 32) + said
+    _, first, inverse = np.unique(key, return_index=True, return_inverse=True)
+    return np.sort(first), np.argsort(np.argsort(first))[inverse]
+
+
+def _similarities(nodes: Rows, i: Index, j: Index, parameters: MergeParameters) -> NDArray[np.float64]:
+    """Eq. 13 for each pair."""
+    parts = [np.zeros(0)]
+    for start in range(0, len(i), PAIRS_AT_ONCE):
+        a, b = nodes[i[start : start + PAIRS_AT_ONCE]], nodes[j[start : start + PAIRS_AT_ONCE]]
+        parts.append(_similarity(a, b, parameters))
+    return np.concatenate(parts)
+
+
+def _similarity(a: Rows, b: Rows, parameters: MergeParameters) -> NDArray[np.float64]:
+    return similarity(
+        a["count"] > 0,
+        a["mean_m"],
+        a["cov_m2"],
+        b["count"] > 0,
+        b["mean_m"],
+        b["cov_m2"],
+        parameters.mode,
+        noise_m=parameters.noise_m,
+    )
+
+
+def _winners(voxel_id: NDArray[np.int32], cluster: Index, xi: float) -> Index:
+    """GND 5.3: of each voxel the cluster with most statements, if it holds more than ξ of all. Sorted cluster numbers.
+
+    Of equally large clusters the one with the earliest report wins.
+    """
+    in_cluster = cluster >= 0
+    number, first, size = np.unique(cluster[in_cluster], return_index=True, return_counts=True)
+    voxel = voxel_id[in_cluster][first]
+    order = np.lexsort((number, -size, voxel))
+    best = order[np.unique(voxel[order], return_index=True)[1]]
+    observed, n_observers = np.unique(voxel_id, return_counts=True)
+    n = n_observers[np.searchsorted(observed, voxel[best])]
+    return np.sort(number[best[size[best] > xi * n]])
+
+
+def _representatives(rows: Rows, cluster: Index) -> Rows:
+    """GND 5.2: one row a cluster, by the recursive update of sample mean and covariance over its measured statements.
+
+    A quoted Gaussian is no new measurement: it represents its cluster only where nobody measured, and then once.
+
+    Args:
+        rows: members, ordered by report within a cluster.
+        cluster: (M,) 0 … C-1 of each row.
+    """
+    n_clusters = int(cluster.max(initial=-1)) + 1
+    measured = rows["kind"] == Kind.MEASURED
+    has_measured = np.bincount(cluster[measured], minlength=n_clusters) > 0
+    first = np.unique(cluster, return_index=True)[1]
+    use = measured.copy()
+    use[first[~has_measured]] = True
+    return _recursive_moments(rows[use], cluster[use])
+
+
+def _recursive_moments(rows: Rows, cluster: Index) -> Rows:
+    """Merge sample means and covariances (population form), one member of every cluster at a time."""
+    order = np.argsort(cluster, kind="stable")
+    rows, cluster = rows[order], cluster[order]
+    first = np.unique(cluster, return_index=True)[1]
+    turn = np.arange(len(rows)) - first[cluster]
+    merged = rows[first].copy()
+    n = merged["count"].astype(np.int64)
+    mean, cov = merged["mean_m"].astype(np.float64), merged["cov_m2"].astype(np.float64)
+    for k in range(1, int(turn.max(initial=0)) + 1):
+        new = rows[turn == k]
+        c = cluster[turn == k]
+        total = n[c] + new["count"]
+        share = (new["count"] / total)[:, None]
+        step = new["mean_m"] - mean[c]
+        mean[c] += share * step
+        cov[c] += share * (new["cov_m2"] - cov[c]) + share * (1 - share) * _outer(step)
+        n[c] = total
+    merged["count"] = np.minimum(n, np.iinfo(np.int32).max)
+    np.maximum.at(merged["cells"], cluster, rows["cells"])
+    merged["mean_m"], merged["cov_m2"] = mean, cov
+    return merged
+
+
+def _outer(v: NDArray[np.float64]) -> NDArray[np.float64]:
+    """V v^T of (N, 3) as (N, 6) xx, xy, xz, yy, yz, zz."""
+    x, y, z = v.T
+    return np.stack([x * x, x * y, x * z, y * y, y * z, z * z], axis=1)
+
+
+def _differs(epoch: Gaussians, candidate: Rows, parameters: MergeParameters) -> NDArray[np.bool_]:
+    """GND 5.3: a candidate is a change when its similarity to the base voxel is SMALLER than d_update."""
+    was = states_at(epoch, candidate["voxel_id"], Kind.QUOTED)
+    return _similarity(was, candidate, parameters) < parameters.d_update
+
+
+def _confirmed(epoch: Gaussians, rows: Rows, cluster: Index) -> NDArray[np.bool_]:
+    """Clusters in which at least half of the statements quote the epoch's own voxel.
+
+    Neighbours of neighbours share a cluster, so without this two changed measurements could carry a majority that says
+    "as it was".
+    """
+    was = states_at(epoch, rows["voxel_id"], Kind.QUOTED)
+    same = rows["kind"] == Kind.QUOTED
+    for name in ("count", "mean_m", "cov_m2"):
+        same &= (rows[name] == was[name]).reshape(len(rows), -1).all(axis=1)
+    return np.asarray(2 * np.bincount(cluster, weights=same) >= np.bincount(cluster))
+
+
+def _merged(epoch: Gaussians, changes: Rows, statements: Statements, members: Rows) -> MergedTile:
+    """The epoch with the changes applied, and who said so."""
+    there = changes[changes["count"] > 0]
+    put = Gaussians(*(np.ascontiguousarray(there[name]) for name in ("voxel_id", "count", "cells", "mean_m", "cov_m2")))
+    gone = np.ascontiguousarray(changes["voxel_id"][changes["count"] == 0])
+    said_by: dict[int, list[str]] = {int(voxel): [] for voxel in changes["voxel_id"]}
+    for row in members:
+        said_by[int(row["voxel_id"])].append(statements.report_ids[row["report"]])
+    return MergedTile(
+        gaussians=apply(epoch, TileDelta(gone, put)),
+        changed=np.ascontiguousarray(changes["voxel_id"]),
+        provenance={voxel: tuple(ids) for voxel, ids in said_by.items()},
+    )

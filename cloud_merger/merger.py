@@ -1,0 +1,49 @@
+"""The cloud's half of the loop: reports come in, tiles are merged, versions go out."""
+
+import logging
+import threading
+
+from cloud_merger.announce import Announcer
+from cloud_merger.config import ShardConfig
+from cloud_merger.ingest import Ingest
+from cloud_merger.ownership import Members
+from cloud_merger.reception import Reception, districts_of
+from cloud_merger.work import Worker
+from fleet_bus.bus import open_bus
+from fleet_bus.config import BusConfig
+from tile_store.sqlite_store import SqliteStore
+
+__all__ = ["ShardConfig", "run_shard"]
+_LOG = logging.getLogger(__name__)
+
+
+def run_shard(config: ShardConfig, stop: threading.Event) -> None:
+    """Run one merger shard until `stop` is set.
+
+    Any number of shards may share a store. What one leaves undone, when it ends or is killed, another does.
+
+    Raises:
+        StoreError: the store cannot be opened or has failed.
+        NoRouter: no router answers at the start.
+    """
+    bus_config = BusConfig(connect=config.connect, lease_ms=config.bus_lease_ms)
+    with SqliteStore(config.store_path, config.store) as store, open_bus(bus_config, name=config.shard_id) as bus:
+        members = Members(config.shard_id)
+        wake = threading.Event()
+        store.release(config.shard_id)  # leases of an earlier life
+
+        # Ingest: check, keep, acknowledge, in threads of the bus.
+        ingest = Ingest(store, config.ingest, on_stored=wake.set)
+        reception = Reception(bus, members, ingest.answer, on_death=store.release)
+        reception.open(districts_of(store))
+
+        worker, announcer = Worker(store, config), Announcer(store, bus, members)
+        while not stop.is_set():
+            claims = store.claim(config.shard_id, config.tiles_at_once, config.lease_s, prefer=reception.districts)
+            merged = worker.merge(claims)  # load, decode, cluster, decide
+            store.publish(merged)  # compare-and-swap; a stale one is refused and its tile claimed again
+            n_announced = announcer.announce(config.announce_at_once)  # after the commit
+            if not claims and not n_announced:
+                wake.wait(worker.idle_s(store.next_ready_ns()))
+                wake.clear()
+        store.release(config.shard_id)

@@ -1,0 +1,45 @@
+"""Which shard answers for which district: rendezvous hashing over the shards that live.
+
+Every member computes the same owner from the same members, without talking; when one goes, only its districts move.
+Ownership spreads the ingest and keeps caches warm. It protects nothing: that is the store's compare-and-swap.
+"""
+
+import threading
+from collections.abc import Collection
+from hashlib import blake2b
+
+from gnd_map.tile_id import District
+
+
+def owner_of(district: District, members: Collection[str]) -> str:
+    """The member with the highest hash of (member, district); the same in every process. `members` is not empty."""
+    return max(members, key=lambda member: (_score(member, district), member))
+
+
+def _score(member: str, district: District) -> bytes:
+    return blake2b(f"{member}\0{district.path}".encode(), digest_size=16).digest()
+
+
+class Members:
+    """The shards that live, as this shard sees them; itself always among them. Safe to use from any thread."""
+
+    def __init__(self, own: str) -> None:
+        self.own = own
+        self._lock = threading.Lock()
+        self._living = frozenset({own})
+
+    @property
+    def living(self) -> frozenset[str]:
+        """All members now."""
+        return self._living
+
+    def note(self, member: str, *, alive: bool) -> bool:
+        """A token has come or gone; whether that changes who lives."""
+        with self._lock:
+            before = self._living
+            self._living = before | {member} if alive else (before - {member}) | {self.own}
+            return self._living != before
+
+    def is_mine(self, district: District) -> bool:
+        """Whether this shard owns the district among those that live."""
+        return owner_of(district, self._living) == self.own

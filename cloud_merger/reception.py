@@ -1,0 +1,106 @@
+"""Where reports are received: a `complete` queryable on every district owned, and a fallback for all others.
+
+The router hands a report to the owner's complete queryable alone. Of a district that has none (new in the map, or its
+owner has just died) every shard's fallback hears; there, only the shard that now owns the district answers, and from
+then on declares it. So there is one ack in normal operation; while the shards' views of who lives differ, none (the
+vehicle asks again) or two (storing twice has no effect).
+"""
+
+import logging
+import threading
+from collections.abc import Callable, Iterable
+
+from cloud_merger.ownership import Members
+from fleet_bus.bus import Bus
+from fleet_bus.errors import NotMine
+from fleet_bus.serving import Request, Serving
+from gnd_map.tile_id import District
+from schemas.changes import ChangeAck
+from schemas.errors import SchemaError
+from schemas.keys import alive_key, alive_keys, change_key, change_keys, parse_alive_key, parse_change_key
+from tile_store.store import Store
+
+ROLE = "merger"
+_LOG = logging.getLogger(__name__)
+
+Place = tuple[str, District]  # layer and district
+Answer = Callable[[str, bytes], ChangeAck]
+
+
+def districts_of(store: Store) -> set[Place]:
+    """Every layer and district of which the store holds tiles."""
+    return {(layer, head.tile.district) for layer in store.layers() for head in store.heads(layer)}
+
+
+class Reception:
+    """Declares this shard's queryables and its sign of life, and moves them when members come and go.
+
+    Args:
+        bus: open.
+        members: kept up to date here.
+        answer: takes (key, encoded ChangeReport) and gives the ack; called from several threads.
+        on_death: called with the name of a member that has gone.
+    """
+
+    def __init__(self, bus: Bus, members: Members, answer: Answer, on_death: Callable[[str], object]) -> None:
+        self._bus, self._members, self._answer, self._on_death = bus, members, answer, on_death
+        self._lock = threading.Lock()
+        self._known: set[Place] = set()
+        self._declared: dict[Place, Serving] = {}
+
+    def open(self, known: Iterable[Place]) -> None:
+        """Begin to receive for the places that the map holds. The sign of life comes last."""
+        self._bus.watch_alive(alive_keys(ROLE), self._on_alive)
+        self._bus.serve(change_keys(), self._fallback, kind="change")
+        self._settle(known)
+        self._bus.declare_alive(alive_key(ROLE, self._members.own))
+
+    @property
+    def districts(self) -> tuple[str, ...]:
+        """Paths of the districts that this shard answers for, sorted."""
+        with self._lock:
+            return tuple(sorted({district.path for _, district in self._declared}))
+
+    def _settle(self, new: Iterable[Place] = ()) -> None:
+        """Declare what is owned, and only that."""
+        with self._lock:
+            self._known.update(new)
+            for place in sorted(self._known):
+                mine = self._members.is_mine(place[1])
+                if mine and place not in self._declared:
+                    self._declared[place] = self._declare(place)
+                elif not mine and place in self._declared:
+                    self._declared.pop(place).close()
+
+    def _declare(self, place: Place) -> Serving:
+        return self._bus.serve(change_key(*place), self._own, complete=True, workers=2, kind="change")
+
+    def _own(self, request: Request) -> bytes:
+        return self._answer(request.key, request.payload).encode()
+
+    def _fallback(self, request: Request) -> bytes:
+        place = _place(request.key)
+        if place is None:
+            return self._own(request)  # nobody owns such a key; the answer says why it is refused
+        if place in self._declared or not self._members.is_mine(place[1]):
+            raise NotMine
+        ack = self._answer(request.key, request.payload)
+        if ack.status != "quarantined":
+            self._settle([place])
+        return ack.encode()
+
+    def _on_alive(self, key: str, alive: bool) -> None:
+        member = parse_alive_key(key)[1]
+        if not self._members.note(member, alive=alive):
+            return
+        _LOG.info("%s: %s has %s", self._members.own, member, "joined" if alive else "gone")
+        if not alive:
+            self._on_death(member)
+        self._settle()
+
+
+def _place(key: str) -> Place | None:
+    try:
+        return parse_change_key(key)
+    except SchemaError:
+        return None

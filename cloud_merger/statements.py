@@ -1,0 +1,151 @@
+"""What the reports of a tile say, voxel by voxel.
+
+A report is a statement about the world for every voxel that its drive observed: "Gaussian G is here", "nothing is
+here", or "as in base version v". The last is resolved by the hash of v, so a report against an older version is
+rebased, not lost.
+"""
+
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from enum import IntEnum
+from typing import Any, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from gnd_map.accumulate import N_MIN_CELLS
+from gnd_map.classes import ChangeClass
+from gnd_map.gaussian import Gaussians
+from gnd_map.tile import diff
+from schemas.changes import TileChange
+
+Mode = Literal["paper", "default"]
+NO_BASE = b""  # hash in the report of a vehicle that had no map of the tile
+
+
+class Kind(IntEnum):
+    """What a statement says about a voxel."""
+
+    NOTHING = 0
+    QUOTED = 1  # the Gaussian of the base version, seen to be still there
+    MEASURED = 2
+
+
+# One statement. `report` indexes Statements.report_ids; `base` numbers the version that a QUOTED one quotes, else 0;
+# count 0 for NOTHING; mean relative to the voxel centre along tile ENU axes; covariance xx, xy, xz, yy, yz, zz.
+STATEMENT = np.dtype(
+    [
+        ("voxel_id", np.int32),
+        ("report", np.int32),
+        ("kind", np.uint8),
+        ("base", np.int32),
+        ("count", np.int32),
+        ("cells", np.int32),
+        ("mean_m", np.float32, 3),
+        ("cov_m2", np.float32, 6),
+    ]
+)
+Rows = NDArray[Any]  # of dtype STATEMENT
+
+
+@dataclass(frozen=True, slots=True)
+class Report:
+    """One report's part about one tile."""
+
+    report_id: str
+    change: TileChange
+
+
+@dataclass(frozen=True, slots=True)
+class Statements:
+    """Statements sorted by voxel, then by report id; at most one a voxel and report.
+
+    Attributes:
+        report_ids: (R,) sorted.
+        rows: STATEMENT (M,).
+    """
+
+    report_ids: tuple[str, ...]
+    rows: Rows
+
+
+def statements_of(
+    epoch: Gaussians, reports: Iterable[Report], bases: Mapping[bytes, Gaussians], mode: Mode = "default"
+) -> Statements:
+    """Every statement about the voxels on which not all agree with the epoch tile.
+
+    A voxel of which every report says "as in the epoch" stays as it is whatever the parameters, so it is left out.
+
+    Args:
+        epoch: the tile that all reports of this epoch are merged into.
+        reports: in any order; a report id that comes again is ignored.
+        bases: Gaussians of the tile's versions by hash. Of an unknown base, "as in base version" abstains.
+        mode: "paper" takes the uploaded changes only; "default" every observed voxel.
+    """
+    ordered = sorted({report.report_id: report for report in reports}.values(), key=lambda r: r.report_id)
+    known = {NO_BASE: Gaussians.empty(), **bases} if mode == "default" else {}
+    number = {sha: k for k, sha in enumerate(sorted(known))}
+    voxels = _disputed(epoch, ordered, known)
+    parts = [np.zeros(0, STATEMENT)]
+    for k, report in enumerate(ordered):
+        sha = report.change.base_sha
+        parts.append(_statements(k, report.change, voxels, known.get(sha), number.get(sha, 0)))
+    rows = np.concatenate(parts)
+    rows = rows[np.argsort(rows["voxel_id"], kind="stable")]  # the parts came in the order of report ids
+    return Statements(tuple(report.report_id for report in ordered), rows)
+
+
+def _disputed(epoch: Gaussians, reports: Sequence[Report], known: Mapping[bytes, Gaussians]) -> NDArray[np.int32]:
+    """Sorted ids of voxels that a report changes, or whose quoted base differs from the epoch."""
+    ids = [np.zeros(0, np.int32)]
+    ids += [report.change.changed.voxel_id for report in reports]
+    for sha in {report.change.base_sha for report in reports} & set(known):
+        delta = diff(epoch, known[sha])
+        ids += [delta.removed, delta.put.voxel_id]
+    return np.unique(np.concatenate(ids)).astype(np.int32)
+
+
+def _statements(
+    report: int, change: TileChange, voxels: NDArray[np.int32], base: Gaussians | None, base_number: int
+) -> Rows:
+    """One report's statements about those of `voxels` that it observed; without a base only its changes speak."""
+    voxel_id = np.intersect1d(change.observed, voxels, assume_unique=True)
+    rows = states_at(base or Gaussians.empty(), voxel_id, Kind.QUOTED, base_number)
+    speaks = np.full(len(rows), base is not None)
+    at = _find(change.changed.voxel_id, voxel_id)
+    rows[at >= 0] = _states(change.changed, Kind.MEASURED)[at[at >= 0]]
+    speaks[at >= 0] = _speaks(change)[at[at >= 0]]
+    rows["report"] = report
+    spoken: Rows = rows[speaks]
+    return spoken
+
+
+def states_at(gaussians: Gaussians, voxel_id: NDArray[np.int32], kind: Kind, base: int = 0) -> Rows:
+    """STATEMENT (len(voxel_id),): what `gaussians` holds at each voxel, NOTHING where they hold none."""
+    states = np.concatenate([_states(gaussians, kind, base), np.zeros(1, STATEMENT)])  # found at -1: nothing
+    rows: Rows = states[_find(gaussians.voxel_id, voxel_id)]
+    rows["voxel_id"] = voxel_id
+    return rows
+
+
+def _states(gaussians: Gaussians, kind: Kind, base: int = 0) -> Rows:
+    rows = np.zeros(len(gaussians), STATEMENT)
+    for name in ("voxel_id", "count", "cells", "mean_m", "cov_m2"):
+        rows[name] = getattr(gaussians, name)
+    rows["kind"] = np.where(gaussians.exists, kind, Kind.NOTHING)
+    rows["base"] = np.where(gaussians.exists, base, 0)
+    return rows
+
+
+def _speaks(change: TileChange) -> NDArray[np.bool_]:
+    """Changed entries that are a statement: not unmeasured, and no Gaussian from too few sub-cells."""
+    weak = change.changed.exists & (change.changed.cells < N_MIN_CELLS)
+    return np.asarray(~weak & (change.change_class != ChangeClass.UNMEASURED))
+
+
+def _find(ids: NDArray[np.int32], wanted: NDArray[np.int32]) -> NDArray[np.int64]:
+    """Index of each wanted id in the sorted `ids`, -1 where it is missing."""
+    if len(ids) == 0:
+        return np.full(len(wanted), -1, np.int64)
+    at = np.minimum(np.searchsorted(ids, wanted), len(ids) - 1)
+    return np.where(ids[at] == wanted, at, -1)

@@ -1,0 +1,86 @@
+"""From claimed tiles to publications: load, decode, merge; a tile whose merge fails does not stop the others."""
+
+import logging
+import time
+from collections.abc import Sequence
+
+from cloud_merger.announce import tile_from
+from cloud_merger.config import ShardConfig
+from cloud_merger.merge import merge_tile
+from cloud_merger.statements import Report, statements_of
+from gnd_map.gaussian import Gaussians
+from gnd_map.tile import Tile
+from schemas.changes import ChangeReport
+from tile_store.store import Store
+from tile_store.values import Claim, Publication, ReportRow, StoredTile, TileWork
+
+_LOG = logging.getLogger(__name__)
+
+
+class Worker:
+    """Merges claimed tiles."""
+
+    def __init__(self, store: Store, config: ShardConfig) -> None:
+        self._store, self._config = store, config
+
+    def merge(self, claims: Sequence[Claim]) -> list[Publication]:
+        """What to publish for these claims; a tile that failed is postponed, or set aside after `max_attempts`."""
+        attempted = [self._attempt(claim) for claim in claims]
+        return [publication for publication in attempted if publication is not None]
+
+    def idle_s(self, next_ready_ns: int | None) -> float:
+        """How long to sleep: until the next tile is ready, at most `poll_s`."""
+        if next_ready_ns is None:
+            return self._config.poll_s
+        return min(max((next_ready_ns - time.time_ns()) / 1e9, 0.005), self._config.poll_s)
+
+    def _attempt(self, claim: Claim) -> Publication | None:
+        work = self._store.load(claim)
+        if claim.attempts > self._config.max_attempts:  # it may be what killed the shards that claimed it before
+            return self._set_aside(work, "no shard that claimed it came to an end")
+        try:
+            return publication_of(work, self._bases(work), self._config)
+        except Exception as error:
+            _LOG.exception("merge of %s failed, attempt %d", claim.tile, claim.attempts)
+            if claim.attempts == self._config.max_attempts:
+                return self._set_aside(work, f"{type(error).__name__}: {error}")
+            self._store.postpone(claim, self._config.retry_s * claim.attempts)
+            return None
+
+    def _bases(self, work: TileWork) -> dict[bytes, Gaussians]:
+        """The versions that the reports refer to, by hash; those that the store has lost are missing."""
+        versions = {row.base_sha: self._store.by_sha(row.layer, row.tile, row.base_sha) for row in work.reports}
+        return {sha: tile_from(stored).gaussians for sha, stored in versions.items() if stored is not None}
+
+    def _set_aside(self, work: TileWork, reason: str) -> Publication:
+        """Leave the tile as it is and consume its reports, which stay in the store; say so in the quarantine."""
+        names = "\n".join(row.report_id for row in work.reports)
+        reason = f"tile {work.claim.tile} set aside after {work.claim.attempts} attempts to merge it: {reason}"
+        _LOG.error("%s", reason)
+        self._store.quarantine(f"{work.claim.layer} {work.claim.tile}\n{names}\n".encode(), reason, source="merge")
+        return Publication(work.claim, work.base_version, None, report_ids=tuple(row.report_id for row in work.reports))
+
+
+def publication_of(work: TileWork, bases: dict[bytes, Gaussians], config: ShardConfig) -> Publication:
+    """Merge all reports since the epoch into the epoch's tile; the tile is None where the head has that content."""
+    epoch = _gaussians(work.epoch)
+    statements = statements_of(epoch, map(_report, work.reports), bases, config.merge.mode)
+    merged = merge_tile(epoch, statements, config.merge)
+    tile = Tile(work.claim.tile, work.base_version + 1, merged.gaussians)
+    is_new = tile.sha != work.head.sha if work.head else len(merged.gaussians) > 0
+    return Publication(
+        claim=work.claim,
+        base_version=work.base_version,
+        tile=tile if is_new else None,
+        report_ids=statements.report_ids,
+        voxel_reports=merged.provenance,
+    )
+
+
+def _gaussians(stored: StoredTile | None) -> Gaussians:
+    return Gaussians.empty() if stored is None else tile_from(stored).gaussians
+
+
+def _report(row: ReportRow) -> Report:
+    (change,) = ChangeReport.decode(row.body).tiles
+    return Report(row.report_id, change)
