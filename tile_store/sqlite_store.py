@@ -255,9 +255,9 @@ class SqliteStore:
             raise StoreError(f"keep_versions is {keep_versions}; at least the newest version stays")
         return self._writer.run(lambda c: versions.collect(c, keep_versions, self._config.max_reports))
 
-    def backup(self, path: str) -> None:
+    def backup(self, path: str | Path) -> None:
         """See `Store.backup` (VACUUM INTO)."""
         if Path(path).exists():
             raise StoreError(f"{path}: exists; a backup never overwrites")
         with self._readers.connection() as c:
-            c.execute("VACUUM INTO ?", (path,))
+            c.execute("VACUUM INTO ?", (str(path),))

@@ -1,6 +1,7 @@
 """What a store of tiles and reports can do, whatever keeps it. `tests/tile_store/` holds every implementation to it."""
 
 from collections.abc import Iterable, Iterator, Sequence
+from pathlib import Path
 from typing import Protocol
 
 from gnd_map.tile import Tile
@@ -123,7 +124,7 @@ class Store(Protocol):
     def gc(self, keep_versions: int) -> GcResult:
         """Remove old versions. Kept: a tile's newest `keep_versions`, its epoch, and what counting reports cite."""
 
-    def backup(self, path: str) -> None:
+    def backup(self, path: str | Path) -> None:
         """A consistent copy while the store is in use."""
 
     def close(self) -> None:

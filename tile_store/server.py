@@ -1,0 +1,105 @@
+"""The tile server: answers tile and catalog queries from a store. It keeps no state of its own."""
+
+from collections.abc import Iterator
+from itertools import groupby
+from typing import Final, Self
+
+from fleet_bus.bus import Bus
+from fleet_bus.errors import Refused
+from fleet_bus.serving import Answer, Request, Serving
+from gnd_map.tile_id import District, TileId
+from schemas import keys
+from schemas.errors import SchemaError
+from schemas.tiles import Catalog, TileReply, TileRequest
+from tile_store.regions import Region
+from tile_store.store import Store
+from tile_store.values import StoredTile
+
+_ANY: Final = "x/**"
+# Only `schemas.keys` knows how a key begins.
+TILE_ROOT: Final = keys.tiles_key("x").removesuffix(_ANY)
+CATALOG_ROOT: Final = keys.catalog_keys("x").removesuffix(_ANY)
+
+
+class TileServer:
+    """Answers on every tile key and every catalog key, of all layers, exact or wildcard.
+
+    A request that can never be answered (bad key, bad payload, codecs that no tile comes in) is refused by name; a
+    store that fails makes the asker try again.
+    """
+
+    def __init__(self, store: Store, bus: Bus, *, workers: int = 4) -> None:
+        self._store, self._bus, self._workers = store, bus, workers
+        self._servings: list[Serving] = []
+
+    def __enter__(self) -> Self:
+        return self.start()
+
+    def __exit__(self, *_exception: object) -> None:
+        self.close()
+
+    def start(self) -> Self:
+        """Begin to answer."""
+        for root, handler, kind in ((TILE_ROOT, self.tiles, "tile"), (CATALOG_ROOT, self.catalogs, "catalog")):
+            serving = self._bus.serve(f"{root}**", handler, complete=True, workers=self._workers, kind=kind)
+            self._servings.append(serving)
+        return self
+
+    def close(self) -> None:
+        """Answer what is in hand, then no more. The store and the bus stay open."""
+        while self._servings:
+            self._servings.pop().close()
+
+    def tiles(self, request: Request) -> Answer:
+        """Reply for the tile of an exact key, or for each tile that exists in a wildcard region."""
+        try:
+            wanted = TileRequest.decode(request.payload) if request.payload else TileRequest()
+            if not request.is_wild:
+                layer, tile = keys.parse_tile_key(request.key)
+                return self._reply(self._store.get(layer, tile), wanted).encode()
+            region = Region.of_key(request.key, TILE_ROOT)
+        except SchemaError as error:
+            raise _refusal(request, error) from None
+        return self._region(region, wanted)
+
+    def catalogs(self, request: Request) -> Answer:
+        """The catalog of an exact key's district (it may be empty), or of each district with tiles in a region."""
+        try:
+            if not request.is_wild:
+                layer, district = keys.parse_catalog_key(request.key)
+                return Catalog(tuple(self._store.heads(layer, district.path))).encode()
+            region = Region.of_key(request.key, CATALOG_ROOT)
+        except SchemaError as error:
+            raise _refusal(request, error) from None
+        return self._catalogs(region)
+
+    def _region(self, region: Region, wanted: TileRequest) -> Iterator[tuple[str, bytes]]:
+        for layer, tile in self._tiles(region):
+            if region.matches(layer, *tile.path.split("/")):
+                yield keys.tile_key(layer, tile), self._reply(self._store.get(layer, tile), wanted).encode()
+
+    def _catalogs(self, region: Region) -> Iterator[tuple[str, bytes]]:
+        for (layer, district), _ in groupby(self._tiles(region), lambda found: (found[0], found[1].district)):
+            if region.matches(layer, *district.path.split("/")):
+                yield keys.catalog_key(layer, district), self._catalog(layer, district)
+
+    def _catalog(self, layer: str, district: District) -> bytes:
+        return Catalog(tuple(self._store.heads(layer, district.path))).encode()
+
+    def _tiles(self, region: Region) -> Iterator[tuple[str, TileId]]:
+        for layer in self._store.layers() if region.layer is None else [region.layer]:
+            for head in self._store.heads(layer, region.prefix):
+                yield layer, head.tile
+
+    def _reply(self, stored: StoredTile | None, wanted: TileRequest) -> TileReply:
+        if stored is None:
+            return TileReply("absent")
+        if stored.sha == wanted.cached_sha:
+            return TileReply("unchanged")
+        if stored.codec_id not in wanted.codecs:
+            raise Refused(f"tile {stored.tile.path} comes in codec {stored.codec_id}, asked for {wanted.codecs}")
+        return TileReply("blob", stored.to_blob())
+
+
+def _refusal(request: Request, error: SchemaError) -> Refused:
+    return Refused(f"{type(error).__name__}: {error} (asked for {request.key[:160]})")
