@@ -74,7 +74,7 @@ def check_endpoint(endpoint: str) -> None:
 
 
 def zenoh_config(config: BusConfig) -> zenoh.Config:
-    """The zenoh configuration with every rule of DESIGN.md section 12.
+    """The zenoh configuration with the rules that protect data and keep the account honest.
 
     Raises:
         BusConfigError: zenoh did not take a setting.

@@ -70,11 +70,10 @@ class Ledger:
             self._note({"direction": direction, "kind": kind, "app_bytes": app_bytes, "tile": path})
 
     def record_wire(self, wire: WireBytes) -> None:
-        """Notes the wire bytes of the agent's session so far."""
+        """Notes the wire bytes of the agent's session so far, and with them the present place."""
         with self._lock:
-            if (wire.up, wire.down) != (self._wire.up, self._wire.down):
-                self._wire = wire
-                self._note({"wire_up": wire.up, "wire_down": wire.down})
+            self._wire = wire
+            self._note({"wire_up": wire.up, "wire_down": wire.down})
 
     def set_position(self, odometer_m: float, drive_ns: int | None = None) -> None:
         """Says where on the drive the agent is: the messages that follow are booked there.

@@ -27,7 +27,7 @@ class LinkProfile:
         delay_ms: one-way delay, ms (half of a published round trip).
         loss: probability that one packet of `SEGMENT_BYTES` must be sent again, 0 … 1.
         burst_bytes: what may pass at once before the rate binds (token bucket depth), bytes.
-        batch_bytes: zenoh batch size, bytes (DESIGN.md section 12).
+        batch_bytes: zenoh batch size, bytes; small ones let a short message pass bulk.
         send_buffer_bytes: SO_SNDBUF of the connection, bytes; 0 leaves the kernel's own.
         lease_ms: how long a silent session stays alive, ms.
         rate_source: where the rates come from (publisher, year), or that they are assumed.

@@ -17,7 +17,7 @@ from fleet_bus.links import SEGMENT_BYTES, LinkProfile
 Direction = Literal["up", "down"]
 
 MESSAGE_OVERHEAD_BYTES: Final = 160
-"""What a message costs on the wire beside its payload: key, headers, acknowledgement (DESIGN.md section 9)."""
+"""What a message costs on the wire beside its payload: key, headers, acknowledgement."""
 
 
 class Bucket:

@@ -2,13 +2,20 @@
 
 import threading
 from abc import ABC, abstractmethod
+from typing import Self
 
 
 class Part(ABC):
-    """Something declared, which `close` takes back once."""
+    """Something declared, which `close` or the end of a `with` block takes back once."""
 
     def __init__(self) -> None:
         self._ended = threading.Event()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_exception: object) -> None:
+        self.close()
 
     @property
     def is_closed(self) -> bool:

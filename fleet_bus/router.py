@@ -30,10 +30,10 @@ def open_router(listen: Sequence[str] = (DEFAULT_ENDPOINT,), connect: Sequence[s
 
 
 def run_router(
-    listen: Sequence[str] = (DEFAULT_ENDPOINT,), *, stop_event: threading.Event, connect: Sequence[str] = ()
+    listen: Sequence[str] = (DEFAULT_ENDPOINT,), *, stop: threading.Event, connect: Sequence[str] = ()
 ) -> None:
     """Runs a router until the event is set; errors as `open_router`."""
     with open_router(listen, connect):
         _LOG.info("router listens at %s", ", ".join(listen))
-        stop_event.wait()
+        stop.wait()
     _LOG.info("router ended")
