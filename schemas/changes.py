@@ -67,7 +67,7 @@ class TileChange:
     change_class: U8
     """(N,) `ChangeClass` of each changed voxel."""
     evidence: I32
-    """(N, 4) rays of each changed voxel: blocked inside (n_BI), outside (n_BO), in an empty one (n_BE), passed (n_PI)."""
+    """(N, 4) rays of each changed voxel: blocked inside n_BI, outside n_BO, in empty n_BE, passed inside n_PI."""
     pose_sigma_m: float
     """Standard deviation of the refined position."""
     pose_sigma_rad: float

@@ -1,0 +1,226 @@
+"""The values of a recorded drive: what a vehicle measures, and where it truly was.
+
+Frames: `lidar` (the sensor), `vehicle` (x forward, y left, z up), `map` (ENU at the drive's anchor). Time is int ns
+UTC.
+"""
+
+import math
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass
+from typing import Final, NamedTuple, TypeVar
+
+import numpy as np
+import numpy.typing as npt
+
+from gnd_map.arrays import F32, F64, I64, check_array
+from gnd_map.geodesy import LocalFrame, check_geodetic
+from schemas import limits
+from schemas.errors import BadValue
+from schemas.wire import PRINTABLE_PATTERN, VEHICLE_PATTERN, check_length, check_text, check_unsigned, refusing
+
+U32 = npt.NDArray[np.uint32]
+U16 = npt.NDArray[np.uint16]
+
+_RIGID_TOLERANCE: Final = 1e-6
+_TIME_BITS: Final = 63
+
+
+def check_rigid(name: str, T: F64) -> None:
+    """`BadValue` unless `T` is a (4, 4) float64 rigid transform: right-handed rotation, last row 0 0 0 1."""
+    with refusing(name):
+        check_array(name, T, np.float64, (4, 4))
+    off = max(np.abs(T[:3, :3] @ T[:3, :3].T - np.eye(3)).max(), np.abs(T[3] - [0, 0, 0, 1]).max())
+    if off > _RIGID_TOLERANCE or np.linalg.det(T[:3, :3]) < 0:
+        raise BadValue(f"{name} is not a rigid transform: off by {off:.3g}, tolerance {_RIGID_TOLERANCE}")
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class DriveHeader:
+    """Whose drive it is, how the sensor is mounted, where the map frame is anchored."""
+
+    drive_id: str
+    """Name of the recording. [1-64 of A-Z a-z 0-9 . _ -]"""
+    vehicle: str
+    """Pseudonym of the vehicle, the same letters."""
+    sensor_model: str
+    """Such as "VLP-16"."""
+    anchor: LocalFrame
+    """The frame `map` of the reference poses: ENU here."""
+    T_vehicle_lidar: F64
+    """(4, 4) mount: p_vehicle = T_vehicle_lidar @ p_lidar."""
+    source: str = ""
+    """Where the recording comes from, and its licence."""
+
+    def __post_init__(self) -> None:
+        check_text("drive id", self.drive_id, VEHICLE_PATTERN)
+        check_text("vehicle", self.vehicle, VEHICLE_PATTERN)
+        check_text("sensor model", self.sensor_model, PRINTABLE_PATTERN)
+        check_rigid("T_vehicle_lidar", self.T_vehicle_lidar)
+
+    def __eq__(self, other: object) -> bool:
+        return isinstance(other, DriveHeader) and self._scalars == other._scalars and self._same_mount(other)
+
+    __hash__ = None  # type: ignore[assignment]
+
+    @property
+    def _scalars(self) -> tuple[object, ...]:
+        return self.drive_id, self.vehicle, self.sensor_model, self.anchor, self.source
+
+    def _same_mount(self, other: "DriveHeader") -> bool:
+        return np.array_equal(self.T_vehicle_lidar, other.T_vehicle_lidar)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Scan:
+    """One sweep of the LiDAR, in firing order, as measured: not deskewed."""
+
+    t_ns: int
+    """Start of the sweep."""
+    points_m: F32
+    """(N, 3) in the frame `lidar`, C-contiguous."""
+    t_offset_ns: U32
+    """(N,) time of each point after `t_ns`."""
+    ring: U16 | None = None
+    """(N,) laser of each point, where the recording tells."""
+
+    def __post_init__(self) -> None:
+        check_unsigned("scan time", self.t_ns, bits=_TIME_BITS)
+        with refusing(f"scan at {self.t_ns} ns"):
+            check_array("points_m", self.points_m, np.float32, (None, 3))
+            check_array("t_offset_ns", self.t_offset_ns, np.uint32, (len(self.points_m),))
+            if self.ring is not None:
+                check_array("ring", self.ring, np.uint16, (len(self.points_m),))
+        check_length(f"scan at {self.t_ns} ns", len(self.points_m), limits.MAX_POINTS_OF_SCAN, "points")
+
+    def __len__(self) -> int:
+        return len(self.points_m)
+
+
+@dataclass(frozen=True, slots=True)
+class MotionSample:
+    """Wheel speed and yaw rate."""
+
+    t_ns: int
+    speed_mps: float
+    """Along the vehicle's x axis, forward positive."""
+    yaw_rate_radps: float
+    """About the vehicle's z axis, counter-clockwise positive."""
+
+    def __post_init__(self) -> None:
+        check_unsigned("motion time", self.t_ns, bits=_TIME_BITS)
+        if not (math.isfinite(self.speed_mps) and math.isfinite(self.yaw_rate_radps)):
+            raise BadValue(f"motion at {self.t_ns} ns: {self.speed_mps} m/s, {self.yaw_rate_radps} rad/s")
+
+
+@dataclass(frozen=True, slots=True)
+class GnssFix:
+    """A position from satellites."""
+
+    t_ns: int
+    lat_rad: float
+    lon_rad: float
+    height_m: float
+    """Above the ellipsoid."""
+    sigma_m: float
+    """Standard deviation along each axis."""
+
+    def __post_init__(self) -> None:
+        check_unsigned("GNSS time", self.t_ns, bits=_TIME_BITS)
+        with refusing(f"GNSS fix at {self.t_ns} ns"):
+            check_geodetic(self.lat_rad, self.lon_rad)
+        if not (math.isfinite(self.height_m) and 0 <= self.sigma_m < math.inf):
+            raise BadValue(f"GNSS fix at {self.t_ns} ns: height {self.height_m} m, sigma {self.sigma_m} m")
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class ReferencePose:
+    """Where the vehicle truly was: ground truth, or the best known."""
+
+    t_ns: int
+    T_map_vehicle: F64
+    """(4, 4) pose of the vehicle in the map frame, ENU at the header's anchor."""
+
+    def __post_init__(self) -> None:
+        check_unsigned("reference time", self.t_ns, bits=_TIME_BITS)
+        check_rigid(f"reference pose at {self.t_ns} ns", self.T_map_vehicle)
+
+
+DriveItem = Scan | MotionSample | GnssFix | ReferencePose
+
+
+class MotionTrack(NamedTuple):
+    """All motion samples of a drive as arrays (N,)."""
+
+    t_ns: I64
+    speed_mps: F64
+    yaw_rate_radps: F64
+
+
+class GnssTrack(NamedTuple):
+    """All GNSS fixes of a drive as arrays (N,)."""
+
+    t_ns: I64
+    lat_rad: F64
+    lon_rad: F64
+    height_m: F64
+    sigma_m: F64
+
+
+class ReferenceTrack(NamedTuple):
+    """All reference poses of a drive."""
+
+    t_ns: I64
+    """(N,)"""
+    T_map_vehicle: F64
+    """(N, 4, 4)"""
+
+
+class DriveTrack(NamedTuple):
+    """Everything in a drive but the scans."""
+
+    motion: MotionTrack
+    gnss: GnssTrack
+    reference: ReferenceTrack
+
+
+_ItemT = TypeVar("_ItemT", MotionSample, GnssFix, ReferencePose)
+
+
+def track_of(items: Iterable[DriveItem]) -> DriveTrack:
+    """Everything among `items` but the scans, as arrays in the given order."""
+    kept = list(items)
+    return DriveTrack(_motion_track(kept), _gnss_track(kept), _reference_track(kept))
+
+
+def _motion_track(items: list[DriveItem]) -> MotionTrack:
+    found = _of_kind(items, MotionSample)
+    return MotionTrack(
+        np.array([m.t_ns for m in found], np.int64),
+        np.array([m.speed_mps for m in found], np.float64),
+        np.array([m.yaw_rate_radps for m in found], np.float64),
+    )
+
+
+def _gnss_track(items: list[DriveItem]) -> GnssTrack:
+    found = _of_kind(items, GnssFix)
+    return GnssTrack(
+        np.array([g.t_ns for g in found], np.int64),
+        *(np.array(column, np.float64).reshape(len(found)) for column in _gnss_columns(found)),
+    )
+
+
+def _gnss_columns(found: list[GnssFix]) -> Iterator[list[float]]:
+    yield [g.lat_rad for g in found]
+    yield [g.lon_rad for g in found]
+    yield [g.height_m for g in found]
+    yield [g.sigma_m for g in found]
+
+
+def _reference_track(items: list[DriveItem]) -> ReferenceTrack:
+    found = _of_kind(items, ReferencePose)
+    poses = np.stack([r.T_map_vehicle for r in found]) if found else np.empty((0, 4, 4))
+    return ReferenceTrack(np.array([r.t_ns for r in found], np.int64), poses)
+
+
+def _of_kind(items: list[DriveItem], kind: type[_ItemT]) -> list[_ItemT]:
+    return [item for item in items if isinstance(item, kind)]

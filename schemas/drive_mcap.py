@@ -1,0 +1,279 @@
+"""Recorded drives as MCAP files that open in Foxglove; written whole or not at all, read as a stream.
+
+| topic | message | |
+|---|---|---|
+| /lidar/points | foxglove.PointCloud | one sweep, firing order, log time = start of the sweep |
+| /vehicle/motion | gnd.v1.VehicleMotion | wheel speed and yaw rate |
+| /gnss | foxglove.LocationFix | |
+| /reference/pose | foxglove.PoseInFrame | where the vehicle truly was; may be missing |
+| /tf | foxglove.FrameTransform | the same pose, so that Foxglove shows the scans in the map |
+| /tf_static | foxglove.FrameTransform | mount of the LiDAR, once |
+
+The metadata record `gnd.drive` holds the header. Scans fill chunks of their own, the rest shares chunks of some
+seconds, so that the track is read without unpacking the points.
+"""
+
+import os
+from collections.abc import Callable, Iterator, Mapping
+from pathlib import Path
+from types import TracebackType
+from typing import Any, Final, NamedTuple
+
+from foxglove_schemas_protobuf.FrameTransform_pb2 import FrameTransform
+from foxglove_schemas_protobuf.LocationFix_pb2 import LocationFix
+from foxglove_schemas_protobuf.PointCloud_pb2 import PointCloud
+from foxglove_schemas_protobuf.PoseInFrame_pb2 import PoseInFrame
+from google.protobuf.message import Message
+from mcap.reader import SeekingReader
+from mcap.summary import Summary
+from mcap.writer import CompressionType, Writer
+from mcap_protobuf.schema import register_schema
+
+from gnd_map.arrays import F64
+from schemas.drive import DriveHeader, DriveItem, DriveTrack, GnssFix, MotionSample, ReferencePose, Scan, track_of
+from schemas.drive_messages import (
+    LIDAR_FRAME,
+    MAP_FRAME,
+    VEHICLE_FRAME,
+    T_of_transform,
+    cloud_of,
+    fix_of,
+    gnss_of,
+    motion_message_of,
+    motion_of,
+    pose_message_of,
+    reference_of,
+    scan_of,
+    transform_message_of,
+)
+from schemas.drive_metadata import METADATA, header_of, metadata_of
+from schemas.errors import DriveError
+from schemas.generated.vehicle_motion_pb2 import VehicleMotion
+from schemas.mcap_file import open_mcap, write_errors
+
+POINTS_TOPIC: Final = "/lidar/points"
+MOTION_TOPIC: Final = "/vehicle/motion"
+GNSS_TOPIC: Final = "/gnss"
+REFERENCE_TOPIC: Final = "/reference/pose"
+TF_TOPIC: Final = "/tf"
+TF_STATIC_TOPIC: Final = "/tf_static"
+
+_CHUNK_BYTES: Final = 1 << 20
+_SMALL_SPAN_NS: Final = 10_000_000_000
+_SMALL_COUNT: Final = 10_000
+
+_MESSAGES: Final[Mapping[str, type[Message]]] = {
+    POINTS_TOPIC: PointCloud,
+    MOTION_TOPIC: VehicleMotion,
+    GNSS_TOPIC: LocationFix,
+    REFERENCE_TOPIC: PoseInFrame,
+    TF_TOPIC: FrameTransform,
+    TF_STATIC_TOPIC: FrameTransform,
+}
+_ITEMS: Final[Mapping[str, Callable[[Any], DriveItem]]] = {
+    POINTS_TOPIC: scan_of,
+    MOTION_TOPIC: motion_of,
+    GNSS_TOPIC: gnss_of,
+    REFERENCE_TOPIC: reference_of,
+}
+
+
+class DriveWriter:
+    """Writes one drive; the file appears under its name when the `with` block ends, and not at all when it fails.
+
+    Items may come in any order within some ten seconds; readers get them in time order.
+
+    Raises:
+        DriveError: the folder does not exist, is not writable, the disk is full.
+    """
+
+    def __init__(self, path: Path | str, header: DriveHeader) -> None:
+        self._path = Path(path)
+        self._partial = self._path.with_name(f".{self._path.name}.{os.getpid()}.partial")
+        self._header = header
+        self._small: list[tuple[str, int, Message]] = []
+        self._mount_written = False
+        with write_errors(self._path):
+            self._stream = self._partial.open("wb")
+        self._writer = Writer(self._stream, chunk_size=_CHUNK_BYTES, compression=CompressionType.ZSTD)
+        self._writer.start(profile="", library="gnd-fleet")
+        self._writer.add_metadata(METADATA, metadata_of(header))
+        self._channels = {topic: self._channel(topic, kind) for topic, kind in _MESSAGES.items()}
+
+    def _channel(self, topic: str, kind: type[Message]) -> int:
+        schema_id = register_schema(self._writer, kind)
+        return self._writer.register_channel(topic=topic, message_encoding="protobuf", schema_id=schema_id)
+
+    def scan(self, scan: Scan) -> None:
+        """Add one sweep."""
+        self._add_mount(scan.t_ns)
+        with write_errors(self._path):
+            self._write(POINTS_TOPIC, scan.t_ns, cloud_of(scan))
+
+    def motion(self, sample: MotionSample) -> None:
+        """Add one odometry sample."""
+        self._add_small(MOTION_TOPIC, sample.t_ns, motion_message_of(sample))
+
+    def gnss(self, fix: GnssFix) -> None:
+        """Add one GNSS fix."""
+        self._add_small(GNSS_TOPIC, fix.t_ns, fix_of(fix))
+
+    def reference(self, pose: ReferencePose) -> None:
+        """Add one pose of the truth."""
+        self._add_small(REFERENCE_TOPIC, pose.t_ns, pose_message_of(pose))
+        tf = transform_message_of(pose.t_ns, MAP_FRAME, VEHICLE_FRAME, pose.T_map_vehicle)
+        self._add_small(TF_TOPIC, pose.t_ns, tf)
+
+    def add(self, item: DriveItem) -> None:
+        """Add an item of any kind: what `read_drive` yields."""
+        match item:
+            case Scan():
+                self.scan(item)
+            case MotionSample():
+                self.motion(item)
+            case GnssFix():
+                self.gnss(item)
+            case ReferencePose():
+                self.reference(item)
+
+    def _add_mount(self, t_ns: int) -> None:
+        """The mount goes in with the first item, at its time: a viewer's time line begins where the drive does."""
+        if not self._mount_written:
+            self._mount_written = True
+            tf = transform_message_of(t_ns, VEHICLE_FRAME, LIDAR_FRAME, self._header.T_vehicle_lidar)
+            self._add_small(TF_STATIC_TOPIC, t_ns, tf)
+
+    def _add_small(self, topic: str, t_ns: int, message: Message) -> None:
+        self._add_mount(t_ns)
+        self._small.append((topic, t_ns, message))
+        if len(self._small) >= _SMALL_COUNT or abs(t_ns - self._small[0][1]) >= _SMALL_SPAN_NS:
+            self._write_small()
+
+    def _write_small(self) -> None:
+        """The small messages so far as a chunk of their own."""
+        with write_errors(self._path):
+            self._writer.flush()  # type: ignore[no-untyped-call]
+            for topic, t_ns, message in self._small:
+                self._write(topic, t_ns, message)
+            self._writer.flush()  # type: ignore[no-untyped-call]
+        self._small.clear()
+
+    def _write(self, topic: str, t_ns: int, message: Message) -> None:
+        self._writer.add_message(self._channels[topic], t_ns, message.SerializeToString(), t_ns)
+
+    def close(self) -> None:
+        """Write the index and give the file its name. Called by the end of the `with` block."""
+        self._add_mount(0)
+        self._write_small()
+        with write_errors(self._path):
+            self._writer.finish()  # type: ignore[no-untyped-call]
+            self._stream.flush()
+            os.fsync(self._stream.fileno())
+            self._stream.close()
+            self._partial.replace(self._path)
+
+    def discard(self) -> None:
+        """Throw away what was written. Called when the `with` block fails."""
+        self._stream.close()
+        self._partial.unlink(missing_ok=True)
+
+    def __enter__(self) -> "DriveWriter":
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        if kind is not None:
+            self.discard()
+            return
+        try:
+            self.close()
+        except BaseException:
+            self.discard()
+            raise
+
+
+def read_header(path: Path | str) -> DriveHeader:
+    """The header of a drive; `DriveError` when the file is none."""
+    with open_mcap(Path(path)) as (reader, summary):
+        _check_channels(summary)
+        metadata = next((m.metadata for m in reader.iter_metadata() if m.name == METADATA), None)
+        if metadata is None:
+            raise DriveError(f"{path}: MCAP file without a metadata record {METADATA!r}; import it with `gnd import`")
+        return header_of(metadata, _mount_of(reader))
+
+
+def read_drive(path: Path | str) -> Iterator[DriveItem]:
+    """Scans, motion samples, GNSS fixes and reference poses in time order, some seconds of them in memory at a time.
+
+    Raises:
+        DriveError: no such file, not MCAP, cut off or damaged (when the damaged part is reached).
+    """
+    with open_mcap(Path(path)) as (reader, summary):
+        _check_channels(summary)
+        for _, channel, message in reader.iter_messages(topics=list(_ITEMS)):
+            yield _decode(channel.topic, message.data)
+
+
+def load_track(path: Path | str) -> DriveTrack:
+    """Motion, GNSS and reference poses of a whole drive as arrays, without unpacking the scans; `DriveError`."""
+    with open_mcap(Path(path)) as (reader, summary):
+        _check_channels(summary)
+        items = [
+            _decode(channel.topic, message.data)
+            for _, channel, message in reader.iter_messages(topics=[MOTION_TOPIC, GNSS_TOPIC, REFERENCE_TOPIC])
+        ]
+    return track_of(items)
+
+
+class DriveCounts(NamedTuple):
+    """How much a drive holds."""
+
+    scans: int
+    motion: int
+    gnss: int
+    reference: int
+    first_ns: int
+    last_ns: int
+
+
+def drive_counts(path: Path | str) -> DriveCounts:
+    """Number of items of each kind, and the time of the first and last, from the file's summary alone; `DriveError`."""
+    with open_mcap(Path(path)) as (_, summary):
+        _check_channels(summary)
+        statistics = summary.statistics
+        if statistics is None:
+            raise DriveError(f"{path}: recording has no statistics; restore it with `mcap recover`")
+        counts = {c.topic: statistics.channel_message_counts.get(c.id, 0) for c in summary.channels.values()}
+        return DriveCounts(
+            scans=counts.get(POINTS_TOPIC, 0),
+            motion=counts.get(MOTION_TOPIC, 0),
+            gnss=counts.get(GNSS_TOPIC, 0),
+            reference=counts.get(REFERENCE_TOPIC, 0),
+            first_ns=statistics.message_start_time,
+            last_ns=statistics.message_end_time,
+        )
+
+
+def _decode(topic: str, data: bytes) -> DriveItem:
+    message = _MESSAGES[topic]()
+    message.ParseFromString(data)
+    return _ITEMS[topic](message)
+
+
+def _check_channels(summary: Summary) -> None:
+    """Refuse a topic of ours that carries something else."""
+    for channel in summary.channels.values():
+        schema = summary.schemas.get(channel.schema_id)
+        expected = _MESSAGES.get(channel.topic)
+        if expected and (schema is None or schema.name != expected.DESCRIPTOR.full_name):
+            found = schema.name if schema else "no schema"
+            raise DriveError(f"topic {channel.topic} carries {found}, expected {expected.DESCRIPTOR.full_name}")
+
+
+def _mount_of(reader: SeekingReader) -> F64:
+    for _, _, message in reader.iter_messages(topics=[TF_STATIC_TOPIC]):
+        transform = FrameTransform.FromString(message.data)
+        if (transform.parent_frame_id, transform.child_frame_id) == (VEHICLE_FRAME, LIDAR_FRAME):
+            return T_of_transform(transform)
+    raise DriveError(f"no transform {VEHICLE_FRAME} → {LIDAR_FRAME} on {TF_STATIC_TOPIC}: how is the LiDAR mounted?")

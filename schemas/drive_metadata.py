@@ -1,0 +1,59 @@
+"""The header of a drive as the metadata record of its MCAP file."""
+
+import zlib
+from collections.abc import Mapping
+from typing import Final
+
+from gnd_map.arrays import F64
+from gnd_map.geodesy import LocalFrame
+from schemas.drive import DriveHeader
+from schemas.errors import DriveError
+
+METADATA: Final = "gnd.drive"
+_FIELDS: Final = (
+    "drive_id",
+    "vehicle",
+    "sensor_model",
+    "map_anchor_lat_rad",
+    "map_anchor_lon_rad",
+    "map_anchor_height_m",
+    "source",
+)
+
+
+def metadata_of(header: DriveHeader) -> dict[str, str]:
+    """The header, but for the mount, as strings under a CRC."""
+    fields = {
+        "drive_id": header.drive_id,
+        "vehicle": header.vehicle,
+        "sensor_model": header.sensor_model,
+        "map_anchor_lat_rad": repr(float(header.anchor.lat_rad)),
+        "map_anchor_lon_rad": repr(float(header.anchor.lon_rad)),
+        "map_anchor_height_m": repr(float(header.anchor.height_m)),
+        "source": header.source,
+    }
+    return fields | {"crc32": _crc_of(fields)}
+
+
+def _crc_of(fields: Mapping[str, str]) -> str:
+    """MCAP guards its chunks; metadata lies outside them, and a flipped digit of the anchor would move the map."""
+    text = "\n".join(f"{key}={value}" for key, value in sorted(fields.items()) if key != "crc32")
+    return f"{zlib.crc32(text.encode()):08x}"
+
+
+def header_of(metadata: Mapping[str, str], T_vehicle_lidar: F64) -> DriveHeader:
+    """The header in a metadata record and the mount; `DriveError` when the record is damaged or lacks a field."""
+    missing = {"crc32", *_FIELDS} - metadata.keys()
+    if missing:
+        raise DriveError(f"metadata {METADATA!r} lacks {', '.join(sorted(missing))}")
+    if metadata["crc32"] != _crc_of(metadata):
+        raise DriveError(f"metadata {METADATA!r} is damaged: CRC {metadata['crc32']}, found {_crc_of(metadata)}")
+    anchor = (float(metadata[f"map_anchor_{name}"]) for name in ("lat_rad", "lon_rad", "height_m"))
+    return DriveHeader(
+        drive_id=metadata["drive_id"],
+        vehicle=metadata["vehicle"],
+        sensor_model=metadata["sensor_model"],
+        anchor=LocalFrame(*anchor),
+        T_vehicle_lidar=T_vehicle_lidar,
+        source=metadata["source"],
+    )
