@@ -11,6 +11,10 @@ class WindowTooLarge(VehicleError):
     """The tiles asked for do not fit a dense window of bounded memory."""
 
 
+class MapChanged(VehicleError):
+    """A tile was replaced or removed while evidence was gathered against it."""
+
+
 class BadScan(VehicleError):
     """A scan that cannot be used; `state` names why (`empty`, `not-finite`, `constant`, `time-backwards`)."""
 
@@ -38,10 +42,6 @@ class LocaliseError(VehicleError):
 
 class RegistrationError(LocaliseError):
     """A scan could not be matched with the map: too few of its points have a Gaussian nearby."""
-
-
-class MotionError(LocaliseError):
-    """The vehicle's motion is not known for the time asked for."""
 
 
 class ImportDriveError(VehicleError):

@@ -123,9 +123,10 @@ class LocalMap:
         self._build()
         return len(self._mean)
 
-    def box_of(self, tile_id: TileId) -> tuple[slice, slice]:
-        """The tile's columns of `index` along x and y; only for a tile that is held."""
-        low, high = tile_box(self.grid_frame, tile_id) - self.window_origin_g[:2]
+    def box_of(self, tile_id: TileId, origin_g: NDArray[np.int64] | None = None) -> tuple[slice, slice]:
+        """The tile's columns along x and y in a window at `origin_g` (3,), by default in `index`."""
+        origin = self.window_origin_g if origin_g is None else origin_g
+        low, high = tile_box(self.grid_frame, tile_id) - origin[:2]
         return slice(int(low[0]), int(high[0])), slice(int(low[1]), int(high[1]))
 
     def _hold(self, held: HeldTile) -> None:

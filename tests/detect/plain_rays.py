@@ -1,0 +1,125 @@
+"""The plain twin of the ray kernel: one ray, one voxel at a time, written for reading and sharing no code with it.
+
+The voxels of a ray come from sorting the parameters at which it crosses integer planes, not from stepping.
+"""
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+
+
+@dataclass
+class PlainMap:
+    """Gaussians by voxel in window coordinates; everything else that is `known` is empty."""
+
+    shape: tuple[int, int, int]
+    mean: np.ndarray
+    cov: np.ndarray
+    index: np.ndarray  # >= 0 Gaussian, -1 empty, UNKNOWN
+
+    def r2(self, row: int, point: np.ndarray, noise_m: float) -> float:
+        d = point - self.mean[row]
+        return float(d @ np.linalg.solve(self.cov[row] + np.eye(3) * noise_m**2, d))
+
+
+def voxels_of_segment(start: np.ndarray, end: np.ndarray) -> list[tuple[tuple[int, ...], float, float]]:
+    """(voxel, t_in, t_out) of every voxel that the segment has a stretch of positive length in, in order."""
+    cuts = {0.0, 1.0}
+    for axis in range(3):
+        low, high = sorted((start[axis], end[axis]))
+        for plane in range(math.ceil(low), math.floor(high) + 1):
+            if high > low:
+                t = (plane - start[axis]) / (end[axis] - start[axis])
+                cuts.add(min(max(t, 0.0), 1.0))
+    ordered = sorted(cuts)
+    pieces = []
+    for t_in, t_out in zip(ordered, ordered[1:], strict=False):
+        middle = start + (end - start) * (t_in + t_out) / 2
+        pieces.append((tuple(int(math.floor(x)) for x in middle), t_in, t_out))
+    return pieces
+
+
+def is_inside_window(voxel: tuple[int, ...], shape: tuple[int, int, int]) -> bool:
+    return all(0 <= i < n for i, n in zip(voxel, shape, strict=True))
+
+
+class PlainDetector:
+    """Counts the six cases of GND 4.2 with the meaning of `DetectParameters`, one after the other."""
+
+    def __init__(self, world: PlainMap, p, quantile, A: np.ndarray, b: np.ndarray) -> None:
+        self.world, self.p, self.quantile, self.A, self.b = world, p, quantile, A, b
+        n = len(world.mean)
+        self.bi, self.bo, self.pi, self.po = (np.zeros(n, int) for _ in range(4))
+        self.pe = np.zeros(world.shape, int)
+        self.kept: list[bool] = []
+
+    def ray(self, origin: np.ndarray, point: np.ndarray) -> None:
+        length = float(np.linalg.norm(point - origin))
+        self.kept.append(False)
+        if not length > self.p.range_min_m:
+            return
+        reach = min(1.0, self.p.range_max_m / length)
+        start, full = self.A @ origin + self.b, self.A @ (point - origin)
+        pieces = [
+            (voxel, t_in * reach, t_out * reach)
+            for voxel, t_in, t_out in voxels_of_segment(start, start + full * reach)
+            if is_inside_window(voxel, self.world.shape)
+        ]
+        if not pieces:
+            return
+        ends_inside = reach == 1.0 and is_inside_window(tuple(np.floor(start + full).astype(int)), self.world.shape)
+        for voxel, t_in, t_out in pieces[:-1]:
+            self._pass(voxel, origin, point, t_in, t_out, length)
+        if ends_inside:
+            self._block(pieces[-1][0], point, start + full)
+
+    def _pass(self, voxel, origin, point, t_in, t_out, length) -> None:
+        row = self.world.index[voxel]
+        if row == -1:
+            self.pe[voxel] += 1
+        elif row >= 0:
+            counter = self.pi if self._passes(row, origin, point, t_in, t_out, length) else self.po
+            counter[row] += 1
+
+    def _passes(self, row, origin, point, t_in, t_out, length) -> bool:
+        v, mean = point - origin, self.world.mean[row]
+        cov = self.world.cov[row] + np.eye(3) * self.p.pass_noise_m**2
+        values, vectors = np.linalg.eigh(cov)
+        if self.p.passing_rule == "plane" and values[1] >= self.p.planar_ratio * values[0]:
+            normal = vectors[:, 0]
+            t = normal @ (mean - origin) / (normal @ v)
+            if not t_in <= t <= t_out or (1 - t) * abs(normal @ v) <= self.p.beyond_m:
+                return False
+            return self.world.r2(row, origin + t * v, self.p.pass_noise_m) <= self.quantile(self.p.eta_plane)
+        information = np.linalg.inv(cov)
+        t = min(max(v @ information @ (mean - origin) / (v @ information @ v), t_in), t_out)
+        if self.p.passing_rule != "ml" and (1 - t) * length < self.p.ahead_m:
+            return False
+        return self.world.r2(row, origin + t * v, self.p.pass_noise_m) <= self.quantile(self.p.eta_pass)
+
+    def _block(self, voxel, point, g) -> None:
+        row = self.world.index[voxel]
+        if row < -1:
+            return
+        if row >= 0 and self.world.r2(row, point, self.p.block_noise_m) <= self.quantile(self.p.eta_block):
+            self.bi[row] += 1
+        elif self._explained(voxel, point, g):
+            return
+        elif row >= 0:
+            self.bo[row] += 1
+        self.kept[-1] = True
+
+    def _explained(self, voxel, point, g) -> bool:
+        for axis in range(3):
+            face = self.p.face_m * np.linalg.norm(self.A[axis])
+            fraction = g[axis] - voxel[axis]
+            step = -1 if fraction < face else 1 if fraction > 1 - face else 0
+            beside = list(voxel)
+            beside[axis] += step
+            if step == 0 or not is_inside_window(tuple(beside), self.world.shape):
+                continue
+            row = self.world.index[tuple(beside)]
+            if row >= 0 and self.world.r2(row, point, self.p.block_noise_m) <= self.p.face_sigma**2:
+                return True
+        return False
