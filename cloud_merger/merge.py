@@ -78,6 +78,8 @@ def merge_tile(epoch: Gaussians, statements: Statements, parameters: MergeParame
     """
     parameters = parameters or MergeParameters()
     rows = statements.rows
+    if len(rows) == 0:
+        return MergedTile(epoch, np.zeros(0, np.int32))
     cluster = _clusters(rows, parameters)
     winner = _winners(rows["voxel_id"], cluster, parameters.xi)
     member = np.isin(cluster, winner)
@@ -216,9 +218,8 @@ def _confirmed(epoch: Gaussians, rows: Rows, cluster: Index) -> NDArray[np.bool_
     "as it was".
     """
     was = states_at(epoch, rows["voxel_id"], Kind.QUOTED)
-    same = rows["kind"] == Kind.QUOTED
-    for name in ("count", "mean_m", "cov_m2"):
-        same &= (rows[name] == was[name]).reshape(len(rows), -1).all(axis=1)
+    same = (rows["kind"] == Kind.QUOTED) & (rows["count"] == was["count"])
+    same &= (rows["mean_m"] == was["mean_m"]).all(axis=1) & (rows["cov_m2"] == was["cov_m2"]).all(axis=1)
     return np.asarray(2 * np.bincount(cluster, weights=same) >= np.bincount(cluster))
 
 
@@ -227,9 +228,9 @@ def _merged(epoch: Gaussians, changes: Rows, statements: Statements, members: Ro
     there = changes[changes["count"] > 0]
     put = Gaussians(*(np.ascontiguousarray(there[name]) for name in ("voxel_id", "count", "cells", "mean_m", "cov_m2")))
     gone = np.ascontiguousarray(changes["voxel_id"][changes["count"] == 0])
-    said_by: dict[int, list[str]] = {int(voxel): [] for voxel in changes["voxel_id"]}
-    for row in members:
-        said_by[int(row["voxel_id"])].append(statements.report_ids[row["report"]])
+    said_by: dict[int, list[str]] = {voxel: [] for voxel in changes["voxel_id"].tolist()}
+    for voxel, report in zip(members["voxel_id"].tolist(), members["report"].tolist(), strict=True):
+        said_by[voxel].append(statements.report_ids[report])
     return MergedTile(
         gaussians=apply(epoch, TileDelta(gone, put)),
         changed=np.ascontiguousarray(changes["voxel_id"]),

@@ -1,0 +1,94 @@
+"""Small tiles and reports for the tests of the merger."""
+
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+
+from gnd_map.classes import ChangeClass
+from gnd_map.gaussian import Gaussians
+from gnd_map.tile import Tile, content_sha
+from gnd_map.tile_id import TileId
+from schemas.changes import ChangeReport, TileChange
+from schemas.report_id import deterministic_report_id
+
+TILE = TileId(497353963154)  # Figure 2 of the paper
+NEIGHBOUR = TileId(497353963155)
+
+# A state of a voxel: mean (3) and standard deviations along x, y, z (3), in metres.
+State = tuple[float, float, float, float, float, float]
+GROUND: State = (0.0, 0.0, -0.2, 0.28, 0.28, 0.02)
+GROUND_AGAIN: State = (0.01, -0.02, -0.19, 0.27, 0.28, 0.02)
+WALL: State = (0.3, 0.0, 0.0, 0.02, 0.28, 0.28)
+WALL_AGAIN: State = (0.29, 0.03, 0.0, 0.02, 0.27, 0.28)
+POLE: State = (-0.3, 0.2, 0.0, 0.03, 0.03, 0.28)
+BALL: State = (0.0, 0.0, 0.2, 0.2, 0.2, 0.2)
+
+
+def gaussians_of(states: Mapping[int, State | None], count: int = 200, cells: int = 60) -> Gaussians:
+    """A Gaussian a voxel; None: count 0."""
+    ids = sorted(states)
+    there = np.array([states[i] is not None for i in ids], bool)
+    rows = np.array([states[i] or (0.0,) * 6 for i in ids], np.float64).reshape(-1, 6)
+    cov = np.zeros((len(ids), 6), np.float32)
+    cov[:, [0, 3, 5]] = rows[:, 3:] ** 2
+    return Gaussians(
+        np.array(ids, np.int32),
+        np.where(there, count, 0).astype(np.int32),
+        np.where(there, cells, 0).astype(np.int32),
+        rows[:, :3].astype(np.float32),
+        cov,
+    )
+
+
+def sha_of(base: Gaussians | None, tile: TileId = TILE) -> bytes:
+    """The hash by which a report names its base; none: the vehicle had no map."""
+    return b"" if base is None else content_sha(tile, base)
+
+
+def change_of(
+    base: Gaussians | None,
+    observed: Sequence[int],
+    changed: Mapping[int, State | None] | Gaussians,
+    *,
+    tile: TileId = TILE,
+    change_class: ChangeClass = ChangeClass.MODIFIED,
+    version: int = 1,
+) -> TileChange:
+    """One report's part about a tile."""
+    gaussians = changed if isinstance(changed, Gaussians) else gaussians_of(changed)
+    n = len(gaussians)
+    return TileChange(
+        tile=tile,
+        base_version=0 if base is None else version,
+        base_sha=sha_of(base, tile),
+        observed=np.array(sorted(observed), np.int32),
+        changed=gaussians,
+        change_class=np.full(n, change_class, np.uint8),
+        evidence=np.zeros((n, 4), np.int32),
+        pose_sigma_m=0.03,
+        pose_sigma_rad=0.001,
+    )
+
+
+def report_id(number: int) -> str:
+    """Ids that sort as their numbers."""
+    return deterministic_report_id(1_700_000_000_000 + number, "test")
+
+
+def report_of(number: int, *changes: TileChange, vehicle: str = "") -> ChangeReport:
+    """A whole report with these tiles, all of one district."""
+    return ChangeReport(
+        report_id=report_id(number),
+        vehicle=vehicle or f"car-{number}",
+        sensor_model="VLP-16",
+        software="test 1",
+        district=changes[0].tile.district,
+        first_ns=1_700_000_000_000_000_000 + number,
+        last_ns=1_700_000_001_000_000_000 + number,
+        tiles=changes,
+    )
+
+
+def tile_of_states(states: Mapping[int, State], tile: TileId = TILE, version: int = 1) -> Tile:
+    """A tile with these voxels."""
+    return Tile(tile, version, gaussians_of(states))

@@ -1,0 +1,202 @@
+"""The merge against a plain twin, and its purity: the same reports in any order and batching give the same bits."""
+
+import itertools
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from merger_world import (
+    BALL,
+    GROUND,
+    GROUND_AGAIN,
+    POLE,
+    TILE,
+    WALL,
+    WALL_AGAIN,
+    change_of,
+    gaussians_of,
+    report_of,
+    sha_of,
+)
+from sklearn.cluster import DBSCAN
+
+from cloud_merger.config import ShardConfig
+from cloud_merger.merge import MergeParameters, merge_tile
+from cloud_merger.statements import Report, statements_of
+from cloud_merger.work import Worker
+from gnd_map.classes import ChangeClass
+from gnd_map.gaussian import Gaussians, Moments, concat
+from gnd_map.similarity import similarity
+from gnd_map.tile import Tile
+from schemas.changes import split
+from tile_store.sqlite_store import SqliteStore
+from tile_store.values import ReportRow, StoreConfig
+
+VOXELS = range(4)
+EPOCH = gaussians_of({0: GROUND, 1: WALL})
+OLDER = gaussians_of({0: GROUND, 2: POLE, 3: BALL})
+LOST = gaussians_of({9: BALL})  # a version that the store has not
+STATES = [None, GROUND, GROUND_AGAIN, WALL, WALL_AGAIN, POLE, BALL]
+
+
+@st.composite
+def changes(draw, bases=(EPOCH, OLDER, LOST, None)):
+    observed = sorted(draw(st.sets(st.sampled_from(VOXELS))))
+    changed = {v: draw(st.sampled_from(STATES)) for v in observed if draw(st.booleans())}
+    gaussians = gaussians_of(changed, count=draw(st.integers(20, 1000)), cells=draw(st.sampled_from([20, 60, 10])))
+    shift = draw(st.floats(-0.0625, 0.0625, width=32))
+    moved = Gaussians(
+        *gaussians.columns[:3], gaussians.mean_m + gaussians.exists[:, None] * np.float32(shift), gaussians.cov_m2
+    )
+    base = draw(st.sampled_from(bases))
+    kind = draw(st.sampled_from([ChangeClass.MODIFIED, ChangeClass.MODIFIED, ChangeClass.UNMEASURED]))
+    return change_of(base, observed, moved, change_class=kind)
+
+
+def plain_merge(epoch, reports, bases, parameters):
+    """Voxel by voxel, as the paper tells it, with scikit-learn's DBSCAN on a full distance matrix."""
+    parts, provenance = [], {}
+    for voxel in sorted({*VOXELS, *epoch.voxel_id.tolist()}):
+        was = epoch.select([voxel])
+        votes = [
+            (r.report_id, *vote)
+            for r in sorted(reports, key=lambda r: r.report_id)
+            if (vote := plain_vote(r, voxel, bases, parameters))
+        ]
+        now = plain_decision(was, votes, parameters)
+        parts.append(was if now is None else now[0])
+        if now is not None:
+            provenance[voxel] = now[1]
+    return concat(parts), provenance
+
+
+def plain_vote(report, voxel, bases, parameters):
+    """(state, is it measured), or nothing when the report abstains."""
+    change = report.change
+    if voxel not in change.observed:
+        return None
+    entry = change.changed.select([voxel])
+    if len(entry):
+        row = int(np.flatnonzero(change.changed.voxel_id == voxel)[0])
+        if change.change_class[row] == ChangeClass.UNMEASURED or 0 < entry.cells[0] < 20:
+            return None
+        return entry.take(entry.exists), bool(entry.exists[0])
+    base = {**bases, b"": Gaussians.empty()}.get(change.base_sha)
+    if parameters.mode == "paper" or base is None:
+        return None
+    return base.select([voxel]), False
+
+
+def plain_similarity(a, b, parameters):
+    def one(g):
+        return np.array([len(g) > 0]), *(g.columns[3:] if len(g) else (np.zeros((1, 3)), np.zeros((1, 6))))
+
+    return float(similarity(*one(a), *one(b), parameters.mode, parameters.noise_m)[0])
+
+
+def plain_decision(was, votes, parameters):
+    if not votes:
+        return None
+    states = [state for _, state, _ in votes]
+    distance = np.array([[0.0 if a is b else 1 - plain_similarity(a, b, parameters) for b in states] for a in states])
+    label = DBSCAN(eps=parameters.eps, min_samples=parameters.min_samples, metric="precomputed").fit(distance).labels_
+    sizes = {cluster: int((label == cluster).sum()) for cluster in label if cluster >= 0}
+    if not sizes:
+        return None
+    winner = min(sizes, key=lambda cluster: (-sizes[cluster], cluster))
+    members = [vote for vote, cluster in zip(votes, label, strict=True) if cluster == winner]
+    if not len(members) > parameters.xi * len(votes):
+        return None
+    now = plain_representative(members)
+    quotes = sum(not measured and len(state) > 0 and state == was for _, state, measured in members)
+    if plain_similarity(was, now, parameters) >= parameters.d_update or 2 * quotes >= len(members):
+        return None
+    return now, tuple(report_id for report_id, _, _ in members)
+
+
+def plain_representative(members):
+    measured = [state for _, state, is_measured in members if is_measured]
+    if not measured:
+        return members[0][1]
+    total = Moments.zeros(1)
+    for state in measured:
+        total = total + Moments.of(state)
+    return total.to_gaussians(measured[0].voxel_id)
+
+
+@settings(max_examples=150, deadline=None)
+@given(
+    st.lists(changes(), max_size=7),
+    st.sampled_from(["default", "paper"]),
+    st.sampled_from([0.3, 0.5, 0.6]),
+    st.integers(1, 3),
+)
+def test_the_merge_is_that_of_the_plain_twin(some, mode, xi, min_samples):
+    parameters = MergeParameters(mode=mode, xi=xi, min_samples=min_samples)
+    reports = [Report(f"{n:026d}", change) for n, change in enumerate(some)]
+    bases = {sha_of(EPOCH): EPOCH, sha_of(OLDER): OLDER}
+    got = merge_tile(EPOCH, statements_of(EPOCH, reports, bases, mode), parameters)
+    expected, provenance = plain_merge(EPOCH, reports, bases, parameters)
+    assert got.provenance == provenance
+    assert got.changed.tolist() == sorted(provenance)
+    for mine, plain in zip(got.gaussians.columns, expected.columns, strict=True):
+        np.testing.assert_allclose(mine, plain, rtol=1e-5, atol=1e-7)
+
+
+@settings(max_examples=100, deadline=None)
+@given(st.lists(changes(), max_size=7), st.randoms(use_true_random=False))
+def test_order_and_repetition_do_not_matter(some, random):
+    reports = [Report(f"{n:026d}", change) for n, change in enumerate(some)]
+    shuffled = reports + reports[: len(reports) // 2]
+    random.shuffle(shuffled)
+    bases = {sha_of(EPOCH): EPOCH, sha_of(OLDER): OLDER}
+    one, two = (merge_tile(EPOCH, statements_of(EPOCH, r, bases)) for r in (reports, shuffled))
+    assert Tile(TILE, 1, one.gaussians).sha == Tile(TILE, 1, two.gaussians).sha
+    assert one.provenance == two.provenance
+
+
+def rows_of(reports):
+    return [
+        ReportRow(r.report_id, r.layer, tile, r.vehicle, 0, body, base_sha=change.base_sha)
+        for r in reports
+        for change, (tile, body) in zip(r.tiles, split(r), strict=True)
+    ]
+
+
+def head_after(path, reports, cuts):
+    """The head's hash when the reports come in these batches, each merged and published before the next."""
+    config = ShardConfig(store_path=path)
+    with SqliteStore(path, StoreConfig(merge_delay_s=0.0)) as store:
+        store.put_tiles([Tile(TILE, 1, OLDER)])
+        store.put_tiles([Tile(TILE, 2, EPOCH)])
+        worker = Worker(store, config)
+        for first, end in itertools.pairwise([0, *cuts, len(reports)]):
+            store.put_reports(rows_of(reports[first:end]))
+            while claims := store.claim("one", 4, 30.0):
+                store.publish(worker.merge(claims))
+        assert store.dirty_count() == 0
+        head = store.get("ndt", TILE)
+        return head.sha, store.voxel_provenance("ndt", TILE, head.version)
+
+
+@settings(max_examples=15, deadline=None)
+@given(some=st.lists(changes(bases=(EPOCH, OLDER, None)), min_size=1, max_size=6), data=st.data())
+def test_any_batching_ends_in_the_same_tile_bit_for_bit(tmp_path_factory, some, data):
+    folder = tmp_path_factory.mktemp("batching")
+    reports = [report_of(n, change) for n, change in enumerate(some)]
+    shuffled = data.draw(st.permutations(reports))
+    cuts = sorted(data.draw(st.sets(st.integers(0, len(reports)))))
+    assert head_after(folder / "one.sqlite", reports, [])[0] == head_after(folder / "many.sqlite", shuffled, cuts)[0]
+
+
+@pytest.mark.parametrize("mode", ["default", "paper"])
+def test_a_batch_after_publication_ends_as_if_it_had_come_at_once(tmp_path, mode):
+    reports = [
+        report_of(n, change_of(EPOCH, [0, 1, 2], {1: WALL_AGAIN, 2: state}))
+        for n, state in enumerate((POLE, BALL, POLE))
+    ]
+    apart, provenance = head_after(tmp_path / "a.sqlite", reports, [1, 2])
+    together, _ = head_after(tmp_path / "b.sqlite", reports[::-1], [])
+    assert apart == together
+    assert provenance == {2: (reports[0].report_id, reports[2].report_id)}

@@ -1,0 +1,187 @@
+"""What the merge decides, one rule a test."""
+
+import numpy as np
+import pytest
+from merger_world import (
+    BALL,
+    GROUND,
+    GROUND_AGAIN,
+    POLE,
+    WALL,
+    WALL_AGAIN,
+    change_of,
+    gaussians_of,
+    report_id,
+    sha_of,
+)
+
+from cloud_merger.errors import MergerError
+from cloud_merger.merge import MergeParameters, merge_tile
+from cloud_merger.statements import Report, statements_of
+from gnd_map.classes import ChangeClass
+from gnd_map.gaussian import Gaussians, Moments
+
+EPOCH = gaussians_of({0: GROUND, 1: WALL})
+
+
+def merged(changes, *, epoch=EPOCH, bases=(), mode="default", **parameters):
+    known = {sha_of(base): base for base in (epoch, *bases)}
+    reports = [Report(report_id(number), change) for number, change in enumerate(changes)]
+    statements = statements_of(epoch, reports, known, mode)
+    return merge_tile(epoch, statements, MergeParameters(mode=mode, **parameters))
+
+
+def test_without_reports_the_tile_stays():
+    result = merged([])
+    assert result.gaussians == EPOCH
+    assert len(result.changed) == 0
+
+
+def test_one_drive_publishes_a_new_voxel():
+    result = merged([change_of(EPOCH, [0, 1, 2], {2: POLE})])
+    assert result.gaussians == gaussians_of({0: GROUND, 1: WALL, 2: POLE})
+    assert result.changed.tolist() == [2]
+    assert result.provenance == {2: (report_id(0),)}
+
+
+def test_one_drive_deletes_a_voxel():
+    result = merged([change_of(EPOCH, [0, 1], {1: None}, change_class=ChangeClass.DELETED)])
+    assert result.gaussians == gaussians_of({0: GROUND})
+    assert result.changed.tolist() == [1]
+
+
+def test_a_deletion_of_what_was_never_there_changes_nothing():
+    assert merged([change_of(EPOCH, [0, 5], {5: None})]).gaussians == EPOCH
+
+
+def test_what_resembles_the_map_is_not_published():
+    result = merged([change_of(EPOCH, [0], {0: GROUND_AGAIN})])
+    assert result.gaussians == EPOCH
+    assert len(result.changed) == 0
+
+
+def test_observers_who_saw_no_change_outvote_one_parked_car():
+    sees_car = change_of(EPOCH, [0, 1, 2], {2: BALL})
+    sees_none = change_of(EPOCH, [0, 1, 2], {})
+    assert merged([sees_car, sees_none, sees_none]).gaussians == EPOCH
+    assert merged([sees_car, sees_none, sees_none], mode="paper").changed.tolist() == [2]  # counts uploads only
+
+
+def test_who_did_not_observe_the_voxel_has_no_vote():
+    sees_car = change_of(EPOCH, [0, 1, 2], {2: BALL})
+    elsewhere = change_of(EPOCH, [0, 1], {})
+    assert merged([sees_car, elsewhere, elsewhere]).changed.tolist() == [2]
+
+
+def test_the_share_must_exceed_xi_not_only_reach_it():
+    yes, no = change_of(EPOCH, [2], {2: BALL}), change_of(EPOCH, [2], {})
+    assert merged([yes, yes, yes, no, no], xi=0.6).changed.tolist() == []
+    assert merged([yes, yes, yes, no, no], xi=0.59).changed.tolist() == [2]
+
+
+def test_the_biggest_cluster_wins_and_is_represented_by_its_moments():
+    one, two = gaussians_of({1: POLE}, count=100), gaussians_of({1: (*POLE[:2], 0.05, *POLE[3:])}, count=300)
+    result = merged([change_of(EPOCH, [1], g) for g in (one, gaussians_of({1: BALL}), two)], xi=0.5)
+    expected = (Moments.of(one) + Moments.of(two)).to_gaussians([1])
+    got = result.gaussians.select([1])
+    assert got.count.tolist() == [400]
+    np.testing.assert_allclose(got.mean_m, expected.mean_m, atol=1e-7)
+    np.testing.assert_allclose(got.cov_m2, expected.cov_m2, atol=1e-8)
+    assert result.provenance == {1: (report_id(0), report_id(2))}
+
+
+def test_of_equal_clusters_the_earliest_wins_when_xi_lets_any_win():
+    pole, ball = change_of(EPOCH, [2], {2: POLE}), change_of(EPOCH, [2], {2: BALL})
+    assert merged([pole, ball], xi=0.4).gaussians.select([2]) == gaussians_of({2: POLE})
+    assert merged([ball, pole], xi=0.4).gaussians.select([2]) == gaussians_of({2: BALL})
+    assert merged([pole, ball]).changed.tolist() == []
+
+
+def test_a_measured_gaussian_that_is_alone_is_published_bit_for_bit():
+    alone = gaussians_of({2: (0.123456, -0.2345678, 0.34567, 0.0123, 0.27, 0.19)}, count=977)
+    assert merged([change_of(EPOCH, [2], alone)]).gaussians.select([2]) == alone
+
+
+def test_a_report_against_an_older_version_is_rebased():
+    # Version 2 lacked the wall; this vehicle says "as in version 2", which speaks against the wall of the epoch.
+    old = gaussians_of({0: GROUND})
+    result = merged([change_of(old, [0, 1], {}, version=2)], bases=[old])
+    assert result.gaussians == old
+    assert result.provenance == {1: (report_id(0),)}
+
+
+def test_a_quoted_gaussian_counts_once_and_only_where_nobody_measured():
+    # Both confirm version 2, in which voxel 2 held a pole: it comes back with its own count, not with twice that.
+    old = gaussians_of({0: GROUND, 1: WALL, 2: POLE}, count=150)
+    quotes = [change_of(old, [2], {}, version=2)] * 2
+    assert merged(quotes, bases=[old]).gaussians.select([2]).count.tolist() == [150]
+    measures = change_of(EPOCH, [2], gaussians_of({2: POLE}, count=90))
+    assert merged([*quotes, measures], bases=[old]).gaussians.select([2]).count.tolist() == [90]
+
+
+def test_reports_that_confirm_a_published_change_do_not_alter_it():
+    first = change_of(EPOCH, [0, 1, 2], {2: POLE})
+    version_2 = merged([first]).gaussians
+    confirms = change_of(version_2, [0, 1, 2], {}, version=2)
+    assert merged([first, confirms, confirms], bases=[version_2]).gaussians == version_2
+
+
+def test_of_an_unknown_base_only_the_measurements_speak():
+    lost = gaussians_of({7: BALL})
+    result = merged([change_of(lost, [0, 1, 2], {2: POLE})])
+    assert result.gaussians == gaussians_of({0: GROUND, 1: WALL, 2: POLE})
+
+
+def test_a_vehicle_without_a_map_says_what_it_saw_and_that_the_rest_is_empty():
+    result = merged([change_of(None, [0, 1, 2], {0: GROUND_AGAIN, 2: POLE}, change_class=ChangeClass.NEW)])
+    assert result.gaussians == gaussians_of({0: GROUND, 2: POLE})
+    assert result.changed.tolist() == [1, 2]
+
+
+def test_a_tile_without_a_map_gets_its_first_gaussians():
+    empty = Gaussians.empty()
+    change = change_of(None, [0, 1], {0: GROUND}, change_class=ChangeClass.NEW)
+    assert merged([change], epoch=empty).gaussians == gaussians_of({0: GROUND})
+
+
+def test_unmeasured_and_weak_entries_abstain():
+    pole = change_of(EPOCH, [2], {2: POLE})
+    unmeasured = change_of(EPOCH, [2], {2: None}, change_class=ChangeClass.UNMEASURED)
+    weak = change_of(EPOCH, [2], gaussians_of({2: BALL}, cells=19))
+    assert merged([pole, unmeasured, unmeasured, weak, weak]).changed.tolist() == [2]
+    assert merged([weak]).gaussians == EPOCH
+    enough = change_of(EPOCH, [2], gaussians_of({2: BALL}, cells=20))
+    assert merged([enough]).changed.tolist() == [2]
+
+
+def test_a_chain_of_neighbours_cannot_carry_those_who_confirm_the_map():
+    # near resembles the ground, far resembles near but not the ground: all are one cluster.
+    near = {0: (0.0, 0.0, -0.14, 0.28, 0.28, 0.02)}
+    far = {0: (0.0, 0.0, -0.08, 0.28, 0.28, 0.02)}
+    quotes = [change_of(EPOCH, [0], {})] * 3
+    changes = [change_of(EPOCH, [0], near), *[change_of(EPOCH, [0], far)] * 2]
+    assert merged([*quotes, *changes]).gaussians == EPOCH
+    assert merged([*quotes[:1], *changes, *changes]).changed.tolist() == [0]
+
+
+def test_the_same_report_twice_counts_once():
+    sees, none = change_of(EPOCH, [2], {2: POLE}), change_of(EPOCH, [2], {})
+    reports = [Report(report_id(0), sees), Report(report_id(0), sees), Report(report_id(1), none)]
+    statements = statements_of(EPOCH, reports, {sha_of(EPOCH): EPOCH})
+    assert merge_tile(EPOCH, statements).gaussians == EPOCH  # 1 of 2, not 2 of 3
+
+
+def test_paper_mode_takes_the_same_shape_only():
+    wall = change_of(EPOCH, [1], {1: WALL_AGAIN})
+    ball = change_of(EPOCH, [1], {1: (*WALL[:3], 0.25, 0.25, 0.25)})
+    assert merged([wall], mode="paper").gaussians == EPOCH
+    assert merged([ball], mode="paper").changed.tolist() == [1]  # Eq. 17: another type, similarity 0
+
+
+@pytest.mark.parametrize(
+    ("name", "value"),
+    [("mode", "best"), ("eps", 0.0), ("eps", 1.0), ("min_samples", 0), ("xi", 1.0), ("xi", -0.1), ("d_update", 1.1)],
+)
+def test_absurd_parameters_are_refused(name, value):
+    with pytest.raises(MergerError, match=name):
+        MergeParameters(**{name: value})
