@@ -1,1 +1,14 @@
+"""Localisation on the GND map: first pose, scan-to-map matching, pose graph, final poses for the evidence."""
 
+from vehicle_agent.localise.estimates import LocalisationError, PoseEstimate, RefinedScan, localisation_error
+from vehicle_agent.localise.localiser import Localiser
+from vehicle_agent.localise.parameters import LocaliserParameters
+
+__all__ = [
+    "LocalisationError",
+    "Localiser",
+    "LocaliserParameters",
+    "PoseEstimate",
+    "RefinedScan",
+    "localisation_error",
+]

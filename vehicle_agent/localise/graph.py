@@ -1,0 +1,117 @@
+"""The pose graph: a fixed-lag smoother over the last seconds of poses (GTSAM, built-in factors only)."""
+
+from dataclasses import dataclass
+
+import gtsam
+import numpy as np
+from numpy.typing import NDArray
+
+from vehicle_agent.localise.parameters import GraphParameters
+
+F64 = NDArray[np.float64]
+
+SLACK_S = 0.01
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class SmoothedPose:
+    """A pose of the graph: number, time, (4, 4) T_map_vehicle and (6, 6) covariance (rotation first, vehicle frame)."""
+
+    number: int
+    t_ns: int
+    T_map_vehicle: F64
+    covariance: F64
+
+
+class PoseGraph:
+    """Poses of the last `lag_s` seconds, tied by odometry, map matches and GNSS; the oldest leave it as final."""
+
+    def __init__(self, parameters: GraphParameters) -> None:
+        self.parameters = parameters
+        # A little longer than our lag, so that a pose is taken out before the smoother forgets it.
+        self._smoother = gtsam.BatchFixedLagSmoother(parameters.lag_s + SLACK_S)
+        self._t_ns: dict[int, int] = {}
+        self._first_ns = 0
+        self._next = 0
+
+    def __len__(self) -> int:
+        return len(self._t_ns)
+
+    @property
+    def newest(self) -> int:
+        """Number of the newest pose."""
+        return self._next - 1
+
+    def add(
+        self,
+        t_ns: int,
+        T_map_vehicle: F64,
+        odometry: F64 | None,
+        match: tuple[F64, F64] | None,
+        gnss: tuple[F64, float] | None,
+    ) -> list[SmoothedPose]:
+        """Add a pose and return the poses that leave the lag, oldest first.
+
+        Args:
+            t_ns: its time, later than the one before.
+            T_map_vehicle: (4, 4) where the optimisation starts.
+            odometry: (4, 4) motion since the pose before, None for the first pose.
+            match: pose (4, 4) and covariance (6, 6) that the map gives, or None.
+            gnss: position (3,) of the vehicle in the map frame and horizontal sigma in metres, or None.
+        """
+        number, factors, values = self._next, gtsam.NonlinearFactorGraph(), gtsam.Values()
+        values.insert(number, gtsam.Pose3(T_map_vehicle))
+        if odometry is not None:
+            drift = gtsam.noiseModel.Diagonal.Sigmas(self._odometry_sigmas(odometry))
+            factors.add(gtsam.BetweenFactorPose3(number - 1, number, gtsam.Pose3(odometry), drift))
+        if match is not None:
+            noise = self._robust(gtsam.noiseModel.Gaussian.Covariance(match[1]))
+            factors.add(gtsam.PriorFactorPose3(number, gtsam.Pose3(match[0]), noise))
+        if gnss is not None:
+            factors.add(gtsam.GPSFactor(number, gnss[0], self._gnss_noise(gnss[1])))
+        final = self._leaving(t_ns)
+        if number == 0:
+            self._first_ns = t_ns
+        self._t_ns[number] = t_ns
+        self._next += 1
+        self._smoother.update(factors, values, {number: (t_ns - self._first_ns) * 1e-9})
+        return final
+
+    def _leaving(self, now_ns: int) -> list[SmoothedPose]:
+        return self._take([n for n, t in self._t_ns.items() if now_ns - t > self.parameters.lag_s * 1e9])
+
+    def flush(self) -> list[SmoothedPose]:
+        """All poses still inside, as they stand now; the graph is empty afterwards."""
+        return self._take(list(self._t_ns))
+
+    def pose(self, number: int) -> F64:
+        """(4, 4) present estimate of a pose inside the lag."""
+        return np.asarray(self._smoother.calculateEstimatePose3(number).matrix())
+
+    def smoothed(self, *numbers: int) -> list[SmoothedPose]:
+        """Poses inside the lag with their marginal covariances."""
+        if not numbers:
+            return []
+        marginals = gtsam.Marginals(self._smoother.getFactors(), self._smoother.calculateEstimate())
+        return [
+            SmoothedPose(n, self._t_ns[n], self.pose(n), np.asarray(marginals.marginalCovariance(n))) for n in numbers
+        ]
+
+    def _take(self, numbers: list[int]) -> list[SmoothedPose]:
+        poses = self.smoothed(*numbers)
+        for number in numbers:
+            del self._t_ns[number]
+        return poses
+
+    def _odometry_sigmas(self, odometry: F64) -> F64:
+        par = self.parameters
+        along = par.longitudinal_m + par.distance_share * float(np.linalg.norm(odometry[:3, 3]))
+        return np.array([par.roll_pitch_rad, par.roll_pitch_rad, par.yaw_rad, along, par.lateral_m, par.vertical_m])
+
+    def _gnss_noise(self, sigma_m: float) -> gtsam.noiseModel.Base:
+        axes = np.array([1.0, 1.0, self.parameters.gnss_vertical])
+        return self._robust(gtsam.noiseModel.Diagonal.Sigmas(sigma_m * self.parameters.gnss_inflation * axes))
+
+    def _robust(self, noise: gtsam.noiseModel.Base) -> gtsam.noiseModel.Base:
+        cauchy = gtsam.noiseModel.mEstimator.Cauchy.Create(self.parameters.robust_k)
+        return gtsam.noiseModel.Robust.Create(cauchy, noise)

@@ -1,0 +1,205 @@
+"""The first pose: a search of the map around a GNSS position with unknown heading.
+
+Coarse: every position x heading on a grid is scored by how many sampled points fall into or next to a voxel of the map
+that stands above the ground. The best are refined by registration, and the answer says how close the runner-up came.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from gnd_map.jit import kernel
+from gnd_map.se3 import T_from_R_t, exp_so3, log_so3
+from vehicle_agent.errors import RegistrationError
+from vehicle_agent.localise.match_map import MatchMap
+from vehicle_agent.localise.parameters import InitialiseParameters, RegistrationParameters
+from vehicle_agent.localise.registration import RegistrationResult, register
+
+F64 = NDArray[np.float64]
+U8 = NDArray[np.uint8]
+
+GROUND_RADIUS_M = 12.0  # map columns around the position that say how high and how steep the ground is
+HIT, NEXT_TO = 3, 1  # score of a point in a voxel with a Gaussian, in a neighbour of one
+SUPPRESS_M, SUPPRESS_DEG = 1.5, 8.0  # coarse hypotheses nearer than this converge to the same pose
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class InitialPose:
+    """The best pose found, and how sure it is.
+
+    fit: 0 ... 1, robust fit times the share of points in known voxels; runner_up_fit: that of the best pose that is a
+    different answer (0 if there is none); hypotheses: how many were scored; found: good enough and unambiguous.
+    """
+
+    registration: RegistrationResult
+    fit: float
+    runner_up_fit: float
+    hypotheses: int
+    found: bool
+
+
+def initialise(
+    points_m: F64,
+    p_gnss_m: F64,
+    sigma_m: float,
+    match_map: MatchMap,
+    parameters: InitialiseParameters | None = None,
+    registration: RegistrationParameters | None = None,
+) -> InitialPose | None:
+    """Find the vehicle's pose around a GNSS position; None when the map there matches nothing.
+
+    Args:
+        points_m: (N, 3) sampled points, vehicle frame, sweep motion removed.
+        p_gnss_m: (3,) position in the map frame; its height is not used.
+        sigma_m: one sigma of the horizontal position.
+        match_map: the map window, linearised near the position.
+        parameters: of the search.
+        registration: of the refinement.
+    """
+    par = parameters or InitialiseParameters()
+    ground = _ground_plane(match_map, p_gnss_m)
+    if ground is None:
+        return None
+    hypotheses = _hypotheses(p_gnss_m, sigma_m, ground, _ground_below(points_m), par)
+    scores = _score(points_m, hypotheses, match_map, par)
+    best = _distinct_best(hypotheses, scores, par.n_refined)
+    return _answer(_refined(points_m, hypotheses[best], match_map, registration), len(hypotheses), par)
+
+
+def _ground_plane(m: MatchMap, p_map_m: F64) -> F64 | None:
+    """(3,) z = c + sx dx + sy dy around `p_map_m`: least squares through the lowest Gaussians of the columns there."""
+    near = np.flatnonzero(np.hypot(*(m.mean_m[:, :2] - p_map_m[:2]).T) < GROUND_RADIUS_M)
+    if len(near) < 10:
+        return None
+    g = np.floor(m.mean_m[near] @ m.A.T + m.b).astype(np.int64)
+    order = np.lexsort((m.mean_m[near, 2], g[:, 1], g[:, 0]))
+    first = np.any(np.diff(g[order, :2], axis=0, prepend=-1), axis=1)
+    low = m.mean_m[near[order[first]]] - [*p_map_m[:2], 0.0]
+    return _robust_plane(low)
+
+
+def _robust_plane(points: F64) -> F64:
+    """Z = c + sx x + sy y through the lower half of `points` (N, 3), refitted twice without what stands above it."""
+    keep = points[:, 2] <= np.median(points[:, 2])
+    plane = np.zeros(3)
+    for _ in range(3):
+        columns = np.column_stack([np.ones(keep.sum()), points[keep, :2]])
+        plane = np.linalg.lstsq(columns, points[keep, 2], rcond=None)[0]
+        off = points[:, 2] - (plane[0] + points[:, :2] @ plane[1:])
+        keep = np.abs(off) <= max(0.2, float(np.quantile(np.abs(off), 0.4)))
+    return np.asarray(plane)
+
+
+def _ground_below(points_m: F64) -> float:
+    """Height of the ground in the vehicle frame: the fullest 20 cm among the points within 15 m."""
+    near = points_m[np.hypot(points_m[:, 0], points_m[:, 1]) < 15.0, 2]
+    if not len(near):
+        return 0.0
+    low = near[near <= np.quantile(near, 0.6)]
+    counts, edges = np.histogram(low, bins=max(1, int(np.ptp(low) / 0.2)))
+    k = int(np.argmax(counts))
+    return float(np.median(low[(low >= edges[k]) & (low <= edges[k + 1])]))
+
+
+def _hypotheses(p_gnss_m: F64, sigma_m: float, ground: F64, ground_below_m: float, par: InitialiseParameters) -> F64:
+    """(K, 4, 4) poses on a grid of positions in the circle and headings, standing on the ground plane."""
+    reach = par.radius_sigmas * sigma_m
+    steps = np.arange(-np.ceil(reach / par.step_m), np.ceil(reach / par.step_m) + 1) * par.step_m
+    dx, dy = (a.ravel() for a in np.meshgrid(steps, steps))
+    inside = np.hypot(dx, dy) <= max(reach, par.step_m)
+    dx, dy = dx[inside], dy[inside]
+    z = ground[0] + ground[1] * dx + ground[2] * dy - ground_below_m
+    t = np.column_stack([p_gnss_m[0] + dx, p_gnss_m[1] + dy, z])
+    yaw = np.radians(np.arange(0.0, 360.0, par.step_deg))
+    R = _tilt(ground) @ exp_so3(np.column_stack([np.zeros((len(yaw), 2)), yaw]))
+    return T_from_R_t(np.tile(R, (len(t), 1, 1)), np.repeat(t, len(yaw), axis=0))
+
+
+def _tilt(ground: F64) -> F64:
+    """(3, 3) the smallest rotation that puts the z axis on the ground's normal."""
+    normal = np.array([-ground[1], -ground[2], 1.0]) / np.sqrt(1.0 + ground[1] ** 2 + ground[2] ** 2)
+    return exp_so3(np.arccos(normal[2]) * np.array([-normal[1], normal[0], 0.0]) / max(np.hypot(*normal[:2]), 1e-12))
+
+
+def _score(points_m: F64, hypotheses: F64, m: MatchMap, par: InitialiseParameters) -> F64:
+    """(K,) mean score a point of each hypothesis: points above the ground only, as ground fits everywhere."""
+    standing = points_m[points_m[:, 2] > _ground_below(points_m) + par.above_ground_m]
+    chosen = standing[np.linspace(0, len(standing) - 1, min(par.n_points, len(standing))).astype(np.int64)]
+    R = m.A @ hypotheses[:, :3, :3]
+    t = hypotheses[:, :3, 3] @ m.A.T + m.b
+    scores = np.zeros(len(hypotheses))
+    if len(chosen):
+        _score_all(np.ascontiguousarray(chosen), np.ascontiguousarray(R), t, _field(m.index), scores)
+    return scores
+
+
+def _field(index: NDArray[np.int32]) -> U8:
+    """(nx, ny, nz) uint8: HIT in a voxel with a Gaussian, NEXT_TO in its six neighbours, else 0."""
+    occupied = index >= 0
+    field = np.zeros(index.shape, np.uint8)
+    for axis in range(3):
+        low, high = [slice(None)] * 3, [slice(None)] * 3
+        low[axis], high[axis] = slice(None, -1), slice(1, None)
+        field[tuple(low)] |= occupied[tuple(high)] * np.uint8(NEXT_TO)
+        field[tuple(high)] |= occupied[tuple(low)] * np.uint8(NEXT_TO)
+    field[occupied] = HIT
+    return field
+
+
+@kernel
+def _score_all(points: F64, R: F64, t: F64, field: U8, scores: F64) -> None:
+    """Mean of `field` over the points (N, 3) under each transform R (K, 3, 3), t (K, 3) into window coordinates."""
+    nx, ny, nz = field.shape
+    for k in range(R.shape[0]):
+        total = 0
+        for n in range(points.shape[0]):
+            x, y, z = points[n, 0], points[n, 1], points[n, 2]
+            gx = R[k, 0, 0] * x + R[k, 0, 1] * y + R[k, 0, 2] * z + t[k, 0]
+            gy = R[k, 1, 0] * x + R[k, 1, 1] * y + R[k, 1, 2] * z + t[k, 1]
+            gz = R[k, 2, 0] * x + R[k, 2, 1] * y + R[k, 2, 2] * z + t[k, 2]
+            if 0.0 <= gx < nx and 0.0 <= gy < ny and 0.0 <= gz < nz:
+                total += field[int(gx), int(gy), int(gz)]
+        scores[k] = total / points.shape[0]
+
+
+def _distinct_best(hypotheses: F64, scores: F64, n: int) -> NDArray[np.int64]:
+    """Indices of the n best hypotheses, none near a better one."""
+    left = np.argsort(-scores, kind="stable")
+    chosen: list[int] = []
+    while len(left) and len(chosen) < n:
+        chosen.append(int(left[0]))
+        left = left[~_near(hypotheses[left], hypotheses[left[0]], SUPPRESS_M, SUPPRESS_DEG)]
+    return np.array(chosen, np.int64)
+
+
+def _near(T: F64, other: F64, apart_m: float, apart_deg: float) -> NDArray[np.bool_]:
+    """(K,) which poses (K, 4, 4) lie within both limits of `other` (4, 4)."""
+    distance = np.linalg.norm(T[:, :2, 3] - other[:2, 3], axis=1)
+    turn = np.linalg.norm(log_so3(other[:3, :3].T @ T[:, :3, :3]), axis=1)
+    return np.asarray((distance < apart_m) & (turn < np.radians(apart_deg)))
+
+
+def _refined(points_m: F64, poses: F64, m: MatchMap, par: RegistrationParameters | None) -> list[RegistrationResult]:
+    """Registrations from each pose, those that match nothing left out."""
+    results = []
+    for T in poses:
+        try:
+            results.append(register(points_m, T, m, par, capture=True))
+        except RegistrationError:
+            continue
+    return results
+
+
+def _answer(results: list[RegistrationResult], n: int, par: InitialiseParameters) -> InitialPose | None:
+    """The best refined pose, compared with the best that is a different one."""
+    if not results:
+        return None
+    fits = np.array([r.fit * r.known_ratio for r in results])
+    best = int(np.argmax(fits))
+    T = np.stack([r.T_map_vehicle for r in results])
+    others = fits[~_near(T, T[best], par.apart_m, par.apart_deg)]
+    runner_up = float(others.max()) if len(others) else 0.0
+    fit = float(fits[best])
+    found = fit >= par.min_fit and runner_up <= par.ambiguity * fit
+    return InitialPose(results[best], fit, runner_up, n, found)

@@ -1,0 +1,184 @@
+"""Numba kernels of the point-to-Gaussian registration (DESIGN 8): plain loops over flat arrays, no allocation."""
+
+import numpy as np
+from numpy.typing import NDArray
+
+from gnd_map.jit import kernel
+
+F64 = NDArray[np.float64]
+I32 = NDArray[np.int32]
+
+JACOBI_SWEEPS = 6  # a symmetric 3x3 matrix is diagonal to 1e-15 after five
+
+
+@kernel
+def _jacobi_rotate(S: F64, V: F64, p: int, q: int) -> None:
+    """Turn the symmetric S (3, 3) so that S[p, q] becomes 0, and the columns of V with it."""
+    if S[p, q] == 0.0:
+        return
+    theta = 0.5 * (S[q, q] - S[p, p]) / S[p, q]
+    t = (1.0 if theta >= 0.0 else -1.0) / (abs(theta) + np.sqrt(theta * theta + 1.0))
+    c = 1.0 / np.sqrt(t * t + 1.0)
+    s = t * c
+    o = 3 - p - q
+    S[p, p], S[q, q] = S[p, p] - t * S[p, q], S[q, q] + t * S[p, q]
+    S[p, q] = S[q, p] = 0.0
+    S[o, p], S[o, q] = c * S[o, p] - s * S[o, q], s * S[o, p] + c * S[o, q]
+    S[p, o], S[q, o] = S[o, p], S[o, q]
+    for r in range(3):
+        V[r, p], V[r, q] = c * V[r, p] - s * V[r, q], s * V[r, p] + c * V[r, q]
+
+
+@kernel
+def tapered_information(cov: F64, noise_m2: float, uniform_m2: float, information: F64) -> None:
+    """Fill `information` (M, 6) from the covariances `cov` (M, 6), both xx,xy,xz,yy,yz,zz.
+
+    Along each principal axis 1/(variance + noise), less what a voxel filled evenly (variance `uniform_m2`) would give,
+    never below 0. Eigenvectors by cyclic Jacobi rotations; `numpy.linalg.eigh` is the oracle in the tests.
+    """
+    S, V = np.empty((3, 3)), np.empty((3, 3))
+    for m in range(cov.shape[0]):
+        V[:] = 0.0
+        V[0, 0] = V[1, 1] = V[2, 2] = 1.0
+        S[0, 0], S[0, 1], S[0, 2], S[1, 1], S[1, 2], S[2, 2] = cov[m]
+        S[1, 0], S[2, 0], S[2, 1] = S[0, 1], S[0, 2], S[1, 2]
+        for _ in range(JACOBI_SWEEPS):
+            _jacobi_rotate(S, V, 0, 1)
+            _jacobi_rotate(S, V, 0, 2)
+            _jacobi_rotate(S, V, 1, 2)
+        information[m] = 0.0
+        for k in range(3):
+            i = max(0.0, 1.0 / (max(S[k, k], 0.0) + noise_m2) - 1.0 / (uniform_m2 + noise_m2))
+            x, y, z = V[0, k], V[1, k], V[2, k]
+            information[m, 0] += i * x * x
+            information[m, 1] += i * x * y
+            information[m, 2] += i * x * z
+            information[m, 3] += i * y * y
+            information[m, 4] += i * y * z
+            information[m, 5] += i * z * z
+
+
+@kernel
+def _mahalanobis2(o: F64, d0: float, d1: float, d2: float) -> float:
+    """Squared distance d' Omega d with Omega as upper triangle (6,)."""
+    mixed = o[1] * d0 * d1 + o[2] * d0 * d2 + o[4] * d1 * d2
+    return float(o[0] * d0 * d0 + o[3] * d1 * d1 + o[5] * d2 * d2 + 2.0 * mixed)
+
+
+@kernel
+def _nearest(
+    q0: float, q1: float, q2: float, ix: int, iy: int, iz: int, index: I32, mean: F64, omega: F64, gate_m2: float
+) -> tuple[int, float]:
+    """Row and squared Mahalanobis distance of the nearest Gaussian of the voxel and its six face neighbours, or -1."""
+    best, best_m2 = -1, gate_m2
+    for k in range(7):
+        jx, jy, jz = ix, iy, iz
+        step = 1 if k & 1 else -1
+        if 1 <= k <= 2:
+            jx += step
+        elif 3 <= k <= 4:
+            jy += step
+        elif k >= 5:
+            jz += step
+        row = index[jx, jy, jz]
+        if row >= 0:
+            m2 = _mahalanobis2(omega[row], q0 - mean[row, 0], q1 - mean[row, 1], q2 - mean[row, 2])
+            if m2 < best_m2:
+                best, best_m2 = row, m2
+    return best, best_m2
+
+
+@kernel
+def _accumulate(
+    H: F64, g: F64, a0: float, a1: float, a2: float, d0: float, d1: float, d2: float, o: F64, w: float
+) -> None:
+    """Add a point's share: J = [-[a]x, I], H += w J' Omega J (upper triangle), g += w J' Omega d."""
+    o00, o01, o02, o11, o12, o22 = w * o[0], w * o[1], w * o[2], w * o[3], w * o[4], w * o[5]
+    f0, f1, f2 = o00 * d0 + o01 * d1 + o02 * d2, o01 * d0 + o11 * d1 + o12 * d2, o02 * d0 + o12 * d1 + o22 * d2
+    g[0] += a1 * f2 - a2 * f1
+    g[1] += a2 * f0 - a0 * f2
+    g[2] += a0 * f1 - a1 * f0
+    g[3] += f0
+    g[4] += f1
+    g[5] += f2
+    b00, b01, b02 = a1 * o02 - a2 * o01, a1 * o12 - a2 * o11, a1 * o22 - a2 * o12  # B = [a]x Omega
+    b10, b11, b12 = a2 * o00 - a0 * o02, a2 * o01 - a0 * o12, a2 * o02 - a0 * o22
+    b20, b21, b22 = a0 * o01 - a1 * o00, a0 * o11 - a1 * o01, a0 * o12 - a1 * o02
+    H[0, 0] += a1 * b02 - a2 * b01  # B [a]x'
+    H[0, 1] += a2 * b00 - a0 * b02
+    H[0, 2] += a0 * b01 - a1 * b00
+    H[1, 1] += a2 * b10 - a0 * b12
+    H[1, 2] += a0 * b11 - a1 * b10
+    H[2, 2] += a0 * b21 - a1 * b20
+    H[0, 3] += b00
+    H[0, 4] += b01
+    H[0, 5] += b02
+    H[1, 3] += b10
+    H[1, 4] += b11
+    H[1, 5] += b12
+    H[2, 3] += b20
+    H[2, 4] += b21
+    H[2, 5] += b22
+    H[3, 3] += o00
+    H[3, 4] += o01
+    H[3, 5] += o02
+    H[4, 4] += o11
+    H[4, 5] += o12
+    H[5, 5] += o22
+
+
+@kernel
+def linearise(
+    points: F64, R: F64, t: F64, index: I32, A: F64, b: F64, mean: F64, omega: F64, scale2: float, gate_m2: float,
+    H: F64, g: F64,
+) -> tuple[float, int, int]:  # fmt: skip
+    """Normal equations of sum rho(d' Omega d), d = R p + t - mean, about the pose (R, t).
+
+    Args:
+        points: (N, 3) in the vehicle frame.
+        R: (3, 3), with t the pose in the map frame.
+        t: (3,).
+        index: (nx, ny, nz) int32: a row of `mean` and `omega`, -1 empty, below -1 unknown.
+        A: (3, 3); window coordinates of a map point q are A q + b.
+        b: (3,).
+        mean: (M, 3) in the map frame.
+        omega: (M, 6) information matrices, 1/m².
+        scale2: square of the Geman-McClure scale.
+        gate_m2: largest squared Mahalanobis distance of a match.
+        H: (6, 6), filled: for a turn about the vehicle and a shift, both along map axes, rotation first.
+        g: (6,), filled: the gradient to H.
+
+    Returns:
+        robust cost (between 0 and scale2 a point), points matched, points in known voxels.
+    """
+    nx, ny, nz = index.shape
+    H[:] = 0.0
+    g[:] = 0.0
+    cost, matched, inside = 0.0, 0, 0
+    for n in range(points.shape[0]):
+        p0, p1, p2 = points[n, 0], points[n, 1], points[n, 2]
+        a0 = R[0, 0] * p0 + R[0, 1] * p1 + R[0, 2] * p2
+        a1 = R[1, 0] * p0 + R[1, 1] * p1 + R[1, 2] * p2
+        a2 = R[2, 0] * p0 + R[2, 1] * p1 + R[2, 2] * p2
+        q0, q1, q2 = a0 + t[0], a1 + t[1], a2 + t[2]
+        gx = A[0, 0] * q0 + A[0, 1] * q1 + A[0, 2] * q2 + b[0]
+        gy = A[1, 0] * q0 + A[1, 1] * q1 + A[1, 2] * q2 + b[1]
+        gz = A[2, 0] * q0 + A[2, 1] * q1 + A[2, 2] * q2 + b[2]
+        if not (1.0 <= gx < nx - 1 and 1.0 <= gy < ny - 1 and 1.0 <= gz < nz - 1):
+            continue
+        ix, iy, iz = int(gx), int(gy), int(gz)
+        if index[ix, iy, iz] < -1:
+            continue
+        inside += 1
+        row, m2 = _nearest(q0, q1, q2, ix, iy, iz, index, mean, omega, gate_m2)
+        if row < 0:
+            cost += scale2
+            continue
+        matched += 1
+        cost += scale2 * m2 / (scale2 + m2)  # Geman-McClure
+        s = scale2 / (scale2 + m2)
+        _accumulate(H, g, a0, a1, a2, q0 - mean[row, 0], q1 - mean[row, 1], q2 - mean[row, 2], omega[row], s * s)
+    for r in range(6):
+        for c in range(r):
+            H[r, c] = H[c, r]
+    return cost, matched, inside

@@ -1,0 +1,258 @@
+"""The localiser: predict, deskew, match, gate, fuse; poses are final when the lag has passed (GND, 3 (ii))."""
+
+from collections import deque
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from gnd_map.motion import deskew
+from gnd_map.se3 import transform
+from schemas.drive import GnssFix, MotionSample, Scan
+from vehicle_agent.errors import RegistrationError
+from vehicle_agent.local_map import LocalMap
+from vehicle_agent.localise.estimates import Health, PoseEstimate, RefinedScan
+from vehicle_agent.localise.graph import PoseGraph, SmoothedPose
+from vehicle_agent.localise.health import HealthMonitor
+from vehicle_agent.localise.initialise import InitialPose, initialise
+from vehicle_agent.localise.match_map import MatchMapCache
+from vehicle_agent.localise.odometry import MotionBuffer, MotionTeacher
+from vehicle_agent.localise.parameters import LocaliserParameters
+from vehicle_agent.localise.registration import RegistrationResult, register
+from vehicle_agent.localise.sampling import sample_scan
+
+F64 = NDArray[np.float64]
+
+MAX_GNSS_AGE_NS = 2_000_000_000
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _HeldScan:
+    """A scan in the lag: what is needed to make it final, and how its match went."""
+
+    scan: Scan
+    t_ns: int
+    matching_ratio: float
+    health: Health
+
+
+@dataclass(slots=True, eq=False)
+class _Track:
+    """What exists only while the pose is known."""
+
+    graph: PoseGraph
+    monitor: HealthMonitor
+    held: dict[int, _HeldScan]
+
+
+class Localiser:
+    """Feeds on motion, GNSS and scans in time order; holds the scans of the last `lag_s` seconds and nothing older.
+
+    A scan waits until the motion to its end is known, is matched then, and comes out as `RefinedScan` when its pose is
+    final. Scans taken while the pose is not known (before the first, or while lost) are dropped and counted.
+    """
+
+    def __init__(
+        self, local_map: LocalMap, T_vehicle_lidar: F64, parameters: LocaliserParameters | None = None
+    ) -> None:
+        self.parameters = parameters or LocaliserParameters()
+        self.local_map = local_map
+        self.T_vehicle_lidar = np.asarray(T_vehicle_lidar, dtype=np.float64)
+        self.online: PoseEstimate | None = None
+        """Newest pose, for progress and for choosing tiles; its health is `lost` until it is found again."""
+        self.dropped_scans = 0
+        self.initialisations = 0
+        self._motion = MotionBuffer()
+        self._teacher = MotionTeacher(self._motion)
+        self._map = MatchMapCache(local_map, self.parameters.registration.noise_m)
+        self._fix: GnssFix | None = None
+        self._pending: Scan | None = None
+        self._ready: deque[RefinedScan] = deque()
+        self._searched_ns = -(2**62)
+        self._track: _Track | None = None
+
+    # --- what the agent calls ------------------------------------------------------------------------------------
+
+    def push_motion(self, sample: MotionSample) -> None:
+        """Take a sample of wheel speed and yaw rate; a scan that waited for it is matched."""
+        self._motion.push(sample.t_ns, sample.speed_mps, sample.yaw_rate_radps)
+        self._process_if_covered()
+
+    def push_gnss(self, fix: GnssFix) -> None:
+        """Take a GNSS fix: it starts the search for the first pose, bounds drift, and shows a wrong pose."""
+        self._fix = fix
+
+    def push_scan(self, scan: Scan) -> list[RefinedScan]:
+        """Take a scan; give the scans whose poses became final, oldest first."""
+        self._process()
+        self._pending = scan
+        self._process_if_covered()
+        return self._take_ready()
+
+    def flush(self) -> list[RefinedScan]:
+        """Finish: give all scans that are still held, with their poses as they stand."""
+        self._process()
+        track, self._track = self._track, None
+        if track is not None:
+            self._finalise(track, track.graph.flush())
+        return self._take_ready()
+
+    @property
+    def speed_scale(self) -> float:
+        """What the wheel speed is multiplied with, as learnt from the map."""
+        return self._motion.speed_scale
+
+    @property
+    def yaw_bias_radps(self) -> float:
+        """What is taken off the yaw rate, as learnt from the map."""
+        return self._motion.yaw_bias_radps
+
+    # --- one scan --------------------------------------------------------------------------------------------------
+
+    def _process_if_covered(self) -> None:
+        if self._pending is not None and len(self._motion) and self._motion.last_ns >= _end_ns(self._pending):
+            self._process()
+
+    def _process(self) -> None:
+        scan, self._pending = self._pending, None
+        if scan is None or len(scan) == 0:
+            return
+        chosen = sample_scan(scan.points_m, self.parameters.sampling)
+        points = self._deskewed(scan, chosen, scan.points_m[chosen])
+        if self._track is None:
+            self._start(scan, points)
+        else:
+            self._step(self._track, scan, points)
+
+    def _step(self, track: _Track, scan: Scan, points: F64) -> None:
+        """Predict from the newest pose, match, gate, fuse."""
+        t_ns, newest = _reference_ns(scan), track.graph.newest
+        odometry = self._motion.delta(track.held[newest].t_ns, t_ns)
+        predicted = track.graph.pose(newest) @ odometry
+        result = self._match(points, predicted)
+        believed = track.monitor.believe(result, predicted, t_ns)
+        match = (result.T_map_vehicle, result.covariance) if result is not None and believed else None
+        gnss = self._gnss_at(track, t_ns, predicted)
+        final = track.graph.add(t_ns, predicted, odometry, match, gnss)
+        self._hold(track, scan, result.matching_ratio if result is not None else 0.0)
+        self._finalise(track, final)
+        if track.monitor.health(t_ns) == "lost":
+            self._lose(track)
+
+    def _match(self, points: F64, predicted: F64) -> RegistrationResult | None:
+        try:
+            return register(points, predicted, self._map.near(predicted[:3, 3]), self.parameters.registration)
+        except RegistrationError:
+            return None
+
+    def _gnss_at(self, track: _Track, t_ns: int, T_map_vehicle: F64) -> tuple[F64, float] | None:
+        """A new fix as position of the vehicle at `t_ns`; the monitor is told how far off it is."""
+        fix, self._fix = self._fix, None
+        if fix is None or abs(t_ns - fix.t_ns) > MAX_GNSS_AGE_NS:
+            return None
+        at_fix = T_map_vehicle @ self._motion.delta(t_ns, fix.t_ns)
+        offset = self._p_map(fix) - at_fix[:3, 3]
+        track.monitor.see_fix(float(np.hypot(offset[0], offset[1])), fix.sigma_m)
+        return T_map_vehicle[:3, 3] + offset, fix.sigma_m
+
+    def _p_map(self, fix: GnssFix) -> F64:
+        frame = self.local_map.grid_frame.frame
+        return frame.enu_from_geodetic(fix.lat_rad, fix.lon_rad, fix.height_m).reshape(3)
+
+    def _hold(self, track: _Track, scan: Scan, matching_ratio: float) -> None:
+        """Keep the scan until its pose is final, and tell the online pose."""
+        t_ns, number = _reference_ns(scan), track.graph.newest
+        health = track.monitor.health(t_ns)
+        track.held[number] = _HeldScan(scan, t_ns, matching_ratio, health)
+        pose = track.graph.smoothed(number)[0]
+        self.online = _estimate(pose, matching_ratio, health)
+
+    # --- the first pose, and the last --------------------------------------------------------------------------------
+
+    def _start(self, scan: Scan, points: F64) -> None:
+        """Search for the pose, now and then while there is none."""
+        t_ns = _reference_ns(scan)
+        found = self._search(t_ns, points)
+        if found is None or not found.found:
+            self.dropped_scans += 1
+            return
+        par, result = self.parameters, found.registration
+        self.initialisations += 1
+        self._track = _Track(PoseGraph(par.graph), HealthMonitor(par.health, t_ns), {})
+        self._track.graph.add(t_ns, result.T_map_vehicle, None, (result.T_map_vehicle, result.covariance), None)
+        self._hold(self._track, scan, result.matching_ratio)
+
+    def _search(self, t_ns: int, points: F64) -> InitialPose | None:
+        par, fix = self.parameters, self._fix
+        if fix is None or t_ns - fix.t_ns > MAX_GNSS_AGE_NS or not self.local_map.count:
+            return None
+        if t_ns - self._searched_ns < par.health.retry_s * 1e9:
+            return None
+        self._searched_ns = t_ns
+        p_map = self._p_map(fix)
+        moved_m = abs(self._motion.speed_mps * (t_ns - fix.t_ns) * 1e-9)
+        match_map = self._map.near(p_map)
+        return initialise(
+            points, p_map, fix.sigma_m + moved_m / par.initialise.radius_sigmas, match_map, par.initialise,
+            par.registration,
+        )  # fmt: skip
+
+    def _lose(self, track: _Track) -> None:
+        """The pose is wrong: nothing held may reach the evidence."""
+        self.dropped_scans += len(track.held)
+        self._track = None
+        self._teacher.forget()
+
+    # --- final poses -------------------------------------------------------------------------------------------------
+
+    def _finalise(self, track: _Track, poses: list[SmoothedPose]) -> None:
+        for pose in poses:
+            held = track.held.pop(pose.number)
+            self._ready.append(self._refined(held, pose))
+            if held.health == "good":
+                self._teacher.learn(pose)
+
+    def _refined(self, held: _HeldScan, pose: SmoothedPose) -> RefinedScan:
+        scan = held.scan
+        finite = np.flatnonzero(np.isfinite(scan.points_m).all(axis=1))
+        points = self._deskewed(scan, finite, scan.points_m[finite])
+        origins = self._deskewed(scan, finite, np.zeros((len(finite), 3), np.float32))
+        estimate = _estimate(pose, held.matching_ratio, held.health)
+        T = pose.T_map_vehicle
+        return RefinedScan(held.t_ns, transform(T, points), transform(T, origins), estimate)
+
+    def _deskewed(self, scan: Scan, chosen: NDArray[np.int64], points_lidar_m: NDArray[np.float32]) -> F64:
+        """(K, 3) points (of the LiDAR's frame, at the times of the chosen points) in the vehicle frame at the scan's
+        reference time.
+        """
+        sweep = self._motion.trajectory(scan.t_ns, _end_ns(scan))
+        offset_ns = scan.t_offset_ns[chosen]
+        return deskew(points_lidar_m, offset_ns, scan.t_ns, sweep, self.T_vehicle_lidar, _reference_ns(scan))
+
+    def _take_ready(self) -> list[RefinedScan]:
+        ready = list(self._ready)
+        self._ready.clear()
+        return ready
+
+
+def _end_ns(scan: Scan) -> int:
+    """Time of the last point."""
+    return scan.t_ns + int(scan.t_offset_ns.max(initial=0))
+
+
+def _reference_ns(scan: Scan) -> int:
+    """The middle of the sweep: what the motion is wrong by is shared by both halves."""
+    return (scan.t_ns + _end_ns(scan)) // 2
+
+
+def _estimate(pose: SmoothedPose, matching_ratio: float, health: Health) -> PoseEstimate:
+    R, covariance = pose.T_map_vehicle[:3, :3], pose.covariance
+    horizontal = (R @ covariance[3:, 3:] @ R.T)[:2, :2]
+    return PoseEstimate(
+        t_ns=pose.t_ns,
+        T_map_vehicle=pose.T_map_vehicle,
+        sigma_m=float(np.sqrt(np.linalg.eigvalsh(horizontal)[1])),
+        sigma_rad=float(np.sqrt(covariance[2, 2])),
+        matching_ratio=matching_ratio,
+        health=health,
+    )

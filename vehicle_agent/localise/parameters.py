@@ -1,0 +1,144 @@
+"""Settings of localisation: one frozen dataclass a step, with defaults that run; units are in the names."""
+
+from dataclasses import dataclass, field
+
+
+@dataclass(frozen=True, slots=True)
+class SamplingParameters:
+    """Which points of a scan are matched: about `n_points`, at most one in a cube of `leaf_m`."""
+
+    n_points: int = 2500
+    leaf_m: float = 0.3
+    min_range_m: float = 2.5
+    max_range_m: float = 60.0
+
+    def __post_init__(self) -> None:
+        if self.n_points < 100 or self.leaf_m <= 0 or not 0 <= self.min_range_m < self.max_range_m:
+            raise ValueError(f"n_points >= 100, leaf_m > 0 and 0 <= min_range_m < max_range_m are required, got {self}")
+
+
+@dataclass(frozen=True, slots=True)
+class RegistrationParameters:
+    """Scan-to-map matching.
+
+    noise_m: one sigma of range noise, distortion left in the sweep and voxel rounding together.
+    scales: Geman-McClure scales in sigmas, one a stage, wide to narrow; a point farther than `gate_per_scale` of them
+        from every Gaussian is no match.
+    capture_scales: the stages when the start is only known to about 2 m and 5 degrees.
+    correlation: how many points share one error (of the map, of the mount); multiplies the covariance.
+    floor_m, floor_rad: the least sigma claimed along an axis, whatever the Hessian says.
+    degenerate_m: a direction whose sigma exceeds this (turns taken at 10 m) is reported and not moved along.
+    """
+
+    noise_m: float = 0.04
+    scales: tuple[float, ...] = (8.0, 3.0)
+    capture_scales: tuple[float, ...] = (30.0, 10.0, 3.0)
+    gate_per_scale: float = 2.5
+    max_iterations: int = 15
+    stop_m: float = 5e-4
+    stop_rad: float = 1e-4
+    min_matched: int = 60
+    correlation: float = 10.0
+    floor_m: float = 0.01
+    floor_rad: float = 3e-4
+    degenerate_m: float = 0.2
+
+    def __post_init__(self) -> None:
+        if not (self.scales and self.capture_scales) or min(*self.scales, *self.capture_scales, self.noise_m) <= 0:
+            raise ValueError(f"noise_m and at least one scale, all positive, are required, got {self}")
+        if self.min_matched < 6 or self.max_iterations < 1:
+            raise ValueError(f"min_matched >= 6 and max_iterations >= 1 are required, got {self}")
+
+
+@dataclass(frozen=True, slots=True)
+class InitialiseParameters:
+    """Search for the first pose around a GNSS position.
+
+    radius_sigmas: how far around the position, in its sigmas; step_m, step_deg: spacing of the coarse hypotheses;
+    n_points: points that score one; n_refined: how many of the best are refined by registration;
+    min_fit: least fit (0 ... 1) that counts as found; ambiguity: the runner-up may reach this share of the best fit;
+    apart_m, apart_deg: two poses nearer than this are the same answer.
+    """
+
+    radius_sigmas: float = 3.0
+    step_m: float = 1.0
+    step_deg: float = 5.0
+    n_points: int = 400
+    n_refined: int = 24
+    min_fit: float = 0.45
+    ambiguity: float = 0.9
+    apart_m: float = 1.0
+    apart_deg: float = 5.0
+    above_ground_m: float = 0.4
+
+    def __post_init__(self) -> None:
+        if min(self.step_m, self.step_deg, self.radius_sigmas) <= 0 or min(self.n_points, self.n_refined) < 1:
+            raise ValueError(f"steps, radius and counts must be positive, got {self}")
+        if not (0 < self.min_fit < 1 and 0 < self.ambiguity <= 1):
+            raise ValueError(f"0 < min_fit < 1 and 0 < ambiguity <= 1 are required, got {self}")
+
+
+@dataclass(frozen=True, slots=True)
+class GraphParameters:
+    """The fixed-lag pose graph: noise of its factors, one sigma.
+
+    Odometry a step: a share of the distance plus a constant. `gnss_inflation`: GNSS errors last for tens of seconds, so
+    a fix counts for less than its sigma says. `robust_k`: Cauchy scale of map matches and GNSS, in sigmas.
+    """
+
+    lag_s: float = 3.0
+    distance_share: float = 0.01
+    longitudinal_m: float = 0.01
+    lateral_m: float = 0.01
+    vertical_m: float = 0.02
+    roll_pitch_rad: float = 3e-3
+    yaw_rad: float = 6e-4
+    gnss_inflation: float = 5.0
+    gnss_vertical: float = 2.0
+    robust_k: float = 2.0
+
+    def __post_init__(self) -> None:
+        if self.lag_s <= 0 or self.distance_share < 0 or self.gnss_inflation < 1:
+            raise ValueError(f"lag_s > 0, distance_share >= 0 and gnss_inflation >= 1 are required, got {self}")
+
+
+@dataclass(frozen=True, slots=True)
+class HealthParameters:
+    """When a match is believed, and when the pose is called degraded or lost.
+
+    min_matching_ratio: least share of the points with a Gaussian nearby.
+    gate_m, gate_m_per_s, gate_deg, gate_deg_per_s: how far a match may lie from the prediction, at once and for every
+        second without a believed match.
+    degraded_after_s, lost_after_s: time without a believed match.
+    gnss_sigmas, gnss_count: this many fixes in a row farther than this from the pose mean that the pose is wrong,
+        however well the scan seems to fit.
+    retry_s: pause between two searches for the first pose.
+    """
+
+    min_matching_ratio: float = 0.5
+    gate_m: float = 0.3
+    gate_m_per_s: float = 0.5
+    gate_deg: float = 1.0
+    gate_deg_per_s: float = 1.0
+    degraded_after_s: float = 0.6
+    lost_after_s: float = 4.0
+    gnss_sigmas: float = 5.0
+    gnss_count: int = 5
+    retry_s: float = 0.4
+
+    def __post_init__(self) -> None:
+        if not 0 < self.degraded_after_s <= self.lost_after_s or self.gnss_count < 1:
+            raise ValueError(f"0 < degraded_after_s <= lost_after_s and gnss_count >= 1 are required, got {self}")
+        if min(self.gate_m, self.gate_deg, self.gnss_sigmas) <= 0 or not 0 <= self.min_matching_ratio <= 1:
+            raise ValueError(f"gates must be positive and min_matching_ratio within 0 ... 1, got {self}")
+
+
+@dataclass(frozen=True, slots=True)
+class LocaliserParameters:
+    """Everything of the localiser."""
+
+    sampling: SamplingParameters = field(default_factory=SamplingParameters)
+    registration: RegistrationParameters = field(default_factory=RegistrationParameters)
+    initialise: InitialiseParameters = field(default_factory=InitialiseParameters)
+    graph: GraphParameters = field(default_factory=GraphParameters)
+    health: HealthParameters = field(default_factory=HealthParameters)

@@ -1,0 +1,174 @@
+"""Point-to-Gaussian registration of a scan on the dense voxel grid: annealed robust Gauss-Newton (DESIGN 8)."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from gnd_map.se3 import exp_so3
+from vehicle_agent.errors import RegistrationError
+from vehicle_agent.localise.kernels import linearise
+from vehicle_agent.localise.match_map import MatchMap
+from vehicle_agent.localise.parameters import RegistrationParameters
+
+F64 = NDArray[np.float64]
+
+LEVER_M = 10.0  # a turn moves the points that constrain it by about this times its angle
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class RegistrationResult:
+    """A pose and how far to believe it.
+
+    T_map_vehicle: (4, 4). covariance: (6, 6) of a small motion of the vehicle in its own frame, rotation [rad] first,
+    then position [m] (GTSAM's order). matching_ratio: matched share of the points in known voxels. fit: 1 - mean robust
+    cost, 0 ... 1. known_ratio: share of the points that fell into known voxels. degenerate: (K, 6) unit directions
+    (rotation at 10 m, position; vehicle frame) that the scan does not constrain and along which nothing was moved.
+    """
+
+    T_map_vehicle: F64
+    covariance: F64
+    matching_ratio: float
+    fit: float
+    known_ratio: float
+    iterations: int
+    converged: bool
+    degenerate: F64
+
+    @property
+    def sigma_m(self) -> F64:
+        """(3,) forward, left, up."""
+        return np.sqrt(np.diag(self.covariance)[3:])
+
+    @property
+    def sigma_rad(self) -> F64:
+        """(3,) roll, pitch, yaw."""
+        return np.sqrt(np.diag(self.covariance)[:3])
+
+
+@dataclass(slots=True, eq=False)
+class _State:
+    """The pose being moved and the normal equations at it."""
+
+    R: F64
+    t: F64
+    H: F64
+    g: F64
+    cost: float = 0.0
+    matched: int = 0
+    inside: int = 0
+
+
+def register(
+    points_m: F64,
+    T_map_vehicle: ArrayLike,
+    match_map: MatchMap,
+    parameters: RegistrationParameters | None = None,
+    *,
+    capture: bool = False,
+) -> RegistrationResult:
+    """Move the scan onto the map.
+
+    Args:
+        points_m: (N, 3) float64 points in the vehicle frame, sweep motion removed.
+        T_map_vehicle: (4, 4) where to start: within about 1 m and 3°, with `capture` 2 m and 5°.
+        match_map: the map window.
+        parameters: defaults if None.
+        capture: use the wider stages.
+
+    Raises:
+        RegistrationError: fewer than `min_matched` points have a Gaussian nearby.
+    """
+    par = parameters or RegistrationParameters()
+    T = np.array(T_map_vehicle, dtype=np.float64)
+    state = _State(T[:3, :3].copy(), T[:3, 3].copy(), np.zeros((6, 6)), np.zeros(6))
+    points = np.ascontiguousarray(points_m, dtype=np.float64)
+    scales = par.capture_scales if capture else par.scales
+    iterations, converged = 0, False
+    for stage, scale in enumerate(scales):
+        coarse = 1.0 if stage == len(scales) - 1 else 10.0
+        used, converged = _descend(points, state, match_map, par, scale, coarse)
+        iterations += used
+    _linearise(points, state, match_map, par, scales[-1])
+    return _result(state, len(points), scales[-1], par, iterations, converged)
+
+
+def _linearise(points: F64, s: _State, m: MatchMap, par: RegistrationParameters, scale: float) -> None:
+    """Refresh the normal equations of `s`; RegistrationError when too little matches."""
+    gate_m2 = (par.gate_per_scale * scale) ** 2
+    s.cost, s.matched, s.inside = linearise(
+        points, s.R, s.t, m.index, m.A, m.b, m.mean_m, m.information, scale**2, gate_m2, s.H, s.g
+    )
+    if s.matched < par.min_matched:
+        raise RegistrationError(
+            f"{s.matched} of {len(points)} points have a Gaussian nearby ({s.inside} lie in known voxels),"
+            f" {par.min_matched} are needed: is the start within 2 m, is the map loaded?"
+        )
+
+
+def _descend(
+    points: F64, s: _State, m: MatchMap, par: RegistrationParameters, scale: float, coarse: float
+) -> tuple[int, bool]:
+    """Gauss-Newton steps at one robust scale until they are small; (steps, converged)."""
+    for n in range(1, par.max_iterations + 1):
+        _linearise(points, s, m, par, scale)
+        step = _solve(s.H, s.g, par)
+        s.R = exp_so3(step[:3]) @ s.R
+        s.t = s.t + step[3:]
+        if np.abs(step[:3]).max() < coarse * par.stop_rad and np.abs(step[3:]).max() < coarse * par.stop_m:
+            return n, True
+    return par.max_iterations, False
+
+
+def _solve(H: F64, g: F64, par: RegistrationParameters) -> F64:
+    """-H^-1 g, leaving out the directions that are degenerate (solution remapping, Zhang et al. 2016)."""
+    values, vectors, scale = _principal(H)
+    strong = values > _least_information(par)
+    along = vectors[:, strong]
+    return np.asarray(-(along @ ((along.T @ (g * scale)) / values[strong])) * scale)
+
+
+def _principal(H: F64) -> tuple[F64, F64, F64]:
+    """Eigenvalues and vectors of H with turns measured as motion at `LEVER_M`, and the scale that does so."""
+    scale = np.array([1.0 / LEVER_M] * 3 + [1.0] * 3)
+    values, vectors = np.linalg.eigh(H * scale * scale[:, None])
+    return values, vectors, scale
+
+
+def _least_information(par: RegistrationParameters) -> float:
+    return par.correlation / par.degenerate_m**2
+
+
+def _result(
+    s: _State, n: int, scale: float, par: RegistrationParameters, iterations: int, converged: bool
+) -> RegistrationResult:
+    T = np.eye(4)
+    T[:3, :3], T[:3, 3] = s.R, s.t
+    H = _in_vehicle_axes(s.H, s.R)
+    values, vectors, _ = _principal(H)
+    return RegistrationResult(
+        T_map_vehicle=T,
+        covariance=_covariance(values, vectors, par),
+        matching_ratio=s.matched / max(s.inside, 1),
+        fit=1.0 - s.cost / (scale**2 * max(s.inside, 1)),
+        known_ratio=s.inside / n,
+        iterations=iterations,
+        converged=converged,
+        degenerate=vectors[:, values <= _least_information(par)].T,
+    )
+
+
+def _in_vehicle_axes(H: F64, R_map_vehicle: F64) -> F64:
+    """H of a motion along map axes as H of the same motion along the vehicle's axes."""
+    turn = np.zeros((6, 6))
+    turn[:3, :3] = turn[3:, 3:] = R_map_vehicle
+    return np.asarray(turn.T @ H @ turn)
+
+
+def _covariance(values: F64, vectors: F64, par: RegistrationParameters) -> F64:
+    """Inverse Hessian, enlarged because points share errors, plus the floor; a free direction gets 10 m."""
+    scale = np.array([1.0 / LEVER_M] * 3 + [1.0] * 3)
+    free = 1e2
+    shared = vectors @ (np.minimum(par.correlation / np.maximum(values, 1e-9), free)[:, None] * vectors.T)
+    floor = np.diag([par.floor_rad**2] * 3 + [par.floor_m**2] * 3)
+    return np.asarray(shared * scale * scale[:, None] + floor)

@@ -1,0 +1,49 @@
+"""A few thousand points of a scan, spread evenly in space: all that registration needs."""
+
+import numpy as np
+from numpy.typing import NDArray
+
+from gnd_map.jit import kernel
+from vehicle_agent.localise.parameters import SamplingParameters
+
+TABLE_BITS = 16
+CANDIDATES_PER_POINT = 12  # points looked at for each one kept
+
+
+def sample_scan(points_m: NDArray[np.floating], parameters: SamplingParameters) -> NDArray[np.int64]:
+    """Indices (K,) of about `n_points` points, ascending, at most one in a cube of `leaf_m`.
+
+    Args:
+        points_m: (N, 3) in the LiDAR's frame, firing order; points that are not finite are left out.
+        parameters: range limits (metres from the LiDAR), leaf and number.
+    """
+    n = len(points_m)
+    # An odd stride meets every ring of a sensor with 16, 32, 64 or 128 of them.
+    stride = max(1, n // (CANDIDATES_PER_POINT * parameters.n_points)) | 1
+    chosen = np.empty(n // stride + 1, np.int64)
+    limits = (parameters.min_range_m**2, parameters.max_range_m**2)
+    kept = _first_in_cubes(np.ascontiguousarray(points_m), stride, 1.0 / parameters.leaf_m, *limits, chosen)
+    every = max(1.0, kept / parameters.n_points)
+    return chosen[:kept][np.arange(0.0, kept, every).astype(np.int64)]
+
+
+@kernel
+def _first_in_cubes(
+    points: NDArray[np.floating], stride: int, per_m: float, min2: float, max2: float, chosen: NDArray[np.int64]
+) -> int:
+    """Fill `chosen` with the first point of each cube; a cube may take over the slot of another."""
+    table = np.zeros(1 << TABLE_BITS, np.int64)
+    kept = 0
+    for n in range(0, points.shape[0], stride):
+        x, y, z = np.float64(points[n, 0]), np.float64(points[n, 1]), np.float64(points[n, 2])
+        r2 = x * x + y * y + z * z
+        if not min2 <= r2 <= max2:  # false for NaN too
+            continue
+        i, j, k = int(np.floor(x * per_m)), int(np.floor(y * per_m)), int(np.floor(z * per_m))
+        key = ((i + (1 << 20)) << 42) | ((j + (1 << 20)) << 21) | (k + (1 << 20))
+        slot = (i * 73856093 ^ j * 19349669 ^ k * 83492791) & ((1 << TABLE_BITS) - 1)
+        if table[slot] != key:
+            table[slot] = key
+            chosen[kept] = n
+            kept += 1
+    return kept
