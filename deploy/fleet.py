@@ -13,6 +13,7 @@ from pathlib import Path
 
 from rich.console import Console
 
+from cloud_merger.merge import MergeParameters
 from cloud_merger.merger import ShardConfig
 from deploy import roles
 from deploy.errors import DeployError
@@ -25,7 +26,8 @@ from deploy.run_folder import RunFolder
 from fleet_bus.bus import open_bus
 from fleet_bus.config import BusConfig
 from schemas.keys import traffic_keys
-from tile_store.sqlite import SqliteStore
+from tile_store.sqlite_store import SqliteStore
+from tile_store.values import StoreConfig
 from vehicle_agent.agent import AgentConfig
 
 POLL_S = 0.2
@@ -76,7 +78,7 @@ def run_fleet(
         bus = stack.enter_context(open_bus(BusConfig(connect=(connect,)), name="fleet"))
         stack.enter_context(bus.subscribe(traffic_keys(), state.on_traffic))
         view = stack.enter_context(live_view(state, console))
-        run = _Run(config, folder, supervisor, opened, view, state, stop, started_s)
+        run = _Run(config, folder, supervisor, opened, view, state, stop, opened.counts().versions)
         run.wait_until(run.watcher_ready, SETTLE_S, "the watcher did not start")
         start_agents(supervisor, config, folder, prepared, connect)
         run.wait_until(lambda: supervisor.finished("vehicle-"), config.deadline_s, "the agents did not finish")
@@ -120,7 +122,13 @@ def start_agents(
 
 def shard_config(config: FleetConfig, shard_id: str, store: Path, connect: str) -> ShardConfig:
     """Return the configuration of one merger shard."""
-    return ShardConfig(shard_id=shard_id, store_path=store, connect=(connect,))
+    return ShardConfig(
+        shard_id=shard_id,
+        store_path=store,
+        connect=(connect,),
+        merge=MergeParameters(mode="paper" if config.merge_mode == "paper" else "default"),
+        store=StoreConfig(merge_delay_s=config.merge_delay_s, merge_after_reports=config.merge_after_reports),
+    )
 
 
 def agent_config(config: FleetConfig, vehicle: str, drive: Path, folder: RunFolder, connect: str) -> AgentConfig:
@@ -141,7 +149,7 @@ class _Run:
     view: View
     state: FleetState
     stop: threading.Event
-    started_s: float
+    versions_before: int
 
     def wait_until(self, done: Callable[[], bool], timeout_s: float, complaint: str | None) -> None:
         """Supervise and draw until a condition holds.
@@ -176,7 +184,7 @@ class _Run:
 
     def _observe(self) -> None:
         counts = self.store.counts()
-        self.state.published, self.state.reports = counts.published, counts.reports
+        self.state.published, self.state.reports = counts.versions - self.versions_before, counts.reports
         self.state.waiting = counts.dirty
         self.state.updates = count_lines(self.folder.updates)
         self.view.refresh()

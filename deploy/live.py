@@ -1,5 +1,6 @@
 """What a person sees while a fleet runs: a table of the agents, or plain lines where there is no terminal."""
 
+import math
 import threading
 import time
 from collections.abc import Iterator
@@ -13,7 +14,7 @@ from rich.table import Table
 from rich.text import Text
 
 from schemas.errors import SchemaError
-from schemas.traffic_sample import TrafficSample, decode_traffic_sample
+from schemas.traffic import TrafficSample
 
 HEALTH_STYLE = {"good": "green", "degraded": "yellow", "lost": "red"}
 PLAIN_PERIOD_S = 10.0
@@ -43,7 +44,7 @@ class FleetState:
     def on_traffic(self, key: str, payload: bytes) -> None:
         """Take a traffic sample from the bus; an unreadable one is noted and left out."""
         try:
-            sample = decode_traffic_sample(payload)
+            sample = TrafficSample.decode(payload)
         except SchemaError as error:
             self.note(f"unreadable sample on {key}: {error}")
             return
@@ -86,7 +87,7 @@ def render(state: FleetState) -> Group:
 def _row(sample: TrafficSample) -> tuple[str | Text, ...]:
     return (
         sample.vehicle,
-        f"{sample.lat_deg:.6f} {sample.lon_deg:.6f}",
+        f"{math.degrees(sample.lat_rad):.6f} {math.degrees(sample.lon_rad):.6f}",
         f"{sample.odometer_m:.0f} m",
         Text(sample.health, style=HEALTH_STYLE.get(sample.health, "dim")),
         size_text(sample.wire_down_bytes),

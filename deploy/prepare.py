@@ -14,7 +14,7 @@ from deploy.run_folder import RunFolder
 from fleet_sim.prepare import prepare_fleet_run
 from schemas.drive_mcap import read_header
 from tile_store.build import build_map
-from tile_store.sqlite import SqliteStore
+from tile_store.sqlite_store import SqliteStore
 
 
 @dataclass(frozen=True, slots=True)

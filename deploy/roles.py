@@ -10,7 +10,7 @@ from fleet_bus.bus import open_bus
 from fleet_bus.config import BusConfig
 from fleet_bus.router import run_router
 from tile_store.server import TileServer
-from tile_store.sqlite import SqliteStore
+from tile_store.sqlite_store import SqliteStore
 from vehicle_agent.agent import AgentConfig, run_agent
 
 

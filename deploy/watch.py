@@ -17,13 +17,14 @@ from deploy.region import Region
 from fleet_bus.bus import Bus
 from fleet_bus.errors import BusError
 from gnd_map.tile_id import TileId
-from schemas.catalog import decode_catalog
 from schemas.errors import SchemaError
 from schemas.keys import catalog_keys, update_keys
-from schemas.tile_update import TileUpdate, decode_tile_update
+from schemas.tiles import Catalog
+from schemas.updates import TileUpdate
 
 LAYER: Final = "ndt"
 CATALOG_PERIOD_S: Final = 3.0
+CATALOG_TIMEOUT_S: Final = 5.0
 
 _log = logging.getLogger(__name__)
 
@@ -94,7 +95,7 @@ class TileWatch:
 
     def _on_update(self, key: str, payload: bytes) -> None:
         try:
-            update = decode_tile_update(payload)
+            update = TileUpdate.decode(payload)
         except SchemaError as error:
             _log.warning("unreadable update on %s: %s", key, error)
             return
@@ -118,14 +119,15 @@ class TileWatch:
 
     def _catalog(self) -> list[tuple[TileId, int, int]]:
         try:
-            replies = self._bus.request_many(catalog_keys(self._layer, self._region.prefix), b"", kind="catalog")
+            key = catalog_keys(self._layer, self._region.prefix)
+            replies = self._bus.request_many(key, b"", kind="catalog", timeout_s=CATALOG_TIMEOUT_S)
         except BusError as error:
             _log.warning("no catalog: %s", error)
             return []
         return [
             (entry.tile, entry.version, len(payload))
             for _, payload in replies
-            for entry in decode_catalog(payload).entries
+            for entry in Catalog.decode(payload).entries
             if entry.tile in self._region
         ]
 

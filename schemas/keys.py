@@ -89,9 +89,9 @@ def catalog_key(layer: str, district: District) -> str:
     return f"{ROOT}/catalog/{_layer(layer)}/{district.path}"
 
 
-def catalog_keys(layer: str) -> str:
-    """Every catalog of a layer (what the tile server serves)."""
-    return f"{ROOT}/catalog/{_layer(layer)}/**"
+def catalog_keys(layer: str, prefix: str = "") -> str:
+    """The catalogs of a region; `prefix` = none to three chunks of a tile's path (a fourth is left out)."""
+    return f"{ROOT}/catalog/{_layer(layer)}/{_region('/'.join(prefix.split('/')[:3]))}"
 
 
 def change_key(layer: str, district: District) -> str:
