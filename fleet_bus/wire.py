@@ -6,6 +6,7 @@ so a duplicate of the descriptor is kept until the link is reported as gone, and
 
 import os
 import socket
+import stat
 import struct
 import threading
 from dataclasses import dataclass, field
@@ -104,8 +105,10 @@ def _duplicate_of(source: str, destination: str) -> socket.socket | None:
 
 def _tcp_socket(descriptor: int) -> socket.socket | None:
     try:
+        if not stat.S_ISSOCK(os.fstat(descriptor).st_mode):
+            return None
         tap = socket.socket(fileno=os.dup(descriptor))
-    except OSError:
+    except OSError:  # closed meanwhile by the thread that owns it
         return None
     if tap.family in (socket.AF_INET, socket.AF_INET6) and tap.type == socket.SOCK_STREAM:
         return tap
