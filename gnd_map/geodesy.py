@@ -63,7 +63,8 @@ def geodetic_from_ecef(p_ecef_m: npt.ArrayLike) -> tuple[F64, F64, F64]:
         raise GeodesyError(f"ECEF points: expected shape (..., 3), got {p.shape}")
     x, y, z = p[..., 0], p[..., 1], p[..., 2]
     r = np.hypot(x, y)
-    if not (np.hypot(r, z) >= _MIN_RADIUS_M).all():  # NaN fails as well
+    radius = np.hypot(r, z)
+    if not ((radius >= _MIN_RADIUS_M) & (radius < np.inf)).all():  # NaN fails as well
         raise GeodesyError(f"ECEF points: finite and >= {_MIN_RADIUS_M:.0f} m from the Earth's centre, got {p!r:.200}")
     beta = np.arctan2(z, (1.0 - WGS84_F) * r)
     lat = beta

@@ -96,9 +96,10 @@ def pairs_within(group: npt.ArrayLike) -> tuple[I64, I64]:
     """Row numbers i < j of all pairs with the same group number; equal numbers must stand together."""
     numbers = np.asarray(group)
     n = len(numbers)
-    first = np.flatnonzero(np.r_[True, numbers[1:] != numbers[:-1]]) if n else np.empty(0, np.int64)
-    end = np.repeat(np.append(first[1:], n), np.diff(np.append(first, n)))
-    after = end - np.arange(n) - 1  # rows of the same group behind each row
+    begins = np.append(True, numbers[1:] != numbers[:-1])[:n]
+    first = np.flatnonzero(begins)
+    size = np.diff(np.append(first, n))
+    after = np.repeat(first + size, size) - np.arange(n) - 1  # rows of the same group behind each row
     i = np.repeat(np.arange(n), after)
     j = i + 1 + np.arange(len(i)) - np.repeat(np.cumsum(after) - after, after)
     return i.astype(np.int64), j.astype(np.int64)
