@@ -56,7 +56,11 @@ class Gaussians:
         self._check_values()
 
     def _check_values(self) -> None:
-        _refuse("voxel ids are not strictly increasing", self.voxel_id, np.flatnonzero(np.diff(self.voxel_id) <= 0) + 1)
+        _refuse(
+            "voxel ids are not strictly increasing",
+            self.voxel_id,
+            np.flatnonzero(self.voxel_id[1:] <= self.voxel_id[:-1]) + 1,
+        )
         _refuse("negative counts or cells", self.voxel_id, np.flatnonzero((self.count < 0) | (self.cells < 0)))
         _refuse(
             f"means beyond {MAX_MEAN_M} m",

@@ -26,7 +26,7 @@ class Trajectory:
     def __post_init__(self) -> None:
         check_array("t_ns", self.t_ns, np.int64, (None,))
         check_array("T_dst_vehicle", self.T_dst_vehicle, np.float64, (len(self.t_ns), 4, 4))
-        late = np.flatnonzero(np.diff(self.t_ns) <= 0)
+        late = np.flatnonzero(self.t_ns[1:] <= self.t_ns[:-1])
         if len(late):
             raise MotionError(f"trajectory: pose {late[0] + 1} of {len(self.t_ns)} is not later than the one before")
 

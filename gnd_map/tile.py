@@ -53,7 +53,7 @@ class TileDelta:
 
     def __post_init__(self) -> None:
         check_array("removed", self.removed, np.int32, (None,))
-        if (np.diff(self.removed) <= 0).any():
+        if (self.removed[1:] <= self.removed[:-1]).any():
             raise DeltaError(f"delta: the {len(self.removed)} removed voxel ids are not strictly increasing")
         if np.isin(self.removed, self.put.voxel_id).any():
             raise DeltaError(
