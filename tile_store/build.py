@@ -1,0 +1,247 @@
+"""A map from drives whose poses are known: every scan deskewed on the reference poses, every point into its voxel.
+
+The poses decide the map, so they are checked before a point is used: a track that jumps, has gaps, or lies elsewhere
+than its own GNSS fixes is refused with numbers. Nothing is written until all drives are read.
+"""
+
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Final
+
+import numpy as np
+
+from gnd_map.accumulate import N_MIN_CELLS, VoxelAccumulator
+from gnd_map.arrays import F64
+from gnd_map.errors import MotionError
+from gnd_map.gaussian import Gaussians
+from gnd_map.geodesy import LocalFrame
+from gnd_map.grid import GridFrame, zones
+from gnd_map.motion import Trajectory, deskew
+from gnd_map.se3 import log_so3, transform
+from gnd_map.tile import Tile
+from gnd_map.tile_id import TileId, covering_corridor
+from schemas.drive import DriveHeader, GnssTrack, ReferenceTrack, Scan
+from schemas.drive_mcap import drive_counts, load_track, read_drive, read_header
+from tile_store.errors import StoreError
+from tile_store.store import Store
+from tile_store.values import DEFAULT_LAYER
+
+_TILE_M: Final = 40.0
+
+Progress = Callable[[Path, int, int], None]
+"""Called with the drive, its scans done, and its scans in all."""
+
+
+class BuildError(StoreError):
+    """Drives that cannot become a map: no poses, impossible poses, nothing measured."""
+
+
+@dataclass(frozen=True, slots=True)
+class BuildParameters:
+    """Which points are used, and what a track of poses may do."""
+
+    min_range_m: float = 2.0
+    """Nearer points are the vehicle itself."""
+    max_range_m: float = 80.0
+    """Farther points are blurred by the heading's error: 0.1 degrees are 14 cm at 80 m."""
+    max_speed_mps: float = 60.0
+    """A faster track jumps."""
+    max_turn_radps: float = 3.0
+    """A track that turns faster jumps."""
+    max_gap_s: float = 1.0
+    """Longer gaps between poses are refused, unless the vehicle stands."""
+    standing_m: float = 0.5
+    """A vehicle that moved less in a gap stands."""
+    max_gnss_offset_m: float = 30.0
+    """Median horizontal distance of poses from GNSS fixes (or five sigma, if larger); beyond, the anchor is wrong."""
+
+    def __post_init__(self) -> None:
+        if not 0 <= self.min_range_m < self.max_range_m:
+            raise BuildError(f"range from {self.min_range_m} m to {self.max_range_m} m is empty")
+        positive = (self.max_speed_mps, self.max_turn_radps, self.max_gap_s, self.max_gnss_offset_m)
+        if not all(limit > 0 for limit in positive):
+            raise BuildError(f"limits of poses must be positive, got {positive}")
+
+
+@dataclass(frozen=True, slots=True)
+class BuildResult:
+    """What went into a map and what came out."""
+
+    drives: int
+    scans: int
+    scans_skipped: int
+    """Sweeps that the reference poses do not cover."""
+    points: int
+    """Points used."""
+    tiles: int
+    gaussians: int
+    versions_published: int
+    """Tiles that changed; the others held the same content already."""
+
+
+@dataclass(frozen=True, slots=True)
+class _Source:
+    """One drive, checked, with its poses in the map frame of the build."""
+
+    path: Path
+    header: DriveHeader
+    poses: Trajectory
+    scans: int
+
+
+def build_map(
+    drives: Sequence[Path],
+    store: Store,
+    *,
+    layer: str = DEFAULT_LAYER,
+    n_min_cells: int = N_MIN_CELLS,
+    parameters: BuildParameters | None = None,
+    progress: Progress | None = None,
+) -> BuildResult:
+    """Build the tiles that the drives measured and put them into the store as a new base, all or none.
+
+    A tile that the store holds already is replaced, not mixed with: to add drives to a map, build from all of them.
+
+    Raises:
+        BuildError: no drives, no reference poses, impossible poses, no voxel dense enough.
+        DriveError: a drive cannot be read.
+        StoreError: the store cannot take the tiles.
+    """
+    parameters = parameters or BuildParameters()
+    sources = _sources(drives, parameters)
+    accumulators = _accumulators(sources, parameters)
+    used, skipped, points = 0, 0, 0
+    for source in sources:
+        for points_map_m in _swept(source, parameters, progress):
+            if points_map_m is None:
+                skipped += 1
+                continue
+            used, points = used + 1, points + len(points_map_m)
+            for accumulator in accumulators:
+                accumulator.add(points_map_m)
+    if used == 0:
+        raise BuildError(f"none of {skipped} scans lies within the reference poses: are both in the same clock?")
+    tiles = _tiles(accumulators, n_min_cells)
+    results = store.put_tiles(tiles, layer=layer)
+    return BuildResult(
+        drives=len(sources),
+        scans=used,
+        scans_skipped=skipped,
+        points=points,
+        tiles=len(tiles),
+        gaussians=sum(len(tile.gaussians) for tile in tiles),
+        versions_published=sum(result.status == "published" for result in results),
+    )
+
+
+def _sources(drives: Sequence[Path], parameters: BuildParameters) -> list[_Source]:
+    """The drives with checked poses, all in the map frame of the first."""
+    if not drives:
+        raise BuildError("no drives to build a map from")
+    anchor = read_header(drives[0]).anchor
+    return [_source(Path(drive), anchor, parameters) for drive in drives]
+
+
+def _source(path: Path, anchor: LocalFrame, parameters: BuildParameters) -> _Source:
+    header, track = read_header(path), load_track(path)
+    check_poses(path, track.reference, parameters)
+    _check_gnss(path, header.anchor, track.reference, track.gnss, parameters)
+    T_map_vehicle = anchor.T_self_other(header.anchor) @ track.reference.T_map_vehicle
+    return _Source(path, header, Trajectory(track.reference.t_ns, T_map_vehicle), drive_counts(path).scans)
+
+
+def check_poses(path: Path, reference: ReferenceTrack, parameters: BuildParameters) -> None:
+    """Refuse a track that no vehicle can drive.
+
+    Raises:
+        BuildError: fewer than two poses, times not increasing, a jump in place or heading, a gap.
+    """
+    t_ns, T = reference
+    if len(t_ns) < 2:
+        raise BuildError(f"{path}: {len(t_ns)} reference poses; a map needs known poses (gnd import computes them)")
+    step_s = np.diff(t_ns) / 1e9
+    _refuse(path, "is not later than the one before", step_s <= 0, step_s, "s")
+    step_m = np.linalg.norm(np.diff(T[:, :3, 3], axis=0), axis=1)
+    turn_rad = np.linalg.norm(log_so3(np.swapaxes(T[:-1, :3, :3], 1, 2) @ T[1:, :3, :3]), axis=1)
+    _refuse(path, "jumps", step_m > parameters.max_speed_mps * step_s, step_m / step_s, "m/s")
+    _refuse(path, "jumps in heading", turn_rad > parameters.max_turn_radps * step_s, turn_rad / step_s, "rad/s")
+    gap = (step_s > parameters.max_gap_s) & (step_m > parameters.standing_m)
+    _refuse(path, "comes after a gap", gap, step_s, "s")
+
+
+def _refuse(path: Path, what: str, bad: "np.ndarray[tuple[int], np.dtype[np.bool_]]", value: F64, unit: str) -> None:
+    if bad.any():
+        worst = int(np.argmax(np.where(bad, np.abs(value), -1.0)))
+        raise BuildError(
+            f"{path}: reference pose {worst + 2} of {len(bad) + 1} {what} ({value[worst]:.3g} {unit}), "
+            f"so do {bad.sum() - 1} others; the track cannot be a vehicle's"
+        )
+
+
+def _check_gnss(
+    path: Path, anchor: LocalFrame, reference: ReferenceTrack, gnss: GnssTrack, parameters: BuildParameters
+) -> None:
+    """Refuse poses that lie elsewhere than the drive's own GNSS fixes: a wrong anchor moves a whole map unnoticed."""
+    inside = (gnss.t_ns >= reference.t_ns[0]) & (gnss.t_ns <= reference.t_ns[-1])
+    if not inside.any():
+        return
+    fixes_map_m = anchor.enu_from_geodetic(*(column[inside] for column in gnss[1:4]))
+    T = Trajectory(*reference).at(gnss.t_ns[inside])
+    offset_m = float(np.median(np.linalg.norm((fixes_map_m - T[:, :3, 3])[:, :2], axis=1)))
+    allowed_m = max(parameters.max_gnss_offset_m, 5.0 * float(np.median(gnss.sigma_m[inside])))
+    if offset_m > allowed_m:
+        raise BuildError(
+            f"{path}: reference poses lie {offset_m:.1f} m from {inside.sum()} GNSS fixes (median), allowed are "
+            f"{allowed_m:.1f} m: is the map frame's anchor right?"
+        )
+
+
+def _accumulators(sources: list[_Source], parameters: BuildParameters) -> list[VoxelAccumulator]:
+    """One for each zone of latitude that points may fall into; each passes over the points of the others."""
+    frame = sources[0].header.anchor
+    groups = zones(_reachable_tiles(frame, sources, parameters.max_range_m))
+    return [VoxelAccumulator(GridFrame.around(frame, tiles)) for tiles in groups.values()]
+
+
+def _reachable_tiles(frame: LocalFrame, sources: list[_Source], max_range_m: float) -> set[TileId]:
+    found: set[TileId] = set()
+    for source in sources:
+        lat, lon, _ = frame.geodetic_from_enu(source.poses.T_dst_vehicle[:, :3, 3])
+        found.update(covering_corridor(lat, lon, max_range_m + _TILE_M))
+    return found
+
+
+def _swept(source: _Source, parameters: BuildParameters, progress: Progress | None) -> Iterator[F64 | None]:
+    """Points (N, 3) in the map frame of each scan; None for a scan that the poses do not cover."""
+    done = 0
+    for item in read_drive(source.path):
+        if isinstance(item, Scan):
+            yield _points_map_m(item, source, parameters)
+            done += 1
+            if progress:
+                progress(source.path, done, source.scans)
+
+
+def _points_map_m(scan: Scan, source: _Source, parameters: BuildParameters) -> F64 | None:
+    range_m = np.linalg.norm(scan.points_m, axis=1)
+    kept = (range_m >= parameters.min_range_m) & (range_m <= parameters.max_range_m)
+    points_m, offset_ns = scan.points_m[kept], scan.t_offset_ns[kept]
+    try:
+        points_vehicle_m = deskew(
+            points_m, offset_ns, scan.t_ns, source.poses, source.header.T_vehicle_lidar, scan.t_ns
+        )
+        return transform(source.poses.at(scan.t_ns), points_vehicle_m)
+    except MotionError:
+        return None
+
+
+def _tiles(accumulators: list[VoxelAccumulator], n_min_cells: int) -> list[Tile]:
+    """All tiles, sorted; the store numbers their versions."""
+    found: dict[TileId, Gaussians] = {}
+    for accumulator in accumulators:
+        found.update(accumulator.finish(n_min_cells))
+    if not found:
+        voxels = sum(len(accumulator) for accumulator in accumulators)
+        raise BuildError(f"none of {voxels} voxels with points has {n_min_cells} occupied sub-cells: too few scans?")
+    return [Tile(tile, 1, found[tile]) for tile in sorted(found)]

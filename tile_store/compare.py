@@ -1,0 +1,209 @@
+"""What a map holds, and how two maps, two times or two versions differ: values that print as tables and as JSON."""
+
+from collections.abc import Iterable, Iterator
+from dataclasses import asdict, dataclass, fields
+from typing import Any
+
+import numpy as np
+
+from gnd_map.gaussian import Gaussians
+from gnd_map.grid import VoxelGrid
+from gnd_map.tile import diff
+from gnd_map.tile_id import TileId
+from tile_store.errors import StoreError, UnknownVersion
+from tile_store.store import Store
+from tile_store.values import DEFAULT_LAYER, StoredTile
+
+
+@dataclass(frozen=True, slots=True)
+class MapInfo:
+    """Totals of a region's newest versions."""
+
+    layer: str
+    prefix: str
+    tiles: int
+    districts: int
+    gaussians: int
+    points: int
+    """Raw points that the Gaussians stand for."""
+    body_bytes: int
+    lowest_version: int
+    highest_version: int
+    updated_ns: int
+    """Time of the newest version, UTC."""
+    south_deg: float
+    west_deg: float
+    north_deg: float
+    east_deg: float
+    lowest_m: int
+    """Floor of the lowest Gaussian, ellipsoidal height."""
+    highest_m: int
+
+    def as_dict(self) -> dict[str, Any]:
+        """JSON-able."""
+        return asdict(self)
+
+
+def map_info(store: Store, *, layer: str = DEFAULT_LAYER, prefix: str = "") -> MapInfo:
+    """Totals of a region's newest versions; `StoreError` when it holds no tiles."""
+    stored = list(_newest(store, layer, prefix, at_ns=None).values())
+    if not stored:
+        raise StoreError(f"no tiles in layer {layer!r}, region {prefix or 'everywhere'!r}")
+    gaussians = [(one.tile, one.decode().gaussians) for one in stored]
+    south, west, north, east = _bounds_deg([one.tile for one in stored])
+    lowest, highest = _heights_m(gaussians)
+    return MapInfo(
+        layer=layer,
+        prefix=prefix,
+        tiles=len(stored),
+        districts=len({one.tile.district for one in stored}),
+        gaussians=sum(len(g) for _, g in gaussians),
+        points=sum(int(g.count.sum(dtype=np.int64)) for _, g in gaussians),
+        body_bytes=sum(len(one.body) for one in stored),
+        lowest_version=min(one.version for one in stored),
+        highest_version=max(one.version for one in stored),
+        updated_ns=max(one.created_ns for one in stored),
+        south_deg=south,
+        west_deg=west,
+        north_deg=north,
+        east_deg=east,
+        lowest_m=lowest,
+        highest_m=highest,
+    )
+
+
+def _bounds_deg(tiles: Iterable[TileId]) -> tuple[float, float, float, float]:
+    corners = np.degrees([(*tile.south_west_rad, *tile.north_east_rad) for tile in tiles])
+    south, west = corners[:, :2].min(axis=0).tolist()
+    north, east = corners[:, 2:].max(axis=0).tolist()
+    return south, west, north, east
+
+
+def _heights_m(gaussians: Iterable[tuple[TileId, Gaussians]]) -> tuple[int, int]:
+    floors = [VoxelGrid.of(tile).unravel(g.voxel_id)[2] for tile, g in gaussians if len(g)]
+    return (min(int(f.min()) for f in floors), max(int(f.max()) for f in floors) + 1) if floors else (0, 0)
+
+
+@dataclass(frozen=True, slots=True)
+class TileDiff:
+    """How one tile differs between an old and a new state; version 0 = the tile is not there."""
+
+    tile: str
+    """Path."""
+    old_version: int
+    new_version: int
+    added: int
+    """Voxels that have a Gaussian only in the new state."""
+    removed: int
+    """Voxels that have a Gaussian only in the old state."""
+    changed: int
+    """Voxels whose Gaussian is another one."""
+    same: int
+    max_shift_m: float
+    """Largest move of a changed voxel's mean."""
+
+
+@dataclass(frozen=True, slots=True)
+class MapDiff:
+    """How two maps differ: the tiles with a difference, and totals over all."""
+
+    layer: str
+    prefix: str
+    tiles: tuple[TileDiff, ...]
+    """Those that differ, in the order of their ids."""
+    tiles_same: int
+    added: int
+    removed: int
+    changed: int
+    same: int
+
+    def as_dict(self) -> dict[str, Any]:
+        """JSON-able."""
+        return asdict(self)
+
+    def rows(self) -> Iterator[tuple[str, ...]]:
+        """A table: its head, then one row a tile that differs."""
+        yield tuple(field.name for field in fields(TileDiff))
+        for tile in self.tiles:
+            yield tuple(_cell(getattr(tile, field.name)) for field in fields(TileDiff))
+
+
+def _cell(value: object) -> str:
+    return f"{value:.3f}" if isinstance(value, float) else str(value)
+
+
+def map_diff(
+    old: Store,
+    new: Store,
+    *,
+    layer: str = DEFAULT_LAYER,
+    prefix: str = "",
+    old_at_ns: int | None = None,
+    new_at_ns: int | None = None,
+) -> MapDiff:
+    """How a region differs between two stores, or between two times of one store.
+
+    Args:
+        old: the store of the old state.
+        new: the store of the new state; may be the same one.
+        layer: such as "ndt".
+        prefix: leading chunks of a tile's path; "" = all.
+        old_at_ns: the old state's time, UTC; None = its newest versions.
+        new_at_ns: the new state's time, UTC; None = its newest versions.
+    """
+    before, after = _newest(old, layer, prefix, old_at_ns), _newest(new, layer, prefix, new_at_ns)
+    both = sorted(before.keys() | after.keys())
+    return _map_diff(layer, prefix, [tile_diff(tile, before.get(tile), after.get(tile)) for tile in both])
+
+
+def version_diff(store: Store, layer: str, tile: TileId, old_version: int, new_version: int) -> MapDiff:
+    """How two versions of one tile differ; `UnknownVersion` when one is not there."""
+    versions = []
+    for version in (old_version, new_version):
+        stored = store.get(layer, tile, version)
+        if stored is None:
+            raise UnknownVersion(f"tile {tile} of layer {layer!r} has no version {version}")
+        versions.append(stored)
+    return _map_diff(layer, tile.path, [tile_diff(tile, *versions)])
+
+
+def tile_diff(tile: TileId, old: StoredTile | None, new: StoredTile | None) -> TileDiff:
+    """How one tile differs between two states."""
+    before, after = _gaussians(old), _gaussians(new)
+    delta = diff(before, after)
+    changed = np.intersect1d(delta.put.voxel_id, before.voxel_id)
+    shift_m = before.select(changed).mean_m - after.select(changed).mean_m
+    return TileDiff(
+        tile=tile.path,
+        old_version=old.version if old else 0,
+        new_version=new.version if new else 0,
+        added=len(delta.put) - len(changed),
+        removed=len(delta.removed),
+        changed=len(changed),
+        same=len(after) - len(delta.put),
+        max_shift_m=float(np.linalg.norm(shift_m, axis=1).max(initial=0.0)),
+    )
+
+
+def _gaussians(stored: StoredTile | None) -> Gaussians:
+    return stored.decode().gaussians if stored else Gaussians.empty()
+
+
+def _map_diff(layer: str, prefix: str, diffs: list[TileDiff]) -> MapDiff:
+    different = tuple(d for d in diffs if d.added or d.removed or d.changed)
+    return MapDiff(
+        layer=layer,
+        prefix=prefix,
+        tiles=different,
+        tiles_same=len(diffs) - len(different),
+        added=sum(d.added for d in diffs),
+        removed=sum(d.removed for d in diffs),
+        changed=sum(d.changed for d in diffs),
+        same=sum(d.same for d in diffs),
+    )
+
+
+def _newest(store: Store, layer: str, prefix: str, at_ns: int | None) -> dict[TileId, StoredTile]:
+    """The tiles of a region as they are, or as they were at a time."""
+    stored = (store.get(layer, entry.tile, at_ns=at_ns) for entry in store.heads(layer, prefix))
+    return {one.tile: one for one in stored if one is not None}
