@@ -80,8 +80,8 @@ class SqliteStore:
 
     def close(self) -> None:
         """Finish what is queued and close the file. Calling it twice is harmless."""
-        self._writer.close()
         self._readers.close()
+        self._writer.close()  # the last connection folds the log into the file, which a reader could not
 
     def _timing(self) -> dict[str, Any]:
         return inbox.timing_of(self._config, self._now_ns())

@@ -1,0 +1,68 @@
+"""What the killed processes of `test_store_processes` do: `python store_process.py reporter|merger STORE NAME`.
+
+Each says on its standard output what was confirmed to it, one line a fact, at once.
+"""
+
+import random
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+from store_helpers import TILE, report
+
+from gnd_map.gaussian import Gaussians
+from gnd_map.tile import Tile
+from gnd_map.tile_id import TileId
+from tile_store.sqlite_store import SqliteStore
+from tile_store.store import Store
+from tile_store.values import Publication, ReportRow, StoreConfig, TileWork
+
+TILES = (TILE, *TILE.neighbours()[:3])
+HURRY = StoreConfig(merge_delay_s=0.02, merge_after_reports=5, max_reports=100_000)
+
+
+def merged_tile(tile: TileId, reports: tuple[ReportRow, ...]) -> Tile:
+    """A merge that counts: the Gaussian of voxel k has one point for each report whose number ends in k."""
+    numbers = np.array([row.received_ns % 1_000_000 for row in reports])
+    ids, counts = np.unique(numbers % 50, return_counts=True)
+    n = len(ids)
+    zeros = np.zeros((n, 3), dtype=np.float32), np.zeros((n, 6), dtype=np.float32)
+    return Tile(tile, 0, Gaussians(ids.astype(np.int32), counts.astype(np.int32), np.ones(n, np.int32), *zeros))
+
+
+def publication_of(work: TileWork) -> Publication:
+    ids = tuple(row.report_id for row in work.reports)
+    return Publication(work.claim, work.base_version, merged_tile(work.claim.tile, work.reports), report_ids=ids)
+
+
+def run_reporter(store: Store, name: str) -> None:
+    """Sends reports 0, 1, 2 … of this vehicle, from the start again after a kill: those are duplicates."""
+    generator = random.Random(name)
+    number = 0
+    while True:
+        rows = [report(number + i, generator.choice(TILES), name) for i in range(3)]
+        for row, status in zip(rows, store.put_reports(rows), strict=True):
+            print(status, row.tile.morton, row.report_id, flush=True)
+        number += 3
+        time.sleep(0.002)
+
+
+def run_merger(store: Store, name: str) -> None:
+    """Merges what it can, with leases so short that they run out now and then."""
+    generator = random.Random()
+    store.release(name)
+    while True:
+        for claim in store.claim(name, 2, lease_s=0.05):
+            work = store.load(claim)
+            time.sleep(generator.uniform(0.0, 0.08))
+            (result,) = store.publish([publication_of(work)])
+            print(result.status, claim.tile.morton, result.version, flush=True)
+        time.sleep(0.005)
+
+
+if __name__ == "__main__":
+    role, path, name = sys.argv[1:]
+    with SqliteStore(Path(path), HURRY) as opened:
+        print("ready", flush=True)
+        {"reporter": run_reporter, "merger": run_merger}[role](opened, name)

@@ -1,0 +1,131 @@
+"""Several processes on one store, killed with -9 again and again: nothing acknowledged is lost or applied twice."""
+
+import random
+import subprocess
+import sys
+import threading
+import time
+from collections import Counter
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import apsw
+import pytest
+from store_process import HURRY, TILES, merged_tile, publication_of
+
+from tile_store.sqlite_store import SqliteStore
+
+SCRIPT = Path(__file__).with_name("store_process.py")
+KILLS = 20
+
+
+@dataclass
+class Worker:
+    """One role in one process after the other; what all of them were told lands in `facts`."""
+
+    role: str
+    store: Path
+    name: str
+    facts: list[tuple[str, ...]]
+    process: subprocess.Popen[str] = field(init=False)
+    reader: threading.Thread = field(init=False)
+    ready: threading.Event = field(init=False)
+
+    def start(self) -> None:
+        command = [sys.executable, str(SCRIPT), self.role, str(self.store), self.name]
+        self.process = subprocess.Popen(command, stdout=subprocess.PIPE, text=True)
+        self.ready = threading.Event()
+        self.reader = threading.Thread(target=self._read, args=(self.process, self.ready))
+        self.reader.start()
+
+    def kill(self) -> None:
+        self.process.kill()
+        self.process.wait()
+        self.reader.join()
+        assert self.process.stdout is not None
+        self.process.stdout.close()
+
+    def _read(self, process: subprocess.Popen[str], ready: threading.Event) -> None:
+        assert process.stdout is not None
+        for line in process.stdout:
+            ready.set()
+            if line.endswith("\n") and line != "ready\n":
+                self.facts.append(tuple(line.split()))
+
+
+@pytest.mark.slow
+def test_nothing_acknowledged_is_lost_or_applied_twice_whoever_is_killed(tmp_path: Path) -> None:
+    path = tmp_path / "store.db"
+    facts: list[tuple[str, ...]] = []
+    roles = [("reporter", "v0"), ("reporter", "v1"), ("merger", "m0"), ("merger", "m1")]
+    workers = [Worker(role, path, name, facts) for role, name in roles]
+    for worker in workers:
+        worker.start()
+    try:
+        kill_again_and_again(workers, facts)
+    finally:
+        for worker in workers:
+            worker.kill()
+
+    told = Counter(fact[0] for fact in facts)
+    assert told["stored"] > 0
+    assert told["duplicate"] > 0
+    assert told["published"] > 0
+    with SqliteStore(path, HURRY) as store:
+        check_reports(store, facts)
+        check_versions(store, facts)
+        drain(store)
+        for tile in TILES:
+            rows = tuple(row for row in store.reports() if row.tile == tile)
+            head = store.get("ndt", tile)
+            assert head is not None
+            assert head.sha == merged_tile(tile, rows).sha
+            assert [v.version for v in store.history("ndt", tile)] == list(range(1, head.version + 1))
+    assert apsw.Connection(str(path)).pragma("integrity_check") == "ok"
+
+
+def kill_again_and_again(workers: list[Worker], facts: list[tuple[str, ...]]) -> None:
+    """Kill one after the other in mid-work: each lives until it has been told something, the store moves on."""
+    generator = random.Random(7)
+    deadline = time.monotonic() + 60
+    for k in range(KILLS):
+        worker = workers[k % len(workers)]
+        assert worker.ready.wait(20), f"{worker.name} never opened the store"
+        n = len(facts)
+        while len(facts) < n + generator.randint(5, 60):
+            assert time.monotonic() < deadline, f"no progress: {len(facts)} facts after {k} kills"
+            time.sleep(0.002)
+        worker.kill()
+        worker.start()
+
+
+def check_reports(store: SqliteStore, facts: list[tuple[str, ...]]) -> None:
+    kept = Counter((str(row.tile.morton), row.report_id) for row in store.reports())
+    assert max(kept.values()) == 1
+    acknowledged = {fact[1:] for fact in facts if fact[0] in ("stored", "duplicate")}
+    assert acknowledged <= kept.keys()
+    stored = Counter(fact[1:] for fact in facts if fact[0] == "stored")
+    assert max(stored.values()) == 1
+
+
+def check_versions(store: SqliteStore, facts: list[tuple[str, ...]]) -> None:
+    published = Counter((int(fact[1]), int(fact[2])) for fact in facts if fact[0] == "published")
+    assert max(published.values()) == 1
+    kept = {(tile.morton, v.version) for tile in TILES for v in store.history("ndt", tile)}
+    assert published.keys() <= kept
+    for tile in TILES:
+        versions = store.history("ndt", tile)
+        assert [v.parent for v in versions] == list(range(len(versions)))
+
+
+def drain(store: SqliteStore) -> None:
+    """Merge what is left, as a shard does that outlives the others."""
+    deadline = time.monotonic() + 20
+    for name in ("m0", "m1"):
+        store.release(name)
+    while store.dirty_count():
+        assert time.monotonic() < deadline
+        for claim in store.claim("last", 10, lease_s=60.0):
+            store.publish([publication_of(store.load(claim))])
+        time.sleep(0.005)
+    assert store.counts().waiting == 0
