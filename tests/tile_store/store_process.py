@@ -1,4 +1,4 @@
-"""What the killed processes of `test_store_processes` do: `python store_process.py reporter|merger STORE NAME`.
+"""What the killed processes of `test_store_processes` do: `python store_process.py reporter|merger STORE NAME FIRST`.
 
 Each says on its standard output what was confirmed to it, one line a fact, at once.
 """
@@ -36,19 +36,17 @@ def publication_of(work: TileWork) -> Publication:
     return Publication(work.claim, work.base_version, merged_tile(work.claim.tile, work.reports), report_ids=ids)
 
 
-def run_reporter(store: Store, name: str) -> None:
-    """Sends reports 0, 1, 2 … of this vehicle, from the start again after a kill: those are duplicates."""
-    generator = random.Random(name)
-    number = 0
+def run_reporter(store: Store, name: str, number: int) -> None:
+    """Sends the reports of this vehicle from `number` on; the same number is the same report after a kill."""
     while True:
-        rows = [report(number + i, generator.choice(TILES), name) for i in range(3)]
+        rows = [report(number + i, TILES[(number + i) % 4], name) for i in range(3)]
         for row, status in zip(rows, store.put_reports(rows), strict=True):
             print(status, row.tile.morton, row.report_id, flush=True)
         number += 3
         time.sleep(0.002)
 
 
-def run_merger(store: Store, name: str) -> None:
+def run_merger(store: Store, name: str, _first: int) -> None:
     """Merges what it can, with leases so short that they run out now and then."""
     generator = random.Random()
     store.release(name)
@@ -62,7 +60,7 @@ def run_merger(store: Store, name: str) -> None:
 
 
 if __name__ == "__main__":
-    role, path, name = sys.argv[1:]
+    role, path, name, first = sys.argv[1:]
     with SqliteStore(Path(path), HURRY) as opened:
         print("ready", flush=True)
-        {"reporter": run_reporter, "merger": run_merger}[role](opened, name)
+        {"reporter": run_reporter, "merger": run_merger}[role](opened, name, int(first))

@@ -21,18 +21,20 @@ KILLS = 20
 
 @dataclass
 class Worker:
-    """One role in one process after the other; what all of them were told lands in `facts`."""
+    """One role in one process after the other, and all that they were told."""
 
     role: str
     store: Path
     name: str
-    facts: list[tuple[str, ...]]
+    facts: list[tuple[str, ...]] = field(default_factory=list)
     process: subprocess.Popen[str] = field(init=False)
     reader: threading.Thread = field(init=False)
     ready: threading.Event = field(init=False)
 
     def start(self) -> None:
-        command = [sys.executable, str(SCRIPT), self.role, str(self.store), self.name]
+        # A reporter begins a little before the last acknowledged report, as an outbox would.
+        acknowledged = len(self.facts) if self.role == "reporter" else 0
+        command = [sys.executable, str(SCRIPT), self.role, str(self.store), self.name, str(max(acknowledged - 9, 0))]
         self.process = subprocess.Popen(command, stdout=subprocess.PIPE, text=True)
         self.ready = threading.Event()
         self.reader = threading.Thread(target=self._read, args=(self.process, self.ready))
@@ -56,21 +58,19 @@ class Worker:
 @pytest.mark.slow
 def test_nothing_acknowledged_is_lost_or_applied_twice_whoever_is_killed(tmp_path: Path) -> None:
     path = tmp_path / "store.db"
-    facts: list[tuple[str, ...]] = []
-    roles = [("reporter", "v0"), ("reporter", "v1"), ("merger", "m0"), ("merger", "m1")]
-    workers = [Worker(role, path, name, facts) for role, name in roles]
+    roles = [("reporter", "v0"), ("merger", "m0"), ("reporter", "v1"), ("merger", "m1")]
+    workers = [Worker(role, path, name) for role, name in roles]
     for worker in workers:
         worker.start()
     try:
-        kill_again_and_again(workers, facts)
+        kill_again_and_again(workers)
     finally:
         for worker in workers:
             worker.kill()
 
+    facts = [fact for worker in workers for fact in worker.facts]
     told = Counter(fact[0] for fact in facts)
-    assert told["stored"] > 0
-    assert told["duplicate"] > 0
-    assert told["published"] > 0
+    assert min(told["stored"], told["duplicate"], told["published"], told["stale"]) > 0, told
     with SqliteStore(path, HURRY) as store:
         check_reports(store, facts)
         check_versions(store, facts)
@@ -84,16 +84,16 @@ def test_nothing_acknowledged_is_lost_or_applied_twice_whoever_is_killed(tmp_pat
     assert apsw.Connection(str(path)).pragma("integrity_check") == "ok"
 
 
-def kill_again_and_again(workers: list[Worker], facts: list[tuple[str, ...]]) -> None:
-    """Kill one after the other in mid-work: each lives until it has been told something, the store moves on."""
+def kill_again_and_again(workers: list[Worker]) -> None:
+    """Kill one after the other in mid-work: each lives until it has been told something."""
     generator = random.Random(7)
     deadline = time.monotonic() + 60
     for k in range(KILLS):
         worker = workers[k % len(workers)]
         assert worker.ready.wait(20), f"{worker.name} never opened the store"
-        n = len(facts)
-        while len(facts) < n + generator.randint(5, 60):
-            assert time.monotonic() < deadline, f"no progress: {len(facts)} facts after {k} kills"
+        enough = len(worker.facts) + generator.randint(1, 60 if worker.role == "reporter" else 6)
+        while len(worker.facts) < enough:
+            assert time.monotonic() < deadline, f"{worker.name} makes no progress after {k} kills"
             time.sleep(0.002)
         worker.kill()
         worker.start()
