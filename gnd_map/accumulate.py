@@ -9,6 +9,8 @@ grid's band of latitude are taken, whether or not the grid frame was made for th
 counted in `ignored`.
 """
 
+from collections.abc import Collection
+
 import numpy as np
 import numpy.typing as npt
 
@@ -72,13 +74,16 @@ class VoxelAccumulator:
 
     def _grow(self) -> None:
         """Room for twice as many voxels."""
-        more = len(self._key)
-        self._key = np.concatenate([self._key, np.empty(more, dtype=np.int64)])
-        self._count = np.concatenate([self._count, np.zeros(more, dtype=np.int64)])
-        self._cells = np.concatenate([self._cells, np.zeros(more, dtype=np.int32)])
-        self._bits = np.concatenate([self._bits, np.zeros((more, _WORDS), dtype=np.uint64)])
-        self._sums = np.concatenate([self._sums, np.zeros((more, 9))])
-        self._table = np.full(2 * len(self._table), _EMPTY, dtype=np.int32)
+        self._resize(np.arange(self._used), 2 * len(self._key))
+
+    def _resize(self, rows: I64, room: int) -> None:
+        """Keep only these rows, in this order, with room for `room`."""
+        self._used = len(rows)
+        self._key, self._count, self._cells, self._bits, self._sums = (
+            np.concatenate([old[rows], np.zeros((room - len(rows), *old.shape[1:]), old.dtype)])
+            for old in (self._key, self._count, self._cells, self._bits, self._sums)
+        )
+        self._table = np.full(2 * room, _EMPTY, dtype=np.int32)
         _rehash(self._table, self._key, self._used)
 
     def moments(self) -> tuple[I32, Moments]:
@@ -100,6 +105,16 @@ class VoxelAccumulator:
         """
         g, moments = self.moments()
         dense = np.flatnonzero(moments.cells >= n_min_cells)
+        return gaussians_by_tile(self.grid_frame, g[dense], moments.take(dense))
+
+    def pop(self, tiles: Collection[TileId], n_min_cells: int = N_MIN_CELLS) -> dict[TileId, Gaussians]:
+        """As `finish`, but of `tiles` only, and all their voxels are forgotten: bounded memory on a long drive."""
+        g, moments = self.moments()
+        morton, _ = self.grid_frame.tile_voxel_of(g)
+        going = np.isin(morton, [tile.morton for tile in tiles])
+        staying = np.argsort(self._key[: self._used])[~going]
+        self._resize(np.sort(staying), max(_FIRST_VOXELS, 1 << len(staying).bit_length()))
+        dense = np.flatnonzero(going & (moments.cells >= n_min_cells))
         return gaussians_by_tile(self.grid_frame, g[dense], moments.take(dense))
 
 

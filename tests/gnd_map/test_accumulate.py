@@ -136,6 +136,30 @@ def test_the_accumulator_goes_on_after_finishing() -> None:
     np.testing.assert_allclose(full_matrices(a.outer_m2), full_matrices(b.outer_m2), rtol=0, atol=1e-6)
 
 
+def test_popped_tiles_are_forgotten_and_the_others_stay() -> None:
+    points = points_in_cells(FRAME, [0.0, 0.0, 0.0], 400, seed=7)
+    accumulator, whole = VoxelAccumulator(FRAME), VoxelAccumulator(FRAME)
+    accumulator.add(points)
+    whole.add(points)
+    expected = whole.finish(1)
+    first, *others = expected
+    assert accumulator.pop([first], n_min_cells=1) == {first: expected[first]}
+    assert accumulator.finish(1) == {tile: expected[tile] for tile in others}
+    accumulator.add(points)  # the hash still finds the voxels that stayed, and knows those that went no more
+    again = accumulator.finish(1)
+    np.testing.assert_array_equal(again[first].count, expected[first].count)
+    np.testing.assert_array_equal(again[others[0]].count, 2 * expected[others[0]].count)
+    accumulator.pop(list(expected))
+    assert len(accumulator) == 0
+
+
+def test_popping_leaves_out_voxels_with_too_few_cells() -> None:
+    accumulator = VoxelAccumulator(FRAME)
+    accumulator.add(np.zeros((30, 3)))
+    assert accumulator.pop([WANGSIMNI]) == {}
+    assert len(accumulator) == 0
+
+
 def test_points_of_another_band_are_counted_not_taken() -> None:
     _, last = FRAME.lat_index_range
     edge = TileId.from_indices(WANGSIMNI.lon_index, last)

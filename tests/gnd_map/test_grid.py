@@ -40,9 +40,10 @@ def test_figure_2_sea_level_floor_runs_from_minus_604_to_604() -> None:
     grid = VoxelGrid.of(WANGSIMNI)
     iy, ix = np.divmod(np.arange(1209), 31)
     assert grid.voxel_id(ix, iy, 0).tolist() == list(range(-604, 605))
-    assert int(grid.voxel_id(0, 0, 0)) == -604  # south-west
-    assert int(grid.voxel_id(30, 0, 0)) == -574  # south-east
-    assert int(grid.voxel_id(30, 38, 0)) == 604  # north-east
+    assert grid.voxel_id([0, 30], 0, 0).tolist() == [-604, -574]  # the ends of the rows that the figure prints
+    assert grid.voxel_id([0, 30], 1, 0).tolist() == [-573, -543]
+    assert grid.voxel_id([0, 30], 37, 0).tolist() == [543, 573]
+    assert grid.voxel_id([0, 30], 38, 0).tolist() == [574, 604]
     assert int(grid.voxel_id(15, 19, 0)) == 0  # the middle
     assert int(grid.voxel_id(0, 0, 1)) == 605  # the next floor begins where this one ends
     assert int(grid.voxel_id(30, 38, -1)) == -605
@@ -108,6 +109,18 @@ def test_the_tile_edge_belongs_to_the_tile_in_the_east_and_north() -> None:
     assert TileId.from_geodetic(lat, lon) == east
     ix, _, _ = VoxelGrid.of(east).unravel(VoxelGrid.of(east).voxel_of(lat, lon, 0.0))
     assert int(ix) == 0
+
+
+def test_the_worked_example_of_the_frames_document() -> None:
+    lat, lon, height = np.radians(37.56), np.radians(127.0364), 31.27
+    grid = VoxelGrid.of(TileId.from_geodetic(lat, lon))
+    voxel_id = grid.voxel_of(lat, lon, height)
+    assert (grid.tile, int(voxel_id)) == (WANGSIMNI, 37381)
+    assert tuple(map(int, grid.unravel(voxel_id))) == (10, 16, 31)
+    d = grid.frame.enu_from_geodetic(lat, lon, height) - grid.centre_m(voxel_id)
+    assert d == pytest.approx([-0.149, 0.238, -0.230], abs=6e-4)
+    frame = GridFrame.around(LocalFrame(lat, lon, height), [WANGSIMNI])
+    assert frame.grid_of_voxel(WANGSIMNI, [37381]).tolist() == [[27723558, 14490271, 31]]
 
 
 def test_positions_outside_the_tile_are_refused() -> None:
