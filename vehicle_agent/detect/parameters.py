@@ -93,6 +93,3 @@ def _check(name: str, value: float, low: float, high: float, *, open_ends: bool 
     inside = low < value < high if open_ends else low <= value <= high
     if not inside:
         raise DetectParameterError(f"{name} = {value} lies outside {low} ... {high}")
-
-
-__all__ = ["DetectParameterError", "DetectParameters", "Mode", "PassRule"]

@@ -1,0 +1,44 @@
+"""The vehicle's half of the loop on one page (GND, Figure 1): drive, download, localise, detect, report, upload."""
+
+import logging
+import threading
+from typing import Any
+
+from schemas.drive import Scan
+from vehicle_agent.config import AgentConfig
+from vehicle_agent.result import write_json
+from vehicle_agent.vehicle import open_vehicle
+
+__all__ = ["AgentConfig", "run_agent"]
+
+_log = logging.getLogger(__name__)
+
+
+def run_agent(config: AgentConfig, stop: threading.Event) -> dict[str, Any]:
+    """Drive one recording to its end, upload what has changed, and wait for the acknowledgements.
+
+    An agent that was killed is simply started again: its recording begins anew, its cache and outbox are kept, and
+    reports that were acknowledged are not sent again. `stop` ends the drive early and in order; what is in the outbox
+    then goes with the next start.
+
+    Returns:
+        The content of `work_dir/result.json`.
+
+    Raises:
+        GndError: the recording, a file or the bus cannot be used; the message says which and what to do.
+    """
+    with open_vehicle(config, stop) as vehicle:
+        for item in vehicle.drive():  # recording -> usable measurements in time order
+            if isinstance(item, Scan):
+                vehicle.download()  # position -> the tiles around and ahead, and what others changed
+            for scan in vehicle.localise(item):  # measurements + tiles -> scans with final poses
+                vehicle.detect(scan)  # rays + tiles -> evidence and new Gaussians
+                vehicle.report(scan)  # tiles left behind -> classes -> one report a district -> outbox
+        for scan in vehicle.localiser.flush():
+            vehicle.detect(scan)
+        vehicle.report_the_rest()
+        vehicle.upload()  # outbox -> acknowledged
+        result = vehicle.result()
+    write_json(config.work_dir / "result.json", result)
+    _log.info("%s: %s reports acknowledged", config.vehicle, result["reports_acknowledged"])
+    return result

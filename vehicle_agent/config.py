@@ -1,0 +1,95 @@
+"""The settings of one agent; the defaults run."""
+
+from dataclasses import dataclass, field
+from pathlib import Path
+
+from fleet_bus.config import DEFAULT_ENDPOINT
+from fleet_bus.links import LinkProfile
+from vehicle_agent.detect.parameters import DetectParameters
+from vehicle_agent.errors import AgentConfigError
+from vehicle_agent.localise.parameters import LocaliserParameters
+
+
+@dataclass(frozen=True, slots=True)
+class DownloadParameters:
+    """Which tiles are asked for, and how patiently."""
+
+    near_m: float = 60.0
+    """Tiles this near are needed now: beyond the range of detection."""
+    ahead_m: float = 120.0
+    """How far along the heading tiles are asked for in advance."""
+    in_flight: int = 8
+    """Requests at a time; one at a time leaves a 5G link at 15 %."""
+    request_s: float = 20.0
+    """One request, its retries included."""
+    retry_s: float = 1.0
+    """Pause after a request that failed."""
+    wait_s: float = 30.0
+    """A drive that is not paced waits this long for a tile that is near; then it goes on without."""
+    forget_m: float = 200.0
+    """Tiles farther away leave the memory (not the cache)."""
+
+    def __post_init__(self) -> None:
+        """Distances in order, at least one request in flight."""
+        if not 0 < self.near_m <= self.forget_m or self.ahead_m < 0:
+            raise AgentConfigError(f"near_m = {self.near_m}, ahead_m = {self.ahead_m}, forget_m = {self.forget_m} m")
+        if not 1 <= self.in_flight <= 64:
+            raise AgentConfigError(f"in_flight = {self.in_flight} lies outside 1 ... 64")
+
+
+@dataclass(frozen=True, slots=True)
+class ReportParameters:
+    """When a tile is left, when a report is sent, which poses may make statements."""
+
+    left_behind_m: float = 60.0
+    """A tile farther from the vehicle gets no more evidence: its classes are decided."""
+    longest_m: float = 300.0
+    """A district's changes are reported at the latest after this much way."""
+    max_sigma_m: float = 0.15
+    """Scans whose refined position is less certain are no evidence."""
+    drain_s: float = 120.0
+    """At the end of a drive the agent waits this long for its reports to be acknowledged."""
+
+
+@dataclass(frozen=True, slots=True)
+class AgentConfig:
+    """One vehicle agent.
+
+    `pace` 0 drives as fast as the recording can be worked on, 1 in real time, 2 twice as fast. The ledger goes to
+    `ledger_dir`, by default the folder `ledger` beside `work_dir`.
+    """
+
+    vehicle: str
+    drive: Path
+    work_dir: Path
+    connect: tuple[str, ...] = (DEFAULT_ENDPOINT,)
+    link: str | LinkProfile = "none"
+    layer: str = "ndt"
+    pace: float = 0.0
+    ledger_dir: Path | None = None
+    localise: LocaliserParameters = field(default_factory=LocaliserParameters)
+    detect: DetectParameters = field(default_factory=DetectParameters)
+    download: DownloadParameters = field(default_factory=DownloadParameters)
+    report: ReportParameters = field(default_factory=ReportParameters)
+
+    def __post_init__(self) -> None:
+        """A name and a pace that can work."""
+        if not self.vehicle:
+            raise AgentConfigError("the vehicle needs a name (its pseudonym)")
+        if not 0 <= self.pace < float("inf"):
+            raise AgentConfigError(f"pace = {self.pace}: 0 is as fast as possible, 1 real time")
+        if self.report.left_behind_m <= self.detect.range_max_m:
+            raise AgentConfigError(
+                f"left_behind_m = {self.report.left_behind_m} must exceed the range of detection,"
+                f" {self.detect.range_max_m} m: a tile would be left while rays still reach it"
+            )
+
+    @property
+    def ledger_path(self) -> Path:
+        """The traffic ledger of this vehicle."""
+        return (self.ledger_dir or self.work_dir.parent / "ledger") / f"{self.vehicle}.jsonl"
+
+    @property
+    def waits_for_tiles(self) -> bool:
+        """A drive that is not paced would otherwise outrun any link."""
+        return self.pace == 0

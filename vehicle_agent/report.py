@@ -1,0 +1,156 @@
+"""From evidence to the outbox: tiles that the vehicle has left are decided, districts that it has left are reported."""
+
+import logging
+from collections import Counter
+from collections.abc import Collection
+from dataclasses import dataclass, field
+from importlib.metadata import version
+
+import numpy as np
+
+from gnd_map.classes import ChangeClass
+from gnd_map.tile_id import District, TileId
+from schemas.changes import ChangeReport, TileChange
+from schemas.keys import change_key
+from schemas.report_id import deterministic_report_id
+from vehicle_agent.config import ReportParameters
+from vehicle_agent.detect.classify import classify, tile_change
+from vehicle_agent.detect.detector import ChangeDetector
+from vehicle_agent.localise.estimates import PoseEstimate, RefinedScan
+from vehicle_agent.outbox import Outbox
+from vehicle_agent.surroundings import left_behind
+
+_log = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True, slots=True)
+class Identity:
+    """What every report of a drive says about who made it."""
+
+    vehicle: str
+    drive_id: str
+    sensor_model: str
+    layer: str
+    software: str = field(default_factory=lambda: f"gnd-fleet {version('gnd-fleet')}")
+
+
+@dataclass(slots=True)
+class _Stretch:
+    """The scans that the pending changes of all districts rest on."""
+
+    first_ns: int
+    last_ns: int
+    variances: list[tuple[float, float]] = field(default_factory=list)
+
+    def sigma(self) -> tuple[float, float]:
+        """Root mean square of the poses' sigmas (m, rad)."""
+        m, rad = np.sqrt(np.mean(np.array(self.variances or [(0.0, 0.0)]), axis=0))
+        return float(m), float(rad)
+
+
+@dataclass(slots=True)
+class _Pending:
+    """Changes of one district that wait for its other tiles."""
+
+    since_m: float
+    changes: dict[TileId, TileChange] = field(default_factory=dict)
+
+
+class Reporter:
+    """Feeds refined scans to the detector, decides the tiles left behind and puts a report a district into the outbox.
+
+    Report ids are made of vehicle, drive, district and the report's number in it, so a restarted agent, which drives
+    its recording again, makes the same ids.
+    """
+
+    def __init__(
+        self, detector: ChangeDetector, outbox: Outbox, identity: Identity, start_ns: int, parameters: ReportParameters
+    ) -> None:
+        self.classes: Counter[str] = Counter()
+        self.counts: Counter[str] = Counter()
+        self._detector, self._outbox, self._who = detector, outbox, identity
+        self._start_ns, self._parameters = start_ns, parameters
+        self._pending: dict[District, _Pending] = {}
+        self._numbers: Counter[District] = Counter()
+        self._stretch: _Stretch | None = None
+
+    def add_scan(self, scan: RefinedScan) -> None:
+        """Count the scan's rays, if its pose is good enough to speak about the world."""
+        estimate = scan.estimate
+        if estimate.health != "good" or estimate.sigma_m > self._parameters.max_sigma_m:
+            self.counts["scans_uncertain"] += 1
+            return
+        self.counts["scans_used"] += 1
+        self.counts["rays"] += self._detector.add_scan(scan.points_map_m, scan.origins_map_m)
+        self._lengthen(scan.t_ns, estimate)
+
+    def leave_behind(self, estimate: PoseEstimate, odometer_m: float) -> None:
+        """Decide the tiles that the refined pose has left, report the districts that have none left to decide."""
+        frame, p_map = self._detector.local_map.grid_frame.frame, estimate.T_map_vehicle[:3, 3]
+        touched = self._detector.touched_tiles()
+        left = left_behind(frame, touched, p_map, self._parameters.left_behind_m)
+        self._decide(left, odometer_m)
+        open_districts = {t.district for t in set(touched) - set(left)}
+        for district, pending in list(self._pending.items()):
+            overdue = odometer_m - pending.since_m > self._parameters.longest_m
+            if overdue or district not in open_districts:
+                self._report(district)
+
+    def report_all(self, odometer_m: float) -> None:
+        """The drive has ended: decide and report everything."""
+        self._decide(self._detector.touched_tiles(), odometer_m)
+        for district in list(self._pending):
+            self._report(district)
+
+    def _lengthen(self, t_ns: int, estimate: PoseEstimate) -> None:
+        if self._stretch is None:
+            self._stretch = _Stretch(t_ns, t_ns)
+        self._stretch.last_ns = max(self._stretch.last_ns, t_ns)
+        self._stretch.variances.append((estimate.sigma_m**2, estimate.sigma_rad**2))
+
+    def _decide(self, tiles: Collection[TileId], odometer_m: float) -> None:
+        if not tiles or self._stretch is None:
+            return
+        sigma_m, sigma_rad = self._stretch.sigma()
+        for tile_id, evidence in self._detector.finish(tiles).items():
+            found = classify(evidence, self._detector.parameters)
+            for name, n in zip(ChangeClass.__members__, np.bincount(found.change_class, minlength=6), strict=True):
+                self.classes[name.lower()] += int(n)
+            if not found.observed.any():
+                continue
+            change = tile_change(found, pose_sigma_m=sigma_m, pose_sigma_rad=sigma_rad)
+            pending = self._pending.setdefault(tile_id.district, _Pending(odometer_m))
+            if tile_id in pending.changes:  # the vehicle came back: one statement a tile and report
+                self._report(tile_id.district)
+                pending = self._pending.setdefault(tile_id.district, _Pending(odometer_m))
+            pending.changes[tile_id] = change
+
+    def _report(self, district: District) -> None:
+        pending, stretch = self._pending.pop(district), self._stretch
+        if stretch is None or not pending.changes:
+            return
+        report = self._make(district, pending, stretch)
+        self._numbers[district] += 1
+        if self._outbox.put(report.report_id, change_key(report.layer, district), report.encode()):
+            self.counts["reports"] += 1
+            self.counts["changed_voxels"] += sum(len(change.changed) for change in report.tiles)
+        else:
+            self.counts["reports_known"] += 1  # this agent was restarted: its first statement stands
+        _log.info("report %s: %d tiles of district %s", report.report_id, len(report.tiles), district)
+
+    def _make(self, district: District, pending: _Pending, stretch: _Stretch) -> ChangeReport:
+        who, number = self._who, str(self._numbers[district])
+        report_id = deterministic_report_id(
+            self._start_ns // 1_000_000, who.vehicle, who.drive_id, who.layer, district.path, number
+        )
+        return ChangeReport(
+            report_id=report_id,
+            vehicle=who.vehicle,
+            sensor_model=who.sensor_model,
+            software=who.software,
+            district=district,
+            first_ns=stretch.first_ns,
+            last_ns=stretch.last_ns,
+            tiles=tuple(change for _, change in sorted(pending.changes.items())),
+            layer=who.layer,
+        )

@@ -1,0 +1,95 @@
+"""What one drive of an agent came to: counts, traffic, health, and errors against the recording's reference.
+
+The reference poses of a recording are read here, and nowhere else in the vehicle.
+"""
+
+import json
+import os
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import psutil
+
+from gnd_map.arrays import F64
+from gnd_map.geodesy import LocalFrame
+from gnd_map.motion import Trajectory
+from gnd_map.se3 import T_inverse
+from schemas.drive import ReferencePose
+from vehicle_agent.errors import LocaliseError
+from vehicle_agent.localise.estimates import PoseEstimate, localisation_error
+
+
+@dataclass(slots=True)
+class Evaluation:
+    """Refined poses and reference poses side by side."""
+
+    T_map_anchor: F64
+    """(4, 4) from the frame of the reference poses to the map frame."""
+    estimates: list[PoseEstimate] = field(default_factory=list)
+    reference_t_ns: list[int] = field(default_factory=list)
+    reference_pose: list[F64] = field(default_factory=list)
+
+    @classmethod
+    def between(cls, map_frame: LocalFrame, anchor: LocalFrame) -> "Evaluation":
+        """For a map frame and the frame in which the drive's reference is given."""
+        return cls(map_frame.T_self_other(anchor))
+
+    def take_reference(self, pose: ReferencePose) -> None:
+        """Keep a reference pose."""
+        self.reference_t_ns.append(pose.t_ns)
+        self.reference_pose.append(self.T_map_anchor @ pose.T_map_vehicle)
+
+    def errors(self) -> dict[str, Any] | None:
+        """Quantiles and every single error; None without reference, or without an estimate within its time."""
+        if len(self.reference_t_ns) < 2 or not self.estimates:
+            return None
+        reference = Trajectory(np.array(self.reference_t_ns, np.int64), np.stack(self.reference_pose))
+        try:
+            return asdict(localisation_error(self.estimates, reference)) | self._single(reference)
+        except LocaliseError:
+            return None
+
+    def _single(self, reference: Trajectory) -> dict[str, Any]:
+        """Signed errors along, across (m) and about (deg) the reference's heading, one a refined scan."""
+        first, last = int(reference.t_ns[0]), int(reference.t_ns[-1])
+        within = [e for e in self.estimates if first <= e.t_ns <= last]
+        t_ns = np.array([e.t_ns for e in within], np.int64)
+        error = T_inverse(reference.at(t_ns)) @ np.stack([e.T_map_vehicle for e in within])
+        heading_deg = np.degrees(np.arctan2(error[:, 1, 0], error[:, 0, 0]))
+        return {
+            "t_ns": t_ns.tolist(),
+            "longitudinal_m": np.round(error[:, 0, 3], 4).tolist(),
+            "lateral_m": np.round(error[:, 1, 3], 4).tolist(),
+            "heading_deg": np.round(heading_deg, 4).tolist(),
+        }
+
+
+@dataclass(slots=True)
+class HealthTimeline:
+    """When the health changed."""
+
+    changes: list[tuple[int, str]] = field(default_factory=list)
+
+    def note(self, t_ns: int, health: str) -> None:
+        """Keep a change."""
+        if not self.changes or self.changes[-1][1] != health:
+            self.changes.append((t_ns, health))
+
+    def as_json(self) -> list[dict[str, Any]]:
+        """One object a change."""
+        return [{"t_ns": t_ns, "health": health} for t_ns, health in self.changes]
+
+
+def memory_mb() -> dict[str, float]:
+    """Proportional (PSS), resident and private (USS) memory of this process in MB (10^6 bytes)."""
+    info = psutil.Process(os.getpid()).memory_full_info()
+    return {name: round(getattr(info, name, 0) / 1e6, 1) for name in ("pss", "rss", "uss")}
+
+
+def write_json(path: Path, content: dict[str, Any]) -> None:
+    """Write the whole file or nothing of it."""
+    partial = path.with_suffix(".partial")
+    partial.write_text(json.dumps(content, indent=1) + "\n", encoding="utf-8")
+    partial.replace(path)

@@ -1,0 +1,122 @@
+"""The local map follows the vehicle: tiles ahead are asked for, arrivals are held, tiles far behind are let go."""
+
+import threading
+from collections import Counter
+from collections.abc import Iterable
+
+import numpy as np
+
+from gnd_map.arrays import F64
+from gnd_map.errors import TileError
+from gnd_map.geodesy import LocalFrame
+from gnd_map.tile import Tile
+from gnd_map.tile_id import TileId, covering_corridor
+from vehicle_agent.cache import TileCache
+from vehicle_agent.config import DownloadParameters
+from vehicle_agent.detect.detector import ChangeDetector
+from vehicle_agent.download import TileFetcher
+from vehicle_agent.local_map import LocalMap
+from vehicle_agent.place import Place
+
+STEP_M = 5.0  # the wanted tiles are looked at again after this much way
+FLOORS_BELOW, FLOORS_ABOVE = 8, 16  # of the vehicle, where the map alone does not say how high the world is
+
+
+class Surroundings:
+    """Keeps `local_map` in step with the place and the cache; the agent's main thread owns it.
+
+    A tile about which there is evidence keeps its map until it is finished: newer versions stay in the
+    cache until then.
+    """
+
+    def __init__(
+        self,
+        local_map: LocalMap,
+        fetcher: TileFetcher,
+        detector: ChangeDetector,
+        cache: TileCache,
+        parameters: DownloadParameters,
+    ) -> None:
+        self.counts: Counter[str] = Counter()
+        self._map, self._fetcher, self._detector, self._cache = local_map, fetcher, detector, cache
+        self._parameters = parameters
+        self.wanted: tuple[TileId, ...] = ()
+        self._looked_at: F64 | None = None
+        self._near: tuple[TileId, ...] = ()
+        self._given_up: set[TileId] = set()
+
+    def follow(self, place: Place, stop: threading.Event, *, wait: bool) -> None:
+        """Ask for what lies around and ahead and hold what has arrived; `wait` for the tiles that are near."""
+        if self._has_moved(place):
+            self._look_ahead(place)
+        if wait:
+            self._given_up |= self._fetcher.wait_for(set(self._near) - self._given_up, self._parameters.wait_s, stop)
+        for fetched in self._fetcher.take():
+            self._hold(fetched.tile_id, fetched.tile)
+
+    def replace(self, tile: Tile) -> bool:
+        """Hold a newer version of a tile that is held, unless evidence is gathered against the old one."""
+        held = self._map.tile(tile.tile_id)
+        if held is None or held.sha == tile.sha or self._detector.touched(tile.tile_id):
+            return False
+        self._map.set_tile(tile)
+        return True
+
+    def _has_moved(self, place: Place) -> bool:
+        ahead = place.ahead_map_m(self._parameters.ahead_m)
+        before = self._looked_at
+        if before is not None and before.shape == ahead.shape and np.abs(ahead - before).max() <= STEP_M:
+            return False
+        self._looked_at = ahead
+        return True
+
+    def _look_ahead(self, place: Place) -> None:
+        p = self._parameters
+        here, frame = place.position_map_m, self._map.grid_frame.frame
+        floor = int(np.floor(place.height_m / FLOORS_BELOW)) * FLOORS_BELOW
+        self._map.cover_floors(floor - FLOORS_BELOW, floor + FLOORS_ABOVE)
+        wanted = self.wanted = tiles_along(frame, place.ahead_map_m(p.ahead_m), p.near_m)
+        distance_m = {tile_id: tile_distance_m(frame, tile_id, here) for tile_id in wanted}
+        self._near = tuple(t for t in wanted if distance_m[t] <= p.near_m)
+        self._fetcher.want(sorted(wanted, key=lambda t: (distance_m[t], t)))
+        self._let_go(here)
+
+    def _let_go(self, here: F64) -> None:
+        """Drop tiles far behind that nothing is counted about."""
+        frame, limit_m = self._map.grid_frame.frame, self._parameters.forget_m
+        for tile_id in self._map.tiles:
+            if tile_distance_m(frame, tile_id, here) > limit_m and not self._detector.touched(tile_id):
+                self._map.remove_tile(tile_id)
+                self._fetcher.forget(tile_id)
+
+    def _hold(self, tile_id: TileId, tile: Tile | None) -> None:
+        """Put an answer into the map: a tile, or the knowledge that there is none."""
+        try:
+            if self._map.tile(tile_id) is not None:
+                if tile is not None:
+                    self.replace(tile)
+            elif tile is None:
+                self._map.set_absent(tile_id)
+            else:
+                self._map.set_tile(tile)
+        except TileError:  # a tile of another latitude zone has voxels that this grid frame cannot hold
+            self.counts["other-zone"] += 1
+
+
+def tiles_along(frame: LocalFrame, points_map_m: F64, half_width_m: float) -> tuple[TileId, ...]:
+    """The tiles within `half_width_m` of the line through points (N, 3) of the map frame."""
+    lat, lon, _ = frame.geodetic_from_enu(points_map_m)
+    return covering_corridor(lat, lon, half_width_m)
+
+
+def tile_distance_m(frame: LocalFrame, tile_id: TileId, p_map_m: F64) -> float:
+    """Horizontal distance of a point (3,) of the map frame to a tile, 0 inside (to about 1 cm within 1 km)."""
+    (south, west), (north, east) = tile_id.south_west_rad, tile_id.north_east_rad
+    corners = frame.enu_from_geodetic(np.array([south, north]), np.array([west, east]), np.zeros(2))[:, :2]
+    outside = np.maximum(0.0, np.maximum(corners[0] - p_map_m[:2], p_map_m[:2] - corners[1]))
+    return float(np.hypot(*outside))
+
+
+def left_behind(frame: LocalFrame, tiles: Iterable[TileId], p_map_m: F64, distance_m: float) -> tuple[TileId, ...]:
+    """Those of `tiles` that are farther away than `distance_m`."""
+    return tuple(t for t in tiles if tile_distance_m(frame, t, p_map_m) > distance_m)

@@ -1,0 +1,68 @@
+"""Compile or load every kernel that a vehicle uses, before processes are forked: each child then shares the pages."""
+
+import numpy as np
+
+from gnd_map.accumulate import VoxelAccumulator
+from gnd_map.arrays import F64
+from gnd_map.geodesy import LocalFrame
+from gnd_map.grid import GridFrame
+from gnd_map.tile import Tile
+from gnd_map.tile_id import TileId
+from schemas.drive import GnssFix, MotionSample, Scan
+from vehicle_agent.detect.classify import classify, tile_change
+from vehicle_agent.detect.detector import ChangeDetector
+from vehicle_agent.local_map import LocalMap
+from vehicle_agent.localise.estimates import RefinedScan
+from vehicle_agent.localise.localiser import Localiser
+
+_LIDAR_HEIGHT_M = 2.0
+_STEP_NS = 20_000_000
+_SWEEP_NS = 100_000_000
+
+
+def warm_up() -> None:
+    """Run the whole way of a few scans on a small scene; starts no thread and opens nothing."""
+    tile_id = TileId.from_geodetic(0.6555, 2.2173)
+    frame = LocalFrame.of_tile(tile_id)
+    points = _room()
+    local_map = _map_of(points, GridFrame.around(frame, [tile_id]))
+    detector = ChangeDetector(local_map)
+    for scan in _localised(local_map, points, frame):
+        detector.add_scan(scan.points_map_m, scan.origins_map_m)
+    detector.add_scan(points, np.array([0.0, 0.0, _LIDAR_HEIGHT_M]))
+    for evidence in detector.finish(local_map.tiles).values():
+        tile_change(classify(evidence, detector.parameters), pose_sigma_m=0.0, pose_sigma_rad=0.0)
+
+
+def _room() -> F64:
+    """Points (N, 3) of a floor of 24 m x 16 m and two walls, map frame."""
+    x, y = np.meshgrid(np.arange(-12.0, 12.0, 0.15), np.arange(-8.0, 8.0, 0.15))
+    floor = np.stack([x.ravel(), y.ravel(), np.full(x.size, 0.05)], axis=1)
+    along, up = np.meshgrid(np.arange(-12.0, 12.0, 0.15), np.arange(0.1, 4.0, 0.15))
+    side = np.stack([along.ravel(), np.full(along.size, 7.9), up.ravel()], axis=1)
+    end = np.stack([np.full(along.size, 11.9), along.ravel() * 0.6, up.ravel()], axis=1)
+    return np.concatenate([floor, side, end])
+
+
+def _map_of(points_map_m: F64, grid_frame: GridFrame) -> LocalMap:
+    accumulator, local_map = VoxelAccumulator(grid_frame), LocalMap(grid_frame)
+    accumulator.add(points_map_m)
+    for tile_id, gaussians in accumulator.finish().items():
+        local_map.set_tile(Tile(tile_id, 1, gaussians))
+    return local_map
+
+
+def _localised(local_map: LocalMap, points_map_m: F64, frame: LocalFrame) -> list[RefinedScan]:
+    """What a standing vehicle makes of three scans of the room."""
+    T_vehicle_lidar = np.eye(4)
+    T_vehicle_lidar[2, 3] = _LIDAR_HEIGHT_M
+    localiser = Localiser(local_map, T_vehicle_lidar)
+    seen = np.ascontiguousarray(points_map_m - T_vehicle_lidar[:3, 3], dtype=np.float32)
+    offset_ns = np.linspace(0, _SWEEP_NS - 1, len(seen)).astype(np.uint32)
+    localiser.push_gnss(GnssFix(0, frame.lat_rad, frame.lon_rad, 0.0, 0.3))
+    refined: list[RefinedScan] = []
+    for number in range(3):
+        for k in range(_SWEEP_NS // _STEP_NS):
+            localiser.push_motion(MotionSample(number * _SWEEP_NS + k * _STEP_NS, 0.0, 0.0))
+        refined += localiser.push_scan(Scan(number * _SWEEP_NS, seen, offset_ns))
+    return refined + localiser.flush()
