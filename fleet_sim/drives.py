@@ -1,0 +1,243 @@
+"""Simulated drives: what a vehicle's sensors give along a street, written as MCAP in the form of recorded drives."""
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, field
+from math import radians, sqrt
+from pathlib import Path
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fleet_sim.cars import parked_cars
+from fleet_sim.errors import DriveSimError
+from fleet_sim.lidar import MODELS, Lidar, LidarModel, column_poses
+from fleet_sim.raycast import Scene
+from fleet_sim.trajectory import Direction, DrivingStyle, gauss_markov, lane_motion
+from fleet_sim.world import State, World
+from gnd_map.se3 import exp_so3
+from schemas.drive import DriveHeader, DriveItem, GnssFix, MotionSample, ReferencePose, Scan
+from schemas.drive_mcap import DriveWriter
+
+_NS_PER_S: Final = 1_000_000_000
+EPOCH_NS: Final = 1_570_838_400 * _NS_PER_S
+"""12 October 2019, 00:00 UTC, the day of the GND paper's 38 drives (section 7.1)."""
+_LEAD_S: Final = 0.2
+_MOTION_HZ: Final = 50
+_REFERENCE_HZ: Final = 100
+
+
+@dataclass(frozen=True, slots=True)
+class SensorErrors:
+    """Errors of the vehicle's own sensors; each drive draws its own (standard deviations).
+
+    Attributes:
+        wheel_scale: error of the wheel's radius, as a share.
+        wheel_mps: white noise of the wheel speed.
+        gyro_bias_radps: constant error of the yaw rate.
+        gyro_radps: white noise of the yaw rate.
+        gnss_m: horizontal error of the GNSS (root mean square of both axes together), slowly varying.
+        gnss_correlation_s: its time constant.
+        gnss_white_m: white noise of each axis on top.
+        mount_m: error of the LiDAR's mounting position against what the drive's header says, each axis.
+        mount_rad: error of its mounting angle, each axis.
+    """
+
+    wheel_scale: float = 0.005
+    wheel_mps: float = 0.02
+    gyro_bias_radps: float = radians(0.1)
+    gyro_radps: float = radians(0.1)
+    gnss_m: float = 2.5
+    gnss_correlation_s: float = 40.0
+    gnss_white_m: float = 0.2
+    mount_m: float = 0.003
+    mount_rad: float = radians(0.02)
+
+    def __post_init__(self) -> None:
+        bad = [name for name in self.__slots__ if getattr(self, name) < 0]
+        if bad or self.gnss_correlation_s == 0:
+            raise DriveSimError(f"sensor errors must not be negative: {bad or 'gnss_correlation_s is 0'}")
+
+
+PERFECT: Final = SensorErrors(0.0, 0.0, 0.0, 0.0, 0.0, 40.0, 0.0, 0.0, 0.0)
+
+
+@dataclass(frozen=True, slots=True)
+class DriveConfig:
+    """What a simulated drive is like.
+
+    Attributes:
+        vehicle: pseudonym written into the recording.
+        sensor: model name, one of `lidar.MODELS`.
+        state: the world's state that it drives through.
+        direction: +1 along the street, -1 against it.
+        seed: everything random of this drive.
+        cruise_mps: speed once under way.
+        car_share: share of parking slots that are taken.
+        scans: at most so many scans, None for the whole street.
+        gnss_hz: rate of the GNSS.
+        errors: of the vehicle's sensors.
+        start_ns: UTC of the first scan.
+        mount_height_m: height of the LiDAR over the road.
+    """
+
+    vehicle: str
+    sensor: str
+    state: State = "after"
+    direction: Direction = 1
+    seed: int = 0
+    cruise_mps: float = 9.0
+    car_share: float = 0.2
+    scans: int | None = None
+    gnss_hz: int = 10
+    errors: SensorErrors = field(default_factory=SensorErrors)
+    start_ns: int = EPOCH_NS
+    mount_height_m: float = 1.9
+
+    def __post_init__(self) -> None:
+        if self.sensor not in MODELS:
+            raise DriveSimError(f"unknown sensor {self.sensor!r}, known are {', '.join(MODELS)}")
+        if self.direction not in (1, -1):
+            raise DriveSimError(f"direction must be 1 or -1, got {self.direction}")
+        if not 1 <= self.gnss_hz <= _MOTION_HZ:
+            raise DriveSimError(f"gnss_hz must be in 1 … {_MOTION_HZ}, got {self.gnss_hz}")
+
+    @property
+    def model(self) -> LidarModel:
+        """The sensor's data sheet."""
+        return MODELS[self.sensor]
+
+    @property
+    def T_vehicle_lidar(self) -> NDArray[np.float64]:
+        """Mounting pose as the vehicle knows it, float64 (4, 4): on the roof, level, looking ahead."""
+        T = np.eye(4)
+        T[:3, 3] = (1.2, 0.0, self.mount_height_m)
+        return T
+
+
+def simulate_drive(
+    world: World, config: DriveConfig, path: Path, on_scan: Callable[[int, int], None] | None = None
+) -> Path:
+    """Simulate one drive and write it; the file appears complete or not at all.
+
+    Args:
+        world: the street.
+        config: vehicle, sensor and style.
+        path: the MCAP file to write.
+        on_scan: told (scans done, scans in all) now and then.
+
+    Returns:
+        The path.
+
+    Raises:
+        DriveSimError: the configuration cannot be driven.
+        DriveError: the file cannot be written.
+    """
+    simulation = DriveSimulation(world, config)
+    with DriveWriter(path, simulation.header()) as writer:
+        for item in simulation.items():
+            writer.add(item)
+            if on_scan is not None and isinstance(item, Scan):
+                on_scan((item.t_ns - config.start_ns) // config.model.period_ns + 1, simulation.scans)
+    return path
+
+
+class DriveSimulation:
+    """One drive through a world, as a stream of what the sensors give.
+
+    Attributes:
+        motion: the true motion; its time 0 is `config.start_ns`.
+        scans: number of LiDAR revolutions.
+    """
+
+    def __init__(self, world: World, config: DriveConfig) -> None:
+        self._config = config
+        self._world = world
+        self._rng = np.random.default_rng([config.seed, world.seed])
+        style = DrivingStyle.drawn(self._rng, config.cruise_mps)
+        self.motion, duration_s = lane_motion(world, style, config.direction)
+        whole = int(duration_s * config.model.rate_hz)
+        self.scans = whole if config.scans is None else min(whole, config.scans)
+        if self.scans < 1:
+            raise DriveSimError(f"a drive needs at least one scan, got {self.scans} ({duration_s:.2f} s of street)")
+        cars = parked_cars(world, config.state, config.car_share, config.seed)
+        self._scene = Scene.build((*world.shapes(config.state), *cars), world.A_street_map)
+        self._lidar = Lidar(config.model)
+        self._T_vehicle_lidar_true = self._drawn_mount()
+
+    @property
+    def _seconds(self) -> float:
+        return self.scans / self._config.model.rate_hz
+
+    def header(self) -> DriveHeader:
+        """Return the header of the recording; its mount is the one that the vehicle believes in."""
+        c = self._config
+        return DriveHeader(
+            drive_id=f"{c.vehicle}-{c.state}-{c.seed}",
+            vehicle=c.vehicle,
+            sensor_model=c.sensor,
+            anchor=self._world.frame,
+            T_vehicle_lidar=c.T_vehicle_lidar,
+            source=f"fleet_sim, world seed {self._world.seed}, state {c.state}, drive seed {c.seed}",
+        )
+
+    def items(self) -> Iterator[DriveItem]:
+        """Yield everything that the sensors give, in time order."""
+        small: list[DriveItem] = [*self._motion_samples(), *self._gnss_fixes(), *self._reference_poses()]
+        small.sort(key=lambda item: item.t_ns)
+        position, period_ns = 0, self._config.model.period_ns
+        for index in range(self.scans):
+            t_ns = self._config.start_ns + index * period_ns
+            while position < len(small) and small[position].t_ns < t_ns:
+                yield small[position]
+                position += 1
+            yield self._scan(t_ns)
+        yield from small[position:]
+
+    def _drawn_mount(self) -> NDArray[np.float64]:
+        errors, T = self._config.errors, np.eye(4)
+        T[:3, :3] = exp_so3(errors.mount_rad * self._rng.standard_normal(3))
+        T[:3, 3] = errors.mount_m * self._rng.standard_normal(3)
+        return np.asarray(self._config.T_vehicle_lidar @ T)
+
+    def _scan(self, t_ns: int) -> Scan:
+        t_s = (t_ns - self._config.start_ns) / _NS_PER_S
+        T_map_lidar = column_poses(
+            self._config.model, t_s, lambda t: self.motion.T_map_vehicle(t) @ self._T_vehicle_lidar_true
+        )
+        sweep = self._lidar.sweep(self._scene, T_map_lidar, self._rng)
+        return Scan(t_ns, sweep.points_lidar_m, sweep.t_offset_ns, sweep.ring.astype(np.uint16))
+
+    def _times(self, rate_hz: int) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
+        """Times of a sensor, a little longer than the scans: UTC [ns], time of the drive [s]."""
+        step_ns = _NS_PER_S // rate_hz
+        first, last = -round(_LEAD_S * rate_hz), round((self._seconds + _LEAD_S) * rate_hz)
+        offset_ns = np.arange(first, last + 1, dtype=np.int64) * step_ns
+        return self._config.start_ns + offset_ns, offset_ns / _NS_PER_S
+
+    def _motion_samples(self) -> list[MotionSample]:
+        errors, rng = self._config.errors, self._rng
+        t_ns, t_s = self._times(_MOTION_HZ)
+        speed, yaw_rate = self.motion.speed_and_yaw_rate(t_s)
+        scale, bias = 1.0 + errors.wheel_scale * rng.standard_normal(), errors.gyro_bias_radps * rng.standard_normal()
+        speed = scale * speed + errors.wheel_mps * rng.standard_normal(len(t_s))
+        yaw_rate = yaw_rate + bias + errors.gyro_radps * rng.standard_normal(len(t_s))
+        return [MotionSample(*row) for row in zip(t_ns.tolist(), speed.tolist(), yaw_rate.tolist(), strict=True)]
+
+    def _gnss_fixes(self) -> list[GnssFix]:
+        errors, rng = self._config.errors, self._rng
+        t_ns, t_s = self._times(self._config.gnss_hz)
+        axis_m = errors.gnss_m / sqrt(2.0) * np.array([1.0, 1.0, 1.5])
+        step_s = 1.0 / self._config.gnss_hz
+        slow = [gauss_markov(rng, len(t_s), step_s, sigma, errors.gnss_correlation_s) for sigma in axis_m]
+        offset = np.stack(slow, axis=1) + errors.gnss_white_m * rng.standard_normal((len(t_s), 3))
+        where = self.motion.T_map_vehicle(t_s)[:, :3, 3] + offset
+        lat, lon, height = self._world.frame.geodetic_from_enu(where)
+        sigma_m = max(errors.gnss_m, 0.01)
+        rows = zip(t_ns.tolist(), lat.tolist(), lon.tolist(), height.tolist(), strict=True)
+        return [GnssFix(*row, sigma_m) for row in rows]
+
+    def _reference_poses(self) -> list[ReferencePose]:
+        t_ns, t_s = self._times(_REFERENCE_HZ)
+        poses = self.motion.T_map_vehicle(t_s)
+        return [ReferencePose(t, T) for t, T in zip(t_ns.tolist(), poses, strict=True)]

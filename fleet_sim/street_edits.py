@@ -1,0 +1,204 @@
+"""What changes on the street between `before` and `after`: a construction zone, and the rest of a year in a city.
+
+The edits follow the GND paper's simulations (section 6.1: objects added, removed, transformed), sized so that
+modified, new and deleted voxels each have a few hundred examples.
+"""
+
+from collections.abc import Sequence
+from dataclasses import replace
+from math import pi
+
+import numpy as np
+
+from fleet_sim import parts
+from fleet_sim.parts import Lot
+from fleet_sim.shapes import Ball, Block, Post, Shape
+from fleet_sim.world import Edit, WorldObject
+
+Gap = tuple[int, float, float]
+
+
+class Site:
+    """The objects of a street while they are being edited."""
+
+    def __init__(self, objects: Sequence[WorldObject], base_m: float) -> None:
+        self._objects = list(objects)
+        self.base_m = base_m
+
+    @property
+    def objects(self) -> tuple[WorldObject, ...]:
+        """Everything, untouched things first in their old order, then what the edits made."""
+        return tuple(self._objects)
+
+    def kept(self, kind: str) -> list[WorldObject]:
+        """Return the things of a kind that no edit has touched yet, nearest to the middle of the street first."""
+        return sorted((o for o in self._objects if o.kind == kind and o.edit == "kept"), key=lambda o: abs(_x_m(o)))
+
+    def add(self, name: str, kind: str, shapes: tuple[Shape, ...]) -> None:
+        """Put a thing that was not there before."""
+        self._objects.append(WorldObject(name, kind, ("after",), "added", shapes))
+
+    def remove(self, old: WorldObject) -> None:
+        """Take a thing away."""
+        self._swap(old, replace(old, states=("before",), edit="removed"))
+
+    def change(self, old: WorldObject, shapes: tuple[Shape, ...], edit: Edit) -> None:
+        """Give a thing other shapes."""
+        self._swap(old, replace(old, states=("before",), edit=edit))
+        self._objects.append(WorldObject(old.name, old.kind, ("after",), edit, shapes))
+
+    def shift(self, old: WorldObject, dx_m: float, dy_m: float) -> None:
+        """Move a thing."""
+        self.change(old, tuple(_shifted(shape, dx_m, dy_m) for shape in old.shapes), "moved")
+
+    def named(self, name: str) -> WorldObject:
+        """Return an untouched thing by its name."""
+        return next(o for o in self._objects if o.name == name and o.edit == "kept")
+
+    def _swap(self, old: WorldObject, new: WorldObject) -> None:
+        self._objects[self._objects.index(old)] = new
+
+
+def rebuild(
+    objects: Sequence[WorldObject],
+    lots: Sequence[Lot],
+    gaps: Sequence[Gap],
+    zone_side: int,
+    zone_x_m: float,
+    base_m: float,
+    rng: np.random.Generator,
+) -> tuple[WorldObject, ...]:
+    """Edit the street `before` into the street of both states.
+
+    Args:
+        objects: everything on the street before, all of it in both states.
+        lots: the buildings, in the order of their names.
+        gaps: alleys (side, x0, x1).
+        zone_side: side with the construction zone.
+        zone_x_m: middle of the construction zone along the street.
+        base_m: height of the pavement.
+        rng: decides the sizes.
+    """
+    site = Site(objects, base_m)
+    near = sorted(range(len(lots)), key=lambda i: abs(lots[i].x_m - zone_x_m))
+    here = [i for i in near if lots[i].side == zone_side]
+    there = [i for i in near if lots[i].side != zone_side]
+    _demolish(site, lots[here[0]], here[0], rng)
+    _rebuild_fronts(site, lots, here, there, rng)
+    _construction_zone(site, zone_side, zone_x_m, rng)
+    _pavements(site, zone_side, zone_x_m)
+    _walls(site, rng)
+    _infill(site, gaps, zone_x_m)
+    _furniture(site, rng)
+    return site.objects
+
+
+def _demolish(site: Site, lot: Lot, index: int, rng: np.random.Generator) -> None:
+    """A building goes; rubble, a container and hoarding take its place."""
+    site.remove(site.named(f"building {index}"))
+    y = lot.side * (lot.front_m + 0.2)
+    hoarding = parts.slab(lot.x0_m - 0.5, lot.x1_m + 0.5, y - 0.05, y + 0.05, site.base_m, site.base_m + 2.2)
+    site.add("hoarding", "hoarding", (hoarding,))
+    size = float(rng.uniform(3.5, 4.5))
+    site.add("rubble", "heap", parts.heap(lot.x_m, lot.side * (lot.front_m + 5.0), site.base_m, size))
+
+
+def _rebuild_fronts(
+    site: Site, lots: Sequence[Lot], here: list[int], there: list[int], rng: np.random.Generator
+) -> None:
+    """Fronts rebuilt with other relief, moved forwards or backwards, and a building grown by a storey."""
+    style = int(rng.integers(2**31))
+    changes: list[tuple[int, float, float, int]] = [
+        (here[1], -0.35, 0.0, style),
+        (here[2], 0.45, 0.0, 0),
+        (here[4], 0.0, 3.0, style + 1),
+        (there[0], 0.6, 0.0, 0),
+        (there[1], 0.0, 0.0, style + 2),
+        (there[2], -0.4, 0.0, 0),
+        (there[4], -0.3, 1.5, style + 3),
+    ]
+    for index, forward, taller, new_style in changes:
+        old = lots[index]
+        style = new_style or old.style
+        lot = replace(old, front_m=old.front_m - forward, height_m=old.height_m + taller, style=style)
+        edit: Edit = "reshaped" if new_style else "moved"
+        site.change(site.named(f"building {index}"), parts.building(lot), edit)
+
+
+def _construction_zone(site: Site, side: int, x: float, rng: np.random.Generator) -> None:
+    """Barriers, containers, scaffold, site signs and spoil on the pavement and the parking lane."""
+    base = site.base_m
+    for index in range(11):
+        where = x - 12.0 + 2.3 * index
+        turned = parts.barrier(where, side * 4.75, -0.1, float(rng.normal(0.0, 0.04)))
+        site.add(f"barrier {index}", "barrier", turned)
+    for index, dx in enumerate((-6.0, 1.5)):
+        turned = parts.container(x + dx, side * 7.7, base, float(rng.normal(0.0, 0.05)))
+        site.add(f"container {index}", "container", turned)
+    site.add("scaffold", "scaffold", parts.scaffold(x + 7.0, x + 17.0, side * 9.2, base, side, 3))
+    site.add("spoil", "heap", parts.heap(x - 13.5, side * 7.9, base, 2.6))
+    for index, dx in enumerate((-15.5, 15.5)):
+        site.add(f"site sign {index}", "sign", parts.sign(x + dx, side * 5.6, -0.1, 1.2, 1.4, 0.0))
+
+
+def _pavements(site: Site, side: int, x: float) -> None:
+    """The kerb moves: pavement widened on one stretch, a lay-by cut into it on another, a terrace raised on a third."""
+    base = site.base_m
+    wide = parts.slab(x + 18.0, x + 42.0, side * 5.0, side * 6.2, -1.0, base)
+    site.add("kerb extension", "pavement", (wide,))
+    pieces = sorted((o for o in site.kept("pavement") if o.name.startswith(f"pavement {-side:+d} ")), key=_x_m)
+    for piece in [p for p in pieces if x - 45.0 < _x_m(p) < x - 18.0]:
+        site.remove(piece)
+    site.add("terrace", "pavement", (parts.slab(x + 2.0, x + 24.0, -side * 7.2, -side * 10.3, -0.5, base + 0.35),))
+
+
+def _walls(site: Site, rng: np.random.Generator) -> None:
+    """Walls moved by 0.3 to 2 m, one taken away, one raised."""
+    walls = [o for o in site.kept("wall") if abs(_x_m(o)) < 85.0]
+    for old, dy in zip(walls[0:4], (0.3, 0.6, 1.2, 2.0), strict=False):
+        site.shift(old, 0.0, float(np.sign(_y_m(old))) * dy)
+    for old in walls[4:6]:
+        site.remove(old)
+    for index in range(2):
+        side, x = (1, -1)[index], float(rng.uniform(20.0, 60.0)) * (-1, 1)[index]
+        shapes = parts.wall(x - 5.0, x + 5.0, side * 9.5, 1.3, site.base_m)
+        site.add(f"new wall {index}", "wall", shapes)
+
+
+def _infill(site: Site, gaps: Sequence[Gap], x: float) -> None:
+    """New shops in the alleys nearest to the zone, a kiosk on either pavement."""
+    for index, (side, x0, x1) in enumerate(sorted(gaps, key=lambda gap: abs(gap[1] - x))[0:3]):
+        lot = Lot(side, x0, x1, 10.4, 4.2 + index, 77 + index, site.base_m)
+        site.add(f"shop {index}", "building", parts.building(lot))
+    for index, (side, dx) in enumerate(((1, -52.0), (-1, 58.0))):
+        kiosk = parts.slab(dx - 2.2, dx + 2.2, side * 7.4, side * 9.6, site.base_m - 0.1, site.base_m + 2.6)
+        site.add(f"kiosk {index}", "kiosk", (kiosk,))
+
+
+def _furniture(site: Site, rng: np.random.Generator) -> None:
+    """Signs, lamps, trees, cabinets and shelters: some moved, some gone, some new."""
+    for kind, moved, removed in (("sign", 3, 3), ("lamp", 2, 1), ("cabinet", 2, 2), ("tree", 0, 4), ("shelter", 1, 0)):
+        found = [o for o in site.kept(kind) if abs(_x_m(o)) < 85.0]
+        order = rng.permutation(len(found)).tolist()
+        for rank in order[0:moved]:
+            site.shift(found[rank], float(rng.uniform(0.5, 3.0)) * float(rng.choice((-1.0, 1.0))), 0.0)
+        for rank in order[moved : moved + removed]:
+            site.remove(found[rank])
+    for index in range(4):
+        side, x = (1, -1)[index % 2], float(rng.uniform(-75.0, 75.0))
+        site.add(f"new sign {index}", "sign", parts.sign(x, side * 7.1, site.base_m, 0.9, 2.5, pi * (side < 0)))
+    for index in range(3):
+        side, x = (1, -1)[index % 2], float(rng.uniform(-70.0, 70.0))
+        site.add(f"new tree {index}", "tree", parts.tree(x, side * 8.1, site.base_m, int(rng.integers(2**31))))
+
+
+def _shifted(shape: Shape, dx_m: float, dy_m: float) -> Block | Post | Ball:
+    return replace(shape, x_m=round(shape.x_m + dx_m, 3), y_m=round(shape.y_m + dy_m, 3))
+
+
+def _x_m(o: WorldObject) -> float:
+    return o.shapes[0].x_m
+
+
+def _y_m(o: WorldObject) -> float:
+    return o.shapes[0].y_m

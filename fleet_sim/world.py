@@ -1,0 +1,214 @@
+"""A simulated street in two states, `before` and `after` its changes, and its file.
+
+Two frames. *map*: ENU at the anchor of the world (x east, y north, z up, metres). *street*: x along the street, y to
+the left, z above the street's sloping reference plane, same origin. The step between them is affine, not rigid:
+`p_street = A_street_map @ p_map` turns about the vertical and then shears the slope away, so that walls stay upright,
+kerbs follow the slope, and straight rays stay straight.
+"""
+
+import json
+from dataclasses import asdict, dataclass
+from functools import cached_property
+from math import cos, sin
+from pathlib import Path
+from typing import Any, Final, Literal, get_args
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fleet_sim.errors import ShapeError, WorldError
+from fleet_sim.shapes import Ball, Block, Post, Shape
+from gnd_map.geodesy import LocalFrame
+
+State = Literal["before", "after"]
+Edit = Literal["kept", "added", "removed", "moved", "reshaped"]
+STATES: Final = get_args(State)
+EDITS: Final = get_args(Edit)
+
+_FORMAT: Final = "gnd.world"
+_VERSION: Final = 1
+_MAX_FILE_BYTES: Final = 64 * 1024 * 1024
+_TYPES: Final[dict[str, type[Block] | type[Post] | type[Ball]]] = {"block": Block, "post": Post, "ball": Ball}
+
+
+@dataclass(frozen=True, slots=True)
+class WorldObject:
+    """One thing on the street: a building, a kerb, a sign.
+
+    Attributes:
+        name: unique within its state; a moved or reshaped thing has the same name in both.
+        kind: what it is ("building", "kerb", "pole", ...).
+        states: the states in which it stands like this.
+        edit: what happened to it between the states.
+        shapes: its primitives, street frame.
+    """
+
+    name: str
+    kind: str
+    states: tuple[State, ...]
+    edit: Edit
+    shapes: tuple[Shape, ...]
+
+    def __post_init__(self) -> None:
+        if not self.states or any(state not in STATES for state in self.states):
+            raise WorldError(f"object {self.name!r}: states must be some of {STATES}, got {self.states}")
+        if self.edit not in EDITS:
+            raise WorldError(f"object {self.name!r}: edit must be one of {EDITS}, got {self.edit!r}")
+        if not self.shapes:
+            raise WorldError(f"object {self.name!r} has no shapes")
+
+
+@dataclass(frozen=True)
+class World:
+    """A street with everything on it, in both states.
+
+    Attributes:
+        seed: the number that it was made from.
+        lat_rad, lon_rad, height_m: anchor of the map frame, WGS-84, ellipsoidal height of the road's middle there.
+        heading_rad: direction of the street's x, counter-clockwise from east.
+        slope: rise of the street along its x, metres a metre.
+        crown: fall of the carriageway from its middle to the kerbs, metres a metre.
+        half_length_m: drives stay within this distance of the anchor, along the street.
+        lane_offset_m: middle of a lane from the middle of the road (traffic keeps to the right).
+        kerb_m: distance of the kerbs from the middle of the road.
+        objects: everything, in a fixed order.
+    """
+
+    seed: int
+    lat_rad: float
+    lon_rad: float
+    height_m: float
+    heading_rad: float
+    slope: float
+    crown: float
+    half_length_m: float
+    lane_offset_m: float
+    kerb_m: float
+    objects: tuple[WorldObject, ...]
+
+    def __post_init__(self) -> None:
+        if self.half_length_m <= 0 or not 0 < self.lane_offset_m < self.kerb_m:
+            raise WorldError(
+                f"need half_length_m > 0 and 0 < lane_offset_m < kerb_m, got {self.half_length_m},"
+                f" {self.lane_offset_m}, {self.kerb_m}"
+            )
+        for state in STATES:
+            names = [o.name for o in self.objects if state in o.states]
+            if len(names) != len(set(names)):
+                raise WorldError(f"world {self.seed}: object names are not unique in state {state!r}")
+
+    @cached_property
+    def frame(self) -> LocalFrame:
+        """The map frame: ENU at the anchor."""
+        return LocalFrame(self.lat_rad, self.lon_rad, self.height_m)
+
+    @cached_property
+    def A_street_map(self) -> NDArray[np.float64]:
+        """Affine step from the map frame to the street frame, float64 (3, 3): turn about z, then shear along z."""
+        c, s = cos(self.heading_rad), sin(self.heading_rad)
+        turn = np.array([[c, s, 0.0], [-s, c, 0.0], [0.0, 0.0, 1.0]])
+        shear = np.array([[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [-self.slope, 0.0, 1.0]])
+        return np.asarray(shear @ turn)
+
+    def street_of_map(self, points_map: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return street-frame coordinates (..., 3) of map-frame points (..., 3) [m]."""
+        return points_map @ self.A_street_map.T
+
+    def map_of_street(self, points_street: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return map-frame coordinates (..., 3) of street-frame points (..., 3) [m]."""
+        return points_street @ np.linalg.inv(self.A_street_map).T
+
+    def road_height_m(self, y_street_m: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return the street-frame height of the carriageway at distances y (N,) from its middle [m]."""
+        return -self.crown * np.abs(y_street_m)
+
+    def in_state(self, state: State) -> tuple[WorldObject, ...]:
+        """Return the objects that stand in `state`.
+
+        Raises:
+            WorldError: there is no such state.
+        """
+        if state not in STATES:
+            raise WorldError(f"unknown state {state!r}, use one of {STATES}")
+        return tuple(o for o in self.objects if state in o.states)
+
+    def shapes(self, state: State) -> tuple[Shape, ...]:
+        """Return the primitives of `state`, street frame."""
+        return tuple(shape for o in self.in_state(state) for shape in o.shapes)
+
+
+def to_json(world: World) -> str:
+    """Return the text of the world's file: floats as Python writes them, so that reading gives the same bits."""
+    head = {key: value for key, value in vars(world).items() if key in World.__dataclass_fields__ and key != "objects"}
+    objects = ",\n".join(json.dumps(_encode_object(o)) for o in world.objects)
+    start = json.dumps({"format": _FORMAT, "version": _VERSION, **head})[:-1]
+    return f'{start}, "objects": [\n{objects}\n]}}\n'
+
+
+def from_json(text: str, where: str = "world") -> World:
+    """Read a world from the text of its file.
+
+    Raises:
+        WorldError: `where` is no world file, of an unknown version, or says something impossible.
+    """
+    try:
+        data = json.loads(text)
+    except ValueError as error:
+        raise WorldError(f"{where} is not JSON: {error}") from error
+    if not isinstance(data, dict) or data.pop("format", None) != _FORMAT:
+        raise WorldError(f'{where} is not a world file: it lacks "format": "{_FORMAT}"')
+    version = data.pop("version", None)
+    if version != _VERSION:
+        raise WorldError(f"{where} has version {version!r}, this program reads version {_VERSION}")
+    try:
+        objects = tuple(_decode_object(o) for o in data.pop("objects"))
+        return World(**data, objects=objects)
+    except (TypeError, KeyError, ValueError, AttributeError, ShapeError, WorldError) as error:
+        raise WorldError(f"{where} cannot be read: {type(error).__name__}: {error}") from error
+
+
+def _encode_object(o: WorldObject) -> dict[str, Any]:
+    shapes = [{"type": type(shape).__name__.lower(), **asdict(shape)} for shape in o.shapes]
+    return {"name": o.name, "kind": o.kind, "states": list(o.states), "edit": o.edit, "shapes": shapes}
+
+
+def _decode_object(data: dict[str, Any]) -> WorldObject:
+    shapes = tuple(_decode_shape(shape) for shape in data.pop("shapes"))
+    return WorldObject(**{**data, "states": tuple(data["states"])}, shapes=shapes)
+
+
+def _decode_shape(data: dict[str, Any]) -> Shape:
+    kind = data.pop("type", None)
+    if kind not in _TYPES:
+        raise WorldError(f"unknown shape type {kind!r}, known are {sorted(_TYPES)}")
+    return _TYPES[kind](**data)
+
+
+def write_world(world: World, path: Path) -> None:
+    """Write the world's file; the file appears complete or not at all.
+
+    Raises:
+        WorldError: the file cannot be written.
+    """
+    partial = path.with_name(path.name + ".part")
+    try:
+        partial.write_text(to_json(world), encoding="utf-8")
+        partial.replace(path)
+    except OSError as error:
+        raise WorldError(f"cannot write the world file {path}: {error}") from error
+
+
+def read_world(path: Path) -> World:
+    """Read a world's file.
+
+    Raises:
+        WorldError: the file is missing, too large, or no world file.
+    """
+    try:
+        size = path.stat().st_size
+        if size > _MAX_FILE_BYTES:
+            raise WorldError(f"world file {path} has {size} bytes, the limit is {_MAX_FILE_BYTES}")
+        text = path.read_text(encoding="utf-8")
+    except (OSError, UnicodeDecodeError) as error:
+        raise WorldError(f"cannot read the world file {path}: {error}") from error
+    return from_json(text, f"world file {path}")
