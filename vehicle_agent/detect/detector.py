@@ -6,6 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from gnd_map.accumulate import VoxelAccumulator
 from gnd_map.arrays import F64, I32, points_3d
 from gnd_map.errors import ShapeError
 from gnd_map.gaussian import Gaussians
@@ -14,7 +15,6 @@ from gnd_map.tile_id import TileId
 from vehicle_agent.detect.evidence import TileEvidence
 from vehicle_agent.detect.kernel import cast_rays, kernel_parameters, window_affine
 from vehicle_agent.detect.parameters import DetectParameters
-from vehicle_agent.detect.points import NewPoints
 from vehicle_agent.detect.records import N_BI, N_BO, N_PI, N_PO, Records, make_records
 from vehicle_agent.errors import MapChanged
 from vehicle_agent.local_map import EMPTY, UNKNOWN, LocalMap
@@ -44,7 +44,7 @@ class ChangeDetector:
         self.local_map = local_map
         self.parameters = parameters or DetectParameters()
         self._kernel = kernel_parameters(self.parameters)
-        self._points = NewPoints(local_map.grid_frame)
+        self._points = VoxelAccumulator(local_map.grid_frame)
         self._window: _Window | None = None
 
     def add_scan(self, points_map_m: F64, origins_map_m: F64) -> int:
@@ -92,7 +92,7 @@ class ChangeDetector:
         """Take out the evidence of tiles that are held by the map; afterwards there is none about them."""
         window = self._current()
         held = sorted(set(tiles) & set(window.tiles))
-        measured = self._points.pop(held)
+        measured = self._points.pop(held, n_min_cells=1)
         return {t: self._take(window, t, measured.get(t, Gaussians.empty())) for t in held}
 
     def _current(self) -> _Window:
