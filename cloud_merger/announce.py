@@ -4,12 +4,14 @@ transaction; so a notice outlives the shard that published the version, and goes
 
 import logging
 from collections import OrderedDict
+from dataclasses import replace
 from typing import Final
 
 from cloud_merger.ownership import Members
 from fleet_bus.bus import Bus
 from fleet_bus.subscribing import RecallingPublisher
-from gnd_map.tile import Tile, diff
+from gnd_map.tile import Tile, TileDelta, diff
+from schemas.errors import SchemaError, TooLarge
 from schemas.keys import update_key
 from schemas.tiles import TileBlob, tile_of
 from schemas.updates import TileUpdate
@@ -48,7 +50,7 @@ class Announcer:
             return
         parent = self._store.get(notice.layer, notice.tile, stored.parent) if stored.parent else None
         key = update_key(notice.layer, notice.tile)
-        self._publisher(key).put(update_of(stored, parent).encode(), tile=notice.tile)
+        self._publisher(key).put(encoded(update_of(stored, parent)), tile=notice.tile)
 
     def _publisher(self, key: str) -> RecallingPublisher:
         publisher = self._publishers.pop(key, None) or self._bus.advanced_publisher(key)
@@ -68,8 +70,24 @@ def update_of(stored: StoredTile, parent: StoredTile | None) -> TileUpdate:
         sha=stored.sha,
         previous_sha=parent.sha if parent else b"",
         reason=stored.kind,
-        delta=diff(tile_from(parent).gaussians, tile_from(stored).gaussians) if parent else None,
+        delta=_delta(stored, parent) if parent else None,
     )
+
+
+def _delta(stored: StoredTile, parent: StoredTile) -> TileDelta | None:
+    try:
+        return diff(tile_from(parent).gaussians, tile_from(stored).gaussians)
+    except SchemaError as error:  # one damaged body must not keep the notices of all other tiles
+        _LOG.error("%s version %d is announced without a delta: %s", stored.tile, stored.version, error)
+        return None
+
+
+def encoded(update: TileUpdate) -> bytes:
+    """The notice's bytes; without its delta where that is larger than a notice may be."""
+    try:
+        return update.encode()
+    except TooLarge:
+        return replace(update, delta=None).encode()
 
 
 def tile_from(stored: StoredTile) -> Tile:

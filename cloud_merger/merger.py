@@ -27,7 +27,10 @@ def run_shard(config: ShardConfig, stop: threading.Event) -> None:
         NoRouter: no router answers at the start.
     """
     bus_config = BusConfig(connect=config.connect, lease_ms=config.bus_lease_ms)
-    with SqliteStore(config.store_path, config.store) as store, open_bus(bus_config, name=config.shard_id) as bus:
+    with (
+        SqliteStore(config.store_path, config.store, create=False) as store,
+        open_bus(bus_config, name=config.shard_id) as bus,
+    ):
         members = Members(config.shard_id)
         wake = threading.Event()
         store.release(config.shard_id)  # leases of an earlier life
@@ -36,6 +39,7 @@ def run_shard(config: ShardConfig, stop: threading.Event) -> None:
         ingest = Ingest(store, config.ingest, on_stored=wake.set)
         reception = Reception(bus, members, ingest.answer, on_death=store.release)
         reception.open(districts_of(store))
+        _LOG.info("merger %s: store %s, mode %s", config.shard_id, config.store_path, config.merge.mode)
 
         worker, announcer = Worker(store, config), Announcer(store, bus, members)
         while not stop.is_set():

@@ -11,8 +11,9 @@ from cloud_merger.statements import Report, statements_of
 from gnd_map.gaussian import Gaussians
 from gnd_map.tile import Tile
 from schemas.changes import ChangeReport
+from schemas.errors import SchemaError
 from tile_store.store import Store
-from tile_store.values import Claim, Publication, ReportRow, StoredTile, TileWork
+from tile_store.values import Claim, Publication, ReportRow, TileWork
 
 _LOG = logging.getLogger(__name__)
 
@@ -39,7 +40,7 @@ class Worker:
         if claim.attempts > self._config.max_attempts:  # it may be what killed the shards that claimed it before
             return self._set_aside(work, "no shard that claimed it came to an end")
         try:
-            return publication_of(work, self._bases(work), self._config)
+            return self._publication(work)
         except Exception as error:
             _LOG.exception("merge of %s failed, attempt %d", claim.tile, claim.attempts)
             if claim.attempts == self._config.max_attempts:
@@ -47,40 +48,47 @@ class Worker:
             self._store.postpone(claim, self._config.retry_s * claim.attempts)
             return None
 
+    def _publication(self, work: TileWork) -> Publication:
+        """Merge all reports since the epoch into the epoch's tile; the tile is None where the head has that content."""
+        epoch = Gaussians.empty() if work.epoch is None else tile_from(work.epoch).gaussians
+        reports = [report for row in work.reports if (report := self._report(row)) is not None]
+        statements = statements_of(epoch, reports, self._bases(work), self._config.merge.mode)
+        merged = merge_tile(epoch, statements, self._config.merge)
+        tile = Tile(work.claim.tile, work.base_version + 1, merged.gaussians)
+        is_new = tile.sha != work.head.sha if work.head else len(merged.gaussians) > 0
+        return Publication(
+            claim=work.claim,
+            base_version=work.base_version,
+            tile=tile if is_new else None,
+            report_ids=_ids(work),
+            voxel_reports=merged.provenance,
+        )
+
+    def _report(self, row: ReportRow) -> Report | None:
+        """What a stored report says; nothing when it can no longer be read (its vehicle has long had its ack)."""
+        try:
+            (change,) = ChangeReport.decode(row.body).tiles
+        except SchemaError as error:
+            reason = f"report {row.report_id} on tile {row.tile} cannot be read any more and is left out: {error}"
+            _LOG.error("%s", reason)
+            self._store.quarantine(row.body, reason, source="merge")
+            return None
+        return Report(row.report_id, change)
+
     def _bases(self, work: TileWork) -> dict[bytes, Gaussians]:
         """The versions that the reports refer to, by hash; those that the store has lost are missing."""
-        versions = {row.base_sha: self._store.by_sha(row.layer, row.tile, row.base_sha) for row in work.reports}
+        shas = {row.base_sha for row in work.reports if row.base_sha}
+        versions = {sha: self._store.by_sha(work.claim.layer, work.claim.tile, sha) for sha in sorted(shas)}
         return {sha: tile_from(stored).gaussians for sha, stored in versions.items() if stored is not None}
 
     def _set_aside(self, work: TileWork, reason: str) -> Publication:
         """Leave the tile as it is and consume its reports, which stay in the store; say so in the quarantine."""
-        names = "\n".join(row.report_id for row in work.reports)
         reason = f"tile {work.claim.tile} set aside after {work.claim.attempts} attempts to merge it: {reason}"
         _LOG.error("%s", reason)
-        self._store.quarantine(f"{work.claim.layer} {work.claim.tile}\n{names}\n".encode(), reason, source="merge")
-        return Publication(work.claim, work.base_version, None, report_ids=tuple(row.report_id for row in work.reports))
+        body = "\n".join([f"{work.claim.layer} {work.claim.tile}", *_ids(work)])
+        self._store.quarantine(body.encode(), reason, source="merge")
+        return Publication(work.claim, work.base_version, None, report_ids=_ids(work))
 
 
-def publication_of(work: TileWork, bases: dict[bytes, Gaussians], config: ShardConfig) -> Publication:
-    """Merge all reports since the epoch into the epoch's tile; the tile is None where the head has that content."""
-    epoch = _gaussians(work.epoch)
-    statements = statements_of(epoch, map(_report, work.reports), bases, config.merge.mode)
-    merged = merge_tile(epoch, statements, config.merge)
-    tile = Tile(work.claim.tile, work.base_version + 1, merged.gaussians)
-    is_new = tile.sha != work.head.sha if work.head else len(merged.gaussians) > 0
-    return Publication(
-        claim=work.claim,
-        base_version=work.base_version,
-        tile=tile if is_new else None,
-        report_ids=statements.report_ids,
-        voxel_reports=merged.provenance,
-    )
-
-
-def _gaussians(stored: StoredTile | None) -> Gaussians:
-    return Gaussians.empty() if stored is None else tile_from(stored).gaussians
-
-
-def _report(row: ReportRow) -> Report:
-    (change,) = ChangeReport.decode(row.body).tiles
-    return Report(row.report_id, change)
+def _ids(work: TileWork) -> tuple[str, ...]:
+    return tuple(row.report_id for row in work.reports)

@@ -1,0 +1,123 @@
+"""Two real shard processes, one real router: one ack, fail-over, nothing lost, nothing twice."""
+
+import itertools
+import signal
+
+import pytest
+from merger_processes import Cloud, all_acks, in_threads, raw_session, wait_for
+from merger_world import BALL, GROUND, NEIGHBOUR, POLE, TILE, WALL, change_of, gaussians_of, report_of, tile_of_states
+
+from cloud_merger.config import ShardConfig
+from cloud_merger.ownership import owner_of
+from cloud_merger.work import Worker
+from gnd_map.tile_id import TileId
+from schemas.changes import split
+from tile_store.sqlite_store import SqliteStore
+from tile_store.values import ReportRow, StoreConfig
+
+SHARDS = ("left", "right")
+STATES = {0: GROUND, 1: WALL}
+BASE = gaussians_of(STATES)
+# The same place of eight districts in a row, and a second tile in each: both shards own some.
+FIRST = [TileId((TILE.morton & ~1023) + k * 1024 + 5) for k in range(8)]
+TILES = [*FIRST, *(TileId(tile.morton + 1) for tile in FIRST)]
+
+
+@pytest.fixture
+def cloud(tmp_path, free_port):
+    cloud = Cloud(tmp_path, free_port)
+    cloud.open()
+    cloud.store.put_tiles([tile_of_states(STATES, tile) for tile in TILES])
+    yield cloud
+    cloud.close()
+
+
+def report_number(n):
+    """Reports over one or two tiles of a district that agree or disagree about two voxels."""
+    first = FIRST[n % len(FIRST)]
+    tiles = [first, TileId(first.morton + 1)][: 1 + n % 2]
+    changed = {2: (POLE, POLE, BALL)[n % 3], 1: (WALL, None)[n % 5 == 0]}
+    return report_of(n, *(change_of(BASE, [0, 1, 2], changed, tile=tile) for tile in tiles))
+
+
+def fault_free(path, reports):
+    """Head hashes when one worker merges the reports one by one, in order."""
+    with SqliteStore(path, StoreConfig(merge_delay_s=0.0)) as store:
+        store.put_tiles([tile_of_states(STATES, tile) for tile in TILES])
+        worker = Worker(store, ShardConfig(store_path=path))
+        for report in reports:
+            bodies = split(report)
+            store.put_reports(
+                [ReportRow(report.report_id, "ndt", tile, report.vehicle, 0, body) for tile, body in bodies]
+            )
+            while claims := store.claim("one", 16, 30.0):
+                store.publish(worker.merge(claims))
+        return {head.tile: head.sha for head in store.heads()}
+
+
+def test_the_test_gives_both_shards_districts():
+    assert {owner_of(tile.district, SHARDS) for tile in TILES} == set(SHARDS)
+    assert TILE.district == NEIGHBOUR.district
+
+
+@pytest.mark.slow
+def test_every_report_has_one_ack_and_every_version_one_notice(cloud):
+    cloud.start(*SHARDS)
+    with raw_session(cloud.endpoint) as session:
+        for n in range(16):
+            assert [ack.status for ack in all_acks(session, report_number(n))] == ["stored"]
+            assert [ack.status for ack in all_acks(session, report_number(n))] == ["duplicate"]
+    wait_for("all is merged and announced", cloud.is_settled)
+    wait_for("the watcher has heard of all", lambda: cloud.versions() == cloud.announced())
+    assert len(cloud.updates) == len(cloud.versions()) > 0
+    assert cloud.store.counts().reports == 16
+    for name in SHARDS:
+        cloud.signal(name, signal.SIGTERM)
+        assert cloud.shards[name].wait(20) == 0, cloud.log(name)
+        assert "Traceback" not in cloud.log(name)
+
+
+@pytest.mark.slow
+def test_a_shard_killed_while_reports_flow_loses_nothing_and_applies_nothing_twice(cloud, tmp_path):
+    cloud.start(*SHARDS)
+    reports = [report_number(n) for n in range(96)]
+    sent = itertools.count()
+    acks = []
+
+    def agent(k):
+        for report in reports[k::3]:
+            if next(sent) == len(reports) // 3:
+                cloud.signal("left", signal.SIGKILL)
+            acks.append(cloud.send(report))
+
+    in_threads(3, agent)
+    assert {ack.report_id for ack in acks} == {report.report_id for report in reports}
+    assert {ack.status for ack in acks} <= {"stored", "duplicate"}
+    assert cloud.shards["left"].wait(5) == -signal.SIGKILL
+    wait_for("all is merged and announced", cloud.is_settled)
+    assert cloud.store.counts().reports == len(reports)
+    assert cloud.store.counts().report_rows == sum(len(report.tiles) for report in reports)
+    assert {head.tile: head.sha for head in cloud.store.heads()} == fault_free(tmp_path / "plain.sqlite", reports)
+    wait_for("the watcher has heard of all", lambda: cloud.versions() <= cloud.announced())
+
+    cloud.start("left")  # and when it comes back, it answers again, alone
+    wait_for("one ack each", lambda: one_ack_each(cloud, range(len(reports), len(reports) + 8)))
+
+
+def one_ack_each(cloud, numbers):
+    with raw_session(cloud.endpoint) as session:
+        return all(len(all_acks(session, report_number(n))) == 1 for n in numbers)
+
+
+@pytest.mark.slow
+def test_a_shard_that_hangs_is_replaced_after_its_lease_and_may_come_back(cloud):
+    cloud.start(*SHARDS)
+    cloud.signal("left", signal.SIGSTOP)
+    for n in range(8):
+        assert cloud.send(report_number(n)).status in ("stored", "duplicate")
+    assert cloud.living == {"right"}
+    cloud.signal("left", signal.SIGCONT)
+    wait_for("both live again", lambda: cloud.living == set(SHARDS))
+    wait_for("one ack each", lambda: one_ack_each(cloud, range(8, 16)))
+    wait_for("all is merged and announced", cloud.is_settled)
+    assert cloud.store.counts().reports == 16
