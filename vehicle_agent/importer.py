@@ -1,0 +1,158 @@
+"""Recordings into drives: read a folder, find the track of all scans, put it on the Earth, write the chosen scans.
+
+The track is found over *all* scans before any is left out, so that the halves of a recording share one frame: what one
+half maps, the other half can drive on.
+"""
+
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from gnd_map.motion import Trajectory
+from gnd_map.se3 import T_inverse, exp_so3, log_so3
+from schemas.drive import DriveHeader, DriveItem, GnssFix, MotionSample, ReferencePose, Scan
+from schemas.drive_mcap import DriveWriter
+from vehicle_agent.errors import ImportDriveError
+from vehicle_agent.importers.kitti import open_kitti
+from vehicle_agent.importers.lidar_odometry import Progress, lidar_odometry, reference_ns
+from vehicle_agent.importers.pcd import open_pcd
+from vehicle_agent.importers.radiate import open_radiate
+from vehicle_agent.importers.recording import GNSS_SIGMA_M, Anchor, Recording
+from vehicle_agent.importers.splits import chosen_scans
+
+F64 = NDArray[np.float64]
+
+FORMATS: Final[dict[str, Callable[[Path, Anchor | None], Recording]]] = {
+    "kitti": open_kitti,
+    "radiate": open_radiate,
+    "pcd": open_pcd,
+}
+AROUND_NS = 300_000_000  # motion and fixes kept before the first and after the last chosen scan
+
+
+def no_progress(_step: str, _done: int, _total: int) -> None:
+    """For callers that show nothing."""
+
+
+def import_recording(
+    kind: str,
+    folder: Path,
+    out: Path,
+    *,
+    scans: str = "all",
+    anchor: Anchor | None = None,
+    vehicle: str = "recorded",
+    progress: Progress = no_progress,
+) -> int:
+    """Write the drive `out` (MCAP) from a recording; give the number of scans written.
+
+    Args:
+        kind: "kitti", "radiate" or "pcd".
+        folder: of the recording; see the readers for what it must hold.
+        out: file to write.
+        scans: which scans; see `chosen_scans`.
+        anchor: place on the Earth; see the readers for what it means and whether it may be left out.
+        vehicle: pseudonym written into the drive.
+        progress: called with a step's name, how much is done, and of how much.
+
+    Raises:
+        ImportDriveError: the folder is missing, holds no scans of that format, or is damaged.
+        DriveError: the drive cannot be written.
+    """
+    if kind not in FORMATS:
+        raise ImportDriveError(f"format {kind!r} is not known; known are {', '.join(FORMATS)}")
+    recording = FORMATS[kind](folder, anchor)
+    chosen = chosen_scans(scans, len(recording))
+    track = map_track(recording, progress)
+    header = _header(recording, f"{recording.name}-{scans}".replace(":", "-"), vehicle)
+    with DriveWriter(out, header) as writer:
+        done = 0
+        for item in _items(recording, track, chosen):
+            writer.add(item)
+            done += isinstance(item, Scan)
+            progress("writing scans", done, len(chosen))
+    return len(chosen)
+
+
+def _header(recording: Recording, drive_id: str, vehicle: str) -> DriveHeader:
+    return DriveHeader(
+        drive_id=drive_id,
+        vehicle=vehicle,
+        sensor_model=recording.sensor_model,
+        anchor=recording.anchor.frame,
+        T_vehicle_lidar=recording.T_vehicle_lidar,
+        source=recording.source,
+    )
+
+
+def map_track(recording: Recording, progress: Progress = no_progress) -> Trajectory:
+    """T_map_vehicle of every scan: the recording's own track, else LiDAR odometry laid over the fixes."""
+    if recording.track is not None:
+        return recording.track
+    track = lidar_odometry(recording, progress)
+    T_map_first = _T_map_first(recording, track)
+    return Trajectory(track.t_ns, T_map_first @ track.T_dst_vehicle)
+
+
+def _T_map_first(recording: Recording, track: Trajectory) -> F64:
+    """Heading and position that lay the track over the fixes, least squares; the identity without fixes."""
+    t_ns = np.array([fix.t_ns for fix in recording.gnss], np.int64)
+    within = (t_ns >= track.t_ns[0]) & (t_ns <= track.t_ns[-1])
+    if within.sum() < 2:
+        return np.eye(4)
+    fixes = [fix for fix, inside in zip(recording.gnss, within, strict=True) if inside]
+    p_map = recording.anchor.frame.enu_from_geodetic(*np.array([(f.lat_rad, f.lon_rad, f.height_m) for f in fixes]).T)
+    return fit_heading_and_position(track.at(t_ns[within])[:, :3, 3], p_map)
+
+
+def fit_heading_and_position(p_src_m: F64, p_dst_m: F64) -> F64:
+    """(4, 4) T_dst_src, turned about the vertical only, that brings points (N, 3) closest to points (N, 3)."""
+    middle_src, middle_dst = p_src_m.mean(axis=0), p_dst_m.mean(axis=0)
+    a, b = (p_src_m - middle_src)[:, :2], (p_dst_m - middle_dst)[:, :2]
+    yaw = np.arctan2((a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0]).sum(), (a * b).sum())
+    T = np.eye(4)
+    T[:3, :3] = exp_so3([0.0, 0.0, yaw])
+    T[:3, 3] = middle_dst - T[:3, :3] @ middle_src
+    return T
+
+
+def _items(recording: Recording, track: Trajectory, chosen: NDArray[np.int64]) -> Iterator[DriveItem]:
+    """Everything of the drive, the small things of its span first."""
+    first, last = int(recording.t_ns[chosen[0]]) - AROUND_NS, int(recording.t_ns[chosen[-1]]) + AROUND_NS
+    small: list[MotionSample | GnssFix | ReferencePose] = [*(recording.motion or motion_of(track))]
+    small += recording.gnss or fixes_of(recording, track)
+    small += [ReferencePose(int(t), T) for t, T in zip(track.t_ns, track.T_dst_vehicle, strict=True)]
+    within = [item for item in small if first <= item.t_ns <= last]
+    items = sorted(within, key=lambda item: item.t_ns)
+    for number in chosen:
+        scan = recording.read(int(number))
+        while items and items[0].t_ns <= scan.t_ns:
+            yield items.pop(0)
+        yield scan
+    yield from items
+
+
+def motion_of(track: Trajectory) -> list[MotionSample]:
+    """Speed and yaw rate between the poses of a track, one sample in the middle of each step and one at either end."""
+    step = T_inverse(track.T_dst_vehicle[:-1]) @ track.T_dst_vehicle[1:]
+    dt_s = np.diff(track.t_ns) * 1e-9
+    speed, yaw_rate = step[:, 0, 3] / dt_s, log_so3(step[:, :3, :3])[:, 2] / dt_s
+    middle = track.t_ns[:-1] + np.diff(track.t_ns) // 2
+    t = np.concatenate([track.t_ns[:1], middle, track.t_ns[-1:]])
+    k = np.clip(np.arange(len(t)) - 1, 0, len(speed) - 1)
+    return [MotionSample(int(t), float(v), float(w)) for t, v, w in zip(t, speed[k], yaw_rate[k], strict=True)]
+
+
+def fixes_of(recording: Recording, track: Trajectory) -> list[GnssFix]:
+    """The track's positions as fixes of `GNSS_SIGMA_M`, for recordings without any."""
+    lat, lon, height = recording.anchor.frame.geodetic_from_enu(track.T_dst_vehicle[:, :3, 3])
+    return [
+        GnssFix(int(t), float(a), float(o), float(h), GNSS_SIGMA_M)
+        for t, a, o, h in zip(track.t_ns, lat, lon, height, strict=True)
+    ]
+
+
+__all__ = ["FORMATS", "Anchor", "Progress", "fit_heading_and_position", "import_recording", "map_track", "reference_ns"]

@@ -1,0 +1,57 @@
+"""`gnd import`: a recording into a drive."""
+
+from pathlib import Path
+
+import click
+from rich.console import Console
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TaskID, TextColumn, TimeElapsedColumn
+
+from vehicle_agent.errors import ImportDriveError
+from vehicle_agent.importer import FORMATS, import_recording
+from vehicle_agent.importers.recording import Anchor
+from vehicle_agent.importers.splits import CHOICES
+
+
+@click.command(name="import")
+@click.argument("kind", metavar="FORMAT", type=click.Choice(list(FORMATS)))
+@click.argument("folder", type=click.Path(path_type=Path))
+@click.option("-o", "--out", required=True, type=click.Path(path_type=Path, dir_okay=False), help="Drive to write.")
+@click.option("--scans", default="all", show_default=True, help=f"Which scans: {CHOICES}.")
+@click.option("--anchor", help="Place on the Earth: LAT,LON,HEIGHT in degrees and metres above the ellipsoid.")
+@click.option("--vehicle", default="recorded", show_default=True, help="Pseudonym written into the drive.")
+def import_drives(kind: str, folder: Path, out: Path, scans: str, anchor: str | None, vehicle: str) -> None:
+    """Turn a recording into a drive (MCAP): FORMAT is kitti, radiate or pcd, FOLDER holds the recording."""
+    with _bars() as bars:
+        n = import_recording(
+            kind, folder, out, scans=scans, anchor=_anchor(anchor), vehicle=vehicle, progress=_Shown(bars)
+        )
+    click.echo(f"{out}: {n} scans")
+
+
+class _Shown:
+    """One bar a step."""
+
+    def __init__(self, bars: Progress) -> None:
+        self._bars = bars
+        self._tasks: dict[str, TaskID] = {}
+
+    def __call__(self, step: str, done: int, total: int) -> None:
+        if step not in self._tasks:
+            self._tasks[step] = self._bars.add_task(step, total=total)
+        self._bars.update(self._tasks[step], completed=done, total=total)
+
+
+def _bars() -> Progress:
+    columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn())
+    return Progress(*columns, console=Console(stderr=True))
+
+
+def _anchor(text: str | None) -> Anchor | None:
+    """LAT,LON,HEIGHT; ImportDriveError when it is something else."""
+    if text is None:
+        return None
+    try:
+        lat, lon, height = (float(part) for part in text.split(","))
+    except ValueError as error:
+        raise ImportDriveError(f"--anchor {text!r}: expected LAT,LON,HEIGHT, such as 37.56,127.03,30") from error
+    return Anchor(lat, lon, height)

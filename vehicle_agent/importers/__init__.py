@@ -1,0 +1,1 @@
+"""Readers of recordings (KITTI, RADIATE, PCD folders) and what turns them into drives."""

@@ -1,0 +1,115 @@
+"""KITTI: folders of HDL-64E scans (.bin or .bin.xz), as in the odometry benchmark or the raw recordings.
+
+KITTI's scans are already freed of motion distortion, so all offsets are zero. The ground truth of the benchmark drifts
+against the LiDAR (a metre over the first 13 m of sequence 00), so it gives the GNSS fixes only; the reference track is
+LiDAR odometry. The benchmark does not tell the place: unless told otherwise it is a nominal one in Karlsruhe.
+"""
+
+import lzma
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from gnd_map.se3 import T_inverse
+from schemas.drive import GnssFix, Scan
+from vehicle_agent.errors import ImportDriveError
+from vehicle_agent.importers.recording import GNSS_SIGMA_M, Anchor, Recording, check_folder, files_of, mount
+
+F64 = NDArray[np.float64]
+
+KARLSRUHE = Anchor(49.0, 8.4, 160.0)  # nominal: 49° N, about the ellipsoidal height of the city
+LIDAR_HEIGHT_M = 1.73  # KITTI's sensor setup
+PERIOD_NS = 103_600_000  # where no times are given: the LiDAR turned at 9.65 Hz
+START_NS = 1_317_000_000_000_000_000  # times in the files count from 0: put them in autumn 2011
+SCAN_FOLDERS = ("velodyne", "velodyne_xz", "velodyne_points/data", "velodyne_points_xz", "data", ".")
+RECORD_BYTES = 16
+
+# Velodyne to camera 0 of 2011_10_03 (sequences 00-02), used where the folder has no calib.txt.
+T_CAMERA_LIDAR_2011_10_03 = np.array(
+    [
+        [4.276802385584e-04, -9.999672484946e-01, -8.084491683471e-03, -1.198459927713e-02],
+        [-7.210626507497e-03, 8.081198471645e-03, -9.999413164504e-01, -5.403984729748e-02],
+        [9.999738645903e-01, 4.859485810390e-04, -7.206933692422e-03, -2.921968648686e-01],
+        [0.0, 0.0, 0.0, 1.0],
+    ]
+)
+
+
+def open_kitti(folder: Path, anchor: Anchor | None) -> Recording:
+    """A KITTI folder; `anchor`: where its first pose is put, heading east.
+
+    Raises:
+        ImportDriveError: no scans, or a file that is not what its name says.
+    """
+    check_folder(folder)
+    files = _scan_files(folder)
+    t_ns = _times(folder, len(files))
+    T_vehicle_lidar = mount(0.0, LIDAR_HEIGHT_M)
+    place = anchor or KARLSRUHE
+    return Recording(
+        name=folder.name,
+        sensor_model="HDL-64E",
+        source="KITTI (Geiger et al.), CC BY-NC-SA 3.0; nominal place, track by LiDAR odometry",
+        T_vehicle_lidar=T_vehicle_lidar,
+        t_ns=t_ns,
+        read=lambda i: _scan(files[i], int(t_ns[i])),
+        anchor=place,
+        gnss=_fixes(folder, t_ns, T_vehicle_lidar, place),
+    )
+
+
+def _scan_files(folder: Path) -> list[Path]:
+    for name in SCAN_FOLDERS:
+        files = files_of(folder / name, "*.bin", "*.bin.xz")
+        if files:
+            return files
+    raise ImportDriveError(f"{folder}: no .bin or .bin.xz scans there or in {', '.join(SCAN_FOLDERS[:-1])}")
+
+
+def _scan(path: Path, t_ns: int) -> Scan:
+    """float32 x, y, z, reflectance of every point, in the file's order."""
+    data = lzma.decompress(path.read_bytes()) if path.suffix == ".xz" else path.read_bytes()
+    if not data or len(data) % RECORD_BYTES:
+        raise ImportDriveError(f"{path}: {len(data)} bytes, which is no positive multiple of {RECORD_BYTES}")
+    points = np.frombuffer(data, np.float32).reshape(-1, 4)[:, :3]
+    return Scan(t_ns, np.ascontiguousarray(points), np.zeros(len(points), np.uint32))
+
+
+def _times(folder: Path, n: int) -> NDArray[np.int64]:
+    files = files_of(folder, "times.txt", "*_times.txt")
+    if not files:
+        return START_NS + PERIOD_NS * np.arange(n, dtype=np.int64)
+    seconds = np.loadtxt(files[0], ndmin=1)
+    if len(seconds) < n:
+        raise ImportDriveError(f"{files[0]}: {len(seconds)} times for {n} scans")
+    return START_NS + np.round(seconds[:n] * 1e9).astype(np.int64)
+
+
+def _fixes(folder: Path, t_ns: NDArray[np.int64], T_vehicle_lidar: F64, anchor: Anchor) -> tuple[GnssFix, ...]:
+    """Positions of the ground truth, where there is one."""
+    files = files_of(folder, "poses.txt", "*_gt.txt")
+    if not files:
+        return ()
+    rows = np.loadtxt(files[0], ndmin=2)
+    if rows.shape[1] != 12 or len(rows) < len(t_ns):
+        raise ImportDriveError(f"{files[0]}: {rows.shape} numbers for {len(t_ns)} scans; 12 a scan are needed")
+    T_camera = np.tile(np.eye(4), (len(t_ns), 1, 1))
+    T_camera[:, :3] = rows[: len(t_ns)].reshape(-1, 3, 4)
+    T_camera_vehicle = _T_camera_lidar(folder) @ T_inverse(T_vehicle_lidar)
+    p_map = (T_inverse(T_camera_vehicle) @ T_inverse(T_camera[0]) @ T_camera @ T_camera_vehicle)[:, :3, 3]
+    lat, lon, height = anchor.frame.geodetic_from_enu(p_map)
+    return tuple(
+        GnssFix(int(t), float(a), float(o), float(h), GNSS_SIGMA_M)
+        for t, a, o, h in zip(t_ns, lat, lon, height, strict=True)
+    )
+
+
+def _T_camera_lidar(folder: Path) -> F64:
+    path = folder / "calib.txt"
+    if not path.exists():
+        return T_CAMERA_LIDAR_2011_10_03
+    for line in path.read_text().splitlines():
+        if line.startswith("Tr:"):
+            return np.vstack([np.array(line.split()[1:], np.float64).reshape(3, 4), [0.0, 0.0, 0.0, 1.0]])
+    raise ImportDriveError(f"{path}: no line 'Tr:' with the pose of the LiDAR before the camera")

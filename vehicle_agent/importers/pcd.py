@@ -1,0 +1,108 @@
+"""A folder of PCD files, with or without poses.
+
+Poses come from `poses.txt` (in the folder or the one above), one line a scan in the order of the files' numbers:
+`number t x y z qx qy qz qw`, `t x y z qx qy qz qw` (TUM) or twelve numbers of a 3 x 4 matrix (KITTI; 10 Hz then). They
+are poses of the LiDAR, x forward, in axes east, north, up; the place of the first one must be given. Without poses
+LiDAR odometry tells the track, heading east. Points are taken as freed of motion distortion.
+"""
+
+import re
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from gnd_map.motion import Trajectory
+from gnd_map.se3 import R_from_quaternion_xyzw, T_from_R_t
+from schemas.drive import Scan
+from vehicle_agent.errors import ImportDriveError
+from vehicle_agent.importers.pcd_format import read_pcd
+from vehicle_agent.importers.recording import Anchor, Recording, check_folder, files_of
+
+F64 = NDArray[np.float64]
+I64 = NDArray[np.int64]
+
+PERIOD_NS = 100_000_000
+START_NS = 1_000_000_000_000_000_000  # where no times are given
+SCAN_FOLDERS = (".", "pcds", "pcd", "scans", "velodyne")
+
+
+def open_pcd(folder: Path, anchor: Anchor | None) -> Recording:
+    """A folder of PCD files; `anchor` says where on the Earth the first pose lies.
+
+    Raises:
+        ImportDriveError: no scans, no anchor, poses that do not fit the scans.
+    """
+    check_folder(folder)
+    files = _scan_files(folder)
+    if anchor is None:
+        raise ImportDriveError(f"{folder}: PCD files do not say where they were taken; give --anchor LAT,LON,HEIGHT")
+    t_ns, track = _track(files[0].parent, len(files))
+    return Recording(
+        name=folder.name,
+        sensor_model="unknown",
+        source=f"PCD files of {folder.name}; motion from the track",
+        T_vehicle_lidar=np.eye(4),
+        t_ns=t_ns,
+        read=lambda i: _scan(files[i], int(t_ns[i])),
+        anchor=anchor,
+        track=track,
+    )
+
+
+def _scan_files(folder: Path) -> list[Path]:
+    for name in SCAN_FOLDERS:
+        files = files_of(folder / name, "*.pcd")
+        if files:
+            return sorted(files, key=_number)
+    raise ImportDriveError(f"{folder}: no .pcd files there or in {', '.join(SCAN_FOLDERS[1:])}")
+
+
+def _number(path: Path) -> tuple[int, str]:
+    """2.pcd before 10.pcd."""
+    digits = re.findall(r"\d+", path.stem)
+    return int(digits[-1]) if digits else -1, path.name
+
+
+def _scan(path: Path, t_ns: int) -> Scan:
+    points = read_pcd(path)
+    missing = {"x", "y", "z"} - set(points.dtype.names or ())
+    if missing:
+        raise ImportDriveError(f"{path}: no field {', '.join(sorted(missing))}")
+    xyz = np.stack([points["x"], points["y"], points["z"]], axis=1).astype(np.float32)
+    xyz = xyz[np.isfinite(xyz).all(axis=1)]
+    if not len(xyz):
+        raise ImportDriveError(f"{path}: no point with finite coordinates")
+    return Scan(t_ns, xyz, np.zeros(len(xyz), np.uint32))
+
+
+def _track(folder: Path, n: int) -> tuple[I64, Trajectory | None]:
+    """Scan times and poses, the first pose's position taken as origin."""
+    files = files_of(folder, "poses.txt") or files_of(folder.parent, "poses.txt")
+    if not files:
+        return START_NS + PERIOD_NS * np.arange(n, dtype=np.int64), None
+    rows = _rows(files[0])
+    if len(rows) != n or rows.shape[1] not in (8, 9, 12):
+        raise ImportDriveError(
+            f"{files[0]}: {len(rows)} lines of {rows.shape[1]} numbers for {n} scans; one line a scan of 8 (t,"
+            " position, quaternion), 9 (number first) or 12 (matrix) is needed"
+        )
+    t_ns, T = _poses(rows)
+    T[:, :3, 3] -= T[0, :3, 3]
+    return t_ns, Trajectory(t_ns, T)
+
+
+def _rows(path: Path) -> F64:
+    try:
+        return np.loadtxt(path, ndmin=2)
+    except ValueError as error:
+        raise ImportDriveError(f"{path}: {error}") from error
+
+
+def _poses(rows: F64) -> tuple[I64, F64]:
+    if rows.shape[1] == 12:
+        T = np.tile(np.eye(4), (len(rows), 1, 1))
+        T[:, :3] = rows.reshape(-1, 3, 4)
+        return START_NS + PERIOD_NS * np.arange(len(rows), dtype=np.int64), T
+    t_s, position, quaternion = rows[:, -8], rows[:, -7:-4], rows[:, -4:]
+    return np.round(t_s * 1e9).astype(np.int64), T_from_R_t(R_from_quaternion_xyzw(quaternion), position)
