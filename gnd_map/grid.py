@@ -192,13 +192,15 @@ class GridFrame:
         """The grid of `tiles` in the map frame `frame`.
 
         Raises:
-            TileError: no tiles, or tiles of more than one (nx, ny): split them with `zones`.
+            TileError: no tiles, tiles of more than one (nx, ny): split them with `zones`, or on both hemispheres.
         """
         groups = zones(set(tiles))
         if len(groups) != 1:
             found = ", ".join(f"{nx} x {ny} in {len(group)} tiles" for (nx, ny), group in groups.items())
             raise TileError(f"a grid frame needs tiles of one kind, got {found or 'no tiles'}; group them with zones()")
         ((nx, ny), group) = next(iter(groups.items()))
+        first, last = _band(group[0].lat_index)
+        _check_range("latitude index of the tiles", np.array([tile.lat_index for tile in group]), first, last)
         return cls(frame, nx, ny, group)
 
     @property

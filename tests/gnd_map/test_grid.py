@@ -232,6 +232,13 @@ def test_tiles_of_two_kinds_do_not_share_a_frame() -> None:
         GridFrame.around(LocalFrame.of_tile(WANGSIMNI), [])
 
 
+def test_a_frame_does_not_reach_around_the_equator() -> None:
+    opposite = TileId.from_indices(WANGSIMNI.lon_index, LAT_TILES - 1 - WANGSIMNI.lat_index)
+    assert VoxelGrid.of(opposite).nx == VoxelGrid.of(WANGSIMNI).nx
+    with pytest.raises(TileError, match="latitude index of the tiles"):
+        GridFrame.around(LocalFrame.of_tile(WANGSIMNI), [WANGSIMNI, opposite])
+
+
 def test_zones_group_tiles_by_their_grid() -> None:
     near = covering_circle(*WANGSIMNI.centre_rad, 100.0)
     assert zones([*near, KARLSRUHE]) == {(26, 39): (KARLSRUHE,), (31, 39): near}
