@@ -94,6 +94,11 @@ class Outbox:
         n = {str(state): int(count) for state, count in rows}
         return OutboxCounts(n.get("pending", 0), n.get("stored", 0) + n.get("duplicate", 0), n.get("quarantined", 0))
 
+    def states(self) -> dict[str, str]:
+        """The state of every report by its id: pending, stored, duplicate or quarantined."""
+        rows = self._db.run("SELECT report_id, state FROM report ORDER BY report_id")
+        return {str(report_id): str(state) for report_id, state in rows}
+
     def refused(self) -> list[tuple[str, str]]:
         """(report id, reason) of the quarantined reports."""
         rows = self._db.run("SELECT report_id, reason FROM report WHERE state = 'quarantined' ORDER BY report_id")
