@@ -16,7 +16,6 @@ from tile_store.values import Publication, TileWork
 LEASE_S = 10.0
 TILES = st.sampled_from([TILE, EAST])
 OWNERS = st.sampled_from(["m1", "m2"])
-NUMBERS = st.integers(0, 9)
 
 
 @dataclass
@@ -68,6 +67,13 @@ class StoreMachine(RuleBasedStateMachine):
         self.held: list[Held] = []
 
     def teardown(self) -> None:
+        try:
+            self.merge_the_rest()
+        finally:
+            self.store.close()
+            self.folder.cleanup()
+
+    def merge_the_rest(self) -> None:
         """Whatever has happened: when all is merged, the map is a function of the epochs and the reports that count."""
         self.clock.advance(LEASE_S)
         for claim in self.store.claim("last", 10, LEASE_S):
@@ -79,21 +85,19 @@ class StoreMachine(RuleBasedStateMachine):
             head = self.store.get("ndt", tile)
             assert (head.sha if head else None) == (tile_of_voxels(tile, *merged(model)).sha if head else None)
             assert head is not None or not model.merged_in
-        self.store.close()
-        self.folder.cleanup()
 
-    @rule(tile=TILES, number=NUMBERS)
-    def a_report_arrives(self, tile: TileId, number: int) -> None:
+    @rule(tile=TILES, numbers=st.sets(st.integers(0, 9), min_size=1, max_size=3))
+    def reports_arrive(self, tile: TileId, numbers: set[int]) -> None:
         model = self.tiles[tile]
-        expected = "duplicate" if number in model.merged_in else "stored"
-        assert self.store.put_reports([report(number, tile)]) == [expected]
-        if expected == "stored":
+        new = sorted(numbers - model.merged_in.keys())
+        statuses = self.store.put_reports([report(number, tile) for number in sorted(numbers)])
+        assert statuses == ["stored" if number in new else "duplicate" for number in sorted(numbers)]
+        for number in new:
             model.merged_in[number] = None
             model.arrivals += 1
             model.is_dirty = True
 
-    @rule(owner=OWNERS)
-    def a_merger_claims_and_loads(self, owner: str) -> None:
+    def claim_and_load(self, owner: str) -> None:
         free = {
             tile
             for tile, model in self.tiles.items()
@@ -109,6 +113,17 @@ class StoreMachine(RuleBasedStateMachine):
             assert [row.report_id for row in work.reports] == [report_id(n) for n in model.counting()]
             assert work.base_version == model.version
             self.held.append(Held(work, model.arrivals))
+
+    @precondition(lambda self: any(model.is_dirty for model in self.tiles.values()))
+    @rule(owner=OWNERS)
+    def a_merger_claims_and_loads(self, owner: str) -> None:
+        self.claim_and_load(owner)
+
+    @precondition(lambda self: self.held)
+    @rule(owner=OWNERS)
+    def leases_run_out_and_another_claims(self, owner: str) -> None:
+        self.clock.advance(LEASE_S)
+        self.claim_and_load(owner)
 
     @precondition(lambda self: self.held)
     @rule(data=st.data())
@@ -169,10 +184,6 @@ class StoreMachine(RuleBasedStateMachine):
         model.epoch = model.version
         assert stored.version == model.version
 
-    @rule(seconds=st.sampled_from([1.0, LEASE_S]))
-    def time_passes(self, seconds: float) -> None:
-        self.clock.advance(seconds)
-
     @rule()
     def the_process_is_started_again(self) -> None:
         self.store.close()
@@ -200,5 +211,5 @@ class StoreMachine(RuleBasedStateMachine):
 
 TestStoreMachine = StoreMachine.TestCase
 TestStoreMachine.settings = settings(
-    max_examples=40, stateful_step_count=30, deadline=None, suppress_health_check=[HealthCheck.too_slow]
+    max_examples=100, stateful_step_count=50, deadline=None, suppress_health_check=[HealthCheck.too_slow]
 )
