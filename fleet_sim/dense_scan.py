@@ -1,0 +1,332 @@
+"""A dense, noise-free scan of both states of a world from its lanes: what there is to be known about it.
+
+Every metre of both lanes, an ideal scanner with the joint field of view of the fleet's LiDARs casts the same rays
+through `before` and `after`: some 1,500 hits a voxel, five times what a VLP-16 brings home from a drive, and evenly
+spread. Kept are, for each voxel of the GND grid: which of its 10 cm sub-cells (those of `gnd_map.accumulate`) were hit
+on what kind of surface, and how many rays passed through in either state.
+"""
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from math import radians, tau
+from typing import Final, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fleet_sim.errors import TruthError
+from fleet_sim.raycast import Scene
+from fleet_sim.world import STATES, State, World
+from gnd_map.accumulate import VoxelAccumulator
+from gnd_map.grid import GridFrame
+from gnd_map.jit import kernel
+from gnd_map.near_grid import grid_near
+from gnd_map.tile_id import covering_corridor
+
+FloatArray = NDArray[np.float64]
+
+BEFORE_KEPT: Final = 1
+"""Sub-cell hit before, on something that still stands after."""
+BEFORE_GONE: Final = 2
+"""Sub-cell hit before, on something that does not stand after."""
+AFTER_KEPT: Final = 4
+"""Sub-cell hit after, on something that stood before."""
+AFTER_COME: Final = 8
+"""Sub-cell hit after, on something that did not stand before."""
+KNOWN_BEFORE: Final = BEFORE_KEPT | BEFORE_GONE
+STANDS_AFTER: Final = BEFORE_KEPT | AFTER_KEPT | AFTER_COME
+"""What an ideal map holds after: all that was ever seen and still stands."""
+
+CELLS: Final = 10
+"""Sub-cells of a voxel along each axis."""
+_MAX_VOXELS: Final = 150_000
+_MARGIN_M: Final = 3.0
+_HEIGHT_M: Final = 24.0
+_GOLDEN: Final = 0.6180339887498949
+
+
+@dataclass(frozen=True, slots=True)
+class ScanPlan:
+    """Where the dense scan looks from, and how finely.
+
+    Attributes:
+        spacing_m: distance of the scanner's places along each lane.
+        end_margin_m: the first and last place are so far from the street's ends.
+        sensor_m: height over the road.
+        step_rad: angle between rays, both ways.
+        low_rad, high_rad: field of view: HDL-32E's lowest to VLP-16's highest beam.
+        range_m: reach of the rays.
+        pass_stride: every n-th ray is followed through the voxels that it passes.
+    """
+
+    spacing_m: float = 1.0
+    end_margin_m: float = 2.0
+    sensor_m: float = 1.9
+    step_rad: float = radians(0.5)
+    low_rad: float = radians(-31.0)
+    high_rad: float = radians(15.0)
+    range_m: float = 50.0
+    pass_stride: int = 7
+
+    def origins_street(self, world: World) -> FloatArray:
+        """Return the scanner's places, float64 (K, 3), street frame."""
+        reach = world.half_length_m - self.end_margin_m
+        x = np.arange(-reach, reach + 1e-9, self.spacing_m)
+        lanes = [np.stack([x, np.full_like(x, side * world.lane_offset_m)], axis=1) for side in (-1, 1)]
+        xy = np.concatenate(lanes)
+        return np.column_stack([xy, world.road_height_m(xy[:, 1]) + self.sensor_m])
+
+    def directions_street(self, index: int) -> FloatArray:
+        """Return unit ray directions, float64 (N, 3), of place `index`; its raster is shifted so as to fill gaps."""
+        shift = (index * _GOLDEN) % 1.0, (index * _GOLDEN**2) % 1.0
+        elevation = np.arange(self.low_rad, self.high_rad - self.step_rad, self.step_rad) + shift[0] * self.step_rad
+        azimuth = np.arange(0.0, tau, self.step_rad) + shift[1] * self.step_rad
+        flat, up = np.cos(elevation)[:, None], np.sin(elevation)[:, None]
+        parts = np.broadcast_arrays(flat * np.cos(azimuth), flat * np.sin(azimuth), up)
+        return np.stack(parts, axis=-1).reshape(-1, 3)
+
+
+class Window(NamedTuple):
+    """A box of voxels in grid coordinates: lowest voxel and size."""
+
+    gx: int
+    gy: int
+    gz: int
+    nx: int
+    ny: int
+    nz: int
+
+
+@dataclass(frozen=True, slots=True)
+class DenseScan:
+    """What the dense scan has seen, for the V voxels that a ray touched.
+
+    Attributes:
+        grid_frame: the grid of the world.
+        g: int32 (V, 3), grid coordinates, sorted by gx, gy, gz.
+        cells: uint8 (M, 1000), flags of the sub-cells of the M voxels with hits; sub-cell (cz * 10 + cy) * 10 + cx.
+        row: int32 (V,), row in `cells`, -1 for a voxel without hits.
+        passes: int32 (V, 2), followed rays that passed through in the states before and after.
+        unexplained: int32 (V, 3), sub-cells gone, come and revealed that have no neighbour (of 26) in the other state.
+        shell: int32 (V, 2), hit sub-cells that touch the voxel from outside, in the states before and after.
+        before: accumulator of all points of the state before.
+        after: accumulator of what stands after: its own points, and those of before on what was kept.
+    """
+
+    grid_frame: GridFrame
+    g: NDArray[np.int32]
+    cells: NDArray[np.uint8]
+    row: NDArray[np.int32]
+    passes: NDArray[np.int32]
+    unexplained: NDArray[np.int32]
+    shell: NDArray[np.int32]
+    before: VoxelAccumulator
+    after: VoxelAccumulator
+
+    def count(self, flags: int) -> NDArray[np.int32]:
+        """Return how many sub-cells of each voxel carry any of the flags, int32 (V,)."""
+        counts = np.append(((self.cells & flags) != 0).sum(axis=1), 0)
+        return np.asarray(counts[self.row], dtype=np.int32)
+
+
+def world_grid(world: World, half_width_m: float = 60.0) -> GridFrame:
+    """Return the voxel grid of a world's street and its surroundings."""
+    x = np.array([-world.half_length_m - half_width_m, world.half_length_m + half_width_m])
+    ends = world.map_of_street(np.stack([x, np.zeros(2), np.zeros(2)], axis=1))
+    lat, lon, _ = world.frame.geodetic_from_enu(ends)
+    return GridFrame.around(world.frame, covering_corridor(lat, lon, half_width_m))
+
+
+def dense_scan(world: World, plan: ScanPlan) -> DenseScan:
+    """Scan both states of a world.
+
+    Raises:
+        TruthError: more voxels with hits than there is room for.
+    """
+    grid = world_grid(world)
+    window = _window(world, plan, grid)
+    index = np.full(window.nx * window.ny * window.nz, -1, dtype=np.int32)
+    passes = np.zeros((2, len(index)), dtype=np.int32)
+    cells = np.zeros((_MAX_VOXELS, CELLS**3), dtype=np.uint8)
+    before, after = VoxelAccumulator(grid), VoxelAccumulator(grid)
+    used = 0
+    for shots in _shots(world, plan):
+        g_origin, g_ends = grid_near(grid, shots.origin[None, :])[0], grid_near(grid, shots.ends)
+        _pass(g_origin, g_ends[:: plan.pass_stride], window, passes[shots.state])
+        used = _mark(g_ends, shots.flags, window, index, cells, used)
+        if used < 0:
+            raise TruthError(f"more than {_MAX_VOXELS} voxels were hit: use a shorter street")
+        before.add(shots.ends[(shots.flags & KNOWN_BEFORE) != 0])
+        after.add(shots.ends[((shots.flags & STANDS_AFTER) != 0) & shots.fresh])
+    touched = np.flatnonzero((index >= 0) | (passes[0] > 0) | (passes[1] > 0))
+    row, seen = index[touched], cells[:used]
+    changes = np.append(_unexplained(window, index, seen, used), np.zeros((1, 3), np.int32), axis=0)[row]
+    shell = _shell(window, index, seen, touched)
+    g = (np.stack(np.unravel_index(touched, window[3:]), axis=1) + np.array(window[:3])).astype(np.int32)
+    return DenseScan(grid, g, seen, row, passes[:, touched].T.copy(), changes, shell, before, after)
+
+
+class _Shots(NamedTuple):
+    """Rays of one place in one state.
+
+    Index of the state, origin (3,) and ends (N, 3) in metres in the map frame, flags uint8 (N,), and bool (N,): false
+    for a ray before that ends at the same point after, and would be counted twice there.
+    """
+
+    state: int
+    origin: FloatArray
+    ends: FloatArray
+    flags: NDArray[np.uint8]
+    fresh: NDArray[np.bool_]
+
+
+def _shots(world: World, plan: ScanPlan) -> Iterator[_Shots]:
+    scenes = [Scene.build(world.shapes(state), world.A_street_map) for state in STATES]
+    flags = [_flags(world, state) for state in STATES]
+    origins = world.map_of_street(plan.origins_street(world))
+    for place, origin in enumerate(origins):
+        directions = world.map_of_street(plan.directions_street(place))
+        directions /= np.linalg.norm(directions, axis=1, keepdims=True)
+        casts = [scene.cast(origin, directions, plan.range_m) for scene in scenes]
+        for state, (ranges, hit) in enumerate(casts):
+            ends = origin + np.minimum(ranges, plan.range_m)[:, None] * directions
+            fresh = np.ones(len(ends), dtype=np.bool_) if state else casts[0][0] != casts[1][0]
+            yield _Shots(state, origin, ends, flags[state][hit], fresh)
+
+
+def _flags(world: World, state: State) -> NDArray[np.uint8]:
+    """Flag of a hit on each primitive of a state; the last entry, for index -1, says that nothing was hit."""
+    kept, changed = (BEFORE_KEPT, BEFORE_GONE) if state == "before" else (AFTER_KEPT, AFTER_COME)
+    each = [kept if len(o.states) == len(STATES) else changed for o in world.in_state(state) for _ in o.shapes]
+    return np.array([*each, 0], dtype=np.uint8)
+
+
+def _window(world: World, plan: ScanPlan, grid: GridFrame) -> Window:
+    reach = world.half_length_m + plan.range_m + _MARGIN_M
+    corners = np.array([(x, y, z) for x in (-reach, reach) for y in (-reach, reach) for z in (-1, 1)], dtype=np.float64)
+    corners *= np.array([1.0, (plan.range_m + world.kerb_m) / reach, _HEIGHT_M])
+    g = np.floor(grid.grid_of(world.map_of_street(corners))).astype(int)
+    low, high = g.min(axis=0), g.max(axis=0) + 1
+    return Window(*low.tolist(), *(high - low).tolist())
+
+
+@kernel
+def _slot(window: Window, x: int, y: int, z: int) -> int:
+    """Place of a voxel in the window's flat arrays, -1 outside."""
+    i, j, k = x - window.gx, y - window.gy, z - window.gz
+    if i < 0 or j < 0 or k < 0 or i >= window.nx or j >= window.ny or k >= window.nz:
+        return -1
+    return (i * window.ny + j) * window.nz + k
+
+
+@kernel
+def _mark(
+    g: FloatArray,
+    flags: NDArray[np.uint8],
+    window: Window,
+    index: NDArray[np.int32],
+    cells: NDArray[np.uint8],
+    used: int,
+) -> int:
+    """Set the flags of the sub-cells that points g (N, 3) fall into; rows used so far, -1 if there are too few."""
+    for n in range(len(g)):
+        x, y, z = int(np.floor(g[n, 0])), int(np.floor(g[n, 1])), int(np.floor(g[n, 2]))
+        slot = _slot(window, x, y, z)
+        if flags[n] == 0 or slot < 0:
+            continue
+        if index[slot] < 0:
+            if used == len(cells):
+                return -1
+            index[slot] = used
+            used += 1
+        cx, cy, cz = int((g[n, 0] - x) * CELLS), int((g[n, 1] - y) * CELLS), int((g[n, 2] - z) * CELLS)
+        cells[index[slot], (cz * CELLS + cy) * CELLS + cx] |= flags[n]
+    return used
+
+
+@kernel
+def _pass(origin: FloatArray, ends: FloatArray, window: Window, passes: NDArray[np.int32]) -> None:
+    """Count rays from origin (3,) to ends (N, 3), grid coordinates, in every voxel but that of the end."""
+    voxel, step, last = np.empty(3, np.int64), np.empty(3, np.int64), np.empty(3, np.int64)
+    at, delta = np.empty(3), np.empty(3)
+    for n in range(len(ends)):
+        left = 0
+        for a in range(3):
+            d = ends[n, a] - origin[a]
+            voxel[a], last[a], step[a] = np.floor(origin[a]), np.floor(ends[n, a]), 1 if d > 0.0 else -1
+            delta[a] = abs(1.0 / d) if d != 0.0 else np.inf
+            at[a] = (voxel[a] + (d > 0.0) - origin[a]) / d if d != 0.0 else np.inf
+            left += abs(last[a] - voxel[a])
+        for _ in range(left):
+            slot = _slot(window, voxel[0], voxel[1], voxel[2])
+            if slot >= 0:
+                passes[slot] += 1
+            a = 0 if at[0] < at[1] and at[0] < at[2] else (1 if at[1] < at[2] else 2)
+            at[a] += delta[a]
+            voxel[a] += step[a]
+
+
+@kernel
+def _near(
+    window: Window, index: NDArray[np.int32], cells: NDArray[np.uint8], x: int, y: int, z: int, wanted: int
+) -> bool:
+    """Whether sub-cell (x, y, z), counted from the window's corner, or a neighbour (of 26) carries a wanted flag."""
+    for i in range(x - 1, x + 2):
+        for j in range(y - 1, y + 2):
+            for k in range(z - 1, z + 2):
+                vx, vy, vz = i // CELLS, j // CELLS, k // CELLS
+                slot = _slot(window, vx + window.gx, vy + window.gy, vz + window.gz)
+                if slot >= 0 and index[slot] >= 0:
+                    cell = ((k - vz * CELLS) * CELLS + j - vy * CELLS) * CELLS + i - vx * CELLS
+                    if cells[index[slot], cell] & wanted:
+                        return True
+    return False
+
+
+@kernel
+def _unexplained(window: Window, index: NDArray[np.int32], cells: NDArray[np.uint8], used: int) -> NDArray[np.int32]:
+    """Sub-cells of each row that are gone, come or revealed: none of the other state's within one sub-cell, (M, 3)."""
+    found = np.zeros((used, 3), np.int32)
+    for slot in range(len(index)):
+        row = index[slot]
+        if row < 0:
+            continue
+        x, y = slot // (window.ny * window.nz) * CELLS, slot // window.nz % window.ny * CELLS
+        z = slot % window.nz * CELLS
+        for cell in range(CELLS**3):
+            flags = cells[row, cell]
+            if flags == 0 or (flags & KNOWN_BEFORE and flags & STANDS_AFTER):
+                continue
+            i, j, k = x + cell % CELLS, y + cell // CELLS % CELLS, z + cell // CELLS**2
+            if flags & BEFORE_GONE:
+                found[row, 0] += not _near(window, index, cells, i, j, k, STANDS_AFTER)
+            elif not _near(window, index, cells, i, j, k, KNOWN_BEFORE):
+                found[row, 1 if flags & AFTER_COME else 2] += 1
+    return found
+
+
+@kernel
+def _shell(
+    window: Window, index: NDArray[np.int32], cells: NDArray[np.uint8], touched: NDArray[np.int64]
+) -> NDArray[np.int32]:
+    """Sub-cells (V, 2) known before and standing after in the six layers, one sub-cell thick, around each voxel."""
+    found = np.zeros((len(touched), 2), np.int32)
+    for n in range(len(touched)):
+        i, j = touched[n] // (window.ny * window.nz), touched[n] // window.nz % window.ny
+        k = touched[n] % window.nz
+        for face in range(6):
+            axis, side = face // 2, face % 2 * 2 - 1
+            x, y, z = i + (axis == 0) * side, j + (axis == 1) * side, k + (axis == 2) * side
+            slot = _slot(window, x + window.gx, y + window.gy, z + window.gz)
+            if slot < 0 or index[slot] < 0:
+                continue
+            layer = 0 if side > 0 else CELLS - 1
+            for a in range(CELLS):
+                for b in range(CELLS):
+                    cx = layer if axis == 0 else a
+                    cy = layer if axis == 1 else (a if axis == 0 else b)
+                    cz = layer if axis == 2 else b
+                    flags = cells[index[slot], (cz * CELLS + cy) * CELLS + cx]
+                    found[n, 0] += (flags & KNOWN_BEFORE) != 0
+                    found[n, 1] += (flags & STANDS_AFTER) != 0
+    return found

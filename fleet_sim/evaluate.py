@@ -1,0 +1,172 @@
+"""How well a map, or a set of reported changes, agrees with the truth (GND, section 6.3, Eq. 18).
+
+F1 is the macro average over five classes (normal, new, modified, deleted, empty), in percent, at three levels of voxels
+(`truth.LEVELS`). Predictions are about the same voxels as the truth; what they say elsewhere is not counted.
+"""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any, Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fleet_sim.errors import EvaluationError
+from fleet_sim.truth import LEVELS, Level, Truth
+from gnd_map.classes import ChangeClass
+from gnd_map.gaussian import Gaussians
+from gnd_map.tile import diff
+from gnd_map.tile_id import TileId
+
+Tiles = Mapping[TileId, Gaussians]
+ClassArray = NDArray[np.uint8]
+
+CLASSES: Final = tuple(c for c in ChangeClass if c is not ChangeClass.UNMEASURED)
+
+
+@dataclass(frozen=True, slots=True)
+class ClassScore:
+    """Precision, recall and F1 of one class, in percent; 0 where there is nothing to divide by."""
+
+    precision: float
+    recall: float
+    f1: float
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Score:
+    """The comparison at one level.
+
+    Attributes:
+        level: which voxels count.
+        confusion: int64 (5, 5), rows: true class, columns: predicted class, in the order of `CLASSES`.
+    """
+
+    level: Level
+    confusion: NDArray[np.int64]
+
+    @property
+    def classes(self) -> dict[str, ClassScore]:
+        """The score of each class, by lower-case name."""
+        hits = np.diag(self.confusion).astype(float)
+        precision = 100.0 * hits / np.maximum(self.confusion.sum(axis=0), 1)
+        recall = 100.0 * hits / np.maximum(self.confusion.sum(axis=1), 1)
+        f1 = 2.0 * precision * recall / np.maximum(precision + recall, 1e-12)  # Eq. (18)
+        rows = zip(CLASSES, precision.tolist(), recall.tolist(), f1.tolist(), strict=True)
+        return {c.name.lower(): ClassScore(p, r, f) for c, p, r, f in rows}
+
+    @property
+    def macro_f1(self) -> float:
+        """Mean F1 of the five classes, in percent."""
+        return float(np.mean([score.f1 for score in self.classes.values()]))
+
+    def as_dict(self) -> dict[str, Any]:
+        """Return everything as plain numbers, for JSON."""
+        classes = {
+            name: {"precision": round(s.precision, 2), "recall": round(s.recall, 2), "f1": round(s.f1, 2)}
+            for name, s in self.classes.items()
+        }
+        return {"macro_f1": round(self.macro_f1, 2), "classes": classes, "confusion": self.confusion.tolist()}
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Evaluation:
+    """A prediction compared with the truth.
+
+    Attributes:
+        predicted: uint8 (V,), the predicted class of each voxel of the truth.
+        scores: one score a level.
+    """
+
+    predicted: ClassArray
+    scores: Mapping[Level, Score]
+
+    def f1(self, level: Level = "scored") -> float:
+        """Return the macro F1 at a level, in percent."""
+        return self.scores[level].macro_f1
+
+    def as_dict(self) -> dict[str, Any]:
+        """Return all scores as plain numbers, for JSON."""
+        return {level: score.as_dict() for level, score in self.scores.items()}
+
+
+def evaluate(truth: Truth, predicted: ClassArray) -> Evaluation:
+    """Compare predicted classes with the truth.
+
+    Args:
+        truth: V voxels.
+        predicted: uint8 (V,), classes NORMAL to EMPTY in the order of the truth's voxels.
+
+    Raises:
+        EvaluationError: wrong length, or a class outside the five.
+    """
+    if predicted.shape != (len(truth),):
+        raise EvaluationError(f"the truth has {len(truth)} voxels, the prediction has shape {predicted.shape}")
+    if len(predicted) and predicted.max() >= len(CLASSES):
+        raise EvaluationError(f"the prediction holds class {predicted.max()}, the last is {len(CLASSES) - 1}")
+    return Evaluation(predicted, {level: _score(truth, predicted, level) for level in LEVELS})
+
+
+def _score(truth: Truth, predicted: ClassArray, level: Level) -> Score:
+    mask, n = truth.mask(level), len(CLASSES)
+    pairs = truth.change_class[mask].astype(np.int64) * n + predicted[mask]
+    return Score(level, np.bincount(pairs, minlength=n * n).reshape(n, n))
+
+
+def evaluate_maps(truth: Truth, base: Tiles, final: Tiles) -> Evaluation:
+    """Compare what became of a base map with the truth.
+
+    A voxel of both maps is normal when its Gaussian is the same to the bit, else modified; in one map only it is new or
+    deleted. The stale map is `evaluate_maps(truth, base, base)`.
+    """
+    return evaluate(truth, classes_of_maps(truth, base, final))
+
+
+def evaluate_changes(
+    truth: Truth, base: Tiles, changes: Mapping[TileId, tuple[NDArray[np.int32], ClassArray]]
+) -> Evaluation:
+    """Compare reported changes with the truth.
+
+    Args:
+        truth: the truth.
+        base: the map that the reports refer to.
+        changes: by tile, voxel ids int32 (K,) and classes uint8 (K,) of `ChangeClass`. Voxels without a report, or
+            reported as UNMEASURED, are as in the base map.
+    """
+    predicted = classes_of_maps(truth, base, base)
+    for tile, (voxel_id, change_class) in changes.items():
+        said = change_class < len(CLASSES)
+        at = _positions(truth, tile, voxel_id[said])
+        predicted[at[at >= 0]] = change_class[said][at >= 0]
+    return evaluate(truth, predicted)
+
+
+def classes_of_maps(truth: Truth, base: Tiles, final: Tiles) -> ClassArray:
+    """Return the classes, uint8 (V,), that two maps assign to the truth's voxels."""
+    predicted = np.full(len(truth), int(ChangeClass.EMPTY), dtype=np.uint8)
+    for tile in sorted(set(base) | set(final)):
+        old, new = base.get(tile, Gaussians.empty()), final.get(tile, Gaussians.empty())
+        delta = diff(old, new)
+        put = delta.put.voxel_id
+        _assign(truth, predicted, tile, new.voxel_id, ChangeClass.NORMAL)
+        _assign(truth, predicted, tile, np.intersect1d(put, old.voxel_id), ChangeClass.MODIFIED)
+        _assign(truth, predicted, tile, np.setdiff1d(put, old.voxel_id), ChangeClass.NEW)
+        _assign(truth, predicted, tile, delta.removed, ChangeClass.DELETED)
+    return predicted
+
+
+def _assign(
+    truth: Truth, predicted: ClassArray, tile: TileId, voxel_id: NDArray[np.int32], change_class: ChangeClass
+) -> None:
+    at = _positions(truth, tile, voxel_id)
+    predicted[at[at >= 0]] = int(change_class)
+
+
+def _positions(truth: Truth, tile: TileId, voxel_id: NDArray[np.int32]) -> NDArray[np.int64]:
+    """Rows of the truth that hold voxels of a tile, int64 (K,), -1 where it has none."""
+    low, high = np.searchsorted(truth.morton, [tile.morton, tile.morton + 1])
+    inside = truth.voxel_id[low:high]
+    at = np.searchsorted(inside, voxel_id)
+    found = at < len(inside)
+    found[found] = inside[at[found]] == voxel_id[found]
+    return np.where(found, low + at, -1)

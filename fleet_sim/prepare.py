@@ -1,0 +1,136 @@
+"""What a simulated fleet run needs before it can start: world, truth, mapping drives, one drive a vehicle."""
+
+import multiprocessing
+from collections.abc import Callable
+from concurrent.futures import Future, ProcessPoolExecutor, as_completed
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Final
+
+from rich.progress import Progress
+
+from fleet_sim.drives import EPOCH_NS, PERFECT, DriveConfig, simulate_drive
+from fleet_sim.errors import SimError
+from fleet_sim.street import street
+from fleet_sim.trajectory import Direction
+from fleet_sim.truth import load_or_make_truth
+from fleet_sim.world import write_world
+
+SENSORS: Final = ("VLP-16", "HDL-32E")
+_DAY_NS: Final = 86_400 * 1_000_000_000
+_HOUR_NS: Final = 3_600 * 1_000_000_000
+_MAPPING_DAYS: Final = 72
+"""The paper's map was made on 1 August 2019, its drives on 12 October (section 7.1)."""
+
+
+@dataclass(frozen=True, slots=True)
+class FleetWorld:
+    """Files of a simulated world.
+
+    Attributes:
+        base_drives: drives of a mapping vehicle through the state before, with exact reference poses.
+        agent_drives: one drive a vehicle through the state after.
+        truth_path: what changed, see `fleet_sim.truth`.
+        world_path: the world itself.
+    """
+
+    base_drives: tuple[Path, ...]
+    agent_drives: tuple[Path, ...]
+    truth_path: Path
+    world_path: Path
+
+
+def mapping_configs(world_seed: int) -> tuple[DriveConfig, ...]:
+    """Return the drives of the mapping vehicle: an HDL-32E up and down the empty street, slowly."""
+    directions: tuple[Direction, Direction] = (1, -1)
+    return tuple(
+        DriveConfig(
+            vehicle=f"mapper-{index}",
+            sensor="HDL-32E",
+            state="before",
+            direction=direction,
+            seed=1_000_003 * world_seed + 900_000 + index,
+            cruise_mps=7.0,
+            car_share=0.0,
+            errors=PERFECT,
+            start_ns=EPOCH_NS - _MAPPING_DAYS * _DAY_NS + index * _HOUR_NS,
+        )
+        for index, direction in enumerate(directions)
+    )
+
+
+def agent_configs(world_seed: int, agents: int) -> tuple[DriveConfig, ...]:
+    """Return one drive a vehicle: sensors and directions mixed evenly, every drive with its own parked cars.
+
+    Raises:
+        SimError: fewer than one vehicle.
+    """
+    if agents < 1:
+        raise SimError(f"a fleet needs at least one vehicle, got {agents}")
+    return tuple(
+        DriveConfig(
+            vehicle=f"vehicle-{index}",
+            sensor=SENSORS[index % 2],
+            direction=1 if index // 2 % 2 == 0 else -1,
+            seed=1_000_003 * world_seed + index,
+            start_ns=EPOCH_NS + index * _HOUR_NS,
+        )
+        for index in range(agents)
+    )
+
+
+def prepare_fleet_run(
+    world_seed: int, agents: int, out_dir: Path, progress: Progress | None = None, processes: int = 2
+) -> FleetWorld:
+    """Make a world, its truth and all drives.
+
+    A truth of the same world that is already in the folder is used again; drives are simulated anew.
+
+    Args:
+        world_seed: seed of the street.
+        agents: number of vehicles.
+        out_dir: folder for world.json, truth.npz and drives/, made if need be.
+        progress: gets one task that counts drives and truth.
+        processes: worker processes for the drives.
+
+    Returns:
+        Where everything is.
+
+    Raises:
+        SimError: nonsense was asked for, or a file cannot be written.
+        DriveError: a drive cannot be written.
+    """
+    configs = (*mapping_configs(world_seed), *agent_configs(world_seed, agents))
+    folder = out_dir / "drives"
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise SimError(f"cannot make the folder {folder}: {error}") from error
+    world = street(world_seed)
+    write_world(world, out_dir / "world.json")
+    jobs: list[tuple[Callable[..., object], tuple[object, ...]]] = [
+        (load_or_make_truth, (world, out_dir / "truth.npz")),
+        *((simulate_drive, (world, config, folder / f"{config.vehicle}.mcap")) for config in configs),
+    ]
+    _run(jobs, processes, progress)
+    paths = [folder / f"{config.vehicle}.mcap" for config in configs]
+    split = len(configs) - agents
+    return FleetWorld(tuple(paths[:split]), tuple(paths[split:]), out_dir / "truth.npz", out_dir / "world.json")
+
+
+def _run(
+    jobs: list[tuple[Callable[..., object], tuple[object, ...]]], processes: int, progress: Progress | None
+) -> None:
+    """Run jobs in worker processes (fork server: Zenoh and threads of the caller stay out of them)."""
+    task = progress.add_task("simulating", total=len(jobs)) if progress else None
+    context = multiprocessing.get_context("forkserver")
+    with ProcessPoolExecutor(max(1, min(processes, len(jobs))), mp_context=context) as pool:
+        futures: list[Future[object]] = [pool.submit(function, *arguments) for function, arguments in jobs]
+        try:
+            for future in as_completed(futures):
+                future.result()
+                if progress and task is not None:
+                    progress.advance(task)
+        except BaseException:
+            pool.shutdown(wait=False, cancel_futures=True)
+            raise
