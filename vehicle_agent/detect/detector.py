@@ -188,7 +188,8 @@ def tile_evidence(
     """
     voxel_id = np.union1d(blocked_or_seen, passes[0]).astype(np.int32)
     row = _find(tile.gaussians.voxel_id, voxel_id)
-    of_map = np.where((row >= 0)[:, None], counters[row] if len(counters) else 0, 0).astype(np.int32)
+    at = counters[row] if len(counters) else np.zeros((len(row), 4), np.int32)  # an unmapped tile has no Gaussians
+    of_map = np.where((row >= 0)[:, None], at, 0).astype(np.int32)
     new = _spread(measured, voxel_id)
     return TileEvidence(
         base=tile,
