@@ -6,6 +6,7 @@ change, too.
 """
 
 from dataclasses import dataclass, replace
+from itertools import pairwise
 from typing import Final, Literal
 
 import numpy as np
@@ -181,7 +182,7 @@ class ChangeReport:
         check_length(f"report {self.report_id}", len(self.tiles), limits.MAX_TILES_OF_DISTRICT, "tiles")
         if not self.tiles:
             raise BadValue(f"report {self.report_id} has no tiles")
-        for before, after in zip(self.tiles, self.tiles[1:], strict=False):
+        for before, after in pairwise(self.tiles):
             if before.tile >= after.tile:
                 raise BadValue(
                     f"report {self.report_id} lists tile {after.tile} after {before.tile}: ascending, none twice"
@@ -209,7 +210,9 @@ class ChangeReport:
     @classmethod
     def decode(cls, data: bytes) -> "ChangeReport":
         """The value in `data`; `SchemaError` when it is none."""
-        message = parse(change_report_pb2.ChangeReport, data, limits.MAX_CHANGE_REPORT_BYTES)
+        message = parse(
+            change_report_pb2.ChangeReport, data, limits.MAX_CHANGE_REPORT_BYTES, max_fields=limits.MAX_REPORT_FIELDS
+        )
         check_major(message, "ChangeReport")
         check_length("ChangeReport", len(message.tiles), limits.MAX_TILES_OF_DISTRICT, "tiles")
         with refusing("ChangeReport"):
@@ -259,17 +262,29 @@ def _change_values(message: change_report_pb2.ChangeReport) -> tuple[TileChange,
 def _change_value(message: tile_change_pb2.TileChange) -> TileChange:
     tile = tile_id(message.tile)
     with refusing(f"change of tile {tile}"):
-        return TileChange(
-            tile=tile,
-            base_version=message.base_version,
-            base_sha=message.base_sha,
-            observed=decode_observed(message.observed_first, message.observed_bitmap),
-            changed=codec_of(message.codec_id).decode(message.changed),
-            change_class=np.frombuffer(message.change_class, np.uint8).copy(),
-            evidence=np.array(message.evidence, np.int32).reshape(-1, _COUNTERS),
-            pose_sigma_m=message.pose_sigma_m,
-            pose_sigma_rad=message.pose_sigma_rad,
-        )
+        observed = decode_observed(message.observed_first, message.observed_bitmap)
+        changed = codec_of(message.codec_id).decode(message.changed)
+        evidence = _evidence_of(message, len(changed))
+    return TileChange(
+        tile=tile,
+        base_version=message.base_version,
+        base_sha=message.base_sha,
+        observed=observed,
+        changed=changed,
+        change_class=np.frombuffer(message.change_class, np.uint8).copy(),
+        evidence=evidence,
+        pose_sigma_m=message.pose_sigma_m,
+        pose_sigma_rad=message.pose_sigma_rad,
+    )
+
+
+def _evidence_of(message: tile_change_pb2.TileChange, n: int) -> I32:
+    if len(message.evidence) != _COUNTERS * n:
+        raise BadValue(f"{len(message.evidence)} counters of rays for {n} changed voxels, expected {_COUNTERS * n}")
+    counters = np.array(message.evidence, np.int64).reshape(n, _COUNTERS)
+    if (counters >= 2**31).any():
+        raise BadValue(f"evidence of {counters.max()} rays does not fit 31 bits")
+    return counters.astype(np.int32)
 
 
 def split(report: ChangeReport) -> tuple[tuple[TileId, bytes], ...]:

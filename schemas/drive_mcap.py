@@ -199,7 +199,7 @@ def read_header(path: Path | str) -> DriveHeader:
         _check_channels(summary)
         metadata = next((m.metadata for m in reader.iter_metadata() if m.name == METADATA), None)
         if metadata is None:
-            raise DriveError(f"{path}: MCAP file without a metadata record {METADATA!r}; import it with `gnd import`")
+            raise DriveError(f"MCAP file without a metadata record {METADATA!r}; import it with `gnd import`")
         return header_of(metadata, _mount_of(reader))
 
 
@@ -243,7 +243,7 @@ def drive_counts(path: Path | str) -> DriveCounts:
         _check_channels(summary)
         statistics = summary.statistics
         if statistics is None:
-            raise DriveError(f"{path}: recording has no statistics; restore it with `mcap recover`")
+            raise DriveError("recording has no statistics; restore it with `mcap recover`")
         counts = {c.topic: statistics.channel_message_counts.get(c.id, 0) for c in summary.channels.values()}
         return DriveCounts(
             scans=counts.get(POINTS_TOPIC, 0),

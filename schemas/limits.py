@@ -20,6 +20,9 @@ MAX_TRAFFIC_SAMPLE_BYTES: Final = 16 * KIB
 
 # A district (q5/q10/q15) is 32 x 32 tiles.
 MAX_TILES_OF_DISTRICT: Final = 1024
+# Fields on the top level of a report: its tiles and its own, with room for a newer minor version's.
+MAX_REPORT_FIELDS: Final = MAX_TILES_OF_DISTRICT + 64
+MAX_REMOVED_VOXELS: Final = 200_000
 MAX_CODECS: Final = 16
 MAX_REASON_CHARACTERS: Final = 1024
 MAX_TEXT_CHARACTERS: Final = 128

@@ -13,6 +13,7 @@ from google.protobuf.message import DecodeError
 from mcap.exceptions import McapError
 from mcap.reader import SeekingReader
 from mcap.summary import Summary
+from mcap.writer import MCAP0_MAGIC
 
 from gnd_map.errors import GndError
 from schemas import limits
@@ -45,8 +46,8 @@ def drive_errors(path: Path) -> Iterator[None]:
     """Everything that goes wrong inside becomes a `DriveError` of one line that names the file."""
     try:
         yield
-    except DriveError:
-        raise
+    except DriveError as error:
+        raise DriveError(f"{path}: {error}") from error
     except FileNotFoundError as error:
         raise DriveError(f"{path}: no such drive") from error
     except _DAMAGE as error:
@@ -71,31 +72,35 @@ def open_mcap(path: Path) -> Iterator[tuple[SeekingReader, Summary]]:
         DriveError: no such file, not MCAP, cut off, damaged.
     """
     with drive_errors(path), path.open("rb") as stream:
+        _check_summary(stream)
+        stream.seek(0)
         reader = SeekingReader(stream, validate_crcs=True, record_size_limit=limits.MAX_CHUNK_BYTES)
-        _check_summary(path, stream)
         summary = reader.get_summary()
         if summary is None:
-            raise DriveError(f"{path}: recording has no summary; restore it with `mcap recover`")
+            raise DriveError("recording has no summary; restore it with `mcap recover`")
         for chunk in summary.chunk_indexes:
             if max(chunk.uncompressed_size, chunk.compressed_size) > limits.MAX_CHUNK_BYTES:
                 raise DriveError(
-                    f"{path}: chunk at byte {chunk.chunk_start_offset} unpacks to {chunk.uncompressed_size} bytes, "
+                    f"chunk at byte {chunk.chunk_start_offset} unpacks to {chunk.uncompressed_size} bytes, "
                     f"the limit is {limits.MAX_CHUNK_BYTES}"
                 )
         yield reader, summary
 
 
-def _check_summary(path: Path, stream: IO[bytes]) -> None:
+def _check_summary(stream: IO[bytes]) -> None:
     """The library trusts the summary; a flipped bit there would lose messages without a word."""
+    start_of_file = stream.read(len(MCAP0_MAGIC))
+    if not MCAP0_MAGIC.startswith(start_of_file):
+        raise DriveError(f"not an MCAP file: it begins with {start_of_file!r}")
     size = stream.seek(0, os.SEEK_END)
     if size < _TAIL.size:
-        raise DriveError(f"{path}: recording of {size} bytes is cut off; restore it with `mcap recover`")
+        raise DriveError(f"recording of {size} bytes is cut off; restore it with `mcap recover`")
     stream.seek(size - _TAIL.size)
     opcode, length, start, _, crc, magic = _TAIL.unpack(stream.read(_TAIL.size))
-    if (opcode, length) != (2, 20) or magic[1:5] != b"MCAP":
-        raise DriveError(f"{path}: recording is cut off (no footer at its end); restore it with `mcap recover`")
+    if (opcode, length) != (2, 20) or magic != MCAP0_MAGIC:
+        raise DriveError("recording is cut off (no footer at its end); restore it with `mcap recover`")
     if start and crc and crc != _crc(stream, start, size - _CRC_AND_MAGIC_BYTES):
-        raise DriveError(f"{path}: summary is damaged (CRC {crc:#010x} does not match); restore it with `mcap recover`")
+        raise DriveError(f"summary is damaged (CRC {crc:#010x} does not match); restore it with `mcap recover`")
 
 
 def _crc(stream: IO[bytes], start: int, end: int) -> int:

@@ -28,5 +28,6 @@ def deterministic_report_id(t_ms: int, *parts: str | bytes) -> str:
 def check_report_id(report_id: str) -> None:
     """`BadValue` unless `report_id` is a ULID in its one canonical spelling (26 upper-case characters)."""
     with refusing(f"report id {report_id[:40]!r}"):
-        if str(ULID.from_str(report_id)) != report_id:
-            raise BadValue(f"report id {report_id[:40]!r} is not a ULID in canonical spelling")
+        canonical = str(ULID.from_str(report_id))
+    if canonical != report_id:
+        raise BadValue(f"report id {report_id[:40]!r} is not a ULID in canonical spelling")

@@ -1,6 +1,7 @@
 """Tiles on the bus: request, blob, reply, catalog. Each value checks itself; encode and decode stand side by side."""
 
 from dataclasses import dataclass
+from itertools import pairwise
 from typing import Final, Literal
 
 from gnd_map.codec import CODEC_FLOAT32, codec_of, encode_gaussians
@@ -169,7 +170,7 @@ class Catalog:
 
     def __post_init__(self) -> None:
         check_length("Catalog", len(self.entries), limits.MAX_TILES_OF_DISTRICT, "entries")
-        for before, after in zip(self.entries, self.entries[1:], strict=False):
+        for before, after in pairwise(self.entries):
             if before.tile >= after.tile:
                 raise BadValue(f"Catalog lists tile {after.tile} after {before.tile}: ascending, none twice")
 

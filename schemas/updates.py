@@ -14,6 +14,7 @@ from schemas.generated import tile_delta_pb2, tile_update_pb2
 from schemas.wire import (
     LAYER_PATTERN,
     MAJOR,
+    check_length,
     check_major,
     check_pair,
     check_sha,
@@ -99,4 +100,5 @@ def _delta_message(delta: TileDelta) -> tile_delta_pb2.TileDelta:
 
 
 def _delta_value(message: tile_delta_pb2.TileDelta) -> TileDelta:
+    check_length("delta", len(message.removed), limits.MAX_REMOVED_VOXELS, "removed voxels")
     return TileDelta(np.array(message.removed, np.int32), codec_of(message.codec_id).decode(message.put))

@@ -10,6 +10,7 @@ from google.protobuf.message import DecodeError, Message
 from gnd_map.errors import GndError
 from gnd_map.tile_id import TileId
 from schemas.errors import BadValue, Malformed, SchemaError, TooLarge, WrongVersion
+from schemas.wire_fields import check_field_count
 
 MAJOR: Final = 1
 SHA_BYTES: Final = 32
@@ -32,11 +33,13 @@ MessageT = TypeVar("MessageT", bound=Message)
 WordT = TypeVar("WordT", bound=str)
 
 
-def parse(kind: type[MessageT], data: bytes, limit: int) -> MessageT:
+def parse(kind: type[MessageT], data: bytes, limit: int, *, max_fields: int | None = None) -> MessageT:
     """The protobuf message in `data`; `TooLarge` before parsing, `Malformed` when the bytes are none."""
     name = kind.DESCRIPTOR.name
     if len(data) > limit:
         raise TooLarge(f"{name} of {len(data)} bytes exceeds the limit of {limit} bytes")
+    if max_fields is not None:
+        check_field_count(name, data, max_fields)
     message = kind()
     try:
         message.ParseFromString(data)
@@ -61,11 +64,11 @@ def serialise(message: Message, limit: int) -> bytes:
 
 @contextmanager
 def refusing(what: str, kind: type[SchemaError] = BadValue) -> Iterator[None]:
-    """Errors of the values inside (`gnd_map`'s, numpy's) become `kind` with `what` in front."""
+    """Errors of the values inside get `what` in front; `gnd_map`'s and numpy's become `kind`."""
     try:
         yield
-    except SchemaError:
-        raise
+    except SchemaError as error:
+        raise type(error)(f"{what}: {error}") from error
     except (GndError, ValueError, OverflowError) as error:
         raise kind(f"{what}: {error}") from error
 

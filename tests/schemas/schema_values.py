@@ -1,0 +1,247 @@
+"""Values for the tests of messages: one of each kind with known bytes, and strategies for any.
+
+`python tests/schemas/schema_values.py` writes the golden files that are missing. A golden file is never changed: it
+stands for the messages that are out there already.
+"""
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from hypothesis import strategies as st
+
+from gnd_map.gaussian import Gaussians
+from gnd_map.tile import Tile, TileDelta
+from gnd_map.tile_id import TileId
+from schemas.changes import ChangeAck, ChangeReport, TileChange
+from schemas.report_id import deterministic_report_id
+from schemas.tiles import Catalog, CatalogEntry, TileBlob, TileReply, TileRequest, blob_of
+from schemas.traffic import TrafficLine, TrafficSample
+from schemas.updates import TileUpdate
+
+GOLDEN_DIR = Path(__file__).parent / "golden"
+
+TILE = TileId(497353963154)
+EAST = TileId(497353963155)
+SHA = bytes(range(32))
+OTHER_SHA = bytes(range(100, 132))
+REPORT_ID = deterministic_report_id(1_700_000_000_000, "car-1", b"drive")
+
+
+def gaussians(ids: Any, count: int = 40) -> Gaussians:
+    """Plausible Gaussians at the voxel ids; count 0 = nothing there."""
+    voxel_id = np.unique(np.asarray(ids, np.int32))
+    n = len(voxel_id)
+    if count == 0:
+        return Gaussians.nothing_at(voxel_id)
+    mean_m = (np.arange(3 * n, dtype=np.float32).reshape(n, 3) % 7 - 3) / 8
+    cov_m2 = np.tile(np.float32([0.0625, 0.015625, 0, 0.0625, 0, 0.0078125]), (n, 1))
+    return Gaussians(voxel_id, np.full(n, count, np.int32), np.full(n, count // 2, np.int32), mean_m, cov_m2)
+
+
+def mixed(ids: Any) -> Gaussians:
+    """Every second voxel holds a Gaussian, the others hold nothing now."""
+    voxel_id = np.unique(np.asarray(ids, np.int32))
+    full = gaussians(voxel_id)
+    there = np.arange(len(voxel_id)) % 2 == 0
+    return Gaussians(
+        voxel_id,
+        np.where(there, full.count, 0).astype(np.int32),
+        np.where(there, full.cells, 0).astype(np.int32),
+        full.mean_m * there[:, None].astype(np.float32),
+        full.cov_m2 * there[:, None].astype(np.float32),
+    )
+
+
+def change(tile: TileId = TILE, **values: Any) -> TileChange:
+    changed = values.pop("changed", mixed([-604, -3, 0, 77, 604, 2000]))
+    plain: dict[str, Any] = {
+        "base_version": 3,
+        "base_sha": SHA,
+        "observed": np.union1d(np.arange(-700, 900, 3, dtype=np.int32), changed.voxel_id).astype(np.int32),
+        "changed": changed,
+        "change_class": (np.arange(len(changed)) % 6).astype(np.uint8),
+        "evidence": np.arange(4 * len(changed), dtype=np.int32).reshape(-1, 4) * 100,
+        "pose_sigma_m": 0.08,
+        "pose_sigma_rad": 0.0021,
+    }
+    return TileChange(tile=tile, **(plain | values))
+
+
+def report(**values: Any) -> ChangeReport:
+    plain: dict[str, Any] = {
+        "report_id": REPORT_ID,
+        "vehicle": "car-1",
+        "sensor_model": "VLP-16",
+        "software": "gnd-fleet 0.1.0",
+        "district": TILE.district,
+        "first_ns": 1_700_000_000_000_000_000,
+        "last_ns": 1_700_000_012_300_000_000,
+        "tiles": (change(), change(EAST, base_version=0, base_sha=b"")),
+    }
+    return ChangeReport(**(plain | values))
+
+
+def update(**values: Any) -> TileUpdate:
+    plain: dict[str, Any] = {
+        "tile": TILE,
+        "layer": "ndt",
+        "version": 4,
+        "previous_version": 3,
+        "sha": SHA,
+        "previous_sha": OTHER_SHA,
+        "reason": "merged",
+        "delta": TileDelta(np.array([-600, 12], np.int32), gaussians([-5, 7])),
+    }
+    return TileUpdate(**(plain | values))
+
+
+def sample(**values: Any) -> TrafficSample:
+    plain: dict[str, Any] = {
+        "vehicle": "car-1",
+        "t_ns": 1_700_000_000_000_000_000,
+        "odometer_m": 123.5,
+        "lines": (TrafficLine("tile", "down", 12, 345_678), TrafficLine("change", "up", 2, 5_000)),
+        "wire_up_bytes": 6_000,
+        "wire_down_bytes": 350_000,
+        "lat_rad": 0.6555,
+        "lon_rad": 2.2172,
+        "health": "good",
+        "tiles": 12,
+        "reports": 2,
+    }
+    return TrafficSample(**(plain | values))
+
+
+GOLDEN: dict[str, Any] = {
+    "TileRequest-nothing_cached": TileRequest(),
+    "TileRequest-cached-two_codecs": TileRequest(3, SHA, (1, 0)),
+    "TileReply-blob": TileReply("blob", blob_of(Tile(TILE, 7, gaussians([-604, 0, 604])))),
+    "TileReply-blob-empty_tile": TileReply("blob", blob_of(Tile(TILE, 1, Gaussians.empty()))),
+    "TileReply-unchanged": TileReply("unchanged"),
+    "TileReply-absent": TileReply("absent"),
+    "Catalog-empty": Catalog(),
+    "Catalog-two_tiles": Catalog((CatalogEntry(TILE, 3, SHA), CatalogEntry(EAST, 2**32 - 1, OTHER_SHA))),
+    "ChangeReport-two_tiles-with_and_without_base": report(),
+    "ChangeReport-nothing_changed": report(tiles=(change(changed=Gaussians.empty()),)),
+    "ChangeReport-nothing_observed": report(tiles=(change(changed=Gaussians.empty(), observed=np.empty(0, np.int32)),)),
+    "ChangeAck-stored": ChangeAck(REPORT_ID, "stored"),
+    "ChangeAck-duplicate": ChangeAck(REPORT_ID, "duplicate"),
+    "ChangeAck-quarantined-without_id": ChangeAck("", "quarantined", "TileChange: 3 covariances are not positive"),
+    "TileUpdate-merged-delta": update(),
+    "TileUpdate-base-new_tile": update(version=1, previous_version=0, previous_sha=b"", reason="base", delta=None),
+    "TileUpdate-rollback": update(reason="rollback", delta=None),
+    "TrafficSample-two_lines": sample(),
+    "TrafficSample-start": sample(
+        lines=(), odometer_m=0.0, wire_up_bytes=0, wire_down_bytes=0, health="starting", tiles=0, reports=0
+    ),
+}
+
+KINDS: dict[str, Any] = {
+    kind.__name__: kind
+    for kind in (TileRequest, TileReply, TileBlob, Catalog, ChangeReport, ChangeAck, TileUpdate, TrafficSample)
+}
+
+
+def kind_of(name: str) -> Any:
+    """The class that a golden file's name begins with."""
+    return KINDS[name.split("-")[0]]
+
+
+# Strategies
+
+shas = st.binary(min_size=32, max_size=32)
+versions = st.integers(1, 2**32 - 1)
+voxel_sets = st.frozensets(st.integers(-5000, 60_000), max_size=12).map(sorted)
+tiles = st.integers(0, 2**39 - 1).map(TileId)
+district_tiles = st.frozensets(st.integers(0, 1023), min_size=1, max_size=3).map(
+    lambda offsets: [TileId(TILE.district.first_morton + k) for k in sorted(offsets)]
+)
+pairs = st.one_of(st.just((0, b"")), st.tuples(versions, shas))
+names = st.from_regex(r"[A-Za-z0-9][A-Za-z0-9._-]{0,20}", fullmatch=True)
+texts = st.text(st.characters(codec="utf-8", exclude_categories=("Cc", "Cs")), max_size=60)
+
+
+@st.composite
+def any_gaussians(draw: Any, ids: Any = None, *, with_nothing: bool = False) -> Gaussians:
+    """Gaussians with positive covariances inside their voxels; some hold nothing when asked for."""
+    voxel_id = np.array(draw(voxel_sets) if ids is None else ids, np.int32)
+    rng = np.random.default_rng(draw(st.integers(0, 2**32 - 1)))
+    n = len(voxel_id)
+    spread = rng.uniform(-0.3, 0.3, (n, 3, 3))
+    cov = (spread @ np.swapaxes(spread, 1, 2))[:, [0, 0, 0, 1, 1, 2], [0, 1, 2, 1, 2, 2]]
+    there = rng.random(n) < (0.6 if with_nothing else 1.1)
+    columns = (rng.integers(1, 2**31, n), rng.integers(1, 1001, n), rng.uniform(-0.5, 0.5, (n, 3)), cov)
+    kept = [np.where(there.reshape(-1, *[1] * (c.ndim - 1)), c, 0) for c in columns]
+    kinds = (np.int32, np.int32, np.float32, np.float32)
+    return Gaussians(voxel_id, *(c.astype(kind) for c, kind in zip(kept, kinds, strict=True)))
+
+
+@st.composite
+def any_change(draw: Any, tile: TileId) -> TileChange:
+    changed = draw(any_gaussians(with_nothing=True))
+    observed = np.union1d(changed.voxel_id, draw(voxel_sets)).astype(np.int32)
+    n = len(changed)
+    version, sha = draw(pairs)
+    rng = np.random.default_rng(draw(st.integers(0, 2**32 - 1)))
+    return TileChange(
+        tile=tile,
+        base_version=version,
+        base_sha=sha,
+        observed=observed,
+        changed=changed,
+        change_class=rng.integers(0, 6, n).astype(np.uint8),
+        evidence=rng.integers(0, 2**31, (n, 4)).astype(np.int32),
+        pose_sigma_m=draw(st.floats(0, 1000)),
+        pose_sigma_rad=draw(st.floats(0, 3.15)),
+    )
+
+
+@st.composite
+def any_report(draw: Any) -> ChangeReport:
+    first, last = sorted(draw(st.tuples(st.integers(0, 2**63 - 1), st.integers(0, 2**63 - 1))))
+    return ChangeReport(
+        report_id=deterministic_report_id(draw(st.integers(0, 2**48 - 1)), draw(texts)),
+        vehicle=draw(names),
+        sensor_model=draw(texts),
+        software=draw(texts),
+        district=TILE.district,
+        first_ns=first,
+        last_ns=last,
+        tiles=tuple(draw(any_change(tile)) for tile in draw(district_tiles)),
+        layer=draw(st.from_regex(r"[a-z][a-z0-9_]{0,31}", fullmatch=True)),
+    )
+
+
+@st.composite
+def any_update(draw: Any) -> TileUpdate:
+    previous, previous_sha = draw(st.one_of(st.just((0, b"")), st.tuples(st.integers(1, 2**32 - 2), shas)))
+    put = draw(any_gaussians())
+    removed = np.setdiff1d(np.array(draw(voxel_sets), np.int32), put.voxel_id).astype(np.int32)
+    return TileUpdate(
+        tile=draw(tiles),
+        layer="ndt",
+        version=draw(st.integers(previous + 1, 2**32 - 1)),
+        previous_version=previous,
+        sha=draw(shas),
+        previous_sha=previous_sha,
+        reason=draw(st.sampled_from(["merged", "base", "rollback"])),
+        delta=draw(st.one_of(st.none(), st.just(TileDelta(removed, put)))),
+    )
+
+
+@st.composite
+def any_tile(draw: Any) -> Tile:
+    return Tile(draw(tiles), draw(versions), draw(any_gaussians()))
+
+
+def write_missing_golden_files() -> None:
+    GOLDEN_DIR.mkdir(exist_ok=True)
+    for name, value in GOLDEN.items():
+        path = GOLDEN_DIR / f"{name}.bin"
+        if not path.exists():
+            path.write_bytes(value.encode())
+
+
+if __name__ == "__main__":
+    write_missing_golden_files()
