@@ -1,0 +1,263 @@
+"""The tile server on a real router, and as a process that is killed."""
+
+import os
+import signal
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+from store_helpers import EAGER, EAST, FAR, TILE, merge_once, report, report_id, tile_of_voxels
+
+from fleet_bus.bus import Bus, open_bus
+from fleet_bus.config import BusConfig
+from fleet_bus.errors import RequestFailed, RequestRefused
+from fleet_bus.requesting import RetryPolicy
+from fleet_bus.router import open_router
+from gnd_map.tile_id import TileId
+from schemas import keys
+from schemas.tiles import Catalog, TileReply, TileRequest, tile_of
+from tile_store.errors import StoreError
+from tile_store.server import TileServer
+from tile_store.sqlite_store import SqliteStore
+from tile_store.values import StoredTile
+
+ONCE = RetryPolicy(attempt_timeout_s=5.0)
+
+
+@pytest.fixture
+def endpoint(free_port: int) -> Iterator[str]:
+    at = f"tcp/127.0.0.1:{free_port}"
+    with open_router((at,)):
+        yield at
+
+
+@pytest.fixture
+def client(endpoint: str) -> Iterator[Bus]:
+    with open_bus(BusConfig(connect=(endpoint,)), name="client") as bus:
+        yield bus
+
+
+@pytest.fixture
+def store(tmp_path: Path) -> Iterator[SqliteStore]:
+    with SqliteStore(tmp_path / "store.db", EAGER) as opened:
+        opened.put_tiles([tile_of_voxels(tile, 1, 2) for tile in (TILE, EAST, FAR)])
+        opened.put_tiles([tile_of_voxels(TILE, 8)], layer="signs")
+        yield opened
+
+
+@pytest.fixture
+def server(endpoint: str, store: SqliteStore) -> Iterator[TileServer]:
+    with open_bus(BusConfig(connect=(endpoint,)), name="store") as bus, TileServer(store, bus) as serving:
+        yield serving
+
+
+def ask(client: Bus, tile: TileId, request: TileRequest | None = None, layer: str = "ndt") -> TileReply:
+    payload = (request or TileRequest()).encode()
+    return TileReply.decode(client.request(keys.tile_key(layer, tile), payload, kind="tile", timeout_s=20.0))
+
+
+def refusal(client: Bus, key: str, payload: bytes = b"") -> str:
+    with pytest.raises(RequestRefused) as caught:
+        client.request(key, payload, kind="tile", timeout_s=20.0)
+    assert caught.value.attempts == 1
+    return caught.value.cause
+
+
+@pytest.mark.usefixtures("server")
+def test_a_tile_is_delivered_with_its_version_and_hash(client: Bus, store: SqliteStore) -> None:
+    reply = ask(client, TILE)
+    assert reply.blob is not None
+    assert tile_of(reply.blob).gaussians == tile_of_voxels(TILE, 1, 2).gaussians
+    assert reply.blob.version == 1
+    store.put_reports([report(1)])
+    merge_once(store, 5)
+    reply = ask(client, TILE)
+    assert reply.blob is not None
+    assert (reply.blob.version, reply.blob.sha) == (2, tile_of_voxels(TILE, 5).sha)
+
+
+@pytest.mark.usefixtures("server")
+def test_who_has_the_content_hears_that_it_is_unchanged(client: Bus, store: SqliteStore) -> None:
+    cached = ask(client, TILE).blob
+    assert cached is not None
+    assert ask(client, TILE, TileRequest(1, cached.sha)) == TileReply("unchanged")
+    store.put_tiles([tile_of_voxels(TILE, 3)])
+    assert ask(client, TILE, TileRequest(1, cached.sha)).status == "blob"
+    store.rollback("ndt", TILE, 1)
+    assert ask(client, TILE, TileRequest(1, cached.sha)) == TileReply("unchanged")
+
+
+@pytest.mark.usefixtures("server")
+def test_a_tile_that_the_map_lacks_is_absent(client: Bus) -> None:
+    assert ask(client, TILE.neighbours()[0]) == TileReply("absent")
+    assert ask(client, EAST, layer="signs") == TileReply("absent")
+
+
+@pytest.mark.usefixtures("server")
+def test_a_region_is_answered_with_one_reply_a_tile_and_nothing_outside_it(client: Bus) -> None:
+    def asked(key: str, request: TileRequest | None = None) -> dict[str, str]:
+        answers = client.request_many(key, (request or TileRequest()).encode(), kind="tile", timeout_s=20.0)
+        return {key: TileReply.decode(payload).status for key, payload in answers}
+
+    here = {keys.tile_key("ndt", tile): "blob" for tile in (TILE, EAST)}
+    assert asked(keys.tiles_key("ndt", "13033/03021")) == here
+    assert asked(keys.tiles_key("ndt", "13033/03021/23031")) == here
+    assert asked(keys.tiles_key("ndt")) == here | {keys.tile_key("ndt", FAR): "blob"}
+    assert asked(keys.tiles_key("ndt", "13033/03022")) == {}
+    assert asked(keys.tiles_key("nothing")) == {}
+    assert asked(keys.tile_key("ndt", TILE).replace("/ndt/", "/*/")) == {
+        keys.tile_key(layer, TILE): "blob" for layer in ("ndt", "signs")
+    }
+    request = TileRequest(1, tile_of_voxels(TILE, 1, 2).sha)
+    assert asked(keys.tiles_key("ndt", "13033"), request) == here | {keys.tile_key("ndt", TILE): "unchanged"}
+
+
+@pytest.mark.usefixtures("server")
+def test_catalogs_of_one_district_and_of_many(client: Bus, store: SqliteStore) -> None:
+    def catalog(key: str) -> Catalog:
+        return Catalog.decode(client.request(key, b"", kind="catalog", timeout_s=20.0))
+
+    store.put_tiles([tile_of_voxels(EAST, 3)])
+    here = catalog(keys.catalog_key("ndt", TILE.district))
+    assert [(entry.tile, entry.version) for entry in here.entries] == [(TILE, 1), (EAST, 2)]
+    assert [entry.sha for entry in here.entries] == [tile_of_voxels(TILE, 1, 2).sha, tile_of_voxels(EAST, 3).sha]
+    assert catalog(keys.catalog_key("signs", FAR.district)).entries == ()
+    many = dict(client.request_many(keys.catalog_keys("ndt"), b"", kind="catalog", timeout_s=20.0))
+    assert set(many) == {keys.catalog_key("ndt", tile.district) for tile in (TILE, FAR)}
+    assert Catalog.decode(many[keys.catalog_key("ndt", TILE.district)]) == here
+    deeper = keys.catalog_keys("ndt").removesuffix("**") + "13033/03021/**"
+    assert [key for key, _ in client.request_many(deeper, b"", kind="catalog", timeout_s=20.0)] == [
+        keys.catalog_key("ndt", TILE.district)
+    ]
+
+
+@pytest.mark.usefixtures("server")
+def test_what_can_never_be_answered_is_refused_by_name_at_once(client: Bus) -> None:
+    key = keys.tile_key("ndt", TILE)
+    assert "Malformed: 3 bytes are not a TileRequest" in refusal(client, key, b"\xff\xff\xff")
+    assert "TooLarge: TileRequest of 5000 bytes exceeds the limit of 1024" in refusal(client, key, bytes(5000))
+    assert "WrongVersion: TileRequest of major version 9" in refusal(client, key, b"\x08\x09")
+    assert "BadKey" in refusal(client, key.replace("13033", "99999"), TileRequest().encode())
+    assert "BadKey" in refusal(client, keys.catalog_key("ndt", TILE.district).replace("13033", "x"))
+    assert "comes in codec 0, asked for (7,)" in refusal(client, key, TileRequest(codecs=(7,)).encode())
+
+
+@pytest.mark.usefixtures("server")
+def test_a_query_without_payload_gets_the_tile(client: Bus) -> None:
+    """A program that knows only zenoh and our schemas needs no request."""
+    reply = TileReply.decode(client.request(keys.tile_key("ndt", TILE), b"", kind="tile", timeout_s=20.0))
+    assert reply.status == "blob"
+
+
+def test_a_store_that_fails_makes_the_asker_try_again(client: Bus, endpoint: str, store: SqliteStore) -> None:
+    class Flaky(SqliteStore):
+        failures = 2
+
+        def get(
+            self, layer: str, tile: TileId, version: int | None = None, at_ns: int | None = None
+        ) -> StoredTile | None:
+            if self.failures:
+                self.failures -= 1
+                raise StoreError("disk full")
+            return super().get(layer, tile, version, at_ns)
+
+    with Flaky(store.path) as flaky, open_bus(BusConfig(connect=(endpoint,))) as bus, TileServer(flaky, bus):
+        assert ask(client, TILE).status == "blob"
+        assert flaky.failures == 0
+        flaky.failures = 1_000_000
+        with pytest.raises(RequestFailed, match="StoreError: disk full"):
+            client.request(keys.tile_key("ndt", TILE), b"", kind="tile", timeout_s=0.5)
+
+
+def test_a_closed_server_answers_no_more_and_a_new_one_does(client: Bus, endpoint: str, store: SqliteStore) -> None:
+    with open_bus(BusConfig(connect=(endpoint,))) as bus:
+        server = TileServer(store, bus).start()
+        assert ask(client, TILE).status == "blob"
+        server.close()
+        with pytest.raises(RequestFailed, match="nobody serves"):
+            client.request(keys.tile_key("ndt", TILE), b"", kind="tile", timeout_s=0.3)
+        with TileServer(store, bus):
+            assert ask(client, TILE).status == "blob"
+
+
+def start_process(path: Path, endpoint: str) -> subprocess.Popen[str]:
+    """`gnd store` as a process that answers."""
+    command = [sys.executable, "-m", "deploy.cli", "store", "--path", str(path), "--connect", endpoint]
+    process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True)
+    assert process.stdout is not None
+    assert "tile server: " in process.stdout.readline()
+    return process
+
+
+def end(process: subprocess.Popen[str], with_signal: int) -> str:
+    process.send_signal(with_signal)
+    output, _ = process.communicate(timeout=20)
+    return output
+
+
+@pytest.mark.slow
+def test_a_killed_tile_server_loses_nothing_and_its_clients_only_wait(
+    client: Bus, endpoint: str, store: SqliteStore
+) -> None:
+    """Vehicles ask and a merger publishes all the while the server is killed and started again."""
+    process = start_process(store.path, endpoint)
+    stop, answers, failures = threading.Event(), [], []
+
+    def drive() -> None:
+        while not stop.is_set():
+            try:
+                answers.append(ask(client, TILE))
+            except RequestFailed as error:
+                failures.append(error)
+
+    vehicle = threading.Thread(target=drive)
+    vehicle.start()
+    try:
+        for number in range(1, 4):
+            enough = len(answers) + 20
+            deadline = time.monotonic() + 20
+            while len(answers) < enough:
+                assert time.monotonic() < deadline
+                time.sleep(0.005)
+            assert end(process, signal.SIGKILL) == ""
+            store.put_reports([report(number)])
+            merge_once(store, 100 + number)
+            process = start_process(store.path, endpoint)
+        assert ask(client, TILE).blob is not None
+    finally:
+        stop.set()
+        vehicle.join()
+        output = end(process, signal.SIGINT)
+    assert failures == []
+    assert output == "tile server ended\n"
+    assert process.returncode == 0
+    last = ask_again(client, endpoint, store)
+    assert (last.version, last.sha) == (4, tile_of_voxels(TILE, 103).sha)
+    assert [row.report_id for row in store.reports()] == [report_id(number) for number in (1, 2, 3)]
+
+
+def ask_again(client: Bus, endpoint: str, store: SqliteStore) -> StoredTile:
+    """The tile as a new server delivers it, checked against the store."""
+    with open_bus(BusConfig(connect=(endpoint,))) as bus, TileServer(store, bus):
+        blob = ask(client, TILE).blob
+    stored = store.get("ndt", TILE)
+    assert stored is not None
+    assert blob == stored.to_blob()
+    return stored
+
+
+def test_a_store_process_that_cannot_start_says_why_in_one_line(tmp_path: Path, free_port: int) -> None:
+    (tmp_path / "s.db").write_text("not a store, whatever its name says " * 10)
+    command = [sys.executable, "-m", "deploy.cli", "store", "--path", str(tmp_path / "s.db")]
+    done = subprocess.run(
+        [*command, "--connect", f"tcp/127.0.0.1:{free_port}"], capture_output=True, text=True, env=os.environ
+    )
+    assert done.returncode == 2
+    assert done.stdout == ""
+    assert done.stderr == (
+        f"gnd: {tmp_path / 's.db'}: not a tile store (not an SQLite database); choose another path\n"
+    )

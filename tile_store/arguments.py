@@ -1,0 +1,49 @@
+"""What people type for a tile, a time, two versions."""
+
+import math
+import re
+from datetime import UTC, datetime
+from typing import Final
+
+from gnd_map.errors import MapError
+from gnd_map.tile_id import TileId
+from tile_store.errors import StoreError
+
+_VERSIONS: Final = re.compile(r"(\d+)\.\.(\d+)")
+
+
+def parse_tile(text: str) -> TileId:
+    """A tile by its path (13033/03021/23031/22102), its Morton number (497353963154), or a place in it (lat,lon in °).
+
+    Raises:
+        StoreError: it is none of these.
+    """
+    try:
+        if "," in text:
+            lat_deg, lon_deg = map(float, text.split(","))
+            return TileId.from_geodetic(math.radians(lat_deg), math.radians(lon_deg))
+        return TileId.from_path(text) if "/" in text else TileId(int(text))
+    except (ValueError, MapError) as error:
+        raise StoreError(
+            f"tile {text!r} is not a path (13033/03021/23031/22102), a number (497353963154)"
+            f" or lat,lon in degrees (37.5597,127.0365): {error}"
+        ) from None
+
+
+def parse_time_ns(text: str) -> int:
+    """ISO 8601 (2026-01-31T12:00:00Z; UTC when it names no zone) as int ns UTC; StoreError when it is no time."""
+    try:
+        moment = datetime.fromisoformat(text)
+    except ValueError:
+        raise StoreError(f"time {text!r} is not like 2026-01-31T12:00:00Z") from None
+    moment = moment if moment.tzinfo else moment.replace(tzinfo=UTC)
+    since = moment - datetime(1970, 1, 1, tzinfo=UTC)
+    return ((since.days * 86_400 + since.seconds) * 1_000_000 + since.microseconds) * 1_000
+
+
+def parse_versions(text: str) -> tuple[int, int]:
+    """Two versions, "3..5"; StoreError when it is something else."""
+    match = _VERSIONS.fullmatch(text)
+    if match is None:
+        raise StoreError(f"versions {text!r} are not like 3..5")
+    return int(match[1]), int(match[2])

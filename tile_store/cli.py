@@ -1,0 +1,247 @@
+"""`gnd store` and `gnd map`: thin commands over the library."""
+
+import json
+import os
+import signal
+import threading
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack, contextmanager
+from dataclasses import asdict
+from pathlib import Path
+from types import FrameType
+from typing import Any, Final, TypeVar
+
+import click
+from rich.console import Console
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TaskID, TextColumn, TimeElapsedColumn
+
+from fleet_bus.bus import open_bus
+from fleet_bus.config import DEFAULT_ENDPOINT, BusConfig
+from tile_store import tables
+from tile_store.arguments import parse_tile, parse_time_ns, parse_versions
+from tile_store.build import build_map
+from tile_store.compare import MapDiff, map_diff, map_info, version_diff
+from tile_store.errors import StoreError
+from tile_store.export import FORMATS, export_map
+from tile_store.server import TileServer
+from tile_store.sqlite_store import SqliteStore
+from tile_store.store import Store
+from tile_store.values import DEFAULT_LAYER
+
+PATH: Final = click.Path(path_type=Path)
+_F = TypeVar("_F", bound=Callable[..., Any])
+
+
+def layer_option(command: _F) -> _F:
+    """Adds --layer."""
+    return click.option("--layer", default=DEFAULT_LAYER, show_default=True, help="Layer of the map.")(command)
+
+
+def region_option(command: _F) -> _F:
+    """Adds --region."""
+    help_text = "Leading part of tile paths, such as 13033/03021.  [default: everywhere]"
+    return click.option("--region", default="", help=help_text)(command)
+
+
+def json_option(command: _F) -> _F:
+    """Adds --json."""
+    return click.option("--json", "as_json", is_flag=True, help="Print JSON instead of tables.")(command)
+
+
+@click.command()
+@click.option("--path", required=True, type=PATH, help="The store; it is made when missing.")
+@click.option("--connect", multiple=True, default=(DEFAULT_ENDPOINT,), show_default=True, help="Endpoint of a router.")
+@click.option("--workers", default=4, show_default=True, type=click.IntRange(1, 64), help="Threads that answer.")
+def store(path: Path, connect: tuple[str, ...], workers: int) -> None:
+    """Run the tile server until Ctrl-C: it answers the vehicles' tile and catalog queries."""
+    stop = threading.Event()
+
+    def end(_signal: int, _frame: FrameType | None) -> None:
+        stop.set()
+
+    for number in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(number, end)
+    config = BusConfig(connect=connect)
+    with SqliteStore(path) as opened, open_bus(config, name="store") as bus, TileServer(opened, bus, workers=workers):
+        counts = opened.counts()
+        click.echo(f"tile server: {counts.tiles} tiles of {path} at {', '.join(connect)}; Ctrl-C ends it")
+        stop.wait()
+    click.echo("tile server ended")
+
+
+@click.group(name="map")
+def map_group() -> None:
+    """Build, inspect, compare, export and roll back maps."""
+
+
+@map_group.command()
+@click.argument("drives", nargs=-1, required=True, type=PATH)
+@click.option("--store", "-o", "path", required=True, type=PATH, help="The store; it is made when missing.")
+@layer_option
+@json_option
+def build(drives: tuple[Path, ...], path: Path, layer: str, as_json: bool) -> None:
+    """Build tiles from DRIVES (MCAP, with reference poses) and put them into a store as a new base."""
+    with _store_to_fill(path) as opened, _bars() as bars:
+        result = build_map(drives, opened, layer=layer, progress=_Shown(bars))
+    _show(
+        asdict(result), as_json, lambda console: console.print(tables.fields(f"{path}, layer {layer}", asdict(result)))
+    )
+
+
+@map_group.command()
+@click.argument("path", metavar="STORE", type=PATH)
+@region_option
+@layer_option
+@json_option
+def info(path: Path, region: str, layer: str, as_json: bool) -> None:
+    """What STORE holds: its newest versions in numbers, its queue and its quarantine."""
+    with _existing(path) as opened:
+        values = {"layers": opened.layers()} | map_info(opened, layer=layer, prefix=region).as_dict()
+        values["store"] = asdict(opened.counts())
+    _show(values, as_json, lambda console: console.print(tables.info(str(path), values)))
+
+
+@map_group.command()
+@click.argument("path", metavar="STORE", type=PATH)
+@click.argument("out", metavar="FILE", type=PATH)
+@region_option
+@layer_option
+@click.option("--format", "kind", type=click.Choice(list(FORMATS)), help="  [default: by the file's ending]")
+@json_option
+def export(path: Path, out: Path, region: str, layer: str, kind: str | None, as_json: bool) -> None:
+    """Write the newest tiles of STORE to FILE: Gaussians as PCD or PLY, tiles as GeoJSON."""
+    with _existing(path) as opened:
+        result = export_map(opened, layer, region, out, kind)
+    values = asdict(result) | {"path": str(result.path)}
+    line = f"{out}: {result.gaussians} Gaussians of {result.tiles} tiles, {result.size_bytes / 1e6:.2f} MB"
+    _show(values, as_json, lambda console: console.print(line, highlight=False))
+
+
+@map_group.command()
+@click.argument("old", metavar="STORE", type=PATH)
+@click.argument("new", metavar="[OTHER]", type=PATH, required=False)
+@click.option("--since", help="Compare with STORE as it was then: 2026-01-31T12:00:00Z.")
+@click.option("--tile", help="Compare two versions of one tile (path, number, or lat,lon) ...")
+@click.option("--versions", help="... these two: 3..5.  [default: the newest with the one before]")
+@region_option
+@layer_option
+@json_option
+def diff(
+    old: Path,
+    new: Path | None,
+    since: str | None,
+    tile: str | None,
+    versions: str | None,
+    region: str,
+    layer: str,
+    as_json: bool,
+) -> None:
+    """Where STORE differs from OTHER, from itself at an earlier time, or between two versions of a tile."""
+    if sum(way is not None for way in (new, since, tile)) != 1 or (versions and not tile):
+        raise StoreError("diff: give either OTHER, --since TIME, or --tile TILE [--versions A..B]")
+    with ExitStack() as stack:
+        first = stack.enter_context(_existing(old))
+        if tile is not None:
+            result = _version_diff(first, layer, tile, versions)
+        elif since is not None:
+            result = map_diff(first, first, layer=layer, prefix=region, old_at_ns=parse_time_ns(since))
+        else:
+            assert new is not None
+            result = map_diff(first, stack.enter_context(_existing(new)), layer=layer, prefix=region)
+    _show(result.as_dict(), as_json, lambda console: tables.print_diff(console, result))
+
+
+@map_group.command()
+@click.argument("path", metavar="STORE", type=PATH)
+@click.argument("tile")
+@layer_option
+@json_option
+def history(path: Path, tile: str, layer: str, as_json: bool) -> None:
+    """The versions of TILE (path, number, or lat,lon in degrees), and the reports that each comes from."""
+    tile_id = parse_tile(tile)
+    with _existing(path) as opened:
+        lines = opened.history(layer, tile_id)
+        if not lines:
+            raise StoreError(f"tile {tile_id.path} of layer {layer} is not in {path}")
+        rows = [
+            asdict(line) | {"sha": line.sha.hex(), "reports": opened.provenance(layer, tile_id, line.version)}
+            for line in lines
+        ]
+    values = {"layer": layer, "tile": tile_id.path, "morton": tile_id.morton, "versions": rows}
+    _show(values, as_json, lambda console: console.print(tables.history(values)))
+
+
+@map_group.command()
+@click.argument("path", metavar="STORE", type=PATH)
+@click.argument("tile")
+@click.argument("version", type=int)
+@layer_option
+@json_option
+def rollback(path: Path, tile: str, version: int, layer: str, as_json: bool) -> None:
+    """Publish the content of an older VERSION of TILE as its next one; merged reports count no more.
+
+    Running mergers announce it to the vehicles.
+    """
+    with _existing(path) as opened:
+        current = opened.rollback(layer, parse_tile(tile), version)
+    values = {"tile": current.tile.path, "layer": layer, "version": current.version, "content_of": version}
+    line = f"tile {current.tile.path}: version {current.version} has the content of version {version}"
+    _show(values, as_json, lambda console: console.print(line, highlight=False))
+
+
+def _version_diff(store: Store, layer: str, tile: str, versions: str | None) -> MapDiff:
+    tile_id = parse_tile(tile)
+    if versions is not None:
+        return version_diff(store, layer, tile_id, *parse_versions(versions))
+    lines = store.history(layer, tile_id)
+    if len(lines) < 2:
+        raise StoreError(f"tile {tile_id.path} of layer {layer} has {len(lines)} versions; two are needed")
+    return version_diff(store, layer, tile_id, lines[-2].version, lines[-1].version)
+
+
+def _existing(path: Path) -> SqliteStore:
+    return SqliteStore(path, create=False)
+
+
+@contextmanager
+def _store_to_fill(path: Path) -> Iterator[SqliteStore]:
+    """The store at `path`; a new one gets its name only when it is filled."""
+    if path.exists():
+        with SqliteStore(path) as opened:
+            yield opened
+        return
+    if not path.parent.is_dir():
+        raise StoreError(f"{path}: the folder {path.parent} does not exist")
+    partial = path.with_name(f".{path.name}.{os.getpid()}.partial")
+    try:
+        with SqliteStore(partial) as opened:
+            yield opened
+        partial.rename(path)
+    finally:
+        for suffix in ("", "-wal", "-shm"):
+            partial.with_name(partial.name + suffix).unlink(missing_ok=True)
+
+
+class _Shown:
+    """A progress bar a drive."""
+
+    def __init__(self, bars: Progress) -> None:
+        self._bars = bars
+        self._tasks: dict[Path, TaskID] = {}
+
+    def __call__(self, drive: Path, done: int, total: int) -> None:
+        if drive not in self._tasks:
+            self._tasks[drive] = self._bars.add_task(drive.name, total=total)
+        self._bars.update(self._tasks[drive], completed=done)
+
+
+def _bars() -> Progress:
+    columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TextColumn("scans"))
+    return Progress(*columns, TimeElapsedColumn(), console=Console(stderr=True))
+
+
+def _show(values: dict[str, Any], as_json: bool, print_it: Callable[[Console], None]) -> None:
+    if as_json:
+        click.echo(json.dumps(values, indent=1))
+    else:
+        print_it(Console(width=120))
