@@ -29,6 +29,7 @@ from schemas.keys import traffic_keys
 from tile_store.sqlite_store import SqliteStore
 from tile_store.values import StoreConfig
 from vehicle_agent.agent import AgentConfig
+from vehicle_agent.detect.parameters import DetectParameters
 
 POLL_S = 0.2
 SETTLE_S = 60.0
@@ -43,10 +44,12 @@ class FleetOutcome:
 
     Attributes:
         wall_s: from the start of the first process to the settled map.
+        published: tile versions published by the run.
         restarts: how often each process was started again.
     """
 
     wall_s: float
+    published: int
     restarts: dict[str, int]
 
 
@@ -84,7 +87,7 @@ def run_fleet(
         run.wait_until(lambda: supervisor.finished("vehicle-"), config.deadline_s, "the agents did not finish")
         run.wait_until(run.settled, SETTLE_S, "the merges did not settle")
         run.wait_until(run.watcher_caught_up, WATCHER_GRACE_S, None)
-    return FleetOutcome(time.monotonic() - started_s, dict(supervisor.restarts))
+    return FleetOutcome(time.monotonic() - started_s, state.published, dict(supervisor.restarts))
 
 
 @contextmanager
@@ -133,8 +136,15 @@ def shard_config(config: FleetConfig, shard_id: str, store: Path, connect: str) 
 
 def agent_config(config: FleetConfig, vehicle: str, drive: Path, folder: RunFolder, connect: str) -> AgentConfig:
     """Return the configuration of one vehicle agent."""
+    paper = config.detect_mode == "paper"
     return AgentConfig(
-        vehicle=vehicle, drive=drive, connect=(connect,), link=config.link, work_dir=folder.agents / vehicle
+        vehicle=vehicle,
+        drive=drive,
+        work_dir=folder.agents / vehicle,
+        connect=(connect,),
+        link=config.link,
+        ledger_dir=folder.ledger,
+        detect=DetectParameters.paper() if paper else DetectParameters(),
     )
 
 

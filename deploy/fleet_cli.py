@@ -10,9 +10,9 @@ from typing import Any
 import click
 from rich.console import Console
 
-from deploy.errors import DeployError
 from deploy.fleet_config import FleetConfig, load_fleet_config
 from deploy.run_folder import RunFolder, create_run_folder, default_run_path
+from deploy.source import Source
 
 PATH = click.Path(path_type=Path)
 
@@ -24,6 +24,7 @@ PATH = click.Path(path_type=Path)
 @click.option("--world-seed", type=int, help="Seed of the simulated world.  [default: 7]")
 @click.option("--drives", type=PATH, multiple=True, help="Recorded drives (MCAP, folders) instead of simulated ones.")
 @click.option("--map", "base_map", type=PATH, help="Store with the base map for --drives (`gnd map build`).")
+@click.option("--worlds", type=PATH, help="Folder that keeps simulated worlds by seed for further runs.")
 @click.option("--out", type=PATH, help="Folder of the run.  [default: runs/<UTC time>]")
 @click.option("--overwrite", is_flag=True, help="Replace an earlier run in that folder.")
 @click.option("--port", type=int, help="Port of the router; 0 takes a free one.  [default: 0]")
@@ -36,6 +37,7 @@ PATH = click.Path(path_type=Path)
 def fleet(
     drives: tuple[Path, ...],
     base_map: Path | None,
+    worlds: Path | None,
     out: Path | None,
     overwrite: bool,
     config_file: Path | None,
@@ -53,22 +55,14 @@ def fleet(
     if dump_config:
         click.echo(json.dumps(dataclasses.asdict(config), indent=2))
         return
-    if base_map is not None and not drives:
-        raise DeployError("--map goes with --drives: a simulated run builds its own map")
+    source = Source(drives, base_map, worlds, options["agents"])
     folder = create_run_folder(out or default_run_path(), overwrite=overwrite)
     folder.write_mark({"config": dataclasses.asdict(config), "drives": [str(path) for path in drives]})
-    summary = _run(config, folder, drives, base_map, options["agents"], keep_drives)
+    summary = _run(config, folder, source, keep_drives)
     click.echo(json.dumps(summary, indent=2) if as_json else summary_text(summary, folder))
 
 
-def _run(
-    config: FleetConfig,
-    folder: RunFolder,
-    drives: tuple[Path, ...],
-    base_map: Path | None,
-    agents: int | None,
-    keep_drives: bool,
-) -> dict[str, Any]:
+def _run(config: FleetConfig, folder: RunFolder, source: Source, keep_drives: bool) -> dict[str, Any]:
     # The heavy imports wait until the options have been found good.
     from deploy import prepare, summary
     from deploy.fleet import run_fleet
@@ -80,11 +74,7 @@ def _run(
     with progress_bars(console) as progress:
         warm = threading.Thread(target=start_fork_server, name="fork-server")
         warm.start()  # the kernels are loaded while the world is made
-        prepared = (
-            prepare.prepare_recorded(config, folder, drives, base_map, agents)
-            if drives
-            else prepare.prepare_simulated(config, folder, progress)
-        )
+        prepared = prepare.prepare(config, folder, source, progress)
         warm.join()
     outcome = run_fleet(config, folder, prepared, console, stop)
     result = summary.write_summary(config, folder, prepared, outcome)

@@ -3,14 +3,16 @@
 import itertools
 import os
 import shutil
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
-from rich.progress import Progress
+from rich.progress import Progress, TaskID
 
 from deploy.errors import DeployError
 from deploy.fleet_config import FleetConfig
 from deploy.run_folder import RunFolder
+from deploy.source import Source
 from fleet_sim.prepare import prepare_fleet_run
 from schemas.drive_mcap import read_header
 from tile_store.build import build_map
@@ -30,34 +32,64 @@ class PreparedRun:
     truth: Path | None
 
 
-def prepare_simulated(config: FleetConfig, folder: RunFolder, progress: Progress) -> PreparedRun:
+def prepare(config: FleetConfig, folder: RunFolder, source: Source, progress: Progress) -> PreparedRun:
+    """Make drives and store ready, from recordings or by simulation; see the two functions below."""
+    if source.drives:
+        return prepare_recorded(config, folder, source)
+    return prepare_simulated(config, folder, source.worlds, progress)
+
+
+def prepare_simulated(config: FleetConfig, folder: RunFolder, worlds: Path | None, progress: Progress) -> PreparedRun:
     """Simulate the world and its drives, and build the base map from the mapping drives of the state before.
 
     Args:
         config: number of agents and world seed.
-        folder: where drives, truth and store are written.
+        folder: where the store is written, and drives and truth where no folder of worlds is given.
+        worlds: folder that keeps worlds, drives and base maps by seed for further runs.
         progress: shows how far the work is.
 
     Returns:
         One drive an agent, and the truth.
     """
-    world = prepare_fleet_run(config.world_seed, config.agents, folder.world, progress, processes=os.cpu_count() or 1)
-    with SqliteStore(folder.store) as store:
-        build_map(list(world.base_drives), store, progress=progress)
+    home = folder.world if worlds is None else worlds / f"seed-{config.world_seed}"
+    world = prepare_fleet_run(config.world_seed, config.agents, home, progress, processes=os.cpu_count() or 1)
+    base_map = home / "base.sqlite"
+    if not base_map.exists():
+        _build_base(base_map, world.base_drives, progress)
+    copy_store(base_map, folder.store)
     return PreparedRun(tuple(world.agent_drives), world.truth_path)
 
 
-def prepare_recorded(
-    config: FleetConfig, folder: RunFolder, drives: tuple[Path, ...], base_map: Path | None, agents: int | None
-) -> PreparedRun:
+def _build_base(path: Path, drives: tuple[Path, ...], progress: Progress) -> None:
+    partial = path.with_suffix(".partial")
+    partial.unlink(missing_ok=True)
+    with SqliteStore(partial) as store:
+        build_map(list(drives), store, progress=_bar(progress, "base map"))
+        store.backup(path)
+    for leftover in path.parent.glob(f"{partial.name}*"):
+        leftover.unlink()
+
+
+def _bar(progress: Progress, title: str) -> Callable[[Path, int, int], None]:
+    """Return a callback that shows the scans done of each drive as a bar."""
+    tasks: dict[Path, TaskID] = {}
+
+    def show(drive: Path, done: int, total: int) -> None:
+        if drive not in tasks:
+            tasks[drive] = progress.add_task(f"{title}: {drive.stem}", total=total)
+        progress.update(tasks[drive], completed=done)
+
+    return show
+
+
+def prepare_recorded(config: FleetConfig, folder: RunFolder, source: Source) -> PreparedRun:
     """Take recorded drives and, where one is given, a store that already holds a map.
 
     Args:
-        config: link and modes; its number of agents is not used.
+        config: gives the number of agents where one was asked for.
         folder: where the store is copied to.
-        drives: MCAP files or folders of them.
-        base_map: a store made by `gnd map build`, or None to start without a map.
-        agents: number of vehicles; recordings are driven again by further vehicles where there are fewer of them.
+        source: drives, map and number of agents; recordings are driven again by further vehicles where there are
+            fewer of them than agents.
 
     Returns:
         One drive an agent, without truth.
@@ -66,12 +98,12 @@ def prepare_recorded(
         DeployError: no drive was found, or the map does not exist.
         DriveError: a drive cannot be read.
     """
-    found = find_drives(drives)
+    found = find_drives(source.drives)
     for drive in found:
         read_header(drive)  # a broken file is refused before any process starts
-    if base_map is not None:
-        copy_store(base_map, folder.store)
-    count = len(found) if agents is None else config.agents
+    if source.base_map is not None:
+        copy_store(source.base_map, folder.store)
+    count = len(found) if source.agents is None else config.agents
     return PreparedRun(tuple(itertools.islice(itertools.cycle(found), count)), None)
 
 

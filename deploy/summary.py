@@ -1,30 +1,109 @@
-"""The result of a run: one JSON object, three pictures, and a few lines for people."""
+"""The result of a run: `summary.json`, three pictures, and a few lines for people."""
 
 import json
-from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
+from deploy.account import FleetResults, TileHistory, lost_reports, tile_histories
+from deploy.evaluation import NO_TRUTH, score_run
+from deploy.fleet import FleetOutcome, count_lines
+from deploy.fleet_config import FleetConfig
+from deploy.live import size_text
+from deploy.prepare import PreparedRun
 from deploy.run_folder import RunFolder
+from fleet_sim.truth import read_truth
+from tile_store.sqlite_store import SqliteStore
 
-PERCENTILE = 95
 
+def write_summary(
+    config: FleetConfig, folder: RunFolder, prepared: PreparedRun, outcome: FleetOutcome
+) -> dict[str, Any]:
+    """Account for a finished run, compare it with the truth where there is one, and write `summary.json`.
 
-@dataclass(frozen=True, slots=True)
-class AgentResults:
-    """The result files of all agents of a run.
+    Args:
+        config: what was run.
+        folder: the run.
+        prepared: drives and truth.
+        outcome: time and restarts.
 
-    Attributes:
-        results: one decoded `result.json` a vehicle.
+    Returns:
+        The content of `summary.json`.
     """
+    results = FleetResults.read(folder)
+    with SqliteStore(folder.store) as store:
+        histories = tile_histories(store)
+        summary = _counts(config, folder, prepared, outcome, results, store, histories)
+        summary["f1"] = _evaluate(folder, prepared, store, histories)
+    summary["localisation_p95"] = results.localisation_p95()
+    summary["traffic"] = results.traffic()
+    _write(folder.summary, summary)
+    return summary
 
-    results: tuple[dict[str, Any], ...]
 
-    @classmethod
-    def read(cls, folder: RunFolder) -> "AgentResults":
-        """Read the result of every vehicle that left one."""
-        files = sorted(folder.agents.glob("*/result.json"))
-        return cls(tuple(json.loads(path.read_text(encoding="utf-8")) for path in files))
+def _counts(
+    config: FleetConfig,
+    folder: RunFolder,
+    prepared: PreparedRun,
+    outcome: FleetOutcome,
+    results: FleetResults,
+    store: SqliteStore,
+    histories: list[TileHistory],
+) -> dict[str, Any]:
+    return {
+        "agents": len(prepared.agent_drives),
+        "shards": config.shards,
+        "link": config.link,
+        "world_seed": config.world_seed if prepared.truth else None,
+        "wall_s": round(outcome.wall_s, 1),
+        "drive_km": round(results.total("distance_km"), 4),
+        "tiles_downloaded": int(results.total("tiles_downloaded")),
+        "reports_sent": int(results.total("reports_sent")),
+        "reports_acknowledged": int(results.total("reports_acknowledged")),
+        "reports_quarantined": int(results.total("reports_quarantined")),
+        "reports_lost": len(lost_reports(folder, store)),
+        "tiles_published": outcome.published,
+        "updates_received": count_lines(folder.updates),
+        "changed_voxels": sum(history.changed_voxels() for history in histories),
+        "agent_pss_mb_max": max((result["memory_mb"]["pss"] for result in results.results), default=None),
+        "restarts": outcome.restarts,
+    }
 
-    def total(self, key: str) -> float:
-        """Return the sum of a number over the vehicles."""
-        return sum(result[key] for result in self.results)
+
+def _evaluate(
+    folder: RunFolder, prepared: PreparedRun, store: SqliteStore, histories: list[TileHistory]
+) -> dict[str, Any]:
+    """Compare with the truth where there is one; draw the maps in any case."""
+    if prepared.truth is None:
+        return dict(NO_TRUTH)
+    return score_run(read_truth(prepared.truth), store, histories).as_dict()
+
+
+def _write(path: Path, summary: dict[str, Any]) -> None:
+    partial = path.with_suffix(".partial")
+    partial.write_text(json.dumps(summary, indent=2) + "\n", encoding="utf-8")
+    partial.replace(path)
+
+
+def summary_lines(summary: dict[str, Any]) -> list[str]:
+    """Return a summary as lines for people."""
+    traffic, f1, p95 = summary["traffic"], summary["f1"], summary["localisation_p95"]
+    lines = [
+        f"{summary['agents']} agents drove {summary['drive_km']:.2f} km on {summary['link']} links "
+        f"in {summary['wall_s']:.0f} s; {summary['tiles_downloaded']} tiles downloaded",
+        f"{summary['reports_sent']} reports sent, {summary['reports_acknowledged']} acknowledged, "
+        f"{summary['reports_lost']} lost; {summary['tiles_published']} tile versions published, "
+        f"{summary['updates_received']} updates received, {summary['changed_voxels']} voxels changed",
+        f"traffic: {size_text(traffic['down_bytes'])} down, {size_text(traffic['up_bytes'])} up "
+        f"({traffic['kB_per_km_down']:.0f} and {traffic['kB_per_km_up']:.1f} kB/km)",
+    ]
+    if p95["longitudinal_m"] is not None:
+        lines.append(
+            f"localisation, 95 % of errors: {p95['longitudinal_m'] * 100:.1f} cm along, "
+            f"{p95['lateral_m'] * 100:.1f} cm across, {p95['heading_deg']:.3f} degrees"
+        )
+    if f1["before"] is not None:
+        lines.append(
+            f"map against the truth, macro F1: {f1['before']:.1f} % before, {f1['single']:.1f} % by a single drive, "
+            f"{f1['after']:.1f} % after"
+        )
+    return lines

@@ -1,0 +1,110 @@
+"""The account of a run: what agents sent, what the store holds, what the watcher saw."""
+
+import json
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from deploy.run_folder import RunFolder
+from gnd_map.gaussian import Gaussians
+from gnd_map.tile import diff
+from tile_store.sqlite_store import SqliteStore
+from tile_store.values import DEFAULT_LAYER, StoredTile
+from vehicle_agent.outbox import Outbox
+
+P95 = 0.95
+
+
+@dataclass(frozen=True, slots=True)
+class FleetResults:
+    """The result files of all vehicles of a run.
+
+    Attributes:
+        results: one decoded `result.json` a vehicle.
+    """
+
+    results: tuple[dict[str, Any], ...]
+
+    @classmethod
+    def read(cls, folder: RunFolder) -> "FleetResults":
+        """Read the result of every vehicle that left one, in the order of their names."""
+        files = sorted(folder.agents.glob("*/result.json"))
+        return cls(tuple(json.loads(path.read_text(encoding="utf-8")) for path in files))
+
+    def total(self, key: str) -> float:
+        """Return the sum of a number over the vehicles."""
+        return float(sum(result[key] for result in self.results))
+
+    def traffic(self) -> dict[str, float]:
+        """Return bytes of the application and on the wire, and kB a driven km, over all vehicles."""
+        names = ("down_bytes", "up_bytes", "down_wire_bytes", "up_wire_bytes")
+        sums = {name: sum(int(result["traffic"][name]) for result in self.results) for name in names}
+        drive_km = self.total("distance_km")
+        return sums | {
+            "kB_per_km_up": _per_km(sums["up_bytes"], drive_km),
+            "kB_per_km_down": _per_km(sums["down_bytes"], drive_km),
+        }
+
+    def localisation_p95(self) -> dict[str, float | None]:
+        """Return the 95 % quantile of the absolute errors of all refined scans of all vehicles together."""
+        return {name: self._p95(name) for name in ("longitudinal_m", "lateral_m", "heading_deg")}
+
+    def _p95(self, name: str) -> float | None:
+        errors = [error for result in self.results for error in (result["localisation"] or {}).get(name, ())]
+        return round(float(np.quantile(np.abs(errors), P95)), 4) if errors else None
+
+
+def _per_km(size: int, drive_km: float) -> float:
+    return round(size / 1000 / drive_km, 3) if drive_km > 0 else 0.0
+
+
+def lost_reports(folder: RunFolder, store: SqliteStore) -> list[str]:
+    """Return the ids of reports that a vehicle made but neither the store nor its quarantine can show.
+
+    Args:
+        folder: the run; each vehicle's outbox says what it made.
+        store: the store of the run.
+    """
+    made: dict[str, str] = {}
+    for path in sorted(folder.agents.glob("*/outbox.sqlite")):
+        outbox = Outbox(path)
+        made |= outbox.states()
+        outbox.close()
+    stored = {row.report_id for row in store.reports()}
+    return sorted(report_id for report_id, state in made.items() if report_id not in stored and state != "quarantined")
+
+
+@dataclass(frozen=True, slots=True)
+class TileHistory:
+    """A tile before and after a run.
+
+    Attributes:
+        before: Gaussians of the epoch, empty where the tile was not mapped.
+        after: Gaussians of the newest version.
+        tile: the newest version as stored.
+    """
+
+    tile: StoredTile
+    before: Gaussians
+    after: Gaussians
+
+    def changed_voxels(self) -> int:
+        """Return how many voxels differ."""
+        delta = diff(self.before, self.after)
+        return len(delta.removed) + len(delta.put)
+
+
+def tile_histories(store: SqliteStore, layer: str = DEFAULT_LAYER) -> list[TileHistory]:
+    """Return every tile of a store as it was in its epoch and as it is now."""
+    return [_history(store, layer, entry.tile, entry.version) for entry in store.heads(layer)]
+
+
+def _history(store: SqliteStore, layer: str, tile: Any, version: int) -> TileHistory:
+    head = store.get(layer, tile, version)
+    if head is None:
+        raise LookupError(f"version {version} of tile {tile.path} was listed but is not there")
+    bases = [info.version for info in store.history(layer, tile) if info.kind != "merged"]
+    base = store.get(layer, tile, bases[-1]) if bases else None
+    before = Gaussians.empty() if base is None else base.decode().gaussians
+    return TileHistory(head, before, head.decode().gaussians)

@@ -1,0 +1,106 @@
+"""The run against the truth of its simulated world: the stale map, each drive alone, and the healed map."""
+
+import statistics
+from collections import defaultdict
+from collections.abc import Iterable
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from deploy.account import TileHistory
+from fleet_sim.evaluate import Evaluation, Tiles, evaluate_maps
+from fleet_sim.truth import LEVELS, Truth
+from gnd_map.gaussian import Gaussians
+from gnd_map.tile import TileDelta, apply, diff
+from gnd_map.tile_id import TileId
+from schemas.changes import ChangeReport, TileChange
+from tile_store.sqlite_store import SqliteStore
+from tile_store.values import DEFAULT_LAYER
+
+
+@dataclass(frozen=True, slots=True)
+class RunScores:
+    """A run compared with the truth.
+
+    Attributes:
+        before: the base map, taken as if nothing had changed.
+        single: for each vehicle, the map as its own reports alone would have it.
+        after: the newest map.
+    """
+
+    before: Evaluation
+    single: dict[str, Evaluation]
+    after: Evaluation
+
+    def as_dict(self) -> dict[str, Any]:
+        """Return macro F1 in percent: scored voxels by stage, and all three levels below `levels`."""
+        levels = {level: self._stages(level) for level in LEVELS}
+        by_vehicle = {name: round(score.f1("scored"), 2) for name, score in sorted(self.single.items())}
+        return {**levels["scored"], "levels": levels, "single_by_vehicle": by_vehicle}
+
+    def _stages(self, level: Any) -> dict[str, float | None]:
+        alone = [score.f1(level) for score in self.single.values()]
+        return {
+            "before": round(self.before.f1(level), 2),
+            "single": round(statistics.fmean(alone), 2) if alone else None,
+            "after": round(self.after.f1(level), 2),
+        }
+
+
+NO_TRUTH: dict[str, Any] = {"before": None, "single": None, "after": None}
+
+
+def score_run(truth: Truth, store: SqliteStore, histories: Iterable[TileHistory]) -> RunScores:
+    """Compare a finished run with the truth.
+
+    Args:
+        truth: the truth of the simulated world.
+        store: the store of the run: versions and reports.
+        histories: every tile before and after.
+
+    Returns:
+        The scores of the three stages.
+    """
+    held = list(histories)
+    base = {history.tile.tile: history.before for history in held}
+    final = {history.tile.tile: history.after for history in held}
+    single = {vehicle: evaluate_maps(truth, base, alone) for vehicle, alone in maps_of_vehicles(store, base).items()}
+    return RunScores(evaluate_maps(truth, base, base), single, evaluate_maps(truth, base, final))
+
+
+def maps_of_vehicles(store: SqliteStore, base: Tiles) -> dict[str, dict[TileId, Gaussians]]:
+    """Return for each vehicle the base map changed by its own reports and nothing else.
+
+    A voxel that it observed is as it said: the new Gaussian, nothing, or as in the version that it held.
+    """
+    maps: dict[str, dict[TileId, Gaussians]] = defaultdict(lambda: dict(base))
+    for row in store.reports():
+        for change in ChangeReport.decode(row.body).tiles:
+            held = _held(store, change, base)
+            alone = maps[row.vehicle]
+            alone[change.tile] = with_statement(alone.get(change.tile, Gaussians.empty()), held, change)
+    return dict(maps)
+
+
+def with_statement(tile: Gaussians, held: Gaussians, change: TileChange) -> Gaussians:
+    """Return a tile after what one report says about it.
+
+    Args:
+        tile: the tile before.
+        held: the version that the vehicle compared with.
+        change: its statement.
+    """
+    as_held = diff(tile.select(change.observed), held.select(change.observed))
+    said = change.changed
+    there = said.take(np.flatnonzero(said.count > 0))
+    gone = np.setdiff1d(said.voxel_id, there.voxel_id)
+    after = apply(tile, as_held)
+    return apply(after, TileDelta(np.intersect1d(gone, after.voxel_id), there))
+
+
+def _held(store: SqliteStore, change: TileChange, base: Tiles) -> Gaussians:
+    if not change.base_sha:
+        return Gaussians.empty()
+    stored = store.by_sha(DEFAULT_LAYER, change.tile, change.base_sha)
+    return base.get(change.tile, Gaussians.empty()) if stored is None else stored.decode().gaussians

@@ -1,0 +1,30 @@
+"""Where the drives and the map of a run come from."""
+
+from dataclasses import dataclass
+from pathlib import Path
+
+from deploy.errors import DeployError
+
+
+@dataclass(frozen=True, slots=True)
+class Source:
+    """Recorded drives, or a simulated world.
+
+    Attributes:
+        drives: MCAP files or folders; empty for a simulated world.
+        base_map: a store with the map of the recorded drives, None to start without a map.
+        worlds: folder that keeps simulated worlds for further runs, None to keep them in the run.
+        agents: number of vehicles as asked for, None where it was not.
+    """
+
+    drives: tuple[Path, ...] = ()
+    base_map: Path | None = None
+    worlds: Path | None = None
+    agents: int | None = None
+
+    def __post_init__(self) -> None:
+        """Refuse options that contradict each other."""
+        if self.base_map is not None and not self.drives:
+            raise DeployError("--map goes with --drives: a simulated run builds its own map")
+        if self.worlds is not None and self.drives:
+            raise DeployError("--worlds is for simulated runs, --drives for recorded ones: give one of them")
