@@ -19,7 +19,6 @@ from fleet_bus.bus import open_bus
 from fleet_bus.config import DEFAULT_ENDPOINT, BusConfig
 from tile_store import tables
 from tile_store.arguments import parse_tile, parse_time_ns, parse_versions
-from tile_store.build import build_map
 from tile_store.compare import MapDiff, map_diff, map_info, version_diff
 from tile_store.errors import StoreError
 from tile_store.export import FORMATS, export_map
@@ -81,6 +80,8 @@ def map_group() -> None:
 @json_option
 def build(drives: tuple[Path, ...], path: Path, layer: str, as_json: bool) -> None:
     """Build tiles from DRIVES (MCAP, with reference poses) and put them into a store as a new base."""
+    from tile_store.build import build_map  # it loads numba, which the other commands do without
+
     with _store_to_fill(path) as opened, _bars() as bars:
         result = build_map(drives, opened, layer=layer, progress=_Shown(bars))
     _show(

@@ -1,0 +1,174 @@
+"""`gnd map …` as its users call it: numbers for people and for programs, and errors in one line."""
+
+import json
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from click.testing import CliRunner
+from store_helpers import EAGER, EAST, FAR, TILE, merge_once, report, report_id, tile_of_voxels
+
+from gnd_map.errors import GndError
+from gnd_map.geodesy import LocalFrame
+from schemas.drive import DriveHeader, ReferencePose, Scan
+from schemas.drive_mcap import DriveWriter
+from tile_store.cli import map_group
+from tile_store.sqlite_store import SqliteStore
+
+T0_NS = 1_700_000_000_000_000_000
+
+
+@pytest.fixture
+def path(tmp_path: Path) -> Path:
+    """A store with three tiles; that of Figure 2 has been merged once."""
+    at = tmp_path / "map.db"
+    with SqliteStore(at, EAGER) as store:
+        store.put_tiles([tile_of_voxels(tile, 1, 2, 3) for tile in (TILE, EAST, FAR)])
+        store.put_reports([report(1)])
+        merge_once(store, 2, 3, 4, 5)
+    return at
+
+
+def gnd_map(*arguments: object) -> str:
+    """What `gnd map` prints; what it raises is raised here."""
+    result = CliRunner().invoke(map_group, list(map(str, arguments)), catch_exceptions=False)
+    assert result.exit_code == 0, result.output
+    return result.stdout
+
+
+def as_json(*arguments: object) -> Any:
+    return json.loads(gnd_map(*arguments, "--json"))
+
+
+def refused(*arguments: object) -> str:
+    with pytest.raises(GndError) as caught:
+        gnd_map(*arguments)
+    assert "\n" not in str(caught.value)
+    return str(caught.value)
+
+
+def write_drive(at: Path) -> Path:
+    """A vehicle that stands before a wall."""
+    anchor = LocalFrame(*TILE.centre_rad, 0.0)
+    rng = np.random.default_rng(0)
+    with DriveWriter(at, DriveHeader("wall", "car-1", "test", anchor, np.eye(4), "made by a test")) as writer:
+        for k in range(3):
+            points = np.stack([np.full(3000, 5.3), rng.uniform(-4, 4, 3000), rng.uniform(0, 3, 3000)], axis=1)
+            writer.scan(Scan(T0_NS + k * 100_000_000, points.astype(np.float32), np.zeros(3000, np.uint32)))
+        for k in range(5):
+            writer.reference(ReferencePose(T0_NS + k * 100_000_000, np.eye(4)))
+    return at
+
+
+def test_build_makes_a_store_from_drives(tmp_path: Path) -> None:
+    drive, at = write_drive(tmp_path / "wall.mcap"), tmp_path / "new.db"
+    built = as_json("build", drive, "--store", at)
+    assert (built["drives"], built["scans"], built["points"]) == (1, 3, 9000)
+    assert built["gaussians"] > 20
+    assert {one.name for one in tmp_path.iterdir()} == {"wall.mcap", "new.db"}
+    told = as_json("info", at)
+    assert (told["tiles"], told["gaussians"], told["points"]) == (built["tiles"], built["gaussians"], 9000)
+    again = as_json("build", drive, "-o", at)
+    assert again["versions_published"] == 0
+    assert "gaussians" in gnd_map("build", drive, "-o", at, "--layer", "other")
+    assert as_json("info", at, "--layer", "other")["layers"] == ["ndt", "other"]
+
+
+def test_a_build_that_fails_leaves_nothing_behind(tmp_path: Path) -> None:
+    (tmp_path / "broken.mcap").write_bytes(b"\x89MCAP0\r\n" + bytes(100))
+    assert "broken.mcap" in refused("build", tmp_path / "broken.mcap", "-o", tmp_path / "new.db")
+    assert [one.name for one in tmp_path.iterdir()] == ["broken.mcap"]
+    assert "the folder" in refused("build", tmp_path / "broken.mcap", "-o", tmp_path / "no" / "new.db")
+
+
+def test_info_in_numbers_and_as_a_table(path: Path) -> None:
+    told = as_json("info", path)
+    assert (told["tiles"], told["districts"], told["gaussians"]) == (3, 2, 10)
+    assert (told["lowest_version"], told["highest_version"], told["layers"]) == (1, 2, ["ndt"])
+    assert told["store"]["versions"] == 4
+    assert as_json("info", path, "--region", "13033")["tiles"] == 2
+    table = gnd_map("info", path)
+    assert "gaussians" in table
+    assert "store quarantined" in table
+
+
+@pytest.mark.parametrize("name", ["map.pcd", "map.ply", "map.geojson"])
+def test_export_writes_the_region(path: Path, tmp_path: Path, name: str) -> None:
+    told = as_json("export", path, tmp_path / name, "--region", "13033/03021")
+    assert (told["tiles"], told["gaussians"]) == (2, 7)
+    assert told["size_bytes"] == (tmp_path / name).stat().st_size
+    assert "7 Gaussians of 2 tiles" in gnd_map("export", path, tmp_path / name, "--region", "13033")
+
+
+def test_diff_of_two_stores(path: Path, tmp_path: Path) -> None:
+    other = tmp_path / "other.db"
+    with SqliteStore(other) as store:
+        store.put_tiles([tile_of_voxels(TILE, 1, 2), tile_of_voxels(FAR, 1, 2, 3)])
+    told = as_json("diff", other, path)
+    assert (told["added"], told["removed"], told["tiles_same"]) == (6, 1, 1)
+    assert "2 tiles differ, 1 are the same; voxels: 6 added, 1 removed, 0 changed" in gnd_map("diff", other, path)
+    assert "0 tiles differ, 3 are the same" in gnd_map("diff", path, path)
+
+
+def test_diff_of_two_versions_of_a_tile(path: Path) -> None:
+    for arguments in (["--versions", "1..2"], []):
+        told = as_json("diff", path, "--tile", TILE.morton, *arguments)
+        assert (told["added"], told["removed"], told["same"]) == (2, 1, 2)
+    assert as_json("diff", path, "--tile", TILE.path, "--versions", "2..1")["added"] == 1
+
+
+def test_diff_since_a_time(path: Path) -> None:
+    told = as_json("diff", path, "--since", "2001-01-01")
+    assert (told["added"], len(told["tiles"])) == (10, 3)
+    assert as_json("diff", path, "--since", "2199-01-01T00:00:00Z")["tiles"] == []
+
+
+def test_history_names_the_reports_of_each_version(path: Path) -> None:
+    told = as_json("history", path, TILE.path)
+    first, second = told["versions"]
+    assert (first["kind"], first["reports"]) == ("base", [])
+    assert (second["kind"], second["merger"], second["reports"]) == ("merged", "m1", [report_id(1)])
+    assert second["sha"] == tile_of_voxels(TILE, 2, 3, 4, 5).sha.hex()
+    table = gnd_map("history", path, f"{TILE.morton}")
+    assert "merged" in table
+    assert second["sha"][:12] in table
+
+
+def test_rollback_publishes_the_old_content(path: Path) -> None:
+    assert as_json("rollback", path, TILE.path, 1)["version"] == 3
+    assert "version 4 has the content of version 2" in gnd_map("rollback", path, TILE.path, 2)
+    kinds = [version["kind"] for version in as_json("history", path, TILE.path)["versions"]]
+    assert kinds == ["base", "merged", "rollback", "rollback"]
+    with SqliteStore(path) as store:
+        assert [notice.version for notice in store.notices()] == [2, 3, 4]
+
+
+def test_what_cannot_be_is_said_in_one_line_and_nothing_is_made(path: Path, tmp_path: Path) -> None:
+    before = sorted(tmp_path.iterdir())
+    missing = tmp_path / "missing.db"
+    assert "no such store" in refused("info", missing)
+    assert "no such store" in refused("diff", path, missing)
+    assert "not a path" in refused("history", path, "13033/03021")
+    assert "is not in" in refused("history", path, TILE.neighbours()[0].path)
+    assert "has no version 9 (newest: 2)" in refused("rollback", path, TILE.path, 9)
+    assert "has 1 versions; two are needed" in refused("diff", path, "--tile", EAST.path)
+    assert "has no version 7" in refused("diff", path, "--tile", TILE.path, "--versions", "1..7")
+    assert "not like 3..5" in refused("diff", path, "--tile", TILE.path, "--versions", "1-7")
+    assert "give either OTHER" in refused("diff", path)
+    assert "give either OTHER" in refused("diff", path, path, "--versions", "1..2")
+    assert "not like 2026" in refused("diff", path, "--since", "yesterday")
+    assert "no tiles in layer" in refused("info", path, "--layer", "signs")
+    assert "no tiles in layer" in refused("export", path, tmp_path / "x.pcd", "--region", "13000")
+    assert "unknown export format 'las'" in refused("export", path, tmp_path / "x.las")
+    assert "base-4 digits" in refused("info", path, "--region", "9")
+    assert sorted(tmp_path.iterdir()) == before
+
+
+def test_the_command_line_turns_errors_into_one_line_and_exit_code_2(tmp_path: Path) -> None:
+    command = [sys.executable, "-m", "deploy.cli", "map", "info", str(tmp_path / "missing.db")]
+    done = subprocess.run(command, capture_output=True, text=True)
+    assert (done.returncode, done.stdout) == (2, "")
+    assert done.stderr == f"gnd: {tmp_path / 'missing.db'}: no such store; `gnd map build` makes one\n"
