@@ -29,17 +29,17 @@ class KeySpec:
 KEY_TABLE: Final = (
     KeySpec(
         pattern=f"{ROOT}/tile/<layer>/<q5>/<q10>/<q15>/<q20>",
-        kind="query, agent → tile server",
-        request="TileRequest",
+        kind="query, any client → tile server",
+        request="TileRequest, or nothing",
         reply="TileReply",
-        reliability="asked again until answered; a wildcard is answered with one reply a tile",
+        reliability="asked again until answered; a wildcard is answered with one reply a tile that exists",
     ),
     KeySpec(
         pattern=f"{ROOT}/catalog/<layer>/<q5>/<q10>/<q15>",
         kind="query, any client → tile server",
         request="–",
         reply="Catalog",
-        reliability="asked again until answered",
+        reliability="asked again until answered; a wildcard is answered with one reply a district",
     ),
     KeySpec(
         pattern=f"{ROOT}/change/<layer>/<q5>/<q10>/<q15>",

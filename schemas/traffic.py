@@ -37,7 +37,7 @@ class TrafficLine:
     """"up" = from the vehicle to the cloud."""
     messages: int
     app_bytes: int
-    """Payload and key, before the transport adds its own."""
+    """Payloads, without keys and what the transport adds."""
 
     def __post_init__(self) -> None:
         check_text("traffic kind", self.kind, WORD_PATTERN)

@@ -52,7 +52,7 @@ class TrafficLine(_message.Message):
     messages: _builtins.int
     """[messages]"""
     app_bytes: _builtins.int
-    """Payload and key, before the transport adds its own. [bytes]"""
+    """Payloads, without keys and what the transport adds. [bytes]"""
     def __init__(
         self,
         *,
