@@ -3,7 +3,7 @@
 import threading
 from typing import Self, TypeVar
 
-from fleet_bus import requesting, subscribing
+from fleet_bus import leftovers, requesting, subscribing
 from fleet_bus.config import BusConfig
 from fleet_bus.connection import Connection
 from fleet_bus.ledger import Ledger
@@ -43,6 +43,7 @@ class Bus:
         self._connection = connection
         self._parts: list[Part] = []
         self._lock = threading.Lock()
+        leftovers.remember(self)
 
     def __enter__(self) -> Self:
         return self
@@ -220,6 +221,7 @@ class Bus:
         for part in parts:
             part.close()
         self._connection.close()
+        leftovers.forget(self)
         if self.ledger is not None:
             self.wire()
             self.ledger.flush()

@@ -13,7 +13,7 @@ from rich.console import Console
 from fleet_bus.config import DEFAULT_ENDPOINT
 from fleet_bus.ledger_file import read_run
 from fleet_bus.links import load_link
-from fleet_bus.router import open_router
+from fleet_bus.router import open_router, wait_for_stop
 from fleet_bus.traffic import agent_traffic, as_json
 from fleet_bus.traffic_table import print_tables
 
@@ -34,7 +34,7 @@ def router(listen: tuple[str, ...], connect: tuple[str, ...]) -> None:
         for number in (signal.SIGINT, signal.SIGTERM):
             signal.signal(number, end)
         click.echo(f"router listens at {', '.join(listen)}; Ctrl-C ends it")
-        stop.wait()
+        wait_for_stop(stop)
     click.echo("router ended")
 
 

@@ -31,7 +31,8 @@ class Connection:
         self.meter = WireMeter()
         self._pacer = Pacer(config.link_profile, self.closed)
         self._pid = os.getpid()
-        self._links = session.info.declare_link_events_listener(self._on_link, history=True)
+        if config.mode == "client":  # a router carries everybody's bytes, and needs its descriptors for them
+            self._links = session.info.declare_link_events_listener(self._on_link, history=True)
 
     @classmethod
     def open(cls, config: BusConfig, ledger: Ledger | None, name: str) -> Self:

@@ -5,13 +5,16 @@ server's.
 """
 
 import logging
+import resource
 import threading
 from collections.abc import Sequence
+from typing import Final
 
 from fleet_bus.bus import Bus, open_bus
 from fleet_bus.config import DEFAULT_ENDPOINT, BusConfig
 
 _LOG = logging.getLogger(__name__)
+_LOOK_UP_S: Final = 0.25
 
 
 def open_router(listen: Sequence[str] = (DEFAULT_ENDPOINT,), connect: Sequence[str] = ()) -> Bus:
@@ -25,6 +28,7 @@ def open_router(listen: Sequence[str] = (DEFAULT_ENDPOINT,), connect: Sequence[s
         PortInUse: another process listens there.
         BusConfigError: malformed endpoint.
     """
+    _raise_file_limit()
     config = BusConfig(mode="router", listen=tuple(listen), connect=tuple(connect))
     return open_bus(config, name="router")
 
@@ -35,5 +39,21 @@ def run_router(
     """Runs a router until the event is set; errors as `open_router`."""
     with open_router(listen, connect):
         _LOG.info("router listens at %s", ", ".join(listen))
-        stop.wait()
+        wait_for_stop(stop)
     _LOG.info("router ended")
+
+
+def wait_for_stop(stop: threading.Event) -> None:
+    """Waits in the main thread for an event that a signal handler sets.
+
+    A signal that arrives just before a wait without timeout is seen only after it, that is never: look up now and then.
+    """
+    while not stop.wait(_LOOK_UP_S):
+        pass
+
+
+def _raise_file_limit() -> None:
+    """A session is a descriptor: take all that the system allows (often 1024 unless asked for)."""
+    soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
+    if soft != hard:
+        resource.setrlimit(resource.RLIMIT_NOFILE, (hard, hard))

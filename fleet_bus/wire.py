@@ -90,17 +90,21 @@ def _reading(tap: socket.socket) -> WireBytes:
 def _duplicate_of(source: str, destination: str) -> socket.socket | None:
     """A second descriptor of this process's socket between two locators; None where there is none."""
     wanted = _address(source), _address(destination)
-    for entry in _FD_FOLDER.iterdir() if _FD_FOLDER.is_dir() else ():
-        tap = _tcp_socket(int(entry.name))
+    for descriptor in _descriptors():
+        tap = _tcp_socket(descriptor)
         if tap is None:
             continue
-        try:
-            if (_ends(tap.getsockname()), _ends(tap.getpeername())) == wanted:
-                return tap
-        except OSError:
-            pass
+        if _ends_of(tap) == wanted:
+            return tap
         tap.close()
     return None
+
+
+def _descriptors() -> list[int]:
+    try:
+        return [int(entry.name) for entry in _FD_FOLDER.iterdir()]
+    except OSError:  # not Linux, or no descriptor left
+        return []
 
 
 def _tcp_socket(descriptor: int) -> socket.socket | None:
@@ -116,8 +120,12 @@ def _tcp_socket(descriptor: int) -> socket.socket | None:
     return None
 
 
-def _ends(address: tuple[str, int] | tuple[str, int, int, int]) -> tuple[str, int]:
-    return address[0], address[1]
+def _ends_of(tap: socket.socket) -> tuple[tuple[str, int], tuple[str, int]] | None:
+    try:
+        own, peer = tap.getsockname(), tap.getpeername()
+    except OSError:  # not connected
+        return None
+    return (own[0], own[1]), (peer[0], peer[1])
 
 
 def _address(locator: str) -> tuple[str, int]:
