@@ -32,7 +32,9 @@ class Connection:
         self._pacer = Pacer(config.link_profile, self.closed)
         self._pid = os.getpid()
         if config.mode == "client":  # a router carries everybody's bytes, and needs its descriptors for them
-            self._links = session.info.declare_link_events_listener(self._on_link, history=True)
+            self._links = session.info.declare_link_events_listener(self._on_link)
+            for link in session.info.links():  # now: the first event may come after the first message
+                self.meter.attach(link.src, link.dst)
 
     @classmethod
     def open(cls, config: BusConfig, ledger: Ledger | None, name: str) -> Self:
