@@ -5,12 +5,14 @@ from collections.abc import Iterable, Iterator
 
 import numpy as np
 
+from gnd_map.arrays import F32
 from schemas.drive import DriveItem, GnssFix, MotionSample, Scan
 from vehicle_agent.errors import BadScan
 
 MIN_POINTS = 50
 MIN_FINITE = 0.5  # share of the points
 MIN_SPREAD_M = 0.5  # a sensor that repeats one value shows less
+SAMPLE = 1000  # points that usually settle it
 
 
 def check_scan(scan: Scan) -> None:
@@ -22,12 +24,17 @@ def check_scan(scan: Scan) -> None:
     n = len(scan.points_m)
     if n < MIN_POINTS:
         raise BadScan("empty", f"scan at {scan.t_ns} ns has {n} points, {MIN_POINTS} are needed")
-    finite = np.isfinite(scan.points_m).all(axis=1)
-    if finite.mean() < MIN_FINITE:
-        raise BadScan("not-finite", f"scan at {scan.t_ns} ns: {n - int(finite.sum())} of {n} points are not finite")
-    spread_m = float(np.ptp(scan.points_m[finite], axis=0).max())
-    if spread_m < MIN_SPREAD_M:
-        raise BadScan("constant", f"scan at {scan.t_ns} ns: all points lie within {spread_m:.3g} m")
+    bad = scan.points_m.size - int(np.count_nonzero(np.isfinite(scan.points_m)))
+    if bad > (1 - MIN_FINITE) * scan.points_m.size:
+        raise BadScan("not-finite", f"scan at {scan.t_ns} ns: {bad} of {3 * n} coordinates are not finite")
+    if spread_m(scan.points_m[:: max(1, n // SAMPLE)]) < MIN_SPREAD_M and spread_m(scan.points_m) < MIN_SPREAD_M:
+        raise BadScan("constant", f"scan at {scan.t_ns} ns: its {n} points lie within {MIN_SPREAD_M} m")
+
+
+def spread_m(points_m: F32) -> float:
+    """Longest side of the box around the points (N, 3), metres; what is not finite does not count."""
+    finite = [x[np.isfinite(x)] for x in points_m.T]
+    return max(float(np.ptp(x)) if len(x) else 0.0 for x in finite)
 
 
 class Guard:

@@ -68,7 +68,7 @@ class ChangeDetector:
         window = self._current()
         if not len(points) or not window.state.size:
             return 0
-        affine = self.local_map.grid_frame.affine(origins.mean(axis=0))
+        affine = self.local_map.grid_frame.affine(0.5 * (origins[0] + origins[-1]))
         A, b = window_affine(*affine, window.anchor_m, window.origin_g)
         kept = np.zeros(len(points), np.uint8)
         cast = cast_rays(
