@@ -180,6 +180,7 @@ class ChangeReport:
 
     def _check_tiles(self) -> None:
         check_length(f"report {self.report_id}", len(self.tiles), limits.MAX_TILES_OF_DISTRICT, "tiles")
+        _check_observed(sum(len(change.observed) for change in self.tiles), len(self.tiles))
         if not self.tiles:
             raise BadValue(f"report {self.report_id} has no tiles")
         for before, after in pairwise(self.tiles):
@@ -254,9 +255,13 @@ def _change_values(message: change_report_pb2.ChangeReport) -> tuple[TileChange,
     for change in message.tiles:
         changes.append(_change_value(change))
         observed += len(changes[-1].observed)
-        if observed > limits.MAX_OBSERVED_OF_REPORT:
-            raise TooLarge(f"report observes more than {limits.MAX_OBSERVED_OF_REPORT} voxels in {len(changes)} tiles")
+        _check_observed(observed, len(changes))
     return tuple(changes)
+
+
+def _check_observed(voxels: int, tiles: int) -> None:
+    if voxels > limits.MAX_OBSERVED_OF_REPORT:
+        raise TooLarge(f"report observes more than {limits.MAX_OBSERVED_OF_REPORT} voxels in {tiles} tiles")
 
 
 def _change_value(message: tile_change_pb2.TileChange) -> TileChange:

@@ -13,6 +13,7 @@ The metadata record `gnd.drive` holds the header. Scans fill chunks of their own
 seconds, so that the track is read without unpacking the points.
 """
 
+import contextlib
 import os
 from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
@@ -174,7 +175,8 @@ class DriveWriter:
 
     def discard(self) -> None:
         """Throw away what was written. Called when the `with` block fails."""
-        self._stream.close()
+        with contextlib.suppress(OSError):  # a full disk fails once more on what is still buffered
+            self._stream.close()
         self._partial.unlink(missing_ok=True)
 
     def __enter__(self) -> "DriveWriter":

@@ -55,6 +55,7 @@ class TileUpdate:
         check_sha("tile sha", self.sha)
         check_pair("previous", self.previous_version, self.previous_sha)
         check_word(self.reason, _REASON, "update reason")
+        _check_removed(0 if self.delta is None else len(self.delta.removed))
         if self.previous_version >= self.version:
             raise BadValue(f"update of tile {self.tile} to version {self.version} from {self.previous_version}")
 
@@ -100,5 +101,9 @@ def _delta_message(delta: TileDelta) -> tile_delta_pb2.TileDelta:
 
 
 def _delta_value(message: tile_delta_pb2.TileDelta) -> TileDelta:
-    check_length("delta", len(message.removed), limits.MAX_REMOVED_VOXELS, "removed voxels")
+    _check_removed(len(message.removed))
     return TileDelta(np.array(message.removed, np.int32), codec_of(message.codec_id).decode(message.put))
+
+
+def _check_removed(count: int) -> None:
+    check_length("delta", count, limits.MAX_REMOVED_VOXELS, "removed voxels")

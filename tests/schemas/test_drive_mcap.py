@@ -1,6 +1,8 @@
 """Recorded drives: what is written is read back, in time order, in little memory, and opens as Foxglove expects."""
 
+import contextlib
 import itertools
+import resource
 import tracemalloc
 from collections.abc import Iterator
 from pathlib import Path
@@ -239,6 +241,25 @@ def break_off(path: Path) -> None:
 def test_a_failed_recording_leaves_nothing_behind(tmp_path: Path) -> None:
     with pytest.raises(RuntimeError, match="the sensor is gone"):
         break_off(tmp_path / "drive.mcap")
+    assert list(tmp_path.iterdir()) == []
+
+
+@contextlib.contextmanager
+def files_of_at_most(size: int) -> Iterator[None]:
+    """The operating system refuses to let any file grow further, as a full disk does."""
+    soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (size, hard))
+    try:
+        yield
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
+
+
+@pytest.mark.parametrize("count", [1, 40], ids=["noticed at the end", "noticed on the way"])
+def test_a_full_disk_is_named_and_leaves_nothing_behind(tmp_path: Path, count: int) -> None:
+    scans = [scan(T0_NS + k * S, 10_000, k) for k in range(count)]
+    with files_of_at_most(100_000), pytest.raises(DriveError, match=r"drive\.mcap: cannot write drive: File too large"):
+        write(tmp_path / "drive.mcap", scans)  # type: ignore[arg-type]
     assert list(tmp_path.iterdir()) == []
 
 

@@ -32,7 +32,7 @@ from schema_values import (
 )
 
 from gnd_map.gaussian import Gaussians
-from gnd_map.tile import Tile
+from gnd_map.tile import Tile, TileDelta
 from gnd_map.tile_id import TileId
 from schemas import limits
 from schemas.bitmap import decode_observed, encode_observed
@@ -211,6 +211,17 @@ def test_a_report_of_millions_of_empty_tiles_is_refused_before_parsing() -> None
 def test_encoding_more_than_a_reader_takes_is_refused_by_the_writer() -> None:
     with pytest.raises(TooLarge, match=r"has 4800004 bytes, the limit is 4194304"):
         blob_of(Tile(TILE, 1, gaussians(np.arange(100_000))))
+
+
+def test_a_report_that_no_reader_would_take_cannot_be_made() -> None:
+    full = np.arange(8 * limits.MAX_OBSERVED_BITMAP_BYTES, dtype=np.int32)
+    first = TILE.district.first_morton
+    all_of_it = tuple(change(TileId(first + k), changed=Gaussians.empty(), observed=full) for k in range(9))
+    report(tiles=all_of_it[:8])
+    with pytest.raises(TooLarge, match="observes more than 8388608 voxels in 9 tiles"):
+        report(tiles=all_of_it)
+    with pytest.raises(TooLarge, match="has 200001 removed voxels"):
+        update(delta=TileDelta(np.arange(200_001, dtype=np.int32), Gaussians.empty()))
 
 
 # Hostile reports. Each starts from a good message and changes one thing.
