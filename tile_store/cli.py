@@ -7,6 +7,7 @@ import threading
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
 from dataclasses import asdict
+from hashlib import sha256
 from pathlib import Path
 from types import FrameType
 from typing import Any, Final, TypeVar
@@ -73,7 +74,7 @@ def map_group() -> None:
     """Build, inspect, compare, export and roll back maps."""
 
 
-@map_group.command()
+@map_group.command(short_help="Build a map from drives with known poses.")
 @click.argument("drives", nargs=-1, required=True, type=PATH)
 @click.option("--store", "-o", "path", required=True, type=PATH, help="The store; it is made when missing.")
 @layer_option
@@ -89,7 +90,7 @@ def build(drives: tuple[Path, ...], path: Path, layer: str, as_json: bool) -> No
     )
 
 
-@map_group.command()
+@map_group.command(short_help="What a store holds, in numbers.")
 @click.argument("path", metavar="STORE", type=PATH)
 @region_option
 @layer_option
@@ -102,7 +103,7 @@ def info(path: Path, region: str, layer: str, as_json: bool) -> None:
     _show(values, as_json, lambda console: console.print(tables.info(str(path), values)))
 
 
-@map_group.command()
+@map_group.command(short_help="Write a map as PCD, PLY or GeoJSON.")
 @click.argument("path", metavar="STORE", type=PATH)
 @click.argument("out", metavar="FILE", type=PATH)
 @region_option
@@ -118,7 +119,7 @@ def export(path: Path, out: Path, region: str, layer: str, kind: str | None, as_
     _show(values, as_json, lambda console: console.print(line, highlight=False))
 
 
-@map_group.command()
+@map_group.command(short_help="Where two maps, times or versions differ.")
 @click.argument("old", metavar="STORE", type=PATH)
 @click.argument("new", metavar="[OTHER]", type=PATH, required=False)
 @click.option("--since", help="Compare with STORE as it was then: 2026-01-31T12:00:00Z.")
@@ -152,7 +153,7 @@ def diff(
     _show(result.as_dict(), as_json, lambda console: tables.print_diff(console, result))
 
 
-@map_group.command()
+@map_group.command(short_help="A tile's versions and their reports.")
 @click.argument("path", metavar="STORE", type=PATH)
 @click.argument("tile")
 @layer_option
@@ -172,7 +173,7 @@ def history(path: Path, tile: str, layer: str, as_json: bool) -> None:
     _show(values, as_json, lambda console: console.print(tables.history(values)))
 
 
-@map_group.command()
+@map_group.command(short_help="Publish an older version of a tile again.")
 @click.argument("path", metavar="STORE", type=PATH)
 @click.argument("tile")
 @click.argument("version", type=int)
@@ -188,6 +189,45 @@ def rollback(path: Path, tile: str, version: int, layer: str, as_json: bool) -> 
     values = {"tile": current.tile.path, "layer": layer, "version": current.version, "content_of": version}
     line = f"tile {current.tile.path}: version {current.version} has the content of version {version}"
     _show(values, as_json, lambda console: console.print(line, highlight=False))
+
+
+@map_group.command(short_help="Remove old versions.")
+@click.argument("path", metavar="STORE", type=PATH)
+@click.option("--keep", required=True, type=click.IntRange(1), help="So many of the newest versions of each tile stay.")
+@json_option
+def gc(path: Path, keep: int, as_json: bool) -> None:
+    """Remove old versions; the base and what waiting reports refer to stay."""
+    with _existing(path) as opened:
+        result = opened.gc(keep)
+    line = f"{path}: {result.versions} versions removed, {result.bytes / 1e6:.2f} MB"
+    _show(asdict(result), as_json, lambda console: console.print(line, highlight=False))
+
+
+@map_group.command(short_help="The messages that were refused, and why.")
+@click.argument("path", metavar="STORE", type=PATH)
+@click.option("--save", type=PATH, help="Write the refused bytes into this folder, a file each.")
+@json_option
+def quarantine(path: Path, save: Path | None, as_json: bool) -> None:
+    """The messages that were refused, and why."""
+    with _existing(path) as opened:
+        found = opened.quarantined()
+    rows = [
+        {"received_ns": one.received_ns, "times": one.times, "bytes": len(one.body), "source": one.source}
+        | {"reason": one.reason, "sha256": sha256(one.body).hexdigest()}
+        for one in found
+    ]
+    if save is not None:
+        _save({f"{row['sha256']}.bin": one.body for row, one in zip(rows, found, strict=True)}, save)
+    _show({"quarantined": rows}, as_json, lambda console: console.print(tables.quarantine(rows)))
+
+
+def _save(files: dict[str, bytes], folder: Path) -> None:
+    try:
+        folder.mkdir(exist_ok=True)
+        for name, body in files.items():
+            (folder / name).write_bytes(body)
+    except OSError as error:
+        raise StoreError(f"{folder}: cannot write: {error.strerror}") from None
 
 
 def _version_diff(store: Store, layer: str, tile: str, versions: str | None) -> MapDiff:

@@ -7,8 +7,8 @@ from typing import Any, Final
 import apsw
 
 from gnd_map.tile_id import TileId
-from tile_store.regions import ALL_TILES, morton_range
-from tile_store.sqlite_connection import change, fetch
+from tile_store.regions import morton_range
+from tile_store.sqlite_connection import Row, change, fetch
 from tile_store.values import Claim, PutStatus, ReportRow, StoreConfig
 
 NS_PER_S: Final = 1_000_000_000
@@ -37,12 +37,19 @@ def claim(c: apsw.Connection, owner: str, n: int, lease_s: float, prefer: Sequen
     """Lease ready tiles: those of the preferred regions first, then any, each group oldest first."""
     lease_ns = now + round(lease_s * NS_PER_S)
     claims: list[Claim] = []
-    for first, end in [*map(morton_range, prefer), ALL_TILES]:
+    for first, end in map(morton_range, prefer):
         wanted = {"now": now, "first": first, "end": end, "n": n - len(claims)}
-        for layer, tile, seq, attempts in fetch(c, "claimable", wanted):
-            taken = Claim(layer, TileId(tile), seq, owner, secrets.randbits(62), attempts + 1)
-            change(c, "take_lease", _lease(taken) | {"owner": owner, "lease_ns": lease_ns})
-            claims.append(taken)
+        claims += _take(c, fetch(c, "claimable_in_region", wanted), owner, lease_ns)
+    return claims + _take(c, fetch(c, "claimable", {"now": now, "n": n - len(claims)}), owner, lease_ns)
+
+
+def _take(c: apsw.Connection, rows: Iterable[Row], owner: str, lease_ns: int) -> list[Claim]:
+    claims = [
+        Claim(layer, TileId(tile), seq, owner, secrets.randbits(62), attempts + 1)
+        for layer, tile, seq, attempts in rows
+    ]
+    for one in claims:
+        change(c, "take_lease", _lease(one) | {"owner": owner, "lease_ns": lease_ns})
     return claims
 
 

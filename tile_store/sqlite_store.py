@@ -90,6 +90,8 @@ class SqliteStore:
 
     def put_reports(self, rows: Sequence[ReportRow]) -> list[PutStatus]:
         """See `Store.put_reports`."""
+        if not rows:
+            return []
         return self._writer.run(lambda c: inbox.put_reports(c, rows, self._timing()))
 
     def reports(self, layer: str = DEFAULT_LAYER, vehicle: str | None = None) -> Iterator[ReportRow]:
@@ -117,6 +119,10 @@ class SqliteStore:
 
     def claim(self, owner: str, n: int, lease_s: float, prefer: Sequence[str] = ()) -> list[Claim]:
         """See `Store.claim`."""
+        # Idle mergers look often: they take no write lock for nothing.
+        ready_ns = self.next_ready_ns()
+        if ready_ns is None or ready_ns > self._now_ns():
+            return []
         return self._writer.run(lambda c: inbox.claim(c, owner, n, lease_s, prefer, self._now_ns()))
 
     def renew(self, claims: Sequence[Claim], lease_s: float) -> list[bool]:
@@ -155,6 +161,8 @@ class SqliteStore:
 
     def publish(self, publications: Sequence[Publication]) -> list[PublishResult]:
         """See `Store.publish`."""
+        if not publications:
+            return []
         pairs = [(one, None if one.tile is None else Content.of(one.tile)) for one in publications]
 
         def work(c: apsw.Connection) -> list[PublishResult]:

@@ -12,18 +12,32 @@ from tile_store.compare import MapDiff
 def fields(title: str, values: dict[str, Any]) -> Table:
     """One row a value."""
     table = Table(title=title, show_header=False)
-    table.add_column()
-    table.add_column(justify="right")
     for name, value in values.items():
-        table.add_row(name.replace("_", " "), _cell(name, value))
+        table.add_row(name.replace("_", " "), str(value))
     return table
 
 
-def info(title: str, values: dict[str, Any]) -> Table:
-    """What a store holds: the map, then queue and quarantine."""
-    flat = {name: value for name, value in values.items() if name != "store"}
-    counts = {f"store {name}": value for name, value in values["store"].items() if name != "tiles"}
-    return fields(title, flat | counts)
+def info(title: str, told: dict[str, Any]) -> Table:
+    """What a store holds: the map of a region, then the store's inbox, queue and quarantine."""
+    store = told["store"]
+    return fields(
+        title,
+        {
+            "layer": f"{told['layer']} of {', '.join(told['layers'])}",
+            "region": told["prefix"] or "everywhere",
+            "tiles": f"{told['tiles']} in {told['districts']} districts",
+            "Gaussians": f"{told['gaussians']} of {told['points']} points",
+            "size": f"{told['body_bytes'] / 1e6:.3f} MB",
+            "versions": f"{told['lowest_version']} to {told['highest_version']}",
+            "updated": f"{_time(told['updated_ns'])} UTC",
+            "south-west": f"{told['south_deg']:.6f}, {told['west_deg']:.6f}",
+            "north-east": f"{told['north_deg']:.6f}, {told['east_deg']:.6f}",
+            "heights": f"{told['lowest_m']} m to {told['highest_m']} m above the ellipsoid",
+            "reports": f"{store['reports']} over {store['report_rows']} tiles, {store['waiting']} to merge",
+            "tiles to merge": store["dirty"],
+            "in quarantine": store["quarantined"],
+        },
+    )
 
 
 def history(values: dict[str, Any]) -> Table:
@@ -57,12 +71,12 @@ def print_diff(console: Console, result: MapDiff) -> None:
     )
 
 
-def _cell(name: str, value: object) -> str:
-    if name.endswith("_ns") and isinstance(value, int):
-        return _time(value)
-    if isinstance(value, float):
-        return f"{value:.6f}"
-    return ", ".join(map(str, value)) if isinstance(value, list) else str(value)
+def quarantine(rows: list[dict[str, Any]]) -> Table:
+    """One row a refused message."""
+    table = Table("last received", "times", "bytes", "source", "reason", title=f"{len(rows)} messages in quarantine")
+    for row in rows:
+        table.add_row(_time(row["received_ns"]), str(row["times"]), str(row["bytes"]), row["source"], row["reason"])
+    return table
 
 
 def _time(t_ns: int) -> str:

@@ -107,6 +107,7 @@ def test_own_regions_come_first_then_any(store: Store) -> None:
 
 
 def test_a_region_that_is_none_is_refused(store: Store) -> None:
+    store.put_reports([report(1)])
     with pytest.raises(StoreError, match="13a33"):
         store.claim("m1", 1, 10.0, prefer=["13a33"])
 

@@ -91,8 +91,8 @@ def test_info_in_numbers_and_as_a_table(path: Path) -> None:
     assert told["store"]["versions"] == 4
     assert as_json("info", path, "--region", "13033")["tiles"] == 2
     table = gnd_map("info", path)
-    assert "gaussians" in table
-    assert "store quarantined" in table
+    assert "3 in 2 districts" in table
+    assert "1 over 1 tiles, 0 to merge" in table
 
 
 @pytest.mark.parametrize("name", ["map.pcd", "map.ply", "map.geojson"])
@@ -144,6 +144,24 @@ def test_rollback_publishes_the_old_content(path: Path) -> None:
     assert kinds == ["base", "merged", "rollback", "rollback"]
     with SqliteStore(path) as store:
         assert [notice.version for notice in store.notices()] == [2, 3, 4]
+
+
+def test_gc_removes_old_versions(path: Path) -> None:
+    for voxel in range(3):
+        with SqliteStore(path) as store:
+            store.put_tiles([tile_of_voxels(EAST, voxel)])
+    assert as_json("gc", path, "--keep", 2)["versions"] == 2
+    assert "0 versions removed" in gnd_map("gc", path, "--keep", 2)
+
+
+def test_quarantine_tells_and_saves_what_was_refused(path: Path, tmp_path: Path) -> None:
+    with SqliteStore(path) as store:
+        store.quarantine(b"nonsense", "Malformed: 8 bytes are not a ChangeReport", "gnd/v1/change/x")
+    (row,) = as_json("quarantine", path, "--save", tmp_path / "bad")["quarantined"]
+    assert (row["bytes"], row["reason"]) == (8, "Malformed: 8 bytes are not a ChangeReport")
+    assert (tmp_path / "bad" / f"{row['sha256']}.bin").read_bytes() == b"nonsense"
+    assert "Malformed" in gnd_map("quarantine", path)
+    assert "cannot write" in refused("quarantine", path, "--save", path / "x")
 
 
 def test_what_cannot_be_is_said_in_one_line_and_nothing_is_made(path: Path, tmp_path: Path) -> None:

@@ -69,6 +69,7 @@ CREATE TABLE dirty (
   PRIMARY KEY (layer, tile)
 ) STRICT, WITHOUT ROWID;
 CREATE INDEX dirty_ready ON dirty (ready_ns);
+CREATE INDEX dirty_tile ON dirty (tile);
 
 -- What was refused, with its reason; the same bytes are kept once.
 CREATE TABLE quarantine (
@@ -96,7 +97,12 @@ ON CONFLICT (layer, tile) DO UPDATE SET
   ready_ns = MIN(ready_ns, CASE WHEN waiting + 1 >= :merge_after THEN :now ELSE :now + :delay END)
 
 -- name: claimable
-SELECT layer, tile, seq, attempts FROM dirty
+SELECT layer, tile, seq, attempts FROM dirty INDEXED BY dirty_ready
+WHERE ready_ns <= :now AND (owner IS NULL OR lease_ns <= :now)
+ORDER BY ready_ns, layer, tile LIMIT :n
+
+-- name: claimable_in_region
+SELECT layer, tile, seq, attempts FROM dirty INDEXED BY dirty_tile
 WHERE ready_ns <= :now AND (owner IS NULL OR lease_ns <= :now) AND tile >= :first AND tile < :end
 ORDER BY ready_ns, layer, tile LIMIT :n
 
