@@ -71,13 +71,16 @@ class Scene:
     cell_m: float
 
     @staticmethod
-    def build(shapes: Sequence[Shape], A_street_map: FloatArray | None = None, cell_m: float = CELL_M) -> "Scene":
+    def build(
+        shapes: Sequence[Shape], A_street_map: FloatArray | None = None, cell_m: float = CELL_M, margin_m: float = 0.0
+    ) -> "Scene":
         """Sort primitives into the grid's cells.
 
         Args:
             shapes: at least one primitive, in the street frame.
             A_street_map: float64 (3, 3); identity when the rays come in the frame of the shapes.
             cell_m: edge of a grid cell.
+            margin_m: so much room for ray origins around the primitives.
 
         Raises:
             SceneError: there is no primitive.
@@ -85,8 +88,9 @@ class Scene:
         if not shapes:
             raise SceneError("a scene needs at least one primitive, got none")
         bounds = np.array([shape.bounds() for shape in shapes])
-        low = np.floor(bounds[:, 0:2].min(axis=0) / cell_m - 1) * cell_m
-        nx, ny = (np.ceil((bounds[:, 2:4].max(axis=0) - low) / cell_m).astype(int) + 1).tolist()
+        low = np.floor((bounds[:, 0:2].min(axis=0) - margin_m) / cell_m - 1) * cell_m
+        high = bounds[:, 2:4].max(axis=0) + margin_m
+        nx, ny = (np.ceil((high - low) / cell_m).astype(int) + 1).tolist()
         starts, items, tops = _fill_cells(bounds, low, (nx, ny), cell_m)
         A = np.eye(3) if A_street_map is None else np.ascontiguousarray(A_street_map, dtype=np.float64)
         return Scene(A, pack(shapes), starts, items, tops, (float(low[0]), float(low[1])), (nx, ny), cell_m)
@@ -111,20 +115,25 @@ class Scene:
         self.check_inside(start)
         return _cast_rays(start, directions @ self.A_street_map.T, range_m, *self.arrays())
 
+    def holds(self, points_street: FloatArray) -> NDArray[np.bool_]:
+        """Return which points (N, 3) lie inside the grid, bool (N,): rays may start there."""
+        low = np.array(self.origin_m)
+        high = low + np.array(self.shape) * self.cell_m
+        return np.asarray(((points_street[:, 0:2] > low) & (points_street[:, 0:2] < high)).all(axis=1))
+
     def check_inside(self, points_street: FloatArray) -> None:
-        """Refuse ray origins (..., 3) outside the grid: the walk starts in a cell.
+        """Refuse ray origins (N, 3) outside the grid: the walk starts in a cell.
 
         Raises:
             SceneError: names the first such origin and the grid's extent.
         """
-        low = np.array(self.origin_m)
-        high = low + np.array(self.shape) * self.cell_m
-        xy = points_street.reshape(-1, 3)[:, 0:2]
-        outside = np.flatnonzero(~((xy > low) & (xy < high)).all(axis=1))
+        outside = np.flatnonzero(~self.holds(points_street))
         if outside.size:
+            low, size = np.array(self.origin_m), np.array(self.shape) * self.cell_m
             raise SceneError(
-                f"{outside.size} ray origins lie outside the scene, the first at {xy[outside[0]].round(2).tolist()} m;"
-                f" the scene spans {low.tolist()} to {high.tolist()} m"
+                f"{outside.size} ray origins lie outside the scene, the first at"
+                f" {points_street[outside[0], 0:2].round(2).tolist()} m;"
+                f" the scene spans {low.tolist()} to {(low + size).tolist()} m"
             )
 
     def arrays(self) -> tuple[FloatArray, IntArray, IntArray, FloatArray, Grid]:

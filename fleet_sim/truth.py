@@ -5,8 +5,8 @@ them. They were fixed before the method was tuned, and tests pin them.
 
 Existence. A voxel holds a Gaussian when 20 of its sub-cells are occupied, the one rule of the project
 (`gnd_map.accumulate`). Before: what the scan of `before` hits. After: what the scan of `after` hits, together with what
-was hit before and still stands, though perhaps hidden now: nothing is deleted by being hidden. What a vanished thing has
-revealed is new to the map.
+was hit before and still stands, though perhaps hidden now: nothing is deleted by being hidden. What a vanished thing
+has revealed is new to the map.
 
 Modified. A voxel with both Gaussians is modified when a quarter of its sub-cells lie on surfaces that went or came,
 farther than one sub-cell (10 to 20 cm) from every surface of the other state.

@@ -1,0 +1,229 @@
+"""Pictures of a map as coloured ellipsoids, as in Figure 16 of the GND paper: from above, and in perspective."""
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.collections import EllipseCollection
+from matplotlib.colors import to_rgb
+from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
+from numpy.typing import NDArray
+
+from fleet_sim.ellipsoids import Ellipsoids, Tiles, ellipsoids_of_maps, ellipsoids_of_truth
+from fleet_sim.errors import SimError
+from fleet_sim.truth import Truth
+from gnd_map.classes import CLASS_COLOURS, ChangeClass
+
+FloatArray = NDArray[np.float64]
+
+_DPI: Final = 150
+_SIGMAS: Final = 1.9
+"""Drawn size: an evenly filled plane across a 1 m voxel just reaches the neighbouring voxel's."""
+_SHOWN: Final = (ChangeClass.NORMAL, ChangeClass.NEW, ChangeClass.MODIFIED, ChangeClass.DELETED)
+_SUN: Final = np.array([-0.35, -0.5, 0.79])
+_INK: Final = "#1c2430"
+_PAPER: Final = "#ffffff"
+_SKY: Final = "#e9eef5"
+_HALF_WIDTH_M: Final = 24.0
+_NEAR_M: Final = 4.0
+_FOCAL: Final = 1.3
+_ARROW: Final = {"arrowstyle": "-|>", "color": _INK, "linewidth": 1.6}
+
+
+@dataclass(frozen=True, slots=True)
+class View:
+    """How the pictures look at the map: along the street, whatever its heading.
+
+    Attributes:
+        origin_m: middle of what is shown, map frame (3,).
+        heading_rad: direction of the street, counter-clockwise from east.
+        half_length_m: what is shown reaches so far along the street from the middle.
+        focus_m: place along the street, from the middle, at which the perspective looks.
+    """
+
+    origin_m: tuple[float, float, float]
+    heading_rad: float
+    half_length_m: float
+    focus_m: float
+
+    @staticmethod
+    def around(ellipsoids: Ellipsoids) -> "View":
+        """Return a view that fits a map: its longest horizontal axis is the street, the focus is on changes."""
+        if not len(ellipsoids):
+            return View((0.0, 0.0, 0.0), 0.0, 50.0, 0.0)
+        middle = np.median(ellipsoids.mean_m, axis=0)
+        flat = ellipsoids.mean_m[:, :2] - middle[:2]
+        axis = np.linalg.eigh(flat.T @ flat)[1][:, 1]
+        axis = axis if axis[0] >= 0 else -axis
+        reach = float(np.quantile(np.abs(flat @ axis), 0.97))
+        changed = (flat @ axis)[ellipsoids.change_class != ChangeClass.NORMAL]
+        focus = float(np.median(changed)) if len(changed) else 0.0
+        return View(tuple(middle.tolist()), float(np.arctan2(axis[1], axis[0])), max(reach, 20.0), focus)
+
+    @property
+    def R_view_map(self) -> FloatArray:
+        """Rotation (3, 3) from the map frame to x along the street, y to the left, z up."""
+        c, s = np.cos(self.heading_rad), np.sin(self.heading_rad)
+        return np.array([[c, s, 0.0], [-s, c, 0.0], [0.0, 0.0, 1.0]])
+
+
+def draw_map(ellipsoids: Ellipsoids, path: Path, title: str, note: str = "", view: View | None = None) -> None:
+    """Draw a map from above and in perspective, with legend and scale, as one PNG (about 1900 x 1260 pixels).
+
+    Args:
+        ellipsoids: what to draw.
+        path: the PNG to write.
+        title: heading of the picture.
+        note: small line below the heading.
+        view: the same view for several pictures makes them comparable; by default it is fitted.
+
+    Raises:
+        SimError: the file cannot be written.
+    """
+    view = view or View.around(ellipsoids)
+    figure = Figure(figsize=(12.6, 8.4), dpi=_DPI, facecolor=_PAPER)
+    figure.text(0.03, 0.957, title, fontsize=19, weight="bold", color=_INK, va="center")
+    figure.text(0.03, 0.922, note, fontsize=11, color="#5a6675", va="center")
+    _legend(figure, ellipsoids)
+    _from_above(figure.add_axes((0.03, 0.575, 0.94, 0.315)), ellipsoids, view)
+    _in_perspective(figure.add_axes((0.03, 0.025, 0.94, 0.535)), ellipsoids, view)
+    _save(figure, path)
+
+
+def draw_run(truth: Truth, base: Tiles, final: Tiles, folder: Path) -> tuple[Path, Path, Path]:
+    """Draw map_before.png, map_after.png and truth.png of a run in one view.
+
+    Args:
+        truth: of the world.
+        base: the map at the start.
+        final: the map at the end.
+        folder: where the pictures go.
+
+    Returns:
+        The three paths.
+
+    Raises:
+        SimError: a file cannot be written.
+    """
+    true = ellipsoids_of_truth(truth)
+    view = View.around(true)
+    paths = folder / "map_before.png", folder / "map_after.png", folder / "truth.png"
+    draw_map(ellipsoids_of_maps(truth.frame, base), paths[0], "Map before", "what every vehicle starts with", view)
+    note = "what the fleet has made of it, coloured by what it changed"
+    draw_map(ellipsoids_of_maps(truth.frame, base, final), paths[1], "Map after", note, view)
+    draw_map(true, paths[2], "Truth", "what really changed", view)
+    return paths
+
+
+def _save(figure: Figure, path: Path) -> None:
+    partial = path.with_name(f".{path.name}.part")
+    try:
+        with partial.open("wb") as file:
+            figure.savefig(file, format="png", dpi=_DPI)
+        partial.replace(path)
+    except OSError as error:
+        raise SimError(f"cannot write the picture {path}: {error}") from error
+
+
+def _legend(figure: Figure, ellipsoids: Ellipsoids) -> None:
+    count = np.bincount(ellipsoids.change_class, minlength=len(ChangeClass))
+    dot: dict[str, Any] = {"marker": "o", "linestyle": "", "markersize": 9}
+    handles = [Line2D([], [], color=CLASS_COLOURS[c], label=f"{c.name.lower()}  {count[c]:,}", **dot) for c in _SHOWN]
+    figure.legend(
+        handles=handles, loc="center right", bbox_to_anchor=(0.978, 0.958), ncols=4, frameon=False, fontsize=11,
+        handletextpad=0.2, columnspacing=1.4, labelcolor=_INK,
+    )  # fmt: skip
+
+
+def _from_above(axes: Axes, ellipsoids: Ellipsoids, view: View) -> None:
+    R = view.R_view_map
+    mean, cov = (ellipsoids.mean_m - np.array(view.origin_m)) @ R.T, R @ ellipsoids.cov_m2 @ R.T
+    inside = np.flatnonzero((np.abs(mean[:, 0]) < view.half_length_m) & (np.abs(mean[:, 1]) < _HALF_WIDTH_M))
+    order = inside[np.argsort(mean[inside, 2], kind="stable")]
+    colours = _shaded(cov[order], ellipsoids.change_class[order], np.array([0.0, 0.0, 1.0]))
+    _add_ellipses(axes, mean[order, :2], cov[order, :2, :2], colours)
+    half_width = 2 * view.half_length_m * 0.315 * 8.4 / (0.94 * 12.6) / 2
+    axes.set(xlim=(-view.half_length_m, view.half_length_m), ylim=(-half_width, half_width), aspect="equal")
+    _frame(axes, _PAPER)
+    _scale_bar(axes, view, half_width)
+    _north(axes, view, half_width)
+
+
+def _in_perspective(axes: Axes, ellipsoids: Ellipsoids, view: View) -> None:
+    """Ellipsoids seen from above one end of the street; outlines are covariances through the projection's Jacobian."""
+    eye, target = np.array([view.focus_m - 47.0, -15.0, 27.0]), np.array([view.focus_m, 1.5, -1.0])
+    R = _looking(eye, target) @ view.R_view_map
+    p = (ellipsoids.mean_m - np.array(view.origin_m)) @ R.T - _looking(eye, target) @ eye
+    order = np.flatnonzero(p[:, 2] > _NEAR_M)
+    order = order[np.argsort(-p[order, 2], kind="stable")]
+    p, cov = p[order], R @ ellipsoids.cov_m2[order] @ R.T
+    centre = _FOCAL * p[:, :2] / p[:, 2:]
+    J = np.zeros((len(p), 2, 3))
+    J[:, 0, 0] = J[:, 1, 1] = _FOCAL / p[:, 2]
+    J[:, :, 2] = -centre / p[:, 2:]
+    colours = _shaded(cov, ellipsoids.change_class[order], R @ view.R_view_map.T @ _SUN)
+    haze = np.clip((p[:, 2:] - 60.0) / 260.0, 0.0, 0.55)
+    _add_ellipses(axes, centre, J @ cov @ np.swapaxes(J, 1, 2), colours * (1 - haze) + np.array(to_rgb(_SKY)) * haze)
+    tall = 0.535 * 8.4 / (0.94 * 12.6)
+    axes.set(xlim=(-1.0, 1.0), ylim=(-tall, tall), aspect="equal")
+    _frame(axes, _SKY)
+
+
+def _looking(eye: FloatArray, target: FloatArray) -> FloatArray:
+    """Rotation (3, 3) to x right, y up, z forward of a camera without roll."""
+    forward: FloatArray = (target - eye) / np.linalg.norm(target - eye)
+    right: FloatArray = np.cross(forward, [0.0, 0.0, 1.0]) / np.hypot(forward[0], forward[1])
+    rows: FloatArray = np.stack([right, np.cross(right, forward), forward])
+    return rows
+
+
+def _shaded(cov: FloatArray, change_class: NDArray[np.uint8], sun: FloatArray) -> FloatArray:
+    """Colours (N, 3): the class's, lighter where the flat side of the ellipsoid faces the sun."""
+    palette = np.array([to_rgb(CLASS_COLOURS[c]) for c in ChangeClass])
+    base: FloatArray = palette[change_class]
+    if not len(cov):
+        return base
+    values, axes = np.linalg.eigh(cov)
+    flat = np.clip(1.0 - values[:, 0] / np.maximum(values[:, 1], 1e-9), 0.0, 1.0)
+    light = np.abs(np.einsum("ni,i->n", axes[:, :, 0], sun))
+    shade = (0.62 + 0.5 * (flat * light + (1.0 - flat) * 0.5))[:, None]
+    lit = np.where(shade <= 1.0, base * shade, base + (1.0 - base) * (shade - 1.0) * 2.2)
+    return np.asarray(np.clip(lit, 0.0, 1.0))
+
+
+def _add_ellipses(axes: Axes, centre: FloatArray, cov: FloatArray, colours: FloatArray) -> None:
+    """Draw N ellipses of covariances (N, 2, 2), the first one lowest."""
+    if not len(centre):
+        return
+    values, vectors = np.linalg.eigh(cov + 1e-12 * np.eye(2))
+    size = 2 * _SIGMAS * np.sqrt(np.maximum(values, 0.0))
+    angle = np.degrees(np.arctan2(vectors[:, 1, 1], vectors[:, 0, 1]))
+    place: dict[str, Any] = {"units": "xy", "offsets": centre, "offset_transform": axes.transData}
+    look: dict[str, Any] = {"facecolors": colours, "edgecolors": colours * 0.72, "linewidths": 0.15}
+    axes.add_collection(EllipseCollection(size[:, 1], size[:, 0], angle, **place, **look))
+
+
+def _frame(axes: Axes, background: str) -> None:
+    axes.set_facecolor(background)
+    axes.set_xticks([])
+    axes.set_yticks([])
+    for spine in axes.spines.values():
+        spine.set(color="#c3ccd8", linewidth=0.8)
+
+
+def _scale_bar(axes: Axes, view: View, half_width: float) -> None:
+    length = 20.0 if view.half_length_m > 40 else 10.0
+    x, y = -view.half_length_m + 0.025 * 2 * view.half_length_m, -half_width * 0.84
+    axes.plot([x, x + length], [y, y], color=_INK, linewidth=2.5, solid_capstyle="butt")
+    axes.text(x + length / 2, y + half_width * 0.045, f"{length:.0f} m", ha="center", va="bottom", color=_INK)
+
+
+def _north(axes: Axes, view: View, half_width: float) -> None:
+    size, x, y = half_width * 0.26, view.half_length_m * 0.965, -half_width * 0.72
+    direction = view.R_view_map @ np.array([0.0, 1.0, 0.0])
+    end = size / 2 * direction[:2]
+    axes.annotate("", (x + end[0], y + end[1]), (x - end[0], y - end[1]), arrowprops=_ARROW)
+    axes.text(x + 1.35 * end[0], y + 1.35 * end[1], "N", ha="center", va="center", fontsize=9, color=_INK)
