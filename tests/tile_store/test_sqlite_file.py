@@ -4,6 +4,7 @@ import os
 import subprocess
 import sys
 import threading
+import time
 from pathlib import Path
 
 import apsw
@@ -242,3 +243,29 @@ def test_a_call_that_fails_is_undone_alone(tmp_path: Path) -> None:
             thread.join()
         assert outcomes == {"before": ["stored"], "bad": "half way", "after": ["stored"]}
         assert store.counts().reports == 2
+
+
+def test_calls_that_wait_together_share_one_commit(tmp_path: Path) -> None:
+    with SqliteStore(tmp_path / "s.db", EAGER) as store:
+        entered, go, commits = threading.Event(), threading.Event(), []
+
+        def hold(connection: apsw.Connection) -> None:
+            connection.set_commit_hook(lambda: commits.append(1) and False)
+            entered.set()
+            assert go.wait(20)
+
+        holder = threading.Thread(target=lambda: store._writer.run(hold))
+        holder.start()
+        assert entered.wait(20)
+        threads = [threading.Thread(target=store.put_reports, args=([report(number)],)) for number in range(50)]
+        for thread in threads:
+            thread.start()
+        deadline = time.monotonic() + 20
+        while store._writer._jobs.qsize() < 50:
+            assert time.monotonic() < deadline
+            time.sleep(0.001)
+        go.set()
+        for thread in (holder, *threads):
+            thread.join()
+        assert len(commits) == 2  # the holder, then all the others
+        assert store.counts().reports == 50
