@@ -11,7 +11,6 @@ from gnd_map.errors import TileError
 from gnd_map.geodesy import LocalFrame
 from gnd_map.tile import Tile
 from gnd_map.tile_id import TileId, covering_corridor
-from vehicle_agent.cache import TileCache
 from vehicle_agent.config import DownloadParameters
 from vehicle_agent.detect.detector import ChangeDetector
 from vehicle_agent.download import TileFetcher
@@ -34,11 +33,10 @@ class Surroundings:
         local_map: LocalMap,
         fetcher: TileFetcher,
         detector: ChangeDetector,
-        cache: TileCache,
         parameters: DownloadParameters,
     ) -> None:
         self.counts: Counter[str] = Counter()
-        self._map, self._fetcher, self._detector, self._cache = local_map, fetcher, detector, cache
+        self._map, self._fetcher, self._detector = local_map, fetcher, detector
         self._parameters = parameters
         self.wanted: tuple[TileId, ...] = ()
         self._looked_at: F64 | None = None
