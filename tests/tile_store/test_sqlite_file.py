@@ -250,7 +250,7 @@ def test_calls_that_wait_together_share_one_commit(tmp_path: Path) -> None:
         entered, go, commits = threading.Event(), threading.Event(), []
 
         def hold(connection: apsw.Connection) -> None:
-            connection.set_commit_hook(lambda: commits.append(1) and False)
+            connection.set_commit_hook(lambda: commits.append(1) is not None)
             entered.set()
             assert go.wait(20)
 
