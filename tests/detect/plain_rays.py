@@ -3,6 +3,7 @@
 The voxels of a ray come from sorting the parameters at which it crosses integer planes, not from stepping.
 """
 
+import itertools
 import math
 from dataclasses import dataclass
 
@@ -34,9 +35,9 @@ def voxels_of_segment(start: np.ndarray, end: np.ndarray) -> list[tuple[tuple[in
                 cuts.add(min(max(t, 0.0), 1.0))
     ordered = sorted(cuts)
     pieces = []
-    for t_in, t_out in zip(ordered, ordered[1:], strict=False):
+    for t_in, t_out in itertools.pairwise(ordered):
         middle = start + (end - start) * (t_in + t_out) / 2
-        pieces.append((tuple(int(math.floor(x)) for x in middle), t_in, t_out))
+        pieces.append((tuple(math.floor(x) for x in middle), t_in, t_out))
     return pieces
 
 
