@@ -4,7 +4,6 @@ The fork server imports the heavy libraries and loads the compiled kernels once;
 those pages (4 MB and 30 ms instead of 75 MB and a second). Threads and Zenoh sessions begin only after the fork.
 """
 
-import ctypes
 import json
 import logging
 import multiprocessing
@@ -15,6 +14,7 @@ import threading
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, field
+from multiprocessing import connection
 from multiprocessing.context import ForkServerProcess
 from pathlib import Path
 from typing import Any, Final
@@ -22,7 +22,6 @@ from typing import Any, Final
 from deploy.errors import ProcessDied
 
 PRELOAD: Final = ("deploy.preload",)
-PR_SET_PDEATHSIG: Final = 1
 STOP_GRACE_S: Final = 10.0
 MAX_RESTARTS: Final = 5
 RESTART_DELAY_S: Final = 0.3
@@ -171,7 +170,7 @@ def _nothing() -> None:
 def _run_role(role: Role, args: tuple[Any, ...], log_path: str) -> None:
     """Run a role inside its process: log file, signals, exit code."""
     stop = threading.Event()
-    _die_with_parent()
+    threading.Thread(target=_end_with_launcher, args=(stop,), name="launcher-watch", daemon=True).start()
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # the launcher turns Ctrl-C into an orderly end
     signal.signal(signal.SIGTERM, lambda *_: stop.set())
     _log_to(log_path)
@@ -182,10 +181,14 @@ def _run_role(role: Role, args: tuple[Any, ...], log_path: str) -> None:
         sys.exit(1)
 
 
-def _die_with_parent() -> None:
-    """Ask the kernel for SIGTERM when the fork server (and so the launcher) is gone, however it died."""
-    if sys.platform == "linux":
-        ctypes.CDLL(None).prctl(PR_SET_PDEATHSIG, signal.SIGTERM)
+def _end_with_launcher(stop: threading.Event) -> None:
+    """Stop when the launcher is gone, however it died; called in a thread of its own."""
+    launcher = multiprocessing.parent_process()
+    if launcher is not None:
+        connection.wait([launcher.sentinel])
+        stop.set()
+        time.sleep(STOP_GRACE_S)  # a daemon thread: it ends with the process if that ends in time
+        os._exit(1)
 
 
 def _log_to(path: str) -> None:

@@ -1,0 +1,52 @@
+"""A small world for whole fleet runs: a stretch of the simulated street, mapped, then driven after it changed."""
+
+import signal
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+import pytest
+from fleet_testing import Run
+
+from fleet_sim.drives import PERFECT, DriveConfig, simulate_drive
+from fleet_sim.street import street
+from tile_store.build import build_map
+from tile_store.sqlite_store import SqliteStore
+
+SEED = 11
+SCANS = 70
+
+
+@dataclass(frozen=True)
+class SmallWorld:
+    base_map: Path
+    drives: tuple[Path, ...]
+
+
+@pytest.fixture(scope="session")
+def small_world(tmp_path_factory: pytest.TempPathFactory) -> SmallWorld:
+    folder = tmp_path_factory.mktemp("world")
+    world = street(SEED)
+    mapping = DriveConfig("mapper", "VLP-16", "before", errors=PERFECT, car_share=0.0, scans=SCANS + 20, cruise_mps=7.0)
+    mapped = simulate_drive(world, mapping, folder / "mapper.mcap")
+    with SqliteStore(folder / "base.sqlite") as store:
+        build_map([mapped], store)
+    configs = [DriveConfig(f"car-{n}", "VLP-16", seed=SEED + n, scans=SCANS) for n in range(2)]
+    drives = tuple(simulate_drive(world, config, folder / f"{config.vehicle}.mcap") for config in configs)
+    return SmallWorld(folder / "base.sqlite", drives)
+
+
+@pytest.fixture
+def start_run(tmp_path: Path, small_world: SmallWorld) -> Iterator[Callable[..., Run]]:
+    runs: list[Run] = []
+
+    def start(*arguments: str, name: str = "run") -> Run:
+        drives = [word for drive in small_world.drives for word in ("--drives", str(drive))]
+        runs.append(Run(tmp_path / name, *drives, "--map", str(small_world.base_map), *arguments))
+        return runs[-1]
+
+    yield start
+    for run in runs:
+        if run.process.poll() is None:
+            run.process.send_signal(signal.SIGTERM)
+            run.process.communicate(timeout=30)

@@ -1,0 +1,102 @@
+"""Whole fleet runs with real processes, and what `kill -9` does to them."""
+
+import json
+import os
+import signal
+from collections.abc import Callable
+from pathlib import Path
+
+import psutil
+import pytest
+from fleet_testing import Run
+
+from deploy.account import lost_reports, tile_histories
+from deploy.run_folder import RunFolder
+from gnd_map.tile import content_sha
+from tile_store.sqlite_store import SqliteStore
+
+pytestmark = pytest.mark.slow
+Start = Callable[..., Run]
+
+
+def final_map(folder: Path) -> dict[int, bytes]:
+    """Content hash of every tile of a finished run."""
+    with SqliteStore(folder / "store.sqlite") as store:
+        return {h.tile.tile.morton: content_sha(h.tile.tile, h.after) for h in tile_histories(store)}
+
+
+def report_ids(folder: Path) -> list[tuple[int, str]]:
+    with SqliteStore(folder / "store.sqlite") as store:
+        return [(row.tile.morton, row.report_id) for row in store.reports()]
+
+
+def assert_nothing_lost_or_doubled(run: Run, summary: dict[str, object]) -> None:
+    assert summary["reports_lost"] == 0
+    assert summary["reports_sent"] == summary["reports_acknowledged"]
+    assert int(str(summary["reports_sent"])) > 0
+    rows = report_ids(run.folder)
+    assert len(rows) == len(set(rows))
+    with SqliteStore(run.folder / "store.sqlite") as store:
+        assert lost_reports(RunFolder(run.folder), store) == []
+        assert store.dirty_count() == 0
+        assert store.quarantined() == []
+        for history in tile_histories(store):
+            versions = [info.version for info in store.history("ndt", history.tile.tile)]
+            assert versions == sorted(set(versions))
+
+
+def test_a_run_ends_by_itself_with_a_full_account(start_run: Start) -> None:
+    run = start_run("--link", "none")
+    summary = run.finish()
+    assert_nothing_lost_or_doubled(run, summary)
+    assert summary["updates_received"] >= summary["tiles_published"] > 0
+    assert summary["changed_voxels"] > 0
+    assert summary["traffic"]["down_wire_bytes"] > summary["traffic"]["down_bytes"] > 0
+    assert summary["localisation_p95"]["lateral_m"] is not None
+    assert summary["restarts"] == {}
+    lines = [json.loads(line) for line in (run.folder / "updates.jsonl").read_text().splitlines()]
+    assert len({(line["tile"], line["version"]) for line in lines}) == len(lines)
+
+
+@pytest.mark.parametrize("victim", ["merger-0", "store", "router", "vehicle-00"])
+def test_kill_9_in_mid_run_loses_nothing_and_applies_nothing_twice(start_run: Start, victim: str) -> None:
+    run = start_run("--link", "none")
+    run.wait_for(run.driving, "an agent has downloaded a tile")
+    pid = run.kill(victim)
+    run.wait_for(lambda: run.pid(victim) != pid, f"{victim} is started again")
+    summary = run.finish()
+    assert summary["restarts"] == {victim: 1}
+    assert_nothing_lost_or_doubled(run, summary)
+
+
+def test_every_process_of_the_cloud_killed_in_turn(start_run: Start) -> None:
+    run = start_run("--link", "none")
+    run.wait_for(run.driving, "an agent has downloaded a tile")
+    for victim in ("merger-1", "store", "merger-0", "router"):
+        pid = run.kill(victim)
+        run.wait_for(lambda victim=victim, pid=pid: run.pid(victim) != pid, f"{victim} is started again")  # type: ignore[misc]
+    assert_nothing_lost_or_doubled(run, run.finish())
+
+
+def test_ctrl_c_ends_every_process_in_order(start_run: Start) -> None:
+    run = start_run("--link", "3g")
+    run.wait_for(run.driving, "an agent has downloaded a tile")
+    processes = [psutil.Process(run.pid(name)) for name in ("router", "store", "merger-0", "vehicle-00")]
+    run.process.send_signal(signal.SIGINT)
+    _, err = run.process.communicate(timeout=30)
+    assert run.process.returncode == 130
+    assert err.strip().endswith("gnd: interrupted")
+    _, alive = psutil.wait_procs(processes, timeout=5)
+    assert alive == []
+    assert json.loads((run.folder / "pids.json").read_text()) == {}
+
+
+def test_killing_the_launcher_leaves_no_orphan(start_run: Start) -> None:
+    run = start_run("--link", "none")
+    run.wait_for(run.driving, "an agent has downloaded a tile")
+    names = ("router", "store", "merger-0", "merger-1", "watcher")
+    processes = [psutil.Process(run.pid(name)) for name in names]
+    os.kill(run.process.pid, signal.SIGKILL)
+    run.process.communicate(timeout=30)
+    _, alive = psutil.wait_procs(processes, timeout=20)
+    assert alive == []
