@@ -80,11 +80,12 @@ def test_the_share_must_exceed_xi_not_only_reach_it():
 
 
 def test_the_biggest_cluster_wins_and_is_represented_by_its_moments():
-    one, two = gaussians_of({1: POLE}, count=100), gaussians_of({1: (*POLE[:2], 0.05, *POLE[3:])}, count=300)
+    one = gaussians_of({1: POLE}, count=100, cells=40)
+    two = gaussians_of({1: (*POLE[:2], 0.05, *POLE[3:])}, count=300, cells=55)
     result = merged([change_of(EPOCH, [1], g) for g in (one, gaussians_of({1: BALL}), two)], xi=0.5)
     expected = (Moments.of(one) + Moments.of(two)).to_gaussians([1])
     got = result.gaussians.select([1])
-    assert got.count.tolist() == [400]
+    assert (got.count.tolist(), got.cells.tolist()) == ([400], [55])
     np.testing.assert_allclose(got.mean_m, expected.mean_m, atol=1e-7)
     np.testing.assert_allclose(got.cov_m2, expected.cov_m2, atol=1e-8)
     assert result.provenance == {1: (report_id(0), report_id(2))}

@@ -63,6 +63,7 @@ def test_the_test_gives_both_shards_districts():
 @pytest.mark.slow
 def test_every_report_has_one_ack_and_every_version_one_notice(cloud):
     cloud.start(*SHARDS)
+    wait_for("the shards have seen each other", lambda: one_ack_each(cloud, range(100, 108)))
     with raw_session(cloud.endpoint) as session:
         for n in range(16):
             assert [ack.status for ack in all_acks(session, report_number(n))] == ["stored"]
@@ -70,7 +71,7 @@ def test_every_report_has_one_ack_and_every_version_one_notice(cloud):
     wait_for("all is merged and announced", cloud.is_settled)
     wait_for("the watcher has heard of all", lambda: cloud.versions() == cloud.announced())
     assert len(cloud.updates) == len(cloud.versions()) > 0
-    assert cloud.store.counts().reports == 16
+    assert cloud.store.counts().reports == 24
     for name in SHARDS:
         cloud.signal(name, signal.SIGTERM)
         assert cloud.shards[name].wait(20) == 0, cloud.log(name)

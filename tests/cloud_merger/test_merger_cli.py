@@ -1,0 +1,59 @@
+import pytest
+from click.testing import CliRunner
+
+from cloud_merger.cli import merger, read_config
+from cloud_merger.config import ShardConfig
+from cloud_merger.errors import MergerError
+from cloud_merger.merge import MergeParameters
+from gnd_map.config import to_mapping
+from gnd_map.errors import ConfigError, GndError
+
+
+def test_options_go_before_the_file(tmp_path):
+    path = tmp_path / "merger.toml"
+    path.write_text(
+        'shard_id = "from-file"\nlease_s = 7\n'
+        "[merge]\nxi = 0.7\n[ingest]\nreach_tiles = 1\n[store]\nmerge_delay_s = 0.5\n"
+    )
+    config = read_config(path, {"shard_id": "from-option"}, mode="paper")
+    assert (config.shard_id, config.lease_s, config.ingest.reach_tiles) == ("from-option", 7.0, 1)
+    assert config.merge == MergeParameters(mode="paper", xi=0.7)
+    assert config.store.merge_delay_s == 0.5
+
+
+def test_defaults_run_and_survive_being_written_down():
+    assert read_config(None, {}) == ShardConfig()
+    assert ShardConfig.from_mapping(to_mapping(ShardConfig())) == ShardConfig()
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("lease = 3", "unknown key lease"),
+        ("[merge]\nepsilon = 0.5", r"merger\.merge: unknown key epsilon"),
+        ("[merge]\nmode = 'best'", "'paper'"),
+        ("[merge]\nxi = 1.5", "xi must lie in"),
+        ("tiles_at_once = 0", "tiles_at_once"),
+        ("lease_s = 0", "lease_s"),
+        ("shard_id = 'a/b'", "shard id 'a/b'"),
+        ("lease_s = ", "cannot read the configuration"),
+    ],
+)
+def test_a_bad_configuration_is_one_clear_error(tmp_path, text, message):
+    path = tmp_path / "merger.toml"
+    path.write_text(text)
+    with pytest.raises(GndError, match=message):
+        read_config(path, {})
+
+
+def test_a_missing_configuration_is_an_error(tmp_path):
+    with pytest.raises(MergerError, match=r"absent\.toml"):
+        read_config(tmp_path / "absent.toml", {})
+
+
+def test_the_command_passes_errors_on_to_the_root(tmp_path):
+    path = tmp_path / "merger.toml"
+    path.write_text("nonsense = 1")
+    result = CliRunner().invoke(merger, ["--config", str(path)])
+    assert isinstance(result.exception, ConfigError)
+    assert "--store" in CliRunner().invoke(merger, ["--help"]).output

@@ -1,0 +1,146 @@
+"""Update notices survive the shard that published the version; late watchers get the last one."""
+
+import threading
+
+import pytest
+from merger_processes import Cloud, wait_for
+from merger_world import GROUND, POLE, TILE, WALL, change_of, gaussians_of, report_of, tile_of_states
+
+from cloud_merger.announce import encoded, tile_from, update_of
+from cloud_merger.config import ShardConfig
+from cloud_merger.merger import run_shard
+from cloud_merger.work import Worker
+from fleet_bus.bus import open_bus
+from fleet_bus.config import BusConfig
+from gnd_map.gaussian import Gaussians
+from gnd_map.tile import Tile, apply
+from schemas.changes import split
+from schemas.keys import alive_key, update_key
+from schemas.updates import TileUpdate
+from tile_store.errors import StoreUnavailable
+from tile_store.values import ReportRow, StoreConfig
+
+STATES = {0: GROUND, 1: WALL}
+BASE = gaussians_of(STATES)
+
+
+@pytest.fixture
+def cloud(tmp_path, free_port):
+    cloud = Cloud(tmp_path, free_port)
+    cloud.open()
+    cloud.store.put_tiles([tile_of_states(STATES)])
+    yield cloud
+    cloud.close()
+
+
+@pytest.fixture
+def shard(cloud):
+    """A shard in a thread of this process."""
+    stop = threading.Event()
+    config = ShardConfig(
+        store_path=cloud.path, connect=(cloud.endpoint,), poll_s=0.02, store=StoreConfig(merge_delay_s=0.0)
+    )
+    thread = threading.Thread(target=run_shard, args=(config, stop))
+
+    def start():
+        thread.start()
+        wait_for("the shard lives", lambda: "merger-1" in cloud.living)
+
+    yield start
+    stop.set()
+    if thread.ident is not None:
+        thread.join(10)
+        assert not thread.is_alive()
+        wait_for("its sign of life is gone", lambda: "merger-1" not in cloud.living)
+
+
+def publish_without_notice(cloud, number, changed):
+    """What a shard leaves that is killed between commit and notice."""
+    report = report_of(number, change_of(BASE, [0, 1, 2], changed))
+    cloud.store.put_reports([ReportRow(report.report_id, "ndt", tile, "car", 0, body) for tile, body in split(report)])
+    wait_for("the tile is ready", lambda: (claims := cloud.store.claim("dead", 1, 30.0)) and publish(cloud, claims))
+
+
+def publish(cloud, claims):
+    (result,) = cloud.store.publish(Worker(cloud.store, ShardConfig(store_path=cloud.path)).merge(claims))
+    assert result.status == "published"
+    return True
+
+
+def test_a_notice_that_a_dead_shard_owed_is_sent_by_the_next(cloud, shard):
+    publish_without_notice(cloud, 1, {2: POLE})
+    publish_without_notice(cloud, 2, {1: None, 2: POLE})
+    shard()
+    wait_for("both are announced", lambda: len(cloud.updates) == 2)
+    first, second = cloud.updates
+    assert [(u.version, u.previous_version, u.reason) for u in (first, second)] == [(2, 1, "merged"), (3, 2, "merged")]
+    assert first.previous_sha == tile_of_states(STATES).sha
+    assert apply(apply(BASE, first.delta), second.delta) == tile_from(cloud.store.get("ndt", TILE)).gaussians
+    wait_for("none is owed", cloud.is_settled)
+
+
+def test_the_leases_of_a_shard_that_has_gone_are_freed_at_once(cloud, shard):
+    ghost = cloud.bus.declare_alive(alive_key("merger", "ghost"))
+    report = report_of(1, change_of(BASE, [0, 1, 2], {2: POLE}))
+    cloud.store.put_reports([ReportRow(report.report_id, "ndt", TILE, "car", 0, report.encode())])
+    wait_for("the ghost has the tile", lambda: cloud.store.claim("ghost", 1, 3600.0))
+    shard()
+    assert not cloud.updates
+    ghost.close()
+    wait_for("the shard has merged it", lambda: cloud.updates)
+
+
+def test_a_rollback_is_announced(cloud, shard):
+    shard()
+    cloud.send(report_of(1, change_of(BASE, [0, 1, 2], {2: POLE})))
+    wait_for("version 2", lambda: len(cloud.updates) == 1)
+    cloud.store.rollback("ndt", TILE, 1)
+    wait_for("version 3", lambda: len(cloud.updates) == 2)
+    update = cloud.updates[1]
+    assert (update.version, update.reason, update.sha) == (3, "rollback", tile_of_states(STATES).sha)
+    assert update.delta.removed.tolist() == [2]
+
+
+def test_a_late_watcher_gets_the_last_notice(cloud, shard):
+    shard()
+    cloud.send(report_of(1, change_of(BASE, [0, 1, 2], {2: POLE})))
+    wait_for("version 2", lambda: len(cloud.updates) == 1)
+    heard = []
+    with open_bus(BusConfig(connect=(cloud.endpoint,))) as late:
+        late.subscribe(update_key("ndt", TILE), lambda _key, payload: heard.append(payload), history=True)
+        wait_for("the late watcher has heard", lambda: heard)
+    assert TileUpdate.decode(heard[0]) == cloud.updates[0]
+
+
+def stored_versions(cloud):
+    return cloud.store.get("ndt", TILE, 1), cloud.store.get("ndt", TILE, 2)
+
+
+def test_a_damaged_body_is_announced_without_a_delta(cloud):
+    publish_without_notice(cloud, 1, {2: POLE})
+    one, two = stored_versions(cloud)
+    damaged = type(one)(**{**{name: getattr(one, name) for name in one.__slots__}, "body": one.body[:-1]})
+    update = update_of(two, damaged)
+    assert (update.delta, update.sha, update.previous_sha) == (None, two.sha, one.sha)
+    assert update_of(two, one).delta is not None
+    assert update_of(two, None).previous_version == 0
+
+
+def test_a_delta_that_is_too_large_for_a_notice_is_left_out(cloud):
+    publish_without_notice(cloud, 1, {2: POLE})
+    one, two = stored_versions(cloud)
+    n = 90_000
+    pole = gaussians_of({2: POLE})
+    large = Gaussians(
+        gaussians_of(dict.fromkeys(range(n))).voxel_id, *(column.repeat(n, axis=0) for column in pole.columns[1:])
+    )
+    update = TileUpdate(
+        TILE, "ndt", 2, 1, two.sha, one.sha, "merged", type(update_of(two, one).delta)(gaussians_of({}).voxel_id, large)
+    )
+    assert TileUpdate.decode(encoded(update)).delta is None
+    assert Tile(TILE, 1, large).sha != one.sha
+
+
+def test_a_shard_without_a_store_says_so(tmp_path):
+    with pytest.raises(StoreUnavailable, match=r"nowhere\.sqlite"):
+        run_shard(ShardConfig(store_path=tmp_path / "nowhere.sqlite"), threading.Event())

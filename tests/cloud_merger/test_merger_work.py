@@ -1,0 +1,150 @@
+"""Merging claimed tiles: what is published, and what happens to a tile whose merge fails."""
+
+import logging
+
+import apsw
+import pytest
+from merger_world import GROUND, NEIGHBOUR, POLE, TILE, WALL, change_of, gaussians_of, report_of, tile_of_states
+
+from cloud_merger.announce import tile_from
+from cloud_merger.config import ShardConfig
+from cloud_merger.ingest import Ingest, IngestLimits
+from cloud_merger.work import Worker
+from gnd_map.tile_id import TileId
+from schemas.keys import change_key
+from tile_store.sqlite_store import SqliteStore
+from tile_store.values import ReportRow, StoreConfig
+
+STATES = {0: GROUND, 1: WALL}
+BASE = gaussians_of(STATES)
+KEY = change_key("ndt", TILE.district)
+
+
+@pytest.fixture
+def store(tmp_path):
+    with SqliteStore(tmp_path / "map.sqlite", StoreConfig(merge_delay_s=0.0)) as store:
+        store.put_tiles([tile_of_states(STATES, tile) for tile in (TILE, NEIGHBOUR)])
+        yield store
+
+
+@pytest.fixture
+def worker(store, tmp_path):
+    return Worker(store, ShardConfig(store_path=tmp_path / "map.sqlite", retry_s=0.0, max_attempts=3))
+
+
+def put(store, number, tile=TILE, changed=None, base=BASE, version=1):
+    changed = {2: POLE} if changed is None else changed
+    report = report_of(number, change_of(base, [0, 1, 2], changed, tile=tile, version=version))
+    assert Ingest(store, IngestLimits()).answer(KEY, report.encode()).status == "stored"
+    return report.report_id
+
+
+def merge_once(store, worker):
+    return store.publish(worker.merge(store.claim("one", 16, 30.0)))
+
+
+def head(store, tile=TILE):
+    return tile_from(store.get("ndt", tile))
+
+
+def test_a_merge_becomes_the_next_version_and_names_its_reports(store, worker):
+    one = put(store, 1)
+    assert [(r.status, r.version) for r in merge_once(store, worker)] == [("published", 2)]
+    assert head(store).gaussians == gaussians_of({**STATES, 2: POLE})
+    assert store.provenance("ndt", TILE, 2) == (one,)
+    assert store.voxel_provenance("ndt", TILE, 2) == {2: (one,)}
+    assert store.dirty_count() == 0
+
+
+def test_reports_that_change_nothing_are_consumed_without_a_version(store, worker):
+    put(store, 1, changed={})
+    assert [(r.status, r.version) for r in merge_once(store, worker)] == [("unchanged", 1)]
+    assert store.counts().waiting == store.dirty_count() == 0
+
+
+def test_a_tile_without_a_map_of_which_nobody_says_anything_gets_no_version(store, worker):
+    unmapped = TileId(TILE.morton - 2)
+    put(store, 1, tile=unmapped, changed={}, base=None)
+    assert [(r.status, r.version) for r in merge_once(store, worker)] == [("unchanged", 0)]
+    put(store, 2, tile=unmapped, base=None)
+    put(store, 3, tile=unmapped, base=None)
+    assert [(r.status, r.version) for r in merge_once(store, worker)] == [("published", 1)]
+
+
+def test_what_one_car_published_others_take_back(store, worker):
+    put(store, 1)
+    merge_once(store, worker)
+    put(store, 2, changed={2: None}, base=head(store).gaussians, version=2)
+    merge_once(store, worker)
+    assert head(store).gaussians == BASE  # 1 against 1: not more than ξ for the pole
+    assert store.get("ndt", TILE).version == 3
+
+
+def test_after_a_rollback_only_later_reports_count(store, worker):
+    put(store, 1)
+    merge_once(store, worker)
+    store.rollback("ndt", TILE, 1)
+    put(store, 2, changed={1: None})
+    merge_once(store, worker)
+    assert head(store).gaussians == gaussians_of({0: GROUND})
+
+
+def damage(store, tile):
+    """Flip a byte of the newest body, as a failing disk would."""
+    with apsw.Connection(str(store.path)) as connection:
+        select = "SELECT body FROM tile_version WHERE tile = ? AND version = 1"
+        body = bytearray(connection.execute(select, (tile.morton,)).get)
+        body[-1] ^= 0x40
+        connection.execute("UPDATE tile_version SET body = ? WHERE tile = ?", (bytes(body), tile.morton))
+
+
+def test_a_tile_whose_merge_fails_is_set_aside_after_some_attempts_and_the_others_go_on(store, worker, caplog):
+    damage(store, NEIGHBOUR)
+    failing = put(store, 1, tile=NEIGHBOUR)
+    put(store, 2)
+    with caplog.at_level(logging.CRITICAL):
+        assert [r.status for r in merge_once(store, worker)] == ["published"]
+        assert store.dirty_count() == 1
+        assert merge_once(store, worker) == []
+        assert [r.status for r in merge_once(store, worker)] == ["unchanged"]
+    assert store.dirty_count() == 0
+    (kept,) = store.quarantined()
+    assert "set aside after 3 attempts" in kept.reason
+    assert "WrongHash" in kept.reason
+    assert kept.body.decode().split() == ["ndt", NEIGHBOUR.path, failing]
+    assert store.counts().report_rows == 2  # the report itself is not lost
+
+
+def test_a_tile_that_kills_its_shards_is_set_aside_without_another_attempt(store, worker):
+    first = put(store, 1)
+    for shard in ("a", "b", "c"):
+        assert store.claim(shard, 1, 30.0)
+        store.release(shard)  # as the others do when it has died
+    assert [r.status for r in merge_once(store, worker)] == ["unchanged"]
+    assert "no shard that claimed it came to an end" in store.quarantined()[0].reason
+    second = put(store, 2)  # the next report gives both another chance
+    assert [r.status for r in merge_once(store, worker)] == ["published"]
+    assert store.provenance("ndt", TILE, 2) == (first, second)
+
+
+def test_a_stored_report_that_cannot_be_read_any_more_is_left_out_and_said_so(store, worker):
+    put(store, 1)
+    store.put_reports([ReportRow("01HF7YAT00" + "0" * 16, "ndt", TILE, "car", 0, b"\xff")])
+    assert [r.status for r in merge_once(store, worker)] == ["published"]
+    assert head(store).gaussians == gaussians_of({**STATES, 2: POLE})
+    assert "cannot be read any more" in store.quarantined()[0].reason
+
+
+def test_a_lease_that_was_lost_publishes_nothing(store, worker):
+    put(store, 1)
+    claims = store.claim("slow", 16, 30.0)
+    publications = worker.merge(claims)
+    store.release("slow")
+    assert [r.status for r in merge_once(store, worker)] == ["published"]
+    assert [r.status for r in store.publish(publications)] == ["stale"]
+    assert store.get("ndt", TILE).version == 2
+
+
+def test_idle_time_ends_when_the_next_tile_is_ready(store, worker):
+    assert worker.idle_s(None) == ShardConfig().poll_s
+    assert worker.idle_s(0) == pytest.approx(0.005)
