@@ -47,7 +47,7 @@ def parked_cars(world: World, state: State, occupancy: float, seed: int) -> tupl
 def _is_obstacle(shape: Shape, world: World) -> bool:
     """Whether a primitive stands in a parking lane (the road itself does not)."""
     _, y0, _, y1, top = shape.bounds()
-    near = min(abs(y0), abs(y1)) < world.kerb_m and y0 * y1 > 0
+    near = min(abs(y0), abs(y1)) < world.kerb_m - _CLEARANCE_M / 2 and y0 * y1 > 0
     return near and top > 0.0 and (not isinstance(shape, Post) or shape.bottom_m < 2.0) and not _is_arm(shape)
 
 

@@ -9,7 +9,7 @@ kerbs follow the slope, and straight rays stay straight.
 import json
 from dataclasses import asdict, dataclass
 from functools import cached_property
-from math import cos, sin
+from math import cos, isfinite, sin
 from pathlib import Path
 from typing import Any, Final, Literal, get_args
 
@@ -87,6 +87,10 @@ class World:
     objects: tuple[WorldObject, ...]
 
     def __post_init__(self) -> None:
+        numbers = {name: value for name, value in vars(self).items() if name not in ("objects", "seed")}
+        bad = [name for name, value in numbers.items() if not isinstance(value, (int, float)) or not isfinite(value)]
+        if bad:
+            raise WorldError(f"world {self.seed}: {', '.join(bad)} must be finite numbers")
         if self.half_length_m <= 0 or not 0 < self.lane_offset_m < self.kerb_m:
             raise WorldError(
                 f"need half_length_m > 0 and 0 < lane_offset_m < kerb_m, got {self.half_length_m},"

@@ -1,0 +1,154 @@
+import numpy as np
+import pytest
+
+from fleet_sim.errors import SceneError
+from fleet_sim.lidar import HDL32E, MODELS, VLP16, Lidar, LidarModel, column_poses
+from fleet_sim.raycast import Scene
+from fleet_sim.shapes import Ball, Block, Post, Shape
+from gnd_map.se3 import exp_so3
+
+# A room: floor, four walls, a column, a ball; the sensor stands in its middle.
+ROOM: list[Shape] = [
+    Block(0.0, 0.0, 40.0, 40.0, -1.0, 0.0),
+    Block(15.0, 0.0, 0.5, 20.0, 0.0, 12.0),
+    Block(-15.0, 0.0, 0.5, 20.0, 0.0, 12.0),
+    Block(0.0, 15.0, 20.0, 0.5, 0.0, 12.0),
+    Block(0.0, -15.0, 20.0, 0.5, 0.0, 12.0),
+    Post(6.0, 4.0, 0.5, 0.0, 5.0),
+    Ball(-5.0, -6.0, 1.5, 1.0),
+]
+
+
+def at(x: float, y: float, z: float) -> np.ndarray:
+    T = np.eye(4)
+    T[:3, 3] = x, y, z
+    return T
+
+
+def standing(model: LidarModel, T: np.ndarray) -> np.ndarray:
+    return np.tile(T, (model.columns + 1, 1, 1))
+
+
+def test_the_beams_are_those_of_the_data_sheets() -> None:
+    np.testing.assert_allclose(np.degrees(np.sort(VLP16.elevations_rad)), np.arange(-15.0, 15.1, 2.0))
+    hdl = np.degrees(np.sort(HDL32E.elevations_rad))
+    assert len(hdl) == 32
+    assert (hdl[0], hdl[-1]) == (pytest.approx(-30.67, abs=0.01), pytest.approx(10.67, abs=0.01))
+    np.testing.assert_allclose(np.diff(hdl), 1.333, atol=0.001)
+    np.testing.assert_allclose(np.degrees(VLP16.elevations_rad[:4]), [-15.0, 1.0, -13.0, 3.0])
+    np.testing.assert_allclose(np.degrees(HDL32E.elevations_rad[:4]), [-30.67, -9.33, -29.33, -8.0], atol=0.01)
+
+
+@pytest.mark.parametrize(("model", "azimuth_step_deg"), [(VLP16, 0.2), (HDL32E, 0.16)])
+def test_azimuth_steps_are_those_of_the_data_sheets(model: LidarModel, azimuth_step_deg: float) -> None:
+    assert 360.0 / model.columns == pytest.approx(azimuth_step_deg, rel=0.05)
+    assert model.period_ns == 100_000_000
+
+
+def test_the_sensor_turns_clockwise_and_starts_behind() -> None:
+    directions = VLP16.directions()
+    np.testing.assert_allclose(directions[0, 0, :2] / np.linalg.norm(directions[0, 0, :2]), [-1.0, 0.0], atol=1e-9)
+    azimuth = np.unwrap(np.arctan2(directions[:, 0, 1], directions[:, 0, 0]))
+    assert np.all(np.diff(azimuth) < 0)
+    assert azimuth[0] - azimuth[-1] == pytest.approx(2 * np.pi, abs=0.01)
+    np.testing.assert_allclose(np.linalg.norm(directions, axis=-1), 1.0)
+
+
+def test_shots_too_many_for_the_cycle_are_refused() -> None:
+    with pytest.raises(SceneError, match="do not fit"):
+        LidarModel("bad", (0.0,) * 10, cycle_ns=100, shot_ns=11)
+
+
+@pytest.mark.parametrize("name", MODELS)
+def test_a_standing_sensor_sees_the_room_as_plain_casting_does(name: str) -> None:
+    model = MODELS[name]
+    T, scene = at(0.5, -1.0, 1.9), Scene.build(ROOM)
+    hits = Lidar(model).hits(scene, standing(model, T))
+    ranges, index = scene.cast(T[:3, 3], model.directions().reshape(-1, 3), model.range_max_m)
+    np.testing.assert_allclose(hits.range_m.ravel(), ranges, rtol=1e-12)
+    np.testing.assert_array_equal(hits.primitive.ravel(), index)
+
+
+def test_incidence_is_the_cosine_to_the_surface_normal() -> None:
+    """Against normals found by tilting rays: the range's derivative gives the surface's direction."""
+    scene, T = Scene.build(ROOM), at(0.5, -1.0, 1.9)
+    hits = Lidar(VLP16).hits(scene, standing(VLP16, T))
+    d = VLP16.directions()
+    ahead = np.cross(d, [0.0, 0.0, 1.0])
+    ahead /= np.linalg.norm(ahead, axis=-1, keepdims=True)
+    points = []
+    for offset in (np.zeros_like(d), 1e-5 * ahead, 1e-5 * np.cross(ahead, d)):
+        tilted = (d + offset) / np.linalg.norm(d + offset, axis=-1, keepdims=True)
+        ranges, index = scene.cast(T[:3, 3], tilted.reshape(-1, 3), 100.0)
+        points.append((tilted.reshape(-1, 3) * ranges[:, None], index))
+    same = (points[0][1] >= 0) & (points[0][1] == points[1][1]) & (points[0][1] == points[2][1])
+    normal = np.cross(points[1][0][same] - points[0][0][same], points[2][0][same] - points[0][0][same])
+    normal /= np.linalg.norm(normal, axis=1, keepdims=True)
+    cosine = np.abs(np.einsum("ni,ni->n", normal, d.reshape(-1, 3)[same]))
+    off = np.abs(cosine - hits.incidence.ravel()[same])
+    assert np.quantile(off, 0.99) < 1e-3, "only rays at an edge, whose tilted neighbours meet another face, may differ"
+
+
+def test_every_point_carries_the_motion_at_its_own_time() -> None:
+    """Put back with the true pose at its own time, each point lies on the wall; with one pose for all it does not."""
+    scene = Scene.build(ROOM)
+    model = VLP16
+
+    def pose_at(t_s: np.ndarray) -> np.ndarray:
+        T = np.tile(at(-2.0, 0.0, 1.9), (len(t_s), 1, 1))
+        T[:, 0, 3] += 15.0 * t_s
+        T[:, :3, :3] = exp_so3(np.outer(t_s, [0.0, 0.0, 0.6]))
+        return T
+
+    hits = Lidar(model).hits(scene, column_poses(model, 0.0, pose_at))
+    on_wall = hits.primitive == 1
+    points, t_s = model.directions()[on_wall] * hits.range_m[on_wall][:, None], model.shot_times_ns()[on_wall] * 1e-9
+    true, frozen = pose_at(t_s), pose_at(np.zeros(1))[0]
+    x = np.einsum("ni,ni->n", true[:, 0, :3], points) + true[:, 0, 3]
+    np.testing.assert_allclose(x, 14.5, atol=1e-6)
+    assert np.abs(points @ frozen[0, :3] + frozen[0, 3] - 14.5).max() > 0.5
+
+
+def test_noise_rings_and_times_are_those_of_the_model() -> None:
+    scene, T = Scene.build(ROOM), at(0.5, -1.0, 1.9)
+    lidar = Lidar(HDL32E)
+    hits, sweep = (
+        lidar.hits(scene, standing(HDL32E, T)),
+        lidar.sweep(scene, standing(HDL32E, T), np.random.default_rng(0)),
+    )
+    assert np.all(np.diff(sweep.t_offset_ns.astype(np.int64)) > 0), "points keep the order of firing"
+    assert sweep.t_offset_ns.max() < HDL32E.period_ns
+    column, beam = sweep.t_offset_ns // HDL32E.cycle_ns, sweep.t_offset_ns % HDL32E.cycle_ns // HDL32E.shot_ns
+    np.testing.assert_array_equal(sweep.ring, HDL32E.rings[beam])
+    off = np.linalg.norm(sweep.points_lidar_m.astype(float), axis=1) - hits.range_m[column, beam]
+    assert off.std() == pytest.approx(HDL32E.range_sigma_m, rel=0.03)
+    assert abs(off.mean()) < 1e-3
+    elevation = np.arcsin(sweep.points_lidar_m[:, 2] / np.linalg.norm(sweep.points_lidar_m, axis=1))
+    np.testing.assert_allclose(elevation, np.array(HDL32E.elevations_rad)[beam], atol=2e-3)
+
+
+def test_a_share_of_bright_returns_is_lost_and_dark_grazing_ones_more() -> None:
+    scene, T = Scene.build([Block(0.0, 0.0, 150.0, 150.0, -1.0, 0.0, reflectivity=0.15), *ROOM[1:5]]), at(0.0, 0.0, 1.9)
+    lidar, rng = Lidar(VLP16), np.random.default_rng(0)
+    hits = lidar.hits(scene, standing(VLP16, T))
+    sweeps = [lidar.sweep(scene, standing(VLP16, T), rng) for _ in range(4)]
+    walls = int((hits.primitive > 0).sum())
+    on_walls = [np.abs(s.points_lidar_m[:, :2]).max(axis=1) > 14.3 for s in sweeps]
+    assert np.mean([w.sum() for w in on_walls]) / walls == pytest.approx(0.99, abs=0.005)
+    open_scene = Scene.build([Block(0.0, 0.0, 150.0, 150.0, -1.0, 0.0, reflectivity=0.15)])
+    far = lidar.sweep(open_scene, standing(VLP16, T), rng)
+    met = lidar.hits(open_scene, standing(VLP16, T)).range_m
+    ranges = np.linalg.norm(far.points_lidar_m, axis=1)
+    assert np.isfinite(met).sum() > len(ranges), "asphalt seen at a grazing angle gives no echo"
+    assert 15.0 < ranges.max() < 60.0
+
+
+def test_returns_outside_the_range_are_not_given() -> None:
+    near = Scene.build([Block(0.0, 0.0, 9.0, 9.0, -1.0, 0.0), Post(0.8, 0.0, 0.1, 0.0, 5.0)])
+    sweep = Lidar(VLP16).sweep(near, standing(VLP16, at(0.0, 0.0, 1.9)), np.random.default_rng(0))
+    assert np.linalg.norm(sweep.points_lidar_m, axis=1).min() > 0.99 * VLP16.range_min_m
+
+
+def test_a_wrong_number_of_poses_is_refused() -> None:
+    with pytest.raises(SceneError, match=r"VLP-16 needs poses"):
+        Lidar(VLP16).hits(Scene.build(ROOM), np.tile(np.eye(4), (10, 1, 1)))
