@@ -15,20 +15,20 @@ MIN_SPREAD_M = 0.5  # a sensor that repeats one value shows less
 SAMPLE = 1000  # points that usually settle it
 
 
-def check_scan(scan: Scan) -> None:
-    """Refuse a scan without information.
+def check_points(points_m: F32, t_ns: int) -> None:
+    """Refuse the points (N, 3) of a scan at `t_ns` that hold no information.
 
     Raises:
         BadScan: `empty` (too few points), `not-finite` (mostly NaN) or `constant` (all points in one place).
     """
-    n = len(scan.points_m)
+    n = len(points_m)
     if n < MIN_POINTS:
-        raise BadScan("empty", f"scan at {scan.t_ns} ns has {n} points, {MIN_POINTS} are needed")
-    bad = scan.points_m.size - int(np.count_nonzero(np.isfinite(scan.points_m)))
-    if bad > (1 - MIN_FINITE) * scan.points_m.size:
-        raise BadScan("not-finite", f"scan at {scan.t_ns} ns: {bad} of {3 * n} coordinates are not finite")
-    if spread_m(scan.points_m[:: max(1, n // SAMPLE)]) < MIN_SPREAD_M and spread_m(scan.points_m) < MIN_SPREAD_M:
-        raise BadScan("constant", f"scan at {scan.t_ns} ns: its {n} points lie within {MIN_SPREAD_M} m")
+        raise BadScan("empty", f"scan at {t_ns} ns has {n} points, {MIN_POINTS} are needed")
+    bad = points_m.size - int(np.count_nonzero(np.isfinite(points_m)))
+    if bad > (1 - MIN_FINITE) * points_m.size:
+        raise BadScan("not-finite", f"scan at {t_ns} ns: {bad} of {points_m.size} coordinates are not finite")
+    if spread_m(points_m[:: max(1, n // SAMPLE)]) < MIN_SPREAD_M and spread_m(points_m) < MIN_SPREAD_M:
+        raise BadScan("constant", f"scan at {t_ns} ns: its {n} points lie within {MIN_SPREAD_M} m")
 
 
 def spread_m(points_m: F32) -> float:
@@ -63,4 +63,4 @@ class Guard:
             what = type(item).__name__
             raise BadScan("time-backwards", f"{what} at {item.t_ns} ns comes after one at {newest_ns} ns")
         if isinstance(item, Scan):
-            check_scan(item)
+            check_points(item.points_m, item.t_ns)

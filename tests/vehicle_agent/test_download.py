@@ -1,0 +1,164 @@
+"""Tiles over a real bus from a real tile server: cached, absent, wrong, late."""
+
+import threading
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from vehicle_scene import ground, tiles_of
+from waiting import wait_until
+
+from fleet_bus.bus import Bus
+from fleet_bus.serving import Request
+from gnd_map.tile import Tile
+from gnd_map.tile_id import TileId
+from schemas.keys import tile_key
+from schemas.tiles import TileReply, TileRequest, blob_of
+from tile_store.server import TileServer
+from tile_store.sqlite_store import SqliteStore
+from vehicle_agent.cache import TileCache
+from vehicle_agent.config import DownloadParameters
+from vehicle_agent.download import TileFetcher
+
+QUICK = DownloadParameters(request_s=0.6, retry_s=0.1, in_flight=3)
+NEVER = threading.Event()
+
+
+@pytest.fixture(scope="module")
+def tiles() -> dict[TileId, Tile]:
+    return {t: tile for t, tile in tiles_of(ground(20.0)).items() if len(tile.gaussians) > 100}
+
+
+@pytest.fixture
+def store(tmp_path: Path, tiles: dict[TileId, Tile]) -> Iterator[SqliteStore]:
+    with SqliteStore(tmp_path / "store.sqlite") as opened:
+        opened.put_tiles(list(tiles.values()))
+        yield opened
+
+
+@pytest.fixture
+def cache(tmp_path: Path) -> TileCache:
+    return TileCache(tmp_path / "cache.sqlite")
+
+
+@pytest.fixture
+def fetcher(bus: Bus, cache: TileCache) -> Iterator[TileFetcher]:
+    opened = TileFetcher(bus, cache, QUICK)
+    yield opened
+    bus.close()
+    opened.close()
+
+
+def elsewhere(tiles: dict[TileId, Tile]) -> TileId:
+    return TileId.from_indices(min(tiles).lon_index - 40, min(tiles).lat_index)
+
+
+def test_tiles_arrive_and_absent_ones_are_remembered(
+    fetcher: TileFetcher, cache: TileCache, cloud: Bus, store: SqliteStore, tiles: dict[TileId, Tile]
+) -> None:
+    nowhere = elsewhere(tiles)
+    with TileServer(store, cloud):
+        fetcher.want([nowhere, *tiles])
+        assert fetcher.wait_for([nowhere, *tiles], 15.0, NEVER) == set()
+        arrived = {f.tile_id: f for f in fetcher.take()}
+        assert arrived[nowhere].status == "absent"
+        for tile_id, tile in tiles.items():
+            assert arrived[tile_id].status == "blob"
+            assert arrived[tile_id].tile is not None
+            assert arrived[tile_id].tile.gaussians == tile.gaussians
+            assert cache.head(tile_id)[1] == tile.sha
+        fetcher.want([nowhere, *tiles])  # all of it is known: nobody is asked again
+        assert fetcher.wait_for([nowhere, *tiles], 1.0, NEVER) == set()
+        assert fetcher.take() == []
+    assert fetcher.counts == {"blob": len(tiles), "absent": 1}
+
+
+def test_what_is_cached_is_not_sent_again_unless_it_changed(
+    fetcher: TileFetcher, cache: TileCache, cloud: Bus, store: SqliteStore, tiles: dict[TileId, Tile]
+) -> None:
+    for tile_id in tiles:
+        head = store.get("ndt", tile_id)
+        assert head is not None
+        cache.put(head.decode())
+    changed = min(tiles)
+    store.put_tiles([Tile(changed, 0, tiles[changed].gaussians.take(np.arange(50)))])
+    with TileServer(store, cloud):
+        fetcher.want(list(tiles))
+        assert fetcher.wait_for(tiles, 15.0, NEVER) == set()
+    assert fetcher.counts == {"unchanged": len(tiles) - 1, "blob": 1}
+    assert all(f.tile is not None for f in fetcher.take())
+    assert cache.head(changed)[0] == 2
+
+
+def test_a_tile_with_the_wrong_hash_is_refused_by_name_and_fetched_again(
+    fetcher: TileFetcher, cache: TileCache, cloud: Bus, tiles: dict[TileId, Tile]
+) -> None:
+    tile_id, tile = next(iter(tiles.items()))
+    other = next(t for t in tiles.values() if t.tile_id != tile_id)
+    requests: list[TileRequest] = []
+
+    def answer(request: Request) -> bytes:
+        requests.append(TileRequest.decode(request.payload))
+        bad = replace(blob_of(tile), body=blob_of(other).body)
+        return TileReply("blob", bad if len(requests) == 1 else blob_of(tile)).encode()
+
+    cloud.serve(tile_key("ndt", tile_id), answer)
+    fetcher.want([tile_id])
+    assert fetcher.wait_for([tile_id], 15.0, NEVER) == set()
+    (fetched,) = fetcher.take()
+    assert fetched.tile is not None
+    assert fetched.tile.gaussians == tile.gaussians
+    assert fetcher.counts == {"refused": 1, "blob": 1}
+    assert "content has sha" in fetcher.last_error
+    assert cache.head(tile_id)[1] == tile.sha
+    assert requests[1] == TileRequest()
+
+
+def test_a_tile_that_stays_wrong_never_reaches_the_cache(
+    fetcher: TileFetcher, cache: TileCache, cloud: Bus, tiles: dict[TileId, Tile]
+) -> None:
+    tile_id, other_id = sorted(tiles)[:2]
+    cloud.serve(tile_key("ndt", tile_id), lambda _: TileReply("blob", blob_of(tiles[other_id])).encode())
+    fetcher.want([tile_id])
+    wait_until(lambda: fetcher.counts["failed"] >= 1)
+    assert fetcher.counts["refused"] == 3 * fetcher.counts["failed"] or fetcher.counts["refused"] > 3
+    assert "asked for tile" in fetcher.last_error
+    assert fetcher.take() == []
+    assert len(cache) == 0
+
+
+def test_without_the_store_the_cached_tile_has_to_do_until_it_answers(
+    fetcher: TileFetcher, cache: TileCache, cloud: Bus, store: SqliteStore, tiles: dict[TileId, Tile]
+) -> None:
+    tile_id, unknown = sorted(tiles)[:2]
+    old = Tile(tile_id, 1, tiles[tile_id].gaussians.take(np.arange(20)))
+    cache.put(old)
+    fetcher.want([tile_id, unknown])
+    assert fetcher.wait_for([tile_id], 15.0, NEVER) == set()
+    assert fetcher.wait_for([tile_id, unknown], 0.0, NEVER) == {unknown}
+    (late,) = fetcher.take()
+    assert (late.status, late.tile and late.tile.sha) == ("cached", old.sha)
+    with TileServer(store, cloud):
+        wait_until(lambda: fetcher.counts["blob"] == 2)
+    assert {f.tile_id: f.status for f in fetcher.take()} == {tile_id: "blob", unknown: "blob"}
+
+
+def test_waiting_ends_when_the_drive_is_stopped(fetcher: TileFetcher, tiles: dict[TileId, Tile]) -> None:
+    stop = threading.Event()
+    stop.set()
+    fetcher.want(list(tiles))
+    assert fetcher.wait_for(tiles, 60.0, stop) == set(tiles)
+
+
+def test_a_tile_that_was_let_go_is_asked_for_again(
+    fetcher: TileFetcher, cloud: Bus, store: SqliteStore, tiles: dict[TileId, Tile]
+) -> None:
+    tile_id = min(tiles)
+    with TileServer(store, cloud):
+        fetcher.want([tile_id])
+        wait_until(lambda: fetcher.counts["blob"] == 1)
+        fetcher.forget(tile_id)
+        fetcher.want([tile_id])
+        wait_until(lambda: fetcher.counts["unchanged"] == 1)

@@ -1,0 +1,127 @@
+"""The outbox thread over a real bus: nobody there, a slow answer, a refusal, a restart."""
+
+import threading
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import pytest
+from waiting import wait_until
+
+from fleet_bus.bus import Bus
+from fleet_bus.errors import Refused
+from fleet_bus.serving import Request
+from gnd_map.tile_id import District
+from schemas.changes import ChangeAck
+from schemas.keys import change_key, change_keys
+from schemas.report_id import deterministic_report_id
+from vehicle_agent.outbox import Outbox
+from vehicle_agent.sending import SenderThread
+
+DISTRICT = District("13033/03021/23031")
+KEY = change_key("ndt", DISTRICT)
+NEVER = threading.Event()
+Opener = Callable[[], SenderThread]
+
+
+def report_id(number: int) -> str:
+    return deterministic_report_id(1_570_838_400_000, "vehicle", str(number))
+
+
+@pytest.fixture
+def outbox(tmp_path: Path) -> Outbox:
+    return Outbox(tmp_path / "outbox.sqlite")
+
+
+@pytest.fixture
+def start(bus: Bus, outbox: Outbox) -> Iterator[Opener]:
+    opened: list[SenderThread] = []
+
+    def open_sender() -> SenderThread:
+        opened.append(SenderThread(bus, outbox))
+        return opened[-1]
+
+    yield open_sender
+    bus.close()
+    for sender in opened:
+        sender.close()
+
+
+class Inbox:
+    """Answers reports with a status and remembers them."""
+
+    def __init__(self, status: str = "stored", reason: str = "") -> None:
+        self.status, self.reason = status, reason
+        self.bodies: list[bytes] = []
+
+    def __call__(self, request: Request) -> bytes:
+        self.bodies.append(request.payload)
+        return ChangeAck(request.payload.decode(), self.status, self.reason).encode()  # type: ignore[arg-type]
+
+
+def test_reports_wait_until_somebody_answers(start: Opener, outbox: Outbox, cloud: Bus) -> None:
+    outbox.put(report_id(1), KEY, report_id(1).encode())
+    sender = start()
+    assert not sender.drain(0.3, NEVER)
+    assert outbox.counts().pending == 1
+    inbox = Inbox()
+    cloud.serve(change_keys(), inbox)
+    assert sender.drain(15.0, NEVER)
+    assert outbox.counts().acknowledged == 1
+    assert set(inbox.bodies) == {report_id(1).encode()}
+
+
+def test_the_oldest_goes_first_and_a_duplicate_counts_as_acknowledged(
+    start: Opener, outbox: Outbox, cloud: Bus
+) -> None:
+    inbox = Inbox("duplicate")
+    cloud.serve(change_keys(), inbox)
+    ids = sorted(report_id(n) for n in range(5))
+    for number in reversed(ids):
+        outbox.put(number, KEY, number.encode())
+    assert start().drain(15.0, NEVER)
+    assert inbox.bodies == [number.encode() for number in ids]
+    assert outbox.counts().acknowledged == 5
+
+
+def test_a_quarantined_report_is_kept_with_its_reason(start: Opener, outbox: Outbox, cloud: Bus) -> None:
+    cloud.serve(change_keys(), Inbox("quarantined", "covariance of voxel 7 is absurd"))
+    outbox.put(report_id(1), KEY, report_id(1).encode())
+    assert start().drain(15.0, NEVER)
+    assert outbox.refused() == [(report_id(1), "covariance of voxel 7 is absurd")]
+
+
+def test_a_report_that_is_refused_for_good_is_not_sent_for_ever(start: Opener, outbox: Outbox, cloud: Bus) -> None:
+    def refuse(_request: Request) -> bytes:
+        raise Refused("no reports about this region")
+
+    cloud.serve(change_keys(), refuse)
+    outbox.put(report_id(1), KEY, b"body")
+    assert start().drain(15.0, NEVER)
+    assert "no reports about this region" in outbox.refused()[0][1]
+
+
+def test_an_answer_for_another_report_is_no_acknowledgement(start: Opener, outbox: Outbox, cloud: Bus) -> None:
+    cloud.serve(change_keys(), lambda _: ChangeAck(report_id(99), "stored").encode())
+    outbox.put(report_id(1), KEY, b"body")
+    sender = start()
+    wait_until(lambda: sender.last_error)
+    assert f"was answered for report {report_id(99)}" in sender.last_error
+    assert outbox.counts().pending == 1
+
+
+def test_a_restarted_sender_sends_only_what_is_open(start: Opener, outbox: Outbox, cloud: Bus) -> None:
+    outbox.put(report_id(1), KEY, report_id(1).encode())
+    outbox.put(report_id(2), KEY, report_id(2).encode())
+    outbox.answered(report_id(1), "stored")
+    outbox.failed(outbox.due(0)[0], 10**19 // 2, "the agent was killed here")
+    inbox = Inbox()
+    cloud.serve(change_keys(), inbox)
+    assert start().drain(15.0, NEVER)
+    assert inbox.bodies == [report_id(2).encode()]
+
+
+def test_draining_ends_when_the_agent_is_stopped(start: Opener, outbox: Outbox) -> None:
+    outbox.put(report_id(1), KEY, b"body")
+    stop = threading.Event()
+    stop.set()
+    assert not start().drain(60.0, stop)
