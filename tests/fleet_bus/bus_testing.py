@@ -12,6 +12,8 @@ from pathlib import Path
 
 import psutil
 
+from fleet_bus.bus import Bus
+
 REPOSITORY = Path(__file__).resolve().parents[2]
 DEADLINE_S = 15.0
 
@@ -30,6 +32,36 @@ def stays(condition: Callable[[], object], what: str, for_s: float = 0.3) -> Non
     while time.monotonic() < end_s:
         assert condition(), what
         time.sleep(0.01)
+
+
+PROBE = b"is anybody there?"
+
+
+class Inbox:
+    """A callback that keeps (key, payload) of what it gets, leaving out probes."""
+
+    def __init__(self, then: Callable[[str, bytes], None] = lambda _key, _payload: None) -> None:
+        self.items: list[tuple[str, bytes]] = []
+        self._then = then
+        self._probed = threading.Event()
+
+    def __call__(self, key: str, payload: bytes) -> None:
+        if payload == PROBE:
+            self._probed.set()
+            return
+        self.items.append((key, payload))
+        self._then(key, payload)
+
+    @property
+    def payloads(self) -> list[bytes]:
+        return [payload for _, payload in self.items]
+
+    def wait_connected(self, sender: Bus, key: str) -> None:
+        """Publishes probes until one arrives: before that, the routers may not know the subscription yet."""
+        deadline_s = time.monotonic() + DEADLINE_S
+        while not self._probed.wait(0.01):
+            assert time.monotonic() < deadline_s, f"nothing published on {key} arrives"
+            sender.publish(key, PROBE, kind="control")
 
 
 class Script:

@@ -8,9 +8,9 @@ import threading
 import psutil
 import pytest
 import zenoh
-from bus_testing import sockets_to, wait_for
+from bus_testing import Inbox, sockets_to, wait_for
 
-from fleet_bus.bus import Bus, open_bus
+from fleet_bus.bus import open_bus
 from fleet_bus.config import BusConfig, assert_rules, zenoh_config
 from fleet_bus.errors import BusClosed, BusConfigError, MessageTooLarge, NoRouter
 from fleet_bus.router import open_router
@@ -47,22 +47,15 @@ def test_the_default_of_zenoh_breaks_the_rules():
 def test_large_messages_do_not_bypass_the_socket(router, client, key):
     """With shared memory a local payload above 3 kB would not be seen on the wire."""
     sender, receiver = client(router), client(router)
-    got = []
-    receiver.subscribe(key, lambda _key, payload: got.append(len(payload)))
+    inbox = Inbox()
+    receiver.subscribe(key, inbox)
+    inbox.wait_connected(sender, key)
     before = sender.wire().up, receiver.wire().down
-    wait_for_subscriber(sender, key)
     for _ in range(5):
         sender.publish(key, bytes(200_000), kind="update")
-    wait_for(lambda: got.count(200_000) == 5, "five messages")
+    wait_for(lambda: len(inbox.items) == 5, "five messages")
     assert sender.wire().up - before[0] > 1_000_000
     assert receiver.wire().down - before[1] > 1_000_000
-
-
-def wait_for_subscriber(sender: Bus, key: str) -> None:
-    """Publishes are dropped at the source as long as the router knows no subscriber."""
-    querier = sender._connection.session.declare_publisher(key)
-    wait_for(lambda: querier.matching_status, f"a subscriber of {key}")
-    querier.undeclare()
 
 
 def test_opening_a_session_opens_no_udp_socket(router, client):
@@ -136,13 +129,13 @@ def test_too_large_a_message_is_refused_before_it_is_sent(router, client, key):
 
 def test_a_receiver_drops_what_exceeds_its_limit_and_lives_on(router, client, key):
     sender, receiver = client(router), client(router, max_message_bytes=100_000)
-    got = []
-    receiver.subscribe(key, lambda _key, payload: got.append(len(payload)))
-    wait_for_subscriber(sender, key)
+    inbox = Inbox()
+    receiver.subscribe(key, inbox)
+    inbox.wait_connected(sender, key)
     sender.publish(key, bytes(1_000_000), kind="update")
     sender.publish(key, bytes(10), kind="update")
-    wait_for(lambda: got, "the small message")
-    assert got == [10]
+    wait_for(lambda: inbox.items, "the small message")
+    assert inbox.payloads == [bytes(10)]
 
 
 def test_a_bus_of_the_parent_is_refused_after_a_fork(router, client, key):

@@ -6,9 +6,8 @@ import threading
 
 import pytest
 import zenoh
-from bus_testing import wait_for
+from bus_testing import Inbox, wait_for
 
-from fleet_bus.bus import Bus
 from fleet_bus.config import BusConfig, zenoh_config
 from fleet_bus.errors import RequestFailed
 from fleet_bus.links import LinkProfile
@@ -69,19 +68,18 @@ def relay(router):
 @pytest.mark.slow
 def test_a_stall_longer_than_zenohs_patience_loses_nothing(router, client, relay, key):
     receiver = client(router)
-    got: list[int] = []
-    receiver.subscribe(key, lambda _key, payload: got.append(int.from_bytes(payload[:2], "little")))
-    sender: Bus = client(relay.endpoint, link=CELLULAR)
-    publisher = sender._connection.session.declare_publisher(key)
-    wait_for(lambda: publisher.matching_status, "the subscriber")
+    inbox = Inbox()
+    receiver.subscribe(key, inbox)
+    sender = client(relay.endpoint, link=CELLULAR)
+    inbox.wait_connected(sender, key)
     relay.open.clear()
     reopening = threading.Timer(STALL_S, relay.open.set)
     reopening.start()
     for number in range(200):  # 2 MB: far more than all buffers on the way
         sender.publish(key, number.to_bytes(2, "little") + bytes(10_000), kind="update")
-    wait_for(lambda: len(got) == 200, "all notices after the stall")
+    wait_for(lambda: len(inbox.items) == 200, "all notices after the stall")
     reopening.join()
-    assert got == list(range(200))
+    assert [int.from_bytes(payload[:2], "little") for payload in inbox.payloads] == list(range(200))
     assert relay.connections == 1, "the session was given up and opened again"
 
 

@@ -5,6 +5,7 @@ import threading
 import time
 
 import pytest
+from bus_testing import Inbox, wait_for
 from hypothesis import given
 from hypothesis import strategies as st
 
@@ -165,26 +166,15 @@ def test_requests_pass_the_link_both_ways(router, client, key):
 
 def test_notices_pass_the_link_in_order(router, client, key):
     sender, receiver = client(router), client(router, link=SLOW)
-    got: list[tuple[float, int]] = []
-    arrived = threading.Event()
-
-    def note(_key, payload):
-        got.append((time.monotonic(), payload[0]))
-        if len(got) == 4:
-            arrived.set()
-
-    receiver.subscribe(key, note)
-    publisher = sender._connection.session.declare_publisher(key)
-    deadline_s = time.monotonic() + 10
-    while not publisher.matching_status:
-        assert time.monotonic() < deadline_s
-        time.sleep(0.005)
+    inbox = Inbox()
+    receiver.subscribe(key, inbox)
+    inbox.wait_connected(sender, key)
     start_s = time.monotonic()
     for number in range(4):
         sender.publish(key, bytes([number]) + bytes(24_999), kind="update")
-    assert arrived.wait(10)
-    assert [number for _, number in got] == [0, 1, 2, 3]
-    assert got[-1][0] - start_s >= 4 * 0.05
+    wait_for(lambda: len(inbox.items) == 4, "four notices")
+    assert time.monotonic() - start_s >= 4 * 0.05
+    assert [payload[0] for payload in inbox.payloads] == [0, 1, 2, 3]
 
 
 def test_publishing_waits_for_the_uplink(router, client, key):
