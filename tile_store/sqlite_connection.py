@@ -79,7 +79,7 @@ def open_writer(path: Path, *, create: bool, busy_timeout_s: float) -> apsw.Conn
 
 def _prepare(connection: apsw.Connection, path: Path, busy_timeout_s: float) -> None:
     connection.set_busy_handler(_Patience(busy_timeout_s))
-    _check_header(connection, path)
+    _retry_busy(lambda: _check_header(connection, path), busy_timeout_s)
     _retry_busy(lambda: connection.pragma("journal_mode", "wal"), busy_timeout_s)
     connection.pragma("synchronous", "full")
     connection.pragma("trusted_schema", False)
@@ -91,9 +91,13 @@ def _prepare(connection: apsw.Connection, path: Path, busy_timeout_s: float) -> 
 
 
 def _check_header(connection: apsw.Connection, path: Path) -> None:
-    application_id = connection.pragma("application_id")
-    version = connection.pragma("user_version")
-    empty = not connection.execute("SELECT COUNT(*) FROM sqlite_schema").get
+    connection.execute("BEGIN")  # all at one instant: another process may be making the schema
+    try:
+        application_id = connection.pragma("application_id")
+        version = connection.pragma("user_version")
+        empty = not connection.execute("SELECT COUNT(*) FROM sqlite_schema").get
+    finally:
+        _undo(connection)
     if application_id != APPLICATION_ID and not (empty and application_id == 0):
         raise StoreUnavailable(f"{path}: an SQLite database of another program, not a tile store; choose another path")
     if version > SCHEMA_VERSION:
@@ -112,8 +116,13 @@ def _create_schema(connection: apsw.Connection) -> None:
             connection.pragma("application_id", APPLICATION_ID)
         connection.execute("COMMIT")
     except BaseException:
-        connection.execute("ROLLBACK")
+        _undo(connection)
         raise
+
+
+def _undo(connection: apsw.Connection) -> None:
+    if connection.in_transaction:  # after some errors SQLite has ended it itself
+        connection.execute("ROLLBACK")
 
 
 class _Patience:
