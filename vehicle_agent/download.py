@@ -9,10 +9,10 @@ from dataclasses import dataclass
 from typing import Literal
 
 from fleet_bus.bus import Bus
-from fleet_bus.errors import BusClosed, BusError
+from fleet_bus.errors import BusClosed
 from gnd_map.tile import Tile
 from gnd_map.tile_id import TileId
-from schemas.errors import SchemaError, WrongHash
+from schemas.errors import WrongHash
 from schemas.keys import tile_key
 from schemas.tiles import TileReply, TileRequest, tile_of
 from vehicle_agent.cache import TileCache
@@ -151,7 +151,7 @@ class TileFetcher:
             return self._fetch(tile_id)
         except BusClosed:
             return None
-        except (BusError, SchemaError) as error:
+        except Exception as error:  # whatever it was: a worker that ends would never fetch again
             self._note("failed", f"tile {tile_id}: {error}")
             cached = self._cache.get(tile_id)
             return None if cached is None else Fetched(tile_id, "cached", cached)

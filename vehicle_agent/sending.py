@@ -5,7 +5,7 @@ import threading
 import time
 
 from fleet_bus.bus import Bus
-from fleet_bus.errors import BusClosed, BusError, MessageTooLarge, RequestRefused
+from fleet_bus.errors import BusClosed, MessageTooLarge, RequestRefused
 from schemas.changes import ChangeAck
 from schemas.errors import SchemaError
 from vehicle_agent.outbox import Letter, Outbox
@@ -58,7 +58,7 @@ class SenderThread:
             self._stop.set()
         except (RequestRefused, MessageTooLarge) as error:
             self._outbox.answered(letter.report_id, "quarantined", str(error))
-        except (BusError, SchemaError) as error:
+        except Exception as error:  # whatever it was: this thread is all that empties the outbox
             self._outbox.failed(letter, time.time_ns(), str(error))
             self.last_error = str(error)
             _log.warning("report %s not acknowledged: %s", letter.report_id, error)

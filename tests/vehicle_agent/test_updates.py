@@ -94,7 +94,7 @@ def test_a_missed_version_is_fetched_whole(world: World) -> None:
     world.announce(last)
     wait_until(lambda: cached(world) == 3)
     assert world.updates.counts["delta"] == 0
-    assert world.fetcher.counts == {"blob": 2}
+    assert world.fetcher.counts["blob"] >= 2
 
 
 def test_a_notice_without_delta_makes_the_vehicle_fetch(world: World) -> None:
