@@ -3,7 +3,7 @@
 import multiprocessing
 from collections.abc import Callable
 from concurrent.futures import Future, ProcessPoolExecutor, as_completed
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Final
 
@@ -80,7 +80,12 @@ def agent_configs(world_seed: int, agents: int) -> tuple[DriveConfig, ...]:
 
 
 def prepare_fleet_run(
-    world_seed: int, agents: int, out_dir: Path, progress: Progress | None = None, processes: int = 2
+    world_seed: int,
+    agents: int,
+    out_dir: Path,
+    progress: Progress | None = None,
+    processes: int = 2,
+    scans: int | None = None,
 ) -> FleetWorld:
     """Make a world, its truth and all drives.
 
@@ -92,6 +97,7 @@ def prepare_fleet_run(
         out_dir: folder for world.json, truth.npz and drives/, made if need be.
         progress: gets one task that counts drives and truth.
         processes: worker processes for the drives.
+        scans: at most so many scans a drive, None for the whole street.
 
     Returns:
         Where everything is.
@@ -100,7 +106,8 @@ def prepare_fleet_run(
         SimError: nonsense was asked for, or a file cannot be written.
         DriveError: a drive cannot be written.
     """
-    configs = (*mapping_configs(world_seed), *agent_configs(world_seed, agents))
+    configs = [*mapping_configs(world_seed), *agent_configs(world_seed, agents)]
+    configs = [replace(config, scans=scans) for config in configs]
     folder = out_dir / "drives"
     try:
         folder.mkdir(parents=True, exist_ok=True)

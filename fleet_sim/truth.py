@@ -80,6 +80,7 @@ class Truth:
 
     Attributes:
         world_sha: SHA-256 of the world's file, hexadecimal.
+        plan: how densely it was scanned.
         frame: the world's map frame.
         morton: int64 (V,), tile of each voxel.
         voxel_id: int32 (V,), voxel in its tile; sorted by (morton, voxel_id).
@@ -91,6 +92,7 @@ class Truth:
     """
 
     world_sha: str
+    plan: ScanPlan
     frame: LocalFrame
     morton: NDArray[np.int64]
     voxel_id: NDArray[np.int32]
@@ -140,14 +142,15 @@ def make_truth(world: World, rules: TruthRules | None = None, plan: ScanPlan | N
         rules: the fixed criteria; others only for experiments.
         plan: where the scan looks from.
     """
-    rules = rules or TruthRules()
-    scan = dense_scan.dense_scan(world, plan or ScanPlan())
+    rules, plan = rules or TruthRules(), plan or ScanPlan()
+    scan = dense_scan.dense_scan(world, plan)
     classes = classify(scan, rules)
     morton, voxel_id = scan.grid_frame.tile_voxel_of(scan.g.astype(np.int64))
     order = np.lexsort((voxel_id, morton))
     clear, observable = ~marginal(scan, rules), observed(world, scan, classes, rules)
     return Truth(
         world_sha=world_sha(world),
+        plan=plan,
         frame=world.frame,
         morton=morton[order],
         voxel_id=voxel_id[order],
@@ -207,7 +210,8 @@ def write_truth(truth: Truth, path: Path) -> None:
         TruthError: it cannot be written.
     """
     partial = path.with_name(f".{path.name}.part")
-    head = {"format": _FORMAT, "version": _VERSION, "world_sha": truth.world_sha, "rules": asdict(TruthRules())}
+    head: dict[str, object] = {"format": _FORMAT, "version": _VERSION, "world_sha": truth.world_sha}
+    head |= {"rules": asdict(TruthRules()), "plan": asdict(truth.plan)}
     frame = truth.frame
     arrays: dict[str, Any] = {name: getattr(truth, name) for name in _COLUMNS}
     arrays |= {"head": np.array(json.dumps(head)), "anchor": np.array([frame.lat_rad, frame.lon_rad, frame.height_m])}
@@ -227,7 +231,7 @@ def read_truth(path: Path) -> Truth:
         TruthError: it is missing, damaged, or made by other rules.
     """
     try:
-        with np.load(path, allow_pickle=False) as file:
+        with path.open("rb") as stream, np.load(stream, allow_pickle=False) as file:
             data = dict(file)
         head = json.loads(str(data["head"]))
         if (head.get("format"), head.get("version")) != (_FORMAT, _VERSION):
@@ -236,25 +240,27 @@ def read_truth(path: Path) -> Truth:
             raise TruthError(f"{path} was made by other rules than this program's: delete it, it will be made again")
         columns: dict[str, Any] = {name: data[name] for name in _COLUMNS}
         columns |= {state: _unpacked(state, data) for state in ("before", "after")}
+        columns["plan"] = ScanPlan(**head["plan"])
         return Truth(world_sha=head["world_sha"], frame=LocalFrame(*data["anchor"].tolist()), **columns)
-    except (OSError, ValueError, KeyError, zipfile.BadZipFile, EOFError) as error:
+    except (OSError, ValueError, KeyError, TypeError, zipfile.BadZipFile, EOFError) as error:
         raise TruthError(f"cannot read the truth file {path}: {error}") from error
 
 
-def load_or_make_truth(world: World, path: Path) -> Truth:
-    """Return the truth of a world from its file, made first if the file is missing or belongs to another world.
+def load_or_make_truth(world: World, path: Path, plan: ScanPlan | None = None) -> Truth:
+    """Return the truth of a world from its file, made first if the file is missing or belongs to another world or plan.
 
     Raises:
         TruthError: the file cannot be written.
     """
+    plan = plan or ScanPlan()
     if path.exists():
         try:
-            truth = read_truth(path)
+            kept = read_truth(path)
         except TruthError:
-            truth = None
-        if truth is not None and truth.world_sha == world_sha(world):
-            return truth
-    truth = make_truth(world)
+            kept = None
+        if kept is not None and (kept.world_sha, kept.plan) == (world_sha(world), plan):
+            return kept
+    truth = make_truth(world, plan=plan)
     write_truth(truth, path)
     return truth
 

@@ -1,0 +1,88 @@
+import json
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+from click.testing import CliRunner
+
+from fleet_sim.cli import sim
+from fleet_sim.errors import SimError
+from fleet_sim.prepare import prepare_fleet_run
+from fleet_sim.street import street
+from fleet_sim.truth import Truth, read_truth
+from fleet_sim.world import read_world
+from gnd_map.errors import GndError
+from schemas.drive_mcap import load_track, read_header
+
+
+def run(*arguments: object) -> str:
+    result = CliRunner().invoke(sim, [str(a) for a in arguments], catch_exceptions=False)
+    assert result.exit_code == 0, result.output
+    return result.output
+
+
+def test_a_world_is_written_and_inspected(tmp_path: Path) -> None:
+    path = tmp_path / "w.json"
+    assert "seed 4" in run("world", "write", path, "--seed", 4)
+    assert read_world(path) == street(4)
+    found = json.loads(run("world", "inspect", path, "--json"))
+    assert (found["seed"], found["length_m"]) == (4, 200.0)
+    assert found["edits"]["added"] > 10
+    text = run("world", "inspect", path)
+    assert "heading_deg" in text
+    assert "building" in text
+
+
+def test_a_drive_is_written(tmp_path: Path) -> None:
+    run("world", "write", tmp_path / "w.json")
+    options = ("--sensor", "HDL-32E", "--state", "before", "--reverse", "--scans", 2, "--vehicle", "v-7", "--seed", 5)
+    assert "MB" in run("drive", tmp_path / "w.json", tmp_path / "d.mcap", *options)
+    header = read_header(tmp_path / "d.mcap")
+    assert (header.vehicle, header.sensor_model) == ("v-7", "HDL-32E")
+    assert "state before, drive seed 5" in header.source
+
+
+@pytest.mark.parametrize(
+    "arguments",
+    [
+        lambda folder: ["world", "inspect", folder / "none.json"],
+        lambda folder: ["world", "write", folder / "no" / "w.json"],
+        lambda folder: ["world", "write", folder / "w.json", "--seed", "-1"],
+        lambda folder: ["drive", folder / "none.json", folder / "d.mcap"],
+    ],
+)
+def test_bad_input_is_an_error_of_ours_and_leaves_nothing(
+    arguments: Callable[[Path], list[object]], tmp_path: Path
+) -> None:
+    with pytest.raises(GndError):
+        run(*arguments(tmp_path))
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.slow
+def test_a_picture_of_a_world_is_drawn(truth_1: tuple[Truth, Path], tmp_path: Path) -> None:
+    run("world", "write", tmp_path / "w.json")
+    shutil.copy(truth_1[1], tmp_path / "truth.npz")
+    output = run("world", "picture", tmp_path / "w.json", tmp_path / "w.png", "--truth", tmp_path / "truth.npz")
+    assert "new" in output
+    assert (tmp_path / "w.png").stat().st_size > 100_000
+
+
+@pytest.mark.slow
+def test_a_fleet_run_is_prepared(truth_1: tuple[Truth, Path], tmp_path: Path) -> None:
+    shutil.copy(truth_1[1], tmp_path / "truth.npz")  # kept truths are used again
+    fleet = prepare_fleet_run(1, 2, tmp_path, processes=2, scans=3)
+    assert [read_header(path).vehicle for path in fleet.base_drives] == ["mapper-0", "mapper-1"]
+    assert [read_header(path).sensor_model for path in fleet.agent_drives] == ["VLP-16", "HDL-32E"]
+    assert read_world(fleet.world_path) == street(1)
+    assert len(read_truth(fleet.truth_path)) == len(truth_1[0])
+    starts = [load_track(path).motion.t_ns[0] for path in (*fleet.base_drives, *fleet.agent_drives)]
+    assert starts == sorted(starts)
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["drives", "truth.npz", "world.json"]
+
+
+def test_a_fleet_run_in_a_place_that_cannot_be_made_is_refused(tmp_path: Path) -> None:
+    (tmp_path / "file").write_text("in the way")
+    with pytest.raises(SimError, match="cannot make the folder"):
+        prepare_fleet_run(1, 1, tmp_path / "file")
