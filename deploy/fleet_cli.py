@@ -11,8 +11,10 @@ import click
 from rich.console import Console
 
 from deploy.fleet_config import FleetConfig, load_fleet_config
+from deploy.ports import claim_port
 from deploy.run_folder import RunFolder, create_run_folder, default_run_path
 from deploy.source import Source
+from fleet_bus.links import load_link
 
 PATH = click.Path(path_type=Path)
 
@@ -56,6 +58,8 @@ def fleet(
         click.echo(json.dumps(dataclasses.asdict(config), indent=2))
         return
     source = Source(drives, base_map, worlds, options["agents"])
+    load_link(config.link)  # what cannot work is refused before anything is written
+    claim_port(config.port)
     folder = create_run_folder(out or default_run_path(), overwrite=overwrite)
     folder.write_mark({"config": dataclasses.asdict(config), "drives": [str(path) for path in drives]})
     summary = _run(config, folder, source, keep_drives)

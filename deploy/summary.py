@@ -11,7 +11,10 @@ from deploy.fleet_config import FleetConfig
 from deploy.live import size_text
 from deploy.prepare import PreparedRun
 from deploy.run_folder import RunFolder
+from fleet_sim.ellipsoids import Tiles, ellipsoids_of_maps
+from fleet_sim.pictures import View, draw_map, draw_run
 from fleet_sim.truth import read_truth
+from gnd_map.geodesy import LocalFrame
 from tile_store.sqlite_store import SqliteStore
 
 
@@ -73,9 +76,24 @@ def _evaluate(
     folder: RunFolder, prepared: PreparedRun, store: SqliteStore, histories: list[TileHistory]
 ) -> dict[str, Any]:
     """Compare with the truth where there is one; draw the maps in any case."""
+    base = {history.tile.tile: history.before for history in histories}
+    final = {history.tile.tile: history.after for history in histories}
     if prepared.truth is None:
+        _draw_maps(folder, base, final)
         return dict(NO_TRUTH)
-    return score_run(read_truth(prepared.truth), store, histories).as_dict()
+    truth = read_truth(prepared.truth)
+    draw_run(truth, base, final, folder.root)
+    return score_run(truth, store, histories).as_dict()
+
+
+def _draw_maps(folder: RunFolder, base: Tiles, final: Tiles) -> None:
+    if not final:
+        return
+    frame = LocalFrame.of_tile(sorted(final)[len(final) // 2])
+    after = ellipsoids_of_maps(frame, base, final)
+    view = View.around(after)
+    draw_map(ellipsoids_of_maps(frame, base), folder.root / "map_before.png", "Map before", "", view)
+    draw_map(after, folder.root / "map_after.png", "Map after", "coloured by what the fleet changed", view)
 
 
 def _write(path: Path, summary: dict[str, Any]) -> None:
