@@ -41,14 +41,14 @@ class Surroundings:
         self.wanted: tuple[TileId, ...] = ()
         self._looked_at: F64 | None = None
         self._near: tuple[TileId, ...] = ()
-        self._given_up: set[TileId] = set()
+        self.given_up: set[TileId] = set()
 
     def follow(self, place: Place, stop: threading.Event, *, wait: bool) -> None:
         """Ask for what lies around and ahead and hold what has arrived; `wait` for the tiles that are near."""
         if self._has_moved(place):
             self._look_ahead(place)
         if wait:
-            self._given_up |= self._fetcher.wait_for(set(self._near) - self._given_up, self._parameters.wait_s, stop)
+            self.given_up |= self._fetcher.wait_for(set(self._near) - self.given_up, self._parameters.wait_s, stop)
         for fetched in self._fetcher.take():
             self._hold(fetched.tile_id, fetched.tile)
 

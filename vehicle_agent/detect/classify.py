@@ -49,13 +49,17 @@ def _state(e: TileEvidence, parameters: DetectParameters) -> NDArray[np.uint8]:
 
 def _decide_paper(e: TileEvidence, p: DetectParameters) -> NDArray[np.int64]:
     """GND 4.4 plainly: a changed voxel with points has a new Gaussian, one without is deleted."""
-    changed = _state(e, p) == ChangeState.CHANGED
-    has_gaussian = e.measured.cells >= p.min_cells
-    silent = (e.measured.count > 0) & ~has_gaussian
+    state = _state(e, p)
+    sustained, changed = state == ChangeState.SUSTAINED, state == ChangeState.CHANGED
+    has_gaussian, has_points = e.measured.cells >= p.min_cells, e.measured.count > 0
     of_map = np.select(
-        [~changed, has_gaussian, silent], [_seen(e), ChangeClass.MODIFIED, ChangeClass.UNMEASURED], ChangeClass.DELETED
+        [sustained, changed & has_gaussian, changed & ~has_points],
+        [ChangeClass.NORMAL, ChangeClass.MODIFIED, ChangeClass.DELETED],
+        ChangeClass.UNMEASURED,
     )
-    of_empty = np.select([changed & has_gaussian, silent], [ChangeClass.NEW, ChangeClass.UNMEASURED], ChangeClass.EMPTY)
+    of_empty = np.select(
+        [changed & has_gaussian, ~has_points], [ChangeClass.NEW, ChangeClass.EMPTY], ChangeClass.UNMEASURED
+    )
     return np.where(e.in_map, of_map, of_empty)
 
 
@@ -85,11 +89,6 @@ def _decide_of_empty(e: TileEvidence, p: DetectParameters) -> NDArray[np.int64]:
     return np.select(
         [e.measured.cells >= p.min_cells, empty], [ChangeClass.NEW, ChangeClass.EMPTY], ChangeClass.UNMEASURED
     )
-
-
-def _seen(e: TileEvidence) -> NDArray[np.int64]:
-    """Normal where rays spoke about the map's Gaussian; rays that pass outside it say nothing (Eq. 8)."""
-    return np.where(e.n_bi + e.n_bo + e.n_pi > 0, ChangeClass.NORMAL, ChangeClass.UNMEASURED)
 
 
 def _similar_to_map(e: TileEvidence) -> NDArray[np.float64]:

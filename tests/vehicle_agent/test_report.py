@@ -1,0 +1,147 @@
+"""From evidence to the outbox: when tiles are decided, when districts are reported, and under which ids."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from vehicle_scene import GRID_FRAME, SENSOR, ground, look, tiles_of, wall
+
+from gnd_map.tile import Tile
+from gnd_map.tile_id import TileId
+from schemas.changes import ChangeReport
+from schemas.keys import change_key
+from vehicle_agent.config import ReportParameters
+from vehicle_agent.detect.detector import ChangeDetector
+from vehicle_agent.local_map import LocalMap
+from vehicle_agent.localise.estimates import PoseEstimate, RefinedScan
+from vehicle_agent.outbox import Outbox
+from vehicle_agent.report import Identity, Reporter
+
+START_NS = 1_570_838_400_000_000_000
+WHO = Identity("vehicle-7", "drive-7", "VLP-16", "ndt")
+
+
+@pytest.fixture(scope="module")
+def tiles() -> dict[TileId, Tile]:
+    return tiles_of(np.concatenate([ground(), wall(9.3)]))
+
+
+@pytest.fixture(scope="module")
+def hits() -> np.ndarray:
+    return look([(14.3, -8.0, 8.0, 4.0)], np.random.default_rng(3))
+
+
+@pytest.fixture
+def outbox(tmp_path: Path) -> Outbox:
+    return Outbox(tmp_path / "outbox.sqlite")
+
+
+def reporter(tiles: dict[TileId, Tile], outbox: Outbox, **parameters: float) -> Reporter:
+    local_map = LocalMap(GRID_FRAME)
+    for tile in tiles.values():
+        local_map.set_tile(tile)
+    return Reporter(ChangeDetector(local_map), outbox, WHO, START_NS, ReportParameters(**parameters))
+
+
+def estimate(x_m: float = 0.0, sigma_m: float = 0.03, health: str = "good") -> PoseEstimate:
+    T = np.eye(4)
+    T[:3, 3] = SENSOR + np.array([x_m, 0.0, 0.0])
+    return PoseEstimate(START_NS, T, sigma_m, 0.001, 0.9, health)  # type: ignore[arg-type]
+
+
+def scan(hits: np.ndarray, t_s: float = 0.0, **kwargs: float | str) -> RefinedScan:
+    pose = estimate(**kwargs)  # type: ignore[arg-type]
+    return RefinedScan(START_NS + int(t_s * 1e9), hits, np.broadcast_to(SENSOR, hits.shape), pose)
+
+
+def reports(outbox: Outbox) -> list[ChangeReport]:
+    return [ChangeReport.decode(letter.body) for letter in outbox.due(0, limit=100)]
+
+
+def test_the_end_of_a_drive_reports_every_tile_once_a_district_in_one_message(
+    tiles: dict[TileId, Tile], outbox: Outbox, hits: np.ndarray
+) -> None:
+    drive = reporter(tiles, outbox)
+    for t_s in (0.0, 0.1, 0.2):
+        drive.add_scan(scan(hits, t_s))
+    drive.report_all(20.0)
+    found = reports(outbox)
+    districts = {t.district for t in tiles}
+    assert {r.district for r in found} == districts
+    assert len(found) == len(districts)
+    assert sorted(c.tile for r in found for c in r.tiles) == sorted(tiles)
+    first = found[0]
+    assert (first.vehicle, first.sensor_model, first.layer) == ("vehicle-7", "VLP-16", "ndt")
+    assert (first.first_ns, first.last_ns) == (START_NS, START_NS + 200_000_000)
+    assert first.tiles[0].pose_sigma_m == pytest.approx(0.03)
+    assert outbox.due(0)[0].key == change_key("ndt", first.district)
+    assert drive.counts["changed_voxels"] == sum(len(c.changed) for r in found for c in r.tiles) > 50
+    assert drive.classes["deleted"] > 20
+    assert drive.classes["new"] > 20
+
+
+def test_only_tiles_left_behind_are_decided(tiles: dict[TileId, Tile], outbox: Outbox, hits: np.ndarray) -> None:
+    drive = reporter(tiles, outbox)
+    drive.add_scan(scan(hits))
+    drive.leave_behind(estimate(x_m=0.0), 0.0)
+    assert reports(outbox) == []
+    drive.leave_behind(estimate(x_m=80.0), 80.0)  # the western tiles are behind, the eastern ones are not
+    assert drive.classes["normal"] > 0
+    assert reports(outbox) == []  # their districts still have tiles to decide
+    drive.leave_behind(estimate(x_m=200.0), 200.0)
+    assert sorted(c.tile for r in reports(outbox) for c in r.tiles) == sorted(tiles)
+    drive.report_all(200.0)
+    assert drive.counts["reports"] == len(reports(outbox))
+
+
+def test_a_long_stay_in_a_district_is_reported_before_its_end(
+    tiles: dict[TileId, Tile], outbox: Outbox, hits: np.ndarray
+) -> None:
+    drive = reporter(tiles, outbox, longest_m=50.0)
+    drive.add_scan(scan(hits))
+    drive.leave_behind(estimate(x_m=80.0), 80.0)
+    drive.leave_behind(estimate(x_m=80.0), 131.0)
+    early = reports(outbox)
+    assert early
+    drive.report_all(140.0)
+    assert sorted(c.tile for r in reports(outbox) for c in r.tiles) == sorted(tiles)
+    assert len({r.report_id for r in reports(outbox)}) == len(reports(outbox)) > len(early)
+
+
+def test_a_tile_seen_again_later_is_stated_in_a_report_of_its_own(
+    tiles: dict[TileId, Tile], outbox: Outbox, hits: np.ndarray
+) -> None:
+    drive = reporter(tiles, outbox)
+    drive.add_scan(scan(hits))
+    drive.report_all(10.0)
+    first = {r.report_id for r in reports(outbox)}
+    drive.add_scan(scan(hits, t_s=60.0))
+    drive.report_all(600.0)
+    assert len(reports(outbox)) == 2 * len(first)
+
+
+def test_a_restarted_agent_makes_the_same_ids_and_its_first_statement_stands(
+    tiles: dict[TileId, Tile], outbox: Outbox, hits: np.ndarray
+) -> None:
+    before = reporter(tiles, outbox)
+    before.add_scan(scan(hits))
+    before.report_all(10.0)
+    bodies = [letter.body for letter in outbox.due(0, limit=100)]
+    again = reporter(tiles, outbox)
+    again.add_scan(scan(hits))
+    again.add_scan(scan(hits, t_s=0.1))
+    again.report_all(10.0)
+    assert [letter.body for letter in outbox.due(0, limit=100)] == bodies
+    assert again.counts["reports"] == 0
+    assert again.counts["reports_known"] == len(bodies)
+
+
+@pytest.mark.parametrize("bad", [{"health": "degraded"}, {"health": "lost"}, {"sigma_m": 0.3}])
+def test_an_uncertain_pose_makes_no_statement(
+    tiles: dict[TileId, Tile], outbox: Outbox, hits: np.ndarray, bad: dict[str, float | str]
+) -> None:
+    drive = reporter(tiles, outbox)
+    drive.add_scan(scan(hits, **bad))
+    drive.report_all(10.0)
+    assert reports(outbox) == []
+    assert drive.counts["scans_uncertain"] == 1

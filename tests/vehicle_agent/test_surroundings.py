@@ -1,0 +1,129 @@
+"""The local map follows the vehicle: over a real bus, from a real store."""
+
+import threading
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+from vehicle_scene import FRAME, GRID_FRAME, HEIGHT_M, SENSOR, ground, look, tiles_of
+from waiting import wait_until
+
+from fleet_bus.bus import Bus
+from gnd_map.geodesy import LocalFrame
+from gnd_map.grid import VoxelGrid
+from gnd_map.tile import Tile
+from gnd_map.tile_id import TileId
+from schemas.drive import GnssFix
+from tile_store.server import TileServer
+from tile_store.sqlite_store import SqliteStore
+from vehicle_agent.cache import TileCache
+from vehicle_agent.config import DownloadParameters
+from vehicle_agent.detect.detector import ChangeDetector
+from vehicle_agent.download import TileFetcher
+from vehicle_agent.local_map import LocalMap
+from vehicle_agent.place import Place
+from vehicle_agent.surroundings import Surroundings, left_behind, tile_distance_m, tiles_along
+
+NEVER = threading.Event()
+PARAMETERS = DownloadParameters(near_m=30.0, ahead_m=60.0, forget_m=100.0, wait_s=10.0)
+
+
+def at(east_m: float, north_m: float = 0.0) -> Place:
+    lat, lon, height = FRAME.geodetic_from_enu(np.array([[east_m, north_m, HEIGHT_M]]))
+    return Place(FRAME, GnssFix(0, float(lat[0]), float(lon[0]), float(height[0]), 2.5))
+
+
+class Scene:
+    def __init__(self, cloud: Bus, bus: Bus, folder: Path) -> None:
+        self.tiles = tiles_of(ground(20.0))
+        self.store = SqliteStore(folder / "store.sqlite")
+        self.store.put_tiles(list(self.tiles.values()))
+        self.server = TileServer(self.store, cloud).start()
+        self.map = LocalMap(GRID_FRAME)
+        self.detector = ChangeDetector(self.map)
+        self.fetcher = TileFetcher(bus, TileCache(folder / "cache.sqlite"), PARAMETERS)
+        self.surroundings = Surroundings(self.map, self.fetcher, self.detector, PARAMETERS)
+
+
+@pytest.fixture
+def scene(cloud: Bus, bus: Bus, tmp_path: Path) -> Iterator[Scene]:
+    opened = Scene(cloud, bus, tmp_path)
+    yield opened
+    bus.close()
+    opened.fetcher.close()
+    opened.server.close()
+    opened.store.close()
+
+
+def test_the_tiles_that_are_near_are_held_before_the_drive_goes_on(scene: Scene) -> None:
+    scene.surroundings.follow(at(0.0), NEVER, wait=True)
+    near = tiles_along(FRAME, at(0.0).ahead_map_m(60.0), 30.0)
+    assert set(near) <= set(scene.map.tiles)
+    assert {t for t in scene.map.tiles if not scene.map.is_absent(t)} == set(near) & set(scene.tiles)
+    assert scene.map.window_origin_g[2] <= HEIGHT_M - 5
+
+
+def test_the_way_ahead_is_asked_for_in_advance(scene: Scene) -> None:
+    place = at(0.0)
+    place.heading_rad = np.pi / 2
+    scene.surroundings.follow(place, NEVER, wait=True)
+    north = TileId.from_geodetic(*at(0.0, 60.0).geodetic)
+    assert north in scene.surroundings.wanted
+    assert tile_distance_m(FRAME, north, place.position_map_m) > PARAMETERS.near_m
+    wait_until(lambda: scene.fetcher.wait_for([north], 0.1, NEVER) == set())
+
+
+def test_tiles_far_behind_are_let_go_unless_there_is_evidence_about_them(scene: Scene) -> None:
+    scene.surroundings.follow(at(0.0), NEVER, wait=True)
+    hits = look([], np.random.default_rng(1))
+    scene.detector.add_scan(hits[np.linalg.norm(hits - SENSOR, axis=1) < 10.0], SENSOR)
+    touched = set(scene.detector.touched_tiles())
+    held = set(scene.map.tiles)
+    assert touched < held
+    scene.surroundings.follow(at(300.0), NEVER, wait=True)
+    assert touched <= set(scene.map.tiles)
+    assert not (held - touched) & set(scene.map.tiles)
+    scene.detector.finish(touched)
+    scene.surroundings.follow(at(310.0), NEVER, wait=True)
+    assert not touched & set(scene.map.tiles)
+
+
+def test_a_newer_version_replaces_a_held_tile_only_without_evidence(scene: Scene) -> None:
+    scene.surroundings.follow(at(0.0), NEVER, wait=True)
+    tile_id = max(scene.tiles, key=lambda t: len(scene.tiles[t].gaussians))
+    newer = [Tile(tile_id, v, scene.tiles[tile_id].gaussians.take(np.arange(v, 200))) for v in (2, 3)]
+    assert scene.surroundings.replace(newer[0])
+    assert not scene.surroundings.replace(newer[0])  # already there
+    scene.detector.add_scan(look([], np.random.default_rng(1)), SENSOR)
+    assert not scene.surroundings.replace(newer[1])
+    assert scene.map.tile(tile_id) == newer[0]
+    scene.detector.finish([tile_id])
+    assert scene.surroundings.replace(newer[1])
+
+
+def test_without_an_answer_the_drive_goes_on_after_a_while_and_does_not_wait_again(
+    cloud: Bus, bus: Bus, tmp_path: Path
+) -> None:
+    impatient = DownloadParameters(near_m=30.0, ahead_m=0.0, wait_s=0.2, request_s=0.5)
+    fetcher = TileFetcher(bus, TileCache(tmp_path / "cache.sqlite"), impatient)
+    local_map = LocalMap(GRID_FRAME)
+    surroundings = Surroundings(local_map, fetcher, ChangeDetector(local_map), impatient)
+    for _ in range(50):  # would be 10 s if it waited each time
+        surroundings.follow(at(0.0), NEVER, wait=True)
+    assert local_map.tiles == ()
+    assert len(surroundings.given_up) > 3
+    bus.close()
+    fetcher.close()
+
+
+def test_the_distance_to_a_tile_is_measured_to_its_nearest_edge() -> None:
+    tile_id = TileId.from_geodetic(FRAME.lat_rad, FRAME.lon_rad)
+    grid, frame = VoxelGrid.of(tile_id), LocalFrame.of_tile(tile_id)
+    half_x, half_y = grid.nx * grid.dx_m / 2, grid.ny * grid.dy_m / 2
+    assert tile_distance_m(frame, tile_id, np.array([3.0, -2.0, 99.0])) == 0.0
+    assert tile_distance_m(frame, tile_id, np.array([half_x + 50.0, 0.0, 0.0])) == pytest.approx(50.0, abs=0.01)
+    corner = np.array([half_x + 30.0, -half_y - 40.0, 0.0])
+    assert tile_distance_m(frame, tile_id, corner) == pytest.approx(50.0, abs=0.01)
+    assert left_behind(frame, [tile_id], corner, 49.0) == (tile_id,)
+    assert left_behind(frame, [tile_id], corner, 51.0) == ()
