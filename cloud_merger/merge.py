@@ -82,9 +82,8 @@ def merge_tile(epoch: Gaussians, statements: Statements, parameters: MergeParame
         return MergedTile(epoch, np.zeros(0, np.int32))
     cluster = _clusters(rows, parameters)
     winner = _winners(rows["voxel_id"], cluster, parameters.xi)
-    member = np.isin(cluster, winner)
-    rows, cluster = rows[member], np.searchsorted(winner, cluster[member])
-    candidate = _representatives(rows, cluster)
+    rows, cluster = _members(rows, cluster, winner)
+    candidate = _representatives(rows, cluster, parameters.mode)
     decided = _differs(epoch, candidate, parameters) & ~_confirmed(epoch, rows, cluster)
     return _merged(epoch, candidate[decided], statements, rows[decided[cluster]])
 
@@ -157,42 +156,52 @@ def _winners(voxel_id: NDArray[np.int32], cluster: Index, xi: float) -> Index:
     return np.sort(number[best[size[best] > xi * n]])
 
 
-def _representatives(rows: Rows, cluster: Index) -> Rows:
+def _members(rows: Rows, cluster: Index, winner: Index) -> tuple[Rows, Index]:
+    """The statements of the winning clusters, renumbered 0 … C-1, together and by report within each."""
+    inside = np.flatnonzero(np.isin(cluster, winner))
+    number = np.searchsorted(winner, cluster[inside])
+    order = np.argsort(number, kind="stable")
+    return rows[inside[order]], number[order]
+
+
+def _representatives(rows: Rows, cluster: Index, mode: Mode) -> Rows:
     """GND 5.2: one row a cluster, by the recursive update of sample mean and covariance over its measured statements.
 
     A quoted Gaussian is no new measurement: it represents its cluster only where nobody measured, and then once.
 
-    Args:
-        rows: members, ordered by report within a cluster.
-        cluster: (M,) 0 … C-1 of each row.
+    In default mode a representative is renewed when the number of its measurements has doubled: it takes the first 1,
+    2, 4, 8 … of them. Else every report would move every changed voxel by a hair, and each move is sent to all vehicles
+    (8 drives over one street: 17,027 voxels published with all measurements, 9,492 so, at the same F1).
     """
-    n_clusters = int(cluster.max(initial=-1)) + 1
-    measured = rows["kind"] == Kind.MEASURED
-    has_measured = np.bincount(cluster[measured], minlength=n_clusters) > 0
     first = np.unique(cluster, return_index=True)[1]
-    use = measured.copy()
-    use[first[~has_measured]] = True
+    measured = rows["kind"] == Kind.MEASURED
+    before = np.cumsum(measured) - measured
+    turn = before - before[first][cluster]
+    n = np.bincount(cluster, weights=measured).astype(np.int64)
+    use = measured & (turn < (n if mode == "paper" else _power_of_two(n))[cluster])
+    use[first[n == 0]] = True
     return _recursive_moments(rows[use], cluster[use])
 
 
+def _power_of_two(n: Index) -> Index:
+    """The largest power of two that is at most n, 0 for 0."""
+    return np.where(n > 0, 1 << (np.frexp(n.astype(np.float64))[1].astype(np.int64) - 1).clip(0), 0)
+
+
 def _recursive_moments(rows: Rows, cluster: Index) -> Rows:
-    """Merge sample means and covariances (population form), one member of every cluster at a time."""
-    order = np.argsort(cluster, kind="stable")
-    rows, cluster = rows[order], cluster[order]
+    """Merge sample means and covariances (population form) of each cluster's rows, one member of all at a time."""
     first = np.unique(cluster, return_index=True)[1]
     turn = np.arange(len(rows)) - first[cluster]
-    merged = rows[first].copy()
+    merged = rows[first]
     n = merged["count"].astype(np.int64)
     mean, cov = merged["mean_m"].astype(np.float64), merged["cov_m2"].astype(np.float64)
     for k in range(1, int(turn.max(initial=0)) + 1):
-        new = rows[turn == k]
-        c = cluster[turn == k]
-        total = n[c] + new["count"]
-        share = (new["count"] / total)[:, None]
+        new, c = rows[turn == k], cluster[turn == k]
+        n[c] += new["count"]
+        share = (new["count"] / n[c])[:, None]
         step = new["mean_m"] - mean[c]
         mean[c] += share * step
         cov[c] += share * (new["cov_m2"] - cov[c]) + share * (1 - share) * _outer(step)
-        n[c] = total
     merged["count"] = np.minimum(n, np.iinfo(np.int32).max)
     np.maximum.at(merged["cells"], cluster, rows["cells"])
     merged["mean_m"], merged["cov_m2"] = mean, cov

@@ -108,17 +108,19 @@ def plain_decision(was, votes, parameters):
     members = [vote for vote, cluster in zip(votes, label, strict=True) if cluster == winner]
     if not len(members) > parameters.xi * len(votes):
         return None
-    now = plain_representative(members)
+    now = plain_representative(members, parameters.mode)
     quotes = sum(not measured and len(state) > 0 and state == was for _, state, measured in members)
     if plain_similarity(was, now, parameters) >= parameters.d_update or 2 * quotes >= len(members):
         return None
     return now, tuple(report_id for report_id, _, _ in members)
 
 
-def plain_representative(members):
+def plain_representative(members, mode):
     measured = [state for _, state, is_measured in members if is_measured]
     if not measured:
         return members[0][1]
+    if mode == "default":
+        measured = measured[: 2 ** (len(measured).bit_length() - 1)]
     total = Moments.zeros(1)
     for state in measured:
         total = total + Moments.of(state)

@@ -91,6 +91,15 @@ def test_the_biggest_cluster_wins_and_is_represented_by_its_moments():
     assert result.provenance == {1: (report_id(0), report_id(2))}
 
 
+def test_a_representative_is_renewed_when_its_measurements_have_doubled():
+    poles = [change_of(EPOCH, [2], {2: (-0.3, 0.2, 0.01 * k, *POLE[3:])}) for k in range(9)]
+    counts = [merged(poles[:n]).gaussians.select([2]).count[0] // 200 for n in range(1, 10)]
+    assert counts == [1, 2, 2, 4, 4, 4, 4, 8, 8]
+    assert merged(poles[:4]).gaussians == merged(poles[:7]).gaussians
+    assert merged(poles[:7]).provenance[2] == tuple(map(report_id, range(7)))
+    assert merged(poles[:7], mode="paper").gaussians.select([2]).count[0] == 7 * 200
+
+
 def test_of_equal_clusters_the_earliest_wins_when_xi_lets_any_win():
     pole, ball = change_of(EPOCH, [2], {2: POLE}), change_of(EPOCH, [2], {2: BALL})
     assert merged([pole, ball], xi=0.4).gaussians.select([2]) == gaussians_of({2: POLE})
