@@ -66,6 +66,8 @@ class AgentConfig:
     link: str | LinkProfile = "none"
     layer: str = "ndt"
     pace: float = 0.0
+    open_timeout_s: float = 10.0
+    """How long the agent looks for a router when it starts."""
     ledger_dir: Path | None = None
     localise: LocaliserParameters = field(default_factory=LocaliserParameters)
     detect: DetectParameters = field(default_factory=DetectParameters)

@@ -38,7 +38,8 @@ def open_link(config: AgentConfig) -> Iterator[Link]:
     outbox = Outbox(config.work_dir / "outbox.sqlite")
     cache = TileCache(config.work_dir / "cache.sqlite", config.layer)
     ledger = Ledger(config.vehicle, config.ledger_path)
-    bus = open_bus(BusConfig(connect=config.connect, link=config.link), ledger, config.vehicle)
+    bus_config = BusConfig(connect=config.connect, link=config.link, open_timeout_s=config.open_timeout_s)
+    bus = open_bus(bus_config, ledger, config.vehicle)
     bus.declare_alive(alive_key("agent", config.vehicle))
     fetcher, sender = TileFetcher(bus, cache, config.download), SenderThread(bus, outbox)
     try:

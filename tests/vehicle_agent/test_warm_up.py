@@ -1,0 +1,41 @@
+"""What a fork server may hold ready: kernels and imports, but no thread, no session and nothing of the server side."""
+
+import json
+import subprocess
+import sys
+import textwrap
+
+import pytest
+
+PROGRAM = textwrap.dedent(
+    """
+    import json, sys, threading
+    import vehicle_agent.agent
+    from vehicle_agent.detect import kernel
+    from vehicle_agent.warm import warm_up
+    from vehicle_agent.localise import registration
+    before = len(kernel.cast_rays.signatures)
+    warm_up()
+    first = {k: len(v.signatures) for k, v in vars(kernel).items() if hasattr(v, "signatures")}
+    warm_up()
+    again = {k: len(v.signatures) for k, v in vars(kernel).items() if hasattr(v, "signatures")}
+    print(json.dumps({
+        "before": before, "after": first["cast_rays"], "same": first == again, "threads": threading.active_count(),
+        "modules": sorted({m.split(".")[0] for m in sys.modules} & {"sklearn", "matplotlib", "pandas", "rich"}),
+        "stats": "scipy.stats" in sys.modules,
+    }))
+    """
+)
+
+
+@pytest.mark.slow
+def test_warming_compiles_the_kernels_and_starts_nothing() -> None:
+    done = subprocess.run([sys.executable, "-W", "error", "-c", PROGRAM], capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    found = json.loads(done.stdout)
+    assert found["before"] == 0
+    assert found["after"] == 1, "the drive would compile another signature than the one that was warmed"
+    assert found["same"]
+    assert found["threads"] == 1
+    assert found["modules"] == []
+    assert not found["stats"]
