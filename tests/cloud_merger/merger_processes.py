@@ -54,6 +54,12 @@ class Cloud:
         self.bus.watch_alive(alive_keys("merger"), self._on_alive)
         self.bus.subscribe(update_keys("ndt"), self._on_update, history=True)
 
+    def restart_router(self, between: Callable[[], object]) -> None:
+        """End the router, do something, and start it again."""
+        self.router.close()
+        between()
+        self.router = open_router([self.endpoint])
+
     def close(self) -> None:
         for process in self.shards.values():
             with suppress(ProcessLookupError):

@@ -122,3 +122,25 @@ def test_a_shard_that_hangs_is_replaced_after_its_lease_and_may_come_back(cloud)
     wait_for("one ack each", lambda: one_ack_each(cloud, range(8, 16)))
     wait_for("all is merged and announced", cloud.is_settled)
     assert cloud.store.counts().reports == 16
+
+
+@pytest.mark.slow
+def test_shards_outlive_the_router_and_announce_what_they_merged_meanwhile(cloud):
+    cloud.start(*SHARDS)
+    for n in range(8):
+        cloud.send(report_number(n))
+    wait_for("all is merged and announced", cloud.is_settled)
+    late = report_of(8, change_of(BASE, [0, 1, 2], {1: None, 2: BALL}, tile=TILES[0]))
+    rows = [ReportRow(late.report_id, "ndt", tile, "car", 0, body) for tile, body in split(late)]
+
+    def merge_without_router():
+        cloud.store.put_reports(rows)
+        wait_for("the late report is merged", lambda: cloud.store.dirty_count() == 0)
+        assert cloud.store.notices()
+
+    cloud.restart_router(merge_without_router)
+    wait_for("both live again", lambda: cloud.living == set(SHARDS))
+    wait_for("one ack each", lambda: one_ack_each(cloud, range(16, 24)))
+    wait_for("all is merged and announced", cloud.is_settled)
+    wait_for("the watcher has heard of all", lambda: cloud.versions() <= cloud.announced())
+    assert cloud.store.counts().reports == 17
