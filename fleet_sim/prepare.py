@@ -128,9 +128,12 @@ def prepare_fleet_run(
 def _run(
     jobs: list[tuple[Callable[..., object], tuple[object, ...]]], processes: int, progress: Progress | None
 ) -> None:
-    """Run jobs in worker processes (fork server: Zenoh and threads of the caller stay out of them)."""
+    """Run jobs in worker processes.
+
+    Spawned, not forked: the caller may have threads, and its fork server, if it has one, is warmed for other work.
+    """
     task = progress.add_task("simulating", total=len(jobs)) if progress else None
-    context = multiprocessing.get_context("forkserver")
+    context = multiprocessing.get_context("spawn")
     with ProcessPoolExecutor(max(1, min(processes, len(jobs))), mp_context=context) as pool:
         futures: list[Future[object]] = [pool.submit(function, *arguments) for function, arguments in jobs]
         try:
