@@ -10,10 +10,9 @@ from typing import Final
 from cloud_merger.ownership import Members
 from fleet_bus.bus import Bus
 from fleet_bus.subscribing import RecallingPublisher
-from gnd_map.tile import Tile, TileDelta, diff
+from gnd_map.tile import TileDelta, diff
 from schemas.errors import SchemaError, TooLarge
 from schemas.keys import update_key
-from schemas.tiles import TileBlob, tile_of
 from schemas.updates import TileUpdate
 from tile_store.store import Store
 from tile_store.values import Notice, StoredTile
@@ -76,7 +75,7 @@ def update_of(stored: StoredTile, parent: StoredTile | None) -> TileUpdate:
 
 def _delta(stored: StoredTile, parent: StoredTile) -> TileDelta | None:
     try:
-        return diff(tile_from(parent).gaussians, tile_from(stored).gaussians)
+        return diff(parent.decode().gaussians, stored.decode().gaussians)
     except SchemaError as error:  # one damaged body must not keep the notices of all other tiles
         _LOG.error("%s version %d is announced without a delta: %s", stored.tile, stored.version, error)
         return None
@@ -88,8 +87,3 @@ def encoded(update: TileUpdate) -> bytes:
         return update.encode()
     except TooLarge:
         return replace(update, delta=None).encode()
-
-
-def tile_from(stored: StoredTile) -> Tile:
-    """The tile of a stored version, its hash verified. `SchemaError` when the body is not what the hash says."""
-    return tile_of(TileBlob(stored.tile, stored.version, stored.sha, stored.codec_id, stored.body))

@@ -3,18 +3,20 @@
 import logging
 import time
 from collections.abc import Sequence
+from functools import lru_cache
+from typing import Final
 
-from cloud_merger.announce import tile_from
 from cloud_merger.config import ShardConfig
 from cloud_merger.merge import merge_tile
 from cloud_merger.statements import Report, statements_of
 from gnd_map.gaussian import Gaussians
 from gnd_map.tile import Tile
-from schemas.changes import ChangeReport
+from schemas.changes import ChangeReport, TileChange
 from schemas.errors import SchemaError
 from tile_store.store import Store
 from tile_store.values import Claim, Publication, ReportRow, TileWork
 
+REMEMBERED_REPORTS: Final = 1024  # some 20 kB each
 _LOG = logging.getLogger(__name__)
 
 
@@ -50,7 +52,7 @@ class Worker:
 
     def _publication(self, work: TileWork) -> Publication:
         """Merge all reports since the epoch into the epoch's tile; the tile is None where the head has that content."""
-        epoch = Gaussians.empty() if work.epoch is None else tile_from(work.epoch).gaussians
+        epoch = Gaussians.empty() if work.epoch is None else work.epoch.decode().gaussians
         reports = [report for row in work.reports if (report := self._report(row)) is not None]
         statements = statements_of(epoch, reports, self._bases(work), self._config.merge.mode)
         merged = merge_tile(epoch, statements, self._config.merge)
@@ -67,19 +69,18 @@ class Worker:
     def _report(self, row: ReportRow) -> Report | None:
         """What a stored report says; nothing when it can no longer be read (its vehicle has long had its ack)."""
         try:
-            (change,) = ChangeReport.decode(row.body).tiles
+            return Report(row.report_id, _change(row.body))
         except SchemaError as error:
             reason = f"report {row.report_id} on tile {row.tile} cannot be read any more and is left out: {error}"
             _LOG.error("%s", reason)
             self._store.quarantine(row.body, reason, source="merge")
             return None
-        return Report(row.report_id, change)
 
     def _bases(self, work: TileWork) -> dict[bytes, Gaussians]:
         """The versions that the reports refer to, by hash; those that the store has lost are missing."""
         shas = {row.base_sha for row in work.reports if row.base_sha}
         versions = {sha: self._store.by_sha(work.claim.layer, work.claim.tile, sha) for sha in sorted(shas)}
-        return {sha: tile_from(stored).gaussians for sha, stored in versions.items() if stored is not None}
+        return {sha: stored.decode().gaussians for sha, stored in versions.items() if stored is not None}
 
     def _set_aside(self, work: TileWork, reason: str) -> Publication:
         """Leave the tile as it is and consume its reports, which stay in the store; say so in the quarantine."""
@@ -88,6 +89,13 @@ class Worker:
         body = "\n".join([f"{work.claim.layer} {work.claim.tile}", *_ids(work)])
         self._store.quarantine(body.encode(), reason, source="merge")
         return Publication(work.claim, work.base_version, None, report_ids=_ids(work))
+
+
+@lru_cache(maxsize=REMEMBERED_REPORTS)
+def _change(body: bytes) -> TileChange:
+    """The one tile of a stored report; remembered, because each merge of a tile reads all its reports again."""
+    (change,) = ChangeReport.decode(body).tiles
+    return change
 
 
 def _ids(work: TileWork) -> tuple[str, ...]:
