@@ -166,6 +166,8 @@ class Bus:
     ) -> Subscription:
         """Calls back with (key, payload) for every notice, in order, in one thread of our own.
 
+        The routers learn of the subscription a moment later: compare with what was there (the catalog) after that.
+
         Args:
             keyexpr: keys of interest; whole chunks as wildcards.
             callback: what it raises is logged and the next notice delivered.

@@ -121,6 +121,7 @@ def _settings(config: BusConfig, link: LinkProfile) -> dict[str, Any]:
         "transport/shared_memory/enabled": False,
         "transport/unicast/max_sessions": config.max_sessions,
         "transport/unicast/accept_pending": 1000,
+        "transport/unicast/open_timeout": max(100, min(10_000, round(1000 * config.open_timeout_s))),
         # Has no fragmentation.
         "transport/unicast/lowlatency": False,
         "transport/link/tx/lease": config.lease_ms or link.lease_ms,

@@ -4,6 +4,8 @@ import logging
 import os
 import threading
 import time
+from collections.abc import Iterator
+from contextlib import contextmanager
 from typing import Final, Self
 
 import zenoh
@@ -17,6 +19,7 @@ from gnd_map.tile_id import TileId
 
 _LOG = logging.getLogger(__name__)
 _POLL_S: Final = 0.02
+_CLOSE_S: Final = 1.0
 
 
 class Connection:
@@ -31,6 +34,8 @@ class Connection:
         self.meter = WireMeter()
         self._pacer = Pacer(config.link_profile, self.closed)
         self._pid = os.getpid()
+        self._calls = 0
+        self._idle = threading.Condition()
         if config.mode == "client":  # a router carries everybody's bytes, and needs its descriptors for them
             self._links = session.info.declare_link_events_listener(self._on_link)
             for link in session.info.links():  # now: the first event may come after the first message
@@ -88,6 +93,23 @@ class Connection:
         if self.ledger is not None:
             self.ledger.record("down", kind, len(payload), tile)
 
+    @contextmanager
+    def sending(self) -> Iterator[zenoh.Session]:
+        """The session, for one call that sends; `close` waits for such calls, or cuts their link.
+
+        Raises:
+            BusClosed: closed before.
+        """
+        with self._idle:
+            self.check_open()
+            self._calls += 1
+        try:
+            yield self.session
+        finally:
+            with self._idle:
+                self._calls -= 1
+                self._idle.notify_all()
+
     def is_connected(self) -> bool:
         """Whether a router is at the other end right now."""
         return not self.session.is_closed() and bool(self.session.info.routers_zid())
@@ -109,8 +131,19 @@ class Connection:
     def close(self) -> None:
         """Ends the session and every waiting call; the wire meter keeps its total."""
         self.closed.set()
-        self.session.close()  # type: ignore[no-untyped-call]  # zenoh's stub
+        if not self._wait_idle():
+            # Calls wait for a stalled link and would hold the session open: cut the link off.
+            self.meter.cut()
+            self._wait_idle()
+        try:
+            self.session.close()  # type: ignore[no-untyped-call]  # zenoh's stub
+        except zenoh.ZError as error:
+            _LOG.warning("%s: session not closed cleanly: %s", self.name, error)
         self.meter.close()
+
+    def _wait_idle(self) -> bool:
+        with self._idle:
+            return self._idle.wait_for(lambda: self._calls == 0, _CLOSE_S)
 
     def _on_link(self, event: zenoh.LinkEvent) -> None:
         link = event.link

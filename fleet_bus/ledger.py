@@ -1,6 +1,7 @@
 """The traffic account of one agent: every message in and out, by kind, tile and place along the drive."""
 
 import json
+import logging
 import os
 import threading
 import time
@@ -16,7 +17,7 @@ from gnd_map.tile_id import TileId
 
 Direction = Literal["up", "down"]
 KINDS: Final = ("tile", "delta", "catalog", "change", "ack", "update", "control")
-_FLUSH_EVERY: Final = 64
+_LOG = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True, slots=True)
@@ -34,7 +35,7 @@ class Ledger:
 
     Args:
         agent: who is accounted for.
-        path: JSON-lines file that grows while the agent runs; None keeps the lines until `write_jsonl`.
+        path: JSON-lines file to which each message is appended at once; None keeps the lines until `write_jsonl`.
         now_ns: clock, ns UTC.
     """
 
@@ -122,8 +123,16 @@ class Ledger:
     def _note(self, line: dict[str, Any]) -> None:
         head = {"agent": self.agent, "session": self._session, "t_ns": self._now_ns(), **self._place}
         self._waiting.append(head | line)
-        if self.path is not None and len(self._waiting) >= _FLUSH_EVERY:
-            self._append(self.path)
+        if self.path is not None:
+            self._try_append(self.path)
+
+    def _try_append(self, path: Path) -> None:
+        """Writes at once, so that a kill loses no line; a full disk must not stop the vehicle."""
+        try:
+            self._append(path)
+        except LedgerError as error:
+            if len(self._waiting) & (len(self._waiting) - 1) == 0:  # 1, 2, 4, 8 …: one warning a doubling
+                _LOG.warning("%d ledger lines wait: %s", len(self._waiting), error)
 
     def _append(self, path: Path) -> None:
         if not self._waiting:

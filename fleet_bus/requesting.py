@@ -139,26 +139,30 @@ class _Asking:
                 raise RequestRefused(self.key, attempt, f"refused: {answers.refusal}")
             wait_s = retry.wait_s(attempt)
             if time.monotonic() + wait_s >= deadline_s:
-                raise RequestFailed(self.key, attempt, f"{self._cause(answers)} (gave up after {timeout_s:g} s)")
+                raise RequestFailed(self.key, attempt, f"{answers.cause()} (gave up after {timeout_s:g} s)")
             if self.connection.closed.wait(wait_s):
                 raise BusClosed(f"the bus was closed while asking {self.key} for the {attempt + 1}th time")
         raise AssertionError("unreachable")
 
     def _once(self, timeout_s: float, *, first_only: bool) -> Answers:
         connection = self.connection
+        connection.check_open()
+        if not connection.wait_connected(timeout_s):  # nothing would be sent, so nothing is paced nor booked
+            return Answers(errors=[f"no router at {', '.join(connection.config.connect)}"])
         connection.outgoing(self.payload, self.kind, self.tile)
         inbox: queue.SimpleQueue[zenoh.Reply | None] = queue.SimpleQueue()
         cancel = zenoh.CancellationToken()
-        connection.session.get(
-            self.key,
-            zenoh.handlers.Callback(inbox.put, lambda: inbox.put(None)),
-            payload=self.payload,
-            timeout=timeout_s,
-            # Answers pass at once and one by one; the default would hold all back until the last handler has finished.
-            consolidation=zenoh.ConsolidationMode.NONE,
-            congestion_control=zenoh.CongestionControl.BLOCK,
-            cancellation_token=cancel,
-        )
+        with connection.sending() as session:
+            session.get(
+                self.key,
+                zenoh.handlers.Callback(inbox.put, lambda: inbox.put(None)),
+                payload=self.payload,
+                timeout=timeout_s,
+                # Answers pass at once and one by one; the default would hold all back until the last has come.
+                consolidation=zenoh.ConsolidationMode.NONE,
+                congestion_control=zenoh.CongestionControl.BLOCK,
+                cancellation_token=cancel,
+            )
         try:
             return self._collect(inbox, first_only=first_only)
         finally:
@@ -185,8 +189,3 @@ class _Asking:
                 return inbox.get(timeout=_POLL_S)
             except queue.Empty:
                 continue
-
-    def _cause(self, answers: Answers) -> str:
-        if not self.connection.is_connected():
-            return f"no router at {', '.join(self.connection.config.connect)}"
-        return answers.cause()

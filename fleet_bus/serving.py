@@ -87,4 +87,5 @@ class Serving(Part):
         if "*" in key:
             raise BusError(f"an answer needs a key without wildcards, got {key}: give (key, payload) pairs")
         self._connection.outgoing(payload, self._kind, None)
-        query.reply(key, payload)
+        with self._connection.sending():
+            query.reply(key, payload)

@@ -118,7 +118,8 @@ class RecallingPublisher(Part):
             MessageTooLarge, BusClosed.
         """
         self._connection.outgoing(payload, self._kind, tile)
-        self._publisher.put(payload)
+        with self._connection.sending():
+            self._publisher.put(payload)
 
     def _end(self) -> None:
         self._publisher.undeclare()
@@ -128,12 +129,14 @@ def publish(
     connection: Connection, key: str, payload: bytes, *, kind: str, tile: TileId | str | None, wait_s: float
 ) -> None:
     """Puts a notice; see `Bus.publish`."""
-    connection.outgoing(payload, kind, tile)
+    connection.check_open()
     # A put without a router is silent, so look first.
     if not connection.wait_connected(wait_s):
         where = ", ".join(connection.config.connect)
         raise NoRouter(f"no router at {where} for {wait_s:g} s: {len(payload)} bytes for {key} were not published")
-    connection.session.put(key, payload, congestion_control=zenoh.CongestionControl.BLOCK)
+    connection.outgoing(payload, kind, tile)
+    with connection.sending() as session:
+        session.put(key, payload, congestion_control=zenoh.CongestionControl.BLOCK)
 
 
 def _declare(session: zenoh.Session, keyexpr: str, accept: Callable[[zenoh.Sample], Any], *, history: bool) -> Any:

@@ -4,6 +4,7 @@ The zenoh wheel keeps no transport statistics, but Linux counts for every TCP so
 so a duplicate of the descriptor is kept until the link is reported as gone, and its last reading is added to the past.
 """
 
+import contextlib
 import os
 import socket
 import stat
@@ -69,6 +70,14 @@ class WireMeter:
         """Total of the past and the present connections."""
         with self._lock:
             return sum((_reading(tap) for tap in self._open.values()), self._past)
+
+    def cut(self) -> None:
+        """Ends the connections themselves, whatever still waits on them."""
+        with self._lock:
+            taps = tuple(self._open.values())
+        for tap in taps:
+            with contextlib.suppress(OSError):  # ended already
+                tap.shutdown(socket.SHUT_RDWR)
 
     def close(self) -> None:
         """Detaches everything; `read` keeps giving the final total."""

@@ -2,6 +2,7 @@
 
 import logging
 import threading
+import time
 from collections import deque
 from collections.abc import Callable
 from typing import Final, Generic, TypeVar
@@ -50,14 +51,15 @@ class Workers(Generic[_T]):
             return not full
 
     def close(self) -> None:
-        """Forgets what waits and ends the threads; a handler that does not return is left behind after 5 s."""
+        """Forgets what waits and ends the threads; handlers that do not return are left behind after 5 s."""
         with self._changed:
             self._closed = True
             self._items.clear()
             self._changed.notify_all()
+        deadline_s = time.monotonic() + _JOIN_S
         for thread in self._threads:
             if thread is not threading.current_thread():
-                thread.join(_JOIN_S)
+                thread.join(max(0.0, deadline_s - time.monotonic()))
                 if thread.is_alive():
                     _LOG.warning("%s is still busy %.0f s after it was told to end", thread.name, _JOIN_S)
 

@@ -1,6 +1,7 @@
 """Routers come and go; sessions find them again and end cleanly."""
 
 import signal
+import socket
 import threading
 
 import pytest
@@ -88,6 +89,35 @@ def test_without_router_the_failure_says_so(router_process: RouterProcess, clien
     wait_for(lambda: not bus.is_connected(), "the loss of the router")
     with pytest.raises(RequestFailed, match=f"no router at {router_process.endpoint}"):
         bus.request(key, b"", kind="change", retry=QUICK, timeout_s=0.3)
+
+
+HANGING_ROUTER = """
+import sys, threading
+from fleet_bus.bus import open_bus
+from fleet_bus.config import BusConfig
+with open_bus(BusConfig(mode="router", connect=(), listen=(sys.argv[1],), lease_ms=500)):
+    print("up", flush=True)
+    threading.Event().wait()
+"""
+
+
+def test_a_router_that_hangs_is_given_up_after_its_lease_and_found_again(endpoint, client, key):
+    with script(HANGING_ROUTER, endpoint) as hanging:
+        hanging.wait_line("up")
+        server, bus = client(endpoint, lease_ms=500), client(endpoint, lease_ms=500)
+        server.serve(key, lambda _request: b"back")
+        assert bus.request(key, b"", kind="tile", retry=QUICK) == b"back"
+        hanging.signal(signal.SIGSTOP)
+        wait_for(lambda: not bus.is_connected(), "the end of the lease")
+        hanging.signal(signal.SIGCONT)
+        assert bus.request(key, b"", kind="tile", retry=QUICK) == b"back"
+
+
+def test_a_port_that_is_no_router_is_given_up_in_time():
+    with socket.create_server(("127.0.0.1", 0)) as silent:
+        at = f"tcp/127.0.0.1:{silent.getsockname()[1]}"
+        with pytest.raises(NoRouter, match=f"no router at {at}"):
+            open_bus(BusConfig(connect=(at,), open_timeout_s=0.3))
 
 
 def test_a_client_with_two_endpoints_fails_over(router_process: RouterProcess, client, key):

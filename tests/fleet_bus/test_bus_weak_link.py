@@ -3,13 +3,14 @@
 import json
 import socket
 import threading
+import time
 
 import pytest
 import zenoh
 from bus_testing import Inbox, wait_for
 
 from fleet_bus.config import BusConfig, zenoh_config
-from fleet_bus.errors import RequestFailed
+from fleet_bus.errors import BusClosed, RequestFailed
 from fleet_bus.links import LinkProfile
 from fleet_bus.requesting import RetryPolicy
 
@@ -81,6 +82,32 @@ def test_a_stall_longer_than_zenohs_patience_loses_nothing(router, client, relay
     reopening.join()
     assert [int.from_bytes(payload[:2], "little") for payload in inbox.payloads] == list(range(200))
     assert relay.connections == 1, "the session was given up and opened again"
+
+
+def test_closing_ends_a_put_that_waits_for_a_stalled_link(router, client, relay, key):
+    inbox = Inbox()
+    client(router).subscribe(key, inbox)
+    sender = client(relay.endpoint, link=CELLULAR)
+    inbox.wait_connected(sender, key)
+    relay.open.clear()
+    sent, outcome = [], []
+
+    def put_for_ever() -> None:
+        try:
+            while len(sent) < 10_000:
+                sender.publish(key, bytes(10_000), kind="update")
+                sent.append(time.monotonic())
+        except (BusClosed, zenoh.ZError) as error:
+            outcome.append(error)
+
+    putting = threading.Thread(target=put_for_ever)
+    putting.start()
+    wait_for(lambda: sent and time.monotonic() - sent[-1] > 0.3, "full buffers")
+    sender.close()
+    putting.join(10)
+    relay.open.set()
+    assert not putting.is_alive()
+    assert len(outcome) == 1
 
 
 def test_a_denied_key_is_no_answer(endpoint, client):

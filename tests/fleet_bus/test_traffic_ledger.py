@@ -132,9 +132,23 @@ def test_unreadable_and_unwritable_files_are_named(tmp_path):
     assert read_ledger(tmp_path / "a.jsonl").total_bytes("up") == 1, "a failed write keeps the lines"
 
 
-def test_a_ledger_with_a_path_grows_while_the_agent_runs(tmp_path):
+def test_a_ledger_with_a_path_has_each_message_at_once(tmp_path):
     file = tmp_path / "a.jsonl"
     ledger = Ledger("a", file)
-    for _ in range(200):
+    for count in range(1, 4):
         ledger.record("up", "control", 1)
-    assert len(file.read_text().splitlines()) >= 128
+        assert len(file.read_text().splitlines()) == count
+
+
+def test_a_full_disk_stops_no_message_and_loses_no_line(tmp_path):
+    """A folder in the place of the file stands for a disk that cannot be written."""
+    file = tmp_path / "a.jsonl"
+    file.mkdir()
+    ledger = Ledger("a", file)
+    for _ in range(3):
+        ledger.record("up", "control", 1)
+    with pytest.raises(LedgerError, match="cannot write the ledger"):
+        ledger.flush()
+    file.rmdir()
+    ledger.flush()
+    assert read_ledger(file).total_bytes("up") == 3
