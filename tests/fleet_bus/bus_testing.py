@@ -2,6 +2,7 @@
 
 import os
 import signal
+import socket
 import subprocess
 import sys
 import threading
@@ -32,6 +33,13 @@ def stays(condition: Callable[[], object], what: str, for_s: float = 0.3) -> Non
     while time.monotonic() < end_s:
         assert condition(), what
         time.sleep(0.01)
+
+
+def new_endpoint() -> str:
+    """An endpoint at which nobody listened a moment ago."""
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        return f"tcp/127.0.0.1:{probe.getsockname()[1]}"
 
 
 PROBE = b"is anybody there?"
@@ -82,7 +90,6 @@ class Script:
 
     def _read(self) -> None:
         assert self.process.stdout is not None
-        self.lines.extend([])
         for line in self.process.stdout:
             self.lines.append(line.rstrip("\n"))
 

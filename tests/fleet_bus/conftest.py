@@ -1,9 +1,8 @@
 import itertools
-import socket
 from collections.abc import Callable, Iterator
 
 import pytest
-from bus_testing import RouterProcess
+from bus_testing import RouterProcess, new_endpoint
 
 from fleet_bus.bus import Bus, open_bus
 from fleet_bus.config import BusConfig
@@ -12,12 +11,6 @@ from fleet_bus.links import LinkProfile
 from fleet_bus.router import open_router
 
 _NUMBERS = itertools.count()
-
-
-def new_endpoint() -> str:
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        return f"tcp/127.0.0.1:{probe.getsockname()[1]}"
 
 
 @pytest.fixture

@@ -5,8 +5,7 @@ import socket
 import threading
 
 import pytest
-from bus_testing import RouterProcess, script, wait_for
-from conftest import new_endpoint
+from bus_testing import RouterProcess, new_endpoint, script, wait_for
 
 from fleet_bus.bus import open_bus
 from fleet_bus.config import BusConfig
