@@ -29,7 +29,7 @@ _PAPER: Final = "#ffffff"
 _SKY: Final = "#e9eef5"
 _HALF_WIDTH_M: Final = 24.0
 _NEAR_M: Final = 4.0
-_FOCAL: Final = 1.3
+_FOCAL: Final = 1.75
 _ARROW: Final = {"arrowstyle": "-|>", "color": _INK, "linewidth": 1.6}
 
 
@@ -154,7 +154,7 @@ def _from_above(axes: Axes, ellipsoids: Ellipsoids, view: View) -> None:
 
 def _in_perspective(axes: Axes, ellipsoids: Ellipsoids, view: View) -> None:
     """Ellipsoids seen from above one end of the street; outlines are covariances through the projection's Jacobian."""
-    eye, target = np.array([view.focus_m - 47.0, -15.0, 27.0]), np.array([view.focus_m, 1.5, -1.0])
+    eye, target = np.array([view.focus_m - 66.0, -13.0, 33.0]), np.array([view.focus_m + 2.0, 1.0, 0.0])
     R = _looking(eye, target) @ view.R_view_map
     p = (ellipsoids.mean_m - np.array(view.origin_m)) @ R.T - _looking(eye, target) @ eye
     order = np.flatnonzero(p[:, 2] > _NEAR_M)

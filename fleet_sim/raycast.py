@@ -3,6 +3,8 @@
 Nothing here is shared with the vehicle's ray caster: the simulator stays an independent witness. A ray is cast in the
 street frame, an affine image of the map frame (turn and shear), so that the parameter t along the ray is the same
 in both: with a unit direction in the map frame, t is the range in metres.
+
+All kernels stand in this one file, because numba's cache on disk notices changes of a kernel's own file only.
 """
 
 from collections.abc import Sequence
