@@ -7,7 +7,7 @@ from cloud_merger.announce import Announcer
 from cloud_merger.config import ShardConfig
 from cloud_merger.ingest import Ingest
 from cloud_merger.ownership import Members
-from cloud_merger.reception import Reception, districts_of
+from cloud_merger.reception import Reception
 from cloud_merger.work import Worker
 from fleet_bus.bus import open_bus
 from fleet_bus.config import BusConfig
@@ -38,7 +38,7 @@ def run_shard(config: ShardConfig, stop: threading.Event) -> None:
         # Ingest: check, keep, acknowledge, in threads of the bus.
         ingest = Ingest(store, config.ingest, on_stored=wake.set)
         reception = Reception(bus, members, ingest.answer, on_death=store.release)
-        reception.open(districts_of(store))
+        reception.open()
         _LOG.info("merger %s: store %s, mode %s", config.shard_id, config.store_path, config.merge.mode)
 
         worker, announcer = Worker(store, config), Announcer(store, bus, members)

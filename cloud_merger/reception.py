@@ -1,14 +1,15 @@
-"""Where reports are received: a `complete` queryable on every district owned, and a fallback for all others.
+"""Where reports are received: a fallback for every district, and a `complete` queryable on those owned and active.
 
-The router hands a report to the owner's complete queryable alone. Of a district that has none (new in the map, or its
-owner has just died) every shard's fallback hears; there, only the shard that now owns the district answers, and from
-then on declares it. So there is one ack in normal operation; while the shards' views of who lives differ, none (the
-vehicle asks again) or two (storing twice has no effect).
+The router hands a report to a complete queryable alone. Of a district that has none (its first report, or its owner has
+just died) every shard's fallback hears; there, only the shard that now owns the district answers, and from then on
+declares it. So there is one ack in normal operation; while the views of who lives differ, none (the vehicle asks
+again) or two (storing twice has no effect).
 """
 
 import logging
 import threading
-from collections.abc import Callable, Iterable
+from collections.abc import Callable
+from typing import Final
 
 from cloud_merger.ownership import Members
 from fleet_bus.bus import Bus
@@ -18,18 +19,13 @@ from gnd_map.tile_id import District
 from schemas.changes import ChangeAck
 from schemas.errors import SchemaError
 from schemas.keys import alive_key, alive_keys, change_key, change_keys, parse_alive_key, parse_change_key
-from tile_store.store import Store
 
-ROLE = "merger"
+ROLE: Final = "merger"
+MAX_DECLARED: Final = 256  # each has two threads
 _LOG = logging.getLogger(__name__)
 
 Place = tuple[str, District]  # layer and district
 Answer = Callable[[str, bytes], ChangeAck]
-
-
-def districts_of(store: Store) -> set[Place]:
-    """Every layer and district of which the store holds tiles."""
-    return {(layer, head.tile.district) for layer in store.layers() for head in store.heads(layer)}
 
 
 class Reception:
@@ -45,35 +41,34 @@ class Reception:
     def __init__(self, bus: Bus, members: Members, answer: Answer, on_death: Callable[[str], object]) -> None:
         self._bus, self._members, self._answer, self._on_death = bus, members, answer, on_death
         self._lock = threading.Lock()
-        self._known: set[Place] = set()
-        self._declared: dict[Place, Serving] = {}
+        self._declared: dict[Place, Serving] = {}  # oldest first
 
-    def open(self, known: Iterable[Place]) -> None:
-        """Begin to receive for the places that the map holds. The sign of life comes last."""
+    def open(self) -> None:
+        """Begin to receive; the sign of life comes last."""
         self._bus.watch_alive(alive_keys(ROLE), self._on_alive)
         self._bus.serve(change_keys(), self._fallback, kind="change")
-        self._settle(known)
         self._bus.declare_alive(alive_key(ROLE, self._members.own))
 
     @property
     def districts(self) -> tuple[str, ...]:
-        """Paths of the districts that this shard answers for, sorted."""
+        """Paths of the districts that this shard has declared, sorted."""
         with self._lock:
             return tuple(sorted({district.path for _, district in self._declared}))
 
-    def _settle(self, new: Iterable[Place] = ()) -> None:
-        """Declare what is owned, and only that."""
+    def _declare(self, place: Place) -> None:
+        """Take a district from the fallback; the oldest goes back to it when there are too many."""
         with self._lock:
-            self._known.update(new)
-            for place in sorted(self._known):
-                mine = self._members.is_mine(place[1])
-                if mine and place not in self._declared:
-                    self._declared[place] = self._declare(place)
-                elif not mine and place in self._declared:
-                    self._declared.pop(place).close()
+            if place in self._declared or not self._members.is_mine(place[1]):
+                return
+            serving = self._bus.serve(change_key(*place), self._own, complete=True, workers=2, kind="change")
+            self._declared[place] = serving
+            if len(self._declared) > MAX_DECLARED:
+                self._declared.pop(next(iter(self._declared))).close()
 
-    def _declare(self, place: Place) -> Serving:
-        return self._bus.serve(change_key(*place), self._own, complete=True, workers=2, kind="change")
+    def _give_up_foreign(self) -> None:
+        with self._lock:
+            for place in [place for place in self._declared if not self._members.is_mine(place[1])]:
+                self._declared.pop(place).close()
 
     def _own(self, request: Request) -> bytes:
         return self._answer(request.key, request.payload).encode()
@@ -86,7 +81,7 @@ class Reception:
             raise NotMine
         ack = self._answer(request.key, request.payload)
         if ack.status != "quarantined":
-            self._settle([place])
+            self._declare(place)
         return ack.encode()
 
     def _on_alive(self, key: str, alive: bool) -> None:
@@ -96,7 +91,7 @@ class Reception:
         _LOG.info("%s: %s has %s", self._members.own, member, "joined" if alive else "gone")
         if not alive:
             self._on_death(member)
-        self._settle()
+        self._give_up_foreign()
 
 
 def _place(key: str) -> Place | None:

@@ -1,0 +1,86 @@
+"""Reception on a real router: what one shard declares, answers and gives up."""
+
+import pytest
+from merger_processes import Cloud, all_acks, raw_session, wait_for
+from merger_world import POLE, TILE, change_of, report_of
+
+from cloud_merger import reception
+from cloud_merger.ownership import Members, owner_of
+from cloud_merger.reception import Reception
+from fleet_bus.bus import open_bus
+from fleet_bus.config import BusConfig
+from gnd_map.tile_id import TileId
+from schemas.changes import ChangeAck, ChangeReport
+from schemas.keys import alive_key
+
+TILES = [TileId((TILE.morton & ~1023) + k * 1024 + 5) for k in range(8)]
+REPORTS = [report_of(n, change_of(None, [0], {0: POLE}, tile=tile)) for n, tile in enumerate(TILES)]
+
+
+@pytest.fixture
+def cloud(tmp_path, free_port):
+    cloud = Cloud(tmp_path, free_port)
+    cloud.open()
+    yield cloud
+    cloud.close()
+
+
+@pytest.fixture
+def shard(cloud):
+    """Shard "one", which stores nothing: it acknowledges all, and refuses reports of the last tile's district."""
+    died = []
+
+    def answer(_key, payload):
+        report = ChangeReport.decode(payload)
+        is_bad = report.district == TILES[-1].district
+        return ChangeAck(report.report_id, "quarantined" if is_bad else "stored", "bad" if is_bad else "")
+
+    with open_bus(BusConfig(connect=(cloud.endpoint,)), name="one") as bus:
+        shard = Reception(bus, Members("one"), answer, died.append)
+        shard.open()
+        shard.died = died
+        wait_for("the shard lives", lambda: cloud.living == {"one"})
+        yield shard
+
+
+def districts(reports):
+    return tuple(sorted(report.district.path for report in reports))
+
+
+def test_a_district_is_declared_with_its_first_good_report(cloud, shard):
+    assert shard.districts == ()
+    with raw_session(cloud.endpoint) as session:
+        for report in (*REPORTS, *REPORTS):
+            assert len(all_acks(session, report)) == 1
+    assert shard.districts == districts(REPORTS[:-1])
+
+
+def test_only_so_many_districts_are_declared_and_the_others_are_answered_all_the_same(cloud, shard, monkeypatch):
+    monkeypatch.setattr(reception, "MAX_DECLARED", 2)
+    with raw_session(cloud.endpoint) as session:
+        for report in (*REPORTS, *REPORTS):
+            assert len(all_acks(session, report)) == 1
+    assert shard.districts == districts(REPORTS[5:7])
+
+
+def test_districts_are_given_up_when_their_owner_comes_and_taken_back_when_it_goes(cloud, shard):
+    with raw_session(cloud.endpoint) as session:
+        for report in REPORTS[:-1]:
+            all_acks(session, report)
+        two = cloud.bus.declare_alive(alive_key("merger", "two"))  # lives, but does not answer
+        mine = [report for report in REPORTS[:-1] if owner_of(report.district, ["one", "two"]) == "one"]
+        others = [report for report in REPORTS[:-1] if report not in mine]
+        assert mine
+        assert others
+        wait_for("the districts of two are given up", lambda: shard.districts == districts(mine))
+        assert [len(all_acks(session, report)) for report in others] == [0] * len(others)
+        assert [len(all_acks(session, report)) for report in mine] == [1] * len(mine)
+        two.close()
+        wait_for("the death is noticed", lambda: shard.died == ["two"])
+        assert [len(all_acks(session, report)) for report in others] == [1] * len(others)
+
+
+def test_a_key_that_is_no_district_is_answered_rather_than_ignored(cloud, shard):
+    with raw_session(cloud.endpoint) as session:
+        replies = list(session.get("gnd/v1/change/ndt/9", payload=REPORTS[0].encode(), timeout=5.0))
+    assert [ChangeAck.decode(reply.ok.payload.to_bytes()).report_id for reply in replies] == [REPORTS[0].report_id]
