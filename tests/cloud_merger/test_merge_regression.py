@@ -1,4 +1,4 @@
-"""Results on a place with known truth: how the map heals with the number of drives, and the exact tiles that come out."""
+"""Results on a place with known truth: how the map heals with the number of drives, and the exact tiles that result."""
 
 import hashlib
 
