@@ -8,7 +8,7 @@ from deploy.region import Region
 from deploy.watch import record_updates
 from fleet_bus.bus import open_bus
 from fleet_bus.config import BusConfig
-from fleet_bus.router import run_router
+from fleet_bus.router import run_router, wait_for_stop
 from tile_store.server import TileServer
 from tile_store.sqlite_store import SqliteStore
 from vehicle_agent.agent import AgentConfig, run_agent
@@ -26,7 +26,7 @@ def store(path: Path, connect: str, *, stop: threading.Event) -> None:
         open_bus(BusConfig(connect=(connect,)), name="store") as bus,
         TileServer(opened, bus),
     ):
-        stop.wait()
+        wait_for_stop(stop)
 
 
 def merger(config: ShardConfig, *, stop: threading.Event) -> None:

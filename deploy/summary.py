@@ -12,7 +12,7 @@ from deploy.live import size_text
 from deploy.prepare import PreparedRun
 from deploy.run_folder import RunFolder
 from fleet_sim.ellipsoids import Tiles, ellipsoids_of_maps
-from fleet_sim.pictures import View, draw_map, draw_run
+from fleet_sim.pictures import View, draw_healing, draw_map, draw_run
 from fleet_sim.truth import read_truth
 from gnd_map.geodesy import LocalFrame
 from tile_store.sqlite_store import SqliteStore
@@ -83,6 +83,7 @@ def _evaluate(
         return dict(NO_TRUTH)
     truth = read_truth(prepared.truth)
     draw_run(truth, base, final, folder.root)
+    draw_healing(truth, base, final, folder.root / "healing.png")
     return score_run(truth, store, histories).as_dict()
 
 

@@ -118,20 +118,51 @@ def draw_run(truth: Truth, base: Tiles, final: Tiles, folder: Path) -> tuple[Pat
     return paths
 
 
+def draw_healing(truth: Truth, base: Tiles, final: Tiles, path: Path) -> None:
+    """Draw the map before, the map after and the truth from above, one below the other, as one PNG.
+
+    Args:
+        truth: of the world.
+        base: the map at the start.
+        final: the map at the end.
+        path: the PNG to write.
+
+    Raises:
+        SimError: the file cannot be written.
+    """
+    true = ellipsoids_of_truth(truth)
+    view = View.around(true)
+    panels = (
+        ("Map before", ellipsoids_of_maps(truth.frame, base)),
+        ("Map after", ellipsoids_of_maps(truth.frame, base, final)),
+        ("Truth", true),
+    )
+    figure = Figure(figsize=(12.6, 9.6), dpi=_DPI // 2, facecolor=_PAPER)
+    _legend(figure)
+    for row, (title, ellipsoids) in enumerate(panels):
+        figure.text(0.03, 0.957 - 0.315 * row, title, fontsize=17, weight="bold", color=_INK, va="center")
+        _from_above(figure.add_axes((0.03, 0.667 - 0.315 * row, 0.94, 0.27)), ellipsoids, view)
+    _save(figure, path)
+
+
 def _save(figure: Figure, path: Path) -> None:
     partial = path.with_name(f".{path.name}.part")
     try:
         with partial.open("wb") as file:
-            figure.savefig(file, format="png", dpi=_DPI)
+            figure.savefig(file, format="png")
         partial.replace(path)
     except OSError as error:
         raise SimError(f"cannot write the picture {path}: {error}") from error
 
 
-def _legend(figure: Figure, ellipsoids: Ellipsoids) -> None:
-    count = np.bincount(ellipsoids.change_class, minlength=len(ChangeClass))
+def _legend(figure: Figure, ellipsoids: Ellipsoids | None = None) -> None:
+    """The colours, with the number of ellipsoids of each where they are given."""
+    number = ["" for _ in ChangeClass]
+    if ellipsoids is not None:
+        count = np.bincount(ellipsoids.change_class, minlength=len(ChangeClass))
+        number = [f"  {n:,}" for n in count.tolist()]
     dot: dict[str, Any] = {"marker": "o", "linestyle": "", "markersize": 9}
-    handles = [Line2D([], [], color=CLASS_COLOURS[c], label=f"{c.name.lower()}  {count[c]:,}", **dot) for c in _SHOWN]
+    handles = [Line2D([], [], color=CLASS_COLOURS[c], label=f"{c.name.lower()}{number[c]}", **dot) for c in _SHOWN]
     figure.legend(
         handles=handles, loc="center right", bbox_to_anchor=(0.978, 0.958), ncols=4, frameon=False, fontsize=11,
         handletextpad=0.2, columnspacing=1.4, labelcolor=_INK,

@@ -18,6 +18,7 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TaskID, TextC
 
 from fleet_bus.bus import open_bus
 from fleet_bus.config import DEFAULT_ENDPOINT, BusConfig
+from fleet_bus.router import wait_for_stop
 from tile_store import tables
 from tile_store.arguments import parse_tile, parse_time_ns, parse_versions
 from tile_store.compare import MapDiff, map_diff, map_info, version_diff
@@ -65,7 +66,7 @@ def store(path: Path, connect: tuple[str, ...], workers: int) -> None:
     with SqliteStore(path) as opened, open_bus(config, name="store") as bus, TileServer(opened, bus, workers=workers):
         counts = opened.counts()
         click.echo(f"tile server: {counts.tiles} tiles of {path} at {', '.join(connect)}; Ctrl-C ends it")
-        stop.wait()
+        wait_for_stop(stop)
     click.echo("tile server ended")
 
 
