@@ -1,7 +1,7 @@
 """A recorded drive with objects in it that were not there: exact truth in the noise of a real sensor."""
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
@@ -21,17 +21,23 @@ _MANY = 10**9
 """More scans than a drive can have: `slice` then works like on a list of scans."""
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, eq=False)
 class Rewritten:
     """What became of a drive.
 
     Attributes:
         scans: scans written.
-        moved: points that now lie on an object.
+        on_object_m: float64 (M, 3), the points that now lie on an object, in the frame of the reference poses: which
+            voxels the sensor has measured on it is exact truth.
     """
 
     scans: int
-    moved: int
+    on_object_m: NDArray[np.float64] = field(repr=False)
+
+    @property
+    def moved(self) -> int:
+        """Points that now lie on an object."""
+        return len(self.on_object_m)
 
 
 def rewrite_drive(
@@ -64,16 +70,17 @@ def rewrite_drive(
         raise SimError(f"{source} has {len(reference.t_ns)} reference poses: objects cannot be placed without poses")
     chosen = range(_MANY)[scans]
     painter = _Painter(header, shapes, reference.t_ns, reference.T_map_vehicle, range_sigma_m, seed) if shapes else None
-    written = moved = 0
+    written, on_object = 0, [np.empty((0, 3))]
     with DriveWriter(target, header) as writer:
         for number, item in _numbered(source):
             if not isinstance(item, Scan):
                 writer.add(item)
             elif number in chosen:
-                scan, hits = painter.paint(item) if painter else (item, 0)
+                scan, points_m = painter.paint(item) if painter else (item, on_object[0])
                 writer.add(scan)
-                written, moved = written + 1, moved + hits
-    return Rewritten(written, moved)
+                on_object.append(points_m)
+                written += 1
+    return Rewritten(written, np.concatenate(on_object))
 
 
 def _numbered(source: Path) -> Iterator[tuple[int, DriveItem]]:
@@ -99,11 +106,13 @@ class _Painter:
         self._T_vehicle_lidar, self._sigma_m = header.T_vehicle_lidar, range_sigma_m
         self._inserter, self._rng = Inserter(shapes), np.random.default_rng(seed)
 
-    def paint(self, scan: Scan) -> tuple[Scan, int]:
-        """Return the scan with the objects in it and the number of points moved."""
+    def paint(self, scan: Scan) -> tuple[Scan, NDArray[np.float64]]:
+        """Return the scan with the objects in it, and the points (M, 3) that now lie on them, map frame."""
         step, at = np.unique(scan.t_offset_ns // _STEP_NS, return_inverse=True)
         last = int(self._track.t_ns[-1])
         t_ns = np.minimum(scan.t_ns + step.astype(np.int64) * _STEP_NS, last)
         T_map_lidar = (self._track.at(t_ns) @ self._T_vehicle_lidar)[at]
         inserted = self._inserter.insert(scan.points_m, T_map_lidar, self._rng, self._sigma_m)
-        return replace(scan, points_m=inserted.points_lidar_m), int(inserted.hit.sum())
+        T, points_m = T_map_lidar[inserted.hit], inserted.points_lidar_m[inserted.hit]
+        on_object_m = np.einsum("nij,nj->ni", T[:, :3, :3], points_m) + T[:, :3, 3]
+        return replace(scan, points_m=inserted.points_lidar_m), on_object_m
