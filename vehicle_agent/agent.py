@@ -6,6 +6,7 @@ from typing import Any
 
 from schemas.drive import Scan
 from vehicle_agent.config import AgentConfig
+from vehicle_agent.memory import keep_small
 from vehicle_agent.result import write_json
 from vehicle_agent.vehicle import open_vehicle
 
@@ -27,6 +28,7 @@ def run_agent(config: AgentConfig, stop: threading.Event) -> dict[str, Any]:
     Raises:
         GndError: the recording, a file or the bus cannot be used; the message says which and what to do.
     """
+    keep_small()
     with open_vehicle(config, stop) as vehicle:
         for item in vehicle.drive():  # recording -> usable measurements in time order
             if isinstance(item, Scan):

@@ -15,7 +15,7 @@ class DownloadParameters:
     """Which tiles are asked for, and how patiently."""
 
     near_m: float = 60.0
-    """Tiles this near are needed now: beyond the range of detection."""
+    """Tiles this near are held in memory, and needed now: beyond the range of detection."""
     ahead_m: float = 120.0
     """How far along the heading tiles are asked for in advance."""
     in_flight: int = 8
@@ -26,8 +26,8 @@ class DownloadParameters:
     """Pause after a request that failed."""
     wait_s: float = 30.0
     """A drive that is not paced waits this long for a tile that is near; then it goes on without."""
-    forget_m: float = 200.0
-    """Tiles farther away leave the memory (not the cache)."""
+    forget_m: float = 90.0
+    """Tiles farther away leave the memory (not the cache) once their evidence is reported."""
 
     def __post_init__(self) -> None:
         """Distances in order, at least one request in flight."""

@@ -13,7 +13,7 @@ from gnd_map.tile import Tile
 from gnd_map.tile_id import TileId, covering_corridor
 from vehicle_agent.config import DownloadParameters
 from vehicle_agent.detect.detector import ChangeDetector
-from vehicle_agent.download import TileFetcher
+from vehicle_agent.download import Fetched, TileFetcher
 from vehicle_agent.local_map import LocalMap
 from vehicle_agent.place import Place
 
@@ -41,19 +41,27 @@ class Surroundings:
         self.wanted: tuple[TileId, ...] = ()
         self._looked_at: F64 | None = None
         self._near: tuple[TileId, ...] = ()
+        self._arrived: dict[TileId, Tile | None] = {}
         self.given_up: set[TileId] = set()
 
     def follow(self, place: Place, stop: threading.Event, *, wait: bool) -> None:
-        """Ask for what lies around and ahead and hold what has arrived; `wait` for the tiles that are near."""
+        """Ask for what lies around and ahead and hold what is near; `wait` for the answers about that."""
         if self._has_moved(place):
             self._look_ahead(place)
         if wait:
-            self.given_up |= self._fetcher.wait_for(set(self._near) - self.given_up, self._parameters.wait_s, stop)
+            missing = set(self._near) - self.given_up
+            self.given_up |= self._fetcher.wait_for(missing, self._parameters.wait_s, stop)
         for fetched in self._fetcher.take():
-            self._hold(fetched.tile_id, fetched.tile)
+            self._arrive(fetched)
+        for tile_id in self._near:
+            if tile_id in self._arrived:
+                self._hold(tile_id, self._arrived.pop(tile_id))
 
     def replace(self, tile: Tile) -> bool:
-        """Hold a newer version of a tile that is held, unless evidence is gathered against the old one."""
+        """Use a newer version of a tile that waits or is held, unless evidence is gathered against the old one."""
+        if tile.tile_id in self._arrived:
+            self._arrived[tile.tile_id] = tile
+            return True
         held = self._map.tile(tile.tile_id)
         if held is None or held.sha == tile.sha or self._detector.touched(tile.tile_id):
             return False
@@ -80,20 +88,28 @@ class Surroundings:
         self._let_go(here)
 
     def _let_go(self, here: F64) -> None:
-        """Drop tiles far behind that nothing is counted about."""
+        """Drop tiles far behind that nothing is counted about, and answers about tiles that are no longer wanted."""
         frame, limit_m = self._map.grid_frame.frame, self._parameters.forget_m
-        for tile_id in self._map.tiles:
-            if tile_distance_m(frame, tile_id, here) > limit_m and not self._detector.touched(tile_id):
+        gone = [t for t in self._arrived if t not in self.wanted]
+        for tile_id in gone:
+            del self._arrived[tile_id]
+        for tile_id in left_behind(frame, self._map.tiles, here, limit_m):
+            if not self._detector.touched(tile_id):
                 self._map.remove_tile(tile_id)
-                self._fetcher.forget(tile_id)
+                gone.append(tile_id)
+        for tile_id in gone:
+            self._fetcher.forget(tile_id)
+
+    def _arrive(self, fetched: Fetched) -> None:
+        """Take an answer: a tile (or the knowledge that there is none) waits until it is near."""
+        if self._map.tile(fetched.tile_id) is None:
+            self._arrived[fetched.tile_id] = fetched.tile
+        elif fetched.tile is not None:
+            self.replace(fetched.tile)
 
     def _hold(self, tile_id: TileId, tile: Tile | None) -> None:
-        """Put an answer into the map: a tile, or the knowledge that there is none."""
         try:
-            if self._map.tile(tile_id) is not None:
-                if tile is not None:
-                    self.replace(tile)
-            elif tile is None:
+            if tile is None:
                 self._map.set_absent(tile_id)
             else:
                 self._map.set_tile(tile)

@@ -21,6 +21,7 @@ from vehicle_agent.link import Link, open_link
 from vehicle_agent.local_map import LocalMap
 from vehicle_agent.localise.estimates import RefinedScan
 from vehicle_agent.localise.localiser import Localiser
+from vehicle_agent.memory import trim
 from vehicle_agent.place import Place
 from vehicle_agent.report import Identity, Reporter
 from vehicle_agent.result import Evaluation, HealthTimeline, memory_mb
@@ -78,6 +79,7 @@ class Vehicle:
             self.localiser.push_gnss(item)
         elif isinstance(item, Scan):
             self.scans += 1
+            trim(self.scans)
             return self.localiser.push_scan(item)
         return []
 
