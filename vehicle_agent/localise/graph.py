@@ -1,6 +1,7 @@
 """The pose graph: a fixed-lag smoother over the last seconds of poses (GTSAM, built-in factors only)."""
 
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import gtsam
 import numpy as np
@@ -11,6 +12,27 @@ from vehicle_agent.localise.parameters import GraphParameters
 F64 = NDArray[np.float64]
 
 SLACK_S = 0.01
+
+
+class Odometry(NamedTuple):
+    """Motion since the pose before: (4, 4), and (6,) sigmas, rotation [rad] first, translation [m]."""
+
+    T_before_now: F64
+    sigmas: F64
+
+
+class MapMatch(NamedTuple):
+    """The pose that the map gives: (4, 4), and covariance (6, 6), rotation first, vehicle frame."""
+
+    T_map_vehicle: F64
+    covariance: F64
+
+
+class Position(NamedTuple):
+    """The vehicle's position by GNSS: (3,) in the map frame, and the sigma of a horizontal axis."""
+
+    p_map_m: F64
+    sigma_m: float
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -43,32 +65,21 @@ class PoseGraph:
         return self._next - 1
 
     def add(
-        self,
-        t_ns: int,
-        T_map_vehicle: F64,
-        odometry: F64 | None,
-        match: tuple[F64, F64] | None,
-        gnss: tuple[F64, float] | None,
+        self, t_ns: int, T_start: F64, odometry: Odometry | None, match: MapMatch | None, gnss: Position | None
     ) -> list[SmoothedPose]:
-        """Add a pose and return the poses that leave the lag, oldest first.
-
-        Args:
-            t_ns: its time, later than the one before.
-            T_map_vehicle: (4, 4) where the optimisation starts.
-            odometry: (4, 4) motion since the pose before, None for the first pose.
-            match: pose (4, 4) and covariance (6, 6) that the map gives, or None.
-            gnss: position (3,) of the vehicle in the map frame and horizontal sigma in metres, or None.
+        """Add the pose at `t_ns`, optimisation starting at `T_start` (4, 4); give the poses that leave the lag, oldest
+        first. The first pose has no odometry.
         """
         number, factors, values = self._next, gtsam.NonlinearFactorGraph(), gtsam.Values()
-        values.insert(number, gtsam.Pose3(T_map_vehicle))
+        values.insert(number, gtsam.Pose3(T_start))
         if odometry is not None:
-            drift = gtsam.noiseModel.Diagonal.Sigmas(self._odometry_sigmas(odometry))
-            factors.add(gtsam.BetweenFactorPose3(number - 1, number, gtsam.Pose3(odometry), drift))
+            drift = gtsam.noiseModel.Diagonal.Sigmas(odometry.sigmas)
+            factors.add(gtsam.BetweenFactorPose3(number - 1, number, gtsam.Pose3(odometry.T_before_now), drift))
         if match is not None:
-            noise = self._robust(gtsam.noiseModel.Gaussian.Covariance(match[1]))
-            factors.add(gtsam.PriorFactorPose3(number, gtsam.Pose3(match[0]), noise))
+            noise = self._robust(gtsam.noiseModel.Gaussian.Covariance(match.covariance))
+            factors.add(gtsam.PriorFactorPose3(number, gtsam.Pose3(match.T_map_vehicle), noise))
         if gnss is not None:
-            factors.add(gtsam.GPSFactor(number, gnss[0], self._gnss_noise(gnss[1])))
+            factors.add(gtsam.GPSFactor(number, gnss.p_map_m, self._gnss_noise(gnss.sigma_m)))
         final = self._leaving(t_ns)
         if number == 0:
             self._first_ns = t_ns
@@ -102,11 +113,6 @@ class PoseGraph:
         for number in numbers:
             del self._t_ns[number]
         return poses
-
-    def _odometry_sigmas(self, odometry: F64) -> F64:
-        par = self.parameters
-        along = par.longitudinal_m + par.distance_share * float(np.linalg.norm(odometry[:3, 3]))
-        return np.array([par.roll_pitch_rad, par.roll_pitch_rad, par.yaw_rad, along, par.lateral_m, par.vertical_m])
 
     def _gnss_noise(self, sigma_m: float) -> gtsam.noiseModel.Base:
         axes = np.array([1.0, 1.0, self.parameters.gnss_vertical])

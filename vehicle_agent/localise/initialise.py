@@ -185,7 +185,7 @@ def _refined(points_m: F64, poses: F64, m: MatchMap, par: RegistrationParameters
     results = []
     for T in poses:
         try:
-            results.append(register(points_m, T, m, par, capture=True))
+            results.append(register(points_m, T, m, par, "capture"))
         except RegistrationError:
             continue
     return results

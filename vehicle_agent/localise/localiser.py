@@ -11,14 +11,15 @@ from gnd_map.se3 import transform
 from schemas.drive import GnssFix, MotionSample, Scan
 from vehicle_agent.errors import RegistrationError
 from vehicle_agent.local_map import LocalMap
+from vehicle_agent.localise.calibration import MotionTeacher
 from vehicle_agent.localise.estimates import Health, PoseEstimate, RefinedScan
-from vehicle_agent.localise.graph import PoseGraph, SmoothedPose
+from vehicle_agent.localise.graph import MapMatch, Odometry, PoseGraph, Position, SmoothedPose
 from vehicle_agent.localise.health import HealthMonitor
 from vehicle_agent.localise.initialise import InitialPose, initialise
 from vehicle_agent.localise.match_map import MatchMapCache
-from vehicle_agent.localise.odometry import MotionBuffer, MotionTeacher
+from vehicle_agent.localise.odometry import MotionBuffer
 from vehicle_agent.localise.parameters import LocaliserParameters
-from vehicle_agent.localise.registration import RegistrationResult, register
+from vehicle_agent.localise.registration import RegistrationResult, Start, register
 from vehicle_agent.localise.sampling import sample_scan
 
 F64 = NDArray[np.float64]
@@ -63,7 +64,7 @@ class Localiser:
         self.dropped_scans = 0
         self.initialisations = 0
         self._motion = MotionBuffer()
-        self._teacher = MotionTeacher(self._motion)
+        self._teacher = MotionTeacher(self._motion, self.parameters.odometry)
         self._map = MatchMapCache(local_map, self.parameters.registration.noise_m)
         self._fix: GnssFix | None = None
         self._pending: Scan | None = None
@@ -127,25 +128,45 @@ class Localiser:
     def _step(self, track: _Track, scan: Scan, points: F64) -> None:
         """Predict from the newest pose, match, gate, fuse."""
         t_ns, newest = _reference_ns(scan), track.graph.newest
-        odometry = self._motion.delta(track.held[newest].t_ns, t_ns)
-        predicted = track.graph.pose(newest) @ odometry
-        result = self._match(points, predicted)
-        believed = track.monitor.believe(result, predicted, t_ns)
-        match = (result.T_map_vehicle, result.covariance) if result is not None and believed else None
-        gnss = self._gnss_at(track, t_ns, predicted)
-        final = track.graph.add(t_ns, predicted, odometry, match, gnss)
+        odometry = self._odometry(track.held[newest].t_ns, t_ns)
+        predicted = track.graph.pose(newest) @ odometry.T_before_now
+        result, believed = self._matched(track.monitor, points, predicted, odometry.sigmas, t_ns)
+        match = None
+        if result is not None and believed:
+            match = MapMatch(result.T_map_vehicle, result.covariance)
+            if result.fit >= self.parameters.odometry.teaching_fit:
+                self._teacher.learn(t_ns, result.T_map_vehicle, result.covariance)
+        final = track.graph.add(t_ns, predicted, odometry, match, self._gnss_at(track, t_ns, predicted))
         self._hold(track, scan, result.matching_ratio if result is not None else 0.0)
         self._finalise(track, final)
         if track.monitor.health(t_ns) == "lost":
             self._lose(track)
 
-    def _match(self, points: F64, predicted: F64) -> RegistrationResult | None:
+    def _odometry(self, first_ns: int, last_ns: int) -> Odometry:
+        delta = self._motion.delta(first_ns, last_ns)
+        return Odometry(delta, self._teacher.sigmas(delta, (last_ns - first_ns) * 1e-9))
+
+    def _matched(
+        self, monitor: HealthMonitor, points: F64, predicted: F64, sigmas: F64, t_ns: int
+    ) -> tuple[RegistrationResult | None, bool]:
+        """The match, and whether to believe it: near the prediction if that will do, else a wider one."""
+        near = self._match(points, predicted, "near")
+        if not monitor.doubtful(near):
+            monitor.see_wider(near, None)
+            return near, monitor.believe(near, predicted, sigmas, t_ns)
+        wide = self._match(points, predicted, "wide")
+        monitor.see_wider(near, wide)
+        if monitor.believe(near, predicted, sigmas, t_ns):
+            return near, True
+        return wide, monitor.believe(wide, predicted, sigmas, t_ns)
+
+    def _match(self, points: F64, predicted: F64, start: Start) -> RegistrationResult | None:
         try:
-            return register(points, predicted, self._map.near(predicted[:3, 3]), self.parameters.registration)
+            return register(points, predicted, self._map.near(predicted[:3, 3]), self.parameters.registration, start)
         except RegistrationError:
             return None
 
-    def _gnss_at(self, track: _Track, t_ns: int, T_map_vehicle: F64) -> tuple[F64, float] | None:
+    def _gnss_at(self, track: _Track, t_ns: int, T_map_vehicle: F64) -> Position | None:
         """A new fix as position of the vehicle at `t_ns`; the monitor is told how far off it is."""
         fix, self._fix = self._fix, None
         if fix is None or abs(t_ns - fix.t_ns) > MAX_GNSS_AGE_NS:
@@ -153,7 +174,7 @@ class Localiser:
         at_fix = T_map_vehicle @ self._motion.delta(t_ns, fix.t_ns)
         offset = self._p_map(fix) - at_fix[:3, 3]
         track.monitor.see_fix(float(np.hypot(offset[0], offset[1])), fix.sigma_m)
-        return T_map_vehicle[:3, 3] + offset, fix.sigma_m
+        return Position(T_map_vehicle[:3, 3] + offset, fix.sigma_m)
 
     def _p_map(self, fix: GnssFix) -> F64:
         frame = self.local_map.grid_frame.frame
@@ -178,8 +199,10 @@ class Localiser:
             return
         par, result = self.parameters, found.registration
         self.initialisations += 1
-        self._track = _Track(PoseGraph(par.graph), HealthMonitor(par.health, t_ns), {})
-        self._track.graph.add(t_ns, result.T_map_vehicle, None, (result.T_map_vehicle, result.covariance), None)
+        monitor = HealthMonitor(par.health, t_ns)
+        monitor.believe(result, result.T_map_vehicle, np.zeros(6), t_ns)
+        self._track = _Track(PoseGraph(par.graph), monitor, {})
+        self._track.graph.add(t_ns, result.T_map_vehicle, None, MapMatch(result.T_map_vehicle, result.covariance), None)
         self._hold(self._track, scan, result.matching_ratio)
 
     def _search(self, t_ns: int, points: F64) -> InitialPose | None:
@@ -209,8 +232,6 @@ class Localiser:
         for pose in poses:
             held = track.held.pop(pose.number)
             self._ready.append(self._refined(held, pose))
-            if held.health == "good":
-                self._teacher.learn(pose)
 
     def _refined(self, held: _HeldScan, pose: SmoothedPose) -> RefinedScan:
         scan = held.scan

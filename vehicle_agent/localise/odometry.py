@@ -1,4 +1,4 @@
-"""Dead reckoning from wheel speed and yaw rate, and the two constants of the sensors that the map can teach."""
+"""Dead reckoning from wheel speed and yaw rate."""
 
 from bisect import bisect_left
 
@@ -7,17 +7,10 @@ from numpy.typing import NDArray
 
 from gnd_map.motion import Trajectory
 from gnd_map.se3 import T_inverse
-from vehicle_agent.localise.graph import SmoothedPose
 
 F64 = NDArray[np.float64]
 
 KEEP_NS = 20_000_000_000  # more than any lag
-STRETCH_S = 1.0
-STRETCH_SIGMA_M, STRETCH_SIGMA_RAD = 0.03, 1e-3  # of the motion over a stretch that two final poses tell
-SCALE_PRIOR = 0.01  # one sigma of a wheel's scale error before anything is learnt
-BIAS_PRIOR_RADPS = 0.005
-SCALE_DRIFT = 1e-4  # a root second
-BIAS_DRIFT_RADPS = 1e-5
 
 
 class MotionBuffer:
@@ -29,6 +22,8 @@ class MotionBuffer:
         self._yaw_rate_radps: list[float] = []
         self.speed_scale = 1.0
         self.yaw_bias_radps = 0.0
+        self.course = np.zeros(2)
+        """Sideways and upward motion per metre forward: how the vehicle's axes, as mounted, lie to its course."""
 
     def __len__(self) -> int:
         return len(self._t_ns)
@@ -69,13 +64,15 @@ class MotionBuffer:
         yaw = np.concatenate([[0.0], np.cumsum(dyaw)])
         chord = ds * np.sinc(dyaw / (2 * np.pi))  # a chord of the arc
         middle = yaw[:-1] + 0.5 * dyaw
+        cos, sin = np.cos(middle), np.sin(middle)
         T = np.zeros((len(t), 4, 4))
         T[:, 0, 0] = T[:, 1, 1] = np.cos(yaw)
         T[:, 1, 0] = np.sin(yaw)
         T[:, 0, 1] = -T[:, 1, 0]
         T[:, 2, 2] = T[:, 3, 3] = 1.0
-        T[1:, 0, 3] = np.cumsum(chord * np.cos(middle))
-        T[1:, 1, 3] = np.cumsum(chord * np.sin(middle))
+        T[1:, 0, 3] = np.cumsum(chord * (cos - self.course[0] * sin))
+        T[1:, 1, 3] = np.cumsum(chord * (sin + self.course[0] * cos))
+        T[1:, 2, 3] = np.cumsum(ds * self.course[1])
         return Trajectory(t, T)
 
     def delta(self, first_ns: int, last_ns: int) -> F64:
@@ -98,49 +95,3 @@ class MotionBuffer:
         speed = np.interp(at, x, self._speed_mps[low:high])
         yaw_rate = np.interp(at, x, self._yaw_rate_radps[low:high])
         return t, speed * self.speed_scale, yaw_rate - self.yaw_bias_radps
-
-
-class MotionTeacher:
-    """Learns wheel scale and gyro bias of a `MotionBuffer` from final poses: two scalar Kalman filters."""
-
-    def __init__(self, motion: MotionBuffer) -> None:
-        self._motion = motion
-        self._scale_var = SCALE_PRIOR**2
-        self._bias_var = BIAS_PRIOR_RADPS**2
-        self._anchor: SmoothedPose | None = None
-
-    def forget(self) -> None:
-        """The poses to come do not continue those before."""
-        self._anchor = None
-
-    def learn(self, pose: SmoothedPose) -> None:
-        """Take a final pose; after each `STRETCH_S` the motion since the last such pose is compared."""
-        anchor = self._anchor
-        if anchor is None or pose.t_ns - anchor.t_ns > 3e9 * STRETCH_S:
-            self._anchor = pose
-        elif pose.t_ns - anchor.t_ns >= STRETCH_S * 1e9:
-            self._compare(anchor, pose)
-            self._anchor = pose
-
-    def _compare(self, first: SmoothedPose, last: SmoothedPose) -> None:
-        dt_s = (last.t_ns - first.t_ns) * 1e-9
-        self._scale_var += SCALE_DRIFT**2 * dt_s
-        self._bias_var += BIAS_DRIFT_RADPS**2 * dt_s
-        seen = T_inverse(first.T_map_vehicle) @ last.T_map_vehicle
-        driven = self._motion.delta(first.t_ns, last.t_ns)
-        self._learn_scale(driven[0, 3] / self._motion.speed_scale, seen[0, 3])
-        self._learn_bias(_yaw(driven) + self._motion.yaw_bias_radps * dt_s, _yaw(seen), dt_s)
-
-    def _learn_scale(self, wheel_m: float, map_m: float) -> None:
-        gain = self._scale_var * wheel_m / (wheel_m**2 * self._scale_var + STRETCH_SIGMA_M**2)
-        self._motion.speed_scale += gain * (map_m - self._motion.speed_scale * wheel_m)
-        self._scale_var *= 1.0 - gain * wheel_m
-
-    def _learn_bias(self, gyro_rad: float, map_rad: float, dt_s: float) -> None:
-        gain = self._bias_var * dt_s / (dt_s**2 * self._bias_var + STRETCH_SIGMA_RAD**2)
-        self._motion.yaw_bias_radps += gain * (gyro_rad - map_rad - self._motion.yaw_bias_radps * dt_s)
-        self._bias_var *= 1.0 - gain * dt_s
-
-
-def _yaw(T: F64) -> float:
-    return float(np.arctan2(T[1, 0], T[0, 0]))

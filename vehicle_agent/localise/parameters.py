@@ -22,17 +22,19 @@ class RegistrationParameters:
     """Scan-to-map matching.
 
     noise_m: one sigma of range noise, distortion left in the sweep and voxel rounding together.
-    scales: Geman-McClure scales in sigmas, one a stage, wide to narrow; a point farther than `gate_per_scale` of them
-        from every Gaussian is no match.
-    capture_scales: the stages when the start is only known to about 2 m and 5 degrees.
+    scales: Geman-McClure scales in sigmas, one a stage, wide to narrow, when the start is known to some 10 cm: where
+        the world has changed, a narrow kernel stays with what has not.
+    wide_scales: the stages when the start is known to 1 m and 3 degrees; capture_scales: to 2 m and 5 degrees.
+    gate_per_scale: a point farther than this many scales from every Gaussian is no match.
     correlation: how many points share one error (of the map, of the mount); multiplies the covariance.
     floor_m, floor_rad: the least sigma claimed along an axis, whatever the Hessian says.
     degenerate_m: a direction whose sigma exceeds this (turns taken at 10 m) is reported and not moved along.
     """
 
     noise_m: float = 0.04
-    scales: tuple[float, ...] = (8.0, 3.0)
-    capture_scales: tuple[float, ...] = (30.0, 10.0, 3.0)
+    scales: tuple[float, ...] = (4.0, 2.0)
+    wide_scales: tuple[float, ...] = (8.0, 4.0, 2.0)
+    capture_scales: tuple[float, ...] = (30.0, 10.0, 4.0, 2.0)
     gate_per_scale: float = 2.5
     max_iterations: int = 15
     stop_m: float = 5e-4
@@ -44,7 +46,8 @@ class RegistrationParameters:
     degenerate_m: float = 0.2
 
     def __post_init__(self) -> None:
-        if not (self.scales and self.capture_scales) or min(*self.scales, *self.capture_scales, self.noise_m) <= 0:
+        stages = (*self.scales, *self.wide_scales, *self.capture_scales)
+        if not (self.scales and self.wide_scales and self.capture_scales) or min(*stages, self.noise_m) <= 0:
             raise ValueError(f"noise_m and at least one scale, all positive, are required, got {self}")
         if self.min_matched < 6 or self.max_iterations < 1:
             raise ValueError(f"min_matched >= 6 and max_iterations >= 1 are required, got {self}")
@@ -79,27 +82,59 @@ class InitialiseParameters:
 
 
 @dataclass(frozen=True, slots=True)
-class GraphParameters:
-    """The fixed-lag pose graph: noise of its factors, one sigma.
+class OdometryParameters:
+    """How far to trust wheel speed and yaw rate, one sigma each.
 
-    Odometry a step: a share of the distance plus a constant. `gnss_inflation`: GNSS errors last for tens of seconds, so
-    a fix counts for less than its sigma says. `robust_k`: Cauchy scale of map matches and GNSS, in sigmas.
+    longitudinal_m, lateral_m, vertical_m, distance_share, roll_pitch_rad, yaw_rad: of a step between two scans, the
+        share being of its length, once scale, bias and course are learnt.
+    scale_prior, bias_prior_radps, course_prior: of the wheel scale, of the gyro's bias, and of the motion sideways and
+        upwards per metre forward (the LiDAR's mount is not aligned with the wheels) before anything is learnt.
+    scale_drift, bias_drift_radps: their change in a root second.
+    stretch_m, stretch_rad: of the motion over a second that two map matches tell.
+    teaching_fit: least fit of a match that teaches: where much has changed, matches are off together.
+    excess_gain: weight of the newest step in the running judgement of how much worse than all this the odometry is.
+    """
+
+    longitudinal_m: float = 0.003
+    lateral_m: float = 0.003
+    vertical_m: float = 0.01
+    distance_share: float = 0.007
+    roll_pitch_rad: float = 3e-3
+    yaw_rad: float = 6e-4
+    scale_prior: float = 0.02
+    bias_prior_radps: float = 0.005
+    course_prior: float = 0.02
+    scale_drift: float = 1e-4
+    bias_drift_radps: float = 1e-5
+    stretch_m: float = 0.03
+    stretch_rad: float = 2e-3
+    teaching_fit: float = 0.75
+    excess_gain: float = 0.2
+
+    def __post_init__(self) -> None:
+        steps = (self.longitudinal_m, self.lateral_m, self.vertical_m, self.roll_pitch_rad, self.yaw_rad)
+        if min(*steps, self.stretch_m, self.stretch_rad) <= 0 or self.distance_share < 0:
+            raise ValueError(f"sigmas must be positive and distance_share not negative, got {self}")
+
+
+@dataclass(frozen=True, slots=True)
+class GraphParameters:
+    """The fixed-lag pose graph.
+
+    lag_s: a pose is final when it is this old.
+    gnss_inflation: GNSS errors last for tens of seconds, so a fix counts for less than its sigma says; gnss_vertical:
+        its vertical sigma in horizontal ones.
+    robust_k: Cauchy scale of map matches and GNSS, in sigmas.
     """
 
     lag_s: float = 3.0
-    distance_share: float = 0.01
-    longitudinal_m: float = 0.01
-    lateral_m: float = 0.01
-    vertical_m: float = 0.02
-    roll_pitch_rad: float = 3e-3
-    yaw_rad: float = 6e-4
     gnss_inflation: float = 5.0
     gnss_vertical: float = 2.0
     robust_k: float = 2.0
 
     def __post_init__(self) -> None:
-        if self.lag_s <= 0 or self.distance_share < 0 or self.gnss_inflation < 1:
-            raise ValueError(f"lag_s > 0, distance_share >= 0 and gnss_inflation >= 1 are required, got {self}")
+        if self.lag_s <= 0 or self.gnss_inflation < 1 or min(self.gnss_vertical, self.robust_k) <= 0:
+            raise ValueError(f"positive values and gnss_inflation >= 1 are required, got {self}")
 
 
 @dataclass(frozen=True, slots=True)
@@ -107,8 +142,11 @@ class HealthParameters:
     """When a match is believed, and when the pose is called degraded or lost.
 
     min_matching_ratio: least share of the points with a Gaussian nearby.
+    trusted_fit: a pose is degraded until one match has had this fit: where much has changed, a wrong pose can fit best.
+    better_fit, better_count: this many scans in a row that fit better by so much at a pose farther off mean that the
+        pose is wrong.
     gate_m, gate_m_per_s, gate_deg, gate_deg_per_s: how far a match may lie from the prediction, at once and for every
-        second without a believed match.
+        second without a believed match; three sigmas of the odometry come on top.
     degraded_after_s, lost_after_s: time without a believed match.
     gnss_sigmas, gnss_count: this many fixes in a row farther than this from the pose mean that the pose is wrong,
         however well the scan seems to fit.
@@ -116,10 +154,13 @@ class HealthParameters:
     """
 
     min_matching_ratio: float = 0.5
-    gate_m: float = 0.3
-    gate_m_per_s: float = 0.5
-    gate_deg: float = 1.0
-    gate_deg_per_s: float = 1.0
+    trusted_fit: float = 0.65
+    better_fit: float = 0.1
+    better_count: int = 5
+    gate_m: float = 0.15
+    gate_m_per_s: float = 0.3
+    gate_deg: float = 0.4
+    gate_deg_per_s: float = 0.5
     degraded_after_s: float = 0.6
     lost_after_s: float = 4.0
     gnss_sigmas: float = 5.0
@@ -140,5 +181,6 @@ class LocaliserParameters:
     sampling: SamplingParameters = field(default_factory=SamplingParameters)
     registration: RegistrationParameters = field(default_factory=RegistrationParameters)
     initialise: InitialiseParameters = field(default_factory=InitialiseParameters)
+    odometry: OdometryParameters = field(default_factory=OdometryParameters)
     graph: GraphParameters = field(default_factory=GraphParameters)
     health: HealthParameters = field(default_factory=HealthParameters)

@@ -1,6 +1,7 @@
 """Point-to-Gaussian registration of a scan on the dense voxel grid: annealed robust Gauss-Newton (DESIGN 8)."""
 
 from dataclasses import dataclass
+from typing import Literal
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -12,6 +13,8 @@ from vehicle_agent.localise.match_map import MatchMap
 from vehicle_agent.localise.parameters import RegistrationParameters
 
 F64 = NDArray[np.float64]
+
+Start = Literal["near", "wide", "capture"]
 
 LEVER_M = 10.0  # a turn moves the points that constrain it by about this times its angle
 
@@ -64,17 +67,16 @@ def register(
     T_map_vehicle: ArrayLike,
     match_map: MatchMap,
     parameters: RegistrationParameters | None = None,
-    *,
-    capture: bool = False,
+    start: Start = "near",
 ) -> RegistrationResult:
     """Move the scan onto the map.
 
     Args:
         points_m: (N, 3) float64 points in the vehicle frame, sweep motion removed.
-        T_map_vehicle: (4, 4) where to start: within about 1 m and 3°, with `capture` 2 m and 5°.
+        T_map_vehicle: (4, 4) where to start.
         match_map: the map window.
         parameters: defaults if None.
-        capture: use the wider stages.
+        start: how far off that may be: "near" some 10 cm, "wide" 1 m and 3°, "capture" 2 m and 5°.
 
     Raises:
         RegistrationError: fewer than `min_matched` points have a Gaussian nearby.
@@ -83,7 +85,7 @@ def register(
     T = np.array(T_map_vehicle, dtype=np.float64)
     state = _State(T[:3, :3].copy(), T[:3, 3].copy(), np.zeros((6, 6)), np.zeros(6))
     points = np.ascontiguousarray(points_m, dtype=np.float64)
-    scales = par.capture_scales if capture else par.scales
+    scales = {"near": par.scales, "wide": par.wide_scales, "capture": par.capture_scales}[start]
     iterations, converged = 0, False
     for stage, scale in enumerate(scales):
         coarse = 1.0 if stage == len(scales) - 1 else 10.0
