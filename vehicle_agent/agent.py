@@ -1,6 +1,5 @@
 """The vehicle's half of the loop on one page (GND, Figure 1): drive, download, localise, detect, report, upload."""
 
-import logging
 import threading
 from typing import Any
 
@@ -12,15 +11,13 @@ from vehicle_agent.vehicle import open_vehicle
 
 __all__ = ["AgentConfig", "run_agent"]
 
-_log = logging.getLogger(__name__)
-
 
 def run_agent(config: AgentConfig, stop: threading.Event) -> dict[str, Any]:
     """Drive one recording to its end, upload what has changed, and wait for the acknowledgements.
 
     An agent that was killed is simply started again: its recording begins anew, its cache and outbox are kept, and
     reports that were acknowledged are not sent again. `stop` ends the drive early and in order; what is in the outbox
-    then goes with the next start.
+    then goes with the next start. A recording that is damaged on the way is reported as far as it goes, then raised.
 
     Returns:
         The content of `work_dir/result.json`.
@@ -42,5 +39,6 @@ def run_agent(config: AgentConfig, stop: threading.Event) -> dict[str, Any]:
         vehicle.upload()  # outbox -> acknowledged
         result = vehicle.result()
     write_json(config.work_dir / "result.json", result)
-    _log.info("%s: %s reports acknowledged", config.vehicle, result["reports_acknowledged"])
+    if vehicle.damage is not None:
+        raise vehicle.damage
     return result

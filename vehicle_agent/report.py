@@ -8,6 +8,7 @@ from importlib.metadata import version
 
 import numpy as np
 
+from gnd_map.arrays import F64
 from gnd_map.classes import ChangeClass
 from gnd_map.tile_id import District, TileId
 from schemas.changes import ChangeReport, TileChange
@@ -19,6 +20,8 @@ from vehicle_agent.detect.detector import ChangeDetector
 from vehicle_agent.localise.estimates import PoseEstimate, RefinedScan
 from vehicle_agent.outbox import Outbox
 from vehicle_agent.surroundings import left_behind
+
+STEP_M = 3.0  # tiles left behind are looked for after this much way
 
 _log = logging.getLogger(__name__)
 
@@ -73,6 +76,7 @@ class Reporter:
         self._pending: dict[District, _Pending] = {}
         self._numbers: Counter[District] = Counter()
         self._stretch: _Stretch | None = None
+        self._looked_at: F64 | None = None
 
     def add_scan(self, scan: RefinedScan) -> None:
         """Count the scan's rays, if its pose is good enough to speak about the world."""
@@ -87,6 +91,9 @@ class Reporter:
     def leave_behind(self, estimate: PoseEstimate, odometer_m: float) -> None:
         """Decide the tiles that the refined pose has left, report the districts that have none left to decide."""
         frame, p_map = self._detector.local_map.grid_frame.frame, estimate.T_map_vehicle[:3, 3]
+        if self._looked_at is not None and np.linalg.norm(p_map - self._looked_at) < STEP_M:
+            return
+        self._looked_at = p_map.copy()
         touched = self._detector.touched_tiles()
         left = left_behind(frame, touched, p_map, self._parameters.left_behind_m)
         self._decide(left, odometer_m)

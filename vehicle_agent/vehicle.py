@@ -13,6 +13,7 @@ from gnd_map.grid import GridFrame
 from gnd_map.tile_id import TileId
 from schemas.drive import DriveHeader, DriveItem, GnssFix, MotionSample, ReferencePose, Scan
 from schemas.drive_mcap import read_drive, read_header
+from schemas.errors import SchemaError
 from schemas.traffic import TrafficLine, TrafficSample
 from vehicle_agent.config import AgentConfig
 from vehicle_agent.detect.detector import ChangeDetector
@@ -51,19 +52,33 @@ class Vehicle:
     timeline: HealthTimeline = field(default_factory=HealthTimeline)
     started_s: float = field(default_factory=time.monotonic)
     scans: int = 0
+    damage: SchemaError | None = None
 
     def drive(self) -> Iterator[DriveItem]:
-        """The recording in time order, at the pace asked for, without what cannot be used, until its end or `stop`."""
-        for item in self.guard.usable(paced(read_drive(self.config.drive), self.config.pace, self.stop)):
-            if self.stop.is_set():
-                return
-            if isinstance(item, ReferencePose):
-                self.evaluation.take_reference(item)  # for the account of errors only
-                continue
-            yield item
-            self.place.take(item, self.localiser.online)
-            self.timeline.note(item.t_ns, self.place.health)
-            self.link.ledger.set_position(self.place.odometer_m, item.t_ns)
+        """The recording in time order, at the pace asked for, without what cannot be used, until its end or `stop`.
+
+        A recording that turns out to be damaged on the way ends there: what was seen until then is still reported, and
+        `damage` says why.
+        """
+        items = paced(read_drive(self.config.drive), self.config.pace, self.stop)
+        try:
+            for item in self.guard.usable(items):
+                if self.stop.is_set():
+                    return
+                if isinstance(item, ReferencePose):
+                    self.evaluation.take_reference(item)  # for the account of errors only
+                    continue
+                yield item
+                self._note(item)
+        except SchemaError as damage:
+            self.damage = damage
+            _log.error("%s: the drive ends at %d ns: %s", self.config.vehicle, self.place.t_ns, damage)
+
+    def _note(self, item: DriveItem) -> None:
+        """Keep the books on place, health and way after an item was worked on."""
+        self.place.take(item, self.localiser.online)
+        self.timeline.note(item.t_ns, self.place.health)
+        self.link.ledger.set_position(self.place.odometer_m, item.t_ns)
 
     def download(self) -> None:
         """Apply what others changed, and hold the tiles around and ahead."""
@@ -126,7 +141,7 @@ class Vehicle:
             "vehicle": self.config.vehicle,
             "drive_id": self.header.drive_id,
             "sensor_model": self.header.sensor_model,
-            "finished": not self.stop.is_set(),
+            "finished": not self.stop.is_set() and self.damage is None,
             "wall_s": round(time.monotonic() - self.started_s, 3),
             "distance_km": round(self.place.odometer_m / 1000, 5),
             **self._scan_counts(),

@@ -163,6 +163,23 @@ def test_bad_scans_are_counted_and_the_drive_goes_on(cloud_of: Cloud, config: Ag
     assert result["reports_pending"] == 0
 
 
+@pytest.mark.slow
+def test_a_recording_damaged_on_the_way_is_reported_as_far_as_it_goes(
+    cloud_of: Cloud, config: AgentConfig, tmp_path: Path
+) -> None:
+    content = bytearray(config.drive.read_bytes())
+    middle = int(0.8 * len(content))
+    content[middle : middle + 64] = bytes(64)
+    damaged = tmp_path / "damaged.mcap"
+    damaged.write_bytes(content)
+    with pytest.raises(DriveError):
+        run_agent(replace(config, drive=damaged), NEVER)
+    result = json.loads((config.work_dir / "result.json").read_text())
+    assert not result["finished"]
+    assert 20 < result["scans"] < 55
+    assert result["reports_acknowledged"] == len(cloud_of.reports()) >= 1
+
+
 def test_a_stopped_agent_ends_at_once_in_order(cloud_of: Cloud, config: AgentConfig) -> None:
     stop = threading.Event()
     stop.set()
