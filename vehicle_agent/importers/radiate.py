@@ -19,7 +19,8 @@ from vehicle_agent.importers.recording import GNSS_SIGMA_M, Anchor, Recording, c
 F64 = NDArray[np.float64]
 I64 = NDArray[np.int64]
 
-LIDAR_YAW_DEG = -90.0  # x right, y forward
+LIDAR_YAW_DEG = -90.97  # x right, y forward; the rest is its mean course in fog_6_0 against its axes
+LIDAR_PITCH_DEG = 1.35  # the same, vertically
 LIDAR_HEIGHT_M = 2.1  # the road lies this far below the sensor
 OWN_VEHICLE_M = 2.6  # returns nearer than this come from the vehicle itself
 PERIOD_NS = 100_085_000  # between the scans whose times are listed
@@ -44,7 +45,7 @@ def open_radiate(folder: Path, anchor: Anchor | None) -> Recording:
         name=folder.name,
         sensor_model="HDL-32E",
         source="RADIATE (Sheeny et al.), CC BY-NC-SA 4.0; GPS clock shifted by 65.7 s, track by LiDAR odometry",
-        T_vehicle_lidar=mount(LIDAR_YAW_DEG, LIDAR_HEIGHT_M),
+        T_vehicle_lidar=mount(LIDAR_YAW_DEG, LIDAR_HEIGHT_M, LIDAR_PITCH_DEG),
         t_ns=t_ns,
         read=lambda i: _scan(files[i], int(t_ns[i])),
         anchor=anchor or Anchor(*map(float, gps[0, :3])),

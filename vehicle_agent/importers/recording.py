@@ -80,9 +80,9 @@ def check_folder(folder: Path) -> None:
         raise ImportDriveError(f"{folder}: is a file; give the folder of the recording")
 
 
-def mount(yaw_deg: float, height_m: float) -> F64:
-    """(4, 4) T_vehicle_lidar of a LiDAR `height_m` above the ground, turned by `yaw_deg` about the vertical."""
+def mount(yaw_deg: float, height_m: float, pitch_deg: float = 0.0) -> F64:
+    """(4, 4) T_vehicle_lidar of a LiDAR `height_m` above the ground, turned about the vertical, then nose down."""
     T = np.eye(4)
-    T[:3, :3] = exp_so3([0.0, 0.0, np.radians(yaw_deg)])
+    T[:3, :3] = exp_so3([0.0, np.radians(pitch_deg), 0.0]) @ exp_so3([0.0, 0.0, np.radians(yaw_deg)])
     T[2, 3] = height_m
     return T

@@ -42,7 +42,7 @@ class MotionTeacher:
         across = np.array([par.lateral_m, par.vertical_m]) + par.distance_share * way_m
         left, up = np.hypot(across, np.sqrt(self._course_var) * way_m)
         known = np.array([par.roll_pitch_rad, par.roll_pitch_rad, yaw, forward, left, up])
-        return np.hypot(known, np.sqrt(np.maximum(self._excess_var, 0.0)))
+        return np.asarray(np.hypot(known, np.sqrt(np.maximum(self._excess_var, 0.0))))
 
     def forget(self) -> None:
         """The poses to come do not continue those before."""
