@@ -7,8 +7,11 @@ so the heap is trimmed now and then.
 """
 
 import ctypes
+import os
 import sys
 from functools import cache
+
+import psutil
 
 _M_MMAP_THRESHOLD, _M_ARENA_MAX = -3, -8  # malloc.h
 MMAP_BYTES = 4 * 1024 * 1024
@@ -32,8 +35,30 @@ def keep_small() -> bool:
     return all(library.mallopt(name, value) == 1 for name, value in settings)
 
 
-def trim(scans: int) -> None:
-    """Give back what the heap does not use, once in `TRIM_EVERY` scans."""
+def trim() -> None:
+    """Give back to the system what the heap does not use."""
     library = _glibc()
-    if library is not None and scans % TRIM_EVERY == 0:
+    if library is not None:
         library.malloc_trim(0)
+
+
+class MemoryMeter:
+    """Trims the heap every two seconds of driving, and remembers the most memory that was in use just before."""
+
+    def __init__(self) -> None:
+        self.peak_pss_mb = 0.0
+        self._scans = 0
+
+    def count_scan(self) -> None:
+        """One more scan was worked on."""
+        self._scans += 1
+        if self._scans % TRIM_EVERY == 0:
+            self.read()
+            trim()
+
+    def read(self) -> dict[str, float]:
+        """Proportional (PSS), resident and private (USS) memory of this process now, the highest PSS so far; MB."""
+        info = psutil.Process(os.getpid()).memory_full_info()
+        now = {name: round(getattr(info, name, 0) / 1e6, 1) for name in ("pss", "rss", "uss")}
+        self.peak_pss_mb = max(self.peak_pss_mb, now["pss"])
+        return now | {"pss_peak": self.peak_pss_mb}

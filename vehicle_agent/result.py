@@ -4,13 +4,11 @@ The reference poses of a recording are read here, and nowhere else in the vehicl
 """
 
 import json
-import os
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-import psutil
 
 from gnd_map.arrays import F64
 from gnd_map.geodesy import LocalFrame
@@ -80,12 +78,6 @@ class HealthTimeline:
     def as_json(self) -> list[dict[str, Any]]:
         """One object a change."""
         return [{"t_ns": t_ns, "health": health} for t_ns, health in self.changes]
-
-
-def memory_mb() -> dict[str, float]:
-    """Proportional (PSS), resident and private (USS) memory of this process in MB (10^6 bytes)."""
-    info = psutil.Process(os.getpid()).memory_full_info()
-    return {name: round(getattr(info, name, 0) / 1e6, 1) for name in ("pss", "rss", "uss")}
 
 
 def write_json(path: Path, content: dict[str, Any]) -> None:

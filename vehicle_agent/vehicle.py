@@ -22,10 +22,10 @@ from vehicle_agent.link import Link, open_link
 from vehicle_agent.local_map import LocalMap
 from vehicle_agent.localise.estimates import RefinedScan
 from vehicle_agent.localise.localiser import Localiser
-from vehicle_agent.memory import trim
+from vehicle_agent.memory import MemoryMeter
 from vehicle_agent.place import Place
 from vehicle_agent.report import Identity, Reporter
-from vehicle_agent.result import Evaluation, HealthTimeline, memory_mb
+from vehicle_agent.result import Evaluation, HealthTimeline
 from vehicle_agent.scans import Guard
 from vehicle_agent.surroundings import Surroundings
 from vehicle_agent.telemetry import Telemetry
@@ -51,6 +51,7 @@ class Vehicle:
     guard: Guard = field(default_factory=Guard)
     timeline: HealthTimeline = field(default_factory=HealthTimeline)
     started_s: float = field(default_factory=time.monotonic)
+    memory: MemoryMeter = field(default_factory=MemoryMeter)
     scans: int = 0
     damage: SchemaError | None = None
 
@@ -94,7 +95,7 @@ class Vehicle:
             self.localiser.push_gnss(item)
         elif isinstance(item, Scan):
             self.scans += 1
-            trim(self.scans)
+            self.memory.count_scan()
             return self.localiser.push_scan(item)
         return []
 
@@ -148,7 +149,7 @@ class Vehicle:
             **self._link_counts(),
             "health": self.timeline.as_json(),
             "localisation": self.evaluation.errors(),
-            "memory_mb": memory_mb(),
+            "memory_mb": self.memory.read(),
         }
 
     def _scan_counts(self) -> dict[str, Any]:

@@ -24,7 +24,7 @@ PROGRAM = textwrap.dedent(
     windows = [np.ones(1_500_000) for _ in range(4)]
     del scan, windows
     if small:
-        trim(20)
+        trim()
     print(rss() - start - held)
     """
 )

@@ -85,10 +85,9 @@ def _decide_of_map(e: TileEvidence, p: DetectParameters) -> NDArray[np.int64]:
 
 def _decide_of_empty(e: TileEvidence, p: DetectParameters) -> NDArray[np.int64]:
     """Voxels in which the map has none: new or empty; weak hits and few passes abstain."""
+    new = e.measured.cells >= p.new_cells
     empty = (e.measured.cells < p.weak_cells) & (e.n_pe >= p.min_passes)
-    return np.select(
-        [e.measured.cells >= p.min_cells, empty], [ChangeClass.NEW, ChangeClass.EMPTY], ChangeClass.UNMEASURED
-    )
+    return np.select([new, empty], [ChangeClass.NEW, ChangeClass.EMPTY], ChangeClass.UNMEASURED)
 
 
 def _similar_to_map(e: TileEvidence) -> NDArray[np.float64]:

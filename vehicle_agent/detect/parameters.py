@@ -49,6 +49,8 @@ class DetectParameters:
     """Farther hits are not used; their rays still pass what lies within the range."""
     min_cells: int = 20
     """Occupied 10 cm sub-cells that make a Gaussian, the same rule as the map's."""
+    new_cells: int = 20
+    """The same where the map has none. More would spare voxels in which map and drive differ by a hair."""
     weak_cells: int = 5
     """From here to `min_cells` a voxel has hits, but too few for a Gaussian: it abstains."""
     min_passes: int = 3
@@ -70,6 +72,7 @@ class DetectParameters:
         _check("range_max_m", self.range_max_m, self.range_min_m, 500.0, open_ends=True)
         _check("similar", self.similar, 0.0, 1.0)
         _check("weak_cells", self.weak_cells, 1, self.min_cells)
+        _check("new_cells", self.new_cells, self.min_cells, 1000)
 
     @classmethod
     def paper(cls) -> "DetectParameters":
