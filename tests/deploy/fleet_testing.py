@@ -16,8 +16,8 @@ RUN_TIMEOUT_S = 240
 class Run:
     """A `gnd fleet` in a process of its own."""
 
-    def __init__(self, folder: Path, *arguments: str) -> None:
-        self.folder = folder
+    def __init__(self, folder: Path, *arguments: str, timeout_s: float = RUN_TIMEOUT_S) -> None:
+        self.folder, self.timeout_s = folder, timeout_s
         self.process = subprocess.Popen(
             [sys.executable, "-m", "deploy.cli", "fleet", "--out", str(folder), *arguments],
             stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
@@ -34,15 +34,15 @@ class Run:
         return pid
 
     def wait_for(self, condition: Callable[[], bool], what: str) -> None:
-        deadline_s = time.monotonic() + RUN_TIMEOUT_S
+        deadline_s = time.monotonic() + self.timeout_s
         while not condition():
             assert self.process.poll() is None, f"the run ended before {what}:\n{self.logs()}"
-            assert time.monotonic() < deadline_s, f"not within {RUN_TIMEOUT_S} s: {what}\n{self.logs()}"
+            assert time.monotonic() < deadline_s, f"not within {self.timeout_s} s: {what}\n{self.logs()}"
             time.sleep(0.05)  # between two looks; the deadline above bounds the wait
 
     def finish(self) -> dict[str, Any]:
         """Wait for the end and return the summary."""
-        out, err = self.process.communicate(timeout=RUN_TIMEOUT_S)
+        out, err = self.process.communicate(timeout=self.timeout_s)
         assert self.process.returncode == 0, f"{out}\n{err}\n{self.logs()}"
         summary: dict[str, Any] = json.loads((self.folder / "summary.json").read_text())
         return summary

@@ -1,0 +1,39 @@
+"""The main job as a newcomer runs it, in small: a simulated street that has changed is healed by a fleet."""
+
+from pathlib import Path
+
+import pytest
+from fleet_testing import Run
+
+from fleet_sim.truth import LEVELS
+
+pytestmark = [pytest.mark.slow, pytest.mark.timeout(600)]
+
+SEED = 301  # never used for tuning
+
+
+def test_a_simulated_fleet_heals_its_map(tmp_path: Path) -> None:
+    run = Run(tmp_path / "run", "--agents", "4", "--link", "3g", "--world-seed", str(SEED), timeout_s=500)
+    summary = run.finish()
+
+    assert summary["agents"] == 4
+    assert summary["reports_lost"] == 0
+    assert summary["updates_received"] >= summary["tiles_published"] > 0
+    assert summary["restarts"] == {}
+
+    f1 = summary["f1"]
+    assert f1["before"] < f1["single"] < f1["after"]
+    assert f1["after"] >= 90.0
+    assert set(f1["levels"]) == set(LEVELS)
+    assert len(f1["single_by_vehicle"]) == 4
+
+    p95 = summary["localisation_p95"]
+    assert p95["longitudinal_m"] <= 0.05
+    assert p95["lateral_m"] <= 0.05
+    assert p95["heading_deg"] <= 0.1
+    assert summary["agent_pss_mb_max"] <= 150.0
+
+    for name in ("map_before.png", "map_after.png", "truth.png", "healing.png", "store.sqlite", "updates.jsonl"):
+        assert (tmp_path / "run" / name).stat().st_size > 0
+    assert len(list((tmp_path / "run" / "ledger").glob("*.jsonl"))) == 4
+    assert not (tmp_path / "run" / "world" / "drives").exists()
