@@ -67,7 +67,7 @@ def _counts(
         "tiles_published": outcome.published,
         "updates_received": count_lines(folder.updates),
         "changed_voxels": sum(history.changed_voxels() for history in histories),
-        "agent_pss_mb_max": max((result["memory_mb"]["pss"] for result in results.results), default=None),
+        "agent_pss_mb_max": max((result["memory_mb"]["pss_peak"] for result in results.results), default=None),
         "restarts": outcome.restarts,
     }
 

@@ -65,4 +65,4 @@ def _localised(local_map: LocalMap, points_map_m: F64, frame: LocalFrame) -> lis
         for k in range(_SWEEP_NS // _STEP_NS):
             localiser.push_motion(MotionSample(number * _SWEEP_NS + k * _STEP_NS, 0.0, 0.0))
         refined += localiser.push_scan(Scan(number * _SWEEP_NS, seen, offset_ns))
-    return refined + localiser.flush()
+    return [*refined, *localiser.flush()]

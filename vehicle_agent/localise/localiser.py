@@ -1,6 +1,7 @@
 """The localiser: predict, deskew, match, gate, fuse; poses are final when the lag has passed (GND, 3 (ii))."""
 
 from collections import deque
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
@@ -68,7 +69,7 @@ class Localiser:
         self._map = MatchMapCache(local_map, self.parameters.registration.noise_m)
         self._fix: GnssFix | None = None
         self._pending: Scan | None = None
-        self._ready: deque[RefinedScan] = deque()
+        self._ready: deque[tuple[_HeldScan, SmoothedPose]] = deque()
         self._searched_ns = -(2**62)
         self._track: _Track | None = None
 
@@ -88,10 +89,10 @@ class Localiser:
         self._process()
         self._pending = scan
         self._process_if_covered()
-        return self._take_ready()
+        return list(self._take_ready())
 
-    def flush(self) -> list[RefinedScan]:
-        """Finish: give all scans that are still held, with their poses as they stand."""
+    def flush(self) -> Iterator[RefinedScan]:
+        """Finish: give the scans that are still held, with their poses as they stand, one by one (they are large)."""
         self._process()
         track, self._track = self._track, None
         if track is not None:
@@ -230,8 +231,7 @@ class Localiser:
 
     def _finalise(self, track: _Track, poses: list[SmoothedPose]) -> None:
         for pose in poses:
-            held = track.held.pop(pose.number)
-            self._ready.append(self._refined(held, pose))
+            self._ready.append((track.held.pop(pose.number), pose))
 
     def _refined(self, held: _HeldScan, pose: SmoothedPose) -> RefinedScan:
         scan = held.scan
@@ -250,10 +250,9 @@ class Localiser:
         offset_ns = scan.t_offset_ns[chosen]
         return deskew(points_lidar_m, offset_ns, scan.t_ns, sweep, self.T_vehicle_lidar, _reference_ns(scan))
 
-    def _take_ready(self) -> list[RefinedScan]:
-        ready = list(self._ready)
-        self._ready.clear()
-        return ready
+    def _take_ready(self) -> Iterator[RefinedScan]:
+        while self._ready:
+            yield self._refined(*self._ready.popleft())
 
 
 def _end_ns(scan: Scan) -> int:
