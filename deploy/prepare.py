@@ -1,5 +1,7 @@
 """What must exist before a fleet can run: the drives, and a store that holds the base map."""
 
+import hashlib
+import importlib.resources
 import itertools
 import os
 import shutil
@@ -52,12 +54,32 @@ def prepare_simulated(config: FleetConfig, folder: RunFolder, worlds: Path | Non
         One drive an agent, and the truth.
     """
     home = folder.world if worlds is None else worlds / f"seed-{config.world_seed}"
-    world = prepare_fleet_run(config.world_seed, config.agents, home, progress, processes=os.cpu_count() or 1)
+    forget_if_stale(home)
+    processes = os.cpu_count() or 1
+    world = prepare_fleet_run(config.world_seed, config.agents, home, progress, processes, reuse=True)
     base_map = home / "base.sqlite"
     if not base_map.exists():
         _build_base(base_map, world.base_drives, progress)
     copy_store(base_map, folder.store)
     return PreparedRun(tuple(world.agent_drives), world.truth_path)
+
+
+def forget_if_stale(home: Path) -> None:
+    """Remove drives and base map that another state of the programs has made, and note who makes what follows."""
+    made_by, now = home / "made_by.txt", sources_sha()
+    if not made_by.exists() or made_by.read_text(encoding="utf-8") != now:
+        shutil.rmtree(home / "drives", ignore_errors=True)
+        (home / "base.sqlite").unlink(missing_ok=True)
+    home.mkdir(parents=True, exist_ok=True)
+    made_by.write_text(now, encoding="utf-8")
+
+
+def sources_sha() -> str:
+    """Return a hash over the programs that decide what a simulated world, its drives and its base map are."""
+    names = ("fleet_sim", "gnd_map", "schemas", "tile_store")
+    folders = [Path(str(importlib.resources.files(name))) for name in names]
+    files = sorted(file for folder in folders for file in folder.rglob("*.py"))
+    return hashlib.sha256(b"".join(file.read_bytes() for file in files)).hexdigest()
 
 
 def _build_base(path: Path, drives: tuple[Path, ...], progress: Progress) -> None:

@@ -86,10 +86,12 @@ def prepare_fleet_run(
     progress: Progress | None = None,
     processes: int = 2,
     scans: int | None = None,
+    *,
+    reuse: bool = False,
 ) -> FleetWorld:
     """Make a world, its truth and all drives.
 
-    A truth of the same world that is already in the folder is used again; drives are simulated anew.
+    A truth of the same world that is already in the folder is used again; drives are simulated anew unless `reuse`.
 
     Args:
         world_seed: seed of the street.
@@ -98,6 +100,7 @@ def prepare_fleet_run(
         progress: gets one task that counts drives and truth.
         processes: worker processes for the drives.
         scans: at most so many scans a drive, None for the whole street.
+        reuse: keep the drives that are there; the caller vouches that this simulator made them for this world.
 
     Returns:
         Where everything is.
@@ -115,12 +118,13 @@ def prepare_fleet_run(
         raise SimError(f"cannot make the folder {folder}: {error}") from error
     world = street(world_seed)
     write_world(world, out_dir / "world.json")
+    paths = [folder / f"{config.vehicle}.mcap" for config in configs]
+    missing = [(config, path) for config, path in zip(configs, paths, strict=True) if not (reuse and path.exists())]
     jobs: list[tuple[Callable[..., object], tuple[object, ...]]] = [
         (load_or_make_truth, (world, out_dir / "truth.npz")),
-        *((simulate_drive, (world, config, folder / f"{config.vehicle}.mcap")) for config in configs),
+        *((simulate_drive, (world, config, path)) for config, path in missing),
     ]
     _run(jobs, processes, progress)
-    paths = [folder / f"{config.vehicle}.mcap" for config in configs]
     split = len(configs) - agents
     return FleetWorld(tuple(paths[:split]), tuple(paths[split:]), out_dir / "truth.npz", out_dir / "world.json")
 
