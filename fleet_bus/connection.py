@@ -98,13 +98,16 @@ class Connection:
         """The session, for one call that sends; `close` waits for such calls, or cuts their link.
 
         Raises:
-            BusClosed: closed before.
+            BusClosed: closed before, or so late meanwhile that its link had to be cut.
         """
         with self._idle:
             self.check_open()
             self._calls += 1
         try:
             yield self.session
+        except zenoh.ZError:
+            self.check_open()
+            raise
         finally:
             with self._idle:
                 self._calls -= 1

@@ -88,6 +88,8 @@ def cloud_of(scan: Scan) -> PointCloud:
 def scan_of(cloud: PointCloud) -> Scan:
     """The scan of a point cloud with float32 x, y, z, a time of each point `t_offset` [ns], and perhaps `ring`.
 
+    Points that are not finite (drivers write NaN for beams without a return) are left out.
+
     Raises:
         BadValue: fields are missing or do not fit, or the cloud has a pose of its own.
     """
@@ -95,6 +97,8 @@ def scan_of(cloud: PointCloud) -> Scan:
     dtype = _dtype_of(tuple((f.name, f.offset, f.type) for f in cloud.fields), cloud.point_stride)
     _check_cloud(cloud, dtype, len(data))
     packed = np.frombuffer(data, dtype)
+    finite = np.isfinite(_xyz_view(packed)).all(axis=1)
+    packed = packed if finite.all() else packed[finite]
     # Copied once into rows of their own: packed points are not aligned, and kernels want one layout.
     return Scan(
         t_ns=t_ns,

@@ -221,6 +221,18 @@ def test_another_reader_finds_the_same_points_positions_and_frames(tmp_path: Pat
     assert (tf.rotation.z, tf.rotation.w) == (truth.orientation.z, truth.orientation.w)
 
 
+def test_points_that_are_not_finite_are_left_out_when_a_foreign_cloud_is_read() -> None:
+    whole = scan(T0_NS, seed=0)
+    cloud = cloud_of(whole)
+    packed = np.frombuffer(cloud.data, [("xyz", "<f4", 3), ("t_offset", "<u4"), ("ring", "<u2")]).copy()
+    packed["xyz"][7, 1], packed["xyz"][9, 0] = np.nan, np.inf
+    cloud.data = packed.tobytes()
+    read = scan_of(cloud)
+    kept = np.delete(np.arange(len(whole)), [7, 9])
+    assert np.array_equal(read.points_m, whole.points_m[kept])
+    assert np.array_equal(read.t_offset_ns, whole.t_offset_ns[kept])
+
+
 def test_the_time_line_of_the_file_is_that_of_the_drive(tmp_path: Path) -> None:
     with write(tmp_path / "drive.mcap", items(1)).open("rb") as stream:
         times = [message.log_time for _, _, message in make_reader(stream).iter_messages()]
