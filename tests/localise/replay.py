@@ -1,4 +1,4 @@
-"""Helpers of the localisation tests: a map from the reference poses of drives, and a drive replayed into a localiser."""
+"""Helpers of the localisation tests: a map from drives with reference poses, and a drive replayed into a localiser."""
 
 import time
 from collections.abc import Iterable

@@ -4,7 +4,7 @@ Coarse: every position x heading on a grid is scored by how many sampled points 
 that stands above the ground. The best are refined by registration, and the answer says how close the runner-up came.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,7 +14,7 @@ from gnd_map.se3 import T_from_R_t, exp_so3, log_so3
 from vehicle_agent.errors import RegistrationError
 from vehicle_agent.localise.match_map import MatchMap
 from vehicle_agent.localise.parameters import InitialiseParameters, RegistrationParameters
-from vehicle_agent.localise.registration import RegistrationResult, register
+from vehicle_agent.localise.registration import RegistrationResult, fit_of, register
 
 F64 = NDArray[np.float64]
 U8 = NDArray[np.uint8]
@@ -28,8 +28,8 @@ SUPPRESS_M, SUPPRESS_DEG = 1.5, 8.0  # coarse hypotheses nearer than this conver
 class InitialPose:
     """The best pose found, and how sure it is.
 
-    fit: 0 ... 1, robust fit times the share of points in known voxels; runner_up_fit: that of the best pose that is a
-    different answer (0 if there is none); hypotheses: how many were scored; found: good enough and unambiguous.
+    fit: 0 ... 1, of the points above the ground (see `fit_of`); runner_up_fit: that of the best pose that is another
+    answer (0 if there is none); hypotheses: how many were scored; found: good enough and unambiguous.
     """
 
     registration: RegistrationResult
@@ -57,14 +57,18 @@ def initialise(
         parameters: of the search.
         registration: of the refinement.
     """
-    par = parameters or InitialiseParameters()
+    par, registration = parameters or InitialiseParameters(), registration or RegistrationParameters()
     ground = _ground_plane(match_map, p_gnss_m)
     if ground is None:
         return None
-    hypotheses = _hypotheses(p_gnss_m, sigma_m, ground, _ground_below(points_m), par)
-    scores = _score(points_m, hypotheses, match_map, par)
-    best = _distinct_best(hypotheses, scores, par.n_refined)
-    return _answer(_refined(points_m, hypotheses[best], match_map, registration), len(hypotheses), par)
+    ground_below_m = _ground_below(points_m)
+    standing = points_m[points_m[:, 2] > ground_below_m + par.above_ground_m]  # ground fits everywhere
+    hypotheses = _hypotheses(p_gnss_m, sigma_m, ground, ground_below_m, par)
+    scores = _score(_thinned(standing, par.n_points), hypotheses, match_map)
+    best = hypotheses[_distinct_best(hypotheses, scores, par.n_refined)]
+    few, few_standing = _thinned(points_m, par.n_refining), _thinned(standing, par.n_refining)
+    answer = _answer(_refined(few, few_standing, best, match_map, registration), len(hypotheses), par)
+    return _with_all_points(answer, points_m, match_map, registration)
 
 
 def _ground_plane(m: MatchMap, p_map_m: F64) -> F64 | None:
@@ -122,15 +126,18 @@ def _tilt(ground: F64) -> F64:
     return exp_so3(np.arccos(normal[2]) * np.array([-normal[1], normal[0], 0.0]) / max(np.hypot(*normal[:2]), 1e-12))
 
 
-def _score(points_m: F64, hypotheses: F64, m: MatchMap, par: InitialiseParameters) -> F64:
-    """(K,) mean score a point of each hypothesis: points above the ground only, as ground fits everywhere."""
-    standing = points_m[points_m[:, 2] > _ground_below(points_m) + par.above_ground_m]
-    chosen = standing[np.linspace(0, len(standing) - 1, min(par.n_points, len(standing))).astype(np.int64)]
+def _thinned(points: F64, n: int) -> F64:
+    """At most n of the points (N, 3), evenly through their order."""
+    return points[np.linspace(0, len(points) - 1, min(n, len(points))).astype(np.int64)]
+
+
+def _score(points_m: F64, hypotheses: F64, m: MatchMap) -> F64:
+    """(K,) mean score a point of each hypothesis."""
     R = m.A @ hypotheses[:, :3, :3]
     t = hypotheses[:, :3, 3] @ m.A.T + m.b
     scores = np.zeros(len(hypotheses))
-    if len(chosen):
-        _score_all(np.ascontiguousarray(chosen), np.ascontiguousarray(R), t, _field(m.index), scores)
+    if len(points_m):
+        _score_all(np.ascontiguousarray(points_m), np.ascontiguousarray(R), t, _field(m.index), scores)
     return scores
 
 
@@ -180,26 +187,38 @@ def _near(T: F64, other: F64, apart_m: float, apart_deg: float) -> NDArray[np.bo
     return np.asarray((distance < apart_m) & (turn < np.radians(apart_deg)))
 
 
-def _refined(points_m: F64, poses: F64, m: MatchMap, par: RegistrationParameters | None) -> list[RegistrationResult]:
-    """Registrations from each pose, those that match nothing left out."""
+def _refined(
+    points_m: F64, standing_m: F64, poses: F64, m: MatchMap, par: RegistrationParameters
+) -> list[tuple[float, RegistrationResult]]:
+    """Registrations from each pose with the fit of what stands above the ground; those that match nothing left out."""
     results = []
     for T in poses:
         try:
-            results.append(register(points_m, T, m, par, "capture"))
+            result = register(points_m, T, m, par, "capture")
         except RegistrationError:
             continue
+        results.append((fit_of(standing_m, result.T_map_vehicle, m, par), result))
     return results
 
 
-def _answer(results: list[RegistrationResult], n: int, par: InitialiseParameters) -> InitialPose | None:
+def _answer(results: list[tuple[float, RegistrationResult]], n: int, par: InitialiseParameters) -> InitialPose | None:
     """The best refined pose, compared with the best that is a different one."""
     if not results:
         return None
-    fits = np.array([r.fit * r.known_ratio for r in results])
+    fits = np.array([fit for fit, _ in results])
     best = int(np.argmax(fits))
-    T = np.stack([r.T_map_vehicle for r in results])
+    T = np.stack([result.T_map_vehicle for _, result in results])
     others = fits[~_near(T, T[best], par.apart_m, par.apart_deg)]
     runner_up = float(others.max()) if len(others) else 0.0
     fit = float(fits[best])
     found = fit >= par.min_fit and runner_up <= par.ambiguity * fit
-    return InitialPose(results[best], fit, runner_up, n, found)
+    return InitialPose(results[best][1], fit, runner_up, n, found)
+
+
+def _with_all_points(
+    answer: InitialPose | None, points_m: F64, m: MatchMap, par: RegistrationParameters
+) -> InitialPose | None:
+    """The same answer, its pose refined once more with all points."""
+    if answer is None or not answer.found:
+        return answer
+    return replace(answer, registration=register(points_m, answer.registration.T_map_vehicle, m, par))

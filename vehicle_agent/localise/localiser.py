@@ -71,6 +71,7 @@ class Localiser:
         self._pending: Scan | None = None
         self._ready: deque[tuple[_HeldScan, SmoothedPose]] = deque()
         self._searched_ns = -(2**62)
+        self._searching_ns: int | None = None  # since when there is no pose
         self._track: _Track | None = None
 
     # --- what the agent calls ------------------------------------------------------------------------------------
@@ -195,10 +196,11 @@ class Localiser:
         """Search for the pose, now and then while there is none."""
         t_ns = _reference_ns(scan)
         found = self._search(t_ns, points)
-        if found is None or not found.found:
+        if found is None or not self._good_enough(found, t_ns):
             self.dropped_scans += 1
             return
         par, result = self.parameters, found.registration
+        self._searching_ns = None
         self.initialisations += 1
         monitor = HealthMonitor(par.health, t_ns)
         monitor.believe(result, result.T_map_vehicle, np.zeros(6), t_ns)
@@ -213,6 +215,7 @@ class Localiser:
         if t_ns - self._searched_ns < par.health.retry_s * 1e9:
             return None
         self._searched_ns = t_ns
+        self._searching_ns = t_ns if self._searching_ns is None else self._searching_ns
         p_map = self._p_map(fix)
         moved_m = abs(self._motion.speed_mps * (t_ns - fix.t_ns) * 1e-9)
         match_map = self._map.near(p_map)
@@ -220,6 +223,12 @@ class Localiser:
             points, p_map, fix.sigma_m + moved_m / par.initialise.radius_sigmas, match_map, par.initialise,
             par.registration,
         )  # fmt: skip
+
+    def _good_enough(self, found: InitialPose, t_ns: int) -> bool:
+        """True for a clear answer; one that fits poorly only when waiting has not brought a better one."""
+        par = self.parameters.initialise
+        patient = self._searching_ns is not None and t_ns - self._searching_ns < par.patience_s * 1e9
+        return found.found and (found.fit >= par.good_fit or not patient)
 
     def _lose(self, track: _Track) -> None:
         """The pose is wrong: nothing held may reach the evidence."""

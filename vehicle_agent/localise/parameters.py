@@ -58,8 +58,11 @@ class InitialiseParameters:
     """Search for the first pose around a GNSS position.
 
     radius_sigmas: how far around the position, in its sigmas; step_m, step_deg: spacing of the coarse hypotheses;
-    n_points: points that score one; n_refined: how many of the best are refined by registration;
+    n_points: points that score one; n_refined: how many of the best are refined by registration, with `n_refining`
+        points;
     min_fit: least fit (0 ... 1) that counts as found; ambiguity: the runner-up may reach this share of the best fit;
+    good_fit, patience_s: for so long only a fit of `good_fit` is taken: where much has changed, a pose decimetres off
+        can fit best, and a vehicle that moves soon sees something else;
     apart_m, apart_deg: two poses nearer than this are the same answer.
     """
 
@@ -68,7 +71,10 @@ class InitialiseParameters:
     step_deg: float = 5.0
     n_points: int = 400
     n_refined: int = 24
-    min_fit: float = 0.45
+    n_refining: int = 1000
+    min_fit: float = 0.4
+    good_fit: float = 0.65
+    patience_s: float = 5.0
     ambiguity: float = 0.9
     apart_m: float = 1.0
     apart_deg: float = 5.0
@@ -165,7 +171,7 @@ class HealthParameters:
     lost_after_s: float = 4.0
     gnss_sigmas: float = 5.0
     gnss_count: int = 5
-    retry_s: float = 0.4
+    retry_s: float = 0.8
 
     def __post_init__(self) -> None:
         if not 0 < self.degraded_after_s <= self.lost_after_s or self.gnss_count < 1:

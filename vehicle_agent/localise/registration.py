@@ -95,6 +95,21 @@ def register(
     return _result(state, len(points), scales[-1], par, iterations, converged)
 
 
+def fit_of(points_m: F64, T_map_vehicle: F64, match_map: MatchMap, parameters: RegistrationParameters) -> float:
+    """How well points (N, 3) lie on the map at a pose, 0 ... 1: 1 - mean robust cost at the narrowest scale; a point in
+    voxels that are not known counts as off.
+    """
+    if not len(points_m):
+        return 0.0
+    R, t = np.ascontiguousarray(T_map_vehicle[:3, :3]), np.ascontiguousarray(T_map_vehicle[:3, 3])
+    m, scale = match_map, parameters.scales[-1]
+    cost, _, inside = linearise(
+        np.ascontiguousarray(points_m), R, t, m.index, m.A, m.b, m.mean_m, m.information, scale**2,
+        (parameters.gate_per_scale * scale) ** 2, np.empty((6, 6)), np.empty(6),
+    )  # fmt: skip
+    return (inside - cost / scale**2) / len(points_m)
+
+
 def _linearise(points: F64, s: _State, m: MatchMap, par: RegistrationParameters, scale: float) -> None:
     """Refresh the normal equations of `s`; RegistrationError when too little matches."""
     gate_m2 = (par.gate_per_scale * scale) ** 2

@@ -41,7 +41,7 @@ def _first_in_cubes(
             continue
         i, j, k = int(np.floor(x * per_m)), int(np.floor(y * per_m)), int(np.floor(z * per_m))
         key = ((i + (1 << 20)) << 42) | ((j + (1 << 20)) << 21) | (k + (1 << 20))
-        slot = (i * 73856093 ^ j * 19349669 ^ k * 83492791) & ((1 << TABLE_BITS) - 1)
+        slot = (np.uint64(key) * np.uint64(0x9E3779B97F4A7C15)) >> np.uint64(64 - TABLE_BITS)  # Fibonacci hash
         if table[slot] != key:
             table[slot] = key
             chosen[kept] = n

@@ -1,0 +1,61 @@
+"""The first pose: any heading, a position wrong by metres; and honesty where two answers fit."""
+
+import numpy as np
+import pytest
+from yard import GROUND_M, local_map_of, match_map_of, offset, pose, rectangle, seen_from
+
+from vehicle_agent.localise.initialise import initialise
+from vehicle_agent.localise.parameters import InitialiseParameters
+
+
+@pytest.mark.parametrize("seed", range(8))
+def test_any_heading_is_found_from_a_position_metres_off(yard_map, yard_points, seed):
+    rng = np.random.default_rng(seed)
+    T = pose(rng.uniform(-12, 12), rng.uniform(-6, 6), rng.uniform(0, 360), roll_deg=0.5, pitch_deg=-0.5)
+    away = rng.uniform(0, 2 * np.pi)
+    p_gnss = T[:3, 3] + [4.0 * np.cos(away), 4.0 * np.sin(away), 6.0]  # the height is not looked at
+    found = initialise(seen_from(rng, yard_points, T, 2500), p_gnss, 2.5, match_map_of(yard_map))
+    assert found is not None
+    assert found.found
+    off_m, off_deg = offset(T, found.registration.T_map_vehicle)
+    assert off_m < 0.02
+    assert off_deg < 0.05
+    assert found.runner_up_fit < 0.8 * found.fit
+
+
+def test_a_room_that_looks_the_same_from_both_ends_is_called_ambiguous():
+    rng = np.random.default_rng(0)
+    wall = lambda x, y, dx, dy: rectangle(rng, (x, y, GROUND_M), (dx, dy, 0), (0, 0, 4), 60)  # noqa: E731
+    ground = rectangle(rng, (-15, -8, GROUND_M), (30, 0, 0), (0, 16, 0), 60)
+    room = np.concatenate(
+        [ground, wall(-15, -8, 30, 0), wall(-15, 8, 30, 0), wall(-15, -8, 0, 16), wall(15, -8, 0, 16)]
+    )
+    T = pose(0.0, 0.0, 0.0)
+    found = initialise(seen_from(rng, room, T, 2500), T[:3, 3], 1.0, match_map_of(local_map_of(room)))
+    assert found is not None
+    assert found.fit > 0.8
+    assert found.runner_up_fit > 0.95 * found.fit
+    assert not found.found
+
+
+def test_where_there_is_no_map_there_is_no_answer(yard_map, yard_points):
+    T, rng = pose(0.0, 0.0, 0.0), np.random.default_rng(0)
+    points = seen_from(rng, yard_points, T, 2500)
+    assert initialise(points, np.array([400.0, 0.0, 0.0]), 2.5, match_map_of(yard_map)) is None
+
+
+def test_a_place_that_is_not_in_the_map_is_not_found(yard_map):
+    """Points of somewhere else may fit a little; they must not pass for the yard."""
+    rng = np.random.default_rng(3)
+    elsewhere = rng.uniform([-30, -30, -2], [30, 30, 6], (2500, 3))
+    found = initialise(elsewhere, np.array([0.0, 0.0, GROUND_M]), 2.5, match_map_of(yard_map))
+    assert found is None or not found.found
+
+
+def test_the_number_of_hypotheses_grows_with_the_circle(yard_map, yard_points):
+    T, rng = pose(0.0, 0.0, 0.0), np.random.default_rng(0)
+    points, m = seen_from(rng, yard_points, T, 2500), match_map_of(yard_map)
+    near, far = (initialise(points, T[:3, 3], sigma, m, InitialiseParameters(n_refined=4)) for sigma in (0.5, 2.0))
+    assert near is not None
+    assert far is not None
+    assert far.hypotheses > 6 * near.hypotheses
