@@ -4,6 +4,7 @@ import dataclasses
 import json
 import signal
 import threading
+import time
 from pathlib import Path
 from typing import Any
 
@@ -74,14 +75,15 @@ def _run(config: FleetConfig, folder: RunFolder, source: Source, keep_drives: bo
     from deploy.processes import start_fork_server
 
     console = Console(stderr=True)
-    stop = _stop_on_sigterm()
+    stop, started_s = _stop_on_sigterm(), time.monotonic()
     with progress_bars(console) as progress:
         warm = threading.Thread(target=start_fork_server, name="fork-server")
         warm.start()  # the kernels are loaded while the world is made
         prepared = prepare.prepare(config, folder, source, progress)
         warm.join()
+    prepare_s = time.monotonic() - started_s
     outcome = run_fleet(config, folder, prepared, console, stop)
-    result = summary.write_summary(config, folder, prepared, outcome)
+    result = summary.write_summary(config, folder, prepared, outcome, prepare_s)
     if not keep_drives:
         prepare.remove_drives(folder)
     return result

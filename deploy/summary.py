@@ -19,7 +19,7 @@ from tile_store.sqlite_store import SqliteStore
 
 
 def write_summary(
-    config: FleetConfig, folder: RunFolder, prepared: PreparedRun, outcome: FleetOutcome
+    config: FleetConfig, folder: RunFolder, prepared: PreparedRun, outcome: FleetOutcome, prepare_s: float
 ) -> dict[str, Any]:
     """Account for a finished run, compare it with the truth where there is one, and write `summary.json`.
 
@@ -28,6 +28,7 @@ def write_summary(
         folder: the run.
         prepared: drives and truth.
         outcome: time and restarts.
+        prepare_s: how long world, drives and base map took before.
 
     Returns:
         The content of `summary.json`.
@@ -37,6 +38,7 @@ def write_summary(
         histories = tile_histories(store)
         summary = _counts(config, folder, prepared, outcome, results, store, histories)
         summary["f1"] = _evaluate(folder, prepared, store, histories)
+    summary["prepare_s"] = round(prepare_s, 1)
     summary["localisation_p95"] = results.localisation_p95()
     summary["traffic"] = results.traffic()
     _write(folder.summary, summary)
