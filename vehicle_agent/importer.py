@@ -4,6 +4,7 @@ The track is found over *all* scans before any is left out, so that the halves o
 half maps, the other half can drive on.
 """
 
+from collections import deque
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Final
@@ -17,7 +18,7 @@ from schemas.drive import DriveHeader, DriveItem, GnssFix, MotionSample, Referen
 from schemas.drive_mcap import DriveWriter
 from vehicle_agent.errors import ImportDriveError
 from vehicle_agent.importers.kitti import open_kitti
-from vehicle_agent.importers.lidar_odometry import Progress, lidar_odometry, reference_ns
+from vehicle_agent.importers.lidar_odometry import Progress, lidar_odometry
 from vehicle_agent.importers.pcd import open_pcd
 from vehicle_agent.importers.radiate import open_radiate
 from vehicle_agent.importers.recording import GNSS_SIGMA_M, Anchor, Recording
@@ -62,14 +63,29 @@ def import_recording(
         ImportDriveError: the folder is missing, holds no scans of that format, or is damaged.
         DriveError: the drive cannot be written.
     """
+    recording = open_recording(kind, folder, anchor)
+    chosen_scans(scans, len(recording))  # a wrong rule is told before the long work
+    return write_drive(recording, map_track(recording, progress), out, scans, vehicle, progress)
+
+
+def open_recording(kind: str, folder: Path, anchor: Anchor | None = None) -> Recording:
+    """A recording of a known format; ImportDriveError when it is none."""
     if kind not in FORMATS:
         raise ImportDriveError(f"format {kind!r} is not known; known are {', '.join(FORMATS)}")
-    recording = FORMATS[kind](folder, anchor)
-    chosen = chosen_scans(scans, len(recording))
-    track = map_track(recording, progress)
-    header = _header(recording, f"{recording.name}-{scans}".replace(":", "-"), vehicle)
-    with DriveWriter(out, header) as writer:
-        done = 0
+    return FORMATS[kind](folder, anchor)
+
+
+def write_drive(
+    recording: Recording,
+    track: Trajectory,
+    out: Path,
+    scans: str = "all",
+    vehicle: str = "recorded",
+    progress: Progress = no_progress,
+) -> int:
+    """Write the chosen scans of a recording whose track (T_map_vehicle of all scans) is known; how many."""
+    chosen, done = chosen_scans(scans, len(recording)), 0
+    with DriveWriter(out, _header(recording, f"{recording.name}-{scans}".replace(":", "-"), vehicle)) as writer:
         for item in _items(recording, track, chosen):
             writer.add(item)
             done += isinstance(item, Scan)
@@ -126,11 +142,11 @@ def _items(recording: Recording, track: Trajectory, chosen: NDArray[np.int64]) -
     small += recording.gnss or fixes_of(recording, track)
     small += [ReferencePose(int(t), T) for t, T in zip(track.t_ns, track.T_dst_vehicle, strict=True)]
     within = [item for item in small if first <= item.t_ns <= last]
-    items = sorted(within, key=lambda item: item.t_ns)
+    items = deque(sorted(within, key=lambda item: item.t_ns))
     for number in chosen:
         scan = recording.read(int(number))
         while items and items[0].t_ns <= scan.t_ns:
-            yield items.pop(0)
+            yield items.popleft()
         yield scan
     yield from items
 
@@ -153,6 +169,3 @@ def fixes_of(recording: Recording, track: Trajectory) -> list[GnssFix]:
         GnssFix(int(t), float(a), float(o), float(h), GNSS_SIGMA_M)
         for t, a, o, h in zip(track.t_ns, lat, lon, height, strict=True)
     ]
-
-
-__all__ = ["FORMATS", "Anchor", "Progress", "fit_heading_and_position", "import_recording", "map_track", "reference_ns"]

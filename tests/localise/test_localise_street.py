@@ -7,7 +7,7 @@ from replay import grid_frame_of, map_of, reference_of, replay
 
 from fleet_sim.drives import PERFECT, DriveConfig, simulate_drive
 from fleet_sim.street import street
-from vehicle_agent.importer import import_recording
+from vehicle_agent.importer import map_track, open_recording, write_drive
 from vehicle_agent.localise import LocalisationError, localisation_error
 
 SEED = 5  # of no street on which anything was tuned
@@ -44,8 +44,10 @@ def test_street_that_has_changed(outdated_map):
 
 def half_on_half(kind: str, folder: Path, out: Path) -> LocalisationError:
     """Even scans build the map, odd scans drive on it; the error against the LiDAR odometry of both."""
+    recording = open_recording(kind, folder)
+    track = map_track(recording)
     for half in ("even", "odd"):
-        import_recording(kind, folder, out / f"{half}.mcap", scans=half)
+        write_drive(recording, track, out / f"{half}.mcap", half)
     run = replay(out / "odd.mcap", map_of([out / "even.mcap"], grid_frame_of(out / "odd.mcap")))
     assert len(run.final) == run.scans
     assert {estimate.health for estimate in run.final} == {"good"}
