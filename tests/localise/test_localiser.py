@@ -206,6 +206,17 @@ def test_a_scan_of_no_or_few_points_does_no_harm(localiser, drive, n):
     assert_right(final)
 
 
+def test_a_scan_from_the_past_is_dropped(localiser, drive, sweep):
+    drive(localiser, 0.0, 2.0)
+    dropped = localiser.dropped_scans
+    for t_ns in (S, 19 * SWEEP_NS):
+        localiser.push_scan(sweep(true_pose, t_ns))
+    assert localiser.dropped_scans == dropped + 2
+    final = drive(localiser, 2.0, 4.0) + list(localiser.flush())
+    assert [scan.t_ns for scan in final] == sorted(scan.t_ns for scan in final)
+    assert_right(final)
+
+
 def test_points_that_are_not_finite_are_left_out(localiser, drive, sweep):
     drive(localiser, 0.0, 1.0)
     whole = sweep(true_pose, S)

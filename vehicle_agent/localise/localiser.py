@@ -69,6 +69,7 @@ class Localiser:
         self._map = MatchMapCache(local_map, self.parameters.registration.noise_m)
         self._fix: GnssFix | None = None
         self._pending: Scan | None = None
+        self._newest_scan_ns = -1
         self._ready: deque[tuple[_HeldScan, SmoothedPose]] = deque()
         self._searched_ns = -(2**62)
         self._searching_ns: int | None = None  # since when there is no pose
@@ -86,7 +87,13 @@ class Localiser:
         self._fix = fix
 
     def push_scan(self, scan: Scan) -> list[RefinedScan]:
-        """Take a scan; give the scans whose poses became final, oldest first."""
+        """Take a scan; give the scans whose poses became final, oldest first. A scan that is empty, or not later than
+        the one before, is dropped and counted.
+        """
+        if len(scan) == 0 or scan.t_ns <= self._newest_scan_ns:
+            self.dropped_scans += 1
+            return list(self._take_ready())
+        self._newest_scan_ns = scan.t_ns
         self._process()
         self._pending = scan
         self._process_if_covered()
@@ -118,7 +125,7 @@ class Localiser:
 
     def _process(self) -> None:
         scan, self._pending = self._pending, None
-        if scan is None or len(scan) == 0:
+        if scan is None:
             return
         chosen = sample_scan(scan.points_m, self.parameters.sampling)
         points = self._deskewed(scan, chosen, scan.points_m[chosen])
