@@ -31,20 +31,21 @@ class Recording:
     folder: str
     new_at_m: tuple[float, float]  # forward and left of the middle pose
     gone_at_m: tuple[float, float]
+    half_m: tuple[float, float]  # half length and width of the boxes
 
 
-KITTI = Recording("kitti", "kitti00_start16", (8.0, 4.0), (0.0, 4.0))
+KITTI = Recording("kitti", "kitti00_start16", (8.0, 4.0), (0.0, 4.0), (0.8, 0.5))
 # On the left lies open field: fog returns no beam from behind an object there, so nothing could show that it is gone.
-RADIATE = Recording("radiate", "radiate_fog", (6.0, 4.0), (-2.0, -4.0))
+RADIATE = Recording("radiate", "radiate_fog", (6.0, 4.0), (-2.0, -4.0), (1.3, 0.9))
 
 
-def box_at(drive: Path, at_m: tuple[float, float]) -> Block:
-    """A box of 1.6 x 1.0 x 2.3 m beside the road, in the frame of the drive's reference poses."""
+def box_at(drive: Path, at_m: tuple[float, float], half_m: tuple[float, float]) -> Block:
+    """A box 2.3 m high beside the road, in the frame of the drive's reference poses."""
     T = load_track(drive)[2].T_map_vehicle
     T_map_vehicle = T[len(T) // 2]
     x_m, y_m, z_m, _ = T_map_vehicle @ np.array([*at_m, 0.0, 1.0])
     yaw_rad = float(np.arctan2(T_map_vehicle[1, 0], T_map_vehicle[0, 0]))
-    return Block(float(x_m), float(y_m), 0.8, 0.5, float(z_m) - 0.3, float(z_m) + 2.0, yaw_rad)
+    return Block(float(x_m), float(y_m), *half_m, float(z_m) - 0.3, float(z_m) + 2.0, yaw_rad)
 
 
 def measured_voxels(drive: Path, points_m: np.ndarray) -> dict[TileId, np.ndarray]:
@@ -70,7 +71,8 @@ def shares(
 def test_inserted_objects_come_back_as_new_and_deleted(recording: Recording, shared_data: Path, tmp_path: Path) -> None:
     whole = tmp_path / "whole.mcap"
     import_recording(recording.kind, shared_data / recording.folder, whole)
-    new, gone = box_at(whole, recording.new_at_m), box_at(whole, recording.gone_at_m)
+    new = box_at(whole, recording.new_at_m, recording.half_m)
+    gone = box_at(whole, recording.gone_at_m, recording.half_m)
     mapped = rewrite_drive(whole, tmp_path / "mapped.mcap", [gone], slice(0, None, 2))
     driven = rewrite_drive(whole, tmp_path / "driven.mcap", [new], slice(1, None, 2))
     with SqliteStore(tmp_path / "base.sqlite") as store:
