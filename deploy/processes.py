@@ -94,10 +94,6 @@ class Supervisor:
         group = [r for name, r in self._running.items() if name.startswith(prefix)]
         return all(r.process.exitcode == 0 for r in group)
 
-    def alive(self, name: str) -> bool:
-        """Tell whether the named process runs."""
-        return name in self._running and self._running[name].process.is_alive()
-
     def pids(self) -> dict[str, int]:
         """Return the process ids by name."""
         return {name: r.process.pid for name, r in self._running.items() if r.process.pid is not None}
