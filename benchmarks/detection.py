@@ -74,8 +74,9 @@ def _kernel_alone(
     def cast() -> None:
         for points, origins, A, b, kept in jobs:
             cast_rays(
-                points, origins, A, b, state.reshape(-1), shape, records.words, records.floats, records.block, p, kept
-            )
+                points, origins, A, b, state.reshape(-1), shape, records.words, records.floats, records.block, p,
+                np.zeros(len(points), np.bool_), kept,
+            )  # fmt: skip
 
     steps = sum(float(np.abs(np.floor(p @ A.T + b) - np.floor(o @ A.T + b)).sum()) for p, o, A, b, _ in jobs)
     return median_s(cast) / len(jobs), steps / len(jobs)

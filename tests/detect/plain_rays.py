@@ -55,7 +55,7 @@ class PlainDetector:
         self.pe = np.zeros(world.shape, int)
         self.kept: list[bool] = []
 
-    def ray(self, origin: np.ndarray, point: np.ndarray) -> None:
+    def ray(self, origin: np.ndarray, point: np.ndarray, moving: bool = False) -> None:
         length = float(np.linalg.norm(point - origin))
         self.kept.append(False)
         if not length > self.p.range_min_m:
@@ -72,7 +72,7 @@ class PlainDetector:
         ends_inside = reach == 1.0 and is_inside_window(tuple(np.floor(start + full).astype(int)), self.world.shape)
         for voxel, t_in, t_out in pieces[:-1]:
             self._pass(voxel, origin, point, t_in, t_out, length)
-        if ends_inside:
+        if ends_inside and not moving:
             self._block(pieces[-1][0], point, start + full)
 
     def _pass(self, voxel, origin, point, t_in, t_out, length) -> None:

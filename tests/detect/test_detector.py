@@ -187,3 +187,23 @@ def test_a_scan_that_is_not_finite_or_has_no_origin_is_refused_and_nothing_count
         detector.add_scan(points, SENSOR)
     assert detector.touched_tiles() == ()
     assert detector.add_scan(np.empty((0, 3)), SENSOR) == 0
+
+
+def test_points_of_movers_are_no_hits_but_their_rays_pass(tiles: dict[TileId, Tile]) -> None:
+    away = ChangeDetector(hold(tiles)), ChangeDetector(hold(tiles))
+    for points in scans([FAR]):
+        moving = np.ones(len(points), np.bool_)
+        away[0].add_scan(points, SENSOR)
+        away[1].add_scan(points, SENSOR, moving)
+    plain, masked = (d.finish(d.local_map.tiles) for d in away)
+    for tile_id, evidence in masked.items():
+        assert not evidence.measured.count.any()
+        assert evidence.n_bi.sum() == evidence.n_bo.sum() == evidence.n_be.sum() == 0
+        assert evidence.n_pi.sum() == plain[tile_id].n_pi.sum()
+
+
+def test_a_mask_of_movers_of_the_wrong_length_is_refused(tiles: dict[TileId, Tile]) -> None:
+    detector = ChangeDetector(hold(tiles))
+    with pytest.raises(ShapeError, match=r"\(3,\) for 5 points"):
+        detector.add_scan(np.ones((5, 3)), SENSOR, np.zeros(3, np.bool_))
+    assert detector.touched_tiles() == ()

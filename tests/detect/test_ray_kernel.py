@@ -31,13 +31,15 @@ def random_world(rng: np.random.Generator, n: int = 260) -> PlainMap:
     return PlainMap(SHAPE, mean, turn @ (spread[:, :, None] ** 2 * np.eye(3)) @ turn.transpose(0, 2, 1), index)
 
 
-def kernel_run(world: PlainMap, p: DetectParameters, points: np.ndarray, origins: np.ndarray, b: np.ndarray):
+def kernel_run(
+    world: PlainMap, p: DetectParameters, points: np.ndarray, origins: np.ndarray, b: np.ndarray, moving: np.ndarray
+):
     cov6 = world.cov[:, [0, 0, 0, 1, 1, 2], [0, 1, 2, 1, 2, 2]]
     records = make_records(world.mean, cov6, np.zeros(3), p)
     state, kept = world.index.copy(), np.zeros(len(points), np.uint8)
     cast = cast_rays(
         points, origins, A_GRID, b, state.reshape(-1), state.shape, records.words, records.floats, records.block,
-        kernel_parameters(p), kept,
+        kernel_parameters(p), moving, kept,
     )  # fmt: skip
     return records.words, state, kept, cast
 
@@ -54,13 +56,13 @@ def test_kernel_counts_what_the_plain_twin_counts(rule: str, seed: int) -> None:
     points = np.linalg.solve(A_GRID, inside.T).T
     points[: n // 3] = world.mean[rng.integers(0, len(world.mean), n // 3)] + rng.normal(0, 0.15, (n // 3, 3))
     points[-40:] += rng.normal(0, 20, (40, 3))  # beyond the range and the window
-    b = np.zeros(3)
+    b, moving = np.zeros(3), rng.random(n) < 0.15
 
-    words, state, kept, _ = kernel_run(world, p, points, origins, b)
+    words, state, kept, _ = kernel_run(world, p, points, origins, b, moving)
 
     plain = PlainDetector(world, p, quantile, A_GRID, b)
-    for origin, point in zip(origins, points, strict=True):
-        plain.ray(origin, point)
+    for origin, point, moves in zip(origins, points, moving, strict=True):
+        plain.ray(origin, point, moves)
     for column, expected in ((N_BI, plain.bi), (N_BO, plain.bo), (N_PI, plain.pi), (N_PO, plain.po)):
         np.testing.assert_array_equal(words[:, column], expected)
     assert min(plain.bi.sum(), plain.bo.sum(), plain.pi.sum(), plain.po.sum(), plain.pe.sum()) > 5
@@ -76,7 +78,7 @@ def walked(start: np.ndarray, end: np.ndarray) -> np.ndarray:
     nothing = make_records(np.empty((0, 3)), np.empty((0, 6)), np.zeros(3), DetectParameters())
     cast_rays(
         end[None], start[None], np.eye(3), np.zeros(3), state.reshape(-1), state.shape, nothing.words, nothing.floats,
-        nothing.block, p, np.zeros(1, np.uint8),
+        nothing.block, p, np.zeros(1, np.bool_), np.zeros(1, np.uint8),
     )  # fmt: skip
     assert state.max() == EMPTY
     assert state.min() >= EMPTY - 1, "a voxel was passed twice"

@@ -47,12 +47,13 @@ class ChangeDetector:
         self._points = VoxelAccumulator(local_map.grid_frame)
         self._window: _Window | None = None
 
-    def add_scan(self, points_map_m: F64, origins_map_m: F64) -> int:
+    def add_scan(self, points_map_m: F64, origins_map_m: F64, moving: NDArray[np.bool_] | None = None) -> int:
         """Count the rays of one scan.
 
         Args:
             points_map_m: (N, 3) float64 hits, map frame, in firing order (shuffled points cost 1.5 times the time).
             origins_map_m: (N, 3) the sensor at each point, or (3,) for all.
+            moving: (N,) bool, points on moving objects ([50] in GND): their rays pass, their ends count for nothing.
 
         Returns:
             How many rays were cast.
@@ -65,6 +66,9 @@ class ChangeDetector:
         origins = points_3d("origins_map_m", np.atleast_2d(origins_map_m))
         if len(origins) not in (1, len(points)):
             raise ShapeError(f"{len(origins)} sensor origins for {len(points)} points: one each, or one for all")
+        moves = np.zeros(len(points), np.bool_) if moving is None else np.ascontiguousarray(moving, np.bool_)
+        if moves.shape != (len(points),):
+            raise ShapeError(f"moving has shape {moves.shape} for {len(points)} points: one truth value each")
         window = self._current()
         if not len(points) or not window.state.size:
             return 0
@@ -73,7 +77,7 @@ class ChangeDetector:
         kept = np.zeros(len(points), np.uint8)
         cast = cast_rays(
             points - window.anchor_m, origins - window.anchor_m, A, b, window.state.reshape(-1), window.state.shape,
-            window.records.words, window.records.floats, window.records.block, self._kernel, kept,
+            window.records.words, window.records.floats, window.records.block, self._kernel, moves, kept,
         )  # fmt: skip
         self._points.add(points[kept.view(np.bool_)])
         return cast

@@ -200,6 +200,7 @@ def cast_rays(  # noqa: C901  (one loop: a call a voxel would cost more than the
     records: F32,
     block: F32,
     p: KernelParameters,
+    moving: NDArray[np.bool_],
     kept: NDArray[np.uint8],
 ) -> int:
     """Cast the rays of one scan: counts into `state` and `words`, marks the points that new Gaussians are made of.
@@ -215,6 +216,7 @@ def cast_rays(  # noqa: C901  (one loop: a call a voxel would cost more than the
         records: the same memory as float32.
         block: (M, 6) float32 whitening for blocked points.
         p: KernelParameters.
+        moving: (N,) bool, points of moving objects: the ray passes what lies before, its end says nothing.
         kept: (N,) uint8, set to 1 for the points that count (BI, BO, BE), 0 for the others.
 
     Returns:
@@ -283,7 +285,7 @@ def cast_rays(  # noqa: C901  (one loop: a call a voxel would cost more than the
                 n_z -= 1
                 t_z = t_z + dt_z if n_z > 0 else np.inf
         row = state[np.uint64(at)]
-        if t_end < 1.0 or row == UNKNOWN:
+        if t_end < 1.0 or row == UNKNOWN or moving[r]:
             continue
         if row >= 0 and _r2_block(block, records, row, px, py, pz) <= p.r2_block:  # Eq. (1)
             words[np.uint64(row), N_BI] += 1
