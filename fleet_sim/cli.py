@@ -6,6 +6,7 @@ from pathlib import Path
 
 import click
 
+from fleet_sim.street import SITES, SiteName, StreetOptions, street
 from fleet_sim.world import EDITS, STATES, World, read_world, write_world
 
 
@@ -22,13 +23,15 @@ def world() -> None:
 @world.command("write")
 @click.argument("file", type=click.Path(path_type=Path))
 @click.option("--seed", default=1, show_default=True, help="Seed of the street; the same seed gives the same world.")
-def write(file: Path, seed: int) -> None:
+@click.option("--length", "length_m", default=200.0, show_default=True, help="Length that is driven, 100 to 1000 m.")
+@click.option("--site", type=click.Choice(SITES), default="border", show_default=True, help="Where the street lies.")
+@click.option("--lat", "lat_deg", type=float, help="Latitude of its middle in degrees, instead of a site.")
+@click.option("--lon", "lon_deg", type=float, help="Longitude of its middle in degrees, instead of a site.")
+def write(file: Path, seed: int, length_m: float, site: SiteName, lat_deg: float | None, lon_deg: float | None) -> None:
     """Write the street of a seed to FILE (JSON)."""
-    from fleet_sim.street import street
-
-    made = street(seed)
+    made = street(seed, StreetOptions(length_m, site, lat_deg, lon_deg))
     write_world(made, file)
-    click.echo(f"{file}: {len(made.objects)} objects, seed {seed}")
+    click.echo(f"{file}: {len(made.objects)} objects, {length_m:g} m, seed {seed}")
 
 
 @world.command("inspect")

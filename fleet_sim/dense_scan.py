@@ -39,7 +39,7 @@ STANDS_AFTER: Final = BEFORE_KEPT | AFTER_KEPT | AFTER_COME
 
 CELLS: Final = 10
 """Sub-cells of a voxel along each axis."""
-_MAX_VOXELS: Final = 150_000
+_MAX_VOXELS: Final = 600_000
 _MARGIN_M: Final = 3.0
 _HEIGHT_M: Final = 24.0
 _GOLDEN: Final = 0.6180339887498949

@@ -7,89 +7,50 @@ modified, new and deleted voxels each have a few hundred examples.
 from collections.abc import Sequence
 from dataclasses import replace
 from math import pi
+from typing import Final
 
 import numpy as np
 
 from fleet_sim import parts
 from fleet_sim.parts import Lot
-from fleet_sim.shapes import Ball, Block, Post, Shape
+from fleet_sim.street_before import StreetPlan
+from fleet_sim.street_site import Site, x_of, y_of
+from fleet_sim.street_works import add_works
 from fleet_sim.world import Edit, WorldObject
 
-Gap = tuple[int, float, float]
-
-
-class Site:
-    """The objects of a street while they are being edited."""
-
-    def __init__(self, objects: Sequence[WorldObject], base_m: float) -> None:
-        self._objects = list(objects)
-        self.base_m = base_m
-
-    @property
-    def objects(self) -> tuple[WorldObject, ...]:
-        """Everything, untouched things first in their old order, then what the edits made."""
-        return tuple(self._objects)
-
-    def kept(self, kind: str) -> list[WorldObject]:
-        """Return the things of a kind that no edit has touched yet, nearest to the middle of the street first."""
-        return sorted((o for o in self._objects if o.kind == kind and o.edit == "kept"), key=lambda o: abs(_x_m(o)))
-
-    def add(self, name: str, kind: str, shapes: tuple[Shape, ...]) -> None:
-        """Put a thing that was not there before."""
-        self._objects.append(WorldObject(name, kind, ("after",), "added", shapes))
-
-    def remove(self, old: WorldObject) -> None:
-        """Take a thing away."""
-        self._swap(old, replace(old, states=("before",), edit="removed"))
-
-    def change(self, old: WorldObject, shapes: tuple[Shape, ...], edit: Edit) -> None:
-        """Give a thing other shapes."""
-        self._swap(old, replace(old, states=("before",), edit=edit))
-        self._objects.append(WorldObject(old.name, old.kind, ("after",), edit, shapes))
-
-    def shift(self, old: WorldObject, dx_m: float, dy_m: float) -> None:
-        """Move a thing."""
-        self.change(old, tuple(_shifted(shape, dx_m, dy_m) for shape in old.shapes), "moved")
-
-    def named(self, name: str) -> WorldObject:
-        """Return an untouched thing by its name."""
-        return next(o for o in self._objects if o.name == name and o.edit == "kept")
-
-    def _swap(self, old: WorldObject, new: WorldObject) -> None:
-        self._objects[self._objects.index(old)] = new
+_END_M: Final = 15.0
+"""Nothing is edited so near to the end of the street."""
 
 
 def rebuild(
     objects: Sequence[WorldObject],
-    lots: Sequence[Lot],
-    gaps: Sequence[Gap],
-    zone_side: int,
-    zone_x_m: float,
+    plan: StreetPlan,
     base_m: float,
     rng: np.random.Generator,
+    more: np.random.Generator,
 ) -> tuple[WorldObject, ...]:
     """Edit the street `before` into the street of both states.
 
     Args:
         objects: everything on the street before, all of it in both states.
-        lots: the buildings, in the order of their names.
-        gaps: alleys (side, x0, x1).
-        zone_side: side with the construction zone.
-        zone_x_m: middle of the construction zone along the street.
+        plan: buildings in the order of their names, alleys, and the place of the construction zone.
         base_m: height of the pavement.
         rng: decides the sizes.
+        more: the same for what happens on a longer street only.
     """
-    site = Site(objects, base_m)
+    site, lots, zone_x_m = Site(objects, base_m), plan.lots, plan.zone_x_m
     near = sorted(range(len(lots)), key=lambda i: abs(lots[i].x_m - zone_x_m))
-    here = [i for i in near if lots[i].side == zone_side]
-    there = [i for i in near if lots[i].side != zone_side]
+    here = [i for i in near if lots[i].side == plan.zone_side]
+    there = [i for i in near if lots[i].side != plan.zone_side]
+    reach_m = plan.half_length_m - _END_M
     _demolish(site, lots[here[0]], here[0], rng)
     _rebuild_fronts(site, lots, here, there, rng)
-    _construction_zone(site, zone_side, zone_x_m, rng)
-    _pavements(site, zone_side, zone_x_m)
-    _walls(site, rng)
-    _infill(site, gaps, zone_x_m)
-    _furniture(site, rng)
+    _construction_zone(site, plan.zone_side, zone_x_m, rng)
+    _pavements(site, plan.zone_side, zone_x_m)
+    _walls(site, reach_m, rng)
+    _infill(site, plan.gaps, zone_x_m)
+    _furniture(site, reach_m, rng)
+    add_works(site, lots, reach_m, more)
     return site.objects
 
 
@@ -146,17 +107,17 @@ def _pavements(site: Site, side: int, x: float) -> None:
     base = site.base_m
     wide = parts.slab(x + 18.0, x + 42.0, side * 5.0, side * 6.2, -1.0, base)
     site.add("kerb extension", "pavement", (wide,))
-    pieces = sorted((o for o in site.kept("pavement") if o.name.startswith(f"pavement {-side:+d} ")), key=_x_m)
-    for piece in [p for p in pieces if x - 45.0 < _x_m(p) < x - 18.0]:
+    pieces = sorted((o for o in site.kept("pavement") if o.name.startswith(f"pavement {-side:+d} ")), key=x_of)
+    for piece in [p for p in pieces if x - 45.0 < x_of(p) < x - 18.0]:
         site.remove(piece)
     site.add("terrace", "pavement", (parts.slab(x + 2.0, x + 24.0, -side * 7.2, -side * 10.3, -0.5, base + 0.35),))
 
 
-def _walls(site: Site, rng: np.random.Generator) -> None:
+def _walls(site: Site, reach_m: float, rng: np.random.Generator) -> None:
     """Walls moved by 0.3 to 2 m, one taken away, one raised."""
-    walls = [o for o in site.kept("wall") if abs(_x_m(o)) < 85.0]
+    walls = [o for o in site.kept("wall") if abs(x_of(o)) < reach_m]
     for old, dy in zip(walls[0:4], (0.3, 0.6, 1.2, 2.0), strict=False):
-        site.shift(old, 0.0, float(np.sign(_y_m(old))) * dy)
+        site.shift(old, 0.0, float(np.sign(y_of(old))) * dy)
     for old in walls[4:6]:
         site.remove(old)
     for index in range(2):
@@ -165,7 +126,7 @@ def _walls(site: Site, rng: np.random.Generator) -> None:
         site.add(f"new wall {index}", "wall", shapes)
 
 
-def _infill(site: Site, gaps: Sequence[Gap], x: float) -> None:
+def _infill(site: Site, gaps: Sequence[tuple[int, float, float]], x: float) -> None:
     """New shops in the alleys nearest to the zone, a kiosk on either pavement."""
     for index, (side, x0, x1) in enumerate(sorted(gaps, key=lambda gap: abs(gap[1] - x))[0:3]):
         lot = Lot(side, x0, x1, 10.4, 4.2 + index, 77 + index, site.base_m)
@@ -175,30 +136,18 @@ def _infill(site: Site, gaps: Sequence[Gap], x: float) -> None:
         site.add(f"kiosk {index}", "kiosk", (kiosk,))
 
 
-def _furniture(site: Site, rng: np.random.Generator) -> None:
+def _furniture(site: Site, reach_m: float, rng: np.random.Generator) -> None:
     """Signs, lamps, trees, cabinets and shelters: some moved, some gone, some new."""
     for kind, moved, removed in (("sign", 3, 3), ("lamp", 2, 1), ("cabinet", 2, 2), ("tree", 0, 4), ("shelter", 1, 0)):
-        found = [o for o in site.kept(kind) if abs(_x_m(o)) < 85.0]
+        found = [o for o in site.kept(kind) if abs(x_of(o)) < reach_m]
         order = rng.permutation(len(found)).tolist()
         for rank in order[0:moved]:
             site.shift(found[rank], float(rng.uniform(0.5, 3.0)) * float(rng.choice((-1.0, 1.0))), 0.0)
         for rank in order[moved : moved + removed]:
             site.remove(found[rank])
     for index in range(4):
-        side, x = (1, -1)[index % 2], float(rng.uniform(-75.0, 75.0))
+        side, x = (1, -1)[index % 2], float(rng.uniform(10.0 - reach_m, reach_m - 10.0))
         site.add(f"new sign {index}", "sign", parts.sign(x, side * 7.1, site.base_m, 0.9, 2.5, pi * (side < 0)))
     for index in range(3):
-        side, x = (1, -1)[index % 2], float(rng.uniform(-70.0, 70.0))
+        side, x = (1, -1)[index % 2], float(rng.uniform(15.0 - reach_m, reach_m - 15.0))
         site.add(f"new tree {index}", "tree", parts.tree(x, side * 8.1, site.base_m, int(rng.integers(2**31))))
-
-
-def _shifted(shape: Shape, dx_m: float, dy_m: float) -> Block | Post | Ball:
-    return replace(shape, x_m=round(shape.x_m + dx_m, 3), y_m=round(shape.y_m + dy_m, 3))
-
-
-def _x_m(o: WorldObject) -> float:
-    return o.shapes[0].x_m
-
-
-def _y_m(o: WorldObject) -> float:
-    return o.shapes[0].y_m
