@@ -1,0 +1,135 @@
+"""The segmenter: scans vote on each other's points, then objects are kept or removed as a whole."""
+
+from collections import deque
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from gnd_map.arrays import F32, F64
+from vehicle_agent.localise.estimates import PoseEstimate, RefinedScan
+from vehicle_agent.segment.evidence import belief
+from vehicle_agent.segment.kernels import components, moving_points
+from vehicle_agent.segment.parameters import SegmentParameters
+from vehicle_agent.segment.scene import Objects, RangeImage, find_all_objects, hash_table, image_of, judge_of
+
+I16 = NDArray[np.int16]
+Mask = NDArray[np.bool_]
+
+_S = 1_000_000_000
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class SegmentedScan:
+    """A scan and which of its points lie on moving objects: `moving` (N,) bool."""
+
+    scan: RefinedScan
+    moving: Mask
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Held:
+    """A scan that waits for later ones, in a third of its memory: points to 10 µm, origins to 0.1 mm."""
+
+    t_ns: int
+    estimate: PoseEstimate
+    centre_m: F64
+    points: F32
+    origins: I16
+    origin_step_m: float
+    objects: Objects | None
+
+    def restore(self) -> RefinedScan:
+        """The scan as it came."""
+        origins = self.origins * self.origin_step_m + self.centre_m
+        return RefinedScan(self.t_ns, self.points + self.centre_m, origins, self.estimate)
+
+
+class MotionSegmenter:
+    """Takes refined scans in time order; gives each back `future_s` later with its moving points marked."""
+
+    def __init__(self, parameters: SegmentParameters | None = None) -> None:
+        self.parameters = parameters or SegmentParameters()
+        self._judge = judge_of(self.parameters)
+        self._held: deque[_Held] = deque()
+        self._images: deque[RangeImage] = deque()
+
+    def push(self, scan: RefinedScan) -> list[SegmentedScan]:
+        """Take a scan; give those that no later scan will say anything about any more, oldest first."""
+        if not self.parameters.enabled:
+            return [SegmentedScan(scan, np.zeros(len(scan.points_map_m), np.bool_))]
+        p = self.parameters
+        self._take(scan)
+        return list(self._released(scan.t_ns - round(p.future_s * _S)))
+
+    def flush(self) -> Iterator[SegmentedScan]:
+        """Finish: give the scans that are still held, one by one (they are large)."""
+        yield from self._released(None)
+        self._images.clear()
+
+    def _take(self, scan: RefinedScan) -> None:
+        p, n = self.parameters, len(scan.points_map_m)
+        centre = scan.origins_map_m.mean(axis=0) if n else np.zeros(3)
+        points = (scan.points_map_m - centre).astype(np.float32)
+        origins = (scan.origins_map_m - centre).astype(np.float32)
+        objects = None
+        if n and scan.estimate.health == "good":
+            objects = find_all_objects(points, origins, p)
+            self._hear_the_past(scan.t_ns, objects, centre)
+            if not self._images or scan.t_ns - self._images[-1].t_ns >= p.every_s * _S - _S // 50:
+                R = scan.estimate.T_map_vehicle[:3, :3].T.copy()
+                image = image_of(scan.t_ns, centre, R, points, origins, objects.voxel_of, p)
+                self._tell_the_held(image)
+                self._images.append(image)
+        step_m = max(float(np.abs(origins).max(initial=0.0)) / 32767, 1e-4)
+        self._held.append(
+            _Held(scan.t_ns, scan.estimate, centre, points, np.rint(origins / step_m).astype(np.int16), step_m, objects)
+        )
+
+    def _hear_the_past(self, t_ns: int, objects: Objects, centre_m: F64) -> None:
+        p = self.parameters
+        while self._images and t_ns - self._images[0].t_ns > p.past_s * _S:
+            self._images.popleft()
+        for image in self._images:
+            if t_ns - image.t_ns >= p.apart_s * _S:
+                image.vote(objects.points, centre_m, self._judge, objects.passed, objects.met)
+
+    def _tell_the_held(self, image: RangeImage) -> None:
+        p = self.parameters
+        for held in self._held:
+            if p.apart_s * _S <= image.t_ns - held.t_ns <= p.future_s * _S and held.objects is not None:
+                image.vote(held.objects.points, held.centre_m, self._judge, held.objects.passed, held.objects.met)
+
+    def _released(self, until_ns: int | None) -> Iterator[SegmentedScan]:
+        while self._held and (until_ns is None or self._held[0].t_ns <= until_ns):
+            held = self._held.popleft()
+            yield SegmentedScan(held.restore(), self._moving(held))
+
+    def _moving(self, held: _Held) -> Mask:
+        objects = held.objects
+        if objects is None:
+            return np.zeros(len(held.points), np.bool_)
+        moves = decide(objects, self.parameters)
+        if not moves.any():
+            return np.zeros(len(held.points), np.bool_)
+        table = hash_table(int(moves.sum()))
+        return moving_points(held.points, objects.voxel_of, objects.index, moves, self.parameters.voxel_m, *table)
+
+
+def decide(objects: Objects, p: SegmentParameters) -> Mask:
+    """(V,) bool: voxels of moving objects.
+
+    An object moves as a whole when the share of its voxels that were passed is large; from one that stands, parts of
+    adjacent passed voxels are taken (somebody who walks along a wall).
+    """
+    moving, static = belief(objects.passed, objects.met, p.mass_moving, p.mass_static)
+    goes, stays = moving > static, static > moving
+    if not goes.any():
+        return goes
+    whole = components(objects.index, np.ones(len(goes), np.bool_), *hash_table(len(goes)))
+    n_goes, n_stays = np.bincount(whole, goes), np.bincount(whole, stays)
+    moves = (n_goes >= p.min_voxels) & (n_goes >= p.moving_share * (n_goes + n_stays))
+    part = components(objects.index, goes, *hash_table(int(goes.sum())))
+    large = np.append(np.bincount(part[part >= 0]) >= p.part_voxels, False)
+    return np.asarray(moves[whole] | large[part])
