@@ -1,4 +1,4 @@
-"""The vehicle's half of the loop on one page (GND, Figure 1): drive, download, localise, detect, report, upload."""
+"""The vehicle on one page (GND, Figure 1): drive, download, localise, segment, detect, report, upload."""
 
 import threading
 from typing import Any
@@ -30,10 +30,11 @@ def run_agent(config: AgentConfig, stop: threading.Event) -> dict[str, Any]:
         for item in vehicle.drive():  # recording -> usable measurements in time order
             if isinstance(item, Scan):
                 vehicle.download()  # position -> the tiles around and ahead, and what others changed
-            for scan in vehicle.localise(item):  # measurements + tiles -> scans with final poses
-                vehicle.detect(scan)  # rays + tiles -> evidence and new Gaussians
-                vehicle.report(scan)  # tiles left behind -> classes -> one report a district -> outbox
-        for scan in vehicle.localiser.flush():
+            for refined in vehicle.localise(item):  # measurements + tiles -> scans with final poses
+                for scan in vehicle.segment(refined):  # rays against rays of other scans -> which points are movers
+                    vehicle.detect(scan)  # rays + tiles -> evidence and new Gaussians
+                    vehicle.report(scan)  # tiles left behind -> classes -> one report a district -> outbox
+        for scan in vehicle.segment_the_rest():
             vehicle.detect(scan)
         vehicle.report_the_rest()
         vehicle.upload()  # outbox -> acknowledged

@@ -8,6 +8,7 @@ from fleet_bus.links import LinkProfile
 from vehicle_agent.detect.parameters import DetectParameters
 from vehicle_agent.errors import AgentConfigError
 from vehicle_agent.localise.parameters import LocaliserParameters
+from vehicle_agent.segment.parameters import SegmentParameters
 
 
 @dataclass(frozen=True, slots=True)
@@ -70,6 +71,7 @@ class AgentConfig:
     """How long the agent looks for a router when it starts."""
     ledger_dir: Path | None = None
     localise: LocaliserParameters = field(default_factory=LocaliserParameters)
+    segment: SegmentParameters = field(default_factory=SegmentParameters)
     detect: DetectParameters = field(default_factory=DetectParameters)
     download: DownloadParameters = field(default_factory=DownloadParameters)
     report: ReportParameters = field(default_factory=ReportParameters)

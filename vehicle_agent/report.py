@@ -17,8 +17,9 @@ from schemas.report_id import deterministic_report_id
 from vehicle_agent.config import ReportParameters
 from vehicle_agent.detect.classify import classify, tile_change
 from vehicle_agent.detect.detector import ChangeDetector
-from vehicle_agent.localise.estimates import PoseEstimate, RefinedScan
+from vehicle_agent.localise.estimates import PoseEstimate
 from vehicle_agent.outbox import Outbox
+from vehicle_agent.segment.segmenter import SegmentedScan
 from vehicle_agent.surroundings import left_behind
 
 STEP_M = 3.0  # tiles left behind are looked for after this much way
@@ -78,14 +79,16 @@ class Reporter:
         self._stretch: _Stretch | None = None
         self._looked_at: F64 | None = None
 
-    def add_scan(self, scan: RefinedScan) -> None:
+    def add_scan(self, segmented: SegmentedScan) -> None:
         """Count the scan's rays, if its pose is good enough to speak about the world."""
-        estimate = scan.estimate
+        scan, estimate = segmented.scan, segmented.scan.estimate
         if estimate.health != "good" or estimate.sigma_m > self._parameters.max_sigma_m:
             self.counts["scans_uncertain"] += 1
             return
         self.counts["scans_used"] += 1
-        self.counts["rays"] += self._detector.add_scan(scan.points_map_m, scan.origins_map_m)
+        self.counts["points"] += len(segmented.moving)
+        self.counts["moving_points"] += int(segmented.moving.sum())
+        self.counts["rays"] += self._detector.add_scan(scan.points_map_m, scan.origins_map_m, segmented.moving)
         self._lengthen(scan.t_ns, estimate)
 
     def leave_behind(self, estimate: PoseEstimate, odometer_m: float) -> None:

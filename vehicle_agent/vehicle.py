@@ -27,9 +27,13 @@ from vehicle_agent.place import Place
 from vehicle_agent.report import Identity, Reporter
 from vehicle_agent.result import Evaluation, HealthTimeline
 from vehicle_agent.scans import Guard
+from vehicle_agent.segment.segmenter import MotionSegmenter, SegmentedScan
 from vehicle_agent.surroundings import Surroundings
 from vehicle_agent.telemetry import Telemetry
 from vehicle_agent.updates import Updates
+
+COUNTS = ("scans_used", "scans_uncertain", "points", "moving_points", "rays", "changed_voxels")
+"""What the reporter counts, as `result.json` names it."""
 
 _log = logging.getLogger(__name__)
 
@@ -45,6 +49,7 @@ class Vehicle:
     surroundings: Surroundings
     updates: Updates
     localiser: Localiser
+    segmenter: MotionSegmenter
     reporter: Reporter
     place: Place
     evaluation: Evaluation
@@ -99,14 +104,24 @@ class Vehicle:
             return self.localiser.push_scan(item)
         return []
 
-    def detect(self, scan: RefinedScan) -> None:
-        """Count the rays of a scan whose pose is final."""
-        self.evaluation.estimates.append(scan.estimate)
-        self.reporter.add_scan(scan)
+    def segment(self, scan: RefinedScan) -> list[SegmentedScan]:
+        """Compare the scan with those before and after it; gives the scans whose movers are known now."""
+        return self.segmenter.push(scan)
 
-    def report(self, scan: RefinedScan) -> None:
+    def segment_the_rest(self) -> Iterator[SegmentedScan]:
+        """The scans that wait in the lags of localisation and segmentation: the drive has ended."""
+        for refined in self.localiser.flush():
+            yield from self.segmenter.push(refined)
+        yield from self.segmenter.flush()
+
+    def detect(self, segmented: SegmentedScan) -> None:
+        """Count the rays of a scan whose pose is final and whose movers are known."""
+        self.evaluation.estimates.append(segmented.scan.estimate)
+        self.reporter.add_scan(segmented)
+
+    def report(self, segmented: SegmentedScan) -> None:
         """Decide the tiles that this scan's pose has left behind; a district left behind goes to the outbox."""
-        self.reporter.leave_behind(scan.estimate, self.place.odometer_m)
+        self.reporter.leave_behind(segmented.scan.estimate, self.place.odometer_m)
 
     def report_the_rest(self) -> None:
         """Decide and report everything: the drive has ended."""
@@ -159,7 +174,7 @@ class Vehicle:
             "scans_bad": dict(self.guard.bad),
             "scans_dropped": self.localiser.dropped_scans,
             "scans_refined": len(self.evaluation.estimates),
-            **{name: counts[name] for name in ("scans_used", "scans_uncertain", "rays", "changed_voxels")},
+            **{name: counts[name] for name in COUNTS},
             "classes": dict(self.reporter.classes),
         }
 
@@ -220,6 +235,7 @@ def _assemble(config: AgentConfig, header: DriveHeader, fix: GnssFix, link: Link
         surroundings=surroundings,
         updates=Updates(link.bus, link.cache, link.fetcher, surroundings.replace),
         localiser=Localiser(local_map, header.T_vehicle_lidar, config.localise),
+        segmenter=MotionSegmenter(config.segment),
         reporter=Reporter(detector, link.outbox, identity, fix.t_ns, config.report),
         place=Place(frame, fix),
         evaluation=Evaluation.between(frame, header.anchor),

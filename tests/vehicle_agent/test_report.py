@@ -16,6 +16,7 @@ from vehicle_agent.local_map import LocalMap
 from vehicle_agent.localise.estimates import PoseEstimate, RefinedScan
 from vehicle_agent.outbox import Outbox
 from vehicle_agent.report import Identity, Reporter
+from vehicle_agent.segment import SegmentedScan
 
 START_NS = 1_570_838_400_000_000_000
 WHO = Identity("vehicle-7", "drive-7", "VLP-16", "ndt")
@@ -49,9 +50,10 @@ def estimate(x_m: float = 0.0, sigma_m: float = 0.03, health: str = "good") -> P
     return PoseEstimate(START_NS, T, sigma_m, 0.001, 0.9, health)  # type: ignore[arg-type]
 
 
-def scan(hits: np.ndarray, t_s: float = 0.0, **kwargs: float | str) -> RefinedScan:
+def scan(hits: np.ndarray, t_s: float = 0.0, **kwargs: float | str) -> SegmentedScan:
     pose = estimate(**kwargs)  # type: ignore[arg-type]
-    return RefinedScan(START_NS + int(t_s * 1e9), hits, np.broadcast_to(SENSOR, hits.shape), pose)
+    refined = RefinedScan(START_NS + int(t_s * 1e9), hits, np.broadcast_to(SENSOR, hits.shape), pose)
+    return SegmentedScan(refined, np.zeros(len(hits), np.bool_))
 
 
 def reports(outbox: Outbox) -> list[ChangeReport]:
