@@ -74,15 +74,15 @@ def add_works(site: Site, lots: Sequence[Lot], reach_m: float, rng: np.random.Ge
 
 
 def _new_fronts(work: Work, rng: np.random.Generator) -> None:
-    """Two neighbours get another relief; one of them grows."""
-    for building, taller in zip(work.nearest("building", 2), (0.0, 3.0), strict=False):
+    """Neighbours get another relief; one of them grows."""
+    for building, taller in zip(work.nearest("building", 3), (0.0, 3.0, 0.0), strict=False):
         lot = work.lot(building)
         work.rebuild(building, "reshaped", height_m=lot.height_m + taller, style=int(rng.integers(2**31)))
 
 
 def _moved_fronts(work: Work, rng: np.random.Generator) -> None:
-    """Two neighbours' fronts move by half a metre, one forwards, one backwards."""
-    for building, sign in zip(work.nearest("building", 2), (1.0, -1.0), strict=False):
+    """Neighbours' fronts move by half a metre, forwards or backwards."""
+    for building, sign in zip(work.nearest("building", 3), (1.0, -1.0, 1.0), strict=False):
         forward = sign * float(rng.uniform(0.35, 0.7))
         work.rebuild(building, "moved", front_m=work.lot(building).front_m - forward)
 
@@ -107,10 +107,13 @@ def _scaffolding(work: Work, rng: np.random.Generator) -> None:
 
 
 def _wider_pavement(work: Work, rng: np.random.Generator) -> None:
-    """The kerb comes out on some 20 m, bollards on it."""
+    """The kerb comes out on some 20 m; a terrace is raised before the houses, one of which gets another front."""
     half, base = float(rng.uniform(8.0, 12.0)), work.site.base_m
-    work.add("pavement", parts.slab(work.x_m - half, work.x_m + half, work.side * 5.0, work.side * 6.2, -1.0, base))
-    work.add("bollards", *parts.bollards(work.x_m - 4.0, 6, work.side * 5.4, base))
+    x0, x1 = work.x_m - half, work.x_m + half
+    work.add("pavement", parts.slab(x0, x1, work.side * 5.0, work.side * 6.2, -1.0, base))
+    work.add("pavement", parts.slab(x0, x1, work.side * 7.2, work.side * 10.3, -0.5, base + 0.35))
+    for building in work.nearest("building"):
+        work.rebuild(building, "reshaped", style=int(rng.integers(2**31)))
 
 
 def _lay_by(work: Work, rng: np.random.Generator) -> None:
@@ -125,16 +128,17 @@ def _lay_by(work: Work, rng: np.random.Generator) -> None:
 
 
 def _planting(work: Work, rng: np.random.Generator) -> None:
-    """A tree is felled, one is planted elsewhere, a lamp is moved out of its way."""
+    """A tree is felled, one is planted elsewhere, the house behind it is built anew nearer to the road."""
     for tree in work.nearest("tree"):
         work.site.remove(tree)
     work.add("tree", *parts.tree(work.x_m + 6.0, work.side * 8.1, work.site.base_m, int(rng.integers(2**31))))
-    for lamp in work.nearest("lamp"):
-        work.site.shift(lamp, float(rng.uniform(1.0, 3.0)), 0.0)
+    for building in work.nearest("building"):
+        front_m = max(10.4, work.lot(building).front_m - float(rng.uniform(0.5, 1.5)))
+        work.rebuild(building, "reshaped", front_m=front_m, style=int(rng.integers(2**31)))
 
 
 def _walling(work: Work, rng: np.random.Generator) -> None:
-    """A front wall moves back, another is raised, a sign is moved."""
+    """A front wall moves back, another is raised, a house front moves back."""
     walls = [o for o in work.nearest("wall", 5) if o.name.startswith("wall")]
     for wall in walls[:1]:
         work.site.shift(wall, 0.0, work.side * float(rng.uniform(0.4, 1.5)))
@@ -142,8 +146,8 @@ def _walling(work: Work, rng: np.random.Generator) -> None:
         lot = work.lot(wall)
         raised = parts.wall(lot.x0_m + 0.3, lot.x1_m - 2.5, work.side * 10.35, 2.3, work.site.base_m)
         work.site.change(wall, raised, "reshaped")
-    for sign in work.nearest("sign"):
-        work.site.shift(sign, float(rng.uniform(0.5, 3.0)), 0.0)
+    for building in work.nearest("building"):
+        work.rebuild(building, "moved", front_m=work.lot(building).front_m + float(rng.uniform(0.4, 0.8)))
 
 
 _KINDS: Final[tuple[Callable[[Work, np.random.Generator], None], ...]] = (
