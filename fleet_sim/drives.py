@@ -11,8 +11,9 @@ from numpy.typing import NDArray
 
 from fleet_sim.cars import parked_cars
 from fleet_sim.errors import DriveSimError
-from fleet_sim.lidar import MODELS, Lidar, LidarModel, column_poses
+from fleet_sim.lidar import Lidar, column_poses
 from fleet_sim.raycast import Scene
+from fleet_sim.sensors import MODELS, LidarModel
 from fleet_sim.trajectory import Direction, DrivingStyle, gauss_markov, lane_motion
 from fleet_sim.world import State, World
 from gnd_map.se3 import exp_so3
@@ -68,7 +69,7 @@ class DriveConfig:
 
     Attributes:
         vehicle: pseudonym written into the recording.
-        sensor: model name, one of `lidar.MODELS`.
+        sensor: model name, one of `sensors.MODELS`.
         state: the world's state that it drives through.
         direction: +1 along the street, -1 against it.
         seed: everything random of this drive.
@@ -78,7 +79,7 @@ class DriveConfig:
         gnss_hz: rate of the GNSS.
         errors: of the vehicle's sensors.
         start_ns: UTC of the first scan.
-        mount_height_m: height of the LiDAR over the road.
+        mount_height_m: height of the LiDAR over the road, None for the usual one of the model.
     """
 
     vehicle: str
@@ -92,7 +93,7 @@ class DriveConfig:
     gnss_hz: int = 10
     errors: SensorErrors = field(default_factory=SensorErrors)
     start_ns: int = EPOCH_NS
-    mount_height_m: float = 1.9
+    mount_height_m: float | None = None
 
     def __post_init__(self) -> None:
         if self.sensor not in MODELS:
@@ -109,9 +110,10 @@ class DriveConfig:
 
     @property
     def T_vehicle_lidar(self) -> NDArray[np.float64]:
-        """Mounting pose as the vehicle knows it, float64 (4, 4): on the roof, level, looking ahead."""
+        """Mounting pose as the vehicle knows it, float64 (4, 4): the model's place, level, looking ahead."""
+        x, y, z = self.model.mount_m
         T = np.eye(4)
-        T[:3, 3] = (1.2, 0.0, self.mount_height_m)
+        T[:3, 3] = x, y, z if self.mount_height_m is None else self.mount_height_m
         return T
 
 
@@ -147,7 +149,7 @@ class DriveSimulation:
 
     Attributes:
         motion: the true motion; its time 0 is `config.start_ns`.
-        scans: number of LiDAR revolutions.
+        scans: number of LiDAR sweeps.
     """
 
     def __init__(self, world: World, config: DriveConfig) -> None:

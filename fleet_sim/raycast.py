@@ -329,7 +329,7 @@ def _cast_rays(
 def cast_sweep(
     poses: FloatArray,
     directions: FloatArray,
-    share: float,
+    shares: FloatArray,
     range_m: float,
     p: FloatArray,
     starts: IntArray,
@@ -339,7 +339,7 @@ def cast_sweep(
 ) -> tuple[FloatArray, IntArray, FloatArray]:
     """Cast directions (columns, beams, 3) from poses (columns + 1, 3, 4), both towards the street frame.
 
-    Beam j leaves at the fraction j * share of its cycle; the affine pose between two cycles is interpolated entry by
+    Beam j leaves at the fraction shares[j] of its cycle; the affine pose between two cycles is interpolated entry by
     entry, which over 55 µs is exact to far below a micrometre.
     """
     columns, beams = directions.shape[0], directions.shape[1]
@@ -349,7 +349,7 @@ def cast_sweep(
         for j in range(beams):
             for k in range(12):
                 here, there = poses[i, k // 4, k % 4], poses[i + 1, k // 4, k % 4]
-                T[k // 4, k % 4] = here + j * share * (there - here)
+                T[k // 4, k % 4] = here + shares[j] * (there - here)
             d = directions[i, j]
             dx = T[0, 0] * d[0] + T[0, 1] * d[1] + T[0, 2] * d[2]
             dy = T[1, 0] * d[0] + T[1, 1] * d[1] + T[1, 2] * d[2]

@@ -7,8 +7,8 @@ import pytest
 
 from fleet_sim.drives import EPOCH_NS, PERFECT, DriveConfig, DriveSimulation, SensorErrors, simulate_drive
 from fleet_sim.errors import DriveSimError
-from fleet_sim.lidar import HDL32E
 from fleet_sim.prepare import agent_configs, mapping_configs
+from fleet_sim.sensors import HDL32E
 from fleet_sim.trajectory import DrivingStyle, gauss_markov, lane_motion
 from fleet_sim.world import World
 from gnd_map.errors import GndError

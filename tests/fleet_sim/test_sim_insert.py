@@ -7,8 +7,9 @@ from sim_worlds import small_world
 from fleet_sim.dense_scan import world_grid
 from fleet_sim.errors import SimError
 from fleet_sim.insert import Inserter, surface_points, surface_voxels
-from fleet_sim.lidar import VLP16, Lidar
+from fleet_sim.lidar import Lidar
 from fleet_sim.raycast import Scene
+from fleet_sim.sensors import VLP16
 from fleet_sim.shapes import Block, Post, Shape
 from gnd_map.se3 import exp_so3
 
@@ -34,7 +35,7 @@ def points_and_poses(shapes: list[Shape]) -> tuple[np.ndarray, np.ndarray, np.nd
     """Noise-free points of a sweep, the exact pose of each, and the primitive that it lies on."""
     poses = moving_poses()
     hits = Lidar(VLP16).hits(Scene.build(shapes), poses)
-    share = np.arange(16) * VLP16.shot_ns / VLP16.cycle_ns
+    share = VLP16.shares
     T = poses[:-1, None] + share[None, :, None, None] * (poses[1:] - poses[:-1])[:, None]
     seen = hits.primitive >= 0
     points = VLP16.directions()[seen] * hits.range_m[seen][:, None]
