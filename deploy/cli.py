@@ -16,6 +16,7 @@ COMMANDS: Final[dict[str, tuple[str, str]]] = {
     "map": ("tile_store.cli:map_group", "Build, inspect, compare, export and roll back maps."),
     "import": ("vehicle_agent.importer_cli:import_drives", "Turn a recording (KITTI, RADIATE, PCD) into a drive."),
     "sim": ("fleet_sim.cli:sim", "Write and look at simulated worlds and drives."),
+    "reproduce": ("benchmarks.cli:reproduce", "Reproduce the papers' results and set ours beside them."),
     "router": ("fleet_bus.cli:router", "Run the Zenoh router alone."),
     "store": ("tile_store.cli:store", "Run the tile server alone."),
     "merger": ("cloud_merger.cli:merger", "Run one merger shard alone."),

@@ -1,0 +1,100 @@
+"""The map that every vehicle starts with, and its file."""
+
+import hashlib
+import json
+import zipfile
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from benchmarks.simulation.errors import FolderError
+from benchmarks.simulation.fleet import survey_configs
+from benchmarks.simulation.pose_source import PoseSource
+from benchmarks.simulation.poses import FromReference
+from fleet_sim.drives import DriveSimulation
+from fleet_sim.world import World
+from gnd_map.accumulate import VoxelAccumulator
+from gnd_map.gaussian import Gaussians
+from gnd_map.grid import GridFrame
+from gnd_map.tile import Tile
+from gnd_map.tile_id import TileId, covering_circle
+from vehicle_agent.local_map import LocalMap
+
+_COLUMNS = ("voxel_id", "count", "cells", "mean_m", "cov_m2")
+_MAX_RANGE_M, _MIN_RANGE_M = 80.0, 2.0
+
+
+@dataclass(frozen=True)
+class BaseMap:
+    """Tiles of the state before, all of version 1."""
+
+    tiles: Mapping[TileId, Gaussians]
+
+    @cached_property
+    def shas(self) -> dict[TileId, bytes]:
+        """Content hash of each tile."""
+        return {tile_id: Tile(tile_id, 1, gaussians).sha for tile_id, gaussians in self.tiles.items()}
+
+    @cached_property
+    def sha(self) -> str:
+        """Content hash of the whole map, hexadecimal."""
+        return hashlib.sha256(b"".join(self.shas[tile_id] for tile_id in sorted(self.shas))).hexdigest()
+
+
+def surveyed(before: Mapping[TileId, Gaussians]) -> BaseMap:
+    """Return the truth's own Gaussians of the state before as map, as in the paper (sections 6.1 and 6.3)."""
+    return BaseMap({tile_id: before[tile_id] for tile_id in sorted(before) if len(before[tile_id])})
+
+
+def driven(world: World) -> BaseMap:
+    """Return the map that the mapping vehicle makes: an HDL-32E up and down the empty street, poses exact."""
+    radius_m = world.half_length_m + 2 * _MAX_RANGE_M
+    grid_frame = GridFrame.around(world.frame, covering_circle(world.lat_rad, world.lon_rad, radius_m))
+    accumulator = VoxelAccumulator(grid_frame)
+    for config in survey_configs(world.seed):
+        simulation = DriveSimulation(world, config)
+        poses = FromReference(simulation.header(), LocalMap(grid_frame), PoseSource("true", 0.0, 0.0), 0)
+        for item in simulation.items():
+            for scan in poses.push(item):
+                range_m = np.linalg.norm(scan.points_map_m - scan.origins_map_m, axis=1)
+                accumulator.add(scan.points_map_m[(range_m >= _MIN_RANGE_M) & (range_m <= _MAX_RANGE_M)])
+    return surveyed(accumulator.finish())
+
+
+def write_base(base: BaseMap, path: Path) -> None:
+    """Write the map as .npz; the file appears complete or not at all."""
+    ids = sorted(base.tiles)
+    arrays: dict[str, Any] = {"head": np.array(json.dumps({"format": "gnd.base", "sha": base.sha}))}
+    arrays["morton"] = np.array([i.morton for i in ids], np.int64)
+    arrays["length"] = np.array([len(base.tiles[i]) for i in ids], np.int64)
+    for name in _COLUMNS:
+        arrays[name] = np.concatenate([getattr(base.tiles[i], name) for i in ids])
+    partial = path.with_name(f".{path.name}.part")
+    with partial.open("wb") as file:
+        np.savez(file, **arrays)
+    partial.replace(path)
+
+
+def read_base(path: Path) -> BaseMap:
+    """Read a map.
+
+    Raises:
+        FolderError: it is missing or damaged.
+    """
+    try:
+        with np.load(path, allow_pickle=False) as file:
+            data = dict(file)
+        stops = np.cumsum(data["length"])
+        tiles = {}
+        for code, stop, n in zip(data["morton"].tolist(), stops.tolist(), data["length"].tolist(), strict=True):
+            tiles[TileId(code)] = Gaussians(*(data[name][stop - n : stop] for name in _COLUMNS))
+        base = BaseMap(tiles)
+        if json.loads(str(data["head"]))["sha"] != base.sha:
+            raise FolderError(f"the base map {path} is damaged: its content is not what was written")
+        return base
+    except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile) as error:
+        raise FolderError(f"cannot read the base map {path}: {error}") from error

@@ -1,0 +1,72 @@
+"""Maps against the truth: what was stale, what single drives make of it, what the fleet makes of it."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from benchmarks.simulation.cloud import map_of_one, merged_map
+from benchmarks.simulation.result import VehicleResult, read_result
+from benchmarks.simulation.worlds import WorldFiles, read_world_base
+from cloud_merger.merge import MergeParameters
+from fleet_sim.evaluate import Evaluation, Score, evaluate_maps
+from fleet_sim.truth import LEVELS, Level, read_truth
+
+STALE = "stale"
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Scored:
+    """One map compared with the truth: confusion matrices int64 (5, 5) by level, rows true, columns predicted."""
+
+    confusion: dict[Level, NDArray[np.int64]]
+
+    @classmethod
+    def of(cls, evaluation: Evaluation) -> "Scored":
+        """Keep the matrices of an evaluation."""
+        return cls({level: evaluation.scores[level].confusion for level in LEVELS})
+
+    def score(self, level: Level) -> Score:
+        """Return the score of a level."""
+        return Score(level, self.confusion[level])
+
+    def f1(self, level: Level = "scored") -> float:
+        """Return the macro F1 of a level, percent."""
+        return self.score(level).macro_f1
+
+
+@dataclass(frozen=True, slots=True)
+class VehicleFile:
+    """A vehicle's result in the cache."""
+
+    path: Path
+    key: str
+
+    def read(self) -> VehicleResult:
+        """Read it."""
+        return read_result(self.path, self.key)
+
+
+def score_single(files: WorldFiles, vehicles: Sequence[VehicleFile]) -> dict[str, Scored]:
+    """Return the stale map's score and that of each vehicle alone, by name."""
+    truth, base = read_truth(files.truth), read_world_base(files)
+    found = {STALE: Scored.of(evaluate_maps(truth, base.tiles, base.tiles))}
+    for vehicle in vehicles:
+        result = vehicle.read()
+        found[result.vehicle] = Scored.of(evaluate_maps(truth, base.tiles, map_of_one(base, result.reports)))
+    return found
+
+
+def score_fleet(
+    files: WorldFiles, vehicles: Sequence[VehicleFile], numbers: Sequence[int], merge: MergeParameters
+) -> dict[int, Scored]:
+    """Return the score of the merged map of the first n vehicles, for each n asked for."""
+    truth, base = read_truth(files.truth), read_world_base(files)
+    results = [vehicle.read() for vehicle in vehicles[: max(numbers)]]
+    found = {}
+    for n in numbers:
+        bodies = [body for result in results[:n] for body in result.reports]
+        found[n] = Scored.of(evaluate_maps(truth, base.tiles, merged_map(base, bodies, merge)))
+    return found

@@ -1,0 +1,90 @@
+"""A reproduction as tables for people, the paper's figures and our targets beside ours."""
+
+from collections.abc import Mapping
+from typing import Any
+
+from rich.console import Console, Group
+from rich.table import Table
+from rich.text import Text
+
+from benchmarks.simulation import reference
+from fleet_sim.truth import LEVELS
+
+
+def tables_of(found: Mapping[str, Any], asked: "list[int]") -> Group:
+    """Return the scores, the classes of the largest fleet, and its confusion matrix."""
+    largest = str(max(asked))
+    return Group(
+        _scores(found, asked),
+        Text(),
+        _classes("merged map", largest, found["fleet"][largest]["classes"]["scored"]),
+        Text(),
+        _confusion(found, largest),
+    )
+
+
+def print_tables(found: Mapping[str, Any], asked: "list[int]") -> None:
+    """Print the tables on standard output."""
+    Console().print(tables_of(found, asked))
+
+
+def _scores(found: Mapping[str, Any], asked: "list[int]") -> Table:
+    seeds = ", ".join(map(str, found["seeds"]))
+    title = (
+        f"Macro F1 in percent, world seed {seeds}: {found['parameters']['mode']}, poses {found['parameters']['poses']}"
+    )
+    table = _table(title, "", *LEVELS, "paper", "must", "aim", "upload kB")
+    table.add_row("stale map", *_f1(found["stale"]), f"{reference.STALE}", "", "", "")
+    for sensor, stage in found["single"].items():
+        table.add_row(f"one drive, {sensor}", *_f1(stage), "", "", "", _kb(found["upload_bytes"]["single"][sensor]))
+    target = target_single(found)
+    if target:
+        must, aim = reference.MUST["single"], reference.AIM["single"]
+        values = [f"{target[level]:.2f}" for level in LEVELS]
+        table.add_row("one drive, 16/32 layers", *values, f"{reference.SINGLE}", f"{must}", f"{aim}", "", style="bold")
+    for n in asked:
+        stage, name = found["fleet"][str(n)], f"fleet.{n}"
+        paper = {**reference.FLEET, **reference.FLEET_READ_OFF}.get(n, "")
+        row = [str(paper), str(reference.MUST.get(name, "")), str(reference.AIM.get(name, ""))]
+        size = _kb(found["upload_bytes"]["fleet"][str(n)])
+        style = "bold" if name in reference.MUST else ""
+        table.add_row(f"{n} vehicle{'s' * (n > 1)}", *_f1(stage), *row, size, style=style)
+    return table
+
+
+def target_single(found: Mapping[str, Any]) -> dict[str, float] | None:
+    """Return the mean F1 of one drive over the 16- and 32-layer sensors that drove, by level; None if none did."""
+    stages = [found["single"][sensor] for sensor in reference.TARGET_SENSORS if sensor in found["single"]]
+    if not stages:
+        return None
+    return {level: sum(stage["f1"][level] for stage in stages) / len(stages) for level in LEVELS}
+
+
+def _classes(title: str, n: str, classes: Mapping[str, Mapping[str, float]]) -> Table:
+    table = _table(f"Classes of the {title}, {n} vehicles, scored voxels", "", "precision", "recall", "F1")
+    for name, score in classes.items():
+        table.add_row(name, *(f"{score[key]:.2f}" for key in ("precision", "recall", "f1")))
+    return table
+
+
+def _confusion(found: Mapping[str, Any], n: str) -> Table:
+    names = found["confusion"]["classes"]
+    table = _table(f"Confusion, {n} vehicles, scored voxels (rows: truth)", "", *names)
+    for name, row in zip(names, found["confusion"]["fleet"][n]["scored"], strict=True):
+        table.add_row(name, *(f"{value:,}" for value in row))
+    return table
+
+
+def _table(title: str, *columns: str) -> Table:
+    table = Table(title=title, title_justify="left", box=None, pad_edge=False)
+    for column in columns:
+        table.add_column(column.replace("_", " "), justify="right" if column else "left")
+    return table
+
+
+def _f1(stage: Mapping[str, Any]) -> list[str]:
+    return [f"{stage['f1'][level]:.2f}" for level in LEVELS]
+
+
+def _kb(size: float) -> str:
+    return f"{size / 1000:,.1f}"

@@ -1,0 +1,260 @@
+"""One vehicle from measurements to uploads, in one process: localise, segment, detect, report, as the agent does."""
+
+from collections import Counter
+from collections.abc import Callable, Collection, Iterable, Iterator
+from dataclasses import asdict, dataclass
+from itertools import chain
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from time import process_time
+from typing import Any
+
+import numpy as np
+
+from benchmarks.simulation.base_map import BaseMap, read_base
+from benchmarks.simulation.errors import ReproduceError
+from benchmarks.simulation.held_tiles import HeldTiles
+from benchmarks.simulation.masses import Watch, Watcher
+from benchmarks.simulation.method import MethodParameters
+from benchmarks.simulation.pose_source import PoseSource
+from benchmarks.simulation.poses import FromReference, Localisation, Localising
+from benchmarks.simulation.result import EVIDENCE, VehicleResult, write_result
+from benchmarks.simulation.voxel_rows import VoxelRows
+from fleet_sim.drives import DriveConfig, DriveSimulation
+from fleet_sim.world import read_world
+from gnd_map.arrays import I32
+from gnd_map.classes import ChangeClass
+from gnd_map.geodesy import LocalFrame
+from gnd_map.grid import GridFrame
+from gnd_map.motion import Trajectory
+from gnd_map.similarity import similarity
+from gnd_map.tile_id import TileId
+from schemas.drive import DriveHeader, DriveItem, GnssFix, ReferencePose, Scan
+from schemas.drive_mcap import DriveWriter
+from vehicle_agent.detect.classify import classify
+from vehicle_agent.detect.detector import ChangeDetector
+from vehicle_agent.detect.evidence import TileEvidence
+from vehicle_agent.errors import LocaliseError
+from vehicle_agent.local_map import LocalMap
+from vehicle_agent.localise.estimates import PoseEstimate, localisation_error
+from vehicle_agent.outbox import Outbox
+from vehicle_agent.place import Place
+from vehicle_agent.report import Identity, Reporter
+from vehicle_agent.scans import Guard
+from vehicle_agent.segment import MotionSegmenter, SegmentedScan
+
+Tick = Callable[[int, int], None]
+"""Told (scans done, scans in all); may raise `Stopped`."""
+
+_ALL_LETTERS = 1_000_000
+
+
+@dataclass(frozen=True, slots=True)
+class VehicleTask:
+    """One vehicle's work, as it is handed to a process.
+
+    Attributes:
+        world, base, voxels: files of the world, the base map, and the truth's voxels (their ids only).
+        sensor: short name.
+        drive: what is simulated.
+        poses: where the poses come from.
+        method: parameters of the vehicle.
+        result: file to write, under `key`.
+        watch: voxels to write down scan by scan.
+        recording: keep the drive in this MCAP file, too.
+    """
+
+    world: Path
+    base: Path
+    voxels: Path
+    sensor: str
+    drive: DriveConfig
+    poses: PoseSource
+    method: MethodParameters
+    result: Path
+    key: str
+    watch: Watch | None = None
+    recording: Path | None = None
+
+
+def run_vehicle(task: VehicleTask, tick: Tick) -> None:
+    """Simulate a drive, run the vehicle on it and write its result."""
+    simulation = DriveSimulation(read_world(task.world), task.drive)
+    items = ticking(simulation.items(), tick, simulation.scans)
+    if task.recording is not None:
+        items = recorded(items, simulation.header(), task.recording)
+    result = drive(simulation.header(), items, read_base(task.base), VoxelRows.read(task.voxels), task)
+    write_result(result, task.key, task.result)
+
+
+def ticking(items: Iterable[DriveItem], tick: Tick, scans: int) -> Iterator[DriveItem]:
+    """Pass items on; tell `tick` about every scan that has been worked on."""
+    done = 0
+    for item in items:
+        yield item
+        if isinstance(item, Scan):
+            done += 1
+            tick(done, scans)
+
+
+def recorded(items: Iterable[DriveItem], header: DriveHeader, path: Path) -> Iterator[DriveItem]:
+    """Pass items on and write them to an MCAP file, which appears when all have passed."""
+    with DriveWriter(path, header) as writer:
+        for item in items:
+            writer.add(item)
+            yield item
+
+
+def drive(
+    header: DriveHeader, items: Iterable[DriveItem], base: BaseMap, voxels: VoxelRows, task: VehicleTask
+) -> VehicleResult:
+    """Run the vehicle over the measurements of one drive.
+
+    Args:
+        header: of the drive.
+        items: in time order, from the simulation or from a recording: the result is the same.
+        base: the map it starts with.
+        voxels: the truth's voxels, about which evidence is kept for the analysis of errors.
+        task: sensor, poses, parameters.
+
+    Raises:
+        ReproduceError: the drive has no GNSS fix.
+    """
+    started_s = process_time()
+    with TemporaryDirectory() as folder:
+        outbox = Outbox(Path(folder) / "outbox.sqlite")
+        try:
+            run = _Run(header, items, base, outbox, task)
+            run.to_the_end()
+            reports = tuple(letter.body for letter in outbox.due(2**62, _ALL_LETTERS))
+        finally:
+            outbox.close()
+    row, evidence = voxels.columns(run.detector.taken, lambda found: evidence_columns(found, task.method))
+    stats = run.stats() | {"cpu_s": round(process_time() - started_s, 2)}
+    return VehicleResult(task.drive.vehicle, task.sensor, reports, row, evidence, stats, run.watched())
+
+
+class RecordingDetector(ChangeDetector):
+    """The detector, which also keeps the evidence that was taken out of it."""
+
+    taken: list[TileEvidence]
+
+    def finish(self, tiles: Collection[TileId]) -> dict[TileId, TileEvidence]:
+        """Take out the evidence of tiles, and keep it."""
+        found = super().finish(tiles)
+        self.taken = [*getattr(self, "taken", []), *found.values()]
+        return found
+
+
+class _Run:
+    """The parts of one vehicle, put together as `vehicle_agent.vehicle` does."""
+
+    def __init__(
+        self, header: DriveHeader, items: Iterable[DriveItem], base: BaseMap, outbox: Outbox, task: VehicleTask
+    ) -> None:
+        fix, self._items = _first_fix(iter(items))
+        start = TileId.from_geodetic(fix.lat_rad, fix.lon_rad)
+        frame, method = LocalFrame.of_tile(start), task.method
+        local_map = LocalMap(GridFrame.around(frame, [start]))
+        self.detector = RecordingDetector(local_map, method.detect)
+        self.detector.taken = []
+        self._held = HeldTiles(base, local_map, self.detector)
+        self._place = Place(frame, fix)
+        self._guard = Guard()
+        self._localisation = _localisation(header, local_map, task)
+        self._segmenter = MotionSegmenter(method.segment)
+        who = Identity(header.vehicle, header.drive_id, header.sensor_model, "ndt", "gnd reproduce simulation")
+        self._reporter = Reporter(self.detector, outbox, who, fix.t_ns, method.report)
+        self._watcher = Watcher(task.watch, base, local_map.grid_frame, method.detect) if task.watch else None
+        self._estimates: list[PoseEstimate] = []
+        self._reference: list[ReferencePose] = []
+        self._T_map_anchor = frame.T_self_other(header.anchor)
+        self._counts: Counter[str] = Counter()
+
+    def to_the_end(self) -> None:
+        """The loop of `vehicle_agent.agent`, with the base map at hand and the outbox as the end."""
+        for item in self._guard.usable(self._items):
+            if isinstance(item, ReferencePose):
+                self._reference.append(item)
+            if isinstance(item, Scan):
+                self._counts["scans"] += 1
+                self._held.follow(self._place)
+            for refined in self._localisation.push(item):
+                for scan in self._segmenter.push(refined):
+                    self._detect(scan)
+            self._place.take(item, self._localisation.online)
+        for scan in self._rest():
+            self._detect(scan)
+        self._reporter.report_all(self._place.odometer_m)
+
+    def _rest(self) -> Iterator[SegmentedScan]:
+        for refined in self._localisation.flush():
+            yield from self._segmenter.push(refined)
+        yield from self._segmenter.flush()
+
+    def _detect(self, segmented: SegmentedScan) -> None:
+        self._estimates.append(segmented.scan.estimate)
+        self._reporter.add_scan(segmented)
+        if self._watcher is not None:
+            self._watcher.add_scan(segmented)
+        self._reporter.leave_behind(segmented.scan.estimate, self._place.odometer_m)
+
+    def watched(self) -> tuple[Any, Any]:
+        """What the watcher saw, empty without one."""
+        if self._watcher is None:
+            return np.zeros(0, np.int64), np.zeros((0, 0, 4), np.int32)
+        return self._watcher.history()
+
+    def stats(self) -> dict[str, Any]:
+        """Counts of the drive and errors of its poses."""
+        counts = self._reporter.counts
+        names = ("scans_used", "scans_uncertain", "points", "moving_points", "rays", "changed_voxels", "reports")
+        found: dict[str, Any] = {"scans": self._counts["scans"], **{name: counts[name] for name in names}}
+        found["way_m"] = round(self._place.odometer_m, 2)
+        found["classes"] = dict(self._reporter.classes)
+        found["poses"] = self._pose_errors()
+        return found
+
+    def _pose_errors(self) -> dict[str, float] | None:
+        t_ns = np.array([pose.t_ns for pose in self._reference], np.int64)
+        T = self._T_map_anchor @ np.stack([pose.T_map_vehicle for pose in self._reference])
+        try:
+            return {k: round(v, 5) for k, v in asdict(localisation_error(self._estimates, Trajectory(t_ns, T))).items()}
+        except LocaliseError:
+            return None
+
+
+def _first_fix(items: Iterator[DriveItem]) -> tuple[GnssFix, Iterator[DriveItem]]:
+    """The first position, which places the map frame, and all items again."""
+    before: list[DriveItem] = []
+    for item in items:
+        before.append(item)
+        if isinstance(item, GnssFix):
+            return item, chain(before, items)
+    raise ReproduceError("the drive has no GNSS fix: the vehicle would not know where it is")
+
+
+def _localisation(header: DriveHeader, local_map: LocalMap, task: VehicleTask) -> Localisation:
+    if task.poses.kind == "estimated":
+        return Localising(header, local_map, task.method.localise)
+    return FromReference(header, local_map, task.poses, task.drive.seed)
+
+
+def evidence_columns(found: TileEvidence, method: MethodParameters) -> dict[str, I32]:
+    """Return the columns `EVIDENCE` of a tile's evidence, int32 (K,) each."""
+    columns = {name: getattr(found, name) for name in EVIDENCE if name.startswith("n_")}
+    columns["cells"] = found.measured.cells
+    rows, base = np.flatnonzero(found.in_map), found.base.gaussians
+    at, new = found.map_row[rows], found.measured
+    columns["map_cells"], columns["similar_pct"] = np.zeros((2, len(found)), np.int32)
+    if len(rows):
+        columns["map_cells"][rows] = base.cells[at]
+        alike = similarity(
+            base.exists[at], base.mean_m[at], base.cov_m2[at], new.exists[rows], new.mean_m[rows], new.cov_m2[rows]
+        )
+        columns["similar_pct"][rows] = np.round(100 * alike)
+    columns["change_class"] = classify(found, method.detect).change_class.astype(np.int32)
+    return columns
+
+
+NOT_SEEN = int(ChangeClass.UNMEASURED)

@@ -1,0 +1,97 @@
+"""One world of a reproduction: street, truth, base map, made once and kept in files."""
+
+from dataclasses import dataclass
+from pathlib import Path
+
+from benchmarks.simulation.base_map import BaseMap, driven, read_base, surveyed, write_base
+from benchmarks.simulation.errors import FolderError
+from benchmarks.simulation.folder import RunFolder
+from benchmarks.simulation.options import RunOptions
+from benchmarks.simulation.sources import SIMULATOR, key_of, sources_sha
+from benchmarks.simulation.voxel_rows import VoxelRows
+from fleet_sim.street import StreetOptions, street
+from fleet_sim.truth import Truth, load_or_make_truth, world_sha
+from fleet_sim.world import World, write_world
+
+
+@dataclass(frozen=True, slots=True)
+class WorldFiles:
+    """The files of one world; `name` tells seed, length and place."""
+
+    home: Path
+    base_kind: str
+
+    @property
+    def world(self) -> Path:
+        """The street."""
+        return self.home / "world.json"
+
+    @property
+    def truth(self) -> Path:
+        """What changed."""
+        return self.home / "truth.npz"
+
+    @property
+    def voxels(self) -> Path:
+        """The truth's voxels, ids only."""
+        return self.home / "voxels.npz"
+
+    @property
+    def base(self) -> Path:
+        """The map that every vehicle starts with."""
+        return self.home / f"base-{self.base_kind}.npz"
+
+
+def world_name(seed: int, options: StreetOptions) -> str:
+    """Return the name of a world's folder."""
+    place = options.site if options.lat_deg is None else f"{options.lat_deg:g}N{options.lon_deg:g}E"
+    return f"seed-{seed}-{options.length_m:g}m-{place}"
+
+
+def world_files(folder: RunFolder, seed: int, options: RunOptions) -> WorldFiles:
+    """Return where a world's files lie."""
+    return WorldFiles(folder.world(world_name(seed, options.street)), options.base)
+
+
+def prepare_world(files: WorldFiles, seed: int, options: RunOptions) -> None:
+    """Make what is missing of a world: street, truth, base map. What is there is checked and used again."""
+    world = street(seed, options.street)
+    write_world(world, files.world)
+    truth = _truth(files, world)
+    VoxelRows.of(truth).write(files.voxels)
+    if options.base == "surveyed":
+        write_base(surveyed(truth.before), files.base)
+    elif not _usable(files, world):
+        write_base(driven(world), files.base)
+        _key_file(files).write_text(_base_key(world), encoding="utf-8")
+
+
+def _truth(files: WorldFiles, world: World) -> Truth:
+    """The truth, made again when the programs that make it have changed."""
+    by, now = files.home / "truth_made_by.txt", sources_sha(SIMULATOR)
+    if files.truth.exists() and not (by.exists() and by.read_text(encoding="utf-8") == now):
+        files.truth.unlink()
+    truth = load_or_make_truth(world, files.truth)
+    by.write_text(now, encoding="utf-8")
+    return truth
+
+
+def _usable(files: WorldFiles, world: World) -> bool:
+    try:
+        read_base(files.base)
+        return _key_file(files).read_text(encoding="utf-8") == _base_key(world)
+    except (FolderError, OSError):
+        return False
+
+
+def _key_file(files: WorldFiles) -> Path:
+    return files.base.with_suffix(".key")
+
+
+def _base_key(world: World) -> str:
+    return key_of(world=world_sha(world), sources=sources_sha(SIMULATOR))
+
+
+def read_world_base(files: WorldFiles) -> BaseMap:
+    """Return the map that every vehicle starts with."""
+    return read_base(files.base)
