@@ -12,7 +12,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fleet_sim.errors import SceneError
-from fleet_sim.raycast import FloatArray, IntArray, Scene, cast_sweep
+from fleet_sim.ray_kernels import FloatArray, IntArray, cast_sweep
+from fleet_sim.raycast import Scene
 from fleet_sim.sensors import LidarModel
 from fleet_sim.shapes import reflectivity_of
 
