@@ -44,7 +44,7 @@ def simulation(json_file: str | None, out: Path, jobs: int | None, keep_drives: 
     from rich.console import Console
 
     from benchmarks.simulation.folder import RunFolder
-    from benchmarks.simulation.run import plain_options, reproduce
+    from benchmarks.simulation.run import plain_options, plain_worlds, reproduce
     from benchmarks.simulation.summary import summary_of
     from benchmarks.simulation.tables import print_tables
     from deploy.live import progress_bars
@@ -53,6 +53,7 @@ def simulation(json_file: str | None, out: Path, jobs: int | None, keep_drives: 
     folder.write_mark({"options": plain_options(options)})
     with progress_bars(Console(stderr=True)) as progress:
         outcome = reproduce(options, folder, jobs or os.cpu_count() or 1, progress, keep_drives=keep_drives)
+    folder.write_mark({"options": plain_options(options), "worlds": plain_worlds(outcome, folder)})
     found = summary_of(outcome)
     folder.write_json("result.json", found)
     if json_file == "-":

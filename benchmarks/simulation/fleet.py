@@ -2,9 +2,10 @@
 
 import numpy as np
 
-from benchmarks.simulation.options import SHORT_NAMES, RunOptions
+from benchmarks.simulation.options import RunOptions
 from fleet_sim.drives import EPOCH_NS, DriveConfig
 from fleet_sim.prepare import mapping_configs
+from fleet_sim.sensors import SHORT_NAMES
 
 _HOUR_NS = 3_600 * 1_000_000_000
 

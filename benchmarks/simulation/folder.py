@@ -54,6 +54,17 @@ class RunFolder:
             raise FolderError(f"{self.root} holds no run of `gnd reproduce simulation`: {_MARK} is of another kind")
         return found
 
+    def finished(self) -> dict[str, Any]:
+        """Return what the folder says about its last run, which has ended.
+
+        Raises:
+            FolderError: it holds no such run, or one that has not ended.
+        """
+        found = self.mark()
+        if not found.get("worlds"):
+            raise FolderError(f"the run in {self.root} has not ended: start it again, it continues where it was")
+        return found
+
     def write_mark(self, content: dict[str, Any]) -> None:
         """Say what runs here."""
         self.write_json(_MARK, {"format": _FORMAT, **content})

@@ -6,12 +6,11 @@ from typing import Literal
 from benchmarks.simulation.errors import OptionError
 from benchmarks.simulation.method import MethodParameters, Mode
 from benchmarks.simulation.pose_source import PoseSource
+from fleet_sim.sensors import SHORT_NAMES
 from fleet_sim.street import StreetOptions
 
 Base = Literal["surveyed", "driven"]
 
-ALL_SENSORS = ("vlp16", "hdl32e")
-SHORT_NAMES = {"vlp16": "VLP-16", "hdl32e": "HDL-32E"}
 _MOST_VEHICLES = 200
 
 
@@ -37,7 +36,7 @@ class RunOptions:
     seeds: tuple[int, ...] = (101,)
     street: StreetOptions = field(default_factory=lambda: StreetOptions(400.0, "wangsimni"))
     vehicles: tuple[int, ...] = (1, 5, 9, 20)
-    sensors: tuple[str, ...] = ALL_SENSORS
+    sensors: tuple[str, ...] = tuple(SHORT_NAMES)
     parking: float = 0.2
     traffic: bool = True
     mode: Mode = "default"

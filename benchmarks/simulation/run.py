@@ -32,6 +32,7 @@ class WorldOutcome:
         seed: the world's.
         files: where it lies.
         vehicles: results in the order of the fleet.
+        kept: their files.
         single: score of the stale map and of each vehicle alone, by name.
         fleet: score of the merged map by number of vehicles.
     """
@@ -39,6 +40,7 @@ class WorldOutcome:
     seed: int
     files: WorldFiles
     vehicles: tuple[VehicleResult, ...]
+    kept: tuple[VehicleFile, ...]
     single: dict[str, Scored]
     fleet: dict[int, Scored]
 
@@ -164,7 +166,7 @@ def _scores(
         single = next(results)
         fleet = {n: scored for _ in shares for n, scored in next(results).items()}
         read = tuple(vehicle.read() for vehicle in of_world)
-        found.append(WorldOutcome(seed, files[seed], read, single, dict(sorted(fleet.items()))))
+        found.append(WorldOutcome(seed, files[seed], read, tuple(of_world), single, dict(sorted(fleet.items()))))
     return tuple(found)
 
 
@@ -177,3 +179,15 @@ def _shares(numbers: range, processes: int) -> list[list[int]]:
 def plain_options(options: RunOptions) -> dict[str, Any]:
     """Return the options as plain values, for files and JSON."""
     return {**to_mapping(options), "poses": str(options.poses)}
+
+
+def plain_worlds(outcome: Outcome, folder: RunFolder) -> list[dict[str, Any]]:
+    """Return where the results of each world lie, relative to the folder."""
+    return [
+        {
+            "seed": world.seed,
+            "folder": str(world.files.home.relative_to(folder.root)),
+            "vehicles": [{"file": str(v.path.relative_to(folder.root)), "key": v.key} for v in world.kept],
+        }
+        for world in outcome.worlds
+    ]

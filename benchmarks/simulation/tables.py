@@ -1,7 +1,7 @@
 """A reproduction as tables for people, the paper's figures and our targets beside ours."""
 
 from collections.abc import Mapping
-from typing import Any
+from typing import Any, Final
 
 from rich.console import Console, Group
 from rich.table import Table
@@ -9,6 +9,8 @@ from rich.text import Text
 
 from benchmarks.simulation import reference
 from fleet_sim.truth import LEVELS
+
+_PLAIN_WIDTH: Final = 120
 
 
 def tables_of(found: Mapping[str, Any], asked: "list[int]") -> Group:
@@ -25,7 +27,10 @@ def tables_of(found: Mapping[str, Any], asked: "list[int]") -> Group:
 
 def print_tables(found: Mapping[str, Any], asked: "list[int]") -> None:
     """Print the tables on standard output."""
-    Console().print(tables_of(found, asked))
+    console = Console()
+    if not console.is_terminal:
+        console = Console(width=_PLAIN_WIDTH)
+    console.print(tables_of(found, asked))
 
 
 def _scores(found: Mapping[str, Any], asked: "list[int]") -> Table:
