@@ -24,7 +24,8 @@ def sample_scan(points_m: NDArray[np.floating], parameters: SamplingParameters) 
     limits = (parameters.min_range_m**2, parameters.max_range_m**2)
     kept = _first_in_cubes(np.ascontiguousarray(points_m), stride, 1.0 / parameters.leaf_m, *limits, chosen)
     every = max(1.0, kept / parameters.n_points)
-    return chosen[:kept][np.arange(0.0, kept, every).astype(np.int64)]
+    # Counted, not stepped: stepping a float up to `kept` may give one more, at `kept` itself.
+    return chosen[(np.arange(min(kept, parameters.n_points)) * every).astype(np.int64)]
 
 
 @kernel
