@@ -6,84 +6,35 @@ spread. Kept are, for each voxel of the GND grid: which of its 10 cm sub-cells (
 on what kind of surface, and how many rays passed through in either state.
 """
 
-from collections.abc import Iterator
 from dataclasses import dataclass
-from math import radians, tau
 from typing import Final, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
+from fleet_sim.dense_rays import AFTER_COME, AFTER_KEPT, BEFORE_GONE, BEFORE_KEPT, ScanPlan, Shots, shots
 from fleet_sim.errors import TruthError
-from fleet_sim.raycast import Scene
-from fleet_sim.world import STATES, State, World
+from fleet_sim.world import World
 from gnd_map.accumulate import VoxelAccumulator
-from gnd_map.grid import GridFrame
+from gnd_map.grid import GridFrame, zones
 from gnd_map.jit import kernel
 from gnd_map.near_grid import grid_near
 from gnd_map.tile_id import covering_corridor
 
+__all__ = ["AFTER_COME", "AFTER_KEPT", "BEFORE_GONE", "BEFORE_KEPT", "DenseScan", "ScanPlan", "Window", "dense_scans"]
+
 FloatArray = NDArray[np.float64]
 
-BEFORE_KEPT: Final = 1
-"""Sub-cell hit before, on something that still stands after."""
-BEFORE_GONE: Final = 2
-"""Sub-cell hit before, on something that does not stand after."""
-AFTER_KEPT: Final = 4
-"""Sub-cell hit after, on something that stood before."""
-AFTER_COME: Final = 8
-"""Sub-cell hit after, on something that did not stand before."""
 KNOWN_BEFORE: Final = BEFORE_KEPT | BEFORE_GONE
 STANDS_AFTER: Final = BEFORE_KEPT | AFTER_KEPT | AFTER_COME
 """What an ideal map holds after: all that was ever seen and still stands."""
 
 CELLS: Final = 10
 """Sub-cells of a voxel along each axis."""
-_MAX_VOXELS: Final = 600_000
+_FIRST_VOXELS: Final = 1 << 16
+_MAX_VOXELS: Final = 1 << 20
 _MARGIN_M: Final = 3.0
 _HEIGHT_M: Final = 24.0
-_GOLDEN: Final = 0.6180339887498949
-
-
-@dataclass(frozen=True, slots=True)
-class ScanPlan:
-    """Where the dense scan looks from, and how finely.
-
-    Attributes:
-        spacing_m: distance of the scanner's places along each lane.
-        end_margin_m: the first and last place are so far from the street's ends.
-        sensor_m: height over the road.
-        step_rad: angle between rays, both ways.
-        low_rad, high_rad: field of view: HDL-32E's lowest to VLP-16's highest beam.
-        range_m: reach of the rays.
-        pass_stride: every n-th ray is followed through the voxels that it passes.
-    """
-
-    spacing_m: float = 1.0
-    end_margin_m: float = 2.0
-    sensor_m: float = 1.9
-    step_rad: float = radians(0.5)
-    low_rad: float = radians(-31.0)
-    high_rad: float = radians(15.0)
-    range_m: float = 50.0
-    pass_stride: int = 7
-
-    def origins_street(self, world: World) -> FloatArray:
-        """Return the scanner's places, float64 (K, 3), street frame."""
-        reach = world.half_length_m - self.end_margin_m
-        x = np.arange(-reach, reach + 1e-9, self.spacing_m)
-        lanes = [np.stack([x, np.full_like(x, side * world.lane_offset_m)], axis=1) for side in (-1, 1)]
-        xy = np.concatenate(lanes)
-        return np.column_stack([xy, world.road_height_m(xy[:, 1]) + self.sensor_m])
-
-    def directions_street(self, index: int) -> FloatArray:
-        """Return unit ray directions, float64 (N, 3), of place `index`; its raster is shifted so as to fill gaps."""
-        shift = (index * _GOLDEN) % 1.0, (index * _GOLDEN**2) % 1.0
-        elevation = np.arange(self.low_rad, self.high_rad - self.step_rad, self.step_rad) + shift[0] * self.step_rad
-        azimuth = np.arange(0.0, tau, self.step_rad) + shift[1] * self.step_rad
-        flat, up = np.cos(elevation)[:, None], np.sin(elevation)[:, None]
-        parts = np.broadcast_arrays(flat * np.cos(azimuth), flat * np.sin(azimuth), up)
-        return np.stack(parts, axis=-1).reshape(-1, 3)
 
 
 class Window(NamedTuple):
@@ -125,89 +76,119 @@ class DenseScan:
 
     def count(self, flags: int) -> NDArray[np.int32]:
         """Return how many sub-cells of each voxel carry any of the flags, int32 (V,)."""
-        counts = np.append(((self.cells & flags) != 0).sum(axis=1), 0)
-        return np.asarray(counts[self.row], dtype=np.int32)
+        return np.append(_counted(self.cells, flags), np.int32(0))[self.row]
 
 
-def world_grid(world: World, half_width_m: float = 60.0) -> GridFrame:
-    """Return the voxel grid of a world's street and its surroundings."""
+def world_grids(world: World, half_width_m: float = 60.0) -> tuple[GridFrame, ...]:
+    """Return the voxel grids of a world's street and its surroundings: one, or two where a zone of latitude ends."""
     x = np.array([-world.half_length_m - half_width_m, world.half_length_m + half_width_m])
     ends = world.map_of_street(np.stack([x, np.zeros(2), np.zeros(2)], axis=1))
     lat, lon, _ = world.frame.geodetic_from_enu(ends)
-    return GridFrame.around(world.frame, covering_corridor(lat, lon, half_width_m))
+    tiles = covering_corridor(lat, lon, half_width_m)
+    return tuple(GridFrame.around(world.frame, group) for group in zones(tiles).values())
 
 
-def dense_scan(world: World, plan: ScanPlan) -> DenseScan:
-    """Scan both states of a world.
+def world_grid(world: World) -> GridFrame:
+    """Return the voxel grid of a world that lies in one zone of latitude.
+
+    Raises:
+        TruthError: it lies in several; see `world_grids`.
+    """
+    grids = world_grids(world)
+    if len(grids) > 1:
+        raise TruthError(f"the world lies in {len(grids)} zones of latitude, each with a grid of its own")
+    return grids[0]
+
+
+def dense_scans(world: World, plan: ScanPlan) -> list[DenseScan]:
+    """Scan both states of a world, into one result for each zone of latitude that it lies in.
+
+    Nothing is compared across the border of two zones: there, a voxel has no neighbour.
 
     Raises:
         TruthError: more voxels with hits than there is room for.
     """
-    grid = world_grid(world)
-    window = _window(world, plan, grid)
-    index = np.full(window.nx * window.ny * window.nz, -1, dtype=np.int32)
-    passes = np.zeros((2, len(index)), dtype=np.int32)
-    cells = np.zeros((_MAX_VOXELS, CELLS**3), dtype=np.uint8)
-    before, after = VoxelAccumulator(grid), VoxelAccumulator(grid)
-    used = 0
-    for shots in _shots(world, plan):
-        g_origin, g_ends = grid_near(grid, shots.origin[None, :])[0], grid_near(grid, shots.ends)
-        _pass(g_origin, g_ends[:: plan.pass_stride], window, passes[shots.state])
-        used = _mark(g_ends, shots.flags, window, index, cells, used)
-        if used < 0:
-            raise TruthError(f"more than {_MAX_VOXELS} voxels were hit: use a shorter street")
-        before.add(shots.ends[(shots.flags & KNOWN_BEFORE) != 0])
-        after.add(shots.ends[((shots.flags & STANDS_AFTER) != 0) & shots.fresh])
-    touched = np.flatnonzero((index >= 0) | (passes[0] > 0) | (passes[1] > 0))
-    row, seen = index[touched], cells[:used]
-    changes = np.append(_unexplained(window, index, seen, used), np.zeros((1, 3), np.int32), axis=0)[row]
-    shell = _shell(window, index, seen, touched)
-    g = (np.stack(np.unravel_index(touched, window[3:]), axis=1) + np.array(window[:3])).astype(np.int32)
-    return DenseScan(grid, g, seen, row, passes[:, touched].T.copy(), changes, shell, before, after)
+    windows = [(grid, _window(world, plan, grid)) for grid in world_grids(world)]
+    tallies = [_Tally(grid, window) for grid, window in windows if window.ny > 0]
+    for each in shots(world, plan):
+        for tally in tallies:
+            tally.take(each, plan.pass_stride)
+    return [tally.result() for tally in tallies]
 
 
-class _Shots(NamedTuple):
-    """Rays of one place in one state.
+def dense_scan(world: World, plan: ScanPlan) -> DenseScan:
+    """Scan both states of a world that lies in one zone of latitude.
 
-    Index of the state, origin (3,) and ends (N, 3) in metres in the map frame, flags uint8 (N,), and bool (N,): false
-    for a ray before that ends at the same point after, and would be counted twice there.
+    Raises:
+        TruthError: it lies in several, or has more voxels with hits than there is room for.
     """
-
-    state: int
-    origin: FloatArray
-    ends: FloatArray
-    flags: NDArray[np.uint8]
-    fresh: NDArray[np.bool_]
+    found = dense_scans(world, plan)
+    if len(found) > 1:
+        raise TruthError(f"the world lies in {len(found)} zones of latitude, use dense_scans")
+    return found[0]
 
 
-def _shots(world: World, plan: ScanPlan) -> Iterator[_Shots]:
-    scenes = [Scene.build(world.shapes(state), world.A_street_map) for state in STATES]
-    flags = [_flags(world, state) for state in STATES]
-    origins = world.map_of_street(plan.origins_street(world))
-    for place, origin in enumerate(origins):
-        directions = world.map_of_street(plan.directions_street(place))
-        directions /= np.linalg.norm(directions, axis=1, keepdims=True)
-        casts = [scene.cast(origin, directions, plan.range_m) for scene in scenes]
-        for state, (ranges, hit) in enumerate(casts):
-            ends = origin + np.minimum(ranges, plan.range_m)[:, None] * directions
-            fresh = np.ones(len(ends), dtype=np.bool_) if state else casts[0][0] != casts[1][0]
-            yield _Shots(state, origin, ends, flags[state][hit], fresh)
+class _Tally:
+    """What shots leave in the voxels of one grid."""
 
+    def __init__(self, grid: GridFrame, window: Window) -> None:
+        size = window.nx * window.ny * window.nz
+        self._grid, self._window = grid, window
+        self._index = np.full(size, -1, dtype=np.int32)
+        self._passes = np.zeros((2, size), dtype=np.int32)
+        self._cells = np.zeros((_FIRST_VOXELS, CELLS**3), dtype=np.uint8)
+        self._used = 0
+        self._before, self._after = VoxelAccumulator(grid), VoxelAccumulator(grid)
 
-def _flags(world: World, state: State) -> NDArray[np.uint8]:
-    """Flag of a hit on each primitive of a state; the last entry, for index -1, says that nothing was hit."""
-    kept, changed = (BEFORE_KEPT, BEFORE_GONE) if state == "before" else (AFTER_KEPT, AFTER_COME)
-    each = [kept if len(o.states) == len(STATES) else changed for o in world.in_state(state) for _ in o.shapes]
-    return np.array([*each, 0], dtype=np.uint8)
+    def take(self, shots: Shots, pass_stride: int) -> None:
+        """Count rays."""
+        g_origin, g_ends = grid_near(self._grid, shots.origin[None, :])[0], grid_near(self._grid, shots.ends)
+        _pass(g_origin, g_ends[::pass_stride], self._window, self._passes[shots.state])
+        self._mark(g_ends, shots.flags)
+        self._before.add(shots.ends[(shots.flags & KNOWN_BEFORE) != 0])
+        self._after.add(shots.ends[((shots.flags & STANDS_AFTER) != 0) & shots.fresh])
+
+    def _mark(self, g_ends: FloatArray, flags: NDArray[np.uint8]) -> None:
+        """Set the flags of sub-cells; marking twice does no harm, so a table that was full is made larger first."""
+        while (used := _mark(g_ends, flags, self._window, self._index, self._cells, self._used)) < 0:
+            self._used = len(self._cells)
+            if self._used >= _MAX_VOXELS:
+                raise TruthError(f"more than {_MAX_VOXELS} voxels were hit: use a shorter street")
+            self._cells = np.concatenate([self._cells, np.zeros_like(self._cells)])
+        self._used = used
+
+    def result(self) -> DenseScan:
+        """Return what was counted."""
+        window, index, passes, seen = self._window, self._index, self._passes, self._cells[: self._used]
+        touched = np.flatnonzero((index >= 0) | (passes[0] > 0) | (passes[1] > 0))
+        row = index[touched]
+        changes = np.append(_unexplained(window, index, seen, self._used), np.zeros((1, 3), np.int32), axis=0)[row]
+        shell = _shell(window, index, seen, touched)
+        g = (np.stack(np.unravel_index(touched, window[3:]), axis=1) + np.array(window[:3])).astype(np.int32)
+        seen_passes = passes[:, touched].T.copy()
+        return DenseScan(self._grid, g, seen, row, seen_passes, changes, shell, self._before, self._after)
 
 
 def _window(world: World, plan: ScanPlan, grid: GridFrame) -> Window:
+    """The voxels around the street that lie in the grid's zone."""
     reach = world.half_length_m + plan.range_m + _MARGIN_M
     corners = np.array([(x, y, z) for x in (-reach, reach) for y in (-reach, reach) for z in (-1, 1)], dtype=np.float64)
     corners *= np.array([1.0, (plan.range_m + world.kerb_m) / reach, _HEIGHT_M])
     g = np.floor(grid.grid_of(world.map_of_street(corners))).astype(int)
     low, high = g.min(axis=0), g.max(axis=0) + 1
+    first, last = grid.lat_index_range
+    low[1], high[1] = max(low[1], first * grid.ny), min(high[1], (last + 1) * grid.ny)
     return Window(*low.tolist(), *(high - low).tolist())
+
+
+@kernel
+def _counted(cells: NDArray[np.uint8], flags: int) -> NDArray[np.int32]:
+    """Number of sub-cells of each row that carry any of the flags, (M,)."""
+    found = np.zeros(len(cells), np.int32)
+    for row in range(len(cells)):
+        for cell in range(CELLS**3):
+            found[row] += (cells[row, cell] & flags) != 0
+    return found
 
 
 @kernel

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from sim_worlds import BOTH, COARSE, small_world, thing
 
+import fleet_sim.dense_rays
 import fleet_sim.dense_scan
 import fleet_sim.truth
 from fleet_sim import parts
@@ -148,7 +149,7 @@ def test_the_rules_are_fixed() -> None:
     }
 
 
-@pytest.mark.parametrize("module", [fleet_sim.truth, fleet_sim.dense_scan])
+@pytest.mark.parametrize("module", [fleet_sim.truth, fleet_sim.dense_scan, fleet_sim.dense_rays])
 def test_truth_uses_nothing_of_the_method(module: object) -> None:
     tree = ast.parse(inspect.getsource(module))  # type: ignore[arg-type]
     imports = {n.module for n in ast.walk(tree) if isinstance(n, ast.ImportFrom)}
