@@ -1,6 +1,7 @@
 """Pictures of a map as coloured ellipsoids, as in Figure 16 of the GND paper: from above, and in perspective."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from math import ceil
 from pathlib import Path
 from typing import Any, Final
 
@@ -10,6 +11,7 @@ from matplotlib.collections import EllipseCollection
 from matplotlib.colors import to_rgb
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
+from matplotlib.patheffects import withStroke
 from numpy.typing import NDArray
 
 from fleet_sim.ellipsoids import Ellipsoids, Tiles, ellipsoids_of_maps, ellipsoids_of_truth
@@ -30,6 +32,17 @@ _SKY: Final = "#e9eef5"
 _HALF_WIDTH_M: Final = 24.0
 _NEAR_M: Final = 4.0
 _FOCAL: Final = 1.75
+_HALO: Final = [withStroke(linewidth=3.0, foreground=_PAPER)]
+_WIDTH_IN: Final = 12.6
+_MARGIN_IN: Final = 0.378
+_PANEL_IN: Final = 0.94 * _WIDTH_IN
+_HEAD_IN: Final = 0.924
+_ROW_IN: Final = 2.646
+_PERSPECTIVE_IN: Final = 4.494
+_GAP_IN: Final = 0.126
+_FOOT_IN: Final = 0.21
+_LONGEST_ROW_M: Final = 260.0
+"""A longer street is shown from above in several rows."""
 _ARROW: Final = {"arrowstyle": "-|>", "color": _INK, "linewidth": 1.6}
 
 
@@ -63,6 +76,14 @@ class View:
         focus = float(np.median(changed)) if len(changed) else 0.0
         return View(tuple(middle.tolist()), float(np.arctan2(axis[1], axis[0])), max(reach, 20.0), focus)
 
+    def rows(self) -> "list[View]":
+        """Return views of equal stretches, none longer than a row of the picture, in order along the street."""
+        count = max(1, ceil(2 * self.half_length_m / _LONGEST_ROW_M))
+        half = self.half_length_m / count
+        along = self.R_view_map.T @ np.array([1.0, 0.0, 0.0])
+        middles = np.array(self.origin_m) + np.outer((2 * np.arange(count) + 1 - count) * half, along)
+        return [replace(self, origin_m=(x, y, z), half_length_m=half) for x, y, z in middles.tolist()]
+
     @property
     def R_view_map(self) -> FloatArray:
         """Rotation (3, 3) from the map frame to x along the street, y to the left, z up."""
@@ -71,7 +92,9 @@ class View:
 
 
 def draw_map(ellipsoids: Ellipsoids, path: Path, title: str, note: str = "", view: View | None = None) -> None:
-    """Draw a map from above and in perspective, with legend and scale, as one PNG (about 1900 x 1260 pixels).
+    """Draw a map from above and in perspective, with legend and scale, as one PNG.
+
+    It has about 1900 x 1260 pixels; a street of more than 260 m is shown from above in several rows, 400 pixels each.
 
     Args:
         ellipsoids: what to draw.
@@ -84,13 +107,23 @@ def draw_map(ellipsoids: Ellipsoids, path: Path, title: str, note: str = "", vie
         SimError: the file cannot be written.
     """
     view = view or View.around(ellipsoids)
-    figure = Figure(figsize=(12.6, 8.4), dpi=_DPI, facecolor=_PAPER)
-    figure.text(0.03, 0.957, title, fontsize=19, weight="bold", color=_INK, va="center")
-    figure.text(0.03, 0.922, note, fontsize=11, color="#5a6675", va="center")
-    _legend(figure, ellipsoids)
-    _from_above(figure.add_axes((0.03, 0.575, 0.94, 0.315)), ellipsoids, view)
-    _in_perspective(figure.add_axes((0.03, 0.025, 0.94, 0.535)), ellipsoids, view)
+    rows = view.rows()
+    height_in = _HEAD_IN + len(rows) * (_ROW_IN + _GAP_IN) + _PERSPECTIVE_IN + _FOOT_IN
+    figure = Figure(figsize=(_WIDTH_IN, height_in), dpi=_DPI, facecolor=_PAPER)
+    figure.text(0.03, 1.0 - 0.361 / height_in, title, fontsize=19, weight="bold", color=_INK, va="center")
+    figure.text(0.03, 1.0 - 0.655 / height_in, note, fontsize=11, color="#5a6675", va="center")
+    _legend(figure, 1.0 - 0.353 / height_in, ellipsoids)
+    for index, row in enumerate(rows):
+        bottom_in = height_in - _HEAD_IN - (index + 1) * _ROW_IN - index * _GAP_IN
+        _from_above(_panel(figure, bottom_in, _ROW_IN), ellipsoids, row)
+    _in_perspective(_panel(figure, _FOOT_IN, _PERSPECTIVE_IN), ellipsoids, view)
     _save(figure, path)
+
+
+def _panel(figure: Figure, bottom_in: float, tall_in: float) -> Axes:
+    """Axes as wide as the figure allows, placed in inches."""
+    height_in = figure.get_figheight()
+    return figure.add_axes((_MARGIN_IN / _WIDTH_IN, bottom_in / height_in, _PANEL_IN / _WIDTH_IN, tall_in / height_in))
 
 
 def draw_run(truth: Truth, base: Tiles, final: Tiles, folder: Path) -> tuple[Path, Path, Path]:
@@ -138,7 +171,7 @@ def draw_healing(truth: Truth, base: Tiles, final: Tiles, path: Path) -> None:
         ("Truth", true),
     )
     figure = Figure(figsize=(12.6, 9.6), dpi=_DPI // 2, facecolor=_PAPER)
-    _legend(figure)
+    _legend(figure, 0.958)
     for row, (title, ellipsoids) in enumerate(panels):
         figure.text(0.03, 0.957 - 0.315 * row, title, fontsize=17, weight="bold", color=_INK, va="center")
         _from_above(figure.add_axes((0.03, 0.667 - 0.315 * row, 0.94, 0.27)), ellipsoids, view)
@@ -155,7 +188,7 @@ def _save(figure: Figure, path: Path) -> None:
         raise SimError(f"cannot write the picture {path}: {error}") from error
 
 
-def _legend(figure: Figure, ellipsoids: Ellipsoids | None = None) -> None:
+def _legend(figure: Figure, height: float, ellipsoids: Ellipsoids | None = None) -> None:
     """The colours, with the number of ellipsoids of each where they are given."""
     number = ["" for _ in ChangeClass]
     if ellipsoids is not None:
@@ -164,7 +197,7 @@ def _legend(figure: Figure, ellipsoids: Ellipsoids | None = None) -> None:
     dot: dict[str, Any] = {"marker": "o", "linestyle": "", "markersize": 9}
     handles = [Line2D([], [], color=CLASS_COLOURS[c], label=f"{c.name.lower()}{number[c]}", **dot) for c in _SHOWN]
     figure.legend(
-        handles=handles, loc="center right", bbox_to_anchor=(0.978, 0.958), ncols=4, frameon=False, fontsize=11,
+        handles=handles, loc="center right", bbox_to_anchor=(0.978, height), ncols=4, frameon=False, fontsize=11,
         handletextpad=0.2, columnspacing=1.4, labelcolor=_INK,
     )  # fmt: skip
 
@@ -176,7 +209,7 @@ def _from_above(axes: Axes, ellipsoids: Ellipsoids, view: View) -> None:
     order = inside[np.argsort(mean[inside, 2], kind="stable")]
     colours = _shaded(cov[order], ellipsoids.change_class[order], np.array([0.0, 0.0, 1.0]))
     _add_ellipses(axes, mean[order, :2], cov[order, :2, :2], colours)
-    half_width = 2 * view.half_length_m * 0.315 * 8.4 / (0.94 * 12.6) / 2
+    half_width = view.half_length_m * _ROW_IN / _PANEL_IN
     axes.set(xlim=(-view.half_length_m, view.half_length_m), ylim=(-half_width, half_width), aspect="equal")
     _frame(axes, _PAPER)
     _scale_bar(axes, view, half_width)
@@ -198,7 +231,7 @@ def _in_perspective(axes: Axes, ellipsoids: Ellipsoids, view: View) -> None:
     colours = _shaded(cov, ellipsoids.change_class[order], R @ view.R_view_map.T @ _SUN)
     haze = np.clip((p[:, 2:] - 60.0) / 260.0, 0.0, 0.55)
     _add_ellipses(axes, centre, J @ cov @ np.swapaxes(J, 1, 2), colours * (1 - haze) + np.array(to_rgb(_SKY)) * haze)
-    tall = 0.535 * 8.4 / (0.94 * 12.6)
+    tall = _PERSPECTIVE_IN / _PANEL_IN
     axes.set(xlim=(-1.0, 1.0), ylim=(-tall, tall), aspect="equal")
     _frame(axes, _SKY)
 
@@ -249,7 +282,8 @@ def _scale_bar(axes: Axes, view: View, half_width: float) -> None:
     length = 20.0 if view.half_length_m > 40 else 10.0
     x, y = -view.half_length_m + 0.025 * 2 * view.half_length_m, -half_width * 0.84
     axes.plot([x, x + length], [y, y], color=_INK, linewidth=2.5, solid_capstyle="butt")
-    axes.text(x + length / 2, y + half_width * 0.045, f"{length:.0f} m", ha="center", va="bottom", color=_INK)
+    place: dict[str, Any] = {"ha": "center", "va": "bottom", "color": _INK, "path_effects": _HALO}
+    axes.text(x + length / 2, y + half_width * 0.045, f"{length:.0f} m", **place)
 
 
 def _north(axes: Axes, view: View, half_width: float) -> None:
@@ -257,4 +291,5 @@ def _north(axes: Axes, view: View, half_width: float) -> None:
     direction = view.R_view_map @ np.array([0.0, 1.0, 0.0])
     end = size / 2 * direction[:2]
     axes.annotate("", (x + end[0], y + end[1]), (x - end[0], y - end[1]), arrowprops=_ARROW)
-    axes.text(x + 1.35 * end[0], y + 1.35 * end[1], "N", ha="center", va="center", fontsize=9, color=_INK)
+    place: dict[str, Any] = {"ha": "center", "va": "center", "fontsize": 9, "color": _INK, "path_effects": _HALO}
+    axes.text(x + 1.35 * end[0], y + 1.35 * end[1], "N", **place)
