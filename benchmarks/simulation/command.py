@@ -31,8 +31,11 @@ T = TypeVar("T")
 @click.option("--out", type=PATH, default=DEFAULT_OUT, show_default=True, help="Folder that keeps everything.")
 @click.option("--json", "json_file", help="Write the result as JSON; `-` prints it and nothing else.")
 @click.option("--jobs", type=int, help="Worker processes.  [default: one a core]")
+@click.option("--pictures/--no-pictures", default=True, show_default=True, help="Draw the figures.")
 @click.option("--keep-drives", is_flag=True, help="Write every drive as MCAP, too.")
-def simulation(json_file: str | None, out: Path, jobs: int | None, keep_drives: bool, **given: Any) -> None:
+def simulation(
+    json_file: str | None, out: Path, jobs: int | None, keep_drives: bool, pictures: bool, **given: Any
+) -> None:
     """Reproduce the simulation of the GND paper: worlds with known truth, single drives, fleets, and their scores.
 
     A second start with the same options and folder continues where the first ended.
@@ -56,6 +59,10 @@ def simulation(json_file: str | None, out: Path, jobs: int | None, keep_drives: 
     folder.write_mark({"options": plain_options(options), "worlds": plain_worlds(outcome, folder)})
     found = summary_of(outcome)
     folder.write_json("result.json", found)
+    if pictures:
+        from benchmarks.simulation.figures import draw_figures
+
+        draw_figures(outcome, found, out)
     if json_file == "-":
         click.echo(json.dumps(found))
         return

@@ -8,17 +8,14 @@ from typing import Any
 from rich.progress import Progress
 
 from benchmarks.simulation.errors import FolderError
-from benchmarks.simulation.fleet import fleet_configs, fleet_sensors
 from benchmarks.simulation.folder import RunFolder
-from benchmarks.simulation.masses import choose
 from benchmarks.simulation.options import RunOptions
 from benchmarks.simulation.pool import Job, run_jobs
 from benchmarks.simulation.result import VehicleResult, read_result
-from benchmarks.simulation.scoring import Scored, VehicleFile, score_fleet, score_single
-from benchmarks.simulation.sources import SIMULATOR, VEHICLE, key_of, sources_sha
+from benchmarks.simulation.scoring import Scored, VehicleFile, score_fleet, score_pcd, score_single
+from benchmarks.simulation.tasks import shots_a_second, vehicle_tasks
 from benchmarks.simulation.vehicle import VehicleTask, run_vehicle
-from benchmarks.simulation.worlds import WorldFiles, prepare_world, read_world_base, world_files
-from fleet_sim.truth import read_truth
+from benchmarks.simulation.worlds import WorldFiles, prepare_world, world_files
 from gnd_map.config import to_mapping
 
 _log = logging.getLogger(__name__)
@@ -35,6 +32,7 @@ class WorldOutcome:
         kept: their files.
         single: score of the stale map and of each vehicle alone, by name.
         fleet: score of the merged map by number of vehicles.
+        pcd: score of the point-cloud baseline: of each vehicle alone by name, of the fleet by number; empty without it.
     """
 
     seed: int
@@ -43,6 +41,7 @@ class WorldOutcome:
     kept: tuple[VehicleFile, ...]
     single: dict[str, Scored]
     fleet: dict[int, Scored]
+    pcd: dict[str | int, Scored]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -86,44 +85,10 @@ def _vehicles(
     """The result of every vehicle, in the cache now."""
     tasks = {seed: vehicle_tasks(options, seed, files[seed], keep_drives) for seed in files}
     missing = [task for of_world in tasks.values() for task in of_world if not _is_done(task)]
-    missing.sort(key=_work, reverse=True)  # the longest first, so that no core waits at the end
+    missing.sort(key=shots_a_second, reverse=True)  # the longest first, so that no core waits at the end
     jobs = [Job(f"{t.drive.vehicle} {t.sensor}, world {_seed_of(t)}", run_vehicle, (t,), ticks=True) for t in missing]
     run_jobs(jobs, processes, progress, "vehicles")
     return {seed: [VehicleFile(task.result, task.key) for task in of_world] for seed, of_world in tasks.items()}
-
-
-def vehicle_tasks(options: RunOptions, seed: int, files: WorldFiles, keep_drives: bool = False) -> list[VehicleTask]:
-    """Return the work of each vehicle of a world, with the key under which its result is kept."""
-    base_sha = read_world_base(files).sha
-    watch = choose(read_truth(files.truth))
-    method = options.method
-    tasks = []
-    for index, (sensor, drive) in enumerate(
-        zip(fleet_sensors(options, seed), fleet_configs(options, seed), strict=True)
-    ):
-        watched = watch if index == _watching(options, seed) else None
-        key = key_of(
-            sources=sources_sha(VEHICLE), world=files.home.name, made_by=sources_sha(SIMULATOR), base=base_sha,
-            drive=to_mapping(drive), poses=str(options.poses), watch=watched,
-            method={name: to_mapping(getattr(method, name)) for name in ("localise", "segment", "detect", "report")},
-        )  # fmt: skip
-        kept = files.home / "vehicles" / f"{drive.vehicle}-{sensor}-{key}"
-        recording = files.home / "drives" / f"{drive.vehicle}-{sensor}-{key}.mcap" if keep_drives else None
-        if recording is not None:
-            recording.parent.mkdir(exist_ok=True)
-        tasks.append(
-            VehicleTask(
-                files.world, files.base, files.voxels, sensor, drive, options.poses, method,
-                kept.with_suffix(".npz"), key, watched, recording,
-            )
-        )  # fmt: skip
-    return tasks
-
-
-def _watching(options: RunOptions, seed: int) -> int:
-    """The vehicle whose masses are drawn: the first with an HDL-32E, else the first."""
-    sensors = fleet_sensors(options, seed)
-    return sensors.index("hdl32e") if "hdl32e" in sensors else 0
 
 
 def _is_done(task: VehicleTask) -> bool:
@@ -135,12 +100,6 @@ def _is_done(task: VehicleTask) -> bool:
     except FolderError as error:
         _log.warning("%s: it is made again", error)
         return False
-
-
-def _work(task: VehicleTask) -> float:
-    """Shots a second: what a drive costs."""
-    model = task.drive.model
-    return len(model.elevations_rad) / model.cycle_ns
 
 
 def _seed_of(task: VehicleTask) -> str:
@@ -160,13 +119,16 @@ def _scores(
     for seed, of_world in vehicles.items():
         jobs.append(Job(f"single drives, world {seed}", score_single, (files[seed], of_world)))
         jobs += [Job(f"merges, world {seed}", score_fleet, (files[seed], of_world, share, merge)) for share in shares]
+        if options.pcd:
+            jobs.append(Job(f"baseline, world {seed}", score_pcd, (files[seed], of_world, options.vehicles)))
     results = iter(run_jobs(jobs, processes, progress, "merges and scores"))
     found = []
     for seed, of_world in vehicles.items():
         single = next(results)
         fleet = {n: scored for _ in shares for n, scored in next(results).items()}
+        pcd = next(results) if options.pcd else {}
         read = tuple(vehicle.read() for vehicle in of_world)
-        found.append(WorldOutcome(seed, files[seed], read, tuple(of_world), single, dict(sorted(fleet.items()))))
+        found.append(WorldOutcome(seed, files[seed], read, tuple(of_world), single, dict(sorted(fleet.items())), pcd))
     return tuple(found)
 
 

@@ -70,3 +70,13 @@ def score_fleet(
         bodies = [body for result in results[:n] for body in result.reports]
         found[n] = Scored.of(evaluate_maps(truth, base.tiles, merged_map(base, bodies, merge)))
     return found
+
+
+def score_pcd(files: WorldFiles, vehicles: Sequence[VehicleFile], numbers: Sequence[int]) -> dict[str | int, Scored]:
+    """Return the baseline's scores: of each vehicle alone by name, of the first n vehicles by number."""
+    from benchmarks.simulation.baseline import Clouds, read_cloud
+
+    clouds = Clouds(read_truth(files.truth), read_cloud(files.cloud))
+    results = [vehicle.read() for vehicle in vehicles]
+    found: dict[str | int, Scored] = {r.vehicle: Scored.of(clouds.score([r.pcd])) for r in results}
+    return found | {n: Scored.of(clouds.score([r.pcd for r in results[:n]])) for n in numbers}

@@ -22,10 +22,11 @@ VEHICLE: Final = (
     "benchmarks/simulation/held_tiles.py",
     "benchmarks/simulation/base_map.py",
     "benchmarks/simulation/masses.py",
+    "benchmarks/simulation/voxel_rows.py",
 )
 _DECIDE_NOTHING: Final = ("cli.py", "pictures.py", "ellipsoids.py", "evaluate.py", "insert.py", "insert_drive.py")
 """Files of the simulator that no drive and no truth depends on."""
-PCD: Final = ("benchmarks/pcd",)
+PCD: Final = ("benchmarks/pcd", "benchmarks/simulation/baseline.py")
 
 
 @lru_cache

@@ -43,6 +43,7 @@ def _world_summary(world: WorldOutcome) -> dict[str, Any]:
         "single": {sensor: _stage([world.single[name] for name in names]) for sensor, names in by_sensor.items()},
         "fleet": {str(n): _stage([scored]) for n, scored in world.fleet.items()},
         "upload_bytes": _uploads(world, by_sensor),
+        **({"pcd": _pcd(world, by_sensor)} if world.pcd else {}),
         "drives": {sensor: _drives(world, names) for sensor, names in by_sensor.items()},
     }
 
@@ -75,6 +76,21 @@ def _uploads(world: WorldOutcome, by_sensor: Mapping[str, list[str]]) -> dict[st
     return {
         "single": {sensor: _mean(float(size[name]) for name in names) for sensor, names in by_sensor.items()},
         "fleet": {str(n): sum(size[name] for name in order[:n]) for n in world.fleet},
+    }
+
+
+def _pcd(world: WorldOutcome, by_sensor: Mapping[str, list[str]]) -> dict[str, Any]:
+    """The baseline: scores, and bytes of its uploads by codec ("points" is the paper's)."""
+    numbers = sorted(n for n in world.pcd if isinstance(n, int))
+    size = [vehicle.stats["pcd_bytes"] for vehicle in world.vehicles]
+    by_name = {vehicle.vehicle: vehicle.stats["pcd_bytes"] for vehicle in world.vehicles}
+    return {
+        "single": {sensor: _stage([world.pcd[name] for name in names]) for sensor, names in by_sensor.items()},
+        "fleet": {str(n): _stage([world.pcd[n]]) for n in numbers},
+        "upload_bytes": {
+            "single": {sensor: mean_of([by_name[name] for name in names]) for sensor, names in by_sensor.items()},
+            "fleet": {str(n): {codec: sum(one[codec] for one in size[:n]) for codec in size[0]} for n in numbers},
+        },
     }
 
 

@@ -1,7 +1,7 @@
 """One vehicle from measurements to uploads, in one process: localise, segment, detect, report, as the agent does."""
 
 from collections import Counter
-from collections.abc import Callable, Collection, Iterable, Iterator
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
 from dataclasses import asdict, dataclass
 from itertools import chain
 from pathlib import Path
@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 
 from benchmarks.simulation.base_map import BaseMap, read_base
+from benchmarks.simulation.baseline import CloudVehicle, read_cloud
 from benchmarks.simulation.errors import ReproduceError
 from benchmarks.simulation.held_tiles import HeldTiles
 from benchmarks.simulation.masses import Watch, Watcher
@@ -62,6 +63,7 @@ class VehicleTask:
         result: file to write, under `key`.
         watch: voxels to write down scan by scan.
         recording: keep the drive in this MCAP file, too.
+        cloud: the point-cloud baseline's map; None to run without it.
     """
 
     world: Path
@@ -75,6 +77,7 @@ class VehicleTask:
     key: str
     watch: Watch | None = None
     recording: Path | None = None
+    cloud: Path | None = None
 
 
 def run_vehicle(task: VehicleTask, tick: Tick) -> None:
@@ -130,8 +133,9 @@ def drive(
         finally:
             outbox.close()
     row, evidence = voxels.columns(run.detector.taken, lambda found: evidence_columns(found, task.method))
-    stats = run.stats() | {"cpu_s": round(process_time() - started_s, 2)}
-    return VehicleResult(task.drive.vehicle, task.sensor, reports, row, evidence, stats, run.watched())
+    pcd, pcd_bytes = run.pcd_report()
+    stats = run.stats() | {"pcd_bytes": pcd_bytes, "cpu_s": round(process_time() - started_s, 2)}
+    return VehicleResult(task.drive.vehicle, task.sensor, reports, row, evidence, stats, run.watched(), pcd)
 
 
 class RecordingDetector(ChangeDetector):
@@ -166,6 +170,7 @@ class _Run:
         who = Identity(header.vehicle, header.drive_id, header.sensor_model, "ndt", "gnd reproduce simulation")
         self._reporter = Reporter(self.detector, outbox, who, fix.t_ns, method.report)
         self._watcher = Watcher(task.watch, base, local_map.grid_frame, method.detect) if task.watch else None
+        self._cloud = CloudVehicle(read_cloud(task.cloud), frame) if task.cloud else None
         self._estimates: list[PoseEstimate] = []
         self._reference: list[ReferencePose] = []
         self._T_map_anchor = frame.T_self_other(header.anchor)
@@ -197,6 +202,8 @@ class _Run:
         self._reporter.add_scan(segmented)
         if self._watcher is not None:
             self._watcher.add_scan(segmented)
+        if self._cloud is not None:
+            self._cloud.add_scan(segmented)
         self._reporter.leave_behind(segmented.scan.estimate, self._place.odometer_m)
 
     def watched(self) -> tuple[Any, Any]:
@@ -204,6 +211,10 @@ class _Run:
         if self._watcher is None:
             return np.zeros(0, np.int64), np.zeros((0, 0, 4), np.int32)
         return self._watcher.history()
+
+    def pcd_report(self) -> tuple[bytes, Mapping[str, int]]:
+        """What the point-cloud baseline uploads, and its size by codec; nothing without it."""
+        return (b"", {}) if self._cloud is None else self._cloud.report()
 
     def stats(self) -> dict[str, Any]:
         """Counts of the drive and errors of its poses."""

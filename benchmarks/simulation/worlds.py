@@ -7,7 +7,7 @@ from benchmarks.simulation.base_map import BaseMap, driven, read_base, surveyed,
 from benchmarks.simulation.errors import FolderError
 from benchmarks.simulation.folder import RunFolder
 from benchmarks.simulation.options import RunOptions
-from benchmarks.simulation.sources import SIMULATOR, key_of, sources_sha
+from benchmarks.simulation.sources import PCD, SIMULATOR, key_of, sources_sha
 from benchmarks.simulation.voxel_rows import VoxelRows
 from fleet_sim.street import StreetOptions, street
 from fleet_sim.truth import Truth, load_or_make_truth, world_sha
@@ -41,6 +41,11 @@ class WorldFiles:
         """The map that every vehicle starts with."""
         return self.home / f"base-{self.base_kind}.npz"
 
+    @property
+    def cloud(self) -> Path:
+        """The point-cloud baseline's map of the state before."""
+        return self.home / "cloud.npz"
+
 
 def world_name(seed: int, options: StreetOptions) -> str:
     """Return the name of a world's folder."""
@@ -63,7 +68,24 @@ def prepare_world(files: WorldFiles, seed: int, options: RunOptions) -> None:
         write_base(surveyed(truth.before), files.base)
     elif not _usable(files, world):
         write_base(driven(world), files.base)
-        _key_file(files).write_text(_base_key(world), encoding="utf-8")
+        _key_file(files.base).write_text(_base_key(world), encoding="utf-8")
+    if options.pcd:
+        prepare_cloud(files, world)
+
+
+def prepare_cloud(files: WorldFiles, world: World) -> None:
+    """Make the baseline's map, if it is not there."""
+    from benchmarks.simulation.baseline import read_cloud, write_cloud
+
+    key, key_file = key_of(base=_base_key(world), pcd=sources_sha(PCD)), _key_file(files.cloud)
+    try:
+        read_cloud(files.cloud)
+        if key_file.read_text(encoding="utf-8") == key:
+            return
+    except (FolderError, OSError):
+        pass
+    write_cloud(world, files.cloud)
+    key_file.write_text(key, encoding="utf-8")
 
 
 def _truth(files: WorldFiles, world: World) -> Truth:
@@ -79,13 +101,13 @@ def _truth(files: WorldFiles, world: World) -> Truth:
 def _usable(files: WorldFiles, world: World) -> bool:
     try:
         read_base(files.base)
-        return _key_file(files).read_text(encoding="utf-8") == _base_key(world)
+        return _key_file(files.base).read_text(encoding="utf-8") == _base_key(world)
     except (FolderError, OSError):
         return False
 
 
-def _key_file(files: WorldFiles) -> Path:
-    return files.base.with_suffix(".key")
+def _key_file(path: Path) -> Path:
+    return path.with_suffix(".key")
 
 
 def _base_key(world: World) -> str:
