@@ -14,6 +14,8 @@ from fleet_sim.errors import DriveSimError
 from fleet_sim.lidar import Lidar, column_poses
 from fleet_sim.raycast import Scene
 from fleet_sim.sensors import MODELS, LidarModel
+from fleet_sim.stage import Stage
+from fleet_sim.traffic import Traffic, movers_of
 from fleet_sim.trajectory import Direction, DrivingStyle, gauss_markov, lane_motion
 from fleet_sim.world import State, World
 from gnd_map.se3 import exp_so3
@@ -23,6 +25,8 @@ from schemas.drive_mcap import DriveWriter
 _NS_PER_S: Final = 1_000_000_000
 EPOCH_NS: Final = 1_570_838_400 * _NS_PER_S
 """12 October 2019, 00:00 UTC, the day of the GND paper's 38 drives (section 7.1)."""
+Labels = Callable[[int, NDArray[np.bool_]], None]
+"""Takes the time of a scan [ns] and which of its points move, bool (N,)."""
 _LEAD_S: Final = 0.2
 _MOTION_HZ: Final = 50
 _REFERENCE_HZ: Final = 100
@@ -79,6 +83,7 @@ class DriveConfig:
         gnss_hz: rate of the GNSS.
         errors: of the vehicle's sensors.
         start_ns: UTC of the first scan.
+        traffic: moving cars and people; none by default.
         mount_height_m: height of the LiDAR over the road, None for the usual one of the model.
     """
 
@@ -93,6 +98,7 @@ class DriveConfig:
     gnss_hz: int = 10
     errors: SensorErrors = field(default_factory=SensorErrors)
     start_ns: int = EPOCH_NS
+    traffic: Traffic = field(default_factory=Traffic)
     mount_height_m: float | None = None
 
     def __post_init__(self) -> None:
@@ -150,6 +156,7 @@ class DriveSimulation:
     Attributes:
         motion: the true motion; its time 0 is `config.start_ns`.
         scans: number of LiDAR sweeps.
+        movers: what moves there besides, None if nothing does; its times are those of the motion.
     """
 
     def __init__(self, world: World, config: DriveConfig) -> None:
@@ -163,7 +170,10 @@ class DriveSimulation:
         if self.scans < 1:
             raise DriveSimError(f"a drive needs at least one scan, got {self.scans} ({duration_s:.2f} s of street)")
         cars = parked_cars(world, config.state, config.car_share, config.seed)
-        self._scene = Scene.build((*world.shapes(config.state), *cars), world.A_street_map)
+        shapes = (*world.shapes(config.state), *cars)
+        self._scene = Scene.build(shapes, world.A_street_map)
+        stage = Stage(world, shapes, self._scene, self.motion, self._seconds, config.seed)
+        self.movers = movers_of(config.traffic, stage)
         self._lidar = Lidar(config.model)
         self._T_vehicle_lidar_true = self._drawn_mount()
 
@@ -183,8 +193,13 @@ class DriveSimulation:
             source=f"fleet_sim, world seed {self._world.seed}, state {c.state}, drive seed {c.seed}",
         )
 
-    def items(self) -> Iterator[DriveItem]:
-        """Yield everything that the sensors give, in time order."""
+    def items(self, on_labels: Labels | None = None) -> Iterator[DriveItem]:
+        """Yield everything that the sensors give, in time order.
+
+        Args:
+            on_labels: for evaluation only, told right before each scan is yielded: its time [ns], and which of its
+                points lie on something that moves while the scan is taken, bool (N,). Never part of a recording.
+        """
         small: list[DriveItem] = [*self._motion_samples(), *self._gnss_fixes(), *self._reference_poses()]
         small.sort(key=lambda item: item.t_ns)
         position, period_ns = 0, self._config.model.period_ns
@@ -193,7 +208,7 @@ class DriveSimulation:
             while position < len(small) and small[position].t_ns < t_ns:
                 yield small[position]
                 position += 1
-            yield self._scan(t_ns)
+            yield self._scan(t_ns, on_labels)
         yield from small[position:]
 
     def _drawn_mount(self) -> NDArray[np.float64]:
@@ -202,13 +217,23 @@ class DriveSimulation:
         T[:3, 3] = errors.mount_m * self._rng.standard_normal(3)
         return np.asarray(self._config.T_vehicle_lidar @ T)
 
-    def _scan(self, t_ns: int) -> Scan:
+    def _scan(self, t_ns: int, on_labels: Labels | None) -> Scan:
         t_s = (t_ns - self._config.start_ns) / _NS_PER_S
         T_map_lidar = column_poses(
             self._config.model, t_s, lambda t: self.motion.T_map_vehicle(t) @ self._T_vehicle_lidar_true
         )
-        sweep = self._lidar.sweep(self._scene, T_map_lidar, self._rng)
+        sweep = self._lidar.sweep(self._scene, T_map_lidar, self._rng, self.movers, t_s)
+        if on_labels is not None:
+            on_labels(t_ns, self._moving(sweep.primitive, t_s + 0.5 / self._config.model.rate_hz))
         return Scan(t_ns, sweep.points_lidar_m, sweep.t_offset_ns, sweep.ring.astype(np.uint16))
+
+    def _moving(self, primitive: NDArray[np.int32], t_s: float) -> NDArray[np.bool_]:
+        """Return which points lie on a mover that is under way at an instant, from what they lie on."""
+        base = len(self._scene.packed)
+        if self.movers is None:
+            return np.zeros(len(primitive), dtype=np.bool_)
+        moves = np.concatenate([self.movers.under_way(t_s), [False]])
+        return np.asarray(moves[np.where(primitive >= base, primitive - base, -1)])
 
     def _times(self, rate_hz: int) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
         """Times of a sensor, a little longer than the scans: UTC [ns], time of the drive [s]."""

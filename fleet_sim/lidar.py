@@ -6,12 +6,14 @@ motion; coordinates are those of the lidar frame *at the shot's own time*, as re
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from math import tau
 from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
 
 from fleet_sim.errors import SceneError
+from fleet_sim.movers import Movers
 from fleet_sim.ray_kernels import FloatArray, IntArray, cast_sweep
 from fleet_sim.raycast import Scene
 from fleet_sim.sensors import LidarModel
@@ -30,11 +32,13 @@ class Sweep:
         points_lidar_m: float32 (N, 3), lidar frame at each point's own time.
         t_offset_ns: uint32 (N,), time after the start of the sweep.
         ring: uint8 (N,), beam from the lowest up.
+        primitive: int32 (N,), what each point lies on, for evaluation: index into the scene, the movers' after that.
     """
 
     points_lidar_m: NDArray[np.float32]
     t_offset_ns: NDArray[np.uint32]
     ring: NDArray[np.uint8]
+    primitive: IntArray
 
 
 @dataclass(frozen=True, slots=True)
@@ -43,7 +47,7 @@ class Hits:
 
     Attributes:
         range_m: float64 (columns, beams), inf where nothing was met.
-        primitive: int32 (columns, beams), index into the scene, -1 where nothing was met.
+        primitive: int32 (columns, beams), index into the scene, the movers' after that, -1 where nothing was met.
         incidence: float64 (columns, beams), cosine between shot and surface normal.
     """
 
@@ -62,13 +66,15 @@ class Lidar:
         self._times = model.shot_times_ns()
         self._rings = np.broadcast_to(model.rings, self._times.shape)
 
-    def hits(self, scene: Scene, T_map_lidar: FloatArray) -> Hits:
+    def hits(self, scene: Scene, T_map_lidar: FloatArray, movers: Movers | None = None, t_s: float = 0.0) -> Hits:
         """Cast the shots of one sweep.
 
         Args:
             scene: what stands there.
             T_map_lidar: float64 (columns + 1, 4, 4), true poses at the start of each firing cycle, and at the
                 end of the last.
+            movers: what moves there.
+            t_s: time of the first firing cycle in the movers' time [s].
 
         Raises:
             SceneError: wrong number of poses, or the sensor is outside the scene.
@@ -79,28 +85,43 @@ class Lidar:
         T_street_lidar = scene.A_street_map @ T_map_lidar[:, 0:3, :]
         scene.check_inside(T_street_lidar[:, :, 3])
         poses = np.ascontiguousarray(T_street_lidar, dtype=np.float64)
-        return Hits(*cast_sweep(poses, self._directions, self._shares, self.model.range_max_m, *scene.arrays()))
+        met = cast_sweep(poses, self._directions, self._shares, self.model.range_max_m, *scene.arrays())
+        if movers is not None:
+            shots, cycle_s = (poses, self._directions, self._shares), self.model.cycle_ns / _NS_PER_S
+            timing = (t_s, cycle_s, tau * cycle_s * self.model.rate_hz)
+            movers.meet(shots, self.model.range_max_m, timing, len(scene.packed), met)
+        return Hits(*met)
 
-    def sweep(self, scene: Scene, T_map_lidar: FloatArray, rng: np.random.Generator) -> Sweep:
+    def sweep(
+        self,
+        scene: Scene,
+        T_map_lidar: FloatArray,
+        rng: np.random.Generator,
+        movers: Movers | None = None,
+        t_s: float = 0.0,
+    ) -> Sweep:
         """Take one sweep with range noise and lost returns; arguments and errors as `hits`."""
-        hits = self.hits(scene, T_map_lidar)
+        hits = self.hits(scene, T_map_lidar, movers, t_s)
+        packed = scene.packed if movers is None else np.concatenate([scene.packed, movers.packed])
         noisy = hits.range_m + self.model.range_sigma_m * rng.standard_normal(hits.range_m.shape)
-        seen = self._seen(scene, hits, rng) & (noisy >= self.model.range_min_m) & (noisy <= self.model.range_max_m)
+        seen = self._seen(packed, hits, rng) & (noisy >= self.model.range_min_m) & (noisy <= self.model.range_max_m)
         points = self._directions[seen] * self._given(noisy[seen])[:, None]
         points = np.round(points / _POINT_STEP_M) * _POINT_STEP_M
-        return Sweep(points.astype(np.float32), self._times[seen].astype(np.uint32), self._rings[seen])
+        return Sweep(
+            points.astype(np.float32), self._times[seen].astype(np.uint32), self._rings[seen], hits.primitive[seen]
+        )
 
     def _given(self, range_m: FloatArray) -> FloatArray:
         """Round ranges to what the sensor gives."""
         step = self.model.range_step_m
         return np.asarray(np.round(range_m / step) * step) if step else range_m
 
-    def _seen(self, scene: Scene, hits: Hits, rng: np.random.Generator) -> NDArray[np.bool_]:
+    def _seen(self, packed: FloatArray, hits: Hits, rng: np.random.Generator) -> NDArray[np.bool_]:
         """Draw which returns come back.
 
         The echo falls with reflectivity x cos(incidence) / range² (Lambert); it fades over ±10 % of the limit.
         """
-        bright = reflectivity_of(scene.packed, hits.primitive) * hits.incidence
+        bright = reflectivity_of(packed, hits.primitive) * hits.incidence
         limit = self.model.dark_m * np.sqrt(bright / 0.1)
         chance = np.clip((1.1 * limit - hits.range_m) / (0.2 * limit + 1e-9), 0.0, 1.0) * (1.0 - self.model.loss)
         return np.asarray((hits.primitive >= 0) & (rng.random(hits.range_m.shape) < chance))

@@ -6,7 +6,7 @@ ray is the same in both: with a unit direction in the map frame, t is the range 
 All kernels stand in this one file, because numba's cache on disk notices changes of a kernel's own file only.
 """
 
-from math import sqrt
+from math import cos, sin, sqrt
 from typing import Final, NamedTuple
 
 import numpy as np
@@ -20,6 +20,10 @@ IntArray = NDArray[np.int32]
 
 _PARALLEL: Final = 1e-12
 _SKIN_M: Final = 1e-6
+BLOCK_COLUMNS: Final = 16
+"""Movers are looked for in so many columns of shots at once."""
+_SLACK_M: Final = 0.2
+"""Neither sensor nor mover goes farther within a block (about 1 ms)."""
 
 
 class Ray(NamedTuple):
@@ -210,6 +214,24 @@ def cast_rays(
 
 
 @kernel
+def shot(pose: FloatArray, following: FloatArray, share: float, d: FloatArray) -> Ray:
+    """The ray of a shot along d (3,), lidar frame, that leaves at a share of the way between two poses (3, 4).
+
+    The affine pose is interpolated entry by entry, which over 55 µs is exact to far below a micrometre.
+    """
+    a, b = pose, following
+    ox = a[0, 3] + share * (b[0, 3] - a[0, 3])
+    oy = a[1, 3] + share * (b[1, 3] - a[1, 3])
+    oz = a[2, 3] + share * (b[2, 3] - a[2, 3])
+    dx, dy, dz = 0.0, 0.0, 0.0
+    for k in range(3):
+        dx += (a[0, k] + share * (b[0, k] - a[0, k])) * d[k]
+        dy += (a[1, k] + share * (b[1, k] - a[1, k])) * d[k]
+        dz += (a[2, k] + share * (b[2, k] - a[2, k])) * d[k]
+    return Ray(ox, oy, oz, dx, dy, dz)
+
+
+@kernel
 def cast_sweep(
     poses: FloatArray,
     directions: FloatArray,
@@ -223,23 +245,155 @@ def cast_sweep(
 ) -> tuple[FloatArray, IntArray, FloatArray]:
     """Cast directions (columns, beams, 3) from poses (columns + 1, 3, 4), both towards the street frame.
 
-    Beam j leaves at the fraction shares[j] of its cycle; the affine pose between two cycles is interpolated entry by
-    entry, which over 55 µs is exact to far below a micrometre.
+    Beam j leaves at the fraction shares[j] of its cycle.
     """
     columns, beams = directions.shape[0], directions.shape[1]
     ranges, found = np.empty((columns, beams)), np.empty((columns, beams), np.int32)
-    incidence, T = np.empty((columns, beams)), np.empty((3, 4))
+    incidence = np.empty((columns, beams))
     for i in range(columns):
         for j in range(beams):
-            for k in range(12):
-                here, there = poses[i, k // 4, k % 4], poses[i + 1, k // 4, k % 4]
-                T[k // 4, k % 4] = here + shares[j] * (there - here)
-            d = directions[i, j]
-            dx = T[0, 0] * d[0] + T[0, 1] * d[1] + T[0, 2] * d[2]
-            dy = T[1, 0] * d[0] + T[1, 1] * d[1] + T[1, 2] * d[2]
-            dz = T[2, 0] * d[0] + T[2, 1] * d[1] + T[2, 2] * d[2]
-            ray = Ray(T[0, 3], T[1, 3], T[2, 3], dx, dy, dz)
+            ray = shot(poses[i], poses[i + 1], shares[j], directions[i, j])
             ranges[i, j], found[i, j] = cast_ray(ray, range_m, p, starts, items, tops, grid)
             met = found[i, j] >= 0
             incidence[i, j] = incidence_of(ray, ranges[i, j], p, found[i, j]) if met else 1.0
     return ranges, found, incidence
+
+
+class Crowd(NamedTuple):
+    """Movers as the kernels take them; their shapes are packed in frames of their own (x ahead, z up from the ground).
+
+    Attributes:
+        tracks: float64 (M, S, 5): x, y, z [m], yaw [rad] in the street frame, stride [m], straight between samples.
+        t0_s, step_s: time of the first sample of every track, time from sample to sample.
+        packed: float64 (P * 13,), primitives as `shapes.pack` lays them out, flat.
+        swing: float64 (P,), a primitive is shifted ahead by this much of the stride (legs and arms).
+        first: int32 (M + 1,), where the primitives of each mover start.
+        centre_m: float64 (M,), height of the middle of the ball around a mover.
+        radius_m: float64 (M,), radius of that ball.
+        reach_m: movers farther than this from the street's middle, along the street, are not there.
+    """
+
+    tracks: FloatArray
+    t0_s: float
+    step_s: float
+    packed: FloatArray
+    swing: FloatArray
+    first: IntArray
+    centre_m: FloatArray
+    radius_m: FloatArray
+    reach_m: float
+
+
+@kernel
+def state_at(crowd: Crowd, mover: int, t_s: float) -> tuple[float, float, float, float, float]:
+    """Where a mover is at an instant: x, y, z, yaw, stride; before and after its track it stands at the end of it."""
+    last = crowd.tracks.shape[1] - 1
+    u = min(max((t_s - crowd.t0_s) / crowd.step_s, 0.0), float(last))
+    k = min(int(u), last - 1)
+    f, a, b = u - k, crowd.tracks[mover, k], crowd.tracks[mover, k + 1]
+    return (
+        a[0] + f * (b[0] - a[0]),
+        a[1] + f * (b[1] - a[1]),
+        a[2] + f * (b[2] - a[2]),
+        a[3] + f * (b[3] - a[3]),
+        a[4] + f * (b[4] - a[4]),
+    )
+
+
+@kernel
+def _meet_primitive(ray: Ray, inverse: tuple[float, float, float], p: FloatArray, k: int) -> float:
+    """Range at which the ray enters the primitive packed at p[k:] from outside, inf if it does not.
+
+    `cast_ray` has the same written out: a call there costs a third of its speed.
+    """
+    if p[k] == BOX:
+        return _meet_box(ray, inverse, p, k)
+    if p[k] == BALL:
+        return _meet_ball(ray, p, k)
+    if p[k] == BLOCK:
+        return _meet_block(ray, p, k)
+    return _meet_post(ray, p, k)
+
+
+@kernel
+def _near_ball(ray: Ray, range_m: float, x: float, y: float, z: float, reach: float) -> bool:
+    """Whether a ray comes into a ball within range."""
+    rx, ry, rz = x - ray.ox, y - ray.oy, z - ray.oz
+    dd = ray.dx * ray.dx + ray.dy * ray.dy + ray.dz * ray.dz
+    along, away = rx * ray.dx + ry * ray.dy + rz * ray.dz, rx * rx + ry * ry + rz * rz - reach * reach
+    if away <= 0.0:
+        return True
+    before = along - range_m * dd
+    return along > 0.0 and away * dd <= along * along and (before <= 0.0 or before * before <= reach * reach * dd)
+
+
+@kernel
+def meet_mover(ray: Ray, range_m: float, crowd: Crowd, mover: int, t_s: float) -> tuple[float, int, float]:
+    """Range, primitive and cosine of incidence where a ray shot at an instant first meets a mover, (inf, -1, 1) if not.
+
+    The ray is taken into the mover's own frame at that instant.
+    """
+    x, y, z, yaw, stride = state_at(crowd, mover, t_s)
+    rx, ry, rz = ray.ox - x, ray.oy - y, ray.oz - z
+    best, found, incidence = range_m, -1, 1.0
+    c, s = cos(yaw), sin(yaw)
+    x, y, dx, dy = c * rx + s * ry, c * ry - s * rx, c * ray.dx + s * ray.dy, c * ray.dy - s * ray.dx
+    inverse = (_inverse(dx), _inverse(dy), _inverse(ray.dz))
+    for item in range(crowd.first[mover], crowd.first[mover + 1]):
+        own = Ray(x - crowd.swing[item] * stride, y, rz, dx, dy, ray.dz)
+        t = _meet_primitive(own, inverse, crowd.packed, item * COLUMNS)
+        if t < best:
+            best, found, incidence = t, item, incidence_of(own, t, crowd.packed, item)
+    return (best, found, incidence) if found >= 0 else (np.inf, -1, 1.0)
+
+
+@kernel
+def _faces(pose: FloatArray, direction: FloatArray, x: float, y: float, reach: float, spread: float) -> bool:
+    """Whether shots may touch a ball seen from above; `spread` is the sine of how far they fan out from `direction`."""
+    rx, ry = x - pose[0, 3], y - pose[1, 3]
+    away = sqrt(rx * rx + ry * ry)
+    dx = pose[0, 0] * direction[0] + pose[0, 1] * direction[1] + pose[0, 2] * direction[2]
+    dy = pose[1, 0] * direction[0] + pose[1, 1] * direction[1] + pose[1, 2] * direction[2]
+    flat = sqrt(dx * dx + dy * dy)
+    wide = reach + spread * away
+    return away <= wide or (rx * dx + ry * dy > 0.0 and abs(rx * dy - ry * dx) <= wide * flat)
+
+
+@kernel
+def cast_crowd(
+    poses: FloatArray,
+    directions: FloatArray,
+    shares: FloatArray,
+    range_m: float,
+    crowd: Crowd,
+    timing: tuple[float, float],
+    spreads: tuple[float, float],
+    base: int,
+    ranges: FloatArray,
+    found: IntArray,
+    incidence: FloatArray,
+) -> None:
+    """Let the shots of a sweep, given as to `cast_sweep`, meet movers, each where it is at the time of the shot.
+
+    `timing` is the time of the first cycle and the time of a cycle [s]; `spreads` are the sines of the angles that the
+    shots of a block of BLOCK_COLUMNS columns and of one column fan out: those that look elsewhere are left out.
+    `ranges`, `found` and `incidence` are what `cast_sweep` gave; they change where a mover stands nearer, whose
+    primitives count from `base`.
+    """
+    (t_start, cycle_s), (wide, narrow) = timing, spreads
+    columns, beams = directions.shape[0], directions.shape[1]
+    for mover in range(len(crowd.first) - 1):
+        reach = crowd.radius_m[mover] + _SLACK_M
+        for i in range(columns):
+            block = i % BLOCK_COLUMNS == 0
+            if block:
+                x, y, z, _, _ = state_at(crowd, mover, t_start + i * cycle_s)
+                seen = abs(x) <= crowd.reach_m and _faces(poses[i], directions[i, 0], x, y, reach, wide)
+            if not seen or not _faces(poses[i], directions[i, 0], x, y, reach, narrow):
+                continue
+            for j in range(beams):
+                ray, limit = shot(poses[i], poses[i + 1], shares[j], directions[i, j]), min(range_m, ranges[i, j])
+                if _near_ball(ray, limit, x, y, z + crowd.centre_m[mover], reach):
+                    t, item, cosine = meet_mover(ray, limit, crowd, mover, t_start + (i + shares[j]) * cycle_s)
+                    if item >= 0:
+                        ranges[i, j], found[i, j], incidence[i, j] = t, base + item, cosine
