@@ -11,7 +11,7 @@ TURN_RAD = 0.01
 def room(rng: np.random.Generator, n: int = 60_000) -> np.ndarray:
     """(N, 3) points on the floor, walls and boxes of a room, axes of its first scan, floor 1.73 m below."""
     u, v = rng.uniform(-1, 1, (2, n))
-    kind = rng.integers(0, 7, n)
+    kind = np.maximum(rng.integers(-3, 7, n), 0)  # most points on the floor, as a LiDAR on a car has
     floor, zero = np.full(n, -1.73), np.zeros(n)
     faces = [
         (18 * u, 11 * v, floor),
@@ -34,7 +34,7 @@ def true_pose(k: int) -> np.ndarray:
     return T
 
 
-def scan_of(k: int, n: int = 12_000) -> np.ndarray:
+def scan_of(k: int, n: int = 48_000) -> np.ndarray:
     """(n, 3) what the LiDAR sees from pose k, 1 cm of noise."""
     rng = np.random.default_rng(k)
     T = true_pose(k)

@@ -78,7 +78,7 @@ def test_compressed_scans_without_times_poses_or_calibration(tmp_path):
     folder = tmp_path / "drive"
     folder.mkdir()
     for k in range(3):
-        points = np.column_stack([scan_of(k), np.ones(12_000)]).astype(np.float32)
+        points = np.column_stack([scan_of(k), np.ones(48_000)]).astype(np.float32)
         (folder / f"{k:03d}.bin.xz").write_bytes(lzma.compress(points.tobytes(), preset=0))
     assert import_recording("kitti", folder, tmp_path / "a.mcap") == 3
     assert drive_counts(tmp_path / "a.mcap").gnss == 3  # from the track
@@ -125,7 +125,7 @@ def radiate_folder(folder: Path) -> Path:
     (folder / "velo_lidar").mkdir(parents=True)
     (folder / "GPS_IMU_Twist").mkdir()
     for k in range(4):
-        p = scan_of(k, 6000)
+        p = scan_of(k, 6_000)
         turned = np.column_stack([-p[:, 1], p[:, 0], p[:, 2]])
         own = np.array([[0.5, 0.5, 0.0], [-1.0, 0.3, -0.4]])
         rows = np.concatenate([own, turned])
@@ -215,7 +215,7 @@ BREAK = {
     "no Tr": lambda folder: (folder / "calib.txt").write_text("P0: 1\n"),
     "time goes back": lambda folder: (folder / "times.txt").write_text("0\n.1\n.2\n.1\n.4\n.5\n.6\n.7\n"),
     "another place": lambda folder: write_bin(
-        folder / "velodyne" / "000004.bin", np.random.default_rng(0).uniform(-60, 60, (12_000, 3))
+        folder / "velodyne" / "000004.bin", np.random.default_rng(0).uniform(-60, 60, (48_000, 3))
     ),
 }
 
@@ -225,7 +225,7 @@ BREAK = {
     [
         ("no scans", "no .bin or .bin.xz scans"),
         ("one scan", "1 scans; a drive needs at least 2"),
-        ("cut off", "191995 bytes, which is no positive multiple of 16"),
+        ("cut off", "767995 bytes, which is no positive multiple of 16"),
         ("few times", "2 times for 8 scans"),
         ("odd poses", "12 a scan are needed"),
         ("no Tr", "no line 'Tr:'"),
