@@ -1,13 +1,15 @@
 """The commands `gnd sim world` and `gnd sim drive`; each is a thin layer over a library function."""
 
 import json
-from collections import Counter
+from math import degrees
 from pathlib import Path
 
 import click
 
+from fleet_sim.sensors import SHORT_NAMES
 from fleet_sim.street import SITES, SiteName, StreetOptions, street
-from fleet_sim.world import EDITS, STATES, World, read_world, write_world
+from fleet_sim.world import STATES, World, read_world, write_world
+from fleet_sim.world_summary import as_text, summary
 
 
 @click.group()
@@ -38,30 +40,9 @@ def write(file: Path, seed: int, length_m: float, site: SiteName, lat_deg: float
 @click.argument("file", type=click.Path(path_type=Path))
 @click.option("--json", "as_json", is_flag=True, help="Print one JSON object.")
 def inspect(file: Path, as_json: bool) -> None:
-    """Print what a world file holds: place, objects, edits."""
+    """Print what a world file holds: place, objects, edits by kind and by place along the street."""
     found = summary(read_world(file))
-    if as_json:
-        click.echo(json.dumps(found))
-        return
-    for name, value in found.items():
-        text = ", ".join(f"{k} {v}" for k, v in value.items()) if isinstance(value, dict) else value
-        click.echo(f"{name:<12} {text}")
-
-
-def summary(made: World) -> dict[str, object]:
-    """Return the figures of a world that `gnd sim world inspect` prints."""
-    from math import degrees
-
-    kinds, edits = Counter(o.kind for o in made.objects), Counter(o.edit for o in made.objects)
-    return {
-        "seed": made.seed,
-        "anchor": {"lat_deg": degrees(made.lat_rad), "lon_deg": degrees(made.lon_rad), "height_m": made.height_m},
-        "heading_deg": round(degrees(made.heading_rad), 3),
-        "length_m": 2 * made.half_length_m,
-        "shapes": {state: len(made.shapes(state)) for state in STATES},
-        "kinds": dict(sorted(kinds.items())),
-        "edits": {edit: edits[edit] for edit in EDITS},
-    }
+    click.echo(json.dumps(found) if as_json else as_text(found))
 
 
 @world.command("picture")
@@ -69,26 +50,32 @@ def summary(made: World) -> dict[str, object]:
 @click.argument("png", type=click.Path(path_type=Path))
 @click.option("--truth", "truth_file", type=click.Path(path_type=Path), help="Keep the truth in this file (.npz).")
 def picture(file: Path, png: Path, truth_file: Path | None) -> None:
-    """Draw what changes in the world of FILE, as classes of voxels (takes about 20 s without a kept truth)."""
+    """Draw what changes in the world of FILE, as classes of voxels (some 10 s for 200 m without a kept truth)."""
     from fleet_sim.ellipsoids import ellipsoids_of_truth
     from fleet_sim.pictures import draw_map
     from fleet_sim.truth import load_or_make_truth, make_truth
 
     made = read_world(file)
     truth = load_or_make_truth(made, truth_file) if truth_file else make_truth(made)
-    draw_map(ellipsoids_of_truth(truth), png, f"World {made.seed}", "what changes between before and after")
+    draw_map(ellipsoids_of_truth(truth), png, f"World {made.seed}", _note(made))
     click.echo(f"{png}: {', '.join(f'{n} {name}' for name, n in truth.counts('all').items())}")
+
+
+def _note(made: World) -> str:
+    lat_deg, lon_deg = degrees(made.lat_rad), degrees(made.lon_rad)
+    return f"what changes between before and after on {2 * made.half_length_m:g} m at {lat_deg:.4f}°, {lon_deg:.4f}°"
 
 
 @sim.command()
 @click.argument("world_file", type=click.Path(path_type=Path))
 @click.argument("file", type=click.Path(path_type=Path))
-@click.option("--sensor", default="VLP-16", show_default=True, help="VLP-16 or HDL-32E.")
+@click.option("--sensor", default="VLP-16", show_default=True, help=f"{', '.join(SHORT_NAMES)}, or the model's name.")
 @click.option("--state", type=click.Choice(STATES), default="after", show_default=True)
 @click.option("--reverse", is_flag=True, help="Drive against the street's x.")
 @click.option("--seed", default=0, show_default=True, help="Everything random of the drive.")
 @click.option("--vehicle", default="vehicle-0", show_default=True, help="Pseudonym of the vehicle.")
 @click.option("--cars", default=0.2, show_default=True, help="Share of parking slots that are taken.")
+@click.option("--traffic", type=click.Choice(["none", "urban"]), default="none", show_default=True, help="What moves.")
 @click.option("--scans", type=int, help="At most so many scans.")
 def drive(
     world_file: Path,
@@ -99,18 +86,21 @@ def drive(
     seed: int,
     vehicle: str,
     cars: float,
+    traffic: str,
     scans: int | None,
 ) -> None:
     """Drive through the world of WORLD_FILE and write what the sensors give to FILE (MCAP, opens in Foxglove)."""
     from fleet_sim.drives import DriveConfig, simulate_drive
+    from fleet_sim.traffic import Traffic
 
     config = DriveConfig(
         vehicle=vehicle,
-        sensor=sensor,
+        sensor=SHORT_NAMES.get(sensor, sensor),
         state="before" if state == "before" else "after",
         direction=-1 if reverse else 1,
         seed=seed,
         car_share=cars,
+        traffic=Traffic.urban() if traffic == "urban" else Traffic(),
         scans=scans,
     )
     simulate_drive(read_world(world_file), config, file)

@@ -7,9 +7,10 @@ kerbs follow the slope, and straight rays stay straight.
 """
 
 import json
+from collections import Counter
 from dataclasses import asdict, dataclass
 from functools import cached_property
-from math import cos, isfinite, sin
+from math import cos, isfinite, pi, sin
 from pathlib import Path
 from typing import Any, Final, Literal, get_args
 
@@ -18,6 +19,7 @@ from numpy.typing import NDArray
 
 from fleet_sim.errors import ShapeError, WorldError
 from fleet_sim.shapes import Ball, Block, Post, Shape
+from fleet_sim.strict_json import arguments, items, mapping, parsed
 from gnd_map.geodesy import LocalFrame
 
 State = Literal["before", "after"]
@@ -27,6 +29,9 @@ EDITS: Final = get_args(Edit)
 
 _FORMAT: Final = "gnd.world"
 _VERSION: Final = 1
+MAX_HALF_LENGTH_M: Final = 1000.0
+SURROUNDINGS_M: Final = 500.0
+"""Everything lies so near to the stretch that is driven."""
 _MAX_FILE_BYTES: Final = 64 * 1024 * 1024
 _TYPES: Final[dict[str, type[Block] | type[Post] | type[Ball]]] = {"block": Block, "post": Post, "ball": Ball}
 
@@ -52,10 +57,15 @@ class WorldObject:
     def __post_init__(self) -> None:
         if not self.states or any(state not in STATES for state in self.states):
             raise WorldError(f"object {self.name!r}: states must be some of {STATES}, got {self.states}")
+        if len(set(self.states)) != len(self.states):
+            raise WorldError(f"object {self.name!r}: states are named twice: {self.states}")
         if self.edit not in EDITS:
             raise WorldError(f"object {self.name!r}: edit must be one of {EDITS}, got {self.edit!r}")
         if not self.shapes:
             raise WorldError(f"object {self.name!r} has no shapes")
+        stands = {"kept": set(STATES), "added": {"after"}, "removed": {"before"}}.get(self.edit)
+        if set(self.states) != (stands or {self.states[0]}):
+            raise WorldError(f"object {self.name!r} is {self.edit}, but stands in the states {self.states}")
 
 
 @dataclass(frozen=True)
@@ -91,15 +101,43 @@ class World:
         bad = [name for name, value in numbers.items() if not isinstance(value, (int, float)) or not isfinite(value)]
         if bad:
             raise WorldError(f"world {self.seed}: {', '.join(bad)} must be finite numbers")
-        if self.half_length_m <= 0 or not 0 < self.lane_offset_m < self.kerb_m:
+        lanes = 0 < self.lane_offset_m < self.kerb_m <= SURROUNDINGS_M
+        if not lanes or not 0 < self.half_length_m <= MAX_HALF_LENGTH_M:
             raise WorldError(
-                f"need half_length_m > 0 and 0 < lane_offset_m < kerb_m, got {self.half_length_m},"
-                f" {self.lane_offset_m}, {self.kerb_m}"
+                f"need 0 < half_length_m <= {MAX_HALF_LENGTH_M:.0f} and 0 < lane_offset_m < kerb_m <="
+                f" {SURROUNDINGS_M:.0f}, got {self.half_length_m}, {self.lane_offset_m}, {self.kerb_m}"
             )
+        limits = {"lat_rad": pi / 2, "lon_rad": 2 * pi, "height_m": 1e4, "slope": 1.0, "crown": 1.0}
+        for name, limit in limits.items():
+            if abs(numbers[name]) > limit:
+                raise WorldError(f"world {self.seed}: {name} must be in -{limit:g} … {limit:g}, got {numbers[name]}")
+        self._check_objects()
+
+    def _check_objects(self) -> None:
         for state in STATES:
-            names = [o.name for o in self.objects if state in o.states]
-            if len(names) != len(set(names)):
-                raise WorldError(f"world {self.seed}: object names are not unique in state {state!r}")
+            count = Counter(o.name for o in self.objects if state in o.states)
+            twice = [name for name, number in count.items() if number > 1]
+            if twice:
+                raise WorldError(
+                    f"world {self.seed}: object names are not unique in state {state!r}: {', '.join(twice[:3])}"
+                )
+        changed = {state: {(o.name, o.edit) for o in self.objects if o.states == (state,)} for state in STATES}
+        alone = [o for o in changed["before"] ^ changed["after"] if o[1] in ("moved", "reshaped")]
+        if alone:
+            raise WorldError(f"world {self.seed}: {alone[0][0]!r} is {alone[0][1]}, but stands in one state only")
+        for o in self.objects:
+            self._check_place(o)
+
+    def _check_place(self, o: WorldObject) -> None:
+        """Refuse what lies so far off that a grid around it would not fit into memory."""
+        for shape in o.shapes:
+            x0, y0, x1, y1, top = shape.bounds()
+            out_m = max(-x0 - self.half_length_m, x1 - self.half_length_m, -y0, y1, abs(top))
+            if out_m > SURROUNDINGS_M:
+                raise WorldError(
+                    f"world {self.seed}: object {o.name!r} reaches {out_m:.0f} m beyond the street, at most"
+                    f" {SURROUNDINGS_M:.0f} m are allowed"
+                )
 
     @cached_property
     def frame(self) -> LocalFrame:
@@ -155,20 +193,19 @@ def from_json(text: str, where: str = "world") -> World:
     Raises:
         WorldError: `where` is no world file, of an unknown version, or says something impossible.
     """
-    try:
-        data = json.loads(text)
-    except ValueError as error:
-        raise WorldError(f"{where} is not JSON: {error}") from error
-    if not isinstance(data, dict) or data.pop("format", None) != _FORMAT:
+    data = mapping(parsed(text, where), where)
+    if data.pop("format", None) != _FORMAT:
         raise WorldError(f'{where} is not a world file: it lacks "format": "{_FORMAT}"')
     version = data.pop("version", None)
     if version != _VERSION:
         raise WorldError(f"{where} has version {version!r}, this program reads version {_VERSION}")
+    listed = items(data.pop("objects", None), f"{where}, objects")
+    objects = tuple(_decode_object(o, f"{where}, object {index}") for index, o in enumerate(listed))
+    head = arguments(World, data, where, besides=["objects"])
     try:
-        objects = tuple(_decode_object(o) for o in data.pop("objects"))
-        return World(**data, objects=objects)
-    except (TypeError, KeyError, ValueError, AttributeError, ShapeError, WorldError) as error:
-        raise WorldError(f"{where} cannot be read: {type(error).__name__}: {error}") from error
+        return World(**head, objects=objects)
+    except WorldError as error:
+        raise WorldError(f"{where} cannot be read: {error}") from error
 
 
 def _encode_object(o: WorldObject) -> dict[str, Any]:
@@ -176,16 +213,29 @@ def _encode_object(o: WorldObject) -> dict[str, Any]:
     return {"name": o.name, "kind": o.kind, "states": list(o.states), "edit": o.edit, "shapes": shapes}
 
 
-def _decode_object(data: dict[str, Any]) -> WorldObject:
-    shapes = tuple(_decode_shape(shape) for shape in data.pop("shapes"))
-    return WorldObject(**{**data, "states": tuple(data["states"])}, shapes=shapes)
+def _decode_object(value: object, where: str) -> WorldObject:
+    data = mapping(value, where)
+    where += f" ({str(data.get('name'))[:40]!r})"
+    states = items(data.pop("states", None), f"{where}, states")
+    listed = items(data.pop("shapes", None), f"{where}, shapes")
+    head = arguments(WorldObject, data, where, besides=["states", "shapes"])
+    shapes = tuple(_decode_shape(shape, f"{where}, shape {index}") for index, shape in enumerate(listed))
+    try:
+        return WorldObject(**head, states=tuple(states), shapes=shapes)
+    except WorldError as error:
+        raise WorldError(f"{where}: {error}") from error
 
 
-def _decode_shape(data: dict[str, Any]) -> Shape:
-    kind = data.pop("type", None)
-    if kind not in _TYPES:
-        raise WorldError(f"unknown shape type {kind!r}, known are {sorted(_TYPES)}")
-    return _TYPES[kind](**data)
+def _decode_shape(value: object, where: str) -> Shape:
+    data = mapping(value, where)
+    name = str(data.pop("type", None))
+    if name not in _TYPES:
+        raise WorldError(f"{where}: unknown shape type {name[:40]!r}, known are {', '.join(sorted(_TYPES))}")
+    cls = _TYPES[name]
+    try:
+        return cls(**arguments(cls, data, where))
+    except ShapeError as error:
+        raise WorldError(f"{where}: {error}") from error
 
 
 def write_world(world: World, path: Path) -> None:

@@ -9,7 +9,7 @@ from click.testing import CliRunner
 from fleet_sim.cli import sim
 from fleet_sim.errors import SimError
 from fleet_sim.prepare import prepare_fleet_run
-from fleet_sim.street import street
+from fleet_sim.street import StreetOptions, street
 from fleet_sim.truth import Truth, read_truth
 from fleet_sim.world import read_world
 from gnd_map.errors import GndError
@@ -34,6 +34,35 @@ def test_a_world_is_written_and_inspected(tmp_path: Path) -> None:
     assert "building" in text
 
 
+def test_a_long_world_at_another_place_is_written_and_inspected(tmp_path: Path) -> None:
+    path = tmp_path / "w.json"
+    assert "400 m" in run("world", "write", path, "--seed", 2, "--length", 400, "--site", "wangsimni")
+    assert read_world(path) == street(2, StreetOptions(400.0, "wangsimni"))
+    found = json.loads(run("world", "inspect", path, "--json"))
+    assert found["districts"] == ["13033/03021/23031"]
+    edits = sum(found["edits"].values()) - found["edits"]["kept"]
+    assert edits == sum(sum(kinds.values()) for kinds in found["edits_by_kind"].values())
+    assert edits == sum(sum(place.values()) for place in found["edits_by_place"].values())
+    assert len(found["edits_by_place"]) == 8
+    text = run("world", "inspect", path)
+    assert "-200 … -150" in text
+    assert "reshaped" in text
+
+
+def test_a_world_at_coordinates_is_written(tmp_path: Path) -> None:
+    path = tmp_path / "w.json"
+    run("world", "write", path, "--length", 100, "--lat", 48.2, "--lon", 16.37)
+    assert read_world(path) == street(1, StreetOptions(100.0, lat_deg=48.2, lon_deg=16.37))
+
+
+@pytest.mark.parametrize(("sensor", "model"), [("rs32", "RS-LiDAR-32"), ("Scala", "Scala")])
+def test_a_drive_with_any_sensor_and_traffic_is_written(sensor: str, model: str, tmp_path: Path) -> None:
+    run("world", "write", tmp_path / "w.json", "--length", 100)
+    options = ("--sensor", sensor, "--scans", 2, "--traffic", "urban", "--cars", 0.35)
+    run("drive", tmp_path / "w.json", tmp_path / "d.mcap", *options)
+    assert read_header(tmp_path / "d.mcap").sensor_model == model
+
+
 def test_a_drive_is_written(tmp_path: Path) -> None:
     run("world", "write", tmp_path / "w.json")
     options = ("--sensor", "HDL-32E", "--state", "before", "--reverse", "--scans", 2, "--vehicle", "v-7", "--seed", 5)
@@ -49,7 +78,11 @@ def test_a_drive_is_written(tmp_path: Path) -> None:
         lambda folder: ["world", "inspect", folder / "none.json"],
         lambda folder: ["world", "write", folder / "no" / "w.json"],
         lambda folder: ["world", "write", folder / "w.json", "--seed", "-1"],
+        lambda folder: ["world", "write", folder / "w.json", "--length", "1e9"],
+        lambda folder: ["world", "write", folder / "w.json", "--length", "nan"],
+        lambda folder: ["world", "write", folder / "w.json", "--lat", "48"],
         lambda folder: ["drive", folder / "none.json", folder / "d.mcap"],
+        lambda folder: ["drive", folder / "none.json", folder / "d.mcap", "--sensor", "vlp128"],
     ],
 )
 def test_bad_input_is_an_error_of_ours_and_leaves_nothing(
