@@ -47,7 +47,6 @@ def causes(true_class: NDArray[np.uint8], e: Mapping[str, I32], p: DetectParamet
     silent = said == int(ChangeClass.UNMEASURED)
     weak = (e["cells"] >= p.weak_cells) & (e["cells"] < np.where(e["map_cells"] > 0, p.min_cells, p.new_cells))
     part = e["cells"] < 0.5 * e["map_cells"]
-    little = e["cells"] < p.min_coverage * e["map_cells"]
     cases = (
         (e["seen"] == 0, UNSEEN),
         (said == t, RIGHT),
@@ -57,9 +56,8 @@ def causes(true_class: NDArray[np.uint8], e: Mapping[str, I32], p: DetectParamet
         ((t == A) & (said == E), "empty: rays pass, nothing met"),
         ((t == E) & (said == A), "new: something stood or moved there"),
         ((t == M) & (said == N) & (e["cells"] < p.min_cells), "normal: too few sub-cells for a Gaussian"),
-        ((t == M) & (said == N) & (e["similar_pct"] >= 100 * p.similar), "normal: the Gaussians are too alike"),
-        ((t == M) & (said == N) & little, "normal: too little of it seen"),
-        ((t == M) & (said == N), "normal: evidence sustains it"),
+        ((t == M) & (said == N) & part, "normal: only a part of it seen"),
+        ((t == M) & (said == N), "normal: the Gaussians are too alike"),
         ((t == M) & (said == D), "deleted: rays pass, too few sub-cells"),
         ((t == N) & (said == M) & part, "modified: only a part of it seen"),
         ((t == N) & (said == M), "modified: unlike the map's Gaussian"),

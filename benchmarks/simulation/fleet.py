@@ -6,6 +6,7 @@ from benchmarks.simulation.options import RunOptions
 from fleet_sim.drives import EPOCH_NS, DriveConfig
 from fleet_sim.prepare import mapping_configs
 from fleet_sim.sensors import SHORT_NAMES
+from fleet_sim.traffic import Traffic
 
 _HOUR_NS = 3_600 * 1_000_000_000
 
@@ -29,6 +30,7 @@ def fleet_configs(options: RunOptions, seed: int) -> tuple[DriveConfig, ...]:
             direction=1 if (index + index // round_trip * (round_trip % 2 == 0)) % 2 == 0 else -1,
             seed=1_000_003 * seed + index,
             car_share=options.parking,
+            traffic=Traffic.urban() if options.traffic else Traffic(),
             scans=options.scans,
             start_ns=EPOCH_NS + index * _HOUR_NS,
         )

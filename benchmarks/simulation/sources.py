@@ -22,6 +22,7 @@ VEHICLE: Final = (
     "benchmarks/simulation/held_tiles.py",
     "benchmarks/simulation/base_map.py",
     "benchmarks/simulation/masses.py",
+    "benchmarks/simulation/labels.py",
     "benchmarks/simulation/voxel_rows.py",
 )
 _DECIDE_NOTHING: Final = ("cli.py", "pictures.py", "ellipsoids.py", "evaluate.py", "insert.py", "insert_drive.py")

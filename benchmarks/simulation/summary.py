@@ -97,7 +97,17 @@ def _pcd(world: WorldOutcome, by_sensor: Mapping[str, list[str]]) -> dict[str, A
 def _drives(world: WorldOutcome, names: Sequence[str]) -> dict[str, Any]:
     """Counts and pose errors, mean over the drives of one sensor."""
     stats = [vehicle.stats for vehicle in world.vehicles if vehicle.vehicle in names]
-    kept = ("scans", "scans_used", "scans_uncertain", "points", "moving_points", "changed_voxels", "way_m", "poses")
+    kept = (
+        "scans",
+        "scans_used",
+        "scans_uncertain",
+        "points",
+        "moving_points",
+        "changed_voxels",
+        "way_m",
+        "poses",
+        "segmentation",
+    )
     return mean_of([{name: s[name] for name in kept if s[name] is not None} for s in stats])
 
 

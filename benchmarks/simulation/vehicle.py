@@ -15,6 +15,7 @@ from benchmarks.simulation.base_map import BaseMap, read_base
 from benchmarks.simulation.baseline import CloudVehicle, read_cloud
 from benchmarks.simulation.errors import ReproduceError
 from benchmarks.simulation.held_tiles import HeldTiles
+from benchmarks.simulation.labels import MoverLabels
 from benchmarks.simulation.masses import Watch, Watcher
 from benchmarks.simulation.method import MethodParameters
 from benchmarks.simulation.pose_source import PoseSource
@@ -83,10 +84,11 @@ class VehicleTask:
 def run_vehicle(task: VehicleTask, tick: Tick) -> None:
     """Simulate a drive, run the vehicle on it and write its result."""
     simulation = DriveSimulation(read_world(task.world), task.drive)
-    items = ticking(simulation.items(), tick, simulation.scans)
+    labels = MoverLabels(task.method.detect.range_max_m)
+    items = ticking(simulation.items(labels.take), tick, simulation.scans)
     if task.recording is not None:
         items = recorded(items, simulation.header(), task.recording)
-    result = drive(simulation.header(), items, read_base(task.base), VoxelRows.read(task.voxels), task)
+    result = drive(simulation.header(), items, read_base(task.base), VoxelRows.read(task.voxels), task, labels)
     write_result(result, task.key, task.result)
 
 
@@ -109,7 +111,12 @@ def recorded(items: Iterable[DriveItem], header: DriveHeader, path: Path) -> Ite
 
 
 def drive(
-    header: DriveHeader, items: Iterable[DriveItem], base: BaseMap, voxels: VoxelRows, task: VehicleTask
+    header: DriveHeader,
+    items: Iterable[DriveItem],
+    base: BaseMap,
+    voxels: VoxelRows,
+    task: VehicleTask,
+    labels: MoverLabels | None = None,
 ) -> VehicleResult:
     """Run the vehicle over the measurements of one drive.
 
@@ -119,6 +126,7 @@ def drive(
         base: the map it starts with.
         voxels: the truth's voxels, about which evidence is kept for the analysis of errors.
         task: sensor, poses, parameters.
+        labels: which points lie on movers, for the account of how many were found; a recording has none.
 
     Raises:
         ReproduceError: the drive has no GNSS fix.
@@ -127,7 +135,7 @@ def drive(
     with TemporaryDirectory() as folder:
         outbox = Outbox(Path(folder) / "outbox.sqlite")
         try:
-            run = _Run(header, items, base, outbox, task)
+            run = _Run(header, items, base, outbox, task, labels)
             run.to_the_end()
             reports = tuple(letter.body for letter in outbox.due(2**62, _ALL_LETTERS))
         finally:
@@ -154,7 +162,13 @@ class _Run:
     """The parts of one vehicle, put together as `vehicle_agent.vehicle` does."""
 
     def __init__(
-        self, header: DriveHeader, items: Iterable[DriveItem], base: BaseMap, outbox: Outbox, task: VehicleTask
+        self,
+        header: DriveHeader,
+        items: Iterable[DriveItem],
+        base: BaseMap,
+        outbox: Outbox,
+        task: VehicleTask,
+        labels: MoverLabels | None,
     ) -> None:
         fix, self._items = _first_fix(iter(items))
         start = TileId.from_geodetic(fix.lat_rad, fix.lon_rad)
@@ -171,6 +185,7 @@ class _Run:
         self._reporter = Reporter(self.detector, outbox, who, fix.t_ns, method.report)
         self._watcher = Watcher(task.watch, base, local_map.grid_frame, method.detect) if task.watch else None
         self._cloud = CloudVehicle(read_cloud(task.cloud), frame) if task.cloud else None
+        self._labels = labels
         self._estimates: list[PoseEstimate] = []
         self._reference: list[ReferencePose] = []
         self._T_map_anchor = frame.T_self_other(header.anchor)
@@ -200,6 +215,8 @@ class _Run:
     def _detect(self, segmented: SegmentedScan) -> None:
         self._estimates.append(segmented.scan.estimate)
         self._reporter.add_scan(segmented)
+        if self._labels is not None:
+            self._labels.compare(segmented)
         if self._watcher is not None:
             self._watcher.add_scan(segmented)
         if self._cloud is not None:
@@ -224,6 +241,7 @@ class _Run:
         found["way_m"] = round(self._place.odometer_m, 2)
         found["classes"] = dict(self._reporter.classes)
         found["poses"] = self._pose_errors()
+        found["segmentation"] = dict(self._labels.counts) if self._labels else {}
         return found
 
     def _pose_errors(self) -> dict[str, float] | None:
