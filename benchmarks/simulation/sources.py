@@ -25,6 +25,7 @@ VEHICLE: Final = (
     "benchmarks/simulation/labels.py",
     "benchmarks/simulation/voxel_rows.py",
 )
+_SUFFIXES: Final = (".py", ".json", ".npz", ".toml")
 _DECIDE_NOTHING: Final = ("cli.py", "pictures.py", "ellipsoids.py", "evaluate.py", "insert.py", "insert_drive.py")
 """Files of the simulator that no drive and no truth depends on."""
 PCD: Final = ("benchmarks/pcd", "benchmarks/simulation/baseline.py")
@@ -32,7 +33,7 @@ PCD: Final = ("benchmarks/pcd", "benchmarks/simulation/baseline.py")
 
 @lru_cache
 def sources_sha(parts: tuple[str, ...]) -> str:
-    """Return the SHA-256, hexadecimal, over the Python files of packages, folders and files of this project."""
+    """Return the SHA-256, hexadecimal, over the programs and tables of packages, folders and files of this project."""
     digest = hashlib.sha256()
     for part in parts:
         for path in _files(part):
@@ -43,7 +44,9 @@ def sources_sha(parts: tuple[str, ...]) -> str:
 def _files(part: str) -> Iterable[Path]:
     package, _, inside = part.partition("/")
     path = Path(str(importlib.resources.files(package))) / inside
-    return [path] if path.suffix == ".py" else sorted(p for p in path.rglob("*.py") if p.name not in _DECIDE_NOTHING)
+    if path.is_file():
+        return [path]
+    return sorted(p for p in path.rglob("*") if p.suffix in _SUFFIXES and p.name not in _DECIDE_NOTHING)
 
 
 def key_of(**what: Any) -> str:

@@ -14,6 +14,10 @@ from fleet_sim.truth import LEVELS
 from gnd_map.config import to_mapping
 
 _DIGITS = 4
+_OF_A_DRIVE = (
+    "scans", "scans_used", "scans_uncertain", "points", "moving_points", "changed_voxels", "way_m", "poses",
+    "segmentation",
+)  # fmt: skip
 
 
 def summary_of(outcome: Outcome) -> dict[str, Any]:
@@ -97,18 +101,7 @@ def _pcd(world: WorldOutcome, by_sensor: Mapping[str, list[str]]) -> dict[str, A
 def _drives(world: WorldOutcome, names: Sequence[str]) -> dict[str, Any]:
     """Counts and pose errors, mean over the drives of one sensor."""
     stats = [vehicle.stats for vehicle in world.vehicles if vehicle.vehicle in names]
-    kept = (
-        "scans",
-        "scans_used",
-        "scans_uncertain",
-        "points",
-        "moving_points",
-        "changed_voxels",
-        "way_m",
-        "poses",
-        "segmentation",
-    )
-    return mean_of([{name: s[name] for name in kept if s[name] is not None} for s in stats])
+    return mean_of([{name: s[name] for name in _OF_A_DRIVE if s[name] is not None} for s in stats])
 
 
 def confusion_of(worlds: Sequence[WorldOutcome]) -> dict[str, Any]:

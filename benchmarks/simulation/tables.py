@@ -10,6 +10,8 @@ from rich.text import Text
 from benchmarks.simulation import reference
 from fleet_sim.truth import LEVELS
 
+PCD_CODEC: Final = "points"
+"""The baseline's upload as the paper counts it: every new and every deleted point with its coordinates."""
 _PLAIN_WIDTH: Final = 120
 
 
@@ -22,6 +24,8 @@ def tables_of(found: Mapping[str, Any], asked: "list[int]") -> Group:
         _classes("merged map", largest, found["fleet"][largest]["classes"]["scored"]),
         Text(),
         _confusion(found, largest),
+        Text(),
+        notes_of(found),
     )
 
 
@@ -54,7 +58,28 @@ def _scores(found: Mapping[str, Any], asked: "list[int]") -> Table:
         size = _kb(found["upload_bytes"]["fleet"][str(n)])
         style = "bold" if name in reference.MUST else ""
         table.add_row(f"{n} vehicle{'s' * (n > 1)}", *_f1(stage), *row, size, style=style)
+    for n in asked:
+        if "pcd" in found:
+            size = _kb(found["pcd"]["upload_bytes"]["fleet"][str(n)][PCD_CODEC])
+            table.add_row(f"point clouds, {n}", *_f1(found["pcd"]["fleet"][str(n)]), "", "", "", size, style="dim")
     return table
+
+
+def notes_of(found: Mapping[str, Any]) -> Text:
+    """Return a line each on movers and on upload against the baseline."""
+    counts = [drive["segmentation"] for drive in found["drives"].values() if drive.get("segmentation")]
+    lines = []
+    total = {name: sum(count[name] for count in counts) for name in (counts[0] if counts else ())}
+    if total and total["movers"]:
+        left, lost = 100 * total["movers_left"] / total["movers"], 100 * total["static_lost"] / total["static"]
+        lines.append(
+            f"Movers: {left:.2f} % of their points are left as static; {lost:.3f} % of static points are lost."
+        )
+    if "pcd" in found:
+        ours, theirs = found["upload_bytes"]["single"], found["pcd"]["upload_bytes"]["single"]
+        share = 100 * sum(ours.values()) / sum(one[PCD_CODEC] for one in theirs.values())
+        lines.append(f"Upload of one drive: {share:.2f} % of the point-cloud baseline's (at most 4 %).")
+    return Text("\n".join(lines))
 
 
 def target_single(found: Mapping[str, Any]) -> dict[str, float] | None:
