@@ -49,7 +49,10 @@ def inspect(file: Path, as_json: bool) -> None:
 @click.argument("file", type=click.Path(path_type=Path))
 @click.argument("png", type=click.Path(path_type=Path))
 @click.option("--truth", "truth_file", type=click.Path(path_type=Path), help="Keep the truth in this file (.npz).")
-def picture(file: Path, png: Path, truth_file: Path | None) -> None:
+@click.option(
+    "--dpi", type=click.IntRange(40, 300), default=150, show_default=True, help="Dots an inch, of 12.6 inches."
+)
+def picture(file: Path, png: Path, truth_file: Path | None, dpi: int) -> None:
     """Draw what changes in the world of FILE, as classes of voxels (some 10 s for 200 m without a kept truth)."""
     from fleet_sim.ellipsoids import ellipsoids_of_truth
     from fleet_sim.pictures import draw_map
@@ -57,7 +60,7 @@ def picture(file: Path, png: Path, truth_file: Path | None) -> None:
 
     made = read_world(file)
     truth = load_or_make_truth(made, truth_file) if truth_file else make_truth(made)
-    draw_map(ellipsoids_of_truth(truth), png, f"World {made.seed}", _note(made))
+    draw_map(ellipsoids_of_truth(truth), png, f"World {made.seed}", _note(made), dpi=dpi)
     click.echo(f"{png}: {', '.join(f'{n} {name}' for name, n in truth.counts('all').items())}")
 
 
