@@ -6,6 +6,7 @@ half maps, the other half can drive on.
 
 from collections import deque
 from collections.abc import Callable, Iterator
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
 
@@ -14,11 +15,14 @@ from numpy.typing import NDArray
 
 from gnd_map.motion import Trajectory
 from gnd_map.se3 import T_inverse, exp_so3, log_so3
-from schemas.drive import DriveHeader, DriveItem, GnssFix, MotionSample, ReferencePose, Scan
+from schemas.drive import DriveHeader, DriveItem, GnssFix, MotionSample, ReferencePose
 from schemas.drive_mcap import DriveWriter
 from vehicle_agent.errors import ImportDriveError
+from vehicle_agent.importers.cleaning import MAX_RANGE_M, Cleaned, cleaned
+from vehicle_agent.importers.detect_format import format_of
 from vehicle_agent.importers.kitti import open_kitti
 from vehicle_agent.importers.lidar_odometry import Progress, lidar_odometry
+from vehicle_agent.importers.mcap_clouds import open_mcap_clouds
 from vehicle_agent.importers.pcd import open_pcd
 from vehicle_agent.importers.radiate import open_radiate
 from vehicle_agent.importers.recording import GNSS_SIGMA_M, Anchor, Recording
@@ -30,8 +34,35 @@ FORMATS: Final[dict[str, Callable[[Path, Anchor | None], Recording]]] = {
     "kitti": open_kitti,
     "radiate": open_radiate,
     "pcd": open_pcd,
+    "mcap": open_mcap_clouds,
 }
+AUTO: Final = "auto"
 AROUND_NS = 300_000_000  # motion and fixes kept before the first and after the last chosen scan
+
+
+@dataclass(frozen=True, slots=True)
+class Imported:
+    """What became of a recording.
+
+    scans: written. empty_scans: left out, because no point of them was left. points_not_finite, points_too_far: left
+    out of scans that were written or empty. notes: what else had to be put right.
+    """
+
+    scans: int
+    empty_scans: int
+    points_not_finite: int
+    points_too_far: int
+    notes: tuple[str, ...] = ()
+
+    @property
+    def skipped(self) -> tuple[str, ...]:
+        """One sentence for each thing that was left out or put right."""
+        counts = (
+            (self.empty_scans, "scans without a usable point: left out"),
+            (self.points_not_finite, "points that are no numbers: left out"),
+            (self.points_too_far, f"points beyond {MAX_RANGE_M:.0f} m: left out"),
+        )
+        return (*self.notes, *(f"{n} {what}" for n, what in counts if n))
 
 
 def no_progress(_step: str, _done: int, _total: int) -> None:
@@ -46,33 +77,38 @@ def import_recording(
     scans: str = "all",
     anchor: Anchor | None = None,
     vehicle: str = "recorded",
+    topic: str | None = None,
     progress: Progress = no_progress,
-) -> int:
-    """Write the drive `out` (MCAP) from a recording; give the number of scans written.
+) -> Imported:
+    """Write the drive `out` (MCAP) from a recording; tell what was written and what was left out.
 
     Args:
-        kind: "kitti", "radiate" or "pcd".
-        folder: of the recording; see the readers for what it must hold.
+        kind: "kitti", "radiate", "pcd", "mcap", or "auto" to find out.
+        folder: of the recording (or its file); see the readers for what it must hold.
         out: file to write.
         scans: which scans; see `chosen_scans`.
         anchor: place on the Earth; see the readers for what it means and whether it may be left out.
         vehicle: pseudonym written into the drive.
+        topic: of the clouds in an MCAP file that has several.
         progress: called with a step's name, how much is done, and of how much.
 
     Raises:
         ImportDriveError: the folder is missing, holds no scans of that format, or is damaged.
         DriveError: the drive cannot be written.
     """
-    recording = open_recording(kind, folder, anchor)
+    recording = open_recording(kind, folder, anchor, topic)
     chosen_scans(scans, len(recording))  # a wrong rule is told before the long work
     return write_drive(recording, map_track(recording, progress), out, scans, vehicle, progress)
 
 
-def open_recording(kind: str, folder: Path, anchor: Anchor | None = None) -> Recording:
-    """A recording of a known format; ImportDriveError when it is none."""
-    if kind not in FORMATS:
-        raise ImportDriveError(f"format {kind!r} is not known; known are {', '.join(FORMATS)}")
-    return FORMATS[kind](folder, anchor)
+def open_recording(kind: str, folder: Path, anchor: Anchor | None = None, topic: str | None = None) -> Recording:
+    """A recording of a known format, or of the one that it is found to be of; ImportDriveError when it is none."""
+    if kind not in (*FORMATS, AUTO):
+        raise ImportDriveError(f"format {kind!r} is not known; known are {', '.join(FORMATS)} and {AUTO}")
+    found = format_of(folder) if kind == AUTO else kind
+    if found == "mcap":
+        return open_mcap_clouds(folder, anchor, topic)
+    return FORMATS[found](folder, anchor)
 
 
 def write_drive(
@@ -82,15 +118,22 @@ def write_drive(
     scans: str = "all",
     vehicle: str = "recorded",
     progress: Progress = no_progress,
-) -> int:
-    """Write the chosen scans of a recording whose track (T_map_vehicle of all scans) is known; how many."""
-    chosen, done = chosen_scans(scans, len(recording)), 0
+) -> Imported:
+    """Write the chosen scans of a recording whose track (T_map_vehicle of all scans) is known."""
+    chosen, read = chosen_scans(scans, len(recording)), list[Cleaned]()
     with DriveWriter(out, _header(recording, f"{recording.name}-{scans}".replace(":", "-"), vehicle)) as writer:
-        for item in _items(recording, track, chosen):
+        for item in _items(recording, track, chosen, read):
             writer.add(item)
-            done += isinstance(item, Scan)
-            progress("writing scans", done, len(chosen))
-    return len(chosen)
+            progress("writing scans", len(read), len(chosen))
+        return _imported(recording, read)  # inside: a drive without any scan is not written
+
+
+def _imported(recording: Recording, read: list[Cleaned]) -> Imported:
+    empty = sum(one.scan is None for one in read)
+    if empty == len(read):
+        raise ImportDriveError(f"{recording.name}: none of {len(read)} scans has a usable point")
+    lost = sum(one.not_finite for one in read), sum(one.far for one in read)
+    return Imported(len(read) - empty, empty, *lost, notes=recording.notes)
 
 
 def _header(recording: Recording, drive_id: str, vehicle: str) -> DriveHeader:
@@ -135,8 +178,10 @@ def fit_heading_and_position(p_src_m: F64, p_dst_m: F64) -> F64:
     return T
 
 
-def _items(recording: Recording, track: Trajectory, chosen: NDArray[np.int64]) -> Iterator[DriveItem]:
-    """Everything of the drive, the small things of its span first."""
+def _items(
+    recording: Recording, track: Trajectory, chosen: NDArray[np.int64], read: list[Cleaned]
+) -> Iterator[DriveItem]:
+    """Everything of the drive, the small things of its span first; what was read is noted in `read`."""
     first, last = int(recording.t_ns[chosen[0]]) - AROUND_NS, int(recording.t_ns[chosen[-1]]) + AROUND_NS
     small: list[MotionSample | GnssFix | ReferencePose] = [*(recording.motion or motion_of(track))]
     small += recording.gnss or fixes_of(recording, track)
@@ -144,7 +189,10 @@ def _items(recording: Recording, track: Trajectory, chosen: NDArray[np.int64]) -
     within = [item for item in small if first <= item.t_ns <= last]
     items = deque(sorted(within, key=lambda item: item.t_ns))
     for number in chosen:
-        scan = recording.read(int(number))
+        read.append(cleaned(recording.read(int(number))))
+        scan = read[-1].scan
+        if scan is None:
+            continue
         while items and items[0].t_ns <= scan.t_ns:
             yield items.popleft()
         yield scan

@@ -7,25 +7,32 @@ from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TaskID, TextColumn, TimeElapsedColumn
 
 from vehicle_agent.errors import ImportDriveError
-from vehicle_agent.importer import FORMATS, import_recording
+from vehicle_agent.importer import AUTO, FORMATS, import_recording
 from vehicle_agent.importers.recording import Anchor
 from vehicle_agent.importers.splits import CHOICES
 
 
 @click.command(name="import")
-@click.argument("kind", metavar="FORMAT", type=click.Choice(list(FORMATS)))
+@click.argument("kind", metavar="FORMAT", type=click.Choice([AUTO, *FORMATS]))
 @click.argument("folder", type=click.Path(path_type=Path))
 @click.option("-o", "--out", required=True, type=click.Path(path_type=Path, dir_okay=False), help="Drive to write.")
 @click.option("--scans", default="all", show_default=True, help=f"Which scans: {CHOICES}.")
 @click.option("--anchor", help="Place on the Earth: LAT,LON,HEIGHT in degrees and metres above the ellipsoid.")
 @click.option("--vehicle", default="recorded", show_default=True, help="Pseudonym written into the drive.")
-def import_drives(kind: str, folder: Path, out: Path, scans: str, anchor: str | None, vehicle: str) -> None:
-    """Turn a recording into a drive (MCAP): FORMAT is kitti, radiate or pcd, FOLDER holds the recording."""
+@click.option("--topic", help="Topic of the clouds, for an MCAP file with several.")
+def import_drives(
+    kind: str, folder: Path, out: Path, scans: str, anchor: str | None, vehicle: str, topic: str | None
+) -> None:
+    """Turn a recording into a drive (MCAP): FORMAT is kitti, radiate, pcd, mcap (ROS 2 PointCloud2, Foxglove clouds) or
+    auto, FOLDER holds the recording (or is the .mcap file).
+    """
     with _bars() as bars:
-        n = import_recording(
-            kind, folder, out, scans=scans, anchor=_anchor(anchor), vehicle=vehicle, progress=_Shown(bars)
+        imported = import_recording(
+            kind, folder, out, scans=scans, anchor=_anchor(anchor), vehicle=vehicle, topic=topic, progress=_Shown(bars)
         )
-    click.echo(f"{out}: {n} scans")
+    click.echo(f"{out}: {imported.scans} scans")
+    for sentence in imported.skipped:
+        click.echo(f"{out}: {sentence}")
 
 
 class _Shown:

@@ -28,7 +28,7 @@ def scans_of(path: Path) -> list[Scan]:
 
 def test_lidar_odometry_finds_how_the_vehicle_moved(kitti_folder, tmp_path):
     """The reference track against the truth by construction, to 2 cm after 3.5 m."""
-    assert import_recording("kitti", kitti_folder, tmp_path / "a.mcap", anchor=ANCHOR) == 8
+    assert import_recording("kitti", kitti_folder, tmp_path / "a.mcap", anchor=ANCHOR).scans == 8
     reference = load_track(tmp_path / "a.mcap").reference
     found = T_inverse(reference.T_map_vehicle[0]) @ reference.T_map_vehicle
     for k in range(8):
@@ -80,7 +80,7 @@ def test_compressed_scans_without_times_poses_or_calibration(tmp_path):
     for k in range(3):
         points = np.column_stack([scan_of(k), np.ones(48_000)]).astype(np.float32)
         (folder / f"{k:03d}.bin.xz").write_bytes(lzma.compress(points.tobytes(), preset=0))
-    assert import_recording("kitti", folder, tmp_path / "a.mcap") == 3
+    assert import_recording("kitti", folder, tmp_path / "a.mcap").scans == 3
     assert drive_counts(tmp_path / "a.mcap").gnss == 3  # from the track
 
 
@@ -103,7 +103,7 @@ POSES = "".join(f"{k} {100 + k / 10} {500 + k} 700 3 0 0 0.7071068 0.7071068\n" 
 def test_pcd_folder_with_poses(tmp_path, columns):
     poses = "".join(" ".join(line.split()[columns]) + "\n" for line in POSES.splitlines())
     folder = write_pcds(tmp_path / "pcds", poses)
-    assert import_recording("pcd", folder, tmp_path / "a.mcap", anchor=ANCHOR) == 4
+    assert import_recording("pcd", folder, tmp_path / "a.mcap", anchor=ANCHOR).scans == 4
     reference = load_track(tmp_path / "a.mcap").reference
     np.testing.assert_allclose(reference.T_map_vehicle[:, 0, 3], [0, 1, 2, 3])
     np.testing.assert_allclose(reference.T_map_vehicle[0, :3, :3] @ [1, 0, 0], [0, 1, 0], atol=1e-6)
@@ -225,7 +225,7 @@ BREAK = {
     [
         ("no scans", "no .bin or .bin.xz scans"),
         ("one scan", "1 scans; a drive needs at least 2"),
-        ("cut off", "767995 bytes, which is no positive multiple of 16"),
+        ("cut off", "767995 bytes, which is no multiple of 16"),
         ("few times", "2 times for 8 scans"),
         ("odd poses", "12 a scan are needed"),
         ("no Tr", "no line 'Tr:'"),
@@ -253,7 +253,7 @@ def test_other_formats_tell_what_they_miss(tmp_path):
     (tmp_path / "empty").mkdir()
     for kind, message in (
         ("radiate", "no scans in velo_lidar"),
-        ("pcd", r"no \.pcd files"),
+        ("pcd", r"no \.pcd or \.pcd\.xz files"),
         ("rosbag", "known are kitti"),
     ):
         with pytest.raises(ImportDriveError, match=message):

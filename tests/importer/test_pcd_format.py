@@ -84,7 +84,7 @@ def test_fields_with_a_count_keep_their_shape(tmp_path):
     [
         (b"no header at all\n" * 3, "no line DATA"),
         (b"FIELDS x y z\nDATA ascii\n1 2 3\n", "without a usable 'SIZE'"),
-        (HEADER.format(n=0, data="ascii").encode(), "POINTS 0"),
+        (HEADER.format(n=-1, data="ascii").encode(), "POINTS -1"),
         (HEADER.format(n=30_000_000, data="binary").encode(), "POINTS 30000000"),
         (HEADER.format(n=3, data="zip").encode(), "DATA zip"),
         (HEADER.format(n=3, data="binary").encode() + b"short", "5 bytes of points, 63 announced"),

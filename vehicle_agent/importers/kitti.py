@@ -5,7 +5,6 @@ against the LiDAR (a metre over the first 13 m of sequence 00), so it gives the 
 LiDAR odometry. The benchmark does not tell the place: unless told otherwise it is a nominal one in Karlsruhe.
 """
 
-import lzma
 from pathlib import Path
 
 import numpy as np
@@ -14,11 +13,11 @@ from numpy.typing import NDArray
 from gnd_map.se3 import T_inverse
 from schemas.drive import GnssFix, Scan
 from vehicle_agent.errors import ImportDriveError
-from vehicle_agent.importers.recording import GNSS_SIGMA_M, Anchor, Recording, check_folder, files_of, mount
+from vehicle_agent.importers.files import check_folder, files_below, files_of, read_file
+from vehicle_agent.importers.recording import GNSS_SIGMA_M, NOMINAL, Anchor, Recording, mount
 
 F64 = NDArray[np.float64]
 
-KARLSRUHE = Anchor(49.0, 8.4, 160.0)  # nominal: 49° N, about the ellipsoidal height of the city
 LIDAR_HEIGHT_M = 1.73  # KITTI's sensor setup
 PERIOD_NS = 103_600_000  # where no times are given: the LiDAR turned at 9.65 Hz
 START_NS = 1_317_000_000_000_000_000  # times in the files count from 0: put them in autumn 2011
@@ -46,7 +45,7 @@ def open_kitti(folder: Path, anchor: Anchor | None) -> Recording:
     files = _scan_files(folder)
     t_ns = _times(folder, len(files))
     T_vehicle_lidar = mount(0.0, LIDAR_HEIGHT_M)
-    place = anchor or KARLSRUHE
+    place = anchor or NOMINAL
     return Recording(
         name=folder.name,
         sensor_model="HDL-64E",
@@ -64,14 +63,16 @@ def _scan_files(folder: Path) -> list[Path]:
         files = files_of(folder / name, "*.bin", "*.bin.xz")
         if files:
             return files
-    raise ImportDriveError(f"{folder}: no .bin or .bin.xz scans there or in {', '.join(SCAN_FOLDERS[:-1])}")
+    if files := files_below(folder, ".bin", ".bin.xz"):
+        return files
+    raise ImportDriveError(f"{folder}: no .bin or .bin.xz scans there or in the folders below it")
 
 
 def _scan(path: Path, t_ns: int) -> Scan:
     """float32 x, y, z, reflectance of every point, in the file's order."""
-    data = lzma.decompress(path.read_bytes()) if path.suffix == ".xz" else path.read_bytes()
-    if not data or len(data) % RECORD_BYTES:
-        raise ImportDriveError(f"{path}: {len(data)} bytes, which is no positive multiple of {RECORD_BYTES}")
+    data = read_file(path)
+    if len(data) % RECORD_BYTES:
+        raise ImportDriveError(f"{path}: {len(data)} bytes, which is no multiple of {RECORD_BYTES}")
     points = np.frombuffer(data, np.float32).reshape(-1, 4)[:, :3]
     return Scan(t_ns, np.ascontiguousarray(points), np.zeros(len(points), np.uint32))
 

@@ -22,6 +22,7 @@ from gnd_map.tile import Tile
 from gnd_map.tile_id import TileId, covering_circle
 from schemas.drive import Scan
 from vehicle_agent.errors import ImportDriveError, RegistrationError
+from vehicle_agent.importers.cleaning import cleaned
 from vehicle_agent.importers.recording import Recording
 from vehicle_agent.local_map import LocalMap
 from vehicle_agent.localise.match_map import MatchMap, MatchMapCache
@@ -39,8 +40,9 @@ NEAR_M, KEPT_M = 100.0, 200.0
 """Tiles this near are matched with; tiles farther away than the other are forgotten."""
 CARRIED: Final = 0.8
 """Share of the last step that the next one is taken to have: all of it lets an error of the turn grow on itself."""
-FIRST_STEPS_M: Final = (0.0, 1.5, 3.0, -1.5)
-"""Forward motions between the first two scans that are tried while no speed is known; each catches 2 m around it."""
+FIRST_STEPS_M: Final = ((0.0, 0.0), (1.5, 0.0), (3.0, 0.0), (-1.5, 0.0), (0.0, 1.5), (0.0, 3.0), (0.0, -1.5))
+"""Steps (x, y) between the first two scans that are tried while no speed is known; each catches 2 m around it. Along
+both axes, because a LiDAR whose mount is not told may look any way."""
 MIN_SHARE: Final = 0.5
 """Share of the points that must lie in Gaussians; of a thinner map (a sparse sensor's first scans) voxels with half,
 then a quarter of the sub-cells are taken."""
@@ -62,7 +64,9 @@ def lidar_odometry(recording: Recording, progress: Progress) -> Trajectory:
     """
     odometry = _Odometry(recording)
     for i in range(len(recording)):
-        odometry.add(recording.read(i), i)
+        scan = cleaned(recording.read(i)).scan
+        if scan is not None:
+            odometry.add(scan, i)
         progress("LiDAR odometry", i + 1, len(recording))
     return odometry.trajectory
 
@@ -133,13 +137,13 @@ class _Odometry:
 
     @property
     def trajectory(self) -> Trajectory:
+        if len(self._T) < 2:
+            raise ImportDriveError(f"{self._recording.name}: {len(self._T)} scans with usable points; a track needs 2")
         return Trajectory(np.array(self._t_ns, np.int64), np.stack(self._T))
 
     def add(self, scan: Scan, number: int) -> None:
         t_ns = reference_ns(scan)
         self._take_motion(t_ns)
-        finite = np.isfinite(scan.points_m).all(axis=1)
-        scan = Scan(scan.t_ns, np.ascontiguousarray(scan.points_m[finite]), scan.t_offset_ns[finite])
         points = self._deskewed(scan, t_ns)
         chosen = points[sample_scan(scan.points_m, _SAMPLING)]
         T = self._aligned(chosen, t_ns, number) if self._T else np.eye(4)
@@ -189,7 +193,7 @@ class _Odometry:
     def _matches(self, points: F64, t_ns: int, match_map: MatchMap) -> list[tuple[float, RegistrationResult]]:
         """What matching from the prediction gives, and from farther off where that fits poorly; each with its fit."""
         if not len(self._motion) and len(self._T) == 1:
-            starts = [self._T[0] @ _forward(step_m) for step_m in FIRST_STEPS_M]
+            starts = [self._T[0] @ _shifted(*step_m) for step_m in FIRST_STEPS_M]
             return _registered(points, starts, match_map, "capture")
         guess = self._predicted(t_ns)
         found = _registered(points, [guess], match_map, "near")
@@ -204,9 +208,9 @@ class _Odometry:
         return np.asarray(self._T[-1] @ T_from_R_t(exp_so3(share * log_so3(step[:3, :3])), share * step[:3, 3]))
 
 
-def _forward(step_m: float) -> F64:
+def _shifted(x_m: float, y_m: float) -> F64:
     T = np.eye(4)
-    T[0, 3] = step_m
+    T[:2, 3] = x_m, y_m
     return T
 
 

@@ -16,8 +16,9 @@ from gnd_map.motion import Trajectory
 from gnd_map.se3 import R_from_quaternion_xyzw, T_from_R_t
 from schemas.drive import Scan
 from vehicle_agent.errors import ImportDriveError
+from vehicle_agent.importers.files import check_folder, files_below, files_of
 from vehicle_agent.importers.pcd_format import read_pcd
-from vehicle_agent.importers.recording import Anchor, Recording, check_folder, files_of
+from vehicle_agent.importers.recording import Anchor, Recording
 
 F64 = NDArray[np.float64]
 I64 = NDArray[np.int64]
@@ -52,15 +53,16 @@ def open_pcd(folder: Path, anchor: Anchor | None) -> Recording:
 
 def _scan_files(folder: Path) -> list[Path]:
     for name in SCAN_FOLDERS:
-        files = files_of(folder / name, "*.pcd")
-        if files:
+        if files := files_of(folder / name, "*.pcd", "*.pcd.xz"):
             return sorted(files, key=_number)
-    raise ImportDriveError(f"{folder}: no .pcd files there or in {', '.join(SCAN_FOLDERS[1:])}")
+    if files := files_below(folder, ".pcd", ".pcd.xz"):
+        return sorted(files, key=_number)
+    raise ImportDriveError(f"{folder}: no .pcd or .pcd.xz files there or in the folders below it")
 
 
 def _number(path: Path) -> tuple[int, str]:
     """2.pcd before 10.pcd."""
-    digits = re.findall(r"\d+", path.stem)
+    digits = re.findall(r"\d+", path.name.split(".")[0])
     return int(digits[-1]) if digits else -1, path.name
 
 
@@ -70,9 +72,6 @@ def _scan(path: Path, t_ns: int) -> Scan:
     if missing:
         raise ImportDriveError(f"{path}: no field {', '.join(sorted(missing))}")
     xyz = np.stack([points["x"], points["y"], points["z"]], axis=1).astype(np.float32)
-    xyz = xyz[np.isfinite(xyz).all(axis=1)]
-    if not len(xyz):
-        raise ImportDriveError(f"{path}: no point with finite coordinates")
     return Scan(t_ns, xyz, np.zeros(len(xyz), np.uint32))
 
 

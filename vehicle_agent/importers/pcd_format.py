@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from gnd_map.jit import kernel
 from vehicle_agent.errors import ImportDriveError
+from vehicle_agent.importers.files import read_file
 
 U8 = NDArray[np.uint8]
 
@@ -30,8 +31,10 @@ def read_pcd(path: Path) -> NDArray[np.void]:
     Raises:
         ImportDriveError: not a PCD file, truncated, or of an encoding that does not exist.
     """
-    data = path.read_bytes()
+    data = read_file(path)
     header, body = _split(path, data)
+    if not header.points:
+        return np.empty(0, header.dtype)
     if header.data == "ascii":
         return _from_ascii(path, header, body)
     if header.data == "binary_compressed":
@@ -69,8 +72,8 @@ def _header(lines: dict[str, list[str]]) -> _Header:
         for name, size, kind, count in zip(names, sizes, types, counts, strict=True)
     ]
     points = int(lines["POINTS"][0])
-    if not 0 < points <= MAX_POINTS:
-        raise ValueError(f"POINTS {points} (1 ... {MAX_POINTS})")
+    if not 0 <= points <= MAX_POINTS:
+        raise ValueError(f"POINTS {points} (0 ... {MAX_POINTS})")
     return _Header(np.dtype(fields), points, lines["DATA"][0])
 
 

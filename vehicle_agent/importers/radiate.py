@@ -5,7 +5,6 @@ clock runs 65.7 s ahead of the LiDAR's (seen from both starting together), and s
 records come in pairs at 20 Hz. Velocities are north, east, down.
 """
 
-import lzma
 import re
 from pathlib import Path
 
@@ -14,7 +13,8 @@ from numpy.typing import NDArray
 
 from schemas.drive import GnssFix, MotionSample, Scan
 from vehicle_agent.errors import ImportDriveError
-from vehicle_agent.importers.recording import GNSS_SIGMA_M, Anchor, Recording, check_folder, files_of, mount
+from vehicle_agent.importers.files import check_folder, files_of, read_file
+from vehicle_agent.importers.recording import GNSS_SIGMA_M, Anchor, Recording, mount
 
 F64 = NDArray[np.float64]
 I64 = NDArray[np.int64]
@@ -55,7 +55,7 @@ def open_radiate(folder: Path, anchor: Anchor | None) -> Recording:
 
 
 def _scan(path: Path, t_ns: int) -> Scan:
-    text = lzma.decompress(path.read_bytes()).decode() if path.suffix == ".xz" else path.read_text()
+    text = read_file(path).decode("ascii", "replace")
     try:
         rows = np.array([line.split(",") for line in text.split()], np.float64)
     except ValueError as error:

@@ -2,7 +2,6 @@
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
@@ -32,13 +31,18 @@ class Anchor:
         return LocalFrame(np.radians(self.lat_deg), np.radians(self.lon_deg), self.height_m)
 
 
+NOMINAL = Anchor(49.0, 8.4, 160.0)
+"""For recordings that do not say where they were taken: Karlsruhe, about the city's ellipsoidal height."""
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class Recording:
-    """A folder of scans, read one by one.
+    """Scans, read one by one.
 
     t_ns: (N,) sweep starts. read: scan i. anchor: origin of the map frame. track: where the recording itself says that
     the vehicle was at the scans, in the map frame and consistent with the LiDAR; None: LiDAR odometry tells. gnss:
-    empty where the track must give the fixes. motion: empty where it must give speed and yaw rate.
+    empty where the track must give the fixes. motion: empty where it must give speed and yaw rate. notes: what
+    had to be left out or put right, one sentence each.
     """
 
     name: str
@@ -51,6 +55,7 @@ class Recording:
     track: Trajectory | None = None
     gnss: tuple[GnssFix, ...] = ()
     motion: tuple[MotionSample, ...] = ()
+    notes: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
         if len(self.t_ns) < 2:
@@ -61,23 +66,6 @@ class Recording:
 
     def __len__(self) -> int:
         return len(self.t_ns)
-
-
-def files_of(folder: Path, *patterns: str) -> list[Path]:
-    """Files in `folder` that match the first pattern that matches any, sorted by name."""
-    for pattern in patterns:
-        found = sorted(folder.glob(pattern))
-        if found:
-            return found
-    return []
-
-
-def check_folder(folder: Path) -> None:
-    """ImportDriveError unless `folder` is a folder."""
-    if not folder.exists():
-        raise ImportDriveError(f"{folder}: no such folder")
-    if not folder.is_dir():
-        raise ImportDriveError(f"{folder}: is a file; give the folder of the recording")
 
 
 def mount(yaw_deg: float, height_m: float, pitch_deg: float = 0.0) -> F64:

@@ -1,0 +1,165 @@
+"""MCAP files with point clouds: `sensor_msgs/msg/PointCloud2` of ROS 2, `foxglove.PointCloud`, and drives of our own.
+
+A recording of ROS or Foxglove gives the clouds alone: LiDAR odometry tells the track, the place is nominal unless one
+is given, the LiDAR is taken to sit at the vehicle's origin. A drive of ours keeps everything that it holds.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from itertools import pairwise
+from pathlib import Path
+from typing import Final
+
+import numpy as np
+from foxglove_schemas_protobuf.PointCloud_pb2 import PointCloud
+from mcap.summary import Summary
+
+from gnd_map.motion import Trajectory
+from schemas.drive import GnssFix, MotionSample, Scan
+from schemas.drive_mcap import POINTS_TOPIC, load_track, read_header
+from schemas.drive_messages import ns_of
+from schemas.drive_metadata import METADATA
+from schemas.mcap_file import open_mcap
+from vehicle_agent.errors import ImportDriveError
+from vehicle_agent.importers.fields import Field, scan_of_fields, unpack
+from vehicle_agent.importers.files import files_below
+from vehicle_agent.importers.point_cloud2 import SCHEMA as POINT_CLOUD2
+from vehicle_agent.importers.point_cloud2 import decode_cloud, stamp_ns
+from vehicle_agent.importers.recording import NOMINAL, Anchor, Recording
+
+FOXGLOVE_CLOUD: Final = "foxglove.PointCloud"
+_ENCODINGS: Final = {POINT_CLOUD2: "cdr", FOXGLOVE_CLOUD: "protobuf"}
+_FOXGLOVE_CODES: Final = {1: "u1", 2: "i1", 3: "<u2", 4: "<i2", 5: "<u4", 6: "<i4", 7: "<f4", 8: "<f8"}
+
+
+@dataclass(frozen=True, slots=True)
+class _At:
+    """Where a cloud lies: file, log time, how many of the topic with this log time come before it, and its stamp."""
+
+    path: Path
+    log_ns: int
+    nth: int
+    stamp_ns: int
+
+
+def open_mcap_clouds(place: Path, anchor: Anchor | None, topic: str | None = None) -> Recording:
+    """A file, or a folder with the files of one recording.
+
+    Args:
+        place: `.mcap` file or folder.
+        anchor: where on the Earth the first pose is put; a drive of ours tells its place itself.
+        topic: of the clouds; may be left out where there is only one.
+
+    Raises:
+        ImportDriveError: no clouds, several topics with clouds, or clouds that cannot be.
+        DriveError: a file is damaged or cut off.
+    """
+    paths = [place] if place.is_file() else files_below(place, ".mcap") if place.is_dir() else []
+    if not paths:
+        raise ImportDriveError(f"{place}: no .mcap file there")
+    if len(paths) == 1 and _is_own_drive(paths[0]):
+        return _own_drive(paths[0])
+    chosen, schema = _topic(paths, topic)
+    clouds, notes = _in_time_order([at for path in paths for at in _index(path, chosen, schema)])
+    return Recording(
+        name=place.stem,
+        sensor_model="unknown",
+        source=f"{schema} on {chosen} of {place.name}; track by LiDAR odometry",
+        T_vehicle_lidar=np.eye(4),
+        t_ns=np.array([at.stamp_ns for at in clouds], np.int64),
+        read=lambda i: _read(clouds[i], chosen, schema),
+        anchor=anchor or NOMINAL,
+        notes=notes,
+    )
+
+
+def _is_own_drive(path: Path) -> bool:
+    with open_mcap(path) as (reader, _):
+        return any(record.name == METADATA for record in reader.iter_metadata())
+
+
+def _own_drive(path: Path) -> Recording:
+    """A drive of ours: poses where it has them for all scans, odometry and fixes as they are."""
+    header, track = read_header(path), load_track(path)
+    clouds, notes = _in_time_order(_index(path, POINTS_TOPIC, FOXGLOVE_CLOUD))
+    frame = header.anchor
+    t_ns, reference = np.array([at.stamp_ns for at in clouds], np.int64), track.reference
+    covered = len(reference.t_ns) > 1 and reference.t_ns[0] <= t_ns[0] and t_ns[-1] <= reference.t_ns[-1]
+    return Recording(
+        name=header.drive_id,
+        sensor_model=header.sensor_model,
+        source=header.source,
+        T_vehicle_lidar=header.T_vehicle_lidar,
+        t_ns=t_ns,
+        read=lambda i: _read(clouds[i], POINTS_TOPIC, FOXGLOVE_CLOUD),
+        anchor=Anchor(np.degrees(frame.lat_rad), np.degrees(frame.lon_rad), frame.height_m),
+        track=Trajectory(reference.t_ns, reference.T_map_vehicle) if covered else None,
+        gnss=tuple(GnssFix(int(t), *map(float, row)) for t, *row in zip(*track.gnss, strict=True)),
+        motion=tuple(MotionSample(int(t), float(v), float(w)) for t, v, w in zip(*track.motion, strict=True)),
+        notes=notes,
+    )
+
+
+def _topic(paths: Sequence[Path], wanted: str | None) -> tuple[str, str]:
+    """Topic and schema of the clouds."""
+    found: dict[str, str] = {}
+    for path in paths:
+        with open_mcap(path) as (_, summary):
+            found |= _cloud_topics(summary)
+    if wanted is not None and wanted in found:
+        return wanted, found[wanted]
+    names = ", ".join(sorted(found)) or "none"
+    if wanted is not None or not found:
+        asked = f"topic {wanted}: " if wanted else ""
+        raise ImportDriveError(f"{paths[0]}: {asked}no {POINT_CLOUD2} or {FOXGLOVE_CLOUD}; topics with clouds: {names}")
+    if len(found) > 1:
+        raise ImportDriveError(f"{paths[0]}: clouds on {len(found)} topics ({names}); choose one with --topic")
+    return next(iter(found.items()))
+
+
+def _cloud_topics(summary: Summary) -> dict[str, str]:
+    found = {}
+    for channel in summary.channels.values():
+        schema = summary.schemas.get(channel.schema_id)
+        if schema is not None and _ENCODINGS.get(schema.name) == channel.message_encoding:
+            found[channel.topic] = schema.name
+    return found
+
+
+def _index(path: Path, topic: str, schema: str) -> list[_At]:
+    """Where the clouds of a file lie, and when they were stamped (log time where the stamp is zero)."""
+    found: list[_At] = []
+    with open_mcap(path) as (reader, _):
+        for _, _, message in reader.iter_messages(topics=[topic]):
+            nth = found[-1].nth + 1 if found and found[-1].log_ns == message.log_time else 0
+            stamp = _stamp_ns(f"{path}: {topic}", schema, message.data)
+            found.append(_At(path, message.log_time, nth, stamp or message.log_time))
+    return found
+
+
+def _stamp_ns(where: str, schema: str, data: bytes) -> int:
+    return stamp_ns(where, data) if schema == POINT_CLOUD2 else ns_of(PointCloud.FromString(data).timestamp)
+
+
+def _in_time_order(clouds: list[_At]) -> tuple[list[_At], tuple[str, ...]]:
+    """Clouds by their stamps, each stamp once; and what had to be done for that."""
+    notes, kept = [], sorted(clouds, key=lambda at: at.stamp_ns)
+    if (late := sum(a.stamp_ns > b.stamp_ns for a, b in pairwise(clouds))) > 0:
+        notes.append(f"{late} clouds were not in the order of their stamps: sorted")
+    once = [at for i, at in enumerate(kept) if i == 0 or at.stamp_ns != kept[i - 1].stamp_ns]
+    if len(once) < len(kept):
+        notes.append(f"{len(kept) - len(once)} clouds have the stamp of another: left out")
+    return once, tuple(notes)
+
+
+def _read(at: _At, topic: str, schema: str) -> Scan:
+    with open_mcap(at.path) as (reader, _):
+        messages = reader.iter_messages(topics=[topic], starting_at=at.log_ns, ending_at=at.log_ns)
+        data = next(message.data for nth, (_, _, message) in enumerate(messages) if nth == at.nth)
+    where = f"{at.path}: cloud at {at.stamp_ns} ns"
+    if schema == POINT_CLOUD2:
+        return scan_of_fields(decode_cloud(where, data).points, at.stamp_ns)
+    cloud = PointCloud.FromString(data)
+    fields = [Field(f.name, f.offset, _FOXGLOVE_CODES.get(f.type, "u1")) for f in cloud.fields]
+    n = len(cloud.data) // max(cloud.point_stride, 1)
+    return scan_of_fields(unpack(where, fields, cloud.point_stride, cloud.data, n), at.stamp_ns)
