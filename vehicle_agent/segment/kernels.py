@@ -55,6 +55,7 @@ class Judge(NamedTuple):
     reach_up_m: float
     margin_m: float
     margin_share: float
+    gap_tan: float
 
 
 @kernel
@@ -81,8 +82,8 @@ def _turn(y: float, x: float) -> float:
 
 
 @kernel
-def ground_heights(points: F32, grid: Grid, slope: float) -> F32:
-    """(nx, ny) height of the ground: the second lowest point of a cell, under an envelope that rises by `slope`."""
+def lowest_heights(points: F32, grid: Grid) -> F32:
+    """(nx, ny) height of the second lowest point of each cell (the lowest is sometimes an echo), inf without two."""
     lowest = np.full((grid.nx, grid.ny), np.float32(np.inf))
     second = np.full((grid.nx, grid.ny), np.float32(np.inf))
     for n in range(len(points)):
@@ -94,8 +95,45 @@ def ground_heights(points: F32, grid: Grid, slope: float) -> F32:
                 lowest[i, j] = z
             elif z < second[i, j]:
                 second[i, j] = z
-    _lower_envelope(second, np.float32(slope * grid.cell_m))
     return second
+
+
+@kernel
+def remember_ground(memory: F32, now: F32, step_m: float) -> None:
+    """Bring what is seen now into `memory` (nx, ny), changed: quickly where it is lower, slowly where it is higher.
+
+    What is higher by more than `step_m` stands on the ground; what is lower shows that something stood there.
+    """
+    for i in range(memory.shape[0]):
+        for j in range(memory.shape[1]):
+            change = now[i, j] - memory[i, j]
+            if now[i, j] == np.inf:
+                continue
+            if memory[i, j] == np.inf:
+                memory[i, j] = now[i, j]
+            elif change > step_m:
+                memory[i, j] += np.float32(0.02) * change
+            elif change < -step_m:
+                memory[i, j] += np.float32(0.5) * change
+            else:
+                memory[i, j] += np.float32(0.2) * change
+
+
+@kernel
+def ground_heights(memory: F32, grid: Grid, slope: float, road: F64, road_slope: float) -> F32:
+    """(nx, ny) height of the ground everywhere: an envelope below what is remembered that rises by `slope`.
+
+    `road` (6,): a point of the road under the vehicle and its normal; the ground lies no higher than this plane and
+    `road_slope` times the distance, which matters where the sensor sees no ground.
+    """
+    z = np.empty((grid.nx, grid.ny), np.float32)
+    for i in range(grid.nx):
+        for j in range(grid.ny):
+            dx, dy = grid.x0 + (i + 0.5) * grid.cell_m - road[0], grid.y0 + (j + 0.5) * grid.cell_m - road[1]
+            plane = road[2] - (road[3] * dx + road[4] * dy) / road[5]
+            z[i, j] = min(memory[i, j], plane + road_slope * math.sqrt(dx * dx + dy * dy))
+    _lower_envelope(z, np.float32(slope * grid.cell_m))
+    return z
 
 
 @kernel
@@ -262,6 +300,53 @@ def draw_image(points: F32, origins: F32, voxel_of: I32, R: F64, optics: Optics,
 
 
 @kernel
+def layer_gap(image: U16, share: float) -> int:
+    """Rows from one ray to the next above it in the same column, not exceeded in `share` of the cases."""
+    columns, rows = image.shape
+    count = np.zeros(rows + 1, np.int64)
+    for column in range(columns):
+        before = -1
+        for row in range(rows):
+            if image[column, row]:
+                if before >= 0:
+                    count[row - before] += 1
+                before = row
+    total, gap = count.sum() * share, 0
+    so_far = 0
+    while gap < rows and so_far < total:
+        gap += 1
+        so_far += count[gap]
+    return max(gap, 1)
+
+
+@kernel
+def _look(
+    image: U16, column: int, across: int, low: int, high: int, near_cm: float, far_cm: float
+) -> tuple[bool, bool, bool]:
+    """Whether rays of a window of rows `low` to `high` go beyond `far_cm`, end before `near_cm`, end between.
+
+    Ground between the two counts as beyond: it lies below what is looked for, and can be seen.
+    """
+    beyond, nearer, same = False, False, False
+    columns, rows = image.shape
+    for c in range(column - across, column + across + 1):
+        for q in range(max(0, low), min(rows, high + 1)):
+            seen = int(image[c % columns, q])
+            if seen == 0:
+                continue
+            cm = seen & FAR_CM
+            if cm > far_cm:
+                beyond = True
+            elif seen & GROUND_BIT:
+                beyond = beyond or cm >= near_cm
+            elif cm < near_cm:
+                nearer = True
+            else:
+                return beyond, nearer, True
+    return beyond, nearer, same
+
+
+@kernel
 def vote(  # noqa: C901  (one loop over the window)
     points: F32, offset_m: F64, image: U16, places: F32, R: F64, optics: Optics, judge: Judge, passed: U8, met: U8
 ) -> None:
@@ -296,30 +381,33 @@ def vote(  # noqa: C901  (one loop over the window)
         column = min(int(_turn(v, u) * optics.columns), optics.columns - 1)
         across = min(6, max(1, math.ceil(judge.reach_across_m / (flat * column_rad))))
         up = min(16, max(1, math.ceil(judge.reach_up_m / (flat * optics.tan_step))))
+        extended = min(16, max(up, math.ceil(judge.gap_tan / optics.tan_step)))
         margin_cm = CM * (judge.margin_m + judge.margin_share * r)
         near_cm, far_cm = CM * r - margin_cm, CM * r + margin_cm
-        beyond, nearer, same = 0, 0, False
-        for c in range(column - across, column + across + 1):
-            c_in = c % optics.columns
-            for q in range(max(0, row - up), min(optics.rows, row + up + 1)):
-                seen = int(image[c_in, q])
-                if seen == 0:
-                    continue
-                cm = seen & FAR_CM
-                if cm > far_cm:
-                    beyond += 1
-                elif seen & GROUND_BIT:
-                    continue
-                elif cm < near_cm:
-                    nearer += 1
-                else:
-                    same = True
-                    break
-            if same:
-                break
-        if same:
+        if 0 <= row < optics.rows:
+            seen = int(image[column, row])
+            if seen < GROUND_BIT and near_cm <= seen <= far_cm:  # most often: it stands there
+                met[n] = min(255, met[n] + 1)
+                continue
+        above, nearer, same = _look(image, column, across, row, row + up, near_cm, far_cm)
+        below, nearer_below, same_below = _look(image, column, across, row - up, row - 1, near_cm, far_cm)
+        if same or same_below:
             met[n] = min(255, met[n] + 1)
-        elif beyond > 1 and nearer == 0:
+            continue
+        if nearer or nearer_below:
+            continue
+        if not above or not below:
+            exact, _, _ = _look(image, column, across, row, row, near_cm, far_cm)
+            above, below = above or exact, below or exact
+        for q in range(row + up + 1, row + extended + 1):
+            if above or nearer or same:
+                break
+            above, nearer, same = _look(image, column, across, q, q, near_cm, far_cm)
+        for q in range(row - up - 1, row - extended - 1, -1):
+            if below or nearer_below or same_below:
+                break
+            below, nearer_below, same_below = _look(image, column, across, q, q, near_cm, far_cm)
+        if above and below:
             passed[n] = min(255, passed[n] + 1)
 
 
@@ -335,31 +423,57 @@ def _root(parent: I32, n: int) -> int:
 
 
 @kernel
-def components(index: I32, chosen: NDArray[np.bool_], keys: I64, values: I32) -> I32:  # noqa: C901
-    """(V,) int32: number of the component of each chosen voxel under 26-neighbourhood, -1 for the others.
+def _join(parent: I32, a: int, b: int) -> None:
+    """The root with the smaller number stays."""
+    a, b = _root(parent, a), _root(parent, b)
+    if a != b:
+        parent[max(a, b)] = min(a, b)
 
+
+@kernel
+def _join_above(index: I32, n: int, reach: int, keys: I64, values: I32, parent: I32) -> None:
+    """Join voxel `n` with the next voxel above it in each of its nine columns: layers leave gaps between them."""
+    for column in range(9):
+        i, j = index[n, 0] + column // 3 - 1, index[n, 1] + column % 3 - 1
+        for up in range(1, reach + 1):
+            at = _slot(keys, _key(i, j, index[n, 2] + up))
+            if keys[at] != -1:
+                _join(parent, n, values[at])
+                break
+
+
+@kernel
+def components(index: I32, reach: U8, chosen: NDArray[np.bool_], keys: I64, values: I32) -> I32:
+    """(V,) int32: number of the component of each chosen voxel, -1 for the others.
+
+    Voxels that touch (26-neighbourhood) are joined, and those with at most `reach` (V,) voxels between their heights.
     Components are numbered in the order of their first voxels. `keys` and `values` are an empty hash table.
     """
     n_voxels = len(index)
-    parent = np.empty(n_voxels, np.int32)
+    parent = np.arange(n_voxels).astype(np.int32)
     for n in range(n_voxels):
-        parent[n] = n
         if chosen[n]:
-            at = _slot(keys, _key(index[n, 0], index[n, 1], index[n, 2]))
-            keys[at], values[at] = _key(index[n, 0], index[n, 1], index[n, 2]), n
+            key = _key(index[n, 0], index[n, 1], index[n, 2])
+            at = _slot(keys, key)
+            keys[at], values[at] = key, n
     for n in range(n_voxels):
         if not chosen[n]:
             continue
-        for near in range(14, 27):  # half of the neighbours: the others look here
-            i, j, k = near // 9 - 1, near // 3 % 3 - 1, near % 3 - 1
-            at = _slot(keys, _key(index[n, 0] + i, index[n, 1] + j, index[n, 2] + k))
+        for column in range(5, 9):  # half of the neighbours at the same height: the others look here
+            i, j = index[n, 0] + column // 3 - 1, index[n, 1] + column % 3 - 1
+            at = _slot(keys, _key(i, j, index[n, 2]))
             if keys[at] != -1:
-                a, b = _root(parent, n), _root(parent, values[at])
-                if a != b:
-                    parent[max(a, b)] = min(a, b)
-    label = np.full(n_voxels, -1, np.int32)
+                _join(parent, n, values[at])
+        _join_above(index, n, reach[n], keys, values, parent)
+    return _numbered(parent, chosen)
+
+
+@kernel
+def _numbered(parent: I32, chosen: NDArray[np.bool_]) -> I32:
+    """Components numbered from 0 in the order of their roots, which come first; -1 for voxels not chosen."""
+    label = np.full(len(parent), -1, np.int32)
     count = 0
-    for n in range(n_voxels):
+    for n in range(len(parent)):
         if chosen[n]:
             root = _root(parent, n)
             if root == n:

@@ -39,13 +39,15 @@ class SegmentParameters:
     """A ray passes a point where it ends farther behind it than this …"""
     margin_share: float = 0.01
     """… plus this share of the range."""
-    mass_moving: float = 0.6
+    mass_moving: float = 0.5
     """Mass that one passing ray gives to "moving"."""
-    mass_static: float = 0.3
+    mass_static: float = 0.4
     """Mass that one return at the same place gives to "static"."""
     ground_cell_m: float = 1.0
     ground_slope: float = 0.15
     """The ground rises no steeper than this."""
+    road_slope: float = 0.02
+    """It rises no steeper than this over the plane of the road under the vehicle."""
     ground_m: float = 0.25
     """What lies lower than this over the ground is no object by itself; it goes with what stands above it."""
     feet_m: float = 0.1
@@ -61,7 +63,16 @@ class SegmentParameters:
 
     def __post_init__(self) -> None:
         """Each value within its range, or `SegmentParameterError` with the value."""
-        for name in ("past_s", "future_s", "apart_s", "reach_across_m", "reach_up_m", "margin_share", "ground_slope"):
+        for name in (
+            "past_s",
+            "future_s",
+            "apart_s",
+            "reach_across_m",
+            "reach_up_m",
+            "margin_share",
+            "ground_slope",
+            "road_slope",
+        ):
             self._check(name, 0.0, 100.0)
         for name in ("mass_moving", "mass_static"):
             self._check(name, 0.01, 0.99)

@@ -15,6 +15,9 @@ from vehicle_agent.segment.kernels import (
     elevation_span,
     find_objects,
     ground_heights,
+    layer_gap,
+    lowest_heights,
+    remember_ground,
     vote,
 )
 from vehicle_agent.segment.parameters import SegmentParameters
@@ -23,6 +26,9 @@ U8 = NDArray[np.uint8]
 U16 = NDArray[np.uint16]
 I64 = NDArray[np.int64]
 
+GAP_SHARE = 0.8  # of layers that are at most so far apart
+MOST_REACH = 8  # voxels
+STEP_M = 0.15  # what rises more from one scan to the next is not the ground
 SPREAD_M = 0.5  # farther apart than this within two degrees: start and end of a sweep meet there
 
 
@@ -41,6 +47,11 @@ class RangeImage:
     ranges: U16
     places: F32
 
+    @property
+    def gap_tan(self) -> float:
+        """Usual distance of layers, as tangent."""
+        return layer_gap(self.ranges, GAP_SHARE) * self.optics.tan_step
+
     def vote(self, points: F32, centre_m: F64, judge: Judge, passed: U8, met: U8) -> None:
         """Vote on points (V, 3) relative to `centre_m`; the counts go up."""
         vote(
@@ -53,13 +64,15 @@ class Objects:
     """The voxels of what stands on the ground.
 
     points: (V, 3) float32 one measured point of each, relative to the scan's centre. index: (V, 3) int32. passed, met:
-    (V,) uint8 votes so far. voxel_of: (N,) int32, the voxel of each point of the scan, or what else it is.
+    (V,) uint8 votes so far. reach: (V,) uint8, voxels from one layer to the next there. voxel_of:
+    (N,) int32, the voxel of each point of the scan, or what else it is.
     """
 
     points: F32
     index: I32
     passed: U8
     met: U8
+    reach: U8
     voxel_of: I32
 
 
@@ -69,23 +82,54 @@ def hash_table(n: int) -> tuple[I64, I32]:
     return np.full(size, -1, np.int64), np.empty(size, np.int32)
 
 
-def judge_of(p: SegmentParameters) -> Judge:
-    """The parameters that a vote needs."""
-    return Judge(p.reach_across_m, p.reach_up_m, p.margin_m, p.margin_share)
+def judge_of(p: SegmentParameters, gap_tan: float) -> Judge:
+    """What a vote needs: parameters, and the distance of the sensor's layers."""
+    return Judge(p.reach_across_m, p.reach_up_m, p.margin_m, p.margin_share, 1.2 * gap_tan)
 
 
-def find_all_objects(points: F32, origins: F32, p: SegmentParameters) -> Objects:
-    """Ground and voxels of a scan's points (N, 3), relative to its centre."""
-    half = p.range_max_m + p.ground_cell_m
-    n = ceil(2 * half / p.ground_cell_m)
-    grid = Grid(-half, -half, p.ground_cell_m, n, n)
-    ground = ground_heights(points, grid, p.ground_slope)
+class GroundMap:
+    """The ground around the vehicle, remembered from scan to scan in squares that lie still in the map frame."""
+
+    def __init__(self, p: SegmentParameters) -> None:
+        self._cell_m, self._slope, self._road_slope = p.ground_cell_m, p.ground_slope, p.road_slope
+        self._half = ceil(p.range_max_m / p.ground_cell_m) + 1
+        self._memory = np.full((2 * self._half, 2 * self._half), np.inf, np.float32)
+        self._corner = np.zeros(2, np.int64)
+
+    def around(self, points: F32, centre_m: F64, T_map_vehicle: F64) -> tuple[F32, Grid]:
+        """Heights of the ground relative to `centre_m`, and their grid, with points (N, 3) relative to it just seen."""
+        self._move(np.floor(centre_m[:2] / self._cell_m).astype(np.int64) - self._half)
+        x0, y0 = self._corner * self._cell_m - centre_m[:2]
+        grid = Grid(float(x0), float(y0), self._cell_m, *self._memory.shape)
+        height = np.float32(centre_m[2])
+        remember_ground(self._memory, lowest_heights(points, grid) + height, STEP_M)
+        road = np.concatenate([T_map_vehicle[:3, 3] - centre_m, T_map_vehicle[:3, 2]])
+        return ground_heights(self._memory - height, grid, self._slope, road, self._road_slope), grid
+
+    def _move(self, corner: NDArray[np.int64]) -> None:
+        """Forget what lies outside the new place of the grid."""
+        before, self._corner = self._corner, corner
+        dx, dy = np.clip(corner - before, -2 * self._half, 2 * self._half)
+        if dx or dy:
+            n = 2 * self._half
+            memory = np.full((n, n), np.inf, np.float32)
+            memory[max(0, -dx) : n - max(0, dx), max(0, -dy) : n - max(0, dy)] = self._memory[
+                max(0, dx) : n - max(0, -dx), max(0, dy) : n - max(0, -dy)
+            ]
+            self._memory = memory
+
+
+def find_all_objects(
+    points: F32, origins: F32, ground: tuple[F32, Grid], gap_tan: float, p: SegmentParameters
+) -> Objects:
+    """Voxels of a scan's points (N, 3), relative to its centre; `gap_tan`: distance of its layers."""
     voxel_of, first, index = find_objects(
-        points, origins, ground, grid, p.ground_m, p.feet_m, p.voxel_m, p.range_min_m, p.range_max_m,
+        points, origins, *ground, p.ground_m, p.feet_m, p.voxel_m, p.range_min_m, p.range_max_m,
         *hash_table(len(points)),
     )  # fmt: skip
     votes = np.zeros((2, len(first)), np.uint8)
-    return Objects(points[first], index, votes[0], votes[1], voxel_of)
+    reach = np.ceil(np.hypot(points[first, 0], points[first, 1]) * (1.2 * gap_tan / p.voxel_m))
+    return Objects(points[first], index, votes[0], votes[1], np.clip(reach, 1, MOST_REACH).astype(np.uint8), voxel_of)
 
 
 def image_of(

@@ -12,7 +12,7 @@ from vehicle_agent.localise.estimates import PoseEstimate, RefinedScan
 from vehicle_agent.segment.evidence import belief
 from vehicle_agent.segment.kernels import components, moving_points
 from vehicle_agent.segment.parameters import SegmentParameters
-from vehicle_agent.segment.scene import Objects, RangeImage, find_all_objects, hash_table, image_of, judge_of
+from vehicle_agent.segment.scene import GroundMap, Objects, RangeImage, find_all_objects, hash_table, image_of, judge_of
 
 I16 = NDArray[np.int16]
 Mask = NDArray[np.bool_]
@@ -51,9 +51,11 @@ class MotionSegmenter:
 
     def __init__(self, parameters: SegmentParameters | None = None) -> None:
         self.parameters = parameters or SegmentParameters()
-        self._judge = judge_of(self.parameters)
+        self._judge = judge_of(self.parameters, 0.0)
         self._held: deque[_Held] = deque()
         self._images: deque[RangeImage] = deque()
+        self._ground = GroundMap(self.parameters)
+        self._gap_tan = 0.0
 
     def push(self, scan: RefinedScan) -> list[SegmentedScan]:
         """Take a scan; give those that no later scan will say anything about any more, oldest first."""
@@ -75,13 +77,16 @@ class MotionSegmenter:
         origins = (scan.origins_map_m - centre).astype(np.float32)
         objects = None
         if n and scan.estimate.health == "good":
-            objects = find_all_objects(points, origins, p)
+            ground = self._ground.around(points, centre, scan.estimate.T_map_vehicle)
+            objects = find_all_objects(points, origins, ground, self._gap_tan, p)
             self._hear_the_past(scan.t_ns, objects, centre)
             if not self._images or scan.t_ns - self._images[-1].t_ns >= p.every_s * _S - _S // 50:
                 R = scan.estimate.T_map_vehicle[:3, :3].T.copy()
                 image = image_of(scan.t_ns, centre, R, points, origins, objects.voxel_of, p)
                 self._tell_the_held(image)
                 self._images.append(image)
+                self._gap_tan = image.gap_tan
+                self._judge = judge_of(p, self._gap_tan)
         step_m = max(float(np.abs(origins).max(initial=0.0)) / 32767, 1e-4)
         self._held.append(
             _Held(scan.t_ns, scan.estimate, centre, points, np.rint(origins / step_m).astype(np.int16), step_m, objects)
@@ -127,9 +132,9 @@ def decide(objects: Objects, p: SegmentParameters) -> Mask:
     goes, stays = moving > static, static > moving
     if not goes.any():
         return goes
-    whole = components(objects.index, np.ones(len(goes), np.bool_), *hash_table(len(goes)))
+    whole = components(objects.index, objects.reach, np.ones(len(goes), np.bool_), *hash_table(len(goes)))
     n_goes, n_stays = np.bincount(whole, goes), np.bincount(whole, stays)
     moves = (n_goes >= p.min_voxels) & (n_goes >= p.moving_share * (n_goes + n_stays))
-    part = components(objects.index, goes, *hash_table(int(goes.sum())))
+    part = components(objects.index, objects.reach, goes, *hash_table(int(goes.sum())))
     large = np.append(np.bincount(part[part >= 0]) >= p.part_voxels, False)
     return np.asarray(moves[whole] | large[part])
