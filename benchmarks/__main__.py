@@ -5,7 +5,7 @@ import importlib
 
 from benchmarks.figures import machine, print_figures
 
-NAMES = ("detection", "localisation", "ingest", "sizes")
+NAMES = ("detection", "segmentation", "localisation", "ingest", "sizes")
 
 
 def main() -> None:
