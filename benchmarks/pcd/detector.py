@@ -67,11 +67,16 @@ class PcdDetector:
     def _deleted_cells(self) -> NDArray[np.bool_]:
         """(U,) map cells whose evidence, with that of the cells around, says "changed"."""
         p, c = self.parameters, self._counts
-        own = np.stack([c.map_hits, c.map_passes], axis=1)
-        sums = support_sums(self.index.base, self.index.state, self.index.cells, own, p.support_cells)
-        zero = np.zeros(len(sums), np.int32)
-        state = states(masses(sums[:, 0], zero, zero, sums[:, 1], p.masses))
-        return np.asarray((state == ChangeState.CHANGED) & (sums[:, 1] >= p.min_pass_points))
+        at, zero = self.index, np.zeros(len(self.index.cells), np.int32)
+        hits, passes = support_sums(
+            at.base, at.state, at.cells, c.map_hits, c.map_passes, p.support_cells, p.min_pass_points
+        )
+        touched = np.flatnonzero(passes >= max(p.min_pass_points, 1))
+        some = zero[touched]
+        state = states(masses(hits[touched], some, some, passes[touched], p.masses))
+        deleted = np.zeros(len(zero), np.bool_)
+        deleted[touched[state == ChangeState.CHANGED]] = True
+        return deleted
 
     def _new_points(self) -> F32:
         """(K, 3) float32 centroids, map frame, of the new cells whose evidence says "changed"."""

@@ -1,7 +1,7 @@
 """A point-cloud map turned into what the ray kernel reads: a dense window of blocks, leaf cells, points and normals."""
 
+from collections import OrderedDict
 from dataclasses import dataclass
-from functools import lru_cache
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,6 +14,7 @@ from gnd_map.arrays import F64, I32, I64
 from gnd_map.grid import GridFrame
 
 MAX_BLOCKS = 200_000_000
+_REMEMBERED = 2
 _MARGIN_BLOCKS = np.array([4, 4, 2]), np.array([4, 4, 8])
 """Room for what is new around, below and above the map."""
 
@@ -62,13 +63,24 @@ class PcdIndex:
         return self.grid_frame.map_of_grid((cells + self.origin_c) / CELLS_A_SIDE)
 
 
-@lru_cache(maxsize=2)
+_remembered: "OrderedDict[tuple[bytes, float], PcdIndex]" = OrderedDict()
+
+
 def index_of(pcd: PcdMap, planar_ratio: float) -> PcdIndex:
-    """Index a point cloud (some seconds for a street; the last two are remembered).
+    """Index a point cloud (some seconds for a street; those of the last two clouds, by content, are remembered).
 
     Raises:
         PcdError: no points, or they span more blocks than there is room for.
     """
+    key = pcd.sha, planar_ratio
+    if key not in _remembered:
+        _remembered[key] = _made_index(pcd, planar_ratio)
+        while len(_remembered) > _REMEMBERED:
+            _remembered.popitem(last=False)
+    return _remembered[key]
+
+
+def _made_index(pcd: PcdMap, planar_ratio: float) -> PcdIndex:
     if len(pcd) == 0:
         raise PcdError("a point-cloud map without points cannot be compared with anything")
     grid_frame = pcd.grid_frame

@@ -5,8 +5,10 @@ corner. Cells and blocks are unit cubes there; distances stay in metres.
 """
 
 import math
-from typing import NamedTuple
+from collections.abc import Callable
+from typing import Any, NamedTuple, TypeVar, cast
 
+import numba
 import numpy as np
 from numpy.typing import NDArray
 
@@ -17,6 +19,13 @@ SIDE = 5
 """Leaf cells along each side of a block (half a voxel)."""
 CELLS = SIDE**3
 EMPTY = -1
+
+T = TypeVar("T", bound=Callable[..., Any])
+
+
+def inlined(function: T) -> T:
+    """Compile a part of a kernel into its caller."""
+    return cast("T", numba.njit(inline="always", error_model="numpy")(function))
 
 
 class Base(NamedTuple):
@@ -68,7 +77,7 @@ class Rules(NamedTuple):
     range_max_m: float
 
 
-@kernel
+@inlined
 def _map_cell(base: Base, state: I32, x: int, y: int, z: int) -> int:
     """Number of the map's cell at (x, y, z), -1 where the map has none or outside the window."""
     nx, ny, nz = base.shape
@@ -84,7 +93,7 @@ def _map_cell(base: Base, state: I32, x: int, y: int, z: int) -> int:
     return base.start[row] + slot - 1 if slot > 0 else -1
 
 
-@kernel
+@inlined
 def _clip(g: float, d: float, n: int, t0: float, t1: float) -> tuple[float, float]:
     """The part of [t0, t1] where g + t d lies inside [0, n]; empty when t0 > t1."""
     if d == 0.0:
@@ -93,13 +102,13 @@ def _clip(g: float, d: float, n: int, t0: float, t1: float) -> tuple[float, floa
     return max(t0, min(a, b)), min(t1, max(a, b))
 
 
-@kernel
+@inlined
 def _index(g: float, n: int) -> int:
     """floor(g), kept inside 0 ... n - 1 against rounding at the faces."""
     return min(max(math.floor(g), 0), n - 1)
 
 
-@kernel
+@inlined
 def _first(g: float, d: float, i: int) -> tuple[float, float]:
     """Ray parameter of the first face along one axis, and the step between faces."""
     if d == 0.0:
@@ -108,7 +117,7 @@ def _first(g: float, d: float, i: int) -> tuple[float, float]:
     return (face - g) / d, 1.0 / abs(d)
 
 
-@kernel
+@inlined
 def _has_passed(
     base: Base, u: int, o: tuple[float, float, float], v: tuple[float, float, float], length: float,
     t_in: float, t_out: float, rules: Rules,
@@ -129,7 +138,7 @@ def _has_passed(
     return bool(dx * dx + dy * dy + dz * dz <= rules.beside_m * rules.beside_m)
 
 
-@kernel
+@inlined
 def _cross_block(
     base: Base, counts: Counts, row: int, new: int, corner: tuple[int, int, int],
     g: tuple[float, float, float], d: tuple[float, float, float],
@@ -170,24 +179,48 @@ def _cross_block(
             return
 
 
-@kernel
-def _explained_by(base: Base, state: I32, x: int, y: int, z: int, p: tuple[float, float, float], near_m: float) -> int:
-    """The nearest map cell within two cells whose point or surface is within near_m of the hit p, or -1."""
-    best, least = -1, np.inf
-    reach = 1 if near_m <= 0.1 else 2
-    for i in range(x - reach, x + reach + 1):
-        for j in range(y - reach, y + reach + 1):
-            for k in range(z - reach, z + reach + 1):
-                u = _map_cell(base, state, i, j, k)
-                if u < 0:
-                    continue
-                dx, dy, dz = p[0] - base.point_m[u, 0], p[1] - base.point_m[u, 1], p[2] - base.point_m[u, 2]
-                away = abs(dx * base.normal[u, 0] + dy * base.normal[u, 1] + dz * base.normal[u, 2])
-                distance = math.sqrt(dx * dx + dy * dy + dz * dz)
-                if away == 0.0:
-                    away = distance
-                if away <= near_m and distance < least:
-                    best, least = u, distance
+@inlined
+def _explains(base: Base, u: int, p: tuple[float, float, float], near_m: float) -> float:
+    """Squared distance of the hit p from map point u where its point or surface is within near_m, else infinite."""
+    dx, dy, dz = p[0] - base.point_m[u, 0], p[1] - base.point_m[u, 1], p[2] - base.point_m[u, 2]
+    nx, ny, nz = base.normal[u, 0], base.normal[u, 1], base.normal[u, 2]
+    d2 = dx * dx + dy * dy + dz * dz
+    away = dx * nx + dy * ny + dz * nz
+    if nx == 0.0 and ny == 0.0 and nz == 0.0:
+        return d2 if d2 <= near_m * near_m else np.inf
+    return d2 if abs(away) <= near_m else np.inf
+
+
+@inlined
+def _explained_by(  # noqa: C901  (a call a block would cost more than the block)
+    base: Base, state: I32, x: int, y: int, z: int, p: tuple[float, float, float], near_m: float
+) -> int:
+    """A map cell whose point or surface is within near_m of the hit p, or -1.
+
+    The hit's own cell, else the nearest of the 27 around, else of the 125.
+    """
+    u = _map_cell(base, state, x, y, z)
+    if u >= 0 and _explains(base, u, p, near_m) < np.inf:
+        return u
+    best, least, reach = -1, np.inf, 1
+    while best < 0 and reach <= 2:
+        for i in range(max(x - reach, 0) // SIDE, min((x + reach) // SIDE + 1, base.shape[0])):
+            for j in range(max(y - reach, 0) // SIDE, min((y + reach) // SIDE + 1, base.shape[1])):
+                for k in range(max(z - reach, 0) // SIDE, min((z + reach) // SIDE + 1, base.shape[2])):
+                    row = state[(i * base.shape[1] + j) * base.shape[2] + k]
+                    if row < 0 or row >= len(base.start):
+                        continue
+                    for a in range(max(x - reach - i * SIDE, 0), min(x + reach - i * SIDE, SIDE - 1) + 1):
+                        for b in range(max(y - reach - j * SIDE, 0), min(y + reach - j * SIDE, SIDE - 1) + 1):
+                            for c in range(max(z - reach - k * SIDE, 0), min(z + reach - k * SIDE, SIDE - 1) + 1):
+                                slot = base.slot[row, (a * SIDE + b) * SIDE + c]
+                                if slot == 0:
+                                    continue
+                                u = base.start[row] + slot - 1
+                                d2 = _explains(base, u, p, near_m)
+                                if d2 < least:
+                                    best, least = u, d2
+        reach += 1
     return best
 
 
@@ -305,24 +338,45 @@ def cast_rays(  # noqa: C901  (one loop: a call a block would cost more than the
     return len(points), used
 
 
-@kernel
-def support_sums(base: Base, state: I32, cells: I32, values: I32, reach: int) -> I32:
-    """(U, 2) sums of `values` (U, 2) over the map cells within `reach` cells of each, where any value lies near.
+@inlined
+def _sum_around(base: Base, state: I32, cells: I32, values: I32, u: int, reach: int) -> int:
+    """Sum of `values` (U,) over the map cells within `reach` cells of map cell u."""
+    total = 0
+    for i in range(cells[u, 0] - reach, cells[u, 0] + reach + 1):
+        for j in range(cells[u, 1] - reach, cells[u, 1] + reach + 1):
+            for k in range(cells[u, 2] - reach, cells[u, 2] + reach + 1):
+                w = _map_cell(base, state, i, j, k)
+                if w >= 0:
+                    total += values[w]
+    return total
 
+
+@inlined
+def _add_around(base: Base, state: I32, cells: I32, u: int, value: int, reach: int, sums: I32) -> None:
+    """Add `value` to `sums` (U,) at the map cells within `reach` cells of map cell u."""
+    for i in range(cells[u, 0] - reach, cells[u, 0] + reach + 1):
+        for j in range(cells[u, 1] - reach, cells[u, 1] + reach + 1):
+            for k in range(cells[u, 2] - reach, cells[u, 2] + reach + 1):
+                w = _map_cell(base, state, i, j, k)
+                if w >= 0:
+                    sums[w] += value
+
+
+@kernel
+def support_sums(base: Base, state: I32, cells: I32, hits: I32, passes: I32, reach: int, least: int) -> tuple[I32, I32]:
+    """Sums of hits and of passes (U,) over the map cells within `reach` cells of each.
+
+    Rays have passed few cells: hits are summed only where the sum of passes is `least` or more, else they are 0.
     `cells` (U, 3): cell coordinates of the map's cells.
     """
-    found = np.zeros_like(values)
+    hit_sums, pass_sums = np.zeros(len(cells), np.int32), np.zeros(len(cells), np.int32)
     for u in range(len(cells)):
-        if values[u, 0] == 0 and values[u, 1] == 0:
-            continue
-        for i in range(cells[u, 0] - reach, cells[u, 0] + reach + 1):
-            for j in range(cells[u, 1] - reach, cells[u, 1] + reach + 1):
-                for k in range(cells[u, 2] - reach, cells[u, 2] + reach + 1):
-                    w = _map_cell(base, state, i, j, k)
-                    if w >= 0:
-                        found[w, 0] += values[u, 0]
-                        found[w, 1] += values[u, 1]
-    return found
+        if passes[u] > 0:
+            _add_around(base, state, cells, u, passes[u], reach, pass_sums)
+    for u in range(len(cells)):
+        if pass_sums[u] >= max(least, 1):
+            hit_sums[u] = _sum_around(base, state, cells, hits, u, reach)
+    return hit_sums, pass_sums
 
 
 @kernel

@@ -8,9 +8,10 @@ from numpy.typing import NDArray
 from benchmarks.pcd.errors import PcdError
 from benchmarks.pcd.index import PcdIndex, index_of
 from benchmarks.pcd.parameters import PcdDetectParameters, PcdMergeParameters
-from benchmarks.pcd.points import PcdMap, cells_of, without
+from benchmarks.pcd.points import PcdMap, cell_keys, cells_of, key_cells, without
 from benchmarks.pcd.report import PcdReport
 from gnd_map.arrays import F32, F64, I32, I64
+from gnd_map.jit import kernel
 
 
 def merge_pcd(base: PcdMap, reports: Sequence[PcdReport], parameters: PcdMergeParameters | None = None) -> PcdMap:
@@ -53,31 +54,47 @@ def _deleted(
 
 
 def _new(index: PcdIndex, seen: _Observers, reports: Sequence[PcdReport], p: PcdMergeParameters) -> F32:
+    """Centroids of the new cells for which enough reports have a new point in or beside the cell."""
     clouds = [report.new_points.astype(np.float64) for report in reports]
-    cells = [cells_of(cloud, index.grid_frame) - index.origin_c for cloud in clouds]
-    key, first, which = np.unique(np.concatenate([_keys(c) for c in cells]), return_index=True, return_inverse=True)
-    if not len(key):
-        return np.empty((0, 3), np.float32)
-    votes = np.zeros(len(key), np.int32)
-    for one in cells:
-        votes += np.isin(key, _spread(one, p.reach_cells))
-    blocks = index.blocks_of(np.concatenate(cells)[first])
+    cells = [cells_of(cloud, index.grid_frame) for cloud in clouds]
+    key, which = np.unique(cell_keys(np.concatenate(cells), index.grid_frame), return_inverse=True)
+    owner = np.repeat(np.arange(len(reports)), [len(c) for c in cells])
+    said = np.zeros((len(key), -(-len(reports) // 64)), np.uint64)
+    np.bitwise_or.at(said, (which, owner // 64), np.uint64(1) << (owner % 64).astype(np.uint64))
+    votes = count_votes(key, said, p.reach_cells)
+    blocks = index.blocks_of(key_cells(key, index.grid_frame) - index.origin_c)
     accepted = votes > p.xi * np.maximum(seen.of(blocks), votes)
     return _means(np.concatenate(clouds), which, len(key))[accepted]
 
 
-def _keys(cells: I64) -> I64:
-    return np.asarray(((cells[:, 0] + 8) << 42) | ((cells[:, 1] + 8) << 21) | (cells[:, 2] + 8))
-
-
-def _spread(cells: I64, reach: int) -> I64:
-    """Keys of all cells within `reach` of the given ones."""
-    steps = range(-reach, reach + 1)
-    keys = [_keys(cells + np.array([x, y, z])) for x in steps for y in steps for z in steps]
-    return np.unique(np.concatenate(keys))
-
-
 def _means(points: F64, which: I64, n: int) -> F32:
+    """(n, 3) float32 means of points (N, 3) by group."""
     count = np.bincount(which, minlength=n)
-    sums = np.stack([np.bincount(which, weights=points[:, a], minlength=n) for a in range(3)], axis=1)
-    return (sums / count[:, None]).astype(np.float32)
+    sums = [np.bincount(which, weights=points[:, a], minlength=n) for a in range(3)]
+    return (np.stack(sums, axis=1) / count[:, None]).astype(np.float32)
+
+
+@kernel
+def count_votes(keys: I64, said: NDArray[np.uint64], reach: int) -> I32:
+    """(C,) int32: how many reports have a point within `reach` cells of each cell.
+
+    `keys` (C,) sorted cell keys; `said` (C, W): bit r of word w is set where report 64 w + r has a point.
+    """
+    votes = np.zeros(len(keys), np.int32)
+    word = np.empty(said.shape[1], np.uint64)
+    for c in range(len(keys)):
+        word[:] = 0
+        for dx in range(-reach, reach + 1):
+            for dy in range(-reach, reach + 1):
+                middle = keys[c] + (np.int64(dx) << 42) + (np.int64(dy) << 21)
+                at = np.searchsorted(keys, middle - reach)
+                while at < len(keys) and keys[at] <= middle + reach:
+                    for w in range(len(word)):
+                        word[w] |= said[at, w]
+                    at += 1
+        for w in range(len(word)):
+            bits = word[w]
+            while bits != np.uint64(0):
+                bits &= bits - np.uint64(1)
+                votes[c] += 1
+    return votes

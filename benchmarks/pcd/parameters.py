@@ -12,7 +12,7 @@ class PcdDetectParameters:
 
     masses: MassParameters = field(default_factory=lambda: MassParameters(lambda_c_pass=0.05))
     """Evidence of a map point: hits near it (BI) and rays that passed it (PI), Eq. (5) and (7)."""
-    lambda_new: float = 0.05
+    lambda_new: float = 0.1
     """A hit where the map has no point says "changed" (Eq. 9)."""
     lambda_empty: float = 0.05
     """A ray that passes a cell where the map has no point says "sustained": nothing stands there."""
@@ -26,7 +26,7 @@ class PcdDetectParameters:
     """A ray has passed a point without surface when it went by this close ..."""
     ahead_m: float = 0.5
     """... and so far before its own end."""
-    support_cells: int = 2
+    support_cells: int = 3
     """Evidence of a map point is that of all map points within so many leaf cells."""
     new_support_cells: int = 1
     """The same for new points."""
@@ -63,7 +63,7 @@ class PcdMergeParameters:
     """More than this share of a block's observers must agree (the analogue of ξ_update, GND 5.3)."""
     reach_cells: int = 1
     """New points of several vehicles this many leaf cells apart speak of the same surface."""
-    similar: float = 0.5
+    similar: float = 0.8
     """Score: a voxel whose Gaussians before and after are at least this similar counts as not modified."""
 
     def __post_init__(self) -> None:

@@ -1,9 +1,11 @@
 """Scoring a point-cloud map as the paper does: converted to Gaussians, compared with the same indicator."""
 
 from collections.abc import Mapping
+from typing import Final
 
 import numpy as np
 
+from benchmarks.pcd.parameters import PcdMergeParameters
 from fleet_sim.evaluate import Evaluation, evaluate_maps
 from fleet_sim.truth import Truth
 from gnd_map.gaussian import Gaussians, concat
@@ -11,13 +13,16 @@ from gnd_map.similarity import similarity
 from gnd_map.tile_id import TileId
 
 Tiles = Mapping[TileId, Gaussians]
+SIMILAR: Final = PcdMergeParameters().similar
 
 
-def settled(before: Tiles, after: Tiles, similar: float = 0.5) -> dict[TileId, Gaussians]:
+def settled(before: Tiles, after: Tiles, similar: float = SIMILAR) -> dict[TileId, Gaussians]:
     """`after` with the Gaussians of `before` where the two are at least `similar`.
 
     A few changed points alter a Gaussian by a hair; the paper compares normal distributions, and a voxel counts as
-    modified there only when they differ (GND 5.3's d_update). The same threshold as the GND framework's.
+    modified there only when they differ. Points that nothing was said about stay to the bit, so the threshold can be
+    higher than the GND framework's 0.5, which must allow for measurement noise in unchanged voxels; and it must be,
+    because old points that a new surface hides stay in the cloud.
     """
     return {t: _settled(before.get(t, Gaussians.empty()), g, similar) for t, g in after.items()}
 
@@ -31,6 +36,6 @@ def _settled(old: Gaussians, new: Gaussians, similar: float) -> Gaussians:
     return concat([new.take(changed), a.take(alike)])
 
 
-def evaluate_gnd(truth: Truth, before: Tiles, after: Tiles, similar: float = 0.5) -> Evaluation:
+def evaluate_gnd(truth: Truth, before: Tiles, after: Tiles, similar: float = SIMILAR) -> Evaluation:
     """F1 of the Gaussians `after` an update of the Gaussians `before`, both converted from point clouds."""
     return evaluate_maps(truth, before, settled(before, after, similar))
