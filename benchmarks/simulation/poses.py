@@ -18,7 +18,7 @@ from vehicle_agent.localise.localiser import Localiser
 from vehicle_agent.localise.parameters import LocaliserParameters
 
 TIME_CONSTANT_S: Final = 2.0
-_KEPT_NS: Final = 2_000_000_000
+_KEPT_NS: Final = 200_000_000
 
 
 class Localisation(Protocol):
@@ -103,7 +103,8 @@ class FromReference:
             T[:3, 3] += self._error[:3]
             T[:3, :3] = T[:3, :3] @ exp_so3(self._error[3:])
         self._poses.append((pose.t_ns, T))
-        while self._poses[0][0] < pose.t_ns - _KEPT_NS:
+        needed_ns = self._waiting[0].t_ns if self._waiting else pose.t_ns
+        while self._poses[0][0] < needed_ns - _KEPT_NS:
             self._poses.popleft()
 
     def _ready(self, late_ns: int = 0) -> Iterator[RefinedScan]:

@@ -33,6 +33,7 @@ from gnd_map.similarity import similarity
 from gnd_map.tile_id import TileId
 from schemas.drive import DriveHeader, DriveItem, GnssFix, ReferencePose, Scan
 from schemas.drive_mcap import DriveWriter
+from schemas.drive_messages import fix_of, gnss_of, pose_message_of, reference_of
 from vehicle_agent.detect.classify import classify
 from vehicle_agent.detect.detector import ChangeDetector
 from vehicle_agent.detect.evidence import TileEvidence
@@ -85,7 +86,7 @@ def run_vehicle(task: VehicleTask, tick: Tick) -> None:
     """Simulate a drive, run the vehicle on it and write its result."""
     simulation = DriveSimulation(read_world(task.world), task.drive)
     labels = MoverLabels(task.method.detect.range_max_m)
-    items = ticking(simulation.items(labels.take), tick, simulation.scans)
+    items = ticking(map(as_recorded, simulation.items(labels.take)), tick, simulation.scans)
     if task.recording is not None:
         items = recorded(items, simulation.header(), task.recording)
     result = drive(simulation.header(), items, read_base(task.base), VoxelRows.read(task.voxels), task, labels)
@@ -100,6 +101,13 @@ def ticking(items: Iterable[DriveItem], tick: Tick, scans: int) -> Iterator[Driv
         if isinstance(item, Scan):
             done += 1
             tick(done, scans)
+
+
+def as_recorded(item: DriveItem) -> DriveItem:
+    """Return a measurement as a recording gives it back: positions in degrees and poses by quaternion round a bit."""
+    if isinstance(item, GnssFix):
+        return gnss_of(fix_of(item))
+    return reference_of(pose_message_of(item)) if isinstance(item, ReferencePose) else item
 
 
 def recorded(items: Iterable[DriveItem], header: DriveHeader, path: Path) -> Iterator[DriveItem]:

@@ -14,7 +14,7 @@ from benchmarks.simulation.pose_source import PoseSource
 from benchmarks.simulation.poses import TIME_CONSTANT_S, FromReference
 from benchmarks.simulation.result import VehicleResult
 from benchmarks.simulation.tasks import vehicle_tasks
-from benchmarks.simulation.vehicle import VehicleTask, drive
+from benchmarks.simulation.vehicle import VehicleTask, as_recorded, drive
 from benchmarks.simulation.voxel_rows import VoxelRows
 from benchmarks.simulation.worlds import WorldFiles, world_files
 from fleet_sim.drives import DriveSimulation, simulate_drive
@@ -36,7 +36,7 @@ Finished = tuple[Path, dict[str, Any]]
 @pytest.fixture(scope="module")
 def world(finished: Finished) -> tuple[WorldFiles, VehicleTask]:
     """The files of the world, and the first vehicle's work."""
-    options = RunOptions((5,), StreetOptions(100.0, "wangsimni"), (1,), ("vlp16",), traffic=False, scans=30, pcd=False)
+    options = RunOptions((5,), StreetOptions(100.0, "wangsimni"), (1,), ("rs16",), traffic=False, scans=30, pcd=False)
     files = world_files(RunFolder(finished[0]), 5, options)
     return files, vehicle_tasks(options, 5, files)[0]
 
@@ -47,15 +47,16 @@ def run(task: VehicleTask, header: DriveHeader, items: Any) -> VehicleResult:
 
 def simulated(task: VehicleTask) -> VehicleResult:
     simulation = DriveSimulation(read_world(task.world), task.drive)
-    return run(task, simulation.header(), simulation.items())
+    return run(task, simulation.header(), map(as_recorded, simulation.items()))
 
 
-@pytest.mark.parametrize(("poses", "scans"), [("noisy:4cm:0.08deg", 20), ("estimated", 50)])
+@pytest.mark.parametrize(("poses", "scans"), [("noisy:4cm:0.08deg", 20), ("estimated", 30)])
 def test_streaming_and_mcap_give_identical_reports(
     world: tuple[WorldFiles, VehicleTask], tmp_path: Path, poses: str, scans: int
 ) -> None:
     task = replace(world[1], poses=PoseSource.parse(poses), drive=replace(world[1].drive, scans=scans))
     path = simulate_drive(read_world(task.world), task.drive, tmp_path / "drive.mcap")
+    assert read_header(path) == DriveSimulation(read_world(task.world), task.drive).header()
     from_file = run(task, read_header(path), read_drive(path))
     streamed = simulated(task)
     assert streamed.reports == from_file.reports
@@ -66,7 +67,7 @@ def test_streaming_and_mcap_give_identical_reports(
 def test_reports_are_what_a_vehicle_uploads(world: tuple[WorldFiles, VehicleTask]) -> None:
     result = simulated(world[1])
     report = ChangeReport.decode(result.reports[0])
-    assert (report.vehicle, report.sensor_model, report.layer) == ("vehicle-00", "VLP-16", "ndt")
+    assert (report.vehicle, report.sensor_model, report.layer) == ("vehicle-00", "RS-LiDAR-16", "ndt")
     base = read_base(world[1].base)
     assert all(change.base_sha == base.shas.get(change.tile, b"") for change in report.tiles)
     assert sum(len(change.changed) for change in report.tiles) == result.stats["changed_voxels"]
@@ -115,16 +116,16 @@ def still(n: int) -> tuple[DriveHeader, LocalMap, list[ReferencePose | Scan]]:
 
 
 def test_noise_of_poses_has_its_sigmas_and_time_constant() -> None:
-    header, local_map, items = still(200_000)
+    header, local_map, items = still(40_000)
     poses = FromReference(header, local_map, PoseSource.parse("noisy:4cm:0.08deg"), 7)
     T = np.array([scan.estimate.T_map_vehicle for item in items for scan in poses.push(item)])
-    assert len(T) > 19_000
+    assert len(T) > 3_900
     offset, turn = T[:, :3, 3], np.degrees(log_so3(T[:, :3, :3]))
-    assert offset.std(axis=0) == pytest.approx([0.04, 0.04, 0.02], rel=0.12)
-    assert turn.std(axis=0) == pytest.approx([0.04, 0.04, 0.08], rel=0.12)
+    assert offset.std(axis=0) == pytest.approx([0.04, 0.04, 0.02], rel=0.2)
+    assert turn.std(axis=0) == pytest.approx([0.04, 0.04, 0.08], rel=0.2)
     x = offset[:, 0] / offset[:, 0].std()
     lag = 20  # of 0.1 s: one time constant
-    assert np.mean(x[:-lag] * x[lag:]) == pytest.approx(np.exp(-0.1 * lag / TIME_CONSTANT_S), abs=0.08)
+    assert np.mean(x[:-lag] * x[lag:]) == pytest.approx(np.exp(-0.1 * lag / TIME_CONSTANT_S), abs=0.12)
 
 
 def test_true_poses_are_the_reference(world: tuple[WorldFiles, VehicleTask]) -> None:
