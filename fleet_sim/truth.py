@@ -31,7 +31,7 @@ from gnd_map.accumulate import N_MIN_CELLS
 from gnd_map.classes import ChangeClass
 from gnd_map.gaussian import Gaussians
 from gnd_map.geodesy import LocalFrame
-from gnd_map.grid import GridFrame
+from gnd_map.grid import GridFrame, zones
 from gnd_map.tile_id import TileId
 
 Level = Literal["all", "marginal_excluded", "scored"]
@@ -143,8 +143,8 @@ def make_truth(world: World, rules: TruthRules | None = None, plan: ScanPlan | N
         plan: where the scan looks from.
     """
     rules, plan = rules or TruthRules(), plan or ScanPlan()
-    zones = [_truth_of_zone(world, scan, rules, plan) for scan in dense_scan.dense_scans(world, plan)]
-    return zones[0] if len(zones) == 1 else _joined_zones(zones)
+    parts = [_truth_of_zone(world, scan, rules, plan) for scan in dense_scan.dense_scans(world, plan)]
+    return parts[0] if len(parts) == 1 else _joined_zones(parts)
 
 
 def _truth_of_zone(world: World, scan: DenseScan, rules: TruthRules, plan: ScanPlan) -> Truth:
@@ -166,15 +166,15 @@ def _truth_of_zone(world: World, scan: DenseScan, rules: TruthRules, plan: ScanP
     )
 
 
-def _joined_zones(zones: Sequence[Truth]) -> Truth:
+def _joined_zones(parts: Sequence[Truth]) -> Truth:
     """The truths of several zones of latitude, which have no tile in common, as one."""
-    columns: dict[str, Any] = {name: _joined(getattr(zone, name) for zone in zones) for name in _COLUMNS}
+    columns: dict[str, Any] = {name: _joined(getattr(part, name) for part in parts) for name in _COLUMNS}
     order = np.lexsort((columns["voxel_id"], columns["morton"]))
     columns = {name: column[order] for name, column in columns.items()}
     for state in STATES:
-        merged = {tile: g for zone in zones for tile, g in getattr(zone, state).items()}
+        merged = {tile: g for part in parts for tile, g in getattr(part, state).items()}
         columns[state] = dict(sorted(merged.items()))
-    return replace(zones[0], **columns)
+    return replace(parts[0], **columns)
 
 
 def classify(scan: DenseScan, rules: TruthRules) -> NDArray[np.uint8]:
@@ -302,6 +302,19 @@ def _unpacked(state: str, data: Mapping[str, NDArray[Any]]) -> dict[TileId, Gaus
     return {TileId(code): Gaussians(*(column[index] for column in columns)) for code, index in rows.items()}
 
 
+def grids_of(truth: Truth) -> tuple[GridFrame, ...]:
+    """Return the grid frames of a truth's tiles in the world's map frame, one for each zone of latitude."""
+    tiles = [TileId(int(code)) for code in np.unique(truth.morton)]
+    return tuple(GridFrame.around(truth.frame, group) for group in zones(tiles).values())
+
+
 def grid_of(truth: Truth) -> GridFrame:
-    """Return the grid frame of a truth's tiles in the world's map frame."""
-    return GridFrame.around(truth.frame, [TileId(int(code)) for code in np.unique(truth.morton)])
+    """Return the grid frame of a truth that lies in one zone of latitude.
+
+    Raises:
+        TruthError: it lies in several; see `grids_of`.
+    """
+    grids = grids_of(truth)
+    if len(grids) != 1:
+        raise TruthError(f"the truth lies in {len(grids)} zones of latitude, each with a grid of its own")
+    return grids[0]

@@ -16,7 +16,7 @@ from fleet_sim.drives import PERFECT, DriveConfig, simulate_drive
 from fleet_sim.errors import TruthError
 from fleet_sim.raycast import Scene
 from fleet_sim.street import SITES, SiteName, StreetOptions, street
-from fleet_sim.truth import make_truth, read_truth, write_truth
+from fleet_sim.truth import grid_of, grids_of, make_truth, read_truth, write_truth
 from fleet_sim.world import STATES, World
 from gnd_map.grid import VoxelGrid
 from gnd_map.tile_id import TILE_RAD, TileId
@@ -120,6 +120,9 @@ def test_a_street_in_two_zones_of_latitude_has_one_truth(two_zones: World, tmp_p
         found = np.bincount(truth.change_class[mine], minlength=5)
         assert found[0] > 100
         assert found[3] >= 5, "of the wall that goes"
+    assert sorted(grid.nx for grid in grids_of(truth)) == [30, 31]
+    with pytest.raises(TruthError, match="2 zones"):
+        grid_of(truth)
     write_truth(truth, tmp_path / "truth.npz")
     assert read_truth(tmp_path / "truth.npz").before == truth.before
 
