@@ -123,9 +123,9 @@ def test_noise_of_poses_has_its_sigmas_and_time_constant() -> None:
     offset, turn = T[:, :3, 3], np.degrees(log_so3(T[:, :3, :3]))
     assert offset.std(axis=0) == pytest.approx([0.04, 0.04, 0.02], rel=0.2)
     assert turn.std(axis=0) == pytest.approx([0.04, 0.04, 0.08], rel=0.2)
-    x = offset[:, 0] / offset[:, 0].std()
-    lag = 20  # of 0.1 s: one time constant
-    assert np.mean(x[:-lag] * x[lag:]) == pytest.approx(np.exp(-0.1 * lag / TIME_CONSTANT_S), abs=0.12)
+    x = np.concatenate([offset, turn], axis=1) / np.array([0.04, 0.04, 0.02, 0.04, 0.04, 0.08])
+    for lag in (5, 20):  # of 0.1 s
+        assert np.mean(x[:-lag] * x[lag:]) == pytest.approx(np.exp(-0.1 * lag / TIME_CONSTANT_S), abs=0.12)
 
 
 def test_true_poses_are_the_reference(world: tuple[WorldFiles, VehicleTask]) -> None:
