@@ -1,0 +1,1 @@
+"""Change detection on recordings of real sensors, with objects inserted ray-accurately: `gnd reproduce real`."""

@@ -1,0 +1,132 @@
+"""One round: the recording on the grid in one way, once untouched and once with objects in either half."""
+
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from benchmarks.real.drive import Found, Poses, Tiles, detect, local_map_of, refined_scans, segmented
+from benchmarks.real.insertion import Painter, Truth, changed_by_shadow, truth_of
+from benchmarks.real.places import Placed, Surroundings, choose_places
+from benchmarks.real.scene import Recorded, Scene, in_range, place
+from benchmarks.real.voxels import Cells
+from gnd_map.accumulate import VoxelAccumulator
+from schemas.drive import Scan
+from vehicle_agent.detect.parameters import DetectParameters
+from vehicle_agent.segment.parameters import SegmentParameters
+from vehicle_agent.segment.segmenter import SegmentedScan
+
+I64 = NDArray[np.int64]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Method:
+    """How the vehicle works: detection, segmentation of its own scans and of the map's, where poses come from."""
+
+    detect: DetectParameters
+    segment: SegmentParameters
+    segment_map: bool
+    poses: Poses
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Untouched:
+    """The two halves as they are: nothing changed but what moved by itself."""
+
+    found: Found
+    tiles: Tiles
+    mapped: Cells
+    driven: Cells
+    moving: Cells
+    """Points of the driven half that were marked as moving, whether or not segmentation was on for detection."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Inserted:
+    """The same with objects: those of the map's half are gone, those of the vehicle's half are new."""
+
+    found: Found
+    tiles: Tiles
+    truth: Truth
+    new: tuple[Placed, ...]
+    gone: tuple[Placed, ...]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Round:
+    """All of one round."""
+
+    scene: Scene
+    untouched: Untouched
+    inserted: Inserted
+
+
+def run_round(
+    recorded: Recorded, halves: tuple[I64, I64], number: int, objects: int, seed: int, method: Method
+) -> Round:
+    """Run one round.
+
+    Args:
+        recorded: scans and track.
+        halves: numbers of the scans that make the map, and of those that are driven.
+        number: of the round: which way the recording lies on the grid, and which places are chosen.
+        objects: how many to insert, half of them into either half.
+        seed: of the places.
+        method: how the vehicle works.
+    """
+    scene = place(recorded, number)
+    mapping, driving = ([scene.scans[i] for i in half] for half in halves)
+    untouched = _untouched(scene, mapping, driving, method)
+    rng = np.random.default_rng([seed, number])
+    placed = choose_places(scene, Surroundings.of(scene), objects, rng) if objects else []
+    return Round(scene, untouched, _inserted(scene, mapping, driving, placed, untouched, method, number))
+
+
+def _map_of(scene: Scene, scans: Iterable[Scan], method: Method) -> VoxelAccumulator:
+    accumulator = VoxelAccumulator(scene.grid_frame)
+    parameters = method.segment if method.segment_map else SegmentParameters(enabled=False)
+    for one in segmented(map(scene.refined, scans), parameters):
+        accumulator.add(one.scan.points_map_m[in_range(one.scan) & ~one.moving])
+    return accumulator
+
+
+def _untouched(scene: Scene, mapping: list[Scan], driving: list[Scan], method: Method) -> Untouched:
+    points = _map_of(scene, mapping, method)
+    tiles = points.finish()
+    local_map = local_map_of(scene, tiles)
+    driven, moving = VoxelAccumulator(scene.grid_frame), VoxelAccumulator(scene.grid_frame)
+    scans = segmented(refined_scans(scene, local_map, driving, method.poses), method.segment)
+    found = detect(scene, local_map, _noted(scans, driven, moving), method.detect)
+    return Untouched(found, tiles, Cells.of(points), Cells.of(driven), Cells.of(moving))
+
+
+def _noted(
+    scans: Iterable[SegmentedScan], driven: VoxelAccumulator, moving: VoxelAccumulator
+) -> Iterator[SegmentedScan]:
+    """The scans, with all their points noted in one accumulator and the moving ones in another."""
+    for one in scans:
+        near = in_range(one.scan)
+        driven.add(one.scan.points_map_m[near])
+        moving.add(one.scan.points_map_m[near & one.moving])
+        yield one
+
+
+def _inserted(
+    scene: Scene, mapping: list[Scan], driving: list[Scan], placed: list[Placed], untouched: Untouched, method: Method,
+    number: int,
+) -> Inserted:  # fmt: skip
+    new, gone = tuple(placed[::2]), tuple(placed[1::2])
+    into_map = Painter(scene, [one.shape for one in gone], 2 * number)
+    into_drive = Painter(scene, [one.shape for one in new], 2 * number + 1)
+    crossed = Painter(scene, [one.shape for one in gone], 2 * number)
+    points = _map_of(scene, into_map.paint(mapping), method)
+    tiles = points.finish()
+    local_map = local_map_of(scene, tiles)
+    scans = refined_scans(scene, local_map, into_drive.paint(driving), method.poses)
+    found = detect(scene, local_map, segmented(scans, method.segment), method.detect)
+    for _ in crossed.paint(driving):
+        pass
+    static = Cells.of(scene.accumulated(map(scene.refined, [*mapping, *driving])))
+    shadowed = changed_by_shadow(untouched.mapped, Cells.of(points))
+    return Inserted(found, tiles, truth_of(static, into_drive, into_map, crossed, shadowed), new, gone)
