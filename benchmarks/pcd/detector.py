@@ -56,11 +56,11 @@ class PcdDetector:
 
     def finish(self) -> PcdReport:
         """What the drive has found out: deleted map points, new points, and the blocks that it observed."""
-        deleted = self._deleted_cells()[self.index.cell_of_point]
+        deleted = self._deleted_cells()
         return PcdReport(
             new_points=self._new_points(),
-            deleted_index=np.flatnonzero(deleted).astype(np.int32),
-            observed=self._observed(),
+            deleted_index=np.flatnonzero(deleted[self.index.cell_of_point]).astype(np.int32),
+            observed=self._observed(deleted),
             map_size=len(self.base),
         )
 
@@ -85,21 +85,21 @@ class PcdDetector:
         corner = self.index.corners_of(c.new_block[row])
         at = corner + np.stack(np.unravel_index(cell, (SIDE,) * 3), axis=1)
         hits = c.new_hits[row, cell]
-        support = _box_sums(at, hits, p.new_support_cells)
+        support = box_sums(at, hits, p.new_support_cells)
         zero = np.zeros(len(hits), np.int64)
         state = states(masses(c.new_passes[row, cell], zero, zero, support, p.new_masses))
         new = state == ChangeState.CHANGED
         fraction = c.new_sum[row, cell][new].astype(np.float64) / hits[new, None]
         return self.index.points_at(at[new] + fraction).astype(np.float32)
 
-    def _observed(self) -> I32:
-        """Sorted numbers of the blocks that the drive can speak about."""
-        c, p, used, rows = self._counts, self.parameters, self._used, len(self.index.base.start)
-        seen = np.add.reduceat(c.map_hits + c.map_passes, self.index.base.start) > 0
-        of_map = np.flatnonzero((c.state >= 0) & (c.state < rows))
-        empty = np.flatnonzero(EMPTY - c.state >= p.min_passes)
-        with_new = c.new_block[:used]
-        return np.unique(np.concatenate([of_map[seen[c.state[of_map]]], empty, with_new])).astype(np.int32)
+    def _observed(self, deleted: NDArray[np.bool_]) -> I32:
+        """Sorted numbers of the blocks that the drive can speak about: seen, or with cells that it calls deleted."""
+        c, base = self._counts, self.index.base
+        seen = np.add.reduceat((c.map_hits > 0) | (c.map_passes > 0) | deleted, base.start, dtype=np.int32) > 0
+        of_map = np.flatnonzero((c.state >= 0) & (c.state < len(base.start)))
+        empty = np.flatnonzero(EMPTY - c.state >= self.parameters.min_passes)
+        parts = of_map[seen[c.state[of_map]]], empty, c.new_block[: self._used]
+        return np.unique(np.concatenate(parts)).astype(np.int32)
 
 
 def _no_counts(index: PcdIndex) -> Counts:
@@ -108,23 +108,21 @@ def _no_counts(index: PcdIndex) -> Counts:
         state=index.state.copy(),
         map_hits=np.zeros(cells, np.int32),
         map_passes=np.zeros(cells, np.int32),
-        row_passes=np.zeros(rows, np.int32),
         new_of=np.full(rows, -1, np.int32),
         new_hits=np.zeros((_FIRST_ROWS, CELLS), np.int32),
         new_passes=np.zeros((_FIRST_ROWS, CELLS), np.int32),
         new_sum=np.zeros((_FIRST_ROWS, CELLS, 3), np.float32),
         new_block=np.zeros(_FIRST_ROWS, np.int32),
-        new_block_passes=np.zeros(_FIRST_ROWS, np.int32),
     )
 
 
 def _grown(c: Counts) -> Counts:
     """Room for twice as many new blocks."""
-    names = ("new_hits", "new_passes", "new_sum", "new_block", "new_block_passes")
+    names = ("new_hits", "new_passes", "new_sum", "new_block")
     return c._replace(**{name: np.concatenate([getattr(c, name), np.zeros_like(getattr(c, name))]) for name in names})
 
 
-def _box_sums(at: I64, values: I32, reach: int) -> I64:
+def box_sums(at: I64, values: I32, reach: int) -> I64:
     """(K,) sums of `values` over the listed cells (K, 3) within `reach` cells of each."""
     low = at.min(axis=0, initial=0) - reach
     shape = at.max(axis=0, initial=0) + reach + 1 - low

@@ -48,22 +48,20 @@ class Counts(NamedTuple):
     """What a drive counts.
 
     `state` (blocks,) int32: row of a map block (0 ... R - 1), R + row of a block that only has new points, or
-    -1 - passes. `map_hits`, `map_passes` (U,) int32. `row_passes` (R,) int32. `new_of` (R,) int32: row in the new
-    blocks, -1 without. `new_hits`, `new_passes` (Q, 125) int32; `new_sum` (Q, 125, 3) float32, sums of the points'
-    cell coordinates from the cell's corner; `new_block` (Q,) int32: number of the block; `row_passes` of map blocks and
-    `new_block_passes` (Q,) int32 count the rays that crossed the block.
+    -1 - passes. `map_hits`, `map_passes` (U,) int32. `new_of` (R,) int32: row in the new blocks, -1 without.
+    `new_hits`, `new_passes` (Q, 125) int32; `new_sum` (Q, 125, 3) float32, sums of the points' cell coordinates from
+    the cell's corner; `new_block` (Q,) int32: number of the block. Passes of new cells are counted from the block's
+    first new hit on.
     """
 
     state: I32
     map_hits: I32
     map_passes: I32
-    row_passes: I32
     new_of: I32
     new_hits: I32
     new_passes: I32
     new_sum: F32
     new_block: I32
-    new_block_passes: I32
 
 
 class Rules(NamedTuple):
@@ -290,10 +288,6 @@ def cast_rays(  # noqa: C901  (one loop: a call a block would cost more than the
                     counts.state[at] = row - 1
             else:
                 new = row - n_rows if row >= n_rows else counts.new_of[row]
-                if left > 0 and row >= n_rows:
-                    counts.new_block_passes[new] += 1
-                elif left > 0:
-                    counts.row_passes[row] += 1
                 _cross_block(
                     base, counts, row, new, (i * SIDE, j * SIDE, k * SIDE), g, d, o, v, length, t_in, t_out, rules
                 )
@@ -326,7 +320,6 @@ def cast_rays(  # noqa: C901  (one loop: a call a block would cost more than the
             used += 1
             counts.new_block[new] = at
             if row < 0:
-                counts.new_block_passes[new] = EMPTY - row
                 counts.state[at] = n_rows + new
             else:
                 counts.new_of[row] = new

@@ -1,0 +1,100 @@
+import numpy as np
+import pytest
+import zstandard
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from benchmarks.pcd import PcdCodecError, PcdError, PcdMap, PcdReport
+from benchmarks.pcd.points import cells_of
+from benchmarks.pcd.report import CODECS
+
+
+def same(a: PcdReport, b: PcdReport) -> bool:
+    return np.array_equal(a.deleted_index, b.deleted_index) and np.array_equal(a.observed, b.observed)
+
+
+@pytest.mark.parametrize("codec", CODECS)
+def test_reports_come_back(codec, cloud, reports):
+    report = reports[0]
+    back = PcdReport.decode(report.encode(codec, cloud), cloud)
+    assert same(back, report)
+    if codec != "compact":
+        np.testing.assert_array_equal(back.new_points, report.new_points)
+        return
+    grid = cloud.grid_frame
+    cells = [np.unique(cells_of(r.new_points.astype(float), grid), axis=0) for r in (back, report)]
+    np.testing.assert_array_equal(*cells)
+    order = [np.lexsort(np.round(r.new_points, 1).T) for r in (back, report)]
+    assert len(order[0]) == len(order[1])
+    distance = np.linalg.norm(back.new_points[:, None] - report.new_points[None, :2000], axis=2).min(axis=0)
+    assert distance.max() < 0.006
+
+
+def test_bytes_are_what_they_are_said_to_be(cloud, reports):
+    r = reports[0]
+    size = {codec: len(r.encode(codec, cloud)) for codec in CODECS}
+    assert size["points"] - size["indexed"] == 8 * len(r.deleted_index)
+    bare = PcdReport(r.new_points[:0], r.deleted_index[:0], r.observed, r.map_size)
+    assert size["points"] - len(bare.encode()) == 12 * (len(r.new_points) + len(r.deleted_index))
+    assert size["compact"] < size["indexed"] / 2
+
+
+@pytest.mark.parametrize("codec", CODECS)
+def test_an_empty_report_comes_back(codec, cloud):
+    nothing = np.empty(0, np.int32)
+    empty = PcdReport(np.empty((0, 3), np.float32), nothing, nothing, len(cloud))
+    assert same(PcdReport.decode(empty.encode(codec, cloud), cloud), empty)
+
+
+@pytest.mark.parametrize("codec", CODECS)
+def test_every_truncation_is_refused(codec, cloud, reports):
+    data = reports[0].encode(codec, cloud)
+    for end in np.linspace(0, len(data) - 1, 60).astype(int):
+        with pytest.raises(PcdCodecError):
+            PcdReport.decode(data[:end], cloud)
+
+
+@pytest.fixture(scope="module")
+def encoded(cloud, reports):
+    """A tenth of a report in each codec."""
+    r = reports[1]
+    few = PcdReport(r.new_points[::10], r.deleted_index[::10], r.observed[::10], r.map_size)
+    return {codec: few.encode(codec, cloud) for codec in CODECS}
+
+
+@settings(max_examples=60, deadline=None)
+@given(st.data())
+def test_damaged_bytes_are_refused_or_read_as_a_valid_report(cloud, encoded, data):
+    whole = bytearray(encoded[data.draw(st.sampled_from(CODECS))])
+    whole[data.draw(st.integers(0, min(200, len(whole) - 1)))] ^= data.draw(st.integers(1, 255))
+    try:
+        PcdReport.decode(bytes(whole), cloud)
+    except PcdCodecError:
+        return
+
+
+def test_what_unpacks_to_more_than_it_says_is_not_unpacked(cloud):
+    nothing = np.empty(0, np.int32)
+    data = PcdReport(np.empty((0, 3), np.float32), nothing, np.arange(4, dtype=np.int32), len(cloud)).encode()
+    bomb = zstandard.ZstdCompressor(level=1).compress(bytes(10_000_000))
+    head = bytearray(data[: len(data) - len(zstandard.ZstdCompressor(level=12).compress(bytes(16)))])
+    with pytest.raises(PcdCodecError):
+        PcdReport.decode(bytes(head) + bomb, cloud)
+
+
+def test_a_report_about_another_map_is_refused(cloud, reports):
+    other = PcdMap(cloud.points_m[:-1], cloud.frame)
+    with pytest.raises(PcdCodecError, match=str(len(other))):
+        PcdReport.decode(reports[0].encode(), other)
+    with pytest.raises(PcdError, match="needs the map"):
+        reports[0].encode("points", other)
+    with pytest.raises(PcdError, match="unknown codec"):
+        reports[0].encode("zip")  # type: ignore[arg-type]
+
+
+def test_numbers_out_of_order_are_refused(cloud):
+    empty, nothing = np.empty((0, 3), np.float32), np.empty(0, np.int32)
+    with pytest.raises(PcdError, match="increase"):
+        PcdReport(empty, np.array([3, 3], np.int32), nothing, 10)
+    with pytest.raises(PcdError, match="increase"):
+        PcdReport(empty, np.array([10], np.int32), nothing, 10)
