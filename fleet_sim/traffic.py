@@ -23,7 +23,7 @@ from fleet_sim.world import World
 
 FloatArray = NDArray[np.float64]
 
-MAX_PER_100_M: Final = 20.0
+MAX_PER_100_M: Final = 10.0
 _BEYOND_M: Final = 55.0
 """Cars come and go so far beyond the ends of the stretch that is driven; the ground reaches 5 m farther."""
 _BEHIND_M: Final = 150.0

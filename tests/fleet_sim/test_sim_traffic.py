@@ -233,7 +233,7 @@ def test_a_car_before_the_ego_vehicle_goes_on_when_it_comes() -> None:
 
 @pytest.mark.parametrize(
     "values",
-    [{"cars_per_100m": -1.0}, {"pedestrians_per_100m": 21.0}, {"cars_per_100m": np.nan}, {"stopping_share": 2.0}],
+    [{"cars_per_100m": -1.0}, {"pedestrians_per_100m": 11.0}, {"cars_per_100m": np.nan}, {"stopping_share": 2.0}],
 )
 def test_impossible_traffic_is_refused(values: dict[str, float]) -> None:
     with pytest.raises(DriveSimError, match=next(iter(values))):
