@@ -23,6 +23,8 @@ FAR_CM = 32767
 GROUND_BIT = 32768
 BINS = 180
 """Of azimuth, for the place of the moving sensor."""
+REACH_CELLS = 5
+"""How far the ground is carried on where something stands on it."""
 GROUND, LOW, OUTSIDE = -1, -2, -3
 """What a point is that belongs to no voxel; low points lie between ground and objects."""
 _LIMIT = 1 << 20
@@ -82,13 +84,17 @@ def _turn(y: float, x: float) -> float:
 
 
 @kernel
-def lowest_heights(points: F32, grid: Grid) -> F32:
-    """(nx, ny) height of the second lowest point of each cell (the lowest is sometimes an echo), inf without two."""
+def lowest_heights(points: F32, grid: Grid, near_m: float) -> F32:
+    """(nx, ny) height of the second lowest point of each cell (the lowest is sometimes an echo), inf without two.
+
+    Points nearer than `near_m` to the centre are left out: no ray reaches the ground there.
+    """
     lowest = np.full((grid.nx, grid.ny), np.float32(np.inf))
     second = np.full((grid.nx, grid.ny), np.float32(np.inf))
     for n in range(len(points)):
         i, j = math.floor((points[n, 0] - grid.x0) / grid.cell_m), math.floor((points[n, 1] - grid.y0) / grid.cell_m)
-        if 0 <= i < grid.nx and 0 <= j < grid.ny:
+        far_enough = points[n, 0] ** 2 + points[n, 1] ** 2 >= near_m * near_m
+        if 0 <= i < grid.nx and 0 <= j < grid.ny and far_enough:
             z = points[n, 2]
             if z < lowest[i, j]:
                 second[i, j] = lowest[i, j]
@@ -121,50 +127,37 @@ def remember_ground(memory: F32, now: F32, step_m: float) -> None:
 
 @kernel
 def ground_heights(memory: F32, grid: Grid, slope: float, road: F64, road_slope: float) -> F32:
-    """(nx, ny) height of the ground everywhere: an envelope below what is remembered that rises by `slope`.
+    """(nx, ny) height of the ground everywhere: no higher than what is remembered within `REACH_CELLS` and `slope`.
 
     `road` (6,): a point of the road under the vehicle and its normal; the ground lies no higher than this plane and
-    `road_slope` times the distance, which matters where the sensor sees no ground.
+    `road_slope` times the distance, and not lower than `slope` times the distance below (echoes do).
     """
+    plane, distance = np.empty((grid.nx, grid.ny), np.float32), np.empty((grid.nx, grid.ny), np.float32)
     z = np.empty((grid.nx, grid.ny), np.float32)
     for i in range(grid.nx):
         for j in range(grid.ny):
             dx, dy = grid.x0 + (i + 0.5) * grid.cell_m - road[0], grid.y0 + (j + 0.5) * grid.cell_m - road[1]
-            plane = road[2] - (road[3] * dx + road[4] * dy) / road[5]
-            z[i, j] = min(memory[i, j], plane + road_slope * math.sqrt(dx * dx + dy * dy))
-    _lower_envelope(z, np.float32(slope * grid.cell_m))
-    return z
+            distance[i, j] = math.sqrt(dx * dx + dy * dy)
+            plane[i, j] = road[2] - (road[3] * dx + road[4] * dy) / road[5]
+            low = plane[i, j] - np.float32(slope) * distance[i, j] - np.float32(0.3)
+            z[i, j] = memory[i, j] if memory[i, j] > low else np.inf
+    for _ in range(REACH_CELLS):
+        z = _spread_down(z, np.float32(slope * grid.cell_m))
+    return np.minimum(z, plane + np.float32(road_slope) * distance)
 
 
 @kernel
-def _lower_envelope(z: F32, rise: np.float32) -> None:  # noqa: C901  (the eight neighbours, written out)
-    """z(c) <= z(c') + slope * distance for all cells: two sweeps of a chamfer distance."""
+def _spread_down(z: F32, rise: np.float32) -> F32:
+    """Each cell no higher than its eight neighbours and what the ground may rise between."""
     nx, ny = z.shape
-    corner = np.float32(rise * math.sqrt(2.0))
-    for i in range(nx):
-        for j in range(ny):
-            best = z[i, j]
-            if i > 0:
-                best = min(best, z[i - 1, j] + rise)
-                if j > 0:
-                    best = min(best, z[i - 1, j - 1] + corner)
-                if j < ny - 1:
-                    best = min(best, z[i - 1, j + 1] + corner)
-            if j > 0:
-                best = min(best, z[i, j - 1] + rise)
-            z[i, j] = best
-    for i in range(nx - 1, -1, -1):
-        for j in range(ny - 1, -1, -1):
-            best = z[i, j]
-            if i < nx - 1:
-                best = min(best, z[i + 1, j] + rise)
-                if j > 0:
-                    best = min(best, z[i + 1, j - 1] + corner)
-                if j < ny - 1:
-                    best = min(best, z[i + 1, j + 1] + corner)
-            if j < ny - 1:
-                best = min(best, z[i, j + 1] + rise)
-            z[i, j] = best
+    corner = np.float32(1.41421356) * rise
+    result = z.copy()
+    for i in range(1, nx - 1):
+        for j in range(1, ny - 1):
+            side = min(z[i - 1, j], z[i + 1, j], z[i, j - 1], z[i, j + 1]) + rise
+            diagonal = min(z[i - 1, j - 1], z[i + 1, j - 1], z[i - 1, j + 1], z[i + 1, j + 1]) + corner
+            result[i, j] = min(z[i, j], side, diagonal)
+    return result
 
 
 # --- voxels ---------------------------------------------------------------------------------------------------------

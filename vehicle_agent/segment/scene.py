@@ -28,6 +28,7 @@ I64 = NDArray[np.int64]
 
 GAP_SHARE = 0.8  # of layers that are at most so far apart
 MOST_REACH = 8  # voxels
+VISIBLE = 0.8  # of the distance at which the lowest ray meets a level road
 STEP_M = 0.15  # what rises more from one scan to the next is not the ground
 SPREAD_M = 0.5  # farther apart than this within two degrees: start and end of a sweep meet there
 
@@ -96,13 +97,18 @@ class GroundMap:
         self._memory = np.full((2 * self._half, 2 * self._half), np.inf, np.float32)
         self._corner = np.zeros(2, np.int64)
 
-    def around(self, points: F32, centre_m: F64, T_map_vehicle: F64) -> tuple[F32, Grid]:
-        """Heights of the ground relative to `centre_m`, and their grid, with points (N, 3) relative to it just seen."""
+    def around(self, points: F32, centre_m: F64, T_map_vehicle: F64, tan_low: float) -> tuple[F32, Grid]:
+        """Heights of the ground relative to `centre_m`, and their grid, with points (N, 3) relative to it just seen.
+
+        `tan_low`: tangent of the lowest elevation, which tells from where on the sensor sees the ground.
+        """
         self._move(np.floor(centre_m[:2] / self._cell_m).astype(np.int64) - self._half)
         x0, y0 = self._corner * self._cell_m - centre_m[:2]
         grid = Grid(float(x0), float(y0), self._cell_m, *self._memory.shape)
         height = np.float32(centre_m[2])
-        remember_ground(self._memory, lowest_heights(points, grid) + height, STEP_M)
+        mount_m = float(T_map_vehicle[:3, 2] @ (centre_m - T_map_vehicle[:3, 3]))
+        near_m = VISIBLE * max(mount_m, 0.0) / max(-tan_low, 1e-3)
+        remember_ground(self._memory, lowest_heights(points, grid, near_m) + height, STEP_M)
         road = np.concatenate([T_map_vehicle[:3, 3] - centre_m, T_map_vehicle[:3, 2]])
         return ground_heights(self._memory - height, grid, self._slope, road, self._road_slope), grid
 

@@ -55,7 +55,7 @@ class MotionSegmenter:
         self._held: deque[_Held] = deque()
         self._images: deque[RangeImage] = deque()
         self._ground = GroundMap(self.parameters)
-        self._gap_tan = 0.0
+        self._gap_tan, self._tan_low = 0.0, -np.inf
 
     def push(self, scan: RefinedScan) -> list[SegmentedScan]:
         """Take a scan; give those that no later scan will say anything about any more, oldest first."""
@@ -77,7 +77,7 @@ class MotionSegmenter:
         origins = (scan.origins_map_m - centre).astype(np.float32)
         objects = None
         if n and scan.estimate.health == "good":
-            ground = self._ground.around(points, centre, scan.estimate.T_map_vehicle)
+            ground = self._ground.around(points, centre, scan.estimate.T_map_vehicle, self._tan_low)
             objects = find_all_objects(points, origins, ground, self._gap_tan, p)
             self._hear_the_past(scan.t_ns, objects, centre)
             if not self._images or scan.t_ns - self._images[-1].t_ns >= p.every_s * _S - _S // 50:
@@ -85,7 +85,7 @@ class MotionSegmenter:
                 image = image_of(scan.t_ns, centre, R, points, origins, objects.voxel_of, p)
                 self._tell_the_held(image)
                 self._images.append(image)
-                self._gap_tan = image.gap_tan
+                self._gap_tan, self._tan_low = image.gap_tan, image.optics.tan_low
                 self._judge = judge_of(p, self._gap_tan)
         step_m = max(float(np.abs(origins).max(initial=0.0)) / 32767, 1e-4)
         self._held.append(
