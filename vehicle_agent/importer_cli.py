@@ -1,5 +1,7 @@
 """`gnd import`: a recording into a drive."""
 
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 import click
@@ -26,31 +28,28 @@ def import_drives(
     """Turn a recording into a drive (MCAP): FORMAT is kitti, radiate, pcd, mcap (ROS 2 PointCloud2, Foxglove clouds) or
     auto, FOLDER holds the recording (or is the .mcap file).
     """
-    with _bars() as bars:
+    with step_bars() as progress:
         imported = import_recording(
-            kind, folder, out, scans=scans, anchor=_anchor(anchor), vehicle=vehicle, topic=topic, progress=_Shown(bars)
+            kind, folder, out, scans=scans, anchor=_anchor(anchor), vehicle=vehicle, topic=topic, progress=progress
         )
     click.echo(f"{out}: {imported.scans} scans")
     for sentence in imported.skipped:
         click.echo(f"{out}: {sentence}")
 
 
-class _Shown:
-    """One bar a step."""
-
-    def __init__(self, bars: Progress) -> None:
-        self._bars = bars
-        self._tasks: dict[str, TaskID] = {}
-
-    def __call__(self, step: str, done: int, total: int) -> None:
-        if step not in self._tasks:
-            self._tasks[step] = self._bars.add_task(step, total=total)
-        self._bars.update(self._tasks[step], completed=done, total=total)
-
-
-def _bars() -> Progress:
+@contextmanager
+def step_bars() -> Iterator[Callable[[str, int, int], None]]:
+    """Progress on standard error, one bar a step: to be called with its name, how much is done, and of how much."""
     columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn())
-    return Progress(*columns, console=Console(stderr=True))
+    tasks: dict[str, TaskID] = {}
+    with Progress(*columns, console=Console(stderr=True)) as bars:
+
+        def show(step: str, done: int, total: int) -> None:
+            if step not in tasks:
+                tasks[step] = bars.add_task(step, total=total)
+            bars.update(tasks[step], completed=done, total=total)
+
+        yield show
 
 
 def _anchor(text: str | None) -> Anchor | None:

@@ -18,6 +18,7 @@ from vehicle_agent.segment.parameters import SegmentParameters
 from vehicle_agent.segment.segmenter import SegmentedScan
 
 I64 = NDArray[np.int64]
+SAMPLED = 7
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -39,7 +40,11 @@ class Untouched:
     mapped: Cells
     driven: Cells
     moving: Cells
-    """Points of the driven half that were marked as moving, whether or not segmentation was on for detection."""
+    """Points of the driven half that were marked as moving."""
+    sample_m: NDArray[np.float32]
+    """(N, 3) every `SAMPLED`th point of the driven half, for pictures."""
+    sample_moving: NDArray[np.bool_]
+    """(N,) which of them were marked."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -95,21 +100,32 @@ def _untouched(scene: Scene, mapping: list[Scan], driving: list[Scan], method: M
     points = _map_of(scene, mapping, method)
     tiles = points.finish()
     local_map = local_map_of(scene, tiles)
-    driven, moving = VoxelAccumulator(scene.grid_frame), VoxelAccumulator(scene.grid_frame)
+    notes = _Notes(scene)
     scans = segmented(refined_scans(scene, local_map, driving, method.poses), method.segment)
-    found = detect(scene, local_map, _noted(scans, driven, moving), method.detect)
-    return Untouched(found, tiles, Cells.of(points), Cells.of(driven), Cells.of(moving))
+    found = detect(scene, local_map, notes.noted(scans), method.detect)
+    driven, moving = Cells.of(notes.driven), Cells.of(notes.moving)
+    return Untouched(found, tiles, Cells.of(points), driven, moving, *notes.sample())
 
 
-def _noted(
-    scans: Iterable[SegmentedScan], driven: VoxelAccumulator, moving: VoxelAccumulator
-) -> Iterator[SegmentedScan]:
-    """The scans, with all their points noted in one accumulator and the moving ones in another."""
-    for one in scans:
-        near = in_range(one.scan)
-        driven.add(one.scan.points_map_m[near])
-        moving.add(one.scan.points_map_m[near & one.moving])
-        yield one
+class _Notes:
+    """What the driven half consists of, noted while it passes."""
+
+    def __init__(self, scene: Scene) -> None:
+        self.driven, self.moving = VoxelAccumulator(scene.grid_frame), VoxelAccumulator(scene.grid_frame)
+        self._points: list[NDArray[np.float32]] = [np.empty((0, 3), np.float32)]
+        self._marks: list[NDArray[np.bool_]] = [np.empty(0, np.bool_)]
+
+    def noted(self, scans: Iterable[SegmentedScan]) -> Iterator[SegmentedScan]:
+        for one in scans:
+            near, points = in_range(one.scan), one.scan.points_map_m
+            self.driven.add(points[near])
+            self.moving.add(points[near & one.moving])
+            self._points.append(points[near][::SAMPLED].astype(np.float32))
+            self._marks.append(one.moving[near][::SAMPLED])
+            yield one
+
+    def sample(self) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
+        return np.concatenate(self._points), np.concatenate(self._marks)
 
 
 def _inserted(
