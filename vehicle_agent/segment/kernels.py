@@ -23,6 +23,7 @@ FAR_CM = 32767
 GROUND_BIT = 32768
 BINS = 180
 """Of azimuth, for the place of the moving sensor."""
+PIT_M = 0.3
 REACH_CELLS = 5
 """How far the ground is carried on where something stands on it."""
 GROUND, LOW, OUTSIDE = -1, -2, -3
@@ -126,6 +127,18 @@ def remember_ground(memory: F32, now: F32, step_m: float) -> None:
 
 
 @kernel
+def _is_pit(memory: F32, i: int, j: int) -> bool:
+    """Whether three quarters of the neighbours that are known lie much higher: an echo below the ground."""
+    known, higher = 0, 0
+    for near in range(9):
+        a, b = i + near // 3 - 1, j + near % 3 - 1
+        if near != 4 and 0 <= a < memory.shape[0] and 0 <= b < memory.shape[1] and memory[a, b] < np.inf:
+            known += 1
+            higher += memory[a, b] > memory[i, j] + np.float32(PIT_M)
+    return known >= 3 and 4 * higher >= 3 * known
+
+
+@kernel
 def ground_heights(memory: F32, grid: Grid, slope: float, road: F64, road_slope: float) -> F32:
     """(nx, ny) height of the ground everywhere: no higher than what is remembered within `REACH_CELLS` and `slope`.
 
@@ -140,7 +153,7 @@ def ground_heights(memory: F32, grid: Grid, slope: float, road: F64, road_slope:
             distance[i, j] = math.sqrt(dx * dx + dy * dy)
             plane[i, j] = road[2] - (road[3] * dx + road[4] * dy) / road[5]
             low = plane[i, j] - np.float32(slope) * distance[i, j] - np.float32(0.3)
-            z[i, j] = memory[i, j] if memory[i, j] > low else np.inf
+            z[i, j] = memory[i, j] if memory[i, j] > low and not _is_pit(memory, i, j) else np.inf
     for _ in range(REACH_CELLS):
         z = _spread_down(z, np.float32(slope * grid.cell_m))
     return np.minimum(z, plane + np.float32(road_slope) * distance)
@@ -341,9 +354,18 @@ def _look(
 
 @kernel
 def vote(  # noqa: C901  (one loop over the window)
-    points: F32, offset_m: F64, image: U16, places: F32, R: F64, optics: Optics, judge: Judge, passed: U8, met: U8
+    points: F32,
+    offset_m: F64,
+    image: U16,
+    places: F32,
+    R: F64,
+    optics: Optics,
+    judge: Judge,
+    weight: int,
+    passed: U8,
+    met: U8,
 ) -> None:
-    """Let one scan vote on points of another: `passed` or `met` of a point goes up by one, or neither.
+    """Let one scan vote on points of another: `passed` or `met` of a point goes up, or neither.
 
     Args:
         points: (V, 3) float32 relative to their own scan's centre.
@@ -353,8 +375,9 @@ def vote(  # noqa: C901  (one loop over the window)
         R: (3, 3) map axes to its sensor's.
         optics: its scale.
         judge: distances that decide.
-        passed: (V,) uint8, changed: votes for "moving".
-        met: (V,) uint8, changed: votes for "static".
+        weight: how much a return at the same place says.
+        passed: (V,) uint8, changed: number of votes for "moving".
+        met: (V,) uint8, changed: weights of the votes for "static".
     """
     column_rad = 2.0 * math.pi / optics.columns
     for n in range(len(points)):
@@ -380,12 +403,12 @@ def vote(  # noqa: C901  (one loop over the window)
         if 0 <= row < optics.rows:
             seen = int(image[column, row])
             if seen < GROUND_BIT and near_cm <= seen <= far_cm:  # most often: it stands there
-                met[n] = min(255, met[n] + 1)
+                met[n] = min(255, met[n] + weight)
                 continue
         above, nearer, same = _look(image, column, across, row, row + up, near_cm, far_cm)
         below, nearer_below, same_below = _look(image, column, across, row - up, row - 1, near_cm, far_cm)
         if same or same_below:
-            met[n] = min(255, met[n] + 1)
+            met[n] = min(255, met[n] + weight)
             continue
         if nearer or nearer_below:
             continue

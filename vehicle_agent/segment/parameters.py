@@ -15,12 +15,14 @@ class SegmentParameters:
 
     enabled: bool = True
     """Without it every point is taken for static."""
-    past_s: float = 2.0
+    past_s: float = 4.0
     """Scans this much older are compared."""
     future_s: float = 1.2
     """Scans this much newer are compared: a scan waits this long. What drives away ahead shows only there."""
     every_s: float = 0.3
     """Time between the scans that are kept for comparison."""
+    settled_s: float = 1.0
+    """A return at the same place counts the less the nearer in time below this: what moves still covers its place."""
     apart_s: float = 0.15
     """Scans nearer in time show too little motion."""
     range_min_m: float = 2.0
@@ -41,7 +43,7 @@ class SegmentParameters:
     """… plus this share of the range."""
     mass_moving: float = 0.5
     """Mass that one passing ray gives to "moving"."""
-    mass_static: float = 0.4
+    mass_static: float = 0.5
     """Mass that one return at the same place gives to "static"."""
     ground_cell_m: float = 1.0
     ground_slope: float = 0.15

@@ -7,6 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gnd_map.arrays import F32, F64, I32
+from vehicle_agent.segment.evidence import WEIGHTS
 from vehicle_agent.segment.kernels import (
     Grid,
     Judge,
@@ -28,6 +29,7 @@ I64 = NDArray[np.int64]
 
 GAP_SHARE = 0.8  # of layers that are at most so far apart
 MOST_REACH = 8  # voxels
+NS = 1_000_000_000
 VISIBLE = 0.8  # of the distance at which the lowest ray meets a level road
 STEP_M = 0.15  # what rises more from one scan to the next is not the ground
 SPREAD_M = 0.5  # farther apart than this within two degrees: start and end of a sweep meet there
@@ -53,10 +55,16 @@ class RangeImage:
         """Usual distance of layers, as tangent."""
         return layer_gap(self.ranges, GAP_SHARE) * self.optics.tan_step
 
-    def vote(self, points: F32, centre_m: F64, judge: Judge, passed: U8, met: U8) -> None:
-        """Vote on points (V, 3) relative to `centre_m`; the counts go up."""
+    def vote(self, t_ns: int, objects: "Objects", centre_m: F64, judge: Judge, p: SegmentParameters) -> None:
+        """Vote on the objects of the scan at `t_ns`, whose points are relative to `centre_m`.
+
+        What moves may still cover its own place for a while: a return there says the more the longer after.
+        """
+        share = min(1.0, abs(t_ns - self.t_ns) / (p.settled_s * NS))
+        weight = max(1, round(share * WEIGHTS))
         vote(
-            points, centre_m - self.centre_m, self.ranges, self.places, self.R, self.optics, judge, passed, met
+            objects.points, centre_m - self.centre_m, self.ranges, self.places, self.R, self.optics, judge, weight,
+            objects.passed, objects.met,
         )  # fmt: skip
 
 

@@ -18,6 +18,7 @@ I16 = NDArray[np.int16]
 Mask = NDArray[np.bool_]
 
 _S = 1_000_000_000
+OLD_STEP = 3
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -94,17 +95,26 @@ class MotionSegmenter:
 
     def _hear_the_past(self, t_ns: int, objects: Objects, centre_m: F64) -> None:
         p = self.parameters
-        while self._images and t_ns - self._images[0].t_ns > p.past_s * _S:
-            self._images.popleft()
+        self._thin_out(t_ns)
         for image in self._images:
             if t_ns - image.t_ns >= p.apart_s * _S:
-                image.vote(objects.points, centre_m, self._judge, objects.passed, objects.met)
+                image.vote(t_ns, objects, centre_m, self._judge, p)
+
+    def _thin_out(self, t_ns: int) -> None:
+        """Forget images that are too old; of the older half keep one of `OLD_STEP` times `every_s`."""
+        p, kept = self.parameters, deque[RangeImage]()
+        for image in self._images:
+            age_ns, last_ns = t_ns - image.t_ns, kept[-1].t_ns if kept else -(2**62)
+            young = age_ns <= p.future_s * _S
+            if age_ns <= p.past_s * _S and (young or image.t_ns - last_ns >= OLD_STEP * p.every_s * _S - _S // 50):
+                kept.append(image)
+        self._images = kept
 
     def _tell_the_held(self, image: RangeImage) -> None:
         p = self.parameters
         for held in self._held:
             if p.apart_s * _S <= image.t_ns - held.t_ns <= p.future_s * _S and held.objects is not None:
-                image.vote(held.objects.points, held.centre_m, self._judge, held.objects.passed, held.objects.met)
+                image.vote(held.t_ns, held.objects, held.centre_m, self._judge, p)
 
     def _released(self, until_ns: int | None) -> Iterator[SegmentedScan]:
         while self._held and (until_ns is None or self._held[0].t_ns <= until_ns):
