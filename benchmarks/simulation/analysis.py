@@ -1,6 +1,7 @@
 """The analysis of errors of a finished run, from its folder."""
 
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -14,7 +15,9 @@ from fleet_sim.truth import Level, read_truth
 from gnd_map.config import from_mapping
 
 
-def analyse(out: Path, stages: Sequence[str], levels: Sequence[Level], changes: Sequence[str] = ()) -> dict[str, Any]:
+def analyse(
+    out: Path, stages: Sequence[str], levels: Sequence[Level], changes: Sequence[str] = (), exact: Path | None = None
+) -> dict[str, Any]:
     """Return the losses by stage and level, means over the run's worlds (and over the vehicles of a sensor).
 
     Args:
@@ -22,17 +25,34 @@ def analyse(out: Path, stages: Sequence[str], levels: Sequence[Level], changes: 
         stages: "single", "single.<sensor>" or a number of vehicles; by default all that the run reports.
         levels: of the truth.
         changes: replaced parameters of the merge.
+        exact: folder of the same run with true poses, which tells what the poses cost.
 
     Raises:
         FolderError: no finished run is in the folder.
         OptionError: no such stage.
     """
     mark = RunFolder(out).finished()
-    method = from_mapping(MethodParameters, mark["options"]["method"]).with_changes(changes)
-    cases = [_case(out, world, mark["options"]["base"], method) for world in mark["worlds"]]
+    cases = _cases(out, mark, changes)
+    if exact is not None:
+        cases = _beside(cases, mark, exact, changes)
     sensors = sorted({vehicle.sensor for case in cases for vehicle in case.vehicles})
     wanted = list(stages) or [*(f"single.{sensor}" for sensor in sensors), *map(str, mark["options"]["vehicles"])]
     return {stage: {level: plain(_losses(cases, stage, level, sensors)) for level in levels} for stage in wanted}
+
+
+def _cases(out: Path, mark: dict[str, Any], changes: Sequence[str]) -> list[Case]:
+    method = from_mapping(MethodParameters, mark["options"]["method"]).with_changes(changes)
+    return [_case(out, world, mark["options"]["base"], method) for world in mark["worlds"]]
+
+
+def _beside(cases: Sequence[Case], mark: dict[str, Any], exact: Path, changes: Sequence[str]) -> list[Case]:
+    """The cases with those of the run with true poses beside them."""
+    other = RunFolder(exact).finished()
+    ignored = ("poses", "method", "pcd")
+    differ = [k for k, v in mark["options"].items() if k not in ignored and other["options"].get(k) != v]
+    if differ or other["options"]["poses"] != "true":
+        raise OptionError(f"{exact} is not the same run with --poses true: {', '.join(differ) or 'poses'} differ")
+    return [replace(a, exact=b) for a, b in zip(cases, _cases(exact, other, changes), strict=True)]
 
 
 def _case(out: Path, world: dict[str, Any], base: str, method: MethodParameters) -> Case:

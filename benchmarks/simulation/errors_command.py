@@ -18,14 +18,21 @@ PATH = click.Path(path_type=Path)
 @click.option("--level", "levels", multiple=True, type=click.Choice(get_args(Level)), help="[default: all three]")
 @click.option("--causes", default=4, show_default=True, help="Causes shown of each kind of error.")
 @click.option("--set", "changes", multiple=True, metavar="merge.FIELD=VALUE", help="Merge with other parameters.")
+@click.option("--true-poses", "exact", type=PATH, help="Folder of the same run with --poses true: what poses cost.")
 @click.option("--json", "as_json", is_flag=True, help="Print one JSON object.")
 def errors(
-    out: Path, stages: tuple[str, ...], levels: tuple[Level, ...], causes: int, changes: tuple[str, ...], as_json: bool
+    out: Path,
+    stages: tuple[str, ...],
+    levels: tuple[Level, ...],
+    causes: int,
+    changes: tuple[str, ...],
+    exact: Path | None,
+    as_json: bool,
 ) -> None:
     """Show which voxels of the finished run in OUT cost F1, by true class, predicted class and cause."""
     from benchmarks.simulation.analysis import analyse
 
-    found = analyse(out, stages, levels or LEVELS, changes)
+    found = analyse(out, stages, levels or LEVELS, changes, exact)
     if as_json:
         click.echo(json.dumps(found))
         return

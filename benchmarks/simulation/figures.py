@@ -14,6 +14,7 @@ from benchmarks.simulation.cloud import map_of_one, merged_map
 from benchmarks.simulation.errors import FolderError
 from benchmarks.simulation.masses import WATCHED, Watch, choose, most_telling
 from benchmarks.simulation.run import Outcome, WorldOutcome
+from benchmarks.simulation.tables import target_single
 from benchmarks.simulation.worlds import read_world_base
 from fleet_sim.ellipsoids import ellipsoids_of_maps, ellipsoids_of_truth
 from fleet_sim.pictures import View, draw_map
@@ -72,14 +73,15 @@ def draw_curve(summary: Mapping[str, Any], path: Path) -> Path:
     figure = Figure(figsize=(9.0, 5.6), dpi=150, facecolor="white")
     axes = figure.add_axes((0.085, 0.11, 0.885, 0.76))
     numbers = sorted(int(n) for n in summary["fleet"])
-    for level in LEVELS:
+    for level in reversed(LEVELS):
         main = level == "scored"
         values = [summary["fleet"][str(n)]["f1"][level] for n in numbers]
         label = {"scored": "fleet, scored voxels", "all": "fleet, all voxels"}.get(level, "fleet, marginal excluded")
         axes.plot(numbers, values, _LEVEL_STYLE[level], color="#2e8b57", linewidth=2.4 if main else 1.3, label=label)
-    single = [stage["f1"]["scored"] for stage in summary["single"].values()]
+    _spread(axes, summary, numbers)
+    single, of = _one_drive(summary)
     _line(axes, summary["stale"]["f1"]["scored"], "#2f6fb5", "stale map")
-    _line(axes, float(np.mean(single)), "#e0a020", "one drive alone (mean)")
+    _line(axes, single, "#e0a020", f"one drive alone, {of}")
     _baseline(axes, summary)
     for n, value in (reference.FLEET | reference.FLEET_READ_OFF).items():
         axes.plot([n], [value], "x", color=_INK, markersize=7, zorder=5)
@@ -95,6 +97,22 @@ def draw_curve(summary: Mapping[str, Any], path: Path) -> Path:
 
 def _line(axes: Axes, value: float, colour: str, label: str) -> None:
     axes.axhline(value, color=colour, linewidth=1.8, label=f"{label}: {value:.2f}")
+
+
+def _one_drive(summary: Mapping[str, Any]) -> tuple[float, str]:
+    """Mean F1 of a drive alone and whose it is: of the 16- and 32-layer sensors, of all where none of them drove."""
+    target = target_single(summary)
+    if target is not None:
+        return target["scored"], "16/32 layers"
+    return float(np.mean([stage["f1"]["scored"] for stage in summary["single"].values()])), "all sensors"
+
+
+def _spread(axes: Axes, summary: Mapping[str, Any], numbers: list[int]) -> None:
+    """Shade what lies between the best and the worst of several worlds."""
+    worlds = list(summary.get("by_seed", {}).values())
+    if worlds:
+        each = np.array([[world["fleet"][str(n)]["f1"]["scored"] for n in numbers] for world in worlds])
+        axes.fill_between(numbers, each.min(axis=0), each.max(axis=0), color="#2e8b57", alpha=0.15, linewidth=0)
 
 
 def _baseline(axes: Axes, summary: Mapping[str, Any]) -> None:

@@ -21,6 +21,7 @@ from gnd_map.classes import ChangeClass
 BASE_DIFFERS: Final = "the base map differs from the truth's"
 MARGINAL: Final = "marginal in the truth"
 TOO_FAR: Final = "hardly observable"
+POSES: Final = "right with true poses"
 
 
 @dataclass(frozen=True, slots=True)
@@ -49,6 +50,8 @@ class Case:
     base: BaseMap
     vehicles: Sequence[VehicleResult]
     method: MethodParameters
+    exact: "Case | None" = None
+    """The same world and fleet with true poses: what is right there is wrong here because of the poses."""
 
     def in_base(self) -> NDArray[np.bool_]:
         """Return which voxels of the truth hold a Gaussian in the base map, bool (V,)."""
@@ -57,22 +60,31 @@ class Case:
 
 def single_losses(case: Case, vehicle: VehicleResult, level: Level) -> list[Loss]:
     """Return what costs F1 in the map of one vehicle alone."""
-    predicted = classes_of_maps(case.truth, case.base.tiles, map_of_one(case.base, vehicle.reports))
+    predicted = predicted_by(case, [vehicle])
     rows = _wrong(case.truth, predicted, level)
     found = causes(case.truth.change_class[rows], columns_at(vehicle, rows), case.method.detect)
-    return _losses(case, predicted, rows, found, level)
+    same = [v for v in case.exact.vehicles if v.vehicle == vehicle.vehicle] if case.exact else []
+    exact = predicted_by(case.exact, same) if case.exact else None
+    return _losses(case, predicted, rows, found, level, exact)
 
 
 def fleet_losses(case: Case, n: int, level: Level) -> list[Loss]:
     """Return what costs F1 in the merged map of the first n vehicles."""
     vehicles = case.vehicles[:n]
-    bodies = [body for vehicle in vehicles for body in vehicle.reports]
-    predicted = classes_of_maps(case.truth, case.base.tiles, merged_map(case.base, bodies, case.method.merge))
+    predicted = predicted_by(case, vehicles, merge=True)
     rows = _wrong(case.truth, predicted, level)
     true = case.truth.change_class[rows]
     each = np.stack([causes(true, columns_at(vehicle, rows), case.method.detect) for vehicle in vehicles])
     said = np.stack([columns_at(vehicle, rows)["change_class"] for vehicle in vehicles])
-    return _losses(case, predicted, rows, _vote_causes(true, said, each, case.method.merge.xi), level)
+    exact = predicted_by(case.exact, case.exact.vehicles[:n], merge=True) if case.exact else None
+    return _losses(case, predicted, rows, _vote_causes(true, said, each, case.method.merge.xi), level, exact)
+
+
+def predicted_by(case: Case, vehicles: Sequence[VehicleResult], *, merge: bool = False) -> ClassArray:
+    """Return the class, uint8 (V,), of each voxel after the vehicles' reports, merged or of one vehicle alone."""
+    bodies = [body for vehicle in vehicles for body in vehicle.reports]
+    final = merged_map(case.base, bodies, case.method.merge) if merge else map_of_one(case.base, bodies)
+    return classes_of_maps(case.truth, case.base.tiles, final)
 
 
 def _vote_causes(true: NDArray[np.uint8], said: NDArray[np.int32], each: Causes, xi: float) -> Causes:
@@ -101,13 +113,11 @@ def _wrong(truth: Truth, predicted: ClassArray, level: Level) -> I64:
     return np.flatnonzero(truth.mask(level) & (predicted != truth.change_class))
 
 
-def _losses(case: Case, predicted: ClassArray, rows: I64, found: Causes, level: Level) -> list[Loss]:
-    truth, in_base = case.truth, case.in_base()[rows]
-    true = truth.change_class[rows]
-    was_there = np.isin(true, (ChangeClass.NORMAL, ChangeClass.MODIFIED, ChangeClass.DELETED))
-    names = np.where(truth.observable[rows], found, np.char.add(f"{TOO_FAR}; ", found)) if len(rows) else found
-    names = np.where(truth.clear[rows], names, np.char.add(f"{MARGINAL}; ", found)) if len(rows) else names
-    names = np.where(was_there == in_base, names, BASE_DIFFERS) if len(rows) else names
+def _losses(
+    case: Case, predicted: ClassArray, rows: I64, found: Causes, level: Level, exact: ClassArray | None
+) -> list[Loss]:
+    truth, true = case.truth, case.truth.change_class[rows]
+    names = _with_circumstances(case, rows, found, exact)
     mask = truth.mask(level)
     n = len(CLASSES)
     confusion = np.bincount(truth.change_class[mask].astype(np.int64) * n + predicted[mask], minlength=n * n)
@@ -119,6 +129,19 @@ def _losses(case: Case, predicted: ClassArray, rows: I64, found: Causes, level: 
         name = [CLASSES[i].name.lower() for i in (t, p)]
         groups.append(Loss(name[0], name[1], float(len(of_group)), _gain(confusion, t, p, level), by_cause))
     return sorted(groups, key=lambda loss: -loss.f1)
+
+
+def _with_circumstances(case: Case, rows: I64, found: Causes, exact: ClassArray | None) -> Causes:
+    """Causes with what the truth, the base map and a run with true poses say about the voxels."""
+    if not len(rows):
+        return found
+    truth, true = case.truth, case.truth.change_class[rows]
+    was_there = np.isin(true, (ChangeClass.NORMAL, ChangeClass.MODIFIED, ChangeClass.DELETED))
+    if exact is not None:
+        found = np.where(exact[rows] == true, np.char.add(f"{POSES}; ", found), found)
+    names = np.where(truth.observable[rows], found, np.char.add(f"{TOO_FAR}; ", found))
+    names = np.where(truth.clear[rows], names, np.char.add(f"{MARGINAL}; ", found))
+    return np.where(was_there == case.in_base()[rows], names, BASE_DIFFERS)
 
 
 def _gain(confusion: NDArray[np.int64], t: int, p: int, level: Level) -> float:

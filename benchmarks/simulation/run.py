@@ -15,7 +15,7 @@ from benchmarks.simulation.result import VehicleResult, read_result
 from benchmarks.simulation.scoring import Scored, VehicleFile, score_fleet, score_pcd, score_single
 from benchmarks.simulation.tasks import shots_a_second, vehicle_tasks
 from benchmarks.simulation.vehicle import VehicleTask, run_vehicle
-from benchmarks.simulation.worlds import WorldFiles, prepare_world, world_files
+from benchmarks.simulation.worlds import WorldFiles, prepare_cloud, prepare_world, world_files
 from gnd_map.config import to_mapping
 
 _log = logging.getLogger(__name__)
@@ -70,7 +70,10 @@ def reproduce(
     """
     started_s = perf_counter()
     files = {seed: world_files(folder, seed, options) for seed in options.seeds}
-    run_jobs([Job(f"world {s}", prepare_world, (files[s], s, options)) for s in files], processes, progress, "worlds")
+    jobs = [Job(f"world {seed}", prepare_world, (files[seed], seed, options)) for seed in files]
+    if options.pcd:
+        jobs += [Job(f"point cloud {seed}", prepare_cloud, (files[seed], seed, options)) for seed in files]
+    run_jobs(jobs, processes, progress, "worlds")
     worlds_s = perf_counter()
     vehicles = _vehicles(options, files, processes, progress, keep_drives)
     vehicles_s = perf_counter()

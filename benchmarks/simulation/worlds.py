@@ -69,14 +69,13 @@ def prepare_world(files: WorldFiles, seed: int, options: RunOptions) -> None:
     elif not _usable(files, world):
         write_base(driven(world), files.base)
         _key_file(files.base).write_text(_base_key(world), encoding="utf-8")
-    if options.pcd:
-        prepare_cloud(files, world)
 
 
-def prepare_cloud(files: WorldFiles, world: World) -> None:
+def prepare_cloud(files: WorldFiles, seed: int, options: RunOptions) -> None:
     """Make the baseline's map, if it is not there."""
     from benchmarks.simulation.baseline import read_cloud, write_cloud
 
+    world = street(seed, options.street)
     key, key_file = key_of(base=_base_key(world), pcd=sources_sha(PCD)), _key_file(files.cloud)
     try:
         read_cloud(files.cloud)
