@@ -34,6 +34,8 @@ _FLAGS: Final[dict[State, tuple[int, int]]] = {
     "after": (AFTER_KEPT, AFTER_COME),
 }
 _GOLDEN: Final = 0.6180339887498949
+_TIE_M: Final = 1e-9
+"""Changed things are looked for so far behind a kept one: of two surfaces in one place, the first listed counts."""
 _SPARSE_CELL_M: Final = 6.0
 """Cells of the scenes of changed things, of which there are few."""
 
@@ -104,18 +106,18 @@ def shots(world: World, plan: ScanPlan) -> Iterator[Shots]:
     """Yield the rays of every place, in the state before and then in the state after."""
     kept = _part(world, STATES)
     changed: dict[State, _Part] = {state: _part(world, (state,)) for state in STATES}
-    R_map_street = np.ascontiguousarray(np.linalg.inv(world.A_street_map))
+    A_map_street = np.ascontiguousarray(np.linalg.inv(world.A_street_map))
     origins = plan.origins_street(world)
     for place, (origin, start) in enumerate(zip(world.map_of_street(origins), origins, strict=True)):
-        directions, directions_map = _aim(plan.directions_street(place), R_map_street)
-        common = _cast(kept, start, directions, plan.range_m)
+        directions, directions_map = _aim(plan.directions_street(place), A_map_street)
+        common = _cast(kept, start, directions, np.full(len(directions), plan.range_m))
+        reach_m = np.minimum(common[0] + _TIE_M, plan.range_m)
         casts = [
             _nearer(
-                *common, kept.ranks[state], *_cast(part, start, directions, plan.range_m), part.ranks[state],
-                *_FLAGS[state],
+                *common, kept.ranks[state], *_cast(part, start, directions, reach_m), part.ranks[state], *_FLAGS[state]
             )
             for state, part in changed.items()
-        ]  # fmt: skip
+        ]
         for state, (ranges, flags) in enumerate(casts):
             fresh = np.ones(len(ranges), dtype=np.bool_) if state else casts[0][0] != casts[1][0]
             yield Shots(state, origin, _ends(origin, directions_map, ranges, plan.range_m), flags, fresh)
@@ -136,10 +138,10 @@ def _ranks(world: World, state: State, states: tuple[State, ...]) -> IntArray:
     return np.flatnonzero(mine).astype(np.int32)
 
 
-def _cast(part: _Part, origin: FloatArray, directions: FloatArray, range_m: float) -> tuple[FloatArray, IntArray]:
+def _cast(part: _Part, origin: FloatArray, directions: FloatArray, reach_m: FloatArray) -> tuple[FloatArray, IntArray]:
     if part.scene is None:
         return np.full(len(directions), np.inf), np.full(len(directions), -1, dtype=np.int32)
-    return part.scene.cast_street(origin, directions, range_m)
+    return part.scene.cast_fan(origin, directions, reach_m)
 
 
 @kernel

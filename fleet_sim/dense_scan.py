@@ -145,8 +145,8 @@ class _Tally:
         g_origin, g_ends = grid_near(self._grid, shots.origin[None, :])[0], grid_near(self._grid, shots.ends)
         _pass(g_origin, g_ends[::pass_stride], self._window, self._passes[shots.state])
         self._mark(g_ends, shots.flags)
-        self._before.add(shots.ends[(shots.flags & KNOWN_BEFORE) != 0])
-        self._after.add(shots.ends[((shots.flags & STANDS_AFTER) != 0) & shots.fresh])
+        self._before.add_grid(g_ends[(shots.flags & KNOWN_BEFORE) != 0])
+        self._after.add_grid(g_ends[((shots.flags & STANDS_AFTER) != 0) & shots.fresh])
 
     def _mark(self, g_ends: FloatArray, flags: NDArray[np.uint8]) -> None:
         """Set the flags of sub-cells; marking twice does no harm, so a table that was full is made larger first."""

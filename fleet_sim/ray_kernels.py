@@ -214,6 +214,26 @@ def cast_rays(
 
 
 @kernel
+def cast_fan(
+    origin: FloatArray,
+    directions: FloatArray,
+    reach_m: FloatArray,
+    p: FloatArray,
+    starts: IntArray,
+    items: IntArray,
+    tops: FloatArray,
+    grid: Grid,
+) -> tuple[FloatArray, IntArray]:
+    """Cast rays from one origin (3,) along directions (N, 3), each with its own reach (N,): ranges and primitives."""
+    ranges, index = np.empty(len(directions)), np.empty(len(directions), np.int32)
+    for i in range(len(directions)):
+        d = directions[i]
+        ray = Ray(origin[0], origin[1], origin[2], d[0], d[1], d[2])
+        ranges[i], index[i] = cast_ray(ray, reach_m[i], p, starts, items, tops, grid)
+    return ranges, index
+
+
+@kernel
 def shot(pose: FloatArray, following: FloatArray, share: float, d: FloatArray) -> Ray:
     """The ray of a shot along d (3,), lidar frame, that leaves at a share of the way between two poses (3, 4).
 

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fleet_sim.errors import SceneError
-from fleet_sim.ray_kernels import FloatArray, Grid, IntArray, cast_rays
+from fleet_sim.ray_kernels import FloatArray, Grid, IntArray, cast_fan, cast_rays
 from fleet_sim.shapes import Shape, pack
 
 CELL_M: Final = 2.0
@@ -87,8 +87,8 @@ class Scene:
         self.check_inside(start)
         return cast_rays(start, directions @ self.A_street_map.T, range_m, *self.arrays())
 
-    def cast_street(self, origin: FloatArray, directions: FloatArray, range_m: float) -> tuple[FloatArray, IntArray]:
-        """As `cast`, of N rays from one place (3,), everything in the frame of the shapes.
+    def cast_fan(self, origin: FloatArray, directions: FloatArray, reach_m: FloatArray) -> tuple[FloatArray, IntArray]:
+        """As `cast`, of N rays from one place (3,), each with its own reach (N,), all in the frame of the shapes.
 
         Directions float64 (N, 3) are images of the map frame's unit vectors, so that ranges are in metres.
 
@@ -96,8 +96,7 @@ class Scene:
             SceneError: the origin lies outside the grid of the scene.
         """
         self.check_inside(origin[None, :])
-        start = np.ascontiguousarray(np.broadcast_to(origin, directions.shape))
-        return cast_rays(start, directions, range_m, *self.arrays())
+        return cast_fan(origin, directions, reach_m, *self.arrays())
 
     def holds(self, points_street: FloatArray) -> NDArray[np.bool_]:
         """Return which points (N, 3) lie inside the grid, bool (N,): rays may start there."""

@@ -61,7 +61,10 @@ class VoxelAccumulator:
         Raises:
             ShapeError: wrong shape, or a point that is not finite; nothing is taken then.
         """
-        g = grid_near(self.grid_frame, points_3d("points_map_m", points_map_m))
+        self.add_grid(grid_near(self.grid_frame, points_3d("points_map_m", points_map_m)))
+
+    def add_grid(self, g: F64) -> None:
+        """Take points whose grid coordinates (N, 3) are known, C-contiguous float64 and finite."""
         done = 0
         while done < len(g):
             if self._used >= len(self._key):

@@ -16,7 +16,7 @@ from fleet_sim.drives import PERFECT, DriveConfig, simulate_drive
 from fleet_sim.errors import TruthError
 from fleet_sim.raycast import Scene
 from fleet_sim.street import SITES, SiteName, StreetOptions, street
-from fleet_sim.truth import grid_of, grids_of, make_truth, read_truth, write_truth
+from fleet_sim.truth import Truth, grid_of, grids_of, make_truth, read_truth, write_truth
 from fleet_sim.world import STATES, World
 from gnd_map.grid import VoxelGrid
 from gnd_map.tile_id import TILE_RAD, TileId
@@ -148,3 +148,19 @@ def test_tiles_of_a_street_across_the_date_line_are_neighbours() -> None:
     lon_index = {TileId(int(code)).lon_index for code in np.unique(truth.morton)}
     assert {0, 2**20 - 1} <= lon_index
     assert lon_index <= {i % 2**20 for i in range(-5, 6)}
+
+
+def test_the_truth_of_a_long_street_has_every_class_all_along() -> None:
+    world = street(1, StreetOptions(400.0, "wangsimni"))
+    truth = make_truth(world, plan=ScanPlan(spacing_m=16.0, step_rad=radians(0.7)))
+    centre = world.street_of_map(grid_of(truth).centre_map_m(all_g(truth)))
+    for x0 in np.arange(-200.0, 200.0, 100.0):
+        here = (centre[:, 0] >= x0) & (centre[:, 0] < x0 + 100.0)
+        assert np.bincount(truth.change_class[here], minlength=5).min() > 20, f"from {x0:.0f} m"
+
+
+def all_g(truth: Truth) -> np.ndarray:
+    """Grid coordinates (V, 3) of all voxels of a truth in one zone."""
+    grid = grid_of(truth)
+    rows = [(tile, truth.voxel_id[truth.morton == tile.morton]) for tile in grid.tiles]
+    return np.concatenate([grid.grid_of_voxel(tile, voxel_id) for tile, voxel_id in rows])
