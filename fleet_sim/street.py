@@ -53,6 +53,9 @@ class StreetOptions:
     lon_deg: float | None = None
 
     def __post_init__(self) -> None:
+        numbers = [self.length_m, self.lat_deg or 0.0, self.lon_deg or 0.0]
+        if not all(isinstance(number, (int, float)) for number in numbers):
+            raise WorldError(f"length_m, lat_deg and lon_deg are numbers, got {numbers}")
         if not MIN_LENGTH_M <= self.length_m <= MAX_LENGTH_M:
             raise WorldError(f"a street is {MIN_LENGTH_M:.0f} … {MAX_LENGTH_M:.0f} m long, got {self.length_m}")
         if self.site not in SITES:

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from fleet_sim.errors import WorldError
+from fleet_sim.shapes import Ball
 from fleet_sim.street import SITES, SiteName, StreetOptions, street
 from fleet_sim.world import World, to_json
 from gnd_map.tile_id import TileId
@@ -58,6 +59,16 @@ def test_a_street_of_400_m_is_edited_all_along(seed: int) -> None:
         assert sum(abs(x - middle) <= 25.0 for _, x in edits.values()) >= 3, f"around {middle:.0f} m"
 
 
+@pytest.mark.parametrize("seed", range(4))
+def test_nothing_stands_in_the_lanes(seed: int) -> None:
+    for o in street(seed, StreetOptions(length_m=1000.0)).objects:
+        for shape in o.shapes:
+            _, y0, _, y1, top = shape.bounds()
+            low = shape.z_m if isinstance(shape, Ball) else shape.bottom_m
+            in_lane = y0 < 3.2 and y1 > -3.2 and low < 4.0 and top > 0.05
+            assert not in_lane, o.name
+
+
 @pytest.mark.parametrize("length_m", [200.0, 400.0])
 @pytest.mark.parametrize(("site", "districts"), [("border", 2), ("wangsimni", 1), ("north49", 1)])
 def test_a_site_lies_where_it_says(site: SiteName, districts: int, length_m: float) -> None:
@@ -89,6 +100,8 @@ def test_the_site_does_not_change_what_stands_there() -> None:
         ({"length_m": 99.9}, "100 … 1000"),
         ({"length_m": 1e9}, "100 … 1000"),
         ({"length_m": float("nan")}, "nan"),
+        ({"length_m": "400"}, "numbers"),
+        ({"lat_deg": "north", "lon_deg": 1.0}, "numbers"),
         ({"site": "mars"}, "mars"),
         ({"lat_deg": 10.0}, "both"),
         ({"lon_deg": 10.0}, "both"),
