@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from cloud_merger.cluster import Index, dbscan
 from cloud_merger.errors import MergerError
-from cloud_merger.statements import Kind, Mode, Rows, Statements, states_at
+from cloud_merger.statements import EPOCH, Kind, Mode, Rows, Statements, states_at
 from gnd_map.gaussian import Gaussians
 from gnd_map.similarity import pairs_within, similarity
 from gnd_map.tile import TileDelta, apply
@@ -29,7 +29,10 @@ class MergeParameters:
         eps: DBSCAN's neighbourhood on 1 - similarity.
         min_samples: DBSCAN's core weight.
         xi: a cluster must hold more than this share of the voxel's statements (ξ_update).
+        xi_reshaped: the same for a cluster most of which denies the epoch's own Gaussian ("modified"). Lower, because a
+            shape is judged less surely than a presence, and a parked car seldom touches what the map holds.
         d_update: published when the candidate's similarity to the epoch's voxel is smaller than this.
+        d_denied: the same where most of the candidate's statements were compared with that voxel and deny it.
         noise_m: added (squared) to the covariances that the default similarity compares.
     """
 
@@ -37,7 +40,9 @@ class MergeParameters:
     eps: float = 0.5
     min_samples: int = 1
     xi: float = 0.6
+    xi_reshaped: float = 0.5
     d_update: float = 0.5
+    d_denied: float = 0.95
     noise_m: float = 0.05
 
     def __post_init__(self) -> None:
@@ -49,8 +54,12 @@ class MergeParameters:
             )
         if self.min_samples < 1:
             raise MergerError(f"min_samples must be at least 1, got {self.min_samples}")
-        if not 0 <= self.xi < 1 or not 0 <= self.d_update <= 1:
-            raise MergerError(f"xi must lie in [0, 1) and d_update in [0, 1], got {self.xi} and {self.d_update}")
+        for name, share in (("xi", self.xi), ("xi_reshaped", self.xi_reshaped)):
+            if not 0 <= share < 1:
+                raise MergerError(f"{name} must lie in [0, 1), got {share}")
+        for name, least in (("d_update", self.d_update), ("d_denied", self.d_denied)):
+            if not 0 <= least <= 1:
+                raise MergerError(f"{name} must lie in [0, 1], got {least}")
 
 
 @dataclass(frozen=True, slots=True)
@@ -81,10 +90,11 @@ def merge_tile(epoch: Gaussians, statements: Statements, parameters: MergeParame
     if len(rows) == 0:
         return MergedTile(epoch, np.zeros(0, np.int32))
     cluster = _clusters(rows, parameters)
-    winner = _winners(rows["voxel_id"], cluster, parameters.xi)
+    winner = _winners(rows, cluster, parameters)
     rows, cluster = _members(rows, cluster, winner)
     candidate = _representatives(rows, cluster, parameters.mode)
-    decided = _differs(epoch, candidate, parameters) & ~_confirmed(epoch, rows, cluster)
+    decided = _differs(epoch, candidate, _share(rows["denies"], cluster), parameters)
+    decided &= ~_confirmed(rows, cluster)
     return _merged(epoch, candidate[decided], statements, rows[decided[cluster]])
 
 
@@ -99,11 +109,18 @@ def _clusters(rows: Rows, parameters: MergeParameters) -> Index:
         np.bincount(node, minlength=len(first)).astype(np.int64),
         i,
         j,
-        1.0 - _similarities(nodes, i, j, parameters),
+        1.0 - np.where(_denied(nodes[i], nodes[j]), 0.0, _similarities(nodes, i, j, parameters)),
         eps=parameters.eps,
         min_samples=parameters.min_samples,
     )
     return label[node]
+
+
+def _denied(a: Rows, b: Rows) -> NDArray[np.bool_]:
+    """Pairs of which one quotes what the other was compared with and has found changed: the vehicle, which knows its
+    evidence, has decided that they differ; similarity of two Gaussians knows less.
+    """
+    return np.asarray((a["was"] == b["was"]) & (a["was"] > 0) & (a["kind"] != b["kind"]))
 
 
 def _nodes(rows: Rows) -> tuple[Index, Index]:
@@ -111,7 +128,7 @@ def _nodes(rows: Rows) -> tuple[Index, Index]:
 
     Equal statements have similarity 1, so this changes no cluster; it saves most of the pairs.
     """
-    said = np.where(rows["kind"] == Kind.QUOTED, 1 + rows["base"].astype(np.int64), 0)
+    said = np.where(rows["kind"] == Kind.QUOTED, rows["was"], 0)
     measured = rows["kind"] == Kind.MEASURED  # each its own node
     said[measured] = 1 + said.max(initial=0) + np.flatnonzero(measured)
     key = rows["voxel_id"].astype(np.int64) * (1 << 32) + said
@@ -141,18 +158,20 @@ def _similarity(a: Rows, b: Rows, parameters: MergeParameters) -> NDArray[np.flo
     )
 
 
-def _winners(voxel_id: NDArray[np.int32], cluster: Index, xi: float) -> Index:
+def _winners(rows: Rows, cluster: Index, parameters: MergeParameters) -> Index:
     """GND 5.3: of each voxel the cluster with most statements, if it holds more than ξ of all. Sorted cluster numbers.
 
     Of equally large clusters the one with the earliest report wins.
     """
     in_cluster = cluster >= 0
     number, first, size = np.unique(cluster[in_cluster], return_index=True, return_counts=True)
-    voxel = voxel_id[in_cluster][first]
+    voxel = rows["voxel_id"][in_cluster][first]
     order = np.lexsort((number, -size, voxel))
     best = order[np.unique(voxel[order], return_index=True)[1]]
-    observed, n_observers = np.unique(voxel_id, return_counts=True)
+    observed, n_observers = np.unique(rows["voxel_id"], return_counts=True)
     n = n_observers[np.searchsorted(observed, voxel[best])]
+    denying = _share(rows["denies"][in_cluster], np.searchsorted(number, cluster[in_cluster]))[best]
+    xi = np.where((denying > 0.5) & (parameters.mode == "default"), parameters.xi_reshaped, parameters.xi)
     return np.sort(number[best[size[best] > xi * n]])
 
 
@@ -214,22 +233,30 @@ def _outer(v: NDArray[np.float64]) -> NDArray[np.float64]:
     return np.stack([x * x, x * y, x * z, y * y, y * z, z * z], axis=1)
 
 
-def _differs(epoch: Gaussians, candidate: Rows, parameters: MergeParameters) -> NDArray[np.bool_]:
-    """GND 5.3: a candidate is a change when its similarity to the base voxel is SMALLER than d_update."""
+def _differs(
+    epoch: Gaussians, candidate: Rows, denying: NDArray[np.float64], parameters: MergeParameters
+) -> NDArray[np.bool_]:
+    """GND 5.3: a candidate is a change when its similarity to the base voxel is SMALLER than d_update.
+
+    Where most of its statements were compared with that very voxel and deny it, anything less than equal will do.
+    """
     was = states_at(epoch, candidate["voxel_id"], Kind.QUOTED)
-    return _similarity(was, candidate, parameters) < parameters.d_update
+    limit = np.where(denying > 0.5, parameters.d_denied, parameters.d_update)
+    return np.asarray(_similarity(was, candidate, parameters) < limit)
 
 
-def _confirmed(epoch: Gaussians, rows: Rows, cluster: Index) -> NDArray[np.bool_]:
+def _confirmed(rows: Rows, cluster: Index) -> NDArray[np.bool_]:
     """Clusters in which at least half of the statements quote the epoch's own voxel.
 
     Neighbours of neighbours share a cluster, so without this two changed measurements could carry a majority that says
     "as it was".
     """
-    was = states_at(epoch, rows["voxel_id"], Kind.QUOTED)
-    same = (rows["kind"] == Kind.QUOTED) & (rows["count"] == was["count"])
-    same &= (rows["mean_m"] == was["mean_m"]).all(axis=1) & (rows["cov_m2"] == was["cov_m2"]).all(axis=1)
-    return np.asarray(2 * np.bincount(cluster, weights=same) >= np.bincount(cluster))
+    return np.asarray(_share((rows["kind"] == Kind.QUOTED) & (rows["was"] == EPOCH), cluster) >= 0.5)
+
+
+def _share(mark: NDArray[np.bool_], cluster: Index) -> NDArray[np.float64]:
+    """Share of marked statements in each cluster."""
+    return np.asarray(np.bincount(cluster, weights=mark) / np.bincount(cluster))
 
 
 def _merged(epoch: Gaussians, changes: Rows, statements: Statements, members: Rows) -> MergedTile:

@@ -20,6 +20,7 @@ from gnd_map.tile import diff
 from schemas.changes import TileChange
 
 Mode = Literal["paper", "default"]
+EPOCH = 1  # the number of the epoch's own Gaussian among the states of a voxel
 NO_BASE = b""  # hash in the report of a vehicle that had no map of the tile
 
 
@@ -31,14 +32,17 @@ class Kind(IntEnum):
     MEASURED = 2
 
 
-# One statement. `report` indexes Statements.report_ids; `base` numbers the version that a QUOTED one quotes, else 0;
-# count 0 for NOTHING; mean relative to the voxel centre along tile ENU axes; covariance xx, xy, xz, yy, yz, zz.
+# One statement. `report` indexes Statements.report_ids; `was` numbers the voxel's state in the version that it was made
+# against (0: nothing there; equal numbers in a voxel: equal states), so that one sees whether one statement denies what
+# another quotes; `denies` marks a MEASURED one that denies the epoch's own Gaussian; count 0 for NOTHING; mean relative
+# to the voxel centre along tile ENU axes; covariance xx, xy, xz, yy, yz, zz.
 STATEMENT = np.dtype(
     [
         ("voxel_id", np.int32),
         ("report", np.int32),
         ("kind", np.uint8),
-        ("base", np.int32),
+        ("was", np.int64),
+        ("denies", np.bool_),
         ("count", np.int32),
         ("cells", np.int32),
         ("mean_m", np.float32, 3),
@@ -84,12 +88,11 @@ def statements_of(
     """
     ordered = sorted({report.report_id: report for report in reports}.values(), key=lambda r: r.report_id)
     known = {NO_BASE: Gaussians.empty(), **bases} if mode == "default" else {}
-    number = {sha: k for k, sha in enumerate(sorted(known))}
     voxels = _disputed(epoch, ordered, known)
+    quoted = _numbered_states(voxels, epoch, known)
     parts = [np.zeros(0, STATEMENT)]
     for k, report in enumerate(ordered):
-        sha = report.change.base_sha
-        parts.append(_statements(k, report.change, voxels, known.get(sha), number.get(sha, 0)))
+        parts.append(_statements(k, report.change, voxels, quoted.get(report.change.base_sha)))
     rows = np.concatenate(parts)
     rows = rows[np.argsort(rows["voxel_id"], kind="stable")]  # the parts came in the order of report ids
     return Statements(tuple(report.report_id for report in ordered), rows)
@@ -105,35 +108,56 @@ def _disputed(epoch: Gaussians, reports: Sequence[Report], known: Mapping[bytes,
     return np.unique(np.concatenate(ids)).astype(np.int32)
 
 
-def _statements(
-    report: int, change: TileChange, voxels: NDArray[np.int32], base: Gaussians | None, base_number: int
-) -> Rows:
+def _numbered_states(
+    voxels: NDArray[np.int32], epoch: Gaussians, known: Mapping[bytes, Gaussians]
+) -> dict[bytes, Rows]:
+    """What each known base holds at each of the disputed voxels; `was` is 1 for the epoch's own Gaussian."""
+    of_epoch = states_at(epoch, voxels, Kind.QUOTED)
+    found: dict[bytes, Rows] = {}
+    for number, (sha, base) in enumerate(sorted(known.items()), start=2):
+        rows = states_at(base, voxels, Kind.QUOTED)
+        rows["was"] = np.where(rows["count"] > 0, number, 0)
+        for earlier in (of_epoch, *found.values()):
+            same = same_state(rows, earlier) & (rows["was"] == number)
+            rows["was"][same] = np.where(earlier is of_epoch, EPOCH, earlier["was"])[same]
+        found[sha] = rows
+    return found
+
+
+def same_state(a: Rows, b: Rows) -> NDArray[np.bool_]:
+    """Where two columns of statements hold the same Gaussian, to the bit."""
+    same = (a["count"] == b["count"]) & (a["mean_m"] == b["mean_m"]).all(axis=1)
+    return np.asarray(same & (a["cov_m2"] == b["cov_m2"]).all(axis=1))
+
+
+def _statements(report: int, change: TileChange, voxels: NDArray[np.int32], quoted: Rows | None) -> Rows:
     """One report's statements about those of `voxels` that it observed; without a base only its changes speak."""
     voxel_id = np.intersect1d(change.observed, voxels, assume_unique=True)
-    rows = states_at(base or Gaussians.empty(), voxel_id, Kind.QUOTED, base_number)
-    speaks = np.full(len(rows), base is not None)
-    at = _find(change.changed.voxel_id, voxel_id)
+    rows = states_at(Gaussians.empty(), voxel_id, Kind.QUOTED) if quoted is None else quoted[_find(voxels, voxel_id)]
+    speaks = np.full(len(rows), quoted is not None)
+    at, was = _find(change.changed.voxel_id, voxel_id), rows["was"].copy()
     rows[at >= 0] = _states(change.changed, Kind.MEASURED)[at[at >= 0]]
+    rows["was"] = was
+    rows["denies"] = (was == EPOCH) & (rows["kind"] == Kind.MEASURED)
     speaks[at >= 0] = _speaks(change)[at[at >= 0]]
     rows["report"] = report
     spoken: Rows = rows[speaks]
     return spoken
 
 
-def states_at(gaussians: Gaussians, voxel_id: NDArray[np.int32], kind: Kind, base: int = 0) -> Rows:
+def states_at(gaussians: Gaussians, voxel_id: NDArray[np.int32], kind: Kind) -> Rows:
     """STATEMENT (len(voxel_id),): what `gaussians` holds at each voxel, NOTHING where they hold none."""
-    states = np.concatenate([_states(gaussians, kind, base), np.zeros(1, STATEMENT)])  # found at -1: nothing
+    states = np.concatenate([_states(gaussians, kind), np.zeros(1, STATEMENT)])  # found at -1: nothing
     rows: Rows = states[_find(gaussians.voxel_id, voxel_id)]
     rows["voxel_id"] = voxel_id
     return rows
 
 
-def _states(gaussians: Gaussians, kind: Kind, base: int = 0) -> Rows:
+def _states(gaussians: Gaussians, kind: Kind) -> Rows:
     rows = np.zeros(len(gaussians), STATEMENT)
     for name in ("voxel_id", "count", "cells", "mean_m", "cov_m2"):
         rows[name] = getattr(gaussians, name)
     rows["kind"] = np.where(gaussians.exists, kind, Kind.NOTHING)
-    rows["base"] = np.where(gaussians.exists, base, 0)
     return rows
 
 

@@ -136,7 +136,7 @@ def evaluate_changes(
     predicted = classes_of_maps(truth, base, base)
     for tile, (voxel_id, change_class) in changes.items():
         said = change_class < len(CLASSES)
-        at = _positions(truth, tile, voxel_id[said])
+        at = voxel_rows(truth, tile, voxel_id[said])
         predicted[at[at >= 0]] = change_class[said][at >= 0]
     return evaluate(truth, predicted)
 
@@ -158,12 +158,12 @@ def classes_of_maps(truth: Truth, base: Tiles, final: Tiles) -> ClassArray:
 def _assign(
     truth: Truth, predicted: ClassArray, tile: TileId, voxel_id: NDArray[np.int32], change_class: ChangeClass
 ) -> None:
-    at = _positions(truth, tile, voxel_id)
+    at = voxel_rows(truth, tile, voxel_id)
     predicted[at[at >= 0]] = int(change_class)
 
 
-def _positions(truth: Truth, tile: TileId, voxel_id: NDArray[np.int32]) -> NDArray[np.int64]:
-    """Rows of the truth that hold voxels of a tile, int64 (K,), -1 where it has none."""
+def voxel_rows(truth: Truth, tile: TileId, voxel_id: NDArray[np.int32]) -> NDArray[np.int64]:
+    """Return the rows of the truth that hold voxels (K,) of a tile, int64 (K,), -1 where it has none."""
     low, high = np.searchsorted(truth.morton, [tile.morton, tile.morton + 1])
     inside = truth.voxel_id[low:high]
     at = np.searchsorted(inside, voxel_id)

@@ -72,20 +72,31 @@ def plain_merge(epoch, reports, bases, parameters):
 
 
 def plain_vote(report, voxel, bases, parameters):
-    """(state, is it measured), or nothing when the report abstains."""
+    """(state, is it measured, what stood there in its base), or nothing when the report abstains."""
     change = report.change
     if voxel not in change.observed:
         return None
     entry = change.changed.select([voxel])
+    base = {**bases, b"": Gaussians.empty()}.get(change.base_sha)
+    was = Gaussians.empty() if parameters.mode == "paper" or base is None else base.select([voxel])
     if len(entry):
         row = int(np.flatnonzero(change.changed.voxel_id == voxel)[0])
         if change.change_class[row] == ChangeClass.UNMEASURED or 0 < entry.cells[0] < 20:
             return None
-        return entry.take(entry.exists), bool(entry.exists[0])
-    base = {**bases, b"": Gaussians.empty()}.get(change.base_sha)
+        return entry.take(entry.exists), bool(entry.exists[0]), was
     if parameters.mode == "paper" or base is None:
         return None
-    return base.select([voxel]), False
+    return was, False, was
+
+
+def plain_distance(a, b, parameters):
+    """1 - similarity; 1 where one quotes what the other was compared with and denies."""
+    (_, one, one_measured, one_was), (_, two, two_measured, two_was) = a, b
+    if one is two:
+        return 0.0
+    if one_measured != two_measured and len(one) and len(two) and len(one_was) and one_was == two_was:
+        return 1.0
+    return 1 - plain_similarity(one, two, parameters)
 
 
 def plain_similarity(a, b, parameters):
@@ -98,25 +109,27 @@ def plain_similarity(a, b, parameters):
 def plain_decision(was, votes, parameters):
     if not votes:
         return None
-    states = [state for _, state, _ in votes]
-    distance = np.array([[0.0 if a is b else 1 - plain_similarity(a, b, parameters) for b in states] for a in states])
+    distance = np.array([[plain_distance(a, b, parameters) for b in votes] for a in votes])
     label = DBSCAN(eps=parameters.eps, min_samples=parameters.min_samples, metric="precomputed").fit(distance).labels_
     sizes = {cluster: int((label == cluster).sum()) for cluster in label if cluster >= 0}
     if not sizes:
         return None
     winner = min(sizes, key=lambda cluster: (-sizes[cluster], cluster))
     members = [vote for vote, cluster in zip(votes, label, strict=True) if cluster == winner]
-    if not len(members) > parameters.xi * len(votes):
+    denying = sum(measured and len(state) > 0 and len(was) > 0 and base == was for _, state, measured, base in members)
+    denied = 2 * denying > len(members)
+    if not len(members) > (parameters.xi_reshaped if denied else parameters.xi) * len(votes):
         return None
     now = plain_representative(members, parameters.mode)
-    quotes = sum(not measured and len(state) > 0 and state == was for _, state, measured in members)
-    if plain_similarity(was, now, parameters) >= parameters.d_update or 2 * quotes >= len(members):
+    quotes = sum(not measured and len(state) > 0 and state == was for _, state, measured, _ in members)
+    limit = parameters.d_denied if denied else parameters.d_update
+    if plain_similarity(was, now, parameters) >= limit or 2 * quotes >= len(members):
         return None
-    return now, tuple(report_id for report_id, _, _ in members)
+    return now, tuple(report_id for report_id, *_ in members)
 
 
 def plain_representative(members, mode):
-    measured = [state for _, state, is_measured in members if is_measured]
+    measured = [state for _, state, is_measured, _ in members if is_measured]
     if not measured:
         return members[0][1]
     if mode == "default":

@@ -195,3 +195,25 @@ def test_paper_mode_takes_the_same_shape_only():
 def test_absurd_parameters_are_refused(name, value):
     with pytest.raises(MergerError, match=name):
         MergeParameters(**{name: value})
+
+
+SHIFTED = (GROUND[0] + 0.02, GROUND[1], GROUND[2] + 0.06, *GROUND[3:])
+
+
+def test_a_vehicle_that_denies_the_map_is_not_counted_with_those_who_quote_it():
+    denies, quotes = change_of(EPOCH, [0], {0: SHIFTED}), change_of(EPOCH, [0], {})
+    assert merged([denies, denies, quotes]).changed.tolist() == [0]  # though the Gaussians are alike
+    assert merged([denies, quotes, quotes]).gaussians == EPOCH
+    assert merged([denies, quotes]).gaussians == EPOCH  # half is no majority
+
+
+def test_a_denied_voxel_needs_the_lower_share():
+    denies, quotes = change_of(EPOCH, [0, 1], {1: POLE}), change_of(EPOCH, [0, 1], {})
+    assert merged([denies] * 5 + [quotes] * 4).changed.tolist() == [1]
+    assert merged([denies] * 5 + [quotes] * 4, xi_reshaped=0.6).gaussians == EPOCH
+
+
+@pytest.mark.parametrize("bad", [{"xi": 1.0}, {"xi_reshaped": -0.1}, {"d_update": 1.5}, {"d_denied": 2.0}])
+def test_shares_and_limits_out_of_range_are_refused(bad):
+    with pytest.raises(MergerError, match=next(iter(bad))):
+        MergeParameters(**bad)

@@ -56,7 +56,11 @@ CASES = [
     (one(in_map=True, bi=10, bo=200, cells=50, x_m=0.4), "MODIFIED", "MODIFIED"),
     (one(in_map=True, bi=10, bo=200, cells=50, x_m=0.02), "NORMAL", "MODIFIED"),  # alike: only noise was outside
     (one(in_map=True, bi=100, bo=40, cells=50, x_m=0.4), "MODIFIED", "NORMAL"),  # sustained, but of another shape
-    (one(in_map=True, bi=100, bo=40, cells=21, x_m=0.4, map_cells=120), "NORMAL", "NORMAL"),  # too little of it seen
+    (
+        one(in_map=True, bi=100, bo=40, cells=21, x_m=0.4, map_cells=120),
+        "MODIFIED",
+        "NORMAL",
+    ),  # little, but far off
     (one(in_map=True, pi=100), "DELETED", "DELETED"),
     (one(in_map=True, pi=2), "UNMEASURED", "UNMEASURED"),
     (one(in_map=True, pi=100, bo=2, cells=2), "DELETED", "UNMEASURED"),
@@ -68,7 +72,8 @@ CASES = [
     (one(in_map=False, be=200, cells=50, pe=5000), "NEW", "NEW"),
     (one(in_map=False, pe=50), "EMPTY", "EMPTY"),
     (one(in_map=False, pe=2), "UNMEASURED", "EMPTY"),
-    (one(in_map=False, be=15, cells=12, pe=5000), "UNMEASURED", "UNMEASURED"),
+    (one(in_map=False, be=15, cells=12, pe=60), "UNMEASURED", "UNMEASURED"),  # weak hits abstain
+    (one(in_map=False, be=15, cells=12, pe=5000), "EMPTY", "UNMEASURED"),  # unless many rays looked
     (one(in_map=False, be=3, cells=3, pe=5000), "EMPTY", "UNMEASURED"),
 ]
 

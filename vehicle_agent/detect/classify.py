@@ -8,10 +8,11 @@ from numpy.typing import NDArray
 from gnd_map.classes import CHANGED, ChangeClass
 from gnd_map.evidence import ChangeState, masses, states
 from gnd_map.gaussian import Gaussians, concat
-from gnd_map.similarity import similarity
 from schemas.changes import TileChange
 from vehicle_agent.detect.evidence import TileEvidence
+from vehicle_agent.detect.extension import extends_neighbour
 from vehicle_agent.detect.parameters import DetectParameters
+from vehicle_agent.detect.shape_change import fitted, shape_features
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -36,8 +37,8 @@ def classify(evidence: TileEvidence, parameters: DetectParameters) -> Classifica
     """Decide every voxel of a tile by its evidence.
 
     The state is the largest mass after Eq. (11); a voxel is new, modified or deleted when it is `changed`. `default`
-    mode adds: a new Gaussian that resembles the map's keeps the voxel normal, one that does not makes even a sustained
-    voxel modified; deletion needs rays that passed; too few hits, too few rays or a tie abstain.
+    mode adds: a new Gaussian of the map's shape keeps the voxel normal, one of another shape makes even a sustained
+    voxel modified (`shape_change`); deletion needs rays that passed; too few hits, too few rays or a tie abstain.
     """
     decide = _decide_paper if parameters.mode == "paper" else _decide_default
     return Classification(evidence, decide(evidence, parameters).astype(np.uint8))
@@ -71,10 +72,8 @@ def _decide_of_map(e: TileEvidence, p: DetectParameters) -> NDArray[np.int64]:
     """Voxels in which the map has a Gaussian: normal, modified or deleted."""
     state = _state(e, p)
     has_gaussian = e.measured.cells >= p.min_cells
-    alike = _similar_to_map(e) >= p.similar
-    covered = e.measured.cells >= p.min_coverage * _cells_of_map(e)
     sustained, changed = state == ChangeState.SUSTAINED, state == ChangeState.CHANGED
-    reshaped = has_gaussian & ~alike & (changed | covered)
+    reshaped = has_gaussian & ~_same_shape(e, p)
     gone = changed & (e.measured.cells < p.weak_cells) & (e.n_pi >= p.min_pass_inside)
     return np.select(
         [reshaped & (sustained | changed), sustained | (changed & has_gaussian), gone],
@@ -84,27 +83,30 @@ def _decide_of_map(e: TileEvidence, p: DetectParameters) -> NDArray[np.int64]:
 
 
 def _decide_of_empty(e: TileEvidence, p: DetectParameters) -> NDArray[np.int64]:
-    """Voxels in which the map has none: new or empty; weak hits and few passes abstain."""
-    new = e.measured.cells >= p.new_cells
-    empty = (e.measured.cells < p.weak_cells) & (e.n_pe >= p.min_passes)
+    """Voxels in which the map has none: new or empty; few passes abstain, and weak hits unless many rays looked."""
+    new = e.measured.cells >= _least_cells_of_new(e, p)
+    weak = (e.measured.cells >= p.weak_cells) & (e.n_pe + e.n_be < p.many_rays)
+    empty = ~weak & (e.n_pe >= p.min_passes)
     return np.select([new, empty], [ChangeClass.NEW, ChangeClass.EMPTY], ChangeClass.UNMEASURED)
 
 
-def _similar_to_map(e: TileEvidence) -> NDArray[np.float64]:
-    """(K,) similarity of the new Gaussian with the map's, both about the voxel's centre; 0 where the map has none."""
-    result = np.zeros(len(e))
-    rows, base, new = np.flatnonzero(e.in_map), e.base.gaussians, e.measured
-    at = e.map_row[rows]
-    result[rows] = similarity(
-        base.exists[at], base.mean_m[at], base.cov_m2[at], new.exists[rows], new.mean_m[rows], new.cov_m2[rows]
-    )
-    return result
+def _least_cells_of_new(e: TileEvidence, p: DetectParameters) -> NDArray[np.int64]:
+    """(K,) sub-cells that make a new Gaussian: more where it may be the edge of a surface that the map holds."""
+    least = np.full(len(e), p.new_cells)
+    rows = np.flatnonzero(~e.in_map & (e.measured.cells >= p.new_cells) & (e.measured.cells < p.new_cells_at_edge))
+    edge = extends_neighbour(e.base, e.measured.take(rows), planar_ratio=p.planar_ratio, within_m=p.edge_m)
+    least[rows[edge]] = p.new_cells_at_edge
+    return least
 
 
-def _cells_of_map(e: TileEvidence) -> NDArray[np.int32]:
-    """(K,) occupied sub-cells of the map's Gaussian, 0 where there is none."""
-    result = np.zeros(len(e), np.int32)
-    result[e.in_map] = e.base.gaussians.cells[e.map_row[e.in_map]]
+def _same_shape(e: TileEvidence, p: DetectParameters) -> NDArray[np.bool_]:
+    """(K,) whether the new Gaussian shows the surface that the map holds; False where there are not both."""
+    result = np.zeros(len(e), np.bool_)
+    rows = np.flatnonzero(e.in_map & (e.measured.cells >= p.min_cells))
+    if len(rows):
+        was = e.base.gaussians.take(e.map_row[rows])
+        features = shape_features(was, e.measured.take(rows), e.n_bi[rows], e.n_bo[rows], e.n_pi[rows])
+        result[rows] = fitted().log_odds(features) <= p.reshaped_log_odds
     return result
 
 

@@ -50,18 +50,22 @@ class DetectParameters:
     """Farther hits are not used; their rays still pass what lies within the range."""
     min_cells: int = 20
     """Occupied 10 cm sub-cells that make a Gaussian, the same rule as the map's."""
-    new_cells: int = 25
-    """The same where the map has none: on real scans half of the false new voxels had 20 to 24 sub-cells."""
+    new_cells: int = 30
+    """The same where the map has none: noise and the error of poses thicken a surface, on real scans nine in ten false
+    new voxels had fewer than 38 sub-cells."""
+    new_cells_at_edge: int = 45
+    """The same within `edge_m` of the plane of a planar Gaussian of the map next door: the edge of a known surface."""
+    edge_m: float = 0.15
     weak_cells: int = 5
-    """From here to `min_cells` a voxel has hits, but too few for a Gaussian: it abstains."""
+    """From here to `min_cells` a voxel has hits, but too few for a Gaussian: it abstains (see `many_rays`)."""
     min_passes: int = 3
     """Rays through an empty voxel before it counts as observed empty."""
+    many_rays: int = 100
+    """So many rays into a voxel without a Gaussian make too few hits a statement: by the one rule it is empty."""
     min_pass_inside: int = 3
     """PI rays that a deletion needs."""
-    similar: float = 0.5
-    """New and map Gaussian at least this similar: the voxel stays normal."""
-    min_coverage: float = 0.25
-    """Sub-cells of the new Gaussian over the map's, below which a sustained voxel is never called modified."""
+    reshaped_log_odds: float = 0.2
+    """A measured Gaussian is of another shape than the map's from these log-odds on (see `shape_change`)."""
 
     def __post_init__(self) -> None:
         """Each value within its range, or `DetectParameterError` with the value."""
@@ -71,9 +75,11 @@ class DetectParameters:
         _check("pass_noise_m", self.pass_noise_m, 1e-4, 1.0)
         _check("block_noise_m", self.block_noise_m, 1e-4, 1.0)
         _check("range_max_m", self.range_max_m, self.range_min_m, 500.0, open_ends=True)
-        _check("similar", self.similar, 0.0, 1.0)
+        _check("reshaped_log_odds", self.reshaped_log_odds, -10.0, 10.0)
         _check("weak_cells", self.weak_cells, 1, self.min_cells)
         _check("new_cells", self.new_cells, self.min_cells, 1000)
+        _check("new_cells_at_edge", self.new_cells_at_edge, self.new_cells, 1000)
+        _check("edge_m", self.edge_m, 0.0, 1.0)
 
     @classmethod
     def paper(cls) -> "DetectParameters":
@@ -90,7 +96,6 @@ class DetectParameters:
             weak_cells=1,
             min_passes=1,
             min_pass_inside=1,
-            min_coverage=0.0,
         )
 
 

@@ -1,0 +1,170 @@
+"""Whether the surface in a voxel has changed its shape: the log-odds of a measured Gaussian against the map's.
+
+The similarity of GND Eq. (13) judges two Gaussians alone: a thick one resembles almost anything, a thin one almost
+nothing, and what the rays said is left out. Here ten figures of the two Gaussians and the counters are weighed
+together by boosted regression trees, each monotone in what must only speak for or against a change. They were fitted on
+simulated worlds that no figure of merit is reported on (`python -m benchmarks.fit_shape_change`); the vehicle
+evaluates them alone, without the library that fitted them.
+"""
+
+import json
+from dataclasses import dataclass
+from functools import lru_cache
+from importlib.resources import files
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from gnd_map.arrays import F64, I32, check_array
+from gnd_map.gaussian import Gaussians, full_matrices
+from gnd_map.jit import kernel
+from gnd_map.similarity import similarity
+from vehicle_agent.errors import VehicleError
+
+FEATURES: Final = (
+    "map_offset_m",
+    "new_offset_m",
+    "similarity",
+    "outside_share",
+    "passed_share",
+    "cells",
+    "map_thickness",
+    "new_thickness",
+    "new_spread_m",
+    "map_spread_m",
+)
+"""Distance of the two means along the map Gaussian's thin axis, and along the new one's; similarity (default mode);
+BO over BI + BO; PI over BI + BO + PI; logarithm of the new Gaussian's sub-cells; logarithms of both smallest
+eigenvalues; standard deviation of each Gaussian along the other's thin axis."""
+MONOTONE: Final = (1, 1, -1, 1, 1, 0, 0, 0, 1, 0)
+"""How each feature may act on the log-odds: 1 upwards only, -1 downwards only, 0 freely."""
+_THIN_M2: Final = 2e-4
+"""Added to eigenvalues before the logarithm: (1.4 cm)², below the noise of any sensor."""
+
+
+class ShapeModelError(VehicleError):
+    """The file of the fitted trees is damaged."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Forest:
+    """Regression trees whose leaves add up.
+
+    Attributes:
+        baseline: log-odds without any tree.
+        root: int32 (T,), first node of each tree.
+        feature: int32 (M,), what a node asks about; -1 for a leaf.
+        threshold: float64 (M,): go left when the feature is at most this; the value of a leaf.
+        left, right: int32 (M,), the next node.
+    """
+
+    baseline: float
+    root: NDArray[np.int32]
+    feature: NDArray[np.int32]
+    threshold: F64
+    left: NDArray[np.int32]
+    right: NDArray[np.int32]
+
+    def __post_init__(self) -> None:
+        n = len(self.feature)
+        check_array("threshold", self.threshold, np.float64, (n,))
+        for name in ("root", "left", "right"):
+            nodes = getattr(self, name)
+            if len(nodes) != (len(self.root) if name == "root" else n) or not ((nodes >= 0) & (nodes < n)).all():
+                raise ShapeModelError(f"trees with {n} nodes: {name} names other nodes")
+        inner = np.flatnonzero(self.feature >= 0)
+        if (np.minimum(self.left, self.right)[inner] <= inner).any() or (self.feature >= len(FEATURES)).any():
+            raise ShapeModelError(
+                f"trees with {n} nodes: a node leads back, or asks about feature {self.feature.max()}"
+            )
+
+    def log_odds(self, features: F64) -> F64:
+        """Return the sum of the leaves, float64 (N,), for features (N, 10) in the order of `FEATURES`."""
+        check_array("features", features, np.float64, (None, len(FEATURES)))
+        return self.baseline + _leaves(features, self.root, self.feature, self.threshold, self.left, self.right)
+
+    def to_json(self) -> str:
+        """Return the text of the model's file."""
+        columns = {name: getattr(self, name).tolist() for name in ("root", "feature", "threshold", "left", "right")}
+        return json.dumps({"features": FEATURES, "baseline": self.baseline, **columns}) + "\n"
+
+    @classmethod
+    def from_json(cls, text: str) -> "Forest":
+        """Read a model.
+
+        Raises:
+            ShapeModelError: the text is no model of these features.
+        """
+        try:
+            data = json.loads(text)
+            if tuple(data["features"]) != FEATURES:
+                raise ShapeModelError(f"the trees ask about {data['features']}, this program knows {FEATURES}")
+            ints = {name: np.array(data[name], np.int32) for name in ("root", "feature", "left", "right")}
+            return cls(float(data["baseline"]), threshold=np.array(data["threshold"], np.float64), **ints)
+        except (ValueError, KeyError, TypeError) as error:
+            raise ShapeModelError(f"the file of the fitted trees is damaged: {error}") from error
+
+
+@kernel
+def _leaves(
+    x: F64,
+    root: NDArray[np.int32],
+    feature: NDArray[np.int32],
+    threshold: F64,
+    left: NDArray[np.int32],
+    right: NDArray[np.int32],
+) -> F64:
+    total = np.zeros(len(x))
+    for i in range(len(x)):
+        for node in root:
+            at = node
+            while feature[at] >= 0:
+                at = left[at] if x[i, feature[at]] <= threshold[at] else right[at]
+            total[i] += threshold[at]
+    return total
+
+
+@lru_cache(maxsize=1)
+def fitted() -> Forest:
+    """Return the trees that were fitted (`shape_change.json` beside this file)."""
+    return Forest.from_json((files("vehicle_agent.detect") / "shape_change.json").read_text(encoding="utf-8"))
+
+
+def shape_features(was: Gaussians, now: Gaussians, n_bi: I32, n_bo: I32, n_pi: I32) -> F64:
+    """Return the `FEATURES` (N, 10) of N voxels.
+
+    Args:
+        was: the map's Gaussians of the voxels.
+        now: the measured ones, in the same order.
+        n_bi: (N,) points blocked inside the map's Gaussian.
+        n_bo: (N,) points blocked outside it.
+        n_pi: (N,) rays that passed it.
+    """
+    thin_was, normal_was = _thin_axis(was)
+    thin_now, normal_now = _thin_axis(now)
+    step = now.mean_m.astype(np.float64) - was.mean_m
+    columns = [
+        np.abs(np.einsum("ni,ni->n", normal_was, step)),
+        np.abs(np.einsum("ni,ni->n", normal_now, step)),
+        similarity(was.exists, was.mean_m, was.cov_m2, now.exists, now.mean_m, now.cov_m2),
+        n_bo / np.maximum(n_bi + n_bo, 1),
+        n_pi / np.maximum(n_bi + n_bo + n_pi, 1),
+        np.log(np.maximum(now.cells, 1)),
+        np.log(thin_was + _THIN_M2),
+        np.log(thin_now + _THIN_M2),
+        _spread_m(now, normal_was),
+        _spread_m(was, normal_now),
+    ]
+    return np.column_stack(columns)
+
+
+def _thin_axis(gaussians: Gaussians) -> tuple[F64, F64]:
+    """Smallest eigenvalue (N,) and its direction (N, 3)."""
+    values, vectors = np.linalg.eigh(full_matrices(gaussians.cov_m2.astype(np.float64)))
+    return values[:, 0].clip(0.0), vectors[:, :, 0]
+
+
+def _spread_m(gaussians: Gaussians, axis: F64) -> F64:
+    """Standard deviation (N,) along unit vectors (N, 3)."""
+    return np.asarray(np.sqrt(np.einsum("ni,nij,nj->n", axis, gaussians.full_cov(), axis).clip(0.0)))
