@@ -15,7 +15,7 @@ T = TypeVar("T")
 
 
 @click.command()
-@click.option("--world-seed", "seeds", multiple=True, help="Seed of the world; several (1,2,3) give means.")
+@click.option("--world-seed", "seeds", multiple=True, help="Seed of the world, or several: 1,2,3.  [default: 201]")
 @click.option("--length", "length_m", default=400.0, show_default=True, help="Length of the street, metres.")
 @click.option("--site", default="wangsimni", show_default=True, help="Where it lies: wangsimni, border or north49.")
 @click.option("--vehicles", default="1,5,9,20", show_default=True, help="Sizes of the fleet that are reported.")

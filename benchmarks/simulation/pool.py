@@ -6,13 +6,14 @@ import signal
 import threading
 from collections.abc import Callable, Sequence
 from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
+from concurrent.futures.process import BrokenProcessPool
 from dataclasses import dataclass
 from multiprocessing.connection import wait as wait_for
 from typing import Any, Final
 
 from rich.progress import Progress, TaskID
 
-from benchmarks.simulation.errors import Stopped
+from benchmarks.simulation.errors import FolderError, ReproduceError, Stopped
 
 _ONE_THREAD: Final = ("OPENBLAS_NUM_THREADS", "NUMBA_NUM_THREADS", "OMP_NUM_THREADS")
 _LOOK_S: Final = 0.2
@@ -60,7 +61,10 @@ def _here(job: Job, progress: Progress, whole: TaskID) -> Any:
 
 
 def _call(job: Job, tick: Tick) -> Any:
-    return job.work(*job.arguments, tick) if job.ticks else job.work(*job.arguments)
+    try:
+        return job.work(*job.arguments, tick) if job.ticks else job.work(*job.arguments)
+    except OSError as error:
+        raise FolderError(f"{job.name}: {error}") from error
 
 
 class _Workers:
@@ -83,6 +87,11 @@ class _Workers:
             futures = {pool.submit(_work, index, job): index for index, job in enumerate(self._jobs)}
             try:
                 return self._collect(futures)
+            except BrokenProcessPool as error:
+                raise ReproduceError(
+                    "a worker ended without a word, perhaps for want of memory: start again with fewer --jobs, what is "
+                    "done is kept"
+                ) from error
             except BaseException:
                 self._stop.set()
                 pool.shutdown(wait=False, cancel_futures=True)
