@@ -25,6 +25,7 @@ F64 = NDArray[np.float64]
 INK: Final = "#1c2430"
 PALE: Final = {ChangeClass.NORMAL: "#b9cdf0"}
 """What did not change stays in the background."""
+HIDDEN: Final = "#c9c2b2"
 REACH_M: Final = 38.0
 """So much is shown around the track."""
 DPI: Final = 110
@@ -54,14 +55,17 @@ def draw_round(one: Round, folder: Path) -> list[Path]:
 
 def _classes(one: Round, found: Found, new: Sequence[Placed], gone: Sequence[Placed], title: str) -> Figure:
     figure, axes = _sheet(one, title)
+    hidden = np.isin(found.keys, one.inserted.truth.ignored) & found.where(*_CHANGED) & bool(new or gone)
+    _add_voxels(axes, found.mean_m[hidden], HIDDEN)
     for change in (ChangeClass.NORMAL, ChangeClass.DELETED, ChangeClass.MODIFIED, ChangeClass.NEW):
-        _add_voxels(axes, found.mean_m[found.where(change)], PALE.get(change, CLASS_COLOURS[change]))
+        _add_voxels(axes, found.mean_m[found.where(change) & ~hidden], PALE.get(change, CLASS_COLOURS[change]))
     for placed, colour in [(p, ChangeClass.NEW) for p in new] + [(p, ChangeClass.DELETED) for p in gone]:
         axes.add_patch(_outline(placed, CLASS_COLOURS[colour]))
     handles: list[Artist] = [
         _dot(PALE.get(c, CLASS_COLOURS[c]), c.name.lower()) for c in (ChangeClass.NORMAL, *_CHANGED)
     ]
     handles += [Patch(facecolor="none", edgecolor=CLASS_COLOURS[c], linewidth=2, label=text) for c, text in _OUTLINES]
+    handles.append(_dot(HIDDEN, "behind or under an object: not scored"))
     axes.legend(handles=handles if new or gone else handles[:4], loc="upper right", framealpha=0.9, fontsize=9)
     return figure
 

@@ -10,8 +10,8 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from schemas.drive import Scan
 from vehicle_agent.errors import ImportDriveError
+from vehicle_agent.importers.cleaning import RawScan
 
 RING_FIELDS: Final = ("ring", "channel", "line", "laser_id")
 TIME_FIELDS: Final = ("t_offset", "t", "time", "timestamp", "time_stamp", "offset_time", "timeOffset")
@@ -59,7 +59,7 @@ def _dtype(where: str, fields: Sequence[Field], step: int) -> np.dtype[np.void]:
         raise ImportDriveError(f"{where}: impossible fields: {error}") from error
 
 
-def scan_of_fields(points: NDArray[np.void], t_ns: int) -> Scan:
+def scan_of_fields(points: NDArray[np.void], t_ns: int) -> RawScan:
     """A scan of packed points (N,), times after the earliest of its points, ring where the cloud tells."""
     names = points.dtype.names or ()
     xyz = np.stack([points[axis] for axis in "xyz"], axis=1).astype(np.float32)
@@ -67,7 +67,7 @@ def scan_of_fields(points: NDArray[np.void], t_ns: int) -> Scan:
     ring = next((name for name in RING_FIELDS if name in names), None)
     offset = np.zeros(len(points), np.uint32) if time is None else offsets_ns(points[time])
     rings = None if ring is None or points[ring].ndim > 1 else _rings(points[ring])
-    return Scan(t_ns, np.ascontiguousarray(xyz), offset, rings)
+    return RawScan(t_ns, np.ascontiguousarray(xyz), offset, rings)
 
 
 def offsets_ns(values: NDArray[np.generic]) -> NDArray[np.uint32]:

@@ -11,8 +11,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gnd_map.se3 import T_inverse
-from schemas.drive import GnssFix, Scan
+from schemas.drive import GnssFix
 from vehicle_agent.errors import ImportDriveError
+from vehicle_agent.importers.cleaning import RawScan
 from vehicle_agent.importers.files import check_folder, files_below, files_of, read_file
 from vehicle_agent.importers.recording import GNSS_SIGMA_M, NOMINAL, Anchor, Recording, mount
 
@@ -68,13 +69,13 @@ def _scan_files(folder: Path) -> list[Path]:
     raise ImportDriveError(f"{folder}: no .bin or .bin.xz scans there or in the folders below it")
 
 
-def _scan(path: Path, t_ns: int) -> Scan:
+def _scan(path: Path, t_ns: int) -> RawScan:
     """float32 x, y, z, reflectance of every point, in the file's order."""
     data = read_file(path)
     if len(data) % RECORD_BYTES:
         raise ImportDriveError(f"{path}: {len(data)} bytes, which is no multiple of {RECORD_BYTES}")
     points = np.frombuffer(data, np.float32).reshape(-1, 4)[:, :3]
-    return Scan(t_ns, np.ascontiguousarray(points), np.zeros(len(points), np.uint32))
+    return RawScan(t_ns, np.ascontiguousarray(points), np.zeros(len(points), np.uint32))
 
 
 def _times(folder: Path, n: int) -> NDArray[np.int64]:

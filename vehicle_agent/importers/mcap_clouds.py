@@ -15,12 +15,13 @@ from foxglove_schemas_protobuf.PointCloud_pb2 import PointCloud
 from mcap.summary import Summary
 
 from gnd_map.motion import Trajectory
-from schemas.drive import GnssFix, MotionSample, Scan
+from schemas.drive import GnssFix, MotionSample
 from schemas.drive_mcap import POINTS_TOPIC, load_track, read_header
 from schemas.drive_messages import ns_of
 from schemas.drive_metadata import METADATA
 from schemas.mcap_file import open_mcap
 from vehicle_agent.errors import ImportDriveError
+from vehicle_agent.importers.cleaning import RawScan
 from vehicle_agent.importers.fields import Field, scan_of_fields, unpack
 from vehicle_agent.importers.files import files_below
 from vehicle_agent.importers.point_cloud2 import SCHEMA as POINT_CLOUD2
@@ -152,7 +153,7 @@ def _in_time_order(clouds: list[_At]) -> tuple[list[_At], tuple[str, ...]]:
     return once, tuple(notes)
 
 
-def _read(at: _At, topic: str, schema: str) -> Scan:
+def _read(at: _At, topic: str, schema: str) -> RawScan:
     with open_mcap(at.path) as (reader, _):
         messages = reader.iter_messages(topics=[topic], starting_at=at.log_ns, ending_at=at.log_ns)
         data = next(message.data for nth, (_, _, message) in enumerate(messages) if nth == at.nth)

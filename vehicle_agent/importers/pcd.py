@@ -14,8 +14,8 @@ from numpy.typing import NDArray
 
 from gnd_map.motion import Trajectory
 from gnd_map.se3 import R_from_quaternion_xyzw, T_from_R_t
-from schemas.drive import Scan
 from vehicle_agent.errors import ImportDriveError
+from vehicle_agent.importers.cleaning import RawScan
 from vehicle_agent.importers.files import check_folder, files_below, files_of
 from vehicle_agent.importers.pcd_format import read_pcd
 from vehicle_agent.importers.recording import Anchor, Recording
@@ -66,13 +66,13 @@ def _number(path: Path) -> tuple[int, str]:
     return int(digits[-1]) if digits else -1, path.name
 
 
-def _scan(path: Path, t_ns: int) -> Scan:
+def _scan(path: Path, t_ns: int) -> RawScan:
     points = read_pcd(path)
     missing = {"x", "y", "z"} - set(points.dtype.names or ())
     if missing:
         raise ImportDriveError(f"{path}: no field {', '.join(sorted(missing))}")
     xyz = np.stack([points["x"], points["y"], points["z"]], axis=1).astype(np.float32)
-    return Scan(t_ns, xyz, np.zeros(len(xyz), np.uint32))
+    return RawScan(t_ns, xyz, np.zeros(len(xyz), np.uint32))
 
 
 def _track(folder: Path, n: int) -> tuple[I64, Trajectory | None]:

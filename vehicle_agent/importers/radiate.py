@@ -11,8 +11,9 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from schemas.drive import GnssFix, MotionSample, Scan
+from schemas.drive import GnssFix, MotionSample
 from vehicle_agent.errors import ImportDriveError
+from vehicle_agent.importers.cleaning import RawScan
 from vehicle_agent.importers.files import check_folder, files_of, read_file
 from vehicle_agent.importers.recording import GNSS_SIGMA_M, Anchor, Recording, mount
 
@@ -54,7 +55,7 @@ def open_radiate(folder: Path, anchor: Anchor | None) -> Recording:
     )
 
 
-def _scan(path: Path, t_ns: int) -> Scan:
+def _scan(path: Path, t_ns: int) -> RawScan:
     text = read_file(path).decode("ascii", "replace")
     try:
         rows = np.array([line.split(",") for line in text.split()], np.float64)
@@ -65,7 +66,7 @@ def _scan(path: Path, t_ns: int) -> Scan:
     kept = rows[np.linalg.norm(rows[:, :3], axis=1) >= OWN_VEHICLE_M]
     turned = np.unwrap(np.arctan2(rows[:, 0], rows[:, 1]))  # clockwise from forward, as the sensor turns
     offset = np.maximum(turned - turned[0], 0.0)[np.linalg.norm(rows[:, :3], axis=1) >= OWN_VEHICLE_M]
-    return Scan(
+    return RawScan(
         t_ns,
         kept[:, :3].astype(np.float32),
         np.round(offset / (2 * np.pi) * SWEEP_NS).astype(np.uint32),

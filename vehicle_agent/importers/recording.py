@@ -11,6 +11,7 @@ from gnd_map.motion import Trajectory
 from gnd_map.se3 import exp_so3
 from schemas.drive import GnssFix, MotionSample, Scan
 from vehicle_agent.errors import ImportDriveError
+from vehicle_agent.importers.cleaning import RawScan
 
 F64 = NDArray[np.float64]
 
@@ -50,7 +51,7 @@ class Recording:
     source: str
     T_vehicle_lidar: F64
     t_ns: NDArray[np.int64]
-    read: Callable[[int], Scan]
+    read: Callable[[int], RawScan | Scan]
     anchor: Anchor
     track: Trajectory | None = None
     gnss: tuple[GnssFix, ...] = ()
