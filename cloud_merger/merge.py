@@ -4,6 +4,7 @@ The merged tile depends on the epoch tile and on the set of all reports since th
 on nothing else: in whatever batches and retries they came, the same reports give the same tile, bit for bit.
 """
 
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -33,6 +34,7 @@ class MergeParameters:
             shape is judged less surely than a presence, and a parked car seldom touches what the map holds.
         d_update: published when the candidate's similarity to the epoch's voxel is smaller than this.
         d_denied: the same where most of the candidate's statements were compared with that voxel and deny it.
+        sensor_weights: weight of a vote by sensor model, 1 for the others; "paper" mode does not weigh.
         noise_m: added (squared) to the covariances that the default similarity compares.
     """
 
@@ -44,6 +46,7 @@ class MergeParameters:
     d_update: float = 0.5
     d_denied: float = 0.95
     noise_m: float = 0.05
+    sensor_weights: Mapping[str, float] = field(default_factory=lambda: {"Scala": 0.5})
 
     def __post_init__(self) -> None:
         if self.mode not in ("paper", "default"):
@@ -60,6 +63,13 @@ class MergeParameters:
         for name, least in (("d_update", self.d_update), ("d_denied", self.d_denied)):
             if not 0 <= least <= 1:
                 raise MergerError(f"{name} must lie in [0, 1], got {least}")
+        for model, weight in self.sensor_weights.items():
+            if not 0 < weight <= 1:
+                raise MergerError(f"the weight of {model} must lie in (0, 1], got {weight}")
+
+    def weight_of(self, sensor_model: str) -> float:
+        """Return the weight of a vote of this sensor."""
+        return self.sensor_weights.get(sensor_model, 1.0) if self.mode == "default" else 1.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -164,15 +174,16 @@ def _winners(rows: Rows, cluster: Index, parameters: MergeParameters) -> Index:
     Of equally large clusters the one with the earliest report wins.
     """
     in_cluster = cluster >= 0
-    number, first, size = np.unique(cluster[in_cluster], return_index=True, return_counts=True)
+    number, first, member = np.unique(cluster[in_cluster], return_index=True, return_inverse=True)
     voxel = rows["voxel_id"][in_cluster][first]
-    order = np.lexsort((number, -size, voxel))
+    votes = np.bincount(member, weights=rows["weight"][in_cluster])
+    order = np.lexsort((number, -votes, voxel))
     best = order[np.unique(voxel[order], return_index=True)[1]]
-    observed, n_observers = np.unique(rows["voxel_id"], return_counts=True)
-    n = n_observers[np.searchsorted(observed, voxel[best])]
-    denying = _share(rows["denies"][in_cluster], np.searchsorted(number, cluster[in_cluster]))[best]
+    observed, seat = np.unique(rows["voxel_id"], return_inverse=True)
+    cast = np.bincount(seat, weights=rows["weight"])[np.searchsorted(observed, voxel[best])]
+    denying = _share(rows["denies"][in_cluster], member)[best] if len(best) else np.zeros(0)
     xi = np.where((denying > 0.5) & (parameters.mode == "default"), parameters.xi_reshaped, parameters.xi)
-    return np.sort(number[best[size[best] > xi * n]])
+    return np.sort(number[best[votes[best] > xi * cast]])
 
 
 def _members(rows: Rows, cluster: Index, winner: Index) -> tuple[Rows, Index]:

@@ -43,6 +43,7 @@ STATEMENT = np.dtype(
         ("kind", np.uint8),
         ("was", np.int64),
         ("denies", np.bool_),
+        ("weight", np.float64),
         ("count", np.int32),
         ("cells", np.int32),
         ("mean_m", np.float32, 3),
@@ -54,10 +55,17 @@ Rows = NDArray[Any]  # of dtype STATEMENT
 
 @dataclass(frozen=True, slots=True)
 class Report:
-    """One report's part about one tile."""
+    """One report's part about one tile.
+
+    Attributes:
+        report_id: orders the reports.
+        change: what it says.
+        weight: of its votes, see `MergeParameters.weight_of`.
+    """
 
     report_id: str
     change: TileChange
+    weight: float = 1.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -92,7 +100,9 @@ def statements_of(
     quoted = _numbered_states(voxels, epoch, known)
     parts = [np.zeros(0, STATEMENT)]
     for k, report in enumerate(ordered):
-        parts.append(_statements(k, report.change, voxels, quoted.get(report.change.base_sha)))
+        said = _statements(k, report.change, voxels, quoted.get(report.change.base_sha))
+        said["weight"] = report.weight
+        parts.append(said)
     rows = np.concatenate(parts)
     rows = rows[np.argsort(rows["voxel_id"], kind="stable")]  # the parts came in the order of report ids
     return Statements(tuple(report.report_id for report in ordered), rows)

@@ -69,7 +69,8 @@ class Worker:
     def _report(self, row: ReportRow) -> Report | None:
         """What a stored report says; nothing when it can no longer be read (its vehicle has long had its ack)."""
         try:
-            return Report(row.report_id, _change(row.body))
+            sensor_model, change = _said(row.body)
+            return Report(row.report_id, change, self._config.merge.weight_of(sensor_model))
         except SchemaError as error:
             reason = f"report {row.report_id} on tile {row.tile} cannot be read any more and is left out: {error}"
             _LOG.error("%s", reason)
@@ -92,10 +93,11 @@ class Worker:
 
 
 @lru_cache(maxsize=REMEMBERED_REPORTS)
-def _change(body: bytes) -> TileChange:
-    """The one tile of a stored report; remembered, because each merge of a tile reads all its reports again."""
-    (change,) = ChangeReport.decode(body).tiles
-    return change
+def _said(body: bytes) -> tuple[str, TileChange]:
+    """Sensor model and the one tile of a stored report; remembered: each merge of a tile reads all reports again."""
+    report = ChangeReport.decode(body)
+    (change,) = report.tiles
+    return report.sensor_model, change
 
 
 def _ids(work: TileWork) -> tuple[str, ...]:

@@ -16,20 +16,20 @@ from schemas.changes import ChangeReport, TileChange
 Tiles = Mapping[TileId, Gaussians]
 
 
-def reports_of_tiles(bodies: Iterable[bytes]) -> dict[TileId, list[Report]]:
-    """Decode uploads and sort them by tile."""
+def reports_of_tiles(bodies: Iterable[bytes], parameters: MergeParameters) -> dict[TileId, list[Report]]:
+    """Decode uploads, weigh them by their sensors and sort them by tile."""
     found: dict[TileId, list[Report]] = defaultdict(list)
     for body in bodies:
         report = ChangeReport.decode(body)
         for change in report.tiles:
-            found[change.tile].append(Report(report.report_id, change))
+            found[change.tile].append(Report(report.report_id, change, parameters.weight_of(report.sensor_model)))
     return dict(found)
 
 
 def merged_map(base: BaseMap, bodies: Sequence[bytes], parameters: MergeParameters) -> dict[TileId, Gaussians]:
     """Return the map that the cloud makes of a base map and uploads."""
     final = dict(base.tiles)
-    for tile, reports in reports_of_tiles(bodies).items():
+    for tile, reports in reports_of_tiles(bodies, parameters).items():
         epoch = base.tiles.get(tile, Gaussians.empty())
         bases = {base.shas[tile]: epoch} if tile in base.shas else {}
         merged = merge_tile(epoch, statements_of(epoch, reports, bases, parameters.mode), parameters)
@@ -40,7 +40,7 @@ def merged_map(base: BaseMap, bodies: Sequence[bytes], parameters: MergeParamete
 def map_of_one(base: BaseMap, bodies: Iterable[bytes]) -> dict[TileId, Gaussians]:
     """Return the base map with what one vehicle says about it, no cloud in between."""
     final = dict(base.tiles)
-    for tile, reports in reports_of_tiles(bodies).items():
+    for tile, reports in reports_of_tiles(bodies, MergeParameters()).items():
         for report in reports:
             final[tile] = _with_change(final.get(tile, Gaussians.empty()), report.change)
     return final

@@ -60,7 +60,7 @@ def plain_merge(epoch, reports, bases, parameters):
     for voxel in sorted({*VOXELS, *epoch.voxel_id.tolist()}):
         was = epoch.select([voxel])
         votes = [
-            (r.report_id, *vote)
+            ((r.report_id, r.weight), *vote)
             for r in sorted(reports, key=lambda r: r.report_id)
             if (vote := plain_vote(r, voxel, bases, parameters))
         ]
@@ -111,21 +111,22 @@ def plain_decision(was, votes, parameters):
         return None
     distance = np.array([[plain_distance(a, b, parameters) for b in votes] for a in votes])
     label = DBSCAN(eps=parameters.eps, min_samples=parameters.min_samples, metric="precomputed").fit(distance).labels_
-    sizes = {cluster: int((label == cluster).sum()) for cluster in label if cluster >= 0}
+    weight = np.array([vote[0][1] for vote in votes])
+    sizes = {cluster: weight[label == cluster].sum() for cluster in label if cluster >= 0}
     if not sizes:
         return None
     winner = min(sizes, key=lambda cluster: (-sizes[cluster], cluster))
     members = [vote for vote, cluster in zip(votes, label, strict=True) if cluster == winner]
     denying = sum(measured and len(state) > 0 and len(was) > 0 and base == was for _, state, measured, base in members)
     denied = 2 * denying > len(members)
-    if not len(members) > (parameters.xi_reshaped if denied else parameters.xi) * len(votes):
+    if not sizes[winner] > (parameters.xi_reshaped if denied else parameters.xi) * weight.sum():
         return None
     now = plain_representative(members, parameters.mode)
     quotes = sum(not measured and len(state) > 0 and state == was for _, state, measured, _ in members)
     limit = parameters.d_denied if denied else parameters.d_update
     if plain_similarity(was, now, parameters) >= limit or 2 * quotes >= len(members):
         return None
-    return now, tuple(report_id for report_id, *_ in members)
+    return now, tuple(report_id for (report_id, _), *_ in members)
 
 
 def plain_representative(members, mode):
@@ -146,10 +147,13 @@ def plain_representative(members, mode):
     st.sampled_from(["default", "paper"]),
     st.sampled_from([0.3, 0.5, 0.6]),
     st.integers(1, 3),
+    st.lists(st.sampled_from([1.0, 0.5, 0.25]), min_size=7, max_size=7),
 )
-def test_the_merge_is_that_of_the_plain_twin(some, mode, xi, min_samples):
+def test_the_merge_is_that_of_the_plain_twin(some, mode, xi, min_samples, weights):
     parameters = MergeParameters(mode=mode, xi=xi, min_samples=min_samples)
-    reports = [Report(f"{n:026d}", change) for n, change in enumerate(some)]
+    reports = [
+        Report(f"{n:026d}", change, weight) for n, (change, weight) in enumerate(zip(some, weights, strict=False))
+    ]
     bases = {sha_of(EPOCH): EPOCH, sha_of(OLDER): OLDER}
     got = merge_tile(EPOCH, statements_of(EPOCH, reports, bases, mode), parameters)
     expected, provenance = plain_merge(EPOCH, reports, bases, parameters)

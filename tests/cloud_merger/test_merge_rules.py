@@ -207,6 +207,17 @@ def test_a_vehicle_that_denies_the_map_is_not_counted_with_those_who_quote_it():
     assert merged([denies, quotes]).gaussians == EPOCH  # half is no majority
 
 
+def test_votes_are_weighed_by_sensor():
+    assert MergeParameters().weight_of("Scala") == 0.5
+    assert MergeParameters(mode="paper").weight_of("Scala") == 1.0
+    sees, none = change_of(EPOCH, [2], {2: POLE}), change_of(EPOCH, [2], {})
+    reports = [Report(report_id(0), sees), *(Report(report_id(n), none, 0.25) for n in (1, 2))]
+    statements = statements_of(EPOCH, reports, {sha_of(EPOCH): EPOCH})
+    assert merge_tile(EPOCH, statements).changed.tolist() == [2]
+    with pytest.raises(MergerError, match="weight of Scala must lie in"):
+        MergeParameters(sensor_weights={"Scala": 0.0})
+
+
 def test_a_denied_voxel_needs_the_lower_share():
     denies, quotes = change_of(EPOCH, [0, 1], {1: POLE}), change_of(EPOCH, [0, 1], {})
     assert merged([denies] * 5 + [quotes] * 4).changed.tolist() == [1]
