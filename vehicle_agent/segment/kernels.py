@@ -59,6 +59,8 @@ class Judge(NamedTuple):
     margin_m: float
     margin_share: float
     gap_tan: float
+    enough: int
+    """Weight of "static" votes, none against them, after which a point is asked about no more."""
 
 
 @kernel
@@ -381,6 +383,8 @@ def vote(  # noqa: C901  (one loop over the window)
     """
     column_rad = 2.0 * math.pi / optics.columns
     for n in range(len(points)):
+        if passed[n] == 0 and met[n] >= judge.enough:
+            continue
         x, y, z = points[n, 0] + offset_m[0], points[n, 1] + offset_m[1], points[n, 2] + offset_m[2]
         u, v = R[0, 0] * x + R[0, 1] * y + R[0, 2] * z, R[1, 0] * x + R[1, 1] * y + R[1, 2] * z
         place = places[min(int(_turn(v, u) * BINS), BINS - 1)]
@@ -448,14 +452,20 @@ def _join(parent: I32, a: int, b: int) -> None:
 
 @kernel
 def _join_above(index: I32, n: int, reach: int, keys: I64, values: I32, parent: I32) -> None:
-    """Join voxel `n` with the next voxel above it in each of its nine columns: layers leave gaps between them."""
+    """Join voxel `n` with the nine above it, else with the next one straight above: layers leave gaps."""
+    found = False
     for column in range(9):
-        i, j = index[n, 0] + column // 3 - 1, index[n, 1] + column % 3 - 1
-        for up in range(1, reach + 1):
-            at = _slot(keys, _key(i, j, index[n, 2] + up))
-            if keys[at] != -1:
-                _join(parent, n, values[at])
-                break
+        at = _slot(keys, _key(index[n, 0] + column // 3 - 1, index[n, 1] + column % 3 - 1, index[n, 2] + 1))
+        if keys[at] != -1:
+            _join(parent, n, values[at])
+            found = True
+    for up in range(2, reach + 1):
+        if found:
+            break
+        at = _slot(keys, _key(index[n, 0], index[n, 1], index[n, 2] + up))
+        if keys[at] != -1:
+            _join(parent, n, values[at])
+            found = True
 
 
 @kernel

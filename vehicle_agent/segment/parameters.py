@@ -27,23 +27,23 @@ class SegmentParameters:
     """Scans nearer in time show too little motion."""
     range_min_m: float = 2.0
     """Nearer points are the vehicle itself."""
-    range_max_m: float = 60.0
+    range_max_m: float = 50.0
     """Farther points are not judged (they count as static): beyond the range of detection."""
-    column_deg: float = 0.25
+    column_deg: float = 0.3
     """Width of the range images' columns, at least the spacing of the sensor's shots."""
-    row_deg: float = 0.25
+    row_deg: float = 0.4
     """Height of their rows at the horizon; rows are even in the tangent of the elevation."""
     reach_across_m: float = 0.15
     """How far from a point a ray may pass at its side and still speak about it."""
     reach_up_m: float = 0.3
     """The same above and below: layers are far apart."""
-    margin_m: float = 0.35
+    margin_m: float = 0.45
     """A ray passes a point where it ends farther behind it than this …"""
     margin_share: float = 0.01
     """… plus this share of the range."""
     mass_moving: float = 0.5
     """Mass that one passing ray gives to "moving"."""
-    mass_static: float = 0.5
+    mass_static: float = 0.6
     """Mass that one return at the same place gives to "static"."""
     ground_cell_m: float = 1.0
     ground_slope: float = 0.15

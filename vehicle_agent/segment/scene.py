@@ -30,6 +30,7 @@ I64 = NDArray[np.int64]
 GAP_SHARE = 0.8  # of layers that are at most so far apart
 MOST_REACH = 8  # voxels
 NS = 1_000_000_000
+ENOUGH = 3  # full votes for "static", none against them
 VISIBLE = 0.8  # of the distance at which the lowest ray meets a level road
 STEP_M = 0.15  # what rises more from one scan to the next is not the ground
 SPREAD_M = 0.5  # farther apart than this within two degrees: start and end of a sweep meet there
@@ -93,7 +94,7 @@ def hash_table(n: int) -> tuple[I64, I32]:
 
 def judge_of(p: SegmentParameters, gap_tan: float) -> Judge:
     """What a vote needs: parameters, and the distance of the sensor's layers."""
-    return Judge(p.reach_across_m, p.reach_up_m, p.margin_m, p.margin_share, 1.2 * gap_tan)
+    return Judge(p.reach_across_m, p.reach_up_m, p.margin_m, p.margin_share, 1.2 * gap_tan, ENOUGH * WEIGHTS)
 
 
 class GroundMap:
