@@ -14,7 +14,7 @@ from benchmarks.simulation.cloud import map_of_one, merged_map
 from benchmarks.simulation.errors import FolderError
 from benchmarks.simulation.masses import WATCHED, Watch, choose, most_telling
 from benchmarks.simulation.run import Outcome, WorldOutcome
-from benchmarks.simulation.tables import target_single
+from benchmarks.simulation.targets import target_single
 from benchmarks.simulation.worlds import read_world_base
 from fleet_sim.ellipsoids import ellipsoids_of_maps, ellipsoids_of_truth
 from fleet_sim.pictures import View, draw_map

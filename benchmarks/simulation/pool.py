@@ -14,10 +14,10 @@ from typing import Any, Final
 from rich.progress import Progress, TaskID
 
 from benchmarks.simulation.errors import FolderError, ReproduceError, Stopped
+from benchmarks.simulation.streams import Tick
 
 _ONE_THREAD: Final = ("OPENBLAS_NUM_THREADS", "NUMBA_NUM_THREADS", "OMP_NUM_THREADS")
 _LOOK_S: Final = 0.2
-Tick = Callable[[int, int], None]
 
 
 @dataclass(frozen=True, slots=True)

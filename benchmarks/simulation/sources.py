@@ -16,13 +16,17 @@ VEHICLE: Final = (
     "vehicle_agent/segment",
     "vehicle_agent/report.py",
     "vehicle_agent/local_map.py",
+    "vehicle_agent/place.py",
     "vehicle_agent/scans.py",
+    "vehicle_agent/surroundings.py",
     "benchmarks/simulation/vehicle.py",
     "benchmarks/simulation/poses.py",
     "benchmarks/simulation/held_tiles.py",
     "benchmarks/simulation/base_map.py",
     "benchmarks/simulation/masses.py",
     "benchmarks/simulation/labels.py",
+    "benchmarks/simulation/streams.py",
+    "benchmarks/simulation/kept_evidence.py",
     "benchmarks/simulation/voxel_rows.py",
 )
 _SUFFIXES: Final = (".py", ".json", ".npz", ".toml")

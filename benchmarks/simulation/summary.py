@@ -9,6 +9,7 @@ import numpy as np
 
 from benchmarks.simulation.run import Outcome, WorldOutcome, plain_options
 from benchmarks.simulation.scoring import STALE, Scored
+from benchmarks.simulation.targets import targets_of
 from fleet_sim.evaluate import CLASSES
 from fleet_sim.truth import LEVELS
 from gnd_map.config import to_mapping
@@ -24,6 +25,7 @@ def summary_of(outcome: Outcome) -> dict[str, Any]:
     """Return everything as plain values; of several seeds the means, and each below `by_seed`."""
     by_seed = {str(world.seed): _world_summary(world) for world in outcome.worlds}
     found = mean_of(list(by_seed.values()))
+    found["targets"] = targets_of(found)
     found["confusion"] = confusion_of(outcome.worlds)
     found["parameters"] = parameters_of(outcome)
     found["seeds"] = list(outcome.options.seeds)

@@ -8,6 +8,7 @@ from rich.table import Table
 from rich.text import Text
 
 from benchmarks.simulation import reference
+from benchmarks.simulation.targets import target_single
 from fleet_sim.truth import LEVELS
 
 PCD_CODEC: Final = "points"
@@ -80,14 +81,6 @@ def notes_of(found: Mapping[str, Any]) -> Text:
         share = 100 * sum(ours.values()) / sum(one[PCD_CODEC] for one in theirs.values())
         lines.append(f"Upload of one drive: {share:.2f} % of the point-cloud baseline's (at most 4 %).")
     return Text("\n".join(lines))
-
-
-def target_single(found: Mapping[str, Any]) -> dict[str, float] | None:
-    """Return the mean F1 of one drive over the 16- and 32-layer sensors that drove, by level; None if none did."""
-    stages = [found["single"][sensor] for sensor in reference.TARGET_SENSORS if sensor in found["single"]]
-    if not stages:
-        return None
-    return {level: sum(stage["f1"][level] for stage in stages) / len(stages) for level in LEVELS}
 
 
 def _classes(title: str, n: str, classes: Mapping[str, Mapping[str, float]]) -> Table:

@@ -1,7 +1,7 @@
 """One vehicle from measurements to uploads, in one process: localise, segment, detect, report, as the agent does."""
 
 from collections import Counter
-from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import asdict, dataclass
 from itertools import chain
 from pathlib import Path
@@ -15,28 +15,22 @@ from benchmarks.simulation.base_map import BaseMap, read_base
 from benchmarks.simulation.baseline import CloudVehicle, read_cloud
 from benchmarks.simulation.errors import ReproduceError
 from benchmarks.simulation.held_tiles import HeldTiles
+from benchmarks.simulation.kept_evidence import RecordingDetector, evidence_columns
 from benchmarks.simulation.labels import MoverLabels
 from benchmarks.simulation.masses import Watch, Watcher
 from benchmarks.simulation.method import MethodParameters
 from benchmarks.simulation.pose_source import PoseSource
 from benchmarks.simulation.poses import FromReference, Localisation, Localising
-from benchmarks.simulation.result import EVIDENCE, VehicleResult, write_result
+from benchmarks.simulation.result import VehicleResult, write_result
+from benchmarks.simulation.streams import Tick, as_recorded, recorded, ticking
 from benchmarks.simulation.voxel_rows import VoxelRows
 from fleet_sim.drives import DriveConfig, DriveSimulation
 from fleet_sim.world import read_world
-from gnd_map.arrays import I32
-from gnd_map.classes import ChangeClass
 from gnd_map.geodesy import LocalFrame
 from gnd_map.grid import GridFrame
 from gnd_map.motion import Trajectory
-from gnd_map.similarity import similarity
 from gnd_map.tile_id import TileId
 from schemas.drive import DriveHeader, DriveItem, GnssFix, ReferencePose, Scan
-from schemas.drive_mcap import DriveWriter
-from schemas.drive_messages import fix_of, gnss_of, pose_message_of, reference_of
-from vehicle_agent.detect.classify import classify
-from vehicle_agent.detect.detector import ChangeDetector
-from vehicle_agent.detect.evidence import TileEvidence
 from vehicle_agent.errors import LocaliseError
 from vehicle_agent.local_map import LocalMap
 from vehicle_agent.localise.estimates import PoseEstimate, localisation_error
@@ -45,9 +39,6 @@ from vehicle_agent.place import Place
 from vehicle_agent.report import Identity, Reporter
 from vehicle_agent.scans import Guard
 from vehicle_agent.segment import MotionSegmenter, SegmentedScan
-
-Tick = Callable[[int, int], None]
-"""Told (scans done, scans in all); may raise `Stopped`."""
 
 _ALL_LETTERS = 1_000_000
 
@@ -93,31 +84,6 @@ def run_vehicle(task: VehicleTask, tick: Tick) -> None:
     write_result(result, task.key, task.result)
 
 
-def ticking(items: Iterable[DriveItem], tick: Tick, scans: int) -> Iterator[DriveItem]:
-    """Pass items on; tell `tick` about every scan that has been worked on."""
-    done = 0
-    for item in items:
-        yield item
-        if isinstance(item, Scan):
-            done += 1
-            tick(done, scans)
-
-
-def as_recorded(item: DriveItem) -> DriveItem:
-    """Return a measurement as a recording gives it back: positions in degrees and poses by quaternion round a bit."""
-    if isinstance(item, GnssFix):
-        return gnss_of(fix_of(item))
-    return reference_of(pose_message_of(item)) if isinstance(item, ReferencePose) else item
-
-
-def recorded(items: Iterable[DriveItem], header: DriveHeader, path: Path) -> Iterator[DriveItem]:
-    """Pass items on and write them to an MCAP file, which appears when all have passed."""
-    with DriveWriter(path, header) as writer:
-        for item in items:
-            writer.add(item)
-            yield item
-
-
 def drive(
     header: DriveHeader,
     items: Iterable[DriveItem],
@@ -152,18 +118,6 @@ def drive(
     pcd, pcd_bytes = run.pcd_report()
     stats = run.stats() | {"pcd_bytes": pcd_bytes, "cpu_s": round(process_time() - started_s, 2)}
     return VehicleResult(task.drive.vehicle, task.sensor, reports, row, evidence, stats, run.watched(), pcd)
-
-
-class RecordingDetector(ChangeDetector):
-    """The detector, which also keeps the evidence that was taken out of it."""
-
-    taken: list[TileEvidence]
-
-    def finish(self, tiles: Collection[TileId]) -> dict[TileId, TileEvidence]:
-        """Take out the evidence of tiles, and keep it."""
-        found = super().finish(tiles)
-        self.taken = [*getattr(self, "taken", []), *found.values()]
-        return found
 
 
 class _Run:
@@ -275,23 +229,3 @@ def _localisation(header: DriveHeader, local_map: LocalMap, task: VehicleTask) -
     if task.poses.kind == "estimated":
         return Localising(header, local_map, task.method.localise)
     return FromReference(header, local_map, task.poses, task.drive.seed)
-
-
-def evidence_columns(found: TileEvidence, method: MethodParameters) -> dict[str, I32]:
-    """Return the columns `EVIDENCE` of a tile's evidence, int32 (K,) each."""
-    columns = {name: getattr(found, name) for name in EVIDENCE if name.startswith("n_")}
-    columns["cells"] = found.measured.cells
-    rows, base = np.flatnonzero(found.in_map), found.base.gaussians
-    at, new = found.map_row[rows], found.measured
-    columns["map_cells"], columns["similar_pct"] = np.zeros((2, len(found)), np.int32)
-    if len(rows):
-        columns["map_cells"][rows] = base.cells[at]
-        alike = similarity(
-            base.exists[at], base.mean_m[at], base.cov_m2[at], new.exists[rows], new.mean_m[rows], new.cov_m2[rows]
-        )
-        columns["similar_pct"][rows] = np.round(100 * alike)
-    columns["change_class"] = classify(found, method.detect).change_class.astype(np.int32)
-    return columns
-
-
-NOT_SEEN = int(ChangeClass.UNMEASURED)

@@ -6,6 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
+from benchmarks.simulation.result import EVIDENCE
 from fleet_sim.truth import Truth
 from gnd_map.arrays import I32, I64
 from vehicle_agent.detect.evidence import TileEvidence
@@ -49,8 +50,6 @@ class VoxelRows:
             rows.append(row)
             parts.append({name: column[at] for name, column in columns_of(evidence).items()})
         if not parts:
-            from benchmarks.simulation.result import EVIDENCE
-
             return np.zeros(0, np.int32), {name: np.zeros(0, np.int32) for name in EVIDENCE}
         row, first = np.unique(np.concatenate(rows), return_index=True)
         joined = {name: np.concatenate([part[name] for part in parts])[first] for name in parts[0]}

@@ -13,8 +13,9 @@ from benchmarks.simulation.options import RunOptions
 from benchmarks.simulation.pose_source import PoseSource
 from benchmarks.simulation.poses import TIME_CONSTANT_S, FromReference
 from benchmarks.simulation.result import VehicleResult
+from benchmarks.simulation.streams import as_recorded
 from benchmarks.simulation.tasks import vehicle_tasks
-from benchmarks.simulation.vehicle import VehicleTask, as_recorded, drive
+from benchmarks.simulation.vehicle import VehicleTask, drive
 from benchmarks.simulation.voxel_rows import VoxelRows
 from benchmarks.simulation.worlds import WorldFiles, world_files
 from fleet_sim.drives import DriveSimulation, simulate_drive

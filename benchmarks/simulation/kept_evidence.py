@@ -1,0 +1,43 @@
+"""The evidence of a drive, kept beside what is reported, for the analysis of errors."""
+
+from collections.abc import Collection
+
+import numpy as np
+
+from benchmarks.simulation.method import MethodParameters
+from benchmarks.simulation.result import EVIDENCE
+from gnd_map.arrays import I32
+from gnd_map.similarity import similarity
+from gnd_map.tile_id import TileId
+from vehicle_agent.detect.classify import classify
+from vehicle_agent.detect.detector import ChangeDetector
+from vehicle_agent.detect.evidence import TileEvidence
+
+
+class RecordingDetector(ChangeDetector):
+    """The detector, which also keeps the evidence that was taken out of it."""
+
+    taken: list[TileEvidence]
+
+    def finish(self, tiles: Collection[TileId]) -> dict[TileId, TileEvidence]:
+        """Take out the evidence of tiles, and keep it."""
+        found = super().finish(tiles)
+        self.taken = [*getattr(self, "taken", []), *found.values()]
+        return found
+
+
+def evidence_columns(found: TileEvidence, method: MethodParameters) -> dict[str, I32]:
+    """Return the columns `EVIDENCE` of a tile's evidence, int32 (K,) each."""
+    columns = {name: getattr(found, name) for name in EVIDENCE if name.startswith("n_")}
+    columns["cells"] = found.measured.cells
+    rows, base = np.flatnonzero(found.in_map), found.base.gaussians
+    at, new = found.map_row[rows], found.measured
+    columns["map_cells"], columns["similar_pct"] = np.zeros((2, len(found)), np.int32)
+    if len(rows):
+        columns["map_cells"][rows] = base.cells[at]
+        alike = similarity(
+            base.exists[at], base.mean_m[at], base.cov_m2[at], new.exists[rows], new.mean_m[rows], new.cov_m2[rows]
+        )
+        columns["similar_pct"][rows] = np.round(100 * alike)
+    columns["change_class"] = classify(found, method.detect).change_class.astype(np.int32)
+    return columns
