@@ -10,8 +10,8 @@ _COMMANDS: Final[dict[str, tuple[str, str]]] = {
         "benchmarks.simulation.command:simulation",
         "The GND paper's simulation: worlds, single drives, fleets.",
     ),
+    "errors": ("benchmarks.simulation.errors_command:errors", "Which voxels of a simulation cost F1, and why."),
     "real": ("benchmarks.real.command:real", "Detection on recordings of real sensors, with objects inserted."),
-    "errors": ("benchmarks.simulation.errors_command:errors", "Which voxels of such a run cost F1, and why."),
 }
 
 
