@@ -1,7 +1,7 @@
 """A recording with its track, laid on the grid in one of many ways: which way it lies there is chance, not quality."""
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -103,8 +103,9 @@ def load(recording: Recording, at_most: int, progress: Progress) -> Recorded:
         RealDataError: fewer than four usable scans.
         ImportDriveError: damaged files, scans that do not fit together.
     """
+    whole, n = len(recording), min(len(recording), at_most)
+    recording = replace(recording, t_ns=recording.t_ns[:n]) if n > 1 else recording
     track = map_track(recording, progress)
-    n = min(len(recording), at_most)
     found, empty = [], 0
     for i in range(n):
         scan = cleaned(recording.read(i)).scan
@@ -116,7 +117,7 @@ def load(recording: Recording, at_most: int, progress: Progress) -> Recorded:
         raise RealDataError(f"{recording.name}: {len(found)} usable scans of {n}; at least 4 are needed for two halves")
     left_out = list(recording.notes)
     left_out += [f"{empty} scans without a usable point: left out"] if empty else []
-    left_out += [f"scans after the first {n} of {len(recording)}: left out"] if n < len(recording) else []
+    left_out += [f"scans after the first {n} of {whole}: left out"] if n < whole else []
     return Recorded(recording.name, tuple(found), track, recording, tuple(left_out))
 
 

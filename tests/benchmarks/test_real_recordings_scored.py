@@ -12,18 +12,20 @@ pytestmark = pytest.mark.slow
 
 
 @pytest.mark.parametrize(
-    ("folder", "at_most", "false_per_1000"),
-    [("kitti00_start16", 16, 3.0), ("radiate_fog", 40, 3.0), ("kitti_raw_0060", 40, 5.0)],
+    ("folder", "at_most", "recall_new", "false_per_1000"),
+    [("kitti00_start16", 16, 0.7, 2.0), ("radiate_fog", 40, 0.5, 2.0), ("kitti_raw_0060", 20, 0.6, 5.0)],
 )
-def test_recordings_of_real_sensors(shared_data: Path, folder: str, at_most: int, false_per_1000: float) -> None:
+def test_recordings_of_real_sensors(
+    shared_data: Path, folder: str, at_most: int, recall_new: float, false_per_1000: float
+) -> None:
     if not (shared_data / folder).is_dir():
         pytest.skip(f"{folder} is not there")
     options = RealOptions(shared_data / folder, rounds=1, objects=8, at_most=at_most)
     found = reproduce_real(options, None, no_progress)
     inserted, untouched = found["inserted"], found["untouched"]
-    assert inserted["new"]["true"] >= 8
-    assert inserted["deleted"]["true"] >= 8
-    assert inserted["new"]["recall"] >= 0.7
+    assert inserted["new"]["true"] >= 5
+    assert inserted["deleted"]["true"] >= 5
+    assert inserted["new"]["recall"] >= recall_new
     assert inserted["deleted"]["recall"] >= 0.85
-    assert inserted["new"]["precision_near_objects"] >= 0.9
+    assert inserted["new"]["precision_near_objects"] >= 0.75
     assert untouched["false_per_1000"] <= false_per_1000
