@@ -60,7 +60,7 @@ class SegmentParameters:
     """Share of moving voxels that makes a whole object move."""
     min_voxels: int = 2
     """Moving voxels that an object needs."""
-    part_voxels: int = 4
+    part_voxels: int = 6
     """Adjacent moving voxels that are taken out of an object which as a whole stands."""
 
     def __post_init__(self) -> None:
