@@ -124,8 +124,10 @@ def _grown(c: Counts) -> Counts:
 
 def box_sums(at: I64, values: I32, reach: int) -> I64:
     """(K,) sums of `values` over the listed cells (K, 3) within `reach` cells of each."""
-    low = at.min(axis=0, initial=0) - reach
-    shape = at.max(axis=0, initial=0) + reach + 1 - low
+    if not len(at):
+        return np.zeros(0, np.int64)
+    low = at.min(axis=0) - reach
+    shape = at.max(axis=0) + reach + 1 - low
     key = np.ravel_multi_index(tuple((at - low).T), tuple(shape.tolist()))
     order = np.argsort(key)
     ordered, total = key[order], np.zeros(len(at), np.int64)
