@@ -32,7 +32,7 @@ DPI: Final = 110
 
 
 def draw_round(one: Round, folder: Path) -> list[Path]:
-    """Draw the untouched drive, the drive with objects, and the segmented points; the files written.
+    """Draw the untouched drive, the drive with objects (where there are some), and the segmented points; the files.
 
     Raises:
         RealDataError: a file cannot be written.
@@ -45,11 +45,14 @@ def draw_round(one: Round, folder: Path) -> list[Path]:
     )
     files = [folder / f"{name}_untouched.png", folder / f"{name}_inserted.png", folder / f"{name}_segmented.png"]
     _save(_classes(one, untouched.found, (), (), f"{name}: nothing changed; reported {false}"), files[0])
-    title = f"{name}: {len(inserted.new)} objects new, {len(inserted.gone)} gone"
-    _save(_classes(one, inserted.found, inserted.new, inserted.gone, title), files[1])
+    if inserted.new or inserted.gone:
+        title = f"{name}: {len(inserted.new)} objects new, {len(inserted.gone)} gone"
+        _save(_classes(one, inserted.found, inserted.new, inserted.gone, title), files[1])
+    else:
+        files.pop(1)
     moving = untouched.sample_moving
     title = f"{name}: {moving.mean():.1%} of the points of {len(scene.scans) // 2} scans marked as moving"
-    _save(_points(one, untouched.sample_m, moving, title), files[2])
+    _save(_points(one, untouched.sample_m, moving, title), files[-1])
     return files
 
 

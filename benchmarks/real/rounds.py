@@ -77,10 +77,10 @@ def run_round(
         halves: numbers of the scans that make the map, and of those that are driven.
         number: of the round: which way the recording lies on the grid, and which places are chosen.
         objects: how many to insert, half of them into either half.
-        seed: of the places.
+        seed: of both.
         method: how the vehicle works.
     """
-    scene = place(recorded, number)
+    scene = place(recorded, number, seed)
     mapping, driving = ([scene.scans[i] for i in half] for half in halves)
     untouched = _untouched(scene, mapping, driving, method)
     rng = np.random.default_rng([seed, number])

@@ -121,9 +121,9 @@ def load(recording: Recording, at_most: int, progress: Progress) -> Recorded:
     return Recorded(recording.name, tuple(found), track, recording, tuple(left_out))
 
 
-def place(recorded: Recorded, number: int) -> Scene:
+def place(recorded: Recorded, number: int, seed: int = 0) -> Scene:
     """The recording turned about the vertical and shifted by less than a voxel, seeded; number 0 is as recorded."""
-    rng, A = np.random.default_rng([77, number]), np.eye(4)
+    rng, A = np.random.default_rng([77, seed, number]), np.eye(4)
     if number:
         A[:3, :3] = exp_so3([0.0, 0.0, rng.uniform(0.0, 2.0 * np.pi)])
         A[:3, 3] = rng.uniform(-0.5, 0.5, 3)

@@ -71,8 +71,8 @@ def _class_scores(rounds: Sequence[Round], change: ChangeClass) -> dict[str, Any
         "true": true,
         "found": hit,
         "recall": _rate(hit, true, 1.0),
-        "precision": _rate(hit, reported, 1.0),
-        "precision_near_objects": _rate(hit, hit + near, 1.0),
+        "precision": _rate(hit, reported if true else 0, 1.0),
+        "precision_near_objects": _rate(hit, hit + near if true else 0, 1.0),
         "false": reported - hit,
     }
 
