@@ -24,8 +24,8 @@ from gnd_map.classes import CLASS_COLOURS
 from gnd_map.evidence import MassParameters, masses
 
 _INK: Final = "#1c2430"
-_GREY: Final = "#8a94a3"
 _MASSES: Final = (("m(S) sustained", "#2f6fb5"), ("m(C) changed", "#d1433f"), ("m(Ω) unknown", "#8a94a3"))
+_LEVEL_NAMES: Final = {"all": "all voxels", "marginal_excluded": "marginal excluded", "scored": "scored voxels"}
 _LEVEL_STYLE: Final = {"scored": "-", "marginal_excluded": "--", "all": ":"}
 
 
@@ -69,34 +69,48 @@ def draw_changes(outcome: Outcome, world: WorldOutcome, truth: Truth, folder: Pa
 
 
 def draw_curve(summary: Mapping[str, Any], path: Path) -> Path:
-    """Draw Figure 17: F1 of scored voxels by number of vehicles; thin lines are the other two levels."""
-    figure = Figure(figsize=(9.0, 5.6), dpi=150, facecolor="white")
-    axes = figure.add_axes((0.085, 0.11, 0.885, 0.76))
+    """Draw Figure 17: F1 of scored voxels by number of vehicles; thin lines are the other two levels.
+
+    The axis is broken: the stale map lies far below everything else.
+    """
+    figure = Figure(figsize=(9.4, 6.4), dpi=150, facecolor="white")
+    axes, below = figure.add_axes((0.08, 0.27, 0.89, 0.61)), figure.add_axes((0.08, 0.095, 0.89, 0.13))
     numbers = sorted(int(n) for n in summary["fleet"])
-    for level in reversed(LEVELS):
-        main = level == "scored"
-        values = [summary["fleet"][str(n)]["f1"][level] for n in numbers]
-        label = {"scored": "fleet, scored voxels", "all": "fleet, all voxels"}.get(level, "fleet, marginal excluded")
-        axes.plot(numbers, values, _LEVEL_STYLE[level], color="#2e8b57", linewidth=2.4 if main else 1.3, label=label)
-    _spread(axes, summary, numbers)
-    single, of = _one_drive(summary)
-    _line(axes, summary["stale"]["f1"]["scored"], "#2f6fb5", "stale map")
-    _line(axes, single, "#e0a020", f"one drive alone, {of}")
-    _baseline(axes, summary)
-    for n, value in (reference.FLEET | reference.FLEET_READ_OFF).items():
-        axes.plot([n], [value], "x", color=_INK, markersize=7, zorder=5)
-    axes.plot([], [], "x", color=_INK, label=f"paper (stale {reference.STALE}, one drive {reference.SINGLE})")
-    _dress(axes, "vehicles", "macro F1 in percent")
-    axes.set(xlim=(min(numbers), max(*numbers, 2)), ylim=(min(30.0, summary["stale"]["f1"]["scored"] - 5), 101))
-    axes.xaxis.set_major_locator(MaxNLocator(integer=True))
-    axes.legend(frameon=False, fontsize=9.5, loc="center right", labelcolor=_INK)
+    drawn = [*_curves(axes, summary, numbers), *_baseline(axes, summary)]
+    stale = summary["stale"]["f1"]["scored"]
+    below.axhline(stale, color="#2f6fb5", linewidth=1.8)
+    axes.plot([], [], color="#2f6fb5", linewidth=1.8, label=f"stale map: {stale:.2f} (paper {reference.STALE})")
+    paper = {1: reference.SINGLE, **reference.FLEET_READ_OFF, **reference.FLEET}
+    shown = [n for n in paper if n <= max(numbers)]
+    axes.plot(shown, [paper[n] for n in shown], "x", color=_INK, markersize=7, label="paper", clip_on=False, zorder=5)
+    for part in (axes, below):
+        _dress(part, "", "")
+        part.set_xlim(min(numbers) - 0.3, max(*numbers, 2) + 0.3)
+        part.xaxis.set_major_locator(MaxNLocator(integer=True))
+    axes.set_ylim(np.floor(min(*drawn, reference.SINGLE)) - 1.5, 100.5)
+    axes.tick_params(labelbottom=False)
+    axes.spines["bottom"].set_visible(False)
+    below.set_ylim(stale - 6, stale + 6)
+    below.set_xlabel("vehicles", color=_INK)
+    axes.set_ylabel("macro F1 in percent", color=_INK)
+    axes.legend(frameon=False, fontsize=9.5, loc="lower right", labelcolor=_INK, ncols=2)
     seeds = ", ".join(map(str, summary["seeds"]))
     _title(figure, "F1 by number of vehicles", f"world seed {seeds}, poses {summary['parameters']['poses']}")
     return _save(figure, path)
 
 
-def _line(axes: Axes, value: float, colour: str, label: str) -> None:
-    axes.axhline(value, color=colour, linewidth=1.8, label=f"{label}: {value:.2f}")
+def _curves(axes: Axes, summary: Mapping[str, Any], numbers: list[int]) -> list[float]:
+    """Draw the fleet at the three levels and the line of one drive; give all values."""
+    _spread(axes, summary, numbers)
+    drawn: list[float] = []
+    for level in reversed(LEVELS):
+        values = [summary["fleet"][str(n)]["f1"][level] for n in numbers]
+        width, label = 2.4 if level == "scored" else 1.3, f"fleet, {_LEVEL_NAMES[level]}"
+        axes.plot(numbers, values, _LEVEL_STYLE[level], color="#2e8b57", linewidth=width, label=label)
+        drawn += values
+    single, of = _one_drive(summary)
+    axes.axhline(single, color="#e0a020", linewidth=1.8, label=f"one drive, {of}: {single:.2f}")
+    return [*drawn, single]
 
 
 def _one_drive(summary: Mapping[str, Any]) -> tuple[float, str]:
@@ -115,12 +129,14 @@ def _spread(axes: Axes, summary: Mapping[str, Any], numbers: list[int]) -> None:
         axes.fill_between(numbers, each.min(axis=0), each.max(axis=0), color="#2e8b57", alpha=0.15, linewidth=0)
 
 
-def _baseline(axes: Axes, summary: Mapping[str, Any]) -> None:
+def _baseline(axes: Axes, summary: Mapping[str, Any]) -> list[float]:
+    """Draw the point-cloud baseline, where it ran; give its values."""
     fleet = summary.get("pcd", {}).get("fleet", {})
-    if fleet:
-        numbers = sorted(int(n) for n in fleet)
-        values = [fleet[str(n)]["f1"]["scored"] for n in numbers]
-        axes.plot(numbers, values, "o-", color="#8455a8", linewidth=1.6, markersize=4, label="point-cloud baseline")
+    numbers = sorted(int(n) for n in fleet)
+    values = [float(fleet[str(n)]["f1"]["scored"]) for n in numbers]
+    if values:
+        axes.plot(numbers, values, "o-", color="#8455a8", linewidth=1.6, markersize=4, label="point clouds, scored")
+    return values
 
 
 def draw_masses(watch: Watch, history: tuple[I64, I32], parameters: MassParameters, sensor: str, path: Path) -> Path:

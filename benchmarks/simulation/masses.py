@@ -108,10 +108,16 @@ def _counters_at(found: TileEvidence, voxel_id: I32) -> I32:
 
 
 def most_telling(watch: Watch, counters: I32) -> Sequence[int]:
-    """Return for each watched class the index of the voxel with most evidence; -1 for a class that has none."""
-    total, classes = counters[-1].sum(axis=1) if len(counters) else np.zeros(len(watch.voxel_id)), watch.change_class
+    """Return for each watched class the index of the voxel whose evidence shows its case best.
+
+    Most BI for a normal one, BE for a new one, BO less BI for a modified one, PI for a deleted one; -1 for a class that
+    no ray has met.
+    """
+    if not len(counters):
+        return [-1] * len(WATCHED)
+    n_bi, n_bo, n_be, n_pi = counters[-1].T.astype(np.int64)
     found = []
-    for change_class in WATCHED:
-        of_class = [i for i, c in enumerate(classes) if c == change_class and total[i] > 0]
-        found.append(max(of_class, key=lambda i: total[i], default=-1))
+    for change_class, shown in zip(WATCHED, (n_bi, n_be, n_bo - n_bi, n_pi), strict=True):
+        met = np.flatnonzero((np.array(watch.change_class) == change_class) & (counters[-1].sum(axis=1) > 0))
+        found.append(int(met[np.argmax(shown[met])]) if len(met) else -1)
     return found
