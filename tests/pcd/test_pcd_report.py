@@ -7,6 +7,24 @@ from hypothesis import strategies as st
 from benchmarks.pcd import PcdCodecError, PcdError, PcdMap, PcdReport
 from benchmarks.pcd.points import cells_of
 from benchmarks.pcd.report import CODECS
+from gnd_map.geodesy import LocalFrame
+
+GOLDEN = {
+    "points": (
+        "5043523100030000000200000002000000030000001500000000000000000000000000000028b52ffd200c61000007000000"
+        "0100000024010000000080400000a0400000c03f000084400000a0400000c03f0000003f0000003f0000003f000000400000"
+        "4040000080bf"
+    ),
+    "indexed": (
+        "5043523101030000000200000002000000030000001500000000000000000000000000000028b52ffd200c61000007000000"
+        "0100000024010000000080400000a0400000c03f000084400000a0400000c03f0000000002000000"
+    ),
+    "compact": (
+        "504352310203000000020000000200000003000000150000002c000000390000001900000028b52ffd200c61000007000000"
+        "01000000240100001b00000028b52ffd20129100000000020000000000000000000f030d0d000028b52ffd20084100000000"
+        "000002000000"
+    ),
+}
 
 
 def same(a: PcdReport, b: PcdReport) -> bool:
@@ -37,6 +55,17 @@ def test_bytes_are_what_they_are_said_to_be(cloud, reports):
     bare = PcdReport(r.new_points[:0], r.deleted_index[:0], r.observed, r.map_size)
     assert size["points"] - len(bare.encode()) == 12 * (len(r.new_points) + len(r.deleted_index))
     assert size["compact"] < size["indexed"] / 2
+
+
+@pytest.mark.parametrize("codec", CODECS)
+def test_bytes_written_once_stay_readable(codec):
+    frame = LocalFrame(np.radians(37.5597), np.radians(127.04), 30.0)
+    tiny = PcdMap(np.array([[0.5, 0.5, 0.5], [1.5, 0.25, 0.75], [2.0, 3.0, -1.0]], np.float32), frame)
+    report = PcdReport.decode(bytes.fromhex(GOLDEN[codec]), tiny)
+    np.testing.assert_allclose(report.new_points, [[4.0, 5.0, 1.5], [4.125, 5.0, 1.5]], atol=0.004)
+    assert (report.deleted_index.tolist(), report.observed.tolist()) == ([0, 2], [7, 8, 300])
+    if codec != "compact":
+        assert report.encode(codec, tiny)[:29] == bytes.fromhex(GOLDEN[codec])[:29]
 
 
 @pytest.mark.parametrize("codec", CODECS)
