@@ -14,6 +14,7 @@ from vehicle_agent.detect.parameters import DetectParameters
 RIGHT: Final = "right"
 UNSEEN: Final = "never observed"
 FEW_CELLS: Final = "abstains: too few sub-cells"
+EDGE: Final = "abstains: may be the edge of a neighbour"
 FEW_RAYS: Final = "abstains: too few rays, or a tie"
 OTHER: Final = "other"
 
@@ -46,11 +47,13 @@ def causes(true_class: NDArray[np.uint8], e: Mapping[str, I32], p: DetectParamet
     said, t = e["change_class"], true_class
     silent = said == int(ChangeClass.UNMEASURED)
     weak = (e["cells"] >= p.weak_cells) & (e["cells"] < np.where(e["map_cells"] > 0, p.min_cells, p.new_cells))
+    many = (e["map_cells"] == 0) & (e["cells"] >= p.new_cells)
     part = e["cells"] < 0.5 * e["map_cells"]
     cases = (
         (e["seen"] == 0, UNSEEN),
         (said == t, RIGHT),
         (silent & weak, FEW_CELLS),
+        (silent & many, EDGE),
         (silent, FEW_RAYS),
         ((t == A) & (said == E) & (e["cells"] > 0), "empty: too few sub-cells met"),
         ((t == A) & (said == E), "empty: rays pass, nothing met"),

@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 
-from benchmarks.simulation.causes import FEW_CELLS, FEW_RAYS, RIGHT, UNSEEN, causes, columns_at
+from benchmarks.simulation.causes import EDGE, FEW_CELLS, FEW_RAYS, RIGHT, UNSEEN, causes, columns_at
 from benchmarks.simulation.losses import Loss, _gain, _pattern, mean_losses
 from benchmarks.simulation.result import EVIDENCE, VehicleResult
 from benchmarks.simulation.summary import mean_of
@@ -32,6 +32,7 @@ def evidence(**columns: int) -> dict[str, np.ndarray]:
             {"change_class": N, "cells": 50, "map_cells": 60, "similar_pct": 80},
             "normal: the Gaussians are too alike",
         ),
+        (A, {"change_class": U, "cells": 30}, EDGE),
         (M, {"change_class": N, "cells": 5, "map_cells": 60}, "normal: too few sub-cells for a Gaussian"),
         (N, {"change_class": M, "cells": 25, "map_cells": 60}, "modified: only a part of it seen"),
         (N, {"change_class": M, "cells": 55, "map_cells": 60}, "modified: unlike the map's Gaussian"),
