@@ -9,6 +9,7 @@ from hypothesis import strategies as st
 
 from benchmarks.fit_shape_change import Examples, fit, forest_of
 from gnd_map.gaussian import Gaussians
+from vehicle_agent.detect.parameters import DetectParameters
 from vehicle_agent.detect.shape_change import FEATURES, MONOTONE, Forest, ShapeModelError, fitted, shape_features
 
 
@@ -63,7 +64,7 @@ def plates(offset_m: float, normal: int = 0) -> Gaussians:
 def test_a_plate_that_moved_or_turned_is_of_another_shape(now: Gaussians, outside: int, reshaped: bool) -> None:
     n_bi, n_bo, n_pi = (np.array([n], np.int32) for n in (250 - outside, outside, 0))
     odds = fitted().log_odds(shape_features(plates(0.0), now, n_bi, n_bo, n_pi))
-    assert (odds[0] > 0.2) == reshaped
+    assert (odds[0] > DetectParameters().reshaped_log_odds) == reshaped
 
 
 @pytest.mark.parametrize(

@@ -86,7 +86,7 @@ def _decide_of_empty(e: TileEvidence, p: DetectParameters) -> NDArray[np.int64]:
     """Voxels in which the map has none: new or empty; few passes abstain, and weak hits unless many rays looked."""
     new = e.measured.cells >= _least_cells_of_new(e, p)
     weak = (e.measured.cells >= p.weak_cells) & (e.n_pe + e.n_be < p.many_rays)
-    empty = ~weak & (e.n_pe >= p.min_passes)
+    empty = ~weak & (e.measured.cells < p.empty_cells) & (e.n_pe >= p.min_passes)
     return np.select([new, empty], [ChangeClass.NEW, ChangeClass.EMPTY], ChangeClass.UNMEASURED)
 
 

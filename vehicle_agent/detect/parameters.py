@@ -62,9 +62,11 @@ class DetectParameters:
     """Rays through an empty voxel before it counts as observed empty."""
     many_rays: int = 100
     """So many rays into a voxel without a Gaussian make too few hits a statement: by the one rule it is empty."""
+    empty_cells: int = 15
+    """From here on a voxel is never called empty: another vehicle may find the sub-cells that are missing."""
     min_pass_inside: int = 3
     """PI rays that a deletion needs."""
-    reshaped_log_odds: float = 0.2
+    reshaped_log_odds: float = -0.4
     """A measured Gaussian is of another shape than the map's from these log-odds on (see `shape_change`)."""
 
     def __post_init__(self) -> None:
