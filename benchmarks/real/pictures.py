@@ -44,7 +44,7 @@ def draw_round(one: Round, folder: Path) -> list[Path]:
         f"{count[c]} {c.name.lower()}" for c in (ChangeClass.NEW, ChangeClass.MODIFIED, ChangeClass.DELETED)
     )
     files = [folder / f"{name}_untouched.png", folder / f"{name}_inserted.png", folder / f"{name}_segmented.png"]
-    _save(_classes(one, untouched.found, (), (), f"{name}: nothing changed; reported {false}"), files[0])
+    _save(_classes(one, untouched.found, (), (), f"{name}: untouched; reported {false}"), files[0])
     if inserted.new or inserted.gone:
         title = f"{name}: {len(inserted.new)} objects new, {len(inserted.gone)} gone"
         _save(_classes(one, inserted.found, inserted.new, inserted.gone, title), files[1])
