@@ -1,6 +1,7 @@
 """MCAP files with ROS 2 clouds, written by Foxglove's own encoder: an oracle that shares nothing with our reader."""
 
 from pathlib import Path
+from typing import IO
 
 import numpy as np
 from mcap_ros2.writer import Writer
@@ -58,12 +59,17 @@ def message_of(points: np.ndarray, stamp_ns: int, height: int = 1, padding: int 
 def write_ros(path: Path, clouds: list[tuple[str, int, dict]]) -> Path:
     """Clouds as (topic, log time, message)."""
     with path.open("wb") as stream:
-        writer = Writer(stream, chunk_size=200_000)
-        schema = writer.register_msgdef("sensor_msgs/msg/PointCloud2", MSGDEF)
-        for topic, log_ns, message in clouds:
-            writer.write_message(topic, schema, message, log_time=log_ns, publish_time=log_ns)
-        writer.finish()
+        write_clouds(stream, clouds)
     return path
+
+
+def write_clouds(stream: IO[bytes], clouds: list[tuple[str, int, dict]]) -> None:
+    """The same into a stream."""
+    writer = Writer(stream, chunk_size=200_000)
+    schema = writer.register_msgdef("sensor_msgs/msg/PointCloud2", MSGDEF)
+    for topic, log_ns, message in clouds:
+        writer.write_message(topic, schema, message, log_time=log_ns, publish_time=log_ns)
+    writer.finish()
 
 
 def packed(points: np.ndarray, order: str = "<") -> np.ndarray:

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from click.testing import CliRunner
-from cloud_testing import SECOND, message_of, packed, write_ros
+from cloud_testing import SECOND, message_of, packed, write_clouds, write_ros
 from foxglove_schemas_protobuf.PackedElementField_pb2 import PackedElementField
 from foxglove_schemas_protobuf.PointCloud_pb2 import PointCloud
 from hypothesis import given, settings
@@ -141,15 +141,12 @@ def test_point_cloud2_agrees_with_foxgloves_decoder(kinds, order, height, paddin
 
 def bytes_of(message: dict) -> tuple[bytes, object]:
     """A message's CDR bytes, and what Foxglove's decoder makes of them."""
-    folder = Path(__import__("tempfile").mkdtemp())
-    path = write_ros(folder / "one.mcap", [("/points", 1, message)])
-    with path.open("rb") as stream:
-        raw = next(iter(make_reader(stream).iter_messages()))[2].data
-        stream.seek(0)
-        decoded = next(iter(make_reader(stream, decoder_factories=[DecoderFactory()]).iter_decoded_messages()))[3]
-    path.unlink()
-    folder.rmdir()
-    return raw, decoded
+    stream = io.BytesIO()
+    write_clouds(stream, [("/points", 1, message)])
+    stream.seek(0)
+    raw = next(iter(make_reader(stream).iter_messages()))[2].data
+    stream.seek(0)
+    return raw, next(iter(make_reader(stream, decoder_factories=[DecoderFactory()]).iter_decoded_messages()))[3]
 
 
 CLOUD = bytes_of(message_of(packed(FEW[:5]), START))[0]
