@@ -68,17 +68,24 @@ def test_ground_is_carried_on_a_few_metres_and_pits_are_left_out() -> None:
     memory[10:13, 10:13] = -0.5  # something stands there
     memory[30, 30] = -4.0  # an echo
     memory[20:, :5] = np.inf  # not seen
-    found = ground_heights(memory, GRID, 0.15, LEVEL, 0.05)
+    found = ground_heights(memory, GRID, 0.15, LEVEL, 0.05, 0.0)
     assert found[11, 11] == pytest.approx(-1.9 + 0.15 * 2)
     assert found[30, 30] == pytest.approx(-1.9, abs=0.3)
     assert found[39, 0] == pytest.approx(-1.9 + 0.05 * 19.5 * np.sqrt(2), abs=0.01)
     assert found[20, 20] == pytest.approx(-1.9)
 
 
+def test_nearer_than_any_ray_reaches_the_ground_the_road_is_taken_for_level() -> None:
+    car = np.full((40, 40), -1.2, np.float32)  # the lowest that was ever seen
+    found = ground_heights(car, GRID, 0.15, LEVEL, 0.03, 12.0)
+    assert found[20, 29] == pytest.approx(-1.9 + 0.01 * np.hypot(0.5, 9.5), abs=1e-4)
+    assert found[20, 39] == pytest.approx(-1.9 + 0.03 * np.hypot(0.5, 19.5), abs=1e-4)
+
+
 def test_a_hill_before_the_vehicle_is_ground_up_to_the_slope_allowed() -> None:
     x = np.arange(40) - 19.5
     memory = np.repeat((-1.9 + 0.04 * np.maximum(x, 0.0))[:, None], 40, axis=1).astype(np.float32)
-    np.testing.assert_allclose(ground_heights(memory, GRID, 0.15, LEVEL, 0.04), memory, atol=0.01)
+    np.testing.assert_allclose(ground_heights(memory, GRID, 0.15, LEVEL, 0.04, 0.0), memory, atol=0.01)
 
 
 def test_objects_are_the_voxels_above_the_ground() -> None:

@@ -141,11 +141,12 @@ def _is_pit(memory: F32, i: int, j: int) -> bool:
 
 
 @kernel
-def ground_heights(memory: F32, grid: Grid, slope: float, road: F64, road_slope: float) -> F32:
+def ground_heights(memory: F32, grid: Grid, slope: float, road: F64, road_slope: float, near_m: float) -> F32:
     """(nx, ny) height of the ground everywhere: no higher than what is remembered within `REACH_CELLS` and `slope`.
 
     `road` (6,): a point of the road under the vehicle and its normal; the ground lies no higher than this plane and
-    `road_slope` times the distance, and not lower than `slope` times the distance below (echoes do).
+    `road_slope` times the distance, and not lower than `slope` times the distance below (echoes do). Nearer than
+    `near_m` no ray reaches the ground: were it steep there, the sensor would see it, so a third of `road_slope` holds.
     """
     plane, distance = np.empty((grid.nx, grid.ny), np.float32), np.empty((grid.nx, grid.ny), np.float32)
     z = np.empty((grid.nx, grid.ny), np.float32)
@@ -158,7 +159,8 @@ def ground_heights(memory: F32, grid: Grid, slope: float, road: F64, road_slope:
             z[i, j] = memory[i, j] if memory[i, j] > low and not _is_pit(memory, i, j) else np.inf
     for _ in range(REACH_CELLS):
         z = _spread_down(z, np.float32(slope * grid.cell_m))
-    return np.minimum(z, plane + np.float32(road_slope) * distance)
+    unseen = distance < np.float32(near_m)
+    return np.minimum(z, plane + np.float32(road_slope) * np.where(unseen, distance / np.float32(3.0), distance))
 
 
 @kernel

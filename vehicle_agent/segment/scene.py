@@ -119,7 +119,7 @@ class GroundMap:
         near_m = VISIBLE * max(mount_m, 0.0) / max(-tan_low, 1e-3)
         remember_ground(self._memory, lowest_heights(points, grid, near_m) + height, STEP_M)
         road = np.concatenate([T_map_vehicle[:3, 3] - centre_m, T_map_vehicle[:3, 2]])
-        return ground_heights(self._memory - height, grid, self._slope, road, self._road_slope), grid
+        return ground_heights(self._memory - height, grid, self._slope, road, self._road_slope, near_m), grid
 
     def _move(self, corner: NDArray[np.int64]) -> None:
         """Forget what lies outside the new place of the grid."""
