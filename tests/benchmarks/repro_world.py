@@ -9,7 +9,7 @@ from click.testing import CliRunner, Result
 
 from deploy.cli import gnd
 
-STREET = ("--world-seed", "5", "--length", "100", "--scans", "30", "--sensors", "vlp16,rs16", "--vehicles", "1,3")
+STREET = ("--world-seed", "5", "--length", "100", "--scans", "30", "--sensors", "vlp16,rs16", "--vehicles", "1,2")
 PLAIN = ("--no-pcd", "--no-pictures", "--no-traffic", "--jobs", "1")
 
 

@@ -25,36 +25,32 @@ def test_json_has_the_keys_of_the_issue(finished: Finished) -> None:
     assert set(found["stale"]["f1"]) == LEVELS
     assert set(found["single"]) == {"vlp16", "rs16"}
     assert all(set(stage["f1"]) == LEVELS for stage in found["single"].values())
-    assert set(found["fleet"]) == {"1", "2", "3"}
+    assert set(found["fleet"]) == {"1", "2"}
     assert all(set(stage["f1"]) == LEVELS for stage in found["fleet"].values())
     assert {"confusion", "parameters", "seeds", "runtime_s", "upload_bytes"} <= set(found)
     assert found["seeds"] == [5]
-    assert np.array(found["confusion"]["fleet"]["3"]["scored"]).shape == (5, 5)
+    assert np.array(found["confusion"]["fleet"]["2"]["scored"]).shape == (5, 5)
     assert found["parameters"]["method"]["detect"]["mode"] == "default"
 
 
 def test_vehicles_make_the_map_better(finished: Finished) -> None:
     _, found = finished
-    stale, fleet = found["stale"]["f1"]["scored"], found["fleet"]["3"]["f1"]["scored"]
+    stale, fleet = found["stale"]["f1"]["scored"], found["fleet"]["2"]["f1"]["scored"]
     assert stale < min(stage["f1"]["scored"] for stage in found["single"].values())
     assert stale + 10.0 < fleet <= 100.0
 
 
 def test_the_confusion_matrix_is_that_of_the_f1(finished: Finished) -> None:
     _, found = finished
-    matrix = np.array(found["confusion"]["fleet"]["3"]["scored"], float)
+    matrix = np.array(found["confusion"]["fleet"]["2"]["scored"], float)
     hits, truth, predicted = np.diag(matrix), matrix.sum(axis=1), matrix.sum(axis=0)
     f1 = 100 * 2 * hits / (truth + predicted)
-    assert found["fleet"]["3"]["f1"]["scored"] == pytest.approx(f1.mean(), abs=1e-3)
+    assert found["fleet"]["2"]["f1"]["scored"] == pytest.approx(f1.mean(), abs=1e-3)
 
 
-def test_the_same_command_gives_the_same_bits(finished: Finished, tmp_path: Path) -> None:
-    out, found = finished
-    again = result_of(copy_world(out, tmp_path / "again"))
-    assert without_times(again) == without_times(found)
-
-
-def test_an_interrupted_run_continues(finished: Finished, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_an_interrupted_run_continues_to_the_same_bits(
+    finished: Finished, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     out, found = finished
     other = copy_world(out, tmp_path / "interrupted")
     real, calls = vehicle_module.ticking, []
@@ -76,7 +72,7 @@ def test_an_interrupted_run_continues(finished: Finished, tmp_path: Path, monkey
 
 
 @pytest.mark.slow
-def test_a_killed_run_continues(finished: Finished, tmp_path: Path) -> None:
+def test_a_killed_run_continues_to_the_same_bits(finished: Finished, tmp_path: Path) -> None:
     out, found = finished
     other = copy_world(out, tmp_path / "killed")
     command = [sys.executable, "-m", "deploy.cli", "reproduce", "simulation", *STREET, *PLAIN, "--out", str(other)]
@@ -154,10 +150,10 @@ def test_losses_are_the_voxels_off_the_diagonal(finished: Finished) -> None:
     ran = CliRunner().invoke(gnd, ["reproduce", "errors", str(out), "--json"])
     assert ran.exit_code == 0, ran.output
     losses = json.loads(ran.stdout)
-    assert set(losses) == {"single.rs16", "single.vlp16", "1", "3"}
-    matrix = np.array(found["confusion"]["fleet"]["3"]["scored"])
-    assert sum(loss["voxels"] for loss in losses["3"]["scored"]) == matrix.sum() - np.trace(matrix)
-    for loss in losses["3"]["all"]:
+    assert set(losses) == {"single.rs16", "single.vlp16", "1", "2"}
+    matrix = np.array(found["confusion"]["fleet"]["2"]["scored"])
+    assert sum(loss["voxels"] for loss in losses["2"]["scored"]) == matrix.sum() - np.trace(matrix)
+    for loss in losses["2"]["all"]:
         assert loss["true"] != loss["predicted"]
         assert sum(loss["by_cause"].values()) == loss["voxels"]
 
@@ -167,3 +163,16 @@ def test_losses_need_a_finished_run(tmp_path: Path) -> None:
     assert "holds no run" in str(ran.exception)
     ran = CliRunner().invoke(gnd, ["reproduce", "errors", str(tmp_path), "--stage", "x"])
     assert ran.exit_code != 0
+
+
+@pytest.mark.slow
+def test_the_baseline_sees_the_same_drives_and_pictures_are_drawn(finished: Finished, tmp_path: Path) -> None:
+    out, _ = finished
+    other = copy_world(out, tmp_path / "baseline")
+    found = result_of(other, "--pcd", "--pictures", "--sensors", "rs16", "--vehicles", "2")
+    assert found["pcd"]["fleet"]["2"]["f1"]["scored"] > found["stale"]["f1"]["scored"] + 5.0
+    assert set(found["pcd"]["single"]["rs16"]["f1"]) == LEVELS
+    bytes_of_clouds = found["pcd"]["upload_bytes"]["single"]["rs16"]["points"]
+    assert 0 < found["upload_bytes"]["single"]["rs16"] < 0.2 * bytes_of_clouds
+    for name in ("single", "merged", "truth", "f1_by_vehicles", "masses"):
+        assert (other / f"{name}.png").read_bytes().startswith(b"\x89PNG")
