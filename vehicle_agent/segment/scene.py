@@ -8,20 +8,10 @@ from numpy.typing import NDArray
 
 from gnd_map.arrays import F32, F64, I32
 from vehicle_agent.segment.evidence import WEIGHTS
-from vehicle_agent.segment.kernels import (
-    Grid,
-    Judge,
-    Optics,
-    draw_image,
-    elevation_span,
-    find_objects,
-    ground_heights,
-    layer_gap,
-    lowest_heights,
-    remember_ground,
-    vote,
-)
+from vehicle_agent.segment.ground_kernels import Grid, ground_heights, lowest_heights, remember_ground
+from vehicle_agent.segment.image_kernels import Judge, Optics, draw_image, elevation_span, layer_gap, vote
 from vehicle_agent.segment.parameters import SegmentParameters
+from vehicle_agent.segment.voxel_kernels import find_objects
 
 U8 = NDArray[np.uint8]
 U16 = NDArray[np.uint16]
