@@ -27,7 +27,7 @@ class MergeParameters:
     Attributes:
         mode: "paper": only uploaded changes count (GND as printed, with the corrections without which it cannot run);
             "default": the votes are those of all who observed the voxel, and similarity is the smooth one.
-        eps: DBSCAN's neighbourhood on 1 - similarity.
+        eps: DBSCAN's neighbourhood on 1 - similarity; 0.5 splits the votes of vehicles that saw parts of one thing.
         min_samples: DBSCAN's core weight.
         xi: a cluster must hold more than this share of the voxel's statements (ξ_update).
         xi_reshaped: the same for a cluster most of which denies the epoch's own Gaussian ("modified"). Lower, because a
@@ -39,7 +39,7 @@ class MergeParameters:
     """
 
     mode: Mode = "default"
-    eps: float = 0.5
+    eps: float = 0.7
     min_samples: int = 1
     xi: float = 0.6
     xi_reshaped: float = 0.5

@@ -31,7 +31,7 @@ class MethodParameters:
     def of_mode(cls, mode: Mode) -> "MethodParameters":
         """Return the parameters of a mode; movers are segmented in both, as in the paper ([50])."""
         if mode == "paper":
-            return cls(detect=DetectParameters.paper(), merge=MergeParameters(mode="paper"))
+            return cls(detect=DetectParameters.paper(), merge=MergeParameters(mode="paper", eps=0.5))
         return cls()
 
     def with_changes(self, changes: Iterable[str]) -> "MethodParameters":
