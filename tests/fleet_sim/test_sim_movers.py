@@ -5,7 +5,7 @@ from math import cos, pi, sin
 
 import numpy as np
 import pytest
-from plain_rays import plain_range
+from plain_caster import plain_range
 
 from fleet_sim import parts
 from fleet_sim.errors import DriveSimError

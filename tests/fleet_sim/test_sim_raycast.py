@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from plain_rays import plain_range
+from plain_caster import plain_range
 
 from fleet_sim.errors import SceneError
 from fleet_sim.raycast import Scene
