@@ -12,12 +12,15 @@ from schemas.drive import GnssFix, MotionSample, Scan
 from vehicle_agent.detect.classify import classify, tile_change
 from vehicle_agent.detect.detector import ChangeDetector
 from vehicle_agent.local_map import LocalMap
-from vehicle_agent.localise.estimates import RefinedScan
+from vehicle_agent.localise.estimates import PoseEstimate, RefinedScan
 from vehicle_agent.localise.localiser import Localiser
+from vehicle_agent.segment import MotionSegmenter
 
 _LIDAR_HEIGHT_M = 2.0
 _STEP_NS = 20_000_000
 _SWEEP_NS = 100_000_000
+_SEGMENTED = 10
+_SEGMENT_STEP_NS = 300_000_000
 
 
 def warm_up() -> None:
@@ -27,11 +30,27 @@ def warm_up() -> None:
     points = _room()
     local_map = _map_of(points, GridFrame.around(frame, [tile_id]))
     detector = ChangeDetector(local_map)
-    for scan in _localised(local_map, points, frame):
+    refined = _localised(local_map, points, frame)
+    for scan in refined:
         detector.add_scan(scan.points_map_m, scan.origins_map_m)
+    _segment(points, refined[-1].estimate if refined else None)
     detector.add_scan(points, np.array([0.0, 0.0, _LIDAR_HEIGHT_M]))
     for evidence in detector.finish(local_map.tiles).values():
         tile_change(classify(evidence, detector.parameters), pose_sigma_m=0.0, pose_sigma_rad=0.0)
+
+
+def _segment(points_map_m: F64, estimate: PoseEstimate | None) -> None:
+    """Segment a few scans of the room in which a box drives by."""
+    segmenter = MotionSegmenter()
+    sensor = np.array([0.0, 0.0, _LIDAR_HEIGHT_M])
+    side = np.stack(np.meshgrid(np.arange(0.0, 3.0, 0.1), [3.0], np.arange(0.3, 1.6, 0.1)), axis=-1).reshape(-1, 3)
+    for number in range(_SEGMENTED):
+        t_ns = number * _SEGMENT_STEP_NS
+        seen = np.concatenate([points_map_m, side + np.array([2.0 * number - 9.0, 0.0, 0.0])])
+        pose = PoseEstimate(t_ns, np.eye(4) if estimate is None else estimate.T_map_vehicle, 0.01, 0.001, 1.0, "good")
+        segmenter.push(RefinedScan(t_ns, seen, np.broadcast_to(sensor, seen.shape).copy(), pose))
+    for _ in segmenter.flush():
+        pass
 
 
 def _room() -> F64:
