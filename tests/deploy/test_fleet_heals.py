@@ -31,7 +31,7 @@ def test_a_simulated_fleet_heals_its_map(tmp_path: Path) -> None:
     assert p95["longitudinal_m"] <= 0.05
     assert p95["lateral_m"] <= 0.05
     assert p95["heading_deg"] <= 0.1
-    assert summary["agent_pss_mb_max"] <= 190.0  # 150 without the scans that segmentation holds: docs/decisions/0041
+    assert summary["agent_pss_mb_max"] <= 210.0  # 150 without the scans that segmentation holds: docs/decisions/0041
 
     for name in ("map_before.png", "map_after.png", "truth.png", "healing.png", "store.sqlite", "updates.jsonl"):
         assert (tmp_path / "run" / name).stat().st_size > 0
