@@ -1,9 +1,10 @@
 """`gnd reproduce`: the results of the papers, made again. Commands are imported when they are called."""
 
-import importlib
 from typing import Final
 
 import click
+
+from deploy.cli import LazyGroup
 
 _COMMANDS: Final[dict[str, tuple[str, str]]] = {
     "simulation": (
@@ -15,22 +16,6 @@ _COMMANDS: Final[dict[str, tuple[str, str]]] = {
 }
 
 
-class _LazyGroup(click.Group):
-    def list_commands(self, ctx: click.Context) -> list[str]:  # noqa: ARG002  (click's signature)
-        return list(_COMMANDS)
-
-    def get_command(self, ctx: click.Context, cmd_name: str) -> click.Command | None:  # noqa: ARG002  (click's)
-        if cmd_name not in _COMMANDS:
-            return None
-        module, attribute = _COMMANDS[cmd_name][0].split(":")
-        command: click.Command = getattr(importlib.import_module(module), attribute)
-        return command
-
-    def format_commands(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:  # noqa: ARG002  (click's)
-        with formatter.section("Commands"):
-            formatter.write_dl([(name, text) for name, (_, text) in _COMMANDS.items()])
-
-
-@click.group(cls=_LazyGroup)
+@click.group(cls=LazyGroup, table=_COMMANDS)
 def reproduce() -> None:
     """Reproduce the papers' results and set ours beside them."""

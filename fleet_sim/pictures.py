@@ -121,7 +121,7 @@ def draw_map(
         bottom_in = height_in - _HEAD_IN - (index + 1) * _ROW_IN - index * _GAP_IN
         _from_above(_panel(figure, bottom_in, _ROW_IN), ellipsoids, row)
     _in_perspective(_panel(figure, _FOOT_IN, _PERSPECTIVE_IN), ellipsoids, view)
-    _save(figure, path)
+    save_figure(figure, path)
 
 
 def _panel(figure: Figure, bottom_in: float, tall_in: float) -> Axes:
@@ -179,10 +179,15 @@ def draw_healing(truth: Truth, base: Tiles, final: Tiles, path: Path) -> None:
     for row, (title, ellipsoids) in enumerate(panels):
         figure.text(0.03, 0.957 - 0.315 * row, title, fontsize=17, weight="bold", color=_INK, va="center")
         _from_above(figure.add_axes((0.03, 0.667 - 0.315 * row, 0.94, 0.27)), ellipsoids, view)
-    _save(figure, path)
+    save_figure(figure, path)
 
 
-def _save(figure: Figure, path: Path) -> None:
+def save_figure(figure: Figure, path: Path) -> None:
+    """Write a figure as PNG; the file appears complete or not at all.
+
+    Raises:
+        SimError: it cannot be written.
+    """
     partial = path.with_name(f".{path.name}.part")
     try:
         with partial.open("wb") as file:

@@ -90,4 +90,4 @@ def changed(parameters: DetectParameters, changes: Sequence[str]) -> DetectParam
             given[name] = type(known[name])(value)
         except ValueError as error:
             raise RealDataError(f"--set {change}: {value!r} is no {type(known[name]).__name__}") from error
-    return replace(parameters, **given)  # type: ignore[arg-type]
+    return replace(parameters, **given)  # type: ignore[arg-type]  # each value has its field's own type, see above

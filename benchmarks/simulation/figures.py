@@ -11,13 +11,12 @@ from matplotlib.ticker import MaxNLocator
 
 from benchmarks.simulation import reference
 from benchmarks.simulation.cloud import map_of_one, merged_map
-from benchmarks.simulation.errors import FolderError
 from benchmarks.simulation.masses import WATCHED, Watch, choose, most_telling
 from benchmarks.simulation.run import Outcome, WorldOutcome
 from benchmarks.simulation.targets import target_single
 from benchmarks.simulation.worlds import read_world_base
 from fleet_sim.ellipsoids import ellipsoids_of_maps, ellipsoids_of_truth
-from fleet_sim.pictures import View, draw_map
+from fleet_sim.pictures import View, draw_map, save_figure
 from fleet_sim.truth import LEVELS, Truth, read_truth
 from gnd_map.arrays import F64, I32, I64
 from gnd_map.classes import CLASS_COLOURS
@@ -96,7 +95,8 @@ def draw_curve(summary: Mapping[str, Any], path: Path) -> Path:
     axes.legend(frameon=False, fontsize=9.5, loc="lower right", labelcolor=_INK, ncols=2)
     seeds = ", ".join(map(str, summary["seeds"]))
     _title(figure, "F1 by number of vehicles", f"world seed {seeds}, poses {summary['parameters']['poses']}")
-    return _save(figure, path)
+    save_figure(figure, path)
+    return path
 
 
 def _curves(axes: Axes, summary: Mapping[str, Any], numbers: list[int]) -> list[float]:
@@ -159,7 +159,8 @@ def draw_masses(watch: Watch, history: tuple[I64, I32], parameters: MassParamete
     handles, labels = axes.flat[0].get_legend_handles_labels()
     figure.legend(handles, labels, loc="upper right", bbox_to_anchor=(0.99, 0.985), ncols=3, frameon=False)
     _title(figure, "Masses of single voxels", f"one drive, {sensor}; rays counted in brackets")
-    return _save(figure, path)
+    save_figure(figure, path)
+    return path
 
 
 def _mass_lines(axes: Axes, t_s: F64, counters: I32, parameters: MassParameters) -> None:
@@ -182,17 +183,6 @@ def _dress(axes: Axes, x: str, y: str) -> None:
 def _title(figure: Figure, title: str, note: str) -> None:
     figure.text(0.03, 0.955, title, fontsize=16, weight="bold", color=_INK, va="center")
     figure.text(0.03, 0.912, note, fontsize=10, color="#5a6675", va="center")
-
-
-def _save(figure: Figure, path: Path) -> Path:
-    partial = path.with_name(f".{path.name}.part")
-    try:
-        with partial.open("wb") as file:
-            figure.savefig(file, format="png")
-        partial.replace(path)
-    except OSError as error:
-        raise FolderError(f"cannot write the picture {path}: {error}") from error
-    return path
 
 
 def pictures_of(paths: Sequence[Path]) -> str:

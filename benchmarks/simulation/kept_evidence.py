@@ -7,7 +7,6 @@ import numpy as np
 from benchmarks.simulation.method import MethodParameters
 from benchmarks.simulation.result import EVIDENCE
 from gnd_map.arrays import I32
-from gnd_map.similarity import similarity
 from gnd_map.tile_id import TileId
 from vehicle_agent.detect.classify import classify
 from vehicle_agent.detect.detector import ChangeDetector
@@ -30,14 +29,7 @@ def evidence_columns(found: TileEvidence, method: MethodParameters) -> dict[str,
     """Return the columns `EVIDENCE` of a tile's evidence, int32 (K,) each."""
     columns = {name: getattr(found, name) for name in EVIDENCE if name.startswith("n_")}
     columns["cells"] = found.measured.cells
-    rows, base = np.flatnonzero(found.in_map), found.base.gaussians
-    at, new = found.map_row[rows], found.measured
-    columns["map_cells"], columns["similar_pct"] = np.zeros((2, len(found)), np.int32)
-    if len(rows):
-        columns["map_cells"][rows] = base.cells[at]
-        alike = similarity(
-            base.exists[at], base.mean_m[at], base.cov_m2[at], new.exists[rows], new.mean_m[rows], new.cov_m2[rows]
-        )
-        columns["similar_pct"][rows] = np.round(100 * alike)
+    columns["map_cells"] = np.zeros(len(found), np.int32)
+    columns["map_cells"][found.in_map] = found.base.gaussians.cells[found.map_row[found.in_map]]
     columns["change_class"] = classify(found, method.detect).change_class.astype(np.int32)
     return columns

@@ -15,9 +15,9 @@ from benchmarks.simulation.errors import FolderError
 from schemas.changes import ChangeReport
 from schemas.errors import SchemaError
 
-EVIDENCE: Final = ("n_bi", "n_bo", "n_pi", "n_po", "n_be", "n_pe", "cells", "map_cells", "similar_pct", "change_class")
+EVIDENCE: Final = ("n_bi", "n_bo", "n_pi", "n_po", "n_be", "n_pe", "cells", "map_cells", "change_class")
 """Columns of `VehicleResult.evidence`: the counters of the detector, occupied sub-cells of the new and of the map's
-Gaussian (0: none), their similarity in percent, the class that the vehicle decided."""
+Gaussian (0: none), the class that the vehicle decided."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)

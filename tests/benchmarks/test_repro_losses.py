@@ -27,11 +27,7 @@ def evidence(**columns: int) -> dict[str, np.ndarray]:
         (A, {"change_class": E, "cells": 3}, "empty: too few sub-cells met"),
         (A, {"change_class": E}, "empty: rays pass, nothing met"),
         (E, {"change_class": A, "cells": 50}, "new: something stood or moved there"),
-        (
-            M,
-            {"change_class": N, "cells": 50, "map_cells": 60, "similar_pct": 80},
-            "normal: the Gaussians are too alike",
-        ),
+        (M, {"change_class": N, "cells": 50, "map_cells": 60}, "normal: the Gaussians are too alike"),
         (A, {"change_class": U, "cells": 30}, EDGE),
         (M, {"change_class": N, "cells": 5, "map_cells": 60}, "normal: too few sub-cells for a Gaussian"),
         (N, {"change_class": M, "cells": 25, "map_cells": 60}, "modified: only a part of it seen"),

@@ -94,7 +94,7 @@ def _least_cells_of_new(e: TileEvidence, p: DetectParameters) -> NDArray[np.int6
     """(K,) sub-cells that make a new Gaussian: more where it may be the edge of a surface that the map holds."""
     least = np.full(len(e), p.new_cells)
     rows = np.flatnonzero(~e.in_map & (e.measured.cells >= p.new_cells) & (e.measured.cells < p.new_cells_at_edge))
-    edge = extends_neighbour(e.base, e.measured.take(rows), planar_ratio=p.planar_ratio, within_m=p.edge_m)
+    edge = extends_neighbour(e.base, e.measured.take(rows), p)
     least[rows[edge]] = p.new_cells_at_edge
     return least
 

@@ -10,16 +10,17 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from gnd_map.arrays import F64, I32
+from gnd_map.arrays import I32
 from gnd_map.gaussian import Gaussians
 from gnd_map.grid import VoxelGrid
 from gnd_map.tile import Tile
+from vehicle_agent.detect.parameters import DetectParameters
+from vehicle_agent.detect.records import planar_normals
 
 _AROUND: Final = tuple(step for step in product((-1, 0, 1), repeat=3) if any(step))
-_LEAST_VARIANCE_M2: Final = 1e-4
 
 
-def extends_neighbour(base: Tile, measured: Gaussians, *, planar_ratio: float, within_m: float) -> NDArray[np.bool_]:
+def extends_neighbour(base: Tile, measured: Gaussians, parameters: DetectParameters) -> NDArray[np.bool_]:
     """Return which measured Gaussians (K,) continue a planar one of the map in one of the 26 voxels around.
 
     Neighbours in other tiles are not looked at.
@@ -27,8 +28,7 @@ def extends_neighbour(base: Tile, measured: Gaussians, *, planar_ratio: float, w
     Args:
         base: the tile's map.
         measured: K voxels of the same tile.
-        planar_ratio: λ2 / λ1 from which on a Gaussian of the map is a plane (Eq. 16).
-        within_m: the measured mean lies so near to that plane.
+        parameters: what is planar, and `edge_m`: how near to that plane the measured mean lies.
     """
     found = np.zeros(len(measured), np.bool_)
     if not len(measured) or not len(base.gaussians):
@@ -36,19 +36,13 @@ def extends_neighbour(base: Tile, measured: Gaussians, *, planar_ratio: float, w
     grid = VoxelGrid.of(base.tile_id)
     here = np.stack(grid.unravel(measured.voxel_id), axis=1)
     p_tile_m = grid.centre_m(measured.voxel_id) + measured.mean_m
-    normal, planar = planes(base.gaussians, planar_ratio)
+    normal = planar_normals(base.gaussians.full_cov(), parameters)  # zeros where not planar
     q_tile_m = grid.centre_m(base.gaussians.voxel_id) + base.gaussians.mean_m
     for step in _AROUND:
         row = _rows(grid, base.gaussians.voxel_id, here + step)
         off_m = np.abs(np.einsum("ni,ni->n", normal[row], p_tile_m - q_tile_m[row]))
-        found |= (row >= 0) & planar[row] & (off_m <= within_m)
+        found |= (row >= 0) & normal[row].any(axis=1) & (off_m <= parameters.edge_m)
     return found
-
-
-def planes(gaussians: Gaussians, planar_ratio: float) -> tuple[F64, NDArray[np.bool_]]:
-    """Return the thin axis (N, 3) of each Gaussian, and whether it is planar (N,)."""
-    values, vectors = np.linalg.eigh(gaussians.full_cov() + np.eye(3) * _LEAST_VARIANCE_M2)
-    return vectors[:, :, 0], values[:, 1] >= planar_ratio * values[:, 0]
 
 
 def _rows(grid: VoxelGrid, ids: I32, at: NDArray[np.int64]) -> NDArray[np.int64]:

@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gnd_map.arrays import F64, I32, check_array
-from gnd_map.gaussian import Gaussians, full_matrices
+from gnd_map.gaussian import Gaussians
 from gnd_map.jit import kernel
 from gnd_map.similarity import similarity
 from vehicle_agent.errors import VehicleError
@@ -161,7 +161,7 @@ def shape_features(was: Gaussians, now: Gaussians, n_bi: I32, n_bo: I32, n_pi: I
 
 def _thin_axis(gaussians: Gaussians) -> tuple[F64, F64]:
     """Smallest eigenvalue (N,) and its direction (N, 3)."""
-    values, vectors = np.linalg.eigh(full_matrices(gaussians.cov_m2.astype(np.float64)))
+    values, vectors = np.linalg.eigh(gaussians.full_cov())
     return values[:, 0].clip(0.0), vectors[:, :, 0]
 
 

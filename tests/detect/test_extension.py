@@ -1,0 +1,76 @@
+"""Edges of known surfaces: who continues a planar Gaussian next door, beside a plain search through all pairs."""
+
+import numpy as np
+import pytest
+from vehicle_scene import FIGURE_2
+
+from gnd_map.gaussian import Gaussians
+from gnd_map.grid import VoxelGrid
+from gnd_map.tile import Tile
+from vehicle_agent.detect.extension import extends_neighbour
+from vehicle_agent.detect.parameters import DetectParameters
+from vehicle_agent.detect.records import planar_normals
+
+TILE = FIGURE_2[0]
+GRID = VoxelGrid.of(TILE)
+FLAT, ROUND = (0.08, 0.0, 0.0, 0.08, 0.0, 0.0004), (0.05, 0.0, 0.0, 0.05, 0.0, 0.05)
+
+
+def gaussians(
+    at: list[tuple[int, int, int]], z_m: list[float] | np.ndarray, cov: tuple[float, ...] = FLAT
+) -> Gaussians:
+    ids = np.array([GRID.voxel_id([x], [y], [f])[0] for x, y, f in at], np.int32)
+    order, n = np.argsort(ids), len(at)
+    mean = np.column_stack([np.zeros((n, 2)), z_m]).astype(np.float32)
+    counts = np.full(n, 100, np.int32)
+    return Gaussians(ids[order], counts, counts, mean[order], np.tile(np.array(cov, np.float32), (n, 1)))
+
+
+@pytest.mark.parametrize(
+    ("place", "z_m", "cov", "continues"),
+    [
+        ((11, 10, 31), 0.05, FLAT, True),  # the same level, one voxel on
+        ((11, 11, 31), 0.0, FLAT, True),  # across the corner
+        ((11, 10, 31), 0.4, FLAT, False),  # above the plane
+        ((12, 10, 31), 0.0, FLAT, False),  # two voxels on
+        ((11, 10, 31), 0.05, ROUND, False),  # the neighbour is no plane
+    ],
+)
+def test_what_continues_the_plane_next_door(
+    place: tuple[int, int, int], z_m: float, cov: tuple[float, ...], continues: bool
+) -> None:
+    base = Tile(TILE, 1, gaussians([(10, 10, 31)], [0.0], cov))
+    assert extends_neighbour(base, gaussians([place], [z_m]), DetectParameters()).tolist() == [continues]
+
+
+def test_the_row_at_the_edge_of_the_tile_does_not_go_on_at_the_other_edge() -> None:
+    base = Tile(TILE, 1, gaussians([(GRID.nx - 1, 10, 31)], [0.0]))
+    assert not extends_neighbour(base, gaussians([(0, 11, 31)], [0.0]), DetectParameters()).any()
+
+
+def test_nothing_measured_or_nothing_mapped_is_no_edge() -> None:
+    some = gaussians([(10, 10, 31)], [0.0])
+    assert extends_neighbour(Tile(TILE, 1, some), Gaussians.empty(), DetectParameters()).shape == (0,)
+    assert not extends_neighbour(Tile(TILE, 0, Gaussians.empty()), some, DetectParameters()).any()
+
+
+def test_a_plain_search_through_all_pairs_finds_the_same() -> None:
+    rng, p = np.random.default_rng(3), DetectParameters()
+    cells = [(x, y, f) for x in range(8) for y in range(8) for f in (30, 31, 32)]
+    mapped = rng.random(len(cells)) < 0.3
+    base = gaussians(
+        [c for c, m in zip(cells, mapped, strict=True) if m], rng.uniform(-0.3, 0.3, mapped.sum()).tolist()
+    )
+    new = gaussians([c for c, m in zip(cells, mapped, strict=True) if not m], rng.uniform(-0.4, 0.4, (~mapped).sum()))
+    normal = planar_normals(base.full_cov(), p)
+    at = [np.stack(GRID.unravel(g.voxel_id), axis=1) for g in (base, new)]
+    mean = [GRID.centre_m(g.voxel_id) + g.mean_m for g in (base, new)]
+    expected = [
+        any(
+            np.abs(at[0][j] - at[1][i]).max() == 1 and abs(normal[j] @ (mean[1][i] - mean[0][j])) <= p.edge_m
+            for j in range(len(base))
+        )
+        for i in range(len(new))
+    ]
+    assert extends_neighbour(Tile(TILE, 1, base), new, p).tolist() == expected
+    assert 0 < sum(expected) < len(new)
