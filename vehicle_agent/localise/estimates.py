@@ -13,6 +13,10 @@ from vehicle_agent.errors import LocaliseError
 
 F64 = NDArray[np.float64]
 Health = Literal["good", "degraded", "lost"]
+Cause = Literal[
+    "none", "wrong_pose", "stale_map", "poor_place", "no_map", "no_position", "no_motion", "bad_scan", "ambiguous",
+    "searching", "unconfirmed", "gap",
+]  # fmt: skip
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -21,6 +25,9 @@ class PoseEstimate:
 
     sigma_m: larger one of the two horizontal one-sigma axes; sigma_rad: one sigma of the heading; matching_ratio: share
     of the scan's points that met a Gaussian of the map (0 when the scan was not matched).
+    cause: why the health is what it is; "stale_map" also goes with good health, all else with degraded or lost.
+    degenerate: directions that neither the scan nor the map constrains and the pose is dead reckoned along, of
+    "longitudinal", "lateral", "vertical", "roll", "pitch", "heading".
     """
 
     t_ns: int
@@ -29,6 +36,8 @@ class PoseEstimate:
     sigma_rad: float
     matching_ratio: float
     health: Health
+    cause: Cause = "none"
+    degenerate: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True, slots=True, eq=False)
