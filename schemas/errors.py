@@ -7,7 +7,8 @@ SchemaError
 ├── Malformed       bytes that are not the message they should be
 ├── BadValue        a field whose value cannot be
 ├── WrongHash       content that does not have the hash it claims
-└── DriveError      a recorded drive that cannot be read or written
+├── DriveError      a recorded drive that cannot be read or written
+└── TrajectoryError a file of poses that cannot be read or written
 """
 
 from gnd_map.errors import GndError
@@ -43,3 +44,7 @@ class WrongHash(SchemaError):
 
 class DriveError(SchemaError):
     """A recorded drive that cannot be read or written."""
+
+
+class TrajectoryError(SchemaError):
+    """A file of poses that cannot be read or written."""
