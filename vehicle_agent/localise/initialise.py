@@ -20,6 +20,7 @@ F64 = NDArray[np.float64]
 U8 = NDArray[np.uint8]
 
 GROUND_RADIUS_M = 12.0  # map columns around the position that say how high and how steep the ground is
+HIGHEST_GROUND_M = 0.2  # above the origin of the vehicle frame
 HIT, NEXT_TO = 3, 1  # score of a point in a voxel with a Gaussian, in a neighbour of one
 SUPPRESS_M, SUPPRESS_DEG = 1.5, 8.0  # coarse hypotheses nearer than this converge to the same pose
 
@@ -96,14 +97,19 @@ def _robust_plane(points: F64) -> F64:
 
 
 def _ground_below(points_m: F64) -> float:
-    """Height of the ground in the vehicle frame: the fullest 20 cm among the points within 15 m."""
+    """Height of the ground in the vehicle frame: the fullest 20 cm among the points within 15 m.
+
+    No vehicle stands below the ground: what would lie above the frame's origin is a wall or a car, seen by a sensor
+    that looks ahead only, and the origin itself is on the road.
+    """
     near = points_m[np.hypot(points_m[:, 0], points_m[:, 1]) < 15.0, 2]
     if not len(near):
         return 0.0
     low = near[near <= np.quantile(near, 0.6)]
     counts, edges = np.histogram(low, bins=max(1, int(np.ptp(low) / 0.2)))
     k = int(np.argmax(counts))
-    return float(np.median(low[(low >= edges[k]) & (low <= edges[k + 1])]))
+    found = float(np.median(low[(low >= edges[k]) & (low <= edges[k + 1])]))
+    return found if found < HIGHEST_GROUND_M else 0.0
 
 
 def _hypotheses(p_gnss_m: F64, sigma_m: float, ground: F64, ground_below_m: float, par: InitialiseParameters) -> F64:

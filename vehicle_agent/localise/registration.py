@@ -16,6 +16,9 @@ F64 = NDArray[np.float64]
 
 Start = Literal["near", "wide", "capture"]
 
+# Where a car's wheels touch the road, vehicle frame (origin on the road under the middle of the rear axle), metres.
+WHEELS_M = np.array([[0.0, 0.8, 0.0], [0.0, -0.8, 0.0], [2.8, 0.8, 0.0], [2.8, -0.8, 0.0]])
+WHEEL_SCALE = 10.0
 LEVER_M = 10.0  # a turn moves the points that constrain it by about this times its angle
 
 
@@ -116,11 +119,25 @@ def _linearise(points: F64, s: _State, m: MatchMap, par: RegistrationParameters,
     s.cost, s.matched, s.inside = linearise(
         points, s.R, s.t, m.index, m.A, m.b, m.mean_m, m.information, scale**2, gate_m2, s.H, s.g
     )
+    _add_wheels(s, m, par, scale)
     if s.matched < par.min_matched:
         raise RegistrationError(
             f"{s.matched} of {len(points)} points have a Gaussian nearby ({s.inside} lie in known voxels),"
             f" {par.min_matched} are needed: is the start within 2 m, is the map loaded?"
         )
+
+
+def _add_wheels(s: _State, m: MatchMap, par: RegistrationParameters, scale: float) -> None:
+    """The wheels stand on the map's ground: four points of their own weight, as uncertain as springs and tyres are."""
+    if par.wheel_sigma_m <= 0:
+        return
+    scale = max(scale, WHEEL_SCALE)
+    H, g = np.empty((6, 6)), np.empty(6)
+    gate_m2 = (par.gate_per_scale * scale) ** 2
+    linearise(WHEELS_M, s.R, s.t, m.index, m.A, m.b, m.mean_m, m.information, scale**2, gate_m2, H, g)
+    weight = par.correlation * (par.noise_m / par.wheel_sigma_m) ** 2
+    s.H += weight * H
+    s.g += weight * g
 
 
 def _descend(
