@@ -4,7 +4,7 @@ import hashlib
 import json
 import zipfile
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -16,7 +16,7 @@ from benchmarks.simulation.fleet import survey_configs
 from benchmarks.simulation.pose_source import PoseSource
 from benchmarks.simulation.poses import FromReference
 from fleet_sim.drives import DriveSimulation
-from fleet_sim.world import World
+from fleet_sim.world import State, World
 from gnd_map.accumulate import VoxelAccumulator
 from gnd_map.gaussian import Gaussians
 from gnd_map.grid import GridFrame
@@ -50,13 +50,13 @@ def surveyed(before: Mapping[TileId, Gaussians]) -> BaseMap:
     return BaseMap({tile_id: before[tile_id] for tile_id in sorted(before) if len(before[tile_id])})
 
 
-def driven(world: World) -> BaseMap:
+def driven(world: World, state: State = "before") -> BaseMap:
     """Return the map that the mapping vehicle makes: an HDL-32E up and down the empty street, poses exact."""
     radius_m = world.half_length_m + 2 * _MAX_RANGE_M
     grid_frame = GridFrame.around(world.frame, covering_circle(world.lat_rad, world.lon_rad, radius_m))
     accumulator = VoxelAccumulator(grid_frame)
     for config in survey_configs(world.seed):
-        simulation = DriveSimulation(world, config)
+        simulation = DriveSimulation(world, replace(config, state=state))
         poses = FromReference(simulation.header(), LocalMap(grid_frame), PoseSource("true", 0.0, 0.0), 0)
         for item in simulation.items():
             for scan in poses.push(item):

@@ -7,7 +7,6 @@ from typing import Any, Final
 
 from benchmarks.simulation.errors import FolderError
 
-_FORMAT: Final = "gnd.reproduce.simulation"
 _MARK: Final = "run.json"
 
 
@@ -17,12 +16,18 @@ class RunFolder:
 
     Attributes:
         root: the folder itself.
+        command: the part of `gnd reproduce` that owns it.
     """
 
     root: Path
+    command: str = "simulation"
+
+    @property
+    def _format(self) -> str:
+        return f"gnd.reproduce.{self.command}"
 
     @classmethod
-    def create(cls, root: Path) -> "RunFolder":
+    def create(cls, root: Path, command: str = "simulation") -> "RunFolder":
         """Make the folder, or continue in one that this command made.
 
         Raises:
@@ -35,7 +40,7 @@ class RunFolder:
             raise FolderError(f"cannot write to {root}: {error.strerror}; choose another folder with --out") from error
         if strange:
             raise FolderError(f"{root} is not empty and holds no run of this command; choose another folder with --out")
-        folder = cls(root)
+        folder = cls(root, command)
         if (root / _MARK).is_file():
             folder.mark()
         return folder
@@ -49,9 +54,9 @@ class RunFolder:
         try:
             found = json.loads((self.root / _MARK).read_text(encoding="utf-8"))
         except (OSError, ValueError) as error:
-            raise FolderError(f"{self.root} holds no run of `gnd reproduce simulation`: {error}") from error
-        if not isinstance(found, dict) or found.get("format") != _FORMAT:
-            raise FolderError(f"{self.root} holds no run of `gnd reproduce simulation`: {_MARK} is of another kind")
+            raise FolderError(f"{self.root} holds no run of `gnd reproduce {self.command}`: {error}") from error
+        if not isinstance(found, dict) or found.get("format") != self._format:
+            raise FolderError(f"{self.root} holds no run of `gnd reproduce {self.command}`: {_MARK} is of another kind")
         return found
 
     def finished(self) -> dict[str, Any]:
@@ -67,7 +72,7 @@ class RunFolder:
 
     def write_mark(self, content: dict[str, Any]) -> None:
         """Say what runs here."""
-        self.write_json(_MARK, {"format": _FORMAT, **content})
+        self.write_json(_MARK, {"format": self._format, **content})
 
     def write_json(self, name: str, content: dict[str, Any]) -> None:
         """Write a file of plain values; it appears complete or not at all."""

@@ -20,7 +20,7 @@ from vehicle_agent.surroundings import FLOORS_ABOVE, FLOORS_BELOW, STEP_M, left_
 class HeldTiles:
     """Keeps a local map in step with the place, from a base map at hand: `vehicle_agent.surroundings` without a bus."""
 
-    def __init__(self, base: BaseMap, local_map: LocalMap, detector: ChangeDetector) -> None:
+    def __init__(self, base: BaseMap, local_map: LocalMap, detector: ChangeDetector | None) -> None:
         self._base, self._map, self._detector = base, local_map, detector
         self._parameters: Final = DownloadParameters()
         self._looked_at: F64 | None = None
@@ -38,7 +38,7 @@ class HeldTiles:
         for tile_id in sorted(set(tiles_along(frame, here[None], p.near_m)) - set(self._map.tiles) - self.other_zone):
             self._hold(tile_id)
         for tile_id in left_behind(frame, self._map.tiles, here, p.forget_m):
-            if not self._detector.touched(tile_id):
+            if self._detector is None or not self._detector.touched(tile_id):
                 self._map.remove_tile(tile_id)
 
     def _hold(self, tile_id: TileId) -> None:

@@ -3,7 +3,6 @@
 from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import asdict, dataclass
-from itertools import chain
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from time import process_time
@@ -13,7 +12,6 @@ import numpy as np
 
 from benchmarks.simulation.base_map import BaseMap, read_base
 from benchmarks.simulation.baseline import CloudVehicle, read_cloud
-from benchmarks.simulation.errors import ReproduceError
 from benchmarks.simulation.held_tiles import HeldTiles
 from benchmarks.simulation.kept_evidence import RecordingDetector, evidence_columns
 from benchmarks.simulation.labels import MoverLabels
@@ -22,7 +20,7 @@ from benchmarks.simulation.method import MethodParameters
 from benchmarks.simulation.pose_source import PoseSource
 from benchmarks.simulation.poses import FromReference, Localisation, Localising
 from benchmarks.simulation.result import VehicleResult, write_result
-from benchmarks.simulation.streams import Tick, as_recorded, recorded, ticking
+from benchmarks.simulation.streams import Tick, as_recorded, first_fix, recorded, ticking
 from benchmarks.simulation.voxel_rows import VoxelRows
 from fleet_sim.drives import DriveConfig, DriveSimulation
 from fleet_sim.world import read_world
@@ -30,7 +28,7 @@ from gnd_map.geodesy import LocalFrame
 from gnd_map.grid import GridFrame
 from gnd_map.motion import Trajectory
 from gnd_map.tile_id import TileId
-from schemas.drive import DriveHeader, DriveItem, GnssFix, ReferencePose, Scan
+from schemas.drive import DriveHeader, DriveItem, ReferencePose, Scan
 from vehicle_agent.errors import LocaliseError
 from vehicle_agent.local_map import LocalMap
 from vehicle_agent.localise.estimates import PoseEstimate, localisation_error
@@ -132,7 +130,7 @@ class _Run:
         task: VehicleTask,
         labels: MoverLabels | None,
     ) -> None:
-        fix, self._items = _first_fix(iter(items))
+        fix, self._items = first_fix(iter(items))
         start = TileId.from_geodetic(fix.lat_rad, fix.lon_rad)
         frame, method = LocalFrame.of_tile(start), task.method
         local_map = LocalMap(GridFrame.around(frame, [start]))
@@ -213,16 +211,6 @@ class _Run:
             return {k: round(v, 5) for k, v in asdict(localisation_error(self._estimates, Trajectory(t_ns, T))).items()}
         except LocaliseError:
             return None
-
-
-def _first_fix(items: Iterator[DriveItem]) -> tuple[GnssFix, Iterator[DriveItem]]:
-    """The first position, which places the map frame, and all items again."""
-    before: list[DriveItem] = []
-    for item in items:
-        before.append(item)
-        if isinstance(item, GnssFix):
-            return item, chain(before, items)
-    raise ReproduceError("the drive has no GNSS fix: the vehicle would not know where it is")
 
 
 def _localisation(header: DriveHeader, local_map: LocalMap, task: VehicleTask) -> Localisation:
