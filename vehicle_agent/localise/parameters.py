@@ -2,6 +2,8 @@
 
 from dataclasses import dataclass, field
 
+from vehicle_agent.localise.doubt_parameters import ChallengeParameters, HypothesisParameters, WitnessParameters
+
 
 @dataclass(frozen=True, slots=True)
 class SamplingParameters:
@@ -182,34 +184,6 @@ class HealthParameters:
 
 
 @dataclass(frozen=True, slots=True)
-class WitnessParameters:
-    """What the rays are asked about the pose.
-
-    n_rays: asked at a time, every `period_s` or `way_m`; sectors: around the vehicle, counted with `least_points`.
-    above_ground_m: standing points are higher than this above the ground.
-    hit_sigmas, far_sigmas: a point nearer than the one to a Gaussian is a hit, farther than the other from all is new.
-    behind_m: a Gaussian is gone when a ray went on for so long behind it; least_along_per_m2: least information of the
-        Gaussian along the ray, so that grazing rays say nothing; max_way_m: a ray is followed no farther than this.
-    """
-
-    n_rays: int = 600
-    period_s: float = 0.5
-    way_m: float = 5.0
-    sectors: int = 12
-    least_points: int = 8
-    above_ground_m: float = 0.4
-    hit_sigmas: float = 3.0
-    far_sigmas: float = 8.0
-    behind_m: float = 1.0
-    least_along_per_m2: float = 50.0
-    max_way_m: float = 60.0
-
-    def __post_init__(self) -> None:
-        if min(self.n_rays, self.sectors, self.least_points) < 1 or not 0 < self.hit_sigmas < self.far_sigmas:
-            raise ValueError(f"positive counts and 0 < hit_sigmas < far_sigmas are required, got {self}")
-
-
-@dataclass(frozen=True, slots=True)
 class LocaliserParameters:
     """Everything of the localiser."""
 
@@ -220,3 +194,5 @@ class LocaliserParameters:
     graph: GraphParameters = field(default_factory=GraphParameters)
     health: HealthParameters = field(default_factory=HealthParameters)
     witness: WitnessParameters = field(default_factory=WitnessParameters)
+    hypotheses: HypothesisParameters = field(default_factory=HypothesisParameters)
+    challenge: ChallengeParameters = field(default_factory=ChallengeParameters)

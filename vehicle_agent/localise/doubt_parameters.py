@@ -1,0 +1,95 @@
+"""Settings of what doubts a pose: the witness, the hypotheses of the first pose, and the challenge of a tracked one."""
+
+from dataclasses import dataclass
+
+
+@dataclass(frozen=True, slots=True)
+class WitnessParameters:
+    """What the rays are asked about the pose.
+
+    n_rays: asked at a time, every `period_s` or `way_m`; sectors: around the vehicle, counted with `least_points`.
+    above_ground_m: standing points are higher than this above the ground.
+    hit_sigmas, far_sigmas: a point nearer than the one to a Gaussian is a hit, farther than the other from all is new.
+    behind_m: a Gaussian is gone when a ray went on for so long behind it; least_along_per_m2: least information of the
+        Gaussian along the ray, so that grazing rays say nothing; max_way_m: a ray is followed no farther than this.
+    """
+
+    n_rays: int = 600
+    period_s: float = 0.5
+    way_m: float = 5.0
+    sectors: int = 12
+    least_points: int = 8
+    above_ground_m: float = 0.4
+    hit_sigmas: float = 3.0
+    far_sigmas: float = 8.0
+    behind_m: float = 1.0
+    least_along_per_m2: float = 50.0
+    max_way_m: float = 60.0
+
+    def __post_init__(self) -> None:
+        if min(self.n_rays, self.sectors, self.least_points) < 1 or not 0 < self.hit_sigmas < self.far_sigmas:
+            raise ValueError(f"positive counts and 0 < hit_sigmas < far_sigmas are required, got {self}")
+
+
+@dataclass(frozen=True, slots=True)
+class HypothesisParameters:
+    """How several poses are followed until one of them has won.
+
+    n_most: how many are followed; n_points: that each is registered with; apart_m, apart_deg: two poses nearer than
+        this are one.
+    gain: how many times likelier a pose is (as a logarithm) for a whole unit of mean fit more, one view.
+    view_m, most_views: the way after which a scan is a new view, and how many views count: what is stale stays so.
+    none_fit: mean fit of the hypothesis that it is none of them. innovation_m, innovation_deg: one sigma of how far a
+        right pose's registration moves it from where odometry has put it.
+    sure: least probability of a winner, after `least_scans` scans; at_once, alone: a fit so good, with a runner-up of
+        less than this share of it, wins at the first.
+    dropped: a hypothesis this much less probable than the best is given up.
+    """
+
+    n_most: int = 8
+    n_points: int = 700
+    apart_m: float = 0.3
+    apart_deg: float = 1.0
+    gain: float = 50.0
+    view_m: float = 2.0
+    most_views: float = 3.0
+    none_fit: float = 0.35
+    innovation_m: float = 0.1
+    innovation_deg: float = 0.4
+    sure: float = 0.99
+    least_scans: int = 3
+    at_once: float = 0.75
+    alone: float = 0.75
+    dropped: float = 1e-6
+
+    def __post_init__(self) -> None:
+        if min(self.n_most, self.n_points, self.least_scans) < 1 or not 0.5 < self.sure < 1:
+            raise ValueError(f"positive counts and 0.5 < sure < 1 are required, got {self}")
+        if min(self.gain, self.view_m, self.innovation_m, self.innovation_deg) <= 0 or self.most_views < 1:
+            raise ValueError(f"gain, view_m and innovations must be positive and most_views >= 1, got {self}")
+
+
+@dataclass(frozen=True, slots=True)
+class ChallengeParameters:
+    """How often, and where, a better pose than the tracked one is looked for.
+
+    period_s, doubtful_s: pause between two searches, and when the pose is in doubt; turn_deg: headings within this of
+        the tracked one; n_refined: how many are refined; reach_m: around the tracked pose where there is no GNSS;
+    lead: a rival must fit better by this much to be one. contested: below this probability of the tracked pose it is
+        called degraded; beaten: at this probability of a rival the pose is lost.
+    """
+
+    period_s: float = 2.0
+    doubtful_s: float = 0.8
+    turn_deg: float = 12.0
+    n_refined: int = 5
+    reach_m: float = 5.0
+    lead: float = 0.03
+    contested: float = 0.8
+    beaten: float = 0.97
+
+    def __post_init__(self) -> None:
+        if not 0 < self.doubtful_s <= self.period_s or self.n_refined < 1 or self.reach_m <= 0:
+            raise ValueError(f"0 < doubtful_s <= period_s, n_refined >= 1 and reach_m > 0 are required, got {self}")
+        if not 0 < self.contested < self.beaten < 1:
+            raise ValueError(f"0 < contested < beaten < 1 is required, got {self}")
