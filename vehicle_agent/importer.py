@@ -18,6 +18,7 @@ from gnd_map.se3 import T_inverse, exp_so3, log_so3
 from schemas.drive import DriveHeader, DriveItem, GnssFix, MotionSample, ReferencePose
 from schemas.drive_mcap import DriveWriter
 from vehicle_agent.errors import ImportDriveError
+from vehicle_agent.importers.apollo import open_apollo
 from vehicle_agent.importers.cleaning import MAX_RANGE_M, Cleaned, cleaned
 from vehicle_agent.importers.detect_format import format_of
 from vehicle_agent.importers.kitti import open_kitti
@@ -35,6 +36,7 @@ FORMATS: Final[dict[str, Callable[[Path, Anchor | None], Recording]]] = {
     "radiate": open_radiate,
     "pcd": open_pcd,
     "mcap": open_mcap_clouds,
+    "apollo": open_apollo,
 }
 AUTO: Final = "auto"
 AROUND_NS = 300_000_000  # motion and fixes kept before the first and after the last chosen scan
@@ -83,7 +85,7 @@ def import_recording(
     """Write the drive `out` (MCAP) from a recording; tell what was written and what was left out.
 
     Args:
-        kind: "kitti", "radiate", "pcd", "mcap", or "auto" to find out.
+        kind: "kitti", "radiate", "pcd", "mcap", "apollo", or "auto" to find out.
         folder: of the recording (or its file); see the readers for what it must hold.
         out: file to write.
         scans: which scans; see `chosen_scans`.

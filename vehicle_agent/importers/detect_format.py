@@ -4,13 +4,14 @@ from pathlib import Path
 from typing import Final
 
 from vehicle_agent.errors import ImportDriveError
+from vehicle_agent.importers.apollo import is_apollo
 from vehicle_agent.importers.files import files_below, files_of
 
 ENDINGS: Final = {"kitti": (".bin", ".bin.xz"), "pcd": (".pcd", ".pcd.xz"), "mcap": (".mcap",)}
 
 
 def format_of(place: Path) -> str:
-    """kitti, pcd, mcap or radiate.
+    """kitti, pcd, mcap, apollo or radiate.
 
     Raises:
         ImportDriveError: nothing of the kind is there, or several kinds are.
@@ -21,6 +22,8 @@ def format_of(place: Path) -> str:
         return _format_of_file(place)
     if files_of(place, "GPS_IMU_Twist.txt", "velo_lidar*"):
         return "radiate"
+    if is_apollo(place):
+        return "apollo"
     found = {kind: len(files_below(place, *endings)) for kind, endings in ENDINGS.items()}
     held = [f"{n} of {kind}" for kind, n in found.items() if n]
     if len(held) != 1:

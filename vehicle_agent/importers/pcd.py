@@ -45,7 +45,7 @@ def open_pcd(folder: Path, anchor: Anchor | None) -> Recording:
         source=f"PCD files of {folder.name}; motion from the track",
         T_vehicle_lidar=np.eye(4),
         t_ns=t_ns,
-        read=lambda i: _scan(files[i], int(t_ns[i])),
+        read=lambda i: read_scan(files[i], int(t_ns[i])),
         anchor=anchor,
         track=track,
     )
@@ -54,19 +54,20 @@ def open_pcd(folder: Path, anchor: Anchor | None) -> Recording:
 def _scan_files(folder: Path) -> list[Path]:
     for name in SCAN_FOLDERS:
         if files := files_of(folder / name, "*.pcd", "*.pcd.xz"):
-            return sorted(files, key=_number)
+            return sorted(files, key=scan_number)
     if files := files_below(folder, ".pcd", ".pcd.xz"):
-        return sorted(files, key=_number)
+        return sorted(files, key=scan_number)
     raise ImportDriveError(f"{folder}: no .pcd or .pcd.xz files there or in the folders below it")
 
 
-def _number(path: Path) -> tuple[int, str]:
+def scan_number(path: Path) -> tuple[int, str]:
     """2.pcd before 10.pcd."""
     digits = re.findall(r"\d+", path.name.split(".")[0])
     return int(digits[-1]) if digits else -1, path.name
 
 
-def _scan(path: Path, t_ns: int) -> RawScan:
+def read_scan(path: Path, t_ns: int) -> RawScan:
+    """The points of one file, all at the time of the sweep."""
     points = read_pcd(path)
     missing = {"x", "y", "z"} - set(points.dtype.names or ())
     if missing:
@@ -80,7 +81,7 @@ def _track(folder: Path, n: int) -> tuple[I64, Trajectory | None]:
     files = files_of(folder, "poses.txt") or files_of(folder.parent, "poses.txt")
     if not files:
         return START_NS + PERIOD_NS * np.arange(n, dtype=np.int64), None
-    rows = _rows(files[0])
+    rows = table_of(files[0])
     if len(rows) != n or rows.shape[1] not in (8, 9, 12):
         raise ImportDriveError(
             f"{files[0]}: {len(rows)} lines of {rows.shape[1]} numbers for {n} scans; one line a scan of 8 (t,"
@@ -91,7 +92,8 @@ def _track(folder: Path, n: int) -> tuple[I64, Trajectory | None]:
     return t_ns, Trajectory(t_ns, T)
 
 
-def _rows(path: Path) -> F64:
+def table_of(path: Path) -> F64:
+    """(N, M) numbers of a text file; ImportDriveError when it holds anything else."""
     try:
         return np.loadtxt(path, ndmin=2)
     except ValueError as error:
