@@ -16,6 +16,7 @@ COMMANDS: Final[dict[str, tuple[str, str]]] = {
     "traffic": ("fleet_bus.cli:traffic", "Account for the bytes of a run against 3G, 4G and 5G."),
     "map": ("tile_store.cli:map_group", "Build, inspect, compare, export and roll back maps."),
     "import": ("vehicle_agent.importer_cli:import_drives", "Turn a recording (KITTI, PCD, ROS 2, ...) into a drive."),
+    "localise": ("vehicle_agent.localise_drive.command:localise", "Localise a recorded drive on a map."),
     "sim": ("fleet_sim.cli:sim", "Write and look at simulated worlds and drives."),
     "reproduce": ("benchmarks.cli:reproduce", "Reproduce the papers' results and set ours beside them."),
     "router": ("fleet_bus.cli:router", "Run the Zenoh router alone."),

@@ -8,7 +8,7 @@
 | /tf | foxglove.FrameTransform | map → vehicle of the first track: Foxglove shows the scans of the drive in the map |
 | /health | foxglove.Log | what has changed: info, warning or error |
 
-NAME is that of a track, such as `refined`. The metadata record `gnd.poses` says where on the Earth the frame `map` lies.
+NAME is that of a track, such as `refined`. The metadata record `gnd.poses` says where on the Earth `map` lies.
 """
 
 import contextlib

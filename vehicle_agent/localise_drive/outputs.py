@@ -1,0 +1,120 @@
+"""The files of a localised drive.
+
+| file | |
+|---|---|
+| poses.tum, online.tum | refined and online poses, frame `map`: ENU at the drive's anchor |
+| reference.tum | the drive's reference, interpolated at the times of the poses: other programs do not interpolate |
+| poses.kitti, times.txt | the refined poses; reference.kitti: the reference, line by line beside them |
+| poses.mcap | refined, online, reference: for Foxglove |
+| track.csv, track.geojson | the refined poses on the Earth: for QGIS |
+| health.json, summary.json | always |
+"""
+
+import json
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+
+from gnd_map.motion import Trajectory
+from schemas.poses_mcap import HealthNote, PoseTrack, write_poses_mcap
+from schemas.trajectory_files import write_kitti, write_text, write_times, write_tum
+from vehicle_agent.errors import LocaliseError
+from vehicle_agent.localise.estimates import PoseEstimate
+from vehicle_agent.localise_drive.account import health_json
+from vehicle_agent.localise_drive.geo import csv_text, geojson_text
+from vehicle_agent.localise_drive.run import LocalisedDrive, trajectory_of
+from vehicle_agent.localise_drive.stretches import stretches_of
+
+LEVELS: Final = {"good": "info", "degraded": "warning", "lost": "error"}
+
+
+def write_outputs(drive: LocalisedDrive, values: Mapping[str, Any], folder: Path, formats: Iterable[str]) -> list[Path]:
+    """Write the files of the formats (`FORMATS`) and the two of JSON; each appears whole or not at all.
+
+    Raises:
+        LocaliseError: the folder cannot be made.
+        TrajectoryError: a file cannot be written.
+    """
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise LocaliseError(f"{folder}: cannot make the folder: {error.strerror or error}") from None
+    written = [path for name in formats for path in FORMATS[name](drive, folder)]
+    for name, content in (("health.json", health_json(drive)), ("summary.json", values)):
+        write_text(folder / name, json.dumps(content, indent=1) + "\n")
+        written.append(folder / name)
+    return written
+
+
+def reference_at(drive: LocalisedDrive, estimates: Sequence[PoseEstimate]) -> Trajectory | None:
+    """The reference at the times of the estimates that it covers; None without one, or when it covers none."""
+    if drive.reference is None:
+        return None
+    first, last = int(drive.reference.t_ns[0]), int(drive.reference.t_ns[-1])
+    t_ns = np.unique(np.array([e.t_ns for e in estimates if first <= e.t_ns <= last], np.int64))
+    return Trajectory(t_ns, drive.reference.at(t_ns)) if len(t_ns) else None
+
+
+def _tum(drive: LocalisedDrive, folder: Path) -> list[Path]:
+    about = _about(drive)
+    tracks = {"poses": trajectory_of(drive.refined), "online": trajectory_of(drive.online)}
+    reference = reference_at(drive, [*drive.refined, *drive.online])
+    if reference is not None:
+        tracks["reference"] = reference
+    for name, poses in tracks.items():
+        write_tum(folder / f"{name}.tum", poses, f"{name}: {about}\nt[s] x y z[m] qx qy qz qw")
+    return [folder / f"{name}.tum" for name in tracks]
+
+
+def _about(drive: LocalisedDrive) -> str:
+    anchor = drive.header.anchor
+    lat_deg, lon_deg = np.degrees(anchor.lat_rad), np.degrees(anchor.lon_rad)
+    return f"drive {drive.header.drive_id}, ENU at {lat_deg:.9f} deg, {lon_deg:.9f} deg, {anchor.height_m:.4f} m"
+
+
+def _kitti(drive: LocalisedDrive, folder: Path) -> list[Path]:
+    """The reference only when it covers every pose: rows must stand side by side."""
+    poses, reference = trajectory_of(drive.refined), reference_at(drive, drive.refined)
+    written = [folder / "poses.kitti", folder / "times.txt"]
+    write_kitti(written[0], poses)
+    write_times(written[1], poses.t_ns)
+    if reference is not None and len(reference) == len(poses):
+        written.append(folder / "reference.kitti")
+        write_kitti(written[-1], reference)
+    return written
+
+
+def _mcap(drive: LocalisedDrive, folder: Path) -> list[Path]:
+    tracks = [_track("refined", drive.refined), _track("online", drive.online)]
+    reference = reference_at(drive, [*drive.refined, *drive.online])
+    if reference is not None:
+        tracks.append(PoseTrack("reference", reference))
+    notes = [
+        HealthNote(
+            one.first_ns, LEVELS[one.health], one.health if one.cause == "none" else f"{one.health}: {one.cause}"
+        )
+        for one in stretches_of(drive.moments)
+    ]
+    metadata = {"drive_id": drive.header.drive_id, "vehicle": drive.header.vehicle}
+    write_poses_mcap(folder / "poses.mcap", drive.header.anchor, tracks, notes, metadata)
+    return [folder / "poses.mcap"]
+
+
+def _track(name: str, estimates: Sequence[PoseEstimate]) -> PoseTrack:
+    return PoseTrack(name, trajectory_of(estimates), np.array([e.sigma_m for e in estimates], np.float64))
+
+
+def _geojson(drive: LocalisedDrive, folder: Path) -> list[Path]:
+    write_text(folder / "track.csv", csv_text(drive))
+    write_text(folder / "track.geojson", geojson_text(drive))
+    return [folder / "track.csv", folder / "track.geojson"]
+
+
+FORMATS: Final[Mapping[str, Callable[[LocalisedDrive, Path], list[Path]]]] = {
+    "tum": _tum,
+    "kitti": _kitti,
+    "mcap": _mcap,
+    "geojson": _geojson,
+}

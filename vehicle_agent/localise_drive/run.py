@@ -1,0 +1,277 @@
+"""One recorded drive through the localiser: what it made of every scan, online and refined."""
+
+import threading
+import time
+from collections.abc import Callable, Iterable, Iterator
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Final
+
+import numpy as np
+
+from gnd_map.arrays import F64
+from gnd_map.geodesy import LocalFrame
+from gnd_map.grid import GridFrame
+from gnd_map.motion import Trajectory
+from gnd_map.tile_id import TileId
+from schemas.drive import DriveHeader, DriveItem, DriveTrack, GnssFix, GnssTrack, MotionSample, Scan
+from schemas.drive_mcap import drive_counts, load_track, read_drive, read_header
+from schemas.errors import SchemaError
+from vehicle_agent.config import DownloadParameters
+from vehicle_agent.errors import LocaliseError
+from vehicle_agent.local_map import LocalMap
+from vehicle_agent.localise.estimates import Cause, Health, PoseEstimate, RefinedScan
+from vehicle_agent.localise.localiser import Localiser
+from vehicle_agent.localise.parameters import LocaliserParameters
+from vehicle_agent.localise_drive.tiles import MapAround, StoreMap
+from vehicle_agent.place import Place
+from vehicle_agent.scans import Guard
+
+DRIVE_ENDING: Final = ".mcap"
+
+Progress = Callable[[int, int], None]
+"""Called with the scans done and the scans in all."""
+
+
+@dataclass(frozen=True, slots=True)
+class Moment:
+    """How it stood with the online pose at one scan."""
+
+    t_ns: int
+    """Start of the sweep."""
+    way_m: float
+    """Driven since the recording's start, by the wheels."""
+    health: Health
+    cause: Cause
+    degenerate: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Counts:
+    """What happened on the way."""
+
+    scans: int
+    bad: dict[str, int]
+    """Items that could not be used, by their state."""
+    dropped: int
+    """Scans without a final pose, as the localiser counts them."""
+    initialisations: int
+    speed_scale: float
+    yaw_bias_radps: float
+    wall_s: float
+    finished: bool
+    """False: it was stopped, or the recording is damaged."""
+    damage: str = ""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class LocalisedDrive:
+    """A drive on the map. All poses are T_map_vehicle; map = ENU at the drive's own anchor, as its reference is."""
+
+    header: DriveHeader
+    refined: tuple[PoseEstimate, ...]
+    online: tuple[PoseEstimate, ...]
+    moments: tuple[Moment, ...]
+    reference: Trajectory | None
+    gnss: GnssTrack
+    used: frozenset[TileId]
+    absent: frozenset[TileId]
+    counts: Counts
+
+    @property
+    def start_ns(self) -> int:
+        """Start of the first scan; 0 without scans."""
+        return self.moments[0].t_ns if self.moments else 0
+
+
+def localise_drive(
+    path: Path,
+    tiles: StoreMap,
+    parameters: LocaliserParameters | None = None,
+    *,
+    progress: Progress | None = None,
+    stop: threading.Event | None = None,
+) -> LocalisedDrive:
+    """Localise one drive; memory holds the tiles around the vehicle and the poses, whatever its length.
+
+    A recording that turns out to be damaged on the way, and `stop`, end it there: what was found is returned.
+
+    Raises:
+        LocaliseError: `path` is no drive of ours, has no GNSS fix, or the map has no tiles there.
+        DriveError: the recording cannot be read at all.
+        StoreError: the store cannot be read.
+    """
+    check_is_drive(path)
+    header, track, total = read_header(path), load_track(path), drive_counts(path).scans
+    if not len(track.gnss.t_ns):
+        raise LocaliseError(f"{path} has no GNSS fix: nothing says where on the map to begin")
+    tiles.check_covers(track.gnss.lat_rad, track.gnss.lon_rad, DownloadParameters().near_m)
+    run = _Run(header, first_fix(track.gnss), tiles, parameters or LocaliserParameters())
+    run.to_the_end(read_drive(path), lambda done: progress(done, total) if progress else None, stop)
+    return run.result(track)
+
+
+def check_is_drive(path: Path) -> None:
+    """Refuse what has to be imported first.
+
+    Raises:
+        LocaliseError: a folder, or a file that is no MCAP.
+    """
+    if path.is_dir() or (path.exists() and path.suffix != DRIVE_ENDING):
+        what = "a folder" if path.is_dir() else "no MCAP file"
+        raise LocaliseError(
+            f"{path} is {what}, a drive is one MCAP file of ours: turn a recording into one with"
+            f" `gnd import auto {path} -o {path.stem or 'drive'}{DRIVE_ENDING}`"
+        )
+
+
+def first_fix(gnss: GnssTrack) -> GnssFix:
+    """The first position of a drive."""
+    return GnssFix(int(gnss.t_ns[0]), *(float(column[0]) for column in gnss[1:]))
+
+
+@dataclass(slots=True)
+class _Record:
+    """What is kept of a run."""
+
+    refined: list[PoseEstimate] = field(default_factory=list)
+    online: list[PoseEstimate] = field(default_factory=list)
+    moments: list[Moment] = field(default_factory=list)
+    waiting: tuple[int, float] | None = None
+    """Time and way of the newest scan, whose moment is not yet known."""
+
+
+class _Run:
+    """The parts of `vehicle_agent.vehicle` that localisation needs; the map frame is that of the first tile."""
+
+    def __init__(self, header: DriveHeader, fix: GnssFix, tiles: StoreMap, parameters: LocaliserParameters) -> None:
+        start = TileId.from_geodetic(fix.lat_rad, fix.lon_rad)
+        frame = LocalFrame.of_tile(start)
+        local_map = LocalMap(GridFrame.around(frame, [start]))
+        self._header = header
+        self._T_anchor_map = header.anchor.T_self_other(frame)
+        self._around = MapAround(tiles, local_map)
+        self._place = Place(frame, fix)
+        self._guard = Guard()
+        self._localiser = Localiser(local_map, header.T_vehicle_lidar, parameters)
+        self._record = _Record()
+        self._scans, self._finished, self._damage = 0, False, ""
+        self._started_s = time.monotonic()
+        self._wall_s = 0.0
+
+    def to_the_end(
+        self, items: Iterable[DriveItem], scanned: Callable[[int], None], stop: threading.Event | None
+    ) -> None:
+        """Feed everything until the end, `stop`, or the damaged part of a recording."""
+        try:
+            for item in self._guard.usable(items):
+                if stop is not None and stop.is_set():
+                    break
+                self._take(item)
+                scanned(self._scans)
+            else:
+                self._finished = True
+        except SchemaError as damage:
+            self._damage = str(damage)
+        self._keep(self._localiser.flush())
+        self._settle()
+        self._wall_s = time.monotonic() - self._started_s
+
+    def _take(self, item: DriveItem) -> None:
+        if isinstance(item, MotionSample):
+            self._localiser.push_motion(item)
+        elif isinstance(item, GnssFix):
+            self._localiser.push_gnss(item)
+        elif isinstance(item, Scan):
+            self._take_scan(item)
+        self._note_online()
+        self._place.take(item, self._localiser.online)
+
+    def _take_scan(self, scan: Scan) -> None:
+        self._scans += 1
+        self._around.follow(self._place)
+        self._keep(self._localiser.push_scan(scan))
+        self._note_online()
+        self._settle()
+        self._record.waiting = (scan.t_ns, self._place.odometer_m)
+
+    def _keep(self, scans: Iterable[RefinedScan]) -> None:
+        """Keep the poses; the points, which are large, go."""
+        for scan in scans:
+            self._record.refined.append(self._anchored(scan.estimate))
+
+    def _note_online(self) -> None:
+        online, kept = self._localiser.online, self._record.online
+        if online is not None and (not kept or online.t_ns > kept[-1].t_ns):
+            kept.append(self._anchored(online))
+
+    def _settle(self) -> None:
+        """The newest scan but one was worked on: note how it stands."""
+        if self._record.waiting is None:
+            return
+        (t_ns, way_m), self._record.waiting = self._record.waiting, None
+        self._record.moments.append(self._moment(t_ns, way_m))
+
+    def _moment(self, t_ns: int, way_m: float) -> Moment:
+        online = self._localiser.online
+        if online is None:
+            return Moment(t_ns, way_m, "lost", "searching")
+        if online.t_ns < t_ns:  # the scan was not matched
+            return Moment(t_ns, way_m, "lost", online.cause if online.health == "lost" else "searching")
+        return Moment(t_ns, way_m, online.health, online.cause, online.degenerate)
+
+    def _anchored(self, estimate: PoseEstimate) -> PoseEstimate:
+        return replace(estimate, T_map_vehicle=self._T_anchor_map @ estimate.T_map_vehicle)
+
+    def result(self, track: DriveTrack) -> LocalisedDrive:
+        """What was found."""
+        record = self._record
+        return LocalisedDrive(
+            header=self._header,
+            refined=tuple(_in_order(record.refined)),
+            online=tuple(estimate for estimate in record.online if estimate.health != "lost"),
+            moments=tuple(record.moments),
+            reference=_reference(track),
+            gnss=track.gnss,
+            used=frozenset(self._around.used),
+            absent=frozenset(self._around.absent),
+            counts=self._counts(),
+        )
+
+    def _counts(self) -> Counts:
+        localiser, bad = self._localiser, dict(self._guard.bad)
+        return Counts(
+            scans=self._scans,
+            bad=bad,
+            dropped=localiser.dropped_scans,
+            initialisations=localiser.initialisations,
+            speed_scale=float(localiser.speed_scale),
+            yaw_bias_radps=float(localiser.yaw_bias_radps),
+            wall_s=self._wall_s,
+            finished=self._finished,
+            damage=self._damage,
+        )
+
+
+def _in_order(estimates: list[PoseEstimate]) -> Iterator[PoseEstimate]:
+    """By time, one a time."""
+    newest_ns = -1
+    for estimate in sorted(estimates, key=lambda e: e.t_ns):
+        if estimate.t_ns > newest_ns:
+            newest_ns = estimate.t_ns
+            yield estimate
+
+
+def _reference(track: DriveTrack) -> Trajectory | None:
+    """The reference, when there is one to interpolate."""
+    t_ns, T = track.reference
+    later = np.ones(len(t_ns), np.bool_)
+    later[1:] = t_ns[1:] > np.maximum.accumulate(t_ns)[:-1]
+    return Trajectory(t_ns[later], T[later]) if later.sum() >= 2 else None
+
+
+def trajectory_of(estimates: Iterable[PoseEstimate]) -> Trajectory:
+    """The estimates as one trajectory; they are in order of time."""
+    kept = list(estimates)
+    T: F64 = np.stack([e.T_map_vehicle for e in kept]) if kept else np.empty((0, 4, 4))
+    return Trajectory(np.array([e.t_ns for e in kept], np.int64), T)
