@@ -1,20 +1,23 @@
 """The first pose: a search of the map around a GNSS position with unknown heading.
 
 Coarse: every position x heading on a grid is scored by how many sampled points fall into or next to a voxel of the map
-that stands above the ground. The best are refined by registration, and the answer says how close the runner-up came.
+that stands above the ground. The best are refined by registration: candidates. `initialise` answers from one scan, and
+says how sure it is; `Hypotheses` (hypotheses.py) follows the candidates of a place that looks alike until one has won.
 """
 
+from collections.abc import Iterable
 from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from gnd_map.jit import kernel
-from gnd_map.se3 import T_from_R_t, exp_so3, log_so3
+from gnd_map.se3 import T_from_R_t, exp_so3
 from vehicle_agent.errors import RegistrationError
+from vehicle_agent.localise.doubt_parameters import HypothesisParameters
 from vehicle_agent.localise.match_map import MatchMap
 from vehicle_agent.localise.parameters import InitialiseParameters, RegistrationParameters
-from vehicle_agent.localise.registration import RegistrationResult, fit_of, register
+from vehicle_agent.localise.registration import RegistrationResult, Start, fit_of, register
 
 F64 = NDArray[np.float64]
 U8 = NDArray[np.uint8]
@@ -23,6 +26,27 @@ GROUND_RADIUS_M = 12.0  # map columns around the position that say how high and 
 HIGHEST_GROUND_M = 0.2  # above the origin of the vehicle frame
 HIT, NEXT_TO = 3, 1  # score of a point in a voxel with a Gaussian, in a neighbour of one
 SUPPRESS_M, SUPPRESS_DEG = 1.5, 8.0  # coarse hypotheses nearer than this converge to the same pose
+LOOKED_AT = 1500  # of the best coarse hypotheses, for distinct ones
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Candidate:
+    """A refined pose, and the fit (0 ... 1) of the points that stand above the ground there."""
+
+    registration: RegistrationResult
+    fit: float
+
+
+@dataclass(frozen=True, slots=True)
+class Around:
+    """Where to search: a position (3,) in the map frame, how far around it [m], and headings [rad]: all, or those
+    within `turn_rad` of `heading_rad` (counter-clockwise from the map's x axis).
+    """
+
+    p_map_m: F64
+    reach_m: float
+    heading_rad: float = 0.0
+    turn_rad: float = np.pi
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -30,7 +54,8 @@ class InitialPose:
     """The best pose found, and how sure it is.
 
     fit: 0 ... 1, of the points above the ground (see `fit_of`); runner_up_fit: that of the best pose that is another
-    answer (0 if there is none); hypotheses: how many were scored; found: good enough and unambiguous.
+    answer (0 if there is none); hypotheses: how many were scored; found: good enough and unambiguous; probability: 0
+    ... 1 of this answer among all candidates and "none of them" (Hypotheses).
     """
 
     registration: RegistrationResult
@@ -38,6 +63,7 @@ class InitialPose:
     runner_up_fit: float
     hypotheses: int
     found: bool
+    probability: float = 0.0
 
 
 def initialise(
@@ -59,17 +85,43 @@ def initialise(
         registration: of the refinement.
     """
     par, registration = parameters or InitialiseParameters(), registration or RegistrationParameters()
-    ground = _ground_plane(match_map, p_gnss_m)
-    if ground is None:
-        return None
-    ground_below_m = _ground_below(points_m)
-    standing = points_m[points_m[:, 2] > ground_below_m + par.above_ground_m]  # ground fits everywhere
-    hypotheses = _hypotheses(p_gnss_m, sigma_m, ground, ground_below_m, par)
-    scores = _score(_thinned(standing, par.n_points), hypotheses, match_map)
-    best = hypotheses[_distinct_best(hypotheses, scores, par.n_refined)]
-    few, few_standing = _thinned(points_m, par.n_refining), _thinned(standing, par.n_refining)
-    answer = _answer(_refined(few, few_standing, best, match_map, registration), len(hypotheses), par)
+    around = Around(np.asarray(p_gnss_m, np.float64), par.radius_sigmas * sigma_m)
+    candidates, n = search(points_m, around, match_map, par, registration)
+    answer = _answer(candidates, n, par)
     return _with_all_points(answer, points_m, match_map, registration)
+
+
+def search(
+    points_m: F64, around: Around, match_map: MatchMap, par: InitialiseParameters, registration: RegistrationParameters
+) -> tuple[list[Candidate], int]:
+    """Refined poses around a place, no two of them the same, best fit first; and how many hypotheses were scored. None
+    where the map shows no ground.
+
+    The height of `around` is not used. Fits are of `n_refining` points; `n_checked` points decide which coarse
+    hypotheses are refined to the end.
+    """
+    ground = _ground_plane(match_map, around.p_map_m)
+    if ground is None or not len(points_m):
+        return [], 0
+    ground_below_m = ground_below(points_m)
+    standing = points_m[points_m[:, 2] > ground_below_m + par.above_ground_m]  # ground fits everywhere
+    hypotheses = _hypotheses(around, ground, ground_below_m, par)
+    scores = _score(thinned(standing, par.n_points), hypotheses, match_map)
+    poses = hypotheses[_distinct_best(hypotheses, scores, par.n_refined)]
+    checked = _refined(thinned(points_m, par.n_checked), standing, poses, match_map, registration, "capture", par)
+    best = [c.registration.T_map_vehicle for c in _distinct(checked, par)[: par.n_kept]]
+    few = thinned(points_m, par.n_refining)
+    return _distinct(_refined(few, standing, best, match_map, registration, "near", par), par), len(hypotheses)
+
+
+def _distinct(candidates: list[Candidate], par: InitialiseParameters) -> list[Candidate]:
+    """Best fit first, those left out that ended in the same pose as a better one."""
+    kept: list[Candidate] = []
+    for one in sorted(candidates, key=lambda c: -c.fit):
+        T = np.stack([k.registration.T_map_vehicle for k in kept]) if kept else np.empty((0, 4, 4))
+        if not near_pose(T, one.registration.T_map_vehicle, par.same_m, par.same_deg).any():
+            kept.append(one)
+    return kept
 
 
 def _ground_plane(m: MatchMap, p_map_m: F64) -> F64 | None:
@@ -96,7 +148,7 @@ def _robust_plane(points: F64) -> F64:
     return np.asarray(plane)
 
 
-def _ground_below(points_m: F64) -> float:
+def ground_below(points_m: F64) -> float:
     """Height of the ground in the vehicle frame: the fullest 20 cm among the points within 15 m.
 
     No vehicle stands below the ground: what would lie above the frame's origin is a wall or a car, seen by a sensor
@@ -112,18 +164,26 @@ def _ground_below(points_m: F64) -> float:
     return found if found < HIGHEST_GROUND_M else 0.0
 
 
-def _hypotheses(p_gnss_m: F64, sigma_m: float, ground: F64, ground_below_m: float, par: InitialiseParameters) -> F64:
+def _hypotheses(around: Around, ground: F64, ground_below_m: float, par: InitialiseParameters) -> F64:
     """(K, 4, 4) poses on a grid of positions in the circle and headings, standing on the ground plane."""
-    reach = par.radius_sigmas * sigma_m
+    p, reach = around.p_map_m, around.reach_m
     steps = np.arange(-np.ceil(reach / par.step_m), np.ceil(reach / par.step_m) + 1) * par.step_m
     dx, dy = (a.ravel() for a in np.meshgrid(steps, steps))
     inside = np.hypot(dx, dy) <= max(reach, par.step_m)
     dx, dy = dx[inside], dy[inside]
     z = ground[0] + ground[1] * dx + ground[2] * dy - ground_below_m
-    t = np.column_stack([p_gnss_m[0] + dx, p_gnss_m[1] + dy, z])
-    yaw = np.radians(np.arange(0.0, 360.0, par.step_deg))
+    t = np.column_stack([p[0] + dx, p[1] + dy, z])
+    yaw = _headings(around, np.radians(par.step_deg))
     R = _tilt(ground) @ exp_so3(np.column_stack([np.zeros((len(yaw), 2)), yaw]))
     return T_from_R_t(np.tile(R, (len(t), 1, 1)), np.repeat(t, len(yaw), axis=0))
+
+
+def _headings(around: Around, step_rad: float) -> F64:
+    """Headings at most `step_rad` apart: of the whole circle, or within the turn of the one given."""
+    if around.turn_rad >= np.pi:
+        return np.arange(0.0, 2 * np.pi - 1e-9, step_rad)
+    n = int(np.ceil(around.turn_rad / step_rad))
+    return around.heading_rad + np.linspace(-around.turn_rad, around.turn_rad, 2 * n + 1)
 
 
 def _tilt(ground: F64) -> F64:
@@ -132,7 +192,7 @@ def _tilt(ground: F64) -> F64:
     return exp_so3(np.arccos(normal[2]) * np.array([-normal[1], normal[0], 0.0]) / max(np.hypot(*normal[:2]), 1e-12))
 
 
-def _thinned(points: F64, n: int) -> F64:
+def thinned(points: F64, n: int) -> F64:
     """At most n of the points (N, 3), evenly through their order."""
     return points[np.linspace(0, len(points) - 1, min(n, len(points))).astype(np.int64)]
 
@@ -178,47 +238,59 @@ def _score_all(points: F64, R: F64, t: F64, field: U8, scores: F64) -> None:
 
 def _distinct_best(hypotheses: F64, scores: F64, n: int) -> NDArray[np.int64]:
     """Indices of the n best hypotheses, none near a better one."""
-    left = np.argsort(-scores, kind="stable")
+    left = np.argsort(-scores, kind="stable")[:LOOKED_AT]
     chosen: list[int] = []
     while len(left) and len(chosen) < n:
         chosen.append(int(left[0]))
-        left = left[~_near(hypotheses[left], hypotheses[left[0]], SUPPRESS_M, SUPPRESS_DEG)]
+        left = left[~near_pose(hypotheses[left], hypotheses[left[0]], SUPPRESS_M, SUPPRESS_DEG)]
     return np.array(chosen, np.int64)
 
 
-def _near(T: F64, other: F64, apart_m: float, apart_deg: float) -> NDArray[np.bool_]:
-    """(K,) which poses (K, 4, 4) lie within both limits of `other` (4, 4)."""
-    distance = np.linalg.norm(T[:, :2, 3] - other[:2, 3], axis=1)
-    turn = np.linalg.norm(log_so3(other[:3, :3].T @ T[:, :3, :3]), axis=1)
-    return np.asarray((distance < apart_m) & (turn < np.radians(apart_deg)))
+def near_pose(T: F64, other: F64, apart_m: float, apart_deg: float) -> NDArray[np.bool_]:
+    """(K,) which poses (K, 4, 4) lie within both limits (horizontal distance, angle) of `other` (4, 4)."""
+    distance = np.hypot(T[:, 0, 3] - other[0, 3], T[:, 1, 3] - other[1, 3])
+    cosine = 0.5 * (np.einsum("kij,ij->k", T[:, :3, :3], other[:3, :3]) - 1.0)  # of the angle between them
+    return np.asarray((distance < apart_m) & (cosine > np.cos(np.radians(apart_deg))))
 
 
 def _refined(
-    points_m: F64, standing_m: F64, poses: F64, m: MatchMap, par: RegistrationParameters
-) -> list[tuple[float, RegistrationResult]]:
+    points_m: F64, standing_m: F64, poses: Iterable[F64], m: MatchMap, par: RegistrationParameters, start: Start,
+    how: InitialiseParameters,
+) -> list[Candidate]:  # fmt: skip
     """Registrations from each pose with the fit of what stands above the ground; those that match nothing left out."""
-    results = []
+    standing_m = thinned(standing_m, how.n_refining)
+    candidates = []
     for T in poses:
         try:
-            result = register(points_m, T, m, par, "capture")
+            result = register(points_m, T, m, par, start)
         except RegistrationError:
             continue
-        results.append((fit_of(standing_m, result.T_map_vehicle, m, par), result))
-    return results
+        candidates.append(Candidate(result, fit_of(standing_m, result.T_map_vehicle, m, par)))
+    return candidates
 
 
-def _answer(results: list[tuple[float, RegistrationResult]], n: int, par: InitialiseParameters) -> InitialPose | None:
-    """The best refined pose, compared with the best that is a different one."""
-    if not results:
+def _answer(candidates: list[Candidate], n: int, par: InitialiseParameters) -> InitialPose | None:
+    """The best candidate, compared with the best that is a different answer."""
+    if not candidates:
         return None
-    fits = np.array([fit for fit, _ in results])
-    best = int(np.argmax(fits))
-    T = np.stack([result.T_map_vehicle for _, result in results])
-    others = fits[~_near(T, T[best], par.apart_m, par.apart_deg)]
+    best = candidates[0]
+    T = np.stack([c.registration.T_map_vehicle for c in candidates])
+    fits = np.array([c.fit for c in candidates])
+    others = fits[~near_pose(T, T[0], par.apart_m, par.apart_deg)]
     runner_up = float(others.max()) if len(others) else 0.0
-    fit = float(fits[best])
-    found = fit >= par.min_fit and runner_up <= par.ambiguity * fit
-    return InitialPose(results[best][1], fit, runner_up, n, found)
+    found = best.fit >= par.min_fit and runner_up <= par.ambiguity * best.fit
+    probability = float(probabilities(np.concatenate([[best.fit], others]), 1.0, HypothesisParameters())[0])
+    return InitialPose(best.registration, best.fit, runner_up, n, found, probability)
+
+
+def probabilities(fits: F64, views: float, par: HypothesisParameters, penalties: F64 | float = 0.0) -> F64:
+    """(K,) probabilities of poses with mean fits (K,) over so many views, beside that of being none of them.
+
+    `penalties` (K,) are logarithms taken off: what odometry and GNSS say against a pose.
+    """
+    log = par.gain * views * (np.concatenate([fits, [par.none_fit]])) - np.append(penalties + 0.0 * fits, 0.0)
+    weight = np.exp(log - log.max())
+    return np.asarray(weight[:-1] / weight.sum())
 
 
 def _with_all_points(

@@ -61,8 +61,9 @@ class InitialiseParameters:
     """Search for the first pose around a GNSS position.
 
     radius_sigmas: how far around the position, in its sigmas; step_m, step_deg: spacing of the coarse hypotheses;
-    n_points: points that score one; n_refined: how many of the best are refined by registration, with `n_refining`
-        points;
+    n_points: points that score one; n_refined: how many of the best are refined by registration, with `n_checked`
+        points; n_kept: how many of these are refined to the end, with `n_refining` points; same_m, same_deg: refined
+        poses nearer than this are one;
     min_fit: least fit (0 ... 1) that counts as found; ambiguity: the runner-up may reach this share of the best fit;
     good_fit, patience_s: for so long only a fit of `good_fit` is taken: where much has changed, a pose decimetres off
         can fit best, and a vehicle that moves soon sees something else;
@@ -74,7 +75,11 @@ class InitialiseParameters:
     step_deg: float = 5.0
     n_points: int = 400
     n_refined: int = 24
+    n_checked: int = 400
+    n_kept: int = 8
     n_refining: int = 1000
+    same_m: float = 0.2
+    same_deg: float = 1.0
     min_fit: float = 0.4
     good_fit: float = 0.65
     patience_s: float = 5.0
