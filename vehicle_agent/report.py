@@ -17,6 +17,7 @@ from schemas.report_id import deterministic_report_id
 from vehicle_agent.config import ReportParameters
 from vehicle_agent.detect.classify import classify, tile_change
 from vehicle_agent.detect.detector import ChangeDetector
+from vehicle_agent.detect.uncertainty import PoseUncertainty
 from vehicle_agent.localise.estimates import PoseEstimate
 from vehicle_agent.outbox import Outbox
 from vehicle_agent.segment.segmenter import SegmentedScan
@@ -44,12 +45,6 @@ class _Stretch:
 
     first_ns: int
     last_ns: int
-    variances: list[tuple[float, float]] = field(default_factory=list)
-
-    def sigma(self) -> tuple[float, float]:
-        """Root mean square of the poses' sigmas (m, rad)."""
-        m, rad = np.sqrt(np.mean(np.array(self.variances or [(0.0, 0.0)]), axis=0))
-        return float(m), float(rad)
 
 
 @dataclass(slots=True)
@@ -88,8 +83,9 @@ class Reporter:
         self.counts["scans_used"] += 1
         self.counts["points"] += len(segmented.moving)
         self.counts["moving_points"] += int(segmented.moving.sum())
-        self.counts["rays"] += self._detector.add_scan(scan.points_map_m, scan.origins_map_m, segmented.moving)
-        self._lengthen(scan.t_ns, estimate)
+        pose = PoseUncertainty.of(estimate)
+        self.counts["rays"] += self._detector.add_scan(scan.points_map_m, scan.origins_map_m, segmented.moving, pose)
+        self._lengthen(scan.t_ns)
 
     def leave_behind(self, estimate: PoseEstimate, odometer_m: float) -> None:
         """Decide the tiles that the refined pose has left, report the districts that have none left to decide."""
@@ -112,23 +108,21 @@ class Reporter:
         for district in list(self._pending):
             self._report(district)
 
-    def _lengthen(self, t_ns: int, estimate: PoseEstimate) -> None:
+    def _lengthen(self, t_ns: int) -> None:
         if self._stretch is None:
             self._stretch = _Stretch(t_ns, t_ns)
         self._stretch.last_ns = max(self._stretch.last_ns, t_ns)
-        self._stretch.variances.append((estimate.sigma_m**2, estimate.sigma_rad**2))
 
     def _decide(self, tiles: Collection[TileId], odometer_m: float) -> None:
         if not tiles or self._stretch is None:
             return
-        sigma_m, sigma_rad = self._stretch.sigma()
         for tile_id, evidence in self._detector.finish(tiles).items():
             found = classify(evidence, self._detector.parameters)
             for name, n in zip(ChangeClass.__members__, np.bincount(found.change_class, minlength=6), strict=True):
                 self.classes[name.lower()] += int(n)
             if not found.observed.any():
                 continue
-            change = tile_change(found, pose_sigma_m=sigma_m, pose_sigma_rad=sigma_rad)
+            change = tile_change(found)
             pending = self._pending.setdefault(tile_id.district, _Pending(odometer_m))
             if tile_id in pending.changes:  # the vehicle came back: one statement a tile and report
                 self._report(tile_id.district)

@@ -36,7 +36,7 @@ def warm_up() -> None:
     _segment(points, refined[-1].estimate if refined else None)
     detector.add_scan(points, np.array([0.0, 0.0, _LIDAR_HEIGHT_M]))
     for evidence in detector.finish(local_map.tiles).values():
-        tile_change(classify(evidence, detector.parameters), pose_sigma_m=0.0, pose_sigma_rad=0.0)
+        tile_change(classify(evidence, detector.parameters))
 
 
 def _segment(points_map_m: F64, estimate: PoseEstimate | None) -> None:

@@ -20,6 +20,7 @@ from schemas.drive import GnssFix, MotionSample, Scan
 from vehicle_agent.detect.classify import Classification, classify
 from vehicle_agent.detect.detector import ChangeDetector
 from vehicle_agent.detect.parameters import DetectParameters
+from vehicle_agent.detect.uncertainty import PoseUncertainty
 from vehicle_agent.local_map import LocalMap
 from vehicle_agent.localise import Localiser, RefinedScan
 from vehicle_agent.segment.parameters import SegmentParameters
@@ -100,7 +101,8 @@ def detect(scene: Scene, local_map: LocalMap, scans: Iterable[SegmentedScan], pa
     detector, used = ChangeDetector(local_map, parameters), 0
     for one in scans:
         if one.scan.estimate.health == "good":
-            detector.add_scan(one.scan.points_map_m, one.scan.origins_map_m, one.moving)
+            pose = PoseUncertainty.of(one.scan.estimate)
+            detector.add_scan(one.scan.points_map_m, one.scan.origins_map_m, one.moving, pose)
             used += 1
     if not used:
         raise RealDataError(f"{scene.name}: the localiser found no good pose for any scan on the map of the other half")

@@ -18,6 +18,7 @@ from gnd_map.tile_id import TileId
 from vehicle_agent.detect.detector import ChangeDetector
 from vehicle_agent.detect.evidence import TileEvidence
 from vehicle_agent.detect.parameters import DetectParameters
+from vehicle_agent.detect.uncertainty import PoseUncertainty
 from vehicle_agent.local_map import LocalMap
 from vehicle_agent.segment.segmenter import SegmentedScan
 
@@ -87,7 +88,8 @@ class Watcher:
     def add_scan(self, segmented: SegmentedScan) -> None:
         """Count a scan's rays through the watched tile."""
         scan = segmented.scan
-        if not self._detector.add_scan(scan.points_map_m, scan.origins_map_m, segmented.moving):
+        pose = PoseUncertainty.of(scan.estimate)
+        if not self._detector.add_scan(scan.points_map_m, scan.origins_map_m, segmented.moving, pose):
             return
         found = self._detector.finish([self._watch.tile])[self._watch.tile]
         self._counters.append(_counters_at(found, self._voxel_id))

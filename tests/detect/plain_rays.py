@@ -48,8 +48,8 @@ def is_inside_window(voxel: tuple[int, ...], shape: tuple[int, int, int]) -> boo
 class PlainDetector:
     """Counts the six cases of GND 4.2 with the meaning of `DetectParameters`, one after the other."""
 
-    def __init__(self, world: PlainMap, p, quantile, A: np.ndarray, b: np.ndarray) -> None:
-        self.world, self.p, self.quantile, self.A, self.b = world, p, quantile, A, b
+    def __init__(self, world: PlainMap, p, quantile, A: np.ndarray, b: np.ndarray, pose=None) -> None:
+        self.world, self.p, self.quantile, self.A, self.b, self.pose = world, p, quantile, A, b, pose
         n = len(world.mean)
         self.bi, self.bo, self.pi, self.po = (np.zeros(n, int) for _ in range(4))
         self.pe = np.zeros(world.shape, int)
@@ -58,6 +58,7 @@ class PlainDetector:
     def ray(self, origin: np.ndarray, point: np.ndarray, moving: bool = False) -> None:
         length = float(np.linalg.norm(point - origin))
         self.kept.append(False)
+        s2 = self._variance_beyond_what_is_included(length)
         if not length > self.p.range_min_m:
             return
         reach = min(1.0, self.p.range_max_m / length)
@@ -71,26 +72,33 @@ class PlainDetector:
             return
         ends_inside = reach == 1.0 and is_inside_window(tuple(np.floor(start + full).astype(int)), self.world.shape)
         for voxel, t_in, t_out in pieces[:-1]:
-            self._pass(voxel, origin, point, t_in, t_out, length)
+            self._pass(voxel, origin, point, t_in, t_out, length, s2)
         if ends_inside and not moving:
-            self._block(pieces[-1][0], point, start + full)
+            self._block(pieces[-1][0], point, start + full, s2)
 
-    def _pass(self, voxel, origin, point, t_in, t_out, length) -> None:
+    def _variance_beyond_what_is_included(self, length: float) -> float:
+        if self.pose is None:
+            return 0.0
+        end = self.pose.sigma_m**2 + (self.pose.sigma_rad * length) ** 2
+        return max(end - self.p.soft.included_m**2, 0.0)
+
+    def _pass(self, voxel, origin, point, t_in, t_out, length, s2) -> None:
         row = self.world.index[voxel]
         if row == -1:
             self.pe[voxel] += 1
         elif row >= 0:
-            counter = self.pi if self._passes(row, origin, point, t_in, t_out, length) else self.po
+            counter = self.pi if self._passes(row, origin, point, t_in, t_out, length, s2) else self.po
             counter[row] += 1
 
-    def _passes(self, row, origin, point, t_in, t_out, length) -> bool:
+    def _passes(self, row, origin, point, t_in, t_out, length, s2) -> bool:
         v, mean = point - origin, self.world.mean[row]
         cov = self.world.cov[row] + np.eye(3) * self.p.pass_noise_m**2
         values, vectors = np.linalg.eigh(cov)
         if self.p.passing_rule == "plane" and values[1] >= self.p.planar_ratio * values[0]:
             normal = vectors[:, 0]
             t = normal @ (mean - origin) / (normal @ v)
-            if not t_in <= t <= t_out or (1 - t) * abs(normal @ v) <= self.p.beyond_m:
+            behind = math.hypot(self.p.beyond_m, self.p.soft.beyond_sigmas * math.sqrt(s2))
+            if not t_in <= t <= t_out or (1 - t) * abs(normal @ v) <= behind:
                 return False
             return self.world.r2(row, origin + t * v, self.p.pass_noise_m) <= self.quantile(self.p.eta_plane)
         information = np.linalg.inv(cov)
@@ -99,11 +107,13 @@ class PlainDetector:
             return False
         return self.world.r2(row, origin + t * v, self.p.pass_noise_m) <= self.quantile(self.p.eta_pass)
 
-    def _block(self, voxel, point, g) -> None:
+    def _block(self, voxel, point, g, s2) -> None:
         row = self.world.index[voxel]
         if row < -1:
             return
-        if row >= 0 and self.world.r2(row, point, self.p.block_noise_m) <= self.quantile(self.p.eta_block):
+        noise2 = self.p.block_noise_m**2
+        limit = self.quantile(self.p.eta_block) * (noise2 + self.p.soft.block * s2) / noise2
+        if row >= 0 and self.world.r2(row, point, self.p.block_noise_m) <= limit:
             self.bi[row] += 1
         elif self._explained(voxel, point, g):
             return

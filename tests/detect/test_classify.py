@@ -13,6 +13,7 @@ from schemas.changes import TileChange
 from vehicle_agent.detect.classify import Classification, classify, tile_change
 from vehicle_agent.detect.evidence import TileEvidence
 from vehicle_agent.detect.parameters import DetectParameters
+from vehicle_agent.detect.uncertainty import PoseUncertainty
 
 PLANE = (0.0008, 0.0, 0.0, 0.08, 0.0, 0.08)  # upright, facing x
 FIRST_VOXEL = 36_000
@@ -102,6 +103,7 @@ def several() -> tuple[TileEvidence, Classification]:
         voxel_id=np.array(ids, np.int32),
         map_row=np.array([0, 1, 2, -1, -1], np.int64),
         measured=gaussians(ids, [100, 2, 205, 90, 9], [50, 2, 50, 50, 9], [0.0, 0.4, 0.4, 0.1, 0.1]),
+        pose=PoseUncertainty(0.03, 0.001, range_m=17.0),
         **{name: np.array(column, np.int32) for name, column in columns.items()},
     )
     return evidence, classify(evidence, DetectParameters())
@@ -109,7 +111,7 @@ def several() -> tuple[TileEvidence, Classification]:
 
 def test_the_report_names_what_was_observed_and_what_changed() -> None:
     evidence, found = several()
-    change = tile_change(found, pose_sigma_m=0.03, pose_sigma_rad=0.001)
+    change = tile_change(found)
     assert isinstance(change, TileChange)
     assert (change.base_version, change.base_sha) == (3, evidence.base.sha)
     np.testing.assert_array_equal(change.observed, evidence.voxel_id[:4])  # who abstains has not observed
@@ -123,6 +125,6 @@ def test_the_report_names_what_was_observed_and_what_changed() -> None:
 
 def test_without_a_map_the_report_has_no_base() -> None:
     found = classify(one(in_map=False, be=200, cells=50), DetectParameters())
-    change = tile_change(found, pose_sigma_m=0.0, pose_sigma_rad=0.0)
+    change = tile_change(found)
     assert (change.base_version, change.base_sha) == (0, b"")
     assert len(change.changed) == 1

@@ -11,10 +11,12 @@ from vehicle_agent.detect.chi_square import confidence, quantile
 from vehicle_agent.detect.kernel import cast_rays, kernel_parameters, window_affine
 from vehicle_agent.detect.parameters import DetectParameterError, DetectParameters
 from vehicle_agent.detect.records import N_BI, N_BO, N_PI, N_PO, make_records
+from vehicle_agent.detect.uncertainty import PoseUncertainty
 from vehicle_agent.local_map import EMPTY, UNKNOWN
 
 SHAPE = (14, 12, 9)
 A_GRID = np.array([[1.021, 0.013, 0.0], [-0.011, 1.018, 0.0002], [0.0, 0.0001, 1.0]])  # a grid turned and stretched
+EXACT, VAGUE = PoseUncertainty(), PoseUncertainty(0.06, 0.02)
 ANCHOR = np.array([3.0, -2.0, 30.0])
 
 
@@ -32,21 +34,22 @@ def random_world(rng: np.random.Generator, n: int = 260) -> PlainMap:
 
 
 def kernel_run(
-    world: PlainMap, p: DetectParameters, points: np.ndarray, origins: np.ndarray, b: np.ndarray, moving: np.ndarray
-):
+    world: PlainMap, p: DetectParameters, points: np.ndarray, origins: np.ndarray, b: np.ndarray, moving: np.ndarray,
+    pose: PoseUncertainty,
+):  # fmt: skip
     cov6 = world.cov[:, [0, 0, 0, 1, 1, 2], [0, 1, 2, 1, 2, 2]]
     records = make_records(world.mean, cov6, np.zeros(3), p)
     state, kept = world.index.copy(), np.zeros(len(points), np.uint8)
     cast = cast_rays(
         points, origins, A_GRID, b, state.reshape(-1), state.shape, records.words, records.floats, records.block,
-        kernel_parameters(p), moving, kept,
+        kernel_parameters(p, pose), moving, kept,
     )  # fmt: skip
     return records.words, state, kept, cast
 
 
 @pytest.mark.parametrize("rule", ["ml", "ahead", "plane"])
-@pytest.mark.parametrize("seed", [1, 2])
-def test_kernel_counts_what_the_plain_twin_counts(rule: str, seed: int) -> None:
+@pytest.mark.parametrize(("seed", "pose"), [(1, EXACT), (2, EXACT), (3, VAGUE), (4, VAGUE)])
+def test_kernel_counts_what_the_plain_twin_counts(rule: str, seed: int, pose: PoseUncertainty) -> None:
     rng = np.random.default_rng(seed)
     world = random_world(rng)
     p = replace(DetectParameters(), passing_rule=rule, range_min_m=1.0, range_max_m=11.0, ahead_m=0.5)
@@ -58,9 +61,9 @@ def test_kernel_counts_what_the_plain_twin_counts(rule: str, seed: int) -> None:
     points[-40:] += rng.normal(0, 20, (40, 3))  # beyond the range and the window
     b, moving = np.zeros(3), rng.random(n) < 0.15
 
-    words, state, kept, _ = kernel_run(world, p, points, origins, b, moving)
+    words, state, kept, _ = kernel_run(world, p, points, origins, b, moving, pose)
 
-    plain = PlainDetector(world, p, quantile, A_GRID, b)
+    plain = PlainDetector(world, p, quantile, A_GRID, b, pose)
     for origin, point, moves in zip(origins, points, moving, strict=True):
         plain.ray(origin, point, moves)
     for column, expected in ((N_BI, plain.bi), (N_BO, plain.bo), (N_PI, plain.pi), (N_PO, plain.po)):

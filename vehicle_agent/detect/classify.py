@@ -110,8 +110,10 @@ def _same_shape(e: TileEvidence, p: DetectParameters) -> NDArray[np.bool_]:
     return result
 
 
-def tile_change(found: Classification, *, pose_sigma_m: float, pose_sigma_rad: float) -> TileChange:
-    """What is reported of a tile: all observed voxels, and the changed ones with their new Gaussian or none."""
+def tile_change(found: Classification) -> TileChange:
+    """What is reported of a tile: all observed voxels, the changed ones with their new Gaussian or none, and how well
+    the poses were known.
+    """
     e, base = found.evidence, found.evidence.base
     rows = np.flatnonzero(found.changed)
     return TileChange(
@@ -122,8 +124,8 @@ def tile_change(found: Classification, *, pose_sigma_m: float, pose_sigma_rad: f
         changed=_uploaded(e.measured.take(rows), found.change_class[rows]),
         change_class=found.change_class[rows],
         evidence=e.counters[rows],
-        pose_sigma_m=pose_sigma_m,
-        pose_sigma_rad=pose_sigma_rad,
+        pose_sigma_m=e.pose.sigma_m,
+        pose_sigma_rad=e.pose.sigma_rad,
     )
 
 

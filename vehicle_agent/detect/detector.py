@@ -1,7 +1,7 @@
 """Rays of many scans against the local map: counters while driving, each tile's evidence when it is left."""
 
 from collections.abc import Collection
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,9 +13,10 @@ from gnd_map.gaussian import Gaussians
 from gnd_map.tile import Tile
 from gnd_map.tile_id import TileId
 from vehicle_agent.detect.evidence import TileEvidence
-from vehicle_agent.detect.kernel import cast_rays, kernel_parameters, window_affine
+from vehicle_agent.detect.kernel import CERTAIN, cast_rays, kernel_parameters, window_affine
 from vehicle_agent.detect.parameters import DetectParameters
 from vehicle_agent.detect.records import N_BI, N_BO, N_PI, N_PO, Records, make_records
+from vehicle_agent.detect.uncertainty import PoseUncertainty, TileUncertainties
 from vehicle_agent.errors import MapChanged
 from vehicle_agent.local_map import EMPTY, UNKNOWN, LocalMap
 
@@ -43,17 +44,24 @@ class ChangeDetector:
     def __init__(self, local_map: LocalMap, parameters: DetectParameters | None = None) -> None:
         self.local_map = local_map
         self.parameters = parameters or DetectParameters()
-        self._kernel = kernel_parameters(self.parameters)
         self._points = VoxelAccumulator(local_map.grid_frame)
+        self._poses = TileUncertainties(local_map.grid_frame)
         self._window: _Window | None = None
 
-    def add_scan(self, points_map_m: F64, origins_map_m: F64, moving: NDArray[np.bool_] | None = None) -> int:
+    def add_scan(
+        self,
+        points_map_m: F64,
+        origins_map_m: F64,
+        moving: NDArray[np.bool_] | None = None,
+        pose: PoseUncertainty = CERTAIN,
+    ) -> int:
         """Count the rays of one scan.
 
         Args:
             points_map_m: (N, 3) float64 hits, map frame, in firing order (shuffled points cost 1.5 times the time).
             origins_map_m: (N, 3) the sensor at each point, or (3,) for all.
             moving: (N,) bool, points on moving objects ([50] in GND): their rays pass, their ends count for nothing.
+            pose: how well the scan's pose is known; it softens what its rays say.
 
         Returns:
             How many rays were cast.
@@ -72,14 +80,18 @@ class ChangeDetector:
         window = self._current()
         if not len(points) or not window.state.size:
             return 0
-        affine = self.local_map.grid_frame.affine(0.5 * (origins[0] + origins[-1]))
+        middle = 0.5 * (origins[0] + origins[-1])
+        affine = self.local_map.grid_frame.affine(middle)
         A, b = window_affine(*affine, window.anchor_m, window.origin_g)
         kept = np.zeros(len(points), np.uint8)
         cast = cast_rays(
             points - window.anchor_m, origins - window.anchor_m, A, b, window.state.reshape(-1), window.state.shape,
-            window.records.words, window.records.floats, window.records.block, self._kernel, moves, kept,
+            window.records.words, window.records.floats, window.records.block,
+            kernel_parameters(self.parameters, pose), moves, kept,
         )  # fmt: skip
-        self._points.add(points[kept.view(np.bool_)])
+        evidence = points[kept.view(np.bool_)]
+        self._points.add(evidence)
+        self._poses.add_scan(evidence, middle, affine, pose)
         return cast
 
     def touched(self, tile_id: TileId) -> bool:
@@ -97,7 +109,8 @@ class ChangeDetector:
         window = self._current()
         held = sorted(set(tiles) & set(window.tiles))
         measured = self._points.pop(held, n_min_cells=1)
-        return {t: self._take(window, t, measured.get(t, Gaussians.empty())) for t in held}
+        of_passes = self._poses.mean()
+        return {t: self._take(window, t, measured.get(t, Gaussians.empty()), of_passes) for t in held}
 
     def _current(self) -> _Window:
         """The window of the map as it is now; counters move along when the map has changed."""
@@ -145,14 +158,15 @@ class ChangeDetector:
         x, y = self.local_map.box_of(tile_id, window.origin_g)
         return window.state[x, y]
 
-    def _take(self, window: _Window, tile_id: TileId, measured: Gaussians) -> TileEvidence:
+    def _take(self, window: _Window, tile_id: TileId, measured: Gaussians, of_passes: PoseUncertainty) -> TileEvidence:
         """The tile's evidence; its counters are set back to zero."""
         tile = window.tiles[tile_id]
         passes = self._take_passes(window, tile_id)
         counters = window.records.words[window.rows[tile_id], N_BI:].copy()
         window.records.words[window.rows[tile_id], N_BI:] = 0
         seen = tile.gaussians.voxel_id[counters.any(axis=1)]
-        return tile_evidence(tile, counters, passes, np.union1d(seen, measured.voxel_id), measured)
+        found = tile_evidence(tile, counters, passes, np.union1d(seen, measured.voxel_id), measured)
+        return replace(found, pose=self._poses.pop(tile_id) or of_passes)
 
     def _take_passes(self, window: _Window, tile_id: TileId) -> tuple[I32, I32]:
         """Voxel ids and pass counts of the tile's empty voxels that rays crossed."""

@@ -1,6 +1,6 @@
 """What the rays of one drive said about the voxels of one tile."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
@@ -8,6 +8,7 @@ from numpy.typing import NDArray
 from gnd_map.arrays import check_array
 from gnd_map.gaussian import Gaussians
 from gnd_map.tile import Tile
+from vehicle_agent.detect.uncertainty import PoseUncertainty
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -37,6 +38,8 @@ class TileEvidence:
     """(K,) rays passing an empty voxel."""
     measured: Gaussians
     """(K,) the points that ended in each voxel as a Gaussian, however few they are; count 0 where none did."""
+    pose: PoseUncertainty = field(default_factory=PoseUncertainty)
+    """How well the poses of the scans were known that gave the evidence."""
 
     def __post_init__(self) -> None:
         """The columns belong together."""

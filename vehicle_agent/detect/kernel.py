@@ -18,7 +18,9 @@ from gnd_map.jit import kernel
 from vehicle_agent.detect.chi_square import quantile
 from vehicle_agent.detect.parameters import DetectParameters
 from vehicle_agent.detect.records import N_BI, N_BO, N_PI, N_PO
+from vehicle_agent.detect.uncertainty import PoseUncertainty
 
+CERTAIN = PoseUncertainty()
 RULES = {"ml": 0, "ahead": 1, "plane": 2}
 UNKNOWN = -(2**31)
 
@@ -43,10 +45,20 @@ class KernelParameters(NamedTuple):
     face_m: float
     range_min_m: float
     range_max_m: float
+    pose_m2: float
+    pose_rad2: float
+    included_m2: float
+    block_gain: float
+    beyond_gain: float
 
 
-def kernel_parameters(p: DetectParameters) -> KernelParameters:
-    """Eq. (1) and (4) compare confidences; r² against their quantiles is the same test."""
+def kernel_parameters(p: DetectParameters, pose: PoseUncertainty = CERTAIN) -> KernelParameters:
+    """Eq. (1) and (4) compare confidences; r² against their quantiles is the same test.
+
+    Args:
+        p: the parameters.
+        pose: of the scan whose rays are cast.
+    """
     return KernelParameters(
         rule=RULES[p.passing_rule],
         r2_block=quantile(p.eta_block),
@@ -58,6 +70,11 @@ def kernel_parameters(p: DetectParameters) -> KernelParameters:
         face_m=p.face_m,
         range_min_m=p.range_min_m,
         range_max_m=p.range_max_m,
+        pose_m2=float(pose.sigma_m**2),
+        pose_rad2=float(pose.sigma_rad**2),
+        included_m2=float(p.soft.included_m**2),
+        block_gain=p.soft.block / p.block_noise_m**2,
+        beyond_gain=float(p.soft.beyond_sigmas**2),
     )
 
 
@@ -113,6 +130,7 @@ def _passes(
     t_in: float,
     t_out: float,
     length: float,
+    beyond_m: float,
     p: "KernelParameters",
 ) -> bool:
     """Whether the ray passes inside the Gaussian (PI) rather than outside (PO), by the rule of `p`."""
@@ -121,7 +139,7 @@ def _passes(
     if p.rule == 2 and nx * nx + ny * ny + nz * nz > 0.5:
         along = nx * vx + ny * vy + nz * vz
         t = (nx * dx + ny * dy + nz * dz) / along
-        if not (t_in <= t <= t_out) or (1.0 - t) * abs(along) <= p.beyond_m:
+        if not (t_in <= t <= t_out) or (1.0 - t) * abs(along) <= beyond_m:
             return False
         return _r2_on_ray(records, row, dx, dy, dz, vx, vy, vz, t) <= p.r2_plane
     t = _ml_parameter(records, row, dx, dy, dz, vx, vy, vz, t_in, t_out)
@@ -238,6 +256,8 @@ def cast_rays(  # noqa: C901  (one loop: a call a voxel would cost more than the
         length = math.sqrt(vx * vx + vy * vy + vz * vz)
         if not (length > p.range_min_m):
             continue
+        s2 = max(p.pose_m2 + p.pose_rad2 * length * length - p.included_m2, 0.0)  # variance of the ray's end
+        beyond_m = math.sqrt(p.beyond_m * p.beyond_m + p.beyond_gain * s2)
         # The ray in window coordinates, cut at the range and at the window.
         gx = A[0, 0] * ox + A[0, 1] * oy + A[0, 2] * oz + b[0]
         gy = A[1, 0] * ox + A[1, 1] * oy + A[1, 2] * oz + b[1]
@@ -267,7 +287,7 @@ def cast_rays(  # noqa: C901  (one loop: a call a voxel would cost more than the
             row = state[np.uint64(at)]
             t_out = min(t_x, t_y, t_z)
             if row >= 0:
-                inside = _passes(records, row, ox, oy, oz, vx, vy, vz, t_in, t_out, length, p)
+                inside = _passes(records, row, ox, oy, oz, vx, vy, vz, t_in, t_out, length, beyond_m, p)
                 words[np.uint64(row), N_PI if inside else N_PO] += 1
             elif row != UNKNOWN:
                 state[np.uint64(at)] = row - 1
@@ -287,7 +307,9 @@ def cast_rays(  # noqa: C901  (one loop: a call a voxel would cost more than the
         row = state[np.uint64(at)]
         if t_end < 1.0 or row == UNKNOWN or moving[r]:
             continue
-        if row >= 0 and _r2_block(block, records, row, px, py, pz) <= p.r2_block:  # Eq. (1)
+        # A Gaussian that is thin beside the noise: its variance, and so the limit of r², grows by this factor.
+        wider = 1.0 + p.block_gain * s2
+        if row >= 0 and _r2_block(block, records, row, px, py, pz) <= p.r2_block * wider:  # Eq. (1)
             words[np.uint64(row), N_BI] += 1
             kept[r] = 1
             continue

@@ -15,6 +15,31 @@ class DetectParameterError(VehicleError):
 
 
 @dataclass(frozen=True, slots=True)
+class SoftParameters:
+    """How the uncertainty of the poses softens the evidence; 0 switches a rule off.
+
+    The variance of a ray's end, s², is the position's and, times the squared range, the heading's, less `included_m`².
+    """
+
+    included_m: float = 0.04
+    """So much uncertainty the other parameters stand for: they were chosen with poses off by 4 cm and 0.08°."""
+    block: float = 1.0
+    """BI/BO: this share of s² is added to `block_noise_m`², along the axis in which the Gaussian is thin."""
+    beyond_sigmas: float = 2.0
+    """PI: a ray must end farther behind the plane by this many s (root of the sum of squares with `beyond_m`)."""
+
+    def __post_init__(self) -> None:
+        """Each value within its range, or `DetectParameterError` with the value."""
+        for name in ("included_m", "block", "beyond_sigmas"):
+            _check(f"soft.{name}", getattr(self, name), 0.0, 10.0)
+
+    @classmethod
+    def off(cls) -> "SoftParameters":
+        """Poses are taken for exact, as in the paper."""
+        return cls(block=0.0, beyond_sigmas=0.0)
+
+
+@dataclass(frozen=True, slots=True)
 class DetectParameters:
     """How rays become evidence and evidence becomes classes.
 
@@ -68,6 +93,8 @@ class DetectParameters:
     """PI rays that a deletion needs."""
     reshaped_log_odds: float = -0.4
     """A measured Gaussian is of another shape than the map's from these log-odds on (see `shape_change`)."""
+    soft: SoftParameters = field(default_factory=SoftParameters)
+    """What the uncertainty of the poses changes."""
 
     def __post_init__(self) -> None:
         """Each value within its range, or `DetectParameterError` with the value."""
@@ -98,6 +125,7 @@ class DetectParameters:
             weak_cells=1,
             min_passes=1,
             min_pass_inside=1,
+            soft=SoftParameters.off(),
         )
 
 
