@@ -1,0 +1,207 @@
+"""Scan-to-scan odometry: each scan is matched with what the last ones saw, with no map needed and no wheel.
+
+The scans before are kept as Gaussians in a rolling map (some 20 m of way). A step that lies far from the prediction,
+or that rests on too few points, is not given. Experience with odometry of recordings (`importers.lidar_odometry`) holds
+here too: voxels that hold one or two rings of a scan say where the rings are, not where the ground is.
+"""
+
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from gnd_map.se3 import T_from_R_t, T_inverse, exp_so3, log_so3, transform
+from vehicle_agent.errors import RegistrationError
+from vehicle_agent.localise.parameters import RegistrationParameters
+from vehicle_agent.localise.registration import register
+from vehicle_agent.localise.rolling_map import RollingMap
+from vehicle_agent.localise.scan_odometry_parameters import ScanOdometryParameters
+
+F64 = NDArray[np.float64]
+
+CONTRADICTION = 3.0  # sigmas
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class ScanStep:
+    """The motion between two scans as the scans tell it.
+
+    T_before_now: (4, 4). covariance: (6, 6) of a small motion of the vehicle at its later end, rotation [rad] first,
+    then position [m], along its own axes (as GTSAM's BetweenFactorPose3 takes it); directions that the scans do not
+    constrain have a sigma of metres, and T_before_now follows the prediction there. fit: 0 ... 1.
+    """
+
+    T_before_now: F64
+    covariance: F64
+    fit: float
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class JointStep:
+    """What wheels, gyro and scans say together.
+
+    T_before_now: (4, 4), each believed by its covariance. driven_sigmas: (6,) sigmas of wheels and gyro, grown where
+    the scans contradict them. slipped: they do.
+    """
+
+    T_before_now: F64
+    driven_sigmas: F64
+    slipped: bool
+
+
+def joint_step(T_driven: F64, sigmas: F64, step: ScanStep | None) -> JointStep:
+    """Put together the motion (4, 4) with `sigmas` (6,) that wheels and gyro tell, and what scans tell, if anything."""
+    if step is None:
+        return JointStep(T_driven, sigmas, False)
+    off = _log(T_inverse(T_driven) @ step.T_before_now)
+    excess = off**2 - CONTRADICTION**2 * (sigmas**2 + np.diag(step.covariance))
+    grown = np.hypot(sigmas, np.sqrt(np.maximum(excess, 0.0)))
+    gain = _gain(np.diag(grown**2), step.covariance)
+    return JointStep(T_driven @ _exp(gain @ off), grown, bool((excess > 0).any()))
+
+
+class _Prediction(NamedTuple):
+    """Motion since the scan before (4, 4) and its sigmas (6,)."""
+
+    T_before_now: F64
+    sigmas: F64
+
+
+class _Match(NamedTuple):
+    """Where a scan lies on the rolling map: (4, 4), covariance (6, 6), fit; and the prediction that it is near to."""
+
+    T_odom_vehicle: F64
+    covariance: F64
+    fit: float
+    prediction: _Prediction
+
+
+class ScanOdometry:
+    """Feeds on deskewed scans in time order.
+
+    The pose on the rolling map is filtered, prediction and match each by its covariance, so that the map does not bend
+    with every match. A step is what two filtered poses differ by.
+    """
+
+    def __init__(self, parameters: ScanOdometryParameters) -> None:
+        self.parameters = parameters
+        self._registration = _registration(parameters)
+        self._map = RollingMap(parameters.rolling_map, parameters.noise_m)
+        self._before_ns: int | None = None
+        self._T_odom_before = np.eye(4)
+        self._covariance = np.zeros((6, 6))
+        self._steady: tuple[F64, int] | None = None
+        self._T_odom_added = np.eye(4)
+
+    def forget(self) -> None:
+        """The scans to come do not continue those before."""
+        self._before_ns = None
+
+    def step(self, t_ns: int, points_vehicle_m: F64, T_before_now_predicted: F64, sigmas: F64) -> ScanStep | None:
+        """The motion since the scan before; None when there is none, or it is not to be trusted.
+
+        Args:
+            t_ns: time of the scan; after a gap of more than `max_gap_s` everything begins anew.
+            points_vehicle_m: (N, 3) float64 sampled points, sweep motion removed.
+            T_before_now_predicted: (4, 4) motion since the scan before by wheel speed and yaw rate.
+            sigmas: (6,) its sigmas, rotation [rad] first, then position [m].
+        """
+        if self._before_ns is None or not 0 < t_ns - self._before_ns <= self.parameters.max_gap_s * 1e9:
+            self._begin(t_ns, points_vehicle_m)
+            return None
+        dt_ns, self._before_ns = t_ns - self._before_ns, t_ns
+        driven = _Prediction(T_before_now_predicted, sigmas)
+        match = self._matched(points_vehicle_m, driven, dt_ns)
+        T_before_now = self._advance(driven if match is None else match.prediction, match)
+        self._steady = None if match is None else (T_before_now, dt_ns)
+        self._add(points_vehicle_m)
+        if match is None:
+            return None
+        return ScanStep(T_before_now, self.parameters.step_share * match.covariance, match.fit)
+
+    def _begin(self, t_ns: int, points_m: F64) -> None:
+        self._before_ns = t_ns
+        self._T_odom_before = self._T_odom_added = np.eye(4)
+        self._covariance, self._steady = np.zeros((6, 6)), None
+        self._map.clear(np.zeros(3))
+        self._map.add(points_m, np.zeros(3))
+
+    def _matched(self, points_m: F64, driven: _Prediction, dt_ns: int) -> _Match | None:
+        """The match near to what wheels and gyro say, or else near to going on as before: wheels slip."""
+        chosen = points_m[:: max(1, len(points_m) // self.parameters.n_points)]
+        near = self._match_near(chosen, driven, self.parameters.min_fit)
+        return near or self._match_near(chosen, self._going_on(dt_ns), self.parameters.min_steady_fit)
+
+    def _going_on(self, dt_ns: int) -> _Prediction | None:
+        """The motion of the step before, for as long as this one took."""
+        par = self.parameters
+        if self._steady is None:
+            return None
+        T_step, step_ns = self._steady
+        sigmas = np.array([par.steady_rad] * 3 + [par.steady_m] * 3)
+        return _Prediction(_exp(_log(T_step) * (dt_ns / step_ns)), sigmas)
+
+    def _match_near(self, points_m: F64, prediction: _Prediction | None, min_fit: float) -> _Match | None:
+        """The match, if it fits well enough and lies near enough to the prediction."""
+        if prediction is None:
+            return None
+        par, T_predicted = self.parameters, self._T_odom_before @ prediction.T_before_now
+        try:
+            result = register(points_m, T_predicted, self._map.match_map(), self._registration, "near")
+        except RegistrationError:
+            return None
+        if not result.converged or result.fit < min_fit or result.matching_ratio < par.min_matching_ratio:
+            return None
+        if not self._near(_log(T_inverse(T_predicted) @ result.T_map_vehicle), prediction.sigmas):
+            return None
+        return _Match(result.T_map_vehicle, result.covariance, result.fit, prediction)
+
+    def _near(self, off: F64, sigmas: F64) -> bool:
+        par = self.parameters
+        limit_m = par.gate_m + 3.0 * float(np.linalg.norm(sigmas[3:]))
+        limit_rad = np.radians(par.gate_deg) + 3.0 * float(np.linalg.norm(sigmas[:3]))
+        return bool(np.linalg.norm(off[3:]) <= limit_m and np.linalg.norm(off[:3]) <= limit_rad)
+
+    def _advance(self, prediction: _Prediction, match: _Match | None) -> F64:
+        """Go on to the filtered pose of this scan and give the step (4, 4); a step is too short for its turn to matter
+        to the covariance.
+        """
+        T_before_now, self._covariance = prediction.T_before_now, self._covariance + np.diag(prediction.sigmas**2)
+        if match is not None:
+            gain = _gain(self._covariance, match.covariance)
+            off = _log(T_inverse(self._T_odom_before @ T_before_now) @ match.T_odom_vehicle)
+            T_before_now = T_before_now @ _exp(gain @ off)
+            self._covariance = (np.eye(6) - gain) @ self._covariance
+        self._T_odom_before = self._T_odom_before @ T_before_now
+        return T_before_now
+
+    def _add(self, points_m: F64) -> None:
+        """The scan joins the map when the vehicle has moved on since the last that did."""
+        T, par = self._T_odom_before, self.parameters
+        moved = _log(T_inverse(self._T_odom_added) @ T)
+        far = np.linalg.norm(moved[3:]) >= par.add_m or np.linalg.norm(moved[:3]) >= np.radians(par.add_deg)
+        if far or self._map.scans < par.first_scans:
+            self._T_odom_added = T
+            self._map.add(transform(T, points_m), T[:3, 3])
+
+
+def _registration(par: ScanOdometryParameters) -> RegistrationParameters:
+    return RegistrationParameters(
+        noise_m=par.noise_m, scales=par.scales, correlation=par.correlation, floor_m=par.floor_m,
+        floor_rad=par.floor_rad, degenerate_m=par.degenerate_m,
+    )  # fmt: skip
+
+
+def _gain(prior: F64, measured: F64) -> F64:
+    """(6, 6) how much of the way from the prior to the measurement to go, each believed by its covariance (6, 6)."""
+    return np.asarray(np.linalg.solve(prior + measured, prior).T)
+
+
+def _log(T: F64) -> F64:
+    """(6,) rotation vector and position of a small motion (4, 4)."""
+    return np.concatenate([log_so3(T[:3, :3]), T[:3, 3]])
+
+
+def _exp(small: F64) -> F64:
+    return T_from_R_t(exp_so3(small[:3]), small[3:])
