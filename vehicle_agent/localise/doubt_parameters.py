@@ -75,8 +75,9 @@ class ChallengeParameters:
 
     period_s, doubtful_s: pause between two searches, and when the pose is in doubt; turn_deg: headings within this of
         the tracked one; n_refined: how many are refined; reach_m: around the tracked pose where there is no GNSS;
-    lead: a rival must fit better by this much to be one. contested: below this probability of the tracked pose it is
-        called degraded; beaten: at this probability of a rival the pose is lost.
+    lead: a rival must fit better by this much to be one. prior: how much likelier the tracked pose is before anything
+        is seen; most_views: how many views may speak against it. contested, beaten, dropped: odds of a rival from which
+        on the tracked pose is degraded, is lost, and below which the rival is given up. All odds are logarithms.
     """
 
     period_s: float = 2.0
@@ -85,11 +86,14 @@ class ChallengeParameters:
     n_refined: int = 5
     reach_m: float = 5.0
     lead: float = 0.03
-    contested: float = 0.8
-    beaten: float = 0.97
+    prior: float = 6.0
+    most_views: float = 8.0
+    contested: float = -2.0
+    beaten: float = 4.0
+    dropped: float = -12.0
 
     def __post_init__(self) -> None:
         if not 0 < self.doubtful_s <= self.period_s or self.n_refined < 1 or self.reach_m <= 0:
             raise ValueError(f"0 < doubtful_s <= period_s, n_refined >= 1 and reach_m > 0 are required, got {self}")
-        if not 0 < self.contested < self.beaten < 1:
-            raise ValueError(f"0 < contested < beaten < 1 is required, got {self}")
+        if not self.dropped < self.contested < self.beaten or self.most_views < 1:
+            raise ValueError(f"dropped < contested < beaten and most_views >= 1 are required, got {self}")

@@ -14,8 +14,8 @@ from vehicle_agent.errors import LocaliseError
 F64 = NDArray[np.float64]
 Health = Literal["good", "degraded", "lost"]
 Cause = Literal[
-    "none", "wrong_pose", "stale_map", "poor_place", "no_map", "no_position", "no_motion", "bad_scan", "ambiguous",
-    "searching", "unconfirmed", "gap",
+    "none", "wrong_pose", "stale_map", "poor_place", "no_map", "no_match", "no_position", "no_motion", "bad_scan",
+    "bad_time", "gap", "ambiguous", "searching", "unconfirmed",
 ]  # fmt: skip
 
 

@@ -1,0 +1,117 @@
+"""Is there a better pose than the tracked one? Rivals are searched now and then, followed beside it, and judged."""
+
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from vehicle_agent.localise.first_pose import Place
+from vehicle_agent.localise.hypotheses import Hypotheses
+from vehicle_agent.localise.initialise import Around, near_pose, search, thinned
+from vehicle_agent.localise.match_map import MatchMap
+from vehicle_agent.localise.parameters import LocaliserParameters
+from vehicle_agent.localise.registration import fit_of
+
+F64 = NDArray[np.float64]
+
+
+class Challenger:
+    """Follows rivals of the tracked pose: poses elsewhere, consistent with GNSS, that fit better.
+
+    The tracked pose has been right so far, so a rival must make up for that: where a facade has moved, a pose
+    decimetres off fits better for some metres.
+    """
+
+    def __init__(self, parameters: LocaliserParameters) -> None:
+        self._par = parameters
+        self._how = replace(
+            parameters.initialise, n_refined=parameters.challenge.n_refined, n_kept=parameters.challenge.n_refined
+        )
+        self.rivals = Hypotheses(
+            replace(parameters.hypotheses, most_views=parameters.challenge.most_views), parameters.registration
+        )
+        self._searched_ns = -(2**62)
+        self._own_fits: list[tuple[float, float]] = []  # since there are rivals: fit, share of a view
+
+    def see(
+        self, t_ns: int, points_m: F64, standing_m: F64, T_tracked: F64, T_before_now: F64, place: Place,
+        match_map: MatchMap, doubtful: bool,
+    ) -> None:  # fmt: skip
+        """Take a scan with its tracked pose (4, 4); search when it is time, sooner when the pose is `doubtful`.
+
+        `points_m` (N, 3) and those that stand above the ground in the vehicle frame; `T_before_now` (4, 4) the motion
+        since the scan before; `place` to search around.
+        """
+        if len(self.rivals):
+            self._follow(points_m, standing_m, T_tracked, T_before_now, match_map)
+        par = self._par.challenge
+        if t_ns - self._searched_ns >= (par.doubtful_s if doubtful else par.period_s) * 1e9:
+            self._searched_ns = t_ns
+            self._search(points_m, standing_m, T_tracked, place, match_map)
+
+    @property
+    def odds(self) -> float:
+        """Logarithm of how much likelier the best rival is than the tracked pose; -inf without one."""
+        if not len(self.rivals):
+            return -np.inf
+        best, par = self.rivals.best, self._par
+        ahead = best.mean_fit - self._own_mean()
+        return float(par.hypotheses.gain * best.views * ahead - best.surprise - par.challenge.prior)
+
+    @property
+    def contested(self) -> bool:
+        """True when a rival makes the tracked pose doubtful."""
+        return self.odds > self._par.challenge.contested
+
+    @property
+    def beaten(self) -> bool:
+        """True when a rival has won."""
+        if self.odds <= self._par.challenge.beaten:
+            return False
+        return self.rivals.best.scans >= self._par.hypotheses.least_scans
+
+    def _follow(self, points_m: F64, standing_m: F64, T_tracked: F64, T_before_now: F64, match_map: MatchMap) -> None:
+        self.rivals.follow(T_before_now, points_m, standing_m, match_map)
+        self.rivals.drop_near(T_tracked)
+        if not len(self.rivals):
+            self._own_fits.clear()
+            return
+        self._take_own(standing_m, T_tracked, match_map, min(1.0, float(np.hypot(*T_before_now[:2, 3])) / 2.0))
+        if self.odds < self._par.challenge.dropped:
+            self.rivals.clear()
+            self._own_fits.clear()
+
+    def _search(self, points_m: F64, standing_m: F64, T_tracked: F64, place: Place, match_map: MatchMap) -> None:
+        heading = float(np.arctan2(T_tracked[1, 0], T_tracked[0, 0]))
+        par, own = self._par, self._fit(standing_m, T_tracked, match_map)
+        around = Around(place.p_map_m, place.reach_m, heading, np.radians(par.challenge.turn_deg))
+        found, _ = search(points_m, around, match_map, self._how, par.registration)
+        apart = par.hypotheses.apart_m, par.hypotheses.apart_deg
+        rivals = [
+            one
+            for one in found
+            if one.fit > own + par.challenge.lead
+            and not near_pose(one.registration.T_map_vehicle[None], T_tracked, *apart)[0]
+        ]
+        if rivals and not self._own_fits:
+            self._own_fits.append((own, 1.0))
+        self.rivals.add(rivals)
+
+    def _take_own(self, standing_m: F64, T_tracked: F64, match_map: MatchMap, new: float) -> None:
+        self._own_fits.append((self._fit(standing_m, T_tracked, match_map), max(new, 0.05)))
+        if len(self._own_fits) > 200:
+            del self._own_fits[0]
+
+    def _own_mean(self) -> float:
+        """Mean fit of the tracked pose over the views of the best rival."""
+        left, total, weight = self.rivals.best.views, 0.0, 0.0
+        for fit, share in reversed(self._own_fits):
+            take = min(share, left)
+            total, weight, left = total + take * fit, weight + take, left - take
+            if left <= 0.0:
+                break
+        return total / max(weight, 1e-9)
+
+    def _fit(self, standing_m: F64, T: F64, match_map: MatchMap) -> float:
+        few = thinned(standing_m, self._par.initialise.n_refining)
+        return fit_of(few, T, match_map, self._par.registration)

@@ -1,0 +1,153 @@
+"""Several poses at once: each is followed by odometry and registration until one of them has clearly won."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from gnd_map.se3 import T_inverse, log_so3
+from vehicle_agent.errors import RegistrationError
+from vehicle_agent.localise.doubt_parameters import HypothesisParameters
+from vehicle_agent.localise.initialise import Candidate, InitialPose, near_pose, probabilities, thinned
+from vehicle_agent.localise.match_map import MatchMap
+from vehicle_agent.localise.parameters import RegistrationParameters
+from vehicle_agent.localise.registration import RegistrationResult, fit_of, register
+
+F64 = NDArray[np.float64]
+
+
+@dataclass(slots=True, eq=False)
+class Hypothesis:
+    """A pose that may be the right one: mean fit over so many views; what odometry and GNSS say against it."""
+
+    registration: RegistrationResult
+    T_map_vehicle: F64
+    mean_fit: float
+    fit: float
+    views: float = 1.0
+    scans: int = 1
+    surprise: float = 0.0
+    far: float = 0.0
+
+    def take(self, result: RegistrationResult, fit: float, surprise: float, new: float, most: float) -> None:
+        """A further scan, which is `new` (0 ... 1) of a view."""
+        weight = new / (self.views + new) if self.views + new <= most else new / most
+        self.mean_fit += max(weight, 0.2 / (self.scans + 1.0)) * (fit - self.mean_fit)
+        self.surprise += 0.3 * (surprise - self.surprise)
+        self.views = min(self.views + new, most)
+        self.registration, self.T_map_vehicle, self.fit = result, result.T_map_vehicle, fit
+        self.scans += 1
+
+
+class Hypotheses:
+    """Follows poses over consecutive scans. Which is right is told by the mean fit of what stands above the ground
+    (standing still tells nothing new), by how far registration moves each from where odometry has put it, and by GNSS.
+    """
+
+    def __init__(self, parameters: HypothesisParameters, registration: RegistrationParameters) -> None:
+        self.parameters = parameters
+        self._registration = registration
+        self._held: list[Hypothesis] = []
+
+    def __len__(self) -> int:
+        return len(self._held)
+
+    def add(self, candidates: list[Candidate]) -> None:
+        """Take poses of the present scan; those that are followed already are left out."""
+        for one in candidates:
+            if not self._near(one.registration.T_map_vehicle).any():
+                result = one.registration
+                self._held.append(Hypothesis(result, result.T_map_vehicle, one.fit, one.fit))
+        self._prune()
+
+    def see_position(self, p_map_m: F64, sigma_m: float) -> None:
+        """Take where GNSS says that the vehicle is now: (3,), of which the height is not used; one sigma of an axis."""
+        for one in self._held:
+            one.far = 0.5 * float(np.sum((one.T_map_vehicle[:2, 3] - p_map_m[:2]) ** 2)) / sigma_m**2
+
+    def follow(self, T_before_now: F64, points_m: F64, standing_m: F64, match_map: MatchMap) -> None:
+        """Move every pose by odometry (4, 4) and register it with a scan: `points_m` (N, 3) in the vehicle frame, and
+        those of them that stand above the ground. A pose that matches nothing is given up.
+        """
+        par = self.parameters
+        new = min(1.0, float(np.hypot(*T_before_now[:2, 3])) / par.view_m)
+        few, standing = thinned(points_m, par.n_points), thinned(standing_m, par.n_points)
+        followed = []
+        for one in self._held:
+            predicted = one.T_map_vehicle @ T_before_now
+            result = self._registered(few, predicted, match_map)
+            if result is None:
+                continue
+            fit = fit_of(standing, result.T_map_vehicle, match_map, self._registration)
+            one.take(result, fit, self._surprise(predicted, result.T_map_vehicle), new, par.most_views)
+            followed.append(one)
+        self._held = followed
+        self._prune()
+
+    @property
+    def best(self) -> Hypothesis:
+        """The most probable one; there must be one."""
+        return self._held[int(np.argmax(self._probabilities()))]
+
+    @property
+    def probability(self) -> float:
+        """Of the best one, 0 without any; the rest is shared by the others and by "none of them"."""
+        return float(self._probabilities().max(initial=0.0))
+
+    def drop_near(self, T_map_vehicle: F64) -> None:
+        """Give up what has come to the same pose (4, 4)."""
+        same = self._near(T_map_vehicle)
+        self._held = [one for one, is_same in zip(self._held, same, strict=True) if not is_same]
+
+    def clear(self) -> None:
+        """Follow none."""
+        self._held = []
+
+    def answer(self) -> InitialPose | None:
+        """The best pose as it stands now; `found` when it has won."""
+        if not self._held:
+            return None
+        par, best = self.parameters, self.best
+        T = np.stack([one.T_map_vehicle for one in self._held])
+        fits = np.array([one.mean_fit for one in self._held])
+        others = fits[~near_pose(T, best.T_map_vehicle, par.apart_m, par.apart_deg)]
+        runner_up = float(others.max(initial=0.0))
+        at_once = best.mean_fit >= par.at_once and runner_up <= par.alone * best.mean_fit
+        won = at_once or (best.scans >= par.least_scans and self.probability >= par.sure)
+        return InitialPose(best.registration, best.mean_fit, runner_up, len(fits), won, self.probability)
+
+    def _registered(self, points: F64, predicted: F64, m: MatchMap) -> RegistrationResult | None:
+        try:
+            return register(points, predicted, m, self._registration, "wide")
+        except RegistrationError:
+            return None
+
+    def _surprise(self, T_predicted: F64, T_found: F64) -> float:
+        """Half the squared distance between two poses in sigmas, at most 8."""
+        par, off = self.parameters, T_inverse(T_predicted) @ T_found
+        shift = float(np.hypot(off[0, 3], off[1, 3])) / par.innovation_m
+        turn = float(np.degrees(np.linalg.norm(log_so3(off[:3, :3])))) / par.innovation_deg
+        return min(0.5 * (shift**2 + turn**2), 8.0)
+
+    def _probabilities(self) -> F64:
+        """(K,) of what is followed."""
+        if not self._held:
+            return np.empty(0)
+        fits = np.array([one.mean_fit for one in self._held])
+        views = max(one.views for one in self._held)
+        return probabilities(fits, views, self.parameters, np.array([one.surprise + one.far for one in self._held]))
+
+    def _near(self, T: F64) -> NDArray[np.bool_]:
+        held = np.stack([one.T_map_vehicle for one in self._held]) if self._held else np.empty((0, 4, 4))
+        return near_pose(held, T, self.parameters.apart_m, self.parameters.apart_deg)
+
+    def _prune(self) -> None:
+        """Leave out what has become improbable, what has run into a better one, and the least probable beyond the
+        number that is followed.
+        """
+        p = self._probabilities()
+        order = [k for k in np.argsort(-p, kind="stable") if p[k] >= self.parameters.dropped * p.max()]
+        held, self._held = self._held, []
+        for k in order[: 2 * self.parameters.n_most]:
+            if len(self._held) < self.parameters.n_most and not self._near(held[k].T_map_vehicle).any():
+                self._held.append(held[k])
