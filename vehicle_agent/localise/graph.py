@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vehicle_agent.localise.parameters import GraphParameters
+from vehicle_agent.localise.scan_odometry import ScanStep
 
 F64 = NDArray[np.float64]
 
@@ -65,7 +66,13 @@ class PoseGraph:
         return self._next - 1
 
     def add(
-        self, t_ns: int, T_start: F64, odometry: Odometry | None, match: MapMatch | None, gnss: Position | None
+        self,
+        t_ns: int,
+        T_start: F64,
+        odometry: Odometry | None,
+        match: MapMatch | None,
+        gnss: Position | None,
+        scans: ScanStep | None = None,
     ) -> list[SmoothedPose]:
         """Add the pose at `t_ns`, optimisation starting at `T_start` (4, 4); give the poses that leave the lag, oldest
         first. The first pose has no odometry.
@@ -75,6 +82,9 @@ class PoseGraph:
         if odometry is not None:
             drift = gtsam.noiseModel.Diagonal.Sigmas(odometry.sigmas)
             factors.add(gtsam.BetweenFactorPose3(number - 1, number, gtsam.Pose3(odometry.T_before_now), drift))
+        if scans is not None:
+            seen = self._robust(gtsam.noiseModel.Gaussian.Covariance(scans.covariance))
+            factors.add(gtsam.BetweenFactorPose3(number - 1, number, gtsam.Pose3(scans.T_before_now), seen))
         if match is not None:
             noise = self._robust(gtsam.noiseModel.Gaussian.Covariance(match.covariance))
             factors.add(gtsam.PriorFactorPose3(number, gtsam.Pose3(match.T_map_vehicle), noise))

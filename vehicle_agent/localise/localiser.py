@@ -22,6 +22,7 @@ from vehicle_agent.localise.odometry import MotionBuffer
 from vehicle_agent.localise.parameters import LocaliserParameters
 from vehicle_agent.localise.registration import RegistrationResult, Start, register
 from vehicle_agent.localise.sampling import sample_scan
+from vehicle_agent.localise.scan_odometry import ScanOdometry, ScanStep, joint_step
 
 F64 = NDArray[np.float64]
 
@@ -67,6 +68,7 @@ class Localiser:
         self._motion = MotionBuffer()
         self._teacher = MotionTeacher(self._motion, self.parameters.odometry)
         self._map = MatchMapCache(local_map, self.parameters.registration.noise_m)
+        self._scan_odometry = ScanOdometry(self.parameters.scan_odometry)
         self._fix: GnssFix | None = None
         self._pending: Scan | None = None
         self._newest_scan_ns = -1
@@ -138,18 +140,29 @@ class Localiser:
         """Predict from the newest pose, match, gate, fuse."""
         t_ns, newest = _reference_ns(scan), track.graph.newest
         odometry = self._odometry(track.held[newest].t_ns, t_ns)
-        predicted = track.graph.pose(newest) @ odometry.T_before_now
+        seen = self._scan_step(t_ns, points, odometry)
+        joint = joint_step(*odometry, seen)
+        predicted = track.graph.pose(newest) @ joint.T_before_now
         result, believed = self._matched(track.monitor, points, predicted, odometry.sigmas, t_ns)
         match = None
         if result is not None and believed:
             match = MapMatch(result.T_map_vehicle, result.covariance)
-            if result.fit >= self.parameters.odometry.teaching_fit:
+            if joint.slipped:
+                self._teacher.forget()
+            elif result.fit >= self.parameters.odometry.teaching_fit:
                 self._teacher.learn(t_ns, result.T_map_vehicle, result.covariance)
-        final = track.graph.add(t_ns, predicted, odometry, match, self._gnss_at(track, t_ns, predicted))
+        odometry = Odometry(odometry.T_before_now, joint.driven_sigmas)
+        final = track.graph.add(t_ns, predicted, odometry, match, self._gnss_at(track, t_ns, predicted), seen)
         self._hold(track, scan, result.matching_ratio if result is not None else 0.0)
         self._finalise(track, final)
         if track.monitor.health(t_ns) == "lost":
             self._lose(track)
+
+    def _scan_step(self, t_ns: int, points: F64, odometry: Odometry) -> ScanStep | None:
+        """The motion since the scan before, as the scans tell it."""
+        if not self.parameters.scan_odometry.enabled:
+            return None
+        return self._scan_odometry.step(t_ns, points, *odometry)
 
     def _odometry(self, first_ns: int, last_ns: int) -> Odometry:
         delta = self._motion.delta(first_ns, last_ns)
@@ -214,6 +227,7 @@ class Localiser:
         self._track = _Track(PoseGraph(par.graph), monitor, {})
         self._track.graph.add(t_ns, result.T_map_vehicle, None, MapMatch(result.T_map_vehicle, result.covariance), None)
         self._hold(self._track, scan, result.matching_ratio)
+        self._scan_odometry.begin(t_ns, points)
 
     def _search(self, t_ns: int, points: F64) -> InitialPose | None:
         par, fix = self.parameters, self._fix

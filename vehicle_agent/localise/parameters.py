@@ -3,6 +3,7 @@
 from dataclasses import dataclass, field
 
 from vehicle_agent.localise.doubt_parameters import ChallengeParameters, HypothesisParameters, WitnessParameters
+from vehicle_agent.localise.scan_odometry_parameters import ScanOdometryParameters
 
 
 @dataclass(frozen=True, slots=True)
@@ -201,3 +202,4 @@ class LocaliserParameters:
     witness: WitnessParameters = field(default_factory=WitnessParameters)
     hypotheses: HypothesisParameters = field(default_factory=HypothesisParameters)
     challenge: ChallengeParameters = field(default_factory=ChallengeParameters)
+    scan_odometry: ScanOdometryParameters = field(default_factory=ScanOdometryParameters)

@@ -23,18 +23,16 @@ F64 = NDArray[np.float64]
 CONTRADICTION = 3.0  # sigmas
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class ScanStep:
+class ScanStep(NamedTuple):
     """The motion between two scans as the scans tell it.
 
     T_before_now: (4, 4). covariance: (6, 6) of a small motion of the vehicle at its later end, rotation [rad] first,
     then position [m], along its own axes (as GTSAM's BetweenFactorPose3 takes it); directions that the scans do not
-    constrain have a sigma of metres, and T_before_now follows the prediction there. fit: 0 ... 1.
+    constrain have a sigma of metres, and T_before_now follows the prediction there.
     """
 
     T_before_now: F64
     covariance: F64
-    fit: float
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -94,9 +92,13 @@ class ScanOdometry:
         self._steady: tuple[F64, int] | None = None
         self._T_odom_added = np.eye(4)
 
-    def forget(self) -> None:
-        """The scans to come do not continue those before."""
-        self._before_ns = None
+    def begin(self, t_ns: int, points_m: F64) -> None:
+        """Start with this scan: it does not continue those before."""
+        self._before_ns = t_ns
+        self._T_odom_before = self._T_odom_added = np.eye(4)
+        self._covariance, self._steady = np.zeros((6, 6)), None
+        self._map.clear(np.zeros(3))
+        self._map.add(points_m, np.zeros(3))
 
     def step(self, t_ns: int, points_vehicle_m: F64, T_before_now_predicted: F64, sigmas: F64) -> ScanStep | None:
         """The motion since the scan before; None when there is none, or it is not to be trusted.
@@ -108,7 +110,7 @@ class ScanOdometry:
             sigmas: (6,) its sigmas, rotation [rad] first, then position [m].
         """
         if self._before_ns is None or not 0 < t_ns - self._before_ns <= self.parameters.max_gap_s * 1e9:
-            self._begin(t_ns, points_vehicle_m)
+            self.begin(t_ns, points_vehicle_m)
             return None
         dt_ns, self._before_ns = t_ns - self._before_ns, t_ns
         driven = _Prediction(T_before_now_predicted, sigmas)
@@ -118,14 +120,7 @@ class ScanOdometry:
         self._add(points_vehicle_m)
         if match is None:
             return None
-        return ScanStep(T_before_now, self.parameters.step_share * match.covariance, match.fit)
-
-    def _begin(self, t_ns: int, points_m: F64) -> None:
-        self._before_ns = t_ns
-        self._T_odom_before = self._T_odom_added = np.eye(4)
-        self._covariance, self._steady = np.zeros((6, 6)), None
-        self._map.clear(np.zeros(3))
-        self._map.add(points_m, np.zeros(3))
+        return ScanStep(T_before_now, self.parameters.step_share * match.covariance)
 
     def _matched(self, points_m: F64, driven: _Prediction, dt_ns: int) -> _Match | None:
         """The match near to what wheels and gyro say, or else near to going on as before: wheels slip."""

@@ -43,7 +43,7 @@ class ScanOdometryParameters:
     noise_m, scales, correlation, floor_m, floor_rad, degenerate_m: as in `RegistrationParameters`.
     step_share: a step's variance in that of a match: the matches of a stretch of road share most of their errors.
     steady_m, steady_rad: sigmas of going on as in the step before, which is tried where wheels and gyro lead nowhere.
-    min_fit, min_matching_ratio: a match that fits worse is not given; min_steady_fit: as min_fit, when going on as before.
+    min_fit, min_matching_ratio: a match that fits worse is not given; min_steady_fit: the same when going on as before.
     gate_m, gate_deg: how far a step may lie from the prediction, beyond three of its sigmas.
     add_m, add_deg: a scan joins the map when the vehicle has moved so far since the last that did; the first
         `first_scans` join in any case.
