@@ -34,9 +34,10 @@ INTERRUPTED = 130
 @click.option("--at", help="The map as it was then: 2026-01-31T12:00:00Z.  [default: now]")
 @click.option("--out", type=click.Path(path_type=Path), help="Folder to write to.  [default: runs/localise-DRIVE]")
 @click.option("--format", "formats", default=",".join(FORMATS), show_default=True, help="Which files of poses.")
+@click.option("--no-plots", is_flag=True, help="Draw no pictures.")
 @click.option("--json", "json_to", metavar="FILE", help="Write the summary to this file, too; - prints it instead.")
 def localise(
-    drive: Path, store: Path, layer: str, at: str | None, out: Path | None, formats: str,
+    drive: Path, store: Path, layer: str, at: str | None, out: Path | None, formats: str, no_plots: bool,
     json_to: str | None,
 ) -> None:  # fmt: skip
     """Localise DRIVE (MCAP, see `gnd import`) on the map of a tile store (see `gnd map build`).
@@ -46,14 +47,20 @@ def localise(
     """
     chosen, folder = chosen_formats(formats), out or Path("runs") / f"localise-{drive.stem}"
     check_is_drive(drive)
-    with SqliteStore(store, create=False) as opened, ended_by_ctrl_c() as stop, step_bars() as bars:
+    with SqliteStore(store, create=False) as opened, ended_by_ctrl_c() as stop:
         tiles = StoreMap(opened, layer, None if at is None else parse_time_ns(at))
-        found = localise_drive(drive, tiles, progress=lambda done, total: bars(drive.name, done, total), stop=stop)
-    values = {"map": str(store), "layer": layer, "at": at} | summary(found)
-    written = write_outputs(found, values, folder, chosen)
+        with step_bars() as bars:
+            found = localise_drive(drive, tiles, progress=lambda done, total: bars(drive.name, done, total), stop=stop)
+        values = {"map": str(store), "layer": layer, "at": at} | summary(found)
+        written = write_outputs(found, values, folder, chosen)
+        if not no_plots:
+            from vehicle_agent.localise_drive.pictures import draw_pictures  # it loads matplotlib
+
+            written += draw_pictures(found, tiles, folder)
+        interrupted = stop.is_set()
     _tell(found, values, json_to)
     click.echo(f"{folder}: {', '.join(path.name for path in written)}", err=json_to == "-")
-    _end(found, folder, interrupted=stop.is_set())
+    _end(found, folder, interrupted=interrupted)
 
 
 def chosen_formats(text: str) -> tuple[str, ...]:

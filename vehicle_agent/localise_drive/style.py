@@ -1,0 +1,66 @@
+"""How the pictures of a localised drive look."""
+
+from pathlib import Path
+from typing import Any, Final
+
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+
+from vehicle_agent.errors import LocaliseError
+from vehicle_agent.localise_drive.stretches import Stretch
+
+INK: Final = "#1c2430"
+MUTED: Final = "#5a6675"
+FAINT: Final = "#c3ccd8"
+DPI: Final = 150
+HEALTH_COLOURS: Final = {"good": "#2e8b57", "degraded": "#e0a020", "lost": "#d1433f"}
+REFINED: Final = "#c8322d"
+ONLINE: Final = "#8a5a2b"
+"""Red and brown, as with and without submap in the paper's Figure 19."""
+_STRIP: Final = 0.035
+"""Height of the strip of health, of the axes' height."""
+
+
+def new_figure(width_in: float, height_in: float, title: str, note: str) -> Figure:
+    """A figure with a heading and a small line below it, 0.9 inches in all."""
+    figure = Figure(figsize=(width_in, height_in), dpi=DPI, facecolor="white")
+    left = 0.4 / width_in
+    figure.text(left, 1.0 - 0.36 / height_in, title, fontsize=16, weight="bold", color=INK, va="center")
+    figure.text(left, 1.0 - 0.65 / height_in, note, fontsize=10, color=MUTED, va="center")
+    return figure
+
+
+def dress(axes: Axes, label: str) -> None:
+    """Grid, colours, the label of the y axis."""
+    axes.set_ylabel(label, color=INK)
+    axes.grid(color="#e3e7ed", linewidth=0.8)
+    axes.set_axisbelow(True)
+    axes.tick_params(colors=INK, labelsize=9)
+    for name, spine in axes.spines.items():
+        spine.set(visible=name in ("left", "bottom"), color=FAINT)
+
+
+def health_strip(axes: Axes, stretches: list[Stretch]) -> None:
+    """Colour the foot of the axes by health over time; where it is not good, the whole height faintly."""
+    for one in stretches:
+        colour = HEALTH_COLOURS[one.health]
+        span: dict[str, Any] = {"color": colour, "linewidth": 0}
+        axes.axvspan(one.from_s, one.to_s, ymin=0.0, ymax=_STRIP, alpha=0.9, zorder=4, **span)
+        if one.health != "good":
+            axes.axvspan(one.from_s, one.to_s, alpha=0.10, zorder=0, **span)
+
+
+def save_figure(figure: Figure, path: Path) -> None:
+    """Write a figure as PNG; the file appears complete or not at all.
+
+    Raises:
+        LocaliseError: it cannot be written.
+    """
+    partial = path.with_name(f".{path.name}.part")
+    try:
+        with partial.open("wb") as file:
+            figure.savefig(file, format="png")
+        partial.replace(path)
+    except OSError as error:
+        partial.unlink(missing_ok=True)
+        raise LocaliseError(f"{path}: cannot write the picture: {error.strerror or error}") from None
