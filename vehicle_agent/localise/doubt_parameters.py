@@ -97,3 +97,40 @@ class ChallengeParameters:
             raise ValueError(f"0 < doubtful_s <= period_s, n_refined >= 1 and reach_m > 0 are required, got {self}")
         if not self.dropped < self.contested < self.beaten or self.most_views < 1:
             raise ValueError(f"dropped < contested < beaten and most_views >= 1 are required, got {self}")
+
+
+@dataclass(frozen=True, slots=True)
+class CauseParameters:
+    """What makes a wrong pose, a stale map and a poor place.
+
+    testimonies: how many of the witness's last ones are averaged.
+    trusted_standing_fit: least fit of what stands, beside `HealthParameters.trusted_fit` of all points.
+    fitting_hits: share of hits in the better half of the sectors that is no sign of a wrong pose; suspicious_gone:
+        share of Gaussians gone from which on a better pose is looked for sooner.
+    wrong_hits, wrong_gone: with hits below and gone above these the pose is contradicted all around.
+    stale_share: share of points new and of Gaussians gone, added up, that makes a map stale.
+    poor_sigma_m, poor_sigma_rad: one sigma of position and heading from which on a pose is no longer good.
+    least_standing: fewer standing points among the witness's rays are next to nothing; least_known: a smaller share of
+        the points in known voxels means that there is no map.
+    motion_gap_s, gap_s: after so long without motion samples, or without a believed match, the pose must prove itself
+        again. lost_gap_s: after so long without scans it is lost.
+    """
+
+    testimonies: int = 4
+    trusted_standing_fit: float = 0.6
+    fitting_hits: float = 0.7
+    suspicious_gone: float = 0.25
+    wrong_hits: float = 0.5
+    wrong_gone: float = 0.4
+    stale_share: float = 0.35
+    poor_sigma_m: float = 0.15
+    poor_sigma_rad: float = 0.003
+    least_standing: int = 25
+    least_known: float = 0.3
+    motion_gap_s: float = 0.3
+    gap_s: float = 2.0
+    lost_gap_s: float = 15.0
+
+    def __post_init__(self) -> None:
+        if min(self.testimonies, self.least_standing) < 1 or min(self.poor_sigma_m, self.poor_sigma_rad) <= 0:
+            raise ValueError(f"counts and sigmas must be positive, got {self}")

@@ -9,7 +9,7 @@ from vehicle_agent.errors import RegistrationError
 from vehicle_agent.localise.estimates import Cause
 from vehicle_agent.localise.hypotheses import Hypotheses
 from vehicle_agent.localise.initialise import Around, InitialPose, ground_below, search
-from vehicle_agent.localise.match_map import MatchMap
+from vehicle_agent.localise.match_map import MatchMap, MatchMapCache
 from vehicle_agent.localise.parameters import LocaliserParameters
 from vehicle_agent.localise.registration import register
 
@@ -36,7 +36,7 @@ class FirstPose:
         self._searched_ns = -(2**62)
 
     def see(
-        self, t_ns: int, points_m: F64, T_before_now: F64, place: Place | None, match_map: MatchMap
+        self, t_ns: int, points_m: F64, T_before_now: F64, place: Place | None, maps: MatchMapCache
     ) -> InitialPose | None:
         """Take a scan; give the pose when it is sure.
 
@@ -45,9 +45,18 @@ class FirstPose:
             points_m: (N, 3) sampled points, vehicle frame, sweep motion removed.
             T_before_now: (4, 4) the motion since the scan before.
             place: where GNSS says that the vehicle is now, None if it does not.
-            match_map: the map window there.
+            maps: the map, linearised where it is needed.
         """
-        standing = _standing(points_m, self._par.initialise.above_ground_m)
+        if place is None and not len(self.hypotheses):
+            self.cause = "no_position"
+            return None
+        at_m = self.hypotheses.best.T_map_vehicle[:3, 3] if place is None else place.p_map_m
+        return self._see(t_ns, points_m, T_before_now, place, maps.near(at_m))
+
+    def _see(
+        self, t_ns: int, points_m: F64, T_before_now: F64, place: Place | None, match_map: MatchMap
+    ) -> InitialPose | None:
+        standing = standing_points(points_m, self._par.initialise.above_ground_m)
         self.hypotheses.follow(T_before_now, points_m, standing, match_map)
         if place is not None and t_ns - self._searched_ns >= self._par.health.retry_s * 1e9:
             self._search(t_ns, points_m, place, match_map)
@@ -91,7 +100,7 @@ class FirstPose:
         return replace(answer, registration=result)
 
 
-def _standing(points_m: F64, above_ground_m: float) -> F64:
+def standing_points(points_m: F64, above_ground_m: float) -> F64:
     """The points (N, 3) that stand above the ground; the ground fits everywhere."""
     return points_m[points_m[:, 2] > ground_below(points_m) + above_ground_m] if len(points_m) else points_m
 

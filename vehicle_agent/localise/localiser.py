@@ -2,7 +2,7 @@
 
 from collections import deque
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,10 +13,11 @@ from schemas.drive import GnssFix, MotionSample, Scan
 from vehicle_agent.errors import RegistrationError
 from vehicle_agent.local_map import LocalMap
 from vehicle_agent.localise.calibration import MotionTeacher
-from vehicle_agent.localise.estimates import Health, PoseEstimate, RefinedScan
+from vehicle_agent.localise.estimates import Cause, Health, PoseEstimate, RefinedScan
+from vehicle_agent.localise.first_pose import FirstPose, Place
 from vehicle_agent.localise.graph import MapMatch, Odometry, PoseGraph, Position, SmoothedPose
 from vehicle_agent.localise.health import HealthMonitor
-from vehicle_agent.localise.initialise import InitialPose, initialise
+from vehicle_agent.localise.judge import Judge, Matched
 from vehicle_agent.localise.match_map import MatchMapCache
 from vehicle_agent.localise.odometry import MotionBuffer
 from vehicle_agent.localise.parameters import LocaliserParameters
@@ -27,6 +28,7 @@ from vehicle_agent.localise.scan_odometry import ScanOdometry, ScanStep, joint_s
 F64 = NDArray[np.float64]
 
 MAX_GNSS_AGE_NS = 2_000_000_000
+PAST_NS, MOST_FROM_PAST = 1_000_000_000, 5
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -37,6 +39,8 @@ class _HeldScan:
     t_ns: int
     matching_ratio: float
     health: Health
+    cause: Cause
+    degenerate: tuple[str, ...]
 
 
 @dataclass(slots=True, eq=False)
@@ -44,7 +48,7 @@ class _Track:
     """What exists only while the pose is known."""
 
     graph: PoseGraph
-    monitor: HealthMonitor
+    judge: Judge
     held: dict[int, _HeldScan]
 
 
@@ -73,8 +77,9 @@ class Localiser:
         self._pending: Scan | None = None
         self._newest_scan_ns = -1
         self._ready: deque[tuple[_HeldScan, SmoothedPose]] = deque()
-        self._searched_ns = -(2**62)
-        self._searching_ns: int | None = None  # since when there is no pose
+        self._first = FirstPose(self.parameters)
+        self._last_ns: int | None = None  # of the newest scan that was looked at
+        self._from_past = 0  # scans in a row
         self._track: _Track | None = None
 
     # --- what the agent calls ------------------------------------------------------------------------------------
@@ -82,11 +87,13 @@ class Localiser:
     def push_motion(self, sample: MotionSample) -> None:
         """Take a sample of wheel speed and yaw rate; a scan that waited for it is matched."""
         self._motion.push(sample.t_ns, sample.speed_mps, sample.yaw_rate_radps)
+        self._tell_gap(sample.t_ns)
         self._process_if_covered()
 
     def push_gnss(self, fix: GnssFix) -> None:
         """Take a GNSS fix: it starts the search for the first pose, bounds drift, and shows a wrong pose."""
-        self._fix = fix
+        if np.isfinite([fix.lat_rad, fix.lon_rad, fix.height_m, fix.sigma_m]).all() and fix.sigma_m > 0:
+            self._fix = fix
 
     def push_scan(self, scan: Scan) -> list[RefinedScan]:
         """Take a scan; give the scans whose poses became final, oldest first. A scan that is empty, or not later than
@@ -94,8 +101,9 @@ class Localiser:
         """
         if len(scan) == 0 or scan.t_ns <= self._newest_scan_ns:
             self.dropped_scans += 1
+            self._see_past(scan)
             return list(self._take_ready())
-        self._newest_scan_ns = scan.t_ns
+        self._newest_scan_ns, self._from_past = scan.t_ns, 0
         self._process()
         self._pending = scan
         self._process_if_covered()
@@ -131,10 +139,14 @@ class Localiser:
             return
         chosen = sample_scan(scan.points_m, self.parameters.sampling)
         points = self._deskewed(scan, chosen, scan.points_m[chosen])
+        last_ns = scan.t_ns if self._last_ns is None else self._last_ns
+        if self._track is not None and (scan.t_ns - last_ns) * 1e-9 > self.parameters.causes.lost_gap_s:
+            self._lose(self._track, "gap")
         if self._track is None:
             self._start(scan, points)
         else:
             self._step(self._track, scan, points)
+        self._last_ns = _reference_ns(scan)
 
     def _step(self, track: _Track, scan: Scan, points: F64) -> None:
         """Predict from the newest pose, match, gate, fuse."""
@@ -143,20 +155,24 @@ class Localiser:
         seen = self._scan_step(t_ns, points, odometry)
         joint = joint_step(*odometry, seen)
         predicted = track.graph.pose(newest) @ joint.T_before_now
-        result, believed = self._matched(track.monitor, points, predicted, odometry.sigmas, t_ns)
+        result, believed = self._matched(track.judge.monitor, points, predicted, odometry.sigmas, t_ns)
         match = None
         if result is not None and believed:
             match = MapMatch(result.T_map_vehicle, result.covariance)
             if joint.slipped:
                 self._teacher.forget()
-            elif result.fit >= self.parameters.odometry.teaching_fit:
+            elif result.fit >= self.parameters.odometry.teaching_fit and not len(result.degenerate):
                 self._teacher.learn(t_ns, result.T_map_vehicle, result.covariance)
         odometry = Odometry(odometry.T_before_now, joint.driven_sigmas)
-        final = track.graph.add(t_ns, predicted, odometry, match, self._gnss_at(track, t_ns, predicted), seen)
+        gnss, T_now = self._gnss_at(track, t_ns, predicted), predicted if match is None else match.T_map_vehicle
+        unknown_s = self._motion.unknown_s(track.held[newest].t_ns, t_ns)
+        seen_scan = Matched(t_ns, points, joint.T_before_now, T_now, result, believed, unknown_s)
+        track.judge.see(seen_scan, self._map.near(T_now[:3, 3]))
+        final = track.graph.add(t_ns, predicted, odometry, match, gnss, seen)
         self._hold(track, scan, result.matching_ratio if result is not None else 0.0)
         self._finalise(track, final)
-        if track.monitor.health(t_ns) == "lost":
-            self._lose(track)
+        if self.online is not None and self.online.health == "lost":
+            self._lose(track, self.online.cause)
 
     def _scan_step(self, t_ns: int, points: F64, odometry: Odometry) -> ScanStep | None:
         """The motion since the scan before, as the scans tell it."""
@@ -195,7 +211,7 @@ class Localiser:
             return None
         at_fix = T_map_vehicle @ self._motion.delta(t_ns, fix.t_ns)
         offset = self._p_map(fix) - at_fix[:3, 3]
-        track.monitor.see_fix(float(np.hypot(offset[0], offset[1])), fix.sigma_m)
+        track.judge.see_position(T_map_vehicle[:3, 3] + offset, fix.sigma_m, T_map_vehicle)
         return Position(T_map_vehicle[:3, 3] + offset, fix.sigma_m)
 
     def _p_map(self, fix: GnssFix) -> F64:
@@ -205,57 +221,89 @@ class Localiser:
     def _hold(self, track: _Track, scan: Scan, matching_ratio: float) -> None:
         """Keep the scan until its pose is final, and tell the online pose."""
         t_ns, number = _reference_ns(scan), track.graph.newest
-        health = track.monitor.health(t_ns)
-        track.held[number] = _HeldScan(scan, t_ns, matching_ratio, health)
-        pose = track.graph.smoothed(number)[0]
-        self.online = _estimate(pose, matching_ratio, health)
+        pose, monitor = track.graph.smoothed(number)[0], track.judge.monitor
+        sigma_m, sigma_rad = _sigmas(pose)
+        monitor.see_sigma(sigma_m, sigma_rad)
+        health, cause = monitor.judge(t_ns)
+        held = _HeldScan(scan, t_ns, matching_ratio, health, cause, monitor.degenerate)
+        track.held[number] = held
+        self.online = _estimate(pose, held)
 
     # --- the first pose, and the last --------------------------------------------------------------------------------
 
     def _start(self, scan: Scan, points: F64) -> None:
-        """Search for the pose, now and then while there is none."""
+        """Search for the pose, and follow what was found until one has won."""
         t_ns = _reference_ns(scan)
-        found = self._search(t_ns, points)
-        if found is None or not self._good_enough(found, t_ns):
+        moved = self._motion.delta(t_ns if self._last_ns is None else self._last_ns, t_ns)
+        found = self._first.see(t_ns, points, moved, self._place(t_ns), self._map)
+        if found is None:
             self.dropped_scans += 1
+            self._tell_lost(t_ns, self._first.cause)
             return
-        par, result = self.parameters, found.registration
-        self._searching_ns = None
         self.initialisations += 1
-        monitor = HealthMonitor(par.health, t_ns)
-        monitor.believe(result, result.T_map_vehicle, np.zeros(6), t_ns)
-        self._track = _Track(PoseGraph(par.graph), monitor, {})
+        self._begin(scan, points, found.registration, found.fit)
+
+    def _begin(self, scan: Scan, points: F64, result: RegistrationResult, fit: float) -> None:
+        """Track from this pose on."""
+        par, t_ns = self.parameters, _reference_ns(scan)
+        self._first = FirstPose(par)
+        judge = Judge(par, self.T_vehicle_lidar[:3, 3], t_ns)
+        judge.monitor.see_match(fit, result.fit, result.degenerate)
+        self._track = _Track(PoseGraph(par.graph), judge, {})
         self._track.graph.add(t_ns, result.T_map_vehicle, None, MapMatch(result.T_map_vehicle, result.covariance), None)
         self._hold(self._track, scan, result.matching_ratio)
         self._scan_odometry.begin(t_ns, points)
 
-    def _search(self, t_ns: int, points: F64) -> InitialPose | None:
-        par, fix = self.parameters, self._fix
-        if fix is None or t_ns - fix.t_ns > MAX_GNSS_AGE_NS or not self.local_map.count:
+    def _place(self, t_ns: int) -> Place | None:
+        """Where the last fix says that the vehicle is; how far it has driven since is not known in which direction."""
+        fix, sigmas = self._fix, self.parameters.initialise.radius_sigmas
+        if fix is None or abs(t_ns - fix.t_ns) > MAX_GNSS_AGE_NS:
             return None
-        if t_ns - self._searched_ns < par.health.retry_s * 1e9:
-            return None
-        self._searched_ns = t_ns
-        self._searching_ns = t_ns if self._searching_ns is None else self._searching_ns
-        p_map = self._p_map(fix)
         moved_m = abs(self._motion.speed_mps * (t_ns - fix.t_ns) * 1e-9)
-        match_map = self._map.near(p_map)
-        return initialise(
-            points, p_map, fix.sigma_m + moved_m / par.initialise.radius_sigmas, match_map, par.initialise,
-            par.registration,
-        )  # fmt: skip
+        return Place(self._p_map(fix), float(np.hypot(fix.sigma_m, moved_m)), sigmas * fix.sigma_m + moved_m)
 
-    def _good_enough(self, found: InitialPose, t_ns: int) -> bool:
-        """True for a clear answer; one that fits poorly only when waiting has not brought a better one."""
-        par = self.parameters.initialise
-        patient = self._searching_ns is not None and t_ns - self._searching_ns < par.patience_s * 1e9
-        return found.found and (found.fit >= par.good_fit or not patient)
-
-    def _lose(self, track: _Track) -> None:
-        """The pose is wrong: nothing held may reach the evidence."""
+    def _lose(self, track: _Track, cause: Cause) -> None:
+        """The pose is wrong: nothing held may reach the evidence. A rival that has won is where the search begins."""
         self.dropped_scans += len(track.held)
         self._track = None
         self._teacher.forget()
+        self._first = FirstPose(self.parameters)
+        if track.judge.monitor.beaten:
+            self._first.hypotheses = track.judge.challenger.rivals
+        if self.online is not None:
+            self._tell_lost(self.online.t_ns, cause)
+
+    def _tell_lost(self, t_ns: int, cause: Cause) -> None:
+        """The last pose, moved as odometry says, is worth nothing but to show roughly where."""
+        if self.online is not None:
+            T = self.online.T_map_vehicle @ self._motion.delta(self.online.t_ns, t_ns)
+            self.online = replace(
+                self.online, t_ns=t_ns, T_map_vehicle=T, health="lost", cause=cause, matching_ratio=0.0
+            )
+
+    def _tell_gap(self, now_ns: int) -> None:
+        """Scans have stopped coming: the newest pose grows old."""
+        if self._track is None or self.online is None or self._pending is not None:
+            return
+        age_s = (now_ns - self.online.t_ns) * 1e-9
+        if age_s > self.parameters.health.degraded_after_s:
+            health: Health = "lost" if age_s > self.parameters.causes.lost_gap_s else "degraded"
+            self.online = replace(self.online, health=health, cause="gap")
+
+    def _see_past(self, scan: Scan) -> None:
+        """Scans from the past are dropped; when they go on, it is the clock that was wrong, and all begins anew."""
+        if scan.t_ns >= self._newest_scan_ns - PAST_NS:
+            return
+        self._from_past += 1
+        if self.online is not None:
+            self.online = replace(self.online, health="degraded", cause="bad_time")
+        if self._from_past < MOST_FROM_PAST:
+            return
+        self._motion.clear()
+        self._fix = self._pending = self._last_ns = None
+        self._newest_scan_ns, self._from_past = -1, 0
+        if self._track is not None:
+            self._lose(self._track, "bad_time")
 
     # --- final poses -------------------------------------------------------------------------------------------------
 
@@ -268,7 +316,7 @@ class Localiser:
         finite = np.flatnonzero(np.isfinite(scan.points_m).all(axis=1))
         points = self._deskewed(scan, finite, scan.points_m[finite])
         origins = self._deskewed(scan, finite, np.zeros((len(finite), 3), np.float32))
-        estimate = _estimate(pose, held.matching_ratio, held.health)
+        estimate = _estimate(pose, held)
         T = pose.T_map_vehicle
         return RefinedScan(held.t_ns, transform(T, points), transform(T, origins), estimate)
 
@@ -295,14 +343,22 @@ def _reference_ns(scan: Scan) -> int:
     return (scan.t_ns + _end_ns(scan)) // 2
 
 
-def _estimate(pose: SmoothedPose, matching_ratio: float, health: Health) -> PoseEstimate:
+def _sigmas(pose: SmoothedPose) -> tuple[float, float]:
+    """The larger horizontal one-sigma axis [m], and that of the heading [rad]."""
     R, covariance = pose.T_map_vehicle[:3, :3], pose.covariance
     horizontal = (R @ covariance[3:, 3:] @ R.T)[:2, :2]
+    return float(np.sqrt(np.linalg.eigvalsh(horizontal)[1])), float(np.sqrt(covariance[2, 2]))
+
+
+def _estimate(pose: SmoothedPose, held: _HeldScan) -> PoseEstimate:
+    sigma_m, sigma_rad = _sigmas(pose)
     return PoseEstimate(
         t_ns=pose.t_ns,
         T_map_vehicle=pose.T_map_vehicle,
-        sigma_m=float(np.sqrt(np.linalg.eigvalsh(horizontal)[1])),
-        sigma_rad=float(np.sqrt(covariance[2, 2])),
-        matching_ratio=matching_ratio,
-        health=health,
+        sigma_m=sigma_m,
+        sigma_rad=sigma_rad,
+        matching_ratio=held.matching_ratio,
+        health=held.health,
+        cause=held.cause,
+        degenerate=held.degenerate,
     )

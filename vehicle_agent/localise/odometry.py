@@ -1,6 +1,7 @@
 """Dead reckoning from wheel speed and yaw rate."""
 
 from bisect import bisect_left
+from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,6 +12,7 @@ from gnd_map.se3 import T_inverse
 F64 = NDArray[np.float64]
 
 KEEP_NS = 20_000_000_000  # more than any lag
+GAP_NS = 100_000_000  # two samples farther apart leave something unknown between them
 
 
 class MotionBuffer:
@@ -48,6 +50,20 @@ class MotionBuffer:
         if t_ns - self._t_ns[0] > 2 * KEEP_NS:
             self._drop(bisect_left(self._t_ns, t_ns - KEEP_NS))
         return True
+
+    def clear(self) -> None:
+        """Forget the samples, not what was learnt about them."""
+        self._drop(len(self._t_ns))
+
+    def unknown_s(self, first_ns: int, last_ns: int) -> float:
+        """How much of the time from `first_ns` to `last_ns` lies in gaps between samples or beyond them, seconds."""
+        low = max(bisect_left(self._t_ns, first_ns) - 1, 0)
+        inner = self._t_ns[low : bisect_left(self._t_ns, last_ns) + 1]
+        if not inner:
+            return (last_ns - first_ns) * 1e-9
+        known = [first_ns] * (inner[0] > first_ns) + inner + [last_ns] * (inner[-1] < last_ns)
+        gaps = (min(b, last_ns) - max(a, first_ns) for a, b in pairwise(known) if b - a > GAP_NS)
+        return sum(gaps) * 1e-9
 
     def _drop(self, n: int) -> None:
         del self._t_ns[:n], self._speed_mps[:n], self._yaw_rate_radps[:n]

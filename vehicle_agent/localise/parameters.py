@@ -2,7 +2,12 @@
 
 from dataclasses import dataclass, field
 
-from vehicle_agent.localise.doubt_parameters import ChallengeParameters, HypothesisParameters, WitnessParameters
+from vehicle_agent.localise.doubt_parameters import (
+    CauseParameters,
+    ChallengeParameters,
+    HypothesisParameters,
+    WitnessParameters,
+)
 from vehicle_agent.localise.scan_odometry_parameters import ScanOdometryParameters
 
 
@@ -202,4 +207,5 @@ class LocaliserParameters:
     witness: WitnessParameters = field(default_factory=WitnessParameters)
     hypotheses: HypothesisParameters = field(default_factory=HypothesisParameters)
     challenge: ChallengeParameters = field(default_factory=ChallengeParameters)
+    causes: CauseParameters = field(default_factory=CauseParameters)
     scan_odometry: ScanOdometryParameters = field(default_factory=ScanOdometryParameters)

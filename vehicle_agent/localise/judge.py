@@ -1,0 +1,100 @@
+"""What follows every match: witness, challenger and monitor together judge the tracked pose, scan by scan."""
+
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from vehicle_agent.localise.challenge import Challenger
+from vehicle_agent.localise.estimates import Cause
+from vehicle_agent.localise.first_pose import Place, standing_points
+from vehicle_agent.localise.health import HealthMonitor
+from vehicle_agent.localise.initialise import ground_below
+from vehicle_agent.localise.match_map import MatchMap
+from vehicle_agent.localise.parameters import LocaliserParameters
+from vehicle_agent.localise.registration import RegistrationResult, fit_of
+from vehicle_agent.localise.witness import testify
+
+F64 = NDArray[np.float64]
+
+
+class Matched(NamedTuple):
+    """One scan after its match.
+
+    t_ns: reference time; points_m: (N, 3) vehicle frame; T_before_now: (4, 4) motion since the scan before; T_now: (4,
+    4) the tracked pose; result: the match that was made there; believed: whether it counts; motion_gap_s: how much of
+    the way since the scan before was driven without motion samples.
+    """
+
+    t_ns: int
+    points_m: F64
+    T_before_now: F64
+    T_now: F64
+    result: RegistrationResult | None
+    believed: bool
+    motion_gap_s: float = 0.0
+
+
+class Judge:
+    """Judges one track from its first scan to its end."""
+
+    def __init__(self, parameters: LocaliserParameters, origin_m: F64, now_ns: int) -> None:
+        self._par = parameters
+        self._origin_m = np.ascontiguousarray(origin_m, dtype=np.float64)
+        self.monitor = HealthMonitor(parameters.health, now_ns, parameters.causes)
+        self.challenger = Challenger(parameters)
+        self._witness_ns = -(2**62)
+        self._way_m = 0.0
+        self._place: Place | None = None
+        self._last_points: F64 | None = None
+
+    def see_position(self, p_map_m: F64, sigma_m: float, T_now: F64) -> None:
+        """Take where GNSS says that the vehicle, tracked at `T_now` (4, 4), is now: (3,), one sigma of an axis."""
+        self.monitor.see_fix(p_map_m[:2] - T_now[:2, 3], sigma_m)
+        self._place = Place(p_map_m, sigma_m, self._par.initialise.radius_sigmas * sigma_m)
+
+    def see(self, scan: Matched, match_map: MatchMap) -> None:
+        """Take a scan: what its rays say, how well it fits, whether another pose fits better."""
+        if scan.motion_gap_s > self._par.causes.motion_gap_s or self.monitor.gap_s(scan.t_ns) > self._par.causes.gap_s:
+            self.monitor.distrust()
+        self.monitor.see_scan(self._what_is_wrong(scan))
+        self._way_m += float(np.linalg.norm(scan.T_before_now[:3, 3]))
+        if len(scan.points_m) < self._par.registration.min_matched:
+            return
+        standing = standing_points(scan.points_m, self._par.initialise.above_ground_m)
+        self._ask(scan, match_map)
+        self._challenge(scan, standing, match_map)
+        if scan.result is not None and scan.believed:
+            fit = fit_of(standing, scan.T_now, match_map, self._par.registration)
+            self.monitor.see_match(fit, scan.result.fit, scan.result.degenerate)
+
+    def _ask(self, scan: Matched, match_map: MatchMap) -> None:
+        """The witness, now and then."""
+        par = self._par.witness
+        if scan.t_ns - self._witness_ns < par.period_s * 1e9 and self._way_m < par.way_m:
+            return
+        self._witness_ns, self._way_m = scan.t_ns, 0.0
+        below_m = ground_below(scan.points_m)
+        self.monitor.see_testimony(testify(scan.points_m, self._origin_m, below_m, scan.T_now, match_map, par))
+
+    def _challenge(self, scan: Matched, standing: F64, match_map: MatchMap) -> None:
+        par = self._par.challenge
+        place = self._place or Place(scan.T_now[:3, 3], par.reach_m, par.reach_m)
+        self._place = None
+        monitor = self.monitor
+        doubtful = not scan.believed or monitor.doubtful(scan.result) or monitor.suspicious or not monitor.trusted
+        self.challenger.see(
+            scan.t_ns, scan.points_m, standing, scan.T_now, scan.T_before_now, place, match_map, doubtful
+        )
+        monitor.contested, monitor.beaten = self.challenger.contested, self.challenger.beaten
+
+    def _what_is_wrong(self, scan: Matched) -> Cause:
+        """With the scan itself, whatever it matches."""
+        before, self._last_points = self._last_points, scan.points_m
+        if len(scan.points_m) < self._par.registration.min_matched:
+            return "bad_scan"
+        if before is not None and np.array_equal(before, scan.points_m):
+            return "bad_scan"  # no sensor measures the same twice, to the bit
+        if scan.result is not None and scan.result.known_ratio < self._par.causes.least_known:
+            return "no_map"
+        return "no_motion" if scan.motion_gap_s > self._par.causes.motion_gap_s else "none"
