@@ -1,0 +1,151 @@
+"""Fixes, and the rigid pose that lays a local track over them whatever a minority of them says.
+
+Iterated weights, the scale of the robust cost lowered step by step, so that a third of the fixes may be wild (graduated
+non-convexity, Yang et al., RA-L 2020, with the Geman-McClure cost); never below what the track's own drift asks for.
+"""
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from gnd_map.geodesy import LocalFrame
+from gnd_map.se3 import T_from_R_t, exp_so3, transform
+from schemas.drive import GnssFix
+from vehicle_agent.errors import LocaliseError
+
+F64 = NDArray[np.float64]
+I64 = NDArray[np.int64]
+
+_ROUNDS: Final = 40
+_SHRINK: Final = 1.4
+"""Of the robust scale, a round."""
+
+
+@dataclass(frozen=True, slots=True)
+class GeoreferenceParameters:
+    """How far to trust the track and the fixes.
+
+    tilt: find roll and pitch as well (a SLAM frame that does not know the vertical); needs heights.
+    robust_k: where the robust cost begins to give way, in sigmas of a fix.
+    step_m, step_share, step_rad, step_rad_per_root_m: one sigma of a step of the track, constant and with its length.
+    inflation: GNSS errors last for tens of seconds, so that fixes count for less than their number says.
+    spacing_m: of the fixes along the track, at least: a standing vehicle's do not add up.
+    """
+
+    tilt: bool = False
+    robust_k: float = 2.0
+    step_m: float = 0.01
+    step_share: float = 0.01
+    step_rad: float = 5e-4
+    step_rad_per_root_m: float = 1e-3
+    inflation: float = 3.0
+    spacing_m: float = 1.0
+
+    def __post_init__(self) -> None:
+        positive = (self.robust_k, self.step_m, self.step_rad, self.inflation)
+        if min(positive) <= 0 or min(self.step_share, self.step_rad_per_root_m, self.spacing_m) < 0:
+            raise ValueError(f"positive sigmas, robust_k and inflation, and spacing_m >= 0 are required, got {self}")
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class FixTable:
+    """Fixes in time order: t_ns (N,), lat_rad, lon_rad, height_m (ellipsoidal, NaN where unknown), sigma_m (horizontal
+    axis) and sigma_up_m, each (N,).
+    """
+
+    t_ns: I64
+    lat_rad: F64
+    lon_rad: F64
+    height_m: F64
+    sigma_m: F64
+    sigma_up_m: F64
+
+    def __post_init__(self) -> None:
+        columns = (self.lat_rad, self.lon_rad, self.height_m, self.sigma_m, self.sigma_up_m)
+        if any(column.shape != self.t_ns.shape for column in columns):
+            raise LocaliseError(f"fixes: columns of {[len(c) for c in columns]} values for {len(self.t_ns)} times")
+        if len(self.t_ns) and not (np.minimum(self.sigma_m, self.sigma_up_m) > 0).all():
+            raise LocaliseError("fixes: every sigma must be positive")
+
+    def __len__(self) -> int:
+        return len(self.t_ns)
+
+    @classmethod
+    def of(cls, fixes: Iterable[GnssFix], up: float = 2.0) -> "FixTable":
+        """Of fixes whose vertical sigma is `up` times the horizontal one."""
+        rows = np.array([(f.lat_rad, f.lon_rad, f.height_m, f.sigma_m, up * f.sigma_m) for f in fixes]).reshape(-1, 5)
+        return cls(np.array([f.t_ns for f in fixes], np.int64), *rows.T)
+
+    def take(self, chosen: NDArray[np.bool_] | I64) -> "FixTable":
+        """Some of the fixes."""
+        columns = (self.lat_rad, self.lon_rad, self.height_m, self.sigma_m, self.sigma_up_m)
+        return FixTable(self.t_ns[chosen], *(column[chosen] for column in columns))
+
+    def enu_m(self, frame: LocalFrame) -> F64:
+        """(N, 3); an unknown height counts as the frame's own."""
+        return frame.enu_from_geodetic(
+            self.lat_rad, self.lon_rad, np.where(self.has_height, self.height_m, frame.height_m)
+        )
+
+    @property
+    def has_height(self) -> NDArray[np.bool_]:
+        """(N,)."""
+        return np.isfinite(self.height_m)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Alignment:
+    """T_frame_local (4, 4), the fixes' weights 0 ... 1 (N,), and their distances from the track laid so (N,), metres
+    (horizontal; in space with `tilt`).
+    """
+
+    T_frame_local: F64
+    weights: F64
+    off_m: F64
+
+
+def align(p_local_m: F64, p_frame_m: F64, fixes: FixTable, parameters: GeoreferenceParameters) -> Alignment:
+    """The pose that lays local points (N, 3) over the fixes' positions (N, 3).
+
+    Raises:
+        LocaliseError: the points do not lie apart, or heights are missing for a full rotation.
+    """
+    if parameters.tilt and not fixes.has_height.all():
+        raise LocaliseError(f"{(~fixes.has_height).sum()} of {len(fixes)} fixes have no height, which tilt needs")
+    span_m, sigma_m = float(np.ptp(p_local_m[:, :2], axis=0).max()), float(np.median(fixes.sigma_m))
+    if span_m < 4.0 * sigma_m:
+        raise LocaliseError(f"the track spans {span_m:.1f} m, which gives no heading with fixes of {sigma_m:.1f} m")
+    variance, robust, scale = fixes.sigma_m**2, np.ones(len(fixes)), np.inf
+    for _ in range(_ROUNDS):
+        T = _rigid(p_local_m, p_frame_m, robust / variance, fixes, tilt=parameters.tilt)
+        off_m = np.linalg.norm((p_frame_m - transform(T, p_local_m))[:, : 3 if parameters.tilt else 2], axis=1)
+        variance = fixes.sigma_m**2 + float(np.median(off_m)) ** 2
+        ratio = off_m / np.sqrt(variance)
+        scale = max(parameters.robust_k, min(scale, float(ratio.max())) / _SHRINK)
+        robust = (1.0 + (ratio / scale) ** 2) ** -2  # Geman-McClure
+    return Alignment(T, robust, off_m)
+
+
+def _rigid(p_src: F64, p_dst: F64, weights: F64, fixes: FixTable, *, tilt: bool) -> F64:
+    """(4, 4) weighted least squares; heights apart unless `tilt`, because some may be unknown."""
+    w = weights / weights.sum()
+    middle_src, middle_dst = w @ p_src, w @ p_dst
+    src, dst = p_src - middle_src, p_dst - middle_dst
+    if tilt:
+        R = _umeyama(src, dst, w)
+        return T_from_R_t(R, middle_dst - R @ middle_src)
+    sine, cosine = w @ (src[:, 0] * dst[:, 1] - src[:, 1] * dst[:, 0]), w @ (src[:, :2] * dst[:, :2]).sum(axis=1)
+    R = exp_so3([0.0, 0.0, float(np.arctan2(sine, cosine))])
+    T = T_from_R_t(R, middle_dst - R @ middle_src)
+    known = weights * fixes.has_height / fixes.sigma_up_m**2
+    T[2, 3] = (known @ (p_dst[:, 2] - p_src[:, 2])) / known.sum() if known.any() else 0.0
+    return T
+
+
+def _umeyama(src: F64, dst: F64, w: F64) -> F64:
+    """(3, 3) rotation of centred points (Umeyama, PAMI 1991, without scale)."""
+    U, _, Vt = np.linalg.svd((dst * w[:, None]).T @ src)
+    return np.asarray(U @ np.diag([1.0, 1.0, np.linalg.det(U) * np.linalg.det(Vt)]) @ Vt)
