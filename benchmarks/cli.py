@@ -11,6 +11,10 @@ _COMMANDS: Final[dict[str, tuple[str, str]]] = {
         "benchmarks.simulation.command:simulation",
         "The GND paper's simulation: worlds, single drives, fleets.",
     ),
+    "localisation": (
+        "benchmarks.localisation_study.command:localisation",
+        "Localisation in a changed world, before and after the map update.",
+    ),
     "errors": ("benchmarks.simulation.errors_command:errors", "Which voxels of a simulation cost F1, and why."),
     "real": ("benchmarks.real.command:real", "Detection on recordings of real sensors, with objects inserted."),
 }

@@ -23,7 +23,12 @@ T = TypeVar("T")
 @click.option("--parking", default=0.2, show_default=True, help="Share of parking slots that are taken.")
 @click.option("--traffic/--no-traffic", default=True, show_default=True, help="Moving cars and pedestrians.")
 @click.option("--mode", type=click.Choice(["default", "paper"]), default="default", show_default=True)
-@click.option("--poses", default="noisy:4cm:0.08deg", show_default=True, help="estimated, true, or noisy:<m>:<deg>.")
+@click.option(
+    "--poses",
+    default="noisy:4cm:0.08deg",
+    show_default=True,
+    help="estimated, true, or noisy:<m>:<deg>; true,estimated compares.",
+)
 @click.option("--base", type=click.Choice(["surveyed", "driven"]), default="surveyed", show_default=True)
 @click.option("--set", "changes", multiple=True, metavar="GROUP.FIELD=VALUE", help="Replace a parameter, repeatable.")
 @click.option("--pcd/--no-pcd", default=True, show_default=True, help="Run the point-cloud baseline beside.")
@@ -44,18 +49,39 @@ def simulation(
     if jobs is not None and jobs < 1:
         raise click.BadParameter(f"at least one process is needed, got {jobs}", param_hint="--jobs")
     # The heavy imports wait until the options have been found good.
+    from benchmarks.simulation.comparison import pose_sources
+    from benchmarks.simulation.tables import comparison_tables, print_tables, tables_of
+
+    processes, sources = jobs or os.cpu_count() or 1, pose_sources(given["poses"])
+    if len(sources) == 1:
+        found = _run(options, out, processes, keep_drives=keep_drives, pictures=pictures)
+        tables = tables_of(found, sorted(options.vehicles))
+    else:
+        runs = [dataclasses.replace(options, poses=source) for source in sources]
+        found = _compare(runs, out, processes, keep_drives=keep_drives, pictures=pictures)
+        tables = comparison_tables(found, sorted(options.vehicles))
+    if json_file == "-":
+        click.echo(json.dumps(found))
+        return
+    if json_file is not None:
+        _write(Path(json_file), found)
+    print_tables(tables)
+    click.echo(f"everything else: {out}")
+
+
+def _run(options: Any, out: Path, processes: int, *, keep_drives: bool, pictures: bool) -> dict[str, Any]:
+    """Run everything, write result and figures into the folder, and return the result."""
     from rich.console import Console
 
     from benchmarks.simulation.folder import RunFolder
     from benchmarks.simulation.run import plain_options, plain_worlds, reproduce
     from benchmarks.simulation.summary import summary_of
-    from benchmarks.simulation.tables import print_tables
     from deploy.live import progress_bars
 
     folder = RunFolder.create(out)
     folder.write_mark({"options": plain_options(options)})
     with progress_bars(Console(stderr=True)) as progress:
-        outcome = reproduce(options, folder, jobs or os.cpu_count() or 1, progress, keep_drives=keep_drives)
+        outcome = reproduce(options, folder, processes, progress, keep_drives=keep_drives)
     folder.write_mark({"options": plain_options(options), "worlds": plain_worlds(outcome, folder)})
     found = summary_of(outcome)
     folder.write_json("result.json", found)
@@ -63,13 +89,26 @@ def simulation(
         from benchmarks.simulation.figures import draw_figures
 
         draw_figures(outcome, found, out)
-    if json_file == "-":
-        click.echo(json.dumps(found))
-        return
-    if json_file is not None:
-        _write(Path(json_file), found)
-    print_tables(found, sorted(options.vehicles))
-    click.echo(f"everything else: {out}")
+    return found
+
+
+def _compare(runs: list[Any], out: Path, processes: int, **how: bool) -> dict[str, Any]:
+    """Run the same with poses of each source, in a folder each; the worlds are made once."""
+    from benchmarks.simulation.comparison import comparison_of, folder_of, share_worlds
+    from benchmarks.simulation.folder import RunFolder
+    from benchmarks.simulation.run import plain_options
+
+    folder = RunFolder.create(out)
+    folder.write_mark({"compared": {str(run.poses): plain_options(run) for run in runs}})
+    found: dict[str, Any] = {}
+    for run in runs:
+        home = folder_of(out, run.poses)
+        if found:
+            share_worlds(folder_of(out, runs[0].poses), home)
+        found[str(run.poses)] = _run(run, home, processes, **how)
+    compared = comparison_of(found)
+    folder.write_json("result.json", compared)
+    return compared
 
 
 def _write(path: Path, found: dict[str, Any]) -> None:
@@ -86,28 +125,33 @@ def options_of(given: dict[str, Any]) -> Any:
         click.BadParameter: a value that cannot be read.
         GndError: a value that cannot work.
     """
+    from benchmarks.simulation.comparison import pose_sources
     from benchmarks.simulation.method import MethodParameters
     from benchmarks.simulation.options import RunOptions
-    from benchmarks.simulation.pose_source import PoseSource
     from fleet_sim.street import StreetOptions
 
     chosen: dict[str, Any] = {name: given[name] for name in ("parking", "traffic", "mode", "base", "scans", "pcd")}
     chosen["street"] = StreetOptions(given["length_m"], given["site"])
-    chosen["poses"] = PoseSource.parse(given["poses"])
+    chosen["poses"] = pose_sources(given["poses"])[0]
     chosen["method"] = MethodParameters.of_mode(given["mode"]).with_changes(given["changes"])
     chosen["vehicles"] = tuple(sorted(set(_numbers("--vehicles", given["vehicles"]))))
     if given["seeds"]:
         chosen["seeds"] = _numbers("--world-seed", ",".join(given["seeds"]))
     if given["sensors"] is not None:
-        chosen["sensors"] = _list("--sensors", given["sensors"], str)
+        chosen["sensors"] = list_of("--sensors", given["sensors"], str)
     return dataclasses.replace(RunOptions(), **chosen)
 
 
 def _numbers(option: str, text: str) -> tuple[int, ...]:
-    return _list(option, text, int)
+    return list_of(option, text, int)
 
 
-def _list(option: str, text: str, of: Callable[[str], T]) -> tuple[T, ...]:
+def list_of(option: str, text: str, of: Callable[[str], T]) -> tuple[T, ...]:
+    """Return the values of an option that takes several, with commas between.
+
+    Raises:
+        click.BadParameter: one cannot be read.
+    """
     try:
         return tuple(of(part.strip()) for part in text.split(",") if part.strip())
     except ValueError as error:

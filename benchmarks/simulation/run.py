@@ -87,14 +87,15 @@ def _vehicles(
 ) -> dict[int, list[VehicleFile]]:
     """The result of every vehicle, in the cache now."""
     tasks = {seed: vehicle_tasks(options, seed, files[seed], keep_drives) for seed in files}
-    missing = [task for of_world in tasks.values() for task in of_world if not _is_done(task)]
+    missing = [task for of_world in tasks.values() for task in of_world if not is_done(task)]
     missing.sort(key=shots_a_second, reverse=True)  # the longest first, so that no core waits at the end
     jobs = [Job(f"{t.drive.vehicle} {t.sensor}, world {_seed_of(t)}", run_vehicle, (t,), ticks=True) for t in missing]
     run_jobs(jobs, processes, progress, "vehicles")
     return {seed: [VehicleFile(task.result, task.key) for task in of_world] for seed, of_world in tasks.items()}
 
 
-def _is_done(task: VehicleTask) -> bool:
+def is_done(task: VehicleTask) -> bool:
+    """Return whether a vehicle's result is in the cache; a damaged one is not."""
     if not task.result.exists() or (task.recording is not None and not task.recording.exists()):
         return False
     try:

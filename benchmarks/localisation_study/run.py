@@ -1,0 +1,156 @@
+"""A study from options to results: worlds and drives, fleet and runs, merge and runs on the updated map; resumable."""
+
+from dataclasses import dataclass
+from time import perf_counter
+from typing import Any
+
+from rich.progress import Progress
+
+from benchmarks.localisation_study.kept import read_localised, read_trials
+from benchmarks.localisation_study.localising import Localised
+from benchmarks.localisation_study.options import StudyOptions
+from benchmarks.localisation_study.plan import OUTDATED, UPDATED, WITHOUT, Run, SeedPlan, SensorPlan, plan_of
+from benchmarks.localisation_study.trials import Trial
+from benchmarks.localisation_study.work import make_fresh, make_updated, record, run_all, run_trials
+from benchmarks.simulation.folder import RunFolder
+from benchmarks.simulation.pool import Job, run_jobs
+from benchmarks.simulation.run import is_done
+from benchmarks.simulation.scoring import VehicleFile
+from benchmarks.simulation.tasks import shots_a_second, vehicle_tasks
+from benchmarks.simulation.vehicle import VehicleTask, run_vehicle
+from benchmarks.simulation.worlds import prepare_world
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class SensorOutcome:
+    """What came of one sensor: runs by name, trials."""
+
+    sensor: str
+    runs: dict[str, Localised]
+    cpu_s: dict[str, float]
+    trials: list[Trial]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class SeedOutcome:
+    """What came of one seed."""
+
+    plan: SeedPlan
+    sensors: tuple[SensorOutcome, ...]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class StudyOutcome:
+    """A finished study."""
+
+    options: StudyOptions
+    seeds: tuple[SeedOutcome, ...]
+    runtime_s: dict[str, float]
+
+
+def study(
+    options: StudyOptions, folder: RunFolder, processes: int, progress: Progress, *, keep_drives: bool = False
+) -> StudyOutcome:
+    """Run everything that is not yet in the folder.
+
+    Args:
+        options: what to run.
+        folder: keeps worlds, maps and results for the next start.
+        processes: worker processes.
+        progress: gets the bars.
+        keep_drives: keep the recorded drives, too.
+
+    Raises:
+        GndError: something cannot be made as asked.
+    """
+    plans = [plan_of(folder, seed, options) for seed in options.seeds]
+    spent = {}
+    for title, stage in (("worlds and drives", _worlds), ("fleet and runs", _runs), ("updated map", _updated)):
+        begun_s = perf_counter()
+        for number, jobs in enumerate(stage(options, plans)):
+            run_jobs(jobs, processes, progress, title if number == 0 else f"{title}: runs")
+        spent[title] = perf_counter() - begun_s
+    for plan in plans:
+        for sensor in plan.sensors if not keep_drives else ():
+            sensor.recording.unlink(missing_ok=True)
+    return StudyOutcome(options, tuple(_read(plan) for plan in plans), {**spent, "total": sum(spent.values())})
+
+
+def _worlds(options: StudyOptions, plans: list[SeedPlan]) -> Any:
+    """Worlds with truth and outdated map, fresh maps, and the drives that are still needed."""
+    jobs = []
+    for plan in plans:
+        seed = plan.seed
+        jobs.append(Job(f"world {seed}", prepare_world, (plan.files, seed, options.of_fleet(seed))))
+        if not plan.fresh.done:
+            jobs.append(Job(f"fresh map, world {seed}", make_fresh, (options, seed, plan.fresh)))
+        for one in plan.sensors:
+            if not one.done and not one.recording.exists():
+                arguments = (options, seed, one.drive, one.recording)
+                jobs.append(Job(f"drive {one.sensor}, world {seed}", record, arguments, ticks=True))
+    yield jobs
+
+
+def _runs(options: StudyOptions, plans: list[SeedPlan]) -> Any:
+    """The fleet's vehicles, the longest first, and the runs that need no fleet."""
+    fleet = [task for plan in plans if not plan.updated.done for task in _fleet(options, plan) if not is_done(task)]
+    fleet.sort(key=shots_a_second, reverse=True)
+    jobs = [Job(f"{t.drive.vehicle} {t.sensor}", run_vehicle, (t,), ticks=True) for t in fleet]
+    for plan in plans:
+        for one in plan.sensors:
+            jobs += _trials_jobs(options, plan, one)
+            groups = _grouped([run for run in one.runs if run.name != UPDATED])
+            jobs += [_job(options, plan, one, group) for group in groups]
+    yield jobs
+
+
+def _updated(options: StudyOptions, plans: list[SeedPlan]) -> Any:
+    """The merge of the fleet's reports, then the runs on the updated map."""
+    merge = options.method.merge
+    yield [
+        Job(f"merge, world {plan.seed}", make_updated, (plan.files.base, _files(options, plan), merge, plan.updated))
+        for plan in plans
+        if not plan.updated.done
+    ]
+    runs = [(plan, one, run) for plan in plans for one in plan.sensors if (run := one.run(UPDATED)) is not None]
+    yield [_job(options, plan, one, [run]) for plan, one, run in runs if not run.kept.done]
+
+
+def _fleet(options: StudyOptions, plan: SeedPlan) -> list[VehicleTask]:
+    return vehicle_tasks(options.of_fleet(plan.seed), plan.seed, plan.files)[: options.fleet]
+
+
+def _files(options: StudyOptions, plan: SeedPlan) -> list[VehicleFile]:
+    return [VehicleFile(task.result, task.key) for task in _fleet(options, plan)]
+
+
+def _grouped(runs: list[Run]) -> list[list[Run]]:
+    """Runs that read the recording together, those that are done left out."""
+    missing = [run for run in runs if not run.kept.done]
+    first = [run for run in missing if run.name in (WITHOUT, OUTDATED)]
+    variants = [run for run in missing if run.variant]
+    others = [run for run in missing if run not in first and run not in variants]
+    return [group for group in (first, others, variants) if group]
+
+
+def _job(options: StudyOptions, plan: SeedPlan, one: SensorPlan, runs: list[Run]) -> Job:
+    name = f"{one.sensor}, world {plan.seed}: {', '.join(run.name for run in runs)}"
+    return Job(name, run_all, (one.recording, runs, options.method.localise, plan.seed), ticks=True)
+
+
+def _trials_jobs(options: StudyOptions, plan: SeedPlan, one: SensorPlan) -> list[Job]:
+    if one.trials is None or one.trials.done:
+        return []
+    parameters = options.method.localise
+    arguments = (one.recording, plan.files.base, options.trials, parameters, plan.seed, one.trials)
+    return [Job(f"{one.sensor}, world {plan.seed}: starts", run_trials, arguments, ticks=True)]
+
+
+def _read(plan: SeedPlan) -> SeedOutcome:
+    found = []
+    for one in plan.sensors:
+        runs = {run.name: read_localised(run.kept) for run in one.runs}
+        trials = read_trials(one.trials) if one.trials is not None else []
+        localised, cpu_s = ({name: pair[i] for name, pair in runs.items()} for i in (0, 1))
+        found.append(SensorOutcome(one.sensor, localised, cpu_s, trials))  # type: ignore[arg-type]
+    return SeedOutcome(plan, tuple(found))
