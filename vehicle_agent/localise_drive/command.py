@@ -4,7 +4,7 @@ import json
 import signal
 import sys
 import threading
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from types import FrameType
@@ -12,14 +12,14 @@ from typing import Any
 
 import click
 from rich.console import Console
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
 from tile_store.arguments import parse_time_ns
 from tile_store.sqlite_store import SqliteStore
 from tile_store.values import DEFAULT_LAYER
 from vehicle_agent.errors import LocaliseError
-from vehicle_agent.importer_cli import step_bars
 from vehicle_agent.localise_drive.account import print_account, summary
-from vehicle_agent.localise_drive.outputs import FORMATS, write_outputs
+from vehicle_agent.localise_drive.outputs import FORMATS, make_folder, write_outputs
 from vehicle_agent.localise_drive.run import LocalisedDrive, check_is_drive, localise_drive
 from vehicle_agent.localise_drive.stretches import stretches_of
 from vehicle_agent.localise_drive.tiles import StoreMap
@@ -47,10 +47,11 @@ def localise(
     """
     chosen, folder = chosen_formats(formats), out or Path("runs") / f"localise-{drive.stem}"
     check_is_drive(drive)
+    make_folder(folder)
     with SqliteStore(store, create=False) as opened, ended_by_ctrl_c() as stop:
         tiles = StoreMap(opened, layer, None if at is None else parse_time_ns(at))
-        with step_bars() as bars:
-            found = localise_drive(drive, tiles, progress=lambda done, total: bars(drive.name, done, total), stop=stop)
+        with progress_bar(drive.name) as progress:
+            found = localise_drive(drive, tiles, progress=progress, stop=stop)
         values = {"map": str(store), "layer": layer, "at": at} | summary(found)
         written = write_outputs(found, values, folder, chosen)
         if not no_plots:
@@ -70,6 +71,24 @@ def chosen_formats(text: str) -> tuple[str, ...]:
     if unknown:
         raise LocaliseError(f"--format: {unknown[0]!r} is not known; known are {', '.join(FORMATS)}")
     return names
+
+
+@contextmanager
+def progress_bar(name: str) -> Iterator[Callable[[int, int], None]]:
+    """A bar on standard error, there from the first call: to be called with the scans done and the scans in all."""
+    columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TextColumn("scans"))
+    bars = Progress(*columns, TimeRemainingColumn(), console=Console(stderr=True))
+    task = bars.add_task(name, total=None)
+
+    def show(done: int, total: int) -> None:
+        bars.start()
+        bars.update(task, completed=done, total=total)
+
+    try:
+        yield show
+    finally:
+        if bars.live.is_started:
+            bars.stop()
 
 
 @contextmanager

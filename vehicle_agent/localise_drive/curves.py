@@ -38,7 +38,7 @@ _GRID: Final = {"left": 0.075, "right": 0.985, "top": 0.845, "bottom": 0.075, "h
 
 
 def draw_errors(drive: LocalisedDrive, path: Path) -> Path:
-    """Errors over time, left against the limits, right as large as they are; the drive has a reference.
+    """Errors over time, left against the limits, right enlarged; the drive has a reference.
 
     Raises:
         LocaliseError: the file cannot be written.
@@ -56,7 +56,7 @@ def draw_errors(drive: LocalisedDrive, path: Path) -> Path:
     for foot in axes[-1]:
         foot.set_xlabel("seconds since the first scan", color=INK)
     axes[0, 0].set_title("against the limits", fontsize=11, color=INK, loc="left")
-    axes[0, 1].set_title("as large as they are", fontsize=11, color=INK, loc="left")
+    axes[0, 1].set_title("enlarged", fontsize=11, color=INK, loc="left")
     _legend(figure, [*_error_handles(), *_health_handles(stretches_of(drive.moments))])
     save_figure(figure, path)
     return path
@@ -106,12 +106,18 @@ def _error_row(
         for one, colour in series.values():
             panel.plot(*_broken(one.t_ns, one.of(name) * scale, drive.start_ns), color=colour, linewidth=1.4, zorder=3)
         _whole_drive(panel, drive)
-        health_strip(panel, stretches_of(drive.moments))
-    largest = max((float(np.abs(one.of(name)).max()) for one, _ in series.values() if len(one)), default=0.0) * scale
+        health_strip(panel, stretches_of(drive.moments), shade=panel is row[1])
     _bands(row[0], limit, scale)
     _edges(row[1], limit, scale)
-    row[0].set_ylim(*(np.array([-1, 1]) * _HEADROOM * max(limit.largest * scale, largest)))
-    row[1].set_ylim(*(np.array([-1, 1]) * _HEADROOM * max(largest, 1e-3)))
+    row[0].set_ylim(*(np.array([-1, 1]) * _HEADROOM * limit.largest * scale))
+    row[1].set_ylim(*(np.array([-1, 1]) * _HEADROOM * scale * _reach([one.of(name) for one, _ in series.values()])))
+
+
+def _reach(errors: Sequence[F64]) -> float:
+    """How far the enlarged panel must reach: the largest refined error (last), and 95 % of the others."""
+    *others, refined = (np.abs(one) for one in errors)
+    reaches = [float(np.quantile(one, 0.95)) for one in others if len(one)]
+    return max([*reaches, float(refined.max(initial=0.0)), 1e-5])
 
 
 def _bands(panel: Axes, limit: Limit, scale: float) -> None:

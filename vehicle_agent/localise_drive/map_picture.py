@@ -71,7 +71,7 @@ def _tall_enough(low: F64, high: F64) -> tuple[F64, F64]:
 
 
 def draw_map(drive: LocalisedDrive, tiles: TileSource, path: Path) -> Path:
-    """The Gaussians of the tiles that were used, and the refined poses on them; where it was lost, GNSS fixes.
+    """The Gaussians of the tiles that were used, and the refined poses on them; GNSS fixes where there are none.
 
     Raises:
         LocaliseError: the file cannot be written.
@@ -128,17 +128,17 @@ def _panel(figure: Figure, view: View) -> Axes:
 def _fixes(drive: LocalisedDrive) -> F64:
     """(N, 2) GNSS fixes in the map frame."""
     gnss = drive.gnss
-    return drive.header.anchor.enu_from_geodetic(gnss.lat_rad, gnss.lon_rad, gnss.height_m)[:, :2]
+    p_map_m: F64 = drive.header.anchor.enu_from_geodetic(gnss.lat_rad, gnss.lon_rad, gnss.height_m)
+    return p_map_m[:, :2]
 
 
 def _lost_fixes(drive: LocalisedDrive) -> F64:
-    """(N, 2) those taken while there was no pose."""
-    if not drive.moments:
-        return _fixes(drive)
-    at = np.searchsorted([m.t_ns for m in drive.moments], drive.gnss.t_ns, side="right") - 1
-    last_ns = drive.moments[-1].t_ns
-    lost = np.array([m.health == "lost" for m in drive.moments])[np.maximum(at, 0)]
-    return _fixes(drive)[lost & (at >= 0) & (drive.gnss.t_ns <= last_ns + GAP_NS)]
+    """(N, 2) those of the part that was driven near which there is no refined pose."""
+    last_ns = drive.moments[-1].t_ns if drive.moments else drive.gnss.t_ns[-1]
+    known = np.array([-(2**62), *(e.t_ns for e in drive.refined), 2**62], np.int64)
+    after = np.searchsorted(known, drive.gnss.t_ns)
+    away_ns = np.minimum(known[after] - drive.gnss.t_ns, drive.gnss.t_ns - known[after - 1])
+    return _fixes(drive)[(away_ns > GAP_NS) & (drive.gnss.t_ns <= last_ns + GAP_NS)]
 
 
 def _draw_track(axes: Axes, drive: LocalisedDrive, track_m: F64) -> None:
@@ -199,7 +199,7 @@ def _legend(figure: Figure, drive: LocalisedDrive, *, has_lost: bool) -> None:
     ]
     if has_lost:
         dot: dict[str, Any] = {"marker": ".", "linestyle": "", "markersize": 9, "color": HEALTH_COLOURS["lost"]}
-        handles.append(Line2D([], [], label="no pose: GNSS", **dot))
+        handles.append(Line2D([], [], label="no final pose: GNSS", **dot))
     figure.legend(
         handles=handles, loc="upper right", bbox_to_anchor=(1 - _SIDE_IN / _WIDTH_IN, 1 - 0.1 / figure.get_figheight()),
         ncols=len(handles), frameon=False, fontsize=10, labelcolor=MUTED, columnspacing=1.3, handlelength=1.4,

@@ -37,15 +37,20 @@ def write_outputs(drive: LocalisedDrive, values: Mapping[str, Any], folder: Path
         LocaliseError: the folder cannot be made.
         TrajectoryError: a file cannot be written.
     """
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise LocaliseError(f"{folder}: cannot make the folder: {error.strerror or error}") from None
+    make_folder(folder)
     written = [path for name in formats for path in FORMATS[name](drive, folder)]
     for name, content in (("health.json", health_json(drive)), ("summary.json", values)):
         write_text(folder / name, json.dumps(content, indent=1) + "\n")
         written.append(folder / name)
     return written
+
+
+def make_folder(folder: Path) -> None:
+    """Make the folder and those above it; `LocaliseError` when the system refuses."""
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise LocaliseError(f"{folder}: cannot make the folder: {error.strerror or error}") from None
 
 
 def reference_at(drive: LocalisedDrive, estimates: Sequence[PoseEstimate]) -> Trajectory | None:

@@ -40,13 +40,13 @@ def dress(axes: Axes, label: str) -> None:
         spine.set(visible=name in ("left", "bottom"), color=FAINT)
 
 
-def health_strip(axes: Axes, stretches: list[Stretch]) -> None:
-    """Colour the foot of the axes by health over time; where it is not good, the whole height faintly."""
+def health_strip(axes: Axes, stretches: list[Stretch], *, shade: bool = True) -> None:
+    """Colour the foot of the axes by health over time; with `shade`, the whole height faintly where it is not good."""
     for one in stretches:
         colour = HEALTH_COLOURS[one.health]
         span: dict[str, Any] = {"color": colour, "linewidth": 0}
         axes.axvspan(one.from_s, one.to_s, ymin=0.0, ymax=_STRIP, alpha=0.9, zorder=4, **span)
-        if one.health != "good":
+        if shade and one.health != "good":
             axes.axvspan(one.from_s, one.to_s, alpha=0.10, zorder=0, **span)
 
 

@@ -54,7 +54,8 @@ class StoreMap:
         if not here:
             raise LocaliseError(_elsewhere(float(lat_rad.mean()), float(lon_rad.mean()), known))
         if self.at_ns is not None and not any(self.store.get(self.layer, t, at_ns=self.at_ns) for t in here):
-            raise LocaliseError(f"none of the {len(here)} tiles around the drive existed at {self.at_ns} ns")
+            then = np.datetime64(self.at_ns, "ns").astype("datetime64[s]")
+            raise LocaliseError(f"none of the {len(here)} tiles around the drive existed at {then} UTC")
 
 
 class MapAround:
