@@ -201,7 +201,10 @@ def read_header(path: Path | str) -> DriveHeader:
         _check_channels(summary)
         metadata = next((m.metadata for m in reader.iter_metadata() if m.name == METADATA), None)
         if metadata is None:
-            raise DriveError(f"MCAP file without a metadata record {METADATA!r}; import it with `gnd import`")
+            raise DriveError(
+                f"MCAP file without a metadata record {METADATA!r}; turn it into a drive with"
+                f" `gnd import auto {path} -o drive.mcap`"
+            )
         return header_of(metadata, _mount_of(reader))
 
 

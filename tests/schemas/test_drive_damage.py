@@ -141,7 +141,9 @@ def foreign(path: Path, topic: str) -> Path:
 
 def test_a_foreign_recording_is_refused_with_what_to_do(tmp_path: Path) -> None:
     path = foreign(tmp_path / "other.mcap", "/fix")
-    with pytest.raises(DriveError, match=r"without a metadata record 'gnd\.drive'; import it with `gnd import`"):
+    with pytest.raises(
+        DriveError, match=r"without a metadata record 'gnd\.drive'; turn it into a drive with `gnd import auto"
+    ):
         read_header(path)
     assert list(read_drive(path)) == []
 

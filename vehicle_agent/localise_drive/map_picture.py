@@ -13,7 +13,6 @@ from matplotlib.patches import Patch
 from matplotlib.patheffects import withStroke
 
 from gnd_map.arrays import F64
-from vehicle_agent.localise.estimates import PoseEstimate
 from vehicle_agent.localise_drive.curves import GAP_NS
 from vehicle_agent.localise_drive.map_raster import COLOURS, KINDS, MapRaster
 from vehicle_agent.localise_drive.run import LocalisedDrive, trajectory_of
@@ -128,12 +127,12 @@ def _panel(figure: Figure, view: View) -> Axes:
 def _fixes(drive: LocalisedDrive) -> F64:
     """(N, 2) GNSS fixes in the map frame."""
     gnss = drive.gnss
-    p_map_m: F64 = drive.header.anchor.enu_from_geodetic(gnss.lat_rad, gnss.lon_rad, gnss.height_m)
-    return p_map_m[:, :2]
+    horizontal: F64 = drive.header.anchor.enu_from_geodetic(gnss.lat_rad, gnss.lon_rad, gnss.height_m)[:, :2]
+    return horizontal
 
 
 def _lost_fixes(drive: LocalisedDrive) -> F64:
-    """(N, 2) those of the part that was driven near which there is no refined pose."""
+    """(N, 2) those of the part that was driven for which there is no refined pose."""
     last_ns = drive.moments[-1].t_ns if drive.moments else drive.gnss.t_ns[-1]
     known = np.array([-(2**62), *(e.t_ns for e in drive.refined), 2**62], np.int64)
     after = np.searchsorted(known, drive.gnss.t_ns)
@@ -152,18 +151,20 @@ def _draw_track(axes: Axes, drive: LocalisedDrive, track_m: F64) -> None:
     axes.add_collection(LineCollection(list(pairs[near]), colors="white", linewidths=5.5, **look))
     kept = [colour for colour, there in zip(colours, near, strict=True) if there]
     axes.add_collection(LineCollection(list(pairs[near]), colors=kept, linewidths=3.0, **look))
-    _draw_ways(axes, drive.refined, track_m)
+    _draw_ways(axes, track_m)
 
 
-def _draw_ways(axes: Axes, estimates: tuple[PoseEstimate, ...], track_m: F64) -> None:
-    """A dot and a number every so many metres of the track."""
+def _draw_ways(axes: Axes, track_m: F64) -> None:
+    """A dot and a number every so many metres of the track; none where a gap passes over it."""
     way_m = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(track_m, axis=0), axis=1))])
     step_m = nice_m(float(way_m[-1]) / 5)
-    marks = np.searchsorted(way_m, np.arange(0.0, way_m[-1] + 1e-6, step_m))
-    for number, k in enumerate(np.minimum(marks, len(estimates) - 1)):
+    for mark_m in np.arange(0.0, way_m[-1], step_m):
+        k = int(np.searchsorted(way_m, mark_m))
+        if way_m[k] - mark_m > step_m / 10:
+            continue
         axes.plot(*track_m[k], "o", color="white", markeredgecolor=INK, markersize=5.5, zorder=6)
         axes.annotate(
-            f"{number * step_m:g} m", track_m[k], (0, 9), textcoords="offset points", ha="center", fontsize=9,
+            f"{mark_m:g} m", track_m[k], (0, 9), textcoords="offset points", ha="center", fontsize=9,
             color=INK, path_effects=_HALO, zorder=7,
         )  # fmt: skip
 
