@@ -137,7 +137,8 @@ def _lost_fixes(drive: LocalisedDrive) -> F64:
     known = np.array([-(2**62), *(e.t_ns for e in drive.refined), 2**62], np.int64)
     after = np.searchsorted(known, drive.gnss.t_ns)
     away_ns = np.minimum(known[after] - drive.gnss.t_ns, drive.gnss.t_ns - known[after - 1])
-    return _fixes(drive)[(away_ns > GAP_NS) & (drive.gnss.t_ns <= last_ns + GAP_NS)]
+    lost: F64 = _fixes(drive)[(away_ns > GAP_NS) & (drive.gnss.t_ns <= last_ns + GAP_NS)]
+    return lost
 
 
 def _draw_track(axes: Axes, drive: LocalisedDrive, track_m: F64) -> None:
