@@ -7,8 +7,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from gnd_map.motion import deskew
-from gnd_map.se3 import transform
+from gnd_map.motion import Trajectory, deskew
 from schemas.drive import GnssFix, MotionSample, Scan
 from vehicle_agent.errors import RegistrationError
 from vehicle_agent.local_map import LocalMap
@@ -20,6 +19,7 @@ from vehicle_agent.localise.health import HealthMonitor
 from vehicle_agent.localise.judge import Judge, Matched
 from vehicle_agent.localise.match_map import MatchMapCache
 from vehicle_agent.localise.odometry import MotionBuffer
+from vehicle_agent.localise.packed_scan import PackedScan, pack
 from vehicle_agent.localise.parameters import LocaliserParameters
 from vehicle_agent.localise.registration import RegistrationResult, Start, register
 from vehicle_agent.localise.sampling import sample_scan
@@ -33,9 +33,12 @@ PAST_NS, MOST_FROM_PAST = 1_000_000_000, 5
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _HeldScan:
-    """A scan in the lag: what is needed to make it final, and how its match went."""
+    """A scan in the lag: what is needed to make it final, and how its match went. `sweep` is the motion during the
+    sweep where it is not the one that wheels and gyro tell.
+    """
 
-    scan: Scan
+    scan: PackedScan
+    sweep: Trajectory | None
     t_ns: int
     matching_ratio: float
     health: Health
@@ -218,14 +221,14 @@ class Localiser:
         frame = self.local_map.grid_frame.frame
         return frame.enu_from_geodetic(fix.lat_rad, fix.lon_rad, fix.height_m).reshape(3)
 
-    def _hold(self, track: _Track, scan: Scan, matching_ratio: float) -> None:
+    def _hold(self, track: _Track, scan: Scan, matching_ratio: float, sweep: Trajectory | None = None) -> None:
         """Keep the scan until its pose is final, and tell the online pose."""
         t_ns, number = _reference_ns(scan), track.graph.newest
         pose, monitor = track.graph.smoothed(number)[0], track.judge.monitor
         sigma_m, sigma_rad = _sigmas(pose)
         monitor.see_sigma(sigma_m, sigma_rad)
         health, cause = monitor.judge(t_ns)
-        held = _HeldScan(scan, t_ns, matching_ratio, health, cause, monitor.degenerate)
+        held = _HeldScan(pack(scan), sweep, t_ns, matching_ratio, health, cause, monitor.degenerate)
         track.held[number] = held
         self.online = _estimate(pose, held)
 
@@ -313,12 +316,9 @@ class Localiser:
 
     def _refined(self, held: _HeldScan, pose: SmoothedPose) -> RefinedScan:
         scan = held.scan
-        finite = np.flatnonzero(np.isfinite(scan.points_m).all(axis=1))
-        points = self._deskewed(scan, finite, scan.points_m[finite])
-        origins = self._deskewed(scan, finite, np.zeros((len(finite), 3), np.float32))
-        estimate = _estimate(pose, held)
-        T = pose.T_map_vehicle
-        return RefinedScan(held.t_ns, transform(T, points), transform(T, origins), estimate)
+        sweep = self._motion.trajectory(scan.t_ns, scan.end_ns) if held.sweep is None else held.sweep
+        ends, starts = scan.placed(sweep, self.T_vehicle_lidar, held.t_ns, pose.T_map_vehicle)
+        return RefinedScan(held.t_ns, ends, starts, _estimate(pose, held))
 
     def _deskewed(self, scan: Scan, chosen: NDArray[np.int64], points_lidar_m: NDArray[np.float32]) -> F64:
         """(K, 3) points (of the LiDAR's frame, at the times of the chosen points) in the vehicle frame at the scan's
