@@ -1,0 +1,1 @@
+"""Odometry, localisation, registration and georeferencing on real recordings: `gnd reproduce real-localisation`."""
