@@ -119,9 +119,12 @@ def place_rays(points: Points, ticks: Ticks, step_m: float, tick_ns: int, knot_n
         before = 1.0 - after
         x, y, z = points[n, 0] * step_m, points[n, 1] * step_m, points[n, 2] * step_m
         for row in range(3):
-            a, b = knots[k, row], knots[k + 1, row]
-            start = before * a[3] + after * b[3]
+            start = before * knots[k, row, 3] + after * knots[k + 1, row, 3]
             starts[n, row] = start
-            turned = before * (a[0] * x + a[1] * y + a[2] * z) + after * (b[0] * x + b[1] * y + b[2] * z)
-            ends[n, row] = start + turned
+            ends[n, row] = (
+                start
+                + (before * knots[k, row, 0] + after * knots[k + 1, row, 0]) * x
+                + (before * knots[k, row, 1] + after * knots[k + 1, row, 1]) * y
+                + (before * knots[k, row, 2] + after * knots[k + 1, row, 2]) * z
+            )
     return ends, starts
