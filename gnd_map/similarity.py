@@ -37,7 +37,7 @@ def similarity(
     mean_b: Array,
     cov_b: Array,
     mode: SimilarityMode = "default",
-    noise_m: float = 0.05,
+    noise_m: float | F64 = 0.05,
 ) -> F64:
     """(N,) similarity in [0, 1] of N pairs of voxel states; symmetric in a and b.
 
@@ -49,21 +49,23 @@ def similarity(
         mean_b: as a.
         cov_b: as a.
         mode: "paper" or "default", see the module's head.
-        noise_m: standard deviation added in "default" mode.
+        noise_m: standard deviation added in "default" mode, one for all or (N,): where the poses of a pair's
+            observers are known poorly, it is larger.
 
     Raises:
         ShapeError: shapes differ or values are not finite.
         ConfigError: an unknown mode or a negative noise.
     """
-    _check_mode(mode, noise_m)
     n = len(exists_a)
+    noise = _checked("noise_m", np.full(n, noise_m) if np.ndim(noise_m) == 0 else np.asarray(noise_m), (n,), np.float64)
+    _check_mode(mode, noise)
     exist = [_checked(name, x, (n,), np.bool_) for name, x in (("exists_a", exists_a), ("exists_b", exists_b))]
     mean = [_checked(name, x, (n, 3), np.float64) for name, x in (("mean_a", mean_a), ("mean_b", mean_b))]
     cov = [_checked(name, x, (n, 6), np.float64) for name, x in (("cov_a", cov_a), ("cov_b", cov_b))]
     result: F64 = (exist[0] == exist[1]).astype(np.float64)  # Eq. 14, with both empty = 1
     both = np.flatnonzero(exist[0] & exist[1])
     term = _paper_terms if mode == "paper" else _default_terms
-    result[both] = term(mean[1][both] - mean[0][both], cov[0][both], cov[1][both], noise_m)
+    result[both] = term(mean[1][both] - mean[0][both], cov[0][both], cov[1][both], noise[both])
     return result
 
 
@@ -105,11 +107,11 @@ def pairs_within(group: npt.ArrayLike) -> tuple[I64, I64]:
     return i.astype(np.int64), j.astype(np.int64)
 
 
-def _check_mode(mode: str, noise_m: float) -> None:
+def _check_mode(mode: str, noise_m: F64) -> None:
     if mode not in ("paper", "default"):
         raise ConfigError(f"similarity mode {mode!r}: expected 'paper' or 'default'")
-    if not noise_m >= 0.0:
-        raise ConfigError(f"noise_m = {noise_m} is negative")
+    if (noise_m < 0.0).any():
+        raise ConfigError(f"noise_m = {noise_m.min()} is negative")
 
 
 def _checked(name: str, array: Array, shape: tuple[int, ...], dtype: type[np.generic]) -> Array:
@@ -118,13 +120,13 @@ def _checked(name: str, array: Array, shape: tuple[int, ...], dtype: type[np.gen
     return values
 
 
-def _paper_terms(d: F64, cov_a: F64, cov_b: F64, _noise_m: float) -> F64:
+def _paper_terms(d: F64, cov_a: F64, cov_b: F64, _noise_m: F64) -> F64:
     l2 = np.exp(-0.5 * mahalanobis_squared(add_to_diagonal(cov_a + cov_b, _LEAST_VARIANCE_M2), d))  # Eq. 15
     return l2 * _geometric(cov_a, cov_b)  # Eq. 13
 
 
-def _default_terms(d: F64, cov_a: F64, cov_b: F64, noise_m: float) -> F64:
-    variance = max(noise_m**2, _LEAST_VARIANCE_M2)
+def _default_terms(d: F64, cov_a: F64, cov_b: F64, noise_m: F64) -> F64:
+    variance = np.maximum(noise_m**2, _LEAST_VARIANCE_M2)
     l2 = np.exp(-0.5 * mahalanobis_squared(add_to_diagonal(cov_a + cov_b, variance), d))  # Eq. 15
     a, b = add_to_diagonal(cov_a, variance), add_to_diagonal(cov_b, variance)
     shape = (determinant(a) * determinant(b)) ** 0.25 / np.sqrt(

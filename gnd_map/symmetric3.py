@@ -39,6 +39,6 @@ def mahalanobis_squared(s: F64, d: F64) -> F64:
     return np.maximum(quadratic_form(adjugate(s), d) / determinant(s), 0.0)
 
 
-def add_to_diagonal(s: F64, variance: float) -> F64:
-    """(..., 6) S + variance·I."""
-    return s + variance * np.array([1.0, 0.0, 0.0, 1.0, 0.0, 1.0])
+def add_to_diagonal(s: F64, variance: float | F64) -> F64:
+    """(..., 6) S + variance·I, one variance for all or (...) one each."""
+    return np.asarray(s + np.asarray(variance)[..., None] * np.array([1.0, 0.0, 0.0, 1.0, 0.0, 1.0]))

@@ -55,6 +55,24 @@ def test_symmetric_and_between_zero_and_one(mode: SimilarityMode, seed: int, noi
     assert ((forth >= 0.0) & (forth <= 1.0)).all()
 
 
+def test_each_pair_may_have_its_own_noise() -> None:
+    """Observers whose poses are known poorly see the same wall apart: with more noise two Gaussians are more alike."""
+    a, b = random_states(60, 7), random_states(60, 8)
+    noise_m = np.random.default_rng(9).choice([0.02, 0.05, 0.15], 60)
+    each = similarity(*a, *b, "default", noise_m)
+    for value in np.unique(noise_m):
+        alone = similarity(*a, *b, "default", float(value))
+        np.testing.assert_array_equal(each[noise_m == value], alone[noise_m == value])
+    shifted = [np.broadcast_to(cov(PLANE), (3, 6)), np.array([[0.0, 0.0, 0.1]] * 3)]
+    yes, zero = np.ones(3, np.bool_), np.zeros((3, 3))
+    grown = similarity(yes, zero, shifted[0], yes, shifted[1], shifted[0], "default", np.array([0.02, 0.05, 0.15]))
+    assert (np.diff(grown) > 0.1).all()
+    with pytest.raises(ShapeError):
+        similarity(*a, *b, "default", noise_m[:5])
+    with pytest.raises(ConfigError, match="negative"):
+        similarity(*a, *b, "default", -noise_m)
+
+
 @pytest.mark.parametrize("mode", MODES)
 def test_the_l2_term_is_equation_15(mode: SimilarityMode) -> None:
     c, d = cov(SPHERE, [0.1, 0.2, 0.3]), np.array([0.2, -0.1, 0.3])
