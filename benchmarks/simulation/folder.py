@@ -45,6 +45,18 @@ class RunFolder:
             folder.mark()
         return folder
 
+    @classmethod
+    def begun(cls, root: Path) -> "RunFolder":
+        """Make the folder, or continue in one, and mark it as one of this command at once.
+
+        Raises:
+            FolderError: as `create`.
+        """
+        folder = cls.create(root)
+        if not (root / _MARK).is_file():
+            folder.write_mark({})
+        return folder
+
     def mark(self) -> dict[str, Any]:
         """Return what the folder says about its last run.
 
@@ -66,6 +78,9 @@ class RunFolder:
             FolderError: it holds no such run, or one that has not ended.
         """
         found = self.mark()
+        if "compared" in found:
+            several = ", ".join(sorted(path.name for path in self.root.iterdir() if (path / _MARK).is_file()))
+            raise FolderError(f"{self.root} compares several runs: choose one of its folders {several}")
         if not found.get("worlds"):
             raise FolderError(f"the run in {self.root} has not ended: start it again, it continues where it was")
         return found

@@ -8,6 +8,7 @@ from rich.table import Table
 from rich.text import Text
 
 from benchmarks.simulation import reference
+from benchmarks.simulation.comparison import rows_of
 from benchmarks.simulation.targets import target_single
 from fleet_sim.truth import LEVELS
 
@@ -30,12 +31,57 @@ def tables_of(found: Mapping[str, Any], asked: "list[int]") -> Group:
     )
 
 
-def print_tables(found: Mapping[str, Any], asked: "list[int]") -> None:
-    """Print the tables on standard output."""
+def print_tables(tables: Group) -> None:
+    """Print tables on standard output."""
     console = Console()
     if not console.is_terminal:
         console = Console(width=_PLAIN_WIDTH)
-    console.print(tables_of(found, asked))
+    console.print(tables)
+
+
+def comparison_tables(compared: Mapping[str, Any], asked: "list[int]") -> Group:
+    """Return the scores of runs with poses of several sources beside each other, what each loses, and its poses."""
+    parts: list[Table | Text] = []
+    for name in compared["loss"]:
+        parts += [_losses(compared, name, asked), Text(), _poses(compared["poses"][name], name), Text()]
+        worst = compared["worst"][name]
+        verdict = "met" if worst["met"] else "missed"
+        line = f"Poses {name}: at most {worst['loss']:.2f} points lost ({worst['row']}), {worst['must']:g} allowed"
+        parts += [Text(f"{line}: {verdict}.", style="bold"), Text()]
+    return Group(*parts[:-1])
+
+
+def _losses(compared: Mapping[str, Any], name: str, asked: "list[int]") -> Table:
+    against = compared["against"]
+    exact, other = rows_of(compared["poses"][against]), rows_of(compared["poses"][name])
+    seeds = ", ".join(map(str, compared["poses"][name]["seeds"]))
+    columns = [f"{level} {what}" for level in ("scored", "all") for what in (against, name, "loss")]
+    table = _table(f"Macro F1 in percent, world seed {seeds}: poses {against} and {name}", "", *columns)
+    for row, loss in compared["loss"][name].items():
+        kind, _, number = row.partition(".")
+        if kind == "fleet" and int(number) not in asked:
+            continue
+        values = [(exact[row][level], other[row][level], loss[level]) for level in ("scored", "all")]
+        table.add_row(_row_name(row), *(f"{value:.2f}" for three in values for value in three))
+    return table
+
+
+def _row_name(row: str) -> str:
+    kind, _, which = row.partition(".")
+    if kind == "fleet":
+        return f"{which} vehicle{'s' * (which != '1')}"
+    return f"one drive, {which or '16/32 layers'}"
+
+
+def _poses(found: Mapping[str, Any], name: str) -> Table:
+    """What the localisation of each sensor's drives came to."""
+    errors = ("longitudinal_p95_m", "lateral_p95_m", "heading_p95_deg")
+    table = _table(f"Poses {name}, mean over the drives of a sensor", "", "scans", "used", *errors)
+    for sensor, drive in found["drives"].items():
+        poses = drive.get("poses", {})
+        values = [f"{poses[key]:.4f}" if key in poses else "" for key in errors]
+        table.add_row(sensor, f"{drive['scans']:.0f}", f"{drive['scans_used']:.0f}", *values)
+    return table
 
 
 def _scores(found: Mapping[str, Any], asked: "list[int]") -> Table:
