@@ -148,15 +148,17 @@ class Localiser:
         if self._track is None:
             self._start(scan, points)
         else:
-            self._step(self._track, scan, points)
+            self._step(self._track, scan, chosen, points)
         self._last_ns = _reference_ns(scan)
 
-    def _step(self, track: _Track, scan: Scan, points: F64) -> None:
+    def _step(self, track: _Track, scan: Scan, chosen: NDArray[np.int64], points: F64) -> None:
         """Predict from the newest pose, match, gate, fuse."""
         t_ns, newest = _reference_ns(scan), track.graph.newest
         odometry = self._odometry(track.held[newest].t_ns, t_ns)
-        seen = self._scan_step(t_ns, points, odometry)
+        seen = self._scan_step(scan, chosen, points, odometry)
         joint = joint_step(*odometry, seen)
+        sweep = self._sweep_of_steady(scan) if joint.slipped else None
+        points = points if sweep is None else self._deskewed(scan, chosen, scan.points_m[chosen], sweep)
         predicted = track.graph.pose(newest) @ joint.T_before_now
         result, believed = self._matched(track.judge.monitor, points, predicted, odometry.sigmas, t_ns)
         match = None
@@ -172,16 +174,27 @@ class Localiser:
         seen_scan = Matched(t_ns, points, joint.T_before_now, T_now, result, believed, unknown_s)
         track.judge.see(seen_scan, self._map.near(T_now[:3, 3]))
         final = track.graph.add(t_ns, predicted, odometry, match, gnss, seen)
-        self._hold(track, scan, result.matching_ratio if result is not None else 0.0)
+        self._hold(track, scan, result.matching_ratio if result is not None else 0.0, sweep)
         self._finalise(track, final)
         if self.online is not None and self.online.health == "lost":
             self._lose(track, self.online.cause)
 
-    def _scan_step(self, t_ns: int, points: F64, odometry: Odometry) -> ScanStep | None:
+    def _scan_step(
+        self, scan: Scan, chosen: NDArray[np.int64], points: F64, odometry: Odometry
+    ) -> ScanStep | None:
         """The motion since the scan before, as the scans tell it."""
         if not self.parameters.scan_odometry.enabled:
             return None
-        return self._scan_odometry.step(t_ns, points, *odometry)
+
+        def points_going_on() -> F64:
+            return self._deskewed(scan, chosen, scan.points_m[chosen], self._sweep_of_steady(scan))
+
+        return self._scan_odometry.step(_reference_ns(scan), points, *odometry, points_going_on)
+
+    def _sweep_of_steady(self, scan: Scan) -> Trajectory | None:
+        """The motion during the sweep as the scans tell it; None before they have told any."""
+        steady = self._scan_odometry.steady
+        return None if steady is None else steady.trajectory(scan.t_ns, _end_ns(scan))
 
     def _odometry(self, first_ns: int, last_ns: int) -> Odometry:
         delta = self._motion.delta(first_ns, last_ns)
@@ -320,11 +333,18 @@ class Localiser:
         ends, starts = scan.placed(sweep, self.T_vehicle_lidar, held.t_ns, pose.T_map_vehicle)
         return RefinedScan(held.t_ns, ends, starts, _estimate(pose, held))
 
-    def _deskewed(self, scan: Scan, chosen: NDArray[np.int64], points_lidar_m: NDArray[np.float32]) -> F64:
+    def _deskewed(
+        self,
+        scan: Scan,
+        chosen: NDArray[np.int64],
+        points_lidar_m: NDArray[np.float32],
+        sweep: Trajectory | None = None,
+    ) -> F64:
         """(K, 3) points (of the LiDAR's frame, at the times of the chosen points) in the vehicle frame at the scan's
-        reference time.
+        reference time; the motion is that of wheels and gyro, or `sweep`.
         """
-        sweep = self._motion.trajectory(scan.t_ns, _end_ns(scan))
+        if sweep is None:
+            sweep = self._motion.trajectory(scan.t_ns, _end_ns(scan))
         offset_ns = scan.t_offset_ns[chosen]
         return deskew(points_lidar_m, offset_ns, scan.t_ns, sweep, self.T_vehicle_lidar, _reference_ns(scan))
 

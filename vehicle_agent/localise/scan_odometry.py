@@ -5,12 +5,14 @@ or that rests on too few points, is not given. Experience with odometry of recor
 here too: voxels that hold one or two rings of a scan say where the rings are, not where the ground is.
 """
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
+from gnd_map.motion import Trajectory
 from gnd_map.se3 import T_from_R_t, T_inverse, exp_so3, log_so3, transform
 from vehicle_agent.errors import RegistrationError
 from vehicle_agent.localise.parameters import RegistrationParameters
@@ -21,6 +23,22 @@ from vehicle_agent.localise.scan_odometry_parameters import ScanOdometryParamete
 F64 = NDArray[np.float64]
 
 CONTRADICTION = 3.0  # sigmas
+
+
+class SteadyMotion(NamedTuple):
+    """A motion (4, 4) that took `dt_ns`, and goes on."""
+
+    T_before_now: F64
+    dt_ns: int
+
+    def after(self, dt_ns: int) -> F64:
+        """(4, 4) the motion in another time."""
+        return _exp(_log(self.T_before_now) * (dt_ns / self.dt_ns))
+
+    def trajectory(self, first_ns: int, last_ns: int) -> Trajectory:
+        """The way of the vehicle between two times, in its frame at the first."""
+        last_ns = max(last_ns, first_ns + 1)
+        return Trajectory(np.array([first_ns, last_ns]), np.stack([np.eye(4), self.after(last_ns - first_ns)]))
 
 
 class ScanStep(NamedTuple):
@@ -60,10 +78,11 @@ def joint_step(T_driven: F64, sigmas: F64, step: ScanStep | None) -> JointStep:
 
 
 class _Prediction(NamedTuple):
-    """Motion since the scan before (4, 4) and its sigmas (6,)."""
+    """Motion since the scan before (4, 4), its sigmas (6,), and the scan's points (N, 3) with such a motion removed."""
 
     T_before_now: F64
     sigmas: F64
+    points_m: F64
 
 
 class _Match(NamedTuple):
@@ -89,18 +108,31 @@ class ScanOdometry:
         self._before_ns: int | None = None
         self._T_odom_before = np.eye(4)
         self._covariance = np.zeros((6, 6))
-        self._steady: tuple[F64, int] | None = None
+        self._steady: SteadyMotion | None = None
+        self._slipping = False
         self._T_odom_added = np.eye(4)
 
     def begin(self, t_ns: int, points_m: F64) -> None:
         """Start with this scan: it does not continue those before."""
         self._before_ns = t_ns
         self._T_odom_before = self._T_odom_added = np.eye(4)
-        self._covariance, self._steady = np.zeros((6, 6)), None
+        self._covariance, self._steady, self._slipping = np.zeros((6, 6)), None, False
         self._map.clear(np.zeros(3))
         self._map.add(points_m, np.zeros(3))
 
-    def step(self, t_ns: int, points_vehicle_m: F64, T_before_now_predicted: F64, sigmas: F64) -> ScanStep | None:
+    @property
+    def steady(self) -> SteadyMotion | None:
+        """The motion of the newest step, if there was one."""
+        return self._steady
+
+    def step(
+        self,
+        t_ns: int,
+        points_vehicle_m: F64,
+        T_before_now_predicted: F64,
+        sigmas: F64,
+        points_going_on: Callable[[], F64] | None = None,
+    ) -> ScanStep | None:
         """The motion since the scan before; None when there is none, or it is not to be trusted.
 
         Args:
@@ -108,42 +140,50 @@ class ScanOdometry:
             points_vehicle_m: (N, 3) float64 sampled points, sweep motion removed.
             T_before_now_predicted: (4, 4) motion since the scan before by wheel speed and yaw rate.
             sigmas: (6,) its sigmas, rotation [rad] first, then position [m].
+            points_going_on: gives the points with the motion removed that `steady` says; asked when the wheels slip.
         """
         if self._before_ns is None or not 0 < t_ns - self._before_ns <= self.parameters.max_gap_s * 1e9:
             self.begin(t_ns, points_vehicle_m)
             return None
         dt_ns, self._before_ns = t_ns - self._before_ns, t_ns
-        driven = _Prediction(T_before_now_predicted, sigmas)
-        match = self._matched(points_vehicle_m, driven, dt_ns)
-        T_before_now = self._advance(driven if match is None else match.prediction, match)
-        self._steady = None if match is None else (T_before_now, dt_ns)
-        self._add(points_vehicle_m)
+        driven = _Prediction(T_before_now_predicted, sigmas, points_vehicle_m)
+        match = self._matched(driven, self._going_on(dt_ns, points_going_on))
+        used = driven if match is None else match.prediction
+        T_before_now = self._advance(used, match)
+        self._add(used.points_m)
+        self._steady, self._slipping = None, False
         if match is None:
             return None
-        return ScanStep(T_before_now, self.parameters.step_share * match.covariance)
+        self._steady = SteadyMotion(T_before_now, dt_ns)
+        step = ScanStep(T_before_now, self.parameters.step_share * match.covariance)
+        self._slipping = joint_step(T_before_now_predicted, sigmas, step).slipped
+        return step
 
-    def _matched(self, points_m: F64, driven: _Prediction, dt_ns: int) -> _Match | None:
-        """The match near to what wheels and gyro say, or else near to going on as before: wheels slip."""
-        chosen = points_m[:: max(1, len(points_m) // self.parameters.n_points)]
-        near = self._match_near(chosen, driven, self.parameters.min_fit)
-        return near or self._match_near(chosen, self._going_on(dt_ns), self.parameters.min_steady_fit)
-
-    def _going_on(self, dt_ns: int) -> _Prediction | None:
-        """The motion of the step before, for as long as this one took."""
+    def _matched(self, driven: _Prediction, going_on: Callable[[], _Prediction] | None) -> _Match | None:
+        """The match near to what wheels and gyro say, or near to going on as before: that comes first while the
+        wheels slip.
+        """
         par = self.parameters
-        if self._steady is None:
-            return None
-        T_step, step_ns = self._steady
-        sigmas = np.array([par.steady_rad] * 3 + [par.steady_m] * 3)
-        return _Prediction(_exp(_log(T_step) * (dt_ns / step_ns)), sigmas)
+        if going_on is None:
+            return self._match_near(driven, par.min_fit)
+        if self._slipping:
+            return self._match_near(going_on(), par.min_steady_fit) or self._match_near(driven, par.min_fit)
+        return self._match_near(driven, par.min_fit) or self._match_near(going_on(), par.min_steady_fit)
 
-    def _match_near(self, points_m: F64, prediction: _Prediction | None, min_fit: float) -> _Match | None:
-        """The match, if it fits well enough and lies near enough to the prediction."""
-        if prediction is None:
+    def _going_on(self, dt_ns: int, points_going_on: Callable[[], F64] | None) -> Callable[[], _Prediction] | None:
+        """The motion of the step before, for as long as this one took."""
+        par, steady = self.parameters, self._steady
+        if steady is None or points_going_on is None:
             return None
+        sigmas = np.array([par.steady_rad] * 3 + [par.steady_m] * 3)
+        return lambda: _Prediction(steady.after(dt_ns), sigmas, points_going_on())
+
+    def _match_near(self, prediction: _Prediction, min_fit: float) -> _Match | None:
+        """The match, if it fits well enough and lies near enough to the prediction."""
         par, T_predicted = self.parameters, self._T_odom_before @ prediction.T_before_now
+        chosen = prediction.points_m[:: max(1, len(prediction.points_m) // par.n_points)]
         try:
-            result = register(points_m, T_predicted, self._map.match_map(), self._registration, "near")
+            result = register(chosen, T_predicted, self._map.match_map(), self._registration, "near")
         except RegistrationError:
             return None
         if not result.converged or result.fit < min_fit or result.matching_ratio < par.min_matching_ratio:
