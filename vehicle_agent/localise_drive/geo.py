@@ -17,6 +17,7 @@ COLUMNS: Final = (
     "matching_ratio", "health", "cause", "degenerate", "longitudinal_m", "lateral_m", "heading_error_deg",
 )  # fmt: skip
 """heading_deg: clockwise from north, of the vehicle's x axis. Errors are empty without a reference."""
+_AT_ONCE_NS: Final = 500_000_000
 _DEGREE_DIGITS: Final = 9
 """Of a degree: 0.1 mm on the ground."""
 
@@ -47,16 +48,9 @@ def positions_deg(drive: LocalisedDrive, estimates: Sequence[PoseEstimate]) -> t
     return np.degrees(lat), np.degrees(lon), height
 
 
-def poses_within(drive: LocalisedDrive, first_ns: int, last_ns: int) -> list[PoseEstimate]:
-    """The refined poses of a span of time, last included."""
-    return [e for e in drive.refined if first_ns <= e.t_ns <= last_ns]
-
-
 def _feature(drive: LocalisedDrive, stretch: Stretch) -> dict[str, Any] | None:
     """The line reaches the next stretch's first pose, so that the lines meet."""
-    last_ns = drive.start_ns + round(stretch.to_s * 1e9)
-    poses = poses_within(drive, stretch.first_ns, last_ns + 100_000_000)
-    places = list(_places(drive, poses)) if stretch.health != "lost" else []
+    places = list(_places(drive, _poses_of(drive, stretch))) if stretch.health != "lost" else []
     if len(places) >= 2:
         return _geojson(stretch, "LineString", places)
     fixes = drive.gnss.t_ns
@@ -65,6 +59,15 @@ def _feature(drive: LocalisedDrive, stretch: Stretch) -> dict[str, Any] | None:
     k = int(np.argmin(np.abs(fixes - stretch.first_ns)))
     lon_deg, lat_deg = np.degrees(drive.gnss.lon_rad[k]), np.degrees(drive.gnss.lat_rad[k])
     return _geojson(stretch, "Point", [round(float(lon_deg), 9), round(float(lat_deg), 9)])
+
+
+def _poses_of(drive: LocalisedDrive, stretch: Stretch) -> Sequence[PoseEstimate]:
+    """The refined poses of a stretch, and the one after if it follows at once."""
+    t_ns = trajectory_of(drive.refined).t_ns
+    last_ns = drive.start_ns + round(stretch.to_s * 1e9)
+    first, end = (int(k) for k in np.searchsorted(t_ns, [stretch.first_ns, last_ns]))
+    follows = end < len(t_ns) and t_ns[end] - last_ns < _AT_ONCE_NS
+    return drive.refined[first : end + follows]
 
 
 def _geojson(stretch: Stretch, kind: str, coordinates: list[Any]) -> dict[str, Any]:
