@@ -31,23 +31,30 @@ class Challenger:
             replace(parameters.hypotheses, most_views=parameters.challenge.most_views), parameters.registration
         )
         self._searched_ns = -(2**62)
+        self._T_tracked = np.eye(4)
+        self._way_m = 0.0
         self._own_fits: list[tuple[float, float]] = []  # since there are rivals: fit, share of a view
 
     def see(
         self, t_ns: int, points_m: F64, standing_m: F64, T_tracked: F64, T_before_now: F64, place: Place,
-        match_map: MatchMap, doubtful: bool,
+        match_map: MatchMap, *, doubtful: bool, new: bool, any_heading: bool = False,
     ) -> None:  # fmt: skip
-        """Take a scan with its tracked pose (4, 4); search when it is time, sooner when the pose is `doubtful`.
+        """Take a view with its tracked pose (4, 4); search when it is time, sooner when the pose is `doubtful`.
 
         `points_m` (N, 3) and those that stand above the ground in the vehicle frame; `T_before_now` (4, 4) the motion
-        since the scan before; `place` to search around.
+        since the one before; `place` to search around; `new`: not the view before seen again;
+        `any_heading`: the heading is in doubt too.
         """
-        if len(self.rivals):
-            self._follow(points_m, standing_m, T_tracked, T_before_now, match_map)
+        self._T_tracked = T_tracked
+        self.rivals.move(T_before_now)
+        self._way_m += float(np.hypot(*T_before_now[:2, 3]))
+        if len(self.rivals) and new:
+            self._weigh(points_m, standing_m, T_tracked, match_map)
         par = self._par.challenge
-        if t_ns - self._searched_ns >= (par.doubtful_s if doubtful else par.period_s) * 1e9:
+        if t_ns - self._searched_ns >= (par.doubtful_s if doubtful and not any_heading else par.period_s) * 1e9:
             self._searched_ns = t_ns
-            self._search(points_m, standing_m, T_tracked, place, match_map)
+            turn_rad = np.pi if any_heading else np.radians(par.turn_deg)
+            self._search(points_m, standing_m, T_tracked, _around(place, T_tracked, turn_rad), match_map)
 
     @property
     def odds(self) -> float:
@@ -61,31 +68,34 @@ class Challenger:
     @property
     def contested(self) -> bool:
         """True when a rival makes the tracked pose doubtful."""
-        return self.odds > self._par.challenge.contested
+        par = self._par
+        return self.odds > par.challenge.contested and self.rivals.best.mean_fit >= par.initialise.min_fit
 
     @property
     def beaten(self) -> bool:
-        """True when a rival has won."""
+        """True when a rival has won: one nearby only if it fits well, because a facade that has moved looks like it."""
         if self.odds <= self._par.challenge.beaten:
             return False
-        return self.rivals.best.scans >= self._par.hypotheses.least_scans
+        best, par = self.rivals.best, self._par
+        near = near_pose(best.T_map_vehicle[None], self._T_tracked, par.challenge.near_m, par.challenge.near_deg)[0]
+        least = par.initialise.good_fit if near else par.initialise.fair_fit
+        return bool(best.scans >= par.hypotheses.least_scans and best.mean_fit >= least)
 
-    def _follow(self, points_m: F64, standing_m: F64, T_tracked: F64, T_before_now: F64, match_map: MatchMap) -> None:
-        self.rivals.follow(T_before_now, points_m, standing_m, match_map)
+    def _weigh(self, points_m: F64, standing_m: F64, T_tracked: F64, match_map: MatchMap) -> None:
+        self.rivals.weigh(points_m, standing_m, match_map)
         self.rivals.drop_near(T_tracked)
         if not len(self.rivals):
             self._own_fits.clear()
             return
-        self._take_own(standing_m, T_tracked, match_map, min(1.0, float(np.hypot(*T_before_now[:2, 3])) / 2.0))
+        share, self._way_m = min(1.0, self._way_m / self._par.hypotheses.view_m), 0.0
+        self._take_own(standing_m, T_tracked, match_map, share)
         if self.odds < self._par.challenge.dropped:
             self.rivals.clear()
             self._own_fits.clear()
 
-    def _search(self, points_m: F64, standing_m: F64, T_tracked: F64, place: Place, match_map: MatchMap) -> None:
-        heading = float(np.arctan2(T_tracked[1, 0], T_tracked[0, 0]))
+    def _search(self, points_m: F64, standing_m: F64, T_tracked: F64, around: Around, match_map: MatchMap) -> None:
         par, own = self._par, self._fit(standing_m, T_tracked, match_map)
-        around = Around(place.p_map_m, place.reach_m, heading, np.radians(par.challenge.turn_deg))
-        found, _ = search(points_m, around, match_map, self._how, par.registration)
+        found, _ = search(points_m, around, match_map, self._how, par.registration, standing_m)
         apart = par.hypotheses.apart_m, par.hypotheses.apart_deg
         rivals = [
             one
@@ -95,6 +105,7 @@ class Challenger:
         ]
         if rivals and not self._own_fits:
             self._own_fits.append((own, 1.0))
+            self._way_m = 0.0
         self.rivals.add(rivals)
 
     def _take_own(self, standing_m: F64, T_tracked: F64, match_map: MatchMap, new: float) -> None:
@@ -115,3 +126,7 @@ class Challenger:
     def _fit(self, standing_m: F64, T: F64, match_map: MatchMap) -> float:
         few = thinned(standing_m, self._par.initialise.n_refining)
         return fit_of(few, T, match_map, self._par.registration)
+
+
+def _around(place: Place, T_tracked: F64, turn_rad: float) -> Around:
+    return Around(place.p_map_m, place.reach_m, float(np.arctan2(T_tracked[1, 0], T_tracked[0, 0])), turn_rad)

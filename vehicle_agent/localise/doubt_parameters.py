@@ -32,6 +32,22 @@ class WitnessParameters:
 
 
 @dataclass(frozen=True, slots=True)
+class PoolParameters:
+    """Scans looked at together: one every `every_m`, those of the last `reach_m`, of each but the newest `n_points`;
+    above_ground_m: standing points are higher than this above the ground.
+    """
+
+    every_m: float = 0.7
+    reach_m: float = 10.0
+    n_points: int = 400
+    above_ground_m: float = 0.4
+
+    def __post_init__(self) -> None:
+        if not 0 < self.every_m <= self.reach_m or self.n_points < 1:
+            raise ValueError(f"0 < every_m <= reach_m and n_points >= 1 are required, got {self}")
+
+
+@dataclass(frozen=True, slots=True)
 class HypothesisParameters:
     """How several poses are followed until one of them has won.
 
@@ -41,13 +57,14 @@ class HypothesisParameters:
     view_m, most_views: the way after which a scan is a new view, and how many views count: what is stale stays so.
     none_fit: mean fit of the hypothesis that it is none of them. innovation_m, innovation_deg: one sigma of how far a
         right pose's registration moves it from where odometry has put it.
+    twin_m, twin_deg: poses nearer than this share their probability.
     sure: least probability of a winner, after `least_scans` scans; at_once, alone: a fit so good, with a runner-up of
         less than this share of it, wins at the first.
     dropped: a hypothesis this much less probable than the best is given up.
     """
 
     n_most: int = 8
-    n_points: int = 700
+    n_points: int = 1000
     apart_m: float = 0.3
     apart_deg: float = 1.0
     gain: float = 50.0
@@ -56,6 +73,8 @@ class HypothesisParameters:
     none_fit: float = 0.35
     innovation_m: float = 0.1
     innovation_deg: float = 0.4
+    twin_m: float = 0.5
+    twin_deg: float = 2.0
     sure: float = 0.99
     least_scans: int = 3
     at_once: float = 0.75
@@ -78,6 +97,7 @@ class ChallengeParameters:
     lead: a rival must fit better by this much to be one. prior: how much likelier the tracked pose is before anything
         is seen; most_views: how many views may speak against it. contested, beaten, dropped: odds of a rival from which
         on the tracked pose is degraded, is lost, and below which the rival is given up. All odds are logarithms.
+    near_m, near_deg: a rival nearer than this must fit well to win.
     """
 
     period_s: float = 2.0
@@ -91,6 +111,8 @@ class ChallengeParameters:
     contested: float = -2.0
     beaten: float = 4.0
     dropped: float = -12.0
+    near_m: float = 1.0
+    near_deg: float = 3.0
 
     def __post_init__(self) -> None:
         if not 0 < self.doubtful_s <= self.period_s or self.n_refined < 1 or self.reach_m <= 0:
@@ -113,7 +135,8 @@ class CauseParameters:
     least_standing: fewer standing points among the witness's rays are next to nothing; least_known: a smaller share of
         the points in known voxels means that there is no map.
     motion_gap_s, gap_s: after so long without motion samples, or without a believed match, the pose must prove itself
-        again. lost_gap_s: after so long without scans it is lost.
+        again. lost_gap_s: after so long without scans it is lost; longest_s, lost_sigma_m: where the map is stale or
+        the place is poor, it is lost after so long without a believed match, or with so large a sigma.
     """
 
     testimonies: int = 4
@@ -130,6 +153,8 @@ class CauseParameters:
     motion_gap_s: float = 0.3
     gap_s: float = 2.0
     lost_gap_s: float = 15.0
+    longest_s: float = 15.0
+    lost_sigma_m: float = 1.0
 
     def __post_init__(self) -> None:
         if min(self.testimonies, self.least_standing) < 1 or min(self.poor_sigma_m, self.poor_sigma_rad) <= 0:

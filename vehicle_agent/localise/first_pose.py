@@ -8,10 +8,11 @@ from numpy.typing import NDArray
 from vehicle_agent.errors import RegistrationError
 from vehicle_agent.localise.estimates import Cause
 from vehicle_agent.localise.hypotheses import Hypotheses
-from vehicle_agent.localise.initialise import Around, InitialPose, ground_below, search
+from vehicle_agent.localise.initialise import Around, InitialPose, search
 from vehicle_agent.localise.match_map import MatchMap, MatchMapCache
 from vehicle_agent.localise.parameters import LocaliserParameters
 from vehicle_agent.localise.registration import register
+from vehicle_agent.localise.scan_pool import ScanPool
 
 F64 = NDArray[np.float64]
 
@@ -32,7 +33,7 @@ class FirstPose:
         self._par = parameters
         self.hypotheses = Hypotheses(parameters.hypotheses, parameters.registration)
         self.cause: Cause = "searching"
-        self._since_ns: int | None = None
+        self._pool = ScanPool(parameters.pool)
         self._searched_ns = -(2**62)
 
     def see(
@@ -47,38 +48,40 @@ class FirstPose:
             place: where GNSS says that the vehicle is now, None if it does not.
             maps: the map, linearised where it is needed.
         """
+        new = self._pool.push(points_m, T_before_now)
+        self.hypotheses.move(T_before_now)
         if place is None and not len(self.hypotheses):
             self.cause = "no_position"
             return None
-        at_m = self.hypotheses.best.T_map_vehicle[:3, 3] if place is None else place.p_map_m
-        return self._see(t_ns, points_m, T_before_now, place, maps.near(at_m))
-
-    def _see(
-        self, t_ns: int, points_m: F64, T_before_now: F64, place: Place | None, match_map: MatchMap
-    ) -> InitialPose | None:
-        standing = standing_points(points_m, self._par.initialise.above_ground_m)
-        self.hypotheses.follow(T_before_now, points_m, standing, match_map)
-        if place is not None and t_ns - self._searched_ns >= self._par.health.retry_s * 1e9:
-            self._search(t_ns, points_m, place, match_map)
+        m = maps.near(self.hypotheses.best.T_map_vehicle[:3, 3] if place is None else place.p_map_m)
+        if new or self._pool.stands:
+            self.hypotheses.weigh(self._pool.points_m, self._pool.standing_m, m)
         if place is not None:
-            self.hypotheses.see_position(place.p_map_m, place.sigma_m)
+            self._look_around(t_ns, place, m)
         answer = self.hypotheses.answer()
-        self.cause = self._why(answer, place, match_map, points_m)
-        if answer is None or not self._good_enough(answer, t_ns):
+        self.cause = self._why(answer, place, m, points_m)
+        if answer is None or not self._good_enough(answer):
             return None
-        return self._with_all_points(answer, points_m, match_map)
+        return self._with_all_points(answer, points_m, m)
 
-    def _search(self, t_ns: int, points_m: F64, place: Place, match_map: MatchMap) -> None:
+    def _look_around(self, t_ns: int, place: Place, match_map: MatchMap) -> None:
+        """Search, now and then; what is followed is judged by the position too."""
+        if t_ns - self._searched_ns >= self._par.health.retry_s * 1e9:
+            self._search(t_ns, place, match_map)
+        self.hypotheses.see_position(place.p_map_m, place.sigma_m)
+
+    def _search(self, t_ns: int, place: Place, match_map: MatchMap) -> None:
         self._searched_ns = t_ns
-        self._since_ns = t_ns if self._since_ns is None else self._since_ns
         around = Around(place.p_map_m, place.reach_m)
-        self.hypotheses.add(search(points_m, around, match_map, self._par.initialise, self._par.registration)[0])
+        points, standing = self._pool.points_m, self._pool.standing_m
+        found, _ = search(points, around, match_map, self._par.initialise, self._par.registration, standing)
+        self.hypotheses.add(found)
 
-    def _good_enough(self, found: InitialPose, t_ns: int) -> bool:
-        """True for a clear answer; one that fits poorly only when waiting has not brought a better one."""
+    def _good_enough(self, found: InitialPose) -> bool:
+        """True for a clear answer that fits well; where much has changed only after some way on which it stayed so."""
         par = self._par.initialise
-        patient = self._since_ns is not None and t_ns - self._since_ns < par.patience_s * 1e9
-        return found.found and found.fit >= (par.good_fit if patient else par.min_fit)
+        proven = self.hypotheses.best.views >= self._par.hypotheses.most_views
+        return found.found and (found.fit >= par.good_fit or (proven and found.fit >= par.fair_fit))
 
     def _why(self, answer: InitialPose | None, place: Place | None, match_map: MatchMap, points_m: F64) -> Cause:
         if answer is None and place is None:
@@ -98,11 +101,6 @@ class FirstPose:
         except RegistrationError:
             return None
         return replace(answer, registration=result)
-
-
-def standing_points(points_m: F64, above_ground_m: float) -> F64:
-    """The points (N, 3) that stand above the ground; the ground fits everywhere."""
-    return points_m[points_m[:, 2] > ground_below(points_m) + above_ground_m] if len(points_m) else points_m
 
 
 def _known_at(m: MatchMap, place: Place | None) -> bool:

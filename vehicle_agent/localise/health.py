@@ -100,6 +100,12 @@ class HealthMonitor:
         """Take the uncertainty of the newest pose."""
         self._sigma = (sigma_m, sigma_rad)
 
+    def confirm(self, t_ns: int) -> None:
+        """Submaps hold the pose to be right: what single scans held against it was the changed world."""
+        self._better_elsewhere = 0
+        if self._trusted:
+            self._believed_ns = max(self._believed_ns, t_ns)
+
     def distrust(self) -> None:
         """The pose must prove itself again: it was dead reckoned for long."""
         self._trusted = False
@@ -110,10 +116,11 @@ class HealthMonitor:
     def judge(self, t_ns: int) -> tuple[Health, Cause]:
         """`lost`: the pose is worth nothing; `degraded`: not to be relied on; else `good`; and why."""
         gap_s, par = self._gap_s(t_ns), self.parameters
-        if self.beaten or self._better_elsewhere >= par.better_count or self._gnss_contradicts(gap_s):
+        if self.beaten or self._gnss_contradicts(gap_s):
             return "lost", "wrong_pose"
         if gap_s > par.degraded_after_s:
-            return ("lost" if gap_s > par.lost_after_s else "degraded"), self._why_unmatched()
+            cause = self._why_unmatched()
+            return ("lost" if gap_s > self._patience_s(cause) else "degraded"), cause
         if self.contested or self._contradicted_all_around():
             return "degraded", "wrong_pose"
         if self._scan != "none":
@@ -135,10 +142,12 @@ class HealthMonitor:
 
     @property
     def suspicious(self) -> bool:
-        """True when the rays contradict the map more than a current map would be: worth a look for a better pose."""
-        return bool(self._testimonies) and (
-            self._mean("gone_share") > self.causes.suspicious_gone or self._mean("best_hits") < self.causes.fitting_hits
-        )
+        """True when it is worth to look for a better pose soon: a wider match fits better, or the rays contradict the
+        map more than a current map would be.
+        """
+        hits, gone = self._mean("best_hits"), self._mean("gone_share")
+        contradicted = gone > self.causes.suspicious_gone or hits < self.causes.fitting_hits
+        return self._better_elsewhere >= self.parameters.better_count or (bool(self._testimonies) and contradicted)
 
     @property
     def stale(self) -> bool:
@@ -168,6 +177,11 @@ class HealthMonitor:
         if not self._testimonies:
             return "no_match"
         return "stale_map" if self._mean("best_hits") >= self.causes.fitting_hits else "wrong_pose"
+
+    def _patience_s(self, cause: Cause) -> float:
+        """How long dead reckoning is worth something: where the map or the place is to blame, the pose was right."""
+        blameless = cause in ("stale_map", "poor_place") and self._sigma[0] < self.causes.lost_sigma_m
+        return self.causes.longest_s if blameless else self.parameters.lost_after_s
 
     def _mean(self, name: str) -> float:
         return float(np.mean([getattr(one, name) for one in self._testimonies])) if self._testimonies else 0.0

@@ -48,6 +48,7 @@ class Hypotheses:
         self.parameters = parameters
         self._registration = registration
         self._held: list[Hypothesis] = []
+        self._way_m = 0.0  # since the last view
 
     def __len__(self) -> int:
         return len(self._held)
@@ -65,24 +66,28 @@ class Hypotheses:
         for one in self._held:
             one.far = 0.5 * float(np.sum((one.T_map_vehicle[:2, 3] - p_map_m[:2]) ** 2)) / sigma_m**2
 
-    def follow(self, T_before_now: F64, points_m: F64, standing_m: F64, match_map: MatchMap) -> None:
-        """Move every pose by odometry (4, 4) and register it with a scan: `points_m` (N, 3) in the vehicle frame, and
-        those of them that stand above the ground. A pose that matches nothing is given up.
-        """
-        par = self.parameters
-        new = min(1.0, float(np.hypot(*T_before_now[:2, 3])) / par.view_m)
-        few, standing = thinned(points_m, par.n_points), thinned(standing_m, par.n_points)
-        followed = []
+    def move(self, T_before_now: F64) -> None:
+        """Move every pose by odometry (4, 4)."""
+        self._way_m += float(np.hypot(*T_before_now[:2, 3]))
         for one in self._held:
-            predicted = one.T_map_vehicle @ T_before_now
-            result = self._registered(few, predicted, match_map)
-            if result is None:
-                continue
-            fit = fit_of(standing, result.T_map_vehicle, match_map, self._registration)
-            one.take(result, fit, self._surprise(predicted, result.T_map_vehicle), new, par.most_views)
-            followed.append(one)
-        self._held = followed
+            one.T_map_vehicle = one.T_map_vehicle @ T_before_now
+
+    def weigh(self, points_m: F64, standing_m: F64, match_map: MatchMap) -> None:
+        """Register every pose with a view: `points_m` (N, 3) in the vehicle frame, and those of them that stand above
+        the ground. A pose that matches nothing is given up.
+        """
+        new, self._way_m = min(1.0, self._way_m / self.parameters.view_m), 0.0
+        few, standing = thinned(points_m, self.parameters.n_points), thinned(standing_m, self.parameters.n_points)
+        self._held = [one for one in self._held if self._weighed(one, few, standing, match_map, new)]
         self._prune()
+
+    def _weighed(self, one: Hypothesis, points_m: F64, standing_m: F64, m: MatchMap, new: float) -> bool:
+        result = self._registered(points_m, one.T_map_vehicle, m)
+        if result is None:
+            return False
+        fit = fit_of(standing_m, result.T_map_vehicle, m, self._registration)
+        one.take(result, fit, self._surprise(one.T_map_vehicle, result.T_map_vehicle), new, self.parameters.most_views)
+        return True
 
     @property
     def best(self) -> Hypothesis:
@@ -91,8 +96,11 @@ class Hypotheses:
 
     @property
     def probability(self) -> float:
-        """Of the best one, 0 without any; the rest is shared by the others and by "none of them"."""
-        return float(self._probabilities().max(initial=0.0))
+        """Of the best one and its twins, 0 without any; the others and "none of them" share the rest."""
+        if not self._held:
+            return 0.0
+        twins = self._near(self.best.T_map_vehicle, self.parameters.twin_m, self.parameters.twin_deg)
+        return float(self._probabilities()[twins].sum())
 
     def drop_near(self, T_map_vehicle: F64) -> None:
         """Give up what has come to the same pose (4, 4)."""
@@ -108,17 +116,16 @@ class Hypotheses:
         if not self._held:
             return None
         par, best = self.parameters, self.best
-        T = np.stack([one.T_map_vehicle for one in self._held])
+        twins = self._near(best.T_map_vehicle, par.twin_m, par.twin_deg)
         fits = np.array([one.mean_fit for one in self._held])
-        others = fits[~near_pose(T, best.T_map_vehicle, par.apart_m, par.apart_deg)]
-        runner_up = float(others.max(initial=0.0))
+        runner_up = float(fits[~twins].max(initial=0.0))
         at_once = best.mean_fit >= par.at_once and runner_up <= par.alone * best.mean_fit
         won = at_once or (best.scans >= par.least_scans and self.probability >= par.sure)
         return InitialPose(best.registration, best.mean_fit, runner_up, len(fits), won, self.probability)
 
     def _registered(self, points: F64, predicted: F64, m: MatchMap) -> RegistrationResult | None:
         try:
-            return register(points, predicted, m, self._registration, "wide")
+            return register(points, predicted, m, self._registration, "near")
         except RegistrationError:
             return None
 
@@ -137,9 +144,11 @@ class Hypotheses:
         views = max(one.views for one in self._held)
         return probabilities(fits, views, self.parameters, np.array([one.surprise + one.far for one in self._held]))
 
-    def _near(self, T: F64) -> NDArray[np.bool_]:
+    def _near(self, T: F64, apart_m: float | None = None, apart_deg: float | None = None) -> NDArray[np.bool_]:
+        """(K,) which poses lie near another, by default so near that they are one."""
+        par = self.parameters
         held = np.stack([one.T_map_vehicle for one in self._held]) if self._held else np.empty((0, 4, 4))
-        return near_pose(held, T, self.parameters.apart_m, self.parameters.apart_deg)
+        return near_pose(held, T, apart_m or par.apart_m, apart_deg or par.apart_deg)
 
     def _prune(self) -> None:
         """Leave out what has become improbable, what has run into a better one, and the least probable beyond the

@@ -92,19 +92,26 @@ def initialise(
 
 
 def search(
-    points_m: F64, around: Around, match_map: MatchMap, par: InitialiseParameters, registration: RegistrationParameters
+    points_m: F64,
+    around: Around,
+    match_map: MatchMap,
+    par: InitialiseParameters,
+    registration: RegistrationParameters,
+    standing_m: F64 | None = None,
 ) -> tuple[list[Candidate], int]:
     """Refined poses around a place, no two of them the same, best fit first; and how many hypotheses were scored. None
     where the map shows no ground.
 
     The height of `around` is not used. Fits are of `n_refining` points; `n_checked` points decide which coarse
-    hypotheses are refined to the end.
+    hypotheses are refined to the end. `standing_m` (K, 3): the points that stand above the ground, if known already.
     """
     ground = _ground_plane(match_map, around.p_map_m)
     if ground is None or not len(points_m):
         return [], 0
     ground_below_m = ground_below(points_m)
-    standing = points_m[points_m[:, 2] > ground_below_m + par.above_ground_m]  # ground fits everywhere
+    if standing_m is None:
+        standing_m = points_m[points_m[:, 2] > ground_below_m + par.above_ground_m]  # ground fits everywhere
+    standing = standing_m
     hypotheses = _hypotheses(around, ground, ground_below_m, par)
     scores = _score(thinned(standing, par.n_points), hypotheses, match_map)
     poses = hypotheses[_distinct_best(hypotheses, scores, par.n_refined)]

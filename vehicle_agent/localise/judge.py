@@ -7,12 +7,13 @@ from numpy.typing import NDArray
 
 from vehicle_agent.localise.challenge import Challenger
 from vehicle_agent.localise.estimates import Cause
-from vehicle_agent.localise.first_pose import Place, standing_points
+from vehicle_agent.localise.first_pose import Place
 from vehicle_agent.localise.health import HealthMonitor
-from vehicle_agent.localise.initialise import ground_below
+from vehicle_agent.localise.initialise import ground_below, thinned
 from vehicle_agent.localise.match_map import MatchMap
 from vehicle_agent.localise.parameters import LocaliserParameters
 from vehicle_agent.localise.registration import RegistrationResult, fit_of
+from vehicle_agent.localise.scan_pool import ScanPool
 from vehicle_agent.localise.witness import testify
 
 F64 = NDArray[np.float64]
@@ -43,6 +44,7 @@ class Judge:
         self._origin_m = np.ascontiguousarray(origin_m, dtype=np.float64)
         self.monitor = HealthMonitor(parameters.health, now_ns, parameters.causes)
         self.challenger = Challenger(parameters)
+        self._pool = ScanPool(parameters.pool)
         self._witness_ns = -(2**62)
         self._way_m = 0.0
         self._place: Place | None = None
@@ -61,11 +63,16 @@ class Judge:
         self._way_m += float(np.linalg.norm(scan.T_before_now[:3, 3]))
         if len(scan.points_m) < self._par.registration.min_matched:
             return
-        standing = standing_points(scan.points_m, self._par.initialise.above_ground_m)
+        new = self._pool.push(scan.points_m, scan.T_before_now)
         self._ask(scan, match_map)
-        self._challenge(scan, standing, match_map)
+        self._challenge(scan, new or self._pool.stands, match_map)
         if scan.result is not None and scan.believed:
-            fit = fit_of(standing, scan.T_now, match_map, self._par.registration)
+            fit = fit_of(
+                thinned(self._pool.standing_m, self._par.initialise.n_refining),
+                scan.T_now,
+                match_map,
+                self._par.registration,
+            )
             self.monitor.see_match(fit, scan.result.fit, scan.result.degenerate)
 
     def _ask(self, scan: Matched, match_map: MatchMap) -> None:
@@ -77,15 +84,16 @@ class Judge:
         below_m = ground_below(scan.points_m)
         self.monitor.see_testimony(testify(scan.points_m, self._origin_m, below_m, scan.T_now, match_map, par))
 
-    def _challenge(self, scan: Matched, standing: F64, match_map: MatchMap) -> None:
+    def _challenge(self, scan: Matched, new: bool, match_map: MatchMap) -> None:
         par = self._par.challenge
         place = self._place or Place(scan.T_now[:3, 3], par.reach_m, par.reach_m)
         self._place = None
         monitor = self.monitor
         doubtful = not scan.believed or monitor.doubtful(scan.result) or monitor.suspicious or not monitor.trusted
         self.challenger.see(
-            scan.t_ns, scan.points_m, standing, scan.T_now, scan.T_before_now, place, match_map, doubtful
-        )
+            scan.t_ns, self._pool.points_m, self._pool.standing_m, scan.T_now, scan.T_before_now, place, match_map,
+            doubtful=doubtful, new=new, any_heading=not monitor.trusted,
+        )  # fmt: skip
         monitor.contested, monitor.beaten = self.challenger.contested, self.challenger.beaten
 
     def _what_is_wrong(self, scan: Matched) -> Cause:

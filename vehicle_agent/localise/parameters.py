@@ -6,8 +6,10 @@ from vehicle_agent.localise.doubt_parameters import (
     CauseParameters,
     ChallengeParameters,
     HypothesisParameters,
+    PoolParameters,
     WitnessParameters,
 )
+from vehicle_agent.localise.refine_parameters import RefineParameters
 from vehicle_agent.localise.scan_odometry_parameters import ScanOdometryParameters
 
 
@@ -71,8 +73,8 @@ class InitialiseParameters:
         points; n_kept: how many of these are refined to the end, with `n_refining` points; same_m, same_deg: refined
         poses nearer than this are one;
     min_fit: least fit (0 ... 1) that counts as found; ambiguity: the runner-up may reach this share of the best fit;
-    good_fit, patience_s: for so long only a fit of `good_fit` is taken: where much has changed, a pose decimetres off
-        can fit best, and a vehicle that moves soon sees something else;
+    good_fit, fair_fit: a fit of `good_fit` is taken at once; one of `fair_fit` when it stays the best for some way:
+        where much has changed, a pose decimetres off can fit best, and a vehicle that moves soon sees something else;
     apart_m, apart_deg: two poses nearer than this are the same answer.
     """
 
@@ -88,7 +90,7 @@ class InitialiseParameters:
     same_deg: float = 1.0
     min_fit: float = 0.4
     good_fit: float = 0.65
-    patience_s: float = 5.0
+    fair_fit: float = 0.48
     ambiguity: float = 0.9
     apart_m: float = 1.0
     apart_deg: float = 5.0
@@ -163,8 +165,8 @@ class HealthParameters:
 
     min_matching_ratio: least share of the points with a Gaussian nearby.
     trusted_fit: a pose is degraded until one match has had this fit: where much has changed, a wrong pose can fit best.
-    better_fit, better_count: this many scans in a row that fit better by so much at a pose farther off mean that the
-        pose is wrong.
+    better_fit, better_count: this many scans in a row that fit better by so much at a pose farther off make the pose
+        suspicious.
     gate_m, gate_m_per_s, gate_deg, gate_deg_per_s: how far a match may lie from the prediction, at once and for every
         second without a believed match; three sigmas of the odometry come on top.
     degraded_after_s, lost_after_s: time without a believed match.
@@ -178,9 +180,9 @@ class HealthParameters:
     better_fit: float = 0.1
     better_count: int = 5
     gate_m: float = 0.15
-    gate_m_per_s: float = 0.3
+    gate_m_per_s: float = 0.15
     gate_deg: float = 0.4
-    gate_deg_per_s: float = 0.5
+    gate_deg_per_s: float = 0.25
     degraded_after_s: float = 0.6
     lost_after_s: float = 4.0
     gnss_sigmas: float = 5.0
@@ -205,7 +207,9 @@ class LocaliserParameters:
     graph: GraphParameters = field(default_factory=GraphParameters)
     health: HealthParameters = field(default_factory=HealthParameters)
     witness: WitnessParameters = field(default_factory=WitnessParameters)
+    pool: PoolParameters = field(default_factory=PoolParameters)
     hypotheses: HypothesisParameters = field(default_factory=HypothesisParameters)
     challenge: ChallengeParameters = field(default_factory=ChallengeParameters)
     causes: CauseParameters = field(default_factory=CauseParameters)
     scan_odometry: ScanOdometryParameters = field(default_factory=ScanOdometryParameters)
+    refine: RefineParameters = field(default_factory=RefineParameters)

@@ -1,0 +1,61 @@
+"""The last scans together, in the frame of the newest: one view of a place that is wider than one scan's."""
+
+from collections import deque
+
+import numpy as np
+from numpy.typing import NDArray
+
+from gnd_map.se3 import T_inverse, transform
+from vehicle_agent.localise.doubt_parameters import PoolParameters
+from vehicle_agent.localise.initialise import ground_below, thinned
+
+F64 = NDArray[np.float64]
+
+STANDING_M = 0.02  # between two scans
+
+
+class ScanPool:
+    """Points of the newest scan and of some before it, moved along by odometry: a four-layer scan alone says little.
+
+    Scans enter every so many metres, and leave after so many; a standing vehicle's pool is its newest scan.
+    """
+
+    def __init__(self, parameters: PoolParameters) -> None:
+        self.parameters = parameters
+        self._older: deque[tuple[F64, F64, float]] = deque()  # points, those that stand, way since
+        self._newest: tuple[F64, F64] = (np.empty((0, 3)), np.empty((0, 3)))
+        self._since_m = np.inf
+        self.stands = True
+
+    def push(self, points_m: F64, T_before_now: F64) -> bool:
+        """Take a scan, (N, 3) in the vehicle frame, and the motion (4, 4) since the one before; True when it is a new
+        part of the view, not the last one seen again.
+        """
+        way_m = float(np.hypot(T_before_now[0, 3], T_before_now[1, 3]))
+        T = T_inverse(T_before_now)
+        moved = [(transform(T, p), transform(T, s), way + way_m) for p, s, way in self._older]
+        self._older = deque(one for one in moved if one[2] <= self.parameters.reach_m)
+        self.stands = way_m < STANDING_M
+        self._since_m += way_m
+        self._newest = points_m, standing_points(points_m, self.parameters.above_ground_m)
+        if self._since_m < self.parameters.every_m:
+            return False
+        self._since_m = 0.0
+        few = self.parameters.n_points
+        self._older.append((thinned(self._newest[0], few), thinned(self._newest[1], few), 0.0))
+        return True
+
+    @property
+    def points_m(self) -> F64:
+        """(N, 3) all points, the newest scan's first, newest vehicle frame."""
+        return np.concatenate([self._newest[0], *(p for p, _, way in self._older if way > 0.0)])
+
+    @property
+    def standing_m(self) -> F64:
+        """(N, 3) those that stand above the ground; the ground fits everywhere."""
+        return np.concatenate([self._newest[1], *(s for _, s, way in self._older if way > 0.0)])
+
+
+def standing_points(points_m: F64, above_ground_m: float) -> F64:
+    """The points (N, 3) of a scan in the vehicle frame that stand above the ground."""
+    return points_m[points_m[:, 2] > ground_below(points_m) + above_ground_m] if len(points_m) else points_m
