@@ -12,6 +12,7 @@ from gnd_map.se3 import T_inverse
 F64 = NDArray[np.float64]
 
 KEEP_NS = 20_000_000_000  # more than any lag
+MAX_ACCELERATION_MPS2 = 15.0  # tyres on dry tarmac hold about 10
 GAP_NS = 100_000_000  # two samples farther apart leave something unknown between them
 
 
@@ -44,8 +45,8 @@ class MotionBuffer:
         """Add a sample; False (and nothing kept) when it is not finite or not later than the one before."""
         if not np.isfinite(speed_mps + yaw_rate_radps) or (self._t_ns and t_ns <= self._t_ns[-1]):
             return False
+        self._speed_mps.append(self._possible(t_ns, speed_mps))
         self._t_ns.append(t_ns)
-        self._speed_mps.append(speed_mps)
         self._yaw_rate_radps.append(yaw_rate_radps)
         if t_ns - self._t_ns[0] > 2 * KEEP_NS:
             self._drop(bisect_left(self._t_ns, t_ns - KEEP_NS))
@@ -64,6 +65,13 @@ class MotionBuffer:
         known = [first_ns] * (inner[0] > first_ns) + inner + [last_ns] * (inner[-1] < last_ns)
         gaps = (min(b, last_ns) - max(a, first_ns) for a, b in pairwise(known) if b - a > GAP_NS)
         return sum(gaps) * 1e-9
+
+    def _possible(self, t_ns: int, speed_mps: float) -> float:
+        """The speed that the vehicle can have: wheels that lock or spin change theirs faster than any road allows."""
+        if not self._t_ns:
+            return speed_mps
+        most, before = MAX_ACCELERATION_MPS2 * (t_ns - self._t_ns[-1]) * 1e-9, self._speed_mps[-1]
+        return min(max(speed_mps, before - most), before + most)
 
     def _drop(self, n: int) -> None:
         del self._t_ns[:n], self._speed_mps[:n], self._yaw_rate_radps[:n]
