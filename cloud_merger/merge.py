@@ -4,72 +4,21 @@ The merged tile depends on the epoch tile and on the set of all reports since th
 on nothing else: in whatever batches and retries they came, the same reports give the same tile, bit for bit.
 """
 
-from collections.abc import Mapping
 from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
 
 from cloud_merger.cluster import Index, dbscan
-from cloud_merger.errors import MergerError
-from cloud_merger.statements import EPOCH, Kind, Mode, Rows, Statements, states_at
+from cloud_merger.parameters import MergeParameters
+from cloud_merger.statements import EPOCH, Kind, Rows, Statements, states_at
 from gnd_map.gaussian import Gaussians
 from gnd_map.similarity import pairs_within, similarity
 from gnd_map.tile import TileDelta, apply
 
+__all__ = ["MergeParameters", "MergedTile", "merge_tile"]
+
 PAIRS_AT_ONCE = 200_000  # bounds the memory of the similarities
-
-
-@dataclass(frozen=True, slots=True)
-class MergeParameters:
-    """How statements become changes.
-
-    Attributes:
-        mode: "paper": only uploaded changes count (GND as printed, with the corrections without which it cannot run);
-            "default": the votes are those of all who observed the voxel, and similarity is the smooth one.
-        eps: DBSCAN's neighbourhood on 1 - similarity; 0.5 splits the votes of vehicles that saw parts of one thing.
-        min_samples: DBSCAN's core weight.
-        xi: a cluster must hold more than this share of the voxel's statements (ξ_update).
-        xi_reshaped: the same for a cluster most of which denies the epoch's own Gaussian ("modified"). Lower, because a
-            shape is judged less surely than a presence, and a parked car seldom touches what the map holds.
-        d_update: published when the candidate's similarity to the epoch's voxel is smaller than this.
-        d_denied: the same where most of the candidate's statements were compared with that voxel and deny it.
-        sensor_weights: weight of a vote by sensor model, 1 for the others; "paper" mode does not weigh.
-        noise_m: added (squared) to the covariances that the default similarity compares.
-    """
-
-    mode: Mode = "default"
-    eps: float = 0.7
-    min_samples: int = 1
-    xi: float = 0.6
-    xi_reshaped: float = 0.5
-    d_update: float = 0.5
-    d_denied: float = 0.95
-    noise_m: float = 0.05
-    sensor_weights: Mapping[str, float] = field(default_factory=lambda: {"Scala": 0.5})
-
-    def __post_init__(self) -> None:
-        if self.mode not in ("paper", "default"):
-            raise MergerError(f"mode must be 'paper' or 'default', got {self.mode!r}")
-        if not 0 < self.eps < 1:
-            raise MergerError(
-                f"eps must lie in (0, 1), got {self.eps}: at 1 Gaussians that share nothing are neighbours"
-            )
-        if self.min_samples < 1:
-            raise MergerError(f"min_samples must be at least 1, got {self.min_samples}")
-        for name, share in (("xi", self.xi), ("xi_reshaped", self.xi_reshaped)):
-            if not 0 <= share < 1:
-                raise MergerError(f"{name} must lie in [0, 1), got {share}")
-        for name, least in (("d_update", self.d_update), ("d_denied", self.d_denied)):
-            if not 0 <= least <= 1:
-                raise MergerError(f"{name} must lie in [0, 1], got {least}")
-        for model, weight in self.sensor_weights.items():
-            if not 0 < weight <= 1:
-                raise MergerError(f"the weight of {model} must lie in (0, 1], got {weight}")
-
-    def weight_of(self, sensor_model: str) -> float:
-        """Return the weight of a vote of this sensor."""
-        return self.sensor_weights.get(sensor_model, 1.0) if self.mode == "default" else 1.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -102,7 +51,7 @@ def merge_tile(epoch: Gaussians, statements: Statements, parameters: MergeParame
     cluster = _clusters(rows, parameters)
     winner = _winners(rows, cluster, parameters)
     rows, cluster = _members(rows, cluster, winner)
-    candidate = _representatives(rows, cluster, parameters.mode)
+    candidate = _representatives(rows, cluster, parameters)
     decided = _differs(epoch, candidate, _share(rows["denies"], cluster), parameters)
     decided &= ~_confirmed(rows, cluster)
     return _merged(epoch, candidate[decided], statements, rows[decided[cluster]])
@@ -164,7 +113,7 @@ def _similarity(a: Rows, b: Rows, parameters: MergeParameters) -> NDArray[np.flo
         b["mean_m"],
         b["cov_m2"],
         parameters.mode,
-        noise_m=parameters.noise_m,
+        noise_m=np.sqrt(parameters.noise_m**2 + a["pose_m2"] + b["pose_m2"]),
     )
 
 
@@ -194,23 +143,32 @@ def _members(rows: Rows, cluster: Index, winner: Index) -> tuple[Rows, Index]:
     return rows[inside[order]], number[order]
 
 
-def _representatives(rows: Rows, cluster: Index, mode: Mode) -> Rows:
+def _representatives(rows: Rows, cluster: Index, parameters: MergeParameters) -> Rows:
     """GND 5.2: one row a cluster, by the recursive update of sample mean and covariance over its measured statements.
 
     A quoted Gaussian is no new measurement: it represents its cluster only where nobody measured, and then once.
 
     In default mode a representative is renewed when the number of its measurements has doubled: it takes the first 1,
     2, 4, 8 … of them. Else every report would move every changed voxel by a hair, and each move is sent to all vehicles
-    (8 drives over one street: 17,027 voxels published with all measurements, 9,492 so, at the same F1).
+    (8 drives over one street: 17,027 voxels published with all measurements, 9,492 so, at the same F1). Measurements
+    with much worse poses than the best of the cluster are left out.
     """
     first = np.unique(cluster, return_index=True)[1]
-    measured = rows["kind"] == Kind.MEASURED
-    before = np.cumsum(measured) - measured
-    turn = before - before[first][cluster]
+    measured = _measured_well(rows, cluster, parameters)
+    before: Index = np.cumsum(measured) - measured
+    turn: Index = before - before[first][cluster]
     n = np.bincount(cluster, weights=measured).astype(np.int64)
-    use = measured & (turn < (n if mode == "paper" else _power_of_two(n))[cluster])
+    use = measured & (turn < (n if parameters.mode == "paper" else _power_of_two(n))[cluster])
     use[first[n == 0]] = True
     return _recursive_moments(rows[use], cluster[use])
+
+
+def _measured_well(rows: Rows, cluster: Index, parameters: MergeParameters) -> NDArray[np.bool_]:
+    """Measured statements whose pose variance exceeds the least of their cluster by no more than `noise_m`²."""
+    measured = rows["kind"] == Kind.MEASURED
+    least = np.full(int(cluster.max(initial=-1)) + 1, np.inf)
+    np.minimum.at(least, cluster[measured], rows["pose_m2"][measured])
+    return np.asarray(measured & (rows["pose_m2"] <= least[cluster] + parameters.noise_m**2))
 
 
 def _power_of_two(n: Index) -> Index:
@@ -232,6 +190,7 @@ def _recursive_moments(rows: Rows, cluster: Index) -> Rows:
         step = new["mean_m"] - mean[c]
         mean[c] += share * step
         cov[c] += share * (new["cov_m2"] - cov[c]) + share * (1 - share) * _outer(step)
+    merged["pose_m2"] = np.bincount(cluster, weights=rows["pose_m2"]) / np.bincount(cluster) ** 2  # of their mean
     merged["count"] = np.minimum(n, np.iinfo(np.int32).max)
     np.maximum.at(merged["cells"], cluster, rows["cells"])
     merged["mean_m"], merged["cov_m2"] = mean, cov

@@ -34,8 +34,9 @@ class Kind(IntEnum):
 
 # One statement. `report` indexes Statements.report_ids; `was` numbers the voxel's state in the version that it was made
 # against (0: nothing there; equal numbers in a voxel: equal states), so that one sees whether one statement denies what
-# another quotes; `denies` marks a MEASURED one that denies the epoch's own Gaussian; count 0 for NOTHING; mean relative
-# to the voxel centre along tile ENU axes; covariance xx, xy, xz, yy, yz, zz.
+# another quotes; `denies` marks a MEASURED one that denies the epoch's own Gaussian; `pose_m2` is the variance of a
+# MEASURED one by its poses, beyond what is expected of all; count 0 for NOTHING; mean relative to the voxel centre
+# along tile ENU axes; covariance xx, xy, xz, yy, yz, zz.
 STATEMENT = np.dtype(
     [
         ("voxel_id", np.int32),
@@ -44,6 +45,7 @@ STATEMENT = np.dtype(
         ("was", np.int64),
         ("denies", np.bool_),
         ("weight", np.float64),
+        ("pose_m2", np.float64),
         ("count", np.int32),
         ("cells", np.int32),
         ("mean_m", np.float32, 3),
@@ -60,12 +62,14 @@ class Report:
     Attributes:
         report_id: orders the reports.
         change: what it says.
-        weight: of its votes, see `MergeParameters.weight_of`.
+        weight: of its votes, see `MergeParameters.report_of`.
+        pose_m2: variance of what it measured by its poses, see `MergeParameters.pose_m2_of`.
     """
 
     report_id: str
     change: TileChange
     weight: float = 1.0
+    pose_m2: float = 0.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -102,6 +106,7 @@ def statements_of(
     for k, report in enumerate(ordered):
         said = _statements(k, report.change, voxels, quoted.get(report.change.base_sha))
         said["weight"] = report.weight
+        said["pose_m2"] = np.where(said["kind"] == Kind.MEASURED, report.pose_m2, 0.0)
         parts.append(said)
     rows = np.concatenate(parts)
     rows = rows[np.argsort(rows["voxel_id"], kind="stable")]  # the parts came in the order of report ids

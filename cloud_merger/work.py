@@ -70,7 +70,7 @@ class Worker:
         """What a stored report says; nothing when it can no longer be read (its vehicle has long had its ack)."""
         try:
             sensor_model, change = _said(row.body)
-            return Report(row.report_id, change, self._config.merge.weight_of(sensor_model))
+            return self._config.merge.report_of(row.report_id, sensor_model, change)
         except SchemaError as error:
             reason = f"report {row.report_id} on tile {row.tile} cannot be read any more and is left out: {error}"
             _LOG.error("%s", reason)

@@ -22,7 +22,7 @@ def reports_of_tiles(bodies: Iterable[bytes], parameters: MergeParameters) -> di
     for body in bodies:
         report = ChangeReport.decode(body)
         for change in report.tiles:
-            found[change.tile].append(Report(report.report_id, change, parameters.weight_of(report.sensor_model)))
+            found[change.tile].append(parameters.report_of(report.report_id, report.sensor_model, change))
     return dict(found)
 
 

@@ -60,7 +60,7 @@ def plain_merge(epoch, reports, bases, parameters):
     for voxel in sorted({*VOXELS, *epoch.voxel_id.tolist()}):
         was = epoch.select([voxel])
         votes = [
-            ((r.report_id, r.weight), *vote)
+            ((r.report_id, r.weight, r.pose_m2), *vote)
             for r in sorted(reports, key=lambda r: r.report_id)
             if (vote := plain_vote(r, voxel, bases, parameters))
         ]
@@ -91,19 +91,20 @@ def plain_vote(report, voxel, bases, parameters):
 
 def plain_distance(a, b, parameters):
     """1 - similarity; 1 where one quotes what the other was compared with and denies."""
-    (_, one, one_measured, one_was), (_, two, two_measured, two_was) = a, b
+    (by_one, one, one_measured, one_was), (by_two, two, two_measured, two_was) = a, b
     if one is two:
         return 0.0
     if one_measured != two_measured and len(one) and len(two) and len(one_was) and one_was == two_was:
         return 1.0
-    return 1 - plain_similarity(one, two, parameters)
+    pose_m2 = one_measured * by_one[2] + two_measured * by_two[2]
+    return 1 - plain_similarity(one, two, parameters, pose_m2)
 
 
-def plain_similarity(a, b, parameters):
+def plain_similarity(a, b, parameters, pose_m2=0.0):
     def one(g):
         return np.array([len(g) > 0]), *(g.columns[3:] if len(g) else (np.zeros((1, 3)), np.zeros((1, 6))))
 
-    return float(similarity(*one(a), *one(b), parameters.mode, parameters.noise_m)[0])
+    return float(similarity(*one(a), *one(b), parameters.mode, (parameters.noise_m**2 + pose_m2) ** 0.5)[0])
 
 
 def plain_decision(was, votes, parameters):
@@ -121,24 +122,27 @@ def plain_decision(was, votes, parameters):
     denied = 2 * denying > len(members)
     if not sizes[winner] > (parameters.xi_reshaped if denied else parameters.xi) * weight.sum():
         return None
-    now = plain_representative(members, parameters.mode)
+    now, pose_m2 = plain_representative(members, parameters)
     quotes = sum(not measured and len(state) > 0 and state == was for _, state, measured, _ in members)
     limit = parameters.d_denied if denied else parameters.d_update
-    if plain_similarity(was, now, parameters) >= limit or 2 * quotes >= len(members):
+    if plain_similarity(was, now, parameters, pose_m2) >= limit or 2 * quotes >= len(members):
         return None
-    return now, tuple(report_id for (report_id, _), *_ in members)
+    return now, tuple(report_id for (report_id, *_), *_ in members)
 
 
-def plain_representative(members, mode):
-    measured = [state for _, state, is_measured, _ in members if is_measured]
+def plain_representative(members, parameters):
+    """The merged Gaussian and the variance of its mean by the poses."""
+    measured = [(state, by[2]) for by, state, is_measured, _ in members if is_measured]
     if not measured:
-        return members[0][1]
-    if mode == "default":
+        return members[0][1], 0.0
+    best = min(pose_m2 for _, pose_m2 in measured)
+    measured = [(state, pose_m2) for state, pose_m2 in measured if pose_m2 <= best + parameters.noise_m**2]
+    if parameters.mode == "default":
         measured = measured[: 2 ** (len(measured).bit_length() - 1)]
     total = Moments.zeros(1)
-    for state in measured:
+    for state, _ in measured:
         total = total + Moments.of(state)
-    return total.to_gaussians(measured[0].voxel_id)
+    return total.to_gaussians(measured[0][0].voxel_id), sum(pose_m2 for _, pose_m2 in measured) / len(measured) ** 2
 
 
 @settings(max_examples=150, deadline=None)
@@ -148,12 +152,13 @@ def plain_representative(members, mode):
     st.sampled_from([0.3, 0.5, 0.6]),
     st.integers(1, 3),
     st.lists(st.sampled_from([1.0, 0.5, 0.25]), min_size=7, max_size=7),
+    st.lists(st.sampled_from([0.0, 0.0, 0.001, 0.01]), min_size=7, max_size=7),
 )
-def test_the_merge_is_that_of_the_plain_twin(some, mode, xi, min_samples, weights):
+def test_the_merge_is_that_of_the_plain_twin(some, mode, xi, min_samples, weights, poses):
     parameters = MergeParameters(mode=mode, xi=xi, min_samples=min_samples)
-    reports = [
-        Report(f"{n:026d}", change, weight) for n, (change, weight) in enumerate(zip(some, weights, strict=False))
-    ]
+    poses = poses if mode == "default" else [0.0] * 7
+    by = zip(some, weights, poses, strict=False)
+    reports = [Report(f"{n:026d}", change, weight, pose_m2) for n, (change, weight, pose_m2) in enumerate(by)]
     bases = {sha_of(EPOCH): EPOCH, sha_of(OLDER): OLDER}
     got = merge_tile(EPOCH, statements_of(EPOCH, reports, bases, mode), parameters)
     expected, provenance = plain_merge(EPOCH, reports, bases, parameters)

@@ -1,5 +1,6 @@
 """From evidence to classes (GND 4.4) and to what is uploaded (GND 4.5)."""
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -12,7 +13,7 @@ from schemas.changes import TileChange
 from vehicle_agent.detect.evidence import TileEvidence
 from vehicle_agent.detect.extension import extends_neighbour
 from vehicle_agent.detect.parameters import DetectParameters
-from vehicle_agent.detect.shape_change import fitted, shape_features
+from vehicle_agent.detect.shape_change import NOISE_M, fitted, shape_features
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -105,7 +106,8 @@ def _same_shape(e: TileEvidence, p: DetectParameters) -> NDArray[np.bool_]:
     rows = np.flatnonzero(e.in_map & (e.measured.cells >= p.min_cells))
     if len(rows):
         was = e.base.gaussians.take(e.map_row[rows])
-        features = shape_features(was, e.measured.take(rows), e.n_bi[rows], e.n_bo[rows], e.n_pi[rows])
+        noise_m = math.sqrt(NOISE_M**2 + p.soft.similarity * p.soft.excess_m2(e.pose))  # the pose's Σ in Eq. (15)
+        features = shape_features(was, e.measured.take(rows), e.n_bi[rows], e.n_bo[rows], e.n_pi[rows], noise_m)
         result[rows] = fitted().log_odds(features) <= p.reshaped_log_odds
     return result
 

@@ -4,6 +4,7 @@ from dataclasses import dataclass, field
 from typing import Literal
 
 from gnd_map.evidence import MassParameters
+from vehicle_agent.detect.uncertainty import PoseUncertainty
 from vehicle_agent.errors import VehicleError
 
 Mode = Literal["paper", "default"]
@@ -21,22 +22,29 @@ class SoftParameters:
     The variance of a ray's end, s², is the position's and, times the squared range, the heading's, less `included_m`².
     """
 
-    included_m: float = 0.04
-    """So much uncertainty the other parameters stand for: they were chosen with poses off by 4 cm and 0.08°."""
+    included_m: float = 0.05
+    """So much uncertainty `block_noise_m` and the others stand for: poses that good soften nothing."""
     block: float = 1.0
     """BI/BO: this share of s² is added to `block_noise_m`², along the axis in which the Gaussian is thin."""
     beyond_sigmas: float = 2.0
     """PI: a ray must end farther behind the plane by this many s (root of the sum of squares with `beyond_m`)."""
 
+    similarity: float = 1.0
+    """This share of s² of a tile's points is added to Σi + Σj where the new Gaussian is compared with the map's."""
+
     def __post_init__(self) -> None:
         """Each value within its range, or `DetectParameterError` with the value."""
-        for name in ("included_m", "block", "beyond_sigmas"):
+        for name in ("included_m", "block", "beyond_sigmas", "similarity"):
             _check(f"soft.{name}", getattr(self, name), 0.0, 10.0)
 
     @classmethod
     def off(cls) -> "SoftParameters":
         """Poses are taken for exact, as in the paper."""
-        return cls(block=0.0, beyond_sigmas=0.0)
+        return cls(block=0.0, beyond_sigmas=0.0, similarity=0.0)
+
+    def excess_m2(self, pose: PoseUncertainty) -> float:
+        """Return s² of points at the pose's range."""
+        return max(pose.of_points_m**2 - self.included_m**2, 0.0)
 
 
 @dataclass(frozen=True, slots=True)

@@ -39,6 +39,8 @@ BO over BI + BO; PI over BI + BO + PI; logarithm of the new Gaussian's sub-cells
 eigenvalues; standard deviation of each Gaussian along the other's thin axis."""
 MONOTONE: Final = (1, 1, -1, 1, 1, 0, 0, 0, 1, 0)
 """How each feature may act on the log-odds: 1 upwards only, -1 downwards only, 0 freely."""
+NOISE_M: Final = 0.05
+"""Of the similarity that the trees were fitted with."""
 _THIN_M2: Final = 2e-4
 """Added to eigenvalues before the logarithm: (1.4 cm)², below the noise of any sensor."""
 
@@ -131,7 +133,7 @@ def fitted() -> Forest:
     return Forest.from_json((files("vehicle_agent.detect") / "shape_change.json").read_text(encoding="utf-8"))
 
 
-def shape_features(was: Gaussians, now: Gaussians, n_bi: I32, n_bo: I32, n_pi: I32) -> F64:
+def shape_features(was: Gaussians, now: Gaussians, n_bi: I32, n_bo: I32, n_pi: I32, noise_m: float = NOISE_M) -> F64:
     """Return the `FEATURES` (N, 10) of N voxels.
 
     Args:
@@ -140,6 +142,7 @@ def shape_features(was: Gaussians, now: Gaussians, n_bi: I32, n_bo: I32, n_pi: I
         n_bi: (N,) points blocked inside the map's Gaussian.
         n_bo: (N,) points blocked outside it.
         n_pi: (N,) rays that passed it.
+        noise_m: of the similarity; more where the poses are known poorly.
     """
     thin_was, normal_was = _thin_axis(was)
     thin_now, normal_now = _thin_axis(now)
@@ -147,7 +150,7 @@ def shape_features(was: Gaussians, now: Gaussians, n_bi: I32, n_bo: I32, n_pi: I
     columns = [
         np.abs(np.einsum("ni,ni->n", normal_was, step)),
         np.abs(np.einsum("ni,ni->n", normal_now, step)),
-        similarity(was.exists, was.mean_m, was.cov_m2, now.exists, now.mean_m, now.cov_m2),
+        similarity(was.exists, was.mean_m, was.cov_m2, now.exists, now.mean_m, now.cov_m2, noise_m=noise_m),
         n_bo / np.maximum(n_bi + n_bo, 1),
         n_pi / np.maximum(n_bi + n_bo + n_pi, 1),
         np.log(np.maximum(now.cells, 1)),
