@@ -57,7 +57,7 @@ class ScanOdometryParameters:
     correlation: float = 3.0
     floor_m: float = 0.005
     floor_rad: float = 1e-4
-    degenerate_m: float = 0.2
+    degenerate_m: float = 0.05
     step_share: float = 0.2
     steady_m: float = 0.03
     steady_rad: float = 2e-3
