@@ -22,6 +22,7 @@ DEFAULT_OUT = Path("runs/reproduce-localisation")
 @click.option("--variants", help="Sensors that also run with added errors, none for none.  [default: the first]")
 @click.option("--trials", default=40, show_default=True, help="Starts without a pose, for each sensor.")
 @click.option("--parking", default=0.2, show_default=True, help="Share of parking slots that are taken.")
+@click.option("--base", type=click.Choice(["driven", "surveyed"]), default="driven", show_default=True)
 @click.option("--set", "changes", multiple=True, metavar="GROUP.FIELD=VALUE", help="Replace a parameter, repeatable.")
 @click.option("--scans", type=int, help="At most so many scans a drive, for a quick look.")
 @click.option("--out", type=PATH, default=DEFAULT_OUT, show_default=True, help="Folder that keeps everything.")
@@ -66,8 +67,10 @@ def localisation(
     folder.write_json("result.json", found)
     if pictures:
         from benchmarks.localisation_study.figures import draw_figures
+        from benchmarks.localisation_study.overview import draw_overview
 
         draw_figures(outcome, out)
+        draw_overview(found, out / "overview.png")
     text, markdown = json.dumps(found, indent=2) + "\n", markdown_of(found, _command_of(given))
     printed = [_written(json_file, text, "--json"), _written(markdown_file, markdown, "--markdown")]
     if not any(printed):
@@ -101,7 +104,7 @@ def options_of(given: dict[str, Any]) -> Any:
     from benchmarks.simulation.pose_source import PoseSource
     from fleet_sim.street import StreetOptions
 
-    chosen: dict[str, Any] = {name: given[name] for name in ("fleet", "trials", "parking", "scans")}
+    chosen: dict[str, Any] = {name: given[name] for name in ("fleet", "trials", "parking", "scans", "base")}
     chosen["street"] = StreetOptions(given["length_m"], given["site"])
     chosen["poses"] = PoseSource.parse(given["poses"])
     chosen["method"] = MethodParameters().with_changes(given["changes"])

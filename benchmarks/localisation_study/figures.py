@@ -31,7 +31,12 @@ _YELLOW: Final = "#fff1b8"
 _BROWN: Final = "#9a6a3c"
 _RED: Final = "#d1282e"
 _GREY: Final = "#76808e"
-_NAMES: Final = (("longitudinal", "m"), ("lateral", "m"), ("heading", "°"))
+_PURPLE: Final = "#8455a8"
+_NAMES: Final = (("longitudinal", "m", 1.0), ("lateral", "m", 1.0), ("heading", "°", 1.0))
+_ENLARGED: Final = (("longitudinal", "cm", 100.0), ("lateral", "cm", 100.0), ("heading", "°", 1.0))
+"""Name, unit, and how many of it are a metre or a degree."""
+_MUCH: Final = 0.25
+"""Places where more than this share has changed are marked."""
 _GAP: Final = 3.5  # a line is broken where more than this many scans have no pose
 
 
@@ -108,15 +113,16 @@ def _draw(
     """Draw three rows of errors, against the limits on the left and enlarged on the right."""
     figure = Figure(figsize=(13.0, 8.4), dpi=130, facecolor="white")
     grid = figure.add_gridspec(
-        4, 2, height_ratios=(0.28, 1, 1, 1), left=0.062, right=0.985, top=0.835, bottom=0.065, hspace=0.14, wspace=0.13
+        4, 2, height_ratios=(0.28, 1, 1, 1), left=0.06, right=0.985, top=0.835, bottom=0.065, hspace=0.14, wspace=0.12
     )
-    for column, titled in enumerate(("against the limits", "enlarged")):
+    for column, titled in enumerate(("against the limits; numbers: 95 % / largest", "enlarged")):
         top = figure.add_subplot(grid[0, column])
         _draw_share(top, share)
         top.set_title(titled, fontsize=11, color=_INK, loc="left", weight="bold")
         for quantity in range(3):
             axes = figure.add_subplot(grid[quantity + 1, column], sharex=top)
             _draw_errors(axes, series, quantity, start_ns, enlarged=column == 1)
+            _shade_changes(axes, share)
             axes.tick_params(labelbottom=quantity == 2)
         axes.set_xlabel("seconds since the drive began", color=_INK)
     _legend(figure, series)
@@ -127,7 +133,7 @@ def _draw(
 
 def _draw_share(axes: Axes, share: tuple[F64, F64]) -> None:
     t_s, changed = share
-    axes.fill_between(t_s, 100 * changed, color="#8455a8", alpha=0.55, linewidth=0)
+    axes.fill_between(t_s, 100 * changed, color=_PURPLE, alpha=0.55, linewidth=0)
     axes.set_xlim(t_s[0], t_s[-1])
     axes.set_ylim(0, max(100 * float(changed.max(initial=0.0)) * 1.15, 10))
     axes.set_ylabel(f"changed\n≤ {NEAR_M:g} m, %", color=_INK, fontsize=8)
@@ -138,15 +144,18 @@ def _draw_share(axes: Axes, share: tuple[F64, F64]) -> None:
 def _draw_errors(
     axes: Axes, series: Mapping[Curve, PoseSeries], quantity: int, start_ns: int, *, enlarged: bool
 ) -> None:
-    p95, largest = PAPER_LIMITS.p95[quantity], PAPER_LIMITS.max[quantity]
+    name, unit, size = (_ENLARGED if enlarged else _NAMES)[quantity]
+    p95, largest = size * PAPER_LIMITS.p95[quantity], size * PAPER_LIMITS.max[quantity]
     axes.axhspan(-largest, largest, color=_YELLOW, linewidth=0, zorder=0)
     axes.axhspan(-p95, p95, color=_GREEN, linewidth=0, zorder=0)
     for curve, one in series.items():
-        t_s, error = _broken(1e-9 * (one.t_ns - start_ns).astype(np.float64), one.error[:, quantity])
+        t_s, error = _broken(1e-9 * (one.t_ns - start_ns).astype(np.float64), size * one.error[:, quantity])
         axes.plot(t_s, error, color=curve.colour, linewidth=curve.width, zorder=3, solid_joinstyle="round")
-    axes.set_ylim(*_range(series, quantity, largest, enlarged=enlarged))
+    reach = size * max((float(np.abs(one.error[:, quantity]).max(initial=0.0)) for one in series.values()), default=0.0)
+    axes.set_ylim(*_range(reach, largest, enlarged=enlarged))
+    if not enlarged:
+        _write_errors(axes, series, quantity)
     axes.axhline(0.0, color="#b9c1cc", linewidth=0.8, zorder=1)
-    name, unit = _NAMES[quantity]
     axes.set_ylabel(f"{name}, {unit}", color=_INK)
     axes.tick_params(colors=_INK, labelsize=9)
     _spines(axes)
@@ -160,11 +169,28 @@ def _broken(t_s: F64, error: F64) -> tuple[F64, F64]:
     return np.insert(t_s, gaps, np.nan), np.insert(error, gaps, np.nan)
 
 
-def _range(series: Mapping[Curve, PoseSeries], quantity: int, largest: float, *, enlarged: bool) -> tuple[float, float]:
+def _range(reach: float, largest: float, *, enlarged: bool) -> tuple[float, float]:
     """Limits of the axis: the requirement's and somewhat more, or what the lines fill."""
-    reach = max((float(np.abs(one.error[:, quantity]).max(initial=0.0)) for one in series.values()), default=0.0)
-    size = max(1.12 * reach, 0.01) if enlarged else 1.15 * max(largest, min(reach, 3 * largest))
+    size = max(1.12 * reach, 0.01 * largest) if enlarged else 1.15 * max(largest, min(reach, 3 * largest))
     return -size, size
+
+
+def _shade_changes(axes: Axes, share: tuple[F64, F64]) -> None:
+    t_s, changed = share
+    axes.fill_between(
+        t_s, 0, 1, where=changed > _MUCH, transform=axes.get_xaxis_transform(), color=_PURPLE, alpha=0.12, linewidth=0
+    )
+
+
+def _write_errors(axes: Axes, series: Mapping[Curve, PoseSeries], quantity: int) -> None:
+    """Write 95 % and largest error of each curve into the panel."""
+    name, unit, _ = _NAMES[quantity]
+    scale, unit = (1.0, unit) if unit == "°" else (100.0, "cm")
+    for number, (curve, one) in enumerate(series.items()):
+        error = one.quantiles()[f"{name}_{'deg' if unit == '°' else 'm'}"]
+        text = "no pose" if error is None else f"{scale * error['p95']:.2f} / {scale * error['max']:.2f} {unit}"
+        x = 0.995 - 0.2 * (len(series) - 1 - number)
+        axes.text(x, 0.965, text, transform=axes.transAxes, ha="right", va="top", fontsize=8.5, color=curve.colour)
 
 
 def _legend(figure: Figure, series: Mapping[Curve, PoseSeries]) -> None:

@@ -5,7 +5,7 @@ from math import tau
 
 from benchmarks.simulation.errors import OptionError
 from benchmarks.simulation.method import MethodParameters
-from benchmarks.simulation.options import RunOptions
+from benchmarks.simulation.options import Base, RunOptions
 from benchmarks.simulation.pose_source import PoseSource
 from fleet_sim.drives import EPOCH_NS, DriveConfig
 from fleet_sim.sensors import MODELS, SHORT_NAMES
@@ -31,6 +31,7 @@ class StudyOptions:
         trials: starts a sensor without any pose.
         variant_sensors: sensors that also run with added errors; None for the first of all that drive.
         parking: share of parking slots that are taken.
+        base: "driven": maps are made by an HDL-32E with range noise on the empty street; "surveyed": the truth's own.
         scans: at most so many scans a drive, None for the whole street.
         method: all parameters of the method.
     """
@@ -44,6 +45,7 @@ class StudyOptions:
     trials: int = 40
     variant_sensors: tuple[str, ...] | None = None
     parking: float = 0.2
+    base: Base = "driven"
     scans: int | None = None
     method: MethodParameters = field(default_factory=MethodParameters)
 
@@ -55,8 +57,7 @@ class StudyOptions:
         for sensor in self.variants_of:
             if sensor not in self.sensors:
                 raise OptionError(f"--variants: {sensor!r} does not drive; driving are {', '.join(self.sensors)}")
-        for seed in self.seeds or (-1,):
-            self.of_fleet(seed)  # which checks all that it takes over
+        self._fleet_of(self.seeds)  # which checks all that it takes over
 
     @property
     def variants_of(self) -> tuple[str, ...]:
@@ -69,14 +70,17 @@ class StudyOptions:
         Raises:
             OptionError: a seed, share or number that cannot be.
         """
+        return self._fleet_of((seed,))
+
+    def _fleet_of(self, seeds: tuple[int, ...]) -> RunOptions:
         return RunOptions(
-            seeds=(seed,),
+            seeds=seeds,
             street=self.street,
             vehicles=(self.fleet,),
             sensors=self.fleet_sensors[: self.fleet],
             parking=self.parking,
             poses=self.poses,
-            base="driven",
+            base=self.base,
             method=self.method,
             scans=self.scans,
             pcd=False,

@@ -105,9 +105,10 @@ def plan_of(folder: RunFolder, seed: int, options: StudyOptions) -> SeedPlan:
     """Return the plan of a seed."""
     files = world_files(folder, seed, options.of_fleet(seed))
     world = world_sha(street(seed, options.street))
-    before = key_of(world=world, state="before", sources=sources_sha(_MAPS))
+    maps_by = {"world": world, "base": options.base, "sources": sources_sha(_MAPS)}
+    before = key_of(state="before", **maps_by)
     maps = files.home / "maps"
-    fresh = Kept(maps, FRESH, key_of(world=world, state="after", sources=sources_sha(_MAPS)))
+    fresh = Kept(maps, FRESH, key_of(state="after", **maps_by))
     updated = Kept(maps, UPDATED, _updated_key(before, seed, options))
     paths = {OUTDATED: (files.base, before), FRESH: (fresh.path, fresh.key), UPDATED: (updated.path, updated.key)}
     sensors = tuple(_sensor_plan(files, seed, options, sensor, world, paths) for sensor in options.sensors)

@@ -1,8 +1,8 @@
 """A study from options to results: worlds and drives, fleet and runs, merge and runs on the updated map; resumable."""
 
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from time import perf_counter
-from typing import Any
 
 from rich.progress import Progress
 
@@ -19,6 +19,9 @@ from benchmarks.simulation.scoring import VehicleFile
 from benchmarks.simulation.tasks import shots_a_second, vehicle_tasks
 from benchmarks.simulation.vehicle import VehicleTask, run_vehicle
 from benchmarks.simulation.worlds import prepare_world
+
+Stage = Callable[[StudyOptions, list[SeedPlan]], Iterator[list[Job]]]
+"""Gives lists of jobs; the next list when the jobs of the one before are done."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -65,10 +68,15 @@ def study(
     """
     plans = [plan_of(folder, seed, options) for seed in options.seeds]
     spent = {}
-    for title, stage in (("worlds and drives", _worlds), ("fleet and runs", _runs), ("updated map", _updated)):
+    stages: Sequence[tuple[str, Stage]] = (
+        ("worlds and drives", _worlds),
+        ("fleet and runs", _runs),
+        ("updated map", _updated),
+    )
+    for title, stage in stages:
         begun_s = perf_counter()
-        for number, jobs in enumerate(stage(options, plans)):
-            run_jobs(jobs, processes, progress, title if number == 0 else f"{title}: runs")
+        for jobs in stage(options, plans):
+            run_jobs(jobs, processes, progress, title)
         spent[title] = perf_counter() - begun_s
     for plan in plans:
         for sensor in plan.sensors if not keep_drives else ():
@@ -76,22 +84,28 @@ def study(
     return StudyOutcome(options, tuple(_read(plan) for plan in plans), {**spent, "total": sum(spent.values())})
 
 
-def _worlds(options: StudyOptions, plans: list[SeedPlan]) -> Any:
+def _worlds(options: StudyOptions, plans: list[SeedPlan]) -> Iterator[list[Job]]:
     """Worlds with truth and outdated map, fresh maps, and the drives that are still needed."""
-    jobs = []
-    for plan in plans:
-        seed = plan.seed
-        jobs.append(Job(f"world {seed}", prepare_world, (plan.files, seed, options.of_fleet(seed))))
-        if not plan.fresh.done:
-            jobs.append(Job(f"fresh map, world {seed}", make_fresh, (options, seed, plan.fresh)))
-        for one in plan.sensors:
-            if not one.done and not one.recording.exists():
-                arguments = (options, seed, one.drive, one.recording)
-                jobs.append(Job(f"drive {one.sensor}, world {seed}", record, arguments, ticks=True))
-    yield jobs
+    worlds = [Job(f"world {p.seed}", prepare_world, (p.files, p.seed, options.of_fleet(p.seed))) for p in plans]
+    fresh = [
+        Job(f"fresh map, world {p.seed}", make_fresh, (options, p.seed, p.files.truth, p.fresh))
+        for p in plans
+        if not p.fresh.done
+    ]
+    drives = [
+        Job(f"drive {one.sensor}, world {p.seed}", record, (options, p.seed, one.drive, one.recording), ticks=True)
+        for p in plans
+        for one in p.sensors
+        if not (one.done or one.recording.exists())
+    ]
+    if options.base == "driven":
+        yield [*worlds, *fresh, *drives]
+    else:  # the truth, which the fresh map is taken from, is made with the world
+        yield [*worlds, *drives]
+        yield fresh
 
 
-def _runs(options: StudyOptions, plans: list[SeedPlan]) -> Any:
+def _runs(options: StudyOptions, plans: list[SeedPlan]) -> Iterator[list[Job]]:
     """The fleet's vehicles, the longest first, and the runs that need no fleet."""
     fleet = [task for plan in plans if not plan.updated.done for task in _fleet(options, plan) if not is_done(task)]
     fleet.sort(key=shots_a_second, reverse=True)
@@ -104,7 +118,7 @@ def _runs(options: StudyOptions, plans: list[SeedPlan]) -> Any:
     yield jobs
 
 
-def _updated(options: StudyOptions, plans: list[SeedPlan]) -> Any:
+def _updated(options: StudyOptions, plans: list[SeedPlan]) -> Iterator[list[Job]]:
     """The merge of the fleet's reports, then the runs on the updated map."""
     merge = options.method.merge
     yield [
@@ -150,7 +164,7 @@ def _read(plan: SeedPlan) -> SeedOutcome:
     found = []
     for one in plan.sensors:
         runs = {run.name: read_localised(run.kept) for run in one.runs}
+        localised, cpu_s = {name: r for name, (r, _) in runs.items()}, {name: s for name, (_, s) in runs.items()}
         trials = read_trials(one.trials) if one.trials is not None else []
-        localised, cpu_s = ({name: pair[i] for name, pair in runs.items()} for i in (0, 1))
-        found.append(SensorOutcome(one.sensor, localised, cpu_s, trials))  # type: ignore[arg-type]
+        found.append(SensorOutcome(one.sensor, localised, cpu_s, trials))
     return SeedOutcome(plan, tuple(found))

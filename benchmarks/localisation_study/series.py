@@ -10,8 +10,8 @@ from numpy.typing import NDArray
 from benchmarks.localisation_study.reference import PAPER_LIMITS, QUANTITIES
 from gnd_map.arrays import F64, I64
 from gnd_map.motion import Trajectory
-from gnd_map.se3 import T_inverse
 from vehicle_agent.localise.estimates import PoseEstimate
+from vehicle_agent.localise_drive.accuracy import error_series
 
 HEALTHS: Final = ("lost", "degraded", "good")
 
@@ -34,13 +34,9 @@ class PoseSeries:
     def of(cls, estimates: Sequence[PoseEstimate], reference: Trajectory) -> "PoseSeries":
         """Return the errors of the estimates that lie within the reference's time; frames must be the same."""
         within = [e for e in estimates if reference.t_ns[0] <= e.t_ns <= reference.t_ns[-1]]
-        if not within:
-            return cls(np.zeros(0, np.int64), np.zeros((0, 3)), np.zeros(0, np.uint8))
-        t_ns = np.array([e.t_ns for e in within], np.int64)
-        off = T_inverse(reference.at(t_ns)) @ np.stack([e.T_map_vehicle for e in within])
-        heading_deg = np.degrees(np.arctan2(off[:, 1, 0], off[:, 0, 0]))
+        errors = error_series(within, reference)
         health = np.array([HEALTHS.index(e.health) for e in within], np.uint8)
-        return cls(t_ns, np.column_stack([off[:, 0, 3], off[:, 1, 3], heading_deg]), health)
+        return cls(errors.t_ns, np.column_stack([errors.longitudinal, errors.lateral, errors.heading]), health)
 
     def __len__(self) -> int:
         return len(self.t_ns)

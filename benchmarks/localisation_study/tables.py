@@ -15,7 +15,7 @@ from benchmarks.localisation_study.targets import sensors_of, within
 from benchmarks.localisation_study.variants import LABELS
 
 _PLAIN_WIDTH: Final = 150
-_ROW_LABELS: Final[Mapping[str, str]] = {
+ROW_LABELS: Final[Mapping[str, str]] = {
     "without_submap": "without submap",
     "with_submap": "with submap",
     "online": "online, outdated map",
@@ -47,7 +47,7 @@ class Line:
 def lines_of(rows: Mapping[str, Any]) -> Iterator[Line]:
     """Give the lines of one sensor: each of our rows, the paper's below it, then the runs with added errors."""
     for name in ROWS:
-        yield _line(_ROW_LABELS[name], rows[name])
+        yield _line(ROW_LABELS[name], rows[name])
         for paper in PAPER_OF_ROW.get(name, ()):
             yield _paper_line(paper)
     for name, row in rows.get("variants", {}).items():

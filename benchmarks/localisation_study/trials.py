@@ -76,7 +76,7 @@ def run_trial(
     fix, stream = first_fix(_other_fixes(rest, header, poses, np.random.default_rng([seed, begin_ns])))
     vehicle = Vehicle(header, fix, base, parameters)
     scans = _drive(vehicle, stream)
-    return _judged(PoseSeries.of(vehicle.online, vehicle.reference(poses)), begin_ns, scans)
+    return judged(PoseSeries.of(vehicle.online, vehicle.reference(poses)), begin_ns, scans)
 
 
 def _drive(vehicle: Vehicle, items: Iterator[DriveItem]) -> int:
@@ -91,7 +91,8 @@ def _drive(vehicle: Vehicle, items: Iterator[DriveItem]) -> int:
     return vehicle.scans
 
 
-def _judged(online: PoseSeries, begin_ns: int, scans: int) -> Trial:
+def judged(online: PoseSeries, begin_ns: int, scans: int) -> Trial:
+    """Return what the online poses of a start are worth: the first that is called good decides."""
     good = np.flatnonzero(online.good)
     wrong = int(np.count_nonzero(online.good & online.wrong))
     if not len(good):

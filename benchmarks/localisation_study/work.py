@@ -9,13 +9,14 @@ from benchmarks.localisation_study.options import StudyOptions
 from benchmarks.localisation_study.plan import Run
 from benchmarks.localisation_study.trials import begin_times, run_trial
 from benchmarks.localisation_study.variants import variant_of
-from benchmarks.simulation.base_map import BaseMap, driven, read_base, write_base
+from benchmarks.simulation.base_map import BaseMap, driven, read_base, surveyed, write_base
 from benchmarks.simulation.cloud import merged_map
 from benchmarks.simulation.scoring import VehicleFile
 from benchmarks.simulation.streams import Tick, ticking
 from cloud_merger.merge import MergeParameters
 from fleet_sim.drives import DriveConfig, simulate_drive
 from fleet_sim.street import street
+from fleet_sim.truth import read_truth
 from schemas.drive import Scan
 from schemas.drive_mcap import read_drive, read_header
 from vehicle_agent.localise.parameters import LocaliserParameters
@@ -27,10 +28,13 @@ def record(options: StudyOptions, seed: int, drive: DriveConfig, path: Path, tic
     simulate_drive(street(seed, options.street), drive, path, tick)
 
 
-def make_fresh(options: StudyOptions, seed: int, kept: Kept) -> None:
-    """Make the map that the mapping vehicle makes of the state after."""
+def make_fresh(options: StudyOptions, seed: int, truth: Path, kept: Kept) -> None:
+    """Make the map of the state after as that of the state before was made."""
     kept.home.mkdir(parents=True, exist_ok=True)
-    write_base(driven(street(seed, options.street), "after"), kept.path)
+    if options.base == "driven":
+        write_base(driven(street(seed, options.street), "after"), kept.path)
+    else:
+        write_base(surveyed(read_truth(truth).after), kept.path)
 
 
 def make_updated(base: Path, fleet: list[VehicleFile], merge: MergeParameters, kept: Kept) -> None:
