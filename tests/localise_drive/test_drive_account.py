@@ -122,6 +122,17 @@ def test_one_error_beyond_the_larger_limit_is_enough() -> None:
     assert found["longitudinal_m"] == {"p95": 0.0, "max": 0.45, "within_limits": False}
 
 
+def test_poses_called_good_are_judged_apart() -> None:
+    """The degraded ones are off by metres and say that they are not sure."""
+    poses = tuple(
+        pose(k, h, off_m=(3.0 if h == "degraded" else 0.01, 0.0)) for k, h in enumerate(HEALTH) if h != "lost"
+    )
+    errors = summary(drive(HEALTH, refined=poses, online=poses))["errors"]
+    assert errors["refined"]["longitudinal_m"] == {"p95": 3.0, "max": 3.0, "within_limits": False}
+    assert errors["refined_good"]["longitudinal_m"] == {"p95": 0.01, "max": 0.01, "within_limits": True}
+    assert (errors["online"]["n"], errors["online_good"]["n"]) == (17, 15)
+
+
 def test_the_summary_says_when_the_first_pose_came() -> None:
     values = summary(drive(HEALTH))
     assert values["initialisation_s"] == 0.3

@@ -8,7 +8,7 @@ from rich.console import Console
 from rich.table import Table
 
 from vehicle_agent.localise.estimates import PoseEstimate
-from vehicle_agent.localise_drive.accuracy import LIMITS, error_series, error_summary, limits_json
+from vehicle_agent.localise_drive.accuracy import LIMITS, error_series, error_summary, healthy, limits_json
 from vehicle_agent.localise_drive.run import LocalisedDrive
 from vehicle_agent.localise_drive.stretches import Stretch, health_shares, stretches_of
 
@@ -71,13 +71,16 @@ def _sigma(estimates: Sequence[PoseEstimate]) -> dict[str, float] | None:
 
 
 def _errors(drive: LocalisedDrive) -> dict[str, Any] | None:
-    """Of the refined and the online poses; None without a reference."""
+    """Of the refined and the online poses, all and those called good; None without a reference."""
     if drive.reference is None:
         return None
-    found = {
-        name: error_summary(error_series(estimates, drive.reference))
-        for name, estimates in (("refined", drive.refined), ("online", drive.online))
+    kinds = {
+        "refined": drive.refined,
+        "refined_good": healthy(drive.refined),
+        "online": drive.online,
+        "online_good": healthy(drive.online),
     }
+    found = {name: error_summary(error_series(poses, drive.reference)) for name, poses in kinds.items()}
     return found | {"limits": limits_json()}
 
 
@@ -115,10 +118,17 @@ def _fields(values: dict[str, Any]) -> Table:
 def _error_table(errors: dict[str, Any]) -> Table:
     table = _table("errors against the reference", "", "95 %", "largest", "limits", "")
     for kind in ("refined", "online"):
-        for name, limit in LIMITS.items():
-            if errors[kind] is not None:
-                table.add_row(f"{kind}, {name}", *_error_row(errors[kind][f"{name}_{limit.unit}"], name))
+        _add_errors(table, kind, errors[kind])
+        if errors[f"{kind}_good"] != errors[kind]:
+            _add_errors(table, f"{kind} and good", errors[f"{kind}_good"])
     return table
+
+
+def _add_errors(table: Table, kind: str, errors: dict[str, Any] | None) -> None:
+    """Three rows; none without errors."""
+    if errors is not None:
+        for name, limit in LIMITS.items():
+            table.add_row(f"{kind}, {name}", *_error_row(errors[f"{name}_{limit.unit}"], name))
 
 
 def _error_row(found: dict[str, Any], name: str) -> tuple[str, ...]:

@@ -62,6 +62,11 @@ def error_series(estimates: Sequence[PoseEstimate], reference: Trajectory | None
     return ErrorSeries(t_ns, error[:, 0, 3], error[:, 1, 3], heading_deg)
 
 
+def healthy(estimates: Sequence[PoseEstimate]) -> list[PoseEstimate]:
+    """Those whose health is good: of these, none may be wrong."""
+    return [estimate for estimate in estimates if estimate.health == "good"]
+
+
 def error_summary(series: ErrorSeries) -> dict[str, Any] | None:
     """95 % quantile and largest of the absolute errors, and whether both keep the limits; None without errors."""
     if not len(series):

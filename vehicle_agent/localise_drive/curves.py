@@ -13,7 +13,7 @@ from matplotlib.patches import Patch
 
 from gnd_map.arrays import F64, I64
 from vehicle_agent.localise.estimates import PoseEstimate
-from vehicle_agent.localise_drive.accuracy import LIMITS, ErrorSeries, Limit, error_series
+from vehicle_agent.localise_drive.accuracy import LIMITS, ErrorSeries, Limit, error_series, healthy
 from vehicle_agent.localise_drive.run import LocalisedDrive
 from vehicle_agent.localise_drive.stretches import HEALTHS, Stretch, stretches_of
 from vehicle_agent.localise_drive.style import (
@@ -24,6 +24,7 @@ from vehicle_agent.localise_drive.style import (
     REFINED,
     dress,
     health_strip,
+    name_causes,
     new_figure,
     save_figure,
 )
@@ -52,11 +53,12 @@ def draw_errors(drive: LocalisedDrive, path: Path) -> Path:
     figure.subplots_adjust(**_GRID)
     for (name, limit), row in zip(LIMITS.items(), axes, strict=True):
         _error_row(row, name, limit, series, drive)
+    name_causes(axes[0, 1], stretches_of(drive.moments))
     figure.align_ylabels()
     for foot in axes[-1]:
         foot.set_xlabel("seconds since the first scan", color=INK)
-    axes[0, 0].set_title("against the limits", fontsize=11, color=INK, loc="left")
-    axes[0, 1].set_title("enlarged", fontsize=11, color=INK, loc="left")
+    axes[0, 0].set_title("against the limits", fontsize=11, color=INK, loc="left", pad=14)
+    axes[0, 1].set_title("enlarged", fontsize=11, color=INK, loc="left", pad=14)
     _legend(figure, [*_error_handles(), *_health_handles(stretches_of(drive.moments))])
     save_figure(figure, path)
     return path
@@ -80,6 +82,7 @@ def draw_quality(drive: LocalisedDrive, path: Path) -> Path:
         panel.set_ylim(0.0, 1.05 if label == _RATIO else max(panel.get_ylim()[1], 1e-6))
         _whole_drive(panel, drive)
         health_strip(panel, stretches)
+    name_causes(axes[0], stretches)
     figure.align_ylabels()
     axes[-1].set_xlabel("seconds since the first scan", color=INK)
     lines = [Line2D([], [], color=c, linewidth=2, label=n) for n, c in (("refined", REFINED), ("online", ONLINE))]
@@ -110,14 +113,18 @@ def _error_row(
     _bands(row[0], limit, scale)
     _edges(row[1], limit, scale)
     row[0].set_ylim(*(np.array([-1, 1]) * _HEADROOM * limit.largest * scale))
-    row[1].set_ylim(*(np.array([-1, 1]) * _HEADROOM * scale * _reach([one.of(name) for one, _ in series.values()])))
+    row[1].set_ylim(*(np.array([-1, 1]) * _HEADROOM * scale * _reach(drive, name)))
 
 
-def _reach(errors: Sequence[F64]) -> float:
-    """How far the enlarged panel must reach: the largest refined error (last), and 95 % of the others."""
-    *others, refined = (np.abs(one) for one in errors)
-    reaches = [float(np.quantile(one, 0.95)) for one in others if len(one)]
-    return max([*reaches, float(refined.max(initial=0.0)), 1e-5])
+def _reach(drive: LocalisedDrive, name: str) -> float:
+    """How far the enlarged panel must reach: the largest error of refined poses called good, 95 % of online ones."""
+    refined, online = (error_series(healthy(poses) or poses, drive.reference).of(name) for poses in _both(drive))
+    usual = float(np.quantile(np.abs(online), 0.95)) if len(online) else 0.0
+    return max(float(np.abs(refined).max(initial=0.0)), usual, 1e-5)
+
+
+def _both(drive: LocalisedDrive) -> tuple[Sequence[PoseEstimate], Sequence[PoseEstimate]]:
+    return drive.refined, drive.online
 
 
 def _bands(panel: Axes, limit: Limit, scale: float) -> None:

@@ -17,6 +17,8 @@ HEALTH_COLOURS: Final = {"good": "#2e8b57", "degraded": "#e0a020", "lost": "#d14
 REFINED: Final = "#c8322d"
 ONLINE: Final = "#8a5a2b"
 """Red and brown, as with and without submap in the paper's Figure 19."""
+_WORDS: Final = 0.05
+"""Shortest stretch, of the whole drive, that is named."""
 _STRIP: Final = 0.035
 """Height of the strip of health, of the axes' height."""
 
@@ -48,6 +50,19 @@ def health_strip(axes: Axes, stretches: list[Stretch], *, shade: bool = True) ->
         axes.axvspan(one.from_s, one.to_s, ymin=0.0, ymax=_STRIP, alpha=0.9, zorder=4, **span)
         if shade and one.health != "good":
             axes.axvspan(one.from_s, one.to_s, alpha=0.10, zorder=0, **span)
+
+
+def name_causes(axes: Axes, stretches: list[Stretch]) -> None:
+    """Write the causes of health at the head of the axes, where a stretch is long enough for the words."""
+    whole_s = stretches[-1].to_s if stretches else 0.0
+    for one in stretches:
+        if one.cause != "none" and one.to_s - one.from_s > _WORDS * whole_s:
+            axes.axvline(one.from_s, color=FAINT, linewidth=1.0, zorder=1)
+            axes.axvline(one.to_s, color=FAINT, linewidth=1.0, zorder=1)
+            axes.text(
+                (one.from_s + one.to_s) / 2, 1.015, one.cause.replace("_", " "), transform=axes.get_xaxis_transform(),
+                ha="center", va="bottom", fontsize=8, color=MUTED,
+            )  # fmt: skip
 
 
 def save_figure(figure: Figure, path: Path) -> None:
