@@ -16,6 +16,10 @@ _COMMANDS: Final[dict[str, tuple[str, str]]] = {
         "Localisation in a changed world, before and after the map update.",
     ),
     "errors": ("benchmarks.simulation.errors_command:errors", "Which voxels of a simulation cost F1, and why."),
+    "real-localisation": (
+        "benchmarks.real_localisation.command:real_localisation",
+        "Odometry, localisation and georeferencing on real recordings.",
+    ),
     "real": ("benchmarks.real.command:real", "Detection on recordings of real sensors, with objects inserted."),
 }
 

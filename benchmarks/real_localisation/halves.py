@@ -6,8 +6,8 @@ be searched. Its final poses are held against two references: the LiDAR track th
 GICP of each scan on the points of the mapping scans, which shares no code with ours.
 """
 
-from collections.abc import Iterator, Sequence
-from dataclasses import asdict, dataclass, field, replace
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import asdict, dataclass, replace
 from typing import Any, Final
 
 import numpy as np
@@ -23,6 +23,7 @@ from vehicle_agent.importers.recording import GNSS_SIGMA_M
 from vehicle_agent.importers.splits import chosen_scans
 from vehicle_agent.local_map import LocalMap
 from vehicle_agent.localise import Localiser, LocaliserParameters, PoseEstimate, RefinedScan, localisation_error
+from vehicle_agent.localise.refine_parameters import RefineParameters
 
 F64 = NDArray[np.float64]
 
@@ -73,12 +74,12 @@ class Localised:
     searches: int
 
 
-@dataclass(frozen=True, slots=True)
-class Runs:
-    """How often, and with which parameters."""
-
-    seeds: tuple[int, ...] = (0, 1, 2)
-    parameters: LocaliserParameters = field(default_factory=LocaliserParameters)
+SEEDS: Final = (0, 1, 2)
+"""Of the GNSS error."""
+METHODS: Final = {
+    "with_submap": LocaliserParameters(),
+    "without_submap": LocaliserParameters(refine=RefineParameters(enabled=False)),
+}
 
 
 def localised(half: Half, seed: int, parameters: LocaliserParameters) -> Localised:
@@ -136,49 +137,47 @@ def gicp(half: Half, points: F64, start: F64, reach_m: float) -> tuple[F64, bool
     return np.asarray(found.T_target_source), not found.converged
 
 
-def localisation_of(half: Half, runs: Runs) -> dict[str, Any]:
+def localisation_of(half: Half, seeds: Sequence[int] = SEEDS) -> dict[str, Any]:
     """Runs from several GNSS errors, pooled, against both references."""
-    found = [localised(half, seed, runs.parameters) for seed in runs.seeds]
-    estimates = [estimate for one in found for estimate in one.estimates]
-    driven = len(half.driven) * len(runs.seeds)
-    result: dict[str, Any] = {
+    gicp_track = gicp_reference(half)
+    references = {"track": half.scene.poses, "gicp": gicp_track}
+    return {
         "name": half.name,
-        "runs": len(runs.seeds),
-        "driven": driven,
+        "runs": len(seeds),
+        "driven": len(half.driven) * len(seeds),
+        "gaussians": int(half.local_map.count),
+        **{name: _pooled([localised(half, seed, par) for seed in seeds], references) for name, par in METHODS.items()},
+        "gicp_less_track": None if gicp_track is None else _errors(_as_estimates(gicp_track), half.scene.poses),
+    }
+
+
+def _pooled(found: Sequence[Localised], references: dict[str, Trajectory | None]) -> dict[str, Any]:
+    estimates = [estimate for one in found for estimate in one.estimates]
+    good = [estimate for estimate in estimates if estimate.health == "good"]
+    return {
         "localised": len(estimates),
-        "health": {name: sum(e.health == name for e in estimates) for name in ("good", "degraded", "lost")},
+        "health": _counted(e.health for e in estimates),
         "causes": _counted(e.cause for e in estimates),
         "degenerate": _counted(direction for e in estimates for direction in e.degenerate),
         "searches": [one.searches for one in found],
-        "gaussians": int(half.local_map.count),
         "matching_ratio_p50": float(np.median([e.matching_ratio for e in estimates])) if estimates else None,
+        "errors": {name: reference and _errors(good, reference) for name, reference in references.items()},
     }
-    good = [e for e in estimates if e.health == "good"]
-    for name, reference in (("track", half.scene.poses), ("gicp", gicp_reference(half))):
-        result[name] = _errors(good, reference)
-    result["gicp_less_track"] = _apart(gicp_reference(half), half.scene.poses)
-    return result
 
 
-def _errors(estimates: Sequence[PoseEstimate], reference: Trajectory | None) -> dict[str, Any] | None:
+def _errors(estimates: Sequence[PoseEstimate], reference: Trajectory) -> dict[str, Any] | None:
     """Of the poses called good, where the reference has a pose of the same scan."""
-    if reference is None:
-        return None
     known = set(reference.t_ns.tolist())
     at = [e for e in estimates if e.t_ns in known]
     return asdict(localisation_error(at, reference)) if at else None
 
 
-def _apart(found: Trajectory | None, reference: Trajectory) -> dict[str, Any] | None:
-    if found is None:
-        return None
-    poses = [
-        PoseEstimate(int(t), T, 0.0, 0.0, 1.0, "good") for t, T in zip(found.t_ns, found.T_dst_vehicle, strict=True)
-    ]
-    return asdict(localisation_error(poses, reference))
+def _as_estimates(found: Trajectory) -> list[PoseEstimate]:
+    pairs = zip(found.t_ns, found.T_dst_vehicle, strict=True)
+    return [PoseEstimate(int(t), T, 0.0, 0.0, 1.0, "good") for t, T in pairs]
 
 
-def _counted(names: Iterator[str]) -> dict[str, int]:
+def _counted(names: Iterable[str]) -> dict[str, int]:
     counts: dict[str, int] = {}
     for name in names:
         counts[name] = counts.get(name, 0) + 1

@@ -23,6 +23,12 @@ F64 = NDArray[np.float64]
 I64 = NDArray[np.int64]
 
 MIN_FIXES: Final = 3
+_COSTS: Final = (
+    (gtsam.noiseModel.mEstimator.Huber, 1.0),
+    (gtsam.noiseModel.mEstimator.GemanMcClure, 4.0),
+    (gtsam.noiseModel.mEstimator.GemanMcClure, 1.0),
+)
+"""One after the other, with the robust scale in `robust_k`."""
 _UNKNOWN_UP_M: Final = 1e3  # sigma of a height that nobody measured
 
 
@@ -115,10 +121,12 @@ def _bent(track: Trajectory, p_frame_m: F64, fixes: FixTable, par: GeoreferenceP
     arms = transform_each(T_inverse(track.T_dst_vehicle[near]), track.at(fixes.t_ns)[:, :3, 3])
     steps = _steps(track.T_dst_vehicle, par)
     T = track.T_dst_vehicle
-    for kind in (gtsam.noiseModel.mEstimator.Huber, gtsam.noiseModel.mEstimator.GemanMcClure):
+    for kind, k in _COSTS:
         graph = gtsam.NonlinearFactorGraph(steps)
         for number, p, arm, sigmas in zip(near.tolist(), p_frame_m, arms, _sigmas(fixes, par), strict=True):
-            noise = gtsam.noiseModel.Robust.Create(kind.Create(par.robust_k), gtsam.noiseModel.Diagonal.Sigmas(sigmas))
+            noise = gtsam.noiseModel.Robust.Create(
+                kind.Create(k * par.robust_k), gtsam.noiseModel.Diagonal.Sigmas(sigmas)
+            )
             graph.add(gtsam.GPSFactorArm(number, p, arm, noise))
         T = _optimised(graph, T)
     off = (p_frame_m - transform_each(T[near], arms)) / _sigmas(fixes, par)
@@ -135,7 +143,7 @@ def _steps(T: F64, par: GeoreferenceParameters) -> gtsam.NonlinearFactorGraph:
     graph, step = gtsam.NonlinearFactorGraph(), T_inverse(T[:-1]) @ T[1:]
     length_m = np.linalg.norm(step[:, :3, 3], axis=1)
     turn = np.hypot(par.step_rad, par.step_rad_per_root_m * np.sqrt(length_m))
-    move = np.hypot(par.step_m, par.step_share * length_m)
+    move = np.hypot(par.step_m, par.step_share * np.sqrt(length_m * par.lasting_m))
     for i, (a, m) in enumerate(zip(turn.tolist(), move.tolist(), strict=True)):
         noise = gtsam.noiseModel.Diagonal.Sigmas(np.array([a, a, a, m, m, m]))
         graph.add(gtsam.BetweenFactorPose3(i, i + 1, gtsam.Pose3(step[i]), noise))

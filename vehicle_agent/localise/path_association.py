@@ -90,7 +90,7 @@ def georeference_untimed(
     table = fixes.at(time_at(track, way, at), chosen)
     found = georeference(track, table, parameters)
     for window_m in NEAR_M:
-        at = _nearest_within(found.track.T_dst_vehicle[:, :3, 3], way, _enu(found.frame, fixes, chosen), at, window_m)
+        at = nearest_on_track(found.track.T_dst_vehicle[:, :3, 3], way, _enu(found.frame, fixes, chosen), at, window_m)
         table = fixes.at(time_at(track, way, at), chosen)
         found = georeference(track, table, parameters)
     return found, table
@@ -178,7 +178,7 @@ def _enu(frame: LocalFrame, fixes: Untimed, chosen: I64) -> F64:
     return frame.enu_from_geodetic(fixes.lat_rad[chosen], fixes.lon_rad[chosen], 0.0)
 
 
-def _nearest_within(p_track: F64, way: F64, p_fix: F64, at_m: F64, window_m: float) -> F64:
+def nearest_on_track(p_track: F64, way: F64, p_fix: F64, at_m: F64, window_m: float) -> F64:
     """(M,) distances along the track of the places nearest to fixes (M, 3), not farther along than the window."""
     fine = np.arange(0.0, way[-1] + 0.1, 0.1)
     path = np.column_stack([np.interp(fine, way, p_track[:, axis]) for axis in (0, 1)])

@@ -30,7 +30,9 @@ class GeoreferenceParameters:
 
     tilt: find roll and pitch as well (a SLAM frame that does not know the vertical); needs heights.
     robust_k: where the robust cost begins to give way, in sigmas of a fix.
-    step_m, step_share, step_rad, step_rad_per_root_m: one sigma of a step of the track, constant and with its length.
+    step_m, step_rad: one sigma of a step of the track, whatever its length; step_rad_per_root_m: of its turn, with it.
+    step_share, lasting_m: an error of scale of so much lasts for so long a way; steps get the sigma with which they add
+        up to it.
     inflation: GNSS errors last for tens of seconds, so that fixes count for less than their number says.
     spacing_m: of the fixes along the track, at least: a standing vehicle's do not add up.
     """
@@ -39,13 +41,14 @@ class GeoreferenceParameters:
     robust_k: float = 2.0
     step_m: float = 0.01
     step_share: float = 0.01
+    lasting_m: float = 50.0
     step_rad: float = 5e-4
     step_rad_per_root_m: float = 1e-3
     inflation: float = 3.0
     spacing_m: float = 1.0
 
     def __post_init__(self) -> None:
-        positive = (self.robust_k, self.step_m, self.step_rad, self.inflation)
+        positive = (self.robust_k, self.step_m, self.step_rad, self.inflation, self.lasting_m)
         if min(positive) <= 0 or min(self.step_share, self.step_rad_per_root_m, self.spacing_m) < 0:
             raise ValueError(f"positive sigmas, robust_k and inflation, and spacing_m >= 0 are required, got {self}")
 

@@ -1,0 +1,155 @@
+"""The result for people."""
+
+from typing import Any
+
+from rich import box
+from rich.console import Console
+from rich.table import Table
+
+
+def print_tables(found: dict[str, Any], console: Console | None = None) -> None:
+    """Print what was measured in each recording."""
+    console = console or Console()
+    for name, one in found.items():
+        console.print(f"[bold]{name}[/bold]: {one['kind']}, {one['runtime_s']} s")
+        for sentence in one.get("left_out", ()):
+            console.print(f"  {sentence}")
+        for table in _tables(one):
+            console.print(table)
+
+
+def _tables(one: dict[str, Any]) -> list[Table]:
+    if "odometry" in one:
+        halves = [_registration(half) for half in one["halves"]]
+        return [_odometry(one["odometry"]), _localisation(one["halves"]), *halves]
+    if "on_apollos_map" in one:
+        return [_pair(one), _apollo(one)]
+    if "by" in one:
+        return [_nagoya(one)]
+    return [_flexmap(one)]
+
+
+def _table(title: str, *columns: str) -> Table:
+    table = Table(title=title, title_justify="left", box=box.SIMPLE_HEAD)
+    for number, column in enumerate(columns):
+        table.add_column(column, justify="right" if number else "left")
+    return table
+
+
+def _odometry(rows: list[dict[str, Any]]) -> Table:
+    table = _table(
+        "Odometry", "", "way m", "less the positions' m", "from positions 50 / 95 % m",
+        "step from ours 95 % m / °", "end from ours along / across m", "ms a scan",
+    )  # fmt: skip
+    for row in rows:
+        if row["absent"]:
+            table.add_row(row["name"], row["absent"])
+            continue
+        table.add_row(
+            row["name"],
+            _number(row["way_m"], 2),
+            _number(row.get("way_less_positions_m"), 2),
+            _pair_of(row, "positions_m_p50", "positions_m_p95", 2),
+            _pair_of(row, "step_m_p95", "step_deg_p95", 3),
+            _pair_of(row, "end_along_m", "end_across_m", 2),
+            _number(row["ms_per_scan"], 0),
+        )
+    return table
+
+
+def _localisation(halves: list[dict[str, Any]]) -> Table:
+    table = _table(
+        "Localised on the other part, 95 % (largest) of the poses called good", "", "submaps", "good / localised / driven",
+        "along m", "across m", "heading °", "against",
+    )  # fmt: skip
+    for half in halves:
+        for method in ("with_submap", "without_submap"):
+            one = half[method]
+            count = f"{one['health'].get('good', 0)} / {one['localised']} / {half['driven']}"
+            for name, error in one["errors"].items():
+                table.add_row(half["name"], "yes" if method == "with_submap" else "no", count, *_errors(error), name)
+        table.add_row("", "", "", *_errors(half["gicp_less_track"]), "gicp less track")
+    return table
+
+
+def _errors(error: dict[str, Any] | None) -> list[str]:
+    keys = (("longitudinal", "m"), ("lateral", "m"), ("heading", "deg"))
+    if error is None:
+        return ["-"] * len(keys)
+    return [f"{error[f'{key}_p95_{unit}']:.3f} ({error[f'{key}_max_{unit}']:.3f})" for key, unit in keys]
+
+
+def _registration(half: dict[str, Any]) -> Table:
+    table = _table(
+        f"Registration, {half['name']}", "from", "method", "converged", "not, and said so", "not, and silent",
+        "error 50 % cm / °", "ms",
+    )  # fmt: skip
+    for row in half["registration"]:
+        error = "-" if row["error_m_p50"] is None else f"{100 * row['error_m_p50']:.1f} / {row['error_deg_p50']:.3f}"
+        shares = (f"{row[key]:.0%}" for key in ("converged", "not_and_said_so", "not_and_silent"))
+        table.add_row(f"{row['off_m']} m, {row['off_deg']}°", row["method"], *shares, error, _number(row["ms_p50"], 1))
+    return table
+
+
+def _pair(one: dict[str, Any]) -> Table:
+    at = one["place"]
+    title = f"Scan 2 at {at['lat_deg']:.7f}°, {at['lon_deg']:.7f}°, {at['height_m']:.2f} m, heading {at['heading_deg']:.2f}°"
+    table = _table(title, "searched from 2.5 m, any heading", "found", "Gaussians", "along m", "across m", "heading °")
+    for row in one["halves"]:
+        count = f"{row['found']} of {row['searches']}"
+        table.add_row(row["name"], count, str(row["gaussians"]), *_off(row["largest_error"]))
+    return table
+
+
+def _apollo(one: dict[str, Any]) -> Table:
+    apart = one["gaussians"]
+    shift = ", ".join(f"{100 * value:.1f}" for value in apart["shift_enu_m"])
+    table = _table(
+        f"On Apollo's own map ({apart['compared']} Gaussians compared: {100 * apart['along_normal_m_p50']:.1f} cm apart,"
+        f" shifted by {shift} cm east, north, up)",
+        "scan", "from", "within 10 cm", "along m", "across m", "heading °",
+    )  # fmt: skip
+    for row in one["on_apollos_map"]:
+        table.add_row(
+            str(row["scan"]), f"{row['off_m']} m, {row['off_deg']}°", f"{row['within_10_cm']:.0%}", *_off(row)
+        )
+    return table
+
+
+def _off(error: dict[str, Any] | None) -> list[str]:
+    keys = ("longitudinal_m", "lateral_m", "heading_deg")
+    return ["-"] * len(keys) if error is None else [f"{error[key]:.3f}" for key in keys]
+
+
+def _nagoya(one: dict[str, Any]) -> Table:
+    table = _table(
+        f"{one['poses']} poses over {one['way_m']:.0f} m against the reference, 50 / 95 % / largest m", "fixes", "number",
+        "the fixes", "track, rigid", "track, bent", "heading °",
+    )  # fmt: skip
+    for row in one["by"]:
+        cells = (_three(row[key]) for key in ("fixes_off_m", "rigid_off_m", "off_m", "heading_deg"))
+        table.add_row(row["name"], str(row["fixes"]), *cells)
+    return table
+
+
+def _flexmap(one: dict[str, Any]) -> Table:
+    table = _table(
+        f"{one['poses']} poses over {one['way_m']:.0f} m, distance of GNSS from the track, 50 / 95 % / largest m", "",
+        "fixes used", "fixes held out", "of these in a lane",
+    )  # fmt: skip
+    for name in ("rigid", "bent"):
+        share = f"{one['held_out_in_lanes'][name]:.1%}"
+        table.add_row(name, _three(one["used_m"][name]), _three(one["held_out_m"][name]), share)
+    return table
+
+
+def _three(values: dict[str, float]) -> str:
+    return " / ".join(f"{values[key]:.2f}" for key in ("p50", "p95", "max"))
+
+
+def _pair_of(row: dict[str, Any], first: str, second: str, digits: int) -> str:
+    return f"{row[first]:.{digits}f} / {row[second]:.{digits}f}" if first in row else "-"
+
+
+def _number(value: float | None, digits: int) -> str:
+    return "-" if value is None else f"{value:.{digits}f}"
