@@ -21,13 +21,9 @@ from schemas.drive_mcap import load_track, read_header
 from schemas.trajectory_files import read_kitti, read_tum
 from tile_store.sqlite_store import SqliteStore
 from vehicle_agent.localise_drive.command import ended_by_ctrl_c
+from vehicle_agent.localise_drive.outputs import NAMES
 from vehicle_agent.localise_drive.run import localise_drive
 from vehicle_agent.localise_drive.tiles import StoreMap
-
-FILES = {
-    "poses.tum", "online.tum", "reference.tum", "poses.kitti", "times.txt", "reference.kitti", "poses.mcap",
-    "track.csv", "track.geojson", "health.json", "summary.json", "map.png", "quality.png", "errors.png",
-}  # fmt: skip
 
 
 def offsets_m(found: Trajectory, true: Trajectory) -> np.ndarray:
@@ -37,7 +33,7 @@ def offsets_m(found: Trajectory, true: Trajectory) -> np.ndarray:
 
 
 def test_every_file_is_there_and_every_picture_is_one(ran: Ran) -> None:
-    assert {path.name for path in ran.out.iterdir()} == FILES
+    assert {path.name for path in ran.out.iterdir()} == set(NAMES)
     for path in ran.out.glob("*.png"):
         assert path.read_bytes().startswith(b"\x89PNG\r\n")
 
@@ -136,6 +132,8 @@ def test_the_mcap_holds_all_three_tracks(ran: Ran) -> None:
 
 
 def test_a_drive_without_reference_has_no_errors(ran: Ran, tmp_path: Path) -> None:
+    (tmp_path / "out").mkdir()
+    (tmp_path / "out" / "errors.png").write_bytes(b"of an earlier run")
     bare = changed(ran.drive, tmp_path / "bare.mcap", lambda i: None if isinstance(i, ReferencePose) else i)
     done = localise(
         bare, ran.store, "--out", str(tmp_path / "out"), "--format", "tum,kitti", "--no-plots", "--json", "-"
@@ -146,6 +144,15 @@ def test_a_drive_without_reference_has_no_errors(ran: Ran, tmp_path: Path) -> No
     assert names == {"poses.tum", "online.tum", "poses.kitti", "times.txt", "health.json", "summary.json"}
     refined, same = read_tum(ran.out / "poses.tum"), read_tum(tmp_path / "out" / "poses.tum")
     assert np.array_equal(refined.T_dst_vehicle, same.T_dst_vehicle)
+
+
+def test_poses_of_single_scans_alone_are_others(ran: Ran, tmp_path: Path) -> None:
+    done = localise(ran.drive, ran.store, "--out", str(tmp_path), "--without-submaps", "--no-plots", "--format", "tum")
+    assert done.exit_code == 0, done.output
+    assert json.loads((tmp_path / "summary.json").read_text())["submaps"] is False
+    with_submaps, without = read_tum(ran.out / "poses.tum"), read_tum(tmp_path / "poses.tum")
+    assert len(without) == len(with_submaps)
+    assert not np.array_equal(without.T_dst_vehicle, with_submaps.T_dst_vehicle)
 
 
 def test_a_damaged_recording_keeps_what_came_before(ran: Ran, tmp_path: Path) -> None:

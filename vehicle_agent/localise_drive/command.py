@@ -6,6 +6,7 @@ import sys
 import threading
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from dataclasses import replace
 from pathlib import Path
 from types import FrameType
 from typing import Any
@@ -18,6 +19,7 @@ from tile_store.arguments import parse_time_ns
 from tile_store.sqlite_store import SqliteStore
 from tile_store.values import DEFAULT_LAYER
 from vehicle_agent.errors import LocaliseError
+from vehicle_agent.localise.parameters import LocaliserParameters
 from vehicle_agent.localise_drive.account import print_account, summary
 from vehicle_agent.localise_drive.outputs import FORMATS, make_folder, write_outputs
 from vehicle_agent.localise_drive.run import LocalisedDrive, check_is_drive, localise_drive
@@ -34,11 +36,12 @@ INTERRUPTED = 130
 @click.option("--at", help="The map as it was then: 2026-01-31T12:00:00Z.  [default: now]")
 @click.option("--out", type=click.Path(path_type=Path), help="Folder to write to.  [default: runs/localise-DRIVE]")
 @click.option("--format", "formats", default=",".join(FORMATS), show_default=True, help="Which files of poses.")
+@click.option("--without-submaps", is_flag=True, help="Refined poses from single scans alone.")
 @click.option("--no-plots", is_flag=True, help="Draw no pictures.")
 @click.option("--json", "json_to", metavar="FILE", help="Write the summary to this file, too; - prints it instead.")
 def localise(
-    drive: Path, store: Path, layer: str, at: str | None, out: Path | None, formats: str, no_plots: bool,
-    json_to: str | None,
+    drive: Path, store: Path, layer: str, at: str | None, out: Path | None, formats: str,
+    without_submaps: bool, no_plots: bool, json_to: str | None,
 ) -> None:  # fmt: skip
     """Localise DRIVE (MCAP, see `gnd import`) on the map of a tile store (see `gnd map build`).
 
@@ -51,8 +54,8 @@ def localise(
     with SqliteStore(store, create=False) as opened, ended_by_ctrl_c() as stop:
         tiles = StoreMap(opened, layer, None if at is None else parse_time_ns(at))
         with progress_bar(drive.name) as progress:
-            found = localise_drive(drive, tiles, progress=progress, stop=stop)
-        values = {"map": str(store), "layer": layer, "at": at} | summary(found)
+            found = localise_drive(drive, tiles, _parameters(without_submaps), progress=progress, stop=stop)
+        values = {"map": str(store), "layer": layer, "at": at, "submaps": not without_submaps} | summary(found)
         written = write_outputs(found, values, folder, chosen)
         if not no_plots:
             from vehicle_agent.localise_drive.pictures import draw_pictures  # it loads matplotlib
@@ -62,6 +65,12 @@ def localise(
     _tell(found, values, json_to)
     click.echo(f"{folder}: {', '.join(path.name for path in written)}", err=json_to == "-")
     _end(found, folder, interrupted=interrupted)
+
+
+def _parameters(without_submaps: bool) -> LocaliserParameters:
+    """The defaults, with or without the hierarchical part."""
+    parameters = LocaliserParameters()
+    return replace(parameters, refine=replace(parameters.refine, enabled=not without_submaps))
 
 
 def chosen_formats(text: str) -> tuple[str, ...]:

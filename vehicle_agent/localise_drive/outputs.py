@@ -8,6 +8,9 @@
 | poses.mcap | refined, online, reference: for Foxglove |
 | track.csv, track.geojson | the refined poses on the Earth: for QGIS |
 | health.json, summary.json | always |
+| map.png, quality.png, errors.png | see `pictures` |
+
+Files of these names that an earlier run has left in the folder are removed, so that all belong together.
 """
 
 import json
@@ -27,6 +30,10 @@ from vehicle_agent.localise_drive.geo import csv_text, geojson_text
 from vehicle_agent.localise_drive.run import LocalisedDrive, trajectory_of
 from vehicle_agent.localise_drive.stretches import stretches_of
 
+NAMES: Final = (
+    "poses.tum", "online.tum", "reference.tum", "poses.kitti", "times.txt", "reference.kitti", "poses.mcap",
+    "track.csv", "track.geojson", "health.json", "summary.json", "map.png", "quality.png", "errors.png",
+)  # fmt: skip
 LEVELS: Final = {"good": "info", "degraded": "warning", "lost": "error"}
 
 
@@ -38,6 +45,8 @@ def write_outputs(drive: LocalisedDrive, values: Mapping[str, Any], folder: Path
         TrajectoryError: a file cannot be written.
     """
     make_folder(folder)
+    for name in NAMES:
+        _remove(folder / name)
     written = [path for name in formats for path in FORMATS[name](drive, folder)]
     for name, content in (("health.json", health_json(drive)), ("summary.json", values)):
         write_text(folder / name, json.dumps(content, indent=1) + "\n")
@@ -51,6 +60,13 @@ def make_folder(folder: Path) -> None:
         folder.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise LocaliseError(f"{folder}: cannot make the folder: {error.strerror or error}") from None
+
+
+def _remove(path: Path) -> None:
+    try:
+        path.unlink(missing_ok=True)
+    except OSError as error:
+        raise LocaliseError(f"{path}: cannot remove what an earlier run left: {error.strerror or error}") from None
 
 
 def reference_at(drive: LocalisedDrive, estimates: Sequence[PoseEstimate]) -> Trajectory | None:

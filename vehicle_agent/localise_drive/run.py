@@ -213,12 +213,9 @@ class _Run:
         self._record.moments.append(self._moment(t_ns, way_m))
 
     def _moment(self, t_ns: int, way_m: float) -> Moment:
-        online = self._localiser.online
-        if online is None:
-            return Moment(t_ns, way_m, "lost", "searching")
-        if online.t_ns < t_ns:  # the scan was not matched
-            return Moment(t_ns, way_m, "lost", online.cause if online.health == "lost" else "searching")
-        return Moment(t_ns, way_m, online.health, online.cause, online.degenerate)
+        online, (health, cause) = self._localiser.online, self._localiser.state
+        matched = online is not None and online.t_ns >= t_ns
+        return Moment(t_ns, way_m, health, cause, online.degenerate if online is not None and matched else ())
 
     def _anchored(self, estimate: PoseEstimate) -> PoseEstimate:
         return replace(estimate, T_map_vehicle=self._T_anchor_map @ estimate.T_map_vehicle)
