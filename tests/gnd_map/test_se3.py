@@ -103,3 +103,14 @@ def test_wrong_shapes_are_refused() -> None:
         interpolate_poses(np.array([0, 1]), random_poses(3, 0), [0])
     with pytest.raises(ShapeError, match="length"):
         R_from_quaternion_xyzw([0.0, 0.0, 0.0, 0.0])
+
+
+@pytest.mark.parametrize("angle_rad", [0.0, 1e-13, 1e-9, 1e-4, 0.3, 1.5, 3.0, np.pi - 1e-9, np.pi])
+def test_one_rotation_is_what_many_are(angle_rad: float) -> None:
+    """One and many take different ways, with the same result."""
+    axes = np.random.default_rng(4).normal(size=(20, 3))
+    vectors = angle_rad * axes / np.linalg.norm(axes, axis=1, keepdims=True)
+    many = exp_so3(vectors)
+    one = np.stack([exp_so3(v) for v in vectors])
+    np.testing.assert_allclose(one, many, rtol=0, atol=1e-15)
+    np.testing.assert_allclose(np.stack([log_so3(R) for R in many]), log_so3(many), rtol=0, atol=1e-14)
