@@ -51,14 +51,12 @@ def reproduce_real_localisation(
 def _measured(folder: Path, options: RealLocalisationOptions, out: Path | None, progress: Progress) -> dict[str, Any]:
     if folder.is_dir() and is_flexmap(folder):
         result, drawn = flexmap_of(folder)
-        return {"kind": "track and GNSS without times", **result} | _drawn(
-            out and draw_flexmap(drawn, folder.name, out)
-        )
+        files = [] if out is None else draw_flexmap(drawn, folder.name, out)
+        return {"kind": "track and GNSS without times", **result, "pictures": _names(files)}
     if folder.is_dir() and is_nagoya(folder):
         result, tracks = nagoya_of(folder)
-        return {"kind": "wheel and gyro, GNSS and reference", **result} | _drawn(
-            out and draw_nagoya(folder, tracks, folder.name, out)
-        )
+        files = [] if out is None else draw_nagoya(folder, tracks, folder.name, out)
+        return {"kind": "wheel and gyro, GNSS and reference", **result, "pictures": _names(files)}
     recording, kind = _opened(folder)
     if kind == "apollo" and len(recording) == 2:
         return {"kind": "two scans with poses and Apollo's map", **_pair(folder, recording)}
@@ -71,8 +69,8 @@ def _opened(folder: Path) -> tuple[Recording, str]:
     return open_recording(kind, folder, NOMINAL if kind == "pcd" else None), kind
 
 
-def _drawn(files: list[Path] | None) -> dict[str, Any]:
-    return {"pictures": [path.name for path in files or []]}
+def _names(files: list[Path]) -> list[str]:
+    return [path.name for path in files]
 
 
 def _pair(folder: Path, recording: Recording) -> dict[str, Any]:
@@ -102,5 +100,5 @@ def _scans(
         "left_out": list(recorded.left_out),
         "odometry": compared(tracks, recorded),
         "halves": rows,
-        **_drawn(out and draw_halves(recorded, tracks, halves, out)),
+        "pictures": [] if out is None else _names(draw_halves(recorded, tracks, halves, out)),
     }

@@ -59,7 +59,7 @@ def _odometry(rows: list[dict[str, Any]]) -> Table:
 
 def _localisation(halves: list[dict[str, Any]]) -> Table:
     table = _table(
-        "Localised on the other part, 95 % (largest) of the poses called good", "", "submaps", "good / localised / driven",
+        "Localised on the other part: poses called good, 95 % (largest)", "", "submaps", "good / localised / driven",
         "along m", "across m", "heading °", "against",
     )  # fmt: skip
     for half in halves:
@@ -93,7 +93,8 @@ def _registration(half: dict[str, Any]) -> Table:
 
 def _pair(one: dict[str, Any]) -> Table:
     at = one["place"]
-    title = f"Scan 2 at {at['lat_deg']:.7f}°, {at['lon_deg']:.7f}°, {at['height_m']:.2f} m, heading {at['heading_deg']:.2f}°"
+    where = f"{at['lat_deg']:.7f}°, {at['lon_deg']:.7f}°, {at['height_m']:.2f} m"
+    title = f"Scan 2 lies at {where}, heading {at['heading_deg']:.2f}°"
     table = _table(title, "searched from 2.5 m, any heading", "found", "Gaussians", "along m", "across m", "heading °")
     for row in one["halves"]:
         count = f"{row['found']} of {row['searches']}"
@@ -105,7 +106,7 @@ def _apollo(one: dict[str, Any]) -> Table:
     apart = one["gaussians"]
     shift = ", ".join(f"{100 * value:.1f}" for value in apart["shift_enu_m"])
     table = _table(
-        f"On Apollo's own map ({apart['compared']} Gaussians compared: {100 * apart['along_normal_m_p50']:.1f} cm apart,"
+        f"On Apollo's own map ({apart['compared']} Gaussians, {100 * apart['along_normal_m_p50']:.1f} cm apart (50 %),"
         f" shifted by {shift} cm east, north, up)",
         "scan", "from", "within 10 cm", "along m", "across m", "heading °",
     )  # fmt: skip
@@ -123,8 +124,8 @@ def _off(error: dict[str, Any] | None) -> list[str]:
 
 def _nagoya(one: dict[str, Any]) -> Table:
     table = _table(
-        f"{one['poses']} poses over {one['way_m']:.0f} m against the reference, 50 / 95 % / largest m", "fixes", "number",
-        "the fixes", "track, rigid", "track, bent", "heading °",
+        f"{one['poses']} poses over {one['way_m']:.0f} m against the reference, 50 / 95 % / largest m",
+        "fixes", "number", "the fixes", "track, rigid", "track, bent", "heading °",
     )  # fmt: skip
     for row in one["by"]:
         cells = (_three(row[key]) for key in ("fixes_off_m", "rigid_off_m", "off_m", "heading_deg"))
