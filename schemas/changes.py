@@ -70,9 +70,9 @@ class TileChange:
     evidence: I32
     """(N, 4) rays of each changed voxel: blocked inside n_BI, outside n_BO, in empty n_BE, passed inside n_PI."""
     pose_sigma_m: float
-    """Standard deviation of the refined position."""
+    """Standard deviation of the refined position, in its worst direction, over the scans that saw the tile."""
     pose_sigma_rad: float
-    """Standard deviation of the refined heading."""
+    """Standard deviation of the refined attitude, about its worst axis, over the same scans."""
 
     def __post_init__(self) -> None:
         with refusing(f"change of tile {self.tile}"):

@@ -56,9 +56,9 @@ class TileChange(_message.Message):
     change_class: _builtins.bytes
     """One byte a changed voxel, in the order of `changed`: 0 normal, 1 new, 2 modified, 3 deleted, 4 empty, 5 unmeasured."""
     pose_sigma_m: _builtins.float
-    """Standard deviation of the vehicle's refined position while it saw this tile. [m]"""
+    """Standard deviation of the vehicle's refined position in its worst direction, over the scans that saw this tile. [m]"""
     pose_sigma_rad: _builtins.float
-    """Standard deviation of the vehicle's refined heading while it saw this tile. [rad]"""
+    """Standard deviation of the vehicle's refined attitude about its worst axis, over the scans that saw this tile. [rad]"""
     @_builtins.property
     def evidence(self) -> _containers.RepeatedScalarFieldContainer[_builtins.int]:
         """Four counters of rays a changed voxel, in the order of `changed`: blocked inside, blocked outside, blocked in an

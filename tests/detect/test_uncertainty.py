@@ -13,6 +13,7 @@ from vehicle_agent.detect.detector import ChangeDetector
 from vehicle_agent.detect.parameters import DetectParameterError, DetectParameters, SoftParameters
 from vehicle_agent.detect.uncertainty import PoseUncertainty, TileUncertainties, UncertaintyError
 from vehicle_agent.local_map import LocalMap
+from vehicle_agent.localise.estimates import PoseEstimate
 
 Tiles = dict[TileId, Tile]
 
@@ -42,6 +43,23 @@ def tile_of(points_map_m: F64) -> list[int]:
 def test_of_points_is_the_position_and_the_heading_at_a_lever() -> None:
     assert PoseUncertainty(0.03, 0.002, 20.0).of_points_m == pytest.approx(0.05)
     assert PoseUncertainty(0.03, 0.002).of_points_m == pytest.approx(0.03)
+
+
+def estimate(covariance: F64 | None = None) -> PoseEstimate:
+    return PoseEstimate(0, np.eye(4), 0.02, 0.001, 1.0, "good", covariance=covariance)
+
+
+def test_the_worst_direction_of_the_pose_counts() -> None:
+    assert PoseUncertainty.of(estimate()) == PoseUncertainty(0.02, 0.001)
+    tilted = np.diag([1e-6, 0.01**2, 1e-6, 1e-4, 1e-4, 0.3**2])  # pitch known to 0.01 rad, height to 0.3 m
+    found = PoseUncertainty.of(estimate(tilted))
+    assert (found.sigma_m, found.sigma_rad) == pytest.approx((0.3, 0.01))
+    turned = tilted.copy()
+    R = np.linalg.qr(np.random.default_rng(2).normal(size=(3, 3)))[0]
+    for block in (slice(0, 3), slice(3, 6)):
+        turned[block, block] = R @ tilted[block, block] @ R.T
+    again = PoseUncertainty.of(estimate(turned))
+    assert (again.sigma_m, again.sigma_rad) == pytest.approx((0.3, 0.01))
 
 
 @pytest.mark.parametrize("bad", [(-0.01, 0.0, 0.0), (0.0, float("nan"), 0.0), (0.0, 0.0, float("inf"))])

@@ -21,11 +21,11 @@ class UncertaintyError(VehicleError):
 
 @dataclass(frozen=True, slots=True)
 class PoseUncertainty:
-    """One standard deviation of a position and a heading, and how far away what was seen from there lies.
+    """One standard deviation of a position and an attitude, and how far away what was seen from there lies.
 
     Attributes:
-        sigma_m: of the horizontal position.
-        sigma_rad: of the heading.
+        sigma_m: of the position, in its worst direction.
+        sigma_rad: of the attitude, about its worst axis.
         range_m: root mean square distance of the points; 0 for one pose, whose rays have each their own.
     """
 
@@ -40,12 +40,20 @@ class PoseUncertainty:
 
     @classmethod
     def of(cls, estimate: PoseEstimate) -> "PoseUncertainty":
-        """Return that of one pose."""
-        return cls(estimate.sigma_m, estimate.sigma_rad)
+        """Return that of one pose. A height or a tilt that is known poorly counts as much as a place or a heading: rays
+        then seem to pass the road.
+        """
+        if estimate.covariance is None:
+            return cls(estimate.sigma_m, estimate.sigma_rad)
+        rotation, position = (
+            math.sqrt(max(float(np.linalg.eigvalsh(block)[-1]), 0.0))
+            for block in (estimate.covariance[:3, :3], estimate.covariance[3:, 3:])
+        )
+        return cls(max(position, estimate.sigma_m), max(rotation, estimate.sigma_rad))
 
     @property
     def of_points_m(self) -> float:
-        """Standard deviation of a point at `range_m`: the position's, and the heading's times the lever."""
+        """Standard deviation of a point at `range_m`: the position's, and the attitude's times the lever."""
         return math.hypot(self.sigma_m, self.range_m * self.sigma_rad)
 
 

@@ -28,6 +28,8 @@ class PoseEstimate:
     cause: why the health is what it is; "stale_map" also goes with good health, all else with degraded or lost.
     degenerate: directions that neither the scan nor the map constrains and the pose is dead reckoned along, of
     "longitudinal", "lateral", "vertical", "roll", "pitch", "heading".
+    covariance: (6, 6) of the pose in the vehicle frame, rotation (rad) before position (m); None where only the sigmas
+    are known.
     """
 
     t_ns: int
@@ -38,6 +40,7 @@ class PoseEstimate:
     health: Health
     cause: Cause = "none"
     degenerate: tuple[str, ...] = ()
+    covariance: F64 | None = None
 
 
 @dataclass(frozen=True, slots=True, eq=False)
