@@ -36,7 +36,7 @@ _NAMES: Final = (("longitudinal", "m", 1.0), ("lateral", "m", 1.0), ("heading", 
 _ENLARGED: Final = (("longitudinal", "cm", 100.0), ("lateral", "cm", 100.0), ("heading", "°", 1.0))
 """Name, unit, and how many of it are a metre or a degree."""
 _MUCH: Final = 0.25
-"""Places where more than this share has changed are marked."""
+"""Places where more than this share has changed are marked: dark in the strip, between dotted lines below."""
 _GAP: Final = 3.5  # a line is broken where more than this many scans have no pose
 
 
@@ -55,9 +55,9 @@ _SUBMAPS: Final = (
     Curve("with_submap", "with submap", _RED),
 )
 _UPDATE: Final = (
-    Curve("fresh", "online, fresh map", _GREY, 1.0),
     Curve("online", "online, outdated map", _BROWN),
     Curve("after_update", "online, updated map", _RED),
+    Curve("fresh", "online, fresh map", _GREY, 1.0),
 )
 _PICTURES: Final = (
     ("submaps", "Localisation in a changed world, final poses", _SUBMAPS),
@@ -113,30 +113,33 @@ def _draw(
     """Draw three rows of errors, against the limits on the left and enlarged on the right."""
     figure = Figure(figsize=(13.0, 8.4), dpi=130, facecolor="white")
     grid = figure.add_gridspec(
-        4, 2, height_ratios=(0.28, 1, 1, 1), left=0.06, right=0.985, top=0.835, bottom=0.065, hspace=0.14, wspace=0.12
+        4, 2, height_ratios=(0.28, 1, 1, 1), left=0.06, right=0.985, top=0.835, bottom=0.065, hspace=0.14, wspace=0.14
     )
     for column, titled in enumerate(("against the limits; numbers: 95 % / largest", "enlarged")):
         top = figure.add_subplot(grid[0, column])
-        _draw_share(top, share)
+        _draw_share(top, share, named=column == 0)
         top.set_title(titled, fontsize=11, color=_INK, loc="left", weight="bold")
         for quantity in range(3):
             axes = figure.add_subplot(grid[quantity + 1, column], sharex=top)
             _draw_errors(axes, series, quantity, start_ns, enlarged=column == 1)
-            _shade_changes(axes, share)
+            _mark_changes(axes, share)
             axes.tick_params(labelbottom=quantity == 2)
         axes.set_xlabel("seconds since the drive began", color=_INK)
+    figure.align_ylabels()
     _legend(figure, series)
     figure.text(0.025, 0.965, head[0], fontsize=16, weight="bold", color=_INK, va="center")
     figure.text(0.025, 0.930, head[1], fontsize=10, color=_PALE, va="center")
     save_figure(figure, path)
 
 
-def _draw_share(axes: Axes, share: tuple[F64, F64]) -> None:
+def _draw_share(axes: Axes, share: tuple[F64, F64], *, named: bool) -> None:
+    """Draw the share of what is near that has changed."""
     t_s, changed = share
-    axes.fill_between(t_s, 100 * changed, color=_PURPLE, alpha=0.55, linewidth=0)
+    axes.fill_between(t_s, 100 * changed, color=_PURPLE, alpha=0.3, linewidth=0)
+    axes.fill_between(t_s, 100 * changed, where=changed > _MUCH, color=_PURPLE, alpha=0.6, linewidth=0)
     axes.set_xlim(t_s[0], t_s[-1])
     axes.set_ylim(0, max(100 * float(changed.max(initial=0.0)) * 1.15, 10))
-    axes.set_ylabel(f"changed\n≤ {NEAR_M:g} m, %", color=_INK, fontsize=8)
+    axes.set_ylabel(f"changed\n≤ {NEAR_M:g} m, %" if named else "", color=_INK, fontsize=8)
     axes.tick_params(labelbottom=False, colors=_INK, labelsize=8)
     _spines(axes)
 
@@ -171,15 +174,15 @@ def _broken(t_s: F64, error: F64) -> tuple[F64, F64]:
 
 def _range(reach: float, largest: float, *, enlarged: bool) -> tuple[float, float]:
     """Limits of the axis: the requirement's and somewhat more, or what the lines fill."""
-    size = max(1.12 * reach, 0.01 * largest) if enlarged else 1.15 * max(largest, min(reach, 3 * largest))
+    size = max(1.12 * reach, 0.01 * largest) if enlarged else 1.32 * max(largest, min(reach, 3 * largest))
     return -size, size
 
 
-def _shade_changes(axes: Axes, share: tuple[F64, F64]) -> None:
+def _mark_changes(axes: Axes, share: tuple[F64, F64]) -> None:
+    """Dotted lines where places begin and end that have changed much."""
     t_s, changed = share
-    axes.fill_between(
-        t_s, 0, 1, where=changed > _MUCH, transform=axes.get_xaxis_transform(), color=_PURPLE, alpha=0.12, linewidth=0
-    )
+    for index in np.flatnonzero(np.diff(changed > _MUCH)):
+        axes.axvline((t_s[index] + t_s[index + 1]) / 2, color=_PURPLE, linewidth=1.1, linestyle=":", zorder=2)
 
 
 def _write_errors(axes: Axes, series: Mapping[Curve, PoseSeries], quantity: int) -> None:
@@ -188,7 +191,9 @@ def _write_errors(axes: Axes, series: Mapping[Curve, PoseSeries], quantity: int)
     scale, unit = (1.0, unit) if unit == "°" else (100.0, "cm")
     for number, (curve, one) in enumerate(series.items()):
         error = one.quantiles()[f"{name}_{'deg' if unit == '°' else 'm'}"]
-        text = "no pose" if error is None else f"{scale * error['p95']:.2f} / {scale * error['max']:.2f} {unit}"
+        digits = 3 if unit == "°" else 2
+        numbers = () if error is None else (scale * error["p95"], scale * error["max"])
+        text = " / ".join(f"{value:.{digits}f}" for value in numbers) + f" {unit}" if numbers else "no pose"
         x = 0.995 - 0.2 * (len(series) - 1 - number)
         axes.text(x, 0.965, text, transform=axes.transAxes, ha="right", va="top", fontsize=8.5, color=curve.colour)
 
