@@ -1,172 +1,168 @@
-"""How fast and how well scans find their place: simulated scans of the first street, one thread.
+"""How fast and how well scans find their place: simulated scans of the first street, time of one core.
 
-`registration` starts 0.3 m and 1° off, downsampling of the scan included; small_gicp gets the same scans and starts,
-its own downsampling (0.25 m) and a target of the mapping drive's points: 1 m voxels (VGICP) or points at 0.2 m (GICP).
-Both see the street before it changed. `localisation` is the whole localiser (first search, sampling, deskewing,
-matching, pose graph, the final points of every scan) on a drive along the whole street after it changed, with sensor
-errors, parked cars and the map from before.
+`registration` is a single scan on the map, from three distances (`benchmarks.registering`). `online` is the whole
+localiser on a drive along the street after it changed, with sensor errors, parked cars and the map from before: the
+time until the online pose of a scan is known, and its parts; what comes later (submaps, the final points of a scan) is
+counted apart. `odometry` matches scans with scans only, no map: ours with and KISS-ICP without wheels and gyro.
 """
 
-from collections.abc import Callable
+from collections.abc import Iterator
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from time import perf_counter
+from time import process_time
 
 import numpy as np
-import small_gicp
 
 from benchmarks.figures import Figure
-from fleet_sim.drives import PERFECT, DriveConfig, simulate_drive
-from fleet_sim.street import street
-from gnd_map.accumulate import VoxelAccumulator
+from benchmarks.localisation_scenes import mapped_street, newest_of, push, reference_of, true_scans
+from benchmarks.odometry_alone import steps_of
+from benchmarks.registering import registrations
+from benchmarks.stopwatch import Stopwatch
+from fleet_sim.drives import DriveConfig, simulate_drive
 from gnd_map.arrays import F64
-from gnd_map.grid import GridFrame
-from gnd_map.motion import Trajectory, deskew
-from gnd_map.se3 import T_from_R_t, T_inverse, exp_so3, transform
-from gnd_map.tile import Tile
-from gnd_map.tile_id import covering_corridor
-from schemas.drive import DriveItem, GnssFix, MotionSample, Scan
-from schemas.drive_mcap import load_track, read_drive, read_header
+from gnd_map.motion import Trajectory
+from gnd_map.se3 import T_inverse
+from schemas.drive import Scan
+from schemas.drive_mcap import read_drive, read_header
 from vehicle_agent.local_map import LocalMap
-from vehicle_agent.localise import Localiser, RefinedScan, localisation_error
-from vehicle_agent.localise.match_map import MatchMapCache
-from vehicle_agent.localise.parameters import LocaliserParameters
-from vehicle_agent.localise.registration import register
-from vehicle_agent.localise.sampling import sample_scan
+from vehicle_agent.localise import Localiser, PoseEstimate, localisation_error, localiser
+from vehicle_agent.localise.graph import PoseGraph
+from vehicle_agent.localise.judge import Judge
+from vehicle_agent.localise.packed_scan import PackedScan
+from vehicle_agent.localise.refine import Refiner
+from vehicle_agent.localise.scan_odometry import ScanOdometry
 
 COMMAND = "python -m benchmarks localisation"
-SEED, SCANS, EVERY = 1, 60, 3
-MAPPING = DriveConfig("map", "HDL-32E", "before", errors=PERFECT, car_share=0.0, cruise_mps=12.0)
-Aligner = Callable[[F64, F64], F64]  # points in the vehicle frame and a start to T_map_vehicle
+SENSORS = ("VLP-16", "HDL-32E", "HDL-64E", "Scala")
+SCANS, EVERY = 60, 4
+PARTS = (
+    ("sampling", localiser, "sample_scan"),
+    ("deskewing", localiser, "deskew"),
+    ("scan to scan", ScanOdometry, "step"),
+    ("registration", localiser, "register"),
+    ("judging", Judge, "see"),
+    ("graph", PoseGraph, "add"),
+    ("graph", PoseGraph, "smoothed"),
+    ("packing", localiser, "pack"),
+    ("submaps", Refiner, "push"),
+    ("final points", PackedScan, "placed"),
+)
+LATER = ("submaps", "final points")
 
 
 def run() -> list[Figure]:
-    """Measure both sensors of the simulations."""
+    """Measure the four sensors."""
     figures: list[Figure] = []
     with TemporaryDirectory() as folder:
-        path, world = Path(folder) / "drive.mcap", street(SEED)
-        points, local_map = _map_of(simulate_drive(world, MAPPING, path))
-        for sensor in ("VLP-16", "HDL-32E"):
+        path = Path(folder) / "drive.mcap"
+        world, points, local_map = mapped_street(Path(folder))
+        for sensor in SENSORS:
             unchanged = DriveConfig("car", sensor, "before", seed=1, car_share=0.0, scans=SCANS)
-            figures += _registrations(sensor, simulate_drive(world, unchanged, path), points, local_map)
+            scans = list(true_scans(simulate_drive(world, unchanged, path)))[::EVERY]
+            figures += registrations(sensor, scans, points, local_map)
             changed = DriveConfig("car", sensor, "after", seed=2, cruise_mps=12.0)
-            figures.append(_localisation(sensor, simulate_drive(world, changed, path), local_map))
+            simulate_drive(world, changed, path)
+            figures += _online(sensor, path, local_map)
+            figures += _odometry(sensor, path)
     return figures
 
 
-def _registrations(sensor: str, path: Path, points: F64, local_map: LocalMap) -> list[Figure]:
-    scans = _true_scans(path)[::EVERY]
-    aligners = {"ours": _ours(local_map), "small_gicp VGICP": _vgicp(points), "small_gicp GICP": _gicp(points)}
-    return [_registration(f"registration, {sensor}, {name}", align, scans) for name, align in aligners.items()]
-
-
-def _registration(name: str, align: Aligner, scans: list[tuple[F64, F64]]) -> Figure:
-    """Median time and error over the scans, each from a start that is 0.3 m and 1° off."""
-    rng = np.random.default_rng(0)
-    align(*scans[0])
-    times_s, off_m = [], []
-    for points, T_true in scans:
-        start = T_true @ _offset(rng)
-        begin_s = perf_counter()
-        T = align(points, start)
-        times_s.append(perf_counter() - begin_s)
-        off_m.append(float(np.linalg.norm((T_inverse(T_true) @ T)[:3, 3])))
-    found = np.mean(np.array(off_m) < 0.1)
-    detail = f"median error {np.median(off_m) * 100:.2f} cm, {found:.0%} within 10 cm, {len(scans)} scans"
-    return Figure(name, float(np.median(times_s)) * 1e3, "ms/scan", detail)
-
-
-def _offset(rng: np.random.Generator) -> F64:
-    axis, direction = rng.normal(size=3), rng.normal(size=3)
-    turn = np.radians(1.0) * axis / np.linalg.norm(axis)
-    return T_from_R_t(exp_so3(turn), 0.3 * direction / np.linalg.norm(direction))
-
-
-def _ours(local_map: LocalMap) -> Aligner:
-    parameters = LocaliserParameters()
-    cache = MatchMapCache(local_map, parameters.registration.noise_m)
-
-    def align(points: F64, start: F64) -> F64:
-        chosen = sample_scan(points, parameters.sampling)
-        return register(points[chosen], start, cache.near(start[:3, 3]), parameters.registration, "wide").T_map_vehicle
-
-    return align
-
-
-def _vgicp(map_points: F64) -> Aligner:
-    target = small_gicp.GaussianVoxelMap(1.0)
-    target.set_lru(horizon=1_000_000, clear_cycle=1_000_000)
-    target.insert(small_gicp.preprocess_points(map_points, downsampling_resolution=0.2)[0])
-
-    def align(points: F64, start: F64) -> F64:
-        cloud, _ = small_gicp.preprocess_points(points, downsampling_resolution=0.25)
-        return np.asarray(small_gicp.align(target, cloud, init_T_target_source=start).T_target_source)
-
-    return align
-
-
-def _gicp(map_points: F64) -> Aligner:
-    target, tree = small_gicp.preprocess_points(map_points, downsampling_resolution=0.2)
-
-    def align(points: F64, start: F64) -> F64:
-        cloud, _ = small_gicp.preprocess_points(points, downsampling_resolution=0.25)
-        return np.asarray(small_gicp.align(target, cloud, tree, init_T_target_source=start).T_target_source)
-
-    return align
-
-
-def _localisation(sensor: str, path: Path, local_map: LocalMap) -> Figure:
-    """The whole localiser over a drive."""
-    items = list(read_drive(path))
-    localiser = Localiser(local_map, read_header(path).T_vehicle_lidar)
-    begin_s = perf_counter()
-    estimates = [scan.estimate for item in items for scan in _push(localiser, item)]
-    estimates += [scan.estimate for scan in localiser.flush()]
-    spent_s = perf_counter() - begin_s
-    error = localisation_error(estimates, _reference(path))
-    detail = (
-        f"95 %: {error.longitudinal_p95_m * 100:.1f} cm along, {error.lateral_p95_m * 100:.1f} cm across,"
+def _online(sensor: str, path: Path, local_map: LocalMap) -> list[Figure]:
+    """The localiser over a drive: a step's time and its parts."""
+    _drive(path, local_map, Stopwatch())  # compiles
+    watch = Stopwatch()
+    steps_s, estimates = _drive(path, local_map, watch)
+    error = localisation_error(estimates, reference_of(path))
+    accuracy = (
+        f"95 % below {np.quantile(steps_s, 0.95) * 1e3:.1f}, longest {max(steps_s) * 1e3:.1f} ms; online pose, 95 %:"
+        f" {error.longitudinal_p95_m * 100:.1f} cm along, {error.lateral_p95_m * 100:.1f} cm across,"
         f" {error.heading_p95_deg:.3f}°; {error.n} scans"
     )
-    return Figure(f"localisation, {sensor}, changed street", len(estimates) / spent_s, "scans/s", detail)
-
-
-def _push(localiser: Localiser, item: DriveItem) -> list[RefinedScan]:
-    if isinstance(item, MotionSample):
-        localiser.push_motion(item)
-    elif isinstance(item, GnssFix):
-        localiser.push_gnss(item)
-    elif isinstance(item, Scan):
-        return localiser.push_scan(item)
-    return []
-
-
-def _reference(path: Path) -> Trajectory:
-    track = load_track(path).reference
-    return Trajectory(track.t_ns, track.T_map_vehicle)
-
-
-def _true_scans(path: Path) -> list[tuple[F64, F64]]:
-    """(points in the vehicle frame, true pose) of each scan, sweep motion removed."""
-    reference, T_vehicle_lidar = _reference(path), read_header(path).T_vehicle_lidar
+    mean_ms = float(np.mean(steps_s)) * 1e3
+    parts = {name: 1e3 * spent_s / len(steps_s) for name, spent_s in watch.total_s.items()}
+    rest_ms = mean_ms - sum(ms for name, ms in parts.items() if name not in LATER)
+    detail = [Figure(f"  {name}, {sensor}", ms, "ms/scan", "later" * (name in LATER)) for name, ms in parts.items()]
     return [
-        (
-            deskew(scan.points_m, scan.t_offset_ns, scan.t_ns, reference, T_vehicle_lidar, scan.t_ns),
-            reference.at(scan.t_ns),
-        )
-        for scan in read_drive(path)
-        if isinstance(scan, Scan)
+        Figure(f"online step, {sensor}, changed street", mean_ms, "ms/scan", accuracy),
+        *detail,
+        Figure(f"  the rest, {sensor}", rest_ms, "ms/scan"),
     ]
 
 
-def _map_of(path: Path) -> tuple[F64, LocalMap]:
-    """All points of a mapping drive in the map frame, and their Gaussians."""
-    frame, reference = read_header(path).anchor, _reference(path)
-    lat, lon, _ = frame.geodetic_from_enu(reference.T_dst_vehicle[:, :3, 3])
-    grid_frame = GridFrame.around(frame, covering_corridor(lat, lon, 70.0))
-    points = np.concatenate([transform(T, near[np.linalg.norm(near, axis=1) < 70.0]) for near, T in _true_scans(path)])
-    accumulator, local_map = VoxelAccumulator(grid_frame), LocalMap(grid_frame)
-    accumulator.add(points)
-    for tile_id, gaussians in accumulator.finish().items():
-        local_map.set_tile(Tile(tile_id, 1, gaussians))
-    return points, local_map
+def _drive(path: Path, local_map: LocalMap, watch: Stopwatch) -> tuple[list[float], list[PoseEstimate]]:
+    """Time of each online step (since the scan before, less what comes later), and the online poses."""
+    localising, estimates = Localiser(local_map, read_header(path).T_vehicle_lidar), list[PoseEstimate]()
+    steps_s, before_s, spent_s = [], 0.0, 0.0
+    with watch.worn(PARTS):
+        for item in read_drive(path):
+            begin_s = process_time()
+            push(localising, item)
+            spent_s += process_time() - begin_s
+            if isinstance(item, Scan):
+                online_s = spent_s - sum(watch.total_s[name] for name in LATER)
+                steps_s.append(online_s - before_s)
+                before_s = online_s
+            newest_of(localising, estimates)
+    return steps_s, estimates
+
+
+# --- odometry --------------------------------------------------------------------------------------------------------
+
+
+def _odometry(sensor: str, path: Path) -> list[Figure]:
+    """Ours, timed within the localiser without a map, and KISS-ICP on the same scans."""
+    return [_ours(sensor, path), _kiss(sensor, path)]
+
+
+def _ours(sensor: str, path: Path) -> Figure:
+    reference = reference_of(path)
+    track, ms = steps_of(path)
+    return Figure(f"odometry, {sensor}, scan to scan", ms, "ms/scan", _drift(track, reference))
+
+
+def _kiss(sensor: str, path: Path) -> Figure:
+    name = f"odometry, {sensor}, KISS-ICP"
+    try:
+        from kiss_icp.config import load_config
+        from kiss_icp.kiss_icp import KissICP
+    except ImportError:
+        return Figure(name, float("nan"), "ms/scan", "not installed (extra `benchmarks`)")
+    config = load_config(None)
+    config.registration.max_num_threads, config.data.max_range, config.mapping.voxel_size = 1, 100.0, 1.0
+    engine, T_vehicle_lidar = KissICP(config), read_header(path).T_vehicle_lidar
+    poses, times_ns, times_s = [], [], []
+    for scan in _scans(path):
+        points, offset = scan.points_m.astype(np.float64), scan.t_offset_ns.astype(np.float64)
+        begin_s = process_time()
+        engine.register_frame(points, offset)
+        times_s.append(process_time() - begin_s)
+        poses.append(T_vehicle_lidar @ engine.last_pose @ T_inverse(T_vehicle_lidar))
+        times_ns.append(scan.t_ns + int(scan.t_offset_ns.max()) // 2)
+    track = Trajectory(np.array(times_ns, np.int64), np.stack(poses))
+    return Figure(name, float(np.median(times_s)) * 1e3, "ms/scan", _drift(track, reference_of(path)))
+
+
+def _scans(path: Path) -> Iterator[Scan]:
+    return (item for item in read_drive(path) if isinstance(item, Scan))
+
+
+def _drift(track: Trajectory, reference: Trajectory) -> str:
+    """Error at the end of each stretch of 60 m, in the frame of its start, and of each step."""
+    within = (track.t_ns >= reference.t_ns[0]) & (track.t_ns <= reference.t_ns[-1])
+    T, T_true = track.T_dst_vehicle[within], reference.at(track.t_ns[within])
+    way_m = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(T_true[:, :3, 3], axis=0), axis=1))])
+    first = np.flatnonzero(way_m + 60.0 <= way_m[-1])
+    ends = _relative_error(T, T_true, first, np.searchsorted(way_m, way_m[first] + 60.0))
+    steps = _relative_error(T, T_true, np.arange(len(T) - 1), np.arange(1, len(T)))
+    rms_m, rms_deg = np.sqrt((ends**2).mean(axis=0))
+    return (
+        f"after 60 m {rms_m * 100:.1f} cm, {rms_deg:.3f}° (root mean square);"
+        f" a step {np.median(steps[:, 0]) * 100:.2f} cm; {len(T)} scans"
+    )
+
+
+def _relative_error(T: F64, T_true: F64, first: np.ndarray, last: np.ndarray) -> F64:
+    """(K, 2) horizontal metres and degrees of heading by which motions from `first` to `last` are off."""
+    off = T_inverse(T_inverse(T_true[first]) @ T_true[last]) @ (T_inverse(T[first]) @ T[last])
+    heading = np.degrees(np.abs(np.arctan2(off[:, 1, 0], off[:, 0, 0])))
+    return np.column_stack([np.hypot(off[:, 0, 3], off[:, 1, 3]), heading])
