@@ -79,9 +79,10 @@ def draw_flexmap(drawn: Drawn, name: str, folder: Path) -> list[Path]:
     figure = Figure(figsize=(16.0, 8.5), layout="constrained")
     whole, near = figure.subplots(1, 2)
     fixes = drawn.fixes.enu_m(drawn.bent.frame)
+    rigid = (drawn.bent.frame.T_self_other(drawn.rigid.frame) @ drawn.rigid.track.T_dst_vehicle)[:, :3, 3]
     for axes in (whole, near):
         axes.add_collection(PolyCollection(list(drawn.lanes), facecolor="#dfe5ec", edgecolor=MAP, lw=0.5))
-        axes.plot(*_xy(drawn.rigid), "-", color=COLOURS[1], lw=1.0, label="track, rigid")
+        axes.plot(rigid[:, 0], rigid[:, 1], "-", color=COLOURS[1], lw=1.0, label="track, rigid")
         axes.plot(*_xy(drawn.bent), "-", color=COLOURS[0], lw=1.2, label="track, bent")
         for chosen, colour, label in ((~drawn.held_out, COLOURS[2], "used"), (drawn.held_out, INK, "held out")):
             axes.plot(fixes[chosen, 0], fixes[chosen, 1], ".", color=colour, ms=2.0, label=f"GNSS, {label}")
@@ -103,7 +104,8 @@ def draw_nagoya(source: Path, tracks: dict[str, Georeferenced], name: str, folde
     above.plot(p[:, 0], p[:, 1], "-", color=INK, lw=3.0, alpha=0.35, label="reference")
     for colour, (label, found) in zip(COLOURS, tracks.items(), strict=False):
         at = np.isin(whole.t_ns, found.track.t_ns)
-        above.plot(*_xy(found), "-", color=colour, lw=1.0, label=label)
+        p = (frame.T_self_other(found.frame) @ found.track.T_dst_vehicle)[:, :3, 3]
+        above.plot(p[:, 0], p[:, 1], "-", color=colour, lw=1.0, label=label)
         off = track_off(found, whole.chosen(np.flatnonzero(at)))
         errors.semilogy(
             (found.track.t_ns - whole.t_ns[0]) * 1e-9, np.maximum(off, 1e-3), color=colour, lw=0.9, label=label

@@ -20,10 +20,10 @@ def print_tables(found: dict[str, Any], console: Console | None = None) -> None:
 
 def _tables(one: dict[str, Any]) -> list[Table]:
     if "odometry" in one:
-        halves = [_registration(half) for half in one["halves"]]
+        halves = [_registration(half) for half in one["halves"] if half["registration"]]
         return [_odometry(one["odometry"]), _localisation(one["halves"]), *halves]
     if "on_apollos_map" in one:
-        return [_pair(one), _apollo(one)]
+        return [_pair(one), *(_registration(half) for half in one["halves"]), _apollo(one)]
     if "by" in one:
         return [_nagoya(one)]
     return [_flexmap(one)]
@@ -95,10 +95,13 @@ def _pair(one: dict[str, Any]) -> Table:
     at = one["place"]
     where = f"{at['lat_deg']:.7f}°, {at['lon_deg']:.7f}°, {at['height_m']:.2f} m"
     title = f"Scan 2 lies at {where}, heading {at['heading_deg']:.2f}°"
-    table = _table(title, "searched from 2.5 m, any heading", "found", "Gaussians", "along m", "across m", "heading °")
-    for row in one["halves"]:
-        count = f"{row['found']} of {row['searches']}"
-        table.add_row(row["name"], count, str(row["gaussians"]), *_off(row["largest_error"]))
+    table = _table(
+        title, "searched from 2.5 m, any heading", "sure", "Gaussians", "these off m, m, °", "all off m, m, °"
+    )
+    for row in one["searches"]:
+        count = f"{row['sure']} of {row['searches']}"
+        off = (", ".join(_off(row[key])) for key in ("largest_error_sure", "largest_error"))
+        table.add_row(row["name"], count, str(row["gaussians"]), *off)
     return table
 
 
