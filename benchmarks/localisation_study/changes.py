@@ -24,10 +24,10 @@ def changed_share_along(world: World, truth: Truth, drive: DriveConfig) -> tuple
     ellipsoids = ellipsoids_of_truth(truth)
     changed = ellipsoids.change_class != int(ChangeClass.NORMAL)
     way_m = simulation.motion.T_map_vehicle(t_s)[:, :2, 3]
-    return t_s, _share_near(ellipsoids.mean_m[:, :2], changed, way_m)
+    return t_s, share_near(ellipsoids.mean_m[:, :2], changed, way_m)
 
 
-def _share_near(p_m: F64, changed: NDArray[np.bool_], way_m: F64) -> F64:
+def share_near(p_m: F64, changed: NDArray[np.bool_], way_m: F64) -> F64:
     """Share (K,) of the points (M, 2) near each place (K, 2) that are marked; 0 where there is none."""
     near = cKDTree(p_m).query_ball_point(way_m, NEAR_M)
     return np.array([changed[index].mean() if index else 0.0 for index in near])

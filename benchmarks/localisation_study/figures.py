@@ -152,7 +152,7 @@ def _draw_errors(
     axes.axhspan(-largest, largest, color=_YELLOW, linewidth=0, zorder=0)
     axes.axhspan(-p95, p95, color=_GREEN, linewidth=0, zorder=0)
     for curve, one in series.items():
-        t_s, error = _broken(1e-9 * (one.t_ns - start_ns).astype(np.float64), size * one.error[:, quantity])
+        t_s, error = broken(1e-9 * (one.t_ns - start_ns).astype(np.float64), size * one.error[:, quantity])
         axes.plot(t_s, error, color=curve.colour, linewidth=curve.width, zorder=3, solid_joinstyle="round")
     reach = size * max((float(np.abs(one.error[:, quantity]).max(initial=0.0)) for one in series.values()), default=0.0)
     axes.set_ylim(*_range(reach, largest, enlarged=enlarged))
@@ -164,7 +164,7 @@ def _draw_errors(
     _spines(axes)
 
 
-def _broken(t_s: F64, error: F64) -> tuple[F64, F64]:
+def broken(t_s: F64, error: F64) -> tuple[F64, F64]:
     """The line with gaps where poses are missing."""
     if len(t_s) < 3:
         return t_s, error

@@ -13,7 +13,7 @@ from benchmarks.simulation.base_map import BaseMap
 from benchmarks.simulation.streams import first_fix
 from gnd_map.arrays import F64
 from gnd_map.motion import Trajectory
-from schemas.drive import DriveHeader, DriveItem, GnssFix, ReferencePose
+from schemas.drive import DriveHeader, DriveItem, GnssFix, ReferencePose, Scan
 from vehicle_agent.localise.parameters import LocaliserParameters
 
 GNSS_M: Final = 2.5
@@ -85,6 +85,7 @@ def _drive(vehicle: Vehicle, items: Iterator[DriveItem]) -> int:
     for item in items:
         if good_ns is not None and item.t_ns - good_ns > WATCHED_S * 1e9:
             break
+        vehicle.scans += isinstance(item, Scan)
         vehicle.push(item)
         if good_ns is None and vehicle.online and vehicle.online[-1].health == "good":
             good_ns = item.t_ns
