@@ -14,7 +14,7 @@ from vehicle_agent.localise.match_map import MatchMap
 from vehicle_agent.localise.parameters import LocaliserParameters
 from vehicle_agent.localise.registration import RegistrationResult, fit_of
 from vehicle_agent.localise.scan_pool import ScanPool
-from vehicle_agent.localise.witness import testify
+from vehicle_agent.localise.witness import witnessed
 
 F64 = NDArray[np.float64]
 
@@ -82,7 +82,7 @@ class Judge:
             return
         self._witness_ns, self._way_m = scan.t_ns, 0.0
         below_m = ground_below(scan.points_m)
-        self.monitor.see_testimony(testify(scan.points_m, self._origin_m, below_m, scan.T_now, match_map, par))
+        self.monitor.see_testimony(witnessed(scan.points_m, self._origin_m, below_m, scan.T_now, match_map, par))
 
     def _challenge(self, scan: Matched, new: bool, match_map: MatchMap) -> None:
         par = self._par.challenge

@@ -71,7 +71,7 @@ def _share(counts: I64, part: int, whole: int) -> float:
     return float(counts[:, part].sum() / max(int(counts[:, whole].sum()), 1))
 
 
-def testify(
+def witnessed(
     points_m: F64, origin_m: F64, ground_below_m: float, T_map_vehicle: F64, match_map: MatchMap,
     parameters: WitnessParameters,
 ) -> Testimony:  # fmt: skip
