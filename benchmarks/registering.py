@@ -66,7 +66,10 @@ def _registration(name: str, align: Aligner, scans: Sequence[tuple[F64, F64]], m
     found = (off[:, 0] < CONVERGED_M) & (off[:, 1] < CONVERGED_DEG)
     m, deg = np.median(off[found], axis=0) if found.any() else (np.nan, np.nan)
     whole_ms, match_ms = np.median(times_s, axis=0) * 1e3
-    detail = f"matching alone {match_ms:.1f} ms; {found.mean():.0%} converged, of these median error {m * 100:.2f} cm, {deg:.3f}°; {len(scans)} scans"
+    detail = (
+        f"matching alone {match_ms:.1f} ms; {found.mean():.0%} converged, of these median error {m * 100:.2f} cm,"
+        f" {deg:.3f}°; {len(scans)} scans"
+    )
     return Figure(name, float(whole_ms), "ms/scan", detail)
 
 
