@@ -22,7 +22,7 @@ _FLAT: Final = 0.1
 _LEVEL, _UPRIGHT = 0.9, 0.35
 """Vertical part of the normal of ground, and of walls."""
 _DOTS_A_PIXEL: Final = 6.0
-_MAX_DOTS: Final = 400
+_MAX_DOTS: Final = 1200
 _FULL: Final = 4.0
 """So many dots fill a pixel."""
 _GOLDEN_ANGLE: Final = np.pi * (3.0 - np.sqrt(5.0))
@@ -72,16 +72,19 @@ class MapRaster:
         return image
 
     def _draw(self, kind: int, centre_m: F64, cov_m2: F64) -> None:
-        """Scatter dots evenly over ellipses of N covariances (N, 2, 2)."""
-        dots = np.clip(round(_DOTS_A_PIXEL / self.pixel_m**2), int(_FULL), _MAX_DOTS)
+        """Scatter dots evenly over ellipses of N covariances (N, 2, 2); where they are few, each counts more."""
+        dots = int(np.clip(round(_DOTS_A_PIXEL / self.pixel_m**2), int(_FULL), _MAX_DOTS))
         values, vectors = np.linalg.eigh(cov_m2)
         root = vectors * np.sqrt(np.maximum(values, 0.0))[:, None, :]
-        at = centre_m[:, None, :] + _SIGMAS * disc(int(dots)) @ np.swapaxes(root, 1, 2)
+        at = centre_m[:, None, :] + _SIGMAS * disc(dots) @ np.swapaxes(root, 1, 2)
         pixel = np.floor((at.reshape(-1, 2) - [self.left_m, self.bottom_m]) / self.pixel_m).astype(np.int64)
         rows, columns = self.shape
         inside = (pixel >= 0).all(axis=1) & (pixel[:, 0] < columns) & (pixel[:, 1] < rows)
         flat = pixel[inside, 1] * columns + pixel[inside, 0]
-        self._dots[kind] += np.bincount(flat, minlength=rows * columns).reshape(self.shape).astype(np.float32)
+        area_pixels = np.pi * _SIGMAS**2 * np.sqrt(np.maximum(values.prod(axis=1), 0.0)) / self.pixel_m**2
+        weight = np.repeat(np.maximum(1.0, _FULL * area_pixels / dots), dots)[inside]
+        drawn = np.bincount(flat, weight, minlength=rows * columns)
+        self._dots[kind] += drawn.reshape(self.shape).astype(np.float32)
 
 
 def disc(n: int) -> F64:
