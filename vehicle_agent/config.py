@@ -47,7 +47,9 @@ class ReportParameters:
     longest_m: float = 300.0
     """A district's changes are reported at the latest after this much way."""
     max_sigma_m: float = 0.15
-    """Scans whose refined position is less certain are no evidence."""
+    """Scans whose refined position is less certain (in its worst direction) are no evidence."""
+    max_sigma_rad: float = 0.02
+    """The same for the attitude: about its worst axis, 40 cm at 20 m."""
     drain_s: float = 120.0
     """At the end of a drive the agent waits this long for its reports to be acknowledged."""
 

@@ -77,13 +77,13 @@ class Reporter:
     def add_scan(self, segmented: SegmentedScan) -> None:
         """Count the scan's rays, if its pose is good enough to speak about the world."""
         scan, estimate = segmented.scan, segmented.scan.estimate
-        if estimate.health != "good" or estimate.sigma_m > self._parameters.max_sigma_m:
+        pose, most = PoseUncertainty.of(estimate), self._parameters
+        if estimate.health != "good" or pose.sigma_m > most.max_sigma_m or pose.sigma_rad > most.max_sigma_rad:
             self.counts["scans_uncertain"] += 1
             return
         self.counts["scans_used"] += 1
         self.counts["points"] += len(segmented.moving)
         self.counts["moving_points"] += int(segmented.moving.sum())
-        pose = PoseUncertainty.of(estimate)
         self.counts["rays"] += self._detector.add_scan(scan.points_map_m, scan.origins_map_m, segmented.moving, pose)
         self._lengthen(scan.t_ns)
 

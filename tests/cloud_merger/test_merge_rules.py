@@ -1,5 +1,7 @@
 """What the merge decides, one rule a test."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from merger_world import (
@@ -216,6 +218,70 @@ def test_votes_are_weighed_by_sensor():
     assert merge_tile(EPOCH, statements).changed.tolist() == [2]
     with pytest.raises(MergerError, match="weight of Scala must lie in"):
         MergeParameters(sensor_weights={"Scala": 0.0})
+
+
+def posed(change, sigma_m, sigma_rad=0.0):
+    return replace(change, pose_sigma_m=sigma_m, pose_sigma_rad=sigma_rad)
+
+
+def merged_as_reported(changes, epoch=EPOCH, **parameters):
+    p = MergeParameters(**parameters)
+    reports = [p.report_of(report_id(number), "VLP-16", change) for number, change in enumerate(changes)]
+    return merge_tile(epoch, statements_of(epoch, reports, {sha_of(epoch): epoch}, p.mode), p)
+
+
+def test_good_poses_weigh_the_same_and_add_nothing():
+    change, p = change_of(EPOCH, [2], {2: POLE}), MergeParameters()
+    for pose in ((0.0, 0.0), (0.02, 0.0005), (0.04, 0.0014)):
+        report = p.report_of(report_id(0), "VLP-16", posed(change, *pose))
+        assert (report.weight, report.pose_m2) == (1.0, 0.0)
+
+
+def test_a_vote_weighs_less_the_worse_its_poses_are():
+    change, p = change_of(EPOCH, [2], {2: POLE}), MergeParameters(pose_weight_m=0.1, pose_lever_m=20.0)
+    worse = p.report_of(report_id(0), "VLP-16", posed(change, np.hypot(0.05, 0.1)))
+    assert worse.weight == pytest.approx(0.5)
+    assert worse.pose_m2 == pytest.approx(0.01)
+    turned = p.report_of(report_id(0), "VLP-16", posed(change, 0.05, 0.005))  # 10 cm at 20 m
+    assert turned.weight == pytest.approx(0.5)
+    assert p.report_of(report_id(0), "Scala", posed(change, np.hypot(0.05, 0.1))).weight == pytest.approx(0.25)
+    paper = MergeParameters(mode="paper").report_of(report_id(0), "Scala", posed(change, 0.3))
+    assert (paper.weight, paper.pose_m2) == (1.0, 0.0)
+    unweighed = MergeParameters(pose_weight_m=0.0).report_of(report_id(0), "VLP-16", posed(change, 0.3))
+    assert unweighed.weight == 1.0
+
+
+def test_one_vehicle_that_knew_its_place_outvotes_two_that_did_not():
+    sees, none = change_of(EPOCH, [2], {2: POLE}), change_of(EPOCH, [2], {})
+    assert merged_as_reported([posed(sees, 0.02), posed(none, 0.2), posed(none, 0.2)]).changed.tolist() == [2]
+    assert merged_as_reported([posed(sees, 0.2), posed(none, 0.02), posed(none, 0.02)]).gaussians == EPOCH
+    assert merged_as_reported([posed(change, 0.2) for change in (sees, none, none)]).gaussians == EPOCH
+
+
+def test_one_wall_seen_from_uncertain_places_is_one_wall():
+    """20 cm apart: two walls for vehicles that knew their place to 2 cm, one for those that knew it to 15 cm."""
+    near, far = (0.0, -0.1, 0.1, *WALL[3:]), (0.0, 0.1, 0.1, *WALL[3:])
+    thin = [(*state[:3], 0.28, 0.02, 0.28) for state in (near, far)]
+    changes = [change_of(EPOCH, [3], {3: state}) for state in thin]
+    sure, unsure = (merged_as_reported([posed(c, s) for c in changes]).changed.tolist() for s in (0.02, 0.15))
+    assert (sure, unsure) == ([], [3])
+
+
+def test_the_gaussian_is_taken_from_those_who_knew_their_place():
+    shifted = (POLE[0] + 0.03, *POLE[1:])
+    vague = [posed(change_of(EPOCH, [2], {2: shifted}), 0.12) for _ in range(2)]
+    sure = posed(change_of(EPOCH, [2], {2: POLE}), 0.02)
+    for changes in ([*vague, sure], [sure, *vague]):
+        result = merged_as_reported(changes)
+        assert result.gaussians.select([2]) == gaussians_of({2: POLE})
+        assert len(result.provenance[2]) == 3  # they voted all the same
+    assert merged_as_reported(vague).gaussians.select([2]).mean_m[0, 0] == np.float32(shifted[0])
+
+
+@pytest.mark.parametrize("bad", [{"pose_lever_m": -1.0}, {"pose_weight_m": float("nan")}])
+def test_lengths_of_poses_out_of_range_are_refused(bad):
+    with pytest.raises(MergerError, match=next(iter(bad))):
+        MergeParameters(**bad)
 
 
 def test_a_denied_voxel_needs_the_lower_share():

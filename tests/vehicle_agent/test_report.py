@@ -44,10 +44,10 @@ def reporter(tiles: dict[TileId, Tile], outbox: Outbox, **parameters: float) -> 
     return Reporter(ChangeDetector(local_map), outbox, WHO, START_NS, ReportParameters(**parameters))
 
 
-def estimate(x_m: float = 0.0, sigma_m: float = 0.03, health: str = "good") -> PoseEstimate:
+def estimate(x_m: float = 0.0, sigma_m: float = 0.03, health: str = "good", sigma_rad: float = 0.001) -> PoseEstimate:
     T = np.eye(4)
     T[:3, 3] = SENSOR + np.array([x_m, 0.0, 0.0])
-    return PoseEstimate(START_NS, T, sigma_m, 0.001, 0.9, health)  # type: ignore[arg-type]
+    return PoseEstimate(START_NS, T, sigma_m, sigma_rad, 0.9, health)  # type: ignore[arg-type]
 
 
 def scan(hits: np.ndarray, t_s: float = 0.0, **kwargs: float | str) -> SegmentedScan:
@@ -80,6 +80,19 @@ def test_the_end_of_a_drive_reports_every_tile_once_a_district_in_one_message(
     assert drive.counts["changed_voxels"] == sum(len(c.changed) for r in found for c in r.tiles) > 50
     assert drive.classes["deleted"] > 20
     assert drive.classes["new"] > 20
+
+
+def test_each_tile_tells_the_poses_that_saw_it_not_those_of_the_whole_stretch(
+    tiles: dict[TileId, Tile], outbox: Outbox, hits: np.ndarray
+) -> None:
+    """A vehicle that knew its place well in the west and poorly in the east."""
+    drive, west = reporter(tiles, outbox), hits[:, 0] < -5.0
+    for t_s, part, sigma_m in ((0.0, west, 0.01), (0.1, ~west, 0.09)):
+        drive.add_scan(scan(hits[part], t_s, sigma_m=sigma_m))
+    drive.report_all(20.0)
+    sigma_m = {c.tile: c.pose_sigma_m for r in reports(outbox) for c in r.tiles}
+    assert min(sigma_m.values()) == pytest.approx(0.01)
+    assert max(sigma_m.values()) == pytest.approx(0.09)
 
 
 def test_only_tiles_left_behind_are_decided(tiles: dict[TileId, Tile], outbox: Outbox, hits: np.ndarray) -> None:
@@ -138,7 +151,7 @@ def test_a_restarted_agent_makes_the_same_ids_and_its_first_statement_stands(
     assert again.counts["reports_known"] == len(bodies)
 
 
-@pytest.mark.parametrize("bad", [{"health": "degraded"}, {"health": "lost"}, {"sigma_m": 0.3}])
+@pytest.mark.parametrize("bad", [{"health": "degraded"}, {"health": "lost"}, {"sigma_m": 0.3}, {"sigma_rad": 0.03}])
 def test_an_uncertain_pose_makes_no_statement(
     tiles: dict[TileId, Tile], outbox: Outbox, hits: np.ndarray, bad: dict[str, float | str]
 ) -> None:
