@@ -14,6 +14,8 @@ from vehicle_agent.detect.detector import ChangeDetector
 from vehicle_agent.local_map import LocalMap
 from vehicle_agent.localise.estimates import PoseEstimate, RefinedScan
 from vehicle_agent.localise.localiser import Localiser
+from vehicle_agent.localise.rolling_map import RollingMap
+from vehicle_agent.localise.scan_odometry_parameters import ScanOdometryParameters
 from vehicle_agent.segment import MotionSegmenter
 
 _LIDAR_HEIGHT_M = 2.0
@@ -33,10 +35,19 @@ def warm_up() -> None:
     refined = _localised(local_map, points, frame)
     for scan in refined:
         detector.add_scan(scan.points_map_m, scan.origins_map_m)
+    _rolled(points)
     _segment(points, refined[-1].estimate if refined else None)
     detector.add_scan(points, np.array([0.0, 0.0, _LIDAR_HEIGHT_M]))
     for evidence in detector.finish(local_map.tiles).values():
         tile_change(classify(evidence, detector.parameters))
+
+
+def _rolled(points_m: F64) -> None:
+    """Scan-to-scan odometry of a vehicle that moves: its map rolls on only after some metres."""
+    parameters = ScanOdometryParameters()
+    rolling = RollingMap(parameters.rolling_map, parameters.noise_m)
+    for x_m in (0.0, 2.0 * parameters.rolling_map.move_m):
+        rolling.add(points_m, np.array([x_m, 0.0, 0.0]))
 
 
 def _segment(points_map_m: F64, estimate: PoseEstimate | None) -> None:

@@ -13,13 +13,18 @@ PROGRAM = textwrap.dedent(
     import vehicle_agent.agent
     from vehicle_agent.detect import kernel
     from vehicle_agent.warm import warm_up
-    from vehicle_agent.localise import registration
+    from vehicle_agent.localise import kernels, packed_scan, registration, rolling_kernels
     before = len(kernel.cast_rays.signatures)
     warm_up()
     first = {k: len(v.signatures) for k, v in vars(kernel).items() if hasattr(v, "signatures")}
     warm_up()
     again = {k: len(v.signatures) for k, v in vars(kernel).items() if hasattr(v, "signatures")}
+    cold = [
+        f"{m.__name__}.{k}" for m in (kernels, packed_scan, rolling_kernels) for k, v in vars(m).items()
+        if hasattr(v, "signatures") and not k.startswith("_") and len(v.signatures) != 1
+    ]
     print(json.dumps({
+        "cold": cold,
         "before": before, "after": first["cast_rays"], "same": first == again, "threads": threading.active_count(),
         "modules": sorted({m.split(".")[0] for m in sys.modules} & {"sklearn", "matplotlib", "pandas", "rich"}),
         "stats": "scipy.stats" in sys.modules,
@@ -36,6 +41,7 @@ def test_warming_compiles_the_kernels_and_starts_nothing() -> None:
     assert found["before"] == 0
     assert found["after"] == 1, "the drive would compile another signature than the one that was warmed"
     assert found["same"]
+    assert found["cold"] == [], "compiled on the road, or twice"
     assert found["threads"] == 1
     assert found["modules"] == []
     assert not found["stats"]
