@@ -5,7 +5,7 @@ import importlib
 
 from benchmarks.figures import machine, print_figures
 
-NAMES = ("detection", "segmentation", "localisation", "ingest", "sizes")
+NAMES = ("detection", "segmentation", "localisation", "scan-to-scan", "first-pose", "health", "ingest", "sizes")
 
 
 def main() -> None:
@@ -20,7 +20,7 @@ def main() -> None:
     if not options.json:
         print(machine())
     for name in options.names or NAMES:
-        module = importlib.import_module(f"benchmarks.{name}")
+        module = importlib.import_module(f"benchmarks.{name.replace('-', '_')}")
         print_figures(name, module.COMMAND, module.run(), as_json=options.json)
 
 
