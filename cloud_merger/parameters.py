@@ -25,6 +25,7 @@ class MergeParameters:
         sensor_weights: weight of a vote by sensor model, 1 for the others; "paper" mode does not weigh.
         noise_m: added (squared) to the covariances that the default similarity compares. It stands for poses known to
             so much; what a report's poses are worse than that is added for this report.
+        poses: whether what the reports tell of their poses counts at all.
         pose_lever_m: at this range the heading of a report's poses is counted as a position.
         pose_weight_m: a report whose poses are this much worse than `noise_m` has half a vote; 0: poses do not weigh.
     """
@@ -37,6 +38,7 @@ class MergeParameters:
     d_update: float = 0.5
     d_denied: float = 0.95
     noise_m: float = 0.05
+    poses: bool = True
     pose_lever_m: float = 20.0
     pose_weight_m: float = 0.1
     sensor_weights: Mapping[str, float] = field(default_factory=lambda: {"Scala": 0.5})
@@ -72,7 +74,7 @@ class MergeParameters:
 
     def pose_m2_of(self, change: TileChange) -> float:
         """Return the variance of what a report measured by its poses, beyond what `noise_m` stands for."""
-        if self.mode == "paper":
+        if self.mode == "paper" or not self.poses:
             return 0.0
         at_lever_m = self.pose_lever_m * change.pose_sigma_rad
         return max(change.pose_sigma_m**2 + at_lever_m**2 - self.noise_m**2, 0.0)

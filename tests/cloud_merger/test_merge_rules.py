@@ -247,6 +247,8 @@ def test_a_vote_weighs_less_the_worse_its_poses_are():
     assert p.report_of(report_id(0), "Scala", posed(change, np.hypot(0.05, 0.1))).weight == pytest.approx(0.25)
     paper = MergeParameters(mode="paper").report_of(report_id(0), "Scala", posed(change, 0.3))
     assert (paper.weight, paper.pose_m2) == (1.0, 0.0)
+    ignored = MergeParameters(poses=False).report_of(report_id(0), "VLP-16", posed(change, 0.3))
+    assert (ignored.weight, ignored.pose_m2) == (1.0, 0.0)
     unweighed = MergeParameters(pose_weight_m=0.0).report_of(report_id(0), "VLP-16", posed(change, 0.3))
     assert unweighed.weight == 1.0
 
