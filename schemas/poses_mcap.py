@@ -4,7 +4,7 @@
 |---|---|---|
 | /NAME/pose | foxglove.PoseInFrame | one a pose, frame `map` |
 | /NAME/path | foxglove.PosesInFrame | all poses at once, at the time of the first |
-| /NAME/fix | foxglove.LocationFix | where the pose lies on the Earth, with its uncertainty where that is known |
+| /NAME/fix | foxglove.LocationFix | where the pose lies on the Earth, with its covariance where that is known |
 | /tf | foxglove.FrameTransform | map → vehicle of the first track: Foxglove shows the scans of the drive in the map |
 | /health | foxglove.Log | what has changed: info, warning or error |
 
@@ -19,7 +19,6 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import IO, Any, Final
 
-import numpy as np
 from foxglove_schemas_protobuf.FrameTransform_pb2 import FrameTransform
 from foxglove_schemas_protobuf.LocationFix_pb2 import LocationFix
 from foxglove_schemas_protobuf.Log_pb2 import Log
@@ -53,14 +52,14 @@ class PoseTrack:
     """Such as "refined": letters, digits, _ and -."""
     poses: Trajectory
     """T_map_vehicle; map = ENU at the file's anchor."""
-    sigma_m: F64 | None = None
-    """(N,) one sigma of each horizontal axis, where it is known."""
+    position_cov_m2: F64 | None = None
+    """(N, 3, 3) covariance of each position east, north, up, where it is known."""
 
     def __post_init__(self) -> None:
         if not self.name.replace("_", "").replace("-", "").isalnum():
             raise BadValue(f"track {self.name!r}: expected letters, digits, _ and -")
-        if self.sigma_m is not None and self.sigma_m.shape != self.poses.t_ns.shape:
-            raise BadValue(f"track {self.name}: {len(self.poses)} poses, but {self.sigma_m.shape} sigmas")
+        if self.position_cov_m2 is not None and self.position_cov_m2.shape != (len(self.poses), 3, 3):
+            raise BadValue(f"track {self.name}: {len(self.poses)} poses, but covariances {self.position_cov_m2.shape}")
 
 
 @dataclass(frozen=True, slots=True)
@@ -154,8 +153,8 @@ def _track_messages(anchor: LocalFrame, track: PoseTrack, *, moves_vehicle: bool
     yield f"/{track.name}/path", poses[0].t_ns, _path(poses)
     for k, pose in enumerate(poses):
         yield f"/{track.name}/pose", pose.t_ns, pose_message_of(pose)
-        sigma_m = None if track.sigma_m is None else float(track.sigma_m[k])
-        yield f"/{track.name}/fix", pose.t_ns, _fix(pose.t_ns, lat[k], lon[k], height[k], sigma_m)
+        cov_m2 = None if track.position_cov_m2 is None else track.position_cov_m2[k]
+        yield f"/{track.name}/fix", pose.t_ns, _fix(pose.t_ns, lat[k], lon[k], height[k], cov_m2)
         if moves_vehicle:
             yield TF_TOPIC, pose.t_ns, transform_message_of(pose.t_ns, MAP_FRAME, VEHICLE_FRAME, pose.T_map_vehicle)
 
@@ -168,15 +167,14 @@ def _path(poses: Sequence[ReferencePose]) -> PosesInFrame:
     )
 
 
-def _fix(t_ns: int, lat_rad: float, lon_rad: float, height_m: float, sigma_m: float | None) -> LocationFix:
-    """The height's uncertainty is not estimated on its own; the horizontal one stands in for it, hence APPROXIMATED."""
-    variance = 0.0 if sigma_m is None else sigma_m**2
+def _fix(t_ns: int, lat_rad: float, lon_rad: float, height_m: float, cov_m2: F64 | None) -> LocationFix:
+    """East, north, up at the anchor stand in for those at the position: 1 km away they differ by 0.01 degrees."""
     return LocationFix(
         timestamp=timestamp_of(t_ns),
         frame_id=VEHICLE_FRAME,
         latitude=math.degrees(lat_rad),
         longitude=math.degrees(lon_rad),
         altitude=height_m,
-        position_covariance=np.diag([variance] * 3).ravel().tolist(),
-        position_covariance_type=LocationFix.UNKNOWN if sigma_m is None else LocationFix.APPROXIMATED,
+        position_covariance=[0.0] * 9 if cov_m2 is None else cov_m2.ravel().tolist(),
+        position_covariance_type=LocationFix.UNKNOWN if cov_m2 is None else LocationFix.KNOWN,
     )

@@ -1,6 +1,7 @@
 """Health timeline, errors, pictures and tables of a drive made by hand."""
 
 import json
+from dataclasses import replace
 from io import StringIO
 from pathlib import Path
 from typing import Any
@@ -24,6 +25,7 @@ from vehicle_agent.localise_drive.accuracy import error_series, error_summary
 from vehicle_agent.localise_drive.geo import geojson_text
 from vehicle_agent.localise_drive.map_picture import View, nice_m
 from vehicle_agent.localise_drive.map_raster import GROUND, OTHER, WALL, MapRaster, disc, kinds_of
+from vehicle_agent.localise_drive.outputs import position_cov_m2
 from vehicle_agent.localise_drive.pictures import draw_pictures
 from vehicle_agent.localise_drive.run import Counts, LocalisedDrive, Moment
 from vehicle_agent.localise_drive.stretches import stretches_of
@@ -131,6 +133,16 @@ def test_poses_called_good_are_judged_apart() -> None:
     assert errors["refined"]["longitudinal_m"] == {"p95": 3.0, "max": 3.0, "within_limits": False}
     assert errors["refined_good"]["longitudinal_m"] == {"p95": 0.01, "max": 0.01, "within_limits": True}
     assert (errors["online"]["n"], errors["online_good"]["n"]) == (17, 15)
+
+
+def test_covariances_are_turned_into_the_map() -> None:
+    """Driving north, what is uncertain forward is uncertain along y."""
+    known = [replace(pose(k, "good"), covariance=np.diag([0, 0, 0, 0.04, 0.01, 0.09])) for k in range(2)]
+    found = position_cov_m2(known)
+    assert found is not None
+    assert found == pytest.approx(np.stack([np.diag([0.01, 0.04, 0.09])] * 2))
+    assert position_cov_m2([*known, pose(2, "good")]) is None
+    assert position_cov_m2([]) is None
 
 
 def test_the_summary_says_when_the_first_pose_came() -> None:

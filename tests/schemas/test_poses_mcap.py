@@ -17,6 +17,7 @@ from schemas.errors import BadValue, TrajectoryError
 from schemas.poses_mcap import HealthNote, PoseTrack, write_poses_mcap
 
 T0_NS = 1_700_000_000_123_456_789
+COV_M2 = np.stack([np.diag([0.01, 0.04, 0.09]) + 0.002, 2.0 * np.eye(3), 3.0 * np.eye(3)])
 ANCHOR = LocalFrame(math.radians(37.56), math.radians(127.04), 30.0)
 
 
@@ -39,7 +40,7 @@ def messages(path: Path) -> dict[str, list[tuple[int, Any]]]:
 
 def test_a_viewer_finds_poses_paths_positions_frame_and_health(tmp_path: Path) -> None:
     path = tmp_path / "poses.mcap"
-    refined, online = track("refined", 3, sigma_m=np.array([0.1, 0.2, 0.3])), track("online", 4)
+    refined, online = track("refined", 3, position_cov_m2=COV_M2), track("online", 4)
     notes = [HealthNote(T0_NS, "info", "good"), HealthNote(T0_NS + 250_000_000, "warning", "degraded: stale_map")]
     write_poses_mcap(path, ANCHOR, [refined, online], notes, {"drive_id": "d"})
     found = messages(path)
@@ -60,7 +61,7 @@ def test_a_viewer_finds_poses_paths_positions_frame_and_health(tmp_path: Path) -
 
 def test_positions_on_the_earth_are_those_of_pyproj(tmp_path: Path) -> None:
     path = tmp_path / "poses.mcap"
-    write_poses_mcap(path, ANCHOR, [track("refined", 3, sigma_m=np.array([0.1, 0.2, 0.3])), track("online", 1)])
+    write_poses_mcap(path, ANCHOR, [track("refined", 3, position_cov_m2=COV_M2), track("online", 1)])
     enu_to_ecef = pyproj.Transformer.from_pipeline(
         "+proj=pipeline +step +inv +proj=topocentric +ellps=WGS84 +lat_0=37.56 +lon_0=127.04 +h_0=30"
     )
@@ -70,8 +71,8 @@ def test_positions_on_the_earth_are_those_of_pyproj(tmp_path: Path) -> None:
         lon, lat, height = ecef_to_geodetic.transform(*enu_to_ecef.transform(10.0 * k, -5.0 * k, 2.0 + k))
         assert (fix.latitude, fix.longitude) == pytest.approx((lat, lon), abs=1e-11)
         assert fix.altitude == pytest.approx(height, abs=1e-6)
-        assert list(fix.position_covariance)[::4] == pytest.approx([(0.1 * (k + 1)) ** 2] * 3)
-        assert fix.position_covariance_type == 1  # approximated
+        assert np.array_equal(np.reshape(fix.position_covariance, (3, 3)), COV_M2[k])
+        assert fix.position_covariance_type == 3  # known
     assert found["/online/fix"][0][1].position_covariance_type == 0  # unknown
 
 
@@ -101,8 +102,8 @@ def test_what_cannot_be_is_refused_and_leaves_no_file(tmp_path: Path) -> None:
         write_poses_mcap(tmp_path / "none" / "poses.mcap", ANCHOR, [track("refined", 1)])
     with pytest.raises(BadValue, match="letters"):
         track("re fined", 1)
-    with pytest.raises(BadValue, match=r"3 poses, but \(2,\) sigmas"):
-        track("refined", 3, sigma_m=np.zeros(2))
+    with pytest.raises(BadValue, match=r"3 poses, but covariances \(2, 3, 3\)"):
+        track("refined", 3, position_cov_m2=COV_M2[:2])
     with pytest.raises(BadValue, match="level 'bad'"):
         HealthNote(T0_NS, "bad", "")
     assert list(tmp_path.iterdir()) == []

@@ -20,6 +20,7 @@ from typing import Any, Final
 
 import numpy as np
 
+from gnd_map.arrays import F64
 from gnd_map.motion import Trajectory
 from schemas.poses_mcap import HealthNote, PoseTrack, write_poses_mcap
 from schemas.trajectory_files import write_kitti, write_text, write_times, write_tum
@@ -124,7 +125,17 @@ def _mcap(drive: LocalisedDrive, folder: Path) -> list[Path]:
 
 
 def _track(name: str, estimates: Sequence[PoseEstimate]) -> PoseTrack:
-    return PoseTrack(name, trajectory_of(estimates), np.array([e.sigma_m for e in estimates], np.float64))
+    return PoseTrack(name, trajectory_of(estimates), position_cov_m2(estimates))
+
+
+def position_cov_m2(estimates: Sequence[PoseEstimate]) -> F64 | None:
+    """(N, 3, 3) covariances of the positions along the map's axes; None unless every estimate has one."""
+    known = [(e.T_map_vehicle[:3, :3], e.covariance[3:, 3:]) for e in estimates if e.covariance is not None]
+    if not known or len(known) < len(estimates):
+        return None
+    R, cov = (np.stack(column) for column in zip(*known, strict=True))
+    turned: F64 = R @ cov @ np.swapaxes(R, 1, 2)
+    return turned
 
 
 def _geojson(drive: LocalisedDrive, folder: Path) -> list[Path]:
