@@ -89,8 +89,8 @@ def apollo_of(folder: Path, scene: Scene) -> dict[str, Any]:
         "searches": [_searched(half.name, half, _ours(half)) for half in halves]
         + [_searched(f"Apollo's map, {half.name.split(', ')[1]}", half, theirs.match_map) for half in halves],
         "halves": [{"name": half.name, "registration": convergence_of(half, trials=TRIALS)} for half in halves],
-        "on_apollos_map": _on_their_map(theirs, everything),
-        "gaussians": _gaussians_apart(theirs, everything),
+        "on_apollos_map": on_apollos_map(theirs, everything),
+        "gaussians": gaussians_apart(theirs, everything),
     }  # fmt: skip
 
 
@@ -137,7 +137,7 @@ def _off(poses: Sequence[F64], T_true: F64) -> dict[str, float] | None:
     return {"longitudinal_m": float(along), "lateral_m": float(across), "heading_deg": float(heading)}
 
 
-def _on_their_map(theirs: ApolloMap, half: Half) -> list[dict[str, Any]]:
+def on_apollos_map(theirs: ApolloMap, half: Half) -> list[dict[str, Any]]:
     """Our registration on Apollo's Gaussians, from seeded offsets."""
     align = on_map(lambda _: theirs.match_map, "wide", LocaliserParameters())
     rows = []
@@ -160,7 +160,7 @@ def _from(align: Aligner, points: F64, T_true: F64, off_m: float, off_deg: float
     return align(points, T_true @ start, off_m)[0]
 
 
-def _gaussians_apart(theirs: ApolloMap, half: Half) -> dict[str, Any]:
+def gaussians_apart(theirs: ApolloMap, half: Half) -> dict[str, Any]:
     """Flat Gaussians of ours from both scans against theirs nearest by: along the normal, and between normals."""
     mean, cov = half.local_map.mean_map_m, full_matrices(half.local_map.cov_m2)
     ours, normals = _flat(cov), np.linalg.eigh(cov)[1][:, :, 0]

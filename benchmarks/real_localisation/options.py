@@ -27,9 +27,7 @@ class RealLocalisationOptions:
             raise RealLocalisationError(f"{', '.join(missing)}: no such file or folder")
         names = [path.name for path in self.scans]
         if len(set(names)) != len(names):
-            raise RealLocalisationError(
-                f"--scans {', '.join(names)}: two folders of one name would share their results"
-            )
+            raise RealLocalisationError(f"--scans {', '.join(names)}: one name twice would share its results")
 
     @classmethod
     def of(cls, scans: str, at_most: int, seed: int) -> "RealLocalisationOptions":
