@@ -129,7 +129,7 @@ class CauseParameters:
     trusted_standing_fit: least fit of what stands, beside `HealthParameters.trusted_fit` of all points.
     fitting_hits: share of hits in the better half of the sectors that is no sign of a wrong pose; suspicious_gone:
         share of Gaussians gone from which on a better pose is looked for sooner.
-    wrong_hits, wrong_gone: with hits below and gone above these the pose is contradicted all around.
+    wrong_hits, wrong_share: with hits below, new and gone together above these, the pose is contradicted all around.
     stale_share: share of points new and of Gaussians gone, added up, that makes a map stale.
     poor_sigma_m, poor_sigma_rad: one sigma of position and heading from which on a pose is no longer good.
     least_standing: fewer standing points among the witness's rays are next to nothing; least_known: a smaller share of
@@ -144,7 +144,7 @@ class CauseParameters:
     fitting_hits: float = 0.7
     suspicious_gone: float = 0.25
     wrong_hits: float = 0.5
-    wrong_gone: float = 0.4
+    wrong_share: float = 0.6
     stale_share: float = 0.35
     poor_sigma_m: float = 0.15
     poor_sigma_rad: float = 0.003

@@ -32,6 +32,8 @@ class HealthMonitor:
         self.causes = causes or CauseParameters()
         self.contested = False
         self.beaten = False
+        self.certain = False
+        """Submaps and odometry leave no doubt: what single scans hold against the pose is the changed world."""
         self.degenerate: tuple[str, ...] = ()
         self._believed_ns = now_ns
         self._far_fixes = 0
@@ -100,12 +102,6 @@ class HealthMonitor:
         """Take the uncertainty of the newest pose."""
         self._sigma = (sigma_m, sigma_rad)
 
-    def confirm(self, t_ns: int) -> None:
-        """Submaps hold the pose to be right: what single scans held against it was the changed world."""
-        self._better_elsewhere = 0
-        if self._trusted:
-            self._believed_ns = max(self._believed_ns, t_ns)
-
     def distrust(self) -> None:
         """The pose must prove itself again: it was dead reckoned for long."""
         self._trusted = False
@@ -116,15 +112,15 @@ class HealthMonitor:
     def judge(self, t_ns: int) -> tuple[Health, Cause]:
         """`lost`: the pose is worth nothing; `degraded`: not to be relied on; else `good`; and why."""
         gap_s, par = self._gap_s(t_ns), self.parameters
-        if self.beaten or self._gnss_contradicts(gap_s):
+        if (self.beaten and not self.certain) or self._gnss_contradicts(gap_s):
             return "lost", "wrong_pose"
         if gap_s > par.degraded_after_s:
             cause = self._why_unmatched()
             return ("lost" if gap_s > self._patience_s(cause) else "degraded"), cause
-        if self.contested or self._contradicted_all_around():
-            return "degraded", "wrong_pose"
         if self._scan != "none":
             return "degraded", self._scan
+        if (self.contested or self.contradicted(t_ns)) and not self.certain:
+            return "degraded", "wrong_pose"
         if self._sigma[0] > self.causes.poor_sigma_m or self._sigma[1] > self.causes.poor_sigma_rad:
             return "degraded", "poor_place"
         if not self._trusted:
@@ -164,10 +160,13 @@ class HealthMonitor:
         known_wrong = self._gnss_jumped and self._trusted and gap_s <= self.parameters.degraded_after_s
         return self._far_fixes >= self.parameters.gnss_count and not known_wrong
 
-    def _contradicted_all_around(self) -> bool:
-        if len(self._testimonies) < 2:
+    def contradicted(self, t_ns: int) -> bool:
+        """True when the rays hit nothing all around: of two testimonies, or of one if the match was not believed."""
+        last = list(self._testimonies)[-2:]
+        enough = 1 if self._gap_s(t_ns) > 0.0 else 2
+        if len(last) < enough or max(one.best_hits for one in last[-enough:]) >= self.causes.wrong_hits:
             return False
-        return self._mean("best_hits") < self.causes.wrong_hits and self._mean("gone_share") > self.causes.wrong_gone
+        return min(one.new_share + one.gone_share for one in last[-enough:]) > self.causes.wrong_share
 
     def _why_unmatched(self) -> Cause:
         if self._scan != "none":
@@ -180,7 +179,8 @@ class HealthMonitor:
 
     def _patience_s(self, cause: Cause) -> float:
         """How long dead reckoning is worth something: where the map or the place is to blame, the pose was right."""
-        blameless = cause in ("stale_map", "poor_place") and self._sigma[0] < self.causes.lost_sigma_m
+        known = self._sigma[0] < self.causes.lost_sigma_m
+        blameless = known and (self.certain or cause in ("stale_map", "poor_place"))
         return self.causes.longest_s if blameless else self.parameters.lost_after_s
 
     def _mean(self, name: str) -> float:

@@ -76,9 +76,10 @@ class Judge:
             self.monitor.see_match(fit, scan.result.fit, scan.result.degenerate)
 
     def _ask(self, scan: Matched, match_map: MatchMap) -> None:
-        """The witness, now and then."""
+        """The witness, now and then, and whenever a match is not believed."""
         par = self._par.witness
-        if scan.t_ns - self._witness_ns < par.period_s * 1e9 and self._way_m < par.way_m:
+        rested = scan.t_ns - self._witness_ns >= par.period_s * 1e9 or self._way_m >= par.way_m
+        if scan.believed and not rested:
             return
         self._witness_ns, self._way_m = scan.t_ns, 0.0
         below_m = ground_below(scan.points_m)
@@ -92,7 +93,7 @@ class Judge:
         doubtful = not scan.believed or monitor.doubtful(scan.result) or monitor.suspicious or not monitor.trusted
         self.challenger.see(
             scan.t_ns, self._pool.points_m, self._pool.standing_m, scan.T_now, scan.T_before_now, place, match_map,
-            doubtful=doubtful, new=new, any_heading=not monitor.trusted,
+            doubtful=doubtful, new=new, any_heading=not monitor.trusted or monitor.contradicted(scan.t_ns),
         )  # fmt: skip
         monitor.contested, monitor.beaten = self.challenger.contested, self.challenger.beaten
 

@@ -73,6 +73,10 @@ class MotionBuffer:
         most, before = MAX_ACCELERATION_MPS2 * (t_ns - self._t_ns[-1]) * 1e-9, self._speed_mps[-1]
         return min(max(speed_mps, before - most), before + most)
 
+    def age_s(self, now_ns: int) -> float:
+        """How old the newest sample is, seconds; infinite without one."""
+        return (now_ns - self._t_ns[-1]) * 1e-9 if self._t_ns else float("inf")
+
     def _drop(self, n: int) -> None:
         del self._t_ns[:n], self._speed_mps[:n], self._yaw_rate_radps[:n]
 
