@@ -5,7 +5,7 @@
 | /NAME/pose | foxglove.PoseInFrame | one a pose, frame `map` |
 | /NAME/path | foxglove.PosesInFrame | all poses at once, at the time of the first |
 | /NAME/fix | foxglove.LocationFix | where the pose lies on the Earth, with its covariance where that is known |
-| /tf | foxglove.FrameTransform | map → vehicle of the first track: Foxglove shows the scans of the drive in the map |
+| /tf | foxglove.FrameTransform | map → vehicle of the first track, where it moves the vehicle |
 | /health | foxglove.Log | what has changed: info, warning or error |
 
 NAME is that of a track, such as `refined`. The metadata record `gnd.poses` says where on the Earth `map` lies.
@@ -82,20 +82,23 @@ def write_poses_mcap(
     tracks: Sequence[PoseTrack],
     notes: Sequence[HealthNote] = (),
     metadata: Mapping[str, str] | None = None,
+    *,
+    moves_vehicle: bool = True,
 ) -> None:
     """Write the tracks in order of time; the file appears whole or not at all.
 
     Args:
         path: the file.
         anchor: where on the Earth the frame `map` of the poses lies.
-        tracks: the poses; the first one moves the frame `vehicle`. A track without poses only has its topics.
+        tracks: the poses. A track without poses only has its topics.
         notes: for the topic /health.
         metadata: more to keep in the record `gnd.poses`.
+        moves_vehicle: the first track moves the frame `vehicle`; not beside a drive that does so itself.
 
     Raises:
         TrajectoryError: the file cannot be written.
     """
-    messages = sorted(_messages(anchor, tracks, notes), key=lambda stamped: stamped[1])
+    messages = sorted(_messages(anchor, tracks, notes, moves_vehicle=moves_vehicle), key=lambda stamped: stamped[1])
     record = {
         "map_anchor_lat_rad": repr(float(anchor.lat_rad)),
         "map_anchor_lon_rad": repr(float(anchor.lon_rad)),
@@ -138,10 +141,12 @@ def _write(stream: IO[bytes], topics: Mapping[str, type[Message]], messages: Seq
     writer.finish()  # type: ignore[no-untyped-call]
 
 
-def _messages(anchor: LocalFrame, tracks: Sequence[PoseTrack], notes: Sequence[HealthNote]) -> Iterator[_Stamped]:
+def _messages(
+    anchor: LocalFrame, tracks: Sequence[PoseTrack], notes: Sequence[HealthNote], *, moves_vehicle: bool
+) -> Iterator[_Stamped]:
     for number, track in enumerate(tracks):
         if len(track.poses):
-            yield from _track_messages(anchor, track, moves_vehicle=number == 0)
+            yield from _track_messages(anchor, track, moves_vehicle=moves_vehicle and number == 0)
     for note in notes:
         log = Log(timestamp=timestamp_of(note.t_ns), level=LEVELS[note.level], message=note.text, name="gnd localise")
         yield HEALTH_TOPIC, note.t_ns, log

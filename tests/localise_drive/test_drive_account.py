@@ -61,7 +61,7 @@ def drive(healths: list[Health], **values: Any) -> LocalisedDrive:
         "moments": tuple(moment(k, h) for k, h in enumerate(healths)),
         "reference": Trajectory(t_ns, np.stack([p.T_map_vehicle for p in true])),
         "gnss": GnssTrack(t_ns, *fixes, np.full(len(true), 2.5)),
-        "used": frozenset([TILE]),
+        "used": {TILE: 1},
         "absent": frozenset(),
         "counts": Counts(len(healths), {}, healths.count("lost"), 2, 1.001, 0.002, 1.0, finished=True),
     }
@@ -154,7 +154,7 @@ def test_the_summary_says_when_the_first_pose_came() -> None:
 
 
 def test_a_drive_that_never_finds_its_pose_is_told_and_drawn(tmp_path: Path) -> None:
-    made = drive(["lost"] * 8, used=frozenset())
+    made = drive(["lost"] * 8, used={})
     values, text = summary(made), StringIO()
     assert (values["initialisation_s"], values["scans_localised"], values["sigma"]) == (None, 0, None)
     print_account(Console(file=text, width=120), values, stretches_of(made.moments))

@@ -32,6 +32,15 @@ def offsets_m(found: Trajectory, true: Trajectory) -> np.ndarray:
     return np.linalg.norm(T[:, :3, 3], axis=1)
 
 
+def mcap_counts(path: Path) -> dict[str, int]:
+    """Messages by topic."""
+    with path.open("rb") as stream:
+        summary = make_reader(stream).get_summary()
+    assert summary is not None
+    assert summary.statistics is not None
+    return {c.topic: summary.statistics.channel_message_counts.get(c.id, 0) for c in summary.channels.values()}
+
+
 def test_every_file_is_there_and_every_picture_is_one(ran: Ran) -> None:
     assert {path.name for path in ran.out.iterdir()} == set(NAMES)
     for path in ran.out.glob("*.png"):
@@ -80,6 +89,7 @@ def test_the_summary_counts_and_is_printed(ran: Ran) -> None:
     assert found["localised_share"] == pytest.approx(found["scans_localised"] / SCANS, abs=1e-4)
     assert found["scans_localised"] + found["scans_dropped"] == SCANS
     assert 0 < len(found["tiles_used"]) <= 40
+    assert set(found["tiles_used"].values()) == {1}
     assert found == json.loads((ran.out / "summary.json").read_text())
     assert "refined, longitudinal" in ran.stdout
     assert "good" in ran.stdout
@@ -121,12 +131,9 @@ def test_lines_by_health_lie_on_the_earth(ran: Ran) -> None:
 
 
 def test_the_mcap_holds_all_three_tracks(ran: Ran) -> None:
-    with (ran.out / "poses.mcap").open("rb") as stream:
-        summary = make_reader(stream).get_summary()
-    assert summary is not None
-    assert summary.statistics is not None
-    counts = {c.topic: summary.statistics.channel_message_counts.get(c.id, 0) for c in summary.channels.values()}
-    assert counts["/refined/pose"] == counts["/tf"] == ran.summary["scans_localised"]
+    counts = mcap_counts(ran.out / "poses.mcap")
+    assert counts["/refined/pose"] == ran.summary["scans_localised"]
+    assert counts["/tf"] == 0  # the drive has its own
     assert counts["/online/pose"] == len(read_tum(ran.out / "online.tum"))
     assert counts["/reference/path"] == 1
 
@@ -136,12 +143,15 @@ def test_a_drive_without_reference_has_no_errors(ran: Ran, tmp_path: Path) -> No
     (tmp_path / "out" / "errors.png").write_bytes(b"of an earlier run")
     bare = changed(ran.drive, tmp_path / "bare.mcap", lambda i: None if isinstance(i, ReferencePose) else i)
     done = localise(
-        bare, ran.store, "--out", str(tmp_path / "out"), "--format", "tum,kitti", "--no-plots", "--json", "-"
+        bare, ran.store, "--out", str(tmp_path / "out"), "--format", "tum,kitti,mcap", "--no-plots", "--json", "-"
     )
     assert done.exit_code == 0, done.output
     assert json.loads(done.stdout)["errors"] is None
     names = {path.name for path in (tmp_path / "out").iterdir()}
-    assert names == {"poses.tum", "online.tum", "poses.kitti", "times.txt", "health.json", "summary.json"}
+    assert names == {
+        "poses.tum", "online.tum", "poses.kitti", "times.txt", "poses.mcap", "health.json", "summary.json",
+    }  # fmt: skip
+    assert mcap_counts(tmp_path / "out" / "poses.mcap")["/tf"] == len(read_tum(tmp_path / "out" / "poses.tum"))
     refined, same = read_tum(ran.out / "poses.tum"), read_tum(tmp_path / "out" / "poses.tum")
     assert np.array_equal(refined.T_dst_vehicle, same.T_dst_vehicle)
 

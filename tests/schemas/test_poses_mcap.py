@@ -76,6 +76,13 @@ def test_positions_on_the_earth_are_those_of_pyproj(tmp_path: Path) -> None:
     assert found["/online/fix"][0][1].position_covariance_type == 0  # unknown
 
 
+def test_a_track_beside_a_drive_leaves_the_vehicle_where_the_drive_says(tmp_path: Path) -> None:
+    write_poses_mcap(tmp_path / "poses.mcap", ANCHOR, [track("refined", 3)], moves_vehicle=False)
+    found = messages(tmp_path / "poses.mcap")
+    assert "/tf" not in found
+    assert len(found["/refined/pose"]) == 3
+
+
 def test_the_frame_is_in_the_metadata(tmp_path: Path) -> None:
     path = tmp_path / "poses.mcap"
     write_poses_mcap(path, ANCHOR, [], metadata={"drive_id": "d"})

@@ -39,7 +39,7 @@ def summary(drive: LocalisedDrive) -> dict[str, Any]:
         "sigma": _sigma(drive.refined),
         "errors": _errors(drive),
         "health": health_shares(stretches),
-        "tiles_used": sorted(tile_id.path for tile_id in drive.used),
+        "tiles_used": {tile_id.path: version for tile_id, version in sorted(drive.used.items())},
         "tiles_absent": len(drive.absent),
         "wall_s": round(counts.wall_s, 2),
     }

@@ -120,7 +120,8 @@ def _mcap(drive: LocalisedDrive, folder: Path) -> list[Path]:
         for one in stretches_of(drive.moments)
     ]
     metadata = {"drive_id": drive.header.drive_id, "vehicle": drive.header.vehicle}
-    write_poses_mcap(folder / "poses.mcap", drive.header.anchor, tracks, notes, metadata)
+    path, moves = folder / "poses.mcap", drive.reference is None  # else /tf of the drive itself says where it was
+    write_poses_mcap(path, drive.header.anchor, tracks, notes, metadata, moves_vehicle=moves)
     return [folder / "poses.mcap"]
 
 

@@ -2,7 +2,7 @@
 
 import threading
 import time
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Final
@@ -74,7 +74,8 @@ class LocalisedDrive:
     moments: tuple[Moment, ...]
     reference: Trajectory | None
     gnss: GnssTrack
-    used: frozenset[TileId]
+    used: Mapping[TileId, int]
+    """Tiles and their versions."""
     absent: frozenset[TileId]
     counts: Counts
 
@@ -230,7 +231,7 @@ class _Run:
             moments=tuple(record.moments),
             reference=_reference(track),
             gnss=track.gnss,
-            used=frozenset(self._around.used),
+            used=dict(self._around.used),
             absent=frozenset(self._around.absent),
             counts=self._counts(),
         )

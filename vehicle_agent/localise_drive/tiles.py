@@ -62,8 +62,8 @@ class MapAround:
     """Keeps a local map in step with the place: what is near is held, what is left behind is let go."""
 
     def __init__(self, source: TileSource, local_map: LocalMap, parameters: DownloadParameters | None = None) -> None:
-        self.used: set[TileId] = set()
-        """Tiles that were held at some time."""
+        self.used: dict[TileId, int] = {}
+        """Tiles that were held at some time, and their versions."""
         self.absent: set[TileId] = set()
         """Tiles that were needed, and the map has not."""
         self._source, self._map = source, local_map
@@ -91,7 +91,7 @@ class MapAround:
                 self.absent.add(tile_id)
             else:
                 self._map.set_tile(tile)
-                self.used.add(tile_id)
+                self.used[tile_id] = tile.version
         except TileError:  # of another latitude zone: this grid frame cannot hold its voxels
             self.absent.add(tile_id)
 
