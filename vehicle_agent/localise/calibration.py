@@ -44,6 +44,11 @@ class MotionTeacher:
         known = np.array([par.roll_pitch_rad, par.roll_pitch_rad, yaw, forward, left, up])
         return np.asarray(np.hypot(known, np.sqrt(np.maximum(self._excess_var, 0.0))))
 
+    @property
+    def uncertainty(self) -> tuple[float, float]:
+        """One sigma of the wheel scale, and of the gyro's bias [rad/s], as learnt so far."""
+        return float(np.sqrt(self._scale_var)), float(np.sqrt(self._bias_var))
+
     def forget(self) -> None:
         """The poses to come do not continue those before."""
         self._anchor = self._last = None
@@ -59,7 +64,7 @@ class MotionTeacher:
         if self._anchor is None or t_ns - self._anchor.t_ns > 3e9 * STRETCH_S:
             self._anchor = now
         elif t_ns - self._anchor.t_ns >= STRETCH_S * 1e9:
-            self._compare(self._anchor, now)
+            self.learn_stretch(self._anchor, now, self.parameters.stretch_m, self.parameters.stretch_rad)
             self._anchor = now
 
     def _judge(self, first: Stamped, last: Stamped, match_var: F64) -> None:
@@ -69,29 +74,30 @@ class MotionTeacher:
         square = np.concatenate([log_so3(off[:3, :3]), off[:3, 3]]) ** 2
         self._excess_var += self.parameters.excess_gain * (square - 2.0 * match_var - self._excess_var)
 
-    def _compare(self, first: Stamped, last: Stamped) -> None:
-        par, dt_s = self.parameters, (last.t_ns - first.t_ns) * 1e-9
-        self._scale_var += par.scale_drift**2 * dt_s
-        self._bias_var += par.bias_drift_radps**2 * dt_s
+    def learn_stretch(self, first: Stamped, last: Stamped, sigma_m: float, sigma_rad: float) -> None:
+        """Take the motion between two poses that are off by `sigma_m` and `sigma_rad`, both together."""
+        dt_s = (last.t_ns - first.t_ns) * 1e-9
+        self._scale_var += self.parameters.scale_drift**2 * dt_s
+        self._bias_var += self.parameters.bias_drift_radps**2 * dt_s
         seen = T_inverse(first.T_map_vehicle) @ last.T_map_vehicle
         driven = self._motion.delta(first.t_ns, last.t_ns)
-        self._learn_course(driven, seen)
-        self._learn_scale(driven[0, 3] / self._motion.speed_scale, seen[0, 3])
-        self._learn_bias(_yaw(driven) + self._motion.yaw_bias_radps * dt_s, _yaw(seen), dt_s)
+        self._learn_course(driven, seen, sigma_m)
+        self._learn_scale(driven[0, 3] / self._motion.speed_scale, seen[0, 3], sigma_m)
+        self._learn_bias(_yaw(driven) + self._motion.yaw_bias_radps * dt_s, _yaw(seen), dt_s, sigma_rad)
 
-    def _learn_scale(self, wheel_m: float, map_m: float) -> None:
-        gain = self._scale_var * wheel_m / (wheel_m**2 * self._scale_var + self.parameters.stretch_m**2)
+    def _learn_scale(self, wheel_m: float, map_m: float, sigma_m: float) -> None:
+        gain = self._scale_var * wheel_m / (wheel_m**2 * self._scale_var + sigma_m**2)
         self._motion.speed_scale += gain * (map_m - self._motion.speed_scale * wheel_m)
         self._scale_var *= 1.0 - gain * wheel_m
 
-    def _learn_course(self, driven: F64, seen: F64) -> None:
+    def _learn_course(self, driven: F64, seen: F64, sigma_m: float) -> None:
         forward_m = driven[0, 3]
-        gain = self._course_var * forward_m / (forward_m**2 * self._course_var + self.parameters.stretch_m**2)
+        gain = self._course_var * forward_m / (forward_m**2 * self._course_var + sigma_m**2)
         self._motion.course += gain * (seen[1:3, 3] - driven[1:3, 3])
         self._course_var *= 1.0 - gain * forward_m
 
-    def _learn_bias(self, gyro_rad: float, map_rad: float, dt_s: float) -> None:
-        gain = self._bias_var * dt_s / (dt_s**2 * self._bias_var + self.parameters.stretch_rad**2)
+    def _learn_bias(self, gyro_rad: float, map_rad: float, dt_s: float, sigma_rad: float) -> None:
+        gain = self._bias_var * dt_s / (dt_s**2 * self._bias_var + sigma_rad**2)
         self._motion.yaw_bias_radps += gain * (gyro_rad - map_rad - self._motion.yaw_bias_radps * dt_s)
         self._bias_var *= 1.0 - gain * dt_s
 

@@ -137,6 +137,8 @@ class CauseParameters:
     motion_gap_s, gap_s: after so long without motion samples, or without a believed match, the pose must prove itself
         again. lost_gap_s: after so long without scans it is lost; longest_s, lost_sigma_m: where the map is stale or
         the place is poor, it is lost after so long without a believed match, or with so large a sigma.
+    partly_matched: matching ratio from which on a scan that is not believed still speaks for a pose that submaps hold
+        to be certain: what is missing is what has changed.
     """
 
     testimonies: int = 4
@@ -154,6 +156,7 @@ class CauseParameters:
     gap_s: float = 2.0
     lost_gap_s: float = 15.0
     longest_s: float = 15.0
+    partly_matched: float = 0.3
     lost_sigma_m: float = 1.0
 
     def __post_init__(self) -> None:

@@ -38,12 +38,15 @@ class Position(NamedTuple):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SmoothedPose:
-    """A pose of the graph: number, time, (4, 4) T_map_vehicle and (6, 6) covariance (rotation first, vehicle frame)."""
+    """A pose of the graph: number, time, (4, 4) T_map_vehicle and (6, 6) covariance (rotation first, vehicle frame);
+    certain: submaps leave no doubt about it.
+    """
 
     number: int
     t_ns: int
     T_map_vehicle: F64
     covariance: F64
+    certain: bool = False
 
 
 class PoseGraph:
@@ -97,6 +100,16 @@ class PoseGraph:
         self._next += 1
         self._smoother.update(factors, values, {number: (t_ns - self._first_ns) * 1e-9})
         return final
+
+    def restart(self, T_map_vehicle: F64, covariance: F64) -> None:
+        """Forget everything but the newest pose, and hold that to be (4, 4) with covariance (6, 6)."""
+        number, factors, values = self.newest, gtsam.NonlinearFactorGraph(), gtsam.Values()
+        pose = gtsam.Pose3(T_map_vehicle)
+        values.insert(number, pose)
+        factors.add(gtsam.PriorFactorPose3(number, pose, gtsam.noiseModel.Gaussian.Covariance(covariance)))
+        self._t_ns = {number: self._t_ns[number]}
+        self._smoother = gtsam.BatchFixedLagSmoother(self.parameters.lag_s + SLACK_S)
+        self._smoother.update(factors, values, {number: (self._t_ns[number] - self._first_ns) * 1e-9})
 
     def _leaving(self, now_ns: int) -> list[SmoothedPose]:
         return self._take([n for n, t in self._t_ns.items() if now_ns - t > self.parameters.lag_s * 1e9])

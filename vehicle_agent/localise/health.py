@@ -35,6 +35,8 @@ class HealthMonitor:
         self.certain = False
         """Submaps and odometry leave no doubt: what single scans hold against the pose is the changed world."""
         self.degenerate: tuple[str, ...] = ()
+        self.matching_ratio = 0.0
+        """Of the newest scan's match, believed or not."""
         self._believed_ns = now_ns
         self._far_fixes = 0
         self._offset_m: F64 | None = None
@@ -180,7 +182,8 @@ class HealthMonitor:
     def _patience_s(self, cause: Cause) -> float:
         """How long dead reckoning is worth something: where the map or the place is to blame, the pose was right."""
         known = self._sigma[0] < self.causes.lost_sigma_m
-        blameless = known and (self.certain or cause in ("stale_map", "poor_place"))
+        partly = self.certain and self.matching_ratio >= self.causes.partly_matched
+        blameless = known and (partly or cause in ("stale_map", "poor_place"))
         return self.causes.longest_s if blameless else self.parameters.lost_after_s
 
     def _mean(self, name: str) -> float:

@@ -60,6 +60,7 @@ class Judge:
         if scan.motion_gap_s > self._par.causes.motion_gap_s or self.monitor.gap_s(scan.t_ns) > self._par.causes.gap_s:
             self.monitor.distrust()
         self.monitor.see_scan(self._what_is_wrong(scan))
+        self.monitor.matching_ratio = 0.0 if scan.result is None else scan.result.matching_ratio
         self._way_m += float(np.linalg.norm(scan.T_before_now[:3, 3]))
         if len(scan.points_m) < self._par.registration.min_matched:
             return

@@ -3,6 +3,7 @@
 from collections import deque
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
+from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,13 +22,17 @@ from vehicle_agent.localise.match_map import MatchMapCache
 from vehicle_agent.localise.odometry import MotionBuffer
 from vehicle_agent.localise.packed_scan import PackedScan, pack
 from vehicle_agent.localise.parameters import LocaliserParameters
-from vehicle_agent.localise.registration import RegistrationResult, Start, register
+from vehicle_agent.localise.refine import Refiner
+from vehicle_agent.localise.registration import RegistrationResult, Start, register, settle
 from vehicle_agent.localise.sampling import sample_scan
 from vehicle_agent.localise.scan_odometry import ScanOdometry, ScanStep, joint_step
 
 F64 = NDArray[np.float64]
 
 MAX_GNSS_AGE_NS = 2_000_000_000
+TOLD_M, TOLD_RAD = 0.1, 0.01  # one sigma of a pose from outside
+OVERRULED: Final[tuple[Cause, ...]] = ("wrong_pose", "stale_map", "poor_place", "no_match", "unconfirmed")
+"""What single scans hold against a pose and submaps may know better."""
 PAST_NS, MOST_FROM_PAST = 1_000_000_000, 5
 
 
@@ -46,12 +51,22 @@ class _HeldScan:
     degenerate: tuple[str, ...]
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class _Told:
+    """A pose from outside."""
+
+    t_ns: int
+    T_map_vehicle: F64
+    trusted: bool
+
+
 @dataclass(slots=True, eq=False)
 class _Track:
     """What exists only while the pose is known."""
 
     graph: PoseGraph
     judge: Judge
+    refiner: Refiner | None
     held: dict[int, _HeldScan]
 
 
@@ -83,6 +98,7 @@ class Localiser:
         self._first = FirstPose(self.parameters)
         self._last_ns: int | None = None  # of the newest scan that was looked at
         self._from_past = 0  # scans in a row
+        self._told: _Told | None = None
         self._track: _Track | None = None
 
     # --- what the agent calls ------------------------------------------------------------------------------------
@@ -112,12 +128,26 @@ class Localiser:
         self._process_if_covered()
         return list(self._take_ready())
 
+    def start_at(self, t_ns: int, T_map_vehicle: F64, *, trusted: bool = False) -> None:
+        """Take a pose (4, 4) from outside, such as that of the last parking, instead of the present one or of a search.
+
+        It is judged like any other; `trusted` spares it the first proof, not the doubts that come later.
+        """
+        if self._track is not None:
+            self._lose(self._track, "searching")
+        self._told = _Told(t_ns, np.array(T_map_vehicle, np.float64), trusted)
+
+    @property
+    def state(self) -> tuple[Health, Cause]:
+        """Health and cause now, also while there has been no pose yet."""
+        return ("lost", self._first.cause) if self.online is None else (self.online.health, self.online.cause)
+
     def flush(self) -> Iterator[RefinedScan]:
         """Finish: give the scans that are still held, with their poses as they stand, one by one (they are large)."""
         self._process()
         track, self._track = self._track, None
         if track is not None:
-            self._finalise(track, track.graph.flush())
+            self._finalise(track, track.graph.flush() if track.refiner is None else track.refiner.flush())
         return self._take_ready()
 
     @property
@@ -170,18 +200,16 @@ class Localiser:
                 self._teacher.learn(t_ns, result.T_map_vehicle, result.covariance)
         odometry = Odometry(odometry.T_before_now, joint.driven_sigmas)
         gnss, T_now = self._gnss_at(track, t_ns, predicted), predicted if match is None else match.T_map_vehicle
-        unknown_s = self._motion.unknown_s(track.held[newest].t_ns, t_ns)
+        unknown_s = max(self._motion.unknown_s(track.held[newest].t_ns, t_ns), self._motion.age_s(t_ns))
         seen_scan = Matched(t_ns, points, joint.T_before_now, T_now, result, believed, unknown_s)
         track.judge.see(seen_scan, self._map.near(T_now[:3, 3]))
-        final = track.graph.add(t_ns, predicted, odometry, match, gnss, seen)
+        final = track.graph.add(t_ns, predicted, odometry, match or self._settled(predicted), gnss, seen)
         self._hold(track, scan, result.matching_ratio if result is not None else 0.0, sweep)
-        self._finalise(track, final)
+        self._finalise(track, final if track.refiner is None else self._refine(track, track.refiner, t_ns, points))
         if self.online is not None and self.online.health == "lost":
             self._lose(track, self.online.cause)
 
-    def _scan_step(
-        self, scan: Scan, chosen: NDArray[np.int64], points: F64, odometry: Odometry
-    ) -> ScanStep | None:
+    def _scan_step(self, scan: Scan, chosen: NDArray[np.int64], points: F64, odometry: Odometry) -> ScanStep | None:
         """The motion since the scan before, as the scans tell it."""
         if not self.parameters.scan_odometry.enabled:
             return None
@@ -220,6 +248,14 @@ class Localiser:
         except RegistrationError:
             return None
 
+    def _settled(self, predicted: F64) -> MapMatch | None:
+        """What a scan without a match still knows: its wheels stand on the ground."""
+        try:
+            found = settle(predicted, self._map.near(predicted[:3, 3]), self.parameters.registration)
+        except RegistrationError:
+            return None
+        return MapMatch(found.T_map_vehicle, found.covariance)
+
     def _gnss_at(self, track: _Track, t_ns: int, T_map_vehicle: F64) -> Position | None:
         """A new fix as position of the vehicle at `t_ns`; the monitor is told how far off it is."""
         fix, self._fix = self._fix, None
@@ -245,11 +281,25 @@ class Localiser:
         track.held[number] = held
         self.online = _estimate(pose, held)
 
+    def _refine(self, track: _Track, refiner: Refiner, t_ns: int, points: F64) -> list[SmoothedPose]:
+        """Give the scan to the submaps, and let what they say correct the online pose; the poses that became final."""
+        number = track.graph.newest
+        T_online = track.graph.pose(number)
+        final = refiner.push(number, t_ns, points, T_online)
+        track.judge.monitor.certain = refiner.certain
+        correction = refiner.correction(T_online)
+        if correction is not None:
+            track.graph.restart(*correction)
+        return final
+
     # --- the first pose, and the last --------------------------------------------------------------------------------
 
     def _start(self, scan: Scan, points: F64) -> None:
         """Search for the pose, and follow what was found until one has won."""
         t_ns = _reference_ns(scan)
+        if self._told is not None:
+            self._begin_as_told(scan, points, self._told)
+            return
         moved = self._motion.delta(t_ns if self._last_ns is None else self._last_ns, t_ns)
         found = self._first.see(t_ns, points, moved, self._place(t_ns), self._map)
         if found is None:
@@ -259,16 +309,31 @@ class Localiser:
         self.initialisations += 1
         self._begin(scan, points, found.registration, found.fit)
 
+    def _begin_as_told(self, scan: Scan, points: F64, told: _Told) -> None:
+        self._told = None
+        T = told.T_map_vehicle @ self._motion.delta(told.t_ns, _reference_ns(scan))
+        covariance = np.diag([TOLD_RAD**2] * 3 + [TOLD_M**2] * 3)
+        fit = 1.0 if told.trusted else 0.0
+        self._begin(scan, points, RegistrationResult(T, covariance, 0.0, fit, 1.0, 0, True, np.empty((0, 6))), fit)
+
     def _begin(self, scan: Scan, points: F64, result: RegistrationResult, fit: float) -> None:
         """Track from this pose on."""
         par, t_ns = self.parameters, _reference_ns(scan)
         self._first = FirstPose(par)
         judge = Judge(par, self.T_vehicle_lidar[:3, 3], t_ns)
         judge.monitor.see_match(fit, result.fit, result.degenerate)
-        self._track = _Track(PoseGraph(par.graph), judge, {})
+        self._track = _Track(PoseGraph(par.graph), judge, self._new_refiner(), {})
         self._track.graph.add(t_ns, result.T_map_vehicle, None, MapMatch(result.T_map_vehicle, result.covariance), None)
         self._hold(self._track, scan, result.matching_ratio)
+        if self._track.refiner is not None:
+            self._refine(self._track, self._track.refiner, t_ns, points)
         self._scan_odometry.begin(t_ns, points)
+
+    def _new_refiner(self) -> Refiner | None:
+        par = self.parameters
+        if not par.refine.enabled:
+            return None
+        return Refiner(par.refine, par.registration, self._map, self._motion, self._teacher)
 
     def _place(self, t_ns: int) -> Place | None:
         """Where the last fix says that the vehicle is; how far it has driven since is not known in which direction."""
@@ -372,13 +437,14 @@ def _sigmas(pose: SmoothedPose) -> tuple[float, float]:
 
 def _estimate(pose: SmoothedPose, held: _HeldScan) -> PoseEstimate:
     sigma_m, sigma_rad = _sigmas(pose)
+    overruled = pose.certain and held.health != "good" and held.cause in OVERRULED
     return PoseEstimate(
         t_ns=pose.t_ns,
         T_map_vehicle=pose.T_map_vehicle,
         sigma_m=sigma_m,
         sigma_rad=sigma_rad,
         matching_ratio=held.matching_ratio,
-        health=held.health,
-        cause=held.cause,
+        health="good" if overruled else held.health,
+        cause="stale_map" if overruled else held.cause,
         degenerate=held.degenerate,
     )

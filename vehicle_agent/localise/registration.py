@@ -18,7 +18,8 @@ Start = Literal["near", "wide", "capture"]
 
 # Where a car's wheels touch the road, vehicle frame (origin on the road under the middle of the rear axle), metres.
 WHEELS_M = np.array([[0.0, 0.8, 0.0], [0.0, -0.8, 0.0], [2.8, 0.8, 0.0], [2.8, -0.8, 0.0]])
-WHEEL_SCALE = 10.0
+WHEEL_SCALE = 10.0  # in sigmas of a point: a kerb or a road that was raised, but not a frame that lies elsewhere
+SETTLING = 3
 LEVER_M = 10.0  # a turn moves the points that constrain it by about this times its angle
 
 
@@ -60,6 +61,7 @@ class _State:
     t: F64
     H: F64
     g: F64
+    wheels_m: F64
     cost: float = 0.0
     matched: int = 0
     inside: int = 0
@@ -71,6 +73,7 @@ def register(
     match_map: MatchMap,
     parameters: RegistrationParameters | None = None,
     start: Start = "near",
+    wheels_m: F64 = WHEELS_M,
 ) -> RegistrationResult:
     """Move the scan onto the map.
 
@@ -80,13 +83,14 @@ def register(
         match_map: the map window.
         parameters: defaults if None.
         start: how far off that may be: "near" some 10 cm, "wide" 1 m and 3°, "capture" 2 m and 5°.
+        wheels_m: (W, 3) points of the vehicle frame that lie on the road.
 
     Raises:
         RegistrationError: fewer than `min_matched` points have a Gaussian nearby.
     """
     par = parameters or RegistrationParameters()
     T = np.array(T_map_vehicle, dtype=np.float64)
-    state = _State(T[:3, :3].copy(), T[:3, 3].copy(), np.zeros((6, 6)), np.zeros(6))
+    state = _State(T[:3, :3].copy(), T[:3, 3].copy(), np.zeros((6, 6)), np.zeros(6), wheels_m)
     points = np.ascontiguousarray(points_m, dtype=np.float64)
     scales = {"near": par.scales, "wide": par.wide_scales, "capture": par.capture_scales}[start]
     iterations, converged = 0, False
@@ -113,6 +117,33 @@ def fit_of(points_m: F64, T_map_vehicle: F64, match_map: MatchMap, parameters: R
     return (inside - cost / scale**2) / len(points_m)
 
 
+def settle(
+    T_map_vehicle: ArrayLike,
+    match_map: MatchMap,
+    parameters: RegistrationParameters | None = None,
+    wheels_m: F64 = WHEELS_M,
+) -> RegistrationResult:
+    """Set the vehicle on the map's ground: height, roll and pitch by its wheels alone, the rest stays as it is.
+
+    What a scan that matches nothing, or only what has changed, still knows. Directions that are not moved have a sigma
+    of 10 m (turns at 10 m) in the covariance.
+
+    Raises:
+        RegistrationError: fewer than three wheels stand on ground that the map knows.
+    """
+    par = parameters or RegistrationParameters()
+    T = np.array(T_map_vehicle, dtype=np.float64)
+    state = _State(T[:3, :3].copy(), T[:3, 3].copy(), np.zeros((6, 6)), np.zeros(6), wheels_m)
+    for _ in range(SETTLING):
+        state.H[:], state.g[:] = 0.0, 0.0
+        on_ground = _add_wheels(state, match_map, par, WHEEL_SCALE)
+        if on_ground < 3:
+            raise RegistrationError(f"{on_ground} of {len(wheels_m)} wheels stand on ground that the map knows, 3 must")
+        step = _solve(state.H, state.g, par)
+        state.R, state.t = exp_so3(step[:3]) @ state.R, state.t + step[3:]
+    return _result(state, len(wheels_m), WHEEL_SCALE, par, SETTLING, converged=True)
+
+
 def _linearise(points: F64, s: _State, m: MatchMap, par: RegistrationParameters, scale: float) -> None:
     """Refresh the normal equations of `s`; RegistrationError when too little matches."""
     gate_m2 = (par.gate_per_scale * scale) ** 2
@@ -127,17 +158,22 @@ def _linearise(points: F64, s: _State, m: MatchMap, par: RegistrationParameters,
         )
 
 
-def _add_wheels(s: _State, m: MatchMap, par: RegistrationParameters, scale: float) -> None:
-    """The wheels stand on the map's ground: four points of their own weight, as uncertain as springs and tyres are."""
+def _add_wheels(s: _State, m: MatchMap, par: RegistrationParameters, scale: float) -> int:
+    """The wheels stand on the map's ground: points of their own weight, as uncertain as springs and tyres are; gives
+    how many do.
+    """
     if par.wheel_sigma_m <= 0:
-        return
+        return 0
     scale = max(scale, WHEEL_SCALE)
     H, g = np.empty((6, 6)), np.empty(6)
     gate_m2 = (par.gate_per_scale * scale) ** 2
-    linearise(WHEELS_M, s.R, s.t, m.index, m.A, m.b, m.mean_m, m.information, scale**2, gate_m2, H, g)
+    _, on_ground, _ = linearise(
+        s.wheels_m, s.R, s.t, m.index, m.A, m.b, m.mean_m, m.information, scale**2, gate_m2, H, g
+    )
     weight = par.correlation * (par.noise_m / par.wheel_sigma_m) ** 2
     s.H += weight * H
     s.g += weight * g
+    return on_ground
 
 
 def _descend(
