@@ -16,13 +16,14 @@ from mcap.reader import make_reader
 from deploy.cli import gnd
 from gnd_map.motion import Trajectory
 from gnd_map.se3 import T_inverse
-from schemas.drive import GnssFix, ReferencePose
+from schemas.drive import DriveItem, GnssFix, ReferencePose, Scan
 from schemas.drive_mcap import load_track, read_header
 from schemas.trajectory_files import read_kitti, read_tum
 from tile_store.sqlite_store import SqliteStore
 from vehicle_agent.localise_drive.command import ended_by_ctrl_c
 from vehicle_agent.localise_drive.outputs import NAMES
 from vehicle_agent.localise_drive.run import localise_drive
+from vehicle_agent.localise_drive.stretches import stretches_of
 from vehicle_agent.localise_drive.tiles import StoreMap
 
 
@@ -219,6 +220,30 @@ def test_a_drive_elsewhere_is_told_where_the_map_is(ran: Ran, tmp_path: Path) ->
     assert "no tiles here: the drive is at 38.1" in said
     assert "the nearest of the map's" in said
     assert "63.5 km away" in said
+
+
+def test_scans_that_stop_coming_are_a_gap_of_the_timeline(ran: Ran, tmp_path: Path) -> None:
+    """Scans between 1.5 and 3 s are missing; wheels and satellites go on."""
+    start_ns = load_track(ran.drive).motion.t_ns[0]
+
+    def holed(item: DriveItem) -> DriveItem | None:
+        missing = isinstance(item, Scan) and 1.5 < (item.t_ns - start_ns) * 1e-9 < 3.0
+        return None if missing else item
+
+    hole = changed(ran.drive, tmp_path / "hole.mcap", holed)
+    with SqliteStore(ran.store, create=False) as store:
+        found = localise_drive(hole, StoreMap(store))
+    gaps = [one for one in stretches_of(found.moments) if one.cause == "gap"]
+    assert len(gaps) == 1
+    assert gaps[0].health != "good"
+    assert gaps[0].scans == 0
+    assert 1.5 < gaps[0].from_s < gaps[0].to_s < 3.2
+    assert sum(one.scans for one in stretches_of(found.moments)) == found.counts.scans
+
+
+def test_a_drive_without_scans_is_refused(ran: Ran, tmp_path: Path) -> None:
+    none = changed(ran.drive, tmp_path / "none.mcap", lambda i: None if isinstance(i, Scan) else i)
+    assert "has no scans" in refusal(none, ran.store, "--out", str(tmp_path / "out"))
 
 
 def test_a_drive_without_gnss_is_refused(ran: Ran, tmp_path: Path) -> None:

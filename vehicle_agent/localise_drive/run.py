@@ -35,15 +35,17 @@ Progress = Callable[[int, int], None]
 
 @dataclass(frozen=True, slots=True)
 class Moment:
-    """How it stood with the online pose at one scan."""
+    """How it stood with the online pose at one scan, or when it changed between scans."""
 
     t_ns: int
-    """Start of the sweep."""
+    """Start of the sweep, or when it changed."""
     way_m: float
     """Driven since the recording's start, by the wheels."""
     health: Health
     cause: Cause
     degenerate: tuple[str, ...] = ()
+    of_scan: bool = True
+    """False: between scans, such as when they stop coming."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -98,12 +100,14 @@ def localise_drive(
     A recording that turns out to be damaged on the way, and `stop`, end it there: what was found is returned.
 
     Raises:
-        LocaliseError: `path` is no drive of ours, has no GNSS fix, or the map has no tiles there.
+        LocaliseError: `path` is no drive of ours, has no scan or no GNSS fix, or the map has no tiles there.
         DriveError: the recording cannot be read at all.
         StoreError: the store cannot be read.
     """
     check_is_drive(path)
     header, track, total = read_header(path), load_track(path), drive_counts(path).scans
+    if not total:
+        raise LocaliseError(f"{path} has no scans: there is nothing to localise")
     if not len(track.gnss.t_ns):
         raise LocaliseError(f"{path} has no GNSS fix: nothing says where on the map to begin")
     tiles.check_covers(track.gnss.lat_rad, track.gnss.lon_rad, DownloadParameters().near_m)
@@ -176,6 +180,7 @@ class _Run:
             self._damage = str(damage)
         self._keep(self._localiser.flush())
         self._settle()
+        self._note_end()
         self._wall_s = time.monotonic() - self._started_s
 
     def _take(self, item: DriveItem) -> None:
@@ -186,6 +191,7 @@ class _Run:
         elif isinstance(item, Scan):
             self._take_scan(item)
         self._note_online()
+        self._note_change(item.t_ns)
         self._place.take(item, self._localiser.online)
 
     def _take_scan(self, scan: Scan) -> None:
@@ -205,9 +211,26 @@ class _Run:
         online, kept = self._localiser.online, self._record.online
         if online is not None and (not kept or online.t_ns > kept[-1].t_ns):
             kept.append(self._anchored(online))
+        waiting = self._record.waiting
+        if waiting is not None and online is not None and online.t_ns >= waiting[0]:
+            self._settle()
+
+    def _note_change(self, t_ns: int) -> None:
+        """Note what has changed since the newest scan without another one."""
+        moments = self._record.moments
+        if self._record.waiting is None and moments:
+            health, cause = self._localiser.state
+            if (health, cause) != (moments[-1].health, moments[-1].cause):
+                moments.append(Moment(t_ns, self._place.odometer_m, health, cause, of_scan=False))
+
+    def _note_end(self) -> None:
+        """A state in which no scan came lasts until the recording ends."""
+        moments = self._record.moments
+        if moments and not moments[-1].of_scan and self._place.t_ns > moments[-1].t_ns:
+            moments.append(replace(moments[-1], t_ns=self._place.t_ns, way_m=self._place.odometer_m))
 
     def _settle(self) -> None:
-        """The newest scan but one was worked on: note how it stands."""
+        """The newest scan was worked on, or will not be: note how it stands."""
         if self._record.waiting is None:
             return
         (t_ns, way_m), self._record.waiting = self._record.waiting, None

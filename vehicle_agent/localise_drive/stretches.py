@@ -13,7 +13,7 @@ HEALTHS: Final[tuple[Health, ...]] = ("good", "degraded", "lost")
 
 @dataclass(frozen=True, slots=True)
 class Stretch:
-    """From the first of its scans to the first of the next stretch (the last scan of the drive, for the last)."""
+    """From its first scan (or when it changed) to the first of the next stretch (the last scan, for the last one)."""
 
     health: Health
     cause: Cause
@@ -57,7 +57,7 @@ def _stretch(group: Sequence[Moment], end: Moment, start_ns: int) -> Stretch:
         to_s=(end.t_ns - start_ns) * 1e-9,
         from_m=first.way_m,
         to_m=end.way_m,
-        scans=len(group),
+        scans=sum(moment.of_scan for moment in group),
     )
 
 
