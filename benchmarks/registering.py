@@ -38,13 +38,18 @@ CONVERGED_M, CONVERGED_DEG = 0.1, 0.3
 REACH_M = 2.0
 
 
-def registrations(sensor: str, scans: Sequence[tuple[F64, F64]], points: F64, local_map: LocalMap) -> list[Figure]:
+def rivals_of(map_points: F64) -> dict[str, Aligner]:
+    """small_gicp on the points (N, 3) of a map."""
+    return {"small_gicp VGICP": _vgicp(map_points), "small_gicp GICP": _gicp(map_points)}
+
+
+def registrations(
+    sensor: str, scans: Sequence[tuple[F64, F64]], rivals: dict[str, Aligner], local_map: LocalMap
+) -> list[Figure]:
     """Time, share that converged and median error, for each start and aligner."""
     figures = []
-    vgicp, gicp = _vgicp(points), _gicp(points)
     for metres, degrees, start in STARTS:
-        aligners = {"ours": _ours(local_map, start), "small_gicp VGICP": vgicp, "small_gicp GICP": gicp}
-        for name, align in aligners.items():
+        for name, align in {"ours": _ours(local_map, start), **rivals}.items():
             title = f"registration, {sensor}, {metres:g} m / {degrees:g}°, {name}"
             figures.append(_registration(title, align, scans, metres, degrees))
     return figures

@@ -10,7 +10,7 @@ from gnd_map.se3 import T_inverse, transform
 from vehicle_agent.localise.kernels import tapered_information
 from vehicle_agent.localise.match_map import UNIFORM_VOXEL_M2
 from vehicle_agent.localise.rolling_map import RollingMap
-from vehicle_agent.localise.scan_odometry import ScanOdometry, joint_step
+from vehicle_agent.localise.scan_odometry import ScanOdometry, ScanStep, joint_step
 from vehicle_agent.localise.scan_odometry_parameters import RollingMapParameters, ScanOdometryParameters
 
 STEP_NS = 100_000_000
@@ -87,6 +87,29 @@ def test_locked_wheels_are_seen_through(sweep):
     assert all(s is not None for s in steps)
     for k in (7, 8, 9):
         assert offset(true_step(k), steps[k - 1].T_before_now)[0] < 0.03
+
+
+def test_slipping_wheels_coast_over_a_scan_that_matches_nowhere(sweep):
+    """And not for long: after half a second the wheels have their say again."""
+    odometry = ScanOdometry(ScanOdometryParameters())
+    drive(odometry, sweep, 8, lambda k: wheels(k, 0.0 if k > 5 else 1.0))
+    nothing = sweep(7)[:10]
+    for k in range(8, 13):
+        step = odometry.step(k * STEP_NS, nothing, wheels(k, 0.0), SIGMAS, lambda: nothing)
+        assert offset(true_step(k), step.T_before_now)[0] < 0.05
+        assert step.covariance[3, 3] >= 0.03**2
+        assert joint_step(wheels(k, 0.0), SIGMAS, step).slipped
+    assert odometry.step(13 * STEP_NS, nothing, wheels(13, 0.0), SIGMAS, lambda: nothing) is None
+
+
+def test_wheels_that_slipped_are_believed_again_once_they_agree(sweep):
+    """Two sigmas are no slip in themselves, but the rest of one."""
+    off = wheels(3)
+    off[0, 3] -= 2.0 * np.hypot(SIGMAS[3], 0.005)
+    covariance = np.diag(np.full(6, 0.005**2))
+    assert not joint_step(off, SIGMAS, ScanStep(wheels(3), covariance)).slipped
+    assert joint_step(off, SIGMAS, ScanStep(wheels(3), covariance, slipping=True)).slipped
+    assert not joint_step(wheels(3), SIGMAS, ScanStep(wheels(3), covariance, slipping=True)).slipped
 
 
 def test_agreeing_wheels_are_not_contradicted(sweep):

@@ -22,7 +22,7 @@ from vehicle_agent.localise.scan_odometry_parameters import ScanOdometryParamete
 
 F64 = NDArray[np.float64]
 
-CONTRADICTION = 3.0  # sigmas
+CONTRADICTED, STILL_CONTRADICTED = 3.0, 1.5  # sigmas at which wheels begin to slip, and above which they still do
 
 
 class SteadyMotion(NamedTuple):
@@ -46,11 +46,13 @@ class ScanStep(NamedTuple):
 
     T_before_now: (4, 4). covariance: (6, 6) of a small motion of the vehicle at its later end, rotation [rad] first,
     then position [m], along its own axes (as GTSAM's BetweenFactorPose3 takes it); directions that the scans do not
-    constrain have a sigma of metres, and T_before_now follows the prediction there.
+    constrain have a sigma of metres, and T_before_now follows the prediction there. slipping: the wheels slipped in the
+    step before, so that less is needed to contradict them in this one.
     """
 
     T_before_now: F64
     covariance: F64
+    slipping: bool = False
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -71,10 +73,11 @@ def joint_step(T_driven: F64, sigmas: F64, step: ScanStep | None) -> JointStep:
     if step is None:
         return JointStep(T_driven, sigmas, False)
     off = _log(T_inverse(T_driven) @ step.T_before_now)
-    excess = off**2 - CONTRADICTION**2 * (sigmas**2 + np.diag(step.covariance))
-    grown = np.hypot(sigmas, np.sqrt(np.maximum(excess, 0.0)))
+    level = STILL_CONTRADICTED if step.slipping else CONTRADICTED
+    contradicted = off**2 > level**2 * (sigmas**2 + np.diag(step.covariance))
+    grown = np.where(contradicted, np.hypot(sigmas, CONTRADICTED * off), sigmas)
     gain = _gain(np.diag(grown**2), step.covariance)
-    return JointStep(T_driven @ _exp(gain @ off), grown, bool((excess > 0).any()))
+    return JointStep(T_driven @ _exp(gain @ off), grown, bool(contradicted.any()))
 
 
 class _Prediction(NamedTuple):
@@ -110,6 +113,7 @@ class ScanOdometry:
         self._covariance = np.zeros((6, 6))
         self._steady: SteadyMotion | None = None
         self._slipping = False
+        self._coasted_ns = 0
         self._T_odom_added = np.eye(4)
 
     def begin(self, t_ns: int, points_m: F64) -> None:
@@ -148,16 +152,32 @@ class ScanOdometry:
         dt_ns, self._before_ns = t_ns - self._before_ns, t_ns
         driven = _Prediction(T_before_now_predicted, sigmas, points_vehicle_m)
         match = self._matched(driven, self._going_on(dt_ns, points_going_on))
+        if match is None and self._slipping and self._steady is not None:
+            coasted = self._coast(self._steady, dt_ns, points_vehicle_m)
+            if coasted is not None:
+                return coasted
         used = driven if match is None else match.prediction
         T_before_now = self._advance(used, match)
         self._add(used.points_m)
-        self._steady, self._slipping = None, False
+        slipped, self._steady, self._slipping, self._coasted_ns = self._slipping, None, False, 0
         if match is None:
             return None
         self._steady = SteadyMotion(T_before_now, dt_ns)
-        step = ScanStep(T_before_now, self.parameters.step_share * match.covariance)
+        step = ScanStep(T_before_now, self.parameters.step_share * match.covariance, slipped)
         self._slipping = joint_step(T_before_now_predicted, sigmas, step).slipped
         return step
+
+    def _coast(self, steady: SteadyMotion, dt_ns: int, points_m: F64) -> ScanStep | None:
+        """Go on as before over a scan that matches nowhere while the wheels slip, for a short time."""
+        par = self.parameters
+        self._coasted_ns += dt_ns
+        if self._coasted_ns > par.coast_s * 1e9:
+            return None
+        going_on = _Prediction(steady.after(dt_ns), self._steady_sigmas(), points_m)
+        return ScanStep(self._advance(going_on, None), np.diag(going_on.sigmas**2), slipping=True)
+
+    def _steady_sigmas(self) -> F64:
+        return np.array([self.parameters.steady_rad] * 3 + [self.parameters.steady_m] * 3)
 
     def _matched(self, driven: _Prediction, going_on: Callable[[], _Prediction] | None) -> _Match | None:
         """The match near to what wheels and gyro say, or near to going on as before: that comes first while the
@@ -172,11 +192,10 @@ class ScanOdometry:
 
     def _going_on(self, dt_ns: int, points_going_on: Callable[[], F64] | None) -> Callable[[], _Prediction] | None:
         """The motion of the step before, for as long as this one took."""
-        par, steady = self.parameters, self._steady
+        steady = self._steady
         if steady is None or points_going_on is None:
             return None
-        sigmas = np.array([par.steady_rad] * 3 + [par.steady_m] * 3)
-        return lambda: _Prediction(steady.after(dt_ns), sigmas, points_going_on())
+        return lambda: _Prediction(steady.after(dt_ns), self._steady_sigmas(), points_going_on())
 
     def _match_near(self, prediction: _Prediction, min_fit: float) -> _Match | None:
         """The match, if it fits well enough and lies near enough to the prediction."""

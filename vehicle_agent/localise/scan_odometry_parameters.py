@@ -42,7 +42,8 @@ class ScanOdometryParameters:
     n_points: so many of a scan's sampled points are matched.
     noise_m, scales, correlation, floor_m, floor_rad, degenerate_m: as in `RegistrationParameters`.
     step_share: a step's variance in that of a match: the matches of a stretch of road share most of their errors.
-    steady_m, steady_rad: sigmas of going on as in the step before, which is tried where wheels and gyro lead nowhere.
+    steady_m, steady_rad: sigmas of going on as in the step before, which is tried where wheels and gyro lead nowhere;
+        coast_s: for so long a vehicle with slipping wheels is taken to go on over scans that match nowhere.
     min_fit, min_matching_ratio: a match that fits worse is not given; min_steady_fit: the same when going on as before.
     gate_m, gate_deg: how far a step may lie from the prediction, beyond three of its sigmas.
     add_m, add_deg: a scan joins the map when the vehicle has moved so far since the last that did; the first
@@ -61,6 +62,7 @@ class ScanOdometryParameters:
     step_share: float = 0.2
     steady_m: float = 0.03
     steady_rad: float = 2e-3
+    coast_s: float = 0.5
     min_fit: float = 0.4
     min_steady_fit: float = 0.6
     min_matching_ratio: float = 0.5
