@@ -11,7 +11,7 @@ from benchmarks.real_localisation.apollo import apollo_map, gaussians_apart, on_
 from benchmarks.real_localisation.convergence import convergence_of
 from benchmarks.real_localisation.errors import RealLocalisationError
 from benchmarks.real_localisation.flexmap import flexmap_of, is_flexmap
-from benchmarks.real_localisation.halves import Half, gicp_reference
+from benchmarks.real_localisation.halves import METHODS, Half, gicp_reference, localised
 from benchmarks.real_localisation.nagoya import dead_reckoned, is_nagoya, nagoya_of, read_reference
 from benchmarks.real_localisation.odometry import compared, odometries
 from benchmarks.real_localisation.options import RealLocalisationOptions
@@ -21,6 +21,7 @@ from gnd_map.geodesy import LocalFrame
 from gnd_map.se3 import T_inverse
 from vehicle_agent.importer import map_track, no_progress, open_recording
 from vehicle_agent.importers.cleaning import cleaned
+from vehicle_agent.localise import localisation_error
 
 
 @pytest.fixture(scope="module")
@@ -136,3 +137,14 @@ def test_options_are_checked(tmp_path: Path) -> None:
     (tmp_path / "b" / "x").mkdir(parents=True)
     with pytest.raises(RealLocalisationError, match="one name twice"):
         RealLocalisationOptions.of(f"{tmp_path / 'a' / 'x'},{tmp_path / 'b' / 'x'}", 200, 0)
+
+
+@pytest.mark.slow
+def test_refined_poses_of_a_real_drive_stay_where_its_scans_fit(shared_data: Path) -> None:
+    """Wheels on a thinly mapped road once pulled submaps a quarter of a metre along it."""
+    recorded = load(open_recording("kitti", shared_data / "kitti00_start16"), 16, no_progress)
+    half = Half.of(place(recorded, 0), "second-half", "first-half")
+    found = localised(half, 0, METHODS["with_submap"]).estimates
+    assert len(found) >= 4
+    error = localisation_error(found, half.scene.poses)
+    assert max(error.longitudinal_max_m, error.lateral_max_m) < 0.06

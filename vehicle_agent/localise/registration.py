@@ -19,6 +19,7 @@ Start = Literal["near", "wide", "capture"]
 # Where a car's wheels touch the road, vehicle frame (origin on the road under the middle of the rear axle), metres.
 WHEELS_M = np.array([[0.0, 0.8, 0.0], [0.0, -0.8, 0.0], [2.8, 0.8, 0.0], [2.8, -0.8, 0.0]])
 WHEEL_SCALE = 10.0  # in sigmas of a point: a kerb or a road that was raised, but not a frame that lies elsewhere
+WHEELS_TELL = np.array([1.0, 1.0, 0.0, 0.0, 0.0, 1.0])  # turns about the map's east and north, and height
 SETTLING = 3
 LEVER_M = 10.0  # a turn moves the points that constrain it by about this times its angle
 
@@ -160,7 +161,8 @@ def _linearise(points: F64, s: _State, m: MatchMap, par: RegistrationParameters,
 
 def _add_wheels(s: _State, m: MatchMap, par: RegistrationParameters, scale: float) -> int:
     """The wheels stand on the map's ground: points of their own weight, as uncertain as springs and tyres are; gives
-    how many do.
+    how many do. They tell height, roll and pitch only: of a road of which the map holds single rings, its Gaussians
+    would tell where the rings lie.
     """
     if par.wheel_sigma_m <= 0:
         return 0
@@ -171,8 +173,8 @@ def _add_wheels(s: _State, m: MatchMap, par: RegistrationParameters, scale: floa
         s.wheels_m, s.R, s.t, m.index, m.A, m.b, m.mean_m, m.information, scale**2, gate_m2, H, g
     )
     weight = par.correlation * (par.noise_m / par.wheel_sigma_m) ** 2
-    s.H += weight * H
-    s.g += weight * g
+    s.H += weight * H * WHEELS_TELL * WHEELS_TELL[:, None]
+    s.g += weight * g * WHEELS_TELL
     return on_ground
 
 
