@@ -18,6 +18,7 @@ from vehicle_agent.localise.first_pose import FirstPose, Place
 from vehicle_agent.localise.graph import MapMatch, Odometry, PoseGraph, Position, SmoothedPose
 from vehicle_agent.localise.health import HealthMonitor
 from vehicle_agent.localise.judge import Judge, Matched
+from vehicle_agent.localise.level import on_the_road, sees_tilt
 from vehicle_agent.localise.match_map import MatchMapCache
 from vehicle_agent.localise.odometry import MotionBuffer
 from vehicle_agent.localise.packed_scan import PackedScan, pack
@@ -394,6 +395,8 @@ class Localiser:
 
     def _refined(self, held: _HeldScan, pose: SmoothedPose) -> RefinedScan:
         scan = held.scan
+        if not sees_tilt(scan.points):
+            pose = on_the_road(pose, self._map.near(pose.T_map_vehicle[:3, 3]), self.parameters.registration)
         sweep = self._motion.trajectory(scan.t_ns, scan.end_ns) if held.sweep is None else held.sweep
         ends, starts = scan.placed(sweep, self.T_vehicle_lidar, held.t_ns, pose.T_map_vehicle)
         return RefinedScan(held.t_ns, ends, starts, _estimate(pose, held))
@@ -447,4 +450,5 @@ def _estimate(pose: SmoothedPose, held: _HeldScan) -> PoseEstimate:
         health="good" if overruled else held.health,
         cause="stale_map" if overruled else held.cause,
         degenerate=held.degenerate,
+        covariance=pose.covariance,
     )

@@ -1,0 +1,50 @@
+"""Height and tilt of final poses of sensors that do not see them: the vehicle stands on the map's road.
+
+A few layers close to level meet every facade at one height. Where a Gaussian is not quite evenly filled from bottom to
+top they are drawn to its middle, and at 20 to 30 m that tilts the vehicle by half a degree, always to the same side;
+rays then seem to pass the road. Place and heading do not suffer. Such poses take height, roll and pitch from the map's
+ground under the wheels, which many layers know better than four wheels do.
+"""
+
+from dataclasses import replace
+from typing import Final
+
+import numpy as np
+import numpy.typing as npt
+
+from vehicle_agent.errors import RegistrationError
+from vehicle_agent.localise.graph import SmoothedPose
+from vehicle_agent.localise.match_map import MatchMap
+from vehicle_agent.localise.parameters import RegistrationParameters
+from vehicle_agent.localise.registration import settle
+
+LEAST_SPREAD_DEG: Final = 8.0
+"""A sensor whose rays lie within so much of elevation does not see its tilt: a Scala has 3.2°, a VLP-16 30°."""
+SIGMA_RAD: Final = 2.5e-3
+SIGMA_M: Final = 0.01
+"""Of tilt and height by the wheels: the errors are those of the map's ground, not of springs."""
+_LOOKED_AT: Final = 500
+_TILT_AND_HEIGHT: Final = np.array([0, 1, 5])  # roll, pitch, z of a covariance, rotation first
+
+
+def sees_tilt(points_lidar: npt.NDArray[np.generic]) -> bool:
+    """Return whether the rays to points (N, 3) of a scan, LiDAR frame, any unit, spread enough in elevation."""
+    some = points_lidar[:: 1 + len(points_lidar) // _LOOKED_AT].astype(np.float64)
+    horizontal = np.hypot(some[:, 0], some[:, 1])
+    far = horizontal > 0.0
+    if not far.any():
+        return True
+    low, high = np.quantile(np.arctan2(some[far, 2], horizontal[far]), [0.05, 0.95])
+    return bool(np.degrees(high - low) >= LEAST_SPREAD_DEG)
+
+
+def on_the_road(pose: SmoothedPose, match_map: MatchMap, parameters: RegistrationParameters) -> SmoothedPose:
+    """Return the pose with height, roll and pitch by the wheels alone; as it is where the map has no ground there."""
+    try:
+        found = settle(pose.T_map_vehicle, match_map, parameters)
+    except RegistrationError:
+        return pose
+    covariance = pose.covariance.copy()
+    covariance[_TILT_AND_HEIGHT] = covariance[:, _TILT_AND_HEIGHT] = 0.0
+    covariance[_TILT_AND_HEIGHT, _TILT_AND_HEIGHT] = SIGMA_RAD**2, SIGMA_RAD**2, SIGMA_M**2
+    return replace(pose, T_map_vehicle=found.T_map_vehicle, covariance=covariance)
