@@ -9,7 +9,7 @@ downsampling are in the time.
 """
 
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from math import ceil
 from time import perf_counter
 from typing import Any, Final
@@ -59,7 +59,10 @@ def convergence_of(half: Half, seed: int = 0, trials: int = TRIALS) -> list[dict
 
 
 def _aligners(half: Half, start: Start) -> dict[str, Aligner]:
-    return {"ours": _ours(half, start), "small_gicp VGICP": _vgicp(half), "small_gicp GICP": _gicp(half)}
+    plain = LocaliserParameters()
+    free = replace(plain, registration=replace(plain.registration, wheel_sigma_m=0.0))
+    ours = {"ours": _ours(half, start, plain), "ours, without wheels": _ours(half, start, free)}
+    return ours | {"small_gicp VGICP": _vgicp(half), "small_gicp GICP": _gicp(half)}
 
 
 def _trials(half: Half, off_m: float, off_deg: float, rng: np.random.Generator, at_least: int) -> Iterator[_Trial]:
@@ -111,8 +114,7 @@ def pose_error(T: F64, T_true: F64) -> tuple[float, float]:
     return float(np.hypot(off[0, 3], off[1, 3])), float(np.degrees(np.linalg.norm(log_so3(off[:3, :3]))))
 
 
-def _ours(half: Half, start: Start) -> Aligner:
-    parameters = LocaliserParameters()
+def _ours(half: Half, start: Start, parameters: LocaliserParameters) -> Aligner:
     cache = MatchMapCache(half.local_map, parameters.registration.noise_m)
     return on_map(cache.near, start, parameters)
 

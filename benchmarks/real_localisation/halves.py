@@ -23,6 +23,7 @@ from vehicle_agent.importers.recording import GNSS_SIGMA_M
 from vehicle_agent.importers.splits import chosen_scans
 from vehicle_agent.local_map import LocalMap
 from vehicle_agent.localise import Localiser, LocaliserParameters, PoseEstimate, RefinedScan, localisation_error
+from vehicle_agent.localise.parameters import RegistrationParameters
 from vehicle_agent.localise.refine_parameters import RefineParameters
 
 F64 = NDArray[np.float64]
@@ -76,9 +77,12 @@ class Localised:
 
 SEEDS: Final = (0, 1, 2)
 """Of the GNSS error."""
-METHODS: Final = {
+METHODS: Final = {  # the wheels stand on the road only as well as the recording tells where the LiDAR is mounted
     "with_submap": LocaliserParameters(),
     "without_submap": LocaliserParameters(refine=RefineParameters(enabled=False)),
+    "without_submap_and_wheels": LocaliserParameters(
+        registration=RegistrationParameters(wheel_sigma_m=0.0), refine=RefineParameters(enabled=False)
+    ),
 }
 
 

@@ -40,7 +40,7 @@ def draw_halves(recorded: Recorded, tracks: Sequence[Odometry], halves: Sequence
     for colour, (name, track) in zip(COLOURS, known, strict=False):
         p = (first @ track.T_dst_vehicle)[:, :3, 3]
         above.plot(p[:, 0], p[:, 1], "-", color=colour, lw=1.3, label=name)
-    for (method, parameters), marker in zip(METHODS.items(), ("o", "x"), strict=True):
+    for (method, parameters), marker in zip(METHODS.items(), ("o", "x"), strict=False):
         estimates = localised(half, 0, parameters).estimates
         _errors_of(errors, estimates, half.scene.poses, method.replace("_", " "), marker)
         p = np.array([e.T_map_vehicle[:3, 3] for e in estimates]).reshape(-1, 3)

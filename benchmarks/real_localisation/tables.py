@@ -6,6 +6,8 @@ from rich import box
 from rich.console import Console
 from rich.table import Table
 
+_METHODS = {"with_submap": "yes", "without_submap": "no", "without_submap_and_wheels": "no, no wheels"}
+
 
 def print_tables(found: dict[str, Any], console: Console | None = None) -> None:
     """Print what was measured in each recording."""
@@ -63,11 +65,11 @@ def _localisation(halves: list[dict[str, Any]]) -> Table:
         "along m", "across m", "heading °", "against",
     )  # fmt: skip
     for half in halves:
-        for method in ("with_submap", "without_submap"):
+        for method, submaps in _METHODS.items():
             one = half[method]
             count = f"{one['health'].get('good', 0)} / {one['localised']} / {half['driven']}"
             for name, error in one["errors"].items():
-                table.add_row(half["name"], "yes" if method == "with_submap" else "no", count, *_errors(error), name)
+                table.add_row(half["name"], submaps, count, *_errors(error), name)
         table.add_row("", "", "", *_errors(half["gicp_less_track"]), "gicp less track")
     return table
 
