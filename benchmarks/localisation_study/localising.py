@@ -1,7 +1,7 @@
 """One run of the localiser over a recorded drive, the map's tiles held around the vehicle as the agent does."""
 
 from collections.abc import Iterable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -11,7 +11,6 @@ from benchmarks.simulation.base_map import BaseMap
 from benchmarks.simulation.held_tiles import HeldTiles
 from benchmarks.simulation.poses import Localising
 from benchmarks.simulation.streams import first_fix
-from gnd_map.config import from_mapping, to_mapping
 from gnd_map.geodesy import LocalFrame
 from gnd_map.grid import GridFrame
 from gnd_map.motion import Trajectory
@@ -118,8 +117,4 @@ def _changed(items: Iterable[DriveItem], variant: Variant, vehicle: Vehicle) -> 
 
 def without_submaps(parameters: LocaliserParameters) -> LocaliserParameters:
     """Return the parameters of the general graph SLAM: final poses are those that leave the pose graph."""
-    plain = to_mapping(parameters)
-    if "refine" not in plain:
-        return parameters
-    plain["refine"]["enabled"] = False
-    return from_mapping(LocaliserParameters, plain)
+    return replace(parameters, refine=replace(parameters.refine, enabled=False))
