@@ -22,7 +22,7 @@ from vehicle_agent.localise import Localiser
 COMMAND = "python -m benchmarks first-pose"
 SEED, LENGTH_M = 101, 300.0
 SENSORS = ("VLP-16", "HDL-64E", "Scala")
-STARTS, WINDOW_S, FIX_NS = 20, 12.0, 100_000_000  # starts a drive, of which there are two a sensor
+STARTS, WINDOW_S, FIX_NS = 6, 10.0, 100_000_000  # starts a drive, of which there are two a sensor
 
 
 @dataclass(slots=True)

@@ -54,12 +54,10 @@ class Street:
         """All tiles, held."""
         return local_map_of(self.grid_frame, self.tiles)
 
-    def drive(
-        self, sensor: str, state: State, direction: Direction, seed: int, traffic: Traffic | None = None
-    ) -> "Drive":
-        """A drive with the default errors of its sensors, from one end of the street to the other."""
-        traffic = Traffic.urban() if traffic is None else traffic
-        config = DriveConfig("car", sensor, state, direction=direction, seed=seed, traffic=traffic)
+    def drive(self, sensor: str, state: State, direction: Direction, seed: int, *, empty: bool = False) -> "Drive":
+        """A drive with the default errors of its sensors, from one end of the street to the other; `empty`: of cars."""
+        traffic, share = (Traffic(), 0.0) if empty else (Traffic.urban(), 0.2)
+        config = DriveConfig("car", sensor, state, direction=direction, seed=seed, car_share=share, traffic=traffic)
         return Drive(self, DriveSimulation(self.world, config), MODELS[sensor].rate_hz)
 
 

@@ -56,6 +56,10 @@ class Challenger:
             turn_rad = np.pi if any_heading else np.radians(par.turn_deg)
             self._search(points_m, standing_m, T_tracked, _around(place, T_tracked, turn_rad), match_map)
 
+    def rest(self, t_ns: int) -> None:
+        """All around has just been searched: wait for the next time."""
+        self._searched_ns = t_ns
+
     @property
     def odds(self) -> float:
         """Logarithm of how much likelier the best rival is than the tracked pose; -inf without one."""

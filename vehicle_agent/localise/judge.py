@@ -5,6 +5,8 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from gnd_map.se3 import transform
+from vehicle_agent.local_map import EMPTY
 from vehicle_agent.localise.challenge import Challenger
 from vehicle_agent.localise.estimates import Cause
 from vehicle_agent.localise.first_pose import Place
@@ -59,7 +61,7 @@ class Judge:
         """Take a scan: what its rays say, how well it fits, whether another pose fits better."""
         if scan.motion_gap_s > self._par.causes.motion_gap_s or self.monitor.gap_s(scan.t_ns) > self._par.causes.gap_s:
             self.monitor.distrust()
-        self.monitor.see_scan(self._what_is_wrong(scan))
+        self.monitor.see_scan(self._what_is_wrong(scan, match_map))
         self.monitor.matching_ratio = 0.0 if scan.result is None else scan.result.matching_ratio
         self._way_m += float(np.linalg.norm(scan.T_before_now[:3, 3]))
         if len(scan.points_m) < self._par.registration.min_matched:
@@ -98,13 +100,21 @@ class Judge:
         )  # fmt: skip
         monitor.contested, monitor.beaten = self.challenger.contested, self.challenger.beaten
 
-    def _what_is_wrong(self, scan: Matched) -> Cause:
+    def _what_is_wrong(self, scan: Matched, match_map: MatchMap) -> Cause:
         """With the scan itself, whatever it matches."""
         before, self._last_points = self._last_points, scan.points_m
         if len(scan.points_m) < self._par.registration.min_matched:
             return "bad_scan"
         if before is not None and np.array_equal(before, scan.points_m):
             return "bad_scan"  # no sensor measures the same twice, to the bit
-        if scan.result is not None and scan.result.known_ratio < self._par.causes.least_known:
+        known = _known_ratio(scan, match_map) if scan.result is None else scan.result.known_ratio
+        if known < self._par.causes.least_known:
             return "no_map"
         return "no_motion" if scan.motion_gap_s > self._par.causes.motion_gap_s else "none"
+
+
+def _known_ratio(scan: Matched, m: MatchMap) -> float:
+    """Share of the points that lie in voxels of held tiles."""
+    g = np.floor(transform(scan.T_now, scan.points_m) @ m.A.T + m.b).astype(np.int64)
+    inside = ((g >= 0) & (g < m.index.shape)).all(axis=1)
+    return float((m.index[tuple(g[inside].T)] >= EMPTY).sum() / max(len(g), 1))

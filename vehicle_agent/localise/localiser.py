@@ -323,6 +323,8 @@ class Localiser:
         self._first = FirstPose(par)
         judge = Judge(par, self.T_vehicle_lidar[:3, 3], t_ns)
         judge.monitor.see_match(fit, result.fit, result.degenerate)
+        if judge.monitor.trusted:
+            judge.challenger.rest(t_ns)
         self._track = _Track(PoseGraph(par.graph), judge, self._new_refiner(), {})
         self._track.graph.add(t_ns, result.T_map_vehicle, None, MapMatch(result.T_map_vehicle, result.covariance), None)
         self._hold(self._track, scan, result.matching_ratio)

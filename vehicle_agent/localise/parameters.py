@@ -38,7 +38,8 @@ class RegistrationParameters:
     gate_per_scale: a point farther than this many scales from every Gaussian is no match.
     correlation: how many points share one error (of the map, of the mount); multiplies the covariance.
     floor_m, floor_rad: the least sigma claimed along an axis, whatever the Hessian says.
-    degenerate_m: a direction whose sigma exceeds this (turns taken at 10 m) is reported and not moved along.
+    degenerate_m: a direction whose sigma exceeds this (turns taken at 10 m) is reported and not moved along;
+        degenerate_share: so is a horizontal one with less than this share of the strongest direction's information.
     """
 
     noise_m: float = 0.04
@@ -54,6 +55,7 @@ class RegistrationParameters:
     floor_m: float = 0.01
     floor_rad: float = 3e-4
     degenerate_m: float = 0.2
+    degenerate_share: float = 0.01
     wheel_sigma_m: float = 0.02
 
     def __post_init__(self) -> None:
@@ -113,6 +115,7 @@ class OdometryParameters:
         upwards per metre forward (the LiDAR's mount is not aligned with the wheels) before anything is learnt.
     scale_drift, bias_drift_radps: their change in a root second.
     stretch_m, stretch_rad: of the motion over a second that two map matches tell.
+    least_scale, least_bias_radps: the least sigma of what a stretch of submaps tells about scale and bias.
     teaching_fit: least fit of a match that teaches: where much has changed, matches are off together.
     excess_gain: weight of the newest step in the running judgement of how much worse than all this the odometry is.
     """
@@ -130,6 +133,8 @@ class OdometryParameters:
     bias_drift_radps: float = 1e-5
     stretch_m: float = 0.03
     stretch_rad: float = 2e-3
+    least_scale: float = 5e-4
+    least_bias_radps: float = 7e-5
     teaching_fit: float = 0.75
     excess_gain: float = 0.2
 

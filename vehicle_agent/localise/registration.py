@@ -100,6 +100,8 @@ def register(
         used, converged = _descend(points, state, match_map, par, scale, coarse)
         iterations += used
     _linearise(points, state, match_map, par, scales[-1])
+    if _unmoved(state, T, par):
+        _linearise(points, state, match_map, par, scales[-1])
     return _result(state, len(points), scales[-1], par, iterations, converged)
 
 
@@ -195,7 +197,7 @@ def _descend(
 def _solve(H: F64, g: F64, par: RegistrationParameters) -> F64:
     """-H^-1 g, leaving out the directions that are degenerate (solution remapping, Zhang et al. 2016)."""
     values, vectors, scale = _principal(H)
-    strong = values > _least_information(par)
+    strong = values > par.correlation / par.degenerate_m**2
     along = vectors[:, strong]
     return np.asarray(-(along @ ((along.T @ (g * scale)) / values[strong])) * scale)
 
@@ -207,8 +209,25 @@ def _principal(H: F64) -> tuple[F64, F64, F64]:
     return values, vectors, scale
 
 
-def _least_information(par: RegistrationParameters) -> float:
-    return par.correlation / par.degenerate_m**2
+def _strong(values: F64, vectors: F64, par: RegistrationParameters) -> NDArray[np.bool_]:
+    """(6,) which principal directions are constrained: by enough information, and a horizontal one by more than what
+    the noise of a map says along an even wall.
+    """
+    horizontal = vectors[3] ** 2 + vectors[4] ** 2 > 0.5
+    least = par.correlation / par.degenerate_m**2
+    strongest = float(values[horizontal].max(initial=0.0))  # not the vertical, which wheels on the road hold firmly
+    return np.asarray(values > np.where(horizontal, max(least, par.degenerate_share * strongest), least))
+
+
+def _unmoved(s: _State, T_start: F64, par: RegistrationParameters) -> bool:
+    """Take back what was moved along horizontal directions that the scan does not constrain; True if there were any."""
+    values, vectors, _ = _principal(s.H)
+    weak = vectors[3:, ~_strong(values, vectors, par) & (values > par.correlation / par.degenerate_m**2)]
+    if not weak.size:
+        return False
+    weak = weak / np.linalg.norm(weak, axis=0)
+    s.t = s.t - weak @ (weak.T @ (s.t - T_start[:3, 3]))
+    return True
 
 
 def _result(
@@ -220,13 +239,13 @@ def _result(
     values, vectors, _ = _principal(H)
     return RegistrationResult(
         T_map_vehicle=T,
-        covariance=_covariance(values, vectors, par),
+        covariance=_covariance(np.where(_strong(values, vectors, par), values, 0.0), vectors, par),
         matching_ratio=s.matched / max(s.inside, 1),
         fit=1.0 - s.cost / (scale**2 * max(s.inside, 1)),
         known_ratio=s.inside / n,
         iterations=iterations,
         converged=converged,
-        degenerate=vectors[:, values <= _least_information(par)].T,
+        degenerate=vectors[:, ~_strong(values, vectors, par)].T,
     )
 
 
