@@ -7,8 +7,10 @@ import pytest
 from vehicle_scene import GRID_FRAME, SENSOR, ground, look, tiles_of, wall
 
 from gnd_map.arrays import F64
+from gnd_map.classes import ChangeClass
 from gnd_map.tile import Tile
 from gnd_map.tile_id import TileId
+from vehicle_agent.detect.classify import classify
 from vehicle_agent.detect.detector import ChangeDetector
 from vehicle_agent.detect.parameters import DetectParameterError, DetectParameters, SoftParameters
 from vehicle_agent.detect.uncertainty import PoseUncertainty, TileUncertainties, UncertaintyError
@@ -136,6 +138,37 @@ def test_a_heading_known_poorly_acts_with_the_range(tiles: Tiles) -> None:
 @pytest.mark.parametrize("sigma_m", [0.0, 0.01, 0.02, 0.04])
 def test_good_poses_change_nothing(tiles: Tiles, sigma_m: float) -> None:
     assert counted(tiles, PoseUncertainty(sigma_m)) == counted(tiles, PoseUncertainty())
+
+
+def changes_called(
+    tiles: Tiles, walls: list[tuple[float, float, float, float]], soft: SoftParameters
+) -> dict[str, int]:
+    """Classes that ten scans give whose poses are off by 10 cm along each axis, known to 10 cm and 0.15 degrees."""
+    rng, classes = np.random.default_rng(5), np.zeros(6, np.int64)
+    detector = detector_of(tiles, replace(DetectParameters(), soft=soft))
+    for _ in range(10):
+        off = rng.normal(0.0, 0.1, 3) * [1.0, 1.0, 0.5]
+        detector.add_scan(look(walls, rng) + off, SENSOR + off, None, PoseUncertainty(0.10, 0.0026))
+    for evidence in detector.finish(tiles).values():
+        classes += np.bincount(classify(evidence, detector.parameters).change_class, minlength=6)
+    return {name.lower(): int(n) for name, n in zip(ChangeClass.__members__, classes, strict=True)}
+
+
+def test_an_unchanged_place_seen_from_uncertain_poses_is_called_changed_less_often(tiles: Tiles) -> None:
+    place = [(9.3, -8.0, 8.0, 4.0)]
+    soft, hard = (changes_called(tiles, place, s) for s in (SoftParameters(), SoftParameters.off()))
+    assert hard["modified"] > 20
+    assert soft["modified"] < 0.5 * hard["modified"]
+    assert soft["deleted"] <= hard["deleted"]
+    assert soft["normal"] > hard["normal"]
+
+
+def test_what_has_gone_and_what_is_new_is_found_all_the_same(tiles: Tiles) -> None:
+    place = [(13.4, -8.0, 8.0, 4.0)]  # the wall stands four metres farther back now
+    soft, hard = (changes_called(tiles, place, s) for s in (SoftParameters(), SoftParameters.off()))
+    for name in ("deleted", "new"):
+        assert hard[name] > 20
+        assert soft[name] >= 0.9 * hard[name]
 
 
 def test_paper_mode_takes_every_pose_for_exact(tiles: Tiles) -> None:
