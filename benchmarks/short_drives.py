@@ -98,14 +98,14 @@ class Drive:
 
     def off(self, t_ns: int, T_map_vehicle: F64) -> tuple[float, float]:
         """Horizontal distance [m] and turn about the vertical [deg] of a pose from the true one."""
-        error = T_inverse(self.truth.at(t_ns)) @ T_map_vehicle
+        error = np.asarray(T_inverse(self.truth.at(t_ns)) @ T_map_vehicle)
         turn = np.degrees(abs(np.arctan2(error[1, 0], error[0, 0])))
         return float(np.hypot(error[0, 3], error[1, 3])), float(turn)
 
 
 def gnss_offset_m(rng: np.random.Generator) -> F64:
     """(3,) error of a GNSS of 2.5 m (root mean square of both horizontal axes together)."""
-    return GNSS_M / np.sqrt(2.0) * rng.standard_normal(3) * [1.0, 1.0, 1.5]
+    return np.asarray(GNSS_M / np.sqrt(2.0) * rng.standard_normal(3) * [1.0, 1.0, 1.5])
 
 
 def is_wrong(off_m: float, off_deg: float) -> bool:
