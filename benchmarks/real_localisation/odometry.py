@@ -5,6 +5,7 @@ first. The rivals run on one thread with their defaults and ranges like ours; KI
 benchmarks and its row says so when it is not installed.
 """
 
+from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from time import perf_counter
@@ -87,7 +88,7 @@ def _kiss(recorded: Recorded) -> Odometry:
     return _rival("KISS-ICP", recorded, step)
 
 
-class _Predicted:
+class _Predicted(ABC):
     """A rival of small_gicp: the scan freed of the last step's motion, matched from where that step leads."""
 
     def __init__(self) -> None:
@@ -100,8 +101,9 @@ class _Predicted:
         self._T.append(self._matched(points, T))
         return self._T[-1]
 
+    @abstractmethod
     def _matched(self, points: F64, T_predicted: F64) -> F64:
-        raise NotImplementedError
+        """(4, 4) the pose of the LiDAR."""
 
 
 class _Vgicp(_Predicted):
