@@ -6,12 +6,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gnd_map.se3 import T_inverse, log_so3
+from vehicle_agent.localise.drift import Drift
 from vehicle_agent.localise.odometry import MotionBuffer
 from vehicle_agent.localise.parameters import OdometryParameters
 
 F64 = NDArray[np.float64]
 
 STEP_S, STRETCH_S = 0.5, 1.0
+KEEPS = 2.0  # a stretch that is less sure than what was learnt, by more than this in variance, is not listened to
 
 
 class Stamped(NamedTuple):
@@ -64,7 +66,7 @@ class MotionTeacher:
         if self._anchor is None or t_ns - self._anchor.t_ns > 3e9 * STRETCH_S:
             self._anchor = now
         elif t_ns - self._anchor.t_ns >= STRETCH_S * 1e9:
-            self.learn_stretch(self._anchor, now, self.parameters.stretch_m, self.parameters.stretch_rad)
+            self._compare(self._anchor, now)
             self._anchor = now
 
     def _judge(self, first: Stamped, last: Stamped, match_var: F64) -> None:
@@ -74,16 +76,30 @@ class MotionTeacher:
         square = np.concatenate([log_so3(off[:3, :3]), off[:3, 3]]) ** 2
         self._excess_var += self.parameters.excess_gain * (square - 2.0 * match_var - self._excess_var)
 
-    def learn_stretch(self, first: Stamped, last: Stamped, sigma_m: float, sigma_rad: float) -> None:
-        """Take the motion between two poses that are off by `sigma_m` and `sigma_rad`, both together."""
-        dt_s = (last.t_ns - first.t_ns) * 1e-9
-        self._scale_var += self.parameters.scale_drift**2 * dt_s
-        self._bias_var += self.parameters.bias_drift_radps**2 * dt_s
+    def correct(self, drift: Drift, overlap: float) -> None:
+        """Take off what a whole stretch says, where it knows better than what was learnt so far.
+
+        `overlap`: in how many of the stretch's matches each scan takes part, so that they are not independent.
+        """
+        par, grown = self.parameters, float(np.sqrt(overlap))
+        bias = max(drift.yaw_radps.sigma * grown, par.least_bias_radps)
+        if bias**2 < KEEPS * self._bias_var:
+            self._motion.yaw_bias_radps += drift.yaw_radps.value
+            self._bias_var = bias**2
+        scale = max(drift.forward.sigma * grown, par.least_scale)
+        if scale**2 < KEEPS * self._scale_var:
+            self._motion.speed_scale *= 1.0 - drift.forward.value
+            self._scale_var = scale**2
+
+    def _compare(self, first: Stamped, last: Stamped) -> None:
+        par, dt_s = self.parameters, (last.t_ns - first.t_ns) * 1e-9
+        self._scale_var += par.scale_drift**2 * dt_s
+        self._bias_var += par.bias_drift_radps**2 * dt_s
         seen = T_inverse(first.T_map_vehicle) @ last.T_map_vehicle
         driven = self._motion.delta(first.t_ns, last.t_ns)
-        self._learn_course(driven, seen, sigma_m)
-        self._learn_scale(driven[0, 3] / self._motion.speed_scale, seen[0, 3], sigma_m)
-        self._learn_bias(_yaw(driven) + self._motion.yaw_bias_radps * dt_s, _yaw(seen), dt_s, sigma_rad)
+        self._learn_course(driven, seen, par.stretch_m)
+        self._learn_scale(driven[0, 3] / self._motion.speed_scale, seen[0, 3], par.stretch_m)
+        self._learn_bias(_yaw(driven) + self._motion.yaw_bias_radps * dt_s, _yaw(seen), dt_s, par.stretch_rad)
 
     def _learn_scale(self, wheel_m: float, map_m: float, sigma_m: float) -> None:
         gain = self._scale_var * wheel_m / (wheel_m**2 * self._scale_var + sigma_m**2)

@@ -7,6 +7,7 @@ hold. The poses of the scans follow from their anchors. Only these poses are evi
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,7 +15,8 @@ from numpy.typing import NDArray
 from gnd_map.se3 import T_from_R_t, T_inverse, exp_so3, log_so3
 from vehicle_agent.errors import RegistrationError
 from vehicle_agent.localise.anchor_graph import AnchorStep, Solution, solve
-from vehicle_agent.localise.calibration import MotionTeacher, Stamped
+from vehicle_agent.localise.calibration import MotionTeacher
+from vehicle_agent.localise.drift import drift_of
 from vehicle_agent.localise.graph import MapMatch, SmoothedPose
 from vehicle_agent.localise.match_map import MatchMapCache
 from vehicle_agent.localise.odometry import MotionBuffer
@@ -60,9 +62,8 @@ class Refiner:
         self._next: SubmapScan | None = None  # the anchor to come
         self._anchors: list[_Anchor] = []
         self._news = False
+        self._made_with_radps = 0.0  # gyro bias that the submaps were made with
         self._firm = 0  # anchors so far whose submaps fitted well
-        self._taught: Stamped | None = None
-        self._taught_way_m = 0.0
         self._start: MapMatch | None = None  # of the first anchor of the window, from the time before
         self.solution: Solution | None = None
         """Of the anchors in the window, as of the newest one."""
@@ -159,10 +160,12 @@ class Refiner:
             known = bool(np.sqrt(np.diag(self.solution.covariance[-1])[3:5]).max() < self.parameters.near_m)
         match, fit = self._matched(submap, predicted, known)
         self._anchors.append(_Anchor(scan, submap, match, fit))
+        self._teach()
+        T_local = local_poses(self._scans, self._motion)
         self._place(T_local)
+        self._make_again(T_local)
         self._ask_again(T_local)
         self._count_firm()
-        self._teach()
         self._forget()
 
     def _count_firm(self) -> None:
@@ -193,7 +196,7 @@ class Refiner:
     def _place(self, T_local: F64) -> None:
         """Solve for all anchors of the window."""
         start = self._start or _loose(self._anchors[0].scan.T_map_vehicle)
-        steps = [self._step(T_local, a.scan, b.scan) for a, b in zip(self._anchors, self._anchors[1:], strict=False)]
+        steps = [self._step(T_local, a.scan, b.scan) for a, b in pairwise(self._anchors)]
         matches = [anchor.match for anchor in self._anchors]
         self.solution = solve(start, steps, matches, self.parameters.inlier_chi2)
 
@@ -203,6 +206,19 @@ class Refiner:
             self._place(T_local)
         if self._match_doubted(lambda anchor, T: (self._settled(anchor.submap, T), 0.0)):
             self._place(T_local)
+
+    def _make_again(self, T_local: F64) -> None:
+        """Submaps that were made before the gyro's bias was known are bent: make and match them again."""
+        bias = self._motion.yaw_bias_radps
+        if abs(bias - self._made_with_radps) < np.radians(self.parameters.bent_degps):
+            return
+        self._made_with_radps = bias
+        assert self.solution is not None
+        for anchor, T in zip(self._anchors, self.solution.T_map_vehicle, strict=True):
+            if self._index(anchor.scan) >= self._final:
+                anchor.submap = make_submap(self._scans, T_local, self._index(anchor.scan), self.parameters)
+                anchor.match, anchor.fit = self._matched(anchor.submap, T, True)
+        self._place(T_local)
 
     def _match_doubted(self, matched: Callable[[_Anchor, F64], tuple[MapMatch | None, float]]) -> bool:
         """Give anchors that do not agree with the rest, and may still matter to a pose, another match; any?"""
@@ -215,21 +231,13 @@ class Refiner:
 
     def _teach(self) -> None:
         """Wheels and gyro learn from submaps, too: single scans of a sparse sensor seldom fit well enough to teach."""
-        s, anchor, par = self.solution, self._anchors[-1].scan, self.parameters
-        if s is None or not self._agreeing()[-1]:
-            return
-        now = Stamped(anchor.t_ns, s.T_map_vehicle[-1])
-        if self._taught is None or now.t_ns - self._taught.t_ns > 1e9 * par.window_s:
-            self._taught = now
-        elif anchor.way_m - self._taught_way_m >= 2.0 * par.half_m:  # two submaps that share no scan
-            variance = 2.0 * np.diag(s.covariance[-1])
-            sigma_m = max(par.teaching_m, float(np.sqrt(variance[3])))
-            sigma_rad = max(float(np.radians(par.teaching_deg)), float(np.sqrt(variance[2])))
-            self._teacher.learn_stretch(self._taught, now, sigma_m, sigma_rad)
-            self._taught = now
-        else:
-            return
-        self._taught_way_m = anchor.way_m
+        T_local = local_poses(self._scans, self._motion)
+        T = [T_local[self._index(anchor.scan)] for anchor in self._anchors]
+        steps = [T_inverse(a) @ b for a, b in pairwise(T)]
+        matches = [anchor.match if anchor.fit > 0.0 else None for anchor in self._anchors]
+        drift = drift_of([anchor.scan.t_ns for anchor in self._anchors], steps, matches)
+        if drift is not None:
+            self._teacher.correct(drift, self.parameters.overlap)
 
     def _step(self, T_local: F64, first: SubmapScan, last: SubmapScan) -> AnchorStep:
         par = self.parameters
@@ -248,8 +256,9 @@ class Refiner:
         """Let go of the oldest anchors when the window is full, of the scans before, and of points done with."""
         while self._full():
             self._forget_oldest()
-        for i, scan in enumerate(self._scans[: self._index(self._anchors[-1].scan)]):
-            if self._passed(scan, self._anchors[-1].scan) and len(scan.points_m):
+        waiting = min(self._final, self._index(self._anchors[-1].scan))
+        for i, scan in enumerate(self._scans[:waiting]):
+            if self._passed(scan, self._scans[waiting]) and len(scan.points_m):
                 self._scans[i] = replace(scan, points_m=NO_POINTS)
 
     def _full(self) -> bool:
@@ -275,11 +284,12 @@ class Refiner:
     def _leaving(self, newest: SubmapScan) -> list[SmoothedPose]:
         """The poses of scans that lie `lag_m` behind the newest anchor, or are too old to wait."""
         par, anchor = self.parameters, self._anchors[-1].scan
-        n = self._final
+        learnt = self._teacher.uncertainty[1] < np.radians(par.learnt_degps)
+        longest_s, n = (par.longest_s if learnt else par.unlearnt_s), self._final
         while n < len(self._scans):
             scan = self._scans[n]
-            overdue = newest.t_ns - scan.t_ns > par.longest_s * 1e9
-            if not overdue and anchor.way_m - scan.way_m < par.lag_m:
+            overdue = newest.t_ns - scan.t_ns > longest_s * 1e9
+            if not overdue and (not learnt or anchor.way_m - scan.way_m < par.lag_m):
                 break
             n += 1
         return self._finalise(n)

@@ -21,8 +21,9 @@ class RefineParameters:
         roll_pitch_deg, vertical_m: of attitude and height, which come from the single scans.
     inlier_chi2: matches farther off than this (half of chi-square, 6 degrees of freedom) are left out (graduated
         non-convexity with truncated least squares; Yang et al. 2020).
+    learnt_degps, unlearnt_s: sigma of the gyro's bias below which it is known; until then scans may wait so long.
+    bent_degps: change of the bias from which on submaps are made again.
     firm_fit: fit of a submap that is beyond doubt; certain_m: one sigma of a pose that no rival can question.
-    teaching_m, teaching_deg: the least sigma of the motion between two anchors that wheels and gyro learn from.
     floor_m, floor_deg: the least sigma of a final pose: what map and mount are wrong by, no match can tell.
     correct_m, correct_deg: an online pose farther off than this from what the submaps say begins anew from there.
     """
@@ -51,10 +52,11 @@ class RefineParameters:
     roll_pitch_deg: float = 1.0
     vertical_m: float = 0.03
     inlier_chi2: float = 8.4
+    learnt_degps: float = 0.03
+    unlearnt_s: float = 8.0
+    bent_degps: float = 0.02
     firm_fit: float = 0.35
     certain_m: float = 0.1
-    teaching_m: float = 0.04
-    teaching_deg: float = 0.06
     floor_m: float = 0.005
     floor_deg: float = 0.01
     correct_m: float = 0.06
