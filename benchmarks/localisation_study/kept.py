@@ -91,8 +91,8 @@ def _write(kept: Kept, head: dict[str, Any], arrays: dict[str, Any]) -> None:
 
 def _read(kept: Kept) -> tuple[dict[str, Any], dict[str, Any]]:
     try:
-        with np.load(kept.path, allow_pickle=False) as file:
-            data = dict(file)
+        with kept.path.open("rb") as file, np.load(file, allow_pickle=False) as arrays:
+            data = dict(arrays)
         return json.loads(str(data["head"])), data
     except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile) as error:
         raise FolderError(f"cannot read {kept.path}: {error}; delete it and start again") from error

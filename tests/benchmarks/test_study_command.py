@@ -105,19 +105,6 @@ def test_pictures_and_markdown(studied: Studied, tmp_path: Path) -> None:
     assert "**vlp16**, 95 % / maximum:" in text
 
 
-@pytest.mark.slow
-def test_a_damaged_result_is_named(studied: Studied, tmp_path: Path) -> None:
-    out, _ = studied
-    other = tmp_path / "damaged"
-    shutil.copytree(out, other)
-    path = next(other.glob("seed-*/runs/vlp16-updated-*.npz"))
-    path.write_bytes(path.read_bytes()[:100])
-    ran = run_study(other)
-    assert isinstance(ran.exception, GndError)
-    assert path.name in str(ran.exception)
-    assert "delete it" in str(ran.exception)
-
-
 @pytest.mark.parametrize(
     ("options", "says"),
     [
