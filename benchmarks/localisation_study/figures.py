@@ -191,10 +191,10 @@ def _write_errors(axes: Axes, series: Mapping[Curve, PoseSeries], quantity: int)
     scale, unit = (1.0, unit) if unit == "°" else (100.0, "cm")
     for number, (curve, one) in enumerate(series.items()):
         error = one.quantiles()[f"{name}_{'deg' if unit == '°' else 'm'}"]
-        digits = 3 if unit == "°" else 2
         numbers = () if error is None else (scale * error["p95"], scale * error["max"])
+        digits = 3 if unit == "°" else 1 if max(numbers, default=0.0) >= 10.0 else 2
         text = " / ".join(f"{value:.{digits}f}" for value in numbers) + f" {unit}" if numbers else "no pose"
-        x = 0.995 - 0.2 * (len(series) - 1 - number)
+        x = 0.995 - 0.215 * (len(series) - 1 - number)
         axes.text(x, 0.965, text, transform=axes.transAxes, ha="right", va="top", fontsize=8.5, color=curve.colour)
 
 
