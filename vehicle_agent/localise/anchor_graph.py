@@ -109,6 +109,7 @@ def _solution(
     graph = gtsam.NonlinearFactorGraph(known)
     for factor in believed:
         graph.add(factor)
+    values = gtsam.LevenbergMarquardtOptimizer(graph, values).optimize()  # the graduated one stops early
     marginals = gtsam.Marginals(graph, values)
     return Solution(
         np.stack([values.atPose3(n).matrix() for n in range(len(trusted))]),

@@ -90,6 +90,10 @@ class MotionTeacher:
         if scale**2 < KEEPS * self._scale_var:
             self._motion.speed_scale *= 1.0 - drift.forward.value
             self._scale_var = scale**2
+        course = max(max(drift.left.sigma, drift.up.sigma) * grown, par.least_scale)
+        if course**2 < KEEPS * self._course_var:
+            self._motion.course -= [drift.left.value, drift.up.value]
+            self._course_var = course**2
 
     def _compare(self, first: Stamped, last: Stamped) -> None:
         par, dt_s = self.parameters, (last.t_ns - first.t_ns) * 1e-9
