@@ -1,0 +1,58 @@
+"""Settings of the refined poses: what cannot work is refused with the values."""
+
+from dataclasses import fields, replace
+
+import pytest
+
+from gnd_map.config import from_mapping
+from gnd_map.errors import ConfigError
+from vehicle_agent.localise import LocaliserParameters
+from vehicle_agent.localise.refine_parameters import RefineParameters
+
+POSITIVE = (
+    "every_m", "every_s", "half_m", "half_s", "longest_s", "leaf_m", "yaw_deg", "longitudinal_m", "lateral_m",
+    "roll_pitch_deg", "vertical_m", "wheel_every_m",
+)  # fmt: skip
+
+
+@pytest.mark.parametrize("name", POSITIVE)
+@pytest.mark.parametrize("value", [0.0, -1.0])
+def test_lengths_times_and_sigmas_must_be_positive(name, value):
+    with pytest.raises(ValueError, match=rf"must be positive, got .*{name}={value}"):
+        RefineParameters(**{name: value})
+
+
+@pytest.mark.parametrize("name", ["scales", "first_scales"])
+def test_scales_must_be_positive(name):
+    with pytest.raises(ValueError, match="must be positive"):
+        RefineParameters(**{name: (2.0, 0.0)})
+
+
+@pytest.mark.parametrize(("name", "value"), [("window", 3), ("max_scans", 1), ("n_points", 99)])
+def test_counts_have_a_least_value(name, value):
+    with pytest.raises(ValueError, match=rf"required, got .*{name}={value}"):
+        RefineParameters(**{name: value})
+    assert getattr(RefineParameters(**{name: value + 1}), name) == value + 1
+
+
+def test_a_negative_lag_is_refused_and_none_is_not():
+    with pytest.raises(ValueError, match="lag_m=-0.1"):
+        RefineParameters(lag_m=-0.1)
+    assert RefineParameters(lag_m=0.0).lag_m == 0.0
+
+
+def test_overlap_counts_the_submaps_that_a_scan_takes_part_in():
+    assert RefineParameters(every_m=5.0, half_m=10.0).overlap == 4.0
+    assert RefineParameters(every_m=5.0, half_m=1.0).overlap == 1.0  # scans between submaps do not make them surer
+
+
+def test_a_mapping_sets_them_and_an_unknown_key_is_refused():
+    made = from_mapping(LocaliserParameters, {"refine": {"enabled": False, "half_m": 7.0}})
+    assert made.refine == replace(RefineParameters(), enabled=False, half_m=7.0)
+    with pytest.raises(ConfigError, match="refine: unknown key halve_m"):
+        from_mapping(LocaliserParameters, {"refine": {"halve_m": 7.0}})
+
+
+def test_every_setting_is_explained():
+    document = RefineParameters.__doc__ or ""
+    assert [field.name for field in fields(RefineParameters) if field.name not in document] == []
