@@ -36,7 +36,7 @@ def test_counts_have_a_least_value(name, value):
 
 
 def test_a_negative_lag_is_refused_and_none_is_not():
-    with pytest.raises(ValueError, match="lag_m=-0.1"):
+    with pytest.raises(ValueError, match=r"lag_m=-0\.1"):
         RefineParameters(lag_m=-0.1)
     assert RefineParameters(lag_m=0.0).lag_m == 0.0
 

@@ -152,7 +152,7 @@ def test_wheels_are_put_down_along_the_way():
     scans, motion = straight()
     par = RefineParameters(half_m=6.0, half_s=100.0, wheel_every_m=3.0)
     wheels = make_submap(scans, local_poses(scans, motion), 20, par).wheels_m.reshape(-1, 4, 3)
-    np.testing.assert_allclose(wheels, [WHEELS_M + [way, 0, 0] for way in (-6, -3, 0, 3, 6)], atol=1e-9)
+    np.testing.assert_allclose(wheels, [WHEELS_M + np.array([way, 0, 0]) for way in (-6, -3, 0, 3, 6)], atol=1e-9)
 
 
 def test_a_place_seen_from_many_scans_of_a_bent_way_lies_in_one_spot():
