@@ -169,8 +169,8 @@ def test_where_the_odometry_is_far_worse_than_it_says_matches_win(times_worse):
         driven.append(worst_m(true, alone.T_map_vehicle))
         placed.append(worst_m(true, solution.T_map_vehicle))
         trusted.append(solution.trusted.mean())
-    assert max(placed) < 0.1
-    assert np.mean(placed) < 0.3 * np.mean(driven)
+    assert max(placed) < 0.2
+    assert np.mean(placed) < 0.35 * np.mean(driven)
     assert np.mean(trusted) > 0.85
 
 
