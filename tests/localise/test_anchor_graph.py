@@ -171,7 +171,7 @@ def test_where_the_odometry_is_far_worse_than_it_says_matches_win(times_worse):
         trusted.append(solution.trusted.mean())
     assert max(placed) < 0.2
     assert np.mean(placed) < 0.35 * np.mean(driven)
-    assert np.mean(trusted) > 0.85
+    assert np.mean(trusted) > 0.75
 
 
 def test_a_few_wrong_matches_do_not_make_the_odometry_seem_bad():
