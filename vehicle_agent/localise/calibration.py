@@ -13,6 +13,7 @@ from vehicle_agent.localise.parameters import OdometryParameters
 F64 = NDArray[np.float64]
 
 STEP_S, STRETCH_S = 0.5, 1.0
+MAX_TRIM_RAD, KNOWN_COURSE_RAD = 2e-3, 1e-3
 KEEPS = 2.0  # a stretch that is less sure than what was learnt, by more than this in variance, is not listened to
 
 
@@ -50,6 +51,14 @@ class MotionTeacher:
     def uncertainty(self) -> tuple[float, float]:
         """One sigma of the wheel scale, and of the gyro's bias [rad/s], as learnt so far."""
         return float(np.sqrt(self._scale_var)), float(np.sqrt(self._bias_var))
+
+    @property
+    def trim_rad(self) -> float:
+        """What the heading is turned by so that the rear axle runs along it, once that is known; 0 when it is not, or
+        when it is so much that the recording's vehicle frame means something else than the axle.
+        """
+        course_rad, sigma_rad = float(self._motion.course[0]), float(np.sqrt(self._course_var))
+        return course_rad if abs(course_rad) < MAX_TRIM_RAD and sigma_rad < KNOWN_COURSE_RAD else 0.0
 
     def forget(self) -> None:
         """The poses to come do not continue those before."""

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gnd_map.motion import Trajectory, deskew
+from gnd_map.se3 import T_from_R_t, exp_so3
 from schemas.drive import GnssFix, MotionSample, Scan
 from vehicle_agent.errors import RegistrationError
 from vehicle_agent.local_map import LocalMap
@@ -26,7 +27,8 @@ from vehicle_agent.localise.parameters import LocaliserParameters
 from vehicle_agent.localise.refine import Refiner
 from vehicle_agent.localise.registration import RegistrationResult, Start, register, settle
 from vehicle_agent.localise.sampling import sample_scan
-from vehicle_agent.localise.scan_odometry import ScanOdometry, ScanStep, joint_step
+from vehicle_agent.localise.scan_odometry import JointStep, ScanOdometry, ScanStep, joint_step
+from vehicle_agent.localise.submap import ToldByScans
 
 F64 = NDArray[np.float64]
 
@@ -34,6 +36,7 @@ MAX_GNSS_AGE_NS = 2_000_000_000
 TOLD_M, TOLD_RAD = 0.1, 0.01  # one sigma of a pose from outside
 OVERRULED: Final[tuple[Cause, ...]] = ("wrong_pose", "stale_map", "poor_place", "no_match", "unconfirmed")
 """What single scans hold against a pose and submaps may know better."""
+SURER = np.array([1.0, 1.0, 0.5, 0.3, 1.0, 1.0])  # share of the odometry's sigmas below which scans know better
 PAST_NS, MOST_FROM_PAST = 1_000_000_000, 5
 
 
@@ -206,7 +209,9 @@ class Localiser:
         track.judge.see(seen_scan, self._map.near(T_now[:3, 3]))
         final = track.graph.add(t_ns, predicted, odometry, match or self._settled(predicted), gnss, seen)
         self._hold(track, scan, result.matching_ratio if result is not None else 0.0, sweep)
-        self._finalise(track, final if track.refiner is None else self._refine(track, track.refiner, t_ns, points))
+        if track.refiner is not None:
+            final = self._refine(track, track.refiner, t_ns, points, _told_by_scans(joint, seen))
+        self._finalise(track, final)
         if self.online is not None and self.online.health == "lost":
             self._lose(track, self.online.cause)
 
@@ -282,11 +287,13 @@ class Localiser:
         track.held[number] = held
         self.online = _estimate(pose, held)
 
-    def _refine(self, track: _Track, refiner: Refiner, t_ns: int, points: F64) -> list[SmoothedPose]:
+    def _refine(
+        self, track: _Track, refiner: Refiner, t_ns: int, points: F64, told: ToldByScans | None = None
+    ) -> list[SmoothedPose]:
         """Give the scan to the submaps, and let what they say correct the online pose; the poses that became final."""
         number = track.graph.newest
         T_online = track.graph.pose(number)
-        final = refiner.push(number, t_ns, points, T_online)
+        final = refiner.push(number, t_ns, points, T_online, told)
         track.judge.monitor.certain = refiner.certain
         correction = refiner.correction(T_online)
         if correction is not None:
@@ -401,7 +408,16 @@ class Localiser:
             pose = on_the_road(pose, self._map.near(pose.T_map_vehicle[:3, 3]), self.parameters.registration)
         sweep = self._motion.trajectory(scan.t_ns, scan.end_ns) if held.sweep is None else held.sweep
         ends, starts = scan.placed(sweep, self.T_vehicle_lidar, held.t_ns, pose.T_map_vehicle)
-        return RefinedScan(held.t_ns, ends, starts, _estimate(pose, held))
+        return RefinedScan(held.t_ns, ends, starts, _estimate(self._trimmed(pose), held))
+
+    def _trimmed(self, pose: SmoothedPose) -> SmoothedPose:
+        """The pose with the heading that the rear axle drives along: what the LiDAR's mount is turned by is taken out
+        of it. The points stay where the mount as told puts them, which is how they were matched.
+        """
+        if not self.parameters.refine.enabled:
+            return pose
+        turn = T_from_R_t(exp_so3(np.array([0.0, 0.0, self._teacher.trim_rad])), np.zeros(3))
+        return replace(pose, T_map_vehicle=pose.T_map_vehicle @ turn)
 
     def _deskewed(
         self,
@@ -438,6 +454,17 @@ def _sigmas(pose: SmoothedPose) -> tuple[float, float]:
     R, covariance = pose.T_map_vehicle[:3, :3], pose.covariance
     horizontal = (R @ covariance[3:, 3:] @ R.T)[:2, :2]
     return float(np.sqrt(np.linalg.eigvalsh(horizontal)[1])), float(np.sqrt(covariance[2, 2]))
+
+
+def _told_by_scans(joint: JointStep, seen: ScanStep | None) -> ToldByScans | None:
+    """What scans tell better of the motion since the scan before: its turn, if they are surer of it than the gyro; its
+    way, only if wheels are far worse, because those become better as more is learnt about them.
+    """
+    if seen is None:
+        return None
+    surer = np.sqrt(np.diag(seen.covariance)) < joint.driven_sigmas * SURER
+    T = joint.T_before_now
+    return ToldByScans(T[:3, :3] if surer[2] else None, T[:3, 3] if surer[3] else None)
 
 
 def _estimate(pose: SmoothedPose, held: _HeldScan) -> PoseEstimate:

@@ -23,7 +23,7 @@ from vehicle_agent.localise.odometry import MotionBuffer
 from vehicle_agent.localise.parameters import RegistrationParameters
 from vehicle_agent.localise.refine_parameters import RefineParameters
 from vehicle_agent.localise.registration import register, settle
-from vehicle_agent.localise.submap import Submap, SubmapScan, local_poses, make_submap
+from vehicle_agent.localise.submap import Submap, SubmapScan, ToldByScans, local_poses, make_submap
 
 F64 = NDArray[np.float64]
 
@@ -68,7 +68,9 @@ class Refiner:
         self.solution: Solution | None = None
         """Of the anchors in the window, as of the newest one."""
 
-    def push(self, number: int, t_ns: int, points_m: F64, T_map_vehicle: F64) -> list[SmoothedPose]:
+    def push(
+        self, number: int, t_ns: int, points_m: F64, T_map_vehicle: F64, told: ToldByScans | None = None
+    ) -> list[SmoothedPose]:
         """Take a scan; give the poses that became final with it.
 
         Args:
@@ -76,12 +78,13 @@ class Refiner:
             t_ns: its time.
             points_m: (K, 3) sampled points, vehicle frame, sweep motion removed.
             T_map_vehicle: (4, 4) its online pose.
+            told: what scans tell better than wheels and gyro of the motion since the scan before.
         """
         way_m = 0.0
         if self._scans:
             last = self._scans[-1]
             way_m = last.way_m + float(np.linalg.norm(self._motion.delta(last.t_ns, t_ns)[:3, 3]))
-        scan = SubmapScan(number, t_ns, way_m, points_m.astype(np.float32), T_map_vehicle)
+        scan = SubmapScan(number, t_ns, way_m, points_m.astype(np.float32), T_map_vehicle, told)
         self._news = False
         self._scans.append(scan)
         if self._next is None:
@@ -231,7 +234,7 @@ class Refiner:
 
     def _teach(self) -> None:
         """Wheels and gyro learn from submaps, too: single scans of a sparse sensor seldom fit well enough to teach."""
-        T_local = local_poses(self._scans, self._motion)
+        T_local = local_poses(self._scans, self._motion, driven_only=True)
         T = [T_local[self._index(anchor.scan)] for anchor in self._anchors]
         steps = [T_inverse(a) @ b for a, b in pairwise(T)]
         matches = [anchor.match if anchor.fit > 0.0 else None for anchor in self._anchors]

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from gnd_map.se3 import T_inverse, exp_so3, transform
+from gnd_map.se3 import T_from_R_t, T_inverse, exp_so3, transform
 from vehicle_agent.localise.odometry import MotionBuffer
 from vehicle_agent.localise.refine_parameters import RefineParameters
 from vehicle_agent.localise.registration import WHEELS_M
@@ -22,11 +22,27 @@ F32 = NDArray[np.float32]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
+class ToldByScans:
+    """What scans tell of the motion since the scan before: its turn (3, 3), its way (3,), or None where the vehicle's
+    own sensors know better; those can still be corrected when more has been learnt about them.
+    """
+
+    R_before_now: F64 | None
+    t_before_now: F64 | None
+
+    def instead_of(self, T_driven: F64) -> F64:
+        """(4, 4) the motion with what the scans know better."""
+        R = T_driven[:3, :3] if self.R_before_now is None else self.R_before_now
+        return T_from_R_t(R, T_driven[:3, 3] if self.t_before_now is None else self.t_before_now)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
 class SubmapScan:
     """A scan as submaps take it.
 
     number: of its pose in the track. points_m: (K, 3) float32 sampled points, vehicle frame, sweep motion removed.
-    T_map_vehicle: (4, 4) its online pose, of which only attitude and height are used. way_m: odometer.
+    T_map_vehicle: (4, 4) its online pose, of which only attitude and height are used. way_m: odometer. told: what
+    scans tell better than wheels and gyro of the motion since the scan before.
     """
 
     number: int
@@ -34,6 +50,7 @@ class SubmapScan:
     way_m: float
     points_m: F32
     T_map_vehicle: F64
+    told: ToldByScans | None = None
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -44,13 +61,18 @@ class Submap:
     wheels_m: F64
 
 
-def local_poses(scans: Sequence[SubmapScan], motion: MotionBuffer) -> F64:
+def local_poses(scans: Sequence[SubmapScan], motion: MotionBuffer, *, driven_only: bool = False) -> F64:
     """(N, 4, 4) T_local_vehicle of scans in time order: way and heading by odometry, attitude and height by the single
     scans; the first one's position is the origin, its heading that of its online pose.
+
+    `driven_only`: by wheels and gyro alone, also where scans know better.
     """
     t_ns = np.array([scan.t_ns for scan in scans], np.int64)
     driven = motion.trajectory(int(t_ns[0]), int(t_ns[-1])).at(t_ns)
     steps = T_inverse(driven[:-1]) @ driven[1:]
+    for n, scan in enumerate(scans[1:]):
+        if scan.told is not None and not driven_only:
+            steps[n] = scan.told.instead_of(steps[n])
     T_online = np.stack([scan.T_map_vehicle for scan in scans])
     roll, pitch, yaw = _roll_pitch_yaw(T_online[:, :3, :3])
     heading = yaw[0] + np.concatenate([[0.0], np.cumsum(np.arctan2(steps[:, 1, 0], steps[:, 0, 0]))])
