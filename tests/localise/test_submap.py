@@ -1,5 +1,8 @@
 """Submaps: scans laid together as wheels and gyro say, and the points and wheels of them."""
 
+from dataclasses import replace
+from itertools import pairwise
+
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -9,7 +12,7 @@ from gnd_map.se3 import T_from_R_t, T_inverse, exp_so3, transform
 from vehicle_agent.localise.odometry import MotionBuffer
 from vehicle_agent.localise.refine_parameters import RefineParameters
 from vehicle_agent.localise.registration import WHEELS_M
-from vehicle_agent.localise.submap import SubmapScan, local_poses, make_submap, thinned
+from vehicle_agent.localise.submap import SubmapScan, ToldByScans, local_poses, make_submap, thinned
 
 S = 1_000_000_000
 EVERY_NS = S // 10
@@ -94,6 +97,38 @@ def test_one_scan_alone_is_its_own_origin():
     T = T_from_R_t(attitude(1.0, 0.1, 0.2), [5.0, 6.0, 7.0])
     only = local_poses(scans_at([T], [0.0]), MotionBuffer())
     np.testing.assert_allclose(only, T_from_R_t(T[:3, :3], [0.0, 0.0, 7.0])[None], atol=1e-12)
+
+
+@pytest.mark.parametrize("turn", [True, False])
+@pytest.mark.parametrize("way", [True, False])
+def test_what_scans_tell_better_stands_instead_of_wheels_and_gyro(turn, way):
+    """Wheels 5 % too slow and a gyro that is off; scans tell the true turn, way or both, and only that."""
+    true = circle(40, 8.0, 0.4, T_from_R_t(attitude(0.7), [3.0, 2.0, 1.0]))
+    scans, motion = scans_at(true, 0.8 * np.arange(40)), motion_of(7.6, 0.43)
+    steps = [T_inverse(a) @ b for a, b in pairwise(true)]
+    told = [ToldByScans(T[:3, :3] if turn else None, T[:3, 3] if way else None) for T in steps]
+    scans[1:] = [replace(scan, told=one) for scan, one in zip(scans[1:], told, strict=True)]
+    expected = np.stack(_mixed(true, motion, turn, way))
+    expected[:, :2, 3] -= true[0, :2, 3]
+    np.testing.assert_allclose(local_poses(scans, motion), expected, atol=1e-9)
+
+
+def _mixed(true, motion, turn, way):
+    """The chain of the true turns or ways, and for the rest those of the odometry."""
+    chain = [true[0]]
+    for n, (a, b) in enumerate(pairwise(true)):
+        seen, driven = T_inverse(a) @ b, motion.delta(n * EVERY_NS, (n + 1) * EVERY_NS)
+        chain.append(chain[-1] @ T_from_R_t((seen if turn else driven)[:3, :3], (seen if way else driven)[:3, 3]))
+    return chain
+
+
+def test_for_learning_what_the_odometry_is_wrong_by_scans_do_not_speak():
+    poses = circle(20, 8.0, 0.4, np.eye(4))
+    scans, motion = scans_at(poses, 0.8 * np.arange(20)), motion_of(8.0, 0.4)
+    told = [replace(scan, told=ToldByScans(np.eye(3), np.zeros(3))) for scan in scans]
+    np.testing.assert_array_equal(local_poses(told, motion, driven_only=True), local_poses(scans, motion))
+    standing = local_poses(told, motion)
+    np.testing.assert_allclose(standing[:, :2, 3], 0.0, atol=1e-12)
 
 
 # --- submaps -------------------------------------------------------------------------------------------------------
