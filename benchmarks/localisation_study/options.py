@@ -42,7 +42,7 @@ class StudyOptions:
     fleet: int = 5
     fleet_sensors: tuple[str, ...] = FLEET_SENSORS
     poses: PoseSource = field(default_factory=lambda: PoseSource("estimated", 0.0, 0.0))
-    trials: int = 40
+    trials: int = 20
     variant_sensors: tuple[str, ...] | None = None
     parking: float = 0.2
     base: Base = "driven"

@@ -17,7 +17,8 @@ from schemas.drive import DriveHeader, DriveItem, GnssFix, ReferencePose, Scan
 from vehicle_agent.localise.parameters import LocaliserParameters
 
 GNSS_M: Final = 2.5
-WITHIN_S: Final = 10.0
+WITHIN_S: Final = 15.0
+"""A vehicle inside a place that was rebuilt waits, with a few layers, until it has left it: some 5 s at 9 m/s."""
 WATCHED_S: Final = 2.0
 """After the first pose that is called good the vehicle drives on so long: is it still right?"""
 _WHITE_M: Final = 0.2

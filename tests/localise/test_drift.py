@@ -70,9 +70,11 @@ def test_fewer_than_six_matches_tell_nothing(n, known):
     assert (drift_of(times, steps, held) is not None) == known
 
 
-def test_a_standing_vehicle_tells_nothing():
+def test_a_standing_vehicle_tells_nothing_of_its_wheels():
     match = MapMatch(np.eye(4), np.eye(6) * 1e-4)
-    assert drift_of([n * 10**9 for n in range(10)], [np.eye(4)] * 9, [match] * 10) is None
+    drift = drift_of([n * 10**9 for n in range(10)], [np.eye(4)] * 9, [match] * 10)
+    assert (drift.forward.value, drift.forward.sigma) == (0.0, np.inf)
+    assert drift.yaw_radps.sigma < 1e-9  # but its gyro is known to the end
 
 
 def test_a_perfect_odometry_has_no_drift():

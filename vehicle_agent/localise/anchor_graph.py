@@ -14,6 +14,7 @@ from vehicle_agent.localise.graph import MapMatch
 F64 = NDArray[np.float64]
 
 MIN_STEPS = 4  # between two matches each, before they say how good the odometry is
+CLEARLY = 2.0  # factor by which odometry and matches disagree more than both admit, before it is all the odometry's
 MEDIAN_OF_NORMAL = 0.6745  # of the absolute value, in sigmas
 
 
@@ -131,7 +132,14 @@ def _as_bad_as_seen(steps: Sequence[AnchorStep], matches: Sequence[MapMatch | No
     if len(off) < MIN_STEPS:
         return list(steps)
     grown = np.maximum(np.median(np.abs(off), axis=0) / MEDIAN_OF_NORMAL, 1.0)
-    return [AnchorStep(step.T_before_now, step.sigmas * grown) for step in steps]
+    variance = np.median([np.diag(match.covariance) for match in matches if match is not None], axis=0)
+    return [AnchorStep(step.T_before_now, _grown(step.sigmas, 2.0 * variance, grown)) for step in steps]
+
+
+def _grown(sigmas: F64, match_variance: F64, factor: F64) -> F64:
+    """(6,) sigmas of the odometry alone that make those of odometry and matches together larger by `factor` (6,)."""
+    alone = np.sqrt(np.maximum(factor**2 * (sigmas**2 + match_variance) - match_variance, 0.0))
+    return np.asarray(np.where(factor > CLEARLY, alone, factor * sigmas))
 
 
 def _off(step: AnchorStep, before: MapMatch, now: MapMatch) -> F64:

@@ -63,18 +63,16 @@ def drift_of(t_ns: Sequence[int], steps: Sequence[F64], matches: Sequence[MapMat
     errors, time_s = np.array(off), (np.array([t_ns[n] for n in known]) - t_ns[known[0]]) * 1e-9
     yaw = slope(time_s, errors[:, 0])
     forward, left, up = (slope(np.array(way), errors[:, axis]) for axis in (1, 2, 3))
-    if yaw is None or forward is None or left is None or up is None:
-        return None
     return Drift(yaw, forward, left, up)
 
 
-def slope(x: F64, y: F64) -> Slope | None:
-    """The median slope of y (N,) over ascending x (N,); None when x spans next to nothing."""
+def slope(x: F64, y: F64) -> Slope:
+    """The median slope of y (N,) over ascending x (N,); 0 with an endless sigma when x spans next to nothing."""
     span = float(x[-1] - x[0])
     i, j = np.triu_indices(len(x), 1)
     apart = x[j] - x[i] >= APART * max(span, 1e-3)
     if not apart.any():
-        return None
+        return Slope(0.0, np.inf)
     value = float(np.median((y[j] - y[i])[apart] / (x[j] - x[i])[apart]))
     rest = y - value * x
     noise = MAD * float(np.median(np.abs(rest - np.median(rest))))

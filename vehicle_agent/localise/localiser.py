@@ -330,6 +330,7 @@ class Localiser:
         self._first = FirstPose(par)
         judge = Judge(par, self.T_vehicle_lidar[:3, 3], t_ns)
         judge.monitor.see_match(fit, result.fit, result.degenerate)
+        judge.monitor.scans_prove = not par.refine.enabled or sees_tilt(scan.points_m)
         if judge.monitor.trusted:
             judge.challenger.rest(t_ns)
         self._track = _Track(PoseGraph(par.graph), judge, self._new_refiner(), {})

@@ -1,5 +1,6 @@
 """Settings of the refined poses: submaps, their matches, and the graph that ties them."""
 
+import math
 from dataclasses import dataclass
 
 
@@ -68,9 +69,17 @@ class RefineParameters:
         return max(1.0, 2.0 * self.half_m / self.every_m)
 
     def __post_init__(self) -> None:
-        lengths = (self.every_m, self.every_s, self.half_m, self.half_s, self.longest_s, self.leaf_m)
-        sigmas = (self.yaw_deg, self.longitudinal_m, self.lateral_m, self.roll_pitch_deg, self.vertical_m)
-        if min(*lengths, *sigmas, self.wheel_every_m, *self.scales, *self.first_scales) <= 0 or self.lag_m < 0:
-            raise ValueError(f"lengths, times, sigmas and scales must be positive, got {self}")
+        numbers = [value for name in self.__slots__ if isinstance(value := getattr(self, name), int | float)]
+        if not all(math.isfinite(value) for value in (*numbers, *self.scales, *self.first_scales)):
+            raise ValueError(f"finite values are required, got {self}")
+        may_be_zero = {"enabled", "lag_m", "min_matching_ratio", "wheel_sigma_m", "floor_m", "floor_deg", "firm_fit"}
+        bad = [name for name in self.__slots__ if name not in may_be_zero and _least(getattr(self, name)) <= 0]
+        bad += [name for name in may_be_zero if getattr(self, name) < 0]
+        if bad:
+            raise ValueError(f"{', '.join(sorted(bad))} must be positive, got {self}")
         if self.window < 4 or self.max_scans < 2 or self.n_points < 100:
             raise ValueError(f"window >= 4, max_scans >= 2 and n_points >= 100 are required, got {self}")
+
+
+def _least(value: float | tuple[float, ...]) -> float:
+    return min(value) if isinstance(value, tuple) else value
