@@ -12,6 +12,7 @@ from benchmarks.localisation_study import reference
 from benchmarks.localisation_study.reference import PAPER, PAPER_OF_ROW, QUANTITIES, Limit
 from benchmarks.localisation_study.summary import ROWS
 from benchmarks.localisation_study.targets import sensors_of, within
+from benchmarks.localisation_study.trials import WITHIN_S
 from benchmarks.localisation_study.variants import LABELS
 
 _PLAIN_WIDTH: Final = 150
@@ -93,7 +94,7 @@ def starts_line(rows: Mapping[str, Any]) -> str:
     after = row["good_after_s"]
     seconds = "" if after["p50"] is None else f"; good after {after['p50']:.1f} s (half), {after['p95']:.1f} s (95 %)"
     return (
-        f"{row['trials']} starts 2.5 m off, any heading: {row['right']} right within 10 s"
+        f"{row['trials']} starts 2.5 m off, any heading: {row['right']} right within {WITHIN_S:g} s"
         f" ({100 * row['right_share']:.1f} %), {row['never_good']} never good,"
         f" {row['wrong_called_good']} ever good while wrong{seconds}"
     )
