@@ -13,7 +13,7 @@ from vehicle_agent.localise.parameters import OdometryParameters
 F64 = NDArray[np.float64]
 
 STEP_S, STRETCH_S = 0.5, 1.0
-MAX_TRIM_RAD, KNOWN_COURSE_RAD = 2e-3, 1e-3
+MAX_TRIM_RAD, KNOWN_COURSE_RAD = 1.05e-3, 6e-4
 KEEPS = 2.0  # a stretch that is less sure than what was learnt, by more than this in variance, is not listened to
 
 
