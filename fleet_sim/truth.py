@@ -15,6 +15,7 @@ farther than one sub-cell (10 to 20 cm) from every surface of the other state.
 import hashlib
 import json
 import zipfile
+import zlib
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
@@ -257,7 +258,7 @@ def read_truth(path: Path) -> Truth:
         columns |= {state: _unpacked(state, data) for state in ("before", "after")}
         columns["plan"] = ScanPlan(**head["plan"])
         return Truth(world_sha=head["world_sha"], frame=LocalFrame(*data["anchor"].tolist()), **columns)
-    except (OSError, ValueError, KeyError, TypeError, zipfile.BadZipFile, EOFError) as error:
+    except (OSError, ValueError, KeyError, TypeError, zipfile.BadZipFile, zlib.error, EOFError) as error:
         raise TruthError(f"cannot read the truth file {path}: {error}") from error
 
 

@@ -2,6 +2,7 @@
 
 import json
 import zipfile
+import zlib
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
@@ -94,5 +95,5 @@ def _read(kept: Kept) -> tuple[dict[str, Any], dict[str, Any]]:
         with kept.path.open("rb") as file, np.load(file, allow_pickle=False) as arrays:
             data = dict(arrays)
         return json.loads(str(data["head"])), data
-    except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile) as error:
+    except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile, zlib.error) as error:
         raise FolderError(f"cannot read {kept.path}: {error}; delete it and start again") from error

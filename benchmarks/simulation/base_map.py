@@ -3,6 +3,7 @@
 import hashlib
 import json
 import zipfile
+import zlib
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -96,5 +97,5 @@ def read_base(path: Path) -> BaseMap:
         if json.loads(str(data["head"]))["sha"] != base.sha:
             raise FolderError(f"the base map {path} is damaged: its content is not what was written")
         return base
-    except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile) as error:
+    except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile, zlib.error) as error:
         raise FolderError(f"cannot read the base map {path}: {error}") from error

@@ -2,6 +2,7 @@
 
 import json
 import zipfile
+import zlib
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from itertools import pairwise
@@ -79,7 +80,7 @@ def read_result(path: Path, key: str) -> VehicleResult:
         if head["key"] != key:
             raise FolderError(f"{path} belongs to another run")
         return _result(head, data)
-    except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile, SchemaError) as error:
+    except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile, zlib.error, SchemaError) as error:
         raise FolderError(f"cannot read {path}: {error}") from error
 
 

@@ -21,7 +21,7 @@ def reproduce(out: Path, *more: str) -> Result:
 def result_of(out: Path, *more: str) -> dict[str, Any]:
     """Run the command and return its JSON."""
     ran = reproduce(out, *more, "--json", "-")
-    assert ran.exit_code == 0, ran.output
+    assert ran.exit_code == 0, f"{ran.output}{ran.exception!r}"
     return dict(json.loads(ran.stdout))
 
 

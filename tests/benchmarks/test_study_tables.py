@@ -95,4 +95,4 @@ def test_markdown_is_one_table_a_sensor_with_equal_columns() -> None:
     assert text.count("no pose") == 3
     assert "of every number the worst of the worlds" in text
     assert "world 2: 300 m, 30 edits, 21.0 % of the Gaussians changed" in text
-    assert "40 starts 2.5 m off, any heading: 39 right within 10 s (97.5 %)" in text
+    assert "40 starts 2.5 m off, any heading: 39 right within 15 s (97.5 %)" in text
