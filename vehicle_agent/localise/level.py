@@ -13,10 +13,10 @@ import numpy as np
 import numpy.typing as npt
 
 from vehicle_agent.errors import RegistrationError
-from vehicle_agent.localise.graph import SmoothedPose
+from vehicle_agent.localise.graph import MapMatch, SmoothedPose
 from vehicle_agent.localise.match_map import MatchMap
 from vehicle_agent.localise.parameters import RegistrationParameters
-from vehicle_agent.localise.registration import settle
+from vehicle_agent.localise.registration import WHEELS_M, settle
 
 LEAST_SPREAD_DEG: Final = 8.0
 """A sensor whose rays lie within so much of elevation does not see its tilt: a Scala has 3.2°, a VLP-16 30°."""
@@ -38,11 +38,24 @@ def sees_tilt(points_lidar: npt.NDArray[np.generic]) -> bool:
     return bool(np.degrees(high - low) >= LEAST_SPREAD_DEG)
 
 
+def settled(
+    T_map_vehicle: npt.NDArray[np.float64],
+    match_map: MatchMap,
+    parameters: RegistrationParameters,
+    wheels_m: npt.NDArray[np.float64] = WHEELS_M,
+) -> MapMatch | None:
+    """Return what wheels (W, 3) alone say of a pose (4, 4): height and tilt; None where the map has no ground there."""
+    try:
+        found = settle(T_map_vehicle, match_map, parameters, wheels_m)
+    except RegistrationError:
+        return None
+    return MapMatch(found.T_map_vehicle, found.covariance)
+
+
 def on_the_road(pose: SmoothedPose, match_map: MatchMap, parameters: RegistrationParameters) -> SmoothedPose:
     """Return the pose with height, roll and pitch by the wheels alone; as it is where the map has no ground there."""
-    try:
-        found = settle(pose.T_map_vehicle, match_map, parameters)
-    except RegistrationError:
+    found = settled(pose.T_map_vehicle, match_map, parameters)
+    if found is None:
         return pose
     covariance = pose.covariance.copy()
     covariance[_TILT_AND_HEIGHT] = covariance[:, _TILT_AND_HEIGHT] = 0.0

@@ -19,13 +19,13 @@ from vehicle_agent.localise.first_pose import FirstPose, Place
 from vehicle_agent.localise.graph import MapMatch, Odometry, PoseGraph, Position, SmoothedPose
 from vehicle_agent.localise.health import HealthMonitor
 from vehicle_agent.localise.judge import Judge, Matched
-from vehicle_agent.localise.level import on_the_road, sees_tilt
+from vehicle_agent.localise.level import on_the_road, sees_tilt, settled
 from vehicle_agent.localise.match_map import MatchMapCache
 from vehicle_agent.localise.odometry import MotionBuffer
 from vehicle_agent.localise.packed_scan import PackedScan, pack
 from vehicle_agent.localise.parameters import LocaliserParameters
 from vehicle_agent.localise.refine import Refiner
-from vehicle_agent.localise.registration import RegistrationResult, Start, register, settle
+from vehicle_agent.localise.registration import RegistrationResult, Start, register
 from vehicle_agent.localise.sampling import sample_scan
 from vehicle_agent.localise.scan_odometry import JointStep, ScanOdometry, ScanStep, joint_step
 from vehicle_agent.localise.submap import ToldByScans
@@ -256,11 +256,7 @@ class Localiser:
 
     def _settled(self, predicted: F64) -> MapMatch | None:
         """What a scan without a match still knows: its wheels stand on the ground."""
-        try:
-            found = settle(predicted, self._map.near(predicted[:3, 3]), self.parameters.registration)
-        except RegistrationError:
-            return None
-        return MapMatch(found.T_map_vehicle, found.covariance)
+        return settled(predicted, self._map.near(predicted[:3, 3]), self.parameters.registration)
 
     def _gnss_at(self, track: _Track, t_ns: int, T_map_vehicle: F64) -> Position | None:
         """A new fix as position of the vehicle at `t_ns`; the monitor is told how far off it is."""

@@ -18,11 +18,12 @@ from vehicle_agent.localise.anchor_graph import AnchorStep, Solution, solve
 from vehicle_agent.localise.calibration import MotionTeacher
 from vehicle_agent.localise.drift import drift_of
 from vehicle_agent.localise.graph import MapMatch, SmoothedPose
+from vehicle_agent.localise.level import settled
 from vehicle_agent.localise.match_map import MatchMapCache
 from vehicle_agent.localise.odometry import MotionBuffer
 from vehicle_agent.localise.parameters import RegistrationParameters
 from vehicle_agent.localise.refine_parameters import RefineParameters
-from vehicle_agent.localise.registration import register, settle
+from vehicle_agent.localise.registration import register
 from vehicle_agent.localise.submap import Submap, SubmapScan, ToldByScans, local_poses, make_submap
 
 F64 = NDArray[np.float64]
@@ -190,11 +191,7 @@ class Refiner:
 
     def _settled(self, submap: Submap, predicted: F64) -> MapMatch | None:
         """Height and attitude at least, by the wheels."""
-        try:
-            found = settle(predicted, self._map.near(predicted[:3, 3]), self.registration, submap.wheels_m)
-        except RegistrationError:
-            return None
-        return MapMatch(found.T_map_vehicle, found.covariance)
+        return settled(predicted, self._map.near(predicted[:3, 3]), self.registration, submap.wheels_m)
 
     def _place(self, T_local: F64) -> None:
         """Solve for all anchors of the window."""
