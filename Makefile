@@ -27,12 +27,13 @@ test: setup      ## run every test
 quick: setup     ## run the tests that take less than five seconds each
 	$(BIN)/pytest -m "not slow" $(ARGS)
 
-check: setup     ## what CI runs beside the tests: style, types, layers, generated code
+check: setup     ## what CI runs beside the tests: style, types, layers, generated code, and that all tests can be read together
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
 	$(BIN)/lint-imports
 	$(BIN)/python -m schemas.generate --check
+	$(BIN)/pytest --collect-only --quiet --quiet > /dev/null
 
 bench: setup     ## print the benchmarks with their commands
 	$(BIN)/python -m benchmarks $(ARGS)

@@ -1,7 +1,7 @@
 """A corridor constrains nothing lengthwise: it is said, the pose is dead reckoned along it, and its sigma grows."""
 
 import numpy as np
-from test_bad_input import PARAMETERS, S
+from test_localiser_bad_input import PARAMETERS, S
 from yard import GROUND_M, NOISE_M, corridor, local_map_of, match_map_of, offset, pose, seen_from
 
 from schemas.drive import MotionSample, Scan
