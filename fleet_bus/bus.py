@@ -6,7 +6,7 @@ from typing import Self, TypeVar
 from fleet_bus import leftovers, requesting, subscribing
 from fleet_bus.config import BusConfig
 from fleet_bus.connection import Connection
-from fleet_bus.ledger import Ledger
+from fleet_bus.ledger import Ledger, SharesOf
 from fleet_bus.part import Part
 from fleet_bus.requesting import RetryPolicy
 from fleet_bus.serving import Handler, Serving
@@ -70,6 +70,7 @@ class Bus:
         tile: TileId | str | None = None,
         retry: RetryPolicy = _DEFAULT_RETRY,
         timeout_s: float = 30.0,
+        shares_of: SharesOf | None = None,
     ) -> bytes:
         """Asks until answered. The request may arrive more than once: it must be idempotent.
 
@@ -80,6 +81,7 @@ class Bus:
             tile: the tile it is about, for the ledger.
             retry: pauses between the attempts.
             timeout_s: deadline of the whole, s.
+            shares_of: how an answer that is about several things is booked; none = as `kind` and `tile`.
 
         Returns:
             Payload of the first answer that is ok.
@@ -91,7 +93,14 @@ class Bus:
             BusClosed: closed meanwhile.
         """
         return requesting.request(
-            self._connection, key, payload, kind=kind, tile=tile, retry=retry, timeout_s=timeout_s
+            self._connection,
+            key,
+            payload,
+            kind=kind,
+            tile=tile,
+            retry=retry,
+            timeout_s=timeout_s,
+            shares_of=shares_of,
         )
 
     def request_many(

@@ -12,7 +12,7 @@ import zenoh
 
 from fleet_bus.config import BusConfig, zenoh_config
 from fleet_bus.errors import BusClosed, BusConfigError, MessageTooLarge, NoRouter, PortInUse
-from fleet_bus.ledger import Ledger
+from fleet_bus.ledger import Ledger, Share, SharesOf
 from fleet_bus.pacer import Pacer
 from fleet_bus.wire import WireMeter
 from gnd_map.tile_id import TileId
@@ -82,16 +82,18 @@ class Connection:
         if self.ledger is not None:
             self.ledger.record("up", kind, len(payload), tile)
 
-    def incoming(self, payload: bytes, kind: str, tile: TileId | str | None) -> None:
-        """Paces and accounts for a message that has been received.
+    def incoming(self, payload: bytes, kind: str, tile: TileId | str | None, shares_of: SharesOf | None = None) -> None:
+        """Paces and accounts for a message that has been received, by its shares where it is about several things.
 
         Raises:
             BusClosed: closed before or while waiting.
         """
         self.check_open()
         self._pacer.wait("down", len(payload))
-        if self.ledger is not None:
-            self.ledger.record("down", kind, len(payload), tile)
+        if self.ledger is None:
+            return
+        shares = shares_of(payload) if shares_of is not None else ()
+        self.ledger.record_shares("down", shares or (Share(kind, len(payload), tile),))
 
     @contextmanager
     def sending(self) -> Iterator[zenoh.Session]:

@@ -6,7 +6,7 @@ import os
 import threading
 import time
 from collections import defaultdict
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final, Literal
@@ -18,6 +18,19 @@ from gnd_map.tile_id import TileId
 Direction = Literal["up", "down"]
 KINDS: Final = ("tile", "delta", "catalog", "change", "ack", "update", "control")
 _LOG = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True, slots=True)
+class Share:
+    """A part of one message that is booked by itself: a message may carry many tiles."""
+
+    kind: str
+    app_bytes: int
+    tile: TileId | str | None = None
+
+
+SharesOf = Callable[[bytes], Sequence[Share]]
+"""How a message's payload is booked; the shares add up to its length."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -49,7 +62,15 @@ class Ledger:
         self._place: dict[str, Any] = {"odometer_m": 0.0, "drive_ns": None}
         self._wire = WireBytes()
 
-    def record(self, direction: Direction, kind: str, app_bytes: int, tile: TileId | str | None = None) -> None:
+    def record(
+        self,
+        direction: Direction,
+        kind: str,
+        app_bytes: int,
+        tile: TileId | str | None = None,
+        *,
+        messages: int = 1,
+    ) -> None:
         """Accounts for one message.
 
         Args:
@@ -57,6 +78,7 @@ class Ledger:
             kind: one of `KINDS`.
             app_bytes: length of the payload, bytes.
             tile: the tile it is about, if it is about one.
+            messages: 0 for a further share of a message that is booked already.
 
         Raises:
             LedgerError: unknown kind or direction.
@@ -65,10 +87,16 @@ class Ledger:
             raise LedgerError(f"no such ledger line: {direction} {kind}; kinds are {', '.join(KINDS)}")
         path = tile.path if isinstance(tile, TileId) else tile
         with self._lock:
-            _count(self._totals[kind, direction], app_bytes)
+            _count(self._totals[kind, direction], app_bytes, messages)
             if path is not None:
-                _count(self._by_tile[path], app_bytes)
-            self._note({"direction": direction, "kind": kind, "app_bytes": app_bytes, "tile": path})
+                _count(self._by_tile[path], app_bytes, messages)
+            several = {} if messages == 1 else {"messages": messages}
+            self._note({"direction": direction, "kind": kind, "app_bytes": app_bytes, "tile": path} | several)
+
+    def record_shares(self, direction: Direction, shares: Sequence[Share]) -> None:
+        """Accounts for one message that is about several things; the first share counts as the message."""
+        for place, share in enumerate(shares):
+            self.record(direction, share.kind, share.app_bytes, share.tile, messages=int(place == 0))
 
     def record_wire(self, wire: WireBytes) -> None:
         """Notes the wire bytes of the agent's session so far, and with them the present place."""
@@ -159,6 +187,6 @@ def append_lines(path: Path, text: str) -> None:
         raise LedgerError(f"cannot write the ledger {path}: {error.strerror}") from error
 
 
-def _count(counter: list[int], app_bytes: int) -> None:
-    counter[0] += 1
+def _count(counter: list[int], app_bytes: int, messages: int) -> None:
+    counter[0] += messages
     counter[1] += app_bytes

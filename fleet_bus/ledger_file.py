@@ -21,6 +21,7 @@ class Booking:
         kind: ledger kind.
         app_bytes: payload, bytes.
         tile: path of the tile, if it is about one.
+        messages: 1, or 0 for a further share of a message that is about several things.
     """
 
     drive_s: float
@@ -29,6 +30,7 @@ class Booking:
     kind: str
     app_bytes: int
     tile: str | None
+    messages: int = 1
 
 
 @dataclass(frozen=True, slots=True)
@@ -63,8 +65,8 @@ class AgentLedger:
         return sum(booking.app_bytes for booking in self.bookings if booking.direction == direction)
 
     def _line(self, kind: str, direction: Direction) -> LedgerLine:
-        sizes = [b.app_bytes for b in self.bookings if (b.kind, b.direction) == (kind, direction)]
-        return LedgerLine(kind, direction, len(sizes), sum(sizes))
+        booked = [b for b in self.bookings if (b.kind, b.direction) == (kind, direction)]
+        return LedgerLine(kind, direction, sum(b.messages for b in booked), sum(b.app_bytes for b in booked))
 
 
 def read_ledger(path: Path) -> AgentLedger:
@@ -144,4 +146,5 @@ def _booking(row: dict[str, Any], since_start_ns: int) -> Booking:
         kind=row["kind"],
         app_bytes=int(row["app_bytes"]),
         tile=row["tile"],
+        messages=int(row.get("messages", 1)),
     )

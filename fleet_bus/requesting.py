@@ -17,6 +17,7 @@ import zenoh
 
 from fleet_bus.connection import Connection
 from fleet_bus.errors import BusClosed, BusConfigError, RequestFailed, RequestRefused
+from fleet_bus.ledger import SharesOf
 from gnd_map.tile_id import TileId
 
 END_OF_ANSWERS: Final = "gnd/end"
@@ -98,9 +99,10 @@ def request(
     tile: TileId | str | None,
     retry: RetryPolicy,
     timeout_s: float,
+    shares_of: SharesOf | None = None,
 ) -> bytes:
     """The first answer to an idempotent request; see `Bus.request`."""
-    asking = _Asking(connection, key, payload, kind, tile)
+    asking = _Asking(connection, key, payload, kind, tile, shares_of)
     answers = asking.until(lambda got: bool(got.ok), retry, timeout_s, first_only=True)
     return answers.ok[0][1]
 
@@ -120,6 +122,7 @@ class _Asking:
     payload: bytes
     kind: str
     tile: TileId | str | None
+    shares_of: SharesOf | None = None
 
     def until(
         self, good: Callable[[Answers], bool], retry: RetryPolicy, timeout_s: float, *, first_only: bool
@@ -176,7 +179,7 @@ class _Asking:
                     answers.add_error(reply.err)
                 continue
             payload = reply.ok.payload.to_bytes()
-            self.connection.incoming(payload, _REPLY_KIND.get(self.kind, self.kind), self.tile)
+            self.connection.incoming(payload, _REPLY_KIND.get(self.kind, self.kind), self.tile, self.shares_of)
             answers.ok.append((str(reply.ok.key_expr), payload))
             if first_only:
                 break

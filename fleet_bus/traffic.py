@@ -97,7 +97,7 @@ def link_use(ledger: AgentLedger, link: LinkProfile, direction: Direction) -> Li
     sent_bytes, longest_wait_s = 0, 0.0
     for booking in ledger.bookings:
         if booking.direction == direction:
-            size_bytes = booking.app_bytes + MESSAGE_OVERHEAD_BYTES
+            size_bytes = booking.app_bytes + booking.messages * MESSAGE_OVERHEAD_BYTES
             sent_bytes += size_bytes
             arrival_s = bucket.book(booking.drive_s, size_bytes) + link.delay_s
             longest_wait_s = max(longest_wait_s, arrival_s - booking.drive_s)
