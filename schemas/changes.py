@@ -45,8 +45,8 @@ from schemas.wire import (
 
 U8 = npt.NDArray[np.uint8]
 
-AckStatus = Literal["stored", "duplicate", "quarantined"]
-_STATUS: Final[dict[int, AckStatus]] = {1: "stored", 2: "duplicate", 3: "quarantined"}
+AckStatus = Literal["stored", "duplicate", "quarantined", "wanted", "resend"]
+_STATUS: Final[dict[int, AckStatus]] = {1: "stored", 2: "duplicate", 3: "quarantined", 4: "wanted", 5: "resend"}
 _COUNTERS: Final = 4
 _ROUNDING: Final = 1e-5
 """How negative an eigenvalue of a float32 covariance may be, relative to the largest: a plane's smallest is about 0."""
@@ -215,6 +215,8 @@ class ChangeReport:
             change_report_pb2.ChangeReport, data, limits.MAX_CHANGE_REPORT_BYTES, max_fields=limits.MAX_REPORT_FIELDS
         )
         check_major(message, "ChangeReport")
+        if message.HasField("packed") or message.HasField("gaussians"):
+            raise BadValue("ChangeReport in short (packed, gaussians): here only a whole report is read")
         check_length("ChangeReport", len(message.tiles), limits.MAX_TILES_OF_DISTRICT, "tiles")
         with refusing("ChangeReport"):
             district = District(message.district)
@@ -299,23 +301,30 @@ def split(report: ChangeReport) -> tuple[tuple[TileId, bytes], ...]:
 
 @dataclass(frozen=True, slots=True)
 class ChangeAck:
-    """The merger's answer to a report, sent only after the report is durable."""
+    """The merger's answer to a report. "stored" and "duplicate" are sent only when all of it is durable."""
 
     report_id: str
     """The report that is answered; empty when it was too broken to have an id."""
     status: AckStatus
     reason: str = ""
-    """Why it was quarantined, in one line with numbers."""
+    """Why it was quarantined or is to be sent again, in one line with numbers."""
+    wanted: bytes = b""
+    """Status "wanted": of which new and modified voxels Gaussians are asked for (`gnd_map.codec.encode_mask`)."""
 
     def __post_init__(self) -> None:
         if self.report_id or self.status != "quarantined":
             check_report_id(self.report_id)
         check_word(self.status, _STATUS, "ChangeAck status")
         check_text("reason", self.reason, REASON_PATTERN)
+        check_length("mask of ChangeAck", len(self.wanted), limits.MAX_WANTED_BYTES, "bytes")
+        if (self.status == "wanted") != bool(self.wanted):
+            raise BadValue(f"ChangeAck {self.status} with a mask of {len(self.wanted)} bytes: one asks for the other")
 
     def encode(self) -> bytes:
         """Bytes of gnd.v1.ChangeAck."""
-        message = change_ack_pb2.ChangeAck(major=MAJOR, report_id=self.report_id, reason=self.reason)
+        message = change_ack_pb2.ChangeAck(
+            major=MAJOR, report_id=self.report_id, reason=self.reason, wanted=self.wanted
+        )
         message.status = change_ack_pb2.ChangeAck.Status.ValueType(number_of(self.status, _STATUS))
         return serialise(message, limits.MAX_CHANGE_ACK_BYTES)
 
@@ -324,4 +333,5 @@ class ChangeAck:
         """The value in `data`; `SchemaError` when it is none."""
         message = parse(change_ack_pb2.ChangeAck, data, limits.MAX_CHANGE_ACK_BYTES)
         check_major(message, "ChangeAck")
-        return cls(message.report_id, word_of(message.status, _STATUS, "ChangeAck status"), message.reason)
+        status = word_of(message.status, _STATUS, "ChangeAck status")
+        return cls(message.report_id, status, message.reason, message.wanted)

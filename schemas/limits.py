@@ -14,7 +14,9 @@ MAX_TILE_BODY_BYTES: Final = 4 * MIB
 MAX_TILE_REPLY_BYTES: Final = MAX_TILE_BODY_BYTES + KIB
 MAX_CATALOG_BYTES: Final = 128 * KIB
 MAX_CHANGE_REPORT_BYTES: Final = 8 * MIB
-MAX_CHANGE_ACK_BYTES: Final = 4 * KIB
+MAX_PACKED_REPORT_BYTES: Final = 1 * MIB
+MAX_PACKED_GAUSSIANS_BYTES: Final = 4 * MIB
+MAX_CHANGE_ACK_BYTES: Final = 64 * KIB
 MAX_TILE_UPDATE_BYTES: Final = MAX_TILE_BODY_BYTES + KIB
 MAX_TRAFFIC_SAMPLE_BYTES: Final = 16 * KIB
 
@@ -31,6 +33,11 @@ MAX_TEXT_CHARACTERS: Final = 128
 MAX_OBSERVED_BITMAP_BYTES: Final = 128 * KIB
 # Observed voxels of a whole report once unpacked (32 MB of ids): many small bombs are a bomb.
 MAX_OBSERVED_OF_REPORT: Final = 8 * MIB
+
+# Flags of a packed report: each becomes a statement that is kept and merged.
+MAX_FLAGS_OF_REPORT: Final = 256 * KIB
+# Bits of a mask in an ack, were it not compressed at all.
+MAX_WANTED_BYTES: Final = MAX_FLAGS_OF_REPORT // 8 + KIB
 
 # No Gaussian of the map lies outside: the Dead Sea's shore is at -430 m, Chomolungma at 8,849 m.
 MIN_FLOOR: Final = -1_000

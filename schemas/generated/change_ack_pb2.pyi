@@ -36,6 +36,12 @@ class ChangeAck(_message.Message):
         """Was stored before; nothing was applied twice."""
         STATUS_QUARANTINED: ChangeAck._Status.ValueType  # 3
         """Refused; kept in quarantine with `reason`. Do not send it again."""
+        STATUS_WANTED: ChangeAck._Status.ValueType  # 4
+        """The flags of a packed report are understood and not stored yet: send the Gaussians that `wanted` marks."""
+        STATUS_RESEND: ChangeAck._Status.ValueType  # 5
+        """Not understood here, because a base or the flags that go with these Gaussians are missing: after Gaussians send
+        the flags again, after flags the whole report.
+        """
 
     class Status(_Status, metaclass=_StatusEnumTypeWrapper): ...
     STATUS_UNSPECIFIED: ChangeAck.Status.ValueType  # 0
@@ -45,18 +51,29 @@ class ChangeAck(_message.Message):
     """Was stored before; nothing was applied twice."""
     STATUS_QUARANTINED: ChangeAck.Status.ValueType  # 3
     """Refused; kept in quarantine with `reason`. Do not send it again."""
+    STATUS_WANTED: ChangeAck.Status.ValueType  # 4
+    """The flags of a packed report are understood and not stored yet: send the Gaussians that `wanted` marks."""
+    STATUS_RESEND: ChangeAck.Status.ValueType  # 5
+    """Not understood here, because a base or the flags that go with these Gaussians are missing: after Gaussians send
+    the flags again, after flags the whole report.
+    """
 
     MAJOR_FIELD_NUMBER: _builtins.int
     REPORT_ID_FIELD_NUMBER: _builtins.int
     STATUS_FIELD_NUMBER: _builtins.int
     REASON_FIELD_NUMBER: _builtins.int
+    WANTED_FIELD_NUMBER: _builtins.int
     major: _builtins.int
     """Major version of this message; always 1."""
     report_id: _builtins.str
     """The report that is answered: ULID, 26 characters; empty when the report was too broken to have one."""
     status: Global___ChangeAck.Status.ValueType
     reason: _builtins.str
-    """Why it was quarantined, in one line with numbers; otherwise empty."""
+    """Why it was quarantined or is to be sent again, in one line with numbers; otherwise empty."""
+    wanted: _builtins.bytes
+    """Set exactly when status = STATUS_WANTED: which of the new and modified voxels of the report, in order of tile and
+    voxel id, the merger wants Gaussians of; coded as gnd_map.codec.encode_mask.
+    """
     def __init__(
         self,
         *,
@@ -64,10 +81,11 @@ class ChangeAck(_message.Message):
         report_id: _builtins.str = ...,
         status: Global___ChangeAck.Status.ValueType = ...,
         reason: _builtins.str = ...,
+        wanted: _builtins.bytes = ...,
     ) -> None: ...
     _HasFieldArgType: _TypeAlias = _Never  # noqa: Y015
     def HasField(self, field_name: _HasFieldArgType) -> _builtins.bool: ...
-    _ClearFieldArgType: _TypeAlias = _typing.Literal["major", b"major", "reason", b"reason", "report_id", b"report_id", "status", b"status"]  # noqa: Y015
+    _ClearFieldArgType: _TypeAlias = _typing.Literal["major", b"major", "reason", b"reason", "report_id", b"report_id", "status", b"status", "wanted", b"wanted"]  # noqa: Y015
     def ClearField(self, field_name: _ClearFieldArgType) -> None: ...
     def WhichOneof(self, oneof_group: _Never) -> None: ...
 

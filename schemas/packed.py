@@ -1,0 +1,223 @@
+"""Change reports in short, in two halves: first the flags of what changed, then the Gaussians that the ack asks for.
+
+Both travel in the message ChangeReport on the key of change reports. What they hold is coded against the versions of
+the tiles that vehicle and cloud both have, so these values only carry the bytes: `vehicle_agent.packing` makes them,
+`cloud_merger.expanding` understands them.
+"""
+
+import hashlib
+import zlib
+from collections.abc import Iterable
+from dataclasses import dataclass
+from typing import Final
+
+from ulid import ULID
+
+from gnd_map.codec import decode_tiles, encode_tiles
+from schemas import limits
+from schemas.changes import ChangeReport
+from schemas.errors import BadValue, TooLarge
+from schemas.generated import change_report_pb2, packed_gaussians_pb2, packed_report_pb2
+from schemas.report_id import check_report_id
+from schemas.wire import (
+    MAJOR,
+    PRINTABLE_PATTERN,
+    VEHICLE_PATTERN,
+    check_length,
+    check_major,
+    check_text,
+    check_unsigned,
+    check_version,
+    parse,
+    refusing,
+    serialise,
+)
+
+DIGEST_BYTES: Final = 8
+_ULID_BYTES: Final = 16
+_SIGMA_BITS: Final = 32
+_INDEX_BITS: Final = 10
+_M_PER_STEP: Final = 1e-4
+_RAD_PER_STEP: Final = 1e-5
+
+
+def digest_of(base_shas: Iterable[bytes]) -> bytes:
+    """8 bytes of SHA-256 over the content hashes (32 bytes each, or none where there is no map) in order of tiles."""
+    return hashlib.sha256(b"".join(base_shas)).digest()[:DIGEST_BYTES]
+
+
+@dataclass(frozen=True, slots=True)
+class PackedReport:
+    """The first half of a report: what it rests on and which voxels it flags. Layer and district are in the key."""
+
+    report_id: str
+    """ULID; the same as that of the whole report."""
+    vehicle: str
+    """Pseudonym."""
+    sensor_model: str
+    software: str
+    first_ns: int
+    """Time of the first scan that the report rests on, UTC."""
+    length_ns: int
+    """Time from then to the last scan."""
+    tiles: tuple[tuple[int, int], ...]
+    """(index in the district: the lowest 10 bits of the Morton code, version of the base: 0 none), ascending, >= 1."""
+    base_digest: bytes
+    """`digest_of` the bases."""
+    flags: bytes
+    """Of `gnd_map.codec.encode_flags`."""
+    track: bytes
+    """Of `gnd_map.track.encode_track`."""
+    pose_sigma_tenth_mm: int
+    """Largest of the tiles' standard deviations of the refined position, 0.1 mm, rounded up."""
+    pose_sigma_10urad: int
+    """The same of the attitude, 10 µrad, rounded up."""
+
+    def __post_init__(self) -> None:
+        check_report_id(self.report_id)
+        check_text("vehicle", self.vehicle, VEHICLE_PATTERN)
+        check_text("sensor model", self.sensor_model, PRINTABLE_PATTERN)
+        check_text("software", self.software, PRINTABLE_PATTERN)
+        check_unsigned("first_ns", self.first_ns, bits=63)
+        check_unsigned("last_ns", self.last_ns, bits=63)
+        check_unsigned("pose_sigma_tenth_mm", self.pose_sigma_tenth_mm, bits=_SIGMA_BITS)
+        check_unsigned("pose_sigma_10urad", self.pose_sigma_10urad, bits=_SIGMA_BITS)
+        if len(self.base_digest) != DIGEST_BYTES:
+            raise BadValue(f"base digest has {len(self.base_digest)} bytes, expected {DIGEST_BYTES}")
+        self._check_tiles()
+
+    def _check_tiles(self) -> None:
+        if not self.tiles:
+            raise BadValue(f"packed report {self.report_id} has no tiles")
+        check_length(f"packed report {self.report_id}", len(self.tiles), limits.MAX_TILES_OF_DISTRICT, "tiles")
+        indices = [index for index, _ in self.tiles]
+        if indices != sorted(set(indices)):
+            raise BadValue(f"packed report {self.report_id}: its {len(indices)} tiles are not strictly ascending")
+        for index, version in self.tiles:
+            check_unsigned("index of a tile", index, bits=_INDEX_BITS)
+            check_version("base version", version, lowest=0)
+
+    @property
+    def last_ns(self) -> int:
+        """Time of the last scan."""
+        return self.first_ns + self.length_ns
+
+    @property
+    def pose_sigma_m(self) -> float:
+        """Standard deviation of the refined position, metres."""
+        return self.pose_sigma_tenth_mm * _M_PER_STEP
+
+    @property
+    def pose_sigma_rad(self) -> float:
+        """Standard deviation of the refined attitude, radians."""
+        return self.pose_sigma_10urad * _RAD_PER_STEP
+
+    def encode(self) -> bytes:
+        """Bytes of gnd.v1.ChangeReport with `packed` set."""
+        packed = packed_report_pb2.PackedReport(
+            report_id=_ulid_bytes(self.report_id),
+            vehicle=self.vehicle,
+            sensor_model=self.sensor_model,
+            software=self.software,
+            first_ns=self.first_ns,
+            length_ns=self.length_ns,
+            tiles=encode_tiles(self.tiles),
+            base_digest=self.base_digest,
+            flags=self.flags,
+            track=self.track,
+            pose_sigma_tenth_mm=self.pose_sigma_tenth_mm,
+            pose_sigma_10urad=self.pose_sigma_10urad,
+        )
+        message = change_report_pb2.ChangeReport(major=MAJOR, packed=packed)
+        return serialise(message, limits.MAX_PACKED_REPORT_BYTES)
+
+
+@dataclass(frozen=True, slots=True)
+class PackedGaussians:
+    """The second half of a report: the measured Gaussians that were asked for."""
+
+    report_id: str
+    """ULID of the report."""
+    measured: bytes
+    """Of `gnd_map.codec.encode_measured`."""
+    wanted_crc: int
+    """`crc_of` the bytes of the mask that asked for them."""
+
+    def __post_init__(self) -> None:
+        check_report_id(self.report_id)
+        check_unsigned("wanted_crc", self.wanted_crc, bits=32)
+
+    def encode(self) -> bytes:
+        """Bytes of gnd.v1.ChangeReport with `gaussians` set."""
+        gaussians = packed_gaussians_pb2.PackedGaussians(
+            report_id=_ulid_bytes(self.report_id), measured=self.measured, wanted_crc=self.wanted_crc
+        )
+        message = change_report_pb2.ChangeReport(major=MAJOR, gaussians=gaussians)
+        return serialise(message, limits.MAX_PACKED_GAUSSIANS_BYTES)
+
+
+def crc_of(wanted: bytes) -> int:
+    """CRC-32 of an encoded mask."""
+    return zlib.crc32(wanted)
+
+
+def decode_upload(data: bytes) -> ChangeReport | PackedReport | PackedGaussians:
+    """Whatever a vehicle has sent on the key of change reports.
+
+    Raises:
+        SchemaError: too large (checked before parsing), truncated, of another kind or major version, a value that
+            cannot be; more than one form in one message.
+    """
+    message = parse(
+        change_report_pb2.ChangeReport, data, limits.MAX_CHANGE_REPORT_BYTES, max_fields=limits.MAX_REPORT_FIELDS
+    )
+    forms = [name for name in ("packed", "gaussians") if message.HasField(name)]
+    if not forms:
+        return ChangeReport.decode(data)
+    check_major(message, "ChangeReport")
+    others = sorted(field.name for field, _ in message.ListFields() if field.name not in ("major", forms[0]))
+    if others:
+        raise BadValue(f"ChangeReport holds {forms[0]} and also {', '.join(others)}: one report in one form")
+    if forms[0] == "packed":
+        _check_size("PackedReport", data, limits.MAX_PACKED_REPORT_BYTES)
+        return _packed_report(message.packed)
+    _check_size("PackedGaussians", data, limits.MAX_PACKED_GAUSSIANS_BYTES)
+    return _packed_gaussians(message.gaussians)
+
+
+def _packed_report(message: packed_report_pb2.PackedReport) -> PackedReport:
+    with refusing("tiles of PackedReport"):
+        tiles = tuple(decode_tiles(message.tiles))
+    return PackedReport(
+        report_id=_ulid_text(message.report_id),
+        vehicle=message.vehicle,
+        sensor_model=message.sensor_model,
+        software=message.software,
+        first_ns=message.first_ns,
+        length_ns=message.length_ns,
+        tiles=tiles,
+        base_digest=message.base_digest,
+        flags=message.flags,
+        track=message.track,
+        pose_sigma_tenth_mm=message.pose_sigma_tenth_mm,
+        pose_sigma_10urad=message.pose_sigma_10urad,
+    )
+
+
+def _packed_gaussians(message: packed_gaussians_pb2.PackedGaussians) -> PackedGaussians:
+    return PackedGaussians(_ulid_text(message.report_id), message.measured, message.wanted_crc)
+
+
+def _check_size(name: str, data: bytes, limit: int) -> None:
+    if len(data) > limit:
+        raise TooLarge(f"{name} of {len(data)} bytes exceeds the limit of {limit} bytes")
+
+
+def _ulid_bytes(report_id: str) -> bytes:
+    return bytes(ULID.from_str(report_id).bytes)
+
+
+def _ulid_text(data: bytes) -> str:
+    if len(data) != _ULID_BYTES:
+        raise BadValue(f"report id has {len(data)} bytes, expected {_ULID_BYTES}")
+    return str(ULID.from_bytes(data))
