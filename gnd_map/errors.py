@@ -8,7 +8,8 @@ GndError
     ├── ShapeError   an array of the wrong shape, type or order, or with values that are not finite
     ├── CodecError   bytes that are no encoded Gaussians
     ├── DeltaError   a delta that does not fit the tile
-    └── MotionError  poses that do not cover the time asked for
+    ├── MotionError  poses that do not cover the time asked for
+    └── TrackError   a track that no vehicle drives, or that is too long
 """
 
 
@@ -46,3 +47,7 @@ class DeltaError(MapError):
 
 class MotionError(MapError):
     """A time lies outside the poses that are known."""
+
+
+class TrackError(MapError):
+    """A track that no vehicle drives, or more of it than its limits allow."""
