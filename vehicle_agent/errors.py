@@ -32,6 +32,10 @@ class OutboxError(VehicleError):
     """The outbox cannot be opened or written; nothing may be reported without it."""
 
 
+class PackingError(VehicleError):
+    """A report that cannot be said in short: a base tile is missing, or it says more than flags can."""
+
+
 class AgentConfigError(VehicleError):
     """The agent was started with values that cannot work."""
 

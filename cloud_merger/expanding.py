@@ -1,0 +1,140 @@
+"""From a packed report back to an ordinary one: flags and track against the base tiles, then the Gaussians asked for.
+
+Pure functions, the counterpart of `vehicle_agent.packing`. What comes out is a `ChangeReport` as if the vehicle had sent
+it whole, but for three things: observed voxels are those that the track predicts, rays are not counted (evidence 0), and
+a voxel that is new or modified whose Gaussian was not asked for has count 0 ("withheld"; one that is deleted is
+classed so).
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cloud_merger.errors import BadReport, MissingBase
+from gnd_map.classes import ChangeClass
+from gnd_map.codec import Flags, decode_flags, decode_measured
+from gnd_map.errors import GndError
+from gnd_map.gaussian import Gaussians, concat
+from gnd_map.tile import Tile
+from gnd_map.tile_id import District, TileId
+from gnd_map.track import decode_track
+from gnd_map.visibility import observed_along
+from schemas import limits
+from schemas.changes import ChangeReport, TileChange
+from schemas.packed import PackedReport, digest_of
+
+MEASURED = (ChangeClass.NEW, ChangeClass.MODIFIED)
+
+
+def base_versions(packed: PackedReport, district: District) -> tuple[tuple[TileId, int], ...]:
+    """The tiles of a packed report on the key of `district`, each with the version that it was compared with."""
+    return tuple((TileId(district.first_morton + index), version) for index, version in packed.tiles)
+
+
+def expand(packed: PackedReport, layer: str, district: District, bases: Sequence[Tile]) -> ChangeReport:
+    """The report that `packed` stands for, every Gaussian withheld.
+
+    Args:
+        packed: as it came on the key of `layer` and `district`.
+        layer: of the key.
+        district: of the key.
+        bases: of `base_versions`, in that order; version 0 and no Gaussians where the vehicle had no map.
+
+    Raises:
+        MissingBase: the bases are not those that the vehicle compared with.
+        CodecError: flags or track cannot be read against them.
+        BadReport: more flags than a report may hold.
+        SchemaError: a value that no report has.
+    """
+    shas = [tile.sha if tile.version else b"" for tile in bases]
+    if digest_of(shas) != packed.base_digest:
+        raise MissingBase(
+            f"report {packed.report_id}: the {len(bases)} versions here have digest {digest_of(shas).hex()}, the "
+            f"vehicle compared with {packed.base_digest.hex()}"
+        )
+    known = [(tile.tile_id, tile.gaussians) for tile in bases]
+    flags = decode_flags(known, packed.flags)
+    n = sum(len(one.voxel_id) for one in flags)
+    if n > limits.MAX_FLAGS_OF_REPORT:
+        raise BadReport(f"report {packed.report_id} flags {n} voxels, the limit is {limits.MAX_FLAGS_OF_REPORT}")
+    observed = observed_along(decode_track(district, packed.track), known)
+    return ChangeReport(
+        report_id=packed.report_id,
+        vehicle=packed.vehicle,
+        sensor_model=packed.sensor_model,
+        software=packed.software,
+        district=district,
+        first_ns=packed.first_ns,
+        last_ns=packed.last_ns,
+        tiles=tuple(
+            _change(packed, tile, sha, one, seen)
+            for tile, sha, one, seen in zip(bases, shas, flags, observed, strict=True)
+        ),
+        layer=layer,
+    )
+
+
+def _change(
+    packed: PackedReport, base: Tile, sha: bytes, flags: Flags, observed: NDArray[np.int32]
+) -> TileChange:
+    n = len(flags.voxel_id)
+    return TileChange(
+        tile=base.tile_id,
+        base_version=base.version,
+        base_sha=sha,
+        observed=np.union1d(observed, flags.voxel_id).astype(np.int32),
+        changed=Gaussians.nothing_at(flags.voxel_id),
+        change_class=flags.change_class,
+        evidence=np.zeros((n, 4), np.int32),
+        pose_sigma_m=packed.pose_sigma_m,
+        pose_sigma_rad=packed.pose_sigma_rad,
+    )
+
+
+def is_askable(change: TileChange) -> NDArray[np.bool_]:
+    """(N,) which changed voxels have a Gaussian that can be asked for: those that are new or modified."""
+    return np.isin(change.change_class, MEASURED)
+
+
+def with_measured(
+    report: ChangeReport, bases: Mapping[TileId, Gaussians], wanted: NDArray[np.bool_], measured: bytes
+) -> ChangeReport:
+    """The expanded report with the Gaussians that were asked for in place of withheld ones.
+
+    Args:
+        report: of `expand`.
+        bases: of its tiles.
+        wanted: bool, one for each new or modified voxel of the report, in order of tile and voxel id.
+        measured: `PackedGaussians.measured`, of those that are marked.
+
+    Raises:
+        BadReport: `measured` cannot be read as the Gaussians of these voxels.
+        SchemaError: a covariance that no points in a voxel can have.
+    """
+    rows = _rows_wanted(report, wanted)
+    asked = {change.tile: change.changed.voxel_id[at] for change, at in zip(report.tiles, rows, strict=True) if len(at)}
+    try:
+        found = decode_measured([(tile, bases[tile], ids) for tile, ids in asked.items()], measured)
+    except GndError as error:
+        raise BadReport(f"report {report.report_id}: Gaussians of {int(wanted.sum())} voxels: {error}") from error
+    by_tile = dict(zip(asked, found, strict=True))
+    return replace(report, tiles=tuple(_filled(change, by_tile.get(change.tile)) for change in report.tiles))
+
+
+def _rows_wanted(report: ChangeReport, wanted: NDArray[np.bool_]) -> list[NDArray[np.int64]]:
+    """Of each tile, the rows of changed voxels whose Gaussian is wanted."""
+    found, first = [], 0
+    for change in report.tiles:
+        rows = np.flatnonzero(is_askable(change))
+        found.append(rows[wanted[first : first + len(rows)]])
+        first += len(rows)
+    return found
+
+
+def _filled(change: TileChange, measured: Gaussians | None) -> TileChange:
+    if measured is None:
+        return change
+    kept = change.changed.take(~np.isin(change.changed.voxel_id, measured.voxel_id))
+    return replace(change, changed=concat([kept, measured]))

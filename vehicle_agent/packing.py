@@ -1,0 +1,126 @@
+"""A report in two short halves: flags coded against the base tiles and the track; then the Gaussians asked for.
+
+Pure functions: what they make depends on the report, its base tiles and the track only, so a restarted agent packs the
+same bytes again, and a study of the traffic can pack without a bus. `cloud_merger.expanding` undoes it.
+"""
+
+import math
+from collections.abc import Mapping
+
+import numpy as np
+from numpy.typing import NDArray
+
+from gnd_map.arrays import I32
+from gnd_map.classes import CHANGED, ChangeClass
+from gnd_map.codec import Flags, decode_mask, encode_flags, encode_measured
+from gnd_map.gaussian import Gaussians
+from gnd_map.tile_id import TileId
+from gnd_map.track import Track, encode_track
+from schemas.changes import ChangeReport, TileChange
+from schemas.packed import PackedGaussians, PackedReport, crc_of, digest_of
+from vehicle_agent.errors import PackingError
+
+Bases = Mapping[bytes, Gaussians]
+"""The Gaussians of base tiles by content hash; b"" (the vehicle had no map of the tile) need not be among them."""
+
+_STEPS_PER_M = 10_000
+_STEPS_PER_RAD = 100_000
+
+
+def pack(report: ChangeReport, bases: Bases, track: Track) -> PackedReport:
+    """The first half of `report`: which voxels it flags, and where the vehicle was.
+
+    Args:
+        report: as the detector makes it; what it does not flag as new, modified or deleted is not told.
+        bases: at least those that the report's tiles name.
+        track: where the vehicle was while the scans counted that the report rests on.
+
+    Raises:
+        PackingError: a base is missing, or a changed voxel is of another class.
+        CodecError: the flags cannot be coded.
+    """
+    return PackedReport(
+        report_id=report.report_id,
+        vehicle=report.vehicle,
+        sensor_model=report.sensor_model,
+        software=report.software,
+        first_ns=report.first_ns,
+        length_ns=report.last_ns - report.first_ns,
+        tiles=tuple((change.tile.morton - report.district.first_morton, change.base_version) for change in report.tiles),
+        base_digest=digest_of(change.base_sha for change in report.tiles),
+        flags=encode_flags([_flags(change, bases) for change in report.tiles]),
+        track=encode_track(track),
+        pose_sigma_tenth_mm=_steps_up(max(change.pose_sigma_m for change in report.tiles), _STEPS_PER_M),
+        pose_sigma_10urad=_steps_up(max(change.pose_sigma_rad for change in report.tiles), _STEPS_PER_RAD),
+    )
+
+
+def pack_measured(report: ChangeReport, bases: Bases, wanted: bytes) -> PackedGaussians:
+    """The second half of `report`: the Gaussians that the ack's mask `wanted` asks for.
+
+    The mask runs over `askable(report)`. Gaussians must lie on the lattice "compact".
+
+    Raises:
+        PackingError: a base is missing.
+        CodecError: the mask is damaged or of another length, or a Gaussian is not on the lattice.
+    """
+    entries = asked_for(report, bases, decode_mask(wanted, askable(report)))
+    return PackedGaussians(report.report_id, encode_measured(entries), crc_of(wanted))
+
+
+def askable(report: ChangeReport) -> int:
+    """How many new and modified voxels the report has: of these the cloud may ask for Gaussians."""
+    return sum(int(is_measured(change).sum()) for change in report.tiles)
+
+
+def asked_for(
+    report: ChangeReport, bases: Bases, mask: NDArray[np.bool_]
+) -> list[tuple[TileId, Gaussians, Gaussians]]:
+    """(tile, its base, the Gaussians that are asked for) of each tile of which something is.
+
+    Args:
+        report: whose new and modified voxels, in order of tile and voxel id, `mask` marks.
+        bases: at least those of these tiles.
+        mask: (`askable(report)`,) bool.
+
+    Raises:
+        PackingError: a base is missing.
+    """
+    entries, first = [], 0
+    for change in report.tiles:
+        rows = np.flatnonzero(is_measured(change))
+        chosen = rows[mask[first : first + len(rows)]]
+        first += len(rows)
+        if len(chosen):
+            entries.append((change.tile, base_of(change, bases), change.changed.take(chosen)))
+    return entries
+
+
+def is_measured(change: TileChange) -> NDArray[np.bool_]:
+    """(N,) which changed voxels hold a new Gaussian: those that are new or modified."""
+    return np.isin(change.change_class, (ChangeClass.NEW, ChangeClass.MODIFIED))
+
+
+def base_of(change: TileChange, bases: Bases) -> Gaussians:
+    """The Gaussians that the change was compared with; none where the vehicle had no map.
+
+    Raises:
+        PackingError: the base is missing.
+    """
+    if not change.base_sha:
+        return Gaussians.empty()
+    if change.base_sha not in bases:
+        raise PackingError(f"tile {change.tile}: its base {change.base_sha.hex()[:16]}… is not among {len(bases)} bases")
+    return bases[change.base_sha]
+
+
+def _flags(change: TileChange, bases: Bases) -> Flags:
+    if not np.isin(change.change_class, CHANGED).all():
+        raise PackingError(f"tile {change.tile}: changed voxels of classes {np.unique(change.change_class).tolist()}")
+    voxel_id: I32 = change.changed.voxel_id
+    return Flags(change.tile, base_of(change, bases), voxel_id, change.change_class)
+
+
+def _steps_up(value: float, steps: int) -> int:
+    """Rounded up, so that a vehicle never claims to know its pose better than it does."""
+    return math.ceil(value * steps - 1e-6)
