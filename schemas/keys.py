@@ -35,6 +35,13 @@ KEY_TABLE: Final = (
         reliability="asked again until answered; a wildcard is answered with one reply a tile that exists",
     ),
     KeySpec(
+        pattern=f"{ROOT}/tiles/<layer>/<q5>/<q10>/<q15>",
+        kind="query, any client → tile server",
+        request="TilesRequest",
+        reply="TilesReply",
+        reliability="asked again until answered; what did not fit is asked for again",
+    ),
+    KeySpec(
         pattern=f"{ROOT}/catalog/<layer>/<q5>/<q10>/<q15>",
         kind="query, any client → tile server",
         request="–",
@@ -82,6 +89,16 @@ def tile_key(layer: str, tile: TileId) -> str:
 def tiles_key(layer: str, prefix: str = "") -> str:
     """Where every tile of a region is asked for; `prefix` = none to four chunks of a tile's path."""
     return f"{ROOT}/tile/{_layer(layer)}/{_region(prefix)}"
+
+
+def batch_key(layer: str, district: District) -> str:
+    """Where tiles of one district are asked for together."""
+    return f"{ROOT}/tiles/{_layer(layer)}/{district.path}"
+
+
+def batch_keys() -> str:
+    """Every key on which tiles are asked for together."""
+    return f"{ROOT}/tiles/**"
 
 
 def catalog_key(layer: str, district: District) -> str:
@@ -142,6 +159,11 @@ def parse_tile_key(key: str) -> tuple[str, TileId]:
 def parse_update_key(key: str) -> tuple[str, TileId]:
     """Layer and tile of an update key; `BadKey`, `WrongVersion`."""
     return _layer_and_tile(key, "update")
+
+
+def parse_batch_key(key: str) -> tuple[str, District]:
+    """Layer and district of a key for tiles of one district; `BadKey`, `WrongVersion`."""
+    return _layer_and_district(key, "tiles")
 
 
 def parse_catalog_key(key: str) -> tuple[str, District]:

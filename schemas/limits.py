@@ -12,6 +12,8 @@ MIB: Final = 1024 * KIB
 MAX_TILE_REQUEST_BYTES: Final = 1 * KIB
 MAX_TILE_BODY_BYTES: Final = 4 * MIB
 MAX_TILE_REPLY_BYTES: Final = MAX_TILE_BODY_BYTES + KIB
+MAX_TILES_REQUEST_BYTES: Final = 24 * KIB
+MAX_TILES_REPLY_BYTES: Final = MAX_TILE_BODY_BYTES + 64 * KIB
 MAX_CATALOG_BYTES: Final = 128 * KIB
 MAX_CHANGE_REPORT_BYTES: Final = 8 * MIB
 MAX_PACKED_REPORT_BYTES: Final = 1 * MIB
@@ -24,6 +26,8 @@ MAX_TRAFFIC_SAMPLE_BYTES: Final = 16 * KIB
 MAX_TILES_OF_DISTRICT: Final = 1024
 # Fields on the top level of a report: its tiles and its own, with room for a newer minor version's.
 MAX_REPORT_FIELDS: Final = MAX_TILES_OF_DISTRICT + 64
+# Fields on the top level of a reply about a district's tiles: five values a tile at most, with room.
+MAX_TILES_REPLY_FIELDS: Final = 5 * MAX_TILES_OF_DISTRICT + 64
 MAX_REMOVED_VOXELS: Final = 200_000
 MAX_CODECS: Final = 16
 MAX_REASON_CHARACTERS: Final = 1024

@@ -4,12 +4,20 @@ from dataclasses import dataclass
 from itertools import pairwise
 from typing import Final, Literal
 
-from gnd_map.codec import CODEC_FLOAT32, codec_of, encode_gaussians
+from gnd_map.codec import CODEC_FLOAT32, PREFERRED, codec_of, decode_delta
+from gnd_map.errors import GndError
 from gnd_map.tile import Tile
 from gnd_map.tile_id import TileId
 from schemas import limits
 from schemas.errors import BadValue, WrongHash
-from schemas.generated import catalog_entry_pb2, catalog_pb2, tile_blob_pb2, tile_reply_pb2, tile_request_pb2
+from schemas.generated import (
+    catalog_entry_pb2,
+    catalog_pb2,
+    coded_delta_pb2,
+    tile_blob_pb2,
+    tile_reply_pb2,
+    tile_request_pb2,
+)
 from schemas.wire import (
     MAJOR,
     check_length,
@@ -26,8 +34,8 @@ from schemas.wire import (
     word_of,
 )
 
-ReplyStatus = Literal["blob", "unchanged", "absent"]
-_STATUS: Final[dict[int, ReplyStatus]] = {1: "blob", 2: "unchanged", 3: "absent"}
+ReplyStatus = Literal["blob", "unchanged", "absent", "delta"]
+_STATUS: Final[dict[int, ReplyStatus]] = {1: "blob", 2: "unchanged", 3: "absent", 4: "delta"}
 
 
 @dataclass(frozen=True, slots=True)
@@ -38,19 +46,23 @@ class TileRequest:
     """0 = none."""
     cached_sha: bytes = b""
     """32 bytes; empty = none."""
-    codecs: tuple[int, ...] = (CODEC_FLOAT32,)
+    codecs: tuple[int, ...] = PREFERRED
     """In order of preference, at least one."""
+    deltas: bool = True
+    """Whether it can use a delta against what it holds."""
 
     def __post_init__(self) -> None:
         check_pair("cached", self.cached_version, self.cached_sha)
-        check_length("TileRequest", len(self.codecs), limits.MAX_CODECS, "codecs")
-        if not self.codecs or not all(0 <= codec < 2**32 for codec in self.codecs):
-            raise BadValue(f"TileRequest with codecs {self.codecs}: at least one, each in 0 .. 2^32 - 1")
+        check_codecs("TileRequest", self.codecs)
 
     def encode(self) -> bytes:
         """Bytes of gnd.v1.TileRequest."""
         message = tile_request_pb2.TileRequest(
-            major=MAJOR, cached_version=self.cached_version, cached_sha=self.cached_sha, codecs=self.codecs
+            major=MAJOR,
+            cached_version=self.cached_version,
+            cached_sha=self.cached_sha,
+            codecs=self.codecs,
+            deltas=self.deltas,
         )
         return serialise(message, limits.MAX_TILE_REQUEST_BYTES)
 
@@ -59,7 +71,14 @@ class TileRequest:
         """The value in `data`; `SchemaError` when it is none."""
         message = parse(tile_request_pb2.TileRequest, data, limits.MAX_TILE_REQUEST_BYTES)
         check_major(message, "TileRequest")
-        return cls(message.cached_version, message.cached_sha, tuple(message.codecs))
+        return cls(message.cached_version, message.cached_sha, tuple(message.codecs), message.deltas)
+
+
+def check_codecs(name: str, codecs: tuple[int, ...]) -> None:
+    """`TooLarge`, `BadValue` unless `codecs` are a few ids, at least one."""
+    check_length(name, len(codecs), limits.MAX_CODECS, "codecs")
+    if not codecs or not all(0 <= codec < 2**32 for codec in codecs):
+        raise BadValue(f"{name} with codecs {codecs}: at least one, each in 0 .. 2^32 - 1")
 
 
 @dataclass(frozen=True, slots=True)
@@ -99,9 +118,11 @@ def _blob_value(message: tile_blob_pb2.TileBlob) -> TileBlob:
     return TileBlob(tile_id(message.tile), message.version, message.sha, message.codec_id, message.body)
 
 
-def blob_of(tile: Tile) -> TileBlob:
-    """The tile as float32 columns."""
-    return TileBlob(tile.tile_id, tile.version, tile.sha, CODEC_FLOAT32, encode_gaussians(tile.gaussians))
+def blob_of(tile: Tile, codec_id: int = CODEC_FLOAT32) -> TileBlob:
+    """The tile in a codec; `CodecError` when that codec cannot express it."""
+    return TileBlob(
+        tile.tile_id, tile.version, tile.sha, codec_id, codec_of(codec_id).encode(tile.tile_id, tile.gaussians)
+    )
 
 
 def tile_of(blob: TileBlob) -> Tile:
@@ -112,13 +133,67 @@ def tile_of(blob: TileBlob) -> Tile:
         BadValue: a codec that this program does not know, or a body that is none of it.
     """
     with refusing(f"tile {blob.tile} version {blob.version}"):
-        tile = Tile(blob.tile, blob.version, codec_of(blob.codec_id).decode(blob.body))
-    if tile.sha != blob.sha:
-        raise WrongHash(
-            f"tile {blob.tile} version {blob.version}: content has sha {tile.sha.hex()[:16]}…, "
-            f"claimed is {blob.sha.hex()[:16]}…; fetch it again"
-        )
+        tile = Tile(blob.tile, blob.version, codec_of(blob.codec_id).decode(blob.tile, blob.body))
+    check_hash(f"tile {blob.tile} version {blob.version}", tile, blob.sha)
     return tile
+
+
+@dataclass(frozen=True, slots=True)
+class CodedDelta:
+    """What turns the content of a tile that a client holds into another version."""
+
+    tile: TileId
+    version: int
+    """That comes out."""
+    sha: bytes
+    """SHA-256 of the content that comes out."""
+    body: bytes
+    """`gnd_map.codec.encode_delta` against what the client holds."""
+
+    def __post_init__(self) -> None:
+        check_version("tile version", self.version, lowest=1)
+        check_sha("tile sha", self.sha)
+        check_length(f"delta of tile {self.tile}", len(self.body), limits.MAX_TILE_BODY_BYTES, "bytes")
+
+
+def _delta_message(delta: CodedDelta) -> coded_delta_pb2.CodedDelta:
+    return coded_delta_pb2.CodedDelta(tile=delta.tile.morton, version=delta.version, sha=delta.sha, body=delta.body)
+
+
+def _delta_value(message: coded_delta_pb2.CodedDelta) -> CodedDelta:
+    return CodedDelta(tile_id(message.tile), message.version, message.sha, message.body)
+
+
+def tile_after(delta: CodedDelta, held: Tile) -> Tile:
+    """The tile that a delta makes of the one that the client holds.
+
+    Raises:
+        WrongHash: the delta does not fit what is held, or what comes out has not the delta's sha: fetch the tile whole.
+    """
+    return tile_from_delta(delta.tile, delta.version, delta.body, held, delta.sha)
+
+
+def tile_from_delta(tile: TileId, version: int, body: bytes, held: Tile, sha: bytes) -> Tile:
+    """The tile that the bytes of `encode_delta` make of the one held; `sha` may be the first bytes of the hash only.
+
+    Raises:
+        WrongHash: the delta is of another tile, does not fit what is held, or its outcome has not this hash.
+    """
+    name = f"delta of tile {tile} to version {version}"
+    if held.tile_id != tile:
+        raise WrongHash(f"{name} is not for tile {held.tile_id}; fetch the tile whole")
+    try:
+        after = Tile(tile, version, decode_delta(tile, held.gaussians, body))
+    except GndError as error:
+        raise WrongHash(f"{name} does not fit version {held.version}: {error}; fetch the tile whole") from error
+    check_hash(name, after, sha)
+    return after
+
+
+def check_hash(name: str, tile: Tile, sha: bytes) -> None:
+    """`WrongHash` unless the tile's hash begins with `sha` (all 32 bytes of it, or the first few)."""
+    if not sha or not tile.sha.startswith(sha):
+        raise WrongHash(f"{name}: content has sha {tile.sha.hex()[:16]}…, claimed is {sha.hex()[:16]}…; fetch it again")
 
 
 @dataclass(frozen=True, slots=True)
@@ -128,15 +203,22 @@ class TileReply:
     status: ReplyStatus
     blob: TileBlob | None = None
     """Set exactly when the status is "blob"."""
+    delta: CodedDelta | None = None
+    """Set exactly when the status is "delta"."""
 
     def __post_init__(self) -> None:
         check_word(self.status, _STATUS, "TileReply status")
-        if (self.status == "blob") != (self.blob is not None):
-            raise BadValue(f"TileReply {self.status!r} {'without' if self.blob is None else 'with'} a blob")
+        for name, part in (("blob", self.blob), ("delta", self.delta)):
+            if (self.status == name) != (part is not None):
+                raise BadValue(f"TileReply {self.status!r} {'without' if part is None else 'with'} a {name}")
 
     def encode(self) -> bytes:
         """Bytes of gnd.v1.TileReply."""
-        message = tile_reply_pb2.TileReply(major=MAJOR, blob=_blob_message(self.blob) if self.blob else None)
+        message = tile_reply_pb2.TileReply(
+            major=MAJOR,
+            blob=_blob_message(self.blob) if self.blob else None,
+            delta=_delta_message(self.delta) if self.delta else None,
+        )
         message.status = tile_reply_pb2.TileReply.Status.ValueType(number_of(self.status, _STATUS))
         return serialise(message, limits.MAX_TILE_REPLY_BYTES)
 
@@ -146,7 +228,11 @@ class TileReply:
         message = parse(tile_reply_pb2.TileReply, data, limits.MAX_TILE_REPLY_BYTES)
         check_major(message, "TileReply")
         status = word_of(message.status, _STATUS, "TileReply status")
-        return cls(status, _blob_value(message.blob) if message.HasField("blob") else None)
+        return cls(
+            status,
+            _blob_value(message.blob) if message.HasField("blob") else None,
+            _delta_value(message.delta) if message.HasField("delta") else None,
+        )
 
 
 @dataclass(frozen=True, slots=True)

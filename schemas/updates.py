@@ -6,11 +6,13 @@ from typing import Final, Literal
 import numpy as np
 
 from gnd_map.codec import CODEC_FLOAT32, codec_of, encode_gaussians
-from gnd_map.tile import TileDelta
+from gnd_map.errors import GndError
+from gnd_map.tile import Tile, TileDelta, apply
 from gnd_map.tile_id import TileId
 from schemas import limits
-from schemas.errors import BadValue
+from schemas.errors import BadValue, WrongHash
 from schemas.generated import tile_delta_pb2, tile_update_pb2
+from schemas.tiles import check_hash, tile_from_delta
 from schemas.wire import (
     LAYER_PATTERN,
     MAJOR,
@@ -47,7 +49,13 @@ class TileUpdate:
     """Empty = the tile is new."""
     reason: UpdateReason
     delta: TileDelta | None = None
-    """What turns the previous content into the new one; None = fetch the tile."""
+    """What turns the previous content into the new one, in plain columns; None = see `coded_delta`."""
+    coded_delta: bytes = b""
+    """The same by `gnd_map.codec.encode_delta`; with neither, fetch the tile."""
+    put_voxels: int = 0
+    """Voxels that `coded_delta` gives a Gaussian or another one."""
+    removed_voxels: int = 0
+    """Voxels that lose theirs by `coded_delta`."""
 
     def __post_init__(self) -> None:
         check_text("layer", self.layer, LAYER_PATTERN)
@@ -56,8 +64,33 @@ class TileUpdate:
         check_pair("previous", self.previous_version, self.previous_sha)
         check_word(self.reason, _REASON, "update reason")
         _check_removed(0 if self.delta is None else len(self.delta.removed))
+        check_length(f"delta of tile {self.tile}", len(self.coded_delta), limits.MAX_TILE_BODY_BYTES, "bytes")
+        self._check_coded()
         if self.previous_version >= self.version:
             raise BadValue(f"update of tile {self.tile} to version {self.version} from {self.previous_version}")
+
+    def _check_coded(self) -> None:
+        if self.coded_delta and self.delta is not None:
+            raise BadValue(f"update of tile {self.tile} with a plain and a coded delta: one of them")
+        if max(self.put_voxels, self.removed_voxels) > limits.MAX_REMOVED_VOXELS or (
+            not self.coded_delta and (self.put_voxels or self.removed_voxels)
+        ):
+            raise BadValue(
+                f"update of tile {self.tile} puts {self.put_voxels} and removes {self.removed_voxels} voxels by"
+                f" {len(self.coded_delta)} coded bytes: at most {limits.MAX_REMOVED_VOXELS}, none without a delta"
+            )
+
+    @property
+    def has_delta(self) -> bool:
+        """Whether it says what has changed; else the tile is to be fetched."""
+        return self.delta is not None or bool(self.coded_delta)
+
+    @property
+    def voxels(self) -> tuple[int, int] | None:
+        """(put, removed) by the delta; None without one."""
+        if self.delta is not None:
+            return len(self.delta.put), len(self.delta.removed)
+        return (self.put_voxels, self.removed_voxels) if self.coded_delta else None
 
     def encode(self) -> bytes:
         """Bytes of gnd.v1.TileUpdate."""
@@ -70,6 +103,9 @@ class TileUpdate:
             sha=self.sha,
             previous_sha=self.previous_sha,
             delta=None if self.delta is None else _delta_message(self.delta),
+            coded_delta=self.coded_delta,
+            put_voxels=self.put_voxels,
+            removed_voxels=self.removed_voxels,
         )
         message.reason = tile_update_pb2.TileUpdate.Reason.ValueType(number_of(self.reason, _REASON))
         return serialise(message, limits.MAX_TILE_UPDATE_BYTES)
@@ -81,7 +117,7 @@ class TileUpdate:
         check_major(message, "TileUpdate")
         tile = tile_id(message.tile)
         with refusing(f"update of tile {tile}"):
-            delta = _delta_value(message.delta) if message.HasField("delta") else None
+            delta = _delta_value(tile, message.delta) if message.HasField("delta") else None
         return cls(
             tile=tile,
             layer=message.layer,
@@ -91,7 +127,30 @@ class TileUpdate:
             previous_sha=message.previous_sha,
             reason=word_of(message.reason, _REASON, "update reason"),
             delta=delta,
+            coded_delta=message.coded_delta,
+            put_voxels=message.put_voxels,
+            removed_voxels=message.removed_voxels,
         )
+
+
+def updated(update: TileUpdate, held: Tile) -> Tile:
+    """The tile that a notice makes of the version before it.
+
+    Raises:
+        WrongHash: the notice has no delta, or its delta does not fit what is held, or what comes out has not the
+            notice's hash: fetch the tile.
+    """
+    name = f"update of tile {update.tile} to version {update.version}"
+    if not update.has_delta:
+        raise WrongHash(f"{name} has no delta; fetch the tile")
+    if update.delta is None:
+        return tile_from_delta(update.tile, update.version, update.coded_delta, held, update.sha)
+    try:
+        tile = Tile(update.tile, update.version, apply(held.gaussians, update.delta))
+    except GndError as error:
+        raise WrongHash(f"{name} does not fit version {held.version}: {error}; fetch the tile") from error
+    check_hash(name, tile, update.sha)
+    return tile
 
 
 def _delta_message(delta: TileDelta) -> tile_delta_pb2.TileDelta:
@@ -100,9 +159,9 @@ def _delta_message(delta: TileDelta) -> tile_delta_pb2.TileDelta:
     )
 
 
-def _delta_value(message: tile_delta_pb2.TileDelta) -> TileDelta:
+def _delta_value(tile: TileId, message: tile_delta_pb2.TileDelta) -> TileDelta:
     _check_removed(len(message.removed))
-    return TileDelta(np.array(message.removed, np.int32), codec_of(message.codec_id).decode(message.put))
+    return TileDelta(np.array(message.removed, np.int32), codec_of(message.codec_id).decode(tile, message.put))
 
 
 def _check_removed(count: int) -> None:

@@ -3,6 +3,7 @@
 isort:skip_file
 """
 
+from . import coded_delta_pb2 as _coded_delta_pb2
 from . import tile_blob_pb2 as _tile_blob_pb2
 from google.protobuf import descriptor as _descriptor
 from google.protobuf import message as _message
@@ -37,6 +38,8 @@ class TileReply(_message.Message):
         """The client's content is the newest already."""
         STATUS_ABSENT: TileReply._Status.ValueType  # 3
         """The map has no such tile."""
+        STATUS_DELTA: TileReply._Status.ValueType  # 4
+        """What turns the client's content into the newest version is in `delta`."""
 
     class Status(_Status, metaclass=_StatusEnumTypeWrapper): ...
     STATUS_UNSPECIFIED: TileReply.Status.ValueType  # 0
@@ -46,10 +49,13 @@ class TileReply(_message.Message):
     """The client's content is the newest already."""
     STATUS_ABSENT: TileReply.Status.ValueType  # 3
     """The map has no such tile."""
+    STATUS_DELTA: TileReply.Status.ValueType  # 4
+    """What turns the client's content into the newest version is in `delta`."""
 
     MAJOR_FIELD_NUMBER: _builtins.int
     STATUS_FIELD_NUMBER: _builtins.int
     BLOB_FIELD_NUMBER: _builtins.int
+    DELTA_FIELD_NUMBER: _builtins.int
     major: _builtins.int
     """Major version of this message; always 1."""
     status: Global___TileReply.Status.ValueType
@@ -57,16 +63,21 @@ class TileReply(_message.Message):
     def blob(self) -> _tile_blob_pb2.TileBlob:
         """Set exactly when status = STATUS_BLOB."""
 
+    @_builtins.property
+    def delta(self) -> _coded_delta_pb2.CodedDelta:
+        """Set exactly when status = STATUS_DELTA."""
+
     def __init__(
         self,
         *,
         major: _builtins.int = ...,
         status: Global___TileReply.Status.ValueType = ...,
         blob: _tile_blob_pb2.TileBlob | None = ...,
+        delta: _coded_delta_pb2.CodedDelta | None = ...,
     ) -> None: ...
-    _HasFieldArgType: _TypeAlias = _typing.Literal["blob", b"blob"]  # noqa: Y015
+    _HasFieldArgType: _TypeAlias = _typing.Literal["blob", b"blob", "delta", b"delta"]  # noqa: Y015
     def HasField(self, field_name: _HasFieldArgType) -> _builtins.bool: ...
-    _ClearFieldArgType: _TypeAlias = _typing.Literal["blob", b"blob", "major", b"major", "status", b"status"]  # noqa: Y015
+    _ClearFieldArgType: _TypeAlias = _typing.Literal["blob", b"blob", "delta", b"delta", "major", b"major", "status", b"status"]  # noqa: Y015
     def ClearField(self, field_name: _ClearFieldArgType) -> None: ...
     def WhichOneof(self, oneof_group: _Never) -> None: ...
 

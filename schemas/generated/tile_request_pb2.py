@@ -24,7 +24,7 @@ _sym_db = _symbol_database.Default()
 
 
 
-DESCRIPTOR = _descriptor_pool.Default().AddSerializedFile(b'\n\x19gnd/v1/tile_request.proto\x12\x06gnd.v1\"X\n\x0bTileRequest\x12\r\n\x05major\x18\x01 \x01(\r\x12\x16\n\x0e\x63\x61\x63hed_version\x18\x02 \x01(\r\x12\x12\n\ncached_sha\x18\x03 \x01(\x0c\x12\x0e\n\x06\x63odecs\x18\x04 \x03(\rb\x06proto3')
+DESCRIPTOR = _descriptor_pool.Default().AddSerializedFile(b'\n\x19gnd/v1/tile_request.proto\x12\x06gnd.v1\"h\n\x0bTileRequest\x12\r\n\x05major\x18\x01 \x01(\r\x12\x16\n\x0e\x63\x61\x63hed_version\x18\x02 \x01(\r\x12\x12\n\ncached_sha\x18\x03 \x01(\x0c\x12\x0e\n\x06\x63odecs\x18\x04 \x03(\r\x12\x0e\n\x06\x64\x65ltas\x18\x05 \x01(\x08\x62\x06proto3')
 
 _globals = globals()
 _builder.BuildMessageAndEnumDescriptors(DESCRIPTOR, _globals)
@@ -32,5 +32,5 @@ _builder.BuildTopDescriptorsAndMessages(DESCRIPTOR, 'schemas.generated.tile_requ
 if not _descriptor._USE_C_DESCRIPTORS:
   DESCRIPTOR._loaded_options = None
   _globals['_TILEREQUEST']._serialized_start=37
-  _globals['_TILEREQUEST']._serialized_end=125
+  _globals['_TILEREQUEST']._serialized_end=141
 # @@protoc_insertion_point(module_scope)

@@ -28,12 +28,15 @@ class TileRequest(_message.Message):
     CACHED_VERSION_FIELD_NUMBER: _builtins.int
     CACHED_SHA_FIELD_NUMBER: _builtins.int
     CODECS_FIELD_NUMBER: _builtins.int
+    DELTAS_FIELD_NUMBER: _builtins.int
     major: _builtins.int
     """Major version of this message; always 1."""
     cached_version: _builtins.int
     """Version of the tile that the client holds already; 0 = none. [count of publications, from 1]"""
     cached_sha: _builtins.bytes
     """SHA-256 of the content that the client holds already; empty = none. [32 bytes]"""
+    deltas: _builtins.bool
+    """Whether the client can read a reply of status STATUS_DELTA."""
     @_builtins.property
     def codecs(self) -> _containers.RepeatedScalarFieldContainer[_builtins.int]:
         """Codec ids that the client can read, in order of preference; at least one."""
@@ -45,10 +48,11 @@ class TileRequest(_message.Message):
         cached_version: _builtins.int = ...,
         cached_sha: _builtins.bytes = ...,
         codecs: _abc.Iterable[_builtins.int] | None = ...,
+        deltas: _builtins.bool = ...,
     ) -> None: ...
     _HasFieldArgType: _TypeAlias = _Never  # noqa: Y015
     def HasField(self, field_name: _HasFieldArgType) -> _builtins.bool: ...
-    _ClearFieldArgType: _TypeAlias = _typing.Literal["cached_sha", b"cached_sha", "cached_version", b"cached_version", "codecs", b"codecs", "major", b"major"]  # noqa: Y015
+    _ClearFieldArgType: _TypeAlias = _typing.Literal["cached_sha", b"cached_sha", "cached_version", b"cached_version", "codecs", b"codecs", "deltas", b"deltas", "major", b"major"]  # noqa: Y015
     def ClearField(self, field_name: _ClearFieldArgType) -> None: ...
     def WhichOneof(self, oneof_group: _Never) -> None: ...
 

@@ -56,6 +56,9 @@ class TileUpdate(_message.Message):
     PREVIOUS_SHA_FIELD_NUMBER: _builtins.int
     REASON_FIELD_NUMBER: _builtins.int
     DELTA_FIELD_NUMBER: _builtins.int
+    CODED_DELTA_FIELD_NUMBER: _builtins.int
+    PUT_VOXELS_FIELD_NUMBER: _builtins.int
+    REMOVED_VOXELS_FIELD_NUMBER: _builtins.int
     major: _builtins.int
     """Major version of this message; always 1."""
     tile: _builtins.int
@@ -71,9 +74,15 @@ class TileUpdate(_message.Message):
     previous_sha: _builtins.bytes
     """SHA-256 of the content before it; empty = the tile is new. [32 bytes]"""
     reason: Global___TileUpdate.Reason.ValueType
+    coded_delta: _builtins.bytes
+    """The same, coded by gnd_map.codec.encode_delta; with neither, fetch the tile."""
+    put_voxels: _builtins.int
+    """Voxels that `coded_delta` gives a Gaussian or another one. [voxels]"""
+    removed_voxels: _builtins.int
+    """Voxels that lose theirs by `coded_delta`. [voxels]"""
     @_builtins.property
     def delta(self) -> _tile_delta_pb2.TileDelta:
-        """What turns the previous content into the new one; missing = fetch the tile."""
+        """What turns the previous content into the new one, in plain columns; missing = see `coded_delta`."""
 
     def __init__(
         self,
@@ -87,10 +96,13 @@ class TileUpdate(_message.Message):
         previous_sha: _builtins.bytes = ...,
         reason: Global___TileUpdate.Reason.ValueType = ...,
         delta: _tile_delta_pb2.TileDelta | None = ...,
+        coded_delta: _builtins.bytes = ...,
+        put_voxels: _builtins.int = ...,
+        removed_voxels: _builtins.int = ...,
     ) -> None: ...
     _HasFieldArgType: _TypeAlias = _typing.Literal["delta", b"delta"]  # noqa: Y015
     def HasField(self, field_name: _HasFieldArgType) -> _builtins.bool: ...
-    _ClearFieldArgType: _TypeAlias = _typing.Literal["delta", b"delta", "layer", b"layer", "major", b"major", "previous_sha", b"previous_sha", "previous_version", b"previous_version", "reason", b"reason", "sha", b"sha", "tile", b"tile", "version", b"version"]  # noqa: Y015
+    _ClearFieldArgType: _TypeAlias = _typing.Literal["coded_delta", b"coded_delta", "delta", b"delta", "layer", b"layer", "major", b"major", "previous_sha", b"previous_sha", "previous_version", b"previous_version", "put_voxels", b"put_voxels", "reason", b"reason", "removed_voxels", b"removed_voxels", "sha", b"sha", "tile", b"tile", "version", b"version"]  # noqa: Y015
     def ClearField(self, field_name: _ClearFieldArgType) -> None: ...
     def WhichOneof(self, oneof_group: _Never) -> None: ...
 

@@ -1,0 +1,326 @@
+"""Many tiles of one district in one query: what a client holds in half a byte a tile, the answer in a bit where it
+holds the newest already.
+"""
+
+import hashlib
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import dataclass
+from itertools import groupby, pairwise
+from typing import Final, Literal, Self
+
+from gnd_map.codec import PREFERRED, codec_of, decode_tiles, encode_tiles
+from gnd_map.tile import Tile
+from gnd_map.tile_id import District, TileId
+from schemas import limits
+from schemas.errors import BadValue, WrongHash
+from schemas.generated import tiles_reply_pb2, tiles_request_pb2
+from schemas.tiles import check_codecs, check_hash, tile_from_delta
+from schemas.wire import (
+    MAJOR,
+    check_length,
+    check_major,
+    check_pair,
+    check_version,
+    check_word,
+    number_of,
+    parse,
+    refusing,
+    serialise,
+    word_of,
+)
+
+HASH_BYTES: Final = 8
+"""So much of a content's hash tells it from another: chance errs once in 10^19; a client keeps the whole hash."""
+EVERY_CODEC: Final = (4, 3, 2, 7, 6, 5, 1, 0)
+"""What a request means that names no codecs; frozen, whatever later programs read besides."""
+TILES: Final = limits.MAX_TILES_OF_DISTRICT
+
+AnswerStatus = Literal["blob", "delta", "unchanged", "absent", "later", "hash"]
+_STATUS: Final[dict[int, AnswerStatus]] = {1: "blob", 2: "delta", 3: "unchanged", 4: "absent", 5: "later", 6: "hash"}
+_WITH_BODY: Final = ("blob", "delta")
+
+
+@dataclass(frozen=True, slots=True)
+class HeldTile:
+    """A tile that is wanted, and what the client holds of it."""
+
+    tile: TileId
+    version: int = 0
+    """0 = nothing."""
+    sha: bytes = b""
+    """32 bytes; empty = nothing."""
+
+    def __post_init__(self) -> None:
+        check_pair(f"held tile {self.tile}", self.version, self.sha)
+
+
+@dataclass(frozen=True, slots=True)
+class TilesRequest:
+    """Which tiles of a district a client wants; `of` makes it from the tiles that it holds."""
+
+    wanted: tuple[tuple[int, int], ...]
+    """(index in the district = lowest ten bits of the Morton code, version held, 0 = none), ascending."""
+    held_digest: bytes = b""
+    """`digest_of` the hashes of what is held; empty = nothing is, or `held_hashes` say what."""
+    held_hashes: tuple[bytes, ...] = ()
+    """The first 8 bytes of the hash of each tile held, in order: only when the server has asked for them."""
+    codecs: tuple[int, ...] = PREFERRED
+    """In order of preference, at least one."""
+    max_bytes: int = limits.MAX_TILE_BODY_BYTES
+    """Bodies beyond so many bytes wait for another request; the first always fits."""
+    near: int | None = None
+    """Index of the tile around which tiles are needed first; None = in order."""
+
+    def __post_init__(self) -> None:
+        check_indices(self.wanted)
+        check_codecs("TilesRequest", self.codecs)
+        if not 1 <= self.max_bytes <= limits.MAX_TILE_BODY_BYTES:
+            raise BadValue(f"TilesRequest for {self.max_bytes} bytes: 1 .. {limits.MAX_TILE_BODY_BYTES}")
+        if self.near is not None and not 0 <= self.near < TILES:
+            raise BadValue(f"TilesRequest near tile {self.near}: a district has 0 .. {TILES - 1}")
+        _check_held(self)
+
+    @property
+    def n_held(self) -> int:
+        """Of how many tiles the client holds a version."""
+        return sum(version > 0 for _, version in self.wanted)
+
+    @classmethod
+    def of(
+        cls,
+        held: Iterable[HeldTile],
+        *,
+        codecs: tuple[int, ...] = PREFERRED,
+        max_bytes: int = limits.MAX_TILE_BODY_BYTES,
+        near: TileId | None = None,
+        with_hashes: bool = False,
+    ) -> Self:
+        """A request for these tiles of one district, each once, in any order.
+
+        `with_hashes`: after the server has answered "hash", which a store that has lost a version does.
+        """
+        tiles = sorted(held, key=lambda one: one.tile)
+        if len({one.tile.district for one in tiles}) > 1:
+            raise BadValue(f"TilesRequest for tiles of {len({t.tile.district for t in tiles})} districts: one only")
+        shas = [one.sha for one in tiles if one.version]
+        return cls(
+            wanted=tuple((index_of(one.tile), one.version) for one in tiles),
+            held_digest=digest_of(shas) if shas and not with_hashes else b"",
+            held_hashes=tuple(sha[:HASH_BYTES] for sha in shas) if with_hashes else (),
+            codecs=codecs,
+            max_bytes=max_bytes,
+            near=None if near is None else index_of(near),
+        )
+
+    def tiles(self, district: District) -> tuple[TileId, ...]:
+        """The tiles wanted, in the order of the answers."""
+        return tuple(TileId(district.first_morton + index) for index, _ in self.wanted)
+
+    def encode(self) -> bytes:
+        """Bytes of gnd.v1.TilesRequest."""
+        message = tiles_request_pb2.TilesRequest(
+            major=MAJOR,
+            wanted=encode_tiles(self.wanted),
+            held_digest=self.held_digest,
+            held_hashes=b"".join(self.held_hashes),
+            codecs=() if self.codecs == EVERY_CODEC else self.codecs,
+            max_bytes=0 if self.max_bytes == limits.MAX_TILE_BODY_BYTES else self.max_bytes,
+            near=self.near,
+        )
+        return serialise(message, limits.MAX_TILES_REQUEST_BYTES)
+
+    @classmethod
+    def decode(cls, data: bytes) -> Self:
+        """The value in `data`; `SchemaError` when it is none."""
+        message = parse(tiles_request_pb2.TilesRequest, data, limits.MAX_TILES_REQUEST_BYTES)
+        check_major(message, "TilesRequest")
+        with refusing("TilesRequest"):
+            wanted = tuple((int(index), int(version)) for index, version in decode_tiles(message.wanted))
+        return cls(
+            wanted=wanted,
+            held_digest=message.held_digest,
+            held_hashes=tuple(_cut("TilesRequest", message.held_hashes)),
+            codecs=tuple(message.codecs) or EVERY_CODEC,
+            max_bytes=message.max_bytes or limits.MAX_TILE_BODY_BYTES,
+            near=message.near if message.HasField("near") else None,
+        )
+
+
+def index_of(tile: TileId) -> int:
+    """A tile's number in its district: 0 .. 1023."""
+    return tile.morton % TILES
+
+
+def digest_of(shas: Iterable[bytes]) -> bytes:
+    """First 8 bytes of SHA-256 over the hashes (32 bytes each) of what is held, in order."""
+    return hashlib.sha256(b"".join(shas)).digest()[:HASH_BYTES]
+
+
+def check_indices(wanted: Sequence[tuple[int, int]]) -> None:
+    """`BadValue`, `TooLarge` unless these are (index, version) of tiles of one district, ascending."""
+    check_length("TilesRequest", len(wanted), TILES, "tiles")
+    if not wanted:
+        raise BadValue("TilesRequest for no tiles")
+    for index, version in wanted:
+        check_version(f"held version of tile {index}", version, lowest=0)
+    if wanted[0][0] < 0 or wanted[-1][0] >= TILES or any(a >= b for (a, _), (b, _) in pairwise(wanted)):
+        raise BadValue(
+            f"TilesRequest for tiles {[i for i, _ in wanted][:9]}…: ascending in 0 .. {TILES - 1}, once each"
+        )
+
+
+def _check_held(request: TilesRequest) -> None:
+    if request.held_hashes:
+        good = len(request.held_hashes) == request.n_held and all(len(h) == HASH_BYTES for h in request.held_hashes)
+        good &= not request.held_digest
+    else:
+        good = len(request.held_digest) == (HASH_BYTES if request.n_held else 0)
+    if not good:
+        raise BadValue(
+            f"TilesRequest with {request.n_held} tiles held, a digest of {len(request.held_digest)} bytes and"
+            f" {len(request.held_hashes)} hashes: a digest of {HASH_BYTES} bytes, or a hash of so many for each"
+        )
+
+
+def _cut(name: str, hashes: bytes) -> Iterator[bytes]:
+    if len(hashes) % HASH_BYTES:
+        raise BadValue(f"{name} with hashes of {len(hashes)} bytes, not a multiple of {HASH_BYTES}")
+    return (hashes[at : at + HASH_BYTES] for at in range(0, len(hashes), HASH_BYTES))
+
+
+@dataclass(frozen=True, slots=True)
+class TileAnswer:
+    """What the server says of one tile: `blob` and `delta` bring a version, `later` did not fit, `hash` = ask again
+    with hashes.
+    """
+
+    status: AnswerStatus
+    version: int = 0
+    """New version of a blob or delta; else 0."""
+    sha: bytes = b""
+    """First 8 bytes of the hash of a blob's or delta's content; else empty."""
+    codec_id: int = 0
+    """Codec of a blob; else 0."""
+    body: bytes = b""
+    """Of a blob in its codec, or of a delta by `gnd_map.codec.encode_delta`; else empty."""
+
+    def __post_init__(self) -> None:
+        check_word(self.status, _STATUS, "answer status")
+        check_length("TileAnswer", len(self.body), limits.MAX_TILE_BODY_BYTES, "bytes")
+        if self.status in _WITH_BODY:
+            check_version("tile version", self.version, lowest=1)
+            check_version("codec id", self.codec_id, lowest=0)
+            good = len(self.sha) == HASH_BYTES and (self.status == "blob" or self.codec_id == 0)
+        else:
+            good = (self.version, self.sha, self.codec_id, self.body) == (0, b"", 0, b"")
+        if not good:
+            raise BadValue(
+                f"answer {self.status!r} with version {self.version}, a hash of {len(self.sha)} bytes, codec"
+                f" {self.codec_id} and {len(self.body)} bytes"
+            )
+
+
+def tile_of_answer(tile: TileId, answer: TileAnswer, held: Tile | None = None) -> Tile:
+    """The tile that a "blob" or "delta" brings.
+
+    Args:
+        tile: which tile the answer is about.
+        answer: of status "blob" or "delta".
+        held: the content that the request said is held; needed by a delta.
+
+    Raises:
+        WrongHash: the content has not its hash, or the delta does not fit what is held: fetch the tile whole.
+        BadValue: an unknown codec, a body that is none of it, an answer without a body.
+    """
+    if answer.status not in _WITH_BODY:
+        raise BadValue(f"answer {answer.status!r} about tile {tile} brings no content")
+    name = f"tile {tile} version {answer.version}"
+    if answer.status == "delta":
+        if held is None:
+            raise WrongHash(f"{name} is a delta and nothing is held; fetch the tile whole")
+        return tile_from_delta(tile, answer.version, answer.body, held, answer.sha)
+    with refusing(name):
+        found = Tile(tile, answer.version, codec_of(answer.codec_id).decode(tile, answer.body))
+    check_hash(name, found, answer.sha)
+    return found
+
+
+@dataclass(frozen=True, slots=True)
+class TilesReply:
+    """The tile server's answers, one a tile, in the order of the request."""
+
+    answers: tuple[TileAnswer, ...]
+
+    def __post_init__(self) -> None:
+        check_length("TilesReply", len(self.answers), TILES, "tiles")
+
+    def of_request(self, request: TilesRequest, district: District) -> list[tuple[TileId, TileAnswer]]:
+        """Each tile of the request with its answer.
+
+        Raises:
+            BadValue: it answers more or fewer tiles than were asked for, or a delta where nothing is held.
+        """
+        if len(self.answers) != len(request.wanted):
+            raise BadValue(f"TilesReply about {len(self.answers)} tiles, asked for {len(request.wanted)}")
+        for (index, version), answer in zip(request.wanted, self.answers, strict=True):
+            if version == 0 and answer.status in ("delta", "unchanged", "hash"):
+                raise BadValue(f"TilesReply says {answer.status!r} of tile {index}, of which nothing is held")
+        return list(zip(request.tiles(district), self.answers, strict=True))
+
+    def encode(self) -> bytes:
+        """Bytes of gnd.v1.TilesReply."""
+        brought = [answer for answer in self.answers if answer.status in _WITH_BODY]
+        message = tiles_reply_pb2.TilesReply(
+            major=MAJOR,
+            runs=_runs(self.answers),
+            versions=(answer.version for answer in brought),
+            hashes=b"".join(answer.sha for answer in brought),
+            codecs=(answer.codec_id for answer in brought if answer.status == "blob"),
+            bodies=(answer.body for answer in brought),
+        )
+        return serialise(message, limits.MAX_TILES_REPLY_BYTES)
+
+    @classmethod
+    def decode(cls, data: bytes) -> Self:
+        """The value in `data`; `SchemaError` when it is none. Contents are checked by `tile_of_answer`."""
+        message = parse(
+            tiles_reply_pb2.TilesReply,
+            data,
+            limits.MAX_TILES_REPLY_BYTES,
+            max_fields=limits.MAX_TILES_REPLY_FIELDS,
+        )
+        check_major(message, "TilesReply")
+        return cls(tuple(_answers(message)))
+
+
+def _runs(answers: Iterable[TileAnswer]) -> Iterator[int]:
+    for status, run in groupby(answers, lambda answer: answer.status):
+        yield 8 * sum(1 for _ in run) + number_of(status, _STATUS)
+
+
+def _statuses(runs: Sequence[int]) -> list[AnswerStatus]:
+    check_length("TilesReply", len(runs), TILES, "runs")
+    check_length("TilesReply", sum(run // 8 for run in runs), TILES, "tiles")
+    if any(run < 8 for run in runs):
+        raise BadValue("TilesReply with an empty run")
+    return [status for run in runs for status in [word_of(run % 8, _STATUS, "answer status")] * (run // 8)]
+
+
+def _answers(message: tiles_reply_pb2.TilesReply) -> Iterator[TileAnswer]:
+    statuses = _statuses(message.runs)
+    n_brought, n_blobs = sum(s in _WITH_BODY for s in statuses), statuses.count("blob")
+    hashes = list(_cut("TilesReply", message.hashes))
+    counts = (len(message.versions), len(hashes), len(message.bodies), len(message.codecs))
+    if counts != (n_brought, n_brought, n_brought, n_blobs):
+        raise BadValue(
+            f"TilesReply that brings {n_brought} tiles, {n_blobs} of them whole, has {counts[0]} versions,"
+            f" {counts[1]} hashes, {counts[2]} bodies and {counts[3]} codecs"
+        )
+    brought = iter(zip(message.versions, hashes, message.bodies, strict=True))
+    codecs = iter(message.codecs)
+    for status in statuses:
+        if status in _WITH_BODY:
+            version, sha, body = next(brought)
+            yield TileAnswer(status, version, sha, next(codecs) if status == "blob" else 0, body)
+        else:
+            yield TileAnswer(status)
