@@ -270,7 +270,7 @@ def _change_value(message: tile_change_pb2.TileChange) -> TileChange:
     tile = tile_id(message.tile)
     with refusing(f"change of tile {tile}"):
         observed = decode_observed(message.observed_first, message.observed_bitmap)
-        changed = codec_of(message.codec_id).decode(message.changed)
+        changed = codec_of(message.codec_id).decode(tile, message.changed)
         evidence = _evidence_of(message, len(changed))
     return TileChange(
         tile=tile,

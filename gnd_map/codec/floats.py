@@ -1,14 +1,11 @@
-"""Encodings of a tile's Gaussians. A codec id never changes its meaning; clients say which ids they read.
+"""Codec 0, float32 columns: what a content hash is made of.
 
-Codec 0, the published truth: little-endian, the number of voxels N as uint32, then the columns one after the other,
+Little-endian, the number of voxels N as uint32, then the columns one after the other,
 float32 as they are: voxel_id i4[N], count i4[N], cells i4[N], mean x f4[N], y, z, cov xx f4[N], xy, xz, yy, yz, zz. 4 +
 48·N bytes; -0.0 is written as 0.0.
 """
 
 import struct
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass
-from types import MappingProxyType
 
 import numpy as np
 
@@ -28,7 +25,7 @@ def encode_gaussians(gaussians: Gaussians) -> bytes:
     Raises:
         CodecError: more than MAX_VOXELS voxels.
     """
-    _check_number(len(gaussians))
+    check_number(len(gaussians))
     ints = np.stack([gaussians.voxel_id, gaussians.count, gaussians.cells]).astype("<i4")
     floats = (np.hstack([gaussians.mean_m, gaussians.cov_m2]).T + np.float32(0.0)).astype(
         "<f4"
@@ -45,7 +42,7 @@ def decode_gaussians(body: bytes) -> Gaussians:
     if len(body) < _HEAD.size:
         raise CodecError(f"encoded Gaussians: {len(body)} bytes, fewer than the {_HEAD.size} of the head")
     (n,) = _HEAD.unpack_from(body)
-    _check_number(n)
+    check_number(n)
     if len(body) != _HEAD.size + n * _VOXEL_BYTES:
         raise CodecError(
             f"encoded Gaussians: {len(body)} bytes, expected {_HEAD.size + n * _VOXEL_BYTES} for {n} voxels"
@@ -59,36 +56,7 @@ def decode_gaussians(body: bytes) -> Gaussians:
         raise CodecError(f"encoded Gaussians: {error}") from error
 
 
-def _check_number(n: int) -> None:
+def check_number(n: int) -> None:
+    """`CodecError` when a tile may not hold so many voxels."""
     if n > MAX_VOXELS:
         raise CodecError(f"{n} voxels are more than the {MAX_VOXELS} that a tile may hold")
-
-
-@dataclass(frozen=True, slots=True)
-class Codec:
-    """One way to write Gaussians as bytes."""
-
-    codec_id: int
-    """Number on the wire, never reused."""
-    name: str
-    """For messages and tables."""
-    encode: Callable[[Gaussians], bytes]
-    """Gaussians to bytes."""
-    decode: Callable[[bytes], Gaussians]
-    """Bytes to Gaussians; raises CodecError."""
-
-
-CODECS: Mapping[int, Codec] = MappingProxyType(
-    {CODEC_FLOAT32: Codec(CODEC_FLOAT32, "float32 columns", encode_gaussians, decode_gaussians)}
-)
-
-
-def codec_of(codec_id: int) -> Codec:
-    """The codec with this id.
-
-    Raises:
-        CodecError: there is none; the message lists those there are.
-    """
-    if codec_id not in CODECS:
-        raise CodecError(f"codec {codec_id} is unknown; known: {', '.join(map(str, CODECS))}")
-    return CODECS[codec_id]

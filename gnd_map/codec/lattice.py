@@ -1,0 +1,373 @@
+"""The whitened quantiser: Gaussians on a lattice of integers (after GND 4.1, whose floats it replaces on the wire).
+
+Per voxel the axis along which the Gaussian is thinnest goes last, and Sigma = L L^T (Cholesky) of the permuted axes
+(a, b, c) is written as
+
+    L_ii = sd[k_i], a frozen table of integers; L_ba = s_ba · slope · L_bb, L_ca = s_ca · slope · L_cc, L_cb likewise;
+    mean = L (m · step).
+
+So every error is measured in standard deviations of the Gaussian itself: a wall 1 cm thick keeps its place to
+millimetres, along the wall a few centimetres do not matter. Regression slopes (the plane's tilt) are kept when the
+standard deviations are rounded.
+
+Everything from integers to float32 is exact integer arithmetic and one correctly rounded conversion, so it gives the
+same bits on every machine. `snap` moves Gaussians onto the lattice once; what lies on it stays, to the bit.
+"""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, fields
+from types import MappingProxyType
+from typing import Final
+
+import numpy as np
+import numpy.typing as npt
+
+from gnd_map.arrays import F32, F64, I32, I64, check_array
+from gnd_map.errors import CodecError, ShapeError
+from gnd_map.gaussian import Gaussians
+
+UNIT_BITS: Final = 20
+"""Standard deviations are integers of 2^-20 m."""
+LEVELS: Final = 48
+MAX_SLOPE: Final = 4095
+MAX_STEP: Final = 8191
+CELLS: Final = 20
+"""On the lattice `cells` says only "at least": a voxel holds a Gaussian from so many sub-cells on."""
+COUNTS: Final = np.array([1, 2, 5, 10, *(20 << j for j in range(27))], np.int64)
+"""Numbers of points on the lattice: one an octave."""
+
+AXES: Final = np.array([[1, 2, 0], [0, 2, 1], [0, 1, 2]])
+"""Axes (a, b, c) by the axis c along which the Gaussian is thinnest."""
+_SIX: Final = np.array([[0, 1, 2], [1, 3, 4], [2, 4, 5]])
+
+
+@dataclass(frozen=True, slots=True)
+class Lattice:
+    """How finely Gaussians are rounded.
+
+    Attributes:
+        name: on the command line.
+        code: its number on the wire, never reused.
+        sd: (LEVELS,) int64 standard deviations, 2^-20 m, increasing.
+        plane_step: levels of the standard deviations a and b, along the surface, are multiples of this.
+        slope_bits: L_ca and L_cb are multiples of L_cc · 2^-slope_bits.
+        shear_bits: L_ba is a multiple of L_bb · 2^-shear_bits.
+        thin_bits: the whitened mean's last component is a multiple of 2^-thin_bits.
+        plane_bits: its other two are multiples of 2^-plane_bits.
+    """
+
+    name: str
+    code: int
+    sd: tuple[int, ...]
+    plane_step: int
+    slope_bits: int
+    shear_bits: int
+    thin_bits: int
+    plane_bits: int
+
+    @property
+    def length_bits(self) -> int:
+        """L is held in integers of 2^-length_bits m."""
+        return UNIT_BITS + max(self.slope_bits, self.shear_bits)
+
+    @property
+    def mean_bits(self) -> int:
+        """Means are held in integers of 2^-mean_bits m."""
+        return self.length_bits + max(self.thin_bits, self.plane_bits)
+
+
+def _levels(first_m: float, ratio: float) -> tuple[int, ...]:
+    """Frozen by `tests/gnd_map/test_lattice.py`: another machine's `pow` must not move them."""
+    return tuple(round(first_m * ratio**k * 2**UNIT_BITS) for k in range(LEVELS))
+
+
+ARCHIVE: Final = Lattice("archive", 0, _levels(0.002, 1.15), 1, 3, 3, 3, 3)
+STANDARD: Final = Lattice("standard", 1, _levels(0.004, 1.2), 2, 2, 1, 2, 1)
+COMPACT: Final = Lattice("compact", 2, _levels(0.004, 1.3), 2, 1, 0, 1, 0)
+LATTICES: Final[Mapping[str, Lattice]] = MappingProxyType({x.name: x for x in (ARCHIVE, STANDARD, COMPACT)})
+
+
+def lattice_with(code: int) -> Lattice:
+    """The lattice of this number on the wire; `CodecError` when there is none."""
+    for lattice in LATTICES.values():
+        if lattice.code == code:
+            return lattice
+    raise CodecError(f"lattice {code} is unknown; known: {', '.join(str(x.code) for x in LATTICES.values())}")
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Quantised:
+    """N Gaussians of one tile as integers, sorted by voxel id; all columns int32 but the ids' own."""
+
+    voxel_id: I32
+    """(N,) strictly increasing."""
+    axis: I32
+    """(N,) 0, 1, 2: the axis along which the Gaussian is thinnest."""
+    level: I32
+    """(N, 3) levels of the standard deviations a, b (in units of plane_step) and c."""
+    slope: I32
+    """(N, 3) s_ba, s_ca, s_cb."""
+    step: I32
+    """(N, 3) whitened mean, components a, b, c."""
+    count: I32
+    """(N,) index into COUNTS."""
+
+    def __post_init__(self) -> None:
+        n = len(self.voxel_id)
+        for name in ("voxel_id", "axis", "count"):
+            check_array(name, getattr(self, name), np.int32, (n,))
+        for name in ("level", "slope", "step"):
+            check_array(name, getattr(self, name), np.int32, (n, 3))
+
+    def __len__(self) -> int:
+        return len(self.voxel_id)
+
+    def take(self, index: npt.ArrayLike) -> "Quantised":
+        """The rows at `index`: increasing positions or a mask (N,)."""
+        return Quantised(*(np.ascontiguousarray(getattr(self, f.name)[index]) for f in fields(self)))
+
+    def check(self, lattice: Lattice) -> None:
+        """`CodecError` when a column leaves its range."""
+        _refuse("axis", self.axis, 0, 2)
+        _refuse("level a, b", self.level[:, :2], 0, (LEVELS - 1) // lattice.plane_step)
+        _refuse("level c", self.level[:, 2], 0, LEVELS - 1)
+        _refuse("slope", self.slope, -MAX_SLOPE, MAX_SLOPE)
+        _refuse("step", self.step, -MAX_STEP, MAX_STEP)
+        _refuse("count", self.count, 0, len(COUNTS) - 1)
+
+
+def _refuse(name: str, column: I32, low: int, high: int) -> None:
+    if column.size and (column.min() < low or column.max() > high):
+        raise CodecError(f"{name} {column.min()} .. {column.max()} is outside {low} .. {high}")
+
+
+def dequantise(quantised: Quantised, lattice: Lattice) -> Gaussians:
+    """The Gaussians that the integers stand for, the same bits on every machine.
+
+    Raises:
+        CodecError: a column leaves its range, or the values are no Gaussians (means beyond 2 m ...).
+    """
+    quantised.check(lattice)
+    mean_m, cov_m2 = _floats(quantised, lattice)
+    count = COUNTS[quantised.count].astype(np.int32)
+    try:
+        return Gaussians(quantised.voxel_id, count, np.minimum(count, CELLS).astype(np.int32), mean_m, cov_m2)
+    except ShapeError as error:
+        raise CodecError(f"lattice {lattice.name}: {error}") from error
+
+
+def _floats(quantised: Quantised, lattice: Lattice) -> tuple[F32, F32]:
+    """Means (N, 3) and covariances (N, 6) as float32."""
+    L = _lengths(quantised.level, quantised.slope, lattice)
+    means, covariances = _means(L, quantised.step, lattice), _covariances(L)
+    axes, row = AXES[quantised.axis], np.arange(len(quantised))
+    mean_m, cov_m2 = np.zeros((len(row), 3), np.float32), np.zeros((len(row), 6), np.float32)
+    for i in range(3):
+        mean_m[row, axes[:, i]] = (means[i] * 2.0**-lattice.mean_bits).astype(np.float32)
+        for j in range(i + 1):
+            values = (covariances[i][j] * 2.0 ** (-2 * lattice.length_bits)).astype(np.float32)
+            cov_m2[row, _SIX[axes[:, i], axes[:, j]]] = values
+    return mean_m, cov_m2
+
+
+def snap(gaussians: Gaussians, lattice: Lattice) -> Gaussians:
+    """The Gaussians moved onto the lattice; what lies on it, and "nothing here" (count 0), stays to the bit."""
+    there = gaussians.exists
+    if not there.any():
+        return gaussians
+    some = gaussians if there.all() else gaussians.take(there)
+    off = np.flatnonzero(~_found(some, lattice)[1])
+    if len(off) == 0:
+        return gaussians
+    moved = dequantise(quantise(some.take(off), lattice), lattice)
+    columns = tuple(column.copy() for column in gaussians.columns)
+    at = np.flatnonzero(there)[off]
+    for column, new in zip(columns, moved.columns, strict=True):
+        column[at] = new
+    return Gaussians(*columns)
+
+
+def is_on(gaussians: Gaussians, lattice: Lattice) -> bool:
+    """Whether every Gaussian lies on the lattice (count 0 does not)."""
+    return bool(gaussians.exists.all() and _found(gaussians, lattice)[1].all())
+
+
+def integers_of(gaussians: Gaussians, lattice: Lattice) -> Quantised:
+    """The integers of Gaussians that lie on the lattice: `dequantise` gives them back to the bit.
+
+    Raises:
+        CodecError: some do not lie on it.
+    """
+    if not gaussians.exists.all():
+        raise CodecError(f"{int((~gaussians.exists).sum())} voxels hold no Gaussian: nothing to encode")
+    found, on = _found(gaussians, lattice)
+    if not on.all():
+        first = gaussians.voxel_id[np.flatnonzero(~on)[0]]
+        raise CodecError(
+            f"{int((~on).sum())} of {len(on)} Gaussians do not lie on the lattice {lattice.name}, first voxel {first}"
+        )
+    return found
+
+
+def quantise(gaussians: Gaussians, lattice: Lattice) -> Quantised:
+    """The nearest integers, tilt of the surface first; every count > 0."""
+    cov = gaussians.full_cov()
+    axis = _thin_axis(cov)
+    S = _permuted(cov, axis)
+    L11 = np.sqrt(np.maximum(S[0][0], _TINY))
+    L21 = S[1][0] / L11
+    L22 = np.sqrt(np.maximum(S[1][1] - L21**2, _TINY))
+    L31 = S[2][0] / L11
+    L32 = (S[2][1] - L31 * L21) / L22
+    L33 = np.sqrt(np.maximum(S[2][2] - L31**2 - L32**2, _TINY))
+    level = np.stack([_level(L11, lattice, True), _level(L22, lattice, True), _level(L33, lattice, False)], axis=1)
+    D = _diagonal(level, lattice)
+    # The regression of c on a and b is the surface's tilt: it is kept, whatever became of the standard deviations.
+    tilt_b = L32 / L22
+    tilt_a = (L31 - tilt_b * L21) / L11
+    s_ba = _rounded(L21 / L11 * D[0] / D[1] * 2**lattice.shear_bits, MAX_SLOPE)
+    L21q = s_ba * D[1] / 2**lattice.shear_bits
+    s_ca = _rounded((tilt_a * D[0] + tilt_b * L21q) / D[2] * 2**lattice.slope_bits, MAX_SLOPE)
+    s_cb = _rounded(tilt_b * D[1] / D[2] * 2**lattice.slope_bits, MAX_SLOPE)
+    slope = np.stack([s_ba, s_ca, s_cb], axis=1).astype(np.int32)
+    return _with_means(gaussians, axis, level, slope, lattice)
+
+
+_TINY: Final = 1e-12
+
+
+def _thin_axis(cov: F64) -> I32:
+    """(N,) axis of the largest diagonal entry of Sigma^-1: thinnest given the other two."""
+    cofactors = [
+        cov[:, (i + 1) % 3, (i + 1) % 3] * cov[:, (i + 2) % 3, (i + 2) % 3] - cov[:, (i + 1) % 3, (i + 2) % 3] ** 2
+        for i in range(3)
+    ]
+    return np.argmax(np.stack(cofactors, axis=1), axis=1).astype(np.int32)
+
+
+def _permuted(cov: F64, axis: I32) -> list[list[F64]]:
+    """Entries of Sigma in the order (a, b, c)."""
+    row, axes = np.arange(len(axis)), AXES[axis]
+    return [[cov[row, axes[:, i], axes[:, j]] for j in range(3)] for i in range(3)]
+
+
+def _level(sd_m: F64, lattice: Lattice, is_plane: bool) -> I32:
+    table = np.array(lattice.sd[:: lattice.plane_step if is_plane else 1], np.float64) * 2.0**-UNIT_BITS
+    between = np.sqrt(table[1:] * table[:-1])
+    return np.searchsorted(between, sd_m).astype(np.int32)
+
+
+def _diagonal(level: I32, lattice: Lattice) -> list[F64]:
+    """L_aa, L_bb, L_cc in metres."""
+    return [column * 2.0**-lattice.length_bits for column in _diagonal_units(level, lattice)]
+
+
+def _diagonal_units(level: I32, lattice: Lattice) -> list[I64]:
+    table = np.array(lattice.sd, np.int64) << (lattice.length_bits - UNIT_BITS)
+    return [table[level[:, 0] * lattice.plane_step], table[level[:, 1] * lattice.plane_step], table[level[:, 2]]]
+
+
+def _rounded(values: F64, limit: int) -> F64:
+    return np.clip(np.rint(values), -limit, limit)
+
+
+_Lower = tuple[I64, I64, I64, I64, I64, I64]  # L_aa, L_ba, L_bb, L_ca, L_cb, L_cc
+
+
+def _lengths(level: I32, slope: I32, lattice: Lattice) -> _Lower:
+    """L in integers of 2^-length_bits m."""
+    a, b, c = _diagonal_units(level, lattice)
+    s = slope.astype(np.int64)
+    return (
+        a,
+        s[:, 0] * b >> lattice.shear_bits,
+        b,
+        s[:, 1] * c >> lattice.slope_bits,
+        s[:, 2] * c >> lattice.slope_bits,
+        c,
+    )
+
+
+def _means(L: _Lower, step: I32, lattice: Lattice) -> tuple[I64, I64, I64]:
+    """L (m · step) in integers of 2^-mean_bits m."""
+    bits = lattice.mean_bits - lattice.length_bits
+    a, b = (step[:, i].astype(np.int64) << (bits - lattice.plane_bits) for i in (0, 1))
+    c = step[:, 2].astype(np.int64) << (bits - lattice.thin_bits)
+    return L[0] * a, L[1] * a + L[2] * b, L[3] * a + L[4] * b + L[5] * c
+
+
+def _covariances(L: _Lower) -> tuple[tuple[I64, ...], ...]:
+    """Lower triangle of L L^T in integers of 2^-(2 · length_bits) m²."""
+    aa, ba, bb, ca, cb, cc = L
+    return ((aa * aa,), (ba * aa, ba * ba + bb * bb), (ca * aa, ca * ba + cb * bb, ca * ca + cb * cb + cc * cc))
+
+
+def _with_means(gaussians: Gaussians, axis: I32, level: I32, slope: I32, lattice: Lattice) -> Quantised:
+    """Round the mean one whitened component after the other, each correcting for what the ones before lost."""
+    lower = [column * 2.0**-lattice.length_bits for column in _lengths(level, slope, lattice)]
+    row, axes = np.arange(len(axis)), AXES[axis]
+    mu = [gaussians.mean_m[row, axes[:, i]].astype(np.float64) for i in range(3)]
+    plane, thin = 2.0**-lattice.plane_bits, 2.0**-lattice.thin_bits
+    a = _rounded(mu[0] / lower[0] / plane, MAX_STEP)
+    b = _rounded((mu[1] - lower[1] * a * plane) / lower[2] / plane, MAX_STEP)
+    c = _rounded((mu[2] - (lower[3] * a + lower[4] * b) * plane) / lower[5] / thin, MAX_STEP)
+    step = np.stack([a, b, c], axis=1).astype(np.int32)
+    return Quantised(gaussians.voxel_id, axis, level, slope, step, _count_index(gaussians.count))
+
+
+def _count_index(count: I32) -> I32:
+    """Nearest number of points on the lattice; what suffices for a Gaussian (20) still does."""
+    between = np.sqrt((COUNTS[1:] * COUNTS[:-1]).astype(np.float64))
+    between[COUNTS[1:] == CELLS] = CELLS - 0.5
+    return np.searchsorted(between, count).astype(np.int32)
+
+
+def _found(gaussians: Gaussians, lattice: Lattice) -> tuple[Quantised, npt.NDArray[np.bool_]]:
+    """Integers of each Gaussian, and whether they give it back to the bit: each thin axis is tried."""
+    cov = gaussians.full_cov()
+    likely = _thin_axis(cov)
+    found = _read_off(gaussians, cov, likely, lattice)
+    on = _gives_back(found, gaussians, lattice)
+    for turn in (1, 2):
+        rows = np.flatnonzero(~on)
+        if len(rows) == 0:
+            break
+        some = gaussians.take(rows)
+        other = _read_off(some, cov[rows], ((likely[rows] + turn) % 3).astype(np.int32), lattice)
+        right = _gives_back(other, some, lattice)
+        for field in fields(found):
+            getattr(found, field.name)[rows[right]] = getattr(other, field.name)[right]
+        on[rows] = right
+    return found, on
+
+
+def _read_off(gaussians: Gaussians, cov: F64, axis: I32, lattice: Lattice) -> Quantised:
+    """The integers, taken that the Gaussians lie on the lattice with these thin axes.
+
+    Unlike `quantise` it divides by the lattice's own standard deviations, so that only the rounding to float32 errs.
+    """
+    S = _permuted(cov, axis)
+    level = np.zeros((len(axis), 3), np.int32)
+    level[:, 0] = _level(np.sqrt(np.maximum(S[0][0], _TINY)), lattice, True)
+    D1 = _diagonal(level, lattice)[0]
+    L21 = S[1][0] / D1
+    level[:, 1] = _level(np.sqrt(np.maximum(S[1][1] - L21**2, _TINY)), lattice, True)
+    D2 = _diagonal(level, lattice)[1]
+    s_ba = _rounded(L21 / D2 * 2**lattice.shear_bits, MAX_SLOPE)
+    L21 = s_ba * D2 / 2**lattice.shear_bits
+    L31 = S[2][0] / D1
+    L32 = (S[2][1] - L31 * L21) / D2
+    level[:, 2] = _level(np.sqrt(np.maximum(S[2][2] - L31**2 - L32**2, _TINY)), lattice, False)
+    D3 = _diagonal(level, lattice)[2]
+    s_ca, s_cb = (_rounded(x / D3 * 2**lattice.slope_bits, MAX_SLOPE) for x in (L31, L32))
+    slope = np.stack([s_ba, s_ca, s_cb], axis=1).astype(np.int32)
+    return _with_means(gaussians, axis, level, slope, lattice)
+
+
+def _gives_back(quantised: Quantised, gaussians: Gaussians, lattice: Lattice) -> npt.NDArray[np.bool_]:
+    """(N,) whether `dequantise` gives the same bits."""
+    mean_m, cov_m2 = _floats(quantised, lattice)
+    count = COUNTS[quantised.count]
+    same = (count == gaussians.count) & (np.minimum(count, CELLS) == gaussians.cells)
+    same &= (mean_m == gaussians.mean_m).all(axis=1) & (cov_m2 == gaussians.cov_m2).all(axis=1)
+    return np.asarray(same)

@@ -1,0 +1,85 @@
+"""The codecs by their ids. A codec id never changes its meaning; clients say which ids they read."""
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from types import MappingProxyType
+
+from gnd_map.codec.floats import CODEC_FLOAT32, decode_gaussians, encode_gaussians
+from gnd_map.codec.lattice import ARCHIVE, COMPACT, STANDARD, Lattice, is_on
+from gnd_map.codec.range_tile import decode_tile, encode_tile
+from gnd_map.errors import CodecError
+from gnd_map.gaussian import Gaussians
+from gnd_map.tile_id import TileId
+
+CODEC_FLOAT32_ZSTD = 1
+CODEC_ARCHIVE, CODEC_STANDARD, CODEC_COMPACT = 2, 3, 4
+CODEC_ARCHIVE_ZSTD, CODEC_STANDARD_ZSTD, CODEC_COMPACT_ZSTD = 5, 6, 7
+
+Encode = Callable[[TileId, Gaussians], bytes]
+Decode = Callable[[TileId, bytes], Gaussians]
+
+
+@dataclass(frozen=True, slots=True)
+class Codec:
+    """One way to write the Gaussians of a tile as bytes, without loss of what it can express."""
+
+    codec_id: int
+    """Number on the wire, never reused."""
+    name: str
+    """For messages and tables."""
+    encode: Encode
+    """Gaussians of a tile to bytes; raises CodecError where it cannot express them."""
+    decode: Decode
+    """Bytes to Gaussians; raises CodecError."""
+    lattice: Lattice | None = None
+    """Where its Gaussians lie; None = anywhere."""
+
+
+def _range_codec(codec_id: int, lattice: Lattice) -> Codec:
+    def encode(tile_id: TileId, gaussians: Gaussians) -> bytes:
+        return encode_tile(tile_id, gaussians, lattice)
+
+    def decode(tile_id: TileId, body: bytes) -> Gaussians:
+        return decode_tile(tile_id, body, lattice)
+
+    return Codec(codec_id, f"{lattice.name}, range coded", encode, decode, lattice)
+
+
+_ALL = (
+    Codec(CODEC_FLOAT32, "float32 columns", lambda _, g: encode_gaussians(g), lambda _, body: decode_gaussians(body)),
+    _range_codec(CODEC_ARCHIVE, ARCHIVE),
+    _range_codec(CODEC_STANDARD, STANDARD),
+    _range_codec(CODEC_COMPACT, COMPACT),
+)
+CODECS: Mapping[int, Codec] = MappingProxyType({codec.codec_id: codec for codec in _ALL})
+PREFERRED = tuple(sorted(CODECS, key=lambda i: (i not in (CODEC_COMPACT, CODEC_STANDARD, CODEC_ARCHIVE), -i)))
+"""All ids that this program reads, smallest bodies first."""
+
+
+def codec_of(codec_id: int) -> Codec:
+    """The codec with this id.
+
+    Raises:
+        CodecError: there is none; the message lists those there are.
+    """
+    if codec_id not in CODECS:
+        raise CodecError(f"codec {codec_id} is unknown; known: {', '.join(map(str, CODECS))}")
+    return CODECS[codec_id]
+
+
+def lattice_of(codec_id: int) -> Lattice | None:
+    """The lattice on which the Gaussians of this codec lie; None = anywhere. CodecError for an unknown id."""
+    return codec_of(codec_id).lattice
+
+
+def best_codec(gaussians: Gaussians, known: Sequence[int] = PREFERRED) -> int:
+    """The first id of `known` that can express the Gaussians.
+
+    Raises:
+        CodecError: none of them can.
+    """
+    for codec_id in known:
+        codec = CODECS.get(codec_id)
+        if codec is not None and (codec.lattice is None or is_on(gaussians, codec.lattice)):
+            return codec_id
+    raise CodecError(f"none of the codecs {', '.join(map(str, known))} can express these {len(gaussians)} Gaussians")
