@@ -7,11 +7,17 @@ from types import MappingProxyType
 from gnd_map.codec.floats import CODEC_FLOAT32, decode_gaussians, encode_gaussians
 from gnd_map.codec.lattice import ARCHIVE, COMPACT, STANDARD, Lattice, is_on
 from gnd_map.codec.range_tile import decode_tile, encode_tile
+from gnd_map.codec.zstd_columns import (
+    CODEC_FLOAT32_ZSTD,
+    decode_float_columns,
+    decode_lattice_columns,
+    encode_float_columns,
+    encode_lattice_columns,
+)
 from gnd_map.errors import CodecError
 from gnd_map.gaussian import Gaussians
 from gnd_map.tile_id import TileId
 
-CODEC_FLOAT32_ZSTD = 1
 CODEC_ARCHIVE, CODEC_STANDARD, CODEC_COMPACT = 2, 3, 4
 CODEC_ARCHIVE_ZSTD, CODEC_STANDARD_ZSTD, CODEC_COMPACT_ZSTD = 5, 6, 7
 
@@ -45,11 +51,25 @@ def _range_codec(codec_id: int, lattice: Lattice) -> Codec:
     return Codec(codec_id, f"{lattice.name}, range coded", encode, decode, lattice)
 
 
+def _zstd_codec(codec_id: int, lattice: Lattice) -> Codec:
+    def encode(tile_id: TileId, gaussians: Gaussians) -> bytes:
+        return encode_lattice_columns(codec_id, lattice, tile_id, gaussians)
+
+    def decode(tile_id: TileId, body: bytes) -> Gaussians:
+        return decode_lattice_columns(codec_id, lattice, tile_id, body)
+
+    return Codec(codec_id, f"{lattice.name}, columns, Zstandard", encode, decode, lattice)
+
+
 _ALL = (
     Codec(CODEC_FLOAT32, "float32 columns", lambda _, g: encode_gaussians(g), lambda _, body: decode_gaussians(body)),
+    Codec(CODEC_FLOAT32_ZSTD, "float32 columns, Zstandard", encode_float_columns, decode_float_columns),
     _range_codec(CODEC_ARCHIVE, ARCHIVE),
     _range_codec(CODEC_STANDARD, STANDARD),
     _range_codec(CODEC_COMPACT, COMPACT),
+    _zstd_codec(CODEC_ARCHIVE_ZSTD, ARCHIVE),
+    _zstd_codec(CODEC_STANDARD_ZSTD, STANDARD),
+    _zstd_codec(CODEC_COMPACT_ZSTD, COMPACT),
 )
 CODECS: Mapping[int, Codec] = MappingProxyType({codec.codec_id: codec for codec in _ALL})
 PREFERRED = tuple(sorted(CODECS, key=lambda i: (i not in (CODEC_COMPACT, CODEC_STANDARD, CODEC_ARCHIVE), -i)))
