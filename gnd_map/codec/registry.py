@@ -8,7 +8,6 @@ from gnd_map.codec.floats import CODEC_FLOAT32, decode_gaussians, encode_gaussia
 from gnd_map.codec.lattice import ARCHIVE, COMPACT, STANDARD, Lattice, is_on
 from gnd_map.codec.range_tile import decode_tile, encode_tile
 from gnd_map.codec.zstd_columns import (
-    CODEC_FLOAT32_ZSTD,
     decode_float_columns,
     decode_lattice_columns,
     encode_float_columns,
@@ -18,6 +17,7 @@ from gnd_map.errors import CodecError
 from gnd_map.gaussian import Gaussians
 from gnd_map.tile_id import TileId
 
+CODEC_FLOAT32_ZSTD = 1
 CODEC_ARCHIVE, CODEC_STANDARD, CODEC_COMPACT = 2, 3, 4
 CODEC_ARCHIVE_ZSTD, CODEC_STANDARD_ZSTD, CODEC_COMPACT_ZSTD = 5, 6, 7
 

@@ -27,7 +27,7 @@ from gnd_map.gaussian import Gaussians
 from gnd_map.tile_id import TileId
 
 U8 = npt.NDArray[np.uint8]
-CODEC_FLOAT32_ZSTD: Final = 1
+_FLOAT32_ZSTD: Final = 1
 LEVEL: Final = 9
 """Of compression: higher ones save 4 % for four times the time."""
 MAX_WINDOW_BYTES: Final = 1 << 24
@@ -44,7 +44,7 @@ def encode_float_columns(tile_id: TileId, gaussians: Gaussians) -> bytes:
     """
     floats = np.hstack([gaussians.mean_m, gaussians.cov_m2]) + np.float32(0.0)  # + 0.0 turns -0.0 into 0.0
     columns = [_steps_of(gaussians.voxel_id), gaussians.count, gaussians.cells, *floats.T]
-    return _sealed(CODEC_FLOAT32_ZSTD, tile_id, len(gaussians), _planes(columns, _FLOAT_WIDTHS))
+    return _sealed(_FLOAT32_ZSTD, tile_id, len(gaussians), _planes(columns, _FLOAT_WIDTHS))
 
 
 def decode_float_columns(tile_id: TileId, body: bytes) -> Gaussians:
@@ -53,12 +53,12 @@ def decode_float_columns(tile_id: TileId, body: bytes) -> Gaussians:
     Raises:
         CodecError: damaged, truncated, too long, of another tile or codec, or values that are no Gaussians.
     """
-    columns = _columns(*_opened(CODEC_FLOAT32_ZSTD, tile_id, body, _FLOAT_WIDTHS), _FLOAT_WIDTHS)
-    ints = [column.view(np.int32) for column in columns[1:3]]
+    columns = _columns(*_opened(_FLOAT32_ZSTD, tile_id, body, _FLOAT_WIDTHS), _FLOAT_WIDTHS)
+    count, cells = (column.view(np.int32) for column in columns[1:3])
     floats = np.stack([column.view(np.float32) for column in columns[3:]], axis=1)
     mean_m, cov_m2 = np.ascontiguousarray(floats[:, :3]), np.ascontiguousarray(floats[:, 3:])
     try:
-        return Gaussians(_ids_of(columns[0]), *ints, mean_m, cov_m2)
+        return Gaussians(_ids_of(columns[0]), count, cells, mean_m, cov_m2)
     except ShapeError as error:
         raise CodecError(f"float columns of tile {tile_id}: {error}") from error
 
@@ -117,7 +117,7 @@ def _opened(codec_id: int, tile_id: TileId, body: bytes, widths: Sequence[int]) 
     found = _checksum(codec_id, tile_id, n, frame)
     if found != checksum:
         raise CodecError(
-            f"codec {codec_id}, tile {tile_id}: checksum {found:08x}, expected {checksum:08x}: damaged or of another tile"
+            f"codec {codec_id}: checksum {found:08x}, expected {checksum:08x}: damaged, or not of tile {tile_id}"
         )
     return n, _decompressed(frame, n * sum(widths))
 
