@@ -33,6 +33,10 @@ class LinkProfile:
         rate_source: where the rates come from (publisher, year), or that they are assumed.
         delay_source: the same for the delay.
         loss_source: the same for the loss.
+        jitter_ms: the one-way delay of a packet varies evenly by as much as this to either side, ms. A network that is
+            really shaped (`gnd lab`) does so; the in-process pacer keeps to the mean.
+        jitter_source: where the jitter comes from.
+        paced: whether the session's own pacer imitates the link; not where the network itself is shaped (`gnd lab`).
     """
 
     name: str
@@ -47,12 +51,19 @@ class LinkProfile:
     rate_source: str = ""
     delay_source: str = ""
     loss_source: str = ""
+    jitter_ms: float = 0.0
+    jitter_source: str = ""
+    paced: bool = True
 
     def __post_init__(self) -> None:
         if not (self.down_bit_s > 0 and self.up_bit_s > 0):
             raise LinkError(f"link {self.name}: rates must be positive, got {self.down_bit_s}/{self.up_bit_s} bit/s")
         if not (self.delay_ms >= 0 and math.isfinite(self.delay_ms)):
             raise LinkError(f"link {self.name}: delay_ms must be 0 or more, got {self.delay_ms}")
+        if not 0 <= self.jitter_ms <= self.delay_ms:
+            raise LinkError(
+                f"link {self.name}: jitter_ms must be in 0 … delay_ms ({self.delay_ms}), got {self.jitter_ms}"
+            )
         if not 0 <= self.loss < 1:
             raise LinkError(f"link {self.name}: loss must be in [0, 1), got {self.loss}")
         if not 512 <= self.batch_bytes <= 65_535:
@@ -68,6 +79,9 @@ class LinkProfile:
     @property
     def is_unlimited(self) -> bool:
         """Whether nothing has to be paced on this link."""
+        return not self.paced or self._has_no_limits()
+
+    def _has_no_limits(self) -> bool:
         return math.isinf(self.down_bit_s) and math.isinf(self.up_bit_s) and self.delay_ms == 0 and self.loss == 0
 
     def rate_byte_s(self, direction: str) -> float:

@@ -3,6 +3,7 @@
 import math
 import threading
 import time
+from dataclasses import replace
 
 import pytest
 from bus_testing import Inbox, wait_for
@@ -19,7 +20,7 @@ from fleet_bus.pacer import MESSAGE_OVERHEAD_BYTES, Bucket, Pacer
 def test_each_profile_says_where_its_figures_come_from(name):
     link = load_link(name)
     assert link.name == name
-    for source in (link.rate_source, link.delay_source, link.loss_source):
+    for source in (link.rate_source, link.delay_source, link.jitter_source, link.loss_source):
         assert source.startswith(("quoted: ", "assumed: "))
     assert math.isfinite(link.down_bit_s)
     assert link.down_bit_s > link.up_bit_s > 0
@@ -36,6 +37,13 @@ def test_none_is_no_limit():
     assert load_link("none") is UNLIMITED
     assert UNLIMITED.is_unlimited
     assert load_link(UNLIMITED) is UNLIMITED
+
+
+def test_a_link_that_the_network_shapes_keeps_its_figures_but_is_not_paced():
+    shaped = replace(load_link("3g"), paced=False)
+    assert shaped.is_unlimited
+    assert shaped.rate_byte_s("up") == load_link("3g").rate_byte_s("up")
+    assert not load_link("3g").is_unlimited
 
 
 def test_a_file_of_ones_own(tmp_path):
@@ -55,6 +63,7 @@ def test_a_file_of_ones_own(tmp_path):
         ("[x]\ndown_bit_s = 0", "rates must be positive, got 0"),
         ("[x]\nloss = 1.5", r"loss must be in \[0, 1\), got 1.5"),
         ("[x]\ndelay_ms = -1", "delay_ms must be 0 or more"),
+        ("[x]\ndelay_ms = 3\njitter_ms = 4", r"jitter_ms must be in 0 … delay_ms \(3"),
         ("[x]\nbatch_bytes = 70000", "batch_bytes must be in 512 … 65535, got 70000"),
         ("[x]\nlease_ms = 1", "lease below 100 ms"),
         ("[x]\ndown = 1", "unknown key down"),
