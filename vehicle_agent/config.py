@@ -2,6 +2,7 @@
 
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Literal
 
 from fleet_bus.config import DEFAULT_ENDPOINT
 from fleet_bus.links import LinkProfile
@@ -44,14 +45,21 @@ class ReportParameters:
 
     left_behind_m: float = 60.0
     """A tile farther from the vehicle gets no more evidence: its classes are decided."""
-    longest_m: float = 300.0
+    longest_m: float = 1000.0
     """A district's changes are reported at the latest after this much way."""
+    protocol: Literal["packed", "full"] = "packed"
+    """How reports are sent: in short (flags and track first, then the Gaussians asked for), or at once and whole."""
     max_sigma_m: float = 0.15
     """Scans whose refined position is less certain (in its worst direction) are no evidence."""
     max_sigma_rad: float = 0.02
     """The same for the attitude: about its worst axis, 40 cm at 20 m."""
     drain_s: float = 120.0
     """At the end of a drive the agent waits this long for its reports to be acknowledged."""
+
+    def __post_init__(self) -> None:
+        """A protocol that there is."""
+        if self.protocol not in ("packed", "full"):
+            raise AgentConfigError(f"protocol = {self.protocol!r}: there are 'packed' and 'full'")
 
 
 @dataclass(frozen=True, slots=True)

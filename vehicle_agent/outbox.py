@@ -3,11 +3,20 @@
 States of a report: `pending` -> `stored` | `duplicate` (acknowledged) or `quarantined` (refused by name, kept for
 people to look at). A restarted agent makes the same report ids again; whatever is in the outbox already keeps its first
 body, and what was acknowledged is not sent again (promise 1 of the design).
+
+Beside the whole report lies its first half in short, and the base tiles without which the second half cannot be made:
+they stay as long as a pending report needs them, whatever becomes of the cache.
 """
 
+from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
 
+from gnd_map.codec import CODEC_FLOAT32_ZSTD, CODEC_STANDARD_ZSTD, best_codec, codec_of
+from gnd_map.errors import GndError
+from gnd_map.gaussian import Gaussians
+from gnd_map.tile import Tile, content_sha
+from gnd_map.tile_id import TileId
 from vehicle_agent.errors import OutboxError
 from vehicle_agent.sqlite import Database
 
@@ -22,7 +31,31 @@ CREATE TABLE IF NOT EXISTS report (
     next_ns   INTEGER NOT NULL
 ) STRICT, WITHOUT ROWID;
 CREATE INDEX IF NOT EXISTS report_pending ON report (next_ns) WHERE state = 'pending';
+CREATE TABLE IF NOT EXISTS packed (
+    report_id TEXT PRIMARY KEY,
+    body      BLOB NOT NULL
+) STRICT, WITHOUT ROWID;
+CREATE TABLE IF NOT EXISTS base (
+    sha      BLOB PRIMARY KEY,
+    morton   INTEGER NOT NULL,
+    codec_id INTEGER NOT NULL,
+    body     BLOB NOT NULL
+) STRICT, WITHOUT ROWID;
+CREATE TABLE IF NOT EXISTS needs (
+    report_id TEXT NOT NULL,
+    sha       BLOB NOT NULL,
+    PRIMARY KEY (report_id, sha)
+) STRICT, WITHOUT ROWID;
+CREATE INDEX IF NOT EXISTS needs_sha ON needs (sha);
 """
+# What a report in short needed goes with its answer; a base goes with the last report that needs it.
+_FORGET = (
+    "DELETE FROM packed WHERE report_id = ?",
+    "DELETE FROM base WHERE sha IN (SELECT sha FROM needs WHERE report_id = ?1)"
+    " AND NOT EXISTS (SELECT 1 FROM needs WHERE needs.sha = base.sha AND needs.report_id <> ?1)",
+    "DELETE FROM needs WHERE report_id = ?",
+)
+_CODECS = (CODEC_STANDARD_ZSTD, CODEC_FLOAT32_ZSTD)  # quick, and the second can say anything
 ANSWERS = ("stored", "duplicate", "quarantined")
 FIRST_WAIT_S, LONGEST_WAIT_S = 0.5, 15.0
 
@@ -35,6 +68,8 @@ class Letter:
     key: str
     body: bytes
     attempts: int
+    packed: bytes = b""
+    """The report's first half in short; empty: it is sent whole."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -57,16 +92,38 @@ class Outbox:
     def __init__(self, path: Path) -> None:
         self._db = Database(path, SCHEMA, synchronous="FULL", error=OutboxError)
 
-    def put(self, report_id: str, key: str, body: bytes) -> bool:
-        """Make a report durable; False when its id is known already (the first body stays)."""
-        sql = "INSERT OR IGNORE INTO report VALUES (?, ?, ?, 'pending', '', 0, 0)"
-        return self._db.changes(sql, (report_id, key, body)) == 1
+    def put(self, report_id: str, key: str, body: bytes, packed: bytes = b"", bases: Iterable[Tile] = ()) -> bool:
+        """Make a report durable; False when its id is known already (the first body stays).
+
+        Args:
+            report_id: ULID.
+            key: where it goes.
+            body: the whole report.
+            packed: its first half in short; empty: it is only ever sent whole.
+            bases: the tiles that its second half is coded against.
+        """
+        tiles = [_row(tile) for tile in bases]
+        with self._db.transaction() as c:
+            c.execute("INSERT OR IGNORE INTO report VALUES (?, ?, ?, 'pending', '', 0, 0)", (report_id, key, body))
+            if not c.changes():
+                return False
+            if packed:
+                c.execute("INSERT INTO packed VALUES (?, ?)", (report_id, packed))
+            c.executemany("INSERT OR IGNORE INTO base VALUES (?, ?, ?, ?)", tiles)
+            c.executemany("INSERT INTO needs VALUES (?, ?)", [(report_id, sha) for sha, *_ in tiles])
+        return True
+
+    def bases_of(self, report_id: str) -> dict[bytes, Gaussians]:
+        """The base tiles of a pending report by content hash; one that is damaged on the disk is left out."""
+        sql = "SELECT sha, morton, codec_id, body FROM base WHERE sha IN (SELECT sha FROM needs WHERE report_id = ?)"
+        found = ((bytes(sha), _gaussians(*row)) for sha, *row in self._db.run(sql, (report_id,)))
+        return {sha: g for sha, (tile, g) in found if g is not None and content_sha(tile, g) == sha}
 
     def due(self, now_ns: int, limit: int = 8) -> list[Letter]:
         """Pending reports whose waiting time is over, the oldest id first."""
         sql = (
-            "SELECT report_id, key, body, attempts FROM report"
-            " WHERE state = 'pending' AND next_ns <= ? ORDER BY report_id LIMIT ?"
+            "SELECT report_id, key, report.body, attempts, coalesce(packed.body, x'') FROM report"
+            " LEFT JOIN packed USING (report_id) WHERE state = 'pending' AND next_ns <= ? ORDER BY report_id LIMIT ?"
         )
         return [Letter(*row) for row in self._db.run(sql, (now_ns, limit))]
 
@@ -74,7 +131,10 @@ class Outbox:
         """Record an acknowledgement (`stored`, `duplicate`) or a refusal (`quarantined` with its reason)."""
         if status not in ANSWERS:
             raise OutboxError(f"report {report_id}: unknown answer {status!r}, expected one of {', '.join(ANSWERS)}")
-        self._db.run("UPDATE report SET state = ?, reason = ? WHERE report_id = ?", (status, reason, report_id))
+        with self._db.transaction() as c:
+            c.execute("UPDATE report SET state = ?, reason = ? WHERE report_id = ?", (status, reason, report_id))
+            for sql in _FORGET:
+                c.execute(sql, (report_id,))
 
     def failed(self, letter: Letter, now_ns: int, reason: str) -> int:
         """Record a failed attempt; returns when to try again (ns): 0.5 s doubled each time, at most 15 s."""
@@ -107,3 +167,16 @@ class Outbox:
     def close(self) -> None:
         """Close the file."""
         self._db.close()
+
+
+def _row(tile: Tile) -> tuple[bytes, int, int, bytes]:
+    codec_id = best_codec(tile.gaussians, _CODECS)
+    return tile.sha, tile.tile_id.morton, codec_id, codec_of(codec_id).encode(tile.tile_id, tile.gaussians)
+
+
+def _gaussians(morton: int, codec_id: int, body: bytes) -> tuple[TileId, Gaussians | None]:
+    tile = TileId(morton)
+    try:
+        return tile, codec_of(codec_id).decode(tile, body)
+    except GndError:
+        return tile, None

@@ -46,7 +46,9 @@ def pack(report: ChangeReport, bases: Bases, track: Track) -> PackedReport:
         software=report.software,
         first_ns=report.first_ns,
         length_ns=report.last_ns - report.first_ns,
-        tiles=tuple((change.tile.morton - report.district.first_morton, change.base_version) for change in report.tiles),
+        tiles=tuple(
+            (change.tile.morton - report.district.first_morton, change.base_version) for change in report.tiles
+        ),
         base_digest=digest_of(change.base_sha for change in report.tiles),
         flags=encode_flags([_flags(change, bases) for change in report.tiles]),
         track=encode_track(track),
@@ -73,9 +75,7 @@ def askable(report: ChangeReport) -> int:
     return sum(int(is_measured(change).sum()) for change in report.tiles)
 
 
-def asked_for(
-    report: ChangeReport, bases: Bases, mask: NDArray[np.bool_]
-) -> list[tuple[TileId, Gaussians, Gaussians]]:
+def asked_for(report: ChangeReport, bases: Bases, mask: NDArray[np.bool_]) -> list[tuple[TileId, Gaussians, Gaussians]]:
     """(tile, its base, the Gaussians that are asked for) of each tile of which something is.
 
     Args:
@@ -110,7 +110,9 @@ def base_of(change: TileChange, bases: Bases) -> Gaussians:
     if not change.base_sha:
         return Gaussians.empty()
     if change.base_sha not in bases:
-        raise PackingError(f"tile {change.tile}: its base {change.base_sha.hex()[:16]}… is not among {len(bases)} bases")
+        raise PackingError(
+            f"tile {change.tile}: its base {change.base_sha.hex()[:16]}… is not among {len(bases)} bases"
+        )
     return bases[change.base_sha]
 
 

@@ -3,13 +3,16 @@
 import logging
 from collections import Counter
 from collections.abc import Collection
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from importlib.metadata import version
 
 import numpy as np
 
 from gnd_map.arrays import F64
 from gnd_map.classes import ChangeClass
+from gnd_map.codec import LATTICES, snap
+from gnd_map.errors import GndError
+from gnd_map.tile import Tile
 from gnd_map.tile_id import District, TileId
 from schemas.changes import ChangeReport, TileChange
 from schemas.keys import change_key
@@ -20,8 +23,10 @@ from vehicle_agent.detect.detector import ChangeDetector
 from vehicle_agent.detect.uncertainty import PoseUncertainty
 from vehicle_agent.localise.estimates import PoseEstimate
 from vehicle_agent.outbox import Outbox
+from vehicle_agent.packing import is_measured, pack
 from vehicle_agent.segment.segmenter import SegmentedScan
 from vehicle_agent.surroundings import left_behind
+from vehicle_agent.tracks import Tracks
 
 STEP_M = 3.0  # tiles left behind are looked for after this much way
 
@@ -53,13 +58,15 @@ class _Pending:
 
     since_m: float
     changes: dict[TileId, TileChange] = field(default_factory=dict)
+    bases: dict[TileId, Tile] = field(default_factory=dict)
 
 
 class Reporter:
     """Feeds refined scans to the detector, decides the tiles left behind and puts a report a district into the outbox.
 
     Report ids are made of vehicle, drive, district and the report's number in it, so a restarted agent, which drives
-    its recording again, makes the same ids.
+    its recording again, makes the same ids. New Gaussians are moved onto the lattice that they travel on, so that the
+    short form of a report and the whole one say the same, to the bit.
     """
 
     def __init__(
@@ -73,6 +80,7 @@ class Reporter:
         self._numbers: Counter[District] = Counter()
         self._stretch: _Stretch | None = None
         self._looked_at: F64 | None = None
+        self._tracks = Tracks(detector.local_map.grid_frame.frame)
 
     def add_scan(self, segmented: SegmentedScan) -> None:
         """Count the scan's rays, if its pose is good enough to speak about the world."""
@@ -86,6 +94,7 @@ class Reporter:
         self.counts["moving_points"] += int(segmented.moving.sum())
         self.counts["rays"] += self._detector.add_scan(scan.points_map_m, scan.origins_map_m, segmented.moving, pose)
         self._lengthen(scan.t_ns)
+        self._tracks.add_scan(scan)
 
     def leave_behind(self, estimate: PoseEstimate, odometer_m: float) -> None:
         """Decide the tiles that the refined pose has left, report the districts that have none left to decide."""
@@ -94,6 +103,7 @@ class Reporter:
             return
         self._looked_at = p_map.copy()
         touched = self._detector.touched_tiles()
+        self._tracks.touched(touched)
         left = left_behind(frame, touched, p_map, self._parameters.left_behind_m)
         self._decide(left, odometer_m)
         open_districts = {t.district for t in set(touched) - set(left)}
@@ -122,12 +132,12 @@ class Reporter:
                 self.classes[name.lower()] += int(n)
             if not found.observed.any():
                 continue
-            change = tile_change(found)
+            change = on_lattice(tile_change(found))
             pending = self._pending.setdefault(tile_id.district, _Pending(odometer_m))
             if tile_id in pending.changes:  # the vehicle came back: one statement a tile and report
                 self._report(tile_id.district)
                 pending = self._pending.setdefault(tile_id.district, _Pending(odometer_m))
-            pending.changes[tile_id] = change
+            pending.changes[tile_id], pending.bases[tile_id] = change, evidence.base
 
     def _report(self, district: District) -> None:
         pending, stretch = self._pending.pop(district), self._stretch
@@ -135,12 +145,27 @@ class Reporter:
             return
         report = self._make(district, pending, stretch)
         self._numbers[district] += 1
-        if self._outbox.put(report.report_id, change_key(report.layer, district), report.encode()):
+        packed = self._packed(report, pending)
+        needed = [pending.bases[c.tile] for c in report.tiles if c.base_sha and is_measured(c).any()] if packed else []
+        if self._outbox.put(report.report_id, change_key(report.layer, district), report.encode(), packed, needed):
             self.counts["reports"] += 1
             self.counts["changed_voxels"] += sum(len(change.changed) for change in report.tiles)
         else:
             self.counts["reports_known"] += 1  # this agent was restarted: its first statement stands
         _log.info("report %s: %d tiles of district %s", report.report_id, len(report.tiles), district)
+
+    def _packed(self, report: ChangeReport, pending: _Pending) -> bytes:
+        """The report's first half in short; empty where it can only be sent whole."""
+        try:
+            track = self._tracks.take(report.district, pending.changes)
+            if self._parameters.protocol == "full":
+                return b""
+            bases = {c.base_sha: pending.bases[c.tile].gaussians for c in report.tiles if c.base_sha}
+            return pack(report, bases, track).encode()
+        except GndError as error:
+            self.counts["reports_not_packed"] += 1
+            _log.warning("report %s can only be sent whole: %s", report.report_id, error)
+            return b""
 
     def _make(self, district: District, pending: _Pending, stretch: _Stretch) -> ChangeReport:
         who, number = self._who, str(self._numbers[district])
@@ -158,3 +183,8 @@ class Reporter:
             tiles=tuple(change for _, change in sorted(pending.changes.items())),
             layer=who.layer,
         )
+
+
+def on_lattice(change: TileChange) -> TileChange:
+    """The change with its new Gaussians on the lattice "compact"."""
+    return replace(change, changed=snap(change.changed, LATTICES["compact"]))

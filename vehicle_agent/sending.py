@@ -1,4 +1,9 @@
-"""The thread that empties the outbox: each report is sent until somebody acknowledges it."""
+"""The thread that empties the outbox: each report is sent until somebody acknowledges it.
+
+A report in short goes in two messages: its flags, and then the Gaussians that the answer asks for. Where the cloud
+cannot make sense of the short form, for whatever reason, the whole report follows: only what is refused whole is
+refused.
+"""
 
 import logging
 import threading
@@ -6,12 +11,18 @@ import time
 
 from fleet_bus.bus import Bus
 from fleet_bus.errors import BusClosed, MessageTooLarge, RequestRefused
-from schemas.changes import ChangeAck
+from gnd_map.errors import CodecError
+from schemas.changes import ChangeAck, ChangeReport
 from schemas.errors import SchemaError
-from vehicle_agent.outbox import Letter, Outbox
+from vehicle_agent.errors import PackingError
+from vehicle_agent.outbox import ANSWERS, Letter, Outbox
+from vehicle_agent.packing import pack_measured
 
 POLL_S = 0.2
 REQUEST_S = 20.0
+SHORT_TRIES = 2  # flags again, when another shard that has not heard them was asked to take their Gaussians
+
+ACKNOWLEDGED = ("stored", "duplicate")
 
 _log = logging.getLogger(__name__)
 
@@ -52,8 +63,7 @@ class SenderThread:
 
     def _send(self, letter: Letter) -> None:
         try:
-            answer = self._bus.request(letter.key, letter.body, kind="change", timeout_s=REQUEST_S)
-            self._record(letter, ChangeAck.decode(answer))
+            self._record(letter, self._in_short(letter) or self._ask(letter, letter.body))
         except BusClosed:
             self._stop.set()
         except (RequestRefused, MessageTooLarge) as error:
@@ -63,8 +73,38 @@ class SenderThread:
             self.last_error = str(error)
             _log.warning("report %s not acknowledged: %s", letter.report_id, error)
 
+    def _in_short(self, letter: Letter) -> ChangeAck | None:
+        """The acknowledgement of a report sent in short; None: it is to be sent whole."""
+        if not letter.packed:
+            return None
+        try:
+            for _ in range(SHORT_TRIES):
+                answers = self._two_halves(letter)
+                if answers[-1].status in ACKNOWLEDGED:
+                    return answers[-1]
+                if len(answers) == 1 or answers[-1].status != "resend":
+                    break
+            reason = f"{answers[-1].status} {answers[-1].reason}"
+        except (RequestRefused, MessageTooLarge, CodecError, SchemaError, PackingError) as error:
+            reason = str(error)
+        _log.warning("report %s goes whole: %s", letter.report_id, reason)
+        return None
+
+    def _two_halves(self, letter: Letter) -> list[ChangeAck]:
+        """The answer to the flags, and where that asks for Gaussians the answer to these."""
+        ack = self._ask(letter, letter.packed)
+        if ack.status != "wanted":
+            return [ack]
+        report, bases = ChangeReport.decode(letter.body), self._outbox.bases_of(letter.report_id)
+        return [ack, self._ask(letter, pack_measured(report, bases, ack.wanted).encode())]
+
+    def _ask(self, letter: Letter, payload: bytes) -> ChangeAck:
+        return ChangeAck.decode(self._bus.request(letter.key, payload, kind="change", timeout_s=REQUEST_S))
+
     def _record(self, letter: Letter, ack: ChangeAck) -> None:
-        """An acknowledgement counts for its own report only."""
+        """An acknowledgement counts for its own report only, and a whole report has nothing left to ask for."""
+        if ack.status not in ANSWERS:
+            raise SchemaError(f"report {letter.report_id} was sent whole and answered {ack.status!r}")
         if ack.status != "quarantined" and ack.report_id != letter.report_id:
             raise SchemaError(f"report {letter.report_id} was answered for report {ack.report_id}")
         self._outbox.answered(letter.report_id, ack.status, ack.reason)

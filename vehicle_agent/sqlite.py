@@ -1,6 +1,7 @@
 """One SQLite file of the vehicle: opened with checked settings, guarded by one lock."""
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 from threading import Lock
 from typing import Any, Literal
@@ -42,6 +43,15 @@ class Database:
         try:
             with self._lock, self._connection:
                 self._connection.executemany(sql, rows)
+        except (apsw.Error, OSError) as cause:
+            raise self._error(f"{self._what}: {cause}") from cause
+
+    @contextmanager
+    def transaction(self) -> Iterator[apsw.Connection]:
+        """Several statements that all hold or none; the lock is held as long."""
+        try:
+            with self._lock, self._connection as connection:
+                yield connection
         except (apsw.Error, OSError) as cause:
             raise self._error(f"{self._what}: {cause}") from cause
 
