@@ -36,6 +36,8 @@ class Connection:
         self._pid = os.getpid()
         self._calls = 0
         self._idle = threading.Condition()
+        if ledger is not None:
+            ledger.begin(config.link_profile)
         if config.mode == "client":  # a router carries everybody's bytes, and needs its descriptors for them
             self._links = session.info.declare_link_events_listener(self._on_link)
             for link in session.info.links():  # now: the first event may come after the first message
@@ -67,8 +69,8 @@ class Connection:
         if os.getpid() != self._pid:
             raise BusClosed(f"bus {self.name or 'session'} was opened in process {self._pid}: open one after the fork")
 
-    def outgoing(self, payload: bytes, kind: str, tile: TileId | str | None) -> None:
-        """Checks, paces and accounts for a message that is about to be sent.
+    def outgoing(self, payload: bytes, kind: str, tile: TileId | str | None, head_bytes: int = 0) -> None:
+        """Checks, paces and accounts for a message that is about to be sent; `head_bytes` are its key and envelope.
 
         Raises:
             MessageTooLarge: the receiver would drop it.
@@ -80,10 +82,27 @@ class Connection:
             raise MessageTooLarge(f"a {kind} message has {len(payload)} bytes, more than max_message_bytes {limit}")
         self._pacer.wait("up", len(payload))
         if self.ledger is not None:
-            self.ledger.record("up", kind, len(payload), tile)
+            self.ledger.record("up", kind, len(payload), tile, head_bytes=head_bytes)
 
-    def incoming(self, payload: bytes, kind: str, tile: TileId | str | None, shares_of: SharesOf | None = None) -> None:
+    def incoming(
+        self,
+        payload: bytes,
+        kind: str,
+        tile: TileId | str | None,
+        shares_of: SharesOf | None = None,
+        *,
+        head_bytes: int = 0,
+        asked_at_s: float | None = None,
+    ) -> None:
         """Paces and accounts for a message that has been received, by its shares where it is about several things.
+
+        Args:
+            payload: the message.
+            kind: ledger kind.
+            tile: the tile it is about, if it is about one.
+            shares_of: how it is booked otherwise.
+            head_bytes: its key and envelope, bytes.
+            asked_at_s: when it was asked for, by the monotonic clock, s.
 
         Raises:
             BusClosed: closed before or while waiting.
@@ -93,7 +112,9 @@ class Connection:
         if self.ledger is None:
             return
         shares = shares_of(payload) if shares_of is not None else ()
-        self.ledger.record_shares("down", shares or (Share(kind, len(payload), tile),))
+        took_s = None if asked_at_s is None else time.monotonic() - asked_at_s
+        shares = shares or (Share(kind, len(payload), tile),)
+        self.ledger.record_shares("down", shares, head_bytes=head_bytes, took_s=took_s)
 
     @contextmanager
     def sending(self) -> Iterator[zenoh.Session]:

@@ -2,21 +2,25 @@
 
 import json
 import logging
+import math
 import os
 import threading
 import time
 from collections import defaultdict
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any, Final, Literal
 
 from fleet_bus.errors import LedgerError
+from fleet_bus.links import LinkProfile
 from fleet_bus.wire import WireBytes
 from gnd_map.tile_id import TileId
 
 Direction = Literal["up", "down"]
 KINDS: Final = ("tile", "delta", "catalog", "change", "ack", "update", "control")
+LEDGER_VERSION: Final = 2
+"""Written at the head of every session. Version 1 had no heads, neither of ledgers nor of messages."""
 _LOG = logging.getLogger(__name__)
 
 
@@ -61,6 +65,15 @@ class Ledger:
         self._waiting: list[dict[str, Any]] = []
         self._place: dict[str, Any] = {"odometer_m": 0.0, "drive_ns": None}
         self._wire = WireBytes()
+        self._head: dict[str, Any] = {"ledger": LEDGER_VERSION, "agent": agent, "session": self._session, "link": None}
+        self._is_begun = False
+
+    def begin(self, link: LinkProfile) -> None:
+        """Notes the link that the messages from now on travel by."""
+        with self._lock:
+            self._head = self._head | {"link": _plain(link)}
+            self._waiting.append(self._head)
+            self._is_begun = True
 
     def record(
         self,
@@ -69,7 +82,8 @@ class Ledger:
         app_bytes: int,
         tile: TileId | str | None = None,
         *,
-        messages: int = 1,
+        head_bytes: int = 0,
+        took_s: float | None = None,
     ) -> None:
         """Accounts for one message.
 
@@ -78,31 +92,38 @@ class Ledger:
             kind: one of `KINDS`.
             app_bytes: length of the payload, bytes.
             tile: the tile it is about, if it is about one.
-            messages: 0 for a further share of a message that is booked already.
+            head_bytes: its key and envelope, bytes.
+            took_s: for an answer, time since it was asked for, s.
 
         Raises:
             LedgerError: unknown kind or direction.
         """
-        if kind not in KINDS or direction not in ("up", "down"):
-            raise LedgerError(f"no such ledger line: {direction} {kind}; kinds are {', '.join(KINDS)}")
-        path = tile.path if isinstance(tile, TileId) else tile
-        with self._lock:
-            _count(self._totals[kind, direction], app_bytes, messages)
-            if path is not None:
-                _count(self._by_tile[path], app_bytes, messages)
-            several = {} if messages == 1 else {"messages": messages}
-            self._note({"direction": direction, "kind": kind, "app_bytes": app_bytes, "tile": path} | several)
+        self.record_shares(direction, (Share(kind, app_bytes, tile),), head_bytes=head_bytes, took_s=took_s)
 
-    def record_shares(self, direction: Direction, shares: Sequence[Share]) -> None:
-        """Accounts for one message that is about several things; the first share counts as the message."""
-        for place, share in enumerate(shares):
-            self.record(direction, share.kind, share.app_bytes, share.tile, messages=int(place == 0))
+    def record_shares(
+        self, direction: Direction, shares: Sequence[Share], *, head_bytes: int = 0, took_s: float | None = None
+    ) -> None:
+        """Accounts for one message that is about several things; the first share counts as the message.
+
+        Raises:
+            LedgerError: unknown kind or direction; then nothing is booked.
+        """
+        for share in shares:
+            if share.kind not in KINDS or direction not in ("up", "down"):
+                raise LedgerError(f"no such ledger line: {direction} {share.kind}; kinds are {', '.join(KINDS)}")
+        took = {} if took_s is None else {"took_s": round(took_s, 4)}
+        with self._lock:
+            for place, share in enumerate(shares):
+                first = {"head_bytes": head_bytes} if place == 0 else {"messages": 0}
+                self._book(direction, share, int(place == 0), first | took)
+            self._write_at_once()
 
     def record_wire(self, wire: WireBytes) -> None:
         """Notes the wire bytes of the agent's session so far, and with them the present place."""
         with self._lock:
             self._wire = wire
-            self._note({"wire_up": wire.up, "wire_down": wire.down})
+            self._note({f"wire_{name}": value for name, value in asdict(wire).items()})
+            self._write_at_once()
 
     def set_position(self, odometer_m: float, drive_ns: int | None = None) -> None:
         """Says where on the drive the agent is: the messages that follow are booked there.
@@ -148,16 +169,25 @@ class Ledger:
         if self.path is not None:
             self.write_jsonl(self.path)
 
+    def _book(self, direction: Direction, share: Share, messages: int, more: dict[str, Any]) -> None:
+        path = share.tile.path if isinstance(share.tile, TileId) else share.tile
+        _count(self._totals[share.kind, direction], share.app_bytes, messages)
+        if path is not None:
+            _count(self._by_tile[path], share.app_bytes, messages)
+        self._note({"direction": direction, "kind": share.kind, "app_bytes": share.app_bytes, "tile": path} | more)
+
     def _note(self, line: dict[str, Any]) -> None:
+        if not self._is_begun:
+            self._waiting.append(self._head)
+            self._is_begun = True
         head = {"agent": self.agent, "session": self._session, "t_ns": self._now_ns(), **self._place}
         self._waiting.append(head | line)
-        if self.path is not None:
-            self._try_append(self.path)
 
-    def _try_append(self, path: Path) -> None:
-        """Writes at once, so that a kill loses no line; a full disk must not stop the vehicle."""
+    def _write_at_once(self) -> None:
+        """Writes now, so that a kill loses no line; a full disk must not stop the vehicle."""
         try:
-            self._append(path)
+            if self.path is not None:
+                self._append(self.path)
         except LedgerError as error:
             if len(self._waiting) & (len(self._waiting) - 1) == 0:  # 1, 2, 4, 8 …: one warning a doubling
                 _LOG.warning("%d ledger lines wait: %s", len(self._waiting), error)
@@ -190,3 +220,8 @@ def append_lines(path: Path, text: str) -> None:
 def _count(counter: list[int], app_bytes: int, messages: int) -> None:
     counter[0] += messages
     counter[1] += app_bytes
+
+
+def _plain(link: LinkProfile) -> dict[str, Any]:
+    """The profile as values of JSON, which has no infinite rate."""
+    return {name: value for name, value in asdict(link).items() if value != math.inf}

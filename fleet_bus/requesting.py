@@ -16,6 +16,7 @@ from typing import Final
 import zenoh
 
 from fleet_bus.connection import Connection
+from fleet_bus.envelopes import REPLY_BYTES, REQUEST_BYTES, head_bytes
 from fleet_bus.errors import BusClosed, BusConfigError, RequestFailed, RequestRefused
 from fleet_bus.ledger import SharesOf
 from gnd_map.tile_id import TileId
@@ -152,7 +153,8 @@ class _Asking:
         connection.check_open()
         if not connection.wait_connected(timeout_s):  # nothing would be sent, so nothing is paced nor booked
             return Answers(errors=[f"no router at {', '.join(connection.config.connect)}"])
-        connection.outgoing(self.payload, self.kind, self.tile)
+        asked_at_s = time.monotonic()
+        connection.outgoing(self.payload, self.kind, self.tile, head_bytes(self.key, REQUEST_BYTES))
         inbox: queue.SimpleQueue[zenoh.Reply | None] = queue.SimpleQueue()
         cancel = zenoh.CancellationToken()
         with connection.sending() as session:
@@ -167,20 +169,29 @@ class _Asking:
                 cancellation_token=cancel,
             )
         try:
-            return self._collect(inbox, first_only=first_only)
+            return self._collect(inbox, asked_at_s, first_only=first_only)
         finally:
             cancel.cancel()  # type: ignore[no-untyped-call]  # zenoh's stub
 
-    def _collect(self, inbox: "queue.SimpleQueue[zenoh.Reply | None]", *, first_only: bool) -> Answers:
+    def _collect(
+        self, inbox: "queue.SimpleQueue[zenoh.Reply | None]", asked_at_s: float, *, first_only: bool
+    ) -> Answers:
         answers = Answers()
         while (reply := self._receive(inbox)) is not None:
             if reply.ok is None:
                 if reply.err is not None:
                     answers.add_error(reply.err)
                 continue
-            payload = reply.ok.payload.to_bytes()
-            self.connection.incoming(payload, _REPLY_KIND.get(self.kind, self.kind), self.tile, self.shares_of)
-            answers.ok.append((str(reply.ok.key_expr), payload))
+            key, payload = str(reply.ok.key_expr), reply.ok.payload.to_bytes()
+            self.connection.incoming(
+                payload,
+                _REPLY_KIND.get(self.kind, self.kind),
+                self.tile,
+                self.shares_of,
+                head_bytes=head_bytes(key, REPLY_BYTES),
+                asked_at_s=asked_at_s,
+            )
+            answers.ok.append((key, payload))
             if first_only:
                 break
         return answers

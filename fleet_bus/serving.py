@@ -8,6 +8,7 @@ from typing import Any
 import zenoh
 
 from fleet_bus.connection import Connection
+from fleet_bus.envelopes import REPLY_BYTES, REQUEST_BYTES, head_bytes
 from fleet_bus.errors import BusClosed, BusError, NotMine, Refused
 from fleet_bus.part import Part
 from fleet_bus.requesting import END_OF_ANSWERS, FAILED, REFUSED
@@ -73,7 +74,8 @@ class Serving(Part):
 
     def _reply(self, query: zenoh.Query) -> None:
         request = Request(str(query.key_expr), query.payload.to_bytes() if query.payload is not None else b"")
-        self._connection.incoming(request.payload, self._kind, None)
+        head = head_bytes(request.key, REQUEST_BYTES)
+        self._connection.incoming(request.payload, self._kind, None, head_bytes=head)
         answer = self._handler(request)
         if isinstance(answer, bytes):
             self._send(query, request.key, answer)
@@ -86,6 +88,6 @@ class Serving(Part):
     def _send(self, query: zenoh.Query, key: str, payload: bytes) -> None:
         if "*" in key:
             raise BusError(f"an answer needs a key without wildcards, got {key}: give (key, payload) pairs")
-        self._connection.outgoing(payload, self._kind, None)
+        self._connection.outgoing(payload, self._kind, None, head_bytes(key, REPLY_BYTES))
         with self._connection.sending():
             query.reply(key, payload)

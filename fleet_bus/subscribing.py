@@ -8,6 +8,7 @@ import zenoh
 from zenoh import ext
 
 from fleet_bus.connection import Connection
+from fleet_bus.envelopes import NOTICE_BYTES, head_bytes
 from fleet_bus.errors import BusClosed, NoRouter
 from fleet_bus.part import Part
 from fleet_bus.workers import Workers
@@ -57,7 +58,8 @@ class Subscription(Part):
     def _deliver(self, sample: zenoh.Sample) -> None:
         key, payload = str(sample.key_expr), sample.payload.to_bytes()
         try:
-            self._connection.incoming(payload, self._kind, self._tile_of(key))
+            head = head_bytes(key, NOTICE_BYTES)
+            self._connection.incoming(payload, self._kind, self._tile_of(key), head_bytes=head)
         except BusClosed:
             return
         self._callback(key, payload)
@@ -117,7 +119,7 @@ class RecallingPublisher(Part):
         Raises:
             MessageTooLarge, BusClosed.
         """
-        self._connection.outgoing(payload, self._kind, tile)
+        self._connection.outgoing(payload, self._kind, tile, head_bytes(self._key, NOTICE_BYTES))
         with self._connection.sending():
             self._publisher.put(payload)
 
@@ -134,7 +136,7 @@ def publish(
     if not connection.wait_connected(wait_s):
         where = ", ".join(connection.config.connect)
         raise NoRouter(f"no router at {where} for {wait_s:g} s: {len(payload)} bytes for {key} were not published")
-    connection.outgoing(payload, kind, tile)
+    connection.outgoing(payload, kind, tile, head_bytes(key, NOTICE_BYTES))
     with connection.sending() as session:
         session.put(key, payload, congestion_control=zenoh.CongestionControl.BLOCK)
 

@@ -16,7 +16,9 @@ from typing import Final
 
 _TCP_INFO_BYTES: Final = 232
 _TIMESTAMPS: Final = 1  # TCPI_OPT_TIMESTAMPS of linux/tcp.h
-_OPTIONS_AT, _BYTES_RECEIVED_AT, _SEGMENTS_AT, _BYTES_SENT_AT = 5, 128, 136, 200  # offsets in struct tcp_info
+# Offsets in struct tcp_info of linux/tcp.h.
+_OPTIONS_AT, _SEGMENT_SIZE_AT, _BYTES_RECEIVED_AT, _SEGMENTS_AT, _DATA_SEGMENTS_AT = 5, 16, 128, 136, 152
+_BYTES_SENT_AT = 200  # with the bytes sent again beside it
 _FD_FOLDER: Final = Path("/proc/self/fd")
 
 
@@ -28,14 +30,33 @@ class WireBytes:
         up: sent, bytes.
         down: received, bytes.
         connections: how many connections these are.
+        up_acks: of `up`, packets that carry no data: acknowledgements, opening and closing, bytes.
+        down_acks: likewise of `down`.
+        up_resent: of `up`, data that had to be sent again, bytes. (What was lost on the way down never came.)
+        segment_bytes: data that one packet can carry, the largest of the connections; 0 where nothing was measured.
+        header_bytes: headers of one packet, the largest of the connections.
     """
 
     up: int = 0
     down: int = 0
     connections: int = 0
+    up_acks: int = 0
+    down_acks: int = 0
+    up_resent: int = 0
+    segment_bytes: int = 0
+    header_bytes: int = 0
 
     def __add__(self, other: "WireBytes") -> "WireBytes":
-        return WireBytes(self.up + other.up, self.down + other.down, self.connections + other.connections)
+        return WireBytes(
+            self.up + other.up,
+            self.down + other.down,
+            self.connections + other.connections,
+            self.up_acks + other.up_acks,
+            self.down_acks + other.down_acks,
+            self.up_resent + other.up_resent,
+            max(self.segment_bytes, other.segment_bytes),
+            max(self.header_bytes, other.header_bytes),
+        )
 
 
 @dataclass(slots=True)
@@ -89,11 +110,22 @@ def _reading(tap: socket.socket) -> WireBytes:
     info = tap.getsockopt(socket.IPPROTO_TCP, socket.TCP_INFO, _TCP_INFO_BYTES)
     if len(info) < _TCP_INFO_BYTES:  # a kernel before 4.19 has no bytes_sent
         return WireBytes(connections=1)
-    received = int(struct.unpack_from("=Q", info, _BYTES_RECEIVED_AT)[0])
+    (received,) = struct.unpack_from("=Q", info, _BYTES_RECEIVED_AT)
     segments_out, segments_in = struct.unpack_from("=II", info, _SEGMENTS_AT)
-    sent = int(struct.unpack_from("=Q", info, _BYTES_SENT_AT)[0])
+    data_in, data_out = struct.unpack_from("=II", info, _DATA_SEGMENTS_AT)
+    sent, resent = struct.unpack_from("=QQ", info, _BYTES_SENT_AT)
+    (segment_bytes,) = struct.unpack_from("=I", info, _SEGMENT_SIZE_AT)
     header = (40 if tap.family == socket.AF_INET6 else 20) + 20 + (12 if info[_OPTIONS_AT] & _TIMESTAMPS else 0)
-    return WireBytes(sent + segments_out * header, received + segments_in * header, 1)
+    return WireBytes(
+        up=sent + segments_out * header,
+        down=received + segments_in * header,
+        connections=1,
+        up_acks=(segments_out - data_out) * header,
+        down_acks=max(segments_in - data_in, 0) * header,
+        up_resent=resent,
+        segment_bytes=segment_bytes,
+        header_bytes=header,
+    )
 
 
 def _duplicate_of(source: str, destination: str) -> socket.socket | None:

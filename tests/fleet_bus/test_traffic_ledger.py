@@ -100,8 +100,9 @@ def test_a_line_that_is_json_but_no_booking_is_left_out(tmp_path):
     ledger = Ledger("a")
     ledger.record("up", "tile", 1)
     ledger.write_jsonl(file)
+    booked = json.loads(file.read_text().splitlines()[1])
     with file.open("a") as lines:
-        lines.write('17\n{"agent": "a"}\n\n' + json.dumps(json.loads(file.read_text()) | {"kind": "gossip"}) + "\n")
+        lines.write('17\n{"agent": "a"}\n\n' + json.dumps(booked | {"kind": "gossip"}) + "\n")
     read = read_ledger(file)
     assert (read.total_bytes("up"), read.ignored_lines) == (1, 3)
 
@@ -137,7 +138,7 @@ def test_a_ledger_with_a_path_has_each_message_at_once(tmp_path):
     ledger = Ledger("a", file)
     for count in range(1, 4):
         ledger.record("up", "control", 1)
-        assert len(file.read_text().splitlines()) == count
+        assert len(file.read_text().splitlines()) == 1 + count, "the head of the session, and the messages"
 
 
 def test_a_full_disk_stops_no_message_and_loses_no_line(tmp_path):
