@@ -13,6 +13,7 @@ import numpy as np
 
 from gnd_map.accumulate import N_MIN_CELLS, VoxelAccumulator
 from gnd_map.arrays import F64
+from gnd_map.codec import Lattice, snap
 from gnd_map.errors import MotionError
 from gnd_map.gaussian import Gaussians
 from gnd_map.geodesy import LocalFrame
@@ -25,7 +26,7 @@ from schemas.drive import DriveHeader, GnssTrack, ReferenceTrack, Scan
 from schemas.drive_mcap import drive_counts, load_track, read_drive, read_header
 from tile_store.errors import StoreError
 from tile_store.store import Store
-from tile_store.values import DEFAULT_LAYER
+from tile_store.values import DEFAULT_CODEC, DEFAULT_LAYER, lattice_named
 
 _TILE_M: Final = 40.0
 
@@ -95,6 +96,7 @@ def build_map(
     store: Store,
     *,
     layer: str = DEFAULT_LAYER,
+    codec: str = DEFAULT_CODEC,
     n_min_cells: int = N_MIN_CELLS,
     parameters: BuildParameters | None = None,
     progress: Progress | None = None,
@@ -103,12 +105,22 @@ def build_map(
 
     A tile that the store holds already is replaced, not mixed with: to add drives to a map, build from all of them.
 
+    Args:
+        drives: recordings with reference poses.
+        store: where the tiles go.
+        layer: such as "ndt".
+        codec: one of `MAP_CODECS`: the lattice on which the published Gaussians lie, or "float" = as measured.
+        n_min_cells: a voxel holds a Gaussian from so many occupied sub-cells on.
+        parameters: which points and poses are used.
+        progress: called after each scan.
+
     Raises:
         BuildError: no drives, no reference poses, impossible poses, no voxel dense enough.
         DriveError: a drive cannot be read.
-        StoreError: the store cannot take the tiles.
+        StoreError: an unknown codec, or the store cannot take the tiles.
     """
     parameters = parameters or BuildParameters()
+    lattice = lattice_named(codec)
     sources = _sources(drives, parameters)
     accumulators = _accumulators(sources, parameters)
     used, skipped, points = 0, 0, 0
@@ -122,7 +134,7 @@ def build_map(
                 accumulator.add(points_map_m)
     if used == 0:
         raise BuildError(f"none of {skipped} scans lies within the reference poses: are both in the same clock?")
-    tiles = _tiles(accumulators, n_min_cells)
+    tiles = _tiles(accumulators, n_min_cells, lattice)
     results = store.put_tiles(tiles, layer=layer)
     return BuildResult(
         drives=len(sources),
@@ -236,12 +248,12 @@ def _points_map_m(scan: Scan, source: _Source, parameters: BuildParameters) -> F
         return None
 
 
-def _tiles(accumulators: list[VoxelAccumulator], n_min_cells: int) -> list[Tile]:
-    """All tiles, sorted; the store numbers their versions."""
+def _tiles(accumulators: list[VoxelAccumulator], n_min_cells: int, lattice: Lattice | None) -> list[Tile]:
+    """All tiles, sorted, on the lattice; the store numbers their versions."""
     found: dict[TileId, Gaussians] = {}
     for accumulator in accumulators:
         found.update(accumulator.finish(n_min_cells))
     if not found:
         voxels = sum(len(accumulator) for accumulator in accumulators)
         raise BuildError(f"none of {voxels} voxels with points has {n_min_cells} occupied sub-cells: too few scans?")
-    return [Tile(tile, 1, found[tile]) for tile in sorted(found)]
+    return [Tile(tile, 1, found[tile] if lattice is None else snap(found[tile], lattice)) for tile in sorted(found)]

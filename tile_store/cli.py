@@ -27,9 +27,10 @@ from tile_store.export import FORMATS, export_map
 from tile_store.server import TileServer
 from tile_store.sqlite_store import SqliteStore
 from tile_store.store import Store
-from tile_store.values import DEFAULT_LAYER
+from tile_store.values import DEFAULT_CODEC, DEFAULT_LAYER, MAP_CODECS
 
 PATH: Final = click.Path(path_type=Path)
+CODEC_HELP: Final = "How finely Gaussians are rounded."
 _F = TypeVar("_F", bound=Callable[..., Any])
 
 
@@ -78,14 +79,15 @@ def map_group() -> None:
 @map_group.command(short_help="Build a map from drives with known poses.")
 @click.argument("drives", nargs=-1, required=True, type=PATH)
 @click.option("--store", "-o", "path", required=True, type=PATH, help="The store; it is made when missing.")
+@click.option("--codec", default=DEFAULT_CODEC, show_default=True, type=click.Choice(MAP_CODECS), help=CODEC_HELP)
 @layer_option
 @json_option
-def build(drives: tuple[Path, ...], path: Path, layer: str, as_json: bool) -> None:
+def build(drives: tuple[Path, ...], path: Path, codec: str, layer: str, as_json: bool) -> None:
     """Build tiles from DRIVES (MCAP, with reference poses) and put them into a store as a new base."""
     from tile_store.build import build_map  # it loads numba, which the other commands do without
 
     with _store_to_fill(path) as opened, _bars() as bars:
-        result = build_map(drives, opened, layer=layer, progress=_Shown(bars))
+        result = build_map(drives, opened, layer=layer, codec=codec, progress=_Shown(bars))
     _show(
         asdict(result), as_json, lambda console: console.print(tables.fields(f"{path}, layer {layer}", asdict(result)))
     )

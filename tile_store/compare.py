@@ -1,11 +1,13 @@
 """What a map holds, and how two maps, two times or two versions differ: values that print as tables and as JSON."""
 
+from collections import Counter
 from collections.abc import Iterable, Iterator
 from dataclasses import asdict, dataclass, fields
 from typing import Any
 
 import numpy as np
 
+from gnd_map.codec import codec_of
 from gnd_map.gaussian import Gaussians
 from gnd_map.grid import VoxelGrid
 from gnd_map.tile import diff
@@ -27,6 +29,10 @@ class MapInfo:
     points: int
     """Raw points that the Gaussians stand for."""
     body_bytes: int
+    bytes_a_voxel: float
+    """Of the bodies as they lie in the store; 0 without voxels."""
+    codecs: dict[str, int]
+    """Tiles in each codec, by its name."""
     lowest_version: int
     highest_version: int
     updated_ns: int
@@ -50,6 +56,7 @@ def map_info(store: Store, *, layer: str = DEFAULT_LAYER, prefix: str = "") -> M
     if not stored:
         raise StoreError(f"no tiles in layer {layer!r}, region {prefix or 'everywhere'!r}")
     gaussians = [(one.tile, one.decode().gaussians) for one in stored]
+    body_bytes, n_gaussians = sum(len(one.body) for one in stored), sum(len(g) for _, g in gaussians)
     south, west, north, east = _bounds_deg([one.tile for one in stored])
     lowest, highest = _heights_m(gaussians)
     return MapInfo(
@@ -57,9 +64,11 @@ def map_info(store: Store, *, layer: str = DEFAULT_LAYER, prefix: str = "") -> M
         prefix=prefix,
         tiles=len(stored),
         districts=len({one.tile.district for one in stored}),
-        gaussians=sum(len(g) for _, g in gaussians),
+        gaussians=n_gaussians,
         points=sum(int(g.count.sum(dtype=np.int64)) for _, g in gaussians),
-        body_bytes=sum(len(one.body) for one in stored),
+        body_bytes=body_bytes,
+        bytes_a_voxel=body_bytes / n_gaussians if n_gaussians else 0.0,
+        codecs=dict(Counter(codec_of(one.codec_id).name for one in stored)),
         lowest_version=min(one.version for one in stored),
         highest_version=max(one.version for one in stored),
         updated_ns=max(one.created_ns for one in stored),

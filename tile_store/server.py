@@ -1,4 +1,4 @@
-"""The tile server: answers tile and catalog queries from a store. It keeps no state of its own."""
+"""The tile server: answers tile and catalog queries from a store. All that it remembers is what it has encoded."""
 
 from collections.abc import Iterator
 from itertools import groupby
@@ -7,22 +7,27 @@ from typing import Final, Self
 from fleet_bus.bus import Bus
 from fleet_bus.errors import Refused
 from fleet_bus.serving import Answer, Request, Serving
+from gnd_map.codec import CODEC_FLOAT32
 from gnd_map.tile_id import District, TileId
 from schemas import keys
 from schemas.errors import SchemaError
-from schemas.tiles import Catalog, TileReply, TileRequest
+from schemas.tiles import Catalog, TileRequest
+from schemas.tiles_batch import TilesRequest
+from tile_store.answers import Answers
 from tile_store.regions import Region
 from tile_store.store import Store
-from tile_store.values import StoredTile
 
 _ANY: Final = "x/**"
 # Only `schemas.keys` knows how a key begins.
 TILE_ROOT: Final = keys.tiles_key("x").removesuffix(_ANY)
+# Who asks without a message reads what everybody reads.
+PLAIN_REQUEST: Final = TileRequest(codecs=(CODEC_FLOAT32,), deltas=False)
 CATALOG_ROOT: Final = keys.catalog_keys("x").removesuffix(_ANY)
 
 
 class TileServer:
-    """Answers on every tile key and every catalog key, of all layers, exact or wildcard.
+    """Answers on every tile key and every catalog key, of all layers, exact or wildcard, and on keys for several tiles
+    of a district.
 
     A request that can never be answered (bad key, bad payload, codecs that no tile comes in) is refused by name; a
     store that fails makes the asker try again.
@@ -30,6 +35,7 @@ class TileServer:
 
     def __init__(self, store: Store, bus: Bus, *, workers: int = 4) -> None:
         self._store, self._bus, self._workers = store, bus, workers
+        self._answers = Answers(store)
         self._servings: list[Serving] = []
 
     def __enter__(self) -> Self:
@@ -40,8 +46,12 @@ class TileServer:
 
     def start(self) -> Self:
         """Begin to answer."""
-        for root, handler, kind in ((TILE_ROOT, self.tiles, "tile"), (CATALOG_ROOT, self.catalogs, "catalog")):
-            serving = self._bus.serve(f"{root}**", handler, complete=True, workers=self._workers, kind=kind)
+        for keyexpr, handler, kind in (
+            (f"{TILE_ROOT}**", self.tiles, "tile"),
+            (keys.batch_keys(), self.batch, "tile"),
+            (f"{CATALOG_ROOT}**", self.catalogs, "catalog"),
+        ):
+            serving = self._bus.serve(keyexpr, handler, complete=True, workers=self._workers, kind=kind)
             self._servings.append(serving)
         return self
 
@@ -53,14 +63,23 @@ class TileServer:
     def tiles(self, request: Request) -> Answer:
         """Reply for the tile of an exact key, or for each tile that exists in a wildcard region."""
         try:
-            wanted = TileRequest.decode(request.payload) if request.payload else TileRequest()
+            wanted = TileRequest.decode(request.payload) if request.payload else PLAIN_REQUEST
             if not request.is_wild:
                 layer, tile = keys.parse_tile_key(request.key)
-                return self._reply(self._store.get(layer, tile), wanted).encode()
+                return self._answers.one(self._store.get(layer, tile), wanted).encode()
             region = Region.of_key(request.key, TILE_ROOT)
         except SchemaError as error:
             raise _refusal(request, error) from None
         return self._region(region, wanted)
+
+    def batch(self, request: Request) -> Answer:
+        """Reply about several tiles of one district."""
+        try:
+            layer, district = keys.parse_batch_key(request.key)
+            wanted = TilesRequest.decode(request.payload)
+        except SchemaError as error:
+            raise _refusal(request, error) from None
+        return self._answers.many(layer, district, wanted).encode()
 
     def catalogs(self, request: Request) -> Answer:
         """The catalog of an exact key's district (it may be empty), or of each district with tiles in a region."""
@@ -76,7 +95,7 @@ class TileServer:
     def _region(self, region: Region, wanted: TileRequest) -> Iterator[tuple[str, bytes]]:
         for layer, tile in self._tiles(region):
             if region.matches(layer, *tile.path.split("/")):
-                yield keys.tile_key(layer, tile), self._reply(self._store.get(layer, tile), wanted).encode()
+                yield keys.tile_key(layer, tile), self._answers.one(self._store.get(layer, tile), wanted).encode()
 
     def _catalogs(self, region: Region) -> Iterator[tuple[str, bytes]]:
         for (layer, district), _ in groupby(self._tiles(region), lambda found: (found[0], found[1].district)):
@@ -90,15 +109,6 @@ class TileServer:
         for layer in self._store.layers() if region.layer is None else [region.layer]:
             for head in self._store.heads(layer, region.prefix):
                 yield layer, head.tile
-
-    def _reply(self, stored: StoredTile | None, wanted: TileRequest) -> TileReply:
-        if stored is None:
-            return TileReply("absent")
-        if stored.sha == wanted.cached_sha:
-            return TileReply("unchanged")
-        if stored.codec_id not in wanted.codecs:
-            raise Refused(f"tile {stored.tile.path} comes in codec {stored.codec_id}, asked for {wanted.codecs}")
-        return TileReply("blob", stored.to_blob())
 
 
 def _refusal(request: Request, error: SchemaError) -> Refused:

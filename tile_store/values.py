@@ -4,7 +4,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Final, Literal
 
-from gnd_map.codec import CODEC_FLOAT32, encode_gaussians
+from gnd_map.codec import LATTICES, Lattice, best_codec, codec_of
 from gnd_map.tile import Tile
 from gnd_map.tile_id import TileId
 from schemas.limits import MAX_TILE_BODY_BYTES
@@ -19,6 +19,9 @@ PublishStatus = Literal["published", "unchanged", "stale"]
 
 SHA_BYTES: Final = 32
 DEFAULT_LAYER: Final = "ndt"
+DEFAULT_CODEC: Final = "standard"
+MAP_CODECS: Final = (*LATTICES, "float")
+"""How finely published Gaussians are rounded: the lattices, coarsest last, or as they were measured."""
 
 
 def check_layer(layer: str) -> str:
@@ -26,6 +29,13 @@ def check_layer(layer: str) -> str:
     if not LAYER_PATTERN.fullmatch(layer):
         raise StoreError(f"layer {layer[:80]!r} does not match {LAYER_PATTERN.pattern}")
     return layer
+
+
+def lattice_named(codec: str) -> Lattice | None:
+    """The lattice that a name of `MAP_CODECS` means, None for floats; StoreError for any other name."""
+    if codec not in MAP_CODECS:
+        raise StoreError(f"codec {codec!r} is unknown; known are {', '.join(MAP_CODECS)}")
+    return LATTICES.get(codec)
 
 
 @dataclass(frozen=True, slots=True)
@@ -38,11 +48,14 @@ class Content:
 
     @classmethod
     def of(cls, tile: Tile) -> "Content":
-        """The content of a tile as float32 columns; StoreError when it is larger than any message may be."""
-        body = encode_gaussians(tile.gaussians)
+        """The content of a tile in the best codec that can express it: what lies on a lattice in that lattice's, other
+        floats as they are. StoreError when it is larger than any message may be.
+        """
+        codec_id = best_codec(tile.gaussians)
+        body = codec_of(codec_id).encode(tile.tile_id, tile.gaussians)
         if len(body) > MAX_TILE_BODY_BYTES:
             raise StoreError(f"tile {tile.tile_id.path} has {len(body)} bytes, a message holds {MAX_TILE_BODY_BYTES}")
-        return cls(tile.sha, CODEC_FLOAT32, body)
+        return cls(tile.sha, codec_id, body)
 
 
 @dataclass(frozen=True, slots=True)

@@ -1,0 +1,204 @@
+"""What a client is sent of a tile: nothing where it holds the newest, a delta against what it holds, or the whole tile
+in a codec that it reads.
+
+Every version that is still in the store can be the base of a delta. A delta that is no shorter than the whole tile, or
+whose base is gone or damaged, is not sent.
+"""
+
+import logging
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Final, Literal
+
+from fleet_bus.errors import Refused
+from gnd_map.codec import CODECS, best_codec, codec_of, encode_delta, lattice_of
+from gnd_map.errors import CodecError, GndError
+from gnd_map.gaussian import Gaussians
+from gnd_map.tile_id import District, TileId
+from schemas.errors import SchemaError
+from schemas.tiles import CatalogEntry, CodedDelta, TileBlob, TileReply, TileRequest
+from schemas.tiles_batch import HASH_BYTES, TileAnswer, TilesReply, TilesRequest, digest_of, index_of
+from tile_store.memory import Memory
+from tile_store.store import Store
+from tile_store.values import StoredTile
+
+BYTES_A_VOXEL: Final = 48
+REMEMBERED_BYTES: Final = 64 * 1024 * 1024  # of decoded tiles, and again of deltas and bodies in other codecs
+_LOG = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True, slots=True)
+class _Sent:
+    """What goes out for one tile."""
+
+    status: Literal["blob", "delta"]
+    codec_id: int
+    body: bytes
+
+
+class Answers:
+    """Answers about tiles from a store; remembers what it has decoded and encoded. Any thread may ask."""
+
+    def __init__(self, store: Store, remembered_bytes: int = REMEMBERED_BYTES) -> None:
+        self._store = store
+        self._decoded: Memory[Gaussians] = Memory(remembered_bytes, lambda g: BYTES_A_VOXEL * len(g))
+        self._encoded: Memory[bytes] = Memory(remembered_bytes, len)
+
+    def one(self, stored: StoredTile | None, wanted: TileRequest) -> TileReply:
+        """The answer about one tile; `Refused` when it cannot be written in a codec that the client reads."""
+        if stored is None:
+            return TileReply("absent")
+        if stored.sha == wanted.cached_sha:
+            return TileReply("unchanged")
+        held = self._by_sha(stored, wanted.cached_sha) if wanted.deltas else None
+        sent = self._sent(stored, held, wanted.codecs)
+        if sent.status == "delta":
+            return TileReply("delta", delta=CodedDelta(stored.tile, stored.version, stored.sha, sent.body))
+        return TileReply("blob", TileBlob(stored.tile, stored.version, stored.sha, sent.codec_id, sent.body))
+
+    def many(self, layer: str, district: District, request: TilesRequest) -> TilesReply:
+        """The answers about tiles of a district, those around `request.near` first while bytes are left.
+
+        Raises:
+            Refused: a tile cannot be written in a codec that the client reads.
+            StoreError: the store has failed.
+        """
+        heads = {entry.tile: entry for entry in self._store.heads(layer, district.path)}
+        held = self._held(layer, district, request, heads)
+        answers: dict[TileId, TileAnswer] = {}
+        left = request.max_bytes
+        for tile in _nearest_first(request.tiles(district), district, request.near):
+            known = held[tile]
+            answers[tile] = self._answer(layer, tile, heads.get(tile), known, request.codecs if left > 0 else None)
+            left, answers[tile] = _within(left, request.max_bytes, answers[tile])
+        return TilesReply(tuple(answers[tile] for tile in request.tiles(district)))
+
+    def _answer(
+        self, layer: str, tile: TileId, head: CatalogEntry | None, held: bytes | None, codecs: tuple[int, ...] | None
+    ) -> TileAnswer:
+        """The answer about a tile of which content `held` is held (b"": none, or not known to the store; None: the
+        client shall say which); codecs None = no bytes are left.
+        """
+        if head is None:
+            return TileAnswer("absent")
+        if held is None:
+            return TileAnswer("hash")
+        if held == head.sha:
+            return TileAnswer("unchanged")
+        stored = None if codecs is None else self._store.get(layer, tile)
+        if stored is None or codecs is None:
+            return TileAnswer("later")
+        try:
+            sent = self._sent(stored, self._by_sha(stored, held), codecs)
+        except (SchemaError, CodecError) as error:  # one damaged body must not keep the other tiles from all clients
+            _LOG.error("tile %s version %d cannot be sent: %s", tile, stored.version, error)
+            return TileAnswer("later")
+        codec_id = sent.codec_id if sent.status == "blob" else 0
+        return TileAnswer(sent.status, stored.version, stored.sha[:HASH_BYTES], codec_id, sent.body)
+
+    # What the client holds
+
+    def _held(
+        self, layer: str, district: District, request: TilesRequest, heads: dict[TileId, CatalogEntry]
+    ) -> dict[TileId, bytes | None]:
+        """The hash of what the client holds of each tile: b"" = nothing that the store knows, None = it must say."""
+        tiles = request.tiles(district)
+        versions = {tile: version for tile, (_, version) in zip(tiles, request.wanted, strict=True) if version}
+        held: dict[TileId, bytes | None] = dict.fromkeys(tiles, b"")
+        if request.held_hashes:
+            told = zip(versions.items(), request.held_hashes, strict=True)
+            return held | {tile: self._with_hash(layer, tile, number, start) for (tile, number), start in told}
+        shas = {tile: self._sha_of(layer, tile, version, heads) for tile, version in versions.items()}
+        agreed = all(shas.values()) and digest_of(shas.values()) == request.held_digest
+        return held | (shas if agreed else dict.fromkeys(versions, None))
+
+    def _sha_of(self, layer: str, tile: TileId, version: int, heads: dict[TileId, CatalogEntry]) -> bytes:
+        """The hash of a version; empty when it is not in the store."""
+        head = heads.get(tile)
+        if head is not None and head.version == version:
+            return head.sha
+        stored = self._store.get(layer, tile, version)
+        return stored.sha if stored else b""
+
+    def _with_hash(self, layer: str, tile: TileId, version: int, start: bytes) -> bytes:
+        """The whole hash that begins like this, of the version that the client names or of any other; else empty."""
+        lines = sorted(self._store.history(layer, tile), key=lambda line: line.version != version)
+        return next((line.sha for line in lines if line.sha.startswith(start)), b"")
+
+    def _by_sha(self, stored: StoredTile, sha: bytes) -> StoredTile | None:
+        return self._store.by_sha(stored.layer, stored.tile, sha) if sha else None
+
+    # What is sent
+
+    def _sent(self, stored: StoredTile, held: StoredTile | None, codecs: Sequence[int]) -> _Sent:
+        if held is not None and reads_like(stored.codec_id, codecs):
+            body = self._delta(held, stored)
+            if body is not None and len(body) < len(stored.body):
+                return _Sent("delta", 0, body)
+        return _Sent("blob", *self._body(stored, codecs))
+
+    def _delta(self, base: StoredTile, new: StoredTile) -> bytes | None:
+        """The delta; None when one of the two bodies is damaged."""
+        try:
+            return self._encoded.get(
+                (new.tile, base.sha, new.sha),
+                lambda: encode_delta(new.tile, self._gaussians(base), self._gaussians(new)),
+            )
+        except GndError as error:
+            _LOG.error("tile %s: no delta from version %d to %d: %s", new.tile, base.version, new.version, error)
+            return None
+
+    def _body(self, stored: StoredTile, codecs: Sequence[int]) -> tuple[int, bytes]:
+        """Codec and bytes of the version for a client that reads these codecs, in its order of preference."""
+        codec_id = self._codec_for(stored, codecs)
+        if codec_id == stored.codec_id:
+            return codec_id, stored.body
+        encode = codec_of(codec_id).encode
+        key = (stored.tile, stored.sha, codec_id)
+        return codec_id, self._encoded.get(key, lambda: encode(stored.tile, self._gaussians(stored)))
+
+    def _codec_for(self, stored: StoredTile, codecs: Sequence[int]) -> int:
+        """The first codec of the client that can express the version.
+
+        Bodies lie in the store in the best codec there is, so most versions need not be decoded to know: the codec is
+        the stored one, another of its lattice, or one of floats.
+        """
+        for codec_id in codecs:
+            if codec_id in CODECS and (lattice_of(codec_id) is None or same_lattice(codec_id, stored.codec_id)):
+                return codec_id
+        try:
+            return best_codec(self._gaussians(stored), codecs)
+        except GndError:
+            raise Refused(
+                f"tile {stored.tile.path} comes in codec {stored.codec_id}, asked for {tuple(codecs)}"
+            ) from None
+
+    def _gaussians(self, stored: StoredTile) -> Gaussians:
+        return self._decoded.get((stored.tile, stored.sha), lambda: stored.decode().gaussians)
+
+
+def same_lattice(one: int, other: int) -> bool:
+    """Whether two known codecs write the same lattice (or both floats)."""
+    return lattice_of(one) is lattice_of(other)
+
+
+def reads_like(codec_id: int, codecs: Sequence[int]) -> bool:
+    """Whether a client that reads `codecs` can use deltas of content in this codec."""
+    return any(same_lattice(codec_id, one) for one in codecs if one in CODECS)
+
+
+def _nearest_first(tiles: Sequence[TileId], district: District, near: int | None) -> list[TileId]:
+    """The tiles by their distance from the one with index `near`; in order without one."""
+    if near is None:
+        return list(tiles)
+    centre = TileId(district.first_morton + near)
+    lon, lat = centre.lon_index, centre.lat_index
+    return sorted(tiles, key=lambda t: ((t.lon_index - lon) ** 2 + (t.lat_index - lat) ** 2, index_of(t)))
+
+
+def _within(left: int, limit: int, answer: TileAnswer) -> tuple[int, TileAnswer]:
+    """Bytes left after an answer, and the answer: "later" where its body does not fit; the first one always does."""
+    size = len(answer.body)
+    if size <= left or (size and left == limit):
+        return left - size, answer
+    return 0, TileAnswer("later")
