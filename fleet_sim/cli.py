@@ -3,11 +3,12 @@
 import json
 from math import degrees
 from pathlib import Path
+from typing import Any
 
 import click
 
 from fleet_sim.sensors import SHORT_NAMES
-from fleet_sim.street import SITES, SiteName, StreetOptions, street
+from fleet_sim.street import SITES, StreetOptions, street
 from fleet_sim.world import STATES, World, read_world, write_world
 from fleet_sim.world_summary import as_text, summary
 
@@ -29,11 +30,12 @@ def world() -> None:
 @click.option("--site", type=click.Choice(SITES), default="border", show_default=True, help="Where the street lies.")
 @click.option("--lat", "lat_deg", type=float, help="Latitude of its middle in degrees, instead of a site.")
 @click.option("--lon", "lon_deg", type=float, help="Longitude of its middle in degrees, instead of a site.")
-def write(file: Path, seed: int, length_m: float, site: SiteName, lat_deg: float | None, lon_deg: float | None) -> None:
+@click.option("--edits", "edit_share", default=1.0, show_default=True, help="Share of the street's edits to make.")
+def write(file: Path, seed: int, **options: Any) -> None:
     """Write the street of a seed to FILE (JSON)."""
-    made = street(seed, StreetOptions(length_m, site, lat_deg, lon_deg))
+    made = street(seed, StreetOptions(**options))
     write_world(made, file)
-    click.echo(f"{file}: {len(made.objects)} objects, {length_m:g} m, seed {seed}")
+    click.echo(f"{file}: {len(made.objects)} objects, {options['length_m']:g} m, seed {seed}")
 
 
 @world.command("inspect")

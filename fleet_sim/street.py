@@ -13,7 +13,7 @@ import numpy as np
 
 from fleet_sim.errors import WorldError
 from fleet_sim.street_before import CROWN, KERB_M, PAVEMENT_M, built, drawn_plan
-from fleet_sim.street_edits import rebuild
+from fleet_sim.street_edits import partly_edited, rebuild
 from fleet_sim.world import World
 from gnd_map.geodesy import LocalFrame
 
@@ -33,7 +33,7 @@ MAX_LAT_DEG: Final = 80.0
 _FIGURE_2_DEG: Final = (37.5595, 127.0363)
 _NORTH_49_DEG: Final = (49.0045, 8.4)
 _INSIDE_M: Final = 20.0
-_STREAMS: Final = ("site", "lots", "furniture", "greenery", "edits", "more")
+_STREAMS: Final = ("site", "lots", "furniture", "greenery", "edits", "more", "share")
 
 
 @dataclass(frozen=True, slots=True)
@@ -45,17 +45,22 @@ class StreetOptions:
         site: where it lies. "border": its middle on a border of two districts near Figure 2 of the GND paper;
             "wangsimni": from Figure 2's tiles to the south-east, up to 800 m inside one district; "north49": 49° N.
         lat_deg, lon_deg: middle of the street, WGS-84, instead of a site; both or neither.
+        edit_share: so many of the street's edits are made, drawn from the seed one by one; the other things stay as
+            they were. 1: all, a construction zone and its neighbourhood.
     """
 
     length_m: float = LENGTH_M
     site: SiteName = "border"
     lat_deg: float | None = None
     lon_deg: float | None = None
+    edit_share: float = 1.0
 
     def __post_init__(self) -> None:
-        numbers = [self.length_m, self.lat_deg or 0.0, self.lon_deg or 0.0]
+        numbers = [self.length_m, self.lat_deg or 0.0, self.lon_deg or 0.0, self.edit_share]
         if not all(isinstance(number, (int, float)) for number in numbers):
-            raise WorldError(f"length_m, lat_deg and lon_deg are numbers, got {numbers}")
+            raise WorldError(f"length_m, lat_deg, lon_deg and edit_share are numbers, got {numbers}")
+        if not 0.0 <= self.edit_share <= 1.0:
+            raise WorldError(f"edit_share must be in 0 … 1, got {self.edit_share}")
         if not MIN_LENGTH_M <= self.length_m <= MAX_LENGTH_M:
             raise WorldError(f"a street is {MIN_LENGTH_M:.0f} … {MAX_LENGTH_M:.0f} m long, got {self.length_m}")
         if self.site not in SITES:
@@ -87,6 +92,7 @@ def street(seed: int, options: StreetOptions | None = None) -> World:
     plan = drawn_plan(options.length_m / 2, streams["lots"], site)
     base = built(plan, streams["furniture"], streams["greenery"])
     objects = rebuild(base, plan, PAVEMENT_M, streams["edits"], streams["more"])
+    objects = partly_edited(objects, options.edit_share, streams["share"])
     lat_rad, lon_rad = _anchor(options, heading_rad)
     return World(
         seed=seed,

@@ -16,7 +16,7 @@ from fleet_sim.parts import Lot
 from fleet_sim.street_before import StreetPlan
 from fleet_sim.street_site import Site, x_of, y_of
 from fleet_sim.street_works import add_works
-from fleet_sim.world import Edit, WorldObject
+from fleet_sim.world import STATES, Edit, WorldObject
 
 _END_M: Final = 15.0
 """Nothing is edited so near to the end of the street."""
@@ -52,6 +52,22 @@ def rebuild(
     _furniture(site, reach_m, rng)
     add_works(site, lots, reach_m, more)
     return site.objects
+
+
+def partly_edited(objects: Sequence[WorldObject], share: float, rng: np.random.Generator) -> tuple[WorldObject, ...]:
+    """Take back all edits but a drawn share of them: what was added is not there, all else stays as it was before.
+
+    Args:
+        objects: of both states, as `rebuild` returns them.
+        share: of the things that were edited, 0 … 1; with 1 nothing is taken back and nothing drawn.
+        rng: decides which.
+    """
+    if share >= 1.0:
+        return tuple(objects)
+    names = sorted({o.name for o in objects if o.edit != "kept"})
+    made = {name for name, drawn in zip(names, rng.random(len(names)).tolist(), strict=True) if drawn < share}
+    there = (o for o in objects if o.edit == "kept" or o.name in made or "before" in o.states)
+    return tuple(o if o.edit == "kept" or o.name in made else replace(o, states=STATES, edit="kept") for o in there)
 
 
 def _demolish(site: Site, lot: Lot, index: int, rng: np.random.Generator) -> None:

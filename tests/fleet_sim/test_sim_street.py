@@ -94,6 +94,23 @@ def test_the_site_does_not_change_what_stands_there() -> None:
     assert len({street(5, StreetOptions(site=site)).objects for site in SITES}) == 1
 
 
+def test_a_share_of_the_edits_leaves_the_state_before_and_the_other_edits_as_they_are() -> None:
+    whole, part = street(3, StreetOptions(400.0)), street(3, StreetOptions(400.0, edit_share=0.3))
+    assert {o.name: o.shapes for o in part.in_state("before")} == {o.name: o.shapes for o in whole.in_state("before")}
+    some, all_of_them = edits_of(part), edits_of(whole)
+    assert 0.15 * len(all_of_them) <= len(some) <= 0.45 * len(all_of_them)
+    assert some.items() <= all_of_them.items()
+    made = {o.name for o in part.objects if o.edit != "kept"}
+    after = {o.name: o.shapes for o in part.in_state("after")}
+    assert {n: s for n, s in after.items() if n in made} == {
+        o.name: o.shapes for o in whole.in_state("after") if o.name in made
+    }
+    assert not edits_of(street(3, StreetOptions(400.0, edit_share=0.0)))
+    assert street(3, StreetOptions(400.0, edit_share=0.0)).in_state("after") == tuple(
+        o for o in street(3, StreetOptions(400.0, edit_share=0.0)).objects
+    )
+
+
 @pytest.mark.parametrize(
     ("options", "message"),
     [
@@ -103,6 +120,8 @@ def test_the_site_does_not_change_what_stands_there() -> None:
         ({"length_m": "400"}, "numbers"),
         ({"lat_deg": "north", "lon_deg": 1.0}, "numbers"),
         ({"site": "mars"}, "mars"),
+        ({"edit_share": 1.1}, "edit_share"),
+        ({"edit_share": float("nan")}, "nan"),
         ({"lat_deg": 10.0}, "both"),
         ({"lon_deg": 10.0}, "both"),
         ({"lat_deg": 91.0, "lon_deg": 0.0}, "lat_deg"),
