@@ -59,7 +59,7 @@ def expand(packed: PackedReport, layer: str, district: District, bases: Sequence
     n = sum(len(one.voxel_id) for one in flags)
     if n > limits.MAX_FLAGS_OF_REPORT:
         raise BadReport(f"report {packed.report_id} flags {n} voxels, the limit is {limits.MAX_FLAGS_OF_REPORT}")
-    observed = observed_along(decode_track(district, packed.track), known)
+    observed = observed_along(decode_track(district, packed.track), flags)
     return ChangeReport(
         report_id=packed.report_id,
         vehicle=packed.vehicle,
@@ -69,8 +69,8 @@ def expand(packed: PackedReport, layer: str, district: District, bases: Sequence
         first_ns=packed.first_ns,
         last_ns=packed.last_ns,
         tiles=tuple(
-            _change(packed, tile, sha, one, seen)
-            for tile, sha, one, seen in zip(bases, shas, flags, observed, strict=True)
+            _change(packed, tile, sha, one, observed[tile.tile_id])
+            for tile, sha, one in zip(bases, shas, flags, strict=True)
         ),
         layer=layer,
     )
