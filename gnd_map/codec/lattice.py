@@ -24,11 +24,14 @@ import numpy.typing as npt
 
 from gnd_map.arrays import F32, F64, I32, I64, check_array
 from gnd_map.errors import CodecError, ShapeError
-from gnd_map.gaussian import Gaussians
+from gnd_map.gaussian import MAX_MEAN_M, Gaussians, concat
 
 UNIT_BITS: Final = 20
 """Standard deviations are integers of 2^-20 m."""
 LEVELS: Final = 48
+MAX_SD_M: Final = 4
+MAX_LENGTH_M: Final = 16
+"""Of an entry of L: products of such entries fit 64 bits."""
 MAX_SLOPE: Final = 4095
 MAX_STEP: Final = 8191
 CELLS: Final = 20
@@ -78,7 +81,7 @@ class Lattice:
 
 def _levels(first_m: float, ratio: float) -> tuple[int, ...]:
     """Frozen by `tests/gnd_map/test_lattice.py`: another machine's `pow` must not move them."""
-    return tuple(round(first_m * ratio**k * 2**UNIT_BITS) for k in range(LEVELS))
+    return tuple(min(round(first_m * ratio**k * 2**UNIT_BITS), MAX_SD_M << UNIT_BITS) for k in range(LEVELS))
 
 
 ARCHIVE: Final = Lattice("archive", 0, _levels(0.002, 1.15), 1, 3, 3, 3, 3)
@@ -148,6 +151,9 @@ def dequantise(quantised: Quantised, lattice: Lattice) -> Gaussians:
         CodecError: a column leaves its range, or the values are no Gaussians (means beyond 2 m ...).
     """
     quantised.check(lattice)
+    longest = int((~_is_short(quantised, lattice)).sum())
+    if longest:
+        raise CodecError(f"lattice {lattice.name}: {longest} of {len(quantised)} Gaussians reach {MAX_LENGTH_M} m")
     mean_m, cov_m2 = _floats(quantised, lattice)
     count = COUNTS[quantised.count].astype(np.int32)
     try:
@@ -179,12 +185,54 @@ def snap(gaussians: Gaussians, lattice: Lattice) -> Gaussians:
     off = np.flatnonzero(~_found(some, lattice)[1])
     if len(off) == 0:
         return gaussians
-    moved = dequantise(quantise(some.take(off), lattice), lattice)
-    columns = tuple(column.copy() for column in gaussians.columns)
-    at = np.flatnonzero(there)[off]
-    for column, new in zip(columns, moved.columns, strict=True):
-        column[at] = new
-    return Gaussians(*columns)
+    moved = dequantise(_readable(some.take(off), lattice), lattice)
+    kept = np.delete(np.arange(len(gaussians)), np.flatnonzero(there)[off])
+    return concat([gaussians.take(kept), moved])
+
+
+def _readable(gaussians: Gaussians, lattice: Lattice) -> Quantised:
+    """The nearest integers that can be read back from their float32 and are Gaussians: as it is, else rounder and
+    finally without tilt (extremes only: lines, points, variances beyond any voxel's, means at the limit).
+    """
+    found = quantise(gaussians, lattice)
+    for simpler in (_rounder, _upright):
+        rows = np.flatnonzero(~_can_be_read(found, lattice))
+        if len(rows) == 0:
+            break
+        other = quantise(simpler(gaussians.take(rows)), lattice)
+        for field in fields(found):
+            getattr(found, field.name)[rows] = getattr(other, field.name)
+    return found
+
+
+def _can_be_read(quantised: Quantised, lattice: Lattice) -> npt.NDArray[np.bool_]:
+    """(N,) whether the integers stand for a Gaussian that gives itself back."""
+    good = _is_short(quantised, lattice)
+    mean_m, _ = _floats(quantised, lattice)
+    good &= (np.abs(mean_m) <= MAX_MEAN_M).all(axis=1)
+    rows = np.flatnonzero(good)
+    good[rows] = _found(dequantise(quantised.take(rows), lattice), lattice)[1]
+    return good
+
+
+def _rounder(gaussians: Gaussians) -> Gaussians:
+    """A millimetre more along every axis, means well inside."""
+    mean_m = np.clip(gaussians.mean_m, -_INSIDE_M, _INSIDE_M)
+    cov_m2 = gaussians.cov_m2.copy()
+    cov_m2[:, [0, 3, 5]] += np.float32(1e-6)
+    return Gaussians(gaussians.voxel_id, gaussians.count, gaussians.cells, mean_m, cov_m2)
+
+
+def _upright(gaussians: Gaussians) -> Gaussians:
+    """Without tilt, the mean so near the centre that no rounding carries it out of bounds."""
+    cov_m2 = gaussians.cov_m2.copy()
+    cov_m2[:, [1, 2, 4]] = 0.0
+    cov_m2[:, [0, 3, 5]] = np.minimum(cov_m2[:, [0, 3, 5]], 1.0)
+    mean_m = np.clip(gaussians.mean_m, -_INSIDE_M, _INSIDE_M)
+    return Gaussians(gaussians.voxel_id, gaussians.count, gaussians.cells, mean_m, cov_m2)
+
+
+_INSIDE_M: Final = 1.0
 
 
 def is_on(gaussians: Gaussians, lattice: Lattice) -> bool:
@@ -242,7 +290,7 @@ def _thin_axis(cov: F64) -> I32:
         cov[:, (i + 1) % 3, (i + 1) % 3] * cov[:, (i + 2) % 3, (i + 2) % 3] - cov[:, (i + 1) % 3, (i + 2) % 3] ** 2
         for i in range(3)
     ]
-    return np.argmax(np.stack(cofactors, axis=1), axis=1).astype(np.int32)
+    return np.asarray(np.argmax(np.stack(cofactors, axis=1), axis=1), np.int32)
 
 
 def _permuted(cov: F64, axis: I32) -> list[list[F64]]:
@@ -259,7 +307,7 @@ def _level(sd_m: F64, lattice: Lattice, is_plane: bool) -> I32:
 
 def _diagonal(level: I32, lattice: Lattice) -> list[F64]:
     """L_aa, L_bb, L_cc in metres."""
-    return [column * 2.0**-lattice.length_bits for column in _diagonal_units(level, lattice)]
+    return [np.asarray(column * 2.0**-lattice.length_bits) for column in _diagonal_units(level, lattice)]
 
 
 def _diagonal_units(level: I32, lattice: Lattice) -> list[I64]:
@@ -286,6 +334,13 @@ def _lengths(level: I32, slope: I32, lattice: Lattice) -> _Lower:
         s[:, 2] * c >> lattice.slope_bits,
         c,
     )
+
+
+def _is_short(quantised: Quantised, lattice: Lattice) -> npt.NDArray[np.bool_]:
+    """(N,) whether no entry of L is longer than MAX_LENGTH_M."""
+    longest = MAX_LENGTH_M << lattice.length_bits
+    lower = np.stack(_lengths(quantised.level, quantised.slope, lattice))
+    return np.asarray((np.abs(lower) <= longest).all(axis=0))
 
 
 def _means(L: _Lower, step: I32, lattice: Lattice) -> tuple[I64, I64, I64]:
@@ -369,5 +424,6 @@ def _gives_back(quantised: Quantised, gaussians: Gaussians, lattice: Lattice) ->
     mean_m, cov_m2 = _floats(quantised, lattice)
     count = COUNTS[quantised.count]
     same = (count == gaussians.count) & (np.minimum(count, CELLS) == gaussians.cells)
+    same &= _is_short(quantised, lattice)
     same &= (mean_m == gaussians.mean_m).all(axis=1) & (cov_m2 == gaussians.cov_m2).all(axis=1)
     return np.asarray(same)
