@@ -10,7 +10,9 @@ from typing import Final
 from cloud_merger.ownership import Members
 from fleet_bus.bus import Bus
 from fleet_bus.subscribing import RecallingPublisher
-from gnd_map.tile import TileDelta, diff
+from gnd_map.codec import encode_delta
+from gnd_map.errors import CodecError
+from gnd_map.tile import diff
 from schemas.errors import SchemaError, TooLarge
 from schemas.keys import update_key
 from schemas.updates import TileUpdate
@@ -61,7 +63,7 @@ class Announcer:
 
 def update_of(stored: StoredTile, parent: StoredTile | None) -> TileUpdate:
     """The notice of a version; without its parent (new tile, or gone from the store) it carries no delta."""
-    return TileUpdate(
+    update = TileUpdate(
         tile=stored.tile,
         layer=stored.layer,
         version=stored.version,
@@ -69,16 +71,21 @@ def update_of(stored: StoredTile, parent: StoredTile | None) -> TileUpdate:
         sha=stored.sha,
         previous_sha=parent.sha if parent else b"",
         reason=stored.kind,
-        delta=_delta(stored, parent) if parent else None,
     )
+    return _with_delta(update, stored, parent) if parent else update
 
 
-def _delta(stored: StoredTile, parent: StoredTile) -> TileDelta | None:
+def _with_delta(update: TileUpdate, stored: StoredTile, parent: StoredTile) -> TileUpdate:
     try:
-        return diff(parent.decode().gaussians, stored.decode().gaussians)
-    except SchemaError as error:  # one damaged body must not keep the notices of all other tiles
+        before, after = parent.decode().gaussians, stored.decode().gaussians
+        coded = encode_delta(stored.tile, before, after)
+        changes = diff(before, after)
+        return replace(update, coded_delta=coded, put_voxels=len(changes.put), removed_voxels=len(changes.removed))
+    except TooLarge:
+        return update
+    except (SchemaError, CodecError) as error:  # one damaged body must not keep the notices of all other tiles
         _LOG.error("%s version %d is announced without a delta: %s", stored.tile, stored.version, error)
-        return None
+        return update
 
 
 def encoded(update: TileUpdate) -> bytes:
@@ -86,4 +93,4 @@ def encoded(update: TileUpdate) -> bytes:
     try:
         return update.encode()
     except TooLarge:
-        return replace(update, delta=None).encode()
+        return replace(update, delta=None, coded_delta=b"", put_voxels=0, removed_voxels=0).encode()

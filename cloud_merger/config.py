@@ -11,7 +11,7 @@ from cloud_merger.ingest import IngestLimits
 from cloud_merger.merge import MergeParameters
 from fleet_bus.config import DEFAULT_ENDPOINT
 from gnd_map.config import from_mapping
-from tile_store.values import StoreConfig
+from tile_store.values import DEFAULT_CODEC, StoreConfig, lattice_named
 
 _SHARD_ID: Final = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,63}")
 
@@ -28,6 +28,8 @@ class ShardConfig:
         merge: how statements become changes.
         ingest: which reports are refused.
         store: batching of the store.
+        codec: how finely the Gaussians of tiles are rounded that no base map holds ("float": not at all); all shards of
+            a store use the same. Other tiles stay as fine as their base.
         tiles_at_once: tiles claimed and published together.
         lease_s: how long a claim holds; longer than a merge of `tiles_at_once` tiles takes.
         poll_s: how often to look for tiles and notices when nothing arrives here.
@@ -43,6 +45,7 @@ class ShardConfig:
     merge: MergeParameters = field(default_factory=MergeParameters)
     ingest: IngestLimits = field(default_factory=IngestLimits)
     store: StoreConfig = field(default_factory=StoreConfig)
+    codec: str = DEFAULT_CODEC
     tiles_at_once: int = 16
     lease_s: float = 30.0
     poll_s: float = 0.2
@@ -53,6 +56,7 @@ class ShardConfig:
     def __post_init__(self) -> None:
         if not _SHARD_ID.fullmatch(self.shard_id):
             raise MergerError(f"shard id {self.shard_id!r} must be 1 to 64 of letters, digits, '.', '_', '-'")
+        lattice_named(self.codec)
         if min(self.tiles_at_once, self.max_attempts, self.announce_at_once) < 1:
             raise MergerError("tiles_at_once, max_attempts and announce_at_once must be at least 1")
         if min(self.lease_s, self.poll_s) <= 0 or self.retry_s < 0:

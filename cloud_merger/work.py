@@ -9,12 +9,13 @@ from typing import Final
 from cloud_merger.config import ShardConfig
 from cloud_merger.merge import merge_tile
 from cloud_merger.statements import Report, statements_of
+from gnd_map.codec import Lattice, is_on, lattice_of, snap
 from gnd_map.gaussian import Gaussians
 from gnd_map.tile import Tile
 from schemas.changes import ChangeReport, TileChange
 from schemas.errors import SchemaError
 from tile_store.store import Store
-from tile_store.values import Claim, Publication, ReportRow, TileWork
+from tile_store.values import Claim, Publication, ReportRow, TileWork, lattice_named
 
 REMEMBERED_REPORTS: Final = 1024  # some 20 kB each
 _LOG = logging.getLogger(__name__)
@@ -56,8 +57,9 @@ class Worker:
         reports = [report for row in work.reports if (report := self._report(row)) is not None]
         statements = statements_of(epoch, reports, self._bases(work), self._config.merge.mode)
         merged = merge_tile(epoch, statements, self._config.merge)
-        tile = Tile(work.claim.tile, work.base_version + 1, merged.gaussians)
-        is_new = tile.sha != work.head.sha if work.head else len(merged.gaussians) > 0
+        gaussians = on_lattice(merged.gaussians, self._lattice(work, epoch))
+        tile = Tile(work.claim.tile, work.base_version + 1, gaussians)
+        is_new = tile.sha != work.head.sha if work.head else len(gaussians) > 0
         return Publication(
             claim=work.claim,
             base_version=work.base_version,
@@ -65,6 +67,17 @@ class Worker:
             report_ids=_ids(work),
             voxel_reports=merged.provenance,
         )
+
+    def _lattice(self, work: TileWork, epoch: Gaussians) -> Lattice | None:
+        """Where the merged tile lies: on the lattice of the epoch; a tile that the map has not yet, on the configured.
+
+        The epoch lies on the configured one wherever that can be (few Gaussians may lie on several), and a map of plain
+        floats stays one: so every version is as fine as the base map was made.
+        """
+        configured = lattice_named(self._config.codec)
+        if work.epoch is None or len(epoch) == 0 or (configured is not None and is_on(epoch, configured)):
+            return configured
+        return lattice_of(work.epoch.codec_id)
 
     def _report(self, row: ReportRow) -> Report | None:
         """What a stored report says; nothing when it can no longer be read (its vehicle has long had its ack)."""
@@ -90,6 +103,11 @@ class Worker:
         body = "\n".join([f"{work.claim.layer} {work.claim.tile}", *_ids(work)])
         self._store.quarantine(body.encode(), reason, source="merge")
         return Publication(work.claim, work.base_version, None, report_ids=_ids(work))
+
+
+def on_lattice(gaussians: Gaussians, lattice: Lattice | None) -> Gaussians:
+    """The Gaussians moved onto the lattice, those that lie on it untouched; as they are for None."""
+    return gaussians if lattice is None else snap(gaussians, lattice)
 
 
 @lru_cache(maxsize=REMEMBERED_REPORTS)

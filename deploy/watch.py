@@ -133,7 +133,7 @@ class TileWatch:
 
 
 def _event_of(update: TileUpdate, size: int) -> WatchEvent:
-    delta = update.delta
+    put, removed = update.voxels or (None, None)
     return WatchEvent(
         received_ns=time.time_ns(),
         layer=update.layer,
@@ -142,8 +142,8 @@ def _event_of(update: TileUpdate, size: int) -> WatchEvent:
         version=update.version,
         previous_version=update.previous_version,
         reason=update.reason,
-        put=None if delta is None else len(delta.put.voxel_id),
-        removed=None if delta is None else len(delta.removed),
+        put=put,
+        removed=removed,
         size=size,
     )
 
