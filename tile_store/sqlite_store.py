@@ -105,6 +105,16 @@ class SqliteStore:
         with self._readers.snapshot() as c:
             return inbox.page(c, layer, vehicle, after, REPORTS_A_PAGE)
 
+    def in_play(
+        self, layer: str, tile: TileId, max_reports: int | None = None
+    ) -> tuple[StoredTile | None, tuple[ReportRow, ...]]:
+        """See `Store.in_play`."""
+        n = self._config.max_reports if max_reports is None else max_reports
+        with self._readers.snapshot() as c:
+            epoch = versions.epoch_of(c, layer, tile)
+            base = versions.stored(c, "stored_version", layer, tile, version=epoch) if epoch else None
+            return base, inbox.in_play(c, layer, tile, epoch, n)
+
     def quarantine(self, body: bytes, reason: str, source: str = "") -> None:
         """See `Store.quarantine`."""
         row = {"sha": sha256(body).digest(), "source": source, "reason": reason, "body": body}

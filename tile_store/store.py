@@ -42,6 +42,13 @@ class Store(Protocol):
     def reports(self, layer: str = DEFAULT_LAYER, vehicle: str | None = None) -> Iterator[ReportRow]:
         """All reports of a layer (and of one vehicle) in order of arrival, read in pages."""
 
+    def in_play(
+        self, layer: str, tile: TileId, max_reports: int | None = None
+    ) -> tuple[StoredTile | None, tuple[ReportRow, ...]]:
+        """A tile's epoch and the newest `max_reports` reports that count since, merged or not, sorted by report id; read
+        at one instant. No epoch: the map has no such tile.
+        """
+
     def quarantine(self, body: bytes, reason: str, source: str = "") -> None:
         """Keep refused bytes with the reason; the same bytes again are only counted."""
 
