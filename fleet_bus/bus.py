@@ -209,6 +209,11 @@ class Bus:
             self.ledger.record_wire(wire)
         return wire
 
+    @property
+    def connections(self) -> int:
+        """How many connections to a router there have been: more than before = notices were missed (Linux)."""
+        return self._connection.meter.read().connections
+
     def is_connected(self) -> bool:
         """Whether a router is at the other end right now; a lost one is looked for without being asked."""
         return self._connection.is_connected()

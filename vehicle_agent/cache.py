@@ -1,11 +1,14 @@
 """Tiles on disk: what was downloaded once is asked for only by its version and hash.
 
-Every read is verified against the hash that was published; a tile that fails is dropped, and the caller downloads it
-again. The cache may be deleted at any time.
+Bodies are kept as they arrived, in whatever codec. Every read is verified against the hash that was published; a tile
+that fails is dropped, and the caller downloads it again. The cache is all that a download needs to go on after a lost
+link or a kill; it may be deleted at any time.
 """
 
+from collections.abc import Iterable
 from pathlib import Path
 
+from gnd_map.codec import best_codec
 from gnd_map.errors import GndError
 from gnd_map.tile import Tile
 from gnd_map.tile_id import TileId
@@ -23,6 +26,12 @@ CREATE TABLE IF NOT EXISTS tile (
     body     BLOB NOT NULL,
     PRIMARY KEY (layer, morton)
 ) STRICT, WITHOUT ROWID;
+"""
+KEEP = """
+INSERT INTO tile VALUES (?1, ?2, ?3, ?4, ?5, ?6)
+ON CONFLICT (layer, morton) DO UPDATE
+SET version = excluded.version, sha = excluded.sha, codec_id = excluded.codec_id, body = excluded.body
+WHERE tile.sha = ?7 OR tile.version < excluded.version
 """
 
 
@@ -53,11 +62,25 @@ class TileCache:
         rows = self._db.run("SELECT version, sha FROM tile WHERE layer = ? AND morton = ?", self._of(tile_id))
         return (int(rows[0][0]), bytes(rows[0][1])) if rows else (0, b"")
 
-    def put(self, tile: Tile) -> None:
-        """Keep `tile` in place of any older version."""
-        blob = blob_of(tile)
-        row = (*self._of(tile.tile_id), blob.version, blob.sha, blob.codec_id, blob.body)
-        self._db.run("INSERT OR REPLACE INTO tile VALUES (?, ?, ?, ?, ?, ?)", row)
+    def heads(self, tiles: Iterable[TileId]) -> dict[TileId, tuple[int, bytes]]:
+        """(version, sha) of those tiles that are here."""
+        found = ((tile_id, self.head(tile_id)) for tile_id in tiles)
+        return {tile_id: head for tile_id, head in found if head[0]}
+
+    def keep(self, blob: TileBlob, over: bytes = b"") -> bool:
+        """Keep a tile as it arrived, unless something newer came meanwhile; False then, and nothing is changed.
+
+        Args:
+            blob: what arrived; its content has been verified.
+            over: sha of the version that was here when it was asked for: that one is replaced whatever its number
+                (a store that was built anew counts from 1).
+        """
+        row = (*self._of(blob.tile), blob.version, blob.sha, blob.codec_id, blob.body, over)
+        return self._db.changes(KEEP, row) > 0
+
+    def put(self, tile: Tile, over: bytes = b"") -> bool:
+        """As `keep`, for a tile made here; its body is as small as the tile allows."""
+        return self.keep(blob_of(tile, best_codec(tile.gaussians)), over)
 
     def drop(self, tile_id: TileId) -> None:
         """Forget a tile; not here: nothing happens."""

@@ -19,7 +19,15 @@ class DownloadParameters:
     near_m: float = 60.0
     """Tiles this near are held in memory, and needed now: beyond the range of detection."""
     ahead_m: float = 120.0
-    """How far along the heading tiles are asked for in advance."""
+    """How far along the heading tiles are asked for in advance, at least."""
+    ahead_s: float = 15.0
+    """The same in time: a faster vehicle looks farther."""
+    lead_s: float = 6.0
+    """A question is sent when something is needed within this time; with it goes all that is ahead."""
+    batch_s: float = 0.25
+    """One answer holds what the link carries in this time (4 to 128 kB): something more urgent waits no longer."""
+    link_share: float = 0.8
+    """Part of the link's rate that the plan counts on."""
     in_flight: int = 8
     """Requests at a time; one at a time leaves a 5G link at 15 %."""
     request_s: float = 20.0
@@ -35,6 +43,10 @@ class DownloadParameters:
         """Distances in order, at least one request in flight."""
         if not 0 < self.near_m <= self.forget_m or self.ahead_m < 0:
             raise AgentConfigError(f"near_m = {self.near_m}, ahead_m = {self.ahead_m}, forget_m = {self.forget_m} m")
+        if not 0 <= self.lead_s <= self.ahead_s:
+            raise AgentConfigError(f"lead_s = {self.lead_s} s must lie between 0 and ahead_s = {self.ahead_s} s")
+        if not (0 < self.link_share <= 1 and self.batch_s > 0):
+            raise AgentConfigError(f"link_share = {self.link_share} (0 ... 1), batch_s = {self.batch_s} s")
         if not 1 <= self.in_flight <= 64:
             raise AgentConfigError(f"in_flight = {self.in_flight} lies outside 1 ... 64")
 

@@ -1,57 +1,57 @@
-"""Tiles from the tile server: nearest first, several requests in flight, only what the cache lacks."""
+"""Tiles from the tile server: soonest needed first, in batches of one district, several on their way at a time."""
 
 import logging
 import threading
 import time
 from collections import Counter
-from collections.abc import Collection, Sequence
-from dataclasses import dataclass
-from typing import Literal
+from collections.abc import Collection, Iterable, Sequence
 
 from fleet_bus.bus import Bus
 from fleet_bus.errors import BusClosed
+from fleet_bus.links import LinkProfile
 from gnd_map.tile import Tile
 from gnd_map.tile_id import TileId
-from schemas.errors import WrongHash
-from schemas.keys import tile_key
-from schemas.tiles import TileReply, TileRequest, tile_of
 from vehicle_agent.cache import TileCache
 from vehicle_agent.config import DownloadParameters
+from vehicle_agent.exchange import Exchange, Fetched, Outcome
+from vehicle_agent.plan import batch_bytes
+
+__all__ = ["Fetched", "TileFetcher"]
 
 POLL_S = 0.25
 WRONG_TRIES = 3
+MOST_TILES = 1024  # of one district
+FIRST_GUESS_BYTES = 4_096
+HELD_GUESS_BYTES = 64
 
 _log = logging.getLogger(__name__)
-
-
-@dataclass(frozen=True, slots=True)
-class Fetched:
-    """The answer about one tile: `blob` (downloaded), `unchanged` (the cached one holds), `absent` (the store has none)
-    or `cached` (no answer, the cached one will have to do).
-    """
-
-    tile_id: TileId
-    status: Literal["blob", "unchanged", "absent", "cached"]
-    tile: Tile | None
 
 
 class TileFetcher:
     """Worker threads that ask for the tiles that are wanted, in the order given; answers wait to be taken.
 
-    A tile is asked for once until `forget` or `refresh`. A tile whose content does not have its hash is refused and
-    asked for again without the cache; no answer at all gives the cached tile, if there is one, and another try later.
+    A tile is asked for once until `forget`, `refresh` or `recheck`. A tile whose content does not have its hash is
+    refused and asked for again without the cache; no answer at all gives the cached tile, if there is one, and another
+    try later. What has arrived is in the cache at once, so an agent that was killed goes on where it was.
     """
 
     def __init__(self, bus: Bus, cache: TileCache, parameters: DownloadParameters) -> None:
         self.counts: Counter[str] = Counter()
         self.last_error = ""
-        self._bus, self._cache, self._parameters = bus, cache, parameters
+        self.link: LinkProfile = bus.config.link_profile
+        self._cache, self._parameters = cache, parameters
+        self._exchange = Exchange(bus, cache, parameters.request_s)
+        self._batch_bytes = batch_bytes(self.link.rate_byte_s("down"), parameters.batch_s)
         self._changed = threading.Condition()
+        self._wanted: tuple[TileId, ...] = ()
         self._waiting: list[TileId] = []
         self._not_before: dict[TileId, float] = {}
         self._in_flight: set[TileId] = set()
+        self._again: set[TileId] = set()  # in flight, and already known to have changed
         self._answered: set[TileId] = set()
-        self._stale: set[TileId] = set()
+        self._stale: set[TileId] = set()  # answered, but to be asked for again
+        self._wrong: Counter[TileId] = Counter()
+        self._whole = _Mean(FIRST_GUESS_BYTES)
         self._arrived: list[Fetched] = []
         self._closed = False
         self._threads = [
@@ -63,22 +63,27 @@ class TileFetcher:
     def want(self, tiles: Sequence[TileId]) -> None:
         """These tiles are wanted, the first one most; what was wanted before and is not among them no longer is."""
         with self._changed:
-            done = (self._answered - self._stale) | self._in_flight
-            self._waiting = [t for t in tiles if t not in done]
-            self._changed.notify_all()
+            self._wanted = tuple(tiles)
+            self._line_up()
 
     def refresh(self, tile_id: TileId) -> None:
-        """Ask for a tile again, before all others."""
-        with self._changed:
-            self._answered.discard(tile_id)
-            self._not_before.pop(tile_id, None)
-            self._waiting = [tile_id, *(t for t in self._waiting if t != tile_id)]
-            self._changed.notify_all()
+        """A tile that was answered has changed: ask for it again, before all others, while it is wanted.
 
-    def refresh_if_answered(self, tile_id: TileId) -> None:
-        """As `refresh`, for a tile that was asked for before; others are asked for when they are wanted."""
-        if tile_id in self._answered:
-            self.refresh(tile_id)
+        One that is not wanted is asked for when it is wanted again.
+        """
+        with self._changed:
+            if tile_id in self._in_flight:
+                self._again.add(tile_id)
+            elif tile_id in self._answered:
+                self._stale.add(tile_id)
+                self._not_before.pop(tile_id, None)
+                self._line_up(first=tile_id)
+
+    def recheck(self) -> None:
+        """Any tile may have changed unheard: ask for all that are wanted again."""
+        with self._changed:
+            self._stale |= self._answered
+            self._line_up()
 
     def forget(self, tile_id: TileId) -> None:
         """The tile was let go: the next `want` asks for it again."""
@@ -91,6 +96,17 @@ class TileFetcher:
         with self._changed:
             arrived, self._arrived = self._arrived, []
             return arrived
+
+    def is_known(self, tile_id: TileId) -> bool:
+        """Whether there is or will be an answer without asking anew."""
+        with self._changed:
+            return tile_id in self._in_flight or (tile_id in self._answered and tile_id not in self._stale)
+
+    def size_bytes(self, tile_id: TileId) -> float:
+        """What the answer about a tile is likely to weigh: of one that is held little, of one not held the mean."""
+        if self.is_known(tile_id):
+            return 0.0
+        return HELD_GUESS_BYTES if self._cache.head(tile_id)[0] else self._whole.value
 
     def wait_for(self, tiles: Collection[TileId], timeout_s: float, stop: threading.Event) -> set[TileId]:
         """Wait until all of `tiles` are answered, time is up or `stop` is set; returns those that are not answered."""
@@ -111,97 +127,123 @@ class TileFetcher:
         for thread in self._threads:
             thread.join()
 
-    def _work(self) -> None:
-        while (tile_id := self._next()) is not None:
-            answer = self._try(tile_id)
-            with self._changed:
-                self._in_flight.discard(tile_id)
-                self._settle(tile_id, answer)
-                self._changed.notify_all()
+    def _line_up(self, first: TileId | None = None) -> None:
+        """What is wanted and not known waits, in order. The lock is held."""
+        done = (self._answered - self._stale) | self._in_flight
+        self._waiting = sorted((t for t in self._wanted if t not in done), key=lambda t: t != first)
+        self._changed.notify_all()
 
-    def _next(self) -> TileId | None:
-        """The first tile that may be asked for now; None when closed."""
+    def _work(self) -> None:
+        while batch := self._next():
+            outcome = self._try(batch)
+            done = {fetched.tile_id for fetched in outcome.fetched}
+            instead = self._cached(t for t in batch if t not in done) if not self._closed else {}
+            with self._changed:
+                self._in_flight.difference_update(batch)
+                self._settle_all(batch, outcome, instead)
+                self._line_up()
+
+    def _next(self) -> list[TileId]:
+        """The tiles of the next question: the first that may be asked for now, and more of its district; empty when
+        closed.
+        """
         with self._changed:
             while not self._closed:
                 now_s = time.monotonic()
-                for tile_id in self._waiting:
-                    if self._not_before.get(tile_id, 0.0) <= now_s:
-                        self._waiting.remove(tile_id)
-                        self._in_flight.add(tile_id)
-                        return tile_id
+                ready = [t for t in self._waiting if self._not_before.get(t, 0.0) <= now_s]
+                if ready:
+                    batch = self._fitting(t for t in ready if t.district == ready[0].district)
+                    self._waiting = [t for t in self._waiting if t not in batch]
+                    self._in_flight.update(batch)
+                    return batch
                 self._changed.wait(POLL_S)
-            return None
+            return []
 
-    def _settle(self, tile_id: TileId, answer: Fetched | None) -> None:
-        """Note an answer; without one the tile waits for its next try."""
-        if answer is None or answer.status == "cached":
-            self._not_before[tile_id] = time.monotonic() + self._parameters.retry_s
-            self._waiting.append(tile_id)
-            if answer is None or tile_id in self._stale:
-                return
-            self._stale.add(tile_id)
-        else:
-            self._stale.discard(tile_id)
-        self.counts[answer.status] += 1
-        self._answered.add(tile_id)
-        self._arrived.append(answer)
+    def _fitting(self, tiles: Iterable[TileId]) -> list[TileId]:
+        """The first of `tiles`, and those after it that fit into one answer."""
+        batch: list[TileId] = []
+        expected_bytes = 0.0
+        for tile_id in tiles:
+            expected_bytes += HELD_GUESS_BYTES if self._cache.head(tile_id)[0] else self._whole.value
+            if batch and (expected_bytes > self._batch_bytes or len(batch) == MOST_TILES):
+                break
+            batch.append(tile_id)
+        return batch
 
-    def _try(self, tile_id: TileId) -> Fetched | None:
+    def _try(self, batch: list[TileId]) -> Outcome:
+        with self._changed:
+            whole = {tile_id for tile_id in batch if self._wrong[tile_id]}
         try:
-            return self._fetch(tile_id)
+            return self._exchange.ask(batch, whole, self._batch_bytes)
         except BusClosed:
-            return None
+            return Outcome()
         except Exception as error:  # whatever it was: a worker that ends would never fetch again
-            self._note("failed", f"tile {tile_id}: {error}")
-            cached = self._cache.get(tile_id)
-            return None if cached is None else Fetched(tile_id, "cached", cached)
+            self._note("failed", f"{len(batch)} tiles from {batch[0]} on: {error}")
+            return Outcome()
 
-    def _fetch(self, tile_id: TileId) -> Fetched:
-        """Ask until the content is what its hash says.
+    def _cached(self, tiles: Iterable[TileId]) -> dict[TileId, Tile]:
+        """The cached ones of `tiles` that nobody has been given yet."""
+        found = ((t, self._cache.get(t)) for t in tiles if t not in self._answered)
+        return {tile_id: tile for tile_id, tile in found if tile is not None}
 
-        Raises:
-            BusError: no answer before the deadline.
-            WrongHash: the content was wrong three times.
-            SchemaError: the answer is no tile.
-        """
-        for attempt in range(WRONG_TRIES):
-            request = self._request_for(tile_id, with_cache=attempt == 0)
-            try:
-                return self._ask(tile_id, request)
-            except WrongHash as error:
-                self._note("refused", str(error))
-                if attempt == WRONG_TRIES - 1:
-                    raise
-        raise AssertionError("the loop returns or raises")
+    def _settle_all(self, batch: list[TileId], outcome: Outcome, instead: dict[TileId, Tile]) -> None:
+        """Note the answers; what has none waits for its next try. The lock is held."""
+        for fetched in outcome.fetched:
+            self._settle(fetched)
+            self._whole.add(outcome.body_bytes.get(fetched.tile_id, 0 if fetched.status == "absent" else None))
+        refused = {tile_id for tile_id, why in outcome.wrong.items() if self._refuse(tile_id, why)}
+        without = refused if outcome.fetched or outcome.wrong else set(batch)  # no progress: knock after a pause only
+        for tile_id in without:
+            self._do_without(tile_id, instead.get(tile_id))
 
-    def _request_for(self, tile_id: TileId, *, with_cache: bool) -> TileRequest:
-        version, sha = self._cache.head(tile_id) if with_cache else (0, b"")
-        return TileRequest(version, sha)
+    def _settle(self, fetched: Fetched) -> None:
+        tile_id = fetched.tile_id
+        del self._wrong[tile_id]
+        self.counts[fetched.status] += 1
+        self._answered.add(tile_id)
+        self._arrived.append(fetched)
+        self._stale.discard(tile_id)
+        if tile_id in self._again:
+            self._again.discard(tile_id)
+            self._stale.add(tile_id)
 
-    def _ask(self, tile_id: TileId, request: TileRequest) -> Fetched:
-        key = tile_key(self._cache.layer, tile_id)
-        timeout_s = self._parameters.request_s
-        reply = TileReply.decode(
-            self._bus.request(key, request.encode(), kind="tile", tile=tile_id, timeout_s=timeout_s)
-        )
-        if reply.status == "absent":
-            return Fetched(tile_id, "absent", None)
-        if reply.blob is None:
-            return Fetched(tile_id, "unchanged", self._from_cache(tile_id))
-        tile = tile_of(reply.blob)
-        if tile.tile_id != tile_id:
-            raise WrongHash(f"asked for tile {tile_id}, got tile {tile.tile_id}; fetch it again")
-        self._cache.put(tile)
-        return Fetched(tile_id, "blob", tile)
+    def _do_without(self, tile_id: TileId, cached: Tile | None) -> None:
+        """No answer: the cached tile has to do, once, and the tile is asked for again after a pause."""
+        self._not_before[tile_id] = time.monotonic() + self._parameters.retry_s
+        if cached is not None:
+            self._stale.add(tile_id)
+            self._answered.add(tile_id)
+            self.counts["cached"] += 1
+            self._arrived.append(Fetched(tile_id, "cached", cached))
 
-    def _from_cache(self, tile_id: TileId) -> Tile:
-        tile = self._cache.get(tile_id)
-        if tile is None:
-            raise WrongHash(f"tile {tile_id}: the cached copy does not have its hash; fetch it again")
-        return tile
+    def _refuse(self, tile_id: TileId, why: str) -> bool:
+        """The content was wrong: ask for the whole tile; True = a pause is due, that did not help."""
+        self._note("refused", why)
+        self._wrong[tile_id] += 1
+        hopeless = self._wrong[tile_id] % WRONG_TRIES == 0
+        if hopeless:
+            self._note("failed", why)
+        return hopeless
 
     def _note(self, what: str, message: str) -> None:
         with self._changed:
             self.counts[what] += 1
             self.last_error = message
         _log.warning("%s", message)
+
+
+class _Mean:
+    """Mean size of what came whole, absent ones as 0; begins with a guess that counts as one."""
+
+    def __init__(self, guess: float) -> None:
+        self._sum, self._n = guess, 1
+
+    def add(self, size_bytes: int | None) -> None:
+        """None = nothing came."""
+        if size_bytes is not None:
+            self._sum += size_bytes
+            self._n += 1
+
+    @property
+    def value(self) -> float:
+        return self._sum / self._n

@@ -8,6 +8,7 @@ from gnd_map.arrays import F64
 from gnd_map.geodesy import LocalFrame
 from schemas.drive import DriveItem, GnssFix, MotionSample
 from vehicle_agent.localise.estimates import PoseEstimate
+from vehicle_agent.plan import Course
 
 LONGEST_STEP_S = 1.0  # a gap in the wheel speed is not driven
 HEADING_BASE_M = 3.0  # satellites give a heading from fixes this far apart
@@ -20,6 +21,7 @@ class Place:
         self.frame = frame
         self.t_ns = fix.t_ns
         self.odometer_m = 0.0
+        self.speed_mps = 0.0
         self.health = "lost"
         self.position_map_m = self._enu(fix)
         self.heading_rad: float | None = None
@@ -39,11 +41,20 @@ class Place:
             self._believe_satellites(item)
         self.health = online.health if online is not None else "lost"
 
+    @property
+    def course(self) -> Course:
+        """Where the vehicle goes; in reverse gear the way that it came."""
+        x_m, y_m = self.position_map_m[:2].tolist()
+        back_rad = math.pi if self.speed_mps < 0 else 0.0
+        heading_rad = None if self.heading_rad is None else self.heading_rad + back_rad
+        return Course(x_m, y_m, heading_rad, abs(self.speed_mps))
+
     def ahead_map_m(self, distance_m: float) -> F64:
-        """(2, 3) here and `distance_m` farther along the heading; (1, 3) while the heading is not known."""
-        if self.heading_rad is None:
+        """(2, 3) here and `distance_m` farther along the course; (1, 3) while the heading is not known."""
+        heading_rad = self.course.heading_rad
+        if heading_rad is None:
             return self.position_map_m[None]
-        step = distance_m * np.array([math.cos(self.heading_rad), math.sin(self.heading_rad), 0.0])
+        step = distance_m * np.array([math.cos(heading_rad), math.sin(heading_rad), 0.0])
         return np.stack([self.position_map_m, self.position_map_m + step])
 
     @property
@@ -58,6 +69,7 @@ class Place:
         return float(lat[0]), float(lon[0])
 
     def _drive(self, sample: MotionSample) -> None:
+        self.speed_mps = sample.speed_mps
         if self._motion_ns is not None:
             step_s = (sample.t_ns - self._motion_ns) * 1e-9
             self.odometer_m += abs(sample.speed_mps) * min(max(step_s, 0.0), LONGEST_STEP_S)

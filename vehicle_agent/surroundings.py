@@ -1,5 +1,6 @@
 """The local map follows the vehicle: tiles ahead are asked for, arrivals are held, tiles far behind are let go."""
 
+import math
 import threading
 from collections import Counter
 from collections.abc import Iterable
@@ -16,8 +17,10 @@ from vehicle_agent.detect.detector import ChangeDetector
 from vehicle_agent.download import Fetched, TileFetcher
 from vehicle_agent.local_map import LocalMap
 from vehicle_agent.place import Place
+from vehicle_agent.plan import Need, in_time, needs
 
 STEP_M = 5.0  # the wanted tiles are looked at again after this much way
+AHEAD_STEP_M = 20.0  # every small change of speed would be a reason to look again
 FLOORS_BELOW, FLOORS_ABOVE = 8, 16  # of the vehicle, where the map alone does not say how high the world is
 
 
@@ -40,14 +43,24 @@ class Surroundings:
         self._parameters = parameters
         self.wanted: tuple[TileId, ...] = ()
         self._looked_at: F64 | None = None
+        self._asked: set[TileId] = set()
+        self._plan: list[Need] = []
+        self._plan_is_new = False
         self._near: tuple[TileId, ...] = ()
         self._arrived: dict[TileId, Tile | None] = {}
         self.given_up: set[TileId] = set()
 
+    def look_ahead(self, place: Place) -> tuple[TileId, ...]:
+        """Plan anew after a few metres of way; gives the tiles around and ahead."""
+        if self._has_moved(place):
+            self._look(place)
+        return self.wanted
+
     def follow(self, place: Place, stop: threading.Event, *, wait: bool) -> None:
         """Ask for what lies around and ahead and hold what is near; `wait` for the answers about that."""
-        if self._has_moved(place):
-            self._look_ahead(place)
+        self.look_ahead(place)
+        if self._plan_is_new:
+            self._ask(patiently=wait)
         if wait:
             missing = set(self._near) - self.given_up
             self.given_up |= self._fetcher.wait_for(missing, self._parameters.wait_s, stop)
@@ -69,23 +82,43 @@ class Surroundings:
         return True
 
     def _has_moved(self, place: Place) -> bool:
-        ahead = place.ahead_map_m(self._parameters.ahead_m)
+        ahead = place.ahead_map_m(self._ahead_m(place))
         before = self._looked_at
         if before is not None and before.shape == ahead.shape and np.abs(ahead - before).max() <= STEP_M:
             return False
         self._looked_at = ahead
         return True
 
-    def _look_ahead(self, place: Place) -> None:
-        p = self._parameters
-        here, frame = place.position_map_m, self._map.grid_frame.frame
+    def _ahead_m(self, place: Place) -> float:
+        by_speed_m = self._parameters.ahead_s * abs(place.speed_mps)
+        return max(self._parameters.ahead_m, AHEAD_STEP_M * math.ceil(by_speed_m / AHEAD_STEP_M))
+
+    def _look(self, place: Place) -> None:
+        p, here, frame = self._parameters, place.position_map_m, self._map.grid_frame.frame
         floor = int(np.floor(place.height_m / FLOORS_BELOW)) * FLOORS_BELOW
         self._map.cover_floors(floor - FLOORS_BELOW, floor + FLOORS_ABOVE)
-        wanted = self.wanted = tiles_along(frame, place.ahead_map_m(p.ahead_m), p.near_m)
-        distance_m = {tile_id: tile_distance_m(frame, tile_id, here) for tile_id in wanted}
-        self._near = tuple(t for t in wanted if distance_m[t] <= p.near_m)
-        self._fetcher.want(sorted(wanted, key=lambda t: (distance_m[t], t)))
+        self.wanted = tiles_along(frame, place.ahead_map_m(self._ahead_m(place)), p.near_m)
+        self._plan = needs(frame, self.wanted, place.course, p.near_m)
+        self._plan_is_new = True
+        self._near = tuple(need.tile_id for need in self._plan if need.distance_m <= p.near_m)
         self._let_go(here)
+
+    def _ask(self, *, patiently: bool) -> None:
+        """Ask for the plan's tiles, all together, as soon as one of them is urgent; else only for those asked for
+        before. A drive that waits for its tiles gets all of them, another one what the link can bring in time.
+        """
+        self._plan_is_new = False
+        plan = self._plan if patiently else self._in_time()
+        if any(need.from_s <= self._parameters.lead_s and not self._fetcher.is_known(need.tile_id) for need in plan):
+            self._asked = {need.tile_id for need in plan}
+        self._fetcher.want([need.tile_id for need in plan if need.tile_id in self._asked])
+
+    def _in_time(self) -> list[Need]:
+        link = self._fetcher.link
+        if link.is_unlimited:
+            return self._plan
+        rate_byte_s = self._parameters.link_share * link.rate_byte_s("down")
+        return in_time(self._plan, self._fetcher.size_bytes, rate_byte_s, link.delay_s)
 
     def _let_go(self, here: F64) -> None:
         """Drop tiles far behind that nothing is counted about, and answers about tiles that are no longer wanted."""

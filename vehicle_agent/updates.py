@@ -3,15 +3,16 @@
 import logging
 import queue
 from collections import Counter
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Collection
 
 from fleet_bus.bus import Bus
+from fleet_bus.subscribing import Subscription
 from gnd_map.errors import GndError
-from gnd_map.tile import Tile, apply
+from gnd_map.tile import Tile
 from gnd_map.tile_id import District, TileId
 from schemas.errors import WrongHash
-from schemas.keys import update_keys
-from schemas.updates import TileUpdate
+from schemas.keys import parse_update_key, update_keys
+from schemas.updates import TileUpdate, updated
 from vehicle_agent.cache import TileCache
 from vehicle_agent.download import TileFetcher
 
@@ -19,23 +20,34 @@ _log = logging.getLogger(__name__)
 
 
 class Updates:
-    """Subscribes to the districts that the vehicle comes near; notices wait until the main thread applies them."""
+    """Subscribes to the districts around and ahead; notices wait until the main thread applies them.
+
+    Only what happens from now on is listened to: what happened before is in the answers to the vehicle's own
+    questions, which it puts after it has subscribed. After a lost connection it asks again about what it holds.
+    """
 
     def __init__(self, bus: Bus, cache: TileCache, fetcher: TileFetcher, on_tile: Callable[[Tile], object]) -> None:
         self.counts: Counter[str] = Counter()
         self._bus, self._cache, self._fetcher, self._on_tile = bus, cache, fetcher, on_tile
-        self._districts: set[District] = set()
+        self._followed: dict[District, Subscription] = {}
         self._notices: queue.SimpleQueue[bytes] = queue.SimpleQueue()
+        self._connections = bus.connections
 
-    def follow(self, tiles: Iterable[TileId]) -> None:
-        """Subscribe to the districts of these tiles, each once."""
-        for district in sorted({tile.district for tile in tiles} - self._districts):
-            keys = update_keys(self._cache.layer, district.path)
-            self._bus.subscribe(keys, lambda _key, payload: self._notices.put(payload), history=True)
-            self._districts.add(district)
+    def follow(self, tiles: Collection[TileId]) -> None:
+        """Listen to the districts of these tiles, and no longer to others."""
+        districts = {tile.district for tile in tiles}
+        for district in sorted(districts - self._followed.keys()):
+            self._followed[district] = self._bus.subscribe(
+                update_keys(self._cache.layer, district.path),
+                lambda _key, payload: self._notices.put(payload),
+                tile_of=lambda key: parse_update_key(key)[1],
+            )
+        for district in sorted(self._followed.keys() - districts):
+            self._followed.pop(district).close()
 
     def apply(self) -> int:
         """Apply the notices that have come; returns how many. A bad one is named, counted and left out."""
+        self._catch_up()
         applied = 0
         while True:
             try:
@@ -49,34 +61,33 @@ class Updates:
                 self.counts["refused"] += 1
                 _log.warning("update refused: %s", error)
 
+    def _catch_up(self) -> None:
+        """Notices of the time without a router are lost."""
+        connections = self._bus.connections
+        if connections != self._connections:
+            self._connections = connections
+            self._fetcher.recheck()
+
     def _apply(self, update: TileUpdate) -> None:
         self.counts["received"] += 1
         version, sha = self._cache.head(update.tile)
-        if version == 0:
-            return self._fetch_if_absent(update.tile)
-        if version >= update.version or sha == update.sha:
-            return None
-        if update.delta is None or sha != update.previous_sha:
-            return self._fetcher.refresh(update.tile)
-        self._use_delta(update)
-        return None
-
-    def _fetch_if_absent(self, tile_id: TileId) -> None:
-        """A tile that is not in the cache: it is asked for again if the store had none when it was asked for."""
-        self._fetcher.refresh_if_answered(tile_id)
+        if version and (version >= update.version or sha == update.sha):
+            return  # old news
+        if version and sha == update.previous_sha and update.has_delta:
+            self._use_delta(update)
+        else:
+            self._fetcher.refresh(update.tile)
 
     def _use_delta(self, update: TileUpdate) -> None:
         cached = self._cache.get(update.tile)
-        if cached is None or update.delta is None:
+        if cached is None:
             return self._fetcher.refresh(update.tile)
-        tile = Tile(update.tile, update.version, apply(cached.gaussians, update.delta))
-        if tile.sha != update.sha:
+        try:
+            tile = updated(update, cached)
+        except WrongHash:
             self._fetcher.refresh(update.tile)
-            raise WrongHash(
-                f"tile {update.tile}: the delta to version {update.version} gives sha {tile.sha.hex()[:16]}…,"
-                f" announced is {update.sha.hex()[:16]}…; the tile is fetched again"
-            )
-        self._cache.put(tile)
-        self.counts["delta"] += 1
-        self._on_tile(tile)
+            raise
+        if self._cache.put(tile, over=update.previous_sha):
+            self.counts["delta"] += 1
+            self._on_tile(tile)
         return None

@@ -89,8 +89,8 @@ class Vehicle:
     def download(self) -> None:
         """Apply what others changed, and hold the tiles around and ahead."""
         self.updates.apply()
+        self.updates.follow(self.surroundings.look_ahead(self.place))  # before asking: nothing is missed in between
         self.surroundings.follow(self.place, self.stop, wait=self.config.waits_for_tiles)
-        self.updates.follow(self.surroundings.wanted)
 
     def localise(self, item: DriveItem) -> list[RefinedScan]:
         """Feed the localiser; gives the scans whose poses have become final."""

@@ -2,7 +2,6 @@
 
 import threading
 from collections.abc import Iterator
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -14,8 +13,9 @@ from fleet_bus.bus import Bus
 from fleet_bus.serving import Request
 from gnd_map.tile import Tile
 from gnd_map.tile_id import TileId
-from schemas.keys import tile_key
-from schemas.tiles import TileReply, TileRequest, blob_of
+from schemas.keys import batch_key
+from schemas.tiles import blob_of
+from schemas.tiles_batch import TileAnswer, TilesReply, TilesRequest
 from tile_store.server import TileServer
 from tile_store.sqlite_store import SqliteStore
 from vehicle_agent.cache import TileCache
@@ -87,7 +87,7 @@ def test_what_is_cached_is_not_sent_again_unless_it_changed(
     with TileServer(store, cloud):
         fetcher.want(list(tiles))
         assert fetcher.wait_for(tiles, 15.0, NEVER) == set()
-    assert fetcher.counts == {"unchanged": len(tiles) - 1, "blob": 1}
+    assert fetcher.counts == {"unchanged": len(tiles) - 1, "delta": 1}
     assert all(f.tile is not None for f in fetcher.take())
     assert cache.head(changed)[0] == 2
 
@@ -97,14 +97,15 @@ def test_a_tile_with_the_wrong_hash_is_refused_by_name_and_fetched_again(
 ) -> None:
     tile_id, tile = next(iter(tiles.items()))
     other = next(t for t in tiles.values() if t.tile_id != tile_id)
-    requests: list[TileRequest] = []
+    requests: list[TilesRequest] = []
+    cache.put(Tile(tile_id, 1, tile.gaussians.take(np.arange(9))))
 
     def answer(request: Request) -> bytes:
-        requests.append(TileRequest.decode(request.payload))
-        bad = replace(blob_of(tile), body=blob_of(other).body)
-        return TileReply("blob", bad if len(requests) == 1 else blob_of(tile)).encode()
+        requests.append(TilesRequest.decode(request.payload))
+        body = blob_of(other).body if len(requests) == 1 else blob_of(tile).body
+        return TilesReply((TileAnswer("blob", 2, tile.sha[:8], 0, body),)).encode()
 
-    cloud.serve(tile_key("ndt", tile_id), answer)
+    cloud.serve(batch_key("ndt", tile_id.district), answer)
     fetcher.want([tile_id])
     assert fetcher.wait_for([tile_id], 15.0, NEVER) == set()
     (fetched,) = fetcher.take()
@@ -113,18 +114,21 @@ def test_a_tile_with_the_wrong_hash_is_refused_by_name_and_fetched_again(
     assert fetcher.counts == {"refused": 1, "blob": 1}
     assert "content has sha" in fetcher.last_error
     assert cache.head(tile_id)[1] == tile.sha
-    assert requests[1] == TileRequest()
+    assert requests[0].n_held == 1
+    assert requests[1].n_held == 0, "asked for as if nothing were cached"
 
 
 def test_a_tile_that_stays_wrong_never_reaches_the_cache(
     fetcher: TileFetcher, cache: TileCache, cloud: Bus, tiles: dict[TileId, Tile]
 ) -> None:
     tile_id, other_id = sorted(tiles)[:2]
-    cloud.serve(tile_key("ndt", tile_id), lambda _: TileReply("blob", blob_of(tiles[other_id])).encode())
+    other = blob_of(tiles[other_id])
+    reply = TilesReply((TileAnswer("blob", 1, other.sha[:8], 0, other.body),))
+    cloud.serve(batch_key("ndt", tile_id.district), lambda _: reply.encode())
     fetcher.want([tile_id])
     wait_until(lambda: fetcher.counts["failed"] >= 1)
     assert fetcher.counts["refused"] == 3 * fetcher.counts["failed"] or fetcher.counts["refused"] > 3
-    assert "asked for tile" in fetcher.last_error
+    assert "claimed is" in fetcher.last_error
     assert fetcher.take() == []
     assert len(cache) == 0
 
