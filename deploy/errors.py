@@ -4,6 +4,8 @@ GndError
 └── DeployError            a run cannot start or continue
     ├── RunFolderError     the output folder cannot be used
     ├── ProcessDied        a process ended too often to be restarted
+    ├── LabError           namespaces or shaped links cannot be made or are taken
+    │   └── LabRuns        a lab of that name is running
     └── RegionError        a region that is no wildcard, tile or circle
 """
 
@@ -20,6 +22,14 @@ class RunFolderError(DeployError):
 
 class ProcessDied(DeployError):
     """A process ended more often than the supervisor restarts it."""
+
+
+class LabError(DeployError):
+    """Namespaces or shaped links cannot be made, or are taken by another lab."""
+
+
+class LabRuns(LabError):
+    """A lab of that name is running."""
 
 
 class RegionError(DeployError):

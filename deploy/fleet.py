@@ -19,10 +19,10 @@ from deploy import roles
 from deploy.errors import DeployError
 from deploy.fleet_config import FleetConfig
 from deploy.live import FleetState, View, live_view
-from deploy.ports import claim_port
 from deploy.prepare import PreparedRun
 from deploy.processes import ProcessSpec, Supervisor
 from deploy.run_folder import RunFolder
+from deploy.site import Site, VehicleSite, loopback_site
 from fleet_bus.bus import open_bus
 from fleet_bus.config import BusConfig
 from schemas.keys import traffic_keys
@@ -54,7 +54,12 @@ class FleetOutcome:
 
 
 def run_fleet(
-    config: FleetConfig, folder: RunFolder, prepared: PreparedRun, console: Console, stop: threading.Event
+    config: FleetConfig,
+    folder: RunFolder,
+    prepared: PreparedRun,
+    console: Console,
+    stop: threading.Event,
+    site: Site | None = None,
 ) -> FleetOutcome:
     """Run the processes of a fleet until every drive is done and every report is merged.
 
@@ -64,6 +69,7 @@ def run_fleet(
         prepared: the drives, and a store that holds the base map.
         console: where the live table appears.
         stop: ends the run early and in order.
+        site: where the processes run; by default all on the loopback interface.
 
     Returns:
         How long it took and what had to be restarted.
@@ -72,18 +78,18 @@ def run_fleet(
         DeployError: a process cannot be kept alive, the port is taken, or the deadline has passed.
     """
     started_s = time.monotonic()
-    connect = f"tcp/127.0.0.1:{claim_port(config.port)}"
+    site = site or loopback_site(config, len(prepared.agent_drives))
     state = FleetState()
     with ExitStack() as stack:
         supervisor = stack.enter_context(supervised(folder, state))
-        start_cloud(supervisor, config, folder, connect)
+        start_cloud(supervisor, config, folder, site)
         opened = stack.enter_context(SqliteStore(folder.store))
-        bus = stack.enter_context(open_bus(BusConfig(connect=(connect,)), name="fleet"))
+        bus = stack.enter_context(open_bus(BusConfig(connect=(site.connect,)), name="fleet"))
         stack.enter_context(bus.subscribe(traffic_keys(), state.on_traffic))
         view = stack.enter_context(live_view(state, console))
         run = _Run(config, folder, supervisor, opened, view, state, stop, opened.counts().versions)
         run.wait_until(run.watcher_ready, SETTLE_S, "the watcher did not start")
-        start_agents(supervisor, config, folder, prepared, connect)
+        start_agents(supervisor, config, folder, prepared, site)
         run.wait_until(lambda: supervisor.finished("vehicle-"), config.deadline_s, "the agents did not finish")
         run.wait_until(run.settled, SETTLE_S, "the merges did not settle")
         run.wait_until(run.watcher_caught_up, WATCHER_GRACE_S, None)
@@ -92,7 +98,7 @@ def run_fleet(
 
 @contextmanager
 def supervised(folder: RunFolder, state: FleetState) -> Iterator[Supervisor]:
-    """Give a supervisor whose processes all end with the block: agents first, the router last."""
+    """Give a supervisor whose processes all end with the block: agents first, the router and its links last."""
     supervisor = Supervisor(
         folder.logs, folder.pids, lambda name, code: state.note(f"{name} ended with code {code}, started again")
     )
@@ -100,27 +106,38 @@ def supervised(folder: RunFolder, state: FleetState) -> Iterator[Supervisor]:
         yield supervisor
     finally:
         names = tuple(supervisor.pids())
-        for group in ("vehicle-", "merger-", "watcher", "store", "router"):
+        for group in ("vehicle-", "merger-", "watcher", "store", "router", "link-"):
             supervisor.stop(tuple(name for name in names if name.startswith(group)))
 
 
-def start_cloud(supervisor: Supervisor, config: FleetConfig, folder: RunFolder, connect: str) -> None:
-    """Start router, tile server, merger shards and watcher; each connects as soon as the router listens."""
-    supervisor.start(ProcessSpec("router", roles.router, (connect,)))
-    supervisor.start(ProcessSpec("store", roles.store, (folder.store, connect)))
-    for number in range(config.shards):
-        shard = shard_config(config, f"shard-{number}", folder.store, connect)
-        supervisor.start(ProcessSpec(f"merger-{number}", roles.merger, (shard,)))
-    supervisor.start(ProcessSpec("watcher", roles.watcher, (connect, folder.updates)))
+def start_cloud(supervisor: Supervisor, config: FleetConfig, folder: RunFolder, site: Site) -> None:
+    """Start links, router, tile server, merger shards and watcher; each connects as soon as the router listens."""
+    for carrier in site.carriers:
+        supervisor.start(carrier)
+    for spec in cloud_processes(config, folder, site):
+        supervisor.start(spec)
+
+
+def cloud_processes(config: FleetConfig, folder: RunFolder, site: Site) -> list[ProcessSpec]:
+    """Return the processes of the cloud in the order of their start."""
+    connect, where = site.connect, site.namespace
+    shards = [shard_config(config, f"shard-{number}", folder.store, connect) for number in range(config.shards)]
+    return [
+        ProcessSpec("router", roles.router, (site.listen,), namespace=where),
+        ProcessSpec("store", roles.store, (folder.store, connect), namespace=where),
+        *(ProcessSpec(f"merger-{n}", roles.merger, (shard,), namespace=where) for n, shard in enumerate(shards)),
+        ProcessSpec("watcher", roles.watcher, (connect, folder.updates), namespace=where),
+    ]
 
 
 def start_agents(
-    supervisor: Supervisor, config: FleetConfig, folder: RunFolder, prepared: PreparedRun, connect: str
+    supervisor: Supervisor, config: FleetConfig, folder: RunFolder, prepared: PreparedRun, site: Site
 ) -> None:
     """Start one agent process a drive."""
-    for number, drive in enumerate(prepared.agent_drives):
+    for number, (drive, place) in enumerate(zip(prepared.agent_drives, site.vehicles, strict=True)):
         name = f"vehicle-{number:02d}"
-        supervisor.start(ProcessSpec(name, roles.agent, (agent_config(config, name, drive, folder, connect),)))
+        agent = agent_config(config, name, drive, folder, place)
+        supervisor.start(ProcessSpec(name, roles.agent, (agent,), namespace=place.namespace))
 
 
 def shard_config(config: FleetConfig, shard_id: str, store: Path, connect: str) -> ShardConfig:
@@ -134,15 +151,15 @@ def shard_config(config: FleetConfig, shard_id: str, store: Path, connect: str) 
     )
 
 
-def agent_config(config: FleetConfig, vehicle: str, drive: Path, folder: RunFolder, connect: str) -> AgentConfig:
+def agent_config(config: FleetConfig, vehicle: str, drive: Path, folder: RunFolder, place: VehicleSite) -> AgentConfig:
     """Return the configuration of one vehicle agent."""
     paper = config.detect_mode == "paper"
     return AgentConfig(
         vehicle=vehicle,
         drive=drive,
         work_dir=folder.agents / vehicle,
-        connect=(connect,),
-        link=config.link,
+        connect=(place.connect,),
+        link=place.link,
         ledger_dir=folder.ledger,
         detect=DetectParameters.paper() if paper else DetectParameters(),
     )

@@ -20,6 +20,7 @@ from pathlib import Path
 from typing import Any, Final
 
 from deploy.errors import ProcessDied
+from deploy.lab.namespaces import enter_namespace
 
 PRELOAD: Final = ("deploy.preload",)
 STOP_GRACE_S: Final = 10.0
@@ -41,12 +42,14 @@ class ProcessSpec:
         role: a module-level function `role(*args, stop=Event)` that returns when its work is done or `stop` is set.
         args: picklable arguments of the role.
         restart: start it again when it ends with an exit code other than 0.
+        namespace: the network namespace that it enters first of all; None stays in the launcher's.
     """
 
     name: str
     role: Role
     args: tuple[Any, ...]
     restart: bool = True
+    namespace: str | None = None
 
 
 @dataclass(slots=True)
@@ -137,7 +140,7 @@ class Supervisor:
 
     def _spawn(self, spec: ProcessSpec) -> ForkServerProcess:
         process = _context.Process(
-            target=_run_role, args=(spec.role, spec.args, str(self.log_dir / f"{spec.name}.log")), name=spec.name
+            target=_run_role, args=(spec, str(self.log_dir / f"{spec.name}.log")), name=spec.name
         )
         process.start()
         return process
@@ -163,17 +166,19 @@ def _nothing() -> None:
     pass
 
 
-def _run_role(role: Role, args: tuple[Any, ...], log_path: str) -> None:
-    """Run a role inside its process: log file, signals, exit code."""
+def _run_role(spec: ProcessSpec, log_path: str) -> None:
+    """Run a role inside its process: log file, signals, network namespace, exit code."""
     stop = threading.Event()
     threading.Thread(target=_end_with_launcher, args=(stop,), name="launcher-watch", daemon=True).start()
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # the launcher turns Ctrl-C into an orderly end
     signal.signal(signal.SIGTERM, lambda *_: stop.set())
     _log_to(log_path)
     try:
-        role(*args, stop=stop)
+        if spec.namespace is not None:
+            enter_namespace(spec.namespace)  # before any thread of Zenoh's: threads are born where their maker is
+        spec.role(*spec.args, stop=stop)
     except Exception:
-        logging.getLogger(role.__module__).exception("%s failed", role.__name__)
+        logging.getLogger(spec.role.__module__).exception("%s failed", spec.role.__name__)
         sys.exit(1)
 
 

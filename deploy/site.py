@@ -1,0 +1,52 @@
+"""Where the processes of a fleet run: all on the loopback interface, or each vehicle behind a link of its own."""
+
+from dataclasses import dataclass
+
+from deploy.fleet_config import FleetConfig
+from deploy.ports import claim_port
+from deploy.processes import ProcessSpec
+from fleet_bus.links import LinkProfile
+
+
+@dataclass(frozen=True, slots=True)
+class VehicleSite:
+    """Where one vehicle is.
+
+    Attributes:
+        connect: the router's endpoint as this vehicle reaches it.
+        link: profile of its link.
+        namespace: the network namespace of its process, None for the launcher's own.
+    """
+
+    connect: str
+    link: str | LinkProfile
+    namespace: str | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class Site:
+    """Where the cloud is, and each vehicle.
+
+    Attributes:
+        listen: endpoint that the router opens.
+        connect: the same as the cloud's other processes and the launcher reach it.
+        vehicles: where each vehicle is, by its number.
+        namespace: the network namespace of the cloud's processes, None for the launcher's own.
+        carriers: processes that carry the links; they begin first and end last. Names begin with "link-".
+    """
+
+    listen: str
+    connect: str
+    vehicles: tuple[VehicleSite, ...]
+    namespace: str | None = None
+    carriers: tuple[ProcessSpec, ...] = ()
+
+
+def loopback_site(config: FleetConfig, agents: int) -> Site:
+    """Return a site on the loopback interface, where the sessions themselves imitate the link.
+
+    Raises:
+        DeployError: the port is taken.
+    """
+    endpoint = f"tcp/127.0.0.1:{claim_port(config.port)}"
+    return Site(endpoint, endpoint, (VehicleSite(endpoint, config.link),) * agents)
