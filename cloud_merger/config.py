@@ -9,6 +9,8 @@ from typing import Any, Final
 from cloud_merger.errors import MergerError
 from cloud_merger.ingest import IngestLimits
 from cloud_merger.merge import MergeParameters
+from cloud_merger.waiting import WaitingLimits
+from cloud_merger.wants import WantParameters
 from fleet_bus.config import DEFAULT_ENDPOINT
 from gnd_map.config import from_mapping
 from tile_store.values import DEFAULT_CODEC, StoreConfig, lattice_named
@@ -27,6 +29,8 @@ class ShardConfig:
         bus_lease_ms: how long a silent shard counts as alive; 0: the bus's own.
         merge: how statements become changes.
         ingest: which reports are refused.
+        want: which Gaussians of reports in short are asked for.
+        waiting: how many reports may wait for their Gaussians.
         store: batching of the store.
         codec: how finely the Gaussians of tiles are rounded that no base map holds ("float": not at all); all shards of
             a store use the same. Other tiles stay as fine as their base.
@@ -44,6 +48,8 @@ class ShardConfig:
     bus_lease_ms: int = 0
     merge: MergeParameters = field(default_factory=MergeParameters)
     ingest: IngestLimits = field(default_factory=IngestLimits)
+    want: WantParameters = field(default_factory=WantParameters)
+    waiting: WaitingLimits = field(default_factory=WaitingLimits)
     store: StoreConfig = field(default_factory=StoreConfig)
     codec: str = DEFAULT_CODEC
     tiles_at_once: int = 16

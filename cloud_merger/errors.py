@@ -2,8 +2,10 @@
 
 GndError
 └── MergerError   a parameter or configuration that cannot be used
-    ├── BadReport   a report that cannot be a true statement about this map
-    └── MissingBase a packed report against a version that is not here: the vehicle is to send it whole
+    ├── BadReport  a report that cannot be a true statement about this map
+    └── NotUnderstood   a report in short that means nothing here
+        ├── MissingBase a version that it was coded against is not here
+        └── MissingHalf the flags that its Gaussians belong to are not here
 """
 
 from gnd_map.errors import GndError
@@ -17,5 +19,13 @@ class BadReport(MergerError):
     """A report that cannot be a true statement about this map; the message says why, with numbers."""
 
 
-class MissingBase(MergerError):
+class NotUnderstood(MergerError):
+    """A report in short, perhaps a good one, that means nothing here: the vehicle is to send more."""
+
+
+class MissingBase(NotUnderstood):
     """A packed report was coded against a version that is not here; the message says which."""
+
+
+class MissingHalf(NotUnderstood):
+    """Gaussians came whose flags are not here (another shard has heard them), or that answer another question."""

@@ -1,13 +1,14 @@
 """From a packed report back to an ordinary one: flags and track against the base tiles, then the Gaussians asked for.
 
-Pure functions, the counterpart of `vehicle_agent.packing`. What comes out is a `ChangeReport` as if the vehicle had sent
-it whole, but for three things: observed voxels are those that the track predicts, rays are not counted (evidence 0), and
-a voxel that is new or modified whose Gaussian was not asked for has count 0 ("withheld"; one that is deleted is
-classed so).
+Pure functions, the counterpart of `vehicle_agent.packing`. What comes out is a `ChangeReport` as if the vehicle had
+sent it whole, but for four things: observed voxels are those that the track predicts, rays are not counted (evidence
+0), poses are as uncertain as those of the report's worst tile, and a voxel that is new or modified whose Gaussian was
+not asked for has count 0 ("withheld"; its class tells it from one that is deleted).
 """
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
+from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,8 +16,9 @@ from numpy.typing import NDArray
 from cloud_merger.errors import BadReport, MissingBase
 from gnd_map.classes import ChangeClass
 from gnd_map.codec import Flags, decode_flags, decode_measured
-from gnd_map.errors import GndError
+from gnd_map.errors import CodecError, ConfigError, GndError, ShapeError, TrackError
 from gnd_map.gaussian import Gaussians, concat
+from gnd_map.grid import VoxelGrid
 from gnd_map.tile import Tile
 from gnd_map.tile_id import District, TileId
 from gnd_map.track import decode_track
@@ -25,7 +27,8 @@ from schemas import limits
 from schemas.changes import ChangeReport, TileChange
 from schemas.packed import PackedReport, digest_of
 
-MEASURED = (ChangeClass.NEW, ChangeClass.MODIFIED)
+MEASURED: Final = (ChangeClass.NEW, ChangeClass.MODIFIED)
+MAX_FLOORS: Final = 400  # of 1 m: looking along a track takes memory for each
 
 
 def base_versions(packed: PackedReport, district: District) -> tuple[tuple[TileId, int], ...]:
@@ -44,8 +47,8 @@ def expand(packed: PackedReport, layer: str, district: District, bases: Sequence
 
     Raises:
         MissingBase: the bases are not those that the vehicle compared with.
-        CodecError: flags or track cannot be read against them.
-        BadReport: more flags than a report may hold.
+        BadReport: flags or track cannot be read against them; more flags than a report may hold, or at heights that no
+            vehicle sees.
         SchemaError: a value that no report has.
     """
     shas = [tile.sha if tile.version else b"" for tile in bases]
@@ -54,12 +57,13 @@ def expand(packed: PackedReport, layer: str, district: District, bases: Sequence
             f"report {packed.report_id}: the {len(bases)} versions here have digest {digest_of(shas).hex()}, the "
             f"vehicle compared with {packed.base_digest.hex()}"
         )
-    known = [(tile.tile_id, tile.gaussians) for tile in bases]
-    flags = decode_flags(known, packed.flags)
-    n = sum(len(one.voxel_id) for one in flags)
-    if n > limits.MAX_FLAGS_OF_REPORT:
-        raise BadReport(f"report {packed.report_id} flags {n} voxels, the limit is {limits.MAX_FLAGS_OF_REPORT}")
-    observed = observed_along(decode_track(district, packed.track), flags)
+    try:
+        flags = decode_flags([(tile.tile_id, tile.gaussians) for tile in bases], packed.flags)
+        track = decode_track(district, packed.track)
+        _check_flags(packed.report_id, flags)
+        observed = observed_along(track, flags)
+    except (CodecError, ConfigError, ShapeError, TrackError) as error:
+        raise BadReport(f"report {packed.report_id} in {len(packed.flags)} bytes of flags: {error}") from error
     return ChangeReport(
         report_id=packed.report_id,
         vehicle=packed.vehicle,
@@ -76,9 +80,22 @@ def expand(packed: PackedReport, layer: str, district: District, bases: Sequence
     )
 
 
-def _change(
-    packed: PackedReport, base: Tile, sha: bytes, flags: Flags, observed: NDArray[np.int32]
-) -> TileChange:
+def _check_flags(report_id: str, flags: Sequence[Flags]) -> None:
+    """Refuse what would take more memory than any report needs: too many flags, or a world too high."""
+    n = sum(len(one.voxel_id) for one in flags)
+    if n > limits.MAX_FLAGS_OF_REPORT:
+        raise BadReport(f"report {report_id} flags {n} voxels, the limit is {limits.MAX_FLAGS_OF_REPORT}")
+    ids = [np.concatenate([one.voxel_id, one.base.voxel_id]) for one in flags]
+    floors = [VoxelGrid.of(one.tile_id).unravel(voxel_id)[2] for one, voxel_id in zip(flags, ids, strict=True)]
+    all_floors = np.concatenate(floors)
+    if len(all_floors) and np.ptp(all_floors) > MAX_FLOORS:
+        raise BadReport(
+            f"report {report_id} and its bases span floors {all_floors.min()} … {all_floors.max()}, the limit is "
+            f"{MAX_FLOORS} floors: such a report is read whole only"
+        )
+
+
+def _change(packed: PackedReport, base: Tile, sha: bytes, flags: Flags, observed: NDArray[np.int32]) -> TileChange:
     n = len(flags.voxel_id)
     return TileChange(
         tile=base.tile_id,

@@ -1,4 +1,8 @@
-"""Reports come in: checked, kept, and only then acknowledged. A bad one goes to quarantine with its reason."""
+"""Reports come in: checked, kept, and only then acknowledged. A bad one goes to quarantine with its reason.
+
+A report may come whole, or in short: flags first, answered by "wanted" with the voxels of which Gaussians are asked
+for, then these. Nothing of it is kept before all of it is here; what cannot be understood is answered by "resend".
+"""
 
 import logging
 import time
@@ -8,12 +12,17 @@ from typing import Final
 
 import numpy as np
 
-from cloud_merger.errors import BadReport, MergerError
+from cloud_merger.errors import BadReport, MergerError, NotUnderstood
+from cloud_merger.parameters import MergeParameters
+from cloud_merger.short_reports import ShortReports
+from cloud_merger.waiting import WaitingLimits
+from cloud_merger.wants import WantParameters
 from gnd_map.tile_id import LAT_TILES, LON_TILES, District, TileId
 from schemas.changes import ChangeAck, ChangeReport, TileChange, split
 from schemas.errors import SchemaError
 from schemas.keys import parse_change_key
 from schemas.limits import MAX_REASON_CHARACTERS
+from schemas.packed import PackedGaussians, PackedReport, decode_upload
 from tile_store.store import Store
 from tile_store.values import ReportRow
 
@@ -54,6 +63,7 @@ class Ingest:
     Args:
         store: where reports are kept.
         limits: what is refused.
+        short: how reports in short are understood; None: with the defaults.
         on_stored: called after new reports are durable.
         now_ns: the clock, int ns UTC.
     """
@@ -64,24 +74,54 @@ class Ingest:
         limits: IngestLimits,
         on_stored: Callable[[], object] = lambda: None,
         now_ns: Callable[[], int] = time.time_ns,
+        short: ShortReports | None = None,
     ) -> None:
         self._store, self._limits, self._on_stored, self._now_ns = store, limits, on_stored, now_ns
+        self._short = short or ShortReports(store, MergeParameters(), WantParameters(), WaitingLimits())
         self._known_bases: dict[tuple[str, TileId, bytes], None] = {}
 
     def answer(self, key: str, payload: bytes) -> ChangeAck:
-        """The ack of one report; "stored" and "duplicate" only when every tile of it is durable.
+        """The ack of one message; "stored" and "duplicate" only when every tile of its report is durable.
 
         Raises:
             StoreError: it could not be kept; the vehicle is to send it again.
         """
+        report_id = ""
         try:
-            report = ChangeReport.decode(payload)
-        except SchemaError as error:
-            return self._refuse(key, payload, "", error)
-        try:
-            self._check(key, report)
+            upload = decode_upload(payload)
+            report_id = upload.report_id
+            return self._answer(key, upload)
         except (SchemaError, BadReport) as error:
-            return self._refuse(key, payload, report.report_id, error)
+            self._short.room.forget(report_id)
+            return self._refuse(key, payload, report_id, error)
+        except NotUnderstood as error:
+            _LOG.info("asked for report %s again: %s", report_id, error)
+            return ChangeAck(report_id, "resend", _one_line(str(error)))
+
+    def _answer(self, key: str, upload: ChangeReport | PackedReport | PackedGaussians) -> ChangeAck:
+        if isinstance(upload, ChangeReport):
+            return self._checked_and_kept(key, upload)
+        if self._short.room.has_finished(upload.report_id):
+            return ChangeAck(upload.report_id, "duplicate")
+        if isinstance(upload, PackedGaussians):
+            return self._checked_and_kept(key, self._short.completed(key, upload))
+        return self._first_half(key, upload)
+
+    def _first_half(self, key: str, packed: PackedReport) -> ChangeAck:
+        held = self._short.waits(key, packed)
+        if held is None:
+            report = self._short.expanded(key, packed)
+            self._check(key, report)
+            held = self._short.hold(key, packed, report)
+        if held is None:
+            self._short.room.finish(packed.report_id)
+            return ChangeAck(packed.report_id, "duplicate")
+        if held.mask.any():
+            return ChangeAck(packed.report_id, "wanted", wanted=held.encoded)
+        return self._keep(held.report)
+
+    def _checked_and_kept(self, key: str, report: ChangeReport) -> ChangeAck:
+        self._check(key, report)
         return self._keep(report)
 
     def _keep(self, report: ChangeReport) -> ChangeAck:
@@ -91,6 +131,7 @@ class Ingest:
             for change, (tile, body) in zip(report.tiles, split(report), strict=True)
         ]
         is_new = "stored" in self._store.put_reports(rows)
+        self._short.room.finish(report.report_id)
         if is_new:
             self._on_stored()
         return ChangeAck(report.report_id, "stored" if is_new else "duplicate")

@@ -8,6 +8,7 @@ from cloud_merger.config import ShardConfig
 from cloud_merger.ingest import Ingest
 from cloud_merger.ownership import Members
 from cloud_merger.reception import Reception
+from cloud_merger.short_reports import ShortReports
 from cloud_merger.work import Worker
 from fleet_bus.bus import open_bus
 from fleet_bus.config import BusConfig
@@ -36,7 +37,8 @@ def run_shard(config: ShardConfig, stop: threading.Event) -> None:
         store.release(config.shard_id)  # leases of an earlier life
 
         # Ingest: check, keep, acknowledge, in threads of the bus.
-        ingest = Ingest(store, config.ingest, on_stored=wake.set)
+        short = ShortReports(store, config.merge, config.want, config.waiting)
+        ingest = Ingest(store, config.ingest, on_stored=wake.set, short=short)
         reception = Reception(bus, members, ingest.answer, on_death=store.release)
         reception.open()
         _LOG.info("merger %s: store %s, mode %s", config.shard_id, config.store_path, config.merge.mode)

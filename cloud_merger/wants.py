@@ -1,0 +1,128 @@
+"""Which Gaussians of a packed report the cloud asks for: only those that could still change the map.
+
+Pure functions of what the report flags and of what the store already holds about its tiles, so a study of the traffic
+can ask without a bus. Asking too little costs quality, asking too much costs bytes: the merge decides by votes, and a
+flag without its Gaussian is a vote already.
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cloud_merger.errors import MergerError
+from cloud_merger.expanding import is_askable
+from cloud_merger.parameters import MergeParameters
+from cloud_merger.statements import Kind, Report, Rows, statements_of
+from gnd_map.arrays import I32
+from gnd_map.classes import ChangeClass
+from gnd_map.gaussian import Gaussians
+from gnd_map.tile_id import TileId
+from schemas.changes import ChangeReport, TileChange
+
+
+@dataclass(frozen=True, slots=True)
+class WantParameters:
+    """When a flagged voxel's Gaussian is asked for.
+
+    Attributes:
+        share: all that could agree with it, itself included, must hold more than this share of ξ of the votes; below 1
+            because votes that come later may lift it over ξ.
+        enough: so many measured Gaussians that may agree with it are enough; 0: none is ever asked for.
+    """
+
+    share: float = 0.8
+    enough: int = 4
+
+    def __post_init__(self) -> None:
+        if not 0 <= self.share <= 1:
+            raise MergerError(f"share must lie in [0, 1], got {self.share}")
+        if self.enough < 0:
+            raise MergerError(f"enough must be at least 0, got {self.enough}")
+
+
+@dataclass(frozen=True, slots=True)
+class Known:
+    """What the cloud holds about one tile.
+
+    Attributes:
+        epoch: Gaussians of the version that all reports are merged into.
+        reports: since then, in any order.
+        bases: Gaussians by content hash of the versions that these reports and the new one refer to.
+        promised: (K,) voxels of which Gaussians were asked of other vehicles just now; a voxel may occur several times.
+    """
+
+    epoch: Gaussians
+    reports: Sequence[Report] = ()
+    bases: Mapping[bytes, Gaussians] = field(default_factory=dict)
+    promised: I32 = field(default_factory=lambda: np.zeros(0, np.int32))
+
+
+def wanted(
+    report: ChangeReport, known: Mapping[TileId, Known], merge: MergeParameters, want: WantParameters
+) -> NDArray[np.bool_]:
+    """(N,) bool: for each new or modified voxel of the report, in order of tile and voxel id, whether to ask for it.
+
+    Args:
+        report: with its Gaussians withheld (`expanding.expand`) or not: they are not looked at.
+        known: of at least those tiles of the report that have such voxels.
+        merge: how the statements will be merged.
+        want: when to ask.
+    """
+    parts = [np.zeros(0, np.bool_)]
+    for change in report.tiles:
+        if is_askable(change).any():
+            own = merge.report_of(report.report_id, report.sensor_model, change)
+            parts.append(_wanted_of_tile(own, known[change.tile], merge, want))
+    return np.concatenate(parts)
+
+
+def _wanted_of_tile(own: Report, known: Known, merge: MergeParameters, want: WantParameters) -> NDArray[np.bool_]:
+    asked = is_askable(own.change)
+    ids, modified = own.change.changed.voxel_id[asked], own.change.change_class[asked] == ChangeClass.MODIFIED
+    others = [report for report in known.reports if report.report_id != own.report_id]
+    statements = statements_of(known.epoch, [*others, own], known.bases, merge.mode)
+    rows = statements.rows[np.isin(statements.rows["voxel_id"], ids)]
+    seat = np.searchsorted(ids, rows["voxel_id"])
+    is_own = rows["report"] == statements.report_ids.index(own.report_id)
+    was = np.zeros(len(ids), np.int64)
+    was[seat[is_own]] = rows["was"][is_own]
+    others_rows, others_seat = rows[~is_own], seat[~is_own]
+    may_agree = _may_agree(others_rows, was[others_seat])
+    votes = own.weight + np.bincount(others_seat, others_rows["weight"] * may_agree, len(ids))
+    cast = own.weight + np.bincount(others_seat, others_rows["weight"], len(ids))
+    measured = may_agree & (others_rows["kind"] == Kind.MEASURED) & (others_rows["was"] == was[others_seat])
+    in_hand = np.bincount(others_seat, measured, len(ids)) + _promised(known.promised, ids)
+    xi = np.where(modified & (merge.mode == "default"), merge.xi_reshaped, merge.xi)
+    return np.asarray((votes > want.share * xi * cast) & (in_hand < want.enough))
+
+
+def _may_agree(rows: Rows, was: NDArray[np.int64]) -> NDArray[np.bool_]:
+    """(M,) which statements of others may be of the Gaussian that was flagged against state `was` (M,).
+
+    Not those that see nothing, nor those that quote the very Gaussian which the flag denies.
+    """
+    quotes = rows["kind"] == Kind.QUOTED
+    return np.asarray((rows["kind"] != Kind.NOTHING) & ~(quotes & (rows["was"] == was)))
+
+
+def _promised(promised: I32, ids: I32) -> NDArray[np.int64]:
+    """(len(ids),) how often each of the sorted `ids` was asked of others."""
+    known = promised[np.isin(promised, ids)]
+    return np.bincount(np.searchsorted(ids, known), minlength=len(ids))
+
+
+def asked_voxels(report: ChangeReport, mask: NDArray[np.bool_]) -> dict[TileId, I32]:
+    """Of each tile the voxels that `mask` of `wanted` marks, sorted."""
+    found: dict[TileId, I32] = {}
+    first = 0
+    for change in report.tiles:
+        ids = _askable_ids(change)
+        found[change.tile] = ids[mask[first : first + len(ids)]]
+        first += len(ids)
+    return found
+
+
+def _askable_ids(change: TileChange) -> I32:
+    return change.changed.voxel_id[is_askable(change)]
