@@ -27,7 +27,7 @@ class MapInfo:
     districts: int
     gaussians: int
     points: int
-    """Raw points that the Gaussians stand for."""
+    """Raw points that the Gaussians stand for; on a lattice to within an octave each."""
     body_bytes: int
     bytes_a_voxel: float
     """Of the bodies as they lie in the store; 0 without voxels."""

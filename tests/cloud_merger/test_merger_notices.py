@@ -1,6 +1,7 @@
 """Update notices survive the shard that published the version; late watchers get the last one."""
 
 import threading
+from dataclasses import replace
 
 import pytest
 from merger_processes import Cloud, wait_for
@@ -13,10 +14,11 @@ from cloud_merger.work import Worker
 from fleet_bus.bus import open_bus
 from fleet_bus.config import BusConfig
 from gnd_map.gaussian import Gaussians
-from gnd_map.tile import Tile, apply
+from gnd_map.tile import TileDelta
 from schemas.changes import split
 from schemas.keys import alive_key, update_key
-from schemas.updates import TileUpdate
+from schemas.limits import MAX_TILE_BODY_BYTES
+from schemas.updates import TileUpdate, updated
 from tile_store.errors import StoreUnavailable
 from tile_store.values import ReportRow, StoreConfig
 
@@ -75,7 +77,8 @@ def test_a_notice_that_a_dead_shard_owed_is_sent_by_the_next(cloud, shard):
     first, second = cloud.updates
     assert [(u.version, u.previous_version, u.reason) for u in (first, second)] == [(2, 1, "merged"), (3, 2, "merged")]
     assert first.previous_sha == tile_of_states(STATES).sha
-    assert apply(apply(BASE, first.delta), second.delta) == cloud.store.get("ndt", TILE).decode().gaussians
+    assert updated(second, updated(first, tile_of_states(STATES))) == cloud.store.get("ndt", TILE).decode()
+    assert [update.voxels for update in (first, second)] == [(1, 0), (0, 1)]
     wait_for("none is owed", cloud.is_settled)
 
 
@@ -98,7 +101,8 @@ def test_a_rollback_is_announced(cloud, shard):
     wait_for("version 3", lambda: len(cloud.updates) == 2)
     update = cloud.updates[1]
     assert (update.version, update.reason, update.sha) == (3, "rollback", tile_of_states(STATES).sha)
-    assert update.delta.removed.tolist() == [2]
+    assert update.voxels == (0, 1)
+    assert updated(update, cloud.store.get("ndt", TILE, 2).decode()).gaussians == BASE
 
 
 def test_a_late_watcher_gets_the_last_notice(cloud, shard):
@@ -121,8 +125,8 @@ def test_a_damaged_body_is_announced_without_a_delta(cloud):
     one, two = stored_versions(cloud)
     damaged = type(one)(**{**{name: getattr(one, name) for name in one.__slots__}, "body": one.body[:-1]})
     update = update_of(two, damaged)
-    assert (update.delta, update.sha, update.previous_sha) == (None, two.sha, one.sha)
-    assert update_of(two, one).delta is not None
+    assert (update.has_delta, update.sha, update.previous_sha) == (False, two.sha, one.sha)
+    assert update_of(two, one).has_delta
     assert update_of(two, None).previous_version == 0
 
 
@@ -134,11 +138,11 @@ def test_a_delta_that_is_too_large_for_a_notice_is_left_out(cloud):
     large = Gaussians(
         gaussians_of(dict.fromkeys(range(n))).voxel_id, *(column.repeat(n, axis=0) for column in pole.columns[1:])
     )
-    update = TileUpdate(
-        TILE, "ndt", 2, 1, two.sha, one.sha, "merged", type(update_of(two, one).delta)(gaussians_of({}).voxel_id, large)
-    )
-    assert TileUpdate.decode(encoded(update)).delta is None
-    assert Tile(TILE, 1, large).sha != one.sha
+    plain = TileDelta(gaussians_of({}).voxel_id, large)
+    update = TileUpdate(TILE, "ndt", 2, 1, two.sha, one.sha, "merged", plain)
+    assert not TileUpdate.decode(encoded(update)).has_delta
+    fullest = replace(update_of(two, one), coded_delta=bytes(MAX_TILE_BODY_BYTES), put_voxels=n)
+    assert TileUpdate.decode(encoded(fullest)).coded_delta == fullest.coded_delta
 
 
 def test_a_shard_without_a_store_says_so(tmp_path):

@@ -109,7 +109,7 @@ def test_a_tile_whose_merge_fails_is_set_aside_after_some_attempts_and_the_other
     assert store.dirty_count() == 0
     (kept,) = store.quarantined()
     assert "set aside after 3 attempts" in kept.reason
-    assert "WrongHash" in kept.reason
+    assert "damaged" in kept.reason
     assert kept.body.decode().split() == ["ndt", NEIGHBOUR.path, failing]
     assert store.counts().report_rows == 2  # the report itself is not lost
 

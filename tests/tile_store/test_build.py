@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from gnd_map.accumulate import VoxelAccumulator
+from gnd_map.codec import LATTICES, is_on, snap
 from gnd_map.geodesy import LocalFrame
 from gnd_map.grid import GridFrame, VoxelGrid
 from gnd_map.tile_id import TileId
@@ -14,6 +15,8 @@ from schemas.drive import DriveHeader, GnssFix, ReferencePose, Scan
 from schemas.drive_mcap import DriveWriter
 from schemas.errors import DriveError
 from tile_store.build import BuildError, BuildParameters, build_map
+from tile_store.compare import map_info
+from tile_store.errors import StoreError
 from tile_store.sqlite_store import SqliteStore
 
 ANCHOR = LocalFrame(np.radians(37.5597), np.radians(127.0365), 30.0)
@@ -100,7 +103,7 @@ def map_points_m(store: SqliteStore) -> np.ndarray:
 
 def test_a_moving_vehicle_maps_the_walls_where_they_stand(tmp_path: Path, store: SqliteStore) -> None:
     drive = write_drive(tmp_path / "walls.mcap")
-    result = build_map([drive.path], store)
+    result = build_map([drive.path], store, codec="float")
     assert (result.drives, result.scans, result.scans_skipped) == (1, 12, 0)
     assert result.points == len(drive.points_map_m)
     assert result.tiles == result.versions_published == len(store.heads())
@@ -112,7 +115,7 @@ def test_a_moving_vehicle_maps_the_walls_where_they_stand(tmp_path: Path, store:
 
 def test_the_map_is_that_of_the_true_points_put_straight_into_voxels(tmp_path: Path, store: SqliteStore) -> None:
     drive = write_drive(tmp_path / "walls.mcap")
-    build_map([drive.path], store)
+    build_map([drive.path], store, codec="float")
     heads = store.heads()
     accumulator = VoxelAccumulator(GridFrame.around(ANCHOR, [entry.tile for entry in heads]))
     accumulator.add(drive.points_map_m)
@@ -141,7 +144,7 @@ def test_drives_with_different_anchors_make_one_map(tmp_path: Path, store: Sqlit
             writer.scan(scan_at(T0_NS + k * SWEEP_NS, wall_points_map_m(rng, 4000)))
         for t_ns in range(T0_NS, T0_NS + 13 * SWEEP_NS, 10_000_000):
             writer.reference(ReferencePose(t_ns, T @ T_map_vehicle(t_ns)))
-    result = build_map([first.path, second], store)
+    result = build_map([first.path, second], store, codec="float")
     assert result.scans == 24
     points = map_points_m(store)
     np.testing.assert_allclose(np.abs(points[:, 1]), WALL_Y_M, atol=1e-4)
@@ -277,8 +280,32 @@ def test_a_drive_across_a_change_of_the_voxel_grid_fills_both_sides(tmp_path: Pa
         lat_index += 1
     south, west = TileId.from_indices(lon_index, lat_index).south_west_rad
     drive = write_drive(tmp_path / "border.mcap", drive=header(anchor=LocalFrame(south, west, 30.0)))
-    result = build_map([drive.path], store)
+    result = build_map([drive.path], store, codec="float")
     widths = {VoxelGrid.of(entry.tile).nx for entry in store.heads()}
     assert widths == {nx, nx - 1}
     counts = sum(int(store.get("ndt", e.tile).decode().gaussians.count.sum()) for e in store.heads())
     assert counts > 0.9 * result.points
+
+
+@pytest.mark.parametrize("codec", ["archive", "standard", "compact"])
+def test_a_map_is_built_on_a_lattice_and_stays_near_what_was_measured(tmp_path: Path, codec: str) -> None:
+    drive = write_drive(tmp_path / "walls.mcap")
+    with SqliteStore(tmp_path / "plain.sqlite") as plain, SqliteStore(tmp_path / "map.sqlite") as store:
+        build_map([drive.path], plain, codec="float")
+        build_map([drive.path], store, codec=codec)
+        assert build_map([drive.path], store, codec=codec).versions_published == 0
+        for entry in plain.heads():
+            measured, built = (one.get("ndt", entry.tile).decode().gaussians for one in (plain, store))
+            assert is_on(built, LATTICES[codec])
+            assert not is_on(measured, LATTICES[codec])
+            assert built == snap(measured, LATTICES[codec])
+            assert np.array_equal(built.voxel_id, measured.voxel_id)
+            sd_m = np.sqrt(measured.cov_m2[:, [0, 3, 5]])
+            assert (np.abs(built.mean_m - measured.mean_m) <= sd_m + 0.002).all()
+        assert map_info(store).bytes_a_voxel < map_info(plain).bytes_a_voxel
+        assert list(map_info(plain).codecs.values()) == [len(plain.heads())]
+
+
+def test_an_unknown_codec_is_refused_before_anything_is_read(tmp_path: Path, store: SqliteStore) -> None:
+    with pytest.raises(StoreError, match="codec 'zip' is unknown; known are archive, standard, compact, float"):
+        build_map([tmp_path / "absent.mcap"], store, codec="zip")

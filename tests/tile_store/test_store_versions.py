@@ -3,6 +3,7 @@
 import dataclasses
 import hashlib
 
+import apsw
 import pytest
 from store_helpers import (
     EAST,
@@ -18,7 +19,9 @@ from store_helpers import (
     tile_of_voxels,
 )
 
-from schemas.errors import WrongHash
+from gnd_map.codec import LATTICES, best_codec, encode_gaussians, snap
+from gnd_map.tile import Tile
+from schemas.errors import SchemaError, WrongHash
 from tile_store.errors import StoreError, UnknownVersion
 from tile_store.store import Store
 from tile_store.values import GcResult, Notice, Publication, PublishResult, ReportRow
@@ -41,11 +44,31 @@ def test_an_import_is_version_1_of_kind_base(store: Store) -> None:
     assert (decoded.tile_id, decoded.version, decoded.sha) == (TILE, 1, tile_of_voxels(TILE, 1, 2).sha)
 
 
-def test_the_stored_hash_is_that_of_the_tile_and_its_bytes(store: Store) -> None:
-    store.put_tiles([tile_of_voxels(TILE, 1, 2)])
-    head = store.get("ndt", TILE)
-    assert head is not None
-    assert head.sha == hashlib.sha256(TILE.morton.to_bytes(8, "little") + head.body).digest()
+def test_the_stored_hash_is_that_of_the_tile_and_its_plain_columns_whatever_the_codec(store: Store) -> None:
+    plain = tile_of_voxels(TILE, 1, 2)
+    rounded = Tile(TILE, 0, snap(plain.gaussians, LATTICES["standard"]))
+    for tile in (plain, rounded):
+        store.put_tiles([tile])
+        head = store.get("ndt", TILE)
+        assert head is not None
+        assert head.codec_id == best_codec(tile.gaussians)
+        assert head.sha == hashlib.sha256(TILE.morton.to_bytes(8, "little") + encode_gaussians(tile.gaussians)).digest()
+        assert head.decode().gaussians == tile.gaussians
+    assert best_codec(plain.gaussians) != best_codec(rounded.gaussians)
+
+
+def test_a_body_of_plain_columns_that_an_older_program_has_stored_is_read(store: Store, maker: SqliteMaker) -> None:
+    tile = tile_of_voxels(TILE, 1, 2)
+    store.put_tiles([tile])
+    with apsw.Connection(str(maker.path)) as connection:
+        row = (encode_gaussians(tile.gaussians), TILE.morton)
+        connection.execute("UPDATE tile_version SET codec_id = 0, body = ? WHERE tile = ?", row)
+    old = store.get("ndt", TILE)
+    assert old is not None
+    assert (old.codec_id, old.sha, old.decode().gaussians) == (0, tile.sha, tile.gaussians)
+    store.put_tiles([tile_of_voxels(TILE, 3)])
+    assert store.rollback("ndt", TILE, 1).codec_id == 0
+    assert store.put_tiles([tile]) == [PublishResult("unchanged", 3)]
 
 
 def test_the_same_import_again_changes_nothing(store: Store) -> None:
@@ -273,8 +296,11 @@ def test_a_body_that_is_not_what_its_hash_says_is_found_when_it_is_decoded(store
     one, other = store.get("ndt", TILE), store.get("ndt", EAST)
     assert one is not None
     assert other is not None
-    with pytest.raises(WrongHash):
+    with pytest.raises(SchemaError, match="13033/03021/23031/22102"):
         dataclasses.replace(one, body=other.body).decode()
+    plain = dataclasses.replace(one, codec_id=0, body=encode_gaussians(other.decode().gaussians))
+    with pytest.raises(WrongHash):
+        plain.decode()
 
 
 def test_a_backup_is_a_store_and_overwrites_nothing(store: Store, maker: SqliteMaker) -> None:

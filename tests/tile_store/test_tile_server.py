@@ -143,7 +143,7 @@ def test_what_can_never_be_answered_is_refused_by_name_at_once(client: Bus) -> N
     assert "WrongVersion: TileRequest of major version 9" in refusal(client, key, b"\x08\x09")
     assert "BadKey" in refusal(client, key.replace("13033", "99999"), TileRequest().encode())
     assert "BadKey" in refusal(client, keys.catalog_key("ndt", TILE.district).replace("13033", "x"))
-    assert "comes in codec 0, asked for (7,)" in refusal(client, key, TileRequest(codecs=(7,)).encode())
+    assert "comes in codec 1, asked for (7,)" in refusal(client, key, TileRequest(codecs=(7,)).encode())
 
 
 @pytest.mark.usefixtures("server")
