@@ -12,8 +12,9 @@ from gnd_map.errors import GndError
 
 COMMANDS: Final[dict[str, tuple[str, str]]] = {
     "fleet": ("deploy.fleet_cli:fleet", "Run a whole fleet on this machine and watch the map heal."),
+    "lab": ("deploy.lab.command:lab", "Run a fleet over real shaped links in network namespaces (root)."),
     "watch": ("deploy.watch_cli:watch", "Print the tile updates of a region as they are published."),
-    "traffic": ("fleet_bus.cli:traffic", "Account for the bytes of a run against 3G, 4G and 5G."),
+    "traffic": ("deploy.traffic_cli:traffic", "Account for every byte of a run against 3G, 4G and 5G; as a page, too."),
     "map": ("tile_store.cli:map_group", "Build, inspect, compare, export and roll back maps."),
     "import": ("vehicle_agent.importer_cli:import_drives", "Turn a recording (KITTI, PCD, ROS 2, ...) into a drive."),
     "localise": ("vehicle_agent.localise_drive.command:localise", "Localise a recorded drive on a map."),

@@ -6,6 +6,7 @@ GndError
     ├── ProcessDied        a process ended too often to be restarted
     ├── LabError           namespaces or shaped links cannot be made or are taken
     │   └── LabRuns        a lab of that name is running
+    ├── PageError          a page cannot be written
     └── RegionError        a region that is no wildcard, tile or circle
 """
 
@@ -34,3 +35,7 @@ class LabRuns(LabError):
 
 class RegionError(DeployError):
     """A region that is neither a wildcard, nor a tile, nor a circle."""
+
+
+class PageError(DeployError):
+    """A page cannot be written."""

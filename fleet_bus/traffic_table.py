@@ -1,48 +1,91 @@
 """The report of `gnd traffic` as tables for people."""
 
+from collections.abc import Iterable
+
 from rich.console import Console
 from rich.table import Table
 
-from fleet_bus.traffic import AgentTraffic, fleet_totals
+from fleet_bus.traffic import AgentTraffic, KindTraffic, fleet_lines, fleet_totals, per_km
 
 
 def print_tables(agents: tuple[AgentTraffic, ...], console: Console) -> None:
-    """Prints the messages by agent and kind, then the use of each link."""
-    console.print(_messages(agents))
+    """Prints the kinds of the whole fleet, each agent's own, and the use of each link."""
+    console.print(_fleet(agents))
+    if len(agents) > 1:
+        console.print(_by_agent(agents))
     console.print(_links(agents))
+    for note in notes(agents):
+        console.print(note)
+
+
+def notes(agents: tuple[AgentTraffic, ...]) -> list[str]:
+    """What a reader of the figures has to know about them."""
     ignored = sum(agent.ignored_lines for agent in agents)
+    estimated = sum(agent.estimated_wire_bytes for agent in agents)
+    lines = []
     if ignored:
-        console.print(f"{ignored} unfinished ledger lines left out (a process was killed while writing)")
+        lines.append(f"{ignored} unfinished ledger lines left out (a process was killed while writing, or damage)")
+    if estimated:
+        lines.append(
+            f"{estimated / 1000:.1f} kB on the wire are estimated: no reading of the connection covers them "
+            "(sent after the last reading before a kill, or this system does not count)"
+        )
+    return lines
 
 
-def _messages(agents: tuple[AgentTraffic, ...]) -> Table:
-    table = Table("agent", "kind", "way", title="Payload by agent and kind", caption=_caption(agents))
-    for column in ("messages", "kB", "kB/km"):
-        table.add_column(column, justify="right")
-    for agent in agents:
-        for line in agent.lines:
-            size_kb = line.app_bytes / 1000
-            per_km = f"{size_kb / agent.drive_km:.1f}" if agent.drive_km > 0 else "–"
-            table.add_row(agent.agent, line.kind, line.direction, str(line.messages), f"{size_kb:.1f}", per_km)
-        table.add_section()
+def _fleet(agents: tuple[AgentTraffic, ...]) -> Table:
+    table = _kinds("Bytes by kind, all agents", caption(agents))
+    drive_km = sum(agent.drive_km for agent in agents)
+    _add(table, "all" if len(agents) > 1 else agents[0].agent, fleet_lines(agents), drive_km)
     return table
 
 
+def _by_agent(agents: tuple[AgentTraffic, ...]) -> Table:
+    table = _kinds("Bytes by agent and kind", "")
+    for agent in agents:
+        _add(table, agent.agent, agent.lines, agent.drive_km)
+    return table
+
+
+def _kinds(title: str, caption_: str) -> Table:
+    table = Table("agent", "kind", "way", title=title, caption=caption_ or None)
+    for column in ("messages", "kB", "kB/km", "wire kB", "wire kB/km"):
+        table.add_column(column, justify="right")
+    return table
+
+
+def _add(table: Table, agent: str, lines: Iterable[KindTraffic], drive_km: float) -> None:
+    for line in lines:
+        app, wire = line.app_bytes, line.wire_bytes
+        table.add_row(
+            agent, line.kind, line.direction, str(line.messages) if line.messages else "–",
+            f"{app / 1000:.1f}" if app else "–", _per_km(app, drive_km) if app else "–",
+            f"{wire / 1000:.1f}", _per_km(wire, drive_km),
+        )  # fmt: skip
+    table.add_section()
+
+
+def _per_km(size_bytes: int, drive_km: float) -> str:
+    return f"{per_km(size_bytes, drive_km):.1f}" if drive_km > 0 else "–"
+
+
 def _links(agents: tuple[AgentTraffic, ...]) -> Table:
-    caption = "share = part of what the link can carry during the drive; sizes with the overhead of each message"
-    table = Table("agent", "link", "way", title="On mobile links", caption=caption)
+    text = "share = part of what the link can carry during the drive, by the bytes on the wire"
+    table = Table("agent", "link", "way", title="On mobile links", caption=text)
     for column in ("busy s", "share %", "longest wait s", "a tile arrives after s"):
         table.add_column(column, justify="right")
     for agent in agents:
         for use in agent.links:
-            arrival = f"{agent.tile_arrival_s[use.link]:.3f}" if use.direction == "down" else ""
+            arrival_s = agent.tile_arrival_s[use.link] if use.direction == "down" else None
+            arrival = "" if arrival_s is None else f"{arrival_s:.3f}"
             numbers = (f"{use.sending_s:.3f}", f"{100 * use.share:.3f}", f"{use.longest_wait_s:.3f}", arrival)
             table.add_row(agent.agent, use.link, use.direction, *numbers)
         table.add_section()
     return table
 
 
-def _caption(agents: tuple[AgentTraffic, ...]) -> str:
+def caption(agents: tuple[AgentTraffic, ...]) -> str:
+    """The totals in one sentence."""
     total = fleet_totals(agents)
     return (
         f"{total['agents']} agents, {total['drive_km']:.2f} km: "

@@ -5,13 +5,14 @@ import json
 import pytest
 from click.testing import CliRunner
 
-from fleet_bus.cli import traffic
+from deploy.traffic_cli import traffic
 from fleet_bus.errors import LedgerError, LinkError
 from fleet_bus.ledger import Ledger
 from fleet_bus.ledger_file import read_run
 from fleet_bus.links import LinkProfile
 from fleet_bus.pacer import MESSAGE_OVERHEAD_BYTES
-from fleet_bus.traffic import agent_traffic, link_use
+from fleet_bus.traffic import agent_traffic
+from fleet_bus.traffic_links import link_use
 from fleet_bus.wire import WireBytes
 
 LINK = LinkProfile("test", down_bit_s=80_000, up_bit_s=8_000, delay_ms=250, burst_bytes=0)
@@ -51,12 +52,12 @@ def test_figures_of_a_drive_by_hand(run):
 
 def test_use_of_a_link_by_hand(run):
     ledger, _ = read_run(run)
-    down, up = link_use(ledger, LINK, "down"), link_use(ledger, LINK, "up")
-    assert down.sending_s == pytest.approx(0.5 + 0.02)
-    assert down.share == pytest.approx(0.0052)
+    down, up = link_use(ledger, LINK, "down", 6000), link_use(ledger, LINK, "up", 3000)
+    assert down.sending_s == pytest.approx(0.6)
+    assert down.share == pytest.approx(0.006)
     # The five messages of the start queue up: the last one takes half a second and the delay.
     assert down.longest_wait_s == pytest.approx(0.5 + 0.25)
-    assert up.sending_s == pytest.approx(0.16 + 2.0)
+    assert up.sending_s == pytest.approx(3.0)
     assert up.longest_wait_s == pytest.approx(2.0 + 0.25)
 
 

@@ -1,0 +1,48 @@
+"""`gnd traffic`: what a run sent and received, as tables, JSON, CSV and a page."""
+
+import json
+from pathlib import Path
+from typing import Final
+
+import click
+from rich.console import Console
+
+from deploy.traffic_page import write_page
+from fleet_bus.ledger_file import read_run, run_folder
+from fleet_bus.links import load_link
+from fleet_bus.traffic import agent_traffic, as_json
+from fleet_bus.traffic_csv import as_csv
+from fleet_bus.traffic_table import print_tables
+
+LINKS: Final = ("3g", "4g", "5g")
+_WIDTH: Final = 110
+
+
+@click.command()
+@click.argument("run", type=click.Path(path_type=Path))
+@click.option("--json", "as_json_", is_flag=True, help="Print JSON instead of tables.")
+@click.option("--csv", "as_csv_", is_flag=True, help="Print CSV: a row for each agent, kind and direction.")
+@click.option("--page", type=click.Path(path_type=Path), help="Write the account as a page (one HTML file).")
+@click.option(
+    "--link", "links", multiple=True, default=LINKS, help="Profile to compare with, or a TOML file (FILE or FILE:NAME)."
+)
+def traffic(run: Path, as_json_: bool, as_csv_: bool, page: Path | None, links: tuple[str, ...]) -> None:
+    """Show what RUN (a folder, or a name below runs/) sent and received, and what mobile links make of it.
+
+    Every byte on the wire is accounted for: by kind of message, and what the connections themselves cost
+    (acks: packets without data; resent; session: handshakes, declarations, keep-alives).
+    """
+    if as_json_ and as_csv_:
+        raise click.UsageError("--json and --csv exclude each other: one output, one form")
+    profiles = tuple(load_link(link) for link in links)
+    agents = tuple(agent_traffic(ledger, profiles) for ledger in read_run(run))
+    if page is not None:
+        write_page(page, run_folder(run).resolve().name, agents, profiles)
+    if as_json_:
+        click.echo(json.dumps(as_json(str(run), agents, profiles), indent=1))
+    elif as_csv_:
+        click.echo(as_csv(agents, profiles), nl=False)
+    elif page is not None:
+        click.echo(f"page written: {page}")
+    else:
+        print_tables(agents, Console(width=_WIDTH))
