@@ -65,7 +65,7 @@ def partly_edited(objects: Sequence[WorldObject], share: float, rng: np.random.G
     if share >= 1.0:
         return tuple(objects)
     names = sorted({o.name for o in objects if o.edit != "kept"})
-    made = {name for name, drawn in zip(names, rng.random(len(names)).tolist(), strict=True) if drawn < share}
+    made = {names[k] for k in rng.permutation(len(names))[: round(share * len(names))].tolist()}
     there = (o for o in objects if o.edit == "kept" or o.name in made or "before" in o.states)
     return tuple(o if o.edit == "kept" or o.name in made else replace(o, states=STATES, edit="kept") for o in there)
 
