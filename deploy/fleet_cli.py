@@ -5,8 +5,10 @@ import json
 import signal
 import threading
 import time
+from collections.abc import Callable
+from contextlib import AbstractContextManager, nullcontext
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import click
 from rich.console import Console
@@ -14,29 +16,45 @@ from rich.console import Console
 from deploy.fleet_config import FleetConfig, load_fleet_config
 from deploy.ports import claim_port
 from deploy.run_folder import RunFolder, create_run_folder, default_run_path
+from deploy.site import Site
 from deploy.source import Source
 from fleet_bus.links import load_link
 
 PATH = click.Path(path_type=Path)
 
 
+_Command = TypeVar("_Command", bound=Callable[..., Any])
+
+RUN_OPTIONS = (
+    click.option("--shards", type=int, help="Merger shard processes.  [default: 2]"),
+    click.option("--world-seed", type=int, help="Seed of the simulated world.  [default: 7]"),
+    click.option("--drives", type=PATH, multiple=True, help="Recorded drives (MCAP, folders), not simulated ones."),
+    click.option("--map", "base_map", type=PATH, help="Store with the base map for --drives (`gnd map build`)."),
+    click.option("--worlds", type=PATH, help="Folder that keeps simulated worlds by seed for further runs."),
+    click.option("--out", type=PATH, help="Folder of the run.  [default: runs/<UTC time>]"),
+    click.option("--overwrite", is_flag=True, help="Replace an earlier run in that folder."),
+    click.option("--merge-mode", type=click.Choice(["default", "paper"]), help="Rules of merging."),
+    click.option("--detect-mode", type=click.Choice(["default", "paper"]), help="Rules of detection."),
+    click.option("--config", "config_file", type=PATH, help="TOML file in the form of deploy/fleet.toml."),
+    click.option("--dump-config", is_flag=True, help="Print the effective configuration and end."),
+    click.option("--keep-drives", is_flag=True, help="Keep the simulated drives (some hundred MB) after the run."),
+    click.option("--json", "as_json", is_flag=True, help="Print the summary as JSON."),
+)
+"""Options that `gnd fleet` and `gnd lab` share."""
+
+
+def run_options(command: _Command) -> _Command:
+    """Give a command the options of a run."""
+    for option in reversed(RUN_OPTIONS):
+        command = option(command)
+    return command
+
+
 @click.command()
 @click.option("--agents", type=int, help="Vehicle agent processes.  [default: 8, or one a drive with --drives]")
-@click.option("--shards", type=int, help="Merger shard processes.  [default: 2]")
 @click.option("--link", help="Link of every vehicle: 3g, 4g, 5g, none, or a TOML file.  [default: 4g]")
-@click.option("--world-seed", type=int, help="Seed of the simulated world.  [default: 7]")
-@click.option("--drives", type=PATH, multiple=True, help="Recorded drives (MCAP, folders) instead of simulated ones.")
-@click.option("--map", "base_map", type=PATH, help="Store with the base map for --drives (`gnd map build`).")
-@click.option("--worlds", type=PATH, help="Folder that keeps simulated worlds by seed for further runs.")
-@click.option("--out", type=PATH, help="Folder of the run.  [default: runs/<UTC time>]")
-@click.option("--overwrite", is_flag=True, help="Replace an earlier run in that folder.")
 @click.option("--port", type=int, help="Port of the router; 0 takes a free one.  [default: 0]")
-@click.option("--merge-mode", type=click.Choice(["default", "paper"]), help="Rules of merging.  [default: default]")
-@click.option("--detect-mode", type=click.Choice(["default", "paper"]), help="Rules of detection.  [default: default]")
-@click.option("--config", "config_file", type=PATH, help="TOML file in the form of deploy/fleet.toml.")
-@click.option("--dump-config", is_flag=True, help="Print the effective configuration and end.")
-@click.option("--keep-drives", is_flag=True, help="Keep the simulated drives (some hundred MB) after the run.")
-@click.option("--json", "as_json", is_flag=True, help="Print the summary as JSON.")
+@run_options
 def fleet(
     drives: tuple[Path, ...],
     base_map: Path | None,
@@ -63,11 +81,30 @@ def fleet(
     claim_port(config.port)
     folder = create_run_folder(out or default_run_path(), overwrite=overwrite)
     folder.write_mark({"config": dataclasses.asdict(config), "drives": [str(path) for path in drives]})
-    summary = _run(config, folder, source, keep_drives)
+    summary = run(config, folder, source, keep_drives=keep_drives)
     click.echo(json.dumps(summary, indent=2) if as_json else summary_text(summary, folder))
 
 
-def _run(config: FleetConfig, folder: RunFolder, source: Source, keep_drives: bool) -> dict[str, Any]:
+def run(
+    config: FleetConfig,
+    folder: RunFolder,
+    source: Source,
+    *,
+    keep_drives: bool,
+    place: Callable[[], AbstractContextManager[Site | None]] = nullcontext,
+) -> dict[str, Any]:
+    """Prepare and run a fleet and write its summary.
+
+    Args:
+        config: what to run.
+        folder: where the run writes.
+        source: drives and map.
+        keep_drives: keep simulated drives.
+        place: gives the site while the processes run; by default all run on the loopback interface.
+
+    Returns:
+        The content of `summary.json`.
+    """
     # The heavy imports wait until the options have been found good.
     from deploy import prepare, summary
     from deploy.fleet import run_fleet
@@ -82,7 +119,8 @@ def _run(config: FleetConfig, folder: RunFolder, source: Source, keep_drives: bo
         prepared = prepare.prepare(config, folder, source, progress)
         warm.join()
     prepare_s = time.monotonic() - started_s
-    outcome = run_fleet(config, folder, prepared, console, stop)
+    with place() as site:
+        outcome = run_fleet(config, folder, prepared, console, stop, site)
     result = summary.write_summary(config, folder, prepared, outcome, prepare_s)
     if not keep_drives:
         prepare.remove_drives(folder)

@@ -1,6 +1,6 @@
 """Measures a link by real transfers between its two ends: delay and loss of datagrams, rate of a flood, rate of TCP.
 
-Both ends lie on this machine, so one monotonic clock times both: delays are one-way and measured, not half a round trip.
+Both ends lie on this machine, so one monotonic clock times both: delays are one-way, not half of a round trip.
 """
 
 import contextlib

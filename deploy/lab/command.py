@@ -1,0 +1,121 @@
+"""`gnd lab`: a fleet over real shaped links; `check` measures them, `clean` removes what a killed lab left."""
+
+import dataclasses
+import json
+import signal
+from pathlib import Path
+from types import FrameType
+from typing import Any
+
+import click
+from rich.console import Console
+
+from deploy.fleet_cli import run, run_options, summary_text
+from deploy.fleet_config import load_fleet_config
+from deploy.lab.check import DIRECTIONS, carried, congestion_control, measure
+from deploy.lab.check import as_json as check_as_json
+from deploy.lab.groups import DEFAULT_GROUPS, parse_groups
+from deploy.lab.lab import clean as clean_up
+from deploy.lab.lab import open_lab
+from deploy.lab.run import LabRun
+from deploy.lab.tables import check_table, run_table, run_verdict
+from deploy.lab.tools import check_rights, kernel_offer
+from deploy.run_folder import create_run_folder, default_run_path
+from deploy.source import Source
+
+WIDTH = 170
+
+
+@click.group(invoke_without_command=True)
+@click.option(
+    "--groups", default=DEFAULT_GROUPS, show_default=True, help="Vehicles by link: profile (or TOML file):number, ..."
+)
+@click.option("--name", default="lab", show_default=True, help="Name of the lab: one of a name runs at a time.")
+@click.option("--relay", "relay_all", is_flag=True, help="Delay and lose by a relay even where the kernel has netem.")
+@run_options
+@click.pass_context
+def lab(
+    context: click.Context,
+    /,
+    groups: str,
+    name: str,
+    relay_all: bool,
+    drives: tuple[Path, ...],
+    base_map: Path | None,
+    worlds: Path | None,
+    out: Path | None,
+    overwrite: bool,
+    config_file: Path | None,
+    dump_config: bool,
+    keep_drives: bool,
+    as_json: bool,
+    **options: Any,
+) -> None:
+    """Run a fleet over real links: a network namespace for each group, each vehicle with a link of its own.
+
+    As `gnd fleet`, but rate, delay, jitter and loss of the profiles (deploy/links.toml) are made by the network, not
+    by the sessions. Needs root and iproute2. The folder of the run also holds lab.json: per group the rates reached,
+    delays, losses, and the ledgers' wire bytes against the counters of the interfaces.
+    """
+    if context.invoked_subcommand is not None:
+        return
+    parsed = parse_groups(groups)
+    config = load_fleet_config(config_file, options | {"agents": sum(g.count for g in parsed), "link": groups})
+    if dump_config:
+        click.echo(json.dumps(dataclasses.asdict(config), indent=2))
+        return
+    source = Source(drives, base_map, worlds, config.agents)
+    check_rights()
+    end_on_sigterm()
+    with open_lab(name, parsed, kernel_offer(), relay_all=relay_all) as opened:
+        folder = create_run_folder(out or default_run_path(), overwrite=overwrite)
+        folder.write_mark({"config": dataclasses.asdict(config), "lab": name, "drives": [str(path) for path in drives]})
+        lab_run = LabRun(opened, folder)
+        summary = run(config, folder, source, keep_drives=keep_drives, place=lab_run.place)
+        report = lab_run.report()
+    if as_json:
+        click.echo(json.dumps(summary | {"lab": report}, indent=2))
+        return
+    click.echo(summary_text(summary, folder))
+    Console(width=WIDTH).print(run_table(report))
+    click.echo(run_verdict(report))
+
+
+@lab.command()
+@click.option("--links", default="3g,4g,5g", show_default=True, help="Profiles or TOML files, with commas.")
+@click.option("--name", default="check", show_default=True, help="Name of the lab.")
+@click.option("--relay", "relay_all", is_flag=True, help="Delay and lose by a relay even where the kernel has netem.")
+@click.option("--seconds", type=click.FloatRange(0.5, 60), default=3.0, show_default=True, help="Of each transfer.")
+@click.option("--json", "as_json_", is_flag=True, help="Print the measurements as JSON.")
+def check(links: str, name: str, relay_all: bool, seconds: float, as_json_: bool) -> None:
+    """Measure rate, delay and loss of each profile by real transfers through a shaped link."""
+    groups = parse_groups(",".join(f"{link}:1" for link in links.split(",") if link.strip()))
+    check_rights()
+    end_on_sigterm()
+    with open_lab(name, groups, kernel_offer(), relay_all=relay_all) as opened, carried(opened):
+        measured = [measure(link, direction, seconds) for link in opened.links for direction in DIRECTIONS]
+    if as_json_:
+        click.echo(json.dumps(check_as_json(measured), indent=2))
+        return
+    Console(width=WIDTH).print(check_table(measured))
+    click.echo(f"one TCP: a single connection ({congestion_control()}); flood and delays: datagrams, IP bytes, one-way")
+
+
+@lab.command()
+def clean() -> None:
+    """Remove namespaces and links that killed labs have left behind; labs that run are left alone."""
+    check_rights()
+    done = clean_up()
+    for name, removed in done.items():
+        click.echo(f"{name}: {len(removed)} namespaces removed" if removed else f"{name} runs: left alone")
+    if not done:
+        click.echo("nothing to remove")
+
+
+def end_on_sigterm() -> None:
+    """Make SIGTERM end the command as Ctrl-C does, so that a lab is removed; `gnd fleet` later sets its own."""
+
+    def end(_signal: int, _frame: FrameType | None) -> None:
+        raise KeyboardInterrupt
+
+    signal.signal(signal.SIGTERM, end)

@@ -1,0 +1,81 @@
+"""A fleet in a lab: which process runs where, and the account of its links."""
+
+from collections.abc import Callable, Iterator
+from contextlib import AbstractContextManager, contextmanager
+from pathlib import Path
+from typing import Any, Final
+
+from deploy.lab.groups import ROUTER_FROM_CLOUD, ROUTER_LISTENS, unpaced
+from deploy.lab.lab import Lab
+from deploy.lab.namespaces import inside
+from deploy.lab.relay import run_relay
+from deploy.lab.report import Evidence, account, as_json, count_links, read_relays, write_account
+from deploy.lab.sampler import LinkSeen, sampling
+from deploy.processes import ProcessSpec
+from deploy.run_folder import RunFolder
+from deploy.site import Site, VehicleSite
+from fleet_bus.errors import LedgerError
+from fleet_bus.ledger_file import AgentLedger, read_ledger
+
+RELAYS: Final = "relays"
+ACCOUNT: Final = "lab.json"
+
+
+def lab_site(lab: Lab, relays: Path) -> Site:
+    """Return where the processes of a fleet run: the cloud in one namespace, each group in another."""
+    vehicles = tuple(VehicleSite(link.endpoint, unpaced(link.profile), link.vehicle_namespace) for link in lab.links)
+    return Site(ROUTER_LISTENS, ROUTER_FROM_CLOUD, vehicles, lab.cloud_namespace, relay_processes(lab, relays))
+
+
+def relay_processes(lab: Lab, relays: Path) -> tuple[ProcessSpec, ...]:
+    """Return one relay process for each group whose links need one.
+
+    Args:
+        lab: the lab.
+        relays: folder of the relays' accounts, made here.
+    """
+    relays.mkdir(parents=True, exist_ok=True)
+    carried = {group.name: tuple(link for link in lab.links_of(group) if link in lab.relayed) for group in lab.groups}
+    return tuple(ProcessSpec(f"link-{name}", run_relay, (links, relays)) for name, links in carried.items() if links)
+
+
+class LabRun:
+    """One fleet run in a lab.
+
+    Args:
+        lab: where.
+        folder: the run.
+    """
+
+    def __init__(self, lab: Lab, folder: RunFolder) -> None:
+        self.lab, self.folder = lab, folder
+        self._seen: dict[int, LinkSeen] = {}
+
+    @property
+    def place(self) -> Callable[[], AbstractContextManager[Site]]:
+        """For `fleet_cli.run`: the launcher is in the cloud's namespace, and the links are watched, for the block."""
+        return self._placed
+
+    @contextmanager
+    def _placed(self) -> Iterator[Site]:
+        with sampling(self.lab) as self._seen, inside(self.lab.cloud_namespace):
+            yield lab_site(self.lab, self.folder.root / RELAYS)
+
+    def report(self) -> dict[str, Any]:
+        """Account for the links after the run, while the lab still exists; also written to `lab.json`."""
+        relays = read_relays(self.folder.root / RELAYS)
+        evidence = Evidence(count_links(self.lab), self._seen, relays, read_ledgers(self.folder, len(self.lab.links)))
+        values = as_json(self.lab.name, account(self.lab, evidence))
+        write_account(self.folder.root / ACCOUNT, values)
+        return values
+
+
+def read_ledgers(folder: RunFolder, vehicles: int) -> dict[int, AgentLedger]:
+    """Return the ledgers of a run by number of the vehicle; one that left none is missing."""
+    found: dict[int, AgentLedger] = {}
+    for number in range(vehicles):
+        try:
+            found[number] = read_ledger(folder.ledger / f"vehicle-{number:02d}.jsonl")
+        except LedgerError:
+            continue
+    return found
