@@ -5,7 +5,7 @@ import json
 import zipfile
 import zlib
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -31,9 +31,14 @@ _MAX_RANGE_M, _MIN_RANGE_M = 80.0, 2.0
 
 @dataclass(frozen=True)
 class BaseMap:
-    """Tiles of the state before, all of version 1."""
+    """Tiles of the state before, of version 1 where `versions` says nothing else."""
 
     tiles: Mapping[TileId, Gaussians]
+    versions: Mapping[TileId, int] = field(default_factory=dict)
+
+    def version(self, tile_id: TileId) -> int:
+        """Return which version of a tile this is."""
+        return self.versions.get(tile_id, 1)
 
     @cached_property
     def shas(self) -> dict[TileId, bytes]:
@@ -72,6 +77,7 @@ def write_base(base: BaseMap, path: Path) -> None:
     arrays: dict[str, Any] = {"head": np.array(json.dumps({"format": "gnd.base", "sha": base.sha}))}
     arrays["morton"] = np.array([i.morton for i in ids], np.int64)
     arrays["length"] = np.array([len(base.tiles[i]) for i in ids], np.int64)
+    arrays["version"] = np.array([base.version(i) for i in ids], np.int64)
     for name in _COLUMNS:
         arrays[name] = np.concatenate([getattr(base.tiles[i], name) for i in ids])
     partial = path.with_name(f".{path.name}.part")
@@ -93,7 +99,9 @@ def read_base(path: Path) -> BaseMap:
         tiles = {}
         for code, stop, n in zip(data["morton"].tolist(), stops.tolist(), data["length"].tolist(), strict=True):
             tiles[TileId(code)] = Gaussians(*(data[name][stop - n : stop] for name in _COLUMNS))
-        base = BaseMap(tiles)
+        base = BaseMap(
+            tiles, dict(zip(tiles, data.get("version", np.ones(len(tiles), np.int64)).tolist(), strict=True))
+        )
         if json.loads(str(data["head"]))["sha"] != base.sha:
             raise FolderError(f"the base map {path} is damaged: its content is not what was written")
         return base

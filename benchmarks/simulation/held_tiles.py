@@ -45,7 +45,7 @@ class HeldTiles:
         gaussians = self._base.tiles.get(tile_id, Gaussians.empty())
         try:
             if len(gaussians):
-                self._map.set_tile(Tile(tile_id, 1, gaussians))
+                self._map.set_tile(Tile(tile_id, self._base.version(tile_id), gaussians))
             else:
                 self._map.set_absent(tile_id)
         except TileError:  # of another latitude zone: this grid frame cannot hold its voxels

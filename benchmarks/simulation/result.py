@@ -33,6 +33,7 @@ class VehicleResult:
         stats: counts, localisation errors; plain values.
         watched: times int64 (S,) and counters int32 (S, W, 4) of the watched voxels; empty for most vehicles.
         pcd: the baseline's encoded report; empty without it.
+        packed: the first half of each report in short, as the vehicle's outbox holds it; empty where it has none.
     """
 
     vehicle: str
@@ -45,6 +46,7 @@ class VehicleResult:
         default_factory=lambda: (np.zeros(0, np.int64), np.zeros((0, 0, 4), np.int32))
     )
     pcd: bytes = b""
+    packed: tuple[bytes, ...] = ()
 
     @property
     def upload_bytes(self) -> int:
@@ -56,8 +58,11 @@ def write_result(result: VehicleResult, key: str, path: Path) -> None:
     """Write a result; the file appears complete or not at all."""
     head: dict[str, Any] = {"key": key, "vehicle": result.vehicle, "sensor": result.sensor, "stats": dict(result.stats)}
     head["lengths"] = [len(report) for report in result.reports]
-    arrays: dict[str, Any] = {"head": np.array(json.dumps(head)), "row": result.row}
+    head["packed"] = [len(half) for half in result.packed]
+    arrays: dict[str, Any] = {}
+    arrays["packed"] = np.frombuffer(b"".join(result.packed), np.uint8)
     arrays["reports"] = np.frombuffer(b"".join(result.reports), np.uint8)
+    arrays |= {"head": np.array(json.dumps(head)), "row": result.row}
     arrays["pcd"] = np.frombuffer(result.pcd, np.uint8)
     arrays["watched_t_ns"], arrays["watched_counters"] = result.watched
     arrays["evidence"] = np.stack([result.evidence[name] for name in EVIDENCE]).astype(np.int32)
@@ -85,8 +90,7 @@ def read_result(path: Path, key: str) -> VehicleResult:
 
 
 def _result(head: dict[str, Any], data: dict[str, NDArray[Any]]) -> VehicleResult:
-    body, stops = data["reports"].tobytes(), np.cumsum([0, *head["lengths"]]).tolist()
-    reports = tuple(body[a:b] for a, b in pairwise(stops))
+    reports = _cut(data["reports"], head["lengths"])
     for report in reports:
         ChangeReport.decode(report)
     return VehicleResult(
@@ -98,4 +102,10 @@ def _result(head: dict[str, Any], data: dict[str, NDArray[Any]]) -> VehicleResul
         stats=head["stats"],
         watched=(data["watched_t_ns"], data["watched_counters"]),
         pcd=data["pcd"].tobytes(),
+        packed=_cut(data["packed"], head["packed"]),
     )
+
+
+def _cut(column: NDArray[np.uint8], lengths: list[int]) -> tuple[bytes, ...]:
+    body, stops = column.tobytes(), np.cumsum([0, *lengths]).tolist()
+    return tuple(body[a:b] for a, b in pairwise(stops))

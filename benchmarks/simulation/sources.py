@@ -15,6 +15,8 @@ VEHICLE: Final = (
     "vehicle_agent/localise",
     "vehicle_agent/segment",
     "vehicle_agent/report.py",
+    "vehicle_agent/packing.py",
+    "vehicle_agent/tracks.py",
     "vehicle_agent/local_map.py",
     "vehicle_agent/place.py",
     "vehicle_agent/scans.py",

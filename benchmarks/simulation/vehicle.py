@@ -109,13 +109,14 @@ def drive(
         try:
             run = _Run(header, items, base, outbox, task, labels)
             run.to_the_end()
-            reports = tuple(letter.body for letter in outbox.due(2**62, _ALL_LETTERS))
+            letters = outbox.due(2**62, _ALL_LETTERS)
         finally:
             outbox.close()
     row, evidence = voxels.columns(run.detector.taken, lambda found: evidence_columns(found, task.method))
     pcd, pcd_bytes = run.pcd_report()
     stats = run.stats() | {"pcd_bytes": pcd_bytes, "cpu_s": round(process_time() - started_s, 2)}
-    return VehicleResult(task.drive.vehicle, task.sensor, reports, row, evidence, stats, run.watched(), pcd)
+    reports, packed = tuple(letter.body for letter in letters), tuple(letter.packed for letter in letters)
+    return VehicleResult(task.drive.vehicle, task.sensor, reports, row, evidence, stats, run.watched(), pcd, packed)
 
 
 class _Run:

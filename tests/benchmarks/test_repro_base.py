@@ -59,7 +59,7 @@ def test_a_driven_base_map_is_what_map_build_makes(tmp_path: Path, monkeypatch: 
     ours = driven(world)
     drives = [simulate_drive(world, config, tmp_path / f"{config.vehicle}.mcap") for config in configs]
     with SqliteStore(tmp_path / "map.sqlite") as store:
-        build_map(drives, store)
+        build_map(drives, store, codec="float")
         built = {entry.tile: store.get("ndt", entry.tile, entry.version) for entry in store.heads("ndt")}
     theirs = BaseMap({tile: stored.decode().gaussians for tile, stored in built.items() if stored is not None})
     assert set(ours.tiles) == set(theirs.tiles)
