@@ -18,7 +18,7 @@ from schemas.changes import ChangeReport, TileChange
 from schemas.keys import change_key
 from schemas.report_id import deterministic_report_id
 from vehicle_agent.config import ReportParameters
-from vehicle_agent.detect.classify import classify, tile_change
+from vehicle_agent.detect.classify import Classification, classify, tile_change
 from vehicle_agent.detect.detector import ChangeDetector
 from vehicle_agent.detect.uncertainty import PoseUncertainty
 from vehicle_agent.localise.estimates import PoseEstimate
@@ -132,12 +132,16 @@ class Reporter:
                 self.classes[name.lower()] += int(n)
             if not found.observed.any():
                 continue
-            change = on_lattice(tile_change(found))
+            change = self._said(found)
             pending = self._pending.setdefault(tile_id.district, _Pending(odometer_m))
             if tile_id in pending.changes:  # the vehicle came back: one statement a tile and report
                 self._report(tile_id.district)
                 pending = self._pending.setdefault(tile_id.district, _Pending(odometer_m))
             pending.changes[tile_id], pending.bases[tile_id] = change, evidence.base
+
+    def _said(self, found: Classification) -> TileChange:
+        """What the report says of a tile; a study may let it say something else."""
+        return on_lattice(tile_change(found))
 
     def _report(self, district: District) -> None:
         pending, stretch = self._pending.pop(district), self._stretch

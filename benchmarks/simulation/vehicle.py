@@ -28,7 +28,9 @@ from gnd_map.geodesy import LocalFrame
 from gnd_map.grid import GridFrame
 from gnd_map.motion import Trajectory
 from gnd_map.tile_id import TileId
+from schemas.changes import TileChange
 from schemas.drive import DriveHeader, DriveItem, ReferencePose, Scan
+from vehicle_agent.detect.classify import Classification, tile_change
 from vehicle_agent.errors import LocaliseError
 from vehicle_agent.local_map import LocalMap
 from vehicle_agent.localise.estimates import PoseEstimate, localisation_error
@@ -55,6 +57,8 @@ class VehicleTask:
         watch: voxels to write down scan by scan.
         recording: keep the drive in this MCAP file, too.
         cloud: the point-cloud baseline's map; None to run without it.
+        rounded: whether new Gaussians are moved onto the lattice on which they travel, as the agent does; else the
+            reports hold them as they were measured.
     """
 
     world: Path
@@ -69,6 +73,14 @@ class VehicleTask:
     watch: Watch | None = None
     recording: Path | None = None
     cloud: Path | None = None
+    rounded: bool = True
+
+
+class MeasuredReporter(Reporter):
+    """The reporter, without the lattice: what it says is as it was measured."""
+
+    def _said(self, found: Classification) -> TileChange:
+        return tile_change(found)
 
 
 def run_vehicle(task: VehicleTask, tick: Tick) -> None:
@@ -143,7 +155,8 @@ class _Run:
         self._localisation = _localisation(header, local_map, task)
         self._segmenter = MotionSegmenter(method.segment)
         who = Identity(header.vehicle, header.drive_id, header.sensor_model, "ndt", "gnd reproduce simulation")
-        self._reporter = Reporter(self.detector, outbox, who, fix.t_ns, method.report)
+        reporter = Reporter if task.rounded else MeasuredReporter
+        self._reporter = reporter(self.detector, outbox, who, fix.t_ns, method.report)
         self._watcher = Watcher(task.watch, base, local_map.grid_frame, method.detect) if task.watch else None
         self._cloud = CloudVehicle(read_cloud(task.cloud), frame) if task.cloud else None
         self._labels = labels
