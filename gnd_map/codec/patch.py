@@ -1,24 +1,32 @@
-"""Deltas and reports against Gaussians that both sides hold. First form: plain packing; the range coder follows."""
+"""Deltas and reports, range coded against Gaussians that both sides hold."""
 
-import zlib
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Final
 
 import numpy as np
 import numpy.typing as npt
 
 from gnd_map.arrays import I32, check_array
 from gnd_map.classes import ChangeClass
-from gnd_map.codec.floats import decode_gaussians, encode_gaussians
-from gnd_map.codec.lattice import COMPACT, LATTICES, dequantise, integers_of, is_on, lattice_with
-from gnd_map.codec.range_tile import pack, unpack
+from gnd_map.codec import kernels as k
+from gnd_map.codec.coding import Coder
+from gnd_map.codec.floats import check_number, decode_gaussians, encode_gaussians
+from gnd_map.codec.lattice import COMPACT, LATTICES, Lattice, dequantise, integers_of, is_on, lattice_with
+from gnd_map.codec.priors import mask_at, number_at, priors_of
+from gnd_map.codec.volume import Box, Known, code_box, code_flags, code_voxels, floors_of, known_of
 from gnd_map.errors import CodecError, ShapeError
 from gnd_map.gaussian import Gaussians, concat
+from gnd_map.grid import VoxelGrid
 from gnd_map.tile_id import TileId
 
 U8 = npt.NDArray[np.uint8]
-_FLOATS = 255
-FLAGGED = (ChangeClass.NEW, ChangeClass.MODIFIED, ChangeClass.DELETED)
+MAX_TILES: Final = 1024
+"""Of a district."""
+_FLOATS: Final = 255
+_CLASS_OF: Final = np.array([ChangeClass.NORMAL, ChangeClass.NEW, ChangeClass.MODIFIED, ChangeClass.DELETED], np.uint8)
+"""By flag: k.NONE, k.PUT, k.REPLACED, k.GONE."""
+_FLAG_OF: Final = np.array([k.NONE, k.PUT, k.REPLACED, k.GONE, k.NONE, k.NONE], np.uint8)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -35,122 +43,226 @@ class Flags:
     def __post_init__(self) -> None:
         check_array("voxel_id", self.voxel_id, np.int32, (None,))
         check_array("change_class", self.change_class, np.uint8, (len(self.voxel_id),))
-        if (np.diff(self.voxel_id.astype(np.int64)) <= 0).any() or not np.isin(self.change_class, FLAGGED).all():
-            raise ShapeError(
-                f"tile {self.tile_id}: flagged voxels must increase, their classes be new, modified or deleted"
-            )
+        flagged = (self.change_class >= ChangeClass.NEW) & (self.change_class <= ChangeClass.DELETED)
+        if (np.diff(self.voxel_id.astype(np.int64)) <= 0).any() or not flagged.all():
+            raise ShapeError(f"tile {self.tile_id}: flagged voxels must increase and be new, modified or deleted")
         held = np.isin(self.voxel_id, self.base.voxel_id)
-        if (held == (self.change_class == ChangeClass.NEW)).any():
+        wrong = held == (self.change_class == ChangeClass.NEW)
+        if wrong.any():
             raise ShapeError(
-                f"tile {self.tile_id}: new is what the base does not hold, modified and deleted what it does"
+                f"tile {self.tile_id}: {int(wrong.sum())} voxels are new but held, or changed but not held"
             )
 
 
 def encode_delta(tile_id: TileId, base: Gaussians, new: Gaussians) -> bytes:
-    """What turns `base` into `new`; the first byte names the lattice (255: floats)."""
-    gone = np.setdiff1d(base.voxel_id, new.voxel_id)
-    from gnd_map.tile import diff
+    """What turns `base` into `new`; the first byte names the lattice (255: `new` lies on none, all of it follows).
 
-    put = diff(base, new).put
-    head = np.array([len(gone), *gone], "<i4").tobytes()
-    for lattice in (LATTICES["compact"], LATTICES["standard"], LATTICES["archive"]):
-        if is_on(new, lattice):
-            return bytes([lattice.code]) + zlib.compress(head, 9) + pack(integers_of(put, lattice))
-    return bytes([_FLOATS]) + zlib.compress(head, 9) + encode_gaussians(put)
+    Raises:
+        CodecError: too many voxels, or too far apart in height.
+    """
+    check_number(len(new))
+    lattice = next((lattice for lattice in LATTICES.values() if is_on(new, lattice)), None)
+    if lattice is None:
+        return bytes([_FLOATS]) + encode_gaussians(new)
+    changed = ~_same_rows(new, base)
+    put = new.take(changed)
+    gone = np.setdiff1d(base.voxel_id, new.voxel_id)
+    coder = Coder.writing(priors_of(f"delta-{lattice.name}"), 4096 + 48 * (len(put) + len(gone)))
+    flagged = np.union1d(put.voxel_id, gone).astype(np.int32)
+    box = code_box(coder, tile_id, base.voxel_id, flagged)
+    if box is not None:
+        flag = np.asarray(box.empty(np.uint8, k.NONE), np.uint8)
+        flag[box.places(put.voxel_id)] = np.where(np.isin(put.voxel_id, base.voxel_id), k.REPLACED, k.PUT)
+        flag[box.places(gone.astype(np.int32))] = k.GONE
+        code_flags(coder, box, base.voxel_id, flag)
+        known = _known(base, put.voxel_id, gone, lattice)
+        code_voxels(coder, box, put.voxel_id, known, lattice, integers_of(put, lattice))
+    return bytes([lattice.code]) + coder.finish()
 
 
 def decode_delta(tile_id: TileId, base: Gaussians, body: bytes) -> Gaussians:
-    """The new Gaussians; verify their hash: another base gives CodecError or another hash."""
+    """The new Gaussians. Verify their hash: against another base the bytes mean something else.
+
+    Raises:
+        CodecError: damaged, truncated, of another base, or values that are no Gaussians.
+    """
     if not body:
-        raise CodecError("an empty delta")
-    head, rest = _inflated(body[1:])
-    try:
-        gone = np.frombuffer(head, "<i4")
-        if len(gone) == 0 or len(gone) != gone[0] + 1:
-            raise CodecError("a delta with a wrong number of removed voxels")
-        put = decode_gaussians(rest) if body[0] == _FLOATS else dequantise(unpack(rest), lattice_with(body[0]))
-        kept = base.take(~(np.isin(base.voxel_id, gone[1:]) | np.isin(base.voxel_id, put.voxel_id)))
-        return concat([kept, put])
-    except (ShapeError, ValueError) as error:
-        raise CodecError(f"delta of tile {tile_id}: {error}") from error
+        raise CodecError(f"delta of tile {tile_id}: no bytes")
+    if body[0] == _FLOATS:
+        return decode_gaussians(body[1:])
+    lattice = lattice_with(body[0])
+    coder = Coder.reading(priors_of(f"delta-{lattice.name}"), body[1:])
+    box = code_box(coder, tile_id, base.voxel_id, None)
+    if box is None:
+        coder.end()
+        return base
+    flag = np.asarray(box.empty(np.uint8, k.NONE), np.uint8)
+    check_number(code_flags(coder, box, base.voxel_id, flag))
+    put = box.voxel_ids(*np.nonzero((flag == k.PUT) | (flag == k.REPLACED)))
+    gone = box.voxel_ids(*np.nonzero(flag == k.GONE))
+    found = code_voxels(coder, box, put, _known(base, put, gone, lattice), lattice, None)
+    coder.end()
+    kept = base.take(~(np.isin(base.voxel_id, put) | np.isin(base.voxel_id, gone)))
+    return concat([kept, dequantise(found, lattice)])
 
 
-def _inflated(body: bytes) -> tuple[bytes, bytes]:
-    unpacker = zlib.decompressobj()
-    try:
-        raw = unpacker.decompress(body, 1 << 20)
-    except zlib.error as error:
-        raise CodecError(f"{len(body)} bytes are not packed: {error}") from error
-    if not unpacker.eof:
-        raise CodecError(f"{len(body)} bytes are truncated")
-    return raw, unpacker.unused_data
+def _known(base: Gaussians, put: I32, gone: npt.NDArray[np.integer], lattice: Lattice) -> Known:
+    return known_of(base, np.isin(base.voxel_id, put), np.isin(base.voxel_id, gone), lattice)
+
+
+def _same_rows(new: Gaussians, base: Gaussians) -> npt.NDArray[np.bool_]:
+    """(len(new),) whether the base holds the voxel with the same bits."""
+    same = np.zeros(len(new), np.bool_)
+    _, at, was = np.intersect1d(new.voxel_id, base.voxel_id, assume_unique=True, return_indices=True)
+    pairs = zip(new.columns, base.columns, strict=True)
+    same[at] = np.all([(a[at] == b[was]).reshape(len(at), -1).all(axis=1) for a, b in pairs], axis=0)
+    return same
 
 
 def encode_flags(tiles: Sequence[Flags]) -> bytes:
-    """Bytes of the flags of several tiles; both sides hold the bases."""
-    parts = [np.concatenate([[len(t.voxel_id)], t.voxel_id, t.change_class]) for t in tiles]
-    return zlib.compress(np.concatenate([[0], *parts]).astype("<i4").tobytes(), 9)
+    """Flags of several tiles, of which both sides hold the bases, in one stream.
+
+    Raises:
+        CodecError: voxels too far apart in height.
+    """
+    coder = Coder.writing(priors_of("flags"), 4096 + 16 * sum(len(t.voxel_id) for t in tiles) + 64 * len(tiles))
+    for tile in tiles:
+        box = code_box(coder, tile.tile_id, tile.base.voxel_id, tile.voxel_id)
+        if box is not None:
+            flag = np.asarray(box.empty(np.uint8, k.NONE), np.uint8)
+            flag[box.places(tile.voxel_id)] = _FLAG_OF[tile.change_class]
+            code_flags(coder, box, tile.base.voxel_id, flag)
+    return coder.finish()
 
 
 def decode_flags(bases: Sequence[tuple[TileId, Gaussians]], body: bytes) -> list[Flags]:
-    """The flags of `encode_flags`, given the same tiles and bases."""
-    raw, rest = _inflated(body)
-    numbers, at, found = np.frombuffer(raw, "<i4") if len(raw) % 4 == 0 else np.zeros(0, "<i4"), 1, []
-    for tile_id, base in bases:
-        n = int(numbers[at]) if at < len(numbers) else -1
-        ids, classes = numbers[at + 1 : at + 1 + n], numbers[at + 1 + n : at + 1 + 2 * n]
-        if not 0 <= n <= len(numbers) or len(classes) != n:
-            raise CodecError(f"flags end within tile {tile_id}")
-        try:
-            found.append(Flags(tile_id, base, ids.astype(np.int32), classes.astype(np.uint8)))
-        except ShapeError as error:
-            raise CodecError(str(error)) from error
-        at += 1 + 2 * n
-    if at != len(numbers) or rest:
-        raise CodecError("flags of more tiles than asked for")
+    """The flags of `encode_flags`, given the same tiles and bases in the same order.
+
+    Raises:
+        CodecError: damaged, truncated, or of other bases.
+    """
+    coder = Coder.reading(priors_of("flags"), body)
+    found = [_read_flags(coder, tile_id, base) for tile_id, base in bases]
+    coder.end()
     return found
+
+
+def _read_flags(coder: Coder, tile_id: TileId, base: Gaussians) -> Flags:
+    box = code_box(coder, tile_id, base.voxel_id, None)
+    if box is None:
+        return Flags(tile_id, base, np.empty(0, np.int32), np.empty(0, np.uint8))
+    flag = np.asarray(box.empty(np.uint8, k.NONE), np.uint8)
+    check_number(code_flags(coder, box, base.voxel_id, flag))
+    places = np.nonzero(flag)
+    try:
+        return Flags(tile_id, base, box.voxel_ids(*places), _CLASS_OF[flag[places]])
+    except ShapeError as error:
+        raise CodecError(f"flags of another base: {error}") from error
 
 
 def encode_measured(tiles: Sequence[tuple[TileId, Gaussians, Gaussians]]) -> bytes:
-    """Measured Gaussians (lattice compact) of several tiles, each (tile, base, measured)."""
-    return b"".join(len(b).to_bytes(4, "little") + b for b in (pack(integers_of(m, COMPACT)) for _, _, m in tiles))
+    """Measured Gaussians of several tiles, each (tile, base, measured), in one stream.
+
+    Raises:
+        CodecError: some do not lie on the lattice `compact`, or lie too far apart in height.
+    """
+    coder = Coder.writing(priors_of("measured"), 4096 + 48 * sum(len(m) for _, _, m in tiles))
+    for tile_id, base, measured in tiles:
+        if len(measured):
+            integers = integers_of(measured, COMPACT)
+            code_voxels(coder, *_around(tile_id, base, measured.voxel_id), COMPACT, integers)
+    return coder.finish()
 
 
 def decode_measured(tiles: Sequence[tuple[TileId, Gaussians, I32]], body: bytes) -> list[Gaussians]:
-    """The measured Gaussians of these voxels, each (tile, base, voxel ids)."""
-    found, at = [], 0
-    for tile_id, _, voxel_id in tiles:
-        n = int.from_bytes(body[at : at + 4], "little")
-        found.append(dequantise(unpack(body[at + 4 : at + 4 + n]), COMPACT))
-        at += 4 + n
-        if not np.array_equal(found[-1].voxel_id, voxel_id):
-            raise CodecError(f"tile {tile_id}: Gaussians of other voxels than asked for")
-    if at != len(body):
-        raise CodecError(f"{len(body) - at} bytes behind the last Gaussian")
+    """The measured Gaussians of these voxels, each (tile, base, voxel ids), in the order of `encode_measured`.
+
+    Raises:
+        CodecError: damaged, truncated, of other voxels or bases, or values that are no Gaussians.
+    """
+    coder = Coder.reading(priors_of("measured"), body)
+    found = [_read_measured(coder, *tile) for tile in tiles]
+    coder.end()
     return found
 
 
+def _read_measured(coder: Coder, tile_id: TileId, base: Gaussians, voxel_id: I32) -> Gaussians:
+    if len(voxel_id) == 0:
+        return Gaussians.empty()
+    found = code_voxels(coder, *_around(tile_id, base, voxel_id), COMPACT, None)
+    return dequantise(found, COMPACT)
+
+
+def _around(tile_id: TileId, base: Gaussians, voxel_id: I32) -> tuple[Box, I32, Known]:
+    """Box, voxels and what is known around them."""
+    both = np.union1d(base.voxel_id, voxel_id).astype(np.int32)
+    low, high = floors_of(tile_id, both)
+    box = Box(VoxelGrid.of(tile_id), low, high - low + 1)
+    return box, voxel_id, _known(base, voxel_id, np.empty(0, np.int32), COMPACT)
+
+
 def encode_tiles(entries: Sequence[tuple[int, int]]) -> bytes:
-    """Tiles of one district, each (lowest 10 bits of its Morton code, version), ascending."""
-    return zlib.compress(np.array(entries, "<i8").reshape(-1, 2).tobytes(), 9)
+    """Tiles of one district, each (lowest 10 bits of its Morton code, version), ascending.
+
+    Raises:
+        CodecError: not ascending, or beyond their ranges.
+    """
+    _check_tiles(entries)
+    coder = Coder.writing(priors_of("tiles"), 64 + 16 * len(entries))
+    _code_tiles(coder, list(entries), len(entries))
+    return coder.finish()
 
 
 def decode_tiles(body: bytes) -> list[tuple[int, int]]:
-    """The entries of `encode_tiles`."""
-    raw, rest = _inflated(body)
-    if len(raw) % 16 or rest:
-        raise CodecError(f"{len(body)} bytes are no list of tiles")
-    return [(int(i), int(v)) for i, v in np.frombuffer(raw, "<i8").reshape(-1, 2)]
+    """The entries of `encode_tiles`.
+
+    Raises:
+        CodecError: damaged, or no tiles of a district.
+    """
+    coder = Coder.reading(priors_of("tiles"), body)
+    entries = _code_tiles(coder, [], 0)
+    coder.end()
+    _check_tiles(entries)
+    return entries
+
+
+def _code_tiles(coder: Coder, entries: list[tuple[int, int]], n: int) -> list[tuple[int, int]]:
+    count = coder.number(number_at(0), n)
+    if not 0 <= count <= MAX_TILES:
+        raise CodecError(f"{count} tiles of a district, the limit is {MAX_TILES}")
+    found: list[tuple[int, int]] = []
+    before, version = -1, 1
+    for i in range(count):
+        index, now = entries[i] if entries else (0, 0)
+        before += 1 + coder.number(number_at(1), index - before - 1)
+        version += coder.number(number_at(2), now - version)
+        found.append((before, version))
+    return found
+
+
+def _check_tiles(entries: Sequence[tuple[int, int]]) -> None:
+    before = -1
+    for index, version in entries:
+        if not (before < index < MAX_TILES and 0 <= version < 1 << 31):
+            raise CodecError(f"tile {index} after {before}, version {version}: ascending below {MAX_TILES}, below 2^31")
+        before = index
 
 
 def encode_mask(mask: npt.NDArray[np.bool_]) -> bytes:
-    """Bytes of a mask; its length is known to the reader."""
-    return zlib.compress(np.packbits(mask).tobytes(), 9)
+    """Bytes of a mask (N,); its length is known to the reader."""
+    coder = Coder.writing(priors_of("mask"), 64 + 2 * len(mask))
+    k.code_bits(coder.state, mask_at(0), mask.astype(np.uint8))
+    return coder.finish()
 
 
 def decode_mask(body: bytes, n: int) -> npt.NDArray[np.bool_]:
-    """The mask (n,) of `encode_mask`."""
-    raw, rest = _inflated(body)
-    if len(raw) != (n + 7) // 8 or rest:
-        raise CodecError(f"a mask of {len(raw)} bytes for {n} items")
-    return np.unpackbits(np.frombuffer(raw, np.uint8), count=n).astype(np.bool_)
+    """The mask (n,) of `encode_mask`.
+
+    Raises:
+        CodecError: damaged, or of another length.
+    """
+    coder = Coder.reading(priors_of("mask"), body)
+    bits = np.zeros(n, np.uint8)
+    k.code_bits(coder.state, mask_at(0), bits)
+    coder.end()
+    return bits.astype(np.bool_)

@@ -1,40 +1,54 @@
-"""A tile's Gaussians on a lattice as bytes. First form: integer columns, deflated; the range coder follows."""
-
-import zlib
+"""A tile's Gaussians on a lattice, range coded: which voxels, then each Gaussian from its neighbours."""
 
 import numpy as np
 
-from gnd_map.codec.lattice import Lattice, Quantised, dequantise, integers_of
+from gnd_map.codec import kernels as k
+from gnd_map.codec.coding import Coder
+from gnd_map.codec.floats import check_number
+from gnd_map.codec.lattice import Lattice, dequantise, integers_of
+from gnd_map.codec.priors import priors_of
+from gnd_map.codec.volume import NOTHING_KNOWN, code_box, code_flags, code_voxels
 from gnd_map.errors import CodecError
 from gnd_map.gaussian import Gaussians
 from gnd_map.tile_id import TileId
 
+_NOTHING = np.empty(0, np.int32)
+
 
 def encode_tile(tile_id: TileId, gaussians: Gaussians, lattice: Lattice) -> bytes:
-    """Bytes of the Gaussians; CodecError where they do not lie on the lattice."""
-    return pack(integers_of(gaussians, lattice))
+    """Bytes of a tile's Gaussians.
+
+    Raises:
+        CodecError: they do not lie on the lattice, are more than a tile may hold, or lie too far apart in height.
+    """
+    check_number(len(gaussians))
+    quantised = integers_of(gaussians, lattice)
+    coder = Coder.writing(priors_of(f"tile-{lattice.name}"), 4096 + 48 * len(gaussians))
+    box = code_box(coder, tile_id, _NOTHING, gaussians.voxel_id)
+    if box is not None:
+        flag = np.asarray(box.empty(np.uint8, k.NONE), np.uint8)
+        flag[box.places(gaussians.voxel_id)] = k.PUT
+        code_flags(coder, box, _NOTHING, flag)
+        code_voxels(coder, box, gaussians.voxel_id, NOTHING_KNOWN, lattice, quantised)
+    return coder.finish()
 
 
 def decode_tile(tile_id: TileId, body: bytes, lattice: Lattice) -> Gaussians:
-    """The Gaussians of the bytes; CodecError where they are none."""
-    return dequantise(unpack(body), lattice)
+    """The Gaussians of `encode_tile`.
 
-
-def pack(q: Quantised) -> bytes:
-    """Integer columns, deflated."""
-    columns = np.column_stack([q.voxel_id, q.axis, q.level, q.slope, q.step, q.count]).astype("<i4")
-    return zlib.compress(columns.T.tobytes(), 9)
-
-
-def unpack(body: bytes) -> Quantised:
-    """The integer columns of `pack`."""
-    unpacker = zlib.decompressobj()
-    try:
-        raw = unpacker.decompress(body, 200_000 * 48)
-    except zlib.error as error:
-        raise CodecError(f"{len(body)} bytes are no packed Gaussians: {error}") from error
-    if not unpacker.eof or len(raw) % 48:
-        raise CodecError(f"{len(body)} bytes are truncated or unpack to {len(raw)} bytes")
-    c = np.frombuffer(raw, "<i4").reshape(12, -1).astype(np.int32).T
-    parts = (c[:, 0], c[:, 1], c[:, 2:5], c[:, 5:8], c[:, 8:11], c[:, 11])
-    return Quantised(*(np.ascontiguousarray(part) for part in parts))
+    Raises:
+        CodecError: damaged, truncated, or values that are no Gaussians.
+    """
+    coder = Coder.reading(priors_of(f"tile-{lattice.name}"), body)
+    box = code_box(coder, tile_id, _NOTHING, None)
+    if box is None:
+        coder.end()
+        return Gaussians.empty()
+    flag = np.asarray(box.empty(np.uint8, k.NONE), np.uint8)
+    check_number(code_flags(coder, box, _NOTHING, flag))
+    voxel_id = box.voxel_ids(*np.nonzero(flag))
+    if len(voxel_id) == 0:
+        raise CodecError("a tile that claims Gaussians and holds none")
+    found = code_voxels(coder, box, voxel_id, NOTHING_KNOWN, lattice, None)
+    coder.end()
+    return dequantise(found, lattice)

@@ -1,0 +1,97 @@
+"""A stream of decisions: the coder's state with its contexts, from its frozen start to its bytes."""
+
+import zlib
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+import numpy.typing as npt
+
+from gnd_map.arrays import I32, I64
+from gnd_map.codec import kernels as k
+from gnd_map.codec.priors import Priors
+from gnd_map.errors import CodecError
+
+CHECK_BYTES: Final = 2
+_HALF: Final = 1 << 15
+State = tuple[I64, npt.NDArray[np.uint8], I32, I32, I64]
+
+
+@dataclass(slots=True)
+class Coder:
+    """One stream, being written or read. `state` is what the kernels take."""
+
+    state: State
+
+    @classmethod
+    def writing(cls, priors: Priors, room: int) -> "Coder":
+        """A stream to write, with room for so many bytes."""
+        coder = np.zeros(k.SLOTS, np.int64)
+        coder[k.HIGH] = 0xFFFFFFFF
+        return cls((coder, np.zeros(room, np.uint8), *priors.copies()))
+
+    @classmethod
+    def reading(cls, priors: Priors, body: bytes) -> "Coder":
+        """A stream to read: `finish` of another coder.
+
+        Raises:
+            CodecError: too short, or its checksum is wrong.
+        """
+        if len(body) < CHECK_BYTES:
+            raise CodecError(f"{len(body)} bytes, fewer than the {CHECK_BYTES} of the checksum")
+        data, check = body[:-CHECK_BYTES], body[-CHECK_BYTES:]
+        if checksum(data) != check:
+            raise CodecError(f"{len(body)} bytes with checksum {check.hex()}, computed {checksum(data).hex()}: damaged")
+        coder = np.zeros(k.SLOTS, np.int64)
+        coder[k.HIGH], coder[k.MODE], coder[k.AT] = 0xFFFFFFFF, 1, 4
+        coder[k.CODE] = int.from_bytes(data[:4].ljust(4, b"\0"), "big")
+        coder[k.OVERRUN] = max(0, 4 - len(data))
+        return cls((coder, np.frombuffer(data, np.uint8).copy(), *priors.copies()))
+
+    def check(self) -> None:
+        """`CodecError` when the kernels have met what cannot be."""
+        trouble = int(self.state[0][k.TROUBLE])
+        if trouble:
+            what = {k.FULL: "no room left", k.TOO_SHORT: "truncated", k.TOO_LARGE: "a number beyond 31 bits"}[trouble]
+            raise CodecError(f"range-coded message of {len(self.state[1])} bytes: {what}")
+
+    def number(self, at: int, value: int = 0) -> int:
+        """Write a signed number below 2^31, or read one."""
+        found = int(k.code_plain(self.state, at, value))
+        self.check()
+        return found
+
+    def bit(self, at: int, value: int | bool = 0) -> int:
+        """Write a decision, or read one."""
+        found = int(k.code_bit(self.state, at, int(value)))
+        self.check()
+        return found
+
+    def finish(self) -> bytes:
+        """The bytes written: as few as tell the last interval, then the checksum."""
+        self.check()
+        coder, buffer = self.state[0], self.state[1]
+        data = buffer[: coder[k.AT]].tobytes() + _shortest(int(coder[k.LOW]), int(coder[k.HIGH]))
+        return data + checksum(data)
+
+    def end(self) -> None:
+        """`CodecError` unless the stream that was read ends here."""
+        self.check()
+        coder, length = self.state[0], len(self.state[1])
+        if not coder[k.AT] - 4 <= length <= coder[k.AT]:
+            raise CodecError(f"range-coded message of {length} bytes, {coder[k.AT] - 4} of them used")
+
+
+def checksum(data: bytes) -> bytes:
+    """Two bytes of CRC-32."""
+    return (zlib.crc32(data) & 0xFFFF).to_bytes(CHECK_BYTES, "little")
+
+
+def _shortest(low: int, high: int) -> bytes:
+    """The fewest bytes that, followed by zeros, lie between `low` and `high`."""
+    for length in range(5):
+        unit = 1 << (32 - 8 * length)
+        value = -(-low // unit) * unit
+        if value <= high and value < 1 << 32:
+            return value.to_bytes(4, "big")[:length]
+    raise AssertionError("four bytes tell any number of 32 bits")

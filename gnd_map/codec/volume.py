@@ -1,0 +1,189 @@
+"""Voxels of a tile as arrays around them, as the kernels take them."""
+
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+import numpy.typing as npt
+
+from gnd_map.arrays import I32, I64
+from gnd_map.codec import kernels as k
+from gnd_map.codec.coding import Coder
+from gnd_map.codec.lattice import Lattice, Quantised, integers_of, is_on, quantise
+from gnd_map.codec.priors import FLAGS_AT, VOXEL_WEIGHTS_AT, VOXELS_AT, number_at
+from gnd_map.errors import CodecError
+from gnd_map.gaussian import Gaussians
+from gnd_map.grid import VoxelGrid
+from gnd_map.tile_id import TileId
+
+U8 = npt.NDArray[np.uint8]
+MAX_VOLUME: Final = 1 << 22
+"""Voxels of the box around a tile's Gaussians: 2,700 floors of 39 x 39."""
+_ANY: Final = number_at(0) + 69  # a context of its own in the room of the first number
+
+
+@dataclass(frozen=True, slots=True)
+class Box:
+    """All voxels of a tile between two floors.
+
+    Attributes:
+        grid: the tile's.
+        lowest: first floor.
+        floors: how many.
+    """
+
+    grid: VoxelGrid
+    lowest: int
+    floors: int
+
+    def __post_init__(self) -> None:
+        size = self.floors * self.grid.nx * self.grid.ny
+        if not 0 < size <= MAX_VOLUME:
+            raise CodecError(f"a box of {self.floors} floors, {size} voxels: the limit is {MAX_VOLUME}")
+
+    def empty(self, dtype: type[np.generic], value: int) -> "npt.NDArray[np.generic]":
+        """(floors + 4, ny + 4, nx + 4) of one value."""
+        edge = 2 * k.EDGE
+        return np.full((self.floors + edge, self.grid.ny + edge, self.grid.nx + edge), value, dtype)
+
+    def places(self, voxel_id: I32) -> tuple[I64, I64, I64]:
+        """(N,) each: indices z, y, x into the arrays."""
+        ix, iy, floor = self.grid.unravel(voxel_id)
+        z = floor.astype(np.int64) - self.lowest + k.EDGE
+        return z, iy.astype(np.int64) + k.EDGE, ix.astype(np.int64) + k.EDGE
+
+    def voxel_ids(self, z: I64, y: I64, x: I64) -> I32:
+        """(N,) ids of places."""
+        ids = self.grid.voxel_id(x - k.EDGE, y - k.EDGE, z - k.EDGE + self.lowest)
+        return np.asarray(ids, np.int32)
+
+    def marks(self) -> U8:
+        """Room for the blocks."""
+        return np.zeros([-(-n // k.BLOCK) + 2 for n in (self.floors, self.grid.ny, self.grid.nx)], np.uint8)
+
+
+def floors_of(tile_id: TileId, voxel_id: I32) -> tuple[int, int]:
+    """Lowest and highest floor of some voxels (at least one), ascending."""
+    _, _, floor = VoxelGrid.of(tile_id).unravel(voxel_id[[0, -1]])
+    return int(floor[0]), int(floor[1])
+
+
+def code_box(coder: Coder, tile_id: TileId, held: I32, flagged: I32 | None) -> Box | None:
+    """Write or read the floors between which the held and the flagged voxels lie; None: nothing is flagged.
+
+    Args:
+        coder: the stream.
+        tile_id: which tile.
+        held: (H,) voxel ids that both sides know.
+        flagged: (F,) to write; None to read.
+    """
+    if not coder.bit(_ANY, 0 if flagged is None else len(flagged) > 0):
+        return None
+    low, high = floors_of(tile_id, held) if len(held) else (0, 0)
+    lo, hi = floors_of(tile_id, flagged) if flagged is not None else (0, 0)
+    if len(held):
+        below = coder.number(number_at(1), max(low - lo, 0))
+        above = coder.number(number_at(2), max(hi - high, 0))
+        lo, hi = low - below, high + above
+    else:
+        lo = coder.number(number_at(0), lo)
+        hi = lo + coder.number(number_at(3), hi - lo)
+    return Box(VoxelGrid.of(tile_id), lo, hi - lo + 1)
+
+
+def code_flags(coder: Coder, box: Box, held: I32, flag: U8) -> int:
+    """Write the flags of a box's voxels or read them into `flag`; how many."""
+    known = np.asarray(box.empty(np.uint8, 0), np.uint8)
+    known[box.places(held)] = 1
+    n = int(k.code_flags(coder.state, known, flag, box.marks(), FLAGS_AT, 0))
+    coder.check()
+    return n
+
+
+@dataclass(frozen=True, slots=True)
+class Known:
+    """Gaussians that both sides hold, as integers of a lattice (nearest where they do not lie on it)."""
+
+    quantised: Quantised
+    replaced: npt.NDArray[np.bool_]
+    """(N,) those that will be replaced: they predict their successor, and nothing else."""
+
+
+def known_of(base: Gaussians, replaced: npt.NDArray[np.bool_], gone: npt.NDArray[np.bool_], lattice: Lattice) -> Known:
+    """What the base tells about those that come."""
+    kept = base.take(~gone)
+    integers = integers_of(kept, lattice) if is_on(kept, lattice) else quantise(kept, lattice)
+    return Known(integers, replaced[~gone])
+
+
+NOTHING_KNOWN: Final = Known(
+    Quantised(*(np.zeros((0, 3) if wide else 0, np.int32) for wide in (0, 0, 1, 1, 1, 0))), np.zeros(0, np.bool_)
+)
+
+
+def code_voxels(
+    coder: Coder, box: Box, voxel_id: I32, known: Known, lattice: Lattice, quantised: Quantised | None
+) -> Quantised:
+    """Write the Gaussians of these voxels, or read them (`quantised` None)."""
+    n_known = len(known.quantised)
+    table = np.zeros((1 + n_known + len(voxel_id), k.COLUMNS), np.int32)
+    where = np.asarray(box.empty(np.int32, -1), np.int32)
+    table[0] = _typical(lattice)
+    _fill(table[1 : 1 + n_known], box, known.quantised)
+    where[box.places(known.quantised.voxel_id)] = np.arange(1, 1 + n_known)
+    places = box.places(voxel_id)
+    new = table[1 + n_known :]
+    new[:, k.SELF] = where[places]
+    new[:, k.Z], new[:, k.Y], new[:, k.X] = places
+    where[box.places(known.quantised.voxel_id[known.replaced])] = -2
+    where[places] = -2
+    if quantised is not None:
+        _fill(new, box, quantised, keep_self=True)
+    shape, pitch = _numbers(lattice, box.grid, n_known > 0)
+    sd = np.array(lattice.sd, np.int64)
+    k.code_voxels(coder.state, table, 1 + n_known, where, sd, shape, pitch, VOXELS_AT, VOXEL_WEIGHTS_AT)
+    coder.check()
+    return _read(new, voxel_id)
+
+
+def _fill(rows: I32, box: Box, q: Quantised, *, keep_self: bool = False) -> None:
+    rows[:, k.Z], rows[:, k.Y], rows[:, k.X] = box.places(q.voxel_id)
+    rows[:, k.AXIS], rows[:, k.COUNT] = q.axis, q.count
+    rows[:, k.LEVEL : k.LEVEL + 3], rows[:, k.SLOPE : k.SLOPE + 3], rows[:, k.STEP : k.STEP + 3] = (
+        q.level,
+        q.slope,
+        q.step,
+    )
+    if not keep_self:
+        rows[:, k.SELF] = -1
+
+
+def _read(rows: I32, voxel_id: I32) -> Quantised:
+    columns = (
+        rows[:, k.AXIS],
+        rows[:, k.LEVEL : k.LEVEL + 3],
+        rows[:, k.SLOPE : k.SLOPE + 3],
+        rows[:, k.STEP : k.STEP + 3],
+    )
+    axis, level, slope, step = (np.ascontiguousarray(c) for c in columns)
+    return Quantised(voxel_id, axis, level, slope, step, np.ascontiguousarray(rows[:, k.COUNT]))
+
+
+def _typical(lattice: Lattice) -> I32:
+    """A row of values to expect where no neighbour is known: 1.5 cm thick, 28 cm wide, some hundred points."""
+    row = np.zeros(k.COLUMNS, np.int32)
+    sd_m = np.array(lattice.sd) * 2.0**-20
+    wide = int(np.searchsorted(sd_m[:: lattice.plane_step], 0.28))
+    row[k.LEVEL : k.LEVEL + 3] = wide, wide, int(np.searchsorted(sd_m, 0.015))
+    row[k.AXIS], row[k.SELF], row[k.COUNT] = 3, -1, 6
+    return row
+
+
+def _numbers(lattice: Lattice, grid: VoxelGrid, has_base: bool) -> tuple[I64, I64]:
+    shape = (
+        lattice.plane_step, lattice.slope_bits, lattice.shear_bits, lattice.thin_bits, lattice.plane_bits,
+        lattice.length_bits, lattice.mean_bits, int(has_base),
+    )  # fmt: skip
+    # 1/256 m: coarse enough that no machine's sine rounds it another way
+    pitch = [round(size_m * 256) << (lattice.mean_bits - 8) for size_m in (grid.dx_m, grid.dy_m, grid.dz_m)]
+    return np.array(shape, np.int64), np.array(pitch, np.int64)
