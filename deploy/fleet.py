@@ -25,6 +25,7 @@ from deploy.run_folder import RunFolder
 from deploy.site import Site, VehicleSite, loopback_site
 from fleet_bus.bus import open_bus
 from fleet_bus.config import BusConfig
+from fleet_bus.links import load_link
 from schemas.keys import traffic_keys
 from tile_store.sqlite_store import SqliteStore
 from tile_store.values import StoreConfig
@@ -79,7 +80,7 @@ def run_fleet(
     """
     started_s = time.monotonic()
     site = site or loopback_site(config, len(prepared.agent_drives))
-    state = FleetState()
+    state = FleetState(links={vehicle_name(n): load_link(place.link) for n, place in enumerate(site.vehicles)})
     with ExitStack() as stack:
         supervisor = stack.enter_context(supervised(folder, state))
         start_cloud(supervisor, config, folder, site)
@@ -135,9 +136,14 @@ def start_agents(
 ) -> None:
     """Start one agent process a drive."""
     for number, (drive, place) in enumerate(zip(prepared.agent_drives, site.vehicles, strict=True)):
-        name = f"vehicle-{number:02d}"
+        name = vehicle_name(number)
         agent = agent_config(config, name, drive, folder, place)
         supervisor.start(ProcessSpec(name, roles.agent, (agent,), namespace=place.namespace))
+
+
+def vehicle_name(number: int) -> str:
+    """Return the name of a vehicle and of its process."""
+    return f"vehicle-{number:02d}"
 
 
 def shard_config(config: FleetConfig, shard_id: str, store: Path, connect: str) -> ShardConfig:

@@ -3,7 +3,7 @@
 import math
 import threading
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 
@@ -13,6 +13,8 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 from rich.table import Table
 from rich.text import Text
 
+from deploy.live_traffic import Rate, kinds_table, link_of, plain_traffic, rate_between, rate_cell
+from fleet_bus.links import LinkProfile
 from schemas.errors import SchemaError
 from schemas.traffic import TrafficSample
 
@@ -31,6 +33,9 @@ class FleetState:
         updates: updates that the watcher has received.
         waiting: tiles that wait for a merge.
         events: the last things that happened, newest last.
+        links: profile of each vehicle's link, as far as known.
+        rates: what each vehicle's connection carries now.
+        clock: monotonic time, s.
     """
 
     samples: dict[str, TrafficSample] = field(default_factory=dict)
@@ -39,6 +44,10 @@ class FleetState:
     updates: int = 0
     waiting: int = 0
     events: list[str] = field(default_factory=list)
+    links: dict[str, LinkProfile] = field(default_factory=dict)
+    rates: dict[str, Rate] = field(default_factory=dict)
+    clock: Callable[[], float] = time.monotonic
+    came_s: dict[str, float] = field(default_factory=dict)
     lock: threading.Lock = field(default_factory=threading.Lock)
 
     def on_traffic(self, key: str, payload: bytes) -> None:
@@ -51,7 +60,15 @@ class FleetState:
         with self.lock:
             known = self.samples.get(sample.vehicle)
             if known is None or sample.t_ns >= known.t_ns:
-                self.samples[sample.vehicle] = sample
+                self._take(sample, known, self.clock())
+
+    def _take(self, sample: TrafficSample, known: TrafficSample | None, now_s: float) -> None:
+        rate = rate_between(known, self.came_s[sample.vehicle], sample, now_s) if known is not None else None
+        if rate is not None:
+            self.rates[sample.vehicle] = rate
+        else:
+            self.rates.pop(sample.vehicle, None)
+        self.samples[sample.vehicle], self.came_s[sample.vehicle] = sample, now_s
 
     def note(self, text: str) -> None:
         """Remember an event; the last three are shown."""
@@ -69,29 +86,33 @@ def size_text(size: float) -> str:
 def render(state: FleetState) -> Group:
     """Draw the state as a table and a line of totals."""
     table = Table(box=None, pad_edge=False, header_style="bold")
-    for name, justify in (
-        ("vehicle", "left"), ("position", "left"), ("driven", "right"), ("health", "left"), ("down", "right"),
-        ("up", "right"), ("tiles", "right"), ("reports", "right"),
-    ):  # fmt: skip
-        table.add_column(name, justify="right" if justify == "right" else "left")
+    for name in ("vehicle", "position", "health"):
+        table.add_column(name)
+    for name in ("driven", "down", "of the link", "up", "of the link", "tiles", "reports"):
+        table.add_column(name, justify="right")
     with state.lock:
         for vehicle in sorted(state.samples):
-            table.add_row(*_row(state.samples[vehicle]))
+            table.add_row(*_row(state, state.samples[vehicle]))
         totals = (
             f"store: {state.reports} reports, {state.waiting} tiles waiting, {state.published} versions published"
             f"   watcher: {state.updates} updates"
         )
-        return Group(table, Text(totals, style="bold"), *(Text(event, style="dim") for event in state.events))
+        events = (Text(event, style="dim") for event in state.events)
+        kinds = (Text(), kinds_table(state.samples.values()), Text()) if state.samples else ()
+        return Group(table, *kinds, Text(totals, style="bold"), *events)
 
 
-def _row(sample: TrafficSample) -> tuple[str | Text, ...]:
+def _row(state: FleetState, sample: TrafficSample) -> tuple[str | Text, ...]:
+    rate, link = state.rates.get(sample.vehicle), link_of(state.links, sample.vehicle)
     return (
         sample.vehicle,
         f"{math.degrees(sample.lat_rad):.6f} {math.degrees(sample.lon_rad):.6f}",
-        f"{sample.odometer_m:.0f} m",
         Text(sample.health, style=HEALTH_STYLE.get(sample.health, "dim")),
+        f"{sample.odometer_m:.0f} m",
         size_text(sample.wire_down_bytes),
+        rate_cell(rate, link, "down"),
         size_text(sample.wire_up_bytes),
+        rate_cell(rate, link, "up"),
         str(sample.tiles),
         str(sample.reports),
     )
@@ -129,7 +150,8 @@ class View:
             driven_m = sum(sample.odometer_m for sample in self.state.samples.values())
             return (
                 f"{len(self.state.samples)} agents, {driven_m:.0f} m driven, {self.state.reports} reports, "
-                f"{self.state.waiting} tiles waiting, {self.state.published} versions, {self.state.updates} updates"
+                f"{self.state.waiting} tiles waiting, {self.state.published} versions, {self.state.updates} updates; "
+                + plain_traffic(self.state.samples.values())
             )
 
 
