@@ -1,12 +1,20 @@
 """The account of a run: what agents sent, what the store holds, what the watcher saw."""
 
 import json
-from dataclasses import dataclass
+import logging
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass
 from typing import Any
 
 import numpy as np
 
+from deploy.errors import PageError
 from deploy.run_folder import RunFolder
+from deploy.traffic_page import write_page
+from fleet_bus.errors import LedgerError
+from fleet_bus.ledger_file import read_run
+from fleet_bus.links import load_link
+from fleet_bus.traffic import DEFAULT_LINKS, agent_traffic, fleet_lines
 from gnd_map.gaussian import Gaussians
 from gnd_map.tile import diff
 from tile_store.sqlite_store import SqliteStore
@@ -14,6 +22,8 @@ from tile_store.values import DEFAULT_LAYER, StoredTile
 from vehicle_agent.outbox import Outbox
 
 P95 = 0.95
+
+_log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True, slots=True)
@@ -57,6 +67,23 @@ class FleetResults:
 
 def _per_km(size: int, drive_km: float) -> float:
     return round(size / 1000 / drive_km, 3) if drive_km > 0 else 0.0
+
+
+def account_traffic(folder: RunFolder, links: Sequence[str] = DEFAULT_LINKS) -> list[dict[str, Any]]:
+    """Write the traffic page of a run and return the account of the whole fleet by kind and direction.
+
+    Args:
+        folder: the run; a run whose ledgers cannot be read gets no page.
+        links: profiles to compare with.
+    """
+    profiles = tuple(load_link(link) for link in links)
+    try:
+        agents = tuple(agent_traffic(ledger, profiles) for ledger in read_run(folder.root))
+        write_page(folder.traffic_page, folder.root.resolve().name, agents, profiles)
+    except (LedgerError, PageError) as error:
+        _log.warning("no traffic page: %s", error)
+        return []
+    return [asdict(line) for line in fleet_lines(agents)]
 
 
 def lost_reports(folder: RunFolder, store: SqliteStore) -> list[str]:

@@ -70,7 +70,8 @@ def fleet(
     """Run a fleet: vehicles download the map, drive, detect changes and upload them; the cloud heals the map.
 
     Without --drives a street that has changed since it was mapped is simulated, and the result is compared with the
-    truth. The folder of the run holds the logs, the traffic ledger, the store, three pictures and summary.json.
+    truth. The folder of the run holds the logs, the traffic ledger and its page,
+    the store, three pictures and summary.json.
     """
     config = load_fleet_config(config_file, options)
     if dump_config:
@@ -137,4 +138,7 @@ def summary_text(summary: dict[str, Any], folder: RunFolder) -> str:
     """Return the summary as a few lines for people."""
     from deploy.summary import summary_lines
 
-    return "\n".join([*summary_lines(summary), f"everything else: {folder.root}"])
+    lines = [*summary_lines(summary), f"everything else: {folder.root}"]
+    if folder.traffic_page.exists():
+        lines.insert(-1, f"every byte of it: {folder.traffic_page}")
+    return "\n".join(lines)

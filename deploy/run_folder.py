@@ -58,6 +58,11 @@ class RunFolder:
         return self.root / "summary.json"
 
     @property
+    def traffic_page(self) -> Path:
+        """The account of the run's traffic as a page."""
+        return self.root / "traffic.html"
+
+    @property
     def pids(self) -> Path:
         """Process ids by process name."""
         return self.root / "pids.json"

@@ -1,10 +1,10 @@
-"""The result of a run: `summary.json`, three pictures, and a few lines for people."""
+"""The result of a run: `summary.json`, three pictures, the traffic page, and a few lines for people."""
 
 import json
 from pathlib import Path
 from typing import Any
 
-from deploy.account import FleetResults, TileHistory, lost_reports, tile_histories
+from deploy.account import FleetResults, TileHistory, account_traffic, lost_reports, tile_histories
 from deploy.evaluation import NO_TRUTH, score_run
 from deploy.fleet import FleetOutcome, count_lines
 from deploy.fleet_config import FleetConfig
@@ -40,7 +40,7 @@ def write_summary(
         summary["f1"] = _evaluate(folder, prepared, store, histories)
     summary["prepare_s"] = round(prepare_s, 1)
     summary["localisation_p95"] = results.localisation_p95()
-    summary["traffic"] = results.traffic()
+    summary["traffic"] = results.traffic() | {"by_kind": account_traffic(folder)}
     _write(folder.summary, summary)
     return summary
 

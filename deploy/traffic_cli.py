@@ -1,6 +1,8 @@
 """`gnd traffic`: what a run sent and received, as tables, JSON, CSV and a page."""
 
 import json
+from collections import Counter
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Final
 
@@ -8,13 +10,13 @@ import click
 from rich.console import Console
 
 from deploy.traffic_page import write_page
+from fleet_bus.errors import LinkError
 from fleet_bus.ledger_file import read_run, run_folder
-from fleet_bus.links import load_link
-from fleet_bus.traffic import agent_traffic, as_json
+from fleet_bus.links import LinkProfile, load_link
+from fleet_bus.traffic import DEFAULT_LINKS, agent_traffic, as_json
 from fleet_bus.traffic_csv import as_csv
 from fleet_bus.traffic_table import print_tables
 
-LINKS: Final = ("3g", "4g", "5g")
 _WIDTH: Final = 110
 
 
@@ -24,7 +26,11 @@ _WIDTH: Final = 110
 @click.option("--csv", "as_csv_", is_flag=True, help="Print CSV: a row for each agent, kind and direction.")
 @click.option("--page", type=click.Path(path_type=Path), help="Write the account as a page (one HTML file).")
 @click.option(
-    "--link", "links", multiple=True, default=LINKS, help="Profile to compare with, or a TOML file (FILE or FILE:NAME)."
+    "--link",
+    "links",
+    multiple=True,
+    default=DEFAULT_LINKS,
+    help="Profile to compare with, or a TOML file (FILE or FILE:NAME).",
 )
 def traffic(run: Path, as_json_: bool, as_csv_: bool, page: Path | None, links: tuple[str, ...]) -> None:
     """Show what RUN (a folder, or a name below runs/) sent and received, and what mobile links make of it.
@@ -34,7 +40,7 @@ def traffic(run: Path, as_json_: bool, as_csv_: bool, page: Path | None, links: 
     """
     if as_json_ and as_csv_:
         raise click.UsageError("--json and --csv exclude each other: one output, one form")
-    profiles = tuple(load_link(link) for link in links)
+    profiles = load_links(links)
     agents = tuple(agent_traffic(ledger, profiles) for ledger in read_run(run))
     if page is not None:
         write_page(page, run_folder(run).resolve().name, agents, profiles)
@@ -46,3 +52,16 @@ def traffic(run: Path, as_json_: bool, as_csv_: bool, page: Path | None, links: 
         click.echo(f"page written: {page}")
     else:
         print_tables(agents, Console(width=_WIDTH))
+
+
+def load_links(names: Sequence[str]) -> tuple[LinkProfile, ...]:
+    """The profiles of these names or files.
+
+    Raises:
+        LinkError: one is unknown or malformed, or two have one name, so that their figures could not be told apart.
+    """
+    profiles = tuple(load_link(name) for name in names)
+    twice = [name for name, count in Counter(profile.name for profile in profiles).items() if count > 1]
+    if twice:
+        raise LinkError(f"link profiles with one name: {', '.join(twice)}; rename the table in your file")
+    return profiles

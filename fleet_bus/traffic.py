@@ -13,6 +13,7 @@ from fleet_bus.pacer import MESSAGE_OVERHEAD_BYTES
 from fleet_bus.traffic_links import Arrivals, LinkUse, link_use, measured_arrivals, tile_arrival_s
 from fleet_bus.traffic_wire import RESIDUES, WireAccount, wire_account
 
+DEFAULT_LINKS: Final = ("3g", "4g", "5g")
 _SERIES_POINTS: Final = 100
 
 
