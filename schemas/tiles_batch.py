@@ -33,6 +33,7 @@ HASH_BYTES: Final = 8
 """So much of a content's hash tells it from another: chance errs once in 10^19; a client keeps the whole hash."""
 EVERY_CODEC: Final = (4, 3, 2, 7, 6, 5, 1, 0)
 """What a request means that names no codecs; frozen, whatever later programs read besides."""
+MAX_HELD_VERSION: Final = 2**31
 TILES: Final = limits.MAX_TILES_OF_DISTRICT
 
 AnswerStatus = Literal["blob", "delta", "unchanged", "absent", "later", "hash"]
@@ -162,7 +163,8 @@ def check_indices(wanted: Sequence[tuple[int, int]]) -> None:
     if not wanted:
         raise BadValue("TilesRequest for no tiles")
     for index, version in wanted:
-        check_version(f"held version of tile {index}", version, lowest=0)
+        if not 0 <= version < MAX_HELD_VERSION:
+            raise BadValue(f"held version {version} of tile {index} is outside 0 .. {MAX_HELD_VERSION - 1}")
     if wanted[0][0] < 0 or wanted[-1][0] >= TILES or any(a >= b for (a, _), (b, _) in pairwise(wanted)):
         raise BadValue(
             f"TilesRequest for tiles {[i for i, _ in wanted][:9]}…: ascending in 0 .. {TILES - 1}, once each"

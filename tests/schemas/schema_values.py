@@ -10,12 +10,14 @@ from typing import Any
 import numpy as np
 from hypothesis import strategies as st
 
+from gnd_map.codec import LATTICES, encode_gaussians, snap
 from gnd_map.gaussian import Gaussians
 from gnd_map.tile import Tile, TileDelta
 from gnd_map.tile_id import TileId
 from schemas.changes import ChangeAck, ChangeReport, TileChange
 from schemas.report_id import deterministic_report_id
-from schemas.tiles import Catalog, CatalogEntry, TileBlob, TileReply, TileRequest, blob_of
+from schemas.tiles import Catalog, CatalogEntry, CodedDelta, TileBlob, TileReply, TileRequest, blob_of
+from schemas.tiles_batch import TileAnswer, TilesReply, TilesRequest
 from schemas.traffic import TrafficLine, TrafficSample
 from schemas.updates import TileUpdate
 
@@ -113,13 +115,36 @@ def sample(**values: Any) -> TrafficSample:
     return TrafficSample(**(plain | values))
 
 
+# A tile and its next version, on a lattice.
+HELD = Tile(TILE, 3, snap(gaussians([-604, 0, 7, 604]), LATTICES["standard"]))
+NEXT = Tile(TILE, 4, snap(gaussians([-604, 7, 8], count=300), LATTICES["standard"]))
+
 GOLDEN: dict[str, Any] = {
-    "TileRequest-nothing_cached": TileRequest(),
-    "TileRequest-cached-two_codecs": TileRequest(3, SHA, (1, 0)),
+    "TileRequest-nothing_cached": TileRequest(codecs=(0,), deltas=False),
+    "TileRequest-cached-two_codecs": TileRequest(3, SHA, (1, 0), deltas=False),
+    "TileRequest-cached-every_codec-deltas": TileRequest(3, SHA, (4, 3, 2, 7, 6, 5, 1, 0)),
     "TileReply-blob": TileReply("blob", blob_of(Tile(TILE, 7, gaussians([-604, 0, 604])))),
     "TileReply-blob-empty_tile": TileReply("blob", blob_of(Tile(TILE, 1, Gaussians.empty()))),
     "TileReply-unchanged": TileReply("unchanged"),
     "TileReply-absent": TileReply("absent"),
+    "TileReply-delta": TileReply("delta", delta=CodedDelta(TILE, 8, SHA, b"not looked into")),
+    "TilesRequest-nothing_held": TilesRequest(((0, 0), (274, 0), (1023, 0))),
+    "TilesRequest-digest": TilesRequest(((274, 3), (275, 0), (276, 2**31 - 1)), SHA[:8], max_bytes=60_000, near=274),
+    "TilesRequest-hashes": TilesRequest(
+        ((274, 3), (275, 0), (276, 1)), held_hashes=(SHA[:8], OTHER_SHA[:8]), codecs=(1, 0)
+    ),
+    "TilesReply-every_status": TilesReply(
+        (
+            TileAnswer("unchanged"),
+            TileAnswer("unchanged"),
+            TileAnswer("delta", 4, OTHER_SHA[:8], 0, b"not looked into"),
+            TileAnswer("blob", 7, SHA[:8], 0, encode_gaussians(gaussians([-604, 0]))),
+            TileAnswer("absent"),
+            TileAnswer("hash"),
+            TileAnswer("later"),
+        )
+    ),
+    "TilesReply-unchanged": TilesReply((TileAnswer("unchanged"),) * 100),
     "Catalog-empty": Catalog(),
     "Catalog-two_tiles": Catalog((CatalogEntry(TILE, 3, SHA), CatalogEntry(EAST, 2**32 - 1, OTHER_SHA))),
     "ChangeReport-two_tiles-with_and_without_base": report(),
@@ -129,6 +154,7 @@ GOLDEN: dict[str, Any] = {
     "ChangeAck-duplicate": ChangeAck(REPORT_ID, "duplicate"),
     "ChangeAck-quarantined-without_id": ChangeAck("", "quarantined", "TileChange: 3 covariances are not positive"),
     "TileUpdate-merged-delta": update(),
+    "TileUpdate-merged-coded_delta": update(delta=None, coded_delta=b"not looked into", put_voxels=2, removed_voxels=2),
     "TileUpdate-base-new_tile": update(version=1, previous_version=0, previous_sha=b"", reason="base", delta=None),
     "TileUpdate-rollback": update(reason="rollback", delta=None),
     "TrafficSample-two_lines": sample(),
@@ -139,7 +165,18 @@ GOLDEN: dict[str, Any] = {
 
 KINDS: dict[str, Any] = {
     kind.__name__: kind
-    for kind in (TileRequest, TileReply, TileBlob, Catalog, ChangeReport, ChangeAck, TileUpdate, TrafficSample)
+    for kind in (
+        TileRequest,
+        TileReply,
+        TileBlob,
+        TilesRequest,
+        TilesReply,
+        Catalog,
+        ChangeReport,
+        ChangeAck,
+        TileUpdate,
+        TrafficSample,
+    )
 }
 
 

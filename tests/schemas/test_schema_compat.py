@@ -161,7 +161,7 @@ def test_the_committed_code_is_what_the_sources_say(workspace: Path) -> None:
 
 
 def test_a_new_field_is_noticed_by_the_check_and_taken_by_generate(workspace: Path) -> None:
-    edit(workspace / "change_ack.proto", "string reason = 4;", "string reason = 4;\n  uint32 waiting = 5;")
+    edit(workspace / "change_ack.proto", "string reason = 4;", "string reason = 4;\n  uint32 waiting = 15;")
     with pytest.raises(GenerateError, match=r"differs .* in change_ack_pb2\.py, change_ack_pb2\.pyi: run"):
         generate.check()
     generate.generate()

@@ -9,7 +9,7 @@ from google.protobuf.descriptor import FieldDescriptor
 from google.protobuf.message import Message
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from schema_values import GOLDEN, KINDS, kind_of
+from schema_values import GOLDEN, HELD, KINDS, TILE, kind_of
 
 from schemas.errors import SchemaError
 from schemas.generated import (
@@ -19,13 +19,19 @@ from schemas.generated import (
     tile_reply_pb2,
     tile_request_pb2,
     tile_update_pb2,
+    tiles_reply_pb2,
+    tiles_request_pb2,
     traffic_sample_pb2,
 )
-from schemas.tiles import TileReply, tile_of
+from schemas.tiles import TileReply, tile_after, tile_of
+from schemas.tiles_batch import TilesReply, tile_of_answer
+from schemas.updates import TileUpdate, updated
 
 MESSAGES: dict[str, type[Message]] = {
     "TileRequest": tile_request_pb2.TileRequest,
     "TileReply": tile_reply_pb2.TileReply,
+    "TilesRequest": tiles_request_pb2.TilesRequest,
+    "TilesReply": tiles_reply_pb2.TilesReply,
     "Catalog": catalog_pb2.Catalog,
     "ChangeReport": change_report_pb2.ChangeReport,
     "ChangeAck": change_ack_pb2.ChangeAck,
@@ -42,10 +48,22 @@ def decode(kind: Any, data: bytes) -> bool:
     except SchemaError:
         return False
     assert kind.decode(value.encode()) == value
-    if isinstance(value, TileReply) and value.blob:
-        with contextlib.suppress(SchemaError):
-            tile_of(value.blob)
+    with contextlib.suppress(SchemaError):
+        open_contents(value)
     return True
+
+
+def open_contents(value: Any) -> None:
+    """Decode what a message brings; only a SchemaError may come of it."""
+    if isinstance(value, TileReply) and value.blob:
+        tile_of(value.blob)
+    if isinstance(value, TileReply) and value.delta:
+        tile_after(value.delta, HELD)
+    if isinstance(value, TileUpdate):
+        updated(value, HELD)
+    for answer in value.answers if isinstance(value, TilesReply) else ():
+        with contextlib.suppress(SchemaError):
+            tile_of_answer(TILE, answer, HELD)
 
 
 @pytest.mark.parametrize("kind", KINDS.values(), ids=lambda k: k.__name__)
@@ -97,6 +115,7 @@ EXTREMES: dict[int, list[Any]] = {
     FieldDescriptor.CPPTYPE_INT32: [-(2**31), -1, 0, 1, 2**31 - 1],
     FieldDescriptor.CPPTYPE_INT64: [-(2**63), -1, 0, 1, 2**63 - 1],
     FieldDescriptor.CPPTYPE_DOUBLE: [0.0, -1.0, 1e308, float("inf"), float("-inf"), float("nan")],
+    FieldDescriptor.CPPTYPE_BOOL: [False, True],
     FieldDescriptor.CPPTYPE_ENUM: [0, 1, 2, 3, 4, -1, 2**31 - 1],
 }
 
