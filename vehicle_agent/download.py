@@ -41,12 +41,14 @@ class TileFetcher:
         self.link: LinkProfile = bus.config.link_profile
         self._cache, self._parameters = cache, parameters
         self._exchange = Exchange(bus, cache, parameters.request_s)
-        self._batch_bytes = batch_bytes(self.link.rate_byte_s("down"), parameters.batch_s)
+        rate_byte_s = self.link.rate_byte_s("down")
+        self._batch_bytes = batch_bytes(rate_byte_s, parameters.batch_s)
+        self._window_bytes = rate_byte_s * (parameters.batch_s + 2 * self.link.delay_s)
         self._changed = threading.Condition()
         self._wanted: tuple[TileId, ...] = ()
         self._waiting: list[TileId] = []
         self._not_before: dict[TileId, float] = {}
-        self._in_flight: set[TileId] = set()
+        self._in_flight: dict[TileId, float] = {}  # with the bytes expected
         self._again: set[TileId] = set()  # in flight, and already known to have changed
         self._answered: set[TileId] = set()
         self._stale: set[TileId] = set()  # answered, but to be asked for again
@@ -106,7 +108,7 @@ class TileFetcher:
         """What the answer about a tile is likely to weigh: of one that is held little, of one not held the mean."""
         if self.is_known(tile_id):
             return 0.0
-        return HELD_GUESS_BYTES if self._cache.head(tile_id)[0] else self._whole.value
+        return self._expected_bytes(tile_id)
 
     def wait_for(self, tiles: Collection[TileId], timeout_s: float, stop: threading.Event) -> set[TileId]:
         """Wait until all of `tiles` are answered, time is up or `stop` is set; returns those that are not answered."""
@@ -129,9 +131,12 @@ class TileFetcher:
 
     def _line_up(self, first: TileId | None = None) -> None:
         """What is wanted and not known waits, in order. The lock is held."""
-        done = (self._answered - self._stale) | self._in_flight
+        done = (self._answered - self._stale) | self._in_flight.keys()
         self._waiting = sorted((t for t in self._wanted if t not in done), key=lambda t: t != first)
         self._changed.notify_all()
+
+    def _expected_bytes(self, tile_id: TileId) -> float:
+        return HELD_GUESS_BYTES if self._cache.head(tile_id)[0] else self._whole.value
 
     def _work(self) -> None:
         while batch := self._next():
@@ -139,7 +144,8 @@ class TileFetcher:
             done = {fetched.tile_id for fetched in outcome.fetched}
             instead = self._cached(t for t in batch if t not in done) if not self._closed else {}
             with self._changed:
-                self._in_flight.difference_update(batch)
+                for tile_id in batch:
+                    del self._in_flight[tile_id]
                 self._settle_all(batch, outcome, instead)
                 self._line_up()
 
@@ -151,23 +157,22 @@ class TileFetcher:
             while not self._closed:
                 now_s = time.monotonic()
                 ready = [t for t in self._waiting if self._not_before.get(t, 0.0) <= now_s]
-                if ready:
+                if ready and sum(self._in_flight.values()) <= self._window_bytes:
                     batch = self._fitting(t for t in ready if t.district == ready[0].district)
                     self._waiting = [t for t in self._waiting if t not in batch]
-                    self._in_flight.update(batch)
-                    return batch
+                    self._in_flight |= batch
+                    return list(batch)
                 self._changed.wait(POLL_S)
             return []
 
-    def _fitting(self, tiles: Iterable[TileId]) -> list[TileId]:
-        """The first of `tiles`, and those after it that fit into one answer."""
-        batch: list[TileId] = []
-        expected_bytes = 0.0
+    def _fitting(self, tiles: Iterable[TileId]) -> dict[TileId, float]:
+        """The first of `tiles`, and those after it that fit into one answer, with the bytes expected."""
+        batch: dict[TileId, float] = {}
         for tile_id in tiles:
-            expected_bytes += HELD_GUESS_BYTES if self._cache.head(tile_id)[0] else self._whole.value
-            if batch and (expected_bytes > self._batch_bytes or len(batch) == MOST_TILES):
+            expected_bytes = self._expected_bytes(tile_id)
+            if batch and (sum(batch.values()) + expected_bytes > self._batch_bytes or len(batch) == MOST_TILES):
                 break
-            batch.append(tile_id)
+            batch[tile_id] = expected_bytes
         return batch
 
     def _try(self, batch: list[TileId]) -> Outcome:
