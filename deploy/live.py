@@ -143,7 +143,7 @@ class View:
             self.live.update(render(self.state))
         elif time.monotonic() - self.printed_s >= PLAIN_PERIOD_S:
             self.printed_s = time.monotonic()
-            self.console.print(self._plain())
+            self.console.print(self._plain(), soft_wrap=True)
 
     def _plain(self) -> str:
         with self.state.lock:
