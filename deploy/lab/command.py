@@ -72,13 +72,12 @@ def lab(
         folder.write_mark({"config": dataclasses.asdict(config), "lab": name, "drives": [str(path) for path in drives]})
         lab_run = LabRun(opened, folder)
         summary = run(config, folder, source, keep_drives=keep_drives, place=lab_run.place)
-        report = lab_run.report()
     if as_json:
-        click.echo(json.dumps(summary | {"lab": report}, indent=2))
+        click.echo(json.dumps(summary | {"lab": lab_run.report}, indent=2))
         return
     click.echo(summary_text(summary, folder))
-    Console(width=WIDTH).print(run_table(report))
-    click.echo(run_verdict(report))
+    Console(width=WIDTH).print(run_table(lab_run.report))
+    click.echo(run_verdict(lab_run.report))
 
 
 @lab.command()

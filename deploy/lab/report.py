@@ -15,7 +15,7 @@ from typing import Any, Final
 from deploy.lab.counters import Counts, Drops, read_counts, read_drops
 from deploy.lab.groups import Group, LabLink
 from deploy.lab.lab import Lab
-from deploy.lab.relay import LineCount, read_account
+from deploy.lab.relay import LineCount
 from deploy.lab.sampler import LinkSeen
 from fleet_bus.ledger_file import AgentLedger
 
@@ -208,11 +208,6 @@ def _ledger_and_interface(counted: LinkCounted, ledgers: dict[int, AgentLedger],
 
 def _difference(ledger: int, interface: int) -> float:
     return (ledger - interface) / interface if interface else 0.0
-
-
-def read_relays(folder: Path) -> dict[str, LineCount]:
-    """Return what the relays of a run did, by device; empty where the kernel carried all links."""
-    return read_account(folder) if folder.is_dir() else {}
 
 
 def as_json(lab: str, groups: tuple[GroupAccount, ...]) -> dict[str, Any]:

@@ -1,16 +1,17 @@
 """A fleet in a lab: which process runs where, and the account of its links."""
 
-from collections.abc import Callable, Iterator
-from contextlib import AbstractContextManager, contextmanager
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Final
 
 from deploy.lab.groups import ROUTER_FROM_CLOUD, ROUTER_LISTENS, unpaced
 from deploy.lab.lab import Lab
 from deploy.lab.namespaces import inside
-from deploy.lab.relay import run_relay
-from deploy.lab.report import Evidence, account, as_json, count_links, read_relays, write_account
-from deploy.lab.sampler import LinkSeen, sampling
+from deploy.lab.relay import read_account, run_relay
+from deploy.lab.report import Evidence, account, as_json, count_links, write_account
+from deploy.lab.sampler import sampling
 from deploy.processes import ProcessSpec
 from deploy.run_folder import RunFolder
 from deploy.site import Site, VehicleSite
@@ -39,35 +40,34 @@ def relay_processes(lab: Lab, relays: Path) -> tuple[ProcessSpec, ...]:
     return tuple(ProcessSpec(f"link-{name}", run_relay, (links, relays)) for name, links in carried.items() if links)
 
 
+@dataclass
 class LabRun:
     """One fleet run in a lab.
 
-    Args:
+    Attributes:
         lab: where.
         folder: the run.
+        report: the account of the links once the fleet has run, also in `lab.json`; empty before.
     """
 
-    def __init__(self, lab: Lab, folder: RunFolder) -> None:
-        self.lab, self.folder = lab, folder
-        self._seen: dict[int, LinkSeen] = {}
-
-    @property
-    def place(self) -> Callable[[], AbstractContextManager[Site]]:
-        """For `fleet_cli.run`: the launcher is in the cloud's namespace, and the links are watched, for the block."""
-        return self._placed
+    lab: Lab
+    folder: RunFolder
+    report: dict[str, Any] = field(default_factory=dict)
 
     @contextmanager
-    def _placed(self) -> Iterator[Site]:
-        with sampling(self.lab) as self._seen, inside(self.lab.cloud_namespace):
-            yield lab_site(self.lab, self.folder.root / RELAYS)
+    def place(self) -> Iterator[Site]:
+        """Give the site of the fleet: the launcher is in the cloud's namespace, and the links are watched.
 
-    def report(self) -> dict[str, Any]:
-        """Account for the links after the run, while the lab still exists; also written to `lab.json`."""
-        relays = read_relays(self.folder.root / RELAYS)
-        evidence = Evidence(count_links(self.lab), self._seen, relays, read_ledgers(self.folder, len(self.lab.links)))
-        values = as_json(self.lab.name, account(self.lab, evidence))
-        write_account(self.folder.root / ACCOUNT, values)
-        return values
+        The links are accounted for when the block has ended well.
+        """
+        relays = self.folder.root / RELAYS
+        with sampling(self.lab) as seen, inside(self.lab.cloud_namespace):
+            yield lab_site(self.lab, relays)
+        evidence = Evidence(
+            count_links(self.lab), seen, read_account(relays), read_ledgers(self.folder, len(self.lab.links))
+        )
+        self.report = as_json(self.lab.name, account(self.lab, evidence))
+        write_account(self.folder.root / ACCOUNT, self.report)
 
 
 def read_ledgers(folder: RunFolder, vehicles: int) -> dict[int, AgentLedger]:
