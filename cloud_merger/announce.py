@@ -10,7 +10,7 @@ from typing import Final
 from cloud_merger.ownership import Members
 from fleet_bus.bus import Bus
 from fleet_bus.subscribing import RecallingPublisher
-from gnd_map.codec import encode_delta
+from gnd_map.codec import encode_delta, lattice_of
 from gnd_map.errors import CodecError
 from gnd_map.tile import diff
 from schemas.errors import SchemaError, TooLarge
@@ -76,10 +76,13 @@ def update_of(stored: StoredTile, parent: StoredTile | None) -> TileUpdate:
 
 
 def _with_delta(update: TileUpdate, stored: StoredTile, parent: StoredTile) -> TileUpdate:
+    """The notice with what has changed: coded where the version lies on a lattice, else in plain columns."""
     try:
         before, after = parent.decode().gaussians, stored.decode().gaussians
-        coded = encode_delta(stored.tile, before, after)
         changes = diff(before, after)
+        if lattice_of(stored.codec_id) is None:
+            return replace(update, delta=changes)
+        coded = encode_delta(stored.tile, before, after)
         return replace(update, coded_delta=coded, put_voxels=len(changes.put), removed_voxels=len(changes.removed))
     except TooLarge:
         return update

@@ -2,7 +2,7 @@
 in a codec that it reads.
 
 Every version that is still in the store can be the base of a delta. A delta that is no shorter than the whole tile, or
-whose base is gone or damaged, is not sent.
+whose base is gone or damaged, is not sent; tiles of plain floats have none.
 """
 
 import logging
@@ -131,7 +131,8 @@ class Answers:
     # What is sent
 
     def _sent(self, stored: StoredTile, held: StoredTile | None, codecs: Sequence[int]) -> _Sent:
-        if held is not None and reads_like(stored.codec_id, codecs):
+        # Floats have no short delta (gnd_map.codec.encode_delta).
+        if held is not None and lattice_of(stored.codec_id) is not None and reads_like(stored.codec_id, codecs):
             body = self._delta(held, stored)
             if body is not None and len(body) < len(stored.body):
                 return _Sent("delta", 0, body)

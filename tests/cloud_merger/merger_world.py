@@ -56,18 +56,23 @@ def change_of(
 ) -> TileChange:
     """One report's part about a tile."""
     gaussians = changed if isinstance(changed, Gaussians) else gaussians_of(changed)
-    n = len(gaussians)
     return TileChange(
         tile=tile,
         base_version=0 if base is None else version,
         base_sha=sha_of(base, tile),
         observed=np.array(sorted(observed), np.int32),
         changed=gaussians,
-        change_class=np.full(n, change_class, np.uint8),
-        evidence=np.zeros((n, 4), np.int32),
+        change_class=_classes(gaussians, change_class),
+        evidence=np.zeros((len(gaussians), 4), np.int32),
         pose_sigma_m=0.03,
         pose_sigma_rad=0.001,
     )
+
+
+def _classes(gaussians: Gaussians, change_class: ChangeClass) -> np.ndarray:
+    """The class for all voxels; "modified" where nothing is any more is "deleted", as vehicles say."""
+    gone = ChangeClass.DELETED if change_class == ChangeClass.MODIFIED else change_class
+    return np.where(gaussians.exists, change_class, gone).astype(np.uint8)
 
 
 def report_id(number: int) -> str:

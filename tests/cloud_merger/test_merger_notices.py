@@ -5,7 +5,7 @@ from dataclasses import replace
 
 import pytest
 from merger_processes import Cloud, wait_for
-from merger_world import GROUND, POLE, TILE, WALL, change_of, gaussians_of, report_of, tile_of_states
+from merger_world import BALL, GROUND, NEIGHBOUR, POLE, TILE, WALL, change_of, gaussians_of, report_of, tile_of_states
 
 from cloud_merger.announce import encoded, update_of
 from cloud_merger.config import ShardConfig
@@ -13,8 +13,9 @@ from cloud_merger.merger import run_shard
 from cloud_merger.work import Worker
 from fleet_bus.bus import open_bus
 from fleet_bus.config import BusConfig
+from gnd_map.codec import LATTICES, snap
 from gnd_map.gaussian import Gaussians
-from gnd_map.tile import TileDelta
+from gnd_map.tile import Tile, TileDelta
 from schemas.changes import split
 from schemas.keys import alive_key, update_key
 from schemas.limits import MAX_TILE_BODY_BYTES
@@ -24,6 +25,11 @@ from tile_store.values import ReportRow, StoreConfig
 
 STATES = {0: GROUND, 1: WALL}
 BASE = gaussians_of(STATES)
+
+
+def on_standard(states):
+    """A tile on the lattice of most maps."""
+    return Tile(TILE, 1, snap(gaussians_of(states), LATTICES["standard"]))
 
 
 @pytest.fixture
@@ -78,7 +84,7 @@ def test_a_notice_that_a_dead_shard_owed_is_sent_by_the_next(cloud, shard):
     assert [(u.version, u.previous_version, u.reason) for u in (first, second)] == [(2, 1, "merged"), (3, 2, "merged")]
     assert first.previous_sha == tile_of_states(STATES).sha
     assert updated(second, updated(first, tile_of_states(STATES))) == cloud.store.get("ndt", TILE).decode()
-    assert [update.voxels for update in (first, second)] == [(1, 0), (0, 1)]
+    assert [update.voxels for update in (first, second)] == [(1, 0), (1, 1)]  # the pole was measured again
     wait_for("none is owed", cloud.is_settled)
 
 
@@ -120,6 +126,19 @@ def stored_versions(cloud):
     return cloud.store.get("ndt", TILE, 1), cloud.store.get("ndt", TILE, 2)
 
 
+def test_a_version_on_a_lattice_is_announced_by_a_coded_delta_and_one_of_floats_in_columns(cloud):
+    neighbour = replace(on_standard(STATES), tile_id=NEIGHBOUR)
+    cloud.store.put_tiles([neighbour])
+    after = replace(neighbour, gaussians=on_standard({1: BALL}).gaussians)
+    cloud.store.put_tiles([after, tile_of_states({1: WALL})])
+    coded, plain = (
+        update_of(cloud.store.get("ndt", tile, 2), cloud.store.get("ndt", tile, 1)) for tile in (NEIGHBOUR, TILE)
+    )
+    assert (coded.delta, coded.voxels, plain.coded_delta, plain.voxels) == (None, (1, 1), b"", (0, 1))
+    assert updated(TileUpdate.decode(coded.encode()), neighbour).gaussians == after.gaussians
+    assert updated(TileUpdate.decode(plain.encode()), tile_of_states(STATES)).gaussians == gaussians_of({1: WALL})
+
+
 def test_a_damaged_body_is_announced_without_a_delta(cloud):
     publish_without_notice(cloud, 1, {2: POLE})
     one, two = stored_versions(cloud)
@@ -141,7 +160,7 @@ def test_a_delta_that_is_too_large_for_a_notice_is_left_out(cloud):
     plain = TileDelta(gaussians_of({}).voxel_id, large)
     update = TileUpdate(TILE, "ndt", 2, 1, two.sha, one.sha, "merged", plain)
     assert not TileUpdate.decode(encoded(update)).has_delta
-    fullest = replace(update_of(two, one), coded_delta=bytes(MAX_TILE_BODY_BYTES), put_voxels=n)
+    fullest = replace(update, delta=None, coded_delta=bytes(MAX_TILE_BODY_BYTES), put_voxels=n)
     assert TileUpdate.decode(encoded(fullest)).coded_delta == fullest.coded_delta
 
 
