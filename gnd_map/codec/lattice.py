@@ -84,9 +84,9 @@ def _levels(first_m: float, ratio: float) -> tuple[int, ...]:
     return tuple(min(round(first_m * ratio**k * 2**UNIT_BITS), MAX_SD_M << UNIT_BITS) for k in range(LEVELS))
 
 
-ARCHIVE: Final = Lattice("archive", 0, _levels(0.002, 1.15), 1, 3, 3, 3, 3)
-STANDARD: Final = Lattice("standard", 1, _levels(0.004, 1.2), 2, 2, 1, 2, 1)
-COMPACT: Final = Lattice("compact", 2, _levels(0.004, 1.3), 2, 1, 0, 1, 0)
+ARCHIVE: Final = Lattice("archive", 0, _levels(0.002, 1.15), 1, 3, 3, 3, 4)
+STANDARD: Final = Lattice("standard", 1, _levels(0.004, 1.2), 2, 2, 1, 2, 3)
+COMPACT: Final = Lattice("compact", 2, _levels(0.004, 1.3), 2, 1, 0, 1, 3)
 LATTICES: Final[Mapping[str, Lattice]] = MappingProxyType({x.name: x for x in (ARCHIVE, STANDARD, COMPACT)})
 
 
