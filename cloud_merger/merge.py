@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from cloud_merger.cluster import Index, dbscan
 from cloud_merger.parameters import MergeParameters
-from cloud_merger.statements import EPOCH, Kind, Rows, Statements, states_at
+from cloud_merger.statements import EPOCH, Kind, Rows, Statements, find, states_at
 from gnd_map.gaussian import Gaussians
 from gnd_map.similarity import pairs_within, similarity
 from gnd_map.tile import TileDelta, apply
@@ -48,7 +48,7 @@ def merge_tile(epoch: Gaussians, statements: Statements, parameters: MergeParame
     rows = statements.rows
     if len(rows) == 0:
         return MergedTile(epoch, np.zeros(0, np.int32))
-    cluster = _clusters(rows, parameters)
+    cluster = _joined(rows, _clusters(rows, parameters))
     winner = _winners(rows, cluster, parameters)
     rows, cluster = _members(rows, cluster, winner)
     candidate = _representatives(rows, cluster, parameters)
@@ -58,7 +58,16 @@ def merge_tile(epoch: Gaussians, statements: Statements, parameters: MergeParame
 
 
 def _clusters(rows: Rows, parameters: MergeParameters) -> Index:
-    """GND 5.1: the cluster of each statement, numbered by voxel, then by the cluster's first report; -1 is noise."""
+    """GND 5.1: the cluster of each statement, numbered by voxel, then by the cluster's first report; -1 is noise, and
+    what is withheld.
+    """
+    shown = rows["kind"] != Kind.WITHHELD
+    cluster = np.full(len(rows), -1, np.int64)
+    cluster[shown] = _clusters_shown(rows[shown], parameters)
+    return cluster
+
+
+def _clusters_shown(rows: Rows, parameters: MergeParameters) -> Index:
     first, node = _nodes(rows)
     nodes = rows[first]
     i, j = pairs_within(nodes["voxel_id"])
@@ -73,6 +82,27 @@ def _clusters(rows: Rows, parameters: MergeParameters) -> Index:
         min_samples=parameters.min_samples,
     )
     return label[node]
+
+
+def _joined(rows: Rows, cluster: Index) -> Index:
+    """The clusters, with each withheld statement in its voxel's largest cluster of measurements that is not the
+    epoch's; -1 where there is none. It was not asked for because enough measurements agreed, or because it could not
+    win: either way it counts where a change is most likely.
+    """
+    withheld = rows["kind"] == Kind.WITHHELD
+    inside = np.flatnonzero(cluster >= 0)
+    if not withheld.any() or not len(inside):
+        return cluster
+    number, first, member = np.unique(cluster[inside], return_index=True, return_inverse=True)
+    part = rows[inside]
+    measured = np.bincount(member, weights=part["kind"] == Kind.MEASURED) > 0
+    change = measured & (_share((part["kind"] == Kind.QUOTED) & (part["was"] == EPOCH), member) < 0.5)
+    number, voxel = number[change], part["voxel_id"][first][change]
+    votes = np.bincount(member, weights=part["weight"])[change]
+    order = np.lexsort((number, -votes, voxel))
+    largest, at = np.unique(voxel[order], return_index=True)
+    found = np.append(number[order][at], -1)[find(largest.astype(np.int32), rows["voxel_id"])]
+    return np.where(withheld, found, cluster)
 
 
 def _denied(a: Rows, b: Rows) -> NDArray[np.bool_]:

@@ -30,13 +30,14 @@ class Kind(IntEnum):
     NOTHING = 0
     QUOTED = 1  # the Gaussian of the base version, seen to be still there
     MEASURED = 2
+    WITHHELD = 3  # new or modified, but the Gaussian was not asked for
 
 
 # One statement. `report` indexes Statements.report_ids; `was` numbers the voxel's state in the version that it was made
 # against (0: nothing there; equal numbers in a voxel: equal states), so that one sees whether one statement denies what
-# another quotes; `denies` marks a MEASURED one that denies the epoch's own Gaussian; `pose_m2` is the variance of a
-# MEASURED one by its poses, beyond what is expected of all; count 0 for NOTHING; mean relative to the voxel centre
-# along tile ENU axes; covariance xx, xy, xz, yy, yz, zz.
+# another quotes; `denies` marks a MEASURED or WITHHELD one that denies the epoch's own Gaussian; `pose_m2` is the
+# variance of a MEASURED one by its poses, beyond what is expected of all; count 0 for NOTHING and WITHHELD; mean
+# relative to the voxel centre along tile ENU axes; covariance xx, xy, xz, yy, yz, zz.
 STATEMENT = np.dtype(
     [
         ("voxel_id", np.int32),
@@ -148,12 +149,12 @@ def same_state(a: Rows, b: Rows) -> NDArray[np.bool_]:
 def _statements(report: int, change: TileChange, voxels: NDArray[np.int32], quoted: Rows | None) -> Rows:
     """One report's statements about those of `voxels` that it observed; without a base only its changes speak."""
     voxel_id = np.intersect1d(change.observed, voxels, assume_unique=True)
-    rows = states_at(Gaussians.empty(), voxel_id, Kind.QUOTED) if quoted is None else quoted[_find(voxels, voxel_id)]
+    rows = states_at(Gaussians.empty(), voxel_id, Kind.QUOTED) if quoted is None else quoted[find(voxels, voxel_id)]
     speaks = np.full(len(rows), quoted is not None)
-    at, was = _find(change.changed.voxel_id, voxel_id), rows["was"].copy()
-    rows[at >= 0] = _states(change.changed, Kind.MEASURED)[at[at >= 0]]
+    at, was = find(change.changed.voxel_id, voxel_id), rows["was"].copy()
+    rows[at >= 0] = _changed_states(change)[at[at >= 0]]
     rows["was"] = was
-    rows["denies"] = (was == EPOCH) & (rows["kind"] == Kind.MEASURED)
+    rows["denies"] = (was == EPOCH) & np.isin(rows["kind"], (Kind.MEASURED, Kind.WITHHELD))
     speaks[at >= 0] = _speaks(change)[at[at >= 0]]
     rows["report"] = report
     spoken: Rows = rows[speaks]
@@ -163,7 +164,7 @@ def _statements(report: int, change: TileChange, voxels: NDArray[np.int32], quot
 def states_at(gaussians: Gaussians, voxel_id: NDArray[np.int32], kind: Kind) -> Rows:
     """STATEMENT (len(voxel_id),): what `gaussians` holds at each voxel, NOTHING where they hold none."""
     states = np.concatenate([_states(gaussians, kind), np.zeros(1, STATEMENT)])  # found at -1: nothing
-    rows: Rows = states[_find(gaussians.voxel_id, voxel_id)]
+    rows: Rows = states[find(gaussians.voxel_id, voxel_id)]
     rows["voxel_id"] = voxel_id
     return rows
 
@@ -176,13 +177,25 @@ def _states(gaussians: Gaussians, kind: Kind) -> Rows:
     return rows
 
 
+def _changed_states(change: TileChange) -> Rows:
+    rows = _states(change.changed, Kind.MEASURED)
+    rows["kind"][is_withheld(change)] = Kind.WITHHELD
+    return rows
+
+
+def is_withheld(change: TileChange) -> NDArray[np.bool_]:
+    """(N,) which changed voxels are new or modified without a Gaussian: flagged, and not asked for."""
+    flagged = np.isin(change.change_class, (ChangeClass.NEW, ChangeClass.MODIFIED))
+    return np.asarray(flagged & ~change.changed.exists)
+
+
 def _speaks(change: TileChange) -> NDArray[np.bool_]:
     """Changed entries that are a statement: not unmeasured, and no Gaussian from too few sub-cells."""
     weak = change.changed.exists & (change.changed.cells < N_MIN_CELLS)
     return np.asarray(~weak & (change.change_class != ChangeClass.UNMEASURED))
 
 
-def _find(ids: NDArray[np.int32], wanted: NDArray[np.int32]) -> NDArray[np.int64]:
+def find(ids: NDArray[np.int32], wanted: NDArray[np.int32]) -> NDArray[np.int64]:
     """Index of each wanted id in the sorted `ids`, -1 where it is missing."""
     if len(ids) == 0:
         return np.full(len(wanted), -1, np.int64)

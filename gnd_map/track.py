@@ -26,7 +26,7 @@ STEPS: Final = 64
 HEIGHT_UNIT_M: Final = 0.5
 LEVELS: Final = 9
 """Elevations that cut a sensor's rays into eighths."""
-LEVEL_DEG: Final = 0.5
+LEVEL_DEG: Final = 0.25
 SECTORS: Final = 16
 """Sectors of azimuth, the first from straight ahead 22.5° to the left."""
 MAX_PIECES: Final = 256
@@ -45,7 +45,7 @@ class View:
     """What a LiDAR looks at, as its own scans tell; so no table of sensors is needed.
 
     Attributes:
-        levels: elevations at the quantiles 0, 1/8 … 1 of its rays, ascending, in half degrees, up positive.
+        levels: elevations at the quantiles 0, 1/8 … 1 of its rays, ascending, in quarters of a degree, up positive.
         sectors: bit k: it sees the azimuths from k·22.5° to (k+1)·22.5°, counted from straight ahead to the left.
         rays_log2: rays a scan, the logarithm to base 2 in quarters.
         range_m: how far nearly all of its rays reach.
@@ -60,7 +60,9 @@ class View:
         if len(self.levels) != LEVELS or list(self.levels) != sorted(self.levels):
             raise TrackError(f"a view has {LEVELS} ascending elevations, got {self.levels}")
         if not -128 <= self.levels[0] <= self.levels[-1] <= 127:
-            raise TrackError(f"elevations of {self.levels[0]} … {self.levels[-1]} half degrees are not in -128 … 127")
+            raise TrackError(
+                f"elevations of {self.levels[0]} … {self.levels[-1]} quarter degrees are not in -128 … 127"
+            )
         if not 0 < self.sectors < 1 << SECTORS:
             raise TrackError(f"sectors {self.sectors:#x} are none of {SECTORS}")
         if not 0 <= self.rays_log2 <= 96 or not 1 <= self.range_m <= 255:

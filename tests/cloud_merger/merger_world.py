@@ -53,8 +53,9 @@ def change_of(
     tile: TileId = TILE,
     change_class: ChangeClass = ChangeClass.MODIFIED,
     version: int = 1,
+    withheld: Sequence[int] = (),
 ) -> TileChange:
-    """One report's part about a tile."""
+    """One report's part about a tile; the Gaussians of the voxels `withheld` were not asked for."""
     gaussians = changed if isinstance(changed, Gaussians) else gaussians_of(changed)
     return TileChange(
         tile=tile,
@@ -62,17 +63,18 @@ def change_of(
         base_sha=sha_of(base, tile),
         observed=np.array(sorted(observed), np.int32),
         changed=gaussians,
-        change_class=_classes(gaussians, change_class),
+        change_class=_classes(gaussians, change_class, withheld),
         evidence=np.zeros((len(gaussians), 4), np.int32),
         pose_sigma_m=0.03,
         pose_sigma_rad=0.001,
     )
 
 
-def _classes(gaussians: Gaussians, change_class: ChangeClass) -> np.ndarray:
+def _classes(gaussians: Gaussians, change_class: ChangeClass, withheld: Sequence[int]) -> np.ndarray:
     """The class for all voxels; "modified" where nothing is any more is "deleted", as vehicles say."""
     gone = ChangeClass.DELETED if change_class == ChangeClass.MODIFIED else change_class
-    return np.where(gaussians.exists, change_class, gone).astype(np.uint8)
+    keeps = gaussians.exists | np.isin(gaussians.voxel_id, withheld)
+    return np.where(keeps, change_class, gone).astype(np.uint8)
 
 
 def report_id(number: int) -> str:

@@ -51,7 +51,9 @@ def changes(draw, bases=(EPOCH, OLDER, LOST, None)):
     )
     base = draw(st.sampled_from(bases))
     kind = draw(st.sampled_from([ChangeClass.MODIFIED, ChangeClass.MODIFIED, ChangeClass.UNMEASURED]))
-    return change_of(base, observed, moved, change_class=kind)
+    gone = [voxel for voxel, state in changed.items() if state is None]
+    withheld = draw(st.sets(st.sampled_from(gone))) if gone and kind == ChangeClass.MODIFIED else ()
+    return change_of(base, observed, moved, change_class=kind, withheld=sorted(withheld))
 
 
 def plain_merge(epoch, reports, bases, parameters):
@@ -72,7 +74,7 @@ def plain_merge(epoch, reports, bases, parameters):
 
 
 def plain_vote(report, voxel, bases, parameters):
-    """(state, is it measured, what stood there in its base), or nothing when the report abstains."""
+    """(state, is it measured, what stood there in its base), or nothing when it abstains; withheld: no state."""
     change = report.change
     if voxel not in change.observed:
         return None
@@ -83,6 +85,8 @@ def plain_vote(report, voxel, bases, parameters):
         row = int(np.flatnonzero(change.changed.voxel_id == voxel)[0])
         if change.change_class[row] == ChangeClass.UNMEASURED or 0 < entry.cells[0] < 20:
             return None
+        if change.change_class[row] == ChangeClass.MODIFIED and not entry.exists[0]:
+            return None, False, was
         return entry.take(entry.exists), bool(entry.exists[0]), was
     if parameters.mode == "paper" or base is None:
         return None
@@ -108,26 +112,47 @@ def plain_similarity(a, b, parameters, pose_m2=0.0):
 
 
 def plain_decision(was, votes, parameters):
-    if not votes:
+    shown = [k for k, vote in enumerate(votes) if vote[1] is not None]
+    if not shown:
         return None
-    distance = np.array([[plain_distance(a, b, parameters) for b in votes] for a in votes])
-    label = DBSCAN(eps=parameters.eps, min_samples=parameters.min_samples, metric="precomputed").fit(distance).labels_
+    distance = np.array([[plain_distance(votes[a], votes[b], parameters) for b in shown] for a in shown])
+    label = np.full(len(votes), -1)
+    label[shown] = (
+        DBSCAN(eps=parameters.eps, min_samples=parameters.min_samples, metric="precomputed").fit(distance).labels_
+    )
     weight = np.array([vote[0][1] for vote in votes])
+    label = plain_joined(was, votes, weight, label)
     sizes = {cluster: weight[label == cluster].sum() for cluster in label if cluster >= 0}
     if not sizes:
         return None
     winner = min(sizes, key=lambda cluster: (-sizes[cluster], cluster))
     members = [vote for vote, cluster in zip(votes, label, strict=True) if cluster == winner]
-    denying = sum(measured and len(state) > 0 and len(was) > 0 and base == was for _, state, measured, base in members)
+    denying = sum((measured or state is None) and len(was) > 0 and base == was for _, state, measured, base in members)
     denied = 2 * denying > len(members)
     if not sizes[winner] > (parameters.xi_reshaped if denied else parameters.xi) * weight.sum():
         return None
     now, pose_m2 = plain_representative(members, parameters)
-    quotes = sum(not measured and len(state) > 0 and state == was for _, state, measured, _ in members)
+    quotes = sum(quotes_epoch(was, vote) for vote in members)
     limit = parameters.d_denied if denied else parameters.d_update
     if plain_similarity(was, now, parameters, pose_m2) >= limit or 2 * quotes >= len(members):
         return None
     return now, tuple(report_id for (report_id, *_), *_ in members)
+
+
+def quotes_epoch(was, vote):
+    _, state, measured, _ = vote
+    return not measured and state is not None and len(state) > 0 and state == was
+
+
+def plain_joined(was, votes, weight, label):
+    """Withheld votes go to the largest cluster of measurements of which less than half quotes the epoch."""
+    open_to = {}
+    for cluster in sorted(set(label) - {-1}):
+        members = [vote for vote, of in zip(votes, label, strict=True) if of == cluster]
+        if any(vote[2] for vote in members) and 2 * sum(quotes_epoch(was, vote) for vote in members) < len(members):
+            open_to[cluster] = weight[label == cluster].sum()
+    largest = min(open_to, key=lambda cluster: (-open_to[cluster], cluster), default=-1)
+    return np.array([largest if vote[1] is None else of for vote, of in zip(votes, label, strict=True)])
 
 
 def plain_representative(members, parameters):
