@@ -7,8 +7,12 @@ import sys
 import textwrap
 from pathlib import Path
 
+import numpy as np
 import pytest
 
+from gnd_map.gaussian import Gaussians
+from gnd_map.tile import Tile
+from gnd_map.tile_id import TileId
 from vehicle_agent.errors import OutboxError
 from vehicle_agent.outbox import Outbox, OutboxCounts
 
@@ -67,6 +71,52 @@ def test_an_unknown_answer_is_an_error(outbox: Outbox) -> None:
     with pytest.raises(OutboxError, match="unknown answer 'perhaps'"):
         outbox.answered(A, "perhaps")
     assert outbox.counts().pending == 1
+
+
+def tile(voxels: int, number: int = 0) -> Tile:
+    """Plain floats, on no lattice."""
+    cov = np.tile(np.float32([0.07, 0.001, 0.0, 0.05, 0.0, 0.0003]), (voxels, 1))
+    mean = np.linspace(-0.4, 0.4, 3 * voxels, dtype=np.float32).reshape(voxels, 3)
+    ids, count = np.arange(voxels, dtype=np.int32), np.full(voxels, 77, np.int32)
+    return Tile(TileId(497353963154 + number), 1, Gaussians(ids, count, count // 2, mean, cov))
+
+
+def test_base_tiles_stay_as_long_as_a_pending_report_needs_them(outbox: Outbox) -> None:
+    one, both, two = tile(5), tile(7, 1), tile(9, 2)
+    assert outbox.put(A, "key/a", b"body a", b"short a", [one, both])
+    assert outbox.put(B, "key/b", b"body b", b"short b", [both, two])
+    assert [letter.packed for letter in outbox.due(0)] == [b"short a", b"short b"]
+    assert outbox.bases_of(A) == {t.sha: t.gaussians for t in (one, both)}
+    outbox.answered(A, "stored")
+    assert outbox.bases_of(A) == {}
+    assert outbox.bases_of(B) == {t.sha: t.gaussians for t in (both, two)}
+    outbox.answered(B, "quarantined", "its letter is not sent again")
+    assert [outbox._db.run(f"SELECT * FROM {table}") for table in ("base", "needs", "packed")] == [[], [], []]
+
+
+def test_a_known_report_brings_no_base_tiles(outbox: Outbox) -> None:
+    outbox.put(A, "key/a", b"body")
+    assert not outbox.put(A, "key/a", b"body", b"short", [tile(5)])
+    assert (outbox.due(0)[0].packed, outbox.bases_of(A)) == (b"", {})
+
+
+def test_a_base_tile_that_is_damaged_on_the_disk_is_left_out(outbox: Outbox) -> None:
+    one, two = tile(5), tile(9, 2)
+    outbox.put(A, "key/a", b"body", b"short", [one, two])
+    outbox._db.run("UPDATE base SET body = x'0102' WHERE sha = ?", (one.sha,))
+    assert outbox.bases_of(A) == {two.sha: two.gaussians}
+    outbox._db.run("UPDATE base SET morton = morton + 1 WHERE sha = ?", (two.sha,))
+    assert outbox.bases_of(A) == {}
+
+
+def test_what_an_older_release_left_here_is_sent_whole(tmp_path: Path) -> None:
+    path = tmp_path / "outbox.sqlite"
+    old = Outbox(path)
+    old.put(A, "key/a", b"body")
+    for table in ("packed", "base", "needs"):
+        old._db.run(f"DROP TABLE {table}")
+    old.close()
+    assert [(x.report_id, x.body, x.packed) for x in Outbox(path).due(0)] == [(A, b"body", b"")]
 
 
 def test_what_was_put_survives_kill_9(tmp_path: Path) -> None:
