@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from vehicle_scene import ground, tiles_of
+from vehicle_scene import ground, published
 from waiting import wait_until
 
 from fleet_bus.bus import Bus
@@ -28,7 +28,7 @@ NEVER = threading.Event()
 
 @pytest.fixture(scope="module")
 def tiles() -> dict[TileId, Tile]:
-    return {t: tile for t, tile in tiles_of(ground(20.0)).items() if len(tile.gaussians) > 100}
+    return {t: tile for t, tile in published(ground(20.0)).items() if len(tile.gaussians) > 100}
 
 
 @pytest.fixture

@@ -5,7 +5,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from vehicle_scene import ground, tiles_of
+from vehicle_scene import ground, published
 from waiting import wait_until
 
 from fleet_bus.bus import Bus
@@ -25,7 +25,7 @@ class World:
     """A store with a base map, a vehicle that has cached it, and somebody who announces."""
 
     def __init__(self, cloud: Bus, bus: Bus, folder: Path) -> None:
-        self.base = tiles_of(ground(12.0))
+        self.base = published(ground(12.0))
         self.tile_id = max(self.base, key=lambda t: len(self.base[t].gaussians))
         self.cloud, self.store = cloud, SqliteStore(folder / "store.sqlite")
         self.store.put_tiles(list(self.base.values()))

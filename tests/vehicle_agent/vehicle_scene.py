@@ -3,6 +3,7 @@
 import numpy as np
 
 from gnd_map.accumulate import VoxelAccumulator
+from gnd_map.codec import LATTICES, snap
 from gnd_map.geodesy import LocalFrame
 from gnd_map.grid import GridFrame
 from gnd_map.tile import Tile
@@ -31,6 +32,12 @@ def tiles_of(points_map_m: np.ndarray, version: int = 1) -> dict[TileId, Tile]:
     accumulator = VoxelAccumulator(GRID_FRAME)
     accumulator.add(points_map_m)
     return {tile_id: Tile(tile_id, version, g) for tile_id, g in accumulator.finish().items()}
+
+
+def published(points_map_m: np.ndarray) -> dict[TileId, Tile]:
+    """Tiles as the store publishes them: on the lattice `standard`."""
+    lattice = LATTICES["standard"]
+    return {t: Tile(t, 1, snap(tile.gaussians, lattice)) for t, tile in tiles_of(points_map_m).items()}
 
 
 def look(walls: list[tuple[float, float, float, float]], rng: np.random.Generator, n: int = 40_000) -> np.ndarray:
