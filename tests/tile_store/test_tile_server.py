@@ -20,6 +20,7 @@ from fleet_bus.router import open_router
 from gnd_map.tile_id import TileId
 from schemas import keys
 from schemas.tiles import Catalog, TileReply, TileRequest, tile_of
+from schemas.tiles_batch import HeldTile, TileAnswer, TilesReply, TilesRequest, tile_of_answer
 from tile_store.errors import StoreError
 from tile_store.server import TileServer
 from tile_store.sqlite_store import SqliteStore
@@ -117,6 +118,40 @@ def test_a_region_is_answered_with_one_reply_a_tile_and_nothing_outside_it(clien
 
 
 @pytest.mark.usefixtures("server")
+def test_tiles_of_a_district_in_one_query(client: Bus, store: SqliteStore) -> None:
+    held = ask(client, TILE).blob
+    assert held is not None
+    absent = TileId(TILE.district.first_morton)
+    request = TilesRequest.of([HeldTile(TILE, held.version, held.sha), HeldTile(EAST), HeldTile(absent)])
+
+    def asked() -> dict[TileId, TileAnswer]:
+        key = keys.batch_key("ndt", TILE.district)
+        reply = TilesReply.decode(client.request(key, request.encode(), kind="tile", timeout_s=20.0))
+        return dict(reply.of_request(request, TILE.district))
+
+    assert {tile: answer.status for tile, answer in asked().items()} == {
+        TILE: "unchanged", EAST: "blob", absent: "absent"
+    }  # fmt: skip
+    assert tile_of_answer(EAST, asked()[EAST]).gaussians == tile_of_voxels(EAST, 1, 2).gaussians
+    store.put_tiles([tile_of_voxels(TILE, 1, 2, 3)])
+    newer = tile_of_answer(TILE, asked()[TILE], tile_of(held))
+    assert (newer.version, newer.gaussians) == (2, tile_of_voxels(TILE, 1, 2, 3).gaussians)
+
+
+@pytest.mark.usefixtures("server")
+def test_a_bad_query_for_tiles_of_a_district_is_refused_by_name(client: Bus) -> None:
+    key = keys.batch_key("ndt", TILE.district)
+    good = TilesRequest.of([HeldTile(TILE)]).encode()
+    assert "WrongVersion: TilesRequest of major version 0" in refusal(client, key)
+    assert "Malformed: 3 bytes are not a TilesRequest" in refusal(client, key, b"\xff\xff\xff")
+    assert "TooLarge: TilesRequest of 25000 bytes exceeds the limit of 24576" in refusal(client, key, bytes(25_000))
+    assert "BadKey" in refusal(client, key.replace("13033", "99999"), good)
+    assert "BadKey" in refusal(client, key + "/22102", good)
+    plain = TilesRequest.of([HeldTile(TILE)], codecs=(3,)).encode()
+    assert "comes in codec 1, asked for (3,)" in refusal(client, key, plain)
+
+
+@pytest.mark.usefixtures("server")
 def test_catalogs_of_one_district_and_of_many(client: Bus, store: SqliteStore) -> None:
     def catalog(key: str) -> Catalog:
         return Catalog.decode(client.request(key, b"", kind="catalog", timeout_s=20.0))
@@ -150,7 +185,9 @@ def test_what_can_never_be_answered_is_refused_by_name_at_once(client: Bus) -> N
 def test_a_query_without_payload_gets_the_tile(client: Bus) -> None:
     """A program that knows only zenoh and our schemas needs no request."""
     reply = TileReply.decode(client.request(keys.tile_key("ndt", TILE), b"", kind="tile", timeout_s=20.0))
-    assert reply.status == "blob"
+    assert reply.blob is not None
+    assert reply.blob.codec_id == 0, "float32 columns, which everybody reads"
+    assert tile_of(reply.blob).gaussians == tile_of_voxels(TILE, 1, 2).gaussians
 
 
 def test_a_store_that_fails_makes_the_asker_try_again(client: Bus, endpoint: str, store: SqliteStore) -> None:
