@@ -12,7 +12,7 @@ from gnd_map.classes import ChangeClass
 from gnd_map.codec import kernels as k
 from gnd_map.codec.coding import Coder
 from gnd_map.codec.floats import check_number, decode_gaussians, encode_gaussians
-from gnd_map.codec.lattice import COMPACT, LATTICES, Lattice, dequantise, integers_of, is_on, lattice_with
+from gnd_map.codec.lattice import LATTICES, REPORT, Lattice, dequantise, integers_of, is_on, lattice_with
 from gnd_map.codec.priors import mask_at, number_at, priors_of
 from gnd_map.codec.volume import Box, Known, code_box, code_flags, code_voxels, floors_of, known_of
 from gnd_map.errors import CodecError, ShapeError
@@ -115,7 +115,7 @@ def _same_rows(new: Gaussians, base: Gaussians) -> npt.NDArray[np.bool_]:
     same = np.zeros(len(new), np.bool_)
     _, at, was = np.intersect1d(new.voxel_id, base.voxel_id, assume_unique=True, return_indices=True)
     pairs = zip(new.columns, base.columns, strict=True)
-    same[at] = np.all([(a[at] == b[was]).reshape(len(at), -1).all(axis=1) for a, b in pairs], axis=0)
+    same[at] = np.all([(a[at] == b[was]).all(axis=tuple(range(1, a.ndim))) for a, b in pairs], axis=0)
     return same
 
 
@@ -164,13 +164,13 @@ def encode_measured(tiles: Sequence[tuple[TileId, Gaussians, Gaussians]]) -> byt
     """Measured Gaussians of several tiles, each (tile, base, measured), in one stream.
 
     Raises:
-        CodecError: some do not lie on the lattice `compact`, or lie too far apart in height.
+        CodecError: some do not lie on the lattice `report`, or lie too far apart in height.
     """
     coder = Coder.writing(priors_of("measured"), 4096 + 48 * sum(len(m) for _, _, m in tiles))
     for tile_id, base, measured in tiles:
         if len(measured):
-            integers = integers_of(measured, COMPACT)
-            code_voxels(coder, *_around(tile_id, base, measured.voxel_id), COMPACT, integers)
+            integers = integers_of(measured, REPORT)
+            code_voxels(coder, *_around(tile_id, base, measured.voxel_id), REPORT, integers)
     return coder.finish()
 
 
@@ -189,8 +189,8 @@ def decode_measured(tiles: Sequence[tuple[TileId, Gaussians, I32]], body: bytes)
 def _read_measured(coder: Coder, tile_id: TileId, base: Gaussians, voxel_id: I32) -> Gaussians:
     if len(voxel_id) == 0:
         return Gaussians.empty()
-    found = code_voxels(coder, *_around(tile_id, base, voxel_id), COMPACT, None)
-    return dequantise(found, COMPACT)
+    found = code_voxels(coder, *_around(tile_id, base, voxel_id), REPORT, None)
+    return dequantise(found, REPORT)
 
 
 def _around(tile_id: TileId, base: Gaussians, voxel_id: I32) -> tuple[Box, I32, Known]:
@@ -198,7 +198,7 @@ def _around(tile_id: TileId, base: Gaussians, voxel_id: I32) -> tuple[Box, I32, 
     both = np.union1d(base.voxel_id, voxel_id).astype(np.int32)
     low, high = floors_of(tile_id, both)
     box = Box(VoxelGrid.of(tile_id), low, high - low + 1)
-    return box, voxel_id, _known(base, voxel_id, np.empty(0, np.int32), COMPACT)
+    return box, voxel_id, _known(base, voxel_id, np.empty(0, np.int32), REPORT)
 
 
 def encode_tiles(entries: Sequence[tuple[int, int]]) -> bytes:

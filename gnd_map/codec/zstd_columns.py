@@ -150,7 +150,7 @@ def _planes(columns: Sequence[npt.NDArray[np.generic]], widths: Sequence[int]) -
     """Byte planes of columns (N,) of integers that fit their widths, or of float32."""
     pairs = zip(columns, widths, strict=True)
     narrow = (np.ascontiguousarray(c if c.dtype == np.float32 else c.astype(f"<i{w}")) for c, w in pairs)
-    return b"".join(c.view(np.uint8).reshape(len(c), -1).T.tobytes() for c in narrow)
+    return b"".join(c.view(np.uint8).reshape(len(c), c.itemsize).T.tobytes() for c in narrow)
 
 
 def _columns(n: int, planes: bytes, widths: Sequence[int]) -> list[npt.NDArray[np.unsignedinteger]]:
