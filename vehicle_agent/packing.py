@@ -60,7 +60,7 @@ def pack(report: ChangeReport, bases: Bases, track: Track) -> PackedReport:
 def pack_measured(report: ChangeReport, bases: Bases, wanted: bytes) -> PackedGaussians:
     """The second half of `report`: the Gaussians that the ack's mask `wanted` asks for.
 
-    The mask runs over `askable(report)`. Gaussians must lie on the lattice "compact".
+    The mask runs over `askable(report)`. Gaussians must lie on the lattice "report".
 
     Raises:
         PackingError: a base is missing.

@@ -10,7 +10,7 @@ import numpy as np
 
 from gnd_map.arrays import F64
 from gnd_map.classes import ChangeClass
-from gnd_map.codec import LATTICES, snap
+from gnd_map.codec import REPORT, snap
 from gnd_map.errors import GndError
 from gnd_map.tile import Tile
 from gnd_map.tile_id import District, TileId
@@ -190,5 +190,5 @@ class Reporter:
 
 
 def on_lattice(change: TileChange) -> TileChange:
-    """The change with its new Gaussians on the lattice "compact"."""
-    return replace(change, changed=snap(change.changed, LATTICES["compact"]))
+    """The change with its new Gaussians on the lattice "report"."""
+    return replace(change, changed=snap(change.changed, REPORT))

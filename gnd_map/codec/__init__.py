@@ -1,7 +1,7 @@
 """Encodings of Gaussians: of whole tiles, of deltas, of what vehicles report. A codec id never changes its meaning."""
 
 from gnd_map.codec.floats import CODEC_FLOAT32, MAX_BODY_BYTES, MAX_VOXELS, decode_gaussians, encode_gaussians
-from gnd_map.codec.lattice import LATTICES, Lattice, is_on, snap
+from gnd_map.codec.lattice import LATTICES, REPORT, Lattice, is_on, snap
 from gnd_map.codec.patch import (
     Flags,
     decode_delta,
@@ -45,6 +45,7 @@ __all__ = [
     "MAX_BODY_BYTES",
     "MAX_VOXELS",
     "PREFERRED",
+    "REPORT",
     "Codec",
     "Flags",
     "Lattice",

@@ -87,7 +87,10 @@ def _levels(first_m: float, ratio: float) -> tuple[int, ...]:
 ARCHIVE: Final = Lattice("archive", 0, _levels(0.002, 1.15), 1, 3, 3, 3, 4)
 STANDARD: Final = Lattice("standard", 1, _levels(0.004, 1.2), 2, 2, 1, 2, 3)
 COMPACT: Final = Lattice("compact", 2, _levels(0.004, 1.3), 2, 1, 0, 1, 3)
+REPORT: Final = Lattice("report", 3, _levels(0.004, 1.3), 2, 1, 0, 1, 1)
+"""For what one vehicle measured, which the merger averages: half of a standard deviation does."""
 LATTICES: Final[Mapping[str, Lattice]] = MappingProxyType({x.name: x for x in (ARCHIVE, STANDARD, COMPACT)})
+"""Of maps."""
 
 
 def lattice_with(code: int) -> Lattice:

@@ -7,7 +7,7 @@ import numpy as np
 from merger_world import GROUND, TILE, WALL, State, change_of, gaussians_of, report_of
 
 from gnd_map.classes import ChangeClass
-from gnd_map.codec import LATTICES, snap
+from gnd_map.codec import LATTICES, REPORT, snap
 from gnd_map.gaussian import Gaussians
 from gnd_map.tile import Tile, content_sha
 from gnd_map.tile_id import TileId
@@ -38,7 +38,7 @@ def flagged(
     new, modified = new or {}, modified or {}
     states: dict[int, State | None] = {**new, **modified, **dict.fromkeys(deleted)}
     classes = dict.fromkeys(new, ChangeClass.NEW) | dict.fromkeys(modified, ChangeClass.MODIFIED)
-    changed = snap(gaussians_of(states), LATTICES["compact"])
+    changed = snap(gaussians_of(states), REPORT)
     change = change_of(base, sorted({*observed, *states}), changed, tile=tile, version=version)
     kinds = [classes.get(int(voxel), ChangeClass.DELETED) for voxel in changed.voxel_id]
     return dataclasses.replace(change, change_class=np.array(kinds, np.uint8))

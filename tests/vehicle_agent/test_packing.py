@@ -8,7 +8,7 @@ import pytest
 from vehicle_scene import GRID_FRAME, SENSOR, ground, look, tiles_of, wall
 
 from gnd_map.classes import ChangeClass
-from gnd_map.codec import LATTICES, decode_flags, decode_measured, encode_mask, is_on, snap
+from gnd_map.codec import LATTICES, REPORT, decode_flags, decode_measured, encode_mask, is_on, snap
 from gnd_map.errors import GndError
 from gnd_map.gaussian import Gaussians
 from gnd_map.tile import Tile
@@ -94,7 +94,7 @@ def test_a_reporter_puts_the_short_form_beside_the_whole_one(
 def test_every_gaussian_that_a_report_holds_can_travel_in_short(report: ChangeReport) -> None:
     found = [change.changed.take(is_measured(change)) for change in report.tiles]
     assert sum(map(len, found)) == askable(report) > 20
-    assert all(is_on(gaussians, LATTICES["compact"]) for gaussians in found)
+    assert all(is_on(gaussians, REPORT) for gaussians in found)
 
 
 def test_the_outbox_has_what_the_second_half_needs(

@@ -17,7 +17,7 @@ from fleet_bus.bus import Bus
 from fleet_bus.errors import Refused
 from fleet_bus.serving import Request
 from gnd_map.classes import ChangeClass
-from gnd_map.codec import LATTICES, decode_measured, encode_mask, snap
+from gnd_map.codec import LATTICES, REPORT, decode_measured, encode_mask, snap
 from gnd_map.gaussian import Gaussians
 from gnd_map.tile import Tile
 from gnd_map.track import Piece, Track, View
@@ -48,7 +48,7 @@ def report(tile: Tile) -> ChangeReport:
     ids = tile.gaussians.voxel_id[::10]
     moved = tile.gaussians.take(np.arange(len(tile.gaussians))[1::10][: len(ids)])
     n = len(moved)
-    changed = snap(Gaussians(ids[:n], moved.count, moved.cells, moved.mean_m, moved.cov_m2), LATTICES["compact"])
+    changed = snap(Gaussians(ids[:n], moved.count, moved.cells, moved.mean_m, moved.cov_m2), REPORT)
     change = TileChange(
         tile=tile.tile_id,
         base_version=tile.version,
