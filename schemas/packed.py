@@ -131,6 +131,14 @@ class PackedReport:
         message = change_report_pb2.ChangeReport(major=MAJOR, packed=packed)
         return serialise(message, limits.MAX_PACKED_REPORT_BYTES)
 
+    @classmethod
+    def decode(cls, data: bytes) -> "PackedReport":
+        """The value in `data`; `SchemaError` when it is none."""
+        upload = decode_upload(data)
+        if not isinstance(upload, cls):
+            raise BadValue(f"{len(data)} bytes are no first half of a report but a {type(upload).__name__}")
+        return upload
+
 
 @dataclass(frozen=True, slots=True)
 class PackedGaussians:
@@ -154,6 +162,14 @@ class PackedGaussians:
         )
         message = change_report_pb2.ChangeReport(major=MAJOR, gaussians=gaussians)
         return serialise(message, limits.MAX_PACKED_GAUSSIANS_BYTES)
+
+    @classmethod
+    def decode(cls, data: bytes) -> "PackedGaussians":
+        """The value in `data`; `SchemaError` when it is none."""
+        upload = decode_upload(data)
+        if not isinstance(upload, cls):
+            raise BadValue(f"{len(data)} bytes are no second half of a report but a {type(upload).__name__}")
+        return upload
 
 
 def crc_of(wanted: bytes) -> int:
