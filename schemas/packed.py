@@ -34,6 +34,7 @@ from schemas.wire import (
 )
 
 DIGEST_BYTES: Final = 8
+_FORMS: Final = {"packed": "PackedReport", "gaussians": "PackedGaussians"}
 _ULID_BYTES: Final = 16
 _SIGMA_BITS: Final = 32
 _INDEX_BITS: Final = 10
@@ -187,17 +188,17 @@ def decode_upload(data: bytes) -> ChangeReport | PackedReport | PackedGaussians:
     message = parse(
         change_report_pb2.ChangeReport, data, limits.MAX_CHANGE_REPORT_BYTES, max_fields=limits.MAX_REPORT_FIELDS
     )
-    forms = [name for name in ("packed", "gaussians") if message.HasField(name)]
+    forms = [name for name in _FORMS if message.HasField(name)]  # type: ignore[arg-type]
     if not forms:
         return ChangeReport.decode(data)
-    check_major(message, "ChangeReport")
+    check_major(message, _FORMS[forms[0]])
     others = sorted(field.name for field, _ in message.ListFields() if field.name not in ("major", forms[0]))
     if others:
         raise BadValue(f"ChangeReport holds {forms[0]} and also {', '.join(others)}: one report in one form")
     if forms[0] == "packed":
-        _check_size("PackedReport", data, limits.MAX_PACKED_REPORT_BYTES)
+        _check_size(_FORMS[forms[0]], data, limits.MAX_PACKED_REPORT_BYTES)
         return _packed_report(message.packed)
-    _check_size("PackedGaussians", data, limits.MAX_PACKED_GAUSSIANS_BYTES)
+    _check_size(_FORMS[forms[0]], data, limits.MAX_PACKED_GAUSSIANS_BYTES)
     return _packed_gaussians(message.gaussians)
 
 

@@ -15,6 +15,7 @@ from gnd_map.gaussian import Gaussians
 from gnd_map.tile import Tile, TileDelta
 from gnd_map.tile_id import TileId
 from schemas.changes import ChangeAck, ChangeReport, TileChange
+from schemas.packed import PackedGaussians
 from schemas.report_id import deterministic_report_id
 from schemas.tiles import Catalog, CatalogEntry, CodedDelta, TileBlob, TileReply, TileRequest, blob_of
 from schemas.tiles_batch import TileAnswer, TilesReply, TilesRequest
@@ -153,6 +154,9 @@ GOLDEN: dict[str, Any] = {
     "ChangeAck-stored": ChangeAck(REPORT_ID, "stored"),
     "ChangeAck-duplicate": ChangeAck(REPORT_ID, "duplicate"),
     "ChangeAck-quarantined-without_id": ChangeAck("", "quarantined", "TileChange: 3 covariances are not positive"),
+    "ChangeAck-wanted": ChangeAck(REPORT_ID, "wanted", wanted=b"not looked into"),
+    "ChangeAck-resend": ChangeAck(REPORT_ID, "resend", "tile 13033/03021/23031/22102 has no version 9 here"),
+    "PackedGaussians-some": PackedGaussians(REPORT_ID, b"not looked into", 0xDEADBEEF),
     "TileUpdate-merged-delta": update(),
     "TileUpdate-merged-coded_delta": update(delta=None, coded_delta=b"not looked into", put_voxels=2, removed_voxels=2),
     "TileUpdate-base-new_tile": update(version=1, previous_version=0, previous_sha=b"", reason="base", delta=None),
@@ -174,6 +178,7 @@ KINDS: dict[str, Any] = {
         Catalog,
         ChangeReport,
         ChangeAck,
+        PackedGaussians,
         TileUpdate,
         TrafficSample,
     )
