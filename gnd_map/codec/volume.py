@@ -84,6 +84,8 @@ def code_box(coder: Coder, tile_id: TileId, held: I32, flagged: I32 | None) -> B
     if len(held):
         below = coder.number(number_at(1), max(low - lo, 0))
         above = coder.number(number_at(2), max(hi - high, 0))
+        if below < 0 or above < 0:
+            raise CodecError(f"floors {low - below} .. {high + above} leave out those held, {low} .. {high}")
         lo, hi = low - below, high + above
     else:
         lo = coder.number(number_at(0), lo)
