@@ -38,7 +38,7 @@ from vehicle_agent.updates import Updates
 
 NEVER = threading.Event()
 PARAMETERS = DownloadParameters(near_m=30.0, ahead_m=60.0, forget_m=60.0, retry_s=0.1)
-THIN = LinkProfile("thin", down_bit_s=1.6e5, up_bit_s=1.6e5, delay_ms=5.0, burst_bytes=0)
+THIN = LinkProfile("thin", down_bit_s=2.2e5, up_bit_s=2.2e5, delay_ms=5.0, burst_bytes=0)
 
 
 @pytest.fixture(scope="module")
@@ -191,7 +191,7 @@ from vehicle_agent.config import DownloadParameters
 from vehicle_agent.download import TileFetcher
 
 folder, tiles = Path(sys.argv[2]), [TileId(int(morton)) for morton in sys.argv[3:]]
-thin = LinkProfile("thin", down_bit_s=1.6e5, up_bit_s=1.6e5, delay_ms=5.0, burst_bytes=0)
+thin = LinkProfile("thin", down_bit_s=2.2e5, up_bit_s=2.2e5, delay_ms=5.0, burst_bytes=0)
 with open_bus(BusConfig(connect=(sys.argv[1],), link=thin), Ledger("vehicle", folder / "killed.jsonl")) as bus:
     fetcher = TileFetcher(bus, TileCache(folder / "cache.sqlite"), DownloadParameters())
     fetcher.want(tiles)

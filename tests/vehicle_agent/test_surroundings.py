@@ -2,6 +2,7 @@
 
 import threading
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -9,12 +10,18 @@ import pytest
 from vehicle_scene import FRAME, GRID_FRAME, HEIGHT_M, SENSOR, ground, look, tiles_of
 from waiting import wait_until
 
-from fleet_bus.bus import Bus
+from fleet_bus.bus import Bus, open_bus
+from fleet_bus.config import BusConfig
+from fleet_bus.ledger import Ledger
+from fleet_bus.links import LinkProfile
+from fleet_bus.serving import Request
 from gnd_map.geodesy import LocalFrame
 from gnd_map.grid import VoxelGrid
 from gnd_map.tile import Tile
 from gnd_map.tile_id import TileId
 from schemas.drive import GnssFix
+from schemas.keys import batch_keys, parse_batch_key
+from schemas.tiles_batch import TileAnswer, TilesReply, TilesRequest
 from tile_store.server import TileServer
 from tile_store.sqlite_store import SqliteStore
 from vehicle_agent.cache import TileCache
@@ -35,7 +42,8 @@ def at(east_m: float, north_m: float = 0.0) -> Place:
 
 
 class Scene:
-    def __init__(self, cloud: Bus, bus: Bus, folder: Path) -> None:
+    def __init__(self, cloud: Bus, bus: Bus, ledger: Ledger, folder: Path) -> None:
+        self.ledger = ledger
         self.tiles = tiles_of(ground(20.0))
         self.store = SqliteStore(folder / "store.sqlite")
         self.store.put_tiles(list(self.tiles.values()))
@@ -47,10 +55,11 @@ class Scene:
 
 
 @pytest.fixture
-def scene(cloud: Bus, bus: Bus, tmp_path: Path) -> Iterator[Scene]:
-    opened = Scene(cloud, bus, tmp_path)
-    yield opened
-    bus.close()
+def scene(cloud: Bus, endpoint: str, tmp_path: Path) -> Iterator[Scene]:
+    ledger = Ledger("vehicle")
+    with open_bus(BusConfig(connect=(endpoint,)), ledger, "vehicle") as bus:
+        opened = Scene(cloud, bus, ledger, tmp_path)
+        yield opened
     opened.fetcher.close()
     opened.server.close()
     opened.store.close()
@@ -72,6 +81,61 @@ def test_the_way_ahead_is_asked_for_in_advance(scene: Scene) -> None:
     assert north in scene.surroundings.wanted
     assert tile_distance_m(FRAME, north, place.position_map_m) > PARAMETERS.near_m
     wait_until(lambda: scene.fetcher.wait_for([north], 0.1, NEVER) == set())
+
+
+def test_a_fast_vehicle_looks_farther_and_one_in_reverse_gear_back(scene: Scene) -> None:
+    place = at(0.0)
+    place.heading_rad = 0.0
+    ahead = {}
+    for speed_mps in (0.0, 30.0, -30.0):
+        place.speed_mps = speed_mps
+        scene.surroundings.look_ahead(place)
+        east_m = [FRAME.enu_from_geodetic(*t.centre_rad, 0.0)[..., 0].item() for t in scene.surroundings.wanted]
+        ahead[speed_mps] = (min(east_m), max(east_m))
+    assert ahead[0.0][1] == pytest.approx(PARAMETERS.ahead_m + PARAMETERS.near_m, abs=40.0)
+    assert ahead[30.0][1] == pytest.approx(30.0 * PARAMETERS.ahead_s + PARAMETERS.near_m, abs=40.0)
+    assert ahead[-30.0][0] == pytest.approx(-30.0 * PARAMETERS.ahead_s - PARAMETERS.near_m, abs=40.0)
+
+
+def test_what_is_ahead_is_asked_for_together(scene: Scene) -> None:
+    place = at(-60.0)
+    place.heading_rad, place.speed_mps = 0.0, 10.0
+    for east_m in range(-60, 61):
+        place.position_map_m = at(float(east_m)).position_map_m
+        scene.surroundings.follow(place, NEVER, wait=True)
+    ledger = scene.ledger.totals()
+    (asked,) = [line.messages for line in ledger if (line.kind, line.direction) == ("tile", "up")]
+    assert asked <= 2 + 120.0 / (10.0 * (PARAMETERS.ahead_s - PARAMETERS.lead_s)) * 2  # twice that: two districts
+
+
+@pytest.mark.parametrize(("rate_bit_s", "all_of_them"), [(1e6, True), (3e4, False)])
+def test_a_paced_drive_asks_for_what_its_link_brings_in_time(
+    endpoint: str, cloud: Bus, tmp_path: Path, rate_bit_s: float, all_of_them: bool
+) -> None:
+    link = LinkProfile("slow", down_bit_s=rate_bit_s, up_bit_s=1e6, delay_ms=20.0)
+    with open_bus(BusConfig(connect=(endpoint,), link=link)) as bus:
+        fetcher = TileFetcher(bus, TileCache(tmp_path / "cache.sqlite"), replace(PARAMETERS, in_flight=1))
+        local_map = LocalMap(GRID_FRAME)
+        surroundings = Surroundings(local_map, fetcher, ChangeDetector(local_map), PARAMETERS)
+        asked: list[TileId] = []
+
+        def answer(request: Request) -> bytes:
+            wanted = TilesRequest.decode(request.payload)
+            asked.extend(wanted.tiles(parse_batch_key(request.key)[1]))
+            return TilesReply((TileAnswer("absent"),) * len(wanted.wanted)).encode()
+
+        cloud.serve(batch_keys(), answer)
+        place = at(0.0)
+        place.heading_rad, place.speed_mps = 0.0, 20.0
+        surroundings.follow(place, NEVER, wait=False)
+        here = TileId.from_geodetic(*place.geodetic)
+        wait_until(lambda: here in asked and fetcher.wait_for(asked, 0.1, NEVER) == set())
+        if all_of_them:
+            wait_until(lambda: set(asked) == set(surroundings.wanted))
+        else:
+            assert 1 <= len(asked) < len(surroundings.wanted)
+        bus.close()
+        fetcher.close()
 
 
 def test_tiles_far_behind_are_let_go_unless_there_is_evidence_about_them(scene: Scene) -> None:

@@ -137,6 +137,32 @@ def test_a_tile_that_the_store_had_not_is_fetched_when_it_appears(world: World) 
     wait_until(lambda: world.cache.head(new_id)[0] == 1)
 
 
+def test_a_tile_that_is_not_wanted_any_more_is_not_fetched_for_a_notice(world: World) -> None:
+    download(world)
+    world.fetcher.want([])
+    world.next_version(cut=5)
+    world.announce(world.next_version(cut=9))  # the version between is missing, so the delta does not fit
+    assert not world.fetcher.is_known(world.tile_id)
+    assert cached(world) == 1
+    download(world)
+    wait_until(lambda: cached(world) == 3)
+
+
+def test_districts_that_are_left_are_no_longer_listened_to(world: World) -> None:
+    other = TileId(world.tile_id.morton + 1024)
+    world.updates.follow([other])
+    update = world.next_version(cut=5)
+
+    def heard_of_the_other() -> bool:
+        world.cloud.publish(update_key("ndt", world.tile_id), update.encode(), kind="update")
+        world.cloud.publish(update_key("ndt", other), b"a sign", kind="update")
+        world.updates.apply()
+        return world.updates.counts["refused"] > 0
+
+    wait_until(heard_of_the_other)
+    assert world.updates.counts["received"] == 0
+
+
 def test_rubbish_is_counted_and_left_out(world: World) -> None:
     def again() -> bool:
         world.cloud.publish(update_key("ndt", world.tile_id), b"\xff\xff rubbish", kind="update")
