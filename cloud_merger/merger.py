@@ -13,6 +13,7 @@ from cloud_merger.work import Worker
 from fleet_bus.bus import open_bus
 from fleet_bus.config import BusConfig
 from tile_store.sqlite_store import SqliteStore
+from tile_store.warm import warm_up
 
 __all__ = ["ShardConfig", "run_shard"]
 _LOG = logging.getLogger(__name__)
@@ -27,6 +28,7 @@ def run_shard(config: ShardConfig, stop: threading.Event) -> None:
         StoreError: the store cannot be opened or has failed.
         NoRouter: no router answers at the start.
     """
+    warm_up()  # or the first tile would wait for the codecs' kernels, and its lease with it
     bus_config = BusConfig(connect=config.connect, lease_ms=config.bus_lease_ms)
     with (
         SqliteStore(config.store_path, config.store, create=False) as store,

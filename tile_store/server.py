@@ -16,6 +16,7 @@ from schemas.tiles_batch import TilesRequest
 from tile_store.answers import Answers
 from tile_store.regions import Region
 from tile_store.store import Store
+from tile_store.warm import warm_up
 
 _ANY: Final = "x/**"
 # Only `schemas.keys` knows how a key begins.
@@ -45,7 +46,8 @@ class TileServer:
         self.close()
 
     def start(self) -> Self:
-        """Begin to answer."""
+        """Begin to answer, once the kernels of the codecs are ready."""
+        warm_up()
         for keyexpr, handler, kind in (
             (f"{TILE_ROOT}**", self.tiles, "tile"),
             (keys.batch_keys(), self.batch, "tile"),
