@@ -15,6 +15,7 @@ _COMMANDS: Final[dict[str, tuple[str, str]]] = {
         "benchmarks.localisation_study.command:localisation",
         "Localisation in a changed world, before and after the map update.",
     ),
+    "traffic": ("benchmarks.traffic_study.command:traffic", "What a map and its changes weigh on the way (Figure 23)."),
     "errors": ("benchmarks.simulation.errors_command:errors", "Which voxels of a simulation cost F1, and why."),
     "real-localisation": (
         "benchmarks.real_localisation.command:real_localisation",

@@ -1,0 +1,99 @@
+"""The cloud in this process: the store, ingest and merges as in a merger, reached by a call instead of a bus."""
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from types import TracebackType
+from typing import Final, Self
+
+from benchmarks.simulation.base_map import BaseMap
+from benchmarks.traffic_study.errors import TrafficError
+from cloud_merger.config import ShardConfig
+from cloud_merger.ingest import Ingest
+from cloud_merger.merge import MergeParameters
+from cloud_merger.short_reports import ShortReports
+from cloud_merger.work import Worker
+from gnd_map.tile import Tile
+from tile_store.sqlite_store import SqliteStore
+from tile_store.values import DEFAULT_LAYER, StoreConfig
+
+_OWNER: Final = "traffic-study"
+_LEASE_S: Final = 3600.0
+_AT_ONCE: Final = 64
+
+
+@dataclass(frozen=True, slots=True)
+class Message:
+    """One request of a vehicle and its answer."""
+
+    key: str
+    request: bytes
+    reply: bytes
+
+
+class Cloud:
+    """One merger and its store.
+
+    Args:
+        path: of the store; an older one there is removed.
+        base: the map that it begins with.
+        merge: how statements become changes.
+    """
+
+    def __init__(self, path: Path, base: BaseMap, merge: MergeParameters) -> None:
+        for old in path.parent.glob(f"{path.name}*"):
+            old.unlink()
+        config = ShardConfig(store_path=path, merge=merge, store=StoreConfig(merge_delay_s=0.0))
+        self.store = SqliteStore(path, config.store)
+        self.store.put_tiles(Tile(tile, 1, gaussians) for tile, gaussians in base.tiles.items())
+        short = ShortReports(self.store, config.merge, config.want, config.waiting)
+        self._ingest = Ingest(self.store, config.ingest, short=short)
+        self._worker = Worker(self.store, config)
+        self._messages: list[Message] = []
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.store.close()
+
+    def request(self, key: str, payload: bytes, **_how: object) -> bytes:
+        """Answer a vehicle as a merger does; in place of `fleet_bus.Bus.request`."""
+        reply = self._ingest.answer(key, payload).encode()
+        self._messages.append(Message(key, payload, reply))
+        return reply
+
+    def heard(self) -> list[Message]:
+        """Return the messages since the last call."""
+        messages, self._messages = self._messages, []
+        return messages
+
+    def merge(self) -> int:
+        """Merge everything that has been reported; return how many tiles got a new version.
+
+        Raises:
+            TrafficError: a tile could not be merged, or a report was refused.
+        """
+        published = 0
+        while claims := self.store.claim(_OWNER, _AT_ONCE, _LEASE_S):
+            publications = self._worker.merge(claims)
+            if len(publications) != len(claims):
+                raise TrafficError(f"{len(claims) - len(publications)} of {len(claims)} tiles could not be merged")
+            published += sum(result.status == "published" for result in self.store.publish(publications))
+        bad = self.store.quarantined()
+        if bad:
+            raise TrafficError(f"{len(bad)} reports were refused, the first: {bad[0].reason}")
+        return published
+
+    def map(self) -> BaseMap:
+        """Return the newest version of every tile."""
+        tiles = {tile.tile_id: tile for tile in self._heads()}
+        return BaseMap({i: t.gaussians for i, t in tiles.items()}, {i: t.version for i, t in tiles.items()})
+
+    def _heads(self) -> Iterator[Tile]:
+        for entry in self.store.heads(DEFAULT_LAYER):
+            stored = self.store.get(DEFAULT_LAYER, entry.tile)
+            if stored is not None:
+                yield stored.decode()

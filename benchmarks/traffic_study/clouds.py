@@ -1,0 +1,93 @@
+"""The same street as a point cloud: PCD plain and compressed, LAZ, Draco; one point each 0.2 m."""
+
+import io
+from collections.abc import Callable, Collection, Mapping
+from importlib import import_module
+from typing import Any, Final
+
+import numpy as np
+
+from benchmarks.pcd.points import PcdMap, base_pcd
+from benchmarks.traffic_study.errors import TrafficError
+from benchmarks.traffic_study.pcd_file import pcd_binary, pcd_compressed
+from fleet_sim.world import World
+from gnd_map.arrays import F32, I64
+from gnd_map.tile_id import TileId, morton_of
+
+LEAVES: Final = 5
+"""Leaves of the voxel-grid filter along each side of a voxel: 0.2 m."""
+LAZ_STEP_M: Final = 0.01
+DRACO_BITS: Final = 12
+"""Of each coordinate within a tile of 38 m: steps of 1 cm."""
+
+
+def street_cloud(world: World) -> PcdMap:
+    """The cloud of the state before from the dense scan that the map's Gaussians come from, one point each 0.2 m."""
+    return base_pcd(world, leaves=LEAVES)
+
+
+def points_by_tile(cloud: PcdMap, tiles: Collection[TileId]) -> dict[TileId, F32]:
+    """The points (N, 3) that lie in each of `tiles`; the others are left out."""
+    lat_rad, lon_rad, _ = cloud.frame.geodetic_from_enu(cloud.points_m.astype(np.float64))
+    tile: I64 = morton_of(lat_rad, lon_rad)
+    return {one: cloud.points_m[tile == one.morton] for one in sorted(tiles)}
+
+
+Written = int | str
+"""A size in bytes, or why there is none."""
+
+
+def cloud_sizes(points: Mapping[TileId, F32]) -> dict[str, Written]:
+    """Bytes of the cloud in each format; Draco tile by tile (its steps are a share of the extent), the others as one
+    file, in which points lie sorted along the street's grid.
+    """
+    whole = np.concatenate([*points.values(), np.empty((0, 3), np.float32)])
+    return {
+        "pcd": len(pcd_binary(whole)),
+        "pcd_compressed": len(pcd_compressed(whole)),
+        "laz": _or_why(lambda: len(laz(whole))),
+        "draco": _or_why(lambda: sum(len(draco(one)) for one in points.values() if len(one))),
+    }
+
+
+def laz(points_m: F32) -> bytes:
+    """A LAZ file of points (N, 3), coordinates in steps of 1 cm (laspy with lazrs, point format 0).
+
+    Raises:
+        TrafficError: the libraries are not installed.
+    """
+    laspy = _library("laspy")
+    _library("lazrs")
+    header = laspy.LasHeader(point_format=0, version="1.2")
+    header.scales, header.offsets = np.full(3, LAZ_STEP_M), np.zeros(3)
+    file = laspy.LasData(header)
+    file.x, file.y, file.z = points_m.astype(np.float64).T
+    out = io.BytesIO()
+    file.write(out, do_compress=True, laz_backend=laspy.LazBackend.Lazrs)
+    return out.getvalue()
+
+
+def draco(points_m: F32) -> bytes:
+    """A Draco point cloud of points (N, 3), 12 bits a coordinate, highest compression, order not kept.
+
+    Raises:
+        TrafficError: the library is not installed.
+    """
+    body: bytes = _library("DracoPy").encode(
+        points_m, quantization_bits=DRACO_BITS, compression_level=10, preserve_order=False
+    )
+    return body
+
+
+def _or_why(write: Callable[[], int]) -> Written:
+    try:
+        return write()
+    except TrafficError as error:
+        return str(error)
+
+
+def _library(name: str) -> Any:
+    try:
+        return import_module(name)
+    except ImportError as error:
+        raise TrafficError(f"needs {name}: pip install 'gnd-fleet[benchmarks]'") from error
