@@ -16,6 +16,7 @@ from gnd_map.errors import CodecError, GndError
 from gnd_map.gaussian import Gaussians
 from gnd_map.tile_id import District, TileId
 from schemas.errors import SchemaError
+from schemas.limits import MAX_TILE_BODY_BYTES
 from schemas.tiles import CatalogEntry, CodedDelta, TileBlob, TileReply, TileRequest
 from schemas.tiles_batch import HASH_BYTES, TileAnswer, TilesReply, TilesRequest, digest_of, index_of
 from tile_store.memory import Memory
@@ -131,8 +132,8 @@ class Answers:
     # What is sent
 
     def _sent(self, stored: StoredTile, held: StoredTile | None, codecs: Sequence[int]) -> _Sent:
-        # Floats have no short delta (gnd_map.codec.encode_delta).
-        if held is not None and lattice_of(stored.codec_id) is not None and reads_like(stored.codec_id, codecs):
+        # A delta is coded like the body in the store; floats have no short one (gnd_map.codec.encode_delta).
+        if held is not None and lattice_of(stored.codec_id) is not None and stored.codec_id in codecs:
             body = self._delta(held, stored)
             if body is not None and len(body) < len(stored.body):
                 return _Sent("delta", 0, body)
@@ -156,7 +157,13 @@ class Answers:
             return codec_id, stored.body
         encode = codec_of(codec_id).encode
         key = (stored.tile, stored.sha, codec_id)
-        return codec_id, self._encoded.get(key, lambda: encode(stored.tile, self._gaussians(stored)))
+        body = self._encoded.get(key, lambda: encode(stored.tile, self._gaussians(stored)))
+        if len(body) > MAX_TILE_BODY_BYTES:
+            raise Refused(
+                f"tile {stored.tile.path} has {len(body)} bytes in codec {codec_id}, a message holds"
+                f" {MAX_TILE_BODY_BYTES}; it comes in codec {stored.codec_id}"
+            )
+        return codec_id, body
 
     def _codec_for(self, stored: StoredTile, codecs: Sequence[int]) -> int:
         """The first codec of the client that can express the version.
@@ -181,11 +188,6 @@ class Answers:
 def same_lattice(one: int, other: int) -> bool:
     """Whether two known codecs write the same lattice (or both floats)."""
     return lattice_of(one) is lattice_of(other)
-
-
-def reads_like(codec_id: int, codecs: Sequence[int]) -> bool:
-    """Whether a client that reads `codecs` can use deltas of content in this codec."""
-    return any(same_lattice(codec_id, one) for one in codecs if one in CODECS)
 
 
 def _nearest_first(tiles: Sequence[TileId], district: District, near: int | None) -> list[TileId]:

@@ -25,7 +25,7 @@ from gnd_map.tile_id import TileId
 from schemas.errors import WrongHash
 from schemas.tiles import TileRequest, tile_after, tile_of
 from schemas.tiles_batch import HeldTile, TileAnswer, TilesReply, TilesRequest, tile_of_answer
-from tile_store.answers import Answers, reads_like, same_lattice
+from tile_store.answers import Answers, same_lattice
 from tile_store.memory import Memory
 from tile_store.sqlite_store import SqliteStore
 from tile_store.values import StoredTile
@@ -105,6 +105,7 @@ def test_who_cannot_read_deltas_gets_the_whole_tile(store: SqliteStore) -> None:
     for request in (
         TileRequest(1, old.sha, deltas=False),
         TileRequest(1, old.sha, codecs=(CODEC_FLOAT32,)),  # it does not know lattices
+        TileRequest(1, old.sha, codecs=(CODEC_STANDARD_ZSTD,)),  # nor the range coder
     ):
         assert answers.one(head, request).status == "blob"
 
@@ -152,6 +153,17 @@ def test_an_old_store_with_plain_columns_is_served_to_old_clients_and_new(store:
     assert len(small.body) < len(head.body)
     assert answers.one(head, TileRequest(1, old.sha)).blob == small
     assert answers.one(head, TileRequest(2, new.sha)).status == "unchanged"
+
+
+def test_a_tile_too_large_for_a_message_in_the_clients_codec_is_refused(
+    store: SqliteStore, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    put(store, street(TILE, 1))
+    monkeypatch.setattr("tile_store.answers.MAX_TILE_BODY_BYTES", 10_000)
+    answers, head = Answers(store), store.get("ndt", TILE)
+    with pytest.raises(Refused, match=r"has 14404 bytes in codec 0, a message holds 10000; it comes in codec 3"):
+        answers.one(head, TileRequest(codecs=(CODEC_FLOAT32,)))
+    assert answers.one(head, TileRequest()).blob is not None
 
 
 def test_a_delta_as_large_as_the_tile_is_not_sent(store: SqliteStore) -> None:
@@ -311,5 +323,3 @@ def test_lattices_of_codecs() -> None:
     assert same_lattice(CODEC_STANDARD, CODEC_STANDARD_ZSTD)
     assert same_lattice(CODEC_FLOAT32, CODEC_FLOAT32_ZSTD)
     assert not same_lattice(CODEC_STANDARD, CODEC_FLOAT32)
-    assert reads_like(CODEC_STANDARD, (99, 7, 6))
-    assert not reads_like(CODEC_STANDARD, (99, 7, 0))
