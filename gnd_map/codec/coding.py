@@ -19,9 +19,10 @@ State = tuple[I64, npt.NDArray[np.uint8], I32, I32, I64]
 
 @dataclass(slots=True)
 class Coder:
-    """One stream, being written or read. `state` is what the kernels take."""
+    """One stream, being written or read. `state` is what the kernels take; `volume`: voxels of its boxes so far."""
 
     state: State
+    volume: int = 0
 
     @classmethod
     def writing(cls, priors: Priors, room: int) -> "Coder":

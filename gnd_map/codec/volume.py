@@ -19,6 +19,10 @@ from gnd_map.tile_id import TileId
 U8 = npt.NDArray[np.uint8]
 MAX_VOLUME: Final = 1 << 22
 """Voxels of the box around a tile's Gaussians: 2,700 floors of 39 x 39."""
+MAX_MESSAGE_VOLUME: Final = 1 << 26
+"""Voxels of all boxes of a message: a district of tiles with 50 floors each, a few seconds."""
+MAX_FLOOR: Final = 100_000
+"""As `VoxelGrid` has it."""
 _ANY: Final = number_at(0) + 69  # a context of its own in the room of the first number
 
 
@@ -40,6 +44,8 @@ class Box:
         size = self.floors * self.grid.nx * self.grid.ny
         if not 0 < size <= MAX_VOLUME:
             raise CodecError(f"a box of {self.floors} floors, {size} voxels: the limit is {MAX_VOLUME}")
+        if max(-self.lowest, self.lowest + self.floors - 1) > MAX_FLOOR:
+            raise CodecError(f"{self.floors} floors from {self.lowest} on: the limit is {MAX_FLOOR} either way")
 
     def empty(self, dtype: type[np.generic], value: int) -> "npt.NDArray[np.generic]":
         """(floors + 4, ny + 4, nx + 4) of one value."""
@@ -90,7 +96,11 @@ def code_box(coder: Coder, tile_id: TileId, held: I32, flagged: I32 | None) -> B
     else:
         lo = coder.number(number_at(0), lo)
         hi = lo + coder.number(number_at(3), hi - lo)
-    return Box(VoxelGrid.of(tile_id), lo, hi - lo + 1)
+    box = Box(VoxelGrid.of(tile_id), lo, hi - lo + 1)
+    coder.volume += box.floors * box.grid.nx * box.grid.ny
+    if coder.volume > MAX_MESSAGE_VOLUME:
+        raise CodecError(f"boxes of {coder.volume} voxels in one message: the limit is {MAX_MESSAGE_VOLUME}")
+    return box
 
 
 def code_flags(coder: Coder, box: Box, held: I32, flag: U8) -> int:
