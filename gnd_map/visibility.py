@@ -45,6 +45,9 @@ class VisibilityParameters:
         new_radius_m: of the ball that stands for a new voxel, whose Gaussian is not at hand.
         min_hits: rays that must end in a voxel in which the map has a Gaussian.
         min_passes: rays that must cross a voxel in which it has none.
+        hits_near: so many times more for each face behind which the drive flags a Gaussian as gone or modified: where
+            something goes on to change, drives often cannot tell, and abstain.
+        passes_near: so many times more for each face behind which it flags something new, for the same reason.
         open_rad: a line that leaves the known map lower than this elevation met something there, as streets go on;
             a higher one went into the sky, and nothing came back.
     """
@@ -57,15 +60,18 @@ class VisibilityParameters:
     noise_m: float = 0.05
     r2: float = 6.0
     new_radius_m: float = 0.4
-    min_hits: float = 5.0
-    min_passes: float = 10.0
+    min_hits: float = 16.0
+    min_passes: float = 128.0
+    hits_near: float = 6.0
+    passes_near: float = 8.0
     open_rad: float = 0.0
 
     def __post_init__(self) -> None:
         for name, low, high in (
             ("step_m", 0.25, 20.0), ("azimuths", SECTORS, 3600), ("levels", 2, 128), ("range_m", 5.0, 100.0),
             ("reach_m", self.range_m, 150.0), ("noise_m", 0.005, 0.5), ("r2", 0.1, 100.0), ("new_radius_m", 0.0, 0.5),
-            ("min_hits", 0.0, 1e6), ("min_passes", 0.0, 1e6), ("open_rad", -1.6, 1.6),
+            ("min_hits", 0.0, 1e6), ("min_passes", 0.0, 1e6), ("hits_near", 1.0, 1e3),
+            ("passes_near", 1.0, 1e3), ("open_rad", -1.6, 1.6),
         ):  # fmt: skip
             if not low <= getattr(self, name) <= high:
                 raise ConfigError(f"visibility: {name} must lie in {low:g} … {high:g}, got {getattr(self, name):g}")
@@ -126,12 +132,26 @@ class _Zone:
         """Tiles with the ids of their voxels that were seen, sorted; a tile may come several times."""
         hits = np.zeros(len(self._g))
         crossed = [self._look(part, hits) for part in self._chunks()]
-        seen = self._g[hits >= self._p.min_hits]
-        yield from self._by_tile(seen)
+        near = self._faces(self._g, (ChangeClass.MODIFIED, ChangeClass.DELETED))
+        yield from self._by_tile(self._g[hits >= self._p.min_hits * self._p.hits_near**near])
         if crossed:
             g, member = np.unique(np.concatenate([g for g, _ in crossed]), axis=0, return_inverse=True)
             passes = np.bincount(member.reshape(-1), weights=np.concatenate([n for _, n in crossed]))
-            yield from self._by_tile(g[passes >= self._p.min_passes])
+            near = self._faces(g, (ChangeClass.NEW,))
+            yield from self._by_tile(g[passes >= self._p.min_passes * self._p.passes_near**near])
+
+    def _faces(self, g: I64, classes: tuple[ChangeClass, ...]) -> F64:
+        """(N,) behind how many of the faces of voxels (N, 3) the drive flags one of the classes."""
+        flagged = [f.voxel_id[np.isin(f.change_class, classes)] for f in self._told]
+        changed = [self._grid(f.tile_id, ids) for f, ids in zip(self._told, flagged, strict=True)]
+        key = self._key(np.concatenate(changed))
+        steps = np.concatenate([np.eye(3, dtype=np.int64), -np.eye(3, dtype=np.int64)])
+        return np.asarray(np.sum([np.isin(self._key(g + step), key) for step in steps], axis=0), np.float64)
+
+    def _key(self, g: I64) -> I64:
+        """One number a voxel (N, 3); the tiles told lie in one district or next to it."""
+        corner = np.array([self._first_lon * self._nx, self._told[0].tile_id.lat_index * self._ny, 0])
+        return np.asarray((g - corner) @ np.array([1 << 42, 1 << 21, 1]), np.int64)
 
     def _grid(self, tile_id: TileId, voxel_id: I32) -> I64:
         """(N, 3) global grid coordinates; along longitude unwrapped about the first tile."""
