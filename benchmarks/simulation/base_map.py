@@ -4,7 +4,7 @@ import hashlib
 import json
 import zipfile
 import zlib
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
@@ -19,6 +19,7 @@ from benchmarks.simulation.poses import FromReference
 from fleet_sim.drives import DriveSimulation
 from fleet_sim.world import State, World
 from gnd_map.accumulate import VoxelAccumulator
+from gnd_map.arrays import F64
 from gnd_map.gaussian import Gaussians
 from gnd_map.grid import GridFrame
 from gnd_map.tile import Tile
@@ -58,17 +59,27 @@ def surveyed(before: Mapping[TileId, Gaussians]) -> BaseMap:
 
 def driven(world: World, state: State = "before") -> BaseMap:
     """Return the map that the mapping vehicle makes: an HDL-32E up and down the empty street, poses exact."""
-    radius_m = world.half_length_m + 2 * _MAX_RANGE_M
-    grid_frame = GridFrame.around(world.frame, covering_circle(world.lat_rad, world.lon_rad, radius_m))
-    accumulator = VoxelAccumulator(grid_frame)
+    accumulator = VoxelAccumulator(_mapping_grid(world))
+    for points_m in mapping_points(world, state):
+        accumulator.add(points_m)
+    return surveyed(accumulator.finish())
+
+
+def mapping_points(world: World, state: State = "before") -> Iterator[F64]:
+    """The points (N, 3) of each scan of the mapping vehicle that go into the map, in the world's map frame."""
+    grid_frame = _mapping_grid(world)
     for config in survey_configs(world.seed):
         simulation = DriveSimulation(world, replace(config, state=state))
         poses = FromReference(simulation.header(), LocalMap(grid_frame), PoseSource("true", 0.0, 0.0), 0)
         for item in simulation.items():
             for scan in poses.push(item):
                 range_m = np.linalg.norm(scan.points_map_m - scan.origins_map_m, axis=1)
-                accumulator.add(scan.points_map_m[(range_m >= _MIN_RANGE_M) & (range_m <= _MAX_RANGE_M)])
-    return surveyed(accumulator.finish())
+                yield scan.points_map_m[(range_m >= _MIN_RANGE_M) & (range_m <= _MAX_RANGE_M)]
+
+
+def _mapping_grid(world: World) -> GridFrame:
+    radius_m = world.half_length_m + 2 * _MAX_RANGE_M
+    return GridFrame.around(world.frame, covering_circle(world.lat_rad, world.lon_rad, radius_m))
 
 
 def write_base(base: BaseMap, path: Path) -> None:

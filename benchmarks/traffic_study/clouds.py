@@ -1,17 +1,19 @@
 """The same street as a point cloud: PCD plain and compressed, LAZ, Draco; one point each 0.2 m."""
 
 import io
-from collections.abc import Callable, Collection, Mapping
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
 from importlib import import_module
 from typing import Any, Final
 
 import numpy as np
 
-from benchmarks.pcd.points import PcdMap, base_pcd
+from benchmarks.pcd.points import PcdMap, base_pcd, downsample
+from benchmarks.simulation.base_map import mapping_points
+from benchmarks.simulation.options import Base
 from benchmarks.traffic_study.errors import TrafficError
 from benchmarks.traffic_study.pcd_file import pcd_binary, pcd_compressed
 from fleet_sim.world import World
-from gnd_map.arrays import F32, I64
+from gnd_map.arrays import F32, F64, I64
 from gnd_map.tile_id import TileId, morton_of
 
 LEAVES: Final = 5
@@ -19,11 +21,27 @@ LEAVES: Final = 5
 LAZ_STEP_M: Final = 0.01
 DRACO_BITS: Final = 12
 """Of each coordinate within a tile of 38 m: steps of 1 cm."""
+_SCANS_AT_ONCE: Final = 100
 
 
-def street_cloud(world: World) -> PcdMap:
-    """The cloud of the state before from the dense scan that the map's Gaussians come from, one point each 0.2 m."""
-    return base_pcd(world, leaves=LEAVES)
+def street_cloud(world: World, base: Base) -> PcdMap:
+    """The cloud of the state before from the points that the map's Gaussians come from, one point each 0.2 m."""
+    if base == "surveyed":
+        return base_pcd(world, leaves=LEAVES)
+    grid_frame = PcdMap(np.empty((0, 3), np.float32), world.frame).grid_frame
+    return PcdMap(downsample(_joined(mapping_points(world)), grid_frame, LEAVES), world.frame)
+
+
+def _joined(scans: Iterable[F64]) -> Iterator[F64]:
+    """The points of many scans at a time."""
+    waiting: list[F64] = []
+    for scan in scans:
+        waiting.append(scan)
+        if len(waiting) == _SCANS_AT_ONCE:
+            yield np.concatenate(waiting)
+            waiting = []
+    if waiting:
+        yield np.concatenate(waiting)
 
 
 def points_by_tile(cloud: PcdMap, tiles: Collection[TileId]) -> dict[TileId, F32]:

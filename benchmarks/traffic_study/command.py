@@ -23,6 +23,7 @@ DEFAULT_OUT = Path("runs/reproduce-traffic")
 @click.option("--sensor", default="vlp16", show_default=True, help="The sensor of all vehicles, as in the paper.")
 @click.option("--traffic/--no-traffic", default=True, show_default=True, help="Moving cars and pedestrians.")
 @click.option("--poses", default="noisy:4cm:0.08deg", show_default=True, help="estimated, true, or noisy:<m>:<deg>.")
+@click.option("--base", type=click.Choice(["surveyed", "driven"]), default="surveyed", show_default=True)
 @click.option("--pcd-drives", default=8, show_default=True, help="The point-cloud baseline runs beside so many drives.")
 @click.option("--f1-drives", default=8, show_default=True, help="F1 after so many drives, also in floats; 0: not.")
 @click.option("--set", "changes", multiple=True, metavar="GROUP.FIELD=VALUE", help="Replace a parameter, repeatable.")
@@ -86,7 +87,7 @@ def options_of(given: dict[str, Any]) -> Any:
     kind, street = street_kind(given["kind"]), street_options(given["kind"], given["length_m"])
     if given["edit_share"] is not None:
         street = dataclasses.replace(street, edit_share=given["edit_share"])
-    same = ("seed", "drives", "at_once", "sensor", "traffic", "pcd_drives", "f1_drives", "scans")
+    same = ("seed", "drives", "at_once", "sensor", "traffic", "base", "pcd_drives", "f1_drives", "scans")
     return TrafficOptions(
         **{name: given[name] for name in same},
         street=street,

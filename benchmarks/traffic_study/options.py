@@ -7,7 +7,7 @@ from typing import Final
 
 from benchmarks.simulation.errors import OptionError
 from benchmarks.simulation.method import MethodParameters
-from benchmarks.simulation.options import RunOptions
+from benchmarks.simulation.options import Base, RunOptions
 from benchmarks.simulation.pose_source import PoseSource
 from fleet_sim.sensors import SHORT_NAMES
 from fleet_sim.street import StreetOptions
@@ -50,6 +50,7 @@ class TrafficOptions:
         sensor: short name; all drives have the same, as in the paper.
         traffic: whether other cars and pedestrians move about.
         poses: where the poses come from.
+        base: how the map before was made; see `benchmarks.simulation.options`.
         pcd_drives: the point-cloud baseline runs beside the first so many drives.
         f1_drives: after so many drives the map is scored, once as it travelled and once in floats; 0: not at all.
         scans: at most so many scans a drive, None for the whole street.
@@ -64,6 +65,7 @@ class TrafficOptions:
     sensor: str = "vlp16"
     traffic: bool = True
     poses: PoseSource = field(default_factory=PoseSource)
+    base: Base = "surveyed"
     pcd_drives: int = 8
     f1_drives: int = 8
     scans: int | None = None
@@ -87,6 +89,7 @@ class TrafficOptions:
             parking=self.parking,
             traffic=self.traffic,
             poses=self.poses,
+            base=self.base,
             method=self.method,
             scans=self.scans,
         )

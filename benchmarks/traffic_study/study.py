@@ -137,7 +137,7 @@ def download(options: TrafficOptions, files: WorldFiles, fleet: FleetOutcome) ->
     returned = _drive(track, link, files.home / "maps.sqlite", published, changed, held=held)
     after = _drive(track, link, files.home / "maps.sqlite", published, fleet.final.tiles, held=held)
     tiles = [tile for tile in fetched_tiles(ours) if tile in base]
-    points = points_by_tile(street_cloud(world), tiles)
+    points = points_by_tile(street_cloud(world, options.base), tiles)
     return DownloadOutcome(
         track=track,
         voxels={tile: len(base[tile]) for tile in tiles},

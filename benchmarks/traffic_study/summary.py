@@ -114,7 +114,11 @@ def _upload(uploads: Sequence[DriveUpload], pcd_drives: int) -> dict[str, Any]:
             "steady": _rate(steady),
             "first_float": round(first.float_bytes / first.km / 1e3, 4),
         },
-        "wire_kB_per_km": {"first": _rate([first], "wire_bytes"), "steady": _rate(steady, "wire_bytes")},
+        "wire_kB_per_km": {
+            "first": _rate([first], "wire_bytes"),
+            "flags_first": _rate(uploads[:FIRST_DRIVES], "wire_bytes"),
+            "steady": _rate(steady, "wire_bytes"),
+        },
         "changed_per_km": _densities(uploads, "changed"),
         "wanted_per_km": _densities(uploads, "wanted"),
         "observed_per_km": _density([first], "observed"),

@@ -9,18 +9,18 @@ from rich.table import Table
 from benchmarks.traffic_study.reference import PAPER_BYTES, PAPER_KM
 
 MAPS = (
-    ("pcd", "PCD, a point each 0.2 m"),
+    ("pcd", "PCD, 0.2 m"),
     ("pcd_compressed", "PCD compressed"),
-    ("laz", "LAZ, steps of 1 cm"),
-    ("draco", "Draco, 12 bits a tile"),
-    ("gnd_protobuf", "GND as the paper: protobuf of doubles"),
+    ("laz", "LAZ, 1 cm"),
+    ("draco", "Draco, 12 bits"),
+    ("gnd_protobuf", "GND, protobuf of doubles"),
     ("gnd_float", "GND, float32 columns"),
     ("gnd", "GND, standard"),
 )
 UPLOADS = (
     ("raw", "all measurements"),
     ("pcd_changes", "point-cloud changes"),
-    ("gnd_float", "GND changes in floats, with what was observed"),
+    ("gnd_float", "GND changes in floats"),
     ("gnd", "GND changes, flags first"),
 )
 STAGES = (("first", "first drive"), ("flags_first", "first 8 drives"), ("steady", "merged world"))
@@ -61,9 +61,7 @@ def _uploads(found: Mapping[str, Any]) -> Table:
     up = found["upload"]
     rate = up["changed_per_km"]["first"]
     title = f"upload: {up['drives']} drives of {found['km']:.3f} km; the first reports {rate:.0f} changes a km"
-    table = _table(
-        title, "what", "one drive, kB", "kB/km", "all drives, kB", "paper, one, kB/km", "paper, 38 drives, kB/km"
-    )
+    table = _table(title, "what", "one, kB", "kB/km", "all, kB", "paper, kB/km", "of its fleet")
     for name, label in UPLOADS:
         one, fleet = up["single"][name]["bytes"], up["fleet"][name]["bytes"]
         table.add_row(label, _kb(one), _kb(one, found["km"]), _kb(fleet), _paper("single", name), _paper("fleet", name))
@@ -83,15 +81,18 @@ def _kb(size: float | None, km: float = 1.0) -> str:
 
 def _rates(found: Mapping[str, Any]) -> Table:
     up = found["upload"]
-    parts = list(up["parts_bytes_per_km"]["first"])
-    title = "upload a km: keys, payloads and answers; bytes by part"
-    table = _table(title, "stage", "kB/km", "on the wire", "changes", "Gaussians asked for", *parts)
-    for stage, label in STAGES:
-        wire = up["wire_kB_per_km"].get(stage)
-        densities = (f"{up['changed_per_km'][stage]:.0f}", f"{up['wanted_per_km'][stage]:.0f}")
-        sizes = (f"{up['parts_bytes_per_km'][stage][part]:.0f}" for part in parts)
-        shown = "" if wire is None else f"{wire:.3f}"
-        table.add_row(label, f"{up['kB_per_km'][stage]:.3f}", shown, *densities, *sizes)
+    table = _table("upload a km, by stage", "", *(label for _, label in STAGES))
+    rows = {
+        "kB/km: keys, payloads, answers": (up["kB_per_km"], 3),
+        "kB/km with the transport": (up["wire_kB_per_km"], 3),
+        "changes a km": (up["changed_per_km"], 0),
+        "Gaussians asked for a km": (up["wanted_per_km"], 0),
+    }
+    for label, (values, digits) in rows.items():
+        table.add_row(label, *(f"{values[stage]:.{digits}f}" for stage, _ in STAGES))
+    parts = up["parts_bytes_per_km"]
+    for part in parts["first"]:
+        table.add_row(f"B/km: {part}", *(f"{parts[stage][part]:.0f}" for stage, _ in STAGES))
     return table
 
 
