@@ -17,6 +17,7 @@ _LEFT, _RIGHT, _TOP, _BOTTOM = 62, 40, 10, 42
 _LINK_POINTS: Final = 40
 _COLOURS: Final = 5
 _X_TICKS: Final = 5
+_SMALLEST_PART: Final = 100
 _LABEL_PX: Final = 15
 _NAMES: Final = {"down": "Download", "up": "Upload"}
 
@@ -67,8 +68,7 @@ def _axes(agents: Sequence[AgentTraffic], links: Sequence[LinkProfile], directio
     end_s = max((agent.drive_s for agent in agents), default=0.0) or 1.0
     sizes = [float(_size(agent, direction)) for agent in agents if _size(agent, direction) > 0] or [1000.0]
     capacities = [link.rate_byte_s(direction) * end_s for link in links]
-    firsts = [size for agent in agents for _, size in _points(agent, direction) if size > 0][:1] or sizes
-    low = math.floor(math.log10(max(min(*sizes, *firsts), 10.0)))
+    low = math.floor(math.log10(max(min(sizes) / _SMALLEST_PART, 1.0)))
     high = math.ceil(math.log10(max(*sizes, *capacities, 10.0 ** (low + 1))))
     return Axes(end_s, low, max(high, low + 1))
 

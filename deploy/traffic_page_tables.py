@@ -17,10 +17,12 @@ def cards(agents: Sequence[AgentTraffic]) -> str:
     total = fleet_totals(agents)
     down, up = total["down_wire_bytes"], total["up_wire_bytes"]
     payload = total["down_bytes"] + total["up_bytes"]
+    changes = sum(line.app_bytes for line in fleet_lines(agents) if (line.kind, line.direction) == ("change", "up"))
     extra = f"{100 * (down + up - payload) / (down + up):.1f} %" if down + up else "–"
     items = (
         (_rate(total["down_bytes"], total["drive_km"]), "down, payload"),
-        (_rate(total["up_bytes"], total["drive_km"]), f"up, payload (GND paper: {PAPER_UP_KB_PER_KM} kB/km)"),
+        (_rate(total["up_bytes"], total["drive_km"]), "up, payload"),
+        (_rate(changes, total["drive_km"]), f"of it map changes (GND paper: {PAPER_UP_KB_PER_KM} kB/km)"),
         (size_text(down), "down on the wire"),
         (size_text(up), "up on the wire"),
         (extra, "of the wire is not payload"),

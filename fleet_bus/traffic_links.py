@@ -69,9 +69,10 @@ def link_use(ledger: AgentLedger, link: LinkProfile, direction: Direction, wire_
 
 def brings_tile(booking: Booking) -> bool:
     """Whether this is a tile or a delta that came, rather than a word about one."""
-    if booking.direction != "down" or booking.tile is None:
+    if booking.direction != "down" or booking.tile is None or booking.kind not in ("tile", "delta"):
         return False
-    return booking.kind == "delta" or (booking.kind == "tile" and booking.app_bytes > _NO_CONTENT_BYTES)
+    is_share = booking.messages == 0  # only bodies are shares of an answer about many tiles
+    return is_share or booking.kind == "delta" or booking.app_bytes > _NO_CONTENT_BYTES
 
 
 def tile_arrival_s(bookings: Iterable[Booking], link: LinkProfile) -> float | None:
