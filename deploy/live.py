@@ -110,9 +110,9 @@ def _row(state: FleetState, sample: TrafficSample) -> tuple[str | Text, ...]:
         Text(sample.health, style=HEALTH_STYLE.get(sample.health, "dim")),
         f"{sample.odometer_m:.0f} m",
         size_text(sample.wire_down_bytes),
-        rate_cell(rate, link, "down"),
+        rate_cell(rate, link, "down", state.clock()),
         size_text(sample.wire_up_bytes),
-        rate_cell(rate, link, "up"),
+        rate_cell(rate, link, "up", state.clock()),
         str(sample.tiles),
         str(sample.reports),
     )

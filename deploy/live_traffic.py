@@ -1,7 +1,6 @@
 """The traffic of a running fleet: rates of each vehicle against its link, and totals by kind."""
 
 import math
-import time
 from collections import defaultdict
 from collections.abc import Iterable
 from dataclasses import dataclass
@@ -47,9 +46,9 @@ def rate_between(older: TrafficSample, older_s: float, newer: TrafficSample, new
     return Rate(up / passed_s, down / passed_s, newer_s)
 
 
-def rate_cell(rate: Rate | None, link: LinkProfile, direction: Literal["up", "down"]) -> str:
+def rate_cell(rate: Rate | None, link: LinkProfile, direction: Literal["up", "down"], now_s: float) -> str:
     """The rate and its share of the link: 34.1 kB/s 0.2 %; a rate of long ago is none."""
-    if rate is None or time.monotonic() - rate.at_s > _OLD_S:
+    if rate is None or now_s - rate.at_s > _OLD_S:
         return "–"
     kb_s = (rate.up_byte_s if direction == "up" else rate.down_byte_s) / 1000
     share = rate.share(link, direction)
