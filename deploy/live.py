@@ -20,6 +20,12 @@ from schemas.traffic import TrafficSample
 
 HEALTH_STYLE = {"good": "green", "degraded": "yellow", "lost": "red"}
 PLAIN_PERIOD_S = 10.0
+WIDE = 108
+_COLUMNS = (
+    "vehicle", "position", "health", "driven", "down", "of link, down", "up", "of link, up", "tiles", "reports",
+)  # fmt: skip
+_TEXTS = ("vehicle", "position", "health")
+_WIDE_ONLY = ("position", "tiles", "reports")
 
 
 @dataclass(slots=True)
@@ -83,16 +89,21 @@ def size_text(size: float) -> str:
     return f"{size / 1e3:.1f} kB" if size < 1e6 else f"{size / 1e6:.2f} MB"
 
 
-def render(state: FleetState) -> Group:
-    """Draw the state as a table and a line of totals."""
+def render(state: FleetState, width: int = WIDE) -> Group:
+    """Draw the state as tables and a line of totals; less a vehicle where there is no room for a line each.
+
+    Args:
+        state: what to draw.
+        width: columns of the terminal.
+    """
     table = Table(box=None, pad_edge=False, header_style="bold")
-    for name in ("vehicle", "position", "health"):
-        table.add_column(name)
-    for name in ("driven", "down", "of the link", "up", "of the link", "tiles", "reports"):
-        table.add_column(name, justify="right")
+    shown = [name for name in _COLUMNS if width >= WIDE or name not in _WIDE_ONLY]
+    for name in shown:
+        table.add_column(name.split(",")[0], justify="left" if name in _TEXTS else "right", no_wrap=True)
     with state.lock:
         for vehicle in sorted(state.samples):
-            table.add_row(*_row(state, state.samples[vehicle]))
+            row = dict(zip(_COLUMNS, _row(state, state.samples[vehicle]), strict=True))
+            table.add_row(*(row[name] for name in shown))
         totals = (
             f"store: {state.reports} reports, {state.waiting} tiles waiting, {state.published} versions published"
             f"   watcher: {state.updates} updates"
@@ -106,7 +117,7 @@ def _row(state: FleetState, sample: TrafficSample) -> tuple[str | Text, ...]:
     rate, link = state.rates.get(sample.vehicle), link_of(state.links, sample.vehicle)
     return (
         sample.vehicle,
-        f"{math.degrees(sample.lat_rad):.6f} {math.degrees(sample.lon_rad):.6f}",
+        f"{math.degrees(sample.lat_rad):.5f} {math.degrees(sample.lon_rad):.5f}",
         Text(sample.health, style=HEALTH_STYLE.get(sample.health, "dim")),
         f"{sample.odometer_m:.0f} m",
         size_text(sample.wire_down_bytes),
@@ -124,7 +135,7 @@ def live_view(state: FleetState, console: Console) -> Iterator["View"]:
     if not console.is_terminal:
         yield View(state, console, None)
         return
-    with Live(render(state), console=console, refresh_per_second=2, transient=False) as live:
+    with Live(render(state, console.width), console=console, refresh_per_second=2, transient=False) as live:
         yield View(state, console, live)
 
 
@@ -140,7 +151,7 @@ class View:
     def refresh(self) -> None:
         """Show the newest state."""
         if self.live is not None:
-            self.live.update(render(self.state))
+            self.live.update(render(self.state, self.console.width))
         elif time.monotonic() - self.printed_s >= PLAIN_PERIOD_S:
             self.printed_s = time.monotonic()
             self.console.print(self._plain(), soft_wrap=True)

@@ -52,7 +52,11 @@ def rate_cell(rate: Rate | None, link: LinkProfile, direction: Literal["up", "do
         return "–"
     kb_s = (rate.up_byte_s if direction == "up" else rate.down_byte_s) / 1000
     share = rate.share(link, direction)
-    return f"{kb_s:.1f} kB/s" if share is None else f"{kb_s:.1f} kB/s {100 * share:.2g} %"
+    return f"{kb_s:.1f} kB/s" if share is None else f"{kb_s:.1f} kB/s {_percent(share)}"
+
+
+def _percent(share: float) -> str:
+    return f"{100 * share:.0f} %" if share >= 0.1 else f"{100 * share:.2g} %"
 
 
 def kinds_table(samples: Iterable[TrafficSample]) -> Table:

@@ -111,6 +111,19 @@ def test_before_the_first_sample_there_are_only_totals():
     assert "on the wire" not in text
 
 
+def test_a_narrow_terminal_keeps_a_vehicle_in_a_line():
+    clock = Clock()
+    state = state_of(clock)
+    for t_s in (1, 2):
+        state.on_traffic("key", sample(t_s, wire=(900_000 * t_s, 800_000 * t_s)).encode())
+        clock.now_s += 1.0
+    console = Console(width=80, file=io.StringIO(), record=True)
+    console.print(render(state, console.width))
+    row = " ".join(row_of(console.export_text(), "vehicle-00"))
+    assert row == "vehicle-00 good 1000 m 1.60 MB 800.0 kB/s 80 % 1.80 MB 900.0 kB/s 900 %"
+    assert "37.24226 126.05072" in shown(state)
+
+
 def test_without_a_terminal_a_line_tells_the_same():
     state, console = state_of(Clock()), Console(width=60, file=io.StringIO())
     state.on_traffic(
