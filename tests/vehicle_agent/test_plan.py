@@ -9,6 +9,8 @@ from hypothesis import strategies as st
 from vehicle_scene import FIGURE_2, FRAME
 
 from gnd_map.tile_id import TileId, covering_circle
+from vehicle_agent.config import DownloadParameters
+from vehicle_agent.errors import AgentConfigError
 from vehicle_agent.plan import (
     LARGEST_BATCH_BYTES,
     SLOWEST_MPS,
@@ -112,3 +114,19 @@ def test_batches_suit_the_link() -> None:
     assert batch_bytes(math.inf, 0.25) == LARGEST_BATCH_BYTES
     assert batch_bytes(6_250.0, 0.25) == SMALLEST_BATCH_BYTES
     assert batch_bytes(100_000.0, 0.25) == 25_000
+
+
+@pytest.mark.parametrize(
+    ("setting", "said"),
+    [
+        ({"near_m": 100.0}, "near_m = 100.0"),
+        ({"ahead_m": -1.0}, "ahead_m = -1.0"),
+        ({"lead_s": 20.0}, "lead_s = 20.0"),
+        ({"link_share": 1.5}, "link_share = 1.5"),
+        ({"batch_s": 0.0}, "batch_s = 0.0"),
+        ({"in_flight": 65}, "in_flight = 65"),
+    ],
+)
+def test_settings_that_cannot_work_are_named(setting: dict[str, float], said: str) -> None:
+    with pytest.raises(AgentConfigError, match=said):
+        DownloadParameters(**setting)  # type: ignore[arg-type]
