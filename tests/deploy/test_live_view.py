@@ -121,7 +121,7 @@ def test_a_narrow_terminal_keeps_a_vehicle_in_a_line():
     console.print(render(state, console.width))
     row = " ".join(row_of(console.export_text(), "vehicle-00"))
     assert row == "vehicle-00 good 1000 m 1.60 MB 800.0 kB/s 80 % 1.80 MB 900.0 kB/s 900 %"
-    assert "37.24226 126.05072" in shown(state)
+    assert "37.24226 126.0507" in shown(state)
 
 
 def test_without_a_terminal_a_line_tells_the_same():
