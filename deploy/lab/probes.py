@@ -5,6 +5,8 @@ Both ends lie on this machine, so one monotonic clock times both: delays are one
 
 import contextlib
 import multiprocessing
+import os
+import signal
 import socket
 import struct
 import threading
@@ -30,6 +32,9 @@ RATE_SHARE: Final = 0.25
 """Delay and loss are measured on a link that is a quarter busy, so that no queue grows."""
 DRAIN_S: Final = 1.0
 CONNECT_S: Final = 20.0
+BACKLOG_S: Final = 0.5
+MAX_SET_BACKLOG_BYTES: Final = 200_000
+"""Systems refuse larger ones (net.core.wmem_max); the kernel's own growth goes further."""
 _STAMP: Final = struct.Struct("<Qd")  # number, monotonic time of sending in s
 _PROBE_BYTES: Final = _STAMP.size + UDP_HEADER_BYTES
 _TCP_INFO_BYTES: Final = 232
@@ -109,6 +114,7 @@ def stream(link: LabLink, direction: Direction, seconds: float) -> Stream:
     per_s = min(MAX_PER_S, RATE_SHARE * rate_byte_s / _PROBE_BYTES)
     count = max(10, round(per_s * seconds))
     with _datagrams(link, direction) as (sender, receiver):
+        receiver.settimeout(DRAIN_S + 4 / per_s + 2 * link.profile.delay_s)
         arrived: list[tuple[int, float]] = []
         reader = threading.Thread(target=_collect, args=(receiver, count, arrived))
         reader.start()
@@ -130,9 +136,8 @@ def _send_evenly(sender: socket.socket, count: int, pause_s: float) -> None:
 
 
 def _collect(receiver: socket.socket, count: int, arrived: list[tuple[int, float]]) -> None:
-    """Receive until all have come, or none for a while."""
-    receiver.settimeout(DRAIN_S)
-    with contextlib.suppress(TimeoutError):
+    """Receive until all have come, none for a while, or the socket is closed."""
+    with contextlib.suppress(OSError):
         while len(arrived) < count:
             number, sent_s = _STAMP.unpack(receiver.recv(_STAMP.size))
             arrived.append((number, time.monotonic() - sent_s))
@@ -145,18 +150,21 @@ def flood(link: LabLink, direction: Direction, seconds: float) -> float:
         LabError: nothing arrived.
     """
     with _datagrams(link, direction) as (sender, receiver):
-        process = _fork.Process(target=_pour, args=(sender, seconds))
+        process = _fork.Process(target=_pour, args=(sender, seconds, os.getpid()))
         process.start()
         try:
             return _arriving_bit_s(receiver, seconds)
         finally:
+            process.terminate()
             process.join()
 
 
-def _pour(sender: socket.socket, seconds: float) -> None:
+def _pour(sender: socket.socket, seconds: float, launcher: int) -> None:
+    signal.signal(signal.SIGTERM, signal.SIG_DFL)  # not the launcher's handlers
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
     datagram = bytes(MTU_BYTES - UDP_HEADER_BYTES)
     end_s = time.monotonic() + seconds
-    while time.monotonic() < end_s:
+    while time.monotonic() < end_s and os.getppid() == launcher:
         sender.send(datagram)  # blocks while the link's queue is full
 
 
@@ -188,6 +196,7 @@ def bulk(link: LabLink, direction: Direction, seconds: float) -> Bulk:
     """
     with _connection(link) as (vehicle, cloud):
         sender, receiver = (vehicle, cloud) if direction == "up" else (cloud, vehicle)
+        _keep_short(sender, link.profile.rate_byte_s(direction))
         feeder = threading.Thread(target=_feed, args=(sender, seconds))
         feeder.start()
         start_s, size_bytes = time.monotonic(), 0
@@ -200,12 +209,20 @@ def bulk(link: LabLink, direction: Direction, seconds: float) -> Bulk:
     return Bulk(size_bytes * 8 / took_s, again / sent if sent else 0.0)
 
 
+def _keep_short(sender: socket.socket, rate_byte_s: float) -> None:
+    """Keep the backlog within the sender short on slow links, where the kernel's own would take seconds to drain."""
+    backlog_bytes = rate_byte_s * BACKLOG_S
+    if backlog_bytes < MAX_SET_BACKLOG_BYTES:
+        sender.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, max(16_384, round(backlog_bytes)))
+
+
 def _feed(sender: socket.socket, seconds: float) -> None:
     data = bytes(1 << 16)
     end_s = time.monotonic() + seconds
-    while time.monotonic() < end_s:
-        sender.sendall(data)
-    sender.shutdown(socket.SHUT_WR)
+    with contextlib.suppress(OSError):  # closed by an interruption
+        while time.monotonic() < end_s:
+            sender.sendall(data)
+        sender.shutdown(socket.SHUT_WR)
 
 
 @contextmanager

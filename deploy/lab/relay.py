@@ -31,6 +31,7 @@ _IFF_TUN_NO_PI: Final = 0x1001
 _MAX_PACKET_BYTES: Final = 65_535
 _AT_ONCE: Final = 64
 _JITTER_STEPS: Final = 4  # > 2 keeps the order
+_LEAST_STEP_S: Final = 0.001
 _MAX_WAIT_S: Final = 0.25
 _SAVE_EVERY_S: Final = 1.0
 
@@ -70,9 +71,9 @@ class LineCount:
 class Jitter:
     """A delay that wanders evenly about its mean and never lets a packet overtake another.
 
-    It moves in straight lines between values drawn evenly from ± `amplitude_s`, one every four amplitudes: it changes
-    by at most half a second a second, so what is sent later also arrives later, and a dense stream has the same mean
-    delay as a thin one.
+    It moves in straight lines between values drawn evenly from ± `amplitude_s`, one every four amplitudes (1 ms at
+    least): it changes by at most half a second a second, so what is sent later also arrives later, and a dense stream
+    has the same mean delay as a thin one.
 
     Attributes:
         amplitude_s: how far it goes to either side, s.
@@ -86,12 +87,11 @@ class Jitter:
 
     def at(self, now_s: float) -> float:
         """Return what to add to the mean delay, s; times must not decrease."""
-        if self.amplitude_s == 0:
-            return 0.0
-        if now_s >= self._to[0] + _JITTER_STEPS * self.amplitude_s:  # idle for long: begin anew
+        step_s = max(_LEAST_STEP_S, _JITTER_STEPS * self.amplitude_s)
+        if now_s >= self._to[0] + step_s:  # idle for long: begin anew
             self._from, self._to = (now_s, self._draw()), (now_s, self._draw())
         while now_s >= self._to[0]:
-            self._from, self._to = self._to, (self._to[0] + _JITTER_STEPS * self.amplitude_s, self._draw())
+            self._from, self._to = self._to, (self._to[0] + step_s, self._draw())
         (t0_s, value0_s), (t1_s, value1_s) = self._from, self._to
         return value0_s + (value1_s - value0_s) * (now_s - t0_s) / (t1_s - t0_s)
 

@@ -87,7 +87,7 @@ def run_verdict(report: dict[str, Any]) -> str:
         for direction in ("down", "up")
         if not group[direction]["agrees"]
     ]
-    limit = f"{report['tolerance']:.0%}"
+    limit = f"{report['tolerance'] * 100:.0f} %"
     if bad:
         return f"ledger and interface counters differ by more than {limit}: {', '.join(bad)}"
     return f"ledger and interface counters agree within {limit} for every vehicle"
