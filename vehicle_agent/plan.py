@@ -79,7 +79,7 @@ def tile_boxes_m(frame: LocalFrame, tiles: Sequence[TileId]) -> tuple[F64, F64]:
 
 def _crossing_s(low_m: F64, high_m: F64, velocity_mps: F64) -> tuple[F64, F64]:
     """When a point that starts at the origin is inside each box (N, 2): from (N,) >= 0, until (N,); inf = never."""
-    with np.errstate(divide="ignore", invalid="ignore"):
+    with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
         a, b = low_m / velocity_mps, high_m / velocity_mps
     beside = velocity_mps == 0.0  # along this axis the point stays: inside for ever or never
     inside = (low_m <= 0.0) & (high_m >= 0.0)
