@@ -15,6 +15,7 @@ from gnd_map.config import from_mapping
 from gnd_map.errors import ConfigError
 
 _MOST: Final = 1 << 63
+_WIRE_FIELDS: Final = tuple(field.name for field in fields(WireBytes))
 _LINK_FIELDS: Final = frozenset(field.name for field in fields(LinkProfile))
 
 
@@ -90,8 +91,7 @@ def _row(values: dict[str, Any]) -> Row:
 
 
 def _wire(values: dict[str, Any]) -> dict[str, Any]:
-    names = [field.name for field in fields(WireBytes)]
-    counts = {name: _whole(values.get(f"wire_{name}", 0)) for name in names}
+    counts = {name: _whole(values.get(f"wire_{name}", 0)) for name in _WIRE_FIELDS}
     return {"wire": WireBytes(**counts | {"down": _whole(values["wire_down"])})}
 
 
