@@ -58,11 +58,11 @@ class VisibilityParameters:
     range_m: float = 50.0
     reach_m: float = 70.0
     noise_m: float = 0.05
-    r2: float = 6.0
+    r2: float = 3.0
     new_radius_m: float = 0.4
-    min_hits: float = 16.0
+    min_hits: float = 4.0
     min_passes: float = 128.0
-    hits_near: float = 6.0
+    hits_near: float = 8.0
     passes_near: float = 8.0
     open_rad: float = 0.0
 
