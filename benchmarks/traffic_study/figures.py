@@ -1,16 +1,18 @@
 """The figures of a study: Figure 23 of the GND paper, with our codecs beside."""
 
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from matplotlib.ticker import FuncFormatter
+from matplotlib.ticker import FuncFormatter, MaxNLocator
 
 from benchmarks.traffic_study.tables import UPLOADS
 from fleet_sim.pictures import save_figure
+from gnd_map.arrays import F64
 
 _INK: Final = "#1c2430"
 _PALE: Final = "#5a6675"
@@ -23,7 +25,18 @@ _COLOURS: Final = {
     "gnd_float": "#8a94a3",
     "gnd": "#2e8b57",
 }
+_GAP: Final = 0.042
+"""Least distance of two notes, as a share of the axis."""
 _NAMES: Final = {"pcd": "point cloud, 0.2 m", "gnd_float": "GND, float32 columns", "gnd": "GND, standard"}
+
+
+@dataclass(frozen=True, slots=True)
+class Note:
+    """What stands at the end of a line, at the height of its last size."""
+
+    size: float
+    text: str
+    colour: str
 
 
 def draw_figures(found: Mapping[str, Any], folder: Path) -> list[Path]:
@@ -44,25 +57,24 @@ def _download(axes: Axes, found: Mapping[str, Any]) -> None:
     """Accumulated bytes over the way, against what the links carry in the time."""
     down = found["download"]
     way_m = 1e3 * found["km"]
-    for name in _LINKS:
-        _capacity_line(axes, found, name, way_m, "down_bytes")
+    x = np.linspace(0.0, way_m, 200)[1:]
+    notes = _links(axes, x, {name: found["links"][name]["down_bytes"] * x / way_m for name in _LINKS})
     for name in ("pcd", "gnd_float", "gnd"):
         rows = np.array([[0.0, 0.0, 1.0], *down["along"][name]])
         x, y = np.append(rows[:, 1], way_m), np.append(rows[:, 2], rows[-1, 2])
         axes.step(x, y, where="post", color=_COLOURS[name], linewidth=2.2, zorder=4)
-        _note(axes, way_m, y[-1], f"{_NAMES[name]}: {_shown(y[-1])}", _COLOURS[name])
-    axes.set_xlim(0, 1.42 * way_m)
-    axes.set_xticks([tick for tick in axes.get_xticks() if tick <= way_m])
+        notes.append(Note(y[-1], f"{_NAMES[name]}: {_shown(y[-1])}", _COLOURS[name]))
+    axes.set_xlim(0, way_m)
     axes.set_xlabel("way driven, m", color=_INK)
     density = f"{down['voxels']} voxels in {down['tiles']} tiles, {down['voxels_per_km']} voxels a km"
-    _finish(axes, "Download along the drive", f"world seed {found['seed']}, {density}")
+    _finish(axes, notes, "Download along the drive", f"world seed {found['seed']}, {density}")
 
 
-def _capacity_line(axes: Axes, found: Mapping[str, Any], link: str, way_m: float, direction: str) -> None:
-    size = found["links"][link][direction]
-    x = np.linspace(0.0, way_m, 200)[1:]
-    axes.plot(x, size * x / way_m, color=_LINKS[link], linewidth=1.6, linestyle="--", zorder=2)
-    _note(axes, way_m, size, f"{link.upper()} carries {_shown(size)}", _LINKS[link])
+def _links(axes: Axes, x: F64, sizes: Mapping[str, F64]) -> list[Note]:
+    """Draw what each link carries until x (N,), and return what stands at the ends of the lines."""
+    for name, y in sizes.items():
+        axes.plot(x, y, color=_LINKS[name], linewidth=1.6, linestyle="--", zorder=2)
+    return [Note(y[-1], f"{name.upper()} carries {_shown(y[-1])}", _LINKS[name]) for name, y in sizes.items()]
 
 
 def _single(axes: Axes, found: Mapping[str, Any]) -> None:
@@ -77,11 +89,11 @@ def _single(axes: Axes, found: Mapping[str, Any]) -> None:
             size * 1.15, row, _shown(size), va="center", color=_INK, fontsize=9, zorder=5, backgroundcolor="white"
         )
     axes.set_yticks(range(len(shown)), [label for label, *_ in shown])
-    axes.invert_yaxis()
-    for name, colour in _LINKS.items():
+    axes.set_ylim(len(shown) - 0.5, -0.9)
+    for side, (name, colour) in zip(("right", "right", "left"), _LINKS.items(), strict=True):
         size = found["links"][name]["up_bytes"]
         axes.axvline(size, color=colour, linewidth=1.6, linestyle="--", zorder=2)
-        axes.text(size, -0.62, name.upper(), color=colour, ha="center", va="bottom", fontsize=9)
+        axes.text(size * (0.9 if side == "right" else 1.1), -0.65, name.upper(), color=colour, ha=side, fontsize=9)
     axes.set_xscale("log")
     axes.set_xlim(100.0, 30 * max(size for _, size, _ in shown))
     axes.xaxis.set_major_formatter(FuncFormatter(lambda value, _: _shown(value)))
@@ -96,25 +108,19 @@ def _steady_bytes(found: Mapping[str, Any]) -> float:
 def _fleet(axes: Axes, found: Mapping[str, Any]) -> None:
     """Accumulated bytes over the drives."""
     drives = found["drives"]
-    x = np.arange(1, len(drives) + 1)
-    for name, colour in _LINKS.items():
-        size = found["links"][name]["up_bytes"]
-        axes.plot(x, size * x, color=colour, linewidth=1.6, linestyle="--", zorder=2)
-        _note(axes, x[-1], size * x[-1], f"{name.upper()} carries {_shown(size * x[-1])}", colour)
+    x = np.arange(1.0, len(drives) + 1.0)
+    notes = _links(axes, x, {name: found["links"][name]["up_bytes"] * x for name in _LINKS})
     for name, label, sizes in _series(found, drives):
         y = np.cumsum(sizes)
         axes.plot(x, y, color=_COLOURS[name], linewidth=2.2, marker="o", markersize=2.8, zorder=4)
-        _note(axes, x[-1], y[-1], f"{label}: {_shown(y[-1])}", _COLOURS[name])
-    axes.set_xlim(0, 1.62 * len(drives))
-    axes.set_xticks([tick for tick in axes.get_xticks() if 0 <= tick <= len(drives)])
+        notes.append(Note(float(y[-1]), f"{label}: {_shown(y[-1])}", _COLOURS[name]))
+    axes.set_xlim(0.0, len(drives))
+    axes.xaxis.set_major_locator(MaxNLocator(integer=True))
     axes.set_xlabel("drives", color=_INK)
     rates = found["upload"]["changed_per_km"]
-    note = (
-        f"changes a km: {rates['first']:.0f} on the first drive, {rates['steady']:.0f} when the world has been merged"
-    )
-    _finish(
-        axes, f"Upload of {len(drives)} drives", f"world seed {found['seed']}, {1e3 * found['km']:.0f} m each; {note}"
-    )
+    where = f"world seed {found['seed']}, {1e3 * found['km']:.0f} m each"
+    note = f"changes a km: {rates['first']:.0f} on the first drive, {rates['steady']:.0f} in the merged world"
+    _finish(axes, notes, f"Upload of {len(drives)} drives", f"{where}; {note}")
 
 
 def _series(found: Mapping[str, Any], drives: Sequence[Mapping[str, Any]]) -> list[tuple[str, str, list[float]]]:
@@ -131,15 +137,25 @@ def _series(found: Mapping[str, Any], drives: Sequence[Mapping[str, Any]]) -> li
     return series
 
 
-def _note(axes: Axes, x: float, y: float, text: str, colour: str) -> None:
-    axes.annotate(text, (x, y), (6, 0), textcoords="offset points", color=colour, va="center", fontsize=9, zorder=5)
-
-
-def _finish(axes: Axes, title: str, note: str) -> None:
+def _finish(axes: Axes, notes: Sequence[Note], title: str, note: str) -> None:
     axes.set_yscale("log")
     axes.yaxis.set_major_formatter(FuncFormatter(lambda value, _: _shown(value)))
     axes.set_ylim(bottom=max(axes.get_ylim()[0], 100.0))
+    low, high = np.log10(axes.get_ylim())
+    heights = spread([(np.log10(one.size) - low) / (high - low) for one in notes], _GAP)
+    for one, height in zip(notes, heights, strict=True):
+        axes.annotate(
+            one.text, (1.012, height), xycoords="axes fraction", color=one.colour, va="center", fontsize=9, zorder=5
+        )
     _titled(axes, title, note)
+
+
+def spread(heights: Sequence[float], gap: float) -> list[float]:
+    """Heights in the same order, moved upwards where two are closer than `gap`."""
+    found, last = [0.0] * len(heights), -float("inf")
+    for index in sorted(range(len(heights)), key=lambda k: heights[k]):
+        last = found[index] = max(heights[index], last + gap)
+    return found
 
 
 def _titled(axes: Axes, title: str, note: str) -> None:
