@@ -109,3 +109,16 @@ def _result(head: dict[str, Any], data: dict[str, NDArray[Any]]) -> VehicleResul
 def _cut(column: NDArray[np.uint8], lengths: list[int]) -> tuple[bytes, ...]:
     body, stops = column.tobytes(), np.cumsum([0, *lengths]).tolist()
     return tuple(body[a:b] for a, b in pairwise(stops))
+
+
+def read_reports(path: Path) -> tuple[bytes, ...]:
+    """The encoded reports of a result, whatever run it belongs to.
+
+    Raises:
+        FolderError: it is missing or damaged.
+    """
+    try:
+        with np.load(path, allow_pickle=False) as file:
+            return _cut(file["reports"], json.loads(str(file["head"]))["lengths"])
+    except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile, zlib.error) as error:
+        raise FolderError(f"cannot read {path}: {error}") from error

@@ -14,7 +14,7 @@ from gnd_map.errors import CodecError
 
 CHECK_BYTES: Final = 2
 _HALF: Final = 1 << 15
-State = tuple[I64, npt.NDArray[np.uint8], I32, I32, I64]
+State = tuple[I64, npt.NDArray[np.uint8], I32, I64]
 
 
 @dataclass(slots=True)

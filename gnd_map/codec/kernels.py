@@ -17,7 +17,7 @@ from gnd_map.arrays import I32, I64
 from gnd_map.jit import kernel
 
 U8 = NDArray[np.uint8]
-State = Any  # (coder, buffer, prob, seen, weight): arrays, see `coding.Coder`
+State = Any  # (coder, buffer, places, weight): arrays, see `coding.Coder`; a place is probability << 8 | times seen
 
 # Slots of `coder` (int64).
 LOW: Final = 0
@@ -59,8 +59,8 @@ def _stretch_table() -> I64:
     return np.asarray(np.minimum(np.searchsorted(_squash_table(), (np.arange(4096) << 4) + 8), 4096) - 2048, np.int64)
 
 
-_SQUASH: Final = _squash_table()
-_STRETCH: Final = _stretch_table()
+_SQUASH: Final = _squash_table().astype(np.int32)
+_STRETCH: Final = _stretch_table().astype(np.int16)
 _STEP: Final = np.array([2 * _ONE // (2 * n + 3) for n in range(256)], np.int64)
 _LIMIT: Final = 250
 _MIX_RATE: Final = 6
@@ -107,39 +107,38 @@ def _code(coder: I64, buffer: U8, p: int, bit: int) -> int:
 
 
 @kernel
-def _learn(prob: I32, seen: I32, at: int, bit: int) -> None:
-    """Move a context's probability towards what came, the less the more it has seen."""
-    n = seen[at]
-    prob[at] += ((bit << 16) - bit - prob[at]) * _STEP[n] >> 16
-    if n < _LIMIT:
-        seen[at] = n + 1
+def _learnt(place: int, bit: int) -> int:
+    """A context after a decision: its probability moves towards what came, the less the more it has seen."""
+    p, n = place >> 8, place & 0xFF
+    p += ((bit << 16) - bit - p) * _STEP[n] >> 16
+    learnt: int = p << 8 | min(n + 1, _LIMIT)
+    return learnt
 
 
 @kernel
 def code_bit(state: State, at: int, bit: int) -> int:
     """One decision in one context."""
-    coder, buffer, prob, seen, _ = state
-    p = min(max(prob[at], 6), _ONE - 6)
-    bit = _code(coder, buffer, p, bit)
-    _learn(prob, seen, at, bit)
+    coder, buffer, places, _ = state
+    place = places[at]
+    bit = _code(coder, buffer, min(max(place >> 8, 6), _ONE - 6), bit)
+    places[at] = _learnt(place, bit)
     return bit
 
 
 @kernel
 def code_mixed(state: State, a: int, b: int, c: int, w: int, bit: int) -> int:
     """One decision in three contexts, mixed by the weights at `w`."""
-    coder, buffer, prob, seen, weight = state
-    sa, sb, sc = _STRETCH[prob[a] >> 4], _STRETCH[prob[b] >> 4], _STRETCH[prob[c] >> 4]
+    coder, buffer, places, weight = state
+    pa, pb, pc = places[a], places[b], places[c]
+    sa, sb, sc = np.int64(_STRETCH[pa >> 12]), np.int64(_STRETCH[pb >> 12]), np.int64(_STRETCH[pc >> 12])
     d = (weight[w, 0] * sa + weight[w, 1] * sb + weight[w, 2] * sc) >> 16
-    p = _SQUASH[min(max(d, -2047), 2047) + 2048]
-    bit = _code(coder, buffer, p, bit)
+    p = np.int64(_SQUASH[min(max(d, -2047), 2047) + 2048])
+    bit = _code(coder, buffer, p, bit)  # type: ignore[arg-type]  # an int64 to numba
     error = ((bit << 16) - p) * _MIX_RATE
     weight[w, 0] += (sa * error + 0x80000) >> 20
     weight[w, 1] += (sb * error + 0x80000) >> 20
     weight[w, 2] += (sc * error + 0x80000) >> 20
-    _learn(prob, seen, a, bit)
-    _learn(prob, seen, b, bit)
-    _learn(prob, seen, c, bit)
+    places[a], places[b], places[c] = _learnt(pa, bit), _learnt(pb, bit), _learnt(pc, bit)
     return bit
 
 
@@ -446,45 +445,32 @@ def code_voxels(
             return
 
 
-@kernel
-def _neighbours(table: I32, row: int, where: I32, refs: I64) -> int:
-    """Rows of known neighbours, the replaced one first, then across faces, edges and corners; how many."""
-    n = 0
-    if table[row, SELF] >= 0:
-        refs[0] = table[row, SELF]
-        n = 1
-    z, y, x = table[row, Z], table[row, Y], table[row, X]
-    for reach in range(1, 4):
-        for dz in range(-1, 2):
-            for dy in range(-1, 2):
-                for dx in range(-1, 2):
-                    if abs(dz) + abs(dy) + abs(dx) != reach or n >= _MOST_REFS:
-                        continue
-                    other = where[z + dz, y + dy, x + dx]
-                    if other >= 0:
-                        refs[n] = other
-                        n += 1
-    return n
+def _around() -> I64:
+    """(26, 3) steps to the neighbours across faces, then edges, then corners."""
+    steps = [(z, y, x) for z in (-1, 0, 1) for y in (-1, 0, 1) for x in (-1, 0, 1) if (z, y, x) != (0, 0, 0)]
+    return np.array(sorted(steps, key=lambda step: sum(map(abs, step))), np.int64)
+
+
+_AROUND: Final = _around()
+_ANY_AXIS: Final = -1
 
 
 @kernel
-def _same_axis(table: I32, row: int, where: I32, axis: int, refs: I64) -> int:
-    """As `_neighbours`, those of the same thin axis only."""
+def _neighbours(table: I32, row: int, where: I32, axis: int, most: int, refs: I64) -> int:
+    """Rows of up to `most` known neighbours of one thin axis (or any), the replaced one first; how many."""
     n = 0
-    if table[row, SELF] >= 0 and table[table[row, SELF], AXIS] == axis:
-        refs[0] = table[row, SELF]
+    own = table[row, SELF]
+    if own >= 0 and (axis == _ANY_AXIS or table[own, AXIS] == axis):
+        refs[0] = own
         n = 1
     z, y, x = table[row, Z], table[row, Y], table[row, X]
-    for reach in range(1, 4):
-        for dz in range(-1, 2):
-            for dy in range(-1, 2):
-                for dx in range(-1, 2):
-                    if abs(dz) + abs(dy) + abs(dx) != reach or n >= _MOST_REFS:
-                        continue
-                    other = where[z + dz, y + dy, x + dx]
-                    if other >= 0 and table[other, AXIS] == axis:
-                        refs[n] = other
-                        n += 1
+    for i in range(26):
+        other = where[z + _AROUND[i, 0], y + _AROUND[i, 1], x + _AROUND[i, 2]]
+        if other >= 0 and (axis == _ANY_AXIS or table[other, AXIS] == axis):
+            refs[n] = other
+            n += 1
+            if n >= most:
+                break
     return n
 
 
@@ -529,7 +515,7 @@ def _code_axis(
     state: State, table: I32, row: int, where: I32, refs: I64, occupied: int, kind: int, at: int, w: int
 ) -> int:
     """The axis along which the Gaussian is thinnest."""
-    n = _neighbours(table, row, where, refs)
+    n = _neighbours(table, row, where, _ANY_AXIS, 2, refs)
     first = table[refs[0], AXIS] if n > 0 else 3
     second = table[refs[1], AXIS] if n > 1 else 3
     own = table[table[row, SELF], AXIS] if kind == 2 else 3
@@ -565,7 +551,7 @@ def _code_voxel(
     kind = 2 if table[row, SELF] >= 0 else shape[7]
     axis = _code_axis(state, table, row, where, refs, occupied, kind, at, w)
     table[row, AXIS] = axis
-    n = _same_axis(table, row, where, axis, refs)
+    n = _neighbours(table, row, where, axis, _MOST_REFS, refs)
     top = len(sd) - 1
     first = refs[0] if n > 0 else 0  # row 0 stands for nothing: typical values
     mean_c = mean_count = 0

@@ -4,6 +4,9 @@
 """
 
 import zlib
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from contextvars import ContextVar
 from dataclasses import dataclass
 from functools import lru_cache
 from importlib import resources
@@ -45,27 +48,24 @@ class Priors:
     """How a stream's contexts start.
 
     Attributes:
-        prob: (CONTEXTS,) int32 probability of a 1, of 65536.
-        seen: (CONTEXTS,) int32 how many decisions that probability stands for.
+        places: (CONTEXTS,) int32 probability of a 1, of 65536, << 8 | how many decisions it stands for.
         weight: (WEIGHTS, 3) int64 mixing weights, of 65536.
     """
 
-    prob: I32
-    seen: I32
+    places: I32
     weight: I64
 
     @classmethod
     def flat(cls) -> "Priors":
         """Nothing is known."""
         return cls(
-            np.full(CONTEXTS, 1 << 15, np.int32),
-            np.zeros(CONTEXTS, np.int32),
+            np.full(CONTEXTS, 1 << 23, np.int32),
             np.full((WEIGHTS, 3), _FIRST_WEIGHT, np.int64),
         )
 
-    def copies(self) -> tuple[I32, I32, I64]:
+    def copies(self) -> tuple[I32, I64]:
         """Arrays for a stream to learn in."""
-        return self.prob.copy(), self.seen.copy(), self.weight.copy()
+        return self.places.copy(), self.weight.copy()
 
 
 STREAMS: Final = (
@@ -76,22 +76,50 @@ FILE: Final = "priors.bin"
 
 
 @lru_cache(maxsize=1)
-def _all() -> dict[str, Priors]:
-    data = resources.files("gnd_map.codec").joinpath(FILE)
-    return unpack(data.read_bytes()) if data.is_file() else {}
+def _frozen() -> dict[str, Priors]:
+    return unpack(resources.files("gnd_map.codec").joinpath(FILE).read_bytes())
+
+
+_learning: ContextVar[dict[str, "Learning"] | None] = ContextVar("learning", default=None)
 
 
 def priors_of(stream: str) -> Priors:
     """How the contexts of a stream of this kind start."""
-    return _all().get(stream) or Priors.flat()
+    learning = _learning.get()
+    return _frozen()[stream] if learning is None else learning[stream]
 
 
-def pack(priors: dict[str, Priors]) -> bytes:
-    """The file's bytes: probabilities of 8 bits (in the logistic domain), counts, weights; deflated."""
+@dataclass(frozen=True, slots=True)
+class Learning(Priors):
+    """Priors that go on learning from stream to stream instead of starting anew: how the frozen ones are made."""
+
+    def copies(self) -> tuple[I32, I64]:
+        """The arrays themselves."""
+        return self.places, self.weight
+
+    def frozen(self, trust: int) -> Priors:
+        """What was learnt, to count as at most `trust` decisions."""
+        seen = np.minimum(self.places & 0xFF, trust)
+        return Priors((self.places >> 8 << 8 | seen).astype(np.int32), self.weight.copy())
+
+
+@contextmanager
+def learning(start: Mapping[str, Priors] | None = None) -> Iterator[dict[str, Learning]]:
+    """Within it, every stream starts where the last of its kind ended; from `start`, or from nothing."""
+    states = {name: Learning(*(start[name] if start else Priors.flat()).copies()) for name in STREAMS}
+    token = _learning.set(states)
+    try:
+        yield states
+    finally:
+        _learning.reset(token)
+
+
+def pack(priors: Mapping[str, Priors]) -> bytes:
+    """The file's bytes: places and weights, stream after stream; deflated."""
     parts = []
     for name in STREAMS:
         one = priors[name]
-        parts += [one.prob.astype("<u2").tobytes(), one.seen.astype("u1").tobytes(), one.weight.astype("<i4").tobytes()]
+        parts += [one.places.astype("<i4").tobytes(), one.weight.astype("<i4").tobytes()]
     return zlib.compress(b"".join(parts), 9)
 
 
@@ -99,9 +127,8 @@ def unpack(data: bytes) -> dict[str, Priors]:
     """The priors of `pack`."""
     raw, at, found = zlib.decompress(data), 0, {}
     for name in STREAMS:
-        prob = np.frombuffer(raw, "<u2", CONTEXTS, at).astype(np.int32)
-        seen = np.frombuffer(raw, "u1", CONTEXTS, at + 2 * CONTEXTS).astype(np.int32)
-        weight = np.frombuffer(raw, "<i4", 3 * WEIGHTS, at + 3 * CONTEXTS).astype(np.int64).reshape(WEIGHTS, 3)
-        found[name] = Priors(prob, seen, weight)
-        at += 3 * CONTEXTS + 12 * WEIGHTS
+        places = np.frombuffer(raw, "<i4", CONTEXTS, at).astype(np.int32)
+        weight = np.frombuffer(raw, "<i4", 3 * WEIGHTS, at + 4 * CONTEXTS).astype(np.int64).reshape(WEIGHTS, 3)
+        found[name] = Priors(places, weight)
+        at += 4 * CONTEXTS + 12 * WEIGHTS
     return found
