@@ -1,5 +1,6 @@
 """The account of a run as one HTML file: no script, nothing from elsewhere, readable on a phone, light and dark."""
 
+import contextlib
 import os
 from collections.abc import Sequence
 from html import escape
@@ -60,12 +61,15 @@ def write_page(path: Path, run: str, agents: Sequence[AgentTraffic], links: Sequ
     Raises:
         PageError: the file cannot be written.
     """
+    if path.is_dir():
+        raise PageError(f"cannot write the page {path}: that is a folder, name a file in it")
     partial = path.with_name(f"{path.name}.{os.getpid()}.partial")
     try:
         partial.write_text(page(run, agents, links), encoding="utf-8")
         partial.replace(path)
     except OSError as error:
-        partial.unlink(missing_ok=True) if partial.parent.is_dir() else None
+        with contextlib.suppress(OSError):  # where nothing can be written nothing is left
+            partial.unlink()
         raise PageError(f"cannot write the page {path}: {error.strerror}") from error
 
 
