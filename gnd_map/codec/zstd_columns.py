@@ -157,7 +157,7 @@ def _columns(n: int, planes: bytes, widths: Sequence[int]) -> list[npt.NDArray[n
     """The columns (N,) of planes, unsigned of their widths."""
     rows = np.frombuffer(planes, np.uint8).reshape(sum(widths), n)
     stops = np.cumsum(widths).tolist()
-    return [np.ascontiguousarray(rows[s - w : s].T).view(f"<u{w}").ravel() for s, w in zip(stops, widths, strict=True)]
+    return [rows[s - w : s].T.copy(order="C").view(f"<u{w}").ravel() for s, w in zip(stops, widths, strict=True)]
 
 
 def _steps_of(voxel_id: I32) -> npt.NDArray[np.uint32]:
