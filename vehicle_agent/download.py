@@ -13,6 +13,7 @@ from gnd_map.tile import Tile
 from gnd_map.tile_id import TileId
 from vehicle_agent.cache import TileCache
 from vehicle_agent.config import DownloadParameters
+from vehicle_agent.errors import CacheError
 from vehicle_agent.exchange import Exchange, Fetched, Outcome
 from vehicle_agent.plan import batch_bytes
 
@@ -136,7 +137,10 @@ class TileFetcher:
         self._changed.notify_all()
 
     def _expected_bytes(self, tile_id: TileId) -> float:
-        return HELD_GUESS_BYTES if self._cache.head(tile_id)[0] else self._whole.value
+        try:
+            return HELD_GUESS_BYTES if self._cache.head(tile_id)[0] else self._whole.value
+        except CacheError:  # what cannot be read is asked for whole
+            return self._whole.value
 
     def _work(self) -> None:
         while batch := self._next():
@@ -189,7 +193,11 @@ class TileFetcher:
     def _cached(self, tiles: Iterable[TileId]) -> dict[TileId, Tile]:
         """The cached ones of `tiles` that nobody has been given yet."""
         found = ((t, self._cache.get(t)) for t in tiles if t not in self._answered)
-        return {tile_id: tile for tile_id, tile in found if tile is not None}
+        try:
+            return {tile_id: tile for tile_id, tile in found if tile is not None}
+        except CacheError as error:
+            _log.warning("nothing to do without an answer: %s", error)
+            return {}
 
     def _settle_all(self, batch: list[TileId], outcome: Outcome, instead: dict[TileId, Tile]) -> None:
         """Note the answers; what has none waits for its next try. The lock is held."""

@@ -1,7 +1,7 @@
 """One question about tiles of one district and its answer: verified, put into the cache, booked tile by tile."""
 
 import logging
-from collections.abc import Collection, Sequence
+from collections.abc import Callable, Collection, Iterable, Sequence
 from dataclasses import dataclass, field
 from functools import partial
 from typing import Literal
@@ -16,6 +16,7 @@ from schemas.keys import batch_key
 from schemas.tiles import TileBlob
 from schemas.tiles_batch import HeldTile, TileAnswer, TilesReply, TilesRequest, tile_of_answer
 from vehicle_agent.cache import TileCache
+from vehicle_agent.errors import CacheError
 
 Head = tuple[int, bytes]
 """Version and sha of what is held."""
@@ -63,7 +64,7 @@ class Exchange:
             BusError: no answer before the deadline.
             SchemaError: the answer is none to this question.
         """
-        held = self._cache.heads(t for t in tiles if t not in whole)
+        held = self._held(t for t in tiles if t not in whole)
         ask = partial(self._answers, tiles[0].district, held, max_bytes=max_bytes)
         answers = ask(tiles, with_hashes=False)
         unclear = [t for t in tiles if answers[t].status == "hash"]
@@ -73,6 +74,14 @@ class Exchange:
         for tile_id in tiles:
             self._take(tile_id, answers[tile_id], held.get(tile_id, NOTHING), outcome)
         return outcome
+
+    def _held(self, tiles: Iterable[TileId]) -> dict[TileId, Head]:
+        """A cache that cannot be read holds nothing."""
+        try:
+            return self._cache.heads(tiles)
+        except CacheError as error:
+            _log.warning("asked for as if nothing were cached: %s", error)
+            return {}
 
     def _answers(
         self,
@@ -121,16 +130,24 @@ class Exchange:
     def _blob(self, tile_id: TileId, answer: TileAnswer, held: Head) -> Fetched:
         tile = tile_of_answer(tile_id, answer)
         blob = TileBlob(tile_id, answer.version, tile.sha, answer.codec_id, answer.body)
-        kept = self._cache.keep(blob, over=held[1])
-        return Fetched(tile_id, "blob", tile if kept else self._from_cache(tile_id))
+        newest = self._newest(tile, lambda: self._cache.keep(blob, over=held[1]))
+        return Fetched(tile_id, "blob", newest)
 
     def _delta(self, tile_id: TileId, answer: TileAnswer, held: Head) -> Fetched:
         cached = self._from_cache(tile_id)
         if cached.sha != held[1] and (cached.version >= answer.version or cached.sha.startswith(answer.sha)):
             return Fetched(tile_id, "unchanged", cached)  # a notice brought it while the answer was on its way
         tile = tile_of_answer(tile_id, answer, cached)
-        kept = self._cache.put(tile, over=held[1])
-        return Fetched(tile_id, "delta", tile if kept else self._from_cache(tile_id))
+        newest = self._newest(tile, lambda: self._cache.put(tile, over=held[1]))
+        return Fetched(tile_id, "delta", newest)
+
+    def _newest(self, tile: Tile, keep: Callable[[], bool]) -> Tile:
+        """Keep the tile; gives what is in the cache instead where that is newer. A full disk stops no drive."""
+        try:
+            return tile if keep() else self._from_cache(tile.tile_id)
+        except CacheError as error:
+            _log.warning("tile %s is not kept: %s", tile.tile_id, error)
+            return tile
 
     def _from_cache(self, tile_id: TileId) -> Tile:
         tile = self._cache.get(tile_id)

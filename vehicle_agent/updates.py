@@ -16,6 +16,8 @@ from schemas.updates import TileUpdate, updated
 from vehicle_agent.cache import TileCache
 from vehicle_agent.download import TileFetcher
 
+MOST_DISTRICTS = 4  # as many meet at a corner: a vehicle that turns there need not declare anything anew
+
 _log = logging.getLogger(__name__)
 
 
@@ -34,16 +36,21 @@ class Updates:
         self._connections = bus.connections
 
     def follow(self, tiles: Collection[TileId]) -> None:
-        """Listen to the districts of these tiles, and no longer to others."""
-        districts = {tile.district for tile in tiles}
-        for district in sorted(districts - self._followed.keys()):
-            self._followed[district] = self._bus.subscribe(
-                update_keys(self._cache.layer, district.path),
-                lambda _key, payload: self._notices.put(payload),
-                tile_of=lambda key: parse_update_key(key)[1],
-            )
-        for district in sorted(self._followed.keys() - districts):
+        """Listen to the districts of these tiles; those that were left first are no longer listened to."""
+        districts = sorted({tile.district for tile in tiles})
+        for district in districts:
+            followed = self._followed.pop(district, None)
+            self._followed[district] = followed or self._subscribe(district)
+        for district in list(self._followed)[: -max(MOST_DISTRICTS, len(districts))]:
             self._followed.pop(district).close()
+
+    def _subscribe(self, district: District) -> Subscription:
+        """A whole district: a subscription a tile costs more to declare than the notices that it keeps away."""
+        return self._bus.subscribe(
+            update_keys(self._cache.layer, district.path),
+            lambda _key, payload: self._notices.put(payload),
+            tile_of=lambda key: parse_update_key(key)[1],
+        )
 
     def apply(self) -> int:
         """Apply the notices that have come; returns how many. A bad one is named, counted and left out."""

@@ -5,6 +5,7 @@ from collections.abc import Callable, Iterator
 from dataclasses import replace
 from pathlib import Path
 
+import apsw
 import numpy as np
 import pytest
 from vehicle_scene import ground, published
@@ -228,3 +229,20 @@ def test_the_shares_of_an_answer_add_up_to_it(tiles: dict[TileId, Tile]) -> None
     assert [share.tile for share in shares] == [None, old.tile_id, TileId(old.tile_id.morton + 2)]
     assert sum(share.app_bytes for share in shares) == len(payload)
     assert [share.app_bytes for share in shares[1:]] == [8 + len(answers[0].body), 8 + len(answers[2].body)]
+
+
+def test_a_cache_that_cannot_be_read_nor_written_stops_no_download(
+    bus: Bus, cache: TileCache, cloud: Bus, tmp_path: Path, tiles: dict[TileId, Tile]
+) -> None:
+    with apsw.Connection(str(tmp_path / "cache.sqlite")) as other:
+        other.execute("DROP TABLE tile")
+    fetcher = TileFetcher(bus, cache, DownloadParameters(in_flight=2))
+    with SqliteStore(tmp_path / "store.sqlite") as store:
+        store.put_tiles(list(tiles.values()))
+        with TileServer(store, cloud):
+            fetcher.want(list(tiles))
+            assert fetcher.wait_for(tiles, 15.0, threading.Event()) == set()
+    bus.close()
+    fetcher.close()
+    assert {f.tile_id: f.tile and f.tile.sha for f in fetcher.take()} == {t: tile.sha for t, tile in tiles.items()}
+    assert fetcher.counts == {"blob": len(tiles)}

@@ -149,8 +149,9 @@ def test_a_tile_that_is_not_wanted_any_more_is_not_fetched_for_a_notice(world: W
 
 
 def test_districts_that_are_left_are_no_longer_listened_to(world: World) -> None:
-    other = TileId(world.tile_id.morton + 1024)
-    world.updates.follow([other])
+    others = [TileId(world.tile_id.morton + 1024 * k) for k in range(1, 5)]
+    for other in others:
+        world.updates.follow([other])
     update = world.next_version(cut=5)
 
     def heard_of_the_other() -> bool:
