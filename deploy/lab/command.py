@@ -19,7 +19,7 @@ from deploy.lab.lab import clean as clean_up
 from deploy.lab.lab import open_lab
 from deploy.lab.run import LabRun
 from deploy.lab.tables import check_table, run_table, run_verdict
-from deploy.lab.tools import check_rights, kernel_offer
+from deploy.lab.tools import check_rights
 from deploy.run_folder import create_run_folder, default_run_path
 from deploy.source import Source
 
@@ -67,7 +67,7 @@ def lab(
     source = Source(drives, base_map, worlds, config.agents)
     check_rights()
     end_on_sigterm()
-    with open_lab(name, parsed, kernel_offer(), relay_all=relay_all) as opened:
+    with open_lab(name, parsed, relay_all=relay_all) as opened:
         folder = create_run_folder(out or default_run_path(), overwrite=overwrite)
         folder.write_mark({"config": dataclasses.asdict(config), "lab": name, "drives": [str(path) for path in drives]})
         lab_run = LabRun(opened, folder)
@@ -91,7 +91,7 @@ def check(links: str, name: str, relay_all: bool, seconds: float, as_json_: bool
     groups = parse_groups(",".join(f"{link}:1" for link in links.split(",") if link.strip()))
     check_rights()
     end_on_sigterm()
-    with open_lab(name, groups, kernel_offer(), relay_all=relay_all) as opened, carried(opened):
+    with open_lab(name, groups, relay_all=relay_all) as opened, carried(opened):
         measured = [measure(link, direction, seconds) for link in opened.links for direction in DIRECTIONS]
     if as_json_:
         click.echo(json.dumps(check_as_json(measured), indent=2))

@@ -20,7 +20,7 @@ from deploy.errors import LabError, LabRuns
 from deploy.lab.devices import link_commands
 from deploy.lab.groups import PREFIX, Group, LabLink, check_lab_name, links_of, namespace_name
 from deploy.lab.namespaces import add_namespace, namespaces, pids_in, remove_namespace, run_all
-from deploy.lab.tools import Offer, check_offer, needs_carrying
+from deploy.lab.tools import Offer, check_offer, kernel_offer, needs_carrying
 
 LOCK_FOLDER: Final = Path("/run") / PREFIX
 END_WITHIN_S: Final = 10.0
@@ -53,31 +53,37 @@ class Lab:
 
 
 @contextmanager
-def open_lab(name: str, groups: tuple[Group, ...], offer: Offer, *, relay_all: bool = False) -> Iterator[Lab]:
+def open_lab(name: str, groups: tuple[Group, ...], *, relay_all: bool = False) -> Iterator[Lab]:
     """Make namespaces and links, and remove them with the block, whatever ends it.
 
     Args:
         name: of the lab.
         groups: from `parse_groups`.
-        offer: what the kernel offers.
         relay_all: carry by relay what netem could do.
 
     Raises:
         LabError: the name is taken, an earlier lab of it left something behind, or the kernel refuses.
     """
-    check_offer(offer, tuple(group.link for group in groups))
     links = links_of(check_lab_name(name), groups)
-    by_relay = relay_all or not offer.netem
-    relayed = tuple(link for link in links if by_relay and needs_carrying(link.profile))
     with lab_lock(name):
         left = namespaces_of(name)
         if left:
             raise LabError(f"an earlier lab {name!r} left {len(left)} namespaces: remove them with `gnd lab clean`")
         try:
+            offer = kernel_offer(namespace_name(name, "probe"))
+            check_offer(offer, tuple(group.link for group in groups))
+            relayed = relayed_links(links, offer, relay_all=relay_all)
             _build(links, relayed)
             yield Lab(name, groups, links, relayed)
         finally:
             remove_all(name)
+
+
+def relayed_links(links: tuple[LabLink, ...], offer: Offer, *, relay_all: bool) -> tuple[LabLink, ...]:
+    """Return the links that a relay must carry: those with delay or loss, unless the kernel's netem does it."""
+    if offer.netem and not relay_all:
+        return ()
+    return tuple(link for link in links if needs_carrying(link.profile))
 
 
 def _build(links: tuple[LabLink, ...], relayed: tuple[LabLink, ...]) -> None:
@@ -95,18 +101,29 @@ def lab_lock(name: str) -> Iterator[None]:
         LabRuns: a process that lives holds it; the message tells which.
     """
     LOCK_FOLDER.mkdir(mode=0o755, parents=True, exist_ok=True)
-    descriptor = os.open(LOCK_FOLDER / f"{name}.lock", os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o644)
+    file = LOCK_FOLDER / f"{name}.lock"
+    descriptor = _locked(file, name)
     try:
-        try:
-            fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except BlockingIOError as error:
-            holder = os.pread(descriptor, 20, 0).decode("ascii", "replace").strip() or "unknown"
-            raise LabRuns(f"a lab {name!r} runs (process {holder}): end it, or choose another --name") from error
         os.ftruncate(descriptor, 0)
         os.pwrite(descriptor, f"{os.getpid()}\n".encode("ascii"), 0)
         yield
     finally:
+        file.unlink(missing_ok=True)
         os.close(descriptor)
+
+
+def _locked(file: Path, name: str) -> int:
+    while True:
+        descriptor = os.open(file, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o644)
+        try:
+            fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError as error:
+            holder = os.pread(descriptor, 20, 0).decode("ascii", "replace").strip() or "unknown"
+            os.close(descriptor)
+            raise LabRuns(f"a lab {name!r} runs (process {holder}): end it, or choose another --name") from error
+        if file.exists() and os.path.samestat(file.stat(), os.fstat(descriptor)):
+            return descriptor
+        os.close(descriptor)  # its holder has just removed the file: that lock is worth nothing
 
 
 def namespaces_of(lab: str) -> tuple[str, ...]:

@@ -90,4 +90,4 @@ def run_verdict(report: dict[str, Any]) -> str:
     limit = f"{report['tolerance'] * 100:.0f} %"
     if bad:
         return f"ledger and interface counters differ by more than {limit}: {', '.join(bad)}"
-    return f"ledger and interface counters agree within {limit} for every vehicle"
+    return f"ledger and interface counters agree within {limit} in every namespace"

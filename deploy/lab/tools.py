@@ -47,13 +47,15 @@ def check_rights() -> None:
         raise LabError(f"{' and '.join(missing)} missing: install iproute2")
 
 
-def kernel_offer() -> Offer:
-    """Try out in a namespace of its own which queueing disciplines the kernel knows.
+def kernel_offer(name: str) -> Offer:
+    """Try out which queueing disciplines the kernel knows.
+
+    Args:
+        name: a namespace to make for it, and to remove again.
 
     Raises:
         LabError: no namespace can be made.
     """
-    name = f"gndlab-probe-{os.getpid()}"
     add_namespace(name)
     try:
         tbf = _knows(name, "tbf", "rate", "1mbit", "burst", "4kb", "limit", "64kb")

@@ -22,7 +22,7 @@ from deploy.errors import LabError, LabRuns
 from deploy.lab.check import carried
 from deploy.lab.counters import read_counts
 from deploy.lab.groups import ROUTER_FROM_CLOUD, ROUTER_LISTENS, Group, parse_groups
-from deploy.lab.lab import Lab, lab_lock, labs, namespaces_of, open_lab
+from deploy.lab.lab import LOCK_FOLDER, Lab, lab_lock, labs, namespaces_of, open_lab
 from deploy.lab.namespaces import add_namespace, enter_namespace, inside, remove_namespace, run_tool
 from deploy.lab.probes import bulk, flood, stream
 from deploy.lab.relay import read_account
@@ -30,7 +30,6 @@ from deploy.lab.report import Evidence, GroupAccount, account, as_json, count_li
 from deploy.lab.run import relay_processes
 from deploy.lab.sampler import sampling
 from deploy.lab.tables import run_table, run_verdict
-from deploy.lab.tools import Offer, check_rights, kernel_offer
 from deploy.processes import ProcessSpec, Supervisor
 from fleet_bus.ledger_file import read_ledger
 
@@ -51,12 +50,6 @@ up_bit_s = 4e6
 """
 
 
-@pytest.fixture(scope="module")
-def offer() -> Offer:
-    check_rights()
-    return kernel_offer()
-
-
 @pytest.fixture
 def groups(tmp_path: Path) -> tuple[Group, ...]:
     file = profile_file(tmp_path, PROFILES)
@@ -64,8 +57,8 @@ def groups(tmp_path: Path) -> tuple[Group, ...]:
 
 
 @pytest.fixture
-def lab(groups: tuple[Group, ...], offer: Offer) -> Iterator[Lab]:
-    with open_lab(own_name(), groups, offer, relay_all=True) as opened:
+def lab(groups: tuple[Group, ...]) -> Iterator[Lab]:
+    with open_lab(own_name(), groups, relay_all=True) as opened:
         yield opened
 
 
@@ -94,11 +87,11 @@ def test_a_link_reaches_nothing_but_its_other_end(lab: Lab) -> None:
         assert near.cloud_address not in routes
 
 
-def test_a_lab_ends_without_a_trace(groups: tuple[Group, ...], offer: Offer) -> None:
+def test_a_lab_ends_without_a_trace(groups: tuple[Group, ...]) -> None:
     name = own_name()
 
     def fail() -> None:
-        with open_lab(name, groups, offer):
+        with open_lab(name, groups):
             assert len(namespaces_of(name)) == 3
             assert name in labs()
             raise KeyError(name)
@@ -109,33 +102,33 @@ def test_a_lab_ends_without_a_trace(groups: tuple[Group, ...], offer: Offer) -> 
     assert name not in labs()
 
 
-def test_a_lab_that_the_kernel_refuses_half_way_is_removed(groups: tuple[Group, ...], offer: Offer) -> None:
+def test_a_lab_that_the_kernel_refuses_half_way_is_removed(groups: tuple[Group, ...]) -> None:
     name = own_name()
     add_namespace(f"gndlab-{name}")  # no namespace of a lab: its name has other signs
     try:
         broken = parse_groups("3g:1")[0]
         twice = (broken, Group("3g", broken.link, 0, 1))  # the second makes the first's devices again
-        with pytest.raises(LabError, match=r"`ip .* failed with code \d+: .*"), open_lab(name, twice, offer):
+        with pytest.raises(LabError, match=r"`ip .* failed with code \d+: .*"), open_lab(name, twice):
             pass
         assert namespaces_of(name) == ()
     finally:
         remove_namespace(f"gndlab-{name}")
 
 
-def test_a_name_that_runs_is_refused(lab: Lab, groups: tuple[Group, ...], offer: Offer) -> None:
+def test_a_name_that_runs_is_refused(lab: Lab, groups: tuple[Group, ...]) -> None:
     with pytest.raises(LabRuns, match=rf"'{lab.name}' runs \(process {os.getpid()}\).*--name"), open_lab(
-        lab.name, groups, offer
+        lab.name, groups
     ):  # fmt: skip
         pass
     assert len(namespaces_of(lab.name)) == 3  # untouched
 
 
-def test_leftovers_are_refused(groups: tuple[Group, ...], offer: Offer) -> None:
+def test_leftovers_are_refused(groups: tuple[Group, ...]) -> None:
     name = own_name()
     add_namespace(f"gndlab.{name}.cloud")
     try:
         with pytest.raises(LabError, match="left 1 namespaces: remove them with `gnd lab clean`"), open_lab(
-            name, groups, offer
+            name, groups
         ):  # fmt: skip
             pass
         assert has_namespaces(name)  # not removed by the lab that was refused
@@ -147,7 +140,8 @@ def test_a_lock_ends_with_its_block() -> None:
     name = own_name()
     for _ in range(2):
         with lab_lock(name):
-            pass
+            assert (LOCK_FOLDER / f"{name}.lock").read_text() == f"{os.getpid()}\n"
+        assert not (LOCK_FOLDER / f"{name}.lock").exists()
 
 
 def test_namespaces_that_are_not_there_are_named() -> None:
@@ -193,9 +187,9 @@ def run_bus(lab: Lab, folder: Path, *, rounds: int, size: int, kill_relay: bool 
 
 
 @pytest.mark.parametrize("profile", ["far", "near"])
-def test_ledger_and_interface_agree(tmp_path: Path, offer: Offer, profile: str) -> None:
+def test_ledger_and_interface_agree(tmp_path: Path, profile: str) -> None:
     groups = parse_groups(f"{profile_file(tmp_path, PROFILES)}:{profile}:1")
-    with open_lab(own_name(), groups, offer, relay_all=True) as lab:
+    with open_lab(own_name(), groups, relay_all=True) as lab:
         group = run_bus(lab, tmp_path, rounds=6, size=20_000)
     assert group.carried_by == ("relay" if profile == "far" else "kernel")
     for direction, payload in ((group.up, 6 * 20_000), (group.down, 6 * 40_000)):
@@ -205,13 +199,13 @@ def test_ledger_and_interface_agree(tmp_path: Path, offer: Offer, profile: str) 
     assert (group.down.lost > 0) == (profile == "far")
     assert group.shortest_ms is None or group.shortest_ms >= 2 * (group.wanted_delay_ms - group.wanted_jitter_ms)
     report = as_json("x", (group,))
-    assert run_verdict(report) == "ledger and interface counters agree within 5 % for every vehicle"
+    assert run_verdict(report) == "ledger and interface counters agree within 5 % in every namespace"
     assert run_table(report).row_count == 2
 
 
-def test_a_vehicle_that_books_too_little_does_not_agree(tmp_path: Path, offer: Offer) -> None:
+def test_a_vehicle_that_books_too_little_does_not_agree(tmp_path: Path) -> None:
     groups = parse_groups(f"{profile_file(tmp_path, PROFILES)}:near:1")
-    with open_lab(own_name(), groups, offer) as lab:
+    with open_lab(own_name(), groups) as lab:
         with carried(lab):
             stream(lab.links[0], "up", 0.2)  # traffic that no ledger knows
         with sampling(lab) as seen:
@@ -223,9 +217,9 @@ def test_a_vehicle_that_books_too_little_does_not_agree(tmp_path: Path, offer: O
 
 
 @pytest.mark.slow
-def test_a_killed_relay_is_an_outage_that_the_bus_survives(tmp_path: Path, offer: Offer) -> None:
+def test_a_killed_relay_is_an_outage_that_the_bus_survives(tmp_path: Path) -> None:
     groups = parse_groups(f"{profile_file(tmp_path, PROFILES)}:far:1")
-    with open_lab(own_name(), groups, offer, relay_all=True) as lab:
+    with open_lab(own_name(), groups, relay_all=True) as lab:
         group = run_bus(lab, tmp_path, rounds=6, size=20_000, kill_relay=True)
     assert group.up.agrees, group.up
     assert group.down.interface_bytes > 6 * 40_000
