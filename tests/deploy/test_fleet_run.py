@@ -17,6 +17,7 @@ from tile_store.sqlite_store import SqliteStore
 
 pytestmark = pytest.mark.slow
 Start = Callable[..., Run]
+WAYS = ("up", "down")
 
 
 def final_map(folder: Path) -> dict[int, bytes]:
@@ -52,6 +53,10 @@ def test_a_run_ends_by_itself_with_a_full_account(start_run: Start) -> None:
     assert summary["updates_received"] >= summary["tiles_published"] > 0
     assert summary["changed_voxels"] > 0
     assert summary["traffic"]["down_wire_bytes"] > summary["traffic"]["down_bytes"] > 0
+    wires = {way: sum(x["wire_bytes"] for x in summary["traffic"]["by_kind"] if x["direction"] == way) for way in WAYS}
+    # The ledgers' last reading is that of the closing of the bus, a moment after the vehicles' results.
+    assert all(0 <= wires[way] - summary["traffic"][f"{way}_wire_bytes"] < 5000 for way in WAYS)
+    assert "Traffic of " in (run.folder / "traffic.html").read_text()
     assert summary["localisation_p95"]["lateral_m"] is not None
     assert summary["restarts"] == {}
     lines = [json.loads(line) for line in (run.folder / "updates.jsonl").read_text().splitlines()]
