@@ -9,11 +9,11 @@ from cloud_merger.ingest import Ingest
 from cloud_merger.ownership import Members
 from cloud_merger.reception import Reception
 from cloud_merger.short_reports import ShortReports
+from cloud_merger.warm import warm_up
 from cloud_merger.work import Worker
 from fleet_bus.bus import open_bus
 from fleet_bus.config import BusConfig
 from tile_store.sqlite_store import SqliteStore
-from tile_store.warm import warm_up
 
 __all__ = ["ShardConfig", "run_shard"]
 _LOG = logging.getLogger(__name__)
@@ -28,7 +28,7 @@ def run_shard(config: ShardConfig, stop: threading.Event) -> None:
         StoreError: the store cannot be opened or has failed.
         NoRouter: no router answers at the start.
     """
-    warm_up()  # or the first tile would wait for the codecs' kernels, and its lease with it
+    warm_up()  # or the first tile and the first report would wait for the kernels, and their leases with them
     bus_config = BusConfig(connect=config.connect, lease_ms=config.bus_lease_ms)
     with (
         SqliteStore(config.store_path, config.store, create=False) as store,

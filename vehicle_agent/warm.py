@@ -1,14 +1,21 @@
 """Compile or load every kernel that a vehicle uses, before processes are forked: each child then shares the pages."""
 
+from dataclasses import replace
+
 import numpy as np
 
 from gnd_map.accumulate import VoxelAccumulator
 from gnd_map.arrays import F64
+from gnd_map.classes import ChangeClass
+from gnd_map.codec import encode_mask
 from gnd_map.geodesy import LocalFrame
 from gnd_map.grid import GridFrame
 from gnd_map.tile import Tile
 from gnd_map.tile_id import TileId
+from gnd_map.track_builder import TrackBuilder
+from schemas.changes import ChangeReport, TileChange
 from schemas.drive import GnssFix, MotionSample, Scan
+from schemas.report_id import deterministic_report_id
 from vehicle_agent.detect.classify import classify, tile_change
 from vehicle_agent.detect.detector import ChangeDetector
 from vehicle_agent.local_map import LocalMap
@@ -16,6 +23,8 @@ from vehicle_agent.localise.estimates import PoseEstimate, RefinedScan
 from vehicle_agent.localise.localiser import Localiser
 from vehicle_agent.localise.rolling_map import RollingMap
 from vehicle_agent.localise.scan_odometry_parameters import ScanOdometryParameters
+from vehicle_agent.packing import pack, pack_measured
+from vehicle_agent.report import on_lattice
 from vehicle_agent.segment import MotionSegmenter
 
 _LIDAR_HEIGHT_M = 2.0
@@ -39,7 +48,19 @@ def warm_up() -> None:
     _segment(points, refined[-1].estimate if refined else None)
     detector.add_scan(points, np.array([0.0, 0.0, _LIDAR_HEIGHT_M]))
     for evidence in detector.finish(local_map.tiles).values():
-        tile_change(classify(evidence, detector.parameters))
+        _pack(tile_change(classify(evidence, detector.parameters)), evidence.base, points, frame)
+
+
+def _pack(change: TileChange, base: Tile, points_map_m: F64, frame: LocalFrame) -> None:
+    """Say in short that one voxel of a tile is as it was: the coders of flags, tiles, masks and Gaussians."""
+    one, tile = base.gaussians.take([0]), base.tile_id
+    kind, rays = np.array([ChangeClass.MODIFIED], np.uint8), np.zeros((1, 4), np.int32)
+    said = on_lattice(replace(change, observed=one.voxel_id, changed=one, change_class=kind, evidence=rays))
+    builder, bases = TrackBuilder(frame), {base.sha: base.gaussians}
+    builder.add_scan(0, points_map_m, np.array([0.0, 0.0, _LIDAR_HEIGHT_M]), np.eye(4))
+    report = ChangeReport(deterministic_report_id(0, "warm"), "warm", "", "", tile.district, 0, 0, (said,))
+    pack(report, bases, builder.track(tile.district, [tile])).encode()
+    pack_measured(report, bases, encode_mask(np.ones(1, np.bool_)))
 
 
 def _rolled(points_m: F64) -> None:

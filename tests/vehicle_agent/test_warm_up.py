@@ -14,6 +14,8 @@ PROGRAM = textwrap.dedent(
     from vehicle_agent.detect import kernel
     from vehicle_agent.warm import warm_up
     from vehicle_agent.localise import kernels, packed_scan, registration, rolling_kernels
+    from gnd_map.codec import kernels as coders
+    USED = ("code_bit", "code_bits", "code_flags", "code_plain", "code_voxels")
     before = len(kernel.cast_rays.signatures)
     warm_up()
     first = {k: len(v.signatures) for k, v in vars(kernel).items() if hasattr(v, "signatures")}
@@ -24,7 +26,7 @@ PROGRAM = textwrap.dedent(
         if hasattr(v, "signatures") and not k.startswith("_") and len(v.signatures) != 1
     ]
     print(json.dumps({
-        "cold": cold,
+        "cold": cold, "coders": [k for k in USED if len(getattr(coders, k).signatures) != 1],
         "before": before, "after": first["cast_rays"], "same": first == again, "threads": threading.active_count(),
         "modules": sorted({m.split(".")[0] for m in sys.modules} & {"sklearn", "matplotlib", "pandas", "rich"}),
         "stats": "scipy.stats" in sys.modules,
@@ -42,6 +44,7 @@ def test_warming_compiles_the_kernels_and_starts_nothing() -> None:
     assert found["after"] == 1, "the drive would compile another signature than the one that was warmed"
     assert found["same"]
     assert found["cold"] == [], "compiled on the road, or twice"
+    assert found["coders"] == [], "compiled when the first report is packed"
     assert found["threads"] == 1
     assert found["modules"] == []
     assert not found["stats"]

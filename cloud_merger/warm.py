@@ -1,0 +1,43 @@
+"""Compile or load the kernels of a shard before the first tile or report waits for them."""
+
+import numpy as np
+
+from gnd_map.classes import ChangeClass
+from gnd_map.codec import (
+    REPORT,
+    Flags,
+    decode_flags,
+    decode_mask,
+    decode_measured,
+    encode_flags,
+    encode_mask,
+    encode_measured,
+    snap,
+)
+from gnd_map.gaussian import Gaussians
+from gnd_map.tile_id import TileId
+from gnd_map.track import Piece, Track, View
+from gnd_map.visibility import observed_along
+from tile_store.warm import warm_up as warm_up_codecs
+
+_TILE = TileId(497353963154)
+
+
+def warm_up() -> None:
+    """Write and read a tiny tile and a tiny report in short; starts no thread and opens nothing."""
+    warm_up_codecs()
+    base = _base()
+    flags = [Flags(_TILE, base, base.voxel_id[:1], np.array([ChangeClass.MODIFIED], np.uint8))]
+    (found,) = decode_flags([(_TILE, base)], encode_flags(flags))
+    measured = encode_measured([(_TILE, base, base.take([0]))])
+    decode_measured([(_TILE, base, found.voxel_id)], measured)
+    decode_mask(encode_mask(np.array([True])), 1)
+    place = Piece(np.array([[32, 32, 4]], np.int32), 1)
+    observed_along(Track(_TILE.district, View((-8, -6, -4, -2, 0, 2, 4, 6, 8)), (place,)), [found])
+
+
+def _base() -> Gaussians:
+    """Two voxels of ground on the lattice on which reports travel."""
+    cov = np.tile(np.array([0.08, 0.0, 0.0, 0.08, 0.0, 0.0004], np.float32), (2, 1))
+    ids, count = np.array([0, 1], np.int32), np.array([40, 40], np.int32)
+    return snap(Gaussians(ids, count, count // 2, np.zeros((2, 3), np.float32), cov), REPORT)
