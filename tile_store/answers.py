@@ -60,40 +60,39 @@ class Answers:
     def many(self, layer: str, district: District, request: TilesRequest) -> TilesReply:
         """The answers about tiles of a district, those around `request.near` first while bytes are left.
 
+        A tile whose body is damaged is "later", so that it does not keep the others; alone it is an error.
+
         Raises:
             Refused: a tile cannot be written in a codec that the client reads.
             StoreError: the store has failed.
+            SchemaError: nothing but damaged bodies is left to send.
         """
+        tiles = request.tiles(district)
         heads = {entry.tile: entry for entry in self._store.heads(layer, district.path)}
         held = self._held(layer, district, request, heads)
-        answers: dict[TileId, TileAnswer] = {}
-        left = request.max_bytes
-        for tile in _nearest_first(request.tiles(district), district, request.near):
-            known = held[tile]
-            answers[tile] = self._answer(layer, tile, heads.get(tile), known, request.codecs if left > 0 else None)
-            left, answers[tile] = _within(left, request.max_bytes, answers[tile])
-        return TilesReply(tuple(answers[tile] for tile in request.tiles(district)))
+        answers = {tile: _without_body(heads.get(tile), held[tile]) for tile in tiles}
+        wanting = [tile for tile in tiles if answers[tile].status == "later"]
+        left, damaged = request.max_bytes, list[GndError]()
+        for tile in _nearest_first(wanting, district, request.near):
+            if left <= 0:
+                break
+            try:
+                answer = self._answer(layer, tile, held[tile] or b"", request.codecs)
+            except (SchemaError, CodecError) as error:
+                _LOG.error("tile %s cannot be sent: %s", tile, error)
+                damaged.append(error)
+                continue
+            left, answers[tile] = _within(left, request.max_bytes, answer)
+        if damaged and left == request.max_bytes:
+            raise damaged[0]
+        return TilesReply(tuple(answers.values()))
 
-    def _answer(
-        self, layer: str, tile: TileId, head: CatalogEntry | None, held: bytes | None, codecs: tuple[int, ...] | None
-    ) -> TileAnswer:
-        """The answer about a tile of which content `held` is held (b"": none, or not known to the store; None: the
-        client shall say which); codecs None = no bytes are left.
-        """
-        if head is None:
+    def _answer(self, layer: str, tile: TileId, held: bytes, codecs: tuple[int, ...]) -> TileAnswer:
+        """The newest version for a client that holds the content with this hash (b"": none that the store knows)."""
+        stored = self._store.get(layer, tile)
+        if stored is None:
             return TileAnswer("absent")
-        if held is None:
-            return TileAnswer("hash")
-        if held == head.sha:
-            return TileAnswer("unchanged")
-        stored = None if codecs is None else self._store.get(layer, tile)
-        if stored is None or codecs is None:
-            return TileAnswer("later")
-        try:
-            sent = self._sent(stored, self._by_sha(stored, held), codecs)
-        except (SchemaError, CodecError) as error:  # one damaged body must not keep the other tiles from all clients
-            _LOG.error("tile %s version %d cannot be sent: %s", tile, stored.version, error)
-            return TileAnswer("later")
+        sent = self._sent(stored, self._by_sha(stored, held), codecs)
         codec_id = sent.codec_id if sent.status == "blob" else 0
         return TileAnswer(sent.status, stored.version, stored.sha[:HASH_BYTES], codec_id, sent.body)
 
@@ -188,6 +187,15 @@ class Answers:
 def same_lattice(one: int, other: int) -> bool:
     """Whether two known codecs write the same lattice (or both floats)."""
     return lattice_of(one) is lattice_of(other)
+
+
+def _without_body(head: CatalogEntry | None, held: bytes | None) -> TileAnswer:
+    """What can be said of a tile without its body: "later" where that is wanted; `held` None = the client must say."""
+    if head is None:
+        return TileAnswer("absent")
+    if held is None:
+        return TileAnswer("hash")
+    return TileAnswer("unchanged" if held == head.sha else "later")
 
 
 def _nearest_first(tiles: Sequence[TileId], district: District, near: int | None) -> list[TileId]:

@@ -45,8 +45,9 @@ class Store(Protocol):
     def in_play(
         self, layer: str, tile: TileId, max_reports: int | None = None
     ) -> tuple[StoredTile | None, tuple[ReportRow, ...]]:
-        """A tile's epoch and the newest `max_reports` reports that count since, merged or not, sorted by report id; read
-        at one instant. No epoch: the map has no such tile.
+        """A tile's epoch and the newest `max_reports` reports that count since, merged or not, sorted by report id.
+
+        Both are read at one instant. No epoch: the map has no such tile.
         """
 
     def quarantine(self, body: bytes, reason: str, source: str = "") -> None:

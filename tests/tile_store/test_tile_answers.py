@@ -22,7 +22,7 @@ from gnd_map.codec import (
 from gnd_map.gaussian import Gaussians
 from gnd_map.tile import Tile
 from gnd_map.tile_id import TileId
-from schemas.errors import WrongHash
+from schemas.errors import SchemaError, WrongHash
 from schemas.tiles import TileRequest, tile_after, tile_of
 from schemas.tiles_batch import HeldTile, TileAnswer, TilesReply, TilesRequest, tile_of_answer
 from tile_store.answers import Answers, same_lattice
@@ -281,7 +281,9 @@ def test_one_damaged_body_does_not_keep_the_others(store: SqliteStore, caplog: p
     with caplog.at_level(logging.ERROR):
         found = asked(Answers(store), TilesRequest.of(held(a, b), codecs=(CODEC_FLOAT32,)))
     assert [found[tile].status for tile in (a, b)] == ["later", "blob"]
-    assert f"tile {a} version 2 cannot be sent" in caplog.text
+    assert f"tile {a} cannot be sent: " in caplog.text
+    with caplog.at_level(logging.CRITICAL), pytest.raises(SchemaError, match=f"tile {a} version 2"):
+        asked(Answers(store), TilesRequest.of(held(a), codecs=(CODEC_FLOAT32,)))
 
 
 # What is remembered
