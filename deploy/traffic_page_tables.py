@@ -1,5 +1,6 @@
 """The figures of the traffic page: cards, tables, and where the links' figures come from."""
 
+import itertools
 import math
 from collections.abc import Iterable, Sequence
 from html import escape
@@ -112,7 +113,12 @@ def sources(links: Sequence[LinkProfile]) -> str:
 
 
 def _source(link: LinkProfile) -> str:
-    told = (("Rates", link.rate_source), ("Delay", link.delay_source), ("Loss", link.loss_source))
+    told = (
+        ("Rates", link.rate_source),
+        ("Delay", link.delay_source),
+        ("Loss", link.loss_source),
+        ("Jitter", link.jitter_source),
+    )
     lines = [f"<dd>{what}: {escape(text)}</dd>" for what, text in told if text]
     return "".join(lines) or "<dd>The profile names no source.</dd>"
 
@@ -160,7 +166,18 @@ def _agent_row(agent: AgentTraffic) -> str:
 def _agent_kinds(agent: AgentTraffic) -> str:
     head = _head(("kind", "way"), ("messages", "kB", "kB/km", "wire kB", "wire kB/km"))
     table = _table(head, [f"<tr>{_kind_cells(line, agent.drive_km)}</tr>" for line in agent.lines])
-    return f"<details><summary>{escape(agent.agent)} by kind</summary>{table}</details>"
+    return f"<details><summary>{escape(agent.agent)} by kind and link</summary>{table}{_agent_links(agent)}</details>"
+
+
+def _agent_links(agent: AgentTraffic) -> str:
+    rows = []
+    for down, up in itertools.pairwise(agent.links):
+        if (down.direction, up.direction, down.link) == ("down", "up", up.link):
+            wait_s, tile_s = max(down.longest_wait_s, up.longest_wait_s), agent.tile_arrival_s.get(down.link)
+            shares = (f"{100 * down.share:.3g} %", f"{100 * up.share:.3g} %")
+            numbers = (*shares, f"{wait_s:.3f}", "–" if tile_s is None else f"{tile_s:.3f}")
+            rows.append(f'<tr><td class="t">{escape(down.link)}</td>{_cells(numbers)}</tr>')
+    return _table(_head(("link",), ("of down", "of up", "longest wait s", "a tile after s")), rows)
 
 
 def _head(texts: Sequence[str], numbers: Sequence[str]) -> str:

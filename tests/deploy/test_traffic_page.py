@@ -83,8 +83,21 @@ def test_the_page_holds_the_figures_of_the_account(tmp_path):
     # 20 kB payload down and 6 kB up over 4 km; 31 kB on the wire of which 26 are payload.
     for figure in ("5.00 kB/km", "1.50 kB/km", "23.0 kB", "8.0 kB", "16.1 %"):
         assert figure in read.words, figure
-    for word in ("tile", "change", "acks", "session", "3g", "690.47", "Ministry of Science", "car-2 by kind", "0.250"):
+    for word in (
+        "tile",
+        "change",
+        "acks",
+        "session",
+        "3g",
+        "690.47",
+        "Ministry of Science",
+        "car-2 by kind and link",
+        "Jitter: assumed",
+        "0.250",
+    ):
         assert word in read.words, word
+    # 11.5 kB in 100 s of 5.1 Mbit/s, 4 kB of 1.9 Mbit/s.
+    assert "3g 0.018 % 0.0168 %" in read.words
     assert read.count("rect") == len(TILES), "a square a tile"
     assert read.count("svg") == 3
 
