@@ -15,7 +15,7 @@ from gnd_map.gaussian import Gaussians
 from gnd_map.tile import Tile, TileDelta
 from gnd_map.tile_id import TileId
 from schemas.changes import ChangeAck, ChangeReport, TileChange
-from schemas.packed import PackedGaussians
+from schemas.packed import PackedGaussians, PackedReport, digest_of
 from schemas.report_id import deterministic_report_id
 from schemas.tiles import Catalog, CatalogEntry, CodedDelta, TileBlob, TileReply, TileRequest, blob_of
 from schemas.tiles_batch import TileAnswer, TilesReply, TilesRequest
@@ -156,6 +156,20 @@ GOLDEN: dict[str, Any] = {
     "ChangeAck-quarantined-without_id": ChangeAck("", "quarantined", "TileChange: 3 covariances are not positive"),
     "ChangeAck-wanted": ChangeAck(REPORT_ID, "wanted", wanted=b"not looked into"),
     "ChangeAck-resend": ChangeAck(REPORT_ID, "resend", "tile 13033/03021/23031/22102 has no version 9 here"),
+    "PackedReport-three_tiles": PackedReport(
+        report_id=REPORT_ID,
+        vehicle="car-1",
+        sensor_model="VLP-16",
+        software="gnd-fleet 0.1.0",
+        first_ns=1_700_000_000_000_000_000,
+        length_ns=12_300_000_000,
+        tiles=((0, 3), (17, 0), (1023, 2**31 - 1)),
+        base_digest=digest_of([SHA, b"", OTHER_SHA]),
+        flags=b"not looked into",
+        track=b"nor this",
+        pose_sigma_tenth_mm=312,
+        pose_sigma_10urad=107,
+    ),
     "PackedGaussians-some": PackedGaussians(REPORT_ID, b"not looked into", 0xDEADBEEF),
     "TileUpdate-merged-delta": update(),
     "TileUpdate-merged-coded_delta": update(delta=None, coded_delta=b"not looked into", put_voxels=2, removed_voxels=2),
@@ -178,6 +192,7 @@ KINDS: dict[str, Any] = {
         Catalog,
         ChangeReport,
         ChangeAck,
+        PackedReport,
         PackedGaussians,
         TileUpdate,
         TrafficSample,

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from schema_values import REPORT_ID, SHA, TILE, names, report, texts
+from schema_values import GOLDEN, REPORT_ID, SHA, TILE, names, report, texts
 
 from gnd_map.codec import encode_mask, encode_tiles
 from schemas import limits
@@ -19,24 +19,10 @@ from schemas.report_id import deterministic_report_id
 
 
 def packed(**values: Any) -> PackedReport:
-    plain: dict[str, Any] = {
-        "report_id": REPORT_ID,
-        "vehicle": "car-1",
-        "sensor_model": "VLP-16",
-        "software": "gnd-fleet 0.1.0",
-        "first_ns": 1_700_000_000_000_000_000,
-        "length_ns": 12_300_000_000,
-        "tiles": ((0, 3), (17, 0), (1023, 2**31 - 1)),
-        "base_digest": digest_of([SHA, b"", SHA]),
-        "flags": b"not looked into",
-        "track": b"nor this",
-        "pose_sigma_tenth_mm": 312,
-        "pose_sigma_10urad": 107,
-    }
-    return PackedReport(**(plain | values))
+    return dataclasses.replace(GOLDEN["PackedReport-three_tiles"], **values)
 
 
-HALF = PackedGaussians(REPORT_ID, b"not looked into", 0xDEADBEEF)
+HALF: PackedGaussians = GOLDEN["PackedGaussians-some"]
 
 
 def as_message(value: PackedReport | PackedGaussians) -> change_report_pb2.ChangeReport:
