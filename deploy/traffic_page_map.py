@@ -12,6 +12,7 @@ from gnd_map.tile_id import TileId
 _SIZE: Final = 420.0
 _LEAST_PX: Final = 2.0
 _FAINTEST: Final = 0.12
+_MOST_ROWS: Final = 200
 
 
 def tile_map(tiles: Sequence[TileTraffic]) -> str:
@@ -19,7 +20,7 @@ def tile_map(tiles: Sequence[TileTraffic]) -> str:
     placed = [(tile, place) for tile in tiles if (place := _tile_id(tile.tile)) is not None]
     if not placed:
         return '<p class="note">No message of this run was about a tile.</p>'
-    return _figure(placed)
+    return _figure(placed) + _table([tile for tile, _ in placed])
 
 
 def _tile_id(path: str) -> TileId | None:
@@ -50,11 +51,25 @@ def _figure(placed: list[tuple[TileTraffic, TileId]]) -> str:
     return _drawing("".join(rectangles), wide, high, [tile for tile, _ in placed])
 
 
+def _table(tiles: list[TileTraffic]) -> str:
+    """The same in figures, for readers who cannot hover: the tiles with the most bytes."""
+    most = sorted(tiles, key=lambda tile: (-tile.down_wire_bytes, tile.tile))[:_MOST_ROWS]
+    rows = "".join(
+        f'<tr><td class="t">{tile.tile}</td><td>{tile.down_bytes / 1000:.1f}</td>'
+        f"<td>{tile.down_wire_bytes / 1000:.1f}</td><td>{tile.up_wire_bytes / 1000:.1f}</td></tr>"
+        for tile in most
+    )
+    head = '<tr><th class="t">tile</th><th>down kB</th><th>wire down kB</th><th>wire up kB</th></tr>'
+    which = "The tiles" if len(most) == len(tiles) else f"The {len(most)} tiles with the most bytes, of {len(tiles)}"
+    table = f'<div class="wide"><table><thead>{head}</thead><tbody>{rows}</tbody></table></div>'
+    return f"<details><summary>{which} in figures</summary>{table}</details>"
+
+
 def _drawing(content: str, wide: float, high: float, tiles: list[TileTraffic]) -> str:
     sizes = sorted(tile.down_wire_bytes for tile in tiles)
     text = (
         f"{len(tiles)} tiles, north up. Down on the wire, all vehicles together: {size_text(sizes[0])} (faint) to "
-        f"{size_text(sizes[-1])} (full), {size_text(sizes[len(sizes) // 2])} in the middle. Hover for a tile's own."
+        f"{size_text(sizes[-1])} (full), {size_text(sizes[len(sizes) // 2])} in the middle."
     )
     return (
         f'<figure><svg class="map" viewBox="-2 -2 {wide + 4:.0f} {high + 4:.0f}" role="img" aria-label="map of tiles">'
