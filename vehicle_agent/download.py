@@ -212,6 +212,7 @@ class TileFetcher:
     def _settle(self, fetched: Fetched) -> None:
         tile_id = fetched.tile_id
         del self._wrong[tile_id]
+        self._not_before.pop(tile_id, None)
         self.counts[fetched.status] += 1
         self._answered.add(tile_id)
         self._arrived.append(fetched)

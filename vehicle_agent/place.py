@@ -45,9 +45,8 @@ class Place:
     def course(self) -> Course:
         """Where the vehicle goes; in reverse gear the way that it came."""
         x_m, y_m = self.position_map_m[:2].tolist()
-        back_rad = math.pi if self.speed_mps < 0 else 0.0
-        heading_rad = None if self.heading_rad is None else self.heading_rad + back_rad
-        return Course(x_m, y_m, heading_rad, abs(self.speed_mps))
+        course_rad = None if self.heading_rad is None else self.heading_rad + self._back_rad
+        return Course(x_m, y_m, course_rad, abs(self.speed_mps))
 
     def ahead_map_m(self, distance_m: float) -> F64:
         """(2, 3) here and `distance_m` farther along the course; (1, 3) while the heading is not known."""
@@ -56,6 +55,11 @@ class Place:
             return self.position_map_m[None]
         step = distance_m * np.array([math.cos(heading_rad), math.sin(heading_rad), 0.0])
         return np.stack([self.position_map_m, self.position_map_m + step])
+
+    @property
+    def _back_rad(self) -> float:
+        """From where the vehicle points to where it goes."""
+        return math.pi if self.speed_mps < 0 else 0.0
 
     @property
     def height_m(self) -> float:
@@ -79,7 +83,8 @@ class Place:
         self.position_map_m = self._enu(fix)
         step = self.position_map_m - self._fix_map_m
         if math.hypot(step[0], step[1]) > HEADING_BASE_M:
-            self.heading_rad = math.atan2(step[1], step[0])
+            course_rad = math.atan2(step[1], step[0])
+            self.heading_rad = course_rad + self._back_rad
             self._fix_map_m = self.position_map_m
 
     def _enu(self, fix: GnssFix) -> F64:

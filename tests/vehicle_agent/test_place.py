@@ -57,3 +57,16 @@ def test_the_odometer_counts_way_in_both_directions_but_no_gaps() -> None:
         place.take(MotionSample(int(t_s * SECOND), speed, 0.0), None)
     assert place.odometer_m == pytest.approx(0.5 * 10 + 0.5 * 2 + 1.0 * 10)
     assert place.t_ns == 31 * SECOND
+
+
+def test_in_reverse_gear_the_course_is_where_the_vehicle_goes() -> None:
+    place = Place(FRAME, fix(0, 0, 0))
+    assert place.course.heading_rad is None
+    place.take(MotionSample(0, -2.0, 0.0), None)
+    place.take(fix(4, 8, 0), None)  # satellites tell the way, wheels that it was driven backwards
+    assert math.cos(place.heading_rad or 0.0) == pytest.approx(-1.0)
+    assert math.cos(place.course.heading_rad or 0.0) == pytest.approx(1.0)
+    np.testing.assert_allclose(place.ahead_map_m(10.0)[1], [18, 0, 30], atol=0.1)
+    assert (place.course.x_m, place.course.speed_mps) == (pytest.approx(8.0, abs=1e-3), 2.0)
+    place.take(MotionSample(SECOND, 3.0, 0.0), estimate(8, 0, math.pi, "good"))
+    assert math.cos(place.course.heading_rad or 0.0) == pytest.approx(-1.0)
