@@ -23,7 +23,11 @@ UPLOADED: Codec = "points"
 
 def write_cloud(world: World, path: Path) -> None:
     """Make the baseline's map of the state before and write it; the file appears complete or not at all."""
-    cloud = base_pcd(world)
+    keep_cloud(base_pcd(world), path)
+
+
+def keep_cloud(cloud: PcdMap, path: Path) -> None:
+    """Write a cloud; the file appears complete or not at all."""
     frame = cloud.frame
     partial = path.with_name(f".{path.name}.part")
     with partial.open("wb") as file:

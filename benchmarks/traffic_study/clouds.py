@@ -3,15 +3,20 @@
 import io
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
 from importlib import import_module
+from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
 
 from benchmarks.pcd.points import PcdMap, base_pcd, downsample
 from benchmarks.simulation.base_map import mapping_points
+from benchmarks.simulation.baseline import keep_cloud, read_cloud
+from benchmarks.simulation.errors import FolderError
 from benchmarks.simulation.options import Base
+from benchmarks.simulation.sources import PCD, SIMULATOR, key_of, sources_sha
 from benchmarks.traffic_study.errors import TrafficError
 from benchmarks.traffic_study.pcd_file import pcd_binary, pcd_compressed
+from fleet_sim.truth import world_sha
 from fleet_sim.world import World
 from gnd_map.arrays import F32, F64, I64
 from gnd_map.tile_id import TileId, morton_of
@@ -30,6 +35,21 @@ def street_cloud(world: World, base: Base) -> PcdMap:
         return base_pcd(world, leaves=LEAVES)
     grid_frame = PcdMap(np.empty((0, 3), np.float32), world.frame).grid_frame
     return PcdMap(downsample(_joined(mapping_points(world)), grid_frame, LEAVES), world.frame)
+
+
+def kept_cloud(world: World, base: Base, path: Path) -> PcdMap:
+    """`street_cloud`, made once and kept in a file; made again when the programs that make it have changed."""
+    key = key_of(world=world_sha(world), base=base, sources=sources_sha((*SIMULATOR, *PCD)), leaves=LEAVES)
+    key_file = path.with_suffix(".key")
+    try:
+        if key_file.read_text(encoding="utf-8") == key:
+            return read_cloud(path)
+    except (FolderError, OSError):
+        pass
+    cloud = street_cloud(world, base)
+    keep_cloud(cloud, path)
+    key_file.write_text(key, encoding="utf-8")
+    return cloud
 
 
 def _joined(scans: Iterable[F64]) -> Iterator[F64]:

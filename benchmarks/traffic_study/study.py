@@ -12,7 +12,7 @@ from benchmarks.simulation.base_map import read_base
 from benchmarks.simulation.folder import RunFolder
 from benchmarks.simulation.pool import Job, run_jobs
 from benchmarks.simulation.worlds import WorldFiles, prepare_cloud, prepare_world, world_files
-from benchmarks.traffic_study.clouds import Written, cloud_sizes, points_by_tile, street_cloud
+from benchmarks.traffic_study.clouds import Written, cloud_sizes, kept_cloud, points_by_tile
 from benchmarks.traffic_study.download import (
     Question,
     Server,
@@ -137,7 +137,7 @@ def download(options: TrafficOptions, files: WorldFiles, fleet: FleetOutcome) ->
     returned = _drive(track, link, files.home / "maps.sqlite", published, changed, held=held)
     after = _drive(track, link, files.home / "maps.sqlite", published, fleet.final.tiles, held=held)
     tiles = [tile for tile in fetched_tiles(ours) if tile in base]
-    points = points_by_tile(street_cloud(world, options.base), tiles)
+    points = points_by_tile(kept_cloud(world, options.base, files.home / f"street-cloud-{options.base}.npz"), tiles)
     return DownloadOutcome(
         track=track,
         voxels={tile: len(base[tile]) for tile in tiles},
