@@ -115,9 +115,9 @@ class Surroundings:
 
     def _in_time(self) -> list[Need]:
         link = self._fetcher.link
-        if link.is_unlimited:
-            return self._plan
         rate_byte_s = self._parameters.link_share * link.rate_byte_s("down")
+        if math.isinf(rate_byte_s):
+            return self._plan
         return in_time(self._plan, self._fetcher.size_bytes, rate_byte_s, link.delay_s)
 
     def _let_go(self, here: F64) -> None:

@@ -112,7 +112,7 @@ def test_what_is_ahead_is_asked_for_together(scene: Scene) -> None:
 def test_a_paced_drive_asks_for_what_its_link_brings_in_time(
     endpoint: str, cloud: Bus, tmp_path: Path, rate_bit_s: float, all_of_them: bool
 ) -> None:
-    link = LinkProfile("slow", down_bit_s=rate_bit_s, up_bit_s=1e6, delay_ms=20.0)
+    link = LinkProfile("slow", down_bit_s=rate_bit_s, up_bit_s=1e6, delay_ms=20.0, paced=False)
     with open_bus(BusConfig(connect=(endpoint,), link=link)) as bus:
         fetcher = TileFetcher(bus, TileCache(tmp_path / "cache.sqlite"), replace(PARAMETERS, in_flight=1))
         local_map = LocalMap(GRID_FRAME)
