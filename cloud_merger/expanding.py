@@ -21,7 +21,7 @@ from gnd_map.gaussian import Gaussians, concat
 from gnd_map.grid import VoxelGrid
 from gnd_map.tile import Tile
 from gnd_map.tile_id import District, TileId
-from gnd_map.track import decode_track
+from gnd_map.track import Track, decode_track
 from gnd_map.visibility import observed_along
 from schemas import limits
 from schemas.changes import ChangeReport, TileChange
@@ -61,6 +61,7 @@ def expand(packed: PackedReport, layer: str, district: District, bases: Sequence
         flags = decode_flags([(tile.tile_id, tile.gaussians) for tile in bases], packed.flags)
         track = decode_track(district, packed.track)
         _check_flags(packed.report_id, flags)
+        _check_way(packed.report_id, track)
         observed = observed_along(track, flags)
     except (CodecError, ConfigError, ShapeError, TrackError) as error:
         raise BadReport(f"report {packed.report_id} in {len(packed.flags)} bytes of flags: {error}") from error
@@ -78,6 +79,14 @@ def expand(packed: PackedReport, layer: str, district: District, bases: Sequence
         ),
         layer=layer,
     )
+
+
+def _check_way(report_id: str, track: Track) -> None:
+    if track.way_m > limits.MAX_WAY_OF_REPORT_M:
+        raise BadReport(
+            f"report {report_id} rests on {track.way_m:.0f} m of way, the limit is {limits.MAX_WAY_OF_REPORT_M:g} m: "
+            f"such a report is read whole only"
+        )
 
 
 def _check_flags(report_id: str, flags: Sequence[Flags]) -> None:

@@ -15,7 +15,7 @@ import numpy as np
 from cloud_merger.errors import BadReport, MergerError, NotUnderstood
 from cloud_merger.parameters import MergeParameters
 from cloud_merger.short_reports import ShortReports
-from cloud_merger.waiting import WaitingLimits
+from cloud_merger.waiting import Waiting, WaitingLimits
 from cloud_merger.wants import WantParameters
 from gnd_map.tile_id import LAT_TILES, LON_TILES, District, TileId
 from schemas.changes import ChangeAck, ChangeReport, TileChange, split
@@ -101,24 +101,32 @@ class Ingest:
     def _answer(self, key: str, upload: ChangeReport | PackedReport | PackedGaussians) -> ChangeAck:
         if isinstance(upload, ChangeReport):
             return self._checked_and_kept(key, upload)
+        if isinstance(upload, PackedReport):
+            return self._first_half(key, upload)
         if self._short.room.has_finished(upload.report_id):
             return ChangeAck(upload.report_id, "duplicate")
-        if isinstance(upload, PackedGaussians):
-            return self._checked_and_kept(key, self._short.completed(key, upload))
-        return self._first_half(key, upload)
+        return self._checked_and_kept(key, self._short.completed(key, upload))
 
     def _first_half(self, key: str, packed: PackedReport) -> ChangeAck:
-        held = self._short.waits(key, packed)
-        if held is None:
-            report = self._short.expanded(key, packed)
-            self._check(key, report)
-            held = self._short.hold(key, packed, report)
+        held = self._understood(key, packed)
         if held is None:
             self._short.room.finish(packed.report_id)
             return ChangeAck(packed.report_id, "duplicate")
         if held.mask.any():
             return ChangeAck(packed.report_id, "wanted", wanted=held.encoded)
         return self._keep(held.report)
+
+    def _understood(self, key: str, packed: PackedReport) -> Waiting | None:
+        """What is asked for, perhaps nothing; None: the report is durable already."""
+        with self._short.one_at_a_time:
+            if self._short.room.has_finished(packed.report_id):
+                return None
+            held = self._short.waits(key, packed)
+            if held is not None:
+                return held
+            report = self._short.expanded(key, packed)
+            self._check(key, report)
+            return self._short.hold(key, packed, report)
 
     def _checked_and_kept(self, key: str, report: ChangeReport) -> ChangeAck:
         self._check(key, report)

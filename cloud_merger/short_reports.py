@@ -25,7 +25,10 @@ _NO_BASE: Final = b""
 
 
 class ShortReports:
-    """Understands the halves of packed reports. Safe to call from several threads; one expands at a time.
+    """Understands the halves of packed reports. Safe to call from several threads.
+
+    First halves are to be understood one at a time, under `one_at_a_time`: that bounds the memory which looking along
+    tracks takes, and a vehicle that asks again while its report is worked on costs nothing.
 
     Args:
         store: of tiles and reports.
@@ -38,7 +41,7 @@ class ShortReports:
         self.room = WaitingRoom(waiting)
         self._store, self._merge, self._want = store, merge, want
         self._bases = Bases(store)
-        self._expanding = Lock()  # bounds the memory that looking along tracks takes
+        self.one_at_a_time = Lock()
 
     def expanded(self, key: str, packed: PackedReport) -> ChangeReport:
         """The report that the flags stand for, all Gaussians withheld.
@@ -48,15 +51,14 @@ class ShortReports:
             BadReport, SchemaError: the flags cannot be a report.
         """
         layer, district = parse_change_key(key)
-        with self._expanding:
-            try:
-                return expand(packed, layer, district, self._tiles(key, packed))
-            except MissingBase:
-                self._bases.forget()  # a version's number may have been given again
-                return expand(packed, layer, district, self._tiles(key, packed))
+        try:
+            return expand(packed, layer, district, self._tiles(key, packed))
+        except MissingBase:
+            self._bases.forget()  # a version's number may have been given again
+            return expand(packed, layer, district, self._tiles(key, packed))
 
     def hold(self, key: str, packed: PackedReport, report: ChangeReport) -> Waiting | None:
-        """Decide which Gaussians of the expanded report are wanted, and keep it while they are awaited.
+        """Decide which Gaussians of the expanded report are wanted, and keep it until it is durable.
 
         Returns:
             What is asked for, perhaps nothing; None: the report is durable already.
@@ -66,8 +68,7 @@ class ShortReports:
             return None
         mask = wanted(report, known, self._merge, self._want)
         waiting = Waiting(key, packed, report, mask, encode_mask(mask), asked_voxels(report, mask))
-        if mask.any():
-            self.room.hold(waiting)
+        self.room.hold(waiting)
         return waiting
 
     def waits(self, key: str, packed: PackedReport) -> Waiting | None:

@@ -38,6 +38,7 @@ _LOWEST, _HIGHEST = (-_MARGIN, -_MARGIN, -2_000), (32 * STEPS + _MARGIN, 32 * ST
 _VIEW: Final = struct.Struct(f"<{LEVELS}bHBB")
 _CRC: Final = struct.Struct("<H")
 _MAX_VARINT_BYTES: Final = 4
+_LONGEST_UNIT_M: Final = 0.6
 
 
 @dataclass(frozen=True, slots=True)
@@ -131,6 +132,14 @@ class Track:
     def scans(self) -> int:
         """Scans that counted."""
         return sum(piece.scans for piece in self.pieces)
+
+    @property
+    def way_m(self) -> float:
+        """Length of all pieces together, at most: a unit is nowhere longer than at the equator."""
+        units = [
+            np.linalg.norm(np.diff(piece.vertices.astype(np.float64), axis=0), axis=1).sum() for piece in self.pieces
+        ]
+        return float(sum(units)) * _LONGEST_UNIT_M
 
     def tile_coordinates(self, piece: Piece) -> F64:
         """(N, 3) float64 of a piece's vertices: continuous tile coordinates (u, v) of `tile_id`, height in metres.

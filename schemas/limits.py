@@ -40,6 +40,8 @@ MAX_OBSERVED_OF_REPORT: Final = 8 * MIB
 
 # Flags of a packed report: each becomes a statement that is kept and merged.
 MAX_FLAGS_OF_REPORT: Final = 256 * KIB
+# Way of a packed report's track: the cloud looks along all of it.
+MAX_WAY_OF_REPORT_M: Final = 3_000.0
 # Bits of a mask in an ack, were it not compressed at all.
 MAX_WANTED_BYTES: Final = MAX_FLAGS_OF_REPORT // 8 + KIB
 

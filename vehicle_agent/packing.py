@@ -16,6 +16,7 @@ from gnd_map.codec import Flags, decode_mask, encode_flags, encode_measured
 from gnd_map.gaussian import Gaussians
 from gnd_map.tile_id import TileId
 from gnd_map.track import Track, encode_track
+from schemas import limits
 from schemas.changes import ChangeReport, TileChange
 from schemas.packed import PackedGaussians, PackedReport, crc_of, digest_of
 from vehicle_agent.errors import PackingError
@@ -36,9 +37,11 @@ def pack(report: ChangeReport, bases: Bases, track: Track) -> PackedReport:
         track: where the vehicle was while the scans counted that the report rests on.
 
     Raises:
-        PackingError: a base is missing, or a changed voxel is of another class.
+        PackingError: a base is missing, a changed voxel is of another class, or the track is too long.
         CodecError: the flags cannot be coded.
     """
+    if track.way_m > limits.MAX_WAY_OF_REPORT_M:
+        raise PackingError(f"{track.way_m:.0f} m of way in one report, the limit is {limits.MAX_WAY_OF_REPORT_M:g} m")
     return PackedReport(
         report_id=report.report_id,
         vehicle=report.vehicle,

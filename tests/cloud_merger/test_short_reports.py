@@ -1,6 +1,7 @@
 """Reports in short: what a vehicle packs is what the cloud stores; nothing is kept by halves; bad halves are named."""
 
 import dataclasses
+import random
 import threading
 
 import numpy as np
@@ -17,6 +18,7 @@ from gnd_map.classes import ChangeClass
 from gnd_map.codec import decode_mask, encode_flags, encode_mask
 from gnd_map.gaussian import Gaussians
 from gnd_map.tile_id import District, TileId
+from gnd_map.track import Piece, encode_track
 from schemas.changes import ChangeAck, ChangeReport
 from schemas.keys import change_key
 from schemas.packed import PackedGaussians, PackedReport, crc_of, decode_upload
@@ -24,6 +26,10 @@ from tile_store.errors import StoreClosed
 from tile_store.sqlite_store import SqliteStore
 from vehicle_agent.packing import askable, pack, pack_measured
 
+# Back and forth through the district; its ends are near enough.
+LONG = dataclasses.replace(
+    track_by(), pieces=(Piece(np.tile(np.array([[0, 0, 4], [2000, 0, 4]], np.int32), (3, 1)), 100),)
+)
 REPORT = drive_number(1, new={3: POLE, 4: BALL}, modified={1: WALL_AGAIN}, deleted=(2,))
 PACKED = packed_of(REPORT)
 
@@ -174,6 +180,8 @@ def test_a_report_over_two_tiles_is_asked_about_in_their_order(store, ingest):
         (changed(PACKED, track=b""), "track"),
         (changed(PACKED, track=decode_upload(PACKED).track[:-1]), "track"),
         (changed(PACKED, pose_sigma_tenth_mm=8_000), "pose known to 0.8 m"),
+        (changed(PACKED, track=encode_track(LONG)), "m of way, the limit is 3000 m"),
+        (packed_of(drive_number(1, new={3: POLE, 800 * 39 * 39: POLE})), "the limit is 400 floors"),
     ],
 )
 def test_a_bad_first_half_is_quarantined_with_its_reason_and_nothing_else_is_touched(store, ingest, payload, reason):
@@ -264,6 +272,25 @@ def test_a_store_that_fails_gives_no_ack_and_the_halves_may_come_again(tmp_path,
         assert again.counts().report_rows == 0
         fresh = ingest_of(again)
         assert fresh.answer(KEY, second_half(REPORT, fresh.answer(KEY, PACKED))).status == "stored"
+
+
+def test_damaged_halves_are_refused_or_asked_for_again_and_nothing_is_stored_of_them(store):
+    ingest, rng = ingest_of(store), random.Random(5)
+    half = second_half(REPORT, ingest.answer(KEY, PACKED))
+    for number in range(400):
+        data = bytearray((PACKED, half)[number % 2])
+        for _ in range(rng.randint(1, 3)):
+            at = rng.randrange(len(data))
+            match rng.randrange(3):
+                case 0:
+                    data[at] ^= 1 << rng.randrange(8)
+                case 1:
+                    del data[at : at + rng.randint(1, 5)]
+                case _:
+                    data[at:at] = rng.randbytes(rng.randint(1, 5))
+        ack = ingest.answer(KEY, bytes(data))
+        assert ack.status in ("quarantined", "resend", "wanted"), bytes(data).hex()
+    assert store.counts().report_rows == 0
 
 
 def test_many_vehicles_may_send_halves_at_once(store, ingest):
