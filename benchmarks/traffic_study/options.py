@@ -66,7 +66,7 @@ class TrafficOptions:
     traffic: bool = True
     poses: PoseSource = field(default_factory=PoseSource)
     base: Base = "surveyed"
-    pcd_drives: int = 8
+    pcd_drives: int = 4
     f1_drives: int = 8
     scans: int | None = None
     method: MethodParameters = field(default_factory=MethodParameters)
