@@ -31,7 +31,7 @@ class StreetKind:
 
 
 STREETS: Final[Mapping[str, StreetKind]] = MappingProxyType(
-    {"usual": StreetKind(800.0, 0.06, 0.05), "rebuilt": StreetKind(400.0, 1.0, 0.2)}
+    {"usual": StreetKind(800.0, 0.04, 0.05), "rebuilt": StreetKind(400.0, 1.0, 0.2)}
 )
 """usual: a drive reports about as many changes a km as the GND paper's uploads hold (docs/traffic.md); rebuilt: a fifth
 of the street has changed, as for the scores of change detection."""
