@@ -30,7 +30,11 @@ from schemas.wire import (
 )
 
 HASH_BYTES: Final = 8
-"""So much of a content's hash tells it from another: chance errs once in 10^19; a client keeps the whole hash."""
+"""So much of a hash, or of a digest of hashes, says what a client holds: chance errs once in 10^19."""
+ANSWER_HASH_BYTES: Final = 4
+"""So much of a hash goes with what is brought. Bodies have checksums of their own, the base of a delta is agreed upon
+in the request, and the next request's digest is made of whole hashes: what slips through is found then.
+"""
 EVERY_CODEC: Final = (4, 3, 2, 7, 6, 5, 1, 0)
 """What a request means that names no codecs; frozen, whatever later programs read besides."""
 MAX_HELD_VERSION: Final = 2**31
@@ -140,7 +144,7 @@ class TilesRequest:
         return cls(
             wanted=wanted,
             held_digest=message.held_digest,
-            held_hashes=tuple(_cut("TilesRequest", message.held_hashes)),
+            held_hashes=tuple(_cut("TilesRequest", message.held_hashes, HASH_BYTES)),
             codecs=tuple(message.codecs) or EVERY_CODEC,
             max_bytes=message.max_bytes or limits.MAX_TILE_BODY_BYTES,
             near=message.near if message.HasField("near") else None,
@@ -184,10 +188,10 @@ def _check_held(request: TilesRequest) -> None:
         )
 
 
-def _cut(name: str, hashes: bytes) -> Iterator[bytes]:
-    if len(hashes) % HASH_BYTES:
-        raise BadValue(f"{name} with hashes of {len(hashes)} bytes, not a multiple of {HASH_BYTES}")
-    return (hashes[at : at + HASH_BYTES] for at in range(0, len(hashes), HASH_BYTES))
+def _cut(name: str, hashes: bytes, each: int) -> Iterator[bytes]:
+    if len(hashes) % each:
+        raise BadValue(f"{name} with hashes of {len(hashes)} bytes, not a multiple of {each}")
+    return (hashes[at : at + each] for at in range(0, len(hashes), each))
 
 
 @dataclass(frozen=True, slots=True)
@@ -200,7 +204,7 @@ class TileAnswer:
     version: int = 0
     """New version of a blob or delta; else 0."""
     sha: bytes = b""
-    """First 8 bytes of the hash of a blob's or delta's content; else empty."""
+    """First 4 bytes of the hash of a blob's or delta's content; else empty."""
     codec_id: int = 0
     """Codec of a blob; else 0."""
     body: bytes = b""
@@ -212,7 +216,7 @@ class TileAnswer:
         if self.status in _WITH_BODY:
             check_version("tile version", self.version, lowest=1)
             check_version("codec id", self.codec_id, lowest=0)
-            good = len(self.sha) == HASH_BYTES and (self.status == "blob" or self.codec_id == 0)
+            good = len(self.sha) == ANSWER_HASH_BYTES and (self.status == "blob" or self.codec_id == 0)
         else:
             good = (self.version, self.sha, self.codec_id, self.body) == (0, b"", 0, b"")
         if not good:
@@ -311,7 +315,7 @@ def _statuses(runs: Sequence[int]) -> list[AnswerStatus]:
 def _answers(message: tiles_reply_pb2.TilesReply) -> Iterator[TileAnswer]:
     statuses = _statuses(message.runs)
     n_brought, n_blobs = sum(s in _WITH_BODY for s in statuses), statuses.count("blob")
-    hashes = list(_cut("TilesReply", message.hashes))
+    hashes = list(_cut("TilesReply", message.hashes, ANSWER_HASH_BYTES))
     counts = (len(message.versions), len(hashes), len(message.bodies), len(message.codecs))
     if counts != (n_brought, n_brought, n_brought, n_blobs):
         raise BadValue(

@@ -18,7 +18,7 @@ from gnd_map.tile_id import District, TileId
 from schemas.errors import SchemaError
 from schemas.limits import MAX_TILE_BODY_BYTES
 from schemas.tiles import CatalogEntry, CodedDelta, TileBlob, TileReply, TileRequest
-from schemas.tiles_batch import HASH_BYTES, TileAnswer, TilesReply, TilesRequest, digest_of, index_of
+from schemas.tiles_batch import ANSWER_HASH_BYTES, TileAnswer, TilesReply, TilesRequest, digest_of, index_of
 from tile_store.memory import Memory
 from tile_store.store import Store
 from tile_store.values import StoredTile
@@ -94,7 +94,7 @@ class Answers:
             return TileAnswer("absent")
         sent = self._sent(stored, self._by_sha(stored, held), codecs)
         codec_id = sent.codec_id if sent.status == "blob" else 0
-        return TileAnswer(sent.status, stored.version, stored.sha[:HASH_BYTES], codec_id, sent.body)
+        return TileAnswer(sent.status, stored.version, stored.sha[:ANSWER_HASH_BYTES], codec_id, sent.body)
 
     # What the client holds
 

@@ -71,7 +71,7 @@ class TilesReply(_message.Message):
     major: _builtins.int
     """Major version of this message; always 1."""
     hashes: _builtins.bytes
-    """First 8 bytes of the SHA-256 of the new content of each blob and delta, in order."""
+    """First 4 bytes of the SHA-256 of the new content of each blob and delta, in order."""
     @_builtins.property
     def runs(self) -> _containers.RepeatedScalarFieldContainer[_builtins.int]:
         """The statuses in runs of equal ones: 8 x length + status."""

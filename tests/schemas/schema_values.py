@@ -138,8 +138,8 @@ GOLDEN: dict[str, Any] = {
         (
             TileAnswer("unchanged"),
             TileAnswer("unchanged"),
-            TileAnswer("delta", 4, OTHER_SHA[:8], 0, b"not looked into"),
-            TileAnswer("blob", 7, SHA[:8], 0, encode_gaussians(gaussians([-604, 0]))),
+            TileAnswer("delta", 4, OTHER_SHA[:4], 0, b"not looked into"),
+            TileAnswer("blob", 7, SHA[:4], 0, encode_gaussians(gaussians([-604, 0]))),
             TileAnswer("absent"),
             TileAnswer("hash"),
             TileAnswer("later"),

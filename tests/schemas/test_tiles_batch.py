@@ -28,7 +28,7 @@ from schemas.updates import TileUpdate, updated
 
 DISTRICT = TILE.district
 DELTA = encode_delta(TILE, HELD.gaussians, NEXT.gaussians)
-HASH = NEXT.sha[:8]
+HASH = NEXT.sha[:4]
 ALL_TILES = encode_tiles([(k, 1) for k in range(1024)])
 
 
@@ -48,7 +48,7 @@ def any_answer(draw: Any) -> TileAnswer:
     if status not in ("blob", "delta"):
         return TileAnswer(status)
     codec = draw(st.integers(0, 2**32 - 1)) if status == "blob" else 0
-    return TileAnswer(status, draw(versions), draw(shas)[:8], codec, draw(st.binary(max_size=40)))
+    return TileAnswer(status, draw(versions), draw(shas)[:4], codec, draw(st.binary(max_size=40)))
 
 
 @given(helds, st.booleans(), st.integers(1, limits.MAX_TILE_BODY_BYTES), st.none() | st.integers(0, 1023))
@@ -88,7 +88,7 @@ def test_a_hundred_unchanged_tiles_cost_less_than_half_a_bit_each() -> None:
 def test_a_delta_in_a_reply_costs_little_more_than_itself() -> None:
     alone = len(TilesReply((TileAnswer("unchanged"),)).encode())
     more = TilesReply((TileAnswer("unchanged"), *[TileAnswer("delta", 4, HASH, 0, DELTA)] * 20)).encode()
-    assert len(more) - alone <= 20 * (len(DELTA) + 12) + 8
+    assert len(more) - alone <= 20 * (len(DELTA) + 8) + 8
 
 
 # What comes out
@@ -119,7 +119,7 @@ def test_a_delta_against_other_content_is_a_wrong_hash() -> None:
     with pytest.raises(WrongHash, match="fetch"):
         tile_after(delta, other)
     with pytest.raises(WrongHash, match="fetch"):
-        tile_of_answer(TILE, TileAnswer("delta", 4, OTHER_SHA[:8], 0, DELTA), HELD)
+        tile_of_answer(TILE, TileAnswer("delta", 4, OTHER_SHA[:4], 0, DELTA), HELD)
     with pytest.raises(WrongHash, match="nothing is held"):
         tile_of_answer(TILE, TileAnswer("delta", 4, HASH, 0, DELTA))
     with pytest.raises(WrongHash, match=f"is not for tile {TILE}"):
@@ -237,7 +237,7 @@ def reply_bytes(**fields: Any) -> bytes:
         ({"runs": [8 + 2]}, BadValue, "brings 1 tiles, 0 of them whole, has .* 1 codecs"),
         ({"runs": []}, BadValue, "brings 0 tiles"),
         ({"versions": [0]}, BadValue, "tile version 0 is outside 1"),
-        ({"hashes": HASH[:7]}, BadValue, "hashes of 7 bytes, not a multiple of 8"),
+        ({"hashes": HASH[:3]}, BadValue, "hashes of 3 bytes, not a multiple of 4"),
         ({"bodies": [b"", b""]}, BadValue, "2 bodies"),
         ({"bodies": [bytes(limits.MAX_TILE_BODY_BYTES + 1)]}, TooLarge, "has 4194305 bytes, the limit is 4194304"),
         ({"bodies": [b""] * 6000}, TooLarge, "has more than 5184 fields"),
@@ -257,7 +257,7 @@ def test_a_truncated_reply_is_malformed() -> None:
 @pytest.mark.parametrize(
     "fields",
     [
-        {"status": "blob", "version": 4, "sha": HASH[:4]},
+        {"status": "blob", "version": 4, "sha": HASH[:3]},
         {"status": "delta", "version": 4, "sha": HASH, "codec_id": 3},
         {"status": "later", "body": b"body"},
         {"status": "unchanged", "version": 4},

@@ -103,7 +103,7 @@ def test_a_tile_with_the_wrong_hash_is_refused_by_name_and_fetched_again(
     def answer(request: Request) -> bytes:
         requests.append(TilesRequest.decode(request.payload))
         body = blob_of(other).body if len(requests) == 1 else blob_of(tile).body
-        return TilesReply((TileAnswer("blob", 2, tile.sha[:8], 0, body),)).encode()
+        return TilesReply((TileAnswer("blob", 2, tile.sha[:4], 0, body),)).encode()
 
     cloud.serve(batch_key("ndt", tile_id.district), answer)
     fetcher.want([tile_id])
@@ -123,7 +123,7 @@ def test_a_tile_that_stays_wrong_never_reaches_the_cache(
 ) -> None:
     tile_id, other_id = sorted(tiles)[:2]
     other = blob_of(tiles[other_id])
-    reply = TilesReply((TileAnswer("blob", 1, other.sha[:8], 0, other.body),))
+    reply = TilesReply((TileAnswer("blob", 1, other.sha[:4], 0, other.body),))
     cloud.serve(batch_key("ndt", tile_id.district), lambda _: reply.encode())
     fetcher.want([tile_id])
     wait_until(lambda: fetcher.counts["failed"] >= 1)

@@ -56,11 +56,11 @@ def without(tile: Tile, count: int, version: int) -> Tile:
 
 
 def delta(old: Tile, new: Tile) -> TileAnswer:
-    return TileAnswer("delta", new.version, new.sha[:8], 0, encode_delta(new.tile_id, old.gaussians, new.gaussians))
+    return TileAnswer("delta", new.version, new.sha[:4], 0, encode_delta(new.tile_id, old.gaussians, new.gaussians))
 
 
 def blob(tile: Tile) -> TileAnswer:
-    return TileAnswer("blob", tile.version, tile.sha[:8], 3, blob_of(tile, 3).body)
+    return TileAnswer("blob", tile.version, tile.sha[:4], 3, blob_of(tile, 3).body)
 
 
 def serve(cloud: Bus, tile: Tile, *answers: TileAnswer, before: Callable[[], object] = lambda: None) -> list[Request]:
@@ -165,7 +165,7 @@ def test_forged_bodies_are_named_and_never_kept(
     forged = [
         replace(good, body=good.body[:-1]),
         replace(good, body=bytes([good.body[0] ^ 1]) + good.body[1:]),
-        replace(good, sha=bytes(8)),
+        replace(good, sha=bytes(4)),
         replace(good, codec_id=4711),
         replace(good, body=b"\xff" * 40),
         replace(good, body=b""),
@@ -185,7 +185,7 @@ def test_forged_bodies_are_named_and_never_kept(
         b"\xff rubbish",
         TilesReply((TileAnswer("absent"), TileAnswer("absent"))).encode(),
         TilesReply((TileAnswer("unchanged"),)).encode(),
-        TilesReply((TileAnswer("delta", 2, bytes(8), 0, b"x"),)).encode(),
+        TilesReply((TileAnswer("delta", 2, bytes(4), 0, b"x"),)).encode(),
     ],
     ids=["none", "about two tiles", "unchanged, yet nothing is held", "a delta, yet nothing is held"],
 )
@@ -228,7 +228,7 @@ def test_the_shares_of_an_answer_add_up_to_it(tiles: dict[TileId, Tile]) -> None
     assert [share.kind for share in shares] == ["tile", "delta", "tile"]
     assert [share.tile for share in shares] == [None, old.tile_id, TileId(old.tile_id.morton + 2)]
     assert sum(share.app_bytes for share in shares) == len(payload)
-    assert [share.app_bytes for share in shares[1:]] == [8 + len(answers[0].body), 8 + len(answers[2].body)]
+    assert [share.app_bytes for share in shares[1:]] == [4 + len(answers[0].body), 4 + len(answers[2].body)]
 
 
 def test_a_cache_that_cannot_be_read_nor_written_stops_no_download(
