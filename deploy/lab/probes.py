@@ -30,9 +30,9 @@ UDP_HEADER_BYTES: Final = 28
 MAX_PER_S: Final = 1000.0
 RATE_SHARE: Final = 0.25
 """Delay and loss are measured on a link that is a quarter busy, so that no queue grows."""
-DRAIN_S: Final = 1.0
+DRAIN_S: Final = 0.7
 CONNECT_S: Final = 20.0
-BACKLOG_S: Final = 0.5
+BACKLOG_S: Final = 0.2
 MAX_SET_BACKLOG_BYTES: Final = 200_000
 """Systems refuse larger ones (net.core.wmem_max); the kernel's own growth goes further."""
 _STAMP: Final = struct.Struct("<Qd")  # number, monotonic time of sending in s

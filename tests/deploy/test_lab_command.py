@@ -66,6 +66,7 @@ def test_without_its_tools_it_is_refused(tmp_path: Path) -> None:
 
 
 @needs_root
+@pytest.mark.slow
 def test_check_measures_each_direction(tmp_path: Path) -> None:
     file, name = profile_file(tmp_path, TINY), own_name()
     arguments = ("check", "--links", str(file), "--seconds", "0.5", "--name", name, "--relay", "--json")

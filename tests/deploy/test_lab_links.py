@@ -62,19 +62,19 @@ def lab(groups: tuple[Group, ...]) -> Iterator[Lab]:
         yield opened
 
 
+@pytest.mark.slow
 def test_links_pass_what_their_profiles_say(lab: Lab) -> None:
     far, near = lab.links
     assert lab.relayed == (far,)
     with carried(lab):
         for direction, rate_bit_s in (("up", 4e6), ("down", 8e6)):
-            thin = stream(far, direction, 1.0)
+            thin = stream(far, direction, 0.5)
             assert 0 < thin.lost < 0.05 * thin.sent + 6 * (0.05 * thin.sent) ** 0.5
             assert thin.reordered == 0
             assert thin.delay_ms[0] >= 16
             assert stream(near, direction, 0.2).lost == 0
-            for link in (far, near):
-                # A bucket of 16 kB may pass at once beside the rate; a busy machine may be slower, never faster.
-                assert 0 < flood(link, direction, 0.5) < rate_bit_s * 1.03 + 8 * 16_384 / 0.4
+            # A bucket of 16 kB may pass at once beside the rate; a busy machine may be slower, never faster.
+            assert 0 < flood(far, direction, 0.5) < rate_bit_s * 1.03 + 8 * 16_384 / 0.4
             assert 0 < bulk(near, direction, 0.5).bit_s < rate_bit_s + 8 * 16_384 / 0.5
 
 
