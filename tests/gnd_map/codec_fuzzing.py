@@ -1,6 +1,12 @@
-"""Damaged messages for every decoder of `gnd_map.codec`: seeded, with checksums left wrong or made right again."""
+"""Damaged messages for every decoder of `gnd_map.codec`: seeded, with checksums left wrong or made right again.
+
+For longer runs than the tests', and for compiled code that checks its indices:
+
+    NUMBA_BOUNDSCHECK=1 NUMBA_CACHE_DIR=$(mktemp -d) PYTHONPATH=. python tests/gnd_map/codec_fuzzing.py ROUNDS SEED
+"""
 
 import struct
+import sys
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from random import Random
@@ -188,3 +194,18 @@ def refused(decoder: Decoder, body: bytes) -> bool:
 def foreign_messages(all_decoders: Sequence[Decoder]) -> list[bytes]:
     """What other decoders read."""
     return [body for decoder in all_decoders for body in decoder.messages] + [encode_gaussians(Gaussians.empty())]
+
+
+def main() -> None:
+    """Try so many messages with right checksums on each decoder."""
+    rounds, seed = (int(argument) for argument in sys.argv[1:3])
+    found = decoders()
+    foreign = foreign_messages(found)
+    for decoder in found:
+        rng = Random(seed)
+        n = sum(refused(decoder, decoder.repaired(damaged(rng, decoder.messages, foreign))) for _ in range(rounds))
+        print(f"{decoder.name}: {n} of {rounds} refused")
+
+
+if __name__ == "__main__":
+    main()
