@@ -41,6 +41,7 @@ class Surroundings:
         self.counts: Counter[str] = Counter()
         self._map, self._fetcher, self._detector = local_map, fetcher, detector
         self._parameters = parameters
+        self._rate_byte_s = parameters.link_share * fetcher.link.rate_byte_s("down")
         self.wanted: tuple[TileId, ...] = ()
         self._looked_at: F64 | None = None
         self._asked: set[TileId] = set()
@@ -109,16 +110,21 @@ class Surroundings:
         """
         self._plan_is_new = False
         plan = self._plan if patiently else self._in_time()
-        if any(need.from_s <= self._parameters.lead_s and not self._fetcher.is_known(need.tile_id) for need in plan):
+        lead_s = self._parameters.lead_s + self._download_s(plan)
+        if any(need.from_s <= lead_s and not self._fetcher.is_known(need.tile_id) for need in plan):
             self._asked = {need.tile_id for need in plan}
         self._fetcher.want([need.tile_id for need in plan if need.tile_id in self._asked])
 
     def _in_time(self) -> list[Need]:
-        link = self._fetcher.link
-        rate_byte_s = self._parameters.link_share * link.rate_byte_s("down")
-        if math.isinf(rate_byte_s):
+        if math.isinf(self._rate_byte_s):
             return self._plan
-        return in_time(self._plan, self._fetcher.size_bytes, rate_byte_s, link.delay_s)
+        return in_time(self._plan, self._fetcher.size_bytes, self._rate_byte_s, self._fetcher.link.delay_s)
+
+    def _download_s(self, plan: Iterable[Need]) -> float:
+        """How long the link is busy with what is not known of a plan."""
+        if math.isinf(self._rate_byte_s):
+            return 0.0
+        return sum(self._fetcher.size_bytes(need.tile_id) for need in plan) / self._rate_byte_s
 
     def _let_go(self, here: F64) -> None:
         """Drop tiles far behind that nothing is counted about, and answers about tiles that are no longer wanted."""
