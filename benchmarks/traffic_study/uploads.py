@@ -124,8 +124,10 @@ def _send(result: VehicleResult, reports: list[ChangeReport], held: BaseMap, clo
             bases = [_base(change, held) for change in report.tiles if change.base_sha and is_measured(change).any()]
             outbox.put(report.report_id, change_key(report.layer, report.district), body, packed, bases)
         sender = SenderThread(cast("Bus", cloud), outbox)
-        done = sender.drain(_WAIT_S, threading.Event())
-        sender.close()
+        try:
+            done = sender.drain(_WAIT_S, threading.Event())
+        finally:
+            sender.close()
         counts = outbox.counts()
         if not done or counts.acknowledged != len(reports):
             raise TrafficError(
