@@ -51,11 +51,7 @@ class ShortReports:
             BadReport, SchemaError: the flags cannot be a report.
         """
         layer, district = parse_change_key(key)
-        try:
-            return expand(packed, layer, district, self._tiles(key, packed))
-        except MissingBase:
-            self._bases.forget()  # a version's number may have been given again
-            return expand(packed, layer, district, self._tiles(key, packed))
+        return expand(packed, layer, district, self._tiles(key, packed))
 
     def hold(self, key: str, packed: PackedReport, report: ChangeReport) -> Waiting | None:
         """Decide which Gaussians of the expanded report are wanted, and keep it until it is durable.
@@ -108,11 +104,10 @@ class ShortReports:
 
     def _known(self, report: ChangeReport, change: TileChange) -> Known:
         epoch, rows = self._store.in_play(report.layer, change.tile)
-        base = None if epoch is None else self._bases.version(report.layer, change.tile, epoch.version)
         shas = {row.base_sha for row in rows} | {change.base_sha}
         found = {sha: self._bases.content(report.layer, change.tile, sha) for sha in sorted(shas - {_NO_BASE})}
         return Known(
-            epoch=Gaussians.empty() if base is None else base.gaussians,
+            epoch=Gaussians.empty() if epoch is None else self._bases.decoded(epoch),
             reports=[one for row in rows if (one := self._report(row)) is not None],
             bases={sha: gaussians for sha, gaussians in found.items() if gaussians is not None},
             promised=self.room.promised(change.tile, report.layer, but=report.report_id),

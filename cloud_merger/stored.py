@@ -10,6 +10,7 @@ from gnd_map.tile import Tile
 from gnd_map.tile_id import TileId
 from schemas.changes import ChangeReport, TileChange
 from tile_store.store import Store
+from tile_store.values import StoredTile
 
 REMEMBERED_REPORTS: Final = 1024  # some 20 kB each
 REMEMBERED_TILES: Final = 512  # some 120 kB each
@@ -28,7 +29,7 @@ def said(body: bytes) -> tuple[str, TileChange]:
 
 
 class Bases:
-    """Versions of tiles, decoded; a version never changes, so those used last are remembered. Safe in several threads.
+    """Versions of tiles, decoded; their contents are remembered by hash, those used last. Safe in several threads.
 
     Args:
         store: that holds them.
@@ -37,38 +38,42 @@ class Bases:
     def __init__(self, store: Store) -> None:
         self._store = store
         self._lock = Lock()
-        self._tiles: OrderedDict[tuple[str, TileId, int | bytes], Tile] = OrderedDict()
+        self._held: OrderedDict[tuple[TileId, bytes], Gaussians] = OrderedDict()
 
     def version(self, layer: str, tile: TileId, version: int) -> Tile | None:
         """A version of a tile; None: the store does not hold it. Version 0: the vehicle had no map, so no Gaussians."""
         if version == 0:
             return Tile(tile, 0, Gaussians.empty())
-        return self._remembered(layer, tile, version)
+        stored = self._store.get(layer, tile, version=version)
+        return None if stored is None else Tile(tile, version, self.decoded(stored))
 
     def content(self, layer: str, tile: TileId, sha: bytes) -> Gaussians | None:
         """The Gaussians of a tile by content hash; None: the store does not hold them."""
-        found = self._remembered(layer, tile, sha)
-        return None if found is None else found.gaussians
+        found = self._remembered(tile, sha)
+        if found is not None:
+            return found
+        stored = self._store.by_sha(layer, tile, sha)
+        return None if stored is None else self.decoded(stored)
 
-    def forget(self) -> None:
-        """Read everything anew: after retention a version's number may have been given again."""
-        with self._lock:
-            self._tiles.clear()
+    def decoded(self, stored: StoredTile) -> Gaussians:
+        """The Gaussians of a version that was read.
 
-    def _remembered(self, layer: str, tile: TileId, which: int | bytes) -> Tile | None:
-        place = (layer, tile, which)
+        Raises:
+            SchemaError: they cannot be decoded, or are not what the hash says.
+        """
+        found = self._remembered(stored.tile, stored.sha)
+        return self._remember(stored) if found is None else found
+
+    def _remembered(self, tile: TileId, sha: bytes) -> Gaussians | None:
         with self._lock:
-            if place in self._tiles:
-                self._tiles.move_to_end(place)
-                return self._tiles[place]
-        if isinstance(which, bytes):
-            stored = self._store.by_sha(layer, tile, which)
-        else:
-            stored = self._store.get(layer, tile, version=which)
-        if stored is None:
-            return None
+            if (tile, sha) in self._held:
+                self._held.move_to_end((tile, sha))
+            return self._held.get((tile, sha))
+
+    def _remember(self, stored: StoredTile) -> Gaussians:
+        gaussians = stored.decode().gaussians
         with self._lock:
-            self._tiles[place] = stored.decode()
-            while len(self._tiles) > REMEMBERED_TILES:
-                self._tiles.popitem(last=False)
-            return self._tiles[place]
+            self._held[stored.tile, stored.sha] = gaussians
+            while len(self._held) > REMEMBERED_TILES:
+                self._held.popitem(last=False)
+        return gaussians

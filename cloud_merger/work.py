@@ -3,21 +3,18 @@
 import logging
 import time
 from collections.abc import Sequence
-from functools import lru_cache
-from typing import Final
 
 from cloud_merger.config import ShardConfig
 from cloud_merger.merge import merge_tile
 from cloud_merger.statements import Report, statements_of
+from cloud_merger.stored import Bases, said
 from gnd_map.codec import Lattice, is_on, lattice_of, snap
 from gnd_map.gaussian import Gaussians
 from gnd_map.tile import Tile
-from schemas.changes import ChangeReport, TileChange
 from schemas.errors import SchemaError
 from tile_store.store import Store
 from tile_store.values import Claim, Publication, ReportRow, TileWork, lattice_named
 
-REMEMBERED_REPORTS: Final = 1024  # some 20 kB each
 _LOG = logging.getLogger(__name__)
 
 
@@ -26,6 +23,7 @@ class Worker:
 
     def __init__(self, store: Store, config: ShardConfig) -> None:
         self._store, self._config = store, config
+        self._contents = Bases(store)
 
     def merge(self, claims: Sequence[Claim]) -> list[Publication]:
         """What to publish for these claims; a tile that failed is postponed, or set aside after `max_attempts`."""
@@ -53,7 +51,7 @@ class Worker:
 
     def _publication(self, work: TileWork) -> Publication:
         """Merge all reports since the epoch into the epoch's tile; the tile is None where the head has that content."""
-        epoch = Gaussians.empty() if work.epoch is None else work.epoch.decode().gaussians
+        epoch = Gaussians.empty() if work.epoch is None else self._contents.decoded(work.epoch)
         reports = [report for row in work.reports if (report := self._report(row)) is not None]
         statements = statements_of(epoch, reports, self._bases(work), self._config.merge.mode)
         merged = merge_tile(epoch, statements, self._config.merge)
@@ -82,8 +80,7 @@ class Worker:
     def _report(self, row: ReportRow) -> Report | None:
         """What a stored report says; nothing when it can no longer be read (its vehicle has long had its ack)."""
         try:
-            sensor_model, change = _said(row.body)
-            return self._config.merge.report_of(row.report_id, sensor_model, change)
+            return self._config.merge.report_of(row.report_id, *said(row.body))
         except SchemaError as error:
             reason = f"report {row.report_id} on tile {row.tile} cannot be read any more and is left out: {error}"
             _LOG.error("%s", reason)
@@ -93,8 +90,8 @@ class Worker:
     def _bases(self, work: TileWork) -> dict[bytes, Gaussians]:
         """The versions that the reports refer to, by hash; those that the store has lost are missing."""
         shas = {row.base_sha for row in work.reports if row.base_sha}
-        versions = {sha: self._store.by_sha(work.claim.layer, work.claim.tile, sha) for sha in sorted(shas)}
-        return {sha: stored.decode().gaussians for sha, stored in versions.items() if stored is not None}
+        found = {sha: self._contents.content(work.claim.layer, work.claim.tile, sha) for sha in sorted(shas)}
+        return {sha: gaussians for sha, gaussians in found.items() if gaussians is not None}
 
     def _set_aside(self, work: TileWork, reason: str) -> Publication:
         """Leave the tile as it is and consume its reports, which stay in the store; say so in the quarantine."""
@@ -108,14 +105,6 @@ class Worker:
 def on_lattice(gaussians: Gaussians, lattice: Lattice | None) -> Gaussians:
     """The Gaussians moved onto the lattice, those that lie on it untouched; as they are for None."""
     return gaussians if lattice is None else snap(gaussians, lattice)
-
-
-@lru_cache(maxsize=REMEMBERED_REPORTS)
-def _said(body: bytes) -> tuple[str, TileChange]:
-    """Sensor model and the one tile of a stored report; remembered: each merge of a tile reads all reports again."""
-    report = ChangeReport.decode(body)
-    (change,) = report.tiles
-    return report.sensor_model, change
 
 
 def _ids(work: TileWork) -> tuple[str, ...]:
