@@ -8,6 +8,7 @@ import contextlib
 import fcntl
 import os
 import signal
+import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -24,6 +25,7 @@ from deploy.lab.tools import Offer, check_offer, kernel_offer, needs_carrying
 
 LOCK_FOLDER: Final = Path("/run") / PREFIX
 END_WITHIN_S: Final = 10.0
+_LOOK_S: Final = 0.05
 
 
 @dataclass(frozen=True, slots=True)
@@ -151,12 +153,29 @@ def remove_all(lab: str) -> tuple[str, ...]:
 
 
 def _end(pids: tuple[int, ...]) -> None:
+    """End processes: SIGTERM, a while to obey, then SIGKILL."""
     processes = [process for pid in pids if (process := _process(pid)) is not None]
     for number in (signal.SIGTERM, signal.SIGKILL):
         for process in processes:
             with contextlib.suppress(psutil.NoSuchProcess):
                 process.send_signal(number)
-        _, processes = psutil.wait_procs(processes, timeout=END_WITHIN_S)
+        processes = _still_running(processes)
+
+
+def _still_running(processes: list[psutil.Process]) -> list[psutil.Process]:
+    """Wait until processes have ended, and return those that have not in time."""
+    deadline_s = time.monotonic() + END_WITHIN_S
+    while (running := [process for process in processes if _runs(process)]) and time.monotonic() < deadline_s:
+        time.sleep(_LOOK_S)
+    return running
+
+
+def _runs(process: psutil.Process) -> bool:
+    """Tell whether a process runs; a dead one that its parent has not yet asked for does not."""
+    try:
+        return bool(process.is_running() and process.status() != psutil.STATUS_ZOMBIE)
+    except psutil.NoSuchProcess:
+        return False
 
 
 def _process(pid: int) -> psutil.Process | None:

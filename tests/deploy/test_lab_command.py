@@ -107,6 +107,7 @@ def test_clean_removes_what_a_killed_lab_left_and_nothing_else(tmp_path: Path) -
     process.kill()
     process.communicate()
     assert has_namespaces(name)
+    left = subprocess.Popen(["ip", "netns", "exec", f"gndlab.{name}.cloud", "sleep", "600"])
     code, _, err = finished(gnd_lab("check", *arguments))
     assert code == 2
     assert f"an earlier lab '{name}' left 2 namespaces: remove them with `gnd lab clean`" in err
@@ -120,6 +121,7 @@ def test_clean_removes_what_a_killed_lab_left_and_nothing_else(tmp_path: Path) -
         assert not has_namespaces(name)
     code, out, _ = finished(gnd_lab("clean"))  # its lock is free again
     assert (code, has_namespaces(running)) == (0, False)
+    assert left.wait(timeout=30) == -signal.SIGTERM  # what still ran in there has been ended
     _, alive = psutil.wait_procs(children, timeout=30)
     assert alive == []
 
