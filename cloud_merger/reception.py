@@ -34,7 +34,7 @@ class Reception:
     Args:
         bus: open.
         members: kept up to date here.
-        answer: takes (key, encoded ChangeReport) and gives the ack; called from several threads.
+        answer: takes (key, encoded message) and gives the ack; called from several threads.
         on_death: called with the name of a member that has gone.
     """
 

@@ -1,9 +1,10 @@
 """Reports that come in short: their flags are understood, Gaussians are asked for, and a whole report comes out."""
 
+import logging
 from threading import Lock
 from typing import Final
 
-from cloud_merger.errors import BadReport, MissingBase, MissingHalf
+from cloud_merger.errors import BadReport, MissingBase, MissingHalf, NotUnderstood
 from cloud_merger.expanding import base_versions, expand, is_askable, with_measured
 from cloud_merger.parameters import MergeParameters
 from cloud_merger.statements import Report
@@ -11,6 +12,7 @@ from cloud_merger.stored import Bases, said
 from cloud_merger.waiting import Waiting, WaitingLimits, WaitingRoom
 from cloud_merger.wants import Known, WantParameters, asked_voxels, wanted
 from gnd_map.codec import encode_mask
+from gnd_map.errors import GndError
 from gnd_map.gaussian import Gaussians
 from gnd_map.tile import Tile
 from gnd_map.tile_id import TileId
@@ -22,6 +24,7 @@ from tile_store.store import Store
 from tile_store.values import ReportRow
 
 _NO_BASE: Final = b""
+_LOG = logging.getLogger(__name__)
 
 
 class ShortReports:
@@ -48,10 +51,18 @@ class ShortReports:
 
         Raises:
             MissingBase: the store does not hold what the vehicle compared with.
+            NotUnderstood: something else went wrong here.
             BadReport, SchemaError: the flags cannot be a report.
         """
         layer, district = parse_change_key(key)
-        return expand(packed, layer, district, self._tiles(key, packed))
+        tiles = self._tiles(key, packed)
+        try:
+            return expand(packed, layer, district, tiles)
+        except GndError:
+            raise
+        except Exception as error:  # a fault of ours must not hold up a report that can be sent whole
+            _LOG.exception("report %s cannot be expanded", packed.report_id)
+            raise NotUnderstood(f"report {packed.report_id}: {type(error).__name__}: {error}") from error
 
     def hold(self, key: str, packed: PackedReport, report: ChangeReport) -> Waiting | None:
         """Decide which Gaussians of the expanded report are wanted, and keep it until it is durable.

@@ -9,6 +9,7 @@ import pytest
 from merger_world import BALL, NEIGHBOUR, POLE, TILE, WALL_AGAIN, report_of
 from short_world import KEY, bases_of, drive_number, flagged, packed_of, tile_at, track_by
 
+from cloud_merger import short_reports
 from cloud_merger.ingest import Ingest, IngestLimits
 from cloud_merger.parameters import MergeParameters
 from cloud_merger.short_reports import ShortReports
@@ -272,6 +273,17 @@ def test_a_store_that_fails_gives_no_ack_and_the_halves_may_come_again(tmp_path,
         assert again.counts().report_rows == 0
         fresh = ingest_of(again)
         assert fresh.answer(KEY, second_half(REPORT, fresh.answer(KEY, PACKED))).status == "stored"
+
+
+def test_a_fault_of_the_shard_itself_does_not_hold_up_the_report(store, ingest, monkeypatch):
+    def fails(*_):
+        raise ZeroDivisionError("somewhere inside")
+
+    monkeypatch.setattr(short_reports, "expand", fails)
+    ack = ingest.answer(KEY, PACKED)
+    assert ack.status == "resend"
+    assert "ZeroDivisionError: somewhere inside" in ack.reason
+    assert ingest.answer(KEY, REPORT.encode()).status == "stored"
 
 
 def test_damaged_halves_are_refused_or_asked_for_again_and_nothing_is_stored_of_them(store):
