@@ -24,6 +24,7 @@ from gnd_map.tile import Tile
 from gnd_map.tile_id import TileId
 from schemas.drive import GnssFix
 from schemas.keys import update_key
+from schemas.tiles_batch import ANSWER_HASH_BYTES
 from schemas.updates import TileUpdate
 from tile_store.server import TileServer
 from tile_store.sqlite_store import SqliteStore
@@ -134,7 +135,7 @@ def test_each_tile_comes_once_whole_then_by_delta_then_not_at_all(
     bodies = booked(tmp_path, "first", "tile")
     assert {path: len(bookings) for path, bookings in bodies.items()} == {t.path: 1 for t in got}
     heads = {t: store.get("ndt", t) for t in got}
-    assert all(bodies[t.path][0].app_bytes == 8 + len(head.body) for t, head in heads.items() if head)
+    assert all(bodies[t.path][0].app_bytes == ANSWER_HASH_BYTES + len(head.body) for t, head in heads.items() if head)
     sent = [line for line in served.totals() if (line.kind, line.direction) == ("tile", "up")]
     assert [down_bytes(tmp_path, "first")] == [line.app_bytes for line in sent]
 
@@ -207,8 +208,10 @@ def test_a_download_that_was_killed_goes_on_where_it_was(
     cache = TileCache(tmp_path / "cache.sqlite")
     arguments = [endpoint, str(tmp_path), *(str(t.morton) for t in tiles)]
     with subprocess.Popen([sys.executable, "-c", DOWNLOADER, *arguments]) as process:
-        wait_until(lambda: len(cache) >= 4, 30.0)
-        process.kill()
+        try:
+            wait_until(lambda: len(cache) >= 4, 60.0)
+        finally:
+            process.kill()
     kept = {t for t in tiles if cache.head(t)[0]}
     assert 4 <= len(kept) < len(tiles)
     with car(endpoint, tmp_path, "second") as vehicle:
