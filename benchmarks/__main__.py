@@ -21,8 +21,9 @@ NAMES = (
     "ingest",
     "sizes",
     "codec",
+    "return-download",
 )
-WITH_OPTIONS = ("codec",)
+WITH_OPTIONS = ("codec", "return-download")
 
 
 def main() -> None:
