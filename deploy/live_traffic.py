@@ -12,7 +12,8 @@ from fleet_bus.links import UNLIMITED, LinkProfile
 from fleet_bus.traffic import per_km
 from schemas.traffic import TrafficSample
 
-_OLD_S: Final = 5.0
+_OLD_S: Final = 15.0
+"""A vehicle that is well sends a sample every ten seconds at least."""
 
 
 @dataclass(frozen=True, slots=True)
