@@ -2,12 +2,14 @@
 
 import os
 import shutil
+import signal
 import subprocess
 import sys
 import threading
 import time
 import uuid
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 import pytest
@@ -36,6 +38,18 @@ def gnd_lab(*arguments: str, **options: object) -> subprocess.Popen[str]:
         [sys.executable, "-m", "deploy.cli", "lab", *arguments],
         stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, **options,
     )  # fmt: skip
+
+
+@contextmanager
+def started(*arguments: str) -> Iterator[subprocess.Popen[str]]:
+    """A `gnd lab` that does not outlive the test, and removes its lab, whatever happens."""
+    process = gnd_lab(*arguments)
+    try:
+        yield process
+    finally:
+        if process.poll() is None:
+            process.send_signal(signal.SIGINT)
+        process.communicate(timeout=DEADLINE_S)
 
 
 def finished(process: subprocess.Popen[str]) -> tuple[int, str, str]:

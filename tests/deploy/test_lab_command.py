@@ -1,5 +1,6 @@
 """`gnd lab check` and `gnd lab clean` as commands: their output, their refusals, and what killed ones leave."""
 
+import contextlib
 import json
 import os
 import signal
@@ -9,7 +10,7 @@ from pathlib import Path
 
 import psutil
 import pytest
-from lab_testing import finished, gnd_lab, has_namespaces, needs_root, own_name, profile_file, wait_until
+from lab_testing import finished, gnd_lab, has_namespaces, needs_root, own_name, profile_file, started, wait_until
 
 from deploy.lab.lab import lab_lock, namespaces_of
 from deploy.lab.namespaces import add_namespace
@@ -89,10 +90,11 @@ def test_check_measures_each_direction(tmp_path: Path) -> None:
 def test_interrupted_it_leaves_nothing(tmp_path: Path) -> None:
     for number in (signal.SIGINT, signal.SIGTERM):
         name = own_name()
-        process = gnd_lab("check", "--links", str(profile_file(tmp_path, TINY)), "--seconds", "60", "--name", name)
-        wait_until(lambda name=name: len(namespaces_of(name)) == 2, "the lab is there")  # type: ignore[misc]
-        process.send_signal(number)
-        code, _, err = finished(process)
+        links = str(profile_file(tmp_path, TINY))
+        with started("check", "--links", links, "--seconds", "60", "--name", name) as process:
+            wait_until(lambda name=name: len(namespaces_of(name)) == 2, "the lab is there")  # type: ignore[misc]
+            process.send_signal(number)
+            code, _, err = finished(process)
         assert (code, err.strip().splitlines()[-1]) == (130, "gnd: interrupted")
         assert not has_namespaces(name)
 
@@ -101,11 +103,10 @@ def test_interrupted_it_leaves_nothing(tmp_path: Path) -> None:
 def test_clean_removes_what_a_killed_lab_left_and_nothing_else(tmp_path: Path) -> None:
     name, running = own_name(), own_name()
     arguments = ("--links", str(profile_file(tmp_path, TINY)), "--seconds", "60", "--name", name, "--relay")
-    process = gnd_lab("check", *arguments)
-    wait_until(lambda: bool(list_relays(process.pid)), "its relay runs")
-    children = psutil.Process(process.pid).children(recursive=True)
-    process.kill()
-    process.communicate()
+    with started("check", *arguments) as process:
+        wait_until(lambda: bool(list_relays(process.pid)), "its relay runs")
+        children = psutil.Process(process.pid).children(recursive=True)
+        process.kill()
     assert has_namespaces(name)
     left = subprocess.Popen(["ip", "netns", "exec", f"gndlab.{name}.cloud", "sleep", "600"])
     code, _, err = finished(gnd_lab("check", *arguments))
@@ -128,9 +129,13 @@ def test_clean_removes_what_a_killed_lab_left_and_nothing_else(tmp_path: Path) -
 
 def list_relays(launcher: int) -> list[int]:
     """Processes of a launcher that hold a TUN interface open."""
-    found = []
-    for process in psutil.Process(launcher).children(recursive=True):
-        folder = Path(f"/proc/{process.pid}/fd")
-        if any(entry.readlink() == TUN_DEVICE for entry in folder.iterdir()):
-            found.append(process.pid)
+    children = psutil.Process(launcher).children(recursive=True)
+    return [process.pid for process in children if TUN_DEVICE in open_files(process.pid)]
+
+
+def open_files(pid: int) -> set[Path]:
+    found = set()
+    for entry in Path(f"/proc/{pid}/fd").glob("*"):
+        with contextlib.suppress(OSError):  # closed meanwhile
+            found.add(entry.readlink())
     return found

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import psutil
 import pytest
-from lab_testing import gnd_lab, has_namespaces, needs_root, own_name, profile_file, wait_until
+from lab_testing import has_namespaces, needs_root, own_name, profile_file, started, wait_until
 
 from deploy.lab.devices import MTU_BYTES
 
@@ -43,8 +43,8 @@ def arguments(world: "SmallWorld", folder: Path, name: str) -> list[str]:
 
 def test_a_fleet_over_shaped_links_accounts_for_every_byte(small_world: "SmallWorld", tmp_path: Path) -> None:
     name = own_name()
-    process = gnd_lab(*arguments(small_world, tmp_path, name), "--relay", "--json")
-    out, err = process.communicate(timeout=RUN_TIMEOUT_S)
+    with started(*arguments(small_world, tmp_path, name), "--relay", "--json") as process:
+        out, err = process.communicate(timeout=RUN_TIMEOUT_S)
     assert process.returncode == 0, err
     summary: dict[str, Any] = json.loads(out)
     assert summary["reports_lost"] == 0
@@ -65,13 +65,13 @@ def test_a_fleet_over_shaped_links_accounts_for_every_byte(small_world: "SmallWo
 
 def test_ctrl_c_ends_the_fleet_and_removes_its_lab(small_world: "SmallWorld", tmp_path: Path) -> None:
     name = own_name()
-    process = gnd_lab(*arguments(small_world, tmp_path, name))
-    pids = tmp_path / "run" / "pids.json"
-    wait_until(lambda: "vehicle-01" in (pids.read_text() if pids.exists() else ""), "the vehicles have started")
-    running = [psutil.Process(pid) for pid in json.loads(pids.read_text()).values()]
-    assert {"link-far", "router"} <= json.loads(pids.read_text()).keys()
-    os.kill(process.pid, signal.SIGINT)
-    _, err = process.communicate(timeout=60)
+    with started(*arguments(small_world, tmp_path, name)) as process:
+        pids = tmp_path / "run" / "pids.json"
+        wait_until(lambda: "vehicle-01" in (pids.read_text() if pids.exists() else ""), "the vehicles have started")
+        running = [psutil.Process(pid) for pid in json.loads(pids.read_text()).values()]
+        assert {"link-far", "router"} <= json.loads(pids.read_text()).keys()
+        os.kill(process.pid, signal.SIGINT)
+        _, err = process.communicate(timeout=60)
     assert process.returncode == 130
     assert err.strip().endswith("gnd: interrupted")
     _, alive = psutil.wait_procs(running, timeout=10)
