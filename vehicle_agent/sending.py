@@ -8,6 +8,7 @@ refused.
 import logging
 import threading
 import time
+from collections import Counter
 
 from fleet_bus.bus import Bus
 from fleet_bus.errors import BusClosed, MessageTooLarge, RequestRefused
@@ -32,6 +33,7 @@ class SenderThread:
 
     def __init__(self, bus: Bus, outbox: Outbox) -> None:
         self.last_error = ""
+        self.counts: Counter[str] = Counter()  # messages by form: flags, gaussians, whole
         self._bus, self._outbox = bus, outbox
         self._stop = threading.Event()
         outbox.retry_now()  # what an earlier life of this agent left here goes first
@@ -63,7 +65,7 @@ class SenderThread:
 
     def _send(self, letter: Letter) -> None:
         try:
-            self._record(letter, self._in_short(letter) or self._ask(letter, letter.body))
+            self._record(letter, self._in_short(letter) or self._ask(letter, letter.body, "whole"))
         except BusClosed:
             self._stop.set()
         except (RequestRefused, MessageTooLarge) as error:
@@ -92,13 +94,14 @@ class SenderThread:
 
     def _two_halves(self, letter: Letter) -> list[ChangeAck]:
         """The answer to the flags, and where that asks for Gaussians the answer to these."""
-        ack = self._ask(letter, letter.packed)
+        ack = self._ask(letter, letter.packed, "flags")
         if ack.status != "wanted":
             return [ack]
         report, bases = ChangeReport.decode(letter.body), self._outbox.bases_of(letter.report_id)
-        return [ack, self._ask(letter, pack_measured(report, bases, ack.wanted).encode())]
+        return [ack, self._ask(letter, pack_measured(report, bases, ack.wanted).encode(), "gaussians")]
 
-    def _ask(self, letter: Letter, payload: bytes) -> ChangeAck:
+    def _ask(self, letter: Letter, payload: bytes, form: str) -> ChangeAck:
+        self.counts[form] += 1
         return ChangeAck.decode(self._bus.request(letter.key, payload, kind="change", timeout_s=REQUEST_S))
 
     def _record(self, letter: Letter, ack: ChangeAck) -> None:

@@ -189,6 +189,7 @@ class Vehicle:
             "reports_acknowledged": reports.acknowledged,
             "reports_quarantined": reports.quarantined,
             "reports_pending": reports.pending,
+            "report_messages": dict(self.link.sender.counts),
             "quarantined": dict(self.link.outbox.refused()),
             "last_error": self.link.sender.last_error or self.link.fetcher.last_error or self.guard.last_problem,
             "traffic": {

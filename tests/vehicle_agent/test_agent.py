@@ -106,6 +106,8 @@ def test_a_drive_ends_with_everything_acknowledged_and_a_second_life_sends_nothi
     assert result["tiles_downloaded"] == len(cloud_of.store.heads("ndt"))
     assert result["reports_sent"] == result["reports_acknowledged"] == len(cloud_of.reports()) >= 1
     assert result["reports_pending"] == result["reports_quarantined"] == 0
+    assert result["report_messages"] == {"flags": result["reports_sent"], "gaussians": result["reports_sent"]}
+    assert cloud_of.store.quarantined() == []
     assert result["changed_voxels"] == sum(
         len(c.changed) for r in cloud_of.reports().values() for p in r for c in p.tiles
     )

@@ -5,6 +5,7 @@ import subprocess
 import sys
 import textwrap
 import threading
+from collections import Counter
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
@@ -114,9 +115,14 @@ def some(report: ChangeReport) -> np.ndarray:
     return np.arange(len(report.tiles[0].changed)) % 3 == 0
 
 
+FORMS = {"flags": "PackedReport", "gaussians": "PackedGaussians", "whole": "ChangeReport"}
+
+
 def run(start: Opener, cloud: Bus, script: Script) -> None:
     cloud.serve(change_keys(), script, workers=1)
-    assert start().drain(20.0, NEVER)
+    sender = start()
+    assert sender.drain(20.0, NEVER)
+    assert Counter({FORMS[form]: n for form, n in sender.counts.items()}) == Counter(script.kinds)
 
 
 def test_what_the_cloud_has_enough_of_is_one_message(
