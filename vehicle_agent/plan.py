@@ -43,6 +43,11 @@ class Course:
         direction = np.array([math.cos(self.heading_rad), math.sin(self.heading_rad)])
         return max(self.speed_mps, SLOWEST_MPS) * direction
 
+    @property
+    def patience(self) -> float:
+        """By what a slower vehicle than `velocity_mps` says stays longer; infinite where it stands."""
+        return max(SLOWEST_MPS / self.speed_mps, 1.0) if self.speed_mps > 0 else math.inf
+
 
 @dataclass(frozen=True, slots=True, order=True)
 class Need:
@@ -65,7 +70,7 @@ def needs(frame: LocalFrame, tiles: Sequence[TileId], course: Course, near_m: fl
     low_m, high_m = tile_boxes_m(frame, tiles)
     away_m = np.hypot(*np.maximum(0.0, np.maximum(low_m - course.here_m, course.here_m - high_m)).T)
     from_s, until_s = _crossing_s(low_m - near_m - course.here_m, high_m + near_m - course.here_m, course.velocity_mps)
-    columns = zip(from_s.tolist(), away_m.tolist(), tiles, until_s.tolist(), strict=True)
+    columns = zip(from_s.tolist(), away_m.tolist(), tiles, (until_s * course.patience).tolist(), strict=True)
     return sorted(Need(*one) for one in columns)
 
 
@@ -85,7 +90,7 @@ def _crossing_s(low_m: F64, high_m: F64, velocity_mps: F64) -> tuple[F64, F64]:
     inside = (low_m <= 0.0) & (high_m >= 0.0)
     enter = np.where(beside, np.where(inside, -np.inf, np.inf), np.minimum(a, b)).max(axis=1)
     leave = np.where(beside, np.where(inside, np.inf, -np.inf), np.maximum(a, b)).min(axis=1)
-    never = (enter > leave) | (leave < 0.0)
+    never = (enter > leave) | (leave <= 0.0)
     return np.where(never, np.inf, np.maximum(enter, 0.0)), np.where(never, np.inf, leave)
 
 

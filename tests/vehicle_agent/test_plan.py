@@ -40,7 +40,7 @@ def seconds_near(tile_index: int, course: Course, velocity_mps: np.ndarray) -> l
 
 
 @settings(deadline=None, max_examples=40)
-@given(x=st.floats(-80, 80), y=st.floats(-80, 80), heading=st.floats(-math.pi, math.pi), speed=st.floats(0.0, 40.0))
+@given(x=st.floats(-80, 80), y=st.floats(-80, 80), heading=st.floats(-math.pi, math.pi), speed=st.floats(0.01, 40.0))
 def test_a_tile_is_needed_from_when_it_is_near_until_it_is_left(
     x: float, y: float, heading: float, speed: float
 ) -> None:
@@ -54,9 +54,9 @@ def test_a_tile_is_needed_from_when_it_is_near_until_it_is_left(
         if seen:
             assert need.from_s == pytest.approx(seen[0], abs=1.01 * STEP_S)
             if seen[-1] < 20.0 - 2 * STEP_S:
-                assert need.until_s == pytest.approx(seen[-1], abs=1.01 * STEP_S)
+                assert need.until_s / course.patience == pytest.approx(seen[-1], abs=1.01 * STEP_S)
         elif need.from_s < 20.0 - STEP_S:
-            assert need.until_s - need.from_s <= STEP_S
+            assert need.until_s / course.patience - need.from_s <= STEP_S
 
 
 def test_soonest_first_and_among_those_needed_now_the_nearest() -> None:
@@ -75,6 +75,15 @@ def test_of_a_vehicle_without_heading_what_is_near_is_needed_for_ever() -> None:
     for need in needs(FRAME, AROUND, Course(0.0, 0.0, None, 0.0), 30.0):
         assert (need.from_s, need.until_s) in ((0.0, math.inf), (math.inf, math.inf))
         assert (need.from_s == 0.0) >= (need.distance_m <= 30.0)
+
+
+def test_a_vehicle_that_stands_needs_what_is_near_until_it_drives() -> None:
+    standing, slow = (needs(FRAME, AROUND, Course(0.0, 0.0, 0.3, speed), NEAR_M) for speed in (0.0, 1.0))
+    assert all(need.until_s == math.inf for need in standing)
+    assert in_time(standing, lambda _: 1e9, 1.0, 1.0) == standing
+    driven = {need.tile_id: need.until_s for need in needs(FRAME, AROUND, Course(0.0, 0.0, 0.3, 3.0), NEAR_M)}
+    for need in slow:
+        assert need.until_s == pytest.approx(3.0 * driven[need.tile_id])
 
 
 def test_what_lies_behind_is_needed_last_or_not_at_all() -> None:
