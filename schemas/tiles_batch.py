@@ -6,22 +6,20 @@ import hashlib
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from itertools import groupby, pairwise
-from typing import Final, Literal, Self
+from typing import Final, Self
 
-from gnd_map.codec import PREFERRED, codec_of, decode_tiles, encode_tiles
-from gnd_map.tile import Tile
+from gnd_map.codec import PREFERRED, decode_tiles, encode_tiles
 from gnd_map.tile_id import District, TileId
 from schemas import limits
-from schemas.errors import BadValue, WrongHash
+from schemas.errors import BadValue
 from schemas.generated import tiles_reply_pb2, tiles_request_pb2
-from schemas.tiles import check_codecs, check_hash, tile_from_delta
+from schemas.tile_answer import ANSWER_HASH_BYTES, ANSWER_STATUS, WITH_BODY, AnswerStatus, TileAnswer, tile_of_answer
+from schemas.tiles import check_codecs
 from schemas.wire import (
     MAJOR,
     check_length,
     check_major,
     check_pair,
-    check_version,
-    check_word,
     number_of,
     parse,
     refusing,
@@ -29,20 +27,25 @@ from schemas.wire import (
     word_of,
 )
 
+__all__ = [
+    "ANSWER_HASH_BYTES",
+    "EVERY_CODEC",
+    "HASH_BYTES",
+    "HeldTile",
+    "TileAnswer",
+    "TilesReply",
+    "TilesRequest",
+    "digest_of",
+    "index_of",
+    "tile_of_answer",
+]
+
 HASH_BYTES: Final = 8
 """So much of a hash, or of a digest of hashes, says what a client holds: chance errs once in 10^19."""
-ANSWER_HASH_BYTES: Final = 4
-"""So much of a hash goes with what is brought. Bodies have checksums of their own, the base of a delta is agreed upon
-in the request, and the next request's digest is made of whole hashes: what slips through is found then.
-"""
 EVERY_CODEC: Final = (4, 3, 2, 7, 6, 5, 1, 0)
 """What a request means that names no codecs; frozen, whatever later programs read besides."""
 MAX_HELD_VERSION: Final = 2**31
 TILES: Final = limits.MAX_TILES_OF_DISTRICT
-
-AnswerStatus = Literal["blob", "delta", "unchanged", "absent", "later", "hash"]
-_STATUS: Final[dict[int, AnswerStatus]] = {1: "blob", 2: "delta", 3: "unchanged", 4: "absent", 5: "later", 6: "hash"}
-_WITH_BODY: Final = ("blob", "delta")
 
 
 @dataclass(frozen=True, slots=True)
@@ -195,63 +198,6 @@ def _cut(name: str, hashes: bytes, each: int) -> Iterator[bytes]:
 
 
 @dataclass(frozen=True, slots=True)
-class TileAnswer:
-    """What the server says of one tile: `blob` and `delta` bring a version, `later` did not fit, `hash` = ask again
-    with hashes.
-    """
-
-    status: AnswerStatus
-    version: int = 0
-    """New version of a blob or delta; else 0."""
-    sha: bytes = b""
-    """First 4 bytes of the hash of a blob's or delta's content; else empty."""
-    codec_id: int = 0
-    """Codec of a blob; else 0."""
-    body: bytes = b""
-    """Of a blob in its codec, or of a delta by `gnd_map.codec.encode_delta`; else empty."""
-
-    def __post_init__(self) -> None:
-        check_word(self.status, _STATUS, "answer status")
-        check_length("TileAnswer", len(self.body), limits.MAX_TILE_BODY_BYTES, "bytes")
-        if self.status in _WITH_BODY:
-            check_version("tile version", self.version, lowest=1)
-            check_version("codec id", self.codec_id, lowest=0)
-            good = len(self.sha) == ANSWER_HASH_BYTES and (self.status == "blob" or self.codec_id == 0)
-        else:
-            good = (self.version, self.sha, self.codec_id, self.body) == (0, b"", 0, b"")
-        if not good:
-            raise BadValue(
-                f"answer {self.status!r} with version {self.version}, a hash of {len(self.sha)} bytes, codec"
-                f" {self.codec_id} and {len(self.body)} bytes"
-            )
-
-
-def tile_of_answer(tile: TileId, answer: TileAnswer, held: Tile | None = None) -> Tile:
-    """The tile that a "blob" or "delta" brings.
-
-    Args:
-        tile: which tile the answer is about.
-        answer: of status "blob" or "delta".
-        held: the content that the request said is held; needed by a delta.
-
-    Raises:
-        WrongHash: the content has not its hash, or the delta does not fit what is held: fetch the tile whole.
-        BadValue: an unknown codec, a body that is none of it, an answer without a body.
-    """
-    if answer.status not in _WITH_BODY:
-        raise BadValue(f"answer {answer.status!r} about tile {tile} brings no content")
-    name = f"tile {tile} version {answer.version}"
-    if answer.status == "delta":
-        if held is None:
-            raise WrongHash(f"{name} is a delta and nothing is held; fetch the tile whole")
-        return tile_from_delta(tile, answer.version, answer.body, held, answer.sha)
-    with refusing(name):
-        found = Tile(tile, answer.version, codec_of(answer.codec_id).decode(tile, answer.body))
-    check_hash(name, found, answer.sha)
-    return found
-
-
-@dataclass(frozen=True, slots=True)
 class TilesReply:
     """The tile server's answers, one a tile, in the order of the request."""
 
@@ -275,7 +221,7 @@ class TilesReply:
 
     def encode(self) -> bytes:
         """Bytes of gnd.v1.TilesReply."""
-        brought = [answer for answer in self.answers if answer.status in _WITH_BODY]
+        brought = [answer for answer in self.answers if answer.status in WITH_BODY]
         message = tiles_reply_pb2.TilesReply(
             major=MAJOR,
             runs=_runs(self.answers),
@@ -301,7 +247,7 @@ class TilesReply:
 
 def _runs(answers: Iterable[TileAnswer]) -> Iterator[int]:
     for status, run in groupby(answers, lambda answer: answer.status):
-        yield 8 * sum(1 for _ in run) + number_of(status, _STATUS)
+        yield 8 * sum(1 for _ in run) + number_of(status, ANSWER_STATUS)
 
 
 def _statuses(runs: Sequence[int]) -> list[AnswerStatus]:
@@ -309,12 +255,12 @@ def _statuses(runs: Sequence[int]) -> list[AnswerStatus]:
     check_length("TilesReply", sum(run // 8 for run in runs), TILES, "tiles")
     if any(run < 8 for run in runs):
         raise BadValue("TilesReply with an empty run")
-    return [status for run in runs for status in [word_of(run % 8, _STATUS, "answer status")] * (run // 8)]
+    return [status for run in runs for status in [word_of(run % 8, ANSWER_STATUS, "answer status")] * (run // 8)]
 
 
 def _answers(message: tiles_reply_pb2.TilesReply) -> Iterator[TileAnswer]:
     statuses = _statuses(message.runs)
-    n_brought, n_blobs = sum(s in _WITH_BODY for s in statuses), statuses.count("blob")
+    n_brought, n_blobs = sum(s in WITH_BODY for s in statuses), statuses.count("blob")
     hashes = list(_cut("TilesReply", message.hashes, ANSWER_HASH_BYTES))
     counts = (len(message.versions), len(hashes), len(message.bodies), len(message.codecs))
     if counts != (n_brought, n_brought, n_brought, n_blobs):
@@ -325,7 +271,7 @@ def _answers(message: tiles_reply_pb2.TilesReply) -> Iterator[TileAnswer]:
     brought = iter(zip(message.versions, hashes, message.bodies, strict=True))
     codecs = iter(message.codecs)
     for status in statuses:
-        if status in _WITH_BODY:
+        if status in WITH_BODY:
             version, sha, body = next(brought)
             yield TileAnswer(status, version, sha, next(codecs) if status == "blob" else 0, body)
         else:
