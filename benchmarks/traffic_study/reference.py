@@ -15,8 +15,6 @@ PAPER_BYTES: Final = {
     "upload.fleet.gnd": 3.511e6,
 }
 """GND paper, section 7.5 and Figure 23."""
-CAMERA_KB_PER_KM: Final = 10.0
-"""Map changes of camera-based maps, as the GND paper quotes them."""
 
 PACKET_BYTES: Final = 1206
 PACKET_SHOTS: Final = 384

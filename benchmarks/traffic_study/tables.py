@@ -6,7 +6,7 @@ from typing import Any
 from rich.console import Console
 from rich.table import Table
 
-from benchmarks.traffic_study.reference import PAPER_BYTES, PAPER_KM
+from benchmarks.traffic_study.reference import PAPER_BYTES, PAPER_DRIVES, PAPER_KM
 
 MAPS = (
     ("pcd", "PCD, 0.2 m"),
@@ -71,7 +71,7 @@ def _uploads(found: Mapping[str, Any]) -> Table:
 def _paper(stage: str, name: str) -> str:
     """What the paper's vehicles uploaded, a drive and km."""
     size = PAPER_BYTES.get(f"upload.{stage}.{name}")
-    drives = 38 if stage == "fleet" else 1
+    drives = PAPER_DRIVES if stage == "fleet" else 1
     return "" if size is None else f"{size / 1e3 / PAPER_KM / drives:.1f}"
 
 

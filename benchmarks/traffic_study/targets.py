@@ -4,8 +4,6 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any, Final
 
-from benchmarks.traffic_study.reference import PAPER_BYTES
-
 
 @dataclass(frozen=True, slots=True)
 class Target:
@@ -77,8 +75,3 @@ def _at(values: Mapping[str, Any], path: str) -> float | None:
     for name in path.split("."):
         found = found.get(name) if isinstance(found, Mapping) else None
     return None if found is None else float(found)
-
-
-def paper_bytes(path: str) -> float | None:
-    """Return what the paper reports at a path of the JSON, bytes."""
-    return PAPER_BYTES.get(path)
