@@ -33,6 +33,7 @@ TILES = [*FIRST, *(TileId(tile.morton + 1) for tile in FIRST)]
 @pytest.fixture
 def cloud(tmp_path, free_port):
     cloud = Cloud(tmp_path, free_port)
+    cloud.config_path.write_text(cloud.config_path.read_text() + "[want]\nenough = 1\n")
     cloud.open()
     cloud.store.put_tiles([tile_at(tile) for tile in TILES])
     yield cloud
