@@ -28,11 +28,13 @@ from gnd_map.codec import (
     encode_tiles,
     is_on,
     snap,
+    volume,
 )
 from gnd_map.codec.lattice import COUNTS
 from gnd_map.errors import CodecError
 from gnd_map.gaussian import Gaussians
 from gnd_map.grid import VoxelGrid
+from gnd_map.tile import content_sha
 from gnd_map.tile_id import TileId
 
 ALL_LATTICES = [*LATTICES.values(), REPORT]
@@ -168,6 +170,22 @@ def test_columns_of_another_tile_are_refused(codec: Codec) -> None:
     assert len(codec.decode(SEOUL, body)) > 0
 
 
+@pytest.mark.parametrize("codec", [CODECS[i] for i in (2, 3, 4)], ids=lambda codec: codec.name)
+@by_tile
+def test_range_coded_bytes_of_another_tile_are_refused_or_give_gaussians_whose_hash_tells(
+    codec: Codec, tile_id: TileId
+) -> None:
+    for seed in range(20):
+        g = fitting(codec, street(tile_id, np.random.default_rng(seed), 40))
+        body = codec.encode(tile_id, g)
+        for other in set(TILES) - {tile_id}:
+            try:
+                found = codec.decode(other, body)
+            except CodecError:
+                continue
+            assert content_sha(other, found) != content_sha(tile_id, g)
+
+
 @by_lattice
 @given(g=extreme_gaussians(SEOUL))
 @few
@@ -233,6 +251,16 @@ def _flags(tile_id: TileId, rng: np.random.Generator, share: float, n_new: int) 
     ids = np.union1d(touched, ids_in(tile_id, rng, n_new)).astype(np.int32)
     classes = np.where(np.isin(ids, base.voxel_id), rng.integers(2, 4, len(ids)), 1).astype(np.uint8)
     return Flags(tile_id, base, ids, classes)
+
+
+def test_boxes_of_a_message_have_a_limit_together(monkeypatch: pytest.MonkeyPatch) -> None:
+    flags = [_flags(tile_id, np.random.default_rng(9), 0.5, 9) for tile_id in TILES]
+    body, bases = encode_flags(flags), [(f.tile_id, f.base) for f in flags]
+    monkeypatch.setattr(volume, "MAX_MESSAGE_VOLUME", 30_000)
+    with pytest.raises(CodecError, match="voxels in one message: the limit is 30000"):
+        decode_flags(bases, body)
+    with pytest.raises(CodecError, match="voxels in one message: the limit is 30000"):
+        encode_flags(flags)
 
 
 @given(data=st.data())
