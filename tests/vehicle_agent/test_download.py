@@ -9,11 +9,13 @@ import pytest
 from vehicle_scene import ground, published
 from waiting import wait_until
 
-from fleet_bus.bus import Bus
+from fleet_bus.bus import Bus, open_bus
+from fleet_bus.config import BusConfig
+from fleet_bus.links import LinkProfile
 from fleet_bus.serving import Request
 from gnd_map.tile import Tile
 from gnd_map.tile_id import TileId
-from schemas.keys import batch_key
+from schemas.keys import batch_key, batch_keys
 from schemas.tiles import blob_of
 from schemas.tiles_batch import TileAnswer, TilesReply, TilesRequest
 from tile_store.server import TileServer
@@ -166,3 +168,32 @@ def test_a_tile_that_was_let_go_is_asked_for_again(
         fetcher.forget(tile_id)
         fetcher.want([tile_id])
         wait_until(lambda: fetcher.counts["unchanged"] == 1)
+
+
+@pytest.mark.parametrize(("link", "most"), [("none", 3), (LinkProfile("thin", 8e4, 8e4, 1.0, burst_bytes=0), 1)])
+def test_as_many_questions_are_on_their_way_as_the_link_carries(
+    endpoint: str, cloud: Bus, cache: TileCache, link: LinkProfile | str, most: int
+) -> None:
+    """Three districts are asked for at a time on a fast link; on a slow one the next waits for the first."""
+    districts = [TileId(497353963152 + 1024 * k) for k in range(3)]
+    asked: list[str] = []
+    answer_now = threading.Event()
+
+    def answer(request: Request) -> bytes:
+        asked.append(request.key)
+        answer_now.wait(15.0)
+        return TilesReply((TileAnswer("absent"),) * len(TilesRequest.decode(request.payload).wanted)).encode()
+
+    cloud.serve(batch_keys(), answer)
+    wanted = [TileId(first.morton + k) for first in districts for k in range(4)]
+    with open_bus(BusConfig(connect=(endpoint,), link=link), name="vehicle") as bus:
+        opened = TileFetcher(bus, cache, DownloadParameters(in_flight=3))
+        opened.want(wanted)
+        wait_until(lambda: len(asked) == most)
+        assert opened.wait_for(wanted, 0.5, NEVER) == set(wanted)
+        assert len(asked) == most
+        answer_now.set()
+        assert opened.wait_for(wanted, 15.0, NEVER) == set()
+        bus.close()
+        opened.close()
+    assert len(asked) >= len(set(asked)) == 3
