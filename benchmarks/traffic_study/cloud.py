@@ -15,7 +15,7 @@ from cloud_merger.short_reports import ShortReports
 from cloud_merger.work import Worker
 from gnd_map.tile import Tile
 from tile_store.sqlite_store import SqliteStore
-from tile_store.values import DEFAULT_LAYER, StoreConfig
+from tile_store.values import DEFAULT_CODEC, DEFAULT_LAYER, StoreConfig
 
 _OWNER: Final = "traffic-study"
 _LEASE_S: Final = 3600.0
@@ -38,12 +38,13 @@ class Cloud:
         path: of the store; an older one there is removed.
         base: the map that it begins with.
         merge: how statements become changes.
+        codec: the lattice of tiles that it makes anew, "float" for none; others stay on that of the base.
     """
 
-    def __init__(self, path: Path, base: BaseMap, merge: MergeParameters) -> None:
+    def __init__(self, path: Path, base: BaseMap, merge: MergeParameters, codec: str = DEFAULT_CODEC) -> None:
         for old in path.parent.glob(f"{path.name}*"):
             old.unlink()
-        config = ShardConfig(store_path=path, merge=merge, store=StoreConfig(merge_delay_s=0.0))
+        config = ShardConfig(store_path=path, merge=merge, codec=codec, store=StoreConfig(merge_delay_s=0.0))
         self.store = SqliteStore(path, config.store)
         self.store.put_tiles(Tile(tile, 1, gaussians) for tile, gaussians in base.tiles.items())
         short = ShortReports(self.store, config.merge, config.want, config.waiting)

@@ -87,7 +87,8 @@ class Fleet:
         uploads: list[DriveUpload] = []
         published: list[int] = []
         scores: dict[int, dict[Level, float]] = {}
-        with Cloud(self.files.home / f"cloud-{way.name}.sqlite", base, self.options.method.merge) as cloud:
+        store, merge = self.files.home / f"cloud-{way.name}.sqlite", self.options.method.merge
+        with Cloud(store, base, merge, way.lattice.name if way.lattice else "float") as cloud:
             for first in range(0, drives, self.options.at_once):
                 held = cloud.map()
                 numbers = range(first, min(first + self.options.at_once, drives))
