@@ -41,7 +41,7 @@ class TrackBuilder:
         self._elevations = np.zeros(_ELEVATIONS, np.int64)
         self._sectors = np.zeros(SECTORS, np.int64)
         self._ranges = np.zeros(_RANGES, np.int64)
-        self._rays = 0
+        self._scans = self._rays = 0
 
     def __len__(self) -> int:
         return len(self._t_ns)
@@ -60,8 +60,8 @@ class TrackBuilder:
         origins = np.broadcast_to(origins_map_m, points_map_m.shape)
         self._t_ns.append(t_ns)
         self._origins.append(np.asarray(origins[len(origins) // 2], np.float64))
-        self._rays += len(points_map_m)
-        step = 1 + len(points_map_m) // _RAYS_OF_A_SCAN
+        self._scans, self._rays = self._scans + 1, self._rays + len(points_map_m)
+        step = 1 + len(points_map_m) // _RAYS_OF_A_SCAN | 1  # odd: layers come in powers of two
         self._look((points_map_m[::step] - origins[::step]) @ T_map_vehicle[:3, :3])
 
     def _look(self, rays: F64) -> None:
@@ -116,7 +116,7 @@ class TrackBuilder:
         return View(
             levels=tuple((at - _ELEVATIONS // 2).tolist()),
             sectors=int((half * (1 << np.arange(SECTORS))).sum()),
-            rays_log2=min(round(4.0 * float(np.log2(self._rays / len(self._t_ns)))), 96),
+            rays_log2=min(round(4.0 * float(np.log2(self._rays / self._scans))), 96),
             range_m=min(max(reach, 1), 255),
         )
 

@@ -59,7 +59,7 @@ class VisibilityParameters:
     reach_m: float = 70.0
     noise_m: float = 0.05
     r2: float = 3.0
-    new_radius_m: float = 0.4
+    new_radius_m: float = 0.5
     min_hits: float = 32.0
     min_passes: float = 256.0
     hits_near: float = 4.0
