@@ -260,6 +260,12 @@ def integers_of(gaussians: Gaussians, lattice: Lattice) -> Quantised:
     return found
 
 
+def nearest_integers(gaussians: Gaussians, lattice: Lattice) -> Quantised:
+    """As `integers_of` where all lie on the lattice, else as `quantise`."""
+    found, on = _found(gaussians, lattice)
+    return found if on.all() and gaussians.exists.all() else quantise(gaussians, lattice)
+
+
 def quantise(gaussians: Gaussians, lattice: Lattice) -> Quantised:
     """The nearest integers, tilt of the surface first; every count > 0."""
     cov = gaussians.full_cov()

@@ -9,7 +9,7 @@ import numpy.typing as npt
 from gnd_map.arrays import I32, I64
 from gnd_map.codec import kernels as k
 from gnd_map.codec.coding import Coder
-from gnd_map.codec.lattice import Lattice, Quantised, integers_of, is_on, quantise
+from gnd_map.codec.lattice import Lattice, Quantised, nearest_integers
 from gnd_map.codec.priors import FLAGS_AT, VOXEL_WEIGHTS_AT, VOXELS_AT, number_at
 from gnd_map.errors import CodecError
 from gnd_map.gaussian import Gaussians
@@ -124,8 +124,7 @@ class Known:
 def known_of(base: Gaussians, replaced: npt.NDArray[np.bool_], gone: npt.NDArray[np.bool_], lattice: Lattice) -> Known:
     """What the base tells about those that come."""
     kept = base.take(~gone)
-    integers = integers_of(kept, lattice) if is_on(kept, lattice) else quantise(kept, lattice)
-    return Known(integers, replaced[~gone])
+    return Known(nearest_integers(kept, lattice), replaced[~gone])
 
 
 NOTHING_KNOWN: Final = Known(
