@@ -7,7 +7,10 @@ import numpy as np
 import pytest
 from vehicle_scene import ground, tiles_of
 
+from gnd_map.codec import CODEC_FLOAT32, CODEC_FLOAT32_ZSTD, CODEC_STANDARD, CODEC_STANDARD_ZSTD, LATTICES, snap
 from gnd_map.tile import Tile
+from gnd_map.tile_id import TileId
+from schemas.tiles import blob_of
 from vehicle_agent.cache import TileCache
 from vehicle_agent.errors import CacheError
 
@@ -55,3 +58,25 @@ def test_a_cache_that_cannot_be_opened_is_named(tmp_path: Path) -> None:
     (tmp_path / "cache.sqlite").mkdir()
     with pytest.raises(CacheError, match=r"cannot open .*cache.sqlite"):
         TileCache(tmp_path / "cache.sqlite")
+
+
+@pytest.mark.parametrize("codec_id", [CODEC_FLOAT32, CODEC_FLOAT32_ZSTD, CODEC_STANDARD, CODEC_STANDARD_ZSTD])
+def test_a_body_is_kept_as_it_arrived(tmp_path: Path, tile: Tile, codec_id: int) -> None:
+    published = Tile(tile.tile_id, 4, snap(tile.gaussians, LATTICES["standard"]))
+    blob = blob_of(published, codec_id)
+    cache = TileCache(tmp_path / "cache.sqlite")
+    assert cache.keep(blob)
+    assert cache.get(tile.tile_id) == published
+    with apsw.Connection(str(tmp_path / "cache.sqlite")) as other:
+        assert list(other.execute("SELECT codec_id, body FROM tile")) == [(codec_id, blob.body)]
+
+
+def test_what_came_late_replaces_only_what_it_was_asked_over(tmp_path: Path, tile: Tile) -> None:
+    cache = TileCache(tmp_path / "cache.sqlite")
+    old, new, newest = (Tile(tile.tile_id, v, tile.gaussians.take(np.arange(10 * v))) for v in (1, 2, 3))
+    assert cache.put(old)
+    assert cache.put(newest)
+    assert not cache.put(new, over=old.sha), "a late answer to a question that was put over version 1"
+    assert cache.heads([tile.tile_id, TileId(1)]) == {tile.tile_id: (3, newest.sha)}
+    assert cache.put(new, over=newest.sha), "what the store says now, although it counts anew"
+    assert cache.head(tile.tile_id) == (2, new.sha)
