@@ -16,6 +16,7 @@ same bits on every machine. `snap` moves Gaussians onto the lattice once; what l
 
 from collections.abc import Mapping
 from dataclasses import dataclass, fields
+from functools import lru_cache
 from types import MappingProxyType
 from typing import Final
 
@@ -80,7 +81,7 @@ class Lattice:
 
 
 def _levels(first_m: float, ratio: float) -> tuple[int, ...]:
-    """Frozen by `tests/gnd_map/test_lattice.py`: another machine's `pow` must not move them."""
+    """Frozen by `tests/gnd_map/test_codec_golden.py`: another machine's `pow` must not move them."""
     return tuple(min(round(first_m * ratio**k * 2**UNIT_BITS), MAX_SD_M << UNIT_BITS) for k in range(LEVELS))
 
 
@@ -278,7 +279,7 @@ def quantise(gaussians: Gaussians, lattice: Lattice) -> Quantised:
     L32 = (S[2][1] - L31 * L21) / L22
     L33 = np.sqrt(np.maximum(S[2][2] - L31**2 - L32**2, _TINY))
     level = np.stack([_level(L11, lattice, True), _level(L22, lattice, True), _level(L33, lattice, False)], axis=1)
-    D = _diagonal(level, lattice)
+    D = [_length(level, i, lattice) for i in range(3)]
     # The regression of c on a and b is the surface's tilt: it is kept, whatever became of the standard deviations.
     tilt_b = L32 / L22
     tilt_a = (L31 - tilt_b * L21) / L11
@@ -303,25 +304,35 @@ def _thin_axis(cov: F64) -> I32:
 
 
 def _permuted(cov: F64, axis: I32) -> list[list[F64]]:
-    """Entries of Sigma in the order (a, b, c)."""
+    """Lower triangle of Sigma in the order (a, b, c)."""
     row, axes = np.arange(len(axis)), AXES[axis]
-    return [[cov[row, axes[:, i], axes[:, j]] for j in range(3)] for i in range(3)]
+    return [[cov[row, axes[:, i], axes[:, j]] for j in range(i + 1)] for i in range(3)]
+
+
+@lru_cache(maxsize=16)
+def _tables(lattice: Lattice) -> tuple[F64, F64, I64, I64]:
+    """Between which standard deviations, m, levels change, and those of the levels, 2^-length_bits m: along the surface
+    and across it.
+    """
+    across = np.array(lattice.sd, np.int64)
+    along = across[:: lattice.plane_step]
+    change = (np.sqrt(t[1:] * t[:-1]) for t in (along * 2.0**-UNIT_BITS, across * 2.0**-UNIT_BITS))
+    shift = lattice.length_bits - UNIT_BITS
+    return (*change, along << shift, across << shift)  # type: ignore[return-value]
 
 
 def _level(sd_m: F64, lattice: Lattice, is_plane: bool) -> I32:
-    table = np.array(lattice.sd[:: lattice.plane_step if is_plane else 1], np.float64) * 2.0**-UNIT_BITS
-    between = np.sqrt(table[1:] * table[:-1])
-    return np.searchsorted(between, sd_m).astype(np.int32)
+    return np.searchsorted(_tables(lattice)[0 if is_plane else 1], sd_m).astype(np.int32)
 
 
-def _diagonal(level: I32, lattice: Lattice) -> list[F64]:
-    """L_aa, L_bb, L_cc in metres."""
-    return [np.asarray(column * 2.0**-lattice.length_bits) for column in _diagonal_units(level, lattice)]
+def _length(level: I32, which: int, lattice: Lattice) -> F64:
+    """L_aa, L_bb or L_cc in metres."""
+    return np.asarray(_units(level, which, lattice) * 2.0**-lattice.length_bits)
 
 
-def _diagonal_units(level: I32, lattice: Lattice) -> list[I64]:
-    table = np.array(lattice.sd, np.int64) << (lattice.length_bits - UNIT_BITS)
-    return [table[level[:, 0] * lattice.plane_step], table[level[:, 1] * lattice.plane_step], table[level[:, 2]]]
+def _units(level: I32, which: int, lattice: Lattice) -> I64:
+    """The same in integers of 2^-length_bits m."""
+    return np.asarray(_tables(lattice)[3 if which == 2 else 2][level[:, which]])
 
 
 def _rounded(values: F64, limit: int) -> F64:
@@ -333,7 +344,7 @@ _Lower = tuple[I64, I64, I64, I64, I64, I64]  # L_aa, L_ba, L_bb, L_ca, L_cb, L_
 
 def _lengths(level: I32, slope: I32, lattice: Lattice) -> _Lower:
     """L in integers of 2^-length_bits m."""
-    a, b, c = _diagonal_units(level, lattice)
+    a, b, c = (_units(level, i, lattice) for i in range(3))
     s = slope.astype(np.int64)
     return (
         a,
@@ -413,16 +424,16 @@ def _read_off(gaussians: Gaussians, cov: F64, axis: I32, lattice: Lattice) -> Qu
     S = _permuted(cov, axis)
     level = np.zeros((len(axis), 3), np.int32)
     level[:, 0] = _level(np.sqrt(np.maximum(S[0][0], _TINY)), lattice, True)
-    D1 = _diagonal(level, lattice)[0]
+    D1 = _length(level, 0, lattice)
     L21 = S[1][0] / D1
     level[:, 1] = _level(np.sqrt(np.maximum(S[1][1] - L21**2, _TINY)), lattice, True)
-    D2 = _diagonal(level, lattice)[1]
+    D2 = _length(level, 1, lattice)
     s_ba = _rounded(L21 / D2 * 2**lattice.shear_bits, MAX_SLOPE)
     L21 = s_ba * D2 / 2**lattice.shear_bits
     L31 = S[2][0] / D1
     L32 = (S[2][1] - L31 * L21) / D2
     level[:, 2] = _level(np.sqrt(np.maximum(S[2][2] - L31**2 - L32**2, _TINY)), lattice, False)
-    D3 = _diagonal(level, lattice)[2]
+    D3 = _length(level, 2, lattice)
     s_ca, s_cb = (_rounded(x / D3 * 2**lattice.slope_bits, MAX_SLOPE) for x in (L31, L32))
     slope = np.stack([s_ba, s_ca, s_cb], axis=1).astype(np.int32)
     return _with_means(gaussians, axis, level, slope, lattice)
