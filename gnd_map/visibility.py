@@ -60,9 +60,9 @@ class VisibilityParameters:
     noise_m: float = 0.05
     r2: float = 3.0
     new_radius_m: float = 0.5
-    min_hits: float = 32.0
+    min_hits: float = 48.0
     min_passes: float = 256.0
-    hits_near: float = 4.0
+    hits_near: float = 3.0
     passes_near: float = 8.0
     open_rad: float = 0.0
 
