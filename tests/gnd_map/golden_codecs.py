@@ -84,12 +84,24 @@ def hashes() -> dict[str, str]:
     }
 
 
+def tables() -> dict[str, list[int]]:
+    """What lattices are made of: standard deviations, then steps."""
+    return {
+        lattice.name: [
+            *lattice.sd, lattice.code, lattice.plane_step, lattice.slope_bits, lattice.shear_bits, lattice.thin_bits,
+            lattice.plane_bits,
+        ]
+        for lattice in (*LATTICES.values(), REPORT)
+    }  # fmt: skip
+
+
 def main() -> None:
     """Write what is not there yet."""
-    old = json.loads(FILE.read_text()) if FILE.exists() else {"messages": {}, "hashes": {}}
+    old = {"messages": {}, "hashes": {}, "tables": {}} | (json.loads(FILE.read_text()) if FILE.exists() else {})
     new = {
-        "messages": {k: v.hex() for k, v in messages().items()} | old["messages"],
+        "messages": {name: body.hex() for name, body in messages().items()} | old["messages"],
         "hashes": hashes() | old["hashes"],
+        "tables": tables() | old["tables"],
     }
     FILE.parent.mkdir(exist_ok=True)
     FILE.write_text(json.dumps(new, indent=1) + "\n")

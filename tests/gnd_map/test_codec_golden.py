@@ -5,7 +5,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from golden_codecs import ENTRIES, FILE, MASK, OTHER, TILE, flags_of, hashes, messages, state
+from golden_codecs import ENTRIES, FILE, MASK, OTHER, TILE, flags_of, hashes, messages, state, tables
 
 from gnd_map.codec import (
     CODECS,
@@ -64,6 +64,7 @@ def test_golden_reports_are_read() -> None:
 
 
 def test_integers_stand_for_the_same_bits_for_ever() -> None:
+    assert tables() == GOLDEN["tables"]
     assert hashes() == GOLDEN["hashes"]
 
 
