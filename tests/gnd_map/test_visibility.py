@@ -107,7 +107,7 @@ def gaussians(at):
 
 STREET = gaussians(
     {voxel(i, j, GROUND): FLAT for i in range(GRID.nx) for j in range(GRID.ny)}
-    | {voxel(i, WALL_ROW, GROUND + k): UPRIGHT for i in range(GRID.nx) for k in range(1, HIGH)}
+    | {voxel(i, WALL_ROW, GROUND + k): UPRIGHT for i in range(GRID.nx) for k in range(HIGH)}
 )
 # 2 m over the ground, along row 12 through both tiles
 PATH = [(64 * (TILES[k].lon_index % 32) + 8 + 48 * k, 64 * (WEST.lat_index % 32) + 20, 45) for k in range(2)]
@@ -140,7 +140,7 @@ def test_a_drive_sees_the_ground_the_air_and_the_wall_but_not_what_lies_behind_i
 
 def test_what_is_flagged_is_always_observed_and_stops_lines_unless_it_is_gone():
     behind = voxel(15, WALL_ROW + 1, GROUND + 2)
-    gone = [(voxel(i, WALL_ROW, GROUND + k), ChangeClass.DELETED) for i in range(GRID.nx) for k in range(1, HIGH)]
+    gone = [(voxel(i, WALL_ROW, GROUND + k), ChangeClass.DELETED) for i in range(GRID.nx) for k in range(HIGH)]
     assert behind not in seen()
     assert behind in seen(DRIVE, *gone)
     assert {v for v, _ in gone} <= seen(DRIVE, *gone)
@@ -149,7 +149,7 @@ def test_what_is_flagged_is_always_observed_and_stops_lines_unless_it_is_gone():
     assert before in seen()
     assert before not in seen(DRIVE, *fence)
     assert {v for v, _ in fence} <= seen(DRIVE, *fence)
-    moved = [(voxel(i, WALL_ROW, GROUND + k), ChangeClass.MODIFIED) for i in range(GRID.nx) for k in range(1, HIGH)]
+    moved = [(voxel(i, WALL_ROW, GROUND + k), ChangeClass.MODIFIED) for i in range(GRID.nx) for k in range(HIGH)]
     assert behind not in seen(DRIVE, *moved)
 
 
