@@ -102,6 +102,8 @@ class Outbox:
             packed: its first half in short; empty: it is only ever sent whole.
             bases: the tiles that its second half is coded against.
         """
+        if self._db.run("SELECT 1 FROM report WHERE report_id = ?", (report_id,)):
+            return False  # a restarted agent: no tile is encoded for nothing
         tiles = [_row(tile) for tile in bases]
         with self._db.transaction() as c:
             c.execute("INSERT OR IGNORE INTO report VALUES (?, ?, ?, 'pending', '', 0, 0)", (report_id, key, body))
