@@ -30,6 +30,13 @@ T = TypeVar("T")
     help="estimated, true, or noisy:<m>:<deg>; true,estimated compares.",
 )
 @click.option("--base", type=click.Choice(["surveyed", "driven"]), default="surveyed", show_default=True)
+@click.option(
+    "--upload",
+    type=click.Choice(["float", "full", "packed"]),
+    default="full",
+    show_default=True,
+    help="Whole reports with Gaussians as measured, or on their lattice; or in short, flags first.",
+)
 @click.option("--set", "changes", multiple=True, metavar="GROUP.FIELD=VALUE", help="Replace a parameter, repeatable.")
 @click.option("--pcd/--no-pcd", default=True, show_default=True, help="Run the point-cloud baseline beside.")
 @click.option("--scans", type=int, help="At most so many scans a drive, for a quick look.")
@@ -130,7 +137,9 @@ def options_of(given: dict[str, Any]) -> Any:
     from benchmarks.simulation.options import RunOptions
     from fleet_sim.street import StreetOptions
 
-    chosen: dict[str, Any] = {name: given[name] for name in ("parking", "traffic", "mode", "base", "scans", "pcd")}
+    chosen: dict[str, Any] = {
+        name: given[name] for name in ("parking", "traffic", "mode", "base", "scans", "pcd", "upload")
+    }
     chosen["street"] = StreetOptions(given["length_m"], given["site"])
     chosen["poses"] = pose_sources(given["poses"])[0]
     chosen["method"] = MethodParameters.of_mode(given["mode"]).with_changes(given["changes"])

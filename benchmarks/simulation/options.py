@@ -10,6 +10,7 @@ from fleet_sim.sensors import SHORT_NAMES
 from fleet_sim.street import StreetOptions
 
 Base = Literal["surveyed", "driven"]
+Upload = Literal["float", "full", "packed"]
 
 _MOST_VEHICLES = 200
 
@@ -31,6 +32,8 @@ class RunOptions:
         method: all parameters of the method.
         scans: at most so many scans a drive, None for the whole street.
         pcd: whether the point-cloud baseline runs beside.
+        upload: how reports travel: "float": whole, with Gaussians as measured; "full": whole, with Gaussians on their
+            lattice; "packed": in short, flags first, as agents send them.
     """
 
     seeds: tuple[int, ...] = (201,)
@@ -45,6 +48,7 @@ class RunOptions:
     method: MethodParameters = field(default_factory=MethodParameters)
     scans: int | None = None
     pcd: bool = True
+    upload: Upload = "full"
 
     def __post_init__(self) -> None:
         if not self.seeds or min(self.seeds) < 0 or len(set(self.seeds)) != len(self.seeds):

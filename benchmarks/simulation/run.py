@@ -12,7 +12,7 @@ from benchmarks.simulation.folder import RunFolder
 from benchmarks.simulation.options import RunOptions
 from benchmarks.simulation.pool import Job, run_jobs
 from benchmarks.simulation.result import VehicleResult, read_result
-from benchmarks.simulation.scoring import Scored, VehicleFile, score_fleet, score_pcd, score_single
+from benchmarks.simulation.scoring import Scored, VehicleFile, score_fleet, score_pcd, score_single, sent_bytes
 from benchmarks.simulation.tasks import shots_a_second, vehicle_tasks
 from benchmarks.simulation.vehicle import VehicleTask, run_vehicle
 from benchmarks.simulation.worlds import WorldFiles, prepare_cloud, prepare_world, world_files
@@ -32,6 +32,7 @@ class WorldOutcome:
         kept: their files.
         single: score of the stale map and of each vehicle alone, by name.
         fleet: score of the merged map by number of vehicles.
+        sent: bytes that each vehicle sends, in their order: to the fleet's cloud, and to a cloud of its own.
         pcd: score of the point-cloud baseline: of each vehicle alone by name, of the fleet by number; empty without it.
     """
 
@@ -41,6 +42,7 @@ class WorldOutcome:
     kept: tuple[VehicleFile, ...]
     single: dict[str, Scored]
     fleet: dict[int, Scored]
+    sent: tuple[list[int], list[int]]
     pcd: dict[str | int, Scored]
 
 
@@ -119,10 +121,13 @@ def _scores(
 ) -> tuple[WorldOutcome, ...]:
     """Scores of every world; the curve over the number of vehicles is shared out among the processes."""
     shares = _shares(range(1, max(options.vehicles) + 1), processes)
-    jobs, merge = [], options.method.merge
+    jobs, merge, upload = [], options.method.merge, options.upload
     for seed, of_world in vehicles.items():
         jobs.append(Job(f"single drives, world {seed}", score_single, (files[seed], of_world)))
-        jobs += [Job(f"merges, world {seed}", score_fleet, (files[seed], of_world, share, merge)) for share in shares]
+        jobs += [
+            Job(f"merges, world {seed}", score_fleet, (files[seed], of_world, share, merge, upload)) for share in shares
+        ]
+        jobs.append(Job(f"uploads, world {seed}", sent_bytes, (files[seed], of_world, merge, upload)))
         if options.pcd:
             jobs.append(Job(f"baseline, world {seed}", score_pcd, (files[seed], of_world, options.vehicles)))
     results = iter(run_jobs(jobs, processes, progress, "merges and scores"))
@@ -130,9 +135,11 @@ def _scores(
     for seed, of_world in vehicles.items():
         single = next(results)
         fleet = {n: scored for _ in shares for n, scored in next(results).items()}
+        sent = next(results)
         pcd = next(results) if options.pcd else {}
         read = tuple(vehicle.read() for vehicle in of_world)
-        found.append(WorldOutcome(seed, files[seed], read, tuple(of_world), single, dict(sorted(fleet.items())), pcd))
+        fleet = dict(sorted(fleet.items()))
+        found.append(WorldOutcome(seed, files[seed], read, tuple(of_world), single, fleet, sent, pcd))
     return tuple(found)
 
 

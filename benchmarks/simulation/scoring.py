@@ -8,7 +8,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from benchmarks.simulation.cloud import map_of_one, merged_map
+from benchmarks.simulation.options import Upload
 from benchmarks.simulation.result import VehicleResult, read_result
+from benchmarks.simulation.uploads import arrived
 from benchmarks.simulation.worlds import WorldFiles, read_world_base
 from cloud_merger.merge import MergeParameters
 from fleet_sim.evaluate import Evaluation, Score, evaluate_maps
@@ -60,16 +62,29 @@ def score_single(files: WorldFiles, vehicles: Sequence[VehicleFile]) -> dict[str
 
 
 def score_fleet(
-    files: WorldFiles, vehicles: Sequence[VehicleFile], numbers: Sequence[int], merge: MergeParameters
+    files: WorldFiles,
+    vehicles: Sequence[VehicleFile],
+    numbers: Sequence[int],
+    merge: MergeParameters,
+    upload: Upload = "full",
 ) -> dict[int, Scored]:
     """Return the score of the merged map of the first n vehicles, for each n asked for."""
     truth, base = read_truth(files.truth), read_world_base(files)
-    results = [vehicle.read() for vehicle in vehicles[: max(numbers)]]
+    held = arrived(base, [vehicle.read() for vehicle in vehicles[: max(numbers)]], merge, upload)
     found = {}
     for n in numbers:
-        bodies = [body for result in results[:n] for body in result.reports]
+        bodies = [body for one in held[:n] for body in one.bodies]
         found[n] = Scored.of(evaluate_maps(truth, base.tiles, merged_map(base, bodies, merge)))
     return found
+
+
+def sent_bytes(
+    files: WorldFiles, vehicles: Sequence[VehicleFile], merge: MergeParameters, upload: Upload
+) -> tuple[list[int], list[int]]:
+    """Return what each vehicle sends: one after the other to the same cloud, and each alone to a cloud of its own."""
+    base, results = read_world_base(files), [vehicle.read() for vehicle in vehicles]
+    together = [one.sent_bytes for one in arrived(base, results, merge, upload)]
+    return together, [arrived(base, [result], merge, upload)[0].sent_bytes for result in results]
 
 
 def score_pcd(files: WorldFiles, vehicles: Sequence[VehicleFile], numbers: Sequence[int]) -> dict[str | int, Scored]:

@@ -77,11 +77,11 @@ def _classes(scored: Scored, level: Any) -> dict[str, Any]:
 
 def _uploads(world: WorldOutcome, by_sensor: Mapping[str, list[str]]) -> dict[str, Any]:
     """Bytes of the reports: a drive of each sensor, and the first n vehicles together."""
-    size = {vehicle.vehicle: vehicle.upload_bytes for vehicle in world.vehicles}
-    order = [vehicle.vehicle for vehicle in world.vehicles]
+    together, alone = world.sent
+    size = {vehicle.vehicle: size for vehicle, size in zip(world.vehicles, alone, strict=True)}
     return {
         "single": {sensor: _mean(float(size[name]) for name in names) for sensor, names in by_sensor.items()},
-        "fleet": {str(n): sum(size[name] for name in order[:n]) for n in world.fleet},
+        "fleet": {str(n): sum(together[:n]) for n in world.fleet},
     }
 
 

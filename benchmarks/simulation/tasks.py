@@ -36,6 +36,7 @@ def vehicle_tasks(options: RunOptions, seed: int, files: WorldFiles, keep_drives
                 watch=watched,
                 recording=_recording(files, name) if keep_drives else None,
                 cloud=files.cloud if options.pcd else None,
+                rounded=options.upload != "float",
             )
         )
     return tasks
@@ -52,6 +53,7 @@ def _key(options: RunOptions, files: WorldFiles, base_sha: str, drive: DriveConf
         drive=to_mapping(drive),
         poses=str(options.poses),
         watch=watched,
+        rounded=options.upload != "float",
         pcd=sources_sha(PCD) if options.pcd else None,
         method={name: to_mapping(getattr(method, name)) for name in ("localise", "segment", "detect", "report")},
     )
