@@ -14,6 +14,7 @@ from benchmarks.simulation.cloud import map_of_one, merged_map
 from benchmarks.simulation.masses import WATCHED, Watch, choose, most_telling
 from benchmarks.simulation.run import Outcome, WorldOutcome
 from benchmarks.simulation.targets import target_single
+from benchmarks.simulation.uploads import arrived
 from benchmarks.simulation.worlds import read_world_base
 from fleet_sim.ellipsoids import ellipsoids_of_maps, ellipsoids_of_truth
 from fleet_sim.pictures import View, draw_map, save_figure
@@ -51,8 +52,9 @@ def draw_changes(outcome: Outcome, world: WorldOutcome, truth: Truth, folder: Pa
     base, true = read_world_base(world.files), ellipsoids_of_truth(truth)
     view, n = View.around(true), max(outcome.options.vehicles)
     one = next((vehicle for vehicle in world.vehicles if vehicle.sensor in reference.TARGET_SENSORS), world.vehicles[0])
-    bodies = [body for vehicle in world.vehicles[:n] for body in vehicle.reports]
-    merged = merged_map(base, bodies, outcome.options.method.merge)
+    merge = outcome.options.method.merge
+    held = arrived(base, world.vehicles[:n], merge, outcome.options.upload)
+    merged = merged_map(base, [body for sent in held for body in sent.bodies], merge)
     alone, fleet = (
         f"F1 {scored.f1():.2f} % of scored voxels" for scored in (world.single[one.vehicle], world.fleet[n])
     )

@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pytest
 from repro_world import reproduce, result_of
 
 from benchmarks.simulation.base_map import read_base
@@ -24,6 +25,7 @@ def results_in(out: Path) -> list[VehicleResult]:
     return [read_result(path, key) for path, key in zip(paths, keys, strict=True)]
 
 
+@pytest.mark.slow
 def test_in_short_the_map_is_as_good_and_the_upload_a_fraction(finished: Finished, tmp_path: Path) -> None:
     out, whole = finished
     other = Path(shutil.copytree(out, tmp_path / "packed"))

@@ -166,6 +166,41 @@ def test_unmeasured_and_weak_entries_abstain():
     assert merged([enough]).changed.tolist() == [2]
 
 
+def test_a_withheld_gaussian_votes_with_the_measured_ones():
+    measured, none = change_of(EPOCH, [2], {2: POLE}), change_of(EPOCH, [2], {})
+    withheld = change_of(EPOCH, [2], {2: None}, change_class=ChangeClass.NEW, withheld=[2])
+    assert merged([measured, none]).gaussians == EPOCH  # 1 of 2
+    result = merged([measured, none, withheld])  # 2 of 3
+    assert result.gaussians == merged([measured]).gaussians
+    assert result.provenance == {2: (report_id(0), report_id(2))}
+
+
+def test_flags_alone_change_nothing_but_count_as_observers():
+    withheld = change_of(EPOCH, [2], {2: None}, change_class=ChangeClass.NEW, withheld=[2])
+    assert merged([withheld] * 5).gaussians == EPOCH
+    gone = change_of(EPOCH, [1], {1: None})
+    reshaped = change_of(EPOCH, [1], {1: None}, withheld=[1])
+    assert merged([gone, gone, reshaped]).changed.tolist() == [1]
+    assert merged([gone, gone, reshaped, reshaped]).gaussians == EPOCH  # 2 of 4
+
+
+def test_a_withheld_gaussian_votes_with_the_larger_of_two_and_never_with_the_epoch():
+    pole, ball = change_of(EPOCH, [2], {2: POLE}), change_of(EPOCH, [2], {2: BALL})
+    withheld = change_of(EPOCH, [2], {2: None}, change_class=ChangeClass.NEW, withheld=[2])
+    result = merged([pole, ball, ball, withheld, withheld])
+    assert result.provenance == {2: tuple(report_id(k) for k in (1, 2, 3, 4))}
+    quotes, reshaped = change_of(EPOCH, [1], {}), change_of(EPOCH, [1], {1: None}, withheld=[1])
+    assert merged([quotes, quotes, reshaped]).gaussians == EPOCH
+
+
+def test_withheld_denials_lower_the_bar_for_another_shape():
+    moved = change_of(EPOCH, [1], {1: POLE})
+    reshaped, quotes = change_of(EPOCH, [1], {1: None}, withheld=[1]), change_of(EPOCH, [1], {})
+    changes = [moved, reshaped, reshaped, reshaped, reshaped, quotes, quotes, quotes, quotes]
+    assert merged(changes).changed.tolist() == [1]  # 5 of 9 deny: more than half
+    assert merged([*changes, quotes]).gaussians == EPOCH
+
+
 def test_a_chain_of_neighbours_cannot_carry_those_who_confirm_the_map():
     # near resembles the ground, far resembles near but not the ground: all are one cluster.
     near = {0: (0.0, 0.0, -0.14, 0.28, 0.28, 0.02)}
