@@ -44,7 +44,7 @@ def cast_lines(  # noqa: C901  (one loop, as in the vehicle's ray kernel)
     r2: float,
     range_m: float,
     reach_m: float,
-    open_up: float,
+    level: float,
     hits: F64,
     passes: F64,
 ) -> None:
@@ -63,7 +63,7 @@ def cast_lines(  # noqa: C901  (one loop, as in the vehicle's ray kernel)
         r2: squared Mahalanobis distance within which a Gaussian stops a line.
         range_m: voxels that a line enters beyond are not counted.
         reach_m: lines end there.
-        open_up: a line that nothing stopped counts if the sine of its elevation is smaller.
+        level: a line that nothing stopped counts if the sine of its elevation, up or down, is smaller.
         hits: (M,) float64, changed: lines that each Gaussian stopped within the range.
         passes: (nx * ny * nz,) float64, changed: lines that crossed each voxel and met something behind.
     """
@@ -89,7 +89,7 @@ def cast_lines(  # noqa: C901  (one loop, as in the vehicle's ray kernel)
             t_x = ((i + 1 - places[p, 0]) if step_x > 0 else (places[p, 0] - i)) * dt_x if g[0] != 0.0 else np.inf
             t_y = ((j + 1 - places[p, 1]) if step_y > 0 else (places[p, 1] - j)) * dt_y if g[1] != 0.0 else np.inf
             t_z = ((k + 1 - places[p, 2]) if step_z > 0 else (places[p, 2] - k)) * dt_z if g[2] != 0.0 else np.inf
-            t_in, n, met = 0.0, 0, d[2] < open_up
+            t_in, n, met = 0.0, 0, abs(d[2]) < level
             while t_in < reach_m and n < _MOST_VOXELS:
                 at = (i * ny + j) * nz + k
                 row = state[at]

@@ -48,8 +48,9 @@ class VisibilityParameters:
         hits_near: so many times more for each face behind which the drive flags a Gaussian as gone or modified: where
             something goes on to change, drives often cannot tell, and abstain.
         passes_near: so many times more for each face behind which it flags something new, for the same reason.
-        open_rad: a line that leaves the known map lower than this elevation met something there, as streets go on;
-            a higher one went into the sky, and nothing came back.
+        open_rad: a line that leaves the known map met something there if its elevation is at most this, up or down: far
+            down a street. A higher one went into the sky, and nothing came back; a steeper one slipped through a gap
+            between Gaussians of the ground.
     """
 
     step_m: float = 2.0
@@ -64,14 +65,14 @@ class VisibilityParameters:
     min_passes: float = 256.0
     hits_near: float = 3.0
     passes_near: float = 8.0
-    open_rad: float = 0.0
+    open_rad: float = 0.04
 
     def __post_init__(self) -> None:
         for name, low, high in (
             ("step_m", 0.25, 20.0), ("azimuths", SECTORS, 3600), ("levels", 2, 128), ("range_m", 5.0, 100.0),
             ("reach_m", self.range_m, 150.0), ("noise_m", 0.005, 0.5), ("r2", 0.1, 100.0), ("new_radius_m", 0.0, 0.5),
             ("min_hits", 0.0, 1e6), ("min_passes", 0.0, 1e6), ("hits_near", 1.0, 1e3),
-            ("passes_near", 1.0, 1e3), ("open_rad", -1.6, 1.6),
+            ("passes_near", 1.0, 1e3), ("open_rad", 0.0, 1.6),
         ):  # fmt: skip
             if not low <= getattr(self, name) <= high:
                 raise ConfigError(f"visibility: {name} must lie in {low:g} … {high:g}, got {getattr(self, name):g}")
