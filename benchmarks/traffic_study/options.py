@@ -65,9 +65,9 @@ class TrafficOptions:
     sensor: str = "vlp16"
     traffic: bool = True
     poses: PoseSource = field(default_factory=PoseSource)
-    base: Base = "surveyed"
+    base: Base = "driven"
     pcd_drives: int = 4
-    f1_drives: int = 8
+    f1_drives: int = 4
     scans: int | None = None
     method: MethodParameters = field(default_factory=MethodParameters)
 

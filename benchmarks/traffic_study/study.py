@@ -8,6 +8,7 @@ from typing import Any, Final
 
 from rich.progress import Progress
 
+from benchmarks.pcd import PcdMap
 from benchmarks.simulation.base_map import read_base
 from benchmarks.simulation.folder import RunFolder
 from benchmarks.simulation.pool import Job, run_jobs
@@ -94,6 +95,7 @@ def study(options: TrafficOptions, folder: RunFolder, processes: int, progress: 
     started_s = perf_counter()
     files = world_files(folder, options.seed, options.world)
     jobs = [Job("world", prepare_world, (files, options.seed, options.world))]
+    jobs.append(Job("street as points", _cloud, (options, files)))
     if options.pcd_drives:
         jobs.append(Job("point cloud", prepare_cloud, (files, options.seed, options.world)))
     run_jobs(jobs, processes, progress, "world")
@@ -137,7 +139,7 @@ def download(options: TrafficOptions, files: WorldFiles, fleet: FleetOutcome) ->
     returned = _drive(track, link, files.home / "maps.sqlite", published, changed, held=held)
     after = _drive(track, link, files.home / "maps.sqlite", published, fleet.final.tiles, held=held)
     tiles = [tile for tile in fetched_tiles(ours) if tile in base]
-    points = points_by_tile(kept_cloud(world, options.base, files.home / f"street-cloud-{options.base}.npz"), tiles)
+    points = points_by_tile(_cloud(options, files), tiles)
     return DownloadOutcome(
         track=track,
         voxels={tile: len(base[tile]) for tile in tiles},
@@ -150,6 +152,12 @@ def download(options: TrafficOptions, files: WorldFiles, fleet: FleetOutcome) ->
         after_fleet=after,
         changed_by_fleet=sum(_differing(published[tile], fleet.final.tiles[tile]) for tile in tiles),
     )
+
+
+def _cloud(options: TrafficOptions, files: WorldFiles) -> PcdMap:
+    """The street as a point cloud; made when it is asked for first."""
+    path = files.home / f"street-cloud-{options.base}.npz"
+    return kept_cloud(street(options.seed, options.street), options.base, path)
 
 
 def _drive(
