@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gnd_map.arrays import I32, I64
-from gnd_map.jit import kernel
+from gnd_map.jit import inlined, kernel
 
 U8 = NDArray[np.uint8]
 State = Any  # (coder, buffer, places, weight): arrays, see `coding.Coder`; a place is probability << 8 | times seen
@@ -90,7 +90,7 @@ def _shift_out(coder: I64, buffer: U8) -> None:
         coder[HIGH] = ((coder[HIGH] << 8) & _TOP) | 0xFF
 
 
-@kernel
+@inlined
 def _code(coder: I64, buffer: U8, p: int, bit: int) -> int:
     """Write `bit`, or read one; `p` of 65536 is the probability of a 1."""
     span = coder[HIGH] - coder[LOW]
@@ -106,7 +106,7 @@ def _code(coder: I64, buffer: U8, p: int, bit: int) -> int:
     return bit
 
 
-@kernel
+@inlined
 def _learnt(place: int, bit: int) -> int:
     """A context after a decision: its probability moves towards what came, the less the more it has seen."""
     p, n = place >> 8, place & 0xFF
@@ -526,7 +526,7 @@ def _code_axis(
     return code_mixed(state, a + 1, b + 1, c + 1, w + 1, 1 if axis == 1 else 0)
 
 
-@kernel
+@inlined
 def _number(state: State, which: int, a: int, b: int, c: int, at: int, w: int, value: int) -> int:
     """A number of family `which` in its contexts a, b, c."""
     at += AXIS_CONTEXTS
