@@ -1,13 +1,14 @@
 """Makes `gnd_map/codec/priors.bin`, the frozen start of the range codecs' contexts.
 
     gnd reproduce simulation --world-seed 101,102 --vehicles 1,4 --base driven --length 300 --no-pcd --out FOLDER
-    python -m benchmarks.codec_priors FOLDER gnd_map/codec/priors.bin
+    python -m benchmarks.codec_priors --out gnd_map/codec/priors.bin FOLDER ... [--only tile-compact,delta-compact]
 
 The tiles of the runs' base maps, the differences that each drive makes to them, and the drives' reports are encoded one
 after the other while the contexts go on learning; where they end is where every stream will start. The file is part of
 the codecs' meaning: another one makes other bytes, so it is made once.
 """
 
+import argparse
 import sys
 from collections.abc import Iterator, Sequence
 from itertools import groupby
@@ -28,7 +29,7 @@ from gnd_map.codec import (
     encode_tiles,
     snap,
 )
-from gnd_map.codec.priors import learning, pack
+from gnd_map.codec.priors import STREAMS, learning, pack, priors_of
 from gnd_map.codec.range_tile import encode_tile
 from gnd_map.gaussian import Gaussians, concat
 from gnd_map.tile_id import TileId
@@ -41,15 +42,24 @@ Report = list[TileChange]
 
 
 def main(arguments: Sequence[str]) -> None:
-    """Learn from the runs in some folders and write the file named last."""
-    *folders, out = map(Path, arguments)
+    """Learn from the runs in some folders and write the file."""
+    chosen = _options(arguments)
     with learning() as states:
         for _ in range(2):
-            for folder in folders:
+            for folder in chosen.folders:
                 learn(folder)
-    frozen = {name: state.frozen(trust_of(name)) for name, state in states.items()}
-    out.write_bytes(pack(frozen))
-    print(f"{out}: {out.stat().st_size} bytes")
+    fresh = {name: state.frozen(trust_of(name)) for name, state in states.items()}
+    kept = {name: priors_of(name) for name in STREAMS if chosen.only and name not in chosen.only}
+    chosen.out.write_bytes(pack(fresh | kept))
+    print(f"{chosen.out}: {chosen.out.stat().st_size} bytes")
+
+
+def _options(arguments: Sequence[str]) -> argparse.Namespace:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("folders", nargs="+", type=Path, help="runs of gnd reproduce simulation")
+    parser.add_argument("--out", type=Path, required=True, help="file to write")
+    parser.add_argument("--only", type=lambda text: set(text.split(",")), default=set(), help="keep all other streams")
+    return parser.parse_args(arguments)
 
 
 def trust_of(stream: str) -> int:

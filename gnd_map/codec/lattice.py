@@ -37,8 +37,11 @@ MAX_SLOPE: Final = 4095
 MAX_STEP: Final = 8191
 CELLS: Final = 20
 """On the lattice `cells` says only "at least": a voxel holds a Gaussian from so many sub-cells on."""
-COUNTS: Final = np.array([1, 2, 5, 10, *(20 << j for j in range(27))], np.int64)
-"""Numbers of points on the lattice: one an octave."""
+_FEW: Final = (1, 2, 5, 10)
+COUNTS: Final = (*_FEW, *(CELLS << j for j in range(27)))
+"""Numbers of points on a lattice: one an octave,"""
+ROUGH_COUNTS: Final = (*_FEW, *(CELLS << j for j in range(0, 27, 3)))
+"""or one in three."""
 
 AXES: Final = np.array([[1, 2, 0], [0, 2, 1], [0, 1, 2]])
 """Axes (a, b, c) by the axis c along which the Gaussian is thinnest."""
@@ -58,6 +61,7 @@ class Lattice:
         shear_bits: L_ba is a multiple of L_bb · 2^-shear_bits.
         thin_bits: the whitened mean's last component is a multiple of 2^-thin_bits.
         plane_bits: its other two are multiples of 2^-plane_bits.
+        counts: numbers of points, increasing.
     """
 
     name: str
@@ -68,6 +72,7 @@ class Lattice:
     shear_bits: int
     thin_bits: int
     plane_bits: int
+    counts: tuple[int, ...] = COUNTS
 
     @property
     def length_bits(self) -> int:
@@ -87,7 +92,7 @@ def _levels(first_m: float, ratio: float) -> tuple[int, ...]:
 
 ARCHIVE: Final = Lattice("archive", 0, _levels(0.002, 1.15), 1, 3, 3, 3, 4)
 STANDARD: Final = Lattice("standard", 1, _levels(0.004, 1.2), 2, 2, 1, 2, 3)
-COMPACT: Final = Lattice("compact", 2, _levels(0.004, 1.3), 2, 1, 0, 1, 3)
+COMPACT: Final = Lattice("compact", 2, _levels(0.004, 1.3), 2, 1, 0, 1, 2, ROUGH_COUNTS)
 REPORT: Final = Lattice("report", 3, _levels(0.004, 1.3), 2, 1, 0, 1, 1)
 """For what one vehicle measured, which the merger averages: half of a standard deviation does."""
 LATTICES: Final[Mapping[str, Lattice]] = MappingProxyType({x.name: x for x in (ARCHIVE, STANDARD, COMPACT)})
@@ -117,7 +122,7 @@ class Quantised:
     step: I32
     """(N, 3) whitened mean, components a, b, c."""
     count: I32
-    """(N,) index into COUNTS."""
+    """(N,) index into the lattice's counts."""
 
     def __post_init__(self) -> None:
         n = len(self.voxel_id)
@@ -140,7 +145,7 @@ class Quantised:
         _refuse("level c", self.level[:, 2], 0, LEVELS - 1)
         _refuse("slope", self.slope, -MAX_SLOPE, MAX_SLOPE)
         _refuse("step", self.step, -MAX_STEP, MAX_STEP)
-        _refuse("count", self.count, 0, len(COUNTS) - 1)
+        _refuse("count", self.count, 0, len(lattice.counts) - 1)
 
 
 def _refuse(name: str, column: I32, low: int, high: int) -> None:
@@ -159,7 +164,7 @@ def dequantise(quantised: Quantised, lattice: Lattice) -> Gaussians:
     if longest:
         raise CodecError(f"lattice {lattice.name}: {longest} of {len(quantised)} Gaussians reach {MAX_LENGTH_M} m")
     mean_m, cov_m2 = _floats(quantised, lattice)
-    count = COUNTS[quantised.count].astype(np.int32)
+    count = np.array(lattice.counts, np.int64)[quantised.count].astype(np.int32)
     try:
         return Gaussians(quantised.voxel_id, count, np.minimum(count, CELLS).astype(np.int32), mean_m, cov_m2)
     except ShapeError as error:
@@ -387,13 +392,14 @@ def _with_means(gaussians: Gaussians, axis: I32, level: I32, slope: I32, lattice
     b = _rounded((mu[1] - lower[1] * a * plane) / lower[2] / plane, MAX_STEP)
     c = _rounded((mu[2] - (lower[3] * a + lower[4] * b) * plane) / lower[5] / thin, MAX_STEP)
     step = np.stack([a, b, c], axis=1).astype(np.int32)
-    return Quantised(gaussians.voxel_id, axis, level, slope, step, _count_index(gaussians.count))
+    return Quantised(gaussians.voxel_id, axis, level, slope, step, _count_index(gaussians.count, lattice))
 
 
-def _count_index(count: I32) -> I32:
+def _count_index(count: I32, lattice: Lattice) -> I32:
     """Nearest number of points on the lattice; what suffices for a Gaussian (20) still does."""
-    between = np.sqrt((COUNTS[1:] * COUNTS[:-1]).astype(np.float64))
-    between[COUNTS[1:] == CELLS] = CELLS - 0.5
+    counts = np.array(lattice.counts, np.float64)
+    between = np.sqrt(counts[1:] * counts[:-1])
+    between[counts[1:] == CELLS] = CELLS - 0.5
     return np.searchsorted(between, count).astype(np.int32)
 
 
@@ -442,7 +448,7 @@ def _read_off(gaussians: Gaussians, cov: F64, axis: I32, lattice: Lattice) -> Qu
 def _gives_back(quantised: Quantised, gaussians: Gaussians, lattice: Lattice) -> npt.NDArray[np.bool_]:
     """(N,) whether `dequantise` gives the same bits."""
     mean_m, cov_m2 = _floats(quantised, lattice)
-    count = COUNTS[quantised.count]
+    count = np.array(lattice.counts, np.int64)[quantised.count]
     same = (count == gaussians.count) & (np.minimum(count, CELLS) == gaussians.cells)
     same &= _is_short(quantised, lattice)
     same &= (mean_m == gaussians.mean_m).all(axis=1) & (cov_m2 == gaussians.cov_m2).all(axis=1)

@@ -186,7 +186,7 @@ def _typical(lattice: Lattice) -> I32:
     sd_m = np.array(lattice.sd) * 2.0**-20
     wide = int(np.searchsorted(sd_m[:: lattice.plane_step], 0.28))
     row[k.LEVEL : k.LEVEL + 3] = wide, wide, int(np.searchsorted(sd_m, 0.015))
-    row[k.AXIS], row[k.SELF], row[k.COUNT] = 3, -1, 6
+    row[k.AXIS], row[k.SELF], row[k.COUNT] = 3, -1, int(np.searchsorted(lattice.counts, 80))
     return row
 
 

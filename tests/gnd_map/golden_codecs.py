@@ -46,7 +46,7 @@ def state(lattice: Lattice, number: int) -> Gaussians:
     slope = np.stack([(i * 11) % 3 - 1, (i * 13) % 5 - 2, (i * 17) % 7 - 3], axis=1)
     step = np.stack([(i * 19) % 5 - 2, (i * 23) % 5 - 2, (i * 29 + number) % 41 - 20], axis=1)
     ids = VoxelGrid.of(TILE).voxel_id(ix, iy, floor)[order].astype(np.int32)
-    columns = (axis, level, slope, step, i % 12 + 4)
+    columns = (axis, level, slope, step, np.minimum(i % 12 + 4, len(lattice.counts) - 1))
     return dequantise(Quantised(ids, *(column.astype(np.int32) for column in columns)), lattice)
 
 

@@ -30,7 +30,6 @@ from gnd_map.codec import (
     snap,
     volume,
 )
-from gnd_map.codec.lattice import COUNTS
 from gnd_map.errors import CodecError
 from gnd_map.gaussian import Gaussians
 from gnd_map.grid import VoxelGrid
@@ -91,14 +90,15 @@ def test_a_street_is_moved_by_little(lattice: Lattice) -> None:
 @by_lattice
 @given(count=st.integers(1, 2**31 - 1))
 @few
-def test_counts_are_one_level_an_octave_and_twenty_stay_enough(lattice: Lattice, count: int) -> None:
+def test_counts_are_the_nearest_of_the_lattice_and_twenty_stay_enough(lattice: Lattice, count: int) -> None:
     one = street(SEOUL, np.random.default_rng(2), 1)
     g = Gaussians(one.voxel_id, np.array([count], np.int32), one.cells, one.mean_m, one.cov_m2)
     found, cells = (int(column[0]) for column in snap(g, lattice).columns[1:3])
-    assert found in COUNTS
+    assert found in lattice.counts
     assert (found >= 20) == (count >= 20)
     assert cells == min(found, 20)
-    assert max(found / count, count / found) < 2.0
+    nearest = min(lattice.counts, key=lambda level: abs(np.log(level / count)))
+    assert found == nearest or {found, nearest} == {10, 20}  # twenty stay enough
 
 
 @by_lattice

@@ -12,7 +12,7 @@ from gnd_map.codec.coding import Coder
 from gnd_map.codec.priors import FILE, Priors, priors_of
 from gnd_map.errors import CodecError
 
-FROZEN = "67b8a81be97617fdb956d05efd2725fac3ced9d5d0b2ef4fe1a36624d7de72ed"
+FROZEN = "59f266be96f04858921f72c0eebf9769bceb723fc4746d964717212d90baab01"
 KNOTS = k._KNOTS
 
 
