@@ -83,7 +83,7 @@ def _rates(found: Mapping[str, Any]) -> Table:
     up = found["upload"]
     table = _table("upload a km, by stage", "", *(label for _, label in STAGES))
     rows = {
-        "kB/km: keys, payloads, answers": (up["kB_per_km"], 3),
+        "kB/km up: keys and payloads": (up["kB_per_km"], 3),
         "kB/km with the transport": (up["wire_kB_per_km"], 3),
         "changes a km": (up["changed_per_km"], 0),
         "Gaussians asked for a km": (up["wanted_per_km"], 0),

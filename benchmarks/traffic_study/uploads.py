@@ -47,7 +47,7 @@ class DriveUpload:
         vehicle: its name.
         km: way driven.
         messages: how many questions went up.
-        parts: bytes by `PARTS`: payloads, keys and answers.
+        parts: bytes by `PARTS`: payloads and keys up; `acks`, the answers, down.
         changed: voxels that it reports as new, modified or deleted; by class in `classes`.
         wanted: Gaussians that the cloud asked for.
         observed: voxels observed.
@@ -74,12 +74,12 @@ class DriveUpload:
 
     @property
     def bytes(self) -> int:
-        """All payloads up, their keys, and the answers."""
-        return sum(self.parts.values())
+        """All payloads up and their keys; the answers, which come down, are told apart."""
+        return sum(self.parts.values()) - self.parts["acks"]
 
     @property
     def wire_bytes(self) -> int:
-        """The same with what the transport adds to a message (headers, acknowledgement), without keys twice."""
+        """The same with what the transport adds to a message (key, headers, acknowledgement)."""
         return self.bytes - self.parts["keys"] + self.messages * MESSAGE_OVERHEAD_BYTES
 
 
