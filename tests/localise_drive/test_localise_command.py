@@ -154,7 +154,8 @@ def test_a_drive_without_reference_has_no_errors(ran: Ran, tmp_path: Path) -> No
     }  # fmt: skip
     assert mcap_counts(tmp_path / "out" / "poses.mcap")["/tf"] == len(read_tum(tmp_path / "out" / "poses.tum"))
     refined, same = read_tum(ran.out / "poses.tum"), read_tum(tmp_path / "out" / "poses.tum")
-    assert np.array_equal(refined.T_dst_vehicle, same.T_dst_vehicle)
+    # The graph's threads add in the order in which they end: the last written digit may differ.
+    assert np.abs(refined.T_dst_vehicle - same.T_dst_vehicle).max() < 1e-8
 
 
 def test_poses_of_single_scans_alone_are_others(ran: Ran, tmp_path: Path) -> None:
