@@ -33,7 +33,7 @@ T = TypeVar("T")
 @click.option(
     "--upload",
     type=click.Choice(["float", "full", "packed"]),
-    default="float",
+    default="full",
     show_default=True,
     help="Whole reports with Gaussians as measured, or on their lattice; or in short, flags first.",
 )

@@ -48,7 +48,7 @@ class RunOptions:
     method: MethodParameters = field(default_factory=MethodParameters)
     scans: int | None = None
     pcd: bool = True
-    upload: Upload = "float"
+    upload: Upload = "full"
 
     def __post_init__(self) -> None:
         if not self.seeds or min(self.seeds) < 0 or len(set(self.seeds)) != len(self.seeds):
