@@ -6,6 +6,7 @@ thread and opens no Zenoh session, so forking afterwards is safe.
 
 import gc
 import logging
+import os
 
 import cloud_merger.merger
 import deploy.roles
@@ -15,7 +16,21 @@ from vehicle_agent.warm import warm_up
 
 __all__ = ["cloud_merger", "deploy", "tile_store", "vehicle_agent"]
 
+
+def _compile_in_a_child() -> None:
+    """Compile what the disk's cache lacks in a process that ends: a compiler's memory would be copied to all others."""
+    child = os.fork()
+    if child:
+        os.waitpid(child, 0)
+        return
+    try:
+        warm_up()
+    finally:
+        os._exit(0)
+
+
 try:
+    _compile_in_a_child()
     warm_up()
 except Exception:
     # A process that needs the kernels compiles them itself and reports its own error.

@@ -59,7 +59,7 @@ class TrackBuilder:
             return
         origins = np.broadcast_to(origins_map_m, points_map_m.shape)
         self._t_ns.append(t_ns)
-        self._origins.append(np.asarray(origins[len(origins) // 2], np.float64))
+        self._origins.append(np.array(origins[len(origins) // 2], np.float64))  # a view would keep the whole scan
         self._scans, self._rays = self._scans + 1, self._rays + len(points_map_m)
         step = 1 + len(points_map_m) // _RAYS_OF_A_SCAN | 1  # odd: layers come in powers of two
         self._look((points_map_m[::step] - origins[::step]) @ T_map_vehicle[:3, :3])
