@@ -8,10 +8,11 @@ from typing import Any
 
 import numpy as np
 
+from cloud_merger.expanding import is_askable
 from deploy.account import TileHistory
 from fleet_sim.evaluate import Evaluation, Tiles, evaluate_maps
 from fleet_sim.truth import LEVELS, Truth
-from gnd_map.gaussian import Gaussians
+from gnd_map.gaussian import Gaussians, concat
 from gnd_map.tile import TileDelta, apply, diff
 from gnd_map.tile_id import TileId
 from schemas.changes import ChangeReport, TileChange
@@ -65,36 +66,43 @@ def score_run(truth: Truth, store: SqliteStore, histories: Iterable[TileHistory]
     held = list(histories)
     base = {history.tile.tile: history.before for history in held}
     final = {history.tile.tile: history.after for history in held}
-    single = {vehicle: evaluate_maps(truth, base, alone) for vehicle, alone in maps_of_vehicles(store, base).items()}
+    single = {
+        vehicle: evaluate_maps(truth, base, alone) for vehicle, alone in maps_of_vehicles(store, base, final).items()
+    }
     return RunScores(evaluate_maps(truth, base, base), single, evaluate_maps(truth, base, final))
 
 
-def maps_of_vehicles(store: SqliteStore, base: Tiles) -> dict[str, dict[TileId, Gaussians]]:
+def maps_of_vehicles(store: SqliteStore, base: Tiles, final: Tiles) -> dict[str, dict[TileId, Gaussians]]:
     """Return for each vehicle the base map changed by its own reports and nothing else.
 
-    A voxel that it observed is as it said: the new Gaussian, nothing, or as in the version that it held.
+    A voxel that it observed is as it said: the new Gaussian, nothing, or as in the version that it held. Where the
+    cloud had Gaussians enough and did not ask for the vehicle's own, that of the final map stands in for it.
     """
     maps: dict[str, dict[TileId, Gaussians]] = defaultdict(lambda: dict(base))
     for row in store.reports():
         for change in ChangeReport.decode(row.body).tiles:
             held = _held(store, change, base)
             alone = maps[row.vehicle]
-            alone[change.tile] = with_statement(alone.get(change.tile, Gaussians.empty()), held, change)
+            alone[change.tile] = with_statement(
+                alone.get(change.tile, Gaussians.empty()), held, change, final.get(change.tile, Gaussians.empty())
+            )
     return dict(maps)
 
 
-def with_statement(tile: Gaussians, held: Gaussians, change: TileChange) -> Gaussians:
+def with_statement(tile: Gaussians, held: Gaussians, change: TileChange, final: Gaussians) -> Gaussians:
     """Return a tile after what one report says about it.
 
     Args:
         tile: the tile before.
         held: the version that the vehicle compared with.
         change: its statement.
+        final: where Gaussians that were not asked for are taken from.
     """
     as_held = diff(tile.select(change.observed), held.select(change.observed))
     said = change.changed
-    there = said.take(np.flatnonzero(said.count > 0))
-    gone = np.setdiff1d(said.voxel_id, there.voxel_id)
+    withheld = is_askable(change) & ~said.exists
+    there = concat([said.take(said.exists), final.select(said.voxel_id[withheld])])
+    gone = said.voxel_id[~said.exists & ~withheld]
     after = apply(tile, as_held)
     return apply(after, TileDelta(np.intersect1d(gone, after.voxel_id), there))
 
