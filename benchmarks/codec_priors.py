@@ -1,11 +1,13 @@
 """Makes `gnd_map/codec/priors.bin`, the frozen start of the range codecs' contexts.
 
-    gnd reproduce simulation --world-seed 101,102 --vehicles 1,4 --base driven --length 300 --no-pcd --out FOLDER
-    python -m benchmarks.codec_priors --out gnd_map/codec/priors.bin FOLDER ... [--only tile-compact,delta-compact]
+    gnd reproduce simulation --world-seed 101,102 --length 300 --vehicles 1,8 --no-pcd --out A
+    gnd reproduce simulation --world-seed 101,102 --length 300 --vehicles 1 --base driven --no-pcd --out B
+    python -m benchmarks.codec_priors --out gnd_map/codec/priors.bin A B [--only tile-compact,delta-compact]
 
 The tiles of the runs' base maps, the differences that each drive makes to them, and the drives' reports are encoded one
 after the other while the contexts go on learning; where they end is where every stream will start. The file is part of
-the codecs' meaning: another one makes other bytes, so it is made once.
+the codecs' meaning: another one makes other bytes, so it was made once, of the drives of A and the maps of both, and is
+not made again.
 """
 
 import argparse

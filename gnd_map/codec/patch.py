@@ -15,8 +15,9 @@ from gnd_map.codec.floats import check_number, decode_gaussians, encode_gaussian
 from gnd_map.codec.lattice import LATTICES, REPORT, Lattice, dequantise, integers_of, is_on, lattice_with
 from gnd_map.codec.priors import mask_at, number_at, priors_of
 from gnd_map.codec.volume import Box, Known, code_box, code_flags, code_voxels, floors_of, known_of
+from gnd_map.delta import TileDelta, apply, diff
 from gnd_map.errors import CodecError, ShapeError
-from gnd_map.gaussian import Gaussians, concat
+from gnd_map.gaussian import Gaussians
 from gnd_map.grid import VoxelGrid
 from gnd_map.tile_id import TileId
 
@@ -64,16 +65,15 @@ def encode_delta(tile_id: TileId, base: Gaussians, new: Gaussians) -> bytes:
     lattice = next((lattice for lattice in LATTICES.values() if is_on(new, lattice)), None)
     if lattice is None:
         return bytes([_FLOATS]) + encode_gaussians(new)
-    changed = ~_same_rows(new, base)
-    put = new.take(changed)
-    gone = np.setdiff1d(base.voxel_id, new.voxel_id)
+    changes = diff(base, new)
+    put, gone = changes.put, changes.removed
     coder = Coder.writing(priors_of(f"delta-{lattice.name}"), 4096 + 48 * (len(put) + len(gone)))
     flagged = np.union1d(put.voxel_id, gone).astype(np.int32)
     box = code_box(coder, tile_id, base.voxel_id, flagged)
     if box is not None:
         flag = np.asarray(box.empty(np.uint8, k.NONE), np.uint8)
         flag[box.places(put.voxel_id)] = np.where(np.isin(put.voxel_id, base.voxel_id), k.REPLACED, k.PUT)
-        flag[box.places(gone.astype(np.int32))] = k.GONE
+        flag[box.places(gone)] = k.GONE
         code_flags(coder, box, base.voxel_id, flag)
         known = _known(base, put.voxel_id, gone, lattice)
         code_voxels(coder, box, put.voxel_id, known, lattice, integers_of(put, lattice))
@@ -102,21 +102,11 @@ def decode_delta(tile_id: TileId, base: Gaussians, body: bytes) -> Gaussians:
     gone = box.voxel_ids(*np.nonzero(flag == k.GONE))
     found = code_voxels(coder, box, put, _known(base, put, gone, lattice), lattice, None)
     coder.end()
-    kept = base.take(~(np.isin(base.voxel_id, put) | np.isin(base.voxel_id, gone)))
-    return concat([kept, dequantise(found, lattice)])
+    return apply(base, TileDelta(gone, dequantise(found, lattice)))
 
 
 def _known(base: Gaussians, put: I32, gone: npt.NDArray[np.integer], lattice: Lattice) -> Known:
     return known_of(base, np.isin(base.voxel_id, put), np.isin(base.voxel_id, gone), lattice)
-
-
-def _same_rows(new: Gaussians, base: Gaussians) -> npt.NDArray[np.bool_]:
-    """(len(new),) whether the base holds the voxel with the same bits."""
-    same = np.zeros(len(new), np.bool_)
-    _, at, was = np.intersect1d(new.voxel_id, base.voxel_id, assume_unique=True, return_indices=True)
-    pairs = zip(new.columns, base.columns, strict=True)
-    same[at] = np.all([(a[at] == b[was]).all(axis=tuple(range(1, a.ndim))) for a, b in pairs], axis=0)
-    return same
 
 
 def encode_flags(tiles: Sequence[Flags]) -> bytes:

@@ -1,6 +1,6 @@
 """Where the contexts start: probabilities, how much they count, and mixing weights, learnt once and frozen.
 
-`priors.bin` is made by `python -m benchmarks codec-priors`; its hash is part of the codecs' meaning and held by a test.
+`priors.bin` was made by `python -m benchmarks.codec_priors`; its hash is part of what the codecs mean, a test holds it.
 """
 
 import zlib
