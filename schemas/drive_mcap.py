@@ -5,6 +5,8 @@
 | /lidar/points | foxglove.PointCloud | one sweep, firing order, log time = start of the sweep |
 | /vehicle/motion | gnd.v1.VehicleMotion | wheel speed and yaw rate |
 | /gnss | foxglove.LocationFix | |
+| /detections | gnd.v1.Detections | map features that a detector saw in one look; may be missing |
+| /lanes | gnd.v1.LaneLook | lane markings that a camera saw; may be missing |
 | /reference/pose | foxglove.PoseInFrame | where the vehicle truly was; may be missing |
 | /tf | foxglove.FrameTransform | the same pose, so that Foxglove shows the scans in the map |
 | /tf_static | foxglove.FrameTransform | mount of the LiDAR, once |
@@ -31,7 +33,19 @@ from mcap.writer import CompressionType, Writer
 from mcap_protobuf.schema import register_schema
 
 from gnd_map.arrays import F64
-from schemas.drive import DriveHeader, DriveItem, DriveTrack, GnssFix, MotionSample, ReferencePose, Scan, track_of
+from schemas import limits
+from schemas.drive import (
+    Detections,
+    DriveHeader,
+    DriveItem,
+    DriveTrack,
+    GnssFix,
+    LaneLook,
+    MotionSample,
+    ReferencePose,
+    Scan,
+    track_of,
+)
 from schemas.drive_messages import (
     LIDAR_FRAME,
     MAP_FRAME,
@@ -49,13 +63,18 @@ from schemas.drive_messages import (
 )
 from schemas.drive_metadata import METADATA, header_of, metadata_of
 from schemas.errors import DriveError
+from schemas.generated import detections_pb2, lane_look_pb2
 from schemas.generated.vehicle_motion_pb2 import VehicleMotion
+from schemas.look_messages import detections_message_of, detections_of, lane_message_of, lanes_of
 from schemas.mcap_file import open_mcap, write_errors
+from schemas.wire import parse
 
 POINTS_TOPIC: Final = "/lidar/points"
 MOTION_TOPIC: Final = "/vehicle/motion"
 GNSS_TOPIC: Final = "/gnss"
 REFERENCE_TOPIC: Final = "/reference/pose"
+DETECTIONS_TOPIC: Final = "/detections"
+LANES_TOPIC: Final = "/lanes"
 TF_TOPIC: Final = "/tf"
 TF_STATIC_TOPIC: Final = "/tf_static"
 
@@ -70,12 +89,22 @@ _MESSAGES: Final[Mapping[str, type[Message]]] = {
     REFERENCE_TOPIC: PoseInFrame,
     TF_TOPIC: FrameTransform,
     TF_STATIC_TOPIC: FrameTransform,
+    DETECTIONS_TOPIC: detections_pb2.Detections,
+    LANES_TOPIC: lane_look_pb2.LaneLook,
+}
+_LOOKS: Final = (DETECTIONS_TOPIC, LANES_TOPIC)
+"""Topics that a recording has only if something looked: without them its bytes are those of older programs."""
+_LIMITS: Final[Mapping[str, int]] = {
+    DETECTIONS_TOPIC: limits.MAX_DETECTIONS_BYTES,
+    LANES_TOPIC: limits.MAX_LANE_LOOK_BYTES,
 }
 _ITEMS: Final[Mapping[str, Callable[[Any], DriveItem]]] = {
     POINTS_TOPIC: scan_of,
     MOTION_TOPIC: motion_of,
     GNSS_TOPIC: gnss_of,
     REFERENCE_TOPIC: reference_of,
+    DETECTIONS_TOPIC: detections_of,
+    LANES_TOPIC: lanes_of,
 }
 
 
@@ -99,7 +128,7 @@ class DriveWriter:
         self._writer = Writer(self._stream, chunk_size=_CHUNK_BYTES, compression=CompressionType.ZSTD)
         self._writer.start(profile="", library="gnd-fleet")
         self._writer.add_metadata(METADATA, metadata_of(header))
-        self._channels = {topic: self._channel(topic, kind) for topic, kind in _MESSAGES.items()}
+        self._channels = {topic: self._channel(topic, kind) for topic, kind in _MESSAGES.items() if topic not in _LOOKS}
 
     def _channel(self, topic: str, kind: type[Message]) -> int:
         schema_id = register_schema(self._writer, kind)
@@ -125,6 +154,14 @@ class DriveWriter:
         tf = transform_message_of(pose.t_ns, MAP_FRAME, VEHICLE_FRAME, pose.T_map_vehicle)
         self._add_small(TF_TOPIC, pose.t_ns, tf)
 
+    def detections(self, look: Detections) -> None:
+        """Add one look of a detector."""
+        self._add_small(DETECTIONS_TOPIC, look.t_ns, detections_message_of(look))
+
+    def lanes(self, look: LaneLook) -> None:
+        """Add one look at lane markings."""
+        self._add_small(LANES_TOPIC, look.t_ns, lane_message_of(look))
+
     def add(self, item: DriveItem) -> None:
         """Add an item of any kind: what `read_drive` yields."""
         match item:
@@ -136,6 +173,10 @@ class DriveWriter:
                 self.gnss(item)
             case ReferencePose():
                 self.reference(item)
+            case Detections():
+                self.detections(item)
+            case LaneLook():
+                self.lanes(item)
 
     def _add_mount(self, t_ns: int) -> None:
         """The mount goes in with the first item, at its time: a viewer's time line begins where the drive does."""
@@ -160,6 +201,8 @@ class DriveWriter:
         self._small.clear()
 
     def _write(self, topic: str, t_ns: int, message: Message) -> None:
+        if topic not in self._channels:
+            self._channels[topic] = self._channel(topic, _MESSAGES[topic])
         self._writer.add_message(self._channels[topic], t_ns, message.SerializeToString(), t_ns)
 
     def close(self) -> None:
@@ -209,7 +252,7 @@ def read_header(path: Path | str) -> DriveHeader:
 
 
 def read_drive(path: Path | str) -> Iterator[DriveItem]:
-    """Scans, motion samples, GNSS fixes and reference poses in time order, some seconds of them in memory at a time.
+    """Scans, motion samples, GNSS fixes, reference poses and looks in time order, some seconds of them in memory.
 
     Raises:
         DriveError: no such file, not MCAP, cut off or damaged (when the damaged part is reached).
@@ -240,6 +283,8 @@ class DriveCounts(NamedTuple):
     reference: int
     first_ns: int
     last_ns: int
+    detections: int = 0
+    lanes: int = 0
 
 
 def drive_counts(path: Path | str) -> DriveCounts:
@@ -257,10 +302,14 @@ def drive_counts(path: Path | str) -> DriveCounts:
             reference=counts.get(REFERENCE_TOPIC, 0),
             first_ns=statistics.message_start_time,
             last_ns=statistics.message_end_time,
+            detections=counts.get(DETECTIONS_TOPIC, 0),
+            lanes=counts.get(LANES_TOPIC, 0),
         )
 
 
 def _decode(topic: str, data: bytes) -> DriveItem:
+    if topic in _LIMITS:
+        return _ITEMS[topic](parse(_MESSAGES[topic], data, _LIMITS[topic]))
     message = _MESSAGES[topic]()
     message.ParseFromString(data)
     return _ITEMS[topic](message)

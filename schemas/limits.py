@@ -18,6 +18,7 @@ MAX_CATALOG_BYTES: Final = 128 * KIB
 MAX_CHANGE_REPORT_BYTES: Final = 8 * MIB
 MAX_PACKED_REPORT_BYTES: Final = 1 * MIB
 MAX_PACKED_GAUSSIANS_BYTES: Final = 4 * MIB
+MAX_FEATURE_REPORT_BYTES: Final = 1 * MIB
 MAX_CHANGE_ACK_BYTES: Final = 64 * KIB
 MAX_TILE_UPDATE_BYTES: Final = MAX_TILE_BODY_BYTES + KIB
 MAX_TRAFFIC_SAMPLE_BYTES: Final = 16 * KIB
@@ -45,6 +46,20 @@ MAX_WAY_OF_REPORT_M: Final = 3_000.0
 # Bits of a mask in an ack, were it not compressed at all.
 MAX_WANTED_BYTES: Final = MAX_FLAGS_OF_REPORT // 8 + KIB
 
+# Features of one tile, and points of one feature: a motorway's gantry has some twenty signs, a lane's piece some ten
+# points a tile. A look is one camera image's or one scan's detections.
+MAX_FEATURES_OF_TILE: Final = 4_096
+MAX_POINTS_OF_FEATURE: Final = 4_096
+MAX_DETECTIONS_OF_LOOK: Final = 1_024
+# What a feature report holds over all its tiles: judged and found features, points of those found.
+MAX_FEATURES_OF_REPORT: Final = 16_384
+MAX_POINTS_OF_REPORT: Final = 65_536
+# A position "unknown" along an axis has a variance of 1e4 m^2; beyond this it is none.
+MAX_FEATURE_VARIANCE_M2: Final = 1e6
+# A feature lies in its tile, but for rounding and the error of who measured it.
+MAX_FOUND_OUTSIDE_M: Final = 1.0
+MAX_SEEN_OUTSIDE_M: Final = 100.0
+
 # No Gaussian of the map lies outside: the Dead Sea's shore is at -430 m, Chomolungma at 8,849 m.
 MIN_FLOOR: Final = -1_000
 MAX_FLOOR: Final = 10_000
@@ -58,3 +73,10 @@ MAX_POSE_SIGMA_RAD: Final = 3.15
 # A recorded drive: bytes of one unpacked chunk, points of one scan.
 MAX_CHUNK_BYTES: Final = 256 * MIB
 MAX_POINTS_OF_SCAN: Final = 4_000_000
+
+# What detectors find in one look: features, lane markings with their points. The bytes are checked first.
+MAX_DETECTIONS_OF_LOOK: Final = 1024
+MAX_DETECTIONS_BYTES: Final = 64 * KIB
+MAX_POLYLINES_OF_LOOK: Final = 64
+MAX_POINTS_OF_LANE_LOOK: Final = 16_384
+MAX_LANE_LOOK_BYTES: Final = 256 * KIB
