@@ -1,0 +1,1 @@
+"""What the studies of feature layers share: matching to the truth, averages over seeds, targets, kept results."""
