@@ -74,8 +74,7 @@ MAX_POSE_SIGMA_RAD: Final = 3.15
 MAX_CHUNK_BYTES: Final = 256 * MIB
 MAX_POINTS_OF_SCAN: Final = 4_000_000
 
-# What detectors find in one look: features, lane markings with their points. The bytes are checked first.
-MAX_DETECTIONS_OF_LOOK: Final = 1024
+# Bytes of one look, which are checked first; lane markings of a look and their points.
 MAX_DETECTIONS_BYTES: Final = 64 * KIB
 MAX_POLYLINES_OF_LOOK: Final = 64
 MAX_POINTS_OF_LANE_LOOK: Final = 16_384
