@@ -5,6 +5,8 @@ from typing import Any
 
 import numpy as np
 
+from gnd_map.arrays import F64
+
 _DIGITS = 6
 
 
@@ -16,6 +18,19 @@ def mean_over(results: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
 def std_over(results: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
     """Return the standard deviation (n - 1) of each number; None where there are fewer than two values."""
     return _over(results, lambda values: float(np.std(values, ddof=1)) if len(values) > 1 else None)
+
+
+def distances_plain(distance_m: F64) -> dict[str, float | int | None]:
+    """Return mean, standard deviation, median and 95 % quantile of distances (N,), None of none, and their number."""
+    if not len(distance_m):
+        return {"mean": None, "std": None, "median": None, "p95": None, "found": 0}
+    return {
+        "mean": float(distance_m.mean()),
+        "std": float(distance_m.std()),
+        "median": float(np.median(distance_m)),
+        "p95": float(np.quantile(distance_m, 0.95)),
+        "found": len(distance_m),
+    }
 
 
 def rounded(value: Any) -> Any:

@@ -47,7 +47,7 @@ def write_localised(found: Localised, seconds: float, kept: Kept) -> None:
     """Write a run; the file appears complete or not at all."""
     series = {name: getattr(found, name) for name in _SERIES}
     arrays = {f"{name}_{column}": getattr(one, column) for name, one in series.items() for column in _COLUMNS}
-    _write(kept, {"scans": found.scans, "cpu_s": seconds}, arrays)
+    write_arrays(kept, {"scans": found.scans, "cpu_s": seconds}, arrays)
 
 
 def read_localised(kept: Kept) -> tuple[Localised, float]:
@@ -56,7 +56,7 @@ def read_localised(kept: Kept) -> tuple[Localised, float]:
     Raises:
         FolderError: it is missing or damaged.
     """
-    head, data = _read(kept)
+    head, data = read_arrays(kept)
     try:
         final, online = (PoseSeries(*(data[f"{name}_{column}"] for column in _COLUMNS)) for name in _SERIES)
         return Localised(final, online, int(head["scans"])), float(head["cpu_s"])
@@ -66,7 +66,7 @@ def read_localised(kept: Kept) -> tuple[Localised, float]:
 
 def write_trials(trials: list[Trial], seconds: float, kept: Kept) -> None:
     """Write trials; the file appears complete or not at all."""
-    _write(kept, {"trials": [asdict(trial) for trial in trials], "cpu_s": seconds}, {})
+    write_arrays(kept, {"trials": [asdict(trial) for trial in trials], "cpu_s": seconds}, {})
 
 
 def read_trials(kept: Kept) -> list[Trial]:
@@ -75,14 +75,15 @@ def read_trials(kept: Kept) -> list[Trial]:
     Raises:
         FolderError: they are missing or damaged.
     """
-    head, _ = _read(kept)
+    head, _ = read_arrays(kept)
     try:
         return [Trial(**trial) for trial in head["trials"]]
     except (KeyError, TypeError) as error:
         raise FolderError(f"{kept.path} is damaged: {error}; delete it and start again") from error
 
 
-def _write(kept: Kept, head: dict[str, Any], arrays: dict[str, Any]) -> None:
+def write_arrays(kept: Kept, head: dict[str, Any], arrays: dict[str, Any]) -> None:
+    """Write plain values and arrays; the file appears complete or not at all."""
     kept.home.mkdir(parents=True, exist_ok=True)
     partial = kept.path.with_name(f".{kept.path.name}.part")
     with partial.open("wb") as file:
@@ -90,7 +91,12 @@ def _write(kept: Kept, head: dict[str, Any], arrays: dict[str, Any]) -> None:
     partial.replace(kept.path)
 
 
-def _read(kept: Kept) -> tuple[dict[str, Any], dict[str, Any]]:
+def read_arrays(kept: Kept) -> tuple[dict[str, Any], dict[str, Any]]:
+    """Read plain values and arrays.
+
+    Raises:
+        FolderError: they are missing or damaged.
+    """
     try:
         with kept.path.open("rb") as file, np.load(file, allow_pickle=False) as arrays:
             data = dict(arrays)

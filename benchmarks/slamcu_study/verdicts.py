@@ -1,0 +1,102 @@
+"""What one drive found out about the signs of its route, and what the truth says of them; kept as one file."""
+
+from dataclasses import dataclass, fields
+from typing import Any, Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from benchmarks.localisation_study.kept import Kept, read_arrays, write_arrays
+from benchmarks.simulation.errors import FolderError
+from benchmarks.slamcu_study.reference import TRUE_CLASSES
+from gnd_map.arrays import F64, I64
+
+U8 = NDArray[np.uint8]
+NORMAL, DELETED, NEW = range(3)
+EXIST, ABSENT, UNKNOWN = range(3)
+"""Columns of masses; the largest is the state (section 4.3.3 of the paper)."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class SignTruth:
+    """All N signs of a route, seen or not.
+
+    Attributes:
+        feature_id: int64 (N,); of a new sign the map knows nothing.
+        xy_m: float64 (N, 2), map frame.
+        true_class: uint8 (N,), index of `TRUE_CLASSES`.
+    """
+
+    feature_id: I64
+    xy_m: F64
+    true_class: U8
+
+    def of(self, true_class: int) -> I64:
+        """Return the indices of the signs of a class."""
+        return np.flatnonzero(self.true_class == true_class).astype(np.int64)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Verdicts:
+    """What one drive says, and how it came about. K signs of its map, J new features, N true signs, S steps, Q points.
+
+    Attributes:
+        known_id: int64 (K,).
+        known_masses: float64 (K, 4), exist, absent, unknown, conflict.
+        new_xy_m: float64 (J, 2), map frame.
+        new_cov_m2: float64 (J, 2, 2).
+        new_masses: float64 (J, 4).
+        step_ms: float64 (S,), time of each step.
+        pose_error: float64 (S, 3), along and across the true heading [m], heading [rad].
+        pose_part_m: float64 (N, 2), what the error of the pose moved each sign by, mean over the looks at it [m]; nan
+            for signs never looked at.
+        visible, occluded: int64 (N,), looks at each sign that was in view, free and hidden.
+        no_evidence: looks at signs of the map that were left out as hidden.
+        trace_sign: int64 (Q,), index of the true sign whose masses are told; only of deleted and new signs.
+        trace_s: float64 (Q,), seconds since the drive began.
+        trace_masses: float64 (Q, 4).
+    """
+
+    known_id: I64
+    known_masses: F64
+    new_xy_m: F64
+    new_cov_m2: F64
+    new_masses: F64
+    step_ms: F64
+    pose_error: F64
+    pose_part_m: F64
+    visible: I64
+    occluded: I64
+    no_evidence: I64
+    trace_sign: I64
+    trace_s: F64
+    trace_masses: F64
+
+    @property
+    def new_exists(self) -> NDArray[np.bool_]:
+        """(J,) which new features exist, as the drive says."""
+        return np.asarray(self.new_masses[:, :3].argmax(axis=1) == EXIST)
+
+
+_COLUMNS: Final = tuple(field.name for field in fields(Verdicts))
+
+
+def write_verdicts(found: Verdicts, truth: SignTruth, kept: Kept) -> None:
+    """Write a drive's verdicts with the truth; the file appears complete or not at all."""
+    arrays: dict[str, Any] = {name: getattr(found, name) for name in _COLUMNS}
+    arrays |= {f"true_{field.name}": getattr(truth, field.name) for field in fields(SignTruth)}
+    write_arrays(kept, {"classes": list(TRUE_CLASSES)}, arrays)
+
+
+def read_verdicts(kept: Kept) -> tuple[Verdicts, SignTruth]:
+    """Read a drive's verdicts and the truth.
+
+    Raises:
+        FolderError: they are missing or damaged.
+    """
+    _, arrays = read_arrays(kept)
+    try:
+        truth = SignTruth(**{field.name: arrays[f"true_{field.name}"] for field in fields(SignTruth)})
+        return Verdicts(**{name: arrays[name] for name in _COLUMNS}), truth
+    except KeyError as error:
+        raise FolderError(f"{kept.path} is damaged: it lacks {error}; delete it and start again") from error
