@@ -9,6 +9,7 @@ GndError
     ├── CodecError   bytes that are no encoded Gaussians
     ├── DeltaError   a delta that does not fit the tile
     ├── MotionError  poses that do not cover the time asked for
+    ├── FeatureError a feature that is none (no position, no covariance, masses that do not sum to 1, ...)
     └── TrackError   a track that no vehicle drives, or that is too long
 """
 
@@ -51,3 +52,7 @@ class MotionError(MapError):
 
 class TrackError(MapError):
     """A track that no vehicle drives, or more of it than its limits allow."""
+
+
+class FeatureError(MapError):
+    """A feature without a place, with a covariance that is none, or masses that do not sum to 1."""
