@@ -215,8 +215,8 @@ class ChangeReport:
             change_report_pb2.ChangeReport, data, limits.MAX_CHANGE_REPORT_BYTES, max_fields=limits.MAX_REPORT_FIELDS
         )
         check_major(message, "ChangeReport")
-        if message.HasField("packed") or message.HasField("gaussians"):
-            raise BadValue("ChangeReport in short (packed, gaussians): here only a whole report is read")
+        if any(message.HasField(form) for form in ("packed", "gaussians", "features")):
+            raise BadValue("ChangeReport in short (packed, gaussians) or of features: here only a whole report is read")
         check_length("ChangeReport", len(message.tiles), limits.MAX_TILES_OF_DISTRICT, "tiles")
         with refusing("ChangeReport"):
             district = District(message.district)

@@ -54,8 +54,6 @@ MAX_DETECTIONS_OF_LOOK: Final = 1_024
 # What a feature report holds over all its tiles: judged and found features, points of those found.
 MAX_FEATURES_OF_REPORT: Final = 16_384
 MAX_POINTS_OF_REPORT: Final = 65_536
-# A position "unknown" along an axis has a variance of 1e4 m^2; beyond this it is none.
-MAX_FEATURE_VARIANCE_M2: Final = 1e6
 # A feature lies in its tile, but for rounding and the error of who measured it.
 MAX_FOUND_OUTSIDE_M: Final = 1.0
 MAX_SEEN_OUTSIDE_M: Final = 100.0

@@ -1,4 +1,5 @@
 """Change reports in short, in two halves: first the flags of what changed, then the Gaussians that the ack asks for.
+`decode_upload` reads whatever comes on the key of change reports.
 
 Both travel in the message ChangeReport on the key of change reports. What they hold is coded against the versions of
 the tiles that vehicle and cloud both have, so these values only carry the bytes: `vehicle_agent.packing` makes them,
@@ -17,8 +18,9 @@ from gnd_map.codec import decode_tiles, encode_tiles
 from schemas import limits
 from schemas.changes import ChangeReport
 from schemas.errors import BadValue, TooLarge
+from schemas.features import FeatureReport, check_feature_bytes, report_of
 from schemas.generated import change_report_pb2, packed_gaussians_pb2, packed_report_pb2
-from schemas.report_id import check_report_id
+from schemas.report_id import check_report_id, report_id_of_bytes
 from schemas.wire import (
     MAJOR,
     PRINTABLE_PATTERN,
@@ -34,8 +36,7 @@ from schemas.wire import (
 )
 
 DIGEST_BYTES: Final = 8
-_FORMS: Final = {"packed": "PackedReport", "gaussians": "PackedGaussians"}
-_ULID_BYTES: Final = 16
+_FORMS: Final = {"packed": "PackedReport", "gaussians": "PackedGaussians", "features": "FeatureReport"}
 _SIGMA_BITS: Final = 32
 _INDEX_BITS: Final = 10
 _M_PER_STEP: Final = 1e-4
@@ -178,13 +179,15 @@ def crc_of(wanted: bytes) -> int:
     return zlib.crc32(wanted)
 
 
-def decode_upload(data: bytes) -> ChangeReport | PackedReport | PackedGaussians:
+def decode_upload(data: bytes) -> ChangeReport | PackedReport | PackedGaussians | FeatureReport:
     """Whatever a vehicle has sent on the key of change reports.
 
     Raises:
         SchemaError: too large (checked before parsing), truncated, of another kind or major version, a value that
             cannot be; more than one form in one message.
     """
+    _check_size("ChangeReport", data, limits.MAX_CHANGE_REPORT_BYTES)
+    check_feature_bytes(data)
     message = parse(
         change_report_pb2.ChangeReport, data, limits.MAX_CHANGE_REPORT_BYTES, max_fields=limits.MAX_REPORT_FIELDS
     )
@@ -195,6 +198,8 @@ def decode_upload(data: bytes) -> ChangeReport | PackedReport | PackedGaussians:
     others = sorted(field.name for field, _ in message.ListFields() if field.name not in ("major", forms[0]))
     if others:
         raise BadValue(f"ChangeReport holds {forms[0]} and also {', '.join(others)}: one report in one form")
+    if forms[0] == "features":
+        return report_of(message.features)
     if forms[0] == "packed":
         _check_size(_FORMS[forms[0]], data, limits.MAX_PACKED_REPORT_BYTES)
         return _packed_report(message.packed)
@@ -206,7 +211,7 @@ def _packed_report(message: packed_report_pb2.PackedReport) -> PackedReport:
     with refusing("tiles of PackedReport"):
         tiles = tuple(decode_tiles(message.tiles))
     return PackedReport(
-        report_id=_ulid_text(message.report_id),
+        report_id=report_id_of_bytes(message.report_id),
         vehicle=message.vehicle,
         sensor_model=message.sensor_model,
         software=message.software,
@@ -222,7 +227,7 @@ def _packed_report(message: packed_report_pb2.PackedReport) -> PackedReport:
 
 
 def _packed_gaussians(message: packed_gaussians_pb2.PackedGaussians) -> PackedGaussians:
-    return PackedGaussians(_ulid_text(message.report_id), message.measured, message.wanted_crc)
+    return PackedGaussians(report_id_of_bytes(message.report_id), message.measured, message.wanted_crc)
 
 
 def _check_size(name: str, data: bytes, limit: int) -> None:
@@ -232,9 +237,3 @@ def _check_size(name: str, data: bytes, limit: int) -> None:
 
 def _ulid_bytes(report_id: str) -> bytes:
     return bytes(ULID.from_str(report_id).bytes)
-
-
-def _ulid_text(data: bytes) -> str:
-    if len(data) != _ULID_BYTES:
-        raise BadValue(f"report id has {len(data)} bytes, expected {_ULID_BYTES}")
-    return str(ULID.from_bytes(data))

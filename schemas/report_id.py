@@ -31,3 +31,10 @@ def check_report_id(report_id: str) -> None:
         canonical = str(ULID.from_str(report_id))
     if canonical != report_id:
         raise BadValue(f"report id {report_id[:40]!r} is not a ULID in canonical spelling")
+
+
+def report_id_of_bytes(data: bytes) -> str:
+    """The report id whose ULID has these 16 bytes; `BadValue` when there are more or fewer."""
+    if len(data) != _RANDOM_BYTES + _TIME_BYTES:
+        raise BadValue(f"report id has {len(data)} bytes, expected {_RANDOM_BYTES + _TIME_BYTES}")
+    return str(ULID.from_bytes(data))

@@ -4,6 +4,7 @@ Protobuf makes an object of a hundred bytes and more of every two bytes of empty
 So the messages that hold many submessages are counted before they are parsed.
 """
 
+from collections.abc import Iterator
 from typing import Final
 
 from schemas.errors import Malformed, TooLarge
@@ -20,26 +21,37 @@ def check_field_count(name: str, data: bytes, limit: int) -> None:
         TooLarge: more fields.
         Malformed: the bytes are not fields.
     """
-    at = count = 0
-    while at < len(data):
-        at = _skip_field(name, data, at)
-        count += 1
+    for count, _ in enumerate(_fields(name, data), start=1):
         if count > limit:
             raise TooLarge(f"{name} of {len(data)} bytes has more than {limit} fields")
+
+
+def submessages(name: str, data: bytes, number: int) -> Iterator[bytes]:
+    """The bytes of each submessage `number` on the top level; `Malformed` when `data` are not fields."""
+    for tag, start, end in _fields(name, data):
+        if tag == number << 3 | _BYTES:
+            yield data[start:end]
+
+
+def _fields(name: str, data: bytes) -> Iterator[tuple[int, int, int]]:
+    """Tag of each field, where its content begins and ends."""
+    at = 0
+    while at < len(data):
+        tag, at = _varint(name, data, at)
+        start, at = _skip_field(name, data, at, tag & 7)
+        yield tag, start, at
     if at > len(data):
         raise Malformed(f"{name} of {len(data)} bytes is truncated: its last field ends at byte {at}")
 
 
-def _skip_field(name: str, data: bytes, at: int) -> int:
-    """Where the field that begins at byte `at` ends; may lie behind the end of the data."""
-    tag, at = _varint(name, data, at)
-    kind = tag & 7
+def _skip_field(name: str, data: bytes, at: int, kind: int) -> tuple[int, int]:
+    """Where the content at byte `at` of a field begins and ends; may lie behind the end of the data."""
     if kind in _FIXED_BYTES:
-        return at + _FIXED_BYTES[kind]
+        return at, at + _FIXED_BYTES[kind]
     if kind not in (_VARINT, _BYTES):
         raise Malformed(f"{name} has a field of wire type {kind} at byte {at}")
-    value, at = _varint(name, data, at)
-    return at + value if kind == _BYTES else at
+    value, after = _varint(name, data, at)
+    return (after, after + value) if kind == _BYTES else (at, after)
 
 
 def _varint(name: str, data: bytes, at: int) -> tuple[int, int]:

@@ -4,6 +4,7 @@ isort:skip_file
 """
 
 from collections import abc as _abc
+from . import feature_report_pb2 as _feature_report_pb2
 from . import packed_gaussians_pb2 as _packed_gaussians_pb2
 from . import packed_report_pb2 as _packed_report_pb2
 from . import tile_change_pb2 as _tile_change_pb2
@@ -24,7 +25,8 @@ DESCRIPTOR: _descriptor.FileDescriptor
 @_typing.final
 class ChangeReport(_message.Message):
     """What a vehicle sends on gnd/v1/change/<layer>/<q5>/<q10>/<q15> when it has left tiles of a district behind: a whole
-    report in fields 2 to 10; or in `packed` its flags first; or in `gaussians` what the ack of those has asked for.
+    report in fields 2 to 10; or in `packed` its flags first; or in `gaussians` what the ack of those has asked for; or, of
+    a feature layer, a whole report in `features`.
     """
 
     DESCRIPTOR: _descriptor.Descriptor
@@ -41,6 +43,7 @@ class ChangeReport(_message.Message):
     TILES_FIELD_NUMBER: _builtins.int
     PACKED_FIELD_NUMBER: _builtins.int
     GAUSSIANS_FIELD_NUMBER: _builtins.int
+    FEATURES_FIELD_NUMBER: _builtins.int
     major: _builtins.int
     """Major version of this message; always 1."""
     report_id: _builtins.str
@@ -71,6 +74,10 @@ class ChangeReport(_message.Message):
     def gaussians(self) -> _packed_gaussians_pb2.PackedGaussians:
         """Gaussians of an earlier `packed`; then all other fields but `major` are empty."""
 
+    @_builtins.property
+    def features(self) -> _feature_report_pb2.FeatureReport:
+        """A report about a feature layer; then all other fields but `major` are empty."""
+
     def __init__(
         self,
         *,
@@ -86,10 +93,11 @@ class ChangeReport(_message.Message):
         tiles: _abc.Iterable[_tile_change_pb2.TileChange] | None = ...,
         packed: _packed_report_pb2.PackedReport | None = ...,
         gaussians: _packed_gaussians_pb2.PackedGaussians | None = ...,
+        features: _feature_report_pb2.FeatureReport | None = ...,
     ) -> None: ...
-    _HasFieldArgType: _TypeAlias = _typing.Literal["gaussians", b"gaussians", "packed", b"packed"]  # noqa: Y015
+    _HasFieldArgType: _TypeAlias = _typing.Literal["features", b"features", "gaussians", b"gaussians", "packed", b"packed"]  # noqa: Y015
     def HasField(self, field_name: _HasFieldArgType) -> _builtins.bool: ...
-    _ClearFieldArgType: _TypeAlias = _typing.Literal["district", b"district", "first_ns", b"first_ns", "gaussians", b"gaussians", "last_ns", b"last_ns", "layer", b"layer", "major", b"major", "packed", b"packed", "report_id", b"report_id", "sensor_model", b"sensor_model", "software", b"software", "tiles", b"tiles", "vehicle", b"vehicle"]  # noqa: Y015
+    _ClearFieldArgType: _TypeAlias = _typing.Literal["district", b"district", "features", b"features", "first_ns", b"first_ns", "gaussians", b"gaussians", "last_ns", b"last_ns", "layer", b"layer", "major", b"major", "packed", b"packed", "report_id", b"report_id", "sensor_model", b"sensor_model", "software", b"software", "tiles", b"tiles", "vehicle", b"vehicle"]  # noqa: Y015
     def ClearField(self, field_name: _ClearFieldArgType) -> None: ...
     def WhichOneof(self, oneof_group: _Never) -> None: ...
 
