@@ -1,0 +1,149 @@
+"""A finished study as plain values: the JSON of `gnd reproduce slamcu`."""
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+
+from benchmarks.feature_study.averages import distances_plain, mean_over, rounded, std_over
+from benchmarks.feature_study.matching import RADIUS_M
+from benchmarks.feature_study.targets import judged
+from benchmarks.slamcu_study import reference
+from benchmarks.slamcu_study.outcome import MergedSigns, SeedOutcome, StudyOutcome
+from benchmarks.slamcu_study.scores import SignScore, accuracy_of, score
+from benchmarks.slamcu_study.verdicts import ABSENT, EXIST, NEW, SignTruth, Verdicts
+from gnd_map.arrays import F64, I64
+from gnd_map.config import to_mapping
+
+
+def summary_of(outcome: StudyOutcome) -> dict[str, Any]:
+    """Return everything as plain values: means over the seeds below `slamcu`, their standard deviations below
+    `std_over_seeds`, each seed below `seeds`.
+    """
+    seeds = {str(one.seed): seed_summary(one) for one in outcome.seeds}
+    mean = mean_over(list(seeds.values()))
+    paper = {
+        "accuracy": reference.PAPER_ACCURACY,
+        "confusion": reference.PAPER_CONFUSION,
+        "position_error_m": reference.PAPER_POSITION_M,
+        "step_ms_mean": reference.PAPER_STEP_MS,
+    }
+    found = {
+        "slamcu": mean,
+        "std_over_seeds": std_over(list(seeds.values())),
+        "targets": judged(mean, reference.TARGETS),
+        "paper": paper,
+        "seeds": seeds,
+        "matching_radius_m": RADIUS_M,
+        "classes": {"true": list(reference.TRUE_CLASSES), "predicted": list(reference.PREDICTED)},
+        "parameters": to_mapping(outcome.options),
+        "runtime_s": dict(outcome.runtime_s),
+    }
+    return dict(rounded(found))
+
+
+def seed_summary(outcome: SeedOutcome) -> dict[str, Any]:
+    """Return the numbers of one route."""
+    truth = outcome.truth
+    found = drive_summary(outcome.first, truth)
+    found["all_drives"] = _of_all([scored_drive(drive, truth) for drive in outcome.drives])
+    for vehicles, merged in outcome.merged.items():
+        scored = merged_score(merged, truth)
+        found[f"position_error_{vehicles}_m"] = scored.plain_errors() | {"nees": _nees(scored)}
+        found[f"accuracy_{vehicles}"] = accuracy_of(scored.confusion)
+    found["ablation"] = {name: _ablation(one, truth) for name, one in outcome.variants.items()}
+    return found
+
+
+def drive_summary(found: Verdicts, truth: SignTruth) -> dict[str, Any]:
+    """Return the numbers of one drive."""
+    scored = scored_drive(found, truth)
+    return {
+        "accuracy": accuracy_of(scored.confusion),
+        "confusion": scored.confusion.tolist(),
+        "position_error_m": scored.plain_errors() | parts_of_errors(scored, found) | {"nees": _nees(scored)},
+        "false_new": {"all": len(scored.false_new), "near_a_sign_of_the_map": scored.near_known},
+        "step_ms_median": float(np.median(found.step_ms)),
+        "step_ms_p95": float(np.quantile(found.step_ms, 0.95)),
+        "steps": len(found.step_ms),
+        "pose_rmse": _pose_rmse(found),
+        "conflict": _conflict(found),
+        "looks": {
+            "visible": int(found.visible.sum()),
+            "occluded": int(found.occluded.sum()),
+            "no_evidence": int(found.no_evidence),
+            "signs_never_visible": int(np.count_nonzero(found.visible == 0)),
+            "new_signs_never_visible": int(np.count_nonzero(found.visible[truth.of(NEW)] == 0)),
+        },
+    }
+
+
+def scored_new(found: Verdicts) -> tuple[F64, F64]:
+    """Return positions and covariances of the new features that a drive says exist."""
+    return found.new_xy_m[found.new_exists], found.new_cov_m2[found.new_exists]
+
+
+def scored_drive(found: Verdicts, truth: SignTruth) -> SignScore:
+    """Return how well a drive tells the signs."""
+    return score(truth, (found.known_id, found.known_masses), scored_new(found))
+
+
+def merged_score(merged: MergedSigns, truth: SignTruth) -> SignScore:
+    """Return how well a published layer tells the signs: what it holds exists, what it no longer holds is deleted."""
+    ids = truth.feature_id[truth.true_class != NEW]
+    return score(truth, (ids, _published(ids, merged.known_id)), (merged.new_xy_m, merged.new_cov_m2))
+
+
+def _published(ids: I64, published: I64) -> F64:
+    masses = np.zeros((len(ids), 4))
+    there = np.isin(ids, published)
+    masses[there, EXIST] = masses[~there, ABSENT] = 1.0
+    return masses
+
+
+def parts_of_errors(scored: SignScore, found: Verdicts) -> dict[str, Any]:
+    """Return mean lengths of what the pose moved each new sign by, and of the rest, which is the measurements'."""
+    pose = found.pose_part_m[scored.sign]
+    rest = scored.error_m - pose
+    seen = np.isfinite(pose).all(axis=1)
+    return {f"{name}_part": _mean_length(part[seen]) for name, part in (("pose", pose), ("measurement", rest))}
+
+
+def _mean_length(vectors: F64) -> float | None:
+    return float(np.linalg.norm(vectors, axis=1).mean()) if len(vectors) else None
+
+
+def _nees(scored: SignScore) -> dict[str, Any] | None:
+    return None if scored.honesty is None else scored.honesty.plain()
+
+
+def _pose_rmse(found: Verdicts) -> dict[str, float]:
+    along, across, heading = np.sqrt(np.mean(found.pose_error**2, axis=0))
+    return {"longitudinal_m": float(along), "lateral_m": float(across), "heading_deg": float(np.degrees(heading))}
+
+
+def _conflict(found: Verdicts) -> dict[str, float]:
+    """How much was thrown away by Dempster's normalisation, over the signs of the map and the new features."""
+    conflict = np.concatenate([found.known_masses[:, 3], found.new_masses[:, 3]])
+    if not len(conflict):
+        return {}
+    return {
+        "mean": float(conflict.mean()),
+        "p95": float(np.quantile(conflict, 0.95)),
+        "max": float(conflict.max()),
+        "share_above_half": float(np.mean(conflict > 0.5)),
+    }
+
+
+def _of_all(scores: Sequence[SignScore]) -> dict[str, Any]:
+    """Return the numbers of all drives together."""
+    confusion = np.sum([one.confusion for one in scores], axis=0)
+    errors = distances_plain(np.concatenate([one.distance_m for one in scores]))
+    missed, false = sum(one.missed for one in scores), sum(len(one.false_new) for one in scores)
+    counts = {"drives": len(scores), "missed_a_drive": missed / len(scores), "false_a_drive": false / len(scores)}
+    return {"accuracy": accuracy_of(confusion), "position_error_m": errors | counts}
+
+
+def _ablation(found: Verdicts, truth: SignTruth) -> Mapping[str, Any]:
+    whole = drive_summary(found, truth)
+    return {name: whole[name] for name in ("accuracy", "confusion", "position_error_m", "pose_rmse", "step_ms_median")}
