@@ -50,3 +50,7 @@ class RegistrationError(LocaliseError):
 
 class ImportDriveError(VehicleError):
     """A recording that cannot be read, or is not of the format that was named."""
+
+
+class NewLayerError(VehicleError):
+    """A drive that no feature layer can be made of: no motion, no position, or values that are not finite."""
