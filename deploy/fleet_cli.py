@@ -25,8 +25,17 @@ PATH = click.Path(path_type=Path)
 
 _Command = TypeVar("_Command", bound=Callable[..., Any])
 
+
+def listed(_context: click.Context, _option: click.Parameter, value: str | None) -> list[str] | None:
+    """Give the words of a comma-separated list."""
+    return None if value is None else [word.strip() for word in value.split(",") if word.strip()]
+
+
 RUN_OPTIONS = (
     click.option("--shards", type=int, help="Merger shard processes.  [default: 2]"),
+    click.option(
+        "--layers", callback=listed, help="Layers kept up to date, such as ndt,signs,streetlights.  [default: ndt]"
+    ),
     click.option("--world-seed", type=int, help="Seed of the simulated world.  [default: 7]"),
     click.option("--drives", type=PATH, multiple=True, help="Recorded drives (MCAP, folders), not simulated ones."),
     click.option("--map", "base_map", type=PATH, help="Store with the base map for --drives (`gnd map build`)."),

@@ -11,6 +11,9 @@ from gnd_map.config import from_mapping
 
 MAX_AGENTS = 200
 MAX_SHARDS = 32
+VOXEL_LAYER = "ndt"
+FEATURE_LAYERS = ("signs", "streetlights", "poles")
+"""Those for which the fleet's vehicles have detectors."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -28,6 +31,7 @@ class FleetConfig:
         merge_delay_s: a tile is merged this long after its first unmerged report ...
         merge_after_reports: ... or as soon as this many reports wait.
         deadline_s: a run that takes longer is ended with an error.
+        layers: layers of the map that vehicles keep up to date; "ndt", on which they localise, is always among them.
     """
 
     agents: int = 8
@@ -40,6 +44,7 @@ class FleetConfig:
     merge_delay_s: float = 2.0
     merge_after_reports: int = 16
     deadline_s: float = 1800.0
+    layers: tuple[str, ...] = (VOXEL_LAYER,)
 
     def __post_init__(self) -> None:
         """Refuse values outside their range."""
@@ -52,6 +57,19 @@ class FleetConfig:
         _require(self.merge_delay_s >= 0, f"merge_delay_s must not be negative, got {self.merge_delay_s}")
         _require(self.merge_after_reports >= 1, f"merge_after_reports must be >= 1, got {self.merge_after_reports}")
         _require(self.deadline_s > 0, f"deadline_s must be positive, got {self.deadline_s}")
+        self._check_layers()
+
+    def _check_layers(self) -> None:
+        unfit = [layer for layer in self.layers if layer != VOXEL_LAYER and layer not in FEATURE_LAYERS]
+        known = ", ".join((VOXEL_LAYER, *FEATURE_LAYERS))
+        _require(not unfit, f"no vehicle of the fleet detects the layers {', '.join(unfit)}; it knows {known}")
+        _require(VOXEL_LAYER in self.layers, f"layers must hold {VOXEL_LAYER!r}, on which vehicles localise")
+        _require(len(set(self.layers)) == len(self.layers), f"layers {', '.join(self.layers)}: one comes twice")
+
+    @property
+    def feature_layers(self) -> tuple[str, ...]:
+        """The layers that hold features."""
+        return tuple(layer for layer in self.layers if layer != VOXEL_LAYER)
 
 
 def _require(condition: bool, message: str) -> None:

@@ -41,3 +41,13 @@ def test_a_broken_file_is_refused(tmp_path: Path) -> None:
         load_fleet_config(path, {})
     with pytest.raises(DeployError, match="cannot read"):
         load_fleet_config(tmp_path / "missing.toml", {})
+
+
+def test_layers_are_those_that_vehicles_detect_with_ndt_among_them() -> None:
+    assert load_fleet_config(None, {"layers": ["ndt", "signs", "streetlights"]}).feature_layers == (
+        "signs",
+        "streetlights",
+    )
+    for layers, message in ((["signs"], "must hold 'ndt'"), (["ndt", "trees"], "trees"), (["ndt", "ndt"], "twice")):
+        with pytest.raises(DeployError, match=message):
+            load_fleet_config(None, {"layers": layers})
