@@ -1,0 +1,67 @@
+"""`gnd reproduce new-feature-layer`: thin over `benchmarks.new_layer_study.study`."""
+
+from pathlib import Path
+from typing import Any
+
+import click
+
+from benchmarks.feature_study.output import PATH, picture_folder, workers, write_result
+
+DEFAULT_OUT = Path("runs/reproduce-new-layer")
+
+
+@click.command("new-feature-layer")
+@click.option("--seeds", default="11", show_default=True, help="Seeds of routes, with commas between: 1,2,3.")
+@click.option("--drives", default=6, show_default=True, help="Drives on the test track.")
+@click.option("--motorway-drives", default=11, show_default=True, help="Drives on the motorway; one more localises.")
+@click.option("--levels", default="0.5,1,1.5,2", show_default=True, help="Noise levels of Figure 8; none: no sweep.")
+@click.option("--km", default=4.0, show_default=True, help="Length of the motorway.")
+@click.option("--straight/--no-straight", default=True, show_default=True, help="The straight motorway, too.")
+@click.option("--out", type=PATH, default=DEFAULT_OUT, show_default=True, help="Folder that keeps everything.")
+@click.option("--json", "json_file", help="Write the result as JSON; `-` prints it and nothing else.")
+@click.option("--pictures", type=PATH, help="Folder for the figures.  [default: the one that keeps everything]")
+@click.option("--processes", type=int, help="Worker processes.  [default: one a core]")
+def new_feature_layer(
+    json_file: str | None, out: Path, pictures: Path | None, processes: int | None, **given: Any
+) -> None:
+    """A layer of beacons or streetlights that many cars map while driving, and localisation with it: Figures 6 to 8, 10
+    to 12 and Tables 2 and 3 of the paper on new feature layers.
+
+    A second start with the same options and folder continues where the first ended.
+    """
+    options, processes = options_of(given), workers(processes)
+    # The heavy imports wait until the options have been found good.
+    from rich.console import Console
+
+    from benchmarks.new_layer_study.figures import draw_figures
+    from benchmarks.new_layer_study.study import study
+    from benchmarks.new_layer_study.summary import summary_of
+    from benchmarks.new_layer_study.tables import print_tables
+    from benchmarks.simulation.folder import RunFolder
+    from deploy.live import progress_bars
+
+    folder, drawn = RunFolder.create(out, "new-feature-layer"), picture_folder(pictures, out)
+    folder.write_mark({"seeds": list(options.seeds)})
+    with progress_bars(Console(stderr=True)) as progress:
+        outcome = study(options, folder, processes, progress)
+    found = summary_of(outcome)
+    folder.write_json("result.json", found)
+    draw_figures(outcome, found, drawn)
+    if not write_result(found, json_file):
+        print_tables(found)
+        click.echo(f"everything else: {out}")
+
+
+def options_of(given: dict[str, Any]) -> Any:
+    """Return `NewLayerOptions` of the command line's values.
+
+    Raises:
+        click.BadParameter: a value that cannot be read.
+        OptionError: a value that cannot work.
+    """
+    from benchmarks.new_layer_study.options import NewLayerOptions
+    from benchmarks.simulation.command import list_of
+
+    seeds = list_of("--seeds", given["seeds"], int)
+    levels = () if given["levels"] == "none" else list_of("--levels", given["levels"], float)
+    return NewLayerOptions(seeds, given["drives"], given["motorway_drives"], levels, given["km"], given["straight"])
