@@ -242,3 +242,13 @@ SELECT (SELECT COUNT(*) FROM tile_head), (SELECT COUNT(*) FROM tile_version),
        (SELECT COUNT(*) FROM (SELECT DISTINCT report_id FROM report)), (SELECT COUNT(*) FROM report),
        (SELECT COUNT(*) FROM report WHERE merged_in IS NULL), (SELECT COUNT(*) FROM dirty),
        (SELECT COUNT(*) FROM quarantine)
+
+-- name: put_feature_source
+INSERT INTO feature_source (name, created_ns, about, body) VALUES (:name, :created_ns, :about, :body)
+ON CONFLICT (name) DO UPDATE SET created_ns = excluded.created_ns, about = excluded.about, body = excluded.body
+
+-- name: feature_source_exists
+SELECT 1 FROM sqlite_schema WHERE type = 'table' AND name = 'feature_source'
+
+-- name: feature_sources
+SELECT name, about, body FROM feature_source ORDER BY name

@@ -1,0 +1,73 @@
+"""What a store keeps of the files that its features come from: how they were read, which features they gave, and the
+file itself, so that what was no feature can be given back on export.
+
+It lies in the store beside the tiles, in a table of its own, and is written in the same transaction as they are. It
+never goes to vehicles.
+"""
+
+import json
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Any, Final
+
+import apsw
+import zstandard
+
+from tile_store.errors import StoreError
+from tile_store.feature_io.errors import FeatureFileError
+from tile_store.sqlite_connection import change, fetch
+
+MAX_DOCUMENT_BYTES: Final = 1_000_000_000
+_LEVEL: Final = 9
+
+
+@dataclass(frozen=True, slots=True)
+class Source:
+    """One file that was imported.
+
+    name: what its features are known by. format: "lanelet2", "geojson", ... ids: of its features by layer.
+    options: how it was read. document: its bytes, b"" when the format has no remainder to keep.
+    """
+
+    name: str
+    format: str
+    ids: Mapping[str, tuple[int, ...]]
+    options: Mapping[str, Any]
+    document: bytes = field(default=b"", repr=False)
+
+    def __post_init__(self) -> None:
+        if not 1 <= len(self.name) <= 200:
+            raise FeatureFileError(f"a source's name has 1 … 200 characters, got {len(self.name)}")
+
+
+def put_source(c: apsw.Connection, source: Source, now_ns: int) -> None:
+    """Keep a source in place of one of the same name; inside the caller's transaction."""
+    about = {"format": source.format, "options": dict(source.options), "ids": {k: list(v) for k, v in source.ids.items()}}
+    c.execute("CREATE TABLE IF NOT EXISTS " + TABLE)
+    body = zstandard.compress(source.document, _LEVEL)
+    row = {"name": source.name, "created_ns": now_ns, "about": json.dumps(about), "body": body}
+    change(c, "put_feature_source", row)
+
+
+TABLE: Final = (
+    "feature_source (name TEXT NOT NULL PRIMARY KEY, created_ns INTEGER NOT NULL, about TEXT NOT NULL, "
+    "body BLOB NOT NULL) STRICT"
+)
+"""Made with the first import: stores without one are as they were."""
+
+
+def get_sources(c: apsw.Connection) -> list[Source]:
+    """All sources, sorted by name."""
+    if not fetch(c, "feature_source_exists"):
+        return []
+    return [_source(*row) for row in fetch(c, "feature_sources")]
+
+
+def _source(name: str, about: str, body: bytes) -> Source:
+    try:
+        told = json.loads(about)
+        document = zstandard.ZstdDecompressor().decompress(body, max_output_size=MAX_DOCUMENT_BYTES)
+        ids = {layer: tuple(map(int, numbers)) for layer, numbers in told["ids"].items()}
+        return Source(name, told["format"], ids, told["options"], document)
+    except (ValueError, KeyError, TypeError, AttributeError, zstandard.ZstdError) as error:
+        raise StoreError(f"source {name!r:.80} of the store is damaged: {type(error).__name__}: {error}") from None
