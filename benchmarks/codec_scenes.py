@@ -100,5 +100,5 @@ def stored(path: Path, layer: str = "ndt") -> CodecScene:
     """
     with SqliteStore(path, create=False) as store:
         found = (store.get(layer, entry.tile) for entry in store.heads(layer))
-        tiles = [tile.decode() for tile in found if tile is not None]
+        tiles = [tile.decode_gaussians() for tile in found if tile is not None]
     return CodecScene(path.name, {tile.tile_id: tile.gaussians for tile in tiles if len(tile.gaussians)})

@@ -10,9 +10,9 @@ from typing import Final
 from cloud_merger.ownership import Members
 from fleet_bus.bus import Bus
 from fleet_bus.subscribing import RecallingPublisher
-from gnd_map.codec import encode_delta, lattice_of
+from gnd_map.content import changed_between, encode_content_delta, has_deltas
 from gnd_map.errors import CodecError
-from gnd_map.tile import diff
+from gnd_map.tile import Tile, diff
 from schemas.errors import SchemaError, TooLarge
 from schemas.keys import update_key
 from schemas.updates import TileUpdate
@@ -76,14 +76,14 @@ def update_of(stored: StoredTile, parent: StoredTile | None) -> TileUpdate:
 
 
 def _with_delta(update: TileUpdate, stored: StoredTile, parent: StoredTile) -> TileUpdate:
-    """The notice with what has changed: coded where the version lies on a lattice, else in plain columns."""
+    """The notice with what has changed: coded for features and on a lattice, else in plain columns."""
     try:
-        before, after = parent.decode().gaussians, stored.decode().gaussians
-        changes = diff(before, after)
-        if lattice_of(stored.codec_id) is None:
-            return replace(update, delta=changes)
-        coded = encode_delta(stored.tile, before, after)
-        return replace(update, coded_delta=coded, put_voxels=len(changes.put), removed_voxels=len(changes.removed))
+        before, after = parent.decode(), stored.decode()
+        if isinstance(before, Tile) and isinstance(after, Tile) and not has_deltas(stored.codec_id):
+            return replace(update, delta=diff(before.gaussians, after.gaussians))
+        put, removed = changed_between(before, after)
+        coded = encode_content_delta(before, after)
+        return replace(update, coded_delta=coded, put_voxels=put, removed_voxels=removed)
     except TooLarge:
         return update
     except (SchemaError, CodecError) as error:  # one damaged body must not keep the notices of all other tiles

@@ -71,7 +71,7 @@ class Bases:
             return self._held.get((tile, sha))
 
     def _remember(self, stored: StoredTile) -> Gaussians:
-        gaussians = stored.decode().gaussians
+        gaussians = stored.decode_gaussians().gaussians
         with self._lock:
             self._held[stored.tile, stored.sha] = gaussians
             while len(self._held) > REMEMBERED_TILES:

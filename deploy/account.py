@@ -133,5 +133,5 @@ def _history(store: SqliteStore, layer: str, tile: Any, version: int) -> TileHis
         raise LookupError(f"version {version} of tile {tile.path} was listed but is not there")
     bases = [info.version for info in store.history(layer, tile) if info.kind != "merged"]
     base = store.get(layer, tile, bases[-1]) if bases else None
-    before = Gaussians.empty() if base is None else base.decode().gaussians
-    return TileHistory(head, before, head.decode().gaussians)
+    before = Gaussians.empty() if base is None else base.decode_gaussians().gaussians
+    return TileHistory(head, before, head.decode_gaussians().gaussians)

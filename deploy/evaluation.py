@@ -111,4 +111,4 @@ def _held(store: SqliteStore, change: TileChange, base: Tiles) -> Gaussians:
     if not change.base_sha:
         return Gaussians.empty()
     stored = store.by_sha(DEFAULT_LAYER, change.tile, change.base_sha)
-    return base.get(change.tile, Gaussians.empty()) if stored is None else stored.decode().gaussians
+    return base.get(change.tile, Gaussians.empty()) if stored is None else stored.decode_gaussians().gaussians

@@ -3,12 +3,12 @@
 from dataclasses import dataclass
 from typing import Final, Literal
 
-from gnd_map.codec import codec_of
+from gnd_map.content import AnyTile, TileT, decode_content
 from gnd_map.tile import Tile
 from gnd_map.tile_id import TileId
 from schemas import limits
 from schemas.errors import BadValue, WrongHash
-from schemas.tiles import check_hash, tile_from_delta
+from schemas.tiles import as_kind, check_hash, tile_from_delta
 from schemas.wire import check_length, check_version, check_word, refusing
 
 ANSWER_HASH_BYTES: Final = 4
@@ -42,7 +42,7 @@ class TileAnswer:
     codec_id: int = 0
     """Codec of a blob; else 0."""
     body: bytes = b""
-    """Of a blob in its codec, or of a delta by `gnd_map.codec.encode_delta`; else empty."""
+    """Of a blob in its codec, or of a delta by `gnd_map.content.encode_content_delta`; else empty."""
 
     def __post_init__(self) -> None:
         check_word(self.status, ANSWER_STATUS, "answer status")
@@ -61,16 +61,22 @@ class TileAnswer:
 
 
 def tile_of_answer(tile: TileId, answer: TileAnswer, held: Tile | None = None) -> Tile:
+    """As `content_of_answer`, of a layer of Gaussians."""
+    return content_of_answer(tile, answer, Tile, held)
+
+
+def content_of_answer(tile: TileId, answer: TileAnswer, kind: type[TileT], held: TileT | None = None) -> TileT:
     """The tile that a "blob" or "delta" brings.
 
     Args:
         tile: which tile the answer is about.
         answer: of status "blob" or "delta".
+        kind: what the layer holds: `Tile` of Gaussians or `FeatureTile`.
         held: the content that the request said is held; needed by a delta.
 
     Raises:
         WrongHash: the content has not its hash, or the delta does not fit what is held: fetch the tile whole.
-        BadValue: an unknown codec, a body that is none of it, an answer without a body.
+        BadValue: an unknown codec, a body that is none of it, content of the other kind, an answer without a body.
     """
     if answer.status not in WITH_BODY:
         raise BadValue(f"answer {answer.status!r} about tile {tile} brings no content")
@@ -80,6 +86,6 @@ def tile_of_answer(tile: TileId, answer: TileAnswer, held: Tile | None = None) -
             raise WrongHash(f"{name} is a delta and nothing is held; fetch the tile whole")
         return tile_from_delta(tile, answer.version, answer.body, held, answer.sha)
     with refusing(name):
-        found = Tile(tile, answer.version, codec_of(answer.codec_id).decode(tile, answer.body))
+        found: AnyTile = decode_content(tile, answer.version, answer.codec_id, answer.body)
     check_hash(name, found, answer.sha)
-    return found
+    return as_kind(found, kind)

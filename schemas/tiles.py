@@ -4,8 +4,10 @@ from dataclasses import dataclass
 from itertools import pairwise
 from typing import Final, Literal
 
-from gnd_map.codec import CODEC_FLOAT32, PREFERRED, codec_of, decode_delta
+from gnd_map.codec import CODEC_FLOAT32, PREFERRED, codec_of
+from gnd_map.content import AnyTile, TileT, decode_content, decode_content_delta, noun_of
 from gnd_map.errors import GndError
+from gnd_map.features import FeatureTile
 from gnd_map.tile import Tile
 from gnd_map.tile_id import TileId
 from schemas import limits
@@ -125,16 +127,34 @@ def blob_of(tile: Tile, codec_id: int = CODEC_FLOAT32) -> TileBlob:
     )
 
 
-def tile_of(blob: TileBlob) -> Tile:
-    """The tile in a blob.
+def content_of(blob: TileBlob) -> AnyTile:
+    """The tile in a blob: its codec says whether it holds Gaussians or features.
 
     Raises:
         WrongHash: the content is not what the blob's sha says.
         BadValue: a codec that this program does not know, or a body that is none of it.
     """
-    with refusing(f"tile {blob.tile} version {blob.version}"):
-        tile = Tile(blob.tile, blob.version, codec_of(blob.codec_id).decode(blob.tile, blob.body))
-    check_hash(f"tile {blob.tile} version {blob.version}", tile, blob.sha)
+    name = f"tile {blob.tile} version {blob.version}"
+    with refusing(name):
+        tile = decode_content(blob.tile, blob.version, blob.codec_id, blob.body)
+    check_hash(name, tile, blob.sha)
+    return tile
+
+
+def tile_of(blob: TileBlob) -> Tile:
+    """As `content_of`, of a layer of Gaussians; BadValue where it holds features."""
+    return as_kind(content_of(blob), Tile)
+
+
+def features_of(blob: TileBlob) -> FeatureTile:
+    """As `content_of`, of a feature layer; BadValue where it holds Gaussians."""
+    return as_kind(content_of(blob), FeatureTile)
+
+
+def as_kind(tile: AnyTile, kind: type[TileT]) -> TileT:
+    """The tile itself, now known to be of this kind; BadValue when it is of the other."""
+    if not isinstance(tile, kind):
+        raise BadValue(f"tile {tile.tile_id} version {tile.version} holds {noun_of(tile)}, expected {noun_of(kind)}")
     return tile
 
 
@@ -148,7 +168,7 @@ class CodedDelta:
     sha: bytes
     """SHA-256 of the content that comes out."""
     body: bytes
-    """`gnd_map.codec.encode_delta` against what the client holds."""
+    """`gnd_map.content.encode_content_delta` against what the client holds."""
 
     def __post_init__(self) -> None:
         check_version("tile version", self.version, lowest=1)
@@ -164,7 +184,7 @@ def _delta_value(message: coded_delta_pb2.CodedDelta) -> CodedDelta:
     return CodedDelta(tile_id(message.tile), message.version, message.sha, message.body)
 
 
-def tile_after(delta: CodedDelta, held: Tile) -> Tile:
+def tile_after(delta: CodedDelta, held: TileT) -> TileT:
     """The tile that a delta makes of the one that the client holds.
 
     Raises:
@@ -173,8 +193,8 @@ def tile_after(delta: CodedDelta, held: Tile) -> Tile:
     return tile_from_delta(delta.tile, delta.version, delta.body, held, delta.sha)
 
 
-def tile_from_delta(tile: TileId, version: int, body: bytes, held: Tile, sha: bytes) -> Tile:
-    """The tile that the bytes of `encode_delta` make of the one held; `sha` may be the first bytes of the hash only.
+def tile_from_delta(tile: TileId, version: int, body: bytes, held: TileT, sha: bytes) -> TileT:
+    """The tile that the bytes of a coded delta make of the one held; `sha` may be the first bytes of the hash only.
 
     Raises:
         WrongHash: the delta is of another tile, does not fit what is held, or its outcome has not this hash.
@@ -183,14 +203,14 @@ def tile_from_delta(tile: TileId, version: int, body: bytes, held: Tile, sha: by
     if held.tile_id != tile:
         raise WrongHash(f"{name} is not for tile {held.tile_id}; fetch the tile whole")
     try:
-        after = Tile(tile, version, decode_delta(tile, held.gaussians, body))
+        after = decode_content_delta(held, version, body)
     except GndError as error:
         raise WrongHash(f"{name} does not fit version {held.version}: {error}; fetch the tile whole") from error
     check_hash(name, after, sha)
     return after
 
 
-def check_hash(name: str, tile: Tile, sha: bytes) -> None:
+def check_hash(name: str, tile: AnyTile, sha: bytes) -> None:
     """`WrongHash` unless the tile's hash begins with `sha` (all 32 bytes of it, or the first few)."""
     if not sha or not tile.sha.startswith(sha):
         raise WrongHash(f"{name}: content has sha {tile.sha.hex()[:16]}…, claimed is {sha.hex()[:16]}…; fetch it again")

@@ -6,6 +6,7 @@ from typing import Final, Literal
 import numpy as np
 
 from gnd_map.codec import CODEC_FLOAT32, codec_of, encode_gaussians
+from gnd_map.content import TileT
 from gnd_map.errors import GndError
 from gnd_map.tile import Tile, TileDelta, apply
 from gnd_map.tile_id import TileId
@@ -51,11 +52,11 @@ class TileUpdate:
     delta: TileDelta | None = None
     """What turns the previous content into the new one, in plain columns; None = see `coded_delta`."""
     coded_delta: bytes = b""
-    """The same by `gnd_map.codec.encode_delta`; with neither, fetch the tile."""
+    """The same by `gnd_map.content.encode_content_delta`; with neither, fetch the tile."""
     put_voxels: int = 0
-    """Voxels that `coded_delta` gives a Gaussian or another one."""
+    """Voxels or features that come or are replaced by `coded_delta`."""
     removed_voxels: int = 0
-    """Voxels that lose theirs by `coded_delta`."""
+    """Voxels or features that go by `coded_delta`."""
 
     def __post_init__(self) -> None:
         check_text("layer", self.layer, LAYER_PATTERN)
@@ -133,7 +134,7 @@ class TileUpdate:
         )
 
 
-def updated(update: TileUpdate, held: Tile) -> Tile:
+def updated(update: TileUpdate, held: TileT) -> TileT:
     """The tile that a notice makes of the version before it.
 
     Raises:
@@ -145,6 +146,8 @@ def updated(update: TileUpdate, held: Tile) -> Tile:
         raise WrongHash(f"{name} has no delta; fetch the tile")
     if update.delta is None:
         return tile_from_delta(update.tile, update.version, update.coded_delta, held, update.sha)
+    if not isinstance(held, Tile):
+        raise WrongHash(f"{name} has a delta of Gaussians, held are features; fetch the tile")
     try:
         tile = Tile(update.tile, update.version, apply(held.gaussians, update.delta))
     except GndError as error:

@@ -2,7 +2,7 @@
 in a codec that it reads.
 
 Every version that is still in the store can be the base of a delta. A delta that is no shorter than the whole tile, or
-whose base is gone or damaged, is not sent; tiles of plain floats have none.
+whose base is gone or damaged, is not sent; tiles of plain floats have none. Features come in the one codec they have.
 """
 
 import logging
@@ -11,19 +11,23 @@ from dataclasses import dataclass
 from typing import Final, Literal
 
 from fleet_bus.errors import Refused
-from gnd_map.codec import CODECS, best_codec, codec_of, encode_delta, lattice_of
+from gnd_map.codec import CODECS, best_codec, codec_of, lattice_of
+from gnd_map.content import FEATURE_CODECS, AnyTile, codecs_of_layer, encode_content_delta, has_deltas
 from gnd_map.errors import CodecError, GndError
-from gnd_map.gaussian import Gaussians
+from gnd_map.features import FeatureTile
+from gnd_map.tile import Tile
 from gnd_map.tile_id import District, TileId
 from schemas.errors import SchemaError
 from schemas.limits import MAX_TILE_BODY_BYTES
-from schemas.tiles import CatalogEntry, CodedDelta, TileBlob, TileReply, TileRequest
+from schemas.tiles import CatalogEntry, CodedDelta, TileBlob, TileReply, TileRequest, as_kind
 from schemas.tiles_batch import ANSWER_HASH_BYTES, TileAnswer, TilesReply, TilesRequest, digest_of, index_of
 from tile_store.memory import Memory
 from tile_store.store import Store
 from tile_store.values import StoredTile
 
 BYTES_A_VOXEL: Final = 48
+BYTES_A_FEATURE: Final = 2_000  # as Python objects, with its points and attributes
+BYTES_A_POINT: Final = 24
 REMEMBERED_BYTES: Final = 64 * 1024 * 1024  # of decoded tiles, and again of deltas and bodies in other codecs
 _LOG = logging.getLogger(__name__)
 
@@ -42,7 +46,7 @@ class Answers:
 
     def __init__(self, store: Store, remembered_bytes: int = REMEMBERED_BYTES) -> None:
         self._store = store
-        self._decoded: Memory[Gaussians] = Memory(remembered_bytes, lambda g: BYTES_A_VOXEL * len(g))
+        self._decoded: Memory[AnyTile] = Memory(remembered_bytes, _bytes_of)
         self._encoded: Memory[bytes] = Memory(remembered_bytes, len)
 
     def one(self, stored: StoredTile | None, wanted: TileRequest) -> TileReply:
@@ -131,8 +135,8 @@ class Answers:
     # What is sent
 
     def _sent(self, stored: StoredTile, held: StoredTile | None, codecs: Sequence[int]) -> _Sent:
-        # A delta is coded like the body in the store; floats have no short one (gnd_map.codec.encode_delta).
-        if held is not None and lattice_of(stored.codec_id) is not None and stored.codec_id in codecs:
+        # A delta is coded like the body in the store; floats have no short one.
+        if held is not None and has_deltas(stored.codec_id) and stored.codec_id in codecs:
             body = self._delta(held, stored)
             if body is not None and len(body) < len(stored.body):
                 return _Sent("delta", 0, body)
@@ -143,7 +147,7 @@ class Answers:
         try:
             return self._encoded.get(
                 (new.tile, base.sha, new.sha),
-                lambda: encode_delta(new.tile, self._gaussians(base), self._gaussians(new)),
+                lambda: encode_content_delta(self._tile(base), self._tile(new)),
             )
         except GndError as error:
             _LOG.error("tile %s: no delta from version %d to %d: %s", new.tile, base.version, new.version, error)
@@ -154,9 +158,8 @@ class Answers:
         codec_id = self._codec_for(stored, codecs)
         if codec_id == stored.codec_id:
             return codec_id, stored.body
-        encode = codec_of(codec_id).encode
-        key = (stored.tile, stored.sha, codec_id)
-        body = self._encoded.get(key, lambda: encode(stored.tile, self._gaussians(stored)))
+        encode, tile = codec_of(codec_id).encode, as_kind(self._tile(stored), Tile)
+        body = self._encoded.get((stored.tile, stored.sha, codec_id), lambda: encode(stored.tile, tile.gaussians))
         if len(body) > MAX_TILE_BODY_BYTES:
             raise Refused(
                 f"tile {stored.tile.path} has {len(body)} bytes in codec {codec_id}, a message holds"
@@ -170,18 +173,40 @@ class Answers:
         Bodies lie in the store in the best codec there is, so most versions need not be decoded to know: the codec is
         the stored one, another of its lattice, or one of floats.
         """
+        if stored.codec_id in FEATURE_CODECS:
+            return self._only_codec(stored, codecs)
         for codec_id in codecs:
             if codec_id in CODECS and (lattice_of(codec_id) is None or same_lattice(codec_id, stored.codec_id)):
                 return codec_id
         try:
-            return best_codec(self._gaussians(stored), codecs)
+            return best_codec(as_kind(self._tile(stored), Tile).gaussians, codecs)
         except GndError:
-            raise Refused(
-                f"tile {stored.tile.path} comes in codec {stored.codec_id}, asked for {tuple(codecs)}"
-            ) from None
+            return self._only_codec(stored, codecs)
 
-    def _gaussians(self, stored: StoredTile) -> Gaussians:
-        return self._decoded.get((stored.tile, stored.sha), lambda: stored.decode().gaussians)
+    @staticmethod
+    def _only_codec(stored: StoredTile, codecs: Sequence[int]) -> int:
+        """The codec of the body in the store, for a client that reads it; else Refused."""
+        if stored.codec_id not in codecs:
+            raise Refused(
+                f"tile {stored.tile.path} of layer {stored.layer} comes in codec {stored.codec_id}, asked for"
+                f" {tuple(codecs)}"
+            )
+        return stored.codec_id
+
+    def _tile(self, stored: StoredTile) -> AnyTile:
+        return self._decoded.get((stored.tile, stored.sha), stored.decode)
+
+
+def _bytes_of(tile: AnyTile) -> int:
+    """About what a decoded tile takes in memory."""
+    if isinstance(tile, FeatureTile):
+        return sum(BYTES_A_FEATURE + BYTES_A_POINT * len(feature.points_m) for feature in tile.features)
+    return BYTES_A_VOXEL * len(tile.gaussians)
+
+
+def reads_layer(layer: str, codecs: Sequence[int]) -> bool:
+    """Whether a client that names these codecs reads any of those that a layer may come in."""
+    return not set(codecs).isdisjoint(codecs_of_layer(layer))
 
 
 def same_lattice(one: int, other: int) -> bool:

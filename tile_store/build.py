@@ -15,6 +15,7 @@ from gnd_map.accumulate import N_MIN_CELLS, VoxelAccumulator
 from gnd_map.arrays import F64
 from gnd_map.codec import Lattice, snap
 from gnd_map.errors import MotionError
+from gnd_map.features import is_feature_layer
 from gnd_map.gaussian import Gaussians
 from gnd_map.geodesy import LocalFrame
 from gnd_map.grid import GridFrame, zones
@@ -108,19 +109,21 @@ def build_map(
     Args:
         drives: recordings with reference poses.
         store: where the tiles go.
-        layer: such as "ndt".
+        layer: such as "ndt"; its name begins so, or it would hold features.
         codec: one of `MAP_CODECS`: the lattice on which the published Gaussians lie, or "float" = as measured.
         n_min_cells: a voxel holds a Gaussian from so many occupied sub-cells on.
         parameters: which points and poses are used.
         progress: called after each scan.
 
     Raises:
-        BuildError: no drives, no reference poses, impossible poses, no voxel dense enough.
+        BuildError: a feature layer, no drives, no reference poses, impossible poses, no voxel dense enough.
         DriveError: a drive cannot be read.
         StoreError: an unknown codec, or the store cannot take the tiles.
     """
     parameters = parameters or BuildParameters()
     lattice = lattice_named(codec)
+    if is_feature_layer(layer):
+        raise BuildError(f"layer {layer!r} holds features; a map of Gaussians has a name that begins with ndt")
     sources = _sources(drives, parameters)
     accumulators = _accumulators(sources, parameters)
     used, skipped, points = 0, 0, 0

@@ -55,7 +55,7 @@ def map_info(store: Store, *, layer: str = DEFAULT_LAYER, prefix: str = "") -> M
     stored = list(_newest(store, layer, prefix, at_ns=None).values())
     if not stored:
         raise StoreError(f"no tiles in layer {layer!r}, region {prefix or 'everywhere'!r}")
-    gaussians = [(one.tile, one.decode().gaussians) for one in stored]
+    gaussians = [(one.tile, one.decode_gaussians().gaussians) for one in stored]
     body_bytes, n_gaussians = sum(len(one.body) for one in stored), sum(len(g) for _, g in gaussians)
     south, west, north, east = _bounds_deg([one.tile for one in stored])
     lowest, highest = _heights_m(gaussians)
@@ -195,7 +195,7 @@ def tile_diff(tile: TileId, old: StoredTile | None, new: StoredTile | None) -> T
 
 
 def _gaussians(stored: StoredTile | None) -> Gaussians:
-    return stored.decode().gaussians if stored else Gaussians.empty()
+    return stored.decode_gaussians().gaussians if stored else Gaussians.empty()
 
 
 def _map_diff(layer: str, prefix: str, diffs: list[TileDiff]) -> MapDiff:

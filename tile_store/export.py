@@ -14,6 +14,7 @@ from typing import IO, Any, Final
 import numpy as np
 import numpy.typing as npt
 
+from gnd_map.features import is_feature_layer
 from gnd_map.gaussian import six_entries
 from gnd_map.geodesy import LocalFrame
 from gnd_map.grid import VoxelGrid
@@ -74,13 +75,18 @@ def export_map(store: Store, layer: str, prefix: str, path: Path | str, format: 
 
 
 def region_tiles(store: Store, layer: str, prefix: str) -> list[Tile]:
-    """The newest version of every tile of a region, hashes checked; `ExportError` when there is none."""
+    """The newest version of every tile of a region of Gaussians, hashes checked.
+
+    Raises:
+        ExportError: there is none, or the layer holds features.
+    """
     entries = store.heads(layer, prefix)
-    stored = (store.get(layer, entry.tile, entry.version) for entry in entries)
-    tiles = [tile.decode() for tile in stored if tile is not None]
-    if not tiles:
+    if not entries:
         raise ExportError(f"no tiles in layer {layer!r}, region {prefix or 'everywhere'!r}")
-    return tiles
+    if is_feature_layer(layer):
+        raise ExportError(f"the {len(entries)} tiles of layer {layer!r} hold features, not Gaussians")
+    stored = (store.get(layer, entry.tile, entry.version) for entry in entries)
+    return [tile.decode_gaussians() for tile in stored if tile is not None]
 
 
 def region_frame(tiles: list[Tile]) -> LocalFrame:

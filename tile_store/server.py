@@ -8,12 +8,13 @@ from fleet_bus.bus import Bus
 from fleet_bus.errors import Refused
 from fleet_bus.serving import Answer, Request, Serving
 from gnd_map.codec import CODEC_FLOAT32
+from gnd_map.content import FEATURE_CODECS
 from gnd_map.tile_id import District, TileId
 from schemas import keys
 from schemas.errors import SchemaError
 from schemas.tiles import Catalog, TileRequest
 from schemas.tiles_batch import TilesRequest
-from tile_store.answers import Answers
+from tile_store.answers import Answers, reads_layer
 from tile_store.regions import Region
 from tile_store.store import Store
 from tile_store.warm import warm_up
@@ -22,7 +23,7 @@ _ANY: Final = "x/**"
 # Only `schemas.keys` knows how a key begins.
 TILE_ROOT: Final = keys.tiles_key("x").removesuffix(_ANY)
 # Who asks without a message reads what everybody reads.
-PLAIN_REQUEST: Final = TileRequest(codecs=(CODEC_FLOAT32,), deltas=False)
+PLAIN_REQUEST: Final = TileRequest(codecs=(CODEC_FLOAT32, *FEATURE_CODECS), deltas=False)
 CATALOG_ROOT: Final = keys.catalog_keys("x").removesuffix(_ANY)
 
 
@@ -95,7 +96,10 @@ class TileServer:
         return self._catalogs(region)
 
     def _region(self, region: Region, wanted: TileRequest) -> Iterator[tuple[str, bytes]]:
+        """Of a wildcard over layers only those that the client reads."""
         for layer, tile in self._tiles(region):
+            if region.layer is None and not reads_layer(layer, wanted.codecs):
+                continue
             if region.matches(layer, *tile.path.split("/")):
                 yield keys.tile_key(layer, tile), self._answers.one(self._store.get(layer, tile), wanted).encode()
 

@@ -5,11 +5,11 @@ from collections.abc import Callable, Iterable, Iterator, Sequence
 from hashlib import sha256
 from pathlib import Path
 from types import TracebackType
-from typing import Any, Final
+from typing import Any, Final, TypeVar
 
 import apsw
 
-from gnd_map.tile import Tile
+from gnd_map.content import AnyTile
 from gnd_map.tile_id import TileId
 from schemas.tiles import CatalogEntry
 from tile_store import sqlite_inbox as inbox
@@ -35,10 +35,12 @@ from tile_store.values import (
     TileWork,
     VersionInfo,
     VersionKind,
+    check_fits,
     check_layer,
 )
 from tile_store.writer import GroupWriter
 
+_T = TypeVar("_T")
 NS_PER_S: Final = 1_000_000_000
 REPORTS_A_PAGE: Final = 256
 
@@ -181,17 +183,26 @@ class SqliteStore:
         return self._writer.run(work)
 
     def put_tiles(
-        self, tiles: Iterable[Tile], reason: VersionKind = "base", layer: str = DEFAULT_LAYER
+        self, tiles: Iterable[AnyTile], reason: VersionKind = "base", layer: str = DEFAULT_LAYER
     ) -> list[PublishResult]:
         """See `Store.put_tiles`."""
         check_layer(layer)
-        pairs = [(tile.tile_id, Content.of(tile)) for tile in tiles]
+        pairs = [(tile.tile_id, _content(tile, layer)) for tile in tiles]
 
         def work(c: apsw.Connection) -> list[PublishResult]:
             now = self._now_ns()
             return [versions.put_base(c, layer, tile, content, reason, now) for tile, content in pairs]
 
         return self._writer.run(work)
+
+    def transact(self, work: Callable[[apsw.Connection, int], _T]) -> _T:
+        """Run `work(connection, now)` in one durable write transaction: all that it writes, or nothing if it raises."""
+        return self._writer.run(lambda c: work(c, self._now_ns()))
+
+    def look(self, work: Callable[[apsw.Connection], _T]) -> _T:
+        """Run `work(connection)` on the store as it is at one instant."""
+        with self._readers.snapshot() as c:
+            return work(c)
 
     def rollback(self, layer: str, tile: TileId, version: int) -> StoredTile:
         """See `Store.rollback`."""
@@ -279,3 +290,8 @@ class SqliteStore:
             raise StoreError(f"{path}: exists; a backup never overwrites")
         with self._readers.connection() as c:
             c.execute("VACUUM INTO ?", (str(path),))
+
+
+def _content(tile: AnyTile, layer: str) -> Content:
+    check_fits(tile, layer)
+    return Content.of(tile)

@@ -4,7 +4,7 @@ from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import Protocol
 
-from gnd_map.tile import Tile
+from gnd_map.content import AnyTile
 from gnd_map.tile_id import TileId
 from schemas.tiles import CatalogEntry
 from tile_store.values import (
@@ -88,9 +88,11 @@ class Store(Protocol):
         """
 
     def put_tiles(
-        self, tiles: Iterable[Tile], reason: VersionKind = "base", layer: str = DEFAULT_LAYER
+        self, tiles: Iterable[AnyTile], reason: VersionKind = "base", layer: str = DEFAULT_LAYER
     ) -> list[PublishResult]:
-        """Import tiles, all or none; each starts a new epoch. The same content over an equal epoch is "unchanged"."""
+        """Import tiles, all or none; each starts a new epoch. The same content over an equal epoch is "unchanged".
+        Tiles hold what their layer holds: Gaussians where its name begins with ndt, else features.
+        """
 
     def rollback(self, layer: str, tile: TileId, version: int) -> StoredTile:
         """Publish the next version with the body of `version`; it starts a new epoch: merged reports count no more."""
@@ -122,7 +124,7 @@ class Store(Protocol):
         """The report ids that a version comes from, sorted."""
 
     def voxel_provenance(self, layer: str, tile: TileId, version: int) -> dict[int, tuple[str, ...]]:
-        """The report ids of each changed voxel of a version, where its publication gave them."""
+        """The report ids of each changed voxel (of a feature layer: by feature id), where its publication gave them."""
 
     def counts(self) -> StoreCounts:
         """How much the store holds."""

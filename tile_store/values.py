@@ -4,12 +4,14 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Final, Literal
 
-from gnd_map.codec import LATTICES, Lattice, best_codec, codec_of
+from gnd_map.codec import LATTICES, Lattice
+from gnd_map.content import AnyTile, encode_content, fits_layer, noun_of
+from gnd_map.features import FeatureTile
 from gnd_map.tile import Tile
 from gnd_map.tile_id import TileId
 from schemas.limits import MAX_TILE_BODY_BYTES
 from schemas.report_id import check_report_id
-from schemas.tiles import TileBlob, tile_of
+from schemas.tiles import TileBlob, content_of, features_of, tile_of
 from schemas.wire import LAYER_PATTERN
 from tile_store.errors import StoreError
 
@@ -31,6 +33,15 @@ def check_layer(layer: str) -> str:
     return layer
 
 
+def check_fits(tile: AnyTile, layer: str) -> None:
+    """StoreError unless the tile holds what the layer holds: Gaussians if its name begins with ndt, else features."""
+    if not fits_layer(tile, layer):
+        raise StoreError(
+            f"tile {tile.tile_id.path} holds {noun_of(tile)}, layer {layer!r} does not: layers whose names begin with"
+            " ndt hold Gaussians, all others features"
+        )
+
+
 def lattice_named(codec: str) -> Lattice | None:
     """The lattice that a name of `MAP_CODECS` means, None for floats; StoreError for any other name."""
     if codec not in MAP_CODECS:
@@ -47,12 +58,11 @@ class Content:
     body: bytes = field(repr=False)
 
     @classmethod
-    def of(cls, tile: Tile) -> "Content":
+    def of(cls, tile: AnyTile) -> "Content":
         """The content of a tile in the best codec that can express it: what lies on a lattice in that lattice's, other
-        floats as they are. StoreError when it is larger than any message may be.
+        floats as they are, features in theirs. StoreError when it is larger than any message may be.
         """
-        codec_id = best_codec(tile.gaussians)
-        body = codec_of(codec_id).encode(tile.tile_id, tile.gaussians)
+        codec_id, body = encode_content(tile)
         if len(body) > MAX_TILE_BODY_BYTES:
             raise StoreError(f"tile {tile.tile_id.path} has {len(body)} bytes, a message holds {MAX_TILE_BODY_BYTES}")
         return cls(tile.sha, codec_id, body)
@@ -124,9 +134,17 @@ class StoredTile:
         """What goes out on the bus."""
         return TileBlob(self.tile, self.version, self.sha, self.codec_id, self.body)
 
-    def decode(self) -> Tile:
+    def decode(self) -> AnyTile:
         """The tile itself; WrongHash when the bytes are not what the hash says."""
+        return content_of(self.to_blob())
+
+    def decode_gaussians(self) -> Tile:
+        """As `decode`, of a layer of Gaussians; BadValue when it holds features."""
         return tile_of(self.to_blob())
+
+    def decode_features(self) -> FeatureTile:
+        """As `decode`, of a feature layer; BadValue when it holds Gaussians."""
+        return features_of(self.to_blob())
 
 
 @dataclass(frozen=True, slots=True)
@@ -178,13 +196,14 @@ class TileWork:
 class Publication:
     """A merge's result: the new content, or None when nothing visible has changed.
 
-    `report_ids` are the reports that it comes from. `voxel_reports` names them for each changed voxel, when known.
+    `report_ids` are the reports that it comes from. `voxel_reports` names them for each changed voxel, or by the id of
+    each changed feature, when known.
     The store numbers versions itself: it publishes `base_version + 1`, whatever `tile.version` says.
     """
 
     claim: Claim
     base_version: int
-    tile: Tile | None
+    tile: AnyTile | None
     reason: VersionKind = "merged"
     report_ids: tuple[str, ...] = ()
     voxel_reports: Mapping[int, tuple[str, ...]] = field(default_factory=dict)
@@ -192,6 +211,8 @@ class Publication:
     def __post_init__(self) -> None:
         if self.tile is not None and self.tile.tile_id != self.claim.tile:
             raise StoreError(f"publication of {self.tile.tile_id.path} under a claim of {self.claim.tile.path}")
+        if self.tile is not None:
+            check_fits(self.tile, self.claim.layer)
         if self.base_version < 0:
             raise StoreError(f"base_version {self.base_version} is negative")
 

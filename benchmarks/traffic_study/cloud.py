@@ -97,4 +97,4 @@ class Cloud:
         for entry in self.store.heads(DEFAULT_LAYER):
             stored = self.store.get(DEFAULT_LAYER, entry.tile)
             if stored is not None:
-                yield stored.decode()
+                yield stored.decode_gaussians()

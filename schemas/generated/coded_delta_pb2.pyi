@@ -33,7 +33,9 @@ class CodedDelta(_message.Message):
     sha: _builtins.bytes
     """SHA-256 of the content that comes out. [32 bytes]"""
     body: _builtins.bytes
-    """The changes against the content that the client said it holds; coded by gnd_map.codec.encode_delta."""
+    """The changes against the content that the client said it holds: of Gaussians coded by gnd_map.codec.encode_delta, of
+    a feature layer by gnd_map.features.encode_feature_delta.
+    """
     def __init__(
         self,
         *,

@@ -32,12 +32,14 @@ class TileBlob(_message.Message):
     version: _builtins.int
     """Version of the tile. [count of publications, from 1]"""
     sha: _builtins.bytes
-    """SHA-256 over tile id and canonical columns (codec 0), whatever codec carries the body. [32 bytes]"""
+    """SHA-256 over tile id and canonical columns (codec 0; of features codec 32), whatever codec carries the body.
+    [32 bytes]
+    """
     codec_id: _builtins.int
-    """How the body is encoded; 0 = float32 columns."""
+    """How the body is encoded; 0 = float32 columns of Gaussians, 32 = features."""
     body: _builtins.bytes
-    """The Gaussians of the tile, ascending voxel id; metres in the ENU frame at the tile's centre, means relative to
-    the voxel's centre.
+    """The Gaussians of the tile, ascending voxel id, means relative to the voxel's centre; or its features, ascending id.
+    Metres in the ENU frame at the tile's centre.
     """
     def __init__(
         self,

@@ -64,7 +64,7 @@ class TileUpdate(_message.Message):
     tile: _builtins.int
     """Morton code of the tile: longitude index on the even bits, latitude index on the odd bits. [0 .. 2^39)"""
     layer: _builtins.str
-    """Layer of the map; "ndt" = Gaussian voxels."""
+    """Layer of the map; "ndt" and names that begin so = Gaussian voxels, any other = features."""
     version: _builtins.int
     """The new version. [count of publications, from 1]"""
     previous_version: _builtins.int
@@ -75,11 +75,13 @@ class TileUpdate(_message.Message):
     """SHA-256 of the content before it; empty = the tile is new. [32 bytes]"""
     reason: Global___TileUpdate.Reason.ValueType
     coded_delta: _builtins.bytes
-    """The same, coded by gnd_map.codec.encode_delta; with neither, fetch the tile."""
+    """The same, coded: of Gaussians by gnd_map.codec.encode_delta, of a feature layer by
+    gnd_map.features.encode_feature_delta; with neither, fetch the tile.
+    """
     put_voxels: _builtins.int
-    """Voxels that `coded_delta` gives a Gaussian or another one. [voxels]"""
+    """Voxels that `coded_delta` gives a Gaussian or another one; features that come or change. [voxels or features]"""
     removed_voxels: _builtins.int
-    """Voxels that lose theirs by `coded_delta`. [voxels]"""
+    """Voxels that lose theirs by `coded_delta`; features that go. [voxels or features]"""
     @_builtins.property
     def delta(self) -> _tile_delta_pb2.TileDelta:
         """What turns the previous content into the new one, in plain columns; missing = see `coded_delta`."""

@@ -86,7 +86,9 @@ class TilesReply(_message.Message):
 
     @_builtins.property
     def bodies(self) -> _containers.RepeatedScalarFieldContainer[_builtins.bytes]:
-        """Body of each blob (in its codec) and delta (gnd_map.codec.encode_delta), in order."""
+        """Body of each blob (in its codec) and delta (of Gaussians
+        gnd_map.codec.encode_delta, of a feature layer gnd_map.features.encode_feature_delta), in order.
+        """
 
     def __init__(
         self,

@@ -208,9 +208,9 @@ def test_a_publication_must_be_of_the_claimed_tile(store: Store) -> None:
 
 def test_layers_are_apart(store: Store) -> None:
     store.put_tiles([tile_of_voxels(TILE, 1)])
-    store.put_reports([report(1, layer="signs")])
+    store.put_reports([report(1, layer="ndt_summer")])
     claim = only_claim(store)
-    assert (claim.layer, store.load(claim).base_version) == ("signs", 0)
+    assert (claim.layer, store.load(claim).base_version) == ("ndt_summer", 0)
     store.publish([publication(store.load(claim), 3)])
-    assert store.layers() == ["ndt", "signs"]
-    assert [entry.version for entry in store.heads("signs")] == [1]
+    assert store.layers() == ["ndt", "ndt_summer"]
+    assert [entry.version for entry in store.heads("ndt_summer")] == [1]

@@ -294,7 +294,7 @@ def test_equal_questions_are_worked_out_once(store: SqliteStore, monkeypatch: py
     answers = Answers(store)
     requests = [TilesRequest.of(held(old)), TilesRequest.of(held(TILE), codecs=(CODEC_FLOAT32,))]
     first = [asked(answers, request) for request in requests]
-    monkeypatch.setattr("tile_store.answers.encode_delta", lambda *_: pytest.fail("worked out again"))
+    monkeypatch.setattr("tile_store.answers.encode_content_delta", lambda *_: pytest.fail("worked out again"))
     monkeypatch.setattr(StoredTile, "decode", lambda *_: pytest.fail("decoded again"))
     assert [asked(answers, request) for request in requests] == first
 

@@ -46,7 +46,7 @@ def client(endpoint: str) -> Iterator[Bus]:
 def store(tmp_path: Path) -> Iterator[SqliteStore]:
     with SqliteStore(tmp_path / "store.db", EAGER) as opened:
         opened.put_tiles([tile_of_voxels(tile, 1, 2) for tile in (TILE, EAST, FAR)])
-        opened.put_tiles([tile_of_voxels(TILE, 8)], layer="signs")
+        opened.put_tiles([tile_of_voxels(TILE, 8)], layer="ndt_summer")
         yield opened
 
 
@@ -95,7 +95,7 @@ def test_who_has_the_content_hears_that_it_is_unchanged(client: Bus, store: Sqli
 @pytest.mark.usefixtures("server")
 def test_a_tile_that_the_map_lacks_is_absent(client: Bus) -> None:
     assert ask(client, TILE.neighbours()[0]) == TileReply("absent")
-    assert ask(client, EAST, layer="signs") == TileReply("absent")
+    assert ask(client, EAST, layer="ndt_summer") == TileReply("absent")
 
 
 @pytest.mark.usefixtures("server")
@@ -111,7 +111,7 @@ def test_a_region_is_answered_with_one_reply_a_tile_and_nothing_outside_it(clien
     assert asked(keys.tiles_key("ndt", "13033/03022")) == {}
     assert asked(keys.tiles_key("nothing")) == {}
     assert asked(keys.tile_key("ndt", TILE).replace("/ndt/", "/*/")) == {
-        keys.tile_key(layer, TILE): "blob" for layer in ("ndt", "signs")
+        keys.tile_key(layer, TILE): "blob" for layer in ("ndt", "ndt_summer")
     }
     request = TileRequest(1, tile_of_voxels(TILE, 1, 2).sha)
     assert asked(keys.tiles_key("ndt", "13033"), request) == here | {keys.tile_key("ndt", TILE): "unchanged"}
@@ -160,7 +160,7 @@ def test_catalogs_of_one_district_and_of_many(client: Bus, store: SqliteStore) -
     here = catalog(keys.catalog_key("ndt", TILE.district))
     assert [(entry.tile, entry.version) for entry in here.entries] == [(TILE, 1), (EAST, 2)]
     assert [entry.sha for entry in here.entries] == [tile_of_voxels(TILE, 1, 2).sha, tile_of_voxels(EAST, 3).sha]
-    assert catalog(keys.catalog_key("signs", FAR.district)).entries == ()
+    assert catalog(keys.catalog_key("ndt_summer", FAR.district)).entries == ()
     many = dict(client.request_many(keys.catalog_keys("ndt"), b"", kind="catalog", timeout_s=20.0))
     assert set(many) == {keys.catalog_key("ndt", tile.district) for tile in (TILE, FAR)}
     assert Catalog.decode(many[keys.catalog_key("ndt", TILE.district)]) == here

@@ -76,11 +76,11 @@ def test_build_makes_a_store_from_drives(tmp_path: Path) -> None:
     assert sum(told["codecs"].values()) == told["tiles"]
     again = as_json("build", drive, "-o", at)
     assert again["versions_published"] == 0
-    assert "gaussians" in gnd_map("build", drive, "-o", at, "--layer", "other")
-    plain = as_json("build", drive, "-o", at, "--layer", "other", "--codec", "float")
+    assert "gaussians" in gnd_map("build", drive, "-o", at, "--layer", "ndt_other")
+    plain = as_json("build", drive, "-o", at, "--layer", "ndt_other", "--codec", "float")
     assert plain["versions_published"] == plain["tiles"]
-    measured = as_json("info", at, "--layer", "other")
-    assert (measured["layers"], measured["points"]) == (["ndt", "other"], 9000)
+    measured = as_json("info", at, "--layer", "ndt_other")
+    assert (measured["layers"], measured["points"]) == (["ndt", "ndt_other"], 9000)
     assert measured["bytes_a_voxel"] > told["bytes_a_voxel"]
     assert "bytes a Gaussian" in gnd_map("info", at)
     wrong = CliRunner().invoke(map_group, ["build", str(drive), "-o", str(at), "--codec", "zip"])

@@ -37,7 +37,7 @@ class StoreMap:
     def tile(self, tile_id: TileId) -> Tile | None:
         """The tile with its hash checked; None where there is (or was) none. `StoreError`, `SchemaError`."""
         stored = self.store.get(self.layer, tile_id, at_ns=self.at_ns)
-        return None if stored is None else stored.decode()
+        return None if stored is None else stored.decode_gaussians()
 
     def check_covers(self, lat_rad: F64, lon_rad: F64, half_width_m: float) -> None:
         """Refuse a map that has nothing within `half_width_m` of the line through the positions (N,).
