@@ -13,11 +13,10 @@ from benchmarks.feature_study.averages import distances_plain
 from benchmarks.feature_study.honesty import Honesty
 from benchmarks.feature_study.matching import RADIUS_M, Matching, match_one_to_one
 from benchmarks.slamcu_study.reference import PREDICTED, TRUE_CLASSES
-from benchmarks.slamcu_study.verdicts import DELETED, NEW, NORMAL, SignTruth
+from benchmarks.slamcu_study.verdicts import DELETED, NEW, NORMAL, U8, SignTruth
 from gnd_map.arrays import F64, I64
 
 UNCLASSIFIED = PREDICTED.index("unclassified")
-_OF_STATE = np.array([PREDICTED.index("normal"), PREDICTED.index("deleted"), UNCLASSIFIED])
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -59,7 +58,7 @@ class SignScore:
 
 def score(
     truth: SignTruth,
-    known: tuple[I64, F64],
+    known: tuple[I64, U8],
     new: tuple[F64, F64],
     radius_m: float = RADIUS_M,
 ) -> SignScore:
@@ -67,7 +66,8 @@ def score(
 
     Args:
         truth: all signs of the route.
-        known: feature ids (K,) and masses (K, 4) of the signs of the map that was driven with.
+        known: feature ids (K,) of the signs of the map that was driven with, and their classes (K,), indices of
+            `PREDICTED`.
         new: positions (J, 2) [m] and covariances (J, 2, 2) [m^2] of those new features that are said to exist.
         radius_m: the farthest an estimate may lie from its sign.
     """
@@ -93,10 +93,10 @@ def _placed(
     return SignScore(confusion, sign, error_m, matching.estimate, honesty, matching.false, near)
 
 
-def _predicted(feature_ids: I64, known_id: I64, masses: F64) -> I64:
+def _predicted(feature_ids: I64, known_id: I64, predicted: U8) -> I64:
     """(N,) what the drive says of signs of the map; unclassified what it does not mention."""
-    state = {int(one): int(_OF_STATE[row[:3].argmax()]) for one, row in zip(known_id, masses, strict=True)}
-    return np.array([state.get(int(one), UNCLASSIFIED) for one in feature_ids], np.int64)
+    said = dict(zip(known_id.tolist(), predicted.tolist(), strict=True))
+    return np.array([said.get(one, UNCLASSIFIED) for one in feature_ids.tolist()], np.int64)
 
 
 def _near(xy_m: F64, others_m: F64, radius_m: float) -> int:

@@ -11,8 +11,8 @@ from benchmarks.feature_study.targets import judged
 from benchmarks.slamcu_study import reference
 from benchmarks.slamcu_study.outcome import MergedSigns, SeedOutcome, StudyOutcome
 from benchmarks.slamcu_study.scores import SignScore, accuracy_of, score
-from benchmarks.slamcu_study.verdicts import ABSENT, EXIST, NEW, SignTruth, Verdicts
-from gnd_map.arrays import F64, I64
+from benchmarks.slamcu_study.verdicts import DELETED, NEW, NORMAL, SignTruth, Verdicts
+from gnd_map.arrays import F64
 from gnd_map.config import to_mapping
 
 
@@ -85,20 +85,14 @@ def scored_new(found: Verdicts) -> tuple[F64, F64]:
 
 def scored_drive(found: Verdicts, truth: SignTruth) -> SignScore:
     """Return how well a drive tells the signs."""
-    return score(truth, (found.known_id, found.known_masses), scored_new(found))
+    return score(truth, (found.known_id, found.known_predicted), scored_new(found))
 
 
 def merged_score(merged: MergedSigns, truth: SignTruth) -> SignScore:
     """Return how well a published layer tells the signs: what it holds exists, what it no longer holds is deleted."""
     ids = truth.feature_id[truth.true_class != NEW]
-    return score(truth, (ids, _published(ids, merged.known_id)), (merged.new_xy_m, merged.new_cov_m2))
-
-
-def _published(ids: I64, published: I64) -> F64:
-    masses = np.zeros((len(ids), 4))
-    there = np.isin(ids, published)
-    masses[there, EXIST] = masses[~there, ABSENT] = 1.0
-    return masses
+    said = np.where(np.isin(ids, merged.known_id), NORMAL, DELETED).astype(np.uint8)
+    return score(truth, (ids, said), (merged.new_xy_m, merged.new_cov_m2))
 
 
 def parts_of_errors(scored: SignScore, found: Verdicts) -> dict[str, Any]:
@@ -124,7 +118,7 @@ def _pose_rmse(found: Verdicts) -> dict[str, float]:
 
 def _conflict(found: Verdicts) -> dict[str, float]:
     """How much was thrown away by Dempster's normalisation, over the signs of the map and the new features."""
-    conflict = np.concatenate([found.known_masses[:, 3], found.new_masses[:, 3]])
+    conflict = np.concatenate([found.known_conflict, found.new_conflict])
     if not len(conflict):
         return {}
     return {

@@ -14,7 +14,7 @@ from gnd_map.arrays import F64, I64
 U8 = NDArray[np.uint8]
 NORMAL, DELETED, NEW = range(3)
 EXIST, ABSENT, UNKNOWN = range(3)
-"""Columns of masses; the largest is the state (section 4.3.3 of the paper)."""
+"""Columns of masses."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -42,10 +42,12 @@ class Verdicts:
 
     Attributes:
         known_id: int64 (K,).
-        known_masses: float64 (K, 4), exist, absent, unknown, conflict.
+        known_predicted: uint8 (K,), index of `PREDICTED`.
+        known_conflict: float64 (K,), share of the masses that Dempster's normalisation threw away.
         new_xy_m: float64 (J, 2), map frame.
         new_cov_m2: float64 (J, 2, 2).
-        new_masses: float64 (J, 4).
+        new_exists: bool (J,), whether the drive says that the feature is there; else it has too little evidence.
+        new_conflict: float64 (J,).
         step_ms: float64 (S,), time of each step.
         pose_error: float64 (S, 3), along and across the true heading [m], heading [rad].
         pose_part_m: float64 (N, 2), what the error of the pose moved each sign by, mean over the looks at it [m]; nan
@@ -54,28 +56,25 @@ class Verdicts:
         no_evidence: looks at signs of the map that were left out as hidden.
         trace_sign: int64 (Q,), index of the true sign whose masses are told; only of deleted and new signs.
         trace_s: float64 (Q,), seconds since the drive began.
-        trace_masses: float64 (Q, 4).
+        trace_masses: float64 (Q, 3), exist, absent, unknown.
     """
 
     known_id: I64
-    known_masses: F64
+    known_predicted: U8
+    known_conflict: F64
     new_xy_m: F64
     new_cov_m2: F64
-    new_masses: F64
+    new_exists: NDArray[np.bool_]
+    new_conflict: F64
     step_ms: F64
     pose_error: F64
     pose_part_m: F64
     visible: I64
     occluded: I64
-    no_evidence: I64
+    no_evidence: int
     trace_sign: I64
     trace_s: F64
     trace_masses: F64
-
-    @property
-    def new_exists(self) -> NDArray[np.bool_]:
-        """(J,) which new features exist, as the drive says."""
-        return np.asarray(self.new_masses[:, :3].argmax(axis=1) == EXIST)
 
 
 _COLUMNS: Final = tuple(field.name for field in fields(Verdicts))
@@ -85,7 +84,7 @@ def write_verdicts(found: Verdicts, truth: SignTruth, kept: Kept) -> None:
     """Write a drive's verdicts with the truth; the file appears complete or not at all."""
     arrays: dict[str, Any] = {name: getattr(found, name) for name in _COLUMNS}
     arrays |= {f"true_{field.name}": getattr(truth, field.name) for field in fields(SignTruth)}
-    write_arrays(kept, {"classes": list(TRUE_CLASSES)}, arrays)
+    write_arrays(kept, {"classes": list(TRUE_CLASSES)}, {name: np.asarray(value) for name, value in arrays.items()})
 
 
 def read_verdicts(kept: Kept) -> tuple[Verdicts, SignTruth]:

@@ -10,7 +10,7 @@ from benchmarks.simulation.errors import FolderError
 from benchmarks.slamcu_study.figures import most_telling, outliers
 from benchmarks.slamcu_study.outcome import MergedSigns
 from benchmarks.slamcu_study.reference import PAPER_ACCURACY, PAPER_CONFUSION
-from benchmarks.slamcu_study.scores import accuracy_of, score
+from benchmarks.slamcu_study.scores import UNCLASSIFIED, accuracy_of, score
 from benchmarks.slamcu_study.summary import drive_summary, merged_score, parts_of_errors, scored_drive
 from benchmarks.slamcu_study.verdicts import (
     ABSENT,
@@ -29,7 +29,7 @@ TRUTH = SignTruth(
     np.array([[0, 0], [10, 0], [20, 0], [30, 0], [40, 0], [41, 0], [90, 0]], np.float64),
     np.array([NORMAL, NORMAL, DELETED, DELETED, NEW, NEW, NEW], np.uint8),
 )
-EXISTS, GONE, OPEN = [0.9, 0.05, 0.05, 0.1], [0.0, 0.99, 0.01, 0.9], [0.2, 0.2, 0.6, 0.0]
+EXISTS, GONE = [0.9, 0.05, 0.05], [0.0, 0.99, 0.01]
 STEPS = np.tile([1.0, -0.5, 0.01], (3, 1))
 
 
@@ -37,19 +37,21 @@ def verdicts(**changes: object) -> Verdicts:
     """Sign 1 right, 2 called deleted, 3 deleted, 4 never decided; two of three new ones, one false."""
     columns: dict[str, object] = {
         "known_id": np.array([1, 2, 3, 4]),
-        "known_masses": np.array([EXISTS, GONE, GONE, OPEN]),
+        "known_predicted": np.array([NORMAL, DELETED, DELETED, UNCLASSIFIED], np.uint8),
+        "known_conflict": np.array([0.1, 0.9, 0.9, 0.0]),
         "new_xy_m": np.array([[40.3, 0.4], [41.0, 0.1], [10.5, 0.0], [90.0, 1.0]]),
         "new_cov_m2": np.broadcast_to(0.04 * np.eye(2), (4, 2, 2)),
-        "new_masses": np.array([EXISTS, EXISTS, EXISTS, OPEN]),
+        "new_exists": np.array([True, True, True, False]),
+        "new_conflict": np.zeros(4),
         "step_ms": np.array([1.0, 2.0, 9.0]),
         "pose_error": STEPS,
         "pose_part_m": np.vstack([np.full((4, 2), np.nan), [[0.3, 0.0], [0.0, 0.0], [np.nan, np.nan]]]),
         "visible": np.array([9, 9, 9, 0, 9, 9, 0]),
         "occluded": np.array([1, 0, 0, 4, 0, 0, 2]),
-        "no_evidence": np.int64(5),
+        "no_evidence": 5,
         "trace_sign": np.array([2, 2, 2, 2, 4, 4]),
         "trace_s": np.arange(6.0),
-        "trace_masses": np.array([[.95, 0, .05, 0], [.6, .37, .03, 0], [.9, .08, .02, .1], GONE, [0, 0, 1, 0], EXISTS]),
+        "trace_masses": np.array([[.95, 0, .05], [.6, .37, .03], [.9, .08, .02], GONE, [0, 0, 1], EXISTS]),
     }  # fmt: skip
     return Verdicts(**{**columns, **changes})  # type: ignore[arg-type]
 
@@ -68,7 +70,7 @@ def test_every_sign_of_the_route_is_in_the_table() -> None:
 
 
 def test_a_new_feature_that_does_not_exist_is_not_found() -> None:
-    summary = drive_summary(verdicts(new_masses=np.array([OPEN] * 4)), TRUTH)
+    summary = drive_summary(verdicts(new_exists=np.zeros(4, np.bool_)), TRUTH)
     assert summary["confusion"][NEW] == [0, 0, 0, 3]
     assert summary["position_error_m"]["missed"] == 3
     assert summary["position_error_m"]["mean"] is None
@@ -76,7 +78,7 @@ def test_a_new_feature_that_does_not_exist_is_not_found() -> None:
 
 
 def test_signs_that_the_drive_does_not_mention_are_unclassified() -> None:
-    silent = verdicts(known_id=np.zeros(0, np.int64), known_masses=np.zeros((0, 4)))
+    silent = verdicts(known_id=np.zeros(0, np.int64), known_predicted=np.zeros(0, np.uint8))
     assert scored_drive(silent, TRUTH).confusion[:2].tolist() == [[0, 0, 0, 2], [0, 0, 0, 2]]
 
 
@@ -115,7 +117,7 @@ def test_a_merged_layer_says_deleted_by_holding_a_sign_no_more() -> None:
 
 def test_a_wider_radius_finds_what_a_narrow_one_misses() -> None:
     new = (np.array([[93.0, 0.0]]), np.eye(2)[None])
-    known = (np.zeros(0, np.int64), np.zeros((0, 4)))
+    known = (np.zeros(0, np.int64), np.zeros(0, np.uint8))
     assert score(TRUTH, known, new, 2.0).missed == 3
     assert score(TRUTH, known, new, 4.0).missed == 2
 
