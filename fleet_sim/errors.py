@@ -29,3 +29,7 @@ class TruthError(SimError):
 
 class EvaluationError(SimError):
     """A prediction cannot be compared with the truth."""
+
+
+class RoadError(SimError):
+    """A road or a drive along it cannot be made as asked."""

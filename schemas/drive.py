@@ -13,6 +13,7 @@ import numpy as np
 import numpy.typing as npt
 
 from gnd_map.arrays import F32, F64, I64, check_array
+from gnd_map.features.feature import KIND_PATTERN
 from gnd_map.geodesy import LocalFrame, check_geodetic
 from schemas import limits
 from schemas.errors import BadValue
@@ -20,7 +21,6 @@ from schemas.wire import (
     LAYER_PATTERN,
     PRINTABLE_PATTERN,
     VEHICLE_PATTERN,
-    WORD_PATTERN,
     check_length,
     check_text,
     check_unsigned,
@@ -173,7 +173,7 @@ class Detections:
     layer: str
     """Feature layer that the detector looks for, such as "signs". [1-32 of a-z 0-9 _]"""
     kinds: tuple[str, ...]
-    """N kinds, such as "traffic_sign". [1-32 of a-z _]"""
+    """N kinds, such as "traffic_sign". [1-64 of a-z 0-9 _]"""
     range_m: F32
     """(N,) horizontal distance from the vehicle's origin, >= 0."""
     bearing_rad: F32
@@ -192,7 +192,7 @@ class Detections:
         check_text("layer", self.layer, LAYER_PATTERN)
         check_length(f"look at {self.t_ns} ns", len(self.kinds), limits.MAX_DETECTIONS_OF_LOOK, "detections")
         for kind in set(self.kinds):
-            check_text("kind", kind, WORD_PATTERN)
+            check_text("kind", kind, KIND_PATTERN)
         with refusing(f"look at {self.t_ns} ns"):
             self._check_columns()
 

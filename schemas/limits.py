@@ -73,7 +73,7 @@ MAX_CHUNK_BYTES: Final = 256 * MIB
 MAX_POINTS_OF_SCAN: Final = 4_000_000
 
 # Bytes of one look, which are checked first; lane markings of a look and their points.
-MAX_DETECTIONS_BYTES: Final = 64 * KIB
+MAX_DETECTIONS_BYTES: Final = 128 * KIB
 MAX_POLYLINES_OF_LOOK: Final = 64
 MAX_POINTS_OF_LANE_LOOK: Final = 16_384
 MAX_LANE_LOOK_BYTES: Final = 256 * KIB

@@ -46,7 +46,7 @@ class Detections(_message.Message):
 
     @_builtins.property
     def kinds(self) -> _containers.RepeatedScalarFieldContainer[_builtins.str]:
-        """What each is. [1-32 of a-z _]"""
+        """What each is. [1-64 of a-z 0-9 _]"""
 
     @_builtins.property
     def range_m(self) -> _containers.RepeatedScalarFieldContainer[_builtins.float]:
