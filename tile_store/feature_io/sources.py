@@ -42,7 +42,8 @@ class Source:
 
 def put_source(c: apsw.Connection, source: Source, now_ns: int) -> None:
     """Keep a source in place of one of the same name; inside the caller's transaction."""
-    about = {"format": source.format, "options": dict(source.options), "ids": {k: list(v) for k, v in source.ids.items()}}
+    ids = {layer: list(numbers) for layer, numbers in source.ids.items()}
+    about = {"format": source.format, "options": dict(source.options), "ids": ids}
     c.execute("CREATE TABLE IF NOT EXISTS " + TABLE)
     body = zstandard.compress(source.document, _LEVEL)
     row = {"name": source.name, "created_ns": now_ns, "about": json.dumps(about), "body": body}

@@ -1,0 +1,284 @@
+"""Features as a Lanelet2 map: into the file that they came from, or as a new one.
+
+The file is edited, not written anew: an element is touched only when its feature has moved, changed its attributes or
+gone, and what is no feature (lanelets, regulatory elements, unknown tags, comments, their order) stays byte by byte.
+"""
+
+from collections import defaultdict
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+
+from gnd_map.arrays import F64
+from gnd_map.geodesy import meridian_radius_m, normal_radius_m
+from tile_store.feature_io.lanelet2_import import Drawn, Places, drawn_features, places_of
+from tile_store.feature_io.osm_document import OsmDocument, OsmNode, OsmWay, read_osm
+from tile_store.feature_io.osm_edit import (
+    Edits,
+    degrees,
+    line_of,
+    metres,
+    node_lines,
+    way_lines,
+    with_nodes,
+    with_values,
+    without_members,
+)
+from tile_store.feature_io.osm_kinds import POINT_KINDS
+from tile_store.feature_io.values import ImportOptions, MapFeature
+
+EMPTY: Final = b"""<?xml version="1.0" encoding="UTF-8"?>
+<osm version="0.6" generator="gnd">
+</osm>
+"""
+KEEP_WITHIN_M: Final = 0.002
+"""Published positions are whole millimetres; a vertex that lies so near is where it was."""
+
+
+@dataclass(frozen=True, slots=True)
+class Changes:
+    """What an export changed in the file: elements."""
+
+    moved: int
+    retagged: int
+    removed: int
+    added: int
+
+
+def write_lanelet2(
+    features: Iterable[MapFeature],
+    document: bytes = EMPTY,
+    source: str = "",
+    options: ImportOptions | None = None,
+    *,
+    keep_within_m: float = KEEP_WITHIN_M,
+) -> tuple[bytes, Changes]:
+    """The file with the features as they are now, and what that changed.
+
+    Args:
+        features: as they are now: of the file's own layers all that are left, and new ones.
+        document: the file that they came from; `EMPTY` for a new one.
+        source: under which name it was imported.
+        options: how it was read.
+        keep_within_m: vertices that have moved less keep the bytes of their position; negative: all are written anew.
+
+    Raises:
+        FeatureFileError: the document cannot be read.
+    """
+    options = options or ImportOptions(trust_latlon=True)
+    read = read_osm(document, source or "new map")
+    drawn = {one.feature.feature_id: one for one in drawn_features(read, source, options)[0]}
+    editing = _Editing(read, places_of(read, options), options, keep_within_m)
+    now = {feature.feature_id: feature for feature in features}
+    for feature_id, one in drawn.items():
+        if feature_id in now:
+            editing.update(one, now[feature_id])
+        else:
+            editing.remove(one)
+    for feature_id in sorted(now.keys() - drawn.keys()):
+        editing.add(now[feature_id])
+    return editing.finish()
+
+
+class _Editing:
+    """Collects what becomes of nodes and ways, then writes it."""
+
+    def __init__(self, document: OsmDocument, places: Places, options: ImportOptions, keep_within_m: float) -> None:
+        self._document, self._places, self._options, self._keep_within_m = document, places, options, keep_within_m
+        self._moved: dict[int, list[F64]] = defaultdict(list)
+        self._tags: dict[tuple[str, int], dict[str, str | None]] = {}
+        self._refs: dict[int, list[int]] = {}
+        self._gone: set[tuple[str, int]] = set()
+        self._new_nodes: list[bytes] = []
+        self._new_ways: list[bytes] = []
+        self._next_id = document.highest_id + 1
+        self._added = 0
+
+    def update(self, drawn: Drawn, feature: MapFeature) -> None:
+        """An element's feature as it is now."""
+        tags = _changed_tags(drawn.feature.attributes, feature.attributes)
+        if tags:
+            self._tags[(_name(drawn.element), drawn.element.id)] = tags
+        new, old = _line(feature), _line(drawn.feature)
+        if drawn.feature.kind in POINT_KINDS:
+            rows = self._places.rows(list(drawn.nodes))
+            own = np.column_stack([self._places.lat_rad, self._places.lon_rad, self._places.height_m])[rows]
+            self._move(drawn.nodes, own + (new.mean(axis=0) - old[0]), own)
+        elif len(new) == len(old):
+            self._move(drawn.nodes, new, old)
+        else:
+            assert isinstance(drawn.element, OsmWay)
+            self._redraw(drawn.element, new, old)
+
+    def _move(self, nodes: tuple[OsmNode, ...], new: F64, old: F64) -> None:
+        for node, place, was in zip(nodes, new, old, strict=True):
+            if _apart_m(place, was) > self._keep_within_m:
+                self._moved[node.id].append(place)
+
+    def _redraw(self, way: OsmWay, new: F64, old: F64) -> None:
+        """A line with other vertices: nodes that are where one was are kept, the others are new."""
+        refs = []
+        for place in new:
+            apart = [_apart_m(place, was) for was in old]
+            nearest = int(np.argmin(apart))
+            refs.append(way.nodes[nearest] if apart[nearest] <= KEEP_WITHIN_M else self._node(place, {}))
+        self._refs[way.id] = refs
+
+    def remove(self, drawn: Drawn) -> None:
+        """An element whose feature is gone; a node that is part of a line only loses its tags."""
+        key = _name(drawn.element), drawn.element.id
+        if key[0] == "node" and any(key[1] in way.nodes for way in self._document.ways.values()):
+            self._tags[key] = {name: None for name, _ in drawn.feature.attributes}
+        else:
+            self._gone.add(key)
+
+    def add(self, feature: MapFeature) -> None:
+        """A feature that the file has not."""
+        tags = {"type": feature.kind} | dict(feature.attributes)
+        self._added += 1
+        if len(feature) == 1:
+            self._node(_line(feature)[0], tags)
+        else:
+            refs = [self._node(place, {}) for place in _line(feature)]
+            tags = {"type": "line_thin"} | dict(feature.attributes) if feature.kind == "lane_boundary" else tags
+            self._new_ways.append(way_lines(self._new_id(), refs, tags))
+
+    def _new_id(self) -> int:
+        self._next_id += 1
+        return self._next_id - 1
+
+    def _node(self, place: F64, tags: Mapping[str, str]) -> int:
+        node_id = self._new_id()
+        lat_deg, lon_deg, told = self._told(place)
+        self._new_nodes.append(node_lines(node_id, lat_deg, lon_deg, told | dict(tags)))
+        return node_id
+
+    def _told(self, place: F64) -> tuple[float, float, dict[str, str]]:
+        """Degrees and tags of a new node."""
+        height_m = place[2] - self._options.height_offset_m
+        if self._options.placement is None:
+            return *np.degrees(place[:2]).tolist(), {"ele": metres(height_m)}
+        local = self._options.placement.local(place[:1], place[1:2], np.array([height_m]))[0]
+        assert self._places.local_m is not None
+        near = int(np.linalg.norm(self._places.local_m[:, :2] - local[:2], axis=1).argmin())
+        node = list(self._document.nodes.values())[near]
+        lat_deg, lon_deg = _shifted(node, local - self._places.local_m[near])
+        return lat_deg, lon_deg, {"local_x": metres(local[0]), "local_y": metres(local[1]), "ele": metres(local[2])}
+
+    def finish(self) -> tuple[bytes, Changes]:
+        """The file's new bytes."""
+        edits, data = Edits(), self._document.data
+        removed = self._write_removed(edits)
+        values = self._values()
+        for (name, id_), (attributes, tags) in values.items():
+            element = self._document.nodes[id_] if name == "node" else self._document.ways[id_]
+            edits.replace(element.start, element.end, self._rewritten(data, element, attributes, tags))
+        if self._new_nodes:
+            edits.replace(self._document.end_of_nodes, self._document.end_of_nodes, b"".join(self._new_nodes))
+        if self._new_ways:
+            edits.replace(self._document.end_of_ways, self._document.end_of_ways, b"".join(self._new_ways))
+        moved = len(self._moved) + len(self._refs)
+        return edits.applied(data), Changes(moved, len(self._tags), removed, self._added)
+
+    def _values(self) -> dict[tuple[str, int], tuple[dict[str, str], dict[str, str | None]]]:
+        """Attributes and tags to write, by element."""
+        values: dict[tuple[str, int], tuple[dict[str, str], dict[str, str | None]]] = {}
+        for node_id, places in self._moved.items():
+            values["node", node_id] = self._position(self._document.nodes[node_id], np.mean(places, axis=0))
+        for key, tags in self._tags.items():
+            attributes, others = values.get(key, ({}, {}))
+            values[key] = (attributes, others | tags)
+        for way_id in self._refs:
+            values.setdefault(("way", way_id), ({}, {}))
+        return values
+
+    def _rewritten(
+        self, data: bytes, element: OsmNode | OsmWay, attributes: dict[str, str], tags: dict[str, str | None]
+    ) -> bytes:
+        refs = self._refs.get(element.id) if isinstance(element, OsmWay) else None
+        if refs is None:
+            return with_values(data, element, attributes, tags)
+        raw = with_nodes(data, element, refs)
+        return with_values(raw, OsmWay(element.id, 0, len(raw), element.line, element.tags, ()), attributes, tags)
+
+    def _position(self, node: OsmNode, place: F64) -> tuple[dict[str, str], dict[str, str | None]]:
+        """Attributes and tags of a node that has moved."""
+        height_m = place[2] - self._options.height_offset_m
+        placement = self._options.placement
+        if placement is None:
+            lat_deg, lon_deg = np.degrees(place[:2]).tolist()
+            tell = "ele" in node.tags or abs(height_m) > KEEP_WITHIN_M
+            return {"lat": degrees(lat_deg), "lon": degrees(lon_deg)}, {"ele": metres(height_m)} if tell else {}
+        assert self._places.local_m is not None
+        was = self._places.local_m[self._places.index[node.id]]
+        which = placement.nearest(was[None])
+        local = placement.local(place[:1], place[1:2], np.array([height_m]), which)[0]
+        lat_deg, lon_deg = _shifted(node, local - was)
+        tags: dict[str, str | None] = {"local_x": metres(local[0]), "local_y": metres(local[1])}
+        if "ele" in node.tags:
+            tags["ele"] = metres(local[2])
+        return {"lat": degrees(lat_deg), "lon": degrees(lon_deg)}, tags
+
+    def _write_removed(self, edits: Edits) -> int:
+        """Take elements out, with lanelets that lose a border and every mention of either."""
+        gone, document = self._gone, self._document
+        grown = True
+        while grown:
+            orphans = {
+                ("relation", one.id)
+                for one in document.relations.values()
+                if one.tags.get("type") == "lanelet"
+                and any((type_, ref) in gone and role in ("left", "right") for type_, ref, role in one.members)
+            }
+            grown = not orphans <= gone
+            gone |= orphans
+        gone |= self._orphaned_nodes(gone)
+        for name, table in (("node", document.nodes), ("way", document.ways), ("relation", document.relations)):
+            for id_ in (id_ for what, id_ in gone if what == name):
+                edits.replace(*line_of(document.data, table[id_]), b"")
+        for relation in document.relations.values():
+            if ("relation", relation.id) not in gone and any((t, ref) in gone for t, ref, _ in relation.members):
+                edits.replace(relation.start, relation.end, without_members(document.data, relation, gone))
+        return len(gone)
+
+    def _orphaned_nodes(self, gone: set[tuple[str, int]]) -> set[tuple[str, int]]:
+        """Nodes that only ways used which are gone."""
+        ways = self._document.ways.values()
+        used = {ref for way in ways if ("way", way.id) not in gone for ref in self._refs.get(way.id, way.nodes)}
+        mentioned = {ref for one in self._document.relations.values() for t, ref, _ in one.members if t == "node"}
+        left = {ref for way in ways if ("way", way.id) in gone or way.id in self._refs for ref in way.nodes}
+        orphans = left - used - mentioned
+        for node_id in orphans:
+            self._moved.pop(node_id, None)
+        return {("node", ref) for ref in orphans}
+
+
+def _name(element: OsmNode | OsmWay) -> str:
+    return "way" if isinstance(element, OsmWay) else "node"
+
+
+def _line(feature: MapFeature) -> F64:
+    """(N, 3) latitude, longitude, height."""
+    return np.column_stack([feature.lat_rad, feature.lon_rad, feature.height_m])
+
+
+def _apart_m(a: F64, b: F64) -> float:
+    """Distance of two near positions."""
+    lat = float(a[0])
+    north, east = meridian_radius_m(lat) * (a[0] - b[0]), normal_radius_m(lat) * np.cos(lat) * (a[1] - b[1])
+    return float(np.sqrt(north**2 + east**2 + (a[2] - b[2]) ** 2))
+
+
+def _shifted(node: OsmNode, step_m: F64) -> tuple[float, float]:
+    """A placeholder's degrees, moved as far as its local coordinates are (x east, y north)."""
+    lat = np.radians(node.lat_deg)
+    north, east = step_m[1] / meridian_radius_m(lat), step_m[0] / (normal_radius_m(lat) * np.cos(lat))
+    return node.lat_deg + float(np.degrees(north)), node.lon_deg + float(np.degrees(east))
+
+
+def _changed_tags(old: tuple[tuple[str, str], ...], new: tuple[tuple[str, str], ...]) -> dict[str, str | None]:
+    before, after = dict(old), dict(new)
+    changed: dict[str, str | None] = {key: value for key, value in after.items() if before.get(key) != value}
+    return changed | {key: None for key in before if key not in after}
