@@ -1,0 +1,119 @@
+"""What stands around a column by height: whether it is free, how high it reaches, and what kind of thing it is."""
+
+from typing import Final, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from gnd_map.arrays import F64, I64
+from vehicle_agent.features.pole_columns import Columns
+from vehicle_agent.features.pole_parameters import PoleParameters
+from vehicle_agent.features.pole_place_kernels import around, by_cell
+from vehicle_agent.features.pole_slices import GroundHeights
+
+Mask = NDArray[np.bool_]
+
+BIN_M: Final = 0.25
+BINS: Final = 48
+CORE_M, RING_M, RING_END_M, PLATE_M, REACH_M = 0.15, 0.2, 0.65, 0.9, 2.4
+"""Distances beyond the radius: of the core, where the ring begins and ends, how far a plate and an arm reach."""
+CORE, RING, NEAR, FAR = range(4)
+"""Columns of the counts."""
+
+PLATE_THICK_M: Final = 0.1
+PLATE_WIDE_M: Final = 0.12
+"""Standard deviations of a plate's points across and along it: one of 0.4 m has 0.12 m along."""
+PLATE_HIGH_M: Final = 1.8
+PLATE_POINTS: Final = 4
+CROWN_POINTS: Final = 8
+CROWN_THICK_M: Final = 0.2
+ARM_M: Final = 1.2
+"""Arm and head of a streetlight lie within this of its top."""
+
+
+class Surroundings(NamedTuple):
+    """C candidates by height over the ground, B bins of `BIN_M`.
+
+    Attributes:
+        counts: (C, B, 4) points in core, ring, plate's reach, and beyond.
+        sums: (C, B, 5) of the plate's reach about the axis: x, y, xx, xy, yy.
+    """
+
+    counts: I64
+    sums: F64
+
+
+def look_around(columns: Columns, points_m: F64, height_m: F64, ground: GroundHeights) -> Surroundings:
+    """Count what stands around columns, of the points (N, 3) above the ground and their heights (N,)."""
+    axes = np.column_stack([columns.xy_m, columns.height_m, columns.lean, 0.5 * columns.diameter_m])
+    belts = np.array([CORE_M, RING_M, RING_END_M, PLATE_M, REACH_M])
+    cells = by_cell(points_m, ground.cells)
+    return Surroundings(*around(points_m, height_m, *cells, ground.cells, axes, belts, BIN_M, BINS))
+
+
+def ring_share(columns: Columns, seen: Surroundings) -> F64:
+    """(C,) share of the heights of the thin part at which something stands in the ring around it."""
+    core = _within(columns.bottom_m, columns.top_m) & (seen.counts[:, :, CORE] > 0)
+    return np.asarray((core & (seen.counts[:, :, RING] > 0)).sum(axis=1) / np.maximum(core.sum(axis=1), 1))
+
+
+def _within(low_m: F64, high_m: F64) -> Mask:
+    """(C, B) whether a bin lies between two heights (C,), those of its own ends included."""
+    bins = np.arange(BINS)
+    first, last = np.floor(low_m / BIN_M)[:, None], np.floor(high_m / BIN_M)[:, None]
+    return np.asarray((bins >= first) & (bins <= last))
+
+
+def tops(columns: Columns, seen: Surroundings, gap_m: F64) -> F64:
+    """(C,) height over the ground up to which the core goes on without a gap of more than gap_m (C,)."""
+    top = columns.top_m.copy()
+    for b in range(BINS):
+        middle = (b + 0.5) * BIN_M
+        reached = (seen.counts[:, b, CORE] > 0) & (middle > top) & (middle - top <= gap_m)
+        top = np.where(reached, (b + 1.0) * BIN_M, top)
+    return top
+
+
+def kinds_of(columns: Columns, seen: Surroundings, top_m: F64, p: PoleParameters) -> tuple[str, ...]:
+    """The kind of each column: "trunk", "traffic_sign", "streetlight" or "pole".
+
+    Args:
+        columns: C columns.
+        seen: what stands around them.
+        top_m: (C,) how high each reaches.
+        p: parameters.
+    """
+    above = ~_within(np.zeros(len(top_m)), columns.top_m - 0.5 * BIN_M)
+    wide = above & (seen.counts[:, :, NEAR] + seen.counts[:, :, FAR] > seen.counts[:, :, CORE])
+    crown = _is_crown(columns, seen, wide)
+    plate = _is_plate(seen, wide, top_m)
+    tall = top_m >= p.streetlight_m
+    chosen = np.select([crown, tall, plate], ["trunk", "streetlight", "traffic_sign"], "pole")
+    return tuple(chosen.tolist())
+
+
+def _spread(seen: Surroundings, bins: Mask) -> tuple[I64, F64, F64]:
+    """Points in the plate's reach in the bins (C, B), and their standard deviations across and along."""
+    n = (seen.counts[:, :, NEAR] * bins).sum(axis=1)
+    total = (seen.sums * bins[:, :, None]).sum(axis=1) / np.maximum(n, 1)[:, None]
+    xx, xy, yy = (total[:, k] for k in (2, 3, 4))
+    xx, xy, yy = xx - total[:, 0] ** 2, xy - total[:, 0] * total[:, 1], yy - total[:, 1] ** 2
+    middle, half = 0.5 * (xx + yy), np.hypot(0.5 * (xx - yy), xy)
+    return n, np.sqrt(np.maximum(middle - half, 0.0)), np.sqrt(np.maximum(middle + half, 0.0))
+
+
+def _is_crown(columns: Columns, seen: Surroundings, wide: Mask) -> Mask:
+    """Many points above the thin part that lie about the axis on all sides."""
+    n, across, _ = _spread(seen, wide)
+    beyond = (seen.counts[:, :, FAR] * wide).sum(axis=1)
+    return np.asarray((n + beyond >= CROWN_POINTS) & (across >= CROWN_THICK_M) & (n > 0.2 * columns.points))
+
+
+def _is_plate(seen: Surroundings, wide: Mask, top_m: F64) -> Mask:
+    """Points at the top that lie in an upright plane no higher than a sign."""
+    n, across, along = _spread(seen, wide)
+    first = np.argmax(wide, axis=1)
+    high = top_m - first * BIN_M
+    few = (seen.counts[:, :, FAR] * wide).sum(axis=1) <= 0.3 * n
+    flat = (across <= PLATE_THICK_M) & (along >= PLATE_WIDE_M)
+    return np.asarray(wide.any(axis=1) & (n >= PLATE_POINTS) & few & flat & (high <= PLATE_HIGH_M))

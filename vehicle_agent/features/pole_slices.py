@@ -1,0 +1,205 @@
+"""From a scan to slices: what each row of rays sees of thin things that stand free."""
+
+from dataclasses import dataclass
+from math import ceil, radians, tan
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from gnd_map.arrays import F64, I64
+from vehicle_agent.features.pole_parameters import PoleInputError, PoleParameters
+from vehicle_agent.features.pole_place_kernels import Ground, cone_heights, heights_over, lowest_heights
+from vehicle_agent.features.poles_kernels import (
+    Beside,
+    Rows,
+    azimuth_step,
+    layer_gaps,
+    polar_of,
+    row_order,
+    thin_slices,
+)
+
+U8 = NDArray[np.uint8]
+
+TAN_MAX = 0.6
+"""Steeper rays (31°) are in no row."""
+COLUMNS = 360
+LAYER_SHARE = 0.8
+"""Of the distances of layers, the one that is not exceeded in this share of the cases."""
+PIT_M = 0.5
+MAX_SLICES = 20_000
+"""A scan of a street has some hundred; of more, the nearest are kept."""
+MIN_STEP_RAD = radians(0.02)
+
+
+class Slices(NamedTuple):
+    """S slices of thin things, one row of one scan each.
+
+    Attributes:
+        xy_m: (S, 2) middle of the visible front: mean distance, in the direction of its middle.
+        z_m: (S,) mean height.
+        height_m: (S,) over the ground.
+        toward: (S, 2) unit vector from the sensor.
+        range_m: (S,) horizontal distance from the sensor.
+        extent_m: (S,) from the first to the last of its points, across.
+        step_m: (S,) distance of two rays there.
+        points: (S,) number of points.
+        scan: (S,) which scan of a window.
+        hidden: (S,) whether something nearer is beside it.
+    """
+
+    xy_m: F64
+    z_m: F64
+    height_m: F64
+    toward: F64
+    range_m: F64
+    extent_m: F64
+    step_m: F64
+    points: I64
+    scan: I64
+    hidden: I64
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class GroundHeights:
+    """The ground around a vehicle: cells and their heights z_m (n, n)."""
+
+    cells: Ground
+    z_m: F64
+
+    def under(self, points_m: F64) -> F64:
+        """(N,) height of the points (N, 3) over the ground."""
+        return heights_over(points_m, self.z_m, self.cells)
+
+    def at(self, xy_m: F64) -> F64:
+        """(N,) height of the ground at places (N, 2)."""
+        return -self.under(np.column_stack([xy_m, np.zeros(len(xy_m))]))
+
+
+class Seen(NamedTuple):
+    """A scan after its slices are found.
+
+    Attributes:
+        slices: the slices.
+        points_m: (K, 3) everything above the ground within range.
+        height_m: (K,) over the ground.
+        layer_tan: distance of the sensor's layers, as tangent.
+    """
+
+    slices: Slices
+    points_m: F64
+    height_m: F64
+    layer_tan: float
+
+
+def check_rays(points_m: F64, origins_m: F64) -> tuple[F64, F64]:
+    """Points (N, 3) and origins (3,) or (N, 3) as contiguous float64 (N, 3) and (1 or N, 3).
+
+    Raises:
+        PoleInputError: other shapes, or an origin that is not finite.
+    """
+    points, origins = np.ascontiguousarray(points_m, np.float64), np.ascontiguousarray(origins_m, np.float64)
+    if points.ndim != 2 or points.shape[1] != 3:
+        raise PoleInputError(f"points must be (N, 3), got {points.shape}")
+    origins = origins.reshape(1, 3) if origins.shape == (3,) else origins
+    if origins.shape not in ((1, 3), points.shape):
+        raise PoleInputError(f"origins must be (3,) or {points.shape}, got {origins.shape}")
+    if len(origins) == 1 and not np.isfinite(origins).all():
+        raise PoleInputError(f"the origin of the rays is {origins[0].tolist()}, which is not finite")
+    return points, origins
+
+
+def ground_around(points_m: F64, centre_m: F64, p: PoleParameters) -> GroundHeights:
+    """The ground around a place on the road: no higher than what is seen, no steeper than it may be.
+
+    Args:
+        points_m: (N, 3) of one scan, or several.
+        centre_m: (3,) the vehicle's origin: the road lies there.
+        p: parameters.
+    """
+    half = ceil((p.range_max_m + 3.0) / p.ground_cell_m)
+    side = half * p.ground_cell_m
+    cells = Ground(float(centre_m[0]) - side, float(centre_m[1]) - side, p.ground_cell_m, 2 * half)
+    low = lowest_heights(points_m, cells, float(centre_m[2]), p.ground_slope, PIT_M)
+    low[half - 1 : half + 1, half - 1 : half + 1] = centre_m[2]
+    return GroundHeights(cells, cone_heights(low, p.ground_slope * p.ground_cell_m))
+
+
+def slices_of(points_m: F64, origins_m: F64, ground: GroundHeights, p: PoleParameters, number: int = 0) -> Seen:
+    """The slices of one scan.
+
+    Args:
+        points_m: (N, 3), z up; what is not finite is left out.
+        origins_m: (1 or N, 3) starts of the rays.
+        ground: under the points.
+        p: parameters.
+        number: of the scan in its window.
+    """
+    kept, polar = polar_of(points_m, origins_m, p.range_min_m, p.range_max_m)
+    points = points_m[kept]
+    height = ground.under(points)
+    step_tan = tan(radians(p.row_deg))
+    rows = Rows(-TAN_MAX, step_tan, ceil(2 * TAN_MAX / step_tan), COLUMNS)
+    layer_tan = _layer_gap(layer_gaps(polar, rows)) * step_tan
+    high = np.flatnonzero((height > p.feet_m) & (height < np.inf))
+    points, height, polar = points[high], height[high], polar[high]
+    order, start = row_order(polar, rows)
+    step = max(azimuth_step(polar, order, start, p.link_m), MIN_STEP_RAD)
+    found = thin_slices(polar, order, start, step, Beside(p.link_m, p.diameter_max_m, p.clear_m, p.jump_m))
+    origins = origins_m if len(origins_m) == 1 else origins_m[kept[high]]
+    return Seen(_described(*found, points, height, polar, origins, step, number), points, height, layer_tan)
+
+
+def _layer_gap(gaps: I64) -> int:
+    """Rows from one layer to the next, from how often each number of rows was found between returns of a column."""
+    return max(int(np.searchsorted(np.cumsum(gaps), LAYER_SHARE * gaps.sum())), 1)
+
+
+def _described(
+    members: I64, start: I64, sides: U8, points: F64, height: F64, polar: F64, origins: F64, step: float, number: int
+) -> Slices:
+    if len(start) < 2:
+        return empty_slices()
+    at, count = start[:-1], np.diff(start)
+    distance = _mean(polar[members, 1], at, count)
+    first = polar[members[at], 0]
+    extent = (polar[members[start[1:] - 1], 0] - first) % (2 * np.pi)
+    middle = first + 0.5 * extent
+    toward = np.column_stack([np.cos(middle), np.sin(middle)])
+    origin = origins[:, :2] if len(origins) == 1 else origins[members[at], :2]
+    found = Slices(
+        xy_m=origin + distance[:, None] * toward,
+        z_m=_mean(points[members, 2], at, count),
+        height_m=_mean(height[members], at, count),
+        toward=toward,
+        range_m=distance,
+        extent_m=extent * distance,
+        step_m=step * distance,
+        points=count,
+        scan=np.full(len(at), number),
+        hidden=(sides != 0).any(axis=1).astype(np.int64),
+    )
+    if len(at) > MAX_SLICES:
+        return take(found, np.sort(np.argsort(distance, kind="stable")[:MAX_SLICES]))
+    return found
+
+
+def _mean(values: F64, at: I64, count: I64) -> F64:
+    return np.asarray(np.add.reduceat(values, at) / count)
+
+
+def take(slices: Slices, index: I64) -> Slices:
+    """Some of the slices."""
+    return Slices._make(column[index] for column in slices)
+
+
+def joined(parts: list[Slices]) -> Slices:
+    """The slices of several scans, one after the other."""
+    return Slices._make(map(np.concatenate, zip(*parts, strict=True))) if parts else empty_slices()
+
+
+def empty_slices() -> Slices:
+    """No slices."""
+    flat, plane, whole = np.empty(0), np.empty((0, 2)), np.empty(0, np.int64)
+    return Slices(plane, flat, flat, plane, flat, flat, flat, whole, whole, whole)
