@@ -1,0 +1,266 @@
+"""Rao-Blackwellised particle filter (SLAMCU, section 5; FastSLAM): poses in particles, features in an EKF per particle.
+
+Beside its pose a particle holds the wheel's scale and the gyro's bias, and the GNSS's slow error as a Kalman filter.
+
+Features whose position is known otherwise (the map's) are measured like new ones. The known position is one more
+measurement of the feature, p(m | map), and multiplies the weights once: provisionally while the feature is in view,
+for good in `settle`. For a map without errors this equals weighing with Eq. (17) at each measurement; for a real one it
+counts the map's error once and not at each look, and what the drive measured by itself stays known.
+
+Resampling draws particles again and again from fewer ancestors, and covariances shrink without reason. So resampled
+particles are spread anew by the differences of random pairs, and drawn towards the mean by as much: mean and
+covariance of poses, biases and features stay (Liu and West 2001, with pairs in place of a Gaussian kernel).
+"""
+
+from typing import Final
+
+import numpy as np
+
+from gnd_map.arrays import F64, I64
+from vehicle_agent.features import measurement
+from vehicle_agent.features.parameters import SlamcuParameters
+from vehicle_agent.features.view import wrapped
+
+X, Y, HEADING, SCALE, BIAS, GNSS_X, GNSS_Y = range(7)
+Prior = tuple[F64, F64]
+"""Position (2,) and covariance (3,) xx, xy, yy."""
+FLOOR_PER_M2: Final = 1e-5
+"""Density of a map feature's measured position if it is none: one chance in a thousand, somewhere within 100 m^2."""
+_STANDING_MPS: Final = 0.02
+_GNSS_JUMP: Final = 25.0
+_MOST_STAGES: Final = 20
+
+
+class Rbpf:
+    """M particles.
+
+    Attributes:
+        state: (7, M) x, y [m], heading [rad], wheel scale, gyro bias [rad/s], slow GNSS error [m].
+        log_weight: (M,), not normalised.
+        mu: (F, M, 2) positions of the features.
+        sigma: (F, M, 3) their covariances xx, xy, yy.
+        priors: F positions known otherwise that are not yet settled, None where there is none.
+        weighing: whether measurements weigh particles; not where poses are given.
+    """
+
+    def __init__(self, parameters: SlamcuParameters, pose0: F64, cov0: F64, rng: np.random.Generator) -> None:
+        self._p, self._rng = parameters, rng
+        m = parameters.filter.particles
+        self.offsets = _standard(rng, m)
+        self.state = np.zeros((7, m))
+        self.place(pose0, cov0)
+        if m > 1:
+            self.state[SCALE] = parameters.motion.scale * rng.standard_normal(m)
+            self.state[BIAS] = parameters.motion.bias_radps * rng.standard_normal(m)
+        self._gnss_var: float | None = None
+        self.log_weight = np.zeros(m)
+        self.mu = np.zeros((0, m, 2))
+        self.sigma = np.zeros((0, m, 3))
+        self.priors: list[Prior | None] = []
+        self.weighing = True
+        self.resampled = 0
+
+    @property
+    def m(self) -> int:
+        """Number of particles."""
+        return self.state.shape[1]
+
+    def place(self, pose: F64, cov: F64) -> None:
+        """Draw the poses around one; each particle keeps its side of it, as errors of a localiser last."""
+        values, vectors = np.linalg.eigh(cov)
+        root = vectors * np.sqrt(np.maximum(values, 0.0))
+        self.state[:3] = pose[:, None] + root @ self.offsets
+
+    def predict(self, dt_s: float, speed_mps: float, yaw_rate_radps: float) -> None:
+        """Move every particle as the vehicle moved, with what wheels and gyro may be wrong by. Eq. (12)."""
+        if abs(speed_mps) < _STANDING_MPS:  # what a standing vehicle's gyro shows is its bias
+            return
+        noise, root, s = self._p.motion, np.sqrt(dt_s), self.state
+        if self.m > 1:
+            e = self._rng.standard_normal((4, self.m)) * root
+            s[SCALE] += noise.scale_walk * e[2]
+            s[BIAS] += noise.bias_walk_radps * e[3]
+            way, turn = noise.speed_m * e[0], noise.yaw_rad * e[1]
+        else:
+            way, turn = np.zeros(1), np.zeros(1)
+        way = way + speed_mps * dt_s * (1.0 + s[SCALE])
+        turn = turn + (yaw_rate_radps - s[BIAS]) * dt_s
+        middle = s[HEADING] + 0.5 * turn
+        s[X] += way * np.cos(middle)
+        s[Y] += way * np.sin(middle)
+        s[HEADING] += turn
+
+    def gnss(self, xy_m: F64, sigma_m: float, dt_s: float) -> None:
+        """Weigh with a fix whose error is slow (Gauss-Markov, of this sigma) and white.
+
+        Args:
+            xy_m: (2,).
+            sigma_m: of each axis.
+            dt_s: since the last fix.
+        """
+        noise, s = self._p.gnss, self.state
+        fade = np.exp(-dt_s / noise.correlation_s)
+        before = sigma_m**2 if self._gnss_var is None else self._gnss_var
+        var = before * fade**2 + (1.0 - fade**2) * sigma_m**2
+        s[GNSS_X:] *= fade
+        nu = xy_m[:, None] - s[:2] - s[GNSS_X:]
+        mean, spread = nu.mean(axis=1), nu.var(axis=1).max()
+        if (mean**2).max() > _GNSS_JUMP * (var + noise.white_m**2 + spread):
+            var, s[GNSS_X:] = sigma_m**2, 0.0  # another reflection: what was known of its error is void
+            nu = xy_m[:, None] - s[:2]
+        total = var + noise.white_m**2
+        if self.weighing:
+            self.log_weight -= 0.5 * (nu**2).sum(axis=0) / total
+        s[GNSS_X:] += var / total * nu
+        self._gnss_var = var * (1.0 - var / total)
+
+    def add(self, z: F64, variance: F64, prior: Prior | None = None) -> None:
+        """A further feature, at the end, where this measurement puts it."""
+        mu, sigma = measurement.inverse(self.state[:3], z, variance)
+        self.mu, self.sigma = np.concatenate([self.mu, mu[None]]), np.concatenate([self.sigma, sigma[None]])
+        self.priors.append(prior)
+
+    def remove(self, slot: int) -> None:
+        """Forget a feature."""
+        self.mu, self.sigma = np.delete(self.mu, slot, axis=0), np.delete(self.sigma, slot, axis=0)
+        del self.priors[slot]
+
+    def measure(self, slot: int, z: F64, variance: F64, *, weigh: bool) -> None:
+        """Update a feature with a measurement, Eq. (16), and the weights, Eq. (18) and (19)."""
+        updated = measurement.update(self.state[:3], self.mu[slot], self.sigma[slot], z, variance)
+        self.mu[slot], self.sigma[slot], log_likelihood = updated
+        if weigh and self.weighing:
+            self.log_weight += np.logaddexp(log_likelihood, np.log(self._p.filter.floor))  # Eq. (19)
+
+    def merge(self, kept: int, other: int) -> None:
+        """Two features are one: their estimates are made one, and `other` is removed."""
+        if self.weighing:
+            self.log_weight += measurement.agreement(self.mu[kept], self.sigma[kept], self.mu[other], self.sigma[other])
+        self.mu[kept], self.sigma[kept] = measurement.fused(
+            self.mu[kept], self.sigma[kept], self.mu[other], self.sigma[other]
+        )
+        self.remove(other)
+
+    def weights(self, without: int | None = None) -> F64:
+        """(M,) weights that sum to 1, with positions known otherwise (but not that of slot `without`)."""
+        log = self.log_weight.copy()
+        if self.weighing:
+            for slot, prior in enumerate(self.priors):
+                if prior is not None and slot != without:
+                    log += self._agreement(slot, prior)
+        return _normalised(log)
+
+    def settle(self, slot: int) -> None:
+        """Take the position known otherwise for good, step by step where it leaves few particles much weight."""
+        prior = self.priors[slot]
+        if prior is None:
+            return
+        if self.weighing:
+            self._temper(slot, prior)
+        self.mu[slot], self.sigma[slot] = measurement.fused(self.mu[slot], self.sigma[slot], *prior)
+        self.priors[slot] = None
+
+    def resample_if_needed(self) -> None:
+        """Systematic resampling when the effective number of particles is small. Eq. (20), with squared weights."""
+        weights = _normalised(self.log_weight)
+        if self.m > 1 and effective(weights) < self._p.filter.resample_below * self.m:
+            self._resample(weights)
+
+    def moments(self, slot: int, weights: F64) -> tuple[F64, F64]:
+        """Position (2,) and covariance (2, 2) of a feature over all particles: that of a mixture of Gaussians."""
+        mu = self.mu[slot]
+        mean = weights @ mu
+        off = mu - mean
+        between = (off * weights[:, None]).T @ off
+        xx, xy, yy = weights @ self.sigma[slot]
+        return mean, between + np.array([[xx, xy], [xy, yy]])
+
+    def pose(self, weights: F64) -> tuple[F64, F64]:
+        """Pose (3,) and covariance (3, 3)."""
+        near = self.state[:3].copy()
+        near[HEADING] = near[HEADING, 0] + wrapped(near[HEADING] - near[HEADING, 0])
+        mean = near @ weights
+        off = near - mean[:, None]
+        return np.array([mean[0], mean[1], float(wrapped(mean[2]))]), (off * weights) @ off.T
+
+    def _agreement(self, slot: int, prior: Prior) -> F64:
+        return np.logaddexp(measurement.agreement(self.mu[slot], self.sigma[slot], *prior), np.log(FLOOR_PER_M2))
+
+    def _temper(self, slot: int, prior: Prior) -> None:
+        left = 1.0
+        for stage in range(_MOST_STAGES):
+            log = self._agreement(slot, prior)
+            step = left if stage == _MOST_STAGES - 1 else self._bearable(log, left)
+            self.log_weight += step * log
+            left -= step
+            if left <= 1e-9:
+                return
+            self._resample(_normalised(self.log_weight))
+
+    def _bearable(self, log: F64, most: float) -> float:
+        """The largest share of a log likelihood that leaves enough effective particles."""
+        enough = 0.9 * self._p.filter.resample_below * self.m
+
+        def bears(share: float) -> bool:
+            return effective(_normalised(self.log_weight + share * log)) >= enough
+
+        if self.m == 1 or bears(most):
+            return most
+        low, high = 0.0, most
+        for _ in range(12):
+            middle = 0.5 * (low + high)
+            low, high = (middle, high) if bears(middle) else (low, middle)
+        return max(low, most / _MOST_STAGES)
+
+    def _resample(self, weights: F64) -> None:
+        index = systematic(weights, float(self._rng.random()))
+        self.log_weight = np.zeros(self.m)
+        self.state, self.mu, self.sigma = self.state[:, index], self.mu[:, index], self.sigma[:, index]
+        self.resampled += 1
+        h = self._p.filter.jitter
+        if h > 0.0:
+            one, other = self._rng.permutation(self.m), self._rng.permutation(self.m)
+            self.state[HEADING] = self.state[HEADING, 0] + wrapped(self.state[HEADING] - self.state[HEADING, 0])
+            self.state = _spread(self.state, 1, one, other, h)
+            self.mu = _spread(self.mu, 1, one, other, h)
+
+
+def _spread(values: F64, axis: int, one: I64, other: I64, h: float) -> F64:
+    """Values nearer to their mean, plus differences of random pairs: the covariance stays, the values differ again."""
+    mean = values.mean(axis=axis, keepdims=True)
+    pairs = values.take(one, axis) - values.take(other, axis)
+    return np.asarray(mean + np.sqrt(1.0 - h * h) * (values - mean) + h / np.sqrt(2.0) * pairs)
+
+
+def systematic(weights: F64, start: float) -> I64:
+    """Indices (M,) of resampled particles: one draw for all, so that a weight of n/M is taken n times, or one more.
+
+    Args:
+        weights: (M,), summing to 1.
+        start: uniform in [0, 1).
+    """
+    m = len(weights)
+    borders = np.cumsum(weights)
+    borders[-1] = 1.0
+    return np.asarray(np.searchsorted(borders, (start + np.arange(m)) / m, side="right").clip(0, m - 1), np.int64)
+
+
+def effective(weights: F64) -> float:
+    """Effective number of particles. Eq. (20), with the squares that its sum lacks."""
+    return float(1.0 / np.square(weights).sum())
+
+
+def _normalised(log: F64) -> F64:
+    weights = np.exp(log - log.max())
+    return np.asarray(weights / weights.sum())
+
+
+def _standard(rng: np.random.Generator, m: int) -> F64:
+    """(3, M) of mean zero and, with enough of them, unit covariance exactly."""
+    if m == 1:
+        return np.zeros((3, 1))
+    e = rng.standard_normal((3, m))
+    e -= e.mean(axis=1, keepdims=True)
+    if m < 8:
+        return np.asarray(e)
+    return np.asarray(np.linalg.solve(np.linalg.cholesky(e @ e.T / m), e))

@@ -1,0 +1,239 @@
+"""Simultaneous localisation and map change update: SLAMCU (Jo, Kim and Sunwoo 2018), on one vehicle.
+
+Each look: associate measurements with features, one to one (section 4.3.1); those in view that were not measured lose
+existence, those measured gain it (4.3.2); what is new is registered; what exists tells where the vehicle is (4.3.4, 5).
+"""
+
+from collections.abc import Collection
+from math import isfinite
+from typing import Final
+
+import numpy as np
+
+from gnd_map.arrays import F64, I64
+from vehicle_agent.features.association import Association, associate, pair_costs
+from vehicle_agent.features.errors import BadPose
+from vehicle_agent.features.existence_book import Entry, ExistenceBook, FeatureClass, existence_of
+from vehicle_agent.features.forecast import Forecast, forecast
+from vehicle_agent.features.look import Look, MapFeatures
+from vehicle_agent.features.parameters import SlamcuParameters
+from vehicle_agent.features.rbpf import Rbpf
+from vehicle_agent.features.tidying import Tidying
+from vehicle_agent.features.tracked import Tracked
+from vehicle_agent.features.verdicts import KnownState, NewFeature
+from vehicle_agent.features.view import Occlusion, SensorView, wrapped
+
+NEAR_M: Final = 30.0
+"""Features so much farther than the view's range cannot be what was measured."""
+LEAST_PLAUSIBLE: Final = 1e-3
+"""A feature that surely is not there competes for measurements with this share of its likelihood."""
+
+
+class Slamcu:
+    """One drive.
+
+    Args:
+        parameters: of existence, association and filter.
+        known: the map's features; a 2D frame (ENU), metres.
+        pose0: (3,) x, y, heading at the start.
+        cov0: (3, 3) its covariance.
+        seed: of the particles.
+
+    Attributes:
+        now_s: time driven.
+        odometer_m: way driven.
+        hidden: features of the map in view that got no evidence because something hid them, over all looks.
+
+    Raises:
+        BadPose: the pose is not finite, or the covariance is none.
+    """
+
+    def __init__(self, parameters: SlamcuParameters, known: MapFeatures, pose0: F64, cov0: F64, seed: int = 0) -> None:
+        self._p = parameters
+        self._rbpf = Rbpf(parameters, *checked_pose(pose0, cov0), np.random.default_rng(seed))
+        self._book = ExistenceBook(parameters)
+        self._tracked = Tracked(parameters, known, self._rbpf, self._book)
+        self._tidying = Tidying(parameters, self._tracked, self._rbpf, self._book)
+        self.now_s = 0.0
+        self.odometer_m = 0.0
+        self.hidden = 0
+        self._gnss_s: float | None = None
+
+    def predict(self, dt_s: float, speed_mps: float, yaw_rate_radps: float) -> None:
+        """The vehicle drove on for `dt_s` with the wheel speed and yaw rate that it measured.
+
+        Raises:
+            BadPose: a value is not finite, or the time runs backwards.
+        """
+        if not (isfinite(dt_s + speed_mps + yaw_rate_radps) and dt_s >= 0.0):
+            raise BadPose(f"motion of {speed_mps} m/s, {yaw_rate_radps} rad/s over {dt_s} s")
+        self._rbpf.predict(dt_s, speed_mps, yaw_rate_radps)
+        self.now_s += dt_s
+        self.odometer_m += abs(speed_mps) * dt_s
+
+    def gnss(self, x_m: float, y_m: float, sigma_m: float) -> None:
+        """A GNSS fix in the map frame; `sigma_m` of each axis.
+
+        Raises:
+            BadPose: a value is not finite, or the sigma is not positive.
+        """
+        if not (isfinite(x_m + y_m + sigma_m) and sigma_m > 0.0):
+            raise BadPose(f"GNSS fix ({x_m}, {y_m}) m with sigma {sigma_m} m")
+        since_s = self._p.gnss.interval_s if self._gnss_s is None else self.now_s - self._gnss_s
+        if since_s + 1e-6 >= self._p.gnss.interval_s:
+            self._rbpf.gnss(np.array([x_m, y_m]), sigma_m, since_s)
+            self._gnss_s = self.now_s
+            self._rbpf.resample_if_needed()
+
+    def set_pose(self, pose: F64, cov: F64) -> None:
+        """The pose (3,) as a localiser has it, with its covariance (3, 3): from now on features do not move it.
+
+        Raises:
+            BadPose: as of the constructor.
+        """
+        pose, cov = checked_pose(pose, cov)
+        self._rbpf.weighing = False
+        self._rbpf.place(pose, cov)
+
+    def pose(self) -> tuple[F64, F64]:
+        """Pose (3,) x, y [m], heading [rad], and covariance (3, 3)."""
+        return self._rbpf.pose(self._rbpf.weights())
+
+    def look(self, look: Look, view: SensorView, occlusion: Occlusion | None = None) -> None:
+        """Take what a detector found, or did not find.
+
+        Args:
+            look: one look; none found is evidence too.
+            view: what the detector could have seen.
+            occlusion: what was in the way; None = nothing.
+        """
+        weights = self._rbpf.weights()
+        near = self._tracked.within(self._rbpf.state[:2] @ weights, view.range_m + NEAR_M)
+        ahead = forecast(self._rbpf, weights, near)
+        found = self._associate(look, near, ahead)
+        detected = [near[i] for i in found.feature]
+        missed = self._missed(near, ahead, found.feature, view, occlusion)
+        self._book.evidence(detected, missed, look.t_ns)  # Eq. (5)
+        self._tidying.measured_together(detected)
+        self._measure(look, found.measurement, detected, weights)
+        self._register(look, found.alone, weights)
+        self._tidying.tidy(self.now_s, self.odometer_m, look.t_ns, near)
+        self._rbpf.resample_if_needed()  # Eq. (20)
+
+    def hold(self, known: MapFeatures) -> None:
+        """Further features of the map, such as those of a tile that came.
+
+        Raises:
+            BadMapFeatures: one of them is held already.
+        """
+        self._tracked.hold(known)
+
+    def forget(self, feature_ids: Collection[int]) -> None:
+        """Features of the map that matter no longer, such as those of a tile that was left."""
+        self._tracked.forget(feature_ids)
+
+    def known_states(self) -> tuple[KnownState, ...]:
+        """All features of the map, in its order."""
+        return tuple(self._known_state(entry) for entry in self._tracked.known)
+
+    def new_features(self, *, unclassified: bool = False) -> tuple[NewFeature, ...]:
+        """Features that the map has not and that exist; `unclassified`: those with too little evidence as well."""
+        weights = self._rbpf.weights()
+        found = [self._new_feature(entry, weights) for entry in self._tracked.new]
+        return tuple(one for one in found if unclassified or one.feature_class == FeatureClass.NEW)
+
+    def _associate(self, look: Look, near: list[Entry], ahead: Forecast) -> Association:
+        """Section 4.3.1, by the likelihood of range and bearing and by how plausible the feature's existence is."""
+        z = np.stack([look.range_m, look.bearing_rad], axis=1)
+        innovation = z[:, None] - ahead.z[None]
+        innovation[..., 1] = wrapped(innovation[..., 1])
+        noise = np.zeros((len(look), 1, 2, 2))
+        noise[:, 0, [0, 1], [0, 1]] = look.variance
+        same = np.array([[kind == entry.kind for entry in near] for kind in look.kinds], bool).reshape(len(look), len(near))
+        cost = pair_costs(innovation, ahead.cov[None] + noise, same, self._p.gate)
+        plausible = np.array([max(entry.masses[0] + entry.masses[2], LEAST_PLAUSIBLE) for entry in near])
+        return associate(cost - np.log(plausible), -np.log(self._p.new_density))
+
+    def _missed(
+        self, near: list[Entry], ahead: Forecast, measured: I64, view: SensorView, occlusion: Occlusion | None
+    ) -> list[Entry]:
+        """Features well in view that nothing hides and that were not measured: they get Eq. (2)."""
+        if not near:
+            return []
+        sigma = self._p.edge_sigmas * ahead.sigma
+        edge_m, edge_rad = np.maximum(sigma[:, 0], self._p.edge_m), np.maximum(sigma[:, 1], self._p.edge_rad)
+        in_view = view.inside(ahead.z[:, 0], ahead.z[:, 1])
+        for i in np.flatnonzero(in_view):
+            near[i].in_view_s = self.now_s
+        ask = view.inside(ahead.z[:, 0], ahead.z[:, 1], edge_m, edge_rad)
+        ask[measured] = False
+        rows = np.flatnonzero(ask)
+        if occlusion is not None and len(rows):
+            height_m = np.array([near[i].height_m for i in rows])
+            clear = occlusion.clear(ahead.z[rows, 0], ahead.z[rows, 1], edge_rad[rows], height_m)
+            self.hidden += sum(near[i].known for i in rows[~clear])
+            rows = rows[clear]
+        return [near[i] for i in rows]
+
+    def _measure(self, look: Look, rows: I64, detected: list[Entry], weights: F64) -> None:
+        """Section 4.3.4: features that exist are measured; Eq. (16) to (19)."""
+        for row, entry in zip(rows, detected, strict=True):
+            z, variance = np.array([look.range_m[row], look.bearing_rad[row]]), look.variance[row]
+            exists = self._book.usable(entry)
+            if entry.slot is None and exists:
+                self._tracked.enter(entry, z, variance)
+            elif entry.slot is not None:
+                self._rbpf.measure(entry.slot, z, variance, weigh=exists)
+            self._noted(entry, look, int(row), weights)
+
+    def _register(self, look: Look, rows: I64, weights: F64) -> None:
+        """What belongs to nothing known is new; Eq. (4)."""
+        for row in rows:
+            entry = self._tracked.register(look.kinds[row])
+            self._tracked.enter(entry, np.array([look.range_m[row], look.bearing_rad[row]]), look.variance[row])
+            entry.hits = 1
+            entry.history.append((look.t_ns, entry.masses))
+            self._noted(entry, look, int(row), weights)
+
+    def _noted(self, entry: Entry, look: Look, row: int, weights: F64) -> None:
+        entry.in_view_s, entry.odometer_m = self.now_s, self.odometer_m
+        entry.pass_hits += 1
+        if look.height_m is not None and isfinite(look.height_m[row]):
+            entry.heights.append(float(look.height_m[row]))
+        if entry.slot is not None and not entry.known:
+            entry.xy_m = weights @ self._rbpf.mu[entry.slot] if entry.cov is None else entry.xy_m
+
+    def _known_state(self, entry: Entry) -> KnownState:
+        seen = entry.seen
+        if seen is None and entry.slot is not None and self._rbpf.priors[entry.slot] is not None:
+            seen = self._rbpf.moments(entry.slot, self._rbpf.weights(without=entry.slot))
+        xy_m, cov = seen if seen is not None else (None, None)
+        return KnownState(
+            entry.number, self._book.classify(entry), existence_of(entry.masses), entry.hits, entry.misses,
+            xy_m, cov, entry.height_m, entry.masses_over_time(),
+        )  # fmt: skip
+
+    def _new_feature(self, entry: Entry, weights: F64) -> NewFeature:
+        if entry.slot is not None:
+            xy_m, cov = self._rbpf.moments(entry.slot, weights)
+        else:
+            assert entry.cov is not None
+            xy_m, cov = entry.xy_m, entry.cov[[0, 1, 1, 2]].reshape(2, 2)
+        return NewFeature(
+            entry.number, entry.kind, xy_m, cov, entry.height_m, self._book.classify(entry),
+            existence_of(entry.masses), entry.hits, entry.misses, entry.masses_over_time(),
+        )  # fmt: skip
+
+
+def checked_pose(pose: F64, cov: F64) -> tuple[F64, F64]:
+    """A pose (3,) and its covariance (3, 3) as float64.
+
+    Raises:
+        BadPose: of another shape, not finite, or a covariance with a negative eigenvalue.
+    """
+    pose, cov = np.asarray(pose, np.float64), np.asarray(cov, np.float64)
+    if pose.shape != (3,) or cov.shape != (3, 3) or not (np.isfinite(pose).all() and np.isfinite(cov).all()):
+        raise BadPose(f"pose {pose.tolist()} with covariance of shape {cov.shape}: expected finite (3,) and (3, 3)")
+    if np.abs(cov - cov.T).max() > 1e-6 or np.linalg.eigvalsh(cov)[0] < -1e-9:
+        raise BadPose(f"covariance {cov.tolist()} is not symmetric or has a negative eigenvalue")
+    return pose, cov

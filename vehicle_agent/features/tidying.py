@@ -1,0 +1,164 @@
+"""What happens to features between looks: settled, moved, made one with another, given up."""
+
+from typing import Final
+
+import numpy as np
+
+from gnd_map.arrays import F64
+from vehicle_agent.features.existence_book import Entry, ExistenceBook, FeatureClass
+from vehicle_agent.features.parameters import SlamcuParameters
+from vehicle_agent.features.rbpf import Rbpf
+from vehicle_agent.features.tracked import Tracked
+
+SAME_GATE: Final = 9.0
+"""Two features within this squared Mahalanobis distance may be one."""
+SAME_M: Final = 4.0
+"""And at most so far apart."""
+ENOUGH_HITS: Final = 6
+"""So many measurements of the two together tell whether they are ever measured at once."""
+TOGETHER_SHARE: Final = 0.15
+"""Two features that are measured at once in this share of the looks that could are two."""
+GIVEN_UP: Final = 0.9
+"""A new feature with this mass of absence is forgotten."""
+
+
+class Tidying:
+    """Housekeeping of the features of a drive.
+
+    Args:
+        parameters: when features settle and leave.
+        tracked: the features.
+        rbpf: the particles.
+        book: their masses.
+    """
+
+    def __init__(self, parameters: SlamcuParameters, tracked: Tracked, rbpf: Rbpf, book: ExistenceBook) -> None:
+        self._p, self._tracked, self._rbpf, self._book = parameters, tracked, rbpf, book
+
+    def measured_together(self, detected: list[Entry]) -> None:
+        """Remember which features were measured in one look."""
+        for entry in detected:
+            for other in detected:
+                if other is not entry:
+                    entry.together[other.key] += 1
+
+    def tidy(self, now_s: float, odometer_m: float, t_ns: int, near: list[Entry]) -> None:
+        """Everything that is due.
+
+        Args:
+            now_s: time of the drive.
+            odometer_m: way driven.
+            t_ns: UTC, for the masses over time.
+            near: entries that may be in view.
+        """
+        for entry in [entry for entry in near if not entry.known and entry in self._tracked.new]:
+            self._give_up_or_unite(entry, near, t_ns)
+        for entry in list(self._tracked.live):
+            if entry.slot is None:
+                continue
+            out_of_view = now_s - entry.in_view_s > self._p.settle_s
+            if self._rbpf.priors[entry.slot] is not None:
+                if out_of_view or entry.pass_hits >= self._p.settle_hits:
+                    self._settle(entry, t_ns)
+            elif out_of_view:
+                self._leave(entry, odometer_m)
+        self._leave_oldest()
+
+    def _settle(self, entry: Entry, t_ns: int) -> None:
+        """Compare with the position known otherwise, and take that in."""
+        assert entry.slot is not None
+        weights = self._rbpf.weights(without=entry.slot)
+        xy_m, cov = self._rbpf.moments(entry.slot, weights)
+        if entry.known:
+            if self._moved(entry, xy_m, cov):
+                self._split(entry, xy_m, t_ns)
+                return
+            entry.seen = (xy_m, cov) if entry.seen is None else fused_moments(entry.seen, (xy_m, cov))
+        self._rbpf.settle(entry.slot)
+
+    def _moved(self, entry: Entry, xy_m: F64, cov: F64) -> bool:
+        assert entry.cov is not None
+        off = xy_m - entry.xy_m
+        total = cov + entry.cov[[0, 1, 1, 2]].reshape(2, 2)
+        squared = float(off @ np.linalg.solve(total, off))
+        return squared > self._p.moved_gate and float(np.hypot(*off)) > self._p.moved_m
+
+    def _split(self, entry: Entry, xy_m: F64, t_ns: int) -> None:
+        """A moved feature is a deleted one and a new one (section 2.3)."""
+        found, hits = self._tracked.register(entry.kind), entry.pass_hits
+        found.xy_m, found.in_view_s, found.odometer_m = xy_m, entry.in_view_s, entry.odometer_m
+        found.heights, entry.heights = entry.heights, found.heights
+        self._tracked.hand_over(entry, found)
+        self._book.recount(found, hits, 0, t_ns)
+        self._book.recount(entry, entry.hits - hits, entry.misses + hits, t_ns)
+
+    def _leave(self, entry: Entry, odometer_m: float) -> None:
+        """Out of view: the map's features at once, new ones when they can learn little more."""
+        if entry.known:
+            self._tracked.leave(entry)
+        elif self._book.classify(entry) != FeatureClass.NEW:
+            self._tracked.drop(entry)
+        elif odometer_m - entry.odometer_m > self._p.filter.horizon_m:
+            self._freeze(entry)
+
+    def _freeze(self, entry: Entry) -> None:
+        assert entry.slot is not None
+        entry.xy_m, cov = self._rbpf.moments(entry.slot, self._rbpf.weights())
+        entry.cov = np.array([cov[0, 0], cov[0, 1], cov[1, 1]])
+        self._tracked.leave(entry)
+
+    def _leave_oldest(self) -> None:
+        while len(self._tracked.live) > self._p.filter.horizon_features:
+            oldest = min(self._tracked.live, key=lambda entry: entry.in_view_s)
+            if oldest.known:
+                self._tracked.leave(oldest)
+            else:
+                self._freeze(oldest)
+
+    def _give_up_or_unite(self, entry: Entry, near: list[Entry], t_ns: int) -> None:
+        if entry.masses[1] > GIVEN_UP:
+            self._tracked.drop(entry)
+            return
+        for other in near:
+            if other is not entry and other.kind == entry.kind and self._same(other, entry):
+                self._unite(other, entry, t_ns)
+                return
+
+    def _same(self, other: Entry, entry: Entry) -> bool:
+        """Whether a new feature is another one: at one place, and never measured at once."""
+        if entry.slot is None or (not other.known and (other.slot is None or other.number > entry.number)):
+            return False
+        hits = min(entry.hits, max(other.pass_hits, 1))
+        if entry.hits + other.pass_hits < ENOUGH_HITS or entry.together[other.key] > TOGETHER_SHARE * hits:
+            return False
+        weights = self._rbpf.weights()
+        off, cov = self._apart(other, entry, weights)
+        return float(np.hypot(*off)) < SAME_M and float(off @ np.linalg.solve(cov, off)) < SAME_GATE
+
+    def _apart(self, other: Entry, entry: Entry, weights: F64) -> tuple[F64, F64]:
+        """Mean (2,) and covariance (2, 2) of how far apart two features are."""
+        assert entry.slot is not None
+        mu, sigma = self._rbpf.mu[entry.slot], self._rbpf.sigma[entry.slot]
+        if other.slot is not None:
+            off, within = mu - self._rbpf.mu[other.slot], weights @ (sigma + self._rbpf.sigma[other.slot])
+        else:
+            off, within = mu - other.xy_m, weights @ sigma + (0.0 if other.cov is None else other.cov)
+        mean = weights @ off
+        off = off - mean
+        return mean, (off * weights[:, None]).T @ off + within[[0, 1, 1, 2]].reshape(2, 2)
+
+    def _unite(self, kept: Entry, other: Entry, t_ns: int) -> None:
+        """Each look that measured one of them measured the feature, though the other was missed."""
+        hits = kept.hits + other.hits
+        self._tracked.unite(kept, other)
+        kept.in_view_s = max(kept.in_view_s, other.in_view_s)
+        kept.odometer_m = max(kept.odometer_m, other.odometer_m)
+        kept.heights += other.heights
+        self._book.recount(kept, hits, max(kept.misses - other.hits, 0), t_ns)
+        self._tracked.drop(other)
+
+
+def fused_moments(one: tuple[F64, F64], other: tuple[F64, F64]) -> tuple[F64, F64]:
+    """Two independent estimates (2,), (2, 2) made one."""
+    gain = one[1] @ np.linalg.inv(one[1] + other[1])
+    return one[0] + gain @ (other[0] - one[0]), one[1] - gain @ one[1]

@@ -1,0 +1,124 @@
+"""The features of one drive: the map's and the new ones, and which of them are estimated in the particles."""
+
+from collections.abc import Collection
+from math import nan
+
+import numpy as np
+
+from gnd_map.arrays import F64
+from vehicle_agent.features.errors import BadMapFeatures
+from vehicle_agent.features.existence_book import Entry, ExistenceBook
+from vehicle_agent.features.look import MapFeatures
+from vehicle_agent.features.parameters import SlamcuParameters
+from vehicle_agent.features.rbpf import Prior, Rbpf
+
+
+class Tracked:
+    """Entries of features, and their slots in the particles.
+
+    Attributes:
+        known: entries of the map's features, in its order.
+        new: entries of the others.
+        live: entries that are in the particles; the place in this list is the slot.
+    """
+
+    def __init__(self, parameters: SlamcuParameters, known: MapFeatures, rbpf: Rbpf, book: ExistenceBook) -> None:
+        self._p, self._rbpf, self._book = parameters, rbpf, book
+        self.known: list[Entry] = []
+        self._known_xy_m = np.zeros((0, 2))
+        self.new: list[Entry] = []
+        self.live: list[Entry] = []
+        self._numbers = 0
+        self.hold(known)
+
+    def hold(self, known: MapFeatures) -> None:
+        """Further features of the map.
+
+        Raises:
+            BadMapFeatures: one of them is held already.
+        """
+        held = {entry.number for entry in self.known} & set(known.feature_id.tolist())
+        if held:
+            raise BadMapFeatures(f"{len(held)} features are held already, the first {min(held)}; forget them first")
+        extra = np.eye(2) * self._p.map_sigma_m**2
+        self.known += [self._of_map(known, i, known.cov[i] + extra) for i in range(len(known.feature_id))]
+        self._index()
+
+    def forget(self, feature_ids: Collection[int]) -> None:
+        """Features of the map that matter no longer."""
+        gone = set(feature_ids)
+        for entry in [entry for entry in self.live if entry.known and entry.number in gone]:
+            self.leave(entry)
+        self.known = [entry for entry in self.known if entry.number not in gone]
+        self._index()
+
+    def _index(self) -> None:
+        self._known_xy_m = np.array([entry.xy_m for entry in self.known]).reshape(-1, 2)
+
+    def within(self, xy_m: F64, radius_m: float) -> list[Entry]:
+        """Entries whose position lies within a radius of a place (2,)."""
+        off = self._known_xy_m - xy_m
+        known = np.flatnonzero(np.einsum("ni,ni->n", off, off) <= radius_m**2)
+        new = [entry for entry in self.new if float(np.hypot(*(entry.xy_m - xy_m))) <= radius_m]
+        return [self.known[i] for i in known] + new
+
+    def register(self, kind: str) -> Entry:
+        """A feature that nobody knew, without evidence so far; Eq. (4)."""
+        self._numbers += 1
+        entry = Entry(self._numbers, False, kind, np.zeros(2), None, nan, self._book.new_masses)
+        self.new.append(entry)
+        return entry
+
+    def enter(self, entry: Entry, z: F64, variance: F64) -> None:
+        """Estimate a feature in the particles from this first measurement on."""
+        self._rbpf.add(z, variance, prior_of_entry(entry))
+        entry.slot, entry.pass_hits = len(self.live), 0
+        self.live.append(entry)
+
+    def leave(self, entry: Entry) -> None:
+        """Estimate it no longer."""
+        if entry.slot is not None:
+            self._rbpf.remove(entry.slot)
+            self._forget_slot(entry)
+
+    def drop(self, entry: Entry) -> None:
+        """A new feature that was none."""
+        self.leave(entry)
+        self.new.remove(entry)
+
+    def unite(self, kept: Entry, other: Entry) -> None:
+        """The particles' estimates of two features become one, that of `kept`."""
+        if other.slot is None:
+            return
+        if kept.slot is None:
+            self.live[other.slot] = kept
+            kept.slot, other.slot = other.slot, None
+            kept.pass_hits = other.pass_hits
+            self._rbpf.priors[kept.slot] = prior_of_entry(kept)
+        else:
+            self._rbpf.merge(kept.slot, other.slot)
+            self._forget_slot(other)
+
+    def hand_over(self, giver: Entry, taker: Entry) -> None:
+        """What was estimated for one feature turned out to be another."""
+        assert giver.slot is not None
+        self.live[giver.slot] = taker
+        taker.slot, taker.pass_hits, taker.cov, giver.slot = giver.slot, giver.pass_hits, None, None
+        self._rbpf.priors[taker.slot] = None
+
+    def _forget_slot(self, entry: Entry) -> None:
+        assert entry.slot is not None
+        del self.live[entry.slot]
+        entry.slot = None
+        for slot, one in enumerate(self.live):
+            one.slot = slot
+
+    def _of_map(self, known: MapFeatures, i: int, cov: F64) -> Entry:
+        packed = np.array([cov[0, 0], cov[0, 1], cov[1, 1]])
+        number, kind, z_m = int(known.feature_id[i]), known.kind[i], float(known.z_m[i])
+        return Entry(number, True, kind, known.xy_m[i].copy(), packed, z_m, self._book.known_masses)
+
+
+def prior_of_entry(entry: Entry) -> Prior | None:
+    """Its position known otherwise, if there is one."""
+    return None if entry.cov is None else (entry.xy_m, entry.cov)
