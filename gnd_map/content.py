@@ -3,7 +3,7 @@
 The codec id says which of the two a body is; the name of a layer says which of the two it holds.
 """
 
-from typing import Final, TypeAlias, TypeVar
+from typing import Final, TypeAlias, TypeVar, cast
 
 from gnd_map.codec import PREFERRED, best_codec, codec_of, decode_delta, encode_delta, lattice_of
 from gnd_map.errors import CodecError
@@ -21,7 +21,7 @@ from gnd_map.tile import Tile, diff
 from gnd_map.tile_id import TileId
 
 AnyTile: TypeAlias = Tile | FeatureTile
-TileT = TypeVar("TileT", Tile, FeatureTile)
+TileT = TypeVar("TileT", bound=Tile | FeatureTile)
 
 FEATURE_CODECS: Final = (CODEC_FEATURES,)
 """All codecs of features that this program reads."""
@@ -32,12 +32,17 @@ def codecs_of_layer(layer: str) -> tuple[int, ...]:
     return FEATURE_CODECS if is_feature_layer(layer) else PREFERRED
 
 
+def kind_of_layer(layer: str) -> type[Tile] | type[FeatureTile]:
+    """The class of the tiles of a layer."""
+    return FeatureTile if is_feature_layer(layer) else Tile
+
+
 def fits_layer(tile: AnyTile, layer: str) -> bool:
     """Whether the tile holds what this layer holds."""
-    return isinstance(tile, FeatureTile) == is_feature_layer(layer)
+    return isinstance(tile, kind_of_layer(layer))
 
 
-def noun_of(tile: AnyTile | type[AnyTile]) -> str:
+def noun_of(tile: AnyTile | type[object]) -> str:
     """What the tile holds, for messages."""
     kind = tile if isinstance(tile, type) else type(tile)
     return "features" if kind is FeatureTile else "Gaussians"
@@ -84,9 +89,12 @@ def decode_content_delta(held: TileT, version: int, body: bytes) -> TileT:
         CodecError: the bytes are no delta.
         DeltaError: they do not fit what is held.
     """
+    after: AnyTile
     if isinstance(held, FeatureTile):
-        return FeatureTile(held.tile_id, version, decode_feature_delta(held.features, body))
-    return Tile(held.tile_id, version, decode_delta(held.tile_id, held.gaussians, body))
+        after = FeatureTile(held.tile_id, version, decode_feature_delta(held.features, body))
+    else:
+        after = Tile(held.tile_id, version, decode_delta(held.tile_id, held.gaussians, body))
+    return cast("TileT", after)
 
 
 def changed_between(before: AnyTile, after: AnyTile) -> tuple[int, int]:

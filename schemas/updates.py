@@ -1,7 +1,7 @@
 """Update notices: a tile has a new version, with what changed."""
 
 from dataclasses import dataclass
-from typing import Final, Literal
+from typing import Final, Literal, cast
 
 import numpy as np
 
@@ -153,7 +153,7 @@ def updated(update: TileUpdate, held: TileT) -> TileT:
     except GndError as error:
         raise WrongHash(f"{name} does not fit version {held.version}: {error}; fetch the tile") from error
     check_hash(name, tile, update.sha)
-    return tile
+    return cast("TileT", tile)
 
 
 def _delta_message(delta: TileDelta) -> tile_delta_pb2.TileDelta:

@@ -7,12 +7,12 @@ link or a kill; it may be deleted at any time.
 
 from collections.abc import Iterable
 from pathlib import Path
+from typing import Generic, cast
 
-from gnd_map.codec import best_codec
+from gnd_map.content import TileT, encode_content, kind_of_layer
 from gnd_map.errors import GndError
-from gnd_map.tile import Tile
 from gnd_map.tile_id import TileId
-from schemas.tiles import TileBlob, blob_of, tile_of
+from schemas.tiles import TileBlob, as_kind, content_of
 from vehicle_agent.errors import CacheError
 from vehicle_agent.sqlite import Database
 
@@ -35,15 +35,20 @@ WHERE tile.sha = ?7 OR tile.version < excluded.version
 """
 
 
-class TileCache:
-    """The newest version of each tile that this vehicle has seen, in one SQLite file; safe for several threads."""
+class TileCache(Generic[TileT]):
+    """The newest version of each tile of one layer that this vehicle has seen, in an SQLite file; safe for several
+    threads. Caches of several layers may share a file.
+
+    Holds tiles of Gaussians (`TileCache[Tile]`) where the layer's name begins with ndt, else of features.
+    """
 
     def __init__(self, path: Path, layer: str = "ndt") -> None:
         self.layer = layer
+        self.kind = cast("type[TileT]", kind_of_layer(layer))
         self.refused = 0
         self._db = Database(path, SCHEMA, synchronous="NORMAL", error=CacheError)
 
-    def get(self, tile_id: TileId) -> Tile | None:
+    def get(self, tile_id: TileId) -> TileT | None:
         """The tile, or None when it is not here or no longer what its hash says (then it is dropped and counted)."""
         sql = "SELECT version, sha, codec_id, body FROM tile WHERE layer = ? AND morton = ?"
         rows = self._db.run(sql, self._of(tile_id))
@@ -51,7 +56,7 @@ class TileCache:
             return None
         version, sha, codec_id, body = rows[0]
         try:
-            return tile_of(TileBlob(tile_id, version, sha, codec_id, body))
+            return as_kind(content_of(TileBlob(tile_id, version, sha, codec_id, body)), self.kind)
         except GndError:
             self.drop(tile_id)
             self.refused += 1
@@ -78,9 +83,9 @@ class TileCache:
         row = (*self._of(blob.tile), blob.version, blob.sha, blob.codec_id, blob.body, over)
         return self._db.changes(KEEP, row) > 0
 
-    def put(self, tile: Tile, over: bytes = b"") -> bool:
+    def put(self, tile: TileT, over: bytes = b"") -> bool:
         """As `keep`, for a tile made here; its body is as small as the tile allows."""
-        return self.keep(blob_of(tile, best_codec(tile.gaussians)), over)
+        return self.keep(TileBlob(tile.tile_id, tile.version, tile.sha, *encode_content(tile)), over)
 
     def drop(self, tile_id: TileId) -> None:
         """Forget a tile; not here: nothing happens."""

@@ -5,11 +5,12 @@ import threading
 import time
 from collections import Counter
 from collections.abc import Collection, Iterable, Sequence
+from typing import Generic
 
 from fleet_bus.bus import Bus
 from fleet_bus.errors import BusClosed
 from fleet_bus.links import LinkProfile
-from gnd_map.tile import Tile
+from gnd_map.content import TileT
 from gnd_map.tile_id import TileId
 from vehicle_agent.cache import TileCache
 from vehicle_agent.config import DownloadParameters
@@ -28,7 +29,7 @@ HELD_GUESS_BYTES = 64
 _log = logging.getLogger(__name__)
 
 
-class TileFetcher:
+class TileFetcher(Generic[TileT]):
     """Worker threads that ask for the tiles that are wanted, in the order given; answers wait to be taken.
 
     A tile is asked for once until `forget`, `refresh` or `recheck`. A tile whose content does not have its hash is
@@ -36,7 +37,7 @@ class TileFetcher:
     try later. What has arrived is in the cache at once, so an agent that was killed goes on where it was.
     """
 
-    def __init__(self, bus: Bus, cache: TileCache, parameters: DownloadParameters) -> None:
+    def __init__(self, bus: Bus, cache: TileCache[TileT], parameters: DownloadParameters) -> None:
         self.counts: Counter[str] = Counter()
         self.last_error = ""
         self.link: LinkProfile = bus.config.link_profile
@@ -55,7 +56,7 @@ class TileFetcher:
         self._stale: set[TileId] = set()  # answered, but to be asked for again
         self._wrong: Counter[TileId] = Counter()
         self._whole = _Mean(FIRST_GUESS_BYTES)
-        self._arrived: list[Fetched] = []
+        self._arrived: list[Fetched[TileT]] = []
         self._closed = False
         self._threads = [
             threading.Thread(target=self._work, name=f"tiles-{n}", daemon=True) for n in range(parameters.in_flight)
@@ -94,7 +95,7 @@ class TileFetcher:
             self._answered.discard(tile_id)
             self._stale.discard(tile_id)
 
-    def take(self) -> list[Fetched]:
+    def take(self) -> list[Fetched[TileT]]:
         """The answers since the last call."""
         with self._changed:
             arrived, self._arrived = self._arrived, []
@@ -179,18 +180,18 @@ class TileFetcher:
             batch[tile_id] = expected_bytes
         return batch
 
-    def _try(self, batch: list[TileId]) -> Outcome:
+    def _try(self, batch: list[TileId]) -> Outcome[TileT]:
         with self._changed:
             whole = {tile_id for tile_id in batch if self._wrong[tile_id]}
         try:
             return self._exchange.ask(batch, whole, self._batch_bytes)
         except BusClosed:
-            return Outcome()
+            return Outcome[TileT]()
         except Exception as error:  # whatever it was: a worker that ends would never fetch again
             self._note("failed", f"{len(batch)} tiles from {batch[0]} on: {error}")
-            return Outcome()
+            return Outcome[TileT]()
 
-    def _cached(self, tiles: Iterable[TileId]) -> dict[TileId, Tile]:
+    def _cached(self, tiles: Iterable[TileId]) -> dict[TileId, TileT]:
         """The cached ones of `tiles` that nobody has been given yet."""
         found = ((t, self._cache.get(t)) for t in tiles if t not in self._answered)
         try:
@@ -199,7 +200,7 @@ class TileFetcher:
             _log.warning("nothing to do without an answer: %s", error)
             return {}
 
-    def _settle_all(self, batch: list[TileId], outcome: Outcome, instead: dict[TileId, Tile]) -> None:
+    def _settle_all(self, batch: list[TileId], outcome: Outcome[TileT], instead: dict[TileId, TileT]) -> None:
         """Note the answers; what has none waits for its next try. The lock is held."""
         for fetched in outcome.fetched:
             self._settle(fetched)
@@ -209,7 +210,7 @@ class TileFetcher:
         for tile_id in without:
             self._do_without(tile_id, instead.get(tile_id))
 
-    def _settle(self, fetched: Fetched) -> None:
+    def _settle(self, fetched: Fetched[TileT]) -> None:
         tile_id = fetched.tile_id
         del self._wrong[tile_id]
         self._not_before.pop(tile_id, None)
@@ -221,7 +222,7 @@ class TileFetcher:
             self._again.discard(tile_id)
             self._stale.add(tile_id)
 
-    def _do_without(self, tile_id: TileId, cached: Tile | None) -> None:
+    def _do_without(self, tile_id: TileId, cached: TileT | None) -> None:
         """No answer: the cached tile has to do, once, and the tile is asked for again after a pause."""
         self._not_before[tile_id] = time.monotonic() + self._parameters.retry_s
         if cached is not None:

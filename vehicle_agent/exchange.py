@@ -4,17 +4,18 @@ import logging
 from collections.abc import Callable, Collection, Iterable, Sequence
 from dataclasses import dataclass, field
 from functools import partial
-from typing import Literal
+from typing import Generic, Literal
 
 from fleet_bus.bus import Bus
 from fleet_bus.ledger import Share
 from fleet_bus.requesting import RetryPolicy
-from gnd_map.tile import Tile
+from gnd_map.content import TileT, codecs_of_layer
 from gnd_map.tile_id import District, TileId
 from schemas.errors import SchemaError, WrongHash
 from schemas.keys import batch_key
+from schemas.tile_answer import content_of_answer
 from schemas.tiles import TileBlob
-from schemas.tiles_batch import HeldTile, TileAnswer, TilesReply, TilesRequest, tile_of_answer
+from schemas.tiles_batch import HeldTile, TileAnswer, TilesReply, TilesRequest
 from vehicle_agent.cache import TileCache
 from vehicle_agent.errors import CacheError
 
@@ -26,21 +27,21 @@ _log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True, slots=True)
-class Fetched:
+class Fetched(Generic[TileT]):
     """The answer about one tile: `blob` or `delta` (downloaded), `unchanged` (the cached one holds), `absent` (the
     store has none) or `cached` (no answer, the cached one will have to do).
     """
 
     tile_id: TileId
     status: Literal["blob", "delta", "unchanged", "absent", "cached"]
-    tile: Tile | None
+    tile: TileT | None
 
 
 @dataclass(slots=True)
-class Outcome:
+class Outcome(Generic[TileT]):
     """What one question came to."""
 
-    fetched: list[Fetched] = field(default_factory=list)
+    fetched: list[Fetched[TileT]] = field(default_factory=list)
     later: list[TileId] = field(default_factory=list)
     """Did not fit into the answer: ask again."""
     wrong: dict[TileId, str] = field(default_factory=dict)
@@ -49,15 +50,15 @@ class Outcome:
     """Size of each tile that came whole."""
 
 
-class Exchange:
-    """Asks for several tiles of one district at once. Thread-safe."""
+class Exchange(Generic[TileT]):
+    """Asks for several tiles of one district at once, in the layer of the cache. Thread-safe."""
 
-    def __init__(self, bus: Bus, cache: TileCache, request_s: float) -> None:
+    def __init__(self, bus: Bus, cache: TileCache[TileT], request_s: float) -> None:
         self._bus, self._cache, self._request_s = bus, cache, request_s
         # One attempt may take all the time there is: a second one would fetch a slow answer twice.
         self._retry = RetryPolicy(attempt_timeout_s=request_s)
 
-    def ask(self, tiles: Sequence[TileId], whole: Collection[TileId], max_bytes: int) -> Outcome:
+    def ask(self, tiles: Sequence[TileId], whole: Collection[TileId], max_bytes: int) -> Outcome[TileT]:
         """Ask for tiles of one district, the one needed soonest first; those in `whole` as if nothing were cached.
 
         Raises:
@@ -70,7 +71,7 @@ class Exchange:
         unclear = [t for t in tiles if answers[t].status == "hash"]
         if unclear:
             answers |= ask(unclear, with_hashes=True)
-        outcome = Outcome()
+        outcome = Outcome[TileT]()
         for tile_id in tiles:
             self._take(tile_id, answers[tile_id], held.get(tile_id, NOTHING), outcome)
         return outcome
@@ -93,7 +94,8 @@ class Exchange:
         with_hashes: bool,
     ) -> dict[TileId, TileAnswer]:
         wanted = [HeldTile(t, *held.get(t, NOTHING)) for t in tiles]
-        request = TilesRequest.of(wanted, max_bytes=max_bytes, near=tiles[0], with_hashes=with_hashes)
+        codecs = codecs_of_layer(self._cache.layer)
+        request = TilesRequest.of(wanted, codecs=codecs, max_bytes=max_bytes, near=tiles[0], with_hashes=with_hashes)
         payload = self._bus.request(
             batch_key(self._cache.layer, district),
             request.encode(),
@@ -104,7 +106,7 @@ class Exchange:
         )
         return dict(TilesReply.decode(payload).of_request(request, district))
 
-    def _take(self, tile_id: TileId, answer: TileAnswer, held: Head, outcome: Outcome) -> None:
+    def _take(self, tile_id: TileId, answer: TileAnswer, held: Head, outcome: Outcome[TileT]) -> None:
         if answer.status in ("later", "hash"):
             outcome.later.append(tile_id)
             return
@@ -117,7 +119,7 @@ class Exchange:
         if answer.status == "blob":
             outcome.body_bytes[tile_id] = len(answer.body)
 
-    def _fetched(self, tile_id: TileId, answer: TileAnswer, held: Head) -> Fetched:
+    def _fetched(self, tile_id: TileId, answer: TileAnswer, held: Head) -> Fetched[TileT]:
         """Raises WrongHash, SchemaError."""
         if answer.status == "absent":
             return Fetched(tile_id, "absent", None)
@@ -127,21 +129,21 @@ class Exchange:
             return self._delta(tile_id, answer, held)
         return Fetched(tile_id, "unchanged", self._from_cache(tile_id))
 
-    def _blob(self, tile_id: TileId, answer: TileAnswer, held: Head) -> Fetched:
-        tile = tile_of_answer(tile_id, answer)
+    def _blob(self, tile_id: TileId, answer: TileAnswer, held: Head) -> Fetched[TileT]:
+        tile = content_of_answer(tile_id, answer, self._cache.kind)
         blob = TileBlob(tile_id, answer.version, tile.sha, answer.codec_id, answer.body)
         newest = self._newest(tile, lambda: self._cache.keep(blob, over=held[1]))
         return Fetched(tile_id, "blob", newest)
 
-    def _delta(self, tile_id: TileId, answer: TileAnswer, held: Head) -> Fetched:
+    def _delta(self, tile_id: TileId, answer: TileAnswer, held: Head) -> Fetched[TileT]:
         cached = self._from_cache(tile_id)
         if cached.sha != held[1] and (cached.version >= answer.version or cached.sha.startswith(answer.sha)):
             return Fetched(tile_id, "unchanged", cached)  # a notice brought it while the answer was on its way
-        tile = tile_of_answer(tile_id, answer, cached)
+        tile = content_of_answer(tile_id, answer, self._cache.kind, cached)
         newest = self._newest(tile, lambda: self._cache.put(tile, over=held[1]))
         return Fetched(tile_id, "delta", newest)
 
-    def _newest(self, tile: Tile, keep: Callable[[], bool]) -> Tile:
+    def _newest(self, tile: TileT, keep: Callable[[], bool]) -> TileT:
         """Keep the tile; gives what is in the cache instead where that is newer. A full disk stops no drive."""
         try:
             return tile if keep() else self._from_cache(tile.tile_id)
@@ -149,7 +151,7 @@ class Exchange:
             _log.warning("tile %s is not kept: %s", tile.tile_id, error)
             return tile
 
-    def _from_cache(self, tile_id: TileId) -> Tile:
+    def _from_cache(self, tile_id: TileId) -> TileT:
         tile = self._cache.get(tile_id)
         if tile is None:
             raise WrongHash(f"tile {tile_id}: the cached copy does not have its hash; fetch it again")

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from fleet_bus.bus import Bus, open_bus
 from fleet_bus.config import BusConfig
 from fleet_bus.ledger import Ledger
+from gnd_map.tile import Tile
 from schemas.keys import alive_key
 from vehicle_agent.cache import TileCache
 from vehicle_agent.config import AgentConfig
@@ -21,9 +22,9 @@ class Link:
 
     bus: Bus
     ledger: Ledger
-    cache: TileCache
+    cache: TileCache[Tile]
     outbox: Outbox
-    fetcher: TileFetcher
+    fetcher: TileFetcher[Tile]
     sender: SenderThread
 
 
@@ -36,7 +37,7 @@ def open_link(config: AgentConfig) -> Iterator[Link]:
         NoRouter: nothing answers at `config.connect`.
     """
     outbox = Outbox(config.work_dir / "outbox.sqlite")
-    cache = TileCache(config.work_dir / "cache.sqlite", config.layer)
+    cache: TileCache[Tile] = TileCache(config.work_dir / "cache.sqlite", config.layer)
     ledger = Ledger(config.vehicle, config.ledger_path)
     bus_config = BusConfig(connect=config.connect, link=config.link, open_timeout_s=config.open_timeout_s)
     bus = open_bus(bus_config, ledger, config.vehicle)

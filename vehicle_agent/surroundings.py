@@ -34,7 +34,7 @@ class Surroundings:
     def __init__(
         self,
         local_map: LocalMap,
-        fetcher: TileFetcher,
+        fetcher: TileFetcher[Tile],
         detector: ChangeDetector,
         parameters: DownloadParameters,
     ) -> None:
@@ -139,7 +139,7 @@ class Surroundings:
         for tile_id in gone:
             self._fetcher.forget(tile_id)
 
-    def _arrive(self, fetched: Fetched) -> None:
+    def _arrive(self, fetched: Fetched[Tile]) -> None:
         """Take an answer: a tile (or the knowledge that there is none) waits until it is near."""
         if self._map.tile(fetched.tile_id) is None:
             self._arrived[fetched.tile_id] = fetched.tile

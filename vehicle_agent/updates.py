@@ -4,11 +4,12 @@ import logging
 import queue
 from collections import Counter
 from collections.abc import Callable, Collection
+from typing import Generic
 
 from fleet_bus.bus import Bus
 from fleet_bus.subscribing import Subscription
+from gnd_map.content import TileT
 from gnd_map.errors import GndError
-from gnd_map.tile import Tile
 from gnd_map.tile_id import District, TileId
 from schemas.errors import WrongHash
 from schemas.keys import parse_update_key, update_keys
@@ -21,14 +22,16 @@ MOST_DISTRICTS = 4  # as many meet at a corner: a vehicle that turns there need 
 _log = logging.getLogger(__name__)
 
 
-class Updates:
+class Updates(Generic[TileT]):
     """Subscribes to the districts around and ahead; notices wait until the main thread applies them.
 
     Only what happens from now on is listened to: what happened before is in the answers to the vehicle's own
     questions, which it puts after it has subscribed. After a lost connection it asks again about what it holds.
     """
 
-    def __init__(self, bus: Bus, cache: TileCache, fetcher: TileFetcher, on_tile: Callable[[Tile], object]) -> None:
+    def __init__(
+        self, bus: Bus, cache: TileCache[TileT], fetcher: TileFetcher[TileT], on_tile: Callable[[TileT], object]
+    ) -> None:
         self.counts: Counter[str] = Counter()
         self._bus, self._cache, self._fetcher, self._on_tile = bus, cache, fetcher, on_tile
         self._followed: dict[District, Subscription] = {}

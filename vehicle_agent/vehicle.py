@@ -10,6 +10,7 @@ from typing import Any
 
 from gnd_map.geodesy import LocalFrame
 from gnd_map.grid import GridFrame
+from gnd_map.tile import Tile
 from gnd_map.tile_id import TileId
 from schemas.drive import DriveHeader, DriveItem, GnssFix, MotionSample, ReferencePose, Scan
 from schemas.drive_mcap import read_drive, read_header
@@ -47,7 +48,7 @@ class Vehicle:
     stop: threading.Event
     link: Link
     surroundings: Surroundings
-    updates: Updates
+    updates: Updates[Tile]
     localiser: Localiser
     segmenter: MotionSegmenter
     reporter: Reporter
