@@ -207,9 +207,8 @@ def _turn(angle: float) -> float:
 def _linked(before: int, after: int, polar: F64, step: float, beside: Beside) -> bool:
     gap = _turn(polar[after, 0] - polar[before, 0])
     near = min(polar[before, 1], polar[after, 1])
-    return bool(()
-        gap * near < max(beside.link_m, 2.5 * step * near) and abs(polar[after, 1] - polar[before, 1]) < beside.link_m
-    )
+    apart = abs(polar[after, 1] - polar[before, 1])
+    return bool(apart < beside.link_m and gap * near < max(beside.link_m, 2.5 * step * near))
 
 
 @kernel
