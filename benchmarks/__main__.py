@@ -22,8 +22,9 @@ NAMES = (
     "sizes",
     "codec",
     "return-download",
+    "gnss-noise",
 )
-WITH_OPTIONS = ("codec", "return-download")
+WITH_OPTIONS = ("codec", "return-download", "gnss-noise")
 
 
 def main() -> None:

@@ -27,10 +27,20 @@ _CEP_PER_SIGMA: Final = 1.1774
 """Median of the length of a vector of two normal errors of standard deviation 1."""
 
 GNSS_CEP_M: Final = 2.5
-"""u-blox 6 data sheet: 2.5 m CEP; the papers' "2.5 m positioning errors"."""
-ROAD_ERRORS: Final = SensorErrors(
-    gnss_m=GNSS_CEP_M / _CEP_PER_SIGMA * sqrt(2.0), gnss_correlation_s=12.0, gnss_white_m=0.0
-)
+"""Median horizontal error: u-blox 6 data sheet, the papers' "2.5 m positioning errors"."""
+GNSS_CORRELATION_S: Final = 13.4
+GNSS_WHITE_SHARE: Final = 0.30
+"""`python -m benchmarks gnss-noise`: of a car's single-point fixes against its reference."""
+
+
+def road_errors(cep_m: float = GNSS_CEP_M) -> SensorErrors:
+    """Return the errors of a drive whose GNSS has a median horizontal error of `cep_m`."""
+    axis_m = cep_m / _CEP_PER_SIGMA
+    slow_m, white_m = axis_m * sqrt(1.0 - GNSS_WHITE_SHARE), axis_m * sqrt(GNSS_WHITE_SHARE)
+    return SensorErrors(gnss_m=slow_m * sqrt(2.0), gnss_correlation_s=GNSS_CORRELATION_S, gnss_white_m=white_m)
+
+
+ROAD_ERRORS: Final = road_errors()
 
 
 @dataclass(frozen=True, slots=True)
