@@ -82,6 +82,10 @@ class Coverage:
             return 0
         return sum(1 << int(cell) for cell in np.flatnonzero(looks >= self._parameters.looks))
 
+    def touched(self, tile: TileId) -> bool:
+        """Whether any of the tile's cells was in view."""
+        return tile in self._looks
+
     def forget(self, tile: TileId) -> None:
         """The tile was reported."""
         self._looks.pop(tile, None)

@@ -1,0 +1,208 @@
+"""One feature layer on a vehicle that knows its pose: SLAMCU with given poses, where it looked, what it reports."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from math import atan2, nan
+from typing import Final
+
+import numpy as np
+
+from gnd_map.arrays import F64, I64
+from gnd_map.features import Existence, FeatureTile
+from gnd_map.geodesy import LocalFrame
+from gnd_map.tile_id import TileId
+from schemas.features import FeatureChange, Found, Seen
+from vehicle_agent.features.coverage import Coverage, CoverageParameters
+from vehicle_agent.features.feature_map import features_in_map, place_in_tile, with_height
+from vehicle_agent.features.layer_parameters import LayerParameters
+from vehicle_agent.features.look import Look, MapFeatures
+from vehicle_agent.features.slamcu import Slamcu
+from vehicle_agent.features.verdicts import KnownState
+from vehicle_agent.features.view import Occlusion
+from vehicle_agent.surroundings import left_behind
+
+SIGMA_HEIGHT_M: Final = 0.5
+"""Of a height that a detector has told."""
+AGAIN_M: Final = 1.5
+"""A detection of another kind of the same detector this near to a feature of the layer is that feature: the head of a
+lamp is not seen from everywhere, and then its mast is a pole."""
+LARGEST_MASS: Final = 1.0 - 1e-4
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class PlacedLook:
+    """A look, and where it was taken from.
+
+    Attributes:
+        look: what the detector found.
+        pose: (3,) x, y [m], heading [rad] in the map frame.
+        cov: (3, 3) of the pose.
+        z_m: height of the vehicle's origin in the map frame.
+    """
+
+    look: Look
+    pose: F64
+    cov: F64
+    z_m: float
+
+
+class FeatureLayer:
+    """Judges the features of a layer along one drive; tiles that were left give what is to be reported.
+
+    Args:
+        parameters: the layer, its sensor.
+        coverage: when a place counts as looked at.
+        frame: the map frame.
+    """
+
+    def __init__(self, parameters: LayerParameters, coverage: CoverageParameters, frame: LocalFrame) -> None:
+        self.parameters, self._frame = parameters, frame
+        self._slamcu = Slamcu(parameters.slamcu, MapFeatures.none(), np.zeros(3), np.eye(3) * 1e-4)
+        self._coverage = Coverage(frame, parameters.view, parameters.height_m, coverage)
+        self._held: dict[TileId, FeatureTile] = {}
+        self._ids: dict[TileId, tuple[int, ...]] = {}
+        self._told: set[int] = set()
+        self._z_m = 0.0
+
+    @property
+    def tiles(self) -> list[TileId]:
+        """Tiles about which there is evidence, sorted."""
+        return self._coverage.tiles
+
+    def holds(self, tile_id: TileId) -> FeatureTile | None:
+        """The version of a tile that the vehicle compares with."""
+        return self._held.get(tile_id)
+
+    def hold(self, tile: FeatureTile) -> bool:
+        """Compare with this version from now on, unless there is evidence against an older one already."""
+        if tile.tile_id in self._held and (self._coverage.touched(tile.tile_id) or self._held[tile.tile_id] == tile):
+            return False
+        self._let_go(tile.tile_id)
+        known = features_in_map(self._frame, tile, self.parameters.kinds)
+        self._slamcu.hold(known)
+        self._held[tile.tile_id] = tile
+        self._ids[tile.tile_id] = tuple(int(feature_id) for feature_id in known.feature_id)
+        return True
+
+    def see(self, placed: PlacedLook, occlusion: Occlusion | None) -> None:
+        """Take one look from a known pose."""
+        self._slamcu.set_pose(placed.pose, placed.cov)
+        self._slamcu.look(self._own(placed), self.parameters.view, occlusion)
+        x_m, y_m, heading_rad = placed.pose.tolist()
+        self._coverage.look(x_m, y_m, heading_rad, occlusion)
+        self._z_m = placed.z_m
+
+    def leave(self, p_map_m: F64, distance_m: float) -> list[FeatureChange]:
+        """What is to be said of the tiles farther away than `distance_m`; they are forgotten."""
+        return [self._decide(tile_id) for tile_id in left_behind(self._frame, self.tiles, p_map_m, distance_m)]
+
+    def leave_all(self) -> list[FeatureChange]:
+        """The drive has ended: what is to be said of every tile."""
+        return [self._decide(tile_id) for tile_id in self.tiles]
+
+    # What a look means for this layer
+
+    def _own(self, placed: PlacedLook) -> Look:
+        """The detections that belong to the layer, those of another kind at one of its features among them."""
+        look, kinds = placed.look, self.parameters.kinds
+        c, s = np.cos(placed.pose[2]), np.sin(placed.pose[2])
+        ahead, left = look.range_m * np.cos(look.bearing_rad), look.range_m * np.sin(look.bearing_rad)
+        xy = placed.pose[:2] + np.column_stack([c * ahead - s * left, s * ahead + c * left])
+        near = self._at_features(xy)
+        told = [kind if kind in kinds else near[i] for i, kind in enumerate(look.kinds)]
+        rows = np.array([i for i, kind in enumerate(told) if kind], np.int64)
+        return taken(look, rows, [told[i] for i in rows])
+
+    def _at_features(self, xy_m: F64) -> list[str]:
+        """The kind of the layer's feature at each of some places, empty where there is none."""
+        if not len(xy_m):
+            return []
+        places, kinds = self._places()
+        if not kinds:
+            return [""] * len(xy_m)
+        gap = np.linalg.norm(xy_m[:, None] - places[None], axis=2)
+        nearest = gap.argmin(axis=1)
+        return [kinds[j] if gap[i, j] < AGAIN_M else "" for i, j in enumerate(nearest)]
+
+    def _places(self) -> tuple[F64, list[str]]:
+        found = self._slamcu.new_features(unclassified=True)
+        held = [features_in_map(self._frame, tile, self.parameters.kinds) for tile in self._held.values()]
+        places = [*(one.xy_m for one in held), *(one.position_m[None] for one in found)]
+        kinds = [*(kind for one in held for kind in one.kind), *(one.kind for one in found)]
+        return np.concatenate(places) if kinds else np.zeros((0, 2)), kinds
+
+    # What is said of a tile
+
+    def _decide(self, tile_id: TileId) -> FeatureChange:
+        base = self._held.get(tile_id)
+        states = {state.feature_id: state for state in self._slamcu.known_states()}
+        judged = [states[one] for one in sorted(self._ids.get(tile_id, ())) if one in states]
+        change = FeatureChange(
+            tile=tile_id,
+            base_version=base.version if base else 0,
+            base_sha=base.sha if base else b"",
+            viewed=self._coverage.viewed(tile_id),
+            seen=tuple(self._seen(tile_id, state) for state in judged if state.hits + state.misses),
+            found=tuple(self._found(tile_id)),
+        )
+        self._coverage.forget(tile_id)
+        self._let_go(tile_id)
+        return change
+
+    def _let_go(self, tile_id: TileId) -> None:
+        self._slamcu.forget(self._ids.pop(tile_id, ()))
+        self._held.pop(tile_id, None)
+
+    def _seen(self, tile_id: TileId, state: KnownState) -> Seen:
+        existence = of_counts(state.hits, state.misses, self.parameters.detection_confidence)
+        if state.position_m is None or state.cov_m2 is None:
+            return Seen(state.feature_id, existence, state.hits)
+        _, point, cov = self._placed(state.position_m, state.cov_m2, nan, tile_id)
+        return Seen(state.feature_id, existence, state.hits, point[0], cov)
+
+    def _found(self, tile_id: TileId) -> list[Found]:
+        """The new features of a tile that exist and were not reported yet."""
+        found: list[Found] = []
+        for one in self._slamcu.new_features():
+            tile, point, cov = self._placed(one.position_m, one.cov_m2, one.height_m)
+            if tile == tile_id and one.number not in self._told:
+                self._told.add(one.number)
+                found.append(Found(one.kind, point, cov, bounded(one.existence), one.hits))
+        return found
+
+    def _placed(self, xy_m: F64, cov: F64, height_m: float, tile_id: TileId | None = None) -> tuple[TileId, F64, F64]:
+        point, full = with_height(xy_m, cov, self._z_m + height_m, SIGMA_HEIGHT_M, self._z_m)
+        return place_in_tile(self._frame, point, full, tile_id)
+
+
+def taken(look: Look, rows: I64, kinds: Sequence[str]) -> Look:
+    """Some detections of a look, with these kinds."""
+    columns = (look.range_m, look.bearing_rad, look.sigma_range_m, look.sigma_bearing_rad)
+    range_m, bearing_rad, sigma_range_m, sigma_bearing_rad = (column[rows] for column in columns)
+    height_m = None if look.height_m is None else look.height_m[rows]
+    return Look(look.t_ns, range_m, bearing_rad, sigma_range_m, sigma_bearing_rad, tuple(kinds), height_m)
+
+
+def of_counts(hits: int, misses: int, confidence: float) -> Existence:
+    """Masses of so many detections and misses, begun vacuous: what this drive alone says. SLAMCU, Eq. (1), (2), (5).
+
+    Combined in closed form: with u = (1 - λ)^n of either kind, m(∃) ∝ (1 - u_hit) u_miss, m(∄) ∝ (1 - u_miss) u_hit,
+    m(Ω) ∝ u_hit u_miss, whatever their order.
+    """
+    fewer = min(hits, misses)  # u_hit and u_miss over their common factor: nothing underflows to 0 / 0
+    u_hit, u_miss = (1.0 - confidence) ** (hits - fewer), (1.0 - confidence) ** (misses - fewer)
+    of_hits, of_misses = 1.0 - (1.0 - confidence) ** hits, 1.0 - (1.0 - confidence) ** misses
+    masses = np.array([of_hits * u_miss, of_misses * u_hit, (1.0 - confidence) ** max(hits, misses)])
+    exist, absent, _ = np.minimum(masses / masses.sum(), LARGEST_MASS)
+    return Existence(float(exist), float(absent), float(1.0 - exist - absent), min(of_hits * of_misses, LARGEST_MASS))
+
+
+def bounded(existence: Existence) -> Existence:
+    """Masses with their rounding taken out, so that they sum to 1."""
+    exist, absent = max(existence.exist, 0.0), max(existence.absent, 0.0)
+    return replace(existence, exist=exist, absent=absent, unknown=max(1.0 - exist - absent, 0.0))
+
+
+def pose_of(T_map_vehicle: F64) -> F64:
+    """(3,) x, y, heading of a pose (4, 4)."""
+    return np.array([*T_map_vehicle[:2, 3], atan2(T_map_vehicle[1, 0], T_map_vehicle[0, 0])])
