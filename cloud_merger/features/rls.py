@@ -1,0 +1,74 @@
+"""Recursive least squares of a feature's place (NFL, "Crowd-Sourced Mapping of New Feature Layer", Eq. (11)-(12)).
+
+A state is the points (N, 3) of a feature with one covariance (3, 3) of each of them; a point has N = 1. Of a polyline
+only what lies across the line can be measured, so a measured line is first brought to the state's own vertices.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+
+from cloud_merger.features.shapes import onto
+from gnd_map.arrays import F64
+
+_I3: Final = np.eye(3)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Place:
+    """Where something is.
+
+    Attributes:
+        points_m: (N, 3) in the tile's ENU frame.
+        cov_m2: (3, 3) of each point.
+    """
+
+    points_m: F64
+    cov_m2: F64
+
+    def scaled(self, factor: float) -> "Place":
+        """The same with a covariance `factor` times as large."""
+        return Place(self.points_m, self.cov_m2 * factor) if factor != 1.0 else self
+
+
+def step(state: Place, measured: Place) -> Place:
+    """The state after one more measurement. NFL, Eq. (12) with H = I, in Joseph form.
+
+    Args:
+        state: x_{k-1} and P_{k-1}.
+        measured: y_k and R_k.
+    """
+    P, R = state.cov_m2, measured.cov_m2
+    K = np.linalg.solve(P + R, P).T  # Eq. (12): P (P + R)^-1, both symmetric
+    points_m = state.points_m + (onto(state.points_m, measured.points_m) - state.points_m) @ K.T  # Eq. (12)
+    J = _I3 - K
+    cov = J @ P @ J.T + K @ R @ K.T  # Eq. (12), Joseph form: positive whatever the rounding
+    return Place(points_m, 0.5 * (cov + cov.T))
+
+
+def estimate(measured: Sequence[Place], known: Place | None = None) -> Place:
+    """What all measurements say together, one after the other.
+
+    Args:
+        measured: at least one unless `known` is given.
+        known: what was known before; None: the first measurement is where it begins. NFL, Eq. (11).
+    """
+    state, rest = (measured[0], measured[1:]) if known is None else (known, measured)  # Eq. (11): x_0 = y_0, P_0 = R_0
+    for one in rest:
+        state = step(state, one)
+    return state
+
+
+def fused(repeats: Sequence[Place], information: float) -> Place:
+    """One vehicle's measurements of one feature as a single one.
+
+    Its n errors have something in common. Of n equally good ones with correlation ρ each, the mean has the variance
+    R (1 + (n - 1) ρ) / n, which is what this gives.
+
+    Args:
+        repeats: n >= 1 measurements.
+        information: n / (1 + (n - 1) ρ), `FeatureMergeParameters.information_of`.
+    """
+    return estimate(repeats).scaled(len(repeats) / information)

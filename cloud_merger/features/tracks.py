@@ -1,0 +1,259 @@
+"""Hypotheses about features of a tile, built report by report: what each is, who measured it, who judged it."""
+
+from collections import Counter
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from cloud_merger.features.association import costs, fits, pairs
+from cloud_merger.features.parameters import FeatureMergeParameters
+from cloud_merger.features.rls import Place, step
+from cloud_merger.features.statements import Attributes, Claimed, Statement
+from gnd_map.features import Existence, Feature, feature_id_of, full_covariance
+from schemas.feature_change import Seen
+
+Bases = Mapping[bytes, Mapping[int, tuple[Feature, ...]]]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Measured:
+    """One report's measurement of a feature; `is_found`: anew, not as one of the map's."""
+
+    vehicle: str
+    place: Place
+    is_found: bool
+    attributes: Attributes
+
+
+@dataclass(frozen=True, slots=True)
+class Vote:
+    """One report's verdict on a feature."""
+
+    vehicle: str
+    existence: Existence
+    hits: int = 0
+
+
+@dataclass(slots=True, eq=False)
+class Track:
+    """A hypothesis about one feature.
+
+    Attributes:
+        feature_id: of the map's feature, or of who found it first.
+        kind: of the feature.
+        state: running estimate, for association; it takes every measurement as it comes.
+        epoch: the map's feature; None: a candidate.
+        quoted: a feature of a later version whose finders are no longer among the reports.
+        measured: by number of the report.
+        votes: by number of the report.
+        repeats: how often each vehicle has measured it.
+    """
+
+    feature_id: int
+    kind: str
+    state: Place
+    epoch: Feature | None = None
+    quoted: Feature | None = None
+    measured: dict[int, Measured] = field(default_factory=dict)
+    votes: dict[int, Vote] = field(default_factory=dict)
+    repeats: dict[str, int] = field(default_factory=dict)
+
+    @property
+    def attributes(self) -> Attributes:
+        """Those of the map, for what stands elsewhere now."""
+        said = self.epoch or self.quoted
+        return said.attributes if said else ()
+
+    @property
+    def first(self) -> int:
+        """Number of the first report that speaks for it; -1 for a feature of the map."""
+        return -1 if self.epoch is not None or self.quoted is not None else min(self.measured, default=-1)
+
+    def measure(self, report: int, measured: Measured, parameters: FeatureMergeParameters) -> None:
+        """Take a measurement. The n-th of one vehicle weighs what it adds to what n of them weigh."""
+        n = self.repeats.get(measured.vehicle, 0) + 1
+        adds = parameters.information_of(n) - parameters.information_of(n - 1)
+        self.repeats[measured.vehicle] = n
+        self.measured[report] = measured
+        if adds > 0.0:
+            self.state = step(self.state, measured.place.scaled(1.0 / adds))
+
+
+class Tracks:
+    """All hypotheses about the features of a tile; statements are to come in the order of their report ids.
+
+    Args:
+        epoch: the map's features.
+        bases: contents of the versions that reports refer to, by hash.
+        parameters: of the merge.
+    """
+
+    def __init__(self, epoch: Iterable[Feature], bases: Bases, parameters: FeatureMergeParameters) -> None:
+        self._parameters, self._bases = parameters, bases
+        self.all: list[Track] = []
+        self._by_id: dict[int, list[Track]] = {}
+        self._begun: Counter[str] = Counter()
+        self._elsewhere: list[tuple[Track, int, int]] = []  # map feature, report, id of the claim that it moved
+        for feature in epoch:
+            self._begin(_of_map(feature, epoch=feature))
+
+    def hear(self, report: int, said: Statement) -> None:
+        """Take all that one report says: verdicts first, then what is found among what it has not judged."""
+        judged: set[int] = set()
+        claims = list(said.found)
+        for seen in said.seen:
+            for track in self._named(seen.feature_id, said.base_sha):
+                judged.add(id(track))
+                elsewhere = self._judge(track, report, said, seen)
+                claims += [] if elsewhere is None else [elsewhere]
+        for kind, is_point in sorted({(one.kind, len(one.place.points_m) == 1) for one in claims}):
+            like = [one for one in claims if (one.kind, len(one.place.points_m) == 1) == (kind, is_point)]
+            self._associate(report, said, like, judged)
+
+    def _named(self, feature_id: int, base_sha: bytes | None) -> Sequence[Track]:
+        """The tracks of a map feature; one that only an old version names begins anew, quoted from there."""
+        known = self._by_id.get(feature_id, [])
+        if known or base_sha is None:
+            return known
+        for feature in self._bases.get(base_sha, {}).get(feature_id, ()):
+            self._begin(_of_map(feature, quoted=feature))
+        return self._by_id.get(feature_id, [])
+
+    def _begin(self, track: Track) -> Track:
+        self.all.append(track)
+        self._by_id.setdefault(track.feature_id, []).append(track)
+        return track
+
+    def _judge(self, track: Track, report: int, said: Statement, seen: Seen) -> Claimed | None:
+        """A verdict on a map feature; a claim when it was measured where that feature cannot be.
+
+        Outside the gate the map's feature is not touched: what stands elsewhere is a candidate of its own. Who is right
+        is decided when all have been heard (`settle`).
+        """
+        track.votes[report] = Vote(said.vehicle, seen.existence, seen.hits)
+        if seen.position_m is None or seen.cov_m2 is None or len(track.state.points_m) > 1:
+            return None
+        place = Place(seen.position_m[None], full_covariance(seen.cov_m2))
+        if fits(place, track.state, self._parameters):
+            track.measure(report, Measured(said.vehicle, place, False, ()), self._parameters)
+            return None
+        apart = place.points_m[0] - track.state.points_m[0]
+        if np.hypot(apart[0], apart[1]) <= self._parameters.moved_m or seen.existence.exist <= seen.existence.absent:
+            return None
+        name = feature_id_of(said.report_id, "elsewhere", track.feature_id)
+        self._elsewhere.append((track, report, name))
+        return Claimed(name, track.kind, place, seen.existence, seen.hits, track.attributes, is_found=False)
+
+    def _associate(self, report: int, said: Statement, claims: Sequence[Claimed], judged: set[int]) -> None:
+        """Claims of one kind and shape, one-to-one among the tracks that this report has not judged."""
+        kind, is_point = claims[0].kind, len(claims[0].place.points_m) == 1
+        # What a report names that has come before the finder's: the track is there under that very id.
+        named = {
+            i: track
+            for i, one in enumerate(claims)
+            for track in self._by_id.get(one.feature_id, [])[:1]
+            if id(track) not in judged and report not in track.measured
+        }
+        rest = [i for i in range(len(claims)) if i not in named]
+        open_to = [
+            track
+            for track in self.all
+            if track.kind == kind
+            and (len(track.state.points_m) == 1) == is_point
+            and id(track) not in judged
+            and report not in track.measured
+            and not any(track is other for other in named.values())
+        ]
+        places, states = [claims[i].place for i in rest], [track.state for track in open_to]
+        named |= {rest[i]: open_to[j] for i, j in pairs(places, states, self._parameters)}
+        for i, claim in enumerate(claims):
+            self._take(report, said, claim, named.get(i))
+
+    def _take(self, report: int, said: Statement, claim: Claimed, track: Track | None) -> None:
+        measured = Measured(said.vehicle, claim.place, claim.is_found, claim.attributes)
+        if track is None:
+            if self._begun[said.vehicle] >= self._parameters.max_begun:
+                return
+            self._begun[said.vehicle] += 1
+            track = self._begin(Track(claim.feature_id, claim.kind, claim.place))  # NFL, Eq. (11)
+            track.measured[report], track.repeats[said.vehicle] = measured, 1
+        else:
+            self._by_id.setdefault(claim.feature_id, [track])
+            track.measure(report, measured, self._parameters)
+        track.votes[report] = Vote(said.vehicle, claim.existence, claim.hits)
+
+    def settle(self) -> None:
+        """After the last report: join what turned out to be one, then let those vote against a map feature's place who
+        measured it where several vehicles agree that it stands now.
+        """
+        self._join_all()
+        for track, report, name in self._elsewhere:
+            if any(self._confirms(other) and other is not track for other in self._by_id.get(name, [])):
+                vote = track.votes[report]
+                there = vote.existence
+                track.votes[report] = Vote(vote.vehicle, Existence(there.absent, there.exist, there.unknown), vote.hits)
+
+    def _confirms(self, track: Track) -> bool:
+        return len(track.repeats) >= self._parameters.min_vehicles
+
+    def names_of(self) -> dict[int, set[int]]:
+        """All ids under which each track (by `id`) has been known."""
+        names: dict[int, set[int]] = {}
+        for name, tracks in self._by_id.items():
+            for track in tracks:
+                names.setdefault(id(track), set()).add(name)
+        return names
+
+    def _join_all(self) -> None:
+        """Join hypotheses that may be one, the likeliest first: inside the gates of each other, not both the map's, and
+        no report has told them apart. Again with what came of it, until nothing changes.
+        """
+        while couples := [couple for late in self.all if (couple := self._partner(late)) is not None]:
+            changed: set[int] = set()
+            for _, early, late in sorted(couples, key=lambda couple: couple[0]):
+                if changed.isdisjoint((id(early), id(late))):
+                    self._join(early, late)
+                    changed |= {id(early), id(late)}
+
+    def _partner(self, late: Track) -> tuple[float, Track, Track] | None:
+        """The likeliest earlier hypothesis that may be the same as this one: (cost, earlier, this one)."""
+        if late.epoch is not None:
+            return None
+        number = self.all.index(late)
+        early = [track for track in self.all[:number] if _may_be_one(track, late)]
+        if not early:
+            return None
+        cost = costs([late.state], [track.state for track in early], self._parameters)[0]
+        k = int(np.argmin(cost))
+        return (float(cost[k]), early[k], late) if np.isfinite(cost[k]) else None
+
+    def _join(self, early: Track, late: Track) -> None:
+        """All that was said of the later hypothesis counts for the earlier, in the order of the reports."""
+        self.all.remove(late)
+        for tracks in self._by_id.values():
+            tracks[:] = [early if track is late else track for track in tracks]
+        measured = sorted({**early.measured, **late.measured}.items())
+        early.votes = dict(sorted({**early.votes, **late.votes}.items()))
+        early.measured, early.repeats = {}, {}
+        known = early.epoch or early.quoted
+        if known is None:
+            (number, first), *measured = measured
+            early.state, early.measured[number], early.repeats[first.vehicle] = first.place, first, 1
+        else:
+            early.state = _place_of(known)
+        for number, one in measured:
+            early.measure(number, one, self._parameters)
+
+
+def _may_be_one(a: Track, b: Track) -> bool:
+    alike = a.kind == b.kind and (len(a.state.points_m) == 1) == (len(b.state.points_m) == 1)
+    return alike and a.votes.keys().isdisjoint(b.votes)
+
+
+def _of_map(feature: Feature, epoch: Feature | None = None, quoted: Feature | None = None) -> Track:
+    return Track(feature.feature_id, feature.kind, _place_of(feature), epoch, quoted)
+
+
+def _place_of(feature: Feature) -> Place:
+    return Place(feature.points_m, full_covariance(feature.cov_m2))
