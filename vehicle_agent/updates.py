@@ -47,6 +47,11 @@ class Updates(Generic[TileT]):
         for district in list(self._followed)[: -max(MOST_DISTRICTS, len(districts))]:
             self._followed.pop(district).close()
 
+    def close(self) -> None:
+        """Listen to nothing any more."""
+        while self._followed:
+            self._followed.popitem()[1].close()
+
     def _subscribe(self, district: District) -> Subscription:
         """A whole district: a subscription a tile costs more to declare than the notices that it keeps away."""
         return self._bus.subscribe(
