@@ -5,7 +5,7 @@ from collections.abc import Iterable, Mapping
 from typing import TypeAlias
 
 from gnd_map.errors import FeatureError
-from gnd_map.features import Feature, FeatureTile, join_pieces, pieces_of
+from gnd_map.features import Feature, FeatureTile, join_pieces, pieces_of, snapped
 from gnd_map.tile_id import TileId
 from tile_store.feature_io.errors import BadGeometry, FeatureFileError
 from tile_store.feature_io.osm_document import Progress
@@ -25,7 +25,7 @@ def cut(features: Iterable[MapFeature], total: int = 0, progress: Progress | Non
     found: Pieces = defaultdict(lambda: defaultdict(list))
     for number, feature in enumerate(features):
         try:
-            pieces = pieces_of(feature.feature(), feature.lat_rad, feature.lon_rad, feature.height_m)
+            pieces = _pieces(feature)
         except FeatureError as error:
             raise BadGeometry(f"{feature.name or feature.feature_id}: {error}") from None
         for tile, piece in pieces:
@@ -33,6 +33,16 @@ def cut(features: Iterable[MapFeature], total: int = 0, progress: Progress | Non
         if progress and number % _EVERY == 0:
             progress("cutting into tiles", number, total)
     return found
+
+
+def _pieces(feature: MapFeature) -> list[tuple[TileId, Feature]]:
+    """The snapped pieces; a cut polyline is cut again where it lies once snapped, so that it is the same when what was
+    exported is imported.
+    """
+    pieces = pieces_of(feature.feature(), feature.lat_rad, feature.lon_rad, feature.height_m)
+    if len(pieces) > 1:
+        pieces = pieces_of(feature.feature(), *join_pieces([(tile, snapped(piece)) for tile, piece in pieces]))
+    return pieces
 
 
 def whole(tiles: Mapping[str, Iterable[FeatureTile]]) -> list[MapFeature]:
