@@ -1,4 +1,4 @@
-"""The commands `gnd sim world` and `gnd sim drive`; each is a thin layer over a library function."""
+"""The commands `gnd sim world`, `gnd sim drive` and `gnd sim road`; each is a thin layer over a library function."""
 
 import json
 from math import degrees
@@ -110,3 +110,25 @@ def drive(
     )
     simulate_drive(read_world(world_file), config, file)
     click.echo(f"{file}: {file.stat().st_size / 1e6:.1f} MB")
+
+
+@sim.group()
+def road() -> None:
+    """Roads of the feature studies: motorways and a test track, with what detectors see on a drive."""
+
+
+@road.command("picture")
+@click.argument("kind", type=click.Choice(["motorway", "test-track", "streetlights", "streetlights-straight"]))
+@click.argument("png", type=click.Path(path_type=Path))
+@click.option("--seed", default=11, show_default=True, help="Seed of the road.")
+@click.option("--drive", "drive_seed", default=1, show_default=True, help="Seed of the drive.")
+def road_picture(kind: str, png: Path, seed: int, drive_seed: int) -> None:
+    """Draw a road of KIND and one drive along it to PNG."""
+    from fleet_sim.roads.drive import drive_route
+    from fleet_sim.roads.pictures import draw_drive
+    from fleet_sim.roads.routes import route_named
+
+    driven = drive_route(route_named(kind, seed), drive_seed)
+    draw_drive(driven, png)
+    detections = sum(len(look) for look in driven.looks)
+    click.echo(f"{png}: {driven.route.length_m:.0f} m, {len(driven.looks)} looks, {detections} detections")
