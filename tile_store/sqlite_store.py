@@ -111,7 +111,7 @@ class SqliteStore:
         self, layer: str, tile: TileId, max_reports: int | None = None
     ) -> tuple[StoredTile | None, tuple[ReportRow, ...]]:
         """See `Store.in_play`."""
-        n = self._config.max_reports if max_reports is None else max_reports
+        n = self._config.max_reports_of(layer) if max_reports is None else max_reports
         with self._readers.snapshot() as c:
             epoch = versions.epoch_of(c, layer, tile)
             base = versions.stored(c, "stored_version", layer, tile, version=epoch) if epoch else None
@@ -164,7 +164,7 @@ class SqliteStore:
 
     def load(self, claim: Claim, max_reports: int | None = None) -> TileWork:
         """See `Store.load`."""
-        n = self._config.max_reports if max_reports is None else max_reports
+        n = self._config.max_reports_of(claim.layer) if max_reports is None else max_reports
         with self._readers.snapshot() as c:
             head = versions.stored(c, "stored_head", claim.layer, claim.tile)
             epoch = versions.epoch_of(c, claim.layer, claim.tile)
@@ -282,7 +282,7 @@ class SqliteStore:
         """See `Store.gc`."""
         if keep_versions < 1:
             raise StoreError(f"keep_versions is {keep_versions}; at least the newest version stays")
-        return self._writer.run(lambda c: versions.collect(c, keep_versions, self._config.max_reports))
+        return self._writer.run(lambda c: versions.collect(c, keep_versions, self._config.max_reports_of))
 
     def backup(self, path: str | Path) -> None:
         """See `Store.backup` (VACUUM INTO)."""

@@ -1,5 +1,6 @@
 """Tile versions in SQLite: each function runs inside the caller's transaction."""
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
@@ -82,13 +83,13 @@ def epoch_of(c: apsw.Connection, layer: str, tile: TileId) -> int:
     return _head(c, layer, tile).epoch
 
 
-def collect(c: apsw.Connection, keep_versions: int, max_reports: int) -> GcResult:
+def collect(c: apsw.Connection, keep_versions: int, max_reports_of: Callable[[str], int]) -> GcResult:
     """Remove versions older than the newest `keep_versions` of each tile, but for epochs and what reports cite."""
     sizes: list[int] = []
     for layer, morton in fetch(c, "tiles_with_history", {"keep": keep_versions}):
         head = _head(c, layer, TileId(morton))
         wanted = {"layer": layer, "tile": morton, "epoch": head.epoch, "oldest": head.version - keep_versions + 1}
-        sizes += [size for (size,) in fetch(c, "delete_old_versions", wanted | {"max_reports": max_reports})]
+        sizes += [size for (size,) in fetch(c, "delete_old_versions", wanted | {"max_reports": max_reports_of(layer)})]
     return GcResult(len(sizes), sum(sizes))
 
 

@@ -6,7 +6,7 @@ from typing import Final, Literal
 
 from gnd_map.codec import LATTICES, Lattice
 from gnd_map.content import AnyTile, encode_content, fits_layer, noun_of
-from gnd_map.features import FeatureTile
+from gnd_map.features import FeatureTile, is_feature_layer
 from gnd_map.tile import Tile
 from gnd_map.tile_id import TileId
 from schemas.limits import MAX_TILE_BODY_BYTES
@@ -77,7 +77,9 @@ class StoreConfig:
     merge_after_reports: int = 8
     """or at once when so many reports wait."""
     max_reports: int = 64
-    """`load` gives at most the newest so many reports of a tile (by report id)."""
+    """`load` gives at most the newest so many reports of a tile (by report id),"""
+    max_feature_reports: int = 1024
+    """of a tile of a feature layer so many: they are some 100 bytes each."""
     busy_timeout_s: float = 30.0
     """A writer waits this long for the writers of other processes."""
     group_max: int = 256
@@ -88,8 +90,12 @@ class StoreConfig:
             raise StoreError(
                 f"merge_delay_s {self.merge_delay_s} and busy_timeout_s {self.busy_timeout_s} must be >= 0"
             )
-        if min(self.merge_after_reports, self.max_reports, self.group_max) < 1:
-            raise StoreError("merge_after_reports, max_reports and group_max must be at least 1")
+        if min(self.merge_after_reports, self.max_reports, self.max_feature_reports, self.group_max) < 1:
+            raise StoreError("merge_after_reports, max_reports, max_feature_reports and group_max must be at least 1")
+
+    def max_reports_of(self, layer: str) -> int:
+        """How many reports of a tile of this layer count."""
+        return self.max_feature_reports if is_feature_layer(layer) else self.max_reports
 
 
 @dataclass(frozen=True, slots=True)

@@ -108,7 +108,14 @@ def test_quarantine_keeps_bytes_reason_and_count(store: Store, clock: Clock) -> 
 
 
 @pytest.mark.parametrize(
-    "bad", [{"merge_delay_s": -1.0}, {"busy_timeout_s": 0.0}, {"max_reports": 0}, {"group_max": 0}]
+    "bad",
+    [
+        {"merge_delay_s": -1.0},
+        {"busy_timeout_s": 0.0},
+        {"max_reports": 0},
+        {"max_feature_reports": 0},
+        {"group_max": 0},
+    ],
 )
 def test_a_configuration_that_cannot_work_is_refused(bad: dict[str, float]) -> None:
     with pytest.raises(StoreError):

@@ -1,0 +1,191 @@
+"""Which reports about features are refused, beyond what `schemas` accepts of any: those that cannot be true.
+
+Every refusal names the tile, the feature and the numbers; the report goes to quarantine as a whole.
+"""
+
+from collections.abc import Callable, Collection, Sequence
+from dataclasses import dataclass
+from itertools import combinations
+from typing import Final
+
+import numpy as np
+
+from cloud_merger.errors import BadReport, MergerError
+from gnd_map.arrays import F64
+from gnd_map.errors import FeatureError
+from gnd_map.features import UNKNOWN_HEIGHT_M2, check_simple_polyline, full_covariance
+from gnd_map.geodesy import LocalFrame
+from gnd_map.tile_id import TileId
+from schemas.feature_change import LANE_KINDS, FeatureChange, Found
+from schemas.features import FeatureReport
+
+_HEIGHT_KNOWN_M2: Final = 100.0
+_ROUNDING: Final = 1.01
+"""Covariances travel on levels that are some per cent apart; a limit that is met before is met after."""
+
+IdsOf = Callable[[TileId, bytes], Collection[int] | None]
+"""Ids of the features of a version of a tile, by hash; None: there is no such version."""
+
+
+@dataclass(frozen=True, slots=True)
+class FeatureLimits:
+    """What a statement about features may say.
+
+    Attributes:
+        min_sigma_m: no vehicle knows a place better in any direction: below the millimetre is a mistake of units.
+        max_sigma_m: horizontally; a place known no better than this is none.
+        max_outside_m: a measured map feature may lie this far outside its tile.
+        max_features_of_tile: found and judged features of one tile of 38 m.
+        max_vertices: vertices of a found polyline in one tile.
+        min_verdicts: from so many judged map features on the share of deleted ones is looked at.
+        max_deleted_share: a drive that finds a larger share of the map's features gone has not looked, or lies.
+        duplicate_m: two found features of one kind that are nearer than this and alike are one, sent twice.
+    """
+
+    min_sigma_m: float = 1e-3
+    max_sigma_m: float = 30.0
+    max_outside_m: float = 25.0
+    max_features_of_tile: int = 256
+    max_vertices: int = 512
+    min_verdicts: int = 5
+    max_deleted_share: float = 0.5
+    duplicate_m: float = 0.1
+
+    def __post_init__(self) -> None:
+        if not 0 < self.min_sigma_m < self.max_sigma_m <= 100:
+            raise MergerError(
+                f"min_sigma_m {self.min_sigma_m} and max_sigma_m {self.max_sigma_m} must ascend in (0, 100] m"
+            )
+        if min(self.max_outside_m, self.duplicate_m) < 0:
+            raise MergerError(
+                f"max_outside_m {self.max_outside_m} and duplicate_m {self.duplicate_m} must not be negative"
+            )
+        if min(self.max_features_of_tile, self.max_vertices, self.min_verdicts) < 1:
+            raise MergerError("max_features_of_tile, max_vertices and min_verdicts must be at least 1")
+        if not 0 < self.max_deleted_share <= 1:
+            raise MergerError(f"max_deleted_share must lie in (0, 1], got {self.max_deleted_share}")
+
+
+def check_feature_report(report: FeatureReport, limits: FeatureLimits, ids_of: IdsOf) -> None:
+    """Refuse a report that cannot be a true statement about this map.
+
+    Args:
+        report: that came.
+        limits: what it may say.
+        ids_of: what the map holds.
+
+    Raises:
+        BadReport: says what is wrong with it, and where, with numbers.
+    """
+    _check_verdicts(report, limits)
+    for change in report.tiles:
+        _check_amount(change, limits)
+        _check_base(change, ids_of)
+        for seen in change.seen:
+            if seen.position_m is not None and seen.cov_m2 is not None:
+                name = f"tile {change.tile}, map feature {seen.feature_id}"
+                _check_covariance(name, seen.cov_m2, limits)
+                _check_inside(name, change.tile, seen.position_m, limits)
+        for number, found in enumerate(change.found):
+            _check_found(f"tile {change.tile}, found {found.kind} {number}", found, limits)
+        _check_duplicates(change, limits)
+
+
+def _check_verdicts(report: FeatureReport, limits: FeatureLimits) -> None:
+    judged = [seen.existence.state for change in report.tiles for seen in change.seen]
+    gone = judged.count("absent")
+    if len(judged) >= limits.min_verdicts and gone > limits.max_deleted_share * len(judged):
+        raise BadReport(
+            f"{gone} of {len(judged)} judged features are said to be deleted, the limit is "
+            f"{limits.max_deleted_share:g} of {limits.min_verdicts} or more: so much does not go at once"
+        )
+
+
+def _check_amount(change: FeatureChange, limits: FeatureLimits) -> None:
+    if change.n_features > limits.max_features_of_tile:
+        raise BadReport(
+            f"tile {change.tile}: {len(change.found)} features found, {len(change.seen)} judged, the limit is "
+            f"{limits.max_features_of_tile} together"
+        )
+
+
+def _check_base(change: FeatureChange, ids_of: IdsOf) -> None:
+    if not change.base_sha:
+        return
+    known = ids_of(change.tile, change.base_sha)
+    if known is None:
+        raise BadReport(
+            f"tile {change.tile}: no version of the map has sha {change.base_sha.hex()[:16]}… (the report says version "
+            f"{change.base_version}); fetch the tile again"
+        )
+    strange = [seen.feature_id for seen in change.seen if seen.feature_id not in known]
+    if strange:
+        raise BadReport(
+            f"tile {change.tile}: judges feature {strange[0]}, one of {len(strange)} that version "
+            f"{change.base_version} with its {len(known)} features has not"
+        )
+
+
+def _check_found(name: str, found: Found, limits: FeatureLimits) -> None:
+    _check_covariance(name, found.cov_m2, limits)
+    if len(found.points_m) > limits.max_vertices:
+        raise BadReport(f"{name} has {len(found.points_m)} vertices, the limit is {limits.max_vertices} a tile")
+    if len(found.points_m) > 2 and found.kind.startswith(LANE_KINDS):
+        try:
+            check_simple_polyline(name, found.points_m)
+        except FeatureError as error:
+            raise BadReport(str(error)) from error
+
+
+def _check_covariance(name: str, cov_m2: F64, limits: FeatureLimits) -> None:
+    cov = full_covariance(cov_m2)
+    least = float(np.linalg.eigvalsh(cov)[0])
+    if least * _ROUNDING < limits.min_sigma_m**2:
+        what = "not positive" if least <= 0 else f"{least**0.5:.2g} m in one direction"
+        raise BadReport(f"{name}: sigma {what}, nobody measures better than {limits.min_sigma_m:g} m")
+    most = float(np.linalg.eigvalsh(cov[:2, :2])[-1])
+    if most > limits.max_sigma_m**2 * _ROUNDING:
+        raise BadReport(f"{name}: known to {most**0.5:.3g} m only, the limit is {limits.max_sigma_m:g} m")
+    if cov[2, 2] > UNKNOWN_HEIGHT_M2 * _ROUNDING**2 * 1.1:
+        raise BadReport(
+            f"{name}: variance {cov[2, 2]:.3g} m² of its height, {UNKNOWN_HEIGHT_M2:g} m² stands for unknown"
+        )
+
+
+def _check_inside(name: str, tile: TileId, position_m: F64, limits: FeatureLimits) -> None:
+    (south, west), (north, east) = tile.south_west_rad, tile.north_east_rad
+    corners = LocalFrame.of_tile(tile).enu_from_geodetic([south, south, north, north], [west, east, west, east], 0.0)
+    outside_m = float((np.abs(position_m[:2]) - np.abs(corners[:, :2]).max(axis=0)).max())
+    if outside_m > limits.max_outside_m:
+        raise BadReport(
+            f"{name} was measured {outside_m:.1f} m outside its tile, the limit is {limits.max_outside_m:g} m"
+        )
+
+
+def _check_duplicates(change: FeatureChange, limits: FeatureLimits) -> None:
+    """Found points of one kind at the same place, within their own covariances, of which nothing tells them apart."""
+    points = [(number, found) for number, found in enumerate(change.found) if len(found.points_m) == 1]
+    for (i, a), (j, b) in _near(points, limits.duplicate_m):
+        if (a.kind, a.attributes) != (b.kind, b.attributes):
+            continue
+        apart, both = a.points_m[0] - b.points_m[0], full_covariance(a.cov_m2 + b.cov_m2)
+        has_heights = both[2, 2] < _HEIGHT_KNOWN_M2
+        if has_heights and abs(apart[2]) > limits.duplicate_m:
+            continue
+        if apart @ np.linalg.solve(both, apart) <= 1.0:
+            raise BadReport(
+                f"tile {change.tile}: found {a.kind} {i} and {j} lie {float(np.hypot(*apart[:2])):.3f} m apart, less "
+                f"than their sigma and {limits.duplicate_m:g} m: one feature twice"
+            )
+
+
+Numbered = tuple[int, Found]
+
+
+def _near(points: Sequence[Numbered], within_m: float) -> list[tuple[Numbered, Numbered]]:
+    if len(points) < 2:
+        return []
+    xy = np.array([found.points_m[0, :2] for _, found in points])
+    return [
+        (points[i], points[j]) for i, j in combinations(range(len(points)), 2) if np.hypot(*(xy[i] - xy[j])) <= within_m
+    ]
