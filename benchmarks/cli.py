@@ -16,6 +16,14 @@ _COMMANDS: Final[dict[str, tuple[str, str]]] = {
         "Localisation in a changed world, before and after the map update.",
     ),
     "traffic": ("benchmarks.traffic_study.command:traffic", "What a map and its changes weigh on the way (Figure 23)."),
+    "slamcu": (
+        "benchmarks.slamcu_study.command:slamcu",
+        "Signs that have gone or are new, found by single cars: the SLAMCU paper.",
+    ),
+    "new-feature-layer": (
+        "benchmarks.new_layer_study.command:new_feature_layer",
+        "A layer of beacons or lights mapped by many cars, and localisation with it.",
+    ),
     "errors": ("benchmarks.simulation.errors_command:errors", "Which voxels of a simulation cost F1, and why."),
     "real-localisation": (
         "benchmarks.real_localisation.command:real_localisation",

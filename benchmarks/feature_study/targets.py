@@ -1,11 +1,14 @@
 """Our numbers beside the paper's and what we set out to reach."""
 
 from collections.abc import Mapping, Sequence
-from typing import Any
+from typing import Any, Final
 
+from rich.console import Console
 from rich.table import Table
 
 from benchmarks.traffic_study.targets import Target
+
+_PLAIN_WIDTH: Final = 150
 
 
 def judged(found: Mapping[str, Any], targets: Sequence[Target]) -> dict[str, dict[str, Any]]:
@@ -44,6 +47,15 @@ def targets_table(rows: Mapping[str, Mapping[str, Any]], title: str) -> Table:
         ours, limits = f"{row['value']:.3f} {row['unit']}", (f"{sign} {row[limit]:g}" for limit in ("must", "aim"))
         table.add_row(name, ours, row["paper"], *limits, met, style="" if row["met"] else "red")
     return table
+
+
+def print_tables(tables: Sequence[Table]) -> None:
+    """Print tables on standard output."""
+    console = Console()
+    if not console.is_terminal:
+        console = Console(width=_PLAIN_WIDTH)
+    for table in tables:
+        console.print(table)
 
 
 def plain_table(title: str, *columns: str) -> Table:

@@ -33,10 +33,11 @@ def new_feature_layer(
     # The heavy imports wait until the options have been found good.
     from rich.console import Console
 
+    from benchmarks.feature_study.targets import print_tables
     from benchmarks.new_layer_study.figures import draw_figures
     from benchmarks.new_layer_study.study import study
     from benchmarks.new_layer_study.summary import summary_of
-    from benchmarks.new_layer_study.tables import print_tables
+    from benchmarks.new_layer_study.tables import tables_of
     from benchmarks.simulation.folder import RunFolder
     from deploy.live import progress_bars
 
@@ -48,7 +49,7 @@ def new_feature_layer(
     folder.write_json("result.json", found)
     draw_figures(outcome, found, drawn)
     if not write_result(found, json_file):
-        print_tables(found)
+        print_tables(tables_of(found))
         click.echo(f"everything else: {out}")
 
 

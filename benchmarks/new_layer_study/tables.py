@@ -3,7 +3,6 @@
 from collections.abc import Mapping
 from typing import Any, Final
 
-from rich.console import Console
 from rich.table import Table
 
 from benchmarks.feature_study.targets import plain_table, targets_table
@@ -12,13 +11,6 @@ from benchmarks.new_layer_study.reference import CASES, DIRECTIONS, PAPER_TABLE2
 
 Found = Mapping[str, Any]
 CASE_LABELS: Final = {"without_map": "without HD map", "with_map": "with HD map", "integration": "integration"}
-
-
-def print_tables(found: Found) -> None:
-    """Print the tables on standard output."""
-    console = Console()
-    for table in tables_of(found):
-        console.print(table)
 
 
 def tables_of(found: Found) -> list[Table]:

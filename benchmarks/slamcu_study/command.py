@@ -29,11 +29,12 @@ def slamcu(json_file: str | None, out: Path, pictures: Path | None, processes: i
     # The heavy imports wait until the options have been found good.
     from rich.console import Console
 
+    from benchmarks.feature_study.targets import print_tables
     from benchmarks.simulation.folder import RunFolder
     from benchmarks.slamcu_study.figures import draw_figures
     from benchmarks.slamcu_study.study import study
     from benchmarks.slamcu_study.summary import summary_of
-    from benchmarks.slamcu_study.tables import print_tables
+    from benchmarks.slamcu_study.tables import tables_of
     from deploy.live import progress_bars
 
     folder, drawn = RunFolder.create(out, "slamcu"), picture_folder(pictures, out)
@@ -44,7 +45,7 @@ def slamcu(json_file: str | None, out: Path, pictures: Path | None, processes: i
     folder.write_json("result.json", found)
     draw_figures(outcome, drawn)
     if not write_result(found, json_file):
-        print_tables(found)
+        print_tables(tables_of(found))
         click.echo(f"everything else: {out}")
 
 

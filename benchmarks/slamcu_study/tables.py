@@ -3,7 +3,6 @@
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from rich.console import Console
 from rich.table import Table
 
 from benchmarks.feature_study.targets import plain_table, targets_table
@@ -11,13 +10,6 @@ from benchmarks.slamcu_study import reference
 from benchmarks.slamcu_study.options import VARIANTS
 
 Found = Mapping[str, Any]
-
-
-def print_tables(found: Found) -> None:
-    """Print the tables on standard output."""
-    console = Console()
-    for table in tables_of(found):
-        console.print(table)
 
 
 def tables_of(found: Found) -> list[Table]:

@@ -1,0 +1,263 @@
+"""One drive along the motorway through SLAMCU, in one of the variants, and what the truth says of it."""
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from time import perf_counter
+from typing import Final
+
+import numpy as np
+
+from benchmarks.feature_study.matching import match_one_to_one
+from benchmarks.feature_study.start import start_of
+from benchmarks.simulation.streams import Tick
+from benchmarks.slamcu_study.verdicts import DELETED, NEW, SignTruth, Verdicts
+from fleet_sim.roads.drive import RoadDrive
+from fleet_sim.roads.route import FEATURE_STATES, MAP_ERROR_M, Route
+from fleet_sim.roads.sight import View
+from fleet_sim.trajectory import gauss_markov
+from gnd_map.arrays import F64, I64
+from schemas.drive import Detections
+from vehicle_agent.features.look import Look, MapFeatures
+from vehicle_agent.features.parameters import SlamcuParameters
+from vehicle_agent.features.slamcu import Slamcu
+from vehicle_agent.features.verdicts import KnownState, NewFeature
+from vehicle_agent.features.view import Occlusion, SensorView
+
+LIDAR_SIGMA: Final = (0.04, 0.04, np.radians(0.08))
+"""Errors of the LiDAR localiser's poses, m, m, rad: as `--poses noisy:4cm:0.08deg` of the other studies."""
+_LIDAR_TAU_S: Final = 2.0
+_TELL_EVERY: Final = 200
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Driven:
+    """What SLAMCU says after a drive, and its poses.
+
+    Attributes:
+        known: features of the map.
+        new: features that it has not; those with too little evidence, too.
+        step_ms: float64 (S,), time of each look with the motion since the one before.
+        look: int64 (S,), indices of the looks taken.
+        pose: float64 (S, 3), after each.
+        hidden: looks at features of the map that were left out as hidden.
+    """
+
+    known: tuple[KnownState, ...]
+    new: tuple[NewFeature, ...]
+    step_ms: F64
+    look: I64
+    pose: F64
+    hidden: int
+
+
+def sign_truth(route: Route) -> SignTruth:
+    """Return the signs of a route; its states are `TRUE_CLASSES`, in that order."""
+    features = route.features
+    codes = np.array([FEATURE_STATES.index(state) for state in features.states], np.uint8)
+    return SignTruth(features.feature_id, features.xy_m, codes)
+
+
+def map_features(route: Route) -> MapFeatures:
+    """Return what the vehicle's map holds: normal and deleted signs where the survey put them."""
+    mapped = route.features.mapped
+    n = len(mapped)
+    cov = np.broadcast_to(MAP_ERROR_M**2 * np.eye(2), (n, 2, 2)).copy()
+    return MapFeatures(mapped.feature_id, mapped.kinds, mapped.mapped_xy_m, mapped.height_m, cov)
+
+
+def look_of(detections: Detections) -> Look:
+    """Return a look for SLAMCU."""
+    return Look(
+        detections.t_ns,
+        np.asarray(detections.range_m, np.float64),
+        np.asarray(detections.bearing_rad, np.float64),
+        np.asarray(detections.sigma_range_m, np.float64),
+        np.asarray(detections.sigma_bearing_rad, np.float64),
+        detections.kinds,
+    )
+
+
+def sensor_view(view: View) -> SensorView:
+    """Return a simulated sensor's field of view as the vehicle knows it."""
+    return SensorView(view.width_rad, view.range_m, float(view.rate_hz))
+
+
+def occlusion_of(drive: RoadDrive, look: int) -> Occlusion | None:
+    """Return what was in the way at a look; None where nothing was."""
+    free_m = drive.occluder_m[look]
+    if np.isinf(free_m).all():
+        return None
+    width = drive.view.width_rad
+    return Occlusion.of_ranges(free_m, -0.5 * width, width / len(free_m))
+
+
+def run_slamcu(drive: RoadDrive, variant: str, parameters: SlamcuParameters, seed: int, tick: Tick) -> Driven:
+    """Return what SLAMCU makes of a drive.
+
+    Args:
+        drive: along a motorway.
+        variant: of `VARIANTS`.
+        parameters: of SLAMCU.
+        seed: of its particles.
+        tick: told how many looks have been taken.
+    """
+    start = start_of(drive)
+    slamcu = Slamcu(parameters, map_features(drive.route), start.pose, start.cov, seed)
+    poses = _Poses.of(drive, variant, parameters, seed)
+    view, steps, taken, at = sensor_view(drive.view), [], [], []
+    spent_s, before_ns = 0.0, start.t_ns
+    for t_ns, what, i in drive.events():
+        if t_ns <= start.t_ns or what == "lanes":
+            continue
+        given = poses.at(t_ns, what, i) if poses is not None else None
+        look = look_of(drive.looks[i]) if what == "look" else None
+        occlusion = occlusion_of(drive, i) if look is not None and variant != "no_occlusion" else None
+        begun_s = perf_counter()
+        if what == "motion":
+            slamcu.predict(
+                (t_ns - before_ns) * 1e-9, float(drive.motion.speed_mps[i]), float(drive.motion.yaw_rate_radps[i])
+            )
+            before_ns = t_ns
+        elif what == "gnss" and poses is None:
+            slamcu.gnss(float(drive.gnss.xy_m[i, 0]), float(drive.gnss.xy_m[i, 1]), drive.gnss.sigma_m)
+        elif look is not None:
+            if given is not None:
+                slamcu.set_pose(*given)
+            slamcu.look(look, view, occlusion)
+        spent_s += perf_counter() - begun_s
+        if look is not None:
+            steps.append(1e3 * spent_s)
+            taken.append(i)
+            at.append(slamcu.pose()[0])
+            spent_s = 0.0
+            if len(steps) % _TELL_EVERY == 0:
+                tick(i, len(drive.looks))
+    return Driven(
+        slamcu.known_states(),
+        slamcu.new_features(unclassified=True),
+        np.array(steps),
+        np.array(taken, np.int64),
+        np.array(at),
+        slamcu.hidden,
+    )
+
+
+class _Poses:
+    """Poses that are given to SLAMCU instead of being estimated by it."""
+
+    def __init__(self, drive: RoadDrive, filtered: Slamcu | None, error: F64) -> None:
+        self._drive, self._filtered, self._error = drive, filtered, error
+        self._before_ns = start_of(drive).t_ns
+
+    @classmethod
+    def of(cls, drive: RoadDrive, variant: str, parameters: SlamcuParameters, seed: int) -> "_Poses | None":
+        if variant == "no_rbpf":
+            start = start_of(drive)
+            return cls(drive, Slamcu(parameters, MapFeatures.none(), start.pose, start.cov, seed), np.zeros((0, 3)))
+        if variant == "lidar":
+            rng = np.random.default_rng([seed, drive.seed, 61])
+            n, step_s = len(drive.looks), 1.0 / drive.view.rate_hz
+            error = [gauss_markov(rng, n, step_s, sigma, _LIDAR_TAU_S) for sigma in LIDAR_SIGMA]
+            return cls(drive, None, np.stack(error, axis=1))
+        return None
+
+    def at(self, t_ns: int, what: str, i: int) -> tuple[F64, F64] | None:
+        """Follow the drive; give pose and covariance at a look."""
+        if self._filtered is None:
+            if what != "look":
+                return None
+            return self._drive.truth.look_poses[i] + self._error[i], np.diag(np.square(LIDAR_SIGMA))
+        drive, filtered = self._drive, self._filtered
+        if what == "motion":
+            dt_s = (t_ns - self._before_ns) * 1e-9
+            filtered.predict(dt_s, float(drive.motion.speed_mps[i]), float(drive.motion.yaw_rate_radps[i]))
+            self._before_ns = t_ns
+        elif what == "gnss":
+            filtered.gnss(float(drive.gnss.xy_m[i, 0]), float(drive.gnss.xy_m[i, 1]), drive.gnss.sigma_m)
+        return filtered.pose() if what == "look" else None
+
+
+def verdicts_of(drive: RoadDrive, driven: Driven) -> Verdicts:
+    """Return what a drive says of its signs, with what the truth tells of how it came about."""
+    truth = sign_truth(drive.route)
+    sign, t_s, masses = _traces(drive, driven, truth)
+    in_view, hidden = drive.truth.in_view[driven.look], drive.truth.hidden[driven.look]
+    new = driven.new
+    return Verdicts(
+        known_id=np.array([one.feature_id for one in driven.known], np.int64),
+        known_predicted=np.array([int(one.feature_class) for one in driven.known], np.uint8),
+        known_conflict=np.array([one.existence.conflict for one in driven.known]),
+        new_xy_m=np.array([one.position_m for one in new]).reshape(-1, 2),
+        new_cov_m2=np.array([one.cov_m2 for one in new]).reshape(-1, 2, 2),
+        new_exists=np.array([one.feature_class == NEW for one in new], np.bool_),
+        new_conflict=np.array([one.existence.conflict for one in new]),
+        step_ms=driven.step_ms,
+        pose_error=pose_errors(driven.pose, drive.truth.look_poses[driven.look]),
+        pose_part_m=pose_parts(driven.pose, drive.truth.look_poses[driven.look], truth.xy_m, in_view & ~hidden),
+        visible=(in_view & ~hidden).sum(axis=0).astype(np.int64),
+        occluded=(in_view & hidden).sum(axis=0).astype(np.int64),
+        no_evidence=driven.hidden,
+        trace_sign=sign,
+        trace_s=t_s,
+        trace_masses=masses,
+    )
+
+
+def pose_errors(pose: F64, true: F64) -> F64:
+    """Return errors (S, 3) of poses (S, 3): along and to the left of the true heading [m], heading [rad]."""
+    dx, dy = (pose - true)[:, :2].T
+    c, s = np.cos(true[:, 2]), np.sin(true[:, 2])
+    turn = (pose[:, 2] - true[:, 2] + np.pi) % (2 * np.pi) - np.pi
+    return np.column_stack([c * dx + s * dy, c * dy - s * dx, turn])
+
+
+def pose_parts(pose: F64, true: F64, xy_m: F64, visible: np.ndarray[tuple[int, int], np.dtype[np.bool_]]) -> F64:
+    """Return (N, 2) what errors of the poses moved each place by, mean over the looks at it; nan where there are none.
+
+    A look from near tells more of a place than one from afar, and so counts with the inverse of its squared range.
+
+    Args:
+        pose: (S, 3) as estimated.
+        true: (S, 3).
+        xy_m: (N, 2) places.
+        visible: (S, N) which looks could see which place.
+    """
+    found = np.full((len(xy_m), 2), np.nan)
+    for n, place in enumerate(xy_m):
+        rows = np.flatnonzero(visible[:, n])
+        if len(rows):
+            moved = _seen_from(pose[rows], true[rows], place) - place
+            weight = 1.0 / np.maximum(np.linalg.norm(place - true[rows, :2], axis=1), 10.0) ** 2
+            found[n] = weight @ moved / weight.sum()
+    return found
+
+
+def _seen_from(pose: F64, true: F64, place: F64) -> F64:
+    """Where a place (2,) seen rightly from true poses (S, 3) lies for one who believes to be at other poses."""
+    turn = pose[:, 2] - true[:, 2]
+    c, s = np.cos(turn), np.sin(turn)
+    x, y = (place - true[:, :2]).T
+    return np.asarray(pose[:, :2] + np.column_stack([c * x - s * y, s * x + c * y]))
+
+
+def _traces(drive: RoadDrive, driven: Driven, truth: SignTruth) -> tuple[I64, F64, F64]:
+    """Masses over time of deleted and new signs: sign, seconds, masses (Q, 3)."""
+    begin_ns, rows = int(drive.motion.t_ns[0]), []
+    for sign, one in _told(driven, truth):
+        for step in one.history:
+            masses = step.existence
+            rows.append((sign, (step.t_ns - begin_ns) * 1e-9, masses.exist, masses.absent, masses.unknown))
+    columns = np.array(rows, np.float64).reshape(-1, 5)
+    return columns[:, 0].astype(np.int64), columns[:, 1], columns[:, 2:]
+
+
+def _told(driven: Driven, truth: SignTruth) -> Iterator[tuple[int, KnownState | NewFeature]]:
+    """Deleted and new signs with what SLAMCU says of them."""
+    states = {one.feature_id: one for one in driven.known}
+    for sign in truth.of(DELETED).tolist():
+        yield sign, states[int(truth.feature_id[sign])]
+    signs = truth.of(NEW)
+    new = [one for one in driven.new if one.feature_class == NEW]
+    matching = match_one_to_one(np.array([one.position_m for one in new]).reshape(-1, 2), truth.xy_m[signs])
+    for sign, estimate in zip(signs[matching.true].tolist(), matching.estimate.tolist(), strict=True):
+        yield sign, new[estimate]
