@@ -31,6 +31,7 @@ from tile_store.sqlite_store import SqliteStore
 from tile_store.values import StoreConfig
 from vehicle_agent.agent import AgentConfig
 from vehicle_agent.detect.parameters import DetectParameters
+from vehicle_agent.features.layer_parameters import FeatureParameters
 
 POLL_S = 0.2
 SETTLE_S = 60.0
@@ -168,6 +169,7 @@ def agent_config(config: FleetConfig, vehicle: str, drive: Path, folder: RunFold
         link=place.link,
         ledger_dir=folder.ledger,
         detect=DetectParameters.paper() if paper else DetectParameters(),
+        features=FeatureParameters.of(*config.feature_layers),
     )
 
 

@@ -1,4 +1,7 @@
-"""The vehicle on one page (GND, Figure 1): drive, download, localise, segment, detect, report, upload."""
+"""The vehicle on one page (GND, Figure 1): drive, download, localise, segment, detect, report, upload.
+
+Feature layers go the same way: `judge` is for them what `detect` and `report` are for voxels (SLAMCU, section 4).
+"""
 
 import threading
 from typing import Any
@@ -30,12 +33,15 @@ def run_agent(config: AgentConfig, stop: threading.Event) -> dict[str, Any]:
         for item in vehicle.drive():  # recording -> usable measurements in time order
             if isinstance(item, Scan):
                 vehicle.download()  # position -> the tiles around and ahead, and what others changed
+            vehicle.look(item)  # what a camera detects waits for its pose
             for refined in vehicle.localise(item):  # measurements + tiles -> scans with final poses
                 for scan in vehicle.segment(refined):  # rays against rays of other scans -> which points are movers
                     vehicle.detect(scan)  # rays + tiles -> evidence and new Gaussians
                     vehicle.report(scan)  # tiles left behind -> classes -> one report a district -> outbox
+                    vehicle.judge(scan)  # looks + feature tiles -> what exists, is gone, is new -> outbox
         for scan in vehicle.segment_the_rest():
             vehicle.detect(scan)
+            vehicle.judge(scan)
         vehicle.report_the_rest()
         vehicle.upload()  # outbox -> acknowledged
         result = vehicle.result()

@@ -8,6 +8,7 @@ from fleet_bus.config import DEFAULT_ENDPOINT
 from fleet_bus.links import LinkProfile
 from vehicle_agent.detect.parameters import DetectParameters
 from vehicle_agent.errors import AgentConfigError
+from vehicle_agent.features.layer_parameters import FeatureParameters
 from vehicle_agent.localise.parameters import LocaliserParameters
 from vehicle_agent.segment.parameters import SegmentParameters
 
@@ -97,6 +98,7 @@ class AgentConfig:
     detect: DetectParameters = field(default_factory=DetectParameters)
     download: DownloadParameters = field(default_factory=DownloadParameters)
     report: ReportParameters = field(default_factory=ReportParameters)
+    features: FeatureParameters = field(default_factory=FeatureParameters)
 
     def __post_init__(self) -> None:
         """A name and a pace that can work."""

@@ -4,15 +4,15 @@ import logging
 import threading
 import time
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import AbstractContextManager, contextmanager, nullcontext
 from dataclasses import dataclass, field
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from gnd_map.geodesy import LocalFrame
 from gnd_map.grid import GridFrame
 from gnd_map.tile import Tile
 from gnd_map.tile_id import TileId
-from schemas.drive import DriveHeader, DriveItem, GnssFix, MotionSample, ReferencePose, Scan
+from schemas.drive import Detections, DriveHeader, DriveItem, GnssFix, MotionSample, ReferencePose, Scan
 from schemas.drive_mcap import read_drive, read_header
 from schemas.errors import SchemaError
 from schemas.traffic import TrafficLine, TrafficSample
@@ -32,6 +32,9 @@ from vehicle_agent.segment.segmenter import MotionSegmenter, SegmentedScan
 from vehicle_agent.surroundings import Surroundings
 from vehicle_agent.telemetry import Telemetry
 from vehicle_agent.updates import Updates
+
+if TYPE_CHECKING:
+    from vehicle_agent.features.feature_work import FeatureWork
 
 COUNTS = ("scans_used", "scans_uncertain", "points", "moving_points", "rays", "changed_voxels")
 """What the reporter counts, as `result.json` names it."""
@@ -54,6 +57,7 @@ class Vehicle:
     reporter: Reporter
     place: Place
     evaluation: Evaluation
+    features: "FeatureWork | None"
     guard: Guard = field(default_factory=Guard)
     timeline: HealthTimeline = field(default_factory=HealthTimeline)
     started_s: float = field(default_factory=time.monotonic)
@@ -92,6 +96,13 @@ class Vehicle:
         self.updates.apply()
         self.updates.follow(self.surroundings.look_ahead(self.place))  # before asking: nothing is missed in between
         self.surroundings.follow(self.place, self.stop, wait=self.config.waits_for_tiles)
+        if self.features is not None:
+            self.features.download(self.place, self.stop)
+
+    def look(self, item: DriveItem) -> None:
+        """Keep what a detector found until the pose from which it looked is final."""
+        if self.features is not None and isinstance(item, Detections):
+            self.features.wait(item)
 
     def localise(self, item: DriveItem) -> list[RefinedScan]:
         """Feed the localiser; gives the scans whose poses have become final."""
@@ -124,9 +135,16 @@ class Vehicle:
         """Decide the tiles that this scan's pose has left behind; a district left behind goes to the outbox."""
         self.reporter.leave_behind(segmented.scan.estimate, self.place.odometer_m)
 
+    def judge(self, segmented: SegmentedScan) -> None:
+        """Judge the features in view of a scan whose pose is final; a district left behind goes to the outbox."""
+        if self.features is not None:
+            self.features.take(segmented, self.place.odometer_m)
+
     def report_the_rest(self) -> None:
         """Decide and report everything: the drive has ended."""
         self.reporter.report_all(self.place.odometer_m)
+        if self.features is not None:
+            self.features.finish()
 
     def upload(self) -> None:
         """Wait until the outbox is empty, for a bounded time."""
@@ -163,6 +181,7 @@ class Vehicle:
             "distance_km": round(self.place.odometer_m / 1000, 5),
             **self._scan_counts(),
             **self._link_counts(),
+            "features": self.features.account() if self.features is not None else {},
             "health": self.timeline.as_json(),
             "localisation": self.evaluation.errors(),
             "memory_mb": self.memory.read(),
@@ -212,8 +231,10 @@ def open_vehicle(config: AgentConfig, stop: threading.Event) -> Iterator[Vehicle
         NoRouter: nothing answers at `config.connect`.
     """
     header, fix = read_header(config.drive), first_fix(config)
-    with open_link(config) as link:
-        vehicle = _assemble(config, header, fix, link, stop)
+    frame = LocalFrame.of_tile(TileId.from_geodetic(fix.lat_rad, fix.lon_rad))
+    who = Identity(config.vehicle, header.drive_id, header.sensor_model, config.layer)
+    with open_link(config) as link, _features(config, link, frame, who, fix.t_ns) as features:
+        vehicle = _assemble(config, header, fix, link, stop, features)
         telemetry = Telemetry(link.bus, config.vehicle, vehicle.sample)
         try:
             yield vehicle
@@ -221,7 +242,25 @@ def open_vehicle(config: AgentConfig, stop: threading.Event) -> Iterator[Vehicle
             telemetry.close()
 
 
-def _assemble(config: AgentConfig, header: DriveHeader, fix: GnssFix, link: Link, stop: threading.Event) -> Vehicle:
+def _features(
+    config: AgentConfig, link: Link, frame: LocalFrame, who: Identity, start_ns: int
+) -> AbstractContextManager["FeatureWork | None"]:
+    """The part for feature layers; a vehicle that knows voxels only does not even load it."""
+    if not config.features.layers:
+        return nullcontext(None)
+    from vehicle_agent.features.feature_work import open_features
+
+    return open_features(config, link, frame, who, start_ns)
+
+
+def _assemble(
+    config: AgentConfig,
+    header: DriveHeader,
+    fix: GnssFix,
+    link: Link,
+    stop: threading.Event,
+    features: "FeatureWork | None",
+) -> Vehicle:
     """The map frame is the frame of the tile in which the vehicle starts."""
     start = TileId.from_geodetic(fix.lat_rad, fix.lon_rad)
     frame = LocalFrame.of_tile(start)
@@ -241,6 +280,7 @@ def _assemble(config: AgentConfig, header: DriveHeader, fix: GnssFix, link: Link
         reporter=Reporter(detector, link.outbox, identity, fix.t_ns, config.report),
         place=Place(frame, fix),
         evaluation=Evaluation.between(frame, header.anchor),
+        features=features,
     )
 
 

@@ -109,25 +109,27 @@ class FeatureLayers:
     # The camera
 
     def _camera_looks(self, scan: RefinedScan) -> None:
-        due = []
-        while self._looks and self._looks[0].t_ns <= scan.t_ns:
-            due.append(self._looks.popleft())
-        poses = self._poses_at([look.t_ns for look in due], scan)
-        if not due or poses is None:
-            self.counts["looks_without_pose"] += len(due)
+        due = [look for look in self._looks if look.t_ns <= scan.t_ns]
+        self._looks = deque((look for look in self._looks if look.t_ns > scan.t_ns), MOST_WAITING)
+        placeable = sorted((look for look in due if self._is_between(look.t_ns, scan)), key=lambda look: look.t_ns)
+        self.counts["looks_without_pose"] += len(due) - len(placeable)
+        if not placeable:
             return
         occlusion = occlusion_of(scan)
-        for look, T in zip(due, poses, strict=True):
+        for look, T in zip(placeable, self._poses_at([look.t_ns for look in placeable], scan), strict=True):
             self.counts["looks"] += 1
             self.layers[look.layer].see(placed(look, T, scan), occlusion)
 
-    def _poses_at(self, t_ns: list[int], scan: RefinedScan) -> F64 | None:
-        """(N, 4, 4) poses at times between the scan before and this one."""
+    def _is_between(self, t_ns: int, scan: RefinedScan) -> bool:
+        """Whether a time lies between the scan before and this one, and these are not far apart."""
         before = self._before
-        if before is None or not t_ns or scan.t_ns - before.t_ns > LONGEST_GAP_NS or t_ns[0] < before.t_ns:
-            return None
-        times = np.array([before.t_ns, scan.t_ns], np.int64)
-        T = np.stack([before.T_map_vehicle, scan.estimate.T_map_vehicle])
+        return before is not None and before.t_ns <= t_ns and scan.t_ns - before.t_ns <= LONGEST_GAP_NS
+
+    def _poses_at(self, t_ns: list[int], scan: RefinedScan) -> F64:
+        """(N, 4, 4) poses at times between the scan before and this one."""
+        assert self._before is not None
+        times = np.array([self._before.t_ns, scan.t_ns], np.int64)
+        T = np.stack([self._before.T_map_vehicle, scan.estimate.T_map_vehicle])
         return interpolate_poses(times, T, np.array(t_ns, np.int64))
 
     # The LiDAR
