@@ -4,6 +4,7 @@ from math import pi
 from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
@@ -17,6 +18,8 @@ FRONT = pi / 4
 EDGE_SIGMA = 24.0**-0.5
 """Of the rays' distance: error of the middle between the first and the last ray that met something. Either edge lies
 evenly within one step of its ray: variance (1/12 + 1/12) / 4."""
+THIN_QUANTILE = 0.3
+"""Of the widths of a column's slices, the one that is its thin part's."""
 WIDTH_SIGMA = 6.0**-0.5
 """The same for the width: 1/12 + 1/12."""
 
@@ -29,6 +32,7 @@ class Columns(NamedTuple):
         height_m: (C,) that height, over the ground.
         cov_m2: (C, 2, 2) of the axis.
         lean: (C, 2) metres a metre upwards.
+        toward: (C, 2) mean direction from the sensor.
         diameter_m: (C,) median of the slices.
         sigma_diameter_m: (C,).
         scatter_m: (C,) standard deviation of the slices about the axis, beside what the sensor makes.
@@ -46,6 +50,7 @@ class Columns(NamedTuple):
     height_m: F64
     cov_m2: F64
     lean: F64
+    toward: F64
     diameter_m: F64
     sigma_diameter_m: F64
     scatter_m: F64
@@ -66,9 +71,9 @@ def stacked(slices: Slices, layer_tan: float, p: PoleParameters) -> tuple[Slices
     """
     label = _linked(slices, layer_tan, p)
     for _ in range(2):
-        slices, label = _large(slices, label, p)
+        slices, label = _large(slices, _on_one_axis(slices, label, p), p)
         off = slices.xy_m - _axis_at(slices, label)
-        near = np.flatnonzero(np.hypot(*off.T) <= p.axis_m)
+        near = np.flatnonzero((np.hypot(*off.T) <= p.axis_m) & ~_much_wider(slices, label, p))
         slices, label = take(slices, near), label[near]
     return _large(slices, label, p)
 
@@ -80,7 +85,21 @@ def _linked(slices: Slices, layer_tan: float, p: PoleParameters) -> I64:
     a, b = cKDTree(slices.xy_m).query_pairs(p.axis_m, output_type="ndarray").T
     gap = np.maximum(p.gap_m, p.layers_apart * layer_tan * slices.range_m[a])
     close = np.abs(slices.z_m[a] - slices.z_m[b]) <= gap
-    graph = coo_matrix((np.ones(int(close.sum()), np.bool_), (a[close], b[close])), shape=(n, n))
+    return _components(np.column_stack([a[close], b[close]]), n)
+
+
+def _on_one_axis(slices: Slices, label: I64, p: PoleParameters) -> I64:
+    """Labels with columns about one axis joined: a post goes on above its plate."""
+    if not len(label):
+        return label
+    order = np.argsort(label, kind="stable")
+    axes = _axes(take(slices, order), label[order])
+    pairs = cKDTree(axes).query_pairs(0.5 * p.axis_m, output_type="ndarray")
+    return _components(pairs, len(axes))[np.unique(label, return_inverse=True)[1]]
+
+
+def _components(pairs: I64, n: int) -> I64:
+    graph = coo_matrix((np.ones(len(pairs), np.bool_), pairs.T), shape=(n, n))
     return np.asarray(connected_components(graph, directed=False)[1].astype(np.int64))
 
 
@@ -101,17 +120,27 @@ def _large(slices: Slices, label: I64, p: PoleParameters) -> tuple[Slices, I64]:
 
 def _axis_at(slices: Slices, label: I64) -> F64:
     """(S, 2) median place of each slice's column."""
-    if not len(label):
-        return np.empty((0, 2))
-    middle = np.column_stack([_medians(slices.xy_m[:, 0], label), _medians(slices.xy_m[:, 1], label)])
-    return np.asarray(middle[label])
+    return _axes(slices, label)[label] if len(label) else np.empty((0, 2))
 
 
-def _medians(values: F64, label: I64) -> F64:
-    """(C,) lower median of the values (S,) of each column; `label` sorted, without gaps."""
+def _axes(slices: Slices, label: I64) -> F64:
+    """(C, 2) median place of each column; `label` sorted."""
+    return np.column_stack([_medians(slices.xy_m[:, 0], label), _medians(slices.xy_m[:, 1], label)])
+
+
+def _much_wider(slices: Slices, label: I64, p: PoleParameters) -> NDArray[np.bool_]:
+    """(S,) whether slices are too wide for the thin ones of their column: small plates, feet."""
+    width = slices.extent_m + slices.step_m
+    thin = _medians(width, label, THIN_QUANTILE)[label] if len(label) else width
+    return np.asarray(width > thin + p.wider_m + slices.step_m)
+
+
+def _medians(values: F64, label: I64, quantile: float = 0.5) -> F64:
+    """(C,) lower median, or quantile, of the values (S,) of each column; `label` sorted."""
     by_value = values[np.lexsort((values, label))]
     at = np.flatnonzero(np.diff(label, prepend=-1))
-    return np.asarray(by_value[at + (np.diff(at, append=len(label)) - 1) // 2])
+    last = np.diff(at, append=len(label)) - 1
+    return np.asarray(by_value[at + (quantile * last).astype(np.int64)])
 
 
 def columns_of(slices: Slices, label: I64, p: PoleParameters) -> Columns:
@@ -129,7 +158,7 @@ def columns_of(slices: Slices, label: I64, p: PoleParameters) -> Columns:
     cov += (FRONT * 0.5 * sigma_diameter)[:, None, None] ** 2 * toward[:, :, None] * toward[:, None, :]
     cov += (spread**2 / n)[:, None, None] * np.eye(2)
     return Columns(
-        xy, height, cov, lean, diameter, sigma_diameter, spread,
+        xy, height, cov, lean, toward, diameter, sigma_diameter, spread,
         np.minimum.reduceat(slices.height_m, at) if len(at) else height,
         np.maximum.reduceat(slices.height_m, at) if len(at) else height,
         _sums(slices.range_m, label, n) / n, _sums(slices.step_m, label, n) / n,

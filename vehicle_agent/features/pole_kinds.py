@@ -25,17 +25,20 @@ PLATE_WIDE_M: Final = 0.12
 """Standard deviations of a plate's points across and along it: one of 0.4 m has 0.12 m along."""
 PLATE_HIGH_M: Final = 1.8
 PLATE_POINTS: Final = 4
+LOWEST_PLATE_M: Final = 1.0
+WIDER: Final = 1.5
+"""Plates, crowns and heads begin where so many times more points lie beside the core than in it."""
 CROWN_POINTS: Final = 8
+LOWEST_CROWN_M: Final = 1.75
+CROWN_HIGH_M: Final = 2.0
 CROWN_THICK_M: Final = 0.2
-ARM_M: Final = 1.2
-"""Arm and head of a streetlight lie within this of its top."""
 
 
 class Surroundings(NamedTuple):
     """C candidates by height over the ground, B bins of `BIN_M`.
 
     Attributes:
-        counts: (C, B, 4) points in core, ring, plate's reach, and beyond.
+        counts: (C, B, 4) points in core, ring, plate's reach, and beyond, but for those behind.
         sums: (C, B, 5) of the plate's reach about the axis: x, y, xx, xy, yy.
     """
 
@@ -45,16 +48,24 @@ class Surroundings(NamedTuple):
 
 def look_around(columns: Columns, points_m: F64, height_m: F64, ground: GroundHeights) -> Surroundings:
     """Count what stands around columns, of the points (N, 3) above the ground and their heights (N,)."""
-    axes = np.column_stack([columns.xy_m, columns.height_m, columns.lean, 0.5 * columns.diameter_m])
+    axes = np.column_stack([columns.xy_m, columns.height_m, columns.lean, 0.5 * columns.diameter_m, columns.toward])
     belts = np.array([CORE_M, RING_M, RING_END_M, PLATE_M, REACH_M])
     cells = by_cell(points_m, ground.cells)
     return Surroundings(*around(points_m, height_m, *cells, ground.cells, axes, belts, BIN_M, BINS))
 
 
-def ring_share(columns: Columns, seen: Surroundings) -> F64:
-    """(C,) share of the heights of the thin part at which something stands in the ring around it."""
+def is_free(columns: Columns, seen: Surroundings, p: PoleParameters) -> Mask:
+    """(C,) whether nothing stands in the ring around the thin part at most of its heights, and over one length."""
     core = _within(columns.bottom_m, columns.top_m) & (seen.counts[:, :, CORE] > 0)
-    return np.asarray((core & (seen.counts[:, :, RING] > 0)).sum(axis=1) / np.maximum(core.sum(axis=1), 1))
+    ring = core & (seen.counts[:, :, RING] > 0)
+    run, longest, first = np.zeros(len(core)), np.zeros(len(core)), np.zeros(len(core))
+    for b in range(BINS):
+        free = core[:, b] & ~ring[:, b]
+        first = np.where(free & (run == 0.0), b, first)
+        run = np.where(ring[:, b], 0.0, np.where(free, b + 1.0 - first, run))
+        longest = np.maximum(longest, run)
+    share = ring.sum(axis=1) / np.maximum(core.sum(axis=1), 1)
+    return np.asarray((share <= p.ring_share_max) & (longest * BIN_M >= p.free_m))
 
 
 def _within(low_m: F64, high_m: F64) -> Mask:
@@ -74,6 +85,16 @@ def tops(columns: Columns, seen: Surroundings, gap_m: F64) -> F64:
     return top
 
 
+def bottoms(columns: Columns, seen: Surroundings, gap_m: F64) -> F64:
+    """(C,) height over the ground down to which the core goes on without a gap of more than gap_m (C,)."""
+    bottom = columns.bottom_m.copy()
+    for b in range(BINS - 1, -1, -1):
+        middle = (b + 0.5) * BIN_M
+        reached = (seen.counts[:, b, CORE] > 0) & (middle < bottom) & (bottom - middle <= gap_m)
+        bottom = np.where(reached, b * BIN_M, bottom)
+    return bottom
+
+
 def kinds_of(columns: Columns, seen: Surroundings, top_m: F64, p: PoleParameters) -> tuple[str, ...]:
     """The kind of each column: "trunk", "traffic_sign", "streetlight" or "pole".
 
@@ -83,13 +104,18 @@ def kinds_of(columns: Columns, seen: Surroundings, top_m: F64, p: PoleParameters
         top_m: (C,) how high each reaches.
         p: parameters.
     """
-    above = ~_within(np.zeros(len(top_m)), columns.top_m - 0.5 * BIN_M)
-    wide = above & (seen.counts[:, :, NEAR] + seen.counts[:, :, FAR] > seen.counts[:, :, CORE])
-    crown = _is_crown(columns, seen, wide)
-    plate = _is_plate(seen, wide, top_m)
+    above = _within(np.maximum(columns.top_m - BIN_M, LOWEST_PLATE_M), top_m - 0.5 * BIN_M)
+    wide = above & (seen.counts[:, :, NEAR] > WIDER * seen.counts[:, :, CORE])
+    points, across, along = _spread(seen, wide)
+    high = wide.sum(axis=1) * BIN_M
+    crown = (points >= CROWN_POINTS) & (across >= CROWN_THICK_M)
+    plate = (points >= PLATE_POINTS) & (across <= PLATE_THICK_M) & (along >= PLATE_WIDE_M) & (high <= PLATE_HIGH_M)
+    over = _within(np.maximum(columns.top_m, LOWEST_CROWN_M), columns.top_m + CROWN_HIGH_M)
+    leaves = (seen.counts[:, :, FAR] * over).sum(axis=1) >= CROWN_POINTS
     tall = top_m >= p.streetlight_m
-    chosen = np.select([crown, tall, plate], ["trunk", "streetlight", "traffic_sign"], "pole")
-    return tuple(chosen.tolist())
+    return tuple(
+        np.select([crown, tall, plate, leaves], ["trunk", "streetlight", "traffic_sign", "trunk"], "pole").tolist()
+    )
 
 
 def _spread(seen: Surroundings, bins: Mask) -> tuple[I64, F64, F64]:
@@ -100,20 +126,3 @@ def _spread(seen: Surroundings, bins: Mask) -> tuple[I64, F64, F64]:
     xx, xy, yy = xx - total[:, 0] ** 2, xy - total[:, 0] * total[:, 1], yy - total[:, 1] ** 2
     middle, half = 0.5 * (xx + yy), np.hypot(0.5 * (xx - yy), xy)
     return n, np.sqrt(np.maximum(middle - half, 0.0)), np.sqrt(np.maximum(middle + half, 0.0))
-
-
-def _is_crown(columns: Columns, seen: Surroundings, wide: Mask) -> Mask:
-    """Many points above the thin part that lie about the axis on all sides."""
-    n, across, _ = _spread(seen, wide)
-    beyond = (seen.counts[:, :, FAR] * wide).sum(axis=1)
-    return np.asarray((n + beyond >= CROWN_POINTS) & (across >= CROWN_THICK_M) & (n > 0.2 * columns.points))
-
-
-def _is_plate(seen: Surroundings, wide: Mask, top_m: F64) -> Mask:
-    """Points at the top that lie in an upright plane no higher than a sign."""
-    n, across, along = _spread(seen, wide)
-    first = np.argmax(wide, axis=1)
-    high = top_m - first * BIN_M
-    few = (seen.counts[:, :, FAR] * wide).sum(axis=1) <= 0.3 * n
-    flat = (across <= PLATE_THICK_M) & (along >= PLATE_WIDE_M)
-    return np.asarray(wide.any(axis=1) & (n >= PLATE_POINTS) & few & flat & (high <= PLATE_HIGH_M))

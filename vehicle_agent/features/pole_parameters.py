@@ -45,18 +45,24 @@ class PoleParameters:
     """A pole goes on where the next slice is so many layers of the sensor away …"""
     gap_m: float = 0.6
     """… or so far above."""
+    wider_m: float = 0.15
+    """Slices that are wider than the thin ones of their pole by this much are a plate or a foot."""
     min_slices: int = 3
     min_points: int = 4
-    min_length_m: float = 1.2
+    min_length_m: float = 0.8
     """Length of the thin part that is visible."""
-    min_top_m: float = 1.7
+    min_top_m: float = 1.9
     """Height over the ground that it reaches."""
     lean_max: float = 0.12
     """Horizontal metres a metre upwards."""
     scatter_max_m: float = 0.08
     """Standard deviation of the slices about the axis, beside what the sensor's noise and its rays' distance make."""
-    ring_share_max: float = 0.35
-    """Share of the heights of a pole's thin part at which something stands in the ring around it."""
+    ring_share_max: float = 0.5
+    """Share of the heights of a pole's thin part at which something stands in the ring around it …"""
+    free_m: float = 0.75
+    """… and length of a part of it at which nothing does."""
+    hidden_share_max: float = 0.55
+    """Share of its slices beside which something nearer stands: all of them are beside an edge, not on a thin thing."""
     seen_share_min: float = 0.4
     """Share of the sensor's layers between bottom and top that meet it."""
     foot_m: float = 0.5
@@ -74,12 +80,22 @@ class PoleParameters:
 
     def __post_init__(self) -> None:
         """Each value within its range, or `PoleParameterError` with the value."""
-        lengths = ("ground_cell_m", "link_m", "diameter_max_m", "clear_m", "jump_m", "axis_m", "gap_m", "min_length_m")
+        lengths = (
+            "ground_cell_m",
+            "link_m",
+            "diameter_max_m",
+            "clear_m",
+            "jump_m",
+            "axis_m",
+            "gap_m",
+            "min_length_m",
+            "wider_m",
+        )
         for name in (*lengths, "row_deg", "layers_apart", "scatter_max_m", "sigma_range_m", "sigma_floor_m"):
             self._check(name, 0.001, 10.0)
         for name in ("range_min_m", "feet_m", "min_top_m", "foot_m", "body_diameter_m", "body_top_m", "streetlight_m"):
             self._check(name, 0.0, 20.0)
-        for name in ("ground_slope", "lean_max", "ring_share_max", "seen_share_min"):
+        for name in ("ground_slope", "lean_max", "ring_share_max", "free_m", "seen_share_min", "hidden_share_max"):
             self._check(name, 0.0, 1.0)
         self._check("range_max_m", self.range_min_m + self.ground_cell_m, 200.0)
         self._check("min_slices", 2, 1000)

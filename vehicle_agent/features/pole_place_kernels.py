@@ -107,14 +107,15 @@ def around(
         order: of the points, by cell, as `by_cell` gives it.
         start: of each cell in it.
         ground: the cells.
-        axes: (C, 6) x, y and height over the ground of a point of the axis; its lean in x and y [m a m]; radius.
+        axes: (C, 8) x, y and height over the ground of a point of the axis; its lean in x and y [m a m]; radius; unit
+            vector from the sensor.
         belts: (5,) distances beyond the radius where the core ends, the ring begins and ends, a plate ends, all ends.
         bin_m: height of a bin.
         bins: B, number of bins from the ground.
 
     Returns:
-        int64 (C, B, 4): points in core, ring, within the plate's reach, beyond it; float64 (C, B, 5): sums of x, y,
-        xx, xy, yy about the axis of what lies within the plate's reach.
+        int64 (C, B, 4): points in core, ring, within the plate's reach, beyond it but not behind; float64 (C, B, 5):
+        sums of x, y, xx, xy, yy about the axis of what lies within the plate's reach.
     """
     count, sums = np.zeros((axes.shape[0], bins, 4), np.int64), np.zeros((axes.shape[0], bins, 5))
     for c in range(axes.shape[0]):
@@ -141,7 +142,7 @@ def around(
                     sums[c, b, 2] += x * x
                     sums[c, b, 3] += x * y
                     sums[c, b, 4] += y * y
-                else:
+                elif x * axes[c, 6] + y * axes[c, 7] <= axes[c, 5] + belts[3]:
                     count[c, b, 3] += 1
     return count, sums
 

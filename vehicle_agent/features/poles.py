@@ -17,7 +17,7 @@ from gnd_map.arrays import F64, I64
 from schemas.drive import Detections
 from schemas.limits import MAX_DETECTIONS_OF_LOOK
 from vehicle_agent.features.pole_columns import Columns, columns_of, stacked
-from vehicle_agent.features.pole_kinds import Surroundings, kinds_of, look_around, ring_share, tops
+from vehicle_agent.features.pole_kinds import Surroundings, bottoms, is_free, kinds_of, look_around, tops
 from vehicle_agent.features.pole_parameters import PoleInputError, PoleParameters
 from vehicle_agent.features.pole_place_kernels import rays_below
 from vehicle_agent.features.pole_slices import GroundHeights, Seen, check_rays, ground_around, joined, slices_of
@@ -45,6 +45,7 @@ class Pole:
         kind: "pole", "streetlight", "traffic_sign" or "trunk".
         points: of the thin part.
         scans: in which it was seen.
+        hidden: share of its slices that something nearer stands beside.
     """
 
     xy_m: F64
@@ -58,6 +59,7 @@ class Pole:
     kind: str
     points: int
     scans: int
+    hidden: float
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -155,11 +157,11 @@ def _judged(
     points, height = _together([one.points_m for one in seen]), np.concatenate([one.height_m for one in seen])
     near = look_around(columns, points, height, ground)
     gap = np.maximum(p.gap_m, p.layers_apart * layer_tan * columns.range_m)
-    top, foot = tops(columns, near, gap), ground.at(columns.xy_m)
-    good = (ring_share(columns, near) <= p.ring_share_max) & (top >= p.min_top_m)
+    top, bottom, foot = tops(columns, near, gap), bottoms(columns, near, gap), ground.at(columns.xy_m)
+    good = is_free(columns, near, p) & (top >= p.min_top_m)
     good &= ~((columns.diameter_m > p.body_diameter_m) & (top < p.body_top_m))
     good &= np.hypot(*columns.xy_m.T) <= p.range_max_m
-    good[good] = _stands(_take(columns, np.flatnonzero(good)), foot[good], gap[good], rays, p)
+    good[good] = _stands(_take(columns, np.flatnonzero(good)), bottom[good], foot[good], gap[good], rays, p)
     kept = np.flatnonzero(good)
     kept = kept[np.argsort(np.hypot(*columns.xy_m[kept].T), kind="stable")]
     return _values(
@@ -168,18 +170,21 @@ def _judged(
 
 
 def _straight(columns: Columns, layer_tan: float, p: PoleParameters) -> Mask:
-    """Whether columns (C,) are straight and upright, and met by enough of the layers between their ends."""
+    """Whether columns (C,) are straight, upright, met by enough of the layers between their ends, and no edge."""
     expected = (columns.top_m - columns.bottom_m) / np.maximum(layer_tan * columns.range_m, 1e-3) + 1.0
     met = columns.slices / np.maximum(columns.scans, 1) >= p.seen_share_min * expected
+    met &= columns.hidden <= p.hidden_share_max
     return np.asarray(met & (np.hypot(*columns.lean.T) <= p.lean_max) & (columns.scatter_m <= p.scatter_max_m))
 
 
-def _stands(columns: Columns, foot_z: F64, gap_m: F64, rays: list[tuple[F64, F64]], p: PoleParameters) -> Mask:
+def _stands(
+    columns: Columns, bottom_m: F64, foot_z: F64, gap_m: F64, rays: list[tuple[F64, F64]], p: PoleParameters
+) -> Mask:
     """Whether columns (C,) begin near the ground, or what is below them is hidden rather than free."""
-    stands = columns.bottom_m <= p.foot_m + gap_m - p.gap_m
+    stands = bottom_m <= p.foot_m + gap_m - p.gap_m
     high = np.flatnonzero(~stands)
     if len(high):
-        places = np.column_stack([columns.xy_m, foot_z, foot_z + columns.bottom_m])[high]
+        places = np.column_stack([columns.xy_m, foot_z, foot_z + bottom_m])[high]
         below = np.sum([rays_below(points, origins, places, RAY_HALF_M) for points, origins in rays], axis=0)
         stands[high] = below[:, 0] > below[:, 1]
     return np.asarray(stands)
@@ -202,6 +207,7 @@ def _values(
             kinds[k],
             int(columns.points[k]),
             int(columns.scans[k]),
+            float(columns.hidden[k]),
         )
         for k in range(len(kinds))
     )
