@@ -1,0 +1,185 @@
+"""Roads of an OpenDRIVE file: its XML as values that answer where a place (s, t, height) of the road is."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from itertools import pairwise
+from typing import Final
+
+import numpy as np
+
+from gnd_map.arrays import F64
+from tile_store.feature_io.errors import BadElement
+from tile_store.feature_io.osm_document import real
+from tile_store.feature_io.xml_spans import Element
+from tile_store.feature_io.xodr_curves import (
+    Curve,
+    Piece,
+    Profile,
+    ReferenceLine,
+    arc,
+    line,
+    param_poly3,
+    poly3,
+    spiral,
+)
+
+_COEFFICIENTS: Final = ("a", "b", "c", "d")
+MAX_ROAD_M: Final = 1_000_000.0
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Lane:
+    """A lane: id (left positive), type, width or border along it, and its first mark."""
+
+    id: int
+    type: str
+    width: Profile
+    border: Profile | None
+    mark: str
+    colour: str
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Section:
+    """Lanes from start to end; the reference line is lane 0."""
+
+    start_m: float
+    end_m: float
+    lanes: dict[int, Lane]
+
+    def border_m(self, lane_id: int, s_m: F64) -> F64:
+        """(N,) lateral places, from the offset reference line, of the outer border of a lane."""
+        side, t = (1 if lane_id > 0 else -1), np.zeros(len(s_m))
+        for id_ in range(side, lane_id + side, side) if lane_id else ():
+            lane = self.lanes[id_]
+            ds = s_m - self.start_m
+            t = t + side * lane.width.at(ds) if lane.border is None else lane.border.at(ds)
+        return t
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Road:
+    """A road: where its places are in the file's coordinates."""
+
+    id: str
+    where: str
+    length_m: float
+    plan: ReferenceLine
+    elevation: Profile
+    superelevation: Profile
+    lane_offset: Profile
+    sections: tuple[Section, ...]
+    element: Element
+
+    def points_m(self, s_m: F64, t_m: F64, up_m: float = 0.0) -> F64:
+        """(N, 3) places at distances s, t to the left and `up_m` above the surface."""
+        x, y, heading = self.plan.at(s_m)
+        roll = self.superelevation.at(s_m)
+        across, up = t_m * np.cos(roll) - up_m * np.sin(roll), t_m * np.sin(roll) + up_m * np.cos(roll)
+        z = self.elevation.at(s_m) + up
+        return np.column_stack([x - across * np.sin(heading), y + across * np.cos(heading), z])
+
+
+def road_of(element: Element, where: str) -> Road:
+    """A <road>; BadElement says what it lacks."""
+    name = f"{where}, line {element.line}: road {element.attributes.get('id', '?'):.40}"
+    length_m = value(name, element, "length")
+    if not 0.0 <= length_m <= MAX_ROAD_M:
+        raise BadElement(f"{name}: length {length_m} m is not in 0 … {MAX_ROAD_M:.0f} m")
+    plan = element.find("planView")
+    pieces = tuple(_piece(name, one) for one in (plan.all("geometry") if plan else ()))
+    if not pieces:
+        raise BadElement(f"{name}: has no geometry, so no position")
+    if any(a.s_m >= b.s_m for a, b in pairwise(pieces)):
+        raise BadElement(f"{name}: its {len(pieces)} geometries do not ascend in s")
+    lateral, lanes = element.find("lateralProfile"), element.find("lanes")
+    return Road(
+        element.attributes.get("id", ""), name, length_m, ReferenceLine(pieces),
+        profile(name, element.find("elevationProfile"), "elevation"), profile(name, lateral, "superelevation"),
+        profile(name, lanes, "laneOffset"), _sections(name, lanes, length_m), element,
+    )  # fmt: skip
+
+
+def value(where: str, element: Element, key: str, default: float | None = None) -> float:
+    """An attribute that is a finite number; BadElement otherwise, or when it is missing without a default."""
+    text = element.attributes.get(key)
+    if text is None:
+        if default is None:
+            raise BadElement(f"{where}, line {element.line}: <{element.name}> without {key}")
+        return default
+    return real(f"{where}, line {element.line}", f"{key} of <{element.name}>", text)
+
+
+def profile(where: str, parent: Element | None, name: str, start: str = "s") -> Profile:
+    """The cubics of a name below an element."""
+    found = parent.all(name) if parent else []
+    starts = np.array([value(where, one, start) for one in found], np.float64)
+    rows = [[value(where, one, key) for key in _COEFFICIENTS] for one in found]
+    if (np.diff(starts) < 0).any():
+        raise BadElement(f"{where}: its {len(starts)} <{name}> do not ascend in {start}")
+    return Profile(starts, np.array(rows, np.float64).reshape(-1, 4))
+
+
+def _piece(where: str, element: Element) -> Piece:
+    s, x, y, heading, length = (value(where, element, key) for key in ("s", "x", "y", "hdg", "length"))
+    if length <= 0:
+        raise BadElement(f"{where}, line {element.line}: a geometry of length {length} m")
+    shape = next((child for child in element.children if child.name in _SHAPES), None)
+    if shape is None:
+        raise BadElement(f"{where}, line {element.line}: a geometry that is none of {', '.join(_SHAPES)}")
+    return Piece(s, x, y, heading, length, _SHAPES[shape.name](where, shape, length))
+
+
+def _param(where: str, shape: Element, length: float) -> Curve:
+    u, v = (np.array([value(where, shape, k + axis) for k in _COEFFICIENTS]) for axis in "UV")
+    return param_poly3(u, v, 1.0 if shape.attributes.get("pRange") == "arcLength" else length)
+
+
+_SHAPES: Final[dict[str, Callable[[str, Element, float], Curve]]] = {
+    "line": lambda _where, _shape, _length: line(),
+    "arc": lambda where, shape, length: arc(value(where, shape, "curvature"), length),
+    "spiral": lambda where, shape, length: spiral(
+        value(where, shape, "curvStart"), value(where, shape, "curvEnd"), length
+    ),
+    "poly3": lambda where, shape, length: poly3(np.array([value(where, shape, k) for k in _COEFFICIENTS]), length),
+    "paramPoly3": _param,
+}
+
+
+def _sections(where: str, lanes: Element | None, length_m: float) -> tuple[Section, ...]:
+    found = lanes.all("laneSection") if lanes else []
+    starts = [value(where, one, "s") for one in found]
+    if any(a >= b for a, b in pairwise([*starts, length_m + 1e-9])):
+        raise BadElement(f"{where}: its {len(starts)} lane sections do not ascend in s up to {length_m} m")
+    ends = [*starts[1:], length_m]
+    return tuple(Section(a, b, _lanes(where, one)) for one, a, b in zip(found, starts, ends, strict=True))
+
+
+def _lanes(where: str, section: Element) -> dict[int, Lane]:
+    found: dict[int, Lane] = {}
+    for side in section.children:
+        for element in side.all("lane"):
+            lane = _lane(where, element)
+            if lane.id in found:
+                raise BadElement(f"{where}, line {element.line}: lane {lane.id} comes twice in a section")
+            found[lane.id] = lane
+    for sign in (1, -1):
+        ids = sorted(abs(id_) for id_ in found if id_ * sign > 0)
+        if ids != list(range(1, len(ids) + 1)):
+            raise BadElement(
+                f"{where}, line {section.line}: lanes {[sign * n for n in ids]} do not count from the middle"
+            )
+    return found
+
+
+def _lane(where: str, element: Element) -> Lane:
+    number = value(where, element, "id")
+    if not number.is_integer():
+        raise BadElement(f"{where}, line {element.line}: lane id {number} is no whole number")
+    mark = element.find("roadMark")
+    said = mark.attributes if mark else {}
+    return Lane(
+        int(number), element.attributes.get("type", "none"), profile(where, element, "width", "sOffset"),
+        profile(where, element, "border", "sOffset") if element.find("border") else None,
+        said.get("type", "none"), said.get("color", ""),
+    )  # fmt: skip
