@@ -21,7 +21,7 @@ from fleet_bus.config import DEFAULT_ENDPOINT, BusConfig
 from fleet_bus.router import wait_for_stop
 from tile_store import tables
 from tile_store.arguments import parse_tile, parse_time_ns, parse_versions
-from tile_store.compare import MapDiff, map_diff, map_info, version_diff
+from tile_store.compare import MapDiff, layer_info, map_diff, version_diff
 from tile_store.errors import StoreError
 from tile_store.export import FORMATS, export_map
 from tile_store.server import TileServer
@@ -101,7 +101,7 @@ def build(drives: tuple[Path, ...], path: Path, codec: str, layer: str, as_json:
 def info(path: Path, region: str, layer: str, as_json: bool) -> None:
     """What STORE holds: its newest versions in numbers, its queue and its quarantine."""
     with _existing(path) as opened:
-        values = {"layers": opened.layers()} | map_info(opened, layer=layer, prefix=region).as_dict()
+        values = {"layers": opened.layers()} | layer_info(opened, layer=layer, prefix=region).as_dict()
         values["store"] = asdict(opened.counts())
     _show(values, as_json, lambda console: console.print(tables.info(str(path), values)))
 

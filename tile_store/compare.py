@@ -8,18 +8,21 @@ from typing import Any
 import numpy as np
 
 from gnd_map.codec import codec_of
+from gnd_map.features import is_feature_layer
 from gnd_map.gaussian import Gaussians
 from gnd_map.grid import VoxelGrid
 from gnd_map.tile import diff
 from gnd_map.tile_id import TileId
+from tile_store.compare_features import FeatureMapInfo, feature_map_info, feature_tile_diff
 from tile_store.errors import StoreError, UnknownVersion
+from tile_store.regions import bounds_deg
 from tile_store.store import Store
 from tile_store.values import DEFAULT_LAYER, StoredTile
 
 
 @dataclass(frozen=True, slots=True)
 class MapInfo:
-    """Totals of a region's newest versions."""
+    """Totals of a region's newest versions of a layer of Gaussians."""
 
     layer: str
     prefix: str
@@ -50,14 +53,26 @@ class MapInfo:
         return asdict(self)
 
 
+def layer_info(store: Store, *, layer: str = DEFAULT_LAYER, prefix: str = "") -> MapInfo | FeatureMapInfo:
+    """Totals of a region's newest versions, whatever the layer holds; `StoreError` when there are no tiles."""
+    if is_feature_layer(layer):
+        return feature_map_info(list(_newest(store, layer, prefix, at_ns=None).values()), layer, prefix)
+    return map_info(store, layer=layer, prefix=prefix)
+
+
 def map_info(store: Store, *, layer: str = DEFAULT_LAYER, prefix: str = "") -> MapInfo:
-    """Totals of a region's newest versions; `StoreError` when it holds no tiles."""
+    """Totals of a region's newest versions of a layer of Gaussians.
+
+    Raises:
+        StoreError: no tiles there.
+        BadValue: the layer holds features.
+    """
     stored = list(_newest(store, layer, prefix, at_ns=None).values())
     if not stored:
         raise StoreError(f"no tiles in layer {layer!r}, region {prefix or 'everywhere'!r}")
     gaussians = [(one.tile, one.decode_gaussians().gaussians) for one in stored]
     body_bytes, n_gaussians = sum(len(one.body) for one in stored), sum(len(g) for _, g in gaussians)
-    south, west, north, east = _bounds_deg([one.tile for one in stored])
+    south, west, north, east = bounds_deg([one.tile for one in stored])
     lowest, highest = _heights_m(gaussians)
     return MapInfo(
         layer=layer,
@@ -81,13 +96,6 @@ def map_info(store: Store, *, layer: str = DEFAULT_LAYER, prefix: str = "") -> M
     )
 
 
-def _bounds_deg(tiles: Iterable[TileId]) -> tuple[float, float, float, float]:
-    corners = np.degrees([(*tile.south_west_rad, *tile.north_east_rad) for tile in tiles])
-    south, west = corners[:, :2].min(axis=0).tolist()
-    north, east = corners[:, 2:].max(axis=0).tolist()
-    return south, west, north, east
-
-
 def _heights_m(gaussians: Iterable[tuple[TileId, Gaussians]]) -> tuple[int, int]:
     floors = [VoxelGrid.of(tile).unravel(g.voxel_id)[2] for tile, g in gaussians if len(g)]
     return (min(int(f.min()) for f in floors), max(int(f.max()) for f in floors) + 1) if floors else (0, 0)
@@ -95,21 +103,24 @@ def _heights_m(gaussians: Iterable[tuple[TileId, Gaussians]]) -> tuple[int, int]
 
 @dataclass(frozen=True, slots=True)
 class TileDiff:
-    """How one tile differs between an old and a new state; version 0 = the tile is not there."""
+    """How one tile differs between an old and a new state; version 0 = the tile is not there.
+
+    Counted are voxels, of a feature layer pieces of features (a point is one piece).
+    """
 
     tile: str
     """Path."""
     old_version: int
     new_version: int
     added: int
-    """Voxels that have a Gaussian only in the new state."""
+    """Only in the new state."""
     removed: int
-    """Voxels that have a Gaussian only in the old state."""
+    """Only in the old state."""
     changed: int
-    """Voxels whose Gaussian is another one."""
+    """In both, another one."""
     same: int
     max_shift_m: float
-    """Largest move of a changed voxel's mean."""
+    """Largest move of a changed voxel's mean, or of a changed feature."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -129,6 +140,11 @@ class MapDiff:
     def as_dict(self) -> dict[str, Any]:
         """JSON-able."""
         return asdict(self)
+
+    @property
+    def noun(self) -> str:
+        """What is counted."""
+        return "features" if is_feature_layer(self.layer) else "voxels"
 
     def rows(self) -> Iterator[tuple[str, ...]]:
         """A table: its head, then one row a tile that differs."""
@@ -162,7 +178,8 @@ def map_diff(
     """
     before, after = _newest(old, layer, prefix, old_at_ns), _newest(new, layer, prefix, new_at_ns)
     both = sorted(before.keys() | after.keys())
-    return _map_diff(layer, prefix, [tile_diff(tile, before.get(tile), after.get(tile)) for tile in both])
+    diffs = [tile_diff(tile, before.get(tile), after.get(tile), layer) for tile in both]
+    return _map_diff(layer, prefix, diffs)
 
 
 def version_diff(store: Store, layer: str, tile: TileId, old_version: int, new_version: int) -> MapDiff:
@@ -173,19 +190,25 @@ def version_diff(store: Store, layer: str, tile: TileId, old_version: int, new_v
         if stored is None:
             raise UnknownVersion(f"tile {tile} of layer {layer!r} has no version {version}")
         versions.append(stored)
-    return _map_diff(layer, tile.path, [tile_diff(tile, *versions)])
+    return _map_diff(layer, tile.path, [tile_diff(tile, versions[0], versions[1], layer)])
 
 
-def tile_diff(tile: TileId, old: StoredTile | None, new: StoredTile | None) -> TileDiff:
-    """How one tile differs between two states."""
+def tile_diff(tile: TileId, old: StoredTile | None, new: StoredTile | None, layer: str = DEFAULT_LAYER) -> TileDiff:
+    """How one tile of a layer differs between two states."""
+    numbers = (old.version if old else 0, new.version if new else 0)
+    if is_feature_layer(layer):
+        counts = feature_tile_diff(tile, old, new)
+        return TileDiff(
+            tile.path, *numbers, counts.added, counts.removed, counts.changed, counts.same, counts.max_shift_m
+        )
     before, after = _gaussians(old), _gaussians(new)
     delta = diff(before, after)
     changed = np.intersect1d(delta.put.voxel_id, before.voxel_id)
     shift_m = before.select(changed).mean_m - after.select(changed).mean_m
     return TileDiff(
         tile=tile.path,
-        old_version=old.version if old else 0,
-        new_version=new.version if new else 0,
+        old_version=numbers[0],
+        new_version=numbers[1],
         added=len(delta.put) - len(changed),
         removed=len(delta.removed),
         changed=len(changed),

@@ -1,9 +1,13 @@
 """Regions of tiles: path prefixes as ranges of Morton numbers, and key expressions with wildcards."""
 
 import re
+from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import Final, Self
 
+import numpy as np
+
+from gnd_map.tile_id import TileId
 from schemas.errors import BadKey
 from schemas.wire import LAYER_PATTERN
 from tile_store.errors import StoreError
@@ -30,6 +34,14 @@ def morton_range(prefix: str) -> tuple[int, int]:
     span = 4 ** (LEVELS - len(digits))
     first = int(digits or "0", 4) * span
     return first, first + span
+
+
+def bounds_deg(tiles: Iterable[TileId]) -> tuple[float, float, float, float]:
+    """South, west, north and east of the box around the tiles, degrees."""
+    corners = np.degrees([(*tile.south_west_rad, *tile.north_east_rad) for tile in tiles])
+    south, west = corners[:, :2].min(axis=0).tolist()
+    north, east = corners[:, 2:].max(axis=0).tolist()
+    return south, west, north, east
 
 
 @dataclass(frozen=True, slots=True)

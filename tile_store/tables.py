@@ -26,9 +26,7 @@ def info(title: str, told: dict[str, Any]) -> Table:
             "layer": f"{told['layer']} of {', '.join(told['layers'])}",
             "region": told["prefix"] or "everywhere",
             "tiles": f"{told['tiles']} in {told['districts']} districts",
-            "Gaussians": f"{told['gaussians']} of {told['points']} points",
-            "size": f"{told['body_bytes'] / 1e6:.3f} MB, {told['bytes_a_voxel']:.2f} bytes a Gaussian",
-            "codecs": ", ".join(f"{name} ({tiles} tiles)" for name, tiles in told["codecs"].items()),
+            **(_features(told) if "features" in told else _gaussians(told)),
             "versions": f"{told['lowest_version']} to {told['highest_version']}",
             "updated": f"{_time(told['updated_ns'])} UTC",
             "south-west": f"{told['south_deg']:.6f}, {told['west_deg']:.6f}",
@@ -39,6 +37,27 @@ def info(title: str, told: dict[str, Any]) -> Table:
             "in quarantine": store["quarantined"],
         },
     )
+
+
+def _gaussians(told: dict[str, Any]) -> dict[str, Any]:
+    return {
+        "Gaussians": f"{told['gaussians']} of {told['points']} points",
+        "size": f"{told['body_bytes'] / 1e6:.3f} MB, {told['bytes_a_voxel']:.2f} bytes a Gaussian",
+        "codecs": _listed(told["codecs"], " tiles"),
+    }
+
+
+def _features(told: dict[str, Any]) -> dict[str, Any]:
+    return {
+        "features": f"{told['features']} in {told['pieces']} pieces with {told['points']} points",
+        "kinds": _listed(told["kinds"]),
+        "existence": _listed(told["states"]),
+        "size": f"{told['body_bytes'] / 1e6:.3f} MB, {told['bytes_a_piece']:.2f} bytes a piece",
+    }
+
+
+def _listed(counts: dict[str, int], unit: str = "") -> str:
+    return ", ".join(f"{name} ({n}{unit})" for name, n in counts.items())
 
 
 def history(values: dict[str, Any]) -> Table:
@@ -56,7 +75,7 @@ def history(values: dict[str, Any]) -> Table:
 
 
 def print_diff(console: Console, result: MapDiff) -> None:
-    """One row a tile that differs, and the totals in voxels."""
+    """One row a tile that differs, and the totals in voxels or features."""
     head, *rows = result.rows()
     table = Table(title=f"layer {result.layer}, region {result.prefix or 'everywhere'}")
     for i, column in enumerate(head):
@@ -66,7 +85,7 @@ def print_diff(console: Console, result: MapDiff) -> None:
     if rows:
         console.print(table)
     console.print(
-        f"{len(rows)} tiles differ, {result.tiles_same} are the same; voxels: {result.added} added,"
+        f"{len(rows)} tiles differ, {result.tiles_same} are the same; {result.noun}: {result.added} added,"
         f" {result.removed} removed, {result.changed} changed, {result.same} the same",
         highlight=False,
     )
