@@ -7,6 +7,8 @@ from pathlib import Path
 from typing import Any, Final
 
 from cloud_merger.errors import MergerError
+from cloud_merger.features.check import FeatureLimits
+from cloud_merger.features.parameters import FeatureMergeParameters
 from cloud_merger.ingest import IngestLimits
 from cloud_merger.merge import MergeParameters
 from cloud_merger.waiting import WaitingLimits
@@ -28,7 +30,9 @@ class ShardConfig:
         connect: endpoints of routers.
         bus_lease_ms: how long a silent shard counts as alive; 0: the bus's own.
         merge: how statements become changes.
+        features: the same of feature layers.
         ingest: which reports are refused.
+        feature_limits: which reports about features are refused.
         want: which Gaussians of reports in short are asked for.
         waiting: how many reports may wait for their Gaussians.
         store: batching of the store.
@@ -47,7 +51,9 @@ class ShardConfig:
     connect: tuple[str, ...] = (DEFAULT_ENDPOINT,)
     bus_lease_ms: int = 0
     merge: MergeParameters = field(default_factory=MergeParameters)
+    features: FeatureMergeParameters = field(default_factory=FeatureMergeParameters)
     ingest: IngestLimits = field(default_factory=IngestLimits)
+    feature_limits: FeatureLimits = field(default_factory=FeatureLimits)
     want: WantParameters = field(default_factory=WantParameters)
     waiting: WaitingLimits = field(default_factory=WaitingLimits)
     store: StoreConfig = field(default_factory=StoreConfig)

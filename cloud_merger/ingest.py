@@ -2,6 +2,7 @@
 
 A report may come whole, or in short: flags first, answered by "wanted" with the voxels of which Gaussians are asked
 for, then these. Nothing of it is kept before all of it is here; what cannot be understood is answered by "resend".
+A report about features always comes whole; what it found near a border is kept for the tile beyond, too.
 """
 
 import logging
@@ -13,13 +14,17 @@ from typing import Final
 import numpy as np
 
 from cloud_merger.errors import BadReport, MergerError, NotUnderstood
+from cloud_merger.features.check import FeatureLimits
+from cloud_merger.features.kept import FeatureInbox, check_is_of_gaussians, districts_of, square
+from cloud_merger.features.parameters import FeatureMergeParameters
 from cloud_merger.parameters import MergeParameters
 from cloud_merger.short_reports import ShortReports
 from cloud_merger.waiting import Waiting, WaitingLimits
 from cloud_merger.wants import WantParameters
-from gnd_map.tile_id import LAT_TILES, LON_TILES, District, TileId
+from gnd_map.tile_id import TileId
 from schemas.changes import ChangeAck, ChangeReport, TileChange, split
 from schemas.errors import SchemaError
+from schemas.features import FeatureReport
 from schemas.keys import parse_change_key
 from schemas.limits import MAX_REASON_CHARACTERS
 from schemas.packed import PackedGaussians, PackedReport, decode_upload
@@ -64,6 +69,7 @@ class Ingest:
         store: where reports are kept.
         limits: what is refused.
         short: how reports in short are understood; None: with the defaults.
+        features: what becomes of reports about features; None: with the defaults.
         on_stored: called after new reports are durable.
         now_ns: the clock, int ns UTC.
     """
@@ -75,9 +81,13 @@ class Ingest:
         on_stored: Callable[[], object] = lambda: None,
         now_ns: Callable[[], int] = time.time_ns,
         short: ShortReports | None = None,
+        features: FeatureInbox | None = None,
     ) -> None:
         self._store, self._limits, self._on_stored, self._now_ns = store, limits, on_stored, now_ns
         self._short = short or ShortReports(store, MergeParameters(), WantParameters(), WaitingLimits())
+        self._features = features or FeatureInbox(
+            store, FeatureLimits(), FeatureMergeParameters().reach_m, limits.reach_tiles
+        )
         self._known_bases: dict[tuple[str, TileId, bytes], None] = {}
 
     def answer(self, key: str, payload: bytes) -> ChangeAck:
@@ -98,7 +108,11 @@ class Ingest:
             _LOG.info("asked for report %s again: %s", report_id, error)
             return ChangeAck(report_id, "resend", _one_line(str(error)))
 
-    def _answer(self, key: str, upload: ChangeReport | PackedReport | PackedGaussians) -> ChangeAck:
+    def _answer(self, key: str, upload: ChangeReport | PackedReport | PackedGaussians | FeatureReport) -> ChangeAck:
+        if isinstance(upload, FeatureReport):
+            self._features.check(key, upload)
+            return self._keep_rows(upload.report_id, self._features.rows(upload, self._now_ns()))
+        check_is_of_gaussians(key, upload)
         if isinstance(upload, ChangeReport):
             return self._checked_and_kept(key, upload)
         if isinstance(upload, PackedReport):
@@ -138,11 +152,15 @@ class Ingest:
             ReportRow(report.report_id, report.layer, tile, report.vehicle, received_ns, body, base_sha=change.base_sha)
             for change, (tile, body) in zip(report.tiles, split(report), strict=True)
         ]
-        is_new = "stored" in self._store.put_reports(rows)
+        ack = self._keep_rows(report.report_id, rows)
         self._short.room.finish(report.report_id)
+        return ack
+
+    def _keep_rows(self, report_id: str, rows: list[ReportRow]) -> ChangeAck:
+        is_new = "stored" in self._store.put_reports(rows)
         if is_new:
             self._on_stored()
-        return ChangeAck(report.report_id, "stored" if is_new else "duplicate")
+        return ChangeAck(report_id, "stored" if is_new else "duplicate")
 
     def _refuse(self, key: str, payload: bytes, report_id: str, error: Exception) -> ChangeAck:
         reason = _one_line(f"{type(error).__name__}: {error}")
@@ -176,8 +194,8 @@ class Ingest:
 
     def _check_reach(self, layer: str, tile: TileId) -> None:
         """Refuse a tile without a map that is far from all that the map holds."""
-        near = set(_square(tile, self._limits.reach_tiles))
-        held = (head.tile for district in _districts(near) for head in self._store.heads(layer, district.path))
+        near = set(square(tile, self._limits.reach_tiles))
+        held = (head.tile for district in districts_of(near) for head in self._store.heads(layer, district.path))
         if near.isdisjoint(held):
             reach = self._limits.reach_tiles
             raise BadReport(f"tile {tile} is not on the map of layer {layer}, nor is any within {reach} tiles of it")
@@ -207,19 +225,6 @@ def check_change(change: TileChange, limits: IngestLimits) -> None:
             row = int(np.argmax(value))
             shown = what.format(value[row].item())
             raise BadReport(f"tile {change.tile}, voxel {changed.voxel_id[row]}: {shown}, the limit is {limit:g}")
-
-
-def _square(tile: TileId, reach: int) -> list[TileId]:
-    """The tiles at most `reach` away in each direction."""
-    steps = range(-reach, reach + 1)
-    lon, lat = tile.lon_index, tile.lat_index
-    return [
-        TileId.from_indices((lon + i) % LON_TILES, lat + j) for j in steps if 0 <= lat + j < LAT_TILES for i in steps
-    ]
-
-
-def _districts(tiles: set[TileId]) -> list[District]:
-    return sorted({tile.district for tile in tiles})
 
 
 def _one_line(text: str) -> str:

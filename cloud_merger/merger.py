@@ -5,6 +5,7 @@ import threading
 
 from cloud_merger.announce import Announcer
 from cloud_merger.config import ShardConfig
+from cloud_merger.features.kept import FeatureInbox
 from cloud_merger.ingest import Ingest
 from cloud_merger.ownership import Members
 from cloud_merger.reception import Reception
@@ -40,7 +41,8 @@ def run_shard(config: ShardConfig, stop: threading.Event) -> None:
 
         # Ingest: check, keep, acknowledge, in threads of the bus.
         short = ShortReports(store, config.merge, config.want, config.waiting)
-        ingest = Ingest(store, config.ingest, on_stored=wake.set, short=short)
+        features = FeatureInbox(store, config.feature_limits, config.features.reach_m, config.ingest.reach_tiles)
+        ingest = Ingest(store, config.ingest, on_stored=wake.set, short=short, features=features)
         reception = Reception(bus, members, ingest.answer, on_death=store.release)
         reception.open()
         _LOG.info("merger %s: store %s, mode %s", config.shard_id, config.store_path, config.merge.mode)

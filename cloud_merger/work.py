@@ -2,13 +2,17 @@
 
 import logging
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from typing import TypeVar
 
 from cloud_merger.config import ShardConfig
+from cloud_merger.features.kept import FeatureContents, said_of
+from cloud_merger.features.merge import merge_features
 from cloud_merger.merge import merge_tile
 from cloud_merger.statements import Report, statements_of
 from cloud_merger.stored import Bases, said
 from gnd_map.codec import Lattice, is_on, lattice_of, snap
+from gnd_map.features import FeatureTile, is_feature_layer
 from gnd_map.gaussian import Gaussians
 from gnd_map.tile import Tile
 from schemas.errors import SchemaError
@@ -16,6 +20,7 @@ from tile_store.store import Store
 from tile_store.values import Claim, Publication, ReportRow, TileWork, lattice_named
 
 _LOG = logging.getLogger(__name__)
+T = TypeVar("T")
 
 
 class Worker:
@@ -23,7 +28,7 @@ class Worker:
 
     def __init__(self, store: Store, config: ShardConfig) -> None:
         self._store, self._config = store, config
-        self._contents = Bases(store)
+        self._contents, self._features = Bases(store), FeatureContents(store)
 
     def merge(self, claims: Sequence[Claim]) -> list[Publication]:
         """What to publish for these claims; a tile that failed is postponed, or set aside after `max_attempts`."""
@@ -41,7 +46,7 @@ class Worker:
         if claim.attempts > self._config.max_attempts:  # it may be what killed the shards that claimed it before
             return self._set_aside(work, "no shard that claimed it came to an end")
         try:
-            return self._publication(work)
+            return self._of_features(work) if is_feature_layer(claim.layer) else self._publication(work)
         except Exception as error:
             _LOG.exception("merge of %s failed, attempt %d", claim.tile, claim.attempts)
             if claim.attempts == self._config.max_attempts:
@@ -66,6 +71,26 @@ class Worker:
             voxel_reports=merged.provenance,
         )
 
+    def _of_features(self, work: TileWork) -> Publication:
+        """The same of a tile of a feature layer."""
+        layer, tile = work.claim.layer, work.claim.tile
+        epoch = () if work.epoch is None else work.epoch.decode_features().features
+        parts = [part for row in work.reports if (part := self._readable(row, said_of)) is not None]
+        found = {
+            sha: self._features.content(layer, tile, sha) for sha in sorted({row.base_sha for row in work.reports})
+        }
+        bases = {sha: features for sha, features in found.items() if features is not None}
+        merged = merge_features(tile, epoch, parts, self._config.features, bases)
+        new = FeatureTile(tile, work.base_version + 1, merged.features)
+        is_new = new.sha != work.head.sha if work.head else len(merged.features) > 0
+        return Publication(
+            claim=work.claim,
+            base_version=work.base_version,
+            tile=new if is_new else None,
+            report_ids=_ids(work),
+            voxel_reports=merged.provenance,
+        )
+
     def _lattice(self, work: TileWork, epoch: Gaussians) -> Lattice | None:
         """Where the merged tile lies: on the lattice of the epoch; a tile that the map has not yet, on the configured.
 
@@ -78,9 +103,12 @@ class Worker:
         return lattice_of(work.epoch.codec_id)
 
     def _report(self, row: ReportRow) -> Report | None:
+        return self._readable(row, lambda body: self._config.merge.report_of(row.report_id, *said(body)))
+
+    def _readable(self, row: ReportRow, read: Callable[[bytes], T]) -> T | None:
         """What a stored report says; nothing when it can no longer be read (its vehicle has long had its ack)."""
         try:
-            return self._config.merge.report_of(row.report_id, *said(row.body))
+            return read(row.body)
         except SchemaError as error:
             reason = f"report {row.report_id} on tile {row.tile} cannot be read any more and is left out: {error}"
             _LOG.error("%s", reason)
