@@ -1,0 +1,309 @@
+"""GraphSLAM of a drive in the plane with GTSAM (Kim et al. 2018, sections 3.1 and 3.2).
+
+Nodes are the poses of keyframes, the features, the slow errors of the GNSS, and two numbers of the drive: wheel scale
+and gyro bias. Edges are motion (Eq. 1-2), measurements of features (Eq. 3-5), fixes, and matches with the HD map
+(Eq. 7-9). The cost is Eq. (6), or Eq. (10) when there are matches.
+"""
+
+from dataclasses import dataclass, field
+from math import atan2, cos, pi, sin
+from typing import Any, NamedTuple
+
+import gtsam
+import numpy as np
+
+from gnd_map.arrays import F64, I64
+from vehicle_agent.features.bias_chain import gauss_markov_springs
+from vehicle_agent.features.dead_reckoning import Steps
+from vehicle_agent.features.new_layer_parameters import NewLayerParameters
+
+CALIBRATION = gtsam.symbol("c", 0)
+PINNED_RAD = 1e-3  # sigma of the rotation of what has none
+FREE_RAD = 1e4  # sigma of a rotation of which nothing is said
+ITERATIONS = 30
+
+
+class FixNodes(NamedTuple):
+    """Fixes put together at keyframes, G of them."""
+
+    key: I64
+    """(G,) keyframe, increasing."""
+    t_s: F64
+    """(G,)"""
+    xy_m: F64
+    """(G, 2) map frame."""
+    variance_m2: F64
+    """(G,) of an axis, without the slow error."""
+
+
+class Ties(NamedTuple):
+    """Measurements of one feature put together at a keyframe, T of them."""
+
+    key: I64
+    """(T,) keyframe."""
+    landmark: I64
+    """(T,)"""
+    polar: F64
+    """(T, 2): bearing [rad] and range [m] from the keyframe."""
+    cov: F64
+    """(T, 2, 2) of bearing and range."""
+
+
+class PoseMatches(NamedTuple):
+    """Poses of keyframes told by something else than motion and features: lanes (Eq. 8), or another localiser."""
+
+    key: I64
+    """(P,)"""
+    pose: F64
+    """(P, 3) near which they hold."""
+    off: F64
+    """(P, 3) that the keyframe is off from `pose`, in its frame (x ahead, y left, yaw; the logarithm)."""
+    information: F64
+    """(P, 3, 3) of `off`; may be singular: nothing is then said along some direction."""
+
+
+class Anchors(NamedTuple):
+    """Features whose places are known: A of them."""
+
+    landmark: I64
+    """(A,)"""
+    xy_m: F64
+    """(A, 2)"""
+    cov: F64
+    """(A, 2, 2)"""
+
+
+NO_FIX_NODES = FixNodes(np.empty(0, np.int64), np.empty(0), np.empty((0, 2)), np.empty(0))
+NO_TIES = Ties(np.empty(0, np.int64), np.empty(0, np.int64), np.empty((0, 2)), np.empty((0, 2, 2)))
+NO_MATCHES = PoseMatches(np.empty(0, np.int64), np.empty((0, 3)), np.empty((0, 3)), np.empty((0, 3, 3)))
+NO_ANCHORS = Anchors(np.empty(0, np.int64), np.empty((0, 2)), np.empty((0, 2, 2)))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Problem:
+    """All edges of a drive. calibration: (2,) wheel scale and gyro bias that `steps` were made with."""
+
+    steps: Steps
+    calibration: F64
+    fixes: FixNodes = NO_FIX_NODES
+    ties: Ties = NO_TIES
+    lanes: PoseMatches = NO_MATCHES
+    poses: PoseMatches = NO_MATCHES
+    anchors: Anchors = NO_ANCHORS
+
+
+class State(NamedTuple):
+    """Estimates of all nodes but the GNSS's errors."""
+
+    pose: F64
+    """(K, 3)"""
+    xy_m: F64
+    """(N, 2) features."""
+    calibration: F64
+    """(2,) wheel scale and gyro bias [rad/s]."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Solution:
+    """The optimum of a graph, and what it takes to ask how certain it is."""
+
+    state: State
+    cost: float
+    """J of Eq. (6) or (10)."""
+    _graph: Any = field(repr=False)
+    _values: Any = field(repr=False)
+
+    def landmark_cov(self) -> F64:
+        """(N, 2, 2) marginal covariances of the features in the map frame."""
+        marginals = gtsam.Marginals(self._graph, self._values)
+        found = [marginals.marginalCovariance(_l(n)) for n in range(len(self.state.xy_m))]
+        return np.array(found).reshape(-1, 2, 2)
+
+    def pose_cov(self, keys: I64) -> F64:
+        """(P, 3, 3) marginal covariances of keyframes (P,), x and y turned into the map frame."""
+        marginals = gtsam.Marginals(self._graph, self._values)
+        found = np.array([marginals.marginalCovariance(_x(int(k))) for k in keys]).reshape(-1, 3, 3)
+        R = np.zeros((len(keys), 3, 3))
+        yaw = self.state.pose[keys, 2]
+        R[:, 0, 0], R[:, 0, 1], R[:, 1, 0], R[:, 1, 1] = np.cos(yaw), -np.sin(yaw), np.sin(yaw), np.cos(yaw)
+        R[:, 2, 2] = 1.0
+        return np.asarray(R @ found @ R.transpose(0, 2, 1))
+
+
+def solve(problem: Problem, start: State, parameters: NewLayerParameters) -> Solution:
+    """Minimise Eq. (6), or with matches Eq. (10), by Levenberg-Marquardt from `start`."""
+    graph, values = gtsam.NonlinearFactorGraph(), gtsam.Values()
+    _add_poses(values, start)
+    _add_motion(graph, problem)
+    _add_calibration(graph, parameters)
+    _add_fixes(graph, values, problem.fixes, start, parameters)
+    _add_ties(graph, problem.ties, parameters.landmarks.robust_k)
+    _add_matches(graph, problem.lanes, parameters.lanes.robust_k)
+    _add_matches(graph, problem.poses, None)
+    _add_anchors(graph, problem.anchors)
+    optimum = _optimised(graph, values)
+    return Solution(_state(optimum, len(start.pose), len(start.xy_m)), 2.0 * graph.error(optimum), graph, optimum)
+
+
+def _pose2(pose: F64) -> Any:
+    return gtsam.Pose2(float(pose[0]), float(pose[1]), float(pose[2]))
+
+
+def _x(n: int) -> int:
+    return int(gtsam.symbol("x", n))
+
+
+def _l(n: int) -> int:
+    return int(gtsam.symbol("l", n))
+
+
+def _b(n: int) -> int:
+    return int(gtsam.symbol("b", n))
+
+
+def _optimised(graph: Any, values: Any) -> Any:
+    settings = gtsam.LevenbergMarquardtParams()
+    settings.setMaxIterations(ITERATIONS)
+    settings.setRelativeErrorTol(1e-7)
+    settings.setAbsoluteErrorTol(1e-7)
+    return gtsam.LevenbergMarquardtOptimizer(graph, values, settings).optimize()
+
+
+def _state(values: Any, n_poses: int, n_landmarks: int) -> State:
+    poses = [values.atPose2(_x(k)) for k in range(n_poses)]
+    return State(
+        np.array([(p.x(), p.y(), p.theta()) for p in poses]),
+        np.array([values.atPoint2(_l(n)) for n in range(n_landmarks)]).reshape(-1, 2),
+        np.array(values.atPoint2(CALIBRATION)),
+    )
+
+
+def _add_poses(values: Any, start: State) -> None:
+    for k, pose in enumerate(start.pose):
+        values.insert(_x(k), _pose2(pose))
+    for n, xy in enumerate(start.xy_m):
+        values.insert(_l(n), xy)
+    values.insert(CALIBRATION, start.calibration)
+
+
+def _add_motion(graph: Any, problem: Problem) -> None:
+    rows = zip(problem.steps.delta, problem.steps.jacobian, problem.steps.cov, strict=True)
+    for k, (delta, jacobian, cov) in enumerate(rows):
+        noise = gtsam.noiseModel.Gaussian.Covariance(cov)
+        keys = [_x(k), _x(k + 1), CALIBRATION]
+        graph.add(gtsam.CustomFactor(noise, keys, _Motion(delta, jacobian, problem.calibration)))
+
+
+class _Motion:
+    """Eq. (1) as GTSAM asks for it: how far the motion between two poses is from what wheels and gyro say."""
+
+    __slots__ = ("at", "by_calibration", "delta", "keys")
+
+    def __init__(self, delta: F64, jacobian: F64, at: F64) -> None:
+        self.delta = tuple(delta.tolist())
+        self.by_calibration = -jacobian
+        self.at = at
+
+    def __call__(self, factor: Any, values: Any, jacobians: list[F64] | None) -> F64:
+        before, now, calibration = factor.keys()
+        a, b = values.atPose2(before), values.atPose2(now)
+        c, s = cos(a.theta()), sin(a.theta())
+        dx, dy, turn = b.x() - a.x(), b.y() - a.y(), b.theta() - a.theta()
+        ux, uy = c * dx + s * dy, c * dy - s * dx
+        if jacobians is not None:
+            ct, st = cos(turn), sin(turn)
+            jacobians[0] = np.array([[-1.0, 0.0, uy], [0.0, -1.0, -ux], [0.0, 0.0, -1.0]])
+            jacobians[1] = np.array([[ct, -st, 0.0], [st, ct, 0.0], [0.0, 0.0, 1.0]])
+            jacobians[2] = self.by_calibration
+        x, y, yaw = self.delta
+        off = (turn - yaw + pi) % (2.0 * pi) - pi
+        return np.asarray(
+            np.array([ux - x, uy - y, off]) + self.by_calibration @ (values.atPoint2(calibration) - self.at)
+        )
+
+
+def _add_calibration(graph: Any, parameters: NewLayerParameters) -> None:
+    sigmas = np.array([parameters.motion.wheel_scale, parameters.motion.gyro_bias_radps])
+    graph.add(gtsam.PriorFactorPoint2(CALIBRATION, np.zeros(2), gtsam.noiseModel.Diagonal.Sigmas(sigmas)))
+
+
+def _add_fixes(graph: Any, values: Any, fixes: FixNodes, start: State, parameters: NewLayerParameters) -> None:
+    """Fixes hang on poses through the receiver's slow error: pose = error + fix (docs/decisions/0069)."""
+    if len(fixes.key) == 0:
+        return
+    springs = gauss_markov_springs(fixes.t_s, parameters.gnss.sigma_m, parameters.gnss.correlation_s)
+    huber = gtsam.noiseModel.mEstimator.Huber.Create(parameters.gnss.robust_k)
+    for n, (key, xy, variance) in enumerate(zip(fixes.key, fixes.xy_m, fixes.variance_m2, strict=True)):
+        values.insert(_b(n), _pose2(np.array([*(start.pose[key, :2] - xy), 0.0])))
+        graph.add(gtsam.PriorFactorPose2(_b(n), gtsam.Pose2(), _spring(springs.prior[n], PINNED_RAD)))
+        noise = gtsam.noiseModel.Robust.Create(huber, _spring(1.0 / variance, FREE_RAD))
+        # The rotation says nothing; that it is about right keeps GTSAM's error in metres of the map's axes.
+        measured = gtsam.Pose2(xy[0], xy[1], start.pose[key, 2])
+        graph.add(gtsam.BetweenFactorPose2(_b(n), _x(int(key)), measured, noise))
+    for n, weight in enumerate(springs.between):
+        graph.add(gtsam.BetweenFactorPose2(_b(n), _b(n + 1), gtsam.Pose2(), _spring(weight, PINNED_RAD)))
+
+
+def _spring(information: float, sigma_rad: float) -> Any:
+    sigma_m = float(information) ** -0.5
+    return gtsam.noiseModel.Diagonal.Sigmas(np.array([sigma_m, sigma_m, sigma_rad]))
+
+
+def _add_ties(graph: Any, ties: Ties, robust_k: float) -> None:
+    """Eq. (4)-(5): bearing and range of a feature from a keyframe."""
+    huber = gtsam.noiseModel.mEstimator.Huber.Create(robust_k)
+    for key, landmark, (bearing, distance), cov in zip(*ties, strict=True):
+        noise = gtsam.noiseModel.Robust.Create(huber, gtsam.noiseModel.Gaussian.Covariance(cov))
+        seen = gtsam.Rot2.fromAngle(bearing)
+        graph.add(gtsam.BearingRangeFactor2D(_x(int(key)), _l(int(landmark)), seen, distance, noise))
+
+
+def _add_matches(graph: Any, matches: PoseMatches, robust_k: float | None) -> None:
+    """Eq. (8)-(9); the information may be singular: nothing is then said along that direction."""
+    unit = gtsam.noiseModel.Unit.Create(3)
+    huber = gtsam.noiseModel.mEstimator.Huber.Create(robust_k or np.inf)
+    noise = unit if robust_k is None else gtsam.noiseModel.Robust.Create(huber, unit)
+    for key, pose, off, information in zip(*matches, strict=True):
+        graph.add(gtsam.CustomFactor(noise, [_x(int(key))], _Match(_pose2(pose), off, root_of(information))))
+
+
+class _Match:
+    """Eq. (8) as GTSAM asks for it. A prior at the matched pose would not do: along lanes that say little that pose
+    may lie far away, and what holds near by does not hold there.
+    """
+
+    __slots__ = ("off", "pose", "root")
+
+    def __init__(self, pose: Any, off: F64, root: F64) -> None:
+        self.pose, self.off, self.root = pose, off, root
+
+    def __call__(self, factor: Any, values: Any, jacobians: list[F64] | None) -> F64:
+        moved = self.pose.between(values.atPose2(factor.keys()[0]))
+        if jacobians is not None:
+            jacobians[0] = self.root @ gtsam.Pose2.LogmapDerivative(moved)
+        return np.asarray(self.root @ (gtsam.Pose2.Logmap(moved) - self.off))
+
+
+def root_of(information: F64) -> F64:
+    """Upper triangular (3, 3) R with R.T @ R = information (3, 3), which may be singular."""
+    values, vectors = np.linalg.eigh(0.5 * (information + information.T))
+    root = np.sqrt(np.maximum(values, 0.0))[:, None] * vectors.T
+    return np.asarray(np.linalg.qr(root, mode="r"))
+
+
+def _add_anchors(graph: Any, anchors: Anchors) -> None:
+    for landmark, xy, cov in zip(*anchors, strict=True):
+        graph.add(gtsam.PriorFactorPoint2(_l(int(landmark)), xy, gtsam.noiseModel.Gaussian.Covariance(cov)))
+
+
+def bearing_range(xy_m: F64, cov: F64) -> tuple[F64, F64]:
+    """(T, 2) bearing and range of points (T, 2) in a keyframe's frame, and their covariances (T, 2, 2)."""
+    x, y = xy_m.T
+    distance = np.maximum(np.hypot(x, y), 1e-6)
+    J = np.stack([np.stack([-y, x], axis=1) / distance[:, None] ** 2, xy_m / distance[:, None]], axis=1)
+    return np.stack([np.arctan2(y, x), distance], axis=1), np.asarray(J @ cov @ J.transpose(0, 2, 1))
+
+
+def yaw_of(R: F64) -> float:
+    """Yaw of a rotation (3, 3) or (4, 4) about z [rad]."""
+    return atan2(R[1, 0], R[0, 0])

@@ -1,0 +1,212 @@
+"""Lane looks of a drive matched with the HD map: Eq. (7)-(9) of Kim et al. 2018.
+
+The looks of a window of some metres are put together before they are matched, which beats their noise. The match is
+generalised ICP (section 5.1) of the lanes as seen with the lanes of the map, both sampled every 0.1 m. How much it
+says, and along which direction, is not a constant: it comes from how the polylines' two numbers each (offset and turn)
+depend on the pose, by the lanes' geometry. Along straight lanes, and along circles, that is nothing.
+"""
+
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import gtsam
+import numpy as np
+
+from gnd_map.arrays import F64, I64
+from schemas.drive import LaneLook
+from vehicle_agent.features.dead_reckoning import composed, relative, rotated
+from vehicle_agent.features.drive_nodes import DriveNodes, nearest
+from vehicle_agent.features.graph import NO_MATCHES, PoseMatches
+from vehicle_agent.features.lane_looks import Offsets, Polylines, choices, offsets
+from vehicle_agent.features.lane_map import SAMPLE_M, LaneMap, gicp
+from vehicle_agent.features.new_layer_parameters import LaneParameters
+
+__all__ = ["LaneMap", "LaneMatcher"]
+
+TURN_AT_M = 20.0  # turns and shifts are compared at this distance
+MUCH = 0.05  # share of it above which GICP may say it
+NOTHING = 1e-4  # share of the best direction's information below which a direction is not known
+ASIDE_STEP_M = 0.25
+ASIDE_SIGMA_M = 2.5  # what the first poses may be off by to either side
+SMOOTH = 8  # windows before and after that search together
+SEEN_M = (5.0, 45.0)  # ahead of the vehicle: the part of lanes that GICP is given
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class WindowMatch:
+    """What the looks of W windows say. key: (W,). base: (W, 3) poses they were compared at.
+
+    off: (W, 3) that the pose is off from the base, in its frame. information: (W, 3, 3) of it, singular where lanes
+    say nothing. strong: (W, 3, 3) projection of `off` onto what lanes say well.
+    """
+
+    key: I64
+    base: F64
+    off: F64
+    information: F64
+    strong: F64
+
+
+class _Chosen(NamedTuple):
+    """Polylines with their lanes, S of them."""
+
+    window: I64
+    lane: I64
+    told: F64
+    by_pose: F64
+    variance: F64
+
+
+class LaneMatcher:
+    """Matches the lane looks of a drive, again and again as its poses become better."""
+
+    def __init__(
+        self, lanes: LaneMap, looks: tuple[LaneLook, ...], nodes: DriveNodes, parameters: LaneParameters
+    ) -> None:
+        self.lanes, self.parameters = lanes, parameters
+        self.lines = Polylines.of(looks, parameters)
+        self.t_ns = np.array([look.t_ns for look in looks], np.int64)
+        self.keys = _spaced(nodes.sight(nodes.t_ns).way_m, parameters.window_m)
+        self.window = nearest(nodes.t_ns[self.keys], self.t_ns) if len(looks) else np.empty(0, np.int64)
+        self._searched = False
+
+    def matched(self, nodes: DriveNodes, pose: F64, *, polish: bool = False) -> PoseMatches:
+        """Poses of windows by their lanes, from poses (K, 3) as believed.
+
+        polish: by GICP; else by the linear fit that GICP starts from.
+        """
+        if len(self.lines) == 0:
+            return NO_MATCHES
+        base = pose[self.keys]
+        driven = nodes.reckoning.at(nodes.t_ns[self.keys])[self.window]
+        at = composed(base[self.window], relative(driven, nodes.reckoning.at(self.t_ns)))
+        o = offsets(self.lines, self.lanes, at, base[self.window], self.parameters)
+        chosen = self._chosen(o)
+        found = self._fitted(chosen, base)
+        rows = np.flatnonzero(np.trace(found.information, axis1=1, axis2=2) > 0.0)
+        off = self._polished(found, chosen, rows) if polish else found.off
+        return PoseMatches(found.key[rows], base[rows], off[rows], found.information[rows])
+
+    def _chosen(self, o: Offsets) -> _Chosen:
+        p, n_looks = self.parameters, int(self.lines.look.max()) + 1
+        aside = np.zeros((n_looks, 1)) if self._searched else self._search(o, n_looks)
+        self._searched = True
+        column = choices(self.lines, o, aside, p)[0][:, 0]
+        rows = np.arange(len(column))
+        told = o.told[rows, column]
+        moved = told[:, 0] + aside[self.lines.look, 0]
+        squared = np.stack([moved, told[:, 1]], axis=1) ** 2 / self.lines.sigma**2
+        good = (column >= 0) & (squared.max(axis=1) <= p.gate**2) & (o.cost[rows, column] < 1e5)
+        window, lane = self.window[self.lines.look], o.lane[rows, column]
+        variance = self._variance(window, lane, good)
+        kept = np.flatnonzero(good)
+        return _Chosen(window[kept], lane[kept], told[kept], o.by_pose[kept, column[kept]], variance[kept])
+
+    def _variance(self, window: I64, lane: I64, good: F64) -> F64:
+        """(P, 2) of offset and turn; the map's own error does not grow less with more looks."""
+        group = window * len(self.lanes) + np.maximum(lane, 0)
+        count = np.bincount(group, good, minlength=len(self.keys) * len(self.lanes))
+        variance = self.lines.sigma**2
+        variance[:, 0] += count[group] * self.parameters.map_sigma_m**2
+        return np.asarray(variance)
+
+    def _search(self, o: Offsets, n_looks: int) -> F64:
+        """(L, 1) the move sideways at which the looks of some windows together fit best; the first poses may be a lane
+        off.
+        """
+        p = self.parameters
+        aside = np.arange(-p.search_m, p.search_m + 1e-9, ASIDE_STEP_M)
+        _, cost = choices(self.lines, o, aside, p)
+        total = np.zeros((len(self.keys), len(aside)))
+        np.add.at(total, self.window[:n_looks], cost)
+        summed = np.cumsum(np.concatenate([np.zeros((1, len(aside))), total]), axis=0)
+        rows = np.arange(len(self.keys))
+        high, low = np.minimum(rows + SMOOTH + 1, len(rows)), np.maximum(rows - SMOOTH, 0)
+        best = np.argmin(summed[high] - summed[low] + (aside / ASIDE_SIGMA_M) ** 2, axis=1)
+        return np.asarray(aside[best][self.window[:n_looks], None])
+
+    def _fitted(self, c: _Chosen, base: F64) -> WindowMatch:
+        """Least squares of the polylines of each window."""
+        A, g = _normal_equations(c, c.window, len(self.keys))
+        few = np.bincount(c.window, minlength=len(self.keys)) < self.parameters.min_polylines
+        A[few] = 0.0
+        return WindowMatch(self.keys, base, *solved(A, -g))
+
+    def _polished(self, found: WindowMatch, c: _Chosen, rows: I64) -> F64:
+        """(W, 3) what the poses of windows are off by GICP, Eq. (8), where lanes say it well."""
+        pairs, group = np.unique(np.stack([c.window, c.lane], axis=1), axis=0, return_inverse=True)
+        of_lane = solved(*_normal_equations(c, group.ravel(), len(pairs)))[0]
+        off = found.off.copy()
+        for row in rows:
+            of = np.flatnonzero(pairs[:, 0] == row)
+            source = [self._as_seen(int(pairs[n, 1]), found.base[row], of_lane[n]) for n in of]
+            start = moved(found.base[row], found.strong[row] @ off[row])
+            polished = self._gicp(np.concatenate(source), start)
+            if polished is not None:
+                off[row] += found.strong[row] @ (logarithm(found.base[row], polished) - off[row])
+        return off
+
+    def _gicp(self, source: F64, pose: F64) -> F64 | None:
+        if len(source) < 20:
+            return None
+        target = self.lanes.near(pose[:2], SEEN_M[1] + 10.0)
+        return gicp(target, source, pose, self.parameters.max_correspondence_m)
+
+    def _as_seen(self, lane: int, base: F64, off: F64) -> F64:
+        """(N, 2) a lane of the map, in the frame of the window, moved to where the looks saw it on average."""
+        _, sample = self.lanes.nearest(lane, base[None, :2], np.inf)
+        reach = round((SEEN_M[1] + 20.0) / SAMPLE_M)
+        n = int(self.lanes.count[lane])
+        rows = np.arange(sample[0] - reach, sample[0] + reach)
+        rows = np.unique(rows % n) if self.lanes.closed[lane] else rows[(rows >= 0) & (rows < n)]
+        xy = self.lanes.xy_m[self.lanes.first[lane] + rows] - base[:2]
+        xy = rotated(np.full(len(xy), -base[2]), xy)
+        xy = xy[(xy[:, 0] > SEEN_M[0]) & (xy[:, 0] < SEEN_M[1]) & (np.abs(xy[:, 1]) < SEEN_M[1])]
+        return np.asarray(xy + off[:2] + off[2] * np.stack([-xy[:, 1], xy[:, 0]], axis=1))
+
+
+def _normal_equations(c: _Chosen, group: I64, n: int) -> tuple[F64, F64]:
+    """(n, 3, 3) and (n, 3): information of groups of polylines about the pose's error, and its right-hand side."""
+    A, g = np.zeros((n, 3, 3)), np.zeros((n, 3))
+    np.add.at(A, group, np.einsum("sij,si,sik->sjk", c.by_pose, 1.0 / c.variance, c.by_pose))
+    np.add.at(g, group, np.einsum("sij,si,si->sj", c.by_pose, 1.0 / c.variance, c.told))
+    return A, g
+
+
+def solved(A: F64, g: F64) -> tuple[F64, F64, F64]:
+    """Shortest solutions (n, 3) of A x = g; A (n, 3, 3) without directions of which it says next to nothing; and
+    projections (n, 3, 3) onto those of which it says much.
+    """
+    scale = np.array([1.0, 1.0, 1.0 / TURN_AT_M])
+    values, vectors = np.linalg.eigh(A * scale[:, None] * scale)
+    most = np.maximum(values[:, -1:], 1e-12)
+    known = values > NOTHING * most
+    inverse = np.where(known, 1.0 / np.where(known, values, 1.0), 0.0)
+    x = np.einsum("nij,nj,nkj,nk->ni", vectors, inverse, vectors, g * scale) * scale
+    kept = np.einsum("nij,nj,nkj->nik", vectors, np.where(known, values, 0.0), vectors)
+    strong = np.einsum("nij,nj,nkj->nik", vectors, np.where(values > MUCH * most, 1.0, 0.0), vectors)
+    return x, np.asarray(kept / scale[:, None] / scale), np.asarray(strong * scale[:, None] / scale)
+
+
+def _pose2(pose: F64) -> gtsam.Pose2:
+    return gtsam.Pose2(float(pose[0]), float(pose[1]), float(pose[2]))
+
+
+def moved(base: F64, off: F64) -> F64:
+    """(3,) the pose that is `off` (3,), a logarithm, from `base` (3,)."""
+    pose = _pose2(base).compose(gtsam.Pose2.Expmap(off))
+    return np.array([pose.x(), pose.y(), pose.theta()])
+
+
+def logarithm(base: F64, pose: F64) -> F64:
+    """(3,) how far `pose` (3,) is from `base` (3,), in its frame."""
+    return np.asarray(gtsam.Pose2.Logmap(_pose2(base).between(_pose2(pose))))
+
+
+def _spaced(way_m: F64, least_m: float) -> I64:
+    """Rows of a rising way (K,) of which each is at least `least_m` past the one before."""
+    kept = [0]
+    for row in range(1, len(way_m)):
+        if way_m[row] - way_m[kept[-1]] >= least_m:
+            kept.append(row)
+    return np.array(kept, np.int64)
