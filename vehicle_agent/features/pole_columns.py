@@ -206,8 +206,9 @@ def _fused(slices: Slices, label: I64, places: F64, count: int, p: PoleParameter
     n = np.bincount(member, minlength=len(group))
     mean = np.column_stack([np.bincount(member, places[:, k], len(group)) / n for k in range(2)])
     toward = np.column_stack([np.bincount(member, slices.toward[:, k], len(group)) / n for k in range(2)])
-    along = p.sigma_range_m**2 / np.bincount(member, slices.points, len(group)) + p.sigma_floor_m**2
-    across = (EDGE_SIGMA * np.bincount(member, slices.step_m, len(group)) / n) ** 2 + p.sigma_floor_m**2
+    own = [np.bincount(member, s, len(group)) / n for s in (slices.sigma_along_m, slices.sigma_across_m)]
+    along = p.sigma_range_m**2 / np.bincount(member, slices.points, len(group)) + p.sigma_floor_m**2 + own[0] ** 2
+    across = (EDGE_SIGMA * np.bincount(member, slices.step_m, len(group)) / n) ** 2 + p.sigma_floor_m**2 + own[1] ** 2
     uu = toward[:, :, None] * toward[:, None, :]
     information = uu / along[:, None, None] + (np.eye(2) - uu) / across[:, None, None]
     total, weighted, middle = np.zeros((count, 2, 2)), np.zeros((count, 2)), np.zeros((count, 2))
@@ -222,4 +223,5 @@ def _fused(slices: Slices, label: I64, places: F64, count: int, p: PoleParameter
 def _scatter(slices: Slices, label: I64, off: F64, n: I64, p: PoleParameters) -> F64:
     """(C,) standard deviation of the slices about the axis, less what noise of range and distance of rays make."""
     made = p.sigma_range_m**2 / slices.points + (EDGE_SIGMA * slices.step_m) ** 2 + p.sigma_floor_m**2
+    made = made + slices.sigma_along_m**2 + slices.sigma_across_m**2
     return np.sqrt(np.maximum(_sums((off**2).sum(axis=1) - made, label, n) / n, 0.0))

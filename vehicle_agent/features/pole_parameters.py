@@ -61,7 +61,7 @@ class PoleParameters:
     """Share of the heights of a pole's thin part at which something stands in the ring around it …"""
     free_m: float = 0.75
     """… and length of a part of it at which nothing does."""
-    hidden_share_max: float = 0.55
+    hidden_share_max: float = 0.8
     """Share of its slices beside which something nearer stands: all of them are beside an edge, not on a thin thing."""
     seen_share_min: float = 0.4
     """Share of the sensor's layers between bottom and top that meet it."""

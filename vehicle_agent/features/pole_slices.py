@@ -47,6 +47,8 @@ class Slices(NamedTuple):
         points: (S,) number of points.
         scan: (S,) which scan of a window.
         hidden: (S,) whether something nearer is beside it.
+        sigma_along_m: (S,) of the scan's own place, along its rays and …
+        sigma_across_m: (S,) … across them.
     """
 
     xy_m: F64
@@ -59,6 +61,8 @@ class Slices(NamedTuple):
     points: I64
     scan: I64
     hidden: I64
+    sigma_along_m: F64
+    sigma_across_m: F64
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -75,6 +79,16 @@ class GroundHeights:
     def at(self, xy_m: F64) -> F64:
         """(N,) height of the ground at places (N, 2)."""
         return -self.under(np.column_stack([xy_m, np.zeros(len(xy_m))]))
+
+
+class PoseSigma(NamedTuple):
+    """Standard deviations of a scan's own place (each axis) and heading, drawn anew for each scan."""
+
+    m: float
+    rad: float
+
+
+EXACT = PoseSigma(0.0, 0.0)
 
 
 class Seen(NamedTuple):
@@ -126,7 +140,10 @@ def ground_around(points_m: F64, centre_m: F64, p: PoleParameters) -> GroundHeig
     return GroundHeights(cells, cone_heights(low, p.ground_slope * p.ground_cell_m))
 
 
-def slices_of(points_m: F64, origins_m: F64, ground: GroundHeights, p: PoleParameters, number: int = 0) -> Seen:
+def slices_of(
+    points_m: F64, origins_m: F64, ground: GroundHeights, p: PoleParameters, number: int = 0,
+    pose: PoseSigma = EXACT,
+) -> Seen:  # fmt: skip
     """The slices of one scan.
 
     Args:
@@ -135,6 +152,7 @@ def slices_of(points_m: F64, origins_m: F64, ground: GroundHeights, p: PoleParam
         ground: under the points.
         p: parameters.
         number: of the scan in its window.
+        pose: how well the scan's own place is known.
     """
     kept, polar = polar_of(points_m, origins_m, p.range_min_m, p.range_max_m)
     points = points_m[kept]
@@ -148,7 +166,12 @@ def slices_of(points_m: F64, origins_m: F64, ground: GroundHeights, p: PoleParam
     step = max(azimuth_step(polar, order, start, p.link_m), MIN_STEP_RAD)
     found = thin_slices(polar, order, start, step, Beside(p.link_m, p.diameter_max_m, p.clear_m, p.jump_m))
     origins = origins_m if len(origins_m) == 1 else origins_m[kept[high]]
-    return Seen(_described(*found, points, height, polar, origins, step, number), points, height, layer_tan)
+    slices = _described(*found, points, height, polar, origins, step, number)
+    if pose != EXACT:
+        slices = slices._replace(
+            sigma_along_m=np.full(len(slices.z_m), pose.m), sigma_across_m=np.hypot(pose.m, pose.rad * slices.range_m)
+        )
+    return Seen(slices, points, height, layer_tan)
 
 
 def _layer_gap(gaps: I64) -> int:
@@ -179,6 +202,8 @@ def _described(
         points=count,
         scan=np.full(len(at), number),
         hidden=(sides != 0).any(axis=1).astype(np.int64),
+        sigma_along_m=np.zeros(len(at)),
+        sigma_across_m=np.zeros(len(at)),
     )
     if len(at) > MAX_SLICES:
         return take(found, np.sort(np.argsort(distance, kind="stable")[:MAX_SLICES]))
@@ -202,4 +227,4 @@ def joined(parts: list[Slices]) -> Slices:
 def empty_slices() -> Slices:
     """No slices."""
     flat, plane, whole = np.empty(0), np.empty((0, 2)), np.empty(0, np.int64)
-    return Slices(plane, flat, flat, plane, flat, flat, flat, whole, whole, whole)
+    return Slices(plane, flat, flat, plane, flat, flat, flat, whole, whole, whole, flat, flat)

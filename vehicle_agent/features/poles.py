@@ -20,7 +20,16 @@ from vehicle_agent.features.pole_columns import Columns, columns_of, stacked
 from vehicle_agent.features.pole_kinds import Surroundings, bottoms, is_free, kinds_of, look_around, tops
 from vehicle_agent.features.pole_parameters import PoleInputError, PoleParameters
 from vehicle_agent.features.pole_place_kernels import rays_below
-from vehicle_agent.features.pole_slices import GroundHeights, Seen, check_rays, ground_around, joined, slices_of
+from vehicle_agent.features.pole_slices import (
+    EXACT,
+    GroundHeights,
+    PoseSigma,
+    Seen,
+    check_rays,
+    ground_around,
+    joined,
+    slices_of,
+)
 
 Mask = NDArray[np.bool_]
 
@@ -64,10 +73,14 @@ class Pole:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Rays:
-    """A scan: ends points_m (N, 3) and starts origins_m (N, 3) or (3,) of its rays, z up, sweep motion removed."""
+    """A scan: ends points_m (N, 3) and starts origins_m (N, 3) or (3,) of its rays, z up, sweep motion removed.
+
+    sigma: how well its place is known against the other scans of a window.
+    """
 
     points_m: F64
     origins_m: F64
+    sigma: PoseSigma = EXACT
 
 
 class PoleDetector:
@@ -115,7 +128,8 @@ class PoleDetector:
         if not sum(len(points) for points, _ in near):
             return ()
         ground = ground_around(_together([points for points, _ in near]), np.zeros(3), p)
-        seen = [slices_of(*one, ground, p, number) for number, one in enumerate(near)]
+        sigmas = [scan.sigma for scan in scans]
+        seen = [slices_of(*one, ground, p, k, sigma) for k, (one, sigma) in enumerate(zip(near, sigmas, strict=True))]
         layer_tan = float(np.median([one.layer_tan for one in seen]))
         slices, label = stacked(joined([one.slices for one in seen]), layer_tan, p)
         columns = columns_of(slices, label, p)
