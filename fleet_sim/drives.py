@@ -9,6 +9,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
+from fleet_sim.camera import Sightings, SignCamera, look_times_ns, looks_of, sightings
 from fleet_sim.cars import parked_cars
 from fleet_sim.errors import DriveSimError
 from fleet_sim.lidar import Lidar, column_poses
@@ -19,7 +20,7 @@ from fleet_sim.traffic import Traffic, movers_of
 from fleet_sim.trajectory import Direction, DrivingStyle, gauss_markov, lane_motion
 from fleet_sim.world import State, World
 from gnd_map.se3 import exp_so3
-from schemas.drive import DriveHeader, DriveItem, GnssFix, MotionSample, ReferencePose, Scan
+from schemas.drive import Detections, DriveHeader, DriveItem, GnssFix, MotionSample, ReferencePose, Scan
 from schemas.drive_mcap import DriveWriter
 
 _NS_PER_S: Final = 1_000_000_000
@@ -85,6 +86,7 @@ class DriveConfig:
         start_ns: UTC of the first scan.
         traffic: moving cars and people; none by default.
         mount_height_m: height of the LiDAR over the road, None for the usual one of the model.
+        camera: a camera that detects traffic signs; None for none.
     """
 
     vehicle: str
@@ -100,6 +102,7 @@ class DriveConfig:
     start_ns: int = EPOCH_NS
     traffic: Traffic = field(default_factory=Traffic)
     mount_height_m: float | None = None
+    camera: SignCamera | None = None
 
     def __post_init__(self) -> None:
         if self.sensor not in MODELS:
@@ -201,6 +204,7 @@ class DriveSimulation:
                 points lie on something that moves while the scan is taken, bool (N,). Never part of a recording.
         """
         small: list[DriveItem] = [*self._motion_samples(), *self._gnss_fixes(), *self._reference_poses()]
+        small += self._camera_looks()
         small.sort(key=lambda item: item.t_ns)
         position, period_ns = 0, self._config.model.period_ns
         for index in range(self.scans):
@@ -263,6 +267,19 @@ class DriveSimulation:
         sigma_m = max(errors.gnss_m, 0.01)
         rows = zip(t_ns.tolist(), lat.tolist(), lon.tolist(), height.tolist(), strict=True)
         return [GnssFix(*row, sigma_m) for row in rows]
+
+    def _camera_looks(self) -> list[Detections]:
+        """What the camera reports; its chance is of a stream of its own."""
+        camera = self._config.camera
+        if camera is None:
+            return []
+        times_ns = self._config.start_ns + look_times_ns(camera, self._seconds)
+        return looks_of(camera, self.sightings(camera), times_ns, (self._config.seed, self._world.seed))
+
+    def sightings(self, camera: SignCamera) -> Sightings:
+        """Return which signs a camera could see at its looks; for evaluation only."""
+        t_s = look_times_ns(camera, self._seconds) / _NS_PER_S
+        return sightings(camera, self._world, self._config.state, self._scene, self.movers, self.motion, t_s)
 
     def _reference_poses(self) -> list[ReferencePose]:
         t_ns, t_s = self._times(_REFERENCE_HZ)

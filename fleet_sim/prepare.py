@@ -9,14 +9,18 @@ from typing import Final
 
 from rich.progress import Progress
 
+from fleet_sim.camera import SignCamera
 from fleet_sim.drives import EPOCH_NS, PERFECT, DriveConfig, simulate_drive
 from fleet_sim.errors import SimError
+from fleet_sim.feature_files import write_feature_layers
+from fleet_sim.feature_truth import base_features, feature_truth
 from fleet_sim.street import street
 from fleet_sim.trajectory import Direction
 from fleet_sim.truth import load_or_make_truth
 from fleet_sim.world import write_world
 
 SENSORS: Final = ("VLP-16", "HDL-32E")
+FEATURES_FILE: Final = "features.json"
 _DAY_NS: Final = 86_400 * 1_000_000_000
 _HOUR_NS: Final = 3_600 * 1_000_000_000
 _MAPPING_DAYS: Final = 72
@@ -32,12 +36,14 @@ class FleetWorld:
         agent_drives: one drive a vehicle through the state after.
         truth_path: what changed, see `fleet_sim.truth`.
         world_path: the world itself.
+        features_path: the feature layers of the map before, see `fleet_sim.feature_files`.
     """
 
     base_drives: tuple[Path, ...]
     agent_drives: tuple[Path, ...]
     truth_path: Path
     world_path: Path
+    features_path: Path
 
 
 def mapping_configs(world_seed: int) -> tuple[DriveConfig, ...]:
@@ -74,6 +80,7 @@ def agent_configs(world_seed: int, agents: int) -> tuple[DriveConfig, ...]:
             direction=1 if index // 2 % 2 == 0 else -1,
             seed=1_000_003 * world_seed + index,
             start_ns=EPOCH_NS + index * _HOUR_NS,
+            camera=SignCamera(),
         )
         for index in range(agents)
     )
@@ -96,7 +103,7 @@ def prepare_fleet_run(
     Args:
         world_seed: seed of the street.
         agents: number of vehicles.
-        out_dir: folder for world.json, truth.npz and drives/, made if need be.
+        out_dir: folder for world.json, features.json, truth.npz and drives/, made if need be.
         progress: gets one task that counts drives and truth.
         processes: worker processes for the drives.
         scans: at most so many scans a drive, None for the whole street.
@@ -118,6 +125,7 @@ def prepare_fleet_run(
         raise SimError(f"cannot make the folder {folder}: {error}") from error
     world = street(world_seed)
     write_world(world, out_dir / "world.json")
+    write_feature_layers(base_features(feature_truth(world)), out_dir / FEATURES_FILE)
     paths = [folder / f"{config.vehicle}.mcap" for config in configs]
     missing = [(config, path) for config, path in zip(configs, paths, strict=True) if not (reuse and path.exists())]
     jobs: list[tuple[Callable[..., object], tuple[object, ...]]] = [
@@ -126,7 +134,8 @@ def prepare_fleet_run(
     ]
     _run(jobs, processes, progress)
     split = len(configs) - agents
-    return FleetWorld(tuple(paths[:split]), tuple(paths[split:]), out_dir / "truth.npz", out_dir / "world.json")
+    files = (out_dir / "truth.npz", out_dir / "world.json", out_dir / FEATURES_FILE)
+    return FleetWorld(tuple(paths[:split]), tuple(paths[split:]), *files)
 
 
 def _run(
