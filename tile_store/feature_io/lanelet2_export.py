@@ -185,8 +185,9 @@ class _Editing:
     def _values(self) -> dict[tuple[str, int], tuple[dict[str, str], dict[str, str | None]]]:
         """Attributes and tags to write, by element."""
         values: dict[tuple[str, int], tuple[dict[str, str], dict[str, str | None]]] = {}
-        for node_id, places in self._moved.items():
-            values["node", node_id] = self._position(self._document.nodes[node_id], np.mean(places, axis=0))
+        moved = {node_id: np.mean(places, axis=0) for node_id, places in self._moved.items()}
+        told = self._positions([self._document.nodes[node_id] for node_id in moved], np.array([*moved.values()]))
+        values.update({("node", node_id): one for node_id, one in zip(moved, told, strict=True)})
         for key, tags in self._tags.items():
             attributes, others = values.get(key, ({}, {}))
             values[key] = (attributes, others | tags)
@@ -203,23 +204,19 @@ class _Editing:
         raw = with_nodes(data, element, refs)
         return with_values(raw, OsmWay(element.id, 0, len(raw), element.line, element.tags, ()), attributes, tags)
 
-    def _position(self, node: OsmNode, place: F64) -> tuple[dict[str, str], dict[str, str | None]]:
-        """Attributes and tags of a node that has moved."""
-        height_m = place[2] - self._options.height_offset_m
-        placement = self._options.placement
-        if placement is None:
-            lat_deg, lon_deg = np.degrees(place[:2]).tolist()
-            tell = "ele" in node.tags or abs(height_m) > KEEP_WITHIN_M
-            return {"lat": degrees(lat_deg), "lon": degrees(lon_deg)}, {"ele": metres(height_m)} if tell else {}
+    def _positions(self, nodes: list[OsmNode], places: F64) -> list[tuple[dict[str, str], dict[str, str | None]]]:
+        """Attributes and tags of nodes that have moved to places (N, 3)."""
+        if not nodes:
+            return []
+        height_m = places[:, 2] - self._options.height_offset_m
+        if self._options.placement is None:
+            return [
+                _global(node, *row) for node, row in zip(nodes, np.column_stack([places[:, :2], height_m]), strict=True)
+            ]
         assert self._places.local_m is not None
-        was = self._places.local_m[self._places.index[node.id]]
-        which = placement.nearest(was[None])
-        local = placement.local(place[:1], place[1:2], np.array([height_m]), which)[0]
-        lat_deg, lon_deg = _shifted(node, local - was)
-        tags: dict[str, str | None] = {"local_x": metres(local[0]), "local_y": metres(local[1])}
-        if "ele" in node.tags:
-            tags["ele"] = metres(local[2])
-        return {"lat": degrees(lat_deg), "lon": degrees(lon_deg)}, tags
+        was = self._places.local_m[self._places.rows(nodes)]
+        local_m = self._options.placement.local(places[:, 0], places[:, 1], height_m)
+        return [_local(node, new, old) for node, new, old in zip(nodes, local_m, was, strict=True)]
 
     def _write_removed(self, edits: Edits) -> int:
         """Take elements out, with lanelets that lose a border and every mention of either."""
@@ -253,6 +250,20 @@ class _Editing:
         for node_id in orphans:
             self._moved.pop(node_id, None)
         return {("node", ref) for ref in orphans}
+
+
+def _global(node: OsmNode, lat: float, lon: float, height_m: float) -> tuple[dict[str, str], dict[str, str | None]]:
+    attributes = {"lat": degrees(float(np.degrees(lat))), "lon": degrees(float(np.degrees(lon)))}
+    tell = "ele" in node.tags or abs(height_m) > KEEP_WITHIN_M
+    return attributes, {"ele": metres(height_m)} if tell else {}
+
+
+def _local(node: OsmNode, local_m: F64, was_m: F64) -> tuple[dict[str, str], dict[str, str | None]]:
+    lat_deg, lon_deg = _shifted(node, local_m - was_m)
+    tags: dict[str, str | None] = {"local_x": metres(local_m[0]), "local_y": metres(local_m[1])}
+    return {"lat": degrees(lat_deg), "lon": degrees(lon_deg)}, tags | (
+        {"ele": metres(local_m[2])} if "ele" in node.tags else {}
+    )
 
 
 def _name(element: OsmNode | OsmWay) -> str:

@@ -1,7 +1,8 @@
 """Where local coordinates lie on the Earth: one rigid pose, or many along a track, each for the places near it.
 
 A map drawn over a SLAM track shares the track's drift. When GNSS bends the track straight (`vehicle_agent.localise`),
-each point of the map moves as the pose of the track nearest to it, seen from above; the way back takes the same pose.
+each point of the map moves as the poses around it do, seen from above: the mean of where they put it, weighted by
+1 / (distance² + (10 m)²)². So lines stay smooth where the track comes by a second time with another drift.
 """
 
 import base64
@@ -19,6 +20,11 @@ from tile_store.feature_io.errors import BadGeometry, FeatureFileError
 
 MAX_DISTANCE_M: Final = 50_000.0
 """Of a local point from the nearest pose: beyond, the plane of the frame has left the ground by 200 m."""
+
+_POSES: Final = 64
+_BLEND_M: Final = 10.0
+_ROUNDS: Final = 50
+_EXACT_M: Final = 1e-6
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -47,36 +53,51 @@ class Placement:
         T = T_from_R_t(exp_so3([0.0, 0.0, -bearing_rad]), np.zeros(3))
         return cls(LocalFrame(lat_rad, lon_rad, height_m or 0.0), np.zeros((1, 3)), T[None], height_m is not None)
 
-    def nearest(self, local_m: F64) -> I64:
-        """(N,) which pose moves each local point (N, 3).
+    def geodetic(self, local_m: F64) -> tuple[F64, F64, F64]:
+        """Latitude, longitude (radians) and height, each (N,), of local points (N, 3).
 
         Raises:
             BadGeometry: a point lies farther than 50 km from every pose.
         """
-        return self._nearest(self.at_m, local_m, "local")
+        return self.frame.geodetic_from_enu(self._enu_m(local_m))
 
-    def geodetic(self, local_m: F64) -> tuple[F64, F64, F64]:
-        """Latitude, longitude (radians) and height, each (N,), of local points (N, 3)."""
-        which = self.nearest(local_m)
-        return self.frame.geodetic_from_enu(_each(self.T_frame_local[which], local_m))
+    def local(self, lat_rad: F64, lon_rad: F64, height_m: F64) -> F64:
+        """(N, 3) the local points that lie at positions, to a micrometre.
 
-    def local(self, lat_rad: F64, lon_rad: F64, height_m: F64, which: I64 | None = None) -> F64:
-        """(N, 3) local points of positions, by the poses `which` (N,) or else those nearest in the frame."""
+        Raises:
+            BadGeometry: a position is farther than 50 km from every pose, or the poses fold the map there.
+        """
         enu_m = self.frame.enu_from_geodetic(lat_rad, lon_rad, height_m)
-        if which is None:
-            which = self._nearest(_each(self.T_frame_local, self.at_m), enu_m, "WGS-84")
-        R, t = self.T_frame_local[which, :3, :3], self.T_frame_local[which, :3, 3]
-        return np.asarray(np.einsum("nji,nj->ni", R, enu_m - t))
+        near = self._nearest(_each(self.T_frame_local, self.at_m), enu_m, 1, "WGS-84")[1][:, 0]
+        R, t = self.T_frame_local[near, :3, :3], self.T_frame_local[near, :3, 3]
+        local_m = np.einsum("nji,nj->ni", R, enu_m - t)
+        for _ in range(_ROUNDS):
+            off_m = enu_m - self._enu_m(local_m)
+            if not len(off_m) or np.abs(off_m).max() < _EXACT_M:
+                return np.asarray(local_m)
+            local_m = local_m + np.einsum("nji,nj->ni", R, off_m)
+        raise BadGeometry(
+            f"{int((np.abs(off_m).max(axis=1) >= _EXACT_M).sum())} of {len(off_m)} positions have no local "
+            f"coordinates: {np.abs(off_m).max():.2g} m are left after {_ROUNDS} rounds; the georeference folds there"
+        )
 
-    def _nearest(self, places_m: F64, points_m: F64, what: str) -> I64:
-        apart_m, which = cKDTree(places_m[:, :2]).query(points_m[:, :2])
-        if len(points_m) and apart_m.max() > MAX_DISTANCE_M:
-            worst = int(apart_m.argmax())
+    def _enu_m(self, local_m: F64) -> F64:
+        """(N, 3) in the frame: the means of where the poses around put each point, the near ones counting most."""
+        apart_m, which = self._nearest(self.at_m, local_m, min(_POSES, len(self.at_m)), "local")
+        moved = np.einsum("nkij,nj->nki", self.T_frame_local[which, :3, :3], local_m) + self.T_frame_local[which, :3, 3]
+        weight = 1.0 / (apart_m**2 + _BLEND_M**2) ** 2
+        return np.asarray((weight[..., None] * moved).sum(axis=1) / weight.sum(axis=1)[:, None])
+
+    def _nearest(self, places_m: F64, points_m: F64, n: int, what: str) -> tuple[F64, I64]:
+        """(N, n) distances seen from above, and numbers, of the poses nearest to points (N, 3)."""
+        apart_m, which = cKDTree(places_m[:, :2]).query(points_m[:, :2], k=[*range(1, n + 1)])
+        if len(points_m) and apart_m[:, 0].max() > MAX_DISTANCE_M:
+            worst = int(apart_m[:, 0].argmax())
             raise BadGeometry(
-                f"{what} point {points_m[worst].round(1).tolist()} lies {apart_m[worst] / 1e3:.0f} km from the "
+                f"{what} point {points_m[worst].round(1).tolist()} lies {apart_m[worst, 0] / 1e3:.0f} km from the "
                 f"georeference, the limit is {MAX_DISTANCE_M / 1e3:.0f} km"
             )
-        return np.asarray(which, np.int64)
+        return np.asarray(apart_m), np.asarray(which, np.int64)
 
     def as_dict(self) -> dict[str, Any]:
         """What `from_dict` reads; exact to the last bit."""
