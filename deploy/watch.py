@@ -8,7 +8,8 @@ import json
 import logging
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
+from contextlib import ExitStack
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Final
@@ -16,6 +17,7 @@ from typing import Final
 from deploy.region import Region
 from fleet_bus.bus import Bus
 from fleet_bus.errors import BusError
+from gnd_map.features import is_feature_layer
 from gnd_map.tile_id import TileId
 from schemas.errors import SchemaError
 from schemas.keys import catalog_keys, update_keys
@@ -41,8 +43,8 @@ class WatchEvent:
         version: version that is now current.
         previous_version: version that it follows.
         reason: why: merged, base, rollback; or catalog when the notice itself was missed.
-        put: voxels written by this version, None where the notice carried no delta.
-        removed: voxels removed by this version, likewise.
+        put: voxels (of a feature layer: features) written by this version, None where the notice carried no delta.
+        removed: voxels or features removed by this version, likewise.
         size: bytes of the notice.
     """
 
@@ -60,10 +62,10 @@ class WatchEvent:
     def line(self) -> str:
         """Return the event as a line for people."""
         clock = time.strftime("%H:%M:%S", time.gmtime(self.received_ns // 1_000_000_000))
-        change = "" if self.put is None else f"  +{self.put} -{self.removed} voxels"
-        return (
-            f"{clock}  {self.path}  v{self.previous_version} -> v{self.version}  {self.reason}{change}  {self.size} B"
-        )
+        noun = "features" if is_feature_layer(self.layer) else "voxels"
+        change = "" if self.put is None else f"  +{self.put} -{self.removed} {noun}"
+        place = self.path if self.layer == LAYER else f"{self.layer} {self.path}"
+        return f"{clock}  {place}  v{self.previous_version} -> v{self.version}  {self.reason}{change}  {self.size} B"
 
     def json(self) -> str:
         """Return the event as one JSON object on one line."""
@@ -71,27 +73,32 @@ class WatchEvent:
 
 
 class TileWatch:
-    """Follows the tile versions of a region.
+    """Follows the tile versions of a region in one layer or several.
 
     Args:
         bus: an open bus.
         region: which tiles.
         emit: called with each event, from one thread at a time.
-        layer: map layer.
+        layers: names of map layers, of Gaussians or of features.
     """
 
-    def __init__(self, bus: Bus, region: Region, emit: Callable[[WatchEvent], None], layer: str = LAYER) -> None:
-        self._bus, self._region, self._emit, self._layer = bus, region, emit, layer
-        self._seen: set[tuple[int, int]] = set()
-        self._latest: dict[int, int] = {}
+    def __init__(
+        self, bus: Bus, region: Region, emit: Callable[[WatchEvent], None], layers: Sequence[str] = (LAYER,)
+    ) -> None:
+        self._bus, self._region, self._emit, self._layers = bus, region, emit, tuple(dict.fromkeys(layers))
+        self._seen: set[tuple[str, int, int]] = set()
+        self._latest: dict[tuple[str, int], int] = {}
         self._lock = threading.Lock()
 
     def run(self, stop: threading.Event) -> None:
         """Follow the region until `stop` is set."""
-        with self._bus.subscribe(update_keys(self._layer, self._region.prefix), self._on_update, history=True):
-            self._compare_catalog(report=False)
+        with ExitStack() as subscriptions:
+            for layer in self._layers:
+                keys = update_keys(layer, self._region.prefix)
+                subscriptions.enter_context(self._bus.subscribe(keys, self._on_update, history=True))
+            self._compare_catalogs(report=False)
             while not stop.wait(CATALOG_PERIOD_S):
-                self._compare_catalog(report=True)
+                self._compare_catalogs(report=True)
 
     def _on_update(self, key: str, payload: bytes) -> None:
         try:
@@ -104,22 +111,27 @@ class TileWatch:
 
     def _note(self, event: WatchEvent) -> None:
         with self._lock:
-            if (event.tile, event.version) in self._seen:
+            place = event.layer, event.tile
+            if (*place, event.version) in self._seen:
                 return
-            self._seen.add((event.tile, event.version))
-            self._latest[event.tile] = max(event.version, self._latest.get(event.tile, 0))
+            self._seen.add((*place, event.version))
+            self._latest[place] = max(event.version, self._latest.get(place, 0))
             self._emit(event)
 
-    def _compare_catalog(self, *, report: bool) -> None:
-        """Find versions whose notice never came; the first call only learns where the region stands."""
-        for tile, version, size in self._catalog():
-            known = self._latest.setdefault(tile.morton, 0 if report else version)
-            if version > known:
-                self._note(_missed(self._layer, tile, known, version, size))
+    def _compare_catalogs(self, *, report: bool) -> None:
+        for layer in self._layers:
+            self._compare_catalog(layer, report=report)
 
-    def _catalog(self) -> list[tuple[TileId, int, int]]:
+    def _compare_catalog(self, layer: str, *, report: bool) -> None:
+        """Find versions whose notice never came; the first call only learns where the region stands."""
+        for tile, version, size in self._catalog(layer):
+            known = self._latest.setdefault((layer, tile.morton), 0 if report else version)
+            if version > known:
+                self._note(_missed(layer, tile, known, version, size))
+
+    def _catalog(self, layer: str) -> list[tuple[TileId, int, int]]:
         try:
-            key = catalog_keys(self._layer, self._region.prefix)
+            key = catalog_keys(layer, self._region.prefix)
             replies = self._bus.request_many(key, b"", kind="catalog", timeout_s=CATALOG_TIMEOUT_S)
         except BusError as error:
             _log.warning("no catalog: %s", error)
@@ -152,7 +164,9 @@ def _missed(layer: str, tile: TileId, known: int, version: int, size: int) -> Wa
     return WatchEvent(time.time_ns(), layer, tile.morton, tile.path, version, known, "catalog", None, None, size)
 
 
-def record_updates(bus: Bus, region: Region, path: Path, stop: threading.Event) -> None:
+def record_updates(
+    bus: Bus, region: Region, path: Path, stop: threading.Event, layers: Sequence[str] = (LAYER,)
+) -> None:
     """Write each update of a region as a JSON line until `stop` is set.
 
     Args:
@@ -160,6 +174,7 @@ def record_updates(bus: Bus, region: Region, path: Path, stop: threading.Event) 
         region: which tiles.
         path: file to append to; every line is complete or absent.
         stop: ends the recording.
+        layers: names of map layers.
     """
     with path.open("a", encoding="utf-8", buffering=1) as lines:
-        TileWatch(bus, region, lambda event: print(event.json(), file=lines)).run(stop)
+        TileWatch(bus, region, lambda event: print(event.json(), file=lines), layers).run(stop)

@@ -14,13 +14,13 @@ from fleet_bus.config import BusConfig
 @click.command()
 @click.argument("region")
 @click.option("--connect", default="tcp/127.0.0.1:7447", show_default=True, help="Router to connect to.")
-@click.option("--layer", default="ndt", show_default=True, help="Map layer.")
+@click.option("--layer", "layers", multiple=True, default=("ndt",), show_default=True, help="Map layer; repeatable.")
 @click.option("--json", "as_json", is_flag=True, help="One JSON object a line.")
-def watch(region: str, connect: str, layer: str, as_json: bool) -> None:
+def watch(region: str, connect: str, layers: tuple[str, ...], as_json: bool) -> None:
     """Print each tile update of REGION as it is published; Ctrl-C ends.
 
     REGION is a wildcard (13033/03021/** or ** for the world), a tile id (497353963154), a tile path, or a circle
-    lat,lon,radius in degrees and metres.
+    lat,lon,radius in degrees and metres. Layers are of Gaussians (ndt) or of features (signs, streetlights, ...).
     """
     chosen = parse_region(region)
     stop = threading.Event()
@@ -28,4 +28,4 @@ def watch(region: str, connect: str, layer: str, as_json: bool) -> None:
     signal.signal(signal.SIGINT, lambda *_: stop.set())
     with open_bus(BusConfig(connect=(connect,)), name="watch") as bus:
         click.echo(f"watching {chosen.prefix or 'the world'} on {connect}, Ctrl-C ends", err=True)
-        TileWatch(bus, chosen, lambda event: click.echo(event.json() if as_json else event.line()), layer).run(stop)
+        TileWatch(bus, chosen, lambda event: click.echo(event.json() if as_json else event.line()), layers).run(stop)
