@@ -112,7 +112,8 @@ class Ingest:
         if isinstance(upload, FeatureReport):
             self._features.check(key, upload)
             return self._keep_rows(upload.report_id, self._features.rows(upload, self._now_ns()))
-        check_is_of_gaussians(key, upload)
+        if not isinstance(upload, PackedGaussians):
+            check_is_of_gaussians(key, upload)
         if isinstance(upload, ChangeReport):
             return self._checked_and_kept(key, upload)
         if isinstance(upload, PackedReport):
