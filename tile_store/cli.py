@@ -24,6 +24,7 @@ from tile_store.arguments import parse_tile, parse_time_ns, parse_versions
 from tile_store.compare import MapDiff, layer_info, map_diff, version_diff
 from tile_store.errors import StoreError
 from tile_store.export import FORMATS, export_map
+from tile_store.feature_list import list_features
 from tile_store.server import TileServer
 from tile_store.sqlite_store import SqliteStore
 from tile_store.store import Store
@@ -86,9 +87,9 @@ def build(drives: tuple[Path, ...], path: Path, codec: str, layer: str, as_json:
     """Build tiles from DRIVES (MCAP, with reference poses) and put them into a store as a new base."""
     from tile_store.build import build_map  # it loads numba, which the other commands do without
 
-    with _store_to_fill(path) as opened, _bars() as bars:
+    with store_to_fill(path) as opened, _bars() as bars:
         result = build_map(drives, opened, layer=layer, codec=codec, progress=_Shown(bars))
-    _show(
+    show(
         asdict(result), as_json, lambda console: console.print(tables.fields(f"{path}, layer {layer}", asdict(result)))
     )
 
@@ -103,7 +104,20 @@ def info(path: Path, region: str, layer: str, as_json: bool) -> None:
     with _existing(path) as opened:
         values = {"layers": opened.layers()} | layer_info(opened, layer=layer, prefix=region).as_dict()
         values["store"] = asdict(opened.counts())
-    _show(values, as_json, lambda console: console.print(tables.info(str(path), values)))
+    show(values, as_json, lambda console: console.print(tables.info(str(path), values)))
+
+
+@map_group.command(short_help="The features of a layer, one by one.")
+@click.argument("path", metavar="STORE", type=PATH)
+@click.option("--layer", required=True, help="Feature layer: signs, streetlights, ...")
+@region_option
+@json_option
+def features(path: Path, layer: str, region: str, as_json: bool) -> None:
+    """The features of a layer of STORE: place, certainty, existence, and the reports that each comes from."""
+    with _existing(path) as opened:
+        found = list_features(opened, layer, region)
+    values = {"layer": layer, "prefix": region, "features": [one.as_dict() for one in found]}
+    _show(values, as_json, lambda console: console.print(tables.features(values)))
 
 
 @map_group.command(short_help="Write a map as PCD, PLY or GeoJSON.")
@@ -119,7 +133,7 @@ def export(path: Path, out: Path, region: str, layer: str, kind: str | None, as_
         result = export_map(opened, layer, region, out, kind)
     values = asdict(result) | {"path": str(result.path)}
     line = f"{out}: {result.gaussians} Gaussians of {result.tiles} tiles, {result.size_bytes / 1e6:.2f} MB"
-    _show(values, as_json, lambda console: console.print(line, highlight=False))
+    show(values, as_json, lambda console: console.print(line, highlight=False))
 
 
 @map_group.command(short_help="Where two maps, times or versions differ.")
@@ -153,7 +167,7 @@ def diff(
         else:
             assert new is not None
             result = map_diff(first, stack.enter_context(_existing(new)), layer=layer, prefix=region)
-    _show(result.as_dict(), as_json, lambda console: tables.print_diff(console, result))
+    show(result.as_dict(), as_json, lambda console: tables.print_diff(console, result))
 
 
 @map_group.command(short_help="A tile's versions and their reports.")
@@ -173,7 +187,7 @@ def history(path: Path, tile: str, layer: str, as_json: bool) -> None:
             for line in lines
         ]
     values = {"layer": layer, "tile": tile_id.path, "morton": tile_id.morton, "versions": rows}
-    _show(values, as_json, lambda console: console.print(tables.history(values)))
+    show(values, as_json, lambda console: console.print(tables.history(values)))
 
 
 @map_group.command(short_help="Publish an older version of a tile again.")
@@ -191,7 +205,7 @@ def rollback(path: Path, tile: str, version: int, layer: str, as_json: bool) -> 
         current = opened.rollback(layer, parse_tile(tile), version)
     values = {"tile": current.tile.path, "layer": layer, "version": current.version, "content_of": version}
     line = f"tile {current.tile.path}: version {current.version} has the content of version {version}"
-    _show(values, as_json, lambda console: console.print(line, highlight=False))
+    show(values, as_json, lambda console: console.print(line, highlight=False))
 
 
 @map_group.command(short_help="Remove old versions.")
@@ -203,7 +217,7 @@ def gc(path: Path, keep: int, as_json: bool) -> None:
     with _existing(path) as opened:
         result = opened.gc(keep)
     line = f"{path}: {result.versions} versions removed, {result.bytes / 1e6:.2f} MB"
-    _show(asdict(result), as_json, lambda console: console.print(line, highlight=False))
+    show(asdict(result), as_json, lambda console: console.print(line, highlight=False))
 
 
 @map_group.command(short_help="The messages that were refused, and why.")
@@ -221,7 +235,7 @@ def quarantine(path: Path, save: Path | None, as_json: bool) -> None:
     ]
     if save is not None:
         _save({f"{row['sha256']}.bin": one.body for row, one in zip(rows, found, strict=True)}, save)
-    _show({"quarantined": rows}, as_json, lambda console: console.print(tables.quarantine(rows)))
+    show({"quarantined": rows}, as_json, lambda console: console.print(tables.quarantine(rows)))
 
 
 def _save(files: dict[str, bytes], folder: Path) -> None:
@@ -248,7 +262,7 @@ def _existing(path: Path) -> SqliteStore:
 
 
 @contextmanager
-def _store_to_fill(path: Path) -> Iterator[SqliteStore]:
+def store_to_fill(path: Path) -> Iterator[SqliteStore]:
     """The store at `path`; a new one gets its name only when it is filled."""
     if path.exists():
         with SqliteStore(path) as opened:
@@ -284,7 +298,8 @@ def _bars() -> Progress:
     return Progress(*columns, TimeElapsedColumn(), console=Console(stderr=True))
 
 
-def _show(values: dict[str, Any], as_json: bool, print_it: Callable[[Console], None]) -> None:
+def show(values: dict[str, Any], as_json: bool, print_it: Callable[[Console], None]) -> None:
+    """Print an answer: as JSON, or as `print_it` does."""
     if as_json:
         click.echo(json.dumps(values, indent=1))
     else:

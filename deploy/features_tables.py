@@ -1,0 +1,90 @@
+"""The answers of `gnd features` as tables for people."""
+
+from typing import Any
+
+from rich.console import Console
+from rich.table import Table
+
+from tile_store import tables
+from tile_store.feature_io.formats import ExportResult
+from tile_store.feature_io.stored import ImportResult, layer_tiles
+from tile_store.feature_io.values import MapFeature
+from tile_store.sqlite_store import SqliteStore
+
+
+def print_import(console: Console, path: str, result: ImportResult) -> None:
+    """What an import did."""
+    told = {
+        "from": f"{result.source} ({result.format})",
+        **{f"layer {layer}": f"{n} features" for layer, n in result.features.items()},
+        "left out": _counted(result.left_out) or "nothing",
+        "gone since the last import": result.removed,
+        "tiles": f"{result.tiles} published, {result.unchanged} unchanged",
+    }
+    console.print(tables.fields(path, told))
+    for note in result.notes:
+        console.print(note, highlight=False)
+
+
+def print_export(console: Console, result: ExportResult) -> None:
+    """What an export wrote."""
+    console.print(f"{result.path}: {result.features} features, {result.size_bytes / 1e6:.2f} MB", highlight=False)
+    if result.source is not None and result.changes is not None:
+        changes = result.changes
+        console.print(
+            f"into {result.source}: {changes.moved} nodes and lines moved, {changes.retagged} elements with "
+            f"other tags, {changes.removed} elements removed, {changes.added} features new",
+            highlight=False,
+        )
+
+
+def print_list(console: Console, path: str, values: dict[str, Any]) -> None:
+    """The features, and how many there are."""
+    columns = ("id", "layer", "kind", "lat_deg", "lon_deg", "height_m", "vertices", "state", "exist", "sigma_m")
+    table = Table(title=path)
+    for column in columns:
+        table.add_column(column.replace("_", " "), justify="left" if column in ("layer", "kind", "state") else "right")
+    for row in values["listed"]:
+        table.add_row(*(_cell(column, row[column]) for column in columns))
+    console.print(table)
+    for layer, kinds in values["layers"].items():
+        console.print(f"{layer}: {_counted(kinds)}", highlight=False)
+    if len(values["listed"]) < values["features"]:
+        console.print(f"{len(values['listed'])} of {values['features']} shown (--limit)", highlight=False)
+
+
+def feature(values: dict[str, Any]) -> Table:
+    """One feature, a row a value."""
+    properties = values["properties"]
+    told = {key: value for key, value in properties.items() if key != "attributes"} | properties["attributes"]
+    points = values["geometry"]["coordinates"]
+    line = [points] if values["geometry"]["type"] == "Point" else points
+    places = {"vertices": len(line), "from": _place(line[0]), "to": _place(line[-1])}
+    reports = {"tiles": ", ".join(values["tiles"]), "reports": ", ".join(values["reports"]) or "none"}
+    return tables.fields(f"feature {values['id']}", told | places | reports)
+
+
+def whereabouts(store: SqliteStore, found: MapFeature) -> dict[str, list[str]]:
+    """The tiles that a feature lies in, and the reports that its newest versions come from."""
+    tiles = [
+        one for one in layer_tiles(store, found.layer) if any(f.feature_id == found.feature_id for f in one.features)
+    ]
+    reports = {
+        report
+        for tile in tiles
+        for report in store.voxel_provenance(found.layer, tile.tile_id, tile.version).get(found.feature_id, ())
+    }
+    return {"tiles": [tile.tile_id.path for tile in tiles], "reports": sorted(reports)}
+
+
+def _cell(column: str, value: Any) -> str:
+    digits = {"lat_deg": 8, "lon_deg": 8, "height_m": 2, "exist": 2, "sigma_m": 2}
+    return f"{value:.{digits[column]}f}" if column in digits else str(value)
+
+
+def _place(position: list[float]) -> str:
+    return f"{position[1]:.8f}, {position[0]:.8f}, {position[2]:.3f} m"
+
+
+def _counted(counts: Any) -> str:
+    return ", ".join(f"{n} {kind}" for kind, n in counts.items())
