@@ -161,14 +161,20 @@ class FeatureLayer:
         return Seen(state.feature_id, existence, state.hits, point[0], cov)
 
     def _found(self, tile_id: TileId) -> list[Found]:
-        """The new features of a tile that exist and were not reported yet."""
+        """The new features of a tile that exist, stand alone and were not reported yet."""
         found: list[Found] = []
-        for one in self._slamcu.new_features():
+        new = self._slamcu.new_features()
+        places = np.array([one.position_m for one in new]).reshape(-1, 2)
+        for one in new:
             tile, point, cov = self._placed(one.position_m, one.cov_m2, one.height_m)
-            if tile == tile_id and one.number not in self._told:
+            if tile == tile_id and one.number not in self._told and self._alone(one.position_m, places):
                 self._told.add(one.number)
                 found.append(Found(one.kind, point, cov, bounded(one.existence), one.hits))
         return found
+
+    def _alone(self, xy_m: F64, places: F64) -> bool:
+        """Whether no other new feature of the layer stands too near."""
+        return int((np.hypot(*(places - xy_m).T) < self.parameters.alone_m).sum()) <= 1
 
     def _placed(self, xy_m: F64, cov: F64, height_m: float, tile_id: TileId | None = None) -> tuple[TileId, F64, F64]:
         point, full = with_height(xy_m, cov, self._z_m + height_m, SIGMA_HEIGHT_M, self._z_m)

@@ -24,6 +24,8 @@ class LayerParameters:
         rate_hz: looks a second.
         height_m: usual height of the features above the vehicle's origin: what decides what hides them.
         detection_confidence: λ of SLAMCU, Eq. (1) and (2).
+        alone_m: two features of the layer never stand nearer to each other: found so, they are something else (the tall
+            posts of a scaffold are no lamps); 0 = they may.
     """
 
     name: str
@@ -34,12 +36,15 @@ class LayerParameters:
     rate_hz: float = 10.0
     height_m: float = 2.5
     detection_confidence: float = 0.9
+    alone_m: float = 0.0
 
     def __post_init__(self) -> None:
         if not LAYER_PATTERN.fullmatch(self.name) or self.name.startswith("ndt"):
             raise FeatureLayerError(f"layer {self.name[:80]!r} is no feature layer: {LAYER_PATTERN.pattern}, not ndt…")
-        if not self.kinds or not isfinite(self.height_m):
-            raise FeatureLayerError(f"layer {self.name}: {len(self.kinds)} kinds, height {self.height_m} m")
+        if not self.kinds or not isfinite(self.height_m) or not self.alone_m >= 0:
+            raise FeatureLayerError(
+                f"layer {self.name}: {len(self.kinds)} kinds, height {self.height_m} m, alone within {self.alone_m} m"
+            )
         _ = self.view, self.slamcu  # they check the rest
 
     @property
@@ -59,7 +64,7 @@ LAYERS: Final = {
     layer.name: layer
     for layer in (
         LayerParameters("signs", "camera", ("traffic_sign",), field_deg=40.0, range_m=80.0, rate_hz=15.0),
-        LayerParameters("streetlights", "lidar", ("streetlight",), height_m=4.0, detection_confidence=0.6),
+        LayerParameters("streetlights", "lidar", ("streetlight",), height_m=4.0, detection_confidence=0.6, alone_m=3.0),
         LayerParameters("poles", "lidar", ("pole", "trunk"), detection_confidence=0.6),
     )
 }
