@@ -117,7 +117,7 @@ def features(path: Path, layer: str, region: str, as_json: bool) -> None:
     with _existing(path) as opened:
         found = list_features(opened, layer, region)
     values = {"layer": layer, "prefix": region, "features": [one.as_dict() for one in found]}
-    _show(values, as_json, lambda console: console.print(tables.features(values)))
+    show(values, as_json, lambda console: console.print(tables.features(values)))
 
 
 @map_group.command(short_help="Write a map as PCD, PLY or GeoJSON.")
