@@ -5,7 +5,6 @@ map are gone, 39 stand without being mapped. They stand as along French motorway
 verge before exits, gantries over the lanes with panels a lane apart.
 """
 
-from collections.abc import Iterator
 from dataclasses import dataclass
 from math import pi, radians
 from typing import Final
@@ -13,6 +12,7 @@ from typing import Final
 import numpy as np
 
 from fleet_sim.errors import RoadError
+from fleet_sim.roads.alignment import Bends, drawn_bends
 from fleet_sim.roads.curve import of_curvature
 from fleet_sim.roads.route import FeatureState, Route, placed
 from gnd_map.geodesy import LocalFrame
@@ -31,9 +31,8 @@ MEDIAN_LEFT_M: Final = LANE_M + 2.0
 KINDS: Final = ("speed_limit", "no_overtaking", "warning", "information", "direction", "exit")
 
 _ANCHOR: Final = LocalFrame(radians(49.2), radians(2.6), 90.0)
-_RADIUS_M: Final = (900.0, 5000.0)
+_BENDS: Final = Bends((900.0, 5000.0), (100.0, 1200.0), (300.0, 1300.0), (120.0, 250.0))
 """French motorways for 130 km/h have radii of at least 600 m, curves without superelevation of 900 m (ICTAAL 2015)."""
-_CLOTHOID_M: Final = (120.0, 250.0)
 _MOVED: Final = 3
 """So many of the deleted signs have been moved by some metres: a new one of the same kind stands near."""
 _ENDS_M: Final = 250.0
@@ -62,25 +61,12 @@ def motorway(seed: int, length_m: float = LENGTH_M) -> Route:
     if seed < 0 or length_m < 5000.0:
         raise RoadError(f"a motorway needs a seed >= 0 and at least 5000 m, got {seed} and {length_m:g} m")
     curves, signs, fate, survey = (np.random.default_rng([seed, stream, 6]) for stream in range(4))
-    line = of_curvature(list(_curvature(length_m, curves)), float(curves.uniform(-pi, pi)))
+    line = of_curvature(drawn_bends(_BENDS, length_m, curves), float(curves.uniform(-pi, pi)))
     share = length_m / LENGTH_M
     normal, deleted, new = (max(1, round(share * count)) for count in (NORMAL, DELETED, NEW))
     stands = _fated(_stands(normal + deleted + new - min(_MOVED, deleted, new), length_m, signs), deleted, new, fate)
     features = placed(line, stands, survey)
     return Route(f"motorway-{seed}", seed, _ANCHOR, line, LANES, MARKINGS, features, "signs", (25.0, 33.0))
-
-
-def _curvature(length_m: float, rng: np.random.Generator) -> Iterator[tuple[float, float]]:
-    """Straights and arcs with clothoids between, until the length is reached."""
-    left_m = length_m
-    while left_m > 0:
-        radius_m = float(np.exp(rng.uniform(*np.log(_RADIUS_M)))) * float(rng.choice((-1.0, 1.0)))
-        straight, arc, clothoid = rng.uniform(100, 1200), rng.uniform(300, 1300), rng.uniform(*_CLOTHOID_M)
-        for piece, curvature in ((straight, 0.0), (clothoid, 1 / radius_m), (arc, 1 / radius_m), (clothoid, 0.0)):
-            used = min(float(piece), left_m)
-            if used > 0:
-                yield used, curvature
-            left_m -= used
 
 
 def _stands(count: int, length_m: float, rng: np.random.Generator) -> list[_Stand]:

@@ -10,6 +10,7 @@ from typing import Final
 import numpy as np
 
 from fleet_sim.errors import RoadError
+from fleet_sim.roads.alignment import Bends, drawn_bends
 from fleet_sim.roads.curve import of_curvature
 from fleet_sim.roads.motorway import LANES, MARKINGS
 from fleet_sim.roads.route import FeatureState, Route, placed
@@ -19,7 +20,7 @@ LENGTH_M: Final = 5_000.0
 EVERY_M: Final = 40.0
 
 _ANCHOR: Final = LocalFrame(radians(37.45), radians(127.12), 60.0)
-_RADIUS_M: Final = (1000.0, 4000.0)
+_BENDS: Final = Bends((1000.0, 4000.0), (50.0, 500.0), (300.0, 900.0), (150.0, 150.0))
 
 
 def streetlight_motorway(seed: int, *, straight: bool = False, length_m: float = LENGTH_M) -> Route:
@@ -37,7 +38,7 @@ def streetlight_motorway(seed: int, *, straight: bool = False, length_m: float =
         raise RoadError(f"a motorway with lights needs a seed >= 0 and at least 500 m, got {seed} and {length_m:g} m")
     curves, stands, survey = (np.random.default_rng([seed, stream, 8]) for stream in range(3))
     heading = float(curves.uniform(-pi, pi))
-    line = of_curvature([(length_m, 0.0)] if straight else _bends(length_m, curves), heading)
+    line = of_curvature([(length_m, 0.0)] if straight else drawn_bends(_BENDS, length_m, curves), heading)
     both = stands.random() < 0.5
     lefts = (MARKINGS[0] - 4.0, MARKINGS[-1] + 12.0 + 4.0) if both else (MARKINGS[-1] + 1.5,)
     lights: list[tuple[float, float, str, float, FeatureState]] = []
@@ -49,22 +50,3 @@ def streetlight_motorway(seed: int, *, straight: bool = False, length_m: float =
     name = f"streetlights-{seed}" + ("-straight" if straight else "")
     features = placed(line, lights, survey)
     return Route(name, seed, _ANCHOR, line, LANES, MARKINGS, features, "streetlights", (22.0, 28.0))
-
-
-def _bends(length_m: float, rng: np.random.Generator) -> list[tuple[float, float]]:
-    pieces: list[tuple[float, float]] = []
-    left_m = length_m
-    while left_m > 0:
-        radius_m = float(rng.uniform(*_RADIUS_M)) * float(rng.choice((-1.0, 1.0)))
-        wanted = (
-            (rng.uniform(50, 500), 0.0),
-            (150.0, 1 / radius_m),
-            (rng.uniform(300, 900), 1 / radius_m),
-            (150.0, 0.0),
-        )
-        for piece, curvature in wanted:
-            used = min(float(piece), left_m)
-            if used > 0:
-                pieces.append((used, curvature))
-            left_m -= used
-    return pieces
