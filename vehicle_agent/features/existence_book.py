@@ -15,7 +15,7 @@ from vehicle_agent.features.parameters import SlamcuParameters
 
 HISTORY: Final = 1024
 """So many steps of a feature's masses are kept."""
-DOUBT: Final = 1e-9
+DOUBT: Final = 1e-15
 """No mass falls below this: looks from one place are no independent witnesses, and changes must be able to show."""
 
 
@@ -50,6 +50,7 @@ class Entry:
         masses: (4,) exist, absent, unknown, conflict.
         slot: its place in the particles, None = not there.
         pass_hits: hits since it is there.
+        pass_misses: misses since.
         in_view_s: when it was last in view or measured.
         odometer_m: way driven when it was last measured.
         seen: what this drive measured of a feature of the map, independently of the map's position of it.
@@ -67,6 +68,7 @@ class Entry:
     misses: int = 0
     slot: int | None = None
     pass_hits: int = 0
+    pass_misses: int = 0
     in_view_s: float = 0.0
     odometer_m: float = 0.0
     heights: deque[float] = field(default_factory=lambda: deque(maxlen=HISTORY))
@@ -113,6 +115,7 @@ class ExistenceBook:
             entry.hits += 1
         for entry in missed:
             entry.misses += 1
+            entry.pass_misses += 1
 
     def recount(self, entry: Entry, hits: int, misses: int, t_ns: int) -> None:
         """Masses from counts, whose order does not matter: hits turned out to be misses, or another feature's."""

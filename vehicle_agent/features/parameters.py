@@ -15,7 +15,7 @@ class MotionNoise:
 
     speed_m: float = 0.006
     """Of the way driven, m/√s."""
-    yaw_rad: float = radians(0.03)
+    yaw_rad: float = radians(0.02)
     """Of the heading, rad/√s."""
     scale: float = 0.005
     """Error of the wheel's radius, as a share; constant."""
@@ -35,9 +35,9 @@ class MotionNoise:
 class GnssNoise:
     """Errors of a low-cost GNSS: a slow one (Gauss-Markov, with the sigma that the fix tells) and a white one."""
 
-    white_m: float = 0.3
+    white_m: float = 0.5
     """White noise of each axis."""
-    correlation_s: float = 60.0
+    correlation_s: float = 12.0
     """Time constant of the slow error."""
     interval_s: float = 0.5
     """At most one fix in this time is used: those between tell the same error once more."""
@@ -52,11 +52,11 @@ class GnssNoise:
 class FilterParameters:
     """The Rao-Blackwellised particle filter."""
 
-    particles: int = 600
+    particles: int = 1500
     """M; one is enough where the poses are given and certain."""
     resample_below: float = 0.5
     """α of Eq. (20): resample when the effective number falls below this share of M."""
-    jitter: float = 0.2
+    jitter: float = 0.45
     """h: a resampled particle keeps √(1-h²) of its distance from the mean; h of that of another pair makes up for it.
     0 is plain resampling."""
     floor: float = 4e-4
@@ -98,8 +98,9 @@ class SlamcuParameters:
     """The same, in bearing, at least."""
     map_sigma_m: float = 0.05
     """Error of each axis of a map feature's position on top of the covariance that the map gives it."""
-    moved_gate: float = 25.0
-    """A map feature measured this far off (squared Mahalanobis) has moved: deleted here, new there."""
+    moved_gate: float = 14.0
+    """A map feature measured this far off (squared Mahalanobis) has moved: deleted here, new there. χ² of 2 degrees of
+    freedom, 99.9 %."""
     moved_m: float = 1.0
     """And at least this far."""
     settle_s: float = 0.5

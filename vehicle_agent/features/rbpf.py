@@ -12,6 +12,7 @@ particles are spread anew by the differences of random pairs, and drawn towards 
 covariance of poses, biases and features stay (Liu and West 2001, with pairs in place of a Gaussian kernel).
 """
 
+from collections.abc import Callable, Collection
 from typing import Final
 
 import numpy as np
@@ -109,9 +110,9 @@ class Rbpf:
             var, s[GNSS_X:] = sigma_m**2, 0.0  # another reflection: what was known of its error is void
             nu = xy_m[:, None] - s[:2]
         total = var + noise.white_m**2
-        if self.weighing:
-            self.log_weight -= 0.5 * (nu**2).sum(axis=0) / total
-        s[GNSS_X:] += var / total * nu
+        self._weigh(lambda: -0.5 * self._off(xy_m) / total)
+        s = self.state
+        s[GNSS_X:] += var / total * (xy_m[:, None] - s[:2] - s[GNSS_X:])
         self._gnss_var = var * (1.0 - var / total)
 
     def add(self, z: F64, variance: F64, prior: Prior | None = None) -> None:
@@ -127,10 +128,10 @@ class Rbpf:
 
     def measure(self, slot: int, z: F64, variance: F64, *, weigh: bool) -> None:
         """Update a feature with a measurement, Eq. (16), and the weights, Eq. (18) and (19)."""
+        if weigh:
+            self._weigh(lambda: self._likelihood(slot, z, variance))  # Eq. (19)
         updated = measurement.update(self.state[:3], self.mu[slot], self.sigma[slot], z, variance)
-        self.mu[slot], self.sigma[slot], log_likelihood = updated
-        if weigh and self.weighing:
-            self.log_weight += np.logaddexp(log_likelihood, np.log(self._p.filter.floor))  # Eq. (19)
+        self.mu[slot], self.sigma[slot], _ = updated
 
     def merge(self, kept: int, other: int) -> None:
         """Two features are one: their estimates are made one, and `other` is removed."""
@@ -141,12 +142,12 @@ class Rbpf:
         )
         self.remove(other)
 
-    def weights(self, without: int | None = None) -> F64:
-        """(M,) weights that sum to 1, with positions known otherwise (but not that of slot `without`)."""
+    def weights(self, without: Collection[int] = ()) -> F64:
+        """(M,) weights that sum to 1, with positions known otherwise (but not those of the slots `without`)."""
         log = self.log_weight.copy()
         if self.weighing:
             for slot, prior in enumerate(self.priors):
-                if prior is not None and slot != without:
+                if prior is not None and slot not in without:
                     log += self._agreement(slot, prior)
         return _normalised(log)
 
@@ -155,8 +156,7 @@ class Rbpf:
         prior = self.priors[slot]
         if prior is None:
             return
-        if self.weighing:
-            self._temper(slot, prior)
+        self._weigh(lambda: self._agreement(slot, prior))
         self.mu[slot], self.sigma[slot] = measurement.fused(self.mu[slot], self.sigma[slot], *prior)
         self.priors[slot] = None
 
@@ -186,10 +186,25 @@ class Rbpf:
     def _agreement(self, slot: int, prior: Prior) -> F64:
         return np.logaddexp(measurement.agreement(self.mu[slot], self.sigma[slot], *prior), np.log(FLOOR_PER_M2))
 
-    def _temper(self, slot: int, prior: Prior) -> None:
+    def _likelihood(self, slot: int, z: F64, variance: F64) -> F64:
+        log = measurement.log_likelihood(self.state[:3], self.mu[slot], self.sigma[slot], z, variance)
+        return np.asarray(np.logaddexp(log, np.log(self._p.filter.floor)))
+
+    def _off(self, xy_m: F64) -> F64:
+        """(M,) squared distances of a fix from where each particle expects it."""
+        return np.asarray(np.square(xy_m[:, None] - self.state[:2] - self.state[GNSS_X:]).sum(axis=0))
+
+    def _weigh(self, log_likelihood: Callable[[], F64]) -> None:
+        """Multiply the weights by a likelihood; in steps with resampling between where it would leave few particles.
+
+        Args:
+            log_likelihood: gives (M,) of the particles as they are then.
+        """
+        if not self.weighing or self.m == 1:
+            return
         left = 1.0
         for stage in range(_MOST_STAGES):
-            log = self._agreement(slot, prior)
+            log = log_likelihood()
             step = left if stage == _MOST_STAGES - 1 else self._bearable(log, left)
             self.log_weight += step * log
             left -= step
@@ -204,7 +219,7 @@ class Rbpf:
         def bears(share: float) -> bool:
             return effective(_normalised(self.log_weight + share * log)) >= enough
 
-        if self.m == 1 or bears(most):
+        if bears(most):
             return most
         low, high = 0.0, most
         for _ in range(12):

@@ -149,7 +149,9 @@ class Slamcu:
         innovation[..., 1] = wrapped(innovation[..., 1])
         noise = np.zeros((len(look), 1, 2, 2))
         noise[:, 0, [0, 1], [0, 1]] = look.variance
-        same = np.array([[kind == entry.kind for entry in near] for kind in look.kinds], bool).reshape(len(look), len(near))
+        same = np.array([[kind == entry.kind for entry in near] for kind in look.kinds], bool).reshape(
+            len(look), len(near)
+        )
         cost = pair_costs(innovation, ahead.cov[None] + noise, same, self._p.gate)
         plausible = np.array([max(entry.masses[0] + entry.masses[2], LEAST_PLAUSIBLE) for entry in near])
         return associate(cost - np.log(plausible), -np.log(self._p.new_density))
@@ -206,7 +208,7 @@ class Slamcu:
     def _known_state(self, entry: Entry) -> KnownState:
         seen = entry.seen
         if seen is None and entry.slot is not None and self._rbpf.priors[entry.slot] is not None:
-            seen = self._rbpf.moments(entry.slot, self._rbpf.weights(without=entry.slot))
+            seen = self._rbpf.moments(entry.slot, self._rbpf.weights(without=(entry.slot,)))
         xy_m, cov = seen if seen is not None else (None, None)
         return KnownState(
             entry.number, self._book.classify(entry), existence_of(entry.masses), entry.hits, entry.misses,

@@ -6,6 +6,7 @@ import numpy as np
 
 from gnd_map.arrays import F64
 from vehicle_agent.features.existence_book import Entry, ExistenceBook, FeatureClass
+from vehicle_agent.features.identities import best_identities
 from vehicle_agent.features.parameters import SlamcuParameters
 from vehicle_agent.features.rbpf import Rbpf
 from vehicle_agent.features.tracked import Tracked
@@ -18,6 +19,8 @@ ENOUGH_HITS: Final = 6
 """So many measurements of the two together tell whether they are ever measured at once."""
 TOGETHER_SHARE: Final = 0.15
 """Two features that are measured at once in this share of the looks that could are two."""
+GROUP_M: Final = 12.0
+"""Features within this distance may be taken for each other: three lanes."""
 GIVEN_UP: Final = 0.9
 """A new feature with this mass of absence is forgotten."""
 
@@ -66,8 +69,10 @@ class Tidying:
 
     def _settle(self, entry: Entry, t_ns: int) -> None:
         """Compare with the position known otherwise, and take that in."""
+        if entry.known:
+            self._identify(entry, t_ns)
         assert entry.slot is not None
-        weights = self._rbpf.weights(without=entry.slot)
+        weights = self._rbpf.weights(without=(entry.slot,))
         xy_m, cov = self._rbpf.moments(entry.slot, weights)
         if entry.known:
             if self._moved(entry, xy_m, cov):
@@ -75,6 +80,34 @@ class Tidying:
                 return
             entry.seen = (xy_m, cov) if entry.seen is None else fused_moments(entry.seen, (xy_m, cov))
         self._rbpf.settle(entry.slot)
+
+    def _identify(self, entry: Entry, t_ns: int) -> None:
+        """Give the estimates of features that stand close together to those of the map that they are."""
+        group = self._group(entry)
+        owned = sum(one.known for one in group)
+        if len(group) < 2:
+            return
+        slots = [one.slot for one in group if one.slot is not None]
+        for feature, slot in zip(group, best_identities(self._rbpf, slots, owned), strict=False):
+            other = self._tracked.live[slot]
+            if other is not feature:
+                self._exchange(feature, other, t_ns)
+
+    def _group(self, entry: Entry) -> list[Entry]:
+        """Features like this one around it that are being estimated, those of the map that are not settled first."""
+        alike = [one for one in self._tracked.live if one.kind == entry.kind and self._together(one, entry)]
+        unsettled = [one for one in alike if one.known and one.slot is not None and self._rbpf.priors[one.slot]]
+        return unsettled + [one for one in alike if not one.known and one.cov is None]
+
+    def _together(self, one: Entry, other: Entry) -> bool:
+        places = [self._rbpf.mu[each.slot].mean(axis=0) for each in (one, other)]
+        return float(np.hypot(*(places[0] - places[1]))) < GROUP_M
+
+    def _exchange(self, one: Entry, other: Entry, t_ns: int) -> None:
+        rest = [(each.hits - each.pass_hits, each.misses - each.pass_misses) for each in (one, other)]
+        self._tracked.exchange(one, other)
+        for each, (hits, misses) in zip((one, other), rest, strict=True):
+            self._book.recount(each, hits + each.pass_hits, misses + each.pass_misses, t_ns)
 
     def _moved(self, entry: Entry, xy_m: F64, cov: F64) -> bool:
         assert entry.cov is not None

@@ -72,7 +72,7 @@ class Tracked:
     def enter(self, entry: Entry, z: F64, variance: F64) -> None:
         """Estimate a feature in the particles from this first measurement on."""
         self._rbpf.add(z, variance, prior_of_entry(entry))
-        entry.slot, entry.pass_hits = len(self.live), 0
+        entry.slot, entry.pass_hits, entry.pass_misses = len(self.live), 0, 0
         self.live.append(entry)
 
     def leave(self, entry: Entry) -> None:
@@ -93,7 +93,7 @@ class Tracked:
         if kept.slot is None:
             self.live[other.slot] = kept
             kept.slot, other.slot = other.slot, None
-            kept.pass_hits = other.pass_hits
+            kept.pass_hits, kept.pass_misses = other.pass_hits, other.pass_misses
             self._rbpf.priors[kept.slot] = prior_of_entry(kept)
         else:
             self._rbpf.merge(kept.slot, other.slot)
@@ -105,6 +105,19 @@ class Tracked:
         self.live[giver.slot] = taker
         taker.slot, taker.pass_hits, taker.cov, giver.slot = giver.slot, giver.pass_hits, None, None
         self._rbpf.priors[taker.slot] = None
+
+    def exchange(self, one: Entry, other: Entry) -> None:
+        """The estimates of two features are each other's."""
+        mine, others = one.slot, other.slot
+        assert mine is not None
+        assert others is not None
+        for entry, slot in ((one, others), (other, mine)):
+            entry.slot = slot
+            self.live[slot], self._rbpf.priors[slot] = entry, prior_of_entry(entry)
+        for name in ("pass_hits", "pass_misses", "in_view_s", "odometer_m", "heights"):
+            before = getattr(one, name)
+            setattr(one, name, getattr(other, name))
+            setattr(other, name, before)
 
     def _forget_slot(self, entry: Entry) -> None:
         assert entry.slot is not None

@@ -1,0 +1,69 @@
+"""Which estimate is which feature of the map, decided when all of its measurements are in.
+
+The panels of a gantry stand a lane apart, and one look at 80 m cannot tell them from one another: what is measured at
+first may be taken for its neighbour, and everything after it follows. An estimate gathered over a passage can tell. So
+before the map's features are settled, all ways to give the estimates at hand to them are compared, by the likelihood of
+the whole in each particle: the pose is the same for all of them.
+"""
+
+from itertools import islice, permutations
+from math import perm
+from typing import Final
+
+import numpy as np
+from scipy.optimize import linear_sum_assignment
+
+from gnd_map.arrays import F64
+from vehicle_agent.features import measurement
+from vehicle_agent.features.rbpf import Rbpf
+
+MOST_WAYS: Final = 720
+"""More ways than this are not compared; then the best pairs alone are the only other way."""
+CLEARLY: Final = 3.0
+"""An identity changes when it becomes so much more likely (natural logarithm)."""
+
+
+def best_identities(rbpf: Rbpf, slots: list[int], owned: int) -> list[int]:
+    """Which of `slots` are the features of the map that own the first ones.
+
+    Args:
+        rbpf: the particles; slots that are owned have a prior.
+        slots: S slots of one kind near one another, the `owned` ones first.
+        owned: J features of the map, J <= S.
+
+    Returns:
+        J of the slots, in the order of the features.
+    """
+    fit = agreements(rbpf, slots, owned)
+    log_weight = np.log(np.maximum(rbpf.weights(without=set(slots)), 1e-300))
+    now = tuple(range(owned))
+    best = max(_ways(fit, log_weight), key=lambda way: likelihood(fit, log_weight, way))
+    if likelihood(fit, log_weight, best) < likelihood(fit, log_weight, now) + CLEARLY:
+        best = now
+    return [slots[i] for i in best]
+
+
+def agreements(rbpf: Rbpf, slots: list[int], owned: int) -> F64:
+    """(J, S, M) log likelihood of each prior, were it the slot's."""
+    fit = np.empty((owned, len(slots), rbpf.m))
+    for j in range(owned):
+        prior = rbpf.priors[slots[j]]
+        assert prior is not None
+        for s, slot in enumerate(slots):
+            fit[j, s] = measurement.agreement(rbpf.mu[slot], rbpf.sigma[slot], *prior)
+    return fit
+
+
+def likelihood(fit: F64, log_weight: F64, way: tuple[int, ...]) -> float:
+    """Log likelihood of a way to give slots to features, over all particles."""
+    log = log_weight + sum(fit[j, s] for j, s in enumerate(way))
+    most = float(log.max())
+    return most + float(np.log(np.exp(log - most).sum()))
+
+
+def _ways(fit: F64, log_weight: F64) -> list[tuple[int, ...]]:
+    features, slots = fit.shape[:2]
+    if perm(slots, features) <= MOST_WAYS:
+        return list(islice(permutations(range(slots), features), MOST_WAYS))
+    pairs = np.array([[likelihood(fit[[j]][:, [s]], log_weight, (0,)) for s in range(slots)] for j in range(features)])
+    return [tuple(linear_sum_assignment(-pairs)[1].tolist()), tuple(range(features))]
