@@ -24,7 +24,6 @@ from tile_store.arguments import parse_tile, parse_time_ns, parse_versions
 from tile_store.compare import MapDiff, layer_info, map_diff, version_diff
 from tile_store.errors import StoreError
 from tile_store.export import FORMATS, export_map
-from tile_store.feature_list import list_features
 from tile_store.server import TileServer
 from tile_store.sqlite_store import SqliteStore
 from tile_store.store import Store
@@ -105,19 +104,6 @@ def info(path: Path, region: str, layer: str, as_json: bool) -> None:
         values = {"layers": opened.layers()} | layer_info(opened, layer=layer, prefix=region).as_dict()
         values["store"] = asdict(opened.counts())
     show(values, as_json, lambda console: console.print(tables.info(str(path), values)))
-
-
-@map_group.command(short_help="The features of a layer, one by one.")
-@click.argument("path", metavar="STORE", type=PATH)
-@click.option("--layer", required=True, help="Feature layer: signs, streetlights, ...")
-@region_option
-@json_option
-def features(path: Path, layer: str, region: str, as_json: bool) -> None:
-    """The features of a layer of STORE: place, certainty, existence, and the reports that each comes from."""
-    with _existing(path) as opened:
-        found = list_features(opened, layer, region)
-    values = {"layer": layer, "prefix": region, "features": [one.as_dict() for one in found]}
-    show(values, as_json, lambda console: console.print(tables.features(values)))
 
 
 @map_group.command(short_help="Write a map as PCD, PLY or GeoJSON.")
