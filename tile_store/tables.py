@@ -74,20 +74,6 @@ def history(values: dict[str, Any]) -> Table:
     return table
 
 
-def features(values: dict[str, Any]) -> Table:
-    """One row a feature, or a piece of one."""
-    table = Table(title=f"{len(values['features'])} features of layer {values['layer']}")
-    for column in ("id", "kind", "latitude, longitude", "± m", "existence", "hits", "vehicles", "reports"):
-        table.add_column(column, justify="right" if column in ("± m", "hits", "vehicles", "reports") else "left")
-    for one in values["features"]:
-        part = f" / {one['part']}" if one["points"] > 1 else ""
-        place = f"{one['lat_deg']:.7f}, {one['lon_deg']:.7f}"
-        existence = f"{one['state']} {one['exist']:.2f} {one['absent']:.2f} {one['unknown']:.2f}"
-        counts = (str(one["hits"]), str(one["vehicles"]), str(len(one["reports"])))
-        table.add_row(f"{one['feature_id']}{part}", one["kind"], place, f"{one['sigma_m']:.2f}", existence, *counts)
-    return table
-
-
 def print_diff(console: Console, result: MapDiff) -> None:
     """One row a tile that differs, and the totals in voxels or features."""
     head, *rows = result.rows()
