@@ -12,7 +12,7 @@ from cloud_merger.features.shapes import across
 from gnd_map.arrays import F64
 
 _NEVER: Final = 1e9
-_HEIGHT_KNOWN_M2: Final = 100.0
+HEIGHT_KNOWN_M2: Final = 100.0
 """Where the variance of a difference of heights is larger, it is not a dimension that was measured."""
 _LEAST_OVERLAP: Final = 0.5
 
@@ -48,7 +48,7 @@ def costs(measured: Sequence[Place], known: Sequence[Place], parameters: Feature
     near = reach_m <= (parameters.reach_m if of_point else parameters.line_reach_m)
     offset = np.where(near[..., None], offset, 0.0)
     square = np.einsum("ijk,ijk->ij", offset, np.linalg.solve(S, offset[..., None])[..., 0])
-    gate = np.where(S[..., 2, 2] > _HEIGHT_KNOWN_M2, parameters.gate_of(2), parameters.gate_of(3))
+    gate = np.where(S[..., 2, 2] > HEIGHT_KNOWN_M2, parameters.gate_of(2), parameters.gate_of(3))
     area = S[..., 0, 0] * S[..., 1, 1] - S[..., 0, 1] ** 2
     return np.where(near & (square <= gate), square + np.log(area), np.inf)
 

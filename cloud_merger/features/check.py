@@ -11,6 +11,7 @@ from typing import Final
 import numpy as np
 
 from cloud_merger.errors import BadReport, MergerError
+from cloud_merger.features.association import HEIGHT_KNOWN_M2
 from gnd_map.arrays import F64
 from gnd_map.errors import FeatureError
 from gnd_map.features import UNKNOWN_HEIGHT_M2, check_simple_polyline, full_covariance
@@ -19,7 +20,6 @@ from gnd_map.tile_id import TileId
 from schemas.feature_change import LANE_KINDS, FeatureChange, Found
 from schemas.features import FeatureReport
 
-_HEIGHT_KNOWN_M2: Final = 100.0
 _ROUNDING: Final = 1.01
 """Covariances travel on levels that are some per cent apart; a limit that is met before is met after."""
 
@@ -169,7 +169,7 @@ def _check_duplicates(change: FeatureChange, limits: FeatureLimits) -> None:
         if (a.kind, a.attributes) != (b.kind, b.attributes):
             continue
         apart, both = a.points_m[0] - b.points_m[0], full_covariance(a.cov_m2 + b.cov_m2)
-        has_heights = both[2, 2] < _HEIGHT_KNOWN_M2
+        has_heights = both[2, 2] < HEIGHT_KNOWN_M2
         if has_heights and abs(apart[2]) > limits.duplicate_m:
             continue
         if apart @ np.linalg.solve(both, apart) <= 1.0:

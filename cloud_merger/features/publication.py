@@ -7,13 +7,14 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from cloud_merger.features.association import HEIGHT_KNOWN_M2
 from cloud_merger.features.existence import verdict
 from cloud_merger.features.parameters import FeatureMergeParameters
 from cloud_merger.features.rls import Place, estimate, fused, step
 from cloud_merger.features.shapes import length_of
 from cloud_merger.features.statements import Attributes
 from cloud_merger.features.tracks import Measured, Track, Vote
-from gnd_map.features import Existence, Feature, full_covariance, geodetic_in_tile, six_of
+from gnd_map.features import Existence, Feature, full_covariance, geodetic_in_tile
 from gnd_map.features.feature import MAX_COUNT
 from gnd_map.tile_id import TileId
 
@@ -49,7 +50,7 @@ class _Story:
     def __init__(self, track: Track, parameters: FeatureMergeParameters) -> None:
         self._track, self._parameters = track, parameters
         known = track.epoch
-        self._known = None if known is None else Place(known.points_m, full_covariance(known.cov_m2))
+        self._known = None if known is None else Place.of(known.points_m, known.cov_m2)
         self.shown: Feature | None = track.epoch
         self.is_published = known is not None
         self._votes: dict[str, tuple[int, Vote]] = {}  # the newest of each vehicle, the newest last
@@ -145,7 +146,8 @@ class _Story:
         """Whether the estimate is surer than the published one by the gain, or farther from it than its sigma."""
         place, was = self._place(), full_covariance(shown.cov_m2)
         gain = self._parameters.renewal_gain
-        if (np.diag(was) > gain * np.diag(place.cov_m2) * (1 + 1e-9)).any() or gain == 1.0:
+        before, after = (np.minimum(np.diag(cov), HEIGHT_KNOWN_M2) for cov in (was, place.cov_m2))
+        if gain == 1.0 or (before > gain * after * (1 + 1e-9)).any():
             return True
         if len(place.points_m) != len(shown.points_m):
             return True
@@ -159,12 +161,12 @@ class _Story:
         ayes = [vote for vote in votes if vote.existence.state == "exist"]
         hits = sum(vote.hits for vote in ayes)
         begun = known or Feature(
-            self._track.feature_id, self._track.kind, place.points_m, six_of(place.cov_m2), attributes=self._agreed()
+            self._track.feature_id, self._track.kind, place.points_m, place.six(), attributes=self._agreed()
         )
         return replace(
             begun,
             points_m=place.points_m,
-            cov_m2=six_of(place.cov_m2),
+            cov_m2=place.six(),
             existence=self._masses(),
             hits=min(hits + begun.hits, MAX_COUNT),
             vehicles=max(len(ayes), begun.vehicles),

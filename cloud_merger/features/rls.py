@@ -12,8 +12,10 @@ import numpy as np
 
 from cloud_merger.features.shapes import onto
 from gnd_map.arrays import F64
+from gnd_map.features import UNKNOWN_HEIGHT_M2, full_covariance, six_of
 
 _I3: Final = np.eye(3)
+_NOTHING_M2: Final = 1e12
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -22,11 +24,26 @@ class Place:
 
     Attributes:
         points_m: (N, 3) in the tile's ENU frame.
-        cov_m2: (3, 3) of each point.
+        cov_m2: (3, 3) of each point; 10^12 m² and no correlation for a height that nobody measured.
     """
 
     points_m: F64
     cov_m2: F64
+
+    @classmethod
+    def of(cls, points_m: F64, cov_m2: F64) -> "Place":
+        """From six values xx, xy, xz, yy, yz, zz. Of an unknown height one learns nothing, however often it is told."""
+        cov = full_covariance(cov_m2)
+        if cov[2, 2] > UNKNOWN_HEIGHT_M2 / 2:
+            cov[2], cov[:, 2] = 0.0, 0.0
+            cov[2, 2] = _NOTHING_M2
+        return cls(points_m, cov)
+
+    def six(self) -> F64:
+        """(6,) the covariance as features have it."""
+        six = six_of(self.cov_m2)
+        six[5] = min(six[5], UNKNOWN_HEIGHT_M2)
+        return six
 
     def scaled(self, factor: float) -> "Place":
         """The same with a covariance `factor` times as large."""

@@ -8,7 +8,7 @@ import numpy as np
 from cloud_merger.features.rls import Place
 from cloud_merger.features.spread import between, near_border
 from gnd_map.arrays import F64
-from gnd_map.features import Existence, Feature, feature_id_of, full_covariance
+from gnd_map.features import Existence, Feature, feature_id_of
 from gnd_map.tile_id import TileId
 from schemas.feature_change import FeatureChange, Found, Seen
 from schemas.features import FeatureReport
@@ -100,7 +100,7 @@ def _claims(tile: TileId, report_id: str, change: FeatureChange, reach_m: float)
     claims = []
     for one in found:
         name = _name(report_id, change.tile, one, names)
-        place = Place(_moved(tile, change.tile, one.points_m), full_covariance(one.cov_m2))
+        place = Place.of(_moved(tile, change.tile, one.points_m), one.cov_m2)
         claims.append(Claimed(name, one.kind, place, one.existence, one.hits, one.attributes))
     return claims
 

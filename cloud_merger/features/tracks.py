@@ -10,7 +10,7 @@ from cloud_merger.features.association import costs, fits, pairs
 from cloud_merger.features.parameters import FeatureMergeParameters
 from cloud_merger.features.rls import Place, step
 from cloud_merger.features.statements import Attributes, Claimed, Statement
-from gnd_map.features import Existence, Feature, feature_id_of, full_covariance
+from gnd_map.features import Existence, Feature, feature_id_of
 from schemas.feature_change import Seen
 
 Bases = Mapping[bytes, Mapping[int, tuple[Feature, ...]]]
@@ -134,7 +134,7 @@ class Tracks:
         track.votes[report] = Vote(said.vehicle, seen.existence, seen.hits)
         if seen.position_m is None or seen.cov_m2 is None or len(track.state.points_m) > 1:
             return None
-        place = Place(seen.position_m[None], full_covariance(seen.cov_m2))
+        place = Place.of(seen.position_m[None], seen.cov_m2)
         if fits(place, track.state, self._parameters):
             track.measure(report, Measured(said.vehicle, place, False, ()), self._parameters)
             return None
@@ -256,4 +256,4 @@ def _of_map(feature: Feature, epoch: Feature | None = None, quoted: Feature | No
 
 
 def _place_of(feature: Feature) -> Place:
-    return Place(feature.points_m, full_covariance(feature.cov_m2))
+    return Place.of(feature.points_m, feature.cov_m2)
