@@ -1,4 +1,4 @@
-"""A study of new feature layers from options to results: drives in worker processes; what is kept is not driven again."""
+"""A study of new feature layers from options to results: drives in worker processes; what is kept stays."""
 
 from collections.abc import Iterator
 from dataclasses import dataclass
