@@ -85,7 +85,7 @@ def region_tiles(store: Store, layer: str, prefix: str) -> list[Tile]:
         raise ExportError(f"no tiles in layer {layer!r}, region {prefix or 'everywhere'!r}")
     if is_feature_layer(layer):
         raise ExportError(
-            f"the {len(entries)} tiles of layer {layer!r} hold features, not Gaussians: `gnd features export` writes them"
+            f"the {len(entries)} tiles of layer {layer!r} hold features, not Gaussians: use `gnd features export`"
         )
     stored = (store.get(layer, entry.tile, entry.version) for entry in entries)
     return [tile.decode_gaussians() for tile in stored if tile is not None]
