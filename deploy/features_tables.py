@@ -43,7 +43,10 @@ def print_list(console: Console, path: str, values: dict[str, Any]) -> None:
     columns = ("id", "layer", "kind", "lat_deg", "lon_deg", "height_m", "vertices", "state", "exist", "sigma_m")
     table = Table(title=path)
     for column in columns:
-        table.add_column(column.replace("_", " "), justify="left" if column in ("layer", "kind", "state") else "right")
+        words = column in ("layer", "kind", "state")
+        table.add_column(
+            column.replace("_", " "), justify="left" if words else "right", min_width=19 if column == "id" else None
+        )
     for row in values["listed"]:
         table.add_row(*(_cell(column, row[column]) for column in columns))
     console.print(table)

@@ -4,7 +4,7 @@ from collections import defaultdict
 from collections.abc import Iterable, Mapping
 from typing import TypeAlias
 
-from gnd_map.errors import FeatureError
+from gnd_map.errors import FeatureError, MapError
 from gnd_map.features import Feature, FeatureTile, join_pieces, pieces_of, snapped
 from gnd_map.tile_id import TileId
 from tile_store.feature_io.errors import BadGeometry, FeatureFileError
@@ -26,7 +26,7 @@ def cut(features: Iterable[MapFeature], total: int = 0, progress: Progress | Non
     for number, feature in enumerate(features):
         try:
             pieces = _pieces(feature)
-        except FeatureError as error:
+        except MapError as error:
             raise BadGeometry(f"{feature.name or feature.feature_id}: {error}") from None
         for tile, piece in pieces:
             found[feature.layer][tile].append(piece)

@@ -1,0 +1,228 @@
+"""What is wrong with a file is said with numbers and the place, and nothing of it is imported."""
+
+import json
+from pathlib import Path
+
+import pytest
+from small_maps import STREET, put, write
+
+from gnd_map.errors import GndError
+from tile_store.feature_io import errors
+from tile_store.feature_io.formats import format_of, read_features
+from tile_store.feature_io.json_file import read_json
+from tile_store.feature_io.osm_document import read_osm
+from tile_store.feature_io.placement import Placement
+from tile_store.feature_io.values import ImportOptions
+from tile_store.feature_io.xml_spans import read_bytes, read_root
+from tile_store.sqlite_store import SqliteStore
+
+NODES = '<node id="1" lat="49" lon="8"/><node id="2" lat="49.0001" lon="8.0001"/>'
+BOMB = """<?xml version="1.0"?>
+<!DOCTYPE lolz [<!ENTITY a "lol"><!ENTITY b "&a;&a;&a;&a;&a;&a;&a;&a;&a;&a;"><!ENTITY c "&b;&b;&b;&b;&b;&b;&b;&b;">]>
+<osm><node id="1" lat="49" lon="8"><tag k="type" v="&c;"/></node></osm>"""
+OUTSIDE = '<!DOCTYPE osm SYSTEM "file:///etc/hostname"><osm/>'
+
+
+def osm(inside: str, attributes: str = 'version="0.6"') -> str:
+    return f"<osm {attributes}>{inside}</osm>"
+
+
+def line(id_: int, *refs: int, tags: str = '<tag k="type" v="line_thin"/>') -> str:
+    return f'<way id="{id_}">{"".join(f"<nd ref={chr(34)}{ref}{chr(34)}/>" for ref in refs)}{tags}</way>'
+
+
+def lanelet(left: int, right: int) -> str:
+    return (
+        f'<relation id="9"><member type="way" ref="{left}" role="left"/><member type="way" ref="{right}" role="right"/>'
+        '<tag k="type" v="lanelet"/></relation>'
+    )
+
+
+def nodes(*places: tuple[float, float]) -> str:
+    return "".join(f'<node id="{i}" lat="{lat}" lon="{lon}"/>' for i, (lat, lon) in enumerate(places, 1))
+
+
+CROSSED = nodes((49, 8), (49.0001, 8.0001), (49.0001, 8), (49, 8.0001))
+OSM = [
+    ("<osm><node", errors.NotWellFormed, "line 1"),
+    ("", errors.NotWellFormed, "no element found"),
+    (osm(NODES).replace("</osm>", "</oms>"), errors.NotWellFormed, "mismatched tag"),
+    (BOMB, errors.UnsafeFile, "document type 'lolz'"),
+    (OUTSIDE, errors.UnsafeFile, "document type 'osm'"),
+    ('<?xml version="1.0" encoding="ISO-8859-1"?>' + osm(NODES), errors.UnknownFormat, "encoding 'ISO-8859-1'"),
+    ("<gpx/>", errors.UnknownFormat, "root element <gpx>"),
+    (osm(NODES, 'version="0.5"'), errors.UnknownFormat, "OSM version '0.5', known is 0.6"),
+    (osm('<MetaInfo format_version="2"/>'), errors.UnknownFormat, "map format '2'"),
+    (osm('<node id="1" lat="49"/>'), errors.BadElement, "node 1 has no lon, so no position"),
+    (osm('<node lat="49" lon="8"/>'), errors.BadElement, "<node> without id"),
+    (osm('<node id="x" lat="49" lon="8"/>'), errors.BadElement, "id='x' of <node> is no whole number"),
+    (osm('<node id="1" lat="far" lon="8"/>'), errors.BadElement, "lat of node 1 is 'far', no number"),
+    (osm('<node id="1" lat="nan" lon="8"/>'), errors.BadElement, "lat of node 1 is 'nan', not finite"),
+    (osm(f'<node id="{2**63}" lat="49" lon="8"/>'), errors.BadElement, "exceeds 2^63 - 1"),
+    (osm('<node id="1" lat="49" lon="8"><tag k="type"/></node>'), errors.BadElement, "a tag of node 1 lacks k or v"),
+    (osm('<node id="1" lat="91" lon="8"/>'), errors.BadGeometry, "node 1: latitude 91.000000 degrees is beyond 90"),
+    (osm('<node id="1" lat="9" lon="-181"/>'), errors.BadGeometry, "longitude -181.000000 degrees is beyond 180"),
+    (
+        osm('<node id="1" lat="49" lon="8"><tag k="ele" v="20000"/></node>'),
+        errors.BadGeometry,
+        "height 20000.0 m is not in -1000 … 10000 m",
+    ),
+    (
+        osm('<node id="1" lat="49" lon="8"><tag k="ele" v="high"/></node>'),
+        errors.BadElement,
+        "ele of node 1 is 'high', no number",
+    ),
+    (osm(NODES + NODES), errors.DuplicateId, "id 1 comes twice, first in line 1"),
+    (osm(NODES + line(5, 1, 2) + line(5, 2, 1)), errors.DuplicateId, "id 5 comes twice"),
+    (
+        osm(NODES + line(5, 1, 7, 8)),
+        errors.MissingReference,
+        "way 5 has 2 of 3 nodes that are not in the file, first 7",
+    ),
+    (osm(NODES + lanelet(5, 6)), errors.MissingReference, "the left border of lanelet 9: way 5 is not in the file"),
+    (
+        osm(NODES + line(5, 1, 2) + lanelet(5, 5).replace("right", "centre")),
+        errors.MissingReference,
+        "the right border of lanelet 9: none is given",
+    ),
+    (osm(NODES + line(5, 1)), errors.BadGeometry, "way 5 (lane_boundary) has 1 node; a line needs 2"),
+    (osm(NODES + line(5)), errors.BadGeometry, "way 5 (lane_boundary) has no nodes, so no position"),
+    (osm(CROSSED + line(5, 1, 2, 3, 4)), errors.BadGeometry, "way 5 crosses itself: segments 0 and 2 of 3"),
+    (
+        osm(CROSSED + line(5, 1, 2) + line(6, 3, 4) + lanelet(5, 6)),
+        errors.BadGeometry,
+        "the borders of lanelet 9 cross each other",
+    ),
+    (
+        osm('<node id="1" lat="0" lon="0"><tag k="local_x" v="5"/><tag k="local_y" v="6"/></node>'),
+        errors.NeedsGeoreference,
+        "1 of 1 nodes have local_x and local_y",
+    ),
+    (osm(NODES + line(5, 1, 2, tags='<tag k="type" v="river"/>')), errors.FeatureFileError, "1 of kind river"),
+    (osm(NODES), errors.FeatureFileError, "no features to import"),
+]
+
+
+@pytest.mark.parametrize(("body", "kind", "told"), OSM, ids=[told for _, _, told in OSM])
+def test_a_lanelet2_file_with_a_fault_is_refused_whole(
+    body: str, kind: type[Exception], told: str, store: SqliteStore, tmp_path: Path
+) -> None:
+    with pytest.raises(kind) as caught:
+        put(store, write(tmp_path, "bad.osm", body))
+    assert told in str(caught.value)
+    assert "\n" not in str(caught.value)
+    assert "bad.osm" in str(caught.value)
+    assert store.layers() == []
+
+
+def test_too_many_nodes_are_counted() -> None:
+    with pytest.raises(errors.FileTooLarge, match="more than 1 nodes"):
+        read_osm(osm(NODES).encode(), "big", max_nodes=1)
+
+
+def test_too_many_bytes_are_not_even_read(tmp_path: Path) -> None:
+    with pytest.raises(errors.FileTooLarge, match=r"0\.0 MB, the limit is 0\.0 MB"):
+        read_bytes(write(tmp_path, "a.osm", "12345"), 4)
+    with pytest.raises(errors.NotWellFormed, match="cannot be read: No such file"):
+        read_bytes(tmp_path / "none.osm", 4)
+
+
+def test_too_deep_is_refused() -> None:
+    with pytest.raises(errors.FileTooLarge, match="more than 64 elements inside each other"):
+        read_root(b"<a>" * 100 + b"</a>" * 100, "deep")
+    with pytest.raises(errors.NotWellFormed):
+        read_json(b"[" * 100_000 + b"]" * 100_000, "deep")
+
+
+def test_elements_that_an_editor_has_deleted_do_not_count() -> None:
+    body = osm(NODES + '<node id="3" action="delete" lat="x" lon="y"/><way id="3" visible="false"><nd ref="77"/></way>')
+    assert sorted(read_osm(body.encode(), "josm").nodes) == [1, 2]
+
+
+def geojson(*features: object, **members: object) -> str:
+    return json.dumps({"type": "FeatureCollection", "features": features} | members)
+
+
+def point(position: object, **properties: object) -> dict[str, object]:
+    return {"type": "Feature", "geometry": {"type": "Point", "coordinates": position}, "properties": properties}
+
+
+OURS = {
+    "layer": "poles", "kind": "pole", "state": "exist", "exist": 0.9, "absent": 0.0, "unknown": 0.1, "conflict": 0.0,
+    "hits": 0, "vehicles": 0, "sigma_m": 1.0, "cov_m2": [1.0, 0, 0, 1.0, 0, 1.0], "attributes": {},
+}  # fmt: skip
+GND = {"gnd": {"format": 1}}
+CRS = {"type": "name", "properties": {"name": "urn:ogc:def:crs:EPSG::25832"}}
+ZIGZAG = [[8, 49], [8.0001, 49.0001], [8, 49.0001], [8.0001, 49]]
+GEOJSON = [
+    ('{"type": "Feat', errors.NotWellFormed, "not well-formed JSON"),
+    ('{"type": "FeatureCollection", "features": [NaN]}', errors.NotWellFormed, "NaN is no JSON number"),
+    ("[]", errors.BadElement, "expected an object, got list"),
+    ("{}", errors.BadElement, "has no type"),
+    ('{"type": "Topology"}', errors.UnknownFormat, "type 'Topology'"),
+    (geojson(crs=CRS), errors.UnknownFormat, "EPSG::25832"),
+    (geojson(gnd={"format": 9}), errors.UnknownFormat, "format {'format': 9} of gnd; known is 1"),
+    (geojson(point([8, 49], kind="pole") | {"geometry": None}), errors.BadGeometry, "feature 0: has no position"),
+    (geojson(point([], kind="pole")), errors.BadGeometry, "position [] is not [longitude, latitude]"),
+    (geojson(point([8, "x"], kind="pole")), errors.BadElement, "'x' is no number"),
+    (geojson(point([8, 91], kind="pole")), errors.BadGeometry, "latitude 91.000000 degrees is beyond 90"),
+    (geojson(point([8, 49], kind="pole"), {"type": "Point"}), errors.BadElement, "feature 1: type 'Point'"),
+    (
+        geojson({"type": "Feature", "geometry": {"type": "GeometryCollection", "geometries": []}}),
+        errors.BadGeometry,
+        "geometry 'GeometryCollection'",
+    ),
+    (
+        geojson(
+            {"type": "Feature", "geometry": {"type": "LineString", "coordinates": ZIGZAG},
+             "properties": {"kind": "lane_boundary"}}
+        ),
+        errors.BadGeometry,
+        "crosses itself",
+    ),
+    (geojson(*[point([8, 49], kind="pole") | {"id": "a"}] * 2), errors.DuplicateId, "same id"),
+    (geojson(point([8, 49], kind="pole"), **GND), errors.BadElement, "lacks the properties absent, conflict, cov_m2"),
+    (geojson(point([8, 49], **OURS), **GND), errors.BadElement, "'id'"),
+    (geojson(point([8, 49], **OURS | {"exist": 0.3}) | {"id": "5"}, **GND), errors.BadElement, "sum to"),
+    (geojson(point([8, 49], **OURS | {"cov_m2": [1]}) | {"id": "5"}, **GND), errors.BadGeometry, "covariance of"),
+]  # fmt: skip
+
+
+@pytest.mark.parametrize(("body", "kind", "told"), GEOJSON, ids=[told for _, _, told in GEOJSON])
+def test_a_geojson_file_with_a_fault_is_refused_whole(
+    body: str, kind: type[Exception], told: str, store: SqliteStore, tmp_path: Path
+) -> None:
+    with pytest.raises(kind) as caught:
+        put(store, write(tmp_path, "bad.geojson", body))
+    assert told in str(caught.value)
+    assert "\n" not in str(caught.value)
+    assert store.layers() == []
+
+
+def test_a_georeference_needs_local_coordinates_and_a_place_near_them(tmp_path: Path) -> None:
+    options = ImportOptions(placement=Placement.anchored(0.8, 0.2))
+    with pytest.raises(errors.NeedsGeoreference, match="8 of 8 nodes have no local_x and local_y, first node 1"):
+        read_features(write(tmp_path, "a.osm", STREET), "a", options)
+    far = osm('<node id="1" lat="0" lon="0"><tag k="local_x" v="9e6"/><tag k="local_y" v="0"/></node>')
+    with pytest.raises(errors.BadGeometry, match="lies 9000 km from the georeference, the limit is 50 km"):
+        read_features(write(tmp_path, "b.osm", far), "b", options)
+
+
+def test_options_that_cannot_be_are_refused() -> None:
+    for wrong, told in (
+        ({"other": "ndt_signs"}, "holds Gaussians"),
+        ({"layers": {"pole": "no spaces"}}, "does not match"),
+        ({"sigma_m": 0.0}, "sigmas are in 0 … 100 m"),
+        ({"height_offset_m": 2e4}, "beyond 10000 m"),
+        ({"exist": 1.5}, "0 … 1"),
+    ):
+        with pytest.raises(GndError, match=told):
+            ImportOptions(**wrong)  # type: ignore[arg-type]
+
+
+def test_a_name_that_tells_no_format_is_refused() -> None:
+    assert format_of(Path("a.OSM")) == "lanelet2"
+    assert format_of(Path("log_map_archive_x____PIT_city_1.json")) == "argoverse2"
+    assert format_of(Path("a.json"), "geojson") == "geojson"
+    with pytest.raises(errors.UnknownFormat, match=r"a\.json: its name tells no format"):
+        format_of(Path("a.json"))
