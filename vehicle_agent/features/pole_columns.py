@@ -20,6 +20,7 @@ EDGE_SIGMA = 24.0**-0.5
 evenly within one step of its ray: variance (1/12 + 1/12) / 4."""
 THIN_QUANTILE = 0.3
 """Of the widths of a column's slices, the one that is its thin part's."""
+SMALLEST_M = 0.02
 WIDTH_SIGMA = 6.0**-0.5
 """The same for the width: 1/12 + 1/12."""
 
@@ -182,7 +183,7 @@ def _diameters(slices: Slices, label: I64, p: PoleParameters) -> tuple[F64, F64,
     if not count:
         return np.empty(0), np.empty(0), scans
     step = _medians(slices.step_m, label)
-    width = np.clip(_medians(slices.extent_m + slices.step_m, label), 0.02, p.diameter_max_m)
+    width = np.maximum(_medians(slices.extent_m + slices.step_m, label), SMALLEST_M)
     sigma = np.maximum(WIDTH_SIGMA * step / np.sqrt(scans), 0.5 * p.sigma_floor_m)
     return width, sigma, scans
 

@@ -86,11 +86,15 @@ def tops(columns: Columns, seen: Surroundings, gap_m: F64) -> F64:
 
 
 def bottoms(columns: Columns, seen: Surroundings, gap_m: F64) -> F64:
-    """(C,) height over the ground down to which the core goes on without a gap of more than gap_m (C,)."""
+    """(C,) height over the ground down to which the core goes on without a gap of more than gap_m (C,).
+
+    Where more lies in the ring than in the core it is a wall or a hedge that goes on, not the pole.
+    """
+    own = (seen.counts[:, :, CORE] > 0) & (seen.counts[:, :, RING] <= seen.counts[:, :, CORE])
     bottom = columns.bottom_m.copy()
     for b in range(BINS - 1, -1, -1):
         middle = (b + 0.5) * BIN_M
-        reached = (seen.counts[:, b, CORE] > 0) & (middle < bottom) & (bottom - middle <= gap_m)
+        reached = own[:, b] & (middle < bottom) & (bottom - middle <= gap_m)
         bottom = np.where(reached, b * BIN_M, bottom)
     return bottom
 

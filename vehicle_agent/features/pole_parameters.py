@@ -35,6 +35,7 @@ class PoleParameters:
     link_m: float = 0.25
     """Neighbours of a row whose ranges differ by less lie on one thing."""
     diameter_max_m: float = 0.55
+    """Beams have a width: 0.5 m of a trunk measure this."""
     clear_m: float = 0.35
     """So far beside a pole nothing stands at its range, on at least one side …"""
     jump_m: float = 0.4

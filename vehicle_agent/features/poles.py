@@ -187,7 +187,7 @@ def _straight(columns: Columns, layer_tan: float, p: PoleParameters) -> Mask:
     """Whether columns (C,) are straight, upright, met by enough of the layers between their ends, and no edge."""
     expected = (columns.top_m - columns.bottom_m) / np.maximum(layer_tan * columns.range_m, 1e-3) + 1.0
     met = columns.slices / np.maximum(columns.scans, 1) >= p.seen_share_min * expected
-    met &= columns.hidden <= p.hidden_share_max
+    met &= (columns.diameter_m <= p.diameter_max_m) & (columns.hidden <= p.hidden_share_max)
     return np.asarray(met & (np.hypot(*columns.lean.T) <= p.lean_max) & (columns.scatter_m <= p.scatter_max_m))
 
 
