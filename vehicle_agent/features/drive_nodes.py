@@ -11,7 +11,7 @@ from vehicle_agent.features.graph import NO_FIX_NODES, NO_MATCHES, FixNodes, Pos
 from vehicle_agent.features.landmarks import Sight
 from vehicle_agent.features.new_layer_parameters import GnssNoise, NewLayerParameters
 
-SMOOTHINGS = 3  # of motion and fixes, each with the wheel scale and gyro bias of the one before
+SMOOTHINGS = 2  # of motion and fixes, each with the wheel scale and gyro bias of the one before
 CHORD_M = 60.0  # GNSS tells a direction over so long a way
 
 

@@ -21,6 +21,8 @@ CALIBRATION = gtsam.symbol("c", 0)
 PINNED_RAD = 1e-3  # sigma of the rotation of what has none
 FREE_RAD = 1e4  # sigma of a rotation of which nothing is said
 ITERATIONS = 30
+LINEARISATIONS = 10
+STAYS = 1e-4  # root mean square step of all numbers (m, rad) below which the optimum has been found
 
 
 class FixNodes(NamedTuple):
@@ -134,15 +136,14 @@ def solve(problem: Problem, start: State, parameters: NewLayerParameters) -> Sol
     """Minimise Eq. (6), or with matches Eq. (10), by Levenberg-Marquardt from `start`."""
     graph, values = gtsam.NonlinearFactorGraph(), gtsam.Values()
     _add_poses(values, start)
-    _add_motion(graph, problem)
     _add_calibration(graph, parameters)
     _add_fixes(graph, values, problem.fixes, start, parameters)
     _add_ties(graph, problem.ties, parameters.landmarks.robust_k)
-    _add_matches(graph, problem.lanes, parameters.lanes.robust_k)
-    _add_matches(graph, problem.poses, None)
     _add_anchors(graph, problem.anchors)
-    optimum = _optimised(graph, values)
-    return Solution(_state(optimum, len(start.pose), len(start.xy_m)), 2.0 * graph.error(optimum), graph, optimum)
+    own = _motion(problem) + _matches(problem.lanes, parameters.lanes.robust_k) + _matches(problem.poses, None)
+    linear, optimum = _optimised(graph, own, values)
+    cost = 2.0 * (graph.error(optimum) + sum(factor.error(optimum) for factor in own))  # Eq. (6), (10)
+    return Solution(_state(optimum, len(start.pose), len(start.xy_m)), cost, linear, optimum)
 
 
 def _pose2(pose: F64) -> Any:
@@ -161,12 +162,25 @@ def _b(n: int) -> int:
     return int(gtsam.symbol("b", n))
 
 
-def _optimised(graph: Any, values: Any) -> Any:
+def _optimised(graph: Any, own: list[Any], values: Any) -> tuple[Any, Any]:
+    """The graph as it is linear where our own edges are, and its optimum.
+
+    Own edges are Python, which GTSAM's optimisers call very slowly. So they are linearised here, GTSAM optimises with
+    that, and again at the optimum, until it stays.
+    """
     settings = gtsam.LevenbergMarquardtParams()
     settings.setMaxIterations(ITERATIONS)
-    settings.setRelativeErrorTol(1e-7)
-    settings.setAbsoluteErrorTol(1e-7)
-    return gtsam.LevenbergMarquardtOptimizer(graph, values, settings).optimize()
+    settings.setRelativeErrorTol(1e-6)
+    settings.setAbsoluteErrorTol(1e-6)
+    for _ in range(LINEARISATIONS):
+        linear, before = gtsam.NonlinearFactorGraph(graph), values
+        for factor in own:
+            linear.add(gtsam.LinearContainerFactor(factor.linearize(values), values))
+        values = gtsam.LevenbergMarquardtOptimizer(linear, values, settings).optimize()
+        step = before.localCoordinates(values)
+        if step.norm() < STAYS * step.size() ** 0.5:
+            break
+    return linear, values
 
 
 def _state(values: Any, n_poses: int, n_landmarks: int) -> State:
@@ -186,12 +200,15 @@ def _add_poses(values: Any, start: State) -> None:
     values.insert(CALIBRATION, start.calibration)
 
 
-def _add_motion(graph: Any, problem: Problem) -> None:
+def _motion(problem: Problem) -> list[Any]:
+    """Eq. (1)-(2)."""
+    factors = []
     rows = zip(problem.steps.delta, problem.steps.jacobian, problem.steps.cov, strict=True)
     for k, (delta, jacobian, cov) in enumerate(rows):
         noise = gtsam.noiseModel.Gaussian.Covariance(cov)
         keys = [_x(k), _x(k + 1), CALIBRATION]
-        graph.add(gtsam.CustomFactor(noise, keys, _Motion(delta, jacobian, problem.calibration)))
+        factors.append(gtsam.CustomFactor(noise, keys, _Motion(delta, jacobian, problem.calibration)))
+    return factors
 
 
 class _Motion:
@@ -258,13 +275,15 @@ def _add_ties(graph: Any, ties: Ties, robust_k: float) -> None:
         graph.add(gtsam.BearingRangeFactor2D(_x(int(key)), _l(int(landmark)), seen, distance, noise))
 
 
-def _add_matches(graph: Any, matches: PoseMatches, robust_k: float | None) -> None:
+def _matches(matches: PoseMatches, robust_k: float | None) -> list[Any]:
     """Eq. (8)-(9); the information may be singular: nothing is then said along that direction."""
     unit = gtsam.noiseModel.Unit.Create(3)
     huber = gtsam.noiseModel.mEstimator.Huber.Create(robust_k or np.inf)
     noise = unit if robust_k is None else gtsam.noiseModel.Robust.Create(huber, unit)
-    for key, pose, off, information in zip(*matches, strict=True):
-        graph.add(gtsam.CustomFactor(noise, [_x(int(key))], _Match(_pose2(pose), off, root_of(information))))
+    return [
+        gtsam.CustomFactor(noise, [_x(int(key))], _Match(_pose2(pose), off, root_of(information)))
+        for key, pose, off, information in zip(*matches, strict=True)
+    ]
 
 
 class _Match:
