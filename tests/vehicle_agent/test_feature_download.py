@@ -93,6 +93,8 @@ def download(downloader: FeatureDownloader, *tiles: TileId) -> None:
 
 def test_each_layer_has_its_own_tiles(world: Cloud, downloader: FeatureDownloader) -> None:
     download(downloader, TILE, EAST)
+    assert downloader.step() == {"signs": {TILE, EAST}, "streetlights": {TILE, EAST}}
+    assert downloader.step() == {}
     signs = downloader.tile("signs", TILE)
     assert signs is not None
     assert [feature.feature_id for feature in signs.features] == list(range(1, 40))
