@@ -23,8 +23,9 @@ NAMES = (
     "codec",
     "return-download",
     "gnss-noise",
+    "poles",
 )
-WITH_OPTIONS = ("codec", "return-download", "gnss-noise")
+WITH_OPTIONS = ("codec", "return-download", "gnss-noise", "poles")
 
 
 def main() -> None:
