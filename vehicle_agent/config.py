@@ -6,6 +6,7 @@ from typing import Literal
 
 from fleet_bus.config import DEFAULT_ENDPOINT
 from fleet_bus.links import LinkProfile
+from gnd_map.features import is_feature_layer
 from vehicle_agent.detect.parameters import DetectParameters
 from vehicle_agent.errors import AgentConfigError
 from vehicle_agent.features.layer_parameters import FeatureParameters
@@ -104,6 +105,8 @@ class AgentConfig:
         """A name and a pace that can work."""
         if not self.vehicle:
             raise AgentConfigError("the vehicle needs a name (its pseudonym)")
+        if is_feature_layer(self.layer):
+            raise AgentConfigError(f"layer = {self.layer!r} holds features; that of the voxel map begins with ndt")
         if not 0 <= self.pace < float("inf"):
             raise AgentConfigError(f"pace = {self.pace}: 0 is as fast as possible, 1 real time")
         if self.report.left_behind_m <= self.detect.range_max_m:

@@ -20,7 +20,7 @@ from schemas.tiles import TileBlob
 from tile_store.server import TileServer
 from tile_store.sqlite_store import SqliteStore
 from vehicle_agent.cache import TileCache
-from vehicle_agent.config import DownloadParameters
+from vehicle_agent.config import AgentConfig, DownloadParameters
 from vehicle_agent.errors import AgentConfigError
 from vehicle_agent.features.download import FeatureDownloader
 
@@ -230,6 +230,11 @@ def test_layers_that_cannot_be_are_refused(bus: Bus, tmp_path: Path, layers: tup
     with pytest.raises(AgentConfigError, match=reason):
         FeatureDownloader(bus, tmp_path / "c.sqlite", layers)
     assert issubclass(AgentConfigError, GndError)
+
+
+def test_the_voxel_map_of_an_agent_is_no_feature_layer(tmp_path: Path) -> None:
+    with pytest.raises(AgentConfigError, match="layer = 'signs' holds features; that of the voxel map begins with ndt"):
+        AgentConfig("car-1", tmp_path / "drive.mcap", tmp_path, layer="signs")
 
 
 def test_a_layer_that_is_not_downloaded_is_named(downloader: FeatureDownloader) -> None:
