@@ -7,7 +7,7 @@ from typing import Any, Final
 import apsw
 
 from gnd_map.errors import GndError
-from gnd_map.features import Feature, FeatureTile, is_feature_layer
+from gnd_map.features import MAX_FEATURES_OF_TILE, Feature, FeatureTile, is_feature_layer
 from gnd_map.tile_id import TileId
 from tile_store import sqlite_versions as versions
 from tile_store.feature_io.errors import BadGeometry, DuplicateId, FeatureFileError
@@ -140,6 +140,9 @@ def _puts(
 def _tile(store: SqliteStore, layer: str, tile: TileId, features: list[Feature], ours: set[int]) -> _Put:
     stored = store.get(layer, tile)
     kept = [] if stored is None else [f for f in stored.decode_features().features if f.feature_id not in ours]
+    n = len(kept) + len(features)
+    if n > MAX_FEATURES_OF_TILE:
+        raise BadGeometry(f"tile {tile.path} of layer {layer}: {n} features, the limit is {MAX_FEATURES_OF_TILE}")
     try:
         made = FeatureTile.of(tile, 1, [*kept, *features])
         return _Put(layer, made, Content.of(made), stored.version if stored else 0)
