@@ -99,6 +99,9 @@ def test_fifty_judged_and_measured_features_take_forty_bytes_each() -> None:
     full = changed_report(REPORT, tiles=(feature_change(seen=many, found=()),))
     bare = changed_report(REPORT, tiles=(feature_change(seen=(), found=()),))
     assert len(full.encode()) - len(bare.encode()) < 50 * 40
+    tiles = [type(TILE)(TILE.district.first_morton + k) for k in range(100)]
+    looked = changed_report(REPORT, tiles=tuple(feature_change(tile, seen=(), found=()) for tile in tiles))
+    assert len(looked.encode()) < 70 + len(REPORT.vehicle + REPORT.sensor_model + REPORT.software) + 55 * len(tiles)
 
 
 # Cells
