@@ -142,21 +142,20 @@ def lane_looks(
 
     A marking may be missed, whole, like any feature; other vehicles hide none.
     """
-    ahead = np.arange(0.0, view.range_m + _LANE_STEP_M, _LANE_STEP_M)
-    lines = [_in_vehicle(route, left, poses, way_m, ahead) for left in route.marking_left_m]
-    shape = (len(t_ns), len(lines))
+    shape = (len(t_ns), len(route.marking_left_m))
     missed = rng.random(shape) < noise.miss_rate
     aside = noise.sigma_range_m * rng.standard_normal(shape)
     turn = noise.sigma_bearing_rad * rng.standard_normal(shape)
-    looks = []
-    for row in range(len(t_ns)):
-        seen = []
-        for k in np.flatnonzero(~missed[row]).tolist():
-            points = _within(view, lines[k][row])
-            if len(points) >= 2:
-                seen.append(_moved(points, aside[row, k], turn[row, k]))
-        looks.append(LaneLook(int(t_ns[row]), tuple(seen), noise.sigma_range_m, noise.sigma_bearing_rad))
-    return tuple(looks)
+    ahead = np.arange(0.0, view.range_m + _LANE_STEP_M, _LANE_STEP_M)
+    seen: list[list[NDArray[np.float32]]] = [[] for _ in range(len(t_ns))]
+    for k, left_m in enumerate(route.marking_left_m):
+        points = _in_vehicle(route, left_m, poses, way_m, ahead)
+        held = _within(view, points) & ~missed[:, k, None]
+        found = _moved(points, aside[:, k], turn[:, k])
+        for row in np.flatnonzero(held.sum(axis=1) >= 2).tolist():
+            seen[row].append(found[row, held[row]])
+    sigmas = (noise.sigma_range_m, noise.sigma_bearing_rad)
+    return tuple(LaneLook(t, tuple(lines), *sigmas) for t, lines in zip(t_ns.tolist(), seen, strict=True))
 
 
 def _in_vehicle(route: Route, left_m: float, poses: FloatArray, way_m: FloatArray, ahead_m: FloatArray) -> FloatArray:
@@ -169,16 +168,16 @@ def _in_vehicle(route: Route, left_m: float, poses: FloatArray, way_m: FloatArra
     return np.stack([c * step[..., 0] + s * step[..., 1], -s * step[..., 0] + c * step[..., 1]], axis=2)
 
 
-def _within(view: View, points: FloatArray) -> FloatArray:
-    """The part of a marking that lies in the field of view and is not the same point over and over."""
-    distance = np.linalg.norm(points, axis=1)
-    held = view.holds(distance, np.arctan2(points[:, 1], points[:, 0])) & (distance >= _NEAREST_M)
-    fresh = np.append(True, np.linalg.norm(np.diff(points, axis=0), axis=1) > 1e-6)
-    return np.asarray(points[held & fresh])
+def _within(view: View, points: FloatArray) -> BoolArray:
+    """Which points of markings (L, P, 2) lie in the field of view and are not the one before again, bool (L, P)."""
+    distance = np.linalg.norm(points, axis=2)
+    held = view.holds(distance, np.arctan2(points[..., 1], points[..., 0])) & (distance >= _NEAREST_M)
+    held[:, 1:] &= np.linalg.norm(np.diff(points, axis=1), axis=2) > 1e-6
+    return np.asarray(held)
 
 
-def _moved(points: FloatArray, aside_m: float, turn_rad: float) -> NDArray[np.float32]:
-    c, s = np.cos(turn_rad), np.sin(turn_rad)
-    turned = points @ np.array([[c, s], [-s, c]])
-    turned[:, 1] += aside_m
-    return np.asarray(turned, dtype=np.float32)
+def _moved(points: FloatArray, aside_m: FloatArray, turn_rad: FloatArray) -> NDArray[np.float32]:
+    """Markings (L, P, 2) turned about the vehicle's origin by (L,), then moved to the left by (L,)."""
+    c, s = np.cos(turn_rad)[:, None], np.sin(turn_rad)[:, None]
+    x, y = points[..., 0], points[..., 1]
+    return np.stack([c * x - s * y, s * x + c * y + aside_m[:, None]], axis=2).astype(np.float32)
