@@ -18,6 +18,7 @@ from schemas.drive import GnssFix, MotionSample, Scan
 from schemas.report_id import deterministic_report_id
 from vehicle_agent.detect.classify import classify, tile_change
 from vehicle_agent.detect.detector import ChangeDetector
+from vehicle_agent.features.poles import PoleDetector
 from vehicle_agent.local_map import LocalMap
 from vehicle_agent.localise.estimates import PoseEstimate, RefinedScan
 from vehicle_agent.localise.localiser import Localiser
@@ -46,6 +47,7 @@ def warm_up() -> None:
         detector.add_scan(scan.points_map_m, scan.origins_map_m)
     _rolled(points)
     _segment(points, refined[-1].estimate if refined else None)
+    _find_poles(points)
     detector.add_scan(points, np.array([0.0, 0.0, _LIDAR_HEIGHT_M]))
     for evidence in detector.finish(local_map.tiles).values():
         _pack(tile_change(classify(evidence, detector.parameters)), evidence.base, points, frame)
@@ -69,6 +71,11 @@ def _rolled(points_m: F64) -> None:
     rolling = RollingMap(parameters.rolling_map, parameters.noise_m)
     for x_m in (0.0, 2.0 * parameters.rolling_map.move_m):
         rolling.add(points_m, np.array([x_m, 0.0, 0.0]))
+
+
+def _find_poles(points_m: F64) -> None:
+    """Look for poles where there are none: every kernel runs all the same."""
+    PoleDetector().look(points_m, np.array([0.0, 0.0, _LIDAR_HEIGHT_M]))
 
 
 def _segment(points_map_m: F64, estimate: PoseEstimate | None) -> None:

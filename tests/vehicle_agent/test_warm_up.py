@@ -14,6 +14,7 @@ PROGRAM = textwrap.dedent(
     from vehicle_agent.detect import kernel
     from vehicle_agent.warm import warm_up
     from vehicle_agent.localise import kernels, packed_scan, registration, rolling_kernels
+    from vehicle_agent.features import pole_place_kernels as places, poles_kernels as poles
     from gnd_map.codec import kernels as coders
     USED = ("code_bit", "code_bits", "code_flags", "code_plain", "code_voxels")
     before = len(kernel.cast_rays.signatures)
@@ -22,7 +23,7 @@ PROGRAM = textwrap.dedent(
     warm_up()
     again = {k: len(v.signatures) for k, v in vars(kernel).items() if hasattr(v, "signatures")}
     cold = [
-        f"{m.__name__}.{k}" for m in (kernels, packed_scan, rolling_kernels) for k, v in vars(m).items()
+        f"{m.__name__}.{k}" for m in (kernels, packed_scan, rolling_kernels, places, poles) for k, v in vars(m).items()
         if hasattr(v, "signatures") and not k.startswith("_") and len(v.signatures) != 1
     ]
     print(json.dumps({

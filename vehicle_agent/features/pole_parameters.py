@@ -62,7 +62,7 @@ class PoleParameters:
     """Share of the heights of a pole's thin part at which something stands in the ring around it …"""
     free_m: float = 0.75
     """… and length of a part of it at which nothing does."""
-    hidden_share_max: float = 0.8
+    hidden_share_max: float = 0.65
     """Share of its slices beside which something nearer stands: all of them are beside an edge, not on a thin thing."""
     seen_share_min: float = 0.4
     """Share of the sensor's layers between bottom and top that meet it."""
@@ -76,6 +76,8 @@ class PoleParameters:
     """Lower posts are no streetlights."""
     sigma_range_m: float = 0.03
     """Noise of a range: VLP-16 user manual 63-9243, ±3 cm."""
+    sigma_tilt_rad: float = 0.02
+    """Of a vehicle that does not know how it and the road are tilted: of single looks in its own frame."""
     sigma_floor_m: float = 0.015
     """What more points do not improve: calibration of the lasers, the pose within the sweep."""
 
@@ -96,7 +98,15 @@ class PoleParameters:
             self._check(name, 0.001, 10.0)
         for name in ("range_min_m", "feet_m", "min_top_m", "foot_m", "body_diameter_m", "body_top_m", "streetlight_m"):
             self._check(name, 0.0, 20.0)
-        for name in ("ground_slope", "lean_max", "ring_share_max", "free_m", "seen_share_min", "hidden_share_max"):
+        for name in (
+            "ground_slope",
+            "lean_max",
+            "ring_share_max",
+            "free_m",
+            "seen_share_min",
+            "hidden_share_max",
+            "sigma_tilt_rad",
+        ):
             self._check(name, 0.0, 1.0)
         self._check("range_max_m", self.range_min_m + self.ground_cell_m, 200.0)
         self._check("min_slices", 2, 1000)

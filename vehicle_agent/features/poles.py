@@ -8,7 +8,7 @@ by π/4 of the radius on average, and the radius follows from the angle that a s
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -43,11 +43,12 @@ class Pole:
     """A pole, in the frame of the points that it was found in.
 
     Attributes:
-        xy_m: (2,) its axis at half the height of what is seen of its thin part.
+        xy_m: (2,) its axis at the mean height of its slices, middle_m over the ground.
         cov_m2: (2, 2) covariance of the axis, beside that of the vehicle's pose.
         diameter_m: of the thin part.
         sigma_diameter_m: its standard deviation.
         foot_z_m: height of the ground there.
+        middle_m: mean height of its slices over the ground.
         bottom_m: lowest part that is seen, over the ground.
         top_m: highest part that is seen, over the ground.
         lean: (2,) metres a metre upwards.
@@ -62,6 +63,7 @@ class Pole:
     diameter_m: float
     sigma_diameter_m: float
     foot_z_m: float
+    middle_m: float
     bottom_m: float
     top_m: float
     lean: F64
@@ -103,8 +105,14 @@ class PoleDetector:
         return detections_of(self.poles(points_vehicle_m, origins_vehicle_m), np.eye(4), t_ns)
 
     def poles(self, points_vehicle_m: F64, origins_vehicle_m: F64) -> tuple[Pole, ...]:
-        """As `look`, with all that is known of each pole; the nearest first."""
-        return self.window([Rays(points_vehicle_m, origins_vehicle_m)], np.zeros(3))
+        """As `look`, with all that is known of each pole; the nearest first.
+
+        What is upright leans in the frame of a tilted vehicle: its foot lies off the axis by the unknown tilt times the
+        height at which the axis is seen.
+        """
+        found = self.window([Rays(points_vehicle_m, origins_vehicle_m)], np.zeros(3))
+        tilt = self.parameters.sigma_tilt_rad
+        return tuple(replace(pole, cov_m2=pole.cov_m2 + (tilt * pole.middle_m) ** 2 * np.eye(2)) for pole in found)
 
     def window(self, scans: Sequence[Rays], place_m: F64) -> tuple[Pole, ...]:
         """Poles in some scans with known poses, all in one frame whose z points up.
@@ -197,10 +205,9 @@ def _stands(
     """Whether columns (C,) begin near the ground, or what is below them is hidden rather than free."""
     stands = bottom_m <= p.foot_m + gap_m - p.gap_m
     high = np.flatnonzero(~stands)
-    if len(high):
-        places = np.column_stack([columns.xy_m, foot_z, foot_z + bottom_m])[high]
-        below = np.sum([rays_below(points, origins, places, RAY_HALF_M) for points, origins in rays], axis=0)
-        stands[high] = below[:, 0] > below[:, 1]
+    places = np.column_stack([columns.xy_m, foot_z, foot_z + bottom_m])[high]
+    below = np.sum([rays_below(points, origins, places, RAY_HALF_M) for points, origins in rays], axis=0)
+    stands[high] = below[:, 0] > below[:, 1]
     return np.asarray(stands)
 
 
@@ -215,6 +222,7 @@ def _values(
             float(columns.diameter_m[k]),
             float(columns.sigma_diameter_m[k]),
             float(foot[k] + place[2]),
+            float(columns.height_m[k]),
             float(columns.bottom_m[k]),
             float(top[k]),
             columns.lean[k],
