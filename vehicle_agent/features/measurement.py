@@ -95,16 +95,6 @@ def update(pose: F64, mu: F64, sigma: F64, z: F64, variance: F64) -> tuple[F64, 
     return out_mu, out_sigma, -0.5 * squared - 0.5 * np.log((2.0 * np.pi) ** 2 * det)  # Eq. (18)
 
 
-def log_likelihood(pose: F64, mu: F64, sigma: F64, z: F64, variance: F64) -> F64:
-    """(M,) log likelihoods of a measurement, Eq. (18); arguments as of `update`."""
-    at = predicted(pose, mu)
-    rr, rb, bb = innovation_cov(at, sigma, variance)
-    det = rr * bb - rb * rb
-    nu_r, nu_b = z[0] - at.range_m, wrapped(z[1] - at.bearing_rad)
-    squared = (bb * nu_r**2 - 2.0 * rb * nu_r * nu_b + rr * nu_b**2) / det
-    return np.asarray(-0.5 * squared - 0.5 * np.log((2.0 * np.pi) ** 2 * det))
-
-
 def agreement(mu: F64, sigma: F64, xy_m: F64, cov: F64) -> F64:
     """(M,) log N(μ - m; 0, Σ + C): how well each particle's feature agrees with a position known otherwise.
 

@@ -52,7 +52,7 @@ class GnssNoise:
 class FilterParameters:
     """The Rao-Blackwellised particle filter."""
 
-    particles: int = 1500
+    particles: int = 1000
     """M; one is enough where the poses are given and certain."""
     resample_below: float = 0.5
     """α of Eq. (20): resample when the effective number falls below this share of M."""
@@ -62,7 +62,7 @@ class FilterParameters:
     floor: float = 4e-4
     """Density, 1/(m·rad), of a measurement that belongs to something else although it was associated: about one false
     alarm in fifty looks over 80 m x 40°. It keeps a wrong association from deciding about the particles."""
-    horizon_m: float = 1000.0
+    horizon_m: float = 2000.0
     """A new feature left behind by this way no longer learns from what comes."""
     horizon_features: int = 32
     """At most this many features are kept in the particles; the oldest go first."""

@@ -128,9 +128,9 @@ class Rbpf:
 
     def measure(self, slot: int, z: F64, variance: F64, *, weigh: bool) -> None:
         """Update a feature with a measurement, Eq. (16), and the weights, Eq. (18) and (19)."""
-        if weigh:
-            self._weigh(lambda: self._likelihood(slot, z, variance))  # Eq. (19)
-        updated = measurement.update(self.state[:3], self.mu[slot], self.sigma[slot], z, variance)
+        updated = self._updated(slot, z, variance)
+        if weigh and self._weigh(lambda: self._floored(self._updated(slot, z, variance)[2]), self._floored(updated[2])):
+            updated = self._updated(slot, z, variance)  # by other particles
         self.mu[slot], self.sigma[slot], _ = updated
 
     def merge(self, kept: int, other: int) -> None:
@@ -186,31 +186,39 @@ class Rbpf:
     def _agreement(self, slot: int, prior: Prior) -> F64:
         return np.logaddexp(measurement.agreement(self.mu[slot], self.sigma[slot], *prior), np.log(FLOOR_PER_M2))
 
-    def _likelihood(self, slot: int, z: F64, variance: F64) -> F64:
-        log = measurement.log_likelihood(self.state[:3], self.mu[slot], self.sigma[slot], z, variance)
-        return np.asarray(np.logaddexp(log, np.log(self._p.filter.floor)))
+    def _updated(self, slot: int, z: F64, variance: F64) -> tuple[F64, F64, F64]:
+        return measurement.update(self.state[:3], self.mu[slot], self.sigma[slot], z, variance)
+
+    def _floored(self, log_likelihood: F64) -> F64:
+        return np.asarray(np.logaddexp(log_likelihood, np.log(max(self._p.filter.floor, 1e-300))))
 
     def _off(self, xy_m: F64) -> F64:
         """(M,) squared distances of a fix from where each particle expects it."""
         return np.asarray(np.square(xy_m[:, None] - self.state[:2] - self.state[GNSS_X:]).sum(axis=0))
 
-    def _weigh(self, log_likelihood: Callable[[], F64]) -> None:
-        """Multiply the weights by a likelihood; in steps with resampling between where it would leave few particles.
+    def _weigh(self, log_likelihood: Callable[[], F64], first: F64 | None = None) -> bool:
+        """Multiply the weights by a likelihood, Eq. (19); in steps, with resampling between, where otherwise few particles
+        would keep any weight.
 
         Args:
             log_likelihood: gives (M,) of the particles as they are then.
+            first: the same of the particles as they are now.
+
+        Returns:
+            Whether particles were resampled.
         """
         if not self.weighing or self.m == 1:
-            return
-        left = 1.0
+            return False
+        left, log = 1.0, log_likelihood() if first is None else first
         for stage in range(_MOST_STAGES):
-            log = log_likelihood()
             step = left if stage == _MOST_STAGES - 1 else self._bearable(log, left)
             self.log_weight += step * log
             left -= step
             if left <= 1e-9:
-                return
+                return stage > 0
             self._resample(_normalised(self.log_weight))
+            log = log_likelihood()
+        return True
 
     def _bearable(self, log: F64, most: float) -> float:
         """The largest share of a log likelihood that leaves enough effective particles."""
