@@ -86,19 +86,20 @@ def account_traffic(folder: RunFolder, links: Sequence[str] = DEFAULT_LINKS) -> 
     return [asdict(line) for line in fleet_lines(agents)]
 
 
-def lost_reports(folder: RunFolder, store: SqliteStore) -> list[str]:
+def lost_reports(folder: RunFolder, store: SqliteStore, layers: Sequence[str] = (DEFAULT_LAYER,)) -> list[str]:
     """Return the ids of reports that a vehicle made but neither the store nor its quarantine can show.
 
     Args:
         folder: the run; each vehicle's outbox says what it made.
         store: the store of the run.
+        layers: that its vehicles report about.
     """
     made: dict[str, str] = {}
     for path in sorted(folder.agents.glob("*/outbox.sqlite")):
         outbox = Outbox(path)
         made |= outbox.states()
         outbox.close()
-    stored = {row.report_id for row in store.reports()}
+    stored = {row.report_id for layer in layers for row in store.reports(layer)}
     return sorted(report_id for report_id, state in made.items() if report_id not in stored and state != "quarantined")
 
 

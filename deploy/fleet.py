@@ -128,7 +128,7 @@ def cloud_processes(config: FleetConfig, folder: RunFolder, site: Site) -> list[
         ProcessSpec("router", roles.router, (site.listen,), namespace=where),
         ProcessSpec("store", roles.store, (folder.store, connect), namespace=where),
         *(ProcessSpec(f"merger-{n}", roles.merger, (shard,), namespace=where) for n, shard in enumerate(shards)),
-        ProcessSpec("watcher", roles.watcher, (connect, folder.updates), namespace=where),
+        ProcessSpec("watcher", roles.watcher, (connect, folder.updates, config.layers), namespace=where),
     ]
 
 

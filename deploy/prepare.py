@@ -12,6 +12,7 @@ from pathlib import Path
 from rich.progress import Progress, TaskID
 
 from deploy.errors import DeployError
+from deploy.features import put_base_layers
 from deploy.fleet_config import FleetConfig
 from deploy.run_folder import RunFolder
 from deploy.source import Source
@@ -28,10 +29,12 @@ class PreparedRun:
     Attributes:
         agent_drives: one recorded or simulated drive (MCAP) a vehicle.
         truth: the truth of a simulated world, None for recorded drives.
+        world: the simulated world itself, None for recorded drives.
     """
 
     agent_drives: tuple[Path, ...]
     truth: Path | None
+    world: Path | None = None
 
 
 def prepare(config: FleetConfig, folder: RunFolder, source: Source, progress: Progress) -> PreparedRun:
@@ -61,7 +64,9 @@ def prepare_simulated(config: FleetConfig, folder: RunFolder, worlds: Path | Non
     if not base_map.exists():
         _build_base(base_map, world.base_drives, progress)
     copy_store(base_map, folder.store)
-    return PreparedRun(tuple(world.agent_drives), world.truth_path)
+    if config.feature_layers:
+        put_base_layers(folder.store, world.features_path, config.feature_layers)
+    return PreparedRun(tuple(world.agent_drives), world.truth_path, world.world_path)
 
 
 def forget_if_stale(home: Path) -> None:

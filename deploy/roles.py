@@ -39,7 +39,7 @@ def agent(config: AgentConfig, *, stop: threading.Event) -> None:
     run_agent(config, stop)
 
 
-def watcher(connect: str, path: Path, *, stop: threading.Event) -> None:
-    """Record every tile update of the world as a subscriber would."""
+def watcher(connect: str, path: Path, layers: tuple[str, ...], *, stop: threading.Event) -> None:
+    """Record every tile update of the world, in these layers, as a subscriber would."""
     with open_bus(BusConfig(connect=(connect,)), name="watcher") as bus:
-        record_updates(bus, Region(prefix=""), path, stop)
+        record_updates(bus, Region(prefix=""), path, stop, layers)

@@ -6,6 +6,7 @@ from typing import Any
 
 from deploy.account import FleetResults, TileHistory, account_traffic, lost_reports, tile_histories
 from deploy.evaluation import NO_TRUTH, score_run
+from deploy.features import feature_lines, score_layers
 from deploy.fleet import FleetOutcome, count_lines
 from deploy.fleet_config import FleetConfig
 from deploy.live import size_text
@@ -38,6 +39,7 @@ def write_summary(
         histories = tile_histories(store)
         summary = _counts(config, folder, prepared, outcome, results, store, histories)
         summary["f1"] = _evaluate(folder, prepared, store, histories)
+        summary["features"] = _score_features(config, prepared, store)
     summary["prepare_s"] = round(prepare_s, 1)
     summary["localisation_p95"] = results.localisation_p95()
     summary["traffic"] = results.traffic() | {"by_kind": account_traffic(folder)}
@@ -65,7 +67,7 @@ def _counts(
         "reports_sent": int(results.total("reports_sent")),
         "reports_acknowledged": int(results.total("reports_acknowledged")),
         "reports_quarantined": int(results.total("reports_quarantined")),
-        "reports_lost": len(lost_reports(folder, store)),
+        "reports_lost": len(lost_reports(folder, store, config.layers)),
         "tiles_published": outcome.published,
         "updates_received": count_lines(folder.updates),
         "changed_voxels": sum(history.changed_voxels() for history in histories),
@@ -87,6 +89,13 @@ def _evaluate(
     draw_run(truth, base, final, folder.root)
     draw_healing(truth, base, final, folder.root / "healing.png")
     return score_run(truth, store, histories).as_dict()
+
+
+def _score_features(config: FleetConfig, prepared: PreparedRun, store: SqliteStore) -> dict[str, Any]:
+    """Compare feature layers with the truth where there is one."""
+    if prepared.world is None or not config.feature_layers:
+        return {}
+    return score_layers(prepared.world, store, config.feature_layers)
 
 
 def _draw_maps(folder: RunFolder, base: Tiles, final: Tiles) -> None:
@@ -127,4 +136,5 @@ def summary_lines(summary: dict[str, Any]) -> list[str]:
             f"map against the truth, macro F1: {f1['before']:.1f} % before, {f1['single']:.1f} % by a single drive, "
             f"{f1['after']:.1f} % after"
         )
+    lines += feature_lines(summary.get("features", {}))
     return lines
