@@ -91,9 +91,15 @@ def unknown_reports(c: apsw.Connection, claim: Claim, report_ids: Iterable[str])
     return [one for one in report_ids if not fetch(c, "report_exists", place | {"report_id": one})]
 
 
-def in_play(c: apsw.Connection, layer: str, tile: TileId, epoch: int, n: int) -> tuple[ReportRow, ...]:
-    """The newest `n` reports that count since the epoch, sorted by report id."""
-    rows = fetch(c, "reports_in_play", {"layer": layer, "tile": tile.morton, "epoch": epoch, "n": n})
+def in_play(
+    c: apsw.Connection, layer: str, tile: TileId, epoch: int, n: int, of_vehicle: int | None = None
+) -> tuple[ReportRow, ...]:
+    """The newest `n` reports that count since the epoch, and of each vehicle the newest `of_vehicle`, by report id."""
+    wanted = {"layer": layer, "tile": tile.morton, "epoch": epoch, "n": n}
+    if of_vehicle is None:
+        rows = fetch(c, "reports_in_play", wanted)
+    else:
+        rows = fetch(c, "reports_in_play_of_vehicles", wanted | {"of_vehicle": of_vehicle})
     return tuple(_row(*values) for values in reversed(rows))
 
 

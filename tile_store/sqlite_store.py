@@ -115,7 +115,7 @@ class SqliteStore:
         with self._readers.snapshot() as c:
             epoch = versions.epoch_of(c, layer, tile)
             base = versions.stored(c, "stored_version", layer, tile, version=epoch) if epoch else None
-            return base, inbox.in_play(c, layer, tile, epoch, n)
+            return base, inbox.in_play(c, layer, tile, epoch, n, self._config.of_vehicle(layer))
 
     def quarantine(self, body: bytes, reason: str, source: str = "") -> None:
         """See `Store.quarantine`."""
@@ -169,7 +169,8 @@ class SqliteStore:
             head = versions.stored(c, "stored_head", claim.layer, claim.tile)
             epoch = versions.epoch_of(c, claim.layer, claim.tile)
             base = versions.stored(c, "stored_version", claim.layer, claim.tile, version=epoch) if epoch else None
-            return TileWork(claim, head, base, inbox.in_play(c, claim.layer, claim.tile, epoch, n))
+            of_vehicle = self._config.of_vehicle(claim.layer)
+            return TileWork(claim, head, base, inbox.in_play(c, claim.layer, claim.tile, epoch, n, of_vehicle))
 
     def publish(self, publications: Sequence[Publication]) -> list[PublishResult]:
         """See `Store.publish`."""
@@ -282,7 +283,7 @@ class SqliteStore:
         """See `Store.gc`."""
         if keep_versions < 1:
             raise StoreError(f"keep_versions is {keep_versions}; at least the newest version stays")
-        return self._writer.run(lambda c: versions.collect(c, keep_versions, self._config.max_reports_of))
+        return self._writer.run(lambda c: versions.collect(c, keep_versions, self._config.citing_reports_of))
 
     def backup(self, path: str | Path) -> None:
         """See `Store.backup` (VACUUM INTO)."""

@@ -78,8 +78,10 @@ class StoreConfig:
     """or at once when so many reports wait."""
     max_reports: int = 64
     """`load` gives at most the newest so many reports of a tile (by report id),"""
-    max_feature_reports: int = 1024
-    """of a tile of a feature layer so many: they are some 100 bytes each."""
+    max_feature_reports: int = 256
+    """of a tile of a feature layer so many: they are some 100 bytes each,"""
+    max_reports_of_vehicle: int = 16
+    """and there so many of each vehicle: no vehicle can talk until the reports of others count no more."""
     busy_timeout_s: float = 30.0
     """A writer waits this long for the writers of other processes."""
     group_max: int = 256
@@ -90,12 +92,22 @@ class StoreConfig:
             raise StoreError(
                 f"merge_delay_s {self.merge_delay_s} and busy_timeout_s {self.busy_timeout_s} must be >= 0"
             )
-        if min(self.merge_after_reports, self.max_reports, self.max_feature_reports, self.group_max) < 1:
-            raise StoreError("merge_after_reports, max_reports, max_feature_reports and group_max must be at least 1")
+        if min(self.merge_after_reports, self.max_reports, self.group_max) < 1:
+            raise StoreError("merge_after_reports, max_reports and group_max must be at least 1")
+        if min(self.max_feature_reports, self.max_reports_of_vehicle) < 1:
+            raise StoreError("max_feature_reports and max_reports_of_vehicle must be at least 1")
 
     def max_reports_of(self, layer: str) -> int:
         """How many reports of a tile of this layer count."""
         return self.max_feature_reports if is_feature_layer(layer) else self.max_reports
+
+    def of_vehicle(self, layer: str) -> int | None:
+        """How many of them one vehicle may have sent; None: all."""
+        return self.max_reports_of_vehicle if is_feature_layer(layer) else None
+
+    def citing_reports_of(self, layer: str) -> int:
+        """Of how many newest reports of a tile gc keeps the bases; -1: of all, where one does not know which count."""
+        return -1 if is_feature_layer(layer) else self.max_reports
 
 
 @dataclass(frozen=True, slots=True)

@@ -57,9 +57,11 @@ class _Story:
         self._measured: dict[str, list[Measured]] = {}
         self._state: Place | None = self._known
         self._is_stale = False
+        self._longest_m = 0.0  # of the measured polylines
         self._finders: set[str] = set()
         self._first_confirmed: Place | None = None
-        self._is_settled = False
+        known = track.epoch or track.quoted
+        self._is_settled = known is not None or len(track.state.points_m) > 1
 
     def take(self, report: int) -> None:
         """One more report."""
@@ -78,8 +80,10 @@ class _Story:
         """Whether the vehicle measures it for the first time."""
         own = self._measured.setdefault(measured.vehicle, [])
         own.append(measured)
-        if len(own) > 1 or len(measured.place.points_m) > 1:
+        length_m = length_of(measured.place.points_m)
+        if len(own) > 1 or (self._known is None and length_m > self._longest_m):
             self._is_stale = True
+            self._longest_m = max(self._longest_m, length_m)
         elif not self._is_stale:
             self._state = measured.place if self._state is None else step(self._state, measured.place)
         self._finders |= {measured.vehicle} if measured.is_found else set()
@@ -184,11 +188,9 @@ class _Story:
 
     def is_home(self, tile: TileId) -> bool:
         """Whether it belongs to this tile: it lay here when it was first confirmed by vehicles that found it."""
-        known = self._track.epoch or self._track.quoted
-        if self._first_confirmed is None or known is not None or len(self._track.state.points_m) > 1:
+        if self._is_settled or self._first_confirmed is None:
             return True
-        place, self._first_confirmed = self._first_confirmed, None  # asked once
-        self._is_settled = True
+        place, self._is_settled = self._first_confirmed, True
         lat, lon, _ = geodetic_in_tile(tile, place.points_m)
         return TileId.from_geodetic(float(lat[0]), float(lon[0])) == tile
 

@@ -114,6 +114,7 @@ def test_quarantine_keeps_bytes_reason_and_count(store: Store, clock: Clock) -> 
         {"busy_timeout_s": 0.0},
         {"max_reports": 0},
         {"max_feature_reports": 0},
+        {"max_reports_of_vehicle": 0},
         {"group_max": 0},
     ],
 )

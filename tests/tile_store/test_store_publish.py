@@ -214,3 +214,15 @@ def test_layers_are_apart(store: Store) -> None:
     store.publish([publication(store.load(claim), 3)])
     assert store.layers() == ["ndt", "ndt_summer"]
     assert [entry.version for entry in store.heads("ndt_summer")] == [1]
+
+
+def test_of_a_feature_layer_no_vehicle_crowds_out_the_reports_of_others(maker: SqliteMaker) -> None:
+    config = StoreConfig(merge_delay_s=0.0, max_feature_reports=6, max_reports_of_vehicle=3)
+    store = maker.open(config)
+    talker = [dataclasses.replace(report(10 + i), layer="signs", vehicle="talker") for i in range(20)]
+    others = [dataclasses.replace(report(i), layer="signs", vehicle=f"car-{i}") for i in range(5)]
+    store.put_reports([*others, *talker])
+    rows = store.load(only_claim(store)).reports
+    assert [row.report_id for row in rows] == [report_id(i) for i in (2, 3, 4, 27, 28, 29)]
+    assert store.in_play("signs", rows[0].tile)[1] == rows
+    store.close()

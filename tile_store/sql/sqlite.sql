@@ -208,6 +208,15 @@ SELECT report_id, layer, tile, vehicle, received_ns, body, base_sha FROM report
 WHERE layer = :layer AND tile = :tile AND (merged_in IS NULL OR merged_in >= :epoch)
 ORDER BY report_id DESC LIMIT :n
 
+-- name: reports_in_play_of_vehicles
+SELECT report_id, layer, tile, vehicle, received_ns, body, base_sha FROM report
+WHERE layer = :layer AND tile = :tile AND report_id IN (
+  SELECT report_id FROM (
+    SELECT report_id, ROW_NUMBER() OVER (PARTITION BY vehicle ORDER BY report_id DESC) AS turn FROM report
+    WHERE layer = :layer AND tile = :tile AND (merged_in IS NULL OR merged_in >= :epoch))
+  WHERE turn <= :of_vehicle ORDER BY report_id DESC LIMIT :n)
+ORDER BY report_id DESC
+
 -- name: reports_page
 SELECT arrival, report_id, layer, tile, vehicle, received_ns, body, base_sha FROM report
 WHERE arrival > :after AND layer = :layer AND (:vehicle IS NULL OR vehicle = :vehicle) ORDER BY arrival LIMIT :n
