@@ -8,12 +8,14 @@ from click.testing import CliRunner
 
 from fleet_sim.cli import sim
 from fleet_sim.errors import SimError
+from fleet_sim.feature_files import read_feature_layers
+from fleet_sim.feature_truth import base_features, feature_truth
 from fleet_sim.prepare import prepare_fleet_run
 from fleet_sim.street import StreetOptions, street
 from fleet_sim.truth import Truth, read_truth
 from fleet_sim.world import read_world
 from gnd_map.errors import GndError
-from schemas.drive_mcap import load_track, read_header
+from schemas.drive_mcap import drive_counts, load_track, read_header
 
 
 def run(*arguments: object) -> str:
@@ -106,13 +108,15 @@ def test_a_picture_of_a_world_is_drawn(truth_1: tuple[Truth, Path], tmp_path: Pa
 def test_a_fleet_run_is_prepared(truth_1: tuple[Truth, Path], tmp_path: Path) -> None:
     shutil.copy(truth_1[1], tmp_path / "truth.npz")  # kept truths are used again
     fleet = prepare_fleet_run(1, 2, tmp_path, processes=2, scans=3)
+    assert read_feature_layers(fleet.features_path) == base_features(feature_truth(street(1)))
+    assert [drive_counts(drive).detections for drive in (*fleet.agent_drives, *fleet.base_drives)] == [5, 5, 0, 0]
     assert [read_header(path).vehicle for path in fleet.base_drives] == ["mapper-0", "mapper-1"]
     assert [read_header(path).sensor_model for path in fleet.agent_drives] == ["VLP-16", "HDL-32E"]
     assert read_world(fleet.world_path) == street(1)
     assert len(read_truth(fleet.truth_path)) == len(truth_1[0])
     starts = [load_track(path).motion.t_ns[0] for path in (*fleet.base_drives, *fleet.agent_drives)]
     assert starts == sorted(starts)
-    assert sorted(p.name for p in tmp_path.iterdir()) == ["drives", "truth.npz", "world.json"]
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["drives", "features.json", "truth.npz", "world.json"]
 
 
 def test_a_fleet_run_in_a_place_that_cannot_be_made_is_refused(tmp_path: Path) -> None:
