@@ -136,6 +136,7 @@ class FeatureChange:
         check_length(name, len(self.seen), limits.MAX_FEATURES_OF_TILE, "map features judged")
         check_length(name, len(self.found), limits.MAX_FEATURES_OF_TILE, "features found")
         self._check_order()
+        self._check_found_once()
         for seen in self.seen:
             if seen.position_m is not None:
                 _check_inside(f"map feature {seen.feature_id}", self.tile, seen.position_m, limits.MAX_SEEN_OUTSIDE_M)
@@ -151,6 +152,17 @@ class FeatureChange:
                 )
         if self.seen and not self.base_sha:
             raise BadValue(f"features of tile {self.tile}: judges {len(self.seen)} map features without a map")
+
+    def _check_found_once(self) -> None:
+        """Two things of one kind at the same millimetre are one that was said twice."""
+        places: dict[tuple[str, bytes], int] = {}
+        for number, found in enumerate(self.found):
+            first = places.setdefault((found.kind, np.round(found.points_m * 1e3).tobytes()), number)
+            if first != number:
+                raise BadValue(
+                    f"features of tile {self.tile}: found {found.kind} {number} is the same as {first}, at "
+                    f"{found.points_m[0].round(3).tolist()} m"
+                )
 
     @property
     def n_features(self) -> int:

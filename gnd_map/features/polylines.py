@@ -12,7 +12,7 @@ from typing import Final
 import numpy as np
 import numpy.typing as npt
 
-from gnd_map.arrays import F64, check_array
+from gnd_map.arrays import F64, I64, check_array
 from gnd_map.errors import FeatureError
 from gnd_map.features.feature import CUT_END, CUT_START, Feature
 from gnd_map.geodesy import LocalFrame
@@ -21,8 +21,12 @@ from gnd_map.tile_id import TileId, geodetic_of_tile_coordinates, tile_coordinat
 Piece = tuple[TileId, F64, int]
 """Tile, points (N, 3) in its ENU frame, cuts."""
 _SAME: Final = 1e-12
-"""Crossings nearer to each other, as a share of their segment, are one."""
+"""Points nearer to each other, as a share of their segment, are one."""
 _MAX_PIECES: Final = 100_000
+_ROWS: Final = 64
+"""So many segments at a time are compared with all later ones: memory stays at some megabytes."""
+_ONE_DIRECTION: Final = 1e-12
+_ON_LINE_M: Final = 1e-9
 
 
 def points_in_tile(tile: TileId, lat_rad: npt.ArrayLike, lon_rad: npt.ArrayLike, height_m: npt.ArrayLike) -> F64:
@@ -144,42 +148,70 @@ def pieces_of(feature: Feature, lat_rad: F64, lon_rad: F64, height_m: F64) -> li
 
 
 def check_simple_polyline(name: str, points_m: F64) -> None:
-    """Refuse a polyline that crosses or touches itself, seen from above (its ends may meet: a loop).
+    """Refuse a polyline that crosses, touches or runs back over itself, seen from above (its ends may meet: a loop).
 
     Args:
         name: what to call it in the message.
-        points_m: (N, 2) or (N, 3).
+        points_m: (N, 2) or (N, 3); a vertex that repeats the one before counts once.
 
     Raises:
         FeatureError: says which segments meet, and where.
     """
     xy = np.asarray(points_m, dtype=np.float64)[:, :2]
-    start, step = xy[:-1], np.diff(xy, axis=0)
-    for i in range(len(step) - 1):
-        j = np.arange(i + 1, len(step))
-        crossing = _meeting(start[i], step[i], start[j], step[j])
-        crossing[0] = _turns_back(step[i], step[i + 1])  # neighbours always share a vertex
-        if i == 0 and len(crossing) > 1 and np.array_equal(xy[0], xy[-1]):
-            crossing[-1] = False
-        if crossing.any():
-            k = int(j[np.argmax(crossing)])
-            x, y = start[i]
-            raise FeatureError(
-                f"{name} crosses itself: segments {i} and {k} of {len(step)} meet near ({x:.2f}, {y:.2f}) m"
-            )
+    kept = np.flatnonzero(np.concatenate([[True], (np.diff(xy, axis=0) != 0.0).any(axis=1)]))
+    pair = _first_meeting(xy[kept])
+    if pair is not None:
+        i, k = kept[pair[0]], kept[pair[1]]
+        x, y = xy[i]
+        raise FeatureError(
+            f"{name} crosses itself: segments {i} and {k} of {len(xy) - 1} meet near ({x:.2f}, {y:.2f}) m"
+        )
 
 
-def _turns_back(r: F64, s: F64) -> bool:
-    return bool(r @ s < 0 and abs(_cross(r, s)) < _SAME)
+def _first_meeting(line: F64) -> tuple[int, int] | None:
+    """The first two segments of a polyline (N, 2) that meet where they should not; None: it is simple."""
+    start, step = line[:-1], np.diff(line, axis=0)
+    low, high = np.minimum(line[:-1], line[1:]), np.maximum(line[:-1], line[1:])
+    is_loop = len(line) > 2 and np.array_equal(line[0], line[-1])
+    for first in range(0, len(step), _ROWS):
+        i, j = _boxes_meeting(low[first:], high[first:])
+        i, j = i + first, j + first
+        meets = _meeting(start[i], step[i], start[j], step[j])
+        meets &= (j > i + 1) | ((step[i] * step[j]).sum(axis=1) < 0.0) & _parallel(step[i], step[j])
+        meets &= ~((i == 0) & (j == len(step) - 1)) | (not is_loop) | (len(step) < 3)
+        if meets.any():
+            at = int(np.argmax(meets))
+            return int(i[at]), int(j[at])
+    return None
+
+
+def _boxes_meeting(low: F64, high: F64) -> tuple[I64, I64]:
+    """Pairs i < j of boxes with corners (N, 2) that have a point in common; only the first `_ROWS` boxes as i."""
+    (x_low, y_low), (x_high, y_high) = low.T, high.T
+    rows = slice(_ROWS)
+    x_meet = np.less_equal.outer(x_low[rows], x_high) & np.greater_equal.outer(x_high[rows], x_low)
+    i, j = np.nonzero(x_meet)
+    later = (j > i) & (y_low[i] <= y_high[j]) & (y_high[i] >= y_low[j])
+    return i[later], j[later]
 
 
 def _meeting(p: F64, r: F64, q: F64, s: F64) -> npt.NDArray[np.bool_]:
-    """Whether the segment p → p + r meets each of the segments q → q + s (parallel ones: never)."""
-    across, apart = _cross(r, s), q - p
-    safe = np.where(np.abs(across) < 1e-15, np.inf, across)
+    """(N,) whether the segments p → p + r and q → q + s, each (N, 2), have a point in common."""
+    across, apart, parallel = _cross(r, s), q - p, _parallel(r, s)
+    safe = np.where(parallel, 1.0, across)
     t, u = _cross(apart, s) / safe, _cross(apart, r) / safe
-    parallel = ~np.isfinite(safe)
-    return np.asarray(~parallel & (t >= 0) & (t <= 1) & (u >= 0) & (u <= 1))
+    crosses = ~parallel & (np.maximum(np.abs(t - 0.5), np.abs(u - 0.5)) <= 0.5 + _SAME)
+    length2 = (r * r).sum(axis=1)
+    on_line = parallel & (np.abs(_cross(apart, r)) <= _ON_LINE_M * np.sqrt(length2))
+    a = (apart * r).sum(axis=1) / length2
+    b = a + (s * r).sum(axis=1) / length2
+    return np.asarray(crosses | on_line & (np.minimum(a, b) <= 1 + _SAME) & (np.maximum(a, b) >= -_SAME))
+
+
+def _parallel(r: F64, s: F64) -> npt.NDArray[np.bool_]:
+    """(N,) whether vectors (N, 2) have one direction, or opposite ones."""
+    lengths = np.hypot(*r.T) * np.hypot(*s.T)
+    return np.asarray(np.abs(_cross(r, s)) <= _ONE_DIRECTION * lengths)
 
 
 def _cross(a: F64, b: F64) -> F64:

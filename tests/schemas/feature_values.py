@@ -139,7 +139,7 @@ def any_feature_change(draw: Any, tile: TileId) -> FeatureChange:
         sha,
         draw(st.integers(0, 2**64 - 1)),
         tuple(draw(any_seen(one)) for one in ids),
-        tuple(draw(st.lists(any_found(), max_size=3))),
+        tuple(draw(st.lists(any_found(), max_size=3, unique_by=lambda one: (one.kind, str(one.snapped().points_m))))),
     )
 
 

@@ -147,6 +147,7 @@ def test_cells_count_from_the_south_west_in_rows() -> None:
         (lambda: feature_change(found=(found(points_m=SIGN_M + np.array([40.0, 0, 0])),)), "lies 2[0-9.]+ m outside"),
         (lambda: feature_change(seen=(seen(position_m=SIGN_M[0] + np.array([0, 200.0, 0])),)), "lies 17[0-9.]+ m outs"),
         (lambda: feature_change(found=(found(points_m=SIGN_M + np.array([0, 0, 20_000])),)), "lies at heights 20031"),
+        (lambda: feature_change(found=(found(), found(points_m=SIGN_M + 1e-4))), "traffic_sign 1 is the same as 0"),
         (lambda: feature_report(layer="ndt"), "layer 'ndt' holds Gaussians"),
         (lambda: feature_report(layer="ndt_winter"), "holds Gaussians"),
         (lambda: feature_report(layer="No"), "layer 'No' does not match"),
@@ -184,9 +185,9 @@ def test_too_many_features_are_refused_by_their_number() -> None:
     tiles = tuple(type(TILE)(TILE.district.first_morton + k) for k in range(5))
     with pytest.raises(TooLarge, match="has 20480 features, the limit is 16384"):
         feature_report(tiles=tuple(FeatureChange(tile, 1, SHA, 0, many) for tile in tiles))
-    line = found(kind="outline", points_m=np.zeros((4096, 3)))
+    lines = tuple(found(kind=f"outline{number}", points_m=np.zeros((4096, 3))) for number in range(17))
     with pytest.raises(TooLarge, match="has 69632 points, the limit is 65536"):
-        feature_report(tiles=(feature_change(found=(line,) * 17),))
+        feature_report(tiles=(feature_change(found=lines),))
 
 
 def test_a_million_detections_in_one_message_are_refused_before_they_are_parsed() -> None:
