@@ -1,0 +1,201 @@
+"""Reports about features that cannot be true are refused, with numbers, and kept in quarantine."""
+
+import dataclasses
+import re
+
+import numpy as np
+import pytest
+from feature_cloud import ABSENT, EAST, EXIST, TILE, change, feature, found, line, published, report, seen
+from merger_world import GROUND, POLE, change_of, gaussians_of, report_of
+
+from cloud_merger.errors import BadReport, MergerError
+from cloud_merger.features.check import FeatureLimits, check_feature_report
+from cloud_merger.ingest import Ingest, IngestLimits
+from gnd_map.features import FeatureTile
+from gnd_map.tile_id import TileId
+from schemas.errors import SchemaError
+from schemas.features import FeatureReport
+from schemas.keys import change_key
+from tile_store.sqlite_store import SqliteStore
+
+MAP = published([feature(n, -12.0 + 2.5 * n, 0.0) for n in range(1, 10)])
+KEY = change_key("signs", TILE.district)
+FAR = TileId(TILE.morton + (1 << 20))  # some 39 km away
+
+
+def known(tile, sha):
+    return {one.feature_id for one in MAP} if sha == FeatureTile.of(TILE, 1, MAP).sha and tile == TILE else None
+
+
+def refusal(*changes, limits=None):
+    with pytest.raises(BadReport) as caught:
+        check_feature_report(report(1, *changes), limits or FeatureLimits(), known)
+    return str(caught.value)
+
+
+def check(*changes):
+    check_feature_report(report(1, *changes), FeatureLimits(), known)
+
+
+def with_cov(*cov):
+    return dataclasses.replace(found(0.0, 0.0), cov_m2=np.array(cov, np.float64))
+
+
+def test_a_good_report_passes():
+    check(
+        change(seen(1), seen(2, ABSENT), seen(3, EXIST, (-4.0, 0.0)), found(1.0, 1.0), line((0, 0), (5, 0)), base=MAP)
+    )
+
+
+def test_a_drive_that_finds_every_sign_gone_is_not_believed():
+    every = [seen(one.feature_id, ABSENT) for one in MAP]
+    assert "9 of 9 judged features are said to be deleted, the limit is 0.5 of 5" in refusal(change(*every, base=MAP))
+    some = [seen(n, ABSENT if n < 5 else EXIST) for n in range(1, 10)]
+    check(change(*some, base=MAP))
+    check(change(*every[:4], base=MAP))  # too few to tell; one vehicle changes nothing anyway
+
+
+@pytest.mark.parametrize(
+    ("cov", "says"),
+    [
+        ((1e-8, 0, 0, 1.0, 0, 1.0), "0.0001 m in one direction, nobody measures better than 0.001 m"),
+        ((1.0, 1.0, 0, 1.0, 0, 1.0), "nobody measures better"),
+        ((2000.0, 0, 0, 1.0, 0, 1.0), "known to 44.7 m only, the limit is 30 m"),
+        ((1.0, 0, 0, 1.0, 0, 5e4), "variance 5e\\+04 m² of its height"),
+    ],
+)
+def test_absurd_covariances_are_refused(cov, says):
+    with pytest.raises(BadReport, match=says):
+        check(change(with_cov(*cov)))
+
+
+def test_a_covariance_that_is_none_never_comes_so_far():
+    with pytest.raises(SchemaError, match="eigenvalue"):
+        with_cov(1.0, 2.0, 0, 1.0, 0, 1.0)
+
+
+def test_unknown_heights_pass_as_they_travel():
+    whole = report(1, change(found(0.0, 0.0, height_m2=1e4), found(3.0, 0.0, sigma_m=1e-3, height_m2=1e-6)))
+    check_feature_report(FeatureReport.decode(whole.encode()), FeatureLimits(), known)
+
+
+def test_a_measurement_far_outside_the_tile_is_refused():
+    assert "map feature 1 was measured" in refusal(change(seen(1, EXIST, (60.0, 0.0)), base=MAP))
+    with pytest.raises(SchemaError, match="outside its tile"):
+        change(found(60.0, 0.0))
+
+
+def test_too_many_features_are_refused():
+    many = [found(0.1 * n, 0.5 * n - 12) for n in range(50)]
+    limits = FeatureLimits(max_features_of_tile=49)
+    assert "50 features found, 0 judged, the limit is 49" in refusal(change(*many), limits=limits)
+    wide = line(*[(0.1 * n, 0.0) for n in range(60)])
+    assert "60 vertices, the limit is 59" in refusal(change(wide), limits=FeatureLimits(max_vertices=59))
+
+
+def test_the_same_thing_twice_in_a_report_is_refused():
+    twice = refusal(change(found(1.0, 1.0), found(5.0, 1.0), found(1.05, 1.0)))
+    assert "found traffic_sign 0 and 2 lie 0.050 m apart" in twice
+    check(change(found(1.0, 1.0), found(1.05, 1.0, kind="pole")))
+    check(change(found(1.0, 1.0, attributes=(("code", "274"),)), found(1.05, 1.0, attributes=(("code", "276"),))))
+    check(change(found(1.0, 1.0, height_m=2.0, height_m2=0.01), found(1.0, 1.0, height_m=3.0, height_m2=0.01)))
+    check(change(found(1.0, 1.0, sigma_m=0.01), found(1.09, 1.0, sigma_m=0.01)))
+
+
+def test_lanes_that_cross_themselves_are_refused():
+    with pytest.raises(SchemaError, match="crosses itself: segments 0 and 2"):
+        line((0, 0), (10, 0), (10, 5), (5, -5))
+
+
+def test_verdicts_on_what_the_version_has_not_are_refused():
+    assert "judges feature 99, one of 1 that version 1 with its 9 features has not" in refusal(
+        change(seen(99), base=MAP)
+    )
+    assert "no version of the map has sha" in refusal(change(seen(1), base=MAP[:3]))
+
+
+@pytest.mark.parametrize(
+    "wrong",
+    [
+        {"min_sigma_m": 0.0},
+        {"max_sigma_m": 1e-4},
+        {"max_outside_m": -1.0},
+        {"max_features_of_tile": 0},
+        {"min_verdicts": 0},
+        {"max_deleted_share": 0.0},
+        {"duplicate_m": -0.1},
+    ],
+)
+def test_limits_without_meaning_are_refused(wrong):
+    with pytest.raises(MergerError, match=next(iter(wrong))):
+        FeatureLimits(**wrong)
+
+
+# Through ingest, on a store
+
+
+@pytest.fixture
+def store(tmp_path):
+    with SqliteStore(tmp_path / "map.sqlite") as store:
+        store.put_tiles([FeatureTile.of(TILE, 1, MAP)], layer="signs")
+        yield store
+
+
+@pytest.fixture
+def ingest(store):
+    return Ingest(store, IngestLimits(), now_ns=lambda: 77)
+
+
+def good(number=1, **names):
+    return report(number, change(seen(1), found(1.0, 1.0), base=MAP), **names)
+
+
+def test_a_good_report_is_kept_before_it_is_acknowledged(store, ingest):
+    ack = ingest.answer(KEY, good().encode())
+    assert (ack.report_id, ack.status) == (good().report_id, "stored")
+    assert ingest.answer(KEY, good().encode()).status == "duplicate"
+    (row,) = [row for row in store.reports("signs") if row.tile == TILE]
+    assert (row.vehicle, row.received_ns, row.base_sha) == ("car-1", 77, FeatureTile.of(TILE, 1, MAP).sha)
+    assert FeatureReport.decode(row.body) == good().snapped()
+    assert store.quarantined() == []
+
+
+def test_what_lies_near_the_border_is_kept_for_the_neighbour_too(store, ingest):
+    near = report(1, change(found(15.0, 0.0, sigma_m=2.0), found(-5.0, 0.0, sigma_m=0.1), base=MAP))
+    ingest.answer(KEY, near.encode())
+    rows = {row.tile: FeatureReport.decode(row.body) for row in store.reports("signs")}
+    assert EAST in rows
+    (told,) = rows[EAST].tiles
+    assert (told.tile, told.base_sha, told.viewed, len(told.found)) == (TILE, b"", 0, 1)
+    assert len(rows[TILE].tiles[0].found) == 2
+
+
+@pytest.mark.parametrize(
+    ("made", "key", "says"),
+    [
+        (lambda: good(layer="lamps"), KEY, "report for lamps .* came on the key of signs"),
+        (lambda: good(), change_key("signs", FAR.district), "came on the key of"),
+        (lambda: report(1, change(seen(1), base=MAP[:2])), KEY, "no version of the map has sha"),
+        (lambda: report(1, change(found(0, 0), tile=FAR)), change_key("signs", FAR.district), "is not on the map"),
+        (lambda: report(1, change(*(seen(n, ABSENT) for n in range(1, 10)), base=MAP)), KEY, "9 of 9 judged"),
+    ],
+)
+def test_bad_reports_go_to_quarantine(store, ingest, made, key, says):
+    ack = ingest.answer(key, made().encode())
+    assert ack.status == "quarantined"
+    assert re.search(says, ack.reason)
+    (kept,) = store.quarantined()
+    assert kept.body == made().encode()
+    assert list(store.reports("signs")) == []
+
+
+def test_a_new_layer_begins_where_another_layer_has_a_map(store, ingest):
+    lamps = report(1, change(found(1.0, 1.0, kind="streetlight")), layer="streetlights")
+    assert ingest.answer(change_key("streetlights", TILE.district), lamps.encode()).status == "stored"
+
+
+def test_gaussians_on_the_key_of_a_feature_layer_are_refused(store, ingest):
+    voxels = report_of(1, change_of(gaussians_of({0: GROUND}), [0, 2], {2: POLE}))
+    ack = ingest.answer(KEY, voxels.encode())
+    assert ack.status == "quarantined"
+    assert "speaks of Gaussians, layer signs holds features" in ack.reason
