@@ -13,6 +13,7 @@ from schemas.drive import MotionTrack
 from vehicle_agent.features.new_layer_parameters import MotionNoise
 
 GAP_S = 0.1  # samples farther apart leave something unknown between them
+LEAST_M2, LEAST_RAD2 = 1e-6, 1e-9  # variances of a step: stiffer ones leave the graph ill-conditioned
 
 
 class Steps(NamedTuple):
@@ -125,10 +126,10 @@ class DeadReckoning:
         along, yaw = np.diff(variance, axis=0).T
         length = np.abs(delta[:, 0])
         cov = np.zeros((len(delta), 3, 3))
-        cov[:, 0, 0] = along + 1e-8
-        cov[:, 1, 1] = length**2 * yaw / 3.0 + along / 4.0 + 1e-8
+        cov[:, 0, 0] = along + LEAST_M2
+        cov[:, 1, 1] = length**2 * yaw / 3.0 + along / 4.0 + LEAST_M2
         cov[:, 1, 2] = cov[:, 2, 1] = length * yaw / 2.0
-        cov[:, 2, 2] = yaw + 1e-10
+        cov[:, 2, 2] = yaw + LEAST_RAD2
         return cov
 
 

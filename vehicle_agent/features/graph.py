@@ -172,6 +172,7 @@ def _optimised(graph: Any, own: list[Any], values: Any) -> tuple[Any, Any]:
     settings.setMaxIterations(ITERATIONS)
     settings.setRelativeErrorTol(1e-6)
     settings.setAbsoluteErrorTol(1e-6)
+    settings.setLinearSolverType("MULTIFRONTAL_QR")  # a standing vehicle's motion is too stiff for Cholesky
     for _ in range(LINEARISATIONS):
         linear, before = gtsam.NonlinearFactorGraph(graph), values
         for factor in own:

@@ -29,6 +29,7 @@ NOTHING = 1e-4  # share of the best direction's information below which a direct
 ASIDE_STEP_M = 0.25
 ASIDE_SIGMA_M = 2.5  # what the first poses may be off by to either side
 SMOOTH = 8  # windows before and after that search together
+MARGIN_M = 5.0  # more of the map than of what is seen
 SEEN_M = (5.0, 45.0)  # ahead of the vehicle: the part of lanes that GICP is given
 
 
@@ -149,7 +150,9 @@ class LaneMatcher:
     def _gicp(self, source: F64, pose: F64) -> F64 | None:
         if len(source) < 20:
             return None
-        target = self.lanes.near(pose[:2], SEEN_M[1] + 10.0)
+        near = self.lanes.near(pose[:2], SEEN_M[1] + MARGIN_M)
+        ahead = rotated(np.full(len(near), -pose[2]), near - pose[:2])[:, 0]
+        target = near[ahead > SEEN_M[0] - MARGIN_M]
         return gicp(target, source, pose, self.parameters.max_correspondence_m)
 
     def _as_seen(self, lane: int, base: F64, off: F64) -> F64:

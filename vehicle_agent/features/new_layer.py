@@ -123,6 +123,8 @@ class _Mapping:
                 continue
             if turn > 0 and before.shape == self.xy_m.shape and self._moved(before) < self.parameters.settled_m:
                 break
+        if self.lanes is not None:
+            solution = self._solve(polish=True)
         assert solution is not None
         return self._result(solution)
 
@@ -136,11 +138,11 @@ class _Mapping:
             self.state = solve(problem, self.state, self.parameters).state
             self.nodes = self.nodes.calibrated(self.state.calibration)
 
-    def _problem(self) -> Problem:
+    def _problem(self, polish: bool = False) -> Problem:
         problem = self.nodes.problem(self.state.pose)
         if self.lanes is None:
             return problem
-        return replace(problem, lanes=self.lanes.matched(self.nodes, self.state.pose))
+        return replace(problem, lanes=self.lanes.matched(self.nodes, self.state.pose, polish=polish))
 
     def _associate(self, slack_m: float) -> None:
         """Measurements to known and new features; those left over may make further new ones."""
@@ -173,14 +175,14 @@ class _Mapping:
         self.owner = np.where(self.owner >= 0, number[self.owner], NONE)
         self.xy_m, self.kind = self.xy_m[stays], self.kind[stays]
 
-    def _solve(self) -> Solution:
+    def _solve(self, polish: bool = False) -> Solution:
         """Optimise with the features that are tied to the drive; the others are no nodes."""
         seen = np.unique(self.owner[self.owner >= 0])
         number = np.full(len(self.xy_m) + 1, NONE)
         number[seen] = np.arange(len(seen))
         ties = tied(self.m, self.sight, number[self.owner], self.state.pose, self.xy_m[seen])
         start = State(self.state.pose, self.xy_m[seen], self.state.calibration)
-        problem = replace(self._problem(), ties=ties, anchors=self._anchors(seen, number))
+        problem = replace(self._problem(polish), ties=ties, anchors=self._anchors(seen, number))
         solution = solve(problem, start, self.parameters)
         if not np.isfinite(solution.state.pose).all():
             raise NewLayerError(f"the graph of {len(self.state.pose)} poses has no optimum: check motion and fixes")

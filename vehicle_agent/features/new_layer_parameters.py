@@ -1,7 +1,7 @@
 """Settings of the mapping of a new feature layer: frozen dataclasses with defaults that run; units are in the names."""
 
 from dataclasses import dataclass, field
-from math import radians, sqrt
+from math import log, radians, sqrt
 
 
 @dataclass(frozen=True, slots=True)
@@ -36,16 +36,16 @@ class MotionNoise:
 class GnssNoise:
     """Errors of a low-cost receiver: slow and white, the slow part first-order Gauss-Markov.
 
-    sigma_m: of the slow part, each axis (2.5 m both axes together, section 5 of the paper).
-    correlation_s: its time constant.
+    sigma_m: of the slow part, each axis: half of all fixes within 2.5 m, as the data sheet of the paper's receiver says.
+    correlation_s: its time constant: 12 s fits a low-cost receiver among houses (`fleet_sim.roads.drive`, where from).
     white_m: sigma of what is new with each fix, each axis.
     every_s: a state of the slow part at least this far from the next.
     robust_k: Huber's k of a fix, in sigmas.
     """
 
-    sigma_m: float = 2.5 / sqrt(2.0)
-    correlation_s: float = 40.0
-    white_m: float = 0.2
+    sigma_m: float = 2.5 / sqrt(2.0 * log(2.0))
+    correlation_s: float = 12.0
+    white_m: float = 0.05
     every_s: float = 1.0
     robust_k: float = 3.0
 
@@ -103,7 +103,7 @@ class LaneParameters:
     sigma_m: float = 1.0
     sigma_rad: float = radians(2.5)
     beside_m: float = 15.0
-    window_m: float = 15.0
+    window_m: float = 20.0
     search_m: float = 4.0
     gate: float = 3.5
     max_correspondence_m: float = 1.5
@@ -126,6 +126,7 @@ class NewLayerParameters:
     rounds: how often measurements are given to features anew and the graph is solved.
     settled_m: rounds end when no feature moves by more.
     stop_s, stop_mps: the vehicle has stopped when it stood this long, slower than this.
+    least_m, longest_s: a shorter way than this is not mapped at a stop; one that takes longer is mapped without a stop.
     """
 
     keyframe_m: float = 5.0
@@ -134,11 +135,16 @@ class NewLayerParameters:
     settled_m: float = 0.01
     stop_s: float = 3.0
     stop_mps: float = 0.1
+    least_m: float = 50.0
+    longest_s: float = 1800.0
     motion: MotionNoise = field(default_factory=MotionNoise)
     gnss: GnssNoise = field(default_factory=GnssNoise)
     landmarks: LandmarkParameters = field(default_factory=LandmarkParameters)
     lanes: LaneParameters = field(default_factory=LaneParameters)
 
     def __post_init__(self) -> None:
-        if min(self.keyframe_m, self.keyframe_s, self.settled_m, self.stop_s, self.stop_mps) <= 0 or self.rounds < 1:
+        if (
+            min(self.keyframe_m, self.keyframe_s, self.settled_m, self.stop_s, self.stop_mps, self.longest_s) <= 0
+            or self.rounds < 1
+        ):
             raise ValueError(f"all values must be > 0 and rounds >= 1, got {self}")
