@@ -113,7 +113,7 @@ class _Mapping:
         """Rounds of association, matching and optimisation."""
         if self.lanes is not None:
             self._solve_without_features()
-        slack_m, solution = self.parameters.landmarks.revisit_m, None
+        slack_m = self.parameters.landmarks.revisit_m
         for turn in range(self.parameters.rounds):
             before = self.xy_m
             self._associate(slack_m)
@@ -123,10 +123,7 @@ class _Mapping:
                 continue
             if turn > 0 and before.shape == self.xy_m.shape and self._moved(before) < self.parameters.settled_m:
                 break
-        if self.lanes is not None:
-            solution = self._solve(polish=True)
-        assert solution is not None
-        return self._result(solution)
+        return self._result(self._solve(polish=True))
 
     def _moved(self, before: F64) -> float:
         return float(np.abs(before - self.xy_m).max(initial=0.0))

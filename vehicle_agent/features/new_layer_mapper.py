@@ -10,7 +10,7 @@ from vehicle_agent.features.new_layer_parameters import NewLayerParameters
 
 
 class NewLayerMapper:
-    """Takes a vehicle's items one by one; at each stop, and at the end, gives the features of the way since the last."""
+    """Takes a vehicle's items one by one; gives the features of the way since the last stop at each, and at the end."""
 
     def __init__(
         self,

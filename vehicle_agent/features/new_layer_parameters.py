@@ -36,7 +36,7 @@ class MotionNoise:
 class GnssNoise:
     """Errors of a low-cost receiver: slow and white, the slow part first-order Gauss-Markov.
 
-    sigma_m: of the slow part, each axis: half of all fixes within 2.5 m, as the data sheet of the paper's receiver says.
+    sigma_m: of the slow part, each axis: half of all fixes within 2.5 m, as the paper's receiver's data sheet says.
     correlation_s: its time constant: 12 s fits a low-cost receiver among houses (`fleet_sim.roads.drive`, where from).
     white_m: sigma of what is new with each fix, each axis.
     every_s: a state of the slow part at least this far from the next.
@@ -74,7 +74,7 @@ class LandmarkParameters:
     revisit_way_m: float = 150.0
     drift_m: float = 0.1
     merge_chi2: float = 9.2
-    apart_share: float = 0.1
+    apart_share: float = 0.3
     robust_k: float = 3.0
 
     def __post_init__(self) -> None:
@@ -143,8 +143,6 @@ class NewLayerParameters:
     lanes: LaneParameters = field(default_factory=LaneParameters)
 
     def __post_init__(self) -> None:
-        if (
-            min(self.keyframe_m, self.keyframe_s, self.settled_m, self.stop_s, self.stop_mps, self.longest_s) <= 0
-            or self.rounds < 1
-        ):
+        positive = (self.keyframe_m, self.keyframe_s, self.settled_m, self.stop_s, self.stop_mps, self.longest_s)
+        if min(positive) <= 0 or self.rounds < 1:
             raise ValueError(f"all values must be > 0 and rounds >= 1, got {self}")
