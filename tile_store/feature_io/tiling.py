@@ -2,10 +2,14 @@
 
 from collections import defaultdict
 from collections.abc import Iterable, Mapping
+from dataclasses import replace
 from typing import TypeAlias
 
+import numpy as np
+
 from gnd_map.errors import FeatureError, MapError
-from gnd_map.features import Feature, FeatureTile, join_pieces, pieces_of, snapped
+from gnd_map.features import Feature, FeatureTile, join_pieces, pieces_of
+from gnd_map.features.feature import M_PER_STEP
 from gnd_map.tile_id import TileId
 from tile_store.feature_io.errors import BadGeometry, FeatureFileError
 from tile_store.feature_io.osm_document import Progress
@@ -41,8 +45,13 @@ def _pieces(feature: MapFeature) -> list[tuple[TileId, Feature]]:
     """
     pieces = pieces_of(feature.feature(), feature.lat_rad, feature.lon_rad, feature.height_m)
     if len(pieces) > 1:
-        pieces = pieces_of(feature.feature(), *join_pieces([(tile, snapped(piece)) for tile, piece in pieces]))
+        pieces = pieces_of(feature.feature(), *join_pieces([(tile, _on_lattice(piece)) for tile, piece in pieces]))
     return pieces
+
+
+def _on_lattice(piece: Feature) -> Feature:
+    """The piece with vertices as `snapped` makes them; the rest does not move them."""
+    return replace(piece, points_m=np.round(piece.points_m / M_PER_STEP) / round(1 / M_PER_STEP))
 
 
 def whole(tiles: Mapping[str, Iterable[FeatureTile]]) -> list[MapFeature]:
