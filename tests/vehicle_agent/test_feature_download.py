@@ -2,6 +2,7 @@
 
 import threading
 from collections.abc import Iterator
+from contextlib import ExitStack
 from pathlib import Path
 
 import numpy as np
@@ -197,6 +198,37 @@ def test_without_a_router_the_cache_has_to_do_until_it_is_back(free_port: int, t
             bus.close()
             downloader.close()
         world.store.close()
+
+
+def test_what_happened_while_the_link_was_down_is_asked_for_when_it_is_back(free_port: int, tmp_path: Path) -> None:
+    endpoint = f"tcp/127.0.0.1:{free_port}"
+    config = BusConfig(connect=(endpoint,))
+    with ExitStack() as stack:
+        router = stack.enter_context(ExitStack())
+        router.enter_context(open_router((endpoint,)))
+        cloud = stack.enter_context(open_bus(config, name="cloud"))
+        world = Cloud(cloud, tmp_path)
+        bus = stack.enter_context(open_bus(config, name="vehicle"))
+        downloader = FeatureDownloader(bus, tmp_path / "c.sqlite", ("signs", "streetlights"), QUICK)
+        download(downloader, TILE)
+        before = bus.connections
+        router.close()
+        wait_until(lambda: not (bus.is_connected() or cloud.is_connected()))
+        world.publish("signs", tile(TILE, *map(sign, range(2, 40))))  # its notice reaches nobody
+        assert downloader.step().get("signs", set()) <= {TILE}
+        assert downloader.tile("signs", TILE).version == 1  # type: ignore[union-attr]
+        stack.enter_context(open_router((endpoint,)))
+        wait_until(lambda: bus.connections > before)
+
+        def current() -> bool:
+            downloader.step()
+            return downloader.tile("signs", TILE).version == 2  # type: ignore[union-attr]
+
+        wait_until(current)
+        assert (downloader.counts["blob"], downloader.counts["delta"]) == (2, 1), "what was held is not fetched again"
+        bus.close()
+        downloader.close()
+        world.close()
 
 
 def test_a_cache_that_is_damaged_or_holds_gaussians_is_downloaded_anew(
