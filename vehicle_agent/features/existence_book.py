@@ -121,10 +121,8 @@ class ExistenceBook:
         """Masses from counts, whose order does not matter: hits turned out to be misses, or another feature's."""
         entry.hits, entry.misses = max(hits, 0), max(misses, 0)
         masses = self.known_masses if entry.known else self.new_masses
-        for evidence, count in ((self._hit, entry.hits), (self._miss, entry.misses)):
-            masses = doubted(combine(masses, repeated(evidence, count)))[0]
-        entry.masses = masses
-        entry.history.append((t_ns, masses))
+        entry.masses = doubted(counted(masses, entry.hits, entry.misses, self._p.detection_confidence)[None])[0]
+        entry.history.append((t_ns, entry.masses))
 
     def classify(self, entry: Entry) -> FeatureClass:
         """The class by the largest mass (section 4.3.3); a new one must have been measured `min_hits` times."""
@@ -155,6 +153,25 @@ def repeated(evidence: F64, count: int) -> F64:
     unknown = evidence[2] ** count
     side = (1.0 - unknown) * (evidence[:2] > 0.0)
     return np.array([side[0], side[1], unknown, 0.0])
+
+
+def counted(masses: F64, hits: int, misses: int, confidence: float) -> F64:
+    """Masses (4,) after so many times Eq. (1) and Eq. (2), in any order.
+
+    Dempster's rule multiplies commonalities q(A) = Σ_{B ⊇ A} m(B); here in logarithms, as thousands of looks underflow.
+    """
+    ln_unknown = np.log1p(-confidence)
+    with np.errstate(divide="ignore"):
+        ln = np.log([masses[0], masses[1], masses[2]]) + ln_unknown * np.array([misses, hits, hits + misses])
+        ln_shared = np.log(masses[2]) + ln_unknown * np.array([misses, hits])
+    # m(∃) = q(∃) - q(Ω): what the prior gives to ∃, and what it leaves open and the hits decide
+    top = max(ln.max(), ln_shared.max())
+    decided = -np.expm1(ln_unknown * np.array([hits, misses]))
+    out = np.exp(ln - top)
+    out[:2] += np.exp(ln_shared - top) * decided
+    total = float(out.sum())
+    conflict = 1.0 - (1.0 - masses[3]) * min(total * float(np.exp(top)), 1.0)
+    return np.array([*(out / total), conflict])
 
 
 def doubted(masses: F64) -> F64:

@@ -19,8 +19,6 @@ from vehicle_agent.features.rbpf import Rbpf
 
 MOST_WAYS: Final = 720
 """More ways than this are not compared; then the best pairs alone are the only other way."""
-CLEARLY: Final = 3.0
-"""An identity changes when it becomes so much more likely (natural logarithm)."""
 
 
 def best_identities(rbpf: Rbpf, slots: list[int], owned: int) -> list[int]:
@@ -36,10 +34,7 @@ def best_identities(rbpf: Rbpf, slots: list[int], owned: int) -> list[int]:
     """
     fit = agreements(rbpf, slots, owned)
     log_weight = np.log(np.maximum(rbpf.weights(without=set(slots)), 1e-300))
-    now = tuple(range(owned))
     best = max(_ways(fit, log_weight), key=lambda way: likelihood(fit, log_weight, way))
-    if likelihood(fit, log_weight, best) < likelihood(fit, log_weight, now) + CLEARLY:
-        best = now
     return [slots[i] for i in best]
 
 

@@ -197,8 +197,8 @@ class Rbpf:
         return np.asarray(np.square(xy_m[:, None] - self.state[:2] - self.state[GNSS_X:]).sum(axis=0))
 
     def _weigh(self, log_likelihood: Callable[[], F64], first: F64 | None = None) -> bool:
-        """Multiply the weights by a likelihood, Eq. (19); in steps, with resampling between, where otherwise few particles
-        would keep any weight.
+        """Multiply the weights by a likelihood, Eq. (19); in steps, with resampling between, where few of the particles
+        would be left with any weight.
 
         Args:
             log_likelihood: gives (M,) of the particles as they are then.
