@@ -201,11 +201,12 @@ def show_(path: Path, feature_id: int, as_json: bool) -> None:
 
 
 class _Bars:
-    """A bar for each step of the work."""
+    """A bar for each step of the work, on a terminal."""
 
     def __init__(self) -> None:
         columns = (TextColumn("{task.description}"), BarColumn(), TaskProgressColumn(), TimeElapsedColumn())
-        self._bars = Progress(*columns, console=Console(stderr=True), transient=True)
+        console = Console(stderr=True)
+        self._bars = Progress(*columns, console=console, transient=True, disable=not console.is_terminal)
         self._tasks: dict[str, TaskID] = {}
 
     def __enter__(self) -> "_Bars":
