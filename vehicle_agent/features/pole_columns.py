@@ -34,7 +34,7 @@ class Columns(NamedTuple):
         cov_m2: (C, 2, 2) of the axis.
         lean: (C, 2) metres a metre upwards.
         toward: (C, 2) mean direction from the sensor.
-        diameter_m: (C,) median of the slices.
+        diameter_m: (C,) mean of the slices.
         sigma_diameter_m: (C,).
         scatter_m: (C,) standard deviation of the slices about the axis, beside what the sensor makes.
         bottom_m: (C,) lowest slice, over the ground.
@@ -183,7 +183,8 @@ def _diameters(slices: Slices, label: I64, p: PoleParameters) -> tuple[F64, F64,
     if not count:
         return np.empty(0), np.empty(0), scans
     step = _medians(slices.step_m, label)
-    width = np.maximum(_medians(slices.extent_m + slices.step_m, label), SMALLEST_M)
+    n = np.bincount(label)
+    width = np.maximum(_sums(slices.extent_m + slices.step_m, label, n) / n, SMALLEST_M)
     sigma = np.maximum(WIDTH_SIGMA * step / np.sqrt(scans), 0.5 * p.sigma_floor_m)
     return width, sigma, scans
 

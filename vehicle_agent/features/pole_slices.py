@@ -161,9 +161,12 @@ def slices_of(
     rows = Rows(-TAN_MAX, step_tan, ceil(2 * TAN_MAX / step_tan), COLUMNS)
     layer_tan = _layer_gap(layer_gaps(polar, rows)) * step_tan
     high = np.flatnonzero((height > p.feet_m) & (height < np.inf))
-    points, height, polar = points[high], height[high], polar[high]
+    everything, points, height, polar = polar, points[high], height[high], polar[high]
     order, start = row_order(polar, rows)
-    step = max(azimuth_step(polar, order, start, p.link_m), MIN_STEP_RAD)
+    step = azimuth_step(polar, order, start, p.link_m) or azimuth_step(
+        everything, *row_order(everything, rows), p.link_m
+    )
+    step = max(step, MIN_STEP_RAD)
     found = thin_slices(polar, order, start, step, Beside(p.link_m, p.diameter_max_m, p.clear_m, p.jump_m))
     origins = origins_m if len(origins_m) == 1 else origins_m[kept[high]]
     slices = _described(*found, points, height, polar, origins, step, number)

@@ -18,6 +18,7 @@ CLEAR, HIDDEN, JOINED = 0, 1, 2
 """What lies beside a slice in its own row: nothing or something farther; something nearer; something at its range."""
 STEP_BINS = 4000
 STEP_RAD = math.radians(1.0) / STEP_BINS
+FEW_STEPS = 200
 SMALL = 32
 """Cells with more points are sorted by numpy."""
 
@@ -127,7 +128,10 @@ def _sort_by_azimuth(part: I64, polar: F64) -> None:
 
 @kernel
 def azimuth_step(polar: F64, order: I64, start: I64, link_m: float) -> float:
-    """Usual angle between neighbouring rays of a row that meet the same thing (median) [rad]; 0 without any."""
+    """Usual angle between neighbouring rays of a row that meet the same thing (median) [rad].
+
+    0 where fewer than FEW_STEPS tell.
+    """
     count = np.zeros(STEP_BINS, np.int64)
     for row in range(start.shape[0] - 1):
         for a in range(start[row] + 1, start[row + 1]):
@@ -136,7 +140,7 @@ def azimuth_step(polar: F64, order: I64, start: I64, link_m: float) -> float:
             if abs(polar[k, 1] - polar[before, 1]) < link_m and step < STEP_BINS * STEP_RAD:
                 count[int(step / STEP_RAD)] += 1
     half, so_far = 0.5 * count.sum(), 0
-    for b in range(STEP_BINS):
+    for b in range(STEP_BINS if 2.0 * half >= FEW_STEPS else 0):
         so_far += count[b]
         if so_far > half:
             return (b + 0.5) * STEP_RAD
