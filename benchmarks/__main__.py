@@ -24,6 +24,7 @@ NAMES = (
     "return-download",
     "gnss-noise",
     "poles",
+    "features-merge",
 )
 WITH_OPTIONS = ("codec", "return-download", "gnss-noise", "poles")
 
