@@ -23,6 +23,7 @@ POINTS = 8  # of a polyline that are compared with the map
 MAX_LANES = 8  # beside each other that are looked at
 LEAST_M = 5.0  # a polyline whose compared points span less tells no direction
 IMPOSSIBLE = 1e6
+SLACK = np.array([0.3, np.radians(1.0)])  # what poses may be off by beside the sensor's noise, across and turned
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -48,6 +49,11 @@ class Polylines:
 
     def __len__(self) -> int:
         return len(self.look)
+
+    @property
+    def tolerance(self) -> F64:
+        """(P, 2) sigmas of offset and turn when the pose, too, is not known well."""
+        return np.asarray(np.hypot(self.sigma, SLACK))
 
 
 class Offsets(NamedTuple):
@@ -90,13 +96,9 @@ def offsets(lines: Polylines, lanes: LaneMap, at: F64, base: F64, p: LaneParamet
     fit, enough = _fit(E, feet.valid, lines.xy_m)
     told = np.einsum("pmiq,pmq->pmi", fit, np.where(feet.valid, feet.off_m, 0.0))
     N = _by_pose(feet.normal, here[:, None], base) * feet.valid[..., None]
-    cost = ((told / np.hypot(lines.sigma, _floor(p))[:, None]) ** 2).sum(axis=2)
+    cost = ((told / lines.tolerance[:, None]) ** 2).sum(axis=2)
     cost = np.where(enough & (lane >= 0), cost, IMPOSSIBLE)
     return Offsets(lane, left, told, fit @ N, cost)
-
-
-def _floor(p: LaneParameters) -> F64:
-    return np.array([p.map_sigma_m, 1e-4])
 
 
 def _as_poses(xy_m: F64) -> F64:
@@ -177,8 +179,8 @@ def choices(lines: Polylines, o: Offsets, aside_m: F64, p: LaneParameters) -> tu
 def _pair_costs(lines: Polylines, o: Offsets, rows: I64, n_lanes: int, aside: F64, p: LaneParameters) -> F64:
     """(L, S, M, G) cost of each polyline for each lane and move; never more than the gate."""
     off = o.told[rows, :n_lanes, 0, None] + aside[:, None, None]
-    turn = o.told[rows, :n_lanes, 1, None] / lines.sigma[rows, 1][..., None, None]
-    cost = (off / lines.sigma[rows, 0][..., None, None]) ** 2 + turn**2
+    turn = o.told[rows, :n_lanes, 1, None] / lines.tolerance[rows, 1][..., None, None]
+    cost = (off / lines.tolerance[rows, 0][..., None, None]) ** 2 + turn**2
     cost = np.where(o.cost[rows, :n_lanes, None] >= IMPOSSIBLE, np.inf, cost)
     return np.minimum(cost, 2.0 * p.gate**2)
 

@@ -96,7 +96,7 @@ class LaneMatcher:
         rows = np.arange(len(column))
         told = o.told[rows, column]
         moved = told[:, 0] + aside[self.lines.look, 0]
-        squared = np.stack([moved, told[:, 1]], axis=1) ** 2 / self.lines.sigma**2
+        squared = np.stack([moved, told[:, 1]], axis=1) ** 2 / self.lines.tolerance**2
         good = (column >= 0) & (squared.max(axis=1) <= p.gate**2) & (o.cost[rows, column] < 1e5)
         window, lane = self.window[self.lines.look], o.lane[rows, column]
         variance = self._variance(window, lane, good)
