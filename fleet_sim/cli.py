@@ -66,6 +66,21 @@ def picture(file: Path, png: Path, truth_file: Path | None, dpi: int) -> None:
     click.echo(f"{png}: {', '.join(f'{n} {name}' for name, n in truth.counts('all').items())}")
 
 
+@world.command("features")
+@click.argument("file", type=click.Path(path_type=Path))
+@click.argument("layers", type=click.Path(path_type=Path))
+@click.option("--mapped-streetlights", default=0.0, show_default=True, help="Share of the lamps that the map holds.")
+def features(file: Path, layers: Path, mapped_streetlights: float) -> None:
+    """Write the feature layers of the map before the changes of the world in FILE to LAYERS (JSON)."""
+    from fleet_sim.feature_files import write_feature_layers
+    from fleet_sim.feature_truth import base_features, feature_truth
+
+    truth = feature_truth(read_world(file), mapped_streetlights)
+    write_feature_layers(base_features(truth), layers)
+    for layer, states in truth.counts().items():
+        click.echo(f"{layer}: {', '.join(f'{n} {state}' for state, n in states.items())}")
+
+
 def _note(made: World) -> str:
     lat_deg, lon_deg = degrees(made.lat_rad), degrees(made.lon_rad)
     return f"what changes between before and after on {2 * made.half_length_m:g} m at {lat_deg:.4f}°, {lon_deg:.4f}°"
@@ -82,6 +97,7 @@ def _note(made: World) -> str:
 @click.option("--cars", default=0.2, show_default=True, help="Share of parking slots that are taken.")
 @click.option("--traffic", type=click.Choice(["none", "urban"]), default="none", show_default=True, help="What moves.")
 @click.option("--scans", type=int, help="At most so many scans.")
+@click.option("--camera", is_flag=True, help="A camera that detects traffic signs, too.")
 def drive(
     world_file: Path,
     file: Path,
@@ -93,8 +109,10 @@ def drive(
     cars: float,
     traffic: str,
     scans: int | None,
+    camera: bool,
 ) -> None:
     """Drive through the world of WORLD_FILE and write what the sensors give to FILE (MCAP, opens in Foxglove)."""
+    from fleet_sim.camera import SignCamera
     from fleet_sim.drives import DriveConfig, simulate_drive
     from fleet_sim.traffic import Traffic
 
@@ -107,6 +125,7 @@ def drive(
         car_share=cars,
         traffic=Traffic.urban() if traffic == "urban" else Traffic(),
         scans=scans,
+        camera=SignCamera() if camera else None,
     )
     simulate_drive(read_world(world_file), config, file)
     click.echo(f"{file}: {file.stat().st_size / 1e6:.1f} MB")
@@ -130,5 +149,8 @@ def road_picture(kind: str, png: Path, seed: int, drive_seed: int) -> None:
 
     driven = drive_route(route_named(kind, seed), drive_seed)
     draw_drive(driven, png)
-    detections = sum(len(look) for look in driven.looks)
-    click.echo(f"{png}: {driven.route.length_m:.0f} m, {len(driven.looks)} looks, {detections} detections")
+    detections, blind = sum(len(look) for look in driven.looks), int((driven.truth.looks_at == 0).sum())
+    click.echo(
+        f"{png}: {driven.route.length_m:.0f} m, {len(driven.looks)} looks, {detections} detections,"
+        f" {blind} of {len(driven.route.features)} features hidden all the time"
+    )

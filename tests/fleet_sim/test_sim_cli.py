@@ -123,3 +123,12 @@ def test_a_fleet_run_in_a_place_that_cannot_be_made_is_refused(tmp_path: Path) -
     (tmp_path / "file").write_text("in the way")
     with pytest.raises(SimError, match="cannot make the folder"):
         prepare_fleet_run(1, 1, tmp_path / "file")
+
+
+def test_the_map_before_and_a_drive_with_a_camera_are_written(tmp_path: Path) -> None:
+    run("world", "write", tmp_path / "w.json", "--seed", 1)
+    output = run("world", "features", tmp_path / "w.json", tmp_path / "f.json")
+    assert "signs: 28 normal, 6 deleted, 9 new" in output
+    assert read_feature_layers(tmp_path / "f.json").keys() == {"signs"}
+    run("drive", tmp_path / "w.json", tmp_path / "d.mcap", "--scans", 3, "--camera")
+    assert drive_counts(tmp_path / "d.mcap").detections == 5
