@@ -39,7 +39,7 @@ def kind_of_layer(layer: str) -> type[Tile] | type[FeatureTile]:
 
 def fits_layer(tile: AnyTile, layer: str) -> bool:
     """Whether the tile holds what this layer holds."""
-    return isinstance(tile, kind_of_layer(layer))
+    return isinstance(tile, FeatureTile) == is_feature_layer(layer)
 
 
 def noun_of(tile: AnyTile | type[object]) -> str:
