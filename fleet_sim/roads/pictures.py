@@ -23,7 +23,7 @@ def detection_places(drive: RoadDrive) -> tuple[FloatArray, FloatArray]:
     return places, np.concatenate(drive.truth.of_detection)
 
 
-def draw_drive(drive: RoadDrive, png: Path, *, dpi: int = 120) -> None:
+def draw_drive(drive: RoadDrive, png: Path, *, dpi: int = 75) -> None:
     """Draw a drive: the route, its most crowded stretch, the looks at each feature, the error of the GNSS."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
