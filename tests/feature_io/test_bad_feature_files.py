@@ -3,6 +3,7 @@
 import json
 from pathlib import Path
 
+import numpy as np
 import pytest
 from small_maps import STREET, put, write
 
@@ -10,6 +11,7 @@ from gnd_map.errors import GndError
 from tile_store.feature_io import errors
 from tile_store.feature_io.formats import format_of, read_features
 from tile_store.feature_io.json_file import read_json
+from tile_store.feature_io.lane_crossing import crossing_of
 from tile_store.feature_io.osm_document import read_osm
 from tile_store.feature_io.placement import Placement
 from tile_store.feature_io.values import ImportOptions
@@ -118,6 +120,25 @@ def test_a_lanelet2_file_with_a_fault_is_refused_whole(
 def test_too_many_nodes_are_counted() -> None:
     with pytest.raises(errors.FileTooLarge, match="more than 1 nodes"):
         read_osm(osm(NODES).encode(), "big", max_nodes=1)
+
+
+def test_a_line_has_an_end(store: SqliteStore, tmp_path: Path) -> None:
+    body = osm(NODES + line(5, *[1, 2] * 10_001))
+    with pytest.raises(errors.FileTooLarge, match="way 5: 20002 vertices, a line has at most 20000"):
+        put(store, write(tmp_path, "long.osm", body))
+    long = osm(NODES + line(5, *[1, 2] * 10_001) + line(6, 1, 2) + lanelet(6, 5))
+    left_out = ImportOptions({"lane_boundary": "-"})
+    with pytest.raises(errors.FileTooLarge, match="right border of lanelet 9: 20002 vertices"):
+        put(store, write(tmp_path, "long.osm", long), left_out)
+
+
+def test_lines_are_held_against_each_other_in_blocks() -> None:
+    x = np.arange(5000.0)
+    a, b = np.column_stack([x, np.zeros(5000)]), np.column_stack([x, np.full(5000, 2.0)])
+    assert crossing_of(a, b) is None
+    b[4321:, 1] = -2.0
+    assert crossing_of(a, b) == (4320, 4320)
+    assert crossing_of(b, a) == (4320, 4320)
 
 
 def test_too_many_bytes_are_not_even_read(tmp_path: Path) -> None:

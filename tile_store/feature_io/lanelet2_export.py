@@ -95,6 +95,8 @@ class _Editing:
         self._new_ways: list[bytes] = []
         self._next_id = document.highest_id + 1
         self._added = 0
+        self._in_ways = {ref for way in document.ways.values() for ref in way.nodes}
+        self._nodes = list(document.nodes.values())
 
     def update(self, drawn: Drawn, feature: MapFeature) -> None:
         """An element's feature as it is now."""
@@ -129,7 +131,7 @@ class _Editing:
     def remove(self, drawn: Drawn) -> None:
         """An element whose feature is gone; a node that is part of a line only loses its tags."""
         key = _name(drawn.element), drawn.element.id
-        if key[0] == "node" and any(key[1] in way.nodes for way in self._document.ways.values()):
+        if key[0] == "node" and key[1] in self._in_ways:
             self._tags[key] = {name: None for name, _ in drawn.feature.attributes}
         else:
             self._gone.add(key)
@@ -163,8 +165,7 @@ class _Editing:
         local = self._options.placement.local(place[:1], place[1:2], np.array([height_m]))[0]
         assert self._places.local_m is not None
         near = int(np.linalg.norm(self._places.local_m[:, :2] - local[:2], axis=1).argmin())
-        node = list(self._document.nodes.values())[near]
-        lat_deg, lon_deg = _shifted(node, local - self._places.local_m[near])
+        lat_deg, lon_deg = _shifted(self._nodes[near], local - self._places.local_m[near])
         return lat_deg, lon_deg, {"local_x": metres(local[0]), "local_y": metres(local[1]), "ele": metres(local[2])}
 
     def finish(self) -> tuple[bytes, Changes]:

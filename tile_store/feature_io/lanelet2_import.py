@@ -27,6 +27,7 @@ from tile_store.feature_io.values import (
     attributes_of,
     check_positions,
     check_simple,
+    check_vertices,
 )
 
 FORMAT: Final = "lanelet2"
@@ -224,6 +225,9 @@ def check_lanelets(document: OsmDocument, places: Places) -> None:
         sides = []
         for role in ("left", "right"):
             nodes = [n for ref in relation.member("way", role) for n in document.nodes_of(document.ways[ref])]
+            check_vertices(
+                f"{document.where}, line {relation.line}: {role} border of lanelet {relation.id}", len(nodes)
+            )
             rows = places.rows(nodes)
             sides.append(
                 np.column_stack([places.lon_rad[rows] * np.cos(places.lat_rad[rows[:1]]), places.lat_rad[rows]])

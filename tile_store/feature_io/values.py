@@ -22,7 +22,7 @@ from gnd_map.features import (
 from gnd_map.features.feature import KIND_PATTERN, MAX_ATTRIBUTES, MAX_KEY_CHARACTERS, MAX_VALUE_CHARACTERS
 from gnd_map.geodesy import LocalFrame
 from schemas.limits import MAX_FLOOR, MIN_FLOOR
-from tile_store.feature_io.errors import BadGeometry, DuplicateId, FeatureFileError
+from tile_store.feature_io.errors import BadGeometry, DuplicateId, FeatureFileError, FileTooLarge
 from tile_store.feature_io.placement import Placement
 from tile_store.values import check_layer
 
@@ -45,6 +45,7 @@ SURE: Final = 0.9
 SIGMA_M: Final = 0.1
 """One sigma of an axis of what a file holds, which no format but our GeoJSON states; HD maps are within 10 to 20 cm
 (SLAMCU, section 1)."""
+MAX_VERTICES_OF_LINE: Final = 20_000
 _LATITUDE_LIMIT: Final = pi / 2
 _SLACK: Final = 1e-12
 
@@ -153,13 +154,20 @@ def check_positions(name: str, lat_rad: F64, lon_rad: F64, height_m: F64) -> Non
 
 
 def check_simple(feature: MapFeature) -> None:
-    """BadGeometry when a polyline crosses itself."""
+    """BadGeometry when a polyline crosses itself, FileTooLarge when it has too many vertices to tell."""
+    check_vertices(feature.name, len(feature))
     if len(feature) < 3:
         return
     try:
         check_simple_polyline(feature.name, feature.enu_m())
     except FeatureError as error:
         raise BadGeometry(str(error)) from None
+
+
+def check_vertices(name: str, n: int) -> None:
+    """FileTooLarge when a line has too many vertices: whether it crosses itself takes the square of their number."""
+    if n > MAX_VERTICES_OF_LINE:
+        raise FileTooLarge(f"{name}: {n} vertices, a line has at most {MAX_VERTICES_OF_LINE}; cut it")
 
 
 def attributes_of(values: Mapping[str, str]) -> tuple[tuple[str, str], ...]:
