@@ -151,7 +151,7 @@ class _Story:
         place, was = self._place(), full_covariance(shown.cov_m2)
         gain = self._parameters.renewal_gain
         before, after = (np.minimum(np.diag(cov), HEIGHT_KNOWN_M2) for cov in (was, place.cov_m2))
-        if gain == 1.0 or (before > gain * after * (1 + 1e-9)).any():
+        if gain == 1.0 or (before >= gain * after * (1 - 1e-9)).any():
             return True
         if len(place.points_m) != len(shown.points_m):
             return True

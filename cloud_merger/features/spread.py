@@ -33,7 +33,7 @@ def spread(report: FeatureReport, reach_m: float) -> dict[TileId, FeatureReport]
     """
     parts: dict[TileId, list[FeatureChange]] = {change.tile: [change] for change in report.tiles}
     for change in report.tiles:
-        for tile in change.tile.neighbours() if change.found else ():
+        for tile in around(change.tile) if change.found else ():
             near = tuple(one for one in change.found if near_border(tile, change.tile, one, reach_m))
             if near:
                 parts.setdefault(tile, []).append(
@@ -53,6 +53,12 @@ def near_border(tile: TileId, source: TileId, found: Found, reach_m: float) -> b
     halo_m = min(_SIGMAS * sigma_m + _LEAST_M, reach_m)
     place_m = found.points_m[0] - between(source, tile)[:3, 3]
     return bool((np.abs(place_m[:2]) - _half_extent_m(tile)).max() <= halo_m)
+
+
+@lru_cache(maxsize=4096)
+def around(tile: TileId) -> tuple[TileId, ...]:
+    """The tiles around a tile, remembered."""
+    return tile.neighbours()
 
 
 @lru_cache(maxsize=16384)

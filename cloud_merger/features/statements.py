@@ -6,7 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from cloud_merger.features.rls import Place
-from cloud_merger.features.spread import between, near_border
+from cloud_merger.features.spread import around, between, near_border
 from gnd_map.arrays import F64
 from gnd_map.features import Existence, Feature, feature_id_of
 from gnd_map.tile_id import TileId
@@ -70,7 +70,7 @@ def statements_of(tile: TileId, reports: Iterable[FeatureReport], reach_m: float
     """
     parts: dict[str, dict[TileId, FeatureChange]] = {}
     vehicles: dict[str, str] = {}
-    near = {tile, *tile.neighbours()}
+    near = {tile, *around(tile)}
     for report in sorted(reports, key=lambda report: report.report_id):
         vehicles.setdefault(report.report_id, report.vehicle)
         changes = parts.setdefault(report.report_id, {})
