@@ -156,7 +156,7 @@ class Rbpf:
         prior = self.priors[slot]
         if prior is None:
             return
-        self._weigh(lambda: self._agreement(slot, prior))
+        self._weigh(lambda: measurement.agreement(self.mu[slot], self.sigma[slot], *prior))
         self.mu[slot], self.sigma[slot] = measurement.fused(self.mu[slot], self.sigma[slot], *prior)
         self.priors[slot] = None
 

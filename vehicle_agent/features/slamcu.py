@@ -42,6 +42,7 @@ class Slamcu:
     Attributes:
         now_s: time driven.
         odometer_m: way driven.
+        z_m: height of the vehicle's origin in the map frame, as of `set_pose`; 0 where heights are only ever told over it.
         hidden: features of the map in view that got no evidence because something hid them, over all looks.
 
     Raises:
@@ -57,6 +58,7 @@ class Slamcu:
         self.now_s = 0.0
         self.odometer_m = 0.0
         self.hidden = 0
+        self.z_m = 0.0
         self._gnss_s: float | None = None
 
     def predict(self, dt_s: float, speed_mps: float, yaw_rate_radps: float) -> None:
@@ -171,7 +173,7 @@ class Slamcu:
         ask[measured] = False
         rows = np.flatnonzero(ask)
         if occlusion is not None and len(rows):
-            height_m = np.array([near[i].height_m for i in rows])
+            height_m = np.array([near[i].height_m for i in rows]) - self.z_m
             clear = occlusion.clear(ahead.z[rows, 0], ahead.z[rows, 1], edge_rad[rows], height_m)
             self.hidden += sum(near[i].known for i in rows[~clear])
             rows = rows[clear]
@@ -201,7 +203,7 @@ class Slamcu:
         entry.in_view_s, entry.odometer_m = self.now_s, self.odometer_m
         entry.pass_hits += 1
         if look.height_m is not None and isfinite(look.height_m[row]):
-            entry.heights.append(float(look.height_m[row]))
+            entry.heights.append(float(look.height_m[row]) + self.z_m)
         if entry.slot is not None and not entry.known:
             entry.xy_m = weights @ self._rbpf.mu[entry.slot] if entry.cov is None else entry.xy_m
 

@@ -74,12 +74,23 @@ class Tidying:
         assert entry.slot is not None
         weights = self._rbpf.weights(without=(entry.slot,))
         xy_m, cov = self._rbpf.moments(entry.slot, weights)
-        if entry.known:
-            if self._moved(entry, xy_m, cov):
-                self._split(entry, xy_m, t_ns)
-                return
+        moved = self._moved(entry, xy_m, cov)
+        if not entry.known:
+            self._take(entry, agrees=not moved)
+        elif moved:
+            self._split(entry, xy_m, t_ns)
+        else:
             entry.seen = (xy_m, cov) if entry.seen is None else fused_moments(entry.seen, (xy_m, cov))
-        self._rbpf.settle(entry.slot)
+            self._rbpf.settle(entry.slot)
+
+    def _take(self, entry: Entry, *, agrees: bool) -> None:
+        """A new feature that was found on an earlier passage already, and settled."""
+        assert entry.slot is not None
+        if agrees:
+            self._rbpf.settle(entry.slot)
+        else:
+            self._rbpf.priors[entry.slot] = None
+        entry.cov = None
 
     def _identify(self, entry: Entry, t_ns: int) -> None:
         """Give the estimates of features that stand close together to those of the map that they are."""

@@ -19,7 +19,7 @@ class KnownState:
         misses: looks in which it was in view and was not measured.
         position_m: (2,) where this drive measured it, independently of where the map has it; None = not measured.
         cov_m2: (2, 2) of that position.
-        height_m: over the vehicle's origin, nan = not measured.
+        height_m: in the map frame, as far as the vehicle knows its own height there; nan = not measured.
         history: masses over time, Figure 8.
     """
 
@@ -43,7 +43,7 @@ class NewFeature:
         kind: as measured.
         position_m: (2,) map frame.
         cov_m2: (2, 2) over all particles.
-        height_m: over the vehicle's origin, nan = not measured.
+        height_m: in the map frame, as far as the vehicle knows its own height there; nan = not measured.
         feature_class: new, or unclassified while there is too little evidence.
         existence: masses, begun vacuous (Eq. 4).
         hits: looks that measured it.
