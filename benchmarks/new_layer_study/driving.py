@@ -45,7 +45,7 @@ class RouteTask:
     Attributes:
         kind: `TRACK`, `MOTORWAY` or `STRAIGHT`.
         seed: of the route.
-        km: length of a motorway.
+        km: length of a motorway; of the test track the way driven, 0 for one lap.
         beacon: noise level of the detector of point features.
         lane: noise level of the lane camera.
     """
@@ -80,6 +80,7 @@ def drive_of(task: RouteTask, vehicle: int) -> RoadDrive:
     options = RoadDriveOptions(
         points=DetectorNoise(level=task.beacon),
         lanes=DetectorNoise(level=task.lane, false_alarms=0.0),
+        length_m=1e3 * task.km if task.kind == TRACK and task.km else None,
         start_ns=EPOCH_NS + vehicle * _HOUR_NS,
     )
     return drive_route(task.route, vehicle, options)

@@ -35,7 +35,7 @@ def draw_figures(outcome: StudyOutcome, found: Mapping[str, Any], folder: Path) 
         draw_beacons(first.track, f"test track, {note}", folder / "new_layer_beacons.png"),
         draw_integration(found, folder / "new_layer_by_drives.png"),
     ]
-    if outcome.options.levels:
+    if outcome.options.levels and outcome.options.sweep_seeds:
         paths.append(draw_noise(found, folder / "new_layer_noise.png"))
     roads = [("motorway", first.motorway)]
     if first.straight is not None:
@@ -113,7 +113,8 @@ def draw_noise(found: Mapping[str, Any], path: Path) -> Path:
             axes.plot(levels, values, "o-", color=colour, linewidth=2.0, label=f"noise of {sensor}s")
         axes.set_ylim(bottom=0.0)
         axes.legend(fontsize=9)
-    note = f"test track, seeds {', '.join(found['seeds'])}; N(0, l²) m and N(0, (2.5 l)²) °; the other sensor's l = 1"
+    seeds = ", ".join(seed for seed, one in found["seeds"].items() if one["noise"])
+    note = f"test track, seeds {seeds}; N(0, l²) m and N(0, (2.5 l)²) °; the other sensor's l = 1"
     return finish(figure, "Noise of the sensors", note, path)
 
 

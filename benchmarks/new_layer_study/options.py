@@ -8,7 +8,8 @@ from benchmarks.simulation.errors import OptionError
 
 MOST_DRIVES: Final = 60
 _LEVELS: Final = (0.1, 5.0)
-_KM: Final = (0.3, 20.0)
+_KM: Final = (0.5, 20.0)
+_LAP_M: Final = (100.0, 10_000.0)
 
 
 @dataclass(frozen=True, slots=True)
@@ -19,7 +20,9 @@ class NewLayerOptions:
         seeds: of routes; each has its own beacons, lights and drives.
         drives: on the test track.
         motorway_drives: on the motorway; one more then drives with the layer that they made.
+        lap_m: way driven on the test track; 0: one lap. Beacons that a shorter way does not pass are missed.
         levels: noise levels of Figure 8, of beacons and of lanes; none: no sweep.
+        sweep_seeds: on so many of the seeds, the first ones.
         km: length of the motorway.
         straight: whether the straight motorway is driven, too.
     """
@@ -27,8 +30,10 @@ class NewLayerOptions:
     seeds: tuple[int, ...] = (11,)
     drives: int = 6
     motorway_drives: int = 11
+    lap_m: float = 0.0
     levels: tuple[float, ...] = (0.5, 1.0, 1.5, 2.0)
-    km: float = 4.0
+    sweep_seeds: int = 1
+    km: float = 5.0
     straight: bool = True
 
     def __post_init__(self) -> None:
@@ -40,5 +45,9 @@ class NewLayerOptions:
         wrong = [level for level in self.levels if not _LEVELS[0] <= level <= _LEVELS[1]]
         if wrong or len(set(self.levels)) != len(self.levels):
             raise OptionError(f"--levels must be different numbers {_LEVELS[0]:g} … {_LEVELS[1]:g}, got {self.levels}")
+        if self.lap_m and not _LAP_M[0] <= self.lap_m <= _LAP_M[1]:
+            raise OptionError(f"--lap must be 0 or {_LAP_M[0]:g} … {_LAP_M[1]:g} m, got {self.lap_m:g}")
+        if not 0 <= self.sweep_seeds <= len(self.seeds):
+            raise OptionError(f"--sweep-seeds must be 0 … {len(self.seeds)}, got {self.sweep_seeds}")
         if not _KM[0] <= self.km <= _KM[1]:
             raise OptionError(f"--km must be {_KM[0]:g} … {_KM[1]:g}, got {self.km:g}")

@@ -156,7 +156,7 @@ def tasks_of(options: NewLayerOptions, seed: int, folder: RunFolder) -> SeedTask
     """Return all drives of a seed; the noise level 1 of both sensors is the usual track's."""
     home = folder.root / f"seed-{seed}"
     tracks = [
-        RouteTask(TRACK, seed, 0.0),
+        RouteTask(TRACK, seed, options.lap_m / 1e3),
         *(task for of in noisy_tracks(options, seed).values() for task in of.values()),
     ]
     roads = [RouteTask(kind, seed, options.km) for kind in (MOTORWAY, STRAIGHT)[: 1 + options.straight]]
@@ -167,12 +167,12 @@ def tasks_of(options: NewLayerOptions, seed: int, folder: RunFolder) -> SeedTask
 
 def noisy_tracks(options: NewLayerOptions, seed: int) -> dict[str, dict[float, RouteTask]]:
     """Return the test track at each noise level of each sensor, the other's at 1."""
-    if not options.levels:
+    if seed not in options.seeds[: options.sweep_seeds]:
         return {}
-    levels = sorted(options.levels)
+    levels, km = sorted(options.levels), options.lap_m / 1e3
     return {
-        "beacon": {level: RouteTask(TRACK, seed, 0.0, beacon=level) for level in levels},
-        "lane": {level: RouteTask(TRACK, seed, 0.0, lane=level) for level in levels},
+        "beacon": {level: RouteTask(TRACK, seed, km, beacon=level) for level in levels},
+        "lane": {level: RouteTask(TRACK, seed, km, lane=level) for level in levels},
     }
 
 
@@ -218,7 +218,7 @@ def _read(options: NewLayerOptions, plan: SeedTasks) -> SeedOutcome:
         for sensor, levels in noisy_tracks(options, plan.seed).items()
     }
     roads = {one.route.kind: _read_motorway(routes[one.route], one.kept) for one in plan.fresh}
-    track = routes[RouteTask(TRACK, plan.seed, 0.0)]
+    track = routes[RouteTask(TRACK, plan.seed, options.lap_m / 1e3)]
     return SeedOutcome(plan.seed, track, noisy, roads[MOTORWAY], roads.get(STRAIGHT))
 
 
