@@ -25,8 +25,9 @@ NAMES = (
     "gnss-noise",
     "poles",
     "features-merge",
+    "slamcu-step",
 )
-WITH_OPTIONS = ("codec", "return-download", "gnss-noise", "poles")
+WITH_OPTIONS = ("codec", "return-download", "gnss-noise", "poles", "slamcu-step")
 
 
 def main() -> None:
