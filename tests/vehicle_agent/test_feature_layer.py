@@ -7,14 +7,18 @@ import pytest
 
 from gnd_map.features import VACUOUS, Feature, FeatureTile, feature_id_of, hit, miss, prior
 from gnd_map.geodesy import LocalFrame
+from gnd_map.se3 import exp_so3
 from gnd_map.tile_id import TileId
+from schemas.drive import Detections
 from schemas.features import FeatureChange
 from vehicle_agent.features.coverage import CoverageParameters
 from vehicle_agent.features.errors import FeatureLayerError
 from vehicle_agent.features.feature_map import place_in_tile
 from vehicle_agent.features.layer import FeatureLayer, PlacedLook, of_counts
 from vehicle_agent.features.layer_parameters import LAYERS, FeatureParameters, LayerParameters
+from vehicle_agent.features.layers import placed
 from vehicle_agent.features.look import Look
+from vehicle_agent.localise.estimates import PoseEstimate, RefinedScan
 
 START = TileId.from_path("13033/03021/23031/22102")
 FRAME = LocalFrame.of_tile(START)
@@ -83,6 +87,27 @@ def test_a_new_sign_is_found_where_it_stands(changes: dict[TileId, FeatureChange
     assert np.hypot(*(found[0][1].points_m[0] - point[0])[:2]) < 0.3
     assert found[0][1].points_m[0, 2] == pytest.approx(point[0, 2], abs=0.5)
     assert found[0][1].existence.state == "exist"
+
+
+def test_heights_are_those_of_the_map_on_a_slope() -> None:
+    """The vehicle climbs by 2 % and looks along its own x axis; the sign's foot is where the map has it."""
+    slope, sign = 0.02, np.array([80.0, 4.0, 80.0 * 0.02 + 2.0])
+    T = np.eye(4)
+    T[:3, :3] = exp_so3(np.array([0.0, -np.arctan(slope), 0.0]))
+    layer = FeatureLayer(LAYERS["signs"], CoverageParameters(), FRAME)
+    for x in np.arange(10.0, 60.0, 0.5):
+        T[:3, 3] = x, 0.0, slope * x
+        ahead, left, height = (np.float32(v) for v in T[:3, :3].T @ (sign - T[:3, 3]))
+        columns = [
+            np.array([v], np.float32) for v in (np.hypot(ahead, left), np.arctan2(left, ahead), height, 0.5, 0.01)
+        ]
+        look = Detections(int(x * 1e8), "camera", "signs", ("traffic_sign",), *columns)
+        estimate = PoseEstimate(look.t_ns, T.copy(), 0.01, 1e-3, 0.9, "good")
+        layer.see(placed(look, T, RefinedScan(look.t_ns, np.zeros((0, 3)), np.zeros((0, 3)), estimate)), None)
+    (found,) = [(change.tile, one) for change in layer.leave_all() for one in change.found]
+    tile, point, _ = place_in_tile(FRAME, sign, np.eye(3))
+    assert found[0] == tile
+    assert found[1].points_m[0] == pytest.approx(point[0], abs=0.1)
 
 
 def test_the_report_says_where_the_drive_has_looked_and_what_it_compared_with(

@@ -83,7 +83,7 @@ class Entry:
 
     @property
     def height_m(self) -> float:
-        """Height over the vehicle's origin as measured, nan = never."""
+        """Height in the map frame as measured, nan = never."""
         return float(np.median(self.heights)) if self.heights else nan
 
     def masses_over_time(self) -> tuple[MassesAt, ...]:

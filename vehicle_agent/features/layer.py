@@ -2,7 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from math import atan2, nan
+from math import atan2
 from typing import Final
 
 import numpy as np
@@ -86,7 +86,7 @@ class FeatureLayer:
 
     def see(self, placed: PlacedLook, occlusion: Occlusion | None) -> None:
         """Take one look from a known pose."""
-        self._slamcu.set_pose(placed.pose, placed.cov)
+        self._slamcu.set_pose(placed.pose, placed.cov, placed.z_m)
         self._slamcu.look(self._own(placed), self.parameters.view, occlusion)
         x_m, y_m, heading_rad = placed.pose.tolist()
         self._coverage.look(x_m, y_m, heading_rad, occlusion)
@@ -157,7 +157,7 @@ class FeatureLayer:
         existence = of_counts(state.hits, state.misses, self.parameters.detection_confidence)
         if state.position_m is None or state.cov_m2 is None:
             return Seen(state.feature_id, existence, state.hits)
-        _, point, cov = self._placed(state.position_m, state.cov_m2, nan, tile_id)
+        _, point, cov = self._placed(state.position_m, state.cov_m2, state.height_m, tile_id)
         return Seen(state.feature_id, existence, state.hits, point[0], cov)
 
     def _found(self, tile_id: TileId) -> list[Found]:
@@ -177,7 +177,7 @@ class FeatureLayer:
         return int((np.hypot(*(places - xy_m).T) < self.parameters.alone_m).sum()) <= 1
 
     def _placed(self, xy_m: F64, cov: F64, height_m: float, tile_id: TileId | None = None) -> tuple[TileId, F64, F64]:
-        point, full = with_height(xy_m, cov, self._z_m + height_m, SIGMA_HEIGHT_M, self._z_m)
+        point, full = with_height(xy_m, cov, height_m, SIGMA_HEIGHT_M, self._z_m)
         return place_in_tile(self._frame, point, full, tile_id)
 
 

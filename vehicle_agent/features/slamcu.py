@@ -42,7 +42,7 @@ class Slamcu:
     Attributes:
         now_s: time driven.
         odometer_m: way driven.
-        z_m: height of the vehicle's origin in the map frame, as of `set_pose`; 0 where heights are only ever told over it.
+        z_m: height of the vehicle's origin in the map frame, as of `set_pose`; else 0: heights are those over it.
         hidden: features of the map in view that got no evidence because something hid them, over all looks.
 
     Raises:
@@ -87,13 +87,15 @@ class Slamcu:
             self._gnss_s = self.now_s
             self._rbpf.resample_if_needed()
 
-    def set_pose(self, pose: F64, cov: F64) -> None:
-        """The pose (3,) as a localiser has it, with its covariance (3, 3): from now on features do not move it.
+    def set_pose(self, pose: F64, cov: F64, z_m: float = 0.0) -> None:
+        """The pose (3,) as a localiser has it, with its covariance (3, 3) and the height of the vehicle's origin in the
+        map frame: from now on features do not move it.
 
         Raises:
             BadPose: as of the constructor.
         """
         pose, cov = checked_pose(pose, cov)
+        self.z_m = z_m
         self._rbpf.weighing = False
         self._rbpf.place(pose, cov)
 
