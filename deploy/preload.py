@@ -12,6 +12,7 @@ import cloud_merger.merger
 import deploy.roles
 import tile_store.server
 import vehicle_agent.agent
+import vehicle_agent.features.feature_work
 from vehicle_agent.warm import warm_up
 
 __all__ = ["cloud_merger", "deploy", "tile_store", "vehicle_agent"]
