@@ -47,7 +47,7 @@ def changes(draw):
         if draw(st.booleans()):
             place = draw(st.sampled_from([None, *SPOTS]))
             said.append(seen(one.feature_id, draw(st.sampled_from([EXIST, ABSENT])), place, 0.2))
-    for spot in draw(st.lists(st.sampled_from(SPOTS), max_size=3)):
+    for spot in draw(st.lists(st.sampled_from(SPOTS), max_size=3, unique=True)):
         shift = draw(st.floats(-0.5, 0.5, width=16))
         sigma_m = draw(st.sampled_from([0.1, 0.5, 2.0]))
         height_m2 = draw(st.sampled_from([0.04, 1e4]))
