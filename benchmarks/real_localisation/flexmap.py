@@ -6,7 +6,6 @@ lanes are an independent witness: drawn in the SLAM's frame, they are moved with
 fixes, which the drawer of lanes never used, should lie in them.
 """
 
-import re
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final
@@ -18,17 +17,15 @@ from numpy.typing import NDArray
 from benchmarks.real_localisation.errors import RealLocalisationError
 from gnd_map.motion import Trajectory
 from gnd_map.se3 import T_inverse, transform
+from tile_store.feature_io.osm_document import OsmDocument, OsmRelation, read_osm
+from vehicle_agent.localise.drawn_map import read_fixes, read_track
 from vehicle_agent.localise.georeference import Georeferenced, georeference
-from vehicle_agent.localise.path_association import Untimed, georeference_untimed, nearest_on_track, way_m
+from vehicle_agent.localise.path_association import georeference_untimed, nearest_on_track, way_m
 from vehicle_agent.localise.track_alignment import FixTable
 
 F64 = NDArray[np.float64]
 I64 = NDArray[np.int64]
 
-SIGMA_M: Final = 0.5
-"""Of the receiver, which the recording does not state."""
-STEP_NS: Final = 1_000_000_000
-"""Between two poses of the track, which have no times."""
 HELD_OUT_M: Final = 100.0
 NEAR_M: Final = 15.0
 
@@ -61,9 +58,10 @@ def flexmap_of(folder: Path) -> tuple[dict[str, Any], Drawn]:
     """Residuals and lanes, and what a picture needs.
 
     Raises:
-        RealLocalisationError: a file that cannot be read.
+        GndError: a file that cannot be read, or has no lanelets.
     """
-    track, fixes = _track(folder), _gnss(folder)
+    track = read_track(next(folder.glob("*_pose_kitti.txt")))
+    fixes = read_fixes(next(folder.glob("*_GPS.txt")))
     everything, table = georeference_untimed(track, fixes)
     held_out = (way_m(table.enu_m(everything.frame)) // HELD_OUT_M).astype(np.int64) % 2 == 1
     kept = table.take(np.flatnonzero(~held_out))
@@ -110,52 +108,19 @@ def _off(found: Georeferenced, fixes: FixTable, chosen: NDArray[np.bool_]) -> di
 # --- files -----------------------------------------------------------------------------------------------------------
 
 
-def _track(folder: Path) -> Trajectory:
-    rows = _table(next(folder.glob("*_pose_kitti.txt")), 12)
-    T = np.tile(np.eye(4), (len(rows), 1, 1))
-    T[:, :3] = rows.reshape(-1, 3, 4)
-    return Trajectory(STEP_NS * np.arange(len(T), dtype=np.int64), T)
-
-
-def _gnss(folder: Path) -> Untimed:
-    lat, lon = np.radians(_table(next(folder.glob("*_GPS.txt")), 2)).T
-    return Untimed(lat, lon, np.full(len(lat), np.nan), SIGMA_M)
-
-
-def _table(path: Path, columns: int) -> F64:
-    try:
-        rows = np.loadtxt(path, ndmin=2)
-    except (OSError, ValueError) as error:
-        raise RealLocalisationError(f"{path}: no table of numbers: {error}") from error
-    if rows.shape[1] != columns:
-        raise RealLocalisationError(f"{path}: {rows.shape[1]} columns; {columns} are needed")
-    return rows
-
-
 def _lanes(folder: Path) -> list[Lane]:
     """The lanelets; their nodes carry local coordinates (their latitudes are placeholders)."""
     path = next(folder.glob("lanelet2_*.osm"))
-    text = path.read_text("utf-8")
-    nodes = {
-        number: np.array([float(v) for v in _NUMBER.findall("".join(_LOCAL.findall(body)))])
-        for number, body in re.findall(r'<node id="(-?\d+)"[^>]*>(.*?)</node>', text, re.S)
-    }
-    ways = {
-        number: np.stack([nodes[ref] for ref in re.findall(r'<nd ref="(-?\d+)"', body)])
-        for number, body in re.findall(r'<way id="(-?\d+)"[^>]*>(.*?)</way>', text, re.S)
-    }
-    lanes = []
-    for body in re.findall(r"<relation [^>]*>(.*?)</relation>", text, re.S):
-        sides = dict(re.findall(r'<member type="way" role="(left|right)" ref="(-?\d+)"', body))
-        if 'v="lanelet"' in body and len(sides) == 2:
-            lanes.append(Lane(ways[sides["left"]], ways[sides["right"]]))
-    if not lanes:
+    document = read_osm(path.read_bytes(), path.name)
+    lanelets = [one for one in document.relations.values() if one.tags.get("type") == "lanelet"]
+    if not lanelets:
         raise RealLocalisationError(f"{path}: no lanelets")
-    return lanes
+    return [Lane(*(_border_m(document, one, side) for side in ("left", "right"))) for one in lanelets]
 
 
-_LOCAL: Final = re.compile(r'<tag k="(?:local_x|local_y|ele)" v="[^"]*"/>')
-_NUMBER: Final = re.compile(r'v="([^"]*)"')
+def _border_m(document: OsmDocument, lanelet: OsmRelation, side: str) -> F64:
+    nodes = document.nodes_of(document.ways[lanelet.member("way", side)[0]])
+    return np.array([[float(node.tags[key]) for key in ("local_x", "local_y", "ele")] for node in nodes])
 
 
 def _outlines(lanes: list[Lane], track: Trajectory, found: Georeferenced | None) -> list[F64]:
