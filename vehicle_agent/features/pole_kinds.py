@@ -28,6 +28,10 @@ PLATE_POINTS: Final = 4
 LOWEST_PLATE_M: Final = 1.0
 WIDER: Final = 1.5
 """Plates, crowns and heads begin where so many times more points lie beside the core than in it."""
+HEAD_M: Final = 1.0
+"""Of a streetlight's height at most so much has anything beside the mast: arm and head."""
+MAST_SHARE: Final = 0.8
+"""Of the least height of a streetlight: up to here at least its mast is thin."""
 CROWN_POINTS: Final = 8
 LOWEST_CROWN_M: Final = 1.75
 CROWN_HIGH_M: Final = 2.0
@@ -116,9 +120,16 @@ def kinds_of(columns: Columns, seen: Surroundings, top_m: F64, p: PoleParameters
     plate = (points >= PLATE_POINTS) & (across <= PLATE_THICK_M) & (along >= PLATE_WIDE_M) & (high <= PLATE_HIGH_M)
     over = _within(np.maximum(columns.top_m, LOWEST_CROWN_M), columns.top_m + CROWN_HIGH_M)
     leaves = (seen.counts[:, :, FAR] * over).sum(axis=1) >= CROWN_POINTS
-    tall = top_m >= p.streetlight_m
+    full = (
+        _within(np.full(len(top_m), LOWEST_CROWN_M), top_m)
+        & (seen.counts[:, :, NEAR] > WIDER * seen.counts[:, :, CORE])
+    ).sum(axis=1)
+    tall = (top_m >= p.streetlight_m) & (columns.top_m >= MAST_SHARE * p.streetlight_m)
+    bushy = tall & (full * BIN_M > HEAD_M)
     return tuple(
-        np.select([crown, tall, plate, leaves], ["trunk", "streetlight", "traffic_sign", "trunk"], "pole").tolist()
+        np.select(
+            [crown | bushy, tall, plate, leaves], ["trunk", "streetlight", "traffic_sign", "trunk"], "pole"
+        ).tolist()
     )
 
 

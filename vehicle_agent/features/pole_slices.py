@@ -31,6 +31,9 @@ PIT_M = 0.5
 MAX_SLICES = 20_000
 """A scan of a street has some hundred; of more, the nearest are kept."""
 MIN_STEP_RAD = radians(0.02)
+NEARBY = np.indices((5, 5)).reshape(2, 25) - 2
+"""Cells of the ground around one."""
+MIDDLE = 12
 
 
 class Slices(NamedTuple):
@@ -67,18 +70,31 @@ class Slices(NamedTuple):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class GroundHeights:
-    """The ground around a vehicle: cells and their heights z_m (n, n)."""
+    """The ground around a vehicle.
+
+    Attributes:
+        cells: squares.
+        z_m: (n, n) their heights, where nothing is seen the highest that they may have.
+        seen_m: (n, n) heights where the ground is seen, else inf.
+    """
 
     cells: Ground
     z_m: F64
+    seen_m: F64
 
     def under(self, points_m: F64) -> F64:
         """(N,) height of the points (N, 3) over the ground."""
         return heights_over(points_m, self.z_m, self.cells)
 
     def at(self, xy_m: F64) -> F64:
-        """(N,) height of the ground at places (N, 2)."""
-        return -self.under(np.column_stack([xy_m, np.zeros(len(xy_m))]))
+        """(N,) height of the ground at places (N, 2): mean of what is seen nearby, the nearer the more it weighs."""
+        cell = np.floor((xy_m - [self.cells.x0, self.cells.y0]) / self.cells.cell_m).astype(np.int64)
+        i, j = (np.clip(cell[:, k, None] + NEARBY[k], 0, self.cells.n - 1) for k in range(2))
+        weight = np.where(np.isfinite(self.seen_m[i, j]), 1.0 / (1.0 + NEARBY[0] ** 2 + NEARBY[1] ** 2), 0.0)
+        known = weight.sum(axis=1) > 0.0
+        height = (weight * np.where(weight > 0.0, self.seen_m[i, j], 0.0)).sum(axis=1)
+        seen = height / np.where(known, weight.sum(axis=1), 1.0)
+        return np.asarray(np.where(known, seen, self.z_m[i[:, MIDDLE], j[:, MIDDLE]]))
 
 
 class PoseSigma(NamedTuple):
@@ -137,7 +153,8 @@ def ground_around(points_m: F64, centre_m: F64, p: PoleParameters) -> GroundHeig
     cells = Ground(float(centre_m[0]) - side, float(centre_m[1]) - side, p.ground_cell_m, 2 * half)
     low = lowest_heights(points_m, cells, float(centre_m[2]), p.ground_slope, PIT_M)
     low[half - 1 : half + 1, half - 1 : half + 1] = centre_m[2]
-    return GroundHeights(cells, cone_heights(low, p.ground_slope * p.ground_cell_m))
+    z = cone_heights(low, p.ground_slope * p.ground_cell_m)
+    return GroundHeights(cells, z, np.where(low <= z, low, np.inf))
 
 
 def slices_of(
