@@ -177,37 +177,45 @@ def drive_route(route: Route, seed: int, options: RoadDriveOptions | None = None
     names = ("style", "traffic", "motion", "gnss", "points", "lanes")
     streams = {name: np.random.default_rng([seed, route.seed, k, 9]) for k, name in enumerate(names)}
     motion, boxes = _driven(route, options, streams)
-    view = options.view or (CAMERA if route.layer == "signs" else LIDAR)
-    t_ns, t_s = _times(motion, view.rate_hz, options.start_ns)
-    poses = motion.poses(t_s)
-    placed = placed_boxes(route, boxes, t_s, poses)
-    everything = route.features
-    places = polar(poses, everything.xy_m)
-    in_view = view.holds(*places)
-    out_of_sight = hidden(poses, everything.xy_m, everything.height_m, in_view, placed, view.eye_m)
-    rows = everything.rows("normal", "new")
-    visible = (in_view & ~out_of_sight)[:, rows]
-    standing = (places[0][:, rows], places[1][:, rows])
-    looks, of_detection = detected(
-        view, options.points, everything.take(rows), route.layer, t_ns, standing, visible, streams["points"]
-    )
-    motion_ns, motion_s = _times(motion, MOTION_HZ, options.start_ns)
-    truth = DriveTruth(motion_ns, motion.poses(motion_s), poses, of_detection, in_view, out_of_sight)
     lane_ns, lane_s = _times(motion, LANES_HZ, options.start_ns)
     lanes = lane_looks(
         route, options.lane_view, options.lanes, lane_ns, motion.poses(lane_s), motion.way_m(lane_s), streams["lanes"]
     )
+    looks, occluder_m, truth = _looked(route, options, motion, boxes, streams["points"])
     return RoadDrive(
         route=route,
         seed=seed,
-        motion=_motion_track(motion, motion_ns, motion_s, options.errors, streams["motion"]),
+        motion=_motion_track(motion, options, streams["motion"]),
         gnss=_gnss(motion, options, streams["gnss"]),
-        view=view,
+        view=_view(route, options),
         looks=looks,
-        occluder_m=occluder_ranges(view, poses, placed),
+        occluder_m=occluder_m,
         lane_looks=lanes,
         truth=truth,
     )
+
+
+def _view(route: Route, options: RoadDriveOptions) -> View:
+    return options.view or (CAMERA if route.layer == "signs" else LIDAR)
+
+
+def _looked(
+    route: Route, options: RoadDriveOptions, motion: RoadMotion, boxes: Boxes, rng: np.random.Generator
+) -> tuple[tuple[Detections, ...], NDArray[np.float32], DriveTruth]:
+    """The looks for point features, what was in the way at each, and the truth of the drive."""
+    view, features = _view(route, options), route.features
+    t_ns, t_s = _times(motion, view.rate_hz, options.start_ns)
+    poses = motion.poses(t_s)
+    placed, places = placed_boxes(route, boxes, t_s, poses), polar(poses, features.xy_m)
+    in_view = view.holds(*places)
+    out_of_sight = hidden(poses, features.xy_m, features.height_m, in_view, placed, view.eye_m)
+    rows = features.rows("normal", "new")
+    standing = (places[0][:, rows], places[1][:, rows])
+    visible = (in_view & ~out_of_sight)[:, rows]
+    looks, of = detected(view, options.points, features.take(rows), route.layer, t_ns, standing, visible, rng)
+    motion_ns, motion_s = _times(motion, MOTION_HZ, options.start_ns)
+    truth = DriveTruth(motion_ns, motion.poses(motion_s), poses, of, in_view, out_of_sight)
+    return looks, occluder_ranges(view, poses, placed), truth
 
 
 def _driven(
@@ -231,9 +239,9 @@ def _times(motion: RoadMotion, rate_hz: int, start_ns: int) -> tuple[IntArray, F
     return start_ns + offset_ns, offset_ns / _NS_PER_S
 
 
-def _motion_track(
-    motion: RoadMotion, t_ns: IntArray, t_s: FloatArray, errors: SensorErrors, rng: np.random.Generator
-) -> MotionTrack:
+def _motion_track(motion: RoadMotion, options: RoadDriveOptions, rng: np.random.Generator) -> MotionTrack:
+    errors = options.errors
+    t_ns, t_s = _times(motion, MOTION_HZ, options.start_ns)
     speed, yaw_rate = motion.speed_and_yaw_rate(t_s)
     scale, bias = 1.0 + errors.wheel_scale * rng.standard_normal(), errors.gyro_bias_radps * rng.standard_normal()
     speed = scale * speed + errors.wheel_mps * rng.standard_normal(len(t_s))
