@@ -1,5 +1,6 @@
 """Watchers of feature layers on a real router: their layers and region, nothing else; in the project and outside."""
 
+import json
 import queue
 import subprocess
 import sys
@@ -129,3 +130,20 @@ def printed(bus: Bus, lines: "queue.Queue[str]", key: str, notice: bytes) -> str
         except queue.Empty:
             continue
     raise AssertionError(f"nothing printed within {DEADLINE_S} s")
+
+
+def test_the_command_follows_several_layers(endpoint: str, bus: Bus, store: SqliteStore) -> None:
+    region = ["13033/03021/**", "--layer", "signs", "--layer", "streetlights", "--json", "--connect", endpoint]
+    command = [sys.executable, "-m", "deploy.cli", "watch", *region]
+    lines: queue.Queue[str] = queue.Queue()
+    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True, cwd=SUBSCRIBE.parents[1]) as process:
+        reader = threading.Thread(target=lambda: [lines.put(line.strip()) for line in process.stdout or ()])
+        reader.start()
+        try:
+            bus.publish(*next_notice(store, "poles", signs(HERE, 5)), kind="update")
+            for layer in ("signs", "streetlights"):
+                event = json.loads(printed(bus, lines, *next_notice(store, layer, signs(HERE, 3, 4))))
+                assert [event[name] for name in ("layer", "version", "put", "removed")] == [layer, 2, 1, 2]
+        finally:
+            process.kill()
+            reader.join(DEADLINE_S)
