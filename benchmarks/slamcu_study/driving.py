@@ -177,10 +177,12 @@ class _Poses:
         return filtered.pose() if what == "look" else None
 
 
-def verdicts_of(drive: RoadDrive, driven: Driven) -> Verdicts:
+def verdicts_of(
+    drive: RoadDrive, driven: Driven, map_confidence: float = SlamcuParameters().map_confidence
+) -> Verdicts:
     """Return what a drive says of its signs, with what the truth tells of how it came about."""
     truth = sign_truth(drive.route)
-    sign, t_s, masses = _traces(drive, driven, truth)
+    sign, t_s, masses = _traces(drive, driven, truth, map_confidence)
     in_view, hidden = drive.truth.in_view[driven.look], drive.truth.hidden[driven.look]
     new = driven.new
     return Verdicts(
@@ -240,10 +242,12 @@ def _seen_from(pose: F64, true: F64, place: F64) -> F64:
     return np.asarray(pose[:, :2] + np.column_stack([c * x - s * y, s * x + c * y]))
 
 
-def _traces(drive: RoadDrive, driven: Driven, truth: SignTruth) -> tuple[I64, F64, F64]:
-    """Masses over time of deleted and new signs: sign, seconds, masses (Q, 3)."""
+def _traces(drive: RoadDrive, driven: Driven, truth: SignTruth, map_confidence: float) -> tuple[I64, F64, F64]:
+    """Masses over time of deleted and new signs, those of the map from λ_HD on: sign, seconds, masses (Q, 3)."""
     begin_ns, rows = int(drive.motion.t_ns[0]), []
     for sign, one in _told(driven, truth):
+        if isinstance(one, KnownState) and one.history:
+            rows.append((sign, (one.history[0].t_ns - begin_ns) * 1e-9, map_confidence, 0.0, 1.0 - map_confidence))
         for step in one.history:
             masses = step.existence
             rows.append((sign, (step.t_ns - begin_ns) * 1e-9, masses.exist, masses.absent, masses.unknown))

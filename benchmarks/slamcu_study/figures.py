@@ -68,17 +68,17 @@ def outliers(masses: F64, against: int) -> I64:
 
 
 def most_telling(found: Verdicts, signs: I64, right: int) -> int | None:
-    """Return, of the signs (N,) that end in the right state, the one with the earliest outliers after the first
-    evidence; None where no sign has a trace.
+    """Return, of the signs (N,) that soon come to the right state, the one in which an outlier shows most; None where
+    no sign has a trace.
     """
     wrong = EXIST if right == ABSENT else ABSENT
-    best: tuple[tuple[bool, bool, int, int], int] | None = None
+    best: tuple[tuple[bool, float], int] | None = None
     for sign in signs.tolist():
-        masses = found.trace_masses[found.trace_sign == sign]
+        masses = found.trace_masses[found.trace_sign == sign][:_SHOWN_STEPS]
         if len(masses) < 2:
             continue
-        early = [step for step in outliers(masses, wrong).tolist() if step < _SHOWN_STEPS]
-        rank = (bool(masses[-1, :3].argmax() != right), not early, len(early), -len(masses))
+        grown = float(np.diff(masses[:, wrong]).max(initial=0.0))
+        rank = (bool(masses[-1].argmax() != right), -grown)
         if best is None or rank < best[0]:
             best = (rank, sign)
     return None if best is None else best[1]
