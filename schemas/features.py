@@ -143,10 +143,11 @@ def check_feature_bytes(data: bytes) -> None:
     """Refuse, without parsing it, a message whose feature report is larger than one may be, or of too many tiles.
 
     Raises:
-        TooLarge: more bytes or fields.
+        TooLarge: more bytes or fields, or reports: a parser would make one large report of many.
         Malformed: the bytes are not fields.
     """
-    for report in submessages("ChangeReport", data, _NUMBER):
+    for count, report in enumerate(submessages("ChangeReport", data, _NUMBER), start=1):
+        check_length("ChangeReport", count, 1, "reports of features")
         check_length(_NAME, len(data), limits.MAX_FEATURE_REPORT_BYTES, "bytes")
         check_field_count(_NAME, report, limits.MAX_REPORT_FIELDS)
 

@@ -211,6 +211,12 @@ def test_a_million_empty_tiles_are_refused_before_they_are_parsed() -> None:
         decode_upload(data)
 
 
+def test_many_reports_in_one_message_do_not_become_a_large_one() -> None:
+    some = b"\x6a" + varint(2_000) + b"\x4a\x00" * 1_000
+    with pytest.raises(TooLarge, match="ChangeReport has 2 reports of features, the limit is 1"):
+        decode_upload(b"\x08\x01" + some * 400)
+
+
 def test_a_report_larger_than_a_reader_takes_is_not_sent() -> None:
     long = found(attributes=tuple((f"{number:03}", f"{number:03}" * 300) for number in range(200)))
     tiles = tuple(type(TILE)(TILE.district.first_morton + k) for k in range(6))
