@@ -214,3 +214,18 @@ def test_messages_whose_columns_do_not_agree_are_refused() -> None:
     torn.lengths[0] = 2
     with pytest.raises(BadValue, match="3 x, 3 y for 2 points"):
         lanes_of(torn)
+
+
+def test_bytes_that_are_in_recordings_already_are_still_read_and_written() -> None:
+    detections = (
+        "0a060880e2cfaa06120663616d6572611a057369676e73220c747261666669635f7369676e220864653237345f35302a080000803f0000a0"
+        "423208db0f49c0db0f49403a08000080bf0000a04042083333333f3333333f4a088fc2f53c8fc2f53c"
+    )
+    markings = (
+        "0a060880e2cfaa06120202031a14000000000000004000000000000000400000804022140000803f000040400000803f000040400000a040"
+        "29000000000000e03f317b14ae47e17a943f"
+    )
+    assert detections_message_of(look()).SerializeToString(deterministic=True).hex() == detections
+    assert lane_message_of(lanes(T0_NS, 2, 3)).SerializeToString(deterministic=True).hex() == markings
+    assert same_look(detections_of(detections_pb2.Detections.FromString(bytes.fromhex(detections))), look())
+    assert same_lanes(lanes_of(lane_look_pb2.LaneLook.FromString(bytes.fromhex(markings))), lanes(T0_NS, 2, 3))
