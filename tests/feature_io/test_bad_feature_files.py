@@ -169,8 +169,8 @@ def point(position: object, **properties: object) -> dict[str, object]:
 
 
 OURS = {
-    "layer": "poles", "kind": "pole", "state": "exist", "exist": 0.9, "absent": 0.0, "unknown": 0.1, "conflict": 0.0,
-    "hits": 0, "vehicles": 0, "sigma_m": 1.0, "cov_m2": [1.0, 0, 0, 1.0, 0, 1.0], "attributes": {},
+    "feature_id": "5", "layer": "poles", "kind": "pole", "state": "exist", "exist": 0.9, "absent": 0.0, "unknown": 0.1,
+    "conflict": 0.0, "hits": 0, "vehicles": 0, "sigma_m": 1.0, "cov_m2": [1.0, 0, 0, 1.0, 0, 1.0], "attributes": {},
 }  # fmt: skip
 GND = {"gnd": {"format": 1}}
 CRS = {"type": "name", "properties": {"name": "urn:ogc:def:crs:EPSG::25832"}}
@@ -202,8 +202,10 @@ GEOJSON = [
         "crosses itself",
     ),
     (geojson(*[point([8, 49], kind="pole") | {"id": "a"}] * 2), errors.DuplicateId, "same id"),
-    (geojson(point([8, 49], kind="pole"), **GND), errors.BadElement, "lacks the properties absent, conflict, cov_m2"),
-    (geojson(point([8, 49], **OURS), **GND), errors.BadElement, "'id'"),
+    (geojson(point([8, 49], kind="pole"), **GND), errors.BadElement, "lacks the properties absent, conflict"),
+    (geojson(point([8, 49], **OURS | {"feature_id": "x"})), errors.BadElement, "invalid literal for int()"),
+    (geojson(point([8, 49], **OURS | {"attributes": "["})), errors.NotWellFormed, "not well-formed JSON"),
+    (geojson(point([8, 49], **OURS | {"attributes": [1]})), errors.BadElement, "attributes"),
     (geojson(point([8, 49], **OURS | {"exist": 0.3}) | {"id": "5"}, **GND), errors.BadElement, "sum to"),
     (geojson(point([8, 49], **OURS | {"cov_m2": [1]}) | {"id": "5"}, **GND), errors.BadGeometry, "covariance of"),
 ]  # fmt: skip

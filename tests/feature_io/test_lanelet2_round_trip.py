@@ -1,5 +1,6 @@
 """A Lanelet2 map comes back from a store as it was; what changed in the store has changed in it, and nothing else."""
 
+import json
 import re
 import xml.etree.ElementTree as ET
 from dataclasses import replace
@@ -216,3 +217,25 @@ def test_a_new_file_holds_what_a_store_without_one_has(street: SqliteStore, tmp_
 def test_options_come_back_as_they_were_kept() -> None:
     options = ImportOptions({"pole": "posts"}, "rest", None, True, 12.5, 0.2, 0.3, 0.8)
     assert options_about(about_options(options)) == options
+
+
+def test_what_an_editor_of_geojson_changes_goes_into_the_lanelet2_file(street: SqliteStore, tmp_path: Path) -> None:
+    """As QGIS saves it: without the mark of the whole, attributes as text."""
+    export_features(street, tmp_path / "edit.geojson")
+    told = json.loads((tmp_path / "edit.geojson").read_text("utf-8"))
+    del told["gnd"]
+    told["features"] = [one for one in told["features"] if one["properties"]["kind"] != "traffic_sign"]
+    for one in told["features"]:
+        del one["id"]
+        one["properties"]["attributes"] = json.dumps(one["properties"]["attributes"])
+        if one["properties"]["kind"] == "pole":
+            one["geometry"]["coordinates"][2] += 1.0
+    result = put(street, write(tmp_path, "edit.geojson", json.dumps(told)), source=SOURCE)
+    assert (result.removed, dict(result.features)) == (1, {"lanes": 2, "poles": 1})
+    data = exported(street, tmp_path / "back.osm")
+    assert b'<tag k="ele" v="112.0000"/>\n    <tag k="type" v="pole"/>' in data
+    ids = {element.attrib.get("id") for element in ET.fromstring(data)}
+    assert {"5", "6", "12"}.isdisjoint(ids)
+    again = [line for line in STREET.splitlines() if not re.search(rb"id='(5|6|12|21)'", line)]
+    left = [line for line in data.splitlines() if not re.search(rb"id='21'", line)]
+    assert sum(a != b for a, b in zip(again, left, strict=True)) == 2  # the pole's position and its height

@@ -48,6 +48,7 @@ def properties_of(feature: MapFeature) -> dict[str, Any]:
     """What a feature is, without its place."""
     existence = feature.existence
     return {
+        "feature_id": str(feature.feature_id),
         "layer": feature.layer,
         "kind": feature.kind,
         "state": existence.state,

@@ -16,7 +16,7 @@ from gnd_map.errors import GndError
 from gnd_map.features import Existence, feature_id_of, is_feature_layer
 from gnd_map.features.feature import KIND_PATTERN
 from schemas.wire import LAYER_PATTERN
-from tile_store.feature_io.errors import BadElement, BadGeometry, FileTooLarge, UnknownFormat
+from tile_store.feature_io.errors import BadElement, BadGeometry, FeatureFileError, FileTooLarge, UnknownFormat
 from tile_store.feature_io.geojson_export import FORMAT_VERSION, MEMBER
 from tile_store.feature_io.json_file import as_text, member, read_json, real_number
 from tile_store.feature_io.osm_document import Progress
@@ -34,7 +34,7 @@ MAX_FEATURES: Final = 1_000_000
 _EVERY: Final = 4096
 _WGS84: Final = ("urn:ogc:def:crs:OGC:1.3:CRS84", "urn:ogc:def:crs:OGC::CRS84", "EPSG:4326")
 _OURS: Final = frozenset(
-    {"layer", "kind", "state", "exist", "absent", "unknown", "conflict", "sigma_m", "cov_m2", "hits", "vehicles"}
+    {"feature_id", "layer", "kind", "exist", "absent", "unknown", "conflict", "cov_m2", "hits", "vehicles"}
 )
 
 
@@ -158,8 +158,8 @@ def _feature(
     has_height = len(_first_position(item)) == 3
     line_m = line[:, 2] + options.height_offset_m
     place = (np.radians(line[:, 1]), np.radians(line[:, 0]), line_m)
-    if reading.ours:
-        return _of_ours(where, item, properties, kind, place, options)
+    if reading.ours or properties.keys() >= _OURS:  # editors lose the mark of the whole, not the properties
+        return _of_ours(where, properties, kind, place, options)
     rest = {str(k): as_text(v) for k, v in properties.items() if k not in ("kind", "layer") and v is not None}
     name = (item["id"],) if isinstance(item.get("id"), (str, int)) else ("at", at[0])
     return MapFeature(
@@ -190,7 +190,6 @@ def _layer(properties: dict[str, Any], kind: str, options: ImportOptions) -> str
 
 def _of_ours(
     where: str,
-    item: dict[str, Any],
     properties: dict[str, Any],
     kind: str,
     place: tuple[F64, F64, F64],
@@ -202,16 +201,22 @@ def _of_ours(
         raise BadElement(f"{where}: lacks the properties {', '.join(absent)}")
     try:
         masses = (real_number(where, properties[key]) for key in ("exist", "absent", "unknown", "conflict"))
-        attributes = attributes_of(
-            {str(k): as_text(v) for k, v in member(where, properties, "attributes", dict).items()}
-        )
+        attributes = attributes_of({str(k): as_text(v) for k, v in _attributes(where, properties).items()})
         cov_m2 = np.array([real_number(where, v) for v in properties["cov_m2"]], np.float64)
         return MapFeature(
-            int(item["id"]), kind, _layer(properties, kind, options), *place, cov_m2=cov_m2,
+            int(properties["feature_id"]), kind, _layer(properties, kind, options), *place, cov_m2=cov_m2,
             existence=Existence(*masses), attributes=attributes, name=where,
             hits=int(properties["hits"]), vehicles=int(properties["vehicles"]),
         )  # fmt: skip
-    except (BadElement, BadGeometry):
+    except FeatureFileError:
         raise
     except (GndError, KeyError, TypeError, ValueError) as error:
         raise BadElement(f"{where}: {error}") from None
+
+
+def _attributes(where: str, properties: dict[str, Any]) -> dict[str, Any]:
+    """An object; some editors write it as text."""
+    told = properties.get("attributes") or {}
+    value = read_json(told.encode(), where) if isinstance(told, str) else told
+    found: dict[str, Any] = member(where, {"attributes": value}, "attributes", dict)
+    return found

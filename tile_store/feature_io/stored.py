@@ -79,7 +79,7 @@ def import_features(
     old = known[source].ids if source in known else {}
     puts, removed = _puts(store, file, old, progress)
     ids = {layer: tuple(sorted(f.feature_id for f in file.features if f.layer == layer)) for layer in file.layers}
-    kept = Source(source, file.format, ids, options or {}, file.document or b"")
+    kept = _kept(Source(source, file.format, ids, options or {}, file.document or b""), known.get(source))
 
     def work(c: apsw.Connection, now: int) -> int:
         published = sum(_put(c, one, now) for one in puts)
@@ -90,6 +90,13 @@ def import_features(
     return ImportResult(
         source, file.format, file.layers, removed, published, len(puts) - published, file.left_out, file.notes
     )
+
+
+def _kept(new: Source, before: Source | None) -> Source:
+    """What is kept of a source: features that come back from an editor without their document keep it."""
+    if before is None or new.document or not before.document:
+        return new
+    return Source(new.name, before.format, new.ids, before.options, before.document)
 
 
 def _put(c: apsw.Connection, one: _Put, now: int) -> bool:
