@@ -40,10 +40,9 @@ def prior_of(track: Track, parameters: FeatureMergeParameters) -> Existence:
     return VACUOUS if track.epoch is None else capped(track.epoch.existence, parameters.prior)
 
 
-def verdict(track: Track, votes: Sequence[Vote], parameters: FeatureMergeParameters) -> Existence:
-    """What the map and these votes, one a vehicle, say together."""
-    said = [vote.existence.discounted(parameters.reliability) for vote in votes]
-    return capped(pooled([prior_of(track, parameters), *said]), parameters.ceiling)
+def verdict(prior: Existence, votes: Iterable[Existence], parameters: FeatureMergeParameters) -> Existence:
+    """What the map (`prior_of`) and votes, one a vehicle and discounted already, say together."""
+    return capped(pooled([prior, *votes]), parameters.ceiling)
 
 
 def add_views(

@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from cloud_merger.features.association import HEIGHT_KNOWN_M2
-from cloud_merger.features.existence import verdict
+from cloud_merger.features.existence import prior_of, verdict
 from cloud_merger.features.parameters import FeatureMergeParameters
 from cloud_merger.features.rls import Place, estimate, fused, step
 from cloud_merger.features.shapes import length_of
@@ -44,6 +44,15 @@ def outcome_of(tile: TileId, track: Track, parameters: FeatureMergeParameters) -
     return Outcome(story.shown if story.is_published else None, story.now(), story.witnesses())
 
 
+@dataclass(frozen=True, slots=True)
+class _Cast:
+    """A vehicle's vote, of which report, and what it weighs: its evidence, discounted."""
+
+    report: int
+    vote: Vote
+    weight: Existence
+
+
 class _Story:
     """A hypothesis after some of its reports."""
 
@@ -53,7 +62,9 @@ class _Story:
         self._known = None if known is None else Place.of(known.points_m, known.cov_m2)
         self.shown: Feature | None = track.epoch
         self.is_published = known is not None
-        self._votes: dict[str, tuple[int, Vote]] = {}  # the newest of each vehicle, the newest last
+        self._prior = prior_of(track, parameters)
+        self._masses = self._prior
+        self._votes: dict[str, _Cast] = {}  # the newest of each vehicle, the newest last
         self._measured: dict[str, list[Measured]] = {}
         self._state: Place | None = self._known
         self._is_stale = False
@@ -71,7 +82,8 @@ class _Story:
         if report in self._track.votes:
             vote = self._track.votes[report]
             self._votes.pop(vote.vehicle, None)
-            self._votes[vote.vehicle] = report, vote
+            self._votes[vote.vehicle] = _Cast(report, vote, vote.existence.discounted(self._parameters.reliability))
+            self._masses = verdict(self._prior, (cast.weight for cast in self._newest()), self._parameters)
         self._decide()
         if self.is_published:
             self._renew(is_new)
@@ -107,21 +119,18 @@ class _Story:
             return self._track.state  # quoted from an older version, measured by nobody since
         return estimate(each, self._known)
 
-    def _newest(self) -> list[tuple[int, Vote]]:
+    def _newest(self) -> list[_Cast]:
         return list(self._votes.values())[-self._parameters.voters :]
 
     def _sides(self) -> tuple[list[int], list[int]]:
         """Reports that vote for it, and against it; one a vehicle."""
-        newest = [(report, vote.existence.state) for report, vote in self._newest()]
+        newest = [(cast.report, cast.vote.existence.state) for cast in self._newest()]
         return [r for r, state in newest if state == "exist"], [r for r, state in newest if state == "absent"]
-
-    def _masses(self) -> Existence:
-        return verdict(self._track, [vote for _, vote in self._newest()], self._parameters)
 
     def _decide(self) -> None:
         """Published when enough different vehicles say that it exists and their mass wins; gone likewise."""
         ayes, noes = self._sides()
-        state = self._masses().state
+        state = self._masses.state
         if not self.is_published and len(ayes) >= self._parameters.min_vehicles and state == "exist":
             self.is_published, self.shown = True, self.shown or self._first_shown()
         elif self.is_published and len(noes) >= self._parameters.min_vehicles and state == "absent":
@@ -130,7 +139,7 @@ class _Story:
     def _first_shown(self) -> Feature:
         quoted = self._track.quoted
         enough = len(self._measured) >= self._parameters.min_vehicles
-        return self.now() if quoted is None or enough else replace(quoted, existence=self._masses())
+        return self.now() if quoted is None or enough else replace(quoted, existence=self._masses)
 
     def _renew(self, is_new: bool) -> None:
         shown = self.shown
@@ -140,11 +149,10 @@ class _Story:
             self.shown = self.now()
             return
         ayes, noes = self._sides()
-        masses = self._masses()
-        change = masses.exist - shown.existence.exist
+        change = self._masses.exist - shown.existence.exist
         agree = len(ayes if change > 0 else noes) >= self._parameters.min_vehicles
         if agree and abs(change) > self._parameters.renewal_mass:
-            self.shown = replace(shown, existence=masses)
+            self.shown = replace(shown, existence=self._masses)
 
     def _is_worth_it(self, shown: Feature) -> bool:
         """Whether the estimate is surer than the published one by the gain, or farther from it than its sigma."""
@@ -161,8 +169,7 @@ class _Story:
     def now(self) -> Feature:
         """The feature as all reports so far have it."""
         place, known = self._place(), self._track.epoch or self._track.quoted
-        votes = [vote for _, vote in self._votes.values()]
-        ayes = [vote for vote in votes if vote.existence.state == "exist"]
+        ayes = [cast.vote for cast in self._votes.values() if cast.vote.existence.state == "exist"]
         hits = sum(vote.hits for vote in ayes)
         begun = known or Feature(
             self._track.feature_id, self._track.kind, place.points_m, place.six(), attributes=self._agreed()
@@ -171,7 +178,7 @@ class _Story:
             begun,
             points_m=place.points_m,
             cov_m2=place.six(),
-            existence=self._masses(),
+            existence=self._masses,
             hits=min(hits + begun.hits, MAX_COUNT),
             vehicles=max(len(ayes), begun.vehicles),
         )
@@ -197,4 +204,4 @@ class _Story:
     def witnesses(self) -> tuple[int, ...]:
         """Reports on the winning side."""
         state = "exist" if self.is_published else "absent"
-        return tuple(sorted(report for report, vote in self._votes.values() if vote.existence.state == state))
+        return tuple(sorted(cast.report for cast in self._votes.values() if cast.vote.existence.state == state))
