@@ -29,6 +29,10 @@ def run_agent(config: AgentConfig, stop: threading.Event) -> dict[str, Any]:
         GndError: the recording, a file or the bus cannot be used; the message says which and what to do.
     """
     keep_small()
+    if config.localise_by == "graph":  # no LiDAR: features are mapped stretch by stretch
+        from vehicle_agent.features.mapper import run_mapper
+
+        return run_mapper(config, stop)
     with open_vehicle(config, stop) as vehicle:
         for item in vehicle.drive():  # recording -> usable measurements in time order
             if isinstance(item, Scan):

@@ -100,6 +100,8 @@ class AgentConfig:
     download: DownloadParameters = field(default_factory=DownloadParameters)
     report: ReportParameters = field(default_factory=ReportParameters)
     features: FeatureParameters = field(default_factory=FeatureParameters)
+    localise_by: Literal["lidar", "graph"] = "lidar"
+    """Scans on the voxel map; or, without LiDAR, one graph of motion, GNSS, features and lanes for each stretch."""
 
     def __post_init__(self) -> None:
         """A name and a pace that can work."""
@@ -109,6 +111,10 @@ class AgentConfig:
             raise AgentConfigError(f"layer = {self.layer!r} holds features; that of the voxel map begins with ndt")
         if not 0 <= self.pace < float("inf"):
             raise AgentConfigError(f"pace = {self.pace}: 0 is as fast as possible, 1 real time")
+        if self.localise_by not in ("lidar", "graph"):
+            raise AgentConfigError(f"localise_by = {self.localise_by!r}: there are 'lidar' and 'graph'")
+        if self.localise_by == "graph" and not self.features.layers:
+            raise AgentConfigError("a vehicle without LiDAR maps features: name at least one feature layer")
         if self.report.left_behind_m <= self.detect.range_max_m:
             raise AgentConfigError(
                 f"left_behind_m = {self.report.left_behind_m} must exceed the range of detection,"

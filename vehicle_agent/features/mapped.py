@@ -1,0 +1,106 @@
+"""What a mapped stretch says of each tile: features found, map features judged, and where was looked."""
+
+from collections import defaultdict
+from math import nan
+
+import numpy as np
+
+from gnd_map.arrays import F64, I64
+from gnd_map.tile_id import TileId
+from schemas.features import FeatureChange, Found, Seen
+from vehicle_agent.features.coverage import Coverage, CoverageParameters
+from vehicle_agent.features.feature_drive import FeatureDrive
+from vehicle_agent.features.feature_map import place_in_tile, with_height
+from vehicle_agent.features.held_map import HeldMap
+from vehicle_agent.features.layer import of_counts
+from vehicle_agent.features.layer_parameters import LayerParameters
+from vehicle_agent.features.new_layer import NewLayer
+from vehicle_agent.features.view import wrapped
+
+
+def changes_of(
+    found: NewLayer,
+    drive: FeatureDrive,
+    held: HeldMap,
+    layer: LayerParameters,
+    coverage: CoverageParameters,
+    height_m: float,
+) -> list[FeatureChange]:
+    """What is reported of a stretch, tile by tile.
+
+    Args:
+        found: the graph's result.
+        drive: the stretch.
+        held: what the map says.
+        layer: whose features they are.
+        coverage: when a place counts as looked at.
+        height_m: stands in for heights, which the plane does not tell; map frame.
+    """
+    times = np.array([look.t_ns for look in drive.looks], np.int64)
+    poses = found.path.at(times[(times >= found.path.t_ns[0]) & (times <= found.path.t_ns[-1])])
+    looked = Coverage(held.frame, layer.view, layer.height_m, coverage)
+    for x_m, y_m, heading_rad in poses.tolist():
+        looked.look(x_m, y_m, heading_rad, None)
+    seen, new = _seen(found, held, layer, poses, height_m), _found(found, held, layer, height_m)
+    tiles = held.tiles(layer.name)
+    return [
+        FeatureChange(
+            tile=tile_id,
+            base_version=tiles[tile_id].version if tile_id in tiles else 0,
+            base_sha=tiles[tile_id].sha if tile_id in tiles else b"",
+            viewed=looked.viewed(tile_id),
+            seen=tuple(sorted(seen[tile_id], key=lambda one: one.feature_id)),
+            found=tuple(new[tile_id]),
+        )
+        for tile_id in sorted({*looked.tiles, *seen, *new})
+    ]
+
+
+def _found(found: NewLayer, held: HeldMap, layer: LayerParameters, height_m: float) -> dict[TileId, list[Found]]:
+    """The features that the map has not."""
+    features, new = found.features, defaultdict[TileId, list[Found]](list)
+    for n in np.flatnonzero(features.known_id == 0).tolist():
+        hits = int(features.hits[n])
+        point, cov = with_height(features.xy_m[n], features.cov_m2[n], nan, 1.0, height_m)
+        tile_id, points, six = place_in_tile(held.frame, point, cov)
+        existence = of_counts(hits, 0, layer.detection_confidence)
+        new[tile_id].append(Found(features.kinds[n], points, six, existence, hits))
+    return new
+
+
+def _seen(
+    found: NewLayer, held: HeldMap, layer: LayerParameters, poses: F64, height_m: float
+) -> dict[TileId, list[Seen]]:
+    """Verdicts on map features that were in view: measured independently of the map, or missed."""
+    seen: dict[TileId, list[Seen]] = defaultdict(list)
+    rows = {int(one): n for n, one in enumerate(found.features.known_id) if one}
+    for tile_id, tile in held.tiles(layer.name).items():
+        one_tile = HeldMap(held.frame)
+        one_tile.put(layer.name, tile_id, tile)
+        known = one_tile.known(layer.name, layer.kinds)
+        looks = looks_at(known.xy_m, poses, layer)
+        for feature_id, n_looks in zip(known.feature_id.tolist(), looks.tolist(), strict=True):
+            row = rows.get(feature_id)
+            hits = 0 if row is None else int(found.features.hits[row])
+            if hits + n_looks == 0:
+                continue
+            existence = of_counts(hits, max(n_looks - hits, 0), layer.detection_confidence)
+            if row is None:
+                seen[tile_id].append(Seen(feature_id, existence))
+                continue
+            xy_m, cov_m2 = found.features.xy_m[row], found.features.cov_m2[row]
+            point, cov = with_height(xy_m, cov_m2, nan, 1.0, height_m)
+            _, points, six = place_in_tile(held.frame, point, cov, tile_id)
+            seen[tile_id].append(Seen(feature_id, existence, hits, points[0], six))
+    return seen
+
+
+def looks_at(xy_m: F64, poses: F64, layer: LayerParameters) -> I64:
+    """In how many looks from `poses` (L, 3) each of the places (N, 2) was well inside the field of view, (N,)."""
+    if not len(xy_m) or not len(poses):
+        return np.zeros(len(xy_m), np.int64)
+    away = xy_m[:, None] - poses[None, :, :2]
+    range_m = np.hypot(away[..., 0], away[..., 1])
+    bearing = wrapped(np.arctan2(away[..., 1], away[..., 0]) - poses[None, :, 2])
+    inside = layer.view.inside(range_m, bearing, 0.1 * layer.range_m, 0.1 * layer.view.field_rad)
+    return np.asarray(inside.sum(axis=1), np.int64)
