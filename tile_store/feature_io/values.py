@@ -40,8 +40,8 @@ LAYER_OF_KIND: Final[Mapping[str, str]] = {
 
 LEFT_OUT: Final = "-"
 """Instead of a layer: features of this kind are not imported."""
-SURE: Final = 0.9
-"""How sure a map is that what it holds exists (λ_HD of SLAMCU, section 5), unless told otherwise."""
+SURE: Final = 0.95
+"""How sure a map is that what it holds exists (λ_HD; SLAMCU, section 6.2), unless told otherwise."""
 SIGMA_M: Final = 0.1
 """One sigma of an axis of what a file holds, which no format but our GeoJSON states; HD maps are within 10 to 20 cm
 (SLAMCU, section 1)."""
