@@ -1,6 +1,8 @@
 """The main job as a newcomer runs it, in small: a simulated street that has changed is healed by a fleet."""
 
+import json
 from pathlib import Path
+from typing import Any
 
 import pytest
 from fleet_testing import Run
@@ -10,10 +12,24 @@ from fleet_sim.truth import LEVELS
 pytestmark = [pytest.mark.slow, pytest.mark.timeout(600)]
 
 SEED = 301  # never used for tuning
+LAYERS = ("ndt", "signs", "streetlights")
+
+
+def assert_features_are_healed(features: dict[str, Any]) -> None:
+    """Signs that went, came and stayed; lamps, of which the map before had none."""
+    signs, lamps = features["signs"], features["streetlights"]
+    assert signs["before"]["all"] < signs["single"]["all"] < signs["after"]["all"]
+    assert signs["after"]["all"] >= 85.0
+    assert signs["after"]["new_error_m"] <= 0.3
+    assert lamps["before"]["new"] == 0.0
+    assert lamps["after"]["new"] >= 60.0
+    assert lamps["after"]["false"] <= 2
+    assert lamps["after"]["new_error_m"] <= 0.05
 
 
 def test_a_simulated_fleet_heals_its_map(tmp_path: Path) -> None:
-    run = Run(tmp_path / "run", "--agents", "4", "--link", "3g", "--world-seed", str(SEED), timeout_s=500)
+    options = ("--agents", "4", "--link", "3g", "--world-seed", str(SEED), "--layers", ",".join(LAYERS))
+    run = Run(tmp_path / "run", *options, timeout_s=540)
     summary = run.finish()
 
     assert summary["agents"] == 4
@@ -32,6 +48,10 @@ def test_a_simulated_fleet_heals_its_map(tmp_path: Path) -> None:
     assert p95["lateral_m"] <= 0.05
     assert p95["heading_deg"] <= 0.1
     assert summary["agent_pss_mb_max"] <= 210.0  # 150 without the scans that segmentation holds: docs/decisions/0041
+
+    assert_features_are_healed(summary["features"])
+    lines = [json.loads(line) for line in (tmp_path / "run" / "updates.jsonl").read_text().splitlines()]
+    assert {line["layer"] for line in lines} == set(LAYERS)
 
     for name in ("map_before.png", "map_after.png", "truth.png", "healing.png", "store.sqlite", "updates.jsonl"):
         assert (tmp_path / "run" / name).stat().st_size > 0
