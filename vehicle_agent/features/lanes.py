@@ -30,7 +30,7 @@ ASIDE_STEP_M = 0.25
 ASIDE_SIGMA_M = 2.5  # what the first poses may be off by to either side
 SMOOTH = 8  # windows before and after that search together
 MARGIN_M = 5.0  # more of the map than of what is seen
-SEEN_M = (5.0, 45.0)  # ahead of the vehicle: the part of lanes that GICP is given
+SEEN_M = (5.0, 35.0)  # ahead of the vehicle: the part of lanes that GICP is given
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -131,12 +131,14 @@ class LaneMatcher:
         A, g = _normal_equations(c, c.window, len(self.keys))
         few = np.bincount(c.window, minlength=len(self.keys)) < self.parameters.min_polylines
         A[few] = 0.0
-        return WindowMatch(self.keys, base, *solved(A, -g))
+        off, information, strong = solved(A, -g)
+        return WindowMatch(self.keys, base, off, self.parameters.information * information, strong)
 
     def _polished(self, found: WindowMatch, c: _Chosen, rows: I64) -> F64:
         """(W, 3) what the poses of windows are off by GICP, Eq. (8), where lanes say it well."""
         pairs, group = np.unique(np.stack([c.window, c.lane], axis=1), axis=0, return_inverse=True)
-        of_lane = solved(*_normal_equations(c, group.ravel(), len(pairs)))[0]
+        off, _, strong = solved(*_normal_equations(c, group.ravel(), len(pairs)))
+        of_lane = np.einsum("nij,nj->ni", strong, off)
         off = found.off.copy()
         for row in rows:
             of = np.flatnonzero(pairs[:, 0] == row)

@@ -97,6 +97,8 @@ class LaneParameters:
     max_correspondence_m: of GICP.
     min_polylines: a window of fewer polylines is not matched.
     map_sigma_m: of the HD map itself.
+    information: the share of what polylines would say if it were certain which lane each is. With the paper's noise
+        some are taken for their neighbour; with 0.75 the squared errors of features are as large as they should be.
     robust_k: Huber's k of a window's match, in sigmas.
     """
 
@@ -109,11 +111,14 @@ class LaneParameters:
     max_correspondence_m: float = 1.5
     min_polylines: int = 3
     map_sigma_m: float = 0.01
+    information: float = 0.75
     robust_k: float = 3.0
 
     def __post_init__(self) -> None:
         if min(self.sigma_m, self.sigma_rad, self.window_m, self.beside_m, self.gate, self.max_correspondence_m) <= 0:
             raise ValueError(f"sigmas, window_m, beside_m, gate and max_correspondence_m must be > 0, got {self}")
+        if not 0.0 < self.information <= 1.0:
+            raise ValueError(f"information must be in (0, 1], got {self.information}")
         if self.search_m < 0 or self.min_polylines < 1 or self.map_sigma_m < 0 or self.robust_k <= 0:
             raise ValueError(f"search_m, map_sigma_m >= 0, min_polylines >= 1 and robust_k > 0 required, got {self}")
 
