@@ -115,8 +115,8 @@ def score_features(
         layer: which layer.
         tiles: the layer's tiles now; those of the map before where nothing was published since.
         tolerance_m: see TOLERANCE_M.
-        only: ids of the truth that count; None: those beside the stretch that is driven. What lies at the others is
-            neither right nor wrong.
+        only: ids of the truth that count; None: those that can be seen from the stretch that is driven (`driven`). What
+            lies at the others is neither right nor wrong.
 
     Raises:
         EvaluationError: the tolerance is not positive.
@@ -150,13 +150,16 @@ def score_features(
 
 
 def driven(truth: FeatureTruth) -> tuple[TrueFeature, ...]:
-    """Return the features beside the stretch that is driven; beyond its ends nobody looks long enough."""
+    """Return the features beside the stretch that is driven, but for those inside something that was put there.
+
+    Beyond the ends of the stretch nobody looks long enough.
+    """
     features = truth.features
     if not features:
         return ()
     street = truth.world.street_of_map(np.array([f.position_map_m for f in features]))
     inside = np.abs(street[:, 0]) <= truth.world.half_length_m
-    return tuple(f for f, held in zip(features, inside.tolist(), strict=True) if held)
+    return tuple(f for f, held in zip(features, inside.tolist(), strict=True) if held and not f.buried)
 
 
 def tiles_of_one_drive(

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fleet_sim.errors import WorldError
-from fleet_sim.shapes import Block
+from fleet_sim.shapes import Ball, Block, Post, Shape
 from fleet_sim.world import World, WorldObject
 from gnd_map.features import UNKNOWN_HEIGHT_M2, Feature, FeatureTile, feature_id_of, points_in_tile, prior
 from gnd_map.tile_id import TileId
@@ -29,6 +29,7 @@ MAP_CONFIDENCE: Final = 0.95
 """λ_HD of Jo et al., section 6.2."""
 SAME_PLACE_M: Final = 0.05
 """A thing that was changed but moved less is the same feature."""
+_EYE_M: Final = 1.5
 _SURVEY: Final = 61
 _MAPPED: Final = 63
 
@@ -44,6 +45,7 @@ class TrueFeature:
         state: "normal" (the map before has it, and it stands), "deleted" (the map has it, and it is gone), "new".
         position_map_m: map frame: the middle of a sign's plate, else the foot of the post.
         moved: a deleted one stands elsewhere now, or a new one stood elsewhere.
+        buried: it stands, but inside something that was put there: a container, a shop. Nobody can see it.
     """
 
     feature_id: int
@@ -53,6 +55,7 @@ class TrueFeature:
     state: FeatureClass
     position_map_m: tuple[float, float, float]
     moved: bool = False
+    buried: bool = False
 
 
 @dataclass(frozen=True, slots=True)
@@ -132,7 +135,29 @@ def _feature(world: World, name: str, o: WorldObject, state: FeatureClass, *, mo
     x, y, z = world.map_of_street(position_street_m(o)).tolist()
     layer = LAYER_OF[o.kind]
     number = feature_id_of("world", world.seed, layer, name, "after" if state == "new" else "before")
-    return TrueFeature(number, name, layer, KIND_OF[o.kind], state, (x, y, z), moved)
+    buried = state != "deleted" and is_buried(world, o)
+    return TrueFeature(number, name, layer, KIND_OF[o.kind], state, (x, y, z), moved, buried)
+
+
+def is_buried(world: World, o: WorldObject) -> bool:
+    """Return whether the middle of a sign's plate, or of a mast's lower 3 m, lies inside another solid afterwards."""
+    point = position_street_m(o) + (0.0 if o.kind == "sign" else np.array([0.0, 0.0, _EYE_M]))
+    others = (shape for other in world.in_state("after") if other.name != o.name for shape in other.shapes)
+    return any(holds(shape, point) for shape in others)
+
+
+def holds(shape: Shape, point: FloatArray) -> bool:
+    """Return whether a point (3,) of the street frame lies inside a primitive."""
+    dx, dy, z = point[0] - shape.x_m, point[1] - shape.y_m, point[2]
+    if isinstance(shape, Ball):
+        return bool(dx**2 + dy**2 + (z - shape.z_m) ** 2 <= shape.radius_m**2)
+    if isinstance(shape, Post):
+        return bool(dx**2 + dy**2 <= shape.radius_m**2 and shape.bottom_m <= z <= shape.top_m)
+    c, s = cos(shape.yaw_rad), sin(shape.yaw_rad)
+    along, across = c * dx + s * dy, c * dy - s * dx
+    top = shape.top_m + shape.rise_x * along + shape.rise_y * across
+    inside = abs(along) <= shape.half_x_m and abs(across) <= shape.half_y_m
+    return bool(inside and shape.bottom_m <= z <= top)
 
 
 def plate_of(sign: WorldObject) -> Block:

@@ -12,7 +12,8 @@ from fleet_sim import parts
 from fleet_sim.errors import EvaluationError, WorldError
 from fleet_sim.feature_files import read_feature_layers, write_feature_layers
 from fleet_sim.feature_scores import ClassScore, FeatureScore, driven, score_features, tiles_of_one_drive
-from fleet_sim.feature_truth import FeatureTruth, TrueFeature, base_features, feature_truth
+from fleet_sim.feature_truth import FeatureTruth, TrueFeature, base_features, feature_truth, holds
+from fleet_sim.shapes import Ball, Block, Post, Shape
 from fleet_sim.street import street
 from fleet_sim.world import Edit, State, World, WorldObject
 from gnd_map.features import Feature, FeatureTile, geodetic_in_tile, hit, points_in_tile
@@ -238,6 +239,32 @@ def test_one_drive_alone_is_scored_on_what_it_says(small: FeatureTruth) -> None:
         "deleted": (1, 0, 1),
         "new": (1, 0, 1),
     }
+
+
+def test_what_something_was_put_around_does_not_count(small: FeatureTruth) -> None:
+    kept = named(small, "kept", "normal")
+    shop = parts.slab(5.0, 15.0, -9.0, -6.0, 0.0, 3.0)
+    shed = parts.slab(5.0, 15.0, -9.0, -6.0, 0.0, 2.4)
+    for block, buried in ((shop, True), (shed, False)):
+        around = WorldObject("around", "building", ("after",), "added", (block,))
+        found = feature_truth(replace(small.world, objects=(*small.world.objects, around)))
+        assert named(found, "kept", "normal").buried is buried
+        assert (kept.feature_id in {f.feature_id for f in driven(found)}) is not buried
+    assert not any(f.buried for f in small.features)
+
+
+@pytest.mark.parametrize(
+    ("shape", "inside", "outside"),
+    [
+        (Block(1.0, 2.0, 2.0, 0.5, 0.0, 1.0, np.pi / 2), (1.4, 3.9, 0.5), (2.9, 2.1, 0.5)),
+        (Block(0.0, 0.0, 2.0, 2.0, 0.0, 1.0, rise_x=0.25), (1.9, 0.0, 1.4), (-1.9, 0.0, 0.6)),
+        (Post(0.0, 0.0, 0.2, 0.0, 3.0), (0.1, 0.1, 2.9), (0.15, 0.15, 1.0)),
+        (Ball(0.0, 0.0, 2.0, 1.0), (0.5, 0.5, 2.5), (0.6, 0.6, 2.6)),
+    ],
+)
+def test_points_inside_solids_are_told(shape: Shape, inside: tuple[float, ...], outside: tuple[float, ...]) -> None:
+    assert holds(shape, np.array(inside))
+    assert not holds(shape, np.array(outside))
 
 
 def test_scores_of_nothing_are_perfect_and_bad_tolerances_refused(small: FeatureTruth) -> None:
