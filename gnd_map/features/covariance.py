@@ -4,6 +4,7 @@ cov = L Lᵀ with L_ii = 1 mm · 1.05^k and L_ij = L_ii · t / 16: six small int
 covariance to some 3 % of each standard deviation, from 1 mm to 250 m.
 """
 
+from functools import lru_cache
 from math import ceil, log
 from typing import Final
 
@@ -48,7 +49,13 @@ def check_covariance(name: str, cov_m2: F64) -> None:
 
 def levels_of(cov_m2: F64) -> tuple[int, int, int, int, int, int]:
     """(k0, k1, k2, t10, t20, t21) of the lattice point next to a covariance."""
-    L = _factor(full_covariance(cov_m2))
+    return _levels_of(cov_m2.tobytes())
+
+
+@lru_cache(maxsize=4096)
+def _levels_of(six: bytes) -> tuple[int, int, int, int, int, int]:
+    """As `levels_of`; features of one map mostly share a few covariances."""
+    L = _factor(full_covariance(np.frombuffer(six, np.float64)))
     k = [max(_level(L[i, i]), _lowest(L[i, :i])) for i in range(3)]
     t = [round(float(L[i, j]) / _sigma(k[i]) * STEPS_OF_RATIO) for i, j in ((1, 0), (2, 0), (2, 1))]
     return k[0], k[1], k[2], t[0], t[1], t[2]
