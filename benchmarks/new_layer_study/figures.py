@@ -128,6 +128,7 @@ def draw_lights(route: RouteOutcome, note: str, path: Path) -> Path:
             errors = scored.of(direction)
             mean = f"{errors.mean():.3f} ± {errors.std():.3f} m" if len(errors) else "none found"
             axes.bar(scored.feature + 1 + 0.28 * (i - 1), errors, width=0.28, color=colour, label=f"{label}: {mean}")
+        axes.xaxis.set_major_locator(MaxNLocator(integer=True))
         axes.set_ylim(0.0, 1.28 * max([0.2, *(float(s.of(direction).max(initial=0.0)) for *_, s in cases)]))
         axes.legend(fontsize=8.5, ncols=3, loc="upper right")
     return finish(figure, "Lights along the motorway", f"{note}; single drives: the first", path)
@@ -204,5 +205,6 @@ def draw_localisation(road: MotorwayOutcome, note: str, path: Path) -> Path:
             rmse = one.rmse()[column]
             axes.plot(one.t_s, one.error_m[:, column], color=colour, linewidth=1.2, label=f"{label}: RMSE {rmse:.3f} m")
         axes.axhline(0.0, color=GREY, linewidth=0.8)
+        axes.margins(y=0.3)
         axes.legend(fontsize=9, loc="upper right", ncols=2)
     return finish(figure, "Localisation without and with the new layer", f"{note}, a drive that made none of it", path)

@@ -167,7 +167,7 @@ def tasks_of(options: NewLayerOptions, seed: int, folder: RunFolder) -> SeedTask
 
 def noisy_tracks(options: NewLayerOptions, seed: int) -> dict[str, dict[float, RouteTask]]:
     """Return the test track at each noise level of each sensor, the other's at 1."""
-    if seed not in options.seeds[: options.sweep_seeds]:
+    if not options.levels or seed not in options.seeds[: options.sweep_seeds]:
         return {}
     levels, km = sorted(options.levels), options.lap_m / 1e3
     return {
