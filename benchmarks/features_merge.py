@@ -69,8 +69,17 @@ def processor_s(work: Callable[[], object], runs: int = 3) -> float:
 
 def lights() -> F64:
     """Return (N, 2) streetlights along a gentle curve, metres in `FRAME`."""
-    along = np.arange(0.0, ROAD_M, SPACING_M)
+    return _road(SPACING_M)
+
+
+def _road(step_m: float) -> F64:
+    along = np.arange(0.0, ROAD_M, step_m)
     return np.column_stack([along, along**2 / 6_000.0])
+
+
+def _tiles_of(xy_m: F64) -> list[TileId]:
+    lat, lon, _ = FRAME.geodetic_from_enu(np.column_stack([xy_m, np.zeros(len(xy_m))]))
+    return [TileId.from_geodetic(float(a), float(b)) for a, b in zip(lat, lon, strict=True)]
 
 
 def reports_of(truth_m: F64, vehicles: int, seed: int) -> list[FeatureReport]:
@@ -84,10 +93,12 @@ def _drive(truth_m: F64, vehicle: int, rng: np.random.Generator) -> list[Feature
     at_m = truth_m + shift_m + rng.normal(0.0, EACH_M, truth_m.shape)
     at_m = at_m[rng.random(len(at_m)) < SEEN_SHARE]
     cov_m2 = np.array([ALONG_M**2 + EACH_M**2, 0.0, 0.0, ACROSS_M**2 + EACH_M**2, 0.0, 1e4])
-    by_tile: dict[TileId, list[Found]] = defaultdict(list)
+    by_tile: dict[TileId, list[Found]] = {tile: [] for tile in _tiles_of(_road(5.0))}  # all of the road was viewed
     for lat, lon, height in zip(*FRAME.geodetic_from_enu(np.column_stack([at_m, np.zeros(len(at_m))])), strict=True):
         tile = TileId.from_geodetic(float(lat), float(lon))
-        by_tile[tile].append(Found("streetlight", points_in_tile(tile, lat, lon, height), cov_m2, hit(0.99), 5))
+        by_tile.setdefault(tile, []).append(
+            Found("streetlight", points_in_tile(tile, lat, lon, height), cov_m2, hit(0.99), 5)
+        )
     return [
         _report(f"car-{vehicle}", vehicle, [(tile, by_tile[tile]) for tile in tiles])
         for tiles in _by_district(sorted(by_tile))

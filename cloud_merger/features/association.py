@@ -18,20 +18,22 @@ _LEAST_OVERLAP: Final = 0.5
 
 
 def pairs(
-    measured: Sequence[Place], known: Sequence[Place], parameters: FeatureMergeParameters
+    measured: Sequence[Place], known: Sequence[Place], witnesses: Sequence[int], parameters: FeatureMergeParameters
 ) -> list[tuple[int, int]]:
     """The most likely one-to-one association of measurements with features, as (measurement, feature).
 
-    A measurement without a partner costs as much as one at the very edge of the gate.
+    A feature is the likelier the more vehicles know it: one that began with an outlier must not draw to itself what
+    belongs to its neighbour. A measurement without a partner costs as much as one at the very edge of the gate.
 
     Args:
         measured: M places.
         known: N places, all points or all polylines as `measured` are.
+        witnesses: how many vehicles each of them rests on, at least 1.
         parameters: gate and reach.
     """
     if not measured or not known:
         return []
-    cost = costs(measured, known, parameters)
+    cost = costs(measured, known, parameters) - 2.0 * np.log(np.array(witnesses, np.float64))
     possible = np.isfinite(cost)
     if not possible.any():
         return []

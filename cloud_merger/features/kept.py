@@ -72,7 +72,7 @@ class FeatureInbox:
     Args:
         store: of the map.
         limits: what is refused.
-        reach_m: how far outside a tile what was found is of interest to it.
+        reach_m: `FeatureMergeParameters.reach_m`.
         reach_tiles: a tile that no layer holds may be this many tiles away from one that a layer holds.
     """
 

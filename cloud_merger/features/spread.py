@@ -46,13 +46,18 @@ def spread(report: FeatureReport, reach_m: float) -> dict[TileId, FeatureReport]
 
 
 def near_border(tile: TileId, source: TileId, found: Found, reach_m: float) -> bool:
-    """Whether what was found in the tile `source` may lie in its neighbour `tile`; polylines are cut at borders."""
+    """Whether what was found in the tile `source` may lie in its neighbour `tile`, or be what lies there.
+
+    Twice the reach at most: this tile must hear of all that is associated with what it may publish. Polylines are cut
+    at borders.
+    """
     if len(found.points_m) > 1:
         return False
     sigma_m = float(np.sqrt(found.cov_m2[0] + found.cov_m2[3]))
-    halo_m = min(_SIGMAS * sigma_m + _LEAST_M, reach_m)
+    half_m = _half_extent_m(tile)
+    halo_m = min(_SIGMAS * sigma_m + _LEAST_M, 2.0 * reach_m, 2.0 * float(half_m.min()))
     place_m = found.points_m[0] - between(source, tile)[:3, 3]
-    return bool((np.abs(place_m[:2]) - _half_extent_m(tile)).max() <= halo_m)
+    return bool((np.abs(place_m[:2]) - half_m).max() <= halo_m)
 
 
 @lru_cache(maxsize=4096)

@@ -70,6 +70,11 @@ class Track:
         """Number of the first report that speaks for it; -1 for a feature of the map."""
         return -1 if self.epoch is not None or self.quoted is not None else min(self.measured, default=-1)
 
+    @property
+    def witnesses(self) -> int:
+        """Vehicles that it rests on; the map counts as two."""
+        return len(self.repeats) + (0 if self.epoch is None and self.quoted is None else 2)
+
     def measure(self, report: int, measured: Measured, parameters: FeatureMergeParameters) -> None:
         """Take a measurement. The n-th of one vehicle weighs what it adds to what n of them weigh."""
         n = self.repeats.get(measured.vehicle, 0) + 1
@@ -166,7 +171,8 @@ class Tracks:
             and not any(track is other for other in named.values())
         ]
         places, states = [claims[i].place for i in rest], [track.state for track in open_to]
-        named |= {rest[i]: open_to[j] for i, j in pairs(places, states, self._parameters)}
+        witnesses = [track.witnesses for track in open_to]
+        named |= {rest[i]: open_to[j] for i, j in pairs(places, states, witnesses, self._parameters)}
         for i, claim in enumerate(claims):
             self._take(report, said, claim, named.get(i))
 
