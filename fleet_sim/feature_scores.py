@@ -150,7 +150,7 @@ def score_features(
 
 
 def driven(truth: FeatureTruth) -> tuple[TrueFeature, ...]:
-    """Return the features beside the stretch that is driven, but for those inside something that was put there.
+    """Return the features beside the stretch that is driven, but for those that are buried or doubled.
 
     Beyond the ends of the stretch nobody looks long enough.
     """
@@ -159,7 +159,8 @@ def driven(truth: FeatureTruth) -> tuple[TrueFeature, ...]:
         return ()
     street = truth.world.street_of_map(np.array([f.position_map_m for f in features]))
     inside = np.abs(street[:, 0]) <= truth.world.half_length_m
-    return tuple(f for f, held in zip(features, inside.tolist(), strict=True) if held and not f.buried)
+    seen = (held and not (f.buried or f.doubled) for f, held in zip(features, inside.tolist(), strict=True))
+    return tuple(f for f, one in zip(features, seen, strict=True) if one)
 
 
 def tiles_of_one_drive(

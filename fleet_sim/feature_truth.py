@@ -29,6 +29,8 @@ MAP_CONFIDENCE: Final = 0.95
 """λ_HD of Jo et al., section 6.2."""
 SAME_PLACE_M: Final = 0.05
 """A thing that was changed but moved less is the same feature."""
+PLATE_M: Final = 1.0
+"""Plates are 0.6 to 1.2 m wide: nearer to each other they overlap."""
 _EYE_M: Final = 1.5
 _SURVEY: Final = 61
 _MAPPED: Final = 63
@@ -46,6 +48,7 @@ class TrueFeature:
         position_map_m: map frame: the middle of a sign's plate, else the foot of the post.
         moved: a deleted one stands elsewhere now, or a new one stood elsewhere.
         buried: it stands, but inside something that was put there: a container, a shop. Nobody can see it.
+        doubled: it is new, and its plate overlaps that of a sign that stood there already. Nobody can tell them apart.
     """
 
     feature_id: int
@@ -56,6 +59,7 @@ class TrueFeature:
     position_map_m: tuple[float, float, float]
     moved: bool = False
     buried: bool = False
+    doubled: bool = False
 
 
 @dataclass(frozen=True, slots=True)
@@ -136,7 +140,15 @@ def _feature(world: World, name: str, o: WorldObject, state: FeatureClass, *, mo
     layer = LAYER_OF[o.kind]
     number = feature_id_of("world", world.seed, layer, name, "after" if state == "new" else "before")
     buried = state != "deleted" and is_buried(world, o)
-    return TrueFeature(number, name, layer, KIND_OF[o.kind], state, (x, y, z), moved, buried)
+    doubled = state == "new" and o.kind == "sign" and is_doubled(world, o)
+    return TrueFeature(number, name, layer, KIND_OF[o.kind], state, (x, y, z), moved, buried, doubled)
+
+
+def is_doubled(world: World, sign: WorldObject) -> bool:
+    """Return whether another sign, one that was there before, stands within a plate's width of a sign."""
+    others = (o for o in world.in_state("after") if o.kind == "sign" and "before" in o.states and o.name != sign.name)
+    here = position_street_m(sign)
+    return any(float(np.linalg.norm(position_street_m(o) - here)) < PLATE_M for o in others)
 
 
 def is_buried(world: World, o: WorldObject) -> bool:

@@ -253,6 +253,17 @@ def test_what_something_was_put_around_does_not_count(small: FeatureTruth) -> No
     assert not any(f.buried for f in small.features)
 
 
+@pytest.mark.parametrize(("x_m", "doubled"), [(10.7, True), (11.3, False)])
+def test_a_new_sign_right_before_an_old_one_does_not_count(small: FeatureTruth, x_m: float, doubled: bool) -> None:
+    second = object_of("second", "sign", ("after",), "added", x_m)
+    found = feature_truth(replace(small.world, objects=(*small.world.objects, second)))
+    new, kept = named(found, "second", "new"), named(found, "kept", "normal")
+    assert (new.doubled, kept.doubled) == (doubled, False)
+    assert (new in driven(found), kept in driven(found)) == (not doubled, True)
+    double = map_of(found, [(kept.feature_id, kept.position_map_m), (1000, new.position_map_m)])
+    assert rights(score_features(found, "signs", double))["new"] == ((0, 0, 2) if doubled else (1, 0, 2))
+
+
 @pytest.mark.parametrize(
     ("shape", "inside", "outside"),
     [
