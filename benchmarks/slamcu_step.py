@@ -19,7 +19,6 @@ from benchmarks.slamcu_study.scores import SignScore, accuracy_of, score
 from fleet_sim.roads.drive import RoadDrive, drive_route
 from fleet_sim.roads.motorway import motorway
 from gnd_map.arrays import F64
-from vehicle_agent.features.existence_book import FeatureClass
 from vehicle_agent.features.parameters import SlamcuParameters
 from vehicle_agent.features.slamcu import Slamcu
 
@@ -50,8 +49,11 @@ def options(arguments: Sequence[str]) -> Options:
     parser.add_argument("--particles", default="0,300,3000", help="numbers of particles; 0: the shipped one")
     parser.add_argument("--km", type=float, default=20.0, help="length of each motorway")
     given = parser.parse_args(list(arguments))
-    numbers = (tuple(int(word) for word in text.split(",")) for text in (given.seeds, given.particles))
-    return Options(*numbers, given.km)
+    return Options(_numbers(given.seeds), _numbers(given.particles), given.km)
+
+
+def _numbers(text: str) -> tuple[int, ...]:
+    return tuple(int(word) for word in text.split(","))
 
 
 def run(chosen: Options | None = None) -> list[Figure]:
@@ -92,7 +94,7 @@ def timed_drive(drive: RoadDrive, parameters: SlamcuParameters) -> tuple[Slamcu,
             slamcu.predict((t_ns - before_ns) * 1e-9, speed, yaw_rate)
             before_ns = t_ns
         elif what == "gnss":
-            slamcu.gnss(*drive.gnss.xy_m[i].tolist(), drive.gnss.sigma_m)
+            slamcu.gnss(float(drive.gnss.xy_m[i, 0]), float(drive.gnss.xy_m[i, 1]), drive.gnss.sigma_m)
         elif look is not None:
             slamcu.look(look, view, occlusion)
         spent_s += perf_counter() - begun_s
@@ -105,8 +107,7 @@ def timed_drive(drive: RoadDrive, parameters: SlamcuParameters) -> tuple[Slamcu,
 def scored(drive: RoadDrive, slamcu: Slamcu) -> SignScore:
     """Return how well the drive tells the signs."""
     known, new = slamcu.known_states(), slamcu.new_features()
-    masses = [(k.existence.exist, k.existence.absent, k.existence.unknown, k.existence.conflict) for k in known]
-    assert all(one.feature_class == FeatureClass.NEW for one in new)
-    places = (np.array([one.position_m for one in new]).reshape(-1, 2), np.array([one.cov_m2 for one in new]))
+    classes = np.array([int(one.feature_class) for one in known], np.uint8)
     ids = np.array([one.feature_id for one in known], np.int64)
-    return score(sign_truth(drive.route), (ids, np.array(masses)), (places[0], places[1].reshape(-1, 2, 2)))
+    xy_m, cov_m2 = np.array([one.position_m for one in new]), np.array([one.cov_m2 for one in new])
+    return score(sign_truth(drive.route), (ids, classes), (xy_m.reshape(-1, 2), cov_m2.reshape(-1, 2, 2)))

@@ -108,6 +108,23 @@ def test_a_sign_moved_by_a_few_metres_is_deleted_and_new() -> None:
     assert np.linalg.norm(new.position_m - moved) < 1.5
 
 
+@pytest.mark.parametrize("seed", range(3))
+def test_a_vehicle_that_is_sure_of_a_wrong_place_finds_the_right_one(seed: int) -> None:
+    """It starts 5 m beside the road and says 0.3 m: the first signs seem to have moved, all by the same step."""
+    signs = [(100.0, 8.0), (140.0, -9.0), (210.0, 8.5), (260.0, -8.0)]
+    road = Road(standing=signs, mapped=signs, end_m=290.0)
+    slamcu = Slamcu(FEW, road.known(), np.array([0.0, 5.0, 0.0]), np.diag([0.09, 0.09, radians(0.3) ** 2]), seed)
+    rng = np.random.default_rng(seed)
+    for i, pose in road.poses():
+        if i:
+            slamcu.predict(PERIOD_S, road.speed_mps, 0.0)
+        slamcu.look(road.look(i, pose, rng), CAMERA)
+    end = list(road.poses())[-1][1]
+    assert np.abs(slamcu.pose()[0] - end)[:2].max() < 1.5
+    assert [state.feature_class for state in slamcu.known_states()] == [NORMAL] * 4
+    assert slamcu.new_features() == ()
+
+
 def test_normal_signs_tell_where_the_vehicle_is_and_deleted_ones_do_not() -> None:
     apart = [(140.0, 8.0), (200.0, -8.0), (260.0, 8.0)]
     sigmas = []

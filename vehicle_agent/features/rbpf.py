@@ -160,6 +160,21 @@ class Rbpf:
         self.mu[slot], self.sigma[slot] = measurement.fused(self.mu[slot], self.sigma[slot], *prior)
         self.priors[slot] = None
 
+    def loosen(self, slots: Collection[int], position_m: float, heading_rad: float) -> None:
+        """The place in the map is in doubt: move each particle with these of its features as one body, at random."""
+        if not self.weighing:
+            return
+        shift = position_m * self._rng.standard_normal((2, self.m))
+        turn = heading_rad * self._rng.standard_normal(self.m)
+        cos, sin = np.cos(turn), np.sin(turn)
+        for slot in slots:
+            off = self.mu[slot].T - self.state[:2]
+            turned = np.stack([cos * off[0] - sin * off[1], sin * off[0] + cos * off[1]])
+            self.mu[slot] = (self.state[:2] + turned + shift).T
+        self.state[:2] += shift
+        self.state[HEADING] += turn
+        self.state[GNSS_X:] -= shift
+
     def resample_if_needed(self) -> None:
         """Systematic resampling when the effective number of particles is small. Eq. (20), with squared weights."""
         weights = _normalised(self.log_weight)

@@ -5,6 +5,7 @@ from typing import Final
 import numpy as np
 
 from gnd_map.arrays import F64
+from vehicle_agent.features.doubt import Doubt, Step
 from vehicle_agent.features.existence_book import Entry, ExistenceBook, FeatureClass
 from vehicle_agent.features.identities import best_identities
 from vehicle_agent.features.parameters import SlamcuParameters
@@ -37,6 +38,7 @@ class Tidying:
 
     def __init__(self, parameters: SlamcuParameters, tracked: Tracked, rbpf: Rbpf, book: ExistenceBook) -> None:
         self._p, self._tracked, self._rbpf, self._book = parameters, tracked, rbpf, book
+        self._doubt = Doubt(tracked, rbpf, book)
 
     def measured_together(self, detected: list[Entry]) -> None:
         """Remember which features were measured in one look."""
@@ -77,11 +79,25 @@ class Tidying:
         moved = self._moved(entry, xy_m, cov)
         if not entry.known:
             self._take(entry, agrees=not moved)
+        elif moved and self._doubt.is_it_me(xy_m - entry.xy_m, self._others_off(entry), entry.odometer_m):
+            self._doubt.look_anew(t_ns)  # and settle when the place has been found
+            self._rbpf.settle(entry.slot)
         elif moved:
             self._split(entry, xy_m, t_ns)
         else:
+            self._doubt.found_in_place(entry.odometer_m)
             entry.seen = (xy_m, cov) if entry.seen is None else fused_moments(entry.seen, (xy_m, cov))
             self._rbpf.settle(entry.slot)
+
+    def _others_off(self, entry: Entry) -> list[F64]:
+        """How far off (2,) other features of the map are that are not where they should be, of those not settled."""
+        found = []
+        for one in self._tracked.live:
+            if one is not entry and one.known and one.slot is not None and self._rbpf.priors[one.slot] is not None:
+                xy_m, cov = self._rbpf.moments(one.slot, self._rbpf.weights(without=(one.slot, entry.slot or 0)))
+                if one.pass_hits >= ENOUGH_HITS and self._moved(one, xy_m, cov):
+                    found.append(xy_m - one.xy_m)
+        return found
 
     def _take(self, entry: Entry, *, agrees: bool) -> None:
         """A new feature that was found on an earlier passage already, and settled."""
@@ -133,6 +149,7 @@ class Tidying:
         found.xy_m, found.in_view_s, found.odometer_m = xy_m, entry.in_view_s, entry.odometer_m
         found.heights, entry.heights = entry.heights, found.heights
         self._tracked.hand_over(entry, found)
+        self._doubt.moved(Step(entry, found, hits, xy_m - entry.xy_m, entry.odometer_m))
         self._book.recount(found, hits, 0, t_ns)
         self._book.recount(entry, entry.hits - hits, entry.misses + hits, t_ns)
 

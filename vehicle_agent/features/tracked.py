@@ -106,6 +106,14 @@ class Tracked:
         taker.slot, taker.pass_hits, taker.cov, giver.slot = giver.slot, giver.pass_hits, None, None
         self._rbpf.priors[taker.slot] = None
 
+    def hand_back(self, giver: Entry, taker: Entry) -> None:
+        """The new feature was the map's after all; it is given up."""
+        if giver.slot is not None:
+            self.live[giver.slot] = taker
+            taker.slot, taker.pass_hits, taker.pass_misses = giver.slot, giver.pass_hits, giver.pass_misses
+            self._rbpf.priors[taker.slot], giver.slot = prior_of_entry(taker), None
+        self.drop(giver)
+
     def exchange(self, one: Entry, other: Entry) -> None:
         """The estimates of two features are each other's."""
         mine, others = one.slot, other.slot
