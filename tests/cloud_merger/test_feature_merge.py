@@ -1,5 +1,7 @@
 """What the merge of a feature layer decides: new, confirmed, deleted, moved, told apart, joined."""
 
+import dataclasses
+
 import numpy as np
 import pytest
 from feature_cloud import (
@@ -175,6 +177,19 @@ def test_association_is_one_to_one_and_prefers_the_nearer():
     shifted = report(9, change(found(0.8, 0.0, sigma_m=0.5), found(3.8, 0.0, sigma_m=0.5)))
     merged = merge((), [*known, shifted], FeatureMergeParameters(renewal_gain=1.0))
     np.testing.assert_allclose(np.sort(places(merged.features)[:, 0]), [0.2, 3.2], atol=0.01)
+
+
+def test_what_began_with_an_outlier_does_not_draw_to_itself_what_belongs_to_its_neighbour():
+    """Known well along one axis only, as by lanes: the outlier is off along the other, and vague along the first."""
+    known = [report(n, change(stretched(x, 0.0))) for n, x in enumerate((-3.0, -2.0, 1.0, 4.0))]
+    outlier = report(5, change(stretched(-5.0, -2.6)))
+    between = [report(n, change(stretched(6.0, -0.7))) for n in (6, 7)]
+    merged = merge((), [*known, outlier, *between])
+    assert sorted(one.vehicles for one in merged.estimates) == [1, 6]
+
+
+def stretched(east_m, north_m):
+    return dataclasses.replace(found(east_m, north_m), cov_m2=np.array([25.0, 0.0, 0.0, 0.25, 0.0, 1e4]))
 
 
 def test_candidates_that_turn_out_to_be_one_are_joined():
