@@ -30,6 +30,8 @@ WIDER: Final = 1.5
 """Plates, crowns and heads begin where so many times more points lie beside the core than in it."""
 HEAD_M: Final = 1.0
 """Of a streetlight's height at most so much has anything beside the mast: arm and head."""
+BESIDE_M: Final = 0.3
+"""A crown whose middle lies so far off, aside or behind, is not the mast's own."""
 MAST_SHARE: Final = 0.8
 """Of the least height of a streetlight: up to here at least its mast is thin."""
 CROWN_POINTS: Final = 8
@@ -112,25 +114,28 @@ def kinds_of(columns: Columns, seen: Surroundings, top_m: F64, p: PoleParameters
         top_m: (C,) how high each reaches.
         p: parameters.
     """
-    above = _within(np.maximum(columns.top_m - BIN_M, LOWEST_PLATE_M), top_m - 0.5 * BIN_M)
-    wide = above & (seen.counts[:, :, NEAR] > WIDER * seen.counts[:, :, CORE])
+    more = seen.counts[:, :, NEAR] > WIDER * seen.counts[:, :, CORE]
+    wide = more & _within(np.maximum(columns.top_m - BIN_M, LOWEST_PLATE_M), top_m - 0.5 * BIN_M)
+    full = more & _within(np.full(len(top_m), LOWEST_CROWN_M), top_m)
     points, across, along = _spread(seen, wide)
     high = wide.sum(axis=1) * BIN_M
     crown = (points >= CROWN_POINTS) & (across >= CROWN_THICK_M)
     plate = (points >= PLATE_POINTS) & (across <= PLATE_THICK_M) & (along >= PLATE_WIDE_M) & (high <= PLATE_HIGH_M)
     over = _within(np.maximum(columns.top_m, LOWEST_CROWN_M), columns.top_m + CROWN_HIGH_M)
     leaves = (seen.counts[:, :, FAR] * over).sum(axis=1) >= CROWN_POINTS
-    full = (
-        _within(np.full(len(top_m), LOWEST_CROWN_M), top_m)
-        & (seen.counts[:, :, NEAR] > WIDER * seen.counts[:, :, CORE])
-    ).sum(axis=1)
     tall = (top_m >= p.streetlight_m) & (columns.top_m >= MAST_SHARE * p.streetlight_m)
-    bushy = tall & (full * BIN_M > HEAD_M)
-    return tuple(
-        np.select(
-            [crown | bushy, tall, plate, leaves], ["trunk", "streetlight", "traffic_sign", "trunk"], "pole"
-        ).tolist()
-    )
+    mast = tall & (_beside_it(columns, seen, full) | (~crown & (full.sum(axis=1) * BIN_M <= HEAD_M)))
+    kinds = ["streetlight", "trunk", "traffic_sign", "trunk"]
+    return tuple(np.select([mast, crown | tall, plate, leaves], kinds, "pole").tolist())
+
+
+def _beside_it(columns: Columns, seen: Surroundings, bins: Mask) -> Mask:
+    """(C,) whether what lies in the plate's reach, in some bins (C, B), lies on one side or behind: another's crown."""
+    n = np.maximum((seen.counts[:, :, NEAR] * bins).sum(axis=1), 1)
+    off = (seen.sums[:, :, :2] * bins[:, :, None]).sum(axis=1) / n[:, None]
+    behind = (off * columns.toward).sum(axis=1)
+    aside = off[:, 1] * columns.toward[:, 0] - off[:, 0] * columns.toward[:, 1]
+    return np.asarray((behind > BESIDE_M) | (np.abs(aside) > BESIDE_M))
 
 
 def _spread(seen: Surroundings, bins: Mask) -> tuple[I64, F64, F64]:
