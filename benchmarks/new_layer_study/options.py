@@ -24,17 +24,17 @@ class NewLayerOptions:
         levels: noise levels of Figure 8, of beacons and of lanes; none: no sweep.
         sweep_seeds: on so many of the seeds, the first ones.
         km: length of the motorway.
-        straight: whether the straight motorway is driven, too.
+        straight_seeds: the straight motorway is driven, too, on so many of the seeds, the first ones.
     """
 
     seeds: tuple[int, ...] = (11,)
     drives: int = 6
     motorway_drives: int = 11
     lap_m: float = 0.0
-    levels: tuple[float, ...] = (0.5, 1.0, 1.5, 2.0)
+    levels: tuple[float, ...] = (0.5, 1.0, 2.0)
     sweep_seeds: int = 1
-    km: float = 5.0
-    straight: bool = True
+    km: float = 4.0
+    straight_seeds: int = 1
 
     def __post_init__(self) -> None:
         check_seeds(self.seeds)
@@ -47,7 +47,8 @@ class NewLayerOptions:
             raise OptionError(f"--levels must be different numbers {_LEVELS[0]:g} … {_LEVELS[1]:g}, got {self.levels}")
         if self.lap_m and not _LAP_M[0] <= self.lap_m <= _LAP_M[1]:
             raise OptionError(f"--lap must be 0 or {_LAP_M[0]:g} … {_LAP_M[1]:g} m, got {self.lap_m:g}")
-        if not 0 <= self.sweep_seeds <= len(self.seeds):
-            raise OptionError(f"--sweep-seeds must be 0 … {len(self.seeds)}, got {self.sweep_seeds}")
+        for name in ("sweep_seeds", "straight_seeds"):
+            if getattr(self, name) < 0:
+                raise OptionError(f"--{name.replace('_', '-')} must be at least 0, got {getattr(self, name)}")
         if not _KM[0] <= self.km <= _KM[1]:
             raise OptionError(f"--km must be {_KM[0]:g} … {_KM[1]:g}, got {self.km:g}")

@@ -159,7 +159,8 @@ def tasks_of(options: NewLayerOptions, seed: int, folder: RunFolder) -> SeedTask
         RouteTask(TRACK, seed, options.lap_m / 1e3),
         *(task for of in noisy_tracks(options, seed).values() for task in of.values()),
     ]
-    roads = [RouteTask(kind, seed, options.km) for kind in (MOTORWAY, STRAIGHT)[: 1 + options.straight]]
+    kinds = (MOTORWAY, STRAIGHT) if seed in options.seeds[: options.straight_seeds] else (MOTORWAY,)
+    roads = [RouteTask(kind, seed, options.km) for kind in kinds]
     numbers = dict.fromkeys(tracks, options.drives) | dict.fromkeys(roads, options.motorway_drives)
     routes = {task: tuple(MappingTask(task, n + 1, home) for n in range(many)) for task, many in numbers.items()}
     return SeedTasks(seed, routes, tuple(LocalisingTask(task, routes[task], home) for task in roads))

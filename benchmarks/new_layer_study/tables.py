@@ -18,11 +18,11 @@ def tables_of(found: Found) -> list[Table]:
     ours = found["nfl"]
     tables = [_single(found), _integrated(ours)]
     if ours["noise"]:
-        tables.append(_noise(ours))
+        tables.append(_noise(found))
     tables += [_motorway(ours["motorway"], "motorway"), _localisation(ours["localisation"], "motorway")]
     if "straight" in ours:
-        straight = ours["straight"]
-        tables += [_motorway(straight["motorway"], "straight motorway")]
+        straight, seeds = ours["straight"], ", ".join(seed for seed, one in found["seeds"].items() if "straight" in one)
+        tables += [_motorway(straight["motorway"], f"straight motorway, seeds {seeds}")]
         tables += [_localisation(straight["localisation"], "straight motorway")]
     return [*tables, targets_table(found["targets"], f"targets, mean of {_seeds(found)}")]
 
@@ -46,10 +46,11 @@ def _integrated(ours: Found) -> Table:
     return table
 
 
-def _noise(ours: Found) -> Table:
+def _noise(found: Found) -> Table:
+    ours, seeds = found["nfl"], ", ".join(seed for seed, one in found["seeds"].items() if one["noise"])
     sensors = list(ours["noise"])
     columns = [f"{sensor}: {what}" for sensor in sensors for what in ("integrated, m", "one drive, m")]
-    table = plain_table("Figure 8: noise levels, the other sensor at 1", "level", *columns)
+    table = plain_table(f"Figure 8: noise levels, the other sensor at 1; seeds {seeds}", "level", *columns)
     for level in ours["noise"][sensors[0]]:
         rows = [ours["noise"][sensor][level] for sensor in sensors]
         table.add_row(level, *(metres(row[what]) for row in rows for what in ("integrated", "single_with_map")))

@@ -17,7 +17,7 @@ from gnd_map.errors import GndError
 
 SHORT = (
     "--seeds", "14", "--lap", "150", "--km", "0.5", "--drives", "2", "--motorway-drives", "2", "--levels", "none",
-    "--no-straight", "--processes", "1",
+    "--straight-seeds", "0", "--processes", "1",
 )  # fmt: skip
 Finished = tuple[Path, dict[str, Any]]
 
@@ -97,7 +97,7 @@ def test_a_second_start_drives_no_more_shows_tables_and_draws(
         (("--motorway-drives", "99"), "--motorway-drives must be 1 … 60, got 99"),
         (("--levels", "0.5,0.5"), "--levels must be different numbers"),
         (("--levels", "loud"), "expected numbers"),
-        (("--sweep-seeds", "2"), "--sweep-seeds must be 0 … 1, got 2"),
+        (("--sweep-seeds", "-2"), "--sweep-seeds must be at least 0, got -2"),
         (("--lap", "20"), "--lap must be 0 or 100"),
         (("--km", "0.2"), "--km must be 0.5 … 20, got 0.2"),
         (("--processes", "-1"), "--processes must be at least 1, got -1"),
