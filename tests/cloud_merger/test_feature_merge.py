@@ -183,7 +183,7 @@ def test_what_began_with_an_outlier_does_not_draw_to_itself_what_belongs_to_its_
     """Known well along one axis only, as by lanes: the outlier is off along the other, and vague along the first."""
     known = [report(n, change(stretched(x, 0.0))) for n, x in enumerate((-3.0, -2.0, 1.0, 4.0))]
     outlier = report(5, change(stretched(-5.0, -2.6)))
-    between = [report(n, change(stretched(6.0, -0.7))) for n in (6, 7)]
+    between = [report(n, change(stretched(6.0, -1.4))) for n in (6, 7)]
     merged = merge((), [*known, outlier, *between])
     assert sorted(one.vehicles for one in merged.estimates) == [1, 6]
 
