@@ -5,10 +5,10 @@ Every refusal names the tile, the feature and the numbers; the report goes to qu
 
 from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass
-from itertools import combinations
 from typing import Final
 
 import numpy as np
+from scipy.spatial import cKDTree
 
 from cloud_merger.errors import BadReport, MergerError
 from cloud_merger.features.association import HEIGHT_KNOWN_M2
@@ -23,6 +23,7 @@ from schemas.features import FeatureReport
 _ROUNDING: Final = 1.01
 """Covariances travel on levels that are some per cent apart; a limit that is met before is met after."""
 
+Numbered = tuple[int, Found]
 IdsOf = Callable[[TileId, bytes], Collection[int] | None]
 """Ids of the features of a version of a tile, by hash; None: there is no such version."""
 
@@ -179,13 +180,9 @@ def _check_duplicates(change: FeatureChange, limits: FeatureLimits) -> None:
             )
 
 
-Numbered = tuple[int, Found]
-
-
 def _near(points: Sequence[Numbered], within_m: float) -> list[tuple[Numbered, Numbered]]:
+    """Pairs of points that are horizontally so near, in order."""
     if len(points) < 2:
         return []
     xy = np.array([found.points_m[0, :2] for _, found in points])
-    return [
-        (points[i], points[j]) for i, j in combinations(range(len(points)), 2) if np.hypot(*(xy[i] - xy[j])) <= within_m
-    ]
+    return [(points[i], points[j]) for i, j in sorted(cKDTree(xy).query_pairs(within_m))]

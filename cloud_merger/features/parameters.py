@@ -50,7 +50,7 @@ class FeatureMergeParameters:
     repeat_correlation: float = 0.5
     renewal_gain: float = 1.25
     renewal_mass: float = 0.1
-    max_begun: int = 256
+    max_begun: int = 128
     ceiling: float = 0.99
 
     def __post_init__(self) -> None:
