@@ -48,6 +48,7 @@ class RouteTask:
         km: length of a motorway; of the test track the way driven, 0 for one lap.
         beacon: noise level of the detector of point features.
         lane: noise level of the lane camera.
+        gnss_bias_m: standard deviation of a drive's constant GNSS error, each axis.
     """
 
     kind: str
@@ -55,6 +56,7 @@ class RouteTask:
     km: float
     beacon: float = 1.0
     lane: float = 1.0
+    gnss_bias_m: float = 0.0
 
     @property
     def route(self) -> Route:
@@ -81,6 +83,7 @@ def drive_of(task: RouteTask, vehicle: int) -> RoadDrive:
         points=DetectorNoise(level=task.beacon),
         lanes=DetectorNoise(level=task.lane, false_alarms=0.0),
         length_m=1e3 * task.km if task.kind == TRACK and task.km else None,
+        gnss_bias_m=task.gnss_bias_m,
         start_ns=EPOCH_NS + vehicle * _HOUR_NS,
     )
     return drive_route(task.route, vehicle, options)

@@ -9,6 +9,7 @@ from benchmarks.simulation.errors import OptionError
 MOST_DRIVES: Final = 60
 _LEVELS: Final = (0.1, 5.0)
 _KM: Final = (0.5, 20.0)
+_BIAS_M: Final = 20.0
 _LAP_M: Final = (100.0, 10_000.0)
 
 
@@ -24,6 +25,7 @@ class NewLayerOptions:
         levels: noise levels of Figure 8, of beacons and of lanes; none: no sweep.
         sweep_seeds: on so many of the seeds, the first ones.
         km: length of the motorway.
+        gnss_bias_m: of the motorway's drives: standard deviation of a constant error of each axis, drawn for each drive.
         straight_seeds: the straight motorway is driven, too, on so many of the seeds, the first ones.
     """
 
@@ -34,6 +36,7 @@ class NewLayerOptions:
     levels: tuple[float, ...] = (0.5, 1.0, 2.0)
     sweep_seeds: int = 1
     km: float = 4.0
+    gnss_bias_m: float = 0.0
     straight_seeds: int = 1
 
     def __post_init__(self) -> None:
@@ -47,6 +50,8 @@ class NewLayerOptions:
             raise OptionError(f"--levels must be different numbers {_LEVELS[0]:g} … {_LEVELS[1]:g}, got {self.levels}")
         if self.lap_m and not _LAP_M[0] <= self.lap_m <= _LAP_M[1]:
             raise OptionError(f"--lap must be 0 or {_LAP_M[0]:g} … {_LAP_M[1]:g} m, got {self.lap_m:g}")
+        if not 0.0 <= self.gnss_bias_m <= _BIAS_M:
+            raise OptionError(f"--gnss-bias must be 0 … {_BIAS_M:g} m, got {self.gnss_bias_m:g}")
         for name in ("sweep_seeds", "straight_seeds"):
             if getattr(self, name) < 0:
                 raise OptionError(f"--{name.replace('_', '-')} must be at least 0, got {getattr(self, name)}")

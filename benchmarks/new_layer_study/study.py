@@ -160,7 +160,7 @@ def tasks_of(options: NewLayerOptions, seed: int, folder: RunFolder) -> SeedTask
         *(task for of in noisy_tracks(options, seed).values() for task in of.values()),
     ]
     kinds = (MOTORWAY, STRAIGHT) if seed in options.seeds[: options.straight_seeds] else (MOTORWAY,)
-    roads = [RouteTask(kind, seed, options.km) for kind in kinds]
+    roads = [RouteTask(kind, seed, options.km, gnss_bias_m=options.gnss_bias_m) for kind in kinds]
     numbers = dict.fromkeys(tracks, options.drives) | dict.fromkeys(roads, options.motorway_drives)
     routes = {task: tuple(MappingTask(task, n + 1, home) for n in range(many)) for task, many in numbers.items()}
     return SeedTasks(seed, routes, tuple(LocalisingTask(task, routes[task], home) for task in roads))

@@ -98,6 +98,7 @@ def test_a_second_start_drives_no_more_shows_tables_and_draws(
         (("--levels", "0.5,0.5"), "--levels must be different numbers"),
         (("--levels", "loud"), "expected numbers"),
         (("--sweep-seeds", "-2"), "--sweep-seeds must be at least 0, got -2"),
+        (("--gnss-bias", "-1"), "--gnss-bias must be 0"),
         (("--lap", "20"), "--lap must be 0 or 100"),
         (("--km", "0.2"), "--km must be 0.5 … 20, got 0.2"),
         (("--processes", "-1"), "--processes must be at least 1, got -1"),
