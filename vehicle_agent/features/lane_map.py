@@ -95,9 +95,20 @@ class LaneMap:
         """Samples of lanes that go round, brought back to 0 … count."""
         return np.where(self.closed[lane], at % self.count[lane], at)
 
-    def near(self, xy_m: F64, within_m: float) -> F64:
-        """(N, 2) samples of all lanes within a square around a point (2,)."""
-        return self.xy_m[(np.abs(self.xy_m - xy_m) < within_m).all(axis=1)]
+    def near(self, xy_m: F64, reach_m: float) -> F64:
+        """(N, 2) samples of all lanes that pass a point (2,), so far along them to either side."""
+        parts = [self.stretch(lane, xy_m, reach_m) for lane in range(len(self))]
+        return np.concatenate(parts)
+
+    def stretch(self, lane: int, xy_m: F64, reach_m: float) -> F64:
+        """(N, 2) samples of a lane so far to either side of where it passes a point (2,); none if it is farther."""
+        distance, sample = self.nearest(lane, xy_m[None], reach_m)
+        if not np.isfinite(distance[0]):
+            return np.empty((0, 2))
+        n, reach = int(self.count[lane]), round(reach_m / SAMPLE_M)
+        rows = np.arange(int(sample[0]) - reach, int(sample[0]) + reach)
+        rows = np.unique(rows % n) if self.closed[lane] else rows[(rows >= 0) & (rows < n)]
+        return np.asarray(self.xy_m[self.first[lane] + rows])
 
 
 def _sampled(n: int, lane: F64) -> F64:

@@ -18,7 +18,7 @@ from vehicle_agent.features.dead_reckoning import composed, relative, rotated
 from vehicle_agent.features.drive_nodes import DriveNodes, nearest
 from vehicle_agent.features.graph import NO_MATCHES, PoseMatches
 from vehicle_agent.features.lane_looks import Offsets, Polylines, choices, offsets
-from vehicle_agent.features.lane_map import SAMPLE_M, LaneMap, gicp
+from vehicle_agent.features.lane_map import LaneMap, gicp
 from vehicle_agent.features.new_layer_parameters import LaneParameters
 
 __all__ = ["LaneMap", "LaneMatcher"]
@@ -152,19 +152,16 @@ class LaneMatcher:
     def _gicp(self, source: F64, pose: F64) -> F64 | None:
         if len(source) < 20:
             return None
-        near = self.lanes.near(pose[:2], SEEN_M[1] + MARGIN_M)
+        near = self.lanes.near(pose[:2], SEEN_M[1] + 4.0 * MARGIN_M)
         ahead = rotated(np.full(len(near), -pose[2]), near - pose[:2])[:, 0]
-        target = near[ahead > SEEN_M[0] - MARGIN_M]
+        target = near[(ahead > SEEN_M[0] - MARGIN_M) & (ahead < SEEN_M[1] + MARGIN_M)]
+        if len(target) < 20:
+            return None
         return gicp(target, source, pose, self.parameters.max_correspondence_m)
 
     def _as_seen(self, lane: int, base: F64, off: F64) -> F64:
         """(N, 2) a lane of the map, in the frame of the window, moved to where the looks saw it on average."""
-        _, sample = self.lanes.nearest(lane, base[None, :2], np.inf)
-        reach = round((SEEN_M[1] + 20.0) / SAMPLE_M)
-        n = int(self.lanes.count[lane])
-        rows = np.arange(sample[0] - reach, sample[0] + reach)
-        rows = np.unique(rows % n) if self.lanes.closed[lane] else rows[(rows >= 0) & (rows < n)]
-        xy = self.lanes.xy_m[self.lanes.first[lane] + rows] - base[:2]
+        xy = self.lanes.stretch(lane, base[:2], SEEN_M[1] + 4.0 * MARGIN_M) - base[:2]
         xy = rotated(np.full(len(xy), -base[2]), xy)
         xy = xy[(xy[:, 0] > SEEN_M[0]) & (xy[:, 0] < SEEN_M[1]) & (np.abs(xy[:, 1]) < SEEN_M[1])]
         return np.asarray(xy + off[:2] + off[2] * np.stack([-xy[:, 1], xy[:, 0]], axis=1))
