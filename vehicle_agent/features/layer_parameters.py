@@ -54,9 +54,9 @@ class LayerParameters:
 
     @property
     def slamcu(self) -> SlamcuParameters:
-        """SLAMCU with given poses: one particle."""
+        """SLAMCU with given poses: few particles, which carry the uncertainty of the pose into the features' places."""
         return SlamcuParameters(
-            detection_confidence=self.detection_confidence, filter=FilterParameters(particles=1, jitter=0.0)
+            detection_confidence=self.detection_confidence, filter=FilterParameters(particles=16, jitter=0.0)
         )
 
 
