@@ -25,7 +25,7 @@ class NewLayerOptions:
         levels: noise levels of Figure 8, of beacons and of lanes; none: no sweep.
         sweep_seeds: on so many of the seeds, the first ones.
         km: length of the motorway.
-        gnss_bias_m: of the motorway's drives: standard deviation of a constant error of each axis, drawn for each drive.
+        gnss_bias_m: standard deviation of a constant GNSS error of each axis, drawn for each drive on the motorways.
         straight_seeds: the straight motorway is driven, too, on so many of the seeds, the first ones.
     """
 
