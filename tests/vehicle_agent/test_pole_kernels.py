@@ -170,7 +170,7 @@ def _adjacent(polar: F64, rays: list[int], k: int, m: int) -> bool:
 def _linked(polar: F64, k: int, m: int, step: float, beside: Beside) -> bool:
     near = min(polar[k, 1], polar[m, 1])
     across = abs(_apart(polar, k, m)) * near
-    return across < max(beside.link_m, 2.5 * step * near) and abs(polar[k, 1] - polar[m, 1]) < beside.link_m
+    return bool(across < max(beside.link_m, 2.5 * step * near) and abs(polar[k, 1] - polar[m, 1]) < beside.link_m)
 
 
 def _sides(polar: F64, rays: list[int], run: set[int], step: float, beside: Beside) -> str | None:
@@ -199,7 +199,7 @@ def _lies_on_a_line(polar: F64, rays: list[int], edge: int, way: int, step: floa
     if n < 4 or not all(0.0 < turn <= 2.5 * step for turn in turns):
         return False
     inverse = 1.0 / q[1] + (1.0 / q[1] - 1.0 / p[1]) * turns[1] / turns[0]
-    return inverse > 0.0 and abs(1.0 / inverse - r[1]) < 0.15 + 0.15 * abs(r[1] - q[1])
+    return bool(inverse > 0.0 and abs(1.0 / inverse - r[1]) < 0.15 + 0.15 * abs(r[1] - q[1]))
 
 
 @pytest.mark.parametrize("seed", range(4))

@@ -109,6 +109,14 @@ def test_a_window_knows_a_pole_better_than_a_scan_does() -> None:
     assert all_of_them.sigma_diameter_m < one.sigma_diameter_m
 
 
+def test_empty_scans_of_a_window_say_nothing() -> None:
+    rays, none = rays_of(post(9.0, 6.0)), Rays(np.empty((0, 3)), origin())
+    (one,), (beside_empty,) = (PoleDetector().window(part, PLACE) for part in ([rays], [none, rays]))
+    np.testing.assert_array_equal(one.xy_m, beside_empty.xy_m)
+    assert beside_empty.scans == 1
+    assert PoleDetector().window([], PLACE) == PoleDetector().window([none, none], PLACE) == ()
+
+
 def test_errors_of_poses_go_into_the_covariance() -> None:
     rays = rays_of(post(10.0, 0.0))
     (exact,) = PoleDetector().window([rays], PLACE)
