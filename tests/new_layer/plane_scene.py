@@ -171,6 +171,3 @@ def parameters(noise: Noise, rounds: int = 4) -> NewLayerParameters:
         gnss=GnssNoise(noise.gnss or 0.01, noise.tau_s, noise.white or 0.01),
         lanes=LaneParameters(map_sigma_m=0.0),
     )  # fmt: skip
-
-
-EXACT_PARAMETERS = parameters(Noise())

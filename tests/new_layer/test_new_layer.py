@@ -167,6 +167,28 @@ def test_bad_drives_are_refused(truth):
         Measurements.of([replace_range(good.looks[10])])
 
 
+def test_a_vehicle_that_never_moved_is_refused(truth):
+    t_ns = truth.t_ns
+    still = MotionTrack(t_ns, np.zeros(len(t_ns)), np.zeros(len(t_ns)))
+    with pytest.raises(NewLayerError, match="never moved"):
+        map_new_layer(FeatureDrive(still, Fixes(t_ns[::50], np.zeros((17, 2)))), parameters(PAPER)).solution.pose_cov(
+            np.array([0])
+        )
+
+
+def test_what_was_measured_outside_of_the_motion_is_not_taken(truth):
+    d = drive(truth, EXACT, 0)
+    late = 10_000_000_000
+    fixes_ = Fixes(np.append(d.fixes.t_ns, d.fixes.t_ns[-1] + late), np.concatenate([d.fixes.xy_m, [[999.0, 999.0]]]))
+    more = replace(d, fixes=fixes_, looks=(*d.looks, replace(d.looks[-1], t_ns=d.looks[-1].t_ns + late)))
+    kept = more.within_motion()
+    assert len(kept.fixes.t_ns) == len(d.fixes.t_ns)
+    assert len(kept.looks) == len(d.looks)
+    outside = replace(d, fixes=Fixes(d.fixes.t_ns + 100 * late, d.fixes.xy_m))
+    with pytest.raises(NewLayerError, match="without GNSS fixes"):
+        map_new_layer(outside, parameters(EXACT))
+
+
 class replace_range:
     """A look of another source that is not finite."""
 

@@ -1,8 +1,8 @@
 """What a drive gives to the mapping of a feature layer, in the plane of a map frame (ENU), as columns."""
 
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass, field
-from typing import Any, Protocol
+from dataclasses import dataclass, field, replace
+from typing import Any, Final, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,6 +11,8 @@ from gnd_map.arrays import F64, I64, check_array
 from gnd_map.geodesy import LocalFrame
 from schemas.drive import Detections, DriveItem, LaneLook, MotionTrack, track_of
 from vehicle_agent.errors import NewLayerError
+
+EDGE_NS: Final = 100_000_000
 
 
 class PolarLook(Protocol):
@@ -159,6 +161,22 @@ class FeatureDrive:
             raise NewLayerError("a drive without GNSS fixes and without poses cannot be placed in a map")
         for name, times in self._times():
             self._check_times(name, times)
+
+    def within_motion(self) -> "FeatureDrive":
+        """The same without fixes, poses and looks from before or after the motion: where they belong is not known.
+
+        Raises:
+            NewLayerError: no fix and no pose is left.
+        """
+        first, last = self.motion.t_ns[0] - EDGE_NS, self.motion.t_ns[-1] + EDGE_NS
+        fix, pose = ((t >= first) & (t <= last) for t in (self.fixes.t_ns, self.poses.t_ns))
+        return replace(
+            self,
+            fixes=Fixes(self.fixes.t_ns[fix], self.fixes.xy_m[fix]),
+            poses=KnownPoses(self.poses.t_ns[pose], self.poses.pose[pose], self.poses.cov[pose]),
+            looks=tuple(look for look in self.looks if first <= look.t_ns <= last),
+            lanes=tuple(look for look in self.lanes if first <= look.t_ns <= last),
+        )
 
     def _times(self) -> list[tuple[str, I64]]:
         looks = np.array([look.t_ns for look in self.looks], np.int64)

@@ -5,6 +5,8 @@ and gyro bias. Edges are motion (Eq. 1-2), measurements of features (Eq. 3-5), f
 (Eq. 7-9). The cost is Eq. (6), or Eq. (10) when there are matches.
 """
 
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 from math import atan2, cos, pi, sin
 from typing import Any, NamedTuple
@@ -13,6 +15,7 @@ import gtsam
 import numpy as np
 
 from gnd_map.arrays import F64, I64
+from vehicle_agent.errors import NewLayerError
 from vehicle_agent.features.bias_chain import gauss_markov_springs
 from vehicle_agent.features.dead_reckoning import Steps
 from vehicle_agent.features.new_layer_parameters import NewLayerParameters
@@ -117,23 +120,39 @@ class Solution:
 
     def landmark_cov(self) -> F64:
         """(N, 2, 2) marginal covariances of the features in the map frame."""
-        marginals = gtsam.Marginals(self._graph, self._values)
-        found = [marginals.marginalCovariance(_l(n)) for n in range(len(self.state.xy_m))]
-        return np.array(found).reshape(-1, 2, 2)
+        return self._marginals([_l(n) for n in range(len(self.state.xy_m))], 2)
 
     def pose_cov(self, keys: I64) -> F64:
         """(P, 3, 3) marginal covariances of keyframes (P,), x and y turned into the map frame."""
-        marginals = gtsam.Marginals(self._graph, self._values)
-        found = np.array([marginals.marginalCovariance(_x(int(k))) for k in keys]).reshape(-1, 3, 3)
+        found = self._marginals([_x(int(k)) for k in keys], 3)
         R = np.zeros((len(keys), 3, 3))
         yaw = self.state.pose[keys, 2]
         R[:, 0, 0], R[:, 0, 1], R[:, 1, 0], R[:, 1, 1] = np.cos(yaw), -np.sin(yaw), np.sin(yaw), np.cos(yaw)
         R[:, 2, 2] = 1.0
         return np.asarray(R @ found @ R.transpose(0, 2, 1))
 
+    def _marginals(self, keys: list[int], size: int) -> F64:
+        with _determined(len(self.state.pose)):
+            marginals = gtsam.Marginals(self._graph, self._values)
+            return np.array([marginals.marginalCovariance(key) for key in keys]).reshape(-1, size, size)
+
+
+@contextmanager
+def _determined(n_poses: int) -> Iterator[None]:
+    """What GTSAM says of a graph that leaves something open, by its name."""
+    try:
+        yield
+    except RuntimeError as error:
+        what = f"the graph of {n_poses} poses leaves something open, such as the heading of a vehicle that never moved"
+        raise NewLayerError(f"{what}: {str(error).strip().splitlines()[0]}") from error
+
 
 def solve(problem: Problem, start: State, parameters: NewLayerParameters) -> Solution:
-    """Minimise Eq. (6), or with matches Eq. (10), by Levenberg-Marquardt from `start`."""
+    """Minimise Eq. (6), or with matches Eq. (10), by Levenberg-Marquardt from `start`.
+
+    Raises:
+        NewLayerError: the edges leave something open.
+    """
     graph, values = gtsam.NonlinearFactorGraph(), gtsam.Values()
     _add_poses(values, start)
     _add_calibration(graph, parameters)
@@ -141,7 +160,8 @@ def solve(problem: Problem, start: State, parameters: NewLayerParameters) -> Sol
     _add_ties(graph, problem.ties, parameters.landmarks.robust_k)
     _add_anchors(graph, problem.anchors)
     own = _motion(problem) + _matches(problem.lanes, parameters.lanes.robust_k) + _matches(problem.poses, None)
-    linear, optimum = _optimised(graph, own, values)
+    with _determined(len(start.pose)):
+        linear, optimum = _optimised(graph, own, values)
     cost = 2.0 * (graph.error(optimum) + sum(factor.error(optimum) for factor in own))  # Eq. (6), (10)
     return Solution(_state(optimum, len(start.pose), len(start.xy_m)), cost, linear, optimum)
 

@@ -10,7 +10,6 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from gnd_map.arrays import F64, I64
-from vehicle_agent.errors import NewLayerError
 from vehicle_agent.features.drive_nodes import DriveNodes
 from vehicle_agent.features.feature_drive import FeatureDrive, Measurements
 from vehicle_agent.features.graph import Anchors, Problem, Solution, State, solve
@@ -92,6 +91,7 @@ class _Mapping:
         trust_known: bool,
         find_new: bool = True,
     ) -> None:
+        drive = drive.within_motion()
         self.drive, self.parameters, self.known, self.trust_known = drive, parameters, known, trust_known
         self.find_new = find_new
         self.m = Measurements.of(drive.looks)
@@ -181,8 +181,6 @@ class _Mapping:
         start = State(self.state.pose, self.xy_m[seen], self.state.calibration)
         problem = replace(self._problem(polish), ties=ties, anchors=self._anchors(seen, number))
         solution = solve(problem, start, self.parameters)
-        if not np.isfinite(solution.state.pose).all():
-            raise NewLayerError(f"the graph of {len(self.state.pose)} poses has no optimum: check motion and fixes")
         self.state = State(solution.state.pose, np.empty((0, 2)), solution.state.calibration)
         self.nodes = self.nodes.calibrated(solution.state.calibration)
         self.xy_m = self.xy_m.copy()

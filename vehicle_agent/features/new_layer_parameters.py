@@ -133,24 +133,17 @@ class NewLayerParameters:
     keyframe_m, keyframe_s: a pose of the graph every so many metres, and every so many seconds.
     rounds: how often measurements are given to features anew and the graph is solved.
     settled_m: rounds end when no feature moves by more.
-    stop_s, stop_mps: the vehicle has stopped when it stood this long, slower than this.
-    least_m, longest_s: a shorter way than this is not mapped at a stop; one that takes longer is mapped without a stop.
     """
 
     keyframe_m: float = 5.0
     keyframe_s: float = 1.0
     rounds: int = 6
     settled_m: float = 0.01
-    stop_s: float = 3.0
-    stop_mps: float = 0.1
-    least_m: float = 50.0
-    longest_s: float = 1800.0
     motion: MotionNoise = field(default_factory=MotionNoise)
     gnss: GnssNoise = field(default_factory=GnssNoise)
     landmarks: LandmarkParameters = field(default_factory=LandmarkParameters)
     lanes: LaneParameters = field(default_factory=LaneParameters)
 
     def __post_init__(self) -> None:
-        positive = (self.keyframe_m, self.keyframe_s, self.settled_m, self.stop_s, self.stop_mps, self.longest_s)
-        if min(positive) <= 0 or self.rounds < 1:
+        if min(self.keyframe_m, self.keyframe_s, self.settled_m) <= 0 or self.rounds < 1:
             raise ValueError(f"all values must be > 0 and rounds >= 1, got {self}")

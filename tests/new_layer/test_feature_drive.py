@@ -1,0 +1,64 @@
+"""A recording as the mapping sees it, and parameters that cannot be."""
+
+from math import radians
+
+import numpy as np
+import pytest
+from plane_scene import Noise, Scene, drive
+
+from gnd_map.geodesy import LocalFrame
+from schemas.drive import GnssFix, MotionSample
+from vehicle_agent.features.feature_drive import FeatureDrive
+from vehicle_agent.features.new_layer_parameters import (
+    GnssNoise,
+    LandmarkParameters,
+    LaneParameters,
+    MotionNoise,
+    NewLayerParameters,
+)
+
+FRAME = LocalFrame(radians(37.45), radians(127.12), 60.0)
+
+
+def items_of(d):
+    """The drive as a recording."""
+    items = [MotionSample(*row) for row in zip(*(c.tolist() for c in d.motion), strict=True)]
+    lat, lon, height = FRAME.geodetic_from_enu(np.column_stack([d.fixes.xy_m, np.zeros(len(d.fixes.xy_m))]))
+    rows = zip(d.fixes.t_ns.tolist(), lat.tolist(), lon.tolist(), height.tolist(), strict=True)
+    items += [GnssFix(*row, 2.5) for row in rows]
+    return sorted([*items, *d.looks, *d.lanes], key=lambda item: item.t_ns)
+
+
+@pytest.fixture(scope="module")
+def truth():
+    return Scene().truth()
+
+
+def test_looks_of_another_layer_or_sensor_are_not_taken(truth):
+    items = items_of(drive(truth, Noise(), 0))
+    assert FeatureDrive.of_items(items, FRAME, "signs").looks == ()
+    assert FeatureDrive.of_items(items, FRAME, "streetlights", "camera").looks == ()
+    both = FeatureDrive.of_items(items, FRAME, "streetlights", "lidar")
+    assert len(both.looks) == 81
+    assert len(both.lanes) == 81
+    np.testing.assert_allclose(both.fixes.xy_m, truth.pose[::50, :2], atol=1e-3)
+
+
+@pytest.mark.parametrize(
+    ("kind", "field", "value"),
+    [
+        (MotionNoise, "wheel_scale", 0.0),
+        (MotionNoise, "slip_rad", -1.0),
+        (GnssNoise, "correlation_s", 0.0),
+        (LandmarkParameters, "min_hits", 0),
+        (LandmarkParameters, "gate_chi2", -1.0),
+        (LaneParameters, "sigma_m", 0.0),
+        (LaneParameters, "information", 1.5),
+        (LaneParameters, "min_polylines", 0),
+        (NewLayerParameters, "rounds", 0),
+        (NewLayerParameters, "keyframe_m", 0.0),
+    ],
+)
+def test_parameters_that_cannot_be_are_refused(kind, field, value):
+    with pytest.raises(ValueError, match=field):
+        kind(**{field: value})
