@@ -6,7 +6,8 @@ from hypothesis import strategies as st
 
 from vehicle_agent.features.bias_chain import gauss_markov_springs
 from vehicle_agent.features.dead_reckoning import Steps
-from vehicle_agent.features.graph import FixNodes, PoseMatches, Problem, State, solve
+from vehicle_agent.features.graph import solve
+from vehicle_agent.features.graph_edges import FixNodes, PoseMatches, Problem, State
 from vehicle_agent.features.new_layer_parameters import GnssNoise, NewLayerParameters
 
 

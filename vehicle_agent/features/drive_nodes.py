@@ -7,7 +7,8 @@ import numpy as np
 from gnd_map.arrays import F64, I64
 from vehicle_agent.features.dead_reckoning import DeadReckoning, composed, relative, rotated
 from vehicle_agent.features.feature_drive import FeatureDrive, Fixes, KnownPoses
-from vehicle_agent.features.graph import NO_FIX_NODES, NO_MATCHES, FixNodes, PoseMatches, Problem, State, solve
+from vehicle_agent.features.graph import solve
+from vehicle_agent.features.graph_edges import NO_FIX_NODES, NO_MATCHES, FixNodes, PoseMatches, Problem, State
 from vehicle_agent.features.landmarks import Sight
 from vehicle_agent.features.new_layer_parameters import GnssNoise, NewLayerParameters
 

@@ -8,8 +8,8 @@ and gyro bias. Edges are motion (Eq. 1-2), measurements of features (Eq. 3-5), f
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
-from math import atan2, cos, pi, sin
-from typing import Any, NamedTuple
+from math import cos, pi, sin
+from typing import Any
 
 import gtsam
 import numpy as np
@@ -17,7 +17,7 @@ import numpy as np
 from gnd_map.arrays import F64, I64
 from vehicle_agent.errors import NewLayerError
 from vehicle_agent.features.bias_chain import gauss_markov_springs
-from vehicle_agent.features.dead_reckoning import Steps
+from vehicle_agent.features.graph_edges import Anchors, FixNodes, PoseMatches, Problem, State, Ties
 from vehicle_agent.features.new_layer_parameters import NewLayerParameters
 
 CALIBRATION = gtsam.symbol("c", 0)
@@ -26,86 +26,6 @@ FREE_RAD = 1e4  # sigma of a rotation of which nothing is said
 ITERATIONS = 30
 LINEARISATIONS = 10
 STAYS = 1e-4  # root mean square step of all numbers (m, rad) below which the optimum has been found
-
-
-class FixNodes(NamedTuple):
-    """Fixes put together at keyframes, G of them."""
-
-    key: I64
-    """(G,) keyframe, increasing."""
-    t_s: F64
-    """(G,)"""
-    xy_m: F64
-    """(G, 2) map frame."""
-    variance_m2: F64
-    """(G,) of an axis, without the slow error."""
-
-
-class Ties(NamedTuple):
-    """Measurements of one feature put together at a keyframe, T of them."""
-
-    key: I64
-    """(T,) keyframe."""
-    landmark: I64
-    """(T,)"""
-    polar: F64
-    """(T, 2): bearing [rad] and range [m] from the keyframe."""
-    cov: F64
-    """(T, 2, 2) of bearing and range."""
-
-
-class PoseMatches(NamedTuple):
-    """Poses of keyframes told by something else than motion and features: lanes (Eq. 8), or another localiser."""
-
-    key: I64
-    """(P,)"""
-    pose: F64
-    """(P, 3) near which they hold."""
-    off: F64
-    """(P, 3) that the keyframe is off from `pose`, in its frame (x ahead, y left, yaw; the logarithm)."""
-    information: F64
-    """(P, 3, 3) of `off`; may be singular: nothing is then said along some direction."""
-
-
-class Anchors(NamedTuple):
-    """Features whose places are known: A of them."""
-
-    landmark: I64
-    """(A,)"""
-    xy_m: F64
-    """(A, 2)"""
-    cov: F64
-    """(A, 2, 2)"""
-
-
-NO_FIX_NODES = FixNodes(np.empty(0, np.int64), np.empty(0), np.empty((0, 2)), np.empty(0))
-NO_TIES = Ties(np.empty(0, np.int64), np.empty(0, np.int64), np.empty((0, 2)), np.empty((0, 2, 2)))
-NO_MATCHES = PoseMatches(np.empty(0, np.int64), np.empty((0, 3)), np.empty((0, 3)), np.empty((0, 3, 3)))
-NO_ANCHORS = Anchors(np.empty(0, np.int64), np.empty((0, 2)), np.empty((0, 2, 2)))
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class Problem:
-    """All edges of a drive. calibration: (2,) wheel scale and gyro bias that `steps` were made with."""
-
-    steps: Steps
-    calibration: F64
-    fixes: FixNodes = NO_FIX_NODES
-    ties: Ties = NO_TIES
-    lanes: PoseMatches = NO_MATCHES
-    poses: PoseMatches = NO_MATCHES
-    anchors: Anchors = NO_ANCHORS
-
-
-class State(NamedTuple):
-    """Estimates of all nodes but the GNSS's errors."""
-
-    pose: F64
-    """(K, 3)"""
-    xy_m: F64
-    """(N, 2) features."""
-    calibration: F64
-    """(2,) wheel scale and gyro bias [rad/s]."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -342,8 +262,3 @@ def bearing_range(xy_m: F64, cov: F64) -> tuple[F64, F64]:
     distance = np.maximum(np.hypot(x, y), 1e-6)
     J = np.stack([np.stack([-y, x], axis=1) / distance[:, None] ** 2, xy_m / distance[:, None]], axis=1)
     return np.stack([np.arctan2(y, x), distance], axis=1), np.asarray(J @ cov @ J.transpose(0, 2, 1))
-
-
-def yaw_of(R: F64) -> float:
-    """Yaw of a rotation (3, 3) or (4, 4) about z [rad]."""
-    return atan2(R[1, 0], R[0, 0])

@@ -15,7 +15,8 @@ from gnd_map.arrays import F64, I64
 from vehicle_agent.features.association import FORBIDDEN, associate
 from vehicle_agent.features.dead_reckoning import composed, relative, rotated, wrapped
 from vehicle_agent.features.feature_drive import Measurements
-from vehicle_agent.features.graph import Ties, bearing_range
+from vehicle_agent.features.graph import bearing_range
+from vehicle_agent.features.graph_edges import Ties
 from vehicle_agent.features.new_layer_parameters import LandmarkParameters
 
 NONE = -1  # a measurement of no feature

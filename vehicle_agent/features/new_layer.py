@@ -12,7 +12,8 @@ import numpy as np
 from gnd_map.arrays import F64, I64
 from vehicle_agent.features.drive_nodes import DriveNodes
 from vehicle_agent.features.feature_drive import FeatureDrive, Measurements
-from vehicle_agent.features.graph import Anchors, Problem, Solution, State, solve
+from vehicle_agent.features.graph import Solution, solve
+from vehicle_agent.features.graph_edges import Anchors, Problem, State
 from vehicle_agent.features.landmarks import NONE, Places, Sight, assigned, clustered, doubles, kept, spread, tied
 from vehicle_agent.features.lanes import LaneMap, LaneMatcher
 from vehicle_agent.features.look import MapFeatures
@@ -130,7 +131,7 @@ class _Mapping:
 
     def _solve_without_features(self) -> None:
         """Better first poses: lanes are matched before features are looked for."""
-        for _ in range(3):
+        for _ in range(2):
             problem = self._problem()
             self.state = solve(problem, self.state, self.parameters).state
             self.nodes = self.nodes.calibrated(self.state.calibration)
