@@ -101,45 +101,74 @@ def run_slamcu(drive: RoadDrive, variant: str, parameters: SlamcuParameters, see
         seed: of its particles.
         tick: told how many looks have been taken.
     """
-    start = start_of(drive)
-    slamcu = Slamcu(parameters, map_features(drive.route), start.pose, start.cov, seed)
-    poses = _Poses.of(drive, variant, parameters, seed)
-    view, steps, taken, at = sensor_view(drive.view), [], [], []
-    spent_s, before_ns = 0.0, start.t_ns
+    run, start_ns = _Run(drive, variant, parameters, seed), start_of(drive).t_ns
     for t_ns, what, i in drive.events():
-        if t_ns <= start.t_ns or what == "lanes":
-            continue
-        given = poses.at(t_ns, what, i) if poses is not None else None
-        look = look_of(drive.looks[i]) if what == "look" else None
-        occlusion = occlusion_of(drive, i) if look is not None and variant != "no_occlusion" else None
+        if t_ns > start_ns and what != "lanes":
+            run.take(t_ns, what, i)
+            if what == "look" and len(run.taken) % _TELL_EVERY == 0:
+                tick(i, len(drive.looks))
+    return run.driven()
+
+
+class _Run:
+    """SLAMCU on its way along a drive."""
+
+    def __init__(self, drive: RoadDrive, variant: str, parameters: SlamcuParameters, seed: int) -> None:
+        start = start_of(drive)
+        self._drive, self._variant, self._view = drive, variant, sensor_view(drive.view)
+        self._slamcu = Slamcu(parameters, map_features(drive.route), start.pose, start.cov, seed)
+        self._poses = _Poses.of(drive, variant, parameters, seed)
+        self._before_ns, self._spent_s = start.t_ns, 0.0
+        self._step_ms: list[float] = []
+        self._at: list[F64] = []
+        self.taken: list[int] = []
+
+    def take(self, t_ns: int, what: str, i: int) -> None:
+        """Take one event; only SLAMCU's own work is timed."""
+        given = self._poses.at(t_ns, what, i) if self._poses is not None else None
+        if what == "look":
+            self._look(i, given)
+            return
         begun_s = perf_counter()
         if what == "motion":
-            slamcu.predict(
-                (t_ns - before_ns) * 1e-9, float(drive.motion.speed_mps[i]), float(drive.motion.yaw_rate_radps[i])
-            )
-            before_ns = t_ns
-        elif what == "gnss" and poses is None:
-            slamcu.gnss(float(drive.gnss.xy_m[i, 0]), float(drive.gnss.xy_m[i, 1]), drive.gnss.sigma_m)
-        elif look is not None:
-            if given is not None:
-                slamcu.set_pose(*given)
-            slamcu.look(look, view, occlusion)
-        spent_s += perf_counter() - begun_s
-        if look is not None:
-            steps.append(1e3 * spent_s)
-            taken.append(i)
-            at.append(slamcu.pose()[0])
-            spent_s = 0.0
-            if len(steps) % _TELL_EVERY == 0:
-                tick(i, len(drive.looks))
-    return Driven(
-        slamcu.known_states(),
-        slamcu.new_features(unclassified=True),
-        np.array(steps),
-        np.array(taken, np.int64),
-        np.array(at),
-        slamcu.hidden,
-    )
+            self._slamcu.predict((t_ns - self._before_ns) * 1e-9, *motion_at(self._drive, i))
+            self._before_ns = t_ns
+        elif self._poses is None:
+            self._slamcu.gnss(*fix_at(self._drive, i))
+        self._spent_s += perf_counter() - begun_s
+
+    def _look(self, i: int, given: tuple[F64, F64] | None) -> None:
+        look = look_of(self._drive.looks[i])
+        occlusion = None if self._variant == "no_occlusion" else occlusion_of(self._drive, i)
+        begun_s = perf_counter()
+        if given is not None:
+            self._slamcu.set_pose(*given)
+        self._slamcu.look(look, self._view, occlusion)
+        self._step_ms.append(1e3 * (self._spent_s + perf_counter() - begun_s))
+        self._spent_s = 0.0
+        self.taken.append(i)
+        self._at.append(self._slamcu.pose()[0])
+
+    def driven(self) -> Driven:
+        """What SLAMCU says now."""
+        return Driven(
+            self._slamcu.known_states(),
+            self._slamcu.new_features(unclassified=True),
+            np.array(self._step_ms),
+            np.array(self.taken, np.int64),
+            np.array(self._at),
+            self._slamcu.hidden,
+        )
+
+
+def motion_at(drive: RoadDrive, i: int) -> tuple[float, float]:
+    """Return wheel speed [m/s] and yaw rate [rad/s] of a sample."""
+    return float(drive.motion.speed_mps[i]), float(drive.motion.yaw_rate_radps[i])
+
+
+def fix_at(drive: RoadDrive, i: int) -> tuple[float, float, float]:
+    """Return x, y and sigma of a fix, m."""
+    return float(drive.gnss.xy_m[i, 0]), float(drive.gnss.xy_m[i, 1]), drive.gnss.sigma_m
 
 
 class _Poses:
@@ -169,11 +198,10 @@ class _Poses:
             return self._drive.truth.look_poses[i] + self._error[i], np.diag(np.square(LIDAR_SIGMA))
         drive, filtered = self._drive, self._filtered
         if what == "motion":
-            dt_s = (t_ns - self._before_ns) * 1e-9
-            filtered.predict(dt_s, float(drive.motion.speed_mps[i]), float(drive.motion.yaw_rate_radps[i]))
+            filtered.predict((t_ns - self._before_ns) * 1e-9, *motion_at(drive, i))
             self._before_ns = t_ns
         elif what == "gnss":
-            filtered.gnss(float(drive.gnss.xy_m[i, 0]), float(drive.gnss.xy_m[i, 1]), drive.gnss.sigma_m)
+            filtered.gnss(*fix_at(drive, i))
         return filtered.pose() if what == "look" else None
 
 
