@@ -21,6 +21,7 @@ from vehicle_agent.features.feature_report import FeatureReporter
 from vehicle_agent.features.layer import FeatureLayer, PlacedLook, pose_of
 from vehicle_agent.features.layer_parameters import FeatureParameters
 from vehicle_agent.features.look import MAX_RANGE_M, Look
+from vehicle_agent.features.pole_slices import PoseSigma
 from vehicle_agent.features.poles import PoleDetector, Rays, detections_of
 from vehicle_agent.features.view import Occlusion
 from vehicle_agent.localise.estimates import RefinedScan
@@ -165,8 +166,9 @@ class FeatureLayers:
 
 def still(segmented: SegmentedScan) -> Rays:
     """The rays that end on what does not move, map frame."""
-    kept = ~segmented.moving
-    return Rays(segmented.scan.points_map_m[kept], segmented.scan.origins_map_m[kept])
+    kept, scan = ~segmented.moving, segmented.scan
+    sigma = PoseSigma(scan.estimate.sigma_m, scan.estimate.sigma_rad)
+    return Rays(scan.points_map_m[kept], scan.origins_map_m[kept], sigma)
 
 
 def occlusion_of(scan: RefinedScan) -> Occlusion:
