@@ -30,6 +30,8 @@ class FeatureMergeParameters:
             changes again is followed.
         repeat_correlation: correlation of the errors of one vehicle's measurements of one feature in several reports
             (its sensors, its calibration, the GNSS of one drive are the same): n of them weigh n / (1 + (n - 1) ρ).
+        most_weight: a vehicle that claims to be surer than all others (and the map) weighs at most this times the
+            second surest, until another is as sure.
         renewal_gain: a published estimate is renewed when the variance along an axis has shrunk by this factor, or when
             it has moved by more than its sigma; 1: with every vehicle.
         renewal_mass: published masses are renewed when "exist" has changed by more than this.
@@ -48,6 +50,7 @@ class FeatureMergeParameters:
     view_margin_m: float = 0.5
     voters: int = 6
     repeat_correlation: float = 0.5
+    most_weight: float = 4.0
     renewal_gain: float = 1.25
     renewal_mass: float = 0.1
     max_begun: int = 128
@@ -73,9 +76,14 @@ class FeatureMergeParameters:
                 f"repeat_correlation {self.repeat_correlation} must lie in [0, 1], renewal_mass {self.renewal_mass} in "
                 "(0, 1]"
             )
-        if not 1 <= self.renewal_gain <= 16 or self.max_begun < 1:
+        self._check_bounds()
+
+    def _check_bounds(self) -> None:
+        if not 1 <= self.renewal_gain <= 16:
+            raise MergerError(f"renewal_gain must lie in [1, 16], got {self.renewal_gain}")
+        if self.most_weight < 1 or self.max_begun < 1:
             raise MergerError(
-                f"renewal_gain {self.renewal_gain} must lie in [1, 16], max_begun {self.max_begun} be at least 1"
+                f"most_weight {self.most_weight} and max_begun {self.max_begun} must be at least 1: a vehicle counts"
             )
 
     def gate_of(self, dimensions: int) -> float:

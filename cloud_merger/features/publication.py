@@ -10,7 +10,7 @@ import numpy as np
 from cloud_merger.features.association import HEIGHT_KNOWN_M2
 from cloud_merger.features.existence import prior_of, verdict
 from cloud_merger.features.parameters import FeatureMergeParameters
-from cloud_merger.features.rls import Place, estimate, fused, step
+from cloud_merger.features.rls import Place, balanced, estimate, fused, is_even, step
 from cloud_merger.features.shapes import length_of
 from cloud_merger.features.statements import Attributes
 from cloud_merger.features.tracks import Measured, Track, Vote
@@ -69,6 +69,8 @@ class _Story:
         self._state: Place | None = self._known
         self._is_stale = False
         self._longest_m = 0.0  # of the measured polylines
+        self._least_m2 = [] if self._known is None else [self._known.least_m2]
+        self._is_even, self._has_repeats = True, False
         self._finders: set[str] = set()
         self._first_confirmed: Place | None = None
         known = track.epoch or track.quoted
@@ -93,9 +95,13 @@ class _Story:
         own = self._measured.setdefault(measured.vehicle, [])
         own.append(measured)
         length_m = length_of(measured.place.points_m)
-        if len(own) > 1 or (self._known is None and length_m > self._longest_m):
+        is_longer = self._known is None and length_m > self._longest_m
+        self._longest_m = max(self._longest_m, length_m)
+        self._least_m2.append(measured.place.least_m2)
+        was_even, self._is_even = self._is_even, is_even(self._least_m2, self._parameters.most_weight)
+        self._has_repeats |= len(own) > 1
+        if self._has_repeats or is_longer or not (was_even and self._is_even):
             self._is_stale = True
-            self._longest_m = max(self._longest_m, length_m)
         elif not self._is_stale:
             self._state = measured.place if self._state is None else step(self._state, measured.place)
         self._finders |= {measured.vehicle} if measured.is_found else set()
@@ -117,7 +123,7 @@ class _Story:
     def _estimate(self, each: list[Place]) -> Place:
         if not each and self._known is None:
             return self._track.state  # quoted from an older version, measured by nobody since
-        return estimate(each, self._known)
+        return estimate(balanced(each, self._known, self._parameters.most_weight), self._known)
 
     def _newest(self) -> list[_Cast]:
         return list(self._votes.values())[-self._parameters.voters :]

@@ -39,6 +39,12 @@ class Place:
             cov[2, 2] = _NOTHING_M2
         return cls(points_m, cov)
 
+    @property
+    def least_m2(self) -> float:
+        """The smaller horizontal variance: how sure it claims to be."""
+        xx, xy, yy = self.cov_m2[0, 0], self.cov_m2[0, 1], self.cov_m2[1, 1]
+        return float(0.5 * (xx + yy) - np.hypot(0.5 * (xx - yy), xy))
+
     def six(self) -> F64:
         """(6,) the covariance as features have it."""
         six = six_of(self.cov_m2)
@@ -89,3 +95,23 @@ def fused(repeats: Sequence[Place], information: float) -> Place:
         information: n / (1 + (n - 1) ρ), `FeatureMergeParameters.information_of`.
     """
     return estimate(repeats).scaled(len(repeats) / information)
+
+
+def is_even(least_m2: Sequence[float], most: float) -> bool:
+    """Whether none of these variances is more than `most` times smaller than the next."""
+    return len(least_m2) < 2 or sorted(least_m2)[1] <= most * min(least_m2)
+
+
+def balanced(measured: Sequence[Place], known: Place | None, most: float) -> list[Place]:
+    """The measurements of vehicles, none of which claims to be much surer than all others.
+
+    Args:
+        measured: one a vehicle.
+        known: what the map knows, which is a witness too.
+        most: no variance is more than this times smaller than the second smallest; the covariance is scaled up to that.
+    """
+    least_m2 = [one.least_m2 for one in measured] + ([] if known is None else [known.least_m2])
+    if is_even(least_m2, most):
+        return list(measured)
+    bound_m2 = sorted(least_m2)[1] / most
+    return [one.scaled(max(1.0, bound_m2 / max(one.least_m2, 1e-12))) for one in measured]

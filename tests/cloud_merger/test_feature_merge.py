@@ -153,6 +153,19 @@ def test_an_outlier_does_not_corrupt_a_feature():
     assert len(merged.estimates) == 2
 
 
+def test_one_vehicle_that_claims_millimetres_does_not_decide_where_a_feature_is():
+    reports = [report(n, change(found(1.0 + 0.02 * n, 1.0))) for n in range(4)]
+    sure = report(9, change(found(1.4, 1.0, sigma_m=1e-3)))
+    (before,) = merge((), reports).features
+    (after,) = merge((), [*reports, sure], FeatureMergeParameters(renewal_gain=1.0)).features
+    assert abs(after.points_m[0, 0] - (4 * 1.03 + 4 * 1.4) / 8) < 2e-3
+    assert after.cov_m2[0] > 0.3**2 / 10
+    second = report(10, change(found(1.4, 1.0, sigma_m=1e-3)))
+    (agreed,) = merge((), [*reports, sure, second], FeatureMergeParameters(renewal_gain=1.0)).features
+    assert abs(agreed.points_m[0, 0] - 1.4) < 2e-3
+    assert before.points_m[0, 0] < 1.1
+
+
 def test_an_outlier_that_came_first_is_outlived():
     wild = report(0, change(found(2.5, 1.0, sigma_m=0.1)))
     reports = [report(n, change(found(1.0, 1.0, sigma_m=0.1))) for n in (1, 2, 3)]
@@ -347,6 +360,7 @@ def test_masses_never_become_so_sure_that_nothing_could_change_them():
         {"renewal_gain": 0.5},
         {"renewal_mass": 0.0},
         {"max_begun": 0},
+        {"most_weight": 0.5},
         {"ceiling": 1.0},
     ],
 )
