@@ -6,7 +6,7 @@ before the map's features are settled, all ways to give the estimates at hand to
 the whole in each particle: the pose is the same for all of them.
 """
 
-from itertools import islice, permutations
+from itertools import permutations
 from math import perm
 from typing import Final
 
@@ -15,8 +15,10 @@ from scipy.optimize import linear_sum_assignment
 
 from gnd_map.arrays import F64
 from vehicle_agent.features import measurement
-from vehicle_agent.features.rbpf import Rbpf
+from vehicle_agent.features.rbpf import FLOOR_PER_M2, Rbpf
 
+NONE: Final = -1
+"""Of a feature of the map that none of the estimates is."""
 MOST_WAYS: Final = 720
 """More ways than this are not compared; then the best pairs alone are the only other way."""
 
@@ -30,12 +32,12 @@ def best_identities(rbpf: Rbpf, slots: list[int], owned: int) -> list[int]:
         owned: J features of the map, J <= S.
 
     Returns:
-        J of the slots, in the order of the features.
+        J of the slots, in the order of the features; `NONE` for one that none of them is.
     """
     fit = agreements(rbpf, slots, owned)
     log_weight = np.log(np.maximum(rbpf.weights(without=set(slots)), 1e-300))
     best = max(_ways(fit, log_weight), key=lambda way: likelihood(fit, log_weight, way))
-    return [slots[i] for i in best]
+    return [NONE if i == NONE else slots[i] for i in best]
 
 
 def agreements(rbpf: Rbpf, slots: list[int], owned: int) -> F64:
@@ -51,14 +53,14 @@ def agreements(rbpf: Rbpf, slots: list[int], owned: int) -> F64:
 
 def likelihood(fit: F64, log_weight: F64, way: tuple[int, ...]) -> float:
     """Log likelihood of a way to give slots to features, over all particles."""
-    log = log_weight + sum(fit[j, s] for j, s in enumerate(way))
+    log = log_weight + sum(np.log(FLOOR_PER_M2) if s == NONE else fit[j, s] for j, s in enumerate(way))
     most = float(log.max())
     return most + float(np.log(np.exp(log - most).sum()))
 
 
 def _ways(fit: F64, log_weight: F64) -> list[tuple[int, ...]]:
     features, slots = fit.shape[:2]
-    if perm(slots, features) <= MOST_WAYS:
-        return list(islice(permutations(range(slots), features), MOST_WAYS))
+    if perm(slots + features, features) <= MOST_WAYS:
+        return sorted(set(permutations([*range(slots), *[NONE] * features], features)))
     pairs = np.array([[likelihood(fit[[j]][:, [s]], log_weight, (0,)) for s in range(slots)] for j in range(features)])
     return [tuple(linear_sum_assignment(-pairs)[1].tolist()), tuple(range(features))]

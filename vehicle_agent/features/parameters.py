@@ -101,8 +101,8 @@ class SlamcuParameters:
     moved_gate: float = 14.0
     """A map feature measured this far off (squared Mahalanobis) has moved: deleted here, new there. χ² of 2 degrees of
     freedom, 99.9 %."""
-    moved_m: float = 1.0
-    """And at least this far."""
+    moved_m: float = 2.0
+    """And at least this far: less than a lane, more than a pose that is surer than it should be errs by."""
     settle_s: float = 0.5
     """A feature of the map is compared with its map position when it was out of view for this time."""
     settle_hits: int = 60

@@ -7,7 +7,7 @@ import numpy as np
 from gnd_map.arrays import F64
 from vehicle_agent.features.doubt import Doubt, Step
 from vehicle_agent.features.existence_book import Entry, ExistenceBook, FeatureClass
-from vehicle_agent.features.identities import best_identities
+from vehicle_agent.features.identities import NONE, best_identities
 from vehicle_agent.features.parameters import SlamcuParameters
 from vehicle_agent.features.rbpf import Rbpf
 from vehicle_agent.features.tracked import Tracked
@@ -73,7 +73,8 @@ class Tidying:
         """Compare with the position known otherwise, and take that in."""
         if entry.known:
             self._identify(entry, t_ns)
-        assert entry.slot is not None
+        if entry.slot is None:
+            return
         weights = self._rbpf.weights(without=(entry.slot,))
         xy_m, cov = self._rbpf.moments(entry.slot, weights)
         moved = self._moved(entry, xy_m, cov)
@@ -83,7 +84,7 @@ class Tidying:
             self._doubt.look_anew(t_ns)  # and settle when the place has been found
             self._rbpf.settle(entry.slot)
         elif moved:
-            self._split(entry, xy_m, t_ns)
+            self._split(entry, t_ns)
         else:
             self._doubt.found_in_place(entry.odometer_m)
             entry.seen = (xy_m, cov) if entry.seen is None else fused_moments(entry.seen, (xy_m, cov))
@@ -115,9 +116,12 @@ class Tidying:
         if len(group) < 2:
             return
         slots = [one.slot for one in group if one.slot is not None]
-        for feature, slot in zip(group, best_identities(self._rbpf, slots, owned), strict=False):
-            other = self._tracked.live[slot]
-            if other is not feature:
+        found = list(zip(group, best_identities(self._rbpf, slots, owned), strict=False))
+        for feature, slot in found:
+            if slot == NONE:
+                self._split(feature, t_ns)
+        for feature, slot in found:
+            if slot != NONE and (other := self._tracked.live[slot]) is not feature:
                 self._exchange(feature, other, t_ns)
 
     def _group(self, entry: Entry) -> list[Entry]:
@@ -143,8 +147,10 @@ class Tidying:
         squared = float(off @ np.linalg.solve(total, off))
         return squared > self._p.moved_gate and float(np.hypot(*off)) > self._p.moved_m
 
-    def _split(self, entry: Entry, xy_m: F64, t_ns: int) -> None:
+    def _split(self, entry: Entry, t_ns: int) -> None:
         """A moved feature is a deleted one and a new one (section 2.3)."""
+        assert entry.slot is not None
+        xy_m, _ = self._rbpf.moments(entry.slot, self._rbpf.weights(without=(entry.slot,)))
         found, hits = self._tracked.register(entry.kind), entry.pass_hits
         found.xy_m, found.in_view_s, found.odometer_m = xy_m, entry.in_view_s, entry.odometer_m
         found.heights, entry.heights = entry.heights, found.heights
