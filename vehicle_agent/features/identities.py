@@ -15,10 +15,13 @@ from scipy.optimize import linear_sum_assignment
 
 from gnd_map.arrays import F64
 from vehicle_agent.features import measurement
-from vehicle_agent.features.rbpf import FLOOR_PER_M2, Rbpf
+from vehicle_agent.features.rbpf import Rbpf
 
 NONE: Final = -1
 """Of a feature of the map that none of the estimates is."""
+LN_NONE: Final = -25.0
+"""Natural logarithm of the density of that, 1/m^2: a sign gone and a new one of its kind in its place are rare, and a
+pose that is surer than it should be makes the map look changed."""
 MOST_WAYS: Final = 720
 """More ways than this are not compared; then the best pairs alone are the only other way."""
 
@@ -53,7 +56,7 @@ def agreements(rbpf: Rbpf, slots: list[int], owned: int) -> F64:
 
 def likelihood(fit: F64, log_weight: F64, way: tuple[int, ...]) -> float:
     """Log likelihood of a way to give slots to features, over all particles."""
-    log = log_weight + sum(np.log(FLOOR_PER_M2) if s == NONE else fit[j, s] for j, s in enumerate(way))
+    log = log_weight + sum(LN_NONE if s == NONE else fit[j, s] for j, s in enumerate(way))
     most = float(log.max())
     return most + float(np.log(np.exp(log - most).sum()))
 
