@@ -8,7 +8,7 @@ import numpy as np
 
 from benchmarks.pole_real import RealScan
 from gnd_map.arrays import F64
-from vehicle_agent.features.poles import Pole
+from vehicle_agent.features.poles.detector import Pole
 
 COLOURS: Final = {"pole": "#1f77b4", "streetlight": "#ff7f0e", "traffic_sign": "#d62728", "trunk": "#2ca02c"}
 REACH_M: Final = 42.0

@@ -11,7 +11,7 @@ from gnd_map.arrays import F32, F64
 from gnd_map.motion import Trajectory, deskew
 from gnd_map.se3 import transform
 from schemas.drive import U32
-from vehicle_agent.features.poles import Pole, PoleDetector, Rays
+from vehicle_agent.features.poles.detector import Pole, PoleDetector, Rays
 from vehicle_agent.importer import FORMATS, no_progress
 from vehicle_agent.importers.cleaning import cleaned
 from vehicle_agent.importers.detect_format import format_of

@@ -18,7 +18,7 @@ from fleet_sim.world import World, WorldObject
 from gnd_map.arrays import F64, I64
 from gnd_map.motion import Trajectory, deskew
 from gnd_map.se3 import transform
-from vehicle_agent.features.poles import Rays
+from vehicle_agent.features.poles.detector import Rays
 
 KINDS: Final = {"lamp": "streetlight", "sign": "traffic_sign", "tree": "trunk"}
 """Kinds of the detector by kinds of the world; a post of anything else is a "pole"."""

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from benchmarks.pole_scenes import Posts
 from gnd_map.arrays import F64, I64
-from vehicle_agent.features.poles import Pole
+from vehicle_agent.features.poles.detector import Pole
 
 GATE_M: Final = 0.5
 """A detection is right when the axis of a post that no nearer detection has lies within this."""

@@ -26,8 +26,8 @@ from benchmarks.pole_scenes import KINDS, Drive, PoleDrive, PoleScan
 from benchmarks.pole_scores import BANDS, CHI2_2_95, SINGLE, Score
 from fleet_sim.sensors import SHORT_NAMES
 from gnd_map.se3 import exp_so3, transform
-from vehicle_agent.features.pole_slices import PoseSigma
-from vehicle_agent.features.poles import PoleDetector, Rays
+from vehicle_agent.features.poles.detector import PoleDetector, Rays
+from vehicle_agent.features.poles.slices import PoseSigma
 
 COMMAND = "python -m benchmarks poles"
 RECORDINGS: Final = Path(__file__).resolve().parents[2] / "shared" / "data"

@@ -19,8 +19,8 @@ from benchmarks.slamcu_study.scores import SignScore, accuracy_of, score
 from fleet_sim.roads.drive import RoadDrive, drive_route
 from fleet_sim.roads.motorway import motorway
 from gnd_map.arrays import F64
-from vehicle_agent.features.parameters import SlamcuParameters
-from vehicle_agent.features.slamcu import Slamcu
+from vehicle_agent.features.slamcu.parameters import SlamcuParameters
+from vehicle_agent.features.slamcu.slamcu import Slamcu
 
 COMMAND = "python -m benchmarks slamcu-step"
 PAPER_MS = 30.39

@@ -30,7 +30,7 @@ def run_agent(config: AgentConfig, stop: threading.Event) -> dict[str, Any]:
     """
     keep_small()
     if config.localise_by == "graph":  # no LiDAR: features are mapped stretch by stretch
-        from vehicle_agent.features.mapper import run_mapper
+        from vehicle_agent.features.mapping.mapper import run_mapper
 
         return run_mapper(config, stop)
     with open_vehicle(config, stop) as vehicle:

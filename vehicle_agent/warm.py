@@ -18,7 +18,7 @@ from schemas.drive import GnssFix, MotionSample, Scan
 from schemas.report_id import deterministic_report_id
 from vehicle_agent.detect.classify import classify, tile_change
 from vehicle_agent.detect.detector import ChangeDetector
-from vehicle_agent.features.poles import PoleDetector
+from vehicle_agent.features.poles.detector import PoleDetector
 from vehicle_agent.local_map import LocalMap
 from vehicle_agent.localise.estimates import PoseEstimate, RefinedScan
 from vehicle_agent.localise.localiser import Localiser

@@ -23,10 +23,10 @@ from fleet_sim.roads.streetlights import streetlight_motorway
 from fleet_sim.roads.test_track import test_track
 from gnd_map.arrays import F64
 from schemas.features import FeatureReport
-from vehicle_agent.features.feature_drive import FeatureDrive, Fixes
 from vehicle_agent.features.layer import of_counts
 from vehicle_agent.features.look import MapFeatures
-from vehicle_agent.features.new_layer import NewLayer, lane_map, localise_with_features, map_new_layer
+from vehicle_agent.features.mapping.feature_drive import FeatureDrive, Fixes
+from vehicle_agent.features.mapping.new_layer import NewLayer, lane_map, localise_with_features, map_new_layer
 from vehicle_agent.features.view import SensorView
 
 TRACK: Final = "track"

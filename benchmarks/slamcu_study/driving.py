@@ -18,9 +18,9 @@ from fleet_sim.trajectory import gauss_markov
 from gnd_map.arrays import F64, I64
 from schemas.drive import Detections
 from vehicle_agent.features.look import Look, MapFeatures
-from vehicle_agent.features.parameters import SlamcuParameters
-from vehicle_agent.features.slamcu import Slamcu
-from vehicle_agent.features.verdicts import KnownState, NewFeature
+from vehicle_agent.features.slamcu.parameters import SlamcuParameters
+from vehicle_agent.features.slamcu.slamcu import Slamcu
+from vehicle_agent.features.slamcu.verdicts import KnownState, NewFeature
 from vehicle_agent.features.view import Occlusion, SensorView
 
 LIDAR_SIGMA: Final = (0.04, 0.04, np.radians(0.08))

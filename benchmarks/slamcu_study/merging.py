@@ -19,9 +19,9 @@ from fleet_sim.roads.drive import RoadDrive
 from fleet_sim.roads.route import MAP_ERROR_M, Route
 from gnd_map.arrays import F64
 from schemas.features import FeatureReport
-from vehicle_agent.features.existence_book import FeatureClass
 from vehicle_agent.features.layer import bounded, of_counts
-from vehicle_agent.features.parameters import SlamcuParameters
+from vehicle_agent.features.slamcu.existence_book import FeatureClass
+from vehicle_agent.features.slamcu.parameters import SlamcuParameters
 from vehicle_agent.features.view import TYPICAL_HEIGHT_M
 
 

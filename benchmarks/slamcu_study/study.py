@@ -21,7 +21,7 @@ from benchmarks.slamcu_study.verdicts import read_verdicts, write_verdicts
 from fleet_sim.drives import EPOCH_NS
 from fleet_sim.roads.drive import RoadDriveOptions, drive_route
 from fleet_sim.roads.motorway import motorway
-from vehicle_agent.features.parameters import SlamcuParameters
+from vehicle_agent.features.slamcu.parameters import SlamcuParameters
 
 SOURCES: Final = (
     "fleet_sim/roads",

@@ -13,7 +13,7 @@ from benchmarks.poles import options
 from fleet_sim.shapes import Post
 from fleet_sim.street import street
 from gnd_map.se3 import transform
-from vehicle_agent.features.poles import Pole, PoleDetector, Rays
+from vehicle_agent.features.poles.detector import Pole, PoleDetector, Rays
 from vehicle_agent.importers.cleaning import cleaned
 from vehicle_agent.importers.kitti import open_kitti
 

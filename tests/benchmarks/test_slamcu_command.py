@@ -23,7 +23,7 @@ from deploy.cli import gnd
 from fleet_sim.roads.drive import drive_route
 from fleet_sim.roads.motorway import motorway
 from gnd_map.errors import GndError
-from vehicle_agent.features.parameters import SlamcuParameters
+from vehicle_agent.features.slamcu.parameters import SlamcuParameters
 
 SHORT = ("--seeds", "14", "--km", "5", "--drives", "2", "--processes", "1", "--no-ablations")
 Finished = tuple[Path, dict[str, Any]]

@@ -4,11 +4,11 @@ import numpy as np
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from vehicle_agent.features.bias_chain import gauss_markov_springs
-from vehicle_agent.features.dead_reckoning import Steps
-from vehicle_agent.features.graph import solve
-from vehicle_agent.features.graph_edges import FixNodes, PoseMatches, Problem, State
-from vehicle_agent.features.new_layer_parameters import GnssNoise, NewLayerParameters
+from vehicle_agent.features.mapping.bias_chain import gauss_markov_springs
+from vehicle_agent.features.mapping.dead_reckoning import Steps
+from vehicle_agent.features.mapping.graph import solve
+from vehicle_agent.features.mapping.graph_edges import FixNodes, PoseMatches, Problem, State
+from vehicle_agent.features.mapping.parameters import GnssNoise, NewLayerParameters
 
 
 def precision(t_s, sigma, tau):

@@ -8,8 +8,8 @@ from plane_scene import Noise, Scene, drive
 
 from gnd_map.geodesy import LocalFrame
 from schemas.drive import GnssFix, MotionSample
-from vehicle_agent.features.feature_drive import FeatureDrive
-from vehicle_agent.features.new_layer_parameters import (
+from vehicle_agent.features.mapping.feature_drive import FeatureDrive
+from vehicle_agent.features.mapping.parameters import (
     GnssNoise,
     LandmarkParameters,
     LaneParameters,

@@ -2,8 +2,8 @@ import numpy as np
 import pytest
 
 from schemas.drive import MotionTrack
-from vehicle_agent.features.dead_reckoning import DeadReckoning, composed, relative
-from vehicle_agent.features.new_layer_parameters import MotionNoise
+from vehicle_agent.features.mapping.dead_reckoning import DeadReckoning, composed, relative
+from vehicle_agent.features.mapping.parameters import MotionNoise
 
 NOISE = MotionNoise()
 

@@ -6,12 +6,12 @@ from plane_scene import Noise, Scene, drive, parameters
 
 from gnd_map.errors import ShapeError
 from vehicle_agent.errors import NewLayerError
-from vehicle_agent.features.dead_reckoning import composed, relative
-from vehicle_agent.features.drive_nodes import DriveNodes
-from vehicle_agent.features.lane_looks import Polylines, choices, offsets
-from vehicle_agent.features.lane_map import LaneMap, gicp
-from vehicle_agent.features.lanes import LaneMatcher, logarithm, moved, solved
-from vehicle_agent.features.new_layer_parameters import LaneParameters
+from vehicle_agent.features.mapping.dead_reckoning import composed, relative
+from vehicle_agent.features.mapping.drive_nodes import DriveNodes
+from vehicle_agent.features.mapping.lane_looks import Polylines, choices, offsets
+from vehicle_agent.features.mapping.lane_map import LaneMap, gicp
+from vehicle_agent.features.mapping.lanes import LaneMatcher, logarithm, moved, solved
+from vehicle_agent.features.mapping.parameters import LaneParameters
 
 SHARP = Noise(lane_m=0.05, lane_rad=0.002)
 

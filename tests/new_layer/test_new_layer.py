@@ -9,9 +9,9 @@ from plane_scene import PAPER, T0_NS, Noise, Scene, drive, fixes, lane_looks, lo
 from gnd_map.errors import ShapeError
 from schemas.drive import MotionTrack
 from vehicle_agent.errors import NewLayerError
-from vehicle_agent.features.feature_drive import FeatureDrive, Fixes, KnownPoses, Measurements
 from vehicle_agent.features.look import MapFeatures
-from vehicle_agent.features.new_layer import lane_map, localise_with_features, map_new_layer
+from vehicle_agent.features.mapping.feature_drive import FeatureDrive, Fixes, KnownPoses, Measurements
+from vehicle_agent.features.mapping.new_layer import lane_map, localise_with_features, map_new_layer
 
 EXACT = Noise()
 

@@ -7,7 +7,7 @@ import pytest
 from plane_scene import PAPER, Scene, drive, parameters
 from scipy.stats import chi2
 
-from vehicle_agent.features.new_layer import lane_map, map_new_layer
+from vehicle_agent.features.mapping.new_layer import lane_map, map_new_layer
 
 RUNS = 100
 SCENE = Scene(seconds=8.0, features=np.array([[15.0, 7.0], [60.0, -8.0]]))

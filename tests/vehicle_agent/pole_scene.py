@@ -10,7 +10,7 @@ from fleet_sim.raycast import Scene
 from fleet_sim.sensors import MODELS
 from fleet_sim.shapes import Block, Post, Shape
 from gnd_map.arrays import F64
-from vehicle_agent.features.poles import Rays
+from vehicle_agent.features.poles.detector import Rays
 
 LIDAR_M = 1.9
 GROUND = Block(0.0, 0.0, 150.0, 150.0, -1.0, 0.0)

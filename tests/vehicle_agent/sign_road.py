@@ -7,8 +7,8 @@ from math import atan2, hypot, radians
 import numpy as np
 
 from vehicle_agent.features.look import Look, MapFeatures
-from vehicle_agent.features.parameters import FilterParameters, SlamcuParameters
-from vehicle_agent.features.slamcu import Slamcu
+from vehicle_agent.features.slamcu.parameters import FilterParameters, SlamcuParameters
+from vehicle_agent.features.slamcu.slamcu import Slamcu
 from vehicle_agent.features.view import CAMERA, Occlusion
 
 PERIOD_S = 1.0 / 15.0

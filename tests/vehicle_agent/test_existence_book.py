@@ -7,8 +7,15 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from vehicle_agent.features.existence_book import Entry, ExistenceBook, FeatureClass, counted, doubted, existence_of
-from vehicle_agent.features.parameters import SlamcuParameters
+from vehicle_agent.features.slamcu.existence_book import (
+    Entry,
+    ExistenceBook,
+    FeatureClass,
+    counted,
+    doubted,
+    existence_of,
+)
+from vehicle_agent.features.slamcu.parameters import SlamcuParameters
 
 BOOK = ExistenceBook(SlamcuParameters())
 SETS = (frozenset({"yes"}), frozenset({"no"}), frozenset({"yes", "no"}))

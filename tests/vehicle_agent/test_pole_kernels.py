@@ -7,16 +7,7 @@ import numpy as np
 import pytest
 
 from gnd_map.arrays import F64, I64
-from vehicle_agent.features.pole_place_kernels import (
-    Ground,
-    around,
-    by_cell,
-    cone_heights,
-    heights_over,
-    lowest_heights,
-    rays_below,
-)
-from vehicle_agent.features.poles_kernels import (
+from vehicle_agent.features.poles.kernels import (
     HIDDEN,
     JOINED,
     STEP_RAD,
@@ -27,6 +18,15 @@ from vehicle_agent.features.poles_kernels import (
     polar_of,
     row_order,
     thin_slices,
+)
+from vehicle_agent.features.poles.place_kernels import (
+    Ground,
+    around,
+    by_cell,
+    cone_heights,
+    heights_over,
+    lowest_heights,
+    rays_below,
 )
 
 GROUND = Ground(-6.0, -6.0, 1.0, 12)

@@ -10,9 +10,9 @@ from fleet_sim import parts
 from fleet_sim.shapes import Shape
 from gnd_map.se3 import exp_so3, transform
 from schemas.limits import MAX_DETECTIONS_OF_LOOK
-from vehicle_agent.features.pole_parameters import PoleInputError, PoleParameterError, PoleParameters
-from vehicle_agent.features.pole_slices import PoseSigma
-from vehicle_agent.features.poles import Pole, PoleDetector, Rays, detections_of
+from vehicle_agent.features.poles.detector import Pole, PoleDetector, Rays, detections_of
+from vehicle_agent.features.poles.parameters import PoleInputError, PoleParameterError, PoleParameters
+from vehicle_agent.features.poles.slices import PoseSigma
 
 PLACE = np.zeros(3)
 

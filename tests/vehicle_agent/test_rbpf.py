@@ -9,10 +9,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from rbpf_plain import ekf, h, log_normal, unpacked
 
-from vehicle_agent.features import measurement
 from vehicle_agent.features.errors import SlamcuParameterError
-from vehicle_agent.features.parameters import FilterParameters, MotionNoise, SlamcuParameters
-from vehicle_agent.features.rbpf import GNSS_X, HEADING, Rbpf, X, Y, effective, systematic
+from vehicle_agent.features.slamcu import measurement
+from vehicle_agent.features.slamcu.parameters import FilterParameters, MotionNoise, SlamcuParameters
+from vehicle_agent.features.slamcu.rbpf import GNSS_X, HEADING, Rbpf, X, Y, effective, systematic
 
 VARIANCE = np.array([1.0, radians(2.5) ** 2])
 NO_NOISE = MotionNoise(0.0, 0.0, 0.0, 0.0, 0.0, 0.0)

@@ -8,9 +8,9 @@ import pytest
 from sign_road import CERTAIN, FEW, PERIOD_S, Road, driven
 
 from vehicle_agent.features.errors import BadLook, BadMapFeatures, BadPose
-from vehicle_agent.features.existence_book import FeatureClass
 from vehicle_agent.features.look import Look, MapFeatures
-from vehicle_agent.features.slamcu import Slamcu
+from vehicle_agent.features.slamcu.existence_book import FeatureClass
+from vehicle_agent.features.slamcu.slamcu import Slamcu
 from vehicle_agent.features.view import CAMERA, Occlusion
 
 NORMAL, DELETED, NEW = FeatureClass.NORMAL, FeatureClass.DELETED, FeatureClass.NEW

@@ -16,8 +16,8 @@ from vehicle_agent.features.coverage import Coverage, CoverageParameters
 from vehicle_agent.features.feature_map import features_in_map, place_in_tile, with_height
 from vehicle_agent.features.layer_parameters import LayerParameters
 from vehicle_agent.features.look import Look, MapFeatures
-from vehicle_agent.features.slamcu import Slamcu
-from vehicle_agent.features.verdicts import KnownState
+from vehicle_agent.features.slamcu.slamcu import Slamcu
+from vehicle_agent.features.slamcu.verdicts import KnownState
 from vehicle_agent.features.view import Occlusion
 from vehicle_agent.surroundings import left_behind
 

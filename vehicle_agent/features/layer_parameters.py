@@ -7,7 +7,7 @@ from typing import Final, Literal
 from schemas.wire import LAYER_PATTERN
 from vehicle_agent.features.coverage import CoverageParameters
 from vehicle_agent.features.errors import FeatureLayerError
-from vehicle_agent.features.parameters import FilterParameters, SlamcuParameters
+from vehicle_agent.features.slamcu.parameters import FilterParameters, SlamcuParameters
 from vehicle_agent.features.view import SensorView
 
 

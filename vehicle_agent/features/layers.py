@@ -21,8 +21,8 @@ from vehicle_agent.features.feature_report import FeatureReporter
 from vehicle_agent.features.layer import FeatureLayer, PlacedLook, pose_of
 from vehicle_agent.features.layer_parameters import FeatureParameters
 from vehicle_agent.features.look import MAX_RANGE_M, Look
-from vehicle_agent.features.pole_slices import PoseSigma
-from vehicle_agent.features.poles import PoleDetector, Rays, detections_of
+from vehicle_agent.features.poles.detector import PoleDetector, Rays, detections_of
+from vehicle_agent.features.poles.slices import PoseSigma
 from vehicle_agent.features.view import Occlusion
 from vehicle_agent.localise.estimates import RefinedScan
 from vehicle_agent.segment.segmenter import SegmentedScan

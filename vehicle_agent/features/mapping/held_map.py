@@ -11,8 +11,8 @@ from gnd_map.features import CUT_START, Feature, FeatureTile
 from gnd_map.geodesy import LocalFrame
 from gnd_map.tile_id import TileId
 from vehicle_agent.features.feature_map import features_in_map
-from vehicle_agent.features.lane_map import LaneMap
 from vehicle_agent.features.look import MapFeatures
+from vehicle_agent.features.mapping.lane_map import LaneMap
 
 LANES: Final = "lanes"
 LEAST_LANE_M: Final = 5.0

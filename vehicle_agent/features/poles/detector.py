@@ -16,11 +16,11 @@ from numpy.typing import NDArray
 from gnd_map.arrays import F64, I64
 from schemas.drive import Detections
 from schemas.limits import MAX_DETECTIONS_OF_LOOK
-from vehicle_agent.features.pole_columns import Columns, columns_of, stacked
-from vehicle_agent.features.pole_kinds import Surroundings, bottoms, is_free, kinds_of, look_around, tops
-from vehicle_agent.features.pole_parameters import PoleInputError, PoleParameters
-from vehicle_agent.features.pole_place_kernels import rays_below
-from vehicle_agent.features.pole_slices import (
+from vehicle_agent.features.poles.columns import Columns, columns_of, stacked
+from vehicle_agent.features.poles.kinds import Surroundings, bottoms, is_free, kinds_of, look_around, tops
+from vehicle_agent.features.poles.parameters import PoleInputError, PoleParameters
+from vehicle_agent.features.poles.place_kernels import rays_below
+from vehicle_agent.features.poles.slices import (
     EXACT,
     GroundHeights,
     PoseSigma,

@@ -10,8 +10,8 @@ from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
 from gnd_map.arrays import F64, I64
-from vehicle_agent.features.pole_parameters import PoleParameters
-from vehicle_agent.features.pole_slices import Slices, take
+from vehicle_agent.features.poles.parameters import PoleParameters
+from vehicle_agent.features.poles.slices import Slices, take
 
 FRONT = pi / 4
 """Of the radius: mean distance from the visible half of a cylinder to the plane through its axis, seen from afar."""

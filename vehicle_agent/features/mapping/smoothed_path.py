@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from gnd_map.arrays import F64, I64
-from vehicle_agent.features.dead_reckoning import DeadReckoning, composed, relative, wrapped
+from vehicle_agent.features.mapping.dead_reckoning import DeadReckoning, composed, relative, wrapped
 
 
 @dataclass(frozen=True, slots=True, eq=False)

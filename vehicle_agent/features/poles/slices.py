@@ -8,9 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gnd_map.arrays import F64, I64
-from vehicle_agent.features.pole_parameters import PoleInputError, PoleParameters
-from vehicle_agent.features.pole_place_kernels import Ground, cone_heights, heights_over, lowest_heights
-from vehicle_agent.features.poles_kernels import (
+from vehicle_agent.features.poles.kernels import (
     Beside,
     Rows,
     azimuth_step,
@@ -19,6 +17,8 @@ from vehicle_agent.features.poles_kernels import (
     row_order,
     thin_slices,
 )
+from vehicle_agent.features.poles.parameters import PoleInputError, PoleParameters
+from vehicle_agent.features.poles.place_kernels import Ground, cone_heights, heights_over, lowest_heights
 
 U8 = NDArray[np.uint8]
 

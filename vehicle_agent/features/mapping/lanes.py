@@ -14,12 +14,12 @@ import numpy as np
 
 from gnd_map.arrays import F64, I64
 from schemas.drive import LaneLook
-from vehicle_agent.features.dead_reckoning import composed, relative, rotated
-from vehicle_agent.features.drive_nodes import DriveNodes, nearest
-from vehicle_agent.features.graph_edges import NO_MATCHES, PoseMatches
-from vehicle_agent.features.lane_looks import Offsets, Polylines, choices, offsets
-from vehicle_agent.features.lane_map import LaneMap, gicp
-from vehicle_agent.features.new_layer_parameters import LaneParameters
+from vehicle_agent.features.mapping.dead_reckoning import composed, relative, rotated
+from vehicle_agent.features.mapping.drive_nodes import DriveNodes, nearest
+from vehicle_agent.features.mapping.graph_edges import NO_MATCHES, PoseMatches
+from vehicle_agent.features.mapping.lane_looks import Offsets, Polylines, choices, offsets
+from vehicle_agent.features.mapping.lane_map import LaneMap, gicp
+from vehicle_agent.features.mapping.parameters import LaneParameters
 
 __all__ = ["LaneMap", "LaneMatcher"]
 

@@ -6,10 +6,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gnd_map.arrays import F64, I64
-from vehicle_agent.features.pole_columns import Columns
-from vehicle_agent.features.pole_parameters import PoleParameters
-from vehicle_agent.features.pole_place_kernels import around, by_cell
-from vehicle_agent.features.pole_slices import GroundHeights
+from vehicle_agent.features.poles.columns import Columns
+from vehicle_agent.features.poles.parameters import PoleParameters
+from vehicle_agent.features.poles.place_kernels import around, by_cell
+from vehicle_agent.features.poles.slices import GroundHeights
 
 Mask = NDArray[np.bool_]
 

@@ -7,10 +7,10 @@ import numpy as np
 
 from gnd_map.arrays import F64
 from vehicle_agent.features.errors import BadMapFeatures
-from vehicle_agent.features.existence_book import Entry, ExistenceBook
 from vehicle_agent.features.look import MapFeatures
-from vehicle_agent.features.parameters import SlamcuParameters
-from vehicle_agent.features.rbpf import Prior, Rbpf
+from vehicle_agent.features.slamcu.existence_book import Entry, ExistenceBook
+from vehicle_agent.features.slamcu.parameters import SlamcuParameters
+from vehicle_agent.features.slamcu.rbpf import Prior, Rbpf
 
 
 class Tracked:

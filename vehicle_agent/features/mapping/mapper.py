@@ -20,12 +20,12 @@ from schemas.errors import SchemaError
 from vehicle_agent.config import AgentConfig
 from vehicle_agent.errors import NewLayerError
 from vehicle_agent.features.download import FeatureDownloader
-from vehicle_agent.features.feature_drive import FeatureDrive
 from vehicle_agent.features.feature_report import FeatureReporter
-from vehicle_agent.features.held_map import LANES, HeldMap
 from vehicle_agent.features.layer_parameters import LayerParameters
-from vehicle_agent.features.mapped import changes_of
-from vehicle_agent.features.new_layer import map_new_layer
+from vehicle_agent.features.mapping.feature_drive import FeatureDrive
+from vehicle_agent.features.mapping.held_map import LANES, HeldMap
+from vehicle_agent.features.mapping.mapped import changes_of
+from vehicle_agent.features.mapping.new_layer import map_new_layer
 from vehicle_agent.link import Link, open_link
 from vehicle_agent.place import Place
 from vehicle_agent.report import Identity

@@ -15,9 +15,9 @@ from numpy.typing import NDArray
 
 from gnd_map.arrays import F64, I64
 from schemas.drive import LaneLook
-from vehicle_agent.features.dead_reckoning import composed, rotated
-from vehicle_agent.features.lane_map import SAMPLE_M, LaneMap
-from vehicle_agent.features.new_layer_parameters import LaneParameters
+from vehicle_agent.features.mapping.dead_reckoning import composed, rotated
+from vehicle_agent.features.mapping.lane_map import SAMPLE_M, LaneMap
+from vehicle_agent.features.mapping.parameters import LaneParameters
 
 POINTS = 8  # of a polyline that are compared with the map
 MAX_LANES = 8  # beside each other that are looked at

@@ -14,8 +14,8 @@ import numpy as np
 from scipy.optimize import linear_sum_assignment
 
 from gnd_map.arrays import F64
-from vehicle_agent.features import measurement
-from vehicle_agent.features.rbpf import Rbpf
+from vehicle_agent.features.slamcu import measurement
+from vehicle_agent.features.slamcu.rbpf import Rbpf
 
 NONE: Final = -1
 """Of a feature of the map that none of the estimates is."""

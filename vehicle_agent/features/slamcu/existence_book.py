@@ -11,7 +11,7 @@ import numpy as np
 
 from gnd_map.arrays import F64
 from gnd_map.features import VACUOUS, Existence, combine, hit, miss, prior
-from vehicle_agent.features.parameters import SlamcuParameters
+from vehicle_agent.features.slamcu.parameters import SlamcuParameters
 
 HISTORY: Final = 1024
 """So many steps of a feature's masses are kept."""

@@ -11,16 +11,16 @@ from typing import Final
 import numpy as np
 
 from gnd_map.arrays import F64, I64
-from vehicle_agent.features.association import Association, associate, pair_costs
 from vehicle_agent.features.errors import BadPose
-from vehicle_agent.features.existence_book import Entry, ExistenceBook, FeatureClass, existence_of
-from vehicle_agent.features.forecast import Forecast, forecast
 from vehicle_agent.features.look import Look, MapFeatures
-from vehicle_agent.features.parameters import SlamcuParameters
-from vehicle_agent.features.rbpf import Rbpf
-from vehicle_agent.features.tidying import Tidying
-from vehicle_agent.features.tracked import Tracked
-from vehicle_agent.features.verdicts import KnownState, NewFeature
+from vehicle_agent.features.slamcu.association import Association, associate, pair_costs
+from vehicle_agent.features.slamcu.existence_book import Entry, ExistenceBook, FeatureClass, existence_of
+from vehicle_agent.features.slamcu.forecast import Forecast, forecast
+from vehicle_agent.features.slamcu.parameters import SlamcuParameters
+from vehicle_agent.features.slamcu.rbpf import Rbpf
+from vehicle_agent.features.slamcu.tidying import Tidying
+from vehicle_agent.features.slamcu.tracked import Tracked
+from vehicle_agent.features.slamcu.verdicts import KnownState, NewFeature
 from vehicle_agent.features.view import Occlusion, SensorView, wrapped
 
 NEAR_M: Final = 30.0

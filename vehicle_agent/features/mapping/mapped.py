@@ -9,12 +9,12 @@ from gnd_map.arrays import F64, I64
 from gnd_map.tile_id import TileId
 from schemas.features import FeatureChange, Found, Seen
 from vehicle_agent.features.coverage import Coverage, CoverageParameters
-from vehicle_agent.features.feature_drive import FeatureDrive
 from vehicle_agent.features.feature_map import place_in_tile, with_height
-from vehicle_agent.features.held_map import HeldMap
 from vehicle_agent.features.layer import of_counts
 from vehicle_agent.features.layer_parameters import LayerParameters
-from vehicle_agent.features.new_layer import NewLayer
+from vehicle_agent.features.mapping.feature_drive import FeatureDrive
+from vehicle_agent.features.mapping.held_map import HeldMap
+from vehicle_agent.features.mapping.new_layer import NewLayer
 from vehicle_agent.features.view import wrapped
 
 

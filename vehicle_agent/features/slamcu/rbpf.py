@@ -18,8 +18,8 @@ from typing import Final
 import numpy as np
 
 from gnd_map.arrays import F64, I64
-from vehicle_agent.features import measurement
-from vehicle_agent.features.parameters import SlamcuParameters
+from vehicle_agent.features.slamcu import measurement
+from vehicle_agent.features.slamcu.parameters import SlamcuParameters
 from vehicle_agent.features.view import wrapped
 
 X, Y, HEADING, SCALE, BIAS, GNSS_X, GNSS_Y = range(7)

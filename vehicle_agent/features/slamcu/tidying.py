@@ -5,12 +5,12 @@ from typing import Final
 import numpy as np
 
 from gnd_map.arrays import F64
-from vehicle_agent.features.doubt import Doubt, Step
-from vehicle_agent.features.existence_book import Entry, ExistenceBook, FeatureClass
-from vehicle_agent.features.identities import NONE, best_identities
-from vehicle_agent.features.parameters import SlamcuParameters
-from vehicle_agent.features.rbpf import Rbpf
-from vehicle_agent.features.tracked import Tracked
+from vehicle_agent.features.slamcu.doubt import Doubt, Step
+from vehicle_agent.features.slamcu.existence_book import Entry, ExistenceBook, FeatureClass
+from vehicle_agent.features.slamcu.identities import NONE, best_identities
+from vehicle_agent.features.slamcu.parameters import SlamcuParameters
+from vehicle_agent.features.slamcu.rbpf import Rbpf
+from vehicle_agent.features.slamcu.tracked import Tracked
 
 SAME_GATE: Final = 9.0
 """Two features within this squared Mahalanobis distance may be one."""

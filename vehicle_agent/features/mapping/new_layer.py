@@ -10,15 +10,25 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from gnd_map.arrays import F64, I64
-from vehicle_agent.features.drive_nodes import DriveNodes
-from vehicle_agent.features.feature_drive import FeatureDrive, Measurements
-from vehicle_agent.features.graph import Solution, solve
-from vehicle_agent.features.graph_edges import Anchors, Problem, State
-from vehicle_agent.features.landmarks import NONE, Places, Sight, assigned, clustered, doubles, kept, spread, tied
-from vehicle_agent.features.lanes import LaneMap, LaneMatcher
 from vehicle_agent.features.look import MapFeatures
-from vehicle_agent.features.new_layer_parameters import NewLayerParameters
-from vehicle_agent.features.smoothed_path import SmoothedPath
+from vehicle_agent.features.mapping.drive_nodes import DriveNodes
+from vehicle_agent.features.mapping.feature_drive import FeatureDrive, Measurements
+from vehicle_agent.features.mapping.graph import Solution, solve
+from vehicle_agent.features.mapping.graph_edges import Anchors, Problem, State
+from vehicle_agent.features.mapping.landmarks import (
+    NONE,
+    Places,
+    Sight,
+    assigned,
+    clustered,
+    doubles,
+    kept,
+    spread,
+    tied,
+)
+from vehicle_agent.features.mapping.lanes import LaneMap, LaneMatcher
+from vehicle_agent.features.mapping.parameters import NewLayerParameters
+from vehicle_agent.features.mapping.smoothed_path import SmoothedPath
 
 
 @dataclass(frozen=True, slots=True, eq=False)

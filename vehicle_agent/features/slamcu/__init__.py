@@ -1,0 +1,1 @@
+"""SLAMCU on the vehicle (Jo, Kim and Sunwoo 2018): existence of features, and a Rao-Blackwellised particle filter."""
