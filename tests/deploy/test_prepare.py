@@ -31,4 +31,4 @@ def test_a_kept_world_is_used_again_until_the_programs_change(tmp_path: Path, mo
     assert made("second") == first
     (home / "made_by.txt").write_text("another program")
     prepare.forget_if_stale(home)
-    assert sorted(path.name for path in home.iterdir()) == ["made_by.txt", "truth.npz", "world.json"]
+    assert sorted(path.name for path in home.iterdir()) == ["features.json", "made_by.txt", "truth.npz", "world.json"]
