@@ -60,6 +60,7 @@ def drive_summary(found: Verdicts, truth: SignTruth) -> dict[str, Any]:
     scored = scored_drive(found, truth)
     return {
         "accuracy": accuracy_of(scored.confusion),
+        "accuracy_visible": accuracy_of(scored_drive(found, truth.take(found.visible > 0)).confusion),
         "confusion": scored.confusion.tolist(),
         "position_error_m": scored.plain_errors() | parts_of_errors(scored, found) | {"nees": _nees(scored)},
         "false_new": {"all": len(scored.false_new), "near_a_sign_of_the_map": scored.near_known},

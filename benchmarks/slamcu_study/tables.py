@@ -20,13 +20,15 @@ def tables_of(found: Found) -> list[Table]:
 def _confusion(found: Found) -> Table:
     """Table 1 in the paper's layout, the paper's numbers in brackets."""
     title = f"Table 1, mean of {_seeds(found)}; in brackets the paper's"
-    table = plain_table(title, "true \\ predicted", *(name.capitalize() for name in reference.PREDICTED), "Accuracy")
+    columns = (*(name.capitalize() for name in reference.PREDICTED), "Accuracy", "Of those ever in free view")
+    table = plain_table(title, "true \\ predicted", *columns)
     ours = found["slamcu"]
     for i, name in enumerate(reference.TRUE_CLASSES):
         pairs = zip(ours["confusion"][i], reference.PAPER_CONFUSION[i], strict=True)
         cells = [f"{number:.4g} ({paper})" for number, paper in pairs]
-        table.add_row(name.capitalize(), *cells, _accuracy(ours, name))
-    table.add_row("all", *[""] * len(reference.PREDICTED), _accuracy(ours, "overall"))
+        table.add_row(name.capitalize(), *cells, _accuracy(ours, name), percent(ours["accuracy_visible"][name]))
+    everything = (_accuracy(ours, "overall"), percent(ours["accuracy_visible"]["overall"]))
+    table.add_row("all", *[""] * len(reference.PREDICTED), *everything)
     return table
 
 

@@ -35,6 +35,10 @@ class SignTruth:
         """Return the indices of the signs of a class."""
         return np.flatnonzero(self.true_class == true_class).astype(np.int64)
 
+    def take(self, rows: NDArray[np.bool_]) -> "SignTruth":
+        """Return some of the signs, bool (N,)."""
+        return SignTruth(self.feature_id[rows], self.xy_m[rows], self.true_class[rows])
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Verdicts:

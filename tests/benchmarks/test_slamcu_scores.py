@@ -88,6 +88,15 @@ def test_the_error_is_split_into_the_poses_part_and_the_rest() -> None:
     assert parts == pytest.approx({"pose_part": 0.15, "measurement_part": 0.25})
 
 
+def test_signs_that_were_hidden_all_the_time_are_left_out_of_the_visible_ones_only() -> None:
+    found = verdicts()
+    summary = drive_summary(found, TRUTH)
+    rest = TRUTH.take(found.visible > 0)
+    assert len(rest.feature_id) == len(TRUTH.feature_id) - 2
+    assert summary["accuracy_visible"] == accuracy_of(scored_drive(found, rest).confusion)
+    assert summary["accuracy"] == accuracy_of(scored_drive(found, TRUTH).confusion)
+
+
 def test_summary_of_a_drive_counts_looks_and_poses() -> None:
     summary = drive_summary(verdicts(), TRUTH)
     assert summary["looks"] == {
