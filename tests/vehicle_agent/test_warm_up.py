@@ -14,7 +14,7 @@ PROGRAM = textwrap.dedent(
     from vehicle_agent.detect import kernel
     from vehicle_agent.warm import warm_up
     from vehicle_agent.localise import kernels, packed_scan, registration, rolling_kernels
-    from vehicle_agent.features.poles import place_kernels as places, poles_kernels as poles
+    from vehicle_agent.features.poles import kernels as poles, place_kernels as places
     from gnd_map.codec import kernels as coders
     USED = ("code_bit", "code_bits", "code_flags", "code_plain", "code_voxels")
     before = len(kernel.cast_rays.signatures)
