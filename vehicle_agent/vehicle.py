@@ -231,10 +231,11 @@ def open_vehicle(config: AgentConfig, stop: threading.Event) -> Iterator[Vehicle
         NoRouter: nothing answers at `config.connect`.
     """
     header, fix = read_header(config.drive), first_fix(config)
+    # The map frame is the frame of the tile in which the vehicle starts.
     frame = LocalFrame.of_tile(TileId.from_geodetic(fix.lat_rad, fix.lon_rad))
     who = Identity(config.vehicle, header.drive_id, header.sensor_model, config.layer)
     with open_link(config) as link, _features(config, link, frame, who, fix.t_ns) as features:
-        vehicle = _assemble(config, header, fix, link, stop, features)
+        vehicle = _assemble(config, header, fix, (frame, who), link, stop, features)
         telemetry = Telemetry(link.bus, config.vehicle, vehicle.sample)
         try:
             yield vehicle
@@ -257,17 +258,15 @@ def _assemble(
     config: AgentConfig,
     header: DriveHeader,
     fix: GnssFix,
+    where_and_who: tuple[LocalFrame, Identity],
     link: Link,
     stop: threading.Event,
     features: "FeatureWork | None",
 ) -> Vehicle:
-    """The map frame is the frame of the tile in which the vehicle starts."""
-    start = TileId.from_geodetic(fix.lat_rad, fix.lon_rad)
-    frame = LocalFrame.of_tile(start)
-    local_map = LocalMap(GridFrame.around(frame, [start]))
+    frame, identity = where_and_who
+    local_map = LocalMap(GridFrame.around(frame, [TileId.from_geodetic(fix.lat_rad, fix.lon_rad)]))
     detector = ChangeDetector(local_map, config.detect)
     surroundings = Surroundings(local_map, link.fetcher, detector, config.download)
-    identity = Identity(config.vehicle, header.drive_id, header.sensor_model, config.layer)
     return Vehicle(
         config=config,
         header=header,

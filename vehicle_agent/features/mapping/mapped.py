@@ -9,7 +9,7 @@ from gnd_map.arrays import F64, I64
 from gnd_map.tile_id import TileId
 from schemas.features import FeatureChange, Found, Seen
 from vehicle_agent.features.coverage import Coverage, CoverageParameters
-from vehicle_agent.features.feature_map import place_in_tile, with_height
+from vehicle_agent.features.feature_map import features_in_map, place_in_tile, with_height
 from vehicle_agent.features.layer import of_counts
 from vehicle_agent.features.layer_parameters import LayerParameters
 from vehicle_agent.features.mapping.feature_drive import FeatureDrive
@@ -75,9 +75,7 @@ def _seen(
     seen: dict[TileId, list[Seen]] = defaultdict(list)
     rows = {int(one): n for n, one in enumerate(found.features.known_id) if one}
     for tile_id, tile in held.tiles(layer.name).items():
-        one_tile = HeldMap(held.frame)
-        one_tile.put(layer.name, tile_id, tile)
-        known = one_tile.known(layer.name, layer.kinds)
+        known = features_in_map(held.frame, tile, layer.kinds)
         looks = looks_at(known.xy_m, poses, layer)
         for feature_id, n_looks in zip(known.feature_id.tolist(), looks.tolist(), strict=True):
             row = rows.get(feature_id)
