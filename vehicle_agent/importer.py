@@ -25,6 +25,7 @@ from vehicle_agent.importers.kitti import open_kitti
 from vehicle_agent.importers.lidar_odometry import Progress, lidar_odometry
 from vehicle_agent.importers.mcap_clouds import open_mcap_clouds
 from vehicle_agent.importers.pcd import open_pcd
+from vehicle_agent.importers.planes import open_planes
 from vehicle_agent.importers.radiate import open_radiate
 from vehicle_agent.importers.recording import GNSS_SIGMA_M, Anchor, Recording
 from vehicle_agent.importers.splits import chosen_scans
@@ -36,6 +37,7 @@ FORMATS: Final[dict[str, Callable[[Path, Anchor | None], Recording]]] = {
     "radiate": open_radiate,
     "pcd": open_pcd,
     "mcap": open_mcap_clouds,
+    "planes": open_planes,
     "apollo": open_apollo,
 }
 AUTO: Final = "auto"
@@ -85,7 +87,7 @@ def import_recording(
     """Write the drive `out` (MCAP) from a recording; tell what was written and what was left out.
 
     Args:
-        kind: "kitti", "radiate", "pcd", "mcap", "apollo", or "auto" to find out.
+        kind: "kitti", "radiate", "pcd", "mcap", "planes", "apollo", or "auto" to find out.
         folder: of the recording (or its file); see the readers for what it must hold.
         out: file to write.
         scans: which scans; see `chosen_scans`.
