@@ -6,7 +6,7 @@ half maps, the other half can drive on.
 
 from collections import deque
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Final
 
@@ -20,6 +20,7 @@ from schemas.drive_mcap import DriveWriter
 from vehicle_agent.errors import ImportDriveError
 from vehicle_agent.importers.apollo import open_apollo
 from vehicle_agent.importers.cleaning import MAX_RANGE_M, Cleaned, cleaned
+from vehicle_agent.importers.deskewing import with_times
 from vehicle_agent.importers.detect_format import format_of
 from vehicle_agent.importers.kitti import open_kitti
 from vehicle_agent.importers.lidar_odometry import Progress, lidar_odometry
@@ -102,6 +103,7 @@ def import_recording(
     """
     recording = open_recording(kind, folder, anchor, topic)
     chosen_scans(scans, len(recording))  # a wrong rule is told before the long work
+    recording = _with_times(recording)
     return write_drive(recording, map_track(recording, progress), out, scans, vehicle, progress)
 
 
@@ -148,7 +150,17 @@ def _header(recording: Recording, drive_id: str, vehicle: str) -> DriveHeader:
         anchor=recording.anchor.frame,
         T_vehicle_lidar=recording.T_vehicle_lidar,
         source=recording.source,
+        deskew=recording.deskew,
+        sweep_ns=recording.sweep_ns,
+        mount=recording.mount,
+        mount_sigma=recording.mount_sigma,
     )
+
+
+def _with_times(recording: Recording) -> Recording:
+    """Times of points where the recording gives none and they can be found; what was found joins the notes."""
+    found, verdict = with_times(recording)
+    return replace(found, notes=(*found.notes, verdict.note)) if verdict.note else found
 
 
 def map_track(recording: Recording, progress: Progress = no_progress) -> Trajectory:

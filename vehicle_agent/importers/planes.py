@@ -63,6 +63,8 @@ def open_planes(folder: Path, anchor: Anchor | None) -> Recording:
         anchor=anchor or _place(ins),
         gnss=_fixes(ins_ns, ins),
         motion=_motion(ins_ns, ins),
+        stamp="middle",
+        mount="given" if kitti else "assumed",
         notes=(f"stamps lie up to {rounded * 1e-6:.1f} ms off an even rhythm: scans take the rhythm",) if rounded else (),
     )
 
