@@ -6,7 +6,7 @@ half maps, the other half can drive on.
 
 from collections import deque
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Final
 
@@ -20,11 +20,13 @@ from schemas.drive_mcap import DriveWriter
 from vehicle_agent.errors import ImportDriveError
 from vehicle_agent.importers.apollo import open_apollo
 from vehicle_agent.importers.cleaning import MAX_RANGE_M, Cleaned, cleaned
+from vehicle_agent.importers.deskewing import with_times
 from vehicle_agent.importers.detect_format import format_of
 from vehicle_agent.importers.kitti import open_kitti
 from vehicle_agent.importers.lidar_odometry import Progress, lidar_odometry
 from vehicle_agent.importers.mcap_clouds import open_mcap_clouds
 from vehicle_agent.importers.pcd import open_pcd
+from vehicle_agent.importers.planes import open_planes
 from vehicle_agent.importers.radiate import open_radiate
 from vehicle_agent.importers.recording import GNSS_SIGMA_M, Anchor, Recording
 from vehicle_agent.importers.splits import chosen_scans
@@ -36,6 +38,7 @@ FORMATS: Final[dict[str, Callable[[Path, Anchor | None], Recording]]] = {
     "radiate": open_radiate,
     "pcd": open_pcd,
     "mcap": open_mcap_clouds,
+    "planes": open_planes,
     "apollo": open_apollo,
 }
 AUTO: Final = "auto"
@@ -85,7 +88,7 @@ def import_recording(
     """Write the drive `out` (MCAP) from a recording; tell what was written and what was left out.
 
     Args:
-        kind: "kitti", "radiate", "pcd", "mcap", "apollo", or "auto" to find out.
+        kind: "kitti", "radiate", "pcd", "mcap", "planes", "apollo", or "auto" to find out.
         folder: of the recording (or its file); see the readers for what it must hold.
         out: file to write.
         scans: which scans; see `chosen_scans`.
@@ -100,6 +103,7 @@ def import_recording(
     """
     recording = open_recording(kind, folder, anchor, topic)
     chosen_scans(scans, len(recording))  # a wrong rule is told before the long work
+    recording = _with_times(recording)
     return write_drive(recording, map_track(recording, progress), out, scans, vehicle, progress)
 
 
@@ -146,7 +150,17 @@ def _header(recording: Recording, drive_id: str, vehicle: str) -> DriveHeader:
         anchor=recording.anchor.frame,
         T_vehicle_lidar=recording.T_vehicle_lidar,
         source=recording.source,
+        deskew=recording.deskew,
+        sweep_ns=recording.sweep_ns,
+        mount=recording.mount,
+        mount_sigma=recording.mount_sigma,
     )
+
+
+def _with_times(recording: Recording) -> Recording:
+    """Times of points where the recording gives none and they can be found; what was found joins the notes."""
+    found, verdict = with_times(recording)
+    return replace(found, notes=(*found.notes, verdict.note)) if verdict.note else found
 
 
 def map_track(recording: Recording, progress: Progress = no_progress) -> Trajectory:

@@ -7,7 +7,7 @@ this follows what stands (8.0 m); point-to-point neighbours (small_gicp) stayed 
 and then broke.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Final
 
 import numpy as np
@@ -68,6 +68,18 @@ def lidar_odometry(recording: Recording, progress: Progress) -> Trajectory:
         if scan is not None:
             odometry.add(scan, i)
         progress("LiDAR odometry", i + 1, len(recording))
+    return odometry.trajectory
+
+
+def track_of_scans(recording: Recording, scans: Sequence[Scan]) -> Trajectory:
+    """The same of some scans of the recording, in their order.
+
+    Raises:
+        ImportDriveError: a scan does not fit those before it, or there are fewer than two.
+    """
+    odometry = _Odometry(recording)
+    for i, scan in enumerate(scans):
+        odometry.add(scan, i)
     return odometry.trajectory
 
 
