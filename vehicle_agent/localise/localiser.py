@@ -13,7 +13,7 @@ from gnd_map.se3 import T_from_R_t, exp_so3
 from schemas.drive import GnssFix, MotionSample, Scan
 from vehicle_agent.errors import RegistrationError
 from vehicle_agent.local_map import LocalMap
-from vehicle_agent.localise.calibration import MotionTeacher
+from vehicle_agent.localise.calibration import MotionCalibration, MotionTeacher
 from vehicle_agent.localise.estimates import Cause, Health, PoseEstimate, RefinedScan
 from vehicle_agent.localise.first_pose import FirstPose, Place
 from vehicle_agent.localise.graph import MapMatch, Odometry, PoseGraph, Position, SmoothedPose
@@ -164,6 +164,11 @@ class Localiser:
         """What is taken off the yaw rate, as learnt from the map."""
         return self._motion.yaw_bias_radps
 
+    @property
+    def calibration(self) -> MotionCalibration:
+        """What is known of clock, wheels, gyro and mount so far, with sigmas."""
+        return self._teacher.calibration
+
     # --- one scan --------------------------------------------------------------------------------------------------
 
     def _process_if_covered(self) -> None:
@@ -190,6 +195,7 @@ class Localiser:
         t_ns, newest = _reference_ns(scan), track.graph.newest
         odometry = self._odometry(track.held[newest].t_ns, t_ns)
         seen = self._scan_step(scan, chosen, points, odometry)
+        self._teacher.clock.see(track.held[newest].t_ns, t_ns, seen)
         joint = joint_step(*odometry, seen)
         sweep = self._sweep_of_steady(scan) if joint.slipped else None
         points = points if sweep is None else self._deskewed(scan, chosen, scan.points_m[chosen], sweep)
@@ -205,7 +211,7 @@ class Localiser:
         odometry = Odometry(odometry.T_before_now, joint.driven_sigmas)
         gnss, T_now = self._gnss_at(track, t_ns, predicted), predicted if match is None else match.T_map_vehicle
         unknown_s = max(self._motion.unknown_s(track.held[newest].t_ns, t_ns), self._motion.age_s(t_ns))
-        seen_scan = Matched(t_ns, points, joint.T_before_now, T_now, result, believed, unknown_s)
+        seen_scan = Matched(t_ns, points, joint.T_before_now, T_now, result, believed, unknown_s, self._teacher.cause)
         track.judge.see(seen_scan, self._map.near(T_now[:3, 3]))
         final = track.graph.add(t_ns, predicted, odometry, match or self._settled(predicted), gnss, seen)
         self._hold(track, scan, result.matching_ratio if result is not None else 0.0, sweep)
@@ -232,7 +238,7 @@ class Localiser:
 
     def _odometry(self, first_ns: int, last_ns: int) -> Odometry:
         delta = self._motion.delta(first_ns, last_ns)
-        return Odometry(delta, self._teacher.sigmas(delta, (last_ns - first_ns) * 1e-9))
+        return Odometry(delta, self._teacher.sigmas_between(first_ns, last_ns, delta))
 
     def _matched(
         self, monitor: HealthMonitor, points: F64, predicted: F64, sigmas: F64, t_ns: int
@@ -388,6 +394,7 @@ class Localiser:
         if self._from_past < MOST_FROM_PAST:
             return
         self._motion.clear()
+        self._teacher.clock.forget()
         self._fix = self._pending = self._last_ns = None
         self._newest_scan_ns, self._from_past = -1, 0
         if self._track is not None:

@@ -246,9 +246,11 @@ class Refiner:
         grown = np.sqrt(max(way_m / par.every_m, dt_s / par.every_s))
         roll_pitch, yaw = np.radians(par.roll_pitch_deg), grown * np.radians(par.yaw_deg)
         scale, bias = self._teacher.uncertainty
+        clock_rad, clock_m = self._teacher.clock_sigmas(first.t_ns, last.t_ns)
         sigmas = np.array([
-            roll_pitch, roll_pitch, np.hypot(yaw, bias * dt_s),
-            np.hypot(grown * par.longitudinal_m, scale * way_m), grown * par.lateral_m, par.vertical_m,
+            roll_pitch, roll_pitch, np.hypot(np.hypot(yaw, bias * dt_s), clock_rad),
+            np.hypot(np.hypot(grown * par.longitudinal_m, scale * way_m), clock_m), grown * par.lateral_m,
+            par.vertical_m,
         ])  # fmt: skip
         return AnchorStep(T, sigmas)
 
