@@ -1,8 +1,9 @@
 """The time offset between the LiDAR's clock and that of wheels and gyro, found while driving.
 
-What a scan-to-scan step says of the way and the turn between two scans needs no motion sensor. Wheel speed and yaw rate,
-integrated between the same two times, differ from it by the offset times what speed and yaw rate changed by. So a
-vehicle that brakes, accelerates or turns tells the offset; one that drives on evenly does not, and then it does no harm.
+What a scan-to-scan step says of the way and the turn between two scans needs no motion sensor. Wheel speed and yaw
+rate, integrated between the same two times, differ from it by the offset times what speed and yaw rate changed by. So a
+vehicle that brakes, accelerates or turns tells the offset; one that drives on evenly does not, and then it does no
+harm.
 
 A window of steps is fitted at once, by Gauss and Newton, for offset, its rate, and what else such differences could
 come from: wheel scale, the tyres' slip under acceleration, gyro bias. Neighbouring steps share the error of the scan
@@ -46,9 +47,9 @@ RATE_WALK: Final = 1e-5
 """How much more uncertain offset and rate become in a root second, beyond what the rate explains."""
 FLOOR_S: Final = 5e-4
 SHARED: Final = -0.375
-"""Correlation of neighbouring steps: 3/4 of a step's variance are the errors of its two scans (measured: decision 0086)."""
+"""Correlation of neighbouring steps: 3/4 of a step's variance are the errors of its two scans (decision 0086)."""
 GROWN: Final = 1.5
-"""By which a sigma of the fit is grown for what steps of a stretch share: drift of the rolling map, the road's grade."""
+"""By which a sigma of the fit is grown for what the steps of a stretch share, such as drift of the rolling map."""
 OUTLIER: Final = 4.0
 LEAST_TRUE: Final = 0.3
 """A smaller share of the changes of speed or yaw rate that is no noise counts as none."""
@@ -80,7 +81,7 @@ class ClockEstimate:
 
 @dataclass(frozen=True, slots=True)
 class Step:
-    """What scans say of a step: forward way [m] and turn [rad] between two times of the LiDAR's clock, one sigma each."""
+    """Forward way [m] and turn [rad] between two times of the LiDAR's clock, as scans say, with one sigma each."""
 
     first_ns: int
     last_ns: int
@@ -203,8 +204,7 @@ class ClockEstimator:
         """The steps that the samples reach, whatever the offset."""
         reach_ns = round(MOST_S * 1e9)
         last_ns = self._motion.last_stamp_ns - reach_ns if len(self._motion) else 0
-        known = [step for step in self._steps if step.last_ns <= last_ns]
-        return known
+        return [step for step in self._steps if step.last_ns <= last_ns]
 
     def _signal(self, zero_ns: int) -> MotionSignal:
         t_ns, speed, yaw_rate = self._motion.samples(zero_ns - 2 * round(SEARCH_S * 1e9))
@@ -267,7 +267,8 @@ def fit_clock(steps: list[Step], signal: MotionSignal, zero_ns: int, prior: Offs
 
     Args:
         steps: N in time order.
-        signal: the samples; its time 0 is `zero_ns` of their own clock.
+        signal: the samples, by their own clock.
+        zero_ns: the stamp that is their time 0.
         prior: of offset and rate at the last step's end.
     """
     first, last = (np.array([getattr(s, name) - zero_ns for s in steps]) * 1e-9 for name in ("first_ns", "last_ns"))
@@ -297,7 +298,9 @@ def fit_clock(steps: list[Step], signal: MotionSignal, zero_ns: int, prior: Offs
 
 
 def _residuals(values: F64, first: F64, last: F64, seen: F64, signal: MotionSignal) -> tuple[F64, F64]:
-    """(N, 2) steps minus what the samples say, of way and turn, and the change of the latter with the values (N, 2, 5)."""
+    """(N, 2) ways and turns of the steps minus those of the samples, and how the latter change with the values
+    (N, 2, 5).
+    """
     offset, rate, scale, slip, bias = values
     age_first, age_last = first - last[-1], last - last[-1]
     begin, end = first + offset + rate * age_first, last + offset + rate * age_last

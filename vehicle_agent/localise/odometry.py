@@ -42,7 +42,7 @@ class ClockModel:
 class MotionBuffer:
     """The last seconds of wheel speed and yaw rate, integrated as a car moves: along its x axis, turning about z.
 
-    All times asked for are of the LiDAR's clock; samples are kept as stamped, and `clock` is applied when they are read.
+    All times asked for are of the LiDAR's clock; samples are kept as stamped, and `clock` is applied as they are read.
     """
 
     def __init__(self) -> None:
