@@ -1,7 +1,7 @@
 """What the map teaches about the vehicle's own motion sensors, and how far to trust them until it has."""
 
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -10,6 +10,7 @@ from gnd_map.se3 import T_inverse, log_so3
 from vehicle_agent.localise.clock import ClockDoubt, ClockEstimator
 from vehicle_agent.localise.drift import Drift
 from vehicle_agent.localise.estimates import Cause
+from vehicle_agent.localise.mount import DOUBTFUL_RAD, SIGMAS, MountDoubt, MountResidual, MountWatch
 from vehicle_agent.localise.odometry import MotionBuffer
 from vehicle_agent.localise.parameters import OdometryParameters
 
@@ -35,7 +36,7 @@ class MotionCalibration:
     time_offset_s: stamps of wheels and gyro are so much later than those of the LiDAR, growing by `time_offset_rate`;
     clock_doubt: why that is not to be relied on. wheel_scale: what the wheel speed is multiplied with. gyro_bias_radps:
     what is taken off the yaw rate. course_rad: direction of driving straight, left of the vehicle's x axis as the
-    header's mount puts it; the mount's yaw is too large by it.
+    header's mount puts it. mount: height, roll and pitch against the header, from the ground.
     """
 
     time_offset_s: float
@@ -48,18 +49,47 @@ class MotionCalibration:
     gyro_bias_sigma_radps: float
     course_rad: float
     course_sigma_rad: float
+    mount: MountResidual
 
     def __post_init__(self) -> None:
         sigmas = (self.time_offset_sigma_s, self.wheel_scale_sigma, self.gyro_bias_sigma_radps, self.course_sigma_rad)
         if min(sigmas) < 0.0 or self.wheel_scale <= 0.0:
             raise ValueError(f"sigmas must not be negative and the scale positive, got {self}")
 
+    @property
+    def mount_yaw_rad(self) -> float:
+        """Yaw of the mount against the header, from driving straight; its sigma is that of the course."""
+        return -self.course_rad
+
+    @property
+    def mount_doubtful(self) -> tuple[MountDoubt, ...]:
+        """What the header says wrongly of the mount for certain: by more than 10 cm or 0.3°."""
+        turned = abs(self.course_rad) - SIGMAS * self.course_sigma_rad > DOUBTFUL_RAD
+        return (*self.mount.doubtful, "yaw") if turned else self.mount.doubtful
+
+    def as_json(self) -> dict[str, Any]:
+        """Plain values, angles in degrees; None where nothing is known."""
+        mount = self.mount
+        return {
+            "time_offset_s": _told(self.time_offset_s, self.time_offset_sigma_s),
+            "time_offset_rate": round(self.time_offset_rate, 7),
+            "clock_doubt": self.clock_doubt,
+            "wheel_scale": _told(self.wheel_scale, self.wheel_scale_sigma),
+            "yaw_bias_degps": _told(np.degrees(self.gyro_bias_radps), np.degrees(self.gyro_bias_sigma_radps)),
+            "mount_height_m": _told(mount.height_m, mount.height_sigma_m),
+            "mount_roll_deg": _told(np.degrees(mount.roll_rad), np.degrees(mount.roll_sigma_rad)),
+            "mount_pitch_deg": _told(np.degrees(mount.pitch_rad), np.degrees(mount.pitch_sigma_rad)),
+            "mount_yaw_deg": _told(np.degrees(self.mount_yaw_rad), np.degrees(self.course_sigma_rad)),
+            "mount_doubtful": list(self.mount_doubtful),
+        }
+
 
 class MotionTeacher:
     """Learns wheel scale, gyro bias and course of a `MotionBuffer` from map matches: scalar Kalman filters."""
 
-    def __init__(self, motion: MotionBuffer, parameters: OdometryParameters) -> None:
+    def __init__(self, motion: MotionBuffer, parameters: OdometryParameters, mount: MountWatch | None = None) -> None:
         self.parameters = parameters
+        self.mount = mount or MountWatch(np.eye(4))
         self.clock = ClockEstimator(motion)
         self._motion = motion
         self._scale_var = parameters.scale_prior**2
@@ -102,6 +132,8 @@ class MotionTeacher:
     @property
     def cause(self) -> Cause:
         """What is wrong with the sensors whose errors are learnt, if anything."""
+        if self.mount.residual.wrong:
+            return "mount"
         return "none" if self.clock.estimate.doubt == "none" else "clock"
 
     @property
@@ -120,6 +152,7 @@ class MotionTeacher:
             gyro_bias_sigma_radps=bias_sigma,
             course_rad=float(motion.course[0]),
             course_sigma_rad=float(np.sqrt(self._course_var)),
+            mount=self.mount.residual,
         )
 
     @property
@@ -199,6 +232,10 @@ class MotionTeacher:
         gain = self._bias_var * dt_s / (dt_s**2 * self._bias_var + sigma_rad**2)
         self._motion.yaw_bias_radps += gain * (gyro_rad - map_rad - self._motion.yaw_bias_radps * dt_s)
         self._bias_var *= 1.0 - gain * dt_s
+
+
+def _told(value: float, sigma: float) -> dict[str, float] | None:
+    return {"value": round(float(value), 6), "sigma": round(float(sigma), 6)} if np.isfinite(sigma) else None
 
 
 def _yaw(T: F64) -> float:

@@ -21,6 +21,7 @@ from vehicle_agent.localise.health import HealthMonitor
 from vehicle_agent.localise.judge import Judge, Matched
 from vehicle_agent.localise.level import on_the_road, sees_tilt, settled
 from vehicle_agent.localise.match_map import MatchMapCache
+from vehicle_agent.localise.mount import MountWatch, near_points
 from vehicle_agent.localise.odometry import MotionBuffer
 from vehicle_agent.localise.packed_scan import PackedScan, pack
 from vehicle_agent.localise.parameters import LocaliserParameters
@@ -92,7 +93,7 @@ class Localiser:
         self.dropped_scans = 0
         self.initialisations = 0
         self._motion = MotionBuffer()
-        self._teacher = MotionTeacher(self._motion, self.parameters.odometry)
+        self._teacher = MotionTeacher(self._motion, self.parameters.odometry, MountWatch(self.T_vehicle_lidar))
         self._map = MatchMapCache(local_map, self.parameters.registration.noise_m)
         self._scan_odometry = ScanOdometry(self.parameters.scan_odometry)
         self._fix: GnssFix | None = None
@@ -181,6 +182,7 @@ class Localiser:
             return
         chosen = sample_scan(scan.points_m, self.parameters.sampling)
         points = self._deskewed(scan, chosen, scan.points_m[chosen])
+        self._look_at_mount(scan)
         last_ns = scan.t_ns if self._last_ns is None else self._last_ns
         if self._track is not None and (scan.t_ns - last_ns) * 1e-9 > self.parameters.causes.lost_gap_s:
             self._lose(self._track, "gap")
@@ -189,6 +191,12 @@ class Localiser:
         else:
             self._step(self._track, scan, chosen, points)
         self._last_ns = _reference_ns(scan)
+
+    def _look_at_mount(self, scan: Scan) -> None:
+        t_ns, watch = _reference_ns(scan), self._teacher.mount
+        if watch.due(t_ns):
+            near = near_points(scan.points_m)
+            watch.see(t_ns, self._deskewed(scan, near, scan.points_m[near]))
 
     def _step(self, track: _Track, scan: Scan, chosen: NDArray[np.int64], points: F64) -> None:
         """Predict from the newest pose, match, gate, fuse."""
