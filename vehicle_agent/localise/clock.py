@@ -41,7 +41,7 @@ BLOCK_NS: Final = 10_000_000_000
 LAST_NS: Final = 5_000_000_000
 """So much at the window's end is asked whether the clock has jumped."""
 EVERY_NS: Final = 500_000_000
-LEAST_STEPS: Final = 15
+LEAST_STEPS: Final = 8
 WALK_S: Final = 3e-4
 RATE_WALK: Final = 1e-5
 """How much more uncertain offset and rate become in a root second, beyond what the rate explains."""
@@ -323,10 +323,10 @@ def _believed(changes: F64, false_changes: F64) -> F64:
 
 
 def _noise_factor(rest: F64, sigma: F64, used: NDArray[np.bool_]) -> F64:
-    """(2,) by how much ways and turns are noisier than said, from the middle of what is left over; at least half."""
+    """(2,) by how much ways and turns are noisier than said, from the middle of what is left over; at least 0.7."""
     ratio = np.abs(rest) / sigma
     middle = [np.median(ratio[used[:, k], k]) if used[:, k].any() else np.inf for k in range(2)]
-    return np.maximum(1.4826 * np.array(middle), 0.5)
+    return np.maximum(1.4826 * np.array(middle), 0.7)
 
 
 def _whitened(J: F64, rest: F64, noise: F64, used: NDArray[np.bool_], joined: NDArray[np.bool_]) -> tuple[F64, F64]:
