@@ -28,8 +28,7 @@ from vehicle_agent.localise.parameters import LocaliserParameters
 from vehicle_agent.localise.refine import Refiner
 from vehicle_agent.localise.registration import RegistrationResult, Start, register
 from vehicle_agent.localise.sampling import sample_scan
-from vehicle_agent.localise.scan_odometry import JointStep, ScanOdometry, ScanStep, joint_step
-from vehicle_agent.localise.submap import ToldByScans
+from vehicle_agent.localise.scan_odometry import ScanOdometry, ScanStep, joint_step
 
 F64 = NDArray[np.float64]
 
@@ -37,7 +36,6 @@ MAX_GNSS_AGE_NS = 2_000_000_000
 TOLD_M, TOLD_RAD = 0.1, 0.01  # one sigma of a pose from outside
 OVERRULED: Final[tuple[Cause, ...]] = ("wrong_pose", "stale_map", "poor_place", "no_match", "unconfirmed")
 """What single scans hold against a pose and submaps may know better."""
-SURER = np.array([1.0, 1.0, 0.5, 0.3, 1.0, 1.0])  # share of the odometry's sigmas below which scans know better
 PAST_NS, MOST_FROM_PAST = 1_000_000_000, 5
 
 
@@ -224,7 +222,7 @@ class Localiser:
         final = track.graph.add(t_ns, predicted, odometry, match or self._settled(predicted), gnss, seen)
         self._hold(track, scan, result.matching_ratio if result is not None else 0.0, sweep)
         if track.refiner is not None:
-            final = self._refine(track, track.refiner, t_ns, points, _told_by_scans(joint, seen))
+            final = self._refine(track, track.refiner, t_ns, points, joint.T_before_now, seen)
         self._finalise(track, final)
         if self.online is not None and self.online.health == "lost":
             self._lose(track, self.online.cause)
@@ -298,12 +296,18 @@ class Localiser:
         self.online = _estimate(pose, held)
 
     def _refine(
-        self, track: _Track, refiner: Refiner, t_ns: int, points: F64, told: ToldByScans | None = None
+        self,
+        track: _Track,
+        refiner: Refiner,
+        t_ns: int,
+        points: F64,
+        T_before_now: F64 | None = None,
+        seen: ScanStep | None = None,
     ) -> list[SmoothedPose]:
         """Give the scan to the submaps, and let what they say correct the online pose; the poses that became final."""
         number = track.graph.newest
         T_online = track.graph.pose(number)
-        final = refiner.push(number, t_ns, points, T_online, told)
+        final = refiner.push(number, t_ns, points, T_online, T_before_now, seen)
         track.judge.monitor.certain = refiner.certain
         correction = refiner.correction(T_online)
         if correction is not None:
@@ -466,17 +470,6 @@ def _sigmas(pose: SmoothedPose) -> tuple[float, float]:
     R, covariance = pose.T_map_vehicle[:3, :3], pose.covariance
     horizontal = (R @ covariance[3:, 3:] @ R.T)[:2, :2]
     return float(np.sqrt(np.linalg.eigvalsh(horizontal)[1])), float(np.sqrt(covariance[2, 2]))
-
-
-def _told_by_scans(joint: JointStep, seen: ScanStep | None) -> ToldByScans | None:
-    """What scans tell better of the motion since the scan before: its turn, if they are surer of it than the gyro; its
-    way, only if wheels are far worse, because those become better as more is learnt about them.
-    """
-    if seen is None:
-        return None
-    surer = np.sqrt(np.diag(seen.covariance)) < joint.driven_sigmas * SURER
-    T = joint.T_before_now
-    return ToldByScans(T[:3, :3] if surer[2] else None, T[:3, 3] if surer[3] else None)
 
 
 def _estimate(pose: SmoothedPose, held: _HeldScan) -> PoseEstimate:

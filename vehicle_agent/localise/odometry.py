@@ -82,6 +82,10 @@ class MotionBuffer:
         """Newest speed, corrected; 0 before the first sample."""
         return self._speed_mps[-1] * self.speed_scale if self._speed_mps else 0.0
 
+    def shared(self) -> NDArray[np.float64]:
+        """(4,) what is taken off all samples: gyro bias [rad/s], wheel scale, motion left and up per metre forward."""
+        return np.array([self.yaw_bias_radps, self.speed_scale, *self.course])
+
     def push(self, t_ns: int, speed_mps: float, yaw_rate_radps: float) -> bool:
         """Add a sample; False (and nothing kept) when it is not finite or not later than the one before."""
         if not np.isfinite(speed_mps + yaw_rate_radps) or (self._t_ns and t_ns <= self._t_ns[-1]):
