@@ -184,6 +184,7 @@ class Vehicle:
             "features": self.features.account() if self.features is not None else {},
             "health": self.timeline.as_json(),
             "localisation": self.evaluation.errors(),
+            "calibration": self.localiser.calibration.as_json(),
             "memory_mb": self.memory.read(),
         }
 

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gnd_map.motion import Trajectory, deskew
-from gnd_map.se3 import transform
+from gnd_map.se3 import T_inverse, transform
 from schemas.drive import Deskew, Scan
 from vehicle_agent.errors import ImportDriveError
 from vehicle_agent.importers.cleaning import RawScan, cleaned
@@ -43,6 +43,8 @@ LEAST_STEP_M: Final = 0.3
 """Mean way of a sweep below which a window says nothing (3 m/s at 10 Hz)."""
 ROUNDS: Final = 3
 THINNER: Final = 0.01
+LIKELY, SURE = 1.5, 3.0
+"""Sigmas by which surfaces must be thinner than as recorded, and thinner than with the times reversed."""
 MOTION: Final = (0.5, 1.5)
 """Share of the vehicle's motion that the times must find in the points."""
 NEAR_M, FAR_M = 3.0, 40.0
@@ -133,7 +135,7 @@ def _backwards(share_of: ShareOf) -> ShareOf:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Window:
-    """A window laid together: its scans, their track, and how thick upright surfaces are."""
+    """A window laid together: its scans, their track (one pose more at either end), and how thick upright surfaces are."""
 
     scans: tuple[Scan, ...]
     track: Trajectory
@@ -142,19 +144,33 @@ class _Window:
     @property
     def step_m(self) -> float:
         """Mean way from scan to scan."""
-        return float(np.linalg.norm(np.diff(self.track.T_dst_vehicle[:, :3, 3], axis=0), axis=1).mean())
+        return float(np.linalg.norm(np.diff(self.poses[:, :3, 3], axis=0), axis=1).mean())
+
+    @property
+    def poses(self) -> F64:
+        """(N, 4, 4) of the scans."""
+        return self.track.T_dst_vehicle[1:-1]
 
 
-def _laid(recording: Recording, numbers: range) -> _Window:
+def _laid(recording: Recording, numbers: range, rough: Trajectory | None = None) -> _Window:
+    """Lay a window together; `rough`: the motion to deskew with, so that the first sweeps are deskewed as well."""
     scans = [scan for i in numbers if (scan := cleaned(recording.read(i)).scan) is not None]
-    track = track_of_scans(recording, scans)
+    track = _longer(track_of_scans(recording, scans, rough))
     clouds = []
-    for scan, t_ns, T in zip(scans, track.t_ns, track.T_dst_vehicle, strict=True):
+    for scan, t_ns, T in zip(scans, track.t_ns[1:], track.T_dst_vehicle[1:], strict=False):
         some = scan.points_m[::EVERY]
         points = deskew(some, scan.t_offset_ns[::EVERY], scan.t_ns, track, recording.T_vehicle_lidar, int(t_ns))
         range_m = np.linalg.norm(some, axis=1)
         clouds.append(transform(T, points[(range_m > NEAR_M) & (range_m < FAR_M)]))
     return _Window(tuple(scans), track, thickness_of(clouds))
+
+
+def _longer(track: Trajectory) -> Trajectory:
+    """The track with its first and last step gone once more: sweeps begin before their pose and end after it."""
+    t_ns, T = track.t_ns, track.T_dst_vehicle
+    first, last = T[0] @ T_inverse(T[1]) @ T[0], T[-1] @ T_inverse(T[-2]) @ T[-1]
+    times = np.concatenate([[2 * t_ns[0] - t_ns[1]], t_ns, [2 * t_ns[-1] - t_ns[-2]]])
+    return Trajectory(times, np.concatenate([first[None], T, last[None]]))
 
 
 def _decide(recording: Recording, numbers: range, sweep_ns: int) -> tuple[Verdict, ShareOf | None]:
@@ -164,8 +180,8 @@ def _decide(recording: Recording, numbers: range, sweep_ns: int) -> tuple[Verdic
         if plain.step_m < LEAST_STEP_M:
             return Verdict("none", f"the vehicle moves {plain.step_m:.2f} m a sweep, too little to tell"), None
         found, share_of, motion = _times_in(recording, plain, sweep_ns)
-        forward = _laid(timed(recording, share_of, sweep_ns), numbers)
-        backward = _laid(timed(recording, _backwards(share_of), sweep_ns), numbers)
+        forward = _laid(timed(recording, share_of, sweep_ns), numbers, plain.track)
+        backward = _laid(timed(recording, _backwards(share_of), sweep_ns), numbers, plain.track)
     except ImportDriveError as error:
         return Verdict("none", f"LiDAR odometry fails on scans {numbers.start} to {numbers.stop - 1} ({error})"), None
     return _judged(found, share_of, motion, (plain.thickness, forward.thickness, backward.thickness))
@@ -192,8 +208,8 @@ def _turns_clockwise(scan: Scan) -> bool:
 def _fit(recording: Recording, plain: _Window, sweep_ns: int) -> SweepFit:
     """The saw tooth in a window; surfaces are paired anew with the times found so far."""
     patches = [patches_of(scan.points_m, recording.T_vehicle_lidar) for scan in plain.scans]
-    poses = plain.track.T_dst_vehicle
-    steps = steps_of(plain.track.t_ns, poses, sweep_ns)
+    poses = plain.poses
+    steps = steps_of(plain.track.t_ns[1:-1], poses, sweep_ns)
     fit = fit_sweep(azimuth_times(patches, poses, steps))
     for _ in range(ROUNDS - 1):
         known = min(1.0, fit.motion) * (fit.sweep.share(middle_of_bins_rad()) - 0.5)
@@ -205,15 +221,15 @@ def _judged(
     found: str, share_of: ShareOf, motion: float, thickness: tuple[Thickness, Thickness, Thickness]
 ) -> tuple[Verdict, ShareOf | None]:
     plain, forward, backward = thickness
-    gain, loss = compared(plain, forward), compared(plain, backward)
+    gain, loss, apart = compared(plain, forward), compared(plain, backward), compared(backward, forward)
     said = f"upright surfaces {_percent(gain)} with these times, {_percent(loss)} with their reverse"
-    if gain.clearly(THINNER) and loss.thinner < 0.0 and MOTION[0] <= motion <= MOTION[1]:
+    if gain.by(THINNER, LIKELY) and apart.by(THINNER, SURE) and loss.thinner < 0.0 and MOTION[0] <= motion <= MOTION[1]:
         return Verdict("reconstructed", f"times of points reconstructed {found}; {said}"), share_of
-    if compared(forward, plain).clearly(THINNER) and compared(backward, plain).clearly(THINNER):
+    if compared(forward, plain).by(THINNER, LIKELY) and compared(backward, plain).by(THINNER, LIKELY):
         return Verdict("compensated", f"sweeps are free of motion already: {said} ({found})"), None
     return Verdict("none", f"times {found} find {motion:.0%} of the motion; {said}"), None
 
 
 def _percent(one: Comparison) -> str:
     percent = one.percent
-    return f"{abs(percent):.1f} % {'thinner' if percent >= 0 else 'thicker'}"
+    return f"{abs(percent):.1f} ± {100.0 * one.sigma:.1f} % {'thinner' if percent >= 0 else 'thicker'}"

@@ -7,7 +7,12 @@ from vehicle_agent.errors import ImportDriveError
 from vehicle_agent.importers.apollo import is_apollo
 from vehicle_agent.importers.files import files_below, files_of
 
-ENDINGS: Final = {"kitti": (".bin", ".bin.xz"), "pcd": (".pcd", ".pcd.xz"), "mcap": (".mcap",), "planes": (".xyz_mm", ".xyz_mm.xz")}
+ENDINGS: Final = {
+    "kitti": (".bin", ".bin.xz"),
+    "pcd": (".pcd", ".pcd.xz"),
+    "mcap": (".mcap",),
+    "planes": (".xyz_mm", ".xyz_mm.xz"),
+}
 
 
 def format_of(place: Path) -> str:

@@ -47,9 +47,9 @@ class Comparison:
         """By how much thinner."""
         return 100.0 * float(1.0 - np.exp(-self.thinner))
 
-    def clearly(self, at_least: float) -> bool:
-        """Whether it is thinner by that much (a logarithm) and by three sigmas."""
-        return self.thinner > max(at_least, 3.0 * self.sigma)
+    def by(self, at_least: float, sigmas: float) -> bool:
+        """Whether it is thinner by that much (a logarithm), and by so many sigmas."""
+        return self.thinner > max(at_least, sigmas * self.sigma)
 
 
 def thickness_of(clouds: Sequence[F64]) -> Thickness:

@@ -65,7 +65,9 @@ def open_planes(folder: Path, anchor: Anchor | None) -> Recording:
         motion=_motion(ins_ns, ins),
         stamp="middle",
         mount="given" if kitti else "assumed",
-        notes=(f"stamps lie up to {rounded * 1e-6:.1f} ms off an even rhythm: scans take the rhythm",) if rounded else (),
+        notes=(f"stamps lie up to {rounded * 1e-6:.1f} ms off an even rhythm: scans take the rhythm",)
+        if rounded
+        else (),
     )
 
 

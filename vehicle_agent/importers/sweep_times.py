@@ -41,7 +41,7 @@ SCALE_M: Final = 0.08
 POSE_SIGMA: Final = (0.01, 0.3)
 """How far poses of odometry with distorted sweeps may be off, in radians and metres."""
 CORRELATED: Final = 25.0
-"""Neighbouring patches and pairs of the same patches share their errors: one pair in so many counts as a measurement."""
+"""Neighbouring patches and pairs of the same patches share their errors: one pair in so many counts."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)

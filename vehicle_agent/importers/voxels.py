@@ -10,9 +10,9 @@ _SPAN = 1 << 20
 
 
 def voxels_of(points_m: F64, side_m: float) -> tuple[I64, I64]:
-    """Number of the voxel of each point (N,), counted from 0 over those that hold any, and points of each voxel (V,)."""
-    key, count = np.unique(voxel_keys(points_m, side_m), return_inverse=True, return_counts=True)[1:]
-    return key.astype(np.int64), count.astype(np.int64)
+    """Voxel of each point (N,), counted from 0 over those that hold any, and how many points each voxel holds (V,)."""
+    voxel, count = np.unique(voxel_keys(points_m, side_m), return_inverse=True, return_counts=True)[1:]
+    return voxel.astype(np.int64), count.astype(np.int64)
 
 
 def voxel_keys(points_m: F64, side_m: float) -> I64:

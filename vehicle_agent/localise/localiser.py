@@ -13,7 +13,7 @@ from gnd_map.se3 import T_from_R_t, exp_so3
 from schemas.drive import GnssFix, MotionSample, Scan
 from vehicle_agent.errors import RegistrationError
 from vehicle_agent.local_map import LocalMap
-from vehicle_agent.localise.calibration import MotionTeacher
+from vehicle_agent.localise.calibration import MotionCalibration, MotionTeacher
 from vehicle_agent.localise.estimates import Cause, Health, PoseEstimate, RefinedScan
 from vehicle_agent.localise.first_pose import FirstPose, Place
 from vehicle_agent.localise.graph import MapMatch, Odometry, PoseGraph, Position, SmoothedPose
@@ -21,6 +21,7 @@ from vehicle_agent.localise.health import HealthMonitor
 from vehicle_agent.localise.judge import Judge, Matched
 from vehicle_agent.localise.level import on_the_road, sees_tilt, settled
 from vehicle_agent.localise.match_map import MatchMapCache
+from vehicle_agent.localise.mount import MountWatch, near_points
 from vehicle_agent.localise.odometry import MotionBuffer
 from vehicle_agent.localise.packed_scan import PackedScan, pack
 from vehicle_agent.localise.parameters import LocaliserParameters
@@ -90,7 +91,7 @@ class Localiser:
         self.dropped_scans = 0
         self.initialisations = 0
         self._motion = MotionBuffer()
-        self._teacher = MotionTeacher(self._motion, self.parameters.odometry)
+        self._teacher = MotionTeacher(self._motion, self.parameters.odometry, MountWatch(self.T_vehicle_lidar))
         self._map = MatchMapCache(local_map, self.parameters.registration.noise_m)
         self._scan_odometry = ScanOdometry(self.parameters.scan_odometry)
         self._fix: GnssFix | None = None
@@ -162,6 +163,11 @@ class Localiser:
         """What is taken off the yaw rate, as learnt from the map."""
         return self._motion.yaw_bias_radps
 
+    @property
+    def calibration(self) -> MotionCalibration:
+        """What is known of clock, wheels, gyro and mount so far, with sigmas."""
+        return self._teacher.calibration
+
     # --- one scan --------------------------------------------------------------------------------------------------
 
     def _process_if_covered(self) -> None:
@@ -174,6 +180,7 @@ class Localiser:
             return
         chosen = sample_scan(scan.points_m, self.parameters.sampling)
         points = self._deskewed(scan, chosen, scan.points_m[chosen])
+        self._look_at_mount(scan)
         last_ns = scan.t_ns if self._last_ns is None else self._last_ns
         if self._track is not None and (scan.t_ns - last_ns) * 1e-9 > self.parameters.causes.lost_gap_s:
             self._lose(self._track, "gap")
@@ -183,11 +190,18 @@ class Localiser:
             self._step(self._track, scan, chosen, points)
         self._last_ns = _reference_ns(scan)
 
+    def _look_at_mount(self, scan: Scan) -> None:
+        t_ns, watch = _reference_ns(scan), self._teacher.mount
+        if watch.due(t_ns):
+            near = near_points(scan.points_m)
+            watch.see(t_ns, self._deskewed(scan, near, scan.points_m[near]))
+
     def _step(self, track: _Track, scan: Scan, chosen: NDArray[np.int64], points: F64) -> None:
         """Predict from the newest pose, match, gate, fuse."""
         t_ns, newest = _reference_ns(scan), track.graph.newest
         odometry = self._odometry(track.held[newest].t_ns, t_ns)
         seen = self._scan_step(scan, chosen, points, odometry)
+        self._teacher.clock.see(track.held[newest].t_ns, t_ns, seen)
         joint = joint_step(*odometry, seen)
         sweep = self._sweep_of_steady(scan) if joint.slipped else None
         points = points if sweep is None else self._deskewed(scan, chosen, scan.points_m[chosen], sweep)
@@ -203,7 +217,7 @@ class Localiser:
         odometry = Odometry(odometry.T_before_now, joint.driven_sigmas)
         gnss, T_now = self._gnss_at(track, t_ns, predicted), predicted if match is None else match.T_map_vehicle
         unknown_s = max(self._motion.unknown_s(track.held[newest].t_ns, t_ns), self._motion.age_s(t_ns))
-        seen_scan = Matched(t_ns, points, joint.T_before_now, T_now, result, believed, unknown_s)
+        seen_scan = Matched(t_ns, points, joint.T_before_now, T_now, result, believed, unknown_s, self._teacher.cause)
         track.judge.see(seen_scan, self._map.near(T_now[:3, 3]))
         final = track.graph.add(t_ns, predicted, odometry, match or self._settled(predicted), gnss, seen)
         self._hold(track, scan, result.matching_ratio if result is not None else 0.0, sweep)
@@ -230,7 +244,7 @@ class Localiser:
 
     def _odometry(self, first_ns: int, last_ns: int) -> Odometry:
         delta = self._motion.delta(first_ns, last_ns)
-        return Odometry(delta, self._teacher.sigmas(delta, (last_ns - first_ns) * 1e-9))
+        return Odometry(delta, self._teacher.sigmas_between(first_ns, last_ns, delta))
 
     def _matched(
         self, monitor: HealthMonitor, points: F64, predicted: F64, sigmas: F64, t_ns: int
@@ -392,6 +406,7 @@ class Localiser:
         if self._from_past < MOST_FROM_PAST:
             return
         self._motion.clear()
+        self._teacher.clock.forget()
         self._fix = self._pending = self._last_ns = None
         self._newest_scan_ns, self._from_past = -1, 0
         if self._track is not None:

@@ -223,6 +223,7 @@ class Refiner:
             T, dt_s = self._motion.delta(before.t_ns, now.t_ns), (now.t_ns - before.t_ns) * 1e-9
             between_them = self._scans[self._index(before) + 1 : self._index(now) + 1]
             variance = np.sum([scan.variance for scan in between_them], axis=0)
+            variance[2:4] += np.square(self._teacher.clock_sigmas(before.t_ns, now.t_ns))
             driven.append(Step(T, np.diag(variance), shared_of(T, dt_s)))
             told = [scan.seen for scan in between_them]
             whole = all(step is not None for step in told)

@@ -158,7 +158,11 @@ def _match(knots: Sequence[Knot], match_map: MatchMap, par: RegistrationParamete
     """Match the knots with the map that have moved since, or were matched with another scale."""
     for knot in knots:
         m, T = knot.match, knot.T_map_vehicle
-        if m is not None and m.scale == scale and _small(log_se3(T_inverse(m.T_map_vehicle) @ T)[None], SMALL_M, SMALL_RAD):
+        if (
+            m is not None
+            and m.scale == scale
+            and _small(log_se3(T_inverse(m.T_map_vehicle) @ T)[None], SMALL_M, SMALL_RAD)
+        ):
             continue
         knot.match = linearised(knot.points_m, T, match_map, par, scale)
 
@@ -296,5 +300,3 @@ def _small(motion: F64, m: float, rad: float) -> bool:
 def log_se3(T: F64) -> F64:
     """(6,) rotation vector and position of a small motion (4, 4)."""
     return np.concatenate([log_so3(T[:3, :3]), T[:3, 3]])
-
-
