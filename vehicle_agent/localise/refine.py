@@ -7,6 +7,7 @@ Only these poses are evidence of change.
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from itertools import pairwise
 from typing import Final
 
 import numpy as np
@@ -176,8 +177,10 @@ class Refiner:
         return scan
 
     def _variance(self, driven: F64, dt_ns: int) -> F64:
-        """(6,) of a motion (4, 4) by wheels and gyro beside what all steps share. A step that is far off counts less (`STEP_CHI2`); what
-        single scans say about it is not asked: they follow walls that were moved.
+        """(6,) of a motion (4, 4) by wheels and gyro beside what all steps share.
+
+        A single step that is far off counts less (`STEP_CHI2`); odometry that is worse all along is found out by
+        `_judge_steps`. Single scans are not asked what it is off by: they follow walls that were moved.
         """
         par = self.parameters
         grown = np.sqrt(max(float(np.linalg.norm(driven[:3, 3])), dt_ns * 1e-9) / NOISE_WAY_M)
@@ -219,7 +222,7 @@ class Refiner:
     def _steps(self, knots: Sequence[_Scan]) -> list[list[Step]]:
         """What wheels and gyro, and the scans, say of the motion between neighbouring knots."""
         driven, seen = [], []
-        for before, now in zip(knots, knots[1:], strict=False):
+        for before, now in pairwise(knots):
             T, dt_s = self._motion.delta(before.t_ns, now.t_ns), (now.t_ns - before.t_ns) * 1e-9
             between_them = self._scans[self._index(before) + 1 : self._index(now) + 1]
             variance = np.sum([scan.variance for scan in between_them], axis=0)
@@ -265,7 +268,7 @@ class Refiner:
 
     def _shortened(self, scans: list[_Scan], steps: list[list[Step]], belief: Belief, dt_s: float) -> Belief:
         """Let go of the knots that are far behind; the belief about the first that stays."""
-        par, newest, solved = self.parameters, self._scans[-1], self._solved
+        newest, solved = self._scans[-1], self._solved
         assert solved is not None
         first = 0
         while first < len(scans) - 2 and self._is_done_with(scans[first + 1], newest):

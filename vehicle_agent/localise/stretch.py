@@ -1,9 +1,9 @@
 """A stretch of scans matched with the map together: the submap of GND 6.2, as stiff as the odometry is good.
 
-A rigid submap is shaped by odometry alone. Where wheels, clock or stamps are off by centimetres a step, its match is off
-by decimetres and does not know. Here every scan keeps a pose of its own: all scans of the stretch are matched point to
-Gaussian at once, and odometry ties their poses as tightly as its sigmas say. What all steps share (wheel scale, gyro
-bias, course) is estimated beside the poses, so that it does not count as independent noise.
+A rigid submap is shaped by odometry alone. Where wheels, clock or stamps are off by centimetres a step, its match is
+off by decimetres and does not know. Here every scan keeps a pose of its own: all scans of the stretch are matched
+point to Gaussian at once, and odometry ties their poses as tightly as its sigmas say. What all steps share (wheel
+scale, gyro bias, course) is estimated beside the poses, so that it does not count as independent noise.
 
 Everything is one least-squares problem: Gauss-Newton over 6 N pose parameters and `N_SHARED` shared ones, with robust
 weights (Geman-McClure on points, Cauchy on steps). Old scans leave by marginalisation, so nothing counts twice.
@@ -76,9 +76,9 @@ class Solved:
     shared: (N_SHARED,) estimate. covariance: (N, 6, 6) of each pose, rotation first, vehicle frame; shared_covariance.
     fit: (N,) 1 - mean robust cost of each scan's points, 0 ... 1, at the last scale; known: (N,) share of them in known
     voxels. misfit: mean square of what each scan's own match disagrees with its pose, in sigmas (1 = as expected).
-    step_squares, step_redundancy: (6,) sums over the first measurement of each step: squared residual in sigmas, and how
-        much of each the others can check (0: nothing else knows, 1: all is known otherwise). Their ratio is the variance
-        of these measurements in units of what they claim (variance components, Förstner 1979).
+    step_squares, step_redundancy: (6,) sums over the first measurement of each step: squared residual in sigmas, and
+        how much of each the others can check (0: nothing else knows, 1: all is known otherwise). Their ratio is the
+        variance of these measurements in units of what they claim (variance components, Förstner 1979).
     """
 
     shared: F64
@@ -208,7 +208,9 @@ def _add_step(A: F64, g: F64, k: int, relative: F64, step: Step, shared_off: F64
 
 
 def _residual(relative: F64, step: Step, shared_off: F64) -> tuple[F64, F64]:
-    """e = log(Z^-1 T_k^-1 T_k+1) - S shared (6,), and its derivative (6, 12 + N_SHARED) after both poses and those."""
+    """Residual e = log(Z^-1 T_k^-1 T_k+1) - S shared (6,) of a step, and its derivative (6, 12 + N_SHARED) after
+    both poses and the shared parameters.
+    """
     e = log_se3(T_inverse(step.T_before_now) @ relative) - step.shared @ shared_off
     J = np.zeros((6, 12 + N_SHARED))
     p, R, R_Z = relative[:3, 3], relative[:3, :3], step.T_before_now[:3, :3]
@@ -282,7 +284,7 @@ def _misfit(knots: Sequence[Knot], par: RegistrationParameters) -> float:
 
 
 def shared_of(T_driven: F64, dt_s: float) -> F64:
-    """(6, N_SHARED) how a motion (4, 4) by wheels and gyro that took `dt_s` differs when a shared parameter is larger."""
+    """(6, N_SHARED) how a motion (4, 4) by wheels and gyro that took `dt_s` differs with a larger shared parameter."""
     S = np.zeros((6, N_SHARED))
     S[2, BIAS] = -dt_s  # what is taken off the yaw rate
     forward_m = T_driven[0, 3]
