@@ -50,8 +50,8 @@ MOTION: Final = (0.5, 1.5)
 NEAR_M, FAR_M = 3.0, 40.0
 EVERY: Final = 2
 UNSURE_RAD: Final = np.radians(8.0)
-"""Lasers of a head look up to 9° past its azimuth, so points this near to the place where the sweep begins may be of its
-beginning or of its end, a whole sweep apart: they are left out."""
+"""Lasers of a head look up to 9° past its azimuth, so points this near to the place where the sweep begins may be of
+its beginning or of its end, a whole sweep apart: they are left out."""
 
 ShareOf = Callable[[RawScan | Scan], F64]
 """(N,) share of the sweep that had passed when each point of a scan was measured; NaN where that cannot be told."""
@@ -135,7 +135,7 @@ def _backwards(share_of: ShareOf) -> ShareOf:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Window:
-    """A window laid together: its scans, their track (one pose more at either end), and how thick upright surfaces are."""
+    """A window laid together: its scans, their track (a pose more at either end), how thick upright surfaces are."""
 
     scans: tuple[Scan, ...]
     track: Trajectory

@@ -28,6 +28,7 @@ OWN_VEHICLE_M: Final = 1.5
 HEIGHTS_M: Final = (0.2, 4.5)
 MOST_TILT_DEG: Final = 20.0
 CELL_M: Final = 0.5
+FLAT_CELL_M: Final = 0.15
 LEAST_CELLS: Final = 24
 LEAST_SHARE: Final = 0.35
 """Share of the cells around the vehicle that the plane must hold."""
@@ -74,7 +75,7 @@ class GroundSeen:
 
 @dataclass(frozen=True, slots=True)
 class YawSeen:
-    """Yaw of the LiDAR's x axis against the course (counter-clockwise positive), its sigma, and the straight way used."""
+    """Yaw of the LiDAR's x axis against the course (counter-clockwise positive), its sigma, the straight way used."""
 
     yaw_rad: float
     sigma_rad: float
@@ -128,13 +129,15 @@ def _lane(points: F64, course_rad: float) -> F64:
 
 
 def _lowest_of_cells(points: F64) -> F64:
-    """(M, 3) the lowest point of each cell of ground."""
-    cell = np.floor(points[:, :2] / CELL_M).astype(np.int64) + 4096
+    """(M, 3) the lowest point of each cell of ground, of cells that are flat: not of walls and hedges, whose feet lie
+    in a plane as well when what is below them is hidden.
+    """
+    cell = np.floor(points[:, :2] / CELL_M).astype(np.int64)
     order = np.lexsort((points[:, 2], cell[:, 1], cell[:, 0]))
-    cell = cell[order]
-    first = np.ones(len(order), np.bool_)
-    first[1:] = (np.diff(cell, axis=0) != 0).any(axis=1)
-    return points[order[first]]
+    first = np.flatnonzero(np.r_[True, (np.diff(cell[order], axis=0) != 0).any(axis=1)][: len(order)])
+    count = np.diff(np.r_[first, len(order)])
+    lowest, middle = points[order[first]], points[order[first + count // 2]]
+    return lowest[middle[:, 2] - lowest[:, 2] < FLAT_CELL_M]
 
 
 def _largest_plane(points: F64) -> tuple[F64, float] | None:

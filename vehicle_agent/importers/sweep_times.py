@@ -30,7 +30,7 @@ VOXEL_M: Final = 1.0
 RANGE_M: Final = (4.0, 50.0)
 LEAST_POINTS: Final = 12
 FLAT_M: Final = 0.06
-"""A patch of one scan is a plane when it is no thicker; distortion does not thicken it, all its points are of one time."""
+"""A patch of one scan is a plane when it is no thicker; distortion does not thicken it: its points are of one time."""
 WIDE_M: Final = 0.12
 BINS: Final = 72
 STRIDES: Final = (2, 3, 5, 8, 12)
