@@ -14,6 +14,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
+from gnd_map.errors import MotionError
 from gnd_map.motion import Trajectory, deskew
 from gnd_map.se3 import T_inverse, transform
 from schemas.drive import Deskew, Scan
@@ -182,7 +183,7 @@ def _decide(recording: Recording, numbers: range, sweep_ns: int) -> tuple[Verdic
         found, share_of, motion = _times_in(recording, plain, sweep_ns)
         forward = _laid(timed(recording, share_of, sweep_ns), numbers, plain.track)
         backward = _laid(timed(recording, _backwards(share_of), sweep_ns), numbers, plain.track)
-    except ImportDriveError as error:
+    except (ImportDriveError, MotionError) as error:
         return Verdict("none", f"LiDAR odometry fails on scans {numbers.start} to {numbers.stop - 1} ({error})"), None
     return _judged(found, share_of, motion, (plain.thickness, forward.thickness, backward.thickness))
 

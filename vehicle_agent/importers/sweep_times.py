@@ -220,8 +220,11 @@ def fit_sweep(times: AzimuthTimes) -> SweepFit:
     middles = middle_of_bins_rad()
     begins = np.arange(BINS) * (2 * np.pi / BINS) - np.pi
     found = [_fit(Sweep(float(b), c), times, middles) for b in begins for c in (True, False)]
-    cost, motion, sigma, sweep = min(found, key=lambda one: one[0])
-    rival = min(one[0] for one in found if one[3].clockwise != sweep.clockwise)
+    cost, _, _, best = min(found, key=lambda one: one[0])
+    rival = min(one[0] for one in found if one[3].clockwise != best.clockwise)
+    likely = [(np.exp(0.5 * (cost - one[0])), one[3].begin_rad) for one in found if one[3].clockwise == best.clockwise]
+    begin_rad = float(np.angle(sum(weight * np.exp(1j * begin) for weight, begin in likely)))
+    _, motion, sigma, sweep = _fit(Sweep(begin_rad, best.clockwise), times, middles)
     still = _cost(times, np.zeros(BINS))[0]
     return SweepFit(sweep, motion, sigma, rival - cost, still - cost)
 
