@@ -17,7 +17,7 @@ SWEEP_NS = 100_000_000
 
 @pytest.fixture(scope="module")
 def drive(tmp_path_factory):
-    return drive_of(tmp_path_factory.mktemp("sweeps") / "drive.mcap")
+    return drive_of(tmp_path_factory.mktemp("sweeps") / "drive.mcap", scans=72)
 
 
 def errors_ms(found, path, change):
@@ -126,7 +126,7 @@ def test_points_where_the_sweep_begins_have_no_time():
 
 def test_a_thicker_wall_is_told_and_too_few_decide_nothing():
     rng = np.random.default_rng(5)
-    walls = [rng.uniform((0, 0, 0), (60, 0, 8), (30_000, 3)) for _ in range(4)]
+    walls = [rng.uniform((0, 0.25, 0), (60, 0.25, 8), (30_000, 3)) for _ in range(4)]
     thin = thickness_of([wall + rng.normal(0, (0, 0.02, 0), wall.shape) for wall in walls])
     thick = thickness_of([wall + rng.normal(0, (0, 0.03, 0), wall.shape) for wall in walls])
     assert thin.mean_m == pytest.approx(0.02, rel=0.25)
