@@ -82,12 +82,22 @@ def test_sweeps_that_were_freed_of_motion_stay_as_they_are(drive):
 def test_a_vehicle_that_stands_decides_nothing(drive):
     recording = recording_of(drive, ring_by_ring)
     scan = recording.read(0)
-    still = dataclasses.replace(recording, read=lambda i: dataclasses.replace(scan, t_ns=int(recording.t_ns[i])))
+    t_ns = recording.t_ns[:12]
+    still = dataclasses.replace(
+        recording, t_ns=t_ns, read=lambda i: dataclasses.replace(scan, t_ns=int(recording.t_ns[i]))
+    )
     found, verdict = with_times(still)
     assert verdict.deskew == found.deskew == "none"
     assert "too little to tell" in verdict.note
     assert found.sweep_ns == SWEEP_NS
     assert not found.read(3).t_offset_ns.any()
+
+
+def test_a_few_scans_decide_nothing(drive):
+    recording = recording_of(drive, ring_by_ring)
+    found, verdict = with_times(dataclasses.replace(recording, t_ns=recording.t_ns[40:51]))
+    assert verdict.deskew == found.deskew == "none"
+    assert "11 scans, 12 are needed" in verdict.note
 
 
 def test_recordings_that_give_times_keep_them(drive):

@@ -41,6 +41,7 @@ U32 = NDArray[np.uint32]
 WINDOW: Final = 24
 WINDOWS: Final = 4
 """So many over the recording, none overlaps another; the first that decides is the last that is looked at."""
+LEAST_SCANS: Final = 12
 LEAST_STEP_M: Final = 0.3
 """Mean way of a sweep below which a window says nothing (3 m/s at 10 Hz)."""
 ROUNDS: Final = 3
@@ -188,6 +189,8 @@ def _decide(
     recording: Recording, numbers: range, sweep_ns: int, before: list[_Window]
 ) -> tuple[Verdict, ShareOf | None]:
     """What a window says, with those before it (it joins them); with times where they are to be reconstructed."""
+    if len(numbers) < LEAST_SCANS:
+        return Verdict("none", f"{len(numbers)} scans, {LEAST_SCANS} are needed to tell"), None
     try:
         plain = _laid(recording, numbers)
         if plain.step_m < LEAST_STEP_M:
