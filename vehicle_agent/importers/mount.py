@@ -125,7 +125,8 @@ def _around(points: F64) -> F64:
 def _lane(points: F64, course_rad: float) -> F64:
     along = points[:, :2] @ (np.cos(course_rad), np.sin(course_rad))
     across = points[:, :2] @ (-np.sin(course_rad), np.cos(course_rad))
-    return points[(np.abs(along) < LANE_WITHIN_M) & (np.abs(along) > OWN_VEHICLE_M) & (np.abs(across) < LANE_HALF_M)]
+    inside = (np.abs(along) < LANE_WITHIN_M) & (np.abs(along) > OWN_VEHICLE_M) & (np.abs(across) < LANE_HALF_M)
+    return np.asarray(points[inside])
 
 
 def _lowest_of_cells(points: F64) -> F64:
@@ -137,7 +138,7 @@ def _lowest_of_cells(points: F64) -> F64:
     first = np.flatnonzero(np.r_[True, (np.diff(cell[order], axis=0) != 0).any(axis=1)][: len(order)])
     count = np.diff(np.r_[first, len(order)])
     lowest, middle = points[order[first]], points[order[first + count // 2]]
-    return lowest[middle[:, 2] - lowest[:, 2] < FLAT_CELL_M]
+    return np.asarray(lowest[middle[:, 2] - lowest[:, 2] < FLAT_CELL_M])
 
 
 def _largest_plane(points: F64) -> tuple[F64, float] | None:
@@ -208,7 +209,9 @@ def ground_of_scans(seen: Iterable[GroundSeen | Refused], floor_rad: float = FLO
     middle = np.median(kept, axis=0)
     deviation = 1.4826 * np.median(np.abs(kept - middle), axis=0)
     sigma = np.hypot(1.2533 * deviation / np.sqrt(max(1.0, len(kept) / KEPT_SCANS)), (FLOOR_M, floor_rad, floor_rad))
-    return GroundSeen(*map(float, middle), *map(float, sigma), scans=len(kept))
+    height, roll, pitch = middle.tolist()
+    height_sigma, roll_sigma, pitch_sigma = sigma.tolist()
+    return GroundSeen(height, roll, pitch, height_sigma, roll_sigma, pitch_sigma, len(kept))
 
 
 def yaw_of_track(T: F64) -> YawSeen | Refused:

@@ -154,7 +154,7 @@ def azimuth_times(patches: Sequence[Patches], T: F64, steps: F64, known: F64 | N
     sigma = np.repeat(POSE_SIGMA, 3)
     H[BINS:, BINS:] += np.diag(np.tile(sigma**-2.0, n))
     information, right = _without_poses(H, g)
-    return AzimuthTimes(np.linalg.solve(information + 1e-3 * np.eye(BINS), right), information)
+    return AzimuthTimes(np.asarray(np.linalg.solve(information + 1e-3 * np.eye(BINS), right), np.float64), information)
 
 
 def _without_poses(H: F64, g: F64) -> tuple[F64, F64]:
@@ -225,7 +225,7 @@ def _by_pose(side: _Side, rows: I64, normal: F64) -> F64:
 
 def middle_of_bins_rad() -> F64:
     """(BINS,) azimuths in the middle of the bins."""
-    return (np.arange(BINS) + 0.5) * (2 * np.pi / BINS) - np.pi
+    return np.asarray((np.arange(BINS) + 0.5) * (2 * np.pi / BINS) - np.pi, np.float64)
 
 
 def fit_sweep(times: AzimuthTimes) -> SweepFit:
