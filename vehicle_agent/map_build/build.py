@@ -23,6 +23,7 @@ from tile_store.values import DEFAULT_CODEC, DEFAULT_LAYER
 from vehicle_agent.localise.estimates import RefinedScan
 from vehicle_agent.map_build.bodywork import HIGH_M, LOW_M, Bodywork
 from vehicle_agent.map_build.placed_scans import NoPose, drive_scans, placed, why_no_pose
+from vehicle_agent.map_build.refine_poses import PosesReport, RefineMode, refine_poses
 from vehicle_agent.map_build.survey import DriveSurvey, Progress, look_over
 from vehicle_agent.segment import MotionSegmenter, SegmentedScan, SegmentParameters
 
@@ -51,12 +52,13 @@ class DriveCounts:
 class BuiltMap:
     """A map that was put into a store, and what it was made of.
 
-    sources: the drives with the poses that were used. surveys, counts: of each drive. tiles: as published.
-    measured: all points in their voxels.
+    sources: the drives with the poses that were used. surveys, counts: of each drive. poses: what was done about them.
+    tiles: as published. measured: all points in their voxels.
     """
 
     sources: tuple[Source, ...]
     surveys: tuple[DriveSurvey, ...]
+    poses: PosesReport
     counts: tuple[DriveCounts, ...]
     tiles: tuple[Tile, ...]
     measured: MapPoints
@@ -75,6 +77,7 @@ def build_recorded_map(
     codec: str = DEFAULT_CODEC,
     n_min_cells: int = N_MIN_CELLS,
     keep_movers: bool = False,
+    refine: RefineMode = "auto",
     parameters: BuildParameters | None = None,
     progress: Progress = no_progress,
 ) -> BuiltMap:
@@ -87,6 +90,7 @@ def build_recorded_map(
         codec: one of `MAP_CODECS`.
         n_min_cells: a voxel holds a Gaussian from so many occupied sub-cells on.
         keep_movers: what moves, and the vehicle itself, stay in the map.
+        refine: whether poses are closed in loops and tied to GNSS; see `refine_poses`.
         parameters: which points and poses are used.
         progress: called after each scan of each step.
 
@@ -99,6 +103,7 @@ def build_recorded_map(
     lattice = map_lattice(layer, codec)
     sources = drive_sources(drives, parameters)
     surveys = [look_over(source, parameters, progress) for source in sources]
+    sources, poses = refine_poses(sources, surveys, refine, progress)
     measured, counts = MapPoints(sources, parameters), list[DriveCounts]()
     for source, survey in zip(sources, surveys, strict=True):
         counts.append(DriveCounts())
@@ -109,7 +114,7 @@ def build_recorded_map(
         raise BuildError(f"none of {missing.total()} scans has a pose: {reasons(missing)}; are both in the same clock?")
     tiles = measured.tiles(n_min_cells, lattice)
     published = put_map(tiles, store, layer)
-    return BuiltMap(tuple(sources), tuple(surveys), tuple(counts), tuple(tiles), measured, published)
+    return BuiltMap(tuple(sources), tuple(surveys), poses, tuple(counts), tuple(tiles), measured, published)
 
 
 def reasons(missing: Counter[NoPose]) -> str:
