@@ -159,9 +159,7 @@ def _loop(anchors: Anchors, early: int, late: int, T_expected: F64, sigma_m: flo
     return Loop(early, late, result.T_map_vehicle, result.covariance + floor, best.fit)
 
 
-def _best_two(
-    cloud: F64, target: MatchMap, T_expected: F64, sigma_m: float
-) -> tuple[Candidate | None, float]:
+def _best_two(cloud: F64, target: MatchMap, T_expected: F64, sigma_m: float) -> tuple[Candidate | None, float]:
     """The best match around the expected pose, and the fit of the best that is another answer (0 without one)."""
     reach_m = float(np.clip(SIGMAS * sigma_m, LEAST_REACH_M, MOST_REACH_M))
     heading = float(np.arctan2(T_expected[1, 0], T_expected[0, 0]))
@@ -205,9 +203,7 @@ def _neighbours(loop: Loop, loops: Sequence[Loop], anchors: Anchors) -> Iterator
 
 
 def _agree(loop: Loop, other: Loop, anchors: Anchors, T: F64) -> bool:
-    carried = (
-        T_inverse(T[loop.early]) @ T[other.early] @ other.T_early_late @ T_inverse(T[other.late]) @ T[loop.late]
-    )
+    carried = T_inverse(T[loop.early]) @ T[other.early] @ other.T_early_late @ T_inverse(T[other.late]) @ T[loop.late]
     way_m = abs(float(anchors.way_m[loop.late] - anchors.way_m[other.late]))
     way_m += abs(float(anchors.way_m[loop.early] - anchors.way_m[other.early]))
     return within(apart(loop.T_early_late, carried), AGREE_M + AGREE_SHARE * way_m, AGREE_DEG)

@@ -119,7 +119,8 @@ def bent(poses: Trajectory, anchor_ns: I64, T_old: F64, T_new: F64) -> Trajector
     Args:
         poses: the whole track.
         anchor_ns: (K,) times of its anchors, ascending, at least one.
-        T_old, T_new: (K, 4, 4) where they were and where they are now.
+        T_old: (K, 4, 4) where they were.
+        T_new: (K, 4, 4) where they are now.
     """
     after = np.clip(np.searchsorted(anchor_ns, poses.t_ns), 1, max(len(anchor_ns) - 1, 1)).clip(0, len(anchor_ns) - 1)
     before = np.maximum(after - 1, 0)
