@@ -14,6 +14,8 @@ GATE_M: Final = 0.12
 """Half of the thickness in which the ground lies, once it is roughly known."""
 ROUGH_M: Final = 0.5
 MAX_SLOPE: Final = 0.2
+MIN_SPREAD_M: Final = 2.0
+"""One sd of where the ground was seen, across: along the foot of a wall any plane fits."""
 
 
 def road_below(points_vehicle_m: F64, lidar_vehicle_m: F64) -> float | None:
@@ -36,7 +38,8 @@ def road_below(points_vehicle_m: F64, lidar_vehicle_m: F64) -> float | None:
         if near.sum() < MIN_CELLS:
             return None
         plane = np.linalg.lstsq(A[near], low[near, 2], rcond=None)[0]
-    if np.hypot(plane[0], plane[1]) > MAX_SLOPE or near.sum() < len(low) / 3:
+    spread_m = np.sqrt(np.linalg.eigvalsh(np.cov(low[near, :2].T))[0])
+    if np.hypot(plane[0], plane[1]) > MAX_SLOPE or near.sum() < len(low) / 3 or spread_m < MIN_SPREAD_M:
         return None
     return float(plane[2] + lidar_vehicle_m[2])
 
