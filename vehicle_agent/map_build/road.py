@@ -53,5 +53,7 @@ def _lowest(points_m: F64) -> F64:
     key = cells[:, 0] * 128 + cells[:, 1]
     order = np.lexsort((points[:, 2], key))
     key, points = key[order], points[order]
-    second = np.flatnonzero((np.r_[0, key[:-1]] == key) & (np.r_[0, 0, key[:-2]] != key)) if len(key) > 1 else []
-    return np.asarray(points[second])
+    if len(key) < 2:
+        return np.empty((0, 3))
+    before, two_before = np.r_[-1, key[:-1]], np.r_[-1, -1, key[:-2]]
+    return np.asarray(points[(before == key) & (two_before != key)])

@@ -5,7 +5,7 @@ from pathlib import Path
 
 import numpy as np
 
-from fleet_sim.drives import DriveConfig, DriveSimulation, SensorErrors
+from fleet_sim.drives import DriveConfig, DriveSimulation
 from fleet_sim.world import World
 from gnd_map.motion import Trajectory
 from gnd_map.se3 import T_inverse, exp_so3
@@ -64,6 +64,3 @@ def relative_errors(tracks: list[Trajectory], truths: list[Trajectory]) -> np.nd
     a, b = found - found.mean(axis=0), true - true.mean(axis=0)
     yaw = np.arctan2((a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0]).sum(), (a[:, :2] * b[:, :2]).sum())
     return np.hypot(*((a @ exp_so3([0.0, 0.0, yaw]).T - b)[:, :2]).T)
-
-
-GNSS_2M = SensorErrors(gnss_m=2.5)
