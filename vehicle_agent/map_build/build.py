@@ -27,8 +27,8 @@ from vehicle_agent.map_build.refine_poses import PosesReport, RefineMode, refine
 from vehicle_agent.map_build.survey import DriveSurvey, Progress, look_over
 from vehicle_agent.segment import MotionSegmenter, SegmentedScan, SegmentParameters
 
-MOVERS: Final = SegmentParameters(future_s=4.0, range_max_m=80.0)
-"""A map can wait: more scans judge each point than on the vehicle, and as far as points are taken."""
+MOVERS: Final = SegmentParameters(range_max_m=80.0)
+"""As on the vehicle, but as far as points are taken."""
 _BODY_REACH_M: Final = float(np.linalg.norm(np.maximum(np.abs(LOW_M), np.abs(HIGH_M))))
 
 
