@@ -12,12 +12,12 @@ from deploy.errors import PageError
 from deploy.map_page_pictures import height_picture, map_picture, thickness_picture
 from deploy.traffic_page_style import STYLE
 from vehicle_agent.map_build.build import BuiltMap
-from vehicle_agent.map_build.quality import MOST_DOUBLED, MOST_THICK_M, Quality
+from vehicle_agent.map_build.quality import MOST_DOUBLED_ROAD, MOST_DOUBLED_WALLS, MOST_THICK_M, Quality
 from vehicle_agent.map_build.refine_poses import PassDrift
 from vehicle_agent.map_build.result import summary
 
 _MORE_STYLE: Final = """
-figure img{display:block;width:100%;height:auto;border-radius:.5rem;background:#fff}
+figure img{display:block;width:100%;max-width:52rem;height:auto;border-radius:.5rem;background:#fff}
 ul.warn{margin:.5rem 0;padding:0;list-style:none}
 ul.warn li{border-left:.3rem solid #d1433f;background:var(--card);padding:.5rem .8rem;margin:.4rem 0;
 border-radius:.3rem}
@@ -27,8 +27,9 @@ td.t{white-space:normal}
 _HEAD: Final = """<meta charset="utf-8"><meta name="viewport" content="width=device-width, initial-scale=1">
 <meta name="color-scheme" content="light dark">"""
 _DOUBLE: Final = f"""<p>A surface is doubled when two thin layers of points lie side by side, 0.2 to 1 m apart, over
-most of a voxel: what two passes leave whose poses disagree. Some are real (a sign before a wall, a pane before a
-curtain); more than {MOST_DOUBLED:.0f} of 1,000 are not. Layers nearer than 0.2 m show as thick planes: a median above
+most of a voxel: what two passes leave whose poses disagree. Some are real (a sign before a wall, a bonnet
+over the road); more than {MOST_DOUBLED_WALLS:.0f} of 1,000 walls or {MOST_DOUBLED_ROAD:.0f} of 1,000 pieces of road are
+not. Layers nearer than 0.2 m show as thick planes: a median above
 {100 * MOST_THICK_M:.0f} cm is out of bounds.</p>"""
 
 
