@@ -42,7 +42,7 @@ def drifted(poses: Trajectory, drift: Drift, seed: int) -> Trajectory:
     return Trajectory(poses.t_ns, np.stack(found))
 
 
-def drift_drive(world: World, config: DriveConfig, path: Path, drift: Drift, gnss: bool = True) -> Trajectory:
+def drift_drive(world: World, config: DriveConfig, path: Path, drift: Drift) -> Trajectory:
     """Write a drive with drifting reference poses; give the true ones."""
     simulation = DriveSimulation(world, config)
     t_s = np.arange(-0.1, simulation.scans / config.model.rate_hz + 0.3, 0.1)
@@ -52,7 +52,7 @@ def drift_drive(world: World, config: DriveConfig, path: Path, drift: Drift, gns
         for t, T in zip(wrong.t_ns.tolist(), wrong.T_dst_vehicle, strict=True):
             writer.add(ReferencePose(t, T))
         for item in simulation.items():
-            if not isinstance(item, ReferencePose) and (gnss or type(item).__name__ != "GnssFix"):
+            if not isinstance(item, ReferencePose):
                 writer.add(item)
     return truth
 
@@ -63,4 +63,4 @@ def relative_errors(tracks: list[Trajectory], truths: list[Trajectory]) -> np.nd
     true = np.concatenate([truth.T_dst_vehicle[:, :3, 3] for truth in truths])
     a, b = found - found.mean(axis=0), true - true.mean(axis=0)
     yaw = np.arctan2((a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0]).sum(), (a[:, :2] * b[:, :2]).sum())
-    return np.hypot(*((a @ exp_so3([0.0, 0.0, yaw]).T - b)[:, :2]).T)
+    return np.asarray(np.linalg.norm((a @ exp_so3([0.0, 0.0, yaw]).T - b)[:, :2], axis=1))

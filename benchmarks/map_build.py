@@ -7,6 +7,7 @@ for the first pass alone, for both as recorded, and for both refined.
 import time
 from pathlib import Path
 from tempfile import TemporaryDirectory
+from typing import Final
 
 import numpy as np
 
@@ -14,6 +15,7 @@ from benchmarks.drifting_drives import Drift, drift_drive
 from benchmarks.figures import Figure
 from fleet_sim.drives import DriveConfig
 from fleet_sim.street import StreetOptions, street
+from fleet_sim.trajectory import Direction
 from gnd_map.arrays import F64
 from gnd_map.motion import Trajectory
 from tile_store.sqlite_store import SqliteStore
@@ -23,7 +25,10 @@ from vehicle_agent.map_build.refine_poses import RefineMode
 
 COMMAND = "python -m benchmarks map-build"
 SEED, LENGTH_M = 1101, 300.0
-PASSES = ((1, 11, Drift()), (-1, 12, Drift(start_m=0.8, start_deg=0.5)))
+PASSES: Final[tuple[tuple[Direction, int, Drift], ...]] = (
+    (1, 11, Drift()),
+    (-1, 12, Drift(start_m=0.8, start_deg=0.5)),
+)
 
 
 def run() -> list[Figure]:

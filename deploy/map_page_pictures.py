@@ -22,7 +22,7 @@ def map_picture(built: BuiltMap, quality: Quality) -> bytes:
     """The planes of the map from above by their thickness, the ways of the drives, doubled surfaces in red."""
     figure, axes = _figure(9.0, 6.0, "north, m")
     planes, sd = quality.plane_p_map_m, quality.plane_sd_m
-    shown = np.linspace(0, len(planes) - 1, min(len(planes), _MOST_DOTS)).astype(np.int64) if len(planes) else []
+    shown = np.linspace(0, max(len(planes) - 1, 0), min(len(planes), _MOST_DOTS)).astype(np.int64)
     dots = axes.scatter(
         planes[shown, 0], planes[shown, 1], c=100 * sd[shown], s=3, cmap="cividis_r", vmin=0, vmax=100 * _THICKEST_M,
         linewidths=0, rasterized=True,

@@ -79,7 +79,7 @@ def find_double_layers(g: I32, bits: npt.NDArray[np.uint64], axes: tuple[int, ..
         surfaces |= found > 0
         apart = np.maximum(apart, np.where(found > 1, found - 1, 0))
     doubled = apart > 0
-    return DoubleLayers(int(surfaces.sum()), g[doubled], apart[doubled] * CELL_M)
+    return DoubleLayers(int(surfaces.sum()), g[doubled], apart[doubled].astype(np.float64) * CELL_M)
 
 
 def _keys(g: npt.NDArray[np.integer]) -> I64:

@@ -60,7 +60,8 @@ def solve(drive: I64, T: F64, loops: Sequence[Loop], fixes: Fixes) -> Solved:
         loops: between them.
         fixes: of them.
     """
-    known, doubted, values = _chains(drive, T, held=not len(fixes.anchor)), [], gtsam.Values()
+    known, values = _chains(drive, T, held=not len(fixes.anchor)), gtsam.Values()
+    doubted: list[gtsam.NonlinearFactor] = []
     for n, pose in enumerate(T):
         values.insert(n, gtsam.Pose3(pose))
     for loop in loops:
