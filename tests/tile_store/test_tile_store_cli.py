@@ -11,11 +11,11 @@ import pytest
 from click.testing import CliRunner
 from store_helpers import EAGER, EAST, FAR, TILE, merge_once, report, report_id, tile_of_voxels
 
+from deploy.map_cli import map_group
 from gnd_map.errors import GndError
 from gnd_map.geodesy import LocalFrame
 from schemas.drive import DriveHeader, ReferencePose, Scan
 from schemas.drive_mcap import DriveWriter
-from tile_store.cli import map_group
 from tile_store.sqlite_store import SqliteStore
 
 T0_NS = 1_700_000_000_000_000_000
