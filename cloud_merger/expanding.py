@@ -116,6 +116,7 @@ def _change(packed: PackedReport, base: Tile, sha: bytes, flags: Flags, observed
         evidence=np.zeros((n, 4), np.int32),
         pose_sigma_m=packed.pose_sigma_m,
         pose_sigma_rad=packed.pose_sigma_rad,
+        doubt=packed.doubt_of(base.tile_id.morton % limits.MAX_TILES_OF_DISTRICT),
     )
 
 

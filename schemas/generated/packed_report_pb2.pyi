@@ -3,8 +3,11 @@
 isort:skip_file
 """
 
+from collections import abc as _abc
+from . import doubt_pb2 as _doubt_pb2
 from google.protobuf import descriptor as _descriptor
 from google.protobuf import message as _message
+from google.protobuf.internal import containers as _containers
 import builtins as _builtins
 import sys
 import typing as _typing
@@ -37,6 +40,8 @@ class PackedReport(_message.Message):
     TRACK_FIELD_NUMBER: _builtins.int
     POSE_SIGMA_TENTH_MM_FIELD_NUMBER: _builtins.int
     POSE_SIGMA_10URAD_FIELD_NUMBER: _builtins.int
+    DOUBTFUL_FIELD_NUMBER: _builtins.int
+    DOUBTS_FIELD_NUMBER: _builtins.int
     report_id: _builtins.bytes
     """The report's ULID as 16 bytes."""
     vehicle: _builtins.str
@@ -69,6 +74,16 @@ class PackedReport(_message.Message):
     """Standard deviation of the refined attitude about its worst axis, the largest of the report's tiles.
     [10 microradians, rounded up]
     """
+    @_builtins.property
+    def doubtful(self) -> _containers.RepeatedScalarFieldContainer[_builtins.int]:
+        """Which of the tiles are doubtful: indices in the district, ascending, all among `tiles`. A tile of which something is
+        held back is reported whole only.
+        """
+
+    @_builtins.property
+    def doubts(self) -> _containers.RepeatedCompositeFieldContainer[_doubt_pb2.Doubt]:
+        """Why, one for each of `doubtful`."""
+
     def __init__(
         self,
         *,
@@ -84,10 +99,12 @@ class PackedReport(_message.Message):
         track: _builtins.bytes = ...,
         pose_sigma_tenth_mm: _builtins.int = ...,
         pose_sigma_10urad: _builtins.int = ...,
+        doubtful: _abc.Iterable[_builtins.int] | None = ...,
+        doubts: _abc.Iterable[_doubt_pb2.Doubt] | None = ...,
     ) -> None: ...
     _HasFieldArgType: _TypeAlias = _Never  # noqa: Y015
     def HasField(self, field_name: _HasFieldArgType) -> _builtins.bool: ...
-    _ClearFieldArgType: _TypeAlias = _typing.Literal["base_digest", b"base_digest", "first_ns", b"first_ns", "flags", b"flags", "length_ns", b"length_ns", "pose_sigma_10urad", b"pose_sigma_10urad", "pose_sigma_tenth_mm", b"pose_sigma_tenth_mm", "report_id", b"report_id", "sensor_model", b"sensor_model", "software", b"software", "tiles", b"tiles", "track", b"track", "vehicle", b"vehicle"]  # noqa: Y015
+    _ClearFieldArgType: _TypeAlias = _typing.Literal["base_digest", b"base_digest", "doubtful", b"doubtful", "doubts", b"doubts", "first_ns", b"first_ns", "flags", b"flags", "length_ns", b"length_ns", "pose_sigma_10urad", b"pose_sigma_10urad", "pose_sigma_tenth_mm", b"pose_sigma_tenth_mm", "report_id", b"report_id", "sensor_model", b"sensor_model", "software", b"software", "tiles", b"tiles", "track", b"track", "vehicle", b"vehicle"]  # noqa: Y015
     def ClearField(self, field_name: _ClearFieldArgType) -> None: ...
     def WhichOneof(self, oneof_group: _Never) -> None: ...
 

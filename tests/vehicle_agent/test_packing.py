@@ -15,6 +15,7 @@ from gnd_map.tile import Tile
 from gnd_map.tile_id import TileId
 from gnd_map.track import decode_track
 from schemas.changes import ChangeReport
+from schemas.doubt import Doubt, DoubtReason
 from schemas.packed import PackedReport, decode_upload, digest_of
 from vehicle_agent.config import ReportParameters
 from vehicle_agent.detect.detector import ChangeDetector
@@ -158,3 +159,31 @@ def test_a_class_that_contradicts_the_base_is_refused(report: ChangeReport, base
     empty = dict.fromkeys(bases, Gaussians.empty())
     with pytest.raises(GndError, match="are new but held, or changed but not held"):
         pack(report, empty, decode_track(report.district, packed.track))
+
+
+def test_doubts_travel_in_short_by_their_tiles(report: ChangeReport, bases: Bases, letter: Letter) -> None:
+    packed, doubt = decode_upload(letter.packed), Doubt(DoubtReason.IMPLAUSIBLE_SHARE, changed_permille=700)
+    assert isinstance(packed, PackedReport)
+    track = decode_track(report.district, packed.track)
+    last = dataclasses.replace(report.tiles[-1], doubt=doubt)
+    found = pack(dataclasses.replace(report, tiles=(*report.tiles[:-1], last)), bases, track)
+    assert found == dataclasses.replace(packed, doubts=((packed.tiles[-1][0], doubt),))
+    assert PackedReport.decode(found.encode()) == found
+
+
+def test_changes_held_back_do_not_travel_in_short(report: ChangeReport, bases: Bases, letter: Letter) -> None:
+    """The cloud would take what the track reaches for observed and unchanged."""
+    packed = decode_upload(letter.packed)
+    assert isinstance(packed, PackedReport)
+    first = report.tiles[0]
+    silent = dataclasses.replace(
+        first,
+        observed=np.empty(0, np.int32),
+        changed=Gaussians.empty(),
+        change_class=np.empty(0, np.uint8),
+        evidence=np.empty((0, 4), np.int32),
+        doubt=Doubt(DoubtReason.EXPLAINED_BY_SHIFT, withheld=5),
+    )
+    with pytest.raises(PackingError, match="holds changes back"):
+        tiles = (silent, *report.tiles[1:])
+        pack(dataclasses.replace(report, tiles=tiles), bases, decode_track(report.district, packed.track))
