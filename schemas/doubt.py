@@ -47,7 +47,7 @@ class Doubt:
     explained_permille: int = 0
     """Of the changed voxels those whose measurements fit the base after the shift."""
     changed_permille: int = 0
-    """Of the observed voxels those changed, before anything was held back."""
+    """Of the voxels that hold something in the base or now those changed."""
     uncertain_permille: int = 0
     """Of the scans around the tile those whose poses were not good enough to speak about the world."""
     forward_mm: int = 0

@@ -41,7 +41,7 @@ class Doubt(_message.Message):
     explained_permille: _builtins.int
     """Share of the changed voxels whose measurements fit the base after the shift. [0 .. 1000]"""
     changed_permille: _builtins.int
-    """Share of the observed voxels that are changed, before anything was held back. [0 .. 1000]"""
+    """Share of changed voxels among those that hold something in the base or now. [0 .. 1000]"""
     uncertain_permille: _builtins.int
     """Share of the scans around the tile whose poses were not good enough to speak about the world. [0 .. 1000]"""
     forward_mm: _builtins.int

@@ -184,6 +184,6 @@ def test_changes_held_back_do_not_travel_in_short(report: ChangeReport, bases: B
         evidence=np.empty((0, 4), np.int32),
         doubt=Doubt(DoubtReason.EXPLAINED_BY_SHIFT, withheld=5),
     )
+    said = dataclasses.replace(report, tiles=(silent, *report.tiles[1:]))
     with pytest.raises(PackingError, match="holds changes back"):
-        tiles = (silent, *report.tiles[1:])
-        pack(dataclasses.replace(report, tiles=tiles), bases, decode_track(report.district, packed.track))
+        pack(said, bases, decode_track(report.district, packed.track))
