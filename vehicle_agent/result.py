@@ -70,10 +70,12 @@ class HealthTimeline:
 
     changes: list[tuple[int, str]] = field(default_factory=list)
 
-    def note(self, t_ns: int, health: str) -> None:
-        """Keep a change."""
-        if not self.changes or self.changes[-1][1] != health:
+    def note(self, t_ns: int, health: str) -> bool:
+        """Keep a change; whether it is one."""
+        changed = not self.changes or self.changes[-1][1] != health
+        if changed:
             self.changes.append((t_ns, health))
+        return changed
 
     def as_json(self) -> list[dict[str, Any]]:
         """One object a change."""

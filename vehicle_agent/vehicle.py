@@ -36,7 +36,10 @@ from vehicle_agent.updates import Updates
 if TYPE_CHECKING:
     from vehicle_agent.features.feature_work import FeatureWork
 
-COUNTS = ("scans_used", "scans_uncertain", "points", "moving_points", "rays", "changed_voxels")
+COUNTS = (
+    "scans_used", "scans_uncertain", "scans_disagreeing", "scans_shifted", "scans_taken_back", "points",
+    "moving_points", "rays", "changed_voxels", "tiles_doubtful", "tiles_held_back", "changes_held_back",
+)  # fmt: skip
 """What the reporter counts, as `result.json` names it."""
 
 _log = logging.getLogger(__name__)
@@ -88,7 +91,8 @@ class Vehicle:
     def _note(self, item: DriveItem) -> None:
         """Keep the books on place, health and way after an item was worked on."""
         self.place.take(item, self.localiser.online)
-        self.timeline.note(item.t_ns, self.place.health)
+        if self.timeline.note(item.t_ns, self.place.health) and self.place.health == "lost":
+            self.reporter.take_back(item.t_ns)  # since when it was wrong is not known
         self.link.ledger.set_position(self.place.odometer_m, item.t_ns)
 
     def download(self) -> None:
@@ -196,6 +200,7 @@ class Vehicle:
             "scans_refined": len(self.evaluation.estimates),
             **{name: counts[name] for name in COUNTS},
             "classes": dict(self.reporter.classes),
+            "doubts": self.reporter.account(),
         }
 
     def _link_counts(self) -> dict[str, Any]:
