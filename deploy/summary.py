@@ -41,10 +41,18 @@ def write_summary(
         summary["f1"] = _evaluate(folder, prepared, store, histories)
         summary["features"] = _score_features(config, prepared, store)
     summary["prepare_s"] = round(prepare_s, 1)
+    summary["doubtful"] = doubtful_vehicles(results)
     summary["localisation_p95"] = results.localisation_p95()
     summary["traffic"] = results.traffic() | {"by_kind": account_traffic(folder)}
     _write(folder.summary, summary)
     return summary
+
+
+def doubtful_vehicles(results: FleetResults) -> dict[str, Any]:
+    """What each vehicle took back, held back or doubted, by its name; nothing of those that did not."""
+    named = ("scans_shifted", "scans_taken_back", "tiles_doubtful", "tiles_held_back", "changes_held_back")
+    found = {r["vehicle"]: {name: r.get(name, 0) for name in named} | r.get("doubts", {}) for r in results.results}
+    return {vehicle: counts for vehicle, counts in found.items() if any(counts[name] for name in named)}
 
 
 def _counts(
@@ -136,5 +144,12 @@ def summary_lines(summary: dict[str, Any]) -> list[str]:
             f"map against the truth, macro F1: {f1['before']:.1f} % before, {f1['single']:.1f} % by a single drive, "
             f"{f1['after']:.1f} % after"
         )
+    lines += [
+        f"{vehicle} doubts itself: {d['scans_shifted'] + d['scans_taken_back']} scans taken back, "
+        f"{d['tiles_held_back']} tiles with {d['changes_held_back']} changes held back, {d['tiles_doubtful']} doubtful "
+        f"({', '.join(f'{n} {reason}' for reason, n in d['tiles'].items()) or 'none'}); largest shift "
+        f"{d['largest_shift_m'] * 100:.0f} cm, {d['largest_turn_deg']:.2f} degrees"
+        for vehicle, d in summary.get("doubtful", {}).items()
+    ]
     lines += feature_lines(summary.get("features", {}))
     return lines

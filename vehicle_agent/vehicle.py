@@ -91,7 +91,7 @@ class Vehicle:
     def _note(self, item: DriveItem) -> None:
         """Keep the books on place, health and way after an item was worked on."""
         self.place.take(item, self.localiser.online)
-        if self.timeline.note(item.t_ns, self.place.health) and self.place.health == "lost":
+        if self.timeline.note(item.t_ns, self.place.health):
             self.reporter.take_back(item.t_ns)  # since when it was wrong is not known
         self.link.ledger.set_position(self.place.odometer_m, item.t_ns)
 

@@ -72,7 +72,7 @@ class TileDoubts:
             if costs is None:
                 continue
             account.withheld |= set(voxel[(morton == code) & (costs > 0.5)].tolist())
-            if account.shift is None or tried.shift.size_m(10.0) > account.shift.size_m(10.0):
+            if account.shift is None or tried.shift.size_m > account.shift.size_m:
                 account.shift, account.pose = tried.shift, tried.pose
 
     def poor(self, points_map_m: F64, what: str) -> None:

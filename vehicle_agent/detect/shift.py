@@ -14,8 +14,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gnd_map.arrays import F64
-from gnd_map.se3 import T_inverse, log_so3
+from gnd_map.se3 import T_from_R_t, T_inverse, exp_so3, log_so3
 from vehicle_agent.detect.fit_kernel import point_costs
+from vehicle_agent.detect.uncertainty import PoseUncertainty
 from vehicle_agent.errors import RegistrationError, VehicleError
 from vehicle_agent.localise.match_map import MatchMap
 from vehicle_agent.localise.parameters import RegistrationParameters
@@ -35,6 +36,8 @@ _MANY_MISFITS: Final = 0.05
 """Share of voxels that do not fit from which on the search begins around the pose, too."""
 _AROUND_M: Final = ((0.6, 0.0), (-0.6, 0.0), (0.0, 0.6), (0.0, -0.6))
 """Forward and left of the pose."""
+LEVER_M: Final = 25.0
+"""Distance at which turns are measured: 0.2 degrees move a point there by 9 cm."""
 _REGISTRATION: Final = RegistrationParameters(wheel_sigma_m=0.0)  # wheels are no witness: a mount's height may be wrong
 
 
@@ -47,12 +50,11 @@ class ShiftParameters:
     """When a shift counts as one.
 
     Attributes:
-        least_m: smaller shifts are within what poses may be off by; so are turns that move a point at `lever_m` by
+        least_m: smaller shifts are within what poses may be off by; so are turns that move a point at `LEVER_M` by
             less. At 10 cm detection begins to err (docs/decisions/0082-the-gate-on-the-vehicle.md).
         sigmas: poses that claim to be less certain may be off by so many of their sigmas ...
         loosest_m: ... but never by more than this.
         most_m: farther away is another place, not the error of a pose.
-        lever_m: distance at which turns are measured.
         z: how sure it must be that the map fits better after the shift, in sigmas of the paired test.
     """
 
@@ -60,17 +62,17 @@ class ShiftParameters:
     sigmas: float = 3.0
     loosest_m: float = 0.15
     most_m: float = 2.5
-    lever_m: float = 10.0
-    z: float = 2.5
+    z: float = 3.0
 
     def __post_init__(self) -> None:
         if not 0 < self.least_m <= self.loosest_m < self.most_m:
             raise ShiftError(f"0 < least_m <= loosest_m < most_m is required, got {self}")
-        if min(self.lever_m, self.z) <= 0 or self.sigmas < 0:
-            raise ShiftError(f"lever_m and z > 0 and sigmas >= 0 are required, got {self}")
+        if self.z <= 0 or self.sigmas < 0:
+            raise ShiftError(f"z > 0 and sigmas >= 0 are required, got {self}")
 
-    def limit_m(self, sigma_m: float) -> float:
-        """How far a pose with this sigma may be off."""
+    def limit_m(self, pose: PoseUncertainty) -> float:
+        """How far a pose that is known so well may be off."""
+        sigma_m = max(pose.sigma_m, LEVER_M * pose.sigma_rad)
         return float(np.clip(self.sigmas * sigma_m, self.least_m, self.loosest_m))
 
 
@@ -106,19 +108,23 @@ class Shift:
         """(3,) roll, pitch, yaw."""
         return np.asarray(log_so3(self.T[:3, :3]))
 
-    def size_m(self, lever_m: float) -> float:
-        """The larger one of the shift and of what the turn moves at `lever_m`."""
-        return float(max(np.linalg.norm(self.shift_m), lever_m * np.linalg.norm(self.turn_rad)))
+    @property
+    def size_m(self) -> float:
+        """The larger one of the shift and of what the turn moves at `LEVER_M`."""
+        return float(max(np.linalg.norm(self.shift_m), LEVER_M * np.linalg.norm(self.turn_rad)))
 
     @property
     def explained_share(self) -> float:
         """Of what does not fit, less what the shift spoils, 0 ... 1."""
         return max(self.explained - self.spoiled, 0) / max(self.misfits, 1)
 
-    def is_pose_error(self, parameters: ShiftParameters, sigma_m: float = 0.0) -> bool:
-        """Whether the pose is off by more than a pose of `sigma_m` may be."""
-        p = parameters
-        return p.limit_m(sigma_m) <= self.size_m(p.lever_m) <= p.most_m and self.z >= p.z
+    def is_far(self, parameters: ShiftParameters, pose: PoseUncertainty) -> bool:
+        """Whether the best pose nearby is farther off than a pose known so well may be, surely better or not."""
+        return parameters.limit_m(pose) <= self.size_m <= parameters.most_m
+
+    def is_pose_error(self, parameters: ShiftParameters, pose: PoseUncertainty) -> bool:
+        """Whether the pose is off by more than a pose known so well may be, and surely so."""
+        return self.is_far(parameters, pose) and self.z >= parameters.z
 
 
 def no_shift(voxels: int = 0, misfits: int = 0, *, checked: bool = False) -> Shift:
@@ -126,7 +132,7 @@ def no_shift(voxels: int = 0, misfits: int = 0, *, checked: bool = False) -> Shi
     return Shift(np.eye(4), voxels, misfits, 0, 0, 0.0, checked)
 
 
-def find_shift(points_vehicle_m: F64, T_map_vehicle: F64, match_map: MatchMap) -> Shift:
+def find_shift(points_vehicle_m: F64, T_map_vehicle: F64, match_map: MatchMap, *, planar: bool = False) -> Shift:
     """The small shift under which points fit the map best, and how many voxels it explains and spoils.
 
     Args:
@@ -134,6 +140,7 @@ def find_shift(points_vehicle_m: F64, T_map_vehicle: F64, match_map: MatchMap) -
             stretch (those of other moments moved there as the poses say).
         T_map_vehicle: (4, 4) the pose that is asked about.
         match_map: the map there.
+        planar: look for shifts in place and heading only: what a few layers see does not tell height and tilt.
 
     Returns:
         The shift; the identity where nothing nearby fits better, or too little of the map is known.
@@ -150,12 +157,20 @@ def find_shift(points_vehicle_m: F64, T_map_vehicle: F64, match_map: MatchMap) -
     best = no_shift(voxels.n, misfits, checked=any(_constrains(one) for one in found))
     least = float(was.sum())
     for one in found:
-        after = costs_at(points, one.T_map_vehicle, match_map)
+        T = T_inverse(T_map_vehicle) @ one.T_map_vehicle
+        T = _flat(T) if planar else T
+        after = costs_at(points, T_map_vehicle @ T, match_map)
         now = voxels.mean(np.where(after < 0.0, before, after))
         if float(now.sum()) < least:
             least = float(now.sum())
-            best = _compared(T_inverse(T_map_vehicle) @ one.T_map_vehicle, was, now, checked=best.checked)
+            best = _compared(T, was, now, checked=best.checked)
     return best
+
+
+def _flat(T: F64) -> F64:
+    """Only forward, left and heading of a shift."""
+    turn = np.array([0.0, 0.0, np.arctan2(T[1, 0], T[0, 0])])
+    return T_from_R_t(exp_so3(turn), np.array([T[0, 3], T[1, 3], 0.0]))
 
 
 def costs_at(points: F64, T: F64, m: MatchMap) -> F64:

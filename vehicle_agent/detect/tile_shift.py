@@ -46,8 +46,8 @@ def pose_error_of_tile(found: Classification, match_map: MatchMapCache, T_map_ve
     T[:3, 3] = points.reshape(-1, 3).mean(axis=0)  # a turn about the tile, not about a vehicle far away
     near = match_map.near(T[:3, 3])
     points_vehicle_m = transform(T_inverse(T), points.reshape(-1, 3))
-    shift = find_shift(points_vehicle_m, T, near)
-    if not shift.checked or not shift.is_pose_error(_PARAMETERS, found.evidence.pose.sigma_m):
+    shift = find_shift(points_vehicle_m, T, near, planar=True)
+    if not shift.checked or not shift.is_pose_error(_PARAMETERS, found.evidence.pose):
         return None
     was, now = (costs_at(points_vehicle_m, pose, near).reshape(len(rows), -1).mean(axis=1) for pose in (T, T @ shift.T))
     changed = np.isin(found.change_class[rows], (ChangeClass.NEW, ChangeClass.MODIFIED))

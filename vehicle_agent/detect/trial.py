@@ -18,6 +18,7 @@ from gnd_map.se3 import T_inverse, transform
 from vehicle_agent.detect.shift import Shift, ShiftParameters, find_shift
 from vehicle_agent.detect.uncertainty import PoseUncertainty
 from vehicle_agent.localise.estimates import PoseEstimate, RefinedScan
+from vehicle_agent.localise.level import sees_tilt
 from vehicle_agent.localise.match_map import MatchMapCache
 from vehicle_agent.localise.parameters import SamplingParameters
 from vehicle_agent.localise.sampling import sample_scan
@@ -164,11 +165,16 @@ class Trial:
         n = max(_LEAST_POINTS_OF_SCAN, _POINTS_OF_SEGMENT // len(scans))
         points = np.concatenate([some_of(held.points[~held.moving], held.centre_m, n) for held in scans])
         T = scans[len(scans) // 2].estimate.T_map_vehicle
-        shift = find_shift(transform(T_inverse(T), points), T, self._map.near(T[:3, 3]))
+        seen = scans[0].points @ T[:3, :3].astype(np.float32)  # along the vehicle's axes
+        match_map = self._map.near(T[:3, 3])
+        shift = find_shift(transform(T_inverse(T), points), T, match_map, planar=not sees_tilt(seen))
         poses = [PoseUncertainty.of(held.estimate) for held in scans]
         worst = PoseUncertainty(max(p.sigma_m for p in poses), max(p.sigma_rad for p in poses))
-        shifted = shift.is_pose_error(self._parameters, worst.sigma_m)
-        verdict: Verdict = "shifted" if shifted else "good" if shift.checked else "unchecked"
+        verdict: Verdict = "good"
+        if shift.is_pose_error(self._parameters, worst):
+            verdict = "shifted"
+        elif not shift.checked or shift.is_far(self._parameters, worst):
+            verdict = "unchecked"
         return Tried(shift, verdict, points, T, len(scans), worst)
 
     @staticmethod
