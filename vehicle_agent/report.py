@@ -216,8 +216,8 @@ class Reporter:
         if not tiles:
             return
         for tile_id, evidence in self._detector.finish(tiles).items():
-            found, account = classify(evidence, self._detector.parameters), self._doubts.take(tile_id)
-            self._look_at_tile(found, account)
+            account = self._doubts.take(tile_id)
+            found = self._without_pose_error(classify(evidence, self._detector.parameters), account)
             if len(account.withheld) >= LEAST_WITHHELD and (account.explained or not found.observed.any()):
                 self._hold_back(found, account, odometer_m)
                 continue
@@ -226,15 +226,22 @@ class Reporter:
             if found.observed.any():
                 self._take(replace(self._said(found), doubt=doubt_of(found, account)), evidence.base, odometer_m)
 
-    def _look_at_tile(self, found: Classification, account: Account) -> None:
-        """Whether a shift explains what has changed in a tile, although each stretch of the drive passed."""
+    def _without_pose_error(self, found: Classification, account: Account) -> Classification:
+        """The classes without what a shift of the whole tile explains, although each stretch of the drive passed."""
         if not self._parameters.check_poses or self._T_map_vehicle is None:
-            return
-        shift = pose_error_of_tile(found, self._match_map, self._T_map_vehicle)
-        if shift is not None:
-            account.shift, account.explained, account.pose = shift, True, found.evidence.pose
+            return found
+        error = pose_error_of_tile(found, self._match_map, self._T_map_vehicle)
+        if error is None:
+            return found
+        self.largest_shift.see(error.shift)
+        account.shift, account.explained, account.pose = error.shift, error.most, found.evidence.pose
+        if error.most:
             account.withheld |= set(found.evidence.voxel_id[found.changed].tolist())
-            self.largest_shift.see(shift)
+            return found
+        self.counts["changes_held_back"] += int(error.explained.sum())
+        account.off = True
+        abstains = np.where(error.explained, ChangeClass.UNMEASURED, found.change_class).astype(np.uint8)
+        return Classification(found.evidence, abstains)
 
     def _hold_back(self, found: Classification, account: Account, odometer_m: float) -> None:
         """Say of a tile only that a pose error explains it; where there is no map, nothing could be."""

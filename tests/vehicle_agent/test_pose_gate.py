@@ -141,3 +141,16 @@ def test_without_the_gate_the_same_wrong_pose_would_be_told(tmp_path: Path, yard
         reporter.add_scan(one)
     reporter.report_all(20.0)
     assert reporter.counts["changed_voxels"] > 100
+
+
+def test_a_small_error_that_all_scans_of_a_tile_share_is_found_in_what_adds_up(tmp_path: Path, yard: LocalMap) -> None:
+    """The vehicle says that it knows its place to 5 cm only, so no single stretch is wrong; what is real is told."""
+    error = shift(0.0, 0.13)
+    reporter, told, _ = driven(tmp_path, yard, scans(error, new=True, n=30, sigma_m=0.05))
+    _, honest, _ = driven(tmp_path / "honest", yard, scans(None, new=True, n=30))
+    assert reporter.counts["scans_shifted"] == 0
+    assert reporter.counts["changes_held_back"] >= 5
+    right = sum(len(change.changed) for change in honest)
+    assert sum(len(change.changed) for change in told) <= 1.3 * right
+    assert reporter.account()["largest_shift_m"] == pytest.approx(0.13, abs=0.02)
+    assert any(change.doubt is not None for change in told)

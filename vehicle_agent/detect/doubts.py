@@ -45,7 +45,9 @@ class Account:
     """Voxels that seemed to have changed in scans of a wrong pose."""
     pose: PoseUncertainty = field(default_factory=PoseUncertainty)
     explained: bool = False
-    """The tile as a whole is explained by `shift`."""
+    """Most of what changed in the tile is explained by `shift`."""
+    off: bool = False
+    """Some of it is."""
 
     def add(self, what: str, scans: int) -> None:
         """Count scans under what became of them."""
@@ -114,7 +116,7 @@ def doubt_of(found: Classification, account: Account) -> Doubt | None:
         return None
     if changed_share > IMPLAUSIBLE_SHARE:
         reasons |= DoubtReason.IMPLAUSIBLE_SHARE
-    if account.share("uncertain", "shifted") >= BAD_SHARE:
+    if account.off or account.share("uncertain", "shifted") >= BAD_SHARE:
         reasons |= DoubtReason.HEALTH_NOT_GOOD
     if account.share("disagree") >= BAD_SHARE:
         reasons |= DoubtReason.ESTIMATES_DISAGREE
