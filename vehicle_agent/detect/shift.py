@@ -175,7 +175,7 @@ def _flat(T: F64) -> F64:
 
 def costs_at(points: F64, T: F64, m: MatchMap) -> F64:
     """(N,) robust cost of each point (N, 3) at the pose T (4, 4) of its frame; below 0 where the map is not known."""
-    cost = np.empty(len(points))
+    cost, points = np.empty(len(points)), np.ascontiguousarray(points, np.float64)
     R, t = np.ascontiguousarray(T[:3, :3]), np.ascontiguousarray(T[:3, 3])
     point_costs(points, R, t, m.index, m.A, m.b, m.mean_m, m.information, _SCALE2, cost)
     return cost
