@@ -65,12 +65,20 @@ class Report:
         change: what it says.
         weight: of its votes, see `MergeParameters.report_of`.
         pose_m2: variance of what it measured by its poses, see `MergeParameters.pose_m2_of`.
+        vehicle: who made it; the merge does not look at it, confirmation does.
+        first_ns: time of the first scan that it rests on, UTC.
+        last_ns: time of the last.
+        is_doubtful: the vehicle does not fully believe it; nor does the merge look at this.
     """
 
     report_id: str
     change: TileChange
     weight: float = 1.0
     pose_m2: float = 0.0
+    vehicle: str = ""
+    first_ns: int = 0
+    last_ns: int = 0
+    is_doubtful: bool = False
 
 
 @dataclass(frozen=True, slots=True)

@@ -1,14 +1,17 @@
 """What lies in the store, as the merge reads it: the statements of reports, and tiles by version; both remembered."""
 
 from collections import OrderedDict
+from dataclasses import replace
 from functools import lru_cache
 from threading import Lock
 from typing import Final
 
+from cloud_merger.parameters import MergeParameters
+from cloud_merger.statements import Report
 from gnd_map.gaussian import Gaussians
 from gnd_map.tile import Tile
 from gnd_map.tile_id import TileId
-from schemas.changes import ChangeReport, TileChange
+from schemas.changes import ChangeReport
 from tile_store.store import Store
 from tile_store.values import StoredTile
 
@@ -17,15 +20,25 @@ REMEMBERED_TILES: Final = 512  # some 120 kB each
 
 
 @lru_cache(maxsize=REMEMBERED_REPORTS)
-def said(body: bytes) -> tuple[str, TileChange]:
-    """Sensor model and the one tile of a stored report; remembered: each merge of a tile reads all reports again.
+def said(body: bytes) -> ChangeReport:
+    """A stored report, which has one tile; remembered: each merge of a tile reads all reports again.
 
     Raises:
         SchemaError: it can no longer be read.
     """
-    report = ChangeReport.decode(body)
+    return ChangeReport.decode(body)
+
+
+def report_of(body: bytes, parameters: MergeParameters) -> Report:
+    """The same as the merge takes it.
+
+    Raises:
+        SchemaError: it can no longer be read.
+    """
+    report = said(body)
     (change,) = report.tiles
-    return report.sensor_model, change
+    weighed = parameters.report_of(report.report_id, report.sensor_model, change)
+    return replace(weighed, vehicle=report.vehicle, first_ns=report.first_ns, last_ns=report.last_ns)
 
 
 class Bases:

@@ -6,11 +6,12 @@ from collections.abc import Callable, Sequence
 from typing import TypeVar
 
 from cloud_merger.config import ShardConfig
+from cloud_merger.confirmation import GatedTile, gate
 from cloud_merger.features.kept import FeatureContents, said_of
 from cloud_merger.features.merge import merge_features
-from cloud_merger.merge import merge_tile
+from cloud_merger.merge import MergedTile, merge_tile
 from cloud_merger.statements import Report, statements_of
-from cloud_merger.stored import Bases, said
+from cloud_merger.stored import Bases, report_of
 from gnd_map.codec import Lattice, is_on, lattice_of, snap
 from gnd_map.features import FeatureTile, is_feature_layer
 from gnd_map.gaussian import Gaussians
@@ -59,8 +60,8 @@ class Worker:
         epoch = Gaussians.empty() if work.epoch is None else self._contents.decoded(work.epoch)
         reports = [report for row in work.reports if (report := self._report(row)) is not None]
         statements = statements_of(epoch, reports, self._bases(work), self._config.merge.mode)
-        merged = merge_tile(epoch, statements, self._config.merge)
-        gaussians = on_lattice(merged.gaussians, self._lattice(work, epoch))
+        gated = self._gated(epoch, merge_tile(epoch, statements, self._config.merge), reports)
+        gaussians = on_lattice(gated.merged.gaussians, self._lattice(work, epoch))
         tile = Tile(work.claim.tile, work.base_version + 1, gaussians)
         is_new = tile.sha != work.head.sha if work.head else len(gaussians) > 0
         return Publication(
@@ -68,8 +69,15 @@ class Worker:
             base_version=work.base_version,
             tile=tile if is_new else None,
             report_ids=_ids(work),
-            voxel_reports=merged.provenance,
+            voxel_reports=gated.merged.provenance,
+            waiting=gated.waiting,
         )
+
+    def _gated(self, epoch: Gaussians, merged: MergedTile, reports: Sequence[Report]) -> GatedTile:
+        """What may be published of a merge; the paper knows no such gate."""
+        if self._config.merge.mode == "paper":
+            return GatedTile(merged)
+        return gate(epoch, merged, reports, self._config.confirmation)
 
     def _of_features(self, work: TileWork) -> Publication:
         """The same of a tile of a feature layer."""
@@ -103,7 +111,7 @@ class Worker:
         return lattice_of(work.epoch.codec_id)
 
     def _report(self, row: ReportRow) -> Report | None:
-        return self._readable(row, lambda body: self._config.merge.report_of(row.report_id, *said(body)))
+        return self._readable(row, lambda body: report_of(body, self._config.merge))
 
     def _readable(self, row: ReportRow, read: Callable[[bytes], T]) -> T | None:
         """What a stored report says; nothing when it can no longer be read (its vehicle has long had its ack)."""

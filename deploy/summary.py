@@ -17,6 +17,7 @@ from fleet_sim.pictures import View, draw_healing, draw_map, draw_run
 from fleet_sim.truth import read_truth
 from gnd_map.geodesy import LocalFrame
 from tile_store.sqlite_store import SqliteStore
+from tile_store.status import waiting_totals
 
 
 def write_summary(
@@ -39,6 +40,7 @@ def write_summary(
         histories = tile_histories(store)
         summary = _counts(config, folder, prepared, outcome, results, store, histories)
         summary["f1"] = _evaluate(folder, prepared, store, histories)
+        summary["waiting_for_confirmation"] = waiting_totals(store)
         summary["features"] = _score_features(config, prepared, store)
     summary["prepare_s"] = round(prepare_s, 1)
     summary["doubtful"] = doubtful_vehicles(results)
@@ -124,7 +126,12 @@ def _write(path: Path, summary: dict[str, Any]) -> None:
 
 def summary_lines(summary: dict[str, Any]) -> list[str]:
     """Return a summary as lines for people."""
-    traffic, f1, p95 = summary["traffic"], summary["f1"], summary["localisation_p95"]
+    traffic, f1, p95, waiting = (
+        summary["traffic"],
+        summary["f1"],
+        summary["localisation_p95"],
+        summary["waiting_for_confirmation"],
+    )
     lines = [
         f"{summary['agents']} agents drove {summary['drive_km']:.2f} km on {summary['link']} links "
         f"in {summary['wall_s']:.0f} s; {summary['tiles_downloaded']} tiles downloaded",
@@ -134,6 +141,10 @@ def summary_lines(summary: dict[str, Any]) -> list[str]:
         f"traffic: {size_text(traffic['down_bytes'])} down, {size_text(traffic['up_bytes'])} up "
         f"({traffic['kB_per_km_down']:.0f} and {traffic['kB_per_km_up']:.1f} kB/km)",
     ]
+    if waiting["voxels"]:
+        lines.append(
+            f"waiting for confirmation: {waiting['voxels']} voxels in {waiting['tiles']} tiles (`gnd map status`)"
+        )
     if p95["longitudinal_m"] is not None:
         lines.append(
             f"localisation, 95 % of errors: {p95['longitudinal_m'] * 100:.1f} cm along, "

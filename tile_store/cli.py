@@ -26,6 +26,7 @@ from tile_store.errors import StoreError
 from tile_store.export import FORMATS, export_map
 from tile_store.server import TileServer
 from tile_store.sqlite_store import SqliteStore
+from tile_store.status import status
 from tile_store.store import Store
 from tile_store.values import DEFAULT_CODEC, DEFAULT_LAYER, MAP_CODECS
 
@@ -74,6 +75,9 @@ def store(path: Path, connect: tuple[str, ...], workers: int) -> None:
 @click.group(name="map")
 def map_group() -> None:
     """Build, inspect, compare, export and roll back maps."""
+
+
+map_group.add_command(status)
 
 
 @map_group.command(short_help="Build a map from drives with known poses.")

@@ -12,6 +12,7 @@ import apsw
 from gnd_map.content import AnyTile
 from gnd_map.tile_id import TileId
 from schemas.tiles import CatalogEntry
+from tile_store import sqlite_confirmation as confirmation
 from tile_store import sqlite_inbox as inbox
 from tile_store import sqlite_versions as versions
 from tile_store.errors import StoreError, UnknownVersion
@@ -22,6 +23,7 @@ from tile_store.values import (
     DEFAULT_LAYER,
     Claim,
     Content,
+    DirtyTile,
     GcResult,
     Notice,
     Publication,
@@ -35,6 +37,7 @@ from tile_store.values import (
     TileWork,
     VersionInfo,
     VersionKind,
+    WaitingChange,
     check_fits,
     check_layer,
 )
@@ -220,6 +223,19 @@ class SqliteStore:
         """See `Store.announced`."""
         keys = [{"layer": one.layer, "tile": one.tile.morton, "version": one.version} for one in notices]
         self._writer.run(lambda c: [change(c, "delete_notice", key) for key in keys])
+
+    # Confirmation
+
+    def waiting_changes(self) -> list[WaitingChange]:
+        """See `Store.waiting_changes`."""
+        with self._readers.snapshot() as c:
+            return confirmation.waiting_changes(c)
+
+    def dirty_tiles(self) -> list[DirtyTile]:
+        """See `Store.dirty_tiles`."""
+        with self._readers.snapshot() as c:
+            rows = fetch(c, "dirty_tiles")
+        return [DirtyTile(layer, TileId(tile), *rest) for layer, tile, *rest in rows]
 
     # Reading
 

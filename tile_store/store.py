@@ -10,6 +10,7 @@ from schemas.tiles import CatalogEntry
 from tile_store.values import (
     DEFAULT_LAYER,
     Claim,
+    DirtyTile,
     GcResult,
     Notice,
     Publication,
@@ -22,6 +23,7 @@ from tile_store.values import (
     TileWork,
     VersionInfo,
     VersionKind,
+    WaitingChange,
 )
 
 
@@ -102,6 +104,14 @@ class Store(Protocol):
 
     def announced(self, notices: Sequence[Notice]) -> None:
         """Confirm that the update notices of these versions have gone out."""
+
+    # Confirmation
+
+    def waiting_changes(self) -> list[WaitingChange]:
+        """What single vehicles claim and nobody has confirmed, by layer, tile, vehicle and reason."""
+
+    def dirty_tiles(self) -> list[DirtyTile]:
+        """Tiles that wait to be merged, by layer and tile."""
 
     # Reading
 

@@ -18,6 +18,7 @@ from tile_store.errors import StoreError
 VersionKind = Literal["base", "merged", "rollback"]
 PutStatus = Literal["stored", "duplicate"]
 PublishStatus = Literal["published", "unchanged", "stale"]
+WaitingReason = Literal["share", "poses", "doubtful", "named"]
 
 SHA_BYTES: Final = 32
 DEFAULT_LAYER: Final = "ndt"
@@ -211,11 +212,64 @@ class TileWork:
 
 
 @dataclass(frozen=True, slots=True)
+class DirtyTile:
+    """A tile that waits to be merged: reports that are not merged yet, how often it was tried; `is_leased`: a shard is
+    at it.
+    """
+
+    layer: str
+    tile: TileId
+    reports: int
+    attempts: int
+    is_leased: bool
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "is_leased", bool(self.is_leased))
+
+
+@dataclass(frozen=True, slots=True)
+class Unconfirmed:
+    """What one vehicle alone claims about a tile, and why it is not published.
+
+    Attributes:
+        vehicle: the only witness.
+        report_ids: of its reports that claim it, sorted.
+        voxels: so many.
+        seen: voxels of the tile that it observed and that hold something, before or by its word.
+        reason: "share": too large a share; "poses": of reports with poor poses only; "doubtful": the vehicle doubts it
+            itself; "named": the vehicle's reports are shifted again and again.
+    """
+
+    vehicle: str
+    report_ids: tuple[str, ...]
+    voxels: int
+    seen: int
+    reason: WaitingReason
+
+
+@dataclass(frozen=True, slots=True)
+class WaitingChange:
+    """What one vehicle claims about a tile and nobody has confirmed, as a store keeps it: `Unconfirmed`, and where.
+
+    `since_ns` is when the first of the vehicle's reports that claim it was received.
+    """
+
+    layer: str
+    tile: TileId
+    vehicle: str
+    reason: WaitingReason
+    voxels: int
+    seen: int
+    since_ns: int
+
+
+@dataclass(frozen=True, slots=True)
 class Publication:
     """A merge's result: the new content, or None when nothing visible has changed.
 
     `report_ids` are the reports that it comes from. `voxel_reports` names them for each changed voxel, or by the id of
-    each changed feature, when known.
+    each changed feature, when known. `waiting` is what the reports claim and the content has not;
+    None: as before.
     The store numbers versions itself: it publishes `base_version + 1`, whatever `tile.version` says.
     """
 
@@ -225,6 +279,7 @@ class Publication:
     reason: VersionKind = "merged"
     report_ids: tuple[str, ...] = ()
     voxel_reports: Mapping[int, tuple[str, ...]] = field(default_factory=dict)
+    waiting: tuple[Unconfirmed, ...] | None = None
 
     def __post_init__(self) -> None:
         if self.tile is not None and self.tile.tile_id != self.claim.tile:

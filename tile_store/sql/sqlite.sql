@@ -81,6 +81,40 @@ CREATE TABLE quarantine (
   body        BLOB    NOT NULL
 ) STRICT;
 
+-- name: schema_of_confirmation
+-- Added to the schema later: a store without it gets it when it is opened; a program that does not know it can go on.
+-- What waits for a second witness: derived from the reports by each merge of the tile, in the publication's transaction.
+CREATE TABLE IF NOT EXISTS waiting_change (
+  layer    TEXT    NOT NULL,
+  tile     INTEGER NOT NULL,
+  vehicle  TEXT    NOT NULL,
+  reason   TEXT    NOT NULL,
+  voxels   INTEGER NOT NULL CHECK (voxels > 0),
+  seen     INTEGER NOT NULL CHECK (seen >= voxels),
+  since_ns INTEGER NOT NULL,
+  PRIMARY KEY (layer, tile, vehicle, reason)
+) STRICT, WITHOUT ROWID;
+
+-- name: has_schema_of_confirmation
+SELECT 1 FROM sqlite_schema WHERE type = 'table' AND name = 'waiting_change'
+
+-- name: delete_waiting
+DELETE FROM waiting_change WHERE layer = :layer AND tile = :tile
+
+-- name: insert_waiting
+INSERT INTO waiting_change (layer, tile, vehicle, reason, voxels, seen, since_ns)
+VALUES (:layer, :tile, :vehicle, :reason, :voxels, :seen, :since_ns)
+
+-- name: received
+SELECT received_ns FROM report WHERE layer = :layer AND tile = :tile AND report_id = :report_id
+
+-- name: waiting_changes
+SELECT layer, tile, vehicle, reason, voxels, seen, since_ns FROM waiting_change
+ORDER BY layer, tile, vehicle, reason
+
+-- name: dirty_tiles
+SELECT layer, tile, waiting, attempts, owner IS NOT NULL FROM dirty ORDER BY layer, tile
+
 -- name: insert_report
 INSERT INTO report (layer, tile, report_id, vehicle, received_ns, seq, base_sha, body)
 SELECT :layer, :tile, :report_id, :vehicle, :received_ns,
