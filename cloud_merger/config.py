@@ -12,6 +12,7 @@ from cloud_merger.features.check import FeatureLimits
 from cloud_merger.features.parameters import FeatureMergeParameters
 from cloud_merger.ingest import IngestLimits
 from cloud_merger.merge import MergeParameters
+from cloud_merger.shift import ShiftParameters
 from cloud_merger.waiting import WaitingLimits
 from cloud_merger.wants import WantParameters
 from fleet_bus.config import DEFAULT_ENDPOINT
@@ -32,6 +33,7 @@ class ShardConfig:
         bus_lease_ms: how long a silent shard counts as alive; 0: the bus's own.
         merge: how statements become changes.
         confirmation: what a single vehicle may change.
+        shift: when changes are an error of the vehicle's poses.
         features: how statements become changes in feature layers.
         ingest: which reports are refused.
         feature_limits: which reports about features are refused.
@@ -54,6 +56,7 @@ class ShardConfig:
     bus_lease_ms: int = 0
     merge: MergeParameters = field(default_factory=MergeParameters)
     confirmation: ConfirmationParameters = field(default_factory=ConfirmationParameters)
+    shift: ShiftParameters = field(default_factory=ShiftParameters)
     features: FeatureMergeParameters = field(default_factory=FeatureMergeParameters)
     ingest: IngestLimits = field(default_factory=IngestLimits)
     feature_limits: FeatureLimits = field(default_factory=FeatureLimits)

@@ -38,7 +38,13 @@ def report_of(body: bytes, parameters: MergeParameters) -> Report:
     report = said(body)
     (change,) = report.tiles
     weighed = parameters.report_of(report.report_id, report.sensor_model, change)
-    return replace(weighed, vehicle=report.vehicle, first_ns=report.first_ns, last_ns=report.last_ns)
+    return replace(
+        weighed,
+        vehicle=report.vehicle,
+        first_ns=report.first_ns,
+        last_ns=report.last_ns,
+        is_doubtful=change.doubt is not None,
+    )
 
 
 class Bases:

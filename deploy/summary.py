@@ -17,7 +17,7 @@ from fleet_sim.pictures import View, draw_healing, draw_map, draw_run
 from fleet_sim.truth import read_truth
 from gnd_map.geodesy import LocalFrame
 from tile_store.sqlite_store import SqliteStore
-from tile_store.status import waiting_totals
+from tile_store.status import named_vehicles, waiting_totals
 
 
 def write_summary(
@@ -41,6 +41,7 @@ def write_summary(
         summary = _counts(config, folder, prepared, outcome, results, store, histories)
         summary["f1"] = _evaluate(folder, prepared, store, histories)
         summary["waiting_for_confirmation"] = waiting_totals(store)
+        summary["named_vehicles"] = named_vehicles(store)
         summary["features"] = _score_features(config, prepared, store)
     summary["prepare_s"] = round(prepare_s, 1)
     summary["doubtful"] = doubtful_vehicles(results)
@@ -145,6 +146,7 @@ def summary_lines(summary: dict[str, Any]) -> list[str]:
         lines.append(
             f"waiting for confirmation: {waiting['voxels']} voxels in {waiting['tiles']} tiles (`gnd map status`)"
         )
+    lines += [one["says"] for one in summary["named_vehicles"]]
     if p95["longitudinal_m"] is not None:
         lines.append(
             f"localisation, 95 % of errors: {p95['longitudinal_m'] * 100:.1f} cm along, "

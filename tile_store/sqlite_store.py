@@ -35,6 +35,7 @@ from tile_store.values import (
     StoreCounts,
     StoredTile,
     TileWork,
+    VehicleAccount,
     VersionInfo,
     VersionKind,
     WaitingChange,
@@ -230,6 +231,16 @@ class SqliteStore:
         """See `Store.waiting_changes`."""
         with self._readers.snapshot() as c:
             return confirmation.waiting_changes(c)
+
+    def named_vehicles(self) -> frozenset[str]:
+        """See `Store.named_vehicles`."""
+        with self._readers.snapshot() as c:
+            return confirmation.named_vehicles(c)
+
+    def vehicle_accounts(self) -> list[VehicleAccount]:
+        """See `Store.vehicle_accounts`."""
+        with self._readers.snapshot() as c:
+            return confirmation.accounts(c)
 
     def dirty_tiles(self) -> list[DirtyTile]:
         """See `Store.dirty_tiles`."""

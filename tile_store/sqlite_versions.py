@@ -50,6 +50,8 @@ def publish(
     inbox.consume(c, claim, publication.report_ids, result.version, timing)
     if publication.waiting is not None:
         confirmation.keep(c, claim.layer, claim.tile, publication.waiting)
+    if publication.shift_tests is not None:
+        confirmation.put_tests(c, claim.layer, claim.tile, publication.shift_tests, timing)
     return result
 
 

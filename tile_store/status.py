@@ -3,6 +3,7 @@
 import json
 from dataclasses import asdict
 from datetime import UTC, datetime
+from math import degrees
 from pathlib import Path
 from typing import Any, Final
 
@@ -12,12 +13,13 @@ from rich.table import Table
 
 from tile_store.sqlite_store import SqliteStore
 from tile_store.store import Store
-from tile_store.values import WaitingReason
+from tile_store.values import VehicleAccount, WaitingReason
 
 WORDS: Final[dict[WaitingReason, str]] = {
     "share": "more of the tile than one vehicle is believed",
     "poses": "its poses were known poorly",
     "doubtful": "the vehicle doubts it itself",
+    "shift": "a shift of its poses explains it",
     "named": "its reports are shifted again and again",
 }
 
@@ -26,7 +28,7 @@ WORDS: Final[dict[WaitingReason, str]] = {
 @click.argument("path", metavar="STORE", type=click.Path(path_type=Path))
 @click.option("--json", "as_json", is_flag=True, help="Print JSON instead of tables.")
 def status(path: Path, as_json: bool) -> None:
-    """What STORE waits for: changes that only one vehicle claims, tiles to merge, refused messages."""
+    """What STORE waits for: unconfirmed changes, vehicles to be checked, tiles to merge, refused messages."""
     with SqliteStore(path, create=False) as store:
         values = status_of(store)
     if as_json:
@@ -36,10 +38,11 @@ def status(path: Path, as_json: bool) -> None:
 
 
 def status_of(store: Store) -> dict[str, Any]:
-    """All that waits, in plain values: `waiting_for_confirmation`, `to_merge`, `quarantined`."""
+    """All that waits, in plain values: `waiting_for_confirmation`, `named_vehicles`, `to_merge`, `quarantined`."""
     claims = [asdict(one) | {"tile": one.tile.path} for one in store.waiting_changes()]
     return {
         "waiting_for_confirmation": waiting_totals(store) | {"claims": claims},
+        "named_vehicles": named_vehicles(store),
         "to_merge": [asdict(one) | {"tile": one.tile.path} for one in store.dirty_tiles()],
         "quarantined": store.counts().quarantined,
     }
@@ -52,18 +55,45 @@ def waiting_totals(store: Store) -> dict[str, int]:
     return {"tiles": len(tiles), "voxels": sum(one.voxels for one in waiting)}
 
 
+def named_vehicles(store: Store) -> list[dict[str, Any]]:
+    """The vehicles whose reports are shifted again and again: their account, and one line that tells it."""
+    named = [one for one in store.vehicle_accounts() if one.is_named]
+    return [asdict(one) | {"says": naming_line(one)} for one in named]
+
+
+def naming_line(account: VehicleAccount) -> str:
+    """Such as "vehicle v3: 17 of 20 tiles explained by a shift of 0.31 m (0.30 m left), 0.5°: check its mount"."""
+    along = ""
+    if account.forward_m is not None and account.left_m is not None:
+        sides = (_side(account.forward_m, "forward", "back"), _side(account.left_m, "left", "right"))
+        along = f" ({', '.join(sides)})"
+    shift = f"{account.length_m:.2f} ± {account.length_sd_m:.2f} m{along}, {degrees(account.turn_rad):.1f}°"
+    tiles = f"{account.explained} of {account.tested} tiles explained by a shift of {shift}"
+    return f"vehicle {account.vehicle}: {tiles}: check its mount"
+
+
+def _side(length_m: float, ahead: str, behind: str) -> str:
+    return f"{abs(length_m):.2f} m {ahead if length_m >= 0 else behind}"
+
+
 def print_status(console: Console, title: str, values: dict[str, Any]) -> None:
     """One table for each thing that waits, and one line where nothing does."""
-    waiting, to_merge = values["waiting_for_confirmation"], values["to_merge"]
+    waiting, to_merge, named = values["waiting_for_confirmation"], values["to_merge"], values["named_vehicles"]
+    for one in named:
+        console.print(one["says"], highlight=False, soft_wrap=True)
     if waiting["claims"]:
         console.print(_waiting_table(waiting))
     if to_merge:
         console.print(_merge_table(to_merge))
     if values["quarantined"]:
         line = f"{values['quarantined']} messages in quarantine: see `gnd map quarantine`"
-        console.print(line, highlight=False)
-    if not (waiting["claims"] or to_merge or values["quarantined"]):
-        console.print(f"{title}: all reports merged, nothing waits for confirmation, none refused", highlight=False)
+        console.print(line, highlight=False, soft_wrap=True)
+    if not (named or waiting["claims"] or to_merge or values["quarantined"]):
+        console.print(
+            f"{title}: all reports merged, nothing waits for confirmation, none refused",
+            highlight=False,
+            soft_wrap=True,
+        )
 
 
 def _waiting_table(waiting: dict[str, Any]) -> Table:

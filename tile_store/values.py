@@ -18,7 +18,7 @@ from tile_store.errors import StoreError
 VersionKind = Literal["base", "merged", "rollback"]
 PutStatus = Literal["stored", "duplicate"]
 PublishStatus = Literal["published", "unchanged", "stale"]
-WaitingReason = Literal["share", "poses", "doubtful", "named"]
+WaitingReason = Literal["share", "poses", "doubtful", "shift", "named"]
 
 SHA_BYTES: Final = 32
 DEFAULT_LAYER: Final = "ndt"
@@ -237,7 +237,7 @@ class Unconfirmed:
         voxels: so many.
         seen: voxels of the tile that it observed and that hold something, before or by its word.
         reason: "share": too large a share; "poses": of reports with poor poses only; "doubtful": the vehicle doubts it
-            itself; "named": the vehicle's reports are shifted again and again.
+            itself; "shift": a shift of its poses explains it; "named": its reports are shifted again and again.
     """
 
     vehicle: str
@@ -245,6 +245,58 @@ class Unconfirmed:
     voxels: int
     seen: int
     reason: WaitingReason
+
+
+@dataclass(frozen=True, slots=True)
+class ShiftTest:
+    """Whether the changes that a report claims in a tile are an error of its poses.
+
+    Attributes:
+        report_id: the report.
+        vehicle: who made it.
+        at_ns: time of its last scan, UTC.
+        is_explained: a shift explains them, and no other vehicle sees the same.
+        length_m: length of the shift over the ground.
+        turn_rad: its turn, counter-clockwise seen from above.
+        forward_m: along the vehicle's axes where the vehicle has told it so, else None.
+        left_m: the same.
+    """
+
+    report_id: str
+    vehicle: str
+    at_ns: int
+    is_explained: bool
+    length_m: float
+    turn_rad: float
+    forward_m: float | None = None
+    left_m: float | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class VehicleAccount:
+    """What the shift tests say about one vehicle.
+
+    Attributes:
+        vehicle: its pseudonym.
+        tested: of its newest reports on tiles so many could be tested, ...
+        explained: ... and so many are explained by a shift.
+        length_m: mean length of these shifts.
+        length_sd_m: their standard deviation: a mount or a clock errs alike, again and again.
+        turn_rad: mean turn.
+        forward_m: mean along the vehicle's axes, of the tests that tell it; None: none does.
+        left_m: the same.
+        is_named: the reports are shifted again and again.
+    """
+
+    vehicle: str
+    tested: int
+    explained: int
+    length_m: float
+    length_sd_m: float
+    turn_rad: float
+    forward_m: float | None
+    left_m: float | None
+    is_named: bool
 
 
 @dataclass(frozen=True, slots=True)
@@ -269,7 +321,7 @@ class Publication:
 
     `report_ids` are the reports that it comes from. `voxel_reports` names them for each changed voxel, or by the id of
     each changed feature, when known. `waiting` is what the reports claim and the content has not;
-    None: as before.
+    None: as before. `shift_tests` are those of this tile's reports, all of them; None: as before.
     The store numbers versions itself: it publishes `base_version + 1`, whatever `tile.version` says.
     """
 
@@ -280,6 +332,7 @@ class Publication:
     report_ids: tuple[str, ...] = ()
     voxel_reports: Mapping[int, tuple[str, ...]] = field(default_factory=dict)
     waiting: tuple[Unconfirmed, ...] | None = None
+    shift_tests: tuple[ShiftTest, ...] | None = None
 
     def __post_init__(self) -> None:
         if self.tile is not None and self.tile.tile_id != self.claim.tile:

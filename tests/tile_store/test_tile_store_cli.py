@@ -209,6 +209,7 @@ def test_status_of_a_map_that_waits_for_nothing_is_one_line(path: Path) -> None:
     assert "nothing waits for confirmation" in gnd_map("status", path)
     assert as_json("status", path) == {
         "waiting_for_confirmation": {"tiles": 0, "voxels": 0, "claims": []},
+        "named_vehicles": [],
         "to_merge": [],
         "quarantined": 0,
     }
@@ -237,5 +238,5 @@ def test_status_tells_what_waits_for_whom(path: Path) -> None:
 
 def test_a_store_of_an_older_release_gets_what_it_lacks_when_it_is_opened(path: Path) -> None:
     with apsw.Connection(str(path)) as connection:
-        connection.execute("DROP TABLE waiting_change")
+        connection.execute("DROP TABLE waiting_change; DROP TABLE shift_test; DROP TABLE named_vehicle")
     assert as_json("status", path)["waiting_for_confirmation"]["tiles"] == 0

@@ -95,8 +95,55 @@ CREATE TABLE IF NOT EXISTS waiting_change (
   PRIMARY KEY (layer, tile, vehicle, reason)
 ) STRICT, WITHOUT ROWID;
 
+-- What the shift test says of each report: the account of its vehicle. Derived, too.
+CREATE TABLE IF NOT EXISTS shift_test (
+  layer     TEXT    NOT NULL,
+  tile      INTEGER NOT NULL,
+  report_id TEXT    NOT NULL,
+  vehicle   TEXT    NOT NULL,
+  at_ns     INTEGER NOT NULL,
+  explained INTEGER NOT NULL CHECK (explained IN (0, 1)),
+  length_m  REAL    NOT NULL,
+  turn_rad  REAL    NOT NULL,
+  forward_m REAL,
+  left_m    REAL,
+  PRIMARY KEY (layer, tile, report_id)
+) STRICT, WITHOUT ROWID;
+CREATE INDEX IF NOT EXISTS shift_test_vehicle ON shift_test (vehicle, at_ns);
+
+-- The vehicles whose reports are shifted again and again: of them the merges of all their tiles know.
+CREATE TABLE IF NOT EXISTS named_vehicle (
+  vehicle  TEXT    NOT NULL PRIMARY KEY,
+  since_ns INTEGER NOT NULL
+) STRICT, WITHOUT ROWID;
+
 -- name: has_schema_of_confirmation
-SELECT 1 FROM sqlite_schema WHERE type = 'table' AND name = 'waiting_change'
+SELECT 1 FROM sqlite_schema WHERE type = 'table' AND name = 'named_vehicle'
+
+-- name: put_shift_test
+INSERT INTO shift_test (layer, tile, report_id, vehicle, at_ns, explained, length_m, turn_rad, forward_m, left_m)
+VALUES (:layer, :tile, :report_id, :vehicle, :at_ns, :explained, :length_m, :turn_rad, :forward_m, :left_m)
+ON CONFLICT (layer, tile, report_id) DO UPDATE SET explained = excluded.explained
+
+-- name: tested_vehicles
+SELECT DISTINCT vehicle FROM shift_test ORDER BY vehicle
+
+-- name: shift_tests_of_vehicle
+SELECT explained, length_m, turn_rad, forward_m, left_m FROM shift_test WHERE vehicle = :vehicle
+ORDER BY at_ns DESC, layer, tile, report_id LIMIT :n
+
+-- name: named_vehicles
+SELECT vehicle FROM named_vehicle ORDER BY vehicle
+
+-- name: name_vehicle
+INSERT INTO named_vehicle (vehicle, since_ns) VALUES (:vehicle, :since_ns) ON CONFLICT (vehicle) DO NOTHING
+
+-- name: unname_vehicle
+DELETE FROM named_vehicle WHERE vehicle = :vehicle
+
+-- name: tiles_of_vehicle
+SELECT DISTINCT r.layer, r.tile FROM report AS r LEFT JOIN tile_head AS h USING (layer, tile)
+WHERE r.vehicle = :vehicle AND (r.merged_in IS NULL OR r.merged_in >= COALESCE(h.epoch, 0))
 
 -- name: delete_waiting
 DELETE FROM waiting_change WHERE layer = :layer AND tile = :tile

@@ -1,0 +1,127 @@
+"""Which reports of a tile take part in its merge: not those whose changes are an error of their poses.
+
+A shift that a second vehicle sees alike is none of the poses: then the map is off, or half a street has moved, and both
+are believed. Two passes of one vehicle share its mount, so they do not count as two here, however far apart.
+"""
+
+from collections import OrderedDict
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+
+from cloud_merger.shift import Shift, ShiftParameters, shift_of
+from cloud_merger.statements import Report
+from gnd_map.gaussian import Gaussians
+from schemas.doubt import DoubtReason
+from tile_store.values import ShiftTest, Unconfirmed
+
+ALIKE_M: Final = 0.1
+ALIKE_RAD: Final = 0.006
+REMEMBERED: Final = 4096
+
+
+@dataclass(frozen=True, slots=True)
+class Believed:
+    """The reports of a tile, sorted out.
+
+    Attributes:
+        reports: those that take part in the merge.
+        set_aside: what the others claim, by vehicle.
+        tests: what the shift test says of each report that it could be made on, sorted by report id.
+    """
+
+    reports: tuple[Report, ...]
+    set_aside: tuple[Unconfirmed, ...]
+    tests: tuple[ShiftTest, ...]
+
+
+class ShiftTests:
+    """Shift tests of reports against the versions that they were compared with; remembered, each is made once."""
+
+    def __init__(self, parameters: ShiftParameters) -> None:
+        self._parameters = parameters
+        self._held: OrderedDict[tuple[str, int], Shift] = OrderedDict()
+
+    def of(self, report: Report, bases: Mapping[bytes, Gaussians]) -> Shift:
+        """The test of one report; one whose base is not known, or that had none, cannot be tested."""
+        base = bases.get(report.change.base_sha)
+        if base is None:
+            return Shift(False, 0)
+        key = (report.report_id, report.change.tile.morton)
+        if key not in self._held:
+            self._held[key] = shift_of(report.change, base, self._parameters)
+            if len(self._held) > REMEMBERED:
+                self._held.popitem(last=False)
+        return self._held[key]
+
+
+def believed(reports: Iterable[Report], shifts: Mapping[str, Shift], parameters: ShiftParameters) -> Believed:
+    """Sort out the reports of a tile.
+
+    Args:
+        reports: in any order.
+        shifts: of each by its id.
+        parameters: of the shift test.
+    """
+    ordered = sorted(reports, key=lambda one: one.report_id)
+    doubted = {one.report_id for one in ordered if shifts[one.report_id].is_explained or _doubts_by_shift(one)}
+    alike = {one.report_id for one in ordered if one.report_id in doubted and _is_shared(one, ordered, shifts)}
+    out = [one for one in ordered if one.report_id in doubted - alike]
+    tested = (one for one in ordered if _can_tell(one, shifts, parameters))
+    return Believed(
+        reports=tuple(one for one in ordered if one.report_id not in doubted - alike),
+        set_aside=_claims(out),
+        tests=tuple(_test_of(one, shifts[one.report_id], one.report_id in doubted - alike) for one in tested),
+    )
+
+
+def _doubts_by_shift(report: Report) -> bool:
+    doubt = report.change.doubt
+    return doubt is not None and bool(doubt.reasons & DoubtReason.EXPLAINED_BY_SHIFT)
+
+
+def _can_tell(report: Report, shifts: Mapping[str, Shift], parameters: ShiftParameters) -> bool:
+    return shifts[report.report_id].gaussians >= parameters.least_gaussians or _doubts_by_shift(report)
+
+
+def _is_shared(report: Report, reports: Iterable[Report], shifts: Mapping[str, Shift]) -> bool:
+    """Whether another vehicle's report is explained by the same shift."""
+    own = shifts[report.report_id]
+    others = (shifts[one.report_id] for one in reports if one.vehicle != report.vehicle)
+    return own.is_explained and any(_are_alike(own, other) for other in others if other.is_explained)
+
+
+def _are_alike(a: Shift, b: Shift) -> bool:
+    apart_m = np.hypot(a.east_m - b.east_m, a.north_m - b.north_m)
+    return bool(apart_m <= ALIKE_M and abs(a.turn_rad - b.turn_rad) <= ALIKE_RAD)
+
+
+def _claims(reports: Iterable[Report]) -> tuple[Unconfirmed, ...]:
+    """What the reports claim in vain, by vehicle."""
+    found: dict[str, list[Report]] = {}
+    for report in reports:
+        found.setdefault(report.vehicle, []).append(report)
+    return tuple(_claim(vehicle, own) for vehicle, own in sorted(found.items()))
+
+
+def _claim(vehicle: str, own: list[Report]) -> Unconfirmed:
+    claimed = np.unique(np.concatenate([one.change.changed.voxel_id for one in own]))
+    withheld = max(0 if one.change.doubt is None else one.change.doubt.withheld for one in own)
+    voxels = max(len(claimed), withheld, 1)
+    seen = len(np.unique(np.concatenate([one.change.observed for one in own])))
+    return Unconfirmed(vehicle, tuple(one.report_id for one in own), voxels, max(seen, voxels), "shift")
+
+
+def _test_of(report: Report, shift: Shift, is_explained: bool) -> ShiftTest:
+    """The test's line in the account of its vehicle; along the vehicle's axes where the vehicle has told it so."""
+    doubt = report.change.doubt
+    if doubt is None or not _doubts_by_shift(report):
+        length_m = float(np.hypot(shift.east_m, shift.north_m))
+        return ShiftTest(report.report_id, report.vehicle, report.last_ns, is_explained, length_m, shift.turn_rad)
+    forward_m, left_m, _ = doubt.shift_m
+    length_m = float(np.hypot(forward_m, left_m))
+    return ShiftTest(
+        report.report_id, report.vehicle, report.last_ns, is_explained, length_m, doubt.turn_rad, forward_m, left_m
+    )
