@@ -1,7 +1,7 @@
 """Which reports of a tile take part in its merge: not those whose changes are an error of their poses.
 
-A shift that a second vehicle sees alike is none of the poses: then the map is off, or half a street has moved, and both
-are believed. Two passes of one vehicle share its mount, so they do not count as two here, however far apart.
+What a second vehicle claims alike is none of the poses: then the map is off, or a facade has moved, and both are
+believed. Two passes of one vehicle share its mount, so they do not count as two here, however far apart.
 """
 
 from collections import OrderedDict
@@ -10,15 +10,19 @@ from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
+from numpy.typing import NDArray
 
 from cloud_merger.shift import Shift, ShiftParameters, shift_of
-from cloud_merger.statements import Report
+from cloud_merger.statements import Report, is_withheld
 from gnd_map.gaussian import Gaussians
+from gnd_map.similarity import similarity
+from schemas.changes import TileChange
 from schemas.doubt import DoubtReason
 from tile_store.values import ShiftTest, Unconfirmed
 
-ALIKE_M: Final = 0.1
-ALIKE_RAD: Final = 0.006
+ALIKE: Final = 0.5  # similarity of two claims
+AGREE_VOXELS: Final = 12
+AGREE_SHARE: Final = 0.6
 REMEMBERED: Final = 4096
 
 
@@ -67,7 +71,7 @@ def believed(reports: Iterable[Report], shifts: Mapping[str, Shift], parameters:
     """
     ordered = sorted(reports, key=lambda one: one.report_id)
     doubted = {one.report_id for one in ordered if shifts[one.report_id].is_explained or _doubts_by_shift(one)}
-    alike = {one.report_id for one in ordered if one.report_id in doubted and _is_shared(one, ordered, shifts)}
+    alike = {one.report_id for one in ordered if one.report_id in doubted and _is_shared(one, ordered)}
     out = [one for one in ordered if one.report_id in doubted - alike]
     tested = (one for one in ordered if _can_tell(one, shifts, parameters))
     return Believed(
@@ -86,16 +90,24 @@ def _can_tell(report: Report, shifts: Mapping[str, Shift], parameters: ShiftPara
     return shifts[report.report_id].gaussians >= parameters.least_gaussians or _doubts_by_shift(report)
 
 
-def _is_shared(report: Report, reports: Iterable[Report], shifts: Mapping[str, Shift]) -> bool:
-    """Whether another vehicle's report is explained by the same shift."""
-    own = shifts[report.report_id]
-    others = (shifts[one.report_id] for one in reports if one.vehicle != report.vehicle)
-    return own.is_explained and any(_are_alike(own, other) for other in others if other.is_explained)
+def _is_shared(report: Report, reports: Iterable[Report]) -> bool:
+    """Whether another vehicle claims the same."""
+    return any(_agree(report.change, one.change) for one in reports if one.vehicle != report.vehicle)
 
 
-def _are_alike(a: Shift, b: Shift) -> bool:
-    apart_m = np.hypot(a.east_m - b.east_m, a.north_m - b.north_m)
-    return bool(apart_m <= ALIKE_M and abs(a.turn_rad - b.turn_rad) <= ALIKE_RAD)
+def _agree(a: TileChange, b: TileChange) -> bool:
+    """Whether two reports make enough claims about the same voxels, and most of them alike."""
+    common = np.intersect1d(_claimed(a), _claimed(b))
+    if len(common) < AGREE_VOXELS:
+        return False
+    one, other = a.changed.select(common), b.changed.select(common)
+    alike = similarity(one.exists, one.mean_m, one.cov_m2, other.exists, other.mean_m, other.cov_m2)
+    return bool((alike >= ALIKE).mean() >= AGREE_SHARE)
+
+
+def _claimed(change: TileChange) -> NDArray[np.int32]:
+    """The voxels of which a report says what is there now: not those whose Gaussian was not asked for."""
+    return change.changed.voxel_id[~is_withheld(change)]
 
 
 def _claims(reports: Iterable[Report]) -> tuple[Unconfirmed, ...]:

@@ -10,7 +10,7 @@ from street_corner import WALLS, displaced, mapped, seen_as, street
 
 from cloud_merger.belief import believed
 from cloud_merger.config import ShardConfig
-from cloud_merger.shift import Shift, ShiftParameters, shift_of
+from cloud_merger.shift import ShiftParameters, shift_of
 from cloud_merger.statements import Report
 from cloud_merger.work import Worker
 from gnd_map.tile import Tile
@@ -46,13 +46,21 @@ def test_a_report_that_a_shift_explains_is_set_aside_and_entered():
     assert test.length_m == pytest.approx(np.hypot(0.3, 0.1), abs=0.04)
 
 
-def test_a_shift_that_a_second_vehicle_sees_alike_is_the_maps():
+def test_a_shift_that_a_second_vehicle_claims_alike_is_the_maps():
     """The test alone is wrong here: what is off is the map. Said twice, it is believed."""
     again = seen_as(BASE, displaced(street(4), 0.3, 0.1))
     found = sorted_out(by("a", SHIFTED), by("b", again))
     assert found.set_aside == ()
     assert len(found.reports) == 2
     assert [test.is_explained for test in found.tests] == [False, False]
+
+
+def test_a_facade_that_two_vehicles_find_moved_has_moved():
+    """To the test it is a shift, of either; the honest third that did not come by has no say."""
+    moved = [seen_as(BASE, street(n, ((0, 5.6), *WALLS[1:]))) for n in (5, 6)]
+    assert sorted_out(by("a", moved[0])).reports == ()
+    assert len(sorted_out(by("a", moved[0]), by("b", moved[1])).reports) == 2
+    assert len(sorted_out(by("a", moved[0]), by("a", moved[1], 2)).reports) == 0
 
 
 def test_two_drives_of_one_vehicle_or_another_shift_do_not_help():
@@ -194,12 +202,3 @@ def test_the_order_of_reports_decides_nothing_in_the_end(tmp_path):
                     merge_all(store)
                 ends.append((store.get("ndt", TILE).sha, store.waiting_changes(), store.vehicle_accounts()))
     assert all(end == ends[0] for end in ends)
-
-
-def test_shifts_compare_by_place_and_turn():
-    shifts = {
-        "a" * 26: Shift(True, 20, 1.0, 0.0, 0.0, 0.3, 0.0, 0.0),
-        "b" * 26: Shift(True, 20, 1.0, 0.0, 0.0, 0.3, 0.0, 0.01),
-    }
-    reports = [Report("a" * 26, SHIFTED, vehicle="a"), Report("b" * 26, SHIFTED, vehicle="b")]
-    assert believed(reports, shifts, P).reports == ()
