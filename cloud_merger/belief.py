@@ -18,7 +18,7 @@ from gnd_map.gaussian import Gaussians
 from gnd_map.similarity import similarity
 from schemas.changes import TileChange
 from schemas.doubt import DoubtReason
-from tile_store.values import ShiftTest, Unconfirmed
+from tile_store.values import CourseSaid, ShiftTest, Unconfirmed
 
 ALIKE: Final = 0.5  # similarity of two claims
 AGREE_VOXELS: Final = 12
@@ -78,6 +78,15 @@ def believed(reports: Iterable[Report], shifts: Mapping[str, Shift], parameters:
         reports=tuple(one for one in ordered if one.report_id not in doubted - alike),
         set_aside=_claims(out),
         tests=tuple(_test_of(one, shifts[one.report_id], one.report_id in doubted - alike) for one in tested),
+    )
+
+
+def courses_of(reports: Iterable[Report]) -> tuple[CourseSaid, ...]:
+    """What the reports say of their vehicles' courses."""
+    return tuple(
+        CourseSaid(one.report_id, one.vehicle, one.last_ns, one.course.turn_rad, one.course.sigma_rad)
+        for one in reports
+        if one.course is not None
     )
 
 

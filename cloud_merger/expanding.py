@@ -78,6 +78,7 @@ def expand(packed: PackedReport, layer: str, district: District, bases: Sequence
             for tile, sha, one in zip(bases, shas, flags, strict=True)
         ),
         layer=layer,
+        course=packed.course,
     )
 
 

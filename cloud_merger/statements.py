@@ -18,6 +18,7 @@ from gnd_map.classes import ChangeClass
 from gnd_map.gaussian import Gaussians
 from gnd_map.tile import diff
 from schemas.changes import TileChange
+from schemas.course import Course
 
 Mode = Literal["paper", "default"]
 EPOCH = 1  # the number of the epoch's own Gaussian among the states of a voxel
@@ -69,6 +70,7 @@ class Report:
         first_ns: time of the first scan that it rests on, UTC.
         last_ns: time of the last.
         is_doubtful: the vehicle does not fully believe it; nor does the merge look at this.
+        course: where the vehicle drives in its own frame, None where it does not know.
     """
 
     report_id: str
@@ -79,6 +81,7 @@ class Report:
     first_ns: int = 0
     last_ns: int = 0
     is_doubtful: bool = False
+    course: Course | None = None
 
 
 @dataclass(frozen=True, slots=True)

@@ -44,6 +44,7 @@ def report_of(body: bytes, parameters: MergeParameters) -> Report:
         first_ns=report.first_ns,
         last_ns=report.last_ns,
         is_doubtful=change.doubt is not None,
+        course=report.course,
     )
 
 

@@ -5,7 +5,7 @@ import time
 from collections.abc import Callable, Mapping, Sequence
 from typing import TypeVar
 
-from cloud_merger.belief import Believed, ShiftTests, believed
+from cloud_merger.belief import Believed, ShiftTests, believed, courses_of
 from cloud_merger.config import ShardConfig
 from cloud_merger.confirmation import GatedTile, gate
 from cloud_merger.features.kept import FeatureContents, said_of
@@ -76,6 +76,7 @@ class Worker:
             voxel_reports=gated.merged.provenance,
             waiting=gated.waiting,
             shift_tests=believed_in.tests,
+            courses=courses_of(reports),
         )
 
     def _believed(self, reports: Sequence[Report], bases: Mapping[bytes, Gaussians]) -> Believed:
@@ -89,7 +90,7 @@ class Worker:
         """What may be published of a merge, with all that waits; the paper knows no such gate."""
         if self._config.merge.mode == "paper":
             return GatedTile(merged)
-        found = gate(epoch, merged, believed_in.reports, self._config.confirmation, self._store.named_vehicles())
+        found = gate(epoch, merged, believed_in.reports, self._config.confirmation, self._store.shifted_vehicles())
         return GatedTile(found.merged, (*found.waiting, *believed_in.set_aside))
 
     def _of_features(self, work: TileWork) -> Publication:

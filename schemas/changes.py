@@ -20,6 +20,7 @@ from gnd_map.grid import VoxelGrid
 from gnd_map.tile_id import District, TileId
 from schemas import limits
 from schemas.bitmap import decode_observed, encode_observed
+from schemas.course import Course, course_message, course_value
 from schemas.doubt import Doubt, doubt_message, doubt_value
 from schemas.errors import BadValue, TooLarge
 from schemas.generated import change_ack_pb2, change_report_pb2, tile_change_pb2
@@ -175,6 +176,8 @@ class ChangeReport:
     tiles: tuple[TileChange, ...]
     """One entry a tile, ascending; at least one."""
     layer: str = "ndt"
+    course: Course | None = None
+    """Where the vehicle drives in its own frame; None = it does not know."""
 
     def __post_init__(self) -> None:
         check_report_id(self.report_id)
@@ -215,6 +218,7 @@ class ChangeReport:
             first_ns=self.first_ns,
             last_ns=self.last_ns,
             tiles=map(_change_message, self.tiles),
+            course=course_message(self.course),
         )
         return serialise(message, limits.MAX_CHANGE_REPORT_BYTES)
 
@@ -240,6 +244,7 @@ class ChangeReport:
             first_ns=message.first_ns,
             last_ns=message.last_ns,
             tiles=_change_values(message),
+            course=course_value(message.course) if message.HasField("course") else None,
         )
 
 

@@ -17,6 +17,7 @@ from ulid import ULID
 from gnd_map.codec import decode_tiles, encode_tiles
 from schemas import limits
 from schemas.changes import ChangeReport
+from schemas.course import Course, course_message, course_value
 from schemas.doubt import Doubt, doubt_message, doubt_value
 from schemas.errors import BadValue, TooLarge
 from schemas.features import FeatureReport, check_feature_bytes, report_of
@@ -77,6 +78,8 @@ class PackedReport:
     """The same of the attitude, 10 µrad, rounded up."""
     doubts: tuple[tuple[int, Doubt], ...] = ()
     """(index in the district, doubt) of the tiles that are doubtful, ascending; nothing of them is held back."""
+    course: Course | None = None
+    """Where the vehicle drives in its own frame; None = it does not know."""
 
     def __post_init__(self) -> None:
         check_report_id(self.report_id)
@@ -150,6 +153,7 @@ class PackedReport:
             pose_sigma_10urad=self.pose_sigma_10urad,
             doubtful=[index for index, _ in self.doubts],
             doubts=[doubt_message(doubt) for _, doubt in self.doubts],
+            course=course_message(self.course),
         )
         message = change_report_pb2.ChangeReport(major=MAJOR, packed=packed)
         return serialise(message, limits.MAX_PACKED_REPORT_BYTES)
@@ -248,6 +252,7 @@ def _packed_report(message: packed_report_pb2.PackedReport) -> PackedReport:
         pose_sigma_tenth_mm=message.pose_sigma_tenth_mm,
         pose_sigma_10urad=message.pose_sigma_10urad,
         doubts=tuple(zip(message.doubtful, map(doubt_value, message.doubts), strict=True)),
+        course=course_value(message.course) if message.HasField("course") else None,
     )
 
 

@@ -12,6 +12,7 @@ import apsw
 from gnd_map.content import AnyTile
 from gnd_map.tile_id import TileId
 from schemas.tiles import CatalogEntry
+from tile_store import sqlite_accounts as accounts
 from tile_store import sqlite_confirmation as confirmation
 from tile_store import sqlite_inbox as inbox
 from tile_store import sqlite_versions as versions
@@ -232,15 +233,15 @@ class SqliteStore:
         with self._readers.snapshot() as c:
             return confirmation.waiting_changes(c)
 
-    def named_vehicles(self) -> frozenset[str]:
-        """See `Store.named_vehicles`."""
+    def shifted_vehicles(self) -> frozenset[str]:
+        """See `Store.shifted_vehicles`."""
         with self._readers.snapshot() as c:
-            return confirmation.named_vehicles(c)
+            return accounts.shifted_vehicles(c)
 
     def vehicle_accounts(self) -> list[VehicleAccount]:
         """See `Store.vehicle_accounts`."""
         with self._readers.snapshot() as c:
-            return confirmation.accounts(c)
+            return accounts.accounts(c)
 
     def dirty_tiles(self) -> list[DirtyTile]:
         """See `Store.dirty_tiles`."""

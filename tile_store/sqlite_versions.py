@@ -7,6 +7,7 @@ from typing import Any
 import apsw
 
 from gnd_map.tile_id import TileId
+from tile_store import sqlite_accounts as accounts
 from tile_store import sqlite_confirmation as confirmation
 from tile_store import sqlite_inbox as inbox
 from tile_store.errors import StoreError, UnknownReports, UnknownVersion
@@ -50,8 +51,8 @@ def publish(
     inbox.consume(c, claim, publication.report_ids, result.version, timing)
     if publication.waiting is not None:
         confirmation.keep(c, claim.layer, claim.tile, publication.waiting)
-    if publication.shift_tests is not None:
-        confirmation.put_tests(c, claim.layer, claim.tile, publication.shift_tests, timing)
+    accounts.put_courses(c, claim.layer, claim.tile, publication.courses)
+    accounts.put_tests(c, claim.layer, claim.tile, publication.shift_tests, timing)
     return result
 
 

@@ -56,20 +56,32 @@ def waiting_totals(store: Store) -> dict[str, int]:
 
 
 def named_vehicles(store: Store) -> list[dict[str, Any]]:
-    """The vehicles whose reports are shifted again and again: their account, and one line that tells it."""
-    named = [one for one in store.vehicle_accounts() if one.is_named]
-    return [asdict(one) | {"says": naming_line(one)} for one in named]
+    """The vehicles that somebody should look at: their accounts, and one line that tells why."""
+    return [asdict(one) | {"says": naming_line(one)} for one in store.vehicle_accounts() if one.is_named]
 
 
 def naming_line(account: VehicleAccount) -> str:
     """Such as "vehicle v3: 17 of 20 tiles explained by a shift of 0.31 m (0.30 m left), 0.5°: check its mount"."""
-    along = ""
-    if account.forward_m is not None and account.left_m is not None:
-        sides = (_side(account.forward_m, "forward", "back"), _side(account.left_m, "left", "right"))
-        along = f" ({', '.join(sides)})"
-    shift = f"{account.length_m:.2f} ± {account.length_sd_m:.2f} m{along}, {degrees(account.turn_rad):.1f}°"
-    tiles = f"{account.explained} of {account.tested} tiles explained by a shift of {shift}"
-    return f"vehicle {account.vehicle}: {tiles}: check its mount"
+    says = []
+    if account.is_shifted:
+        shift = (
+            f"{account.length_m:.2f} ± {account.length_sd_m:.2f} m{_along(account)}, {degrees(account.turn_rad):.1f}°"
+        )
+        says.append(f"{account.explained} of {account.tested} tiles explained by a shift of {shift}")
+    if account.is_turned:
+        turn = f"{abs(degrees(account.course_rad)):.2f} ± {degrees(account.course_sigma_rad):.2f}°"
+        side = "left" if account.course_rad > 0 else "right"
+        says.append(
+            f"drives {turn} to the {side} of its own heading, by its reports about {account.course_tiles} tiles"
+        )
+    return f"vehicle {account.vehicle}: {'; '.join(says)}: check its mount"
+
+
+def _along(account: VehicleAccount) -> str:
+    if account.forward_m is None or account.left_m is None:
+        return ""
+    sides = (_side(account.forward_m, "forward", "back"), _side(account.left_m, "left", "right"))
+    return f" ({', '.join(sides)})"
 
 
 def _side(length_m: float, ahead: str, behind: str) -> str:

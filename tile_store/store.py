@@ -111,13 +111,13 @@ class Store(Protocol):
     def waiting_changes(self) -> list[WaitingChange]:
         """What single vehicles claim and nobody has confirmed, by layer, tile, vehicle and reason."""
 
-    def named_vehicles(self) -> frozenset[str]:
+    def shifted_vehicles(self) -> frozenset[str]:
         """The vehicles whose reports are explained by shifts again and again. When one comes or goes, all tiles that it
         has reported about wait to be merged again.
         """
 
     def vehicle_accounts(self) -> list[VehicleAccount]:
-        """What the shift tests say of each vehicle of which anything could be tested, by vehicle."""
+        """What shift tests and courses say of each vehicle of which there are any, by vehicle."""
 
     def dirty_tiles(self) -> list[DirtyTile]:
         """Tiles that wait to be merged, by layer and tile."""

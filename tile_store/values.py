@@ -273,8 +273,19 @@ class ShiftTest:
 
 
 @dataclass(frozen=True, slots=True)
+class CourseSaid:
+    """Where a vehicle drives in its own frame, as its report says: what its LiDAR's mount is turned by, rad."""
+
+    report_id: str
+    vehicle: str
+    at_ns: int
+    turn_rad: float
+    sigma_rad: float
+
+
+@dataclass(frozen=True, slots=True)
 class VehicleAccount:
-    """What the shift tests say about one vehicle.
+    """What shift tests and courses say about one vehicle.
 
     Attributes:
         vehicle: its pseudonym.
@@ -285,7 +296,12 @@ class VehicleAccount:
         turn_rad: mean turn.
         forward_m: mean along the vehicle's axes, of the tests that tell it; None: none does.
         left_m: the same.
-        is_named: the reports are shifted again and again.
+        is_shifted: its reports are shifted again and again; what it alone claims waits.
+        course_tiles: tiles of the newest reports that tell its course, ...
+        course_rad: ... which on the mean runs so much to the left of its heading, ...
+        course_sigma_rad: ... known to so much.
+        is_turned: its LiDAR's mount is turned against what it believes. Its points lie where they should all the same,
+            as they were matched with the map: only its heading is wrong.
     """
 
     vehicle: str
@@ -296,7 +312,16 @@ class VehicleAccount:
     turn_rad: float
     forward_m: float | None
     left_m: float | None
-    is_named: bool
+    is_shifted: bool
+    course_tiles: int = 0
+    course_rad: float = 0.0
+    course_sigma_rad: float = 0.0
+    is_turned: bool = False
+
+    @property
+    def is_named(self) -> bool:
+        """Whether somebody should look at the vehicle."""
+        return self.is_shifted or self.is_turned
 
 
 @dataclass(frozen=True, slots=True)
@@ -321,7 +346,8 @@ class Publication:
 
     `report_ids` are the reports that it comes from. `voxel_reports` names them for each changed voxel, or by the id of
     each changed feature, when known. `waiting` is what the reports claim and the content has not;
-    None: as before. `shift_tests` are those of this tile's reports, all of them; None: as before.
+    None: as before. `shift_tests` and `courses` are those of this tile's reports, which add to the accounts
+    of their vehicles.
     The store numbers versions itself: it publishes `base_version + 1`, whatever `tile.version` says.
     """
 
@@ -332,7 +358,8 @@ class Publication:
     report_ids: tuple[str, ...] = ()
     voxel_reports: Mapping[int, tuple[str, ...]] = field(default_factory=dict)
     waiting: tuple[Unconfirmed, ...] | None = None
-    shift_tests: tuple[ShiftTest, ...] | None = None
+    shift_tests: tuple[ShiftTest, ...] = ()
+    courses: tuple[CourseSaid, ...] = ()
 
     def __post_init__(self) -> None:
         if self.tile is not None and self.tile.tile_id != self.claim.tile:

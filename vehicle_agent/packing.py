@@ -62,6 +62,7 @@ def pack(report: ChangeReport, bases: Bases, track: Track) -> PackedReport:
         pose_sigma_tenth_mm=_steps_up(max(change.pose_sigma_m for change in report.tiles), _STEPS_PER_M),
         pose_sigma_10urad=_steps_up(max(change.pose_sigma_rad for change in report.tiles), _STEPS_PER_RAD),
         doubts=tuple((index, doubt) for index, doubt in doubts if doubt is not None),
+        course=report.course,
     )
 
 

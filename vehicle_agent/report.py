@@ -2,7 +2,7 @@
 
 import logging
 from collections import Counter
-from collections.abc import Collection
+from collections.abc import Callable, Collection
 from dataclasses import dataclass, field, replace
 from importlib.metadata import version
 from typing import Any
@@ -16,6 +16,7 @@ from gnd_map.errors import GndError
 from gnd_map.tile import Tile
 from gnd_map.tile_id import District, TileId
 from schemas.changes import ChangeReport, TileChange
+from schemas.course import Course
 from schemas.keys import change_key
 from schemas.report_id import deterministic_report_id
 from vehicle_agent.config import ReportParameters
@@ -89,11 +90,18 @@ class Reporter:
 
     Report ids are made of vehicle, drive, district and the report's number in it, so a restarted agent, which drives
     its recording again, makes the same ids. New Gaussians are moved onto the lattice that they travel on, so that the
-    short form of a report and the whole one say the same, to the bit.
+    short form of a report and the whole one say the same, to the bit. `course` gives where the vehicle drives in its
+    own frame, as far as it knows.
     """
 
     def __init__(
-        self, detector: ChangeDetector, outbox: Outbox, identity: Identity, start_ns: int, parameters: ReportParameters
+        self,
+        detector: ChangeDetector,
+        outbox: Outbox,
+        identity: Identity,
+        start_ns: int,
+        parameters: ReportParameters,
+        course: Callable[[], Course | None] = lambda: None,
     ) -> None:
         self.classes: Counter[str] = Counter()
         self.counts: Counter[str] = Counter()
@@ -101,7 +109,7 @@ class Reporter:
         """Tiles by reason of doubt."""
         self.largest_shift = LargestShift()
         self._detector, self._outbox, self._who = detector, outbox, identity
-        self._start_ns, self._parameters = start_ns, parameters
+        self._start_ns, self._parameters, self._course = start_ns, parameters, course
         self._pending: dict[District, _Pending] = {}
         self._numbers: Counter[District] = Counter()
         self._stretch: _Stretch | None = None
@@ -317,6 +325,7 @@ class Reporter:
             last_ns=stretch.last_ns,
             tiles=tuple(change for _, change in sorted(pending.changes.items())),
             layer=who.layer,
+            course=self._course(),
         )
 
 

@@ -12,6 +12,7 @@ from gnd_map.geodesy import LocalFrame
 from gnd_map.grid import GridFrame
 from gnd_map.tile import Tile
 from gnd_map.tile_id import TileId
+from schemas.course import Course
 from schemas.drive import Detections, DriveHeader, DriveItem, GnssFix, MotionSample, ReferencePose, Scan
 from schemas.drive_mcap import read_drive, read_header
 from schemas.errors import SchemaError
@@ -42,6 +43,7 @@ COUNTS = (
 )  # fmt: skip
 """What the reporter counts, as `result.json` names it."""
 
+KNOWN_COURSE_RAD = 1e-3
 _log = logging.getLogger(__name__)
 
 
@@ -272,6 +274,7 @@ def _assemble(
     local_map = LocalMap(GridFrame.around(frame, [TileId.from_geodetic(fix.lat_rad, fix.lon_rad)]))
     detector = ChangeDetector(local_map, config.detect)
     surroundings = Surroundings(local_map, link.fetcher, detector, config.download)
+    localiser = Localiser(local_map, header.T_vehicle_lidar, config.localise)
     return Vehicle(
         config=config,
         header=header,
@@ -279,13 +282,20 @@ def _assemble(
         link=link,
         surroundings=surroundings,
         updates=Updates(link.bus, link.cache, link.fetcher, surroundings.replace),
-        localiser=Localiser(local_map, header.T_vehicle_lidar, config.localise),
+        localiser=localiser,
         segmenter=MotionSegmenter(config.segment),
-        reporter=Reporter(detector, link.outbox, identity, fix.t_ns, config.report),
+        reporter=Reporter(
+            detector, link.outbox, identity, fix.t_ns, config.report, lambda: known_course(*localiser.course)
+        ),
         place=Place(frame, fix),
         evaluation=Evaluation.between(frame, header.anchor),
         features=features,
     )
+
+
+def known_course(turn_rad: float, sigma_rad: float) -> Course | None:
+    """The course as a report tells it; None while it is not known well."""
+    return Course.of(turn_rad, sigma_rad) if sigma_rad < KNOWN_COURSE_RAD else None
 
 
 def first_fix(config: AgentConfig) -> GnssFix:

@@ -158,17 +158,17 @@ def test_who_shifts_again_and_again_is_named_and_what_it_alone_claims_is_taken_b
     put(store, few_changes(1, "car"))
     merge_all(store)
     assert store.get("ndt", TILE).version == 2
-    assert store.named_vehicles() == frozenset()
+    assert store.shifted_vehicles() == frozenset()
     for number in (2, 3, 4):
-        assert store.named_vehicles() == frozenset()
+        assert store.shifted_vehicles() == frozenset()
         put(store, report_of(number, SHIFTED, vehicle="car"))
         merge_all(store)
-    assert store.named_vehicles() == {"car"}
+    assert store.shifted_vehicles() == {"car"}
     assert store.dirty_count() == 0
     assert store.get("ndt", TILE).sha == sha_of(BASE)  # its tiles were merged again with what is known now
     assert {one.reason for one in store.waiting_changes()} == {"shift", "named"}
     (account,) = store.vehicle_accounts()
-    assert (account.explained, account.tested, account.is_named) == (3, 3, True)
+    assert (account.explained, account.tested, account.is_shifted) == (3, 3, True)
     assert account.length_m == pytest.approx(np.hypot(0.3, 0.1), abs=0.04)
     put(store, few_changes(7, "another"))
     merge_all(store)
@@ -178,10 +178,10 @@ def test_who_shifts_again_and_again_is_named_and_what_it_alone_claims_is_taken_b
 def test_a_vehicle_that_was_repaired_is_named_no_more(store):
     put(store, *(report_of(n, SHIFTED, vehicle="car") for n in range(3)))
     merge_all(store)
-    assert store.named_vehicles() == {"car"}
+    assert store.shifted_vehicles() == {"car"}
     put(store, *(report_of(n, REBUILT, vehicle="car") for n in range(10, 14)))
     merge_all(store)
-    assert store.named_vehicles() == frozenset()
+    assert store.shifted_vehicles() == frozenset()
 
 
 def test_the_order_of_reports_decides_nothing_in_the_end(tmp_path):

@@ -111,35 +111,57 @@ CREATE TABLE IF NOT EXISTS shift_test (
 ) STRICT, WITHOUT ROWID;
 CREATE INDEX IF NOT EXISTS shift_test_vehicle ON shift_test (vehicle, at_ns);
 
+-- Where vehicles drive in their own frames, as their reports say.
+CREATE TABLE IF NOT EXISTS course_said (
+  layer     TEXT    NOT NULL,
+  tile      INTEGER NOT NULL,
+  report_id TEXT    NOT NULL,
+  vehicle   TEXT    NOT NULL,
+  at_ns     INTEGER NOT NULL,
+  turn_rad  REAL    NOT NULL,
+  sigma_rad REAL    NOT NULL,
+  PRIMARY KEY (layer, tile, report_id)
+) STRICT, WITHOUT ROWID;
+CREATE INDEX IF NOT EXISTS course_said_vehicle ON course_said (vehicle, at_ns);
+
 -- The vehicles whose reports are shifted again and again: of them the merges of all their tiles know.
-CREATE TABLE IF NOT EXISTS named_vehicle (
+CREATE TABLE IF NOT EXISTS shifted_vehicle (
   vehicle  TEXT    NOT NULL PRIMARY KEY,
   since_ns INTEGER NOT NULL
 ) STRICT, WITHOUT ROWID;
 
 -- name: has_schema_of_confirmation
-SELECT 1 FROM sqlite_schema WHERE type = 'table' AND name = 'named_vehicle'
+SELECT 1 FROM sqlite_schema WHERE type = 'table' AND name = 'shifted_vehicle'
 
 -- name: put_shift_test
 INSERT INTO shift_test (layer, tile, report_id, vehicle, at_ns, explained, length_m, turn_rad, forward_m, left_m)
 VALUES (:layer, :tile, :report_id, :vehicle, :at_ns, :explained, :length_m, :turn_rad, :forward_m, :left_m)
 ON CONFLICT (layer, tile, report_id) DO UPDATE SET explained = excluded.explained
 
--- name: tested_vehicles
-SELECT DISTINCT vehicle FROM shift_test ORDER BY vehicle
+-- name: put_course
+INSERT INTO course_said (layer, tile, report_id, vehicle, at_ns, turn_rad, sigma_rad)
+VALUES (:layer, :tile, :report_id, :vehicle, :at_ns, :turn_rad, :sigma_rad)
+ON CONFLICT (layer, tile, report_id) DO NOTHING
+
+-- name: courses_of_vehicle
+SELECT turn_rad, sigma_rad FROM course_said WHERE vehicle = :vehicle
+ORDER BY at_ns DESC, layer, tile, report_id LIMIT :n
+
+-- name: accounted_vehicles
+SELECT vehicle FROM shift_test UNION SELECT vehicle FROM course_said ORDER BY vehicle
 
 -- name: shift_tests_of_vehicle
 SELECT explained, length_m, turn_rad, forward_m, left_m FROM shift_test WHERE vehicle = :vehicle
 ORDER BY at_ns DESC, layer, tile, report_id LIMIT :n
 
--- name: named_vehicles
-SELECT vehicle FROM named_vehicle ORDER BY vehicle
+-- name: shifted_vehicles
+SELECT vehicle FROM shifted_vehicle ORDER BY vehicle
 
--- name: name_vehicle
-INSERT INTO named_vehicle (vehicle, since_ns) VALUES (:vehicle, :since_ns) ON CONFLICT (vehicle) DO NOTHING
+-- name: distrust_vehicle
+INSERT INTO shifted_vehicle (vehicle, since_ns) VALUES (:vehicle, :since_ns) ON CONFLICT (vehicle) DO NOTHING
 
--- name: unname_vehicle
-DELETE FROM named_vehicle WHERE vehicle = :vehicle
+-- name: trust_vehicle
+DELETE FROM shifted_vehicle WHERE vehicle = :vehicle
 
 -- name: tiles_of_vehicle
 SELECT DISTINCT r.layer, r.tile FROM report AS r LEFT JOIN tile_head AS h USING (layer, tile)

@@ -53,6 +53,11 @@ class MotionTeacher:
         return float(np.sqrt(self._scale_var)), float(np.sqrt(self._bias_var))
 
     @property
+    def course(self) -> tuple[float, float]:
+        """Where the vehicle drives in its own frame, as learnt so far: angle to its x axis and its sigma, rad."""
+        return float(self._motion.course[0]), float(np.sqrt(self._course_var))
+
+    @property
     def trim_rad(self) -> float:
         """What the heading is turned by so that the rear axle runs along it, once that is known; 0 when it is not, or
         when it is so much that the recording's vehicle frame means something else than the axle.

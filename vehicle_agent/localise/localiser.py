@@ -118,6 +118,11 @@ class Localiser:
         if np.isfinite([fix.lat_rad, fix.lon_rad, fix.height_m, fix.sigma_m]).all() and fix.sigma_m > 0:
             self._fix = fix
 
+    @property
+    def course(self) -> tuple[float, float]:
+        """Where the vehicle drives in its own frame, as learnt so far: angle to its x axis and its sigma, rad."""
+        return self._teacher.course
+
     def push_scan(self, scan: Scan) -> list[RefinedScan]:
         """Take a scan; give the scans whose poses became final, oldest first. A scan that is empty, or not later than
         the one before, is dropped and counted.
