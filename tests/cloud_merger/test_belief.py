@@ -15,9 +15,11 @@ from cloud_merger.statements import Report
 from cloud_merger.work import Worker
 from gnd_map.tile import Tile
 from schemas.changes import split
+from schemas.course import Course
 from schemas.doubt import Doubt, DoubtReason
 from tile_store.sqlite_store import SqliteStore
-from tile_store.values import ReportRow, StoreConfig
+from tile_store.status import named_vehicles, naming_line
+from tile_store.values import ReportRow, StoreConfig, VehicleAccount
 
 BASE = mapped(street(0))
 OFF = displaced(street(1), 0.3, 0.1)
@@ -202,3 +204,32 @@ def test_the_order_of_reports_decides_nothing_in_the_end(tmp_path):
                     merge_all(store)
                 ends.append((store.get("ndt", TILE).sha, store.waiting_changes(), store.vehicle_accounts()))
     assert all(end == ends[0] for end in ends)
+
+
+def with_course(number, turn_deg, vehicle, sigma_rad=2e-4):
+    course = Course.of(np.radians(turn_deg), sigma_rad)
+    return replace(report_of(number, HONEST, vehicle=vehicle), course=course)
+
+
+def test_who_drives_beside_its_heading_is_named_and_believed_all_the_same(store):
+    put(store, with_course(1, 0.52, "turned"), with_course(2, 0.04, "straight"), with_course(3, 0.52, "unsure", 3e-3))
+    put(store, replace(few_changes(4, "turned"), course=Course.of(np.radians(0.52), 2e-4)))
+    merge_all(store)
+    named = {one.vehicle for one in store.vehicle_accounts() if one.is_named}
+    assert named == {"turned"}
+    (told,) = named_vehicles(store)
+    assert (told["is_turned"], told["is_shifted"], told["course_tiles"]) == (True, False, 2)
+    assert told["says"] == (
+        "vehicle turned: drives 0.52 ± 0.01° to the left of its own heading, by its reports about 2 tiles: "
+        "check its mount"
+    )
+    assert store.shifted_vehicles() == frozenset()
+
+
+def test_the_line_about_a_shifted_vehicle_tells_how_far_and_where_to():
+    account = VehicleAccount("v3", 20, 17, 0.31, 0.02, np.radians(0.5), 0.02, 0.309, True)
+    assert naming_line(account) == (
+        "vehicle v3: 17 of 20 tiles explained by a shift of 0.31 ± 0.02 m (0.02 m forward, 0.31 m left), 0.5°: "
+        "check its mount"
+    )
+    assert "(" not in naming_line(replace(account, forward_m=None, left_m=None))

@@ -15,6 +15,7 @@ from gnd_map.gaussian import Gaussians
 from gnd_map.tile import Tile, TileDelta
 from gnd_map.tile_id import TileId
 from schemas.changes import ChangeAck, ChangeReport, TileChange
+from schemas.course import Course
 from schemas.doubt import Doubt, DoubtReason
 from schemas.packed import PackedGaussians, PackedReport, digest_of
 from schemas.report_id import deterministic_report_id
@@ -168,6 +169,7 @@ GOLDEN: dict[str, Any] = {
     "ChangeReport-nothing_changed": report(tiles=(change(changed=Gaussians.empty()),)),
     "ChangeReport-nothing_observed": report(tiles=(change(changed=Gaussians.empty(), observed=np.empty(0, np.int32)),)),
     "ChangeReport-doubtful": report(tiles=(change(doubt=SHIFTED, **NOTHING), change(EAST, doubt=MUCH))),
+    "ChangeReport-course": report(course=Course(-910, 12)),
     "ChangeAck-stored": ChangeAck(REPORT_ID, "stored"),
     "ChangeAck-duplicate": ChangeAck(REPORT_ID, "duplicate"),
     "ChangeAck-quarantined-without_id": ChangeAck("", "quarantined", "TileChange: 3 covariances are not positive"),
@@ -201,6 +203,21 @@ GOLDEN: dict[str, Any] = {
         pose_sigma_tenth_mm=312,
         pose_sigma_10urad=107,
         doubts=((17, MUCH), (1023, Doubt(DoubtReason.POSE_NOT_CHECKED | DoubtReason.ESTIMATES_DISAGREE))),
+    ),
+    "PackedReport-course": PackedReport(
+        report_id=REPORT_ID,
+        vehicle="car-1",
+        sensor_model="VLP-16",
+        software="gnd-fleet 0.1.0",
+        first_ns=1_700_000_000_000_000_000,
+        length_ns=12_300_000_000,
+        tiles=((0, 3),),
+        base_digest=digest_of([SHA]),
+        flags=b"not looked into",
+        track=b"nor this",
+        pose_sigma_tenth_mm=312,
+        pose_sigma_10urad=107,
+        course=Course(873, 1),
     ),
     "PackedGaussians-some": PackedGaussians(REPORT_ID, b"not looked into", 0xDEADBEEF),
     "TileUpdate-merged-delta": update(),

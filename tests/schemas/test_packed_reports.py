@@ -12,6 +12,7 @@ from schema_values import GOLDEN, MUCH, REPORT_ID, SHA, SHIFTED, TILE, any_doubt
 from gnd_map.codec import encode_mask, encode_tiles
 from schemas import limits
 from schemas.changes import ChangeAck, ChangeReport
+from schemas.course import Course
 from schemas.errors import BadValue, Malformed, SchemaError, TooLarge, WrongVersion
 from schemas.generated import change_report_pb2
 from schemas.packed import PackedGaussians, PackedReport, crc_of, decode_upload, digest_of
@@ -48,6 +49,7 @@ def any_packed(draw: Any) -> PackedReport:
         pose_sigma_tenth_mm=draw(st.integers(0, 2**32 - 1)),
         pose_sigma_10urad=draw(st.integers(0, 2**32 - 1)),
         doubts=tuple((index, draw(any_doubt())) for index in doubtful),
+        course=draw(st.none() | st.builds(Course, st.integers(-314_160, 314_160), st.integers(1, 314_160))),
     )
 
 

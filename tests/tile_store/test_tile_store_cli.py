@@ -238,5 +238,7 @@ def test_status_tells_what_waits_for_whom(path: Path) -> None:
 
 def test_a_store_of_an_older_release_gets_what_it_lacks_when_it_is_opened(path: Path) -> None:
     with apsw.Connection(str(path)) as connection:
-        connection.execute("DROP TABLE waiting_change; DROP TABLE shift_test; DROP TABLE shifted_vehicle; DROP TABLE course_said")
+        connection.execute(
+            "DROP TABLE waiting_change; DROP TABLE shift_test; DROP TABLE shifted_vehicle; DROP TABLE course_said"
+        )
     assert as_json("status", path)["waiting_for_confirmation"]["tiles"] == 0
