@@ -11,11 +11,13 @@ from cloud_merger.statements import Report
 from gnd_map.gaussian import Gaussians
 from gnd_map.tile import Tile
 from gnd_map.tile_id import TileId
-from schemas.changes import ChangeReport
+from schemas.changes import ChangeReport, TileChange
+from schemas.doubt import DoubtReason
 from tile_store.store import Store
 from tile_store.values import StoredTile
 
 REMEMBERED_REPORTS: Final = 1024  # some 20 kB each
+NEW_GROUND: Final = DoubtReason.IMPLAUSIBLE_SHARE | DoubtReason.POSE_NOT_CHECKED
 REMEMBERED_TILES: Final = 512  # some 120 kB each
 
 
@@ -43,9 +45,19 @@ def report_of(body: bytes, parameters: MergeParameters) -> Report:
         vehicle=report.vehicle,
         first_ns=report.first_ns,
         last_ns=report.last_ns,
-        is_doubtful=change.doubt is not None,
+        is_doubtful=is_doubtful(change),
         course=report.course,
     )
+
+
+def is_doubtful(change: TileChange) -> bool:
+    """Whether the vehicle does not fully believe what it says. That all has changed, and that nothing could be checked,
+    is in the nature of ground that no map shows yet.
+    """
+    if change.doubt is None:
+        return False
+    excused = 0 if change.base_sha else int(NEW_GROUND)
+    return int(change.doubt.reasons) & ~excused != 0  # as numbers: reasons of a newer vehicle have no names here
 
 
 class Bases:

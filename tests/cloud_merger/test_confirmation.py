@@ -1,5 +1,7 @@
 """What one vehicle alone claims is published while it is little; more waits for a second witness."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -9,12 +11,14 @@ from merger_world import GROUND, POLE, TILE, WALL, change_of, gaussians_of, repo
 from cloud_merger.config import ShardConfig
 from cloud_merger.confirmation import ConfirmationParameters, gate
 from cloud_merger.errors import MergerError
-from cloud_merger.merge import merge_tile
+from cloud_merger.merge import MergeParameters, merge_tile
 from cloud_merger.statements import Report, statements_of
+from cloud_merger.stored import report_of as stored_report
 from cloud_merger.work import Worker
 from gnd_map.gaussian import Gaussians
 from gnd_map.tile import Tile
 from schemas.changes import split
+from schemas.doubt import Doubt, DoubtReason
 from tile_store.sqlite_store import SqliteStore
 from tile_store.values import ReportRow, StoreConfig
 
@@ -114,6 +118,23 @@ def test_new_ground_is_mapped_by_one_vehicle_unless_it_doubts_itself():
     assert published([said(1, THIRD, base=None)], epoch=empty) == sorted(THIRD)
     assert published([said(1, THIRD, base=None, doubtful=True)], epoch=empty) == []
     assert published([said(1, THIRD, base=None)], epoch=empty, named=frozenset({"car-1"})) == []
+
+
+@pytest.mark.parametrize(
+    ("reasons", "on_the_map", "on_new_ground"),
+    [
+        (DoubtReason.IMPLAUSIBLE_SHARE, True, False),
+        (DoubtReason.POSE_NOT_CHECKED, True, False),
+        (DoubtReason.HEALTH_NOT_GOOD, True, True),
+        (DoubtReason.POSE_NOT_CHECKED | DoubtReason.ESTIMATES_DISAGREE, True, True),
+        (DoubtReason(1 << 20), True, True),  # of a newer vehicle
+    ],
+)
+def test_on_new_ground_only_doubts_about_the_poses_count(reasons, on_the_map, on_new_ground):
+    for base, expected in ((EPOCH, on_the_map), (None, on_new_ground)):
+        change = replace(change_of(base, list(VOXELS), FEW), doubt=Doubt(reasons))
+        body = report_of(1, change).encode()
+        assert stored_report(body, MergeParameters()).is_doubtful == expected
 
 
 @pytest.mark.parametrize(
