@@ -30,8 +30,9 @@ class WantParameters:
         share: all that could agree with it, itself included, must hold more than this share of ξ of the votes; below 1
             because votes that come later may lift it over ξ.
         enough: so many measured Gaussians that may agree with it are enough; 0: none is ever asked for.
-        sample: where at least so many flags of a tile are outvoted, about so many of their Gaussians are asked for all
-            the same: they cannot change the map, but they tell whether the vehicle's poses are off (`shift`); 0: none.
+        sample: where at least so many flags of a tile, and most of them, are outvoted, about so many of their Gaussians
+            are asked for all the same: they cannot change the map, but they tell whether the vehicle's poses are off
+            (`shift`); 0: none.
     """
 
     share: float = 0.8
@@ -106,9 +107,9 @@ def _wanted_of_tile(own: Report, known: Known, merge: MergeParameters, want: Wan
 
 
 def _sample(outvoted: NDArray[np.bool_], n: int) -> NDArray[np.bool_]:
-    """Of at least `n` marked ones about `n`, evenly; none of fewer."""
+    """About `n` of the marked ones, evenly; none where fewer are marked, or less than half."""
     rows, chosen = np.flatnonzero(outvoted), np.zeros(len(outvoted), bool)
-    if n and len(rows) >= n:
+    if n and len(rows) >= max(n, len(outvoted) / 2):
         chosen[rows[:: len(rows) // n]] = True
     return chosen
 

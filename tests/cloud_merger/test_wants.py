@@ -130,6 +130,9 @@ def test_of_many_outvoted_flags_some_are_asked_for_to_test_the_poses():
     assert 32 <= sum(mask(change, against)) <= 50
     assert mask(change, against, WantParameters(sample=0)) == [False] * 100
     assert mask(change, against, WantParameters(sample=101)) == [False] * 100
+    half = flagged(new={3 + k: POLE for k in range(51)}, observed=range(103))
+    confirmed = known(quiet, *[half] * 4)
+    assert sum(mask(change, confirmed)) == 0, "who is right about most of it is not tested for the rest"
 
 
 def test_absurd_parameters_are_refused():
