@@ -176,10 +176,7 @@ def _fits(surfaces: _Surfaces, known: _Surfaces, tree: cKDTree, motion: F64, par
     counts; the turn of at most a degree is left out of the covariances.
     """
     place = moved(surfaces.place_m, motion)
-    distance, at = tree.query(place, k=min(_NEIGHBOURS, len(known.place_m)), distance_upper_bound=1.0)
-    distance, at = distance.reshape(len(place), -1), at.reshape(len(place), -1)
-    row, column = np.nonzero(np.isfinite(distance))
-    other = at[row, column]
+    row, other = _pairs(place, tree)
     step = place[row] - known.place_m[other]
     normal = known.normal[other]
     along = np.einsum("ni,ni->n", step, normal)[:, None] * normal
@@ -187,6 +184,13 @@ def _fits(surfaces: _Surfaces, known: _Surfaces, tree: cKDTree, motion: F64, par
     yes = np.ones(len(row), bool)
     alike = similarity(yes, np.zeros_like(step), known.cov_m2[other], yes, step, surfaces.cov_m2[row])
     return np.bincount(row, weights=alike >= parameters.fits, minlength=len(place)) > 0
+
+
+def _pairs(place: F64, tree: cKDTree) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """Each place with the base Gaussians nearest to it, within a metre: rows, base rows."""
+    distance, at = tree.query(place, k=_NEIGHBOURS, distance_upper_bound=_BESIDE_M)
+    row, column = np.nonzero(np.isfinite(distance))
+    return row, at[row, column]
 
 
 def _searched(
@@ -225,10 +229,7 @@ def _refined(begin: F64, surfaces: _Surfaces, known: _Surfaces, tree: cKDTree, p
     motion, prior = begin, np.diag([1.0, 1.0, (_HUBER_M / parameters.max_rad) ** 2])
     for _ in range(_ROUNDS):
         place = moved(surfaces.place_m, motion)
-        distance, at = tree.query(place, k=min(_NEIGHBOURS, len(known.place_m)), distance_upper_bound=1.0)
-        row, other, off = _nearest_planes(
-            place, surfaces, known, distance.reshape(len(place), -1), at.reshape(len(place), -1)
-        )
+        row, other, off = _nearest_planes(place, surfaces, known, tree)
         if len(row) < parameters.least_gaussians // 2:
             break
         normal, arm = known.normal[other], place[row]
@@ -241,11 +242,10 @@ def _refined(begin: F64, surfaces: _Surfaces, known: _Surfaces, tree: cKDTree, p
 
 
 def _nearest_planes(
-    place: F64, surfaces: _Surfaces, known: _Surfaces, distance: F64, at: NDArray[np.int64]
+    place: F64, surfaces: _Surfaces, known: _Surfaces, tree: cKDTree
 ) -> tuple[NDArray[np.int64], NDArray[np.int64], F64]:
     """Of each place the parallel plane nearest along its normal: rows, base rows, signed distances."""
-    row, column = np.nonzero(np.isfinite(distance))
-    other = at[row, column]
+    row, other = _pairs(place, tree)
     parallel = np.abs(np.einsum("ni,ni->n", surfaces.normal[row], known.normal[other])) > _PARALLEL
     parallel &= (known.flat[other] > _FLAT) & (surfaces.flat[row] > _FLAT)
     row, other = row[parallel], other[parallel]
