@@ -21,6 +21,7 @@ from gnd_map.gaussian import Gaussians
 from gnd_map.tile import TileDelta, apply
 from tile_store.values import Unconfirmed, WaitingReason
 
+VOUCHED_VOXELS = 12  # so many claims of a vehicle must others share at least before they vouch for the rest
 _NS_PER_S = 1_000_000_000
 
 
@@ -33,7 +34,8 @@ class ConfirmationParameters:
         few_share: ... or this share of what the witness saw of the tile, whichever is more, are few. Beyond that all of
             its lonely claims in the tile wait.
         vouched_share: but if at least this share of all its claims that won was made by others, too, the rest is
-            believed with it: the vehicle sees a construction site from where others do not.
+            believed with it, whatever else speaks against it: its poses were right there, and it sees a construction
+            site from where others do not.
         well_known_m: the lonely claims of a report whose poses are worse than this, beyond what the merge expects of
             all, wait however few they are.
         second_drive_s: a vehicle that comes back after so long is a second witness. Passes in a row are one: they share
@@ -147,17 +149,17 @@ def _drives(reports: Iterable[Report], second_drive_s: float, named: frozenset[s
 def _waiting_of(
     witness: _Witness, seen: int, is_new_ground: bool, parameters: ConfirmationParameters
 ) -> dict[int, WaitingReason]:
-    """The lonely claims of one vehicle that wait, and why."""
+    """The lonely claims of one vehicle that wait, and why; none where others vouch for it in this tile."""
     waits: dict[int, WaitingReason] = {}
+    if witness.shared >= max(VOUCHED_VOXELS, parameters.vouched_share * (witness.shared + len(witness.lonely))):
+        return waits
     for voxel, reports in witness.lonely.items():
         if all(report.is_doubtful for report in reports):
             waits[voxel] = "doubtful"
         elif all(report.pose_m2 > parameters.well_known_m**2 for report in reports):
             waits[voxel] = "poses"
     rest = witness.lonely.keys() - waits.keys()
-    few = max(parameters.few_voxels, parameters.few_share * seen)
-    vouched = witness.shared >= parameters.vouched_share * (witness.shared + len(witness.lonely))
-    if len(rest) > few and not vouched and not is_new_ground:
+    if len(rest) > max(parameters.few_voxels, parameters.few_share * seen) and not is_new_ground:
         waits |= dict.fromkeys(rest, "share")
     return waits
 

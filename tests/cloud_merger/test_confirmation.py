@@ -108,6 +108,9 @@ def test_what_one_sees_more_of_a_site_that_others_confirm_is_published_with_it()
     site, more = dict.fromkeys(range(100), WALL), dict.fromkeys(range(150), WALL)
     from_afar = Report("2" * 26, change_of(EPOCH, list(range(100)), site), vehicle="other")
     assert published([said(1, more), from_afar]) == sorted(more)
+    unsure = said(1, more, doubtful=True, pose_m2=0.2**2)
+    assert published([unsure, from_afar]) == sorted(more), "others have confirmed its poses"
+    assert published([unsure, from_afar], named=frozenset({"car-1"})) == sorted(site)
     little = dict.fromkeys(range(10), WALL)
     from_afar = Report("2" * 26, change_of(EPOCH, list(range(10)), little), vehicle="other")
     assert published([said(1, more), from_afar]) == sorted(little)
@@ -153,7 +156,7 @@ def plain_waits(epoch, merged, reports, few):
     for vehicle in {report.vehicle for report in reports}:
         alone = {voxel for voxel, who in witnesses.items() if who == {vehicle}}
         together = {voxel for voxel, who in witnesses.items() if vehicle in who} - alone
-        if len(alone) > few and len(together) < 0.5 * (len(together) + len(alone)):
+        if len(alone) > few and len(together) < max(12, 0.5 * (len(together) + len(alone))):
             waits |= alone
     return waits
 
