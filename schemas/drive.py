@@ -7,7 +7,7 @@ UTC.
 import math
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
-from typing import Final, NamedTuple, TypeVar
+from typing import Final, Literal, NamedTuple, TypeVar, get_args
 
 import numpy as np
 import numpy.typing as npt
@@ -32,6 +32,16 @@ from schemas.wire import (
 U32 = npt.NDArray[np.uint32]
 U16 = npt.NDArray[np.uint16]
 
+Deskew = Literal["unsaid", "measured", "reconstructed", "compensated", "none"]
+"""What is known of the times of points within a sweep.
+
+unsaid: an older drive, or one of the simulator; its offsets count as measured. measured: the recording gives them.
+reconstructed: found from the azimuths. compensated: the sweeps were freed of motion before they were recorded, offsets
+are zero. none: nobody knows; offsets are zero and the vehicle's motion during a sweep is in the points.
+"""
+MountSource = Literal["unsaid", "given", "estimated", "assumed"]
+"""Where the mount comes from: the recording gives it, it was estimated from the scans, or nothing is known."""
+
 _RIGID_TOLERANCE: Final = 1e-6
 _TIME_BITS: Final = 63
 
@@ -43,6 +53,20 @@ def check_rigid(name: str, T: F64) -> None:
     off = max(np.abs(T[:3, :3] @ T[:3, :3].T - np.eye(3)).max(), np.abs(T[3] - [0, 0, 0, 1]).max())
     if off > _RIGID_TOLERANCE or np.linalg.det(T[:3, :3]) < 0:
         raise BadValue(f"{name} is not a rigid transform: off by {off:.3g}, tolerance {_RIGID_TOLERANCE}")
+
+
+def _check_known(name: str, value: str, known: tuple[str, ...]) -> None:
+    if value not in known:
+        raise BadValue(f"{name} {value!r} is not known; known are {', '.join(known)}")
+
+
+class MountSigma(NamedTuple):
+    """One sigma of an estimated mount; infinite where the scans did not tell (the value is then 0)."""
+
+    height_m: float
+    roll_rad: float
+    pitch_rad: float
+    yaw_rad: float
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -61,12 +85,27 @@ class DriveHeader:
     """(4, 4) mount: p_vehicle = T_vehicle_lidar @ p_lidar."""
     source: str = ""
     """Where the recording comes from, and its licence."""
+    deskew: Deskew = "unsaid"
+    """Whether the points' times are known; see `Deskew`."""
+    sweep_ns: int = 0
+    """How long a sweep lasts; 0 where the drive does not say."""
+    mount: MountSource = "unsaid"
+    """Where `T_vehicle_lidar` comes from; see `MountSource`."""
+    mount_sigma: MountSigma | None = None
+    """How far the mount is known, where it was estimated."""
 
     def __post_init__(self) -> None:
         check_text("drive id", self.drive_id, VEHICLE_PATTERN)
         check_text("vehicle", self.vehicle, VEHICLE_PATTERN)
         check_text("sensor model", self.sensor_model, PRINTABLE_PATTERN)
         check_rigid("T_vehicle_lidar", self.T_vehicle_lidar)
+        _check_known("deskew", self.deskew, get_args(Deskew))
+        _check_known("mount", self.mount, get_args(MountSource))
+        check_unsigned("sweep time", self.sweep_ns, bits=_TIME_BITS)
+        if (self.mount_sigma is not None) != (self.mount == "estimated"):
+            raise BadValue(f"mount {self.mount!r} with sigma {self.mount_sigma}: an estimated mount has one, no other")
+        if self.mount_sigma is not None and not all(sigma >= 0 for sigma in self.mount_sigma):
+            raise BadValue(f"sigma of the mount {self.mount_sigma}: all at least 0 are needed")
 
     def __eq__(self, other: object) -> bool:
         return isinstance(other, DriveHeader) and self._scalars == other._scalars and self._same_mount(other)
@@ -75,7 +114,8 @@ class DriveHeader:
 
     @property
     def _scalars(self) -> tuple[object, ...]:
-        return self.drive_id, self.vehicle, self.sensor_model, self.anchor, self.source
+        told = self.drive_id, self.vehicle, self.sensor_model, self.anchor, self.source
+        return (*told, self.deskew, self.sweep_ns, self.mount, self.mount_sigma)
 
     def _same_mount(self, other: "DriveHeader") -> bool:
         return np.array_equal(self.T_vehicle_lidar, other.T_vehicle_lidar)

@@ -1,12 +1,16 @@
-"""The header of a drive as the metadata record of its MCAP file."""
+"""The header of a drive as the metadata record of its MCAP file.
+
+What older programs did not write (`deskew`, `sweep_ns`, `mount`, `mount_sigma`) is only written where it says something,
+and may be missing: such files keep their bytes.
+"""
 
 import zlib
 from collections.abc import Mapping
-from typing import Final
+from typing import Any, Final
 
 from gnd_map.arrays import F64
 from gnd_map.geodesy import LocalFrame
-from schemas.drive import DriveHeader
+from schemas.drive import DriveHeader, MountSigma
 from schemas.errors import DriveError
 
 METADATA: Final = "gnd.drive"
@@ -31,8 +35,31 @@ def metadata_of(header: DriveHeader) -> dict[str, str]:
         "map_anchor_lon_rad": repr(float(header.anchor.lon_rad)),
         "map_anchor_height_m": repr(float(header.anchor.height_m)),
         "source": header.source,
+        **_newer_fields(header),
     }
     return fields | {"crc32": _crc_of(fields)}
+
+
+def _newer_fields(header: DriveHeader) -> dict[str, str]:
+    sigma = header.mount_sigma
+    fields = {
+        "deskew": "" if header.deskew == "unsaid" else header.deskew,
+        "sweep_ns": str(header.sweep_ns) if header.sweep_ns else "",
+        "mount": "" if header.mount == "unsaid" else header.mount,
+        "mount_sigma": " ".join(repr(float(one)) for one in sigma) if sigma else "",
+    }
+    return {key: value for key, value in fields.items() if value}
+
+
+def _newer_values(metadata: Mapping[str, str]) -> dict[str, Any]:
+    """What `_newer_fields` wrote; `DriveError` where it is no number, `BadValue` comes from the header itself."""
+    try:
+        sweep_ns = int(metadata.get("sweep_ns", "0"))
+        sigma = MountSigma(*map(float, metadata["mount_sigma"].split())) if "mount_sigma" in metadata else None
+    except (ValueError, TypeError) as error:
+        raise DriveError(f"metadata {METADATA!r}: sweep time or sigma of the mount is no number: {error}") from error
+    told = {key: metadata[key] for key in ("deskew", "mount") if key in metadata}
+    return {**told, "sweep_ns": sweep_ns, "mount_sigma": sigma}
 
 
 def _crc_of(fields: Mapping[str, str]) -> str:
@@ -56,4 +83,5 @@ def header_of(metadata: Mapping[str, str], T_vehicle_lidar: F64) -> DriveHeader:
         anchor=LocalFrame(*anchor),
         T_vehicle_lidar=T_vehicle_lidar,
         source=metadata["source"],
+        **_newer_values(metadata),
     )

@@ -6,7 +6,7 @@ half maps, the other half can drive on.
 
 from collections import deque
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Final
 
@@ -20,11 +20,14 @@ from schemas.drive_mcap import DriveWriter
 from vehicle_agent.errors import ImportDriveError
 from vehicle_agent.importers.apollo import open_apollo
 from vehicle_agent.importers.cleaning import MAX_RANGE_M, Cleaned, cleaned
+from vehicle_agent.importers.deskewing import with_times
 from vehicle_agent.importers.detect_format import format_of
 from vehicle_agent.importers.kitti import open_kitti
 from vehicle_agent.importers.lidar_odometry import Progress, lidar_odometry
 from vehicle_agent.importers.mcap_clouds import open_mcap_clouds
+from vehicle_agent.importers.mounting import levelled, with_mount
 from vehicle_agent.importers.pcd import open_pcd
+from vehicle_agent.importers.planes import open_planes
 from vehicle_agent.importers.radiate import open_radiate
 from vehicle_agent.importers.recording import GNSS_SIGMA_M, Anchor, Recording
 from vehicle_agent.importers.splits import chosen_scans
@@ -36,6 +39,7 @@ FORMATS: Final[dict[str, Callable[[Path, Anchor | None], Recording]]] = {
     "radiate": open_radiate,
     "pcd": open_pcd,
     "mcap": open_mcap_clouds,
+    "planes": open_planes,
     "apollo": open_apollo,
 }
 AUTO: Final = "auto"
@@ -85,7 +89,7 @@ def import_recording(
     """Write the drive `out` (MCAP) from a recording; tell what was written and what was left out.
 
     Args:
-        kind: "kitti", "radiate", "pcd", "mcap", "apollo", or "auto" to find out.
+        kind: "kitti", "radiate", "pcd", "mcap", "planes", "apollo", or "auto" to find out.
         folder: of the recording (or its file); see the readers for what it must hold.
         out: file to write.
         scans: which scans; see `chosen_scans`.
@@ -100,7 +104,8 @@ def import_recording(
     """
     recording = open_recording(kind, folder, anchor, topic)
     chosen_scans(scans, len(recording))  # a wrong rule is told before the long work
-    return write_drive(recording, map_track(recording, progress), out, scans, vehicle, progress)
+    recording, track = prepared(recording, progress)
+    return write_drive(recording, track, out, scans, vehicle, progress)
 
 
 def open_recording(kind: str, folder: Path, anchor: Anchor | None = None, topic: str | None = None) -> Recording:
@@ -146,16 +151,43 @@ def _header(recording: Recording, drive_id: str, vehicle: str) -> DriveHeader:
         anchor=recording.anchor.frame,
         T_vehicle_lidar=recording.T_vehicle_lidar,
         source=recording.source,
+        deskew=recording.deskew,
+        sweep_ns=recording.sweep_ns,
+        mount=recording.mount,
+        mount_sigma=recording.mount_sigma,
     )
+
+
+def prepared(recording: Recording, progress: Progress = no_progress) -> tuple[Recording, Trajectory]:
+    """A recording with times of points and a mount, found where it gives none, and T_map_vehicle of every scan.
+
+    Raises:
+        ImportDriveError: scans that do not fit each other.
+    """
+    recording = _with_times(levelled(recording))
+    if recording.track is not None:
+        recording, track = with_mount(recording, recording.track)
+        return replace(recording, track=track), track
+    recording, track = with_mount(recording, lidar_odometry(recording, progress))
+    track = Trajectory(track.t_ns, T_inverse(track.T_dst_vehicle[0]) @ track.T_dst_vehicle)
+    return recording, _over_the_fixes(recording, track)
+
+
+def _with_times(recording: Recording) -> Recording:
+    """Times of points where the recording gives none and they can be found; what was found joins the notes."""
+    found, verdict = with_times(recording)
+    return replace(found, notes=(*found.notes, verdict.note)) if verdict.note else found
 
 
 def map_track(recording: Recording, progress: Progress = no_progress) -> Trajectory:
     """T_map_vehicle of every scan: the recording's own track, else LiDAR odometry laid over the fixes."""
     if recording.track is not None:
         return recording.track
-    track = lidar_odometry(recording, progress)
-    T_map_first = _T_map_first(recording, track)
-    return Trajectory(track.t_ns, T_map_first @ track.T_dst_vehicle)
+    return _over_the_fixes(recording, lidar_odometry(recording, progress))
+
+
+def _over_the_fixes(recording: Recording, track: Trajectory) -> Trajectory:
+    return Trajectory(track.t_ns, _T_map_first(recording, track) @ track.T_dst_vehicle)
 
 
 def _T_map_first(recording: Recording, track: Trajectory) -> F64:

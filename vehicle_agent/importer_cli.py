@@ -26,7 +26,7 @@ def import_drives(
     kind: str, folder: Path, out: Path, scans: str, anchor: str | None, vehicle: str, topic: str | None
 ) -> None:
     """Turn a recording into a drive (MCAP): FORMAT is kitti, radiate, pcd, mcap (ROS 2 PointCloud2, Foxglove clouds),
-    apollo or auto, FOLDER holds the recording (or is the .mcap file).
+    planes (millimetres with an INS), apollo or auto, FOLDER holds the recording (or is the .mcap file).
     """
     with step_bars() as progress:
         imported = import_recording(

@@ -22,6 +22,7 @@ from vehicle_agent.detect.detector import ChangeDetector
 from vehicle_agent.errors import VehicleError
 from vehicle_agent.link import Link, open_link
 from vehicle_agent.local_map import LocalMap
+from vehicle_agent.localise.calibration import MotionCalibration
 from vehicle_agent.localise.estimates import RefinedScan
 from vehicle_agent.localise.localiser import Localiser
 from vehicle_agent.memory import MemoryMeter
@@ -190,6 +191,7 @@ class Vehicle:
             "features": self.features.account() if self.features is not None else {},
             "health": self.timeline.as_json(),
             "localisation": self.evaluation.errors(),
+            "calibration": self.localiser.calibration.as_json(),
             "memory_mb": self.memory.read(),
         }
 
@@ -285,7 +287,7 @@ def _assemble(
         localiser=localiser,
         segmenter=MotionSegmenter(config.segment),
         reporter=Reporter(
-            detector, link.outbox, identity, fix.t_ns, config.report, lambda: known_course(*localiser.course)
+            detector, link.outbox, identity, fix.t_ns, config.report, lambda: known_course(localiser.calibration)
         ),
         place=Place(frame, fix),
         evaluation=Evaluation.between(frame, header.anchor),
@@ -293,9 +295,9 @@ def _assemble(
     )
 
 
-def known_course(turn_rad: float, sigma_rad: float) -> Course | None:
+def known_course(known: MotionCalibration) -> Course | None:
     """The course as a report tells it; None while it is not known well."""
-    return Course.of(turn_rad, sigma_rad) if sigma_rad < KNOWN_COURSE_RAD else None
+    return Course.of(known.course_rad, known.course_sigma_rad) if known.course_sigma_rad < KNOWN_COURSE_RAD else None
 
 
 def first_fix(config: AgentConfig) -> GnssFix:

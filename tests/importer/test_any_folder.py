@@ -292,7 +292,7 @@ def broken(tmp_path: Path, what: str) -> Path:
         ("pcd", "1.pcd: 591 bytes of points, 600 announced"),
         ("mixed", "files 1 of kitti and 3 of pcd: name the format"),
         ("file", "a single file must be an .mcap"),
-        ("empty", "no scans (.bin, .bin.xz, .pcd, .pcd.xz, .mcap) below it"),
+        ("empty", "no scans (.bin, .bin.xz, .pcd, .pcd.xz, .mcap, .xyz_mm, .xyz_mm.xz) below it"),
         ("nothing", "no such file or folder"),
     ],
 )

@@ -72,7 +72,7 @@ def test_samples_out_of_order_or_not_finite_are_not_kept(bad):
 
 def test_old_samples_are_forgotten():
     buffer = driven(5.0, 0.0, seconds=100.0)
-    assert len(buffer) <= 41 * 50
+    assert len(buffer) <= 91 * 50
     assert buffer.delta(99 * S, 100 * S)[0, 3] == pytest.approx(5.0)
 
 

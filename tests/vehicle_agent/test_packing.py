@@ -23,7 +23,10 @@ from vehicle_agent.config import ReportParameters
 from vehicle_agent.detect.detector import ChangeDetector
 from vehicle_agent.errors import AgentConfigError, PackingError
 from vehicle_agent.local_map import LocalMap
+from vehicle_agent.localise.calibration import MotionTeacher
 from vehicle_agent.localise.estimates import PoseEstimate, RefinedScan
+from vehicle_agent.localise.odometry import MotionBuffer
+from vehicle_agent.localise.parameters import OdometryParameters
 from vehicle_agent.outbox import Letter, Outbox
 from vehicle_agent.packing import Bases, askable, asked_for, is_measured, pack, pack_measured
 from vehicle_agent.report import Identity, Reporter
@@ -206,5 +209,7 @@ def test_the_course_of_the_vehicle_goes_with_both_forms(tmp_path: Path, tiles: d
 
 
 def test_a_course_that_is_not_known_well_is_not_told() -> None:
-    assert known_course(0.0087, 2e-4) == Course(870, 20)
-    assert known_course(0.0087, 2e-3) is None
+    known = MotionTeacher(MotionBuffer(), OdometryParameters()).calibration
+    assert known_course(known) is None
+    assert known_course(dataclasses.replace(known, course_rad=0.0087, course_sigma_rad=2e-4)) == Course(870, 20)
+    assert known_course(dataclasses.replace(known, course_rad=0.0087, course_sigma_rad=2e-3)) is None

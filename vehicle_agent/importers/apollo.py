@@ -59,6 +59,8 @@ def open_apollo(folder: Path, anchor: Anchor | None) -> Recording:
         t_ns=t_ns,
         read=lambda i: read_scan(files[i], int(t_ns[i])),
         anchor=place,
+        deskew="compensated",
+        mount="assumed",
         track=Trajectory(t_ns, poses_from_utm(T_utm, zone, southern, place.frame)),
     )
 

@@ -7,11 +7,16 @@ from vehicle_agent.errors import ImportDriveError
 from vehicle_agent.importers.apollo import is_apollo
 from vehicle_agent.importers.files import files_below, files_of
 
-ENDINGS: Final = {"kitti": (".bin", ".bin.xz"), "pcd": (".pcd", ".pcd.xz"), "mcap": (".mcap",)}
+ENDINGS: Final = {
+    "kitti": (".bin", ".bin.xz"),
+    "pcd": (".pcd", ".pcd.xz"),
+    "mcap": (".mcap",),
+    "planes": (".xyz_mm", ".xyz_mm.xz"),
+}
 
 
 def format_of(place: Path) -> str:
-    """kitti, pcd, mcap, apollo or radiate.
+    """kitti, pcd, mcap, planes, apollo or radiate.
 
     Raises:
         ImportDriveError: nothing of the kind is there, or several kinds are.

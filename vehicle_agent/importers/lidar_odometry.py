@@ -7,7 +7,7 @@ this follows what stands (8.0 m); point-to-point neighbours (small_gicp) stayed 
 and then broke.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Final
 
 import numpy as np
@@ -71,6 +71,23 @@ def lidar_odometry(recording: Recording, progress: Progress) -> Trajectory:
     return odometry.trajectory
 
 
+def track_of_scans(recording: Recording, scans: Sequence[Scan], rough: Trajectory | None = None) -> Trajectory:
+    """The same of some scans of the recording, in their order.
+
+    Args:
+        recording: that the scans are of.
+        scans: at least two.
+        rough: the motion that they are deskewed with, where it is known; else that of the scans before each.
+
+    Raises:
+        ImportDriveError: a scan does not fit those before it, or there are fewer than two.
+    """
+    odometry = _Odometry(recording, rough)
+    for i, scan in enumerate(scans):
+        odometry.add(scan, i)
+    return odometry.trajectory
+
+
 def reference_ns(scan: Scan) -> int:
     """The middle of the sweep."""
     return scan.t_ns + int(scan.t_offset_ns.max(initial=0)) // 2
@@ -127,8 +144,8 @@ def _lies_as_a_line(gaussians: Gaussians) -> NDArray[np.bool_]:
 
 
 class _Odometry:
-    def __init__(self, recording: Recording) -> None:
-        self._recording = recording
+    def __init__(self, recording: Recording, rough: Trajectory | None = None) -> None:
+        self._recording, self._rough = recording, rough
         self._motion, self._samples = MotionBuffer(), list(reversed(recording.motion))
         self._map = _GrowingMap(recording)
         self._t_ns: list[int] = []
@@ -166,7 +183,9 @@ class _Odometry:
         return deskew(scan.points_m, scan.t_offset_ns, scan.t_ns, sweep, self._recording.T_vehicle_lidar, t_ns)
 
     def _sweep(self, scan: Scan, t_ns: int) -> Trajectory:
-        """Motion during the sweep: as measured, else the motion between the two scans before."""
+        """Motion during the sweep: as known or measured, else the motion between the two scans before."""
+        if self._rough is not None:
+            return self._rough
         end_ns = max(scan.t_ns + 1, 2 * t_ns - scan.t_ns)
         if len(self._motion):
             return self._motion.trajectory(scan.t_ns, end_ns)

@@ -1,7 +1,7 @@
 """MCAP files with point clouds: `sensor_msgs/msg/PointCloud2` of ROS 2, `foxglove.PointCloud`, and drives of our own.
 
 A recording of ROS or Foxglove gives the clouds alone: LiDAR odometry tells the track, the place is nominal unless one
-is given, the LiDAR is taken to sit at the vehicle's origin. A drive of ours keeps everything that it holds.
+is given; the mount is estimated. A drive of ours keeps everything that it holds.
 """
 
 from collections.abc import Sequence
@@ -71,6 +71,7 @@ def open_mcap_clouds(place: Path, anchor: Anchor | None, topic: str | None = Non
         read=lambda i: _read(clouds[i], chosen, schema),
         anchor=anchor or NOMINAL,
         notes=notes,
+        mount="assumed",
     )
 
 
@@ -98,6 +99,10 @@ def _own_drive(path: Path) -> Recording:
         gnss=tuple(GnssFix(int(t), *map(float, row)) for t, *row in zip(*track.gnss, strict=True)),
         motion=tuple(MotionSample(int(t), float(v), float(w)) for t, v, w in zip(*track.motion, strict=True)),
         notes=notes,
+        deskew=header.deskew,
+        sweep_ns=header.sweep_ns,
+        mount=header.mount,
+        mount_sigma=header.mount_sigma,
     )
 
 

@@ -52,6 +52,8 @@ def open_radiate(folder: Path, anchor: Anchor | None) -> Recording:
         anchor=anchor or Anchor(*map(float, gps[0, :3])),
         gnss=_fixes(gps_ns, gps),
         motion=_motion(gps_ns, gps),
+        deskew="reconstructed",
+        sweep_ns=SWEEP_NS,
     )
 
 

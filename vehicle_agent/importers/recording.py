@@ -2,6 +2,7 @@
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -9,7 +10,7 @@ from numpy.typing import NDArray
 from gnd_map.geodesy import LocalFrame
 from gnd_map.motion import Trajectory
 from gnd_map.se3 import exp_so3
-from schemas.drive import GnssFix, MotionSample, Scan
+from schemas.drive import Deskew, GnssFix, MotionSample, MountSigma, MountSource, Scan
 from vehicle_agent.errors import ImportDriveError
 from vehicle_agent.importers.cleaning import RawScan
 
@@ -44,6 +45,10 @@ class Recording:
     the vehicle was at the scans, in the map frame and consistent with the LiDAR; None: LiDAR odometry tells. gnss:
     empty where the track must give the fixes. motion: empty where it must give speed and yaw rate. notes: what
     had to be left out or put right, one sentence each.
+
+    deskew: what the recording says of the times of points; "none" lets the import find out. stamp: what `t_ns` means
+    while the times of points are not known. sweep_ns: length of a sweep; 0: the time between scans. mount: whether the
+    recording gives `T_vehicle_lidar`; "assumed" lets the import estimate it.
     """
 
     name: str
@@ -57,6 +62,11 @@ class Recording:
     gnss: tuple[GnssFix, ...] = ()
     motion: tuple[MotionSample, ...] = ()
     notes: tuple[str, ...] = ()
+    deskew: Deskew = "none"
+    stamp: Literal["begin", "middle"] = "begin"
+    sweep_ns: int = 0
+    mount: MountSource = "given"
+    mount_sigma: MountSigma | None = None
 
     def __post_init__(self) -> None:
         if len(self.t_ns) < 2:

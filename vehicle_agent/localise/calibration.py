@@ -1,12 +1,16 @@
 """What the map teaches about the vehicle's own motion sensors, and how far to trust them until it has."""
 
-from typing import NamedTuple
+from dataclasses import dataclass
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from gnd_map.se3 import T_inverse, log_so3
+from vehicle_agent.localise.clock import ClockDoubt, ClockEstimator
 from vehicle_agent.localise.drift import Drift
+from vehicle_agent.localise.estimates import Cause
+from vehicle_agent.localise.mount import DOUBTFUL_RAD, SIGMAS, MountDoubt, MountResidual, MountWatch
 from vehicle_agent.localise.odometry import MotionBuffer
 from vehicle_agent.localise.parameters import OdometryParameters
 
@@ -14,6 +18,7 @@ F64 = NDArray[np.float64]
 
 STEP_S, STRETCH_S = 0.5, 1.0
 MAX_TRIM_RAD, KNOWN_COURSE_RAD = 1.05e-3, 6e-4
+CLOCK_LASTS = 2.0  # a clock's error goes on as long as the vehicle brakes or turns: for more than the step asked about
 KEEPS = 2.0  # a stretch that is less sure than what was learnt, by more than this in variance, is not listened to
 
 
@@ -24,11 +29,68 @@ class Stamped(NamedTuple):
     T_map_vehicle: F64
 
 
+@dataclass(frozen=True, slots=True)
+class MotionCalibration:
+    """What a localiser knows of its vehicle's sensors, each with one sigma.
+
+    time_offset_s: stamps of wheels and gyro are so much later than those of the LiDAR, growing by `time_offset_rate`;
+    clock_doubt: why that is not to be relied on. wheel_scale: what the wheel speed is multiplied with. gyro_bias_radps:
+    what is taken off the yaw rate. course_rad: direction of driving straight, left of the vehicle's x axis as the
+    header's mount puts it. mount: height, roll and pitch against the header, from the ground.
+    """
+
+    time_offset_s: float
+    time_offset_sigma_s: float
+    time_offset_rate: float
+    clock_doubt: ClockDoubt
+    wheel_scale: float
+    wheel_scale_sigma: float
+    gyro_bias_radps: float
+    gyro_bias_sigma_radps: float
+    course_rad: float
+    course_sigma_rad: float
+    mount: MountResidual
+
+    def __post_init__(self) -> None:
+        sigmas = (self.time_offset_sigma_s, self.wheel_scale_sigma, self.gyro_bias_sigma_radps, self.course_sigma_rad)
+        if min(sigmas) < 0.0 or self.wheel_scale <= 0.0:
+            raise ValueError(f"sigmas must not be negative and the scale positive, got {self}")
+
+    @property
+    def mount_yaw_rad(self) -> float:
+        """Yaw of the mount against the header, from driving straight; its sigma is that of the course."""
+        return -self.course_rad
+
+    @property
+    def mount_doubtful(self) -> tuple[MountDoubt, ...]:
+        """What the header says wrongly of the mount for certain: by more than 10 cm or 0.3°."""
+        turned = abs(self.course_rad) - SIGMAS * self.course_sigma_rad > DOUBTFUL_RAD
+        return (*self.mount.doubtful, "yaw") if turned else self.mount.doubtful
+
+    def as_json(self) -> dict[str, Any]:
+        """Plain values, angles in degrees; None where nothing is known."""
+        mount = self.mount
+        return {
+            "time_offset_s": _told(self.time_offset_s, self.time_offset_sigma_s),
+            "time_offset_rate": round(self.time_offset_rate, 7),
+            "clock_doubt": self.clock_doubt,
+            "wheel_scale": _told(self.wheel_scale, self.wheel_scale_sigma),
+            "yaw_bias_degps": _told(np.degrees(self.gyro_bias_radps), np.degrees(self.gyro_bias_sigma_radps)),
+            "mount_height_m": _told(mount.height_m, mount.height_sigma_m),
+            "mount_roll_deg": _told(np.degrees(mount.roll_rad), np.degrees(mount.roll_sigma_rad)),
+            "mount_pitch_deg": _told(np.degrees(mount.pitch_rad), np.degrees(mount.pitch_sigma_rad)),
+            "mount_yaw_deg": _told(np.degrees(self.mount_yaw_rad), np.degrees(self.course_sigma_rad)),
+            "mount_doubtful": list(self.mount_doubtful),
+        }
+
+
 class MotionTeacher:
     """Learns wheel scale, gyro bias and course of a `MotionBuffer` from map matches: scalar Kalman filters."""
 
-    def __init__(self, motion: MotionBuffer, parameters: OdometryParameters) -> None:
+    def __init__(self, motion: MotionBuffer, parameters: OdometryParameters, mount: MountWatch | None = None) -> None:
         self.parameters = parameters
+        self.mount = mount or MountWatch(np.eye(4))
+        self.clock = ClockEstimator(motion)
         self._motion = motion
         self._scale_var = parameters.scale_prior**2
         self._bias_var = parameters.bias_prior_radps**2
@@ -47,15 +109,51 @@ class MotionTeacher:
         known = np.array([par.roll_pitch_rad, par.roll_pitch_rad, yaw, forward, left, up])
         return np.asarray(np.hypot(known, np.sqrt(np.maximum(self._excess_var, 0.0))))
 
+    def sigmas_between(self, first_ns: int, last_ns: int, odometry: F64) -> F64:
+        """(6,) as `sigmas`, of the motion (4, 4) between two times, with what the clock's uncertainty adds to it."""
+        sigmas = self.sigmas(odometry, (last_ns - first_ns) * 1e-9)
+        yaw_rad, forward_m = self.clock_sigmas(first_ns, last_ns)
+        sigmas[2], sigmas[3] = np.hypot(sigmas[2], yaw_rad), np.hypot(sigmas[3], forward_m)
+        return sigmas
+
+    def clock_sigmas(self, first_ns: int, last_ns: int) -> tuple[float, float]:
+        """One sigma of the turn [rad] and of the way [m] between two times that an uncertain clock makes: that of the
+        offset times what yaw rate and speed changed by.
+        """
+        speed, yaw_rate = self._motion.changes(first_ns, last_ns)
+        sigma_s = CLOCK_LASTS * self.clock.estimate.offset_sigma_s
+        return abs(yaw_rate) * sigma_s, abs(speed) * sigma_s
+
     @property
     def uncertainty(self) -> tuple[float, float]:
         """One sigma of the wheel scale, and of the gyro's bias [rad/s], as learnt so far."""
         return float(np.sqrt(self._scale_var)), float(np.sqrt(self._bias_var))
 
     @property
-    def course(self) -> tuple[float, float]:
-        """Where the vehicle drives in its own frame, as learnt so far: angle to its x axis and its sigma, rad."""
-        return float(self._motion.course[0]), float(np.sqrt(self._course_var))
+    def cause(self) -> Cause:
+        """What is wrong with the sensors whose errors are learnt, if anything."""
+        if self.mount.residual.wrong:
+            return "mount"
+        return "none" if self.clock.estimate.doubt == "none" else "clock"
+
+    @property
+    def calibration(self) -> MotionCalibration:
+        """All that is known so far."""
+        clock, motion = self.clock.estimate, self._motion
+        scale_sigma, bias_sigma = self.uncertainty
+        return MotionCalibration(
+            time_offset_s=clock.offset_s,
+            time_offset_sigma_s=clock.offset_sigma_s,
+            time_offset_rate=clock.rate,
+            clock_doubt=clock.doubt,
+            wheel_scale=float(motion.speed_scale),
+            wheel_scale_sigma=scale_sigma,
+            gyro_bias_radps=float(motion.yaw_bias_radps),
+            gyro_bias_sigma_radps=bias_sigma,
+            course_rad=float(motion.course[0]),
+            course_sigma_rad=float(np.sqrt(self._course_var)),
+            mount=self.mount.residual,
+        )
 
     @property
     def trim_rad(self) -> float:
@@ -134,6 +232,10 @@ class MotionTeacher:
         gain = self._bias_var * dt_s / (dt_s**2 * self._bias_var + sigma_rad**2)
         self._motion.yaw_bias_radps += gain * (gyro_rad - map_rad - self._motion.yaw_bias_radps * dt_s)
         self._bias_var *= 1.0 - gain * dt_s
+
+
+def _told(value: float, sigma: float) -> dict[str, float] | None:
+    return {"value": round(float(value), 6), "sigma": round(float(sigma), 6)} if np.isfinite(sigma) else None
 
 
 def _yaw(T: F64) -> float:

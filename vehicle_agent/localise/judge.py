@@ -26,7 +26,7 @@ class Matched(NamedTuple):
 
     t_ns: reference time; points_m: (N, 3) vehicle frame; T_before_now: (4, 4) motion since the scan before; T_now: (4,
     4) the tracked pose; result: the match that was made there; believed: whether it counts; motion_gap_s: how much of
-    the way since the scan before was driven without motion samples.
+    the way since the scan before was driven without motion samples; cause: what is known to be wrong besides.
     """
 
     t_ns: int
@@ -36,6 +36,7 @@ class Matched(NamedTuple):
     result: RegistrationResult | None
     believed: bool
     motion_gap_s: float = 0.0
+    cause: Cause = "none"
 
 
 class Judge:
@@ -110,7 +111,7 @@ class Judge:
         known = _known_ratio(scan, match_map) if scan.result is None else scan.result.known_ratio
         if known < self._par.causes.least_known:
             return "no_map"
-        return "no_motion" if scan.motion_gap_s > self._par.causes.motion_gap_s else "none"
+        return "no_motion" if scan.motion_gap_s > self._par.causes.motion_gap_s else scan.cause
 
 
 def _known_ratio(scan: Matched, m: MatchMap) -> float:

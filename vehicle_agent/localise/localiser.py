@@ -13,7 +13,7 @@ from gnd_map.se3 import T_from_R_t, exp_so3
 from schemas.drive import GnssFix, MotionSample, Scan
 from vehicle_agent.errors import RegistrationError
 from vehicle_agent.local_map import LocalMap
-from vehicle_agent.localise.calibration import MotionTeacher
+from vehicle_agent.localise.calibration import MotionCalibration, MotionTeacher
 from vehicle_agent.localise.estimates import Cause, Health, PoseEstimate, RefinedScan
 from vehicle_agent.localise.first_pose import FirstPose, Place
 from vehicle_agent.localise.graph import MapMatch, Odometry, PoseGraph, Position, SmoothedPose
@@ -21,14 +21,14 @@ from vehicle_agent.localise.health import HealthMonitor
 from vehicle_agent.localise.judge import Judge, Matched
 from vehicle_agent.localise.level import on_the_road, sees_tilt, settled
 from vehicle_agent.localise.match_map import MatchMapCache
+from vehicle_agent.localise.mount import MountWatch, near_points
 from vehicle_agent.localise.odometry import MotionBuffer
 from vehicle_agent.localise.packed_scan import PackedScan, pack
 from vehicle_agent.localise.parameters import LocaliserParameters
 from vehicle_agent.localise.refine import Refiner
 from vehicle_agent.localise.registration import RegistrationResult, Start, register
 from vehicle_agent.localise.sampling import sample_scan
-from vehicle_agent.localise.scan_odometry import JointStep, ScanOdometry, ScanStep, joint_step
-from vehicle_agent.localise.submap import ToldByScans
+from vehicle_agent.localise.scan_odometry import ScanOdometry, ScanStep, joint_step
 
 F64 = NDArray[np.float64]
 
@@ -36,7 +36,6 @@ MAX_GNSS_AGE_NS = 2_000_000_000
 TOLD_M, TOLD_RAD = 0.1, 0.01  # one sigma of a pose from outside
 OVERRULED: Final[tuple[Cause, ...]] = ("wrong_pose", "stale_map", "poor_place", "no_match", "unconfirmed")
 """What single scans hold against a pose and submaps may know better."""
-SURER = np.array([1.0, 1.0, 0.5, 0.3, 1.0, 1.0])  # share of the odometry's sigmas below which scans know better
 PAST_NS, MOST_FROM_PAST = 1_000_000_000, 5
 
 
@@ -92,7 +91,7 @@ class Localiser:
         self.dropped_scans = 0
         self.initialisations = 0
         self._motion = MotionBuffer()
-        self._teacher = MotionTeacher(self._motion, self.parameters.odometry)
+        self._teacher = MotionTeacher(self._motion, self.parameters.odometry, MountWatch(self.T_vehicle_lidar))
         self._map = MatchMapCache(local_map, self.parameters.registration.noise_m)
         self._scan_odometry = ScanOdometry(self.parameters.scan_odometry)
         self._fix: GnssFix | None = None
@@ -117,11 +116,6 @@ class Localiser:
         """Take a GNSS fix: it starts the search for the first pose, bounds drift, and shows a wrong pose."""
         if np.isfinite([fix.lat_rad, fix.lon_rad, fix.height_m, fix.sigma_m]).all() and fix.sigma_m > 0:
             self._fix = fix
-
-    @property
-    def course(self) -> tuple[float, float]:
-        """Where the vehicle drives in its own frame, as learnt so far: angle to its x axis and its sigma, rad."""
-        return self._teacher.course
 
     def push_scan(self, scan: Scan) -> list[RefinedScan]:
         """Take a scan; give the scans whose poses became final, oldest first. A scan that is empty, or not later than
@@ -169,6 +163,11 @@ class Localiser:
         """What is taken off the yaw rate, as learnt from the map."""
         return self._motion.yaw_bias_radps
 
+    @property
+    def calibration(self) -> MotionCalibration:
+        """What is known of clock, wheels, gyro and mount so far, with sigmas."""
+        return self._teacher.calibration
+
     # --- one scan --------------------------------------------------------------------------------------------------
 
     def _process_if_covered(self) -> None:
@@ -181,6 +180,7 @@ class Localiser:
             return
         chosen = sample_scan(scan.points_m, self.parameters.sampling)
         points = self._deskewed(scan, chosen, scan.points_m[chosen])
+        self._look_at_mount(scan)
         last_ns = scan.t_ns if self._last_ns is None else self._last_ns
         if self._track is not None and (scan.t_ns - last_ns) * 1e-9 > self.parameters.causes.lost_gap_s:
             self._lose(self._track, "gap")
@@ -190,11 +190,18 @@ class Localiser:
             self._step(self._track, scan, chosen, points)
         self._last_ns = _reference_ns(scan)
 
+    def _look_at_mount(self, scan: Scan) -> None:
+        t_ns, watch = _reference_ns(scan), self._teacher.mount
+        if watch.due(t_ns):
+            near = near_points(scan.points_m)
+            watch.see(t_ns, self._deskewed(scan, near, scan.points_m[near]))
+
     def _step(self, track: _Track, scan: Scan, chosen: NDArray[np.int64], points: F64) -> None:
         """Predict from the newest pose, match, gate, fuse."""
         t_ns, newest = _reference_ns(scan), track.graph.newest
         odometry = self._odometry(track.held[newest].t_ns, t_ns)
         seen = self._scan_step(scan, chosen, points, odometry)
+        self._teacher.clock.see(track.held[newest].t_ns, t_ns, seen)
         joint = joint_step(*odometry, seen)
         sweep = self._sweep_of_steady(scan) if joint.slipped else None
         points = points if sweep is None else self._deskewed(scan, chosen, scan.points_m[chosen], sweep)
@@ -210,12 +217,12 @@ class Localiser:
         odometry = Odometry(odometry.T_before_now, joint.driven_sigmas)
         gnss, T_now = self._gnss_at(track, t_ns, predicted), predicted if match is None else match.T_map_vehicle
         unknown_s = max(self._motion.unknown_s(track.held[newest].t_ns, t_ns), self._motion.age_s(t_ns))
-        seen_scan = Matched(t_ns, points, joint.T_before_now, T_now, result, believed, unknown_s)
+        seen_scan = Matched(t_ns, points, joint.T_before_now, T_now, result, believed, unknown_s, self._teacher.cause)
         track.judge.see(seen_scan, self._map.near(T_now[:3, 3]))
         final = track.graph.add(t_ns, predicted, odometry, match or self._settled(predicted), gnss, seen)
         self._hold(track, scan, result.matching_ratio if result is not None else 0.0, sweep)
         if track.refiner is not None:
-            final = self._refine(track, track.refiner, t_ns, points, _told_by_scans(joint, seen))
+            final = self._refine(track, track.refiner, t_ns, points, joint.T_before_now, seen)
         self._finalise(track, final)
         if self.online is not None and self.online.health == "lost":
             self._lose(track, self.online.cause)
@@ -237,7 +244,7 @@ class Localiser:
 
     def _odometry(self, first_ns: int, last_ns: int) -> Odometry:
         delta = self._motion.delta(first_ns, last_ns)
-        return Odometry(delta, self._teacher.sigmas(delta, (last_ns - first_ns) * 1e-9))
+        return Odometry(delta, self._teacher.sigmas_between(first_ns, last_ns, delta))
 
     def _matched(
         self, monitor: HealthMonitor, points: F64, predicted: F64, sigmas: F64, t_ns: int
@@ -289,12 +296,18 @@ class Localiser:
         self.online = _estimate(pose, held)
 
     def _refine(
-        self, track: _Track, refiner: Refiner, t_ns: int, points: F64, told: ToldByScans | None = None
+        self,
+        track: _Track,
+        refiner: Refiner,
+        t_ns: int,
+        points: F64,
+        T_before_now: F64 | None = None,
+        seen: ScanStep | None = None,
     ) -> list[SmoothedPose]:
         """Give the scan to the submaps, and let what they say correct the online pose; the poses that became final."""
         number = track.graph.newest
         T_online = track.graph.pose(number)
-        final = refiner.push(number, t_ns, points, T_online, told)
+        final = refiner.push(number, t_ns, points, T_online, T_before_now, seen)
         track.judge.monitor.certain = refiner.certain
         correction = refiner.correction(T_online)
         if correction is not None:
@@ -393,6 +406,7 @@ class Localiser:
         if self._from_past < MOST_FROM_PAST:
             return
         self._motion.clear()
+        self._teacher.clock.forget()
         self._fix = self._pending = self._last_ns = None
         self._newest_scan_ns, self._from_past = -1, 0
         if self._track is not None:
@@ -456,17 +470,6 @@ def _sigmas(pose: SmoothedPose) -> tuple[float, float]:
     R, covariance = pose.T_map_vehicle[:3, :3], pose.covariance
     horizontal = (R @ covariance[3:, 3:] @ R.T)[:2, :2]
     return float(np.sqrt(np.linalg.eigvalsh(horizontal)[1])), float(np.sqrt(covariance[2, 2]))
-
-
-def _told_by_scans(joint: JointStep, seen: ScanStep | None) -> ToldByScans | None:
-    """What scans tell better of the motion since the scan before: its turn, if they are surer of it than the gyro; its
-    way, only if wheels are far worse, because those become better as more is learnt about them.
-    """
-    if seen is None:
-        return None
-    surer = np.sqrt(np.diag(seen.covariance)) < joint.driven_sigmas * SURER
-    T = joint.T_before_now
-    return ToldByScans(T[:3, :3] if surer[2] else None, T[:3, 3] if surer[3] else None)
 
 
 def _estimate(pose: SmoothedPose, held: _HeldScan) -> PoseEstimate:

@@ -1,6 +1,7 @@
 """Dead reckoning from wheel speed and yaw rate."""
 
 from bisect import bisect_left
+from dataclasses import dataclass
 from itertools import pairwise
 
 import numpy as np
@@ -11,15 +12,41 @@ from gnd_map.se3 import T_inverse
 
 F64 = NDArray[np.float64]
 
-KEEP_NS = 20_000_000_000  # more than any lag
+KEEP_NS = 45_000_000_000  # more than any lag, and than the steps that tell the clock
 MAX_ACCELERATION_MPS2 = 15.0  # tyres on dry tarmac hold about 10
 GAP_NS = 100_000_000  # two samples farther apart leave something unknown between them
 
 
+@dataclass(frozen=True, slots=True)
+class ClockModel:
+    """Stamps of the samples are later than the LiDAR's clock by `offset_s` at `at_ns` of it, growing by `rate`."""
+
+    at_ns: int = 0
+    offset_s: float = 0.0
+    rate: float = 0.0
+
+    def offset_ns(self, t_ns: int) -> int:
+        """How much later the samples are stamped at a time of the LiDAR's clock."""
+        return round(self.offset_s * 1e9 + self.rate * (t_ns - self.at_ns))
+
+    def stamp(self, t_ns: int) -> int:
+        """The stamp of a sample taken at `t_ns` of the LiDAR's clock."""
+        return t_ns + self.offset_ns(t_ns)
+
+    def of_stamps(self, stamp_ns: NDArray[np.int64]) -> NDArray[np.int64]:
+        """Times (N,) of the LiDAR's clock of samples with these stamps (N,)."""
+        since = stamp_ns - self.at_ns - round(self.offset_s * 1e9)
+        return self.at_ns + np.round(since / (1.0 + self.rate)).astype(np.int64) if self.rate else since + self.at_ns
+
+
 class MotionBuffer:
-    """The last seconds of wheel speed and yaw rate, integrated as a car moves: along its x axis, turning about z."""
+    """The last seconds of wheel speed and yaw rate, integrated as a car moves: along its x axis, turning about z.
+
+    All times asked for are of the LiDAR's clock; samples are kept as stamped, and `clock` is applied as they are read.
+    """
 
     def __init__(self) -> None:
+        self.clock = ClockModel()
         self._t_ns: list[int] = []
         self._speed_mps: list[float] = []
         self._yaw_rate_radps: list[float] = []
@@ -33,13 +60,31 @@ class MotionBuffer:
 
     @property
     def last_ns(self) -> int:
-        """Time of the newest sample; the buffer must not be empty."""
+        """Time of the newest sample by the LiDAR's clock; the buffer must not be empty."""
+        return int(self.clock.of_stamps(np.array([self._t_ns[-1]], np.int64))[0])
+
+    @property
+    def last_stamp_ns(self) -> int:
+        """Stamp of the newest sample; the buffer must not be empty."""
         return self._t_ns[-1]
+
+    def samples(self, first_stamp_ns: int) -> tuple[NDArray[np.int64], F64, F64]:
+        """Stamps, speed and yaw rate (N,) from a stamp on, nothing applied."""
+        low = bisect_left(self._t_ns, first_stamp_ns)
+        return (
+            np.array(self._t_ns[low:], np.int64),
+            np.array(self._speed_mps[low:], np.float64),
+            np.array(self._yaw_rate_radps[low:], np.float64),
+        )
 
     @property
     def speed_mps(self) -> float:
         """Newest speed, corrected; 0 before the first sample."""
         return self._speed_mps[-1] * self.speed_scale if self._speed_mps else 0.0
+
+    def shared(self) -> NDArray[np.float64]:
+        """(4,) what is taken off all samples: gyro bias [rad/s], wheel scale, motion left and up per metre forward."""
+        return np.array([self.yaw_bias_radps, self.speed_scale, *self.course])
 
     def push(self, t_ns: int, speed_mps: float, yaw_rate_radps: float) -> bool:
         """Add a sample; False (and nothing kept) when it is not finite or not later than the one before."""
@@ -58,6 +103,7 @@ class MotionBuffer:
 
     def unknown_s(self, first_ns: int, last_ns: int) -> float:
         """How much of the time from `first_ns` to `last_ns` lies in gaps between samples or beyond them, seconds."""
+        first_ns, last_ns = self.clock.stamp(first_ns), self.clock.stamp(last_ns)
         low = max(bisect_left(self._t_ns, first_ns) - 1, 0)
         inner = self._t_ns[low : bisect_left(self._t_ns, last_ns) + 1]
         if not inner:
@@ -75,7 +121,7 @@ class MotionBuffer:
 
     def age_s(self, now_ns: int) -> float:
         """How old the newest sample is, seconds; infinite without one."""
-        return (now_ns - self._t_ns[-1]) * 1e-9 if self._t_ns else float("inf")
+        return (now_ns - self.last_ns) * 1e-9 if self._t_ns else float("inf")
 
     def _drop(self, n: int) -> None:
         del self._t_ns[:n], self._speed_mps[:n], self._yaw_rate_radps[:n]
@@ -109,11 +155,16 @@ class MotionBuffer:
             return T_inverse(self.delta(last_ns, first_ns))
         return np.asarray(self.trajectory(first_ns, last_ns).T_dst_vehicle[-1])
 
+    def changes(self, first_ns: int, last_ns: int) -> tuple[float, float]:
+        """What speed [m/s] and yaw rate [rad/s] changed by between two times: what an offset of the clock acts on."""
+        _, speed, yaw_rate = self._resampled(first_ns, last_ns)
+        return float(speed[-1] - speed[0]), float(yaw_rate[-1] - yaw_rate[0])
+
     def _resampled(self, first_ns: int, last_ns: int) -> tuple[NDArray[np.int64], F64, F64]:
         """Sample times within the span with both ends added, and the corrected samples there."""
-        low = max(bisect_left(self._t_ns, first_ns) - 1, 0)
-        high = min(bisect_left(self._t_ns, last_ns) + 1, len(self._t_ns))
-        known = np.array(self._t_ns[low:high], np.int64)
+        low = max(bisect_left(self._t_ns, self.clock.stamp(first_ns)) - 1, 0)
+        high = min(bisect_left(self._t_ns, self.clock.stamp(last_ns)) + 1, len(self._t_ns))
+        known = self.clock.of_stamps(np.array(self._t_ns[low:high], np.int64))
         inner = known[(known > first_ns) & (known < last_ns)]
         end = [last_ns] if last_ns > first_ns else []
         t = np.concatenate([[first_ns], inner, end]).astype(np.int64)

@@ -1,47 +1,73 @@
 """Refined poses: hierarchical GraphSLAM with submaps, stretch by stretch (GND, 3 (ii), 6.2 and 7.2).
 
-Every few metres a scan becomes an anchor. When the vehicle is some way past it, the scans around it are put together
-as a submap, the submap is matched with the map, and a graph over the anchors of the last 100 m says which matches
-hold. The poses of the scans follow from their anchors. Only these poses are evidence of change.
+The scans of the last 30 m are matched with the map together (`stretch.py`); every few metres they are solved anew, and
+scans that lie far enough behind are final. What leaves the stretch is remembered as a belief about its first scan.
+Only these poses are evidence of change.
 """
 
-from collections.abc import Callable
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from itertools import pairwise
+from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
 
 from gnd_map.se3 import T_from_R_t, T_inverse, exp_so3, log_so3
-from vehicle_agent.errors import RegistrationError
-from vehicle_agent.localise.anchor_graph import AnchorStep, Solution, solve
 from vehicle_agent.localise.calibration import MotionTeacher
-from vehicle_agent.localise.drift import drift_of
+from vehicle_agent.localise.drift import Drift, Slope
 from vehicle_agent.localise.graph import MapMatch, SmoothedPose
-from vehicle_agent.localise.level import settled
 from vehicle_agent.localise.match_map import MatchMapCache
 from vehicle_agent.localise.odometry import MotionBuffer
 from vehicle_agent.localise.parameters import RegistrationParameters
 from vehicle_agent.localise.refine_parameters import RefineParameters
-from vehicle_agent.localise.registration import register
-from vehicle_agent.localise.submap import Submap, SubmapScan, ToldByScans, local_poses, make_submap
+from vehicle_agent.localise.scan_odometry import ScanStep
+from vehicle_agent.localise.stretch import (
+    BIAS,
+    LEFT,
+    N_SHARED,
+    SCALE,
+    UP,
+    Belief,
+    Knot,
+    Solved,
+    Step,
+    marginalised,
+    shared_of,
+    solve_stretch,
+)
 
 F64 = NDArray[np.float64]
 
-RECENT, SUPPORTED = 6, 3  # of so many anchors so many must have a match that takes part
-FIRM = 4  # anchors whose submaps fit well, before anything is certain
-NO_POINTS = np.zeros((0, 3), np.float32)
-FIRST_SIGMA_M, FIRST_SIGMA_RAD = 0.5, 0.02  # of the online pose that the first anchor starts from
+SUPPORTED: Final = 3
+"""Solutions before one tells the online pose where it is."""
+FIRM: Final = 4
+"""Solutions that fit well, before anything is certain."""
+NO_POINTS = np.zeros((0, 3))
+FIRST_SIGMA_M, FIRST_SIGMA_RAD = 0.5, 0.02  # of the online pose that the first scan starts from
+FORGETTING: Final = 0.7
+"""Weight of what was seen of the odometry until the last solution."""
+WORST_VARIANCE: Final = 1e4
+LEAST_WEIGHT: Final = 0.05
+NOISE_WAY_M: Final = 5.0  # for which the sigmas of the odometry are given; a second counts as a metre
 
 
 @dataclass(slots=True, eq=False)
-class _Anchor:
-    """A scan with a submap around it, and what the map says about it; it may be asked again."""
+class _Scan:
+    """A scan since the first of the stretch.
 
-    scan: SubmapScan
-    submap: Submap
-    match: MapMatch | None
-    fit: float
+    way_m: odometer. T_before_now: (4, 4) motion since the scan before, as all odometry tells. variance: (6,) of wheels
+    and gyro in that motion, less what all steps share. seen: that motion as scans tell it. knot: its part in the
+    stretch, None between knots. T_online: (4, 4).
+    """
+
+    number: int
+    t_ns: int
+    way_m: float
+    T_before_now: F64
+    variance: F64
+    seen: ScanStep | None
+    knot: Knot | None
+    T_online: F64
 
 
 class Refiner:
@@ -56,21 +82,27 @@ class Refiner:
         teacher: MotionTeacher,
     ) -> None:
         self.parameters = parameters
-        self.registration = replace(registration, wheel_sigma_m=parameters.wheel_sigma_m)
+        self.registration = registration
         self._map, self._motion, self._teacher = match_map, motion, teacher
-        self._scans: list[SubmapScan] = []  # since the first anchor of the window
+        self._scans: list[_Scan] = []
         self._final = 0  # how many of them are final
-        self._next: SubmapScan | None = None  # the anchor to come
-        self._anchors: list[_Anchor] = []
+        self._belief: Belief | None = None
+        self._solved: Solved | None = None
+        self._solved_way_m, self._solved_ns = 0.0, 0
         self._news = False
-        self._made_with_radps = 0.0  # gyro bias that the submaps were made with
-        self._firm = 0  # anchors so far whose submaps fitted well
-        self._start: MapMatch | None = None  # of the first anchor of the window, from the time before
-        self.solution: Solution | None = None
-        """Of the anchors in the window, as of the newest one."""
+        self._solutions = 0
+        self._step_variance = np.ones(6)  # of wheels and gyro, in units of what is assumed
+        self._squares, self._redundancy = np.full(6, 3.0), np.full(6, 3.0)
+        self._firm = 0  # solutions in a row that fitted well
 
     def push(
-        self, number: int, t_ns: int, points_m: F64, T_map_vehicle: F64, told: ToldByScans | None = None
+        self,
+        number: int,
+        t_ns: int,
+        points_m: F64,
+        T_map_vehicle: F64,
+        T_before_now: F64 | None = None,
+        seen: ScanStep | None = None,
     ) -> list[SmoothedPose]:
         """Take a scan; give the poses that became final with it.
 
@@ -79,217 +111,219 @@ class Refiner:
             t_ns: its time.
             points_m: (K, 3) sampled points, vehicle frame, sweep motion removed.
             T_map_vehicle: (4, 4) its online pose.
-            told: what scans tell better than wheels and gyro of the motion since the scan before.
+            T_before_now: (4, 4) motion since the scan before as all odometry tells it; None: wheels and gyro alone.
+            seen: that motion as the scans tell it.
         """
-        way_m = 0.0
-        if self._scans:
-            last = self._scans[-1]
-            way_m = last.way_m + float(np.linalg.norm(self._motion.delta(last.t_ns, t_ns)[:3, 3]))
-        scan = SubmapScan(number, t_ns, way_m, points_m.astype(np.float32), T_map_vehicle, told)
         self._news = False
-        self._scans.append(scan)
-        if self._next is None:
-            self._next = scan
-        if self._passed(self._next, scan):
-            self._add_anchor(self._next)
-            self._news = True
-            self._next = self._anchor_after(self._next)
-        return self._leaving(scan) if self._anchors else []
+        self._scans.append(self._scan(number, t_ns, points_m, T_map_vehicle, T_before_now, seen))
+        newest, par = self._scans[-1], self.parameters
+        if self._belief is None:
+            self._belief = self._first_belief(T_map_vehicle)
+            self._solved_way_m, self._solved_ns = newest.way_m, t_ns
+        due = newest.way_m - self._solved_way_m >= par.every_m or t_ns - self._solved_ns >= par.every_s * 1e9
+        if newest.knot is not None and due:
+            self._solve()
+            return self._leaving(newest)
+        return []
 
     def flush(self) -> list[SmoothedPose]:
-        """All poses that are not final yet, as they stand; submaps at the end are shorter."""
-        par = self.parameters
-        while self._next is not None:
-            last = self._next
-            self._add_anchor(last)
-            following = self._anchor_after(last)
-            self._next = following if following.way_m - last.way_m >= par.every_m else None
+        """All poses that are not final yet, as they stand."""
+        if self._final < len(self._scans):
+            self._solve()
         return self._finalise(len(self._scans))
 
     @property
     def supported(self) -> bool:
-        """True just after a new anchor, when the matches of enough of the last ones take part."""
-        return self._news and sum(self._agreeing()[-RECENT:]) >= SUPPORTED
-
-    def _agreeing(self) -> list[bool]:
-        """Which anchors have a match, of more than their wheels, that takes part."""
-        if self.solution is None:
-            return []
-        return [bool(t) and a.fit > 0.0 for a, t in zip(self._anchors, self.solution.trusted, strict=True)]
+        """True just after the stretch was solved, not for the first time, when its newest scans fit the map."""
+        return self._news and self._solutions > SUPPORTED and self._fit() >= self.parameters.least_fit
 
     @property
     def certain(self) -> bool:
-        """True when submaps have fitted well for some way, and the odometry since leaves little doubt."""
-        return self.solution is not None and self._is_certain(self.solution.covariance[-1])
+        """True when the stretch has fitted well for some way, and leaves little doubt about its newest scan."""
+        return self._solved is not None and self._is_certain(self._covariance(-1))
 
     def correction(self, T_map_vehicle: F64) -> MapMatch | None:
         """Where the newest scan is, when its online pose (4, 4) is farther from there than either is uncertain."""
-        if not self.supported or self.solution is None:
+        if not self.supported:
             return None
-        par, T_local = self.parameters, local_poses(self._scans, self._motion)
-        T_anchor_scan = T_inverse(T_local[self._index(self._anchors[-1].scan)]) @ T_local[-1]
-        T, covariance = self.solution.T_map_vehicle[-1] @ T_anchor_scan, self.solution.covariance[-1] + self._floor()
+        par, newest = self.parameters, self._scans[-1]
+        assert newest.knot is not None  # only then is there news
+        T, covariance = newest.knot.T_map_vehicle, self._covariance(-1)
         off, sigma = T_inverse(T) @ T_map_vehicle, np.sqrt(np.diag(covariance))
         far = np.hypot(off[0, 3], off[1, 3]) > par.correct_m + 3.0 * sigma[3:5].max()
         turned = abs(off[1, 0]) > np.radians(par.correct_deg) + 3.0 * sigma[2]
         return MapMatch(T, covariance) if far or turned else None
 
-    # --- anchors ---------------------------------------------------------------------------------------------------
+    # --- the stretch -----------------------------------------------------------------------------------------------
 
-    def _passed(self, anchor: SubmapScan, newest: SubmapScan) -> bool:
-        """True when what comes after the newest scan no longer belongs to the anchor's submap."""
+    def _scan(
+        self, number: int, t_ns: int, points_m: F64, T_online: F64, T_before_now: F64 | None, seen: ScanStep | None
+    ) -> _Scan:
+        """The scan as the stretch takes it: a knot, if the vehicle has moved on or time has passed since the last."""
         par = self.parameters
-        return newest.way_m - anchor.way_m >= par.half_m or newest.t_ns - anchor.t_ns >= par.half_s * 1e9
+        if not self._scans:
+            knot = Knot(self._thinned(points_m), T_online.copy(), LEAST_WEIGHT)
+            return _Scan(number, t_ns, 0.0, np.eye(4), np.zeros(6), None, knot, T_online)
+        last, before = self._scans[-1], self._last_knot()
+        driven = self._motion.delta(last.t_ns, t_ns)
+        T = driven if T_before_now is None else T_before_now
+        way_m = last.way_m + float(np.linalg.norm(driven[:3, 3]))
+        scan = _Scan(number, t_ns, way_m, T, self._variance(driven, t_ns - last.t_ns), seen, None, T_online)
+        since_m, since_ns = way_m - before.way_m, t_ns - before.t_ns
+        if since_m >= par.knot_m or since_ns >= par.knot_s * 1e9:
+            weight = float(np.clip(since_m / par.correlated_m, LEAST_WEIGHT, 1.0))
+            scan.knot = Knot(self._thinned(points_m), self._carried(before, scan), weight)
+        return scan
 
-    def _anchor_after(self, anchor: SubmapScan) -> SubmapScan:
-        """The first scan that is far enough on, or else the newest."""
+    def _variance(self, driven: F64, dt_ns: int) -> F64:
+        """(6,) of a motion (4, 4) by wheels and gyro beside what all steps share. A step that is far off counts less (`STEP_CHI2`); what
+        single scans say about it is not asked: they follow walls that were moved.
+        """
         par = self.parameters
-        for scan in self._scans[self._index(anchor) + 1 :]:
-            if scan.way_m - anchor.way_m >= par.every_m or scan.t_ns - anchor.t_ns >= par.every_s * 1e9:
-                return scan
-        return self._scans[-1]
+        grown = np.sqrt(max(float(np.linalg.norm(driven[:3, 3])), dt_ns * 1e-9) / NOISE_WAY_M)
+        roll_pitch = np.radians(par.roll_pitch_deg)
+        sigmas = np.array([
+            roll_pitch, roll_pitch, grown * np.radians(par.yaw_deg),
+            grown * par.longitudinal_m, grown * par.lateral_m, par.vertical_m,
+        ])  # fmt: skip
+        return sigmas**2
 
-    def _index(self, scan: SubmapScan) -> int:
+    def _thinned(self, points_m: F64) -> F64:
+        every = max(1, len(points_m) // self.parameters.n_points)
+        return np.ascontiguousarray(points_m[::every], dtype=np.float64)
+
+    def _last_knot(self) -> _Scan:
+        return next(scan for scan in reversed(self._scans) if scan.knot is not None)
+
+    def _carried(self, knot: _Scan, scan: _Scan) -> F64:
+        """The pose of the newest scan, not yet among the others, from that of the last knot."""
+        assert knot.knot is not None
+        T = knot.knot.T_map_vehicle
+        for between_them in self._scans[self._index(knot) + 1 :]:
+            T = T @ between_them.T_before_now
+        return np.asarray(T @ scan.T_before_now)
+
+    def _index(self, scan: _Scan) -> int:
         return scan.number - self._scans[0].number
 
-    def _add_anchor(self, scan: SubmapScan) -> None:
-        """Make and match the submap of the next anchor, then place all anchors anew."""
-        T_local = local_poses(self._scans, self._motion)
-        index = self._index(scan)
-        submap = make_submap(self._scans, T_local, index, self.parameters)
-        predicted, known = scan.T_map_vehicle, False
-        if self.solution is not None:
-            before = self._index(self._anchors[-1].scan)
-            predicted = self.solution.T_map_vehicle[-1] @ T_inverse(T_local[before]) @ T_local[index]
-            known = bool(np.sqrt(np.diag(self.solution.covariance[-1])[3:5]).max() < self.parameters.near_m)
-        match, fit = self._matched(submap, predicted, known)
-        self._anchors.append(_Anchor(scan, submap, match, fit))
+    def _knots(self) -> list[_Scan]:
+        return [scan for scan in self._scans if scan.knot is not None]
+
+    def _first_belief(self, T_map_vehicle: F64) -> Belief:
+        sigmas = np.array([FIRST_SIGMA_RAD] * 3 + [FIRST_SIGMA_M] * 3)
+        odometry = self._teacher.parameters
+        shared = np.array([odometry.bias_prior_radps, odometry.scale_prior, *[odometry.course_prior] * 2])
+        information = np.diag(1.0 / np.concatenate([sigmas, shared]) ** 2)
+        return Belief(T_map_vehicle.copy(), self._motion.shared(), information, np.zeros(6 + N_SHARED))
+
+    def _steps(self, knots: Sequence[_Scan]) -> list[list[Step]]:
+        """What wheels and gyro, and the scans, say of the motion between neighbouring knots."""
+        driven, seen = [], []
+        for before, now in zip(knots, knots[1:], strict=False):
+            T, dt_s = self._motion.delta(before.t_ns, now.t_ns), (now.t_ns - before.t_ns) * 1e-9
+            between_them = self._scans[self._index(before) + 1 : self._index(now) + 1]
+            variance = np.sum([scan.variance for scan in between_them], axis=0)
+            variance[2:4] += np.square(self._teacher.clock_sigmas(before.t_ns, now.t_ns))
+            driven.append(Step(T, np.diag(variance), shared_of(T, dt_s)))
+            told = [scan.seen for scan in between_them]
+            whole = all(step is not None for step in told)
+            seen.append(_chained([step for step in told if step is not None]) if whole else None)
+        grown = np.sqrt(self._step_variance)
+        return [
+            [replace(one, covariance=grown[:, None] * one.covariance * grown), *([] if other is None else [other])]
+            for one, other in zip(driven, seen, strict=True)
+        ]
+
+    def _judge_steps(self, solved: Solved) -> None:
+        """How much worse than assumed wheels and gyro are, axis by axis, as map and scans together see it."""
+        self._squares = FORGETTING * self._squares + solved.step_squares * self._step_variance
+        self._redundancy = FORGETTING * self._redundancy + solved.step_redundancy
+        self._step_variance = np.clip(self._squares / self._redundancy, 1.0, WORST_VARIANCE)
+
+    def _solve(self) -> None:
+        """Place all scans of the stretch anew, let wheels and gyro learn from it, and let go of its old scans."""
+        par, scans = self.parameters, self._knots()
+        knots = [scan.knot for scan in scans if scan.knot is not None]
+        assert self._belief is not None
+        current = self._motion.shared()
+        known = self._solved is not None and np.sqrt(np.diag(self._covariance(-1))[3:5]).max() < par.near_m
+        belief = _recentred(self._belief, current)
+        match_map = self._map.near(knots[len(knots) // 2].T_map_vehicle[:3, 3])
+        steps = self._steps(scans)
+        self._solved = solve_stretch(
+            knots, steps, belief, match_map, self.registration, par.scales if known else par.first_scales
+        )
+        self._judge_steps(self._solved)
+        self._news, self._solutions = True, self._solutions + 1
+        newest = self._scans[-1]
+        dt_s = (newest.t_ns - self._solved_ns) * 1e-9
+        self._solved_way_m, self._solved_ns = newest.way_m, newest.t_ns
+        fits_well = self._fit() >= par.firm_fit and self._solved.misfit < par.most_misfit
+        self._firm = self._firm + 1 if fits_well else (self._firm if self._fit() >= par.least_fit else 0)
+        self._belief = self._shortened(scans, steps, belief, dt_s)
         self._teach()
-        T_local = local_poses(self._scans, self._motion)
-        self._place(T_local)
-        self._make_again(T_local)
-        self._ask_again(T_local)
-        self._count_firm()
-        self._forget()
 
-    def _count_firm(self) -> None:
-        assert self.solution is not None
-        self._firm += bool(self.solution.trusted[-1]) and self._anchors[-1].fit >= self.parameters.firm_fit
+    def _shortened(self, scans: list[_Scan], steps: list[list[Step]], belief: Belief, dt_s: float) -> Belief:
+        """Let go of the knots that are far behind; the belief about the first that stays."""
+        par, newest, solved = self.parameters, self._scans[-1], self._solved
+        assert solved is not None
+        first = 0
+        while first < len(scans) - 2 and self._is_done_with(scans[first + 1], newest):
+            first += 1
+        if not first:
+            return belief
+        knots = [scan.knot for scan in scans[: first + 1] if scan.knot is not None]
+        kept = marginalised(knots, steps[:first], belief, solved.shared, self.registration)
+        self._solved = replace(
+            solved, covariance=solved.covariance[first:], fit=solved.fit[first:], known=solved.known[first:]
+        )
+        gone = self._index(scans[first])
+        self._scans, self._final = self._scans[gone:], self._final - gone
+        odometry = self._teacher.parameters
+        drift = np.array([odometry.bias_drift_radps, odometry.scale_drift, odometry.scale_drift, odometry.scale_drift])
+        return _loosened(kept, drift**2 * dt_s)
 
-    def _matched(self, submap: Submap, predicted: F64, known: bool) -> tuple[MapMatch | None, float]:
-        """The match of a submap near its predicted pose, if enough of it matches, and its fit."""
+    def _is_done_with(self, scan: _Scan, newest: _Scan) -> bool:
         par = self.parameters
-        registration = replace(self.registration, scales=par.scales if known else par.first_scales)
-        match_map = self._map.near(predicted[:3, 3])
-        try:
-            found = register(submap.points_m, predicted, match_map, registration, "near", submap.wheels_m)
-        except RegistrationError:
-            return self._settled(submap, predicted), 0.0
-        if found.matching_ratio < par.min_matching_ratio:
-            return self._settled(submap, predicted), 0.0
-        return MapMatch(found.T_map_vehicle, found.covariance * par.overlap), found.fit
-
-    def _settled(self, submap: Submap, predicted: F64) -> MapMatch | None:
-        """Height and attitude at least, by the wheels."""
-        return settled(predicted, self._map.near(predicted[:3, 3]), self.registration, submap.wheels_m)
-
-    def _place(self, T_local: F64) -> None:
-        """Solve for all anchors of the window."""
-        start = self._start or _loose(self._anchors[0].scan.T_map_vehicle)
-        steps = [self._step(T_local, a.scan, b.scan) for a, b in pairwise(self._anchors)]
-        matches = [anchor.match for anchor in self._anchors]
-        self.solution = solve(start, steps, matches, self.parameters.inlier_chi2)
-
-    def _ask_again(self, T_local: F64) -> None:
-        """Match the submaps once more that do not agree with the rest, from where the rest says that they are."""
-        if self._match_doubted(lambda anchor, T: self._matched(anchor.submap, T, True)):
-            self._place(T_local)
-        if self._match_doubted(lambda anchor, T: (self._settled(anchor.submap, T), 0.0)):
-            self._place(T_local)
-
-    def _make_again(self, T_local: F64) -> None:
-        """Submaps that were made before the gyro's bias was known are bent: make and match them again."""
-        bias = self._motion.yaw_bias_radps
-        if abs(bias - self._made_with_radps) < np.radians(self.parameters.bent_degps):
-            return
-        self._made_with_radps = bias
-        assert self.solution is not None
-        for anchor, T in zip(self._anchors, self.solution.T_map_vehicle, strict=True):
-            if self._index(anchor.scan) >= self._final:
-                anchor.submap = make_submap(self._scans, T_local, self._index(anchor.scan), self.parameters)
-                anchor.match, anchor.fit = self._matched(anchor.submap, T, True)
-        self._place(T_local)
-
-    def _match_doubted(self, matched: Callable[[_Anchor, F64], tuple[MapMatch | None, float]]) -> bool:
-        """Give anchors that do not agree with the rest, and may still matter to a pose, another match; any?"""
-        assert self.solution is not None
-        doubted = False
-        for anchor, T, trusted in zip(self._anchors, self.solution.T_map_vehicle, self.solution.trusted, strict=True):
-            if not trusted and self._index(anchor.scan) >= self._final:
-                (anchor.match, anchor.fit), doubted = matched(anchor, T), True
-        return doubted
+        old = newest.way_m - scan.way_m > par.length_m or newest.t_ns - scan.t_ns > par.length_s * 1e9
+        return old and self._index(scan) <= self._final
 
     def _teach(self) -> None:
-        """Wheels and gyro learn from submaps, too: single scans of a sparse sensor seldom fit well enough to teach."""
-        T_local = local_poses(self._scans, self._motion, driven_only=True)
-        T = [T_local[self._index(anchor.scan)] for anchor in self._anchors]
-        steps = [T_inverse(a) @ b for a, b in pairwise(T)]
-        matches = [anchor.match if anchor.fit > 0.0 else None for anchor in self._anchors]
-        drift = drift_of([anchor.scan.t_ns for anchor in self._anchors], steps, matches)
-        if drift is not None:
-            self._teacher.correct(drift, self.parameters.overlap)
+        """Wheels and gyro learn from the stretch: single scans of a sparse sensor seldom fit well enough to teach."""
+        assert self._solved is not None
+        if self._fit() < self.parameters.least_fit:
+            return
+        more, variance = self._solved.shared - self._motion.shared(), np.diag(self._solved.shared_covariance)
+        sigma = np.sqrt(variance * max(1.0, self._solved.misfit))
+        self._teacher.correct(
+            Drift(
+                yaw_radps=Slope(float(more[BIAS]), float(sigma[BIAS])),
+                forward=Slope(float(-more[SCALE]), float(sigma[SCALE])),
+                left=Slope(float(-more[LEFT]), float(sigma[LEFT])),
+                up=Slope(float(-more[UP]), float(sigma[UP])),
+            ),
+            overlap=1.0,
+        )
 
-    def _step(self, T_local: F64, first: SubmapScan, last: SubmapScan) -> AnchorStep:
-        par = self.parameters
-        T = T_inverse(T_local[self._index(first)]) @ T_local[self._index(last)]
-        way_m, dt_s = last.way_m - first.way_m, (last.t_ns - first.t_ns) * 1e-9
-        grown = np.sqrt(max(way_m / par.every_m, dt_s / par.every_s))
-        roll_pitch, yaw = np.radians(par.roll_pitch_deg), grown * np.radians(par.yaw_deg)
-        scale, bias = self._teacher.uncertainty
-        sigmas = np.array([
-            roll_pitch, roll_pitch, np.hypot(yaw, bias * dt_s),
-            np.hypot(grown * par.longitudinal_m, scale * way_m), grown * par.lateral_m, par.vertical_m,
-        ])  # fmt: skip
-        return AnchorStep(T, sigmas)
-
-    def _forget(self) -> None:
-        """Let go of the oldest anchors when the window is full, of the scans before, and of points done with."""
-        while self._full():
-            self._forget_oldest()
-        waiting = min(self._final, self._index(self._anchors[-1].scan))
-        for i, scan in enumerate(self._scans[:waiting]):
-            if self._passed(scan, self._scans[waiting]) and len(scan.points_m):
-                self._scans[i] = replace(scan, points_m=NO_POINTS)
-
-    def _full(self) -> bool:
-        """True when the oldest anchor can go: it is one too many or too old, and no scan waits for it."""
-        par = self.parameters
-        if len(self._anchors) < 3 or self._index(self._anchors[1].scan) > self._final:
-            return False
-        age_s = (self._anchors[-1].scan.t_ns - self._anchors[0].scan.t_ns) * 1e-9
-        return len(self._anchors) > par.window or age_s > par.window_s
-
-    def _forget_oldest(self) -> None:
-        assert self.solution is not None
-        oldest, s = self._anchors[1].scan, self.solution
-        self._start = MapMatch(s.T_map_vehicle[1], s.covariance[1])
-        self._anchors = self._anchors[1:]
-        self._anchors[0].match = None  # it is in the prior now
-        gone = self._index(oldest)
-        self._scans, self._final = self._scans[gone:], self._final - gone
-        self.solution = Solution(s.T_map_vehicle[1:], s.covariance[1:], s.trusted[1:])
+    def _fit(self) -> float:
+        """How well the newest `fit_m` of the stretch fit the map, 0 ... 1; points in unknown voxels count as off."""
+        if self._solved is None:
+            return 0.0
+        knots = self._knots()[-len(self._solved.fit) :]
+        near = np.array([self._scans[-1].way_m - scan.way_m <= self.parameters.fit_m for scan in knots])
+        return float((self._solved.fit * self._solved.known)[: len(near)][near].mean()) if near.any() else 0.0
 
     # --- scans -----------------------------------------------------------------------------------------------------
 
-    def _leaving(self, newest: SubmapScan) -> list[SmoothedPose]:
-        """The poses of scans that lie `lag_m` behind the newest anchor, or are too old to wait."""
-        par, anchor = self.parameters, self._anchors[-1].scan
+    def _leaving(self, newest: _Scan) -> list[SmoothedPose]:
+        """The poses of scans that lie `lag_m` behind the newest knot, or are too old to wait."""
+        par = self.parameters
         learnt = self._teacher.uncertainty[1] < np.radians(par.learnt_degps)
         longest_s, n = (par.longest_s if learnt else par.unlearnt_s), self._final
         while n < len(self._scans):
             scan = self._scans[n]
             overdue = newest.t_ns - scan.t_ns > longest_s * 1e9
-            if not overdue and (not learnt or anchor.way_m - scan.way_m < par.lag_m):
+            if not overdue and (not learnt or newest.way_m - scan.way_m < par.lag_m):
                 break
             n += 1
         return self._finalise(n)
@@ -297,44 +331,70 @@ class Refiner:
     def _finalise(self, end: int) -> list[SmoothedPose]:
         """The poses of the scans up to `end` that are not final yet."""
         first, self._final = self._final, end
-        if end == first or self.solution is None:
+        if end == first or self._solved is None:
             return []
-        T_local = local_poses(self._scans, self._motion)
-        at = np.array([self._index(anchor.scan) for anchor in self._anchors])
-        return [self._pose(i, T_local, at, self.solution) for i in range(first, end)]
+        at = [i for i, scan in enumerate(self._scans) if scan.knot is not None]
+        return [self._pose(i, at) for i in range(first, end)]
 
-    def _pose(self, i: int, T_local: F64, at: NDArray[np.int64], s: Solution) -> SmoothedPose:
-        """From the anchors before and after, each by how near it is; beyond the first or last, from that one alone."""
-        after = int(np.clip(np.searchsorted(at, i), 1, max(len(at) - 1, 1)))
-        low, high = after - 1, min(after, len(at) - 1)
-        share = self._share(i, int(at[low]), int(at[high]))
-        by_low, by_high = (s.T_map_vehicle[k] @ T_inverse(T_local[at[k]]) @ T_local[i] for k in (low, high))
-        covariance = (1.0 - share) * s.covariance[low] + share * s.covariance[high]
-        covariance, scan = covariance + self._floor(), self._scans[i]
+    def _pose(self, i: int, at: list[int]) -> SmoothedPose:
+        """From the knots before and after, each by how near it is; beyond the last, from that one alone."""
+        scan = self._scans[i]
+        after = min(int(np.searchsorted(at, i)), len(at) - 1)
+        low = after if at[after] <= i else after - 1
+        by_low, by_high = self._from_knot(at[low], i), self._from_knot(at[after], i)
+        share = self._share(i, at[low], at[after])
+        covariance = (1.0 - share) * self._covariance(low) + share * self._covariance(after)
         T = between(by_low, by_high, share)
         return SmoothedPose(scan.number, scan.t_ns, T, covariance, self._is_certain(covariance))
+
+    def _from_knot(self, knot: int, i: int) -> F64:
+        first, scan = self._scans[knot], self._scans[i]
+        assert first.knot is not None
+        return np.asarray(first.knot.T_map_vehicle @ self._motion.delta(first.t_ns, scan.t_ns))
+
+    def _covariance(self, knot: int) -> F64:
+        """(6, 6) of a knot's pose: what the stretch leaves open, more where it disagrees with itself, and the least."""
+        par = self.parameters
+        assert self._solved is not None
+        floor = np.diag([np.radians(par.floor_deg) ** 2] * 3 + [par.floor_m**2] * 3)
+        return np.asarray(self._solved.covariance[knot] * max(1.0, self._solved.misfit) + floor)
 
     def _is_certain(self, covariance: F64) -> bool:
         sigma_m = float(np.sqrt(np.diag(covariance)[3:5]).max())
         return self._firm >= FIRM and sigma_m < self.parameters.certain_m
 
     def _share(self, i: int, low: int, high: int) -> float:
-        """How far along the way from one anchor to the next a scan is, 0 ... 1."""
+        """How far along the way from one knot to the next a scan is, 0 ... 1."""
         way = [self._scans[k].way_m for k in (low, i, high)]
         t = [self._scans[k].t_ns for k in (low, i, high)]
         a, b, c = way if way[2] - way[0] > 1e-3 else t
         return float(np.clip((b - a) / (c - a), 0.0, 1.0)) if c > a else 0.0
 
-    def _floor(self) -> F64:
-        par = self.parameters
-        return np.diag([np.radians(par.floor_deg) ** 2] * 3 + [par.floor_m**2] * 3)
+
+def _chained(seen: Sequence[ScanStep]) -> Step:
+    """Steps that the scans tell, one after the other, as one; they are short, so that covariances just add."""
+    T, covariance = np.eye(4), np.zeros((6, 6))
+    for step in seen:
+        T, covariance = T @ step.T_before_now, covariance + step.covariance
+    return Step(T, covariance, np.zeros((6, N_SHARED)))
+
+
+def _recentred(belief: Belief, shared: F64) -> Belief:
+    """The same belief told about other values of the shared parameters: those that the steps are made with now."""
+    moved = np.concatenate([np.zeros(6), shared - belief.shared])
+    return belief._replace(shared=shared, gradient=belief.gradient + belief.information @ moved)
+
+
+def _loosened(belief: Belief, variance: F64) -> Belief:
+    """The belief when the shared parameters may have changed since, by so much (N_SHARED,), its mean unchanged."""
+    covariance = np.linalg.inv(belief.information)
+    mean = -covariance @ belief.gradient
+    covariance[-N_SHARED:, -N_SHARED:] += np.diag(variance)
+    information = np.linalg.inv(covariance)
+    return belief._replace(information=information, gradient=-information @ mean)
 
 
 def between(T_first: F64, T_last: F64, share: float) -> F64:
     """(4, 4) the pose `share` (0 ... 1) of the way from one pose to another that is near it."""
     off = T_inverse(T_first) @ T_last
     return np.asarray(T_first @ T_from_R_t(exp_so3(share * log_so3(off[:3, :3])), share * off[:3, 3]))
-
-
-def _loose(T: F64) -> MapMatch:
-    return MapMatch(T, np.diag([FIRST_SIGMA_RAD**2] * 3 + [FIRST_SIGMA_M**2] * 3))

@@ -105,6 +105,46 @@ def register(
     return _result(state, len(points), scales[-1], par, iterations, converged)
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class Linearised:
+    """The cost of points on the map around one pose, to second order.
+
+    T_map_vehicle: (4, 4) where. scale: robust scale in sigmas. H, g: (6, 6) and (6,) of a small motion of the vehicle
+    in its own frame, rotation [rad] first; points count as independent. cost: sum of robust costs; matched, inside:
+    points near a Gaussian, and in known voxels.
+    """
+
+    T_map_vehicle: F64
+    scale: float
+    H: F64
+    g: F64
+    cost: float
+    matched: int
+    inside: int
+
+    def fit(self, scale: float) -> float:
+        """1 - mean robust cost of the points in known voxels, 0 ... 1."""
+        return 1.0 - self.cost / (scale**2 * max(self.inside, 1))
+
+
+def linearised(
+    points_m: F64, T_map_vehicle: F64, match_map: MatchMap, parameters: RegistrationParameters, scale: float
+) -> Linearised:
+    """Points (N, 3) and the wheels on the map at a pose (4, 4); nothing is moved."""
+    T = np.asarray(T_map_vehicle, dtype=np.float64)
+    state = _State(T[:3, :3].copy(), T[:3, 3].copy(), np.zeros((6, 6)), np.zeros(6), WHEELS_M)
+    m, gate_m2 = match_map, (parameters.gate_per_scale * scale) ** 2
+    state.cost, state.matched, state.inside = linearise(
+        np.ascontiguousarray(points_m), state.R, state.t, m.index, m.A, m.b, m.mean_m, m.information, scale**2, gate_m2,
+        state.H, state.g,
+    )  # fmt: skip
+    _add_wheels(state, m, parameters, scale)
+    turn = np.zeros((6, 6))
+    turn[:3, :3] = turn[3:, 3:] = state.R
+    H = turn.T @ state.H @ turn
+    return Linearised(T.copy(), scale, H, turn.T @ state.g, state.cost, state.matched, state.inside)
+
+
 def fit_of(points_m: F64, T_map_vehicle: F64, match_map: MatchMap, parameters: RegistrationParameters) -> float:
     """How well points (N, 3) lie on the map at a pose, 0 ... 1: 1 - mean robust cost at the narrowest scale; a point in
     voxels that are not known counts as off.

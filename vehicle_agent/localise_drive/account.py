@@ -36,6 +36,7 @@ def summary(drive: LocalisedDrive) -> dict[str, Any]:
         "initialisations": counts.initialisations,
         "speed_scale": round(counts.speed_scale, 5),
         "yaw_bias_degps": round(float(np.degrees(counts.yaw_bias_radps)), 5),
+        "calibration": None if counts.calibration is None else counts.calibration.as_json(),
         "sigma": _sigma(drive.refined),
         "errors": _errors(drive),
         "health": health_shares(stretches),
@@ -105,6 +106,7 @@ def _fields(values: dict[str, Any]) -> Table:
         ("without pose", f"{values['scans_dropped']}; unusable: {bad}"),
         ("first pose after", "never" if began is None else f"{began:.1f} s; {values['initialisations']} found in all"),
         ("learnt", f"speed x {values['speed_scale']:.4f}, yaw rate {-values['yaw_bias_degps']:+.3f} °/s"),
+        *_calibration(values["calibration"]),
         ("own estimate of error", "none" if sigma is None else
             f"{sigma['median_m'] * 100:.1f} cm, {sigma['median_deg']:.3f}° (one sigma, median)"),
         ("tiles", f"{len(values['tiles_used'])} used; {values['tiles_absent']} nearby are not in the map"),
@@ -113,6 +115,31 @@ def _fields(values: dict[str, Any]) -> Table:
     for row in rows:
         table.add_row(*row)
     return table
+
+
+def _calibration(values: dict[str, Any] | None) -> tuple[tuple[str, str], ...]:
+    """Rows of clock and mount."""
+    return () if values is None else (("clock", _clock(values)), ("mount against the header", _mount(values)))
+
+
+def _clock(values: dict[str, Any]) -> str:
+    """The time offset between LiDAR and motion."""
+    offset, doubt = values["time_offset_s"], values["clock_doubt"]
+    said = f"wheels and gyro {offset['value'] * 1e3:+.1f} ms against the LiDAR, ±{offset['sigma'] * 1e3:.1f}"
+    return said if doubt == "none" else f"{said}; {doubt}"
+
+
+def _mount(values: dict[str, Any]) -> str:
+    """What the mount is off by, as far as it was seen."""
+    parts = (("height", "mount_height_m", 100.0, " cm"), ("roll", "mount_roll_deg", 1.0, "°"),
+             ("pitch", "mount_pitch_deg", 1.0, "°"), ("yaw", "mount_yaw_deg", 1.0, "°"))  # fmt: skip
+    known = [
+        f"{name} {values[key]['value'] * factor:+.2f}{unit} ±{values[key]['sigma'] * factor:.2f}"
+        for name, key, factor, unit in parts
+        if values[key] is not None
+    ]
+    doubtful = ", ".join(values["mount_doubtful"])
+    return "; ".join(known) + (f"; wrong in the header: {doubtful}" if doubtful else "")
 
 
 def _error_table(errors: dict[str, Any]) -> Table:

@@ -20,6 +20,7 @@ from schemas.errors import SchemaError
 from vehicle_agent.config import DownloadParameters
 from vehicle_agent.errors import LocaliseError
 from vehicle_agent.local_map import LocalMap
+from vehicle_agent.localise.calibration import MotionCalibration
 from vehicle_agent.localise.estimates import Cause, Health, PoseEstimate, RefinedScan
 from vehicle_agent.localise.localiser import Localiser
 from vehicle_agent.localise.parameters import LocaliserParameters
@@ -64,6 +65,7 @@ class Counts:
     finished: bool
     """False: it was stopped, or the recording is damaged."""
     damage: str = ""
+    calibration: MotionCalibration | None = None
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -271,6 +273,7 @@ class _Run:
             wall_s=self._wall_s,
             finished=self._finished,
             damage=self._damage,
+            calibration=localiser.calibration,
         )
 
 

@@ -1,0 +1,125 @@
+"""Whether the LiDAR is mounted as the drive's header says, from the ground around the vehicle while it drives.
+
+The vehicle stands on the ground, so a ground that lies above or below the wheels or is tilted in the vehicle's frame is
+a mount that the header has wrong. Single scans see kerbs, ramps and the vehicle's own nodding; many of them agree on
+what the mount is off by. Nothing is corrected here: it is said.
+"""
+
+from collections import deque
+from dataclasses import dataclass
+from typing import Final, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from gnd_map.se3 import T_inverse, transform
+from vehicle_agent.importers.mount import (
+    CROWN_RAD,
+    LANE_WITHIN_M,
+    GroundSeen,
+    Refused,
+    ground_of,
+    ground_of_scans,
+    tilt_of,
+)
+
+F64 = NDArray[np.float64]
+MountDoubt = Literal["height", "roll", "pitch", "yaw"]
+
+EVERY_NS: Final = 1_000_000_000
+FIRST_NS: Final = 200_000_000
+"""Until `FIRST_SCANS` have been looked at, one is looked at as often as this: a wrong header is found out at once."""
+FIRST_SCANS: Final = 5
+KEPT: Final = 60
+DOUBTFUL_M, DOUBTFUL_RAD = 0.10, float(np.radians(0.3))
+WRONG_M, WRONG_RAD = 0.30, float(np.radians(2.0))
+"""By so much the poses themselves are wrong, whatever they match."""
+SIGMAS: Final = 3.0
+MOST_POINTS: Final = 15_000
+
+
+@dataclass(frozen=True, slots=True)
+class MountResidual:
+    """What the mount is off by against the header (true minus header), one sigma each; endless while not known."""
+
+    height_m: float = 0.0
+    height_sigma_m: float = float("inf")
+    roll_rad: float = 0.0
+    roll_sigma_rad: float = float("inf")
+    pitch_rad: float = 0.0
+    pitch_sigma_rad: float = float("inf")
+    scans: int = 0
+
+    def __post_init__(self) -> None:
+        if min(self.height_sigma_m, self.roll_sigma_rad, self.pitch_sigma_rad) <= 0.0 or self.scans < 0:
+            raise ValueError(f"positive sigmas are required, got {self}")
+
+    @property
+    def doubtful(self) -> tuple[MountDoubt, ...]:
+        """What the header says wrongly for certain, by more than 10 cm or 0.3°."""
+        return self._beyond(DOUBTFUL_M, DOUBTFUL_RAD)
+
+    @property
+    def wrong(self) -> bool:
+        """True when the poses must be wrong, too: by more than 30 cm or 2°."""
+        return bool(self._beyond(WRONG_M, WRONG_RAD))
+
+    def _beyond(self, most_m: float, most_rad: float) -> tuple[MountDoubt, ...]:
+        every: tuple[tuple[MountDoubt, float, float, float], ...] = (
+            ("height", self.height_m, self.height_sigma_m, most_m),
+            ("roll", self.roll_rad, self.roll_sigma_rad, most_rad),
+            ("pitch", self.pitch_rad, self.pitch_sigma_rad, most_rad),
+        )
+        return tuple(name for name, value, sigma, most in every if abs(value) - SIGMAS * sigma > most)
+
+
+def near_points(points_lidar_m: NDArray[np.float32]) -> NDArray[np.int64]:
+    """Which points (K,) of a scan (N, 3) to look at for the ground: near ones, not too many."""
+    near = np.flatnonzero(np.hypot(points_lidar_m[:, 0], points_lidar_m[:, 1]) < LANE_WITHIN_M + 1.0)
+    return np.asarray(near[:: 1 + len(near) // MOST_POINTS])
+
+
+class MountWatch:
+    """Feeds on deskewed scans, of which it takes one a second."""
+
+    def __init__(self, T_vehicle_lidar: F64) -> None:
+        self._T_lidar_vehicle = T_inverse(T_vehicle_lidar)
+        x_lidar = self._T_lidar_vehicle[:3, 0]
+        self._course_rad = float(np.arctan2(x_lidar[1], x_lidar[0]))
+        self._height_m = float(T_vehicle_lidar[2, 3])
+        self._tilt = np.array(tilt_of(self._T_lidar_vehicle[:3, 2]))
+        self._lane: deque[GroundSeen | Refused] = deque(maxlen=KEPT)
+        self._around: deque[GroundSeen | Refused] = deque(maxlen=KEPT)
+        self._looked_ns: int | None = None
+        self.residual = MountResidual()
+
+    def due(self, t_ns: int) -> bool:
+        """Whether a scan at this time is to be looked at."""
+        pause_ns = FIRST_NS if len(self._lane) < FIRST_SCANS else EVERY_NS
+        return self._looked_ns is None or not 0 <= t_ns - self._looked_ns < pause_ns
+
+    def see(self, t_ns: int, points_vehicle_m: F64) -> None:
+        """Take points (N, 3) of a scan, those of `near_points`, vehicle frame as the header has it, sweep motion
+        removed.
+        """
+        self._looked_ns = t_ns
+        points = transform(self._T_lidar_vehicle, points_vehicle_m)
+        self._lane.append(ground_of(points, self._course_rad))
+        together = ground_of_scans(self._lane)
+        if isinstance(together, Refused):  # few lasers see little of the lane
+            self._around.append(ground_of(points))
+            together = ground_of_scans(self._around, CROWN_RAD)
+        if isinstance(together, GroundSeen):
+            self.residual = self._against_header(together)
+
+    def _against_header(self, ground: GroundSeen) -> MountResidual:
+        roll, pitch = np.array([ground.roll_rad, ground.pitch_rad]) - self._tilt
+        return MountResidual(
+            ground.height_m - self._height_m,
+            ground.height_sigma_m,
+            float(roll),
+            ground.roll_sigma_rad,
+            float(pitch),
+            ground.pitch_sigma_rad,
+            ground.scans,
+        )

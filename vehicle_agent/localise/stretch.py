@@ -1,0 +1,302 @@
+"""A stretch of scans matched with the map together: the submap of GND 6.2, as stiff as the odometry is good.
+
+A rigid submap is shaped by odometry alone. Where wheels, clock or stamps are off by centimetres a step, its match is off
+by decimetres and does not know. Here every scan keeps a pose of its own: all scans of the stretch are matched point to
+Gaussian at once, and odometry ties their poses as tightly as its sigmas say. What all steps share (wheel scale, gyro
+bias, course) is estimated beside the poses, so that it does not count as independent noise.
+
+Everything is one least-squares problem: Gauss-Newton over 6 N pose parameters and `N_SHARED` shared ones, with robust
+weights (Geman-McClure on points, Cauchy on steps). Old scans leave by marginalisation, so nothing counts twice.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from typing import Final, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from gnd_map.se3 import T_inverse, exp_so3, log_so3
+from vehicle_agent.localise.match_map import MatchMap
+from vehicle_agent.localise.parameters import RegistrationParameters
+from vehicle_agent.localise.registration import LEVER_M, Linearised, linearised
+
+F64 = NDArray[np.float64]
+
+N_SHARED: Final = 4
+"""What all steps share: gyro bias [rad/s], wheel scale [1], motion to the left and upwards per metre forward [1]."""
+BIAS, SCALE, LEFT, UP = range(N_SHARED)
+STEP_CHI2: Final = 12.6
+"""Of a step's six residuals, from where on it counts less (Cauchy): 95 % of right ones lie below."""
+SMALL_M, SMALL_RAD = 2e-3, 2e-4
+"""Scans that moved less since they were matched with the map are not matched again."""
+STOP_M, STOP_RAD = 1e-3, 5e-5
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Step:
+    """Motion from one scan of the stretch to the next, as odometry tells it.
+
+    T_before_now: (4, 4). covariance: (6, 6) of a small motion of the later vehicle, rotation [rad] first. shared: (6,
+    N_SHARED) how this motion would differ if the shared parameters were larger by one; zeros for what scans tell.
+    """
+
+    T_before_now: F64
+    covariance: F64
+    shared: F64
+
+
+class Belief(NamedTuple):
+    """What is known of the first pose of a stretch and the shared parameters from the time before, as a quadratic in
+    their difference (6 + N_SHARED,) from where it was made: `information` (10, 10), and its gradient there (10,).
+    """
+
+    T_map_vehicle: F64
+    shared: F64
+    information: F64
+    gradient: F64
+
+
+@dataclass(slots=True, eq=False)
+class Knot:
+    """A scan of the stretch: points (K, 3) float64 in the vehicle frame, present pose (4, 4), `weight` (0 ... 1) of its
+    match because neighbours see the same surfaces, and its match where it was last made.
+    """
+
+    points_m: F64
+    T_map_vehicle: F64
+    weight: float
+    match: Linearised | None = field(default=None)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Solved:
+    """What came of a stretch of N scans.
+
+    shared: (N_SHARED,) estimate. covariance: (N, 6, 6) of each pose, rotation first, vehicle frame; shared_covariance.
+    fit: (N,) 1 - mean robust cost of each scan's points, 0 ... 1, at the last scale; known: (N,) share of them in known
+    voxels. misfit: mean square of what each scan's own match disagrees with its pose, in sigmas (1 = as expected).
+    step_squares, step_redundancy: (6,) sums over the first measurement of each step: squared residual in sigmas, and how
+        much of each the others can check (0: nothing else knows, 1: all is known otherwise). Their ratio is the variance
+        of these measurements in units of what they claim (variance components, Förstner 1979).
+    """
+
+    shared: F64
+    covariance: F64
+    shared_covariance: F64
+    fit: F64
+    known: F64
+    misfit: float
+    step_squares: F64
+    step_redundancy: F64
+
+
+class _System(NamedTuple):
+    """Normal equations of a stretch at its present poses: information (n, n) and gradient (n,)."""
+
+    A: F64
+    g: F64
+
+
+def solve_stretch(
+    knots: Sequence[Knot],
+    steps: Sequence[Sequence[Step]],
+    belief: Belief,
+    match_map: MatchMap,
+    registration: RegistrationParameters,
+    scales: Sequence[float],
+    max_iterations: int = 8,
+) -> Solved:
+    """Move the poses of N knots (in place) to where map, odometry and belief agree best.
+
+    Args:
+        knots: in order of time; their poses are where to begin.
+        steps: (N - 1) what is known of the motion between neighbours: one or more measurements each.
+        belief: of the first pose and the shared parameters; its `shared` is where those begin.
+        match_map: the map around the stretch.
+        registration: noise of points and wheels, correlation.
+        scales: robust scales in sigmas, wide to narrow.
+        max_iterations: Gauss-Newton steps at each scale.
+    """
+    shared = belief.shared.copy()
+    for scale in scales:
+        for _ in range(max_iterations):
+            _match(knots, match_map, registration, scale)
+            system = _system(knots, steps, belief, shared, registration)
+            step = -np.linalg.solve(system.A, system.g)
+            _move(knots, step)
+            shared += step[-N_SHARED:]
+            if _small(step[:-N_SHARED].reshape(-1, 6), STOP_M, STOP_RAD):
+                break
+    _match(knots, match_map, registration, scales[-1])
+    A = _system(knots, steps, belief, shared, registration).A
+    return _solved(knots, steps, A, shared - belief.shared, belief.shared, registration, scales[-1])
+
+
+def marginalised(
+    knots: Sequence[Knot],
+    steps: Sequence[Sequence[Step]],
+    belief: Belief,
+    shared: F64,
+    registration: RegistrationParameters,
+) -> Belief:
+    """What all knots but the last one tell about the last one and the shared parameters (Schur complement).
+
+    The match of the last knot is not part of it: it stays with the stretch that goes on there.
+    """
+    last = Knot(knots[-1].points_m, knots[-1].T_map_vehicle, knots[-1].weight)
+    A, g = _system([*knots[:-1], last], steps, belief, shared, registration)
+    kept = slice(6 * (len(knots) - 1), None)
+    gone = slice(0, 6 * (len(knots) - 1))
+    through = np.linalg.solve(A[gone, gone], np.column_stack([A[gone, kept], g[gone]]))
+    information = A[kept, kept] - A[kept, gone] @ through[:, :-1]
+    gradient = g[kept] - A[kept, gone] @ through[:, -1]
+    return Belief(last.T_map_vehicle, shared.copy(), 0.5 * (information + information.T), gradient)
+
+
+def _match(knots: Sequence[Knot], match_map: MatchMap, par: RegistrationParameters, scale: float) -> None:
+    """Match the knots with the map that have moved since, or were matched with another scale."""
+    for knot in knots:
+        m, T = knot.match, knot.T_map_vehicle
+        if (
+            m is not None
+            and m.scale == scale
+            and _small(log_se3(T_inverse(m.T_map_vehicle) @ T)[None], SMALL_M, SMALL_RAD)
+        ):
+            continue
+        knot.match = linearised(knot.points_m, T, match_map, par, scale)
+
+
+def _system(
+    knots: Sequence[Knot],
+    steps: Sequence[Sequence[Step]],
+    belief: Belief,
+    shared: F64,
+    par: RegistrationParameters,
+) -> _System:
+    n = 6 * len(knots) + N_SHARED
+    A, g = np.zeros((n, n)), np.zeros(n)
+    _add_belief(A, g, knots[0], belief, shared)
+    for k, knot in enumerate(knots):
+        if knot.match is not None:
+            at, weight = slice(6 * k, 6 * k + 6), knot.weight / par.correlation
+            moved = log_se3(T_inverse(knot.match.T_map_vehicle) @ knot.T_map_vehicle)
+            A[at, at] += weight * knot.match.H
+            g[at] += weight * (knot.match.g + knot.match.H @ moved)
+    for k, measured in enumerate(steps):
+        relative = T_inverse(knots[k].T_map_vehicle) @ knots[k + 1].T_map_vehicle
+        for step in measured:
+            _add_step(A, g, k, relative, step, shared - belief.shared)
+    return _System(A, g)
+
+
+def _add_belief(A: F64, g: F64, first: Knot, belief: Belief, shared: F64) -> None:
+    at = np.r_[0:6, len(g) - N_SHARED : len(g)]
+    off = np.concatenate([log_se3(T_inverse(belief.T_map_vehicle) @ first.T_map_vehicle), shared - belief.shared])
+    A[np.ix_(at, at)] += belief.information
+    g[at] += belief.gradient + belief.information @ off
+
+
+def _add_step(A: F64, g: F64, k: int, relative: F64, step: Step, shared_off: F64) -> None:
+    """A measured motion from knot k to k + 1, with Cauchy weight."""
+    e, J = _residual(relative, step, shared_off)
+    information = np.linalg.inv(step.covariance)
+    weighted = J.T @ information / (1.0 + float(e @ information @ e) / STEP_CHI2)
+    at = np.r_[6 * k : 6 * k + 12, len(g) - N_SHARED : len(g)]
+    A[np.ix_(at, at)] += weighted @ J
+    g[at] += weighted @ e
+
+
+def _residual(relative: F64, step: Step, shared_off: F64) -> tuple[F64, F64]:
+    """e = log(Z^-1 T_k^-1 T_k+1) - S shared (6,), and its derivative (6, 12 + N_SHARED) after both poses and those."""
+    e = log_se3(T_inverse(step.T_before_now) @ relative) - step.shared @ shared_off
+    J = np.zeros((6, 12 + N_SHARED))
+    p, R, R_Z = relative[:3, 3], relative[:3, :3], step.T_before_now[:3, :3]
+    J[:3, :3], J[:3, 6:9] = -R.T, np.eye(3)
+    J[3:, :3] = R_Z.T @ np.array([[0.0, -p[2], p[1]], [p[2], 0.0, -p[0]], [-p[1], p[0], 0.0]])
+    J[3:, 3:6], J[3:, 9:12] = -R_Z.T, R_Z.T @ R
+    J[:, 12:] = -step.shared
+    return e, J
+
+
+def _move(knots: Sequence[Knot], step: F64) -> None:
+    for knot, small in zip(knots, step[:-N_SHARED].reshape(-1, 6), strict=True):
+        R, T = knot.T_map_vehicle[:3, :3], knot.T_map_vehicle.copy()
+        T[:3, :3], T[:3, 3] = R @ exp_so3(small[:3]), T[:3, 3] + R @ small[3:]
+        knot.T_map_vehicle = T
+
+
+def _solved(
+    knots: Sequence[Knot],
+    steps: Sequence[Sequence[Step]],
+    A: F64,
+    shared_off: F64,
+    shared_before: F64,
+    par: RegistrationParameters,
+    scale: float,
+) -> Solved:
+    covariance = np.linalg.inv(A)
+    blocks = np.stack([covariance[6 * k : 6 * k + 6, 6 * k : 6 * k + 6] for k in range(len(knots))])
+    seen = [(knot, knot.match) for knot in knots if knot.match is not None]
+    squares, redundancy = _checked_steps(knots, steps, covariance, shared_off)
+    return Solved(
+        shared=shared_before + shared_off,
+        covariance=blocks,
+        shared_covariance=covariance[-N_SHARED:, -N_SHARED:],
+        fit=np.array([match.fit(scale) for _, match in seen]),
+        known=np.array([match.inside / max(len(knot.points_m), 1) for knot, match in seen]),
+        misfit=_misfit(knots, par),
+        step_squares=squares,
+        step_redundancy=redundancy,
+    )
+
+
+def _checked_steps(
+    knots: Sequence[Knot], steps: Sequence[Sequence[Step]], covariance: F64, shared_off: F64
+) -> tuple[F64, F64]:
+    squares, redundancy, n = np.zeros(6), np.zeros(6), len(covariance)
+    for k, (step, *_) in enumerate(steps):
+        e, J = _residual(T_inverse(knots[k].T_map_vehicle) @ knots[k + 1].T_map_vehicle, step, shared_off)
+        at = np.r_[6 * k : 6 * k + 12, n - N_SHARED : n]
+        variance = np.diag(step.covariance)
+        left_open = np.diag(J @ covariance[np.ix_(at, at)] @ J.T) / variance
+        squares += e**2 / variance
+        redundancy += np.clip(1.0 - left_open, 0.0, 1.0)
+    return squares, redundancy
+
+
+def _misfit(knots: Sequence[Knot], par: RegistrationParameters) -> float:
+    """Mean over the knots' constrained directions of their squared disagreement with the solution, in sigmas."""
+    scale = np.array([1.0 / LEVER_M] * 3 + [1.0] * 3)
+    total, n = 0.0, 0
+    for knot in knots:
+        if knot.match is None:
+            continue
+        off = log_se3(T_inverse(knot.match.T_map_vehicle) @ knot.T_map_vehicle)
+        values, vectors = np.linalg.eigh(knot.match.H * scale * scale[:, None])
+        strong = values > par.correlation / par.degenerate_m**2
+        pull = vectors[:, strong].T @ ((knot.match.g + knot.match.H @ off) * scale)
+        total += float((pull**2 / values[strong]).sum()) / par.correlation
+        n += int(strong.sum())
+    return total / max(n, 1)
+
+
+def shared_of(T_driven: F64, dt_s: float) -> F64:
+    """(6, N_SHARED) how a motion (4, 4) by wheels and gyro that took `dt_s` differs when a shared parameter is larger."""
+    S = np.zeros((6, N_SHARED))
+    S[2, BIAS] = -dt_s  # what is taken off the yaw rate
+    forward_m = T_driven[0, 3]
+    turned = T_driven[:3, :3].T
+    S[3:, SCALE] = turned @ T_driven[:3, 3]
+    S[3:, LEFT], S[3:, UP] = turned @ [0.0, forward_m, 0.0], turned @ [0.0, 0.0, forward_m]
+    return S
+
+
+def _small(motion: F64, m: float, rad: float) -> bool:
+    """True when none of the small motions (N, 6) is larger."""
+    return bool(np.abs(motion[:, 3:]).max(initial=0.0) < m and np.abs(motion[:, :3]).max(initial=0.0) < rad)
+
+
+def log_se3(T: F64) -> F64:
+    """(6,) rotation vector and position of a small motion (4, 4)."""
+    return np.concatenate([log_so3(T[:3, :3]), T[:3, 3]])
