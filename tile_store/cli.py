@@ -25,6 +25,7 @@ from tile_store.errors import StoreError
 from tile_store.export import FORMATS, export_map
 from tile_store.server import TileServer
 from tile_store.sqlite_store import SqliteStore
+from tile_store.status import status
 from tile_store.store import Store
 from tile_store.values import DEFAULT_LAYER
 
@@ -72,6 +73,9 @@ def store(path: Path, connect: tuple[str, ...], workers: int) -> None:
 @click.group(name="map")
 def map_group() -> None:
     """Inspect, compare, export and roll back maps; `gnd map build` is in `deploy.map_cli`, above the segmentation."""
+
+
+map_group.add_command(status)
 
 
 @map_group.command(short_help="What a store holds, in numbers.")
