@@ -13,6 +13,7 @@ from vehicle_agent.features.view import CAMERA, Occlusion
 
 PERIOD_S = 1.0 / 15.0
 FEW = SlamcuParameters(filter=FilterParameters(particles=300))
+NO_SHIFT = np.zeros(2)
 CERTAIN = np.diag([1e-6, 1e-6, 1e-10])
 
 

@@ -7,7 +7,7 @@ import numpy as np
 from gnd_map.arrays import F64
 from vehicle_agent.features.slamcu.doubt import Doubt, Step
 from vehicle_agent.features.slamcu.existence_book import Entry, ExistenceBook, FeatureClass
-from vehicle_agent.features.slamcu.identities import NONE, best_identities
+from vehicle_agent.features.slamcu.identities import LN_NONE, NONE, best_identities
 from vehicle_agent.features.slamcu.parameters import SlamcuParameters
 from vehicle_agent.features.slamcu.rbpf import Rbpf
 from vehicle_agent.features.slamcu.tracked import Tracked
@@ -22,6 +22,8 @@ TOGETHER_SHARE: Final = 0.15
 """Two features that are measured at once in this share of the looks that could are two."""
 GROUP_M: Final = 12.0
 """Features within this distance may be taken for each other: three lanes."""
+RIVAL_SHARE: Final = 0.25
+"""What was measured less often than this share of what stands beside it is no feature of the map that was in view."""
 GIVEN_UP: Final = 0.9
 """A new feature with this mass of absence is forgotten."""
 
@@ -39,6 +41,7 @@ class Tidying:
     def __init__(self, parameters: SlamcuParameters, tracked: Tracked, rbpf: Rbpf, book: ExistenceBook) -> None:
         self._p, self._tracked, self._rbpf, self._book = parameters, tracked, rbpf, book
         self._doubt = Doubt(tracked, rbpf, book)
+        self.ln_none = LN_NONE
 
     def measured_together(self, detected: list[Entry]) -> None:
         """Remember which features were measured in one look."""
@@ -68,6 +71,17 @@ class Tidying:
             elif out_of_view:
                 self._leave(entry, odometer_m)
         self._leave_oldest()
+
+    def let_go(self) -> None:
+        """Estimate nothing any longer: what is new and exists stays where it is, what is not is forgotten."""
+        for entry in list(self._tracked.live):
+            if not entry.known and self._book.classify(entry) == FeatureClass.NEW:
+                self._freeze(entry)
+            elif not entry.known:
+                self._tracked.drop(entry)
+            else:
+                self._tracked.leave(entry)
+        self._doubt.forget()
 
     def _settle(self, entry: Entry, t_ns: int) -> None:
         """Compare with the position known otherwise, and take that in."""
@@ -116,7 +130,7 @@ class Tidying:
         if len(group) < 2:
             return
         slots = [one.slot for one in group if one.slot is not None]
-        found = list(zip(group, best_identities(self._rbpf, slots, owned), strict=False))
+        found = list(zip(group, best_identities(self._rbpf, slots, owned, self.ln_none), strict=False))
         for feature, slot in found:
             if slot == NONE:
                 self._split(feature, t_ns)
@@ -128,7 +142,9 @@ class Tidying:
         """Features like this one around it that are being estimated, those of the map that are not settled first."""
         alike = [one for one in self._tracked.live if one.kind == entry.kind and self._together(one, entry)]
         unsettled = [one for one in alike if one.known and one.slot is not None and self._rbpf.priors[one.slot]]
-        return unsettled + [one for one in alike if not one.known and one.cov is None]
+        most = max(one.pass_hits for one in alike)
+        found = [one for one in alike if not one.known and one.cov is None]
+        return unsettled + [one for one in found if one.pass_hits >= RIVAL_SHARE * most]
 
     def _together(self, one: Entry, other: Entry) -> bool:
         places = [self._rbpf.mu[each.slot].mean(axis=0) for each in (one, other)]
