@@ -18,8 +18,8 @@ DEFAULT_OUT = Path("runs/reproduce-slamcu")
 @click.option("--out", type=PATH, default=DEFAULT_OUT, show_default=True, help="Folder that keeps everything.")
 @click.option("--json", "json_file", help="Write the result as JSON; `-` prints it and nothing else.")
 @click.option("--pictures", type=PATH, help="Folder for the figures.  [default: the one that keeps everything]")
-@click.option("--processes", type=int, help="Worker processes.  [default: one a core]")
-def slamcu(json_file: str | None, out: Path, pictures: Path | None, processes: int | None, **given: Any) -> None:
+@click.option("--processes", default=1, show_default=True, help="Worker processes.")
+def slamcu(json_file: str | None, out: Path, pictures: Path | None, processes: int, **given: Any) -> None:
     """Signs that have gone or are new, found by single cars on a motorway: Figures 8 and 9 and Table 1 of the SLAMCU
     paper, and what ten cars make of it.
 

@@ -30,6 +30,9 @@ GATE_OFFSET: Final = 18.4
 """χ² of 2 degrees of freedom, one in 10,000."""
 GATE_BLIND: Final = 21.1
 """χ² of 3 degrees of freedom, one in 10,000."""
+WORTH_ASKING: Final = 0.65
+"""An alarm is raised from this share of either gate on, one in 300 to 400: asking costs time only. An account that is
+beyond the gate itself will not do."""
 MOST_COST: Final = 0.25
 """A fix speaks against a place with at most so much (natural logarithm) more than one that fits: a minute of
 reflections weighs as five signs do."""
@@ -123,9 +126,13 @@ class Watch:
 
     def alarm(self, share: float = 1.0) -> Alarm | None:
         """The test that fails most, if one does; `share` < 1 of the gates for a stricter question."""
-        tests = (("offset", self._offset, GATE_OFFSET), ("blind", self._blind, GATE_BLIND), ("map", self.run, GATE_MAP))
-        name, value, gate = max(tests, key=lambda test: test[1] / test[2])
-        return Alarm(name, value, gate) if value > share * gate else None
+        tests = (
+            Alarm("offset", self._offset, WORTH_ASKING * GATE_OFFSET),
+            Alarm("blind", self._blind, WORTH_ASKING * GATE_BLIND),
+            Alarm("map", self.run, GATE_MAP),
+        )
+        most = max(tests, key=lambda test: test.value / test.gate)
+        return most if most.value > share * most.gate else None
 
     @property
     def agrees(self) -> bool:

@@ -307,7 +307,11 @@ class WatchedSlamcu:
     def _look_into(self, alarm: Alarm) -> None:
         """Tell the way anew, and keep the best account of it."""
         self.doubts += 1
-        tried = [(one, account) for one in self._back() for account in self._tellings(one)]
+        tried: list[tuple[_Kept, _Account]] = []
+        for one in self._back():
+            tried += [(one, account) for account in self._tellings(one)]
+            if any(self._will_do(account) for _, account in tried):
+                break
         least = min(_against(account) for _, account in tried)
         one, best = next(pair for pair in tried if _against(pair[1]) <= least + ALIKE)  # the shortest way back
         better = _against(best) < _against(self._now) - BETTER
@@ -318,6 +322,10 @@ class WatchedSlamcu:
             self._give_up(alarm)
         self._now.watch.settled()
         self._asked_s = self._slamcu.now_s
+
+    def _will_do(self, account: _Account) -> bool:
+        """Whether an account is so much better, and so free of doubt, that none from farther back is needed."""
+        return account.watch.alarm() is None and _against(account) < _against(self._now) - 2.0 * BETTER
 
     def _tellings(self, kept: _Kept) -> Iterator[_Account]:
         """From a state by particles around the blind pose, and by those that were there, which doubt the map."""
