@@ -92,4 +92,5 @@ def driven(
             speed = (road.speed_mps + way / PERIOD_S) / (1.0 + scale)
             slamcu.predict(PERIOD_S, speed, bias + turn / PERIOD_S)
         slamcu.look(road.look(i, pose, rng, hidden=hidden), CAMERA, occlusion)
+    slamcu.decide()
     return slamcu

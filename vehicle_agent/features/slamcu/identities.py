@@ -8,7 +8,7 @@ the whole in each particle: the pose is the same for all of them.
 
 from itertools import permutations
 from math import perm
-from typing import Final
+from typing import Final, NamedTuple
 
 import numpy as np
 from scipy.optimize import linear_sum_assignment
@@ -28,7 +28,16 @@ MOST_WAYS: Final = 720
 """More ways than this are not compared; then the best pairs alone are the only other way."""
 
 
-def best_identities(rbpf: Rbpf, slots: list[int], owned: int, ln_none: float = LN_NONE) -> list[int]:
+class Identities(NamedTuple):
+    """The likeliest way to give estimates to features of the map."""
+
+    slots: list[int]
+    """J of the slots, in the order of the features; `NONE` for one that none of them is."""
+    lead: float
+    """How much likelier than the next way, natural logarithm; inf where there is only one."""
+
+
+def best_identities(rbpf: Rbpf, slots: list[int], owned: int, ln_none: float = LN_NONE) -> Identities:
     """Which of `slots` are the features of the map that own the first ones.
 
     Args:
@@ -36,14 +45,14 @@ def best_identities(rbpf: Rbpf, slots: list[int], owned: int, ln_none: float = L
         slots: S slots of one kind near one another, the `owned` ones first.
         owned: J features of the map, J <= S.
         ln_none: of the density of a feature that is none of them, 1/m^2.
-
-    Returns:
-        J of the slots, in the order of the features; `NONE` for one that none of them is.
     """
     fit = agreements(rbpf, slots, owned)
     log_weight = np.log(np.maximum(rbpf.weights(without=set(slots)), 1e-300))
-    best = max(_ways(fit, log_weight), key=lambda way: likelihood(fit, log_weight, way, ln_none))
-    return [NONE if i == NONE else slots[i] for i in best]
+    ways = _ways(fit, log_weight)
+    told = np.array([likelihood(fit, log_weight, way, ln_none) for way in ways])
+    best = int(np.argmax(told))
+    lead = float(told[best] - np.delete(told, best).max(initial=-np.inf))
+    return Identities([NONE if i == NONE else slots[i] for i in ways[best]], lead)
 
 
 def agreements(rbpf: Rbpf, slots: list[int], owned: int) -> F64:

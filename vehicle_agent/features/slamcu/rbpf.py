@@ -39,6 +39,7 @@ class Rbpf:
         mu: (F, M, 2) positions of the features.
         sigma: (F, M, 3) their covariances xx, xy, yy.
         priors: F positions known otherwise that are not yet settled, None where there is none.
+        provisional: F, whether such a prior weighs the particles already; not where it may be another feature's.
         rng: where chance comes from.
         weighing: whether measurements weigh particles; not where poses are given.
     """
@@ -57,6 +58,7 @@ class Rbpf:
         self.mu = np.zeros((0, m, 2))
         self.sigma = np.zeros((0, m, 3))
         self.priors: list[Prior | None] = []
+        self.provisional: list[bool] = []
         self.weighing = True
         self.resampled = 0
 
@@ -130,11 +132,12 @@ class Rbpf:
         mu, sigma = measurement.inverse(self.state[:3], z, variance)
         self.mu, self.sigma = np.concatenate([self.mu, mu[None]]), np.concatenate([self.sigma, sigma[None]])
         self.priors.append(prior)
+        self.provisional.append(True)
 
     def remove(self, slot: int) -> None:
         """Forget a feature."""
         self.mu, self.sigma = np.delete(self.mu, slot, axis=0), np.delete(self.sigma, slot, axis=0)
-        del self.priors[slot]
+        del self.priors[slot], self.provisional[slot]
 
     def measure(self, slot: int, z: F64, variance: F64, *, weigh: bool) -> None:
         """Update a feature with a measurement, Eq. (16), and the weights, Eq. (18) and (19)."""
@@ -157,7 +160,7 @@ class Rbpf:
         log = self.log_weight.copy()
         if self.weighing:
             for slot, prior in enumerate(self.priors):
-                if prior is not None and slot not in without:
+                if prior is not None and self.provisional[slot] and slot not in without:
                     log += self._agreement(slot, prior)
         return _normalised(log)
 

@@ -22,7 +22,7 @@ from vehicle_agent.features.slamcu.forecast import Forecast, forecast
 from vehicle_agent.features.slamcu.identities import LN_NONE, LN_NONE_DOUBTED
 from vehicle_agent.features.slamcu.parameters import SlamcuParameters
 from vehicle_agent.features.slamcu.rbpf import Rbpf
-from vehicle_agent.features.slamcu.tidying import Tidying
+from vehicle_agent.features.slamcu.tidying import Innovation, Tidying
 from vehicle_agent.features.slamcu.tracked import Tracked
 from vehicle_agent.features.slamcu.verdicts import KnownState, NewFeature
 from vehicle_agent.features.view import Occlusion, SensorView, wrapped
@@ -101,6 +101,7 @@ class Slamcu:
         self.fixes_refused = 0
         self._gnss_s: float | None = None
         self._weighed_s: float | None = None
+        self._looked_ns = 0
 
     def predict(self, dt_s: float, speed_mps: float, yaw_rate_radps: float) -> None:
         """The vehicle drove on for `dt_s` with the wheel speed and yaw rate that it measured.
@@ -183,8 +184,20 @@ class Slamcu:
         return [
             Passed(entry.number, entry.known, entry.kind, entry.xy_m, self._book.classify(entry))
             for entry in (*self._tracked.known, *self._tracked.new)
-            if from_s < entry.in_view_s <= until_s and entry.hits + entry.misses
+            if from_s < entry.in_view_s <= until_s and entry.hits + entry.misses and self._decided(entry)
         ]
+
+    def decide(self) -> None:
+        """The drive has ended: decide what was left open for further signs to tell."""
+        self._tidying.decide(self._looked_ns)
+
+    def _decided(self, entry: Entry) -> bool:
+        return entry.slot is None or self._rbpf.provisional[entry.slot]
+
+    def told(self) -> list[Innovation]:
+        """How far from their places features of the map were measured that have been settled since the last call."""
+        found, self._tidying.told = self._tidying.told, []
+        return found
 
     def changes(self) -> tuple[int, int]:
         """How many features of the map are called deleted, and how many new ones there are."""
@@ -205,6 +218,7 @@ class Slamcu:
             view: what the detector could have seen.
             occlusion: what was in the way; None = nothing.
         """
+        self._looked_ns = look.t_ns
         weights = self._rbpf.weights()
         near = self._tracked.within(self._rbpf.state[:2] @ weights, view.range_m + NEAR_M)
         ahead = forecast(self._rbpf, weights, near)

@@ -1,12 +1,14 @@
 """Is the vehicle where its particles have it? Asked of what they cannot talk round: the GNSS, wheels and gyro, the map.
 
-Three tests, each over a while, for each can be wrong for a moment:
+Four tests:
 
 - **offset**: the mean of fix minus pose, weighed by how far its neighbours tell the same error once more (the fixes'
   slow error is a Gauss-Markov process: generalised least squares by its Kalman filter), over two windows;
 - **blind**: the pose against that of wheels, gyro and GNSS alone (`blind.py`), which tells the heading too;
 - **map**: features of the map that have gone, while one like it stands near by, against those found in place: a
-  sequential test (CUSUM) of "lost" against "here".
+  sequential test (CUSUM) of "lost" against "here";
+- **sign**: how far from its place in the map a feature was measured, in units of what pose and measurement may be off
+  by: the sign that finds a lost vehicle's place again is far from where it was expected.
 """
 
 from collections.abc import Sequence
@@ -21,6 +23,7 @@ from vehicle_agent.features.slamcu.blind import Belief, apart
 from vehicle_agent.features.slamcu.existence_book import FeatureClass
 from vehicle_agent.features.slamcu.parameters import GnssNoise
 from vehicle_agent.features.slamcu.slamcu import Passed
+from vehicle_agent.features.slamcu.tidying import Innovation
 
 WINDOWS_S: Final = (40.0, 160.0)
 """Over these times offsets are averaged: three and twelve time constants of the slow error."""
@@ -33,6 +36,10 @@ GATE_BLIND: Final = 21.1
 WORTH_ASKING: Final = 0.65
 """An alarm is raised from this share of either gate on, one in 300 to 400: asking costs time only. An account that is
 beyond the gate itself will not do."""
+GATE_SIGN: Final = 10.6
+"""χ² of 2 degrees of freedom, one in 200."""
+LEAST_LN_DENSITY: Final = -11.5
+"""A feature called itself in spite of its place costs no more than this: one in 100,000 a square metre."""
 MOST_COST: Final = 0.25
 """A fix speaks against a place with at most so much (natural logarithm) more than one that fits: a minute of
 reflections weighs as five signs do."""
@@ -55,7 +62,7 @@ class Alarm:
     """The place is in doubt.
 
     Attributes:
-        test: "offset", "blind" or "map".
+        test: "offset", "blind", "map" or "sign".
         value: of its statistic.
         gate: that it should stay below.
     """
@@ -66,13 +73,13 @@ class Alarm:
 
 
 class Watch:
-    """The three tests along one account of a drive.
+    """The four tests along one account of a drive.
 
     Args:
         noise: of the GNSS.
 
     Attributes:
-        cost: what the fixes say against this account (natural logarithm).
+        cost: what fixes and signs say against this account (natural logarithm).
         run: of the map's test, >= 0.
     """
 
@@ -83,6 +90,7 @@ class Watch:
         self._offset = self._blind = 0.0
         self.cost = 0.0
         self.run = 0.0
+        self._sign = 0.0
 
     def fix(self, off_m: F64, sigma_m: float, dt_s: float, pose: tuple[F64, F64], blind: Belief) -> None:
         """Take a fix that was used.
@@ -118,11 +126,17 @@ class Watch:
             if one.known:
                 self.run = max(self.run + _told(one, beside), 0.0)
 
+    def sign(self, told: Innovation) -> None:
+        """A feature of the map was measured, and compared with its place."""
+        self._sign = max(self._sign, told.squared)
+        self.cost -= max(told.ln_density, LEAST_LN_DENSITY)
+
     def settled(self) -> None:
         """The doubt has been looked into, and this account is the best there is: one more such sign, and it is asked
         again.
         """
         self.run = min(self.run, 0.5 * GATE_MAP)
+        self._sign = 0.0
 
     def alarm(self, share: float = 1.0) -> Alarm | None:
         """The test that fails most, if one does; `share` < 1 of the gates for a stricter question."""
@@ -130,6 +144,7 @@ class Watch:
             Alarm("offset", self._offset, WORTH_ASKING * GATE_OFFSET),
             Alarm("blind", self._blind, WORTH_ASKING * GATE_BLIND),
             Alarm("map", self.run, GATE_MAP),
+            Alarm("sign", self._sign, GATE_SIGN),
         )
         most = max(tests, key=lambda test: test.value / test.gate)
         return most if most.value > share * most.gate else None

@@ -146,6 +146,8 @@ class _Account:
 
     def _passed(self) -> None:
         slamcu = self.slamcu
+        for told in slamcu.told():
+            self.watch.sign(told)
         until_s = slamcu.now_s - CLEAR_S
         if seen := slamcu.last_seen(self._seen_s, until_s):
             self.watch.passed(seen, slamcu.last_seen(self._seen_s - 2.0 * PATIENCE_S, slamcu.now_s))
@@ -232,6 +234,7 @@ class WatchedSlamcu:
         alarm = self._now.watch.alarm(AT_THE_END)
         if alarm is not None:
             self._look_into(alarm)
+        self._slamcu.decide()
 
     def pose(self) -> tuple[F64, F64]:
         """Pose (3,) x, y [m], heading [rad], and covariance (3, 3)."""
