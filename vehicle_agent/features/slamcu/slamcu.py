@@ -16,7 +16,7 @@ from gnd_map.arrays import F64, I64
 from vehicle_agent.features.errors import BadPose
 from vehicle_agent.features.look import Look, MapFeatures
 from vehicle_agent.features.slamcu.association import Association, associate, pair_costs
-from vehicle_agent.features.slamcu.blind import Belief, BlindFilter
+from vehicle_agent.features.slamcu.blind import STANDING_MPS, Belief, BlindFilter
 from vehicle_agent.features.slamcu.existence_book import Entry, ExistenceBook, FeatureClass, existence_of
 from vehicle_agent.features.slamcu.forecast import Forecast, forecast
 from vehicle_agent.features.slamcu.identities import LN_NONE, LN_NONE_DOUBTED
@@ -29,6 +29,8 @@ from vehicle_agent.features.view import Occlusion, SensorView, wrapped
 
 NEAR_M: Final = 30.0
 """Features so much farther than the view's range cannot be what was measured."""
+TOGETHER_S: Final = 0.1
+"""Samples of wheels and gyro are put together for at most so long."""
 LEAST_PLAUSIBLE: Final = 1e-3
 """A feature that surely is not there competes for measurements with this share of its likelihood."""
 
@@ -102,6 +104,7 @@ class Slamcu:
         self._gnss_s: float | None = None
         self._weighed_s: float | None = None
         self._looked_ns = 0
+        self._moved = np.zeros(3)  # seconds, metres, radians that the particles have not moved yet
 
     def predict(self, dt_s: float, speed_mps: float, yaw_rate_radps: float) -> None:
         """The vehicle drove on for `dt_s` with the wheel speed and yaw rate that it measured.
@@ -111,10 +114,20 @@ class Slamcu:
         """
         if not (isfinite(dt_s + speed_mps + yaw_rate_radps) and dt_s >= 0.0):
             raise BadPose(f"motion of {speed_mps} m/s, {yaw_rate_radps} rad/s over {dt_s} s")
-        self._rbpf.predict(dt_s, speed_mps, yaw_rate_radps)
         self._blind.predict(dt_s, speed_mps, yaw_rate_radps)
+        if abs(speed_mps) >= STANDING_MPS:
+            self._moved += np.array([dt_s, speed_mps * dt_s, yaw_rate_radps * dt_s])
+            if self._moved[0] >= TOGETHER_S:
+                self._move()
         self.now_s += dt_s
         self.odometer_m += abs(speed_mps) * dt_s
+
+    def _move(self) -> None:
+        """Move the particles by what was driven since they moved last: nobody asks them between looks and fixes."""
+        dt_s, way_m, turn_rad = self._moved.tolist()
+        if dt_s > 0.0:
+            self._rbpf.predict(dt_s, way_m / dt_s, turn_rad / dt_s)
+            self._moved = np.zeros(3)
 
     def gnss(self, x_m: float, y_m: float, sigma_m: float) -> bool:
         """A GNSS fix in the map frame; `sigma_m` of each axis.
@@ -134,6 +147,7 @@ class Slamcu:
         if not self._blind.fix(np.array([x_m, y_m]), sigma_m, since_s):
             self.fixes_refused += 1
             return False
+        self._move()
         weighed_s = since_s if self._weighed_s is None else self.now_s - self._weighed_s
         self._rbpf.gnss(np.array([x_m, y_m]), sigma_m, weighed_s)
         self._weighed_s = self.now_s
@@ -149,11 +163,13 @@ class Slamcu:
         """
         pose, cov = checked_pose(pose, cov)
         self.z_m = z_m
+        self._moved = np.zeros(3)
         self._rbpf.weighing = False
         self._rbpf.place(pose, cov)
 
     def pose(self) -> tuple[F64, F64]:
         """Pose (3,) x, y [m], heading [rad], and covariance (3, 3)."""
+        self._move()
         return self._rbpf.pose(self._rbpf.weights())
 
     @property
@@ -167,6 +183,7 @@ class Slamcu:
         What is under way with features ends here: those of the map are not settled, new ones stay where they are.
         """
         self._tidying.let_go()
+        self._moved = np.zeros(3)
         self._rbpf.seed(self._blind.belief)
 
     def doubt_the_map(self, *, doubted: bool = True) -> None:
@@ -218,6 +235,7 @@ class Slamcu:
             view: what the detector could have seen.
             occlusion: what was in the way; None = nothing.
         """
+        self._move()
         self._looked_ns = look.t_ns
         weights = self._rbpf.weights()
         near = self._tracked.within(self._rbpf.state[:2] @ weights, view.range_m + NEAR_M)

@@ -26,10 +26,10 @@ KEEP_EVERY_M: Final = 300.0
 """A state is kept so often, when nothing is in view."""
 KEEP_AT_LEAST_M: Final = 1000.0
 """And even when something is."""
-KEPT: Final = 20
-"""So many states: 6 km."""
+KEPT: Final = 14
+"""So many states: 4 km."""
 CLEAR_S: Final = 1.0
-BACK_M: Final = (400.0, 1200.0, 3000.0, 6000.0)
+BACK_M: Final = (400.0, 1500.0, 4000.0)
 """From states so far back the way is told anew."""
 ASK_EVERY_S: Final = 1.0
 BETTER: Final = 3.0
