@@ -78,8 +78,8 @@ class Entry:
 
     def __deepcopy__(self, memo: dict[int, Any]) -> "Entry":
         """A copy that goes its own way: arrays are only ever replaced, never written into, and may be shared."""
-        own = {"heights": self.heights.copy(), "history": self.history.copy(), "together": self.together.copy()}
-        memo[id(self)] = copied = replace(self, **own)
+        copied = replace(self, heights=self.heights.copy(), history=self.history.copy(), together=self.together.copy())
+        memo[id(self)] = copied
         return copied
 
     @property
