@@ -186,6 +186,11 @@ class Slamcu:
         self._moved = np.zeros(3)
         self._rbpf.seed(self._blind.belief)
 
+    def widen(self, position_m: float, heading_rad: float) -> None:
+        """The place is in doubt, and nobody can tell a better one: be as uncertain as that from now on."""
+        self._move()
+        self._rbpf.loosen((), position_m, heading_rad)
+
     def doubt_the_map(self, *, doubted: bool = True) -> None:
         """Whether to take it easier that a sign is gone and another stands in its place."""
         self._tidying.ln_none = LN_NONE_DOUBTED if doubted else LN_NONE

@@ -10,6 +10,7 @@ state that was good is undone, and the place is looked for anew where the vehicl
 from collections.abc import Iterator
 from copy import deepcopy
 from dataclasses import dataclass
+from math import radians
 from typing import Final
 
 import numpy as np
@@ -39,6 +40,9 @@ ALIKE: Final = 1.0
 PATIENCE_S: Final = 20.0
 """After a doubt has been looked into, so long no other one is; twice as long each time that it changed nothing."""
 MOST_PATIENCE_S: Final = 160.0
+WIDE_M: Final = 2.5
+WIDE_RAD: Final = radians(0.5)
+"""What a place is made less certain by that fixes speak against, when no account is better: most of a lane."""
 AT_THE_END: Final = 0.5
 """When the drive ends a doubt need be only so large: nothing more will come."""
 
@@ -321,6 +325,8 @@ class WatchedSlamcu:
         self._patience_s = PATIENCE_S if better else min(2.0 * self._patience_s, MOST_PATIENCE_S)
         if better:
             self._adopt(one, best, alarm)
+        elif alarm.test in ("offset", "blind"):
+            self._slamcu.widen(WIDE_M, WIDE_RAD)
         if not self._now.watch.agrees:
             self._give_up(alarm)
         self._now.watch.settled()
