@@ -12,7 +12,7 @@ from fleet_sim.courses.company import Companion, car, keeping, lagging, lorry, p
 from fleet_sim.courses.course import Course, Place
 from fleet_sim.courses.faults import Faults
 from fleet_sim.courses.places import LENGTH_M
-from fleet_sim.courses.ride import Ride, cruise, halting
+from fleet_sim.courses.ride import Ride, cruise, halting, lively
 
 _CRUISE_MPS: Final = 9.0
 _PARKED_SHARE: Final = 0.2
@@ -87,7 +87,7 @@ class HardCase:
         return Course(place, ride, self.company(rng), self.faults(rng), cars)
 
 
-_WITH_KERBS: Final = ("street", "rebuilt")
+_WITH_KERBS: Final = ("street", "followed", "rebuilt")
 """Places in which cars park at the kerb (the hill's kerb climbs, the others have none)."""
 
 
@@ -127,20 +127,24 @@ def _queue(rng: np.random.Generator) -> tuple[Companion, ...]:
 
 def _creeping(rng: np.random.Generator, way_m: float) -> Ride:
     del way_m
-    return halting(rng, 3.0, 22.0, 0.4)
+    return halting(rng, 3.0, 24.0, (2.5, 5.0), (3.0, 6.0))
 
 
 def _stopping(rng: np.random.Generator, way_m: float) -> Ride:
     del way_m
-    return halting(rng, 8.0, 20.0, 0.35)
+    return halting(rng, 8.0, 22.0, (3.5, 5.0), (4.0, 6.0))
 
 
 def _slowly(rng: np.random.Generator, way_m: float) -> Ride:
     return cruise(rng, 6.0, way_m)
 
 
+def _lively(rng: np.random.Generator, way_m: float) -> Ride:
+    return lively(rng, _CRUISE_MPS, way_m)
+
+
 def _parking(rng: np.random.Generator, way_m: float) -> Ride:
-    return cruise(rng, 4.5, min(way_m, 90.0))
+    return cruise(rng, 3.5, min(way_m, 80.0))
 
 
 def _long(rng: np.random.Generator, way_m: float) -> Ride:
@@ -149,6 +153,10 @@ def _long(rng: np.random.Generator, way_m: float) -> Ride:
 
 def _clock(offset_s: float) -> Errors:
     return lambda _: Faults(clock_s=offset_s)
+
+
+def _scan_clock(offset_s: float) -> Errors:
+    return lambda _: Faults(scan_clock_s=offset_s)
 
 
 def _clock_drift(rng: np.random.Generator) -> Faults:
@@ -176,17 +184,33 @@ _CLOCKS_MS: Final = (-50, -20, -10, 10, 20, 50)
 CASES: Final[Mapping[str, HardCase]] = {
     "street": HardCase("nothing special: a street with a few edits, parked and oncoming cars"),
     "platoon_van": HardCase("a van 12 to 15 m ahead at the same speed, from the first scan on", company=_platoon),
+    "ghost_map": HardCase(
+        "behind a van, on a map whose own vehicle drove behind one that was not taken out",
+        place="followed",
+        company=_platoon,
+    ),
     "lorries": HardCase("lorries before, behind and beside, at the same speed", company=_lorries),
     "traffic_jam": HardCase("queues in both lanes creep and stand", ride=_creeping, company=_jam),
     "stop_and_go": HardCase("up to 8 m/s and to a halt, again and again", ride=_stopping, company=_queue),
     **{
         f"clock_{'m' if ms < 0 else 'p'}{abs(ms)}": HardCase(
             f"stamps of wheels and gyro {abs(ms)} ms too {'early' if ms < 0 else 'late'} against the scans",
+            ride=_lively,
             faults=_clock(ms * 1e-3),
         )
         for ms in _CLOCKS_MS
     },
-    "clock_drift": HardCase("the clocks begin 10 ms apart and drift by 2 ms a second", faults=_clock_drift),
+    "clock_drift": HardCase(
+        "the clocks begin 10 ms apart and drift by 2 ms a second", ride=_lively, faults=_clock_drift
+    ),
+    **{
+        f"scan_clock_{'m' if ms < 0 else 'p'}{abs(ms)}": HardCase(
+            f"stamps of the scans {abs(ms)} ms too {'early' if ms < 0 else 'late'} against all else and the truth",
+            ride=_lively,
+            faults=_scan_clock(ms * 1e-3),
+        )
+        for ms in (-50, 50)
+    },
     "open_field": HardCase("ground, delineators, five trees and a barn", place="field", company=_nobody),
     "tunnel": HardCase(
         "100 m of smooth walls and roof, no satellites inside",

@@ -10,7 +10,7 @@ from rich.progress import Progress
 from benchmarks.hard_cases.cases import CASES
 from benchmarks.hard_cases.localising import CaseRun, ClockOffset
 from benchmarks.hard_cases.scores import joined, row_of
-from benchmarks.hard_cases.work import CaseResult, CaseTask, make_map, read_result, run_task, task_of
+from benchmarks.hard_cases.work import CaseResult, make_map, read_result, run_task, task_of
 from benchmarks.simulation.errors import OptionError
 from benchmarks.simulation.pool import Job, run_jobs
 from fleet_sim.sensors import SHORT_NAMES

@@ -5,7 +5,6 @@ from pathlib import Path
 from time import process_time
 from typing import Any, Final
 
-
 from benchmarks.hard_cases.cases import CASES, HardCase
 from benchmarks.hard_cases.localising import CaseRun, ClockOffset, Poses, run_case
 from benchmarks.localisation_study.kept import Kept, read_arrays, write_arrays

@@ -24,6 +24,7 @@ class Place:
         lane: that is driven, from end to end of what was mapped.
         surveys: that the mapping vehicle drives.
         foliage: leaves of either state.
+        mapped_behind: vehicles that kept pace with the mapping vehicle and are in its scans.
     """
 
     name: str
@@ -32,6 +33,7 @@ class Place:
     lane: Path
     surveys: tuple[Path, ...]
     foliage: Mapping[State, tuple[Leaves, ...]] = field(default_factory=dict)
+    mapped_behind: tuple[Companion, ...] = ()
 
 
 @dataclass(frozen=True, eq=False)

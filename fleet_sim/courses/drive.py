@@ -1,7 +1,7 @@
 """A drive over a course as a stream of what the sensors give, with the faults that it is about."""
 
 from collections.abc import Iterator
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from math import sqrt, tau
 from typing import Final
 
@@ -109,14 +109,15 @@ class CourseDrive:
         small.sort(key=lambda item: item.t_ns)
         arrives = self._course.faults.arrives(self.scans, self._fault_rng)
         middle_rad = self._course.faults.blocked_at(self._config.model.span_rad, self._fault_rng)
-        position = 0
+        position, late_ns = 0, round(self._course.faults.scan_clock_s * _NS_PER_S)
         for index in range(self.scans):
             t_ns = EPOCH_NS + index * self._config.model.period_ns
-            while position < len(small) and small[position].t_ns < t_ns:
+            while position < len(small) and small[position].t_ns < t_ns + late_ns:
                 yield small[position]
                 position += 1
             if arrives[index]:
-                yield self._course.faults.dirty(self._scan(t_ns), middle_rad, self._fault_rng)
+                scan = replace(self._scan(t_ns), t_ns=t_ns + late_ns)
+                yield self._course.faults.dirty(scan, middle_rad, self._fault_rng)
         yield from small[position:]
 
     def _scan(self, t_ns: int) -> Scan:

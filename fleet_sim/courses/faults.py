@@ -24,6 +24,7 @@ class Faults:
     Attributes:
         clock_s: stamps of wheel and gyro samples are so much too late against those of the scans.
         clock_drift: and grow by so many seconds a second.
+        scan_clock_s: stamps of the scans are so much too late against everything else, the truth's times too.
         wheel_scale: the wheels tell so much too much speed, as a share.
         slips_per_min: times that the wheels spin or lock, for half a second or so.
         slip: by how much the speed is off then, as a share.
@@ -38,6 +39,7 @@ class Faults:
 
     clock_s: float = 0.0
     clock_drift: float = 0.0
+    scan_clock_s: float = 0.0
     wheel_scale: float = 0.0
     slips_per_min: float = 0.0
     slip: float = 0.3
@@ -54,7 +56,10 @@ class Faults:
             raise DriveSimError(f"every number of the faults must be finite: {self}")
         if not 0.0 <= self.missing_share <= 0.9 or not 0.0 <= self.blocked_rad < 2 * pi:
             raise DriveSimError(f"faults: {self.missing_share} of the scans, {self.blocked_rad} rad of the window")
-        if min(self.slips_per_min, self.gnss_jumps_per_min, self.gnss_jump_m) < 0.0 or abs(self.clock_s) > 1.0:
+        if (
+            min(self.slips_per_min, self.gnss_jumps_per_min, self.gnss_jump_m) < 0.0
+            or max(abs(self.clock_s), abs(self.scan_clock_s)) > 1.0
+        ):
             raise DriveSimError(f"faults: rates and sizes must not be negative, clocks within 1 s: {self}")
 
     def stamp_error_s(self, t_s: F64) -> F64:

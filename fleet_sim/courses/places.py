@@ -8,6 +8,7 @@ from typing import Final
 import numpy as np
 
 from fleet_sim import parts
+from fleet_sim.courses.company import keeping, van
 from fleet_sim.courses.course import Place
 from fleet_sim.courses.foliage import Leaves, crown, hedge
 from fleet_sim.courses.path import Path, lane, smoothed
@@ -22,7 +23,12 @@ from gnd_map.arrays import F64
 LENGTH_M: Final = 160.0
 _FEW_EDITS: Final = 0.15
 """Share of a street's usual edits where the case is about something else."""
+_ROWS_M: Final = (-23.5, -12.5, -7.5, 3.5, 8.5, 19.5)
+"""Rows of a car park, with aisles of 6 m at -18, -2 and 14 m."""
+_TAKEN: Final = 0.65
+"""Share of its slots that are taken."""
 _MARGIN_M: Final = 4.0
+_MAPPED_BEHIND_M: Final = 15.5
 _OTHER_STREET: Final = 500_000_000
 """The rebuilt third comes from the street of another seed."""
 
@@ -55,6 +61,11 @@ def _street(seed: int, length_m: float) -> Place:
     return _on_street("street", street(seed, StreetOptions(length_m, edit_share=_FEW_EDITS)), LEVEL, {})
 
 
+def _followed(seed: int, length_m: float) -> Place:
+    """The street, mapped by a vehicle that drove behind a van and did not take it out of its scans."""
+    return replace(_street(seed, length_m), name="followed", mapped_behind=(keeping(van(), _MAPPED_BEHIND_M),))
+
+
 def _rebuilt(seed: int, length_m: float) -> Place:
     """The street, a third of which has been torn down and built anew."""
     world = street(seed, StreetOptions(length_m, edit_share=_FEW_EDITS))
@@ -72,9 +83,11 @@ def grafted(world: World, other: World, x0_m: float, x1_m: float) -> World:
     for o in world.objects:
         gone = o.edit == "kept" and o.kind not in ("road", "pavement") and x0_m <= _middle_m(o) < x1_m
         found.append(replace(o, states=("before",), edit="removed") if gone else o)
-    for o in other.in_state("after"):
-        if o.kind not in ("road", "pavement") and x0_m <= _middle_m(o) < x1_m:
-            found.append(WorldObject(f"rebuilt {o.name}", o.kind, ("after",), "added", o.shapes))
+    found += [
+        WorldObject(f"rebuilt {o.name}", o.kind, ("after",), "added", o.shapes)
+        for o in other.in_state("after")
+        if o.kind not in ("road", "pavement") and x0_m <= _middle_m(o) < x1_m
+    ]
     return replace(world, objects=tuple(found))
 
 
@@ -101,8 +114,8 @@ def _avenue(seed: int, length_m: float) -> Place:
     objects = [o for o in world.objects if o.kind in ("road", "pavement", "lamp", "sign")]
     before, after = list[Leaves](), list[Leaves]()
     for side in (1, -1):
-        for index, x in enumerate(np.arange(-end, end, 8.0).tolist()):
-            x, y = x + float(rng.uniform(-0.5, 0.5)), side * 8.0
+        for index, about in enumerate(np.arange(-end, end, 8.0).tolist()):
+            x, y = about + float(rng.uniform(-0.5, 0.5)), side * 8.0
             felled, leaves = rng.random() < 0.1, crown(x, y, PAVEMENT_M, rng, float(rng.uniform(0.7, 1.6)))
             trunk = (Post(x, y, float(rng.uniform(0.12, 0.2)), -0.2, 4.0, 0.25),)
             states: tuple[State, ...] = ("before",) if felled else STATES
@@ -122,8 +135,14 @@ def _avenue(seed: int, length_m: float) -> Place:
 
 
 def _grown(leaves: Leaves, factor: float) -> Leaves:
-    return replace(leaves, half_x_m=leaves.half_x_m * (1.0 if leaves.box else factor), half_y_m=leaves.half_y_m * factor,
-                   half_z_m=leaves.half_z_m * factor)  # fmt: skip
+    """Return leaves that have grown; a hedge not along its row."""
+    along = 1.0 if leaves.box else factor
+    return replace(
+        leaves,
+        half_x_m=leaves.half_x_m * along,
+        half_y_m=leaves.half_y_m * factor,
+        half_z_m=leaves.half_z_m * factor,
+    )
 
 
 def _field(seed: int, length_m: float) -> Place:
@@ -175,7 +194,7 @@ def _roundabout(seed: int, length_m: float) -> Place:
     ring = 13.0 * np.stack([np.cos(angle), np.sin(angle)], axis=1)
     reach = half - 20.0
     corners = np.concatenate([[[-reach, -1.75], [-16.0, -2.5]], ring, [[1.75, 17.0], [1.75, reach]]])
-    driven = smoothed(corners, 2.5)
+    driven = smoothed(corners, 3.0)
     around = np.linspace(0.0, tau, 90, endpoint=False)
     circle = Path(13.0 * np.stack([np.cos(around), np.sin(around)], axis=1))
     world = _world(seed, half, 0.0, objects)
@@ -214,28 +233,30 @@ def _car_park(seed: int, length_m: float) -> Place:
     objects.append(WorldObject("market", "building", STATES, "kept", parts.building(lot)))
     fence = hedge(-half - 12.0, half + 12.0, -30.0, 0.0, rng, 3.0)
     for index, x in enumerate(np.arange(-half, half + 1.0, 20.0).tolist()):
-        for row, y in enumerate((-12.0, 12.0)):
+        for row, y in enumerate((-10.0, 6.0)):
             mast = parts.lamp(x, y, 0.0, 1)
             objects.append(WorldObject(f"lamp {row} {index}", "lamp", STATES, "kept", mast))
-    for row, y in enumerate((-21.0, -14.8, -9.2, -2.8, 2.8, 9.2, 14.8, 21.0)):
+    for row, y in enumerate(_ROWS_M):
         for index, x in enumerate(np.arange(-half, half, 2.6).tolist()):
-            for state, edit in (("before", "removed"), ("after", "added")):
-                if rng.random() < 0.65:
-                    objects.append(_parked(f"car {row} {index} {state}", x, y, (state,), edit, rng))  # type: ignore[arg-type]
-    aisles = np.array([[-half - 6, -18.0], [half + 4, -18.0], [half + 6, -12.0], [half + 4, -6.0], [-half - 4, -6.0]])
-    corners = np.concatenate([aisles, [[-half - 7, 0.0], [-half - 4, 6.0], [half + 4, 6.0]]])
-    driven = smoothed(corners, 2.0)
+            objects += _slot(f"car {row} {index}", x, y, rng)
+    end, turn = half + 4.0, half + 8.0
+    out, back = [[-end, -18.0], [end, -18.0], [turn, -10.0]], [[end, -2.0], [-end, -2.0], [-turn, 6.0]]
+    driven = smoothed(np.array([*out, *back, [-end, 14.0], [end, 14.0]]), 4.0)
     both: dict[State, tuple[Leaves, ...]] = {"before": (fence,), "after": (fence,)}
     world = _world(seed, half, 0.0, objects)
     return Place("car_park", world, Ground(LEVEL, 0.0), driven, (driven.shifted(0.3),), both)
 
 
-def _parked(
-    name: str, x: float, y: float, states: tuple[State, ...], edit: Edit, rng: np.random.Generator
-) -> WorldObject:
-    yaw = float(rng.choice((-1.0, 1.0)) * pi / 2 + rng.normal(0.0, radians(2.0)))
-    at = float(x + rng.normal(0.0, 0.12)), float(y + rng.normal(0.0, 0.2))
-    return WorldObject(name, "car", states, edit, parts.car(*at, 0.0, yaw, int(rng.integers(2**31))))
+def _slot(name: str, x: float, y: float, rng: np.random.Generator) -> list[WorldObject]:
+    """The cars that stand in a slot of a car park before and after, each state with its own, often none."""
+    found = []
+    states: tuple[tuple[State, Edit], ...] = (("before", "removed"), ("after", "added"))
+    for state, edit in states:
+        yaw = float(rng.choice((-1.0, 1.0)) * pi / 2 + rng.normal(0.0, radians(2.0)))
+        shapes = parts.car(x + rng.normal(0.0, 0.12), y + rng.normal(0.0, 0.2), 0.0, yaw, int(rng.integers(2**31)))
+        if rng.random() < _TAKEN:
+            found.append(WorldObject(f"{name} {state}", "car", (state,), edit, shapes))
+    return found
 
 
 def _open_ground(half_x_m: float, half_y_m: float) -> list[WorldObject]:
@@ -267,6 +288,7 @@ def _unit(angle_rad: float) -> F64:
 
 PLACES: Final[Mapping[str, Callable[[int, float], Place]]] = {
     "street": _street,
+    "followed": _followed,
     "rebuilt": _rebuilt,
     "hill": _hill,
     "avenue": _avenue,
