@@ -20,6 +20,7 @@ DEFAULT_OUT = Path("runs/hard-cases")
 @click.option("--out", type=PATH, default=DEFAULT_OUT, show_default=True, help="Folder that keeps everything.")
 @click.option("--json", "json_file", help="Write the result as JSON; `-` prints it and nothing else.")
 @click.option("--markdown", "markdown_file", help="Write the table as Markdown; `-` prints it and nothing else.")
+@click.option("--keep-drives", is_flag=True, help="Keep every drive as MCAP, too.")
 @click.option("--jobs", type=int, help="Worker processes.  [default: one a core]")
 def hard_cases(
     seeds: str,
@@ -30,6 +31,7 @@ def hard_cases(
     out: Path,
     json_file: str | None,
     markdown_file: str | None,
+    keep_drives: bool,
     jobs: int | None,
 ) -> None:
     """Localisation where it is hard: errors, wrong poses called good, honesty of the covariance, case by case.
@@ -61,7 +63,7 @@ def hard_cases(
     folder = RunFolder.create(out, "hard-cases")
     folder.write_mark({"seeds": list(options.seeds)})
     with progress_bars(Console(stderr=True)) as progress:
-        found = study(options, out, jobs or os.cpu_count() or 1, progress)
+        found = study(options, out, jobs or os.cpu_count() or 1, progress, keep_drives=keep_drives)
     folder.write_json("result.json", found)
     printed = [
         written(json_file, json.dumps(found, indent=2) + "\n", "--json"),

@@ -1,7 +1,7 @@
 """The hard cases from options to figures; what is done is kept, and a second start continues."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Final
 
@@ -50,8 +50,10 @@ class HardOptions:
             raise OptionError(f"--shorter must be in 0.65 … 1, got {self.shorter}")
 
 
-def study(options: HardOptions, root: Path, processes: int, progress: Progress) -> dict[str, Any]:
-    """Run what is not yet in the folder and return the figures.
+def study(
+    options: HardOptions, root: Path, processes: int, progress: Progress, *, keep_drives: bool = False
+) -> dict[str, Any]:
+    """Run what is not yet in the folder and return the figures; with `keep_drives` its drives stay as MCAP, too.
 
     Raises:
         GndError: something cannot be made as asked.
@@ -62,7 +64,10 @@ def study(options: HardOptions, root: Path, processes: int, progress: Progress) 
         for case in options.cases
         for sensor in options.sensors
     ]
-    missing = [task for task in tasks if not task.kept.done]
+    if keep_drives:
+        drives = root / "drives"
+        tasks = [replace(t, recording=drives / f"{t.case}-{t.sensor}-{t.seed}.mcap") for t in tasks]
+    missing = [t for t in tasks if not t.kept.done or (t.recording is not None and not t.recording.is_file())]
     maps = {task.base: task for task in missing if not task.base.is_file()}
     run_jobs([Job(f"map {path.stem}", make_map, (task,)) for path, task in maps.items()], processes, progress, "maps")
     run_jobs([Job(task.name, run_task, (task,)) for task in missing], processes, progress, "drives")

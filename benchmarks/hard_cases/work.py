@@ -1,5 +1,6 @@
 """What worker processes do: make the map of a place, drive a case."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from time import process_time
@@ -22,6 +23,8 @@ from gnd_map.accumulate import VoxelAccumulator
 from gnd_map.config import to_mapping
 from gnd_map.grid import GridFrame
 from gnd_map.tile_id import covering_circle
+from schemas.drive import DriveHeader, DriveItem
+from schemas.drive_mcap import DriveWriter
 from vehicle_agent.localise.parameters import LocaliserParameters
 
 SEEN_M: Final = 80.0
@@ -50,6 +53,7 @@ class CaseTask:
         kept: the result.
         parameters: of the localiser.
         shorter: share of the usual length of the place, for a quick look.
+        recording: where to keep the drive as MCAP, None for nowhere.
     """
 
     case: str
@@ -59,6 +63,7 @@ class CaseTask:
     kept: Kept
     parameters: LocaliserParameters
     shorter: float = 1.0
+    recording: Path | None = None
 
     @property
     def name(self) -> str:
@@ -114,12 +119,21 @@ def run_task(task: CaseTask) -> None:
     course = hard.course(task.place(), task.seed)
     drive = CourseDrive(course, CourseConfig(SHORT_NAMES[task.sensor], _drive_seed(task)))
     header, items = drive.header(), [as_recorded(item) for item in drive.items()]
+    if task.recording is not None:
+        _record(header, items, task.recording)
     seconds, base, runs = {"simulated": process_time() - begun_s}, read_base(task.base), list[CaseRun]()
     for name, parameters in zip(_RUNS, (task.parameters, without_submaps(task.parameters)), strict=True):
         begun_s = process_time()
         runs.append(run_case(header, items, base, parameters, hard.kidnap, task.seed))
         seconds[name] = process_time() - begun_s
     _write(CaseResult(runs[0], runs[1], seconds), task.kept)
+
+
+def _record(header: DriveHeader, items: Sequence[DriveItem], path: Path) -> None:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    with DriveWriter(path, header) as writer:
+        for item in items:
+            writer.add(item)
 
 
 def _drive_seed(task: CaseTask) -> int:
