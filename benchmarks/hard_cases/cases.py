@@ -211,7 +211,9 @@ CASES: Final[Mapping[str, HardCase]] = {
         )
         for ms in (-50, 50)
     },
-    "open_field": HardCase("ground, delineators, five trees and a barn", place="field", company=_nobody),
+    "open_field": HardCase(
+        "ground, delineators, eight trees, four pieces of hedge and a barn", place="field", company=_nobody
+    ),
     "tunnel": HardCase(
         "100 m of smooth walls and roof, no satellites inside",
         place="tunnel",

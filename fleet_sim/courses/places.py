@@ -146,7 +146,7 @@ def _grown(leaves: Leaves, factor: float) -> Leaves:
 
 
 def _field(seed: int, length_m: float) -> Place:
-    """A road through open country: ground, a few delineator posts, some trees and a barn far off."""
+    """A road through open country: ground, delineator posts, a few trees, pieces of hedge and a barn far off."""
     rng, half = _rng(seed, 3), length_m / 2
     objects = _open_ground(half + 90.0, 90.0)
     for index, x in enumerate(np.arange(-half - 40.0, half + 40.0, 50.0).tolist()):
@@ -154,13 +154,16 @@ def _field(seed: int, length_m: float) -> Place:
             post = (Post(x + float(rng.uniform(-1, 1)), side * 5.0, 0.06, -0.2, 1.0, 0.5),)
             objects.append(WorldObject(f"delineator {side:+d} {index}", "bollards", STATES, "kept", post))
     leaves = []
-    for index in range(5):
-        x, y = float(rng.uniform(-half - 40, half + 40)), float(rng.choice((-1, 1)) * rng.uniform(28.0, 65.0))
+    for index in range(8):
+        x, y = float(rng.uniform(-half - 40, half + 40)), float(rng.choice((-1, 1)) * rng.uniform(16.0, 60.0))
         objects.append(WorldObject(f"trunk {index}", "tree", STATES, "kept", (Post(x, y, 0.2, -0.2, 4.0, 0.25),)))
         leaves.append(crown(x, y, 0.0, rng, 1.2))
+    for x in np.linspace(-half - 20.0, half, 4).tolist():
+        y = float(rng.choice((-1, 1)) * rng.uniform(12.0, 26.0))
+        leaves.append(hedge(x, x + float(rng.uniform(8.0, 16.0)), y, 0.0, rng, 3.0))
     side = 1 if rng.random() < 0.5 else -1
     x = float(rng.uniform(-half, half))
-    lot = Lot(side, x - 11.0, x + 11.0, float(rng.uniform(50.0, 70.0)), 7.0, int(rng.integers(2**31)), 0.0)
+    lot = Lot(side, x - 11.0, x + 11.0, float(rng.uniform(35.0, 60.0)), 7.0, int(rng.integers(2**31)), 0.0)
     objects.append(WorldObject("barn", "building", STATES, "kept", parts.building(lot)))
     both: dict[State, tuple[Leaves, ...]] = {"before": tuple(leaves), "after": tuple(leaves)}
     return _on_street("field", _world(seed, half, 0.01, objects), LEVEL, both)
