@@ -96,6 +96,10 @@ def _platoon(rng: np.random.Generator) -> tuple[Companion, ...]:
     return (keeping(van(), float(rng.uniform(12.0, 15.0)) + 2.8), *_oncoming(rng))
 
 
+def _van_alone(rng: np.random.Generator) -> tuple[Companion, ...]:
+    return _platoon(rng)[:1]
+
+
 def _lorries(rng: np.random.Generator) -> tuple[Companion, ...]:
     """Lorries before, behind and beside the vehicle, at its speed."""
     ahead, behind = float(rng.uniform(13.0, 16.0)), float(rng.uniform(-15.0, -12.0))
@@ -133,6 +137,10 @@ def _creeping(rng: np.random.Generator, way_m: float) -> Ride:
 def _stopping(rng: np.random.Generator, way_m: float) -> Ride:
     del way_m
     return halting(rng, 8.0, 22.0, (3.5, 5.0), (4.0, 6.0))
+
+
+def _fast(rng: np.random.Generator, way_m: float) -> Ride:
+    return cruise(rng, 14.0, way_m)
 
 
 def _slowly(rng: np.random.Generator, way_m: float) -> Ride:
@@ -184,6 +192,7 @@ _CLOCKS_MS: Final = (-50, -20, -10, 10, 20, 50)
 CASES: Final[Mapping[str, HardCase]] = {
     "street": HardCase("nothing special: a street with a few edits, parked and oncoming cars"),
     "platoon_van": HardCase("a van 12 to 15 m ahead at the same speed, from the first scan on", company=_platoon),
+    "platoon_field": HardCase("the same van in the open field", place="field", company=_van_alone),
     "ghost_map": HardCase(
         "behind a van, on a map whose own vehicle drove behind one that was not taken out",
         place="followed",
@@ -215,10 +224,12 @@ CASES: Final[Mapping[str, HardCase]] = {
         "ground, delineators, eight trees, four pieces of hedge and a barn", place="field", company=_nobody
     ),
     "tunnel": HardCase(
-        "100 m of smooth walls and roof, no satellites inside",
+        "213 m of smooth walls and roof, no satellites inside",
         place="tunnel",
+        ride=_fast,
         company=_nobody,
-        faults=lambda _: Faults(no_gnss_s=(3.0, 14.0)),
+        faults=lambda _: Faults(no_gnss_s=(3.0, 18.0)),
+        length_m=320.0,
     ),
     "hill": HardCase("8 % up, a crest, 6 % down", place="hill"),
     "roundabout": HardCase("three quarters around a ring of 13 m", place="roundabout", ride=_slowly, company=_nobody),
