@@ -52,7 +52,7 @@ def row_of(poses: Poses, scans: int) -> dict[str, Any]:
 
 
 def _share(part: NDArray[np.bool_], whole: NDArray[np.bool_]) -> float:
-    return float(np.count_nonzero(part) / max(np.count_nonzero(whole), 1))
+    return int(part.sum()) / max(int(whole.sum()), 1)
 
 
 def _quantiles(error: F64) -> dict[str, dict[str, float] | None]:
@@ -84,4 +84,5 @@ def nees_of(poses: Poses, chosen: NDArray[np.bool_]) -> dict[str, float | int] |
 
 def _quadratic(error: F64, covariance: F64) -> F64:
     """Squared length (N,) of errors (N, D) in units of their covariances (N, D, D)."""
-    return np.einsum("nd,nd->n", error, np.linalg.solve(covariance, error[:, :, None])[:, :, 0])
+    found: F64 = np.einsum("nd,nd->n", error, np.linalg.solve(covariance, error[:, :, None])[:, :, 0])
+    return found

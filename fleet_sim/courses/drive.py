@@ -151,9 +151,9 @@ class CourseDrive:
         offset = np.stack(slow, axis=1) + errors.gnss_white_m * rng.standard_normal((len(t_s), 3))
         where = self.motion.T_map_vehicle(t_s)[:, :3, 3] + offset + faults.gnss_jumps(t_s, rng)
         lat, lon, height = self._course.place.world.frame.geodetic_from_enu(where)
-        rows = zip(_stamps(t_s), lat.tolist(), lon.tolist(), height.tolist(), faults.has_gnss(t_s), strict=True)
-        sigma_m = max(errors.gnss_m, 0.01)
-        return [GnssFix(*row, sigma_m) for *row, received in rows if received]
+        rows = zip(_stamps(t_s), lat.tolist(), lon.tolist(), height.tolist(), strict=True)
+        fixes = [GnssFix(*row, max(errors.gnss_m, 0.01)) for row in rows]
+        return [fix for fix, received in zip(fixes, faults.has_gnss(t_s), strict=True) if received]
 
     def _reference_poses(self) -> list[ReferencePose]:
         t_s = self._times_s(_REFERENCE_HZ)
@@ -161,4 +161,5 @@ class CourseDrive:
 
 
 def _stamps(t_s: F64) -> list[int]:
-    return (EPOCH_NS + np.round(t_s * _NS_PER_S).astype(np.int64)).tolist()
+    stamps: list[int] = (EPOCH_NS + np.round(t_s * _NS_PER_S).astype(np.int64)).tolist()
+    return stamps

@@ -189,7 +189,7 @@ def _roundabout(seed: int, length_m: float) -> Place:
     objects = _open_ground(half + 60.0, half + 60.0)
     island = (Post(0.0, 0.0, 8.0, -0.5, 0.15, 0.3), Post(0.0, 0.0, 0.1, 0.0, 5.0, 0.25))
     objects.append(WorldObject("island", "pavement", STATES, "kept", island))
-    leaves = tuple(crown(*(rng.uniform(2.0, 6.0) * _unit(a)), -3.2, rng, 2.0) for a in np.arange(0.3, tau, 1.2))
+    leaves = tuple(_bush(rng.uniform(2.0, 6.0) * _unit(angle), rng) for angle in np.arange(0.3, tau, 1.2).tolist())
     for quarter in range(4):
         objects += _corner(quarter, rng)
     both: dict[State, tuple[Leaves, ...]] = {"before": leaves, "after": leaves}
@@ -202,6 +202,11 @@ def _roundabout(seed: int, length_m: float) -> Place:
     circle = Path(13.0 * np.stack([np.cos(around), np.sin(around)], axis=1))
     world = _world(seed, half, 0.0, objects)
     return Place("roundabout", world, Ground(LEVEL, 0.0), driven, (driven.shifted(0.5), circle), both)
+
+
+def _bush(place_m: F64, rng: np.random.Generator) -> Leaves:
+    """A bush on the island: the upper half of a crown."""
+    return crown(float(place_m[0]), float(place_m[1]), -3.2, rng, 2.0)
 
 
 def _corner(quarter: int, rng: np.random.Generator) -> list[WorldObject]:
