@@ -15,6 +15,8 @@ from benchmarks.hard_cases.study import HardOptions
 from benchmarks.hard_cases.work import read_result, task_of
 from benchmarks.simulation.errors import FolderError, OptionError
 from fleet_sim.courses.places import PLACES, place_of
+from schemas.drive import Scan
+from schemas.drive_mcap import read_drive, read_header
 from vehicle_agent.localise.parameters import LocaliserParameters
 
 ASKED = (
@@ -101,7 +103,7 @@ def test_a_changed_parameter_is_another_result_and_cases_of_one_place_share_its_
 def test_two_cases_give_the_json_that_was_promised_and_a_second_start_continues(tmp_path: Path):
     out, found = tmp_path / "out", tmp_path / "found.json"
     options = ("--seeds", 3, "--sensors", "vlp16", "--cases", "platoon_van,clock_p50", "--shorter", 0.65, "--jobs", 1)
-    first = run(*options, "--out", out, "--json", found)
+    first = run(*options, "--out", out, "--json", found, "--keep-drives")
     assert first.exit_code == 0, first.output
     result = json.loads(found.read_text())
     assert set(result["cases"]) == {"platoon_van", "clock_p50"}
@@ -117,6 +119,10 @@ def test_two_cases_give_the_json_that_was_promised_and_a_second_start_continues(
         assert [row["seed"] for row in sensor["seeds"]] == [3]
         assert sensor["seeds"][0]["refined"]["poses"] == sensor["refined"]["poses"]
     assert len(list((out / "maps").iterdir())) == 1
+    recording = out / "drives" / "platoon_van-vlp16-3.mcap"
+    assert read_header(recording).sensor_model == "VLP-16"
+    scans = sum(isinstance(item, Scan) for item in read_drive(recording))
+    assert scans == result["cases"]["platoon_van"]["vlp16"]["refined"]["scans"]
     written = {path: path.stat().st_mtime_ns for path in (out / "runs").iterdir()}
     again = run(*options, "--out", out, "--markdown", "-")
     assert again.exit_code == 0
