@@ -6,7 +6,7 @@ point to Gaussian at once, and odometry ties their poses as tightly as its sigma
 scale, gyro bias, course) is estimated beside the poses, so that it does not count as independent noise.
 
 Everything is one least-squares problem: Gauss-Newton over 6 N pose parameters and `N_SHARED` shared ones, with robust
-weights (Geman-McClure on points, Cauchy on steps). Old scans leave by marginalisation, so nothing counts twice.
+weights (Geman-McClure, on points and on steps). Old scans leave by marginalisation, so nothing counts twice.
 """
 
 from collections.abc import Sequence
@@ -27,7 +27,9 @@ N_SHARED: Final = 4
 """What all steps share: gyro bias [rad/s], wheel scale [1], motion to the left and upwards per metre forward [1]."""
 BIAS, SCALE, LEFT, UP = range(N_SHARED)
 STEP_CHI2: Final = 12.6
-"""Of a step's six residuals, from where on it counts less (Cauchy): 95 % of right ones lie below."""
+"""Of a step's six residuals, from where on it counts less: 95 % of right ones lie below."""
+MOST_SQUARE: Final = 9.0
+"""Of a residual in sigmas, as far as one step may say that all are worse: a slip does not, many of 3 sigmas do."""
 SMALL_M, SMALL_RAD = 2e-3, 2e-4
 """Scans that moved less since they were matched with the map are not matched again."""
 STOP_M, STOP_RAD = 1e-3, 5e-5
@@ -123,7 +125,7 @@ def solve_stretch(
         for _ in range(max_iterations):
             _match(knots, match_map, registration, scale)
             system = _system(knots, steps, belief, shared, registration)
-            step = -np.linalg.solve(system.A, system.g)
+            step: F64 = -np.linalg.solve(system.A, system.g).astype(np.float64)
             _move(knots, step)
             shared += step[-N_SHARED:]
             if _small(step[:-N_SHARED].reshape(-1, 6), STOP_M, STOP_RAD):
@@ -198,13 +200,19 @@ def _add_belief(A: F64, g: F64, first: Knot, belief: Belief, shared: F64) -> Non
 
 
 def _add_step(A: F64, g: F64, k: int, relative: F64, step: Step, shared_off: F64) -> None:
-    """A measured motion from knot k to k + 1, with Cauchy weight."""
+    """A measured motion from knot k to k + 1, with its robust weight."""
     e, J = _residual(relative, step, shared_off)
-    information = np.linalg.inv(step.covariance)
-    weighted = J.T @ information / (1.0 + float(e @ information @ e) / STEP_CHI2)
+    information, weight = _weighed(e, step)
+    weighted = weight * J.T @ information
     at = np.r_[6 * k : 6 * k + 12, len(g) - N_SHARED : len(g)]
     A[np.ix_(at, at)] += weighted @ J
     g[at] += weighted @ e
+
+
+def _weighed(e: F64, step: Step) -> tuple[F64, float]:
+    """Information (6, 6) of a step, and its Geman-McClure weight at a residual (6,)."""
+    information: F64 = np.linalg.inv(step.covariance).astype(np.float64)
+    return information, 1.0 / (1.0 + float(e @ information @ e) / STEP_CHI2) ** 2
 
 
 def _residual(relative: F64, step: Step, shared_off: F64) -> tuple[F64, F64]:
@@ -237,7 +245,7 @@ def _solved(
     par: RegistrationParameters,
     scale: float,
 ) -> Solved:
-    covariance = np.linalg.inv(A)
+    covariance: F64 = np.linalg.inv(A).astype(np.float64)
     blocks = np.stack([covariance[6 * k : 6 * k + 6, 6 * k : 6 * k + 6] for k in range(len(knots))])
     seen = [(knot, knot.match) for knot in knots if knot.match is not None]
     squares, redundancy = _checked_steps(knots, steps, covariance, shared_off)
@@ -261,8 +269,8 @@ def _checked_steps(
         e, J = _residual(T_inverse(knots[k].T_map_vehicle) @ knots[k + 1].T_map_vehicle, step, shared_off)
         at = np.r_[6 * k : 6 * k + 12, n - N_SHARED : n]
         variance = np.diag(step.covariance)
-        left_open = np.diag(J @ covariance[np.ix_(at, at)] @ J.T) / variance
-        squares += e**2 / variance
+        left_open = _weighed(e, step)[1] * np.diag(J @ covariance[np.ix_(at, at)] @ J.T) / variance
+        squares += np.minimum(e**2 / variance, MOST_SQUARE)
         redundancy += np.clip(1.0 - left_open, 0.0, 1.0)
     return squares, redundancy
 

@@ -15,7 +15,6 @@ from gnd_map.arrays import F64, I64
 from gnd_map.motion import Trajectory
 from gnd_map.se3 import T_inverse, transform
 from vehicle_agent.localise.match_map import MatchMap
-from vehicle_agent.localise.submap import thinned
 from vehicle_agent.map_build.survey import DriveSurvey
 
 EVERY_M: Final = 10.0
@@ -77,10 +76,20 @@ class Anchors:
         return np.concatenate(clouds)
 
     def _cloud_of(self, number: int) -> F64:
-        return thinned(self._around(number, CLOUD_M), LEAF_M, CLOUD_POINTS)
+        return _thinned(self._around(number, CLOUD_M), LEAF_M, CLOUD_POINTS)
 
     def _map_of(self, number: int) -> MatchMap | None:
         return match_map_of(self._around(number, MAP_M))
+
+
+def _thinned(points_m: F64, leaf_m: float, n: int) -> F64:
+    """The first of the points (N, 3) in each cube of `leaf_m`, and of these at most n, evenly through their order."""
+    cubes = np.floor(points_m / leaf_m).astype(np.int64) + (1 << 20)
+    key = (cubes[:, 0] << 42) | (cubes[:, 1] << 21) | cubes[:, 2]
+    first = np.sort(np.unique(key, return_index=True)[1])
+    if len(first) > n:
+        first = first[np.linspace(0, len(first) - 1, n).astype(np.int64)]
+    return np.asarray(points_m[first])
 
 
 def _every(way_m: F64, from_m: float, step_m: float) -> list[int]:
