@@ -108,3 +108,9 @@ def test_a_real_drive_of_kitti_gets_its_times(shared_data, tmp_path):
     way_m = np.linalg.norm((T_inverse(T[0]) @ T[-1])[:3, 3])
     ins_m = np.interp(track.reference.t_ns[[0, -1]], track.motion.t_ns, np.cumsum(track.motion.speed_mps) * 0.10356)
     assert way_m == pytest.approx(ins_m[1] - ins_m[0], rel=0.01)
+    turned = np.unwrap(np.arctan2(T[:, 1, 0], T[:, 0, 0]))
+    ins = np.loadtxt(taken / "poses.csv", delimiter=",", skiprows=1)
+    ins_yaw = np.interp(track.reference.t_ns * 1e-9 - ins[0, 1], ins[:, 1] - ins[0, 1], np.unwrap(ins[:, 7]))
+    off_deg = np.degrees(np.angle(np.exp(1j * (turned - ins_yaw))))
+    print(f"heading against the INS: {off_deg.std():.3f}°")
+    assert off_deg.std() < 0.15
