@@ -211,7 +211,7 @@ class ClockEstimator:
 
     def _signal(self, zero_ns: int) -> MotionSignal:
         t_ns, speed, yaw_rate = self._motion.samples(zero_ns - 2 * round(SEARCH_S * 1e9))
-        return MotionSignal((t_ns - zero_ns) * 1e-9, speed, yaw_rate)
+        return MotionSignal(np.asarray((t_ns - zero_ns) * 1e-9, np.float64), speed, yaw_rate)
 
     def _prior(self, at_ns: int) -> OffsetPrior:
         known = None if self._old is None else self._old.later(at_ns)
@@ -299,7 +299,7 @@ def fit_clock(steps: list[Step], signal: MotionSignal, zero_ns: int, prior: Offs
         values[0] = np.clip(values[0], -SEARCH_S, SEARCH_S)
         if turn >= 4 and abs(change[0]) < 1e-5:
             break
-    return ClockFit(values, np.linalg.inv(information), used)
+    return ClockFit(values, np.asarray(np.linalg.inv(information), np.float64), used)
 
 
 def _residuals(values: F64, first: F64, last: F64, seen: F64, signal: MotionSignal) -> tuple[F64, F64]:
