@@ -34,9 +34,9 @@ def test_a_clock_that_is_off_is_found_and_does_no_harm(recorded, offset_ms):
 @pytest.mark.parametrize("offset_s", [lambda _: 0.15, lambda t: 0.006 * t], ids=["150 ms", "6 ms a second"])
 def test_a_clock_that_is_none_of_this_vehicle_is_said(recorded, offset_s):
     run = driven(recorded, offset_s)
-    late = [pose for pose in run.online if pose.t_ns - run.online[0].t_ns > 8e9]
+    late = [pose for pose in run.online if pose.t_ns - run.online[0].t_ns > 10e9]
     said = [pose for pose in late if (pose.health, pose.cause) == ("degraded", "clock")]
-    assert len(said) > 0.8 * len(late)
+    assert len(said) > 0.9 * len(late) > 0
 
 
 @pytest.mark.slow

@@ -264,7 +264,7 @@ class ClockEstimator:
         since_ns, doubt = self._unsteady
         if at_ns - since_ns < LAST_NS:
             return doubt
-        return "unsure" if sigma_s > KNOWN_S and abs(offset_s) > max(LARGE_S, 2.0 * sigma_s) else "none"
+        return "unsure" if sigma_s > KNOWN_S and abs(offset_s) - sigma_s > LARGE_S else "none"
 
 
 def fit_clock(steps: list[Step], signal: MotionSignal, zero_ns: int, prior: OffsetPrior) -> ClockFit:
