@@ -27,6 +27,7 @@ NAMES = (
     "poles",
     "features-merge",
     "slamcu-step",
+    "map-build",
 )
 WITH_OPTIONS = ("codec", "return-download", "gnss-noise", "poles", "slamcu-step")
 

@@ -24,6 +24,10 @@ _COMMANDS: Final[dict[str, tuple[str, str]]] = {
         "benchmarks.new_layer_study.command:new_feature_layer",
         "A layer of beacons or lights mapped by many cars, and localisation with it.",
     ),
+    "hard-cases": (
+        "benchmarks.hard_cases.command:hard_cases",
+        "Cases that make localisation fail: does the vehicle say when it is wrong?",
+    ),
     "errors": ("benchmarks.simulation.errors_command:errors", "Which voxels of a simulation cost F1, and why."),
     "real-localisation": (
         "benchmarks.real_localisation.command:real_localisation",

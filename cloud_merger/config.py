@@ -6,11 +6,13 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Final
 
+from cloud_merger.confirmation import ConfirmationParameters
 from cloud_merger.errors import MergerError
 from cloud_merger.features.check import FeatureLimits
 from cloud_merger.features.parameters import FeatureMergeParameters
 from cloud_merger.ingest import IngestLimits
 from cloud_merger.merge import MergeParameters
+from cloud_merger.shift import ShiftParameters
 from cloud_merger.waiting import WaitingLimits
 from cloud_merger.wants import WantParameters
 from fleet_bus.config import DEFAULT_ENDPOINT
@@ -30,7 +32,9 @@ class ShardConfig:
         connect: endpoints of routers.
         bus_lease_ms: how long a silent shard counts as alive; 0: the bus's own.
         merge: how statements become changes.
-        features: the same of feature layers.
+        confirmation: what a single vehicle may change.
+        shift: when changes are an error of the vehicle's poses.
+        features: how statements become changes in feature layers.
         ingest: which reports are refused.
         feature_limits: which reports about features are refused.
         want: which Gaussians of reports in short are asked for.
@@ -51,6 +55,8 @@ class ShardConfig:
     connect: tuple[str, ...] = (DEFAULT_ENDPOINT,)
     bus_lease_ms: int = 0
     merge: MergeParameters = field(default_factory=MergeParameters)
+    confirmation: ConfirmationParameters = field(default_factory=ConfirmationParameters)
+    shift: ShiftParameters = field(default_factory=ShiftParameters)
     features: FeatureMergeParameters = field(default_factory=FeatureMergeParameters)
     ingest: IngestLimits = field(default_factory=IngestLimits)
     feature_limits: FeatureLimits = field(default_factory=FeatureLimits)

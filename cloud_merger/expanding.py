@@ -78,6 +78,7 @@ def expand(packed: PackedReport, layer: str, district: District, bases: Sequence
             for tile, sha, one in zip(bases, shas, flags, strict=True)
         ),
         layer=layer,
+        course=packed.course,
     )
 
 
@@ -116,6 +117,7 @@ def _change(packed: PackedReport, base: Tile, sha: bytes, flags: Flags, observed
         evidence=np.zeros((n, 4), np.int32),
         pose_sigma_m=packed.pose_sigma_m,
         pose_sigma_rad=packed.pose_sigma_rad,
+        doubt=packed.doubt_of(base.tile_id.morton % limits.MAX_TILES_OF_DISTRICT),
     )
 
 

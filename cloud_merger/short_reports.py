@@ -8,7 +8,7 @@ from cloud_merger.errors import BadReport, MissingBase, MissingHalf, NotUndersto
 from cloud_merger.expanding import base_versions, expand, is_askable, with_measured
 from cloud_merger.parameters import MergeParameters
 from cloud_merger.statements import Report
-from cloud_merger.stored import Bases, said
+from cloud_merger.stored import Bases, report_of
 from cloud_merger.waiting import Waiting, WaitingLimits, WaitingRoom
 from cloud_merger.wants import Known, WantParameters, asked_voxels, wanted
 from gnd_map.codec import encode_mask
@@ -127,6 +127,6 @@ class ShortReports:
     def _report(self, row: ReportRow) -> Report | None:
         """What a stored report says; nothing where it can no longer be read, which the merge will tell."""
         try:
-            return self._merge.report_of(row.report_id, *said(row.body))
+            return report_of(row.body, self._merge)
         except SchemaError:
             return None

@@ -18,6 +18,7 @@ from gnd_map.classes import ChangeClass
 from gnd_map.gaussian import Gaussians
 from gnd_map.tile import diff
 from schemas.changes import TileChange
+from schemas.course import Course
 
 Mode = Literal["paper", "default"]
 EPOCH = 1  # the number of the epoch's own Gaussian among the states of a voxel
@@ -65,12 +66,22 @@ class Report:
         change: what it says.
         weight: of its votes, see `MergeParameters.report_of`.
         pose_m2: variance of what it measured by its poses, see `MergeParameters.pose_m2_of`.
+        vehicle: who made it; the merge does not look at it, confirmation does.
+        first_ns: time of the first scan that it rests on, UTC.
+        last_ns: time of the last.
+        is_doubtful: the vehicle does not fully believe it; nor does the merge look at this.
+        course: where the vehicle drives in its own frame, None where it does not know.
     """
 
     report_id: str
     change: TileChange
     weight: float = 1.0
     pose_m2: float = 0.0
+    vehicle: str = ""
+    first_ns: int = 0
+    last_ns: int = 0
+    is_doubtful: bool = False
+    course: Course | None = None
 
 
 @dataclass(frozen=True, slots=True)

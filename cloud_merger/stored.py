@@ -1,31 +1,63 @@
 """What lies in the store, as the merge reads it: the statements of reports, and tiles by version; both remembered."""
 
 from collections import OrderedDict
+from dataclasses import replace
 from functools import lru_cache
 from threading import Lock
 from typing import Final
 
+from cloud_merger.parameters import MergeParameters
+from cloud_merger.statements import Report
 from gnd_map.gaussian import Gaussians
 from gnd_map.tile import Tile
 from gnd_map.tile_id import TileId
 from schemas.changes import ChangeReport, TileChange
+from schemas.doubt import DoubtReason
 from tile_store.store import Store
 from tile_store.values import StoredTile
 
 REMEMBERED_REPORTS: Final = 1024  # some 20 kB each
+NEW_GROUND: Final = DoubtReason.IMPLAUSIBLE_SHARE | DoubtReason.POSE_NOT_CHECKED
 REMEMBERED_TILES: Final = 512  # some 120 kB each
 
 
 @lru_cache(maxsize=REMEMBERED_REPORTS)
-def said(body: bytes) -> tuple[str, TileChange]:
-    """Sensor model and the one tile of a stored report; remembered: each merge of a tile reads all reports again.
+def said(body: bytes) -> ChangeReport:
+    """A stored report, which has one tile; remembered: each merge of a tile reads all reports again.
 
     Raises:
         SchemaError: it can no longer be read.
     """
-    report = ChangeReport.decode(body)
+    return ChangeReport.decode(body)
+
+
+def report_of(body: bytes, parameters: MergeParameters) -> Report:
+    """The same as the merge takes it.
+
+    Raises:
+        SchemaError: it can no longer be read.
+    """
+    report = said(body)
     (change,) = report.tiles
-    return report.sensor_model, change
+    weighed = parameters.report_of(report.report_id, report.sensor_model, change)
+    return replace(
+        weighed,
+        vehicle=report.vehicle,
+        first_ns=report.first_ns,
+        last_ns=report.last_ns,
+        is_doubtful=is_doubtful(change),
+        course=report.course,
+    )
+
+
+def is_doubtful(change: TileChange) -> bool:
+    """Whether the vehicle does not fully believe what it says. That all has changed, and that nothing could be checked,
+    is in the nature of ground that no map shows yet.
+    """
+    if change.doubt is None:
+        return False
+    excused = 0 if change.base_sha else int(NEW_GROUND)
+    return int(change.doubt.reasons) & ~excused != 0  # as numbers: reasons of a newer vehicle have no names here
 
 
 class Bases:

@@ -30,16 +30,22 @@ class WantParameters:
         share: all that could agree with it, itself included, must hold more than this share of ξ of the votes; below 1
             because votes that come later may lift it over ξ.
         enough: so many measured Gaussians that may agree with it are enough; 0: none is ever asked for.
+        sample: where at least so many flags of a tile, and most of them, are outvoted, about so many of their Gaussians
+            are asked for all the same: they cannot change the map, but they tell whether the vehicle's poses are off
+            (`shift`); 0: none.
     """
 
     share: float = 0.8
     enough: int = 4
+    sample: int = 32
 
     def __post_init__(self) -> None:
         if not 0 <= self.share <= 1:
             raise MergerError(f"share must lie in [0, 1], got {self.share}")
         if self.enough < 0:
             raise MergerError(f"enough must be at least 0, got {self.enough}")
+        if self.sample < 0:
+            raise MergerError(f"sample must be at least 0, got {self.sample}")
 
 
 @dataclass(frozen=True, slots=True)
@@ -95,7 +101,17 @@ def _wanted_of_tile(own: Report, known: Known, merge: MergeParameters, want: Wan
     measured = may_agree & (others_rows["kind"] == Kind.MEASURED) & (others_rows["was"] == was[others_seat])
     in_hand = np.bincount(others_seat, measured, len(ids)) + _promised(known.promised, ids)
     xi = np.where(modified & (merge.mode == "default"), merge.xi_reshaped, merge.xi)
-    return np.asarray((votes > want.share * xi * cast) & (in_hand < want.enough))
+    may_win = votes > want.share * xi * cast
+    asked_anyway = _sample(~may_win, 0 if merge.mode == "paper" else want.sample)
+    return np.asarray((may_win & (in_hand < want.enough)) | asked_anyway)
+
+
+def _sample(outvoted: NDArray[np.bool_], n: int) -> NDArray[np.bool_]:
+    """About `n` of the marked ones, evenly; none where fewer are marked, or less than half."""
+    rows, chosen = np.flatnonzero(outvoted), np.zeros(len(outvoted), bool)
+    if n and len(rows) >= max(n, len(outvoted) / 2):
+        chosen[rows[:: len(rows) // n]] = True
+    return chosen
 
 
 def _may_agree(rows: Rows, was: NDArray[np.int64]) -> NDArray[np.bool_]:

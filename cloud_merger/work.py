@@ -2,15 +2,17 @@
 
 import logging
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import TypeVar
 
+from cloud_merger.belief import Believed, ShiftTests, believed, courses_of
 from cloud_merger.config import ShardConfig
+from cloud_merger.confirmation import GatedTile, gate
 from cloud_merger.features.kept import FeatureContents, said_of
 from cloud_merger.features.merge import merge_features
-from cloud_merger.merge import merge_tile
+from cloud_merger.merge import MergedTile, merge_tile
 from cloud_merger.statements import Report, statements_of
-from cloud_merger.stored import Bases, said
+from cloud_merger.stored import Bases, report_of
 from gnd_map.codec import Lattice, is_on, lattice_of, snap
 from gnd_map.features import FeatureTile, is_feature_layer
 from gnd_map.gaussian import Gaussians
@@ -29,6 +31,7 @@ class Worker:
     def __init__(self, store: Store, config: ShardConfig) -> None:
         self._store, self._config = store, config
         self._contents, self._features = Bases(store), FeatureContents(store)
+        self._shifts = ShiftTests(config.shift)
 
     def merge(self, claims: Sequence[Claim]) -> list[Publication]:
         """What to publish for these claims; a tile that failed is postponed, or set aside after `max_attempts`."""
@@ -58,9 +61,11 @@ class Worker:
         """Merge all reports since the epoch into the epoch's tile; the tile is None where the head has that content."""
         epoch = Gaussians.empty() if work.epoch is None else self._contents.decoded(work.epoch)
         reports = [report for row in work.reports if (report := self._report(row)) is not None]
-        statements = statements_of(epoch, reports, self._bases(work), self._config.merge.mode)
-        merged = merge_tile(epoch, statements, self._config.merge)
-        gaussians = on_lattice(merged.gaussians, self._lattice(work, epoch))
+        bases = self._bases(work)
+        believed_in = self._believed(reports, bases)
+        statements = statements_of(epoch, believed_in.reports, bases, self._config.merge.mode)
+        gated = self._gated(epoch, merge_tile(epoch, statements, self._config.merge), believed_in)
+        gaussians = on_lattice(gated.merged.gaussians, self._lattice(work, epoch))
         tile = Tile(work.claim.tile, work.base_version + 1, gaussians)
         is_new = tile.sha != work.head.sha if work.head else len(gaussians) > 0
         return Publication(
@@ -68,8 +73,25 @@ class Worker:
             base_version=work.base_version,
             tile=tile if is_new else None,
             report_ids=_ids(work),
-            voxel_reports=merged.provenance,
+            voxel_reports=gated.merged.provenance,
+            waiting=gated.waiting,
+            shift_tests=believed_in.tests,
+            courses=courses_of(reports),
         )
+
+    def _believed(self, reports: Sequence[Report], bases: Mapping[bytes, Gaussians]) -> Believed:
+        """The reports without those that a shift of their poses explains; the paper knows no such test."""
+        if self._config.merge.mode == "paper":
+            return Believed(tuple(reports), (), ())
+        shifts = {report.report_id: self._shifts.of(report, bases) for report in reports}
+        return believed(reports, shifts, self._config.shift)
+
+    def _gated(self, epoch: Gaussians, merged: MergedTile, believed_in: Believed) -> GatedTile:
+        """What may be published of a merge, with all that waits; the paper knows no such gate."""
+        if self._config.merge.mode == "paper":
+            return GatedTile(merged)
+        found = gate(epoch, merged, believed_in.reports, self._config.confirmation, self._store.shifted_vehicles())
+        return GatedTile(found.merged, (*found.waiting, *believed_in.set_aside))
 
     def _of_features(self, work: TileWork) -> Publication:
         """The same of a tile of a feature layer."""
@@ -103,7 +125,7 @@ class Worker:
         return lattice_of(work.epoch.codec_id)
 
     def _report(self, row: ReportRow) -> Report | None:
-        return self._readable(row, lambda body: self._config.merge.report_of(row.report_id, *said(body)))
+        return self._readable(row, lambda body: report_of(body, self._config.merge))
 
     def _readable(self, row: ReportRow, read: Callable[[bytes], T]) -> T | None:
         """What a stored report says; nothing when it can no longer be read (its vehicle has long had its ack)."""

@@ -31,12 +31,24 @@ def listed(_context: click.Context, _option: click.Parameter, value: str | None)
     return None if value is None else [word.strip() for word in value.split(",") if word.strip()]
 
 
+def given(_context: click.Context, _option: click.Parameter, values: tuple[str, ...]) -> list[str] | None:
+    """Give what was given of an option that may be repeated; None: nothing."""
+    return list(values) or None
+
+
 RUN_OPTIONS = (
     click.option("--shards", type=int, help="Merger shard processes.  [default: 2]"),
     click.option(
         "--layers", callback=listed, help="Layers kept up to date, such as ndt,signs,streetlights.  [default: ndt]"
     ),
     click.option("--world-seed", type=int, help="Seed of the simulated world.  [default: 7]"),
+    click.option(
+        "--wrong-mount",
+        "wrong_mounts",
+        multiple=True,
+        callback=given,
+        help="VEHICLE:DEGREES, such as 3:0.5: its drive tells a LiDAR mount turned by so much; may be repeated.",
+    ),
     click.option("--drives", type=PATH, multiple=True, help="Recorded drives (MCAP, folders), not simulated ones."),
     click.option("--map", "base_map", type=PATH, help="Store with the base map for --drives (`gnd map build`)."),
     click.option("--worlds", type=PATH, help="Folder that keeps simulated worlds by seed for further runs."),

@@ -1,8 +1,10 @@
 """Configuration of a fleet run: `deploy/fleet.toml` holds the defaults, options and `--config FILE` override them."""
 
+import re
 import tomllib
 from dataclasses import dataclass
 from importlib import resources
+from math import radians
 from pathlib import Path
 from typing import Any
 
@@ -12,6 +14,7 @@ from gnd_map.config import from_mapping
 MAX_AGENTS = 200
 MAX_SHARDS = 32
 VOXEL_LAYER = "ndt"
+_WRONG_MOUNT = re.compile(r"(?P<vehicle>\d{1,3}):(?P<deg>[+-]?\d+(\.\d*)?)")
 FEATURE_LAYERS = ("signs", "streetlights", "poles")
 """Those for which the fleet's vehicles have detectors."""
 
@@ -31,6 +34,8 @@ class FleetConfig:
         merge_delay_s: a tile is merged this long after its first unmerged report ...
         merge_after_reports: ... or as soon as this many reports wait.
         deadline_s: a run that takes longer is ended with an error.
+        wrong_mounts: vehicles whose drives tell a wrong mount, such as "3:0.5": that of vehicle 3 is turned by 0.5
+            degrees (counter-clockwise seen from above) against the one that it was driven with.
         layers: layers of the map that vehicles keep up to date; "ndt", on which they localise, is always among them.
     """
 
@@ -44,6 +49,7 @@ class FleetConfig:
     merge_delay_s: float = 2.0
     merge_after_reports: int = 16
     deadline_s: float = 1800.0
+    wrong_mounts: tuple[str, ...] = ()
     layers: tuple[str, ...] = (VOXEL_LAYER,)
 
     def __post_init__(self) -> None:
@@ -57,6 +63,7 @@ class FleetConfig:
         _require(self.merge_delay_s >= 0, f"merge_delay_s must not be negative, got {self.merge_delay_s}")
         _require(self.merge_after_reports >= 1, f"merge_after_reports must be >= 1, got {self.merge_after_reports}")
         _require(self.deadline_s > 0, f"deadline_s must be positive, got {self.deadline_s}")
+        _ = self.wrong_mounts_rad
         self._check_layers()
 
     def _check_layers(self) -> None:
@@ -65,6 +72,19 @@ class FleetConfig:
         _require(not unfit, f"no vehicle of the fleet detects the layers {', '.join(unfit)}; it knows {known}")
         _require(VOXEL_LAYER in self.layers, f"layers must hold {VOXEL_LAYER!r}, on which vehicles localise")
         _require(len(set(self.layers)) == len(self.layers), f"layers {', '.join(self.layers)}: one comes twice")
+
+    @property
+    def wrong_mounts_rad(self) -> dict[int, float]:
+        """Of each vehicle whose drive tells a wrong mount, what it is turned by."""
+        found: dict[int, float] = {}
+        for item in self.wrong_mounts:
+            match = _WRONG_MOUNT.fullmatch(item)
+            _require(match is not None, f"wrong_mounts holds VEHICLE:DEGREES, such as 3:0.5, got {item!r}")
+            assert match is not None
+            _require(int(match["vehicle"]) < self.agents, f"wrong mount {item!r}: there are {self.agents} vehicles")
+            _require(abs(float(match["deg"])) <= 20.0, f"wrong mount {item!r}: at most 20 degrees")
+            found[int(match["vehicle"])] = radians(float(match["deg"]))
+        return found
 
     @property
     def feature_layers(self) -> tuple[str, ...]:

@@ -6,7 +6,7 @@ import itertools
 import os
 import shutil
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 from rich.progress import Progress, TaskID
@@ -14,6 +14,7 @@ from rich.progress import Progress, TaskID
 from deploy.errors import DeployError
 from deploy.features import put_base_layers
 from deploy.fleet_config import FleetConfig
+from deploy.mounts import with_wrong_mounts
 from deploy.run_folder import RunFolder
 from deploy.source import Source
 from fleet_sim.prepare import prepare_fleet_run
@@ -40,8 +41,12 @@ class PreparedRun:
 def prepare(config: FleetConfig, folder: RunFolder, source: Source, progress: Progress) -> PreparedRun:
     """Make drives and store ready, from recordings or by simulation; see the two functions below."""
     if source.drives:
-        return prepare_recorded(config, folder, source)
-    return prepare_simulated(config, folder, source.worlds, progress)
+        prepared = prepare_recorded(config, folder, source)
+    else:
+        prepared = prepare_simulated(config, folder, source.worlds, progress)
+    folder_of_copies = folder.world / "drives" / "wrong-mounts"
+    drives = with_wrong_mounts(prepared.agent_drives, config.wrong_mounts_rad, folder_of_copies)
+    return replace(prepared, agent_drives=drives)
 
 
 def prepare_simulated(config: FleetConfig, folder: RunFolder, worlds: Path | None, progress: Progress) -> PreparedRun:

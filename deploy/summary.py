@@ -17,6 +17,7 @@ from fleet_sim.pictures import View, draw_healing, draw_map, draw_run
 from fleet_sim.truth import read_truth
 from gnd_map.geodesy import LocalFrame
 from tile_store.sqlite_store import SqliteStore
+from tile_store.status import named_vehicles, waiting_totals
 
 
 def write_summary(
@@ -39,12 +40,22 @@ def write_summary(
         histories = tile_histories(store)
         summary = _counts(config, folder, prepared, outcome, results, store, histories)
         summary["f1"] = _evaluate(folder, prepared, store, histories)
+        summary["waiting_for_confirmation"] = waiting_totals(store)
+        summary["named_vehicles"] = named_vehicles(store)
         summary["features"] = _score_features(config, prepared, store)
     summary["prepare_s"] = round(prepare_s, 1)
+    summary["doubtful"] = doubtful_vehicles(results)
     summary["localisation_p95"] = results.localisation_p95()
     summary["traffic"] = results.traffic() | {"by_kind": account_traffic(folder)}
     _write(folder.summary, summary)
     return summary
+
+
+def doubtful_vehicles(results: FleetResults) -> dict[str, Any]:
+    """What each vehicle took back, held back or doubted, by its name; nothing of those that did not."""
+    named = ("scans_shifted", "scans_taken_back", "tiles_doubtful", "tiles_held_back", "changes_held_back")
+    found = {r["vehicle"]: {name: r.get(name, 0) for name in named} | r.get("doubts", {}) for r in results.results}
+    return {vehicle: counts for vehicle, counts in found.items() if any(counts[name] for name in named)}
 
 
 def _counts(
@@ -116,7 +127,12 @@ def _write(path: Path, summary: dict[str, Any]) -> None:
 
 def summary_lines(summary: dict[str, Any]) -> list[str]:
     """Return a summary as lines for people."""
-    traffic, f1, p95 = summary["traffic"], summary["f1"], summary["localisation_p95"]
+    traffic, f1, p95, waiting = (
+        summary["traffic"],
+        summary["f1"],
+        summary["localisation_p95"],
+        summary["waiting_for_confirmation"],
+    )
     lines = [
         f"{summary['agents']} agents drove {summary['drive_km']:.2f} km on {summary['link']} links "
         f"in {summary['wall_s']:.0f} s; {summary['tiles_downloaded']} tiles downloaded",
@@ -126,6 +142,11 @@ def summary_lines(summary: dict[str, Any]) -> list[str]:
         f"traffic: {size_text(traffic['down_bytes'])} down, {size_text(traffic['up_bytes'])} up "
         f"({traffic['kB_per_km_down']:.0f} and {traffic['kB_per_km_up']:.1f} kB/km)",
     ]
+    if waiting["voxels"]:
+        lines.append(
+            f"waiting for confirmation: {waiting['voxels']} voxels in {waiting['tiles']} tiles (`gnd map status`)"
+        )
+    lines += [one["says"] for one in summary["named_vehicles"]]
     if p95["longitudinal_m"] is not None:
         lines.append(
             f"localisation, 95 % of errors: {p95['longitudinal_m'] * 100:.1f} cm along, "
@@ -136,5 +157,12 @@ def summary_lines(summary: dict[str, Any]) -> list[str]:
             f"map against the truth, macro F1: {f1['before']:.1f} % before, {f1['single']:.1f} % by a single drive, "
             f"{f1['after']:.1f} % after"
         )
+    lines += [
+        f"{vehicle} doubts itself: {d['scans_shifted'] + d['scans_taken_back']} scans taken back, "
+        f"{d['tiles_held_back']} tiles with {d['changes_held_back']} changes held back, {d['tiles_doubtful']} doubtful "
+        f"({', '.join(f'{n} {reason}' for reason, n in d['tiles'].items()) or 'none'}); largest shift "
+        f"{d['largest_shift_m'] * 100:.0f} cm, {d['largest_turn_deg']:.2f} degrees"
+        for vehicle, d in summary.get("doubtful", {}).items()
+    ]
     lines += feature_lines(summary.get("features", {}))
     return lines

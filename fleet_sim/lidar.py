@@ -12,6 +12,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
+from fleet_sim.courses.foliage import Foliage
 from fleet_sim.errors import SceneError
 from fleet_sim.movers import Movers
 from fleet_sim.ray_kernels import FloatArray, IntArray, cast_sweep
@@ -32,7 +33,8 @@ class Sweep:
         points_lidar_m: float32 (N, 3), lidar frame at each point's own time.
         t_offset_ns: uint32 (N,), time after the start of the sweep.
         ring: uint8 (N,), beam from the lowest up.
-        primitive: int32 (N,), what each point lies on, for evaluation: index into the scene, the movers' after that.
+        primitive: int32 (N,), what each point lies on, for evaluation: index into the scene, the movers' after that,
+            then the foliage's volumes.
     """
 
     points_lidar_m: NDArray[np.float32]
@@ -66,7 +68,14 @@ class Lidar:
         self._times = model.shot_times_ns()
         self._rings = np.broadcast_to(model.rings, self._times.shape)
 
-    def hits(self, scene: Scene, T_map_lidar: FloatArray, movers: Movers | None = None, t_s: float = 0.0) -> Hits:
+    def hits(
+        self,
+        scene: Scene,
+        T_map_lidar: FloatArray,
+        movers: Movers | None = None,
+        t_s: float = 0.0,
+        foliage: Foliage | None = None,
+    ) -> Hits:
         """Cast the shots of one sweep.
 
         Args:
@@ -75,6 +84,7 @@ class Lidar:
                 end of the last.
             movers: what moves there.
             t_s: time of the first firing cycle in the movers' time [s].
+            foliage: leaves that let rays through; their volumes count after the movers' primitives.
 
         Raises:
             SceneError: wrong number of poses, or the sensor is outside the scene.
@@ -86,10 +96,13 @@ class Lidar:
         scene.check_inside(T_street_lidar[:, :, 3])
         poses = np.ascontiguousarray(T_street_lidar, dtype=np.float64)
         met = cast_sweep(poses, self._directions, self._shares, self.model.range_max_m, *scene.arrays())
+        shots, cycle_s = (poses, self._directions, self._shares), self.model.cycle_ns / _NS_PER_S
+        turn_rad, base = tau * cycle_s * self.model.rate_hz, len(scene.packed)
         if movers is not None:
-            shots, cycle_s = (poses, self._directions, self._shares), self.model.cycle_ns / _NS_PER_S
-            timing = (t_s, cycle_s, tau * cycle_s * self.model.rate_hz)
-            movers.meet(shots, self.model.range_max_m, timing, len(scene.packed), met)
+            movers.meet(shots, self.model.range_max_m, (t_s, cycle_s, turn_rad), base, met)
+            base += len(movers.packed)
+        if foliage is not None:
+            foliage.meet(shots, self.model.range_max_m, (t_s, turn_rad), base, met)
         return Hits(*met)
 
     def sweep(
@@ -99,10 +112,11 @@ class Lidar:
         rng: np.random.Generator,
         movers: Movers | None = None,
         t_s: float = 0.0,
+        foliage: Foliage | None = None,
     ) -> Sweep:
         """Take one sweep with range noise and lost returns; arguments and errors as `hits`."""
-        hits = self.hits(scene, T_map_lidar, movers, t_s)
-        packed = scene.packed if movers is None else np.concatenate([scene.packed, movers.packed])
+        hits = self.hits(scene, T_map_lidar, movers, t_s, foliage)
+        packed = np.concatenate([part.packed for part in (scene, movers, foliage) if part is not None])
         noisy = hits.range_m + self.model.range_sigma_m * rng.standard_normal(hits.range_m.shape)
         seen = self._seen(packed, hits, rng) & (noisy >= self.model.range_min_m) & (noisy <= self.model.range_max_m)
         points = self._directions[seen] * self._given(noisy[seen])[:, None]

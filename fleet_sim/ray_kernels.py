@@ -6,7 +6,7 @@ ray is the same in both: with a unit direction in the map frame, t is the range 
 All kernels stand in this one file, because numba's cache on disk notices changes of a kernel's own file only.
 """
 
-from math import cos, sin, sqrt
+from math import cos, log, sin, sqrt
 from typing import Final, NamedTuple
 
 import numpy as np
@@ -417,3 +417,80 @@ def cast_crowd(
                     t, item, cosine = meet_mover(ray, limit, crowd, mover, t_start + (i + shares[j]) * cycle_s)
                     if item >= 0:
                         ranges[i, j], found[i, j], incidence[i, j] = t, base + item, cosine
+
+
+@kernel
+def _mixed(value: np.uint64) -> np.uint64:
+    """Scramble the bits of a counter (splitmix64, Steele et al. 2014): neighbours give independent numbers."""
+    value = value + np.uint64(0x9E3779B97F4A7C15)
+    value = (value ^ (value >> np.uint64(30))) * np.uint64(0xBF58476D1CE4E5B9)
+    value = (value ^ (value >> np.uint64(27))) * np.uint64(0x94D049BB133111EB)
+    return value ^ (value >> np.uint64(31))
+
+
+@kernel
+def _within_crown(ray: Ray, v: FloatArray) -> tuple[float, float]:
+    """Ranges at which the ray enters and leaves the ellipsoid v (x, y, z, half axes); leave < entry if it misses."""
+    rx, ry, rz = (ray.ox - v[0]) / v[3], (ray.oy - v[1]) / v[4], (ray.oz - v[2]) / v[5]
+    dx, dy, dz = ray.dx / v[3], ray.dy / v[4], ray.dz / v[5]
+    a, b, c = dx * dx + dy * dy + dz * dz, rx * dx + ry * dy + rz * dz, rx * rx + ry * ry + rz * rz - 1.0
+    root = b * b - a * c
+    if root <= 0.0:
+        return 1.0, 0.0
+    return (-b - sqrt(root)) / a, (-b + sqrt(root)) / a
+
+
+@kernel
+def _within_hedge(ray: Ray, v: FloatArray) -> tuple[float, float]:
+    """Ranges at which the ray enters and leaves the upright box v (x, y, z, half edges); leave < entry if it misses."""
+    entry, leave = _clip(ray.ox - v[0] - v[3], ray.dx, -np.inf, np.inf)
+    entry, leave = _clip(v[0] - v[3] - ray.ox, -ray.dx, entry, leave)
+    entry, leave = _clip(ray.oy - v[1] - v[4], ray.dy, entry, leave)
+    entry, leave = _clip(v[1] - v[4] - ray.oy, -ray.dy, entry, leave)
+    entry, leave = _clip(ray.oz - v[2] - v[5], ray.dz, entry, leave)
+    return _clip(v[2] - v[5] - ray.oz, -ray.dz, entry, leave)
+
+
+@kernel
+def cast_leaves(
+    poses: FloatArray,
+    directions: FloatArray,
+    shares: FloatArray,
+    range_m: float,
+    volumes: FloatArray,
+    spreads: tuple[float, float],
+    base: int,
+    seed: np.uint64,
+    ranges: FloatArray,
+    found: IntArray,
+    incidence: FloatArray,
+) -> None:
+    """Let the shots of a sweep, given as to `cast_sweep`, meet leaves somewhere inside porous volumes, or pass through.
+
+    A volume (V, 8) is x, y, z of its middle, three half axes, leaves met a metre, and 1 for a box, 0 for an ellipsoid.
+    The way to the first leaf is exponential (a Poisson process along the ray), drawn for each shot and volume by a hash
+    of `seed`; the nearest leaf of all volumes counts, which is the same as one process over all of them.
+    `spreads`, `base`, `ranges`, `found` and `incidence` are as with `cast_crowd`.
+    """
+    columns, beams = directions.shape[0], directions.shape[1]
+    for item in range(len(volumes)):
+        v = volumes[item]
+        reach = sqrt(v[3] * v[3] + v[4] * v[4] + v[5] * v[5]) + _SLACK_M
+        seen = False
+        for i in range(columns):
+            if i % BLOCK_COLUMNS == 0:
+                seen = _faces(poses[i], directions[i, 0], v[0], v[1], reach, spreads[0])
+            if not seen or not _faces(poses[i], directions[i, 0], v[0], v[1], reach, spreads[1]):
+                continue
+            for j in range(beams):
+                ray, limit = shot(poses[i], poses[i + 1], shares[j], directions[i, j]), min(range_m, ranges[i, j])
+                entry, leave = _within_hedge(ray, v) if v[7] > 0.0 else _within_crown(ray, v)
+                entry = max(entry, 0.0)
+                if leave <= entry or entry >= limit:
+                    continue
+                drawn = _mixed(seed + np.uint64((item * columns + i) * beams + j))
+                chance = (float(drawn >> np.uint64(11)) + 0.5) / 9007199254740992.0
+                t = entry - log(chance) / v[6]
+                if t < min(leave, limit):
+                    tilt = float(_mixed(drawn) >> np.uint64(11)) / 9007199254740992.0
+                    ranges[i, j], found[i, j], incidence[i, j] = t, base + item, 0.3 + 0.7 * tilt

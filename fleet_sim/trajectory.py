@@ -121,7 +121,7 @@ class Motion:
         up = _unit(np.cross(self.world.map_of_street(along), self.world.map_of_street(across)))
         ahead = _unit(forward)
         T = np.tile(np.eye(4), (len(x), 1, 1))
-        roll, pitch, heave = self._sway(t_s)
+        roll, pitch, heave = swaying(t_s, self.style.sway_rad)
         R_map_road = np.stack([ahead, np.cross(up, ahead), up], axis=2)
         T[:, :3, :3] = R_map_road @ exp_so3(np.stack([roll, pitch, zero], axis=1))
         ground = self.world.map_of_street(np.stack([x, y, self.world.road_height_m(y)], axis=1))
@@ -133,12 +133,16 @@ class Motion:
         step = T_inverse(self.T_map_vehicle(t_s - _STEP_S)) @ self.T_map_vehicle(t_s + _STEP_S)
         return step[:, 0, 3] / (2 * _STEP_S), log_so3(step[:, :3, :3])[:, 2] / (2 * _STEP_S)
 
-    def _sway(self, t_s: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """Roll, pitch [rad] and heave [m]: three sines each, weaker the faster."""
-        phases = np.array(self.style.sway_rad).reshape(3, 3)
-        waves = np.sin(t_s[:, None, None] * np.array(_SWAY_RADPS) + phases) / np.array([1.0, 1.5, 3.0])
-        roll, pitch, heave = waves.sum(axis=2).T
-        return _SWAY_RAD * roll, _SWAY_RAD * pitch, _HEAVE_M * heave
+
+def swaying(t_s: FloatArray, phases_rad: tuple[float, ...]) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Roll, pitch [rad] and heave [m], (K,) each, at times (K,) [s]: three sines each, weaker the faster.
+
+    `phases_rad` are nine phases.
+    """
+    phases = np.array(phases_rad).reshape(3, 3)
+    waves = np.sin(t_s[:, None, None] * np.array(_SWAY_RADPS) + phases) / np.array([1.0, 1.5, 3.0])
+    roll, pitch, heave = waves.sum(axis=2).T
+    return _SWAY_RAD * roll, _SWAY_RAD * pitch, _HEAVE_M * heave
 
 
 def lane_motion(world: World, style: DrivingStyle, direction: Direction) -> tuple[Motion, float]:

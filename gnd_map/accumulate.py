@@ -101,6 +101,15 @@ class VoxelAccumulator:
         count, cells = self._count[: self._used][order], self._cells[: self._used][order]
         return g.astype(np.int32), Moments(count, cells, total, six_entries(outer))
 
+    def occupied(self) -> tuple[I32, npt.NDArray[np.uint64]]:
+        """All voxels with points: integer grid coordinates (M, 3) int32 and their sub-cells (M, 16) uint64, sorted.
+
+        Bit (z * 10 + y) * 10 + x, counted from the lowest of the first word, says whether that sub-cell holds a point.
+        """
+        key = self._key[: self._used]
+        order = np.argsort(key)
+        return (_split_key(key[order]) + self._key_origin).astype(np.int32), self._bits[: self._used][order]
+
     def finish(self, n_min_cells: int = N_MIN_CELLS) -> dict[TileId, Gaussians]:
         """The Gaussians of all voxels with at least `n_min_cells` occupied sub-cells, by tile, in Morton order.
 

@@ -20,6 +20,8 @@ from gnd_map.grid import VoxelGrid
 from gnd_map.tile_id import District, TileId
 from schemas import limits
 from schemas.bitmap import decode_observed, encode_observed
+from schemas.course import Course, course_message, course_value
+from schemas.doubt import Doubt, doubt_message, doubt_value
 from schemas.errors import BadValue, TooLarge
 from schemas.generated import change_ack_pb2, change_report_pb2, tile_change_pb2
 from schemas.report_id import check_report_id
@@ -73,6 +75,8 @@ class TileChange:
     """Standard deviation of the refined position, in its worst direction, over the scans that saw the tile."""
     pose_sigma_rad: float
     """Standard deviation of the refined attitude, about its worst axis, over the same scans."""
+    doubt: Doubt | None = None
+    """Why the vehicle does not fully believe this; None = it does."""
 
     def __post_init__(self) -> None:
         with refusing(f"change of tile {self.tile}"):
@@ -83,6 +87,13 @@ class TileChange:
             self._check_voxels()
             self._check_values()
             _check_covariances(self.changed)
+            self._check_withheld()
+
+    def _check_withheld(self) -> None:
+        if self.doubt is not None and self.doubt.withheld and len(self.observed):
+            raise BadValue(
+                f"{self.doubt.withheld} changes are held back, and {len(self.observed)} voxels are named all the same"
+            )
 
     def _check_voxels(self) -> None:
         if (np.diff(self.observed.astype(np.int64)) <= 0).any():
@@ -110,8 +121,8 @@ class TileChange:
     __hash__ = None  # type: ignore[assignment]
 
     @property
-    def _scalars(self) -> tuple[TileId, int, bytes, float, float]:
-        return self.tile, self.base_version, self.base_sha, self.pose_sigma_m, self.pose_sigma_rad
+    def _scalars(self) -> tuple[TileId, int, bytes, float, float, Doubt | None]:
+        return self.tile, self.base_version, self.base_sha, self.pose_sigma_m, self.pose_sigma_rad, self.doubt
 
     def _same_arrays(self, other: "TileChange") -> bool:
         return (
@@ -165,6 +176,8 @@ class ChangeReport:
     tiles: tuple[TileChange, ...]
     """One entry a tile, ascending; at least one."""
     layer: str = "ndt"
+    course: Course | None = None
+    """Where the vehicle drives in its own frame; None = it does not know."""
 
     def __post_init__(self) -> None:
         check_report_id(self.report_id)
@@ -205,6 +218,7 @@ class ChangeReport:
             first_ns=self.first_ns,
             last_ns=self.last_ns,
             tiles=map(_change_message, self.tiles),
+            course=course_message(self.course),
         )
         return serialise(message, limits.MAX_CHANGE_REPORT_BYTES)
 
@@ -230,6 +244,7 @@ class ChangeReport:
             first_ns=message.first_ns,
             last_ns=message.last_ns,
             tiles=_change_values(message),
+            course=course_value(message.course) if message.HasField("course") else None,
         )
 
 
@@ -247,6 +262,7 @@ def _change_message(change: TileChange) -> tile_change_pb2.TileChange:
         evidence=change.evidence.ravel().tolist(),
         pose_sigma_m=change.pose_sigma_m,
         pose_sigma_rad=change.pose_sigma_rad,
+        doubt=None if change.doubt is None else doubt_message(change.doubt),
     )
 
 
@@ -272,6 +288,7 @@ def _change_value(message: tile_change_pb2.TileChange) -> TileChange:
         observed = decode_observed(message.observed_first, message.observed_bitmap)
         changed = codec_of(message.codec_id).decode(tile, message.changed)
         evidence = _evidence_of(message, len(changed))
+        doubt = doubt_value(message.doubt) if message.HasField("doubt") else None
     return TileChange(
         tile=tile,
         base_version=message.base_version,
@@ -282,6 +299,7 @@ def _change_value(message: tile_change_pb2.TileChange) -> TileChange:
         evidence=evidence,
         pose_sigma_m=message.pose_sigma_m,
         pose_sigma_rad=message.pose_sigma_rad,
+        doubt=doubt,
     )
 
 

@@ -1,7 +1,7 @@
 """The header of a drive as the metadata record of its MCAP file.
 
-What older programs did not write (`deskew`, `sweep_ns`, `mount`, `mount_sigma`) is only written where it says something,
-and may be missing: such files keep their bytes.
+What older programs did not write (`deskew`, `sweep_ns`, `mount`, `mount_sigma`) is only written where it says
+something, and may be missing: such files keep their bytes.
 """
 
 import zlib

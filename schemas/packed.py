@@ -17,6 +17,8 @@ from ulid import ULID
 from gnd_map.codec import decode_tiles, encode_tiles
 from schemas import limits
 from schemas.changes import ChangeReport
+from schemas.course import Course, course_message, course_value
+from schemas.doubt import Doubt, doubt_message, doubt_value
 from schemas.errors import BadValue, TooLarge
 from schemas.features import FeatureReport, check_feature_bytes, report_of
 from schemas.generated import change_report_pb2, packed_gaussians_pb2, packed_report_pb2
@@ -74,6 +76,10 @@ class PackedReport:
     """Largest of the tiles' standard deviations of the refined position, 0.1 mm, rounded up."""
     pose_sigma_10urad: int
     """The same of the attitude, 10 µrad, rounded up."""
+    doubts: tuple[tuple[int, Doubt], ...] = ()
+    """(index in the district, doubt) of the tiles that are doubtful, ascending; nothing of them is held back."""
+    course: Course | None = None
+    """Where the vehicle drives in its own frame; None = it does not know."""
 
     def __post_init__(self) -> None:
         check_report_id(self.report_id)
@@ -87,6 +93,18 @@ class PackedReport:
         if len(self.base_digest) != DIGEST_BYTES:
             raise BadValue(f"base digest has {len(self.base_digest)} bytes, expected {DIGEST_BYTES}")
         self._check_tiles()
+        self._check_doubts()
+
+    def _check_doubts(self) -> None:
+        indices = [index for index, _ in self.doubts]
+        if indices != sorted(set(indices)) or not set(indices) <= {index for index, _ in self.tiles}:
+            raise BadValue(
+                f"packed report {self.report_id}: its {len(indices)} doubtful tiles are not strictly ascending among "
+                f"its {len(self.tiles)} tiles"
+            )
+        withheld = sum(doubt.withheld for _, doubt in self.doubts)
+        if withheld:
+            raise BadValue(f"packed report {self.report_id} holds back {withheld} changes: only a whole report can")
 
     def _check_tiles(self) -> None:
         if not self.tiles:
@@ -114,6 +132,10 @@ class PackedReport:
         """Standard deviation of the refined attitude, radians."""
         return self.pose_sigma_10urad * _RAD_PER_STEP
 
+    def doubt_of(self, index: int) -> Doubt | None:
+        """Of the tile with this index in the district."""
+        return dict(self.doubts).get(index)
+
     def encode(self) -> bytes:
         """Bytes of gnd.v1.ChangeReport with `packed` set."""
         packed = packed_report_pb2.PackedReport(
@@ -129,6 +151,9 @@ class PackedReport:
             track=self.track,
             pose_sigma_tenth_mm=self.pose_sigma_tenth_mm,
             pose_sigma_10urad=self.pose_sigma_10urad,
+            doubtful=[index for index, _ in self.doubts],
+            doubts=[doubt_message(doubt) for _, doubt in self.doubts],
+            course=course_message(self.course),
         )
         message = change_report_pb2.ChangeReport(major=MAJOR, packed=packed)
         return serialise(message, limits.MAX_PACKED_REPORT_BYTES)
@@ -210,6 +235,9 @@ def decode_upload(data: bytes) -> ChangeReport | PackedReport | PackedGaussians 
 def _packed_report(message: packed_report_pb2.PackedReport) -> PackedReport:
     with refusing("tiles of PackedReport"):
         tiles = tuple(decode_tiles(message.tiles))
+    if len(message.doubtful) != len(message.doubts):
+        raise BadValue(f"PackedReport names {len(message.doubtful)} doubtful tiles and {len(message.doubts)} doubts")
+    check_length("PackedReport", len(message.doubts), limits.MAX_TILES_OF_DISTRICT, "doubts")
     return PackedReport(
         report_id=report_id_of_bytes(message.report_id),
         vehicle=message.vehicle,
@@ -223,6 +251,8 @@ def _packed_report(message: packed_report_pb2.PackedReport) -> PackedReport:
         track=message.track,
         pose_sigma_tenth_mm=message.pose_sigma_tenth_mm,
         pose_sigma_10urad=message.pose_sigma_10urad,
+        doubts=tuple(zip(message.doubtful, map(doubt_value, message.doubts), strict=True)),
+        course=course_value(message.course) if message.HasField("course") else None,
     )
 
 

@@ -10,8 +10,8 @@ USUAL_SWEEP_S: Final = 0.1
 UNKNOWN_SHARE: Final[dict[Deskew, float]] = {
     "unsaid": 0.0, "measured": 0.0, "compensated": 0.0, "reconstructed": 0.02, "none": 1.0,
 }  # fmt: skip
-"""Share of the motion during a sweep that is still in the points. Reconstructed: the lasers of a head look up to 9° past
-its azimuth, 2.5 % of a turn, to either side."""
+"""Share of the motion during a sweep that is still in the points. Reconstructed: the lasers of a head look up to 9°
+past its azimuth, 2.5 % of a turn, to either side."""
 LEVER_M: Final = 10.0
 """How far away the surfaces are that hold a heading: what shifts them against each other turns the scan."""
 

@@ -2,6 +2,9 @@
 
 The poses decide the map, so they are checked before a point is used: a track that jumps, has gaps, or lies elsewhere
 than its own GNSS fixes is refused with numbers. Nothing is written until all drives are read.
+
+`build_map` takes every point; what leaves movers out and closes loops (`gnd map build`) is made of the same pieces one
+layer higher: `drive_sources`, `MapPoints`, `put_map`.
 """
 
 from collections.abc import Callable, Iterator, Sequence
@@ -83,13 +86,16 @@ class BuildResult:
 
 
 @dataclass(frozen=True, slots=True)
-class _Source:
-    """One drive, checked, with its poses in the map frame of the build."""
+class Source:
+    """One drive, checked, with its poses in the map frame of the build, which is that of the first drive."""
 
     path: Path
     header: DriveHeader
     poses: Trajectory
     scans: int
+    gnss: GnssTrack
+    T_map_drive: F64
+    """(4, 4) from the drive's own map frame, in which its fixes are, to that of the build."""
 
 
 def build_map(
@@ -121,11 +127,9 @@ def build_map(
         StoreError: an unknown codec, or the store cannot take the tiles.
     """
     parameters = parameters or BuildParameters()
-    lattice = lattice_named(codec)
-    if is_feature_layer(layer):
-        raise BuildError(f"layer {layer!r} holds features; a map of Gaussians has a name that begins with ndt")
-    sources = _sources(drives, parameters)
-    accumulators = _accumulators(sources, parameters)
+    lattice = map_lattice(layer, codec)
+    sources = drive_sources(drives, parameters)
+    measured = MapPoints(sources, parameters)
     used, skipped, points = 0, 0, 0
     for source in sources:
         for points_map_m in _swept(source, parameters, progress):
@@ -133,12 +137,10 @@ def build_map(
                 skipped += 1
                 continue
             used, points = used + 1, points + len(points_map_m)
-            for accumulator in accumulators:
-                accumulator.add(points_map_m)
+            measured.add(points_map_m)
     if used == 0:
         raise BuildError(f"none of {skipped} scans lies within the reference poses: are both in the same clock?")
-    tiles = _tiles(accumulators, n_min_cells, lattice)
-    results = store.put_tiles(tiles, layer=layer)
+    tiles = measured.tiles(n_min_cells, lattice)
     return BuildResult(
         drives=len(sources),
         scans=used,
@@ -146,24 +148,64 @@ def build_map(
         points=points,
         tiles=len(tiles),
         gaussians=sum(len(tile.gaussians) for tile in tiles),
-        versions_published=sum(result.status == "published" for result in results),
+        versions_published=put_map(tiles, store, layer),
     )
 
 
-def _sources(drives: Sequence[Path], parameters: BuildParameters) -> list[_Source]:
-    """The drives with checked poses, all in the map frame of the first."""
+def map_lattice(layer: str, codec: str) -> Lattice | None:
+    """The lattice of a codec, None for "float"; refuses a layer of features and a codec that is not known."""
+    lattice = lattice_named(codec)
+    if is_feature_layer(layer):
+        raise BuildError(f"layer {layer!r} holds features; a map of Gaussians has a name that begins with ndt")
+    return lattice
+
+
+def put_map(tiles: Sequence[Tile], store: Store, layer: str) -> int:
+    """Put tiles into the store as a new base, all or none; how many changed."""
+    return sum(result.status == "published" for result in store.put_tiles(tiles, layer=layer))
+
+
+class MapPoints:
+    """The points of a build in their voxels, each in its zone of latitude."""
+
+    def __init__(self, sources: Sequence[Source], parameters: BuildParameters) -> None:
+        self.accumulators = tuple(_accumulators(sources, parameters))
+
+    def add(self, points_map_m: F64) -> None:
+        """Take points (N, 3) in the map frame of the build."""
+        for accumulator in self.accumulators:  # each passes over the points of the others
+            accumulator.add(points_map_m)
+
+    def tiles(self, n_min_cells: int, lattice: Lattice | None) -> list[Tile]:
+        """All tiles, sorted, on the lattice; the store numbers their versions.
+
+        Raises:
+            BuildError: no voxel is dense enough.
+        """
+        return _tiles(self.accumulators, n_min_cells, lattice)
+
+
+def drive_sources(drives: Sequence[Path], parameters: BuildParameters) -> list[Source]:
+    """The drives with checked poses, all in the map frame of the first.
+
+    Raises:
+        BuildError: no drives, no reference poses, impossible poses.
+        DriveError: a drive cannot be read.
+    """
     if not drives:
         raise BuildError("no drives to build a map from")
     anchor = read_header(drives[0]).anchor
     return [_source(Path(drive), anchor, parameters) for drive in drives]
 
 
-def _source(path: Path, anchor: LocalFrame, parameters: BuildParameters) -> _Source:
+def _source(path: Path, anchor: LocalFrame, parameters: BuildParameters) -> Source:
     header, track = read_header(path), load_track(path)
     check_poses(path, track.reference, parameters)
     _check_gnss(path, header.anchor, track.reference, track.gnss, parameters)
     T_map_vehicle = anchor.T_self_other(header.anchor) @ track.reference.T_map_vehicle
-    return _Source(path, header, Trajectory(track.reference.t_ns, T_map_vehicle), drive_counts(path).scans)
+    poses = Trajectory(track.reference.t_ns, T_map_vehicle)
+    T_map_drive = anchor.T_self_other(header.anchor)
+    return Source(path, header, poses, drive_counts(path).scans, track.gnss, T_map_drive)
 
 
 def check_poses(path: Path, reference: ReferenceTrack, parameters: BuildParameters) -> None:
@@ -212,14 +254,14 @@ def _check_gnss(
         )
 
 
-def _accumulators(sources: list[_Source], parameters: BuildParameters) -> list[VoxelAccumulator]:
-    """One for each zone of latitude that points may fall into; each passes over the points of the others."""
+def _accumulators(sources: Sequence[Source], parameters: BuildParameters) -> list[VoxelAccumulator]:
+    """One for each zone of latitude that points may fall into."""
     frame = sources[0].header.anchor
     groups = zones(_reachable_tiles(frame, sources, parameters.max_range_m))
     return [VoxelAccumulator(GridFrame.around(frame, tiles)) for tiles in groups.values()]
 
 
-def _reachable_tiles(frame: LocalFrame, sources: list[_Source], max_range_m: float) -> set[TileId]:
+def _reachable_tiles(frame: LocalFrame, sources: Sequence[Source], max_range_m: float) -> set[TileId]:
     found: set[TileId] = set()
     for source in sources:
         lat, lon, _ = frame.geodetic_from_enu(source.poses.T_dst_vehicle[:, :3, 3])
@@ -227,7 +269,7 @@ def _reachable_tiles(frame: LocalFrame, sources: list[_Source], max_range_m: flo
     return found
 
 
-def _swept(source: _Source, parameters: BuildParameters, progress: Progress | None) -> Iterator[F64 | None]:
+def _swept(source: Source, parameters: BuildParameters, progress: Progress | None) -> Iterator[F64 | None]:
     """Points (N, 3) in the map frame of each scan; None for a scan that the poses do not cover."""
     done = 0
     for item in read_drive(source.path):
@@ -238,7 +280,7 @@ def _swept(source: _Source, parameters: BuildParameters, progress: Progress | No
                 progress(source.path, done, source.scans)
 
 
-def _points_map_m(scan: Scan, source: _Source, parameters: BuildParameters) -> F64 | None:
+def _points_map_m(scan: Scan, source: Source, parameters: BuildParameters) -> F64 | None:
     range_m = np.linalg.norm(scan.points_m, axis=1)
     kept = (range_m >= parameters.min_range_m) & (range_m <= parameters.max_range_m)
     points_m, offset_ns = scan.points_m[kept], scan.t_offset_ns[kept]
@@ -251,7 +293,7 @@ def _points_map_m(scan: Scan, source: _Source, parameters: BuildParameters) -> F
         return None
 
 
-def _tiles(accumulators: list[VoxelAccumulator], n_min_cells: int, lattice: Lattice | None) -> list[Tile]:
+def _tiles(accumulators: Sequence[VoxelAccumulator], n_min_cells: int, lattice: Lattice | None) -> list[Tile]:
     """All tiles, sorted, on the lattice; the store numbers their versions."""
     found: dict[TileId, Gaussians] = {}
     for accumulator in accumulators:

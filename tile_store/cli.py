@@ -14,7 +14,6 @@ from typing import Any, Final, TypeVar
 
 import click
 from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TaskID, TextColumn, TimeElapsedColumn
 
 from fleet_bus.bus import open_bus
 from fleet_bus.config import DEFAULT_ENDPOINT, BusConfig
@@ -26,11 +25,11 @@ from tile_store.errors import StoreError
 from tile_store.export import FORMATS, export_map
 from tile_store.server import TileServer
 from tile_store.sqlite_store import SqliteStore
+from tile_store.status import status
 from tile_store.store import Store
-from tile_store.values import DEFAULT_CODEC, DEFAULT_LAYER, MAP_CODECS
+from tile_store.values import DEFAULT_LAYER
 
 PATH: Final = click.Path(path_type=Path)
-CODEC_HELP: Final = "How finely Gaussians are rounded."
 _F = TypeVar("_F", bound=Callable[..., Any])
 
 
@@ -73,24 +72,10 @@ def store(path: Path, connect: tuple[str, ...], workers: int) -> None:
 
 @click.group(name="map")
 def map_group() -> None:
-    """Build, inspect, compare, export and roll back maps."""
+    """Inspect, compare, export and roll back maps; `gnd map build` is in `deploy.map_cli`, above the segmentation."""
 
 
-@map_group.command(short_help="Build a map from drives with known poses.")
-@click.argument("drives", nargs=-1, required=True, type=PATH)
-@click.option("--store", "-o", "path", required=True, type=PATH, help="The store; it is made when missing.")
-@click.option("--codec", default=DEFAULT_CODEC, show_default=True, type=click.Choice(MAP_CODECS), help=CODEC_HELP)
-@layer_option
-@json_option
-def build(drives: tuple[Path, ...], path: Path, codec: str, layer: str, as_json: bool) -> None:
-    """Build tiles from DRIVES (MCAP, with reference poses) and put them into a store as a new base."""
-    from tile_store.build import build_map  # it loads numba, which the other commands do without
-
-    with store_to_fill(path) as opened, _bars() as bars:
-        result = build_map(drives, opened, layer=layer, codec=codec, progress=_Shown(bars))
-    show(
-        asdict(result), as_json, lambda console: console.print(tables.fields(f"{path}, layer {layer}", asdict(result)))
-    )
+map_group.add_command(status)
 
 
 @map_group.command(short_help="What a store holds, in numbers.")
@@ -264,24 +249,6 @@ def store_to_fill(path: Path) -> Iterator[SqliteStore]:
     finally:
         for suffix in ("", "-wal", "-shm"):
             partial.with_name(partial.name + suffix).unlink(missing_ok=True)
-
-
-class _Shown:
-    """A progress bar a drive."""
-
-    def __init__(self, bars: Progress) -> None:
-        self._bars = bars
-        self._tasks: dict[Path, TaskID] = {}
-
-    def __call__(self, drive: Path, done: int, total: int) -> None:
-        if drive not in self._tasks:
-            self._tasks[drive] = self._bars.add_task(drive.name, total=total)
-        self._bars.update(self._tasks[drive], completed=done)
-
-
-def _bars() -> Progress:
-    columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TextColumn("scans"))
-    return Progress(*columns, TimeElapsedColumn(), console=Console(stderr=True))
 
 
 def show(values: dict[str, Any], as_json: bool, print_it: Callable[[Console], None]) -> None:

@@ -88,6 +88,8 @@ def _prepare(connection: apsw.Connection, path: Path, busy_timeout_s: float) -> 
         _check_header(connection, path)
     if connection.readonly("main"):
         raise StoreUnavailable(f"{path}: read-only; a store must be writable")
+    if not fetch(connection, "has_schema_of_confirmation"):
+        _in_one(connection, lambda: connection.execute(SQL["schema_of_confirmation"]))
 
 
 def _check_header(connection: apsw.Connection, path: Path) -> None:
@@ -107,13 +109,21 @@ def _check_header(connection: apsw.Connection, path: Path) -> None:
 
 
 def _create_schema(connection: apsw.Connection) -> None:
-    connection.execute("BEGIN IMMEDIATE")
-    try:
+    def create() -> None:
         # Another process may have made it since we looked.
         if connection.pragma("application_id") == 0:
             connection.execute(SQL["schema"])
             connection.pragma("user_version", SCHEMA_VERSION)
             connection.pragma("application_id", APPLICATION_ID)
+
+    _in_one(connection, create)
+
+
+def _in_one(connection: apsw.Connection, work: Callable[[], object]) -> None:
+    """Run `work` in one write transaction."""
+    connection.execute("BEGIN IMMEDIATE")
+    try:
+        work()
         connection.execute("COMMIT")
     except BaseException:
         _undo(connection)

@@ -12,6 +12,8 @@ import apsw
 from gnd_map.content import AnyTile
 from gnd_map.tile_id import TileId
 from schemas.tiles import CatalogEntry
+from tile_store import sqlite_accounts as accounts
+from tile_store import sqlite_confirmation as confirmation
 from tile_store import sqlite_inbox as inbox
 from tile_store import sqlite_versions as versions
 from tile_store.errors import StoreError, UnknownVersion
@@ -22,6 +24,7 @@ from tile_store.values import (
     DEFAULT_LAYER,
     Claim,
     Content,
+    DirtyTile,
     GcResult,
     Notice,
     Publication,
@@ -33,8 +36,10 @@ from tile_store.values import (
     StoreCounts,
     StoredTile,
     TileWork,
+    VehicleAccount,
     VersionInfo,
     VersionKind,
+    WaitingChange,
     check_fits,
     check_layer,
 )
@@ -220,6 +225,29 @@ class SqliteStore:
         """See `Store.announced`."""
         keys = [{"layer": one.layer, "tile": one.tile.morton, "version": one.version} for one in notices]
         self._writer.run(lambda c: [change(c, "delete_notice", key) for key in keys])
+
+    # Confirmation
+
+    def waiting_changes(self) -> list[WaitingChange]:
+        """See `Store.waiting_changes`."""
+        with self._readers.snapshot() as c:
+            return confirmation.waiting_changes(c)
+
+    def shifted_vehicles(self) -> frozenset[str]:
+        """See `Store.shifted_vehicles`."""
+        with self._readers.snapshot() as c:
+            return accounts.shifted_vehicles(c)
+
+    def vehicle_accounts(self) -> list[VehicleAccount]:
+        """See `Store.vehicle_accounts`."""
+        with self._readers.snapshot() as c:
+            return accounts.accounts(c)
+
+    def dirty_tiles(self) -> list[DirtyTile]:
+        """See `Store.dirty_tiles`."""
+        with self._readers.snapshot() as c:
+            rows = fetch(c, "dirty_tiles")
+        return [DirtyTile(layer, TileId(tile), *rest) for layer, tile, *rest in rows]
 
     # Reading
 

@@ -7,6 +7,8 @@ from typing import Any
 import apsw
 
 from gnd_map.tile_id import TileId
+from tile_store import sqlite_accounts as accounts
+from tile_store import sqlite_confirmation as confirmation
 from tile_store import sqlite_inbox as inbox
 from tile_store.errors import StoreError, UnknownReports, UnknownVersion
 from tile_store.provenance import NOTHING, Provenance, encode_provenance
@@ -47,6 +49,10 @@ def publish(
         origin = _Origin(publication.reason, claim.owner, provenance)
         result = PublishResult("published", _append(c, claim.layer, claim.tile, content, origin, timing["now"]))
     inbox.consume(c, claim, publication.report_ids, result.version, timing)
+    if publication.waiting is not None:
+        confirmation.keep(c, claim.layer, claim.tile, publication.waiting)
+    accounts.put_courses(c, claim.layer, claim.tile, publication.courses)
+    accounts.put_tests(c, claim.layer, claim.tile, publication.shift_tests, timing)
     return result
 
 
@@ -120,6 +126,8 @@ def _append(c: apsw.Connection, layer: str, tile: TileId, content: Content, orig
     change(c, "insert_version", row)
     if change(c, "swap_head" if head.version else "insert_head", row) != 1:
         raise StoreError(f"tile {tile.path} of layer {layer}: head {head.version} has moved inside a transaction")
+    if origin.kind != "merged":  # a new epoch: what waited is forgotten with the reports that claimed it
+        confirmation.keep(c, layer, tile, ())
     if head.version or origin.kind == "merged":  # what an import adds to the map is found through the catalog
         change(c, "insert_notice", row)
     return version

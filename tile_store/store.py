@@ -10,6 +10,7 @@ from schemas.tiles import CatalogEntry
 from tile_store.values import (
     DEFAULT_LAYER,
     Claim,
+    DirtyTile,
     GcResult,
     Notice,
     Publication,
@@ -20,8 +21,10 @@ from tile_store.values import (
     StoreCounts,
     StoredTile,
     TileWork,
+    VehicleAccount,
     VersionInfo,
     VersionKind,
+    WaitingChange,
 )
 
 
@@ -102,6 +105,22 @@ class Store(Protocol):
 
     def announced(self, notices: Sequence[Notice]) -> None:
         """Confirm that the update notices of these versions have gone out."""
+
+    # Confirmation
+
+    def waiting_changes(self) -> list[WaitingChange]:
+        """What single vehicles claim and nobody has confirmed, by layer, tile, vehicle and reason."""
+
+    def shifted_vehicles(self) -> frozenset[str]:
+        """The vehicles whose reports are explained by shifts again and again. When one comes or goes, all tiles that it
+        has reported about wait to be merged again.
+        """
+
+    def vehicle_accounts(self) -> list[VehicleAccount]:
+        """What shift tests and courses say of each vehicle of which there are any, by vehicle."""
+
+    def dirty_tiles(self) -> list[DirtyTile]:
+        """Tiles that wait to be merged, by layer and tile."""
 
     # Reading
 

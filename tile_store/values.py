@@ -18,6 +18,7 @@ from tile_store.errors import StoreError
 VersionKind = Literal["base", "merged", "rollback"]
 PutStatus = Literal["stored", "duplicate"]
 PublishStatus = Literal["published", "unchanged", "stale"]
+WaitingReason = Literal["share", "poses", "doubtful", "shift", "named"]
 
 SHA_BYTES: Final = 32
 DEFAULT_LAYER: Final = "ndt"
@@ -211,11 +212,142 @@ class TileWork:
 
 
 @dataclass(frozen=True, slots=True)
+class DirtyTile:
+    """A tile that waits to be merged: reports that are not merged yet, how often it was tried; `is_leased`: a shard is
+    at it.
+    """
+
+    layer: str
+    tile: TileId
+    reports: int
+    attempts: int
+    is_leased: bool
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "is_leased", bool(self.is_leased))
+
+
+@dataclass(frozen=True, slots=True)
+class Unconfirmed:
+    """What one vehicle alone claims about a tile, and why it is not published.
+
+    Attributes:
+        vehicle: the only witness.
+        report_ids: of its reports that claim it, sorted.
+        voxels: so many.
+        seen: voxels of the tile that it observed and that hold something, before or by its word.
+        reason: "share": too large a share; "poses": of reports with poor poses only; "doubtful": the vehicle doubts it
+            itself; "shift": a shift of its poses explains it; "named": its reports are shifted again and again.
+    """
+
+    vehicle: str
+    report_ids: tuple[str, ...]
+    voxels: int
+    seen: int
+    reason: WaitingReason
+
+
+@dataclass(frozen=True, slots=True)
+class ShiftTest:
+    """Whether the changes that a report claims in a tile are an error of its poses.
+
+    Attributes:
+        report_id: the report.
+        vehicle: who made it.
+        at_ns: time of its last scan, UTC.
+        is_explained: a shift explains them, and no other vehicle sees the same.
+        length_m: length of the shift over the ground.
+        turn_rad: its turn, counter-clockwise seen from above.
+        forward_m: along the vehicle's axes where the vehicle has told it so, else None.
+        left_m: the same.
+    """
+
+    report_id: str
+    vehicle: str
+    at_ns: int
+    is_explained: bool
+    length_m: float
+    turn_rad: float
+    forward_m: float | None = None
+    left_m: float | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class CourseSaid:
+    """Where a vehicle drives in its own frame, as its report says: what its LiDAR's mount is turned by, rad."""
+
+    report_id: str
+    vehicle: str
+    at_ns: int
+    turn_rad: float
+    sigma_rad: float
+
+
+@dataclass(frozen=True, slots=True)
+class VehicleAccount:
+    """What shift tests and courses say about one vehicle.
+
+    Attributes:
+        vehicle: its pseudonym.
+        tested: of its newest reports on tiles so many could be tested, ...
+        explained: ... and so many are explained by a shift.
+        length_m: mean length of these shifts.
+        length_sd_m: their standard deviation: a mount or a clock errs alike, again and again.
+        turn_rad: mean turn.
+        forward_m: mean along the vehicle's axes, of the tests that tell it; None: none does.
+        left_m: the same.
+        is_shifted: its reports are shifted again and again; what it alone claims waits.
+        course_tiles: tiles of the newest reports that tell its course, ...
+        course_rad: ... which on the mean runs so much to the left of its heading, ...
+        course_sigma_rad: ... known to so much.
+        is_turned: its LiDAR's mount is turned against what it believes. Its points lie where they should all the same,
+            as they were matched with the map: only its heading is wrong.
+    """
+
+    vehicle: str
+    tested: int
+    explained: int
+    length_m: float
+    length_sd_m: float
+    turn_rad: float
+    forward_m: float | None
+    left_m: float | None
+    is_shifted: bool
+    course_tiles: int = 0
+    course_rad: float = 0.0
+    course_sigma_rad: float = 0.0
+    is_turned: bool = False
+
+    @property
+    def is_named(self) -> bool:
+        """Whether somebody should look at the vehicle."""
+        return self.is_shifted or self.is_turned
+
+
+@dataclass(frozen=True, slots=True)
+class WaitingChange:
+    """What one vehicle claims about a tile and nobody has confirmed, as a store keeps it: `Unconfirmed`, and where.
+
+    `since_ns` is when the first of the vehicle's reports that claim it was received.
+    """
+
+    layer: str
+    tile: TileId
+    vehicle: str
+    reason: WaitingReason
+    voxels: int
+    seen: int
+    since_ns: int
+
+
+@dataclass(frozen=True, slots=True)
 class Publication:
     """A merge's result: the new content, or None when nothing visible has changed.
 
     `report_ids` are the reports that it comes from. `voxel_reports` names them for each changed voxel, or by the id of
-    each changed feature, when known.
+    each changed feature, when known. `waiting` is what the reports claim and the content has not;
+    None: as before. `shift_tests` and `courses` are those of this tile's reports, which add to the accounts
+    of their vehicles.
     The store numbers versions itself: it publishes `base_version + 1`, whatever `tile.version` says.
     """
 
@@ -225,6 +357,9 @@ class Publication:
     reason: VersionKind = "merged"
     report_ids: tuple[str, ...] = ()
     voxel_reports: Mapping[int, tuple[str, ...]] = field(default_factory=dict)
+    waiting: tuple[Unconfirmed, ...] | None = None
+    shift_tests: tuple[ShiftTest, ...] = ()
+    courses: tuple[CourseSaid, ...] = ()
 
     def __post_init__(self) -> None:
         if self.tile is not None and self.tile.tile_id != self.claim.tile:

@@ -8,6 +8,7 @@ from fleet_bus.config import DEFAULT_ENDPOINT
 from fleet_bus.links import LinkProfile
 from gnd_map.features import is_feature_layer
 from vehicle_agent.detect.parameters import DetectParameters
+from vehicle_agent.detect.shift import ShiftParameters
 from vehicle_agent.errors import AgentConfigError
 from vehicle_agent.features.layer_parameters import FeatureParameters
 from vehicle_agent.localise.parameters import LocaliserParameters
@@ -67,6 +68,10 @@ class ReportParameters:
     """Scans whose refined position is less certain (in its worst direction) are no evidence."""
     max_sigma_rad: float = 0.02
     """The same for the attitude: about its worst axis, 40 cm at 20 m."""
+    check_poses: bool = True
+    """Scans are evidence only once no small shift lays them better onto the map; off for studies of what that costs."""
+    shift: ShiftParameters = field(default_factory=ShiftParameters)
+    """When a shift is one."""
     drain_s: float = 120.0
     """At the end of a drive the agent waits this long for its reports to be acknowledged."""
 

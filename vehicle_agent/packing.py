@@ -37,11 +37,15 @@ def pack(report: ChangeReport, bases: Bases, track: Track) -> PackedReport:
         track: where the vehicle was while the scans counted that the report rests on.
 
     Raises:
-        PackingError: a base is missing, a changed voxel is of another class, or the track is too long.
+        PackingError: a base is missing, a changed voxel is of another class, something is held back, or the track is
+            too long.
         CodecError: the flags cannot be coded.
     """
     if track.way_m > limits.MAX_WAY_OF_REPORT_M:
         raise PackingError(f"{track.way_m:.0f} m of way in one report, the limit is {limits.MAX_WAY_OF_REPORT_M:g} m")
+    doubts = [(change.tile.morton - report.district.first_morton, change.doubt) for change in report.tiles]
+    if any(doubt is not None and doubt.withheld for _, doubt in doubts):
+        raise PackingError(f"report {report.report_id} holds changes back: the track would call them observed")
     return PackedReport(
         report_id=report.report_id,
         vehicle=report.vehicle,
@@ -57,6 +61,8 @@ def pack(report: ChangeReport, bases: Bases, track: Track) -> PackedReport:
         track=encode_track(track),
         pose_sigma_tenth_mm=_steps_up(max(change.pose_sigma_m for change in report.tiles), _STEPS_PER_M),
         pose_sigma_10urad=_steps_up(max(change.pose_sigma_rad for change in report.tiles), _STEPS_PER_RAD),
+        doubts=tuple((index, doubt) for index, doubt in doubts if doubt is not None),
+        course=report.course,
     )
 
 

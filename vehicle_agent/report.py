@@ -2,9 +2,10 @@
 
 import logging
 from collections import Counter
-from collections.abc import Collection
+from collections.abc import Callable, Collection
 from dataclasses import dataclass, field, replace
 from importlib.metadata import version
+from typing import Any
 
 import numpy as np
 
@@ -15,13 +16,20 @@ from gnd_map.errors import GndError
 from gnd_map.tile import Tile
 from gnd_map.tile_id import District, TileId
 from schemas.changes import ChangeReport, TileChange
+from schemas.course import Course
 from schemas.keys import change_key
 from schemas.report_id import deterministic_report_id
 from vehicle_agent.config import ReportParameters
 from vehicle_agent.detect.classify import Classification, classify, tile_change
 from vehicle_agent.detect.detector import ChangeDetector
+from vehicle_agent.detect.doubts import LEAST_WITHHELD, Account, TileDoubts, changed_share_of, doubt_of, withheld_change
+from vehicle_agent.detect.shift import Shift, costs_at
+from vehicle_agent.detect.tile_shift import pose_error_of_tile
+from vehicle_agent.detect.trial import POINTS_OF_POOR_SCAN, Trial, some_of
 from vehicle_agent.detect.uncertainty import PoseUncertainty
 from vehicle_agent.localise.estimates import PoseEstimate
+from vehicle_agent.localise.match_map import MatchMapCache
+from vehicle_agent.localise.parameters import RegistrationParameters
 from vehicle_agent.outbox import Outbox
 from vehicle_agent.packing import is_measured, pack
 from vehicle_agent.segment.segmenter import SegmentedScan
@@ -61,52 +69,129 @@ class _Pending:
     bases: dict[TileId, Tile] = field(default_factory=dict)
 
 
+@dataclass(slots=True)
+class LargestShift:
+    """The largest pose error that was found."""
+
+    shift_m: float = 0.0
+    turn_deg: float = 0.0
+
+    def see(self, shift: Shift) -> None:
+        """Take a pose error."""
+        self.shift_m = max(self.shift_m, float(np.linalg.norm(shift.shift_m)))
+        self.turn_deg = max(self.turn_deg, float(np.degrees(np.linalg.norm(shift.turn_rad))))
+
+
 class Reporter:
     """Feeds refined scans to the detector, decides the tiles left behind and puts a report a district into the outbox.
 
+    Scans are evidence only once their poses have stood the shift test (`trial`); a tile whose changes a shift explains
+    is held back and reported as such, in a report of its own that is only sent whole.
+
     Report ids are made of vehicle, drive, district and the report's number in it, so a restarted agent, which drives
     its recording again, makes the same ids. New Gaussians are moved onto the lattice that they travel on, so that the
-    short form of a report and the whole one say the same, to the bit.
+    short form of a report and the whole one say the same, to the bit. `course` gives where the vehicle drives in its
+    own frame, as far as it knows.
     """
 
     def __init__(
-        self, detector: ChangeDetector, outbox: Outbox, identity: Identity, start_ns: int, parameters: ReportParameters
+        self,
+        detector: ChangeDetector,
+        outbox: Outbox,
+        identity: Identity,
+        start_ns: int,
+        parameters: ReportParameters,
+        course: Callable[[], Course | None] = lambda: None,
     ) -> None:
         self.classes: Counter[str] = Counter()
         self.counts: Counter[str] = Counter()
+        self.doubts: Counter[str] = Counter()
+        """Tiles by reason of doubt."""
+        self.largest_shift = LargestShift()
         self._detector, self._outbox, self._who = detector, outbox, identity
-        self._start_ns, self._parameters = start_ns, parameters
+        self._start_ns, self._parameters, self._course = start_ns, parameters, course
         self._pending: dict[District, _Pending] = {}
         self._numbers: Counter[District] = Counter()
         self._stretch: _Stretch | None = None
         self._looked_at: F64 | None = None
         self._tracks = Tracks(detector.local_map.grid_frame.frame)
+        self._match_map = MatchMapCache(detector.local_map, RegistrationParameters().noise_m)
+        self._trial = Trial(self._match_map, parameters.shift)
+        self._doubts = TileDoubts(detector.local_map.grid_frame)
+        self._T_map_vehicle: F64 | None = None  # of the newest scan that counted
 
     def add_scan(self, segmented: SegmentedScan) -> None:
-        """Count the scan's rays, if its pose is good enough to speak about the world."""
-        scan, estimate = segmented.scan, segmented.scan.estimate
+        """Count the scan's rays, if its pose is good enough to speak about the world and has stood the shift test."""
+        estimate = segmented.scan.estimate
         pose, most = PoseUncertainty.of(estimate), self._parameters
         if estimate.health != "good" or pose.sigma_m > most.max_sigma_m or pose.sigma_rad > most.max_sigma_rad:
             self.counts["scans_uncertain"] += 1
+            self._remember(segmented, "uncertain")
             return
+        if disagrees(estimate):
+            self.counts["scans_disagreeing"] += 1
+            self._remember(segmented, "disagree")
+        if not most.check_poses:
+            self._count(segmented)
+            return
+        for one in self._trial.push(segmented):
+            self._count(one)
+        self._hear_trial()
+
+    def take_back(self, until_ns: int) -> None:
+        """The pose was wrong, and it is not known since when: scans up to this time that do not count yet never will.
+
+        Poses are final some seconds after their scans, and the localiser itself drops what it still holds when it is
+        lost; so this reaches back to before the moment at which the error was noticed.
+        """
+        self._trial.take_back(until_ns)
+        self._hear_trial()
+
+    def _remember(self, segmented: SegmentedScan, what: str) -> None:
+        """Which tiles a scan saw of whose pose something is to be said."""
+        scan = segmented.scan
+        if len(scan.points_map_m):
+            centre = scan.origins_map_m[0]
+            points = (scan.points_map_m - centre).astype(np.float32)
+            self._doubts.poor(some_of(points, centre, POINTS_OF_POOR_SCAN), what)
+
+    def _hear_trial(self) -> None:
+        """Which tiles the tried segments saw, and how far their poses were off."""
+        for tried in self._trial.take_tried():
+            costs = None
+            if tried.verdict == "shifted":
+                self.largest_shift.see(tried.shift)
+                costs = costs_at(tried.points_map_m, np.eye(4), self._match_map.near(tried.T_map_vehicle[:3, 3]))
+            self._doubts.tried(tried, costs)
+        self.counts.update(self._trial.counts)
+        self._trial.counts.clear()
+
+    def _count(self, segmented: SegmentedScan) -> None:
+        scan = segmented.scan
+        pose = PoseUncertainty.of(scan.estimate)
         self.counts["scans_used"] += 1
         self.counts["points"] += len(segmented.moving)
         self.counts["moving_points"] += int(segmented.moving.sum())
         self.counts["rays"] += self._detector.add_scan(scan.points_map_m, scan.origins_map_m, segmented.moving, pose)
+        self._T_map_vehicle = scan.estimate.T_map_vehicle
         self._lengthen(scan.t_ns)
         self._tracks.add_scan(scan)
 
     def leave_behind(self, estimate: PoseEstimate, odometer_m: float) -> None:
         """Decide the tiles that the refined pose has left, report the districts that have none left to decide."""
-        frame, p_map = self._detector.local_map.grid_frame.frame, estimate.T_map_vehicle[:3, 3]
+        waiting = self._trial.oldest  # what it saw is not counted yet: its tiles are not left
+        frame = self._detector.local_map.grid_frame.frame
+        p_map = (estimate if waiting is None else waiting).T_map_vehicle[:3, 3]
         if self._looked_at is not None and np.linalg.norm(p_map - self._looked_at) < STEP_M:
             return
         self._looked_at = p_map.copy()
         touched = self._detector.touched_tiles()
         self._tracks.touched(touched)
-        left = left_behind(frame, touched, p_map, self._parameters.left_behind_m)
+        open_tiles = set(touched) | set(self._doubts.tiles())
+        left = left_behind(frame, open_tiles, p_map, self._parameters.left_behind_m)
         self._decide(left, odometer_m)
-        open_districts = {t.district for t in set(touched) - set(left)}
+        self._doubts.forget(left_behind(frame, self._doubts.all_tiles(), p_map, self._parameters.left_behind_m))
+        open_districts = {t.district for t in open_tiles - set(left)}
         for district, pending in list(self._pending.items()):
             overdue = odometer_m - pending.since_m > self._parameters.longest_m
             if overdue or district not in open_districts:
@@ -114,9 +199,21 @@ class Reporter:
 
     def report_all(self, odometer_m: float) -> None:
         """The drive has ended: decide and report everything."""
-        self._decide(self._detector.touched_tiles(), odometer_m)
+        for one in self._trial.flush():
+            self._count(one)
+        self._hear_trial()
+        self._decide({*self._detector.touched_tiles(), *self._doubts.tiles()}, odometer_m)
         for district in list(self._pending):
             self._report(district)
+
+    def account(self) -> dict[str, Any]:
+        """Tiles by reason of doubt, and the largest pose error that was found, for `result.json`."""
+        worst = self.largest_shift
+        return {
+            "tiles": dict(self.doubts),
+            "largest_shift_m": round(worst.shift_m, 4),
+            "largest_turn_deg": round(worst.turn_deg, 4),
+        }
 
     def _lengthen(self, t_ns: int) -> None:
         if self._stretch is None:
@@ -124,32 +221,74 @@ class Reporter:
         self._stretch.last_ns = max(self._stretch.last_ns, t_ns)
 
     def _decide(self, tiles: Collection[TileId], odometer_m: float) -> None:
-        if not tiles or self._stretch is None:
+        if not tiles:
             return
         for tile_id, evidence in self._detector.finish(tiles).items():
-            found = classify(evidence, self._detector.parameters)
+            account = self._doubts.take(tile_id)
+            found = self._without_pose_error(classify(evidence, self._detector.parameters), account)
+            if len(account.withheld) >= LEAST_WITHHELD and (account.explained or not found.observed.any()):
+                self._hold_back(found, account, odometer_m)
+                continue
             for name, n in zip(ChangeClass.__members__, np.bincount(found.change_class, minlength=6), strict=True):
                 self.classes[name.lower()] += int(n)
-            if not found.observed.any():
-                continue
-            change = self._said(found)
-            pending = self._pending.setdefault(tile_id.district, _Pending(odometer_m))
-            if tile_id in pending.changes:  # the vehicle came back: one statement a tile and report
-                self._report(tile_id.district)
-                pending = self._pending.setdefault(tile_id.district, _Pending(odometer_m))
-            pending.changes[tile_id], pending.bases[tile_id] = change, evidence.base
+            if found.observed.any():
+                self._take(replace(self._said(found), doubt=doubt_of(found, account)), evidence.base, odometer_m)
+
+    def _without_pose_error(self, found: Classification, account: Account) -> Classification:
+        """The classes without what a shift of the whole tile explains, although each stretch of the drive passed."""
+        if not self._parameters.check_poses or self._T_map_vehicle is None:
+            return found
+        error = pose_error_of_tile(found, self._match_map, self._T_map_vehicle)
+        if error is None:
+            return found
+        self.largest_shift.see(error.shift)
+        account.shift, account.explained, account.pose = error.shift, error.most, found.evidence.pose
+        if error.most:
+            account.withheld |= set(found.evidence.voxel_id[found.changed].tolist())
+            return found
+        self.counts["changes_held_back"] += int(error.explained.sum())
+        account.off = True
+        abstains = np.where(error.explained, ChangeClass.UNMEASURED, found.change_class).astype(np.uint8)
+        return Classification(found.evidence, abstains)
+
+    def _hold_back(self, found: Classification, account: Account, odometer_m: float) -> None:
+        """Say of a tile only that a pose error explains it; where there is no map, nothing could be."""
+        self.counts["tiles_held_back"] += 1
+        self.counts["changes_held_back"] += len(account.withheld)
+        base = found.evidence.base
+        if base.version:
+            self._take(withheld_change(base, account, changed_share_of(found)), base, odometer_m)
+
+    def _take(self, change: TileChange, base: Tile, odometer_m: float) -> None:
+        """Keep a statement until its district is reported."""
+        if change.doubt is not None:
+            self.counts["tiles_doubtful"] += 1
+            self.doubts.update(change.doubt.words)
+        district = change.tile.district
+        pending = self._pending.setdefault(district, _Pending(odometer_m))
+        if change.tile in pending.changes:  # the vehicle came back: one statement a tile and report
+            self._report(district)
+            pending = self._pending.setdefault(district, _Pending(odometer_m))
+        pending.changes[change.tile], pending.bases[change.tile] = change, base
 
     def _said(self, found: Classification) -> TileChange:
         """What the report says of a tile; a study may let it say something else."""
         return on_lattice(tile_change(found))
 
     def _report(self, district: District) -> None:
-        pending, stretch = self._pending.pop(district), self._stretch
-        if stretch is None or not pending.changes:
-            return
+        """One report of what is told, and one of what is held back: the short form would call its voxels observed."""
+        pending = self._pending.pop(district)
+        held_back = {t for t, change in pending.changes.items() if change.doubt is not None and change.doubt.withheld}
+        for tiles in (pending.changes.keys() - held_back, held_back):
+            if tiles:
+                changes = {t: pending.changes[t] for t in tiles}
+                self._put(district, _Pending(pending.since_m, changes, pending.bases), whole=tiles is held_back)
+
+    def _put(self, district: District, pending: _Pending, *, whole: bool) -> None:
+        stretch = self._stretch or _Stretch(self._start_ns, self._start_ns)
         report = self._make(district, pending, stretch)
         self._numbers[district] += 1
-        packed = self._packed(report, pending)
+        packed = b"" if whole else self._packed(report, pending)
         needed = [pending.bases[c.tile] for c in report.tiles if c.base_sha and is_measured(c).any()] if packed else []
         if self._outbox.put(report.report_id, change_key(report.layer, district), report.encode(), packed, needed):
             self.counts["reports"] += 1
@@ -186,9 +325,15 @@ class Reporter:
             last_ns=stretch.last_ns,
             tiles=tuple(change for _, change in sorted(pending.changes.items())),
             layer=who.layer,
+            course=self._course(),
         )
 
 
 def on_lattice(change: TileChange) -> TileChange:
     """The change with its new Gaussians on the lattice "report"."""
     return replace(change, changed=snap(change.changed, REPORT))
+
+
+def disagrees(estimate: PoseEstimate) -> bool:
+    """Whether the refined pose departs from the online one beyond both their sigmas, where the localiser tells it."""
+    return estimate.disagrees

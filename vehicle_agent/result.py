@@ -70,10 +70,12 @@ class HealthTimeline:
 
     changes: list[tuple[int, str]] = field(default_factory=list)
 
-    def note(self, t_ns: int, health: str) -> None:
-        """Keep a change."""
-        if not self.changes or self.changes[-1][1] != health:
+    def note(self, t_ns: int, health: str) -> bool:
+        """Keep a change; whether a pose that was known is lost."""
+        before = self.changes[-1][1] if self.changes else "lost"
+        if not self.changes or before != health:
             self.changes.append((t_ns, health))
+        return health == "lost" != before
 
     def as_json(self) -> list[dict[str, Any]]:
         """One object a change."""

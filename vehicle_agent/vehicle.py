@@ -12,6 +12,7 @@ from gnd_map.geodesy import LocalFrame
 from gnd_map.grid import GridFrame
 from gnd_map.tile import Tile
 from gnd_map.tile_id import TileId
+from schemas.course import Course
 from schemas.drive import Detections, DriveHeader, DriveItem, GnssFix, MotionSample, ReferencePose, Scan
 from schemas.drive_mcap import read_drive, read_header
 from schemas.errors import SchemaError
@@ -21,6 +22,7 @@ from vehicle_agent.detect.detector import ChangeDetector
 from vehicle_agent.errors import VehicleError
 from vehicle_agent.link import Link, open_link
 from vehicle_agent.local_map import LocalMap
+from vehicle_agent.localise.calibration import MotionCalibration
 from vehicle_agent.localise.estimates import RefinedScan
 from vehicle_agent.localise.localiser import Localiser
 from vehicle_agent.memory import MemoryMeter
@@ -36,9 +38,13 @@ from vehicle_agent.updates import Updates
 if TYPE_CHECKING:
     from vehicle_agent.features.feature_work import FeatureWork
 
-COUNTS = ("scans_used", "scans_uncertain", "points", "moving_points", "rays", "changed_voxels")
+COUNTS = (
+    "scans_used", "scans_uncertain", "scans_disagreeing", "scans_shifted", "scans_taken_back", "points",
+    "moving_points", "rays", "changed_voxels", "tiles_doubtful", "tiles_held_back", "changes_held_back",
+)  # fmt: skip
 """What the reporter counts, as `result.json` names it."""
 
+KNOWN_COURSE_RAD = 1e-3
 _log = logging.getLogger(__name__)
 
 
@@ -88,7 +94,8 @@ class Vehicle:
     def _note(self, item: DriveItem) -> None:
         """Keep the books on place, health and way after an item was worked on."""
         self.place.take(item, self.localiser.online)
-        self.timeline.note(item.t_ns, self.place.health)
+        if self.timeline.note(item.t_ns, self.place.health):
+            self.reporter.take_back(item.t_ns)  # since when it was wrong is not known
         self.link.ledger.set_position(self.place.odometer_m, item.t_ns)
 
     def download(self) -> None:
@@ -197,6 +204,7 @@ class Vehicle:
             "scans_refined": len(self.evaluation.estimates),
             **{name: counts[name] for name in COUNTS},
             "classes": dict(self.reporter.classes),
+            "doubts": self.reporter.account(),
         }
 
     def _link_counts(self) -> dict[str, Any]:
@@ -268,6 +276,7 @@ def _assemble(
     local_map = LocalMap(GridFrame.around(frame, [TileId.from_geodetic(fix.lat_rad, fix.lon_rad)]))
     detector = ChangeDetector(local_map, config.detect)
     surroundings = Surroundings(local_map, link.fetcher, detector, config.download)
+    localiser = Localiser(local_map, header.T_vehicle_lidar, config.localise)
     return Vehicle(
         config=config,
         header=header,
@@ -275,13 +284,20 @@ def _assemble(
         link=link,
         surroundings=surroundings,
         updates=Updates(link.bus, link.cache, link.fetcher, surroundings.replace),
-        localiser=Localiser(local_map, header.T_vehicle_lidar, config.localise),
+        localiser=localiser,
         segmenter=MotionSegmenter(config.segment),
-        reporter=Reporter(detector, link.outbox, identity, fix.t_ns, config.report),
+        reporter=Reporter(
+            detector, link.outbox, identity, fix.t_ns, config.report, lambda: known_course(localiser.calibration)
+        ),
         place=Place(frame, fix),
         evaluation=Evaluation.between(frame, header.anchor),
         features=features,
     )
+
+
+def known_course(known: MotionCalibration) -> Course | None:
+    """The course as a report tells it; None while it is not known well."""
+    return Course.of(known.course_rad, known.course_sigma_rad) if known.course_sigma_rad < KNOWN_COURSE_RAD else None
 
 
 def first_fix(config: AgentConfig) -> GnssFix:

@@ -18,15 +18,19 @@ from schemas.drive import GnssFix, MotionSample, Scan
 from schemas.report_id import deterministic_report_id
 from vehicle_agent.detect.classify import classify, tile_change
 from vehicle_agent.detect.detector import ChangeDetector
+from vehicle_agent.detect.shift import ShiftParameters
+from vehicle_agent.detect.trial import Trial
 from vehicle_agent.features.poles.detector import PoleDetector
 from vehicle_agent.local_map import LocalMap
 from vehicle_agent.localise.estimates import PoseEstimate, RefinedScan
 from vehicle_agent.localise.localiser import Localiser
+from vehicle_agent.localise.match_map import MatchMapCache
+from vehicle_agent.localise.parameters import RegistrationParameters
 from vehicle_agent.localise.rolling_map import RollingMap
 from vehicle_agent.localise.scan_odometry_parameters import ScanOdometryParameters
 from vehicle_agent.packing import pack, pack_measured
 from vehicle_agent.report import on_lattice
-from vehicle_agent.segment import MotionSegmenter
+from vehicle_agent.segment import MotionSegmenter, SegmentedScan
 
 _LIDAR_HEIGHT_M = 2.0
 _STEP_NS = 20_000_000
@@ -45,6 +49,7 @@ def warm_up() -> None:
     refined = _localised(local_map, points, frame)
     for scan in refined:
         detector.add_scan(scan.points_map_m, scan.origins_map_m)
+    _try(local_map, refined)
     _rolled(points)
     _segment(points, refined[-1].estimate if refined else None)
     _find_poles(points)
@@ -63,6 +68,16 @@ def _pack(change: TileChange, base: Tile, points_map_m: F64, frame: LocalFrame) 
     report = ChangeReport(deterministic_report_id(0, "warm"), "warm", "", "", tile.district, 0, 0, (said,))
     pack(report, bases, builder.track(tile.district, [tile])).encode()
     pack_measured(report, bases, encode_mask(np.ones(1, np.bool_)))
+
+
+def _try(local_map: LocalMap, scans: list[RefinedScan]) -> None:
+    """Ask whether a shift explains what the scans see."""
+    trial = Trial(MatchMapCache(local_map, RegistrationParameters().noise_m), ShiftParameters())
+    for scan in scans:
+        for _ in trial.push(SegmentedScan(scan, np.zeros(len(scan.points_map_m), np.bool_))):
+            pass
+    for _ in trial.flush():
+        pass
 
 
 def _rolled(points_m: F64) -> None:

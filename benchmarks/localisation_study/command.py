@@ -72,13 +72,13 @@ def localisation(
         draw_figures(outcome, out)
         draw_overview(found, out / "overview.png")
     text, markdown = json.dumps(found, indent=2) + "\n", markdown_of(found, _command_of(given))
-    printed = [_written(json_file, text, "--json"), _written(markdown_file, markdown, "--markdown")]
+    printed = [written(json_file, text, "--json"), written(markdown_file, markdown, "--markdown")]
     if not any(printed):
         print_tables(found)
         click.echo(f"everything else: {out}")
 
 
-def _written(file: str | None, text: str, option: str) -> bool:
+def written(file: str | None, text: str, option: str) -> bool:
     """Write or print a text; whether it was printed."""
     if file == "-":
         click.echo(text, nl=False)

@@ -11,15 +11,15 @@ DEFAULT_OUT = Path("runs/reproduce-slamcu")
 
 
 @click.command()
-@click.option("--seeds", default="11", show_default=True, help="Seeds of routes, with commas between: 1,2,3.")
+@click.option("--seeds", default="11", show_default=True, help="Seeds of routes: 1,2,3 or 1000-1049.")
 @click.option("--drives", default=10, show_default=True, help="Vehicles whose reports are merged.")
 @click.option("--km", default=20.0, show_default=True, help="Length of the motorway; signs in proportion.")
 @click.option("--ablations/--no-ablations", default=True, show_default=True, help="The first drive in all variants.")
 @click.option("--out", type=PATH, default=DEFAULT_OUT, show_default=True, help="Folder that keeps everything.")
 @click.option("--json", "json_file", help="Write the result as JSON; `-` prints it and nothing else.")
 @click.option("--pictures", type=PATH, help="Folder for the figures.  [default: the one that keeps everything]")
-@click.option("--processes", type=int, help="Worker processes.  [default: one a core]")
-def slamcu(json_file: str | None, out: Path, pictures: Path | None, processes: int | None, **given: Any) -> None:
+@click.option("--processes", default=1, show_default=True, help="Worker processes.")
+def slamcu(json_file: str | None, out: Path, pictures: Path | None, processes: int, **given: Any) -> None:
     """Signs that have gone or are new, found by single cars on a motorway: Figures 8 and 9 and Table 1 of the SLAMCU
     paper, and what ten cars make of it.
 
@@ -56,8 +56,25 @@ def options_of(given: dict[str, Any]) -> Any:
         click.BadParameter: a value that cannot be read.
         OptionError: a value that cannot work.
     """
-    from benchmarks.simulation.command import list_of
     from benchmarks.slamcu_study.options import SlamcuOptions
 
-    seeds = list_of("--seeds", given["seeds"], int)
-    return SlamcuOptions(seeds, given["drives"], given["km"], given["ablations"])
+    return SlamcuOptions(seeds_of(given["seeds"]), given["drives"], given["km"], given["ablations"])
+
+
+def seeds_of(text: str) -> tuple[int, ...]:
+    """Return seeds written as numbers and ranges, such as 7,1000-1049.
+
+    Raises:
+        click.BadParameter: one cannot be read, or a range runs backwards.
+    """
+    from benchmarks.simulation.command import list_of
+
+    return tuple(seed for span in list_of("--seeds", text, _span) for seed in span)
+
+
+def _span(text: str) -> range:
+    first, dash, last = text.partition("-") if not text.startswith("-") else (text, "", "")
+    span = range(int(first), int(last if dash else first) + 1)
+    if not span:
+        raise ValueError(f"{text} runs backwards")
+    return span

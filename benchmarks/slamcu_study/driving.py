@@ -6,6 +6,7 @@ from time import perf_counter
 from typing import Final
 
 import numpy as np
+from numpy.typing import NDArray
 
 from benchmarks.feature_study.matching import match_one_to_one
 from benchmarks.feature_study.start import start_of
@@ -21,11 +22,13 @@ from vehicle_agent.features.look import Look, MapFeatures
 from vehicle_agent.features.slamcu.parameters import SlamcuParameters
 from vehicle_agent.features.slamcu.slamcu import Slamcu
 from vehicle_agent.features.slamcu.verdicts import KnownState, NewFeature
+from vehicle_agent.features.slamcu.watched import Lost, PoseAt, WatchedSlamcu
 from vehicle_agent.features.view import Occlusion, SensorView
 
 LIDAR_SIGMA: Final = (0.04, 0.04, np.radians(0.08))
 """Errors of the LiDAR localiser's poses, m, m, rad: as `--poses noisy:4cm:0.08deg` of the other studies."""
 _LIDAR_TAU_S: Final = 2.0
+GIVEN_POSES: Final = ("no_rbpf", "lidar")
 _TELL_EVERY: Final = 200
 
 
@@ -38,7 +41,11 @@ class Driven:
         new: features that it has not; those with too little evidence, too.
         step_ms: float64 (S,), time of each look with the motion since the one before.
         look: int64 (S,), indices of the looks taken.
-        pose: float64 (S, 3), after each.
+        t_s: float64 (S,), time of the drive at each, since SLAMCU began.
+        pose: float64 (S, 3), after each, as the vehicle believes at the end.
+        pose_cov: float64 (S, 3, 3).
+        lost: stretches on which it had believed something else.
+        doubts: how often it asked.
         hidden: looks at features of the map that were left out as hidden.
     """
 
@@ -46,7 +53,11 @@ class Driven:
     new: tuple[NewFeature, ...]
     step_ms: F64
     look: I64
+    t_s: F64
     pose: F64
+    pose_cov: F64
+    lost: tuple[Lost, ...]
+    doubts: int
     hidden: int
 
 
@@ -116,11 +127,14 @@ class _Run:
     def __init__(self, drive: RoadDrive, variant: str, parameters: SlamcuParameters, seed: int) -> None:
         start = start_of(drive)
         self._drive, self._variant, self._view = drive, variant, sensor_view(drive.view)
-        self._slamcu = Slamcu(parameters, map_features(drive.route), start.pose, start.cov, seed)
+        first = map_features(drive.route), start.pose, start.cov, seed, drive.gnss.sigma_m
+        given = variant in GIVEN_POSES
+        self._given = Slamcu(parameters, *first) if given else None
+        self._watched = None if given else WatchedSlamcu(parameters, *first)
         self._poses = _Poses.of(drive, variant, parameters, seed)
         self._before_ns, self._spent_s = start.t_ns, 0.0
         self._step_ms: list[float] = []
-        self._at: list[F64] = []
+        self._at: list[PoseAt] = []
         self.taken: list[int] = []
 
     def take(self, t_ns: int, what: str, i: int) -> None:
@@ -137,26 +151,41 @@ class _Run:
             self._slamcu.gnss(*fix_at(self._drive, i))
         self._spent_s += perf_counter() - begun_s
 
+    @property
+    def _slamcu(self) -> Slamcu | WatchedSlamcu:
+        found = self._given or self._watched
+        assert found is not None
+        return found
+
     def _look(self, i: int, given: tuple[F64, F64] | None) -> None:
         look = look_of(self._drive.looks[i])
         occlusion = None if self._variant == "no_occlusion" else occlusion_of(self._drive, i)
         begun_s = perf_counter()
-        if given is not None:
-            self._slamcu.set_pose(*given)
+        if given is not None and self._given is not None:
+            self._given.set_pose(*given)
         self._slamcu.look(look, self._view, occlusion)
         self._step_ms.append(1e3 * (self._spent_s + perf_counter() - begun_s))
         self._spent_s = 0.0
         self.taken.append(i)
-        self._at.append(self._slamcu.pose()[0])
+        if self._given is not None:
+            self._at.append(PoseAt(self._given.now_s, *self._given.pose()))
 
     def driven(self) -> Driven:
-        """What SLAMCU says now."""
+        """What SLAMCU says at the end."""
+        watched = self._watched
+        if watched is not None:
+            watched.finish()
+        path = self._at if watched is None else watched.path
         return Driven(
             self._slamcu.known_states(),
             self._slamcu.new_features(unclassified=True),
             np.array(self._step_ms),
             np.array(self.taken, np.int64),
-            np.array(self._at),
+            np.array([one.t_s for one in path]),
+            np.array([one.pose for one in path]),
+            np.array([one.cov for one in path]),
+            () if watched is None else tuple(watched.lost),
+            0 if watched is None else watched.doubts,
             self._slamcu.hidden,
         )
 
@@ -182,7 +211,8 @@ class _Poses:
     def of(cls, drive: RoadDrive, variant: str, parameters: SlamcuParameters, seed: int) -> "_Poses | None":
         if variant == "no_rbpf":
             start = start_of(drive)
-            return cls(drive, Slamcu(parameters, MapFeatures.none(), start.pose, start.cov, seed), np.zeros((0, 3)))
+            first = MapFeatures.none(), start.pose, start.cov, seed, drive.gnss.sigma_m
+            return cls(drive, Slamcu(parameters, *first), np.zeros((0, 3)))
         if variant == "lidar":
             rng = np.random.default_rng([seed, drive.seed, 61])
             n, step_s = len(drive.looks), 1.0 / drive.view.rate_hz
@@ -223,6 +253,11 @@ def verdicts_of(
         new_conflict=np.array([one.existence.conflict for one in new]),
         step_ms=driven.step_ms,
         pose_error=pose_errors(driven.pose, drive.truth.look_poses[driven.look]),
+        pose_chi2=pose_chi2(driven.pose, driven.pose_cov, drive.truth.look_poses[driven.look]),
+        pose_said_lost=said_lost(driven),
+        lost=np.array(
+            [(one.from_s, one.until_s, one.off_m, one.value, one.taken_back, one.told_anew) for one in driven.lost]
+        ).reshape(-1, 6),
         pose_part_m=pose_parts(driven.pose, drive.truth.look_poses[driven.look], truth.xy_m, in_view & ~hidden),
         visible=(in_view & ~hidden).sum(axis=0).astype(np.int64),
         occluded=(in_view & hidden).sum(axis=0).astype(np.int64),
@@ -239,6 +274,20 @@ def pose_errors(pose: F64, true: F64) -> F64:
     c, s = np.cos(true[:, 2]), np.sin(true[:, 2])
     turn = (pose[:, 2] - true[:, 2] + np.pi) % (2 * np.pi) - np.pi
     return np.column_stack([c * dx + s * dy, c * dy - s * dx, turn])
+
+
+def pose_chi2(pose: F64, cov: F64, true: F64) -> F64:
+    """Return (S,) squared Mahalanobis distances of poses' places from the true ones; (S, 3), (S, 3, 3), (S, 3)."""
+    off = (pose - true)[:, :2]
+    return np.asarray(np.einsum("si,si->s", off, np.linalg.solve(cov[:, :2, :2], off[..., None])[..., 0]))
+
+
+def said_lost(driven: Driven) -> NDArray[np.bool_]:
+    """Return bool (S,), the looks of stretches of which the vehicle says nothing."""
+    lost = np.zeros(len(driven.look), np.bool_)
+    for one in driven.lost:
+        lost |= (driven.t_s >= one.from_s) & (driven.t_s <= one.until_s) & (not one.told_anew)
+    return lost
 
 
 def pose_parts(pose: F64, true: F64, xy_m: F64, visible: np.ndarray[tuple[int, int], np.dtype[np.bool_]]) -> F64:

@@ -12,7 +12,7 @@ from benchmarks.feature_study.reporting import (
     in_route_frame,
     reports_of,
 )
-from benchmarks.slamcu_study.driving import Driven, occlusion_of, sensor_view
+from benchmarks.slamcu_study.driving import Driven, occlusion_of, said_lost, sensor_view
 from benchmarks.slamcu_study.outcome import MergedSigns
 from cloud_merger.features import merge_layer
 from fleet_sim.roads.drive import RoadDrive
@@ -33,8 +33,11 @@ def base_layer(route: Route) -> BaseLayer:
 
 def sign_reports(drive: RoadDrive, driven: Driven, vehicle: int, parameters: SlamcuParameters) -> list[FeatureReport]:
     """Return what a vehicle sends after its drive: its own evidence on the map's signs, and the new ones it found."""
-    occlusions = (occlusion_of(drive, look) for look in driven.look.tolist())
-    coverage = coverage_along(drive.route.frame, sensor_view(drive.view), driven.pose, occlusions, TYPICAL_HEIGHT_M)
+    told = ~said_lost(driven)  # of a stretch on which it was lost nothing is said
+    occlusions = (occlusion_of(drive, look) for look in driven.look[told].tolist())
+    coverage = coverage_along(
+        drive.route.frame, sensor_view(drive.view), driven.pose[told], occlusions, TYPICAL_HEIGHT_M
+    )
     confidence = parameters.detection_confidence
     judged = [
         Judged(one.feature_id, of_counts(one.hits, one.misses, confidence), one.hits, one.position_m, one.cov_m2)

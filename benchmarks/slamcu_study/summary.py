@@ -1,7 +1,7 @@
 """A finished study as plain values: the JSON of `gnd reproduce slamcu`."""
 
 from collections.abc import Mapping, Sequence
-from typing import Any
+from typing import Any, Final
 
 import numpy as np
 
@@ -14,6 +14,12 @@ from benchmarks.slamcu_study.scores import SignScore, accuracy_of, score
 from benchmarks.slamcu_study.verdicts import DELETED, NEW, NORMAL, SignTruth, Verdicts
 from gnd_map.arrays import F64
 from gnd_map.config import to_mapping
+
+LOST_M: Final = 5.0
+"""Farther off than this a vehicle that claims to know better is lost: a lane and a half."""
+LOST_CHI2: Final = 13.8
+LOST_LOOKS: Final = 75
+"""Five seconds at 15 Hz."""
 
 
 def summary_of(outcome: StudyOutcome) -> dict[str, Any]:
@@ -30,6 +36,7 @@ def summary_of(outcome: StudyOutcome) -> dict[str, Any]:
     }
     found = {
         "slamcu": mean,
+        **worst_of(seeds),
         "std_over_seeds": std_over(list(seeds.values())),
         "targets": judged(mean, reference.TARGETS),
         "paper": paper,
@@ -68,6 +75,9 @@ def drive_summary(found: Verdicts, truth: SignTruth) -> dict[str, Any]:
         "step_ms_p95": float(np.quantile(found.step_ms, 0.95)),
         "steps": len(found.step_ms),
         "pose_rmse": _pose_rmse(found),
+        "pose_nees": float(found.pose_chi2.mean()),
+        "lost": _lost(found),
+        "lost_without_knowing": lost_without_knowing(found),
         "conflict": _conflict(found),
         "looks": {
             "visible": int(found.visible.sum()),
@@ -115,6 +125,41 @@ def _nees(scored: SignScore) -> dict[str, Any] | None:
 def _pose_rmse(found: Verdicts) -> dict[str, float]:
     along, across, heading = np.sqrt(np.mean(found.pose_error**2, axis=0))
     return {"longitudinal_m": float(along), "lateral_m": float(across), "heading_deg": float(np.degrees(heading))}
+
+
+def lost_without_knowing(found: Verdicts) -> int:
+    """Return on how many stretches of `LOST_LOOKS` looks or more the vehicle was `LOST_M` off, far beyond what it
+    claims (χ² of 2 degrees of freedom, 99.9 %), and does not say that it was lost.
+
+    Poses are those that it believes in at the end, which its reports rest on.
+    """
+    off = np.hypot(*found.pose_error[:, :2].T) > LOST_M
+    wrong = off & (found.pose_chi2 > LOST_CHI2) & ~found.pose_said_lost
+    edges = np.flatnonzero(np.diff(np.concatenate([[False], wrong, [False]]).astype(np.int8)))
+    return int(np.count_nonzero(edges[1::2] - edges[::2] >= LOST_LOOKS))
+
+
+def _lost(found: Verdicts) -> dict[str, float]:
+    """What the vehicle itself says of where it was lost: stretches, of these told anew, and what it took back."""
+    stretches = {"stretches": len(found.lost), "told_anew": float(found.lost[:, 5].sum())}
+    return stretches | {
+        "off_m_max": float(found.lost[:, 2].max(initial=0.0)),
+        "seconds": float((found.lost[:, 1] - found.lost[:, 0]).sum()),
+        "taken_back": float(found.lost[:, 4].sum()),
+        "share_given_up": float(found.pose_said_lost.mean()),
+    }
+
+
+def worst_of(seeds: Mapping[str, Mapping[str, Any]]) -> dict[str, Any]:
+    """Return the worst first drive: its accuracy, and how many drives were lost, knowing it or not."""
+    by_seed = {seed: one["accuracy"]["overall"] for seed, one in seeds.items()}
+    worst = min(by_seed, key=lambda seed: by_seed[seed])
+    return {
+        "worst": {"accuracy": by_seed[worst], "seed": int(worst)},
+        "lost": sum(one["lost"]["stretches"] > 0 for one in seeds.values()),
+        "lost_without_knowing": sum(one["lost_without_knowing"] > 0 for one in seeds.values()),
+        "drives": len(seeds),
+    }
 
 
 def _conflict(found: Verdicts) -> dict[str, float]:

@@ -1,7 +1,7 @@
 """A study of SLAMCU as tables, for the terminal; the paper's numbers beside."""
 
 from collections.abc import Mapping, Sequence
-from typing import Any
+from typing import Any, Final
 
 from rich.table import Table
 
@@ -10,6 +10,7 @@ from benchmarks.slamcu_study import reference
 from benchmarks.slamcu_study.options import VARIANTS
 
 Found = Mapping[str, Any]
+MOST_NAMED: Final = 8
 
 
 def tables_of(found: Found) -> list[Table]:
@@ -77,6 +78,12 @@ def _ablation(found: Found) -> Table:
 
 def _facts(found: Found) -> Table:
     ours, table = found["slamcu"], plain_table("beside", "", "")
+    worst = found["worst"]
+    table.add_row("worst first drive", f"{percent(worst['accuracy'])} (seed {worst['seed']})")
+    table.add_row("drives that found they had been lost", f"{found['lost']} of {found['drives']}")
+    table.add_row("drives lost without knowing", f"{found['lost_without_knowing']} of {found['drives']}")
+    table.add_row("verdicts taken back a drive", f"{ours['lost']['taken_back']:.2f}")
+    table.add_row("NEES of the place (2 expected)", f"{ours['pose_nees']:.2f}")
     looks, conflict, nees = ours["looks"], ours["conflict"], ours["position_error_m"].get("nees")
     table.add_row("one step: median / 95 %", f"{ours['step_ms_median']:.2f} / {ours['step_ms_p95']:.2f} ms")
     table.add_row("looks at signs: visible / hidden", f"{looks['visible']:.0f} / {looks['occluded']:.0f}")
@@ -119,4 +126,6 @@ def metres(value: float | None) -> str:
 
 def _seeds(found: Found) -> str:
     seeds = list(found["seeds"])
+    if len(seeds) > MOST_NAMED:
+        return f"{len(seeds)} seeds, {seeds[0]} … {seeds[-1]}"
     return f"seed {seeds[0]}" if len(seeds) == 1 else f"seeds {', '.join(seeds)}"

@@ -54,6 +54,10 @@ class Verdicts:
         new_conflict: float64 (J,).
         step_ms: float64 (S,), time of each step.
         pose_error: float64 (S, 3), along and across the true heading [m], heading [rad].
+        pose_chi2: float64 (S,), squared Mahalanobis distance of the place from the true one, 2 degrees of freedom.
+        pose_said_lost: bool (S,), looks of a stretch of which the vehicle says nothing, for it was lost.
+        lost: float64 (L, 6), stretches that it found to have told wrong: from, until [s], off [m], statistic of the
+            test that failed, verdicts taken back, whether it told the stretch anew.
         pose_part_m: float64 (N, 2), what the error of the pose moved each sign by, mean over the looks at it [m]; nan
             for signs never looked at.
         visible, occluded: int64 (N,), looks at each sign that was in view, free and hidden.
@@ -72,6 +76,9 @@ class Verdicts:
     new_conflict: F64
     step_ms: F64
     pose_error: F64
+    pose_chi2: F64
+    pose_said_lost: NDArray[np.bool_]
+    lost: F64
     pose_part_m: F64
     visible: I64
     occluded: I64

@@ -4,6 +4,7 @@ isort:skip_file
 """
 
 from collections import abc as _abc
+from . import course_pb2 as _course_pb2
 from . import feature_report_pb2 as _feature_report_pb2
 from . import packed_gaussians_pb2 as _packed_gaussians_pb2
 from . import packed_report_pb2 as _packed_report_pb2
@@ -44,6 +45,7 @@ class ChangeReport(_message.Message):
     PACKED_FIELD_NUMBER: _builtins.int
     GAUSSIANS_FIELD_NUMBER: _builtins.int
     FEATURES_FIELD_NUMBER: _builtins.int
+    COURSE_FIELD_NUMBER: _builtins.int
     major: _builtins.int
     """Major version of this message; always 1."""
     report_id: _builtins.str
@@ -78,6 +80,10 @@ class ChangeReport(_message.Message):
     def features(self) -> _feature_report_pb2.FeatureReport:
         """A report about a feature layer; then all other fields but `major` are empty."""
 
+    @_builtins.property
+    def course(self) -> _course_pb2.Course:
+        """Where the vehicle drives in its own frame; absent = it does not know. A report in short has it in `packed`."""
+
     def __init__(
         self,
         *,
@@ -94,10 +100,11 @@ class ChangeReport(_message.Message):
         packed: _packed_report_pb2.PackedReport | None = ...,
         gaussians: _packed_gaussians_pb2.PackedGaussians | None = ...,
         features: _feature_report_pb2.FeatureReport | None = ...,
+        course: _course_pb2.Course | None = ...,
     ) -> None: ...
-    _HasFieldArgType: _TypeAlias = _typing.Literal["features", b"features", "gaussians", b"gaussians", "packed", b"packed"]  # noqa: Y015
+    _HasFieldArgType: _TypeAlias = _typing.Literal["course", b"course", "features", b"features", "gaussians", b"gaussians", "packed", b"packed"]  # noqa: Y015
     def HasField(self, field_name: _HasFieldArgType) -> _builtins.bool: ...
-    _ClearFieldArgType: _TypeAlias = _typing.Literal["district", b"district", "features", b"features", "first_ns", b"first_ns", "gaussians", b"gaussians", "last_ns", b"last_ns", "layer", b"layer", "major", b"major", "packed", b"packed", "report_id", b"report_id", "sensor_model", b"sensor_model", "software", b"software", "tiles", b"tiles", "vehicle", b"vehicle"]  # noqa: Y015
+    _ClearFieldArgType: _TypeAlias = _typing.Literal["course", b"course", "district", b"district", "features", b"features", "first_ns", b"first_ns", "gaussians", b"gaussians", "last_ns", b"last_ns", "layer", b"layer", "major", b"major", "packed", b"packed", "report_id", b"report_id", "sensor_model", b"sensor_model", "software", b"software", "tiles", b"tiles", "vehicle", b"vehicle"]  # noqa: Y015
     def ClearField(self, field_name: _ClearFieldArgType) -> None: ...
     def WhichOneof(self, oneof_group: _Never) -> None: ...
 

@@ -22,15 +22,17 @@ _runtime_version.ValidateProtobufRuntimeVersion(
 _sym_db = _symbol_database.Default()
 
 
+from . import course_pb2 as gnd_dot_v1_dot_course__pb2
+from . import doubt_pb2 as gnd_dot_v1_dot_doubt__pb2
 
 
-DESCRIPTOR = _descriptor_pool.Default().AddSerializedFile(b'\n\x1agnd/v1/packed_report.proto\x12\x06gnd.v1\"\xf9\x01\n\x0cPackedReport\x12\x11\n\treport_id\x18\x01 \x01(\x0c\x12\x0f\n\x07vehicle\x18\x02 \x01(\t\x12\x14\n\x0csensor_model\x18\x03 \x01(\t\x12\x10\n\x08software\x18\x04 \x01(\t\x12\x10\n\x08\x66irst_ns\x18\x05 \x01(\x10\x12\x11\n\tlength_ns\x18\x06 \x01(\x04\x12\r\n\x05tiles\x18\x07 \x01(\x0c\x12\x13\n\x0b\x62\x61se_digest\x18\x08 \x01(\x0c\x12\r\n\x05\x66lags\x18\t \x01(\x0c\x12\r\n\x05track\x18\n \x01(\x0c\x12\x1b\n\x13pose_sigma_tenth_mm\x18\x0b \x01(\r\x12\x19\n\x11pose_sigma_10urad\x18\x0c \x01(\rb\x06proto3')
+DESCRIPTOR = _descriptor_pool.Default().AddSerializedFile(b'\n\x1agnd/v1/packed_report.proto\x12\x06gnd.v1\x1a\x13gnd/v1/course.proto\x1a\x12gnd/v1/doubt.proto\"\xca\x02\n\x0cPackedReport\x12\x11\n\treport_id\x18\x01 \x01(\x0c\x12\x0f\n\x07vehicle\x18\x02 \x01(\t\x12\x14\n\x0csensor_model\x18\x03 \x01(\t\x12\x10\n\x08software\x18\x04 \x01(\t\x12\x10\n\x08\x66irst_ns\x18\x05 \x01(\x10\x12\x11\n\tlength_ns\x18\x06 \x01(\x04\x12\r\n\x05tiles\x18\x07 \x01(\x0c\x12\x13\n\x0b\x62\x61se_digest\x18\x08 \x01(\x0c\x12\r\n\x05\x66lags\x18\t \x01(\x0c\x12\r\n\x05track\x18\n \x01(\x0c\x12\x1b\n\x13pose_sigma_tenth_mm\x18\x0b \x01(\r\x12\x19\n\x11pose_sigma_10urad\x18\x0c \x01(\r\x12\x10\n\x08\x64oubtful\x18\r \x03(\r\x12\x1d\n\x06\x64oubts\x18\x0e \x03(\x0b\x32\r.gnd.v1.Doubt\x12\x1e\n\x06\x63ourse\x18\x0f \x01(\x0b\x32\x0e.gnd.v1.Courseb\x06proto3')
 
 _globals = globals()
 _builder.BuildMessageAndEnumDescriptors(DESCRIPTOR, _globals)
 _builder.BuildTopDescriptorsAndMessages(DESCRIPTOR, 'schemas.generated.packed_report_pb2', _globals)
 if not _descriptor._USE_C_DESCRIPTORS:
   DESCRIPTOR._loaded_options = None
-  _globals['_PACKEDREPORT']._serialized_start=39
-  _globals['_PACKEDREPORT']._serialized_end=288
+  _globals['_PACKEDREPORT']._serialized_start=80
+  _globals['_PACKEDREPORT']._serialized_end=410
 # @@protoc_insertion_point(module_scope)

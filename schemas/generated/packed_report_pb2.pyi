@@ -3,8 +3,12 @@
 isort:skip_file
 """
 
+from collections import abc as _abc
+from . import course_pb2 as _course_pb2
+from . import doubt_pb2 as _doubt_pb2
 from google.protobuf import descriptor as _descriptor
 from google.protobuf import message as _message
+from google.protobuf.internal import containers as _containers
 import builtins as _builtins
 import sys
 import typing as _typing
@@ -37,6 +41,9 @@ class PackedReport(_message.Message):
     TRACK_FIELD_NUMBER: _builtins.int
     POSE_SIGMA_TENTH_MM_FIELD_NUMBER: _builtins.int
     POSE_SIGMA_10URAD_FIELD_NUMBER: _builtins.int
+    DOUBTFUL_FIELD_NUMBER: _builtins.int
+    DOUBTS_FIELD_NUMBER: _builtins.int
+    COURSE_FIELD_NUMBER: _builtins.int
     report_id: _builtins.bytes
     """The report's ULID as 16 bytes."""
     vehicle: _builtins.str
@@ -69,6 +76,20 @@ class PackedReport(_message.Message):
     """Standard deviation of the refined attitude about its worst axis, the largest of the report's tiles.
     [10 microradians, rounded up]
     """
+    @_builtins.property
+    def doubtful(self) -> _containers.RepeatedScalarFieldContainer[_builtins.int]:
+        """Which of the tiles are doubtful: indices in the district, ascending, all among `tiles`. A tile of which something is
+        held back is reported whole only.
+        """
+
+    @_builtins.property
+    def doubts(self) -> _containers.RepeatedCompositeFieldContainer[_doubt_pb2.Doubt]:
+        """Why, one for each of `doubtful`."""
+
+    @_builtins.property
+    def course(self) -> _course_pb2.Course:
+        """Where the vehicle drives in its own frame; absent = it does not know."""
+
     def __init__(
         self,
         *,
@@ -84,10 +105,13 @@ class PackedReport(_message.Message):
         track: _builtins.bytes = ...,
         pose_sigma_tenth_mm: _builtins.int = ...,
         pose_sigma_10urad: _builtins.int = ...,
+        doubtful: _abc.Iterable[_builtins.int] | None = ...,
+        doubts: _abc.Iterable[_doubt_pb2.Doubt] | None = ...,
+        course: _course_pb2.Course | None = ...,
     ) -> None: ...
-    _HasFieldArgType: _TypeAlias = _Never  # noqa: Y015
+    _HasFieldArgType: _TypeAlias = _typing.Literal["course", b"course"]  # noqa: Y015
     def HasField(self, field_name: _HasFieldArgType) -> _builtins.bool: ...
-    _ClearFieldArgType: _TypeAlias = _typing.Literal["base_digest", b"base_digest", "first_ns", b"first_ns", "flags", b"flags", "length_ns", b"length_ns", "pose_sigma_10urad", b"pose_sigma_10urad", "pose_sigma_tenth_mm", b"pose_sigma_tenth_mm", "report_id", b"report_id", "sensor_model", b"sensor_model", "software", b"software", "tiles", b"tiles", "track", b"track", "vehicle", b"vehicle"]  # noqa: Y015
+    _ClearFieldArgType: _TypeAlias = _typing.Literal["base_digest", b"base_digest", "course", b"course", "doubtful", b"doubtful", "doubts", b"doubts", "first_ns", b"first_ns", "flags", b"flags", "length_ns", b"length_ns", "pose_sigma_10urad", b"pose_sigma_10urad", "pose_sigma_tenth_mm", b"pose_sigma_tenth_mm", "report_id", b"report_id", "sensor_model", b"sensor_model", "software", b"software", "tiles", b"tiles", "track", b"track", "vehicle", b"vehicle"]  # noqa: Y015
     def ClearField(self, field_name: _ClearFieldArgType) -> None: ...
     def WhichOneof(self, oneof_group: _Never) -> None: ...
 

@@ -4,6 +4,7 @@ isort:skip_file
 """
 
 from collections import abc as _abc
+from . import doubt_pb2 as _doubt_pb2
 from google.protobuf import descriptor as _descriptor
 from google.protobuf import message as _message
 from google.protobuf.internal import containers as _containers
@@ -35,6 +36,7 @@ class TileChange(_message.Message):
     EVIDENCE_FIELD_NUMBER: _builtins.int
     POSE_SIGMA_M_FIELD_NUMBER: _builtins.int
     POSE_SIGMA_RAD_FIELD_NUMBER: _builtins.int
+    DOUBT_FIELD_NUMBER: _builtins.int
     tile: _builtins.int
     """Morton code of the tile: longitude index on the even bits, latitude index on the odd bits. [0 .. 2^39)"""
     base_version: _builtins.int
@@ -65,6 +67,10 @@ class TileChange(_message.Message):
         empty voxel, passed inside. [rays]
         """
 
+    @_builtins.property
+    def doubt(self) -> _doubt_pb2.Doubt:
+        """Why the vehicle does not fully believe this; absent = it does."""
+
     def __init__(
         self,
         *,
@@ -79,10 +85,11 @@ class TileChange(_message.Message):
         evidence: _abc.Iterable[_builtins.int] | None = ...,
         pose_sigma_m: _builtins.float = ...,
         pose_sigma_rad: _builtins.float = ...,
+        doubt: _doubt_pb2.Doubt | None = ...,
     ) -> None: ...
-    _HasFieldArgType: _TypeAlias = _Never  # noqa: Y015
+    _HasFieldArgType: _TypeAlias = _typing.Literal["doubt", b"doubt"]  # noqa: Y015
     def HasField(self, field_name: _HasFieldArgType) -> _builtins.bool: ...
-    _ClearFieldArgType: _TypeAlias = _typing.Literal["base_sha", b"base_sha", "base_version", b"base_version", "change_class", b"change_class", "changed", b"changed", "codec_id", b"codec_id", "evidence", b"evidence", "observed_bitmap", b"observed_bitmap", "observed_first", b"observed_first", "pose_sigma_m", b"pose_sigma_m", "pose_sigma_rad", b"pose_sigma_rad", "tile", b"tile"]  # noqa: Y015
+    _ClearFieldArgType: _TypeAlias = _typing.Literal["base_sha", b"base_sha", "base_version", b"base_version", "change_class", b"change_class", "changed", b"changed", "codec_id", b"codec_id", "doubt", b"doubt", "evidence", b"evidence", "observed_bitmap", b"observed_bitmap", "observed_first", b"observed_first", "pose_sigma_m", b"pose_sigma_m", "pose_sigma_rad", b"pose_sigma_rad", "tile", b"tile"]  # noqa: Y015
     def ClearField(self, field_name: _ClearFieldArgType) -> None: ...
     def WhichOneof(self, oneof_group: _Never) -> None: ...
 

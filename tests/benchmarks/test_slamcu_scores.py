@@ -2,16 +2,25 @@
 
 from pathlib import Path
 
+import click
 import numpy as np
 import pytest
 
 from benchmarks.localisation_study.kept import Kept
 from benchmarks.simulation.errors import FolderError
+from benchmarks.slamcu_study.command import seeds_of
 from benchmarks.slamcu_study.figures import most_telling, outliers
 from benchmarks.slamcu_study.outcome import MergedSigns
 from benchmarks.slamcu_study.reference import PAPER_ACCURACY, PAPER_CONFUSION
 from benchmarks.slamcu_study.scores import UNCLASSIFIED, accuracy_of, score
-from benchmarks.slamcu_study.summary import drive_summary, merged_score, parts_of_errors, scored_drive
+from benchmarks.slamcu_study.summary import (
+    drive_summary,
+    lost_without_knowing,
+    merged_score,
+    parts_of_errors,
+    scored_drive,
+    worst_of,
+)
 from benchmarks.slamcu_study.verdicts import (
     ABSENT,
     DELETED,
@@ -45,6 +54,9 @@ def verdicts(**changes: object) -> Verdicts:
         "new_conflict": np.zeros(4),
         "step_ms": np.array([1.0, 2.0, 9.0]),
         "pose_error": STEPS,
+        "pose_chi2": np.array([1.0, 2.0, 3.0]),
+        "pose_said_lost": np.zeros(3, np.bool_),
+        "lost": np.array([[10.0, 40.0, 7.5, 5.6, 3.0, 1.0]]),
         "pose_part_m": np.vstack([np.full((4, 2), np.nan), [[0.3, 0.0], [0.0, 0.0], [np.nan, np.nan]]]),
         "visible": np.array([9, 9, 9, 0, 9, 9, 0]),
         "occluded": np.array([1, 0, 0, 4, 0, 0, 2]),
@@ -148,3 +160,38 @@ def test_kept_verdicts_come_back_as_they_were(tmp_path: Path) -> None:
     kept.path.write_bytes(kept.path.read_bytes()[:200])
     with pytest.raises(FolderError, match="delete it and start again"):
         read_verdicts(kept)
+
+
+def off_by(metres: float, looks: int, chi2: float, **changes: object) -> Verdicts:
+    """400 looks of which some, one after the other, are off along the road."""
+    error = np.zeros((400, 3))
+    error[50 : 50 + looks, 0] = metres
+    squared = np.where(error[:, 0] > 0.0, chi2, 1.0)
+    columns = {"pose_error": error, "pose_chi2": squared, "pose_said_lost": np.zeros(400, np.bool_)}
+    return verdicts(**{**columns, **changes})
+
+
+def test_lost_without_knowing_is_far_off_for_long_and_beyond_what_is_claimed() -> None:
+    assert lost_without_knowing(off_by(20.0, 75, 99.0)) == 1
+    assert lost_without_knowing(off_by(20.0, 74, 99.0)) == 0
+    assert lost_without_knowing(off_by(4.9, 200, 99.0)) == 0
+    assert lost_without_knowing(off_by(20.0, 200, 9.0)) == 0  # it says that it does not know
+    given_up = np.zeros(400, np.bool_)
+    given_up[40:260] = True
+    assert lost_without_knowing(off_by(20.0, 200, 99.0, pose_said_lost=given_up)) == 0
+
+
+def test_the_worst_drive_and_the_lost_ones_are_told() -> None:
+    seeds = {
+        "7": {"accuracy": {"overall": 99.0}, "lost": {"stretches": 0}, "lost_without_knowing": 0},
+        "8": {"accuracy": {"overall": 60.0}, "lost": {"stretches": 2}, "lost_without_knowing": 1},
+    }
+    told = worst_of(seeds)
+    assert told == {"worst": {"accuracy": 60.0, "seed": 8}, "lost": 1, "lost_without_knowing": 1, "drives": 2}
+
+
+def test_seeds_are_numbers_and_ranges() -> None:
+    assert seeds_of("7,1000-1003") == (7, 1000, 1001, 1002, 1003)
+    for text in ("5-3", "a-b", "1-", "-1-2"):
+        with pytest.raises(click.BadParameter):
+            seeds_of(text)

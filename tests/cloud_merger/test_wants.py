@@ -123,7 +123,21 @@ def test_masks_run_over_tiles_and_voxels_in_order():
     assert sorted(found.tolist()) == [False, False, True]
 
 
+def test_of_many_outvoted_flags_some_are_asked_for_to_test_the_poses():
+    many = {3 + k: POLE for k in range(100)}
+    change, quiet = flagged(new=many), flagged(observed=range(103))
+    against = known(*[quiet] * 3)
+    assert 32 <= sum(mask(change, against)) <= 50
+    assert mask(change, against, WantParameters(sample=0)) == [False] * 100
+    assert mask(change, against, WantParameters(sample=101)) == [False] * 100
+    half = flagged(new={3 + k: POLE for k in range(51)}, observed=range(103))
+    confirmed = known(quiet, *[half] * 4)
+    assert sum(mask(change, confirmed)) == 0, "who is right about most of it is not tested for the rest"
+
+
 def test_absurd_parameters_are_refused():
+    with pytest.raises(MergerError, match="sample must be at least 0, got -1"):
+        WantParameters(sample=-1)
     with pytest.raises(MergerError, match="share must lie in"):
         WantParameters(share=1.5)
     with pytest.raises(MergerError, match="enough must be at least 0, got -1"):

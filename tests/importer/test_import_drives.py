@@ -105,8 +105,12 @@ def test_pcd_folder_with_poses(tmp_path, columns):
     folder = write_pcds(tmp_path / "pcds", poses)
     assert import_recording("pcd", folder, tmp_path / "a.mcap", anchor=ANCHOR).scans == 4
     reference = load_track(tmp_path / "a.mcap").reference
-    np.testing.assert_allclose(reference.T_map_vehicle[:, 0, 3], [0, 1, 2, 3])
-    np.testing.assert_allclose(reference.T_map_vehicle[0, :3, :3] @ [1, 0, 0], [0, 1, 0], atol=1e-6)
+    header = read_header(tmp_path / "a.mcap")
+    lidar = reference.T_map_vehicle @ header.T_vehicle_lidar
+    np.testing.assert_allclose(lidar[:, 0, 3], [0, 1, 2, 3], atol=1e-9)
+    np.testing.assert_allclose(lidar[0, :3, :3] @ [1, 0, 0], [0, 1, 0], atol=1e-6)
+    assert header.mount == "estimated"
+    assert header.T_vehicle_lidar[2, 3] == pytest.approx(1.73, abs=0.03)
     assert reference.t_ns[0] == 100_000_000_000
     first = scans_of(tmp_path / "a.mcap")[0]
     np.testing.assert_array_equal(first.points_m, scan_of(0).astype(np.float32))  # 9.pcd comes before 10.pcd

@@ -10,8 +10,8 @@ from vehicle_agent.localise import LocaliserParameters
 from vehicle_agent.localise.refine_parameters import RefineParameters
 
 POSITIVE = (
-    "every_m", "every_s", "half_m", "half_s", "longest_s", "leaf_m", "yaw_deg", "longitudinal_m", "lateral_m",
-    "roll_pitch_deg", "vertical_m", "wheel_every_m",
+    "every_m", "every_s", "knot_m", "knot_s", "correlated_m", "length_m", "length_s", "longest_s", "near_m", "fit_m",
+    "most_misfit", "certain_m",
 )  # fmt: skip
 
 
@@ -28,7 +28,7 @@ def test_scales_must_be_positive(name):
         RefineParameters(**{name: (2.0, 0.0)})
 
 
-@pytest.mark.parametrize(("name", "value"), [("window", 3), ("max_scans", 1), ("n_points", 99)])
+@pytest.mark.parametrize(("name", "value"), [("n_points", 99)])
 def test_counts_have_a_least_value(name, value):
     with pytest.raises(ValueError, match=rf"required, got .*{name}={value}"):
         RefineParameters(**{name: value})
@@ -41,16 +41,11 @@ def test_a_negative_lag_is_refused_and_none_is_not():
     assert RefineParameters(lag_m=0.0).lag_m == 0.0
 
 
-def test_overlap_counts_the_submaps_that_a_scan_takes_part_in():
-    assert RefineParameters(every_m=5.0, half_m=10.0).overlap == 4.0
-    assert RefineParameters(every_m=5.0, half_m=1.0).overlap == 1.0  # scans between submaps do not make them surer
-
-
 def test_a_mapping_sets_them_and_an_unknown_key_is_refused():
-    made = from_mapping(LocaliserParameters, {"refine": {"enabled": False, "half_m": 7.0}})
-    assert made.refine == replace(RefineParameters(), enabled=False, half_m=7.0)
-    with pytest.raises(ConfigError, match="refine: unknown key halve_m"):
-        from_mapping(LocaliserParameters, {"refine": {"halve_m": 7.0}})
+    made = from_mapping(LocaliserParameters, {"refine": {"enabled": False, "length_m": 7.0}})
+    assert made.refine == replace(RefineParameters(), enabled=False, length_m=7.0)
+    with pytest.raises(ConfigError, match="refine: unknown key lenght_m"):
+        from_mapping(LocaliserParameters, {"refine": {"lenght_m": 7.0}})
 
 
 def test_every_setting_is_explained():

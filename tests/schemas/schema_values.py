@@ -15,6 +15,8 @@ from gnd_map.gaussian import Gaussians
 from gnd_map.tile import Tile, TileDelta
 from gnd_map.tile_id import TileId
 from schemas.changes import ChangeAck, ChangeReport, TileChange
+from schemas.course import Course
+from schemas.doubt import Doubt, DoubtReason
 from schemas.packed import PackedGaussians, PackedReport, digest_of
 from schemas.report_id import deterministic_report_id
 from schemas.tiles import Catalog, CatalogEntry, CodedDelta, TileBlob, TileReply, TileRequest, blob_of
@@ -85,6 +87,21 @@ def report(**values: Any) -> ChangeReport:
     return ChangeReport(**(plain | values))
 
 
+SHIFTED = Doubt(
+    DoubtReason.EXPLAINED_BY_SHIFT | DoubtReason.HEALTH_NOT_GOOD,
+    withheld=314,
+    explained_permille=873,
+    changed_permille=412,
+    uncertain_permille=25,
+    forward_mm=-31,
+    left_mm=204,
+    up_mm=-7,
+    turn_10urad=-873,
+)
+MUCH = Doubt(DoubtReason.IMPLAUSIBLE_SHARE, changed_permille=655)
+NOTHING = {"changed": Gaussians.empty(), "observed": np.empty(0, np.int32)}
+
+
 def update(**values: Any) -> TileUpdate:
     plain: dict[str, Any] = {
         "tile": TILE,
@@ -151,6 +168,8 @@ GOLDEN: dict[str, Any] = {
     "ChangeReport-two_tiles-with_and_without_base": report(),
     "ChangeReport-nothing_changed": report(tiles=(change(changed=Gaussians.empty()),)),
     "ChangeReport-nothing_observed": report(tiles=(change(changed=Gaussians.empty(), observed=np.empty(0, np.int32)),)),
+    "ChangeReport-doubtful": report(tiles=(change(doubt=SHIFTED, **NOTHING), change(EAST, doubt=MUCH))),
+    "ChangeReport-course": report(course=Course(-910, 12)),
     "ChangeAck-stored": ChangeAck(REPORT_ID, "stored"),
     "ChangeAck-duplicate": ChangeAck(REPORT_ID, "duplicate"),
     "ChangeAck-quarantined-without_id": ChangeAck("", "quarantined", "TileChange: 3 covariances are not positive"),
@@ -169,6 +188,36 @@ GOLDEN: dict[str, Any] = {
         track=b"nor this",
         pose_sigma_tenth_mm=312,
         pose_sigma_10urad=107,
+    ),
+    "PackedReport-doubtful": PackedReport(
+        report_id=REPORT_ID,
+        vehicle="car-1",
+        sensor_model="VLP-16",
+        software="gnd-fleet 0.1.0",
+        first_ns=1_700_000_000_000_000_000,
+        length_ns=12_300_000_000,
+        tiles=((0, 3), (17, 0), (1023, 2**31 - 1)),
+        base_digest=digest_of([SHA, b"", OTHER_SHA]),
+        flags=b"not looked into",
+        track=b"nor this",
+        pose_sigma_tenth_mm=312,
+        pose_sigma_10urad=107,
+        doubts=((17, MUCH), (1023, Doubt(DoubtReason.POSE_NOT_CHECKED | DoubtReason.ESTIMATES_DISAGREE))),
+    ),
+    "PackedReport-course": PackedReport(
+        report_id=REPORT_ID,
+        vehicle="car-1",
+        sensor_model="VLP-16",
+        software="gnd-fleet 0.1.0",
+        first_ns=1_700_000_000_000_000_000,
+        length_ns=12_300_000_000,
+        tiles=((0, 3),),
+        base_digest=digest_of([SHA]),
+        flags=b"not looked into",
+        track=b"nor this",
+        pose_sigma_tenth_mm=312,
+        pose_sigma_10urad=107,
+        course=Course(873, 1),
     ),
     "PackedGaussians-some": PackedGaussians(REPORT_ID, b"not looked into", 0xDEADBEEF),
     "TileUpdate-merged-delta": update(),
@@ -235,9 +284,25 @@ def any_gaussians(draw: Any, ids: Any = None, *, with_nothing: bool = False) -> 
 
 
 @st.composite
+def any_doubt(draw: Any, *, withholds: bool = False) -> Doubt:
+    """With every reason, those of newer versions too."""
+    permille, mm = st.integers(0, 1000), st.integers(-100_000, 100_000)
+    return Doubt(
+        DoubtReason(draw(st.integers(1, 2**32 - 1))),
+        draw(st.integers(1, 2**32 - 1)) if withholds else 0,
+        *(draw(permille) for _ in range(3)),
+        *(draw(mm) for _ in range(3)),
+        draw(st.integers(-314_160, 314_160)),
+    )
+
+
+@st.composite
 def any_change(draw: Any, tile: TileId) -> TileChange:
-    changed = draw(any_gaussians(with_nothing=True))
-    observed = np.union1d(changed.voxel_id, draw(voxel_sets)).astype(np.int32)
+    changed, seen = draw(any_gaussians(with_nothing=True)), draw(voxel_sets)
+    withholds = draw(st.sampled_from([False, False, True]))
+    if withholds:
+        changed, seen = Gaussians.empty(), []
+    observed = np.union1d(changed.voxel_id, seen).astype(np.int32)
     n = len(changed)
     version, sha = draw(pairs)
     rng = np.random.default_rng(draw(st.integers(0, 2**32 - 1)))
@@ -251,6 +316,7 @@ def any_change(draw: Any, tile: TileId) -> TileChange:
         evidence=rng.integers(0, 2**31, (n, 4)).astype(np.int32),
         pose_sigma_m=draw(st.floats(0, 1000)),
         pose_sigma_rad=draw(st.floats(0, 3.15)),
+        doubt=draw(any_doubt(withholds=True) if withholds else st.none() | any_doubt()),
     )
 
 

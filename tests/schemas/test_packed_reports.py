@@ -7,11 +7,12 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from schema_values import GOLDEN, REPORT_ID, SHA, TILE, names, report, texts
+from schema_values import GOLDEN, MUCH, REPORT_ID, SHA, SHIFTED, TILE, any_doubt, names, report, texts
 
 from gnd_map.codec import encode_mask, encode_tiles
 from schemas import limits
 from schemas.changes import ChangeAck, ChangeReport
+from schemas.course import Course
 from schemas.errors import BadValue, Malformed, SchemaError, TooLarge, WrongVersion
 from schemas.generated import change_report_pb2
 from schemas.packed import PackedGaussians, PackedReport, crc_of, decode_upload, digest_of
@@ -33,6 +34,7 @@ def as_message(value: PackedReport | PackedGaussians) -> change_report_pb2.Chang
 def any_packed(draw: Any) -> PackedReport:
     indices = sorted(draw(st.frozensets(st.integers(0, 1023), min_size=1, max_size=40)))
     first_ns = draw(st.integers(0, 2**63 - 1))
+    doubtful = sorted(draw(st.frozensets(st.sampled_from(indices), max_size=4)))
     return PackedReport(
         report_id=deterministic_report_id(draw(st.integers(0, 2**48 - 1)), draw(texts)),
         vehicle=draw(names),
@@ -46,6 +48,8 @@ def any_packed(draw: Any) -> PackedReport:
         track=draw(st.binary(max_size=60)),
         pose_sigma_tenth_mm=draw(st.integers(0, 2**32 - 1)),
         pose_sigma_10urad=draw(st.integers(0, 2**32 - 1)),
+        doubts=tuple((index, draw(any_doubt())) for index in doubtful),
+        course=draw(st.none() | st.builds(Course, st.integers(-314_160, 314_160), st.integers(1, 314_160))),
     )
 
 
@@ -111,6 +115,9 @@ def test_another_major_version_is_refused() -> None:
         ({"first_ns": 2**63 - 1, "length_ns": 1}, "last_ns"),
         ({"pose_sigma_tenth_mm": 2**32}, "pose_sigma_tenth_mm"),
         ({"pose_sigma_10urad": -1}, "pose_sigma_10urad"),
+        ({"doubts": ((1, MUCH),)}, "1 doubtful tiles are not strictly ascending among its 3"),
+        ({"doubts": ((17, MUCH), (0, MUCH))}, "2 doubtful tiles are not strictly ascending"),
+        ({"doubts": ((17, SHIFTED),)}, "holds back 314 changes: only a whole report can"),
     ],
 )
 def test_first_halves_that_cannot_be_are_refused(values: dict[str, Any], reason: str) -> None:

@@ -156,3 +156,21 @@ def test_what_waits_takes_less_than_half_of_the_memory() -> None:
 def test_parameters_that_cannot_work_are_refused(bad: dict[str, float]) -> None:
     with pytest.raises(SegmentParameterError, match=next(iter(bad))):
         SegmentParameters(**bad)  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize(("size_m", "ahead_m"), [((4.8, 2.0, 2.1), 15.0), ((12.0, 2.5, 3.5), 22.0)])
+def test_who_drives_ahead_at_the_same_speed_is_found_by_later_scans(
+    size_m: tuple[float, float, float], ahead_m: float
+) -> None:
+    """A van, a lorry: they cover their own place in all earlier scans; later ones look through where they were."""
+    leader = Mover(size_m, lambda t: (ahead_m + 6.0 * t, 0.0))
+    left, lost = shares(segmented(list(scans(SENSORS["32 layers"], (leader,), speed_mps=6.0, noise=NOISY)))[:-12])
+    assert left < 0.02
+    assert lost < 0.003
+
+
+def test_who_drives_ahead_is_kept_when_nobody_looks_later() -> None:
+    """The past alone knows nothing of its place: without future scans the leader stays, and that is what is said."""
+    leader = Mover((4.8, 2.0, 2.1), lambda t: (15.0 + 6.0 * t, 0.0))
+    found = segmented(list(scans(SENSORS["32 layers"], (leader,), speed_mps=6.0)), SegmentParameters(future_s=0.0))
+    assert shares(found)[0] > 0.5

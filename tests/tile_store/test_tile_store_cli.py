@@ -6,17 +6,19 @@ import sys
 from pathlib import Path
 from typing import Any
 
+import apsw
 import numpy as np
 import pytest
 from click.testing import CliRunner
 from store_helpers import EAGER, EAST, FAR, TILE, merge_once, report, report_id, tile_of_voxels
 
+from deploy.map_cli import map_group
 from gnd_map.errors import GndError
 from gnd_map.geodesy import LocalFrame
 from schemas.drive import DriveHeader, ReferencePose, Scan
 from schemas.drive_mcap import DriveWriter
-from tile_store.cli import map_group
 from tile_store.sqlite_store import SqliteStore
+from tile_store.values import Publication, Unconfirmed
 
 T0_NS = 1_700_000_000_000_000_000
 
@@ -201,3 +203,42 @@ def test_the_command_line_turns_errors_into_one_line_and_exit_code_2(tmp_path: P
     done = subprocess.run(command, capture_output=True, text=True)
     assert (done.returncode, done.stdout) == (2, "")
     assert done.stderr == f"gnd: {tmp_path / 'missing.db'}: no such store; `gnd map build` makes one\n"
+
+
+def test_status_of_a_map_that_waits_for_nothing_is_one_line(path: Path) -> None:
+    assert "nothing waits for confirmation" in gnd_map("status", path)
+    assert as_json("status", path) == {
+        "waiting_for_confirmation": {"tiles": 0, "voxels": 0, "claims": []},
+        "named_vehicles": [],
+        "to_merge": [],
+        "quarantined": 0,
+    }
+
+
+def test_status_tells_what_waits_for_whom(path: Path) -> None:
+    with SqliteStore(path, EAGER) as store:
+        store.put_reports([report(7), report(8, tile=EAST)])
+        (claim,) = [one for one in store.claim("m", 2, 30.0) if one.tile == TILE]
+        waiting = (Unconfirmed("car-7", (report_id(7),), 120, 300, "share"),)
+        store.publish([Publication(claim, 2, None, report_ids=(report_id(7),), waiting=waiting)])
+        store.quarantine(b"nonsense", "why", "where")
+        since_ns = next(row.received_ns for row in store.reports() if row.report_id == report_id(7))
+    told = as_json("status", path)
+    assert told["quarantined"] == 1
+    (to_merge,) = told["to_merge"]
+    assert (to_merge["tile"], to_merge["reports"], to_merge["is_leased"]) == (EAST.path, 1, True)
+    totals = told["waiting_for_confirmation"]
+    assert (totals["tiles"], totals["voxels"]) == (1, 120)
+    (claim_told,) = totals["claims"]
+    assert claim_told["since_ns"] == since_ns
+    assert (claim_told["tile"], claim_told["vehicle"], claim_told["seen"]) == (TILE.path, "car-7", 300)
+    shown = gnd_map("status", path)
+    assert all(text in shown for text in ("car-7", TILE.path, "120", "1 messages in quarantine", "1 tiles to merge"))
+
+
+def test_a_store_of_an_older_release_gets_what_it_lacks_when_it_is_opened(path: Path) -> None:
+    with apsw.Connection(str(path)) as connection:
+        connection.execute(
+            "DROP TABLE waiting_change; DROP TABLE shift_test; DROP TABLE shifted_vehicle; DROP TABLE course_said"
+        )
+    assert as_json("status", path)["waiting_for_confirmation"]["tiles"] == 0

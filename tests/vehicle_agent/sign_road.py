@@ -13,6 +13,7 @@ from vehicle_agent.features.view import CAMERA, Occlusion
 
 PERIOD_S = 1.0 / 15.0
 FEW = SlamcuParameters(filter=FilterParameters(particles=300))
+NO_SHIFT = np.zeros(2)
 CERTAIN = np.diag([1e-6, 1e-6, 1e-10])
 
 
@@ -91,4 +92,5 @@ def driven(
             speed = (road.speed_mps + way / PERIOD_S) / (1.0 + scale)
             slamcu.predict(PERIOD_S, speed, bias + turn / PERIOD_S)
         slamcu.look(road.look(i, pose, rng, hidden=hidden), CAMERA, occlusion)
+    slamcu.decide()
     return slamcu

@@ -31,23 +31,23 @@ PANELS = [(40.0, -LANE_M), (40.0, 0.0), (40.0, LANE_M)]
 @pytest.mark.parametrize("order", [(0, 1, 2), (1, 0, 2), (2, 1, 0), (1, 2, 0)])
 def test_two_of_three_panels_are_the_maps_whatever_they_were_taken_for(order: tuple[int, ...]) -> None:
     rbpf = gantry([PANELS[i] for i in order], PANELS[:2])
-    assert best_identities(rbpf, [0, 1, 2], 2) == [order.index(0), order.index(1)]
+    assert best_identities(rbpf, [0, 1, 2], 2).slots == [order.index(0), order.index(1)]
 
 
 def test_a_panel_that_is_gone_is_none_of_the_tracks() -> None:
     """Of the map's two the right one is gone; the vehicle may be a lane aside, but not by 15 m."""
     mapped = [(40.0, -5 * LANE_M), PANELS[1]]
     rbpf = gantry([PANELS[1], PANELS[2]], mapped)
-    assert best_identities(rbpf, [0, 1], 2) == [NONE, 0]
+    assert best_identities(rbpf, [0, 1], 2).slots == [NONE, 0]
 
 
 def test_the_pose_is_common_to_all() -> None:
     """Both tracks lie 3 m aside: a vehicle 3 m aside explains both, though a swap has each nearer to one panel."""
     rbpf = gantry([(40.0, -LANE_M + 3.0), (40.0, 3.0)], PANELS[:2], sigma_m=2.5)
-    assert best_identities(rbpf, [0, 1], 2) == [0, 1]
+    assert best_identities(rbpf, [0, 1], 2).slots == [0, 1]
 
 
 def test_too_many_to_try_all() -> None:
     many = [(40.0, LANE_M * i) for i in range(9)]
     rbpf = gantry(many, many[:7], sigma_m=0.3)
-    assert best_identities(rbpf, list(range(9)), 7) == list(range(7))
+    assert best_identities(rbpf, list(range(9)), 7).slots == list(range(7))

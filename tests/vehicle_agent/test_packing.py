@@ -1,6 +1,7 @@
 """Packing is pure: the same bytes each time; what flags cannot say is an error, not a loss."""
 
 import dataclasses
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -15,16 +16,22 @@ from gnd_map.tile import Tile
 from gnd_map.tile_id import TileId
 from gnd_map.track import decode_track
 from schemas.changes import ChangeReport
+from schemas.course import Course
+from schemas.doubt import Doubt, DoubtReason
 from schemas.packed import PackedReport, decode_upload, digest_of
 from vehicle_agent.config import ReportParameters
 from vehicle_agent.detect.detector import ChangeDetector
 from vehicle_agent.errors import AgentConfigError, PackingError
 from vehicle_agent.local_map import LocalMap
+from vehicle_agent.localise.calibration import MotionTeacher
 from vehicle_agent.localise.estimates import PoseEstimate, RefinedScan
+from vehicle_agent.localise.odometry import MotionBuffer
+from vehicle_agent.localise.parameters import OdometryParameters
 from vehicle_agent.outbox import Letter, Outbox
 from vehicle_agent.packing import Bases, askable, asked_for, is_measured, pack, pack_measured
 from vehicle_agent.report import Identity, Reporter
 from vehicle_agent.segment import SegmentedScan
+from vehicle_agent.vehicle import known_course
 
 START_NS = 1_570_838_400_000_000_000
 
@@ -35,14 +42,19 @@ def tiles() -> dict[TileId, Tile]:
     return {t: Tile(t, 1, snap(tile.gaussians, LATTICES["standard"])) for t, tile in found.items()}
 
 
-def drive(folder: Path, tiles: dict[TileId, Tile], protocol: str = "packed") -> Outbox:
+def drive(
+    folder: Path,
+    tiles: dict[TileId, Tile],
+    protocol: str = "packed",
+    course: Callable[[], Course | None] = lambda: None,
+) -> Outbox:
     """Three scans from one place; where the map has a wall at 9.3 m, there is one at 14.3 m."""
     local_map, outbox = LocalMap(GRID_FRAME), Outbox(folder / "outbox.sqlite")
     for tile in tiles.values():
         local_map.set_tile(tile)
     who = Identity("vehicle-7", "drive-7", "VLP-16", "ndt", software="test 1")
     parameters = ReportParameters(protocol=protocol)  # type: ignore[arg-type]
-    reporter = Reporter(ChangeDetector(local_map), outbox, who, START_NS, parameters)
+    reporter = Reporter(ChangeDetector(local_map), outbox, who, START_NS, parameters, course)
     hits = look([(14.3, -8.0, 8.0, 4.0)], np.random.default_rng(3))
     T = np.eye(4)
     T[:3, 3] = SENSOR
@@ -158,3 +170,46 @@ def test_a_class_that_contradicts_the_base_is_refused(report: ChangeReport, base
     empty = dict.fromkeys(bases, Gaussians.empty())
     with pytest.raises(GndError, match="are new but held, or changed but not held"):
         pack(report, empty, decode_track(report.district, packed.track))
+
+
+def test_doubts_travel_in_short_by_their_tiles(report: ChangeReport, bases: Bases, letter: Letter) -> None:
+    packed, doubt = decode_upload(letter.packed), Doubt(DoubtReason.IMPLAUSIBLE_SHARE, changed_permille=700)
+    assert isinstance(packed, PackedReport)
+    track = decode_track(report.district, packed.track)
+    last = dataclasses.replace(report.tiles[-1], doubt=doubt)
+    found = pack(dataclasses.replace(report, tiles=(*report.tiles[:-1], last)), bases, track)
+    assert found == dataclasses.replace(packed, doubts=((packed.tiles[-1][0], doubt),))
+    assert PackedReport.decode(found.encode()) == found
+
+
+def test_changes_held_back_do_not_travel_in_short(report: ChangeReport, bases: Bases, letter: Letter) -> None:
+    """The cloud would take what the track reaches for observed and unchanged."""
+    packed = decode_upload(letter.packed)
+    assert isinstance(packed, PackedReport)
+    first = report.tiles[0]
+    silent = dataclasses.replace(
+        first,
+        observed=np.empty(0, np.int32),
+        changed=Gaussians.empty(),
+        change_class=np.empty(0, np.uint8),
+        evidence=np.empty((0, 4), np.int32),
+        doubt=Doubt(DoubtReason.EXPLAINED_BY_SHIFT, withheld=5),
+    )
+    said = dataclasses.replace(report, tiles=(silent, *report.tiles[1:]))
+    with pytest.raises(PackingError, match="holds changes back"):
+        pack(said, bases, decode_track(report.district, packed.track))
+
+
+def test_the_course_of_the_vehicle_goes_with_both_forms(tmp_path: Path, tiles: dict[TileId, Tile]) -> None:
+    (letter,) = drive(tmp_path, tiles, course=lambda: Course.of(0.0087, 2e-4)).due(0)
+    assert ChangeReport.decode(letter.body).course == Course(870, 20)
+    packed = decode_upload(letter.packed)
+    assert isinstance(packed, PackedReport)
+    assert packed.course == Course(870, 20)
+
+
+def test_a_course_that_is_not_known_well_is_not_told() -> None:
+    known = MotionTeacher(MotionBuffer(), OdometryParameters()).calibration
+    assert known_course(known) is None
+    assert known_course(dataclasses.replace(known, course_rad=0.0087, course_sigma_rad=2e-4)) == Course(870, 20)
+    assert known_course(dataclasses.replace(known, course_rad=0.0087, course_sigma_rad=2e-3)) is None

@@ -11,7 +11,7 @@ PROGRAM = textwrap.dedent(
     """
     import json, sys, threading
     import vehicle_agent.agent
-    from vehicle_agent.detect import kernel
+    from vehicle_agent.detect import fit_kernel, kernel
     from vehicle_agent.warm import warm_up
     from vehicle_agent.localise import kernels, packed_scan, registration, rolling_kernels
     from vehicle_agent.features.poles import kernels as poles, place_kernels as places
@@ -23,7 +23,8 @@ PROGRAM = textwrap.dedent(
     warm_up()
     again = {k: len(v.signatures) for k, v in vars(kernel).items() if hasattr(v, "signatures")}
     cold = [
-        f"{m.__name__}.{k}" for m in (kernels, packed_scan, rolling_kernels, places, poles) for k, v in vars(m).items()
+        f"{m.__name__}.{k}" for m in (kernels, packed_scan, rolling_kernels, places, poles, fit_kernel)
+        for k, v in vars(m).items()
         if hasattr(v, "signatures") and not k.startswith("_") and len(v.signatures) != 1
     ]
     print(json.dumps({

@@ -81,6 +81,109 @@ CREATE TABLE quarantine (
   body        BLOB    NOT NULL
 ) STRICT;
 
+-- name: schema_of_confirmation
+-- Added to the schema later: a store without it gets it when it is opened; a program that does not know it can go on.
+-- What waits for a second witness: derived from the reports by each merge of the tile, in the publication's transaction.
+CREATE TABLE IF NOT EXISTS waiting_change (
+  layer    TEXT    NOT NULL,
+  tile     INTEGER NOT NULL,
+  vehicle  TEXT    NOT NULL,
+  reason   TEXT    NOT NULL,
+  voxels   INTEGER NOT NULL CHECK (voxels > 0),
+  seen     INTEGER NOT NULL CHECK (seen >= voxels),
+  since_ns INTEGER NOT NULL,
+  PRIMARY KEY (layer, tile, vehicle, reason)
+) STRICT, WITHOUT ROWID;
+
+-- What the shift test says of each report: the account of its vehicle. Derived, too.
+CREATE TABLE IF NOT EXISTS shift_test (
+  layer     TEXT    NOT NULL,
+  tile      INTEGER NOT NULL,
+  report_id TEXT    NOT NULL,
+  vehicle   TEXT    NOT NULL,
+  at_ns     INTEGER NOT NULL,
+  explained INTEGER NOT NULL CHECK (explained IN (0, 1)),
+  length_m  REAL    NOT NULL,
+  turn_rad  REAL    NOT NULL,
+  forward_m REAL,
+  left_m    REAL,
+  PRIMARY KEY (layer, tile, report_id)
+) STRICT, WITHOUT ROWID;
+CREATE INDEX IF NOT EXISTS shift_test_vehicle ON shift_test (vehicle, at_ns);
+
+-- Where vehicles drive in their own frames, as their reports say.
+CREATE TABLE IF NOT EXISTS course_said (
+  layer     TEXT    NOT NULL,
+  tile      INTEGER NOT NULL,
+  report_id TEXT    NOT NULL,
+  vehicle   TEXT    NOT NULL,
+  at_ns     INTEGER NOT NULL,
+  turn_rad  REAL    NOT NULL,
+  sigma_rad REAL    NOT NULL,
+  PRIMARY KEY (layer, tile, report_id)
+) STRICT, WITHOUT ROWID;
+CREATE INDEX IF NOT EXISTS course_said_vehicle ON course_said (vehicle, at_ns);
+
+-- The vehicles whose reports are shifted again and again: of them the merges of all their tiles know.
+CREATE TABLE IF NOT EXISTS shifted_vehicle (
+  vehicle  TEXT    NOT NULL PRIMARY KEY,
+  since_ns INTEGER NOT NULL
+) STRICT, WITHOUT ROWID;
+
+-- name: has_schema_of_confirmation
+SELECT 1 FROM sqlite_schema WHERE type = 'table' AND name = 'shifted_vehicle'
+
+-- name: put_shift_test
+INSERT INTO shift_test (layer, tile, report_id, vehicle, at_ns, explained, length_m, turn_rad, forward_m, left_m)
+VALUES (:layer, :tile, :report_id, :vehicle, :at_ns, :explained, :length_m, :turn_rad, :forward_m, :left_m)
+ON CONFLICT (layer, tile, report_id) DO UPDATE SET explained = excluded.explained
+
+-- name: put_course
+INSERT INTO course_said (layer, tile, report_id, vehicle, at_ns, turn_rad, sigma_rad)
+VALUES (:layer, :tile, :report_id, :vehicle, :at_ns, :turn_rad, :sigma_rad)
+ON CONFLICT (layer, tile, report_id) DO NOTHING
+
+-- name: courses_of_vehicle
+SELECT turn_rad, sigma_rad FROM course_said WHERE vehicle = :vehicle
+ORDER BY at_ns DESC, layer, tile, report_id LIMIT :n
+
+-- name: accounted_vehicles
+SELECT vehicle FROM shift_test UNION SELECT vehicle FROM course_said ORDER BY vehicle
+
+-- name: shift_tests_of_vehicle
+SELECT explained, length_m, turn_rad, forward_m, left_m FROM shift_test WHERE vehicle = :vehicle
+ORDER BY at_ns DESC, layer, tile, report_id LIMIT :n
+
+-- name: shifted_vehicles
+SELECT vehicle FROM shifted_vehicle ORDER BY vehicle
+
+-- name: distrust_vehicle
+INSERT INTO shifted_vehicle (vehicle, since_ns) VALUES (:vehicle, :since_ns) ON CONFLICT (vehicle) DO NOTHING
+
+-- name: trust_vehicle
+DELETE FROM shifted_vehicle WHERE vehicle = :vehicle
+
+-- name: tiles_of_vehicle
+SELECT DISTINCT r.layer, r.tile FROM report AS r LEFT JOIN tile_head AS h USING (layer, tile)
+WHERE r.vehicle = :vehicle AND (r.merged_in IS NULL OR r.merged_in >= COALESCE(h.epoch, 0))
+
+-- name: delete_waiting
+DELETE FROM waiting_change WHERE layer = :layer AND tile = :tile
+
+-- name: insert_waiting
+INSERT INTO waiting_change (layer, tile, vehicle, reason, voxels, seen, since_ns)
+VALUES (:layer, :tile, :vehicle, :reason, :voxels, :seen, :since_ns)
+
+-- name: received
+SELECT received_ns FROM report WHERE layer = :layer AND tile = :tile AND report_id = :report_id
+
+-- name: waiting_changes
+SELECT layer, tile, vehicle, reason, voxels, seen, since_ns FROM waiting_change
+ORDER BY layer, tile, vehicle, reason
+
+-- name: dirty_tiles
+SELECT layer, tile, waiting, attempts, owner IS NOT NULL FROM dirty ORDER BY layer, tile
+
 -- name: insert_report
 INSERT INTO report (layer, tile, report_id, vehicle, received_ns, seq, base_sha, body)
 SELECT :layer, :tile, :report_id, :vehicle, :received_ns,

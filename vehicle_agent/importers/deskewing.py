@@ -7,13 +7,14 @@ vehicle's. Surfaces that are thinnest as recorded tell that somebody freed the s
 (the vehicle stands, nothing upright is there, the odometry fails) decides nothing, and the drive says so.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
 
+from gnd_map.errors import MotionError
 from gnd_map.motion import Trajectory, deskew
 from gnd_map.se3 import T_inverse, transform
 from schemas.drive import Deskew, Scan
@@ -30,6 +31,7 @@ from vehicle_agent.importers.sweep_times import (
     fit_sweep,
     middle_of_bins_rad,
     patches_of,
+    pooled,
     steps_of,
 )
 
@@ -37,8 +39,9 @@ F64 = NDArray[np.float64]
 U32 = NDArray[np.uint32]
 
 WINDOW: Final = 24
-WINDOWS: Final = (0.0, 0.25, 0.5, 0.75)
-"""Where in the recording windows begin; the first that decides is the last that is looked at."""
+WINDOWS: Final = 4
+"""So many over the recording, none overlaps another; the first that decides is the last that is looked at."""
+LEAST_SCANS: Final = 12
 LEAST_STEP_M: Final = 0.3
 """Mean way of a sweep below which a window says nothing (3 m/s at 10 Hz)."""
 ROUNDS: Final = 3
@@ -47,11 +50,14 @@ LIKELY, SURE = 1.5, 3.0
 """Sigmas by which surfaces must be thinner than as recorded, and thinner than with the times reversed."""
 MOTION: Final = (0.5, 1.5)
 """Share of the vehicle's motion that the times must find in the points."""
+BEGIN_SIGMA_RAD: Final = np.radians(10.0)
+LEAST_CHI2: Final = 9.0
+"""How much worse other directions, other beginnings and no distortion must fit before times are taken."""
 NEAR_M, FAR_M = 3.0, 40.0
 EVERY: Final = 2
 UNSURE_RAD: Final = np.radians(8.0)
-"""Lasers of a head look up to 9° past its azimuth, so points this near to the place where the sweep begins may be of its
-beginning or of its end, a whole sweep apart: they are left out."""
+"""Lasers of a head look up to 9° past its azimuth, so points this near to the place where the sweep begins may be of
+its beginning or of its end, a whole sweep apart: they are left out."""
 
 ShareOf = Callable[[RawScan | Scan], F64]
 """(N,) share of the sweep that had passed when each point of a scan was measured; NaN where that cannot be told."""
@@ -75,9 +81,9 @@ def with_times(recording: Recording) -> tuple[Recording, Verdict]:
     if cleaned_offsets(recording):
         return replace(recording, deskew="measured"), Verdict("measured", "")
     sweep_ns = recording.sweep_ns or int(np.median(np.diff(recording.t_ns)))
-    reasons = []
-    for begin in dict.fromkeys(int(share * max(0, len(recording) - WINDOW)) for share in WINDOWS):
-        verdict, share_of = _decide(recording, range(begin, min(begin + WINDOW, len(recording))), sweep_ns)
+    reasons, laid = [], list[_Window]()
+    for numbers in windows_of(len(recording)):
+        verdict, share_of = _decide(recording, numbers, sweep_ns, laid)
         if share_of is not None:
             return timed(recording, share_of, sweep_ns), verdict
         if verdict.deskew == "compensated":
@@ -85,6 +91,12 @@ def with_times(recording: Recording) -> tuple[Recording, Verdict]:
         reasons.append(verdict.note)
     note = f"no times of points, not deskewed, poses are the less sure the faster it drives: {reasons[-1]}"
     return replace(recording, sweep_ns=sweep_ns), Verdict("none", note)
+
+
+def windows_of(n: int) -> list[range]:
+    """Windows of n scans."""
+    begins = np.linspace(0, max(0, n - WINDOW), min(WINDOWS, max(1, n // WINDOW))).astype(int)
+    return [range(begin, min(begin + WINDOW, n)) for begin in begins.tolist()]
 
 
 def cleaned_offsets(recording: Recording) -> bool:
@@ -135,7 +147,7 @@ def _backwards(share_of: ShareOf) -> ShareOf:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Window:
-    """A window laid together: its scans, their track (one pose more at either end), and how thick upright surfaces are."""
+    """A window laid together: its scans, their track (a pose more at either end), how thick upright surfaces are."""
 
     scans: tuple[Scan, ...]
     track: Trajectory
@@ -173,29 +185,52 @@ def _longer(track: Trajectory) -> Trajectory:
     return Trajectory(times, np.concatenate([first[None], T, last[None]]))
 
 
-def _decide(recording: Recording, numbers: range, sweep_ns: int) -> tuple[Verdict, ShareOf | None]:
-    """What a window says; with the times where it says that they are to be reconstructed."""
+def _decide(
+    recording: Recording, numbers: range, sweep_ns: int, before: list[_Window]
+) -> tuple[Verdict, ShareOf | None]:
+    """What a window says, with those before it (it joins them); with times where they are to be reconstructed."""
+    if len(numbers) < LEAST_SCANS:
+        return Verdict("none", f"{len(numbers)} scans, {LEAST_SCANS} are needed to tell"), None
     try:
         plain = _laid(recording, numbers)
         if plain.step_m < LEAST_STEP_M:
             return Verdict("none", f"the vehicle moves {plain.step_m:.2f} m a sweep, too little to tell"), None
-        found, share_of, motion = _times_in(recording, plain, sweep_ns)
+        before.append(plain)
+        tried = _times_in(recording, before, sweep_ns)
+        share_of = tried.share_of
         forward = _laid(timed(recording, share_of, sweep_ns), numbers, plain.track)
         backward = _laid(timed(recording, _backwards(share_of), sweep_ns), numbers, plain.track)
-    except ImportDriveError as error:
+    except (ImportDriveError, MotionError) as error:
         return Verdict("none", f"LiDAR odometry fails on scans {numbers.start} to {numbers.stop - 1} ({error})"), None
-    return _judged(found, share_of, motion, (plain.thickness, forward.thickness, backward.thickness))
+    return _judged(tried, (plain.thickness, forward.thickness, backward.thickness))
 
 
-def _times_in(recording: Recording, plain: _Window, sweep_ns: int) -> tuple[str, ShareOf, float]:
-    """Times of points that are to be tried: what they are, and the share of the motion that they find."""
-    if all(firing_share(scan.points_m) is not None for scan in plain.scans):
-        turn = "clockwise" if _turns_clockwise(plain.scans[0]) else "counter-clockwise"
-        return f"from the firing order, {turn}", share_by_order, 1.0
-    fit = _fit(recording, plain, sweep_ns)
+@dataclass(frozen=True, slots=True)
+class _Tried:
+    """Times of points that are tried: what they are, and whether the points alone make them certain."""
+
+    said: str
+    share_of: ShareOf
+    certain: bool
+
+
+def _times_in(recording: Recording, laid: Sequence[_Window], sweep_ns: int) -> _Tried:
+    if all(firing_share(scan.points_m) is not None for scan in laid[-1].scans):
+        turn = "clockwise" if _turns_clockwise(laid[-1].scans[0]) else "counter-clockwise"
+        return _Tried(f"from the firing order, {turn}", share_by_order, certain=True)
+    fit = _fit(recording, laid, sweep_ns)
     turn = "clockwise" if fit.sweep.clockwise else "counter-clockwise"
-    begin_deg = np.degrees(fit.sweep.begin_rad) % 360.0
-    return f"from azimuth: sweep begins at {begin_deg:.0f}°, {turn}", share_by_azimuth(fit.sweep), fit.motion
+    begin_deg, sigma_deg = np.degrees(fit.sweep.begin_rad) % 360.0, np.degrees(fit.begin_sigma_rad)
+    certain = (
+        MOTION[0] <= fit.motion <= MOTION[1]
+        and min(fit.rival, fit.still) > LEAST_CHI2
+        and fit.begin_sigma_rad < BEGIN_SIGMA_RAD
+    )
+    said = (
+        f"from azimuth: sweep begins at {begin_deg:.0f} ± {sigma_deg:.0f}°, {turn},"
+        f" {fit.motion:.2f} ± {fit.motion_sigma:.2f} of the motion is in the points"
+    )
+    return _Tried(said, share_by_azimuth(fit.sweep), certain)
 
 
 def _turns_clockwise(scan: Scan) -> bool:
@@ -205,29 +240,29 @@ def _turns_clockwise(scan: Scan) -> bool:
     return bool(azimuth[-1] < azimuth[0])
 
 
-def _fit(recording: Recording, plain: _Window, sweep_ns: int) -> SweepFit:
-    """The saw tooth in a window; surfaces are paired anew with the times found so far."""
-    patches = [patches_of(scan.points_m, recording.T_vehicle_lidar) for scan in plain.scans]
-    poses = plain.poses
-    steps = steps_of(plain.track.t_ns[1:-1], poses, sweep_ns)
-    fit = fit_sweep(azimuth_times(patches, poses, steps))
-    for _ in range(ROUNDS - 1):
+def _fit(recording: Recording, laid: Sequence[_Window], sweep_ns: int) -> SweepFit:
+    """The saw tooth in some windows; surfaces are paired anew with the times found so far."""
+    patches = [[patches_of(scan.points_m, recording.T_vehicle_lidar) for scan in window.scans] for window in laid]
+    steps = [steps_of(window.track.t_ns[1:-1], window.poses, sweep_ns) for window in laid]
+    known, fit = None, None
+    for _ in range(ROUNDS):
+        times = [azimuth_times(p, w.poses, s, known) for p, w, s in zip(patches, laid, steps, strict=True)]
+        fit = fit_sweep(pooled(times))
         known = min(1.0, fit.motion) * (fit.sweep.share(middle_of_bins_rad()) - 0.5)
-        fit = fit_sweep(azimuth_times(patches, poses, steps, known))
+    assert fit is not None
     return fit
 
 
-def _judged(
-    found: str, share_of: ShareOf, motion: float, thickness: tuple[Thickness, Thickness, Thickness]
-) -> tuple[Verdict, ShareOf | None]:
+def _judged(tried: _Tried, thickness: tuple[Thickness, Thickness, Thickness]) -> tuple[Verdict, ShareOf | None]:
+    """What comes of upright surfaces as recorded, with the times that were tried, and with their reverse."""
     plain, forward, backward = thickness
     gain, loss, apart = compared(plain, forward), compared(plain, backward), compared(backward, forward)
-    said = f"upright surfaces {_percent(gain)} with these times, {_percent(loss)} with their reverse"
-    if gain.by(THINNER, LIKELY) and apart.by(THINNER, SURE) and loss.thinner < 0.0 and MOTION[0] <= motion <= MOTION[1]:
-        return Verdict("reconstructed", f"times of points reconstructed {found}; {said}"), share_of
+    said = f"{tried.said}; upright surfaces {_percent(gain)} with these times, {_percent(loss)} with their reverse"
+    if tried.certain and gain.by(THINNER, LIKELY) and apart.by(THINNER, SURE) and loss.thinner < 0.0:
+        return Verdict("reconstructed", f"times of points reconstructed {said}"), tried.share_of
     if compared(forward, plain).by(THINNER, LIKELY) and compared(backward, plain).by(THINNER, LIKELY):
-        return Verdict("compensated", f"sweeps are free of motion already: {said} ({found})"), None
-    return Verdict("none", f"times {found} find {motion:.0%} of the motion; {said}"), None
+        return Verdict("compensated", f"sweeps are free of motion already: times {said}"), None
+    return Verdict("none", f"times {said}"), None
 
 
 def _percent(one: Comparison) -> str:

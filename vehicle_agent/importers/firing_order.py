@@ -33,6 +33,8 @@ def firing_share(points_lidar_m: NDArray[np.generic]) -> F64 | None:
     against = float((np.sign(steps) != np.sign(head[-1] - head[0])).mean())
     if not TURN[0] <= turns <= TURN[1] or against > BACKWARDS:
         return None
-    middles = 0.5 * (edges[:-1] + edges[1:])
-    turned = np.interp(np.arange(len(azimuth)), middles, np.maximum.accumulate(np.abs(head - head[0])))
+    turned = np.maximum.accumulate(np.abs(head - head[0]))
+    ends = turned[0] - 0.5 * (turned[1] - turned[0]), turned[-1] + 0.5 * (turned[-1] - turned[-2])
+    at = np.concatenate([[0], 0.5 * (edges[:-1] + edges[1:]), [len(azimuth) - 1]])
+    turned = np.interp(np.arange(len(azimuth)), at, np.concatenate([ends[:1], turned, ends[1:]])) - ends[0]
     return np.asarray(np.clip(turned / (2.0 * np.pi), 0.0, 1.0))

@@ -1,9 +1,10 @@
 """KITTI: folders of HDL-64E scans (.bin or .bin.xz), as in the odometry benchmark or the raw recordings.
 
-Files give no times of points, and lie ring by ring. Scans of the benchmark are freed of motion distortion already, raw
-recordings are not; the import finds out which. A scan's time is when the laser looks forward, the middle of its sweep.
-The ground truth of the benchmark drifts against the LiDAR (a metre over the first 13 m of sequence 00), so it gives the GNSS fixes only; the reference track is
-LiDAR odometry. The benchmark does not tell the place: unless told otherwise it is a nominal one in Karlsruhe.
+Files give no times of points, and lie ring by ring. Scans of the benchmark are said to be freed of motion distortion,
+raw recordings are not; the import finds out. A scan's time is when the laser looks forward, the middle of its sweep.
+The ground truth of the benchmark drifts against the LiDAR (a metre over the first 13 m of sequence 00), so it gives
+the GNSS fixes only; the reference track is LiDAR odometry. The benchmark does not tell the place: unless told otherwise
+it is a nominal one in Karlsruhe.
 """
 
 from pathlib import Path

@@ -28,6 +28,7 @@ OWN_VEHICLE_M: Final = 1.5
 HEIGHTS_M: Final = (0.2, 4.5)
 MOST_TILT_DEG: Final = 20.0
 CELL_M: Final = 0.5
+FLAT_CELL_M: Final = 0.15
 LEAST_CELLS: Final = 24
 LEAST_SHARE: Final = 0.35
 """Share of the cells around the vehicle that the plane must hold."""
@@ -74,7 +75,7 @@ class GroundSeen:
 
 @dataclass(frozen=True, slots=True)
 class YawSeen:
-    """Yaw of the LiDAR's x axis against the course (counter-clockwise positive), its sigma, and the straight way used."""
+    """Yaw of the LiDAR's x axis against the course (counter-clockwise positive), its sigma, the straight way used."""
 
     yaw_rad: float
     sigma_rad: float
@@ -124,17 +125,20 @@ def _around(points: F64) -> F64:
 def _lane(points: F64, course_rad: float) -> F64:
     along = points[:, :2] @ (np.cos(course_rad), np.sin(course_rad))
     across = points[:, :2] @ (-np.sin(course_rad), np.cos(course_rad))
-    return points[(np.abs(along) < LANE_WITHIN_M) & (np.abs(along) > OWN_VEHICLE_M) & (np.abs(across) < LANE_HALF_M)]
+    inside = (np.abs(along) < LANE_WITHIN_M) & (np.abs(along) > OWN_VEHICLE_M) & (np.abs(across) < LANE_HALF_M)
+    return np.asarray(points[inside])
 
 
 def _lowest_of_cells(points: F64) -> F64:
-    """(M, 3) the lowest point of each cell of ground."""
-    cell = np.floor(points[:, :2] / CELL_M).astype(np.int64) + 4096
+    """(M, 3) the lowest point of each cell of ground, of cells that are flat: not of walls and hedges, whose feet lie
+    in a plane as well when what is below them is hidden.
+    """
+    cell = np.floor(points[:, :2] / CELL_M).astype(np.int64)
     order = np.lexsort((points[:, 2], cell[:, 1], cell[:, 0]))
-    cell = cell[order]
-    first = np.ones(len(order), np.bool_)
-    first[1:] = (np.diff(cell, axis=0) != 0).any(axis=1)
-    return points[order[first]]
+    first = np.flatnonzero(np.r_[True, (np.diff(cell[order], axis=0) != 0).any(axis=1)][: len(order)])
+    count = np.diff(np.r_[first, len(order)])
+    lowest, middle = points[order[first]], points[order[first + count // 2]]
+    return np.asarray(lowest[middle[:, 2] - lowest[:, 2] < FLAT_CELL_M])
 
 
 def _largest_plane(points: F64) -> tuple[F64, float] | None:
@@ -205,7 +209,9 @@ def ground_of_scans(seen: Iterable[GroundSeen | Refused], floor_rad: float = FLO
     middle = np.median(kept, axis=0)
     deviation = 1.4826 * np.median(np.abs(kept - middle), axis=0)
     sigma = np.hypot(1.2533 * deviation / np.sqrt(max(1.0, len(kept) / KEPT_SCANS)), (FLOOR_M, floor_rad, floor_rad))
-    return GroundSeen(*map(float, middle), *map(float, sigma), scans=len(kept))
+    height, roll, pitch = middle.tolist()
+    height_sigma, roll_sigma, pitch_sigma = sigma.tolist()
+    return GroundSeen(height, roll, pitch, height_sigma, roll_sigma, pitch_sigma, len(kept))
 
 
 def yaw_of_track(T: F64) -> YawSeen | Refused:

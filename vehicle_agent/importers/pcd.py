@@ -3,8 +3,8 @@
 Poses come from `poses.txt` (in the folder or the one above), one line a scan in the order of the files' numbers:
 `number t x y z qx qy qz qw`, `t x y z qx qy qz qw` (TUM) or twelve numbers of a 3 x 4 matrix (KITTI; 10 Hz then). They
 are poses of the LiDAR, x forward, in axes east, north, up; the place of the first one must be given. Without poses
-LiDAR odometry tells the track, heading east. Files give neither times of points nor the mount; a scan's time is taken as
-the beginning of its sweep.
+LiDAR odometry tells the track, heading east. Files give neither times of points nor the mount; a scan's time is taken
+as the beginning of its sweep.
 """
 
 import re

@@ -7,7 +7,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from vehicle_agent.importers.voxels import covariances_of, voxel_keys, voxels_of
+from vehicle_agent.importers.voxels import block_keys, covariances_of, voxel_keys, voxels_of
 
 F64 = NDArray[np.float64]
 I64 = NDArray[np.int64]
@@ -17,8 +17,9 @@ LEAST_POINTS: Final = 30
 LEAST_SCANS: Final = 4
 UPRIGHT: Final = 0.5
 """Normals steeper than this (their part along z) are the ground, which no motion along it distorts."""
-CORRELATED: Final = 10.0
-"""Voxels of one facade are thick or thin together: one in so many counts."""
+BLOCK_VOXELS: Final = 10
+LEAST_BLOCKS: Final = 10
+"""Voxels of one facade become thick or thin together: blocks of 5 m count as measurements, voxels within do not."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -68,9 +69,13 @@ def thickness_of(clouds: Sequence[F64]) -> Thickness:
 
 
 def compared(before: Thickness, after: Thickness) -> Comparison:
-    """Over the voxels that both have."""
-    _, i, j = np.intersect1d(before.key, after.key, assume_unique=True, return_indices=True)
-    if len(i) < 2 * CORRELATED:
-        return Comparison(0.0, float("inf"), len(i))
+    """Over the voxels that both have; sigma from how far blocks of them differ (cluster-robust)."""
+    key, i, j = np.intersect1d(before.key, after.key, assume_unique=True, return_indices=True)
     ratio = np.log(before.sigma_m[i] / after.sigma_m[j])
-    return Comparison(float(ratio.mean()), float(ratio.std() / np.sqrt(len(i) / CORRELATED)), len(i))
+    block = np.unique(block_keys(key, BLOCK_VOXELS), return_inverse=True)[1]
+    blocks = int(block.max(initial=-1)) + 1
+    if blocks < LEAST_BLOCKS:
+        return Comparison(0.0, float("inf"), len(key))
+    left = np.bincount(block, ratio - ratio.mean())
+    sigma = np.sqrt((left**2).sum() * blocks / (blocks - 1)) / len(key)
+    return Comparison(float(ratio.mean()), float(sigma), len(key))

@@ -21,6 +21,12 @@ def voxel_keys(points_m: F64, side_m: float) -> I64:
     return np.asarray((cell[:, 0] * _SPAN + cell[:, 1]) * _SPAN + cell[:, 2])
 
 
+def block_keys(keys: I64, voxels: int) -> I64:
+    """(N,) one number for each column of so many by so many voxels, over all heights, of voxels with these keys."""
+    x, y = keys // _SPAN // _SPAN, keys // _SPAN % _SPAN
+    return np.asarray(x // voxels * _SPAN + y // voxels)
+
+
 def covariances_of(points_m: F64, voxel: I64, count: I64) -> tuple[F64, F64]:
     """(V, 3) means and (V, 3, 3) covariances of points (N, 3) in voxels (N,) of so many points (V,)."""
     n = len(count)

@@ -124,16 +124,6 @@ class MotionTeacher:
         sigma_s = CLOCK_LASTS * self.clock.estimate.offset_sigma_s
         return abs(yaw_rate) * sigma_s, abs(speed) * sigma_s
 
-    def noise(self, odometry: F64) -> F64:
-        """(6,) as `sigmas`, less what all steps share: scale, bias and course."""
-        par, way_m = self.parameters, float(np.linalg.norm(odometry[:3, 3]))
-        more = par.distance_share * way_m
-        known = np.array([
-            par.roll_pitch_rad, par.roll_pitch_rad, par.yaw_rad,
-            par.longitudinal_m + more, par.lateral_m + more, par.vertical_m + more,
-        ])  # fmt: skip
-        return np.asarray(np.hypot(known, np.sqrt(np.maximum(self._excess_var, 0.0))))
-
     @property
     def uncertainty(self) -> tuple[float, float]:
         """One sigma of the wheel scale, and of the gyro's bias [rad/s], as learnt so far."""

@@ -16,7 +16,7 @@ Health = Literal["good", "degraded", "lost"]
 Cause = Literal[
     "none", "wrong_pose", "stale_map", "poor_place", "no_map", "no_match", "no_position", "no_motion", "bad_scan",
     "bad_time", "gap", "ambiguous", "searching", "unconfirmed",
-    "clock", "mount",
+    "clock", "mount", "disputed",
 ]  # fmt: skip
 
 
@@ -31,6 +31,7 @@ class PoseEstimate:
     "longitudinal", "lateral", "vertical", "roll", "pitch", "heading".
     covariance: (6, 6) of the pose in the vehicle frame, rotation (rad) before position (m); None where only the sigmas
     are known.
+    disagrees: the refined pose lay farther from the online one than both are uncertain.
     """
 
     t_ns: int
@@ -42,6 +43,7 @@ class PoseEstimate:
     cause: Cause = "none"
     degenerate: tuple[str, ...] = ()
     covariance: F64 | None = None
+    disagrees: bool = False
 
 
 @dataclass(frozen=True, slots=True, eq=False)

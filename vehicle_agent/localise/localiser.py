@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gnd_map.motion import Trajectory, deskew
-from gnd_map.se3 import T_from_R_t, exp_so3
+from gnd_map.se3 import T_from_R_t, T_inverse, exp_so3
 from schemas.drive import GnssFix, MotionSample, Scan
 from vehicle_agent.errors import RegistrationError
 from vehicle_agent.local_map import LocalMap
@@ -29,6 +29,7 @@ from vehicle_agent.localise.refine import Refiner
 from vehicle_agent.localise.registration import RegistrationResult, Start, register
 from vehicle_agent.localise.sampling import sample_scan
 from vehicle_agent.localise.scan_odometry import ScanOdometry, ScanStep, joint_step
+from vehicle_agent.localise.stretch import log_se3
 
 F64 = NDArray[np.float64]
 
@@ -36,13 +37,15 @@ MAX_GNSS_AGE_NS = 2_000_000_000
 TOLD_M, TOLD_RAD = 0.1, 0.01  # one sigma of a pose from outside
 OVERRULED: Final[tuple[Cause, ...]] = ("wrong_pose", "stale_map", "poor_place", "no_match", "unconfirmed")
 """What single scans hold against a pose and submaps may know better."""
+DISPUTED_CHI2 = 21.1  # of heading and place, three degrees of freedom: 99.99 %
+DISPUTED_VARIANCE = np.array([np.radians(0.1), 0.02, 0.02]) ** 2  # what online poses are wrong by in changed places
 PAST_NS, MOST_FROM_PAST = 1_000_000_000, 5
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _HeldScan:
     """A scan in the lag: what is needed to make it final, and how its match went. `sweep` is the motion during the
-    sweep where it is not the one that wheels and gyro tell.
+    sweep where it is not the one that wheels and gyro tell; `online` the pose as it was when the scan came.
     """
 
     scan: PackedScan
@@ -52,6 +55,7 @@ class _HeldScan:
     health: Health
     cause: Cause
     degenerate: tuple[str, ...]
+    online: SmoothedPose
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -291,7 +295,7 @@ class Localiser:
         sigma_m, sigma_rad = _sigmas(pose)
         monitor.see_sigma(sigma_m, sigma_rad)
         health, cause = monitor.judge(t_ns)
-        held = _HeldScan(pack(scan), sweep, t_ns, matching_ratio, health, cause, monitor.degenerate)
+        held = _HeldScan(pack(scan), sweep, t_ns, matching_ratio, health, cause, monitor.degenerate, pose)
         track.held[number] = held
         self.online = _estimate(pose, held)
 
@@ -420,11 +424,15 @@ class Localiser:
 
     def _refined(self, held: _HeldScan, pose: SmoothedPose) -> RefinedScan:
         scan = held.scan
+        pose, disagrees = _settled_dispute(pose, held.online)
         if not sees_tilt(scan.points):
             pose = on_the_road(pose, self._map.near(pose.T_map_vehicle[:3, 3]), self.parameters.registration)
         sweep = self._motion.trajectory(scan.t_ns, scan.end_ns) if held.sweep is None else held.sweep
         ends, starts = scan.placed(sweep, self.T_vehicle_lidar, held.t_ns, pose.T_map_vehicle)
-        return RefinedScan(held.t_ns, ends, starts, _estimate(self._trimmed(pose), held))
+        estimate = replace(_estimate(self._trimmed(pose), held), disagrees=disagrees)
+        if disagrees and not pose.certain and estimate.health == "good":
+            estimate = replace(estimate, health="degraded", cause="disputed")
+        return RefinedScan(held.t_ns, ends, starts, estimate)
 
     def _trimmed(self, pose: SmoothedPose) -> SmoothedPose:
         """The pose with the heading that the rear axle drives along: what the LiDAR's mount is turned by is taken out
@@ -463,6 +471,20 @@ def _end_ns(scan: Scan) -> int:
 def _reference_ns(scan: Scan) -> int:
     """The middle of the sweep: what the motion is wrong by is shared by both halves."""
     return (scan.t_ns + _end_ns(scan)) // 2
+
+
+def _settled_dispute(refined: SmoothedPose, online: SmoothedPose) -> tuple[SmoothedPose, bool]:
+    """The refined pose, or the online one where they lie farther apart than both are uncertain and the stretch has not
+    fitted well for long: then what both say is in doubt, and the covariance holds the other one, too.
+    """
+    off = log_se3(T_inverse(online.T_map_vehicle) @ refined.T_map_vehicle)
+    horizontal = off[[2, 3, 4]]
+    both = (refined.covariance + online.covariance)[np.ix_([2, 3, 4], [2, 3, 4])] + np.diag(DISPUTED_VARIANCE)
+    if float(horizontal @ np.linalg.solve(both, horizontal)) < DISPUTED_CHI2:
+        return refined, False
+    if refined.certain:
+        return refined, True
+    return replace(online, covariance=online.covariance + np.outer(off, off), certain=False), True
 
 
 def _sigmas(pose: SmoothedPose) -> tuple[float, float]:

@@ -7,6 +7,7 @@ Only these poses are evidence of change.
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from itertools import pairwise
 from typing import Final
 
 import numpy as np
@@ -38,11 +39,17 @@ from vehicle_agent.localise.stretch import (
 
 F64 = NDArray[np.float64]
 
+SUPPORTED: Final = 3
+"""Solutions before one tells the online pose where it is."""
 FIRM: Final = 4
 """Solutions that fit well, before anything is certain."""
 NO_POINTS = np.zeros((0, 3))
 FIRST_SIGMA_M, FIRST_SIGMA_RAD = 0.5, 0.02  # of the online pose that the first scan starts from
+FORGETTING: Final = 0.7
+"""Weight of what was seen of the odometry until the last solution."""
+WORST_VARIANCE: Final = 1e4
 LEAST_WEIGHT: Final = 0.05
+NOISE_WAY_M: Final = 5.0  # for which the sigmas of the odometry are given; a second counts as a metre
 
 
 @dataclass(slots=True, eq=False)
@@ -84,6 +91,9 @@ class Refiner:
         self._solved: Solved | None = None
         self._solved_way_m, self._solved_ns = 0.0, 0
         self._news = False
+        self._solutions = 0
+        self._step_variance = np.ones(6)  # of wheels and gyro, in units of what is assumed
+        self._squares, self._redundancy = np.full(6, 3.0), np.full(6, 3.0)
         self._firm = 0  # solutions in a row that fitted well
 
     def push(
@@ -125,8 +135,8 @@ class Refiner:
 
     @property
     def supported(self) -> bool:
-        """True just after the stretch was solved, when its newest scans fit the map."""
-        return self._news and self._fit() >= self.parameters.least_fit
+        """True just after the stretch was solved, not for the first time, when its newest scans fit the map."""
+        return self._news and self._solutions > SUPPORTED and self._fit() >= self.parameters.least_fit
 
     @property
     def certain(self) -> bool:
@@ -159,12 +169,27 @@ class Refiner:
         driven = self._motion.delta(last.t_ns, t_ns)
         T = driven if T_before_now is None else T_before_now
         way_m = last.way_m + float(np.linalg.norm(driven[:3, 3]))
-        scan = _Scan(number, t_ns, way_m, T, self._teacher.noise(driven) ** 2, seen, None, T_online)
+        scan = _Scan(number, t_ns, way_m, T, self._variance(driven, t_ns - last.t_ns), seen, None, T_online)
         since_m, since_ns = way_m - before.way_m, t_ns - before.t_ns
         if since_m >= par.knot_m or since_ns >= par.knot_s * 1e9:
             weight = float(np.clip(since_m / par.correlated_m, LEAST_WEIGHT, 1.0))
             scan.knot = Knot(self._thinned(points_m), self._carried(before, scan), weight)
         return scan
+
+    def _variance(self, driven: F64, dt_ns: int) -> F64:
+        """(6,) of a motion (4, 4) by wheels and gyro beside what all steps share.
+
+        A single step that is far off counts less (`STEP_CHI2`); odometry that is worse all along is found out by
+        `_judge_steps`. Single scans are not asked what it is off by: they follow walls that were moved.
+        """
+        par = self.parameters
+        grown = np.sqrt(max(float(np.linalg.norm(driven[:3, 3])), dt_ns * 1e-9) / NOISE_WAY_M)
+        roll_pitch = np.radians(par.roll_pitch_deg)
+        sigmas = np.array([
+            roll_pitch, roll_pitch, grown * np.radians(par.yaw_deg),
+            grown * par.longitudinal_m, grown * par.lateral_m, par.vertical_m,
+        ])  # fmt: skip
+        return sigmas**2
 
     def _thinned(self, points_m: F64) -> F64:
         every = max(1, len(points_m) // self.parameters.n_points)
@@ -196,18 +221,27 @@ class Refiner:
 
     def _steps(self, knots: Sequence[_Scan]) -> list[list[Step]]:
         """What wheels and gyro, and the scans, say of the motion between neighbouring knots."""
-        steps = []
-        for before, now in zip(knots, knots[1:], strict=False):
-            driven, dt_s = self._motion.delta(before.t_ns, now.t_ns), (now.t_ns - before.t_ns) * 1e-9
+        driven, seen = [], []
+        for before, now in pairwise(knots):
+            T, dt_s = self._motion.delta(before.t_ns, now.t_ns), (now.t_ns - before.t_ns) * 1e-9
             between_them = self._scans[self._index(before) + 1 : self._index(now) + 1]
             variance = np.sum([scan.variance for scan in between_them], axis=0)
             variance[2:4] += np.square(self._teacher.clock_sigmas(before.t_ns, now.t_ns))
-            measured = [Step(driven, np.diag(variance), shared_of(driven, dt_s))]
-            seen = [scan.seen for scan in between_them]
-            if all(step is not None for step in seen):
-                measured.append(_chained([step for step in seen if step is not None]))
-            steps.append(measured)
-        return steps
+            driven.append(Step(T, np.diag(variance), shared_of(T, dt_s)))
+            told = [scan.seen for scan in between_them]
+            whole = all(step is not None for step in told)
+            seen.append(_chained([step for step in told if step is not None]) if whole else None)
+        grown = np.sqrt(self._step_variance)
+        return [
+            [replace(one, covariance=grown[:, None] * one.covariance * grown), *([] if other is None else [other])]
+            for one, other in zip(driven, seen, strict=True)
+        ]
+
+    def _judge_steps(self, solved: Solved) -> None:
+        """How much worse than assumed wheels and gyro are, axis by axis, as map and scans together see it."""
+        self._squares = FORGETTING * self._squares + solved.step_squares * self._step_variance
+        self._redundancy = FORGETTING * self._redundancy + solved.step_redundancy
+        self._step_variance = np.clip(self._squares / self._redundancy, 1.0, WORST_VARIANCE)
 
     def _solve(self) -> None:
         """Place all scans of the stretch anew, let wheels and gyro learn from it, and let go of its old scans."""
@@ -222,7 +256,8 @@ class Refiner:
         self._solved = solve_stretch(
             knots, steps, belief, match_map, self.registration, par.scales if known else par.first_scales
         )
-        self._news = True
+        self._judge_steps(self._solved)
+        self._news, self._solutions = True, self._solutions + 1
         newest = self._scans[-1]
         dt_s = (newest.t_ns - self._solved_ns) * 1e-9
         self._solved_way_m, self._solved_ns = newest.way_m, newest.t_ns
@@ -233,7 +268,7 @@ class Refiner:
 
     def _shortened(self, scans: list[_Scan], steps: list[list[Step]], belief: Belief, dt_s: float) -> Belief:
         """Let go of the knots that are far behind; the belief about the first that stays."""
-        par, newest, solved = self.parameters, self._scans[-1], self._solved
+        newest, solved = self._scans[-1], self._solved
         assert solved is not None
         first = 0
         while first < len(scans) - 2 and self._is_done_with(scans[first + 1], newest):

@@ -15,6 +15,8 @@ class RefineParameters:
     correlated_m: scans nearer to each other see the same surfaces of the map, wrong by the same: they share one say.
     length_m, length_s: of the stretch; what is older is remembered as a belief about its first scan.
     lag_m: a scan is final when one this much further on takes part; longest_s: or when it is this old.
+    yaw_deg, longitudinal_m, lateral_m: one sigma of the odometry over 5 m beside what all steps share, growing with the
+        root of the way; roll_pitch_deg, vertical_m: of attitude and height from scan to scan, which no wheel tells.
     scales: Geman-McClure scales of the match; first_scales: when the prediction is off by more than `near_m`.
     learnt_degps, unlearnt_s: sigma of the gyro's bias below which it is known; until then scans may wait so long.
     fit_m: the newest part of the stretch that says how well all fits. firm_fit: fit of a stretch that is beyond doubt;
@@ -30,13 +32,18 @@ class RefineParameters:
     knot_m: float = 0.7
     knot_s: float = 0.5
     n_points: int = 1200
-    correlated_m: float = 5.0
+    correlated_m: float = 4.0
     length_m: float = 25.0
     length_s: float = 15.0
     lag_m: float = 10.0
     longest_s: float = 4.0
-    scales: tuple[float, ...] = (2.0, 1.0)
-    first_scales: tuple[float, ...] = (4.0, 2.0, 1.0)
+    yaw_deg: float = 0.02
+    longitudinal_m: float = 0.004
+    lateral_m: float = 0.003
+    roll_pitch_deg: float = 0.2
+    vertical_m: float = 0.01
+    scales: tuple[float, ...] = (2.0, 1.5)
+    first_scales: tuple[float, ...] = (4.0, 2.0, 1.5)
     near_m: float = 0.04
     learnt_degps: float = 0.03
     unlearnt_s: float = 8.0
@@ -45,7 +52,7 @@ class RefineParameters:
     least_fit: float = 0.15
     most_misfit: float = 4.0
     certain_m: float = 0.1
-    floor_m: float = 0.005
+    floor_m: float = 0.01
     floor_deg: float = 0.01
     correct_m: float = 0.06
     correct_deg: float = 0.12

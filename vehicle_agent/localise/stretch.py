@@ -1,9 +1,9 @@
 """A stretch of scans matched with the map together: the submap of GND 6.2, as stiff as the odometry is good.
 
-A rigid submap is shaped by odometry alone. Where wheels, clock or stamps are off by centimetres a step, its match is off
-by decimetres and does not know. Here every scan keeps a pose of its own: all scans of the stretch are matched point to
-Gaussian at once, and odometry ties their poses as tightly as its sigmas say. What all steps share (wheel scale, gyro
-bias, course) is estimated beside the poses, so that it does not count as independent noise.
+A rigid submap is shaped by odometry alone. Where wheels, clock or stamps are off by centimetres a step, its match is
+off by decimetres and does not know. Here every scan keeps a pose of its own: all scans of the stretch are matched
+point to Gaussian at once, and odometry ties their poses as tightly as its sigmas say. What all steps share (wheel
+scale, gyro bias, course) is estimated beside the poses, so that it does not count as independent noise.
 
 Everything is one least-squares problem: Gauss-Newton over 6 N pose parameters and `N_SHARED` shared ones, with robust
 weights (Geman-McClure on points, Cauchy on steps). Old scans leave by marginalisation, so nothing counts twice.
@@ -76,6 +76,9 @@ class Solved:
     shared: (N_SHARED,) estimate. covariance: (N, 6, 6) of each pose, rotation first, vehicle frame; shared_covariance.
     fit: (N,) 1 - mean robust cost of each scan's points, 0 ... 1, at the last scale; known: (N,) share of them in known
     voxels. misfit: mean square of what each scan's own match disagrees with its pose, in sigmas (1 = as expected).
+    step_squares, step_redundancy: (6,) sums over the first measurement of each step: squared residual in sigmas, and
+        how much of each the others can check (0: nothing else knows, 1: all is known otherwise). Their ratio is the
+        variance of these measurements in units of what they claim (variance components, Förstner 1979).
     """
 
     shared: F64
@@ -84,6 +87,8 @@ class Solved:
     fit: F64
     known: F64
     misfit: float
+    step_squares: F64
+    step_redundancy: F64
 
 
 class _System(NamedTuple):
@@ -124,7 +129,8 @@ def solve_stretch(
             if _small(step[:-N_SHARED].reshape(-1, 6), STOP_M, STOP_RAD):
                 break
     _match(knots, match_map, registration, scales[-1])
-    return _solved(knots, _system(knots, steps, belief, shared, registration), shared, registration, scales[-1])
+    A = _system(knots, steps, belief, shared, registration).A
+    return _solved(knots, steps, A, shared - belief.shared, belief.shared, registration, scales[-1])
 
 
 def marginalised(
@@ -152,7 +158,11 @@ def _match(knots: Sequence[Knot], match_map: MatchMap, par: RegistrationParamete
     """Match the knots with the map that have moved since, or were matched with another scale."""
     for knot in knots:
         m, T = knot.match, knot.T_map_vehicle
-        if m is not None and m.scale == scale and _small(_log(T_inverse(m.T_map_vehicle) @ T)[None], SMALL_M, SMALL_RAD):
+        if (
+            m is not None
+            and m.scale == scale
+            and _small(log_se3(T_inverse(m.T_map_vehicle) @ T)[None], SMALL_M, SMALL_RAD)
+        ):
             continue
         knot.match = linearised(knot.points_m, T, match_map, par, scale)
 
@@ -170,7 +180,7 @@ def _system(
     for k, knot in enumerate(knots):
         if knot.match is not None:
             at, weight = slice(6 * k, 6 * k + 6), knot.weight / par.correlation
-            moved = _log(T_inverse(knot.match.T_map_vehicle) @ knot.T_map_vehicle)
+            moved = log_se3(T_inverse(knot.match.T_map_vehicle) @ knot.T_map_vehicle)
             A[at, at] += weight * knot.match.H
             g[at] += weight * (knot.match.g + knot.match.H @ moved)
     for k, measured in enumerate(steps):
@@ -182,26 +192,33 @@ def _system(
 
 def _add_belief(A: F64, g: F64, first: Knot, belief: Belief, shared: F64) -> None:
     at = np.r_[0:6, len(g) - N_SHARED : len(g)]
-    off = np.concatenate([_log(T_inverse(belief.T_map_vehicle) @ first.T_map_vehicle), shared - belief.shared])
+    off = np.concatenate([log_se3(T_inverse(belief.T_map_vehicle) @ first.T_map_vehicle), shared - belief.shared])
     A[np.ix_(at, at)] += belief.information
     g[at] += belief.gradient + belief.information @ off
 
 
 def _add_step(A: F64, g: F64, k: int, relative: F64, step: Step, shared_off: F64) -> None:
-    """A measured motion from knot k to k + 1: e = log(Z^-1 T_k^-1 T_k+1) - S shared, with Cauchy weight."""
-    e = _log(T_inverse(step.T_before_now) @ relative) - step.shared @ shared_off
-    J = np.zeros((6, 12 + N_SHARED))
-    p, R = relative[:3, 3], relative[:3, :3]
-    R_Z = step.T_before_now[:3, :3]
-    J[:3, :3], J[:3, 6:9] = -R.T, np.eye(3)
-    J[3:, :3] = R_Z.T @ np.array([[0.0, -p[2], p[1]], [p[2], 0.0, -p[0]], [-p[1], p[0], 0.0]])
-    J[3:, 3:6], J[3:, 9:12] = -R_Z.T, R_Z.T @ R
-    J[:, 12:] = -step.shared
+    """A measured motion from knot k to k + 1, with Cauchy weight."""
+    e, J = _residual(relative, step, shared_off)
     information = np.linalg.inv(step.covariance)
     weighted = J.T @ information / (1.0 + float(e @ information @ e) / STEP_CHI2)
     at = np.r_[6 * k : 6 * k + 12, len(g) - N_SHARED : len(g)]
     A[np.ix_(at, at)] += weighted @ J
     g[at] += weighted @ e
+
+
+def _residual(relative: F64, step: Step, shared_off: F64) -> tuple[F64, F64]:
+    """Residual e = log(Z^-1 T_k^-1 T_k+1) - S shared (6,) of a step, and its derivative (6, 12 + N_SHARED) after
+    both poses and the shared parameters.
+    """
+    e = log_se3(T_inverse(step.T_before_now) @ relative) - step.shared @ shared_off
+    J = np.zeros((6, 12 + N_SHARED))
+    p, R, R_Z = relative[:3, 3], relative[:3, :3], step.T_before_now[:3, :3]
+    J[:3, :3], J[:3, 6:9] = -R.T, np.eye(3)
+    J[3:, :3] = R_Z.T @ np.array([[0.0, -p[2], p[1]], [p[2], 0.0, -p[0]], [-p[1], p[0], 0.0]])
+    J[3:, 3:6], J[3:, 9:12] = -R_Z.T, R_Z.T @ R
+    J[:, 12:] = -step.shared
+    return e, J
 
 
 def _move(knots: Sequence[Knot], step: F64) -> None:
@@ -212,15 +229,42 @@ def _move(knots: Sequence[Knot], step: F64) -> None:
 
 
 def _solved(
-    knots: Sequence[Knot], system: _System, shared: F64, par: RegistrationParameters, scale: float
+    knots: Sequence[Knot],
+    steps: Sequence[Sequence[Step]],
+    A: F64,
+    shared_off: F64,
+    shared_before: F64,
+    par: RegistrationParameters,
+    scale: float,
 ) -> Solved:
-    covariance = np.linalg.inv(system.A)
-    n = len(knots)
-    blocks = np.stack([covariance[6 * k : 6 * k + 6, 6 * k : 6 * k + 6] for k in range(n)])
-    matches = [knot.match for knot in knots]
-    fit = np.array([0.0 if m is None else m.fit(scale) for m in matches])
-    known = np.array([0.0 if m is None else m.inside / max(len(k.points_m), 1) for m, k in zip(matches, knots, strict=True)])
-    return Solved(shared, blocks, covariance[-N_SHARED:, -N_SHARED:], fit, known, _misfit(knots, par))
+    covariance = np.linalg.inv(A)
+    blocks = np.stack([covariance[6 * k : 6 * k + 6, 6 * k : 6 * k + 6] for k in range(len(knots))])
+    seen = [(knot, knot.match) for knot in knots if knot.match is not None]
+    squares, redundancy = _checked_steps(knots, steps, covariance, shared_off)
+    return Solved(
+        shared=shared_before + shared_off,
+        covariance=blocks,
+        shared_covariance=covariance[-N_SHARED:, -N_SHARED:],
+        fit=np.array([match.fit(scale) for _, match in seen]),
+        known=np.array([match.inside / max(len(knot.points_m), 1) for knot, match in seen]),
+        misfit=_misfit(knots, par),
+        step_squares=squares,
+        step_redundancy=redundancy,
+    )
+
+
+def _checked_steps(
+    knots: Sequence[Knot], steps: Sequence[Sequence[Step]], covariance: F64, shared_off: F64
+) -> tuple[F64, F64]:
+    squares, redundancy, n = np.zeros(6), np.zeros(6), len(covariance)
+    for k, (step, *_) in enumerate(steps):
+        e, J = _residual(T_inverse(knots[k].T_map_vehicle) @ knots[k + 1].T_map_vehicle, step, shared_off)
+        at = np.r_[6 * k : 6 * k + 12, n - N_SHARED : n]
+        variance = np.diag(step.covariance)
+        left_open = np.diag(J @ covariance[np.ix_(at, at)] @ J.T) / variance
+        squares += e**2 / variance
+        redundancy += np.clip(1.0 - left_open, 0.0, 1.0)
+    return squares, redundancy
 
 
 def _misfit(knots: Sequence[Knot], par: RegistrationParameters) -> float:
@@ -230,7 +274,7 @@ def _misfit(knots: Sequence[Knot], par: RegistrationParameters) -> float:
     for knot in knots:
         if knot.match is None:
             continue
-        off = _log(T_inverse(knot.match.T_map_vehicle) @ knot.T_map_vehicle)
+        off = log_se3(T_inverse(knot.match.T_map_vehicle) @ knot.T_map_vehicle)
         values, vectors = np.linalg.eigh(knot.match.H * scale * scale[:, None])
         strong = values > par.correlation / par.degenerate_m**2
         pull = vectors[:, strong].T @ ((knot.match.g + knot.match.H @ off) * scale)
@@ -240,7 +284,7 @@ def _misfit(knots: Sequence[Knot], par: RegistrationParameters) -> float:
 
 
 def shared_of(T_driven: F64, dt_s: float) -> F64:
-    """(6, N_SHARED) how a motion (4, 4) by wheels and gyro that took `dt_s` differs when a shared parameter is larger."""
+    """(6, N_SHARED) how a motion (4, 4) by wheels and gyro that took `dt_s` differs with a larger shared parameter."""
     S = np.zeros((6, N_SHARED))
     S[2, BIAS] = -dt_s  # what is taken off the yaw rate
     forward_m = T_driven[0, 3]
@@ -255,8 +299,6 @@ def _small(motion: F64, m: float, rad: float) -> bool:
     return bool(np.abs(motion[:, 3:]).max(initial=0.0) < m and np.abs(motion[:, :3]).max(initial=0.0) < rad)
 
 
-def _log(T: F64) -> F64:
+def log_se3(T: F64) -> F64:
     """(6,) rotation vector and position of a small motion (4, 4)."""
     return np.concatenate([log_so3(T[:3, :3]), T[:3, 3]])
-
-

@@ -142,6 +142,9 @@ class Mapper:
             return
         known = self.held.known(layer.name, layer.kinds)
         found = map_new_layer(drive, lanes=self.held.lanes(), known=known, trust_known=False)
+        if found.strains:
+            self.counts["stretches_contradicting"] += 1
+            raise NewLayerError("the graph contradicts itself: " + "; ".join(map(str, found.strains)))
         self.counts["stretches"] += 1
         reporter = self.reporters[layer.name]
         for change in changes_of(found, drive, self.held, layer, self.config.features.coverage, self.place.height_m):
@@ -163,6 +166,7 @@ class Mapper:
             "distance_km": round(self.place.odometer_m / 1000, 5),
             "stretches": self.counts["stretches"],
             "stretches_refused": self.counts["stretches_refused"],
+            "stretches_contradicting": self.counts["stretches_contradicting"],
             "layers": {name: dict(reporter.counts) for name, reporter in self.reporters.items()},
             "tiles": dict(self.downloader.counts),
             "reports_sent": reports.total,

@@ -29,6 +29,7 @@ from vehicle_agent.features.mapping.landmarks import (
 from vehicle_agent.features.mapping.lanes import LaneMap, LaneMatcher
 from vehicle_agent.features.mapping.parameters import NewLayerParameters
 from vehicle_agent.features.mapping.smoothed_path import SmoothedPath
+from vehicle_agent.features.mapping.strain import Strain, strains
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -56,7 +57,10 @@ class MappedFeatures:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class NewLayer:
-    """What a drive gives. cost: J of Eq. (6), with lanes of Eq. (10). calibration: (2,) wheel scale, gyro bias."""
+    """What a drive gives. cost: J of Eq. (6), with lanes of Eq. (10). calibration: (2,) wheel scale, gyro bias.
+
+    strains: edges that contradict the rest of the graph; when there are any, nothing of it is to be believed.
+    """
 
     features: MappedFeatures
     path: SmoothedPath
@@ -64,6 +68,7 @@ class NewLayer:
     cost: float
     solution: Solution
     """For covariances of poses: `solution.pose_cov(keys)`."""
+    strains: tuple[Strain, ...] = ()
 
 
 def map_new_layer(
@@ -111,6 +116,7 @@ class _Mapping:
         self.owner = np.full(len(self.m), NONE, np.int64)
         self.xy_m = known.xy_m
         self.kind = self._known_kinds()
+        self.strains: tuple[Strain, ...] = ()
 
     def _known_kinds(self) -> I64:
         code = {name: n for n, name in enumerate(self.m.kinds)}
@@ -192,6 +198,7 @@ class _Mapping:
         start = State(self.state.pose, self.xy_m[seen], self.state.calibration)
         problem = replace(self._problem(polish), ties=ties, anchors=self._anchors(seen, number))
         solution = solve(problem, start, self.parameters)
+        self.strains = strains(problem, solution.state, self.nodes.t_ns, self.parameters)
         self.state = State(solution.state.pose, np.empty((0, 2)), solution.state.calibration)
         self.nodes = self.nodes.calibrated(solution.state.calibration)
         self.xy_m = self.xy_m.copy()
@@ -235,7 +242,7 @@ class _Mapping:
             np.array([self.m.t_ns[r].max() for r in rows], np.int64),
         )
         path = SmoothedPath(self.nodes.t_ns, solution.state.pose, self.nodes.reckoning)
-        return NewLayer(features, path, solution.state.calibration, solution.cost, solution)
+        return NewLayer(features, path, solution.state.calibration, solution.cost, solution, self.strains)
 
 
 _COLUMNS = ("look", "t_ns", "range_m", "bearing_rad", "sigma_range_m", "sigma_bearing_rad", "height_m", "kind")

@@ -67,6 +67,10 @@ class Doubt:
         """A feature of the map was called moved."""
         self._last = step
 
+    def forget(self) -> None:
+        """The place is looked for anew: steps from before say nothing."""
+        self._last = None
+
     def is_it_me(self, off_m: F64, others_m: list[F64], odometer_m: float) -> bool:
         """Whether another feature is off by the same step as one that is off by (2,)."""
         before = self._last

@@ -2,10 +2,10 @@
 
 from collections import Counter, deque
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from enum import IntEnum
 from math import nan
-from typing import Final
+from typing import Any, Final
 
 import numpy as np
 
@@ -75,6 +75,12 @@ class Entry:
     seen: tuple[F64, F64] | None = None
     together: Counter[int] = field(default_factory=Counter)
     history: deque[tuple[int, F64]] = field(default_factory=lambda: deque(maxlen=HISTORY))
+
+    def __deepcopy__(self, memo: dict[int, Any]) -> "Entry":
+        """A copy that goes its own way: arrays are only ever replaced, never written into, and may be shared."""
+        copied = replace(self, heights=self.heights.copy(), history=self.history.copy(), together=self.together.copy())
+        memo[id(self)] = copied
+        return copied
 
     @property
     def key(self) -> int:

@@ -6,8 +6,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from gnd_map.arrays import F64
+from vehicle_agent.features.slamcu.blind import HEADING
 from vehicle_agent.features.slamcu.existence_book import Entry
-from vehicle_agent.features.slamcu.rbpf import HEADING, Rbpf
+from vehicle_agent.features.slamcu.rbpf import Rbpf
 from vehicle_agent.features.view import wrapped
 
 

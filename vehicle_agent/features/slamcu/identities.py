@@ -8,7 +8,7 @@ the whole in each particle: the pose is the same for all of them.
 
 from itertools import permutations
 from math import perm
-from typing import Final
+from typing import Final, NamedTuple
 
 import numpy as np
 from scipy.optimize import linear_sum_assignment
@@ -22,25 +22,37 @@ NONE: Final = -1
 LN_NONE: Final = -25.0
 """Natural logarithm of the density of that, 1/m^2: a sign gone and a new one of its kind in its place are rare, and a
 pose that is surer than it should be makes the map look changed."""
+LN_NONE_DOUBTED: Final = -10.0
+"""The same for a place in doubt, when all signs may seem to have their neighbour's place."""
 MOST_WAYS: Final = 720
 """More ways than this are not compared; then the best pairs alone are the only other way."""
 
 
-def best_identities(rbpf: Rbpf, slots: list[int], owned: int) -> list[int]:
+class Identities(NamedTuple):
+    """The likeliest way to give estimates to features of the map."""
+
+    slots: list[int]
+    """J of the slots, in the order of the features; `NONE` for one that none of them is."""
+    lead: float
+    """How much likelier than the next way, natural logarithm; inf where there is only one."""
+
+
+def best_identities(rbpf: Rbpf, slots: list[int], owned: int, ln_none: float = LN_NONE) -> Identities:
     """Which of `slots` are the features of the map that own the first ones.
 
     Args:
         rbpf: the particles; slots that are owned have a prior.
         slots: S slots of one kind near one another, the `owned` ones first.
         owned: J features of the map, J <= S.
-
-    Returns:
-        J of the slots, in the order of the features; `NONE` for one that none of them is.
+        ln_none: of the density of a feature that is none of them, 1/m^2.
     """
     fit = agreements(rbpf, slots, owned)
     log_weight = np.log(np.maximum(rbpf.weights(without=set(slots)), 1e-300))
-    best = max(_ways(fit, log_weight), key=lambda way: likelihood(fit, log_weight, way))
-    return [NONE if i == NONE else slots[i] for i in best]
+    ways = _ways(fit, log_weight)
+    told = np.array([likelihood(fit, log_weight, way, ln_none) for way in ways])
+    best = int(np.argmax(told))
+    lead = float(told[best] - np.delete(told, best).max(initial=-np.inf))
+    return Identities([NONE if i == NONE else slots[i] for i in ways[best]], lead)
 
 
 def agreements(rbpf: Rbpf, slots: list[int], owned: int) -> F64:
@@ -54,9 +66,9 @@ def agreements(rbpf: Rbpf, slots: list[int], owned: int) -> F64:
     return fit
 
 
-def likelihood(fit: F64, log_weight: F64, way: tuple[int, ...]) -> float:
+def likelihood(fit: F64, log_weight: F64, way: tuple[int, ...], ln_none: float = LN_NONE) -> float:
     """Log likelihood of a way to give slots to features, over all particles."""
-    log = log_weight + sum(LN_NONE if s == NONE else fit[j, s] for j, s in enumerate(way))
+    log = log_weight + sum(ln_none if s == NONE else fit[j, s] for j, s in enumerate(way))
     most = float(log.max())
     return most + float(np.log(np.exp(log - most).sum()))
 

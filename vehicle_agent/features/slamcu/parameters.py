@@ -33,17 +33,20 @@ class MotionNoise:
 
 @dataclass(frozen=True, slots=True)
 class GnssNoise:
-    """Errors of a low-cost GNSS: a slow one (Gauss-Markov, with the sigma that the fix tells) and a white one."""
+    """Errors of a low-cost GNSS: a slow one (Gauss-Markov) and a white one, together of the sigma that the fix tells.
 
-    white_m: float = 0.5
-    """White noise of each axis."""
-    correlation_s: float = 12.0
+    As `python -m benchmarks gnss-noise` finds them in a car's single-point fixes.
+    """
+
+    white_share: float = 0.30
+    """White noise's share of the variance."""
+    correlation_s: float = 13.4
     """Time constant of the slow error."""
     interval_s: float = 0.5
     """At most one fix in this time is used: those between tell the same error once more."""
 
     def __post_init__(self) -> None:
-        _check("gnss.white_m", self.white_m, 1e-3, 100.0)
+        _check("gnss.white_share", self.white_share, 1e-3, 0.999)
         _check("gnss.correlation_s", self.correlation_s, 1e-3, 1e6)
         _check("gnss.interval_s", self.interval_s, 0.0, 1e3)
 

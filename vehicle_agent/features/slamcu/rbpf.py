@@ -19,16 +19,14 @@ import numpy as np
 
 from gnd_map.arrays import F64, I64
 from vehicle_agent.features.slamcu import measurement
+from vehicle_agent.features.slamcu.blind import BIAS, GNSS_X, HEADING, SCALE, STANDING_MPS, Belief, X, Y
 from vehicle_agent.features.slamcu.parameters import SlamcuParameters
 from vehicle_agent.features.view import wrapped
 
-X, Y, HEADING, SCALE, BIAS, GNSS_X, GNSS_Y = range(7)
 Prior = tuple[F64, F64]
 """Position (2,) and covariance (3,) xx, xy, yy."""
 FLOOR_PER_M2: Final = 1e-5
 """Density of a map feature's measured position if it is none: one chance in a thousand, somewhere within 100 m^2."""
-_STANDING_MPS: Final = 0.02
-_GNSS_JUMP: Final = 25.0
 _MOST_STAGES: Final = 20
 
 
@@ -41,11 +39,13 @@ class Rbpf:
         mu: (F, M, 2) positions of the features.
         sigma: (F, M, 3) their covariances xx, xy, yy.
         priors: F positions known otherwise that are not yet settled, None where there is none.
+        provisional: F, whether such a prior weighs the particles already; not where it may be another feature's.
+        rng: where chance comes from.
         weighing: whether measurements weigh particles; not where poses are given.
     """
 
     def __init__(self, parameters: SlamcuParameters, pose0: F64, cov0: F64, rng: np.random.Generator) -> None:
-        self._p, self._rng = parameters, rng
+        self._p, self.rng = parameters, rng
         m = parameters.filter.particles
         self.offsets = _standard(rng, m)
         self.state = np.zeros((7, m))
@@ -58,6 +58,7 @@ class Rbpf:
         self.mu = np.zeros((0, m, 2))
         self.sigma = np.zeros((0, m, 3))
         self.priors: list[Prior | None] = []
+        self.provisional: list[bool] = []
         self.weighing = True
         self.resampled = 0
 
@@ -72,13 +73,28 @@ class Rbpf:
         root = vectors * np.sqrt(np.maximum(values, 0.0))
         self.state[:3] = pose[:, None] + root @ self.offsets
 
+    def seed(self, belief: Belief) -> None:
+        """Draw the particles anew from a belief; the GNSS's error stays a Kalman filter in each of them."""
+        if self.m == 1:
+            self.place(belief.mean[:3], belief.cov[:3, :3])
+            return
+        self.log_weight = np.zeros(self.m)
+        driven = belief.cov[:GNSS_X, :GNSS_X]
+        values, vectors = np.linalg.eigh(driven)
+        off = (vectors * np.sqrt(np.maximum(values, 0.0))) @ self.rng.standard_normal((GNSS_X, self.m))
+        self.state[:GNSS_X] = belief.mean[:GNSS_X, None] + off
+        gain = belief.cov[GNSS_X:, :GNSS_X] @ np.linalg.pinv(driven, hermitian=True)
+        self.state[GNSS_X:] = belief.mean[GNSS_X:, None] + gain @ off
+        rest = belief.cov[GNSS_X:, GNSS_X:] - gain @ belief.cov[:GNSS_X, GNSS_X:]
+        self._gnss_var = max(0.5 * float(np.trace(rest)), 1e-6) if belief.cov[GNSS_X, GNSS_X] > 0.0 else None
+
     def predict(self, dt_s: float, speed_mps: float, yaw_rate_radps: float) -> None:
         """Move every particle as the vehicle moved, with what wheels and gyro may be wrong by. Eq. (12)."""
-        if abs(speed_mps) < _STANDING_MPS:  # what a standing vehicle's gyro shows is its bias
+        if abs(speed_mps) < STANDING_MPS:  # what a standing vehicle's gyro shows is its bias
             return
         noise, root, s = self._p.motion, np.sqrt(dt_s), self.state
         if self.m > 1:
-            e = self._rng.standard_normal((4, self.m)) * root
+            e = self.rng.standard_normal((4, self.m)) * root
             s[SCALE] += noise.scale_walk * e[2]
             s[BIAS] += noise.bias_walk_radps * e[3]
             way, turn = noise.speed_m * e[0], noise.yaw_rad * e[1]
@@ -92,24 +108,20 @@ class Rbpf:
         s[HEADING] += turn
 
     def gnss(self, xy_m: F64, sigma_m: float, dt_s: float) -> None:
-        """Weigh with a fix whose error is slow (Gauss-Markov, of this sigma) and white.
+        """Weigh with a fix whose error is slow (Gauss-Markov) and white.
 
         Args:
             xy_m: (2,).
-            sigma_m: of each axis.
+            sigma_m: of each axis, both together.
             dt_s: since the last fix.
         """
         noise, s = self._p.gnss, self.state
         fade = np.exp(-dt_s / noise.correlation_s)
-        before = sigma_m**2 if self._gnss_var is None else self._gnss_var
-        var = before * fade**2 + (1.0 - fade**2) * sigma_m**2
+        white, slow = noise.white_share * sigma_m**2, (1.0 - noise.white_share) * sigma_m**2
+        before = slow if self._gnss_var is None else self._gnss_var
+        var = before * fade**2 + (1.0 - fade**2) * slow
         s[GNSS_X:] *= fade
-        nu = xy_m[:, None] - s[:2] - s[GNSS_X:]
-        mean, spread = nu.mean(axis=1), nu.var(axis=1).max()
-        if (mean**2).max() > _GNSS_JUMP * (var + noise.white_m**2 + spread):
-            var, s[GNSS_X:] = sigma_m**2, 0.0  # another reflection: what was known of its error is void
-            nu = xy_m[:, None] - s[:2]
-        total = var + noise.white_m**2
+        total = var + white
         self._weigh(lambda: -0.5 * self._off(xy_m) / total)
         s = self.state
         s[GNSS_X:] += var / total * (xy_m[:, None] - s[:2] - s[GNSS_X:])
@@ -120,11 +132,12 @@ class Rbpf:
         mu, sigma = measurement.inverse(self.state[:3], z, variance)
         self.mu, self.sigma = np.concatenate([self.mu, mu[None]]), np.concatenate([self.sigma, sigma[None]])
         self.priors.append(prior)
+        self.provisional.append(True)
 
     def remove(self, slot: int) -> None:
         """Forget a feature."""
         self.mu, self.sigma = np.delete(self.mu, slot, axis=0), np.delete(self.sigma, slot, axis=0)
-        del self.priors[slot]
+        del self.priors[slot], self.provisional[slot]
 
     def measure(self, slot: int, z: F64, variance: F64, *, weigh: bool) -> None:
         """Update a feature with a measurement, Eq. (16), and the weights, Eq. (18) and (19)."""
@@ -147,7 +160,7 @@ class Rbpf:
         log = self.log_weight.copy()
         if self.weighing:
             for slot, prior in enumerate(self.priors):
-                if prior is not None and slot not in without:
+                if prior is not None and self.provisional[slot] and slot not in without:
                     log += self._agreement(slot, prior)
         return _normalised(log)
 
@@ -164,8 +177,8 @@ class Rbpf:
         """The place in the map is in doubt: move each particle with these of its features as one body, at random."""
         if not self.weighing:
             return
-        shift = position_m * self._rng.standard_normal((2, self.m))
-        turn = heading_rad * self._rng.standard_normal(self.m)
+        shift = position_m * self.rng.standard_normal((2, self.m))
+        turn = heading_rad * self.rng.standard_normal(self.m)
         cos, sin = np.cos(turn), np.sin(turn)
         for slot in slots:
             off = self.mu[slot].T - self.state[:2]
@@ -251,13 +264,13 @@ class Rbpf:
         return max(low, most / _MOST_STAGES)
 
     def _resample(self, weights: F64) -> None:
-        index = systematic(weights, float(self._rng.random()))
+        index = systematic(weights, float(self.rng.random()))
         self.log_weight = np.zeros(self.m)
         self.state, self.mu, self.sigma = self.state[:, index], self.mu[:, index], self.sigma[:, index]
         self.resampled += 1
         h = self._p.filter.jitter
         if h > 0.0:
-            one, other = self._rng.permutation(self.m), self._rng.permutation(self.m)
+            one, other = self.rng.permutation(self.m), self.rng.permutation(self.m)
             self.state[HEADING] = self.state[HEADING, 0] + wrapped(self.state[HEADING] - self.state[HEADING, 0])
             self.state = _spread(self.state, 1, one, other, h)
             self.mu = _spread(self.mu, 1, one, other, h)

@@ -5,6 +5,8 @@ existence, those measured gain it (4.3.2); what is new is registered; what exist
 """
 
 from collections.abc import Collection
+from copy import deepcopy
+from dataclasses import dataclass
 from math import isfinite
 from typing import Final
 
@@ -14,19 +16,42 @@ from gnd_map.arrays import F64, I64
 from vehicle_agent.features.errors import BadPose
 from vehicle_agent.features.look import Look, MapFeatures
 from vehicle_agent.features.slamcu.association import Association, associate, pair_costs
+from vehicle_agent.features.slamcu.blind import STANDING_MPS, Belief, BlindFilter
 from vehicle_agent.features.slamcu.existence_book import Entry, ExistenceBook, FeatureClass, existence_of
 from vehicle_agent.features.slamcu.forecast import Forecast, forecast
+from vehicle_agent.features.slamcu.identities import LN_NONE, LN_NONE_DOUBTED
 from vehicle_agent.features.slamcu.parameters import SlamcuParameters
 from vehicle_agent.features.slamcu.rbpf import Rbpf
-from vehicle_agent.features.slamcu.tidying import Tidying
+from vehicle_agent.features.slamcu.tidying import Innovation, Tidying
 from vehicle_agent.features.slamcu.tracked import Tracked
 from vehicle_agent.features.slamcu.verdicts import KnownState, NewFeature
 from vehicle_agent.features.view import Occlusion, SensorView, wrapped
 
 NEAR_M: Final = 30.0
 """Features so much farther than the view's range cannot be what was measured."""
+TOGETHER_S: Final = 0.1
+"""Samples of wheels and gyro are put together for at most so long."""
 LEAST_PLAUSIBLE: Final = 1e-3
 """A feature that surely is not there competes for measurements with this share of its likelihood."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Passed:
+    """A feature that the vehicle has passed.
+
+    Attributes:
+        number: the map's id, or 1, 2, 3 … of new ones.
+        known: whether it is the map's.
+        kind: of it.
+        xy_m: (2,) where the map has it, or where it was found.
+        feature_class: what was concluded.
+    """
+
+    number: int
+    known: bool
+    kind: str
+    xy_m: F64
+    feature_class: FeatureClass
 
 
 class Slamcu:
@@ -38,20 +63,36 @@ class Slamcu:
         pose0: (3,) x, y, heading at the start.
         cov0: (3, 3) its covariance.
         seed: of the particles.
+        gnss_sigma_m: of the GNSS fixes that the first pose was made of, whose slow error it shares; 0: made otherwise.
 
     Attributes:
+        parameters: of existence, association and filter.
         now_s: time driven.
         odometer_m: way driven.
         z_m: height of the vehicle's origin in the map frame, as of `set_pose`; else 0: heights are those over it.
         hidden: features of the map in view that got no evidence because something hid them, over all looks.
+        fixes_refused: fixes of the GNSS that lay too far from where wheels and gyro can have brought the vehicle.
 
     Raises:
         BadPose: the pose is not finite, or the covariance is none.
     """
 
-    def __init__(self, parameters: SlamcuParameters, known: MapFeatures, pose0: F64, cov0: F64, seed: int = 0) -> None:
-        self._p = parameters
-        self._rbpf = Rbpf(parameters, *checked_pose(pose0, cov0), np.random.default_rng(seed))
+    def __init__(
+        self,
+        parameters: SlamcuParameters,
+        known: MapFeatures,
+        pose0: F64,
+        cov0: F64,
+        seed: int = 0,
+        gnss_sigma_m: float = 0.0,
+    ) -> None:
+        self._p = self.parameters = parameters
+        pose0, cov0 = checked_pose(pose0, cov0)
+        self._rbpf = Rbpf(parameters, pose0, cov0, np.random.default_rng(seed))
+        belief = Belief.first(pose0, cov0, parameters, gnss_sigma_m)
+        self._blind = BlindFilter(parameters, belief)
+        if gnss_sigma_m > 0.0:
+            self._rbpf.seed(belief)
         self._book = ExistenceBook(parameters)
         self._tracked = Tracked(parameters, known, self._rbpf, self._book)
         self._tidying = Tidying(parameters, self._tracked, self._rbpf, self._book)
@@ -59,7 +100,11 @@ class Slamcu:
         self.odometer_m = 0.0
         self.hidden = 0
         self.z_m = 0.0
+        self.fixes_refused = 0
         self._gnss_s: float | None = None
+        self._weighed_s: float | None = None
+        self._looked_ns = 0
+        self._moved = np.zeros(3)  # seconds, metres, radians that the particles have not moved yet
 
     def predict(self, dt_s: float, speed_mps: float, yaw_rate_radps: float) -> None:
         """The vehicle drove on for `dt_s` with the wheel speed and yaw rate that it measured.
@@ -69,12 +114,26 @@ class Slamcu:
         """
         if not (isfinite(dt_s + speed_mps + yaw_rate_radps) and dt_s >= 0.0):
             raise BadPose(f"motion of {speed_mps} m/s, {yaw_rate_radps} rad/s over {dt_s} s")
-        self._rbpf.predict(dt_s, speed_mps, yaw_rate_radps)
+        self._blind.predict(dt_s, speed_mps, yaw_rate_radps)
+        if abs(speed_mps) >= STANDING_MPS:
+            self._moved += np.array([dt_s, speed_mps * dt_s, yaw_rate_radps * dt_s])
+            if self._moved[0] >= TOGETHER_S:
+                self._move()
         self.now_s += dt_s
         self.odometer_m += abs(speed_mps) * dt_s
 
-    def gnss(self, x_m: float, y_m: float, sigma_m: float) -> None:
+    def _move(self) -> None:
+        """Move the particles by what was driven since they moved last: nobody asks them between looks and fixes."""
+        dt_s, way_m, turn_rad = self._moved.tolist()
+        if dt_s > 0.0:
+            self._rbpf.predict(dt_s, way_m / dt_s, turn_rad / dt_s)
+            self._moved = np.zeros(3)
+
+    def gnss(self, x_m: float, y_m: float, sigma_m: float) -> bool:
         """A GNSS fix in the map frame; `sigma_m` of each axis.
+
+        Returns:
+            Whether it was used: not when it comes too soon after another, or is another reflection.
 
         Raises:
             BadPose: a value is not finite, or the sigma is not positive.
@@ -82,10 +141,18 @@ class Slamcu:
         if not (isfinite(x_m + y_m + sigma_m) and sigma_m > 0.0):
             raise BadPose(f"GNSS fix ({x_m}, {y_m}) m with sigma {sigma_m} m")
         since_s = self._p.gnss.interval_s if self._gnss_s is None else self.now_s - self._gnss_s
-        if since_s + 1e-6 >= self._p.gnss.interval_s:
-            self._rbpf.gnss(np.array([x_m, y_m]), sigma_m, since_s)
-            self._gnss_s = self.now_s
-            self._rbpf.resample_if_needed()
+        if since_s + 1e-6 < self._p.gnss.interval_s:
+            return False
+        self._gnss_s = self.now_s
+        if not self._blind.fix(np.array([x_m, y_m]), sigma_m, since_s):
+            self.fixes_refused += 1
+            return False
+        self._move()
+        weighed_s = since_s if self._weighed_s is None else self.now_s - self._weighed_s
+        self._rbpf.gnss(np.array([x_m, y_m]), sigma_m, weighed_s)
+        self._weighed_s = self.now_s
+        self._rbpf.resample_if_needed()
+        return True
 
     def set_pose(self, pose: F64, cov: F64, z_m: float = 0.0) -> None:
         """The pose (3,) as a localiser has it, with its covariance (3, 3) and the height of the vehicle's origin in the
@@ -96,12 +163,74 @@ class Slamcu:
         """
         pose, cov = checked_pose(pose, cov)
         self.z_m = z_m
+        self._moved = np.zeros(3)
         self._rbpf.weighing = False
         self._rbpf.place(pose, cov)
 
     def pose(self) -> tuple[F64, F64]:
         """Pose (3,) x, y [m], heading [rad], and covariance (3, 3)."""
+        self._move()
         return self._rbpf.pose(self._rbpf.weights())
+
+    @property
+    def blind(self) -> Belief:
+        """Where the vehicle is by wheels, gyro and GNSS alone."""
+        return self._blind.belief
+
+    def look_anew(self) -> None:
+        """Lost: look for the place anew around where wheels, gyro and GNSS have it.
+
+        What is under way with features ends here: those of the map are not settled, new ones stay where they are.
+        """
+        self._tidying.let_go()
+        self._moved = np.zeros(3)
+        self._rbpf.seed(self._blind.belief)
+
+    def widen(self, position_m: float, heading_rad: float) -> None:
+        """The place is in doubt, and nobody can tell a better one: be as uncertain as that from now on."""
+        self._move()
+        self._rbpf.loosen((), position_m, heading_rad)
+
+    def doubt_the_map(self, *, doubted: bool = True) -> None:
+        """Whether to take it easier that a sign is gone and another stands in its place."""
+        self._tidying.ln_none = LN_NONE_DOUBTED if doubted else LN_NONE
+
+    def fork(self, seed: int) -> "Slamcu":
+        """A copy that goes its own way, with chance of its own."""
+        copied = deepcopy(self)
+        copied._rbpf.rng = np.random.default_rng(seed)
+        return copied
+
+    def last_seen(self, from_s: float, until_s: float) -> list[Passed]:
+        """What was last in view after `from_s` and not after `until_s`, and of which there is evidence."""
+        return [
+            Passed(entry.number, entry.known, entry.kind, entry.xy_m, self._book.classify(entry))
+            for entry in (*self._tracked.known, *self._tracked.new)
+            if from_s < entry.in_view_s <= until_s and entry.hits + entry.misses and self._decided(entry)
+        ]
+
+    def decide(self) -> None:
+        """The drive has ended: decide what was left open for further signs to tell."""
+        self._tidying.decide(self._looked_ns)
+
+    def _decided(self, entry: Entry) -> bool:
+        return entry.slot is None or self._rbpf.provisional[entry.slot]
+
+    def told(self) -> list[Innovation]:
+        """How far from their places features of the map were measured that have been settled since the last call."""
+        found, self._tidying.told = self._tidying.told, []
+        return found
+
+    def changes(self) -> tuple[int, int]:
+        """How many features of the map are called deleted, and how many new ones there are."""
+        classify = self._book.classify
+        deleted = sum(classify(entry) == FeatureClass.DELETED for entry in self._tracked.known)
+        return deleted, sum(classify(entry) == FeatureClass.NEW for entry in self._tracked.new)
+
+    def in_view(self, within_s: float) -> bool:
+        """Whether a feature was in view in the last so many seconds."""
+        entries = (*self._tracked.known, *self._tracked.live)
+        return any(entry.in_view_s > self.now_s - within_s for entry in entries)
 
     def look(self, look: Look, view: SensorView, occlusion: Occlusion | None = None) -> None:
         """Take what a detector found, or did not find.
@@ -111,6 +240,8 @@ class Slamcu:
             view: what the detector could have seen.
             occlusion: what was in the way; None = nothing.
         """
+        self._move()
+        self._looked_ns = look.t_ns
         weights = self._rbpf.weights()
         near = self._tracked.within(self._rbpf.state[:2] @ weights, view.range_m + NEAR_M)
         ahead = forecast(self._rbpf, weights, near)

@@ -1,13 +1,14 @@
 """What happens to features between looks: settled, moved, made one with another, given up."""
 
-from typing import Final
+from math import inf
+from typing import Final, NamedTuple
 
 import numpy as np
 
 from gnd_map.arrays import F64
 from vehicle_agent.features.slamcu.doubt import Doubt, Step
 from vehicle_agent.features.slamcu.existence_book import Entry, ExistenceBook, FeatureClass
-from vehicle_agent.features.slamcu.identities import NONE, best_identities
+from vehicle_agent.features.slamcu.identities import LN_NONE, NONE, best_identities
 from vehicle_agent.features.slamcu.parameters import SlamcuParameters
 from vehicle_agent.features.slamcu.rbpf import Rbpf
 from vehicle_agent.features.slamcu.tracked import Tracked
@@ -22,8 +23,24 @@ TOGETHER_SHARE: Final = 0.15
 """Two features that are measured at once in this share of the looks that could are two."""
 GROUP_M: Final = 12.0
 """Features within this distance may be taken for each other: three lanes."""
+SURE: Final = 3.0
+"""Identities are decided when they are so much likelier than any others (natural logarithm)."""
+UNDECIDED_M: Final = 600.0
+"""Or after so much way, in which further signs may have told where the vehicle was."""
+ASK_EVERY_S: Final = 1.0
+RIVAL_SHARE: Final = 0.25
+"""What was measured less often than this share of what stands beside it is no feature of the map that was in view."""
 GIVEN_UP: Final = 0.9
 """A new feature with this mass of absence is forgotten."""
+
+
+class Innovation(NamedTuple):
+    """How far from its place in the map a feature was measured."""
+
+    squared: float
+    """Mahalanobis distance, squared; 2 degrees of freedom."""
+    ln_density: float
+    """Natural logarithm of its density, 1/m^2."""
 
 
 class Tidying:
@@ -34,11 +51,18 @@ class Tidying:
         tracked: the features.
         rbpf: the particles.
         book: their masses.
+
+    Attributes:
+        ln_none: natural logarithm of the density of a feature that is gone while another stands in its place.
+        told: what features of the map said when they were settled, until somebody takes it.
     """
 
     def __init__(self, parameters: SlamcuParameters, tracked: Tracked, rbpf: Rbpf, book: ExistenceBook) -> None:
         self._p, self._tracked, self._rbpf, self._book = parameters, tracked, rbpf, book
         self._doubt = Doubt(tracked, rbpf, book)
+        self.ln_none = LN_NONE
+        self.told: list[Innovation] = []
+        self._odometer_m = self._asked_s = 0.0
 
     def measured_together(self, detected: list[Entry]) -> None:
         """Remember which features were measured in one look."""
@@ -56,6 +80,7 @@ class Tidying:
             t_ns: UTC, for the masses over time.
             near: entries that may be in view.
         """
+        self._odometer_m = odometer_m
         for entry in [entry for entry in near if not entry.known and entry in self._tracked.new]:
             self._give_up_or_unite(entry, near, t_ns)
         for entry in list(self._tracked.live):
@@ -63,21 +88,43 @@ class Tidying:
                 continue
             out_of_view = now_s - entry.in_view_s > self._p.settle_s
             if self._rbpf.priors[entry.slot] is not None:
+                if not self._rbpf.provisional[entry.slot] and now_s - self._asked_s < ASK_EVERY_S:
+                    continue
                 if out_of_view or entry.pass_hits >= self._p.settle_hits:
                     self._settle(entry, t_ns)
             elif out_of_view:
                 self._leave(entry, odometer_m)
         self._leave_oldest()
+        if now_s - self._asked_s >= ASK_EVERY_S:
+            self._asked_s = now_s
+
+    def decide(self, t_ns: int) -> None:
+        """Nothing more will come: what is undecided is decided by what there is."""
+        self._odometer_m = inf
+        for entry in list(self._tracked.live):
+            if entry.slot is not None and self._rbpf.priors[entry.slot] and not self._rbpf.provisional[entry.slot]:
+                self._settle(entry, t_ns)
+
+    def let_go(self) -> None:
+        """Estimate nothing any longer: what is new and exists stays where it is, what is not is forgotten."""
+        for entry in list(self._tracked.live):
+            if not entry.known and self._book.classify(entry) == FeatureClass.NEW:
+                self._freeze(entry)
+            elif not entry.known:
+                self._tracked.drop(entry)
+            else:
+                self._tracked.leave(entry)
+        self._doubt.forget()
 
     def _settle(self, entry: Entry, t_ns: int) -> None:
         """Compare with the position known otherwise, and take that in."""
-        if entry.known:
-            self._identify(entry, t_ns)
-        if entry.slot is None:
+        if (entry.known and not self._identify(entry, t_ns)) or entry.slot is None:
             return
         weights = self._rbpf.weights(without=(entry.slot,))
         xy_m, cov = self._rbpf.moments(entry.slot, weights)
         moved = self._moved(entry, xy_m, cov)
+        if entry.known:
+            self.told.append(innovation_of(entry, xy_m, cov))
         if not entry.known:
             self._take(entry, agrees=not moved)
         elif moved and self._doubt.is_it_me(xy_m - entry.xy_m, self._others_off(entry), entry.odometer_m):
@@ -109,26 +156,36 @@ class Tidying:
             self._rbpf.priors[entry.slot] = None
         entry.cov = None
 
-    def _identify(self, entry: Entry, t_ns: int) -> None:
-        """Give the estimates of features that stand close together to those of the map that they are."""
+    def _identify(self, entry: Entry, t_ns: int) -> bool:
+        """Give the estimates of features that stand close together to those of the map that they are; False: nobody can
+        tell yet, and until then they tell nothing of where the vehicle is.
+        """
         group = self._group(entry)
         owned = sum(one.known for one in group)
         if len(group) < 2:
-            return
+            return True
         slots = [one.slot for one in group if one.slot is not None]
-        found = list(zip(group, best_identities(self._rbpf, slots, owned), strict=False))
+        best = best_identities(self._rbpf, slots, owned, self.ln_none)
+        if best.lead < SURE and self._odometer_m - entry.odometer_m < UNDECIDED_M:
+            for slot in slots[:owned]:
+                self._rbpf.provisional[slot] = False
+            return False
+        found = list(zip(group, best.slots, strict=False))
         for feature, slot in found:
             if slot == NONE:
                 self._split(feature, t_ns)
         for feature, slot in found:
             if slot != NONE and (other := self._tracked.live[slot]) is not feature:
                 self._exchange(feature, other, t_ns)
+        return True
 
     def _group(self, entry: Entry) -> list[Entry]:
         """Features like this one around it that are being estimated, those of the map that are not settled first."""
         alike = [one for one in self._tracked.live if one.kind == entry.kind and self._together(one, entry)]
         unsettled = [one for one in alike if one.known and one.slot is not None and self._rbpf.priors[one.slot]]
-        return unsettled + [one for one in alike if not one.known and one.cov is None]
+        most = max(one.pass_hits for one in alike)
+        found = [one for one in alike if not one.known and one.cov is None]
+        return unsettled + [one for one in found if one.pass_hits >= RIVAL_SHARE * most]
 
     def _together(self, one: Entry, other: Entry) -> bool:
         places = [self._rbpf.mu[each.slot].mean(axis=0) for each in (one, other)]
@@ -141,11 +198,8 @@ class Tidying:
             self._book.recount(each, hits + each.pass_hits, misses + each.pass_misses, t_ns)
 
     def _moved(self, entry: Entry, xy_m: F64, cov: F64) -> bool:
-        assert entry.cov is not None
-        off = xy_m - entry.xy_m
-        total = cov + entry.cov[[0, 1, 1, 2]].reshape(2, 2)
-        squared = float(off @ np.linalg.solve(total, off))
-        return squared > self._p.moved_gate and float(np.hypot(*off)) > self._p.moved_m
+        far = float(np.hypot(*(xy_m - entry.xy_m))) > self._p.moved_m
+        return far and innovation_of(entry, xy_m, cov).squared > self._p.moved_gate
 
     def _split(self, entry: Entry, t_ns: int) -> None:
         """A moved feature is a deleted one and a new one (section 2.3)."""
@@ -223,6 +277,14 @@ class Tidying:
         kept.heights += other.heights
         self._book.recount(kept, hits, max(kept.misses - other.hits, 0), t_ns)
         self._tracked.drop(other)
+
+
+def innovation_of(entry: Entry, xy_m: F64, cov: F64) -> Innovation:
+    """What a measured position (2,) with covariance (2, 2) says of a feature whose position is known otherwise."""
+    assert entry.cov is not None
+    off, total = xy_m - entry.xy_m, cov + entry.cov[[0, 1, 1, 2]].reshape(2, 2)
+    squared = float(off @ np.linalg.solve(total, off))
+    return Innovation(squared, -0.5 * squared - 0.5 * float(np.log((2.0 * np.pi) ** 2 * np.linalg.det(total))))
 
 
 def fused_moments(one: tuple[F64, F64], other: tuple[F64, F64]) -> tuple[F64, F64]:

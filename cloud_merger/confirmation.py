@@ -1,0 +1,202 @@
+"""Which of a tile's decided changes are published, and which wait for a second witness.
+
+GND decides by the majority of those who observed a voxel (5.3); where only one vehicle came by, its word is the
+majority. One vehicle may be wrong in all that it says: its pose was, or its LiDAR is mounted otherwise than it
+believes. So what a single witness claims is published only while it is little and well supported; more waits until a
+second vehicle, or the same vehicle on another drive, has seen it, too.
+
+A pure function of the merged tile and the reports, as the merge itself: every new report decides all anew.
+"""
+
+from collections import Counter, defaultdict
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+
+import numpy as np
+
+from cloud_merger.errors import MergerError
+from cloud_merger.merge import MergedTile
+from cloud_merger.statements import Report
+from gnd_map.gaussian import Gaussians
+from gnd_map.tile import TileDelta, apply
+from tile_store.values import Unconfirmed, WaitingReason
+
+VOUCHED_VOXELS = 12  # so many claims of a vehicle must others share at least before they vouch for the rest
+_NS_PER_S = 1_000_000_000
+
+
+@dataclass(frozen=True, slots=True)
+class ConfirmationParameters:
+    """What a single witness may change.
+
+    Attributes:
+        few_voxels: so many changed voxels of a tile, ...
+        few_share: ... or this share of what the witness saw of the tile, whichever is more, are few. Beyond that all of
+            its lonely claims in the tile wait.
+        vouched_share: but if at least this share of all its claims that won was made by others, too, the rest is
+            believed with it, whatever else speaks against it: its poses were right there, and it sees a construction
+            site from where others do not.
+        well_known_m: the lonely claims of a report whose poses are worse than this, beyond what the merge expects of
+            all, wait however few they are.
+        second_drive_s: a vehicle that comes back after so long is a second witness. Passes in a row are one: they share
+            the state of localisation, the parked cars and the mount.
+    """
+
+    few_voxels: int = 8
+    few_share: float = 0.02
+    vouched_share: float = 0.5
+    well_known_m: float = 0.1
+    second_drive_s: float = 1800.0
+
+    def __post_init__(self) -> None:
+        if self.few_voxels < 0:
+            raise MergerError(f"few_voxels must not be negative, got {self.few_voxels}")
+        for name in ("few_share", "vouched_share"):
+            if not 0 <= getattr(self, name) <= 1:
+                raise MergerError(f"{name} must lie in [0, 1], got {getattr(self, name)}")
+        for name in ("well_known_m", "second_drive_s"):
+            if not getattr(self, name) > 0:
+                raise MergerError(f"{name} must be positive, got {getattr(self, name)}")
+
+
+@dataclass(frozen=True, slots=True)
+class GatedTile:
+    """A tile without what waits.
+
+    Attributes:
+        merged: the tile to publish.
+        waiting: what does, sorted by vehicle and reason.
+    """
+
+    merged: MergedTile
+    waiting: tuple[Unconfirmed, ...] = ()
+
+
+@dataclass(frozen=True, slots=True)
+class _Witness:
+    """The changes that won, as one vehicle has part in them: voxels that it alone claims, with its reports, and how
+    many others claim, too.
+    """
+
+    lonely: Mapping[int, tuple[Report, ...]]
+    shared: int
+
+
+def gate(
+    epoch: Gaussians,
+    merged: MergedTile,
+    reports: Iterable[Report],
+    parameters: ConfirmationParameters | None = None,
+    named: frozenset[str] = frozenset(),
+) -> GatedTile:
+    """Take back the changes that wait for confirmation.
+
+    A tile that the map has not yet (an empty epoch) is published on one vehicle's word: somebody has to be the first,
+    there is nothing that its word could damage, and who disagrees later takes it back by vote. Doubtful reports and
+    named vehicles wait there, too.
+
+    Args:
+        epoch: the tile that the reports were merged into.
+        merged: of `merge_tile`.
+        reports: those of the merge, in any order.
+        parameters: see `ConfirmationParameters`.
+        named: vehicles whose reports are shifted again and again: what they alone claim always waits, and they are
+            never a second witness of themselves.
+    """
+    parameters = parameters or ConfirmationParameters()
+    by_id = {report.report_id: report for report in reports}
+    waits: dict[int, tuple[str, WaitingReason]] = {}
+    for vehicle, witness in sorted(_witnesses(merged, by_id, parameters, named).items()):
+        reasons = _waiting_of(witness, _seen(vehicle, epoch, by_id.values()), len(epoch) == 0, parameters)
+        if vehicle in named:
+            reasons = dict.fromkeys(witness.lonely, "named")
+        waits |= {voxel: (vehicle, reason) for voxel, reason in reasons.items()}
+    if not waits:
+        return GatedTile(merged)
+    return GatedTile(_without(epoch, merged, waits), _told(waits, merged, epoch, by_id))
+
+
+def _witnesses(
+    merged: MergedTile, by_id: Mapping[str, Report], parameters: ConfirmationParameters, named: frozenset[str]
+) -> dict[str, _Witness]:
+    """By vehicle, its part in the changes that won."""
+    drive = _drives(by_id.values(), parameters.second_drive_s, named)
+    lonely: dict[str, dict[int, tuple[Report, ...]]] = defaultdict(dict)
+    shared: Counter[str] = Counter()
+    for voxel, ids in merged.provenance.items():
+        vehicles = {by_id[one].vehicle for one in ids}
+        if len({drive[one] for one in ids}) == 1:
+            lonely[vehicles.pop()][voxel] = tuple(by_id[one] for one in ids)
+        else:
+            shared.update(vehicles)
+    return {vehicle: _Witness(own, shared[vehicle]) for vehicle, own in lonely.items()}
+
+
+def _drives(reports: Iterable[Report], second_drive_s: float, named: frozenset[str]) -> dict[str, tuple[str, int]]:
+    """Of each report, who saw the tile when: vehicle and number of its drive."""
+    found: dict[str, tuple[str, int]] = {}
+    number, until_ns, before = 0, 0, ""
+    for report in sorted(reports, key=lambda one: (one.vehicle, one.first_ns, one.report_id)):
+        if report.vehicle != before:
+            number, until_ns, before = 0, report.last_ns, report.vehicle
+        elif report.first_ns - until_ns >= second_drive_s * _NS_PER_S and report.vehicle not in named:
+            number += 1
+        until_ns = max(until_ns, report.last_ns)
+        found[report.report_id] = (report.vehicle, number)
+    return found
+
+
+def _waiting_of(
+    witness: _Witness, seen: int, is_new_ground: bool, parameters: ConfirmationParameters
+) -> dict[int, WaitingReason]:
+    """The lonely claims of one vehicle that wait, and why; none where others vouch for it in this tile."""
+    waits: dict[int, WaitingReason] = {}
+    if witness.shared >= max(VOUCHED_VOXELS, parameters.vouched_share * (witness.shared + len(witness.lonely))):
+        return waits
+    for voxel, reports in witness.lonely.items():
+        if all(report.is_doubtful for report in reports):
+            waits[voxel] = "doubtful"
+        elif all(report.pose_m2 > parameters.well_known_m**2 for report in reports):
+            waits[voxel] = "poses"
+    rest = witness.lonely.keys() - waits.keys()
+    if len(rest) > max(parameters.few_voxels, parameters.few_share * seen) and not is_new_ground:
+        waits |= dict.fromkeys(rest, "share")
+    return waits
+
+
+def _seen(vehicle: str, epoch: Gaussians, reports: Iterable[Report]) -> int:
+    """Voxels of the tile that a vehicle observed and that hold something, before or by its word."""
+    own = [report.change for report in reports if report.vehicle == vehicle]
+    before = [np.intersect1d(change.observed, epoch.voxel_id) for change in own]
+    return len(np.unique(np.concatenate([*before, *(change.changed.voxel_id for change in own)])))
+
+
+def _without(epoch: Gaussians, merged: MergedTile, waits: Mapping[int, object]) -> MergedTile:
+    """The merged tile with the voxels that wait as they are in the epoch."""
+    held = np.array(sorted(waits), np.int32)
+    now, was = merged.gaussians.select(held), epoch.select(held)
+    back = TileDelta(np.setdiff1d(now.voxel_id, was.voxel_id), was)
+    return MergedTile(
+        gaussians=apply(merged.gaussians, back),
+        changed=np.setdiff1d(merged.changed, held),
+        provenance={voxel: ids for voxel, ids in merged.provenance.items() if voxel not in waits},
+    )
+
+
+def _told(
+    waits: Mapping[int, tuple[str, WaitingReason]], merged: MergedTile, epoch: Gaussians, by_id: Mapping[str, Report]
+) -> tuple[Unconfirmed, ...]:
+    """What waits, by vehicle and reason."""
+    told: dict[tuple[str, WaitingReason], list[int]] = defaultdict(list)
+    for voxel, why in waits.items():
+        told[why].append(voxel)
+    return tuple(
+        Unconfirmed(
+            vehicle=vehicle,
+            report_ids=tuple(sorted({one for voxel in voxels for one in merged.provenance[voxel]})),
+            voxels=len(voxels),
+            seen=_seen(vehicle, epoch, by_id.values()),
+            reason=reason,
+        )
+        for (vehicle, reason), voxels in sorted(told.items())
+    )

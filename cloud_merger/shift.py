@@ -1,0 +1,270 @@
+"""Could the changes that a report claims be an error of the vehicle's poses? A test on its Gaussians alone.
+
+A vehicle whose poses are off by a few decimetres measures the unchanged world beside itself: walls seem to have moved,
+all by the same step. So the measured Gaussians of a report are laid back onto the base that it was compared with, by
+one small rigid motion over the ground (east, north, turn): a coarse search by votes of pairs of planes, then a robust
+point-to-plane fit (Chen and Medioni 1992; weights of Huber). The changes are explained by it where
+
+1. most of the Gaussians that fit nothing before fit afterwards (`gnd_map.similarity`), many more than by the same
+   motion in other directions, which is what chance gives, and
+2. the rest of the tile agrees: of the surfaces that such a motion would displace, most are not reported as unchanged.
+
+A pure function of a report and its base.
+"""
+
+from dataclasses import dataclass
+from math import cos, sin
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial import cKDTree
+
+from cloud_merger.errors import MergerError
+from gnd_map.gaussian import Gaussians
+from gnd_map.grid import VoxelGrid
+from gnd_map.similarity import similarity
+from schemas.changes import TileChange
+
+F64 = NDArray[np.float64]
+Mask = NDArray[np.bool_]
+
+MAX_GAUSSIANS: Final = 400  # of a report that are looked at, every second, third, ... where there are more
+_NEIGHBOURS: Final = 12  # base Gaussians that one is compared with
+_REACH_M: Final = 1.6  # beyond the largest shift
+_STEP_M: Final = 0.05  # of the search
+_ROUNDS: Final = 6
+_HUBER_M: Final = 0.05
+_FLAT: Final = 0.5  # of 0 (a ball) to 1 (a plane)
+_PARALLEL: Final = 0.95  # cosine
+_BESIDE_M: Final = 1.0  # Gaussians of one surface lie so near to each other
+_FAR_PER_M: Final = 0.05
+
+
+@dataclass(frozen=True, slots=True)
+class ShiftParameters:
+    """When changes are explained by a shift.
+
+    Attributes:
+        max_m: largest shift that is looked for, on each axis.
+        max_rad: largest turn.
+        least_gaussians: so many measured Gaussians that fit nothing must be there, or the test says nothing.
+        fits: similarity at which a Gaussian fits the base.
+        explained_share: of these Gaussians so many must fit after the shift, ...
+        beyond_chance: ... and so many more than after shifts of that size in other directions.
+        displaced_m: a surface that the shift moves by so much along its normal would have been found changed.
+        refuted_share: where more of these surfaces are reported unchanged, it was no shift.
+    """
+
+    max_m: float = 1.0
+    max_rad: float = 0.0175
+    least_gaussians: int = 12
+    fits: float = 0.5
+    explained_share: float = 0.65
+    beyond_chance: float = 0.3
+    displaced_m: float = 0.12
+    refuted_share: float = 0.5
+
+    def __post_init__(self) -> None:
+        for name in ("max_m", "max_rad", "displaced_m"):
+            if not 0 < getattr(self, name) <= 2:
+                raise MergerError(f"{name} must lie in (0, 2], got {getattr(self, name)}")
+        for name in ("fits", "explained_share", "beyond_chance", "refuted_share"):
+            if not 0 <= getattr(self, name) <= 1:
+                raise MergerError(f"{name} must lie in [0, 1], got {getattr(self, name)}")
+        if self.least_gaussians < 3:
+            raise MergerError(f"least_gaussians must be at least 3, got {self.least_gaussians}")
+
+
+@dataclass(frozen=True, slots=True)
+class Shift:
+    """What the test found; the motion lays the measurements onto the base: the vehicle's poses are off by its inverse.
+
+    Attributes:
+        is_explained: the changes are no changes.
+        gaussians: measured Gaussians that fitted nothing before.
+        fit: of these, share that fits after the shift.
+        chance: the same of shifts of that size in other directions.
+        unchanged: of the surfaces that the shift would have displaced, share that the report says is as in the base.
+        east_m, north_m: the shift at the tile's centre.
+        turn_rad: counter-clockwise seen from above, about the tile's centre.
+    """
+
+    is_explained: bool
+    gaussians: int
+    fit: float = 0.0
+    chance: float = 0.0
+    unchanged: float = 1.0
+    east_m: float = 0.0
+    north_m: float = 0.0
+    turn_rad: float = 0.0
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Surfaces:
+    """Gaussians in the tile's frame: places (N, 3), covariances (N, 6), normals (N, 3), how flat (N,) 0 … 1."""
+
+    place_m: F64
+    cov_m2: F64
+    normal: F64
+    flat: F64
+
+    @classmethod
+    def of(cls, grid: VoxelGrid, gaussians: Gaussians) -> "_Surfaces":
+        place = grid.centre_m(gaussians.voxel_id) + gaussians.mean_m.astype(np.float64)
+        value, vector = np.linalg.eigh(gaussians.full_cov())
+        flat = 1.0 - np.sqrt(np.maximum(value[:, 0], 0.0) / np.maximum(value[:, 1], 1e-9))
+        return cls(place.reshape(-1, 3), gaussians.cov_m2.astype(np.float64), vector[:, :, 0], flat)
+
+    @property
+    def is_upright(self) -> Mask:
+        """(N,) walls and the like."""
+        return np.asarray((self.flat > _FLAT) & (np.abs(self.normal[:, 2]) < 0.5))
+
+    def take(self, index: NDArray[np.int64] | Mask) -> "_Surfaces":
+        return _Surfaces(self.place_m[index], self.cov_m2[index], self.normal[index], self.flat[index])
+
+
+def shift_of(change: TileChange, base: Gaussians, parameters: ShiftParameters | None = None) -> Shift:
+    """Test whether a small shift explains what a report says about a tile.
+
+    Args:
+        change: the report's part about the tile. Gaussians that were not asked for take no part.
+        base: the tile's Gaussians that the vehicle compared with.
+        parameters: see `ShiftParameters`.
+    """
+    parameters = parameters or ShiftParameters()
+    grid = VoxelGrid.of(change.tile)
+    there = change.changed.take(change.changed.exists)
+    if len(there) < parameters.least_gaussians or len(base) < parameters.least_gaussians:
+        return Shift(False, len(there))
+    surfaces, known = _Surfaces.of(grid, _thinned(there)), _Surfaces.of(grid, base)
+    tree = cKDTree(known.place_m)
+    strange = surfaces.take(~_fits(surfaces, known, tree, np.zeros(3), parameters))
+    if len(strange.place_m) < parameters.least_gaussians:
+        return Shift(False, len(strange.place_m))
+    is_seen, is_changed = (np.isin(base.voxel_id, ids) for ids in (change.observed, change.changed.voxel_id))
+    begin = _searched(strange, known.take(is_seen & ~is_changed), known, tree, parameters)
+    motion = _refined(begin, strange, known, tree, parameters)
+    fit = float(_fits(strange, known, tree, motion, parameters).mean())
+    others = [_fits(strange, known, tree, other, parameters).mean() for other in _elsewhere(motion)]
+    chance = float(np.mean(others))
+    unchanged = _unchanged(known.take(is_seen), is_changed[is_seen], motion, parameters)
+    is_explained = (
+        fit >= parameters.explained_share
+        and fit - chance >= parameters.beyond_chance
+        and unchanged <= parameters.refuted_share
+    )
+    return Shift(is_explained, len(strange.place_m), fit, chance, unchanged, *motion.tolist())
+
+
+def _thinned(gaussians: Gaussians) -> Gaussians:
+    return gaussians.take(np.arange(0, len(gaussians), -(-len(gaussians) // MAX_GAUSSIANS)))
+
+
+def moved(place_m: F64, motion: F64) -> F64:
+    """(N, 3) places after a motion (east, north, turn)."""
+    c, s = cos(motion[2]), sin(motion[2])
+    x, y, z = place_m.T
+    return np.stack([c * x - s * y + motion[0], s * x + c * y + motion[1], z], axis=1)
+
+
+def _fits(surfaces: _Surfaces, known: _Surfaces, tree: cKDTree, motion: F64, parameters: ShiftParameters) -> Mask:
+    """(N,) whether a surface, moved, is like one of the base Gaussians around it.
+
+    Along a surface its mean lies where the voxel has cut it, so only what the means differ by along the base's normal
+    counts; the turn of at most a degree is left out of the covariances.
+    """
+    place = moved(surfaces.place_m, motion)
+    row, other = _pairs(place, tree)
+    step = place[row] - known.place_m[other]
+    normal = known.normal[other]
+    along = np.einsum("ni,ni->n", step, normal)[:, None] * normal
+    step = np.where((known.flat[other] > _FLAT)[:, None], along, step)
+    yes = np.ones(len(row), bool)
+    alike = similarity(yes, np.zeros_like(step), known.cov_m2[other], yes, step, surfaces.cov_m2[row])
+    return np.bincount(row, weights=alike >= parameters.fits, minlength=len(place)) > 0
+
+
+def _pairs(place: F64, tree: cKDTree) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """Each place with the base Gaussians nearest to it, within a metre: rows, base rows."""
+    distance, at = tree.query(place, k=_NEIGHBOURS, distance_upper_bound=_BESIDE_M)
+    row, column = np.nonzero(np.isfinite(distance))
+    return row, at[row, column]
+
+
+def _searched(
+    surfaces: _Surfaces, unchanged: _Surfaces, known: _Surfaces, tree: cKDTree, parameters: ShiftParameters
+) -> F64:
+    """The shift (east, north, 0) that most upright planes agree on.
+
+    Each pair of parallel planes votes for the shifts that lay one into the other, each surface that is reported
+    unchanged against those that would displace it: along a straight street nothing else would tell how far. Of shifts
+    that are as good the smallest.
+    """
+    axis = np.arange(-parameters.max_m, parameters.max_m + _STEP_M / 2, _STEP_M)
+    steps = np.stack([values.ravel() for values in np.meshgrid(axis, axis)])
+    upright = surfaces.take(surfaces.is_upright)
+    votes = np.zeros(steps.shape[1])
+    for k, near in enumerate(tree.query_ball_point(upright.place_m, _REACH_M)):
+        other = known.take(np.array(sorted(near), np.int64))
+        other = other.take((other.flat > _FLAT) & (np.abs(other.normal @ upright.normal[k]) > _PARALLEL))
+        apart = other.place_m - upright.place_m[k]
+        off = np.einsum("ni,ni->n", apart, other.normal)[:, None] - other.normal[:, :2] @ steps
+        beside = np.hypot(apart[:, :1] - steps[0], apart[:, 1:2] - steps[1]) < _BESIDE_M
+        votes += ((np.abs(off) < _STEP_M) & beside & (np.abs(apart[:, 2:]) < _BESIDE_M)).any(axis=0)
+    still = unchanged.take(unchanged.is_upright)
+    against = (np.abs(still.normal[:, :2] @ steps) > parameters.displaced_m).sum(axis=0)
+    score = votes / max(len(upright.place_m), 1) - against / max(len(still.place_m), 1)
+    score -= _FAR_PER_M * np.hypot(*steps)
+    best = np.lexsort((steps[1], steps[0], -score))[0]
+    return np.array([*steps[:, best], 0.0])
+
+
+def _refined(begin: F64, surfaces: _Surfaces, known: _Surfaces, tree: cKDTree, parameters: ShiftParameters) -> F64:
+    """The motion after a few rounds of robust point-to-plane least squares, within the limits.
+
+    One more measurement says that it is where it began: what no surface constrains, along a straight wall, stays there.
+    """
+    motion, prior = begin, np.diag([1.0, 1.0, (_HUBER_M / parameters.max_rad) ** 2])
+    for _ in range(_ROUNDS):
+        place = moved(surfaces.place_m, motion)
+        row, other, off = _nearest_planes(place, surfaces, known, tree)
+        if len(row) < parameters.least_gaussians // 2:
+            break
+        normal, arm = known.normal[other], place[row]
+        jacobian = np.stack([normal[:, 0], normal[:, 1], normal[:, 1] * arm[:, 0] - normal[:, 0] * arm[:, 1]], axis=1)
+        weight = np.minimum(1.0, _HUBER_M / np.maximum(np.abs(off), 1e-9))
+        matrix = jacobian.T @ (weight[:, None] * jacobian) + prior
+        motion = motion + np.linalg.solve(matrix, -jacobian.T @ (weight * off) - prior @ (motion - begin))
+    limit = np.array([parameters.max_m, parameters.max_m, parameters.max_rad])
+    return np.asarray(np.clip(motion, -limit, limit))
+
+
+def _nearest_planes(
+    place: F64, surfaces: _Surfaces, known: _Surfaces, tree: cKDTree
+) -> tuple[NDArray[np.int64], NDArray[np.int64], F64]:
+    """Of each place the parallel plane nearest along its normal: rows, base rows, signed distances."""
+    row, other = _pairs(place, tree)
+    parallel = np.abs(np.einsum("ni,ni->n", surfaces.normal[row], known.normal[other])) > _PARALLEL
+    parallel &= (known.flat[other] > _FLAT) & (surfaces.flat[row] > _FLAT)
+    row, other = row[parallel], other[parallel]
+    off = np.einsum("ni,ni->n", place[row] - known.place_m[other], known.normal[other])
+    near = np.abs(off) < 0.3
+    row, other, off = row[near], other[near], off[near]
+    order = np.lexsort((other, np.abs(off), row))
+    first = order[np.unique(row[order], return_index=True)[1]]
+    return row[first], other[first], off[first]
+
+
+def _elsewhere(motion: F64) -> list[F64]:
+    """The same step towards the three other sides, turned the other way."""
+    x, y, turn = motion.tolist()
+    return [np.array([-y, x, -turn]), np.array([-x, -y, -turn]), np.array([y, -x, -turn])]
+
+
+def _unchanged(seen: _Surfaces, is_changed: Mask, motion: F64, parameters: ShiftParameters) -> float:
+    """Of the observed surfaces that the motion would have displaced, the share reported unchanged; 0 of none."""
+    step = moved(seen.place_m, motion) - seen.place_m
+    displaced = (np.abs(np.einsum("ni,ni->n", step, seen.normal)) > parameters.displaced_m) & (seen.flat > _FLAT)
+    return float((~is_changed)[displaced].mean()) if displaced.any() else 0.0

@@ -1,0 +1,108 @@
+"""`gnd map`: the commands of the store, and `build`, which needs the vehicle's segmentation and localisation."""
+
+from pathlib import Path
+from typing import Any, Final
+
+import click
+from rich.console import Console
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TaskID, TextColumn, TimeElapsedColumn
+
+from tile_store import tables
+from tile_store.cli import PATH, json_option, layer_option, show, store_to_fill
+from tile_store.cli import map_group as store_group
+from tile_store.values import DEFAULT_CODEC, MAP_CODECS
+
+CODEC_HELP: Final = "How finely Gaussians are rounded."
+REFINE_HELP: Final = (
+    "Close loops and tie poses to GNSS: auto, where passes meet and disagree; always; or never, for surveyed poses."
+)
+MODES: Final = ("auto", "always", "never")
+
+
+@click.command(short_help="Build a map from drives with known poses.")
+@click.argument("drives", nargs=-1, required=True, type=PATH)
+@click.option("--store", "-o", "path", required=True, type=PATH, help="The store; it is made when missing.")
+@click.option("--codec", default=DEFAULT_CODEC, show_default=True, type=click.Choice(MAP_CODECS), help=CODEC_HELP)
+@click.option("--keep-movers", is_flag=True, help="What moves, and the vehicle itself, stay in the map.")
+@click.option("--refine-poses", "refine", default="auto", show_default=True, type=click.Choice(MODES), help=REFINE_HELP)
+@click.option("--report", type=PATH, help="Write what the map is worth as a page (one HTML file).")
+@layer_option
+@json_option
+def build(
+    drives: tuple[Path, ...],
+    path: Path,
+    codec: str,
+    keep_movers: bool,
+    refine: Any,
+    report: Path | None,
+    layer: str,
+    as_json: bool,
+) -> None:
+    """Build tiles from DRIVES (MCAP, with reference poses) and put them into a store as a new base.
+
+    What moves and the vehicle's own bodywork are left out. Where a place is passed twice and the passes disagree, as
+    poses from odometry do, loops are closed first; several drives become one map. What is out of bounds is said.
+    """
+    # loaded here: they load numba, gtsam and matplotlib, which the other commands do without
+    from deploy.map_page import check_writable, write_map_page
+    from vehicle_agent.map_build.build import build_recorded_map
+    from vehicle_agent.map_build.quality import measure
+    from vehicle_agent.map_build.result import summary
+
+    if report is not None:
+        check_writable(report)
+    with store_to_fill(path) as opened, _bars() as bars:
+        built = build_recorded_map(
+            drives, opened, layer=layer, codec=codec, keep_movers=keep_movers, refine=refine, progress=_Shown(bars)
+        )
+    quality = measure(built)
+    if report is not None:
+        write_map_page(report, path.name, built, quality)
+    values = summary(built, quality)
+    show(values, as_json, lambda console: _print(console, f"{path}, layer {layer}", values))
+    if report is not None and not as_json:
+        click.echo(f"page written: {report}")
+
+
+def _print(console: Console, title: str, values: dict[str, Any]) -> None:
+    """The figures as a table, what was done about the poses, and the warnings."""
+    plain = {name: value for name, value in values.items() if not isinstance(value, dict | list)}
+    missing = values["scans_without_pose"]
+    if missing:
+        plain["scans_skipped"] = ", ".join(f"{n} {reason}" for reason, n in missing.items())
+    quality, drift = values["quality"], values["poses"]["after"] or values["poses"]["before"]
+    plain["doubled walls of 1,000"] = f"{quality['doubled_walls']['per_thousand']:.1f}"
+    plain["doubled road of 1,000"] = f"{quality['doubled_road']['per_thousand']:.1f}"
+    plain["thickness of planes"] = f"{100 * quality['plane_sd_m']['p50']:.1f} cm (median sd)"
+    plain["poses"] = f"{'refined' if values['poses']['refined'] else 'kept'}: {values['poses']['reason']}"
+    if drift:
+        plain["passes off each other"] = (
+            f"{100 * drift['horizontal_m']:.1f} cm, {drift['angle_deg']:.2f} degrees "
+            f"(median of {drift['loops']} places)"
+        )
+    console.print(tables.fields(title, plain))
+    for warning in values["warnings"]:
+        console.print(f"warning: {warning}", style="yellow", highlight=False)
+
+
+class _Shown:
+    """A progress bar a step and drive."""
+
+    def __init__(self, bars: Progress) -> None:
+        self._bars = bars
+        self._tasks: dict[str, TaskID] = {}
+
+    def __call__(self, step: str, done: int, total: int) -> None:
+        if step not in self._tasks:
+            self._tasks[step] = self._bars.add_task(step, total=total)
+        self._bars.update(self._tasks[step], completed=done)
+
+
+def _bars() -> Progress:
+    columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn())
+    return Progress(*columns, TimeElapsedColumn(), console=Console(stderr=True))
+
+
+map_group = click.Group(
+    "map", commands=[build, *store_group.commands.values()], help="Build, inspect, compare, export and roll back maps."
+)

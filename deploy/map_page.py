@@ -1,0 +1,195 @@
+"""The quality of a map as one HTML file: no script, nothing from elsewhere, readable on a phone, light and dark."""
+
+import base64
+import contextlib
+import os
+from collections.abc import Iterable, Sequence
+from html import escape
+from pathlib import Path
+from typing import Any, Final
+
+from deploy.errors import PageError
+from deploy.map_page_pictures import height_picture, map_picture, thickness_picture
+from deploy.traffic_page_style import STYLE
+from vehicle_agent.map_build.build import BuiltMap
+from vehicle_agent.map_build.quality import MOST_DOUBLED_ROAD, MOST_DOUBLED_WALLS, MOST_THICK_M, Quality
+from vehicle_agent.map_build.refine_poses import PassDrift
+from vehicle_agent.map_build.result import summary
+
+_MORE_STYLE: Final = """
+figure img{display:block;width:100%;max-width:52rem;height:auto;border-radius:.5rem;background:#fff}
+ul.warn{margin:.5rem 0;padding:0;list-style:none}
+ul.warn li{border-left:.3rem solid #d1433f;background:var(--card);padding:.5rem .8rem;margin:.4rem 0;
+border-radius:.3rem}
+p.fine{border-left:.3rem solid var(--down);background:var(--card);padding:.5rem .8rem;border-radius:.3rem}
+td.t{white-space:normal}
+"""
+_HEAD: Final = """<meta charset="utf-8"><meta name="viewport" content="width=device-width, initial-scale=1">
+<meta name="color-scheme" content="light dark">"""
+_DOUBLE: Final = f"""<p>A surface is doubled when two thin layers of points lie side by side, 0.2 to 1 m apart, over
+most of a voxel: what two passes leave whose poses disagree. Some are real (a sign before a wall, a bonnet
+over the road); more than {MOST_DOUBLED_WALLS:.0f} of 1,000 walls or {MOST_DOUBLED_ROAD:.0f} of 1,000 pieces of road are
+not. Layers nearer than 0.2 m show as thick planes: a median above
+{100 * MOST_THICK_M:.0f} cm is out of bounds.</p>"""
+
+
+def page(title: str, built: BuiltMap, quality: Quality) -> str:
+    """The page of a map as HTML."""
+    told = summary(built, quality)
+    name = f"Map {escape(title)}"
+    body = "\n".join(
+        (
+            f"<header><h1>{name}</h1><p>{told['drives']} drives, {told['quality']['way_m'] / 1000:.2f} km, "
+            f"{told['scans']} scans, {told['tiles']} tiles, {told['gaussians']:,} voxels</p></header>",
+            _warnings(quality.warnings),
+            _cards(told),
+            _section("From above", _figure(map_picture(built, quality), "Planes by thickness, ways, doubled surfaces")),
+            _section("Doubled surfaces and thick planes", _DOUBLE + _surfaces(told["quality"])),
+            _section("", _figure(thickness_picture(quality), "Thickness of planes")),
+            _section("Poses", _poses(built)),
+            _section("By drive", _drives(told["by_drive"])),
+            _section("The LiDAR over the road", _figure(height_picture(built, quality), "Height along the way")),
+        )
+    )
+    return (
+        f'<!doctype html>\n<html lang="en"><head>{_HEAD}<title>{name}</title><style>{STYLE}{_MORE_STYLE}</style></head>'
+        f"\n<body><main>\n{body}\n</main></body></html>\n"
+    )
+
+
+def check_writable(path: Path) -> None:
+    """Refuse a place that cannot hold the page, before the long work.
+
+    Raises:
+        PageError: it is a folder, or lies in none.
+    """
+    if path.is_dir():
+        raise PageError(f"cannot write the page {path}: that is a folder, name a file in it")
+    if not path.parent.is_dir():
+        raise PageError(f"cannot write the page {path}: the folder {path.parent} does not exist")
+
+
+def write_map_page(path: Path, title: str, built: BuiltMap, quality: Quality) -> None:
+    """Write the page; an earlier one is replaced at once.
+
+    Raises:
+        PageError: the file cannot be written.
+    """
+    check_writable(path)
+    partial = path.with_name(f"{path.name}.{os.getpid()}.partial")
+    try:
+        partial.write_text(page(title, built, quality), encoding="utf-8")
+        partial.replace(path)
+    except OSError as error:
+        with contextlib.suppress(OSError):  # where nothing can be written nothing is left
+            partial.unlink()
+        raise PageError(f"cannot write the page {path}: {error.strerror}") from error
+
+
+def _warnings(warnings: Sequence[str]) -> str:
+    if not warnings:
+        return '<p class="fine">Nothing is out of bounds.</p>'
+    return f'<ul class="warn">{"".join(f"<li>{escape(one)}</li>" for one in warnings)}</ul>'
+
+
+def _cards(told: dict[str, Any]) -> str:
+    quality, points = told["quality"], sum(one["points"] for one in told["by_drive"])
+    drift = told["poses"]["after"] or told["poses"]["before"]
+    off = f"{100 * drift['horizontal_m']:.1f} cm" if drift else "one pass"
+    rows = (
+        (f"{quality['doubled_walls']['per_thousand']:.1f}", "doubled of 1,000 walls"),
+        (f"{quality['doubled_road']['per_thousand']:.1f}", "doubled of 1,000 pieces of road"),
+        (f"{100 * quality['plane_sd_m']['p50']:.1f} cm", "thickness of planes (median sd)"),
+        (off, "passes off each other (median)"),
+        (_share(told["points_of_movers"], points), "points left out as moving"),
+        (_share(told["points_of_bodywork"], points), "points left out as the vehicle itself"),
+        (_share(told["scans_skipped"], told["scans"] + told["scans_skipped"]), "scans without a pose"),
+        (f"{quality['voxels_with_points']:,}", f"voxels with points, {told['gaussians']:,} dense enough"),
+    )
+    return f'<ul class="cards">{"".join(f"<li><b>{value}</b><span>{what}</span></li>" for value, what in rows)}</ul>'
+
+
+def _surfaces(quality: dict[str, Any]) -> str:
+    rows = []
+    for name, key in (("walls", "doubled_walls"), ("road", "doubled_road")):
+        one = quality[key]
+        apart = "" if one["apart_m_p50"] is None else f"{one['apart_m_p50']:.2f} m"
+        rows.append((name, f"{one['surfaces']:,}", f"{one['doubled']:,}", f"{one['per_thousand']:.1f}", apart))
+    return _table(("", "surfaces", "doubled", "of 1,000", "apart (median)"), rows)
+
+
+def _poses(built: BuiltMap) -> str:
+    poses = built.poses
+    done = "refined in a graph" if poses.refined else "kept as they were"
+    text = f"<p>The poses were {done}: {escape(poses.reason)}.</p>"
+    if poses.candidates is not None:
+        tried = poses.candidates
+        text += (
+            f"<p>{tried.tried} pairs of places were compared: {tried.found} sure loops, {tried.poor} fit badly, "
+            f"{tried.ambiguous} fit in two places, {tried.one_way} only one way, {tried.alone} had no neighbour that "
+            f"agreed; the graph left out {poses.loops_left_out} loops and {poses.fixes_left_out} of {poses.fixes} GNSS "
+            f"fixes, and moved places by up to {poses.moved_m:.2f} m.</p>"
+        )
+    rows = [_drift(name, drift) for name, drift in (("before", poses.before), ("after", poses.after)) if drift]
+    header = ("passes off each other", "places", "horizontal", "95 %", "height", "angle", "95 %")
+    return text + (_table(header, rows) if rows else "")
+
+
+def _drift(name: str, drift: PassDrift) -> tuple[str, ...]:
+    return (
+        name,
+        str(drift.loops),
+        f"{100 * drift.horizontal_m:.1f} cm",
+        f"{100 * drift.horizontal_p95_m:.1f} cm",
+        f"{100 * drift.vertical_m:.1f} cm",
+        f"{drift.angle_deg:.2f}°",
+        f"{drift.angle_p95_deg:.2f}°",
+    )
+
+
+def _drives(drives: Sequence[dict[str, Any]]) -> str:
+    rows = []
+    for one in drives:
+        mount, missing = one["mount"], one["scans_without_pose"]
+        seen = "not seen" if mount["seen_m"] is None else f"{mount['seen_m']:.2f} m"
+        why = ", ".join(f"{n} {reason}" for reason, n in missing.items()) or "none"
+        rows.append(
+            (
+                one["drive"],
+                f"{one['way_m']:.0f} m",
+                str(one["scans"]),
+                why,
+                _share(one["points_of_movers"], one["points"]),
+                _share(one["points_of_bodywork"], one["points"]),
+                f"{mount['header_m']:.2f} m",
+                seen,
+            )
+        )
+    header = ("drive", "way", "scans", "without pose", "movers", "bodywork", "LiDAR over road, header", "seen")
+    return _table(header, rows)
+
+
+def _share(part: int, whole: int) -> str:
+    return f"{100 * part / max(whole, 1):.2f} %"
+
+
+def _table(header: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
+    head = "".join(f"<th{' class=t' if n == 0 else ''}>{escape(one)}</th>" for n, one in enumerate(header))
+    body = "".join(
+        "<tr>" + "".join(f"<td{' class=t' if n == 0 else ''}>{escape(one)}</td>" for n, one in enumerate(row)) + "</tr>"
+        for row in rows
+    )
+    return f'<div class="wide"><table><thead><tr>{head}</tr></thead><tbody>{body}</tbody></table></div>'
+
+
+def _figure(png: bytes, caption: str) -> str:
+    data = base64.b64encode(png).decode()
+    return (
+        f'<figure><img alt="{escape(caption)}" src="data:image/png;base64,{data}">'
+        f"<figcaption>{escape(caption)}</figcaption></figure>"
+    )
+
+
+def _section(title: str, content: str) -> str:
+    head = f"<h2>{title}</h2>\n" if title else ""
+    return f"<section>{head}{content}</section>"

@@ -1,0 +1,92 @@
+"""The accounts of vehicles in SQLite: each function runs inside the caller's transaction."""
+
+from collections.abc import Iterable, Sequence
+from math import radians
+from statistics import fmean, pstdev
+from typing import Any, Final
+
+import apsw
+
+from gnd_map.tile_id import TileId
+from tile_store.sqlite_connection import Row, change, fetch
+from tile_store.values import CourseSaid, ShiftTest, VehicleAccount
+
+NEWEST_TESTS: Final = 40
+"""So many of a vehicle's newest tests count: a vehicle that was repaired is trusted again."""
+NAMED_TESTS: Final = 3
+"""A vehicle counts as shifted after so many explained tests, ..."""
+NAMED_SHARE: Final = 0.5
+"""... if they are so many of all that could be made. Honest vehicles have one here and there, where a facade moved."""
+TURNED_RAD: Final = radians(0.2)
+"""A course that runs so much beside the heading is a mount that is off, ..."""
+TURNED_SIGMAS: Final = 4.0
+"""... if it is so many of its standard deviations."""
+
+
+def put_courses(c: apsw.Connection, layer: str, tile: TileId, courses: Iterable[CourseSaid]) -> None:
+    """Enter what the reports of a tile say of their vehicles' courses."""
+    for said in courses:
+        told = {name: getattr(said, name) for name in CourseSaid.__slots__}
+        change(c, "put_course", told | {"layer": layer, "tile": tile.morton})
+
+
+def put_tests(c: apsw.Connection, layer: str, tile: TileId, tests: Iterable[ShiftTest], timing: dict[str, Any]) -> None:
+    """Enter the tests of a tile into the accounts of their vehicles. Where that puts a vehicle
+    among the shifted ones, or takes it out, all tiles that it has reported about are merged again.
+    """
+    vehicles = set()
+    for test in tests:
+        told = {name: getattr(test, name) for name in ShiftTest.__slots__ if name != "is_explained"}
+        change(c, "put_shift_test", told | {"layer": layer, "tile": tile.morton, "explained": int(test.is_explained)})
+        vehicles.add(test.vehicle)
+    known = shifted_vehicles(c)
+    for vehicle in sorted(vehicles):
+        if account(c, vehicle).is_shifted != (vehicle in known):
+            what = "trust_vehicle" if vehicle in known else "distrust_vehicle"
+            change(c, what, {"vehicle": vehicle, "since_ns": timing["now"]})
+            for one_layer, one_tile in fetch(c, "tiles_of_vehicle", {"vehicle": vehicle}):
+                change(c, "mark_dirty", {"layer": one_layer, "tile": one_tile} | timing)
+
+
+def shifted_vehicles(c: apsw.Connection) -> frozenset[str]:
+    """The vehicles whose reports are shifted again and again."""
+    return frozenset(vehicle for (vehicle,) in fetch(c, "shifted_vehicles"))
+
+
+def accounts(c: apsw.Connection) -> list[VehicleAccount]:
+    """Of all vehicles of which there is anything to tell."""
+    return [account(c, vehicle) for (vehicle,) in fetch(c, "accounted_vehicles")]
+
+
+def account(c: apsw.Connection, vehicle: str) -> VehicleAccount:
+    """What the newest tests of a vehicle say."""
+    rows = fetch(c, "shift_tests_of_vehicle", {"vehicle": vehicle, "n": NEWEST_TESTS})
+    shifts = [row[1:] for row in rows if row[0]]
+    courses = fetch(c, "courses_of_vehicle", {"vehicle": vehicle, "n": NEWEST_TESTS})
+    along = [row for row in shifts if row[2] is not None]
+    return VehicleAccount(
+        vehicle=vehicle,
+        tested=len(rows),
+        explained=len(shifts),
+        length_m=_mean(shifts, 0) or 0.0,
+        length_sd_m=pstdev([row[0] for row in shifts]) if shifts else 0.0,
+        turn_rad=_mean(shifts, 1) or 0.0,
+        forward_m=_mean(along, 2),
+        left_m=_mean(along, 3),
+        course_tiles=len(courses),
+        course_rad=_mean(courses, 0) or 0.0,
+        course_sigma_rad=_mean(courses, 1) or 0.0,
+        is_turned=_is_turned(courses),
+        is_shifted=len(shifts) >= NAMED_TESTS and len(shifts) >= NAMED_SHARE * len(rows),
+    )
+
+
+def _is_turned(courses: Sequence[Row]) -> bool:
+    """Whether the course runs beside the heading by more than any mount is off that was ever set right."""
+    turn_rad, sigma_rad = _mean(courses, 0) or 0.0, _mean(courses, 1) or 0.0
+    return abs(turn_rad) > max(TURNED_RAD, TURNED_SIGMAS * sigma_rad)
+
+
+def _mean(rows: Iterable[Row], column: int) -> float | None:
+    values = [row[column] for row in rows]
+    return fmean(values) if values else None

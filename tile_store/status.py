@@ -1,0 +1,131 @@
+"""`gnd map status`: what a map is waiting for."""
+
+import json
+from dataclasses import asdict
+from datetime import UTC, datetime
+from math import degrees
+from pathlib import Path
+from typing import Any, Final
+
+import click
+from rich.console import Console
+from rich.table import Table
+
+from tile_store.sqlite_store import SqliteStore
+from tile_store.store import Store
+from tile_store.values import VehicleAccount, WaitingReason
+
+WORDS: Final[dict[WaitingReason, str]] = {
+    "share": "more of the tile than one vehicle is believed",
+    "poses": "its poses were known poorly",
+    "doubtful": "the vehicle doubts it itself",
+    "shift": "a shift of its poses explains it",
+    "named": "its reports are shifted again and again",
+}
+
+
+@click.command(short_help="What the map waits for: confirmation, merging, people.")
+@click.argument("path", metavar="STORE", type=click.Path(path_type=Path))
+@click.option("--json", "as_json", is_flag=True, help="Print JSON instead of tables.")
+def status(path: Path, as_json: bool) -> None:
+    """What STORE waits for: unconfirmed changes, vehicles to be checked, tiles to merge, refused messages."""
+    with SqliteStore(path, create=False) as store:
+        values = status_of(store)
+    if as_json:
+        click.echo(json.dumps(values, indent=1))
+    else:
+        print_status(Console(width=120), str(path), values)
+
+
+def status_of(store: Store) -> dict[str, Any]:
+    """All that waits, in plain values: `waiting_for_confirmation`, `named_vehicles`, `to_merge`, `quarantined`."""
+    claims = [asdict(one) | {"tile": one.tile.path} for one in store.waiting_changes()]
+    return {
+        "waiting_for_confirmation": waiting_totals(store) | {"claims": claims},
+        "named_vehicles": named_vehicles(store),
+        "to_merge": [asdict(one) | {"tile": one.tile.path} for one in store.dirty_tiles()],
+        "quarantined": store.counts().quarantined,
+    }
+
+
+def waiting_totals(store: Store) -> dict[str, int]:
+    """How many tiles and voxels wait for a second witness; a voxel counts once for each vehicle that claims it."""
+    waiting = store.waiting_changes()
+    tiles = {(one.layer, one.tile) for one in waiting}
+    return {"tiles": len(tiles), "voxels": sum(one.voxels for one in waiting)}
+
+
+def named_vehicles(store: Store) -> list[dict[str, Any]]:
+    """The vehicles that somebody should look at: their accounts, and one line that tells why."""
+    return [asdict(one) | {"says": naming_line(one)} for one in store.vehicle_accounts() if one.is_named]
+
+
+def naming_line(account: VehicleAccount) -> str:
+    """Such as "vehicle v3: 17 of 20 tiles explained by a shift of 0.31 m (0.30 m left), 0.5°: check its mount"."""
+    says = []
+    if account.is_shifted:
+        shift = (
+            f"{account.length_m:.2f} ± {account.length_sd_m:.2f} m{_along(account)}, {degrees(account.turn_rad):.1f}°"
+        )
+        says.append(f"{account.explained} of {account.tested} tiles explained by a shift of {shift}")
+    if account.is_turned:
+        turn = f"{abs(degrees(account.course_rad)):.2f} ± {degrees(account.course_sigma_rad):.2f}°"
+        side = "left" if account.course_rad > 0 else "right"
+        says.append(
+            f"drives {turn} to the {side} of its own heading, by its reports about {account.course_tiles} tiles"
+        )
+    return f"vehicle {account.vehicle}: {'; '.join(says)}: check its mount"
+
+
+def _along(account: VehicleAccount) -> str:
+    if account.forward_m is None or account.left_m is None:
+        return ""
+    sides = (_side(account.forward_m, "forward", "back"), _side(account.left_m, "left", "right"))
+    return f" ({', '.join(sides)})"
+
+
+def _side(length_m: float, ahead: str, behind: str) -> str:
+    return f"{abs(length_m):.2f} m {ahead if length_m >= 0 else behind}"
+
+
+def print_status(console: Console, title: str, values: dict[str, Any]) -> None:
+    """One table for each thing that waits, and one line where nothing does."""
+    waiting, to_merge, named = values["waiting_for_confirmation"], values["to_merge"], values["named_vehicles"]
+    for one in named:
+        console.print(one["says"], highlight=False, soft_wrap=True)
+    if waiting["claims"]:
+        console.print(_waiting_table(waiting))
+    if to_merge:
+        console.print(_merge_table(to_merge))
+    if values["quarantined"]:
+        line = f"{values['quarantined']} messages in quarantine: see `gnd map quarantine`"
+        console.print(line, highlight=False, soft_wrap=True)
+    if not (named or waiting["claims"] or to_merge or values["quarantined"]):
+        console.print(
+            f"{title}: all reports merged, nothing waits for confirmation, none refused",
+            highlight=False,
+            soft_wrap=True,
+        )
+
+
+def _waiting_table(waiting: dict[str, Any]) -> Table:
+    title = (
+        f"waiting for confirmation by a second vehicle or drive: {waiting['voxels']} voxels in {waiting['tiles']} tiles"
+    )
+    table = Table("layer", "tile", "vehicle", "voxels", "of seen", "since (UTC)", "because", title=title)
+    for one in waiting["claims"]:
+        numbers = (str(one["voxels"]), str(one["seen"]), _time(one["since_ns"]))
+        table.add_row(one["layer"], one["tile"], one["vehicle"], *numbers, WORDS.get(one["reason"], one["reason"]))
+    return table
+
+
+def _merge_table(to_merge: list[dict[str, Any]]) -> Table:
+    table = Table("layer", "tile", "reports", "attempts", "", title=f"{len(to_merge)} tiles to merge")
+    for one in to_merge:
+        numbers = (str(one["reports"]), str(one["attempts"]))
+        table.add_row(one["layer"], one["tile"], *numbers, "at work" if one["is_leased"] else "")
+    return table
+
+
+def _time(t_ns: int) -> str:
+    return datetime.fromtimestamp(t_ns / 1e9, UTC).strftime("%Y-%m-%d %H:%M:%S")

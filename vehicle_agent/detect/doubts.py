@@ -1,0 +1,165 @@
+"""What speaks against believing a tile: counted scan by scan while it is seen, said when it is decided."""
+
+from collections.abc import Collection
+from dataclasses import dataclass, field
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from gnd_map.arrays import F64
+from gnd_map.classes import ChangeClass
+from gnd_map.gaussian import Gaussians
+from gnd_map.grid import GridFrame
+from gnd_map.tile import Tile
+from gnd_map.tile_id import TileId
+from schemas.changes import TileChange
+from schemas.doubt import Doubt, DoubtReason
+from vehicle_agent.detect.classify import Classification
+from vehicle_agent.detect.shift import Shift, no_shift
+from vehicle_agent.detect.trial import Tried
+from vehicle_agent.detect.uncertainty import PoseUncertainty
+
+BAD_SHARE: Final = 0.1
+"""From this share of scans with poor health, or that disagree, a tile is doubtful."""
+UNCHECKED_SHARE: Final = 0.5
+IMPLAUSIBLE_SHARE: Final = 0.6
+"""Of the voxels that hold something. A tile has no time of its own, so time cannot excuse more: a building site leaves
+the road and what lies around it (docs/decisions/0082-the-gate-on-the-vehicle.md)."""
+LEAST_OF_SHARE: Final = 50
+"""So many voxels must hold something before their share says anything."""
+LEAST_WITHHELD: Final = 5
+"""A tile of which so few voxels were seen from a wrong pose is not worth a word."""
+_PERMILLE: Final = 1000
+_LONGEST_MM: Final = 100_000
+
+
+@dataclass(slots=True)
+class Account:
+    """Scans that saw a tile, by what became of them."""
+
+    scans: dict[str, int] = field(default_factory=dict)
+    shift: Shift | None = None
+    """The largest that a pose error was found by."""
+    withheld: set[int] = field(default_factory=set)
+    """Voxels that seemed to have changed in scans of a wrong pose."""
+    pose: PoseUncertainty = field(default_factory=PoseUncertainty)
+    explained: bool = False
+    """Most of what changed in the tile is explained by `shift`."""
+    off: bool = False
+    """Some of it is."""
+
+    def add(self, what: str, scans: int) -> None:
+        """Count scans under what became of them."""
+        self.scans[what] = self.scans.get(what, 0) + scans
+
+    def share(self, *what: str) -> float:
+        """Of all scans that saw the tile, 0 ... 1."""
+        return sum(self.scans.get(name, 0) for name in what) / max(sum(self.scans.values()), 1)
+
+
+class TileDoubts:
+    """Remembers of each tile which scans saw it and what was wrong with them, until the tile is decided."""
+
+    def __init__(self, grid_frame: GridFrame) -> None:
+        self._grid_frame = grid_frame
+        self._accounts: dict[TileId, Account] = {}
+
+    def tried(self, tried: Tried, costs: F64 | None) -> None:
+        """Take a segment; of one that is shifted, the cost of each of its points at the pose as it is."""
+        morton, voxel = self._tiles_of(tried.points_map_m)
+        for code in np.unique(morton).tolist():
+            account = self._accounts.setdefault(TileId(code), Account())
+            account.add(tried.verdict, tried.scans)
+            if costs is None:
+                continue
+            account.withheld |= set(voxel[(morton == code) & (costs > 0.5)].tolist())
+            if account.shift is None or tried.shift.size_m > account.shift.size_m:
+                account.shift, account.pose = tried.shift, tried.pose
+
+    def poor(self, points_map_m: F64, what: str) -> None:
+        """Take some points (N, 3) of a scan that is no evidence ("uncertain"), or whose estimates "disagree"."""
+        morton, _ = self._tiles_of(points_map_m)
+        for code in np.unique(morton).tolist():
+            self._accounts.setdefault(TileId(code), Account()).add(what, 1)
+
+    def tiles(self) -> tuple[TileId, ...]:
+        """Tiles in which a pose error was found."""
+        return tuple(sorted(t for t, account in self._accounts.items() if account.shift is not None))
+
+    def all_tiles(self) -> tuple[TileId, ...]:
+        """Tiles that anything is known of."""
+        return tuple(sorted(self._accounts))
+
+    def forget(self, tiles: Collection[TileId]) -> None:
+        """Tiles that are left and have nothing to decide."""
+        for tile in tiles:
+            self._accounts.pop(tile, None)
+
+    def take(self, tile: TileId) -> Account:
+        """What is known of a tile; forgotten here."""
+        return self._accounts.pop(tile, Account())
+
+    def _tiles_of(self, points_map_m: F64) -> tuple[NDArray[np.int64], NDArray[np.int32]]:
+        if not len(points_map_m):
+            return np.empty(0, np.int64), np.empty(0, np.int32)
+        A, b = self._grid_frame.affine(points_map_m.mean(axis=0))
+        return self._grid_frame.tile_voxel_of(np.floor(points_map_m @ A.T + b).astype(np.int64))
+
+
+def doubt_of(found: Classification, account: Account) -> Doubt | None:
+    """Why a tile that is told all the same is not fully believed; None where nothing speaks against it, or where
+    nothing has changed.
+    """
+    reasons, changed_share = DoubtReason.NONE, changed_share_of(found)
+    if not found.changed.any():
+        return None
+    if changed_share > IMPLAUSIBLE_SHARE:
+        reasons |= DoubtReason.IMPLAUSIBLE_SHARE
+    if account.off or account.share("uncertain", "shifted") >= BAD_SHARE:
+        reasons |= DoubtReason.HEALTH_NOT_GOOD
+    if account.share("disagree") >= BAD_SHARE:
+        reasons |= DoubtReason.ESTIMATES_DISAGREE
+    if account.share("unchecked") > UNCHECKED_SHARE:
+        reasons |= DoubtReason.POSE_NOT_CHECKED
+    return _doubt(reasons, account, changed_share) if reasons else None
+
+
+def changed_share_of(found: Classification) -> float:
+    """Of the voxels that hold something in the base or now, those that are changed; 0 where there are too few."""
+    changed = int(found.changed.sum())
+    holding = changed + int((found.change_class == ChangeClass.NORMAL).sum())
+    return changed / holding if holding >= LEAST_OF_SHARE else 0.0
+
+
+def withheld_change(base: Tile, account: Account, changed_share: float = 0.0) -> TileChange:
+    """A tile of which nothing is told, because a pose error explains what seems to have changed."""
+    nothing = Gaussians.empty()
+    return TileChange(
+        tile=base.tile_id,
+        base_version=base.version,
+        base_sha=base.sha if base.version else b"",
+        observed=nothing.voxel_id,
+        changed=nothing,
+        change_class=np.empty(0, np.uint8),
+        evidence=np.empty((0, 4), np.int32),
+        pose_sigma_m=account.pose.sigma_m,
+        pose_sigma_rad=account.pose.sigma_rad,
+        doubt=_doubt(DoubtReason.EXPLAINED_BY_SHIFT, account, changed_share, withheld=max(len(account.withheld), 1)),
+    )
+
+
+def _doubt(reasons: DoubtReason, account: Account, changed_share: float, withheld: int = 0) -> Doubt:
+    shift = account.shift or no_shift()
+    mm = np.clip(np.rint(shift.shift_m * 1e3), -_LONGEST_MM, _LONGEST_MM).astype(int).tolist()
+    return Doubt(
+        reasons=reasons,
+        withheld=withheld,
+        explained_permille=round(shift.explained_share * _PERMILLE),
+        changed_permille=round(changed_share * _PERMILLE),
+        uncertain_permille=round(account.share("uncertain", "shifted") * _PERMILLE),
+        forward_mm=mm[0],
+        left_mm=mm[1],
+        up_mm=mm[2],
+        turn_10urad=round(float(shift.turn_rad[2]) * 1e5),
+    )

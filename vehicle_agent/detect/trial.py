@@ -1,0 +1,195 @@
+"""Scans wait here until it is known that their poses were right: then they are evidence, else they are taken back.
+
+Scans are put together into short segments. A segment that is complete is asked whether a common shift lays it better
+onto the map (`shift`). It becomes evidence only after the segment behind it has passed, too: what was concluded since
+the last good moment is taken back when a pose turns out to be wrong, and after a wrong one two in a row must be good.
+"""
+
+from collections import Counter, deque
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from typing import Final, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from gnd_map.arrays import F32, F64
+from gnd_map.se3 import T_inverse, transform
+from vehicle_agent.detect.shift import Shift, ShiftParameters, find_shift
+from vehicle_agent.detect.uncertainty import PoseUncertainty
+from vehicle_agent.localise.estimates import PoseEstimate, RefinedScan
+from vehicle_agent.localise.level import sees_tilt
+from vehicle_agent.localise.match_map import MatchMapCache
+from vehicle_agent.localise.parameters import SamplingParameters
+from vehicle_agent.localise.sampling import sample_scan
+from vehicle_agent.segment.segmenter import SegmentedScan
+
+Verdict = Literal["good", "shifted", "unchecked"]
+
+SEGMENT_NS: Final = 500_000_000
+"""A segment ends when a scan comes this long after its first: some 5 m in town."""
+_POINTS_OF_SEGMENT: Final = 3000
+_LEAST_POINTS_OF_SCAN: Final = 300
+POINTS_OF_POOR_SCAN: Final = 300
+_MAX_RANGE_M: Final = 50.0
+_NS_PER_S: Final = 1e9
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Held:
+    """A scan that waits, in a third of its memory: points to 10 µm, origins to 0.1 mm."""
+
+    t_ns: int
+    estimate: PoseEstimate
+    centre_m: F64
+    points: F32
+    origins: NDArray[np.int16]
+    origin_step_m: float
+    moving: NDArray[np.bool_]
+
+    @classmethod
+    def of(cls, segmented: SegmentedScan) -> "_Held":
+        scan = segmented.scan
+        centre = scan.origins_map_m.mean(axis=0) if len(scan.origins_map_m) else np.zeros(3)
+        origins = (scan.origins_map_m - centre).astype(np.float32)
+        step_m = max(float(np.abs(origins).max(initial=0.0)) / 32767, 1e-4)
+        packed = np.rint(origins / step_m).astype(np.int16)
+        points = (scan.points_map_m - centre).astype(np.float32)
+        return cls(scan.t_ns, scan.estimate, centre, points, packed, step_m, segmented.moving)
+
+    def restore(self) -> SegmentedScan:
+        """The scan as it came."""
+        origins = self.origins * self.origin_step_m + self.centre_m
+        return SegmentedScan(RefinedScan(self.t_ns, self.points + self.centre_m, origins, self.estimate), self.moving)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Tried:
+    """A segment and its verdict.
+
+    Attributes:
+        shift: what the shift test found.
+        verdict: "shifted": its poses are wrong; "unchecked": too little of the map is there to tell.
+        points_map_m: (N, 3) sampled points that stand still.
+        T_map_vehicle: (4, 4) a pose in its middle.
+        scans: how many.
+        pose: how well the poses were said to be known, the worst of them.
+    """
+
+    shift: Shift
+    verdict: Verdict
+    points_map_m: F64
+    T_map_vehicle: F64
+    scans: int
+    pose: PoseUncertainty
+
+
+@dataclass(slots=True)
+class _Segment:
+    first_ns: int
+    scans: list[_Held] = field(default_factory=list)
+
+
+class Trial:
+    """Takes scans in time order; gives those whose poses have stood the test, some 0.5 to 1 s later.
+
+    Args:
+        match_map: the base map that is compared with.
+        parameters: of the shift test.
+    """
+
+    def __init__(self, match_map: MatchMapCache, parameters: ShiftParameters) -> None:
+        self.counts: Counter[str] = Counter()
+        self._map, self._parameters = match_map, parameters
+        self._open: _Segment | None = None
+        self._passed: list[_Held] = []
+        self._wrong = False  # the segment before was
+        self._tried: deque[Tried] = deque()
+        self._refused_until_ns = -1
+
+    def push(self, segmented: SegmentedScan) -> Iterator[SegmentedScan]:
+        """Take a scan; give those that are evidence now, oldest first."""
+        t_ns = segmented.scan.t_ns
+        if t_ns <= self._refused_until_ns:
+            self.counts["scans_taken_back"] += 1
+            return
+        if self._open is not None and t_ns - self._open.first_ns >= SEGMENT_NS:
+            yield from self._close()
+        if self._open is None:
+            self._open = _Segment(t_ns)
+        self._open.scans.append(_Held.of(segmented))
+
+    def flush(self) -> Iterator[SegmentedScan]:
+        """The drive has ended: give what has stood the test until now."""
+        yield from self._close()
+        yield from self._release(self._passed)
+        self._passed = []
+
+    @property
+    def oldest(self) -> PoseEstimate | None:
+        """Pose of the oldest scan that waits."""
+        waiting = self._passed or (self._open.scans if self._open is not None else [])
+        return waiting[0].estimate if waiting else None
+
+    def take_back(self, until_ns: int) -> None:
+        """The pose was wrong, and it is not known since when: no scan up to this time counts."""
+        self._refused_until_ns = max(self._refused_until_ns, until_ns)
+        waiting = len(self._passed) + (len(self._open.scans) if self._open is not None else 0)
+        self.counts["scans_taken_back"] += waiting
+        self._open, self._passed, self._wrong = None, [], True
+
+    def take_tried(self) -> list[Tried]:
+        """The segments that were tried since the last call."""
+        tried, self._tried = list(self._tried), deque()
+        return tried
+
+    def _close(self) -> Iterator[SegmentedScan]:
+        segment, self._open = self._open, None
+        if segment is None:
+            return
+        tried = self._try(segment.scans)
+        self._tried.append(tried)
+        before, self._passed = self._passed, []
+        if tried.verdict == "shifted":
+            self.counts["scans_shifted"] += tried.scans
+            self.counts["scans_taken_back"] += len(before)
+            self._wrong = True
+        elif self._wrong:
+            self.counts["scans_taken_back"] += tried.scans
+            self._wrong = tried.verdict == "unchecked"  # nothing is there that would prove the pose right again
+        else:
+            yield from self._release(before)
+            self._passed = segment.scans
+
+    def _try(self, scans: list[_Held]) -> Tried:
+        n = max(_LEAST_POINTS_OF_SCAN, _POINTS_OF_SEGMENT // len(scans))
+        points = np.concatenate([some_of(held.points[~held.moving], held.centre_m, n) for held in scans])
+        T = scans[len(scans) // 2].estimate.T_map_vehicle
+        seen = scans[0].points @ T[:3, :3].astype(np.float32)  # along the vehicle's axes
+        match_map = self._map.near(T[:3, 3])
+        shift = find_shift(transform(T_inverse(T), points), T, match_map, planar=not sees_tilt(seen))
+        poses = [PoseUncertainty.of(held.estimate) for held in scans]
+        worst = PoseUncertainty(max(p.sigma_m for p in poses), max(p.sigma_rad for p in poses))
+        verdict: Verdict = "good"
+        if shift.is_pose_error(self._parameters, worst):
+            verdict = "shifted"
+        elif not shift.checked or shift.is_far(self._parameters, worst):
+            verdict = "unchecked"
+        return Tried(shift, verdict, points, T, len(scans), worst)
+
+    @staticmethod
+    def _release(scans: list[_Held]) -> Iterator[SegmentedScan]:
+        while scans:
+            yield scans.pop(0).restore()
+
+
+def some_of(points_m: F32, centre_map_m: F64, n: int) -> F64:
+    """(K, 3) about n of the points within range, map frame.
+
+    Args:
+        points_m: (N, 3) from the sensor, along map axes.
+        centre_map_m: (3,) the sensor.
+        n: how many.
+    """
+    chosen = sample_scan(points_m, SamplingParameters(n_points=n, max_range_m=_MAX_RANGE_M))
+    return np.asarray(points_m[chosen] + centre_map_m)

@@ -1,0 +1,396 @@
+"""SLAMCU that knows when it is lost, and takes back what it concluded since it was last where it believed to be.
+
+A particle filter that is sure of a wrong place finds what it expects, or calls the map wrong: it never notices by
+itself. So its place is watched (`watch.py`). On an alarm the stretch is told anew, from states kept along the way, by
+particles drawn around where wheels, gyro and GNSS had the vehicle: of all accounts the one with the fewest changes of
+the map that the fixes do not speak against is kept. When none will do, the vehicle is lost: everything since the last
+state that was good is undone, and the place is looked for anew where the vehicle is now.
+"""
+
+from collections.abc import Iterator
+from copy import deepcopy
+from dataclasses import dataclass
+from math import radians
+from typing import Final
+
+import numpy as np
+
+from gnd_map.arrays import F64
+from vehicle_agent.features.look import Look, MapFeatures
+from vehicle_agent.features.slamcu.parameters import SlamcuParameters
+from vehicle_agent.features.slamcu.slamcu import Slamcu
+from vehicle_agent.features.slamcu.verdicts import KnownState, NewFeature
+from vehicle_agent.features.slamcu.watch import DELETED_COST, NEW_COST, Alarm, Watch
+from vehicle_agent.features.view import Occlusion, SensorView
+
+KEEP_EVERY_M: Final = 300.0
+"""A state is kept so often, when nothing is in view."""
+KEEP_AT_LEAST_M: Final = 1000.0
+"""And even when something is."""
+KEPT: Final = 14
+"""So many states: 4 km."""
+CLEAR_S: Final = 1.0
+BACK_M: Final = (400.0, 1500.0, 4000.0)
+"""From states so far back the way is told anew."""
+ASK_EVERY_S: Final = 1.0
+BETTER: Final = 3.0
+"""Another account must be so much better (natural logarithm)."""
+ALIKE: Final = 1.0
+"""Accounts that differ by less are as good as each other."""
+PATIENCE_S: Final = 20.0
+"""After a doubt has been looked into, so long no other one is; twice as long each time that it changed nothing."""
+MOST_PATIENCE_S: Final = 160.0
+WIDE_M: Final = 2.5
+WIDE_RAD: Final = radians(0.5)
+"""What a place is made less certain by that fixes speak against, when no account is better: most of a lane."""
+AT_THE_END: Final = 0.5
+"""When the drive ends a doubt need be only so large: nothing more will come."""
+
+
+@dataclass(frozen=True, slots=True)
+class Lost:
+    """A stretch on which the vehicle was not where it believed to be.
+
+    Attributes:
+        from_s: the last good state, time of the drive.
+        until_s: when it noticed.
+        off_m: the farthest that what it believed was from what it believes now; for a stretch that was given up, from
+            where wheels, gyro and GNSS have it at its end.
+        test: which of the watch's tests failed.
+        value: of its statistic.
+        taken_back: verdicts on features that hold no longer.
+        told_anew: whether the stretch has another account; else nothing is said of it.
+    """
+
+    from_s: float
+    until_s: float
+    off_m: float
+    test: str
+    value: float
+    taken_back: int
+    told_anew: bool
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class PoseAt:
+    """Where the vehicle was at a look, as it believes now.
+
+    Attributes:
+        t_s: time of the drive.
+        pose: (3,) x, y [m], heading [rad].
+        cov: (3, 3).
+    """
+
+    t_s: float
+    pose: F64
+    cov: F64
+
+
+@dataclass(frozen=True, slots=True)
+class _Moved:
+    dt_s: float
+    speed_mps: float
+    yaw_rate_radps: float
+
+
+@dataclass(frozen=True, slots=True)
+class _Fixed:
+    x_m: float
+    y_m: float
+    sigma_m: float
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Looked:
+    look: Look
+    view: SensorView
+    occlusion: Occlusion | None
+
+
+_Event = _Moved | _Fixed | _Looked
+
+
+class _Account:
+    """One telling of the drive: SLAMCU, its watch, its path."""
+
+    def __init__(self, slamcu: Slamcu, watch: Watch) -> None:
+        self.slamcu, self.watch = slamcu, watch
+        self.path: list[PoseAt] = []
+        self._fix_s: float | None = None
+        self._seen_s = slamcu.now_s
+
+    def fork(self, seed: int) -> "_Account":
+        """A copy that goes its own way, its path empty."""
+        copied = _Account(self.slamcu.fork(seed), deepcopy(self.watch))
+        copied._fix_s, copied._seen_s = self._fix_s, self._seen_s
+        return copied
+
+    def take(self, event: _Event) -> None:
+        """One more event."""
+        slamcu = self.slamcu
+        if isinstance(event, _Moved):
+            slamcu.predict(event.dt_s, event.speed_mps, event.yaw_rate_radps)
+        elif isinstance(event, _Looked):
+            slamcu.look(event.look, event.view, event.occlusion)
+            self.path.append(PoseAt(slamcu.now_s, *slamcu.pose()))
+            if slamcu.now_s - CLEAR_S - self._seen_s >= ASK_EVERY_S:
+                self._passed()
+        else:
+            self._fixed(event)
+
+    def _fixed(self, event: _Fixed) -> None:
+        slamcu = self.slamcu
+        before = slamcu.pose()[0][:2]
+        if not slamcu.gnss(event.x_m, event.y_m, event.sigma_m):
+            return
+        dt_s = 0.0 if self._fix_s is None else slamcu.now_s - self._fix_s
+        self._fix_s = slamcu.now_s
+        off_m = np.array([event.x_m, event.y_m]) - before
+        self.watch.fix(off_m, event.sigma_m, dt_s, slamcu.pose(), slamcu.blind)
+
+    def _passed(self) -> None:
+        slamcu = self.slamcu
+        for told in slamcu.told():
+            self.watch.sign(told)
+        until_s = slamcu.now_s - CLEAR_S
+        if seen := slamcu.last_seen(self._seen_s, until_s):
+            self.watch.passed(seen, slamcu.last_seen(self._seen_s - 2.0 * PATIENCE_S, slamcu.now_s))
+        self._seen_s = until_s
+
+    @property
+    def cost(self) -> float:
+        """What speaks against this account, natural logarithm: changes of the map, and the GNSS."""
+        deleted, new = self.slamcu.changes()
+        return DELETED_COST * deleted + NEW_COST * new + self.watch.cost
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Kept:
+    """A state on the way: what had been told, and how many events and poses there were."""
+
+    account: _Account
+    events: int
+    poses: int
+
+    @property
+    def t_s(self) -> float:
+        return self.account.slamcu.now_s
+
+    @property
+    def odometer_m(self) -> float:
+        return self.account.slamcu.odometer_m
+
+
+class WatchedSlamcu:
+    """One drive whose poses the particles find, watched.
+
+    Args:
+        parameters: of existence, association and filter.
+        known: the map's features; a 2D frame (ENU), metres.
+        pose0: (3,) x, y, heading at the start.
+        cov0: (3, 3) its covariance.
+        seed: of the particles.
+        gnss_sigma_m: of the GNSS fixes that the first pose was made of, whose slow error it shares; 0: made otherwise.
+
+    Attributes:
+        path: where the vehicle was at each look, as it believes now.
+        lost: stretches on which it believed something else.
+        doubts: alarms that were looked into.
+
+    Raises:
+        BadPose: the pose is not finite, or the covariance is none.
+    """
+
+    def __init__(
+        self,
+        parameters: SlamcuParameters,
+        known: MapFeatures,
+        pose0: F64,
+        cov0: F64,
+        seed: int = 0,
+        gnss_sigma_m: float = 0.0,
+    ) -> None:
+        slamcu = Slamcu(parameters, known, pose0, cov0, seed, gnss_sigma_m)
+        self._now, self._seed = _Account(slamcu, Watch(parameters.gnss)), seed
+        self.path: list[PoseAt] = []
+        self.lost: list[Lost] = []
+        self.doubts = 0
+        self._events: list[_Event] = []
+        self._kept: list[_Kept] = [self._state()]
+        self._asked_s, self._patience_s = 0.0, PATIENCE_S
+
+    def predict(self, dt_s: float, speed_mps: float, yaw_rate_radps: float) -> None:
+        """As of `Slamcu`."""
+        self._take(_Moved(dt_s, speed_mps, yaw_rate_radps))
+
+    def gnss(self, x_m: float, y_m: float, sigma_m: float) -> None:
+        """As of `Slamcu`; on an alarm the way is told anew."""
+        self._take(_Fixed(x_m, y_m, sigma_m))
+        self._ask()
+
+    def look(self, look: Look, view: SensorView, occlusion: Occlusion | None = None) -> None:
+        """As of `Slamcu`; on an alarm the way is told anew."""
+        self._take(_Looked(look, view, occlusion))
+        self._ask()
+
+    def finish(self) -> None:
+        """The drive has ended: look into what is in doubt before anything is said."""
+        alarm = self._now.watch.alarm(AT_THE_END)
+        if alarm is not None:
+            self._look_into(alarm)
+        self._slamcu.decide()
+
+    def pose(self) -> tuple[F64, F64]:
+        """Pose (3,) x, y [m], heading [rad], and covariance (3, 3)."""
+        return self._slamcu.pose()
+
+    def known_states(self) -> tuple[KnownState, ...]:
+        """All features of the map, in its order."""
+        return self._slamcu.known_states()
+
+    def new_features(self, *, unclassified: bool = False) -> tuple[NewFeature, ...]:
+        """Features that the map has not and that exist; `unclassified`: those with too little evidence as well."""
+        return self._slamcu.new_features(unclassified=unclassified)
+
+    @property
+    def hidden(self) -> int:
+        """As of `Slamcu`."""
+        return self._slamcu.hidden
+
+    @property
+    def fixes_refused(self) -> int:
+        """As of `Slamcu`."""
+        return self._slamcu.fixes_refused
+
+    @property
+    def _slamcu(self) -> Slamcu:
+        return self._now.slamcu
+
+    def _take(self, event: _Event) -> None:
+        self._now.take(event)  # raises before anything is remembered
+        self._events.append(event)
+        if self._now.path:
+            self.path += self._now.path
+            self._now.path.clear()
+
+    def _ask(self) -> None:
+        """Whether there is an alarm, and a state to keep."""
+        alarm = self._now.watch.alarm()
+        if alarm is not None and self._slamcu.now_s - self._asked_s > self._patience_s:
+            self._look_into(alarm)
+        self._keep()
+
+    # States on the way
+
+    def _state(self) -> _Kept:
+        self._seed += 1
+        return _Kept(self._now.fork(self._seed), len(self._events), len(self.path))
+
+    def _keep(self) -> None:
+        way_m = self._slamcu.odometer_m - self._kept[-1].odometer_m
+        clear = way_m > KEEP_EVERY_M and not self._slamcu.in_view(CLEAR_S)
+        if clear or way_m > KEEP_AT_LEAST_M:
+            self._kept.append(self._state())
+        if len(self._kept) > KEPT:
+            del self._kept[0]
+            self._forget_events(self._kept[0].events)
+
+    def _forget_events(self, count: int) -> None:
+        del self._events[:count]
+        self._kept = [_Kept(one.account, one.events - count, one.poses) for one in self._kept]
+
+    def _back(self) -> Iterator[_Kept]:
+        """States so far back, each once; the oldest when the drive has just begun."""
+        told: set[int] = set()
+        for back_m in BACK_M:
+            old = [one for one in self._kept if self._slamcu.odometer_m - one.odometer_m >= back_m]
+            one = old[-1] if old else self._kept[0]
+            if one.events not in told:
+                told.add(one.events)
+                yield one
+
+    # A doubt
+
+    def _look_into(self, alarm: Alarm) -> None:
+        """Tell the way anew, and keep the best account of it."""
+        self.doubts += 1
+        tried: list[tuple[_Kept, _Account]] = []
+        for one in self._back():
+            tried += [(one, account) for account in self._tellings(one)]
+            if any(self._will_do(account) for _, account in tried):
+                break
+        least = min(_against(account) for _, account in tried)
+        one, best = next(pair for pair in tried if _against(pair[1]) <= least + ALIKE)  # the shortest way back
+        better = _against(best) < _against(self._now) - BETTER
+        self._patience_s = PATIENCE_S if better else min(2.0 * self._patience_s, MOST_PATIENCE_S)
+        if better:
+            self._adopt(one, best, alarm)
+        elif alarm.test in ("offset", "blind"):
+            self._slamcu.widen(WIDE_M, WIDE_RAD)
+        if not self._now.watch.agrees:
+            self._give_up(alarm)
+        self._now.watch.settled()
+        self._asked_s = self._slamcu.now_s
+
+    def _will_do(self, account: _Account) -> bool:
+        """Whether an account is so much better, and so free of doubt, that none from farther back is needed."""
+        return account.watch.alarm() is None and _against(account) < _against(self._now) - 2.0 * BETTER
+
+    def _tellings(self, kept: _Kept) -> Iterator[_Account]:
+        """From a state by particles around the blind pose, and by those that were there, which doubt the map."""
+        for anew in (True, False):
+            self._seed += 1
+            account = kept.account.fork(self._seed)
+            if anew:
+                account.slamcu.look_anew()
+            else:
+                account.slamcu.doubt_the_map()
+            for event in self._events[kept.events :]:
+                account.take(event)
+            yield account
+
+    def _adopt(self, kept: _Kept, account: _Account, alarm: Alarm) -> None:
+        """The account of the way since a state was wrong; here is another."""
+        old = self.path[kept.poses :]
+        off_m = max(
+            (float(np.hypot(*(a.pose - b.pose)[:2])) for a, b in zip(old, account.path, strict=True)), default=0.0
+        )
+        taken = _differences(self._slamcu, account.slamcu)
+        self.lost.append(Lost(kept.t_s, self._slamcu.now_s, off_m, alarm.test, alarm.value, taken, True))
+        self.path[kept.poses :] = account.path
+        account.path.clear()
+        account.slamcu.doubt_the_map(doubted=False)
+        self._now = account
+        self._kept = [one for one in self._kept if one.events <= kept.events]
+
+    def _give_up(self, alarm: Alarm) -> None:
+        """No account will do: nothing is said of the way since the last good state."""
+        kept = next((one for one in reversed(self._kept) if one.account.watch.agrees), self._kept[0])
+        lost_s, believed = self._slamcu.now_s, self._slamcu
+        self._seed += 1
+        account = kept.account.fork(self._seed)
+        account.slamcu.look_anew()
+        for event in self._events[kept.events :]:
+            if not isinstance(event, _Looked):
+                account.take(event)
+        account.slamcu.look_anew()
+        account.watch = Watch(believed.parameters.gnss)
+        off_m = float(np.hypot(*(believed.pose()[0] - account.slamcu.blind.mean[:3])[:2]))
+        taken = _differences(believed, account.slamcu)
+        self.lost.append(Lost(kept.t_s, lost_s, off_m, alarm.test, alarm.value, taken, False))
+        self._now = account
+        self._kept = [*(one for one in self._kept if one.events <= kept.events), self._state()]
+
+
+def _against(account: _Account) -> float:
+    """What speaks against an account; one whose place GNSS, wheels and gyro deny is out unless all are."""
+    return account.cost + (0.0 if account.watch.agrees else 1e3)
+
+
+def _differences(one: Slamcu, other: Slamcu) -> int:
+    """How many verdicts of one drive the other does not share."""
+    classes = [{state.feature_id: state.feature_class for state in each.known_states()} for each in (one, other)]
+    known = sum(classes[0][number] != classes[1].get(number) for number in classes[0])
+    found = [np.array([new.position_m for new in each.new_features()]).reshape(-1, 2) for each in (one, other)]
+    apart = np.linalg.norm(found[0][:, None] - found[1][None], axis=2)
+    return known + (int((apart.min(axis=1) > 1.0).sum()) if apart.size else len(found[0]))
