@@ -16,6 +16,7 @@ NAMES = (
     "segmentation",
     "localisation",
     "scan-to-scan",
+    "clock",
     "first-pose",
     "health",
     "ingest",

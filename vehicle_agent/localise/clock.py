@@ -39,7 +39,9 @@ WINDOW_NS: Final = 30_000_000_000
 BLOCK_NS: Final = 10_000_000_000
 """So much leaves the window at once."""
 LAST_NS: Final = 5_000_000_000
-"""So much at the window's end is asked whether the clock has jumped."""
+"""So much at the window's end is asked whether the clock has jumped; and so long a clock that did is doubted."""
+JUMP_S: Final = 0.02
+"""A smaller jump is followed as drift is."""
 EVERY_NS: Final = 500_000_000
 LEAST_STEPS: Final = 8
 WALK_S: Final = 3e-4
@@ -162,6 +164,7 @@ class ClockEstimator:
         self._steps: deque[Step] = deque()
         self._solved_ns = 0
         self._old: OffsetPrior | None = None  # what left the window knew
+        self._unsteady: tuple[int, ClockDoubt] = (-LAST_NS, "none")  # when the clock drifted or jumped
         self.estimate = ClockEstimate(0)
 
     def see(self, first_ns: int, last_ns: int, seen: ScanStep | None) -> None:
@@ -183,7 +186,7 @@ class ClockEstimator:
     def forget(self) -> None:
         """All stamps begin anew."""
         self._steps.clear()
-        self._old, self._solved_ns = None, 0
+        self._old, self._solved_ns, self._unsteady = None, 0, (-LAST_NS, "none")
         self.estimate = ClockEstimate(0)
         self._motion.clock = ClockModel()
 
@@ -208,8 +211,7 @@ class ClockEstimator:
 
     def _signal(self, zero_ns: int) -> MotionSignal:
         t_ns, speed, yaw_rate = self._motion.samples(zero_ns - 2 * round(SEARCH_S * 1e9))
-        since_s: F64 = ((t_ns - zero_ns) * 1e-9).astype(np.float64)
-        return MotionSignal(since_s, speed, yaw_rate)
+        return MotionSignal(np.asarray((t_ns - zero_ns) * 1e-9, np.float64), speed, yaw_rate)
 
     def _prior(self, at_ns: int) -> OffsetPrior:
         known = None if self._old is None else self._old.later(at_ns)
@@ -241,7 +243,7 @@ class ClockEstimator:
         zero_ns = known[0].first_ns
         alone = fit_clock(last, signal, zero_ns, nothing_known(last[-1].last_ns))
         (value, sigma), (whole, whole_sigma) = alone.offset, fit.offset
-        if abs(value - whole) < max(KNOWN_S, 4.0 * np.hypot(sigma, whole_sigma)):
+        if abs(value - whole) < max(JUMP_S, 4.0 * np.hypot(sigma, whole_sigma)):
             return False
         self._steps = deque(last)
         self._old = None
@@ -250,17 +252,19 @@ class ClockEstimator:
     def _tell(self, fit: ClockFit, known: list[Step], jumped: bool) -> None:
         (offset, sigma), at_ns = fit.offset, known[-1].last_ns
         rate, rate_sigma = float(fit.values[1]), float(np.sqrt(fit.covariance[1, 1]))
-        doubt: ClockDoubt = "none"
-        if jumped:
-            doubt = "jumped"
-        elif abs(offset) > MOST_S:
-            doubt = "large"
-        elif abs(rate) > MOST_RATE:
-            doubt = "drifting"
-        elif sigma > KNOWN_S and abs(offset) > max(LARGE_S, 2.0 * sigma):
-            doubt = "unsure"
+        if jumped or abs(rate) > MOST_RATE:
+            self._unsteady = (at_ns, "jumped" if jumped else "drifting")
+        doubt = self._doubt(at_ns, offset, sigma)
         self.estimate = ClockEstimate(at_ns, offset, sigma, rate, rate_sigma, doubt)
         self._motion.clock = ClockModel(at_ns, offset, rate)
+
+    def _doubt(self, at_ns: int, offset_s: float, sigma_s: float) -> ClockDoubt:
+        if abs(offset_s) > MOST_S:
+            return "large"
+        since_ns, doubt = self._unsteady
+        if at_ns - since_ns < LAST_NS:
+            return doubt
+        return "unsure" if sigma_s > KNOWN_S and abs(offset_s) - sigma_s > LARGE_S else "none"
 
 
 def fit_clock(steps: list[Step], signal: MotionSignal, zero_ns: int, prior: OffsetPrior) -> ClockFit:
