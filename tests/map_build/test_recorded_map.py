@@ -93,11 +93,11 @@ def test_poses_that_agree_are_left_alone(tmp_path: Path) -> None:
     assert abs(told["by_drive"][0]["mount"]["road_m"]) < 0.03
 
 
-def colonnade(path: Path, shift_m: float, seed: int) -> Path:
+def colonnade(path: Path, shift_m: float, seed: int, mount_m: float = 1.9) -> Path:
     """A drive of 90 m past posts 6 m apart before even walls; its reference is `shift_m` off along the street."""
     rng, anchor = np.random.default_rng(seed), LocalFrame(np.radians(37.5597), np.radians(127.0365), 30.0)
     mount = np.eye(4)
-    mount[2, 3] = 1.9
+    mount[2, 3] = mount_m
     with DriveWriter(path, DriveHeader(f"posts-{seed}", "car", "test", anchor, mount, "made by a test")) as writer:
         for k in range(90):
             t_ns, T = 1_700_000_000_000_000_000 + k * 100_000_000, np.eye(4)
@@ -192,3 +192,19 @@ def test_a_page_that_cannot_be_written_is_refused_before_the_work(tmp_path: Path
         with pytest.raises(GndError, match="cannot write the page"):
             gnd_map("build", tmp_path / "absent.mcap", "-o", tmp_path / "map.db", "--report", report)
     assert list(tmp_path.iterdir()) == []
+
+
+def test_the_command_writes_a_page_and_says_that_the_mount_is_wrong(tmp_path: Path) -> None:
+    """A header that has the LiDAR on the road, as imports without a mount do."""
+    path, page = colonnade(tmp_path / "a.mcap", 0.0, 1, mount_m=0.0), tmp_path / "page.html"
+    arguments = ["build", str(path), "-o", str(tmp_path / "map.db"), "--report", str(page)]
+    result = CliRunner().invoke(map_group, arguments, catch_exceptions=False)
+    assert result.exit_code == 0, result.output
+    assert f"page written: {page}" in result.stdout
+    said = " ".join(result.stdout.split())
+    assert "the road lies 1.90 m below where the wheels should stand" in said
+    assert "the header has the LiDAR 0.00 m over the road, the scans 1.90 m" in said
+    assert "the road lies 1.90 m below" in page.read_text()
+    right = gnd_map("build", colonnade(tmp_path / "b.mcap", 0.0, 1), "-o", tmp_path / "right.db")
+    assert not [warning for warning in right["warnings"] if "wheels" in warning]
+    assert right["by_drive"][0]["mount"]["seen_m"] == pytest.approx(1.9, abs=0.03)

@@ -25,7 +25,7 @@ one.
 """
 
 MOST_DOUBLED_WALLS, MOST_DOUBLED_ROAD = 25.0, 40.0
-"""Of 1,000 surfaces. Single passes have 5 to 13 and 3 to 21: signs before walls, bonnets and hedges over the road."""
+"""Of 1,000 surfaces. Single passes have 5 to 20 and 3 to 21: signs before walls, bonnets and hedges over the road."""
 MOST_THICK_M: Final = 0.05
 MOST_DRIFT_M, MOST_DRIFT_DEG = 0.10, 0.3
 MOUNT_M: Final = 0.15
