@@ -44,7 +44,7 @@ COUNTS = (
 )  # fmt: skip
 """What the reporter counts, as `result.json` names it."""
 
-KNOWN_COURSE_RAD = 1e-3
+KNOWN_COURSE_RAD = 2e-3
 _log = logging.getLogger(__name__)
 
 

@@ -212,4 +212,4 @@ def test_a_course_that_is_not_known_well_is_not_told() -> None:
     known = MotionTeacher(MotionBuffer(), OdometryParameters()).calibration
     assert known_course(known) is None
     assert known_course(dataclasses.replace(known, course_rad=0.0087, course_sigma_rad=2e-4)) == Course(870, 20)
-    assert known_course(dataclasses.replace(known, course_rad=0.0087, course_sigma_rad=2e-3)) is None
+    assert known_course(dataclasses.replace(known, course_rad=0.0087, course_sigma_rad=2.1e-3)) is None
