@@ -5,6 +5,7 @@ onto the map (`shift`). It becomes evidence only after the segment behind it has
 the last good moment is taken back when a pose turns out to be wrong, and after a wrong one two in a row must be good.
 """
 
+import math
 from collections import Counter, deque
 from collections.abc import Iterator
 from dataclasses import dataclass, field, replace
@@ -193,10 +194,9 @@ class Trial:
         shift = find_shift(points_m, T, self._map.near(T[:3, 3]), planar=not sees_tilt(seen))
         poses = [PoseUncertainty.of(held.estimate) for held in scans]
         worst = PoseUncertainty(max(p.sigma_m for p in poses), max(p.sigma_rad for p in poses))
-        verdict: Verdict = "good"
-        if not shift.checked or shift.is_far(self._parameters, worst):
-            verdict = "unchecked"
-        if shift.is_pose_error(self._parameters, worst) and self._may_have_come(points_m, T, shift):
+        far = shift.is_far(self._parameters, worst)
+        verdict: Verdict = "good" if shift.checked and not far else "unchecked"
+        if far and self._sureness(points_m, T, shift) >= self._parameters.z:
             verdict = "shifted"
         if verdict == "good":
             self._recent = _Recent.of(scans, T @ shift.T @ T_inverse(T))
@@ -204,20 +204,24 @@ class Trial:
             self._recent = None
         return Tried(shift, verdict, points, T, len(scans), worst)
 
-    def _may_have_come(self, points_m: F64, T: F64, shift: Shift) -> bool:
-        """Whether the pose error may have come since the last good segment.
+    def _sureness(self, points_m: F64, T: F64, shift: Shift) -> float:
+        """How sure a pose error is, in sigmas: by the base map, and by what was seen when the pose was last good.
 
-        A small step may: the error creeps in. A large one must show against what was seen then; where that is seen
-        where it was, the base map was met by chance.
+        A step since then that is small needs no second witness: the error creeps in. A large one must show there, too,
+        and then both count together (Stouffer's sum); where what was seen is seen where it was, the base map was met by
+        chance.
         """
         if self._recent is None:
-            return True
+            return shift.z
         X_step = T @ shift.T @ T_inverse(T) @ T_inverse(self._recent.X)
         if replace(shift, T=T_inverse(T) @ X_step @ T).size_m < self._parameters.least_m:
-            return True
+            return shift.z
         then = self._recent.points_m + self._recent.centre_m
         near = then[np.linalg.norm(then - T[:3, 3], axis=1) < _MAX_RANGE_M]
-        return len(near) == 0 or gain(points_m, T, X_step @ T, recent_map(near, self._map.noise_m)) > 0.0
+        if not len(near):
+            return shift.z
+        z = gain(points_m, T, X_step @ T, recent_map(near, self._map.noise_m))
+        return max(shift.z, (shift.z + z) / math.sqrt(2.0)) if min(shift.z, z) > 0.0 else 0.0
 
     @staticmethod
     def _release(scans: list[_Held]) -> Iterator[SegmentedScan]:
