@@ -14,6 +14,7 @@ from vehicle_agent.detect.detector import ChangeDetector
 from vehicle_agent.local_map import LocalMap
 from vehicle_agent.outbox import Outbox
 from vehicle_agent.report import Identity, Reporter
+from vehicle_agent.result import HealthTimeline
 from vehicle_agent.segment import SegmentedScan
 
 WHO = Identity("vehicle-7", "drive-7", "VLP-16", "ndt", software="test 1")
@@ -154,3 +155,14 @@ def test_a_small_error_that_all_scans_of_a_tile_share_is_found_in_what_adds_up(t
     assert sum(len(change.changed) for change in told) <= 1.3 * right
     assert reporter.account()["largest_shift_m"] == pytest.approx(0.13, abs=0.02)
     assert any(change.doubt is not None for change in told)
+
+
+def test_a_pose_counts_as_lost_only_where_it_was_known() -> None:
+    """At the start of a drive there is nothing to take back."""
+    timeline = HealthTimeline()
+    told = [
+        timeline.note(k, health)
+        for k, health in enumerate(["lost", "good", "degraded", "lost", "lost", "good", "lost"])
+    ]
+    assert told == [False, False, False, True, False, False, True]
+    assert [change["health"] for change in timeline.as_json()] == ["lost", "good", "degraded", "lost", "good", "lost"]

@@ -61,7 +61,7 @@ class ShiftParameters:
     least_m: float = 0.08
     sigmas: float = 3.0
     loosest_m: float = 0.15
-    most_m: float = 2.5
+    most_m: float = 5.0
     z: float = 3.0
 
     def __post_init__(self) -> None:
@@ -173,6 +173,23 @@ def _flat(T: F64) -> F64:
     return T_from_R_t(exp_so3(turn), np.array([T[0, 3], T[1, 3], 0.0]))
 
 
+def gain(points_vehicle_m: F64, T_before: F64, T_after: F64, match_map: MatchMap) -> float:
+    """How much surer the points (N, 3) fit a map at one pose (4, 4) than at another: z of the paired test, above 0 for
+    the pose after.
+    """
+    before, after = (costs_at(points_vehicle_m, T, match_map) for T in (T_before, T_after))
+    known = (before >= 0.0) & (after >= 0.0)
+    voxels = _Voxels.of(points_vehicle_m[known], T_before)
+    if not voxels.n:
+        return 0.0
+    return _z(voxels.mean(before[known]) - voxels.mean(after[known]))
+
+
+def _z(gains: F64) -> float:
+    """Of the paired test: as far from 0 as so many sigmas, if the gains (n,) were as often losses."""
+    return float(gains.sum() / max(np.sqrt((gains**2).sum()), 1e-9))
+
+
 def costs_at(points: F64, T: F64, m: MatchMap) -> F64:
     """(N,) robust cost of each point (N, 3) at the pose T (4, 4) of its frame; below 0 where the map is not known."""
     cost, points = np.empty(len(points)), np.ascontiguousarray(points, np.float64)
@@ -183,14 +200,14 @@ def costs_at(points: F64, T: F64, m: MatchMap) -> F64:
 
 def _compared(T: F64, was: F64, now: F64, *, checked: bool) -> Shift:
     """What a shift does to the costs (n,) of the voxels."""
-    bad, still_bad, gain = was > _MISFIT, now > _MISFIT, was - now
+    bad, still_bad = was > _MISFIT, now > _MISFIT
     return Shift(
         T=T,
         voxels=len(was),
         misfits=int(bad.sum()),
         explained=int((bad & ~still_bad).sum()),
         spoiled=int((still_bad & ~bad).sum()),
-        z=float(gain.sum() / max(np.sqrt((gain**2).sum()), 1e-9)),
+        z=_z(was - now),
         checked=checked,
     )
 

@@ -5,9 +5,10 @@ onto the map (`shift`). It becomes evidence only after the segment behind it has
 the last good moment is taken back when a pose turns out to be wrong, and after a wrong one two in a row must be good.
 """
 
+import math
 from collections import Counter, deque
 from collections.abc import Iterator
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Final, Literal
 
 import numpy as np
@@ -15,7 +16,8 @@ from numpy.typing import NDArray
 
 from gnd_map.arrays import F32, F64
 from gnd_map.se3 import T_inverse, transform
-from vehicle_agent.detect.shift import Shift, ShiftParameters, find_shift
+from vehicle_agent.detect.recent_map import recent_map
+from vehicle_agent.detect.shift import Shift, ShiftParameters, find_shift, gain
 from vehicle_agent.detect.uncertainty import PoseUncertainty
 from vehicle_agent.localise.estimates import PoseEstimate, RefinedScan
 from vehicle_agent.localise.level import sees_tilt
@@ -32,7 +34,8 @@ _POINTS_OF_SEGMENT: Final = 3000
 _LEAST_POINTS_OF_SCAN: Final = 300
 POINTS_OF_POOR_SCAN: Final = 300
 _MAX_RANGE_M: Final = 50.0
-_NS_PER_S: Final = 1e9
+_EVERY_RECENT: Final = 2
+"""So many of the last good segment's points are enough to compare with."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -84,6 +87,25 @@ class Tried:
     pose: PoseUncertainty
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class _Recent:
+    """What the last good segment saw: points about a centre, and the small shift X (4, 4, map axes) that lays them
+    onto the base map.
+    """
+
+    centre_m: F64
+    points_m: F32
+    X: F64
+
+    @classmethod
+    def of(cls, scans: list[_Held], X: F64) -> "_Recent":
+        centre = scans[0].centre_m
+        still = [
+            held.points[~held.moving][::_EVERY_RECENT] + (held.centre_m - centre).astype(np.float32) for held in scans
+        ]
+        return cls(centre, np.concatenate(still), X)
+
+
 @dataclass(slots=True)
 class _Segment:
     first_ns: int
@@ -106,6 +128,7 @@ class Trial:
         self._wrong = False  # the segment before was
         self._tried: deque[Tried] = deque()
         self._refused_until_ns = -1
+        self._recent: _Recent | None = None
 
     def push(self, segmented: SegmentedScan) -> Iterator[SegmentedScan]:
         """Take a scan; give those that are evidence now, oldest first."""
@@ -136,7 +159,7 @@ class Trial:
         self._refused_until_ns = max(self._refused_until_ns, until_ns)
         waiting = len(self._passed) + (len(self._open.scans) if self._open is not None else 0)
         self.counts["scans_taken_back"] += waiting
-        self._open, self._passed, self._wrong = None, [], True
+        self._open, self._passed, self._recent, self._wrong = None, [], None, True
 
     def take_tried(self) -> list[Tried]:
         """The segments that were tried since the last call."""
@@ -162,20 +185,43 @@ class Trial:
             self._passed = segment.scans
 
     def _try(self, scans: list[_Held]) -> Tried:
+        """Ask the base map, and where that says "shifted" what was seen just before."""
         n = max(_LEAST_POINTS_OF_SCAN, _POINTS_OF_SEGMENT // len(scans))
         points = np.concatenate([some_of(held.points[~held.moving], held.centre_m, n) for held in scans])
         T = scans[len(scans) // 2].estimate.T_map_vehicle
+        points_m = transform(T_inverse(T), points)
         seen = scans[0].points @ T[:3, :3].astype(np.float32)  # along the vehicle's axes
-        match_map = self._map.near(T[:3, 3])
-        shift = find_shift(transform(T_inverse(T), points), T, match_map, planar=not sees_tilt(seen))
+        shift = find_shift(points_m, T, self._map.near(T[:3, 3]), planar=not sees_tilt(seen))
         poses = [PoseUncertainty.of(held.estimate) for held in scans]
         worst = PoseUncertainty(max(p.sigma_m for p in poses), max(p.sigma_rad for p in poses))
-        verdict: Verdict = "good"
-        if shift.is_pose_error(self._parameters, worst):
+        far = shift.is_far(self._parameters, worst)
+        verdict: Verdict = "good" if shift.checked and not far else "unchecked"
+        if far and self._sureness(points_m, T, shift) >= self._parameters.z:
             verdict = "shifted"
-        elif not shift.checked or shift.is_far(self._parameters, worst):
-            verdict = "unchecked"
+        if verdict == "good":
+            self._recent = _Recent.of(scans, T @ shift.T @ T_inverse(T))
+        elif verdict == "shifted":
+            self._recent = None
         return Tried(shift, verdict, points, T, len(scans), worst)
+
+    def _sureness(self, points_m: F64, T: F64, shift: Shift) -> float:
+        """How sure a pose error is, in sigmas: by the base map, and by what was seen when the pose was last good.
+
+        A step since then that is small needs no second witness: the error creeps in. A large one must show there, too,
+        and then both count together (Stouffer's sum); where what was seen is seen where it was, the base map was met by
+        chance.
+        """
+        if self._recent is None:
+            return shift.z
+        X_step = T @ shift.T @ T_inverse(T) @ T_inverse(self._recent.X)
+        if replace(shift, T=T_inverse(T) @ X_step @ T).size_m < self._parameters.least_m:
+            return shift.z
+        then = self._recent.points_m + self._recent.centre_m
+        near = then[np.linalg.norm(then - T[:3, 3], axis=1) < _MAX_RANGE_M]
+        if not len(near):
+            return shift.z
+        z = gain(points_m, T, X_step @ T, recent_map(near, self._map.noise_m))
+        return max(shift.z, (shift.z + z) / math.sqrt(2.0)) if min(shift.z, z) > 0.0 else 0.0
 
     @staticmethod
     def _release(scans: list[_Held]) -> Iterator[SegmentedScan]:
