@@ -1,9 +1,10 @@
 """How far a pose may be off because the vehicle moved while the LiDAR turned and nobody knows the times of points."""
 
 import math
+from collections.abc import Callable
 from typing import Final, NamedTuple
 
-from schemas.drive import Deskew
+from schemas.drive import Deskew, DriveHeader
 
 USUAL_SWEEP_S: Final = 0.1
 """Taken where a drive does not say how long its sweeps last: most LiDARs turn at 10 Hz."""
@@ -40,3 +41,10 @@ def distortion_sigma(deskew: Deskew, speed_mps: float, yaw_rate_radps: float, sw
     sigma_s = UNKNOWN_SHARE[deskew] * (sweep_ns * 1e-9 or USUAL_SWEEP_S) / math.sqrt(12.0)
     along_m, turned_rad = abs(speed_mps) * sigma_s, abs(yaw_rate_radps) * sigma_s
     return DistortionSigma(along_m, LEVER_M * turned_rad, math.hypot(turned_rad, along_m / (2.0 * LEVER_M)))
+
+
+def distortion_of(header: DriveHeader) -> Callable[[float, float], DistortionSigma] | None:
+    """`distortion_sigma` of speed and yaw rate for the sweeps of a drive; None where nothing distorts them."""
+    if UNKNOWN_SHARE[header.deskew] == 0.0:
+        return None
+    return lambda speed_mps, yaw_rate_radps: distortion_sigma(header.deskew, speed_mps, yaw_rate_radps, header.sweep_ns)

@@ -16,6 +16,7 @@ from schemas.course import Course
 from schemas.drive import Detections, DriveHeader, DriveItem, GnssFix, MotionSample, ReferencePose, Scan
 from schemas.drive_mcap import read_drive, read_header
 from schemas.errors import SchemaError
+from schemas.sweep_distortion import distortion_of
 from schemas.traffic import TrafficLine, TrafficSample
 from vehicle_agent.config import AgentConfig
 from vehicle_agent.detect.detector import ChangeDetector
@@ -276,7 +277,7 @@ def _assemble(
     local_map = LocalMap(GridFrame.around(frame, [TileId.from_geodetic(fix.lat_rad, fix.lon_rad)]))
     detector = ChangeDetector(local_map, config.detect)
     surroundings = Surroundings(local_map, link.fetcher, detector, config.download)
-    localiser = Localiser(local_map, header.T_vehicle_lidar, config.localise)
+    localiser = Localiser(local_map, header.T_vehicle_lidar, config.localise, distortion_of(header))
     return Vehicle(
         config=config,
         header=header,

@@ -19,7 +19,7 @@ SWEEP_NS = S // 10
 SLICES = 5
 MOUNT = pose(1.2, 0.0, 0.0, z=1.9)
 SPEED_MPS, RADIUS_M = 5.0, 9.0
-SHORT = RefineParameters(every_m=2.0, half_m=3.0, lag_m=1.0, longest_s=1.0)  # submaps that a yard has room for
+SHORT = RefineParameters(every_m=2.0, length_m=10.0, lag_m=1.0, longest_s=1.0)  # stretches that a yard has room for
 PARAMETERS = LocaliserParameters(graph=GraphParameters(lag_s=1.0), refine=SHORT)
 
 

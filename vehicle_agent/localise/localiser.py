@@ -1,7 +1,7 @@
 """The localiser: predict, deskew, match, gate, fuse; poses are final when the lag has passed (GND, 3 (ii))."""
 
 from collections import deque
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from typing import Final
 
@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from gnd_map.motion import Trajectory, deskew
 from gnd_map.se3 import T_from_R_t, T_inverse, exp_so3
 from schemas.drive import GnssFix, MotionSample, Scan
+from schemas.sweep_distortion import DistortionSigma
 from vehicle_agent.errors import RegistrationError
 from vehicle_agent.local_map import LocalMap
 from vehicle_agent.localise.calibration import MotionCalibration, MotionTeacher
@@ -32,6 +33,8 @@ from vehicle_agent.localise.scan_odometry import ScanOdometry, ScanStep, joint_s
 from vehicle_agent.localise.stretch import log_se3
 
 F64 = NDArray[np.float64]
+Distortion = Callable[[float, float], DistortionSigma]
+"""Sigma of a pose from speed [m/s] and yaw rate [rad/s], by the motion that is left in the points of a sweep."""
 
 MAX_GNSS_AGE_NS = 2_000_000_000
 TOLD_M, TOLD_RAD = 0.1, 0.01  # one sigma of a pose from outside
@@ -39,6 +42,9 @@ OVERRULED: Final[tuple[Cause, ...]] = ("wrong_pose", "stale_map", "poor_place", 
 """What single scans hold against a pose and submaps may know better."""
 DISPUTED_CHI2 = 21.1  # of heading and place, three degrees of freedom: 99.99 %
 DISPUTED_VARIANCE = np.array([np.radians(0.1), 0.02, 0.02]) ** 2  # what online poses are wrong by in changed places
+SWEPT_NS = 100_000_000
+POSE_SHARE = 0.25
+"""Of what distortion moves a point by, as far as it moves a pose, which is held by points all around."""
 PAST_NS, MOST_FROM_PAST = 1_000_000_000, 5
 
 
@@ -85,13 +91,19 @@ class Localiser:
     """
 
     def __init__(
-        self, local_map: LocalMap, T_vehicle_lidar: F64, parameters: LocaliserParameters | None = None
+        self,
+        local_map: LocalMap,
+        T_vehicle_lidar: F64,
+        parameters: LocaliserParameters | None = None,
+        distortion: Distortion | None = None,
     ) -> None:
+        """Poses are sought on `local_map`; `distortion` tells what speed and turn do to the points, where they do."""
         self.parameters = parameters or LocaliserParameters()
         self.local_map = local_map
         self.T_vehicle_lidar = np.asarray(T_vehicle_lidar, dtype=np.float64)
         self.online: PoseEstimate | None = None
         """Newest pose, for progress and for choosing tiles; its health is `lost` until it is found again."""
+        self._distortion = distortion
         self.dropped_scans = 0
         self.initialisations = 0
         self._motion = MotionBuffer()
@@ -213,7 +225,7 @@ class Localiser:
         result, believed = self._matched(track.judge.monitor, points, predicted, odometry.sigmas, t_ns)
         match = None
         if result is not None and believed:
-            match = MapMatch(result.T_map_vehicle, result.covariance)
+            match = MapMatch(result.T_map_vehicle, result.covariance + self._distorted(t_ns))
             if joint.slipped:
                 self._teacher.forget()
             elif result.fit >= self.parameters.odometry.teaching_fit and not len(result.degenerate):
@@ -429,10 +441,21 @@ class Localiser:
             pose = on_the_road(pose, self._map.near(pose.T_map_vehicle[:3, 3]), self.parameters.registration)
         sweep = self._motion.trajectory(scan.t_ns, scan.end_ns) if held.sweep is None else held.sweep
         ends, starts = scan.placed(sweep, self.T_vehicle_lidar, held.t_ns, pose.T_map_vehicle)
+        pose = replace(pose, covariance=pose.covariance + self._distorted(held.t_ns))
         estimate = replace(_estimate(self._trimmed(pose), held), disagrees=disagrees)
         if disagrees and not pose.certain and estimate.health == "good":
             estimate = replace(estimate, health="degraded", cause="disputed")
         return RefinedScan(held.t_ns, ends, starts, estimate)
+
+    def _distorted(self, t_ns: int) -> F64:
+        """(6, 6) what the motion that is left in a sweep adds to a pose: its points agree on a wrong one."""
+        variance = np.zeros(6)
+        if self._distortion is not None and len(self._motion):
+            before = self._motion.delta(t_ns - SWEPT_NS, t_ns)
+            dt_s = SWEPT_NS * 1e-9
+            sigma = self._distortion(before[0, 3] / dt_s, float(np.arctan2(before[1, 0], before[0, 0])) / dt_s)
+            variance[[3, 4, 2]] = np.square(sigma) * POSE_SHARE**2
+        return np.diag(variance)
 
     def _trimmed(self, pose: SmoothedPose) -> SmoothedPose:
         """The pose with the heading that the rear axle drives along: what the LiDAR's mount is turned by is taken out

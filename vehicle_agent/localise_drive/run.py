@@ -17,6 +17,7 @@ from gnd_map.tile_id import TileId
 from schemas.drive import DriveHeader, DriveItem, DriveTrack, GnssFix, GnssTrack, MotionSample, Scan
 from schemas.drive_mcap import drive_counts, load_track, read_drive, read_header
 from schemas.errors import SchemaError
+from schemas.sweep_distortion import distortion_of
 from vehicle_agent.config import DownloadParameters
 from vehicle_agent.errors import LocaliseError
 from vehicle_agent.local_map import LocalMap
@@ -160,7 +161,7 @@ class _Run:
         self._around = MapAround(tiles, local_map)
         self._place = Place(frame, fix)
         self._guard = Guard()
-        self._localiser = Localiser(local_map, header.T_vehicle_lidar, parameters)
+        self._localiser = Localiser(local_map, header.T_vehicle_lidar, parameters, distortion_of(header))
         self._record = _Record()
         self._scans, self._finished, self._damage = 0, False, ""
         self._started_s = time.monotonic()
