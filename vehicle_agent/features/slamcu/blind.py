@@ -65,12 +65,15 @@ class BlindFilter:
     Args:
         parameters: of motion and GNSS.
         belief: at the start; a GNSS error without variance means that no fix has been seen.
+
+    Attributes:
+        has_fixes: whether a fix has been seen, or the first pose was made of some.
     """
 
     def __init__(self, parameters: SlamcuParameters, belief: Belief) -> None:
         self._p = parameters
         self._mean, self._cov = belief.mean.copy(), belief.cov.copy()
-        self._has_error = float(belief.cov[GNSS_X, GNSS_X]) > 0.0
+        self.has_fixes = float(belief.cov[GNSS_X, GNSS_X]) > 0.0
         self._since = np.zeros(3)  # x, y, heading at the last propagation of the covariance
         self._since[:] = self._mean[:3]
         self._driven_s = 0.0
@@ -120,8 +123,8 @@ class BlindFilter:
         white = self._p.gnss.white_share * sigma_m**2
         slow = (1.0 - self._p.gnss.white_share) * sigma_m**2
         fade = exp(-dt_s / self._p.gnss.correlation_s)
-        if not self._has_error:
-            self._cov[[GNSS_X, GNSS_Y], [GNSS_X, GNSS_Y]], self._has_error = slow, True
+        if not self.has_fixes:
+            self._cov[[GNSS_X, GNSS_Y], [GNSS_X, GNSS_Y]], self.has_fixes = slow, True
             fade = 1.0
         F = np.diag([1.0, 1.0, 1.0, 1.0, 1.0, fade, fade])
         self._mean, self._cov = F @ self._mean, F @ self._cov @ F

@@ -95,7 +95,7 @@ class Slamcu:
             self._rbpf.seed(belief)
         self._book = ExistenceBook(parameters)
         self._tracked = Tracked(parameters, known, self._rbpf, self._book)
-        self._tidying = Tidying(parameters, self._tracked, self._rbpf, self._book)
+        self._tidying = Tidying(parameters, self._tracked, self._rbpf, self._book, self._blind)
         self.now_s = 0.0
         self.odometer_m = 0.0
         self.hidden = 0

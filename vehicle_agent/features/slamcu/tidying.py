@@ -6,9 +6,10 @@ from typing import Final, NamedTuple
 import numpy as np
 
 from gnd_map.arrays import F64
+from vehicle_agent.features.slamcu.blind import BlindFilter
 from vehicle_agent.features.slamcu.doubt import Doubt, Step
 from vehicle_agent.features.slamcu.existence_book import Entry, ExistenceBook, FeatureClass
-from vehicle_agent.features.slamcu.identities import LN_NONE, NONE, best_identities
+from vehicle_agent.features.slamcu.identities import LN_NONE, LN_NONE_DOUBTED, NONE, best_identities
 from vehicle_agent.features.slamcu.parameters import SlamcuParameters
 from vehicle_agent.features.slamcu.rbpf import Rbpf
 from vehicle_agent.features.slamcu.tracked import Tracked
@@ -24,7 +25,10 @@ TOGETHER_SHARE: Final = 0.15
 GROUP_M: Final = 12.0
 """Features within this distance may be taken for each other: three lanes."""
 SURE: Final = 3.0
-"""Identities are decided when they are so much likelier than any others (natural logarithm)."""
+"""Identities are decided when they are so much likelier than any others (natural logarithm), whichever of the two
+prices a sign has that is gone while another stands in its place."""
+ALLOWED: Final = 18.4
+"""χ² of 2 degrees of freedom, one in 10,000: no two signs alike put the vehicle farther from its fixes than this."""
 UNDECIDED_M: Final = 600.0
 """Or after so much way, in which further signs may have told where the vehicle was."""
 ASK_EVERY_S: Final = 1.0
@@ -51,14 +55,17 @@ class Tidying:
         tracked: the features.
         rbpf: the particles.
         book: their masses.
+        blind: where the vehicle is by what has never seen a feature.
 
     Attributes:
         ln_none: natural logarithm of the density of a feature that is gone while another stands in its place.
         told: what features of the map said when they were settled, until somebody takes it.
     """
 
-    def __init__(self, parameters: SlamcuParameters, tracked: Tracked, rbpf: Rbpf, book: ExistenceBook) -> None:
-        self._p, self._tracked, self._rbpf, self._book = parameters, tracked, rbpf, book
+    def __init__(
+        self, parameters: SlamcuParameters, tracked: Tracked, rbpf: Rbpf, book: ExistenceBook, blind: BlindFilter
+    ) -> None:
+        self._p, self._tracked, self._rbpf, self._book, self._blind = parameters, tracked, rbpf, book, blind
         self._doubt = Doubt(tracked, rbpf, book)
         self.ln_none = LN_NONE
         self.told: list[Innovation] = []
@@ -127,7 +134,7 @@ class Tidying:
             self.told.append(innovation_of(entry, xy_m, cov))
         if not entry.known:
             self._take(entry, agrees=not moved)
-        elif moved and self._doubt.is_it_me(xy_m - entry.xy_m, self._others_off(entry), entry.odometer_m):
+        elif moved and self._is_it_me(entry, xy_m - entry.xy_m):
             self._doubt.look_anew(t_ns)  # and settle when the place has been found
             self._rbpf.settle(entry.slot)
         elif moved:
@@ -136,6 +143,16 @@ class Tidying:
             self._doubt.found_in_place(entry.odometer_m)
             entry.seen = (xy_m, cov) if entry.seen is None else fused_moments(entry.seen, (xy_m, cov))
             self._rbpf.settle(entry.slot)
+
+    def _is_it_me(self, entry: Entry, off_m: F64) -> bool:
+        """Whether it is the vehicle that is off by (2,): others say so too, and GNSS, wheels and gyro allow it."""
+        if not self._doubt.is_it_me(off_m, self._others_off(entry), entry.odometer_m):
+            return False
+        pose, cov = self._rbpf.pose(self._rbpf.weights(without=(entry.slot or 0,)))
+        belief = self._blind.belief
+        there = pose[:2] - off_m - belief.mean[:2]
+        squared = float(there @ np.linalg.solve((cov + belief.cov[:3, :3])[:2, :2], there))
+        return squared < ALLOWED or not self._blind.has_fixes
 
     def _others_off(self, entry: Entry) -> list[F64]:
         """How far off (2,) other features of the map are that are not where they should be, of those not settled."""
@@ -166,7 +183,9 @@ class Tidying:
             return True
         slots = [one.slot for one in group if one.slot is not None]
         best = best_identities(self._rbpf, slots, owned, self.ln_none)
-        if best.lead < SURE and self._odometer_m - entry.odometer_m < UNDECIDED_M:
+        easier = best_identities(self._rbpf, slots, owned, LN_NONE_DOUBTED)
+        clear = best.slots == easier.slots and min(best.lead, easier.lead) >= SURE
+        if not clear and self._odometer_m - entry.odometer_m < UNDECIDED_M:
             for slot in slots[:owned]:
                 self._rbpf.provisional[slot] = False
             return False
