@@ -47,4 +47,4 @@ def test_a_header_that_puts_the_lidar_on_the_ground_is_said_at_once(recorded):
     assert run.localiser.calibration.mount_doubtful == ("height",)
     assert run.localiser.calibration.mount.height_m == pytest.approx(recorded.T_vehicle_lidar[2, 3], abs=0.05)
     late = [pose for pose in run.online if pose.t_ns - recorded.items[0].t_ns > 3e9]
-    assert not any(pose.health == "good" for pose in [*late, *run.refined[20:]])
+    assert not any(pose.health == "good" for pose in [*late, *list(run.refined)[20:]])

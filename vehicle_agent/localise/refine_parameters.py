@@ -45,7 +45,7 @@ class RefineParameters:
     scales: tuple[float, ...] = (2.0, 1.5)
     first_scales: tuple[float, ...] = (4.0, 2.0, 1.5)
     near_m: float = 0.04
-    learnt_degps: float = 0.03
+    learnt_degps: float = 0.06
     unlearnt_s: float = 8.0
     fit_m: float = 20.0
     firm_fit: float = 0.35
