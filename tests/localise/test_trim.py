@@ -33,6 +33,19 @@ def test_a_mount_that_is_told_only_roughly_is_left_alone():
     assert teacher_told(2 * MAX_TRIM_RAD).trim_rad == 0.0
 
 
+@pytest.mark.parametrize("course_rad", [-0.018, 0.009])
+def test_a_header_that_is_certainly_wrong_is_put_right(course_rad):
+    assert teacher_told(-course_rad).trim_rad == pytest.approx(course_rad)
+
+
+def test_a_header_that_is_likely_wrong_makes_the_heading_doubtful_until_it_is_known():
+    assert teacher_told(0.012, sigma=3e-3).yaw_in_doubt
+    assert teacher_told(0.012, sigma=3e-3).cause == "mount"
+    assert teacher_told(0.012, sigma=3e-3).trim_rad == 0.0
+    assert not teacher_told(0.012, sigma=5e-4).yaw_in_doubt
+    assert not teacher_told(0.003, sigma=3e-3).yaw_in_doubt
+
+
 def fitting(scans_prove):
     monitor = HealthMonitor(HealthParameters(), 0, CauseParameters())
     monitor.scans_prove = scans_prove

@@ -17,6 +17,8 @@ from vehicle_agent.localise.parameters import OdometryParameters
 F64 = NDArray[np.float64]
 
 STEP_S, STRETCH_S = 0.5, 1.0
+IN_DOUBT = 1.5
+"""Sigmas from which on a course beyond what is allowed makes the heading doubtful."""
 MAX_TRIM_RAD, KNOWN_COURSE_RAD = 1.05e-3, 6e-4
 CLOCK_LASTS = 2.0  # a clock's error goes on as long as the vehicle brakes or turns: for more than the step asked about
 KEEPS = 2.0  # a stretch that is less sure than what was learnt, by more than this in variance, is not listened to
@@ -132,7 +134,7 @@ class MotionTeacher:
     @property
     def cause(self) -> Cause:
         """What is wrong with the sensors whose errors are learnt, if anything."""
-        if self.mount.residual.wrong:
+        if self.mount.residual.wrong or self.yaw_in_doubt:
             return "mount"
         return "none" if self.clock.estimate.doubt == "none" else "clock"
 
@@ -157,11 +159,20 @@ class MotionTeacher:
 
     @property
     def trim_rad(self) -> float:
-        """What the heading is turned by so that the rear axle runs along it, once that is known; 0 when it is not, or
-        when it is so much that the recording's vehicle frame means something else than the axle.
+        """What the heading is turned by so that the rear axle runs along it, once that is known; 0 when it is not. Also
+        0 between what a mount may be off by unknowingly and what is certainly a wrong header: there the recording's
+        vehicle frame may mean something else than the axle.
         """
         course_rad, sigma_rad = float(self._motion.course[0]), float(np.sqrt(self._course_var))
-        return course_rad if abs(course_rad) < MAX_TRIM_RAD and sigma_rad < KNOWN_COURSE_RAD else 0.0
+        wrong_header = abs(course_rad) - SIGMAS * sigma_rad > DOUBTFUL_RAD
+        slight = abs(course_rad) < MAX_TRIM_RAD and sigma_rad < KNOWN_COURSE_RAD
+        return course_rad if wrong_header or slight else 0.0
+
+    @property
+    def yaw_in_doubt(self) -> bool:
+        """True while the course says that the mount's yaw is likely wrong and not yet by how much."""
+        course_rad, sigma_rad = abs(float(self._motion.course[0])), float(np.sqrt(self._course_var))
+        return course_rad > max(DOUBTFUL_RAD, IN_DOUBT * sigma_rad) and course_rad - SIGMAS * sigma_rad <= DOUBTFUL_RAD
 
     def forget(self) -> None:
         """The poses to come do not continue those before."""

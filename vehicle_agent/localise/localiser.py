@@ -42,6 +42,8 @@ OVERRULED: Final[tuple[Cause, ...]] = ("wrong_pose", "stale_map", "poor_place", 
 """What single scans hold against a pose and submaps may know better."""
 DISPUTED_CHI2 = 21.1  # of heading and place, three degrees of freedom: 99.99 %
 DISPUTED_VARIANCE = np.array([np.radians(0.1), 0.02, 0.02]) ** 2  # what online poses are wrong by in changed places
+MOUNT_VARIANCE = np.array([0.0, 0.0, np.radians(0.03), 0.005, 0.005, 0.0]) ** 2
+"""Of a mount that is as told: rotation [rad], position [m]; all scans of a drive share it."""
 SWEPT_NS = 100_000_000
 POSE_SHARE = 0.25
 """Of what distortion moves a point by, as far as it moves a pose, which is held by points all around."""
@@ -309,7 +311,7 @@ class Localiser:
         health, cause = monitor.judge(t_ns)
         held = _HeldScan(pack(scan), sweep, t_ns, matching_ratio, health, cause, monitor.degenerate, pose)
         track.held[number] = held
-        self.online = _estimate(pose, held)
+        self.online = _estimate(self._trimmed(pose), held)
 
     def _refine(
         self,
@@ -448,13 +450,20 @@ class Localiser:
         return RefinedScan(held.t_ns, ends, starts, estimate)
 
     def _distorted(self, t_ns: int) -> F64:
-        """(6, 6) what the motion that is left in a sweep adds to a pose: its points agree on a wrong one."""
+        """(6, 6) what motion that is left in a sweep, and a mount that is certainly tilted, add to a pose: all points
+        agree on a wrong one.
+        """
         variance = np.zeros(6)
         if self._distortion is not None and len(self._motion):
             before = self._motion.delta(t_ns - SWEPT_NS, t_ns)
             dt_s = SWEPT_NS * 1e-9
             sigma = self._distortion(before[0, 3] / dt_s, float(np.arctan2(before[1, 0], before[0, 0])) / dt_s)
             variance[[3, 4, 2]] = np.square(sigma) * POSE_SHARE**2
+        tilt, height_m = self._teacher.mount.residual, self.T_vehicle_lidar[2, 3]
+        if "pitch" in tilt.doubtful:
+            variance[3] += (height_m * tilt.pitch_rad) ** 2
+        if "roll" in tilt.doubtful:
+            variance[4] += (height_m * tilt.roll_rad) ** 2
         return np.diag(variance)
 
     def _trimmed(self, pose: SmoothedPose) -> SmoothedPose:
@@ -518,6 +527,8 @@ def _sigmas(pose: SmoothedPose) -> tuple[float, float]:
 
 
 def _estimate(pose: SmoothedPose, held: _HeldScan) -> PoseEstimate:
+    """The pose as told: with what neither scans nor map can know of the mount."""
+    pose = replace(pose, covariance=pose.covariance + np.diag(MOUNT_VARIANCE))
     sigma_m, sigma_rad = _sigmas(pose)
     overruled = pose.certain and held.health != "good" and held.cause in OVERRULED
     return PoseEstimate(
