@@ -16,6 +16,7 @@ from gnd_map.motion import Trajectory
 from gnd_map.se3 import T_inverse
 from schemas.drive import ReferencePose
 from vehicle_agent.errors import LocaliseError
+from vehicle_agent.localise.consistency import nees_of
 from vehicle_agent.localise.estimates import PoseEstimate, localisation_error
 
 
@@ -45,7 +46,9 @@ class Evaluation:
             return None
         reference = Trajectory(np.array(self.reference_t_ns, np.int64), np.stack(self.reference_pose))
         try:
-            return asdict(localisation_error(self.estimates, reference)) | self._single(reference)
+            nees = nees_of([e for e in self.estimates if e.health == "good"], reference)
+            errors = asdict(localisation_error(self.estimates, reference)) | self._single(reference)
+            return errors | {"nees": None if nees is None else nees.as_json()}
         except LocaliseError:
             return None
 

@@ -192,6 +192,7 @@ class Vehicle:
             "features": self.features.account() if self.features is not None else {},
             "health": self.timeline.as_json(),
             "localisation": self.evaluation.errors(),
+            "nis": self.localiser.innovations.mean,
             "calibration": self.localiser.calibration.as_json(),
             "memory_mb": self.memory.read(),
         }

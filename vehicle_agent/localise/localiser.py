@@ -15,6 +15,7 @@ from schemas.sweep_distortion import DistortionSigma
 from vehicle_agent.errors import RegistrationError
 from vehicle_agent.local_map import LocalMap
 from vehicle_agent.localise.calibration import MotionCalibration, MotionTeacher
+from vehicle_agent.localise.consistency import Innovations
 from vehicle_agent.localise.estimates import Cause, Health, PoseEstimate, RefinedScan
 from vehicle_agent.localise.first_pose import FirstPose, Place
 from vehicle_agent.localise.graph import MapMatch, Odometry, PoseGraph, Position, SmoothedPose
@@ -106,6 +107,8 @@ class Localiser:
         self.online: PoseEstimate | None = None
         """Newest pose, for progress and for choosing tiles; its health is `lost` until it is found again."""
         self._distortion = distortion
+        self.innovations = Innovations()
+        """Of believed matches against the prediction: NIS."""
         self.dropped_scans = 0
         self.initialisations = 0
         self._motion = MotionBuffer()
@@ -228,6 +231,8 @@ class Localiser:
         match = None
         if result is not None and believed:
             match = MapMatch(result.T_map_vehicle, result.covariance + self._distorted(t_ns))
+            before = np.diag(np.square(joint.driven_sigmas)) + track.held[newest].online.covariance
+            self.innovations.see(predicted, before, *match)
             if joint.slipped:
                 self._teacher.forget()
             elif result.fit >= self.parameters.odometry.teaching_fit and not len(result.degenerate):

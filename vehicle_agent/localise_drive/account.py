@@ -7,6 +7,7 @@ import numpy as np
 from rich.console import Console
 from rich.table import Table
 
+from vehicle_agent.localise.consistency import nees_of
 from vehicle_agent.localise.estimates import PoseEstimate
 from vehicle_agent.localise_drive.accuracy import LIMITS, error_series, error_summary, healthy, limits_json
 from vehicle_agent.localise_drive.run import LocalisedDrive
@@ -38,6 +39,8 @@ def summary(drive: LocalisedDrive) -> dict[str, Any]:
         "yaw_bias_degps": round(float(np.degrees(counts.yaw_bias_radps)), 5),
         "calibration": None if counts.calibration is None else counts.calibration.as_json(),
         "sigma": _sigma(drive.refined),
+        "nis": None if counts.nis is None else round(counts.nis, 3),
+        "nees": _nees(drive),
         "errors": _errors(drive),
         "health": health_shares(stretches),
         "tiles_used": {tile_id.path: version for tile_id, version in sorted(drive.used.items())},
@@ -69,6 +72,15 @@ def _sigma(estimates: Sequence[PoseEstimate]) -> dict[str, float] | None:
     m, deg = np.array([(e.sigma_m, np.degrees(e.sigma_rad)) for e in estimates]).T
     columns = {"median_m": np.median(m), "max_m": m.max(), "median_deg": np.median(deg), "max_deg": deg.max()}
     return {name: round(float(value), 5) for name, value in columns.items()}
+
+
+def _nees(drive: LocalisedDrive) -> dict[str, Any] | None:
+    """Of the refined and the online poses called good; None without a reference."""
+    if drive.reference is None:
+        return None
+    kinds = {"refined": healthy(drive.refined), "online": healthy(drive.online)}
+    found = {name: nees_of(poses, drive.reference) for name, poses in kinds.items()}
+    return {name: None if nees is None else nees.as_json() for name, nees in found.items()}
 
 
 def _errors(drive: LocalisedDrive) -> dict[str, Any] | None:
@@ -109,12 +121,22 @@ def _fields(values: dict[str, Any]) -> Table:
         *_calibration(values["calibration"]),
         ("own estimate of error", "none" if sigma is None else
             f"{sigma['median_m'] * 100:.1f} cm, {sigma['median_deg']:.3f}° (one sigma, median)"),
+        ("are errors as large as told", _consistency(values)),
         ("tiles", f"{len(values['tiles_used'])} used; {values['tiles_absent']} nearby are not in the map"),
         ("time", f"{values['wall_s']:.1f} s, {values['wall_s'] / max(values['scans'], 1) * 1000:.1f} ms a scan"),
     )  # fmt: skip
     for row in rows:
         table.add_row(*row)
     return table
+
+
+def _consistency(values: dict[str, Any]) -> str:
+    """NIS, and NEES where there is a reference: 1 is honest, more is too sure."""
+    parts = [] if values["nis"] is None else [f"NIS {values['nis']:.2f}"]
+    for name, nees in (values["nees"] or {}).items():
+        if nees is not None:
+            parts.append(f"NEES {name} place {nees['place']:.2f}, heading {nees['heading']:.2f}")
+    return "; ".join(parts) or "not known"
 
 
 def _calibration(values: dict[str, Any] | None) -> tuple[tuple[str, str], ...]:

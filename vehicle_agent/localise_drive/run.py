@@ -67,6 +67,8 @@ class Counts:
     """False: it was stopped, or the recording is damaged."""
     damage: str = ""
     calibration: MotionCalibration | None = None
+    nis: float | None = None
+    """Of matches against the prediction, over degrees of freedom; None without any."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -275,6 +277,7 @@ class _Run:
             finished=self._finished,
             damage=self._damage,
             calibration=localiser.calibration,
+            nis=localiser.innovations.mean,
         )
 
 
