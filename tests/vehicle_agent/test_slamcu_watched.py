@@ -12,7 +12,7 @@ from sign_road import NO_SHIFT as HERE
 from vehicle_agent.features.slamcu.blind import Belief, BlindFilter
 from vehicle_agent.features.slamcu.existence_book import FeatureClass
 from vehicle_agent.features.slamcu.parameters import SlamcuParameters
-from vehicle_agent.features.slamcu.watch import Watch
+from vehicle_agent.features.slamcu.watch import Alarm, Watch
 from vehicle_agent.features.slamcu.watched import WatchedSlamcu
 from vehicle_agent.features.view import CAMERA
 
@@ -135,6 +135,22 @@ def watched_without_doubt(trouble: Trouble, seed: int) -> WatchedSlamcu:
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(WatchedSlamcu, "_look_into", lambda *_: None)
         return watched(LONG, trouble, seed).slamcu
+
+
+def test_a_stretch_that_is_given_up_is_forgotten() -> None:
+    """No account would do: the book is that of the last good state, and the place that of wheels, gyro and GNSS."""
+    slamcu = watched_without_doubt(Trouble(kidnapped_s=40.0, kidnapped_m=(25.0, 0.0)), 0)
+    wrong = sum(one != NORMAL for one in classes(slamcu)) + len(slamcu.new_features())
+    assert wrong >= 5
+    slamcu._give_up(Alarm("blind", 99.0, 21.1))
+    (lost,) = slamcu.lost
+    assert not lost.told_anew
+    assert lost.from_s < 41.0 < lost.until_s
+    assert lost.taken_back >= 5
+    assert classes(slamcu) == [NORMAL] * len(SIGNS)
+    assert slamcu.new_features() == ()
+    end = list(LONG.poses())[-1][1]
+    assert np.hypot(*(slamcu.pose()[0] - end)[:2]) < 8.0
 
 
 def test_a_fork_goes_its_own_way() -> None:
