@@ -17,7 +17,7 @@ from vehicle_agent.localise.parameters import OdometryParameters
 F64 = NDArray[np.float64]
 
 STEP_S, STRETCH_S = 0.5, 1.0
-IN_DOUBT = 1.5
+IN_DOUBT = 2.5
 """Sigmas from which on a course beyond what is allowed makes the heading doubtful."""
 MAX_TRIM_RAD, KNOWN_COURSE_RAD = 1.05e-3, 6e-4
 CLOCK_LASTS = 2.0  # a clock's error goes on as long as the vehicle brakes or turns: for more than the step asked about
@@ -172,7 +172,8 @@ class MotionTeacher:
     def yaw_in_doubt(self) -> bool:
         """True while the course says that the mount's yaw is likely wrong and not yet by how much."""
         course_rad, sigma_rad = abs(float(self._motion.course[0])), float(np.sqrt(self._course_var))
-        return course_rad > max(DOUBTFUL_RAD, IN_DOUBT * sigma_rad) and course_rad - SIGMAS * sigma_rad <= DOUBTFUL_RAD
+        likely = course_rad > max(2.0 * DOUBTFUL_RAD, IN_DOUBT * sigma_rad)  # where the heading would be called wrong
+        return likely and course_rad - SIGMAS * sigma_rad <= DOUBTFUL_RAD
 
     def forget(self) -> None:
         """The poses to come do not continue those before."""
