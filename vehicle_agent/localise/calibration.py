@@ -214,7 +214,7 @@ class MotionTeacher:
         if scale**2 < KEEPS * self._scale_var:
             self._motion.speed_scale *= 1.0 - drift.forward.value
             self._scale_var = scale**2
-        course = max(max(drift.left.sigma, drift.up.sigma) * grown, par.least_scale)
+        course = max(drift.left.sigma * grown, par.least_scale)
         if course**2 < KEEPS * self._course_var:
             self._motion.course -= [drift.left.value, drift.up.value]
             self._course_var = course**2

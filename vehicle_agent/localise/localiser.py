@@ -43,8 +43,8 @@ OVERRULED: Final[tuple[Cause, ...]] = ("wrong_pose", "stale_map", "poor_place", 
 """What single scans hold against a pose and submaps may know better."""
 DISPUTED_CHI2 = 21.1  # of heading and place, three degrees of freedom: 99.99 %
 DISPUTED_VARIANCE = np.array([np.radians(0.1), 0.02, 0.02]) ** 2  # what online poses are wrong by in changed places
-MOUNT_VARIANCE = np.array([0.0, 0.0, np.radians(0.03), 0.005, 0.005, 0.0]) ** 2
-"""Of a mount that is as told: rotation [rad], position [m]; all scans of a drive share it."""
+MOUNTED_M, MOUNTED_RAD, TRIMMED_RAD = 0.005, np.radians(0.03), np.radians(0.012)
+"""One sigma of a mount that is as told: position, yaw, and yaw once the course has told it. All scans share it."""
 SWEPT_NS = 100_000_000
 POSE_SHARE = 0.25
 """Of what distortion moves a point by, as far as it moves a pose, which is held by points all around."""
@@ -473,12 +473,14 @@ class Localiser:
 
     def _trimmed(self, pose: SmoothedPose) -> SmoothedPose:
         """The pose with the heading that the rear axle drives along: what the LiDAR's mount is turned by is taken out
-        of it. The points stay where the mount as told puts them, which is how they were matched.
+        of it. The points stay where the mount as told puts them, which is how they were matched. The covariance holds
+        what neither scans nor map can know of the mount.
         """
-        if not self.parameters.refine.enabled:
-            return pose
-        turn = T_from_R_t(exp_so3(np.array([0.0, 0.0, self._teacher.trim_rad])), np.zeros(3))
-        return replace(pose, T_map_vehicle=pose.T_map_vehicle @ turn)
+        turned_rad = self._teacher.trim_rad if self.parameters.refine.enabled else 0.0
+        turn = T_from_R_t(exp_so3(np.array([0.0, 0.0, turned_rad])), np.zeros(3))
+        yaw_rad = TRIMMED_RAD if turned_rad else MOUNTED_RAD
+        variance = np.array([0.0, 0.0, yaw_rad, MOUNTED_M, MOUNTED_M, 0.0]) ** 2
+        return replace(pose, T_map_vehicle=pose.T_map_vehicle @ turn, covariance=pose.covariance + np.diag(variance))
 
     def _deskewed(
         self,
@@ -532,8 +534,6 @@ def _sigmas(pose: SmoothedPose) -> tuple[float, float]:
 
 
 def _estimate(pose: SmoothedPose, held: _HeldScan) -> PoseEstimate:
-    """The pose as told: with what neither scans nor map can know of the mount."""
-    pose = replace(pose, covariance=pose.covariance + np.diag(MOUNT_VARIANCE))
     sigma_m, sigma_rad = _sigmas(pose)
     overruled = pose.certain and held.health != "good" and held.cause in OVERRULED
     return PoseEstimate(
