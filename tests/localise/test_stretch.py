@@ -5,11 +5,12 @@ from itertools import pairwise
 import gtsam
 import numpy as np
 import pytest
-from yard import local_map_of, pose, seen_from
+from yard import corridor, local_map_of, pose, seen_from
 
 from gnd_map.se3 import T_from_R_t, T_inverse, exp_so3
 from vehicle_agent.localise.match_map import MatchMapCache
 from vehicle_agent.localise.parameters import RegistrationParameters
+from vehicle_agent.localise.registration import linearised
 from vehicle_agent.localise.stretch import (
     BIAS,
     LEFT,
@@ -186,3 +187,12 @@ def test_scans_that_contradict_the_odometry_are_noticed(yard, yard_points):
     against = solve_stretch(aside, steps, belief_at(truth[0]), yard, PAR, (4.0,))
     ratio = [one.misfit + one.step_squares[4] / max(one.step_redundancy[4], 1.0) for one in (agreeing, against)]
     assert ratio[1] > 4.0 * ratio[0]
+
+
+def test_along_even_walls_a_scan_tells_nothing_however_many_there_are():
+    rng = np.random.default_rng(7)
+    walls = corridor(rng)
+    match_map = MatchMapCache(local_map_of(walls + rng.normal(0.0, 0.02, walls.shape)), PAR.noise_m).near(np.zeros(3))
+    one = linearised(seen_from(rng, walls, np.eye(4), 1500), np.eye(4), match_map, PAR, 2.0)
+    assert one.H[3, 3] < 1e-3 * one.H[4, 4]
+    assert abs(one.g[3]) < 0.05 * np.sqrt(one.H[4, 4])

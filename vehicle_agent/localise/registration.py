@@ -130,7 +130,11 @@ class Linearised:
 def linearised(
     points_m: F64, T_map_vehicle: F64, match_map: MatchMap, parameters: RegistrationParameters, scale: float
 ) -> Linearised:
-    """Points (N, 3) and the wheels on the map at a pose (4, 4); nothing is moved."""
+    """Points (N, 3) and the wheels on the map at a pose (4, 4); nothing is moved.
+
+    Horizontal directions about which the scan says next to nothing beside the others tell nothing: along an even wall
+    it is the noise of the map that speaks, and with many scans it would sum up.
+    """
     T = np.asarray(T_map_vehicle, dtype=np.float64)
     state = _State(T[:3, :3].copy(), T[:3, 3].copy(), np.zeros((6, 6)), np.zeros(6), WHEELS_M)
     m, gate_m2 = match_map, (parameters.gate_per_scale * scale) ** 2
@@ -141,8 +145,20 @@ def linearised(
     _add_wheels(state, m, parameters, scale)
     turn = np.zeros((6, 6))
     turn[:3, :3] = turn[3:, 3:] = state.R
-    H = turn.T @ state.H @ turn
-    return Linearised(T.copy(), scale, H, turn.T @ state.g, state.cost, state.matched, state.inside)
+    H, g = _without_hints(turn.T @ state.H @ turn, turn.T @ state.g, parameters)
+    return Linearised(T.copy(), scale, H, g, state.cost, state.matched, state.inside)
+
+
+def _without_hints(H: F64, g: F64, par: RegistrationParameters) -> tuple[F64, F64]:
+    """H (6, 6) and g (6,) without the horizontal directions that have less than `degenerate_share` of the strongest."""
+    values, vectors, scale = _principal(H)
+    horizontal = vectors[3] ** 2 + vectors[4] ** 2 > 0.5
+    strongest = float(values[horizontal].max(initial=0.0))
+    told = ~horizontal | (values > par.degenerate_share * strongest)
+    if told.all():
+        return H, g
+    along = vectors[:, told]
+    return (along * values[told]) @ along.T / (scale * scale[:, None]), along @ (along.T @ (g * scale)) / scale
 
 
 def fit_of(points_m: F64, T_map_vehicle: F64, match_map: MatchMap, parameters: RegistrationParameters) -> float:
