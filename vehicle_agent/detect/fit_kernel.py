@@ -5,7 +5,6 @@ from numpy.typing import NDArray
 
 from gnd_map.arrays import F64
 from gnd_map.jit import kernel
-from vehicle_agent.localise.kernels import nearest_gaussian
 
 UNKNOWN_COST = -1.0
 """Of a point where the map is not known, or at the edge of the window."""
@@ -54,5 +53,20 @@ def point_costs(
         ix, iy, iz = int(gx), int(gy), int(gz)
         if index[ix, iy, iz] < -1:
             continue
-        row, best = nearest_gaussian(q0, q1, q2, ix, iy, iz, index, mean, omega, np.inf)
-        cost[n] = best / (scale2 + best) if row >= 0 else 1.0
+        best = np.inf
+        for k in range(7):
+            jx, jy, jz = ix, iy, iz
+            step = 1 if k & 1 else -1
+            if 1 <= k <= 2:
+                jx += step
+            elif 3 <= k <= 4:
+                jy += step
+            elif k >= 5:
+                jz += step
+            row = index[jx, jy, jz]
+            if row >= 0:
+                d0, d1, d2 = q0 - mean[row, 0], q1 - mean[row, 1], q2 - mean[row, 2]
+                o = omega[row]
+                mixed = o[1] * d0 * d1 + o[2] * d0 * d2 + o[4] * d1 * d2
+                best = min(best, o[0] * d0 * d0 + o[3] * d1 * d1 + o[5] * d2 * d2 + 2.0 * mixed)
+        cost[n] = best / (scale2 + best) if best < np.inf else 1.0

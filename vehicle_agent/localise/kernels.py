@@ -66,7 +66,7 @@ def _mahalanobis2(o: F64, d0: float, d1: float, d2: float) -> float:
 
 
 @kernel
-def nearest_gaussian(
+def _nearest(
     q0: float, q1: float, q2: float, ix: int, iy: int, iz: int, index: I32, mean: F64, omega: F64, gate_m2: float
 ) -> tuple[int, float]:
     """Row and squared Mahalanobis distance of the nearest Gaussian of the voxel and its six face neighbours, or -1."""
@@ -170,7 +170,7 @@ def linearise(
         if index[ix, iy, iz] < -1:
             continue
         inside += 1
-        row, m2 = nearest_gaussian(q0, q1, q2, ix, iy, iz, index, mean, omega, gate_m2)
+        row, m2 = _nearest(q0, q1, q2, ix, iy, iz, index, mean, omega, gate_m2)
         if row < 0:
             cost += scale2
             continue
