@@ -135,8 +135,9 @@ class Refiner:
 
     @property
     def supported(self) -> bool:
-        """True just after the stretch was solved, not for the first time, when its newest scans fit the map."""
-        return self._news and self._solutions > SUPPORTED and self._fit() >= self.parameters.least_fit
+        """True just after the stretch was solved, not for the first time, when it is whole and its newest scans fit."""
+        whole = self._solved is not None and not self._solved.torn
+        return self._news and whole and self._solutions > SUPPORTED and self._fit() >= self.parameters.least_fit
 
     @property
     def certain(self) -> bool:
@@ -262,7 +263,9 @@ class Refiner:
         dt_s = (newest.t_ns - self._solved_ns) * 1e-9
         self._solved_way_m, self._solved_ns = newest.way_m, newest.t_ns
         fits_well = self._fit() >= par.firm_fit and self._solved.misfit < par.most_misfit
-        self._firm = self._firm + 1 if fits_well else (self._firm if self._fit() >= par.least_fit else 0)
+        if self._solved.torn or self._fit() < par.least_fit:
+            self._firm = 0
+        self._firm += fits_well and not self._solved.torn
         self._belief = self._shortened(scans, steps, belief, dt_s)
         self._teach()
 

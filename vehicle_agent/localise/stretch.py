@@ -30,6 +30,8 @@ STEP_CHI2: Final = 12.6
 """Of a step's six residuals, from where on it counts less: 95 % of right ones lie below."""
 MOST_SQUARE: Final = 9.0
 """Of a residual in sigmas, as far as one step may say that all are worse: a slip does not, many of 3 sigmas do."""
+TORN_WEIGHT: Final = 0.1
+"""Robust weight below which a measured motion ties nothing."""
 SMALL_M, SMALL_RAD = 2e-3, 2e-4
 """Scans that moved less since they were matched with the map are not matched again."""
 STOP_M, STOP_RAD = 1e-3, 5e-5
@@ -81,6 +83,7 @@ class Solved:
     step_squares, step_redundancy: (6,) sums over the first measurement of each step: squared residual in sigmas, and
         how much of each the others can check (0: nothing else knows, 1: all is known otherwise). Their ratio is the
         variance of these measurements in units of what they claim (variance components, Förstner 1979).
+    torn: somewhere no measured motion fits its two poses, so that nothing ties what lies before to what lies behind.
     """
 
     shared: F64
@@ -91,6 +94,7 @@ class Solved:
     misfit: float
     step_squares: F64
     step_redundancy: F64
+    torn: bool
 
 
 class _System(NamedTuple):
@@ -258,7 +262,16 @@ def _solved(
         misfit=_misfit(knots, par),
         step_squares=squares,
         step_redundancy=redundancy,
+        torn=_is_torn(knots, steps, shared_off),
     )
+
+
+def _is_torn(knots: Sequence[Knot], steps: Sequence[Sequence[Step]], shared_off: F64) -> bool:
+    for k, measured in enumerate(steps):
+        relative = T_inverse(knots[k].T_map_vehicle) @ knots[k + 1].T_map_vehicle
+        if max(_weighed(_residual(relative, step, shared_off)[0], step)[1] for step in measured) < TORN_WEIGHT:
+            return True
+    return False
 
 
 def _checked_steps(
