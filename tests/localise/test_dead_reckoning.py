@@ -127,3 +127,14 @@ def test_a_gap_starts_a_new_stretch():
     teacher.forget()
     teacher.learn(11 * S, T_inverse(far), np.eye(6) * 1e-4)
     assert buffer.speed_scale == 1.0
+
+
+def test_wheels_that_change_speed_faster_than_a_car_can_have_slipped():
+    buffer = MotionBuffer()
+    for k in range(200):
+        slipping = 100 <= k < 120
+        buffer.push(k * 20_000_000, 9.0 * (1.3 if slipping else 1.0), 0.0)
+    assert not buffer.slipped(0, 1_900_000_000)
+    assert buffer.slipped(2_000_000_000, 2_600_000_000)
+    assert buffer.slipped(3_000_000_000, 3_100_000_000)  # what was driven meanwhile is still not known
+    assert not buffer.slipped(3_800_000_000, 3_900_000_000)

@@ -116,7 +116,12 @@ class MotionTeacher:
         sigmas = self.sigmas(odometry, (last_ns - first_ns) * 1e-9)
         yaw_rad, forward_m = self.clock_sigmas(first_ns, last_ns)
         sigmas[2], sigmas[3] = np.hypot(sigmas[2], yaw_rad), np.hypot(sigmas[3], forward_m)
+        sigmas[3] = np.hypot(sigmas[3], self.slip_sigma_m(first_ns, last_ns, odometry))
         return sigmas
+
+    def slip_sigma_m(self, first_ns: int, last_ns: int, odometry: F64) -> float:
+        """One sigma of the way of a motion (4, 4) by wheels that slip: all of it; 0 where they do not."""
+        return float(np.linalg.norm(odometry[:3, 3])) if self._motion.slipped(first_ns, last_ns) else 0.0
 
     def clock_sigmas(self, first_ns: int, last_ns: int) -> tuple[float, float]:
         """One sigma of the turn [rad] and of the way [m] between two times that an uncertain clock makes: that of the

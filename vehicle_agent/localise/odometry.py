@@ -14,6 +14,8 @@ F64 = NDArray[np.float64]
 
 KEEP_NS = 45_000_000_000  # more than any lag, and than the steps that tell the clock
 MAX_ACCELERATION_MPS2 = 15.0  # tyres on dry tarmac hold about 10
+SLIP_MPS = 0.5  # beyond what is possible, before it is a slip and no noise
+SLIP_LASTS_NS = 1_000_000_000
 GAP_NS = 100_000_000  # two samples farther apart leave something unknown between them
 
 
@@ -47,6 +49,7 @@ class MotionBuffer:
 
     def __init__(self) -> None:
         self.clock = ClockModel()
+        self._slipped_ns: int | None = None
         self._t_ns: list[int] = []
         self._speed_mps: list[float] = []
         self._yaw_rate_radps: list[float] = []
@@ -90,7 +93,10 @@ class MotionBuffer:
         """Add a sample; False (and nothing kept) when it is not finite or not later than the one before."""
         if not np.isfinite(speed_mps + yaw_rate_radps) or (self._t_ns and t_ns <= self._t_ns[-1]):
             return False
-        self._speed_mps.append(self._possible(t_ns, speed_mps))
+        possible_mps = self._possible(t_ns, speed_mps)
+        if abs(speed_mps - possible_mps) > SLIP_MPS:
+            self._slipped_ns = t_ns
+        self._speed_mps.append(possible_mps)
         self._t_ns.append(t_ns)
         self._yaw_rate_radps.append(yaw_rate_radps)
         if t_ns - self._t_ns[0] > 2 * KEEP_NS:
@@ -111,6 +117,14 @@ class MotionBuffer:
         known = [first_ns] * (inner[0] > first_ns) + inner + [last_ns] * (inner[-1] < last_ns)
         gaps = (min(b, last_ns) - max(a, first_ns) for a, b in pairwise(known) if b - a > GAP_NS)
         return sum(gaps) * 1e-9
+
+    def slipped(self, first_ns: int, last_ns: int) -> bool:
+        """Whether between two times, or up to `SLIP_LASTS_NS` before, the newest slip of the wheels was seen: a speed
+        that changed faster than any road allows.
+        """
+        return self._slipped_ns is not None and (
+            self.clock.stamp(first_ns) - SLIP_LASTS_NS <= self._slipped_ns <= self.clock.stamp(last_ns)
+        )
 
     def _possible(self, t_ns: int, speed_mps: float) -> float:
         """The speed that the vehicle can have: wheels that lock or spin change theirs faster than any road allows."""

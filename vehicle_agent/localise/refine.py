@@ -48,6 +48,8 @@ FIRST_SIGMA_M, FIRST_SIGMA_RAD = 0.5, 0.02  # of the online pose that the first 
 FORGETTING: Final = 0.7
 """Weight of what was seen of the odometry until the last solution."""
 WORST_VARIANCE: Final = 1e4
+FIRM_AFTER_SLIP: Final = 2
+"""As if so many had fitted well so far: rivals of single scans have a say for some metres."""
 LEAST_WEIGHT: Final = 0.05
 NOISE_WAY_M: Final = 5.0  # for which the sigmas of the odometry are given; a second counts as a metre
 
@@ -228,6 +230,7 @@ class Refiner:
             between_them = self._scans[self._index(before) + 1 : self._index(now) + 1]
             variance = np.sum([scan.variance for scan in between_them], axis=0)
             variance[2:4] += np.square(self._teacher.clock_sigmas(before.t_ns, now.t_ns))
+            variance[3] += self._teacher.slip_sigma_m(before.t_ns, now.t_ns, T) ** 2
             driven.append(Step(T, np.diag(variance), shared_of(T, dt_s)))
             told = [scan.seen for scan in between_them]
             whole = all(step is not None for step in told)
@@ -260,11 +263,14 @@ class Refiner:
         self._judge_steps(self._solved)
         self._news, self._solutions = True, self._solutions + 1
         newest = self._scans[-1]
+        before_ns = self._solved_ns
         dt_s = (newest.t_ns - self._solved_ns) * 1e-9
         self._solved_way_m, self._solved_ns = newest.way_m, newest.t_ns
         fits_well = self._fit() >= par.firm_fit and self._solved.misfit < par.most_misfit
         if self._solved.torn or self._fit() < par.least_fit:
             self._firm = 0
+        elif self._motion.slipped(before_ns, newest.t_ns):
+            self._firm = min(self._firm, FIRM_AFTER_SLIP)
         self._firm += fits_well and not self._solved.torn
         self._belief = self._shortened(scans, steps, belief, dt_s)
         self._teach()
