@@ -47,7 +47,8 @@ def test_a_simulated_fleet_heals_its_map(tmp_path: Path) -> None:
     assert p95["longitudinal_m"] <= 0.05
     assert p95["lateral_m"] <= 0.05
     assert p95["heading_deg"] <= 0.1
-    assert summary["agent_pss_mb_max"] <= 240.0  # 150 without what segmentation (docs/decisions/0041) and features hold
+    # 150 without what segmentation (docs/decisions/0041), features and the gate (0082) hold
+    assert summary["agent_pss_mb_max"] <= 270.0
 
     assert_features_are_healed(summary["features"])
     lines = [json.loads(line) for line in (tmp_path / "run" / "updates.jsonl").read_text().splitlines()]
