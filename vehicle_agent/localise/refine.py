@@ -43,7 +43,6 @@ SUPPORTED: Final = 3
 """Solutions before one tells the online pose where it is."""
 FIRM: Final = 4
 """Solutions that fit well, before anything is certain."""
-NO_POINTS = np.zeros((0, 3))
 FIRST_SIGMA_M, FIRST_SIGMA_RAD = 0.5, 0.02  # of the online pose that the first scan starts from
 FORGETTING: Final = 0.7
 """Weight of what was seen of the odometry until the last solution."""
@@ -60,7 +59,7 @@ class _Scan:
 
     way_m: odometer. T_before_now: (4, 4) motion since the scan before, as all odometry tells. variance: (6,) of wheels
     and gyro in that motion, less what all steps share. seen: that motion as scans tell it. knot: its part in the
-    stretch, None between knots. T_online: (4, 4).
+    stretch, None between knots.
     """
 
     number: int
@@ -70,7 +69,6 @@ class _Scan:
     variance: F64
     seen: ScanStep | None
     knot: Knot | None
-    T_online: F64
 
 
 class Refiner:
@@ -167,12 +165,12 @@ class Refiner:
         par = self.parameters
         if not self._scans:
             knot = Knot(self._thinned(points_m), T_online.copy(), LEAST_WEIGHT)
-            return _Scan(number, t_ns, 0.0, np.eye(4), np.zeros(6), None, knot, T_online)
+            return _Scan(number, t_ns, 0.0, np.eye(4), np.zeros(6), None, knot)
         last, before = self._scans[-1], self._last_knot()
         driven = self._motion.delta(last.t_ns, t_ns)
         T = driven if T_before_now is None else T_before_now
         way_m = last.way_m + float(np.linalg.norm(driven[:3, 3]))
-        scan = _Scan(number, t_ns, way_m, T, self._variance(driven, t_ns - last.t_ns), seen, None, T_online)
+        scan = _Scan(number, t_ns, way_m, T, self._variance(driven, t_ns - last.t_ns), seen, None)
         since_m, since_ns = way_m - before.way_m, t_ns - before.t_ns
         if since_m >= par.knot_m or since_ns >= par.knot_s * 1e9:
             weight = float(np.clip(since_m / par.correlated_m, LEAST_WEIGHT, 1.0))
@@ -264,7 +262,7 @@ class Refiner:
         self._news, self._solutions = True, self._solutions + 1
         newest = self._scans[-1]
         before_ns = self._solved_ns
-        dt_s = (newest.t_ns - self._solved_ns) * 1e-9
+        dt_s = (newest.t_ns - before_ns) * 1e-9
         self._solved_way_m, self._solved_ns = newest.way_m, newest.t_ns
         fits_well = self._fit() >= par.firm_fit and self._solved.misfit < par.most_misfit
         if self._solved.torn or self._fit() < par.least_fit:
