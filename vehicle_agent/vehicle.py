@@ -26,6 +26,7 @@ from vehicle_agent.local_map import LocalMap
 from vehicle_agent.localise.calibration import MotionCalibration
 from vehicle_agent.localise.estimates import RefinedScan
 from vehicle_agent.localise.localiser import Localiser
+from vehicle_agent.localise.remount import header_sigma
 from vehicle_agent.memory import MemoryMeter
 from vehicle_agent.place import Place
 from vehicle_agent.report import Identity, Reporter
@@ -278,7 +279,7 @@ def _assemble(
     local_map = LocalMap(GridFrame.around(frame, [TileId.from_geodetic(fix.lat_rad, fix.lon_rad)]))
     detector = ChangeDetector(local_map, config.detect)
     surroundings = Surroundings(local_map, link.fetcher, detector, config.download)
-    localiser = Localiser(local_map, header.T_vehicle_lidar, config.localise, distortion_of(header))
+    localiser = Localiser(local_map, header.T_vehicle_lidar, config.localise, distortion_of(header), header_sigma(header))
     return Vehicle(
         config=config,
         header=header,

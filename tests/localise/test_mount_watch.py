@@ -15,7 +15,7 @@ HEIGHT_M = 1.9
 def mount(height_m=HEIGHT_M, roll_deg=0.0, pitch_deg=0.0, yaw_deg=0.0):
     T = np.eye(4)
     roll, pitch, yaw = np.radians([roll_deg, pitch_deg, yaw_deg])
-    T[:3, :3] = exp_so3([0.0, 0.0, yaw]) @ exp_so3([0.0, pitch, 0.0]) @ exp_so3([roll, 0.0, 0.0])
+    T[:3, :3] = exp_so3([0.0, pitch, 0.0]) @ exp_so3([roll, 0.0, 0.0]) @ exp_so3([0.0, 0.0, yaw])
     T[:3, 3] = 1.2, 0.0, height_m
     return T
 

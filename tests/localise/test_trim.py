@@ -13,8 +13,10 @@ from vehicle_agent.localise.parameters import HealthParameters, OdometryParamete
 SURE, NOTHING = 1e-5, Slope(0.0, np.inf)
 
 
-def teacher_told(left, sigma=SURE):
-    teacher = MotionTeacher(MotionBuffer(), OdometryParameters())
+def teacher_told(left, sigma=SURE, way_m=1000.0):
+    teacher, way = MotionTeacher(MotionBuffer(), OdometryParameters()), np.eye(4)
+    way[0, 3] = way_m
+    teacher.see_step(0, 1, way, None)
     teacher.correct(Drift(NOTHING, NOTHING, Slope(left, sigma), Slope(0.0, sigma)), overlap=1.0)
     return teacher
 

@@ -9,10 +9,14 @@ from numpy.typing import NDArray
 from gnd_map.se3 import T_inverse, log_so3
 from vehicle_agent.localise.clock import ClockDoubt, ClockEstimator
 from vehicle_agent.localise.drift import Drift
-from vehicle_agent.localise.estimates import Cause
-from vehicle_agent.localise.mount import DOUBTFUL_RAD, SIGMAS, MountDoubt, MountResidual, MountWatch
+from vehicle_agent.importers.mounting import angles_of
+from vehicle_agent.localise.estimates import Cause, Health
+from vehicle_agent.localise.first_course import FirstCourse
+from vehicle_agent.localise.mount import DOUBTFUL_RAD, SIGMAS, MountDoubt, MountResidual
 from vehicle_agent.localise.odometry import MotionBuffer
 from vehicle_agent.localise.parameters import OdometryParameters
+from vehicle_agent.localise.remount import Mounting, left_over
+from vehicle_agent.localise.scan_odometry import ScanStep
 
 F64 = NDArray[np.float64]
 
@@ -20,6 +24,13 @@ STEP_S, STRETCH_S = 0.5, 1.0
 IN_DOUBT = 2.5
 """Sigmas from which on a course beyond what is allowed makes the heading doubtful."""
 MAX_TRIM_RAD, KNOWN_COURSE_RAD = 1.05e-3, 6e-4
+WRONG_HEADING_RAD = float(np.radians(0.5))
+"""Until the mount's yaw is known to be off by less, by two sigmas, no pose is called good."""
+OBSERVED_RAD, DISPUTABLE_RAD = float(np.radians(0.2)), float(np.radians(0.6))
+"""Once the course was observed so well, one sigma and the larger limit will do: recordings tell mounts, or mean axes,
+that are turned by half a degree (KITTI 00: 0.5°, KITTI raw 0027: 0.2°)."""
+CRAB_M = 0.03
+"""By how much a way is off sideways that was driven straight: of steering, camber, an origin that is not at the axle."""
 CLOCK_LASTS = 2.0  # a clock's error goes on as long as the vehicle brakes or turns: for more than the step asked about
 KEEPS = 2.0  # a stretch that is less sure than what was learnt, by more than this in variance, is not listened to
 
@@ -52,6 +63,10 @@ class MotionCalibration:
     course_rad: float
     course_sigma_rad: float
     mount: MountResidual
+    mount_told: F64 | None = None
+    """(4, 4) the header's T_vehicle_lidar."""
+    mount_used: F64 | None = None
+    """(4, 4) what it is taken to be: the header's where that is not certainly wrong."""
 
     def __post_init__(self) -> None:
         sigmas = (self.time_offset_sigma_s, self.wheel_scale_sigma, self.gyro_bias_sigma_radps, self.course_sigma_rad)
@@ -83,20 +98,24 @@ class MotionCalibration:
             "mount_pitch_deg": _told(np.degrees(mount.pitch_rad), np.degrees(mount.pitch_sigma_rad)),
             "mount_yaw_deg": _told(np.degrees(self.mount_yaw_rad), np.degrees(self.course_sigma_rad)),
             "mount_doubtful": list(self.mount_doubtful),
+            "mount_told": _mount_json(self.mount_told),
+            "mount_used": _mount_json(self.mount_used),
         }
 
 
 class MotionTeacher:
     """Learns wheel scale, gyro bias and course of a `MotionBuffer` from map matches: scalar Kalman filters."""
 
-    def __init__(self, motion: MotionBuffer, parameters: OdometryParameters, mount: MountWatch | None = None) -> None:
+    def __init__(self, motion: MotionBuffer, parameters: OdometryParameters, mount: Mounting | None = None) -> None:
         self.parameters = parameters
-        self.mount = mount or MountWatch(np.eye(4))
+        self.mount = mount or Mounting(np.eye(4))
+        self.first_course = FirstCourse()
         self.clock = ClockEstimator(motion)
         self._motion = motion
         self._scale_var = parameters.scale_prior**2
         self._bias_var = parameters.bias_prior_radps**2
         self._course_var = parameters.course_prior**2
+        self._way_m = 0.0
         self._excess_var = np.zeros(6)
         self._anchor: Stamped | None = None
         self._last: Stamped | None = None
@@ -139,9 +158,31 @@ class MotionTeacher:
     @property
     def cause(self) -> Cause:
         """What is wrong with the sensors whose errors are learnt, if anything."""
-        if self.mount.residual.wrong or self.yaw_in_doubt:
-            return "mount"
+        return "mount" if self.mount_in_doubt else self.clock_cause
+
+    @property
+    def clock_cause(self) -> Cause:
+        """What is wrong with the clock, if anything."""
         return "none" if self.clock.estimate.doubt == "none" else "clock"
+
+    @property
+    def mount_in_doubt(self) -> bool:
+        """True while the mount is, or may well be, off by so much that poses are wrong, and was not yet put right."""
+        return self.mount.unsettled or self.mount.torn or self.yaw_in_doubt
+
+    def doubted(self, health: Health, cause: Cause, *, trimmed: bool) -> tuple[Health, Cause]:
+        """Health and cause (of all but the mount) with what is known of the mount by now.
+
+        `trimmed`: the heading is turned by `trim_rad`; else by `header_trim_rad`.
+        """
+        if health != "good":
+            return health, cause
+        off_rad, sigma_rad = self._heading_left(self.trim_rad if trimmed else self.header_trim_rad)
+        observed = min(self._course[1], self.first_course.sigma_rad) < OBSERVED_RAD
+        known = abs(off_rad) + 2.0 * sigma_rad < WRONG_HEADING_RAD or (
+            observed and abs(off_rad) + sigma_rad < DISPUTABLE_RAD
+        )
+        return (health, cause) if known and not self.mount_in_doubt else ("degraded", "mount")
 
     @property
     def calibration(self) -> MotionCalibration:
@@ -158,9 +199,22 @@ class MotionTeacher:
             gyro_bias_radps=float(motion.yaw_bias_radps),
             gyro_bias_sigma_radps=bias_sigma,
             course_rad=float(motion.course[0]),
-            course_sigma_rad=float(np.sqrt(self._course_var)),
+            course_sigma_rad=self._course[1],
             mount=self.mount.residual,
+            mount_told=self.mount.T_header,
+            mount_used=self.mount.T_vehicle_lidar(-self.header_trim_rad),
         )
+
+    @property
+    def _course(self) -> tuple[float, float]:
+        """Direction of driving straight [rad], as the matches teach it, and one sigma."""
+        return float(self._motion.course[0]), float(np.hypot(np.sqrt(self._course_var), CRAB_M / max(self._way_m, 1.0)))
+
+    @property
+    def header_trim_rad(self) -> float:
+        """What the heading is turned by where the header is certainly wrong; 0 where it is not."""
+        course_rad, sigma_rad = self._course
+        return course_rad if abs(course_rad) - SIGMAS * sigma_rad > DOUBTFUL_RAD else 0.0
 
     @property
     def trim_rad(self) -> float:
@@ -168,21 +222,49 @@ class MotionTeacher:
         0 between what a mount may be off by unknowingly and what is certainly a wrong header: there the recording's
         vehicle frame may mean something else than the axle.
         """
-        course_rad, sigma_rad = float(self._motion.course[0]), float(np.sqrt(self._course_var))
-        wrong_header = abs(course_rad) - SIGMAS * sigma_rad > DOUBTFUL_RAD
+        course_rad, sigma_rad = self._course
         slight = abs(course_rad) < MAX_TRIM_RAD and sigma_rad < KNOWN_COURSE_RAD
-        return course_rad if wrong_header or slight else 0.0
+        return course_rad if slight else self.header_trim_rad
+
+    def yaw_sigma_rad(self, trim_rad: float, least_rad: float) -> float:
+        """One sigma of what the heading is off by for the mount's sake when it was turned by `trim_rad`: at least
+        `least_rad`, and no more once the course is known.
+        """
+        if trim_rad and self._course[1] < KNOWN_COURSE_RAD:
+            return least_rad
+        return max(least_rad, float(np.hypot(*self._heading_left(trim_rad))))
+
+    def _heading_left(self, trim_rad: float) -> tuple[float, float]:
+        """What the heading is still off by for the mount's sake [rad], and one sigma, by what knows better: the matches,
+        or the first steps between scans.
+        """
+        course_rad, sigma_rad = self._course
+        if self.first_course.sigma_rad < sigma_rad:
+            course_rad, sigma_rad = self.first_course.course_rad, self.first_course.sigma_rad
+        return left_over(course_rad, sigma_rad, trim_rad, self.mount.sigma.yaw_rad)
 
     @property
     def yaw_in_doubt(self) -> bool:
         """True while the course says that the mount's yaw is likely wrong and not yet by how much."""
-        course_rad, sigma_rad = abs(float(self._motion.course[0])), float(np.sqrt(self._course_var))
+        course_rad, sigma_rad = abs(self._course[0]), self._course[1]
         likely = course_rad > max(2.0 * DOUBTFUL_RAD, IN_DOUBT * sigma_rad)  # where the heading would be called wrong
         return likely and course_rad - SIGMAS * sigma_rad <= DOUBTFUL_RAD
+
+    def remounted(self, T_now_before: F64) -> None:
+        """The vehicle's axes are others from now on: (4, 4), those before in those now."""
+        forward = T_now_before[:3, :3] @ np.array([1.0, *self._motion.course])
+        self._motion.course = forward[1:] / forward[0]
+        self.forget()
 
     def forget(self) -> None:
         """The poses to come do not continue those before."""
         self._anchor = self._last = None
+
+    def see_step(self, first_ns: int, last_ns: int, T_driven: F64, seen: ScanStep | None) -> None:
+        """Take the motion between two scans: (4, 4) by wheels and gyro, and as the scans tell it, if they do."""
+        self._way_m += float(np.linalg.norm(T_driven[:3, 3]))
+        self.clock.see(first_ns, last_ns, seen)
+        self.first_course.see(seen)
 
     def learn(self, t_ns: int, T_map_vehicle: F64, covariance: F64) -> None:
         """Take a trusted match and its covariance (6, 6): each step tells how good the odometry is, each stretch of
@@ -253,6 +335,14 @@ class MotionTeacher:
 
 def _told(value: float, sigma: float) -> dict[str, float] | None:
     return {"value": round(float(value), 6), "sigma": round(float(sigma), 6)} if np.isfinite(sigma) else None
+
+
+def _mount_json(T_vehicle_lidar: F64 | None) -> dict[str, float] | None:
+    """Height, and angles about the vehicle's axes in degrees."""
+    if T_vehicle_lidar is None:
+        return None
+    angles = dict(zip(("roll_deg", "pitch_deg", "yaw_deg"), np.degrees(angles_of(T_vehicle_lidar[:3, :3])), strict=True))
+    return {"height_m": round(float(T_vehicle_lidar[2, 3]), 4)} | {k: round(float(v), 3) for k, v in angles.items()}
 
 
 def _yaw(T: F64) -> float:

@@ -52,9 +52,14 @@ def settled(
     return MapMatch(found.T_map_vehicle, found.covariance)
 
 
-def on_the_road(pose: SmoothedPose, match_map: MatchMap, parameters: RegistrationParameters) -> SmoothedPose:
+def on_the_road(
+    pose: SmoothedPose,
+    match_map: MatchMap,
+    parameters: RegistrationParameters,
+    wheels_m: npt.NDArray[np.float64] = WHEELS_M,
+) -> SmoothedPose:
     """Return the pose with height, roll and pitch by the wheels alone; as it is where the map has no ground there."""
-    found = settled(pose.T_map_vehicle, match_map, parameters)
+    found = settled(pose.T_map_vehicle, match_map, parameters, wheels_m)
     if found is None:
         return pose
     covariance = pose.covariance.copy()

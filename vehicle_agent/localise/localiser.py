@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from gnd_map.motion import Trajectory, deskew
 from gnd_map.se3 import T_from_R_t, T_inverse, exp_so3
-from schemas.drive import GnssFix, MotionSample, Scan
+from schemas.drive import GnssFix, MotionSample, MountSigma, Scan
 from schemas.sweep_distortion import DistortionSigma
 from vehicle_agent.errors import RegistrationError
 from vehicle_agent.local_map import LocalMap
@@ -23,12 +23,13 @@ from vehicle_agent.localise.health import HealthMonitor
 from vehicle_agent.localise.judge import Judge, Matched
 from vehicle_agent.localise.level import on_the_road, sees_tilt, settled
 from vehicle_agent.localise.match_map import MatchMapCache
-from vehicle_agent.localise.mount import MountWatch, near_points
+from vehicle_agent.localise.mount import near_points
 from vehicle_agent.localise.odometry import MotionBuffer
 from vehicle_agent.localise.packed_scan import PackedScan, pack
 from vehicle_agent.localise.parameters import LocaliserParameters
 from vehicle_agent.localise.refine import Refiner
 from vehicle_agent.localise.registration import RegistrationResult, Start, register
+from vehicle_agent.localise.remount import TRUSTED, Mounting, lever_covariance
 from vehicle_agent.localise.sampling import sample_scan
 from vehicle_agent.localise.scan_odometry import ScanOdometry, ScanStep, joint_step
 from vehicle_agent.localise.stretch import log_se3
@@ -99,11 +100,14 @@ class Localiser:
         T_vehicle_lidar: F64,
         parameters: LocaliserParameters | None = None,
         distortion: Distortion | None = None,
+        mount_sigma: MountSigma = TRUSTED,
     ) -> None:
-        """Poses are sought on `local_map`; `distortion` tells what speed and turn do to the points, where they do."""
+        """Poses are sought on `local_map`; `distortion` tells what speed and turn do to the points, where they do;
+        `mount_sigma` how far the mount is known.
+        """
         self.parameters = parameters or LocaliserParameters()
         self.local_map = local_map
-        self.T_vehicle_lidar = np.asarray(T_vehicle_lidar, dtype=np.float64)
+        self._mounting = Mounting(T_vehicle_lidar, mount_sigma)
         self.online: PoseEstimate | None = None
         """Newest pose, for progress and for choosing tiles; its health is `lost` until it is found again."""
         self._distortion = distortion
@@ -112,7 +116,7 @@ class Localiser:
         self.dropped_scans = 0
         self.initialisations = 0
         self._motion = MotionBuffer()
-        self._teacher = MotionTeacher(self._motion, self.parameters.odometry, MountWatch(self.T_vehicle_lidar))
+        self._teacher = MotionTeacher(self._motion, self.parameters.odometry, self._mounting)
         self._map = MatchMapCache(local_map, self.parameters.registration.noise_m)
         self._scan_odometry = ScanOdometry(self.parameters.scan_odometry)
         self._fix: GnssFix | None = None
@@ -200,8 +204,8 @@ class Localiser:
         if scan is None:
             return
         chosen = sample_scan(scan.points_m, self.parameters.sampling)
-        points = self._deskewed(scan, chosen, scan.points_m[chosen])
         self._look_at_mount(scan)
+        points = self._deskewed(scan, chosen, scan.points_m[chosen])
         last_ns = scan.t_ns if self._last_ns is None else self._last_ns
         if self._track is not None and (scan.t_ns - last_ns) * 1e-9 > self.parameters.causes.lost_gap_s:
             self._lose(self._track, "gap")
@@ -212,17 +216,33 @@ class Localiser:
         self._last_ns = _reference_ns(scan)
 
     def _look_at_mount(self, scan: Scan) -> None:
-        t_ns, watch = _reference_ns(scan), self._teacher.mount
-        if watch.due(t_ns):
+        """Watch the mount; what it is known by then counts as soon as no track is torn by it."""
+        t_ns, mounting = _reference_ns(scan), self._mounting
+        if mounting.watch.due(t_ns):
             near = near_points(scan.points_m)
-            watch.see(t_ns, self._deskewed(scan, near, scan.points_m[near]))
+            mounting.see(t_ns, self._deskewed(scan, near, scan.points_m[near]))
+        if self._track is not None and self.online is not None and mounting.torn:
+            T_map_vehicle = self.online.T_map_vehicle
+            self._lose(self._track, "mount")
+            self._told = _Told(self.online.t_ns, T_map_vehicle, trusted=False)
+        if self._track is None and not self._ready:
+            self._remount()
+
+    def _remount(self) -> None:
+        """Go on in the axes of the mount as it is known by now: what is held in others is dropped."""
+        before = self._mounting.T_used
+        T_now_before = self._mounting.remount()
+        if np.array_equal(before, self._mounting.T_used):
+            return
+        self._teacher.remounted(T_now_before)
+        self._first = FirstPose(self.parameters)
 
     def _step(self, track: _Track, scan: Scan, chosen: NDArray[np.int64], points: F64) -> None:
         """Predict from the newest pose, match, gate, fuse."""
         t_ns, newest = _reference_ns(scan), track.graph.newest
         odometry = self._odometry(track.held[newest].t_ns, t_ns)
         seen = self._scan_step(scan, chosen, points, odometry)
-        self._teacher.clock.see(track.held[newest].t_ns, t_ns, seen)
+        self._teacher.see_step(track.held[newest].t_ns, t_ns, odometry.T_before_now, seen)
         joint = joint_step(*odometry, seen)
         sweep = self._sweep_of_steady(scan) if joint.slipped else None
         points = points if sweep is None else self._deskewed(scan, chosen, scan.points_m[chosen], sweep)
@@ -240,7 +260,7 @@ class Localiser:
         odometry = Odometry(odometry.T_before_now, joint.driven_sigmas)
         gnss, T_now = self._gnss_at(track, t_ns, predicted), predicted if match is None else match.T_map_vehicle
         unknown_s = max(self._motion.unknown_s(track.held[newest].t_ns, t_ns), self._motion.age_s(t_ns))
-        seen_scan = Matched(t_ns, points, joint.T_before_now, T_now, result, believed, unknown_s, self._teacher.cause)
+        seen_scan = Matched(t_ns, points, joint.T_before_now, T_now, result, believed, unknown_s, self._teacher.clock_cause)
         track.judge.see(seen_scan, self._map.near(T_now[:3, 3]))
         final = track.graph.add(t_ns, predicted, odometry, match or self._settled(predicted), gnss, seen)
         self._hold(track, scan, result.matching_ratio if result is not None else 0.0, sweep)
@@ -285,13 +305,15 @@ class Localiser:
 
     def _match(self, points: F64, predicted: F64, start: Start) -> RegistrationResult | None:
         try:
-            return register(points, predicted, self._map.near(predicted[:3, 3]), self.parameters.registration, start)
+            m, wheels_m = self._map.near(predicted[:3, 3]), self._mounting.wheels_m
+            return register(points, predicted, m, self.parameters.registration, start, wheels_m)
         except RegistrationError:
             return None
 
     def _settled(self, predicted: F64) -> MapMatch | None:
         """What a scan without a match still knows: its wheels stand on the ground."""
-        return settled(predicted, self._map.near(predicted[:3, 3]), self.parameters.registration)
+        m = self._map.near(predicted[:3, 3])
+        return settled(predicted, m, self.parameters.registration, self._mounting.wheels_m)
 
     def _gnss_at(self, track: _Track, t_ns: int, T_map_vehicle: F64) -> Position | None:
         """A new fix as position of the vehicle at `t_ns`; the monitor is told how far off it is."""
@@ -313,7 +335,7 @@ class Localiser:
         pose, monitor = track.graph.smoothed(number)[0], track.judge.monitor
         sigma_m, sigma_rad = _sigmas(pose)
         monitor.see_sigma(sigma_m, sigma_rad)
-        health, cause = monitor.judge(t_ns)
+        health, cause = self._with_mount(*monitor.judge(t_ns))
         held = _HeldScan(pack(scan), sweep, t_ns, matching_ratio, health, cause, monitor.degenerate, pose)
         track.held[number] = held
         self.online = _estimate(self._trimmed(pose), held)
@@ -345,6 +367,10 @@ class Localiser:
         if self._told is not None:
             self._begin_as_told(scan, points, self._told)
             return
+        if self._mounting.waits:
+            self.dropped_scans += 1
+            self._tell_lost(t_ns, "mount")
+            return
         moved = self._motion.delta(t_ns if self._last_ns is None else self._last_ns, t_ns)
         found = self._first.see(t_ns, points, moved, self._place(t_ns), self._map)
         if found is None:
@@ -357,6 +383,7 @@ class Localiser:
     def _begin_as_told(self, scan: Scan, points: F64, told: _Told) -> None:
         self._told = None
         T = told.T_map_vehicle @ self._motion.delta(told.t_ns, _reference_ns(scan))
+        T = T @ T_inverse(self._mounting.T_used_vehicle(-self._trim_rad))
         covariance = np.diag([TOLD_RAD**2] * 3 + [TOLD_M**2] * 3)
         fit = 1.0 if told.trusted else 0.0
         self._begin(scan, points, RegistrationResult(T, covariance, 0.0, fit, 1.0, 0, True, np.empty((0, 6))), fit)
@@ -365,7 +392,7 @@ class Localiser:
         """Track from this pose on."""
         par, t_ns = self.parameters, _reference_ns(scan)
         self._first = FirstPose(par)
-        judge = Judge(par, self.T_vehicle_lidar[:3, 3], t_ns)
+        judge = Judge(par, self._mounting.T_used[:3, 3], t_ns)
         judge.monitor.see_match(fit, result.fit, result.degenerate)
         judge.monitor.scans_prove = not par.refine.enabled or sees_tilt(scan.points_m)
         if judge.monitor.trusted:
@@ -445,42 +472,51 @@ class Localiser:
         scan = held.scan
         pose, disagrees = _settled_dispute(pose, held.online)
         if not sees_tilt(scan.points):
-            pose = on_the_road(pose, self._map.near(pose.T_map_vehicle[:3, 3]), self.parameters.registration)
+            m, wheels_m = self._map.near(pose.T_map_vehicle[:3, 3]), self._mounting.wheels_m
+            pose = on_the_road(pose, m, self.parameters.registration, wheels_m)
         sweep = self._motion.trajectory(scan.t_ns, scan.end_ns) if held.sweep is None else held.sweep
-        ends, starts = scan.placed(sweep, self.T_vehicle_lidar, held.t_ns, pose.T_map_vehicle)
+        ends, starts = scan.placed(sweep, self._mounting.T_used, held.t_ns, pose.T_map_vehicle)
         pose = replace(pose, covariance=pose.covariance + self._distorted(held.t_ns))
         estimate = replace(_estimate(self._trimmed(pose), held), disagrees=disagrees)
+        if held.cause == "mount":  # the scan came before the mount was known
+            estimate = replace(estimate, health="good", cause="none")
+        health, cause = self._with_mount(estimate.health, estimate.cause)
+        estimate = replace(estimate, health=health, cause=cause)
         if disagrees and not pose.certain and estimate.health == "good":
             estimate = replace(estimate, health="degraded", cause="disputed")
         return RefinedScan(held.t_ns, ends, starts, estimate)
 
     def _distorted(self, t_ns: int) -> F64:
-        """(6, 6) what motion that is left in a sweep, and a mount that is certainly tilted, add to a pose: all points
-        agree on a wrong one.
-        """
+        """(6, 6) what motion that is left in a sweep adds to a pose: all points agree on a wrong one."""
         variance = np.zeros(6)
         if self._distortion is not None and len(self._motion):
             before = self._motion.delta(t_ns - SWEPT_NS, t_ns)
             dt_s = SWEPT_NS * 1e-9
             sigma = self._distortion(before[0, 3] / dt_s, float(np.arctan2(before[1, 0], before[0, 0])) / dt_s)
             variance[[3, 4, 2]] = np.square(sigma) * POSE_SHARE**2
-        tilt, height_m = self._teacher.mount.residual, self.T_vehicle_lidar[2, 3]
-        if "pitch" in tilt.doubtful:
-            variance[3] += (height_m * tilt.pitch_rad) ** 2
-        if "roll" in tilt.doubtful:
-            variance[4] += (height_m * tilt.roll_rad) ** 2
         return np.diag(variance)
 
     def _trimmed(self, pose: SmoothedPose) -> SmoothedPose:
-        """The pose with the heading that the rear axle drives along: what the LiDAR's mount is turned by is taken out
-        of it. The points stay where the mount as told puts them, which is how they were matched. The covariance holds
-        what neither scans nor map can know of the mount.
+        """The pose of the vehicle as it lies under its mount, as far as that is known, from that in the axes of the
+        mount in use: the LiDAR stays where it is, the heading is the one that the rear axle drives along. The
+        covariance holds what neither scans nor map can know of the mount, with its lever arm.
         """
-        turned_rad = self._teacher.trim_rad if self.parameters.refine.enabled else 0.0
-        turn = T_from_R_t(exp_so3(np.array([0.0, 0.0, turned_rad])), np.zeros(3))
-        yaw_rad = TRIMMED_RAD if turned_rad else MOUNTED_RAD
-        variance = np.array([0.0, 0.0, yaw_rad, MOUNTED_M, MOUNTED_M, 0.0]) ** 2
-        return replace(pose, T_map_vehicle=pose.T_map_vehicle @ turn, covariance=pose.covariance + np.diag(variance))
+        trim_rad = self._trim_rad
+        yaw_rad = self._teacher.yaw_sigma_rad(trim_rad, TRIMMED_RAD if trim_rad else MOUNTED_RAD)
+        T = pose.T_map_vehicle @ self._mounting.T_used_vehicle(-trim_rad)
+        place = np.diag(np.array([0.0, 0.0, 0.0, MOUNTED_M, MOUNTED_M, 0.0]) ** 2)
+        variance = np.append(self._mounting.tilt_variance_rad2(), yaw_rad**2)
+        mounted = place + lever_covariance(self._mounting.T_vehicle_lidar()[:3, 3], variance)
+        return replace(pose, T_map_vehicle=T, covariance=pose.covariance + mounted)
+
+    @property
+    def _trim_rad(self) -> float:
+        """What the heading is turned by: finely only where submaps teach the course."""
+        return self._teacher.trim_rad if self.parameters.refine.enabled else self._teacher.header_trim_rad
+
+    def _with_mount(self, health: Health, cause: Cause) -> tuple[Health, Cause]:
+        """Health and cause with what is known of the mount by now."""
+        return self._teacher.doubted(health, cause, trimmed=self.parameters.refine.enabled)
 
     def _deskewed(
         self,
@@ -495,7 +531,7 @@ class Localiser:
         if sweep is None:
             sweep = self._motion.trajectory(scan.t_ns, _end_ns(scan))
         offset_ns = scan.t_offset_ns[chosen]
-        return deskew(points_lidar_m, offset_ns, scan.t_ns, sweep, self.T_vehicle_lidar, _reference_ns(scan))
+        return deskew(points_lidar_m, offset_ns, scan.t_ns, sweep, self._mounting.T_used, _reference_ns(scan))
 
     def _take_ready(self) -> Iterator[RefinedScan]:
         while self._ready:

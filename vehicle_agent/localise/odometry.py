@@ -49,7 +49,7 @@ class MotionBuffer:
 
     def __init__(self) -> None:
         self.clock = ClockModel()
-        self._slipped_ns: int | None = None
+        self._slipped_ns: list[int] = []
         self._t_ns: list[int] = []
         self._speed_mps: list[float] = []
         self._yaw_rate_radps: list[float] = []
@@ -95,7 +95,7 @@ class MotionBuffer:
             return False
         possible_mps = self._possible(t_ns, speed_mps)
         if abs(speed_mps - possible_mps) > SLIP_MPS:
-            self._slipped_ns = t_ns
+            self._slipped_ns.append(t_ns)
         self._speed_mps.append(possible_mps)
         self._t_ns.append(t_ns)
         self._yaw_rate_radps.append(yaw_rate_radps)
@@ -119,12 +119,11 @@ class MotionBuffer:
         return sum(gaps) * 1e-9
 
     def slipped(self, first_ns: int, last_ns: int) -> bool:
-        """Whether between two times, or up to `SLIP_LASTS_NS` before, the newest slip of the wheels was seen: a speed
-        that changed faster than any road allows.
+        """Whether between two times, or up to `SLIP_LASTS_NS` before, a slip of the wheels was seen: a speed that changed
+        faster than any road allows. Slips are remembered as long as samples.
         """
-        return self._slipped_ns is not None and (
-            self.clock.stamp(first_ns) - SLIP_LASTS_NS <= self._slipped_ns <= self.clock.stamp(last_ns)
-        )
+        k = bisect_left(self._slipped_ns, self.clock.stamp(first_ns) - SLIP_LASTS_NS)
+        return k < len(self._slipped_ns) and self._slipped_ns[k] <= self.clock.stamp(last_ns)
 
     def _possible(self, t_ns: int, speed_mps: float) -> float:
         """The speed that the vehicle can have: wheels that lock or spin change theirs faster than any road allows."""
@@ -139,6 +138,7 @@ class MotionBuffer:
 
     def _drop(self, n: int) -> None:
         del self._t_ns[:n], self._speed_mps[:n], self._yaw_rate_radps[:n]
+        del self._slipped_ns[: bisect_left(self._slipped_ns, self._t_ns[0]) if self._t_ns else None]
 
     def trajectory(self, first_ns: int, last_ns: int) -> Trajectory:
         """Poses in the vehicle frame at `first_ns`, from there to `last_ns` (>= first), at the samples' times.

@@ -164,7 +164,7 @@ class Refiner:
         """The scan as the stretch takes it: a knot, if the vehicle has moved on or time has passed since the last."""
         par = self.parameters
         if not self._scans:
-            knot = Knot(self._thinned(points_m), T_online.copy(), LEAST_WEIGHT)
+            knot = Knot(self._thinned(points_m), T_online.copy(), LEAST_WEIGHT, wheels_m=self._teacher.mount.wheels_m)
             return _Scan(number, t_ns, 0.0, np.eye(4), np.zeros(6), None, knot)
         last, before = self._scans[-1], self._last_knot()
         driven = self._motion.delta(last.t_ns, t_ns)
@@ -174,7 +174,8 @@ class Refiner:
         since_m, since_ns = way_m - before.way_m, t_ns - before.t_ns
         if since_m >= par.knot_m or since_ns >= par.knot_s * 1e9:
             weight = float(np.clip(since_m / par.correlated_m, LEAST_WEIGHT, 1.0))
-            scan.knot = Knot(self._thinned(points_m), self._carried(before, scan), weight)
+            T_carried, wheels_m = self._carried(before, scan), self._teacher.mount.wheels_m
+            scan.knot = Knot(self._thinned(points_m), T_carried, weight, wheels_m=wheels_m)
         return scan
 
     def _variance(self, driven: F64, dt_ns: int) -> F64:

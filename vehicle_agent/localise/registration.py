@@ -128,15 +128,20 @@ class Linearised:
 
 
 def linearised(
-    points_m: F64, T_map_vehicle: F64, match_map: MatchMap, parameters: RegistrationParameters, scale: float
+    points_m: F64,
+    T_map_vehicle: F64,
+    match_map: MatchMap,
+    parameters: RegistrationParameters,
+    scale: float,
+    wheels_m: F64 = WHEELS_M,
 ) -> Linearised:
-    """Points (N, 3) and the wheels on the map at a pose (4, 4); nothing is moved.
+    """Points (N, 3) and the wheels (W, 3) on the map at a pose (4, 4); nothing is moved.
 
     Horizontal directions about which the scan says next to nothing beside the others tell nothing: along an even wall
     it is the noise of the map that speaks, and with many scans it would sum up.
     """
     T = np.asarray(T_map_vehicle, dtype=np.float64)
-    state = _State(T[:3, :3].copy(), T[:3, 3].copy(), np.zeros((6, 6)), np.zeros(6), WHEELS_M)
+    state = _State(T[:3, :3].copy(), T[:3, 3].copy(), np.zeros((6, 6)), np.zeros(6), wheels_m)
     m, gate_m2 = match_map, (parameters.gate_per_scale * scale) ** 2
     state.cost, state.matched, state.inside = linearise(
         np.ascontiguousarray(points_m), state.R, state.t, m.index, m.A, m.b, m.mean_m, m.information, scale**2, gate_m2,

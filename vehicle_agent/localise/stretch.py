@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from gnd_map.se3 import T_inverse, exp_so3, log_so3
 from vehicle_agent.localise.match_map import MatchMap
 from vehicle_agent.localise.parameters import RegistrationParameters
-from vehicle_agent.localise.registration import LEVER_M, Linearised, linearised
+from vehicle_agent.localise.registration import LEVER_M, WHEELS_M, Linearised, linearised
 
 F64 = NDArray[np.float64]
 
@@ -64,13 +64,14 @@ class Belief(NamedTuple):
 @dataclass(slots=True, eq=False)
 class Knot:
     """A scan of the stretch: points (K, 3) float64 in the vehicle frame, present pose (4, 4), `weight` (0 ... 1) of its
-    match because neighbours see the same surfaces, and its match where it was last made.
+    match because neighbours see the same surfaces, its match where it was last made, and where its wheels are (W, 3).
     """
 
     points_m: F64
     T_map_vehicle: F64
     weight: float
     match: Linearised | None = field(default=None)
+    wheels_m: F64 = field(default_factory=lambda: WHEELS_M)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -170,7 +171,7 @@ def _match(knots: Sequence[Knot], match_map: MatchMap, par: RegistrationParamete
             and _small(log_se3(T_inverse(m.T_map_vehicle) @ T)[None], SMALL_M, SMALL_RAD)
         ):
             continue
-        knot.match = linearised(knot.points_m, T, match_map, par, scale)
+        knot.match = linearised(knot.points_m, T, match_map, par, scale, knot.wheels_m)
 
 
 def _system(

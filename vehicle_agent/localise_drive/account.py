@@ -141,7 +141,9 @@ def _consistency(values: dict[str, Any]) -> str:
 
 def _calibration(values: dict[str, Any] | None) -> tuple[tuple[str, str], ...]:
     """Rows of clock and mount."""
-    return () if values is None else (("clock", _clock(values)), ("mount against the header", _mount(values)))
+    if values is None:
+        return ()
+    return ("clock", _clock(values)), ("mount", _mount_used(values)), ("mount against the header", _mount(values))
 
 
 def _clock(values: dict[str, Any]) -> str:
@@ -149,6 +151,16 @@ def _clock(values: dict[str, Any]) -> str:
     offset, doubt = values["time_offset_s"], values["clock_doubt"]
     said = f"wheels and gyro {offset['value'] * 1e3:+.1f} ms against the LiDAR, ±{offset['sigma'] * 1e3:.1f}"
     return said if doubt == "none" else f"{said}; {doubt}"
+
+
+def _mount_used(values: dict[str, Any]) -> str:
+    """The mount that the header tells, and the one that is used where that is another."""
+    told, used = values["mount_told"], values["mount_used"]
+    said = [
+        "LiDAR {height_m:.2f} m above the road, roll {roll_deg:.2f}°, pitch {pitch_deg:.2f}°, yaw {yaw_deg:.2f}°".format(**m)
+        for m in (told, used)
+    ]
+    return f"{said[0]}, as told" if told == used else f"{said[1]}; told: {said[0]}"
 
 
 def _mount(values: dict[str, Any]) -> str:

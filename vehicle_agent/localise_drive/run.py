@@ -25,6 +25,7 @@ from vehicle_agent.localise.calibration import MotionCalibration
 from vehicle_agent.localise.estimates import Cause, Health, PoseEstimate, RefinedScan
 from vehicle_agent.localise.localiser import Localiser
 from vehicle_agent.localise.parameters import LocaliserParameters
+from vehicle_agent.localise.remount import header_sigma
 from vehicle_agent.localise_drive.tiles import MapAround, StoreMap
 from vehicle_agent.place import Place
 from vehicle_agent.scans import Guard
@@ -163,7 +164,7 @@ class _Run:
         self._around = MapAround(tiles, local_map)
         self._place = Place(frame, fix)
         self._guard = Guard()
-        self._localiser = Localiser(local_map, header.T_vehicle_lidar, parameters, distortion_of(header))
+        self._localiser = Localiser(local_map, header.T_vehicle_lidar, parameters, distortion_of(header), header_sigma(header))
         self._record = _Record()
         self._scans, self._finished, self._damage = 0, False, ""
         self._started_s = time.monotonic()
