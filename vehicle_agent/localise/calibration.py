@@ -177,11 +177,11 @@ class MotionTeacher:
         """
         if health != "good":
             return health, cause
-        off_rad, sigma_rad = self._heading_left(self.trim_rad if trimmed else self.header_trim_rad)
-        observed = min(self._course[1], self.first_course.sigma_rad) < OBSERVED_RAD
-        known = abs(off_rad) + 2.0 * sigma_rad < WRONG_HEADING_RAD or (
-            observed and abs(off_rad) + sigma_rad < DISPUTABLE_RAD
-        )
+        turned_rad = self.trim_rad if trimmed else self.header_trim_rad
+        off_rad, sigma_rad = self._heading_left(turned_rad)
+        observed = not turned_rad and min(self._course[1], self.first_course.sigma_rad) < OBSERVED_RAD
+        sure = abs(off_rad) + 2.0 * sigma_rad < WRONG_HEADING_RAD
+        known = sure or (observed and abs(off_rad) + sigma_rad < DISPUTABLE_RAD)
         return (health, cause) if known and not self.mount_in_doubt else ("degraded", "mount")
 
     @property
@@ -236,10 +236,10 @@ class MotionTeacher:
 
     def _heading_left(self, trim_rad: float) -> tuple[float, float]:
         """What the heading is still off by for the mount's sake [rad], and one sigma, by what knows better: the matches,
-        or the first steps between scans.
+        or the first steps between scans; by the matches alone where it was turned after them.
         """
         course_rad, sigma_rad = self._course
-        if self.first_course.sigma_rad < sigma_rad:
+        if not trim_rad and self.first_course.sigma_rad < sigma_rad:
             course_rad, sigma_rad = self.first_course.course_rad, self.first_course.sigma_rad
         return left_over(course_rad, sigma_rad, trim_rad, self.mount.sigma.yaw_rad)
 

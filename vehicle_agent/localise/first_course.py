@@ -13,7 +13,7 @@ from vehicle_agent.localise.scan_odometry import ScanStep
 
 F64 = NDArray[np.float64]
 
-GROWN: Final = 1.5
+GROWN: Final = 1.0
 """Steps of scans are taken to be so much less sure than they say."""
 LEVER_M: Final = 1.0
 """How far ahead of the rear axle the vehicle's origin may lie: it moves sideways then where the vehicle turns."""

@@ -369,6 +369,7 @@ class Localiser:
             return
         if self._mounting.waits:
             self.dropped_scans += 1
+            self._first.cause = "mount"
             self._tell_lost(t_ns, "mount")
             return
         moved = self._motion.delta(t_ns if self._last_ns is None else self._last_ns, t_ns)
