@@ -138,3 +138,16 @@ def test_wheels_that_change_speed_faster_than_a_car_can_have_slipped():
     assert buffer.slipped(2_000_000_000, 2_600_000_000)
     assert buffer.slipped(3_000_000_000, 3_100_000_000)  # what was driven meanwhile is still not known
     assert not buffer.slipped(3_800_000_000, 3_900_000_000)
+
+
+def test_every_slip_of_the_last_stretch_is_remembered():
+    """Before, the newest one alone: what the wheels told between older ones counted as exact again."""
+    buffer, slips_s = MotionBuffer(), (2.0, 6.0, 9.0)
+    for k in range(600):
+        buffer.push(k * 20_000_000, 0.0 if k / 50 in slips_s else 10.0, 0.0)
+    for at_s in slips_s:
+        assert buffer.slipped(round(at_s * 1e9), round((at_s + 0.5) * 1e9))
+    assert not buffer.slipped(4_000_000_000, 5_500_000_000)
+    for k in range(600, 12_000):
+        buffer.push(k * 20_000_000, 10.0, 0.0)
+    assert not buffer.slipped(0, 10_000_000_000)  # as long as samples, no longer

@@ -261,9 +261,11 @@ class MotionTeacher:
         self._anchor = self._last = None
 
     def see_step(self, first_ns: int, last_ns: int, T_driven: F64, seen: ScanStep | None) -> None:
-        """Take the motion between two scans: (4, 4) by wheels and gyro, and as the scans tell it, if they do."""
+        """Take the motion between two scans: (4, 4) by wheels and gyro, and as the scans tell it, if they do. Wheels that
+        slip tell nothing of the clock.
+        """
         self._way_m += float(np.linalg.norm(T_driven[:3, 3]))
-        self.clock.see(first_ns, last_ns, seen)
+        self.clock.see(first_ns, last_ns, None if self._motion.slipped(first_ns, last_ns) else seen)
         self.first_course.see(seen)
 
     def learn(self, t_ns: int, T_map_vehicle: F64, covariance: F64) -> None:
