@@ -279,7 +279,9 @@ def _assemble(
     local_map = LocalMap(GridFrame.around(frame, [TileId.from_geodetic(fix.lat_rad, fix.lon_rad)]))
     detector = ChangeDetector(local_map, config.detect)
     surroundings = Surroundings(local_map, link.fetcher, detector, config.download)
-    localiser = Localiser(local_map, header.T_vehicle_lidar, config.localise, distortion_of(header), header_sigma(header))
+    localiser = Localiser(
+        local_map, header.T_vehicle_lidar, config.localise, distortion_of(header), header_sigma(header)
+    )
     return Vehicle(
         config=config,
         header=header,

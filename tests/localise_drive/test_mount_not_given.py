@@ -50,7 +50,9 @@ def forgotten(drive: Path, target: Path) -> Path:
     header = read_header(drive)
     T = header.T_vehicle_lidar.copy()
     T[:3, 3] = 0.0
-    with DriveWriter(target, dataclasses.replace(header, T_vehicle_lidar=T, mount="unsaid", mount_sigma=None)) as writer:
+    with DriveWriter(
+        target, dataclasses.replace(header, T_vehicle_lidar=T, mount="unsaid", mount_sigma=None)
+    ) as writer:
         for item in read_drive(drive):
             writer.add(item)
     return target

@@ -7,9 +7,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gnd_map.se3 import T_inverse, log_so3
+from vehicle_agent.importers.mounting import angles_of
 from vehicle_agent.localise.clock import ClockDoubt, ClockEstimator
 from vehicle_agent.localise.drift import Drift
-from vehicle_agent.importers.mounting import angles_of
 from vehicle_agent.localise.estimates import Cause, Health
 from vehicle_agent.localise.first_course import FirstCourse
 from vehicle_agent.localise.mount import DOUBTFUL_RAD, SIGMAS, MountDoubt, MountResidual
@@ -30,7 +30,7 @@ OBSERVED_RAD, DISPUTABLE_RAD = float(np.radians(0.2)), float(np.radians(0.6))
 """Once the course was observed so well, one sigma and the larger limit will do: recordings tell mounts, or mean axes,
 that are turned by half a degree (KITTI 00: 0.5°, KITTI raw 0027: 0.2°)."""
 CRAB_M = 0.03
-"""By how much a way is off sideways that was driven straight: of steering, camber, an origin that is not at the axle."""
+"""How far a way driven straight leads aside: by steering, camber, an origin that is not at the axle."""
 CLOCK_LASTS = 2.0  # a clock's error goes on as long as the vehicle brakes or turns: for more than the step asked about
 KEEPS = 2.0  # a stretch that is less sure than what was learnt, by more than this in variance, is not listened to
 
@@ -235,8 +235,8 @@ class MotionTeacher:
         return max(least_rad, float(np.hypot(*self._heading_left(trim_rad))))
 
     def _heading_left(self, trim_rad: float) -> tuple[float, float]:
-        """What the heading is still off by for the mount's sake [rad], and one sigma, by what knows better: the matches,
-        or the first steps between scans; by the matches alone where it was turned after them.
+        """What the heading is still off by for the mount's sake [rad], and one sigma, by what knows better: matches, or
+        the first steps between scans; by matches alone where it was turned after them.
         """
         course_rad, sigma_rad = self._course
         if not trim_rad and self.first_course.sigma_rad < sigma_rad:
@@ -261,8 +261,8 @@ class MotionTeacher:
         self._anchor = self._last = None
 
     def see_step(self, first_ns: int, last_ns: int, T_driven: F64, seen: ScanStep | None) -> None:
-        """Take the motion between two scans: (4, 4) by wheels and gyro, and as the scans tell it, if they do. Wheels that
-        slip tell nothing of the clock.
+        """Take the motion between two scans: (4, 4) by wheels and gyro, and as the scans tell it, if they do. Wheels
+        that slip tell nothing of the clock.
         """
         self._way_m += float(np.linalg.norm(T_driven[:3, 3]))
         self.clock.see(first_ns, last_ns, None if self._motion.slipped(first_ns, last_ns) else seen)
@@ -343,7 +343,9 @@ def _mount_json(T_vehicle_lidar: F64 | None) -> dict[str, float] | None:
     """Height, and angles about the vehicle's axes in degrees."""
     if T_vehicle_lidar is None:
         return None
-    angles = dict(zip(("roll_deg", "pitch_deg", "yaw_deg"), np.degrees(angles_of(T_vehicle_lidar[:3, :3])), strict=True))
+    angles = dict(
+        zip(("roll_deg", "pitch_deg", "yaw_deg"), np.degrees(angles_of(T_vehicle_lidar[:3, :3])), strict=True)
+    )
     return {"height_m": round(float(T_vehicle_lidar[2, 3]), 4)} | {k: round(float(v), 3) for k, v in angles.items()}
 
 

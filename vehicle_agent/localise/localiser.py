@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gnd_map.motion import Trajectory, deskew
-from gnd_map.se3 import T_from_R_t, T_inverse, exp_so3
+from gnd_map.se3 import T_inverse
 from schemas.drive import GnssFix, MotionSample, MountSigma, Scan
 from schemas.sweep_distortion import DistortionSigma
 from vehicle_agent.errors import RegistrationError
@@ -260,7 +260,9 @@ class Localiser:
         odometry = Odometry(odometry.T_before_now, joint.driven_sigmas)
         gnss, T_now = self._gnss_at(track, t_ns, predicted), predicted if match is None else match.T_map_vehicle
         unknown_s = max(self._motion.unknown_s(track.held[newest].t_ns, t_ns), self._motion.age_s(t_ns))
-        seen_scan = Matched(t_ns, points, joint.T_before_now, T_now, result, believed, unknown_s, self._teacher.clock_cause)
+        seen_scan = Matched(
+            t_ns, points, joint.T_before_now, T_now, result, believed, unknown_s, self._teacher.clock_cause
+        )
         track.judge.see(seen_scan, self._map.near(T_now[:3, 3]))
         final = track.graph.add(t_ns, predicted, odometry, match or self._settled(predicted), gnss, seen)
         self._hold(track, scan, result.matching_ratio if result is not None else 0.0, sweep)

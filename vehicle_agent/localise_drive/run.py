@@ -164,7 +164,9 @@ class _Run:
         self._around = MapAround(tiles, local_map)
         self._place = Place(frame, fix)
         self._guard = Guard()
-        self._localiser = Localiser(local_map, header.T_vehicle_lidar, parameters, distortion_of(header), header_sigma(header))
+        self._localiser = Localiser(
+            local_map, header.T_vehicle_lidar, parameters, distortion_of(header), header_sigma(header)
+        )
         self._record = _Record()
         self._scans, self._finished, self._damage = 0, False, ""
         self._started_s = time.monotonic()
