@@ -343,10 +343,9 @@ def _mount_json(T_vehicle_lidar: F64 | None) -> dict[str, float] | None:
     """Height, and angles about the vehicle's axes in degrees."""
     if T_vehicle_lidar is None:
         return None
-    angles = dict(
-        zip(("roll_deg", "pitch_deg", "yaw_deg"), np.degrees(angles_of(T_vehicle_lidar[:3, :3])), strict=True)
-    )
-    return {"height_m": round(float(T_vehicle_lidar[2, 3]), 4)} | {k: round(float(v), 3) for k, v in angles.items()}
+    roll, pitch, yaw = (round(float(angle), 3) for angle in np.degrees(angles_of(T_vehicle_lidar[:3, :3])))
+    height_m = round(float(T_vehicle_lidar[2, 3]), 4)
+    return {"height_m": height_m, "roll_deg": roll, "pitch_deg": pitch, "yaw_deg": yaw}
 
 
 def _yaw(T: F64) -> float:

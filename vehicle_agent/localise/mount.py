@@ -41,7 +41,7 @@ WRONG: Final = np.array([WRONG_M, WRONG_RAD, WRONG_RAD])
 SIGMAS: Final = 3.0
 MOST_POINTS: Final = 15_000
 NOD_RAD: Final = float(np.radians(0.3))
-"""One sigma of what a vehicle leans by while it brakes or turns, or its stretch of road: scans of one moment share it."""
+"""One sigma of what a vehicle, or its piece of road, leans by at a moment."""
 
 
 @dataclass(frozen=True, slots=True)

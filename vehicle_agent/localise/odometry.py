@@ -119,8 +119,8 @@ class MotionBuffer:
         return sum(gaps) * 1e-9
 
     def slipped(self, first_ns: int, last_ns: int) -> bool:
-        """Whether between two times, or up to `SLIP_LASTS_NS` before, a slip of the wheels was seen: a speed that changed
-        faster than any road allows. Slips are remembered as long as samples.
+        """Whether between two times, or up to `SLIP_LASTS_NS` before, a slip of the wheels was seen: a speed that
+        changed faster than any road allows. Slips are remembered as long as samples.
         """
         k = bisect_left(self._slipped_ns, self.clock.stamp(first_ns) - SLIP_LASTS_NS)
         return k < len(self._slipped_ns) and self._slipped_ns[k] <= self.clock.stamp(last_ns)

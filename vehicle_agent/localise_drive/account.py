@@ -156,12 +156,8 @@ def _clock(values: dict[str, Any]) -> str:
 def _mount_used(values: dict[str, Any]) -> str:
     """The mount that the header tells, and the one that is used where that is another."""
     told, used = values["mount_told"], values["mount_used"]
-    said = [
-        "LiDAR {height_m:.2f} m above the road, roll {roll_deg:.2f}°, pitch {pitch_deg:.2f}°, yaw {yaw_deg:.2f}°".format(
-            **m
-        )
-        for m in (told, used)
-    ]
+    form = "LiDAR {height_m:.2f} m above the road, roll {roll_deg:.2f}°, pitch {pitch_deg:.2f}°, yaw {yaw_deg:.2f}°"
+    said = [form.format(**mount) for mount in (told, used)]
     return f"{said[0]}, as told" if told == used else f"{said[1]}; told: {said[0]}"
 
 
