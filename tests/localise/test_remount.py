@@ -11,7 +11,15 @@ from vehicle_agent.localise.mount import MountResidual
 from vehicle_agent.localise.odometry import MotionBuffer
 from vehicle_agent.localise.parameters import OdometryParameters
 from vehicle_agent.localise.registration import WHEELS_M
-from vehicle_agent.localise.remount import TRUSTED, TRUSTED_RAD, Mounting, left_over, lever_covariance, tilted
+from vehicle_agent.localise.remount import (
+    TRUSTED,
+    TRUSTED_RAD,
+    Mounting,
+    left_over,
+    left_sigma,
+    lever_covariance,
+    tilted,
+)
 from vehicle_agent.localise.scan_odometry import ScanStep
 
 S = 1_000_000_000
@@ -161,9 +169,21 @@ def test_a_mount_that_is_known_well_need_not_be_seen():
 
 
 def test_the_sigma_of_the_heading_holds_what_the_mount_may_be_turned_by():
-    assert teacher_after([]).yaw_sigma_rad(0.0, 1e-4) == pytest.approx(TRUSTED_RAD, rel=0.02)
-    known = teacher_after([step(0.0)] * 20)
-    assert known.yaw_sigma_rad(0.0, 1e-4) < 0.4 * TRUSTED_RAD
+    unseen, known, askew = (teacher_after(steps) for steps in ([], [step(0.0)] * 20, [step(DEG)] * 6))
+    assert unseen.yaw_sigma_rad(0.0, 1e-4) == pytest.approx(np.sqrt(0.05) * DEG, rel=0.2)
+    assert known.yaw_sigma_rad(0.0, 1e-4) < 0.02 * DEG
+    assert askew.yaw_sigma_rad(0.0, 1e-4) > 0.8 * DEG
+
+
+def test_a_header_that_says_how_well_it_is_known_is_believed():
+    assert left_sigma(0.0, np.inf, 0.0, 0.2 * DEG) == pytest.approx(0.2 * DEG)
+    assert left_sigma(0.3 * DEG, 0.1 * DEG, 0.0, TRUSTED_RAD) < left_sigma(0.6 * DEG, 0.1 * DEG, 0.0, TRUSTED_RAD)
+
+
+def test_where_no_course_can_be_seen_the_header_is_believed_after_some_way():
+    assert teacher_after([step(0.0, across_m=0.05)] * 4).doubted("good", "none", trimmed=True) == ("degraded", "mount")
+    assert teacher_after([step(0.0, across_m=0.05)] * 6).doubted("good", "none", trimmed=True) == ("good", "none")
+    assert teacher_after([step(2 * DEG, across_m=0.02)] * 6).doubted("good", "none", trimmed=True)[1] == "mount"
 
 
 def test_an_unsettled_mount_is_said():

@@ -1,4 +1,4 @@
-"""Real scans whose files tell no mount, end to end: it is found at import, or while driving where an old file lacks it."""
+"""Real scans whose files tell no mount, end to end: found at import, or while driving where an old file lacks it."""
 
 import dataclasses
 import json

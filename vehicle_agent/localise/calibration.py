@@ -15,7 +15,7 @@ from vehicle_agent.localise.first_course import FirstCourse
 from vehicle_agent.localise.mount import DOUBTFUL_RAD, SIGMAS, MountDoubt, MountResidual
 from vehicle_agent.localise.odometry import MotionBuffer
 from vehicle_agent.localise.parameters import OdometryParameters
-from vehicle_agent.localise.remount import Mounting, left_over
+from vehicle_agent.localise.remount import Mounting, left_over, left_sigma
 from vehicle_agent.localise.scan_odometry import ScanStep
 
 F64 = NDArray[np.float64]
@@ -29,6 +29,8 @@ WRONG_HEADING_RAD = float(np.radians(0.5))
 OBSERVED_RAD, DISPUTABLE_RAD = float(np.radians(0.2)), float(np.radians(0.6))
 """Once the course was observed so well, one sigma and the larger limit will do: recordings tell mounts, or mean axes,
 that are turned by half a degree (KITTI 00: 0.5°, KITTI raw 0027: 0.2°)."""
+PATIENT_M = 5.0
+"""Where no course is seen on so much of way, as in an open field, one sigma will do."""
 CRAB_M = 0.03
 """How far a way driven straight leads aside: by steering, camber, an origin that is not at the axle."""
 CLOCK_LASTS = 2.0  # a clock's error goes on as long as the vehicle brakes or turns: for more than the step asked about
@@ -178,10 +180,11 @@ class MotionTeacher:
         if health != "good":
             return health, cause
         turned_rad = self.trim_rad if trimmed else self.header_trim_rad
-        off_rad, sigma_rad = self._heading_left(turned_rad)
-        observed = not turned_rad and min(self._course[1], self.first_course.sigma_rad) < OBSERVED_RAD
-        sure = abs(off_rad) + 2.0 * sigma_rad < WRONG_HEADING_RAD
-        known = sure or (observed and abs(off_rad) + sigma_rad < DISPUTABLE_RAD)
+        course_rad, course_sigma_rad = self._course_seen(turned_rad)
+        off_rad, sigma_rad = left_over(course_rad, course_sigma_rad, turned_rad, self.mount.sigma.yaw_rad)
+        known = abs(off_rad) + 2.0 * sigma_rad < WRONG_HEADING_RAD
+        if not turned_rad and (course_sigma_rad < OBSERVED_RAD or self._way_m > PATIENT_M):
+            known |= abs(off_rad) + sigma_rad < DISPUTABLE_RAD
         return (health, cause) if known and not self.mount_in_doubt else ("degraded", "mount")
 
     @property
@@ -232,16 +235,15 @@ class MotionTeacher:
         """
         if trim_rad and self._course[1] < KNOWN_COURSE_RAD:
             return least_rad
-        return max(least_rad, float(np.hypot(*self._heading_left(trim_rad))))
+        left_rad = left_sigma(*self._course_seen(trim_rad), trim_rad, self.mount.sigma.yaw_rad)
+        return float(np.hypot(least_rad, left_rad))
 
-    def _heading_left(self, trim_rad: float) -> tuple[float, float]:
-        """What the heading is still off by for the mount's sake [rad], and one sigma, by what knows better: matches, or
-        the first steps between scans; by matches alone where it was turned after them.
+    def _course_seen(self, trim_rad: float) -> tuple[float, float]:
+        """The course [rad] and one sigma, by what knows better: matches, or the first steps between scans; by matches
+        alone where the heading was turned after them.
         """
-        course_rad, sigma_rad = self._course
-        if not trim_rad and self.first_course.sigma_rad < sigma_rad:
-            course_rad, sigma_rad = self.first_course.course_rad, self.first_course.sigma_rad
-        return left_over(course_rad, sigma_rad, trim_rad, self.mount.sigma.yaw_rad)
+        matched, first = self._course, self.first_course
+        return matched if trim_rad or matched[1] <= first.sigma_rad else (first.course_rad, first.sigma_rad)
 
     @property
     def yaw_in_doubt(self) -> bool:

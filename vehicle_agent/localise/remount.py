@@ -21,6 +21,11 @@ F64 = NDArray[np.float64]
 TRUSTED_RAD: Final = float(np.radians(0.3))
 TRUSTED: Final = MountSigma(0.05, TRUSTED_RAD, TRUSTED_RAD, TRUSTED_RAD)
 """One sigma of a header that does not say how well its mount is known."""
+BROKEN_SHARE: Final = 0.05
+BROKEN_RAD: Final = float(np.radians(1.0))
+MEANT_RAD: Final = float(np.radians(0.15))
+"""Of headers that do not say how well they are known, one in twenty is wrong by a degree (one sigma); axes of the
+others may mean something else than the axle's by so much, and are right by what they mean."""
 UNKNOWN_RAD: Final = float(np.radians(5.0))
 """One sigma of an angle that nobody knows."""
 KEPT_SHARE: Final = 0.5
@@ -68,6 +73,24 @@ def left_over(found: float, sigma: float, applied: float, trusted: float) -> tup
         return 0.0, trusted
     share = trusted**2 / (trusted**2 + sigma**2)
     return share * found, float(np.sqrt(share)) * sigma
+
+
+def left_sigma(found: float, sigma: float, applied: float, trusted: float) -> float:
+    """Root mean square of what an angle is still off by, arguments as of `left_over`. A header that does not say how
+    well it is known is either right or broken: by Bayes, from how well what was found fits either.
+    """
+    if applied or trusted != TRUSTED_RAD:
+        return float(np.hypot(*left_over(found, sigma, applied, trusted)))
+    if not np.isfinite(sigma):
+        return float(np.sqrt(BROKEN_SHARE)) * BROKEN_RAD
+    broken = BROKEN_SHARE * _density(found, float(np.hypot(sigma, BROKEN_RAD)))
+    right = (1.0 - BROKEN_SHARE) * _density(found, float(np.hypot(sigma, MEANT_RAD)))
+    share = broken / max(broken + right, 1e-300)
+    return float(np.sqrt(share) * np.hypot(*left_over(found, sigma, 0.0, BROKEN_RAD)))
+
+
+def _density(value: float, sigma: float) -> float:
+    return float(np.exp(-0.5 * (value / sigma) ** 2) / sigma)
 
 
 class Mounting:
@@ -153,6 +176,6 @@ class Mounting:
     def tilt_variance_rad2(self) -> F64:
         """(2,) mean square of what roll and pitch are still off by."""
         r, off = self.residual, self.off
-        roll = left_over(r.roll_rad, r.roll_sigma_rad, off[1], self.sigma.roll_rad)
-        pitch = left_over(r.pitch_rad, r.pitch_sigma_rad, off[2], self.sigma.pitch_rad)
-        return np.square([np.hypot(*roll), np.hypot(*pitch)])
+        roll = left_sigma(r.roll_rad, r.roll_sigma_rad, off[1], self.sigma.roll_rad)
+        pitch = left_sigma(r.pitch_rad, r.pitch_sigma_rad, off[2], self.sigma.pitch_rad)
+        return np.square([roll, pitch])
