@@ -14,18 +14,21 @@ from numpy.typing import NDArray
 
 from gnd_map.arrays import F32, F64
 from gnd_map.se3 import T_inverse
-from vehicle_agent.localise.co_moving_kernels import COLUMNS, ROWS, compare, draw_sweep, grown
+from vehicle_agent.localise.co_moving_kernels import COLUMNS, MIN_PASSED, ROWS, compare, draw_sweep, grown
 
 Mask = NDArray[np.bool_]
+U8 = NDArray[np.uint8]
 
 LAGS_M: Final = (1.0, 1.7, 2.6, 4.3, 6.6, 11.0)
 """Ways to earlier sweeps, none a multiple of another: posts of a fence are not mistaken for one that travels along."""
-LAG_SHARE, LAG_M = 0.2, 0.15
-"""How far from these a sweep may be."""
+LEAST_M, REACH_M = 0.7, 14.0
+"""Nearer and farther sweeps are not asked."""
 EVERY_M: Final = 0.5
 OLDEST_NS: Final = 4_000_000_000
 LEAST_SWEEPS: Final = 3
-REACH_M: Final = (1.0 + LAG_SHARE) * LAGS_M[-1] + LAG_M
+REMEMBER_NS: Final = 1_000_000_000
+REMEMBERED_M: Final = 0.6
+SURE: Final = 6
 SLOTS: Final = round(REACH_M / EVERY_M) + 3
 
 
@@ -41,7 +44,7 @@ class _Kept(NamedTuple):
 class CoMoving:
     """Feeds on sweeps in time order; a standing vehicle judges nothing, for there everything keeps its place.
 
-    Remembers images of the last 13 m of way and 4 s: 5 MB.
+    Remembers images of the last 14 m of way and 4 s: 6 MB.
     """
 
     def __init__(self, T_vehicle_lidar: F64) -> None:
@@ -54,6 +57,7 @@ class CoMoving:
         self._kept: list[_Kept] = []
         self._way_m, self._T_odom_vehicle = 0.0, np.eye(4)
         self._before_ns: int | None = None
+        self._sure_m, self._sure_ns = np.empty((0, 3)), np.empty(0, np.int64)
         self.left_out = 0
         """Points so far."""
 
@@ -91,15 +95,34 @@ class CoMoving:
                 *self._motions(then, t_ns), self._images, self._times_s, self._twists,
                 self._T_vehicle_lidar, self._T_lidar_vehicle,
             )  # fmt: skip
-            result = grown(points_vehicle_m, *votes)
+            result = self._things(t_ns, points_vehicle_m, votes)
         if not self._kept or self._way_m - self._kept[-1].way_m >= EVERY_M:
             self._kept.append(_Kept(slot, t_ns, self._way_m, self._T_odom_vehicle))
         self.left_out += int(result.sum())
         return result
 
+    def _things(self, t_ns: int, points_m: F64, votes: tuple[U8, U8, U8]) -> Mask:
+        """(K,) bool: points on what travels along; what surely did a moment ago, at the same place, helps to grow it."""
+        young = t_ns - self._sure_ns <= REMEMBER_NS
+        self._sure_m, self._sure_ns = self._sure_m[young], self._sure_ns[young]
+        certain = np.full((3, len(self._sure_m)), [[SURE], [SURE], [0]], np.uint8)
+        all_votes = [np.concatenate(pair) for pair in zip(votes, certain, strict=True)]
+        result = grown(np.concatenate([points_m, self._sure_m]), *all_votes)[: len(points_m)]
+        self._remember(t_ns, points_m[result & (votes[1] >= MIN_PASSED)])
+        return result
+
+    def _remember(self, t_ns: int, sure_m: F64) -> None:
+        """Keep one point in each cube, the newest."""
+        p = np.concatenate([sure_m, self._sure_m])
+        ns = np.concatenate([np.full(len(sure_m), t_ns), self._sure_ns])
+        i, j, k = np.floor(p / REMEMBERED_M).astype(np.int64).T
+        newest = np.unique((i * 1024 + j) * 1024 + k, return_index=True)[1]
+        self._sure_m, self._sure_ns = p[newest], ns[newest]
+
     def forget(self) -> None:
         """Begin anew: the next sweep does not continue those before."""
         self._kept, self._before_ns = [], None
+        self._sure_m, self._sure_ns = np.empty((0, 3)), np.empty(0, np.int64)
 
     def _advance(self, t_ns: int, T_before_now: F64) -> None:
         dt_s = 0.0 if self._before_ns is None else (t_ns - self._before_ns) * 1e-9
@@ -123,7 +146,7 @@ class CoMoving:
         for lag_m in reversed(LAGS_M) if len(way_m) else ():
             off_m = np.abs(way_m - lag_m)
             nearest = int(off_m.argmin())
-            if off_m[nearest] <= LAG_SHARE * lag_m + LAG_M:
+            if way_m[nearest] >= LEAST_M:
                 found.setdefault(nearest, self._kept[nearest])
         return list(found.values())
 
