@@ -38,7 +38,9 @@ class VanAhead:
 
     def __post_init__(self) -> None:
         if not self.rear_m - abs(self.swing_m) >= 4.0 or not self.period_s > 0.0:
-            raise SimError(f"a van's rear comes as near as {self.rear_m - abs(self.swing_m)} m, at least 4 m are needed")
+            raise SimError(
+                f"a van's rear comes as near as {self.rear_m - abs(self.swing_m)} m, at least 4 m are needed"
+            )
 
     def block(self, t_s: float) -> Block:
         """Return its box in the vehicle frame at a time [s]."""
