@@ -15,6 +15,7 @@ from schemas.sweep_distortion import DistortionSigma
 from vehicle_agent.errors import RegistrationError
 from vehicle_agent.local_map import LocalMap
 from vehicle_agent.localise.calibration import MotionCalibration, MotionTeacher
+from vehicle_agent.localise.co_moving import CoMoving
 from vehicle_agent.localise.consistency import Innovations
 from vehicle_agent.localise.estimates import Cause, Health, PoseEstimate, RefinedScan
 from vehicle_agent.localise.first_pose import FirstPose, Place
@@ -119,6 +120,7 @@ class Localiser:
         self._teacher = MotionTeacher(self._motion, self.parameters.odometry, self._mounting)
         self._map = MatchMapCache(local_map, self.parameters.registration.noise_m)
         self._scan_odometry = ScanOdometry(self.parameters.scan_odometry)
+        self._co_moving = CoMoving(self._mounting.T_used)
         self._fix: GnssFix | None = None
         self._pending: Scan | None = None
         self._newest_scan_ns = -1
@@ -189,6 +191,11 @@ class Localiser:
         return self._motion.yaw_bias_radps
 
     @property
+    def left_out(self) -> int:
+        """Sampled points so far that were left out because they travel along with the vehicle."""
+        return self._co_moving.left_out
+
+    @property
     def calibration(self) -> MotionCalibration:
         """What is known of clock, wheels, gyro and mount so far, with sigmas."""
         return self._teacher.calibration
@@ -206,6 +213,7 @@ class Localiser:
         chosen = sample_scan(scan.points_m, self.parameters.sampling)
         self._look_at_mount(scan)
         points = self._deskewed(scan, chosen, scan.points_m[chosen])
+        chosen, points = self._without_company(scan, chosen, points)
         last_ns = scan.t_ns if self._last_ns is None else self._last_ns
         if self._track is not None and (scan.t_ns - last_ns) * 1e-9 > self.parameters.causes.lost_gap_s:
             self._lose(self._track, "gap")
@@ -214,6 +222,13 @@ class Localiser:
         else:
             self._step(self._track, scan, chosen, points)
         self._last_ns = _reference_ns(scan)
+
+    def _without_company(self, scan: Scan, chosen: NDArray[np.int64], points: F64) -> tuple[NDArray[np.int64], F64]:
+        """The sampled points, and these in the vehicle frame, without those on what travels along."""
+        t_ns = _reference_ns(scan)
+        moved = self._motion.delta(t_ns if self._last_ns is None else self._last_ns, t_ns)
+        stands = ~self._co_moving.see(scan.points_m, scan.t_offset_ns, scan.t_ns, t_ns, chosen, points, moved)
+        return chosen[stands], points[stands]
 
     def _look_at_mount(self, scan: Scan) -> None:
         """Watch the mount; what it is known by then counts as soon as no track is torn by it."""
@@ -235,6 +250,7 @@ class Localiser:
         if np.array_equal(before, self._mounting.T_used):
             return
         self._teacher.remounted(T_now_before)
+        self._co_moving.remounted(self._mounting.T_used)
         self._first = FirstPose(self.parameters)
 
     def _step(self, track: _Track, scan: Scan, chosen: NDArray[np.int64], points: F64) -> None:
@@ -460,6 +476,7 @@ class Localiser:
             return
         self._motion.clear()
         self._teacher.clock.forget()
+        self._co_moving.forget()
         self._fix = self._pending = self._last_ns = None
         self._newest_scan_ns, self._from_past = -1, 0
         if self._track is not None:
