@@ -16,6 +16,7 @@ from vehicle_agent.localise.match_map import MatchMap
 from vehicle_agent.localise.parameters import LocaliserParameters
 from vehicle_agent.localise.registration import RegistrationResult, fit_of
 from vehicle_agent.localise.scan_pool import ScanPool
+from vehicle_agent.localise.uniqueness import Uniqueness
 from vehicle_agent.localise.witness import witnessed
 
 F64 = NDArray[np.float64]
@@ -47,6 +48,7 @@ class Judge:
         self._origin_m = np.ascontiguousarray(origin_m, dtype=np.float64)
         self.monitor = HealthMonitor(parameters.health, now_ns, parameters.causes)
         self.challenger = Challenger(parameters)
+        self.uniqueness = Uniqueness(parameters)
         self._pool = ScanPool(parameters.pool)
         self._witness_ns = -(2**62)
         self._way_m = 0.0
@@ -57,17 +59,21 @@ class Judge:
         """Take where GNSS says that the vehicle, tracked at `T_now` (4, 4), is now: (3,), one sigma of an axis."""
         self.monitor.see_fix(p_map_m[:2] - T_now[:2, 3], sigma_m)
         self._place = Place(p_map_m, sigma_m, self._par.initialise.radius_sigmas * sigma_m)
+        self.uniqueness.see_position(p_map_m, self._place.reach_m)
 
     def see(self, scan: Matched, match_map: MatchMap) -> None:
         """Take a scan: what its rays say, how well it fits, whether another pose fits better."""
         if scan.motion_gap_s > self._par.causes.motion_gap_s or self.monitor.gap_s(scan.t_ns) > self._par.causes.gap_s:
             self.monitor.distrust()
+            self.uniqueness.distrust(moved=scan.motion_gap_s > self._par.causes.motion_gap_s)
         self.monitor.see_scan(self._what_is_wrong(scan, match_map))
         self.monitor.matching_ratio = 0.0 if scan.result is None else scan.result.matching_ratio
         self._way_m += float(np.linalg.norm(scan.T_before_now[:3, 3]))
         if len(scan.points_m) < self._par.registration.min_matched:
             return
         new = self._pool.push(scan.points_m, scan.T_before_now)
+        self.uniqueness.see(self._pool.newest_standing_m, scan.T_before_now, scan.T_now, match_map)
+        self.monitor.unique = self.uniqueness.proven
         self._ask(scan, match_map)
         self._challenge(scan, new or self._pool.stands, match_map)
         if scan.result is not None and scan.believed:

@@ -330,6 +330,7 @@ class Localiser:
         """Give the scan to the submaps, and let what they say correct the online pose; the poses that became final."""
         number = track.graph.newest
         T_online = track.graph.pose(number)
+        refiner.unique = track.judge.monitor.unique
         final = refiner.push(number, t_ns, points, T_online, T_before_now, seen)
         track.judge.monitor.certain = refiner.certain
         correction = refiner.correction(T_online)

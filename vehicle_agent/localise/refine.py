@@ -85,6 +85,8 @@ class Refiner:
         self.parameters = parameters
         self.registration = registration
         self._map, self._motion, self._teacher = match_map, motion, teacher
+        self.unique = True
+        """No other place looks the same: else a good fit proves nothing."""
         self._scans: list[_Scan] = []
         self._final = 0  # how many of them are final
         self._belief: Belief | None = None
@@ -371,7 +373,7 @@ class Refiner:
 
     def _is_certain(self, covariance: F64) -> bool:
         sigma_m = float(np.sqrt(np.diag(covariance)[3:5]).max())
-        return self._firm >= FIRM and sigma_m < self.parameters.certain_m
+        return self.unique and self._firm >= FIRM and sigma_m < self.parameters.certain_m
 
     def _share(self, i: int, low: int, high: int) -> float:
         """How far along the way from one knot to the next a scan is, 0 ... 1."""
