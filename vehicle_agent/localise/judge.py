@@ -52,8 +52,14 @@ class Judge:
         self._pool = ScanPool(parameters.pool)
         self._witness_ns = -(2**62)
         self._way_m = 0.0
+        self._T_looked_now = np.eye(4)  # motion since the last scan that had points enough to look at
         self._place: Place | None = None
         self._last_points: F64 | None = None
+
+    def begin(self, points_m: F64, T_now: F64, match_map: MatchMap) -> None:
+        """Take the first scan (N, 3) of the track, at its pose (4, 4)."""
+        self._pool.push(points_m, np.eye(4))
+        self._see_others(np.eye(4), T_now, match_map)
 
     def see_position(self, p_map_m: F64, sigma_m: float, T_now: F64) -> None:
         """Take where GNSS says that the vehicle, tracked at `T_now` (4, 4), is now: (3,), one sigma of an axis."""
@@ -69,11 +75,12 @@ class Judge:
         self.monitor.see_scan(self._what_is_wrong(scan, match_map))
         self.monitor.matching_ratio = 0.0 if scan.result is None else scan.result.matching_ratio
         self._way_m += float(np.linalg.norm(scan.T_before_now[:3, 3]))
+        self._T_looked_now = self._T_looked_now @ scan.T_before_now
         if len(scan.points_m) < self._par.registration.min_matched:
             return
+        scan, self._T_looked_now = scan._replace(T_before_now=self._T_looked_now), np.eye(4)
         new = self._pool.push(scan.points_m, scan.T_before_now)
-        self.uniqueness.see(self._pool.newest_standing_m, scan.T_before_now, scan.T_now, match_map)
-        self.monitor.unique = self.uniqueness.proven
+        self._see_others(scan.T_before_now, scan.T_now, match_map)
         self._ask(scan, match_map)
         self._challenge(scan, new or self._pool.stands, match_map)
         if scan.result is not None and scan.believed:
@@ -84,6 +91,11 @@ class Judge:
                 self._par.registration,
             )
             self.monitor.see_match(fit, scan.result.fit, scan.result.degenerate)
+
+    def _see_others(self, T_before_now: F64, T_now: F64, match_map: MatchMap) -> None:
+        """Whether another place looks the same."""
+        self.uniqueness.see(self._pool.newest_standing_m, T_before_now, T_now, match_map)
+        self.monitor.unique = self.uniqueness.proven
 
     def _ask(self, scan: Matched, match_map: MatchMap) -> None:
         """The witness, now and then, and whenever a match is not believed."""

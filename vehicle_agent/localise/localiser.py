@@ -332,7 +332,7 @@ class Localiser:
         T_online = track.graph.pose(number)
         refiner.unique = track.judge.monitor.unique
         final = refiner.push(number, t_ns, points, T_online, T_before_now, seen)
-        track.judge.monitor.certain = refiner.certain
+        track.judge.monitor.certain = refiner.certain and not track.judge.uniqueness.beaten
         correction = refiner.correction(T_online)
         if correction is not None:
             track.graph.restart(*correction)
@@ -369,6 +369,7 @@ class Localiser:
         judge = Judge(par, self.T_vehicle_lidar[:3, 3], t_ns)
         judge.monitor.see_match(fit, result.fit, result.degenerate)
         judge.monitor.scans_prove = not par.refine.enabled or sees_tilt(scan.points_m)
+        judge.begin(points, result.T_map_vehicle, self._map.near(result.T_map_vehicle[:3, 3]))
         if judge.monitor.trusted:
             judge.challenger.rest(t_ns)
         self._track = _Track(PoseGraph(par.graph), judge, self._new_refiner(), {})

@@ -357,7 +357,7 @@ class Refiner:
         share = self._share(i, at[low], at[after])
         covariance = (1.0 - share) * self._covariance(low) + share * self._covariance(after)
         T = between(by_low, by_high, share)
-        return SmoothedPose(scan.number, scan.t_ns, T, covariance, self._is_certain(covariance))
+        return SmoothedPose(scan.number, scan.t_ns, T, covariance, self.unique and self._is_certain(covariance))
 
     def _from_knot(self, knot: int, i: int) -> F64:
         first, scan = self._scans[knot], self._scans[i]
@@ -373,7 +373,7 @@ class Refiner:
 
     def _is_certain(self, covariance: F64) -> bool:
         sigma_m = float(np.sqrt(np.diag(covariance)[3:5]).max())
-        return self.unique and self._firm >= FIRM and sigma_m < self.parameters.certain_m
+        return self._firm >= FIRM and sigma_m < self.parameters.certain_m
 
     def _share(self, i: int, low: int, high: int) -> float:
         """How far along the way from one knot to the next a scan is, 0 ... 1."""

@@ -130,7 +130,7 @@ class Uniqueness:
         self.margin = 0.0
         """Sigmas by which the tracked pose was ahead of the best other one at the last test."""
         self._view = View(par.way_m, par.every_m, par.n_points)
-        self._beaten = 0
+        self._beaten = 0  # tests in a row
         self._next_m = 0.0  # odometer of the next test
 
     def see_position(self, p_map_m: F64, reach_m: float) -> None:
@@ -139,8 +139,10 @@ class Uniqueness:
 
     def distrust(self, *, moved: bool) -> None:
         """The pose must be proven again; `moved`: odometry does not know either how it has come here."""
-        self.proven, self._beaten, self._next_m = not self._par.enabled, 0, 0.0
+        if self._par.enabled and self.proven:
+            self.proven, self._beaten, self._next_m = False, 0, self._view.way_m
         if moved:
+            self._next_m = 0.0
             self._view = View(self._par.way_m, self._par.every_m, self._par.n_points)
 
     def see(self, standing_m: F64, T_before_now: F64, T_tracked: F64, match_map: MatchMap) -> None:
@@ -152,10 +154,15 @@ class Uniqueness:
             self.margin = self._tested(T_tracked, match_map)
             self._conclude()
 
+    @property
+    def beaten(self) -> bool:
+        """True when another pose was clearly better, twice in a row."""
+        return self._beaten >= 2
+
     def _conclude(self) -> None:
         par = self._par
         self._beaten = self._beaten + 1 if self.margin <= -par.lost else 0
-        self.proven = (self.proven or self.margin >= par.won) and self._beaten < 2
+        self.proven = (self.proven or self.margin >= par.won) and not self.beaten
         steady = self.proven and not self._beaten
         self._next_m = self._view.way_m + (par.proven_m if steady else par.unproven_m)
 
@@ -169,7 +176,8 @@ class Uniqueness:
         fits = self._fits(points, own, match_map)
         others = self._others(points, own, match_map)
         against = [self._fits(points, T, match_map) for T in others] or [np.zeros(len(points))]
-        return min(ahead(fits - other, patches, self._par.full_points) for other in against)
+        high = points[:, 2] > self._par.high_m
+        return min(ahead_of_both(fits - other, patches, high, self._par.full_points) for other in against)
 
     def _others(self, points: F64, own: F64, match_map: MatchMap) -> list[F64]:
         """Poses (4, 4) elsewhere, as good as registration can make them."""
@@ -231,6 +239,17 @@ def ahead(difference: F64, patches: I64, full_points: int) -> float:
     count = np.maximum(np.bincount(patches), 1)
     d = np.bincount(patches, difference) / count * np.minimum(count / full_points, 1.0)
     return float(d.sum() / np.sqrt((d**2).sum() + LEAST_SQUARES))
+
+
+def ahead_of_both(difference: F64, patches: I64, high: NDArray[np.bool_], full_points: int) -> float:
+    """By how many sigmas a pose is ahead of another, by all points or by those that are `high` (N,), whichever say more.
+
+    What stands higher than a car stays where it is: where many cars have left, they only add noise to what a few lamps
+    know.
+    """
+    by_all = ahead(difference, patches, full_points)
+    by_high = ahead(difference[high], patches[high], full_points)
+    return by_high if abs(by_high) > abs(by_all) else by_all
 
 
 def _yaw(T: F64) -> float:
