@@ -155,7 +155,8 @@ class Localiser:
     def start_at(self, t_ns: int, T_map_vehicle: F64, *, trusted: bool = False) -> None:
         """Take a pose (4, 4) from outside, such as that of the last parking, instead of the present one or of a search.
 
-        It is judged like any other; `trusted` spares it the first proof, not the doubts that come later.
+        It is judged like any other; `trusted` spares it the first good match, but not the proof that no other place
+        looks the same, nor the doubts that come later.
         """
         if self._track is not None:
             self._lose(self._track, "searching")

@@ -67,7 +67,9 @@ class View:
         self._fixes: deque[_Fix] = deque()
 
     def push(self, standing_m: F64, T_before_now: F64, T_tracked: F64) -> None:
-        """Take a scan: standing points (K, 3) in the vehicle frame, motion (4, 4) since the one before, tracked pose."""
+        """Take a scan: standing points (K, 3) in the vehicle frame, motion (4, 4) since the one before, tracked pose
+        (4, 4).
+        """
         moved = T_tracked if self._T is None else self._T @ T_before_now
         turn = _yaw(moved) - _yaw(T_tracked)
         self._T = T_from_R_t(exp_so3(np.array([0.0, 0.0, turn])) @ T_tracked[:3, :3], [*moved[:2, 3], T_tracked[2, 3]])
@@ -83,7 +85,7 @@ class View:
         """Take where GNSS says that the vehicle is now: (3,) in the map, and how far it may be off."""
         if self._T is None:
             return
-        if self._fixes and self.way_m - self._fixes[-1].way_m < SEEN_BY * self._reach_m:
+        if len(self._fixes) > 1 and self._fixes[-1].way_m - self._fixes[-2].way_m < SEEN_BY * self._reach_m:
             self._fixes.pop()
         self._fixes.append(_Fix(self.way_m, self._T[:3, 3].copy(), np.asarray(p_map_m, np.float64), reach_m))
 
@@ -124,7 +126,11 @@ class Uniqueness:
         self._par, self._registration = parameters.uniqueness, parameters.registration
         par = self._par
         self._how = replace(
-            parameters.initialise, n_refined=par.n_refined, n_kept=par.n_kept, same_m=par.apart_m, same_deg=par.apart_deg
+            parameters.initialise,
+            n_refined=par.n_refined,
+            n_kept=par.n_kept,
+            same_m=par.apart_m,
+            same_deg=par.apart_deg,
         )
         self.proven = not par.enabled
         self.margin = 0.0
@@ -195,7 +201,9 @@ class Uniqueness:
 
     def _apart(self, T: F64, own: F64) -> bool:
         off = T_inverse(own) @ T
-        return bool(np.hypot(off[0, 3], off[1, 3]) > self._par.apart_m or abs(_yaw(off)) > np.radians(self._par.apart_deg))
+        return bool(
+            np.hypot(off[0, 3], off[1, 3]) > self._par.apart_m or abs(_yaw(off)) > np.radians(self._par.apart_deg)
+        )
 
     def _registered(self, points: F64, T: F64, m: MatchMap, start: Start) -> F64 | None:
         try:
@@ -242,7 +250,7 @@ def ahead(difference: F64, patches: I64, full_points: int) -> float:
 
 
 def ahead_of_both(difference: F64, patches: I64, high: NDArray[np.bool_], full_points: int) -> float:
-    """By how many sigmas a pose is ahead of another, by all points or by those that are `high` (N,), whichever say more.
+    """By how many sigmas a pose is ahead of another, by all points or by the `high` (N,) ones, whichever say more.
 
     What stands higher than a car stays where it is: where many cars have left, they only add noise to what a few lamps
     know.

@@ -10,8 +10,8 @@ class UniquenessParameters:
     enabled: without, no pose has to be the only one.
     way_m, every_m, n_points: the view is of the scans of so much way, one every so many metres, of each so many points.
     n_compared: points of the view by which poses are compared; patch_m: points of one square of this side are one piece
-        of evidence, and fewer than `full_points` of them a smaller one. high_m: above the vehicle's origin, no car is so
-        high.
+        of evidence, and fewer than `full_points` of them a smaller one.
+    high_m: above the vehicle's origin; no car is so high.
     unproven_m, proven_m: way between two tests. reach_m: around the tracked pose where GNSS tells nothing; turn_deg:
         headings within this of the tracked one, all as long as less than `course_m` have been driven.
     n_refined, n_kept: other poses tried by registration, and kept; apart_m, apart_deg: two poses nearer are one;
