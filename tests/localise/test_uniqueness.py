@@ -7,6 +7,7 @@ from yard import FRAME, GROUND_M, corridor, local_map_of, match_map_of, pose, re
 from gnd_map.gaussian import full_matrices
 from schemas.drive import GnssFix, MotionSample, Scan
 from vehicle_agent.localise import Localiser
+from vehicle_agent.localise.first_pose import Place
 from vehicle_agent.localise.health import HealthMonitor
 from vehicle_agent.localise.match_map import MatchMapCache
 from vehicle_agent.localise.parameters import HealthParameters, LocaliserParameters, RegistrationParameters
@@ -52,8 +53,8 @@ def drive_beside(scene, off_m, last_x_m, parameters=None):
     for k, x in enumerate(np.arange(0.0, last_x_m, STEP_M)):
         seen = standing_points(seen_from(rng, points, pose(x, 0.0, 0.0), 2500, REACH_M), 0.4)
         moved = pose(STEP_M if k else 0.0, 0.0, 0.0, z=0.0)
-        unique.see_position(np.array([x + 2.0, -1.0, 0.0]), 7.5)
-        unique.see(seen, moved, pose(x + off_m, 0.0, 0.0), maps.near(np.array([x, 0.0, 0.0])))
+        place = Place(np.array([x + 2.0, -1.0, 0.0]), 2.5, 7.5)
+        unique.see(seen, moved, pose(x + off_m, 0.0, 0.0), place, maps.near(np.array([x, 0.0, 0.0])))
         told.append((x, unique.proven, unique.margin, unique.beaten))
     return told
 
@@ -83,7 +84,7 @@ def test_a_place_like_no_other_is_proven_at_once():
     points = yard(rng)
     unique, T = Uniqueness(LocaliserParameters()), pose(2.0, 1.0, 40.0)
     seen = standing_points(seen_from(rng, points, T, 2500), 0.4)
-    unique.see(seen, np.eye(4), T, match_map_of(local_map_of(points)))
+    unique.see(seen, np.eye(4), T, None, match_map_of(local_map_of(points)))
     assert unique.proven
 
 
@@ -92,7 +93,11 @@ def test_a_smooth_corridor_proves_nothing_but_does_not_take_a_proof_away():
     points = corridor(rng)
     m, unique = match_map_of(local_map_of(points)), Uniqueness(LocaliserParameters())
     see = lambda x: unique.see(  # noqa: E731
-        standing_points(seen_from(rng, points, pose(x, 0, 0), 2500), 0.4), pose(STEP_M, 0, 0, z=0.0), pose(x, 0, 0), m
+        standing_points(seen_from(rng, points, pose(x, 0, 0), 2500), 0.4),
+        pose(STEP_M, 0, 0, z=0.0),
+        pose(x, 0, 0),
+        None,
+        m,
     )
     for x in range(12):
         see(float(x))

@@ -56,16 +56,16 @@ class Judge:
         self._place: Place | None = None
         self._last_points: F64 | None = None
 
-    def begin(self, points_m: F64, T_now: F64, match_map: MatchMap) -> None:
-        """Take the first scan (N, 3) of the track, at its pose (4, 4)."""
+    def begin(self, points_m: F64, T_now: F64, place: Place | None, match_map: MatchMap) -> None:
+        """Take the first scan (N, 3) of the track, at its pose (4, 4), and where GNSS says that it is."""
         self._pool.push(points_m, np.eye(4))
-        self._see_others(np.eye(4), T_now, match_map)
+        self.uniqueness.see(self._pool.newest_standing_m, np.eye(4), T_now, place, match_map)
+        self.monitor.unique = self.uniqueness.proven
 
     def see_position(self, p_map_m: F64, sigma_m: float, T_now: F64) -> None:
         """Take where GNSS says that the vehicle, tracked at `T_now` (4, 4), is now: (3,), one sigma of an axis."""
         self.monitor.see_fix(p_map_m[:2] - T_now[:2, 3], sigma_m)
         self._place = Place(p_map_m, sigma_m, self._par.initialise.radius_sigmas * sigma_m)
-        self.uniqueness.see_position(p_map_m, self._place.reach_m)
 
     def see(self, scan: Matched, match_map: MatchMap) -> None:
         """Take a scan: what its rays say, how well it fits, whether another pose fits better."""
@@ -80,7 +80,10 @@ class Judge:
             return
         scan, self._T_looked_now = scan._replace(T_before_now=self._T_looked_now), np.eye(4)
         new = self._pool.push(scan.points_m, scan.T_before_now)
-        self._see_others(scan.T_before_now, scan.T_now, match_map)
+        self.uniqueness.see(
+            self._pool.newest_standing_m, scan.T_before_now, scan.T_now, self._place, match_map, believed=scan.believed
+        )
+        self.monitor.unique = self.uniqueness.proven
         self._ask(scan, match_map)
         self._challenge(scan, new or self._pool.stands, match_map)
         if scan.result is not None and scan.believed:
@@ -91,11 +94,6 @@ class Judge:
                 self._par.registration,
             )
             self.monitor.see_match(fit, scan.result.fit, scan.result.degenerate)
-
-    def _see_others(self, T_before_now: F64, T_now: F64, match_map: MatchMap) -> None:
-        """Whether another place looks the same."""
-        self.uniqueness.see(self._pool.newest_standing_m, T_before_now, T_now, match_map)
-        self.monitor.unique = self.uniqueness.proven
 
     def _ask(self, scan: Matched, match_map: MatchMap) -> None:
         """The witness, now and then, and whenever a match is not believed."""

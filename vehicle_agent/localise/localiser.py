@@ -370,7 +370,8 @@ class Localiser:
         judge = Judge(par, self.T_vehicle_lidar[:3, 3], t_ns)
         judge.monitor.see_match(fit, result.fit, result.degenerate)
         judge.monitor.scans_prove = not par.refine.enabled or sees_tilt(scan.points_m)
-        judge.begin(points, result.T_map_vehicle, self._map.near(result.T_map_vehicle[:3, 3]))
+        T = result.T_map_vehicle
+        judge.begin(points, T, self._place(t_ns), self._map.near(T[:3, 3]))
         if judge.monitor.trusted:
             judge.challenger.rest(t_ns)
         self._track = _Track(PoseGraph(par.graph), judge, self._new_refiner(), {})

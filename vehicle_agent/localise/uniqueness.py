@@ -21,6 +21,7 @@ from numpy.typing import NDArray
 
 from gnd_map.se3 import T_from_R_t, T_inverse, exp_so3, transform
 from vehicle_agent.errors import RegistrationError
+from vehicle_agent.localise.first_pose import Place
 from vehicle_agent.localise.initialise import Around, search, thinned
 from vehicle_agent.localise.kernels import point_fits
 from vehicle_agent.localise.match_map import MatchMap
@@ -139,24 +140,36 @@ class Uniqueness:
         self._beaten = 0  # tests in a row
         self._next_m = 0.0  # odometer of the next test
 
-    def see_position(self, p_map_m: F64, reach_m: float) -> None:
-        """Take where GNSS says that the vehicle is now: (3,) in the map, and how far it may be off."""
-        self._view.see_position(p_map_m, reach_m)
-
     def distrust(self, *, moved: bool) -> None:
         """The pose must be proven again; `moved`: odometry does not know either how it has come here."""
-        if self._par.enabled and self.proven:
+        if not self._par.enabled:
+            return
+        if self.proven:
             self.proven, self._beaten, self._next_m = False, 0, self._view.way_m
         if moved:
-            self._next_m = 0.0
             self._view = View(self._par.way_m, self._par.every_m, self._par.n_points)
+            self._next_m = self._par.every_m
 
-    def see(self, standing_m: F64, T_before_now: F64, T_tracked: F64, match_map: MatchMap) -> None:
-        """Take a scan: standing points (K, 3), motion (4, 4) since the one before, tracked pose (4, 4); test if due."""
+    def see(
+        self, standing_m: F64, T_before_now: F64, T_tracked: F64, place: Place | None, match_map: MatchMap,
+        *, believed: bool = True,
+    ) -> None:  # fmt: skip
+        """Take a scan; test the pose if it is time.
+
+        Args:
+            standing_m: (K, 3) points that stand above the ground, vehicle frame.
+            T_before_now: (4, 4) motion since the one before.
+            T_tracked: (4, 4) the tracked pose.
+            place: where a new fix says that the vehicle is now.
+            match_map: the map window.
+            believed: whether the scan's match is; what is not matched is not compared.
+        """
         if not self._par.enabled:
             return
         self._view.push(standing_m, T_before_now, T_tracked)
-        if self._view.way_m >= self._next_m:
+        if place is not None:
+            self._view.see_position(place.p_map_m, place.reach_m)
+        if believed and self._view.way_m >= self._next_m:
             self.margin = self._tested(T_tracked, match_map)
             self._conclude()
 
