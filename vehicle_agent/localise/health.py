@@ -36,6 +36,8 @@ class HealthMonitor:
         """Submaps and odometry leave no doubt: what single scans hold against the pose is the changed world."""
         self.scans_prove = True
         """A single scan that fits well proves the pose; those of a few layers fit in too many places."""
+        self.unique = True
+        """No other place looks the same (uniqueness.py)."""
         self.degenerate: tuple[str, ...] = ()
         self.matching_ratio = 0.0
         """Of the newest scan's match, believed or not."""
@@ -127,7 +129,7 @@ class HealthMonitor:
             return "degraded", "wrong_pose"
         if self._sigma[0] > self.causes.poor_sigma_m or self._sigma[1] > self.causes.poor_sigma_rad:
             return "degraded", "poor_place"
-        if not (self._trusted and self.scans_prove) and not self.certain:
+        if not self.unique or (not (self._trusted and self.scans_prove) and not self.certain):
             return "degraded", "unconfirmed"
         return "good", "stale_map" if self.stale else "none"
 

@@ -16,6 +16,7 @@ from vehicle_agent.localise.match_map import MatchMap
 from vehicle_agent.localise.parameters import LocaliserParameters
 from vehicle_agent.localise.registration import RegistrationResult, fit_of
 from vehicle_agent.localise.scan_pool import ScanPool
+from vehicle_agent.localise.uniqueness import Uniqueness
 from vehicle_agent.localise.witness import witnessed
 
 F64 = NDArray[np.float64]
@@ -47,11 +48,19 @@ class Judge:
         self._origin_m = np.ascontiguousarray(origin_m, dtype=np.float64)
         self.monitor = HealthMonitor(parameters.health, now_ns, parameters.causes)
         self.challenger = Challenger(parameters)
+        self.uniqueness = Uniqueness(parameters)
         self._pool = ScanPool(parameters.pool)
         self._witness_ns = -(2**62)
         self._way_m = 0.0
+        self._T_looked_now = np.eye(4)  # motion since the last scan that had points enough to look at
         self._place: Place | None = None
         self._last_points: F64 | None = None
+
+    def begin(self, points_m: F64, T_now: F64, place: Place | None, match_map: MatchMap) -> None:
+        """Take the first scan (N, 3) of the track, at its pose (4, 4), and where GNSS says that it is."""
+        self._pool.push(points_m, np.eye(4))
+        self.uniqueness.see(self._pool.newest_standing_m, np.eye(4), T_now, place, match_map)
+        self.monitor.unique = self.uniqueness.proven
 
     def see_position(self, p_map_m: F64, sigma_m: float, T_now: F64) -> None:
         """Take where GNSS says that the vehicle, tracked at `T_now` (4, 4), is now: (3,), one sigma of an axis."""
@@ -62,12 +71,19 @@ class Judge:
         """Take a scan: what its rays say, how well it fits, whether another pose fits better."""
         if scan.motion_gap_s > self._par.causes.motion_gap_s or self.monitor.gap_s(scan.t_ns) > self._par.causes.gap_s:
             self.monitor.distrust()
+            self.uniqueness.distrust(moved=scan.motion_gap_s > self._par.causes.motion_gap_s)
         self.monitor.see_scan(self._what_is_wrong(scan, match_map))
         self.monitor.matching_ratio = 0.0 if scan.result is None else scan.result.matching_ratio
         self._way_m += float(np.linalg.norm(scan.T_before_now[:3, 3]))
+        self._T_looked_now = self._T_looked_now @ scan.T_before_now
         if len(scan.points_m) < self._par.registration.min_matched:
             return
+        scan, self._T_looked_now = scan._replace(T_before_now=self._T_looked_now), np.eye(4)
         new = self._pool.push(scan.points_m, scan.T_before_now)
+        self.uniqueness.see(
+            self._pool.newest_standing_m, scan.T_before_now, scan.T_now, self._place, match_map, believed=scan.believed
+        )
+        self.monitor.unique = self.uniqueness.proven
         self._ask(scan, match_map)
         self._challenge(scan, new or self._pool.stands, match_map)
         if scan.result is not None and scan.believed:

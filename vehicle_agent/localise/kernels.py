@@ -182,3 +182,26 @@ def linearise(
         for c in range(r):
             H[r, c] = H[c, r]
     return cost, matched, inside
+
+
+@kernel
+def point_fits(
+    points: F64, R: F64, t: F64, index: I32, A: F64, b: F64, mean: F64, omega: F64, scale2: float, gate_m2: float,
+    fits: F64,
+) -> None:  # fmt: skip
+    """Fill `fits` (N,): 1 - robust cost of each point at the pose (R, t), 0 ... 1; arguments as of `linearise`."""
+    nx, ny, nz = index.shape
+    for n in range(points.shape[0]):
+        fits[n] = 0.0
+        p0, p1, p2 = points[n, 0], points[n, 1], points[n, 2]
+        q0 = R[0, 0] * p0 + R[0, 1] * p1 + R[0, 2] * p2 + t[0]
+        q1 = R[1, 0] * p0 + R[1, 1] * p1 + R[1, 2] * p2 + t[1]
+        q2 = R[2, 0] * p0 + R[2, 1] * p1 + R[2, 2] * p2 + t[2]
+        gx = A[0, 0] * q0 + A[0, 1] * q1 + A[0, 2] * q2 + b[0]
+        gy = A[1, 0] * q0 + A[1, 1] * q1 + A[1, 2] * q2 + b[1]
+        gz = A[2, 0] * q0 + A[2, 1] * q1 + A[2, 2] * q2 + b[2]
+        if not (1.0 <= gx < nx - 1 and 1.0 <= gy < ny - 1 and 1.0 <= gz < nz - 1):
+            continue
+        row, m2 = _nearest(q0, q1, q2, int(gx), int(gy), int(gz), index, mean, omega, gate_m2)
+        if row >= 0 and index[int(gx), int(gy), int(gz)] >= -1:
+            fits[n] = scale2 / (scale2 + m2)

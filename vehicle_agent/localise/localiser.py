@@ -161,7 +161,8 @@ class Localiser:
     def start_at(self, t_ns: int, T_map_vehicle: F64, *, trusted: bool = False) -> None:
         """Take a pose (4, 4) from outside, such as that of the last parking, instead of the present one or of a search.
 
-        It is judged like any other; `trusted` spares it the first proof, not the doubts that come later.
+        It is judged like any other; `trusted` spares it the first good match, but not the proof that no other place
+        looks the same, nor the doubts that come later.
         """
         if self._track is not None:
             self._lose(self._track, "searching")
@@ -370,8 +371,9 @@ class Localiser:
         """Give the scan to the submaps, and let what they say correct the online pose; the poses that became final."""
         number = track.graph.newest
         T_online = track.graph.pose(number)
+        refiner.unique = track.judge.monitor.unique
         final = refiner.push(number, t_ns, points, T_online, T_before_now, seen)
-        track.judge.monitor.certain = refiner.certain
+        track.judge.monitor.certain = refiner.certain and not track.judge.uniqueness.beaten
         correction = refiner.correction(T_online)
         if correction is not None:
             track.graph.restart(*correction)
@@ -414,6 +416,8 @@ class Localiser:
         judge = Judge(par, self._mounting.T_used[:3, 3], t_ns)
         judge.monitor.see_match(fit, result.fit, result.degenerate)
         judge.monitor.scans_prove = not par.refine.enabled or sees_tilt(scan.points_m)
+        T = result.T_map_vehicle
+        judge.begin(points, T, self._place(t_ns), self._map.near(T[:3, 3]))
         if judge.monitor.trusted:
             judge.challenger.rest(t_ns)
         self._track = _Track(PoseGraph(par.graph), judge, self._new_refiner(), {})

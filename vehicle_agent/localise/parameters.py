@@ -11,6 +11,7 @@ from vehicle_agent.localise.doubt_parameters import (
 )
 from vehicle_agent.localise.refine_parameters import RefineParameters
 from vehicle_agent.localise.scan_odometry_parameters import ScanOdometryParameters
+from vehicle_agent.localise.uniqueness_parameters import UniquenessParameters
 
 
 @dataclass(frozen=True, slots=True)
@@ -218,3 +219,4 @@ class LocaliserParameters:
     causes: CauseParameters = field(default_factory=CauseParameters)
     scan_odometry: ScanOdometryParameters = field(default_factory=ScanOdometryParameters)
     refine: RefineParameters = field(default_factory=RefineParameters)
+    uniqueness: UniquenessParameters = field(default_factory=UniquenessParameters)

@@ -85,6 +85,8 @@ class Refiner:
         self.parameters = parameters
         self.registration = registration
         self._map, self._motion, self._teacher = match_map, motion, teacher
+        self.unique = True
+        """No other place looks the same: else a good fit proves nothing."""
         self._scans: list[_Scan] = []
         self._final = 0  # how many of them are final
         self._belief: Belief | None = None
@@ -356,7 +358,7 @@ class Refiner:
         share = self._share(i, at[low], at[after])
         covariance = (1.0 - share) * self._covariance(low) + share * self._covariance(after)
         T = between(by_low, by_high, share)
-        return SmoothedPose(scan.number, scan.t_ns, T, covariance, self._is_certain(covariance))
+        return SmoothedPose(scan.number, scan.t_ns, T, covariance, self.unique and self._is_certain(covariance))
 
     def _from_knot(self, knot: int, i: int) -> F64:
         first, scan = self._scans[knot], self._scans[i]

@@ -46,6 +46,11 @@ class ScanPool:
         return True
 
     @property
+    def newest_standing_m(self) -> F64:
+        """(N, 3) points of the newest scan that stand above the ground, vehicle frame."""
+        return self._newest[1]
+
+    @property
     def points_m(self) -> F64:
         """(N, 3) all points, the newest scan's first, newest vehicle frame."""
         return np.concatenate([self._newest[0], *(p for p, _, way in self._older if way > 0.0)])

@@ -1,0 +1,277 @@
+"""Is the tracked pose the only one that explains what was seen? Slots, pillars and tunnel segments repeat.
+
+A pose that fits well proves nothing where another one fits as well. What the vehicle has seen over the last metres,
+placed by odometry, is laid on the map at the tracked pose and at every other one that GNSS allows, and the poses are
+compared patch by patch: the points of one car are one piece of evidence. If two poses were equally right, differences
+d of their fits would be as likely positive as negative, whatever has changed in the world since, and
+
+    z = sum(d) / sqrt(sum(d^2))
+
+would exceed z with a probability below exp(-z^2 / 2) (Efron 1969, Student's t-test under symmetry conditions). Only a
+pose that beats each other one by that measure is *proven*. Odometry carries a proof on, through a smooth tunnel for
+instance; a gap takes it away, and so does a pose elsewhere that wins.
+"""
+
+from collections import deque
+from dataclasses import replace
+from typing import Final, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from gnd_map.se3 import T_from_R_t, T_inverse, exp_so3, transform
+from vehicle_agent.errors import RegistrationError
+from vehicle_agent.localise.first_pose import Place
+from vehicle_agent.localise.initialise import Around, search, thinned
+from vehicle_agent.localise.kernels import point_fits
+from vehicle_agent.localise.match_map import MatchMap
+from vehicle_agent.localise.parameters import LocaliserParameters, RegistrationParameters
+from vehicle_agent.localise.registration import Start, register
+
+F64 = NDArray[np.float64]
+I64 = NDArray[np.int64]
+
+FARTHEST_M: Final = 60.0  # a far point is moved by more than a patch when odometry turns by a degree or two
+LEAST_SQUARES: Final = 0.25  # added to sum(d^2): where next to nothing differs, nothing is told
+SEEN_BY: Final = 0.3  # least way between two fixes that are remembered, as share of the view
+
+
+class _Look(NamedTuple):
+    """What one scan saw: odometer [m], pose (4, 4) and standing points (K, 3) in its own frame."""
+
+    way_m: float
+    T_odom_vehicle: F64
+    points_m: F64
+
+
+class _Fix(NamedTuple):
+    """GNSS: odometer [m], where odometry was (3,), where the fix was (3,) in the map, how far it may be off [m]."""
+
+    way_m: float
+    p_odom_m: F64
+    p_map_m: F64
+    reach_m: float
+
+
+class View:
+    """Standing points of the last metres of way, and the GNSS fixes on it, in a frame that odometry carries on.
+
+    Place and heading are odometry's; height and tilt are those of the tracked poses, which the road gives and odometry
+    does not.
+    """
+
+    def __init__(self, way_m: float, every_m: float, n_points: int) -> None:
+        self._reach_m, self._every_m, self._n_points = way_m, every_m, n_points
+        self.way_m = 0.0
+        self._T: F64 | None = None  # newest, odometry's frame
+        self._looks: deque[_Look] = deque()
+        self._fixes: deque[_Fix] = deque()
+
+    def push(self, standing_m: F64, T_before_now: F64, T_tracked: F64) -> None:
+        """Take a scan: standing points (K, 3) in the vehicle frame, motion (4, 4) since the one before, tracked pose
+        (4, 4).
+        """
+        moved = T_tracked if self._T is None else self._T @ T_before_now
+        turn = _yaw(moved) - _yaw(T_tracked)
+        self._T = T_from_R_t(exp_so3(np.array([0.0, 0.0, turn])) @ T_tracked[:3, :3], [*moved[:2, 3], T_tracked[2, 3]])
+        self.way_m += float(np.hypot(*T_before_now[:2, 3]))
+        if not self._looks or self.way_m - self._looks[-1].way_m >= self._every_m:
+            self._looks.append(_Look(self.way_m, self._T, thinned(standing_m, self._n_points)))
+        while self.way_m - self._looks[0].way_m > self._reach_m:
+            self._looks.popleft()
+        while self._fixes and self.way_m - self._fixes[0].way_m > self._reach_m:
+            self._fixes.popleft()
+
+    def see_position(self, p_map_m: F64, reach_m: float) -> None:
+        """Take where GNSS says that the vehicle is now: (3,) in the map, and how far it may be off."""
+        if self._T is None:
+            return
+        if len(self._fixes) > 1 and self._fixes[-1].way_m - self._fixes[-2].way_m < SEEN_BY * self._reach_m:
+            self._fixes.pop()
+        self._fixes.append(_Fix(self.way_m, self._T[:3, 3].copy(), np.asarray(p_map_m, np.float64), reach_m))
+
+    @property
+    def points_m(self) -> F64:
+        """(N, 3) of all scans, newest vehicle frame, newest first."""
+        if self._T is None:
+            return np.empty((0, 3))
+        T_now_odom = T_inverse(self._T)
+        seen = [transform(T_now_odom @ look.T_odom_vehicle, look.points_m) for look in reversed(self._looks)]
+        points = np.concatenate(seen)
+        return points[np.hypot(points[:, 0], points[:, 1]) < FARTHEST_M]
+
+    @property
+    def place(self) -> tuple[F64, float] | None:
+        """Where the newest fix says that the vehicle is now, (3,), odometry since then added as a reach; or None."""
+        if not self._fixes or self._T is None:
+            return None
+        fix = self._fixes[-1]
+        return fix.p_map_m, fix.reach_m + float(np.hypot(*(self._T[:2, 3] - fix.p_odom_m[:2])))
+
+    def allowed(self, T_map_vehicle: F64, T_tracked: F64) -> bool:
+        """True when GNSS allows the pose (4, 4), or speaks no more against it than against the tracked one."""
+        if self._T is None:
+            return True
+        for fix in self._fixes:
+            p = transform(T_inverse(self._T), fix.p_odom_m[None])
+            off, own = (float(np.hypot(*(transform(T, p)[0] - fix.p_map_m)[:2])) for T in (T_map_vehicle, T_tracked))
+            if off > max(fix.reach_m, own):
+                return False
+        return True
+
+
+class Uniqueness:
+    """Compares the tracked pose with all others; `proven` when it has won once, and none has won since."""
+
+    def __init__(self, parameters: LocaliserParameters) -> None:
+        self._par, self._registration = parameters.uniqueness, parameters.registration
+        par = self._par
+        self._how = replace(
+            parameters.initialise,
+            n_refined=par.n_refined,
+            n_kept=par.n_kept,
+            same_m=par.apart_m,
+            same_deg=par.apart_deg,
+        )
+        self.proven = not par.enabled
+        self.margin = 0.0
+        """Sigmas by which the tracked pose was ahead of the best other one at the last test."""
+        self._view = View(par.way_m, par.every_m, par.n_points)
+        self._beaten = 0  # tests in a row
+        self._next_m = 0.0  # odometer of the next test
+
+    def distrust(self, *, moved: bool) -> None:
+        """The pose must be proven again; `moved`: odometry does not know either how it has come here."""
+        if not self._par.enabled:
+            return
+        if self.proven:
+            self.proven, self._beaten, self._next_m = False, 0, self._view.way_m
+        if moved:
+            self._view = View(self._par.way_m, self._par.every_m, self._par.n_points)
+            self._next_m = self._par.every_m
+
+    def see(
+        self, standing_m: F64, T_before_now: F64, T_tracked: F64, place: Place | None, match_map: MatchMap,
+        *, believed: bool = True,
+    ) -> None:  # fmt: skip
+        """Take a scan; test the pose if it is time.
+
+        Args:
+            standing_m: (K, 3) points that stand above the ground, vehicle frame.
+            T_before_now: (4, 4) motion since the one before.
+            T_tracked: (4, 4) the tracked pose.
+            place: where a new fix says that the vehicle is now.
+            match_map: the map window.
+            believed: whether the scan's match is; what is not matched is not compared.
+        """
+        if not self._par.enabled:
+            return
+        self._view.push(standing_m, T_before_now, T_tracked)
+        if place is not None:
+            self._view.see_position(place.p_map_m, place.reach_m)
+        if believed and self._view.way_m >= self._next_m:
+            self.margin = self._tested(T_tracked, match_map)
+            self._conclude()
+
+    @property
+    def beaten(self) -> bool:
+        """True when another pose was clearly better, twice in a row."""
+        return self._beaten >= 2
+
+    def _conclude(self) -> None:
+        par = self._par
+        self._beaten = self._beaten + 1 if self.margin <= -par.lost else 0
+        self.proven = (self.proven or self.margin >= par.won) and not self.beaten
+        steady = self.proven and not self._beaten
+        self._next_m = self._view.way_m + (par.proven_m if steady else par.unproven_m)
+
+    def _tested(self, T_tracked: F64, match_map: MatchMap) -> float:
+        """Sigmas by which the tracked pose is ahead of each other one."""
+        points = thinned(self._view.points_m, self._par.n_compared)
+        own = self._registered(points, T_tracked, match_map, "near")
+        if own is None:
+            return 0.0
+        patches = patches_of(points, self._par.patch_m)
+        fits = self._fits(points, own, match_map)
+        others = self._others(points, own, match_map)
+        against = [self._fits(points, T, match_map) for T in others] or [np.zeros(len(points))]
+        high = points[:, 2] > self._par.high_m
+        return min(ahead_of_both(fits - other, patches, high, self._par.full_points) for other in against)
+
+    def _others(self, points: F64, own: F64, match_map: MatchMap) -> list[F64]:
+        """Poses (4, 4) elsewhere, as good as registration can make them."""
+        par, place = self._par, self._view.place
+        turn_rad = np.radians(par.turn_deg) if self._view.way_m >= par.course_m else np.pi
+        p_m, reach_m = (own[:3, 3], par.reach_m) if place is None else place
+        around = Around(p_m, reach_m, _yaw(own), turn_rad)
+        found, _ = search(points, around, match_map, self._how, self._registration, points)
+        tried = [one.registration.T_map_vehicle for one in found]
+        for x, y in ((1, 0), (-1, 0), (0, 1), (0, -1)):
+            beside = own @ T_from_R_t(np.eye(3), [x * par.beside_m, y * par.beside_m, 0.0])
+            T = self._registered(points, beside, match_map, "wide")
+            tried += [] if T is None else [T]
+        return [T for T in tried if self._apart(T, own) and self._view.allowed(T, own)]
+
+    def _apart(self, T: F64, own: F64) -> bool:
+        off = T_inverse(own) @ T
+        return bool(
+            np.hypot(off[0, 3], off[1, 3]) > self._par.apart_m or abs(_yaw(off)) > np.radians(self._par.apart_deg)
+        )
+
+    def _registered(self, points: F64, T: F64, m: MatchMap, start: Start) -> F64 | None:
+        try:
+            return register(thinned(points, self._how.n_refining), T, m, self._registration, start).T_map_vehicle
+        except RegistrationError:
+            return None
+
+    def _fits(self, points: F64, T: F64, m: MatchMap) -> F64:
+        return fits_at(points, T, m, self._registration)
+
+
+def fits_at(points_m: F64, T_map_vehicle: F64, m: MatchMap, parameters: RegistrationParameters) -> F64:
+    """(N,) how well each of points (N, 3) lies on the map at a pose (4, 4): 1 - robust cost, 0 ... 1; 0 where it is
+    not known.
+    """
+    fits, scale = np.empty(len(points_m)), parameters.scales[-1]
+    R, t = np.ascontiguousarray(T_map_vehicle[:3, :3]), np.ascontiguousarray(T_map_vehicle[:3, 3])
+    gate_m2 = (parameters.gate_per_scale * scale) ** 2
+    point_fits(
+        np.ascontiguousarray(points_m), R, t, m.index, m.A, m.b, m.mean_m, m.information, scale**2, gate_m2, fits
+    )
+    return fits
+
+
+def patches_of(points_m: F64, side_m: float) -> I64:
+    """(N,) number of the square of the ground that each of points (N, 3) stands on."""
+    square = np.floor(points_m[:, :2] / side_m).astype(np.int64)
+    return np.unique(square, axis=0, return_inverse=True)[1].reshape(-1).astype(np.int64)
+
+
+def ahead(difference: F64, patches: I64, full_points: int) -> float:
+    """By how many sigmas a pose is ahead of another.
+
+    Args:
+        difference: (N,) fit of each point at the one less that at the other.
+        patches: (N,) which piece of evidence each point belongs to, from 0.
+        full_points: a patch with fewer counts for less.
+    """
+    if not len(difference):
+        return 0.0
+    count = np.maximum(np.bincount(patches), 1)
+    d = np.bincount(patches, difference) / count * np.minimum(count / full_points, 1.0)
+    return float(d.sum() / np.sqrt((d**2).sum() + LEAST_SQUARES))
+
+
+def ahead_of_both(difference: F64, patches: I64, high: NDArray[np.bool_], full_points: int) -> float:
+    """By how many sigmas a pose is ahead of another, by all points or by the `high` (N,) ones, whichever say more.
+
+    What stands higher than a car stays where it is: where many cars have left, they only add noise to what a few lamps
+    know.
+    """
+    by_all = ahead(difference, patches, full_points)
+    by_high = ahead(difference[high], patches[high], full_points)
+    return by_high if abs(by_high) > abs(by_all) else by_all
+
+
+def _yaw(T: F64) -> float:
+    return float(np.arctan2(T[1, 0], T[0, 0]))
