@@ -14,6 +14,7 @@ from schemas.drive import GnssFix, MotionSample, Scan
 from schemas.sweep_distortion import DistortionSigma
 from vehicle_agent.errors import RegistrationError
 from vehicle_agent.local_map import LocalMap
+from vehicle_agent.localise.arbiter import Motion, believing_neither, who_is_wrong
 from vehicle_agent.localise.calibration import MotionCalibration, MotionTeacher
 from vehicle_agent.localise.consistency import Innovations
 from vehicle_agent.localise.estimates import Cause, Health, PoseEstimate, RefinedScan
@@ -30,7 +31,7 @@ from vehicle_agent.localise.parameters import LocaliserParameters
 from vehicle_agent.localise.refine import Refiner
 from vehicle_agent.localise.registration import RegistrationResult, Start, register
 from vehicle_agent.localise.sampling import sample_scan
-from vehicle_agent.localise.scan_odometry import ScanOdometry, ScanStep, joint_step
+from vehicle_agent.localise.scan_odometry import JointStep, ScanOdometry, ScanStep, joint_step
 from vehicle_agent.localise.stretch import log_se3
 
 F64 = NDArray[np.float64]
@@ -222,12 +223,15 @@ class Localiser:
         t_ns, newest = _reference_ns(scan), track.graph.newest
         odometry = self._odometry(track.held[newest].t_ns, t_ns)
         seen = self._scan_step(scan, chosen, points, odometry)
-        self._teacher.clock.see(track.held[newest].t_ns, t_ns, seen)
-        joint = joint_step(*odometry, seen)
+        joint, reach = joint_step(*odometry, seen), odometry.sigmas
+        if joint.slipped and seen is not None:
+            joint, seen, reach = self._arbitrated(track, scan, chosen, points, odometry, seen)
+        slipped = joint.slipped or self._motion.slipped(track.held[newest].t_ns, t_ns)
+        self._teacher.clock.see(track.held[newest].t_ns, t_ns, None if slipped else seen)
         sweep = self._sweep_of_steady(scan) if joint.slipped else None
         points = points if sweep is None else self._deskewed(scan, chosen, scan.points_m[chosen], sweep)
         predicted = track.graph.pose(newest) @ joint.T_before_now
-        result, believed = self._matched(track.judge.monitor, points, predicted, odometry.sigmas, t_ns)
+        result, believed = self._matched(track.judge.monitor, points, predicted, reach, t_ns)
         match = None
         if result is not None and believed:
             match = MapMatch(result.T_map_vehicle, result.covariance + self._distorted(t_ns))
@@ -259,6 +263,30 @@ class Localiser:
             return self._deskewed(scan, chosen, scan.points_m[chosen], self._sweep_of_steady(scan))
 
         return self._scan_odometry.step(_reference_ns(scan), points, *odometry, points_going_on)
+
+    def _arbitrated(
+        self, track: _Track, scan: Scan, chosen: NDArray[np.int64], points: F64, odometry: Odometry, seen: ScanStep
+    ) -> tuple[JointStep, ScanStep | None, F64]:
+        """Wheels and scans contradict each other: the joint step, and the scans' own, after the map was asked, and the
+        sigmas (6,) that a match may be off by. Scans that are wrong begin anew.
+        """
+        newest = track.graph.newest
+        T_before, joint = track.graph.pose(newest), joint_step(*odometry, seen)
+        sweep = self._sweep_of_steady(scan)
+        going_on = points if sweep is None else self._deskewed(scan, chosen, scan.points_m[chosen], sweep)
+        starts = ((points, odometry.T_before_now), (going_on, seen.T_before_now))
+        matches = [self._match(some, T_before @ T, "near") for some, T in starts]
+        driven = Motion(odometry.T_before_now, np.diag(np.square(odometry.sigmas)))
+        told = [one for one in matches if one is not None]
+        covariance = track.held[newest].online.covariance
+        wrong = who_is_wrong(T_before, covariance, driven, Motion(seen.T_before_now, seen.covariance), told)
+        if wrong == "wheels":
+            return joint, seen, odometry.sigmas
+        if wrong == "scans":
+            self._scan_odometry.begin(_reference_ns(scan), points)
+            return joint_step(*odometry, None), None, odometry.sigmas
+        joint, unsure = believing_neither(*odometry, seen)
+        return joint, unsure, joint.driven_sigmas
 
     def _sweep_of_steady(self, scan: Scan) -> Trajectory | None:
         """The motion during the sweep as the scans tell it; None before they have told any."""
