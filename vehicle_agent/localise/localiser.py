@@ -25,6 +25,7 @@ from vehicle_agent.localise.judge import Judge, Matched
 from vehicle_agent.localise.level import on_the_road, sees_tilt, settled
 from vehicle_agent.localise.match_map import MatchMapCache
 from vehicle_agent.localise.mount import MountWatch, near_points
+from vehicle_agent.localise.neighbours import FAR_M, hedged
 from vehicle_agent.localise.odometry import MotionBuffer
 from vehicle_agent.localise.packed_scan import PackedScan, pack
 from vehicle_agent.localise.parameters import LocaliserParameters
@@ -223,9 +224,10 @@ class Localiser:
         t_ns, newest = _reference_ns(scan), track.graph.newest
         odometry = self._odometry(track.held[newest].t_ns, t_ns)
         seen = self._scan_step(scan, chosen, points, odometry)
-        joint, reach = joint_step(*odometry, seen), odometry.sigmas
+        joint, reach = joint_step(*odometry, seen), self._reach(track, odometry)
         if joint.slipped and seen is not None:
-            joint, seen, reach = self._arbitrated(track, scan, chosen, points, odometry, seen)
+            joint, seen, doubt = self._arbitrated(track, scan, chosen, points, odometry, seen)
+            reach = np.hypot(reach, doubt)
         slipped = joint.slipped or self._motion.slipped(track.held[newest].t_ns, t_ns)
         self._teacher.clock.see(track.held[newest].t_ns, t_ns, None if slipped else seen)
         sweep = self._sweep_of_steady(scan) if joint.slipped else None
@@ -268,7 +270,7 @@ class Localiser:
         self, track: _Track, scan: Scan, chosen: NDArray[np.int64], points: F64, odometry: Odometry, seen: ScanStep
     ) -> tuple[JointStep, ScanStep | None, F64]:
         """Wheels and scans contradict each other: the joint step, and the scans' own, after the map was asked, and the
-        sigmas (6,) that a match may be off by. Scans that are wrong begin anew.
+        sigmas (6,) that this adds to the motion. Scans that are wrong begin anew.
         """
         newest = track.graph.newest
         T_before, joint = track.graph.pose(newest), joint_step(*odometry, seen)
@@ -281,12 +283,19 @@ class Localiser:
         covariance = track.held[newest].online.covariance
         wrong = who_is_wrong(T_before, covariance, driven, Motion(seen.T_before_now, seen.covariance), told)
         if wrong == "wheels":
-            return joint, seen, odometry.sigmas
+            return joint, seen, np.zeros(6)
         if wrong == "scans":
             self._scan_odometry.begin(_reference_ns(scan), points)
-            return joint_step(*odometry, None), None, odometry.sigmas
+            return joint_step(*odometry, None), None, np.zeros(6)
         joint, unsure = believing_neither(*odometry, seen)
         return joint, unsure, joint.driven_sigmas
+
+    def _reach(self, track: _Track, odometry: Odometry) -> F64:
+        """(6,) one sigma of where a match may lie: of the motion, and of a pose that is poorly known itself."""
+        covariance = track.held[track.graph.newest].online.covariance
+        if np.sqrt(np.linalg.eigvalsh(covariance[3:5, 3:5])[1]) < self.parameters.causes.poor_sigma_m:
+            return odometry.sigmas
+        return np.asarray(np.hypot(odometry.sigmas, np.sqrt(np.diag(covariance))))
 
     def _sweep_of_steady(self, scan: Scan) -> Trajectory | None:
         """The motion during the sweep as the scans tell it; None before they have told any."""
@@ -302,14 +311,21 @@ class Localiser:
     ) -> tuple[RegistrationResult | None, bool]:
         """The match, and whether to believe it: near the prediction if that will do, else a wider one."""
         near = self._match(points, predicted, "near")
+        if near is not None:
+            near, _ = hedged(points, near, self._map.near(predicted[:3, 3]), self.parameters.registration)
         if not monitor.doubtful(near):
             monitor.see_wider(near, None)
-            return near, monitor.believe(near, predicted, sigmas, t_ns)
+            believed = monitor.believe(near, predicted, sigmas, t_ns)
+            monitor.see_verdict(near, believed)
+            return near, believed
         wide = self._match(points, predicted, "wide")
         monitor.see_wider(near, wide)
         if monitor.believe(near, predicted, sigmas, t_ns):
+            monitor.see_verdict(near, True)
             return near, True
-        return wide, monitor.believe(wide, predicted, sigmas, t_ns)
+        believed = monitor.believe(wide, predicted, sigmas, t_ns)
+        monitor.see_verdict(wide, believed)
+        return wide, believed
 
     def _match(self, points: F64, predicted: F64, start: Start) -> RegistrationResult | None:
         try:
@@ -394,16 +410,29 @@ class Localiser:
         par, t_ns = self.parameters, _reference_ns(scan)
         self._first = FirstPose(par)
         judge = Judge(par, self.T_vehicle_lidar[:3, 3], t_ns)
+        covariance, contested = self._hedged_first(points, result)
+        if contested:
+            judge.monitor.prove_first()
         judge.monitor.see_match(fit, result.fit, result.degenerate)
         judge.monitor.scans_prove = not par.refine.enabled or sees_tilt(scan.points_m)
         if judge.monitor.trusted:
             judge.challenger.rest(t_ns)
         self._track = _Track(PoseGraph(par.graph), judge, self._new_refiner(), {})
-        self._track.graph.add(t_ns, result.T_map_vehicle, None, MapMatch(result.T_map_vehicle, result.covariance), None)
+        self._track.graph.add(t_ns, result.T_map_vehicle, None, MapMatch(result.T_map_vehicle, covariance), None)
         self._hold(self._track, scan, result.matching_ratio)
         if self._track.refiner is not None:
             self._refine(self._track, self._track.refiner, t_ns, points)
         self._scan_odometry.begin(t_ns, points)
+
+    def _hedged_first(self, points: F64, result: RegistrationResult) -> tuple[F64, bool]:
+        """The covariance (6, 6) of a first pose, and whether a neighbouring minimum fits as well. One that was told is
+        no match, and has no neighbours.
+        """
+        if not result.iterations:
+            return result.covariance, False
+        near = self._map.near(result.T_map_vehicle[:3, 3])
+        known, contested = hedged(points, result, near, self.parameters.registration, FAR_M)
+        return known.covariance, contested
 
     def _new_refiner(self) -> Refiner | None:
         par = self.parameters
