@@ -14,7 +14,7 @@ from schemas.drive import GnssFix, MotionSample, Scan
 from schemas.sweep_distortion import DistortionSigma
 from vehicle_agent.errors import RegistrationError
 from vehicle_agent.local_map import LocalMap
-from vehicle_agent.localise.arbiter import Motion, believing_neither, who_is_wrong
+from vehicle_agent.localise.arbiter import Motion, Wrong, believing_neither, who_is_wrong
 from vehicle_agent.localise.calibration import MotionCalibration, MotionTeacher
 from vehicle_agent.localise.consistency import Innovations
 from vehicle_agent.localise.estimates import Cause, Health, PoseEstimate, RefinedScan
@@ -86,6 +86,7 @@ class _Track:
     judge: Judge
     refiner: Refiner | None
     held: dict[int, _HeldScan]
+    wrong: Wrong = "open"  # of wheels and scans, since they contradict each other
 
 
 class Localiser:
@@ -228,6 +229,8 @@ class Localiser:
         if joint.slipped and seen is not None:
             joint, seen, doubt = self._arbitrated(track, scan, chosen, points, odometry, seen)
             reach = np.hypot(reach, doubt)
+        else:
+            track.wrong = "open"
         slipped = joint.slipped or self._motion.slipped(track.held[newest].t_ns, t_ns)
         self._teacher.clock.see(track.held[newest].t_ns, t_ns, None if slipped else seen)
         sweep = self._sweep_of_steady(scan) if joint.slipped else None
@@ -282,6 +285,10 @@ class Localiser:
         told = [one for one in matches if one is not None]
         covariance = track.held[newest].online.covariance
         wrong = who_is_wrong(T_before, covariance, driven, Motion(seen.T_before_now, seen.covariance), told)
+        if wrong == "open":
+            slipped = self._motion.slipped(track.held[newest].t_ns, _reference_ns(scan))
+            wrong = "wheels" if slipped else track.wrong
+        track.wrong = wrong
         if wrong == "wheels":
             return joint, seen, np.zeros(6)
         if wrong == "scans":

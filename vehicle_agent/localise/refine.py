@@ -52,6 +52,8 @@ FIRM_AFTER_SLIP: Final = 2
 """As if so many had fitted well so far: rivals of single scans have a say for some metres."""
 SEEN_SIGMA_M: Final = 0.025
 """Of a step forward that scans have seen: less than that of one that is only taken to go on as before."""
+HELD_INFORMATION: Final = np.diag([3e-3**-2, 3e-3**-2, 6e-4**-2, 0.0, 0.01**-2, 0.01**-2])
+"""Of a step's turns and of its motion left and up, from gyro, tyres and road."""
 AGREES_CHI2: Final = 16.3
 """Of heading and place, three degrees of freedom: 99.9 %."""
 MAP_VARIANCE: Final = np.array([np.radians(0.05), 0.01, 0.01]) ** 2  # of heading and place between two knots
@@ -292,7 +294,7 @@ class Refiner:
             if len(measured) < 2 or not _agrees(measured[-1], relative):
                 return False
         told = [scan.seen for scan in self._scans if scan.t_ns > since_ns]
-        return all(step is not None and step.covariance[3, 3] < SEEN_SIGMA_M**2 for step in told)
+        return all(step is not None and _forward_sigma_m(step) < SEEN_SIGMA_M for step in told)
 
     def _shortened(self, scans: list[_Scan], steps: list[list[Step]], belief: Belief, dt_s: float) -> Belief:
         """Let go of the knots that are far behind; the belief about the first that stays."""
@@ -408,6 +410,11 @@ def _chained(seen: Sequence[ScanStep]) -> Step:
     for step in seen:
         T, covariance = T @ step.T_before_now, covariance + step.covariance
     return Step(T, covariance, np.zeros((6, N_SHARED)))
+
+
+def _forward_sigma_m(step: ScanStep) -> float:
+    """One sigma of how far forward a step went, the rest told by gyro and road too: a car that slips still rolls on."""
+    return float(np.sqrt(np.linalg.inv(np.linalg.inv(step.covariance) + HELD_INFORMATION)[3, 3]))
 
 
 def _agrees(step: Step, T_before_now: F64) -> bool:
