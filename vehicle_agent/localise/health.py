@@ -92,10 +92,10 @@ class HealthMonitor:
 
     @property
     def disputed(self) -> bool:
-        """True when scans fit well elsewhere, one after the other. What submaps are certain of is only disputed by scans
-        that fit nearly with all their points: where the world has changed, they do not.
+        """True when scans fit well elsewhere, one after the other. Where submaps are certain it takes longer, unless the
+        scans fit with nearly all their points: where the world has changed, they do not.
         """
-        return self._disputes >= DISPUTED and (self._full or not self.certain)
+        return self._disputes >= (DISPUTED if self._full or not self.certain else MOST_DISPUTES)
 
     def see_fix(self, offset_m: F64, sigma_m: float) -> None:
         """Take the horizontal offset (2,) of a GNSS fix from the pose at its time.

@@ -232,6 +232,8 @@ class Localiser:
         else:
             track.wrong = "open"
         slipped = joint.slipped or self._motion.slipped(track.held[newest].t_ns, t_ns)
+        if slipped:
+            self._teacher.clock.see_slip(t_ns)
         self._teacher.clock.see(track.held[newest].t_ns, t_ns, None if slipped else seen)
         sweep = self._sweep_of_steady(scan) if joint.slipped else None
         points = points if sweep is None else self._deskewed(scan, chosen, scan.points_m[chosen], sweep)
