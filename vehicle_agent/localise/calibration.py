@@ -262,12 +262,17 @@ class MotionTeacher:
         """The poses to come do not continue those before."""
         self._anchor = self._last = None
 
-    def see_step(self, first_ns: int, last_ns: int, T_driven: F64, seen: ScanStep | None) -> None:
+    def see_step(
+        self, first_ns: int, last_ns: int, T_driven: F64, seen: ScanStep | None, *, slipped: bool = False
+    ) -> None:
         """Take the motion between two scans: (4, 4) by wheels and gyro, and as the scans tell it, if they do. Wheels
-        that slip tell nothing of the clock.
+        that slip, or that the scans contradict (`slipped`), tell nothing of the clock.
         """
         self._way_m += float(np.linalg.norm(T_driven[:3, 3]))
-        self.clock.see(first_ns, last_ns, None if self._motion.slipped(first_ns, last_ns) else seen)
+        slipped |= self._motion.slipped(first_ns, last_ns)
+        if slipped:
+            self.clock.see_slip(last_ns)
+        self.clock.see(first_ns, last_ns, None if slipped else seen)
         self.first_course.see(seen)
 
     def learn(self, t_ns: int, T_map_vehicle: F64, covariance: F64) -> None:

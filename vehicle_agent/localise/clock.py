@@ -43,6 +43,8 @@ LAST_NS: Final = 5_000_000_000
 JUMP_S: Final = 0.02
 """A smaller jump is followed as drift is."""
 EVERY_NS: Final = 500_000_000
+SLIP_REACHES_NS: Final = 300_000_000
+"""The largest offset, and what speeds are averaged over."""
 LEAST_STEPS: Final = 8
 WALK_S: Final = 3e-4
 RATE_WALK: Final = 1e-5
@@ -176,6 +178,11 @@ class ClockEstimator:
             if not seen.slipping:
                 self.push(Step(first_ns, last_ns, float(T[0, 3]), yaw, float(sigma[3]), float(sigma[2])))
         self.update(last_ns)
+
+    def see_slip(self, t_ns: int) -> None:
+        """The wheels slip at a time: steps that such samples could belong to, whatever the offset, tell nothing."""
+        while self._steps and self._steps[-1].last_ns > t_ns - SLIP_REACHES_NS:
+            self._steps.pop()
 
     def push(self, step: Step) -> None:
         """Take a step; one that is not later than the one before makes all begin anew."""

@@ -22,6 +22,8 @@ from vehicle_agent.localise.witness import Testimony
 F64 = NDArray[np.float64]
 
 DIRECTIONS = ("roll", "pitch", "heading", "longitudinal", "lateral", "vertical")  # as in `degenerate`
+DISPUTED, MOST_DISPUTES = 2, 4  # matches that fit and lie elsewhere, less those that were believed since
+FULL_FIT = 0.85  # of a scan that finds nearly all of what it sees in the map
 
 
 class HealthMonitor:
@@ -50,6 +52,7 @@ class HealthMonitor:
         self._testimonies: deque[Testimony] = deque(maxlen=self.causes.testimonies)
         self._scan: Cause = "none"
         self._sigma = (0.0, 0.0)
+        self._disputes, self._full = 0, False
 
     # --- what is told to it ------------------------------------------------------------------------------------------
 
@@ -74,6 +77,27 @@ class HealthMonitor:
         fit = 0.0 if near is None else near.fit
         better = wide is not None and wide.fit > fit + self.parameters.better_fit
         self._better_elsewhere = self._better_elsewhere + 1 if better else 0
+
+    def see_verdict(self, result: RegistrationResult | None, believed: bool) -> None:
+        """Take whether the scan's match was believed. One that fits well and lies elsewhere is evidence against the pose:
+        odometry that goes wrong in small steps looks like that, and so does a first pose at a neighbouring minimum.
+        """
+        if believed:
+            self._disputes = max(self._disputes - 1, 0)
+        elif result is not None and result.converged and result.fit >= self.parameters.trusted_fit:
+            self._disputes = min(self._disputes + 1, MOST_DISPUTES)
+            self._full = result.fit >= FULL_FIT
+
+    def prove_first(self) -> None:
+        """Another pose fits as well as the first one: it must agree with the next scans."""
+        self._disputes, self._full = MOST_DISPUTES, True
+
+    @property
+    def disputed(self) -> bool:
+        """True when scans fit well elsewhere, one after the other. Where submaps are certain it takes longer, unless the
+        scans fit with nearly all their points: where the world has changed, they do not.
+        """
+        return self._disputes >= (DISPUTED if self._full or not self.certain else MOST_DISPUTES)
 
     def see_fix(self, offset_m: F64, sigma_m: float) -> None:
         """Take the horizontal offset (2,) of a GNSS fix from the pose at its time.
@@ -125,7 +149,7 @@ class HealthMonitor:
             return ("lost" if gap_s > self._patience_s(cause) else "degraded"), cause
         if self._scan != "none":
             return "degraded", self._scan
-        if (self.contested or self.contradicted(t_ns)) and not self.certain:
+        if self.disputed or ((self.contested or self.contradicted(t_ns)) and not self.certain):
             return "degraded", "wrong_pose"
         if self._sigma[0] > self.causes.poor_sigma_m or self._sigma[1] > self.causes.poor_sigma_rad:
             return "degraded", "poor_place"

@@ -14,6 +14,7 @@ from schemas.drive import GnssFix, MotionSample, MountSigma, Scan
 from schemas.sweep_distortion import DistortionSigma
 from vehicle_agent.errors import RegistrationError
 from vehicle_agent.local_map import LocalMap
+from vehicle_agent.localise.arbiter import Motion, Wrong, believing_neither, who_is_wrong
 from vehicle_agent.localise.calibration import MotionCalibration, MotionTeacher
 from vehicle_agent.localise.co_moving import CoMoving
 from vehicle_agent.localise.consistency import Innovations
@@ -25,6 +26,7 @@ from vehicle_agent.localise.judge import Judge, Matched
 from vehicle_agent.localise.level import on_the_road, sees_tilt, settled
 from vehicle_agent.localise.match_map import MatchMapCache
 from vehicle_agent.localise.mount import near_points
+from vehicle_agent.localise.neighbours import FAR_M, hedged
 from vehicle_agent.localise.odometry import MotionBuffer
 from vehicle_agent.localise.packed_scan import PackedScan, pack
 from vehicle_agent.localise.parameters import LocaliserParameters
@@ -32,7 +34,7 @@ from vehicle_agent.localise.refine import Refiner
 from vehicle_agent.localise.registration import RegistrationResult, Start, register
 from vehicle_agent.localise.remount import TRUSTED, Mounting, lever_covariance
 from vehicle_agent.localise.sampling import sample_scan
-from vehicle_agent.localise.scan_odometry import ScanOdometry, ScanStep, joint_step
+from vehicle_agent.localise.scan_odometry import JointStep, ScanOdometry, ScanStep, joint_step
 from vehicle_agent.localise.stretch import log_se3
 
 F64 = NDArray[np.float64]
@@ -86,6 +88,7 @@ class _Track:
     judge: Judge
     refiner: Refiner | None
     held: dict[int, _HeldScan]
+    wrong: Wrong = "open"  # of wheels and scans, since they contradict each other
 
 
 class Localiser:
@@ -259,12 +262,17 @@ class Localiser:
         t_ns, newest = _reference_ns(scan), track.graph.newest
         odometry = self._odometry(track.held[newest].t_ns, t_ns)
         seen = self._scan_step(scan, chosen, points, odometry)
-        self._teacher.see_step(track.held[newest].t_ns, t_ns, odometry.T_before_now, seen)
-        joint = joint_step(*odometry, seen)
+        joint, reach = joint_step(*odometry, seen), self._reach(track, odometry)
+        if joint.slipped and seen is not None:
+            joint, seen, doubt = self._arbitrated(track, scan, chosen, points, odometry, seen)
+            reach = np.hypot(reach, doubt)
+        else:
+            track.wrong = "open"
+        self._teacher.see_step(track.held[newest].t_ns, t_ns, odometry.T_before_now, seen, slipped=joint.slipped)
         sweep = self._sweep_of_steady(scan) if joint.slipped else None
         points = points if sweep is None else self._deskewed(scan, chosen, scan.points_m[chosen], sweep)
         predicted = track.graph.pose(newest) @ joint.T_before_now
-        result, believed = self._matched(track.judge.monitor, points, predicted, odometry.sigmas, t_ns)
+        result, believed = self._matched(track.judge.monitor, points, predicted, reach, t_ns)
         match = None
         if result is not None and believed:
             match = MapMatch(result.T_map_vehicle, result.covariance + self._distorted(t_ns))
@@ -299,6 +307,41 @@ class Localiser:
 
         return self._scan_odometry.step(_reference_ns(scan), points, *odometry, points_going_on)
 
+    def _arbitrated(
+        self, track: _Track, scan: Scan, chosen: NDArray[np.int64], points: F64, odometry: Odometry, seen: ScanStep
+    ) -> tuple[JointStep, ScanStep | None, F64]:
+        """Wheels and scans contradict each other: the joint step, and the scans' own, after the map was asked, and the
+        sigmas (6,) that this adds to the motion. Scans that are wrong begin anew.
+        """
+        newest = track.graph.newest
+        T_before, joint = track.graph.pose(newest), joint_step(*odometry, seen)
+        sweep = self._sweep_of_steady(scan)
+        going_on = points if sweep is None else self._deskewed(scan, chosen, scan.points_m[chosen], sweep)
+        starts = ((points, odometry.T_before_now), (going_on, seen.T_before_now))
+        matches = [self._match(some, T_before @ T, "near") for some, T in starts]
+        driven = Motion(odometry.T_before_now, np.diag(np.square(odometry.sigmas)))
+        told = [one for one in matches if one is not None]
+        covariance = track.held[newest].online.covariance
+        wrong = who_is_wrong(T_before, covariance, driven, Motion(seen.T_before_now, seen.covariance), told)
+        if wrong == "open":
+            slipped = self._motion.slipped(track.held[newest].t_ns, _reference_ns(scan))
+            wrong = "wheels" if slipped else track.wrong
+        track.wrong = wrong
+        if wrong == "wheels":
+            return joint, seen, np.zeros(6)
+        if wrong == "scans":
+            self._scan_odometry.begin(_reference_ns(scan), points)
+            return joint_step(*odometry, None), None, np.zeros(6)
+        joint, unsure = believing_neither(*odometry, seen)
+        return joint, unsure, joint.driven_sigmas
+
+    def _reach(self, track: _Track, odometry: Odometry) -> F64:
+        """(6,) one sigma of where a match may lie: of the motion, and of a pose that is poorly known itself."""
+        covariance = track.held[track.graph.newest].online.covariance
+        if np.sqrt(np.linalg.eigvalsh(covariance[3:5, 3:5])[1]) < self.parameters.causes.poor_sigma_m:
+            return odometry.sigmas
+        return np.asarray(np.hypot(odometry.sigmas, np.sqrt(np.diag(covariance))))
+
     def _sweep_of_steady(self, scan: Scan) -> Trajectory | None:
         """The motion during the sweep as the scans tell it; None before they have told any."""
         steady = self._scan_odometry.steady
@@ -313,14 +356,21 @@ class Localiser:
     ) -> tuple[RegistrationResult | None, bool]:
         """The match, and whether to believe it: near the prediction if that will do, else a wider one."""
         near = self._match(points, predicted, "near")
+        if near is not None:
+            near, _ = hedged(points, near, self._map.near(predicted[:3, 3]), self.parameters.registration)
         if not monitor.doubtful(near):
             monitor.see_wider(near, None)
-            return near, monitor.believe(near, predicted, sigmas, t_ns)
+            believed = monitor.believe(near, predicted, sigmas, t_ns)
+            monitor.see_verdict(near, believed)
+            return near, believed
         wide = self._match(points, predicted, "wide")
         monitor.see_wider(near, wide)
         if monitor.believe(near, predicted, sigmas, t_ns):
+            monitor.see_verdict(near, True)
             return near, True
-        return wide, monitor.believe(wide, predicted, sigmas, t_ns)
+        believed = monitor.believe(wide, predicted, sigmas, t_ns)
+        monitor.see_verdict(wide, believed)
+        return wide, believed
 
     def _match(self, points: F64, predicted: F64, start: Start) -> RegistrationResult | None:
         try:
@@ -414,6 +464,9 @@ class Localiser:
         par, t_ns = self.parameters, _reference_ns(scan)
         self._first = FirstPose(par)
         judge = Judge(par, self._mounting.T_used[:3, 3], t_ns)
+        covariance, contested = self._hedged_first(points, result)
+        if contested:
+            judge.monitor.prove_first()
         judge.monitor.see_match(fit, result.fit, result.degenerate)
         judge.monitor.scans_prove = not par.refine.enabled or sees_tilt(scan.points_m)
         T = result.T_map_vehicle
@@ -421,11 +474,21 @@ class Localiser:
         if judge.monitor.trusted:
             judge.challenger.rest(t_ns)
         self._track = _Track(PoseGraph(par.graph), judge, self._new_refiner(), {})
-        self._track.graph.add(t_ns, result.T_map_vehicle, None, MapMatch(result.T_map_vehicle, result.covariance), None)
+        self._track.graph.add(t_ns, result.T_map_vehicle, None, MapMatch(result.T_map_vehicle, covariance), None)
         self._hold(self._track, scan, result.matching_ratio)
         if self._track.refiner is not None:
             self._refine(self._track, self._track.refiner, t_ns, points)
         self._scan_odometry.begin(t_ns, points)
+
+    def _hedged_first(self, points: F64, result: RegistrationResult) -> tuple[F64, bool]:
+        """The covariance (6, 6) of a first pose, and whether a neighbouring minimum fits as well. One that was told is
+        no match, and has no neighbours.
+        """
+        if not result.iterations:
+            return result.covariance, False
+        near = self._map.near(result.T_map_vehicle[:3, 3])
+        known, contested = hedged(points, result, near, self.parameters.registration, FAR_M)
+        return known.covariance, contested
 
     def _new_refiner(self) -> Refiner | None:
         par = self.parameters

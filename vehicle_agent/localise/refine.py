@@ -18,7 +18,7 @@ from vehicle_agent.localise.calibration import MotionTeacher
 from vehicle_agent.localise.drift import Drift, Slope
 from vehicle_agent.localise.graph import MapMatch, SmoothedPose
 from vehicle_agent.localise.match_map import MatchMapCache
-from vehicle_agent.localise.odometry import MotionBuffer
+from vehicle_agent.localise.odometry import SLIP_LASTS_NS, MotionBuffer
 from vehicle_agent.localise.parameters import RegistrationParameters
 from vehicle_agent.localise.refine_parameters import RefineParameters
 from vehicle_agent.localise.scan_odometry import ScanStep
@@ -32,6 +32,7 @@ from vehicle_agent.localise.stretch import (
     Knot,
     Solved,
     Step,
+    log_se3,
     marginalised,
     shared_of,
     solve_stretch,
@@ -49,6 +50,13 @@ FORGETTING: Final = 0.7
 WORST_VARIANCE: Final = 1e4
 FIRM_AFTER_SLIP: Final = 2
 """As if so many had fitted well so far: rivals of single scans have a say for some metres."""
+SEEN_SIGMA_M: Final = 0.025
+"""Of a step forward that scans have seen: less than that of one that is only taken to go on as before."""
+HELD_INFORMATION: Final = np.diag([3e-3**-2, 3e-3**-2, 6e-4**-2, 0.0, 0.01**-2, 0.01**-2])
+"""Of a step's turns and of its motion left and up, from gyro, tyres and road."""
+AGREES_CHI2: Final = 16.3
+"""Of heading and place, three degrees of freedom: 99.9 %."""
+MAP_VARIANCE: Final = np.array([np.radians(0.05), 0.01, 0.01]) ** 2  # of heading and place between two knots
 LEAST_WEIGHT: Final = 0.05
 NOISE_WAY_M: Final = 5.0  # for which the sigmas of the odometry are given; a second counts as a metre
 
@@ -270,11 +278,26 @@ class Refiner:
         fits_well = self._fit() >= par.firm_fit and self._solved.misfit < par.most_misfit
         if self._solved.torn or self._fit() < par.least_fit:
             self._firm = 0
-        elif self._motion.slipped(before_ns, newest.t_ns):
+        elif self._motion.slipped(before_ns, newest.t_ns) and not self._scans_hold(scans, steps, before_ns):
             self._firm = min(self._firm, FIRM_AFTER_SLIP)
         self._firm += fits_well and not self._solved.torn
         self._belief = self._shortened(scans, steps, belief, dt_s)
         self._teach()
+
+    def _scans_hold(self, scans: Sequence[_Scan], steps: Sequence[Sequence[Step]], since_ns: int) -> bool:
+        """Whether the scans alone tell the whole way since a time, well enough to see a slip, and agree with where the
+        map puts its ends: then nothing rests on the wheels.
+        """
+        since_ns -= SLIP_LASTS_NS
+        for (before, now), measured in zip(pairwise(scans), steps, strict=True):
+            if now.t_ns <= since_ns:
+                continue
+            assert before.knot is not None and now.knot is not None
+            relative = T_inverse(before.knot.T_map_vehicle) @ now.knot.T_map_vehicle
+            if len(measured) < 2 or not _agrees(measured[-1], relative):
+                return False
+        told = [scan.seen for scan in self._scans if scan.t_ns > since_ns]
+        return all(step is not None and _forward_sigma_m(step) < SEEN_SIGMA_M for step in told)
 
     def _shortened(self, scans: list[_Scan], steps: list[list[Step]], belief: Belief, dt_s: float) -> Belief:
         """Let go of the knots that are far behind; the belief about the first that stays."""
@@ -390,6 +413,17 @@ def _chained(seen: Sequence[ScanStep]) -> Step:
     for step in seen:
         T, covariance = T @ step.T_before_now, covariance + step.covariance
     return Step(T, covariance, np.zeros((6, N_SHARED)))
+
+
+def _forward_sigma_m(step: ScanStep) -> float:
+    """One sigma of how far forward a step went, the rest told by gyro and road too: a car that slips still rolls on."""
+    return float(np.sqrt(np.linalg.inv(np.linalg.inv(step.covariance) + HELD_INFORMATION)[3, 3]))
+
+
+def _agrees(step: Step, T_before_now: F64) -> bool:
+    """True when a motion (4, 4) is one that the step allows."""
+    off = log_se3(T_inverse(step.T_before_now) @ T_before_now)[2:5]
+    return float(off @ np.linalg.solve(step.covariance[2:5, 2:5] + np.diag(MAP_VARIANCE), off)) < AGREES_CHI2
 
 
 def _recentred(belief: Belief, shared: F64) -> Belief:
