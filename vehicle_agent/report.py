@@ -12,6 +12,7 @@ import numpy as np
 from gnd_map.arrays import F64
 from gnd_map.classes import ChangeClass
 from gnd_map.codec import REPORT, snap
+from gnd_map.day import day_of
 from gnd_map.errors import GndError
 from gnd_map.tile import Tile
 from gnd_map.tile_id import District, TileId
@@ -215,6 +216,11 @@ class Reporter:
             "largest_turn_deg": round(worst.turn_deg, 4),
         }
 
+    @property
+    def _now_ns(self) -> int:
+        """Time of the newest scan that counts."""
+        return self._stretch.last_ns if self._stretch is not None else self._start_ns
+
     def _lengthen(self, t_ns: int) -> None:
         if self._stretch is None:
             self._stretch = _Stretch(t_ns, t_ns)
@@ -232,7 +238,8 @@ class Reporter:
             for name, n in zip(ChangeClass.__members__, np.bincount(found.change_class, minlength=6), strict=True):
                 self.classes[name.lower()] += int(n)
             if found.observed.any():
-                self._take(replace(self._said(found), doubt=doubt_of(found, account)), evidence.base, odometer_m)
+                doubt = doubt_of(found, account, day_of(self._now_ns))
+                self._take(replace(self._said(found), doubt=doubt), evidence.base, odometer_m)
 
     def _without_pose_error(self, found: Classification, account: Account) -> Classification:
         """The classes without what a shift of the whole tile explains, although each stretch of the drive passed."""

@@ -13,6 +13,7 @@ from gnd_map.grid import GridFrame
 from gnd_map.tile import Tile
 from gnd_map.tile_id import TileId
 from schemas.course import Course
+from schemas.doubt import tiles_by_reason
 from schemas.drive import Detections, DriveHeader, DriveItem, GnssFix, MotionSample, ReferencePose, Scan
 from schemas.drive_mcap import read_drive, read_header
 from schemas.errors import SchemaError
@@ -176,6 +177,10 @@ class Vehicle:
             health=self.place.health,
             tiles=self.link.fetcher.counts["blob"],
             reports=self.link.outbox.counts().acknowledged,
+            scans_taken_back=self.reporter.counts["scans_shifted"] + self.reporter.counts["scans_taken_back"],
+            tiles_held_back=self.reporter.counts["tiles_held_back"],
+            tiles_doubtful=self.reporter.counts["tiles_doubtful"],
+            doubts=tiles_by_reason(self.reporter.doubts),
         )
 
     def result(self) -> dict[str, Any]:
