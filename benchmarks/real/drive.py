@@ -45,6 +45,12 @@ class Found:
     mean_m: NDArray[np.float64]
     scans_used: int
 
+    def within(self, keys: NDArray[np.int64]) -> "Found":
+        """What is said of these voxels only."""
+        kept = np.isin(self.keys, keys)
+        columns = (self.keys, self.g, self.change_class, self.in_map, self.mean_m)
+        return Found(*(column[kept] for column in columns), self.scans_used)
+
     def where(self, *classes: int) -> NDArray[np.bool_]:
         """(K,) bool."""
         return np.isin(self.change_class, classes)
