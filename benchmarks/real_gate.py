@@ -10,7 +10,7 @@ import argparse
 import json
 import tempfile
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -18,20 +18,16 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from benchmarks.gated_merge import Merged, merged
 from benchmarks.real.drive import Poses, Tiles, detect, local_map_of, refined_scans, segmented
 from benchmarks.real.scene import Scene, in_range, load, place
 from benchmarks.real.voxels import keys_of
-from cloud_merger.config import ShardConfig
-from cloud_merger.work import Worker
 from gnd_map.accumulate import N_MIN_CELLS, VoxelAccumulator
 from gnd_map.classes import ChangeClass
 from gnd_map.codec import LATTICES, snap
-from gnd_map.tile import Tile
 from gnd_map.tile_id import TileId
-from schemas.changes import ChangeReport, TileChange, split
+from schemas.changes import ChangeReport, TileChange
 from schemas.drive import Scan
-from tile_store.sqlite_store import SqliteStore
-from tile_store.values import ReportRow, StoreConfig
 from vehicle_agent.config import ReportParameters
 from vehicle_agent.detect.detector import ChangeDetector
 from vehicle_agent.detect.parameters import DetectParameters
@@ -98,28 +94,7 @@ def _known(one: SegmentedScan) -> SegmentedScan:
     return SegmentedScan(replace(one.scan, estimate=pose), one.moving)
 
 
-def merged(halves: Halves, bodies: Sequence[bytes], folder: Path) -> tuple[dict[TileId, set[int]], dict[str, int]]:
-    """Voxels published by tile, and how many wait by reason."""
-    with SqliteStore(folder / "store.sqlite", StoreConfig(merge_delay_s=0.0)) as store:
-        store.put_tiles([Tile(tile, 1, gaussians) for tile, gaussians in halves.tiles.items()])
-        for report in map(ChangeReport.decode, bodies):
-            for change, (tile, part) in zip(report.tiles, split(report), strict=True):
-                row = ReportRow(report.report_id, "ndt", tile, report.vehicle, 1, part, base_sha=change.base_sha)
-                store.put_reports([row])
-        worker = Worker(store, ShardConfig(store_path=folder / "store.sqlite"))
-        while claims := store.claim("one", 64, 60.0):
-            store.publish(worker.merge(claims))
-        heads = [(head.tile, head.version) for head in store.heads()]
-        published = {tile: set(store.voxel_provenance("ndt", tile, version)) for tile, version in heads}
-        waiting = Counter[str]()
-        for one in store.waiting_changes():
-            waiting[one.reason] += one.voxels
-        return published, dict(waiting)
-
-
-def counted(
-    halves: Halves, changes: Sequence[TileChange], published: Mapping[TileId, set[int]], *, only_seen: bool
-) -> dict[str, Any]:
+def counted(halves: Halves, changes: Sequence[TileChange], found: Merged, *, only_seen: bool) -> dict[str, Any]:
     """Observed, reported and published voxels of all changes, or only of what the map's half had seen."""
     observed, said, out = 0, Counter[str](), Counter[str]()
     for change in changes:
@@ -129,14 +104,12 @@ def counted(
         names = [ChangeClass(int(c)).name.lower() for c in change.change_class[of_changed]]
         said.update(names)
         voxels = change.changed.voxel_id[of_changed].tolist()
-        out.update(name for name, v in zip(names, voxels, strict=True) if v in published.get(change.tile, set()))
+        out.update(name for name, v in zip(names, voxels, strict=True) if v in found.published.get(change.tile, ()))
     rates = {name: round(1e3 * n.total() / max(observed, 1), 3) for name, n in (("reported", said), ("published", out))}
     return {"observed": observed, "reported": dict(said), "published": dict(out), "of_1000": rates}
 
 
-def _known_voxels(
-    halves: Halves, tile: TileId, voxel_id: NDArray[np.int32], *, only_seen: bool
-) -> NDArray[np.bool_]:
+def _known_voxels(halves: Halves, tile: TileId, voxel_id: NDArray[np.int32], *, only_seen: bool) -> NDArray[np.bool_]:
     if not only_seen:
         return np.ones(len(voxel_id), np.bool_)
     frame = halves.scene.grid_frame
@@ -149,7 +122,7 @@ def run(folder: Path, map_scans: str, drive_scans: str, at_most: int, poses: Pos
     with tempfile.TemporaryDirectory() as where:
         reporter, bodies = reported(halves, poses, Path(where), check_poses=True)
         changes = [change for body in bodies for change in ChangeReport.decode(body).tiles]
-        published, waiting = merged(halves, bodies, Path(where))
+        found = merged(halves.tiles, bodies)
     return {
         "recording": folder.name,
         "map_scans": map_scans,
@@ -159,9 +132,9 @@ def run(folder: Path, map_scans: str, drive_scans: str, at_most: int, poses: Pos
         "scans_taken_back": reporter.counts["scans_shifted"] + reporter.counts["scans_taken_back"],
         "tiles_held_back": reporter.counts["tiles_held_back"],
         "doubts": dict(reporter.doubts),
-        "all": counted(halves, changes, published, only_seen=False),
-        "seen": counted(halves, changes, published, only_seen=True),
-        "waiting": waiting,
+        "all": counted(halves, changes, found, only_seen=False),
+        "seen": counted(halves, changes, found, only_seen=True),
+        "waiting": dict(found.waiting),
     }
 
 

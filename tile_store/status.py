@@ -20,6 +20,7 @@ from tile_store.values import VehicleAccount, WaitingChange, WaitingReason
 
 WORDS: Final[dict[WaitingReason, str]] = {
     "share": "more of the tile than one vehicle is believed",
+    "isolated": "single voxels, nothing beside them",
     "poses": "its poses were known poorly",
     "doubtful": "the vehicle doubts it itself",
     "shift": "a shift of its poses explains it",

@@ -19,7 +19,7 @@ from tile_store.errors import StoreError
 VersionKind = Literal["base", "merged", "rollback"]
 PutStatus = Literal["stored", "duplicate"]
 PublishStatus = Literal["published", "unchanged", "stale"]
-WaitingReason = Literal["share", "poses", "doubtful", "shift", "named"]
+WaitingReason = Literal["share", "isolated", "poses", "doubtful", "shift", "named"]
 
 SHA_BYTES: Final = 32
 DEFAULT_LAYER: Final = "ndt"
@@ -248,8 +248,9 @@ class Unconfirmed:
         report_ids: of its reports that claim it, sorted.
         voxels: so many.
         seen: voxels of the tile that it observed and that hold something, before or by its word.
-        reason: "share": too large a share; "poses": of reports with poor poses only; "doubtful": the vehicle doubts it
-            itself; "shift": a shift of its poses explains it; "named": its reports are shifted again and again.
+        reason: "share": too large a share; "isolated": little, but nothing beside it has come or gone; "poses": of
+            reports with poor poses only; "doubtful": the vehicle doubts it itself; "shift": a shift of its poses
+            explains it; "named": its reports are shifted again and again.
     """
 
     vehicle: str
