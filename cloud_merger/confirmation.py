@@ -111,7 +111,7 @@ def gate(
         reports: those of the merge, in any order.
         parameters: see `ConfirmationParameters`.
         named: vehicles whose reports are shifted again and again: what they alone claim always waits, and they are
-            never a second witness of themselves.
+            never a second witness of themselves or of each other.
     """
     parameters = parameters or ConfirmationParameters()
     by_id = {report.report_id: report for report in reports}
@@ -131,14 +131,14 @@ def gate(
 def _witnesses(
     merged: MergedTile, by_id: Mapping[str, Report], parameters: ConfirmationParameters, named: frozenset[str]
 ) -> dict[str, _Witness]:
-    """By vehicle, its part in the changes that won."""
+    """By vehicle, its part in the changes that won. Named vehicles do not confirm each other either."""
     drive = _drives(by_id.values(), parameters.second_drive_s, named)
     lonely: dict[str, dict[int, tuple[Report, ...]]] = defaultdict(dict)
     shared: Counter[str] = Counter()
     for voxel, ids in merged.provenance.items():
         vehicles = {by_id[one].vehicle for one in ids}
-        if len({drive[one] for one in ids}) == 1:
-            lonely[vehicles.pop()][voxel] = tuple(by_id[one] for one in ids)
+        if len({drive[one] for one in ids}) == 1 or vehicles <= named:
+            lonely[min(vehicles)][voxel] = tuple(by_id[one] for one in ids)
         else:
             shared.update(vehicles)
     return {vehicle: _Witness(own, shared[vehicle]) for vehicle, own in lonely.items()}

@@ -84,6 +84,7 @@ def test_a_named_vehicle_never_confirms_itself_and_its_lonely_claims_wait_all():
     few = gated([said(1, FEW, "car")], named=frozenset({"car"}))
     assert [one.reason for one in few.waiting] == ["named"]
     assert published([said(1, FEW, "car"), said(2, FEW)], named=frozenset({"car"})) == sorted(FEW)
+    assert published([said(1, FEW, "car"), said(2, FEW, "other")], named=frozenset({"car", "other"})) == []
 
 
 def test_few_well_supported_claims_are_published_at_once():
