@@ -21,6 +21,7 @@ from schemas.course import Course
 from schemas.keys import change_key
 from schemas.report_id import deterministic_report_id
 from vehicle_agent.config import ReportParameters
+from vehicle_agent.detect.beyond import beyond_map
 from vehicle_agent.detect.classify import Classification, classify, tile_change
 from vehicle_agent.detect.detector import ChangeDetector
 from vehicle_agent.detect.doubts import LEAST_WITHHELD, Account, TileDoubts, changed_share_of, doubt_of, withheld_change
@@ -237,6 +238,7 @@ class Reporter:
                 continue
             for name, n in zip(ChangeClass.__members__, np.bincount(found.change_class, minlength=6), strict=True):
                 self.classes[name.lower()] += int(n)
+            self.counts["voxels_beyond_map"] += int(beyond_map(found).sum())
             if found.observed.any():
                 doubt = doubt_of(found, account, day_of(self._now_ns))
                 self._take(replace(self._said(found), doubt=doubt), evidence.base, odometer_m)

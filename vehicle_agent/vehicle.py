@@ -43,6 +43,7 @@ if TYPE_CHECKING:
 COUNTS = (
     "scans_used", "scans_uncertain", "scans_disagreeing", "scans_shifted", "scans_taken_back", "points",
     "moving_points", "rays", "changed_voxels", "tiles_doubtful", "tiles_held_back", "changes_held_back",
+    "voxels_beyond_map",
 )  # fmt: skip
 """What the reporter counts, as `result.json` names it."""
 

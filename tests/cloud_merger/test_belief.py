@@ -1,11 +1,13 @@
 """Reports that a shift explains do not vote, a shift that others see alike is none, and who shifts is named."""
 
+import io
 import itertools
 from dataclasses import replace
 
 import numpy as np
 import pytest
 from merger_world import TILE, gaussians_of, report_of, sha_of
+from rich.console import Console
 from street_corner import WALLS, displaced, mapped, seen_as, street
 
 from cloud_merger.belief import believed
@@ -18,7 +20,7 @@ from schemas.changes import split
 from schemas.course import Course
 from schemas.doubt import Doubt, DoubtReason
 from tile_store.sqlite_store import SqliteStore
-from tile_store.status import named_vehicles, naming_line
+from tile_store.status import named_vehicles, naming_line, print_status, status_of
 from tile_store.values import ReportRow, StoreConfig, VehicleAccount
 
 BASE = mapped(street(0))
@@ -255,3 +257,14 @@ def test_the_line_about_a_shifted_vehicle_tells_how_far_and_where_to():
         "check its mount"
     )
     assert "(" not in naming_line(replace(account, forward_m=None, left_m=None))
+
+
+def test_status_tells_why_the_vehicle_itself_doubts(store):
+    doubt = Doubt(DoubtReason.IMPLAUSIBLE_SHARE | DoubtReason.HEALTH_NOT_GOOD, changed_permille=700)
+    put(store, report_of(1, replace(REBUILT, doubt=doubt), vehicle="car"))
+    merge_all(store)
+    (claim,) = status_of(store)["waiting_for_confirmation"]["claims"]
+    assert (claim["reason"], claim["doubts"]) == ("doubtful", ["implausible_share", "health_not_good"])
+    console = Console(width=200, record=True, file=io.StringIO())
+    print_status(console, "map", status_of(store))
+    assert "the vehicle doubts it itself: implausible share, health not good" in console.export_text()

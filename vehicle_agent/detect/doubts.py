@@ -16,6 +16,7 @@ from gnd_map.tile import Tile
 from gnd_map.tile_id import TileId
 from schemas.changes import TileChange
 from schemas.doubt import Doubt, DoubtReason
+from vehicle_agent.detect.beyond import beyond_map
 from vehicle_agent.detect.classify import Classification
 from vehicle_agent.detect.shift import Shift, no_shift
 from vehicle_agent.detect.trial import Tried
@@ -149,8 +150,11 @@ def doubt_of(found: Classification, account: Account, day: int = UNKNOWN_DAY) ->
 
 
 def changed_share_of(found: Classification) -> float:
-    """Of the voxels that hold something in the base or now, those that are changed; 0 where there are too few."""
-    changed = int(found.changed.sum())
+    """Of the voxels that hold something in the base or now, those that are changed; 0 where there are too few. What
+    lies beyond the map extends it and does not count, unless there is no map at all.
+    """
+    beyond = int(beyond_map(found).sum()) if len(found.evidence.base.gaussians) else 0
+    changed = int(found.changed.sum()) - beyond
     holding = changed + int((found.change_class == ChangeClass.NORMAL).sum())
     return changed / holding if holding >= LEAST_OF_SHARE else 0.0
 
