@@ -58,7 +58,7 @@ def test_new_voxels_two_columns_off_extend_the_map() -> None:
 
 
 def test_a_tile_that_is_mostly_new_ground_is_no_implausible_change_and_a_tile_of_new_walls_is() -> None:
-    behind = ids(*((x, y, 40) for x in range(18, 36) for y in range(18, 36)))
+    behind = ids(*((x, y, 40) for x in range(16, 31) for y in range(16, 36)))
     assert changed_share_of(classified(ROAD, behind)) == 0.0
     walls = ids(*((x, 5, z) for x in range(12) for z in range(41, 71)))
     assert changed_share_of(classified(ROAD, walls)) > 0.7
