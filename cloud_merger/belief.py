@@ -152,8 +152,7 @@ def _test_of(report: Report, shift: Shift, is_explained: bool) -> ShiftTest:
     """The test's line in the account of its vehicle; along the vehicle's axes where the vehicle has told it so."""
     doubt = report.change.doubt
     if doubt is None or not _doubts_by_shift(report):
-        length_m = float(np.hypot(shift.east_m, shift.north_m))
-        return ShiftTest(report.report_id, report.vehicle, report.last_ns, is_explained, length_m, shift.turn_rad)
+        return ShiftTest(report.report_id, report.vehicle, report.last_ns, is_explained, shift.length_m, shift.turn_rad)
     forward_m, left_m, _ = doubt.shift_m
     length_m = float(np.hypot(forward_m, left_m))
     return ShiftTest(
