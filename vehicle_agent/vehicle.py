@@ -114,8 +114,8 @@ class Vehicle:
         if self.features is not None and isinstance(item, Detections):
             self.features.wait(item)
 
-    def localise(self, item: DriveItem) -> list[RefinedScan]:
-        """Feed the localiser; gives the scans whose poses have become final."""
+    def localise(self, item: DriveItem) -> Iterator[RefinedScan]:
+        """Feed the localiser; gives the scans whose poses have become final, to be used up before the next item."""
         if isinstance(item, MotionSample):
             self.localiser.push_motion(item)
         elif isinstance(item, GnssFix):
@@ -123,8 +123,8 @@ class Vehicle:
         elif isinstance(item, Scan):
             self.scans += 1
             self.memory.count_scan()
-            return self.localiser.push_scan(item)
-        return []
+            return self.localiser.take_scan(item)
+        return iter(())
 
     def segment(self, scan: RefinedScan) -> list[SegmentedScan]:
         """Compare the scan with those before and after it; gives the scans whose movers are known now."""
