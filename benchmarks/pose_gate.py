@@ -49,13 +49,25 @@ ERRORS: dict[str, F64] = {
     "50 cm left": shift(0.0, 0.5), "1 m ahead": shift(1.0), "0.2 deg": shift(yaw_deg=0.2),
     "0.5 deg": shift(yaw_deg=0.5),
 }  # fmt: skip
+
+
+def always(error: F64) -> ErrorAt:
+    """The same error (4, 4) all the way."""
+    return lambda _: error
+
+
+def drifting(forward_m: float, left_m: float) -> ErrorAt:
+    """An error that grows from nothing to this."""
+    return lambda done: shift(forward_m * done, left_m * done)
+
+
 SHARED: dict[str, ErrorAt] = {
-    "none": lambda _: shift(),
-    **{f"{m} m across": (lambda _, m=m: shift(0.3 * m, 0.95 * m)) for m in (0.2, 0.4, 0.8)},
-    **{f"{deg} deg": (lambda _, deg=deg: shift(yaw_deg=deg)) for deg in (0.5, 1.0)},
-    "drifting to 0.8 m": lambda done: shift(0.24 * done, 0.76 * done),
-    **{f"{m} m too high": (lambda _, m=m: shift(up_m=m)) for m in (0.1, 0.2, 0.5)},
-}  # type: ignore[misc]
+    "none": always(shift()),
+    **{f"{off_m} m across": always(shift(0.3 * off_m, 0.95 * off_m)) for off_m in (0.2, 0.4, 0.8)},
+    **{f"{turn_deg} deg": always(shift(yaw_deg=turn_deg)) for turn_deg in (0.5, 1.0)},
+    "drifting to 0.8 m": drifting(0.24, 0.76),
+    **{f"{up_m} m too high": always(shift(up_m=up_m)) for up_m in (0.1, 0.2, 0.5)},
+}
 """What a whole fleet may have in common: firmware, a mount, half a map."""
 PARTS = {"20 cm left": shift(0.0, 0.2), "1 m ahead": shift(1.0), "0.5 deg": shift(yaw_deg=0.5)}
 
@@ -139,7 +151,7 @@ def main() -> None:
     for gate in (False, True):
         print(f"{'with' if gate else 'without'} the gate")
         for name, error in ERRORS.items():
-            print(f"  {name:24s} {drive(local_map, scans, lambda _, e=error: e, gate=gate)}")  # type: ignore[misc]
+            print(f"  {name:24s} {drive(local_map, scans, always(error), gate=gate)}")
     for name, error in PARTS.items():
         at = _third(error)
         print(f"  {name + ', middle third':24s} {drive(local_map, scans, at, gate=True)}")

@@ -48,8 +48,14 @@ class Found:
     def within(self, keys: NDArray[np.int64]) -> "Found":
         """What is said of these voxels only."""
         kept = np.isin(self.keys, keys)
-        columns = (self.keys, self.g, self.change_class, self.in_map, self.mean_m)
-        return Found(*(column[kept] for column in columns), self.scans_used)
+        return Found(
+            keys=self.keys[kept],
+            g=self.g[kept],
+            change_class=self.change_class[kept],
+            in_map=self.in_map[kept],
+            mean_m=self.mean_m[kept],
+            scans_used=self.scans_used,
+        )
 
     def where(self, *classes: int) -> NDArray[np.bool_]:
         """(K,) bool."""
