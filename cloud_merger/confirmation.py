@@ -226,7 +226,7 @@ def _told(
             vehicle=vehicle,
             report_ids=tuple(sorted({one for voxel in voxels for one in merged.provenance[voxel]})),
             voxels=len(voxels),
-            seen=_seen(vehicle, epoch, by_id.values()),
+            seen=max(_seen(vehicle, epoch, by_id.values()), len(voxels)),  # "as in an older version" claims, too
             reason=reason,
         )
         for (vehicle, reason), voxels in sorted(told.items())

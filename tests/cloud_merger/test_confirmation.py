@@ -114,6 +114,14 @@ def test_what_a_lonely_vehicle_claims_of_single_voxels_waits(changed, waits):
     assert published([said(1, changed), said(2, changed)]) == sorted(changed), "a second vehicle confirms it"
 
 
+def test_a_voxel_that_is_as_in_an_older_version_is_a_claim_that_was_seen():
+    older = gaussians_of({400: POLE})
+    report = Report("1" * 26, change_of(older, [400], {}), vehicle="car")
+    merged = merge_tile(EPOCH, statements_of(EPOCH, [report], {sha_of(older): older}))
+    (waiting,) = gate(EPOCH, merged, [report]).waiting
+    assert (waiting.voxels, waiting.seen, waiting.reason) == (1, 1, "isolated")
+
+
 def test_on_new_ground_single_voxels_do_not_wait():
     assert published([said(1, {400: POLE}, base=None)], epoch=Gaussians.empty()) == [400]
 
