@@ -71,6 +71,7 @@ def update_of(stored: StoredTile, parent: StoredTile | None) -> TileUpdate:
         sha=stored.sha,
         previous_sha=parent.sha if parent else b"",
         reason=stored.kind,
+        day=stored.day,
     )
     return _with_delta(update, stored, parent) if parent else update
 

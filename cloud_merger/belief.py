@@ -1,7 +1,8 @@
 """Which reports of a tile take part in its merge: not those whose changes are an error of their poses.
 
-What a second vehicle claims alike is none of the poses: then the map is off, or a facade has moved, and both are
-believed. Two passes of one vehicle share its mount, so they do not count as two here, however far apart.
+What a second vehicle claims alike is none of the poses: then a facade has moved, and both are believed. Two passes of
+one vehicle share its mount, so they do not count as two here, however far apart. Nor do two vehicles whose reports are
+shifted again and again: they share their software, or the map is off all over, which no vote about voxels mends.
 """
 
 from collections import OrderedDict
@@ -61,23 +62,35 @@ class ShiftTests:
         return self._held[key]
 
 
-def believed(reports: Iterable[Report], shifts: Mapping[str, Shift], parameters: ShiftParameters) -> Believed:
+def believed(
+    reports: Iterable[Report],
+    shifts: Mapping[str, Shift],
+    parameters: ShiftParameters,
+    named: frozenset[str] = frozenset(),
+) -> Believed:
     """Sort out the reports of a tile.
 
     Args:
         reports: in any order.
         shifts: of each by its id.
         parameters: of the shift test.
+        named: vehicles whose reports are shifted again and again.
+
+    An account takes no notice of `named`: a report counts as explained there unless one that is not explained itself
+    claims the same. So who is named depends on the reports alone.
     """
     ordered = sorted(reports, key=lambda one: one.report_id)
     doubted = {one.report_id for one in ordered if shifts[one.report_id].is_explained or _doubts_by_shift(one)}
-    alike = {one.report_id for one in ordered if one.report_id in doubted and _is_shared(one, ordered)}
+    sure = [one for one in ordered if one.report_id not in doubted]
+    unnamed = [one for one in ordered if one.vehicle not in named]
+    cleared = {one.report_id for one in ordered if one.report_id in doubted and _is_shared(one, sure)}
+    alike = cleared | {one.report_id for one in unnamed if one.report_id in doubted and _is_shared(one, unnamed)}
     out = [one for one in ordered if one.report_id in doubted - alike]
     tested = (one for one in ordered if _can_tell(one, shifts, parameters))
     return Believed(
         reports=tuple(one for one in ordered if one.report_id not in doubted - alike),
         set_aside=_claims(out),
-        tests=tuple(_test_of(one, shifts[one.report_id], one.report_id in doubted - alike) for one in tested),
+        tests=tuple(_test_of(one, shifts[one.report_id], one.report_id in doubted - cleared) for one in tested),
     )
 
 
@@ -139,8 +152,7 @@ def _test_of(report: Report, shift: Shift, is_explained: bool) -> ShiftTest:
     """The test's line in the account of its vehicle; along the vehicle's axes where the vehicle has told it so."""
     doubt = report.change.doubt
     if doubt is None or not _doubts_by_shift(report):
-        length_m = float(np.hypot(shift.east_m, shift.north_m))
-        return ShiftTest(report.report_id, report.vehicle, report.last_ns, is_explained, length_m, shift.turn_rad)
+        return ShiftTest(report.report_id, report.vehicle, report.last_ns, is_explained, shift.length_m, shift.turn_rad)
     forward_m, left_m, _ = doubt.shift_m
     length_m = float(np.hypot(forward_m, left_m))
     return ShiftTest(

@@ -13,11 +13,15 @@ from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
+from scipy.spatial import cKDTree
 
 from cloud_merger.errors import MergerError
 from cloud_merger.merge import MergedTile
 from cloud_merger.statements import Report
 from gnd_map.gaussian import Gaussians
+from gnd_map.grid import VoxelGrid
 from gnd_map.tile import TileDelta, apply
 from tile_store.values import Unconfirmed, WaitingReason
 
@@ -33,6 +37,9 @@ class ConfirmationParameters:
         few_voxels: so many changed voxels of a tile, ...
         few_share: ... or this share of what the witness saw of the tile, whichever is more, are few. Beyond that all of
             its lonely claims in the tile wait.
+        together_voxels: a lonely claim is well supported in a group of changes, voxel beside voxel, in which at least
+            so many appear or vanish. What has come or gone is larger than a voxel or two; what detection errs about is
+            not: edges, leaves, a surface that the map just missed. Changes of shape alone are told less surely.
         vouched_share: but if at least this share of all its claims that won was made by others, too, the rest is
             believed with it, whatever else speaks against it: its poses were right there, and it sees a construction
             site from where others do not.
@@ -44,6 +51,7 @@ class ConfirmationParameters:
 
     few_voxels: int = 8
     few_share: float = 0.02
+    together_voxels: int = 3
     vouched_share: float = 0.5
     well_known_m: float = 0.1
     second_drive_s: float = 1800.0
@@ -51,6 +59,8 @@ class ConfirmationParameters:
     def __post_init__(self) -> None:
         if self.few_voxels < 0:
             raise MergerError(f"few_voxels must not be negative, got {self.few_voxels}")
+        if self.together_voxels < 1:
+            raise MergerError(f"together_voxels must be at least 1, got {self.together_voxels}")
         for name in ("few_share", "vouched_share"):
             if not 0 <= getattr(self, name) <= 1:
                 raise MergerError(f"{name} must lie in [0, 1], got {getattr(self, name)}")
@@ -101,13 +111,15 @@ def gate(
         reports: those of the merge, in any order.
         parameters: see `ConfirmationParameters`.
         named: vehicles whose reports are shifted again and again: what they alone claim always waits, and they are
-            never a second witness of themselves.
+            never a second witness of themselves or of each other.
     """
     parameters = parameters or ConfirmationParameters()
     by_id = {report.report_id: report for report in reports}
     waits: dict[int, tuple[str, WaitingReason]] = {}
+    isolated = _isolated(epoch, merged, by_id.values(), parameters.together_voxels)
     for vehicle, witness in sorted(_witnesses(merged, by_id, parameters, named).items()):
-        reasons = _waiting_of(witness, _seen(vehicle, epoch, by_id.values()), len(epoch) == 0, parameters)
+        seen = _seen(vehicle, epoch, by_id.values())
+        reasons = _waiting_of(witness, seen, None if len(epoch) == 0 else isolated, parameters)
         if vehicle in named:
             reasons = dict.fromkeys(witness.lonely, "named")
         waits |= {voxel: (vehicle, reason) for voxel, reason in reasons.items()}
@@ -119,14 +131,14 @@ def gate(
 def _witnesses(
     merged: MergedTile, by_id: Mapping[str, Report], parameters: ConfirmationParameters, named: frozenset[str]
 ) -> dict[str, _Witness]:
-    """By vehicle, its part in the changes that won."""
+    """By vehicle, its part in the changes that won. Named vehicles do not confirm each other either."""
     drive = _drives(by_id.values(), parameters.second_drive_s, named)
     lonely: dict[str, dict[int, tuple[Report, ...]]] = defaultdict(dict)
     shared: Counter[str] = Counter()
     for voxel, ids in merged.provenance.items():
         vehicles = {by_id[one].vehicle for one in ids}
-        if len({drive[one] for one in ids}) == 1:
-            lonely[vehicles.pop()][voxel] = tuple(by_id[one] for one in ids)
+        if len({drive[one] for one in ids}) == 1 or vehicles <= named:
+            lonely[min(vehicles)][voxel] = tuple(by_id[one] for one in ids)
         else:
             shared.update(vehicles)
     return {vehicle: _Witness(own, shared[vehicle]) for vehicle, own in lonely.items()}
@@ -146,10 +158,27 @@ def _drives(reports: Iterable[Report], second_drive_s: float, named: frozenset[s
     return found
 
 
+def _isolated(epoch: Gaussians, merged: MergedTile, reports: Iterable[Report], together_voxels: int) -> frozenset[int]:
+    """The changed voxels, whoever claims them, in whose group too few appear or vanish."""
+    tile = next((report.change.tile for report in reports), None)
+    if tile is None or not merged.provenance:
+        return frozenset()
+    voxels = np.array(sorted(merged.provenance), np.int32)
+    there, was = (np.isin(voxels, gaussians.voxel_id) for gaussians in (merged.gaussians, epoch))
+    at = np.stack(VoxelGrid.of(tile).unravel(voxels), axis=1)
+    pairs = cKDTree(at).query_pairs(1.5, p=np.inf, output_type="ndarray")
+    links = coo_array((np.ones(len(pairs)), (pairs[:, 0], pairs[:, 1])), shape=(len(voxels), len(voxels)))
+    n_groups, group = connected_components(links, directed=False)
+    size = np.bincount(group, there != was, n_groups)
+    return frozenset(voxels[size[group] < together_voxels].tolist())
+
+
 def _waiting_of(
-    witness: _Witness, seen: int, is_new_ground: bool, parameters: ConfirmationParameters
+    witness: _Witness, seen: int, isolated: frozenset[int] | None, parameters: ConfirmationParameters
 ) -> dict[int, WaitingReason]:
-    """The lonely claims of one vehicle that wait, and why; none where others vouch for it in this tile."""
+    """The lonely claims of one vehicle that wait, and why; none where others vouch for it in this tile. `isolated`:
+    None on new ground, where nothing is too much or too little.
+    """
     waits: dict[int, WaitingReason] = {}
     if witness.shared >= max(VOUCHED_VOXELS, parameters.vouched_share * (witness.shared + len(witness.lonely))):
         return waits
@@ -159,9 +188,11 @@ def _waiting_of(
         elif all(report.pose_m2 > parameters.well_known_m**2 for report in reports):
             waits[voxel] = "poses"
     rest = witness.lonely.keys() - waits.keys()
-    if len(rest) > max(parameters.few_voxels, parameters.few_share * seen) and not is_new_ground:
-        waits |= dict.fromkeys(rest, "share")
-    return waits
+    if isolated is None:
+        return waits
+    if len(rest) > max(parameters.few_voxels, parameters.few_share * seen):
+        return waits | dict.fromkeys(rest, "share")
+    return waits | dict.fromkeys(rest & isolated, "isolated")
 
 
 def _seen(vehicle: str, epoch: Gaussians, reports: Iterable[Report]) -> int:
@@ -195,7 +226,7 @@ def _told(
             vehicle=vehicle,
             report_ids=tuple(sorted({one for voxel in voxels for one in merged.provenance[voxel]})),
             voxels=len(voxels),
-            seen=_seen(vehicle, epoch, by_id.values()),
+            seen=max(_seen(vehicle, epoch, by_id.values()), len(voxels)),  # "as in an older version" claims, too
             reason=reason,
         )
         for (vehicle, reason), voxels in sorted(told.items())

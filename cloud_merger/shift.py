@@ -9,10 +9,13 @@ point-to-plane fit (Chen and Medioni 1992; weights of Huber). The changes are ex
    motion in other directions, which is what chance gives, and
 2. the rest of the tile agrees: of the surfaces that such a motion would displace, most are not reported as unchanged.
 
+Where no motion over the ground explains them, one up or down is tried, by votes of level planes and under the same
+conditions: a LiDAR that hangs lower than its vehicle believes raises every road.
+
 A pure function of a report and its base.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from math import cos, sin
 from typing import Final
 
@@ -37,6 +40,7 @@ _ROUNDS: Final = 6
 _HUBER_M: Final = 0.05
 _FLAT: Final = 0.5  # of 0 (a ball) to 1 (a plane)
 _PARALLEL: Final = 0.95  # cosine
+_LEVEL: Final = 0.95  # cosine with the vertical
 _BESIDE_M: Final = 1.0  # Gaussians of one surface lie so near to each other
 _FAR_PER_M: Final = 0.05
 
@@ -88,6 +92,7 @@ class Shift:
         unchanged: of the surfaces that the shift would have displaced, share that the report says is as in the base.
         east_m, north_m: the shift at the tile's centre.
         turn_rad: counter-clockwise seen from above, about the tile's centre.
+        up_m: the shift upwards; not together with the others.
     """
 
     is_explained: bool
@@ -98,6 +103,20 @@ class Shift:
     east_m: float = 0.0
     north_m: float = 0.0
     turn_rad: float = 0.0
+    up_m: float = 0.0
+
+    def meets(self, parameters: ShiftParameters) -> bool:
+        """Whether it explains the changes: most fit, many more than by chance, and the rest of the tile agrees."""
+        return (
+            self.fit >= parameters.explained_share
+            and self.fit - self.chance >= parameters.beyond_chance
+            and self.unchanged <= parameters.refuted_share
+        )
+
+    @property
+    def length_m(self) -> float:
+        """How far the shift is."""
+        return float(np.sqrt(self.east_m**2 + self.north_m**2 + self.up_m**2))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -120,6 +139,15 @@ class _Surfaces:
     def is_upright(self) -> Mask:
         """(N,) walls and the like."""
         return np.asarray((self.flat > _FLAT) & (np.abs(self.normal[:, 2]) < 0.5))
+
+    @property
+    def is_level(self) -> Mask:
+        """(N,) roads and the like."""
+        return np.asarray((self.flat > _FLAT) & (np.abs(self.normal[:, 2]) > _LEVEL))
+
+    def raised(self, up_m: float) -> "_Surfaces":
+        """The same so much higher."""
+        return replace(self, place_m=self.place_m + np.array([0.0, 0.0, up_m]))
 
     def take(self, index: NDArray[np.int64] | Mask) -> "_Surfaces":
         return _Surfaces(self.place_m[index], self.cov_m2[index], self.normal[index], self.flat[index])
@@ -150,12 +178,31 @@ def shift_of(change: TileChange, base: Gaussians, parameters: ShiftParameters | 
     others = [_fits(strange, known, tree, other, parameters).mean() for other in _elsewhere(motion)]
     chance = float(np.mean(others))
     unchanged = _unchanged(known.take(is_seen), is_changed[is_seen], motion, parameters)
-    is_explained = (
-        fit >= parameters.explained_share
-        and fit - chance >= parameters.beyond_chance
-        and unchanged <= parameters.refuted_share
+    found = Shift(False, len(strange.place_m), fit, chance, unchanged, *motion.tolist())
+    upwards = found if found.meets(parameters) else _raised(strange, known, tree, is_seen, is_changed, parameters)
+    return next((replace(one, is_explained=True) for one in (found, upwards) if one.meets(parameters)), found)
+
+
+def _raised(
+    strange: _Surfaces, known: _Surfaces, tree: cKDTree, is_seen: Mask, is_changed: Mask, parameters: ShiftParameters
+) -> Shift:
+    """The shift up or down that most level planes agree on, and what it explains."""
+    level, ground = strange.take(strange.is_level), known.take(known.is_level)
+    if len(level.place_m) < parameters.least_gaussians or not len(ground.place_m):
+        return Shift(False, len(strange.place_m))
+    near = cKDTree(ground.place_m[:, :2]).query_ball_point(level.place_m[:, :2], _BESIDE_M)
+    steps = np.arange(-parameters.max_m, parameters.max_m + _STEP_M / 2, _STEP_M)
+    votes = np.zeros(len(steps))
+    for place, others in zip(level.place_m, near, strict=True):
+        up_m = ground.place_m[others, 2] - place[2]
+        votes += (np.abs(up_m[:, None] - steps) < _STEP_M).any(axis=0)
+    best = float(steps[np.lexsort((np.abs(steps), -votes))[0]])
+    fit, chance = (
+        float(_fits(strange.raised(up_m), known, tree, np.zeros(3), parameters).mean()) for up_m in (best, -best)
     )
-    return Shift(is_explained, len(strange.place_m), fit, chance, unchanged, *motion.tolist())
+    displaced = is_seen & known.is_level & (abs(best) > parameters.displaced_m)
+    unchanged = float((~is_changed)[displaced].mean()) if displaced.any() else 1.0
+    return Shift(False, len(strange.place_m), fit, chance, unchanged, up_m=best)
 
 
 def _thinned(gaussians: Gaussians) -> Gaussians:

@@ -84,7 +84,7 @@ class Worker:
         if self._config.merge.mode == "paper":
             return Believed(tuple(reports), (), ())
         shifts = {report.report_id: self._shifts.of(report, bases) for report in reports}
-        return believed(reports, shifts, self._config.shift)
+        return believed(reports, shifts, self._config.shift, self._store.shifted_vehicles())
 
     def _gated(self, epoch: Gaussians, merged: MergedTile, believed_in: Believed) -> GatedTile:
         """What may be published of a merge, with all that waits; the paper knows no such gate."""

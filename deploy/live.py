@@ -23,6 +23,7 @@ PLAIN_PERIOD_S = 10.0
 WIDE = 108
 _COLUMNS = (
     "vehicle", "position", "health", "driven", "down", "of link, down", "up", "of link, up", "tiles", "reports",
+    "doubts",
 )  # fmt: skip
 _TEXTS = ("vehicle", "position", "health")
 _WIDE_ONLY = ("position", "tiles", "reports")
@@ -97,7 +98,9 @@ def render(state: FleetState, width: int = WIDE) -> Group:
         width: columns of the terminal.
     """
     table = Table(box=None, pad_edge=False, header_style="bold")
+    doubts = any(map(doubts_text, state.samples.values()))
     shown = [name for name in _COLUMNS if width >= WIDE or name not in _WIDE_ONLY]
+    shown = [name for name in shown if doubts or name != "doubts"]
     for name in shown:
         table.add_column(name.split(",")[0], justify="left" if name in _TEXTS else "right", no_wrap=True)
     with state.lock:
@@ -126,7 +129,15 @@ def _row(state: FleetState, sample: TrafficSample) -> tuple[str | Text, ...]:
         rate_cell(rate, link, "up", state.clock()),
         str(sample.tiles),
         str(sample.reports),
+        Text(doubts_text(sample), style="yellow"),
     )
+
+
+def doubts_text(sample: TrafficSample) -> str:
+    """What a vehicle takes back or doubts: "4 (2 held back)", and the scans; nothing where it believes itself."""
+    parts = [f"{sample.tiles_doubtful} tiles ({sample.tiles_held_back} held back)"] if sample.tiles_doubtful else []
+    parts += [f"{sample.scans_taken_back} scans"] if sample.scans_taken_back else []
+    return ", ".join(parts)
 
 
 @contextmanager
@@ -159,9 +170,13 @@ class View:
     def _plain(self) -> str:
         with self.state.lock:
             driven_m = sum(sample.odometer_m for sample in self.state.samples.values())
+            doubtful = sum(sample.tiles_doubtful for sample in self.state.samples.values())
+            held_back = sum(sample.tiles_held_back for sample in self.state.samples.values())
+            doubts = f"{doubtful} tiles doubtful ({held_back} held back); " if doubtful else ""
             return (
                 f"{len(self.state.samples)} agents, {driven_m:.0f} m driven, {self.state.reports} reports, "
                 f"{self.state.waiting} tiles waiting, {self.state.published} versions, {self.state.updates} updates; "
+                + doubts
                 + plain_traffic(self.state.samples.values())
             )
 

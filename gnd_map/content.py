@@ -3,9 +3,11 @@
 The codec id says which of the two a body is; the name of a layer says which of the two it holds.
 """
 
+from dataclasses import replace
 from typing import Final, TypeAlias, TypeVar, cast
 
 from gnd_map.codec import PREFERRED, best_codec, codec_of, decode_delta, encode_delta, lattice_of
+from gnd_map.day import UNKNOWN_DAY
 from gnd_map.errors import CodecError
 from gnd_map.features import (
     CODEC_FEATURES,
@@ -46,6 +48,16 @@ def noun_of(tile: AnyTile | type[object]) -> str:
     """What the tile holds, for messages."""
     kind = tile if isinstance(tile, type) else type(tile)
     return "features" if kind is FeatureTile else "Gaussians"
+
+
+def dated(tile: TileT, day: int) -> TileT:
+    """The tile with its day; features have none."""
+    return replace(tile, day=day) if isinstance(tile, Tile) and tile.day != day else tile
+
+
+def day_of_tile(tile: AnyTile) -> int:
+    """The day of a tile of Gaussians; `UNKNOWN_DAY` of features."""
+    return tile.day if isinstance(tile, Tile) else UNKNOWN_DAY
 
 
 def has_deltas(codec_id: int) -> bool:

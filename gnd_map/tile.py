@@ -1,9 +1,10 @@
 """A version of a tile and its content hash; deltas between versions are in `gnd_map.delta`."""
 
 import hashlib
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 from gnd_map.codec import encode_gaussians
+from gnd_map.day import LAST_DAY, UNKNOWN_DAY
 from gnd_map.delta import TileDelta, apply, diff
 from gnd_map.errors import ShapeError
 from gnd_map.gaussian import Gaussians
@@ -24,10 +25,15 @@ class Tile:
     """1, 2, 3 … as the store counts; 0 = not published."""
     gaussians: Gaussians
     """Its voxels, every count > 0."""
+    day: int = field(default=UNKNOWN_DAY, compare=False)
+    """When the world looked so: the day of the survey, or of the merge that made the version (`gnd_map.day`). No part
+    of the content: the hash does not know it."""
 
     def __post_init__(self) -> None:
         if self.version < 0:
             raise ShapeError(f"tile {self.tile_id}: version {self.version} is negative")
+        if not UNKNOWN_DAY <= self.day <= LAST_DAY:
+            raise ShapeError(f"tile {self.tile_id}: day {self.day} is outside {UNKNOWN_DAY} .. {LAST_DAY}")
         if not self.gaussians.exists.all():
             raise ShapeError(f"tile {self.tile_id}: {int((~self.gaussians.exists).sum())} voxels have count 0")
 

@@ -1,5 +1,6 @@
 """Why a vehicle does not fully believe what it reports of a tile: the reasons and the figures behind them."""
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from enum import IntFlag
 from typing import Final
@@ -91,6 +92,14 @@ class Doubt:
     def words(self) -> tuple[str, ...]:
         """The reasons that are known here, in words, in order of their bits."""
         return tuple(reason.name.lower() for reason in DoubtReason if reason & self.reasons and reason.name)
+
+
+def tiles_by_reason(words: Mapping[str, int]) -> tuple[int, ...]:
+    """Counts by word (`Doubt.words`) in the order of the bits, without zeros at the end."""
+    counts = [words.get(reason.name.lower(), 0) for reason in DoubtReason if reason.name]
+    while counts and not counts[-1]:
+        counts.pop()
+    return tuple(counts)
 
 
 def doubt_message(doubt: Doubt) -> doubt_pb2.Doubt:

@@ -3,12 +3,13 @@
 from dataclasses import dataclass
 from typing import Final, Literal
 
-from gnd_map.content import AnyTile, TileT, decode_content
+from gnd_map.content import AnyTile, TileT, dated, decode_content
+from gnd_map.day import UNKNOWN_DAY
 from gnd_map.tile import Tile
 from gnd_map.tile_id import TileId
 from schemas import limits
 from schemas.errors import BadValue, WrongHash
-from schemas.tiles import as_kind, check_hash, tile_from_delta
+from schemas.tiles import as_kind, check_day, check_hash, tile_from_delta
 from schemas.wire import check_length, check_version, check_word, refusing
 
 ANSWER_HASH_BYTES: Final = 4
@@ -43,16 +44,19 @@ class TileAnswer:
     """Codec of a blob; else 0."""
     body: bytes = b""
     """Of a blob in its codec, or of a delta by `gnd_map.content.encode_content_delta`; else empty."""
+    day: int = UNKNOWN_DAY
+    """When the world looked as a blob or delta says (`gnd_map.day`); else not known."""
 
     def __post_init__(self) -> None:
         check_word(self.status, ANSWER_STATUS, "answer status")
         check_length("TileAnswer", len(self.body), limits.MAX_TILE_BODY_BYTES, "bytes")
+        check_day(self.day)
         if self.status in WITH_BODY:
             check_version("tile version", self.version, lowest=1)
             check_version("codec id", self.codec_id, lowest=0)
             good = len(self.sha) == ANSWER_HASH_BYTES and (self.status == "blob" or self.codec_id == 0)
         else:
-            good = (self.version, self.sha, self.codec_id, self.body) == (0, b"", 0, b"")
+            good = (self.version, self.sha, self.codec_id, self.body, self.day) == (0, b"", 0, b"", UNKNOWN_DAY)
         if not good:
             raise BadValue(
                 f"answer {self.status!r} with version {self.version}, a hash of {len(self.sha)} bytes, codec"
@@ -84,8 +88,8 @@ def content_of_answer(tile: TileId, answer: TileAnswer, kind: type[TileT], held:
     if answer.status == "delta":
         if held is None:
             raise WrongHash(f"{name} is a delta and nothing is held; fetch the tile whole")
-        return tile_from_delta(tile, answer.version, answer.body, held, answer.sha)
+        return dated(tile_from_delta(tile, answer.version, answer.body, held, answer.sha), answer.day)
     with refusing(name):
         found: AnyTile = decode_content(tile, answer.version, answer.codec_id, answer.body)
     check_hash(name, found, answer.sha)
-    return as_kind(found, kind)
+    return dated(as_kind(found, kind), answer.day)

@@ -5,7 +5,8 @@ from itertools import pairwise
 from typing import Final, Literal
 
 from gnd_map.codec import CODEC_FLOAT32, PREFERRED, codec_of
-from gnd_map.content import AnyTile, TileT, decode_content, decode_content_delta, noun_of
+from gnd_map.content import AnyTile, TileT, dated, decode_content, decode_content_delta, noun_of
+from gnd_map.day import LAST_DAY, UNKNOWN_DAY
 from gnd_map.errors import GndError
 from gnd_map.features import FeatureTile
 from gnd_map.tile import Tile
@@ -93,11 +94,14 @@ class TileBlob:
     """SHA-256 of the content, whatever the codec."""
     codec_id: int
     body: bytes
+    day: int = UNKNOWN_DAY
+    """When the world looked so (`gnd_map.day`)."""
 
     def __post_init__(self) -> None:
         check_version("tile version", self.version, lowest=1)
         check_sha("tile sha", self.sha)
         check_version("codec id", self.codec_id, lowest=0)
+        check_day(self.day)
         check_length(f"tile {self.tile}", len(self.body), limits.MAX_TILE_BODY_BYTES, "bytes")
 
     def encode(self) -> bytes:
@@ -110,20 +114,36 @@ class TileBlob:
         return _blob_value(parse(tile_blob_pb2.TileBlob, data, limits.MAX_TILE_REPLY_BYTES))
 
 
+def check_day(day: int) -> None:
+    """`BadValue` unless this can be the day of a tile."""
+    if not UNKNOWN_DAY <= day <= LAST_DAY:
+        raise BadValue(f"day {day} is outside {UNKNOWN_DAY} .. {LAST_DAY}")
+
+
 def _blob_message(blob: TileBlob) -> tile_blob_pb2.TileBlob:
     return tile_blob_pb2.TileBlob(
-        tile=blob.tile.morton, version=blob.version, sha=blob.sha, codec_id=blob.codec_id, body=blob.body
+        tile=blob.tile.morton,
+        version=blob.version,
+        sha=blob.sha,
+        codec_id=blob.codec_id,
+        body=blob.body,
+        day=blob.day,
     )
 
 
 def _blob_value(message: tile_blob_pb2.TileBlob) -> TileBlob:
-    return TileBlob(tile_id(message.tile), message.version, message.sha, message.codec_id, message.body)
+    return TileBlob(tile_id(message.tile), message.version, message.sha, message.codec_id, message.body, message.day)
 
 
 def blob_of(tile: Tile, codec_id: int = CODEC_FLOAT32) -> TileBlob:
     """The tile in a codec; `CodecError` when that codec cannot express it."""
     return TileBlob(
-        tile.tile_id, tile.version, tile.sha, codec_id, codec_of(codec_id).encode(tile.tile_id, tile.gaussians)
+        tile.tile_id,
+        tile.version,
+        tile.sha,
+        codec_id,
+        codec_of(codec_id).encode(tile.tile_id, tile.gaussians),
+        tile.day,
     )
 
 
@@ -138,7 +158,7 @@ def content_of(blob: TileBlob) -> AnyTile:
     with refusing(name):
         tile = decode_content(blob.tile, blob.version, blob.codec_id, blob.body)
     check_hash(name, tile, blob.sha)
-    return tile
+    return dated(tile, blob.day)
 
 
 def tile_of(blob: TileBlob) -> Tile:
@@ -169,19 +189,24 @@ class CodedDelta:
     """SHA-256 of the content that comes out."""
     body: bytes
     """`gnd_map.content.encode_content_delta` against what the client holds."""
+    day: int = UNKNOWN_DAY
+    """When the world looked so (`gnd_map.day`)."""
 
     def __post_init__(self) -> None:
         check_version("tile version", self.version, lowest=1)
         check_sha("tile sha", self.sha)
         check_length(f"delta of tile {self.tile}", len(self.body), limits.MAX_TILE_BODY_BYTES, "bytes")
+        check_day(self.day)
 
 
 def _delta_message(delta: CodedDelta) -> coded_delta_pb2.CodedDelta:
-    return coded_delta_pb2.CodedDelta(tile=delta.tile.morton, version=delta.version, sha=delta.sha, body=delta.body)
+    return coded_delta_pb2.CodedDelta(
+        tile=delta.tile.morton, version=delta.version, sha=delta.sha, body=delta.body, day=delta.day
+    )
 
 
 def _delta_value(message: coded_delta_pb2.CodedDelta) -> CodedDelta:
-    return CodedDelta(tile_id(message.tile), message.version, message.sha, message.body)
+    return CodedDelta(tile_id(message.tile), message.version, message.sha, message.body, message.day)
 
 
 def tile_after(delta: CodedDelta, held: TileT) -> TileT:
@@ -190,7 +215,7 @@ def tile_after(delta: CodedDelta, held: TileT) -> TileT:
     Raises:
         WrongHash: the delta does not fit what is held, or what comes out has not the delta's sha: fetch the tile whole.
     """
-    return tile_from_delta(delta.tile, delta.version, delta.body, held, delta.sha)
+    return dated(tile_from_delta(delta.tile, delta.version, delta.body, held, delta.sha), delta.day)
 
 
 def tile_from_delta(tile: TileId, version: int, body: bytes, held: TileT, sha: bytes) -> TileT:

@@ -229,6 +229,7 @@ class TilesReply:
             hashes=b"".join(answer.sha for answer in brought),
             codecs=(answer.codec_id for answer in brought if answer.status == "blob"),
             bodies=(answer.body for answer in brought),
+            days=_days([answer.day for answer in brought]),
         )
         return serialise(message, limits.MAX_TILES_REPLY_BYTES)
 
@@ -243,6 +244,22 @@ class TilesReply:
         )
         check_major(message, "TilesReply")
         return cls(tuple(_answers(message)))
+
+
+def _days(days: Sequence[int]) -> Sequence[int]:
+    """As few numbers as say the days of all: most tiles of a map were surveyed on one day."""
+    if not any(days):
+        return ()
+    return days if any(day != days[0] for day in days) else days[:1]
+
+
+def _days_of(days: Sequence[int], n_brought: int) -> Sequence[int]:
+    """The days of all tiles that are brought."""
+    if len(days) == n_brought:
+        return days
+    if len(days) > 1:
+        raise BadValue(f"TilesReply that brings {n_brought} tiles has {len(days)} days: one for each, one, or none")
+    return n_brought * (list(days) or [0])
 
 
 def _runs(answers: Iterable[TileAnswer]) -> Iterator[int]:
@@ -268,11 +285,12 @@ def _answers(message: tiles_reply_pb2.TilesReply) -> Iterator[TileAnswer]:
             f"TilesReply that brings {n_brought} tiles, {n_blobs} of them whole, has {counts[0]} versions,"
             f" {counts[1]} hashes, {counts[2]} bodies and {counts[3]} codecs"
         )
-    brought = iter(zip(message.versions, hashes, message.bodies, strict=True))
+    days = _days_of(message.days, n_brought)
+    brought = iter(zip(message.versions, hashes, message.bodies, days, strict=True))
     codecs = iter(message.codecs)
     for status in statuses:
         if status in WITH_BODY:
-            version, sha, body = next(brought)
-            yield TileAnswer(status, version, sha, next(codecs) if status == "blob" else 0, body)
+            version, sha, body, day = next(brought)
+            yield TileAnswer(status, version, sha, next(codecs) if status == "blob" else 0, body, day)
         else:
             yield TileAnswer(status)

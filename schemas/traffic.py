@@ -5,6 +5,7 @@ from dataclasses import dataclass
 from typing import Final, Literal
 
 from schemas import limits
+from schemas.doubt import DoubtReason
 from schemas.errors import BadValue
 from schemas.generated import traffic_line_pb2, traffic_sample_pb2
 from schemas.wire import (
@@ -25,6 +26,7 @@ from schemas.wire import (
 Direction = Literal["up", "down"]
 _DIRECTION: Final[dict[int, Direction]] = {1: "up", 2: "down"}
 _MAX_LINES: Final = 64
+_MAX_REASONS: Final = 32
 
 
 @dataclass(frozen=True, slots=True)
@@ -66,6 +68,14 @@ class TrafficSample:
     """Tiles downloaded so far."""
     reports: int
     """Reports acknowledged so far."""
+    scans_taken_back: int = 0
+    """Scans of which nothing was concluded because their poses turned out to be wrong."""
+    tiles_held_back: int = 0
+    """Tiles of which nothing was told because an error of the poses explains what seemed to have changed."""
+    tiles_doubtful: int = 0
+    """Tiles reported with a doubt, those held back included."""
+    doubts: tuple[int, ...] = ()
+    """The same by reason, in the order of the bits of `DoubtReason`; missing ones at the end are 0."""
 
     def __post_init__(self) -> None:
         check_text("vehicle", self.vehicle, VEHICLE_PATTERN)
@@ -75,8 +85,19 @@ class TrafficSample:
         check_unsigned("wire_down_bytes", self.wire_down_bytes, bits=63)
         check_unsigned("tiles", self.tiles, bits=32)
         check_unsigned("reports", self.reports, bits=32)
+        for name in ("scans_taken_back", "tiles_held_back", "tiles_doubtful"):
+            check_unsigned(name, getattr(self, name), bits=32)
+        check_length("TrafficSample", len(self.doubts), _MAX_REASONS, "reasons of doubt")
+        for tiles in self.doubts:
+            check_unsigned("tiles by reason of doubt", tiles, bits=32)
         self._check_position()
         self._check_lines()
+
+    @property
+    def doubts_in_words(self) -> dict[str, int]:
+        """Tiles by reason, of those reasons that are known here and that there are."""
+        words = (reason.name.lower() for reason in DoubtReason if reason.name)
+        return {word: n for word, n in zip(words, self.doubts, strict=False) if n}
 
     def _check_position(self) -> None:
         if not (math.isfinite(self.odometer_m) and self.odometer_m >= 0):
@@ -104,6 +125,10 @@ class TrafficSample:
             health=self.health,
             tiles=self.tiles,
             reports=self.reports,
+            scans_taken_back=self.scans_taken_back,
+            tiles_held_back=self.tiles_held_back,
+            tiles_doubtful=self.tiles_doubtful,
+            doubts=self.doubts,
         )
         return serialise(message, limits.MAX_TRAFFIC_SAMPLE_BYTES)
 
@@ -124,6 +149,10 @@ class TrafficSample:
             health=m.health,
             tiles=m.tiles,
             reports=m.reports,
+            scans_taken_back=m.scans_taken_back,
+            tiles_held_back=m.tiles_held_back,
+            tiles_doubtful=m.tiles_doubtful,
+            doubts=tuple(m.doubts),
         )
 
 

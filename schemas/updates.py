@@ -6,14 +6,15 @@ from typing import Final, Literal, cast
 import numpy as np
 
 from gnd_map.codec import CODEC_FLOAT32, codec_of, encode_gaussians
-from gnd_map.content import TileT
+from gnd_map.content import TileT, dated
+from gnd_map.day import UNKNOWN_DAY
 from gnd_map.errors import GndError
 from gnd_map.tile import Tile, TileDelta, apply
 from gnd_map.tile_id import TileId
 from schemas import limits
 from schemas.errors import BadValue, WrongHash
 from schemas.generated import tile_delta_pb2, tile_update_pb2
-from schemas.tiles import check_hash, tile_from_delta
+from schemas.tiles import check_day, check_hash, tile_from_delta
 from schemas.wire import (
     LAYER_PATTERN,
     MAJOR,
@@ -57,6 +58,8 @@ class TileUpdate:
     """Voxels or features that come or are replaced by `coded_delta`."""
     removed_voxels: int = 0
     """Voxels or features that go by `coded_delta`."""
+    day: int = UNKNOWN_DAY
+    """When the world looked as the new version says (`gnd_map.day`)."""
 
     def __post_init__(self) -> None:
         check_text("layer", self.layer, LAYER_PATTERN)
@@ -67,6 +70,7 @@ class TileUpdate:
         _check_removed(0 if self.delta is None else len(self.delta.removed))
         check_length(f"delta of tile {self.tile}", len(self.coded_delta), limits.MAX_TILE_BODY_BYTES, "bytes")
         self._check_coded()
+        check_day(self.day)
         if self.previous_version >= self.version:
             raise BadValue(f"update of tile {self.tile} to version {self.version} from {self.previous_version}")
 
@@ -107,6 +111,7 @@ class TileUpdate:
             coded_delta=self.coded_delta,
             put_voxels=self.put_voxels,
             removed_voxels=self.removed_voxels,
+            day=self.day,
         )
         message.reason = tile_update_pb2.TileUpdate.Reason.ValueType(number_of(self.reason, _REASON))
         return serialise(message, limits.MAX_TILE_UPDATE_BYTES)
@@ -131,6 +136,7 @@ class TileUpdate:
             coded_delta=message.coded_delta,
             put_voxels=message.put_voxels,
             removed_voxels=message.removed_voxels,
+            day=message.day,
         )
 
 
@@ -145,11 +151,11 @@ def updated(update: TileUpdate, held: TileT) -> TileT:
     if not update.has_delta:
         raise WrongHash(f"{name} has no delta; fetch the tile")
     if update.delta is None:
-        return tile_from_delta(update.tile, update.version, update.coded_delta, held, update.sha)
+        return dated(tile_from_delta(update.tile, update.version, update.coded_delta, held, update.sha), update.day)
     if not isinstance(held, Tile):
         raise WrongHash(f"{name} has a delta of Gaussians, held are features; fetch the tile")
     try:
-        tile = Tile(update.tile, update.version, apply(held.gaussians, update.delta))
+        tile = Tile(update.tile, update.version, apply(held.gaussians, update.delta), update.day)
     except GndError as error:
         raise WrongHash(f"{name} does not fit version {held.version}: {error}; fetch the tile") from error
     check_hash(name, tile, update.sha)

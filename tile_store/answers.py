@@ -13,6 +13,7 @@ from typing import Final, Literal
 from fleet_bus.errors import Refused
 from gnd_map.codec import CODECS, best_codec, codec_of, lattice_of
 from gnd_map.content import FEATURE_CODECS, AnyTile, codecs_of_layer, encode_content_delta, has_deltas
+from gnd_map.day import UNKNOWN_DAY
 from gnd_map.errors import CodecError, GndError
 from gnd_map.features import FeatureTile
 from gnd_map.tile import Tile
@@ -58,8 +59,9 @@ class Answers:
         held = self._by_sha(stored, wanted.cached_sha) if wanted.deltas else None
         sent = self._sent(stored, held, wanted.codecs)
         if sent.status == "delta":
-            return TileReply("delta", delta=CodedDelta(stored.tile, stored.version, stored.sha, sent.body))
-        return TileReply("blob", TileBlob(stored.tile, stored.version, stored.sha, sent.codec_id, sent.body))
+            return TileReply("delta", delta=CodedDelta(stored.tile, stored.version, stored.sha, sent.body, stored.day))
+        blob = TileBlob(stored.tile, stored.version, stored.sha, sent.codec_id, sent.body, stored.day)
+        return TileReply("blob", blob)
 
     def many(self, layer: str, district: District, request: TilesRequest) -> TilesReply:
         """The answers about tiles of a district, those around `request.near` first while bytes are left.
@@ -98,7 +100,8 @@ class Answers:
             return TileAnswer("absent")
         sent = self._sent(stored, self._by_sha(stored, held), codecs)
         codec_id = sent.codec_id if sent.status == "blob" else 0
-        return TileAnswer(sent.status, stored.version, stored.sha[:ANSWER_HASH_BYTES], codec_id, sent.body)
+        day = UNKNOWN_DAY if stored.codec_id in FEATURE_CODECS else stored.day
+        return TileAnswer(sent.status, stored.version, stored.sha[:ANSWER_HASH_BYTES], codec_id, sent.body, day)
 
     # What the client holds
 

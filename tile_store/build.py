@@ -148,7 +148,7 @@ def build_map(
         points=points,
         tiles=len(tiles),
         gaussians=sum(len(tile.gaussians) for tile in tiles),
-        versions_published=put_map(tiles, store, layer),
+        versions_published=put_map(tiles, store, layer, surveyed_ns(sources)),
     )
 
 
@@ -160,9 +160,15 @@ def map_lattice(layer: str, codec: str) -> Lattice | None:
     return lattice
 
 
-def put_map(tiles: Sequence[Tile], store: Store, layer: str) -> int:
+def put_map(tiles: Sequence[Tile], store: Store, layer: str, surveyed_ns: int) -> int:
     """Put tiles into the store as a new base, all or none; how many changed."""
-    return sum(result.status == "published" for result in store.put_tiles(tiles, layer=layer))
+    results = store.put_tiles(tiles, layer=layer, surveyed_ns=surveyed_ns)
+    return sum(result.status == "published" for result in results)
+
+
+def surveyed_ns(sources: Sequence[Source]) -> int:
+    """When the drives of a map ended: the oldest of them, as each tile may be of that one alone."""
+    return min(int(source.poses.t_ns[-1]) for source in sources)
 
 
 class MapPoints:

@@ -90,6 +90,8 @@ def _prepare(connection: apsw.Connection, path: Path, busy_timeout_s: float) -> 
         raise StoreUnavailable(f"{path}: read-only; a store must be writable")
     if not fetch(connection, "has_schema_of_confirmation"):
         _in_one(connection, lambda: connection.execute(SQL["schema_of_confirmation"]))
+    if not fetch(connection, "has_schema_of_surveys"):
+        _in_one(connection, lambda: connection.execute(SQL["schema_of_surveys"]))
 
 
 def _check_header(connection: apsw.Connection, path: Path) -> None:

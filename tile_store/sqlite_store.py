@@ -189,7 +189,11 @@ class SqliteStore:
         return self._writer.run(work)
 
     def put_tiles(
-        self, tiles: Iterable[AnyTile], reason: VersionKind = "base", layer: str = DEFAULT_LAYER
+        self,
+        tiles: Iterable[AnyTile],
+        reason: VersionKind = "base",
+        layer: str = DEFAULT_LAYER,
+        surveyed_ns: int | None = None,
     ) -> list[PublishResult]:
         """See `Store.put_tiles`."""
         check_layer(layer)
@@ -197,7 +201,7 @@ class SqliteStore:
 
         def work(c: apsw.Connection) -> list[PublishResult]:
             now = self._now_ns()
-            return [versions.put_base(c, layer, tile, content, reason, now) for tile, content in pairs]
+            return [versions.put_base(c, layer, tile, content, reason, now, surveyed_ns) for tile, content in pairs]
 
         return self._writer.run(work)
 

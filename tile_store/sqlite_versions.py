@@ -57,13 +57,22 @@ def publish(
 
 
 def put_base(
-    c: apsw.Connection, layer: str, tile: TileId, content: Content, kind: VersionKind, now: int
+    c: apsw.Connection,
+    layer: str,
+    tile: TileId,
+    content: Content,
+    kind: VersionKind,
+    now: int,
+    surveyed_ns: int | None = None,
 ) -> PublishResult:
     """Import a tile: a new epoch, unless the head is an epoch of the same content."""
     head = _head(c, layer, tile)
-    if head.version and head.version == head.epoch and head.sha == content.sha:
-        return PublishResult("unchanged", head.version)
-    return PublishResult("published", _append(c, layer, tile, content, _Origin(kind), now))
+    is_known = bool(head.version) and head.version == head.epoch and head.sha == content.sha
+    version = head.version if is_known else _append(c, layer, tile, content, _Origin(kind), now)
+    if surveyed_ns is not None:
+        row = {"layer": layer, "tile": tile.morton, "version": version, "surveyed_ns": surveyed_ns}
+        change(c, "put_survey", row)
+    return PublishResult("unchanged" if is_known else "published", version)
 
 
 def rollback(c: apsw.Connection, layer: str, tile: TileId, version: int, now: int) -> StoredTile:

@@ -1,6 +1,7 @@
 """`gnd map status`: what a map is waiting for."""
 
 import json
+from contextlib import suppress
 from dataclasses import asdict
 from datetime import UTC, datetime
 from math import degrees
@@ -11,17 +12,23 @@ import click
 from rich.console import Console
 from rich.table import Table
 
+from schemas.changes import ChangeReport
+from schemas.errors import SchemaError
 from tile_store.sqlite_store import SqliteStore
 from tile_store.store import Store
-from tile_store.values import VehicleAccount, WaitingReason
+from tile_store.values import VehicleAccount, WaitingChange, WaitingReason
 
 WORDS: Final[dict[WaitingReason, str]] = {
     "share": "more of the tile than one vehicle is believed",
+    "isolated": "single voxels, nothing beside them",
     "poses": "its poses were known poorly",
     "doubtful": "the vehicle doubts it itself",
     "shift": "a shift of its poses explains it",
     "named": "its reports are shifted again and again",
 }
+
+DOUBTED: Final = ("doubtful", "shift")
+"""Reasons behind which the vehicle may have some of its own."""
 
 
 @click.command(short_help="What the map waits for: confirmation, merging, people.")
@@ -39,13 +46,29 @@ def status(path: Path, as_json: bool) -> None:
 
 def status_of(store: Store) -> dict[str, Any]:
     """All that waits, in plain values: `waiting_for_confirmation`, `named_vehicles`, `to_merge`, `quarantined`."""
-    claims = [asdict(one) | {"tile": one.tile.path} for one in store.waiting_changes()]
+    claims = [
+        asdict(one) | {"tile": one.tile.path, "doubts": _doubts_of(store, one)} for one in store.waiting_changes()
+    ]
     return {
         "waiting_for_confirmation": waiting_totals(store) | {"claims": claims},
         "named_vehicles": named_vehicles(store),
         "to_merge": [asdict(one) | {"tile": one.tile.path} for one in store.dirty_tiles()],
         "quarantined": store.counts().quarantined,
     }
+
+
+def _doubts_of(store: Store, waiting: WaitingChange) -> list[str]:
+    """In words why the vehicle itself doubts what waits, of all its reports about the tile that count."""
+    if waiting.reason not in DOUBTED:
+        return []
+    _, rows = store.in_play(waiting.layer, waiting.tile)
+    words: dict[str, None] = {}
+    for row in rows:
+        if row.vehicle == waiting.vehicle:
+            with suppress(SchemaError):  # a damaged body is the merger's to tell
+                doubts = (change.doubt for change in ChangeReport.decode(row.body).tiles)
+                words |= dict.fromkeys(word for doubt in doubts if doubt is not None for word in doubt.words)
+    return list(words)
 
 
 def waiting_totals(store: Store) -> dict[str, int]:
@@ -115,7 +138,9 @@ def _waiting_table(waiting: dict[str, Any]) -> Table:
     table = Table("layer", "tile", "vehicle", "voxels", "of seen", "since (UTC)", "because", title=title)
     for one in waiting["claims"]:
         numbers = (str(one["voxels"]), str(one["seen"]), _time(one["since_ns"]))
-        table.add_row(one["layer"], one["tile"], one["vehicle"], *numbers, WORDS.get(one["reason"], one["reason"]))
+        why = WORDS.get(one["reason"], one["reason"])
+        doubts = f": {', '.join(word.replace('_', ' ') for word in one['doubts'])}" if one["doubts"] else ""
+        table.add_row(one["layer"], one["tile"], one["vehicle"], *numbers, why + doubts)
     return table
 
 

@@ -91,10 +91,15 @@ class Store(Protocol):
         """
 
     def put_tiles(
-        self, tiles: Iterable[AnyTile], reason: VersionKind = "base", layer: str = DEFAULT_LAYER
+        self,
+        tiles: Iterable[AnyTile],
+        reason: VersionKind = "base",
+        layer: str = DEFAULT_LAYER,
+        surveyed_ns: int | None = None,
     ) -> list[PublishResult]:
         """Import tiles, all or none; each starts a new epoch. The same content over an equal epoch is "unchanged".
-        Tiles hold what their layer holds: Gaussians where its name begins with ndt, else features.
+        Tiles hold what their layer holds: Gaussians where its name begins with ndt, else features. `surveyed_ns`: when
+        the world was measured; of content that is there already the newest survey counts.
         """
 
     def rollback(self, layer: str, tile: TileId, version: int) -> StoredTile:

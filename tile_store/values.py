@@ -6,6 +6,7 @@ from typing import Final, Literal
 
 from gnd_map.codec import LATTICES, Lattice
 from gnd_map.content import AnyTile, encode_content, fits_layer, noun_of
+from gnd_map.day import UNKNOWN_DAY, day_of
 from gnd_map.features import FeatureTile, is_feature_layer
 from gnd_map.tile import Tile
 from gnd_map.tile_id import TileId
@@ -18,7 +19,7 @@ from tile_store.errors import StoreError
 VersionKind = Literal["base", "merged", "rollback"]
 PutStatus = Literal["stored", "duplicate"]
 PublishStatus = Literal["published", "unchanged", "stale"]
-WaitingReason = Literal["share", "poses", "doubtful", "shift", "named"]
+WaitingReason = Literal["share", "isolated", "poses", "doubtful", "shift", "named"]
 
 SHA_BYTES: Final = 32
 DEFAULT_LAYER: Final = "ndt"
@@ -148,10 +149,21 @@ class StoredTile:
     sha: bytes
     codec_id: int
     body: bytes = field(repr=False)
+    surveyed_ns: int | None = None
+    """When the world was measured of which a base was built; None: not told, or no base."""
+
+    @property
+    def day(self) -> int:
+        """When the world looked so: of a merge the day of its publication, of a base that of its survey. What is
+        published again is as old as it was, which nobody has written down.
+        """
+        if self.kind == "merged":
+            return day_of(self.created_ns)
+        return UNKNOWN_DAY if self.surveyed_ns is None else day_of(self.surveyed_ns)
 
     def to_blob(self) -> TileBlob:
         """What goes out on the bus."""
-        return TileBlob(self.tile, self.version, self.sha, self.codec_id, self.body)
+        return TileBlob(self.tile, self.version, self.sha, self.codec_id, self.body, self.day)
 
     def decode(self) -> AnyTile:
         """The tile itself; WrongHash when the bytes are not what the hash says."""
@@ -236,8 +248,9 @@ class Unconfirmed:
         report_ids: of its reports that claim it, sorted.
         voxels: so many.
         seen: voxels of the tile that it observed and that hold something, before or by its word.
-        reason: "share": too large a share; "poses": of reports with poor poses only; "doubtful": the vehicle doubts it
-            itself; "shift": a shift of its poses explains it; "named": its reports are shifted again and again.
+        reason: "share": too large a share; "isolated": little, but nothing beside it has come or gone; "poses": of
+            reports with poor poses only; "doubtful": the vehicle doubts it itself; "shift": a shift of its poses
+            explains it; "named": its reports are shifted again and again.
     """
 
     vehicle: str

@@ -9,7 +9,7 @@ from collections.abc import Iterable
 from pathlib import Path
 from typing import Generic, cast
 
-from gnd_map.content import TileT, encode_content, kind_of_layer
+from gnd_map.content import TileT, day_of_tile, encode_content, kind_of_layer
 from gnd_map.errors import GndError
 from gnd_map.tile_id import TileId
 from schemas.tiles import TileBlob, as_kind, content_of
@@ -24,15 +24,22 @@ CREATE TABLE IF NOT EXISTS tile (
     sha      BLOB NOT NULL,
     codec_id INTEGER NOT NULL,
     body     BLOB NOT NULL,
+    day      INTEGER NOT NULL DEFAULT 0,
     PRIMARY KEY (layer, morton)
 ) STRICT, WITHOUT ROWID;
 """
 KEEP = """
-INSERT INTO tile VALUES (?1, ?2, ?3, ?4, ?5, ?6)
+INSERT INTO tile (layer, morton, version, sha, codec_id, body, day) VALUES (?1, ?2, ?3, ?4, ?5, ?6, ?7)
 ON CONFLICT (layer, morton) DO UPDATE
-SET version = excluded.version, sha = excluded.sha, codec_id = excluded.codec_id, body = excluded.body
-WHERE tile.sha = ?7 OR tile.version < excluded.version
+SET version = excluded.version, sha = excluded.sha, codec_id = excluded.codec_id, body = excluded.body,
+    day = excluded.day
+WHERE tile.sha = ?8 OR tile.version < excluded.version
 """
+
+
+HAS_DAYS = "SELECT 1 FROM pragma_table_info('tile') WHERE name = 'day'"
+ADD_DAYS = "ALTER TABLE tile ADD COLUMN day INTEGER NOT NULL DEFAULT 0"
+"""Caches of older releases have none; of what they hold the day stays unknown until it changes."""
 
 
 class TileCache(Generic[TileT]):
@@ -47,16 +54,18 @@ class TileCache(Generic[TileT]):
         self.kind = cast("type[TileT]", kind_of_layer(layer))
         self.refused = 0
         self._db = Database(path, SCHEMA, synchronous="NORMAL", error=CacheError)
+        if not self._db.run(HAS_DAYS):
+            self._db.run(ADD_DAYS)
 
     def get(self, tile_id: TileId) -> TileT | None:
         """The tile, or None when it is not here or no longer what its hash says (then it is dropped and counted)."""
-        sql = "SELECT version, sha, codec_id, body FROM tile WHERE layer = ? AND morton = ?"
+        sql = "SELECT version, sha, codec_id, body, day FROM tile WHERE layer = ? AND morton = ?"
         rows = self._db.run(sql, self._of(tile_id))
         if not rows:
             return None
-        version, sha, codec_id, body = rows[0]
+        version, sha, codec_id, body, day = rows[0]
         try:
-            return as_kind(content_of(TileBlob(tile_id, version, sha, codec_id, body)), self.kind)
+            return as_kind(content_of(TileBlob(tile_id, version, sha, codec_id, body, day)), self.kind)
         except GndError:
             self.drop(tile_id)
             self.refused += 1
@@ -80,12 +89,13 @@ class TileCache(Generic[TileT]):
             over: sha of the version that was here when it was asked for: that one is replaced whatever its number
                 (a store that was built anew counts from 1).
         """
-        row = (*self._of(blob.tile), blob.version, blob.sha, blob.codec_id, blob.body, over)
+        row = (*self._of(blob.tile), blob.version, blob.sha, blob.codec_id, blob.body, blob.day, over)
         return self._db.changes(KEEP, row) > 0
 
     def put(self, tile: TileT, over: bytes = b"") -> bool:
         """As `keep`, for a tile made here; its body is as small as the tile allows."""
-        return self.keep(TileBlob(tile.tile_id, tile.version, tile.sha, *encode_content(tile)), over)
+        blob = TileBlob(tile.tile_id, tile.version, tile.sha, *encode_content(tile), day_of_tile(tile))
+        return self.keep(blob, over)
 
     def drop(self, tile_id: TileId) -> None:
         """Forget a tile; not here: nothing happens."""

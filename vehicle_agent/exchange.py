@@ -131,7 +131,7 @@ class Exchange(Generic[TileT]):
 
     def _blob(self, tile_id: TileId, answer: TileAnswer, held: Head) -> Fetched[TileT]:
         tile = content_of_answer(tile_id, answer, self._cache.kind)
-        blob = TileBlob(tile_id, answer.version, tile.sha, answer.codec_id, answer.body)
+        blob = TileBlob(tile_id, answer.version, tile.sha, answer.codec_id, answer.body, answer.day)
         newest = self._newest(tile, lambda: self._cache.keep(blob, over=held[1]))
         return Fetched(tile_id, "blob", newest)
 

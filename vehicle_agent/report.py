@@ -12,6 +12,7 @@ import numpy as np
 from gnd_map.arrays import F64
 from gnd_map.classes import ChangeClass
 from gnd_map.codec import REPORT, snap
+from gnd_map.day import day_of
 from gnd_map.errors import GndError
 from gnd_map.tile import Tile
 from gnd_map.tile_id import District, TileId
@@ -20,6 +21,7 @@ from schemas.course import Course
 from schemas.keys import change_key
 from schemas.report_id import deterministic_report_id
 from vehicle_agent.config import ReportParameters
+from vehicle_agent.detect.beyond import beyond_map
 from vehicle_agent.detect.classify import Classification, classify, tile_change
 from vehicle_agent.detect.detector import ChangeDetector
 from vehicle_agent.detect.doubts import LEAST_WITHHELD, Account, TileDoubts, changed_share_of, doubt_of, withheld_change
@@ -215,6 +217,11 @@ class Reporter:
             "largest_turn_deg": round(worst.turn_deg, 4),
         }
 
+    @property
+    def _now_ns(self) -> int:
+        """Time of the newest scan that counts."""
+        return self._stretch.last_ns if self._stretch is not None else self._start_ns
+
     def _lengthen(self, t_ns: int) -> None:
         if self._stretch is None:
             self._stretch = _Stretch(t_ns, t_ns)
@@ -231,8 +238,10 @@ class Reporter:
                 continue
             for name, n in zip(ChangeClass.__members__, np.bincount(found.change_class, minlength=6), strict=True):
                 self.classes[name.lower()] += int(n)
+            self.counts["voxels_beyond_map"] += int(beyond_map(found).sum())
             if found.observed.any():
-                self._take(replace(self._said(found), doubt=doubt_of(found, account)), evidence.base, odometer_m)
+                doubt = doubt_of(found, account, day_of(self._now_ns))
+                self._take(replace(self._said(found), doubt=doubt), evidence.base, odometer_m)
 
     def _without_pose_error(self, found: Classification, account: Account) -> Classification:
         """The classes without what a shift of the whole tile explains, although each stretch of the drive passed."""

@@ -48,7 +48,7 @@ class Telemetry:
         said = self._said
         if said is None or time.monotonic() - self._said_s >= EVERY_S:
             return True
-        happened = (sample.health, sample.reports) != (said.health, said.reports)
+        happened = _told_at_once(sample) != _told_at_once(said)
         return happened or sample.odometer_m - said.odometer_m >= EVERY_M
 
     def _publish(self, sample: TrafficSample) -> None:
@@ -59,3 +59,8 @@ class Telemetry:
             self._stop.set()
         except BusError as error:
             _log.info("sample not published: %s", error)
+
+
+def _told_at_once(sample: TrafficSample) -> tuple[object, ...]:
+    """Scans that are taken back come in rows: they wait for the next sample."""
+    return sample.health, sample.reports, sample.tiles_held_back, sample.tiles_doubtful

@@ -13,6 +13,7 @@ from gnd_map.grid import GridFrame
 from gnd_map.tile import Tile
 from gnd_map.tile_id import TileId
 from schemas.course import Course
+from schemas.doubt import tiles_by_reason
 from schemas.drive import Detections, DriveHeader, DriveItem, GnssFix, MotionSample, ReferencePose, Scan
 from schemas.drive_mcap import read_drive, read_header
 from schemas.errors import SchemaError
@@ -43,6 +44,7 @@ if TYPE_CHECKING:
 COUNTS = (
     "scans_used", "scans_uncertain", "scans_disagreeing", "scans_shifted", "scans_taken_back", "points",
     "moving_points", "rays", "changed_voxels", "tiles_doubtful", "tiles_held_back", "changes_held_back",
+    "voxels_beyond_map",
 )  # fmt: skip
 """What the reporter counts, as `result.json` names it."""
 
@@ -113,8 +115,8 @@ class Vehicle:
         if self.features is not None and isinstance(item, Detections):
             self.features.wait(item)
 
-    def localise(self, item: DriveItem) -> list[RefinedScan]:
-        """Feed the localiser; gives the scans whose poses have become final."""
+    def localise(self, item: DriveItem) -> Iterator[RefinedScan]:
+        """Feed the localiser; gives the scans whose poses have become final, to be used up before the next item."""
         if isinstance(item, MotionSample):
             self.localiser.push_motion(item)
         elif isinstance(item, GnssFix):
@@ -122,8 +124,8 @@ class Vehicle:
         elif isinstance(item, Scan):
             self.scans += 1
             self.memory.count_scan()
-            return self.localiser.push_scan(item)
-        return []
+            return self.localiser.take_scan(item)
+        return iter(())
 
     def segment(self, scan: RefinedScan) -> list[SegmentedScan]:
         """Compare the scan with those before and after it; gives the scans whose movers are known now."""
@@ -177,6 +179,10 @@ class Vehicle:
             health=self.place.health,
             tiles=self.link.fetcher.counts["blob"],
             reports=self.link.outbox.counts().acknowledged,
+            scans_taken_back=self.reporter.counts["scans_shifted"] + self.reporter.counts["scans_taken_back"],
+            tiles_held_back=self.reporter.counts["tiles_held_back"],
+            tiles_doubtful=self.reporter.counts["tiles_doubtful"],
+            doubts=tiles_by_reason(self.reporter.doubts),
         )
 
     def result(self) -> dict[str, Any]:

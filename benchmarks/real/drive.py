@@ -45,6 +45,18 @@ class Found:
     mean_m: NDArray[np.float64]
     scans_used: int
 
+    def within(self, keys: NDArray[np.int64]) -> "Found":
+        """What is said of these voxels only."""
+        kept = np.isin(self.keys, keys)
+        return Found(
+            keys=self.keys[kept],
+            g=self.g[kept],
+            change_class=self.change_class[kept],
+            in_map=self.in_map[kept],
+            mean_m=self.mean_m[kept],
+            scans_used=self.scans_used,
+        )
+
     def where(self, *classes: int) -> NDArray[np.bool_]:
         """(K,) bool."""
         return np.isin(self.change_class, classes)

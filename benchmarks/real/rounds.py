@@ -37,6 +37,8 @@ class Untouched:
 
     found: Found
     tiles: Tiles
+    seen: I64
+    """Keys of the voxels that a ray of the map's half crossed or ended in: of the others the map cannot know."""
     mapped: Cells
     driven: Cells
     moving: Cells
@@ -103,8 +105,9 @@ def _untouched(scene: Scene, mapping: list[Scan], driving: list[Scan], method: M
     notes = _Notes(scene)
     scans = segmented(refined_scans(scene, local_map, driving, method.poses), method.segment)
     found = detect(scene, local_map, notes.noted(scans), method.detect)
+    seen = detect(scene, local_map, segmented(map(scene.refined, mapping), method.segment), method.detect).keys
     driven, moving = Cells.of(notes.driven), Cells.of(notes.moving)
-    return Untouched(found, tiles, Cells.of(points), driven, moving, *notes.sample())
+    return Untouched(found, tiles, seen, Cells.of(points), driven, moving, *notes.sample())
 
 
 class _Notes:

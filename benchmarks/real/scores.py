@@ -21,6 +21,7 @@ def summary_of(rounds: Sequence[Round]) -> dict[str, Any]:
     """Everything as plain numbers, pooled over the rounds."""
     return {
         "untouched": untouched_scores([r.untouched.found for r in rounds]) | {"causes": _causes(rounds)},
+        "untouched_seen": untouched_scores([r.untouched.found.within(r.untouched.seen) for r in rounds]),
         "inserted": inserted_scores(rounds),
         "scans_driven": sum(r.untouched.found.scans_used for r in rounds),
         "map_gaussians": sum(len(g) for r in rounds for g in r.untouched.tiles.values()),

@@ -20,6 +20,11 @@ def print_tables(found: dict[str, Any], console: Console | None = None) -> None:
     for sentence in found["left_out"]:
         console.print(f"  {sentence}")
     console.print(_false_changes(untouched))
+    seen = found["untouched_seen"]
+    console.print(
+        f"  Where the map's half had looked: {sum(seen['false'].values()):,} of {seen['observed']:,} observed,"
+        f" {_number(seen['false_per_1000'])} of 1,000\n"
+    )
     console.print(_causes(untouched["causes"]))
     console.print(_inserted(inserted))
 

@@ -26,6 +26,7 @@ class CodedDelta(_message.Message):
     VERSION_FIELD_NUMBER: _builtins.int
     SHA_FIELD_NUMBER: _builtins.int
     BODY_FIELD_NUMBER: _builtins.int
+    DAY_FIELD_NUMBER: _builtins.int
     tile: _builtins.int
     """Morton code of the tile: longitude index on the even bits, latitude index on the odd bits. [0 .. 2^39)"""
     version: _builtins.int
@@ -36,6 +37,10 @@ class CodedDelta(_message.Message):
     """The changes against the content that the client said it holds: of Gaussians coded by gnd_map.codec.encode_delta, of
     a feature layer by gnd_map.features.encode_feature_delta.
     """
+    day: _builtins.int
+    """Day on which the world looked so: of the survey, or of the merge that made the version.
+    [days, 1 = 2000-01-01 UTC; 0 = not known]
+    """
     def __init__(
         self,
         *,
@@ -43,10 +48,11 @@ class CodedDelta(_message.Message):
         version: _builtins.int = ...,
         sha: _builtins.bytes = ...,
         body: _builtins.bytes = ...,
+        day: _builtins.int = ...,
     ) -> None: ...
     _HasFieldArgType: _TypeAlias = _Never  # noqa: Y015
     def HasField(self, field_name: _HasFieldArgType) -> _builtins.bool: ...
-    _ClearFieldArgType: _TypeAlias = _typing.Literal["body", b"body", "sha", b"sha", "tile", b"tile", "version", b"version"]  # noqa: Y015
+    _ClearFieldArgType: _TypeAlias = _typing.Literal["body", b"body", "day", b"day", "sha", b"sha", "tile", b"tile", "version", b"version"]  # noqa: Y015
     def ClearField(self, field_name: _ClearFieldArgType) -> None: ...
     def WhichOneof(self, oneof_group: _Never) -> None: ...
 

@@ -24,7 +24,7 @@ _sym_db = _symbol_database.Default()
 
 
 
-DESCRIPTOR = _descriptor_pool.Default().AddSerializedFile(b'\n\x16gnd/v1/tile_blob.proto\x12\x06gnd.v1\"V\n\x08TileBlob\x12\x0c\n\x04tile\x18\x01 \x01(\x04\x12\x0f\n\x07version\x18\x02 \x01(\r\x12\x0b\n\x03sha\x18\x03 \x01(\x0c\x12\x10\n\x08\x63odec_id\x18\x04 \x01(\r\x12\x0c\n\x04\x62ody\x18\x05 \x01(\x0c\x62\x06proto3')
+DESCRIPTOR = _descriptor_pool.Default().AddSerializedFile(b'\n\x16gnd/v1/tile_blob.proto\x12\x06gnd.v1\"c\n\x08TileBlob\x12\x0c\n\x04tile\x18\x01 \x01(\x04\x12\x0f\n\x07version\x18\x02 \x01(\r\x12\x0b\n\x03sha\x18\x03 \x01(\x0c\x12\x10\n\x08\x63odec_id\x18\x04 \x01(\r\x12\x0c\n\x04\x62ody\x18\x05 \x01(\x0c\x12\x0b\n\x03\x64\x61y\x18\x06 \x01(\rb\x06proto3')
 
 _globals = globals()
 _builder.BuildMessageAndEnumDescriptors(DESCRIPTOR, _globals)
@@ -32,5 +32,5 @@ _builder.BuildTopDescriptorsAndMessages(DESCRIPTOR, 'schemas.generated.tile_blob
 if not _descriptor._USE_C_DESCRIPTORS:
   DESCRIPTOR._loaded_options = None
   _globals['_TILEBLOB']._serialized_start=34
-  _globals['_TILEBLOB']._serialized_end=120
+  _globals['_TILEBLOB']._serialized_end=133
 # @@protoc_insertion_point(module_scope)

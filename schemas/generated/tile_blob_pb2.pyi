@@ -27,6 +27,7 @@ class TileBlob(_message.Message):
     SHA_FIELD_NUMBER: _builtins.int
     CODEC_ID_FIELD_NUMBER: _builtins.int
     BODY_FIELD_NUMBER: _builtins.int
+    DAY_FIELD_NUMBER: _builtins.int
     tile: _builtins.int
     """Morton code of the tile: longitude index on the even bits, latitude index on the odd bits. [0 .. 2^39)"""
     version: _builtins.int
@@ -41,6 +42,10 @@ class TileBlob(_message.Message):
     """The Gaussians of the tile, ascending voxel id, means relative to the voxel's centre; or its features, ascending id.
     Metres in the ENU frame at the tile's centre.
     """
+    day: _builtins.int
+    """Day on which the world looked so: of the survey, or of the merge that made the version.
+    [days, 1 = 2000-01-01 UTC; 0 = not known]
+    """
     def __init__(
         self,
         *,
@@ -49,10 +54,11 @@ class TileBlob(_message.Message):
         sha: _builtins.bytes = ...,
         codec_id: _builtins.int = ...,
         body: _builtins.bytes = ...,
+        day: _builtins.int = ...,
     ) -> None: ...
     _HasFieldArgType: _TypeAlias = _Never  # noqa: Y015
     def HasField(self, field_name: _HasFieldArgType) -> _builtins.bool: ...
-    _ClearFieldArgType: _TypeAlias = _typing.Literal["body", b"body", "codec_id", b"codec_id", "sha", b"sha", "tile", b"tile", "version", b"version"]  # noqa: Y015
+    _ClearFieldArgType: _TypeAlias = _typing.Literal["body", b"body", "codec_id", b"codec_id", "day", b"day", "sha", b"sha", "tile", b"tile", "version", b"version"]  # noqa: Y015
     def ClearField(self, field_name: _ClearFieldArgType) -> None: ...
     def WhichOneof(self, oneof_group: _Never) -> None: ...
 

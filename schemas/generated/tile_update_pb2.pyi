@@ -59,6 +59,7 @@ class TileUpdate(_message.Message):
     CODED_DELTA_FIELD_NUMBER: _builtins.int
     PUT_VOXELS_FIELD_NUMBER: _builtins.int
     REMOVED_VOXELS_FIELD_NUMBER: _builtins.int
+    DAY_FIELD_NUMBER: _builtins.int
     major: _builtins.int
     """Major version of this message; always 1."""
     tile: _builtins.int
@@ -82,6 +83,10 @@ class TileUpdate(_message.Message):
     """Voxels that `coded_delta` gives a Gaussian or another one; features that come or change. [voxels or features]"""
     removed_voxels: _builtins.int
     """Voxels that lose theirs by `coded_delta`; features that go. [voxels or features]"""
+    day: _builtins.int
+    """Day on which the world looked so: of the survey, or of the merge that made the version.
+    [days, 1 = 2000-01-01 UTC; 0 = not known]
+    """
     @_builtins.property
     def delta(self) -> _tile_delta_pb2.TileDelta:
         """What turns the previous content into the new one, in plain columns; missing = see `coded_delta`."""
@@ -101,10 +106,11 @@ class TileUpdate(_message.Message):
         coded_delta: _builtins.bytes = ...,
         put_voxels: _builtins.int = ...,
         removed_voxels: _builtins.int = ...,
+        day: _builtins.int = ...,
     ) -> None: ...
     _HasFieldArgType: _TypeAlias = _typing.Literal["delta", b"delta"]  # noqa: Y015
     def HasField(self, field_name: _HasFieldArgType) -> _builtins.bool: ...
-    _ClearFieldArgType: _TypeAlias = _typing.Literal["coded_delta", b"coded_delta", "delta", b"delta", "layer", b"layer", "major", b"major", "previous_sha", b"previous_sha", "previous_version", b"previous_version", "put_voxels", b"put_voxels", "reason", b"reason", "removed_voxels", b"removed_voxels", "sha", b"sha", "tile", b"tile", "version", b"version"]  # noqa: Y015
+    _ClearFieldArgType: _TypeAlias = _typing.Literal["coded_delta", b"coded_delta", "day", b"day", "delta", b"delta", "layer", b"layer", "major", b"major", "previous_sha", b"previous_sha", "previous_version", b"previous_version", "put_voxels", b"put_voxels", "reason", b"reason", "removed_voxels", b"removed_voxels", "sha", b"sha", "tile", b"tile", "version", b"version"]  # noqa: Y015
     def ClearField(self, field_name: _ClearFieldArgType) -> None: ...
     def WhichOneof(self, oneof_group: _Never) -> None: ...
 

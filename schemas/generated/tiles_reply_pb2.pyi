@@ -68,6 +68,7 @@ class TilesReply(_message.Message):
     HASHES_FIELD_NUMBER: _builtins.int
     CODECS_FIELD_NUMBER: _builtins.int
     BODIES_FIELD_NUMBER: _builtins.int
+    DAYS_FIELD_NUMBER: _builtins.int
     major: _builtins.int
     """Major version of this message; always 1."""
     hashes: _builtins.bytes
@@ -90,6 +91,12 @@ class TilesReply(_message.Message):
         gnd_map.codec.encode_delta, of a feature layer gnd_map.features.encode_feature_delta), in order.
         """
 
+    @_builtins.property
+    def days(self) -> _containers.RepeatedScalarFieldContainer[_builtins.int]:
+        """Day of each blob and delta, in order; a single one is that of all, none = not known. The day on which the world
+        looked so: of the survey, or of the merge that made the version. [days, 1 = 2000-01-01 UTC; 0 = not known]
+        """
+
     def __init__(
         self,
         *,
@@ -99,10 +106,11 @@ class TilesReply(_message.Message):
         hashes: _builtins.bytes = ...,
         codecs: _abc.Iterable[_builtins.int] | None = ...,
         bodies: _abc.Iterable[_builtins.bytes] | None = ...,
+        days: _abc.Iterable[_builtins.int] | None = ...,
     ) -> None: ...
     _HasFieldArgType: _TypeAlias = _Never  # noqa: Y015
     def HasField(self, field_name: _HasFieldArgType) -> _builtins.bool: ...
-    _ClearFieldArgType: _TypeAlias = _typing.Literal["bodies", b"bodies", "codecs", b"codecs", "hashes", b"hashes", "major", b"major", "runs", b"runs", "versions", b"versions"]  # noqa: Y015
+    _ClearFieldArgType: _TypeAlias = _typing.Literal["bodies", b"bodies", "codecs", b"codecs", "days", b"days", "hashes", b"hashes", "major", b"major", "runs", b"runs", "versions", b"versions"]  # noqa: Y015
     def ClearField(self, field_name: _ClearFieldArgType) -> None: ...
     def WhichOneof(self, oneof_group: _Never) -> None: ...
 

@@ -37,6 +37,10 @@ class TrafficSample(_message.Message):
     HEALTH_FIELD_NUMBER: _builtins.int
     TILES_FIELD_NUMBER: _builtins.int
     REPORTS_FIELD_NUMBER: _builtins.int
+    SCANS_TAKEN_BACK_FIELD_NUMBER: _builtins.int
+    TILES_HELD_BACK_FIELD_NUMBER: _builtins.int
+    TILES_DOUBTFUL_FIELD_NUMBER: _builtins.int
+    DOUBTS_FIELD_NUMBER: _builtins.int
     major: _builtins.int
     """Major version of this message; always 1."""
     vehicle: _builtins.str
@@ -59,9 +63,19 @@ class TrafficSample(_message.Message):
     """Tiles downloaded so far."""
     reports: _builtins.int
     """Reports acknowledged so far."""
+    scans_taken_back: _builtins.int
+    """Scans of which nothing was concluded because their poses turned out to be wrong."""
+    tiles_held_back: _builtins.int
+    """Tiles of which nothing was told because an error of the poses explains what seemed to have changed."""
+    tiles_doubtful: _builtins.int
+    """Tiles reported with a doubt, those held back included."""
     @_builtins.property
     def lines(self) -> _containers.RepeatedCompositeFieldContainer[_traffic_line_pb2.TrafficLine]:
         """One line a kind and direction; no pair twice."""
+
+    @_builtins.property
+    def doubts(self) -> _containers.RepeatedScalarFieldContainer[_builtins.int]:
+        """The same by reason, in the order of the bits of `Doubt.reasons`; missing ones at the end = 0. [tiles]"""
 
     def __init__(
         self,
@@ -78,10 +92,14 @@ class TrafficSample(_message.Message):
         health: _builtins.str = ...,
         tiles: _builtins.int = ...,
         reports: _builtins.int = ...,
+        scans_taken_back: _builtins.int = ...,
+        tiles_held_back: _builtins.int = ...,
+        tiles_doubtful: _builtins.int = ...,
+        doubts: _abc.Iterable[_builtins.int] | None = ...,
     ) -> None: ...
     _HasFieldArgType: _TypeAlias = _Never  # noqa: Y015
     def HasField(self, field_name: _HasFieldArgType) -> _builtins.bool: ...
-    _ClearFieldArgType: _TypeAlias = _typing.Literal["health", b"health", "lat_rad", b"lat_rad", "lines", b"lines", "lon_rad", b"lon_rad", "major", b"major", "odometer_m", b"odometer_m", "reports", b"reports", "t_ns", b"t_ns", "tiles", b"tiles", "vehicle", b"vehicle", "wire_down_bytes", b"wire_down_bytes", "wire_up_bytes", b"wire_up_bytes"]  # noqa: Y015
+    _ClearFieldArgType: _TypeAlias = _typing.Literal["doubts", b"doubts", "health", b"health", "lat_rad", b"lat_rad", "lines", b"lines", "lon_rad", b"lon_rad", "major", b"major", "odometer_m", b"odometer_m", "reports", b"reports", "scans_taken_back", b"scans_taken_back", "t_ns", b"t_ns", "tiles", b"tiles", "tiles_doubtful", b"tiles_doubtful", "tiles_held_back", b"tiles_held_back", "vehicle", b"vehicle", "wire_down_bytes", b"wire_down_bytes", "wire_up_bytes", b"wire_up_bytes"]  # noqa: Y015
     def ClearField(self, field_name: _ClearFieldArgType) -> None: ...
     def WhichOneof(self, oneof_group: _Never) -> None: ...
 

@@ -24,7 +24,13 @@ from schemas.updates import TileUpdate
 from tile_store.sqlite_store import SqliteStore
 
 DEADLINE_S = 30.0
-FAST = "poll_s = 0.05\nbus_lease_ms = 1500\n[store]\nmerge_delay_s = 0.1\n"
+FAST = """poll_s = 0.05
+bus_lease_ms = 1500
+[store]
+merge_delay_s = 0.1
+[confirmation]
+together_voxels = 1  # the tests' tiles are a few voxels
+"""
 
 
 def wait_for(what: str, condition: Callable[[], object], deadline_s: float = DEADLINE_S) -> None:

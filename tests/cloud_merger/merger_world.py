@@ -4,6 +4,7 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 
+from cloud_merger.confirmation import ConfirmationParameters
 from gnd_map.classes import ChangeClass
 from gnd_map.gaussian import Gaussians
 from gnd_map.tile import Tile, content_sha
@@ -13,6 +14,9 @@ from schemas.report_id import deterministic_report_id
 
 TILE = TileId(497353963154)  # Figure 2 of the paper
 NEIGHBOUR = TileId(497353963155)
+
+VOXEL_BY_VOXEL = ConfirmationParameters(together_voxels=1)
+"""These tiles are a few voxels: one is no less than what comes or goes in a street."""
 
 # A state of a voxel: mean (3) and standard deviations along x, y, z (3), in metres.
 State = tuple[float, float, float, float, float, float]

@@ -16,6 +16,7 @@ from cloud_merger.statements import Report, statements_of
 from cloud_merger.stored import report_of as stored_report
 from cloud_merger.work import Worker
 from gnd_map.gaussian import Gaussians
+from gnd_map.grid import VoxelGrid
 from gnd_map.tile import Tile
 from schemas.changes import split
 from schemas.doubt import Doubt, DoubtReason
@@ -25,7 +26,7 @@ from tile_store.values import ReportRow, StoreConfig
 VOXELS = range(300)
 EPOCH = gaussians_of(dict.fromkeys(VOXELS, GROUND))
 THIRD = dict.fromkeys(range(0, 300, 3), WALL)
-FEW = dict.fromkeys(range(8), POLE)
+FEW = dict.fromkeys(range(300, 308), POLE)  # new, side by side
 HOUR_NS = 3_600_000_000_000
 
 
@@ -83,12 +84,46 @@ def test_a_named_vehicle_never_confirms_itself_and_its_lonely_claims_wait_all():
     few = gated([said(1, FEW, "car")], named=frozenset({"car"}))
     assert [one.reason for one in few.waiting] == ["named"]
     assert published([said(1, FEW, "car"), said(2, FEW)], named=frozenset({"car"})) == sorted(FEW)
+    assert published([said(1, FEW, "car"), said(2, FEW, "other")], named=frozenset({"car", "other"})) == []
 
 
 def test_few_well_supported_claims_are_published_at_once():
     assert published([said(1, FEW)]) == sorted(FEW)
     assert published([said(1, FEW)], few_voxels=7, few_share=0.0) == []
     assert published([said(1, FEW)], few_voxels=0, few_share=0.03) == sorted(FEW)
+
+
+def waiting_for(changed, epoch=EPOCH):
+    """Voxels that wait, by reason, of what one vehicle claims."""
+    return {one.reason: one.voxels for one in gated([said(1, changed)], epoch=epoch).waiting}
+
+
+@pytest.mark.parametrize(
+    ("changed", "waits"),
+    [
+        ({400: POLE}, {"isolated": 1}),
+        ({400: POLE, 401: POLE}, {"isolated": 2}),
+        ({400: POLE, 401: POLE, 402: POLE}, {}),
+        ({400: POLE, 410: POLE, 420: POLE}, {"isolated": 3}),  # far from each other
+        (dict.fromkeys(range(8), WALL), {"isolated": 8}),  # of another shape, no more
+        ({0: WALL, 1: None, 2: None, 3: None, 9: None}, {"isolated": 1}),  # a shape goes with what has gone beside it
+    ],
+)
+def test_what_a_lonely_vehicle_claims_of_single_voxels_waits(changed, waits):
+    assert waiting_for(changed) == waits
+    assert published([said(1, changed), said(2, changed)]) == sorted(changed), "a second vehicle confirms it"
+
+
+def test_a_voxel_that_is_as_in_an_older_version_is_a_claim_that_was_seen():
+    older = gaussians_of({400: POLE})
+    report = Report("1" * 26, change_of(older, [400], {}), vehicle="car")
+    merged = merge_tile(EPOCH, statements_of(EPOCH, [report], {sha_of(older): older}))
+    (waiting,) = gate(EPOCH, merged, [report]).waiting
+    assert (waiting.voxels, waiting.seen, waiting.reason) == (1, 1, "isolated")
+
+
+def test_on_new_ground_single_voxels_do_not_wait():
+    assert published([said(1, {400: POLE}, base=None)], epoch=Gaussians.empty()) == [400]
 
 
 def test_few_claims_from_poor_poses_wait():
@@ -135,13 +170,14 @@ def test_new_ground_is_mapped_by_one_vehicle_unless_it_doubts_itself():
 )
 def test_on_new_ground_only_doubts_about_the_poses_count(reasons, on_the_map, on_new_ground):
     for base, expected in ((EPOCH, on_the_map), (None, on_new_ground)):
-        change = replace(change_of(base, list(VOXELS), FEW), doubt=Doubt(reasons))
+        change = replace(change_of(base, [*VOXELS, *FEW], FEW), doubt=Doubt(reasons))
         body = report_of(1, change).encode()
         assert stored_report(body, MergeParameters()).is_doubtful == expected
 
 
 @pytest.mark.parametrize(
-    "bad", [{"few_voxels": -1}, {"few_share": 1.5}, {"vouched_share": -0.1}, {"second_drive_s": 0.0}]
+    "bad",
+    [{"few_voxels": -1}, {"together_voxels": 0}, {"few_share": 1.5}, {"vouched_share": -0.1}, {"second_drive_s": 0.0}],
 )
 def test_parameters_out_of_range_are_refused(bad):
     with pytest.raises(MergerError, match=next(iter(bad))):
@@ -156,15 +192,32 @@ def plain_waits(epoch, merged, reports, few):
     for vehicle in {report.vehicle for report in reports}:
         alone = {voxel for voxel, who in witnesses.items() if who == {vehicle}}
         together = {voxel for voxel, who in witnesses.items() if vehicle in who} - alone
-        if len(alone) > few and len(together) < max(12, 0.5 * (len(together) + len(alone))):
-            waits |= alone
+        if len(together) < max(12, 0.5 * (len(together) + len(alone))):
+            waits |= alone if len(alone) > few else alone & plain_isolated(epoch, merged)
     return waits
+
+
+def plain_isolated(epoch, merged):
+    """Voxels in whose group of neighbours fewer than three appear or vanish, found by walking from each of them."""
+    grid, there = VoxelGrid.of(TILE), set(merged.gaussians.voxel_id.tolist())
+    at = {voxel: np.array([int(axis[0]) for axis in grid.unravel(np.int32([voxel]))]) for voxel in merged.provenance}
+    isolated = set()
+    for voxel in at:
+        group = {voxel}
+        while more := {a for a in at for b in group if np.abs(at[a] - at[b]).max() <= 1} - group:
+            group |= more
+        if sum((one in there) != (one in set(epoch.voxel_id.tolist())) for one in group) < 3:
+            isolated.add(voxel)
+    return isolated
 
 
 @settings(max_examples=60, deadline=None)
 @given(
     claims=st.lists(
-        st.tuples(st.sampled_from("abc"), st.dictionaries(st.integers(0, 39), st.sampled_from([WALL, POLE, None]))),
+        st.tuples(
+            st.sampled_from("abc"),
+            st.dictionaries(st.integers(0, 39), st.sampled_from([WALL, POLE, None]), max_size=12),
+        ),
         max_size=6,
     ),
     random=st.randoms(use_true_random=False),
@@ -203,7 +256,7 @@ def merge_all(store):
 
 
 def whole(number, changed, vehicle=""):
-    return report_of(number, change_of(EPOCH, list(VOXELS), changed), vehicle=vehicle)
+    return report_of(number, change_of(EPOCH, sorted({*VOXELS, *changed}), changed), vehicle=vehicle)
 
 
 @pytest.fixture

@@ -5,7 +5,7 @@ from itertools import permutations
 
 import numpy as np
 import pytest
-from merger_world import BALL, POLE, TILE, WALL, WALL_AGAIN, change_of, gaussians_of, report_of
+from merger_world import BALL, POLE, TILE, VOXEL_BY_VOXEL, WALL, WALL_AGAIN, change_of, gaussians_of, report_of
 
 from cloud_merger.config import ShardConfig
 from cloud_merger.work import Worker
@@ -39,7 +39,7 @@ def put(store, base, number, changed, tile=TILE):
 
 
 def merge_once(store, **config):
-    worker = Worker(store, ShardConfig(store_path=store.path, retry_s=0.0, **config))
+    worker = Worker(store, ShardConfig(store_path=store.path, retry_s=0.0, confirmation=VOXEL_BY_VOXEL, **config))
     return store.publish(worker.merge(store.claim("one", 16, 30.0)))
 
 

@@ -5,7 +5,19 @@ from dataclasses import replace
 
 import pytest
 from merger_processes import Cloud, wait_for
-from merger_world import BALL, GROUND, NEIGHBOUR, POLE, TILE, WALL, change_of, gaussians_of, report_of, tile_of_states
+from merger_world import (
+    BALL,
+    GROUND,
+    NEIGHBOUR,
+    POLE,
+    TILE,
+    VOXEL_BY_VOXEL,
+    WALL,
+    change_of,
+    gaussians_of,
+    report_of,
+    tile_of_states,
+)
 
 from cloud_merger.announce import encoded, update_of
 from cloud_merger.config import ShardConfig
@@ -46,7 +58,11 @@ def shard(cloud):
     """A shard in a thread of this process."""
     stop = threading.Event()
     config = ShardConfig(
-        store_path=cloud.path, connect=(cloud.endpoint,), poll_s=0.02, store=StoreConfig(merge_delay_s=0.0)
+        store_path=cloud.path,
+        connect=(cloud.endpoint,),
+        poll_s=0.02,
+        store=StoreConfig(merge_delay_s=0.0),
+        confirmation=VOXEL_BY_VOXEL,
     )
     thread = threading.Thread(target=run_shard, args=(config, stop))
 
@@ -70,7 +86,8 @@ def publish_without_notice(cloud, number, changed):
 
 
 def publish(cloud, claims):
-    (result,) = cloud.store.publish(Worker(cloud.store, ShardConfig(store_path=cloud.path)).merge(claims))
+    config = ShardConfig(store_path=cloud.path, confirmation=VOXEL_BY_VOXEL)
+    (result,) = cloud.store.publish(Worker(cloud.store, config).merge(claims))
     assert result.status == "published"
     return True
 

@@ -4,7 +4,18 @@ import logging
 
 import apsw
 import pytest
-from merger_world import GROUND, NEIGHBOUR, POLE, TILE, WALL, change_of, gaussians_of, report_of, tile_of_states
+from merger_world import (
+    GROUND,
+    NEIGHBOUR,
+    POLE,
+    TILE,
+    VOXEL_BY_VOXEL,
+    WALL,
+    change_of,
+    gaussians_of,
+    report_of,
+    tile_of_states,
+)
 
 from cloud_merger.config import ShardConfig
 from cloud_merger.ingest import Ingest, IngestLimits
@@ -28,7 +39,9 @@ def store(tmp_path):
 
 @pytest.fixture
 def worker(store, tmp_path):
-    return Worker(store, ShardConfig(store_path=tmp_path / "map.sqlite", retry_s=0.0, max_attempts=3))
+    return Worker(
+        store, ShardConfig(store_path=tmp_path / "map.sqlite", retry_s=0.0, max_attempts=3, confirmation=VOXEL_BY_VOXEL)
+    )
 
 
 def put(store, number, tile=TILE, changed=None, base=BASE, version=1):

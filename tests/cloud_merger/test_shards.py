@@ -5,7 +5,19 @@ import signal
 
 import pytest
 from merger_processes import Cloud, all_acks, in_threads, raw_session, wait_for
-from merger_world import BALL, GROUND, NEIGHBOUR, POLE, TILE, WALL, change_of, gaussians_of, report_of, tile_of_states
+from merger_world import (
+    BALL,
+    GROUND,
+    NEIGHBOUR,
+    POLE,
+    TILE,
+    VOXEL_BY_VOXEL,
+    WALL,
+    change_of,
+    gaussians_of,
+    report_of,
+    tile_of_states,
+)
 
 from cloud_merger.config import ShardConfig
 from cloud_merger.ownership import owner_of
@@ -44,7 +56,7 @@ def fault_free(path, reports):
     """Head hashes when one worker merges the reports one by one, in order."""
     with SqliteStore(path, StoreConfig(merge_delay_s=0.0)) as store:
         store.put_tiles([tile_of_states(STATES, tile) for tile in TILES])
-        worker = Worker(store, ShardConfig(store_path=path))
+        worker = Worker(store, ShardConfig(store_path=path, confirmation=VOXEL_BY_VOXEL))
         for report in reports:
             bodies = split(report)
             store.put_reports(

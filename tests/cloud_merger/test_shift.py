@@ -33,6 +33,22 @@ def test_the_shift_of_wrong_poses_is_found(east_m, north_m, turn_deg):
     assert abs(found.turn_rad + turn_rad) < np.radians(0.25)
 
 
+@pytest.mark.parametrize("up_m", [0.2, -0.3, 0.5])
+def test_a_lidar_that_hangs_elsewhere_raises_all_roads(up_m):
+    found = shift_of(seen_as(BASE, street(1) + np.array([0.0, 0.0, up_m])), BASE)
+    assert found.is_explained
+    assert found.up_m == pytest.approx(-up_m, abs=0.06)
+    assert (found.east_m, found.north_m, found.length_m) == (0.0, 0.0, abs(found.up_m))
+
+
+def test_a_road_of_which_half_was_raised_is_no_shift():
+    points = street(3)
+    points[(points[:, 2] < 0.35) & (points[:, 0] < -1.0), 2] += 0.3
+    change = seen_as(BASE, points)
+    assert len(change.changed) > 30
+    assert not shift_of(change, BASE).is_explained
+
+
 def test_an_unchanged_street_says_nothing():
     found = shift_of(seen_as(BASE, street(2)), BASE)
     assert not found.is_explained

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 from merger_processes import DEADLINE_S, Cloud, in_threads, wait_for
-from merger_world import BALL, POLE, TILE, WALL_AGAIN, report_of
+from merger_world import BALL, POLE, TILE, VOXEL_BY_VOXEL, WALL_AGAIN, report_of
 from short_world import bases_of, flagged, packed_of, tile_at
 
 from cloud_merger.config import ShardConfig
@@ -58,7 +58,7 @@ def merged_anew(path: Path, reports) -> dict:
     """Head hashes when one worker merges the stored reports one by one, in order of their ids."""
     with SqliteStore(path, StoreConfig(merge_delay_s=0.0)) as store:
         store.put_tiles([tile_at(tile) for tile in TILES])
-        worker = Worker(store, ShardConfig(store_path=path))
+        worker = Worker(store, ShardConfig(store_path=path, confirmation=VOXEL_BY_VOXEL))
         for row in sorted(reports, key=lambda row: (row.report_id, row.tile)):
             store.put_reports([row])
             while claims := store.claim("one", 16, 30.0):

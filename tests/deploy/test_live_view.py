@@ -1,6 +1,7 @@
 """What a person sees of the traffic while a fleet runs."""
 
 import io
+from dataclasses import replace
 
 import pytest
 from rich.console import Console
@@ -122,6 +123,16 @@ def test_a_narrow_terminal_keeps_a_vehicle_in_a_line():
     row = " ".join(row_of(console.export_text(), "vehicle-00"))
     assert row == "vehicle-00 good 1000 m 1.60 MB 800.0 kB/s 80 % 1.80 MB 900.0 kB/s 900 %"
     assert "37.24226 126.0507" in shown(state)
+
+
+def test_a_vehicle_that_doubts_itself_is_seen_to():
+    state = state_of(Clock())
+    state.on_traffic("key", sample(1).encode())
+    assert "doubts" not in shown(state)
+    doubtful = replace(sample(2), scans_taken_back=7, tiles_held_back=2, tiles_doubtful=3, doubts=(2, 0, 0, 1))
+    state.on_traffic("key", doubtful.encode())
+    assert "3 tiles (2 held back), 7 scans" in shown(state)
+    assert state.samples["vehicle-00"].doubts_in_words == {"explained_by_shift": 2, "estimates_disagree": 1}
 
 
 def test_without_a_terminal_a_line_tells_the_same():

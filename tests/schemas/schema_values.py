@@ -224,7 +224,19 @@ GOLDEN: dict[str, Any] = {
     "TileUpdate-merged-coded_delta": update(delta=None, coded_delta=b"not looked into", put_voxels=2, removed_voxels=2),
     "TileUpdate-base-new_tile": update(version=1, previous_version=0, previous_sha=b"", reason="base", delta=None),
     "TileUpdate-rollback": update(reason="rollback", delta=None),
+    "TileUpdate-day": update(day=9750),
+    "TileReply-blob-day": TileReply("blob", blob_of(Tile(TILE, 7, gaussians([-604, 0, 604]), 9750))),
+    "TileReply-delta-day": TileReply("delta", delta=CodedDelta(TILE, 8, SHA, b"not looked into", 9750)),
+    "TilesReply-one_day": TilesReply((TileAnswer("delta", 4, OTHER_SHA[:4], 0, b"not looked into", 9750),) * 3),
+    "TilesReply-days": TilesReply(
+        (
+            TileAnswer("delta", 4, OTHER_SHA[:4], 0, b"not looked into", 9750),
+            TileAnswer("absent"),
+            TileAnswer("delta", 5, SHA[:4], 0, b"not looked into"),
+        )
+    ),
     "TrafficSample-two_lines": sample(),
+    "TrafficSample-doubts": sample(scans_taken_back=31, tiles_held_back=2, tiles_doubtful=4, doubts=(2, 0, 1, 0, 1)),
     "TrafficSample-start": sample(
         lines=(), odometer_m=0.0, wire_up_bytes=0, wire_down_bytes=0, health="starting", tiles=0, reports=0
     ),

@@ -1,5 +1,6 @@
 """Tiles of a district in one query: what is asked and answered survives, is small, and lies are found."""
 
+from dataclasses import replace
 from typing import Any
 
 import pytest
@@ -48,7 +49,8 @@ def any_answer(draw: Any) -> TileAnswer:
     if status not in ("blob", "delta"):
         return TileAnswer(status)
     codec = draw(st.integers(0, 2**32 - 1)) if status == "blob" else 0
-    return TileAnswer(status, draw(versions), draw(shas)[:4], codec, draw(st.binary(max_size=40)))
+    body, day = draw(st.binary(max_size=40)), draw(st.sampled_from([0, 1, 9750, 2**16 - 1]))
+    return TileAnswer(status, draw(versions), draw(shas)[:4], codec, body, day)
 
 
 @given(helds, st.booleans(), st.integers(1, limits.MAX_TILE_BODY_BYTES), st.none() | st.integers(0, 1023))
@@ -91,6 +93,22 @@ def test_a_delta_in_a_reply_costs_little_more_than_itself() -> None:
     assert len(more) - alone <= 20 * (len(DELTA) + 8) + 8
 
 
+def test_the_day_of_a_survey_costs_four_bytes_whatever_the_number_of_tiles() -> None:
+    without, dated = (TilesReply((TileAnswer("delta", 4, HASH, 0, DELTA, day),) * 200).encode() for day in (0, 9750))
+    assert len(dated) - len(without) == 4
+    assert {answer.day for answer in TilesReply.decode(dated).answers} == {9750}
+
+
+def test_days_that_are_not_one_each_are_refused() -> None:
+    message = tiles_reply_pb2.TilesReply.FromString(TilesReply((TileAnswer("delta", 4, HASH, 0, DELTA),) * 3).encode())
+    message.days.extend([9750, 9751])
+    with pytest.raises(BadValue, match="3 tiles has 2 days"):
+        TilesReply.decode(message.SerializeToString())
+    message.days[:] = [2**16]
+    with pytest.raises(BadValue, match="day 65536 is outside"):
+        TilesReply.decode(message.SerializeToString())
+
+
 # What comes out
 
 
@@ -110,6 +128,8 @@ def test_a_delta_gives_the_next_version_wherever_it_comes() -> None:
     assert tile_of_answer(TILE, TileAnswer("delta", 4, HASH, 0, DELTA), HELD) == NEXT
     update = TileUpdate(TILE, "ndt", 4, 3, NEXT.sha, HELD.sha, "merged", coded_delta=DELTA, put_voxels=2)
     assert updated(TileUpdate.decode(update.encode()), HELD) == NEXT
+    assert updated(TileUpdate.decode(replace(update, day=9750).encode()), HELD).day == 9750
+    assert tile_of_answer(TILE, TileAnswer("delta", 4, HASH, 0, DELTA, 9750), HELD).day == 9750
 
 
 def test_a_delta_against_other_content_is_a_wrong_hash() -> None:

@@ -8,6 +8,7 @@ import pytest
 
 from gnd_map.accumulate import VoxelAccumulator
 from gnd_map.codec import LATTICES, is_on, snap
+from gnd_map.day import day_of
 from gnd_map.geodesy import LocalFrame
 from gnd_map.grid import GridFrame, VoxelGrid
 from gnd_map.tile_id import TileId
@@ -107,6 +108,7 @@ def test_a_moving_vehicle_maps_the_walls_where_they_stand(tmp_path: Path, store:
     assert (result.drives, result.scans, result.scans_skipped) == (1, 12, 0)
     assert result.points == len(drive.points_map_m)
     assert result.tiles == result.versions_published == len(store.heads())
+    assert {store.get("ndt", entry.tile).day for entry in store.heads()} == {day_of(T0_NS)}
     points = map_points_m(store)
     assert result.gaussians == len(points) > 150
     # 10 ms between poses on a circle of 50 m: the chord is 25 µm off; float32 points 1 µm.

@@ -20,11 +20,14 @@ from store_helpers import (
 )
 
 from gnd_map.codec import LATTICES, best_codec, encode_gaussians, snap
+from gnd_map.day import UNKNOWN_DAY, day_of
 from gnd_map.tile import Tile
 from schemas.errors import SchemaError, WrongHash
 from tile_store.errors import StoreError, UnknownVersion
 from tile_store.store import Store
 from tile_store.values import GcResult, Notice, Publication, PublishResult, ReportRow
+
+DAY_NS = 86_400_000_000_000
 
 
 def merged_versions(store: Store, n: int) -> None:
@@ -313,3 +316,52 @@ def test_a_backup_is_a_store_and_overwrites_nothing(store: Store, maker: SqliteM
     copy.close()
     with pytest.raises(StoreError, match="exists"):
         store.backup(path)
+
+
+# Days
+
+
+def day_of_head(store: Store) -> int:
+    head = store.get("ndt", TILE)
+    assert head is not None
+    assert head.to_blob().day == head.decode_gaussians().day == head.day
+    return head.day
+
+
+def test_a_base_has_the_day_of_its_survey_and_a_merge_that_of_its_publication(store: Store, clock: Clock) -> None:
+    surveyed_ns = clock.ns - 400 * DAY_NS
+    store.put_tiles([tile_of_voxels(TILE, 1)], surveyed_ns=surveyed_ns)
+    assert day_of_head(store) == day_of(surveyed_ns)
+    store.put_tiles([tile_of_voxels(TILE, 1)], surveyed_ns=surveyed_ns + 9 * DAY_NS)  # surveyed again, and unchanged
+    store.put_tiles([tile_of_voxels(TILE, 1)], surveyed_ns=surveyed_ns - 9 * DAY_NS)
+    assert day_of_head(store) == day_of(surveyed_ns) + 9
+    store.put_reports([report(1)])
+    merge_once(store, 1, 2)
+    assert day_of_head(store) == day_of(clock.ns)
+    store.rollback("ndt", TILE, 1)
+    assert day_of_head(store) == UNKNOWN_DAY  # as old as it was
+
+
+def test_a_base_of_which_nobody_told_when_it_was_surveyed_has_no_day(store: Store) -> None:
+    store.put_tiles([tile_of_voxels(TILE, 1)])
+    assert day_of_head(store) == UNKNOWN_DAY
+
+
+def test_a_store_of_a_release_without_days_gets_room_for_them(store: Store, maker: SqliteMaker) -> None:
+    store.put_tiles([tile_of_voxels(TILE, 1)], surveyed_ns=1_700_000_000_000_000_000)
+    store.close()
+    with apsw.Connection(str(maker.path)) as connection:
+        connection.execute("DROP TRIGGER survey_goes; DROP TABLE survey")
+    again = maker.open()
+    assert day_of_head(again) == UNKNOWN_DAY
+    again.put_tiles([tile_of_voxels(TILE, 1)], surveyed_ns=1_700_000_000_000_000_000)
+    assert day_of_head(again) == day_of(1_700_000_000_000_000_000)
+    again.close()
+
+
+def test_a_survey_goes_with_its_version(store: Store, maker: SqliteMaker) -> None:
+    for k in range(4):
+        store.put_tiles([tile_of_voxels(TILE, k)], surveyed_ns=1_700_000_000_000_000_000)
+    store.gc(1)
+    with apsw.Connection(str(maker.path)) as connection:
+        assert connection.execute("SELECT version FROM survey").get == 4

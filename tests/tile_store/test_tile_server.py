@@ -17,6 +17,7 @@ from fleet_bus.config import BusConfig
 from fleet_bus.errors import RequestFailed, RequestRefused
 from fleet_bus.requesting import RetryPolicy
 from fleet_bus.router import open_router
+from gnd_map.day import day_of
 from gnd_map.tile_id import TileId
 from schemas import keys
 from schemas.tiles import Catalog, TileReply, TileRequest, tile_of
@@ -79,6 +80,22 @@ def test_a_tile_is_delivered_with_its_version_and_hash(client: Bus, store: Sqlit
     reply = ask(client, TILE)
     assert reply.blob is not None
     assert (reply.blob.version, reply.blob.sha) == (2, tile_of_voxels(TILE, 5).sha)
+
+
+@pytest.mark.usefixtures("server")
+def test_a_client_learns_when_the_world_looked_so(client: Bus, store: SqliteStore) -> None:
+    request = TilesRequest.of([HeldTile(TILE), HeldTile(EAST)])
+
+    def days() -> list[int]:
+        payload = client.request(keys.batch_key("ndt", TILE.district), request.encode(), kind="tile", timeout_s=20.0)
+        return [answer.day for _, answer in TilesReply.decode(payload).of_request(request, TILE.district)]
+
+    assert days() == [0, 0]
+    store.put_tiles([tile_of_voxels(TILE, 3)], surveyed_ns=1_700_000_000_000_000_000)
+    assert days() == [day_of(1_700_000_000_000_000_000), 0]
+    reply = ask(client, TILE)
+    assert reply.blob is not None
+    assert tile_of(reply.blob).day == days()[0]
 
 
 @pytest.mark.usefixtures("server")

@@ -1,5 +1,6 @@
 """The gate before the outbox: nothing of a wrong pose is told, and that something was held back is told."""
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -7,6 +8,7 @@ import pytest
 from gate_scene import START_NS, WALLS, map_of, scan, seen, shift
 
 from gnd_map.classes import ChangeClass
+from gnd_map.day import UNKNOWN_DAY, day_of
 from schemas.changes import ChangeReport, TileChange
 from schemas.doubt import DoubtReason
 from vehicle_agent.config import ReportParameters
@@ -121,6 +123,34 @@ def test_a_yard_rebuilt_all_over_is_told_with_doubt(tmp_path: Path, yard: LocalM
     assert doubts
     assert all(doubt is not None and doubt.reasons & DoubtReason.IMPLAUSIBLE_SHARE for doubt in doubts)
     assert all(doubt.changed_permille > 600 for doubt in doubts if doubt is not None)
+
+
+def dated(yard: LocalMap, day: int) -> LocalMap:
+    """The same yard, surveyed on a day."""
+    found = LocalMap(yard.grid_frame)
+    for tile_id in yard.tiles:
+        tile = yard.tile(tile_id)
+        assert tile is not None
+        found.set_tile(replace(tile, day=day)) if tile.version else found.set_absent(tile_id)
+    return found
+
+
+@pytest.mark.parametrize(
+    ("age_days", "is_doubted"), [(0, True), (60, True), (600, False), (-1, False), (None, False)], ids=str
+)
+def test_how_much_may_have_changed_depends_on_the_age_of_the_map(
+    tmp_path: Path, yard: LocalMap, age_days: int | None, is_doubted: bool
+) -> None:
+    """Half of what stands in a tile is new: too much for a map of last week, not for one of last year. A map that
+    is younger than the drive means a wrong clock, one without a day says nothing: both are judged as before.
+    """
+    day = UNKNOWN_DAY if age_days is None else day_of(START_NS) - age_days
+    rows = [((-17.0, float(y)), (17.0, float(y))) for y in np.arange(-11.0, 11.0, 1.3)]
+    walls = [*WALLS, *rows]
+    moved = [scan(seen(walls, k, 6.0), k) for k in range(20)]
+    _, told, _ = driven(tmp_path, dated(yard, day), moved)
+    doubts = {change.doubt.reasons for change in told if change.doubt is not None}
+    assert doubts == ({DoubtReason.IMPLAUSIBLE_SHARE} if is_doubted else set())
 
 
 def test_what_waits_is_taken_back_when_the_pose_is_lost(tmp_path: Path, yard: LocalMap) -> None:

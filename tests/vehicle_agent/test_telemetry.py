@@ -40,5 +40,9 @@ def test_samples_go_out_by_way_and_by_event_and_at_the_end(endpoint: str) -> Non
         assert looked_again() == 3
         now = replace(now, reports=1)
         assert looked_again() == 4
+        now = replace(now, scans_taken_back=7)
+        assert looked_again() == 4  # comes in rows
+        now = replace(now, tiles_doubtful=1, doubts=(0, 1))
+        assert looked_again() == 5
         telemetry.close()
-        assert said() == 5
+        assert said() == 6

@@ -1,5 +1,6 @@
 """Tiles on disk are verified at every read."""
 
+from dataclasses import replace
 from pathlib import Path
 
 import apsw
@@ -8,6 +9,7 @@ import pytest
 from vehicle_scene import ground, tiles_of
 
 from gnd_map.codec import CODEC_FLOAT32, CODEC_FLOAT32_ZSTD, CODEC_STANDARD, CODEC_STANDARD_ZSTD, LATTICES, snap
+from gnd_map.day import UNKNOWN_DAY
 from gnd_map.tile import Tile
 from gnd_map.tile_id import TileId
 from schemas.tiles import blob_of
@@ -32,6 +34,21 @@ def test_a_tile_comes_back_as_it_was_also_after_a_restart(tmp_path: Path, tile: 
     assert (found.version, found.gaussians) == (tile.version, tile.gaussians)
     assert again.head(tile.tile_id) == (tile.version, tile.sha)
     assert TileCache(tmp_path / "cache.sqlite", "signs").get(tile.tile_id) is None
+
+
+def test_a_tile_keeps_its_day_and_a_cache_of_an_older_release_gets_room_for_it(tmp_path: Path, tile: Tile) -> None:
+    path = tmp_path / "cache.sqlite"
+    TileCache(path).put(replace(tile, day=9000))
+    with apsw.Connection(str(path)) as other:
+        other.execute("ALTER TABLE tile DROP COLUMN day")
+    cache: TileCache[Tile] = TileCache(path)
+    old = cache.get(tile.tile_id)
+    assert old is not None
+    assert old.day == UNKNOWN_DAY
+    cache.put(replace(tile, version=tile.version + 1, day=9750))
+    new = TileCache(path).get(tile.tile_id)
+    assert new is not None
+    assert (new.version, new.day) == (tile.version + 1, 9750)
 
 
 def test_a_newer_version_takes_the_place_of_the_older(tmp_path: Path, tile: Tile) -> None:

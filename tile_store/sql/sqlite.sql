@@ -133,6 +133,27 @@ CREATE TABLE IF NOT EXISTS shifted_vehicle (
 -- name: has_schema_of_confirmation
 SELECT 1 FROM sqlite_schema WHERE type = 'table' AND name = 'shifted_vehicle'
 
+-- name: schema_of_surveys
+-- Added later, too. When the world was measured of which a base was built; versions without a row are older than this
+-- table, or nobody has told.
+CREATE TABLE IF NOT EXISTS survey (
+  layer       TEXT    NOT NULL,
+  tile        INTEGER NOT NULL,
+  version     INTEGER NOT NULL,
+  surveyed_ns INTEGER NOT NULL,
+  PRIMARY KEY (layer, tile, version)
+) STRICT, WITHOUT ROWID;
+CREATE TRIGGER IF NOT EXISTS survey_goes AFTER DELETE ON tile_version BEGIN
+  DELETE FROM survey WHERE layer = OLD.layer AND tile = OLD.tile AND version = OLD.version;
+END;
+
+-- name: has_schema_of_surveys
+SELECT 1 FROM sqlite_schema WHERE type = 'trigger' AND name = 'survey_goes'
+
+-- name: put_survey
+INSERT INTO survey (layer, tile, version, surveyed_ns) VALUES (:layer, :tile, :version, :surveyed_ns)
+ON CONFLICT (layer, tile, version) DO UPDATE SET surveyed_ns = MAX(surveyed_ns, excluded.surveyed_ns)
+
 -- name: put_shift_test
 INSERT INTO shift_test (layer, tile, report_id, vehicle, at_ns, explained, length_m, turn_rad, forward_m, left_m)
 VALUES (:layer, :tile, :report_id, :vehicle, :at_ns, :explained, :length_m, :turn_rad, :forward_m, :left_m)
@@ -277,20 +298,25 @@ DELETE FROM notice WHERE layer = :layer AND tile = :tile AND version = :version
 SELECT layer, tile, version FROM notice WHERE created_ns <= :before ORDER BY created_ns, layer, tile, version LIMIT :n
 
 -- name: stored_version
-SELECT layer, tile, version, parent, kind, created_ns, merger, n_reports, sha, codec_id, body FROM tile_version
+SELECT layer, tile, version, parent, kind, created_ns, merger, n_reports, sha, codec_id, body, surveyed_ns
+FROM tile_version LEFT JOIN survey USING (layer, tile, version)
 WHERE layer = :layer AND tile = :tile AND version = :version
 
 -- name: stored_head
-SELECT v.layer, v.tile, v.version, v.parent, v.kind, v.created_ns, v.merger, v.n_reports, v.sha, v.codec_id, v.body
+SELECT v.layer, v.tile, v.version, v.parent, v.kind, v.created_ns, v.merger, v.n_reports, v.sha, v.codec_id, v.body,
+       s.surveyed_ns
 FROM tile_head AS h JOIN tile_version AS v USING (layer, tile, version)
+  LEFT JOIN survey AS s USING (layer, tile, version)
 WHERE h.layer = :layer AND h.tile = :tile
 
 -- name: stored_at
-SELECT layer, tile, version, parent, kind, created_ns, merger, n_reports, sha, codec_id, body FROM tile_version
+SELECT layer, tile, version, parent, kind, created_ns, merger, n_reports, sha, codec_id, body, surveyed_ns
+FROM tile_version LEFT JOIN survey USING (layer, tile, version)
 WHERE layer = :layer AND tile = :tile AND created_ns <= :at_ns ORDER BY version DESC LIMIT 1
 
 -- name: stored_by_sha
-SELECT layer, tile, version, parent, kind, created_ns, merger, n_reports, sha, codec_id, body FROM tile_version
+SELECT layer, tile, version, parent, kind, created_ns, merger, n_reports, sha, codec_id, body, surveyed_ns
+FROM tile_version LEFT JOIN survey USING (layer, tile, version)
 WHERE layer = :layer AND tile = :tile AND sha = :sha ORDER BY version DESC LIMIT 1
 
 -- name: heads

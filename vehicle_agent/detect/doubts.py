@@ -9,12 +9,14 @@ from numpy.typing import NDArray
 
 from gnd_map.arrays import F64
 from gnd_map.classes import ChangeClass
+from gnd_map.day import UNKNOWN_DAY
 from gnd_map.gaussian import Gaussians
 from gnd_map.grid import GridFrame
 from gnd_map.tile import Tile
 from gnd_map.tile_id import TileId
 from schemas.changes import TileChange
 from schemas.doubt import Doubt, DoubtReason
+from vehicle_agent.detect.beyond import beyond_map
 from vehicle_agent.detect.classify import Classification
 from vehicle_agent.detect.shift import Shift, no_shift
 from vehicle_agent.detect.trial import Tried
@@ -24,8 +26,14 @@ BAD_SHARE: Final = 0.1
 """From this share of scans with poor health, or that disagree, a tile is doubtful."""
 UNCHECKED_SHARE: Final = 0.5
 IMPLAUSIBLE_SHARE: Final = 0.6
-"""Of the voxels that hold something. A tile has no time of its own, so time cannot excuse more: a building site leaves
-the road and what lies around it (docs/decisions/0082-the-gate-on-the-vehicle.md)."""
+"""Of the voxels that hold something, whatever time has passed: a building site leaves the road and what lies around it
+(docs/decisions/0082-the-gate-on-the-vehicle.md)."""
+BURST_SHARE: Final = 0.3
+"""What may change from one day to the next: a market, scaffolding, snow at the roadside ..."""
+SHARE_OF_YEAR: Final = 0.3
+"""... and what a year adds. After a year the limit is the one without time. The same for all vehicles; no more than a
+convention (docs/decisions/0093-gates-told-and-measured.md)."""
+_DAYS_OF_YEAR: Final = 365.25
 LEAST_OF_SHARE: Final = 50
 """So many voxels must hold something before their share says anything."""
 LEAST_WITHHELD: Final = 5
@@ -107,14 +115,30 @@ class TileDoubts:
         return self._grid_frame.tile_voxel_of(np.floor(points_map_m @ A.T + b).astype(np.int64))
 
 
-def doubt_of(found: Classification, account: Account) -> Doubt | None:
+def plausible_share(base_day: int, day: int) -> float:
+    """How much of a tile may have changed, 0 ... 1, by the time since its version.
+
+    Where that is not known the limit is the one without time; so it is where the clock of the vehicle, or of who dated
+    the tile, must be wrong: the drive is older than what it is compared with. A clock that runs ahead makes no change
+    plausible that would not be so anyway.
+
+    Args:
+        base_day: of the tile, `gnd_map.day`.
+        day: of the drive.
+    """
+    if UNKNOWN_DAY in (base_day, day) or day < base_day:
+        return IMPLAUSIBLE_SHARE
+    return min(BURST_SHARE + SHARE_OF_YEAR * (day - base_day) / _DAYS_OF_YEAR, IMPLAUSIBLE_SHARE)
+
+
+def doubt_of(found: Classification, account: Account, day: int = UNKNOWN_DAY) -> Doubt | None:
     """Why a tile that is told all the same is not fully believed; None where nothing speaks against it, or where
-    nothing has changed.
+    nothing has changed. `day`: of the drive, `gnd_map.day`.
     """
     reasons, changed_share = DoubtReason.NONE, changed_share_of(found)
     if not found.changed.any():
         return None
-    if changed_share > IMPLAUSIBLE_SHARE:
+    if changed_share > plausible_share(found.evidence.base.day, day):
         reasons |= DoubtReason.IMPLAUSIBLE_SHARE
     if account.off or account.share("uncertain", "shifted") >= BAD_SHARE:
         reasons |= DoubtReason.HEALTH_NOT_GOOD
@@ -126,8 +150,11 @@ def doubt_of(found: Classification, account: Account) -> Doubt | None:
 
 
 def changed_share_of(found: Classification) -> float:
-    """Of the voxels that hold something in the base or now, those that are changed; 0 where there are too few."""
-    changed = int(found.changed.sum())
+    """Of the voxels that hold something in the base or now, those that are changed; 0 where there are too few. What
+    lies beyond the map extends it and does not count, unless there is no map at all.
+    """
+    beyond = int(beyond_map(found).sum()) if len(found.evidence.base.gaussians) else 0
+    changed = int(found.changed.sum()) - beyond
     holding = changed + int((found.change_class == ChangeClass.NORMAL).sum())
     return changed / holding if holding >= LEAST_OF_SHARE else 0.0
 

@@ -151,15 +151,19 @@ class Localiser:
         """Take a scan; give the scans whose poses became final, oldest first. A scan that is empty, or not later than
         the one before, is dropped and counted.
         """
+        return list(self.take_scan(scan))
+
+    def take_scan(self, scan: Scan) -> Iterator[RefinedScan]:
+        """The same, but each scan is placed when it is asked for: a whole lag that becomes final at once is large."""
         if len(scan) == 0 or scan.t_ns <= self._newest_scan_ns:
             self.dropped_scans += 1
             self._see_past(scan)
-            return list(self._take_ready())
+            return self._take_ready()
         self._newest_scan_ns, self._from_past = scan.t_ns, 0
         self._process()
         self._pending = scan
         self._process_if_covered()
-        return list(self._take_ready())
+        return self._take_ready()
 
     def start_at(self, t_ns: int, T_map_vehicle: F64, *, trusted: bool = False) -> None:
         """Take a pose (4, 4) from outside, such as that of the last parking, instead of the present one or of a search.

@@ -17,7 +17,16 @@ from gnd_map.accumulate import N_MIN_CELLS
 from gnd_map.arrays import F64
 from gnd_map.se3 import T_inverse, transform
 from gnd_map.tile import Tile
-from tile_store.build import BuildError, BuildParameters, MapPoints, Source, drive_sources, map_lattice, put_map
+from tile_store.build import (
+    BuildError,
+    BuildParameters,
+    MapPoints,
+    Source,
+    drive_sources,
+    map_lattice,
+    put_map,
+    surveyed_ns,
+)
 from tile_store.store import Store
 from tile_store.values import DEFAULT_CODEC, DEFAULT_LAYER
 from vehicle_agent.localise.estimates import RefinedScan
@@ -113,7 +122,7 @@ def build_recorded_map(
         missing = sum((one.without_pose for one in counts), Counter[NoPose]())
         raise BuildError(f"none of {missing.total()} scans has a pose: {reasons(missing)}; are both in the same clock?")
     tiles = measured.tiles(n_min_cells, lattice)
-    published = put_map(tiles, store, layer)
+    published = put_map(tiles, store, layer, surveyed_ns(sources))
     return BuiltMap(tuple(sources), tuple(surveys), poses, tuple(counts), tuple(tiles), measured, published)
 
 
