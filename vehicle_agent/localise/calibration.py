@@ -225,15 +225,20 @@ class MotionTeacher:
         0 between what a mount may be off by unknowingly and what is certainly a wrong header: there the recording's
         vehicle frame may mean something else than the axle.
         """
-        course_rad, sigma_rad = self._course
-        slight = abs(course_rad) < MAX_TRIM_RAD and sigma_rad < KNOWN_COURSE_RAD
+        course_rad = self._course[0]
+        slight = abs(course_rad) < MAX_TRIM_RAD and self._course_known
         return course_rad if slight else self.header_trim_rad
+
+    @property
+    def _course_known(self) -> bool:
+        """True when the matches of a whole stretch tell it."""
+        return bool(self._course_var < KNOWN_COURSE_RAD**2)
 
     def yaw_sigma_rad(self, trim_rad: float, least_rad: float) -> float:
         """One sigma of what the heading is off by for the mount's sake when it was turned by `trim_rad`: at least
         `least_rad`, and no more once the course is known.
         """
-        if trim_rad and self._course[1] < KNOWN_COURSE_RAD:
+        if trim_rad and self._course_known:
             return least_rad
         left_rad = left_sigma(*self._course_seen(trim_rad), trim_rad, self.mount.sigma.yaw_rad)
         return float(np.hypot(least_rad, left_rad))
