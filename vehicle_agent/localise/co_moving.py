@@ -102,7 +102,7 @@ class CoMoving:
         return result
 
     def _things(self, t_ns: int, points_m: F64, votes: tuple[U8, U8, U8]) -> Mask:
-        """(K,) bool: points on what travels along; what surely did a moment ago, at the same place, helps to grow it."""
+        """(K,) bool: points on what travels along; what surely did a moment ago helps to grow it."""
         young = t_ns - self._sure_ns <= REMEMBER_NS
         self._sure_m, self._sure_ns = self._sure_m[young], self._sure_ns[young]
         certain = np.full((3, len(self._sure_m)), [[SURE], [SURE], [0]], np.uint8)
