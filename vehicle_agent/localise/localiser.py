@@ -187,7 +187,7 @@ class Localiser:
         return self._motion.yaw_bias_radps
 
     @property
-    def left_out(self) -> int:
+    def points_travelling_along(self) -> int:
         """Sampled points so far that were left out because they travel along with the vehicle."""
         return self._co_moving.left_out
 
