@@ -55,7 +55,7 @@ class CoMoving:
         self._times_s = np.zeros((SLOTS, COLUMNS), np.float32)
         self._twists = np.zeros((SLOTS, 3))
         self._kept: list[_Kept] = []
-        self._way_m, self._T_odom_vehicle = 0.0, np.eye(4)
+        self._way_m, self._T_odom_vehicle, self._T_odom_before = 0.0, np.eye(4), np.eye(4)
         self._before_ns: int | None = None
         self._sure_m, self._sure_ns = np.empty((0, 3)), np.empty(0, np.int64)
         self.left_out = 0
@@ -119,6 +119,12 @@ class CoMoving:
         newest = np.unique((i * 1024 + j) * 1024 + k, return_index=True)[1]
         self._sure_m, self._sure_ns = p[newest], ns[newest]
 
+    def correct(self, T_before_now: F64) -> None:
+        """Put in what is known better by now of the motion (4, 4) before the newest sweep: its wheels may have slipped."""
+        self._T_odom_vehicle = self._T_odom_before @ T_before_now
+        if self._kept and self._kept[-1].t_ns == self._before_ns:
+            self._kept[-1] = self._kept[-1]._replace(T_odom_vehicle=self._T_odom_vehicle)
+
     def forget(self) -> None:
         """Begin anew: the next sweep does not continue those before."""
         self._kept, self._before_ns = [], None
@@ -127,7 +133,8 @@ class CoMoving:
     def _advance(self, t_ns: int, T_before_now: F64) -> None:
         dt_s = 0.0 if self._before_ns is None else (t_ns - self._before_ns) * 1e-9
         self._before_ns = t_ns
-        self._T_odom_vehicle = self._T_odom_vehicle @ T_before_now
+        self._T_odom_before = self._T_odom_vehicle
+        self._T_odom_vehicle = self._T_odom_before @ T_before_now
         self._way_m += float(np.hypot(T_before_now[0, 3], T_before_now[1, 3]))
         self._kept = [k for k in self._kept if t_ns - k.t_ns <= OLDEST_NS and self._way_m - k.way_m <= REACH_M]
         turned_rad = np.arctan2(T_before_now[1, 0], T_before_now[0, 0])

@@ -239,6 +239,7 @@ class Localiser:
         seen = self._scan_step(scan, chosen, points, odometry)
         self._teacher.clock.see(track.held[newest].t_ns, t_ns, seen)
         joint = joint_step(*odometry, seen)
+        self._co_moving.correct(joint.T_before_now)
         sweep = self._sweep_of_steady(scan) if joint.slipped else None
         points = points if sweep is None else self._deskewed(scan, chosen, scan.points_m[chosen], sweep)
         predicted = track.graph.pose(newest) @ joint.T_before_now
