@@ -102,13 +102,13 @@ class CoMoving:
         return result
 
     def _things(self, t_ns: int, points_m: F64, votes: tuple[U8, U8, U8]) -> Mask:
-        """(K,) bool: points on what travels along; what surely did a moment ago helps to grow it."""
+        """(K,) bool: points on what travels along; what seemed to a moment ago, at the same place, counts too."""
         young = t_ns - self._sure_ns <= REMEMBER_NS
         self._sure_m, self._sure_ns = self._sure_m[young], self._sure_ns[young]
         certain = np.full((3, len(self._sure_m)), [[SURE], [SURE], [0]], np.uint8)
         all_votes = [np.concatenate(pair) for pair in zip(votes, certain, strict=True)]
         result = grown(np.concatenate([points_m, self._sure_m]), *all_votes)[: len(points_m)]
-        self._remember(t_ns, points_m[result & (votes[1] >= MIN_PASSED)])
+        self._remember(t_ns, points_m[(votes[1] >= MIN_PASSED) & (votes[2] <= votes[1])])
         return result
 
     def _remember(self, t_ns: int, sure_m: F64) -> None:

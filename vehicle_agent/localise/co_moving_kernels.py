@@ -44,7 +44,7 @@ MIN_PASSED: Final = 2
 MIN_MET: Final = 2
 SETTLED: Final = 3
 """Sweeps that met a point, none against them, after which no other is asked."""
-MIN_SEEDS: Final = 3
+MIN_SEEDS: Final = 6
 NEIGHBOUR_M: Final = 0.9
 SAME_M: Final = 0.2
 SAME_MPS: Final = 0.45
