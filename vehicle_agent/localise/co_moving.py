@@ -120,7 +120,7 @@ class CoMoving:
         self._sure_m, self._sure_ns = p[newest], ns[newest]
 
     def correct(self, T_before_now: F64) -> None:
-        """Put in what is known better by now of the motion (4, 4) before the newest sweep: its wheels may have slipped."""
+        """Put in what is known better by now of the motion (4, 4) before the newest sweep: wheels slip."""
         self._T_odom_vehicle = self._T_odom_before @ T_before_now
         if self._kept and self._kept[-1].t_ns == self._before_ns:
             self._kept[-1] = self._kept[-1]._replace(T_odom_vehicle=self._T_odom_vehicle)
