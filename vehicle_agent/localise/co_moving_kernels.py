@@ -201,7 +201,7 @@ def _moved(T: F64, p: F64, out: F64) -> None:
 @kernel
 def _under_the_vehicle(p: F64) -> bool:
     """True where the vehicle itself was: what lies there now was not there then."""
-    return LOW_M[0] < p[0] < HIGH_M[0] and LOW_M[1] < p[1] < HIGH_M[1] and LOW_M[2] < p[2] < HIGH_M[2]
+    return bool(LOW_M[0] < p[0] < HIGH_M[0] and LOW_M[1] < p[1] < HIGH_M[1] and LOW_M[2] < p[2] < HIGH_M[2])
 
 
 @kernel
