@@ -1,4 +1,4 @@
-"""A recorded drive with a van ahead that was not there and keeps its distance: what moves along, in a real sensor's noise."""
+"""A recorded drive with a van ahead that was not there: what moves along, in the noise of a real sensor."""
 
 from dataclasses import dataclass, replace
 from math import pi, sin

@@ -200,6 +200,7 @@ class Vehicle:
             "health": self.timeline.as_json(),
             "localisation": self.evaluation.errors(),
             "nis": self.localiser.innovations.mean,
+            "points_travelling_along": self.localiser.points_travelling_along,
             "calibration": self.localiser.calibration.as_json(),
             "memory_mb": self.memory.read(),
         }

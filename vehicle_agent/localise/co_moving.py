@@ -54,7 +54,7 @@ class CoMoving:
         self._times_s = np.zeros((SLOTS, COLUMNS), np.float32)
         self._twists = np.zeros((SLOTS, 3))
         self._kept: list[_Kept] = []
-        self._way_m, self._T_odom_vehicle = 0.0, np.eye(4)
+        self._way_m, self._T_odom_vehicle, self._T_odom_before = 0.0, np.eye(4), np.eye(4)
         self._before_ns: int | None = None
         self._sure_m, self._sure_ns = np.empty((0, 3)), np.empty(0, np.int64)
         self.left_out = 0
@@ -101,13 +101,13 @@ class CoMoving:
         return result
 
     def _things(self, t_ns: int, points_m: F64, votes: tuple[U8, U8, U8]) -> Mask:
-        """(K,) bool: points on what travels along; what surely did a moment ago, at the same place, helps to grow it."""
+        """(K,) bool: points on what travels along; what seemed to a moment ago, at the same place, counts too."""
         young = t_ns - self._sure_ns <= REMEMBER_NS
         self._sure_m, self._sure_ns = self._sure_m[young], self._sure_ns[young]
         certain = np.full((3, len(self._sure_m)), [[SURE], [SURE], [0]], np.uint8)
         all_votes = [np.concatenate(pair) for pair in zip(votes, certain, strict=True)]
         result = grown(np.concatenate([points_m, self._sure_m]), *all_votes)[: len(points_m)]
-        self._remember(t_ns, points_m[result & (votes[1] >= MIN_PASSED)])
+        self._remember(t_ns, points_m[(votes[1] >= MIN_PASSED) & (votes[2] <= votes[1])])
         return result
 
     def _remember(self, t_ns: int, sure_m: F64) -> None:
@@ -117,6 +117,12 @@ class CoMoving:
         i, j, k = np.floor(p / REMEMBERED_M).astype(np.int64).T
         newest = np.unique((i * 1024 + j) * 1024 + k, return_index=True)[1]
         self._sure_m, self._sure_ns = p[newest], ns[newest]
+
+    def correct(self, T_before_now: F64) -> None:
+        """Put in what is known better by now of the motion (4, 4) before the newest sweep: wheels slip."""
+        self._T_odom_vehicle = self._T_odom_before @ T_before_now
+        if self._kept and self._kept[-1].t_ns == self._before_ns:
+            self._kept[-1] = self._kept[-1]._replace(T_odom_vehicle=self._T_odom_vehicle)
 
     def remounted(self, T_vehicle_lidar: F64) -> None:
         """Begin anew with another mount (4, 4)."""
@@ -135,7 +141,8 @@ class CoMoving:
     def _advance(self, t_ns: int, T_before_now: F64) -> None:
         dt_s = 0.0 if self._before_ns is None else (t_ns - self._before_ns) * 1e-9
         self._before_ns = t_ns
-        self._T_odom_vehicle = self._T_odom_vehicle @ T_before_now
+        self._T_odom_before = self._T_odom_vehicle
+        self._T_odom_vehicle = self._T_odom_before @ T_before_now
         self._way_m += float(np.hypot(T_before_now[0, 3], T_before_now[1, 3]))
         self._kept = [k for k in self._kept if t_ns - k.t_ns <= OLDEST_NS and self._way_m - k.way_m <= REACH_M]
         turned_rad = np.arctan2(T_before_now[1, 0], T_before_now[0, 0])

@@ -1,4 +1,4 @@
-"""Range images of single sweeps in the frame of the turning LiDAR, and what they say of points that may travel along."""
+"""Range images of single sweeps in the frame of the turning LiDAR, and what they say of what may travel along."""
 
 import math
 from typing import Final
@@ -44,7 +44,7 @@ MIN_PASSED: Final = 2
 MIN_MET: Final = 2
 SETTLED: Final = 3
 """Sweeps that met a point, none against them, after which no other is asked."""
-MIN_SEEDS: Final = 3
+MIN_SEEDS: Final = 6
 NEIGHBOUR_M: Final = 0.9
 SAME_M: Final = 0.2
 SAME_MPS: Final = 0.45
@@ -201,7 +201,7 @@ def _moved(T: F64, p: F64, out: F64) -> None:
 @kernel
 def _under_the_vehicle(p: F64) -> bool:
     """True where the vehicle itself was: what lies there now was not there then."""
-    return LOW_M[0] < p[0] < HIGH_M[0] and LOW_M[1] < p[1] < HIGH_M[1] and LOW_M[2] < p[2] < HIGH_M[2]
+    return bool(LOW_M[0] < p[0] < HIGH_M[0] and LOW_M[1] < p[1] < HIGH_M[1] and LOW_M[2] < p[2] < HIGH_M[2])
 
 
 @kernel
@@ -217,9 +217,13 @@ def compare(
         newest: slot of the newest sweep.
         then: (L,) slots of earlier ones, the farthest first: they tell most.
         ages_s: (L,) how long ago they were.
-        T_now_then, T_then_now: (L, 4, 4) motion of the vehicle since then, and back.
-        images, times_s, twists: `cm`, `column_s` and `twist` of the sweeps by slot.
-        T_vehicle_lidar, T_lidar_vehicle: (4, 4) the mount.
+        T_now_then: (L, 4, 4) motion of the vehicle since then.
+        T_then_now: (L, 4, 4) and back.
+        images: (S, COLUMNS, ROWS) uint16 of `draw_sweep`, by slot.
+        times_s: (S, COLUMNS) float32 of `draw_sweep`.
+        twists: (S, 3) the vehicle's motion during each sweep: forward and left [m/s], yaw rate [rad/s].
+        T_vehicle_lidar: (4, 4) the mount.
+        T_lidar_vehicle: (4, 4) its inverse.
 
     Returns:
         Three (K,) uint8, the number of earlier sweeps in which: something lay at the same place relative to the

@@ -199,7 +199,7 @@ class Localiser:
         return self._motion.yaw_bias_radps
 
     @property
-    def left_out(self) -> int:
+    def points_travelling_along(self) -> int:
         """Sampled points so far that were left out because they travel along with the vehicle."""
         return self._co_moving.left_out
 
@@ -273,6 +273,7 @@ class Localiser:
         else:
             track.wrong = "open"
         self._teacher.see_step(track.held[newest].t_ns, t_ns, odometry.T_before_now, seen, slipped=joint.slipped)
+        self._co_moving.correct(joint.T_before_now)
         sweep = self._sweep_of_steady(scan) if joint.slipped else None
         points = points if sweep is None else self._deskewed(scan, chosen, scan.points_m[chosen], sweep)
         predicted = track.graph.pose(newest) @ joint.T_before_now

@@ -26,10 +26,6 @@ F64 = NDArray[np.float64]
 CONTRADICTED, STILL_CONTRADICTED = 3.0, 1.5  # sigmas at which wheels begin to slip, and above which they still do
 
 
-STANDING_SHARE = 0.25
-"""Of a scan's points must stand above the ground. Rings on open ground keep their place relative to the vehicle: they
-fit wherever it is, best where it stood before, and the vehicle seems to be slower than it is.
-"""
 OFF_GROUND_M, OFF_GROUND_SLOPE = 0.3, 0.02
 
 
@@ -159,7 +155,8 @@ class ScanOdometry:
             return None
         dt_ns, self._before_ns = t_ns - self._before_ns, t_ns
         driven = _Prediction(T_before_now_predicted, sigmas, points_vehicle_m)
-        sees = len(off_the_ground(points_vehicle_m)) >= STANDING_SHARE * len(points_vehicle_m)
+        standing = len(off_the_ground(points_vehicle_m))
+        sees = standing >= self.parameters.min_standing_share * len(points_vehicle_m)
         match = self._matched(driven, self._going_on(dt_ns, points_going_on)) if sees else None
         if sees and match is None and self._slipping and self._steady is not None:
             coasted = self._coast(self._steady, dt_ns, points_vehicle_m)

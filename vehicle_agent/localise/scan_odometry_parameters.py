@@ -45,6 +45,8 @@ class ScanOdometryParameters:
     steady_m, steady_rad: sigmas of going on as in the step before, which is tried where wheels and gyro lead nowhere;
         coast_s: for so long a vehicle with slipping wheels is taken to go on over scans that match nowhere.
     min_fit, min_matching_ratio: a match that fits worse is not given; min_steady_fit: the same when going on as before.
+    min_standing_share: so many of a scan's points must stand above the ground. Rings on open ground keep their place
+        relative to the vehicle: they fit best where it stood before, and it seems to be slower than it is.
     gate_m, gate_deg: how far a step may lie from the prediction, beyond three of its sigmas.
     add_m, add_deg: a scan joins the map when the vehicle has moved so far since the last that did; the first
         `first_scans` join in any case.
@@ -66,6 +68,7 @@ class ScanOdometryParameters:
     min_fit: float = 0.4
     min_steady_fit: float = 0.6
     min_matching_ratio: float = 0.5
+    min_standing_share: float = 0.25
     gate_m: float = 0.08
     gate_deg: float = 0.1
     add_m: float = 1.5
@@ -77,5 +80,7 @@ class ScanOdometryParameters:
     def __post_init__(self) -> None:
         if self.n_points < 100 or min(self.noise_m, self.gate_m, self.gate_deg, self.add_m, self.max_gap_s) <= 0:
             raise ValueError(f"n_points >= 100 and positive gates and steps are required, got {self}")
+        if not 0 <= self.min_standing_share < 1:
+            raise ValueError(f"0 <= min_standing_share < 1 is required, got {self}")
         if not (0 <= self.min_fit <= 1 and 0 <= self.min_matching_ratio <= 1) or self.first_scans < 1:
             raise ValueError(f"shares within 0 ... 1 and first_scans >= 1 are required, got {self}")

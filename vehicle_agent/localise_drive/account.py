@@ -41,6 +41,7 @@ def summary(drive: LocalisedDrive) -> dict[str, Any]:
         "sigma": _sigma(drive.refined),
         "nis": None if counts.nis is None else round(counts.nis, 3),
         "nees": _nees(drive),
+        "points_travelling_along": counts.points_travelling_along,
         "errors": _errors(drive),
         "health": health_shares(stretches),
         "tiles_used": {tile_id.path: version for tile_id, version in sorted(drive.used.items())},

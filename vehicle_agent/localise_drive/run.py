@@ -70,6 +70,8 @@ class Counts:
     calibration: MotionCalibration | None = None
     nis: float | None = None
     """Of matches against the prediction, over degrees of freedom; None without any."""
+    points_travelling_along: int = 0
+    """Sampled points that were left out because they keep their place relative to the vehicle."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -281,6 +283,7 @@ class _Run:
             damage=self._damage,
             calibration=localiser.calibration,
             nis=localiser.innovations.mean,
+            points_travelling_along=localiser.points_travelling_along,
         )
 
 
