@@ -34,7 +34,6 @@ I64 = NDArray[np.int64]
 FARTHEST_M: Final = 60.0  # a far point is moved by more than a patch when odometry turns by a degree or two
 LEAST_SQUARES: Final = 0.25  # added to sum(d^2): where next to nothing differs, nothing is told
 TOLD: Final = 1.0  # sigmas by which poses a little before and behind must fit worse for the map to tell the place along
-INF: Final = float("inf")
 SEEN_BY: Final = 0.3  # least way between two fixes that are remembered, as share of the view
 
 
@@ -209,26 +208,26 @@ class Uniqueness:
         fits = self._fits(points, own, match_map)
 
         def least(others: list[F64]) -> float:
-            against = [self._fits(points, T, match_map) for T in others if self._apart(T, own)]
+            against = [self._fits(points, T, match_map) for T in others]
             return min(
-                (ahead_of_both(fits - fit, patches, high, self._par.full_points) for fit in against), default=INF
+                (ahead_of_both(fits - fit, patches, high, self._par.full_points) for fit in against), default=np.inf
             )
 
         along, across = (self._beside(points, own, match_map, axis) for axis in (0, 1))
         if least(along) >= TOLD:
             self._told_m = self._view.way_m
-        found = min(least(self._elsewhere(points, own, match_map)), least(along), least(across))
-        return found if found < INF else ahead(fits, patches, self._par.full_points)
+        others = [T for T in [*self._elsewhere(points, own, match_map), *along, *across] if self._view.allowed(T, own)]
+        return least(others) if others else ahead(fits, patches, self._par.full_points)
 
     def _elsewhere(self, points: F64, own: F64, match_map: MatchMap) -> list[F64]:
-        """Poses (4, 4) that GNSS allows, as good as registration can make them."""
+        """Other poses (4, 4) about where GNSS says, as good as registration can make them."""
         par, place = self._par, self._view.place
         turn_rad = np.radians(par.turn_deg) if self._view.way_m >= par.course_m else np.pi
         p_m, reach_m = (own[:3, 3], par.reach_m) if place is None else place
         around = Around(p_m, reach_m, _yaw(own), turn_rad)
         found, _ = search(points, around, match_map, self._how, self._registration, points)
         poses = [one.registration.T_map_vehicle for one in found]
-        return [T for T in poses if self._view.allowed(T, own)]
+        return [T for T in poses if self._apart(T, own)]
 
     def _beside(self, points: F64, own: F64, match_map: MatchMap, axis: int) -> list[F64]:
         """The same from a little before and behind (axis 0), or to the left and right (1): a search may leave them out,
@@ -239,7 +238,7 @@ class Uniqueness:
             shift = np.zeros(3)
             shift[axis] = side_m
             poses.append(self._registered(points, own @ T_from_R_t(np.eye(3), shift), match_map, "wide"))
-        return [T for T in poses if T is not None]
+        return [T for T in poses if T is not None and self._apart(T, own)]
 
     def _apart(self, T: F64, own: F64) -> bool:
         off = T_inverse(own) @ T
