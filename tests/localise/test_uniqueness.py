@@ -55,12 +55,13 @@ def drive_beside(scene, off_m, last_x_m, parameters=None):
         moved = pose(STEP_M if k else 0.0, 0.0, 0.0, z=0.0)
         place = Place(np.array([x + 2.0, -1.0, 0.0]), 2.5, 7.5)
         unique.see(seen, moved, pose(x + off_m, 0.0, 0.0), place, maps.near(np.array([x, 0.0, 0.0])))
-        told.append((x, unique.proven, unique.margin, unique.beaten))
+        told.append((x, unique.proven, unique.margin, unique.beaten, unique.untold_m))
     return told
 
 
 def test_equal_pillars_prove_nothing_before_the_odd_ones_are_seen(row):
     told = drive_beside(row, 0.0, 62.0)
+    assert told[-1][4] == 0.0  # pillars tell the place along, if not which
     first = min(x for x, proven, *_ in told if proven)
     assert first > ODD_FROM_M - REACH_M
     assert first < 62.0
@@ -107,6 +108,7 @@ def test_a_smooth_corridor_proves_nothing_but_does_not_take_a_proof_away():
         see(float(x))
     assert unique.proven
     assert abs(unique.margin) < 2.0
+    assert unique.untold_m > 30.0  # odometry alone knows the place along
     unique.distrust(moved=True)
     assert not unique.proven
 
@@ -239,7 +241,9 @@ def test_the_localiser_calls_no_pose_good_before_it_has_seen_that_it_is_the_only
         assert online[-1][2] == "good"
 
 
-@pytest.mark.parametrize("bad", [{"won": 0.0}, {"way_m": float("nan")}, {"n_kept": 99}, {"every_m": 30.0}])
+@pytest.mark.parametrize(
+    "bad", [{"won": 0.0}, {"won": 4.0}, {"way_m": float("nan")}, {"n_kept": 99}, {"every_m": 30.0}]
+)
 def test_parameters_check_themselves(bad):
     with pytest.raises(ValueError, match=r"required|positive"):
         UniquenessParameters(**bad)

@@ -406,13 +406,21 @@ class Localiser:
     def _hold(self, track: _Track, scan: Scan, matching_ratio: float, sweep: Trajectory | None = None) -> None:
         """Keep the scan until its pose is final, and tell the online pose."""
         t_ns, number = _reference_ns(scan), track.graph.newest
-        pose, monitor = track.graph.smoothed(number)[0], track.judge.monitor
+        pose, monitor = self._drifted(track, track.graph.smoothed(number)[0]), track.judge.monitor
         sigma_m, sigma_rad = _sigmas(pose)
         monitor.see_sigma(sigma_m, sigma_rad)
         health, cause = self._with_mount(*monitor.judge(t_ns))
         held = _HeldScan(pack(scan), sweep, t_ns, matching_ratio, health, cause, monitor.degenerate, pose)
         track.held[number] = held
         self.online = _estimate(self._trimmed(pose), held)
+
+    def _drifted(self, track: _Track, pose: SmoothedPose) -> SmoothedPose:
+        """The pose with what wheels may be off by since the map last told the place along. The graph takes their
+        errors for independent from step to step; the scale's are not.
+        """
+        along = np.zeros(6)
+        along[3] = (self._teacher.uncertainty[0] * track.judge.uniqueness.untold_m) ** 2
+        return replace(pose, covariance=pose.covariance + np.diag(along))
 
     def _refine(
         self,

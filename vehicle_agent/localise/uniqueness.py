@@ -33,6 +33,7 @@ I64 = NDArray[np.int64]
 
 FARTHEST_M: Final = 60.0  # a far point is moved by more than a patch when odometry turns by a degree or two
 LEAST_SQUARES: Final = 0.25  # added to sum(d^2): where next to nothing differs, nothing is told
+TOLD: Final = 1.0  # sigmas by which poses a little before and behind must fit worse for the map to tell the place along
 SEEN_BY: Final = 0.3  # least way between two fixes that are remembered, as share of the view
 
 
@@ -137,18 +138,20 @@ class Uniqueness:
         self.margin = 0.0
         """Sigmas by which the tracked pose was ahead of the best other one at the last test."""
         self._view = View(par.way_m, par.every_m, par.n_points)
-        self._beaten = 0  # tests in a row
+        self._beaten = self._ahead = 0  # tests in a row
         self._next_m = 0.0  # odometer of the next test
+        self._tested_m = self._told_m = 0.0  # odometer of the last test, and of the last that told the place along
 
     def distrust(self, *, moved: bool) -> None:
         """The pose must be proven again; `moved`: odometry does not know either how it has come here."""
         if not self._par.enabled:
             return
         if self.proven:
-            self.proven, self._beaten, self._next_m = False, 0, self._view.way_m
+            self.proven, self._ahead, self._beaten, self._next_m = False, 0, 0, self._view.way_m
         if moved:
             self._view = View(self._par.way_m, self._par.every_m, self._par.n_points)
             self._next_m = self._par.every_m
+            self._tested_m = self._told_m = 0.0
 
     def see(
         self, standing_m: F64, T_before_now: F64, T_tracked: F64, place: Place | None, match_map: MatchMap,
@@ -170,8 +173,14 @@ class Uniqueness:
         if place is not None:
             self._view.see_position(place.p_map_m, place.reach_m)
         if believed and self._view.way_m >= self._next_m:
+            self._tested_m = self._view.way_m
             self.margin = self._tested(T_tracked, match_map)
             self._conclude()
+
+    @property
+    def untold_m(self) -> float:
+        """Way since the map last told the place along it: in a smooth tunnel odometry alone knows it."""
+        return self._view.way_m - self._told_m if self._told_m < self._tested_m else 0.0
 
     @property
     def beaten(self) -> bool:
@@ -181,7 +190,9 @@ class Uniqueness:
     def _conclude(self) -> None:
         par = self._par
         self._beaten = self._beaten + 1 if self.margin <= -par.lost else 0
-        self.proven = (self.proven or self.margin >= par.won) and not self.beaten
+        self._ahead = self._ahead + 1 if self.margin >= par.won else 0
+        won = self._ahead >= 2 or self.margin >= par.won_at_once
+        self.proven = (self.proven or won) and not self.beaten
         steady = self.proven and not self._beaten
         self._next_m = self._view.way_m + (par.proven_m if steady else par.unproven_m)
 
@@ -191,26 +202,43 @@ class Uniqueness:
         own = self._registered(points, T_tracked, match_map, "near")
         if own is None:
             return 0.0
-        patches = patches_of(points, self._par.patch_m)
+        if self._apart(own, T_tracked):
+            own = T_tracked  # what it was drawn to is another pose
+        patches, high = patches_of(points, self._par.patch_m), points[:, 2] > self._par.high_m
         fits = self._fits(points, own, match_map)
-        others = self._others(points, own, match_map)
-        against = [self._fits(points, T, match_map) for T in others] or [np.zeros(len(points))]
-        high = points[:, 2] > self._par.high_m
-        return min(ahead_of_both(fits - other, patches, high, self._par.full_points) for other in against)
 
-    def _others(self, points: F64, own: F64, match_map: MatchMap) -> list[F64]:
-        """Poses (4, 4) elsewhere, as good as registration can make them."""
+        def least(others: list[F64]) -> float:
+            against = [self._fits(points, T, match_map) for T in others]
+            return min(
+                (ahead_of_both(fits - fit, patches, high, self._par.full_points) for fit in against), default=np.inf
+            )
+
+        along, across = (self._beside(points, own, match_map, axis) for axis in (0, 1))
+        if least(along) >= TOLD:
+            self._told_m = self._view.way_m
+        others = [T for T in [*self._elsewhere(points, own, match_map), *along, *across] if self._view.allowed(T, own)]
+        return least(others) if others else ahead(fits, patches, self._par.full_points)
+
+    def _elsewhere(self, points: F64, own: F64, match_map: MatchMap) -> list[F64]:
+        """Other poses (4, 4) about where GNSS says, as good as registration can make them."""
         par, place = self._par, self._view.place
         turn_rad = np.radians(par.turn_deg) if self._view.way_m >= par.course_m else np.pi
         p_m, reach_m = (own[:3, 3], par.reach_m) if place is None else place
         around = Around(p_m, reach_m, _yaw(own), turn_rad)
         found, _ = search(points, around, match_map, self._how, self._registration, points)
-        tried = [one.registration.T_map_vehicle for one in found]
-        for x, y in ((1, 0), (-1, 0), (0, 1), (0, -1)):
-            beside = own @ T_from_R_t(np.eye(3), [x * par.beside_m, y * par.beside_m, 0.0])
-            T = self._registered(points, beside, match_map, "wide")
-            tried += [] if T is None else [T]
-        return [T for T in tried if self._apart(T, own) and self._view.allowed(T, own)]
+        poses = [one.registration.T_map_vehicle for one in found]
+        return [T for T in poses if self._apart(T, own)]
+
+    def _beside(self, points: F64, own: F64, match_map: MatchMap, axis: int) -> list[F64]:
+        """The same from a little before and behind (axis 0), or to the left and right (1): a search may leave them out,
+        and where the map does not tell the place along that axis, they stay there.
+        """
+        poses = []
+        for side_m in (self._par.beside_m, -self._par.beside_m):
+            shift = np.zeros(3)
+            shift[axis] = side_m
+            poses.append(self._registered(points, own @ T_from_R_t(np.eye(3), shift), match_map, "wide"))
+        return [T for T in poses if T is not None and self._apart(T, own)]
 
     def _apart(self, T: F64, own: F64) -> bool:
         off = T_inverse(own) @ T

@@ -16,8 +16,8 @@ class UniquenessParameters:
         headings within this of the tracked one, all as long as less than `course_m` have been driven.
     n_refined, n_kept: other poses tried by registration, and kept; apart_m, apart_deg: two poses nearer are one;
         beside_m: so far along and across from the tracked pose others are tried that a search might leave out.
-    won: by how many sigmas the pose must beat each other one to be proven. lost: by how many it must be beaten, twice
-        in a row, to be no longer so.
+    won, won_at_once: by how many sigmas the pose must beat each other one to be proven: twice in a row, or at once.
+        lost: by how many it must be beaten, twice in a row, to be no longer so.
     """
 
     enabled: bool = True
@@ -38,12 +38,13 @@ class UniquenessParameters:
     apart_m: float = 0.4
     apart_deg: float = 1.5
     beside_m: float = 1.5
-    won: float = 3.0
+    won: float = 2.5
+    won_at_once: float = 3.0
     lost: float = 3.0
 
     def __post_init__(self) -> None:
         numbers = [value for name in self.__slots__ if name != "enabled" and (value := getattr(self, name)) is not None]
         if not min(numbers) > 0:  # false for NaN too
             raise ValueError(f"all must be positive, got {self}")
-        if self.every_m > self.way_m or self.n_kept > self.n_refined:
-            raise ValueError(f"every_m <= way_m and n_kept <= n_refined are required, got {self}")
+        if self.every_m > self.way_m or self.n_kept > self.n_refined or self.won > self.won_at_once:
+            raise ValueError(f"every_m <= way_m, n_kept <= n_refined and won <= won_at_once are required, got {self}")
