@@ -147,3 +147,59 @@ def test_directions_have_names():
 def test_settings_that_make_no_sense_are_refused():
     with pytest.raises(ValueError, match="positive"):
         CauseParameters(testimonies=0)
+
+
+def elsewhere(monitor, t_ns, fit):
+    result = match(fit=fit, off_m=0.7)
+    believed = follow(monitor, t_ns, result)
+    assert not believed
+    monitor.see_verdict(result, believed)
+
+
+def test_scans_that_fit_elsewhere_one_after_the_other_dispute_the_pose(monitor):
+    elsewhere(monitor, S, 0.95)
+    assert monitor.judge(S) == ("good", "none")  # one may be a scan's own error
+    elsewhere(monitor, S + S // 10, 0.95)
+    assert monitor.judge(S + S // 10) == ("degraded", "wrong_pose")
+
+
+def test_what_submaps_are_certain_of_is_disputed_by_scans_that_fit_wholly_or_for_long(monitor):
+    monitor.certain = True
+    for k in range(3):
+        elsewhere(monitor, S + k, 0.7)
+    assert monitor.judge(S + 3)[0] == "good"
+    elsewhere(monitor, S + 3, 0.7)
+    assert monitor.judge(S + 3) == ("degraded", "wrong_pose")
+
+
+def test_scans_that_fit_wholly_dispute_a_certain_pose_at_once(monitor):
+    monitor.certain = True
+    for k in range(2):
+        elsewhere(monitor, S + k, 0.95)
+    assert monitor.judge(S + 2) == ("degraded", "wrong_pose")
+
+
+def test_matches_that_are_believed_settle_the_dispute(monitor):
+    for k in range(2):
+        elsewhere(monitor, S + k, 0.95)
+    assert follow(monitor, S + 3)
+    monitor.see_verdict(match(), True)
+    assert monitor.judge(S + 3) == ("good", "none")
+
+
+def test_a_first_pose_with_a_rival_nearby_must_agree_with_the_next_scans():
+    monitor = HealthMonitor(HealthParameters(), 0)
+    monitor.prove_first()
+    said = []
+    for k in range(4):
+        follow(monitor, k)
+        monitor.see_verdict(match(), True)
+        said.append(monitor.judge(k)[0])
+    assert said == ["degraded", "degraded", "good", "good"]
+
+
+def test_a_scan_that_fits_nothing_disputes_nothing(monitor):
+    for _k in range(6):
+        monitor.see_verdict(match(fit=0.3, off_m=0.7), False)
+        monitor.see_verdict(None, False)
+    assert not monitor.disputed

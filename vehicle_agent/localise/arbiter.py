@@ -42,11 +42,11 @@ def who_is_wrong(
     """Say whose motion the matches contradict.
 
     Args:
-        T_map_before: (4, 4) pose of the scan before; covariance: its (6, 6).
+        T_map_before: (4, 4) pose of the scan before.
         covariance: (6, 6) of that pose, rotation [rad] first, vehicle frame.
         driven: by wheels and gyro.
         seen: by the scans.
-        matches: of the newest scan, begun where either motion leads to. Two that lie apart and fit alike decide nothing.
+        matches: of the newest scan, begun where either motion leads to. Two apart that fit alike decide nothing.
     """
     converged = sorted((one for one in matches if one.converged), key=lambda one: -one.fit)
     if not converged or _rivals(converged):

@@ -79,7 +79,7 @@ class HealthMonitor:
         self._better_elsewhere = self._better_elsewhere + 1 if better else 0
 
     def see_verdict(self, result: RegistrationResult | None, believed: bool) -> None:
-        """Take whether the scan's match was believed. One that fits well and lies elsewhere is evidence against the pose:
+        """Take whether the scan's match was believed. One that fits well and lies elsewhere speaks against the pose:
         odometry that goes wrong in small steps looks like that, and so does a first pose at a neighbouring minimum.
         """
         if believed:
@@ -94,8 +94,8 @@ class HealthMonitor:
 
     @property
     def disputed(self) -> bool:
-        """True when scans fit well elsewhere, one after the other. Where submaps are certain it takes longer, unless the
-        scans fit with nearly all their points: where the world has changed, they do not.
+        """True when scans fit well elsewhere, one after the other. Where submaps are certain it takes longer, unless
+        the scans fit with nearly all their points: where the world has changed, they do not.
         """
         return self._disputes >= (DISPUTED if self._full or not self.certain else MOST_DISPUTES)
 

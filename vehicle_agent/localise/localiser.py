@@ -26,7 +26,7 @@ from vehicle_agent.localise.judge import Judge, Matched
 from vehicle_agent.localise.level import on_the_road, sees_tilt, settled
 from vehicle_agent.localise.match_map import MatchMapCache
 from vehicle_agent.localise.mount import near_points
-from vehicle_agent.localise.neighbours import FAR_M, hedged
+from vehicle_agent.localise.neighbours import FAR_M, UNSURE_M, hedged, weakest
 from vehicle_agent.localise.odometry import MotionBuffer
 from vehicle_agent.localise.packed_scan import PackedScan, pack
 from vehicle_agent.localise.parameters import LocaliserParameters
@@ -494,14 +494,14 @@ class Localiser:
         self._scan_odometry.begin(t_ns, points)
 
     def _hedged_first(self, points: F64, result: RegistrationResult) -> tuple[F64, bool]:
-        """The covariance (6, 6) of a first pose, and whether a neighbouring minimum fits as well. One that was told is
-        no match, and has no neighbours.
+        """The covariance (6, 6) of a first pose, and whether it must be proven: a neighbouring minimum fits as well, or
+        so little holds it that there may be one elsewhere. One that was told is no match, and has no neighbours.
         """
         if not result.iterations:
             return result.covariance, False
         near = self._map.near(result.T_map_vehicle[:3, 3])
         known, contested = hedged(points, result, near, self.parameters.registration, FAR_M)
-        return known.covariance, contested
+        return known.covariance, contested or weakest(result)[0] > UNSURE_M
 
     def _new_refiner(self) -> Refiner | None:
         par = self.parameters

@@ -21,6 +21,8 @@ F64 = NDArray[np.float64]
 
 WEAK_M: Final = 0.05
 """One sigma of the weakest horizontal direction from which on its neighbours are tried beside a tracked pose."""
+UNSURE_M: Final = 0.03
+"""The same of a first pose from which on it must agree with the scans to come."""
 NEAR_M: Final = (0.4,)
 FAR_M: Final = (0.4, 0.8)
 """Starts along that direction, either way: beside a tracked pose, and beside one that was found by search."""
@@ -46,7 +48,7 @@ def hedged(
         parameters: that it was made with.
         starts_m: how far off the neighbours are begun.
     """
-    sigma_m, weak = _weakest(result)
+    sigma_m, weak = weakest(result)
     tracked = starts_m == NEAR_M
     if (tracked and sigma_m < WEAK_M) or not result.converged or len(result.degenerate):
         return result, False
@@ -63,7 +65,7 @@ def hedged(
     return replace(result, covariance=result.covariance + np.outer(far, far)), True
 
 
-def _weakest(result: RegistrationResult) -> tuple[float, F64]:
+def weakest(result: RegistrationResult) -> tuple[float, F64]:
     """One sigma [m], and the direction (2,) in the vehicle frame, of the weakest horizontal one."""
     values, vectors = np.linalg.eigh(result.covariance[3:5, 3:5])
     return float(np.sqrt(values[1])), np.asarray(vectors[:, 1])

@@ -292,7 +292,8 @@ class Refiner:
         for (before, now), measured in zip(pairwise(scans), steps, strict=True):
             if now.t_ns <= since_ns:
                 continue
-            assert before.knot is not None and now.knot is not None
+            assert before.knot is not None
+            assert now.knot is not None
             relative = T_inverse(before.knot.T_map_vehicle) @ now.knot.T_map_vehicle
             if len(measured) < 2 or not _agrees(measured[-1], relative):
                 return False
