@@ -47,6 +47,8 @@ MOUNTED_M, MOUNTED_RAD, TRIMMED_RAD = 0.003, np.radians(0.02), np.radians(0.004)
 """One sigma of a mount that is as told: position, and yaw; of the axle's own course (tyres, the road's camber) once
 that tells the yaw. All scans share it.
 """
+COURSE_RAD: Final = np.radians(0.012)
+"""One sigma of the course where a pose's own covariance does not hold it: that of online poses."""
 SWEPT_NS = 100_000_000
 POSE_SHARE = 0.25
 """Of what distortion moves a point by, as far as it moves a pose, which is held by points all around."""
@@ -493,9 +495,9 @@ class Localiser:
         """
         turned_rad = self._teacher.trim_rad if self.parameters.refine.enabled else 0.0
         turn = T_from_R_t(exp_so3(np.array([0.0, 0.0, turned_rad])), np.zeros(3))
-        yaw_rad, scale = TRIMMED_RAD if turned_rad else MOUNTED_RAD, np.ones(6)
+        yaw_rad, scale = COURSE_RAD if turned_rad else MOUNTED_RAD, np.ones(6)
         if turned_rad and pose.axle_variance is not None:
-            scale[2] = np.sqrt(pose.axle_variance / pose.covariance[2, 2])
+            yaw_rad, scale[2] = TRIMMED_RAD, np.sqrt(pose.axle_variance / pose.covariance[2, 2])
         variance = np.array([0.0, 0.0, yaw_rad, MOUNTED_M, MOUNTED_M, 0.0]) ** 2
         covariance = scale[:, None] * pose.covariance * scale + np.diag(variance)
         return replace(pose, T_map_vehicle=pose.T_map_vehicle @ turn, covariance=covariance)

@@ -406,7 +406,7 @@ class Refiner:
         if self._solved is None:
             return covariance
         grown = np.ones(6)
-        grown[2:5] = np.sqrt(self._solved.seen)
+        grown[2:5] = np.sqrt(np.maximum(self._solved.seen, 1.0))  # the stretch leaves out what draws single scans
         return np.asarray(grown[:, None] * covariance * grown)
 
     def _is_certain(self, covariance: F64) -> bool:
