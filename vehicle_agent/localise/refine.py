@@ -393,6 +393,7 @@ class Refiner:
         assert self._solved is not None
         grown, matched = np.full(6, max(1.0, self._solved.misfit)), self._solved.matched
         odometry = np.clip(self._squares / self._redundancy / self._step_variance, LEAST_VARIANCE, 1.0)
+        odometry[3:5] = 1.0  # along a tunnel the steps agree with each other and drift together
         grown[2:5] *= self._solved.seen * matched + odometry[2:5] * (1.0 - matched)
         return grown
 
