@@ -39,7 +39,8 @@ class Position(NamedTuple):
 @dataclass(frozen=True, slots=True, eq=False)
 class SmoothedPose:
     """A pose of the graph: number, time, (4, 4) T_map_vehicle and (6, 6) covariance (rotation first, vehicle frame);
-    certain: submaps leave no doubt about it.
+    certain: submaps leave no doubt about it; axle_variance: of the direction in which the rear axle drives [rad²],
+    where it is known better than that of the LiDAR.
     """
 
     number: int
@@ -47,6 +48,7 @@ class SmoothedPose:
     T_map_vehicle: F64
     covariance: F64
     certain: bool = False
+    axle_variance: float | None = None
 
 
 class PoseGraph:

@@ -205,3 +205,48 @@ def point_fits(
         row, m2 = _nearest(q0, q1, q2, int(gx), int(gy), int(gz), index, mean, omega, gate_m2)
         if row >= 0 and index[int(gx), int(gy), int(gz)] >= -1:
             fits[n] = scale2 / (scale2 + m2)
+
+
+@kernel
+def pulls(
+    points: F64, R: F64, t: F64, index: I32, A: F64, b: F64, mean: F64, omega: F64, scale2: float, gate_m2: float,
+    along: F64, pull: F64, weight: F64,
+) -> None:  # fmt: skip
+    """Add the slope of the cost along D motions, and its curvature, Gaussian by Gaussian.
+
+    What is not named here is as in `linearise`. along: (D, 6) motions, each a turn about the vehicle and a shift along
+    map axes, rotation first. pull: (M, D), added to: w u' Omega d, with u the motion of a point. weight: (M, D), added
+    to: w u' Omega u.
+    """
+    nx, ny, nz = index.shape
+    for n in range(points.shape[0]):
+        p0, p1, p2 = points[n, 0], points[n, 1], points[n, 2]
+        a0 = R[0, 0] * p0 + R[0, 1] * p1 + R[0, 2] * p2
+        a1 = R[1, 0] * p0 + R[1, 1] * p1 + R[1, 2] * p2
+        a2 = R[2, 0] * p0 + R[2, 1] * p1 + R[2, 2] * p2
+        q0, q1, q2 = a0 + t[0], a1 + t[1], a2 + t[2]
+        gx = A[0, 0] * q0 + A[0, 1] * q1 + A[0, 2] * q2 + b[0]
+        gy = A[1, 0] * q0 + A[1, 1] * q1 + A[1, 2] * q2 + b[1]
+        gz = A[2, 0] * q0 + A[2, 1] * q1 + A[2, 2] * q2 + b[2]
+        if not (1.0 <= gx < nx - 1 and 1.0 <= gy < ny - 1 and 1.0 <= gz < nz - 1):
+            continue
+        ix, iy, iz = int(gx), int(gy), int(gz)
+        if index[ix, iy, iz] < -1:
+            continue
+        row, m2 = _nearest(q0, q1, q2, ix, iy, iz, index, mean, omega, gate_m2)
+        if row < 0:
+            continue
+        o, s = omega[row], scale2 / (scale2 + m2)
+        d0, d1, d2 = q0 - mean[row, 0], q1 - mean[row, 1], q2 - mean[row, 2]
+        f0, f1, f2 = (
+            o[0] * d0 + o[1] * d1 + o[2] * d2,
+            o[1] * d0 + o[3] * d1 + o[4] * d2,
+            o[2] * d0 + o[4] * d1 + o[5] * d2,
+        )
+        for k in range(along.shape[0]):
+            w = along[k]
+            u0 = w[1] * a2 - w[2] * a1 + w[3]
+            u1 = w[2] * a0 - w[0] * a2 + w[4]
+            u2 = w[0] * a1 - w[1] * a0 + w[5]
+            pull[row, k] += s * s * (u0 * f0 + u1 * f1 + u2 * f2)
+            weight[row, k] += s * s * _mahalanobis2(o, u0, u1, u2)

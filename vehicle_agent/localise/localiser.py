@@ -47,18 +47,24 @@ OVERRULED: Final[tuple[Cause, ...]] = ("wrong_pose", "stale_map", "poor_place", 
 """What single scans hold against a pose and submaps may know better."""
 DISPUTED_CHI2 = 21.1  # of heading and place, three degrees of freedom: 99.99 %
 DISPUTED_VARIANCE = np.array([np.radians(0.1), 0.02, 0.02]) ** 2  # what online poses are wrong by in changed places
-MOUNTED_M, MOUNTED_RAD, TRIMMED_RAD = 0.005, np.radians(0.03), np.radians(0.012)
-"""One sigma of a mount that is as told: position, yaw, and yaw once the course has told it. All scans share it."""
+MOUNTED_M, MOUNTED_RAD, TRIMMED_RAD = 0.003, np.radians(0.02), np.radians(0.004)
+"""One sigma of a mount that is as told: position, and yaw; of the axle's own course (tyres, the road's camber) once
+that tells the yaw. All scans share it.
+"""
+COURSE_RAD: Final = np.radians(0.012)
+"""One sigma of the course where a pose's own covariance does not hold it: that of online poses."""
 SWEPT_NS = 100_000_000
 POSE_SHARE = 0.25
 """Of what distortion moves a point by, as far as it moves a pose, which is held by points all around."""
+SURE: Final = np.zeros(3)
 PAST_NS, MOST_FROM_PAST = 1_000_000_000, 5
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _HeldScan:
     """A scan in the lag: what is needed to make it final, and how its match went. `sweep` is the motion during the
-    sweep where it is not the one that wheels and gyro tell; `online` the pose as it was when the scan came.
+    sweep where it is not the one that wheels and gyro tell; `online` the pose as it was when the scan came; `unsure`
+    (3,) variance of the sweep's motion forward, left and in yaw.
     """
 
     scan: PackedScan
@@ -69,6 +75,7 @@ class _HeldScan:
     cause: Cause
     degenerate: tuple[str, ...]
     online: SmoothedPose
+    unsure: F64
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -275,12 +282,13 @@ class Localiser:
         self._teacher.see_step(track.held[newest].t_ns, t_ns, odometry.T_before_now, seen, slipped=joint.slipped)
         self._co_moving.correct(joint.T_before_now)
         sweep = self._sweep_of_steady(scan) if joint.slipped else None
+        unsure = _unsure(odometry.T_before_now, seen, (_end_ns(scan) - scan.t_ns) / (t_ns - track.held[newest].t_ns))
         points = points if sweep is None else self._deskewed(scan, chosen, scan.points_m[chosen], sweep)
         predicted = track.graph.pose(newest) @ joint.T_before_now
         result, believed = self._matched(track.judge.monitor, points, predicted, reach, t_ns)
         match = None
         if result is not None and believed:
-            match = MapMatch(result.T_map_vehicle, result.covariance + self._distorted(t_ns))
+            match = MapMatch(result.T_map_vehicle, result.covariance + self._distorted(t_ns, unsure))
             before = np.diag(np.square(joint.driven_sigmas)) + track.held[newest].online.covariance
             self.innovations.see(predicted, before, *match)
             if joint.slipped:
@@ -295,7 +303,7 @@ class Localiser:
         )
         track.judge.see(seen_scan, self._map.near(T_now[:3, 3]))
         final = track.graph.add(t_ns, predicted, odometry, match or self._settled(predicted), gnss, seen)
-        self._hold(track, scan, result.matching_ratio if result is not None else 0.0, sweep)
+        self._hold(track, scan, result.matching_ratio if result is not None else 0.0, sweep, unsure)
         if track.refiner is not None:
             final = self._refine(track, track.refiner, t_ns, points, joint.T_before_now, seen)
         self._finalise(track, final)
@@ -403,14 +411,23 @@ class Localiser:
         frame = self.local_map.grid_frame.frame
         return frame.enu_from_geodetic(fix.lat_rad, fix.lon_rad, fix.height_m).reshape(3)
 
-    def _hold(self, track: _Track, scan: Scan, matching_ratio: float, sweep: Trajectory | None = None) -> None:
+    def _hold(
+        self,
+        track: _Track,
+        scan: Scan,
+        matching_ratio: float,
+        sweep: Trajectory | None = None,
+        unsure: F64 = SURE,
+    ) -> None:
         """Keep the scan until its pose is final, and tell the online pose."""
         t_ns, number = _reference_ns(scan), track.graph.newest
         pose, monitor = self._drifted(track, track.graph.smoothed(number)[0]), track.judge.monitor
+        if track.refiner is not None:
+            pose = replace(pose, covariance=track.refiner.as_seen(pose.covariance) + _left_in(unsure))
         sigma_m, sigma_rad = _sigmas(pose)
         monitor.see_sigma(sigma_m, sigma_rad)
         health, cause = self._with_mount(*monitor.judge(t_ns))
-        held = _HeldScan(pack(scan), sweep, t_ns, matching_ratio, health, cause, monitor.degenerate, pose)
+        held = _HeldScan(pack(scan), sweep, t_ns, matching_ratio, health, cause, monitor.degenerate, pose, unsure)
         track.held[number] = held
         self.online = _estimate(self._trimmed(pose), held)
 
@@ -576,7 +593,7 @@ class Localiser:
             pose = on_the_road(pose, m, self.parameters.registration, wheels_m)
         sweep = self._motion.trajectory(scan.t_ns, scan.end_ns) if held.sweep is None else held.sweep
         ends, starts = scan.placed(sweep, self._mounting.T_used, held.t_ns, pose.T_map_vehicle)
-        pose = replace(pose, covariance=pose.covariance + self._distorted(held.t_ns))
+        pose = replace(pose, covariance=pose.covariance + self._distorted(held.t_ns, held.unsure))
         estimate = replace(_estimate(self._trimmed(pose), held), disagrees=disagrees)
         if held.cause == "mount":  # the scan came before the mount was known
             estimate = replace(estimate, health="good", cause="none")
@@ -586,14 +603,16 @@ class Localiser:
             estimate = replace(estimate, health="degraded", cause="disputed")
         return RefinedScan(held.t_ns, ends, starts, estimate)
 
-    def _distorted(self, t_ns: int) -> F64:
-        """(6, 6) what motion that is left in a sweep adds to a pose: all points agree on a wrong one."""
-        variance = np.zeros(6)
+    def _distorted(self, t_ns: int, unsure: F64) -> F64:
+        """(6, 6) what motion that is left in a sweep adds to a pose: all points agree on a wrong one. `unsure`: (3,)
+        variance of the sweep's motion, beside what is known of its times.
+        """
+        variance = np.diag(_left_in(unsure)).copy()
         if self._distortion is not None and len(self._motion):
             before = self._motion.delta(t_ns - SWEPT_NS, t_ns)
             dt_s = SWEPT_NS * 1e-9
             sigma = self._distortion(before[0, 3] / dt_s, float(np.arctan2(before[1, 0], before[0, 0])) / dt_s)
-            variance[[3, 4, 2]] = np.square(sigma) * POSE_SHARE**2
+            variance[[3, 4, 2]] += np.square(sigma) * POSE_SHARE**2
         return np.diag(variance)
 
     def _trimmed(self, pose: SmoothedPose) -> SmoothedPose:
@@ -601,13 +620,15 @@ class Localiser:
         mount in use: the LiDAR stays where it is, the heading is the one that the rear axle drives along. The
         covariance holds what neither scans nor map can know of the mount, with its lever arm.
         """
-        trim_rad = self._trim_rad
-        yaw_rad = self._teacher.yaw_sigma_rad(trim_rad, TRIMMED_RAD if trim_rad else MOUNTED_RAD)
+        trim_rad, scale = self._trim_rad, np.ones(6)
+        least_rad = COURSE_RAD if trim_rad else MOUNTED_RAD
+        if trim_rad and pose.axle_variance is not None:
+            least_rad, scale[2] = TRIMMED_RAD, np.sqrt(pose.axle_variance / pose.covariance[2, 2])
         T = pose.T_map_vehicle @ self._mounting.T_used_vehicle(-trim_rad)
         place = np.diag(np.array([0.0, 0.0, 0.0, MOUNTED_M, MOUNTED_M, 0.0]) ** 2)
-        variance = np.append(self._mounting.tilt_variance_rad2(), yaw_rad**2)
+        variance = np.append(self._mounting.tilt_variance_rad2(), self._teacher.yaw_sigma_rad(trim_rad, least_rad) ** 2)
         mounted = place + lever_covariance(self._mounting.T_vehicle_lidar()[:3, 3], variance)
-        return replace(pose, T_map_vehicle=T, covariance=pose.covariance + mounted)
+        return replace(pose, T_map_vehicle=T, covariance=scale[:, None] * pose.covariance * scale + mounted)
 
     @property
     def _trim_rad(self) -> float:
@@ -646,6 +667,23 @@ def _end_ns(scan: Scan) -> int:
 def _reference_ns(scan: Scan) -> int:
     """The middle of the sweep: what the motion is wrong by is shared by both halves."""
     return (scan.t_ns + _end_ns(scan)) // 2
+
+
+def _unsure(T_driven: F64, seen: ScanStep | None, share: float) -> F64:
+    """(3,) variance, forward, left and in yaw, of a sweep's motion that was taken off its points: what wheels and gyro
+    (4, 4) differ from the scans by since the scan before, more than scans are uncertain; a sweep is a `share` of that.
+    """
+    if seen is None:
+        return SURE
+    off = log_se3(T_inverse(T_driven) @ seen.T_before_now)
+    return np.asarray(np.maximum(off**2 - np.diag(seen.covariance), 0.0)[[3, 4, 2]] * min(share, 1.0) ** 2)
+
+
+def _left_in(unsure: F64) -> F64:
+    """(6, 6) what that does to a pose: points were measured at any time of the sweep, and its middle is right."""
+    variance = np.zeros(6)
+    variance[[3, 4, 2]] = unsure * POSE_SHARE**2 / 12.0
+    return np.diag(variance)
 
 
 def _settled_dispute(refined: SmoothedPose, online: SmoothedPose) -> tuple[SmoothedPose, bool]:

@@ -34,6 +34,7 @@ from vehicle_agent.localise.stretch import (
     Step,
     log_se3,
     marginalised,
+    residual,
     shared_of,
     solve_stretch,
 )
@@ -48,6 +49,9 @@ FIRST_SIGMA_M, FIRST_SIGMA_RAD = 0.5, 0.02  # of the online pose that the first 
 FORGETTING: Final = 0.7
 """Weight of what was seen of the odometry until the last solution."""
 WORST_VARIANCE: Final = 1e4
+LEAST_VARIANCE: Final = 0.1
+WINDOW: Final = 8
+"""Steps over which wheels and gyro are compared with scans: the error of the latter does not grow with the way."""
 FIRM_AFTER_SLIP: Final = 2
 """As if so many had fitted well so far: rivals of single scans have a say for some metres."""
 SEEN_SIGMA_M: Final = 0.025
@@ -250,11 +254,17 @@ class Refiner:
             for one, other in zip(driven, seen, strict=True)
         ]
 
-    def _judge_steps(self, solved: Solved) -> None:
-        """How much worse than assumed wheels and gyro are, axis by axis, as map and scans together see it."""
+    def _judge_steps(self, solved: Solved, steps: Sequence[Sequence[Step]], off: F64) -> None:
+        """How much worse than assumed wheels and gyro are, axis by axis, as map and scans together see it.
+
+        Where map and odometry disagree either may be worse than it claims, and the stretch that trusts one finds its
+        fault with the other. Steps from scan to scan know no map: wheels and gyro are no worse than they say.
+        `off`: (N_SHARED,) what the shared parameters differ by from those that the steps were made with.
+        """
         self._squares = FORGETTING * self._squares + solved.step_squares * self._step_variance
         self._redundancy = FORGETTING * self._redundancy + solved.step_redundancy
-        self._step_variance = np.clip(self._squares / self._redundancy, 1.0, WORST_VARIANCE)
+        worst = np.minimum(WORST_VARIANCE, np.maximum(told_by_scans(steps, off) * self._step_variance, 1.0))
+        self._step_variance = np.clip(self._squares / self._redundancy, 1.0, worst)
 
     def _solve(self) -> None:
         """Place all scans of the stretch anew, let wheels and gyro learn from it, and let go of its old scans."""
@@ -269,7 +279,7 @@ class Refiner:
         self._solved = solve_stretch(
             knots, steps, belief, match_map, self.registration, par.scales if known else par.first_scales
         )
-        self._judge_steps(self._solved)
+        self._judge_steps(self._solved, steps, self._solved.shared - belief.shared)
         self._news, self._solutions = True, self._solutions + 1
         newest = self._scans[-1]
         before_ns = self._solved_ns
@@ -312,7 +322,11 @@ class Refiner:
         knots = [scan.knot for scan in scans[: first + 1] if scan.knot is not None]
         kept = marginalised(knots, steps[:first], belief, solved.shared, self.registration)
         self._solved = replace(
-            solved, covariance=solved.covariance[first:], fit=solved.fit[first:], known=solved.known[first:]
+            solved,
+            covariance=solved.covariance[first:],
+            axle_variance=solved.axle_variance[first:],
+            fit=solved.fit[first:],
+            known=solved.known[first:],
         )
         gone = self._index(scans[first])
         self._scans, self._final = self._scans[gone:], self._final - gone
@@ -382,7 +396,9 @@ class Refiner:
         share = self._share(i, at[low], at[after])
         covariance = (1.0 - share) * self._covariance(low) + share * self._covariance(after)
         T = between(by_low, by_high, share)
-        return SmoothedPose(scan.number, scan.t_ns, T, covariance, self.unique and self._is_certain(covariance))
+        axle = (1.0 - share) * self._axle_variance(low) + share * self._axle_variance(after)
+        certain = self.unique and self._is_certain(covariance)
+        return SmoothedPose(scan.number, scan.t_ns, T, covariance, certain, axle)
 
     def _from_knot(self, knot: int, i: int) -> F64:
         first, scan = self._scans[knot], self._scans[i]
@@ -394,7 +410,33 @@ class Refiner:
         par = self.parameters
         assert self._solved is not None
         floor = np.diag([np.radians(par.floor_deg) ** 2] * 3 + [par.floor_m**2] * 3)
-        return np.asarray(self._solved.covariance[knot] * max(1.0, self._solved.misfit) + floor)
+        grown = np.sqrt(self._grown)
+        return np.asarray(grown[:, None] * self._solved.covariance[knot] * grown + floor)
+
+    @property
+    def _grown(self) -> F64:
+        """(6,) by what a pose's variances differ from those that are assumed: what residuals show of the errors of map
+        and odometry, and more where scans disagree with each other.
+        """
+        assert self._solved is not None
+        grown, matched = np.full(6, max(1.0, self._solved.misfit)), self._solved.matched
+        odometry = np.clip(self._squares / self._redundancy / self._step_variance, LEAST_VARIANCE, 1.0)
+        odometry[3:5] = 1.0  # along a tunnel the steps agree with each other and drift together
+        grown[2:5] *= self._solved.seen * matched + odometry[2:5] * (1.0 - matched)
+        return grown
+
+    def _axle_variance(self, knot: int) -> float:
+        assert self._solved is not None
+        floor = np.radians(self.parameters.floor_deg) ** 2
+        return float(self._solved.axle_variance[knot] * self._grown[2] + floor)
+
+    def as_seen(self, covariance: F64) -> F64:
+        """The covariance (6, 6) of an online pose with errors of the map as the stretch's residuals show them."""
+        if self._solved is None:
+            return covariance
+        grown = np.ones(6)
+        grown[2:5] = np.sqrt(np.maximum(self._solved.seen, 1.0))  # the stretch leaves out what draws single scans
+        return np.asarray(grown[:, None] * covariance * grown)
 
     def _is_certain(self, covariance: F64) -> bool:
         sigma_m = float(np.sqrt(np.diag(covariance)[3:5]).max())
@@ -406,6 +448,19 @@ class Refiner:
         t = [self._scans[k].t_ns for k in (low, i, high)]
         a, b, c = way if way[2] - way[0] > 1e-3 else t
         return float(np.clip((b - a) / (c - a), 0.0, 1.0)) if c > a else 0.0
+
+
+def told_by_scans(steps: Sequence[Sequence[Step]], shared_off: F64) -> F64:
+    """(6,) mean square of what the motion of some steps by wheels and gyro (the first measurement of each) differs from
+    what scans say (the second), in units of the variance claimed; endless where scans say too little.
+    """
+    squares = []
+    for i in range(0, len(steps) - WINDOW + 1, WINDOW // 2):
+        window = steps[i : i + WINDOW]
+        if all(len(measured) > 1 for measured in window):
+            off = np.sum([residual(seen.T_before_now, driven, shared_off)[0] for driven, seen, *_ in window], axis=0)
+            squares.append(off**2 / np.sum([np.diag(driven.covariance) for driven, *_ in window], axis=0))
+    return np.mean(squares, axis=0) if squares else np.full(6, np.inf)
 
 
 def _chained(seen: Sequence[ScanStep]) -> Step:

@@ -52,8 +52,8 @@ class RefineParameters:
     least_fit: float = 0.15
     most_misfit: float = 4.0
     certain_m: float = 0.1
-    floor_m: float = 0.005
-    floor_deg: float = 0.01
+    floor_m: float = 0.002
+    floor_deg: float = 0.004
     correct_m: float = 0.06
     correct_deg: float = 0.12
 

@@ -111,7 +111,7 @@ class Linearised:
 
     T_map_vehicle: (4, 4) where. scale: robust scale in sigmas. H, g: (6, 6) and (6,) of a small motion of the vehicle
     in its own frame, rotation [rad] first; points count as independent. cost: sum of robust costs; matched, inside:
-    points near a Gaussian, and in known voxels.
+    points near a Gaussian, and in known voxels. told: (6, 6), the part of a motion that it tells.
     """
 
     T_map_vehicle: F64
@@ -121,6 +121,7 @@ class Linearised:
     cost: float
     matched: int
     inside: int
+    told: F64
 
     def fit(self, scale: float) -> float:
         """1 - mean robust cost of the points in known voxels, 0 ... 1."""
@@ -150,20 +151,21 @@ def linearised(
     _add_wheels(state, m, parameters, scale)
     turn = np.zeros((6, 6))
     turn[:3, :3] = turn[3:, 3:] = state.R
-    H, g = _without_hints(turn.T @ state.H @ turn, turn.T @ state.g, parameters)
-    return Linearised(T.copy(), scale, H, g, state.cost, state.matched, state.inside)
+    H, g = turn.T @ state.H @ turn, turn.T @ state.g
+    told = _without_hints(H, parameters)
+    return Linearised(T.copy(), scale, told.T @ H @ told, told.T @ g, state.cost, state.matched, state.inside, told)
 
 
-def _without_hints(H: F64, g: F64, par: RegistrationParameters) -> tuple[F64, F64]:
-    """H (6, 6) and g (6,) without the horizontal directions that have less than `degenerate_share` of the strongest."""
+def _without_hints(H: F64, par: RegistrationParameters) -> F64:
+    """(6, 6) that takes from a motion the horizontal directions for which H (6, 6) has less than `degenerate_share` of
+    the strongest.
+    """
     values, vectors, scale = _principal(H)
     horizontal = vectors[3] ** 2 + vectors[4] ** 2 > 0.5
     strongest = float(values[horizontal].max(initial=0.0))
     told = ~horizontal | (values > par.degenerate_share * strongest)
-    if told.all():
-        return H, g
     along = vectors[:, told]
-    return (along * values[told]) @ along.T / (scale * scale[:, None]), along @ (along.T @ (g * scale)) / scale
+    return np.eye(6) if told.all() else np.asarray((along @ along.T) * scale[:, None] / scale)
 
 
 def fit_of(points_m: F64, T_map_vehicle: F64, match_map: MatchMap, parameters: RegistrationParameters) -> float:

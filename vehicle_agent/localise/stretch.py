@@ -10,13 +10,14 @@ weights (Geman-McClure, on points and on steps). Old scans leave by marginalisat
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Final, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from gnd_map.se3 import T_inverse, exp_so3, log_so3
+from vehicle_agent.localise.influence import SeenScan, influence
 from vehicle_agent.localise.match_map import MatchMap
 from vehicle_agent.localise.parameters import RegistrationParameters
 from vehicle_agent.localise.registration import LEVER_M, WHEELS_M, Linearised, linearised
@@ -84,6 +85,9 @@ class Solved:
     step_squares, step_redundancy: (6,) sums over the first measurement of each step: squared residual in sigmas, and
         how much of each the others can check (0: nothing else knows, 1: all is known otherwise). Their ratio is the
         variance of these measurements in units of what they claim (variance components, Förstner 1979).
+    seen: (3,) of yaw, forward and left: by what the errors that residuals show differ from those that are assumed, in
+        variance (`influence`); matched: (3,) share of the map in these variances of the poses, the rest is odometry's.
+    axle_variance: (N,) of the direction in which the rear axle drives, yaw and course together [rad²].
     torn: somewhere no measured motion fits its two poses, so that nothing ties what lies before to what lies behind.
     """
 
@@ -95,6 +99,9 @@ class Solved:
     misfit: float
     step_squares: F64
     step_redundancy: F64
+    seen: F64
+    matched: F64
+    axle_variance: F64
     torn: bool
 
 
@@ -136,8 +143,10 @@ def solve_stretch(
             if _small(step[:-N_SHARED].reshape(-1, 6), STOP_M, STOP_RAD):
                 break
     _match(knots, match_map, registration, scales[-1])
-    A = _system(knots, steps, belief, shared, registration).A
-    return _solved(knots, steps, A, shared - belief.shared, belief.shared, registration, scales[-1])
+    covariance = np.asarray(np.linalg.inv(_system(knots, steps, belief, shared, registration).A), np.float64)
+    seen, matched = _as_seen(knots, belief, covariance, match_map, registration)
+    solved = _solved(knots, steps, covariance, shared - belief.shared, belief.shared, registration, scales[-1])
+    return replace(solved, seen=seen, matched=matched)
 
 
 def marginalised(
@@ -206,7 +215,7 @@ def _add_belief(A: F64, g: F64, first: Knot, belief: Belief, shared: F64) -> Non
 
 def _add_step(A: F64, g: F64, k: int, relative: F64, step: Step, shared_off: F64) -> None:
     """A measured motion from knot k to k + 1, with its robust weight."""
-    e, J = _residual(relative, step, shared_off)
+    e, J = residual(relative, step, shared_off)
     information, weight = _weighed(e, step)
     weighted = weight * J.T @ information
     at = np.r_[6 * k : 6 * k + 12, len(g) - N_SHARED : len(g)]
@@ -220,7 +229,7 @@ def _weighed(e: F64, step: Step) -> tuple[F64, float]:
     return information, 1.0 / (1.0 + float(e @ information @ e) / STEP_CHI2) ** 2
 
 
-def _residual(relative: F64, step: Step, shared_off: F64) -> tuple[F64, F64]:
+def residual(relative: F64, step: Step, shared_off: F64) -> tuple[F64, F64]:
     """Residual e = log(Z^-1 T_k^-1 T_k+1) - S shared (6,) of a step, and its derivative (6, 12 + N_SHARED) after
     both poses and the shared parameters.
     """
@@ -244,13 +253,12 @@ def _move(knots: Sequence[Knot], step: F64) -> None:
 def _solved(
     knots: Sequence[Knot],
     steps: Sequence[Sequence[Step]],
-    A: F64,
+    covariance: F64,
     shared_off: F64,
     shared_before: F64,
     par: RegistrationParameters,
     scale: float,
 ) -> Solved:
-    covariance: F64 = np.linalg.inv(A).astype(np.float64)
     blocks = np.stack([covariance[6 * k : 6 * k + 6, 6 * k : 6 * k + 6] for k in range(len(knots))])
     seen = [(knot, knot.match) for knot in knots if knot.match is not None]
     squares, redundancy = _checked_steps(knots, steps, covariance, shared_off)
@@ -263,14 +271,44 @@ def _solved(
         misfit=_misfit(knots, par),
         step_squares=squares,
         step_redundancy=redundancy,
+        seen=np.ones(3),
+        matched=np.ones(3),
+        axle_variance=_axle_variance(covariance),
         torn=_is_torn(knots, steps, shared_off),
     )
+
+
+def _axle_variance(covariance: F64) -> F64:
+    """(N,) of yaw and course together: a scan that is turned makes the course seem turned the other way."""
+    yaw, left = np.arange(2, len(covariance) - N_SHARED, 6), len(covariance) - N_SHARED + LEFT
+    return np.asarray(covariance[yaw, yaw] + 2.0 * covariance[yaw, left] + covariance[left, left])
+
+
+def _as_seen(
+    knots: Sequence[Knot], belief: Belief, covariance: F64, match_map: MatchMap, par: RegistrationParameters
+) -> tuple[F64, F64]:
+    """(3,) and (3,), of yaw, forward and left: variance that the map's errors have, as residuals show them, in units
+    of what is assumed, and the share of the map in the variance of the pose in the middle. What was matched before is
+    taken to be as good as what is matched now.
+    """
+    rows = [6 * (len(knots) // 2) + row for row in (2, 3, 4)]
+    answers, matched, scans = covariance[rows], np.zeros(3), []
+    for k, knot in enumerate(knots):
+        if knot.match is not None:
+            v, weight = answers[:, 6 * k : 6 * k + 6], knot.weight / par.correlation
+            matched += weight * np.einsum("di,ij,dj->d", v, knot.match.H, v)
+            scans.append(SeenScan(knot.points_m, knot.match, weight * v))
+    first = np.r_[0:6, len(covariance) - N_SHARED : len(covariance)]
+    matched += np.einsum("di,ij,dj->d", answers[:, first], belief.information, answers[:, first])
+    seen = influence(scans, match_map, par).factor if scans else np.ones(3)
+    share = np.clip(matched / np.diag(covariance)[rows], 0.0, 1.0)
+    return seen, np.asarray(share)
 
 
 def _is_torn(knots: Sequence[Knot], steps: Sequence[Sequence[Step]], shared_off: F64) -> bool:
     for k, measured in enumerate(steps):
         relative = T_inverse(knots[k].T_map_vehicle) @ knots[k + 1].T_map_vehicle
-        if max(_weighed(_residual(relative, step, shared_off)[0], step)[1] for step in measured) < TORN_WEIGHT:
+        if max(_weighed(residual(relative, step, shared_off)[0], step)[1] for step in measured) < TORN_WEIGHT:
             return True
     return False
 
@@ -280,7 +318,7 @@ def _checked_steps(
 ) -> tuple[F64, F64]:
     squares, redundancy, n = np.zeros(6), np.zeros(6), len(covariance)
     for k, (step, *_) in enumerate(steps):
-        e, J = _residual(T_inverse(knots[k].T_map_vehicle) @ knots[k + 1].T_map_vehicle, step, shared_off)
+        e, J = residual(T_inverse(knots[k].T_map_vehicle) @ knots[k + 1].T_map_vehicle, step, shared_off)
         at = np.r_[6 * k : 6 * k + 12, n - N_SHARED : n]
         variance = np.diag(step.covariance)
         left_open = _weighed(e, step)[1] * np.diag(J @ covariance[np.ix_(at, at)] @ J.T) / variance
