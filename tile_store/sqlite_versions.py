@@ -6,10 +6,12 @@ from typing import Any
 
 import apsw
 
+from gnd_map.features import is_feature_layer
 from gnd_map.tile_id import TileId
 from tile_store import sqlite_accounts as accounts
 from tile_store import sqlite_confirmation as confirmation
 from tile_store import sqlite_inbox as inbox
+from tile_store import sqlite_refuted as refuted
 from tile_store.errors import StoreError, UnknownReports, UnknownVersion
 from tile_store.provenance import NOTHING, Provenance, encode_provenance
 from tile_store.sqlite_connection import change, fetch
@@ -52,7 +54,10 @@ def publish(
     if publication.waiting is not None:
         confirmation.keep(c, claim.layer, claim.tile, publication.waiting)
     accounts.put_courses(c, claim.layer, claim.tile, publication.courses)
+    before = refuted.refuted(c, claim.layer) if is_feature_layer(claim.layer) else frozenset()
     accounts.put_tests(c, claim.layer, claim.tile, publication.shift_tests, timing)
+    if is_feature_layer(claim.layer) and publication.shift_tests:
+        refuted.merge_again(c, claim.layer, before ^ refuted.refuted(c, claim.layer), timing)
     return result
 
 

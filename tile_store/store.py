@@ -116,6 +116,11 @@ class Store(Protocol):
         has reported about wait to be merged again.
         """
 
+    def refuted_reports(self, layer: str) -> frozenset[str]:
+        """The reports of a layer that other vehicles contradict in most tiles. When one comes or goes, all tiles that
+        it speaks of wait to be merged again.
+        """
+
     def vehicle_accounts(self) -> list[VehicleAccount]:
         """What shift tests and courses say of each vehicle of which there are any, by vehicle."""
 
