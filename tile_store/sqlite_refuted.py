@@ -1,6 +1,6 @@
 """Reports that other vehicles contradict, in SQLite: inside the caller's transaction, derived from `shift_test`."""
 
-from collections.abc import Iterable
+from collections.abc import Mapping
 from typing import Any, Final
 
 import apsw
@@ -13,14 +13,18 @@ REFUTED_SHARE: Final = 0.5
 """... if they are so many of all that could be compared."""
 
 
-def refuted(c: apsw.Connection, layer: str) -> frozenset[str]:
-    """The refuted reports of a layer."""
+def refuted(c: apsw.Connection, layer: str) -> dict[str, str]:
+    """The refuted reports of a layer, and whose each is."""
     limits = {"layer": layer, "least": REFUTED_TESTS, "share": REFUTED_SHARE}
-    return frozenset(report for (report,) in fetch(c, "refuted_reports", limits))
+    return {report: vehicle for report, vehicle in fetch(c, "refuted_reports", limits)}
 
 
-def merge_again(c: apsw.Connection, layer: str, reports: Iterable[str], timing: dict[str, Any]) -> None:
-    """The tiles of reports that are refuted now, or no longer, wait to be merged again."""
-    for report in sorted(reports):
-        for (tile,) in fetch(c, "tiles_of_report", {"layer": layer, "report_id": report}):
-            change(c, "mark_dirty", {"layer": layer, "tile": tile} | timing)
+def merge_again(c: apsw.Connection, layer: str, before: Mapping[str, str], timing: dict[str, Any]) -> None:
+    """Where a report is refuted now that was not before, or the reverse, all tiles that its vehicle speaks of wait to
+    be merged again.
+    """
+    changed = before.items() ^ refuted(c, layer).items()
+    for vehicle in sorted({vehicle for _, vehicle in changed}):
+        for of_layer, tile in fetch(c, "tiles_of_vehicle", {"vehicle": vehicle}):
+            if of_layer == layer:
+                change(c, "mark_dirty", {"layer": layer, "tile": tile} | timing)

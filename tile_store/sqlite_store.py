@@ -239,7 +239,7 @@ class SqliteStore:
         with self._readers.snapshot() as c:
             return accounts.shifted_vehicles(c)
 
-    def refuted_reports(self, layer: str) -> frozenset[str]:
+    def refuted_reports(self, layer: str) -> dict[str, str]:
         """See `Store.refuted_reports`."""
         with self._readers.snapshot() as c:
             return refuted.refuted(c, layer)

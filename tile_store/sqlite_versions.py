@@ -54,10 +54,10 @@ def publish(
     if publication.waiting is not None:
         confirmation.keep(c, claim.layer, claim.tile, publication.waiting)
     accounts.put_courses(c, claim.layer, claim.tile, publication.courses)
-    before = refuted.refuted(c, claim.layer) if is_feature_layer(claim.layer) else frozenset()
+    before = refuted.refuted(c, claim.layer) if is_feature_layer(claim.layer) else {}
     accounts.put_tests(c, claim.layer, claim.tile, publication.shift_tests, timing)
     if is_feature_layer(claim.layer) and publication.shift_tests:
-        refuted.merge_again(c, claim.layer, before ^ refuted.refuted(c, claim.layer), timing)
+        refuted.merge_again(c, claim.layer, before, timing)
     return result
 
 

@@ -8,11 +8,12 @@ same reports give the same features, bit for bit.
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
+from types import MappingProxyType
 
 from cloud_merger.features.existence import add_views
 from cloud_merger.features.parameters import FeatureMergeParameters
 from cloud_merger.features.publication import Outcome, outcome_of
-from cloud_merger.features.refuted import heard, refuted_of, tests_of
+from cloud_merger.features.refuted import heard, left_out, refuted_of, tests_of
 from cloud_merger.features.spread import spread
 from cloud_merger.features.statements import Statement, contents_of, statements_of
 from cloud_merger.features.tracks import Bases, Track, Tracks
@@ -46,7 +47,7 @@ def merge_features(
     reports: Iterable[FeatureReport],
     parameters: FeatureMergeParameters | None = None,
     bases: Mapping[bytes, Sequence[Feature]] | None = None,
-    refuted: frozenset[str] = frozenset(),
+    refuted: Mapping[str, str] = MappingProxyType({}),
 ) -> MergedFeatures:
     """Decide what the reports change in the features of a tile.
 
@@ -58,8 +59,8 @@ def merge_features(
         parameters: see `FeatureMergeParameters`.
         bases: the features of the versions that reports refer to, by hash. The epoch's and "none" need not be given; a
             report about an unknown version says nothing of features that it does not name.
-        refuted: ids of reports that others contradict again and again (`refuted.py`): they are compared as all are, and
-            say nothing.
+        refuted: reports that others contradict again and again, and whose each is (`refuted.py`): they are compared as
+            all are, and say nothing.
     """
     parameters = parameters or FeatureMergeParameters()
     own = FeatureTile.of(tile, 0, epoch)
@@ -68,8 +69,8 @@ def merge_features(
     said = statements_of(tile, reports, parameters.reach_m)
     tracks = _tracks_of(tile, epoch, said, contents, parameters)
     tests = tests_of(heard(tracks.all), said, {one.report_id: one.last_ns for one in reports})
-    if any(one.report_id in refuted for one in said):
-        said = tuple(one for one in said if one.report_id not in refuted)
+    if out := left_out(said, tests, refuted):
+        said = tuple(one for one in said if one.report_id not in out)
         tracks = _tracks_of(tile, epoch, said, contents, parameters)
     outcomes = [(track, outcome) for track in tracks.all if (outcome := outcome_of(tile, track, parameters))]
     return MergedFeatures(
@@ -125,7 +126,7 @@ def merge_layer(
             parts.setdefault(tile, []).append(part)
     merged = {tile: merge_features(tile, epochs.get(tile, ()), parts[tile], parameters) for tile in sorted(parts)}
     refuted = refuted_of(test for one in merged.values() for test in one.tests)
-    again = {tile for tile, said in parts.items() if any(one.report_id in refuted for one in said)}
+    again = {tile for tile, said in parts.items() if any(one.vehicle in refuted.values() for one in said)}
     return {
         tile: merge_features(tile, epochs.get(tile, ()), parts[tile], parameters, refuted=refuted)
         if tile in again

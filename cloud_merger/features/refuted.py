@@ -84,14 +84,29 @@ def tests_of(found: Iterable[Heard], said: Sequence[Statement], last_ns: Mapping
     )  # fmt: skip
 
 
-def refuted_of(tests: Iterable[ShiftTest]) -> frozenset[str]:
-    """The reports that are refuted, of the tests of all tiles of a layer; as a store tells it."""
+def left_out(said: Sequence[Statement], tests: Iterable[ShiftTest], refuted: Mapping[str, str]) -> frozenset[str]:
+    """The reports that say nothing about a tile: those refuted, and what else their vehicles say alone in this tile: a
+    lost stretch does not end where a report does.
+    """
+    lost = set(refuted.values())
+    alone = {test.report_id for test in tests if test.is_explained and test.vehicle in lost}
+    return frozenset(one.report_id for one in said if one.report_id in refuted or one.report_id in alone)
+
+
+def refuted_of(tests: Iterable[ShiftTest]) -> dict[str, str]:
+    """The reports that are refuted, and whose each is, of the tests of all tiles of a layer; as a store tells it."""
     made: Counter[str] = Counter()
     against: Counter[str] = Counter()
+    vehicles: dict[str, str] = {}
     for test in tests:
+        vehicles[test.report_id] = test.vehicle
         made[test.report_id] += 1
         against[test.report_id] += test.is_explained
-    return frozenset(report for report, n in made.items() if against[report] >= max(REFUTED_TESTS, REFUTED_SHARE * n))
+    return {
+        report: vehicles[report]
+        for report, n in made.items()
+        if against[report] >= max(REFUTED_TESTS, REFUTED_SHARE * n)
+    }
 
 
 def _ayes(track: Track) -> int:

@@ -158,12 +158,8 @@ ORDER BY at_ns DESC, layer, tile, report_id LIMIT :n
 SELECT vehicle FROM shifted_vehicle ORDER BY vehicle
 
 -- name: refuted_reports
-SELECT report_id FROM shift_test WHERE layer = :layer
-GROUP BY report_id HAVING SUM(explained) >= :least AND SUM(explained) >= :share * COUNT(*)
-
--- name: tiles_of_report
-SELECT r.tile FROM report AS r LEFT JOIN tile_head AS h USING (layer, tile)
-WHERE r.layer = :layer AND r.report_id = :report_id AND (r.merged_in IS NULL OR r.merged_in >= COALESCE(h.epoch, 0))
+SELECT report_id, vehicle FROM shift_test WHERE layer = :layer
+GROUP BY report_id, vehicle HAVING SUM(explained) >= :least AND SUM(explained) >= :share * COUNT(*)
 
 -- name: distrust_vehicle
 INSERT INTO shifted_vehicle (vehicle, since_ns) VALUES (:vehicle, :since_ns) ON CONFLICT (vehicle) DO NOTHING
