@@ -16,7 +16,7 @@ REFUTED_SHARE: Final = 0.5
 def refuted(c: apsw.Connection, layer: str) -> dict[str, str]:
     """The refuted reports of a layer, and whose each is."""
     limits = {"layer": layer, "least": REFUTED_TESTS, "share": REFUTED_SHARE}
-    return {report: vehicle for report, vehicle in fetch(c, "refuted_reports", limits)}
+    return {str(report): str(vehicle) for report, vehicle in fetch(c, "refuted_reports", limits)}
 
 
 def merge_again(c: apsw.Connection, layer: str, before: Mapping[str, str], timing: dict[str, Any]) -> None:
