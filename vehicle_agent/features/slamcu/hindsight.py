@@ -162,8 +162,8 @@ def elsewhere(off_m: F64, total_m2: F64) -> F64:
 
 
 def claimed(t_s: F64, pose: F64, cov: F64, smoothed: Smoothed) -> F64:
-    """(S, 3, 3) covariances that hold what the particles say and what hindsight does: the moments of the mixture of both
-    about the pose that is told.
+    """(S, 3, 3) covariances that hold what the particles say and what hindsight does: the moments of both, mixed, about
+    the pose that is told.
     """
     if not (len(smoothed) and len(t_s)):
         return held(cov)
