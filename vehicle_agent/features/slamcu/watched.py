@@ -18,6 +18,7 @@ import numpy as np
 from gnd_map.arrays import F64
 from vehicle_agent.features.look import Look, MapFeatures
 from vehicle_agent.features.slamcu.blind import Belief
+from vehicle_agent.features.slamcu.existence_book import FeatureClass
 from vehicle_agent.features.slamcu.hindsight import (
     GATE,
     GATE_SURE,
@@ -56,6 +57,13 @@ MOST_PATIENCE_S: Final = 160.0
 WIDE_M: Final = 2.5
 WIDE_RAD: Final = radians(0.5)
 """What a place is made less certain by that fixes speak against, when no account is better: most of a lane."""
+CONTRADICTS: Final = 15.0
+"""Where the account that GNSS, wheels and gyro allow is so much worse (natural logarithm, four signs gone) than one that
+they deny, map and GNSS contradict, and nobody can tell which is right."""
+FOUND_AGAIN: Final = 2
+"""A vehicle that has given up knows its place again when so many signs of the map, and more than are gone, are there."""
+LOST_M: Final = 10.0
+"""Sigma of each axis of the place until then."""
 LOOK_BACK_EVERY_S: Final = 10.0
 LOOK_BACK_S: Final = 240.0
 """Hindsight is asked so often, of so much: fixes from farther back say nothing of the place."""
@@ -241,6 +249,7 @@ class WatchedSlamcu:
         self._hindsight = Hindsight(parameters, Belief.first(pose0, cov0, parameters, gnss_sigma_m))
         self._back_s = self._known_s = 0.0  # when hindsight was asked last, and until when its answer has been heard
         self._clock_ns = 0
+        self._lost_since: _Kept | None = None
         self._extra = np.zeros((0, 2, 2))  # of each pose of the path, once the drive has ended
 
     def predict(self, dt_s: float, speed_mps: float, yaw_rate_radps: float) -> None:
@@ -263,6 +272,8 @@ class WatchedSlamcu:
         if alarm is not None:
             self._look_into(alarm)
         self._look_back()
+        if self._lost_since is not None:
+            self._stay_lost(self._lost_since)
         self._slamcu.decide()
         if self.path:
             columns = _columns(self.path)
@@ -273,7 +284,13 @@ class WatchedSlamcu:
     def pose(self) -> tuple[F64, F64]:
         """Pose (3,) x, y [m], heading [rad], and covariance (3, 3)."""
         pose, cov = self._slamcu.pose()
-        return pose, claimed_now(pose, cov, self._slamcu.blind) if self._slamcu.has_fixes else held(cov[None])[0]
+        wide = claimed_now(pose, cov, self._slamcu.blind) if self._slamcu.has_fixes else held(cov[None])[0]
+        return pose, wide + np.diag([LOST_M**2, LOST_M**2, 0.0]) if self.is_lost else wide
+
+    @property
+    def is_lost(self) -> bool:
+        """Whether the vehicle has given up and not found its place again."""
+        return self._lost_since is not None
 
     def known_states(self) -> tuple[KnownState, ...]:
         """All features of the map, in its order."""
@@ -327,6 +344,7 @@ class WatchedSlamcu:
             self._look_into(alarm)
         elif self._slamcu.now_s - self._back_s >= LOOK_BACK_EVERY_S:
             self._look_back()
+        self._found_again()
         self._keep()
 
     # States on the way
@@ -379,9 +397,11 @@ class WatchedSlamcu:
             self._adopt(one, best, alarm)
         elif alarm.test in ("offset", "blind"):
             self._slamcu.widen(WIDE_M, WIDE_RAD)
-        if not self._now.watch.agrees:
+        easiest = min(account.cost for account in (self._now, *(each for _, each in tried)))
+        if not self._now.watch.agrees or self._now.cost > easiest + CONTRADICTS:
             self._give_up(alarm)
-        self._cut_out(smoothed)
+        else:
+            self._cut_out(smoothed)
         self._now.watch.settled()
         self._asked_s = self._slamcu.now_s
 
@@ -484,6 +504,24 @@ class WatchedSlamcu:
         self.lost.append(Lost(kept.t_s, lost_s, off_m, alarm.test, alarm.value, taken, False))
         self._now = account
         self._kept = [*(one for one in self._kept if one.events <= kept.events), self._state()]
+        self._lost_since = self._kept[-1]
+
+    def _found_again(self) -> None:
+        """After giving up: whether signs of the map are where the place that was found since has them."""
+        since = self._lost_since
+        if since is None or self._slamcu.now_s - since.t_s < CLEAR_S:
+            return
+        seen = [one for one in self._slamcu.last_seen(since.t_s, self._slamcu.now_s - CLEAR_S) if one.known]
+        there = sum(one.feature_class == FeatureClass.NORMAL for one in seen)
+        if there >= FOUND_AGAIN and there > sum(one.feature_class == FeatureClass.DELETED for one in seen):
+            self._lost_since = None
+
+    def _stay_lost(self, since: _Kept) -> None:
+        """The place was not found again: nothing of what was concluded since is told."""
+        off_m = float(np.hypot(*(self._slamcu.pose()[0] - self._slamcu.blind.mean[:3])[:2]))
+        taken = _differences(self._slamcu, since.account.slamcu)
+        self.lost.append(Lost(since.t_s, self._slamcu.now_s, off_m, "not found again", 0.0, taken, False))
+        self._now = since.account.fork(self._seed)
 
 
 def _columns(path: list[PoseAt]) -> tuple[F64, F64, F64]:
