@@ -8,6 +8,7 @@ import numpy as np
 
 from benchmarks.simulation.errors import OptionError
 from fleet_sim.roads.drive import RoadDrive
+from gnd_map.arrays import F64
 from schemas.drive import Detections
 
 SIGN_RANGE: Final = 0.05
@@ -41,10 +42,15 @@ def _signs(drive: RoadDrive, rng: np.random.Generator) -> RoadDrive:
 
 
 def _camera(drive: RoadDrive, _: np.random.Generator) -> RoadDrive:
-    return replace(drive, looks=tuple(_moved(look, np.ones(len(look.kinds)), CAMERA_RAD) for look in drive.looks))
+    return replace(
+        drive,
+        looks=tuple(
+            _moved(look, np.ones(len(look.kinds)), np.full(len(look.kinds), CAMERA_RAD)) for look in drive.looks
+        ),
+    )
 
 
-def _moved(look: Detections, scale: np.ndarray[tuple[int], np.dtype[np.float64]], turn_rad: object) -> Detections:
+def _moved(look: Detections, scale: F64, turn_rad: F64) -> Detections:
     range_m = (look.range_m * scale).astype(look.range_m.dtype)
     return replace(look, range_m=range_m, bearing_rad=(look.bearing_rad + turn_rad).astype(look.bearing_rad.dtype))
 

@@ -308,7 +308,7 @@ class WatchedSlamcu:
             return np.zeros((2, 2))
         at_s = np.array([pose.t_s for pose in self.path])
         seen_s = (one.history[-1].t_ns - self._clock_ns) * 1e-9
-        return self._extra[min(int(np.searchsorted(at_s, seen_s)), len(at_s) - 1)]
+        return np.asarray(self._extra[min(int(np.searchsorted(at_s, seen_s)), len(at_s) - 1)])
 
     @property
     def hidden(self) -> int:
