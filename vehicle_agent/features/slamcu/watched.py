@@ -58,10 +58,10 @@ WIDE_M: Final = 2.5
 WIDE_RAD: Final = radians(0.5)
 """What a place is made less certain by that fixes speak against, when no account is better: most of a lane."""
 CONTRADICTS: Final = 15.0
-"""Where the account that GNSS, wheels and gyro allow is so much worse (natural logarithm, four signs gone) than one that
-they deny, map and GNSS contradict, and nobody can tell which is right."""
+"""Where the account that GNSS, wheels and gyro allow is so much worse (natural logarithm; five signs gone) than one
+that they deny, map and GNSS contradict, and nobody can tell which is right."""
 FOUND_AGAIN: Final = 2
-"""A vehicle that has given up knows its place again when so many signs of the map, and more than are gone, are there."""
+"""A vehicle that has given up knows its place again when so many signs of the map are there, and more than are not."""
 LOST_M: Final = 10.0
 """Sigma of each axis of the place until then."""
 LOOK_BACK_EVERY_S: Final = 10.0
