@@ -102,7 +102,7 @@ class Worker:
             sha: self._features.content(layer, tile, sha) for sha in sorted({row.base_sha for row in work.reports})
         }
         bases = {sha: features for sha, features in found.items() if features is not None}
-        refuted = self._store.refuted_reports(layer)
+        refuted = self._store.refuted_reports(layer, {row.vehicle for row in work.reports})
         merged = merge_features(tile, epoch, parts, self._config.features, bases, refuted)
         new = FeatureTile(tile, work.base_version + 1, merged.features)
         is_new = new.sha != work.head.sha if work.head else len(merged.features) > 0

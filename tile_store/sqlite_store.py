@@ -239,10 +239,10 @@ class SqliteStore:
         with self._readers.snapshot() as c:
             return accounts.shifted_vehicles(c)
 
-    def refuted_reports(self, layer: str) -> dict[str, str]:
+    def refuted_reports(self, layer: str, vehicles: Iterable[str]) -> dict[str, str]:
         """See `Store.refuted_reports`."""
         with self._readers.snapshot() as c:
-            return refuted.refuted(c, layer)
+            return refuted.refuted(c, layer, vehicles)
 
     def vehicle_accounts(self) -> list[VehicleAccount]:
         """See `Store.vehicle_accounts`."""

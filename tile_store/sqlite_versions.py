@@ -54,11 +54,17 @@ def publish(
     if publication.waiting is not None:
         confirmation.keep(c, claim.layer, claim.tile, publication.waiting)
     accounts.put_courses(c, claim.layer, claim.tile, publication.courses)
-    before = refuted.refuted(c, claim.layer) if is_feature_layer(claim.layer) else {}
-    accounts.put_tests(c, claim.layer, claim.tile, publication.shift_tests, timing)
-    if is_feature_layer(claim.layer) and publication.shift_tests:
-        refuted.merge_again(c, claim.layer, before, timing)
+    _put_tests(c, publication, timing)
     return result
+
+
+def _put_tests(c: apsw.Connection, publication: Publication, timing: dict[str, Any]) -> None:
+    """The accounts of the vehicles, and which of their reports about features are refuted now."""
+    claim, tests = publication.claim, publication.shift_tests
+    vehicles = {test.vehicle for test in tests} if is_feature_layer(claim.layer) else set()
+    before = refuted.refuted(c, claim.layer, vehicles)
+    accounts.put_tests(c, claim.layer, claim.tile, tests, timing)
+    refuted.merge_again(c, claim.layer, before, refuted.refuted(c, claim.layer, vehicles), timing)
 
 
 def put_base(
