@@ -18,13 +18,14 @@ from vehicle_agent.features.slamcu.parameters import SlamcuParameters
 
 LASTING_M: Final = 0.5
 """What a GNSS may be off by all the while (ionosphere, the antenna's place), each axis."""
-TOO_SURE: Final = 1.5
+TOO_SURE: Final = 2.0
 """The particles' covariance is too small by this: associations are taken for certain, and resampling forgets. Of the
 drives of seeds 100 to 144, as the next two."""
 SIGN_M: Final = 0.3
 """And by this, each axis: errors that stay with a sign, however often it is measured."""
-ELSEWHERE: Final = 0.05
-"""Share of places, of those that the particles are sure of, that are those of other signs."""
+ELSEWHERE: Final = 0.2
+"""Share of places that are those of other signs: more than are (a few in a hundred), for these are what is never to be
+called sure."""
 ELSEWHERE_M: Final = 4.0
 """Sigma of how far off those are, each axis: a lane."""
 
