@@ -102,7 +102,8 @@ class Worker:
             sha: self._features.content(layer, tile, sha) for sha in sorted({row.base_sha for row in work.reports})
         }
         bases = {sha: features for sha, features in found.items() if features is not None}
-        merged = merge_features(tile, epoch, parts, self._config.features, bases)
+        refuted = self._store.refuted_reports(layer, {row.vehicle for row in work.reports})
+        merged = merge_features(tile, epoch, parts, self._config.features, bases, refuted)
         new = FeatureTile(tile, work.base_version + 1, merged.features)
         is_new = new.sha != work.head.sha if work.head else len(merged.features) > 0
         return Publication(
@@ -111,6 +112,7 @@ class Worker:
             tile=new if is_new else None,
             report_ids=_ids(work),
             voxel_reports=merged.provenance,
+            shift_tests=merged.tests,
         )
 
     def _lattice(self, work: TileWork, epoch: Gaussians) -> Lattice | None:

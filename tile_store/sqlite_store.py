@@ -15,6 +15,7 @@ from schemas.tiles import CatalogEntry
 from tile_store import sqlite_accounts as accounts
 from tile_store import sqlite_confirmation as confirmation
 from tile_store import sqlite_inbox as inbox
+from tile_store import sqlite_refuted as refuted
 from tile_store import sqlite_versions as versions
 from tile_store.errors import StoreError, UnknownVersion
 from tile_store.provenance import Provenance, decode_provenance
@@ -241,6 +242,11 @@ class SqliteStore:
         """See `Store.shifted_vehicles`."""
         with self._readers.snapshot() as c:
             return accounts.shifted_vehicles(c)
+
+    def refuted_reports(self, layer: str, vehicles: Iterable[str]) -> dict[str, str]:
+        """See `Store.refuted_reports`."""
+        with self._readers.snapshot() as c:
+            return refuted.refuted(c, layer, vehicles)
 
     def vehicle_accounts(self) -> list[VehicleAccount]:
         """See `Store.vehicle_accounts`."""

@@ -6,10 +6,12 @@ from typing import Any
 
 import apsw
 
+from gnd_map.features import is_feature_layer
 from gnd_map.tile_id import TileId
 from tile_store import sqlite_accounts as accounts
 from tile_store import sqlite_confirmation as confirmation
 from tile_store import sqlite_inbox as inbox
+from tile_store import sqlite_refuted as refuted
 from tile_store.errors import StoreError, UnknownReports, UnknownVersion
 from tile_store.provenance import NOTHING, Provenance, encode_provenance
 from tile_store.sqlite_connection import change, fetch
@@ -52,8 +54,17 @@ def publish(
     if publication.waiting is not None:
         confirmation.keep(c, claim.layer, claim.tile, publication.waiting)
     accounts.put_courses(c, claim.layer, claim.tile, publication.courses)
-    accounts.put_tests(c, claim.layer, claim.tile, publication.shift_tests, timing)
+    _put_tests(c, publication, timing)
     return result
+
+
+def _put_tests(c: apsw.Connection, publication: Publication, timing: dict[str, Any]) -> None:
+    """The accounts of the vehicles, and which of their reports about features are refuted now."""
+    claim, tests = publication.claim, publication.shift_tests
+    vehicles = {test.vehicle for test in tests} if is_feature_layer(claim.layer) else set()
+    before = refuted.refuted(c, claim.layer, vehicles)
+    accounts.put_tests(c, claim.layer, claim.tile, tests, timing)
+    refuted.merge_again(c, claim.layer, before, refuted.refuted(c, claim.layer, vehicles), timing)
 
 
 def put_base(

@@ -90,7 +90,8 @@ def naming_line(account: VehicleAccount) -> str:
         shift = (
             f"{account.length_m:.2f} ± {account.length_sd_m:.2f} m{_along(account)}, {degrees(account.turn_rad):.1f}°"
         )
-        says.append(f"{account.explained} of {account.tested} tiles explained by a shift of {shift}")
+        by = f"explained by a shift of {shift}" if account.length_m > 0.0 else "contradicted by the other vehicles"
+        says.append(f"{account.explained} of {account.tested} tiles {by}")
     if account.is_turned:
         turn = f"{abs(degrees(account.course_rad)):.2f} ± {degrees(account.course_sigma_rad):.2f}°"
         side = "left" if account.course_rad > 0 else "right"

@@ -121,6 +121,11 @@ class Store(Protocol):
         has reported about wait to be merged again.
         """
 
+    def refuted_reports(self, layer: str, vehicles: Iterable[str]) -> dict[str, str]:
+        """The reports of some vehicles about a layer that others contradict in most tiles, and whose each is. When one
+        comes or goes, all tiles that its vehicle speaks of wait to be merged again.
+        """
+
     def vehicle_accounts(self) -> list[VehicleAccount]:
         """What shift tests and courses say of each vehicle of which there are any, by vehicle."""
 

@@ -121,6 +121,7 @@ class Reporter:
         self._trial = Trial(self._match_map, parameters.shift)
         self._doubts = TileDoubts(detector.local_map.grid_frame)
         self._T_map_vehicle: F64 | None = None  # of the newest scan that counted
+        self._shifted = 0
 
     def add_scan(self, segmented: SegmentedScan) -> None:
         """Count the scan's rays, if its pose is good enough to speak about the world and has stood the shift test."""
@@ -149,6 +150,11 @@ class Reporter:
         self._trial.take_back(until_ns)
         self._hear_trial()
 
+    def take_shifted(self) -> int:
+        """How many scans have not stood the shift test since this was asked last."""
+        shifted, self._shifted = self._shifted, 0
+        return shifted
+
     def _remember(self, segmented: SegmentedScan, what: str) -> None:
         """Which tiles a scan saw of whose pose something is to be said."""
         scan = segmented.scan
@@ -162,6 +168,7 @@ class Reporter:
         for tried in self._trial.take_tried():
             costs = None
             if tried.verdict == "shifted":
+                self._shifted += tried.scans
                 self.largest_shift.see(tried.shift)
                 costs = costs_at(tried.points_map_m, np.eye(4), self._match_map.near(tried.T_map_vehicle[:3, 3]))
             self._doubts.tried(tried, costs)

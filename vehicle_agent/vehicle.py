@@ -100,6 +100,8 @@ class Vehicle:
         self.place.take(item, self.localiser.online)
         if self.timeline.note(item.t_ns, self.place.health):
             self.reporter.take_back(item.t_ns)  # since when it was wrong is not known
+            if self.features is not None:
+                self.features.take_back()
         self.link.ledger.set_position(self.place.odometer_m, item.t_ns)
 
     def download(self) -> None:
@@ -149,6 +151,7 @@ class Vehicle:
     def judge(self, segmented: SegmentedScan) -> None:
         """Judge the features in view of a scan whose pose is final; a district left behind goes to the outbox."""
         if self.features is not None:
+            self.features.doubt(self.reporter.take_shifted())
             self.features.take(segmented, self.place.odometer_m)
 
     def report_the_rest(self) -> None:

@@ -15,6 +15,9 @@ DEFAULT_OUT = Path("runs/reproduce-slamcu")
 @click.option("--drives", default=10, show_default=True, help="Vehicles whose reports are merged.")
 @click.option("--km", default=20.0, show_default=True, help="Length of the motorway; signs in proportion.")
 @click.option("--ablations/--no-ablations", default=True, show_default=True, help="The first drive in all variants.")
+@click.option(
+    "--faults", default="", help="What the vehicle knows nothing of, put into every drive: camera, gnss, signs."
+)
 @click.option("--out", type=PATH, default=DEFAULT_OUT, show_default=True, help="Folder that keeps everything.")
 @click.option("--json", "json_file", help="Write the result as JSON; `-` prints it and nothing else.")
 @click.option("--pictures", type=PATH, help="Folder for the figures.  [default: the one that keeps everything]")
@@ -58,7 +61,14 @@ def options_of(given: dict[str, Any]) -> Any:
     """
     from benchmarks.slamcu_study.options import SlamcuOptions
 
-    return SlamcuOptions(seeds_of(given["seeds"]), given["drives"], given["km"], given["ablations"])
+    return SlamcuOptions(
+        seeds_of(given["seeds"]), given["drives"], given["km"], given["ablations"], faults_of(given["faults"])
+    )
+
+
+def faults_of(text: str) -> tuple[str, ...]:
+    """Return faults written as names with commas, each once, sorted."""
+    return tuple(sorted({name for part in text.split(",") if (name := part.strip())}))
 
 
 def seeds_of(text: str) -> tuple[int, ...]:

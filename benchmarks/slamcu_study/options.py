@@ -6,6 +6,7 @@ from typing import Final
 
 from benchmarks.feature_study.output import check_seeds
 from benchmarks.simulation.errors import OptionError
+from benchmarks.slamcu_study.faults import check_faults
 
 FULL: Final = "full"
 VARIANTS: Final[Mapping[str, str]] = {
@@ -28,15 +29,18 @@ class SlamcuOptions:
         drives: vehicles whose reports are merged; the first of them is the paper's one drive.
         km: length of the motorway; the number of signs follows it.
         ablations: whether the first vehicle drives once more with each variant.
+        faults: of `FAULTS`, in every drive.
     """
 
     seeds: tuple[int, ...] = (11,)
     drives: int = 10
     km: float = 20.0
     ablations: bool = True
+    faults: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
         check_seeds(self.seeds)
+        check_faults(self.faults)
         if not 1 <= self.drives <= MOST_DRIVES:
             raise OptionError(f"--drives must be 1 … {MOST_DRIVES}, got {self.drives}")
         if not _KM[0] <= self.km <= _KM[1]:

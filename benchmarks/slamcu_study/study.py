@@ -14,6 +14,7 @@ from benchmarks.simulation.pool import Job, run_jobs
 from benchmarks.simulation.sources import key_of, sources_sha
 from benchmarks.simulation.streams import Tick
 from benchmarks.slamcu_study.driving import run_slamcu, sign_truth, verdicts_of
+from benchmarks.slamcu_study.faults import with_faults
 from benchmarks.slamcu_study.merging import merged_signs, sign_reports
 from benchmarks.slamcu_study.options import FULL, SlamcuOptions
 from benchmarks.slamcu_study.outcome import MergedSigns, SeedOutcome, StudyOutcome
@@ -31,6 +32,7 @@ SOURCES: Final = (
     "vehicle_agent/features",
     "benchmarks/feature_study",
     "benchmarks/slamcu_study/driving.py",
+    "benchmarks/slamcu_study/faults.py",
     "benchmarks/slamcu_study/merging.py",
     "benchmarks/slamcu_study/verdicts.py",
 )
@@ -47,6 +49,7 @@ class DriveTask:
         km: its length.
         vehicle: 1, 2, 3 …; its drive has its own noise, traffic and speed.
         variant: of `VARIANTS`.
+        faults: of `FAULTS`.
         home: folder of results.
         key: hash of all that decides them.
     """
@@ -55,18 +58,23 @@ class DriveTask:
     km: float
     vehicle: int
     variant: str
+    faults: tuple[str, ...]
     home: Path
     key: str
 
     @property
     def verdicts(self) -> Kept:
         """Where what it says is kept."""
-        return Kept(self.home, f"verdicts-{self.vehicle}-{self.variant}", self.key)
+        return Kept(self.home, f"verdicts-{self._label}", self.key)
 
     @property
     def reports(self) -> Kept:
         """Where its reports are kept."""
-        return Kept(self.home, f"reports-{self.vehicle}-{self.variant}", self.key)
+        return Kept(self.home, f"reports-{self._label}", self.key)
+
+    @property
+    def _label(self) -> str:
+        return "-".join([str(self.vehicle), self.variant, *self.faults])
 
     @property
     def done(self) -> bool:
@@ -105,12 +113,13 @@ def tasks_of(options: SlamcuOptions, seed: int, folder: RunFolder) -> list[Drive
     home = folder.root / f"seed-{seed}"
     vehicles = [(vehicle, FULL) for vehicle in range(1, options.drives + 1)]
     variants = [(1, variant) for variant in options.variants if variant != FULL]
-    bare = DriveTask(seed, options.km, 0, FULL, home, "")
+    bare = DriveTask(seed, options.km, 0, FULL, options.faults, home, "")
     return [_keyed(replace(bare, vehicle=vehicle, variant=variant)) for vehicle, variant in [*vehicles, *variants]]
 
 
 def _keyed(task: DriveTask) -> DriveTask:
     what = {"seed": task.seed, "km": task.km, "vehicle": task.vehicle, "variant": task.variant}
+    what["faults"] = ",".join(task.faults)
     return replace(task, key=key_of(sources=sources_sha(SOURCES), **what))
 
 
@@ -118,6 +127,7 @@ def run_drive(task: DriveTask, tick: Tick) -> None:
     """Drive, classify, report; runs in a worker process."""
     route, parameters = motorway(task.seed, 1e3 * task.km), SlamcuParameters()
     drive = drive_route(route, task.vehicle, RoadDriveOptions(start_ns=EPOCH_NS + task.vehicle * _HOUR_NS))
+    drive = with_faults(drive, task.faults, task.seed)
     driven = run_slamcu(drive, task.variant, parameters, task.vehicle, tick)
     write_reports(sign_reports(drive, driven, task.vehicle, parameters), task.reports)
     write_verdicts(verdicts_of(drive, driven), sign_truth(route), task.verdicts)

@@ -2,7 +2,7 @@
 
 import threading
 from collections import defaultdict
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import replace
 from pathlib import Path
 
@@ -13,7 +13,7 @@ from waiting import wait_until
 from cloud_merger.config import ShardConfig
 from cloud_merger.merger import run_shard
 from fleet_bus.bus import Bus
-from fleet_sim.roads.drive import RoadDriveOptions, drive_route
+from fleet_sim.roads.drive import RoadDrive, RoadDriveOptions, drive_route
 from fleet_sim.roads.recording import write_road_drive
 from fleet_sim.roads.route import Route
 from fleet_sim.roads.streetlights import streetlight_motorway
@@ -67,9 +67,19 @@ def store(bus: Bus, endpoint: str, route: Route, tmp_path: Path) -> Iterator[Sql
         thread.join()
 
 
-def drive(route: Route, vehicle: int, endpoint: str, folder: Path) -> dict[str, object]:
-    name = f"mapper-{vehicle}"
-    path = write_road_drive(drive_route(route, vehicle, RoadDriveOptions()), name, folder / f"{name}.mcap")
+def reflected(honest: RoadDrive) -> RoadDrive:
+    """The same drive with a GNSS that is 30 m beside itself for its second half."""
+    xy_m = honest.gnss.xy_m.copy()
+    xy_m[len(xy_m) // 2 :] += np.array([21.0, -21.0])
+    return replace(honest, gnss=replace(honest.gnss, xy_m=xy_m))
+
+
+def drive(
+    route: Route, vehicle: int, endpoint: str, folder: Path, gone_wrong: Callable[[RoadDrive], RoadDrive] | None = None
+) -> dict[str, object]:
+    folder.mkdir(exist_ok=True)
+    name, driven = f"mapper-{vehicle}", drive_route(route, vehicle, RoadDriveOptions())
+    path = write_road_drive(gone_wrong(driven) if gone_wrong else driven, name, folder / f"{name}.mcap")
     config = AgentConfig(
         vehicle=name,
         drive=path,
@@ -114,6 +124,18 @@ def test_vehicles_without_lidar_make_a_layer_and_one_alone_does_not(
     reports = [FeatureReport.decode(row.body) for row in store.reports("streetlights")]
     assert {report.vehicle for report in reports} == {f"mapper-{n}" for n in range(VEHICLES)}
     assert store.quarantined() == []
+
+
+def test_a_graph_that_contradicts_itself_reports_nothing_and_says_so(
+    route: Route, store: SqliteStore, endpoint: str, tmp_path: Path
+) -> None:
+    """The optimum is a compromise between motion and fixes that cannot both be right; no light of it leaves the car."""
+    honest = drive(route, 1, endpoint, tmp_path / "honest")
+    assert (honest["stretches"], honest["stretches_contradicting"]) == (1, 0)
+    assert honest["reports_sent"] > 0  # type: ignore[operator]
+    wrong = drive(route, 1, endpoint, tmp_path / "wrong", reflected)
+    assert (wrong["stretches"], wrong["stretches_contradicting"]) == (0, 1)
+    assert wrong["reports_sent"] == 0
 
 
 def test_a_vehicle_without_lidar_needs_a_feature_layer(tmp_path: Path) -> None:

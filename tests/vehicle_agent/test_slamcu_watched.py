@@ -112,6 +112,33 @@ def test_a_map_whose_signs_all_stand_elsewhere_is_not_followed_silently() -> Non
     assert told.slamcu.doubts or told.slamcu.lost
 
 
+def given_up(told: Told) -> np.ndarray:
+    """(S,) looks of stretches of which the vehicle says nothing."""
+    t_s, lost = np.array([one.t_s for one in told.slamcu.path]), np.zeros(len(told.slamcu.path), bool)
+    for one in told.slamcu.lost:
+        lost |= (t_s >= one.from_s) & (t_s <= one.until_s) & (not one.told_anew)
+    return lost
+
+
+@pytest.mark.slow
+def test_fixes_that_go_wrong_for_good_end_in_giving_up_and_nothing_concluded_then_is_told() -> None:
+    """From 40 s on all fixes lie 14 m to the left, a few signs have gone and a few are new: map and GNSS contradict,
+    the vehicle cannot know which is right, and says of the rest of its way nothing at all.
+    """
+    changed = [(x + 40.0, y) if 1200.0 < x < 1900.0 and i % 2 else (x, y) for i, (x, y) in enumerate(SIGNS)]
+    road = replace(LONG, standing=changed)
+    honest = watched(road, Trouble(), 0).slamcu
+    assert sum(one != NORMAL for one in classes(honest)) + len(honest.new_features()) >= 4
+    told = watched(road, Trouble(gnss_m=lambda t_s: np.array([0.0, 14.0]) if t_s > 40.0 else HERE), 0)
+    assert told.slamcu.is_lost
+    assert np.sqrt(told.slamcu.pose()[1][1, 1]) > 8.0
+    assert any(not one.told_anew for one in told.slamcu.lost)
+    assert classes(told.slamcu) == [NORMAL] * len(SIGNS)
+    assert told.slamcu.new_features() == ()
+    wrong = (np.hypot(*told.off_m.T) > 5.0) & ~given_up(told)
+    assert wrong.sum() < 75  # five seconds
+
+
 def test_wheels_that_tell_three_per_cent_too_much() -> None:
     """Six times the sigma that is known of them: the place must stay within what is claimed, or be said to be lost."""
     told = watched(LONG, Trouble(wheel=1.03), 4)

@@ -178,6 +178,10 @@ ORDER BY at_ns DESC, layer, tile, report_id LIMIT :n
 -- name: shifted_vehicles
 SELECT vehicle FROM shifted_vehicle ORDER BY vehicle
 
+-- name: refuted_reports
+SELECT report_id FROM shift_test WHERE vehicle = :vehicle AND layer = :layer
+GROUP BY report_id HAVING SUM(explained) >= :least AND SUM(explained) >= :share * COUNT(*)
+
 -- name: distrust_vehicle
 INSERT INTO shifted_vehicle (vehicle, since_ns) VALUES (:vehicle, :since_ns) ON CONFLICT (vehicle) DO NOTHING
 

@@ -64,6 +64,14 @@ class FeatureWork:
         """A scan whose pose is final."""
         self.layers.take(segmented, odometer_m)
 
+    def take_back(self) -> None:
+        """The pose was wrong, and it is not known since when."""
+        self.layers.take_back()
+
+    def doubt(self, scans: int) -> None:
+        """So many of the last scans did not stand the shift test."""
+        self.layers.doubt(scans)
+
     def finish(self) -> None:
         """The drive has ended: report everything."""
         self.layers.finish()

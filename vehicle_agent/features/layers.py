@@ -14,7 +14,9 @@ from gnd_map.arrays import F64, I64
 from gnd_map.features import FeatureTile
 from gnd_map.geodesy import LocalFrame
 from gnd_map.se3 import interpolate_poses
+from gnd_map.tile_id import TileId
 from schemas.drive import Detections
+from schemas.features import FeatureChange
 from vehicle_agent.config import ReportParameters
 from vehicle_agent.detect.uncertainty import PoseUncertainty
 from vehicle_agent.features.feature_report import FeatureReporter
@@ -23,6 +25,7 @@ from vehicle_agent.features.layer_parameters import FeatureParameters
 from vehicle_agent.features.look import MAX_RANGE_M, Look
 from vehicle_agent.features.poles.detector import PoleDetector, Rays, detections_of
 from vehicle_agent.features.poles.slices import PoseSigma
+from vehicle_agent.features.pose_doubts import GOOD, POOR, WRONG, PoseDoubts
 from vehicle_agent.features.view import Occlusion
 from vehicle_agent.localise.estimates import RefinedScan
 from vehicle_agent.segment.segmenter import SegmentedScan
@@ -68,6 +71,7 @@ class FeatureLayers:
         self._before: _Pose | None = None
         self._looked_at: F64 | None = None
         self._t_ns = 0
+        self._doubts = PoseDoubts()
 
     def hold(self, layer: str, tile: FeatureTile) -> None:
         """A version of a tile has come."""
@@ -83,20 +87,45 @@ class FeatureLayers:
         scan = segmented.scan
         if not self._usable(scan):
             self.counts["feature_scans_uncertain"] += 1
+            self._doubts.count(self._open(), POOR)
             self._before = None
             return
         self._t_ns = scan.t_ns
         self._camera_looks(scan)
         self._lidar_looks(segmented)
         self._before = _Pose(scan.t_ns, scan.estimate.T_map_vehicle)
+        self._doubts.count(self._open(), GOOD)
         self._leave_behind(scan.estimate.T_map_vehicle[:3, 3], odometer_m)
 
     def finish(self) -> None:
         """The drive has ended: say everything."""
         for name, layer in self.layers.items():
             for change in layer.leave_all():
-                self._reporters[name].add(change, self._t_ns, 0.0)
+                self._say(name, change, 0.0)
             self._reporters[name].report_all(self._t_ns)
+
+    def take_back(self) -> None:
+        """The pose was wrong, and it is not known since when: nothing is said of the tiles that are in sight."""
+        self._doubts.count(self._open(), WRONG)
+        self._scans.clear()
+        self._before = None
+
+    def doubt(self, scans: int) -> None:
+        """A shift lays so many of the last scans better onto the map: their poses were off."""
+        if scans:
+            self._doubts.count(self._open(), POOR, scans)
+
+    def _open(self) -> list[tuple[str, TileId]]:
+        """Tiles of which there is evidence."""
+        return [(name, tile) for name, layer in self.layers.items() for tile in layer.tiles]
+
+    def _say(self, name: str, change: FeatureChange, odometer_m: float) -> None:
+        """Report a tile, unless the poses from which it was seen are in doubt."""
+        if self._doubts.holds_back((name, change.tile)):
+            self.counts["tiles_held_back"] += 1
+            self.counts["features_held_back"] += change.n_features
+            return
+        self._reporters[name].add(change, self._t_ns, odometer_m)
 
     def account(self) -> dict[str, dict[str, int]]:
         """Counts by layer: reports, features judged and found."""
@@ -104,7 +133,7 @@ class FeatureLayers:
 
     def _usable(self, scan: RefinedScan) -> bool:
         pose, most = PoseUncertainty.of(scan.estimate), self._report
-        good = scan.estimate.health == "good"
+        good = scan.estimate.health == "good" and not scan.estimate.disagrees
         return bool(good and pose.sigma_m <= most.max_sigma_m and pose.sigma_rad <= most.max_sigma_rad)
 
     # The camera
@@ -160,7 +189,7 @@ class FeatureLayers:
         for name, layer in self.layers.items():
             reporter, reach_m = self._reporters[name], layer.parameters.range_m + self._parameters.margin_m
             for change in layer.leave(p_map_m, reach_m):
-                reporter.add(change, self._t_ns, odometer_m)
+                self._say(name, change, odometer_m)
             reporter.report(layer.tiles, self._t_ns, odometer_m)
 
 

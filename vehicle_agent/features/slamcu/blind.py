@@ -77,6 +77,13 @@ class BlindFilter:
         self._since = np.zeros(3)  # x, y, heading at the last propagation of the covariance
         self._since[:] = self._mean[:3]
         self._driven_s = 0.0
+        self._F = np.eye(7)  # since the last fix
+        self._expected = belief, np.eye(7)
+
+    @property
+    def expected(self) -> tuple[Belief, F64]:
+        """What was believed right before the last fix, and the transition (7, 7) from right after the one before."""
+        return self._expected
 
     @property
     def belief(self) -> Belief:
@@ -113,7 +120,7 @@ class BlindFilter:
         q[:2, HEADING] = q[HEADING, :2] = 0.5 * noise.yaw_rad**2 * t_s * across
         q[HEADING, HEADING] = noise.yaw_rad**2 * t_s
         q[SCALE, SCALE], q[BIAS, BIAS] = noise.scale_walk**2 * t_s, noise.bias_walk_radps**2 * t_s
-        self._cov = F @ self._cov @ F.T + q
+        self._cov, self._F = F @ self._cov @ F.T + q, F @ self._F
         self._since[:] = self._mean[:3]
         self._driven_s = 0.0
 
@@ -129,6 +136,7 @@ class BlindFilter:
         F = np.diag([1.0, 1.0, 1.0, 1.0, 1.0, fade, fade])
         self._mean, self._cov = F @ self._mean, F @ self._cov @ F
         self._cov[[GNSS_X, GNSS_Y], [GNSS_X, GNSS_Y]] += (1.0 - fade**2) * slow
+        self._expected, self._F = (Belief(self._mean.copy(), self._cov.copy()), F @ self._F), np.eye(7)
         H = np.zeros((2, 7))
         H[0, [X, GNSS_X]] = H[1, [Y, GNSS_Y]] = 1.0
         nu, S = xy_m - H @ self._mean, H @ self._cov @ H.T + white * np.eye(2)

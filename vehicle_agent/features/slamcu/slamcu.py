@@ -177,6 +177,11 @@ class Slamcu:
         """Where the vehicle is by wheels, gyro and GNSS alone."""
         return self._blind.belief
 
+    @property
+    def has_fixes(self) -> bool:
+        """Whether the GNSS has told anything yet."""
+        return self._blind.has_fixes
+
     def look_anew(self) -> None:
         """Lost: look for the place anew around where wheels, gyro and GNSS have it.
 

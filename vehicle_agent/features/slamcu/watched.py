@@ -9,7 +9,7 @@ state that was good is undone, and the place is looked for anew where the vehicl
 
 from collections.abc import Iterator
 from copy import deepcopy
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from math import radians
 from typing import Final
 
@@ -17,6 +17,20 @@ import numpy as np
 
 from gnd_map.arrays import F64
 from vehicle_agent.features.look import Look, MapFeatures
+from vehicle_agent.features.slamcu.blind import Belief
+from vehicle_agent.features.slamcu.existence_book import FeatureClass
+from vehicle_agent.features.slamcu.hindsight import (
+    GATE,
+    GATE_SURE,
+    Contradiction,
+    Hindsight,
+    Smoothed,
+    claimed,
+    claimed_now,
+    contradictions,
+    held,
+    speaks_against,
+)
 from vehicle_agent.features.slamcu.parameters import SlamcuParameters
 from vehicle_agent.features.slamcu.slamcu import Slamcu
 from vehicle_agent.features.slamcu.verdicts import KnownState, NewFeature
@@ -43,6 +57,16 @@ MOST_PATIENCE_S: Final = 160.0
 WIDE_M: Final = 2.5
 WIDE_RAD: Final = radians(0.5)
 """What a place is made less certain by that fixes speak against, when no account is better: most of a lane."""
+CONTRADICTS: Final = 15.0
+"""Where the account that GNSS, wheels and gyro allow is so much worse (natural logarithm; five signs gone) than one
+that they deny, map and GNSS contradict, and nobody can tell which is right."""
+FOUND_AGAIN: Final = 2
+"""A vehicle that has given up knows its place again when so many signs of the map are there, and more than are not."""
+LOST_M: Final = 10.0
+"""Sigma of each axis of the place until then."""
+LOOK_BACK_EVERY_S: Final = 10.0
+LOOK_BACK_S: Final = 240.0
+"""Hindsight is asked so often, of so much: fixes from farther back say nothing of the place."""
 AT_THE_END: Final = 0.5
 """When the drive ends a doubt need be only so large: nothing more will come."""
 
@@ -69,6 +93,10 @@ class Lost:
     value: float
     taken_back: int
     told_anew: bool
+
+    def covers(self, from_s: float, until_s: float) -> bool:
+        """Whether a stretch lies within one that was given up."""
+        return not self.told_anew and self.from_s <= from_s and until_s <= self.until_s
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -218,6 +246,11 @@ class WatchedSlamcu:
         self._events: list[_Event] = []
         self._kept: list[_Kept] = [self._state()]
         self._asked_s, self._patience_s = 0.0, PATIENCE_S
+        self._hindsight = Hindsight(parameters, Belief.first(pose0, cov0, parameters, gnss_sigma_m))
+        self._back_s = self._known_s = 0.0  # when hindsight was asked last, and until when its answer has been heard
+        self._clock_ns = 0
+        self._lost_since: _Kept | None = None
+        self._extra = np.zeros((0, 2, 2))  # of each pose of the path, once the drive has ended
 
     def predict(self, dt_s: float, speed_mps: float, yaw_rate_radps: float) -> None:
         """As of `Slamcu`."""
@@ -238,19 +271,44 @@ class WatchedSlamcu:
         alarm = self._now.watch.alarm(AT_THE_END)
         if alarm is not None:
             self._look_into(alarm)
+        self._look_back()
+        if self._lost_since is not None:
+            self._stay_lost(self._lost_since)
         self._slamcu.decide()
+        if self.path:
+            columns = _columns(self.path)
+            covs = claimed(*columns, self._hindsight.smoothed())
+            self._extra = (covs - columns[2])[:, :2, :2]
+            self.path = [replace(one, cov=cov) for one, cov in zip(self.path, covs, strict=True)]
 
     def pose(self) -> tuple[F64, F64]:
         """Pose (3,) x, y [m], heading [rad], and covariance (3, 3)."""
-        return self._slamcu.pose()
+        pose, cov = self._slamcu.pose()
+        wide = claimed_now(pose, cov, self._slamcu.blind) if self._slamcu.has_fixes else held(cov[None])[0]
+        return pose, wide + np.diag([LOST_M**2, LOST_M**2, 0.0]) if self.is_lost else wide
+
+    @property
+    def is_lost(self) -> bool:
+        """Whether the vehicle has given up and not found its place again."""
+        return self._lost_since is not None
 
     def known_states(self) -> tuple[KnownState, ...]:
         """All features of the map, in its order."""
-        return self._slamcu.known_states()
+        states = self._slamcu.known_states()
+        return tuple(one if one.cov_m2 is None else replace(one, cov_m2=one.cov_m2 + self._more(one)) for one in states)
 
     def new_features(self, *, unclassified: bool = False) -> tuple[NewFeature, ...]:
         """Features that the map has not and that exist; `unclassified`: those with too little evidence as well."""
-        return self._slamcu.new_features(unclassified=unclassified)
+        found = self._slamcu.new_features(unclassified=unclassified)
+        return tuple(replace(one, cov_m2=one.cov_m2 + self._more(one)) for one in found)
+
+    def _more(self, one: KnownState | NewFeature) -> F64:
+        """(2, 2) by how much less certain than the particles have it a feature is: as the places it was seen from."""
+        if not len(self._extra) or not one.history:
+            return np.zeros((2, 2))
+        at_s = np.array([pose.t_s for pose in self.path])
+        seen_s = (one.history[-1].t_ns - self._clock_ns) * 1e-9
+        return np.asarray(self._extra[min(int(np.searchsorted(at_s, seen_s)), len(at_s) - 1)])
 
     @property
     def hidden(self) -> int:
@@ -268,6 +326,12 @@ class WatchedSlamcu:
 
     def _take(self, event: _Event) -> None:
         self._now.take(event)  # raises before anything is remembered
+        if isinstance(event, _Moved):
+            self._hindsight.predict(event.dt_s, event.speed_mps, event.yaw_rate_radps)
+        elif isinstance(event, _Fixed):
+            self._hindsight.fix(np.array([event.x_m, event.y_m]), event.sigma_m)
+        else:
+            self._clock_ns = event.look.t_ns - round(self._slamcu.now_s * 1e9)
         self._events.append(event)
         if self._now.path:
             self.path += self._now.path
@@ -278,6 +342,9 @@ class WatchedSlamcu:
         alarm = self._now.watch.alarm()
         if alarm is not None and self._slamcu.now_s - self._asked_s > self._patience_s:
             self._look_into(alarm)
+        elif self._slamcu.now_s - self._back_s >= LOOK_BACK_EVERY_S:
+            self._look_back()
+        self._found_again()
         self._keep()
 
     # States on the way
@@ -319,18 +386,78 @@ class WatchedSlamcu:
             tried += [(one, account) for account in self._tellings(one)]
             if any(self._will_do(account) for _, account in tried):
                 break
-        least = min(_against(account) for _, account in tried)
-        one, best = next(pair for pair in tried if _against(pair[1]) <= least + ALIKE)  # the shortest way back
-        better = _against(best) < _against(self._now) - BETTER
+        smoothed = self._smoothed()
+        against = [_against(account) + self._denied(one, account.path, smoothed) for one, account in tried]
+        first = min(kept.poses for kept in self._kept)
+        now = _against(self._now) + speaks_against(*_columns(self.path[first:]), smoothed)
+        which = next(i for i, one in enumerate(against) if one <= min(against) + ALIKE)  # the shortest way back
+        (one, best), better = tried[which], against[which] < now - BETTER
         self._patience_s = PATIENCE_S if better else min(2.0 * self._patience_s, MOST_PATIENCE_S)
         if better:
             self._adopt(one, best, alarm)
         elif alarm.test in ("offset", "blind"):
             self._slamcu.widen(WIDE_M, WIDE_RAD)
-        if not self._now.watch.agrees:
+        easiest = min(account.cost for account in (self._now, *(each for _, each in tried)))
+        if not self._now.watch.agrees or self._now.cost > easiest + CONTRADICTS:
             self._give_up(alarm)
+        else:
+            self._cut_out(smoothed)
         self._now.watch.settled()
         self._asked_s = self._slamcu.now_s
+
+    def _smoothed(self) -> Smoothed:
+        return self._hindsight.smoothed(self._slamcu.now_s - LOOK_BACK_S)
+
+    def _denied(self, kept: _Kept, path: list[PoseAt], smoothed: Smoothed) -> float:
+        """What hindsight says against the way since the first state that is kept, with another path from one on."""
+        first = min(one.poses for one in self._kept)
+        return speaks_against(*_columns([*self.path[first : kept.poses], *path]), smoothed)
+
+    def _look_back(self) -> None:
+        """Whether what came since denies a place that was believed in."""
+        self._back_s = self._slamcu.now_s
+        found = self._contradictions(self._smoothed())
+        if found:
+            self._known_s = found[-1].until_s
+            most = max(found, key=lambda one: one.squared)
+            self._look_into(Alarm("hindsight", most.squared, GATE))
+
+    def _contradictions(self, smoothed: Smoothed, gate: float = GATE) -> list[Contradiction]:
+        """Stretches that hindsight denies, of those that can be told anew and have not been cut out."""
+        path = self.path[self._kept[0].poses :]
+        found = contradictions(*_columns(path), smoothed, gate) if path else []
+        return [one for one in found if not any(lost.covers(one.from_s, one.until_s) for lost in self.lost)]
+
+    def _cut_out(self, smoothed: Smoothed) -> None:
+        """Stretches that are still denied are not told: as if nobody had looked, and the place is looked for anew."""
+        for denied in self._contradictions(smoothed, GATE_SURE):
+            self._tell_without(denied)
+
+    def _tell_without(self, denied: Contradiction) -> None:
+        kept = next((one for one in reversed(self._kept) if one.t_s < denied.from_s), self._kept[0])
+        self._seed += 1
+        account, at = kept.account.fork(self._seed), kept.poses
+        is_in = False
+        for event in self._events[kept.events :]:
+            was_in, is_in = is_in, denied.from_s - CLEAR_S <= account.slamcu.now_s <= denied.until_s
+            if was_in != is_in:
+                account.slamcu.look_anew()
+            if is_in and isinstance(event, _Looked):
+                account.path.append(self.path[at])
+            else:
+                account.take(event)
+            at += isinstance(event, _Looked)
+        taken = _differences(self._slamcu, account.slamcu)
+        self.lost.append(
+            Lost(denied.from_s - CLEAR_S, denied.until_s, denied.off_m, "hindsight", denied.squared, taken, False)
+        )
+        self._replace(kept, account)
+
+    def _replace(self, kept: _Kept, account: _Account) -> None:
+        self.path[kept.poses :] = account.path
+        account.path.clear()
+        self._now = account
+        self._kept = [one for one in self._kept if one.events <= kept.events]
 
     def _will_do(self, account: _Account) -> bool:
         """Whether an account is so much better, and so free of doubt, that none from farther back is needed."""
@@ -357,11 +484,8 @@ class WatchedSlamcu:
         )
         taken = _differences(self._slamcu, account.slamcu)
         self.lost.append(Lost(kept.t_s, self._slamcu.now_s, off_m, alarm.test, alarm.value, taken, True))
-        self.path[kept.poses :] = account.path
-        account.path.clear()
         account.slamcu.doubt_the_map(doubted=False)
-        self._now = account
-        self._kept = [one for one in self._kept if one.events <= kept.events]
+        self._replace(kept, account)
 
     def _give_up(self, alarm: Alarm) -> None:
         """No account will do: nothing is said of the way since the last good state."""
@@ -380,6 +504,33 @@ class WatchedSlamcu:
         self.lost.append(Lost(kept.t_s, lost_s, off_m, alarm.test, alarm.value, taken, False))
         self._now = account
         self._kept = [*(one for one in self._kept if one.events <= kept.events), self._state()]
+        self._lost_since = self._kept[-1]
+
+    def _found_again(self) -> None:
+        """After giving up: whether signs of the map are where the place that was found since has them."""
+        since = self._lost_since
+        if since is None or self._slamcu.now_s - since.t_s < CLEAR_S:
+            return
+        seen = [one for one in self._slamcu.last_seen(since.t_s, self._slamcu.now_s - CLEAR_S) if one.known]
+        there = sum(one.feature_class == FeatureClass.NORMAL for one in seen)
+        if there >= FOUND_AGAIN and there > sum(one.feature_class == FeatureClass.DELETED for one in seen):
+            self._lost_since = None
+
+    def _stay_lost(self, since: _Kept) -> None:
+        """The place was not found again: nothing of what was concluded since is told."""
+        off_m = float(np.hypot(*(self._slamcu.pose()[0] - self._slamcu.blind.mean[:3])[:2]))
+        taken = _differences(self._slamcu, since.account.slamcu)
+        self.lost.append(Lost(since.t_s, self._slamcu.now_s, off_m, "not found again", 0.0, taken, False))
+        self._now = since.account.fork(self._seed)
+
+
+def _columns(path: list[PoseAt]) -> tuple[F64, F64, F64]:
+    """Times (S,), poses (S, 3) and covariances (S, 3, 3)."""
+    return (
+        np.array([one.t_s for one in path]),
+        np.array([one.pose for one in path]),
+        np.array([one.cov for one in path]),
+    )
 
 
 def _against(account: _Account) -> float:

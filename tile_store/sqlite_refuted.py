@@ -1,0 +1,35 @@
+"""Reports that other vehicles contradict, in SQLite: inside the caller's transaction, derived from `shift_test`."""
+
+from collections.abc import Iterable, Mapping
+from typing import Any, Final
+
+import apsw
+
+from tile_store.sqlite_connection import change, fetch
+
+REFUTED_TESTS: Final = 3
+"""A report is refuted after so many tiles in which it stands alone against others, ..."""
+REFUTED_SHARE: Final = 0.5
+"""... if they are so many of all that could be compared."""
+
+
+def refuted(c: apsw.Connection, layer: str, vehicles: Iterable[str]) -> dict[str, str]:
+    """The refuted reports that some vehicles have made about a layer, and whose each is."""
+    limits = {"layer": layer, "least": REFUTED_TESTS, "share": REFUTED_SHARE}
+    return {
+        str(report): vehicle
+        for vehicle in sorted(set(vehicles))
+        for (report,) in fetch(c, "refuted_reports", limits | {"vehicle": vehicle})
+    }
+
+
+def merge_again(
+    c: apsw.Connection, layer: str, before: Mapping[str, str], now: Mapping[str, str], timing: dict[str, Any]
+) -> None:
+    """Where a report is refuted now that was not before, or the reverse, all tiles that its vehicle speaks of wait to
+    be merged again.
+    """
+    for vehicle in sorted({vehicle for _, vehicle in before.items() ^ now.items()}):
+        for of_layer, tile in fetch(c, "tiles_of_vehicle", {"vehicle": vehicle}):
+            if of_layer == layer:
+                change(c, "mark_dirty", {"layer": layer, "tile": tile} | timing)
