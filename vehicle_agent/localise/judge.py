@@ -1,6 +1,6 @@
 """What follows every match: witness, challenger and monitor together judge the tracked pose, scan by scan."""
 
-from typing import NamedTuple
+from typing import Final, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,13 +21,17 @@ from vehicle_agent.localise.witness import witnessed
 
 F64 = NDArray[np.float64]
 
+FEWEST_POINTS: Final = 20
+"""Of a scan that a sensor in order gives: in an open field four layers see a few dozen points that matter."""
+
 
 class Matched(NamedTuple):
     """One scan after its match.
 
     t_ns: reference time; points_m: (N, 3) vehicle frame; T_before_now: (4, 4) motion since the scan before; T_now: (4,
     4) the tracked pose; result: the match that was made there; believed: whether it counts; motion_gap_s: how much of
-    the way since the scan before was driven without motion samples; cause: what is known to be wrong besides.
+    the way since the scan before was driven without motion samples; cause: what is known to be wrong besides;
+    repeated: it is the scan before to the bit, which no sensor measures.
     """
 
     t_ns: int
@@ -38,6 +42,7 @@ class Matched(NamedTuple):
     believed: bool
     motion_gap_s: float = 0.0
     cause: Cause = "none"
+    repeated: bool = False
 
 
 class Judge:
@@ -54,7 +59,6 @@ class Judge:
         self._way_m = 0.0
         self._T_looked_now = np.eye(4)  # motion since the last scan that had points enough to look at
         self._place: Place | None = None
-        self._last_points: F64 | None = None
 
     def begin(self, points_m: F64, T_now: F64, place: Place | None, match_map: MatchMap) -> None:
         """Take the first scan (N, 3) of the track, at its pose (4, 4), and where GNSS says that it is."""
@@ -119,11 +123,10 @@ class Judge:
 
     def _what_is_wrong(self, scan: Matched, match_map: MatchMap) -> Cause:
         """With the scan itself, whatever it matches."""
-        before, self._last_points = self._last_points, scan.points_m
-        if len(scan.points_m) < self._par.registration.min_matched:
+        if scan.repeated or len(scan.points_m) < FEWEST_POINTS:
             return "bad_scan"
-        if before is not None and np.array_equal(before, scan.points_m):
-            return "bad_scan"  # no sensor measures the same twice, to the bit
+        if len(scan.points_m) < self._par.registration.min_matched:
+            return "poor_place"
         known = _known_ratio(scan, match_map) if scan.result is None else scan.result.known_ratio
         if known < self._par.causes.least_known:
             return "no_map"

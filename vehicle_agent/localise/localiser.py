@@ -137,6 +137,7 @@ class Localiser:
         self._ready: deque[tuple[_HeldScan, SmoothedPose]] = deque()
         self._first = FirstPose(self.parameters)
         self._last_ns: int | None = None  # of the newest scan that was looked at
+        self._last_raw_m, self._repeated = np.empty((0, 3), np.float32), False
         self._from_past = 0  # scans in a row
         self._told: _Told | None = None
         self._track: _Track | None = None
@@ -225,6 +226,8 @@ class Localiser:
         scan, self._pending = self._pending, None
         if scan is None:
             return
+        self._repeated = np.array_equal(self._last_raw_m, scan.points_m)
+        self._last_raw_m = scan.points_m
         chosen = sample_scan(scan.points_m, self.parameters.sampling)
         self._look_at_mount(scan)
         points = self._deskewed(scan, chosen, scan.points_m[chosen])
@@ -299,8 +302,9 @@ class Localiser:
         gnss, T_now = self._gnss_at(track, t_ns, predicted), predicted if match is None else match.T_map_vehicle
         unknown_s = max(self._motion.unknown_s(track.held[newest].t_ns, t_ns), self._motion.age_s(t_ns))
         seen_scan = Matched(
-            t_ns, points, joint.T_before_now, T_now, result, believed, unknown_s, self._teacher.clock_cause
-        )
+            t_ns, points, joint.T_before_now, T_now, result, believed, unknown_s, self._teacher.clock_cause,
+            repeated=self._repeated,
+        )  # fmt: skip
         track.judge.see(seen_scan, self._map.near(T_now[:3, 3]))
         final = track.graph.add(t_ns, predicted, odometry, match or self._settled(predicted), gnss, seen)
         self._hold(track, scan, result.matching_ratio if result is not None else 0.0, sweep, unsure)
