@@ -454,13 +454,16 @@ def told_by_scans(steps: Sequence[Sequence[Step]], shared_off: F64) -> F64:
     """(6,) mean square of what the motion of some steps by wheels and gyro (the first measurement of each) differs from
     what scans say (the second), in units of the variance claimed; endless where scans say too little.
     """
-    squares = []
+    windows, single = [], []
     for i in range(0, len(steps) - WINDOW + 1, WINDOW // 2):
         window = steps[i : i + WINDOW]
         if all(len(measured) > 1 for measured in window):
-            off = np.sum([residual(seen.T_before_now, driven, shared_off)[0] for driven, seen, *_ in window], axis=0)
-            squares.append(off**2 / np.sum([np.diag(driven.covariance) for driven, *_ in window], axis=0))
-    return np.mean(squares, axis=0) if squares else np.full(6, np.inf)
+            off = np.array([residual(seen.T_before_now, driven, shared_off)[0] for driven, seen, *_ in window])
+            variance = np.array([np.diag(driven.covariance) for driven, *_ in window])
+            by_scans = np.array([np.diag(seen.covariance) for _, seen, *_ in window])
+            windows.append(off.sum(axis=0) ** 2 / variance.sum(axis=0))
+            single.append((off**2 - by_scans).sum(axis=0) / variance.sum(axis=0))
+    return np.maximum(np.mean(windows, axis=0), np.mean(single, axis=0)) if windows else np.full(6, np.inf)
 
 
 def _chained(seen: Sequence[ScanStep]) -> Step:

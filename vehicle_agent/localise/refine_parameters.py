@@ -31,14 +31,14 @@ class RefineParameters:
     every_s: float = 1.0
     knot_m: float = 0.7
     knot_s: float = 0.5
-    n_points: int = 1200
-    correlated_m: float = 4.0
+    n_points: int = 2500
+    correlated_m: float = 2.0
     length_m: float = 25.0
     length_s: float = 15.0
     lag_m: float = 10.0
     longest_s: float = 4.0
     yaw_deg: float = 0.02
-    longitudinal_m: float = 0.004
+    longitudinal_m: float = 0.01
     lateral_m: float = 0.003
     roll_pitch_deg: float = 0.2
     vertical_m: float = 0.01
