@@ -22,20 +22,31 @@ from vehicle_agent.localise.estimates import Cause, Health, PoseEstimate, Refine
 from vehicle_agent.localise.first_pose import FirstPose, Place
 from vehicle_agent.localise.graph import MapMatch, Odometry, PoseGraph, Position, SmoothedPose
 from vehicle_agent.localise.health import HealthMonitor
+from vehicle_agent.localise.held_scan import (
+    POSE_SHARE,
+    SURE,
+    HeldScan,
+    end_ns,
+    estimate_of,
+    left_in_sweep,
+    reference_ns,
+    settled_dispute,
+    sigmas_of,
+    sweep_variance,
+)
 from vehicle_agent.localise.judge import Judge, Matched
 from vehicle_agent.localise.level import on_the_road, sees_tilt, settled
 from vehicle_agent.localise.match_map import MatchMapCache
 from vehicle_agent.localise.mount import near_points
 from vehicle_agent.localise.neighbours import FAR_M, UNSURE_M, hedged, weakest
 from vehicle_agent.localise.odometry import MotionBuffer
-from vehicle_agent.localise.packed_scan import PackedScan, pack
+from vehicle_agent.localise.packed_scan import pack
 from vehicle_agent.localise.parameters import LocaliserParameters
 from vehicle_agent.localise.refine import Refiner
 from vehicle_agent.localise.registration import RegistrationResult, Start, register
 from vehicle_agent.localise.remount import TRUSTED, Mounting, lever_covariance
 from vehicle_agent.localise.sampling import sample_scan
 from vehicle_agent.localise.scan_odometry import JointStep, ScanOdometry, ScanStep, joint_step
-from vehicle_agent.localise.stretch import log_se3
 
 F64 = NDArray[np.float64]
 Distortion = Callable[[float, float], DistortionSigma]
@@ -43,10 +54,6 @@ Distortion = Callable[[float, float], DistortionSigma]
 
 MAX_GNSS_AGE_NS = 2_000_000_000
 TOLD_M, TOLD_RAD = 0.1, 0.01  # one sigma of a pose from outside
-OVERRULED: Final[tuple[Cause, ...]] = ("wrong_pose", "stale_map", "poor_place", "no_match", "unconfirmed")
-"""What single scans hold against a pose and submaps may know better."""
-DISPUTED_CHI2 = 21.1  # of heading and place, three degrees of freedom: 99.99 %
-DISPUTED_VARIANCE = np.array([np.radians(0.1), 0.02, 0.02]) ** 2  # what online poses are wrong by in changed places
 MOUNTED_M, MOUNTED_RAD, TRIMMED_RAD = 0.003, np.radians(0.02), np.radians(0.004)
 """One sigma of a mount that is as told: position, and yaw; of the axle's own course (tyres, the road's camber) once
 that tells the yaw. All scans share it.
@@ -54,28 +61,7 @@ that tells the yaw. All scans share it.
 COURSE_RAD: Final = np.radians(0.012)
 """One sigma of the course where a pose's own covariance does not hold it: that of online poses."""
 SWEPT_NS = 100_000_000
-POSE_SHARE = 0.25
-"""Of what distortion moves a point by, as far as it moves a pose, which is held by points all around."""
-SURE: Final = np.zeros(3)
 PAST_NS, MOST_FROM_PAST = 1_000_000_000, 5
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class _HeldScan:
-    """A scan in the lag: what is needed to make it final, and how its match went. `sweep` is the motion during the
-    sweep where it is not the one that wheels and gyro tell; `online` the pose as it was when the scan came; `unsure`
-    (3,) variance of the sweep's motion forward, left and in yaw.
-    """
-
-    scan: PackedScan
-    sweep: Trajectory | None
-    t_ns: int
-    matching_ratio: float
-    health: Health
-    cause: Cause
-    degenerate: tuple[str, ...]
-    online: SmoothedPose
-    unsure: F64
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -94,7 +80,7 @@ class _Track:
     graph: PoseGraph
     judge: Judge
     refiner: Refiner | None
-    held: dict[int, _HeldScan]
+    held: dict[int, HeldScan]
     wrong: Wrong = "open"  # of wheels and scans, since they contradict each other
 
 
@@ -134,7 +120,7 @@ class Localiser:
         self._fix: GnssFix | None = None
         self._pending: Scan | None = None
         self._newest_scan_ns = -1
-        self._ready: deque[tuple[_HeldScan, SmoothedPose]] = deque()
+        self._ready: deque[tuple[HeldScan, SmoothedPose]] = deque()
         self._first = FirstPose(self.parameters)
         self._last_ns: int | None = None  # of the newest scan that was looked at
         self._last_raw_m, self._repeated = np.empty((0, 3), np.float32), False
@@ -219,7 +205,7 @@ class Localiser:
     # --- one scan --------------------------------------------------------------------------------------------------
 
     def _process_if_covered(self) -> None:
-        if self._pending is not None and len(self._motion) and self._motion.last_ns >= _end_ns(self._pending):
+        if self._pending is not None and len(self._motion) and self._motion.last_ns >= end_ns(self._pending):
             self._process()
 
     def _process(self) -> None:
@@ -239,18 +225,18 @@ class Localiser:
             self._start(scan, points)
         else:
             self._step(self._track, scan, chosen, points)
-        self._last_ns = _reference_ns(scan)
+        self._last_ns = reference_ns(scan)
 
     def _without_company(self, scan: Scan, chosen: NDArray[np.int64], points: F64) -> tuple[NDArray[np.int64], F64]:
         """The sampled points, and these in the vehicle frame, without those on what travels along."""
-        t_ns = _reference_ns(scan)
+        t_ns = reference_ns(scan)
         moved = self._motion.delta(t_ns if self._last_ns is None else self._last_ns, t_ns)
         stands = ~self._co_moving.see(scan.points_m, scan.t_offset_ns, scan.t_ns, t_ns, chosen, points, moved)
         return chosen[stands], points[stands]
 
     def _look_at_mount(self, scan: Scan) -> None:
         """Watch the mount; what it is known by then counts as soon as no track is torn by it."""
-        t_ns, mounting = _reference_ns(scan), self._mounting
+        t_ns, mounting = reference_ns(scan), self._mounting
         if mounting.watch.due(t_ns):
             near = near_points(scan.points_m)
             mounting.see(t_ns, self._deskewed(scan, near, scan.points_m[near]))
@@ -273,7 +259,7 @@ class Localiser:
 
     def _step(self, track: _Track, scan: Scan, chosen: NDArray[np.int64], points: F64) -> None:
         """Predict from the newest pose, match, gate, fuse."""
-        t_ns, newest = _reference_ns(scan), track.graph.newest
+        t_ns, newest = reference_ns(scan), track.graph.newest
         odometry = self._odometry(track.held[newest].t_ns, t_ns)
         seen = self._scan_step(scan, chosen, points, odometry)
         joint, reach = joint_step(*odometry, seen), self._reach(track, odometry)
@@ -285,7 +271,9 @@ class Localiser:
         self._teacher.see_step(track.held[newest].t_ns, t_ns, odometry.T_before_now, seen, slipped=joint.slipped)
         self._co_moving.correct(joint.T_before_now)
         sweep = self._sweep_of_steady(scan) if joint.slipped else None
-        unsure = _unsure(odometry.T_before_now, seen, (_end_ns(scan) - scan.t_ns) / (t_ns - track.held[newest].t_ns))
+        unsure = sweep_variance(
+            odometry.T_before_now, seen, (end_ns(scan) - scan.t_ns) / (t_ns - track.held[newest].t_ns)
+        )
         points = points if sweep is None else self._deskewed(scan, chosen, scan.points_m[chosen], sweep)
         predicted = track.graph.pose(newest) @ joint.T_before_now
         result, believed = self._matched(track.judge.monitor, points, predicted, reach, t_ns)
@@ -322,7 +310,7 @@ class Localiser:
         def points_going_on() -> F64:
             return self._deskewed(scan, chosen, scan.points_m[chosen], self._sweep_of_steady(scan))
 
-        return self._scan_odometry.step(_reference_ns(scan), points, *odometry, points_going_on)
+        return self._scan_odometry.step(reference_ns(scan), points, *odometry, points_going_on)
 
     def _arbitrated(
         self, track: _Track, scan: Scan, chosen: NDArray[np.int64], points: F64, odometry: Odometry, seen: ScanStep
@@ -341,13 +329,13 @@ class Localiser:
         covariance = track.held[newest].online.covariance
         wrong = who_is_wrong(T_before, covariance, driven, Motion(seen.T_before_now, seen.covariance), told)
         if wrong == "open":
-            slipped = self._motion.slipped(track.held[newest].t_ns, _reference_ns(scan))
+            slipped = self._motion.slipped(track.held[newest].t_ns, reference_ns(scan))
             wrong = "wheels" if slipped else track.wrong
         track.wrong = wrong
         if wrong == "wheels":
             return joint, seen, np.zeros(6)
         if wrong == "scans":
-            self._scan_odometry.begin(_reference_ns(scan), points)
+            self._scan_odometry.begin(reference_ns(scan), points)
             return joint_step(*odometry, None), None, np.zeros(6)
         joint, unsure = believing_neither(*odometry, seen)
         return joint, unsure, joint.driven_sigmas
@@ -362,7 +350,7 @@ class Localiser:
     def _sweep_of_steady(self, scan: Scan) -> Trajectory | None:
         """The motion during the sweep as the scans tell it; None before they have told any."""
         steady = self._scan_odometry.steady
-        return None if steady is None else steady.trajectory(scan.t_ns, _end_ns(scan))
+        return None if steady is None else steady.trajectory(scan.t_ns, end_ns(scan))
 
     def _odometry(self, first_ns: int, last_ns: int) -> Odometry:
         delta = self._motion.delta(first_ns, last_ns)
@@ -424,16 +412,16 @@ class Localiser:
         unsure: F64 = SURE,
     ) -> None:
         """Keep the scan until its pose is final, and tell the online pose."""
-        t_ns, number = _reference_ns(scan), track.graph.newest
+        t_ns, number = reference_ns(scan), track.graph.newest
         pose, monitor = self._drifted(track, track.graph.smoothed(number)[0]), track.judge.monitor
         if track.refiner is not None:
-            pose = replace(pose, covariance=track.refiner.as_seen(pose.covariance) + _left_in(unsure))
-        sigma_m, sigma_rad = _sigmas(pose)
+            pose = replace(pose, covariance=track.refiner.as_seen(pose.covariance) + left_in_sweep(unsure))
+        sigma_m, sigma_rad = sigmas_of(pose)
         monitor.see_sigma(sigma_m, sigma_rad)
         health, cause = self._with_mount(*monitor.judge(t_ns))
-        held = _HeldScan(pack(scan), sweep, t_ns, matching_ratio, health, cause, monitor.degenerate, pose, unsure)
+        held = HeldScan(pack(scan), sweep, t_ns, matching_ratio, health, cause, monitor.degenerate, pose, unsure)
         track.held[number] = held
-        self.online = _estimate(self._trimmed(pose), held)
+        self.online = estimate_of(self._trimmed(pose), held)
 
     def _drifted(self, track: _Track, pose: SmoothedPose) -> SmoothedPose:
         """The pose with what wheels may be off by since the map last told the place along. The graph takes their
@@ -467,7 +455,7 @@ class Localiser:
 
     def _start(self, scan: Scan, points: F64) -> None:
         """Search for the pose, and follow what was found until one has won."""
-        t_ns = _reference_ns(scan)
+        t_ns = reference_ns(scan)
         if self._told is not None:
             self._begin_as_told(scan, points, self._told)
             return
@@ -487,7 +475,7 @@ class Localiser:
 
     def _begin_as_told(self, scan: Scan, points: F64, told: _Told) -> None:
         self._told = None
-        T = told.T_map_vehicle @ self._motion.delta(told.t_ns, _reference_ns(scan))
+        T = told.T_map_vehicle @ self._motion.delta(told.t_ns, reference_ns(scan))
         T = T @ T_inverse(self._mounting.T_used_vehicle(-self._trim_rad))
         covariance = np.diag([TOLD_RAD**2] * 3 + [TOLD_M**2] * 3)
         fit = 1.0 if told.trusted else 0.0
@@ -495,7 +483,7 @@ class Localiser:
 
     def _begin(self, scan: Scan, points: F64, result: RegistrationResult, fit: float) -> None:
         """Track from this pose on."""
-        par, t_ns = self.parameters, _reference_ns(scan)
+        par, t_ns = self.parameters, reference_ns(scan)
         self._first = FirstPose(par)
         judge = Judge(par, self._mounting.T_used[:3, 3], t_ns)
         covariance, contested = self._hedged_first(points, result)
@@ -589,16 +577,16 @@ class Localiser:
         for pose in poses:
             self._ready.append((track.held.pop(pose.number), pose))
 
-    def _refined(self, held: _HeldScan, pose: SmoothedPose) -> RefinedScan:
+    def _refined(self, held: HeldScan, pose: SmoothedPose) -> RefinedScan:
         scan = held.scan
-        pose, disagrees = _settled_dispute(pose, held.online)
+        pose, disagrees = settled_dispute(pose, held.online)
         if not sees_tilt(scan.points):
             m, wheels_m = self._map.near(pose.T_map_vehicle[:3, 3]), self._mounting.wheels_m
             pose = on_the_road(pose, m, self.parameters.registration, wheels_m)
         sweep = self._motion.trajectory(scan.t_ns, scan.end_ns) if held.sweep is None else held.sweep
         ends, starts = scan.placed(sweep, self._mounting.T_used, held.t_ns, pose.T_map_vehicle)
         pose = replace(pose, covariance=pose.covariance + self._distorted(held.t_ns, held.unsure))
-        estimate = replace(_estimate(self._trimmed(pose), held), disagrees=disagrees)
+        estimate = replace(estimate_of(self._trimmed(pose), held), disagrees=disagrees)
         if held.cause == "mount":  # the scan came before the mount was known
             estimate = replace(estimate, health="good", cause="none")
         health, cause = self._with_mount(estimate.health, estimate.cause)
@@ -611,7 +599,7 @@ class Localiser:
         """(6, 6) what motion that is left in a sweep adds to a pose: all points agree on a wrong one. `unsure`: (3,)
         variance of the sweep's motion, beside what is known of its times.
         """
-        variance = np.diag(_left_in(unsure)).copy()
+        variance = np.diag(left_in_sweep(unsure)).copy()
         if self._distortion is not None and len(self._motion):
             before = self._motion.delta(t_ns - SWEPT_NS, t_ns)
             dt_s = SWEPT_NS * 1e-9
@@ -654,74 +642,10 @@ class Localiser:
         reference time; the motion is that of wheels and gyro, or `sweep`.
         """
         if sweep is None:
-            sweep = self._motion.trajectory(scan.t_ns, _end_ns(scan))
+            sweep = self._motion.trajectory(scan.t_ns, end_ns(scan))
         offset_ns = scan.t_offset_ns[chosen]
-        return deskew(points_lidar_m, offset_ns, scan.t_ns, sweep, self._mounting.T_used, _reference_ns(scan))
+        return deskew(points_lidar_m, offset_ns, scan.t_ns, sweep, self._mounting.T_used, reference_ns(scan))
 
     def _take_ready(self) -> Iterator[RefinedScan]:
         while self._ready:
             yield self._refined(*self._ready.popleft())
-
-
-def _end_ns(scan: Scan) -> int:
-    """Time of the last point."""
-    return scan.t_ns + int(scan.t_offset_ns.max(initial=0))
-
-
-def _reference_ns(scan: Scan) -> int:
-    """The middle of the sweep: what the motion is wrong by is shared by both halves."""
-    return (scan.t_ns + _end_ns(scan)) // 2
-
-
-def _unsure(T_driven: F64, seen: ScanStep | None, share: float) -> F64:
-    """(3,) variance, forward, left and in yaw, of a sweep's motion that was taken off its points: what wheels and gyro
-    (4, 4) differ from the scans by since the scan before, more than scans are uncertain; a sweep is a `share` of that.
-    """
-    if seen is None:
-        return SURE
-    off = log_se3(T_inverse(T_driven) @ seen.T_before_now)
-    return np.asarray(np.maximum(off**2 - np.diag(seen.covariance), 0.0)[[3, 4, 2]] * min(share, 1.0) ** 2)
-
-
-def _left_in(unsure: F64) -> F64:
-    """(6, 6) what that does to a pose: points were measured at any time of the sweep, and its middle is right."""
-    variance = np.zeros(6)
-    variance[[3, 4, 2]] = unsure * POSE_SHARE**2 / 12.0
-    return np.diag(variance)
-
-
-def _settled_dispute(refined: SmoothedPose, online: SmoothedPose) -> tuple[SmoothedPose, bool]:
-    """The refined pose, or the online one where they lie farther apart than both are uncertain and the stretch has not
-    fitted well for long: then what both say is in doubt, and the covariance holds the other one, too.
-    """
-    off = log_se3(T_inverse(online.T_map_vehicle) @ refined.T_map_vehicle)
-    horizontal = off[[2, 3, 4]]
-    both = (refined.covariance + online.covariance)[np.ix_([2, 3, 4], [2, 3, 4])] + np.diag(DISPUTED_VARIANCE)
-    if float(horizontal @ np.linalg.solve(both, horizontal)) < DISPUTED_CHI2:
-        return refined, False
-    if refined.certain:
-        return refined, True
-    return replace(online, covariance=online.covariance + np.outer(off, off), certain=False), True
-
-
-def _sigmas(pose: SmoothedPose) -> tuple[float, float]:
-    """The larger horizontal one-sigma axis [m], and that of the heading [rad]."""
-    R, covariance = pose.T_map_vehicle[:3, :3], pose.covariance
-    horizontal = (R @ covariance[3:, 3:] @ R.T)[:2, :2]
-    return float(np.sqrt(np.linalg.eigvalsh(horizontal)[1])), float(np.sqrt(covariance[2, 2]))
-
-
-def _estimate(pose: SmoothedPose, held: _HeldScan) -> PoseEstimate:
-    sigma_m, sigma_rad = _sigmas(pose)
-    overruled = pose.certain and held.health != "good" and held.cause in OVERRULED
-    return PoseEstimate(
-        t_ns=pose.t_ns,
-        T_map_vehicle=pose.T_map_vehicle,
-        sigma_m=sigma_m,
-        sigma_rad=sigma_rad,
-        matching_ratio=held.matching_ratio,
-        health="good" if overruled else held.health,
-        cause="stale_map" if overruled else held.cause,
-        degenerate=held.degenerate,
-        covariance=pose.covariance,
-    )
