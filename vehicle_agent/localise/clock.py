@@ -28,8 +28,8 @@ PRIOR_S: Final = 0.04
 """One sigma of the offset before anything is known."""
 RATE_PRIOR: Final = 5e-4
 """One sigma of its rate: half a millisecond in a second, far more than two crystals differ by."""
-MOST_RATE: Final = 3.0 * RATE_PRIOR
-"""A larger rate contradicts what the fit takes for granted."""
+MOST_RATE: Final = 4.5 * RATE_PRIOR
+"""Of a clock that is followed: 2.25 ms in a second. A larger rate contradicts what the fit takes for granted."""
 MOST_S: Final = 0.1
 """A larger offset is none of a clock that is meant to be the same."""
 SEARCH_S: Final = 0.3
