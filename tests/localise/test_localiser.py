@@ -97,7 +97,11 @@ def test_a_drive_gives_every_scan_once_and_in_order(localiser, drive):
     assert len(final) == 40 - localiser.dropped_scans
     assert localiser.dropped_scans <= 1
     assert_right(final)
-    assert all(scan.estimate.health == "good" and scan.estimate.matching_ratio > 0.9 for scan in final)
+    assert {scan.estimate.cause for scan in final[:8]} <= {
+        "none",
+        "unconfirmed",
+    }  # the first metres may still be elsewhere
+    assert all(scan.estimate.health == "good" and scan.estimate.matching_ratio > 0.9 for scan in final[8:])
     assert list(localiser.flush()) == []
 
 

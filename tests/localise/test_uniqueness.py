@@ -242,7 +242,7 @@ def test_the_localiser_calls_no_pose_good_before_it_has_seen_that_it_is_the_only
 
 
 @pytest.mark.parametrize(
-    "bad", [{"won": 0.0}, {"won": 4.0}, {"way_m": float("nan")}, {"n_kept": 99}, {"every_m": 30.0}]
+    "bad", [{"won": 0.0}, {"won": 6.0}, {"way_m": float("nan")}, {"n_kept": 99}, {"every_m": 30.0}]
 )
 def test_parameters_check_themselves(bad):
     with pytest.raises(ValueError, match=r"required|positive"):

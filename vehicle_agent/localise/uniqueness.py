@@ -32,6 +32,7 @@ F64 = NDArray[np.float64]
 I64 = NDArray[np.int64]
 
 FARTHEST_M: Final = 60.0  # a far point is moved by more than a patch when odometry turns by a degree or two
+WON_IN_A_ROW: Final = 3
 LEAST_SQUARES: Final = 0.25  # added to sum(d^2): where next to nothing differs, nothing is told
 TOLD: Final = 1.0  # sigmas by which poses a little before and behind must fit worse for the map to tell the place along
 SEEN_BY: Final = 0.3  # least way between two fixes that are remembered, as share of the view
@@ -188,12 +189,16 @@ class Uniqueness:
         return self._beaten >= 2
 
     def _conclude(self) -> None:
+        """A few metres of a place that repeats prove any pose now and then: the proof stands once three tests in a row
+        agree, or one by far, and until the view is whole any other pose that is ahead by a sigma takes it away.
+        """
         par = self._par
         self._beaten = self._beaten + 1 if self.margin <= -par.lost else 0
         self._ahead = self._ahead + 1 if self.margin >= par.won else 0
-        won = self._ahead >= 2 or self.margin >= par.won_at_once
-        self.proven = (self.proven or won) and not self.beaten
-        steady = self.proven and not self._beaten
+        won = self._ahead >= WON_IN_A_ROW or self.margin >= par.won_at_once
+        whole = self._view.way_m >= par.way_m
+        self.proven = (self.proven or won) and not self.beaten and (whole or self.margin >= -TOLD)
+        steady = self.proven and whole and not self._beaten
         self._next_m = self._view.way_m + (par.proven_m if steady else par.unproven_m)
 
     def _tested(self, T_tracked: F64, match_map: MatchMap) -> float:

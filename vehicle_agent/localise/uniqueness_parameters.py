@@ -16,8 +16,8 @@ class UniquenessParameters:
         headings within this of the tracked one, all as long as less than `course_m` have been driven.
     n_refined, n_kept: other poses tried by registration, and kept; apart_m, apart_deg: two poses nearer are one;
         beside_m: so far along and across from the tracked pose others are tried that a search might leave out.
-    won, won_at_once: by how many sigmas the pose must beat each other one to be proven: twice in a row, or at once.
-        lost: by how many it must be beaten, twice in a row, to be no longer so.
+    won, won_at_once: by how many sigmas the pose must beat each other one to be proven: three times in a row, or at
+        once. lost: by how many it must be beaten, twice in a row, to be no longer so.
     """
 
     enabled: bool = True
@@ -39,7 +39,7 @@ class UniquenessParameters:
     apart_deg: float = 1.5
     beside_m: float = 1.5
     won: float = 2.5
-    won_at_once: float = 3.0
+    won_at_once: float = 5.0
     lost: float = 3.0
 
     def __post_init__(self) -> None:
