@@ -1,16 +1,12 @@
 """Reports that other vehicles contradict, in SQLite: inside the caller's transaction, derived from `shift_test`."""
 
 from collections.abc import Iterable, Mapping
-from typing import Any, Final
+from typing import Any
 
 import apsw
 
 from tile_store.sqlite_connection import change, fetch
-
-REFUTED_TESTS: Final = 3
-"""A report is refuted after so many tiles in which it stands alone against others, ..."""
-REFUTED_SHARE: Final = 0.5
-"""... if they are so many of all that could be compared."""
+from tile_store.values import REFUTED_SHARE, REFUTED_TESTS
 
 
 def refuted(c: apsw.Connection, layer: str, vehicles: Iterable[str]) -> dict[str, str]:

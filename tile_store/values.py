@@ -51,6 +51,12 @@ def lattice_named(codec: str) -> Lattice | None:
     return LATTICES.get(codec)
 
 
+REFUTED_TESTS: Final = 3
+"""A report is refuted after so many tiles in which it stands alone against others, ..."""
+REFUTED_SHARE: Final = 0.5
+"""... if they are so many of all that could be compared."""
+
+
 @dataclass(frozen=True, slots=True)
 class Content:
     """A tile's content as a store keeps it: hash, codec and encoded bytes."""

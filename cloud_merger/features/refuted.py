@@ -15,8 +15,7 @@ import numpy as np
 
 from cloud_merger.features.statements import Statement
 from cloud_merger.features.tracks import Track
-from tile_store.sqlite_refuted import REFUTED_SHARE, REFUTED_TESTS
-from tile_store.values import ShiftTest
+from tile_store.values import REFUTED_SHARE, REFUTED_TESTS, ShiftTest
 
 OPPOSING: Final = 2
 """So many other vehicles must say otherwise."""

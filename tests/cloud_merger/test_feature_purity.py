@@ -93,7 +93,8 @@ def test_one_more_vehicle_publishes_nothing_that_nobody_else_has_found(some, mor
     before = merge((), others)
     after = merge((), [*others, *(report(100 + n, one, vehicle="car") for n, one in enumerate(more))])
     fresh = {one.feature_id for one in after.features} - {one.feature_id for one in before.features}
-    assert fresh <= {one.feature_id for one in before.estimates}
+    by_others = {one.report_id for one in others}
+    assert all(by_others.intersection(after.provenance[feature_id]) for feature_id in fresh)
 
 
 @pytest.mark.parametrize("seed", range(3))

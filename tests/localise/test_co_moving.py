@@ -18,7 +18,13 @@ from vehicle_agent.localise.co_moving import CoMoving
 from vehicle_agent.localise.odometry import MotionBuffer
 from vehicle_agent.localise.parameters import SamplingParameters
 from vehicle_agent.localise.sampling import sample_scan
-from vehicle_agent.localise.scan_odometry import ScanOdometry, ScanOdometryParameters, off_the_ground
+from vehicle_agent.localise.scan_odometry import (
+    OFF_GROUND_M,
+    OFF_GROUND_SLOPE,
+    ScanOdometry,
+    ScanOdometryParameters,
+)
+from vehicle_agent.localise.scan_pool import standing_points
 
 SWEEP_S, AZIMUTHS, LAYERS = 0.1, 720, 16
 HEIGHT_M = 1.9
@@ -237,7 +243,7 @@ def test_rings_on_open_ground_are_no_odometry():
             T = np.eye(4)
             T[0, 3] = 0.93
             told.append(odometry.step(n * 10**8, points, T, SIGMAS))
-        return told[1:], len(off_the_ground(points)) / len(points)
+        return told[1:], len(standing_points(points, OFF_GROUND_M, OFF_GROUND_SLOPE)) / len(points)
 
     silent, few = steps([Block(70.0 * s, 20.0 * s, 0.2, 0.2, 0.0, 3.0) for s in (-1, 1)])
     assert few < 0.05

@@ -3,7 +3,7 @@
 import numpy as np
 from yard import local_map_of, match_map_of, pose, rectangle, seen_from
 
-from vehicle_agent.localise.neighbours import FAR_M, NEAR_M, hedged
+from vehicle_agent.localise.neighbours import FAR_M, NEAR_M, WEAK_M, hedged
 from vehicle_agent.localise.parameters import RegistrationParameters
 from vehicle_agent.localise.registration import register
 
@@ -34,7 +34,7 @@ def test_a_match_on_the_wrong_rung_holds_the_right_one_in_its_covariance():
     off_m = abs(wrong.T_map_vehicle[0, 3] - 0.3)
     assert 0.6 < off_m < 1.0
     assert wrong.sigma_m[0] < 0.05  # sure of it
-    known, contested = hedged(points, wrong, m, PAR, FAR_M)
+    known, contested = hedged(points, wrong, m, PAR, FAR_M, 0.0)
     assert contested
     assert known.sigma_m[0] > 0.8 * off_m
 
@@ -45,7 +45,7 @@ def test_a_match_that_is_the_only_one_stays_as_sure_as_it_was(yard_points, yard_
     m = match_map_of(yard_map)
     points = seen_from(rng, yard_points, T, 6000)
     right = register(points, T, m, PAR, "near")
-    for starts_m in (NEAR_M, FAR_M):
-        known, contested = hedged(points, right, m, PAR, starts_m)
+    for starts_m, least_sigma_m in ((NEAR_M, WEAK_M), (FAR_M, 0.0)):
+        known, contested = hedged(points, right, m, PAR, starts_m, least_sigma_m)
         assert not contested
         assert np.array_equal(known.covariance, right.covariance)

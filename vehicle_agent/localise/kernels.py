@@ -128,6 +128,19 @@ def _accumulate(
 
 
 @kernel
+def _known_cell(q0: float, q1: float, q2: float, index: I32, A: F64, b: F64) -> tuple[int, int, int]:
+    """The cell of the window that a map point lies in; (-1, -1, -1) at its edge, outside, and in tiles not held."""
+    nx, ny, nz = index.shape
+    gx = A[0, 0] * q0 + A[0, 1] * q1 + A[0, 2] * q2 + b[0]
+    gy = A[1, 0] * q0 + A[1, 1] * q1 + A[1, 2] * q2 + b[1]
+    gz = A[2, 0] * q0 + A[2, 1] * q1 + A[2, 2] * q2 + b[2]
+    if not (1.0 <= gx < nx - 1 and 1.0 <= gy < ny - 1 and 1.0 <= gz < nz - 1):
+        return -1, -1, -1
+    ix, iy, iz = int(gx), int(gy), int(gz)
+    return (-1, -1, -1) if index[ix, iy, iz] < -1 else (ix, iy, iz)
+
+
+@kernel
 def linearise(
     points: F64, R: F64, t: F64, index: I32, A: F64, b: F64, mean: F64, omega: F64, scale2: float, gate_m2: float,
     H: F64, g: F64,
@@ -151,7 +164,6 @@ def linearise(
     Returns:
         robust cost (between 0 and scale2 a point), points matched, points in known voxels.
     """
-    nx, ny, nz = index.shape
     H[:] = 0.0
     g[:] = 0.0
     cost, matched, inside = 0.0, 0, 0
@@ -161,13 +173,8 @@ def linearise(
         a1 = R[1, 0] * p0 + R[1, 1] * p1 + R[1, 2] * p2
         a2 = R[2, 0] * p0 + R[2, 1] * p1 + R[2, 2] * p2
         q0, q1, q2 = a0 + t[0], a1 + t[1], a2 + t[2]
-        gx = A[0, 0] * q0 + A[0, 1] * q1 + A[0, 2] * q2 + b[0]
-        gy = A[1, 0] * q0 + A[1, 1] * q1 + A[1, 2] * q2 + b[1]
-        gz = A[2, 0] * q0 + A[2, 1] * q1 + A[2, 2] * q2 + b[2]
-        if not (1.0 <= gx < nx - 1 and 1.0 <= gy < ny - 1 and 1.0 <= gz < nz - 1):
-            continue
-        ix, iy, iz = int(gx), int(gy), int(gz)
-        if index[ix, iy, iz] < -1:
+        ix, iy, iz = _known_cell(q0, q1, q2, index, A, b)
+        if ix < 0:
             continue
         inside += 1
         row, m2 = _nearest(q0, q1, q2, ix, iy, iz, index, mean, omega, gate_m2)
@@ -190,20 +197,17 @@ def point_fits(
     fits: F64,
 ) -> None:  # fmt: skip
     """Fill `fits` (N,): 1 - robust cost of each point at the pose (R, t), 0 ... 1; arguments as of `linearise`."""
-    nx, ny, nz = index.shape
     for n in range(points.shape[0]):
         fits[n] = 0.0
         p0, p1, p2 = points[n, 0], points[n, 1], points[n, 2]
         q0 = R[0, 0] * p0 + R[0, 1] * p1 + R[0, 2] * p2 + t[0]
         q1 = R[1, 0] * p0 + R[1, 1] * p1 + R[1, 2] * p2 + t[1]
         q2 = R[2, 0] * p0 + R[2, 1] * p1 + R[2, 2] * p2 + t[2]
-        gx = A[0, 0] * q0 + A[0, 1] * q1 + A[0, 2] * q2 + b[0]
-        gy = A[1, 0] * q0 + A[1, 1] * q1 + A[1, 2] * q2 + b[1]
-        gz = A[2, 0] * q0 + A[2, 1] * q1 + A[2, 2] * q2 + b[2]
-        if not (1.0 <= gx < nx - 1 and 1.0 <= gy < ny - 1 and 1.0 <= gz < nz - 1):
+        ix, iy, iz = _known_cell(q0, q1, q2, index, A, b)
+        if ix < 0:
             continue
-        row, m2 = _nearest(q0, q1, q2, int(gx), int(gy), int(gz), index, mean, omega, gate_m2)
-        if row >= 0 and index[int(gx), int(gy), int(gz)] >= -1:
+        row, m2 = _nearest(q0, q1, q2, ix, iy, iz, index, mean, omega, gate_m2)
+        if row >= 0:
             fits[n] = scale2 / (scale2 + m2)
 
 
@@ -218,20 +222,14 @@ def pulls(
     map axes, rotation first. pull: (M, D), added to: w u' Omega d, with u the motion of a point. weight: (M, D), added
     to: w u' Omega u.
     """
-    nx, ny, nz = index.shape
     for n in range(points.shape[0]):
         p0, p1, p2 = points[n, 0], points[n, 1], points[n, 2]
         a0 = R[0, 0] * p0 + R[0, 1] * p1 + R[0, 2] * p2
         a1 = R[1, 0] * p0 + R[1, 1] * p1 + R[1, 2] * p2
         a2 = R[2, 0] * p0 + R[2, 1] * p1 + R[2, 2] * p2
         q0, q1, q2 = a0 + t[0], a1 + t[1], a2 + t[2]
-        gx = A[0, 0] * q0 + A[0, 1] * q1 + A[0, 2] * q2 + b[0]
-        gy = A[1, 0] * q0 + A[1, 1] * q1 + A[1, 2] * q2 + b[1]
-        gz = A[2, 0] * q0 + A[2, 1] * q1 + A[2, 2] * q2 + b[2]
-        if not (1.0 <= gx < nx - 1 and 1.0 <= gy < ny - 1 and 1.0 <= gz < nz - 1):
-            continue
-        ix, iy, iz = int(gx), int(gy), int(gz)
-        if index[ix, iy, iz] < -1:
+        ix, iy, iz = _known_cell(q0, q1, q2, index, A, b)
+        if ix < 0:
             continue
         row, m2 = _nearest(q0, q1, q2, ix, iy, iz, index, mean, omega, gate_m2)
         if row < 0:

@@ -362,7 +362,8 @@ class Localiser:
         """The match, and whether to believe it: near the prediction if that will do, else a wider one."""
         near = self._match(points, predicted, "near")
         if near is not None:
-            near, _ = hedged(points, near, self._map.near(predicted[:3, 3]), self.parameters.registration)
+            m = self._map.near(predicted[:3, 3])
+            near, _ = hedged(points, near, m, self.parameters.registration, wheels_m=self._mounting.wheels_m)
         if not monitor.doubtful(near):
             monitor.see_wider(near, None)
             believed = monitor.believe(near, predicted, sigmas, t_ns)
@@ -508,8 +509,8 @@ class Localiser:
         """
         if not result.iterations:
             return result.covariance, False
-        near = self._map.near(result.T_map_vehicle[:3, 3])
-        known, contested = hedged(points, result, near, self.parameters.registration, FAR_M)
+        m, par = self._map.near(result.T_map_vehicle[:3, 3]), self.parameters.registration
+        known, contested = hedged(points, result, m, par, FAR_M, 0.0, self._mounting.wheels_m)
         return known.covariance, contested or weakest(result)[0] > UNSURE_M
 
     def _new_refiner(self) -> Refiner | None:

@@ -14,7 +14,7 @@ from gnd_map.se3 import T_inverse
 from vehicle_agent.errors import RegistrationError
 from vehicle_agent.localise.match_map import MatchMap
 from vehicle_agent.localise.parameters import RegistrationParameters
-from vehicle_agent.localise.registration import RegistrationResult, register
+from vehicle_agent.localise.registration import WHEELS_M, RegistrationResult, register
 from vehicle_agent.localise.stretch import log_se3
 
 F64 = NDArray[np.float64]
@@ -38,6 +38,8 @@ def hedged(
     match_map: MatchMap,
     parameters: RegistrationParameters,
     starts_m: tuple[float, ...] = NEAR_M,
+    least_sigma_m: float = WEAK_M,
+    wheels_m: F64 = WHEELS_M,
 ) -> tuple[RegistrationResult, bool]:
     """The match with a covariance that holds its neighbouring minima too, and whether there are any.
 
@@ -47,16 +49,17 @@ def hedged(
         match_map: that it was made with.
         parameters: that it was made with.
         starts_m: how far off the neighbours are begun.
+        least_sigma_m: a match whose weakest direction is known better has none.
+        wheels_m: (W, 3) that it was made with.
     """
     sigma_m, weak = weakest(result)
-    tracked = starts_m == NEAR_M
-    if (tracked and sigma_m < WEAK_M) or not result.converged or len(result.degenerate):
+    if sigma_m < least_sigma_m or not result.converged or len(result.degenerate):
         return result, False
     found = [
         off
         for start_m in starts_m
         for sign in (-1.0, 1.0)
-        if (off := _neighbour(points_m, result, sign * start_m * weak, match_map, parameters)) is not None
+        if (off := _neighbour(points_m, result, sign * start_m * weak, match_map, parameters, wheels_m)) is not None
         and float(np.hypot(*off[3:5])) > APART_SIGMAS * sigma_m
     ]
     if not found:
@@ -72,13 +75,18 @@ def weakest(result: RegistrationResult) -> tuple[float, F64]:
 
 
 def _neighbour(
-    points_m: F64, result: RegistrationResult, shift_m: F64, match_map: MatchMap, parameters: RegistrationParameters
+    points_m: F64,
+    result: RegistrationResult,
+    shift_m: F64,
+    match_map: MatchMap,
+    parameters: RegistrationParameters,
+    wheels_m: F64,
 ) -> F64 | None:
     """(6,) from the match to where it ends when begun shifted by (2,) m; None if that does not fit as well."""
     T = result.T_map_vehicle.copy()
     T[:3, 3] += T[:3, :2] @ shift_m
     try:
-        other = register(points_m, T, match_map, parameters, "near")
+        other = register(points_m, T, match_map, parameters, "near", wheels_m)
     except RegistrationError:
         return None
     if not other.converged or other.fit < result.fit - LIKE_FIT:

@@ -15,18 +15,16 @@ from numpy.typing import NDArray
 from gnd_map.motion import Trajectory
 from gnd_map.se3 import T_from_R_t, T_inverse, exp_so3, log_so3, transform
 from vehicle_agent.errors import RegistrationError
-from vehicle_agent.localise.initialise import ground_below
 from vehicle_agent.localise.parameters import RegistrationParameters
 from vehicle_agent.localise.registration import register
 from vehicle_agent.localise.rolling_map import RollingMap
 from vehicle_agent.localise.scan_odometry_parameters import ScanOdometryParameters
+from vehicle_agent.localise.scan_pool import standing_points
 
 F64 = NDArray[np.float64]
 
 CONTRADICTED, STILL_CONTRADICTED = 3.0, 1.5  # sigmas at which wheels begin to slip, and above which they still do
-
-
-OFF_GROUND_M, OFF_GROUND_SLOPE = 0.3, 0.02
+OFF_GROUND_M, OFF_GROUND_SLOPE = 0.3, 0.02  # what stands higher, and so much for each metre of distance, is no ground
 
 
 class SteadyMotion(NamedTuple):
@@ -155,7 +153,7 @@ class ScanOdometry:
             return None
         dt_ns, self._before_ns = t_ns - self._before_ns, t_ns
         driven = _Prediction(T_before_now_predicted, sigmas, points_vehicle_m)
-        standing = len(off_the_ground(points_vehicle_m))
+        standing = len(standing_points(points_vehicle_m, OFF_GROUND_M, OFF_GROUND_SLOPE))
         sees = standing >= self.parameters.min_standing_share * len(points_vehicle_m)
         match = self._matched(driven, self._going_on(dt_ns, points_going_on)) if sees else None
         if sees and match is None and self._slipping and self._steady is not None:
@@ -244,14 +242,6 @@ class ScanOdometry:
         if far or self._map.scans < par.first_scans:
             self._T_odom_added = T
             self._map.add(transform(T, points_m), T[:3, 3])
-
-
-def off_the_ground(points_m: F64) -> F64:
-    """Those of the points (N, 3) of a scan, vehicle frame, that stand above the ground."""
-    if not len(points_m):
-        return points_m
-    rise_m = OFF_GROUND_M + OFF_GROUND_SLOPE * np.hypot(points_m[:, 0], points_m[:, 1])
-    return points_m[points_m[:, 2] > ground_below(points_m) + rise_m]
 
 
 def _registration(par: ScanOdometryParameters) -> RegistrationParameters:

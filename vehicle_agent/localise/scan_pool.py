@@ -61,6 +61,11 @@ class ScanPool:
         return np.concatenate([self._newest[1], *(s for _, s, way in self._older if way > 0.0)])
 
 
-def standing_points(points_m: F64, above_ground_m: float) -> F64:
-    """The points (N, 3) of a scan in the vehicle frame that stand above the ground."""
-    return points_m[points_m[:, 2] > ground_below(points_m) + above_ground_m] if len(points_m) else points_m
+def standing_points(points_m: F64, above_ground_m: float, slope: float = 0.0) -> F64:
+    """The points (N, 3) of a scan in the vehicle frame that stand so high above the ground, and so much more for each
+    metre of distance.
+    """
+    if not len(points_m):
+        return points_m
+    rise_m = above_ground_m + slope * np.hypot(points_m[:, 0], points_m[:, 1])
+    return points_m[points_m[:, 2] > ground_below(points_m) + rise_m]

@@ -10,7 +10,7 @@ weights (Geman-McClure, on points and on steps). Old scans leave by marginalisat
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from typing import Final, NamedTuple
 
 import numpy as np
@@ -144,9 +144,8 @@ def solve_stretch(
                 break
     _match(knots, match_map, registration, scales[-1])
     covariance = np.asarray(np.linalg.inv(_system(knots, steps, belief, shared, registration).A), np.float64)
-    seen, matched = _as_seen(knots, belief, covariance, match_map, registration)
-    solved = _solved(knots, steps, covariance, shared - belief.shared, belief.shared, registration, scales[-1])
-    return replace(solved, seen=seen, matched=matched)
+    seen = _as_seen(knots, belief, covariance, match_map, registration)
+    return _solved(knots, steps, covariance, shared - belief.shared, belief.shared, registration, scales[-1], *seen)
 
 
 def marginalised(
@@ -258,21 +257,23 @@ def _solved(
     shared_before: F64,
     par: RegistrationParameters,
     scale: float,
+    seen: F64,
+    matched: F64,
 ) -> Solved:
     blocks = np.stack([covariance[6 * k : 6 * k + 6, 6 * k : 6 * k + 6] for k in range(len(knots))])
-    seen = [(knot, knot.match) for knot in knots if knot.match is not None]
+    matches = [(knot, knot.match) for knot in knots if knot.match is not None]
     squares, redundancy = _checked_steps(knots, steps, covariance, shared_off)
     return Solved(
         shared=shared_before + shared_off,
         covariance=blocks,
         shared_covariance=covariance[-N_SHARED:, -N_SHARED:],
-        fit=np.array([match.fit(scale) for _, match in seen]),
-        known=np.array([match.inside / max(len(knot.points_m), 1) for knot, match in seen]),
+        fit=np.array([match.fit(scale) for _, match in matches]),
+        known=np.array([match.inside / max(len(knot.points_m), 1) for knot, match in matches]),
         misfit=_misfit(knots, par),
         step_squares=squares,
         step_redundancy=redundancy,
-        seen=np.ones(3),
-        matched=np.ones(3),
+        seen=seen,
+        matched=matched,
         axle_variance=_axle_variance(covariance),
         torn=_is_torn(knots, steps, shared_off),
     )

@@ -28,10 +28,17 @@ ELSEWHERE: Final = 0.2
 called sure."""
 ELSEWHERE_M: Final = 4.0
 """Sigma of how far off those are, each axis: a lane."""
-
-
 AROUND_S: Final = 2.0
 """A pose is compared with a fix at most so far away."""
+GATE: Final = 13.8
+"""χ² of 2 degrees of freedom, one in 1,000: a question costs time only."""
+GATE_SURE: Final = 18.4
+"""One in 10,000."""
+LEAST_S: Final = 2.0
+"""A shorter contradiction is none: a sign at the edge of view turns the place for a moment."""
+CORRELATED_S: Final = 20.0
+"""So far apart what hindsight says of two poses is told anew: the GNSS's slow error, and the way between signs."""
+MOST_EACH: Final = 15.0
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -199,17 +206,6 @@ def stretches(t_s: F64, wrong: NDArray[np.bool_]) -> list[tuple[float, float]]:
     """From and until of runs of True."""
     edges = np.flatnonzero(np.diff(np.concatenate([[False], wrong, [False]]).astype(np.int8)))
     return [(float(t_s[a]), float(t_s[b - 1])) for a, b in zip(edges[::2], edges[1::2], strict=True)]
-
-
-GATE: Final = 13.8
-"""χ² of 2 degrees of freedom, one in 1,000: a question costs time only."""
-GATE_SURE: Final = 18.4
-"""One in 10,000."""
-LEAST_S: Final = 2.0
-"""A shorter contradiction is none: a sign at the edge of view turns the place for a moment."""
-CORRELATED_S: Final = 20.0
-"""So far apart what hindsight says of two poses is told anew: the GNSS's slow error, and the way between signs."""
-MOST_EACH: Final = 15.0
 
 
 @dataclass(frozen=True, slots=True)
