@@ -92,6 +92,13 @@ def _prepare(connection: apsw.Connection, path: Path, busy_timeout_s: float) -> 
         _in_one(connection, lambda: connection.execute(SQL["schema_of_confirmation"]))
     if not fetch(connection, "has_schema_of_surveys"):
         _in_one(connection, lambda: connection.execute(SQL["schema_of_surveys"]))
+    if not fetch(connection, "has_schema_of_parts"):
+        _in_one(connection, lambda: _add_parts(connection))
+
+
+def _add_parts(connection: apsw.Connection) -> None:
+    if not fetch(connection, "has_schema_of_parts"):  # another process may have added them since we looked
+        connection.execute(SQL["schema_of_parts"])
 
 
 def _check_header(connection: apsw.Connection, path: Path) -> None:

@@ -26,7 +26,7 @@ def put_reports(c: apsw.Connection, rows: Iterable[ReportRow], timing: dict[str,
 
 def _put_report(c: apsw.Connection, row: ReportRow, timing: dict[str, Any]) -> PutStatus:
     place = {"layer": row.layer, "tile": row.tile.morton}
-    told = {"report_id": row.report_id, "vehicle": row.vehicle, "received_ns": row.received_ns}
+    told = {"report_id": row.report_id, "part": row.part, "vehicle": row.vehicle, "received_ns": row.received_ns}
     if not change(c, "insert_report", place | told | {"base_sha": row.base_sha, "body": row.body}):
         return "duplicate"
     change(c, "mark_dirty", place | timing)

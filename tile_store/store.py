@@ -38,7 +38,7 @@ class Store(Protocol):
     # The inbox
 
     def put_reports(self, rows: Sequence[ReportRow]) -> list[PutStatus]:
-        """Keep reports, all of a call or none. A row whose (layer, tile, report id) is known is a "duplicate" and
+        """Keep reports, all of a call or none. A row whose (layer, tile, report id, part) is known is a "duplicate" and
         changes nothing. Each new row makes its tile dirty.
         """
 

@@ -132,10 +132,14 @@ class ReportRow:
     received_ns: int
     body: bytes = field(repr=False)
     base_sha: bytes = b""
+    part: int = 0
+    """0: flags, or the whole report; 1: the same with the Gaussians that were asked for later, in place of part 0."""
 
     def __post_init__(self) -> None:
         check_layer(self.layer)
         check_report_id(self.report_id)
+        if self.part not in (0, 1):
+            raise StoreError(f"report {self.report_id} has part {self.part}; there are 0 and 1")
         if len(self.base_sha) not in (0, SHA_BYTES):
             raise StoreError(f"base_sha has {len(self.base_sha)} bytes, need 0 or {SHA_BYTES}")
 

@@ -5,6 +5,7 @@ import subprocess
 import sys
 import threading
 import time
+from dataclasses import replace
 from pathlib import Path
 
 import apsw
@@ -75,6 +76,19 @@ def test_a_store_of_a_newer_release_is_refused(tmp_path: Path) -> None:
     newer.pragma("user_version", SCHEMA_VERSION + 1)
     newer.close()
     assert f"store schema {SCHEMA_VERSION + 1}, this release reads up to {SCHEMA_VERSION}" in opens_as(path)
+
+
+def test_a_store_from_before_reports_had_parts_gets_them_and_keeps_its_reports(tmp_path: Path) -> None:
+    path = tmp_path / "s.db"
+    with SqliteStore(path) as store:
+        store.put_reports([report(1)])
+    older = apsw.Connection(str(path))
+    older.execute("DROP INDEX report_key; ALTER TABLE report DROP COLUMN part")
+    older.execute("CREATE UNIQUE INDEX report_key ON report (layer, tile, report_id)")
+    older.close()
+    with SqliteStore(path) as store:
+        assert store.put_reports([report(1), replace(report(1), part=1)]) == ["duplicate", "stored"]
+        assert [row.part for row in store.reports()] == [0, 1]
 
 
 def test_a_truncated_store_is_named(tmp_path: Path) -> None:

@@ -150,6 +150,15 @@ END;
 -- name: has_schema_of_surveys
 SELECT 1 FROM sqlite_schema WHERE type = 'trigger' AND name = 'survey_goes'
 
+-- name: schema_of_parts
+-- Added later, too. A report in short comes in two parts: 0 its flags (or the whole report), 1 with its Gaussians.
+ALTER TABLE report ADD COLUMN part INTEGER NOT NULL DEFAULT 0 CHECK (part IN (0, 1));
+DROP INDEX report_key;
+CREATE UNIQUE INDEX report_key ON report (layer, tile, report_id, part);
+
+-- name: has_schema_of_parts
+SELECT 1 FROM pragma_table_info('report') WHERE name = 'part'
+
 -- name: put_survey
 INSERT INTO survey (layer, tile, version, surveyed_ns) VALUES (:layer, :tile, :version, :surveyed_ns)
 ON CONFLICT (layer, tile, version) DO UPDATE SET surveyed_ns = MAX(surveyed_ns, excluded.surveyed_ns)
@@ -200,7 +209,7 @@ INSERT INTO waiting_change (layer, tile, vehicle, reason, voxels, seen, since_ns
 VALUES (:layer, :tile, :vehicle, :reason, :voxels, :seen, :since_ns)
 
 -- name: received
-SELECT received_ns FROM report WHERE layer = :layer AND tile = :tile AND report_id = :report_id
+SELECT MIN(received_ns) FROM report WHERE layer = :layer AND tile = :tile AND report_id = :report_id
 
 -- name: waiting_changes
 SELECT layer, tile, vehicle, reason, voxels, seen, since_ns FROM waiting_change
@@ -210,11 +219,11 @@ ORDER BY layer, tile, vehicle, reason
 SELECT layer, tile, waiting, attempts, owner IS NOT NULL FROM dirty ORDER BY layer, tile
 
 -- name: insert_report
-INSERT INTO report (layer, tile, report_id, vehicle, received_ns, seq, base_sha, body)
-SELECT :layer, :tile, :report_id, :vehicle, :received_ns,
+INSERT INTO report (layer, tile, report_id, part, vehicle, received_ns, seq, base_sha, body)
+SELECT :layer, :tile, :report_id, :part, :vehicle, :received_ns,
        COALESCE((SELECT seq FROM dirty WHERE layer = :layer AND tile = :tile), 0) + 1, :base_sha, :body
 WHERE true
-ON CONFLICT (layer, tile, report_id) DO NOTHING
+ON CONFLICT (layer, tile, report_id, part) DO NOTHING
 
 -- name: mark_dirty
 INSERT INTO dirty (layer, tile, seq, waiting, ready_ns)
@@ -337,12 +346,14 @@ WHERE layer = :layer AND tile = :tile ORDER BY version
 SELECT provenance FROM tile_version WHERE layer = :layer AND tile = :tile AND version = :version
 
 -- name: reports_in_play
-SELECT report_id, layer, tile, vehicle, received_ns, body, base_sha FROM report
+SELECT report_id, layer, tile, vehicle, received_ns, body, base_sha, part FROM report
 WHERE layer = :layer AND tile = :tile AND (merged_in IS NULL OR merged_in >= :epoch)
+  AND NOT EXISTS (SELECT 1 FROM report AS next WHERE next.layer = report.layer AND next.tile = report.tile
+                  AND next.report_id = report.report_id AND next.part > report.part)
 ORDER BY report_id DESC LIMIT :n
 
 -- name: reports_in_play_of_vehicles
-SELECT report_id, layer, tile, vehicle, received_ns, body, base_sha FROM report
+SELECT report_id, layer, tile, vehicle, received_ns, body, base_sha, part FROM report
 WHERE layer = :layer AND tile = :tile AND report_id IN (
   SELECT report_id FROM (
     SELECT report_id, ROW_NUMBER() OVER (PARTITION BY vehicle ORDER BY report_id DESC) AS turn FROM report
@@ -351,7 +362,7 @@ WHERE layer = :layer AND tile = :tile AND report_id IN (
 ORDER BY report_id DESC
 
 -- name: reports_page
-SELECT arrival, report_id, layer, tile, vehicle, received_ns, body, base_sha FROM report
+SELECT arrival, report_id, layer, tile, vehicle, received_ns, body, base_sha, part FROM report
 WHERE arrival > :after AND layer = :layer AND (:vehicle IS NULL OR vehicle = :vehicle) ORDER BY arrival LIMIT :n
 
 -- name: dirty_count
