@@ -94,11 +94,18 @@ def _prepare(connection: apsw.Connection, path: Path, busy_timeout_s: float) -> 
         _in_one(connection, lambda: connection.execute(SQL["schema_of_surveys"]))
     if not fetch(connection, "has_schema_of_parts"):
         _in_one(connection, lambda: _add_parts(connection))
+    if not fetch(connection, "has_schema_of_journal"):
+        _in_one(connection, lambda: _add_journal(connection))
 
 
 def _add_parts(connection: apsw.Connection) -> None:
     if not fetch(connection, "has_schema_of_parts"):  # another process may have added them since we looked
         connection.execute(SQL["schema_of_parts"])
+
+
+def _add_journal(connection: apsw.Connection) -> None:
+    if not fetch(connection, "has_schema_of_journal"):
+        connection.execute(SQL["schema_of_journal"])
 
 
 def _check_header(connection: apsw.Connection, path: Path) -> None:

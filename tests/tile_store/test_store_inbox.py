@@ -30,11 +30,11 @@ def test_a_duplicate_of_a_merged_report_does_not_make_its_tile_dirty_again(store
     assert store.dirty_count() == 0
 
 
-def test_the_second_part_of_a_report_takes_the_place_of_the_first_and_comes_once(store: Store) -> None:
+def test_the_second_part_of_a_report_comes_after_the_first_and_once(store: Store) -> None:
     flags = report(1, body=b"flags")
     gaussians = replace(flags, body=b"with Gaussians", part=1)
     assert store.put_reports([flags, gaussians, gaussians]) == ["stored", "stored", "duplicate"]
-    assert [row.body for row in store.in_play("ndt", TILE)[1]] == [b"with Gaussians"]
+    assert [row.body for row in store.in_play("ndt", TILE).reports] == [b"flags", b"with Gaussians"]
     assert list(store.reports()) == [flags, gaussians]
     assert store.counts().reports == 1
 
@@ -44,7 +44,7 @@ def test_the_second_part_counts_before_the_first_has_come(store: Store) -> None:
     store.put_reports([replace(late, body=b"with Gaussians", part=1)])
     merge_once(store, 1)
     assert store.put_reports([late]) == ["stored"]
-    assert [row.part for row in store.in_play("ndt", TILE)[1]] == [1]
+    assert [row.part for row in store.in_play("ndt", TILE).reports] == [0, 1]
 
 
 def test_a_report_has_two_parts_at_most() -> None:
@@ -135,7 +135,9 @@ def test_quarantine_keeps_bytes_reason_and_count(store: Store, clock: Clock) -> 
     [
         {"merge_delay_s": -1.0},
         {"busy_timeout_s": 0.0},
-        {"max_reports": 0},
+        {"window_s": 0.0},
+        {"window_vehicles": 0},
+        {"window_reports": 0},
         {"max_feature_reports": 0},
         {"max_reports_of_vehicle": 0},
         {"group_max": 0},
