@@ -94,8 +94,6 @@ def test_a_report_between_claim_and_load_is_merged_with_the_others(store: Store)
     assert len(work.reports) == 2
     store.publish([publication(work, 1, 2)])
     assert (store.counts().waiting, store.dirty_count()) == (0, 0)
-    assert store.publish([publication(store.load(only_claim(store)), 1, 2)]) == [PublishResult("unchanged", 1)]
-    assert store.dirty_count() == 0
 
 
 def test_a_tile_left_dirty_waits_its_delay_again(maker: SqliteMaker, clock: Clock) -> None:
