@@ -1,8 +1,8 @@
 """The clusters of a tile's statements (GND 5.1), voxel by voxel in one kernel: no array of pairs is made.
 
-Similarity is the smooth one of `gnd_map.similarity` ("default"). The labels are those of `cloud_merger.merge.plain_clusters`,
-its twin. What saves most: a statement whose cluster is known is compared with nobody any more. Where all agree that is
-one similarity each, not one a pair.
+Similarity is the smooth one of `gnd_map.similarity` ("default"). The labels are those of its twin,
+`cloud_merger.merge.plain_clusters`. What saves most: a statement whose cluster is known is found by nobody any more.
+Where all agree that is one similarity each, not one a pair.
 """
 
 import math
@@ -16,9 +16,10 @@ from gnd_map.arrays import F32, F64, I32, I64
 from gnd_map.jit import inlined, kernel
 
 U8 = NDArray[np.uint8]
+Said = tuple[U8, I64, I32, F64, F32, F32, float, float, float]
+"""Kind, was, count, pose_m2, mean_m and cov_m2 of the statements, noise in m², eps, `far_at` it."""
 NOISE = -1
 _LEAST_VARIANCE_M2 = 1e-6  # of `gnd_map.similarity`
-_FAR, _TINY = 1e-9, 1e-300
 _NOTHING, _QUOTED, _MEASURED, _WITHHELD = (int(kind) for kind in Kind)
 
 
@@ -31,7 +32,7 @@ def clusters_of(rows: Rows, parameters: MergeParameters) -> I64:
     """
     label = np.full(len(rows), NOISE, np.int64)
     columns = ("voxel_id", "kind", "was", "count", "pose_m2", "mean_m", "cov_m2")
-    said = (np.ascontiguousarray(rows[name]) for name in columns)
+    said = (rows[name].copy() for name in columns)  # aligned; a single row of a record is contiguous, but is not that
     _label_voxels(*said, parameters.noise_m**2, parameters.eps, parameters.min_samples, label)
     return label
 
@@ -54,13 +55,13 @@ def _label_voxels(
     most = _most_in_a_voxel(voxel_id)
     node, row, weight = np.empty(most, np.int64), np.empty(most, np.int64), np.empty(most, np.int64)
     found, queue, rest = np.empty(most, np.int64), np.empty(most, np.int64), np.empty(most, np.int64)
-    begin, number = 0, 0
+    begin, number, far = 0, 0, far_at(1.0 - eps)
     while begin < len(voxel_id):
         end = begin + 1
         while end < len(voxel_id) and voxel_id[end] == voxel_id[begin]:
             end += 1
         n = _nodes(begin, end, kind, was, node, row, weight)
-        said = (kind, was, count, pose_m2, mean_m, cov_m2, noise_m2, eps)
+        said = (kind, was, count, pose_m2, mean_m, cov_m2, noise_m2, eps, far)
         _add_neighbours(n, row, weight, min_samples, said)
         number = _cores(n, row, weight, min_samples, said, found, queue, rest, number)
         _borders(n, row, weight, min_samples, said, found)
@@ -106,7 +107,7 @@ def _nodes(begin: int, end: int, kind: U8, was: I64, node: I64, row: I64, weight
 
 
 @kernel
-def _add_neighbours(n: int, row: I64, weight: I64, min_samples: int, said) -> None:  # type: ignore[no-untyped-def]
+def _add_neighbours(n: int, row: I64, weight: I64, min_samples: int, said: Said) -> None:
     """Add to each node's weight that of its neighbours, until it is enough for a core."""
     if min_samples <= 1:
         return
@@ -119,8 +120,8 @@ def _add_neighbours(n: int, row: I64, weight: I64, min_samples: int, said) -> No
 
 
 @kernel
-def _cores(  # type: ignore[no-untyped-def]
-    n: int, row: I64, weight: I64, min_samples: int, said, found: I64, queue: I64, rest: I64, number: int
+def _cores(
+    n: int, row: I64, weight: I64, min_samples: int, said: Said, found: I64, queue: I64, rest: I64, number: int
 ) -> int:
     """Label the connected components of the cores from `number` on by their first core; the next number."""
     left = 0
@@ -151,7 +152,7 @@ def _cores(  # type: ignore[no-untyped-def]
 
 
 @kernel
-def _borders(n: int, row: I64, weight: I64, min_samples: int, said, found: I64) -> None:  # type: ignore[no-untyped-def]
+def _borders(n: int, row: I64, weight: I64, min_samples: int, said: Said, found: I64) -> None:  # type: ignore[no-untyped-def]
     """A node near a core joins the first cluster that reaches it."""
     for i in range(n):
         if weight[i] >= min_samples:
@@ -163,9 +164,9 @@ def _borders(n: int, row: I64, weight: I64, min_samples: int, said, found: I64) 
 
 
 @kernel
-def _is_near(a: int, b: int, said) -> bool:  # type: ignore[no-untyped-def]
-    """Whether two statements of a voxel lie within `eps` of each other; `said`: the columns, noise (m²) and eps."""
-    kind, was, count, pose_m2, mean_m, cov_m2, noise_m2, eps = said
+def _is_near(a: int, b: int, said: Said) -> bool:
+    """Whether two statements of a voxel lie within `eps` of each other."""
+    kind, was, count, pose_m2, mean_m, cov_m2, noise_m2, eps, far = said
     if kind[a] == _NOTHING or kind[b] == _NOTHING:  # Eq. 14
         return False
     if was[a] == was[b] and was[a] > 0 and kind[a] != kind[b]:  # one denies what the other quotes
@@ -173,14 +174,19 @@ def _is_near(a: int, b: int, said) -> bool:  # type: ignore[no-untyped-def]
     if count[a] <= 0 or count[b] <= 0:
         return (count[a] > 0) == (count[b] > 0)
     noise_m = math.sqrt(noise_m2 + pose_m2[a] + pose_m2[b])
-    return 1.0 - alike(mean_m[a], cov_m2[a], mean_m[b], cov_m2[b], noise_m, 1.0 - eps) <= eps
+    return 1.0 - alike(mean_m[a], cov_m2[a], mean_m[b], cov_m2[b], noise_m, far) <= eps
 
 
 @kernel
-def alike(mean_a: F32, cov_a: F32, mean_b: F32, cov_b: F32, noise_m: float, least: float) -> float:
-    """Similarity of two Gaussians, means (3,), covariances (6,), as `gnd_map.similarity` has it in "default" mode.
+def far_at(least: float) -> float:
+    """The squared Mahalanobis distance of means beyond which similarity is certainly below `least`."""
+    return 1e-9 - 2.0 * math.log(max(least, 1e-300))
 
-    Where the distance of the means alone makes it certain that it is below `least`, 0 is returned instead.
+
+@kernel
+def alike(mean_a: F32, cov_a: F32, mean_b: F32, cov_b: F32, noise_m: float, far: float) -> float:
+    """Similarity of two Gaussians, means (3,), covariances (6,), as `gnd_map.similarity` has it in "default" mode; 0
+    where the squared Mahalanobis distance of the means is beyond `far`.
     """
     variance = max(noise_m * noise_m, _LEAST_VARIANCE_M2)
     a, b = _raised(cov_a, variance), _raised(cov_b, variance)
@@ -194,11 +200,9 @@ def alike(mean_a: F32, cov_a: F32, mean_b: F32, cov_b: F32, noise_m: float, leas
     form = x * x * (yy * zz - yz * yz) + y * y * (xx * zz - xz * xz) + z * z * (xx * yy - xy * xy)
     form += 2.0 * (x * y * (xz * yz - xy * zz) + x * z * (xy * yz - xz * yy) + y * z * (xy * xz - xx * yz))
     squared = max(form / _determinant(xx, xy, xz, yy, yz, zz), 0.0)
-    if squared > _FAR - 2.0 * math.log(max(least, _TINY)):
+    if squared > far:
         return 0.0
-    middle = _determinant(
-        0.5 * (a[0] + b[0]), 0.5 * xy, 0.5 * xz, 0.5 * (a[3] + b[3]), 0.5 * yz, 0.5 * (a[5] + b[5])
-    )
+    middle = _determinant(0.5 * (a[0] + b[0]), 0.5 * xy, 0.5 * xz, 0.5 * (a[3] + b[3]), 0.5 * yz, 0.5 * (a[5] + b[5]))
     shape = math.sqrt(math.sqrt(_determinant(*a) * _determinant(*b))) / math.sqrt(middle)
     return math.exp(-0.5 * squared) * min(shape, 1.0)
 

@@ -15,20 +15,22 @@ conditions: a LiDAR that hangs lower than its vehicle believes raises every road
 A pure function of a report and its base.
 """
 
+from collections import OrderedDict
 from dataclasses import dataclass, replace
 from functools import cached_property, lru_cache
+from threading import Lock
 from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 
 from cloud_merger import shift_kernels as kernels
 from cloud_merger.errors import MergerError
 from cloud_merger.shift_kernels import Buckets, Mask, Planes
 from cloud_merger.statements import find
-from gnd_map.arrays import F64
+from gnd_map.arrays import F64, I64
 from gnd_map.gaussian import Gaussians
 from gnd_map.grid import VoxelGrid
+from gnd_map.tile_id import TileId
 from schemas.changes import TileChange
 
 MAX_GAUSSIANS: Final = 400  # of a report that are looked at, every second, third, ... where there are more
@@ -121,9 +123,9 @@ class _Surfaces:
     flat: F64
 
     @classmethod
-    def of(cls, grid: VoxelGrid, gaussians: Gaussians) -> "_Surfaces":
-        place = grid.centre_m(gaussians.voxel_id) + gaussians.mean_m.astype(np.float64)
-        cov = gaussians.cov_m2.astype(np.float64)
+    def of(cls, grid: VoxelGrid, gaussians: Gaussians, rows: I64 | slice = slice(None)) -> "_Surfaces":
+        place = grid.centre_m(gaussians.voxel_id[rows]) + gaussians.mean_m[rows].astype(np.float64)
+        cov = gaussians.cov_m2[rows].astype(np.float64)
         return cls(place.reshape(-1, 3), cov, *kernels.normals(cov))
 
     def __len__(self) -> int:
@@ -139,19 +141,49 @@ class _Surfaces:
         """By which the kernels find those near a place."""
         return kernels.buckets_of(self.place_m)
 
-    @property
+    @cached_property
     def is_upright(self) -> Mask:
         """(N,) walls and the like."""
         return np.asarray((self.flat > kernels.FLAT) & (np.abs(self.normal[:, 2]) < 0.5))
 
-    @property
+    @cached_property
     def is_level(self) -> Mask:
         """(N,) roads and the like."""
         return np.asarray((self.flat > kernels.FLAT) & (np.abs(self.normal[:, 2]) > _LEVEL))
 
+    @cached_property
+    def level(self) -> "_Surfaces":
+        """The level ones alone."""
+        return self.take(self.is_level)
+
     def take(self, mask: Mask) -> "_Surfaces":
         index = np.flatnonzero(mask)
         return _Surfaces(self.place_m[index], self.cov_m2[index], self.normal[index], self.flat[index])
+
+
+class _Known:
+    """Surfaces of the bases looked at last, by the very object: the reports of a street refer to few versions."""
+
+    def __init__(self, most: int) -> None:
+        self._most = most
+        self._held: OrderedDict[tuple[int, int], tuple[Gaussians, _Surfaces]] = OrderedDict()
+        self._lock = Lock()
+
+    def of(self, tile: TileId, base: Gaussians) -> _Surfaces:
+        key = (tile.morton, id(base))
+        with self._lock:
+            if key in self._held:
+                self._held.move_to_end(key)
+                return self._held[key][1]
+        found = _Surfaces.of(VoxelGrid.of(tile), base)
+        with self._lock:
+            self._held[key] = base, found  # held, so that no other object gets its id
+            if len(self._held) > self._most:
+                self._held.popitem(last=False)
+        return found
+
+
+_KNOWN: Final = _Known(64)
 
 
 def shift_of(change: TileChange, base: Gaussians, parameters: ShiftParameters | None = None) -> Shift:
@@ -166,8 +198,8 @@ def shift_of(change: TileChange, base: Gaussians, parameters: ShiftParameters | 
     n = int(change.changed.exists.sum())
     if n < parameters.least_gaussians or len(base) < parameters.least_gaussians:
         return Shift(False, n)
-    grid = VoxelGrid.of(change.tile)
-    surfaces, known = _Surfaces.of(grid, _thinned(change.changed)), _Surfaces.of(grid, base)
+    surfaces = _Surfaces.of(VoxelGrid.of(change.tile), change.changed, _thinned(change.changed))
+    known = _KNOWN.of(change.tile, base)
     strange = surfaces.take(~_fits(surfaces, known, _STILL, parameters))
     if len(strange) < parameters.least_gaussians:
         return Shift(False, len(strange))
@@ -177,8 +209,7 @@ def shift_of(change: TileChange, base: Gaussians, parameters: ShiftParameters | 
     fit = float(_fits(strange, known, motion, parameters).mean())
     others = [_fits(strange, known, other, parameters).mean() for other in _elsewhere(motion)]
     chance = float(np.mean(others))
-    seen = known.take(is_seen).planes
-    unchanged = kernels.unchanged_share(seen, is_changed[is_seen], motion, parameters.displaced_m)
+    unchanged = kernels.unchanged_share(known.planes, is_seen, is_changed, motion, parameters.displaced_m)
     found = Shift(False, len(strange), fit, chance, unchanged, *motion.tolist())
     upwards = found if found.meets(parameters) else _raised(strange, known, is_seen, is_changed, parameters)
     return next((replace(one, is_explained=True) for one in (found, upwards) if one.meets(parameters)), found)
@@ -187,28 +218,28 @@ def shift_of(change: TileChange, base: Gaussians, parameters: ShiftParameters | 
 def _raised(
     strange: _Surfaces, known: _Surfaces, is_seen: Mask, is_changed: Mask, parameters: ShiftParameters
 ) -> Shift:
-    """The shift up or down that most level planes agree on, and what it explains."""
-    level, ground = strange.take(strange.is_level), known.take(known.is_level)
+    """The shift up or down that most level planes agree on, and what it explains; nothing where the tile refutes it."""
+    level, ground, no = strange.level, known.level, Shift(False, len(strange))
     if len(level) < parameters.least_gaussians or not len(ground):
-        return Shift(False, len(strange))
+        return no
     steps = _axis(parameters.max_m)
     votes = kernels.votes_up(level.place_m, ground.place_m, ground.buckets, steps)
     best = float(steps[np.lexsort((np.abs(steps), -votes))[0]])
-    fit, chance = (float(_fits(strange, known, _STILL, parameters, up_m).mean()) for up_m in (best, -best))
     displaced = is_seen & known.is_level & (abs(best) > parameters.displaced_m)
     unchanged = float((~is_changed)[displaced].mean()) if displaced.any() else 1.0
-    return Shift(False, len(strange), fit, chance, unchanged, up_m=best)
+    if unchanged > parameters.refuted_share:
+        return no
+    fit, chance = (float(_fits(strange, known, _STILL, parameters, up_m).mean()) for up_m in (best, -best))
+    return replace(no, fit=fit, chance=chance, unchanged=unchanged, up_m=best)
 
 
-def _thinned(gaussians: Gaussians) -> Gaussians:
-    """Those that are measured, `MAX_GAUSSIANS` at most."""
+def _thinned(gaussians: Gaussians) -> I64:
+    """Rows of those that are measured, `MAX_GAUSSIANS` at most."""
     there = np.flatnonzero(gaussians.exists)
-    return gaussians.take(there[:: -(-len(there) // MAX_GAUSSIANS)])
+    return there[:: -(-len(there) // MAX_GAUSSIANS)]
 
 
-def _fits(
-    surfaces: _Surfaces, known: _Surfaces, motion: F64, parameters: ShiftParameters, up_m: float = 0.0
-) -> Mask:
+def _fits(surfaces: _Surfaces, known: _Surfaces, motion: F64, parameters: ShiftParameters, up_m: float = 0.0) -> Mask:
     """(N,) whether a surface, moved, is like one of the base Gaussians around it.
 
     Along a surface its mean lies where the voxel has cut it, so only what the means differ by along the base's normal
@@ -241,7 +272,7 @@ def _searched(surfaces: _Surfaces, known: _Surfaces, is_unchanged: Mask, paramet
     east, north, far = _steps(parameters.max_m)
     pro = votes / max(len(upright), 1)
     x, y, _ = np.ascontiguousarray(known.normal[is_unchanged & known.is_upright].T)
-    best = kernels.best_shift(np.argsort(far - pro, kind="stable"), pro, far, east, north, x, y, parameters.displaced_m)
+    best = kernels.best_shift(pro, far, east, north, x, y, parameters.displaced_m)
     return np.array([east[best], north[best], 0.0])
 
 

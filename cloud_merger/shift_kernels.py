@@ -8,7 +8,7 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from cloud_merger.merge_kernels import alike
+from cloud_merger.merge_kernels import alike, far_at
 from gnd_map.arrays import F64, I64
 from gnd_map.jit import inlined, kernel
 
@@ -163,7 +163,7 @@ def fitting(surfaces: Planes, known: Planes, buckets: Buckets, motion: F64, up_m
     base, base_cov, normal, flat = known
     c, s = math.cos(motion[2]), math.sin(motion[2])
     found, off = np.empty(len(base), np.int64), np.empty(len(base))
-    zero, step = np.zeros(3), np.empty(3)
+    zero, step, far = np.zeros(3), np.empty(3), far_at(fits)
     result = np.zeros(len(place), np.bool_)
     for k in range(len(place)):
         x = c * place[k, 0] - s * place[k, 1] + motion[0]
@@ -175,7 +175,7 @@ def fitting(surfaces: Planes, known: Planes, buckets: Buckets, motion: F64, up_m
             if flat[j] > FLAT:
                 along = step[0] * normal[j, 0] + step[1] * normal[j, 1] + step[2] * normal[j, 2]
                 step[0], step[1], step[2] = along * normal[j, 0], along * normal[j, 1], along * normal[j, 2]
-            if alike(zero, base_cov[j], step, cov[k], NOISE_M, fits) >= fits:
+            if alike(zero, base_cov[j], step, cov[k], NOISE_M, far) >= fits:
                 result[k] = True
                 break
     return result
@@ -201,40 +201,60 @@ def votes_of(upright: Planes, known: Planes, buckets: Buckets, axis: F64) -> I64
             j = found[at]
             cosine = other[j, 0] * normal[k, 0] + other[j, 1] * normal[k, 1] + other[j, 2] * normal[k, 2]
             if flat[j] > FLAT and abs(cosine) > PARALLEL and abs(base[j, 2] - place[k, 2]) < BESIDE_M:
-                _vote(k, base[j] - place[k], other[j], axis, seen, votes)
+                apart = (base[j, 0] - place[k, 0], base[j, 1] - place[k, 1], base[j, 2] - place[k, 2])
+                off_m = apart[0] * other[j, 0] + apart[1] * other[j, 1] + apart[2] * other[j, 2]
+                _vote(k, off_m, apart[0], apart[1], other[j, 0], other[j, 1], axis, seen, votes)
     return votes
 
 
 @kernel
-def _vote(voter: int, apart: F64, normal: F64, axis: F64, seen: I64, votes: I64) -> None:
-    """One vote for each shift that takes a plane into one that lies `apart`: a strip of the grid along the plane."""
+def _vote(
+    voter: int,
+    off_m: float,
+    apart_x: float,
+    apart_y: float,
+    normal_x: float,
+    normal_y: float,
+    axis: F64,
+    seen: I64,
+    votes: I64,
+) -> None:
+    """One vote for each shift that takes a plane into one `off_m` away: a strip of the grid along the plane."""
     n = len(axis)
-    off_m = apart[0] * normal[0] + apart[1] * normal[1] + apart[2] * normal[2]
-    across = 0 if abs(normal[0]) > abs(normal[1]) else 1  # the axis along which the strip is narrow
-    half = STEP_M / abs(normal[across])
+    is_east = abs(normal_x) > abs(normal_y)  # the axis along which the strip is narrow; the other one is gone along
+    narrow, wide = (normal_x, normal_y) if is_east else (normal_y, normal_x)
+    wide_m = apart_y if is_east else apart_x
+    stride, step = (1, n) if is_east else (n, 1)
+    half = STEP_M / abs(narrow)
     for i in range(n):
-        if abs(apart[1 - across] - axis[i]) >= BESIDE_M:
+        if abs(wide_m - axis[i]) >= BESIDE_M:
             continue
-        middle = (off_m - normal[1 - across] * axis[i]) / normal[across]
-        first = max(int(math.floor((middle - half - axis[0]) / STEP_M)) - 1, 0)
-        last = min(int(math.floor((middle + half - axis[0]) / STEP_M)) + 2, n - 1)
+        middle = (off_m - wide * axis[i]) / narrow
+        first = max(math.floor((middle - half - axis[0]) / STEP_M) - 1, 0)
+        last = min(math.floor((middle + half - axis[0]) / STEP_M) + 2, n - 1)
         for j in range(first, last + 1):
-            east, north = (axis[j], axis[i]) if across == 0 else (axis[i], axis[j])
-            is_into = abs(off_m - (normal[0] * east + normal[1] * north)) < STEP_M
-            at = (i * n + j) if across == 0 else (j * n + i)
-            if is_into and seen[at] != voter and math.hypot(apart[0] - east, apart[1] - north) < BESIDE_M:
+            at = i * step + j * stride
+            east, north = (axis[j], axis[i]) if is_east else (axis[i], axis[j])
+            is_into = abs(off_m - (normal_x * east + normal_y * north)) < STEP_M
+            if is_into and seen[at] != voter and _is_beside(apart_x - east, apart_y - north):
                 seen[at] = voter
                 votes[at] += 1
 
 
+@inlined
+def _is_beside(x: float, y: float) -> bool:
+    """Whether hypot(x, y) < `BESIDE_M`; that is only computed where it is close."""
+    squared = x * x + y * y
+    if abs(squared - BESIDE_M * BESIDE_M) > 1e-9:
+        return squared < BESIDE_M * BESIDE_M
+    return math.hypot(x, y) < BESIDE_M
+
+
 @kernel
-def best_shift(
-    order: I64, pro: F64, far: F64, east: F64, north: F64, normal_x: F64, normal_y: F64, displaced_m: float
-) -> int:
+def best_shift(pro: F64, far: F64, east: F64, north: F64, normal_x: F64, normal_y: F64, displaced_m: float) -> int:
     """The shift with the largest score; of equal ones the most western, then the most southern.
 
     Args:
-        order: (S,) the shifts by `pro - far`, the largest first.
         pro: (S,) share of planes that vote for each.
         far: (S,) taken off for its length.
         east: (S,) metres.
@@ -243,12 +263,14 @@ def best_shift(
         normal_y: (P,)
         displaced_m: a shift that moves such a plane by more along its normal has it against it.
 
-    Those against are counted only where the votes for a shift could still win.
+    Those against are counted only where the votes for a shift could still win, of the likeliest first.
     """
-    best, most = order[0], -np.inf
-    for k in order:
+    best, most = 0, -np.inf
+    likeliest = int(np.argmax(pro - far))
+    for turn in range(-1, len(pro)):
+        k = likeliest if turn < 0 else turn
         if pro[k] - far[k] < most:
-            break
+            continue
         against = 0
         for p in range(len(normal_x)):
             against += abs(normal_x[p] * east[k] + normal_y[p] * north[k]) > displaced_m
@@ -256,13 +278,11 @@ def best_shift(
         is_first = (east[k], north[k]) < (east[best], north[best])
         if score > most or (score == most and is_first):
             best, most = k, score
-    return int(best)
+    return best
 
 
 @kernel
-def refined(
-    begin: F64, surfaces: Planes, known: Planes, buckets: Buckets, prior: F64, least: int
-) -> F64:
+def refined(begin: F64, surfaces: Planes, known: Planes, buckets: Buckets, prior: F64, least: int) -> F64:
     """The motion (east, north, turn) after `ROUNDS` of robust point-to-plane least squares from `begin`.
 
     Args:
@@ -306,7 +326,7 @@ def refined(
 def _nearest_plane(
     k: int, x: float, y: float, surfaces: Planes, known: Planes, buckets: Buckets, found: I64, off: F64
 ) -> tuple[int, float]:
-    """The parallel plane nearest to surface k, at (x, y), along its normal: base row or -1, signed distance in metres."""
+    """The parallel plane nearest to surface k, at (x, y), along its normal: base row or -1, distance m."""
     base, _, normal, flat = known
     own, z = surfaces[2][k], surfaces[0][k, 2]
     best, best_m = -1, np.inf
@@ -362,15 +382,15 @@ def votes_up(level: F64, ground: F64, buckets: Buckets, steps: F64) -> I64:
 
 
 @kernel
-def unchanged_share(seen: Planes, is_changed: Mask, motion: F64, displaced_m: float) -> float:
+def unchanged_share(known: Planes, is_seen: Mask, is_changed: Mask, motion: F64, displaced_m: float) -> float:
     """Of observed surfaces that the motion would have displaced along their normals, the share unchanged; 0 of none."""
-    place, _, normal, flat = seen
+    place, _, normal, flat = known
     c, s = math.cos(motion[2]), math.sin(motion[2])
     displaced, unchanged = 0, 0
     for k in range(len(place)):
         x = c * place[k, 0] - s * place[k, 1] + motion[0] - place[k, 0]
         y = s * place[k, 0] + c * place[k, 1] + motion[1] - place[k, 1]
-        if flat[k] > FLAT and abs(x * normal[k, 0] + y * normal[k, 1]) > displaced_m:
+        if is_seen[k] and flat[k] > FLAT and abs(x * normal[k, 0] + y * normal[k, 1]) > displaced_m:
             displaced += 1
             unchanged += not is_changed[k]
     return unchanged / displaced if displaced else 0.0

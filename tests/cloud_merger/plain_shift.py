@@ -1,4 +1,4 @@
-"""The shift test in plain numpy: the twin of `cloud_merger.shift` and its kernels, with a k-d tree and arrays of pairs."""
+"""The shift test in plain numpy, the twin of `cloud_merger.shift`: with a k-d tree and arrays of pairs."""
 
 from dataclasses import dataclass, replace
 from math import cos, sin
@@ -168,11 +168,15 @@ def searched(
         other = known.take(np.array(sorted(near), np.int64))
         other = other.take((other.flat > _FLAT) & (np.abs(other.normal @ upright.normal[k]) > _PARALLEL))
         apart = other.place_m - upright.place_m[k]
-        off = np.einsum("ni,ni->n", apart, other.normal)[:, None] - (other.normal[:, :1] * steps[0] + other.normal[:, 1:2] * steps[1])
+        off = np.einsum("ni,ni->n", apart, other.normal)[:, None] - (
+            other.normal[:, :1] * steps[0] + other.normal[:, 1:2] * steps[1]
+        )
         beside = np.hypot(apart[:, :1] - steps[0], apart[:, 1:2] - steps[1]) < _BESIDE_M
         votes += ((np.abs(off) < _STEP_M) & beside & (np.abs(apart[:, 2:]) < _BESIDE_M)).any(axis=0)
     still = unchanged.take(unchanged.is_upright)
-    against = (np.abs(still.normal[:, :1] * steps[0] + still.normal[:, 1:2] * steps[1]) > parameters.displaced_m).sum(axis=0)
+    against = (np.abs(still.normal[:, :1] * steps[0] + still.normal[:, 1:2] * steps[1]) > parameters.displaced_m).sum(
+        axis=0
+    )
     score = votes / max(len(upright.place_m), 1) - against / max(len(still.place_m), 1)
     score -= _FAR_PER_M * np.hypot(*steps)
     best = np.lexsort((steps[1], steps[0], -score))[0]
