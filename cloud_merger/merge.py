@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cloud_merger.cluster import Index, dbscan
+from cloud_merger.merge_kernels import clusters_of
 from cloud_merger.parameters import MergeParameters
 from cloud_merger.statements import EPOCH, Kind, Rows, Statements, find, states_at
 from gnd_map.gaussian import Gaussians
@@ -80,6 +81,11 @@ def _clusters(rows: Rows, parameters: MergeParameters) -> Index:
     """GND 5.1: the cluster of each statement, numbered by voxel, then by the cluster's first report; -1 is noise, and
     what is withheld.
     """
+    return clusters_of(rows, parameters) if parameters.mode == "default" else plain_clusters(rows, parameters)
+
+
+def plain_clusters(rows: Rows, parameters: MergeParameters) -> Index:
+    """The same over arrays of all pairs: for "paper" mode, and the twin of `clusters_of`."""
     shown = rows["kind"] != Kind.WITHHELD
     cluster = np.full(len(rows), -1, np.int64)
     cluster[shown] = _clusters_shown(rows[shown], parameters)
