@@ -19,3 +19,15 @@ def kernel(function: F) -> F:
 def inlined(function: F) -> F:
     """As `kernel`, laid into its callers: for the few lines that run a hundred times a voxel."""
     return cast("F", numba.njit(cache=True, error_model="numpy", nogil=True, forceinline=True)(function))
+
+
+def bare(function: F) -> F:
+    """As `kernel`, for functions that make no arrays and are called a hundred times a voxel: arrays given to them are
+    not counted as held, which takes two locked instructions an array and call.
+    """
+    return cast("F", numba.njit(cache=True, error_model="numpy", nogil=True, _nrt=False)(function))
+
+
+def bare_inlined(function: F) -> F:
+    """As `bare`, laid into its callers."""
+    return cast("F", numba.njit(cache=True, error_model="numpy", nogil=True, _nrt=False, forceinline=True)(function))

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from gnd_map.arrays import F32, F64, I32, I64
 from gnd_map.classes import ChangeClass
-from gnd_map.jit import inlined, kernel
+from gnd_map.jit import bare, bare_inlined, kernel
 
 U8 = NDArray[np.uint8]
 U64 = NDArray[np.uint64]
@@ -33,7 +33,7 @@ STOP: Final = 9
 _NEAR_NEW, _NEAR_CHANGED = 1, 8
 _GOLDEN: Final = 40503  # of 65536
 _ONE, _ALL, _WORD = np.uint64(1), np.uint64(0xFFFF_FFFF_FFFF_FFFF), np.uint64(64)
-_MOST_COLUMNS: Final = 512  # that one fan crosses
+MOST_COLUMNS: Final = 512  # that one fan crosses
 _NEW, _DELETED = int(ChangeClass.NEW), int(ChangeClass.DELETED)
 
 
@@ -62,7 +62,7 @@ class Window(NamedTuple):
     lowest: int
 
 
-@kernel
+@bare
 def _cell(w: Window, slot: int, column: int, floor: int) -> int:
     """Cell of a voxel, -1 where no line comes."""
     if not w.low[slot] <= floor < w.low[slot] + w.floors[slot]:
@@ -71,7 +71,7 @@ def _cell(w: Window, slot: int, column: int, floor: int) -> int:
     return found
 
 
-@kernel
+@bare
 def lay_out(
     w: Window, slot: I32, voxel_id: I32, mean_m: F32, cov_m2: F32, ball_m2: float, noise_m2: float,
     state: I32, filled: U64, stop: F32,
@@ -121,7 +121,7 @@ def lay_out(
         stop[row, 6], stop[row, 7], stop[row, 8] = (b * e - c * d) / (a * c * f), -e / (c * f), 1.0 / f
 
 
-@kernel
+@bare
 def mark(
     w: Window, slot: I32, voxel_id: I32, change_class: U8, state: I32, filled: U64, near: U8, seen: U64
 ) -> None:
@@ -163,7 +163,7 @@ def mark(
                     near[cell] += _NEAR_NEW if change_class[row] == _NEW else _NEAR_CHANGED
 
 
-@inlined
+@bare_inlined
 def _stops(
     stop: F32, row: int, o: tuple[float, float, float], d: tuple[float, float, float],
     t_in: float, t_out: float, r2: float,
@@ -199,8 +199,14 @@ class Columns(NamedTuple):
     filled: U64
     leave_m: F64
 
+    @classmethod
+    def room(cls) -> "Columns":
+        """For the longest fan."""
+        n = MOST_COLUMNS
+        return cls(*(np.empty(n, np.int64) for _ in range(3)), np.empty(n, np.uint64), np.empty(n))
 
-@kernel
+
+@bare
 def _cross(w: Window, filled: U64, x: float, y: float, bottom: int, d: F64, reach_m: float, crossed: Columns) -> int:
     """Fill in the columns that a fan crosses from (x, y) along the unit vector d (2,), from floor `bottom` on; how
     many.
@@ -216,7 +222,7 @@ def _cross(w: Window, filled: U64, x: float, y: float, bottom: int, d: F64, reac
     i, j = i - tile_x * nx, j - tile_y * ny
     word, shift = (bottom - w.lowest) // 64, np.uint64((bottom - w.lowest) % 64)
     n, t = 0, 0.0
-    while t < reach_m and n < _MOST_COLUMNS:
+    while t < reach_m and n < MOST_COLUMNS:
         if not (0 <= tile_x < w.slot_of.shape[0] and 0 <= tile_y < w.slot_of.shape[1]):
             break
         slot = w.slot_of[tile_x, tile_y]
@@ -246,10 +252,10 @@ def _cross(w: Window, filled: U64, x: float, y: float, bottom: int, d: F64, reac
     return n
 
 
-@kernel
+@bare
 def cast_fans(  # noqa: C901, PLR0912, PLR0915  (one loop, as in the vehicle's ray kernel)
     w: Window, place: F64, turn: F64, rays: I64, azimuth: F64, slope: F64, lines: int, stop: F32, filled: U64,
-    r2: float, range_m: float, reach_m: float, level: float, state: I32, hits: I64,
+    r2: float, range_m: float, reach_m: float, level: float, state: I32, hits: I64, columns: Columns, ahead: F64,
 ) -> None:  # fmt: skip
     """From every place a fan of lines along every azimuth; counts into `state` and `hits`.
 
@@ -272,16 +278,11 @@ def cast_fans(  # noqa: C901, PLR0912, PLR0915  (one loop, as in the vehicle's r
         level: a line that nothing stopped counts if the tangent of its elevation, up or down, is smaller.
         state: (cells,) int32, changed: less the rays of lines that crossed a voxel without Gaussian and met something.
         hits: (M,) int64, changed: rays of the lines that each Gaussian stopped.
+        columns: room to work in, as is ahead.
+        ahead: (2,) float64.
     """
-    columns = Columns(
-        np.empty(_MOST_COLUMNS, np.int64),
-        np.empty(_MOST_COLUMNS, np.int64),
-        np.empty(_MOST_COLUMNS, np.int64),
-        np.empty(_MOST_COLUMNS, np.uint64),
-        np.empty(_MOST_COLUMNS),
-    )
     base, first, end, full, leave_m = columns
-    ahead, stride, phase = np.empty(2), len(slope) // lines, 0
+    stride, phase = len(slope) // lines, 0
     for p in range(len(place)):
         bottom, ray = math.floor(place[p, 2]) - BELOW, rays[p]
         ox, oy, oz = place[p, 0] * w.metres[0], place[p, 1] * w.metres[1], place[p, 2] - bottom
@@ -342,7 +343,7 @@ def cast_fans(  # noqa: C901, PLR0912, PLR0915  (one loop, as in the vehicle's r
                     t_in = leave_m[n]
 
 
-@inlined
+@bare_inlined
 def _lowest_bit(bits: int) -> int:
     """Number of the lowest bit that is set."""
     n = 0
@@ -353,7 +354,7 @@ def _lowest_bit(bits: int) -> int:
     return n
 
 
-@kernel
+@bare
 def _with_border(w: Window, slot: int, bits: U64, padded: U64, base: I64) -> None:
     """Bits of a slot's columns and of those around it.
 
@@ -413,7 +414,7 @@ def pool(w: Window, filled: U64, state: I32, hits: I64, pooled: I64) -> None:
                         pooled[state[base[y, x] + bit]] = total // n
 
 
-@kernel
+@bare
 def read_out(w: Window, state: I32, pooled: I64, near: U8, least_hits: I64, least_passes: I64, seen: U64) -> None:
     """Which voxels enough rays have met.
 
@@ -526,7 +527,7 @@ def collect(w: Window, seen: U64, found: I32, ends: I64) -> None:
         ends[slot] = n
 
 
-@kernel
+@bare
 def _ones_of(seen: U64) -> int:
     """How many bits are set."""
     n = 0

@@ -21,7 +21,7 @@ from gnd_map.codec import Flags
 from gnd_map.errors import ConfigError, TrackError
 from gnd_map.grid import VoxelGrid, zones
 from gnd_map import sight
-from gnd_map.sight import FACES, MOST_RAYS, NO_SLOT, NOTHING, STOP, Window
+from gnd_map.sight import FACES, MOST_RAYS, NO_SLOT, NOTHING, STOP, Columns, Window
 from gnd_map.tile_id import LON_TILES, TileId, deinterleave
 from gnd_map.track import SECTORS, Track, View
 
@@ -60,7 +60,7 @@ class VisibilityParameters:
     """
 
     step_m: float = 8.0
-    azimuths: int = 96
+    azimuths: int = 64
     lines: int = 16
     range_m: float = 50.0
     reach_m: float = 70.0
@@ -69,7 +69,7 @@ class VisibilityParameters:
     new_radius_m: float = 0.5
     min_hits: float = 48.0
     min_passes: float = 256.0
-    hits_near: float = 3.0
+    hits_near: float = 6.0
     passes_near: float = 8.0
     open_rad: float = 0.04
 
@@ -243,6 +243,7 @@ class _Zone:
         sight.cast_fans(
             w, np.column_stack([g, places.height_m]), places.turn, places.rays, self._azimuth, self._slope, p.lines,
             stop, filled, p.r2, p.range_m, p.reach_m, float(_rounded(np.tan(p.open_rad))), state, hits,
+            Columns.room(), np.empty(2),
         )  # fmt: skip
         sight.pool(w, filled, state, hits, pooled)
         least_hits, least_passes = _least(p.min_hits, p.hits_near), _least(p.min_passes, p.passes_near)
