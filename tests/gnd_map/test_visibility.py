@@ -228,7 +228,8 @@ def test_what_is_flagged_is_always_observed_and_stops_lines_unless_it_is_gone():
     assert behind not in seen()
     assert behind in seen(DRIVE, *gone)
     assert {v for v, _ in gone} <= seen(DRIVE, *gone)
-    fence = [(voxel(i, 18, GROUND + k), ChangeClass.NEW) for i in range(GRID.nx) for k in range(1, 6)]
+    across = itertools.product(range(GRID.nx), (18, 19, 20), range(1, 6))  # thick: lines slip between single balls
+    fence = [(voxel(i, j, GROUND + k), ChangeClass.NEW) for i, j, k in across]
     before = voxel(15, WALL_ROW, GROUND + 2)
     assert before in seen()
     fenced = set(observed_along(DRIVE, [told(*fence), told(*fence, tile=TILES[1])])[WEST].tolist())
@@ -298,7 +299,7 @@ def test_two_threads_look_at_once_and_a_third_goes_on():
     """Kernels run without the GIL. While two threads look along a drive, a third that only counts keeps most of its
     pace: with the GIL held it would stand still for whole looks.
     """
-    told_all, fine = [told(), told(tile=TILES[1])], VisibilityParameters(step_m=0.25, azimuths=960, lines=64)
+    told_all, fine = [told(), told(tile=TILES[1])], VisibilityParameters(step_m=1.0, azimuths=480, lines=32)
     observed_along(DRIVE, told_all, fine)
     gaps_s, stop = [], threading.Event()
 
