@@ -386,7 +386,8 @@ SLOPE: Final = 7  # ba, ca, cb
 STEP: Final = 10  # a, b, c
 COUNT: Final = 13
 SELF: Final = 14  # row that this one replaces, or -1
-COLUMNS: Final = 15
+TILT: Final = 15  # of the surface along a and b, 2^-16: follows from the others, found once for all that ask
+COLUMNS: Final = 17
 
 # Families of contexts of each number, three each.
 _FAMILIES: Final = (
@@ -438,6 +439,8 @@ def code_voxels(
         w: first mixing weights.
         refs: (MOST_REFS,) int64, room to work in.
     """
+    for row in range(1, first):
+        _keep_tilts(table, row, sd, shape)
     for row in range(first, len(table)):
         _code_voxel(state, table, row, where, sd, shape, pitch, at, w, refs)
         where[table[row, Z], table[row, Y], table[row, X]] = row
@@ -595,7 +598,7 @@ def _code_voxel(
     low_a = low_b = 1 << 40
     high_a = high_b = -(1 << 40)
     for i in range(n):
-        ta, tb = _tilts(table, refs[i], sd, plane_step, slope_bits, shear_bits, up)
+        ta, tb = np.int64(table[refs[i], TILT]), np.int64(table[refs[i], TILT + 1])
         tilt_a, tilt_b = tilt_a + ta, tilt_b + tb
         low_a, high_a, low_b, high_b = min(low_a, ta), max(high_a, ta), min(low_b, tb), max(high_b, tb)
     if n > 0:
@@ -650,6 +653,7 @@ def _code_voxel(
     surprise = min(_bucket(odd_a), 3) * 4 + min(_bucket(odd_b), 3)
     m_c = want + _number(state, 9, min(n, 3) * 6 + doubt, thin, surprise * 3 + kind, at, w, table[row, STEP + 2] - want)
     table[row, STEP + 2] = m_c
+    _keep_tilts(table, row, sd, shape)
 
 
 @bare
@@ -668,17 +672,16 @@ def _code_level(
 
 
 @bare
-def _tilts(
-    table: I32, row: int, sd: I64, plane_step: int, slope_bits: int, shear_bits: int, up: int
-) -> tuple[int, int]:
+def _keep_tilts(table: I32, row: int, sd: I64, shape: I64) -> None:
     """Tilt of a known voxel's surface along a and b, 2^-16, at most 4 either way."""
+    plane_step, slope_bits, shear_bits, up = shape[0], shape[1], shape[2], shape[5] - 20
     D1, D2 = sd[table[row, LEVEL] * plane_step] << up, sd[table[row, LEVEL + 1] * plane_step] << up
     D3 = sd[table[row, LEVEL + 2]] << up
     L21 = table[row, SLOPE] * D2 >> shear_bits
     L31, L32 = table[row, SLOPE + 1] * D3 >> slope_bits, table[row, SLOPE + 2] * D3 >> slope_bits
     tilt_b = _clip((L32 << _BITS) // D2, -(4 << _BITS), 4 << _BITS)
-    tilt_a = _clip(((L31 << _BITS) - tilt_b * L21) // D1, -(4 << _BITS), 4 << _BITS)
-    return tilt_a, tilt_b
+    table[row, TILT] = _clip(((L31 << _BITS) - tilt_b * L21) // D1, -(4 << _BITS), 4 << _BITS)
+    table[row, TILT + 1] = tilt_b
 
 
 @bare
@@ -698,7 +701,7 @@ def _height(table: I32, row: int, other: int, sd: I64, shape: I64, pitch: I64, a
     to_a = step_y if axis == 0 else step_x
     to_b = step_y if axis == 2 else step_z
     to_c = step_x if axis == 0 else (step_y if axis == 1 else step_z)
-    tilt_a, tilt_b = _tilts(table, other, sd, plane_step, slope_bits, shear_bits, up)
+    tilt_a, tilt_b = np.int64(table[other, TILT]), np.int64(table[other, TILT + 1])
     off_a = mu_a - (D1 * ya + to_a)
     off_b = mu_b - (L21 * ya + D2 * yb + to_b)
     height: int = L31 * ya + L32 * yb + D3 * yc + to_c + (tilt_a * off_a + tilt_b * off_b >> _BITS)
