@@ -28,6 +28,8 @@ NAMES = (
     "features-merge",
     "slamcu-step",
     "map-build",
+    "stalled",
+    "outage",
 )
 WITH_OPTIONS = ("codec", "return-download", "gnss-noise", "poles", "slamcu-step")
 

@@ -11,6 +11,17 @@ from fleet_bus.links import LinkProfile, load_link
 
 DEFAULT_ENDPOINT: Final = "tcp/127.0.0.1:7447"
 MAX_MESSAGE_BYTES: Final = 16 * 1024 * 1024
+READS: Final = ("gnd/v1/tile/**", "gnd/v1/tiles/**", "gnd/v1/catalog/**")
+"""Keys of questions that change nothing: whose link is full loses the answer, and asks again."""
+QUEUED_BATCHES: Final = 16
+"""How many batches a router keeps for each client and each lane (zenoh's most); allocated when needed."""
+
+# A client's own queue may be full for as long as its own weak link needs: it drops nothing itself.
+_OWN_LINK_WAIT_US: Final = 60_000_000
+# At a router somebody else waits meanwhile: who takes nothing for so long loses the connection.
+_OTHERS_WAIT_US: Final = 500_000
+# What may be dropped waits for room this long, once until the link moves again; a fragment at most twice as long.
+_DROP_WAIT_US: Final = 5_000
 
 
 @dataclass(frozen=True, slots=True)
@@ -105,11 +116,53 @@ def assert_rules(settings: zenoh.Config, config: BusConfig) -> None:
 def _same(want: Any, got: Any) -> bool:
     if isinstance(want, dict) and isinstance(got, dict):
         return all(_same(value, got.get(key)) for key, value in want.items())
+    if isinstance(want, list) and isinstance(got, list):
+        return len(want) == len(got) and all(map(_same, want, got))
     return bool(want == got)
 
 
 def _settings(config: BusConfig, link: LinkProfile) -> dict[str, Any]:
-    settings: dict[str, Any] = {
+    settings = _session_settings(config, link) | (_router_rules() if config.mode == "router" else {})
+    if link.send_buffer_bytes:
+        settings["transport/link/tcp/so_sndbuf"] = link.send_buffer_bytes
+    return settings | _patience(config)
+
+
+def _patience(config: BusConfig) -> dict[str, Any]:
+    """How long a full queue is waited for: by a client as long as its own link needs, by a router hardly at all."""
+    is_router = config.mode == "router"
+    drop_us = _DROP_WAIT_US if is_router else _OWN_LINK_WAIT_US
+    control = "transport/link/tx/queue/congestion_control"
+    return {
+        f"{control}/drop/wait_before_drop": drop_us,
+        f"{control}/drop/max_wait_before_drop_fragments": drop_us,
+        # Then the session is closed, and later puts would vanish.
+        f"{control}/block/wait_before_close": _OTHERS_WAIT_US if is_router else _OWN_LINK_WAIT_US,
+    }
+
+
+def _router_rules() -> dict[str, Any]:
+    """Whoever does not read loses its own messages, then its own connection, and nobody waits for it.
+
+    Answers have the congestion control of their question as it left the router; the end of the answers always blocks,
+    and where its lane is known to be full, zenoh closes that connection at once.
+    """
+    lanes = ("data_high", "data", "data_low")
+    return {
+        "transport/link/tx/queue/size": dict.fromkeys(lanes, QUEUED_BATCHES),
+        "qos/network": [
+            _rule("notices", ["put", "delete"], ["**"], {"congestion_control": "drop", "priority": "data_low"}),
+            _rule("reads", ["query"], list(READS), {"congestion_control": "drop"}),
+        ],
+    }
+
+
+def _rule(name: str, messages: list[str], keys: list[str], overwrite: dict[str, str]) -> dict[str, Any]:
+    return {"id": name, "messages": messages, "key_exprs": keys, "flows": ["ingress"], "overwrite": overwrite}
+
+
+def _session_settings(config: BusConfig, link: LinkProfile) -> dict[str, Any]:
+    return {
         "mode": config.mode,
         "connect/endpoints": list(config.connect),
         # Endpoints come back by themselves after a lost connection.
@@ -126,10 +179,5 @@ def _settings(config: BusConfig, link: LinkProfile) -> dict[str, Any]:
         "transport/unicast/lowlatency": False,
         "transport/link/tx/lease": config.lease_ms or link.lease_ms,
         "transport/link/tx/batch_size": link.batch_bytes,
-        # A full queue closes the session after this long, and later puts would vanish: longer than any slow link needs.
-        "transport/link/tx/queue/congestion_control/block/wait_before_close": 60_000_000,
         "transport/link/rx/max_message_size": config.max_message_bytes,
     }
-    if link.send_buffer_bytes:
-        settings["transport/link/tcp/so_sndbuf"] = link.send_buffer_bytes
-    return settings

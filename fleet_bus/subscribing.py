@@ -2,7 +2,7 @@
 
 import logging
 from collections.abc import Callable
-from typing import Any
+from typing import Any, Final
 
 import zenoh
 from zenoh import ext
@@ -15,6 +15,8 @@ from fleet_bus.workers import Workers
 from gnd_map.tile_id import TileId
 
 _LOG = logging.getLogger(__name__)
+# Notices let answers and acknowledgements pass.
+NOTICE_LANE: Final = zenoh.Priority.DATA_LOW
 OnMessage = Callable[[str, bytes], None]
 OnAlive = Callable[[str, bool], None]
 TileOf = Callable[[str], TileId | None]
@@ -108,6 +110,7 @@ class RecallingPublisher(Part):
             connection.session,
             key,
             congestion_control=zenoh.CongestionControl.BLOCK,
+            priority=NOTICE_LANE,
             cache=ext.CacheConfig(max_samples=remember),
             sample_miss_detection=ext.MissDetectionConfig(heartbeat=None, sporadic_heartbeat=0.5),
             publisher_detection=True,
@@ -138,7 +141,7 @@ def publish(
         raise NoRouter(f"no router at {where} for {wait_s:g} s: {len(payload)} bytes for {key} were not published")
     connection.outgoing(payload, kind, tile, head_bytes(key, NOTICE_BYTES))
     with connection.sending() as session:
-        session.put(key, payload, congestion_control=zenoh.CongestionControl.BLOCK)
+        session.put(key, payload, congestion_control=zenoh.CongestionControl.BLOCK, priority=NOTICE_LANE)
 
 
 def _declare(session: zenoh.Session, keyexpr: str, accept: Callable[[zenoh.Sample], Any], *, history: bool) -> Any:
