@@ -12,6 +12,7 @@ import numpy as np
 from benchmarks.ingest import base_tile
 from cloud_merger.config import ShardConfig
 from deploy import roles
+from deploy.fleet import POLL_S
 from deploy.ports import claim_port
 from deploy.processes import ProcessSpec, Supervisor, start_fork_server
 from fleet_bus.bus import open_bus
@@ -23,7 +24,6 @@ from schemas.keys import tile_key
 from tile_store.sqlite_store import SqliteStore
 
 READY_S = 60.0
-SUPERVISE_S = 0.05
 SHARD_POLL_S = 0.02
 TILES = 8
 VOXELS = 2_000
@@ -119,7 +119,7 @@ def _processes(connect: str, folder: Path, shards: int) -> list[ProcessSpec]:
 
 @contextmanager
 def _supervised(supervisor: Supervisor) -> Iterator[None]:
-    with repeated(lambda _number: supervisor.poll(), SUPERVISE_S):
+    with repeated(lambda _number: supervisor.poll(), POLL_S):
         yield
 
 

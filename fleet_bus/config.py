@@ -1,6 +1,7 @@
 """Settings of a bus session, checked, and their translation for zenoh."""
 
 import json
+import math
 from dataclasses import dataclass
 from typing import Any, Final, Literal
 
@@ -16,6 +17,9 @@ READS: Final = ("gnd/v1/tile/**", "gnd/v1/tiles/**", "gnd/v1/catalog/**")
 QUEUED_BATCHES: Final = 16
 """How many batches a router keeps for each client and each lane (zenoh's most); allocated when needed."""
 
+# Knocking at a router that is down costs some 100 bytes a time.
+_RETRY_MS: Final = 200
+_RETRY_MOBILE_MS: Final = 1000
 # A client's own queue may be full for as long as its own weak link needs: it drops nothing itself.
 _OWN_LINK_WAIT_US: Final = 60_000_000
 # At a router somebody else waits meanwhile: who takes nothing for so long loses the connection.
@@ -166,10 +170,16 @@ def _session_settings(config: BusConfig, link: LinkProfile) -> dict[str, Any]:
         "mode": config.mode,
         "connect/endpoints": list(config.connect),
         # Endpoints come back by themselves after a lost connection.
-        "connect/retry": {"period_init_ms": 50, "period_max_ms": 1000, "period_increase_factor": 1.5},
+        "connect/retry": {
+            "period_init_ms": 50,
+            "period_max_ms": _RETRY_MS if math.isinf(link.up_bit_s) else _RETRY_MOBILE_MS,
+            "period_increase_factor": 1.5,
+        },
         "listen/endpoints": list(config.listen),
         "scouting/multicast/enabled": False,
         "scouting/gossip/enabled": False,
+        # A router would wait half a second for others to be found, though nobody scouts.
+        "scouting/delay": 0,
         # On by default; would carry messages past the socket and past the traffic account.
         "transport/shared_memory/enabled": False,
         "transport/unicast/max_sessions": config.max_sessions,
