@@ -39,6 +39,8 @@ class BusConfig:
         link: profile of the vehicle's link, by name, file or value; "none" paces nothing.
         lease_ms: how long a silent session stays alive, ms; 0 takes the link's own.
         open_timeout_s: how long `open_bus` tries to reach a router, s.
+        patient: whether `open_bus` returns without a router, too, and looks for one as long as it takes: what is
+            declared until then is declared when it is found, requests wait for it.
         publish_wait_s: how long `Bus.publish` waits for a lost router to come back, s.
         max_message_bytes: limit for every message, both directions, bytes.
         max_sessions: how many sessions a router accepts.
@@ -51,6 +53,7 @@ class BusConfig:
     link: str | LinkProfile = "none"
     lease_ms: int = 0
     open_timeout_s: float = 10.0
+    patient: bool = False
     publish_wait_s: float = 10.0
     max_message_bytes: int = MAX_MESSAGE_BYTES
     max_sessions: int = 10_000
@@ -63,6 +66,8 @@ class BusConfig:
             raise BusConfigError("a client needs at least one endpoint of a router in `connect`")
         if self.mode == "client" and self.listen:
             raise BusConfigError(f"a client does not listen, got {', '.join(self.listen)}")
+        if self.patient and self.mode != "client":
+            raise BusConfigError("only a client waits for a router")
         for endpoint in (*self.connect, *self.listen):
             check_endpoint(endpoint)
         if self.lease_ms != 0 and self.lease_ms < 100:

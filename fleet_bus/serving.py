@@ -3,7 +3,7 @@
 import logging
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
-from typing import Any, Final
+from typing import Final
 
 import zenoh
 
@@ -57,10 +57,10 @@ class Serving(Part):
         self._regions = self._workers
         if "*" in keyexpr:
             self._regions = Workers(f"regions {keyexpr}", self._answer, 1, REGIONS_WAITING)
-        self._queryable: Any = connection.session.declare_queryable(keyexpr, self._accept, complete=complete)
+        self.declare(connection, lambda session: session.declare_queryable(keyexpr, self._accept, complete=complete))
 
     def _end(self) -> None:
-        self._queryable.undeclare()
+        self.undeclare()
         self._workers.close()
         self._regions.close()
 

@@ -8,6 +8,7 @@ from collections.abc import Collection, Iterable, Sequence
 from typing import Generic
 
 from fleet_bus.bus import Bus
+from fleet_bus.config import QUEUED_BATCHES
 from fleet_bus.errors import BusClosed
 from fleet_bus.links import LinkProfile
 from gnd_map.content import TileT
@@ -45,7 +46,9 @@ class TileFetcher(Generic[TileT]):
         self._exchange = Exchange(bus, cache, parameters.request_s)
         rate_byte_s = self.link.rate_byte_s("down")
         self._batch_bytes = batch_bytes(rate_byte_s, parameters.batch_s)
-        self._window_bytes = rate_byte_s * (parameters.batch_s + 2 * self.link.delay_s)
+        # More on its way than the router keeps for us would be thrown away.
+        kept_bytes = 0.75 * QUEUED_BATCHES * self.link.batch_bytes
+        self._window_bytes = min(kept_bytes, rate_byte_s * (parameters.batch_s + 2 * self.link.delay_s))
         self._changed = threading.Condition()
         self._wanted: tuple[TileId, ...] = ()
         self._waiting: list[TileId] = []
@@ -53,6 +56,7 @@ class TileFetcher(Generic[TileT]):
         self._in_flight: dict[TileId, float] = {}  # with the bytes expected
         self._again: set[TileId] = set()  # in flight, and already known to have changed
         self._answered: set[TileId] = set()
+        self._answered_s: dict[TileId, float] = {}
         self._stale: set[TileId] = set()  # answered, but to be asked for again
         self._wrong: Counter[TileId] = Counter()
         self._whole = _Mean(FIRST_GUESS_BYTES)
@@ -83,16 +87,20 @@ class TileFetcher(Generic[TileT]):
                 self._not_before.pop(tile_id, None)
                 self._line_up(first=tile_id)
 
-    def recheck(self) -> None:
-        """Any tile may have changed unheard: ask for all that are wanted again."""
+    def recheck(self, older_than_s: float = 0.0) -> None:
+        """Tiles whose answer is older may have changed unheard: ask again for those that are wanted."""
+        before_s = time.monotonic() - older_than_s
         with self._changed:
-            self._stale |= self._answered
-            self._line_up()
+            old = {tile_id for tile_id in self._answered if self._answered_s.get(tile_id, 0.0) <= before_s}
+            if not old <= self._stale:
+                self._stale |= old
+                self._line_up()
 
     def forget(self, tile_id: TileId) -> None:
         """The tile was let go: the next `want` asks for it again."""
         with self._changed:
             self._answered.discard(tile_id)
+            self._answered_s.pop(tile_id, None)
             self._stale.discard(tile_id)
 
     def take(self) -> list[Fetched[TileT]]:
@@ -216,6 +224,7 @@ class TileFetcher(Generic[TileT]):
         self._not_before.pop(tile_id, None)
         self.counts[fetched.status] += 1
         self._answered.add(tile_id)
+        self._answered_s[tile_id] = time.monotonic()
         self._arrived.append(fetched)
         self._stale.discard(tile_id)
         if tile_id in self._again:
