@@ -22,6 +22,7 @@ from vehicle_agent.plan import batch_bytes
 __all__ = ["Fetched", "TileFetcher"]
 
 POLL_S = 0.25
+OFFLINE_WAIT_S = 0.5
 WRONG_TRIES = 3
 MOST_TILES = 1024  # of one district
 FIRST_GUESS_BYTES = 4_096
@@ -42,7 +43,8 @@ class TileFetcher(Generic[TileT]):
         self.counts: Counter[str] = Counter()
         self.last_error = ""
         self.link: LinkProfile = bus.config.link_profile
-        self._cache, self._parameters = cache, parameters
+        self._bus, self._cache, self._parameters = bus, cache, parameters
+        self._offline = False
         self._exchange = Exchange(bus, cache, parameters.request_s)
         rate_byte_s = self.link.rate_byte_s("down")
         self._batch_bytes = batch_bytes(rate_byte_s, parameters.batch_s)
@@ -121,12 +123,15 @@ class TileFetcher(Generic[TileT]):
         return self._expected_bytes(tile_id)
 
     def wait_for(self, tiles: Collection[TileId], timeout_s: float, stop: threading.Event) -> set[TileId]:
-        """Wait until all of `tiles` are answered, time is up or `stop` is set; returns those that are not answered."""
+        """Wait until all of `tiles` are answered, time is up or `stop` is set; returns those that are not answered.
+
+        Without a router it waits only until the cache was asked.
+        """
         deadline_s = time.monotonic() + timeout_s
         with self._changed:
             while (missing := set(tiles) - self._answered) and not (stop.is_set() or self._closed):
                 left_s = deadline_s - time.monotonic()
-                if left_s <= 0:
+                if left_s <= 0 or (self._offline and missing <= self._not_before.keys()):
                     break
                 self._changed.wait(min(left_s, POLL_S))
             return missing
@@ -192,12 +197,23 @@ class TileFetcher(Generic[TileT]):
         with self._changed:
             whole = {tile_id for tile_id in batch if self._wrong[tile_id]}
         try:
+            if not self._has_router():
+                return Outcome[TileT]()
             return self._exchange.ask(batch, whole, self._batch_bytes)
         except BusClosed:
             return Outcome[TileT]()
         except Exception as error:  # whatever it was: a worker that ends would never fetch again
             self._note("failed", f"{len(batch)} tiles from {batch[0]} on: {error}")
             return Outcome[TileT]()
+
+    def _has_router(self) -> bool:
+        """Whether there is a router within a moment; else the cache has to do. Says so once."""
+        found = self._bus.wait_connected(OFFLINE_WAIT_S)
+        with self._changed:
+            changed, self._offline = self._offline == found, not found
+        if changed:
+            _log.warning("the router is there again" if found else "no router: tiles from the cache, as far as it goes")
+        return found
 
     def _cached(self, tiles: Iterable[TileId]) -> dict[TileId, TileT]:
         """The cached ones of `tiles` that nobody has been given yet."""

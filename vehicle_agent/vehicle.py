@@ -250,7 +250,6 @@ def open_vehicle(config: AgentConfig, stop: threading.Event) -> Iterator[Vehicle
     Raises:
         DriveError: the recording cannot be read.
         VehicleError: it has no GNSS fix to start from, or cache or outbox cannot be opened.
-        NoRouter: nothing answers at `config.connect`.
     """
     header, fix = read_header(config.drive), first_fix(config)
     # The map frame is the frame of the tile in which the vehicle starts.

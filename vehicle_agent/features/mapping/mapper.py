@@ -191,7 +191,6 @@ def open_mapper(config: AgentConfig, stop: threading.Event) -> Iterator[Mapper]:
     Raises:
         DriveError: the recording cannot be read.
         VehicleError: it has no GNSS fix to start from, or a file cannot be opened.
-        NoRouter: nothing answers at `config.connect`.
     """
     names = [layer.name for layer in config.features.layers]
     header, fix = read_header(config.drive), first_fix(config)
