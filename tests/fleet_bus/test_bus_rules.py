@@ -1,9 +1,11 @@
 """Settings whose breach loses data or hides traffic: each is read back, and where it can be, seen at work."""
 
+import glob
 import json
 import os
 import socket
 import threading
+from pathlib import Path
 
 import psutil
 import pytest
@@ -28,6 +30,30 @@ def test_shared_memory_and_scouting_are_off_in_every_mode(mode):
     assert setting(config, "scouting/multicast/enabled") is False
     assert setting(config, "scouting/gossip/enabled") is False
     assert setting(config, "transport/unicast/lowlatency") is False
+
+
+def test_a_client_waits_for_its_own_link_and_a_router_for_nobody():
+    control = "transport/link/tx/queue/congestion_control"
+    waits = ("block/wait_before_close", "drop/wait_before_drop", "drop/max_wait_before_drop_fragments")
+
+    def waits_us(config: BusConfig) -> list[int]:
+        return [setting(config, f"{control}/{wait}") for wait in waits]
+
+    assert waits_us(BusConfig()) == [60_000_000] * 3
+    router = BusConfig(mode="router", listen=("tcp/127.0.0.1:1",))
+    assert waits_us(router) == [500_000, 5_000, 5_000]
+    assert {rule["id"]: rule["overwrite"]["congestion_control"] for rule in setting(router, "qos/network")} == {
+        "notices": "drop",
+        "reads": "drop",
+    }
+    assert setting(BusConfig(), "qos/network") == []
+
+
+def test_a_router_receives_in_many_threads(router, client):
+    """A thread that forwards to a full queue waits."""
+    client(router).wait_connected(5)
+    names = [Path(task, "comm").read_text() for task in glob.glob("/proc/self/task/*")]
+    assert sum(name.startswith("rx-") for name in names) == 16
 
 
 def test_a_broken_rule_is_an_error_that_names_it():

@@ -9,11 +9,13 @@ import time
 from collections.abc import Iterator
 from pathlib import Path
 
+import numpy as np
 import pytest
+import zenoh
 from store_helpers import EAGER, EAST, FAR, TILE, merge_once, report, report_id, tile_of_voxels
 
 from fleet_bus.bus import Bus, open_bus
-from fleet_bus.config import BusConfig
+from fleet_bus.config import READS, BusConfig
 from fleet_bus.errors import RequestFailed, RequestRefused
 from fleet_bus.requesting import RetryPolicy
 from fleet_bus.router import open_router
@@ -331,6 +333,14 @@ def test_a_foreign_program_gets_a_region_without_an_error(client: Bus) -> None:
         replies = list(client._connection.session.get(key, timeout=10.0))
         assert all(reply.ok is not None for reply in replies)
         assert len(replies) == {keys.tiles_key("ndt"): 3, keys.catalog_keys("ndt"): 2}.get(key, 0)
+
+
+def test_a_router_knows_the_keys_whose_answers_it_may_drop() -> None:
+    """And no others: reports and their acknowledgements are never dropped."""
+    district = keys.tile_key("ndt", TILE), keys.batch_key("ndt", TILE.district), keys.catalog_key("ndt", TILE.district)
+    reads = [zenoh.KeyExpr(one) for one in READS]
+    assert [[one.includes(zenoh.KeyExpr(key)) for key in district] for one in reads] == np.eye(3, dtype=bool).tolist()
+    assert not any(one.intersects(zenoh.KeyExpr(keys.change_keys())) for one in reads)
 
 
 def test_a_store_process_that_cannot_start_says_why_in_one_line(tmp_path: Path, free_port: int) -> None:
