@@ -1,6 +1,5 @@
 """Settings whose breach loses data or hides traffic: each is read back, and where it can be, seen at work."""
 
-import glob
 import json
 import os
 import socket
@@ -10,7 +9,7 @@ from pathlib import Path
 import psutil
 import pytest
 import zenoh
-from bus_testing import Inbox, sockets_to, wait_for
+from bus_testing import Inbox, RouterProcess, sockets_to, wait_for
 
 from fleet_bus.bus import open_bus
 from fleet_bus.config import BusConfig, assert_rules, zenoh_config
@@ -49,11 +48,11 @@ def test_a_client_waits_for_its_own_link_and_a_router_for_nobody():
     assert setting(BusConfig(), "qos/network") == []
 
 
-def test_a_router_receives_in_many_threads(router, client):
+def test_a_router_receives_in_many_threads(router_process: RouterProcess, client):
     """A thread that forwards to a full queue waits."""
-    client(router).wait_connected(5)
-    names = [Path(task, "comm").read_text() for task in glob.glob("/proc/self/task/*")]
-    assert sum(name.startswith("rx-") for name in names) == 16
+    client(router_process.endpoint).wait_connected(5)
+    tasks = Path(f"/proc/{router_process.pid}/task")
+    wait_for(lambda: sum((task / "comm").read_text().startswith("rx-") for task in tasks.iterdir()) == 16, "threads")
 
 
 def test_a_broken_rule_is_an_error_that_names_it():
