@@ -18,7 +18,7 @@ from schemas.updates import TileUpdate, updated
 from vehicle_agent.cache import TileCache
 from vehicle_agent.download import TileFetcher
 
-RECHECK_S = 60.0
+RECHECK_S = 120.0
 """A notice may be lost: what is held for so long is asked about again. Who drives has left it behind before."""
 RECHECK_LOOK_S = 1.0
 MOST_DISTRICTS = 4  # as many meet at a corner: a vehicle that turns there need not declare anything anew
@@ -30,7 +30,8 @@ class Updates(Generic[TileT]):
     """Subscribes to the districts around and ahead; notices wait until the main thread applies them.
 
     Only what happens from now on is listened to: what happened before is in the answers to the vehicle's own
-    questions, which it puts after it has subscribed. After a lost connection it asks again about what it holds.
+    questions, which it puts after it has subscribed. After a lost connection, a notice that was dropped here, and every
+    two minutes (a router may drop notices, too) it asks again about what it holds.
     """
 
     def __init__(
