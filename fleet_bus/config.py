@@ -11,6 +11,9 @@ from fleet_bus.links import LinkProfile, load_link
 
 DEFAULT_ENDPOINT: Final = "tcp/127.0.0.1:7447"
 MAX_MESSAGE_BYTES: Final = 16 * 1024 * 1024
+ROUTER_LEASE_MS: Final = 120_000
+"""A router speaks to vehicles on mobile links: its keep-alives are half of theirs, and cost both ways."""
+_ROUTER_KEEP_ALIVES: Final = 2
 
 
 @dataclass(frozen=True, slots=True)
@@ -22,7 +25,7 @@ class BusConfig:
         connect: endpoints of routers, tried in order; a client fails over to the next.
         listen: endpoints to open (routers only).
         link: profile of the vehicle's link, by name, file or value; "none" paces nothing.
-        lease_ms: how long a silent session stays alive, ms; 0 takes the link's own.
+        lease_ms: how long a silent session stays alive, ms; 0 takes the link's own, for a router `ROUTER_LEASE_MS`.
         open_timeout_s: how long `open_bus` tries to reach a router, s.
         publish_wait_s: how long `Bus.publish` waits for a lost router to come back, s.
         max_message_bytes: limit for every message, both directions, bytes.
@@ -109,6 +112,7 @@ def _same(want: Any, got: Any) -> bool:
 
 
 def _settings(config: BusConfig, link: LinkProfile) -> dict[str, Any]:
+    is_router = config.mode == "router"
     settings: dict[str, Any] = {
         "mode": config.mode,
         "connect/endpoints": list(config.connect),
@@ -124,7 +128,8 @@ def _settings(config: BusConfig, link: LinkProfile) -> dict[str, Any]:
         "transport/unicast/open_timeout": max(100, min(10_000, round(1000 * config.open_timeout_s))),
         # Has no fragmentation.
         "transport/unicast/lowlatency": False,
-        "transport/link/tx/lease": config.lease_ms or link.lease_ms,
+        "transport/link/tx/lease": config.lease_ms or (ROUTER_LEASE_MS if is_router else link.lease_ms),
+        "transport/link/tx/keep_alive": _ROUTER_KEEP_ALIVES if is_router else link.keep_alives,
         "transport/link/tx/batch_size": link.batch_bytes,
         # A full queue closes the session after this long, and later puts would vanish: longer than any slow link needs.
         "transport/link/tx/queue/congestion_control/block/wait_before_close": 60_000_000,

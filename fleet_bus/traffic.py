@@ -2,7 +2,7 @@
 
 import math
 from collections import defaultdict
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass
 from typing import Any, Final
 
@@ -11,9 +11,10 @@ from fleet_bus.ledger_file import AgentLedger, Booking
 from fleet_bus.links import LinkProfile
 from fleet_bus.pacer import MESSAGE_OVERHEAD_BYTES
 from fleet_bus.traffic_links import Arrivals, LinkUse, link_use, measured_arrivals, tile_arrival_s
-from fleet_bus.traffic_wire import RESIDUES, WireAccount, wire_account
+from fleet_bus.traffic_wire import RESIDUES, TILE_KINDS, WireAccount, wire_account
 
 DEFAULT_LINKS: Final = ("3g", "4g", "5g")
+_TILES: Final = (*TILE_KINDS, "tile acks")
 _SERIES_POINTS: Final = 100
 
 
@@ -165,6 +166,28 @@ def fleet_totals(agents: Sequence[AgentTraffic]) -> dict[str, Any]:
         "estimated_wire_bytes": sum(agent.estimated_wire_bytes for agent in agents),
         "kB_per_km_up": per_km(up_bytes, drive_km),
         "kB_per_km_down": per_km(down_bytes, drive_km),
+        **headline(agents),
+    }
+
+
+def headline(agents: Sequence[AgentTraffic]) -> dict[str, float]:
+    """All bytes on the wire, up and down together, a km: in all, tiles apart, all else together; then of this else
+    upload and download, and what keep-alives and telemetry are of it.
+    """
+    drive_km = sum(agent.drive_km for agent in agents)
+    lines = fleet_lines(agents)
+
+    def rate(wanted: Callable[[KindTraffic], bool]) -> float:
+        return per_km(sum(line.wire_bytes for line in lines if wanted(line)), drive_km)
+
+    return {
+        "all_kB_per_km": rate(lambda line: True),
+        "tiles_kB_per_km": rate(lambda line: line.kind in _TILES),
+        "other_kB_per_km": rate(lambda line: line.kind not in _TILES),
+        "other_up_kB_per_km": rate(lambda line: line.kind not in _TILES and line.direction == "up"),
+        "other_down_kB_per_km": rate(lambda line: line.kind not in _TILES and line.direction == "down"),
+        "keep_alives_kB_per_km": rate(lambda line: line.kind == "keep-alives"),
+        "telemetry_kB_per_km": rate(lambda line: line.kind == "telemetry"),
     }
 
 
@@ -200,7 +223,7 @@ def _lines(ledger: AgentLedger, accounts: tuple[WireAccount, WireAccount]) -> tu
         for line in ledger.lines()
     ]
     rest = [
-        KindTraffic(name, account.direction, 0, 0, getattr(account, name)) for account in accounts for name in RESIDUES
+        KindTraffic(name, account.direction, 0, 0, account.rest[name]) for account in accounts for name in RESIDUES
     ]
     return (*messages, *(line for line in rest if line.wire_bytes))
 
