@@ -170,6 +170,11 @@ def fleet_totals(agents: Sequence[AgentTraffic]) -> dict[str, Any]:
     }
 
 
+def is_of_tiles(line: KindTraffic) -> bool:
+    """Whether a line is the map itself: questions about tiles, what they brought, and its acknowledgements."""
+    return line.kind in _TILES
+
+
 def headline(agents: Sequence[AgentTraffic]) -> dict[str, float]:
     """All bytes on the wire, up and down together, a km: in all, tiles apart, all else together; then of this else
     upload and download, and what keep-alives and telemetry are of it.
@@ -181,11 +186,11 @@ def headline(agents: Sequence[AgentTraffic]) -> dict[str, float]:
         return per_km(sum(line.wire_bytes for line in lines if wanted(line)), drive_km)
 
     return {
-        "all_kB_per_km": rate(lambda line: True),
-        "tiles_kB_per_km": rate(lambda line: line.kind in _TILES),
-        "other_kB_per_km": rate(lambda line: line.kind not in _TILES),
-        "other_up_kB_per_km": rate(lambda line: line.kind not in _TILES and line.direction == "up"),
-        "other_down_kB_per_km": rate(lambda line: line.kind not in _TILES and line.direction == "down"),
+        "all_kB_per_km": rate(lambda _: True),
+        "tiles_kB_per_km": rate(is_of_tiles),
+        "other_kB_per_km": rate(lambda line: not is_of_tiles(line)),
+        "other_up_kB_per_km": rate(lambda line: not is_of_tiles(line) and line.direction == "up"),
+        "other_down_kB_per_km": rate(lambda line: not is_of_tiles(line) and line.direction == "down"),
         "keep_alives_kB_per_km": rate(lambda line: line.kind == "keep-alives"),
         "telemetry_kB_per_km": rate(lambda line: line.kind == "telemetry"),
     }
@@ -222,9 +227,7 @@ def _lines(ledger: AgentLedger, accounts: tuple[WireAccount, WireAccount]) -> tu
         KindTraffic(line.kind, line.direction, line.messages, line.app_bytes, wire[line.direction].by_kind[line.kind])
         for line in ledger.lines()
     ]
-    rest = [
-        KindTraffic(name, account.direction, 0, 0, account.rest[name]) for account in accounts for name in RESIDUES
-    ]
+    rest = [KindTraffic(name, account.direction, 0, 0, account.rest[name]) for account in accounts for name in RESIDUES]
     return (*messages, *(line for line in rest if line.wire_bytes))
 
 

@@ -6,8 +6,8 @@ Measured is only the total of each connection. It is laid out so:
 
 Payloads are exact. A message's head is its key and envelope (exact but for some bytes) and its part of the headers of
 packets; a ledger of version 1 does not know keys and takes `MESSAGE_OVERHEAD_BYTES`. Acknowledgements (packets without
-data) and what was sent again are counted by the kernel; acknowledgements are shared out by the packets that they answer, so
-that those of tiles stand with the tiles. The opening is what had passed when the connection was new,
+data) and what was sent again are counted by the kernel; acknowledgements are shared out by the packets that they
+answer, so that those of tiles stand with the tiles. The opening is what had passed when the connection was new,
 keep-alives are known by their size (`fleet_bus.wire`); a ledger of version 2 knows neither, there both are in the rest.
 What is left is the session itself: declarations and their ends, answers that nobody waited for. Where messages travel
 together in packets less is left than their heads come to; then they share it.
@@ -21,7 +21,7 @@ from typing import Final
 from fleet_bus.ledger import Direction
 from fleet_bus.ledger_file import AgentLedger, Booking
 from fleet_bus.pacer import MESSAGE_OVERHEAD_BYTES
-from fleet_bus.wire import WireBytes
+from fleet_bus.wire import KEEP_ALIVE_BYTES, WireBytes
 
 RESIDUES: Final = ("tile acks", "acks", "resent", "opening", "keep-alives", "session")
 """Lines of the account beside the kinds of messages."""
@@ -117,7 +117,7 @@ def _counted(wire: WireBytes, direction: Direction, answered: list[Booking]) -> 
 
 def _acks(acks: int, wire: WireBytes, answered: list[Booking], alive_bytes: int) -> tuple[int, int]:
     """Acknowledgements of tiles and of all else, in the proportion of the packets that were answered."""
-    alive = alive_bytes / (wire.header_bytes or MESSAGE_OVERHEAD_BYTES)
+    alive = alive_bytes / (KEEP_ALIVE_BYTES + wire.header_bytes)
     weights = [_packets(booking, wire) for booking in answered]
     of_tiles = sum(n for booking, n in zip(answered, weights, strict=True) if booking.kind in TILE_KINDS)
     tiles, rest = apportion(acks, (of_tiles, sum(weights) - of_tiles + alive))
@@ -125,9 +125,10 @@ def _acks(acks: int, wire: WireBytes, answered: list[Booking], alive_bytes: int)
 
 
 def _packets(booking: Booking, wire: WireBytes) -> float:
-    """In how many packets a message travels; a share of one only fills them."""
+    """In how many packets a message travels; a share of one only fills them, the end of an answer has one of its own."""
     size = booking.app_bytes + (booking.head_bytes or 0)
-    return max(size / wire.segment_bytes if wire.segment_bytes else 0.0, float(booking.messages))
+    ends = booking.messages if booking.took_s is not None else 0
+    return ends + max(size / wire.segment_bytes if wire.segment_bytes else 0.0, float(booking.messages))
 
 
 def _head_bytes(booking: Booking, wire: WireBytes) -> float:

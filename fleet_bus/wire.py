@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import Final
 
 _TCP_INFO_BYTES: Final = 232
-_KEEP_ALIVE_BYTES: Final = 3
+KEEP_ALIVE_BYTES: Final = 3
 """Of a keep-alive within the stream; nothing else that zenoh sends is as short (counted again in a test)."""
 _TRANSMIT_TIMEOUT_MS: Final = 20_000
 """A connection on which nothing arrives that was sent ends after this long, and zenoh opens another. Leases may
@@ -99,7 +99,9 @@ class _Tap:
         """Everything until now."""
         now = _Counters.read(self.socket)
         self.alive[0] += _keep_alive_bytes(now.sent - self.counted.sent, now.data_out - self.counted.data_out, now)
-        self.alive[1] += _keep_alive_bytes(now.received - self.counted.received, now.data_in - self.counted.data_in, now)
+        self.alive[1] += _keep_alive_bytes(
+            now.received - self.counted.received, now.data_in - self.counted.data_in, now
+        )
         self.counted = now
         return WireBytes(
             up=now.sent + now.segments_out * now.header_bytes,
@@ -192,9 +194,7 @@ class _Counters:
         sent, resent = struct.unpack_from("=QQ", info, _BYTES_SENT_AT)
         (segment_bytes,) = struct.unpack_from("=I", info, _SEGMENT_SIZE_AT)
         header = (40 if tap.family == socket.AF_INET6 else 20) + 20 + (12 if info[_OPTIONS_AT] & _TIMESTAMPS else 0)
-        return cls(
-            sent, received, segments_out, segments_in, data_out, data_in, resent, segment_bytes, header
-        )
+        return cls(sent, received, segments_out, segments_in, data_out, data_in, resent, segment_bytes, header)
 
     def data_bytes(self, direction: str) -> int:
         """Bytes of the packets that carry data, sent again or not."""
@@ -205,9 +205,9 @@ class _Counters:
 
 def _keep_alive_bytes(stream_bytes: int, packets: int, now: _Counters) -> int:
     """What keep-alives came to between two readings; 0 where anything else may have been among it."""
-    if packets <= 0 or stream_bytes != packets * _KEEP_ALIVE_BYTES:
+    if packets <= 0 or stream_bytes != packets * KEEP_ALIVE_BYTES:
         return 0
-    return packets * (_KEEP_ALIVE_BYTES + now.header_bytes)
+    return packets * (KEEP_ALIVE_BYTES + now.header_bytes)
 
 
 def _duplicate_of(source: str, destination: str) -> socket.socket | None:

@@ -71,7 +71,7 @@ class SteadyOptions:
     def __post_init__(self) -> None:
         if not (self.speed_kmh > 0 and self.pace > 0 and self.deadline_s > 0):
             raise TrafficError(
-                f"speed, pace and deadline must be positive, got {self.speed_kmh} km/h, {self.pace}, {self.deadline_s} s"
+                f"speed, pace, deadline must be positive: {self.speed_kmh} km/h, {self.pace}, {self.deadline_s} s"
             )
         if self.sensor not in SHORT_NAMES:
             raise TrafficError(f"unknown sensor {self.sensor!r}, use one of {', '.join(SHORT_NAMES)}")

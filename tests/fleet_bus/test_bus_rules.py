@@ -103,7 +103,7 @@ def send_buffer_of(descriptor: int) -> int:
 
 def test_the_lease_can_be_set_and_otherwise_follows_the_link():
     assert setting(BusConfig(lease_ms=1500), "transport/link/tx/lease") == 1500
-    assert setting(BusConfig(link="4g"), "transport/link/tx/lease") == 120_000
+    assert setting(BusConfig(link="4g"), "transport/link/tx/lease") == 60_000
     assert setting(BusConfig(), "transport/link/tx/lease") == 10_000
     assert setting(BusConfig(mode="router"), "transport/link/tx/lease") == ROUTER_LEASE_MS
     assert setting(BusConfig(mode="router", lease_ms=1500), "transport/link/tx/lease") == 1500

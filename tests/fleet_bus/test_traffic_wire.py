@@ -94,10 +94,16 @@ MESSAGES = st.builds(
 )
 COUNT = st.integers(0, 1 << 41)
 WIRES = st.builds(
-    WireBytes, up=COUNT, down=COUNT, up_acks=st.integers(0, 9999), down_acks=st.integers(0, 9999),
-    up_resent=st.integers(0, 9999), up_opening=st.integers(0, 999), down_opening=st.integers(0, 999),
-    up_alive=st.integers(0, 9999), down_alive=st.integers(0, 9999), segment_bytes=st.sampled_from([0, 536, 1448, 65483]), header_bytes=st.just(52),
-)  # fmt: skip
+    WireBytes,
+    up=COUNT,
+    down=COUNT,
+    **{
+        name: st.integers(0, 9999)
+        for name in ("up_acks", "down_acks", "up_resent", "up_opening", "down_opening", "up_alive", "down_alive")
+    },
+    segment_bytes=st.sampled_from([0, 536, 1448, 65483]),
+    header_bytes=st.just(52),
+)
 
 
 @given(st.lists(MESSAGES, max_size=30), st.dictionaries(st.sampled_from(["s1", "s3"]), WIRES))
@@ -209,3 +215,18 @@ def test_a_word_about_a_tile_is_no_tile_that_arrived(tmp_path, size):
     report = agent_traffic(read_ledger(tmp_path / "a.jsonl"), (load_link("3g"),))
     assert report.arrivals is None
     assert report.tile_arrival_s == {"3g": None}
+
+
+def test_acknowledgements_stand_with_what_they_answer():
+    """Ten packets of tiles and five of all else came down, two of them keep-alives: the vehicle sent 15 acks."""
+    wire = WireBytes(up=2000, up_acks=15 * 52, down_alive=2 * 55, segment_bytes=1000, header_bytes=52)
+    bookings = [down("tile", 9_950), *(down("ack", 40) for _ in range(3))]
+    account = wire_account(ledger_of(*bookings, s=wire), "up")
+    assert (account.rest["tile acks"], account.rest["acks"]) == (10 * 52, 5 * 52)
+    nothing = wire_account(ledger_of(s=wire), "up")
+    assert (nothing.rest["tile acks"], nothing.rest["acks"]) == (0, 15 * 52), "two keep-alives, and no tile"
+
+
+def test_without_anything_that_they_could_answer_acknowledgements_are_nobodys():
+    account = wire_account(ledger_of(s=WireBytes(up=104, up_acks=104)), "up")
+    assert account.rest == {"tile acks": 0, "acks": 104, "resent": 0, "opening": 0, "keep-alives": 0, "session": 0}
