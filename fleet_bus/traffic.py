@@ -198,9 +198,10 @@ def headline(agents: Sequence[AgentTraffic]) -> dict[str, float]:
 
 def fleet_lines(agents: Sequence[AgentTraffic]) -> tuple[KindTraffic, ...]:
     """The lines of all agents added up: download first, the connection's own lines last."""
-    sums: dict[tuple[Direction, bool, str], list[int]] = defaultdict(lambda: [0, 0, 0])
+    place = {name: number for number, name in enumerate(RESIDUES, start=1)}
+    sums: dict[tuple[Direction, int, str], list[int]] = defaultdict(lambda: [0, 0, 0])
     for line in (line for agent in agents for line in agent.lines):
-        total = sums[line.direction, line.kind in RESIDUES, line.kind]
+        total = sums[line.direction, place.get(line.kind, 0), line.kind]
         total[0] += line.messages
         total[1] += line.app_bytes
         total[2] += line.wire_bytes

@@ -125,7 +125,7 @@ def _acks(acks: int, wire: WireBytes, answered: list[Booking], alive_bytes: int)
 
 
 def _packets(booking: Booking, wire: WireBytes) -> float:
-    """In how many packets a message travels; a share of one only fills them, the end of an answer has one of its own."""
+    """In how many packets a message travels: a share of one only fills them, the end of an answer has one more."""
     size = booking.app_bytes + (booking.head_bytes or 0)
     ends = booking.messages if booking.took_s is not None else 0
     return ends + max(size / wire.segment_bytes if wire.segment_bytes else 0.0, float(booking.messages))

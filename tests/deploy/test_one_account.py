@@ -72,7 +72,14 @@ def test_parts_of_the_headline_are_the_whole(tmp_path: Path) -> None:
     ledger.record("up", "change", 300, head_bytes=50)
     ledger.set_position(2000.0, 10**18 + 10**10)
     ledger.record("up", "telemetry", 70, head_bytes=37)
-    parts = {"up_acks": 520, "down_acks": 104, "up_opening": 200, "down_opening": 180, "up_alive": 110, "down_alive": 55}
+    parts = {
+        "up_acks": 520,
+        "down_acks": 104,
+        "up_opening": 200,
+        "down_opening": 180,
+        "up_alive": 110,
+        "down_alive": 55,
+    }
     ledger.record_wire(WireBytes(up=3000, down=4000, segment_bytes=1448, header_bytes=52, **parts))
     found = account_traffic(RunFolder(run))
     assert found["all_kB_per_km"] == 3.5
