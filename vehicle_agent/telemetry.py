@@ -1,7 +1,7 @@
-"""What the vehicle says about itself: now and then by the way driven, and when its health has changed.
+"""What the vehicle says about itself: by the way driven, and when its health or its doubts have changed.
 
-The next sample makes up for a lost one, and what reports say is not said again: a sample and its packets weigh as much
-as the flags of 300 changed voxels. Way and time are those of the drive, not of the clock: a vehicle on a busy machine,
+The next sample makes up for a lost one, and that a report was acknowledged the cloud knows: a sample and its packets
+weigh as much as the flags of 300 changed voxels. Way and time are those of the drive, not of the clock: a vehicle on a busy machine,
 or one that stands, has no more to say.
 """
 
@@ -20,7 +20,7 @@ LOOK_S = 1.0
 EVERY_M = 1000.0
 EVERY_S = 600.0
 HEALTH_S = 10.0
-"""Health that wavers is told no oftener than this."""
+"""Health that wavers, and doubts that grow, are told no oftener than this."""
 PUBLISH_WAIT_S = 0.5
 
 _log = logging.getLogger(__name__)
@@ -55,7 +55,7 @@ class Telemetry:
             self._began_ns = self._began_ns or sample.t_ns
             return sample.health != "lost" or (sample.t_ns - self._began_ns) * 1e-9 >= HEALTH_S
         passed_s = (sample.t_ns - said.t_ns) * 1e-9
-        if sample.health != said.health and passed_s >= HEALTH_S:
+        if _well_being(sample) != _well_being(said) and passed_s >= HEALTH_S:
             return True
         return passed_s >= EVERY_S or sample.odometer_m - said.odometer_m >= EVERY_M
 
@@ -67,3 +67,8 @@ class Telemetry:
             self._stop.set()
         except BusError as error:
             _log.info("sample not published: %s", error)
+
+
+def _well_being(sample: TrafficSample) -> tuple[object, ...]:
+    """Scans that are taken back come in rows: they wait for the next sample."""
+    return sample.health, sample.tiles_held_back, sample.tiles_doubtful

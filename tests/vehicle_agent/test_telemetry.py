@@ -41,8 +41,8 @@ def test_samples_go_out_by_way_and_by_event_and_at_the_end(endpoint: str) -> Non
         assert looked_again() == 0, "it has not found itself yet"
         now = replace(START, health="degraded")
         wait_until(lambda: said() == 1)
-        now = replace(now, odometer_m=EVERY_M - 1.0, tiles=3, reports=1, tiles_doubtful=1, doubts=(0, 1))
-        assert looked_again() == 1, "what reports say is not said again"
+        now = replace(now, odometer_m=EVERY_M - 1.0, tiles=3, reports=1, scans_taken_back=7)
+        assert looked_again() == 1, "what the cloud knows is not said again, and scans come in rows"
         now = replace(now, odometer_m=EVERY_M)
         assert looked_again() == 2
         now = replace(now, t_ns=after(HEALTH_S) - 1, health="good")
@@ -53,8 +53,10 @@ def test_samples_go_out_by_way_and_by_event_and_at_the_end(endpoint: str) -> Non
         assert looked_again() == 3, "a vehicle that stands says little"
         now = replace(now, t_ns=after(HEALTH_S + EVERY_S))
         assert looked_again() == 4
+        now = replace(now, t_ns=after(2 * HEALTH_S + EVERY_S), tiles_doubtful=1, doubts=(0, 1))
+        assert looked_again() == 5
         telemetry.close()
-        assert said() == 5
+        assert said() == 6
         wait_until(lambda: len(heard) >= 2 and heard[-1].lines == LINES)
         assert all(sample.lines == () for sample in heard[:-1]), "totals by kind go with the last sample only"
         assert heard[-1].doubts == (0, 1)
