@@ -84,7 +84,7 @@ class _Tap:
     must come oftener than keep-alives, or these are booked as the rest of the session: too few, never too many.
     """
 
-    socket: socket.socket
+    end: socket.socket
     counted: "_Counters"
     opening: tuple[int, int]
     alive: list[int] = field(default_factory=lambda: [0, 0])
@@ -97,12 +97,11 @@ class _Tap:
 
     def read(self) -> WireBytes:
         """Everything until now."""
-        now = _Counters.read(self.socket)
-        self.alive[0] += _keep_alive_bytes(now.sent - self.counted.sent, now.data_out - self.counted.data_out, now)
-        self.alive[1] += _keep_alive_bytes(
-            now.received - self.counted.received, now.data_in - self.counted.data_in, now
-        )
-        self.counted = now
+        now = _Counters.read(self.end)
+        then, self.counted = self.counted, now
+        if now.resent == then.resent:
+            self.alive[0] += _keep_alive_bytes(now.sent - then.sent, now.data_out - then.data_out, now)
+        self.alive[1] += _keep_alive_bytes(now.received - then.received, now.data_in - then.data_in, now)
         return WireBytes(
             up=now.sent + now.segments_out * now.header_bytes,
             down=now.received + now.segments_in * now.header_bytes,
@@ -138,7 +137,7 @@ class WireMeter:
             old = self._open.pop((source, destination), None)
             self._open[source, destination] = _Tap.of(tap)
         if old is not None:
-            old.socket.close()
+            old.end.close()
 
     def detach(self, source: str, destination: str) -> None:
         """Adds the last reading of a connection to the past and lets its socket go."""
@@ -147,7 +146,7 @@ class WireMeter:
             if tap is not None:
                 self._past += tap.read()
         if tap is not None:
-            tap.socket.close()
+            tap.end.close()
 
     def read(self) -> WireBytes:
         """Total of the past and the present connections."""
@@ -160,7 +159,7 @@ class WireMeter:
             taps = tuple(self._open.values())
         for tap in taps:
             with contextlib.suppress(OSError):  # ended already
-                tap.socket.shutdown(socket.SHUT_RDWR)
+                tap.end.shutdown(socket.SHUT_RDWR)
 
     def close(self) -> None:
         """Detaches everything; `read` keeps giving the final total."""
