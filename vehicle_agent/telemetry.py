@@ -1,8 +1,8 @@
 """What the vehicle says about itself: by the way driven, and when its health or its doubts have changed.
 
 The next sample makes up for a lost one, and that a report was acknowledged the cloud knows: a sample and its packets
-weigh as much as the flags of 300 changed voxels. Way and time are those of the drive, not of the clock: a vehicle on a busy machine,
-or one that stands, has no more to say.
+weigh as much as the flags of 300 changed voxels. Way and time are those of the drive, not of the clock: a vehicle on a
+busy machine, or one that stands, has no more to say.
 """
 
 import logging
@@ -53,7 +53,7 @@ class Telemetry:
         said = self._said
         if said is None:
             self._began_ns = self._began_ns or sample.t_ns
-            return sample.health != "lost" or (sample.t_ns - self._began_ns) * 1e-9 >= HEALTH_S
+            return sample.health == "good" or (sample.t_ns - self._began_ns) * 1e-9 >= HEALTH_S
         passed_s = (sample.t_ns - said.t_ns) * 1e-9
         if _well_being(sample) != _well_being(said) and passed_s >= HEALTH_S:
             return True

@@ -40,12 +40,14 @@ def test_samples_go_out_by_way_and_by_event_and_at_the_end(endpoint: str) -> Non
         telemetry = Telemetry(bus, "v", sample, look_s=0.01)
         assert looked_again() == 0, "it has not found itself yet"
         now = replace(START, health="degraded")
+        assert looked_again() == 0, "a moment later it is well"
+        now = replace(START, health="good")
         wait_until(lambda: said() == 1)
         now = replace(now, odometer_m=EVERY_M - 1.0, tiles=3, reports=1, scans_taken_back=7)
         assert looked_again() == 1, "what the cloud knows is not said again, and scans come in rows"
         now = replace(now, odometer_m=EVERY_M)
         assert looked_again() == 2
-        now = replace(now, t_ns=after(HEALTH_S) - 1, health="good")
+        now = replace(now, t_ns=after(HEALTH_S) - 1, health="lost")
         assert looked_again() == 2, "health that wavers is told after a while only"
         now = replace(now, t_ns=after(HEALTH_S))
         assert looked_again() == 3
