@@ -13,7 +13,7 @@ DEFAULT_ENDPOINT: Final = "tcp/127.0.0.1:7447"
 MAX_MESSAGE_BYTES: Final = 16 * 1024 * 1024
 ROUTER_LEASE_MS: Final = 120_000
 """A router speaks to vehicles on mobile links: its keep-alives cost them as much as their own. A client notices a dead
-router by its own keep-alives, which nobody acknowledges, long before this."""
+router by its own keep-alives, which nobody acknowledges, long before this (`WireMeter.transmit_timeout_ms`)."""
 _ROUTER_KEEP_ALIVES: Final = 2
 
 

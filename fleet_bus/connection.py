@@ -31,7 +31,7 @@ class Connection:
     def __init__(self, session: zenoh.Session, config: BusConfig, ledger: Ledger | None, name: str) -> None:
         self.session, self.config, self.ledger, self.name = session, config, ledger, name
         self.closed = threading.Event()
-        self.meter = WireMeter()
+        self.meter = WireMeter(config.lease_ms or config.link_profile.lease_ms)
         self._pacer = Pacer(config.link_profile, self.closed)
         self._pid = os.getpid()
         self._calls = 0

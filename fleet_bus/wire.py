@@ -17,9 +17,6 @@ from typing import Final
 _TCP_INFO_BYTES: Final = 232
 KEEP_ALIVE_BYTES: Final = 3
 """Of a keep-alive within the stream; nothing else that zenoh sends is as short (counted again in a test)."""
-_TRANSMIT_TIMEOUT_MS: Final = 20_000
-"""A connection on which nothing arrives that was sent ends after this long, and zenoh opens another. Leases may
-therefore be long: who has something to say notices a dead link by what is not acknowledged, not by silence."""
 _TIMESTAMPS: Final = 1  # TCPI_OPT_TIMESTAMPS of linux/tcp.h
 # Offsets in struct tcp_info of linux/tcp.h.
 _OPTIONS_AT, _SEGMENT_SIZE_AT, _BYTES_RECEIVED_AT, _SEGMENTS_AT, _DATA_SEGMENTS_AT = 5, 16, 128, 136, 152
@@ -120,8 +117,15 @@ class _Tap:
 
 @dataclass(slots=True)
 class WireMeter:
-    """Follows the connections of one session. Thread-safe."""
+    """Follows the connections of one session. Thread-safe.
 
+    Attributes:
+        transmit_timeout_ms: a connection ends on which nothing that was sent is acknowledged for this long, and zenoh
+            opens another; 0 leaves it to the kernel, which tries for a quarter of an hour. The other side may send
+            its keep-alives as seldom as it likes: a dead link is noticed by what is not acknowledged, not by silence.
+    """
+
+    transmit_timeout_ms: int = 0
     _past: WireBytes = field(default_factory=WireBytes)
     _open: dict[tuple[str, str], _Tap] = field(default_factory=dict)
     _lock: threading.Lock = field(default_factory=threading.Lock)
@@ -132,7 +136,7 @@ class WireMeter:
         if tap is None:
             return
         with contextlib.suppress(OSError):  # ended already, or not Linux
-            tap.setsockopt(socket.IPPROTO_TCP, socket.TCP_USER_TIMEOUT, _TRANSMIT_TIMEOUT_MS)
+            tap.setsockopt(socket.IPPROTO_TCP, socket.TCP_USER_TIMEOUT, self.transmit_timeout_ms)
         with self._lock:
             old = self._open.pop((source, destination), None)
             self._open[source, destination] = _Tap.of(tap)

@@ -123,7 +123,7 @@ def test_as_far_as_the_way_is_held_it_is_asked_for_at_once(scene: Scene) -> None
     scene.store.put_tiles([tile for tile_id, tile in road.items() if tile_id not in scene.tiles])
     for tile in road.values():
         scene.cache.put(scene.tiles.get(tile.tile_id, tile))
-    for east_m in range(0, 600, 5):
+    for east_m in range(0, 600, 10):
         place.position_map_m = at(float(east_m)).position_map_m
         scene.surroundings.follow(place, NEVER, wait=True)
     (asked,) = [x.messages for x in scene.ledger.totals() if (x.kind, x.direction) == ("tile", "up")]
