@@ -26,6 +26,10 @@ _OWN_LINK_WAIT_US: Final = 60_000_000
 _OTHERS_WAIT_US: Final = 500_000
 # What may be dropped waits for room this long, once until the link moves again; a fragment at most twice as long.
 _DROP_WAIT_US: Final = 5_000
+ROUTER_LEASE_MS: Final = 120_000
+"""A router speaks to vehicles on mobile links: its keep-alives cost them as much as their own. A client notices a dead
+router by its own keep-alives, which nobody acknowledges, long before this (`WireMeter.transmit_timeout_ms`)."""
+_ROUTER_KEEP_ALIVES: Final = 2
 
 
 @dataclass(frozen=True, slots=True)
@@ -37,7 +41,7 @@ class BusConfig:
         connect: endpoints of routers, tried in order; a client fails over to the next.
         listen: endpoints to open (routers only).
         link: profile of the vehicle's link, by name, file or value; "none" paces nothing.
-        lease_ms: how long a silent session stays alive, ms; 0 takes the link's own.
+        lease_ms: how long a silent session stays alive, ms; 0 takes the link's own, for a router `ROUTER_LEASE_MS`.
         open_timeout_s: how long `open_bus` tries to reach a router, s.
         patient: whether `open_bus` returns without a router, too, and looks for one as long as it takes: what is
             declared until then is declared when it is found, requests wait for it.
@@ -171,6 +175,7 @@ def _rule(name: str, messages: list[str], keys: list[str], overwrite: dict[str, 
 
 
 def _session_settings(config: BusConfig, link: LinkProfile) -> dict[str, Any]:
+    is_router = config.mode == "router"
     return {
         "mode": config.mode,
         "connect/endpoints": list(config.connect),
@@ -192,7 +197,8 @@ def _session_settings(config: BusConfig, link: LinkProfile) -> dict[str, Any]:
         "transport/unicast/open_timeout": max(100, min(10_000, round(1000 * config.open_timeout_s))),
         # Has no fragmentation.
         "transport/unicast/lowlatency": False,
-        "transport/link/tx/lease": config.lease_ms or link.lease_ms,
+        "transport/link/tx/lease": config.lease_ms or (ROUTER_LEASE_MS if is_router else link.lease_ms),
+        "transport/link/tx/keep_alive": _ROUTER_KEEP_ALIVES if is_router else link.keep_alives,
         "transport/link/tx/batch_size": link.batch_bytes,
         "transport/link/rx/max_message_size": config.max_message_bytes,
     }

@@ -40,7 +40,7 @@ class Connection:
         self._declarations: list[Declare] = []
         self._opening = threading.RLock()
         self.closed = threading.Event()
-        self.meter = WireMeter()
+        self.meter = WireMeter(config.lease_ms or config.link_profile.lease_ms)
         self._pacer = Pacer(config.link_profile, self.closed)
         self._pid = os.getpid()
         self._calls = 0

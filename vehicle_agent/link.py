@@ -30,6 +30,15 @@ class Link:
     fetcher: TileFetcher[Tile]
     sender: SenderThread
 
+    def traffic(self) -> dict[str, int]:
+        """What this session came to, bytes; the whole of it once the link is closed."""
+        return {
+            "up_bytes": self.ledger.total_bytes("up"),
+            "down_bytes": self.ledger.total_bytes("down"),
+            "up_wire_bytes": self.ledger.wire.up,
+            "down_wire_bytes": self.ledger.wire.down,
+        }
+
 
 @contextmanager
 def open_link(config: AgentConfig) -> Iterator[Link]:

@@ -12,7 +12,7 @@ import zenoh
 from bus_testing import Inbox, RouterProcess, sockets_to, wait_for
 
 from fleet_bus.bus import open_bus
-from fleet_bus.config import BusConfig, assert_rules, zenoh_config
+from fleet_bus.config import ROUTER_LEASE_MS, BusConfig, assert_rules, zenoh_config
 from fleet_bus.errors import BusClosed, BusConfigError, MessageTooLarge, NoRouter
 from fleet_bus.router import open_router
 
@@ -128,8 +128,15 @@ def send_buffer_of(descriptor: int) -> int:
 
 def test_the_lease_can_be_set_and_otherwise_follows_the_link():
     assert setting(BusConfig(lease_ms=1500), "transport/link/tx/lease") == 1500
-    assert setting(BusConfig(link="4g"), "transport/link/tx/lease") == 30_000
+    assert setting(BusConfig(link="4g"), "transport/link/tx/lease") == 60_000
     assert setting(BusConfig(), "transport/link/tx/lease") == 10_000
+    assert setting(BusConfig(mode="router"), "transport/link/tx/lease") == ROUTER_LEASE_MS
+    assert setting(BusConfig(mode="router", lease_ms=1500), "transport/link/tx/lease") == 1500
+
+
+def test_keep_alives_follow_the_link():
+    assert setting(BusConfig(link="4g"), "transport/link/tx/keep_alive") == 2
+    assert setting(BusConfig(), "transport/link/tx/keep_alive") == 4
 
 
 def test_a_router_takes_more_sessions_than_zenoh_by_default():
