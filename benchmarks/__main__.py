@@ -29,6 +29,8 @@ NAMES = (
     "merging",
     "slamcu-step",
     "map-build",
+    "stalled",
+    "outage",
 )
 WITH_OPTIONS = ("codec", "return-download", "gnss-noise", "poles", "slamcu-step")
 

@@ -62,7 +62,7 @@ def store(path: Path, connect: tuple[str, ...], workers: int) -> None:
 
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, end)
-    config = BusConfig(connect=connect)
+    config = BusConfig(connect=connect, patient=True)
     with SqliteStore(path) as opened, open_bus(config, name="store") as bus, TileServer(opened, bus, workers=workers):
         counts = opened.counts()
         click.echo(f"tile server: {counts.tiles} tiles of {path} at {', '.join(connect)}; Ctrl-C ends it")
