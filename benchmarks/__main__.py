@@ -20,6 +20,7 @@ NAMES = (
     "first-pose",
     "health",
     "ingest",
+    "short-reports",
     "sizes",
     "codec",
     "return-download",
@@ -29,7 +30,7 @@ NAMES = (
     "slamcu-step",
     "map-build",
 )
-WITH_OPTIONS = ("codec", "return-download", "gnss-noise", "poles", "slamcu-step")
+WITH_OPTIONS = ("codec", "return-download", "gnss-noise", "poles", "slamcu-step", "short-reports")
 
 
 def main() -> None:
