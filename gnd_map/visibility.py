@@ -28,6 +28,7 @@ from gnd_map.track import SECTORS, Track, View
 U64 = npt.NDArray[np.uint64]
 
 _GOLDEN: Final = 0.6180339887498949
+_NEW: Final = int(ChangeClass.NEW)
 _LEAST_PLACES, _MOST_PLACES = 4, 4_000
 _FLOORS_BELOW, _FLOORS_ABOVE = 3, 8
 _MOST_CELLS: Final = 1 << 26
@@ -228,7 +229,7 @@ class _Zone:
         state, near = np.full(w.offset[-1], NOTHING, np.int32), np.zeros(w.offset[-1], np.uint8)
         words = (int((w.low + w.floors).max()) - w.lowest) // 64 + 1
         filled, seen, more = (np.zeros((len(told) * w.columns[0] * w.columns[1], words), np.uint64) for _ in range(3))
-        new = [flags.voxel_id[flags.change_class == ChangeClass.NEW] for flags in told]
+        new = [flags.voxel_id[flags.change_class == _NEW] for flags in told]
         known = [flags.base.voxel_id for flags in told]
         slot, voxel_id = _slots([*known, *new], len(told)), np.concatenate([*known, *new])
         stop = np.zeros((len(slot), STOP), np.float32)
