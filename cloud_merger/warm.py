@@ -15,8 +15,9 @@ from gnd_map.codec import (
     snap,
 )
 from gnd_map.gaussian import Gaussians
+from gnd_map.similarity import similarity_pairs
 from gnd_map.tile_id import TileId
-from gnd_map.track import Piece, Track, View
+from gnd_map.track import STEPS, Piece, Track, View
 from gnd_map.visibility import observed_along
 from tile_store.warm import warm_up as warm_up_codecs
 
@@ -32,8 +33,15 @@ def warm_up() -> None:
     measured = encode_measured([(_TILE, base, base.take([0]))])
     decode_measured([(_TILE, base, found.voxel_id)], measured)
     decode_mask(encode_mask(np.array([True])), 1)
-    place = Piece(np.array([[32, 32, 4]], np.int32), 1)
-    observed_along(Track(_TILE.district, View((-8, -6, -4, -2, 0, 2, 4, 6, 8)), (place,)), [found])
+    observed_along(Track(_TILE.district, View((-8, -6, -4, -2, 0, 2, 4, 6, 8)), (_place(),)), [found])
+    similarity_pairs(np.array([0]), np.array([1]), base.exists, base.mean_m, base.cov_m2)
+
+
+def _place() -> Piece:
+    """In the middle of the tile, 2 m up."""
+    corner = TileId(_TILE.district.first_morton)
+    east, north = _TILE.lon_index - corner.lon_index, _TILE.lat_index - corner.lat_index
+    return Piece(np.array([[STEPS * east + STEPS // 2, STEPS * north + STEPS // 2, 4]], np.int32), 1)
 
 
 def _base() -> Gaussians:

@@ -15,12 +15,12 @@ from typing import Final
 import numpy as np
 import numpy.typing as npt
 
+from gnd_map import sight
 from gnd_map.arrays import F64, I32, I64
 from gnd_map.classes import ChangeClass
 from gnd_map.codec import Flags
 from gnd_map.errors import ConfigError, TrackError
 from gnd_map.grid import VoxelGrid, zones
-from gnd_map import sight
 from gnd_map.sight import FACES, MOST_RAYS, NO_SLOT, NOTHING, STOP, Columns, Window
 from gnd_map.tile_id import LON_TILES, TileId, deinterleave
 from gnd_map.track import SECTORS, Track, View
@@ -61,7 +61,7 @@ class VisibilityParameters:
     """
 
     step_m: float = 8.0
-    azimuths: int = 64
+    azimuths: int = 48
     lines: int = 16
     range_m: float = 50.0
     reach_m: float = 70.0
@@ -128,7 +128,7 @@ class _Places:
     turn: F64
     rays: I64
 
-    def take(self, rows: npt.NDArray[np.bool_]) -> "_Places":
+    def take(self, rows: I64) -> "_Places":
         return _Places(self.uv[rows], self.height_m[rows], self.turn[rows], self.rays[rows])
 
 
@@ -151,8 +151,9 @@ class _Zone:
         reached = np.flatnonzero(within.any(axis=1))
         if len(reached) == 0:
             return {}
-        shown = within[reached][:, within.any(axis=0)]
-        places, told = places.take(within.any(axis=0)), [self._told[k] for k in reached.tolist()]
+        of_use = np.flatnonzero(within.any(axis=0))
+        shown = within[reached][:, of_use]
+        places, told = places.take(of_use), [self._told[k] for k in reached.tolist()]
         w, origin = self._window(told, corner[reached], places, shown)
         return _read(w, told, self._look(w, told, places, (places.uv - origin) * w.columns))
 
@@ -304,7 +305,7 @@ def _rounded(values: npt.ArrayLike) -> F64:
 def _least(rays: float, near: float) -> I64:
     """(FACES + 1,) how many rays are enough by the number of faces, in 1 / _PARTS; at least some."""
     parts = np.ceil(rays * near ** np.arange(FACES + 1) * _PARTS)
-    return np.clip(parts, 1, MOST_RAYS).astype(np.int64)
+    return np.asarray(np.clip(parts, 1, MOST_RAYS), np.int64)
 
 
 def _slots(parts: Sequence[I32], tiles: int) -> I32:

@@ -8,8 +8,8 @@ from short_world import bases_of, drive_number, packed_of, tile_at
 
 from cloud_merger.expanding import expand, with_measured
 from cloud_merger.warm import warm_up
-from gnd_map import sight
-from gnd_map.codec import encode_mask, kernels
+from gnd_map import sight, similarity
+from gnd_map.codec import encode_mask, kernels, lattice_kernels
 from schemas.packed import PackedReport
 from vehicle_agent.packing import askable, pack_measured
 
@@ -17,7 +17,7 @@ from vehicle_agent.packing import askable, pack_measured
 def signatures():
     return {
         f"{module.__name__}.{name}": len(value.signatures)
-        for module in (sight, kernels)
+        for module in (sight, kernels, lattice_kernels, similarity)
         for name, value in vars(module).items()
         if hasattr(value, "signatures")
     }
@@ -33,6 +33,8 @@ def test_warming_leaves_nothing_to_compile_for_the_first_report():
     expanded = expand(packed, "ndt", TILE.district, [tile_at()])
     mask = np.ones(askable(report), np.bool_)
     half = pack_measured(report, bases_of(report), encode_mask(mask))
-    with_measured(expanded, {TILE: tile_at().gaussians}, mask, half.measured)
+    found = with_measured(expanded, {TILE: tile_at().gaussians}, mask, half.measured).tiles[0].changed
+    yes = found.exists
+    similarity.similarity(yes, found.mean_m, found.cov_m2, yes, found.mean_m, found.cov_m2)
     assert signatures() == warm
     assert threading.active_count() == threads

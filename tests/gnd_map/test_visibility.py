@@ -30,7 +30,9 @@ def small_window(low):
     slot_of = np.array([[0, 1], [NO_SLOT, 2]], np.int32)
     corner = np.array([(0, 0), (0, 5), (4, 5)], np.int32)
     offset = np.arange(4) * 20 * FLOORS
-    return Window(COLUMNS, METRES, slot_of, corner, offset, np.array(low, np.int32), np.full(3, FLOORS, np.int32), min(low))
+    return Window(
+        COLUMNS, METRES, slot_of, corner, offset, np.array(low, np.int32), np.full(3, FLOORS, np.int32), min(low)
+    )
 
 
 def cells(w):
