@@ -33,6 +33,7 @@ from fleet_sim.evaluate import evaluate_maps
 from fleet_sim.street import StreetOptions
 from fleet_sim.truth import read_truth
 from gnd_map.codec import CODECS, Flags, decode_flags, snap
+from gnd_map.codec.lattice import STANDARD
 from gnd_map.codec.registry import CODEC_STANDARD
 from gnd_map.gaussian import Gaussians
 from gnd_map.grid import VoxelGrid
@@ -186,7 +187,7 @@ def _spread(values: list[float]) -> str:
 def _tiles(reports: list[ShortReport]) -> list[Figure]:
     """What a tile costs that is published, and pairs of Gaussians."""
     standard = CODECS[CODEC_STANDARD]
-    tiles = {t.tile_id: snap(t.gaussians, standard.lattice) for r in reports for t in r.bases if len(t.gaussians)}
+    tiles = {t.tile_id: snap(t.gaussians, STANDARD) for r in reports for t in r.bases if len(t.gaussians)}
     bodies = {tile_id: standard.encode(tile_id, g) for tile_id, g in tiles.items()}
     voxels = sum(map(len, tiles.values()))
     write_ms = _cpu_ms(lambda: [standard.encode(tile_id, g) for tile_id, g in tiles.items()])

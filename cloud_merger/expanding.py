@@ -135,7 +135,7 @@ def _nothing_at(voxel_id: NDArray[np.int32]) -> Gaussians:
 
 def is_askable(change: TileChange) -> NDArray[np.bool_]:
     """(N,) which changed voxels have a Gaussian that can be asked for: those that are new or modified."""
-    return (change.change_class == MEASURED[0]) | (change.change_class == MEASURED[1])
+    return np.asarray((change.change_class == MEASURED[0]) | (change.change_class == MEASURED[1]))
 
 
 def with_measured(
