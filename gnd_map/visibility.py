@@ -32,6 +32,7 @@ _NEW: Final = int(ChangeClass.NEW)
 _LEAST_PLACES, _MOST_PLACES = 4, 4_000
 _FLOORS_BELOW, _FLOORS_ABOVE = 3, 8
 _MOST_CELLS: Final = 1 << 26
+_MOST_WORDS: Final = 1 << 23  # of 64 floors of a column, from the lowest floor of all on
 _PARTS: Final = 16  # of a ray: lines stand for so many of them
 _SLOPES: Final = 512
 _ROUND: Final = 2.0**24  # what trigonometry gives is rounded, so that no machine's last bit decides
@@ -210,8 +211,12 @@ class _Zone:
         floors = np.maximum(np.minimum(np.floor(top).astype(np.int64), highest + _FLOORS_ABOVE) - low + 1, 0)
         columns = self._grid.nx, self._grid.ny
         offset = np.concatenate([[0], np.cumsum(floors * columns[0] * columns[1])])
-        if offset[-1] > _MOST_CELLS:
-            raise TrackError(f"lines of sight over {len(told)} tiles cross {offset[-1]} voxels: at most {_MOST_CELLS}")
+        words = len(told) * columns[0] * columns[1] * (int((low + floors).max() - low.min()) // 64 + 1)
+        if offset[-1] > _MOST_CELLS or words > _MOST_WORDS:
+            raise TrackError(
+                f"lines of sight over {len(told)} tiles between floors {low.min()} and {(low + floors).max()} cross "
+                f"{offset[-1]} voxels, {words} words of floors: at most {_MOST_CELLS}, {_MOST_WORDS}"
+            )
         first = ((corner - origin) * columns).astype(np.int32)
         return Window(
             columns, self._metres, slot_of, first, offset, low.astype(np.int32), floors.astype(np.int32), int(low.min())
