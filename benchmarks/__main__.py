@@ -20,6 +20,7 @@ NAMES = (
     "first-pose",
     "health",
     "ingest",
+    "short-reports",
     "sizes",
     "codec",
     "return-download",
@@ -32,7 +33,7 @@ NAMES = (
     "stalled",
     "outage",
 )
-WITH_OPTIONS = ("codec", "return-download", "gnss-noise", "poles", "slamcu-step")
+WITH_OPTIONS = ("codec", "return-download", "gnss-noise", "poles", "slamcu-step", "short-reports")
 
 
 def main() -> None:
