@@ -38,6 +38,7 @@ from vehicle_agent.cache import TileCache
 
 MUST_KB_PER_KM: Final = 2.0
 AIM_KB_PER_KM: Final = 1.0
+_ONCE_A_DRIVE: Final = ("opening", "closing", "session")
 _VEHICLE: Final = "vehicle-00"
 _LOOK_S: Final = 0.5
 _SETTLE_S: Final = 1.0
@@ -99,7 +100,7 @@ def account(traffic: AgentTraffic, wall_s: float) -> dict[str, Any]:
     Must and aim hold for a vehicle under way: what comes once a drive, however long, is told by itself.
     """
     total = headline((traffic,))
-    once_a_drive = sum(line.wire_bytes for line in traffic.lines if line.kind in ("opening", "session"))
+    once_a_drive = sum(line.wire_bytes for line in traffic.lines if line.kind in _ONCE_A_DRIVE)
     under_way = total["other_kB_per_km"] - per_km(once_a_drive, traffic.drive_km)
     return {
         "km": round(traffic.drive_km, 4),
