@@ -235,6 +235,7 @@ class Bus:
             if self._connection.closed.is_set():
                 return
             self._connection.closed.set()
+        self._connection.meter.close_from_now()
         for part in parts:
             part.close()
         self._connection.close()

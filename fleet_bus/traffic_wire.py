@@ -2,14 +2,15 @@
 
 Measured is only the total of each connection. It is laid out so:
 
-    measured = payloads + heads of messages + acks + resent + opening + keep-alives + session
+    measured = payloads + heads of messages + acks + resent + opening + closing + keep-alives + session
 
 Payloads are exact. A message's head is its key and envelope (exact but for some bytes) and its part of the headers of
 packets; a ledger of version 1 does not know keys and takes `MESSAGE_OVERHEAD_BYTES`. Acknowledgements (packets without
 data) and what was sent again are counted by the kernel; acknowledgements are shared out by the packets that they
 answer, so that those of tiles stand with the tiles. The opening is what had passed when the connection was new,
-keep-alives are known by their size (`fleet_bus.wire`); a ledger of version 2 knows neither, there both are in the rest.
-What is left is the session itself: declarations and their ends, answers that nobody waited for. Where messages travel
+closing what passed since the session was being closed, keep-alives are known by their size (`fleet_bus.wire`); a ledger
+of version 2 knows none of them, there they are in the rest. What is left is the session itself: declarations, answers
+that nobody waited for. Where messages travel
 together in packets less is left than their heads come to; then they share it.
 """
 
@@ -23,7 +24,7 @@ from fleet_bus.ledger_file import AgentLedger, Booking
 from fleet_bus.pacer import MESSAGE_OVERHEAD_BYTES
 from fleet_bus.wire import KEEP_ALIVE_BYTES, WireBytes
 
-RESIDUES: Final = ("tile acks", "acks", "resent", "opening", "keep-alives", "session")
+RESIDUES: Final = ("tile acks", "acks", "resent", "opening", "closing", "keep-alives", "session")
 """Lines of the account beside the kinds of messages."""
 TILE_KINDS: Final = ("tile", "delta")
 """Questions about tiles and what they brought: the map itself. All else is what a vehicle costs that holds its map."""
@@ -40,7 +41,7 @@ class WireAccount:
         by_kind: wire bytes of the messages of each kind.
         by_tile: wire bytes of the messages, or shares of them, about each tile.
         rest: the lines of `RESIDUES`: packets without data, those that answer tiles apart; data sent again; handshakes
-            of connections; keep-alives; declarations and what else the session carries.
+            of connections; their closing; keep-alives; declarations and what else the session carries.
     """
 
     direction: Direction
@@ -109,10 +110,11 @@ def _counted(wire: WireBytes, direction: Direction, answered: list[Booking]) -> 
     """Measured total, and of it what the meter itself could tell, bytes; `answered` came from the other side."""
     if direction == "up":
         tiles, acks = _acks(wire.up_acks, wire, answered, wire.down_alive)
-        parts = (tiles, acks, wire.up_resent, wire.up_opening, wire.up_alive)
+        parts = (tiles, acks, wire.up_resent, wire.up_opening, wire.up_closing, wire.up_alive)
         return wire.up, dict(zip(RESIDUES, parts, strict=False))
     tiles, acks = _acks(wire.down_acks, wire, answered, wire.up_alive)
-    return wire.down, dict(zip(RESIDUES, (tiles, acks, 0, wire.down_opening, wire.down_alive), strict=False))
+    parts = (tiles, acks, 0, wire.down_opening, wire.down_closing, wire.down_alive)
+    return wire.down, dict(zip(RESIDUES, parts, strict=False))
 
 
 def _acks(acks: int, wire: WireBytes, answered: list[Booking], alive_bytes: int) -> tuple[int, int]:

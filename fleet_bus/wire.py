@@ -32,15 +32,17 @@ class WireBytes:
         up: sent, bytes.
         down: received, bytes.
         connections: how many connections these are.
-        up_acks: of `up`, packets that carry no data: acknowledgements, opening and closing, bytes.
+        up_acks: of `up`, packets in between that carry no data: acknowledgements, bytes.
         down_acks: likewise of `down`.
         up_resent: of `up`, data that had to be sent again, bytes. (What was lost on the way down never came.)
         segment_bytes: data that one packet can carry, the largest of the connections; 0 where nothing was measured.
         header_bytes: headers of one packet, the largest of the connections.
-        up_opening: of `up`, what carried data when a connection was new: zenoh's handshake, bytes.
+        up_opening: of `up`, what had passed when a connection was new: handshakes with their acknowledgements, bytes.
         down_opening: likewise of `down`.
         up_alive: of `up`, keep-alives with their packet headers, as far as readings came between them, bytes.
         down_alive: likewise of `down`.
+        up_closing: of `up`, what passed once the session was being closed: ends of declarations, bytes.
+        down_closing: likewise of `down`.
     """
 
     up: int = 0
@@ -55,6 +57,8 @@ class WireBytes:
     down_opening: int = 0
     up_alive: int = 0
     down_alive: int = 0
+    up_closing: int = 0
+    down_closing: int = 0
 
     def __add__(self, other: "WireBytes") -> "WireBytes":
         return WireBytes(
@@ -70,6 +74,8 @@ class WireBytes:
             self.down_opening + other.down_opening,
             self.up_alive + other.up_alive,
             self.down_alive + other.down_alive,
+            self.up_closing + other.up_closing,
+            self.down_closing + other.down_closing,
         )
 
 
@@ -82,36 +88,45 @@ class _Tap:
     """
 
     end: socket.socket
+    opening: "_Counters"
     counted: "_Counters"
-    opening: tuple[int, int]
+    closing: "_Counters | None" = None
     alive: list[int] = field(default_factory=lambda: [0, 0])
 
     @classmethod
     def of(cls, tap: socket.socket) -> "_Tap":
         """Begins to count; what has passed until now is the opening."""
         counted = _Counters.read(tap)
-        return cls(tap, counted, (counted.data_bytes("up"), counted.data_bytes("down")))
+        return cls(tap, counted, counted)
+
+    def close_from_now(self) -> None:
+        """What passes from now on is the closing."""
+        self.read()
+        self.closing = self.counted
 
     def read(self) -> WireBytes:
         """Everything until now."""
         now = _Counters.read(self.end)
         then, self.counted = self.counted, now
-        if now.resent == then.resent:
+        if self.closing is None and now.resent == then.resent:
             self.alive[0] += _keep_alive_bytes(now.sent - then.sent, now.data_out - then.data_out, now)
-        self.alive[1] += _keep_alive_bytes(now.received - then.received, now.data_in - then.data_in, now)
+            self.alive[1] += _keep_alive_bytes(now.received - then.received, now.data_in - then.data_in, now)
+        first, last = self.opening, self.closing or now
         return WireBytes(
-            up=now.sent + now.segments_out * now.header_bytes,
-            down=now.received + now.segments_in * now.header_bytes,
+            up=now.up,
+            down=now.down,
             connections=1,
-            up_acks=(now.segments_out - now.data_out) * now.header_bytes,
-            down_acks=max(now.segments_in - now.data_in, 0) * now.header_bytes,
-            up_resent=now.resent,
+            up_acks=last.up_acks - first.up_acks,
+            down_acks=last.down_acks - first.down_acks,
+            up_resent=last.resent - first.resent,
             segment_bytes=now.segment_bytes,
             header_bytes=now.header_bytes,
-            up_opening=self.opening[0],
-            down_opening=self.opening[1],
+            up_opening=first.up,
+            down_opening=first.down,
             up_alive=self.alive[0],
             down_alive=self.alive[1],
+            up_closing=now.up - last.up,
+            down_closing=now.down - last.down,
         )
 
 
@@ -157,6 +172,12 @@ class WireMeter:
         with self._lock:
             return sum((tap.read() for tap in self._open.values()), self._past)
 
+    def close_from_now(self) -> None:
+        """The session is being closed: what its connections carry from now on is the closing."""
+        with self._lock:
+            for tap in self._open.values():
+                tap.close_from_now()
+
     def cut(self) -> None:
         """Ends the connections themselves, whatever still waits on them."""
         with self._lock:
@@ -199,11 +220,25 @@ class _Counters:
         header = (40 if tap.family == socket.AF_INET6 else 20) + 20 + (12 if info[_OPTIONS_AT] & _TIMESTAMPS else 0)
         return cls(sent, received, segments_out, segments_in, data_out, data_in, resent, segment_bytes, header)
 
-    def data_bytes(self, direction: str) -> int:
-        """Bytes of the packets that carry data, sent again or not."""
-        if direction == "up":
-            return self.sent - self.resent + self.data_out * self.header_bytes
-        return self.received + min(self.data_in, self.segments_in) * self.header_bytes
+    @property
+    def up(self) -> int:
+        """IP bytes sent."""
+        return self.sent + self.segments_out * self.header_bytes
+
+    @property
+    def down(self) -> int:
+        """IP bytes received."""
+        return self.received + self.segments_in * self.header_bytes
+
+    @property
+    def up_acks(self) -> int:
+        """Of `up`, packets without data."""
+        return (self.segments_out - self.data_out) * self.header_bytes
+
+    @property
+    def down_acks(self) -> int:
+        """Of `down`, packets without data."""
+        return max(self.segments_in - self.data_in, 0) * self.header_bytes
 
 
 def _keep_alive_bytes(stream_bytes: int, packets: int, now: _Counters) -> int:

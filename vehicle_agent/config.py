@@ -25,9 +25,6 @@ class DownloadParameters:
     """How far along the heading tiles are asked for in advance, at least."""
     ahead_s: float = 15.0
     """The same in time: a faster vehicle looks farther."""
-    held_ahead_m: float = 600.0
-    """As far ahead, at most, as the tiles right under the way are held: one question then asks whether they still hold,
-    where a question every few seconds of way would cost hundreds of times what changes."""
     lead_s: float = 6.0
     """A question is sent when something is needed within this time; with it goes all that is ahead."""
     batch_s: float = 0.25
@@ -47,11 +44,8 @@ class DownloadParameters:
 
     def __post_init__(self) -> None:
         """Distances in order, at least one request in flight."""
-        if not 0 < self.near_m <= self.forget_m or min(self.ahead_m, self.held_ahead_m) < 0:
-            raise AgentConfigError(
-                f"near_m = {self.near_m}, ahead_m = {self.ahead_m}, held_ahead_m = {self.held_ahead_m}, "
-                f"forget_m = {self.forget_m} m"
-            )
+        if not 0 < self.near_m <= self.forget_m or self.ahead_m < 0:
+            raise AgentConfigError(f"near_m = {self.near_m}, ahead_m = {self.ahead_m}, forget_m = {self.forget_m} m")
         if not 0 <= self.lead_s <= self.ahead_s:
             raise AgentConfigError(f"lead_s = {self.lead_s} s must lie between 0 and ahead_s = {self.ahead_s} s")
         if not (0 < self.link_share <= 1 and self.batch_s > 0):

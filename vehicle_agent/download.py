@@ -116,13 +116,6 @@ class TileFetcher(Generic[TileT]):
         with self._changed:
             return tile_id in self._in_flight or (tile_id in self._answered and tile_id not in self._stale)
 
-    def holds(self, tile_id: TileId) -> bool:
-        """Whether the cache has a version of the tile."""
-        try:
-            return bool(self._cache.head(tile_id)[0])
-        except CacheError:
-            return False
-
     def size_bytes(self, tile_id: TileId) -> float:
         """What the answer about a tile is likely to weigh: of one that is held little, of one not held the mean."""
         if self.is_known(tile_id):
@@ -158,7 +151,10 @@ class TileFetcher(Generic[TileT]):
         self._changed.notify_all()
 
     def _expected_bytes(self, tile_id: TileId) -> float:
-        return HELD_GUESS_BYTES if self.holds(tile_id) else self._whole.value  # what cannot be read is asked for whole
+        try:
+            return HELD_GUESS_BYTES if self._cache.head(tile_id)[0] else self._whole.value
+        except CacheError:  # what cannot be read is asked for whole
+            return self._whole.value
 
     def _work(self) -> None:
         while batch := self._next():

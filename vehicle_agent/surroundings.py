@@ -94,24 +94,11 @@ class Surroundings:
         by_speed_m = self._parameters.ahead_s * abs(place.speed_mps)
         return max(self._parameters.ahead_m, AHEAD_STEP_M * math.ceil(by_speed_m / AHEAD_STEP_M))
 
-    def _held_ahead_m(self, place: Place) -> float:
-        """How far the tiles right under the way ahead are held, if the vehicle goes straight on."""
-        most_m, ends = self._parameters.held_ahead_m, place.ahead_map_m(1.0)
-        if len(ends) < 2:
-            return 0.0
-        steps_m = np.arange(0.0, most_m, AHEAD_STEP_M)
-        lat, lon, _ = self._map.grid_frame.frame.geodetic_from_enu(ends[0] + steps_m[:, None] * (ends[1] - ends[0]))
-        for step_m, *where in zip(steps_m.tolist(), lat.tolist(), lon.tolist(), strict=True):
-            if not self._fetcher.holds(TileId.from_geodetic(*where)):
-                return step_m
-        return most_m
-
     def _look(self, place: Place) -> None:
         p, here, frame = self._parameters, place.position_map_m, self._map.grid_frame.frame
         floor = int(np.floor(place.height_m / FLOORS_BELOW)) * FLOORS_BELOW
         self._map.cover_floors(floor - FLOORS_BELOW, floor + FLOORS_ABOVE)
-        ahead_m = max(self._ahead_m(place), self._held_ahead_m(place))
-        self.wanted = tiles_along(frame, place.ahead_map_m(ahead_m), p.near_m)
+        self.wanted = tiles_along(frame, place.ahead_map_m(self._ahead_m(place)), p.near_m)
         self._plan = needs(frame, self.wanted, place.course, p.near_m)
         self._plan_is_new = True
         self._near = tuple(need.tile_id for need in self._plan if need.distance_m <= p.near_m)

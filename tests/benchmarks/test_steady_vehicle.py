@@ -13,13 +13,14 @@ from fleet_bus.wire import WireBytes
 
 
 def driven(tmp_path, up: int, down: int):
-    """2 km: a question about a tile, a report, a sample, some keep-alives."""
+    """2 km: a question about a tile, a report, many notices, some keep-alives."""
     ledger = Ledger("v")
     ledger.set_position(0.0, 10**18)
     ledger.record("up", "tile", 40, head_bytes=50)
     ledger.record("down", "tile", 10, head_bytes=50, took_s=0.1)
     ledger.set_position(2000.0, 10**18 + 180 * 10**9)
     ledger.record("up", "change", 300, head_bytes=50)
+    ledger.record("down", "update", down - 1000, head_bytes=50)
     parts = {
         "up_acks": 104,
         "down_acks": 104,
@@ -36,9 +37,9 @@ def driven(tmp_path, up: int, down: int):
 @pytest.mark.parametrize(
     ("wire", "met", "aim_met", "said"),
     [
-        ((1200, 800), True, True, "aim met"),
-        ((2600, 1400), True, False, "must met"),
-        ((3600, 1600), False, False, "missed"),
+        ((1300, 1000), True, True, "aim met"),
+        ((1300, 3900), True, False, "must met"),
+        ((1300, 6900), False, False, "missed"),
     ],
 )
 def test_must_and_aim_are_judged_by_all_bytes_but_tiles(tmp_path, wire, met, aim_met, said):
@@ -53,7 +54,7 @@ def test_must_and_aim_are_judged_by_all_bytes_but_tiles(tmp_path, wire, met, aim
 
 
 def test_what_comes_once_a_drive_is_told_apart(tmp_path):
-    found = driven(tmp_path, 1200, 800)
+    found = driven(tmp_path, 1300, 1000)
     rest = sum(row["wire_bytes"] for row in found["rows"] if row["kind"] == "session")
     assert found["once_a_drive_bytes"] == 200 + 180 + rest
     assert found["under_way_kB_per_km"] == pytest.approx(found["other_kB_per_km"] - found["once_a_drive_bytes"] / 2000)

@@ -99,7 +99,17 @@ WIRES = st.builds(
     down=COUNT,
     **{
         name: st.integers(0, 9999)
-        for name in ("up_acks", "down_acks", "up_resent", "up_opening", "down_opening", "up_alive", "down_alive")
+        for name in (
+            "up_acks",
+            "down_acks",
+            "up_resent",
+            "up_opening",
+            "down_opening",
+            "up_alive",
+            "down_alive",
+            "up_closing",
+            "down_closing",
+        )
     },
     segment_bytes=st.sampled_from([0, 536, 1448, 65483]),
     header_bytes=st.just(52),
@@ -229,4 +239,12 @@ def test_acknowledgements_stand_with_what_they_answer():
 
 def test_without_anything_that_they_could_answer_acknowledgements_are_nobodys():
     account = wire_account(ledger_of(s=WireBytes(up=104, up_acks=104)), "up")
-    assert account.rest == {"tile acks": 0, "acks": 104, "resent": 0, "opening": 0, "keep-alives": 0, "session": 0}
+    assert account.rest == {
+        "tile acks": 0,
+        "acks": 104,
+        "resent": 0,
+        "opening": 0,
+        "closing": 0,
+        "keep-alives": 0,
+        "session": 0,
+    }

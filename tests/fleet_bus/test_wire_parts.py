@@ -44,11 +44,12 @@ def test_a_silent_session_is_opening_keep_alives_and_acks(tmp_path):
     assert 10 <= (last.up_alive - first.up_alive) / KEEP_ALIVE_BYTES <= 13
     assert 5 <= (last.down_alive - first.down_alive) / KEEP_ALIVE_BYTES <= 7
     assert last.up_alive % KEEP_ALIVE_BYTES == last.down_alive % KEEP_ALIVE_BYTES == 0
-    assert 150 < found["opening", "up"] < 400
+    assert 250 < found["opening", "up"] < 500
+    assert 50 < found["closing", "up"] < 400
     assert found["keep-alives", "up"] >= last.up_alive
-    # What the end of a session sends; on a busy machine a reading may have come too late for a keep-alive or two.
-    assert found.get(("session", "up"), 0) < 100 + 2 * KEEP_ALIVE_BYTES
-    assert found.get(("session", "down"), 0) < 100 + 2 * KEEP_ALIVE_BYTES
+    # On a busy machine a reading may have come too late for a keep-alive or two.
+    assert found.get(("session", "up"), 0) <= 2 * KEEP_ALIVE_BYTES
+    assert found.get(("session", "down"), 0) <= 2 * KEEP_ALIVE_BYTES
 
 
 def test_a_message_is_never_taken_for_a_keep_alive(router, client, key, tmp_path):

@@ -41,12 +41,6 @@ def at(east_m: float, north_m: float = 0.0) -> Place:
     return Place(FRAME, GnssFix(0, float(lat[0]), float(lon[0]), float(height[0]), 2.5))
 
 
-def road_of(length_m: float) -> dict[TileId, Tile]:
-    """The tiles of a strip of ground, 1 m wide, to the east."""
-    east, north = np.meshgrid(np.arange(-5.0, length_m, 0.1), np.arange(-0.5, 0.5, 0.1))
-    return tiles_of(np.stack([east.ravel(), north.ravel(), np.full(east.size, HEIGHT_M)], axis=1))
-
-
 class Scene:
     def __init__(self, cloud: Bus, bus: Bus, ledger: Ledger, folder: Path) -> None:
         self.ledger = ledger
@@ -56,8 +50,7 @@ class Scene:
         self.server = TileServer(self.store, cloud).start()
         self.map = LocalMap(GRID_FRAME)
         self.detector = ChangeDetector(self.map)
-        self.cache = TileCache[Tile](folder / "cache.sqlite")
-        self.fetcher = TileFetcher(bus, self.cache, PARAMETERS)
+        self.fetcher = TileFetcher(bus, TileCache(folder / "cache.sqlite"), PARAMETERS)
         self.surroundings = Surroundings(self.map, self.fetcher, self.detector, PARAMETERS)
 
 
@@ -113,42 +106,6 @@ def test_what_is_ahead_is_asked_for_together(scene: Scene) -> None:
     ledger = scene.ledger.totals()
     (asked,) = [line.messages for line in ledger if (line.kind, line.direction) == ("tile", "up")]
     assert asked <= 2 + 120.0 / (10.0 * (PARAMETERS.ahead_s - PARAMETERS.lead_s)) * 2  # twice that: two districts
-
-
-def test_as_far_as_the_way_is_held_it_is_asked_for_at_once(scene: Scene) -> None:
-    """600 m of way, all in the cache: a question a district and 540 m, not one every few seconds."""
-    place = at(0.0)
-    place.heading_rad, place.speed_mps = 0.0, 10.0
-    road = road_of(1300.0)
-    scene.store.put_tiles([tile for tile_id, tile in road.items() if tile_id not in scene.tiles])
-    for tile in road.values():
-        scene.cache.put(scene.tiles.get(tile.tile_id, tile))
-    for east_m in range(0, 600, 10):
-        place.position_map_m = at(float(east_m)).position_map_m
-        scene.surroundings.follow(place, NEVER, wait=True)
-    (asked,) = [x.messages for x in scene.ledger.totals() if (x.kind, x.direction) == ("tile", "up")]
-    districts = len({tile.district for tile in scene.surroundings.wanted})
-    assert asked <= 4 * districts
-
-
-def test_beyond_what_is_held_the_vehicle_may_turn_off(scene: Scene) -> None:
-    place = at(0.0)
-    place.heading_rad, place.speed_mps = 0.0, 0.0
-
-    def reach_m() -> float:
-        place.position_map_m = place.position_map_m + 6.0  # far enough to look again
-        wanted = scene.surroundings.look_ahead(place)
-        return max(float(FRAME.enu_from_geodetic(*t.centre_rad, 0.0)[..., 0]) for t in wanted)
-
-    usual_m = PARAMETERS.ahead_m + PARAMETERS.near_m
-    assert reach_m() == pytest.approx(usual_m, abs=40.0)
-    for tile in road_of(900.0).values():
-        scene.cache.put(tile)
-    assert reach_m() == pytest.approx(PARAMETERS.held_ahead_m + PARAMETERS.near_m, abs=60.0)
-    hole = {TileId.from_geodetic(*at(250.0, float(north)).geodetic) for north in range(-60, 61, 10)}
-    for tile_id in hole:
-        scene.cache.drop(tile_id)
-    assert reach_m() == pytest.approx(250.0 + PARAMETERS.near_m, abs=80.0)
 
 
 @pytest.mark.parametrize(("rate_bit_s", "all_of_them"), [(1e6, True), (3e4, False)])
