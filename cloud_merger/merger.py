@@ -5,11 +5,12 @@ import threading
 
 from cloud_merger.announce import Announcer
 from cloud_merger.config import ShardConfig
-from cloud_merger.features.kept import FeatureInbox
+from cloud_merger.expander import Expander
+from cloud_merger.expander_threads import working
 from cloud_merger.ingest import Ingest
 from cloud_merger.ownership import Members
 from cloud_merger.reception import Reception
-from cloud_merger.short_reports import ShortReports
+from cloud_merger.states import States
 from cloud_merger.warm import warm_up
 from cloud_merger.work import Worker
 from fleet_bus.bus import open_bus
@@ -39,21 +40,24 @@ def run_shard(config: ShardConfig, stop: threading.Event) -> None:
         wake = threading.Event()
         store.release(config.shard_id)  # leases of an earlier life
 
-        # Ingest: check, keep, acknowledge, in threads of the bus.
-        short = ShortReports(store, config.merge, config.want, config.waiting)
-        features = FeatureInbox(store, config.feature_limits, config.features.reach_m, config.ingest.reach_tiles)
-        ingest = Ingest(store, config.ingest, on_stored=wake.set, short=short, features=features)
-        reception = Reception(bus, members, ingest.answer, on_death=store.release)
+        # Ingest: look at the outside, keep the bytes, acknowledge; in threads of the bus.
+        arrived = threading.Event()
+        ingest = Ingest(store, config.shard_id, on_stored=arrived.set)
+        reception, states = Reception(bus, members, ingest.answer, on_death=store.release), States(store, bus)
+        states.open()
         reception.open()
         _LOG.info("merger %s: store %s, mode %s", config.shard_id, config.store_path, config.merge.mode)
 
+        # Expand: what was acknowledged becomes reports of tiles, and vehicles hear what is wanted; in threads.
+        expander = Expander(store, config, states.tell, on_journaled=wake.set)
         worker, announcer = Worker(store, config), Announcer(store, bus, members)
-        while not stop.is_set():
-            claims = store.claim(config.shard_id, config.tiles_at_once, config.lease_s, prefer=reception.districts)
-            merged = worker.merge(claims)  # load, decode, cluster, decide
-            store.publish(merged)  # compare-and-swap; a stale one is refused and its tile claimed again
-            n_announced = announcer.announce(config.announce_at_once)  # after the commit
-            if not claims and not n_announced:
-                wake.wait(worker.idle_s(store.next_ready_ns()))
-                wake.clear()
+        with working(expander.work, arrived, config.expanders, config.poll_s):
+            while not stop.is_set():
+                claims = store.claim(config.shard_id, config.tiles_at_once, config.lease_s, prefer=reception.districts)
+                merged = worker.merge(claims)  # load, decode, cluster, decide
+                store.publish(merged)  # compare-and-swap; a stale one is refused and its tile claimed again
+                n_announced = announcer.announce(config.announce_at_once)  # after the commit
+                if not claims and not n_announced:
+                    wake.wait(worker.idle_s(store.next_ready_ns()))
+                    wake.clear()
         store.release(config.shard_id)

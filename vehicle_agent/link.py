@@ -42,7 +42,7 @@ def open_link(config: AgentConfig) -> Iterator[Link]:
     bus_config = BusConfig(connect=config.connect, link=config.link, open_timeout_s=config.open_timeout_s)
     bus = open_bus(bus_config, ledger, config.vehicle)
     bus.declare_alive(alive_key("agent", config.vehicle))
-    fetcher, sender = TileFetcher(bus, cache, config.download), SenderThread(bus, outbox)
+    fetcher, sender = TileFetcher(bus, cache, config.download), SenderThread(bus, outbox, config.vehicle)
     try:
         yield Link(bus, ledger, cache, outbox, fetcher, sender)
     finally:
