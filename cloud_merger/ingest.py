@@ -76,10 +76,10 @@ def check_head(key: str, head: UploadHead, received_ns: int) -> None:
         SchemaError: no key of reports.
     """
     layer, district = parse_change_key(key)
-    if head.place not in (None, (layer, district)):
-        raise BadReport(f"report for {head.place[0]} {head.place[1]} came on the key of {layer} {district}")
     if head.form != "features" and is_feature_layer(layer):
         raise BadReport(f"an upload in form {head.form} speaks of Gaussians, layer {layer} holds features")
+    if head.place not in (None, (layer, district)):
+        raise BadReport(f"report for {head.place[0]} {head.place[1]} came on the key of {layer} {district}")
     if head.last_ns > received_ns + MAX_AHEAD_NS:
         raise BadReport(
             f"report {head.report_id} ends {(head.last_ns - received_ns) / 1e9:.0f} s after it was received, the limit "

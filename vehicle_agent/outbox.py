@@ -25,8 +25,7 @@ from schemas.report_states import ReportState
 from vehicle_agent.errors import OutboxError
 from vehicle_agent.sqlite import Database
 
-_REPORTS = """
-CREATE TABLE {name} (
+_COLUMNS = """
     report_id TEXT PRIMARY KEY,
     key       TEXT NOT NULL,
     body      BLOB NOT NULL,
@@ -39,7 +38,8 @@ CREATE TABLE {name} (
 ) STRICT, WITHOUT ROWID;
 """
 SCHEMA = (
-    _REPORTS.format(name="IF NOT EXISTS report")
+    "CREATE TABLE IF NOT EXISTS report ("
+    + _COLUMNS
     + """
 CREATE TABLE IF NOT EXISTS packed (
     report_id TEXT PRIMARY KEY,
@@ -61,14 +61,13 @@ CREATE INDEX IF NOT EXISTS needs_sha ON needs (sha);
 )
 # An outbox of an older release: there, what was stored was done with.
 _MIGRATION = (
-    _REPORTS.format(name="report_now")
-    + """
-INSERT INTO report_now (report_id, key, body, state, reason, attempts, next_ns)
-    SELECT report_id, key, body, CASE WHEN state IN ('stored', 'duplicate') THEN 'released' ELSE state END,
-        reason, attempts, next_ns FROM report;
-DROP TABLE report;
-ALTER TABLE report_now RENAME TO report;
-"""
+    "ALTER TABLE report RENAME TO report_before",
+    "DROP INDEX IF EXISTS report_pending",
+    "CREATE TABLE report (" + _COLUMNS,
+    "INSERT INTO report (report_id, key, body, state, reason, attempts, next_ns)"
+    " SELECT report_id, key, body, CASE WHEN state IN ('stored', 'duplicate') THEN 'released' ELSE state END,"
+    " reason, attempts, next_ns FROM report_before",
+    "DROP TABLE report_before",
 )
 _INDEX = "CREATE INDEX IF NOT EXISTS report_open ON report (next_ns) WHERE state IN ('pending', 'stored')"
 # What a report in short needed goes with its release; a base goes with the last report that needs it.
@@ -128,7 +127,8 @@ class Outbox:
         self._db = Database(path, SCHEMA, synchronous="FULL", error=OutboxError)
         with self._db.transaction() as c:
             if "wanted" not in {row[0] for row in c.execute("SELECT name FROM pragma_table_info('report')")}:
-                c.execute(_MIGRATION)
+                for step in _MIGRATION:
+                    c.execute(step)
             c.execute(_INDEX)
 
     def put(self, report_id: str, key: str, body: bytes, packed: bytes = b"", bases: Iterable[Tile] = ()) -> bool:
@@ -177,8 +177,8 @@ class Outbox:
     def answered(self, report_id: str, status: str, reason: str = "", now_ns: int = 0, wanted: bytes = b"") -> None:
         """Record what came to a message: `stored` or `duplicate` (acknowledged), or `quarantined` with its reason.
 
-        An acknowledged report is held: word of it is waited for, and some seconds after `now_ns` `unheard` names it. What
-        is refused is done with.
+        An acknowledged report is held: word of it is waited for, and some seconds after `now_ns` `unheard` names it.
+        What is refused is done with.
 
         Args:
             report_id: of the message.
@@ -195,7 +195,8 @@ class Outbox:
                 return
             sql = (  # what is wanted may have come before the ack of the flags
                 "UPDATE report SET state = 'stored', reason = '', attempts = 0, answers = answers + (?1 <> x''),"
-                " next_ns = CASE WHEN wanted = ?1 THEN ?2 ELSE 0 END, wanted = CASE WHEN wanted = ?1 THEN x'' ELSE wanted END"
+                " next_ns = CASE WHEN wanted = ?1 THEN ?2 ELSE 0 END,"
+                " wanted = CASE WHEN wanted = ?1 THEN x'' ELSE wanted END"
                 " WHERE report_id = ?3 AND state IN ('pending', 'stored')"
             )
             c.execute(sql, (wanted, now_ns + int(FIRST_ASK_S * 1e9), report_id))
@@ -203,13 +204,14 @@ class Outbox:
     def told(self, state: ReportState, now_ns: int) -> None:
         """Record how far the cloud says that a report has come; of one that is not here, or done with, nothing.
 
-        The cloud's word counts for reports that it has acknowledged, and "wanted" and "released" for those too whose ack
-        was lost.
+        The cloud's word counts for reports that it has acknowledged; "wanted" and "released" count as the ack that was
+        lost.
         """
         with self._db.transaction() as c:
             sql = "SELECT state, answers, report_id IN (SELECT report_id FROM packed) FROM report WHERE report_id = ?"
-            for was, answers, is_short in c.execute(sql, (state.report_id,)).fetchall():
-                _hear(c, state, (str(was), bool(is_short), int(answers)), now_ns)
+            rows: list[tuple[str, int, int]] = c.execute(sql, (state.report_id,)).fetchall()  # type: ignore[assignment]
+            for was, answers, is_short in rows:
+                _hear(c, state, (was, bool(is_short), answers), now_ns)
 
     def unheard(self, now_ns: int, limit: int = 32) -> list[str]:
         """Acknowledged reports of which no word has come for some time, the oldest first."""

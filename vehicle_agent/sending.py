@@ -12,13 +12,13 @@ import time
 from collections import Counter
 
 from fleet_bus.bus import Bus
-from fleet_bus.errors import BusClosed, BusError, MessageTooLarge, RequestRefused
-from gnd_map.errors import CodecError
+from fleet_bus.errors import BusClosed, MessageTooLarge, RequestRefused
+from gnd_map.errors import CodecError, GndError
 from schemas.changes import ChangeAck, ChangeReport
 from schemas.errors import SchemaError
 from schemas.keys import state_key, want_key
 from schemas.report_states import ReportQuestion, ReportState, ReportStates
-from vehicle_agent.errors import OutboxError, PackingError
+from vehicle_agent.errors import PackingError
 from vehicle_agent.outbox import ANSWERS, Letter, Outbox
 from vehicle_agent.packing import pack_measured
 
@@ -132,18 +132,19 @@ class SenderThread:
 
     def _ask_after(self) -> bool:
         """Ask after reports of which no word has come; False when there are none."""
-        report_ids = self._outbox.unheard(time.time_ns())
-        if not report_ids:
-            return False
-        self._outbox.asked(report_ids, time.time_ns())
-        self.counts["questions"] += 1
         try:
+            report_ids = self._outbox.unheard(time.time_ns())
+            if not report_ids:
+                return False
+            self._outbox.asked(report_ids, time.time_ns())
+            self.counts["questions"] += 1
             question = ReportQuestion(tuple(report_ids)).encode()
             answer = self._bus.request(state_key(self._vehicle), question, kind="change", timeout_s=QUESTION_S)
             self._hear(ReportStates.decode(answer))
         except BusClosed:
             self._stop.set()
-        except (BusError, SchemaError, OutboxError) as error:
+        except GndError as error:
             self.last_error = str(error)
-            _log.warning("nothing heard of %d reports: %s", len(report_ids), error)
+            _log.warning("nothing heard of stored reports: %s", error)
+            self._stop.wait(POLL_S)
         return True

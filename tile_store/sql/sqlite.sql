@@ -431,7 +431,7 @@ CREATE TABLE IF NOT EXISTS upload (
   attempts    INTEGER NOT NULL DEFAULT 0
 ) STRICT;
 CREATE INDEX IF NOT EXISTS upload_fresh ON upload (home, upload) WHERE state = 'waiting' AND attempts = 0;
-CREATE INDEX IF NOT EXISTS upload_waiting ON upload (upload) WHERE state = 'waiting';
+CREATE INDEX IF NOT EXISTS upload_waiting ON upload (attempts, upload) WHERE state = 'waiting';
 CREATE INDEX IF NOT EXISTS upload_report ON upload (report_id, upload);
 CREATE INDEX IF NOT EXISTS upload_state ON upload (state, received_ns);
 
@@ -449,7 +449,8 @@ WHERE state = 'waiting' AND attempts = 0 AND home = :home ORDER BY upload LIMIT 
 
 -- name: free_uploads
 SELECT upload, key, body, report_id, vehicle, form, received_ns, attempts FROM upload INDEXED BY upload_waiting
-WHERE state = 'waiting' AND (boot <> :boot OR lease_ns <= :now OR lease_ns > :never) ORDER BY upload LIMIT :n
+WHERE state = 'waiting' AND (boot <> :boot OR lease_ns <= :now OR lease_ns > :never)
+ORDER BY attempts, upload LIMIT :n
 
 -- name: lease_upload
 UPDATE upload SET owner = :owner, token = :token, boot = :boot, lease_ns = :lease_ns, attempts = attempts + 1
