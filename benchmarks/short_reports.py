@@ -23,8 +23,8 @@ from schemas.report_id import deterministic_report_id
 
 FOLDER: Final = Path("runs/benchmark-short-reports")
 SEED: Final = 205
-LENGTH_M: Final = 200.0
-DRIVES: Final = 3
+LENGTH_M: Final = 100.0
+DRIVES: Final = 2
 _KEY: Final = "short-reports-1"
 
 
