@@ -79,7 +79,7 @@ def corpus(folder: Path = FOLDER, drives: int = DRIVES, length_m: float = LENGTH
     Raises:
         ReproduceError: no drive has a report in short.
     """
-    street = street_options("usual", length_m)
+    street = street_options("rebuilt", length_m)
     options = TrafficOptions(seed=SEED, street=street, drives=drives, base="surveyed", pcd_drives=0, scans=scans)
     files = world_files(RunFolder.begun(folder), SEED, options.world)
     path = files.home / "map-standard.npz"

@@ -174,7 +174,16 @@ class Outbox:
         )
         return [Letter(*row) for row in self._db.run(sql, (now_ns, limit))]
 
-    def answered(self, report_id: str, status: str, reason: str = "", now_ns: int = 0, wanted: bytes = b"") -> None:
+    def answered(
+        self,
+        report_id: str,
+        status: str,
+        reason: str = "",
+        now_ns: int = 0,
+        wanted: bytes = b"",
+        *,
+        is_short: bool = False,
+    ) -> None:
         """Record what came to a message: `stored` or `duplicate` (acknowledged), or `quarantined` with its reason.
 
         An acknowledged report is held: word of it is waited for, and some seconds after `now_ns` `unheard` names it.
@@ -186,6 +195,7 @@ class Outbox:
             reason: of a refusal.
             now_ns: the time.
             wanted: the mask that the message has answered; empty: it held no Gaussians that were asked for.
+            is_short: whether the message was a half: its ack says nothing once the report is to go whole.
         """
         if status not in ANSWERS:
             raise OutboxError(f"report {report_id}: unknown answer {status!r}, expected one of {', '.join(ANSWERS)}")
@@ -198,14 +208,14 @@ class Outbox:
                 " next_ns = CASE WHEN wanted = ?1 THEN ?2 ELSE 0 END,"
                 " wanted = CASE WHEN wanted = ?1 THEN x'' ELSE wanted END"
                 " WHERE report_id = ?3 AND state IN ('pending', 'stored')"
+                " AND (NOT ?4 OR report_id IN (SELECT report_id FROM packed))"
             )
-            c.execute(sql, (wanted, now_ns + int(FIRST_ASK_S * 1e9), report_id))
+            c.execute(sql, (wanted, now_ns + int(FIRST_ASK_S * 1e9), report_id, is_short))
 
     def told(self, state: ReportState, now_ns: int) -> None:
         """Record how far the cloud says that a report has come; of one that is not here, or done with, nothing.
 
-        The cloud's word counts for reports that it has acknowledged; "wanted" and "released" count as the ack that was
-        lost.
+        The word may overtake the ack, or be all that is left of it.
         """
         with self._db.transaction() as c:
             sql = "SELECT state, answers, report_id IN (SELECT report_id FROM packed) FROM report WHERE report_id = ?"
@@ -283,12 +293,14 @@ def _hear(c: apsw.Connection, state: ReportState, here: tuple[str, bool, int], n
             return
         sql = "UPDATE report SET state = 'stored', wanted = ?, attempts = 0, next_ns = ? WHERE report_id = ?"
         c.execute(sql, (state.wanted, now_ns, state.report_id))
+    elif state.status in ("resend", "quarantined") and is_short:  # the word may overtake the ack
+        _whole(c, state.report_id, f"{state.status} {state.reason}")
     elif was == "pending":
-        return  # an answer to what was sent before: what is to be sent now has not been looked at
+        return  # the word on what was sent before: what is to be sent now has not been looked at
     elif state.status == "unknown":  # a store of before the ack: as if it had never been sent
         sql = "UPDATE report SET state = 'pending', wanted = x'', attempts = 0, next_ns = ? WHERE report_id = ?"
         c.execute(sql, (now_ns, state.report_id))
-    elif state.status == "quarantined" and not is_short:
+    elif state.status == "quarantined":
         _end(c, state.report_id, "quarantined", state.reason)
     elif state.status != "waiting":
         _whole(c, state.report_id, f"{state.status} {state.reason}")

@@ -109,7 +109,8 @@ class SenderThread:
         elif ack.status in ("quarantined", "resend"):
             self._refused(letter, ack.reason)
         else:
-            self._outbox.answered(letter.report_id, ack.status, now_ns=time.time_ns(), wanted=letter.wanted)
+            now_ns, is_short = time.time_ns(), form != "whole"
+            self._outbox.answered(letter.report_id, ack.status, now_ns=now_ns, wanted=letter.wanted, is_short=is_short)
 
     def _refused(self, letter: Letter, reason: str) -> None:
         """Only a whole report is refused for good."""

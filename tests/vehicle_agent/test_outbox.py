@@ -62,6 +62,16 @@ def test_the_ack_of_the_flags_may_come_after_the_notice_of_what_is_wanted(outbox
     assert outbox.states() == {A: "released"}
 
 
+@pytest.mark.parametrize("status", ["resend", "quarantined"])
+def test_the_ack_of_a_half_says_nothing_once_the_report_is_to_go_whole(outbox: Outbox, status: ReportStatus) -> None:
+    outbox.put(A, "key/a", b"body", b"short", [tile(5)])
+    outbox.told(ReportState(A, status, reason="why"), 7)
+    outbox.answered(A, "stored", now_ns=8, is_short=True)
+    assert [(letter.packed, letter.body) for letter in outbox.due(8)] == [(b"", b"body")]
+    outbox.answered(A, "stored", now_ns=9)
+    assert outbox.counts().held == 1
+
+
 def test_who_hears_nothing_asks_after_four_seconds_and_then_ever_less_often(outbox: Outbox) -> None:
     outbox.put(A, "key/a", b"body")
     outbox.answered(A, "stored", now_ns=0)
