@@ -285,24 +285,29 @@ def _hear(c: apsw.Connection, state: ReportState, here: tuple[str, bool, int], n
         return
     if state.status == "released":
         _end(c, state.report_id, "released", "")
-    elif state.status == "wanted":
-        if not is_short:
-            return  # the whole report is on its way
-        if answers >= MAX_ANSWERS:
-            _whole(c, state.report_id, f"its Gaussians were sent {answers} times and are asked for again")
-            return
-        sql = "UPDATE report SET state = 'stored', wanted = ?, attempts = 0, next_ns = ? WHERE report_id = ?"
-        c.execute(sql, (state.wanted, now_ns, state.report_id))
+    elif state.status == "wanted" and is_short:  # of a report that goes whole nothing is wanted any more
+        _want(c, state, answers, now_ns)
     elif state.status in ("resend", "quarantined") and is_short:  # the word may overtake the ack
         _whole(c, state.report_id, f"{state.status} {state.reason}")
-    elif was == "pending":
-        return  # the word on what was sent before: what is to be sent now has not been looked at
-    elif state.status == "unknown":  # a store of before the ack: as if it had never been sent
+    elif was == "stored":  # else it is the word on what was sent before: what is to be sent now nobody has looked at
+        _hear_of_held(c, state, now_ns)
+
+
+def _want(c: apsw.Connection, state: ReportState, answers: int, now_ns: int) -> None:
+    if answers >= MAX_ANSWERS:
+        _whole(c, state.report_id, f"its Gaussians were sent {answers} times and are asked for again")
+        return
+    sql = "UPDATE report SET state = 'stored', wanted = ?, attempts = 0, next_ns = ? WHERE report_id = ?"
+    c.execute(sql, (state.wanted, now_ns, state.report_id))
+
+
+def _hear_of_held(c: apsw.Connection, state: ReportState, now_ns: int) -> None:
+    if state.status == "unknown":  # a store of before the ack: as if it had never been sent
         sql = "UPDATE report SET state = 'pending', wanted = x'', attempts = 0, next_ns = ? WHERE report_id = ?"
         c.execute(sql, (now_ns, state.report_id))
     elif state.status == "quarantined":
         _end(c, state.report_id, "quarantined", state.reason)
-    elif state.status != "waiting":
+    elif state.status == "resend":
         _whole(c, state.report_id, f"{state.status} {state.reason}")
 
 
