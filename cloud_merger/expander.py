@@ -6,8 +6,11 @@ comes late changes nothing.
 """
 
 import logging
+from collections import OrderedDict
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from threading import Lock
+from typing import Final
 
 from ulid import ULID
 
@@ -30,6 +33,7 @@ from tile_store.store import Store
 from tile_store.uploads import Answered, FirstHalf, Settled, UploadClaim
 from tile_store.values import ReportRow
 
+REMEMBERED_DISTRICTS: Final = 32
 _LOG = logging.getLogger(__name__)
 Tell = Callable[[str, ReportState], object]
 
@@ -61,6 +65,14 @@ class Expander:
         self._short = ShortReports(store, config.merge, config.want, config.waiting)
         self._features = FeatureInbox(store, config.feature_limits, config.features.reach_m, config.ingest.reach_tiles)
         self._map = MapCheck(store, config.ingest)
+        self._lock = Lock()
+        self._districts: OrderedDict[str, None] = OrderedDict()  # newest last
+
+    @property
+    def districts(self) -> tuple[str, ...]:
+        """Paths of the districts that reports were about lately, the newest first: their tiles are in memory."""
+        with self._lock:
+            return tuple(reversed(self._districts))
 
     def work(self) -> int:
         """Settle some uploads; how many were claimed.
@@ -100,6 +112,7 @@ class Expander:
 
     def _announce(self, outcome: _Outcome) -> None:
         if outcome.settled.rows:
+            self._remember(outcome.settled.rows[0].tile.district.path)
             self._on_journaled()
         if outcome.asks is not None:
             self._short.asks(outcome.asks)
@@ -107,6 +120,13 @@ class Expander:
             self._short.promises.forget(outcome.settled.claim.upload.report_id)
         if outcome.told is not None:
             self._tell(outcome.vehicle, outcome.told)
+
+    def _remember(self, path: str) -> None:
+        with self._lock:
+            self._districts.pop(path, None)
+            self._districts[path] = None
+            while len(self._districts) > REMEMBERED_DISTRICTS:
+                self._districts.popitem(last=False)
 
     def _understood(self, claim: UploadClaim) -> _Outcome:
         if claim.attempts > self._config.max_attempts:  # it may be what killed the workers that claimed it before

@@ -8,21 +8,22 @@ from cloud_merger.config import ShardConfig
 from cloud_merger.expander import Expander
 from cloud_merger.expander_threads import working
 from cloud_merger.ingest import Ingest
-from cloud_merger.ownership import Members
+from cloud_merger.ownership import Members, following
 from cloud_merger.reception import Reception
 from cloud_merger.states import States
 from cloud_merger.warm import warm_up
 from cloud_merger.work import Worker
+from cloud_merger.worker_process import worker_process
 from fleet_bus.bus import open_bus
 from fleet_bus.config import BusConfig
 from tile_store.sqlite_store import SqliteStore
 
-__all__ = ["ShardConfig", "run_shard"]
+__all__ = ["ShardConfig", "run_shard", "run_worker"]
 _LOG = logging.getLogger(__name__)
 
 
 def run_shard(config: ShardConfig, stop: threading.Event) -> None:
-    """Run one merger shard until `stop` is set.
+    """Run one merger shard until `stop` is set: this process receives and acknowledges, its worker does the rest.
 
     Any number of shards may share a store. What one leaves undone, when it ends or is killed, another does.
 
@@ -30,34 +31,46 @@ def run_shard(config: ShardConfig, stop: threading.Event) -> None:
         StoreError: the store cannot be opened or has failed.
         NoRouter: no router answers at the start.
     """
-    warm_up()  # or the first tile and the first report would wait for the kernels, and their leases with them
     bus_config = BusConfig(connect=config.connect, lease_ms=config.bus_lease_ms)
     with (
         SqliteStore(config.store_path, config.store, create=False) as store,
         open_bus(bus_config, name=config.shard_id) as bus,
     ):
-        members = Members(config.shard_id)
-        wake = threading.Event()
         store.release(config.shard_id)  # leases of an earlier life
+        with worker_process(config) as worker:
+            ingest = Ingest(store, config.shard_id, on_stored=worker.wake)  # look at the outside, keep the bytes
+            members = Members(config.shard_id)
+            States(store, bus).open()
+            Reception(bus, members, ingest.answer, on_death=store.release).open()
+            _LOG.info("merger %s: store %s, mode %s", config.shard_id, config.store_path, config.merge.mode)
+            while not stop.wait(config.poll_s):
+                worker.keep_running()
+        store.release(config.shard_id)
 
-        # Ingest: look at the outside, keep the bytes, acknowledge; in threads of the bus.
-        arrived = threading.Event()
-        ingest = Ingest(store, config.shard_id, on_stored=arrived.set)
-        reception, states = Reception(bus, members, ingest.answer, on_death=store.release), States(store, bus)
-        states.open()
-        reception.open()
-        _LOG.info("merger %s: store %s, mode %s", config.shard_id, config.store_path, config.merge.mode)
+
+def run_worker(config: ShardConfig, stop: threading.Event, arrived: threading.Event) -> None:
+    """Expand, merge and announce until `stop` is set; `arrived` is set when something has come.
+
+    Raises:
+        StoreError, NoRouter: as `run_shard`.
+    """
+    warm_up()  # or the first tile and the first report would wait for the kernels, and their leases with them
+    bus_config = BusConfig(connect=config.connect, lease_ms=config.bus_lease_ms)
+    with (
+        SqliteStore(config.store_path, config.store, create=False) as store,
+        open_bus(bus_config, name=f"{config.shard_id}-worker") as bus,
+    ):
+        members, wake = following(bus, config.shard_id), threading.Event()
 
         # Expand: what was acknowledged becomes reports of tiles, and vehicles hear what is wanted; in threads.
-        expander = Expander(store, config, states.tell, on_journaled=wake.set)
+        expander = Expander(store, config, States(store, bus).tell, on_journaled=wake.set)
         worker, announcer = Worker(store, config), Announcer(store, bus, members)
         with working(expander.work, arrived, config.expanders, config.poll_s):
             while not stop.is_set():
-                claims = store.claim(config.shard_id, config.tiles_at_once, config.lease_s, prefer=reception.districts)
+                claims = store.claim(config.shard_id, config.tiles_at_once, config.lease_s, prefer=expander.districts)
                 merged = worker.merge(claims)  # load, decode, cluster, decide
                 store.publish(merged)  # compare-and-swap; a stale one is refused and its tile claimed again
                 n_announced = announcer.announce(config.announce_at_once)  # after the commit
                 if not claims and not n_announced:
                     wake.wait(worker.idle_s(store.next_ready_ns()))
                     wake.clear()
-        store.release(config.shard_id)
