@@ -1,7 +1,9 @@
 """Reports in short through real shards and a real router: halves that meet another shard, kills, and the same map."""
 
+import os
 import signal
 import threading
+import time
 from pathlib import Path
 
 import pytest
@@ -148,3 +150,42 @@ def test_what_is_wanted_outlives_a_restart_of_the_router_and_a_lost_notice(cloud
     wait_for("the Gaussians are looked at", lambda: state_of(cloud, report).status == "released")
     wait_for("all is merged and announced", cloud.is_settled)
     assert cloud.store.counts().reports == 1
+
+
+def worker_of(cloud, name) -> int:
+    """Process id of a shard's worker."""
+    shard = cloud.shards[name].pid
+    return int(Path(f"/proc/{shard}/task/{shard}/children").read_text().split()[0])
+
+
+@pytest.mark.slow
+def test_acks_come_while_the_worker_is_stopped_and_what_came_is_looked_at_when_it_goes_on(cloud):
+    cloud.start("left")
+    report = report_number(100)
+    send(cloud, report, packed_of(report))
+    wait_for("the worker works", lambda: state_of(cloud, report).status != "waiting")
+    worker = worker_of(cloud, "left")
+    os.kill(worker, signal.SIGSTOP)
+    reports, took_s = [report_number(n) for n in range(40)], []
+    for report in reports:
+        start_s = time.monotonic()
+        assert send(cloud, report, packed_of(report)).status == "stored"
+        took_s.append(time.monotonic() - start_s)
+    assert sorted(took_s)[20] < 0.5
+    assert {state_of(cloud, report).status for report in reports} == {"waiting"}
+    os.kill(worker, signal.SIGCONT)
+    wait_for("all is looked at and merged", cloud.is_settled)
+    assert cloud.store.counts().reports == 41
+
+
+@pytest.mark.slow
+def test_a_worker_that_is_killed_is_started_again_and_one_whose_shard_is_killed_ends(cloud):
+    cloud.start("left")
+    report, worker = report_number(1), worker_of(cloud, "left")
+    os.kill(worker, signal.SIGKILL)
+    assert send(cloud, report, packed_of(report)).status == "stored"
+    wait_for("another worker has looked at it", lambda: state_of(cloud, report).status == "wanted")
+    second = worker_of(cloud, "left")
+    assert second != worker
+    cloud.kill("left")
+    wait_for("its worker has ended", lambda: not Path(f"/proc/{second}").exists())
