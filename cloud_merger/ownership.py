@@ -53,5 +53,9 @@ class Members:
 def following(bus: Bus, own: str) -> Members:
     """The members as they come and go from now on, for who only wants to know whose a district is."""
     members = Members(own)
-    bus.watch_alive(alive_keys(ROLE), lambda key, alive: members.note(parse_alive_key(key)[1], alive=alive))
+
+    def note(key: str, alive: bool) -> None:
+        members.note(parse_alive_key(key)[1], alive=alive)
+
+    bus.watch_alive(alive_keys(ROLE), note)
     return members
