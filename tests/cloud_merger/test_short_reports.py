@@ -2,6 +2,9 @@
 
 import dataclasses
 import random
+import signal
+import subprocess
+import sys
 import threading
 
 import numpy as np
@@ -156,6 +159,43 @@ def test_what_is_wanted_outlives_every_shard(store, desk):
     assert later.state(REPORT.vehicle, REPORT.report_id) == told
     later.send(KEY, second_half(REPORT, told))
     assert later.state(REPORT.vehicle, REPORT.report_id).status == "released"
+    assert stored(store)[TILE].changed == REPORT.tiles[0].changed
+
+
+DIES = """
+import os, signal, sys
+from cloud_merger.config import ShardConfig
+from cloud_merger.expander import Expander
+from tile_store.sqlite_store import SqliteStore
+
+store = SqliteStore(sys.argv[1])
+settle = store.settle_upload
+
+def dies(settled):
+    if sys.argv[2] == "after":
+        settle(settled)
+    os.kill(os.getpid(), signal.SIGKILL)
+
+store.settle_upload = dies
+Expander(store, ShardConfig("victim"), print).work()
+"""
+
+
+@pytest.mark.parametrize("when", ["before", "after"])
+def test_a_worker_killed_before_or_after_the_journal_loses_and_doubles_nothing(store, desk, when):
+    """Both halves meet a worker that dies with its work in hand, and then one that has just made it durable."""
+    payload = PACKED
+    for status in ("wanted", "released"):
+        assert desk.ack(KEY, payload).status == "stored"
+        store.release("desk")  # so that the other may have it at once
+        died = subprocess.run([sys.executable, "-c", DIES, str(store.path), when], check=False, capture_output=True)
+        assert died.returncode == -signal.SIGKILL, died.stderr
+        store.release("victim")
+        desk.work()
+        state = desk.state(REPORT.vehicle, REPORT.report_id)
+        assert state.status == status
+        payload = second_half(REPORT, state) if state.wanted else b""
+    assert [row.part for row in store.reports()] == [0, 1]
     assert stored(store)[TILE].changed == REPORT.tiles[0].changed
 
 
