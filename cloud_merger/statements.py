@@ -166,7 +166,7 @@ def _statements(report: int, change: TileChange, voxels: NDArray[np.int32], quot
     rows[at >= 0] = _changed_states(change)[at[at >= 0]]
     rows["was"] = was
     rows["denies"] = (was == EPOCH) & np.isin(rows["kind"], (Kind.MEASURED, Kind.WITHHELD))
-    speaks[at >= 0] = _speaks(change)[at[at >= 0]]
+    speaks[at >= 0] = speaks_of_changed(change)[at[at >= 0]]
     rows["report"] = report
     spoken: Rows = rows[speaks]
     return spoken
@@ -190,8 +190,15 @@ def _states(gaussians: Gaussians, kind: Kind) -> Rows:
 
 def _changed_states(change: TileChange) -> Rows:
     rows = _states(change.changed, Kind.MEASURED)
-    rows["kind"][is_withheld(change)] = Kind.WITHHELD
+    rows["kind"] = kinds_of_changed(change)
     return rows
+
+
+def kinds_of_changed(change: TileChange) -> NDArray[np.uint8]:
+    """(N,) the `Kind` of statement that each changed entry makes, if it speaks."""
+    kinds = np.where(change.changed.exists, Kind.MEASURED, Kind.NOTHING).astype(np.uint8)
+    kinds[is_withheld(change)] = Kind.WITHHELD
+    return kinds
 
 
 def is_withheld(change: TileChange) -> NDArray[np.bool_]:
@@ -200,7 +207,7 @@ def is_withheld(change: TileChange) -> NDArray[np.bool_]:
     return np.asarray(flagged & ~change.changed.exists)
 
 
-def _speaks(change: TileChange) -> NDArray[np.bool_]:
+def speaks_of_changed(change: TileChange) -> NDArray[np.bool_]:
     """Changed entries that are a statement: not unmeasured, and no Gaussian from too few sub-cells."""
     weak = change.changed.exists & (change.changed.cells < N_MIN_CELLS)
     return np.asarray(~weak & (change.change_class != ChangeClass.UNMEASURED))
