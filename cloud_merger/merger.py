@@ -44,7 +44,9 @@ def run_shard(config: ShardConfig, stop: threading.Event) -> None:
             Reception(bus, members, ingest.answer, on_death=store.release).open()
             _LOG.info("merger %s: store %s, mode %s", config.shard_id, config.store_path, config.merge.mode)
             while not stop.wait(config.poll_s):
-                worker.keep_running()
+                if worker.has_ended():
+                    store.release(config.shard_id)  # what it had in hand need not wait for the ends of its leases
+                    worker.restart()
         store.release(config.shard_id)
 
 

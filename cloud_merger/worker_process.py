@@ -48,11 +48,14 @@ class WorkerProcess:
             if self._process.stdin is not None:
                 self._process.stdin.write(b"\n")
 
-    def keep_running(self) -> None:
-        """Start the worker again if it has ended, at most once a second."""
-        if self._process.poll() is not None and time.monotonic() - self._started_s > _RESTART_S:
-            _LOG.error("the worker has ended with status %s; it is started again", self._process.returncode)
-            self._process = self._start()
+    def has_ended(self) -> bool:
+        """Whether it is to be started again: it has ended, and was not started just now."""
+        return self._process.poll() is not None and time.monotonic() - self._started_s > _RESTART_S
+
+    def restart(self) -> None:
+        """Start a worker in place of one that has ended."""
+        _LOG.error("the worker has ended with status %s; it is started again", self._process.returncode)
+        self._process = self._start()
 
     def close(self) -> None:
         """End the worker: in order, or by force where that takes too long."""

@@ -182,8 +182,10 @@ def test_acks_come_while_the_worker_is_stopped_and_what_came_is_looked_at_when_i
 def test_a_worker_that_is_killed_is_started_again_and_one_whose_shard_is_killed_ends(cloud):
     cloud.start("left")
     report, worker = report_number(1), worker_of(cloud, "left")
-    os.kill(worker, signal.SIGKILL)
+    os.kill(worker, signal.SIGSTOP)
     assert send(cloud, report, packed_of(report)).status == "stored"
+    assert len(cloud.store.claim_uploads("left", 8, 3600.0)) == 1, "what it has in hand when it is killed"
+    os.kill(worker, signal.SIGKILL)
     wait_for("another worker has looked at it", lambda: state_of(cloud, report).status == "wanted")
     second = worker_of(cloud, "left")
     assert second != worker
