@@ -6,11 +6,11 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Final
 
+from cloud_merger.checking import IngestLimits
 from cloud_merger.confirmation import ConfirmationParameters
 from cloud_merger.errors import MergerError
 from cloud_merger.features.check import FeatureLimits
 from cloud_merger.features.parameters import FeatureMergeParameters
-from cloud_merger.ingest import IngestLimits
 from cloud_merger.merge import MergeParameters
 from cloud_merger.shift import ShiftParameters
 from cloud_merger.waiting import WaitingLimits
@@ -38,15 +38,17 @@ class ShardConfig:
         ingest: which reports are refused.
         feature_limits: which reports about features are refused.
         want: which Gaussians of reports in short are asked for.
-        waiting: how many reports may wait for their Gaussians.
+        waiting: for how many reports, and how long, Gaussians that were asked for are not asked of others.
         store: batching of the store.
         codec: how finely the Gaussians of tiles are rounded that no base map holds ("float": not at all); all shards of
             a store use the same. Other tiles stay as fine as their base.
         tiles_at_once: tiles claimed and published together.
+        expanders: threads that look at what was acknowledged.
+        uploads_at_once: uploads that such a thread claims together.
         lease_s: how long a claim holds; longer than a merge of `tiles_at_once` tiles takes.
         poll_s: how often to look for tiles and notices when nothing arrives here.
-        max_attempts: a tile whose merge fails so often is set aside.
-        retry_s: pause before a failed tile is tried again, times the number of attempts.
+        max_attempts: a tile whose merge fails so often is set aside; so is an upload that cannot be read so often.
+        retry_s: pause before a failed tile or upload is tried again, times the number of attempts.
         announce_at_once: publish a notice for at most so many versions in one round.
     """
 
@@ -65,6 +67,8 @@ class ShardConfig:
     store: StoreConfig = field(default_factory=StoreConfig)
     codec: str = DEFAULT_CODEC
     tiles_at_once: int = 16
+    expanders: int = 2
+    uploads_at_once: int = 8
     lease_s: float = 30.0
     poll_s: float = 0.2
     max_attempts: int = 5
@@ -75,8 +79,9 @@ class ShardConfig:
         if not _SHARD_ID.fullmatch(self.shard_id):
             raise MergerError(f"shard id {self.shard_id!r} must be 1 to 64 of letters, digits, '.', '_', '-'")
         lattice_named(self.codec)
-        if min(self.tiles_at_once, self.max_attempts, self.announce_at_once) < 1:
-            raise MergerError("tiles_at_once, max_attempts and announce_at_once must be at least 1")
+        at_least_one = ("tiles_at_once", "expanders", "uploads_at_once", "max_attempts", "announce_at_once")
+        if min(getattr(self, name) for name in at_least_one) < 1:
+            raise MergerError(f"{', '.join(at_least_one)} must be at least 1")
         if min(self.lease_s, self.poll_s) <= 0 or self.retry_s < 0:
             raise MergerError(
                 f"lease_s {self.lease_s} and poll_s {self.poll_s} must be positive, retry_s {self.retry_s} >= 0"

@@ -4,8 +4,7 @@ GndError
 └── MergerError   a parameter or configuration that cannot be used
     ├── BadReport  a report that cannot be a true statement about this map
     └── NotUnderstood   a report in short that means nothing here
-        ├── MissingBase a version that it was coded against is not here
-        └── MissingHalf the flags that its Gaussians belong to are not here
+        └── MissingBase a version that it was coded against is not here
 """
 
 from gnd_map.errors import GndError
@@ -25,7 +24,3 @@ class NotUnderstood(MergerError):
 
 class MissingBase(NotUnderstood):
     """A packed report was coded against a version that is not here; the message says which."""
-
-
-class MissingHalf(NotUnderstood):
-    """Gaussians came whose flags are not here (another shard has heard them), or that answer another question."""

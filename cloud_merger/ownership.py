@@ -7,8 +7,13 @@ Ownership spreads the ingest and keeps caches warm. It protects nothing: that is
 import threading
 from collections.abc import Collection
 from hashlib import blake2b
+from typing import Final
 
+from fleet_bus.bus import Bus
 from gnd_map.tile_id import District
+from schemas.keys import alive_keys, parse_alive_key
+
+ROLE: Final = "merger"
 
 
 def owner_of(district: District, members: Collection[str]) -> str:
@@ -43,3 +48,14 @@ class Members:
     def is_mine(self, district: District) -> bool:
         """Whether this shard owns the district among those that live."""
         return owner_of(district, self._living) == self.own
+
+
+def following(bus: Bus, own: str) -> Members:
+    """The members as they come and go from now on, for who only wants to know whose a district is."""
+    members = Members(own)
+
+    def note(key: str, alive: bool) -> None:
+        members.note(parse_alive_key(key)[1], alive=alive)
+
+    bus.watch_alive(alive_keys(ROLE), note)
+    return members

@@ -11,7 +11,7 @@ import threading
 from collections.abc import Callable
 from typing import Final
 
-from cloud_merger.ownership import Members
+from cloud_merger.ownership import ROLE, Members
 from fleet_bus.bus import Bus
 from fleet_bus.errors import NotMine
 from fleet_bus.serving import Request, Serving
@@ -20,8 +20,8 @@ from schemas.changes import ChangeAck
 from schemas.errors import SchemaError
 from schemas.keys import alive_key, alive_keys, change_key, change_keys, parse_alive_key, parse_change_key
 
-ROLE: Final = "merger"
-MAX_DECLARED: Final = 256  # each has two threads
+MAX_DECLARED: Final = 128
+WORKERS: Final = 8  # threads of each: acks that come at the same time share a commit
 _LOG = logging.getLogger(__name__)
 
 Place = tuple[str, District]  # layer and district
@@ -46,7 +46,7 @@ class Reception:
     def open(self) -> None:
         """Begin to receive; the sign of life comes last."""
         self._bus.watch_alive(alive_keys(ROLE), self._on_alive)
-        self._bus.serve(change_keys(), self._fallback, kind="change")
+        self._bus.serve(change_keys(), self._fallback, workers=WORKERS, kind="change")
         self._bus.declare_alive(alive_key(ROLE, self._members.own))
 
     @property
@@ -60,7 +60,7 @@ class Reception:
         with self._lock:
             if place in self._declared or not self._members.is_mine(place[1]):
                 return
-            serving = self._bus.serve(change_key(*place), self._own, complete=True, workers=2, kind="change")
+            serving = self._bus.serve(change_key(*place), self._own, complete=True, workers=WORKERS, kind="change")
             self._declared[place] = serving
             if len(self._declared) > MAX_DECLARED:
                 self._declared.pop(next(iter(self._declared))).close()

@@ -281,8 +281,8 @@ class _Changed:
     @classmethod
     def made(cls, change: TileChange) -> "_Changed":
         rows = _states(change.changed, np.arange(len(change.changed)), Kind.MEASURED)
-        rows["kind"][is_withheld(change)] = Kind.WITHHELD
-        return cls(change, rows, _speaks(change), np.isin(rows["kind"], (Kind.MEASURED, Kind.WITHHELD)))
+        rows["kind"] = kinds_of_changed(change)
+        return cls(change, rows, speaks_of_changed(change), np.isin(rows["kind"], (Kind.MEASURED, Kind.WITHHELD)))
 
 
 class _Remembered:
@@ -308,13 +308,20 @@ class _Remembered:
 _CHANGED: Final = _Remembered()
 
 
+def kinds_of_changed(change: TileChange) -> NDArray[np.uint8]:
+    """(N,) the `Kind` of statement that each changed entry makes, if it speaks."""
+    kinds = np.where(change.changed.exists, Kind.MEASURED, Kind.NOTHING).astype(np.uint8)
+    kinds[is_withheld(change)] = Kind.WITHHELD
+    return kinds
+
+
 def is_withheld(change: TileChange) -> NDArray[np.bool_]:
     """(N,) which changed voxels are new or modified without a Gaussian: flagged, and not asked for."""
     flagged = np.isin(change.change_class, (ChangeClass.NEW, ChangeClass.MODIFIED))
     return np.asarray(flagged & ~change.changed.exists)
 
 
-def _speaks(change: TileChange) -> NDArray[np.bool_]:
+def speaks_of_changed(change: TileChange) -> NDArray[np.bool_]:
     """Changed entries that are a statement: not unmeasured, and no Gaussian from too few sub-cells."""
     weak = change.changed.exists & (change.changed.cells < N_MIN_CELLS)
     return np.asarray(~weak & (change.change_class != ChangeClass.UNMEASURED))

@@ -5,7 +5,7 @@ can ask without a bus. Asking too little costs quality, asking too much costs by
 flag without its Gaussian is a vote already.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -15,9 +15,21 @@ from cloud_merger.errors import MergerError
 from cloud_merger.expanding import is_askable
 from cloud_merger.memory import TileMemory
 from cloud_merger.parameters import MergeParameters
-from cloud_merger.statements import Kind, Report, Rows, statements_of
+from cloud_merger.statements import (
+    EPOCH,
+    NO_BASE,
+    Kind,
+    Report,
+    Rows,
+    find,
+    kinds_of_changed,
+    same_state,
+    speaks_of_changed,
+    states_at,
+)
 from gnd_map.arrays import I32
 from gnd_map.classes import ChangeClass
+from gnd_map.day import day_of
 from gnd_map.gaussian import Gaussians
 from gnd_map.tile_id import TileId
 from schemas.changes import ChangeReport, TileChange
@@ -90,24 +102,88 @@ def wanted(
 def _wanted_of_tile(own: Report, known: Known, merge: MergeParameters, want: WantParameters) -> NDArray[np.bool_]:
     asked = is_askable(own.change)
     ids, modified = own.change.changed.voxel_id[asked], own.change.change_class[asked] == ChangeClass.MODIFIED
-    others = [report for report in known.reports if report.report_id != own.report_id]
-    memory = None if merge.mode == "paper" else known.memory
-    statements = statements_of(known.epoch, [*others, own], known.bases, merge.mode, memory)
-    rows = statements.rows[np.isin(statements.rows["voxel_id"], ids)]
-    seat = np.searchsorted(ids, rows["voxel_id"])
-    is_own = rows["report"] == statements.report_ids.index(own.report_id)
-    was = np.zeros(len(ids), np.int64)
-    was[seat[is_own]] = rows["was"][is_own]
-    others_rows, others_seat = rows[~is_own], seat[~is_own]
-    may_agree = _may_agree(others_rows, was[others_seat])
-    votes = own.weight + np.bincount(others_seat, others_rows["weight"] * may_agree, len(ids))
-    cast = own.weight + np.bincount(others_seat, others_rows["weight"], len(ids))
-    measured = may_agree & (others_rows["kind"] == Kind.MEASURED) & (others_rows["was"] == was[others_seat])
-    in_hand = np.bincount(others_seat, measured, len(ids)) + _promised(known.promised, ids)
+    votes, cast, in_hand = np.zeros((3, len(ids)))
+    for other, said in _said_by_others(own, known, merge, ids):
+        votes += other.weight * said.may_agree
+        cast += other.weight * said.speaks
+        in_hand += said.is_same
+    if merge.mode == "default":
+        remembered = _remembered(own, known, ids)
+        votes, cast, in_hand = votes + remembered[0], cast + remembered[1], in_hand + remembered[2]
+    votes, cast, in_hand = votes + own.weight, cast + own.weight, in_hand + _promised(known.promised, ids)
     xi = np.where(modified & (merge.mode == "default"), merge.xi_reshaped, merge.xi)
     may_win = votes > want.share * xi * cast
     asked_anyway = _sample(~may_win, 0 if merge.mode == "paper" else want.sample)
     return np.asarray((may_win & (in_hand < want.enough)) | asked_anyway)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Said:
+    """What another report says of the flagged voxels, each (N,) bool.
+
+    Attributes:
+        speaks: it makes a statement.
+        may_agree: one that may be of the Gaussian that was flagged: not that there is nothing, nor a quotation of the
+            very Gaussian which the flag denies.
+        is_same: a measured Gaussian of the same change: against the same state of the voxel.
+    """
+
+    speaks: NDArray[np.bool_]
+    may_agree: NDArray[np.bool_]
+    is_same: NDArray[np.bool_]
+
+
+def _said_by_others(own: Report, known: Known, merge: MergeParameters, ids: I32) -> Iterator[tuple[Report, _Said]]:
+    """What `statements_of` says of these voxels, without making statements of all others: by report id."""
+    bases = {NO_BASE: Gaussians.empty(), **known.bases} if merge.mode == "default" else {}
+    others = {report.report_id: report for report in known.reports if report.report_id != own.report_id}
+    held: dict[bytes, Rows] = {}
+    for sha in {own.change.base_sha} | {other.change.base_sha for other in others.values()}:
+        held[sha] = states_at(bases.get(sha, Gaussians.empty()), ids, Kind.QUOTED)
+    was = held[own.change.base_sha]
+    same_was = {sha: same_state(was, rows) for sha, rows in held.items()}
+    for _, other in sorted(others.items()):
+        sha = other.change.base_sha
+        yield other, _said(other.change, ids, held[sha] if sha in bases else None, same_was[sha])
+
+
+def _said(change: TileChange, ids: I32, quoted: Rows | None, same_was: NDArray[np.bool_]) -> _Said:
+    at = find(change.changed.voxel_id, ids)
+    is_changed = at >= 0
+    kind, speaks = np.full(len(ids), Kind.NOTHING, np.uint8), np.zeros(len(ids), np.bool_)
+    if quoted is not None:
+        kind[:] = quoted["kind"]
+        speaks[:] = find(change.observed, ids) >= 0
+    if is_changed.any():
+        rows = at[is_changed]
+        kind[is_changed] = kinds_of_changed(change)[rows]
+        speaks[is_changed] = speaks_of_changed(change)[rows]
+    quotes_the_denied = (kind == Kind.QUOTED) & same_was
+    may_agree = speaks & (kind != Kind.NOTHING) & ~quotes_the_denied
+    return _Said(speaks, may_agree, may_agree & (kind == Kind.MEASURED) & same_was)
+
+
+def _remembered(own: Report, known: Known, ids: I32) -> tuple[NDArray[np.float64], ...]:
+    """Of these voxels what the windows before say: votes that may agree with the flag, all votes, Gaussians in hand."""
+    n, bases = len(ids), {NO_BASE: Gaussians.empty(), **known.bases}
+    was = states_at(bases.get(own.change.base_sha, Gaussians.empty()), ids, Kind.QUOTED)
+    of_epoch = states_at(known.epoch, ids, Kind.QUOTED)
+    is_epoch = same_state(was, of_epoch)
+    support = known.memory.support_rows(ids, known.epoch, day_of(own.last_ns))
+    claims = known.memory.claims[find(ids, known.memory.claims["voxel_id"]) >= 0]
+    rows = np.concatenate([support, claims])
+    seat = np.searchsorted(ids, rows["voxel_id"])
+    quotes_the_denied = (rows["kind"] == Kind.QUOTED) & is_epoch[seat]
+    may_agree = (rows["kind"] != Kind.NOTHING) & ~quotes_the_denied
+    against = np.where(
+        rows["was"] == EPOCH, True, of_epoch["count"][seat] == 0
+    )  # the state that a claim was made against
+    in_hand = may_agree & (rows["kind"] == Kind.MEASURED) & is_epoch[seat] & against
+    return (
+        np.bincount(seat, rows["weight"] * may_agree, n),
+        np.bincount(seat, rows["weight"], n),
+        np.bincount(seat, in_hand, n).astype(np.float64),
+    )
 
 
 def _sample(outvoted: NDArray[np.bool_], n: int) -> NDArray[np.bool_]:
@@ -116,15 +192,6 @@ def _sample(outvoted: NDArray[np.bool_], n: int) -> NDArray[np.bool_]:
     if n and len(rows) >= max(n, len(outvoted) / 2):
         chosen[rows[:: len(rows) // n]] = True
     return chosen
-
-
-def _may_agree(rows: Rows, was: NDArray[np.int64]) -> NDArray[np.bool_]:
-    """(M,) which statements of others may be of the Gaussian that was flagged against state `was` (M,).
-
-    Not those that see nothing, nor those that quote the very Gaussian which the flag denies.
-    """
-    quotes = rows["kind"] == Kind.QUOTED
-    return np.asarray((rows["kind"] != Kind.NOTHING) & ~(quotes & (rows["was"] == was)))
 
 
 def _promised(promised: I32, ids: I32) -> NDArray[np.int64]:

@@ -212,7 +212,7 @@ class _Run:
 
     def settled(self) -> bool:
         """Tell whether no tile waits for a merge."""
-        return self.store.dirty_count() == 0
+        return "waiting" not in self.store.upload_counts().by_state and self.store.dirty_count() == 0
 
     def watcher_caught_up(self) -> bool:
         """Tell whether the watcher has seen every published version."""

@@ -17,6 +17,11 @@ def kernel(function: F) -> F:
     return cast("F", numba.njit(cache=True, error_model="numpy", nogil=True)(function))
 
 
+def inlined(function: F) -> F:
+    """As `kernel`, laid into its callers."""
+    return cast("F", numba.njit(cache=True, error_model="numpy", nogil=True, forceinline=True)(function))
+
+
 # numba's own name for it. A version without it would refuse it at import, not go on slower.
 _BARE: Final[dict[str, Any]] = {"cache": True, "error_model": "numpy", "nogil": True, "_nrt": False}
 

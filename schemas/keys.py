@@ -56,6 +56,20 @@ KEY_TABLE: Final = (
         reliability="durable before the ack; sent again under the same report id until acknowledged",
     ),
     KeySpec(
+        pattern=f"{ROOT}/want/<vehicle>",
+        kind="put, merger shard → agent, after the commit",
+        request="ReportStates",
+        reply="–",
+        reliability="may be lost; the agent then asks on its state key",
+    ),
+    KeySpec(
+        pattern=f"{ROOT}/state/<vehicle>",
+        kind="query, agent → merger shard",
+        request="ReportQuestion",
+        reply="ReportStates",
+        reliability="asked again until the report is released",
+    ),
+    KeySpec(
         pattern=f"{ROOT}/update/<layer>/<q5>/<q10>/<q15>/<q20>",
         kind="put, merger → anyone, after the commit",
         request="TileUpdate",
@@ -131,6 +145,21 @@ def update_keys(layer: str, prefix: str = "") -> str:
     return f"{ROOT}/update/{_layer(layer)}/{_region(prefix)}"
 
 
+def want_key(vehicle: str) -> str:
+    """Where a vehicle hears how far its reports have come."""
+    return f"{ROOT}/want/{_matching('vehicle', vehicle, VEHICLE_PATTERN)}"
+
+
+def state_key(vehicle: str) -> str:
+    """Where a vehicle asks how far its reports have come."""
+    return f"{ROOT}/state/{_matching('vehicle', vehicle, VEHICLE_PATTERN)}"
+
+
+def state_keys() -> str:
+    """Every key on which vehicles ask how far their reports have come."""
+    return f"{ROOT}/state/*"
+
+
 def traffic_key(vehicle: str) -> str:
     """Where a vehicle puts its traffic samples."""
     return f"{ROOT}/traffic/{_matching('vehicle', vehicle, VEHICLE_PATTERN)}"
@@ -179,6 +208,12 @@ def parse_change_key(key: str) -> tuple[str, District]:
 def parse_traffic_key(key: str) -> str:
     """The vehicle of a traffic key; `BadKey`, `WrongVersion`."""
     (vehicle,) = _chunks(key, "traffic", 1)
+    return _matching("vehicle", vehicle, VEHICLE_PATTERN)
+
+
+def parse_state_key(key: str) -> str:
+    """The vehicle of a state key; `BadKey`, `WrongVersion`."""
+    (vehicle,) = _chunks(key, "state", 1)
     return _matching("vehicle", vehicle, VEHICLE_PATTERN)
 
 

@@ -20,6 +20,8 @@ MAX_PACKED_REPORT_BYTES: Final = 1 * MIB
 MAX_PACKED_GAUSSIANS_BYTES: Final = 4 * MIB
 MAX_FEATURE_REPORT_BYTES: Final = 1 * MIB
 MAX_CHANGE_ACK_BYTES: Final = 64 * KIB
+MAX_REPORT_STATES_BYTES: Final = 64 * KIB
+MAX_REPORT_QUESTION_BYTES: Final = 4 * KIB
 MAX_TILE_UPDATE_BYTES: Final = MAX_TILE_BODY_BYTES + KIB
 MAX_TRAFFIC_SAMPLE_BYTES: Final = 16 * KIB
 
@@ -41,10 +43,15 @@ MAX_OBSERVED_OF_REPORT: Final = 8 * MIB
 
 # Flags of a packed report: each becomes a statement that is kept and merged.
 MAX_FLAGS_OF_REPORT: Final = 256 * KIB
+# A report ends at most so long after it is received: the clocks of vehicles differ. Old ones are welcome.
+MAX_AHEAD_NS: Final = 300_000_000_000
 # Way of a packed report's track: the cloud looks along all of it.
 MAX_WAY_OF_REPORT_M: Final = 3_000.0
 # Bits of a mask in an ack, were it not compressed at all.
 MAX_WANTED_BYTES: Final = MAX_FLAGS_OF_REPORT // 8 + KIB
+
+# Reports of a vehicle that one question is about, and fields of the answer.
+MAX_REPORTS_OF_QUESTION: Final = 64
 
 # Features of one tile, and points of one feature: a motorway's gantry has some twenty signs, a lane's piece some ten
 # points a tile. A look is one camera image's or one scan's detections.

@@ -38,3 +38,9 @@ def report_id_of_bytes(data: bytes) -> str:
     if len(data) != _RANDOM_BYTES + _TIME_BYTES:
         raise BadValue(f"report id has {len(data)} bytes, expected {_RANDOM_BYTES + _TIME_BYTES}")
     return str(ULID.from_bytes(data))
+
+
+def bytes_of_report_id(report_id: str) -> bytes:
+    """The 16 bytes of a report id; `BadValue` when it is none."""
+    with refusing(f"report id {report_id[:40]!r}"):
+        return bytes(ULID.from_str(report_id).bytes)

@@ -7,6 +7,7 @@ StoreBusy            another process has held the write lock for too long
 StoreClosed          it was used after close()
 UnknownVersion       the tile has no such version
 UnknownReports       a publication names reports that the store does not hold
+IdTaken              a report has the id of another vehicle's
 """
 
 from gnd_map.errors import GndError
@@ -34,3 +35,7 @@ class UnknownVersion(StoreError):
 
 class UnknownReports(StoreError):
     """A publication names reports that the store does not hold for its tile."""
+
+
+class IdTaken(StoreError):
+    """A report has the id of another vehicle's report about the same tile: it needs another in the journal."""

@@ -96,6 +96,8 @@ def _prepare(connection: apsw.Connection, path: Path, busy_timeout_s: float) -> 
         _in_one(connection, lambda: _add_parts(connection))
     if not fetch(connection, "has_schema_of_journal"):
         _in_one(connection, lambda: _add_journal(connection))
+    if not fetch(connection, "has_schema_of_uploads"):
+        _in_one(connection, lambda: connection.execute(SQL["schema_of_uploads"]))
 
 
 def _add_parts(connection: apsw.Connection) -> None:

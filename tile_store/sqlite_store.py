@@ -18,11 +18,13 @@ from tile_store import sqlite_confirmation as confirmation
 from tile_store import sqlite_inbox as inbox
 from tile_store import sqlite_journal as journal
 from tile_store import sqlite_refuted as refuted
+from tile_store import sqlite_uploads as uploads
 from tile_store import sqlite_versions as versions
 from tile_store.errors import StoreError, UnknownVersion
 from tile_store.provenance import Provenance, decode_provenance
 from tile_store.regions import morton_range
 from tile_store.sqlite_connection import ReaderPool, change, fetch, open_writer
+from tile_store.uploads import FirstHalf, Settled, Upload, UploadClaim, UploadCounts, UploadStatus
 from tile_store.values import (
     DEFAULT_LAYER,
     Basis,
@@ -101,6 +103,52 @@ class SqliteStore:
     def _timing(self) -> dict[str, Any]:
         return inbox.timing_of(self._config, self._now_ns())
 
+    # Uploads
+
+    def put_upload(self, upload: Upload, home: str) -> PutStatus:
+        """See `Store.put_upload`."""
+        return self._writer.run(lambda c: uploads.put(c, upload, home))
+
+    def claim_uploads(self, owner: str, n: int, lease_s: float) -> list[UploadClaim]:
+        """See `Store.claim_uploads`."""
+        # As with tiles: who looks often takes no write lock for nothing.
+        with self._readers.snapshot() as c:
+            if not uploads.any_claimable(c, owner):
+                return []
+        return self._writer.run(lambda c: uploads.claim(c, owner, n, lease_s))
+
+    def postpone_upload(self, claim: UploadClaim, delay_s: float) -> None:
+        """See `Store.postpone_upload`."""
+        self._writer.run(lambda c: uploads.postpone(c, claim, delay_s))
+
+    def settle_upload(self, settled: Settled) -> bool:
+        """See `Store.settle_upload`."""
+        return self._writer.run(lambda c: uploads.settle(c, settled, self._config, self._now_ns()))
+
+    def first_halves(self, key: str, report_id: str) -> list[FirstHalf]:
+        """See `Store.first_halves`."""
+        with self._readers.snapshot() as c:
+            return uploads.first_halves(c, key, report_id)
+
+    def first_parts(self, layer: str, report_id: str, tiles: Sequence[TileId]) -> list[ReportRow]:
+        """See `Store.first_parts`."""
+        with self._readers.snapshot() as c:
+            return uploads.parts(c, layer, report_id, tiles)
+
+    def upload_statuses(self, vehicle: str, report_ids: Sequence[str]) -> list[UploadStatus]:
+        """See `Store.upload_statuses`."""
+        with self._readers.snapshot() as c:
+            return uploads.statuses(c, vehicle, report_ids)
+
+    def upload_counts(self) -> UploadCounts:
+        """See `Store.upload_counts`."""
+        with self._readers.snapshot() as c:
+            return uploads.counts(c)
+
+    def forget_uploads(self, before_ns: int) -> int:
+        """See `Store.forget_uploads`."""
+        return self._writer.run(lambda c: uploads.forget(c, before_ns))
+
     # The inbox
 
     def put_reports(self, rows: Sequence[ReportRow]) -> list[PutStatus]:
@@ -166,7 +214,7 @@ class SqliteStore:
 
     def release(self, owner: str) -> int:
         """See `Store.release`."""
-        return self._writer.run(lambda c: inbox.release(c, owner))
+        return self._writer.run(lambda c: (inbox.release(c, owner), uploads.release(c, owner))[0])
 
     def postpone(self, claim: Claim, delay_s: float) -> None:
         """See `Store.postpone`."""

@@ -7,6 +7,7 @@ from typing import Protocol
 from gnd_map.content import AnyTile
 from gnd_map.tile_id import TileId
 from schemas.tiles import CatalogEntry
+from tile_store.uploads import FirstHalf, Settled, Upload, UploadClaim, UploadCounts, UploadStatus
 from tile_store.values import (
     DEFAULT_LAYER,
     Basis,
@@ -37,6 +38,38 @@ class Store(Protocol):
     Every method may be called from any thread, and several processes may use one store at a time. What writes returns
     only when the change is durable. Every method raises StoreError (one line) when the store cannot do it.
     """
+
+    # Uploads
+
+    def put_upload(self, upload: Upload, home: str) -> PutStatus:
+        """Keep a message as it came, received by shard `home`; the same bytes on the same key are a "duplicate"."""
+
+    def claim_uploads(self, owner: str, n: int, lease_s: float) -> list[UploadClaim]:
+        """Lease up to `n` uploads that wait, the oldest first; one that was claimed before comes alone."""
+
+    def postpone_upload(self, claim: UploadClaim, delay_s: float) -> None:
+        """Give an upload back, to be claimed again after `delay_s`."""
+
+    def settle_upload(self, settled: Settled) -> bool:
+        """Apply what has become of a claimed upload, all or nothing: its rows in the journal, its state, that of the
+        flags that it answers. False, and nothing is applied: its lease is another's. IdTaken: the report id is another
+        vehicle's on one of the tiles.
+        """
+
+    def first_halves(self, key: str, report_id: str) -> list[FirstHalf]:
+        """The flags that have come under a report id on a key."""
+
+    def first_parts(self, layer: str, report_id: str, tiles: Sequence[TileId]) -> list[ReportRow]:
+        """The parts 0 that the journal holds of a report about these tiles, in this order."""
+
+    def upload_statuses(self, vehicle: str, report_ids: Sequence[str]) -> list[UploadStatus]:
+        """How far a vehicle's reports have come; those of which the store holds nothing are left out."""
+
+    def upload_counts(self) -> UploadCounts:
+        """How many uploads are in which state."""
+
+    def forget_uploads(self, before_ns: int) -> int:
+        """Forget what came before a time and is settled; the number forgotten. The journal keeps its reports."""
 
     # The inbox
 
@@ -69,7 +102,7 @@ class Store(Protocol):
         """Prolong leases; False where the lease has gone to another owner."""
 
     def release(self, owner: str) -> int:
-        """Free all leases of an owner (it has died); the number freed."""
+        """Free all leases of an owner (it has died), those of uploads too; the number of tiles freed."""
 
     def postpone(self, claim: Claim, delay_s: float) -> None:
         """Give a tile back, to be ready again after `delay_s` (its merge has failed)."""

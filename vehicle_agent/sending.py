@@ -1,7 +1,8 @@
-"""The thread that empties the outbox: each report is sent until somebody acknowledges it.
+"""The thread that empties the outbox: each report is sent until it is acknowledged, and kept until it is released.
 
-A report in short goes in two messages: its flags, and then the Gaussians that the answer asks for. Where the cloud
-cannot make sense of the short form, for whatever reason, the whole report follows: only what is refused whole is
+A report in short goes in two messages: its flags, and then the Gaussians that the cloud asks for. It asks on the
+vehicle's own key once it has looked at the flags; where no word comes, the vehicle asks after its reports. Where the
+cloud cannot make sense of the short form, for whatever reason, the whole report follows: only what is refused whole is
 refused.
 """
 
@@ -12,38 +13,45 @@ from collections import Counter
 
 from fleet_bus.bus import Bus
 from fleet_bus.errors import BusClosed, MessageTooLarge, RequestRefused
-from gnd_map.errors import CodecError
+from gnd_map.errors import CodecError, GndError
 from schemas.changes import ChangeAck, ChangeReport
 from schemas.errors import SchemaError
+from schemas.keys import state_key, want_key
+from schemas.report_states import ReportQuestion, ReportState, ReportStates
 from vehicle_agent.errors import PackingError
 from vehicle_agent.outbox import ANSWERS, Letter, Outbox
 from vehicle_agent.packing import pack_measured
 
 POLL_S = 0.2
 REQUEST_S = 20.0
-SHORT_TRIES = 2  # flags again, when another shard that has not heard them was asked to take their Gaussians
-
-ACKNOWLEDGED = ("stored", "duplicate")
+QUESTION_S = 5.0
 
 _log = logging.getLogger(__name__)
 
 
 class SenderThread:
-    """Sends what is due, oldest first, from its start to `close`; a failure never ends it."""
+    """Sends what is due, oldest first, from its start to `close`; a failure never ends it.
 
-    def __init__(self, bus: Bus, outbox: Outbox) -> None:
+    Args:
+        bus: open.
+        outbox: what is to be sent.
+        vehicle: its pseudonym, whose key tells what is wanted.
+    """
+
+    def __init__(self, bus: Bus, outbox: Outbox, vehicle: str) -> None:
         self.last_error = ""
-        self.counts: Counter[str] = Counter()  # messages by form: flags, gaussians, whole
-        self._bus, self._outbox = bus, outbox
-        self._stop = threading.Event()
+        self.counts: Counter[str] = Counter()  # messages by form: flags, gaussians, whole, questions
+        self._bus, self._outbox, self._vehicle = bus, outbox, vehicle
+        self._stop, self._wake = threading.Event(), threading.Event()
         outbox.retry_now()  # what an earlier life of this agent left here goes first
+        bus.subscribe(want_key(vehicle), self._on_notice, kind="ack")
         self._thread = threading.Thread(target=self._run, name="outbox", daemon=True)
         self._thread.start()
 
     def drain(self, timeout_s: float, stop: threading.Event) -> bool:
-        """Wait until nothing is pending; False when time is up or `stop` is set."""
+        """Wait until all is released or refused; False when time is up or `stop` is set."""
         deadline_s = time.monotonic() + timeout_s
-        while self._outbox.counts().pending:
+        while self._outbox.counts().open:
             if time.monotonic() > deadline_s or stop.wait(POLL_S):
                 return False
         return True
@@ -51,63 +59,93 @@ class SenderThread:
     def close(self) -> None:
         """End the thread; a request under way ends with the bus or its deadline."""
         self._stop.set()
+        self._wake.set()
         self._thread.join()
 
     def _run(self) -> None:
         while not self._stop.is_set():
+            self._wake.clear()
             letters = self._outbox.due(time.time_ns())
             for letter in letters:
                 if self._stop.is_set():
                     return
                 self._send(letter)
-            if not letters:
-                self._stop.wait(POLL_S)
+            if not letters and not self._ask_after():
+                self._wake.wait(POLL_S)
 
     def _send(self, letter: Letter) -> None:
         try:
-            self._record(letter, self._in_short(letter) or self._ask(letter, letter.body, "whole"))
+            self._record(letter, *self._asked(letter))
         except BusClosed:
             self._stop.set()
         except (RequestRefused, MessageTooLarge) as error:
-            self._outbox.answered(letter.report_id, "quarantined", str(error))
+            self._refused(letter, str(error))
+        except (CodecError, PackingError) as error:  # no Gaussians can be made of what the outbox holds
+            self._go_whole(letter, str(error))
         except Exception as error:  # whatever it was: this thread is all that empties the outbox
             self._outbox.failed(letter, time.time_ns(), str(error))
             self.last_error = str(error)
             _log.warning("report %s not acknowledged: %s", letter.report_id, error)
 
-    def _in_short(self, letter: Letter) -> ChangeAck | None:
-        """The acknowledgement of a report sent in short; None: it is to be sent whole."""
-        if not letter.packed:
-            return None
-        try:
-            for _ in range(SHORT_TRIES):
-                answers = self._two_halves(letter)
-                if answers[-1].status in ACKNOWLEDGED:
-                    return answers[-1]
-                if len(answers) == 1 or answers[-1].status != "resend":
-                    break
-            reason = f"{answers[-1].status} {answers[-1].reason}"
-        except (RequestRefused, MessageTooLarge, CodecError, SchemaError, PackingError) as error:
-            reason = str(error)
-        _log.warning("report %s goes whole: %s", letter.report_id, reason)
-        return None
-
-    def _two_halves(self, letter: Letter) -> list[ChangeAck]:
-        """The answer to the flags, and where that asks for Gaussians the answer to these."""
-        ack = self._ask(letter, letter.packed, "flags")
-        if ack.status != "wanted":
-            return [ack]
-        report, bases = ChangeReport.decode(letter.body), self._outbox.bases_of(letter.report_id)
-        return [ack, self._ask(letter, pack_measured(report, bases, ack.wanted).encode(), "gaussians")]
-
-    def _ask(self, letter: Letter, payload: bytes, form: str) -> ChangeAck:
+    def _asked(self, letter: Letter) -> tuple[ChangeAck, str]:
+        """The answer to the next message of a report, and its form."""
+        payload, form = letter.body, "whole"
+        if letter.wanted:
+            report, bases = ChangeReport.decode(letter.body), self._outbox.bases_of(letter.report_id)
+            payload, form = pack_measured(report, bases, letter.wanted).encode(), "gaussians"
+        elif letter.packed:
+            payload, form = letter.packed, "flags"
         self.counts[form] += 1
-        return ChangeAck.decode(self._bus.request(letter.key, payload, kind="change", timeout_s=REQUEST_S))
+        return ChangeAck.decode(self._bus.request(letter.key, payload, kind="change", timeout_s=REQUEST_S)), form
 
-    def _record(self, letter: Letter, ack: ChangeAck) -> None:
+    def _record(self, letter: Letter, ack: ChangeAck, form: str) -> None:
         """An acknowledgement counts for its own report only, and a whole report has nothing left to ask for."""
-        if ack.status not in ANSWERS:
-            raise SchemaError(f"report {letter.report_id} was sent whole and answered {ack.status!r}")
         if ack.status != "quarantined" and ack.report_id != letter.report_id:
             raise SchemaError(f"report {letter.report_id} was answered for report {ack.report_id}")
-        self._outbox.answered(letter.report_id, ack.status, ack.reason)
+        if form == "whole" and ack.status not in ANSWERS:
+            raise SchemaError(f"report {letter.report_id} was sent whole and answered {ack.status!r}")
+        if ack.status == "wanted":
+            self._outbox.told(ReportState(letter.report_id, "wanted", ack.wanted), time.time_ns())
+        elif ack.status in ("quarantined", "resend"):
+            self._refused(letter, ack.reason)
+        else:
+            now_ns, is_short = time.time_ns(), form != "whole"
+            self._outbox.answered(letter.report_id, ack.status, now_ns=now_ns, wanted=letter.wanted, is_short=is_short)
+
+    def _refused(self, letter: Letter, reason: str) -> None:
+        """Only a whole report is refused for good."""
+        if letter.packed or letter.wanted:
+            self._go_whole(letter, reason)
+        else:
+            self._outbox.answered(letter.report_id, "quarantined", reason)
+
+    def _go_whole(self, letter: Letter, reason: str) -> None:
+        _log.warning("report %s goes whole: %s", letter.report_id, reason)
+        self._outbox.send_whole(letter.report_id, reason)
+
+    def _on_notice(self, _key: str, payload: bytes) -> None:
+        self._hear(ReportStates.decode(payload))
+
+    def _hear(self, states: ReportStates) -> None:
+        for state in states.states:
+            self._outbox.told(state, time.time_ns())
+        self._wake.set()
+
+    def _ask_after(self) -> bool:
+        """Ask after reports of which no word has come; False when there are none."""
+        try:
+            report_ids = self._outbox.unheard(time.time_ns())
+            if not report_ids:
+                return False
+            self._outbox.asked(report_ids, time.time_ns())
+            self.counts["questions"] += 1
+            question = ReportQuestion(tuple(report_ids)).encode()
+            answer = self._bus.request(state_key(self._vehicle), question, kind="change", timeout_s=QUESTION_S)
+            self._hear(ReportStates.decode(answer))
+        except BusClosed:
+            self._stop.set()
+        except GndError as error:
+            self.last_error = str(error)
+            _log.warning("nothing heard of stored reports: %s", error)
+            self._stop.wait(POLL_S)
+        return True

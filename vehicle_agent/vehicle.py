@@ -161,9 +161,9 @@ class Vehicle:
             self.features.finish()
 
     def upload(self) -> None:
-        """Wait until the outbox is empty, for a bounded time."""
+        """Wait until the cloud has all that it wants of the reports, for a bounded time."""
         if not self.link.sender.drain(self.config.report.drain_s, self.stop):
-            _log.warning("%s: %d reports are not acknowledged", self.config.vehicle, self.link.outbox.counts().pending)
+            _log.warning("%s: %d reports are not released", self.config.vehicle, self.link.outbox.counts().open)
 
     def sample(self) -> TrafficSample:
         """The ledger's totals, position and health, for the bus."""

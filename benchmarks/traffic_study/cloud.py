@@ -1,7 +1,7 @@
 """The cloud in this process: the store, ingest and merges as in a merger, reached by a call instead of a bus."""
 
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from types import TracebackType
@@ -10,11 +10,14 @@ from typing import Final, Self
 from benchmarks.simulation.base_map import BaseMap
 from benchmarks.traffic_study.errors import TrafficError
 from cloud_merger.config import ShardConfig
+from cloud_merger.expander import Expander
 from cloud_merger.ingest import Ingest
 from cloud_merger.merge import MergeParameters
-from cloud_merger.short_reports import ShortReports
+from cloud_merger.states import answer
 from cloud_merger.work import Worker
 from gnd_map.tile import Tile
+from schemas.keys import change_keys, want_key
+from schemas.report_states import ReportState, ReportStates
 from tile_store.sqlite_store import SqliteStore
 from tile_store.values import DEFAULT_CODEC, DEFAULT_LAYER, StoreConfig
 
@@ -27,11 +30,16 @@ _BETWEEN_NS: Final = 3600 * 1_000_000_000
 
 @dataclass(frozen=True, slots=True)
 class Message:
-    """One request of a vehicle and its answer."""
+    """One request of a vehicle and its answer; or a notice, which has no request."""
 
     key: str
     request: bytes
     reply: bytes
+
+    @property
+    def is_notice(self) -> bool:
+        """Whether the cloud began to speak."""
+        return not self.request
 
 
 class Cloud:
@@ -47,14 +55,15 @@ class Cloud:
     def __init__(self, path: Path, base: BaseMap, merge: MergeParameters, codec: str = DEFAULT_CODEC) -> None:
         for old in path.parent.glob(f"{path.name}*"):
             old.unlink()
-        config = ShardConfig(store_path=path, merge=merge, codec=codec, store=StoreConfig(merge_delay_s=0.0))
+        store = StoreConfig(merge_delay_s=0.0)
+        config = ShardConfig(_OWNER, path, merge=merge, codec=codec, store=store)
         self._later_ns = 0
         self.store = SqliteStore(path, config.store, now_ns=self._now_ns)
         self.store.put_tiles(Tile(tile, 1, gaussians) for tile, gaussians in base.tiles.items())
-        short = ShortReports(self.store, config.merge, config.want, config.waiting)
-        self._ingest = Ingest(self.store, config.ingest, now_ns=self._now_ns, short=short)
+        self._ingest, self._expander = Ingest(self.store, _OWNER), Expander(self.store, config, self._tell)
         self._worker = Worker(self.store, config)
         self._messages: list[Message] = []
+        self._hearers: dict[str, Callable[[str, bytes], None]] = {}
 
     def __enter__(self) -> Self:
         return self
@@ -66,9 +75,21 @@ class Cloud:
 
     def request(self, key: str, payload: bytes, **_how: object) -> bytes:
         """Answer a vehicle as a merger does; in place of `fleet_bus.Bus.request`."""
-        reply = self._ingest.answer(key, payload).encode()
+        is_report = key.startswith(change_keys().removesuffix("**"))
+        reply = self._ingest.answer(key, payload).encode() if is_report else answer(self.store, key, payload)
         self._messages.append(Message(key, payload, reply))
+        while self._expander.work():
+            pass
         return reply
+
+    def subscribe(self, key: str, callback: Callable[[str, bytes], None], **_how: object) -> None:
+        """Tell a vehicle what is wanted of it; in place of `fleet_bus.Bus.subscribe`."""
+        self._hearers[key] = callback
+
+    def _tell(self, vehicle: str, state: ReportState) -> None:
+        key, notice = want_key(vehicle), ReportStates((state,)).encode()
+        self._messages.append(Message(key, b"", notice))
+        self._hearers[key](key, notice)
 
     def heard(self) -> list[Message]:
         """Return the messages since the last call."""

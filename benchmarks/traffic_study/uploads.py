@@ -23,11 +23,12 @@ from gnd_map.classes import ChangeClass
 from gnd_map.codec import decode_mask
 from gnd_map.tile import Tile
 from schemas.bitmap import encode_observed
-from schemas.changes import ChangeAck, ChangeReport, TileChange
+from schemas.changes import ChangeReport, TileChange
 from schemas.drive import GnssFix, MotionSample
 from schemas.drive_messages import fix_of, motion_message_of
 from schemas.keys import change_key
 from schemas.packed import PackedGaussians, PackedReport, decode_upload
+from schemas.report_states import ReportStates
 from vehicle_agent.outbox import Outbox
 from vehicle_agent.packing import askable, is_measured
 from vehicle_agent.sending import SenderThread
@@ -47,7 +48,7 @@ class DriveUpload:
         vehicle: its name.
         km: way driven.
         messages: how many questions went up.
-        parts: bytes by `PARTS`: payloads and keys up; `acks`, the answers, down.
+        parts: bytes by `PARTS`: payloads and keys up; `acks`, answers and notices, down.
         changed: voxels that it reports as new, modified or deleted; by class in `classes`.
         wanted: Gaussians that the cloud asked for.
         observed: voxels observed.
@@ -102,7 +103,7 @@ def upload(result: VehicleResult, held: BaseMap, cloud: Cloud) -> DriveUpload:
     return DriveUpload(
         vehicle=result.vehicle,
         km=result.stats["way_m"] / 1e3,
-        messages=len(messages),
+        messages=sum(not message.is_notice for message in messages),
         parts=_parts(messages),
         changed=sum(len(change.changed) for change in changes),
         classes=_classes(changes),
@@ -123,7 +124,7 @@ def _send(result: VehicleResult, reports: list[ChangeReport], held: BaseMap, clo
         for report, body, packed in zip(reports, result.reports, result.packed, strict=True):
             bases = [_base(change, held) for change in report.tiles if change.base_sha and is_measured(change).any()]
             outbox.put(report.report_id, change_key(report.layer, report.district), body, packed, bases)
-        sender = SenderThread(cast("Bus", cloud), outbox)
+        sender = SenderThread(cast("Bus", cloud), outbox, result.vehicle)
         try:
             done = sender.drain(_WAIT_S, threading.Event())
         finally:
@@ -144,8 +145,11 @@ def _base(change: TileChange, held: BaseMap) -> Tile:
 def _parts(messages: list[Message]) -> dict[str, int]:
     parts: Counter[str] = Counter(dict.fromkeys(PARTS, 0))
     for message in messages:
-        parts["keys"] += len(message.key)
         parts["acks"] += len(message.reply)
+        if message.is_notice:
+            parts["acks"] += len(message.key)
+            continue
+        parts["keys"] += len(message.key)
         said = decode_upload(message.request)
         if isinstance(said, PackedReport):
             parts["flags"] += len(said.flags)
@@ -157,12 +161,12 @@ def _parts(messages: list[Message]) -> dict[str, int]:
 
 
 def _wanted(message: Message, reports: list[ChangeReport]) -> int:
-    """How many Gaussians an answer asks for."""
-    ack = ChangeAck.decode(message.reply)
-    if ack.status != "wanted":
+    """How many Gaussians a notice asks for."""
+    if not message.is_notice:
         return 0
-    report = next(report for report in reports if report.report_id == ack.report_id)
-    return int(decode_mask(ack.wanted, askable(report)).sum())
+    by_id = {report.report_id: report for report in reports}
+    told = [state for state in ReportStates.decode(message.reply).states if state.wanted]
+    return sum(int(decode_mask(state.wanted, askable(by_id[state.report_id])).sum()) for state in told)
 
 
 def _classes(changes: list[TileChange]) -> dict[str, int]:

@@ -91,7 +91,7 @@ class FeatureInbox:
             raise BadReport(f"report for {report.layer} {report.district} came on the key of {layer} {district}")
         check_feature_report(report, self._limits, lambda tile, sha: self._ids(layer, tile, sha))
         for change in report.tiles:
-            if not change.base_sha:
+            if not change.base_sha or self._contents.content(layer, change.tile, change.base_sha) is None:
                 self._check_reach(change.tile)
 
     def rows(self, report: FeatureReport, received_ns: int) -> list[ReportRow]:

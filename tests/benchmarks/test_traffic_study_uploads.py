@@ -123,10 +123,10 @@ def test_a_short_half_that_cannot_be_read_is_followed_by_the_whole_report(cloud:
 
 def test_a_report_that_is_refused_is_no_upload(cloud: Cloud) -> None:
     base = cloud.map()
-    unknown = BaseMap({TILE: grounds([0, 1, 7], 0.1)})
-    report = report_of(1, unknown)
+    good = report_of(1, base)
+    report = replace(good, tiles=(replace(good.tiles[0], pose_sigma_m=0.8),))
     with pytest.raises(TrafficError, match="0 of 1 reports"):
-        upload(result_of(report, unknown, packed=b""), unknown, cloud)
+        upload(result_of(report, base, packed=b""), base, cloud)
     with pytest.raises(TrafficError, match="refused"):
         cloud.merge()
     assert base.shas == cloud.map().shas

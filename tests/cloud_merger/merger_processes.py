@@ -106,6 +106,13 @@ class Cloud:
     def signal(self, name: str, number: signal.Signals) -> None:
         self.shards[name].send_signal(number)
 
+    def kill(self, *names: str) -> None:
+        """kill -9, and wait until they are gone."""
+        for name in names:
+            self.signal(name, signal.SIGKILL)
+            self.shards[name].wait()
+        wait_for(f"{names} are gone", lambda: not set(names) & self.living)
+
     def log(self, name: str) -> str:
         return (self._log / f"{name}.log").read_text()
 
@@ -117,8 +124,9 @@ class Cloud:
         return ChangeAck.decode(reply)
 
     def is_settled(self) -> bool:
-        """Whether every report is merged and every version announced."""
-        return self.store.dirty_count() == 0 and not self.store.notices()
+        """Whether every upload is looked at, every report merged and every version announced."""
+        is_looked_at = "waiting" not in self.store.upload_counts().by_state
+        return is_looked_at and self.store.dirty_count() == 0 and not self.store.notices()
 
     def versions(self) -> set[tuple[TileId, int]]:
         """Every version in the store after the first import."""

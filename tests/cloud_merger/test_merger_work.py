@@ -16,9 +16,9 @@ from merger_world import (
     report_of,
     tile_of_states,
 )
+from upload_desk import Desk
 
 from cloud_merger.config import ShardConfig
-from cloud_merger.ingest import Ingest, IngestLimits
 from cloud_merger.work import Worker
 from gnd_map.tile_id import TileId
 from schemas.keys import change_key
@@ -47,7 +47,7 @@ def worker(store, tmp_path):
 def put(store, number, tile=TILE, changed=None, base=BASE, version=1):
     changed = {2: POLE} if changed is None else changed
     report = report_of(number, change_of(base, [0, 1, 2], changed, tile=tile, version=version))
-    assert Ingest(store, IngestLimits()).answer(KEY, report.encode()).status == "stored"
+    assert Desk(store).send(KEY, report.encode()).status == "released"
     return report.report_id
 
 

@@ -1,7 +1,9 @@
 """Reports in short through real shards and a real router: halves that meet another shard, kills, and the same map."""
 
+import os
 import signal
 import threading
+import time
 from pathlib import Path
 
 import pytest
@@ -10,15 +12,14 @@ from merger_world import BALL, POLE, TILE, VOXEL_BY_VOXEL, WALL_AGAIN, report_of
 from short_world import bases_of, flagged, packed_of, tile_at
 
 from cloud_merger.config import ShardConfig
-from cloud_merger.ownership import owner_of
 from cloud_merger.work import Worker
 from fleet_bus.bus import open_bus
 from fleet_bus.config import BusConfig
 from fleet_bus.requesting import RetryPolicy
 from gnd_map.tile_id import TileId
 from schemas.changes import ChangeAck, ChangeReport
-from schemas.keys import change_key
-from schemas.packed import decode_upload
+from schemas.keys import change_key, state_key
+from schemas.report_states import ReportQuestion, ReportState, ReportStates
 from tile_store.sqlite_store import SqliteStore
 from tile_store.values import StoreConfig
 from vehicle_agent.outbox import Outbox
@@ -45,7 +46,9 @@ def report_number(n):
     first = FIRST[n % len(FIRST)]
     new = {3: (POLE, POLE, BALL)[n % 3]}
     said = {"new": new, "modified": {1: WALL_AGAIN}} if n % 5 else {"new": new, "deleted": (1,)}
-    return report_of(n, *(flagged(tile=TileId(first.morton + k), **said) for k in range(1 + n % 2)))
+    return report_of(
+        n, *(flagged(tile=TileId(first.morton + k), **said) for k in range(1 + n % 2)), vehicle=f"car-{n % 3}"
+    )
 
 
 def send(cloud, report: ChangeReport, payload: bytes) -> ChangeAck:
@@ -66,25 +69,33 @@ def merged_anew(path: Path, reports) -> dict:
         return {head.tile: head.sha for head in store.heads()}
 
 
+def state_of(cloud, report) -> ReportState:
+    """What the vehicle hears when it asks."""
+    question = ReportQuestion((report.report_id,)).encode()
+    retry = RetryPolicy(longest_wait_s=0.2, attempt_timeout_s=5.0)
+    answer = cloud.bus.request(state_key(report.vehicle), question, kind="change", retry=retry, timeout_s=DEADLINE_S)
+    return ReportStates.decode(answer).states[0]
+
+
 @pytest.mark.slow
-def test_a_shard_killed_between_the_halves_costs_a_second_question_and_nothing_else(cloud):
+def test_shards_killed_between_ack_and_expansion_and_between_the_halves_lose_and_double_nothing(cloud):
+    """Every step meets shards that have just been killed: what is durable is all that they know."""
     cloud.start(*SHARDS)
     report = report_number(1)
-    owner = owner_of(report.district, SHARDS)
-    first = send(cloud, report, packed_of(report))
-    assert first.status == "wanted"
-    assert cloud.store.counts().report_rows == 0
-    cloud.signal(owner, signal.SIGKILL)
-    second = pack_measured(report, bases_of(report), first.wanted).encode()
-    assert send(cloud, report, second).status == "resend"
-    again = send(cloud, report, packed_of(report))
-    assert again == first, "the same store, the same question"
+    assert send(cloud, report, packed_of(report)).status == "stored"
+    cloud.kill(*SHARDS)  # before or after they looked at it
+    cloud.start(*SHARDS)
+    wait_for("the flags are looked at", lambda: state_of(cloud, report).status == "wanted")
+    wanted = state_of(cloud, report).wanted
+    second = pack_measured(report, bases_of(report), wanted).encode()
     assert send(cloud, report, second).status == "stored"
-    assert send(cloud, report, second).status == "duplicate"
-    assert send(cloud, report, report.encode()).status == "duplicate"
-    assert cloud.store.counts().report_rows == len(report.tiles)
+    cloud.kill(*SHARDS)
+    cloud.start(*SHARDS)
+    wait_for("the Gaussians are looked at", lambda: state_of(cloud, report).status == "released")
+    assert [send(cloud, report, half).status for half in (packed_of(report), second)] == ["duplicate"] * 2
+    rows = sorted((row.tile, row.part) for row in cloud.store.reports())
+    assert rows == sorted((change.tile, part) for change in report.tiles for part in (0, 1))
     wait_for("all is merged and announced", cloud.is_settled)
-    assert {tile for tile, _ in cloud.versions()} == {change.tile for change in report.tiles}
     for change in report.tiles:
         merged = cloud.store.get("ndt", change.tile).decode().gaussians
         assert set(change.changed.voxel_id.tolist()) <= set(merged.voxel_id.tolist())
@@ -102,7 +113,7 @@ def test_senders_lose_nothing_and_apply_nothing_twice_while_a_shard_is_killed(cl
             key, bases = change_key("ndt", report.district), [tile_at(change.tile) for change in report.tiles]
             assert outbox.put(report.report_id, key, report.encode(), packed_of(report), bases)
         with open_bus(BusConfig(connect=(cloud.endpoint,)), name=f"car-{k}") as bus:
-            sender = SenderThread(bus, outbox)
+            sender = SenderThread(bus, outbox, f"car-{k}")
             wait_for("some are acknowledged", lambda: outbox.counts().acknowledged > 1)
             if not killed.is_set():
                 killed.set()
@@ -116,24 +127,67 @@ def test_senders_lose_nothing_and_apply_nothing_twice_while_a_shard_is_killed(cl
     in_threads(3, vehicle)
     wait_for("all is merged and announced", cloud.is_settled)
     assert cloud.store.counts().reports == len(reports)
-    assert cloud.store.counts().report_rows == sum(len(report.tiles) for report in reports)
+    first = [row for row in cloud.store.reports() if row.part == 0]
+    assert len(first) == sum(len(report.tiles) for report in reports)
     assert cloud.store.quarantined() == []
     rows = list(cloud.store.reports())
+    assert set(cloud.store.upload_counts().by_state) == {"released"}
     asked = sum(int(c.changed.exists.sum()) for row in rows for c in ChangeReport.decode(row.body).tiles)
     assert 0 < asked < sum(int(c.changed.exists.sum()) for report in reports for c in report.tiles)
     assert {head.tile: head.sha for head in cloud.store.heads()} == merged_anew(tmp_path / "plain.sqlite", rows)
 
 
 @pytest.mark.slow
-def test_halves_outlive_a_restart_of_the_router(cloud):
+def test_what_is_wanted_outlives_a_restart_of_the_router_and_a_lost_notice(cloud):
     cloud.start(*SHARDS)
     report = report_number(3)
-    first = send(cloud, report, packed_of(report))
-    assert first.status == "wanted"
+    assert send(cloud, report, packed_of(report)).status == "stored"  # nobody hears the notice
     cloud.restart_router(lambda: None)
     wait_for("both live again", lambda: cloud.living == set(SHARDS))
-    ack = send(cloud, report, pack_measured(report, bases_of(report), first.wanted).encode())
-    assert ack.status == "stored"
-    assert decode_upload(packed_of(report)).report_id == ack.report_id
+    wait_for("the flags are looked at", lambda: state_of(cloud, report).status == "wanted")
+    second = pack_measured(report, bases_of(report), state_of(cloud, report).wanted).encode()
+    assert send(cloud, report, second).status == "stored"
+    wait_for("the Gaussians are looked at", lambda: state_of(cloud, report).status == "released")
     wait_for("all is merged and announced", cloud.is_settled)
     assert cloud.store.counts().reports == 1
+
+
+def worker_of(cloud, name) -> int:
+    """Process id of a shard's worker."""
+    shard = cloud.shards[name].pid
+    return int(Path(f"/proc/{shard}/task/{shard}/children").read_text().split()[0])
+
+
+@pytest.mark.slow
+def test_acks_come_while_the_worker_is_stopped_and_what_came_is_looked_at_when_it_goes_on(cloud):
+    cloud.start("left")
+    report = report_number(100)
+    send(cloud, report, packed_of(report))
+    wait_for("the worker works", lambda: state_of(cloud, report).status != "waiting")
+    worker = worker_of(cloud, "left")
+    os.kill(worker, signal.SIGSTOP)
+    reports, took_s = [report_number(n) for n in range(40)], []
+    for report in reports:
+        start_s = time.monotonic()
+        assert send(cloud, report, packed_of(report)).status == "stored"
+        took_s.append(time.monotonic() - start_s)
+    assert sorted(took_s)[20] < 0.5
+    assert {state_of(cloud, report).status for report in reports} == {"waiting"}
+    os.kill(worker, signal.SIGCONT)
+    wait_for("all is looked at and merged", cloud.is_settled)
+    assert cloud.store.counts().reports == 41
+
+
+@pytest.mark.slow
+def test_a_worker_that_is_killed_is_started_again_and_one_whose_shard_is_killed_ends(cloud):
+    cloud.start("left")
+    report, worker = report_number(1), worker_of(cloud, "left")
+    os.kill(worker, signal.SIGSTOP)
+    assert send(cloud, report, packed_of(report)).status == "stored"
+    assert len(cloud.store.claim_uploads("left", 8, 3600.0)) == 1, "what it has in hand when it is killed"
+    os.kill(worker, signal.SIGKILL)
+    wait_for("another worker has looked at it", lambda: state_of(cloud, report).status == "wanted")
+    second = worker_of(cloud, "left")
+    assert second != worker
+    cloud.kill("left")
+    wait_for("its worker has ended", lambda: not Path(f"/proc/{second}").exists())

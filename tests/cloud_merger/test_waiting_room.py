@@ -1,24 +1,13 @@
-"""First halves wait in bounded memory, for a bounded time."""
+"""Promises of Gaussians are remembered within bounds, for a bounded time."""
 
 import numpy as np
 import pytest
-from merger_world import NEIGHBOUR, POLE, TILE
-from short_world import KEY, drive_number, packed_of
+from merger_world import NEIGHBOUR, TILE
 
 from cloud_merger.errors import MergerError
-from cloud_merger.waiting import Waiting, WaitingLimits, WaitingRoom
-from gnd_map.codec import encode_mask
-from schemas.packed import PackedReport, decode_upload
+from cloud_merger.waiting import Promises, WaitingLimits
 
 SECOND = 1_000_000_000
-
-
-def waiting(number):
-    report = drive_number(number, new={3: POLE})
-    packed = decode_upload(packed_of(report))
-    assert isinstance(packed, PackedReport)
-    mask = np.array([True])
-    return Waiting(KEY, packed, report, mask, encode_mask(mask), {TILE: np.array([3], np.int32)})
 
 
 class Clock:
@@ -34,73 +23,45 @@ def clock():
     return Clock()
 
 
-def held(room, *numbers):
-    return [room.get(waiting(n).packed.report_id) is not None for n in numbers]
+def asked(*voxels, tile=TILE):
+    return {tile: np.array(voxels, np.int32)}
+
+
+def test_what_was_asked_of_others_is_promised_and_own_is_not(clock):
+    promises = Promises(WaitingLimits(), clock)
+    promises.note("a", "ndt", asked(3, 4))
+    promises.note("b", "ndt", asked(4))
+    promises.note("c", "ndt_other", asked(4))
+    assert sorted(promises.of(TILE, "ndt", but="c").tolist()) == [3, 4, 4]
+    assert promises.of(TILE, "ndt", but="b").tolist() == [3, 4]
+    assert promises.of(NEIGHBOUR, "ndt", but="c").tolist() == []
 
 
 def test_the_oldest_make_room(clock):
-    room = WaitingRoom(WaitingLimits(reports=2), clock)
-    for number in (1, 2, 3):
-        room.hold(waiting(number))
-    assert held(room, 1, 2, 3) == [False, True, True]
+    promises = Promises(WaitingLimits(reports=2), clock)
+    for number, name in enumerate("abc"):
+        promises.note(name, "ndt", asked(number))
+    assert promises.of(TILE, "ndt", but="").tolist() == [1, 2]
 
 
-def test_voxels_are_bounded_however_few_the_reports(clock):
-    room = WaitingRoom(WaitingLimits(voxels=2 * waiting(1).voxels), clock)
-    for number in (1, 2, 3):
-        room.hold(waiting(number))
-    assert held(room, 1, 2, 3) == [False, True, True]
-    room.forget(waiting(2).packed.report_id)
-    room.hold(waiting(4))
-    assert held(room, 3, 4) == [True, True], "what was forgotten weighs nothing"
-
-
-def test_one_report_may_be_larger_than_the_room(clock):
-    room = WaitingRoom(WaitingLimits(voxels=1), clock)
-    room.hold(waiting(1))
-    assert held(room, 1) == [True]
-
-
-def test_what_nobody_comes_back_for_is_forgotten_and_no_longer_promised(clock):
-    room = WaitingRoom(WaitingLimits(keep_s=10.0), clock)
-    room.hold(waiting(1))
+def test_a_promise_that_is_not_kept_in_time_counts_no_more(clock):
+    promises = Promises(WaitingLimits(keep_s=10), clock)
+    promises.note("a", "ndt", asked(1))
     clock.now = 10 * SECOND
-    room.hold(waiting(2))
-    assert room.promised(TILE, "ndt", but="").tolist() == [3, 3]
+    assert promises.of(TILE, "ndt", but="").tolist() == [1]
     clock.now += 1
-    assert held(room, 1, 2) == [False, True]
-    assert room.promised(TILE, "ndt", but="").tolist() == [3]
+    assert promises.of(TILE, "ndt", but="").tolist() == []
 
 
-def test_a_report_that_is_held_again_is_held_once(clock):
-    room = WaitingRoom(WaitingLimits(voxels=2 * waiting(1).voxels), clock)
-    for _ in range(3):
-        room.hold(waiting(1))
-    room.hold(waiting(2))
-    assert len(room) == 2
+def test_a_promise_that_was_kept_is_forgotten(clock):
+    promises = Promises(WaitingLimits(), clock)
+    promises.note("a", "ndt", asked(1))
+    promises.forget("a")
+    promises.forget("never there")
+    assert len(promises) == 0
 
 
-def test_promises_are_those_of_other_reports_on_this_tile_and_layer(clock):
-    room = WaitingRoom(WaitingLimits(), clock)
-    room.hold(waiting(1))
-    room.hold(waiting(2))
-    assert room.promised(TILE, "ndt", but=waiting(1).packed.report_id).tolist() == [3]
-    assert room.promised(NEIGHBOUR, "ndt", but="").tolist() == []
-    assert room.promised(TILE, "signs", but="").tolist() == []
-    room.finish(waiting(2).packed.report_id)
-    assert room.promised(TILE, "ndt", but="").tolist() == [3]
-
-
-def test_finished_reports_are_known_up_to_a_number(clock):
-    room = WaitingRoom(WaitingLimits(finished=2), clock)
-    room.hold(waiting(1))
-    for name in ("a", waiting(1).packed.report_id, "b"):
-        room.finish(name)
-    assert held(room, 1) == [False]
-    assert [room.has_finished(name) for name in ("a", waiting(1).packed.report_id, "b")] == [False, True, True]
-
-
-@pytest.mark.parametrize("limits", [{"reports": 0}, {"voxels": 0}, {"keep_s": 0.0}, {"finished": 0}])
-def test_absurd_limits_are_refused(limits):
+@pytest.mark.parametrize("bad", [{"reports": 0}, {"keep_s": 0.0}])
+def test_limits_that_cannot_work_are_refused(bad):
     with pytest.raises(MergerError, match="must be positive"):
-        WaitingLimits(**limits)
+        WaitingLimits(**bad)

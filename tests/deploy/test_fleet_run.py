@@ -26,16 +26,16 @@ def final_map(folder: Path) -> dict[int, bytes]:
         return {h.tile.tile.morton: content_sha(h.tile.tile, h.after) for h in tile_histories(store)}
 
 
-def report_ids(folder: Path) -> list[tuple[int, str]]:
+def report_parts(folder: Path) -> list[tuple[int, str, int]]:
     with SqliteStore(folder / "store.sqlite") as store:
-        return [(row.tile.morton, row.report_id) for row in store.reports()]
+        return [(row.tile.morton, row.report_id, row.part) for row in store.reports()]
 
 
 def assert_nothing_lost_or_doubled(run: Run, summary: dict[str, object]) -> None:
     assert summary["reports_lost"] == 0
     assert summary["reports_sent"] == summary["reports_acknowledged"]
     assert int(str(summary["reports_sent"])) > 0
-    rows = report_ids(run.folder)
+    rows = report_parts(run.folder)
     assert len(rows) == len(set(rows))
     with SqliteStore(run.folder / "store.sqlite") as store:
         assert lost_reports(RunFolder(run.folder), store) == []

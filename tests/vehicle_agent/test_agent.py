@@ -70,8 +70,10 @@ class Cloud:
         self.store.close()
 
     def reports(self) -> dict[str, list[ChangeReport]]:
+        """What counts: of each tile of a report its part 1 where there is one, else part 0."""
+        newest = {(row.report_id, row.tile): row for row in sorted(self.store.reports("ndt"), key=lambda row: row.part)}
         found: dict[str, list[ChangeReport]] = {}
-        for row in self.store.reports("ndt"):
+        for row in newest.values():
             found.setdefault(row.report_id, []).append(ChangeReport.decode(row.body))
         return found
 
@@ -105,7 +107,8 @@ def test_a_drive_ends_with_everything_acknowledged_and_a_second_life_sends_nothi
     assert result["tiles_downloaded"] == len(cloud_of.store.heads("ndt"))
     assert result["reports_sent"] == result["reports_acknowledged"] == len(cloud_of.reports()) >= 1
     assert result["reports_pending"] == result["reports_quarantined"] == 0
-    assert result["report_messages"] == {"flags": result["reports_sent"], "gaussians": result["reports_sent"]}
+    messages = {form: n for form, n in result["report_messages"].items() if form != "questions"}
+    assert messages == {"flags": result["reports_sent"], "gaussians": result["reports_sent"]}
     assert cloud_of.store.quarantined() == []
     assert result["changed_voxels"] == sum(
         len(c.changed) for r in cloud_of.reports().values() for p in r for c in p.tiles

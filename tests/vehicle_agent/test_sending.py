@@ -12,8 +12,9 @@ from fleet_bus.errors import Refused
 from fleet_bus.serving import Request
 from gnd_map.tile_id import District
 from schemas.changes import ChangeAck
-from schemas.keys import change_key, change_keys
+from schemas.keys import change_key, change_keys, state_key, state_keys, want_key
 from schemas.report_id import deterministic_report_id
+from schemas.report_states import ReportQuestion, ReportState, ReportStates
 from vehicle_agent.outbox import Outbox
 from vehicle_agent.sending import SenderThread
 
@@ -37,7 +38,7 @@ def start(bus: Bus, outbox: Outbox) -> Iterator[Opener]:
     opened: list[SenderThread] = []
 
     def open_sender() -> SenderThread:
-        opened.append(SenderThread(bus, outbox))
+        opened.append(SenderThread(bus, outbox, "vehicle"))
         return opened[-1]
 
     yield open_sender
@@ -47,14 +48,17 @@ def start(bus: Bus, outbox: Outbox) -> Iterator[Opener]:
 
 
 class Inbox:
-    """Answers reports with a status and remembers them."""
+    """Answers reports with a status, remembers them, and tells that they are released."""
 
-    def __init__(self, status: str = "stored", reason: str = "") -> None:
-        self.status, self.reason = status, reason
+    def __init__(self, cloud: Bus, status: str = "stored", reason: str = "") -> None:
+        self.cloud, self.status, self.reason = cloud, status, reason
         self.bodies: list[bytes] = []
 
     def __call__(self, request: Request) -> bytes:
         self.bodies.append(request.payload)
+        if self.status != "quarantined":
+            told = ReportStates((ReportState(request.payload.decode(), "released"),))
+            self.cloud.publish(want_key("vehicle"), told.encode(), kind="ack")
         return ChangeAck(request.payload.decode(), self.status, self.reason).encode()  # type: ignore[arg-type]
 
 
@@ -63,7 +67,7 @@ def test_reports_wait_until_somebody_answers(start: Opener, outbox: Outbox, clou
     sender = start()
     assert not sender.drain(0.3, NEVER)
     assert outbox.counts().pending == 1
-    inbox = Inbox()
+    inbox = Inbox(cloud)
     cloud.serve(change_keys(), inbox)
     assert sender.drain(15.0, NEVER)
     assert outbox.counts().acknowledged == 1
@@ -73,7 +77,7 @@ def test_reports_wait_until_somebody_answers(start: Opener, outbox: Outbox, clou
 def test_the_oldest_goes_first_and_a_duplicate_counts_as_acknowledged(
     start: Opener, outbox: Outbox, cloud: Bus
 ) -> None:
-    inbox = Inbox("duplicate")
+    inbox = Inbox(cloud, "duplicate")
     cloud.serve(change_keys(), inbox)
     ids = sorted(report_id(n) for n in range(5))
     for number in reversed(ids):
@@ -84,7 +88,7 @@ def test_the_oldest_goes_first_and_a_duplicate_counts_as_acknowledged(
 
 
 def test_a_quarantined_report_is_kept_with_its_reason(start: Opener, outbox: Outbox, cloud: Bus) -> None:
-    cloud.serve(change_keys(), Inbox("quarantined", "covariance of voxel 7 is absurd"))
+    cloud.serve(change_keys(), Inbox(cloud, "quarantined", "covariance of voxel 7 is absurd"))
     outbox.put(report_id(1), KEY, report_id(1).encode())
     assert start().drain(15.0, NEVER)
     assert outbox.refused() == [(report_id(1), "covariance of voxel 7 is absurd")]
@@ -113,8 +117,9 @@ def test_a_restarted_sender_sends_only_what_is_open(start: Opener, outbox: Outbo
     outbox.put(report_id(1), KEY, report_id(1).encode())
     outbox.put(report_id(2), KEY, report_id(2).encode())
     outbox.answered(report_id(1), "stored")
+    outbox.told(ReportState(report_id(1), "released"), 0)
     outbox.failed(outbox.due(0)[0], 10**19 // 2, "the agent was killed here")
-    inbox = Inbox()
+    inbox = Inbox(cloud)
     cloud.serve(change_keys(), inbox)
     assert start().drain(15.0, NEVER)
     assert inbox.bodies == [report_id(2).encode()]
@@ -125,3 +130,46 @@ def test_draining_ends_when_the_agent_is_stopped(start: Opener, outbox: Outbox) 
     stop = threading.Event()
     stop.set()
     assert not start().drain(60.0, stop)
+
+
+def test_a_lost_notice_is_asked_for_and_the_end_of_the_drive_waits_for_it(
+    start: Opener, outbox: Outbox, cloud: Bus
+) -> None:
+    """Nobody tells anything: after four seconds the vehicle asks after all that is held, in one message."""
+    asked = []
+
+    def answer(request: Request) -> bytes:
+        asked.append((request.key, ReportQuestion.decode(request.payload).report_ids))
+        states = (ReportState(one, "waiting" if len(asked) == 1 else "released") for one in asked[-1][1])
+        return ReportStates(tuple(states)).encode()
+
+    cloud.serve(change_keys(), lambda request: ChangeAck(request.payload.decode(), "stored").encode())
+    cloud.serve(state_keys(), answer)
+    ids = tuple(report_id(n) for n in (1, 2))
+    for number in sorted(ids):
+        outbox.put(number, KEY, number.encode())
+    sender = start()
+    assert not sender.drain(2.0, NEVER)
+    assert (outbox.counts().acknowledged, outbox.counts().held, asked) == (2, 2, [])
+    assert sender.drain(15.0, NEVER)
+    assert asked == [(state_key("vehicle"), tuple(sorted(ids)))] * 2
+    assert sender.counts == {"whole": 2, "questions": 2}
+
+
+def test_an_agent_that_was_killed_asks_at_once_after_what_it_had_sent(
+    start: Opener, outbox: Outbox, cloud: Bus
+) -> None:
+    outbox.put(report_id(1), KEY, report_id(1).encode())
+    outbox.answered(report_id(1), "stored", now_ns=10**19 // 2)
+    cloud.serve(state_keys(), lambda _: ReportStates((ReportState(report_id(1), "released"),)).encode())
+    assert start().drain(3.0, NEVER)
+
+
+def test_a_cloud_that_has_forgotten_a_report_gets_it_again(start: Opener, outbox: Outbox, cloud: Bus) -> None:
+    """A store put back from a backup of before the ack."""
+    outbox.put(report_id(1), KEY, report_id(1).encode())
+    outbox.answered(report_id(1), "stored")
+    cloud.serve(state_keys(), lambda _: ReportStates((ReportState(report_id(1), "unknown"),)).encode())
+    cloud.serve(change_keys(), inbox := Inbox(cloud))
+    assert start().drain(15.0, NEVER)
+    assert inbox.bodies == [report_id(1).encode()]

@@ -23,10 +23,11 @@ from gnd_map.gaussian import Gaussians
 from gnd_map.tile import Tile
 from gnd_map.track import Piece, Track, View
 from schemas.changes import ChangeAck, ChangeReport, TileChange
-from schemas.keys import change_key, change_keys
+from schemas.keys import change_key, change_keys, state_keys, want_key
 from schemas.packed import PackedGaussians, PackedReport, decode_upload
 from schemas.report_id import deterministic_report_id
-from vehicle_agent.outbox import Outbox
+from schemas.report_states import ReportState, ReportStates, ReportStatus
+from vehicle_agent.outbox import Outbox, OutboxCounts
 from vehicle_agent.packing import pack
 from vehicle_agent.sending import SenderThread
 
@@ -80,7 +81,7 @@ def start(bus: Bus, outbox: Outbox) -> Iterator[Opener]:
     opened: list[SenderThread] = []
 
     def open_sender() -> SenderThread:
-        opened.append(SenderThread(bus, outbox))
+        opened.append(SenderThread(bus, outbox, "vehicle"))
         return opened[-1]
 
     yield open_sender
@@ -89,26 +90,34 @@ def start(bus: Bus, outbox: Outbox) -> Iterator[Opener]:
         sender.close()
 
 
-class Script:
-    """Answers each message by the next line of a script and remembers what came."""
+Told = ReportState | Exception
 
-    def __init__(self, *answers: ChangeAck | Exception) -> None:
-        self.answers, self.heard = list(answers), list[Upload]()
+
+class Script:
+    """Acknowledges each message and tells the next line of a script, also to who asks; remembers what came."""
+
+    def __init__(self, cloud: Bus, *lines: Told) -> None:
+        self.cloud, self.lines, self.heard = cloud, list(lines), list[Upload]()
 
     def __call__(self, request: Request) -> bytes:
         self.heard.append(decode_upload(request.payload))
-        answer = self.answers.pop(0)
-        if isinstance(answer, Exception):
-            raise answer
-        return answer.encode()
+        line = self.lines.pop(0)
+        if isinstance(line, Exception):
+            raise line
+        self.last = line
+        self.cloud.publish(want_key("vehicle"), ReportStates((line,)).encode(), kind="ack")
+        return ChangeAck(REPORT_ID, "stored").encode()
+
+    def state(self, _request: Request) -> bytes:
+        return ReportStates((self.last,)).encode()
 
     @property
     def kinds(self) -> list[str]:
         return [type(upload).__name__ for upload in self.heard]
 
 
-def ack(status: str, wanted: bytes = b"", report_id: str = REPORT_ID) -> ChangeAck:
-    return ChangeAck(report_id, status, "a reason" if status in ("quarantined", "resend") else "", wanted)  # type: ignore[arg-type]
+def told(status: ReportStatus, wanted: bytes = b"") -> ReportState:
+    return ReportState(REPORT_ID, status, wanted, "a reason" if status in ("quarantined", "resend") else "")
 
 
 def some(report: ChangeReport) -> np.ndarray:
@@ -120,15 +129,16 @@ FORMS = {"flags": "PackedReport", "gaussians": "PackedGaussians", "whole": "Chan
 
 def run(start: Opener, cloud: Bus, script: Script) -> None:
     cloud.serve(change_keys(), script, workers=1)
+    cloud.serve(state_keys(), script.state)  # a notice may overtake the ack, and is asked for then
     sender = start()
     assert sender.drain(20.0, NEVER)
-    assert Counter({FORMS[form]: n for form, n in sender.counts.items()}) == Counter(script.kinds)
+    assert Counter({FORMS[form]: n for form, n in sender.counts.items() if form in FORMS}) == Counter(script.kinds)
 
 
 def test_what_the_cloud_has_enough_of_is_one_message(
     start: Opener, outbox: Outbox, cloud: Bus, report: ChangeReport
 ) -> None:
-    run(start, cloud, script := Script(ack("stored")))
+    run(start, cloud, script := Script(cloud, told("released")))
     (packed,) = script.heard
     assert isinstance(packed, PackedReport)
     assert len(packed.encode()) < len(report.encode()) / 10
@@ -140,7 +150,7 @@ def test_the_gaussians_that_are_asked_for_follow_and_no_others(
     start: Opener, outbox: Outbox, cloud: Bus, report: ChangeReport, tile: Tile
 ) -> None:
     mask = some(report)
-    run(start, cloud, script := Script(ack("wanted", encode_mask(mask)), ack("stored")))
+    run(start, cloud, script := Script(cloud, told("wanted", encode_mask(mask)), told("released")))
     assert script.kinds == ["PackedReport", "PackedGaussians"]
     second = script.heard[1]
     assert isinstance(second, PackedGaussians)
@@ -149,49 +159,52 @@ def test_the_gaussians_that_are_asked_for_follow_and_no_others(
     assert outbox.counts().acknowledged == 1
 
 
-def test_gaussians_that_reach_a_shard_which_has_not_heard_the_flags_begin_again(
+def test_gaussians_are_made_long_after_the_ack_of_their_flags(
     start: Opener, outbox: Outbox, cloud: Bus, report: ChangeReport
 ) -> None:
-    wanted = encode_mask(some(report))
-    run(start, cloud, script := Script(ack("wanted", wanted), ack("resend"), ack("wanted", wanted), ack("stored")))
-    assert script.kinds == ["PackedReport", "PackedGaussians"] * 2
-    assert outbox.counts().acknowledged == 1
-
-
-def test_a_report_that_finds_no_shard_twice_goes_whole(
-    start: Opener, outbox: Outbox, cloud: Bus, report: ChangeReport
-) -> None:
-    asked = ack("wanted", encode_mask(some(report)))
-    run(start, cloud, script := Script(asked, ack("resend"), asked, ack("resend"), ack("stored")))
-    assert script.kinds == ["PackedReport", "PackedGaussians", "PackedReport", "PackedGaussians", "ChangeReport"]
-    assert script.heard[-1] == report
+    script = Script(cloud, told("waiting"), told("released"))
+    cloud.serve(change_keys(), script, workers=1)
+    sender = start()
+    wait_until(lambda: outbox.counts().held)
+    assert not sender.drain(1.0, NEVER)
+    notice = ReportStates((told("wanted", encode_mask(some(report))),)).encode()
+    cloud.publish(want_key("vehicle"), notice, kind="ack")
+    assert sender.drain(10.0, NEVER)
+    assert script.kinds == ["PackedReport", "PackedGaussians"]
 
 
 @pytest.mark.parametrize(
-    "answer",
-    [
-        ack("resend"),
-        ack("quarantined"),
-        ack("quarantined", report_id=""),
-        Refused("only whole reports here"),
-        ack("wanted", b"no mask at all"),
-    ],
+    "line", [told("resend"), told("quarantined"), Refused("only whole reports here"), told("wanted", b"no mask at all")]
 )
 def test_flags_that_are_not_understood_are_followed_by_the_whole_report(
-    start: Opener, outbox: Outbox, cloud: Bus, report: ChangeReport, answer: ChangeAck | Exception
+    start: Opener, outbox: Outbox, cloud: Bus, report: ChangeReport, line: Told
 ) -> None:
-    run(start, cloud, script := Script(answer, ack("stored")))
+    run(start, cloud, script := Script(cloud, line, told("released")))
     assert script.kinds == ["PackedReport", "ChangeReport"]
     assert script.heard[-1] == report
     assert outbox.counts().acknowledged == 1
 
 
+def test_flags_that_are_refused_instead_of_acknowledged_are_followed_by_the_whole_report(
+    start: Opener, outbox: Outbox, cloud: Bus, report: ChangeReport
+) -> None:
+    heard = []
+
+    def answer(request: Request) -> bytes:
+        heard.append(decode_upload(request.payload))
+        return ChangeAck("" if len(heard) == 1 else REPORT_ID, "quarantined", "a reason").encode()
+
+    cloud.serve(change_keys(), answer, workers=1)
+    assert start().drain(20.0, NEVER)
+    assert [type(upload).__name__ for upload in heard] == ["PackedReport", "ChangeReport"]
+    assert outbox.refused() == [(REPORT_ID, "a reason")], "only the refusal of the whole counts"
+
+
 def test_refused_gaussians_are_followed_by_the_whole_report_and_only_its_refusal_counts(
     start: Opener, outbox: Outbox, cloud: Bus, report: ChangeReport
 ) -> None:
-    run(
-        start, cloud, script := Script(ack("wanted", encode_mask(some(report))), ack("quarantined"), ack("quarantined"))
-    )
+    lines = told("wanted", encode_mask(some(report))), told("resend"), told("quarantined")
+    run(start, cloud, script := Script(cloud, *lines))
     assert script.kinds == ["PackedReport", "PackedGaussians", "ChangeReport"]
     assert outbox.refused() == [(REPORT_ID, "a reason")]
 
@@ -200,36 +213,22 @@ def test_bases_damaged_on_the_disk_cost_only_bytes(
     start: Opener, outbox: Outbox, cloud: Bus, report: ChangeReport
 ) -> None:
     outbox._db.run("UPDATE base SET body = x'00'")
-    run(start, cloud, script := Script(ack("wanted", encode_mask(some(report))), ack("stored")))
+    run(start, cloud, script := Script(cloud, told("wanted", encode_mask(some(report))), told("released")))
     assert script.kinds == ["PackedReport", "ChangeReport"]
     assert outbox.counts().acknowledged == 1
 
 
-def test_a_whole_report_that_is_answered_by_a_question_is_sent_again(
-    start: Opener, outbox: Outbox, cloud: Bus, report: ChangeReport
-) -> None:
-    script = Script(ack("resend"), ack("resend"), ack("stored"))
-    cloud.serve(change_keys(), script, workers=1)
-    sender = start()
-    wait_until(lambda: "was sent whole and answered 'resend'" in sender.last_error)
-    assert sender.drain(20.0, NEVER)
-    assert script.kinds == ["PackedReport", "ChangeReport", "PackedReport"]
-
-
-def test_an_agent_killed_between_the_halves_begins_with_the_flags_again(
+def test_an_agent_killed_after_the_ack_of_its_flags_asks_what_is_wanted_and_sends_it(
     start: Opener, outbox: Outbox, cloud: Bus, endpoint: str, report: ChangeReport, tmp_path: Path
 ) -> None:
-    """The first life hears the question and dies while it answers; the second one is asked again."""
-    heard, question, first_life = list[Upload](), ack("wanted", encode_mask(some(report))), threading.Event()
+    """The first life is acknowledged and dies before it hears what is wanted."""
+    heard, wanted = list[Upload](), told("wanted", encode_mask(some(report)))
 
     def answer(request: Request) -> bytes:
         heard.append(decode_upload(request.payload))
-        if isinstance(heard[-1], PackedReport):
-            return question.encode()
-        if not first_life.is_set():
-            first_life.wait(30.0)
-            raise Refused("nobody is there any more")
-        return ack("stored").encode()
+        if isinstance(heard[-1], PackedGaussians):
+            cloud.publish(want_key("vehicle"), ReportStates((told("released"),)).encode(), kind="ack")
+        return ChangeAck(REPORT_ID, "stored").encode()
 
     cloud.serve(change_keys(), answer, workers=1)
     program = textwrap.dedent(
@@ -241,26 +240,34 @@ def test_an_agent_killed_between_the_halves_begins_with_the_flags_again(
         from vehicle_agent.outbox import Outbox
         from vehicle_agent.sending import SenderThread
         with open_bus(BusConfig(connect=({endpoint!r},)), name="first") as bus:
-            SenderThread(bus, Outbox(Path({str(tmp_path / "outbox.sqlite")!r})))
+            SenderThread(bus, Outbox(Path({str(tmp_path / "outbox.sqlite")!r})), "vehicle")
             threading.Event().wait(60)
         """
     )
     with subprocess.Popen([sys.executable, "-c", program]) as process:
-        wait_until(lambda: len(heard) == 2, timeout_s=40.0)
+        wait_until(lambda: outbox.counts().held, timeout_s=40.0)
         process.kill()
-    first_life.set()
-    assert (outbox.counts().pending, len(outbox.bases_of(REPORT_ID))) == (1, 1)
+    assert (outbox.counts().held, len(outbox.bases_of(REPORT_ID))) == (1, 1)
+    cloud.serve(state_keys(), lambda _: ReportStates((wanted,)).encode())
     assert start().drain(30.0, NEVER)
-    assert [type(upload).__name__ for upload in heard] == ["PackedReport", "PackedGaussians"] * 2
-    assert heard[:2] == heard[2:], "to the bit the same"
-    assert outbox.counts().acknowledged == 1
+    assert [type(upload).__name__ for upload in heard] == ["PackedReport", "PackedGaussians"]
+    assert outbox.counts() == OutboxCounts(pending=0, acknowledged=1, quarantined=0)
 
 
 def test_a_report_that_cannot_be_packed_goes_whole_at_once(
     start: Opener, outbox: Outbox, cloud: Bus, report: ChangeReport
 ) -> None:
     other = dataclasses.replace(report, report_id=deterministic_report_id(1_570_838_400_001, "vehicle", "2"))
-    outbox.answered(REPORT_ID, "stored")
+    outbox.told(told("released"), 0)
     outbox.put(other.report_id, change_key("ndt", report.district), other.encode())
-    run(start, cloud, script := Script(ack("stored", report_id=other.report_id)))
-    assert script.heard == [other]
+    heard = []
+
+    def answer(request: Request) -> bytes:
+        heard.append(decode_upload(request.payload))
+        released = ReportStates((ReportState(other.report_id, "released"),)).encode()
+        cloud.publish(want_key("vehicle"), released, kind="ack")
+        return ChangeAck(other.report_id, "stored").encode()
+
+    cloud.serve(change_keys(), answer)
+    assert start().drain(20.0, NEVER)
+    assert heard == [other]

@@ -513,3 +513,110 @@ SELECT 1 FROM sqlite_schema WHERE type = 'table' AND name = 'feature_source'
 
 -- name: feature_sources
 SELECT name, about, body FROM feature_source ORDER BY name
+
+-- name: schema_of_uploads
+-- Added later, too. What vehicles have sent, as the bytes that came, until it is understood; then what became of it.
+-- `lease_ns` counts from the machine's start `boot` (lease_clock). `journal_id` is the report id in the journal.
+CREATE TABLE IF NOT EXISTS upload (
+  upload      INTEGER PRIMARY KEY,
+  sha         BLOB    NOT NULL UNIQUE,
+  key         TEXT    NOT NULL,
+  body        BLOB    NOT NULL,
+  report_id   TEXT    NOT NULL,
+  vehicle     TEXT    NOT NULL,
+  form        TEXT    NOT NULL CHECK (form IN ('packed', 'gaussians', 'whole', 'features')),
+  received_ns INTEGER NOT NULL,
+  state       TEXT    NOT NULL DEFAULT 'waiting'
+    CHECK (state IN ('waiting', 'early', 'wanted', 'released', 'resend', 'quarantined')),
+  wanted      BLOB    NOT NULL DEFAULT x'',
+  reason      TEXT    NOT NULL DEFAULT '',
+  journal_id  TEXT    NOT NULL DEFAULT '',
+  home        TEXT    NOT NULL,
+  owner       TEXT,
+  token       INTEGER,
+  boot        TEXT    NOT NULL,
+  lease_ns    INTEGER NOT NULL,
+  attempts    INTEGER NOT NULL DEFAULT 0
+) STRICT;
+CREATE INDEX IF NOT EXISTS upload_fresh ON upload (home, upload) WHERE state = 'waiting' AND attempts = 0;
+CREATE INDEX IF NOT EXISTS upload_waiting ON upload (attempts, upload) WHERE state = 'waiting';
+CREATE INDEX IF NOT EXISTS upload_report ON upload (report_id, upload);
+CREATE INDEX IF NOT EXISTS upload_state ON upload (state, received_ns);
+
+-- name: has_schema_of_uploads
+SELECT 1 FROM sqlite_schema WHERE type = 'index' AND name = 'upload_state'
+
+-- name: insert_upload
+INSERT INTO upload (sha, key, body, report_id, vehicle, form, received_ns, home, boot, lease_ns)
+VALUES (:sha, :key, :body, :report_id, :vehicle, :form, :received_ns, :home, :boot, :lease_ns)
+ON CONFLICT (sha) DO NOTHING
+
+-- name: fresh_uploads
+SELECT upload, key, body, report_id, vehicle, form, received_ns, attempts FROM upload INDEXED BY upload_fresh
+WHERE state = 'waiting' AND attempts = 0 AND home = :home ORDER BY upload LIMIT :n
+
+-- name: free_uploads
+SELECT upload, key, body, report_id, vehicle, form, received_ns, attempts FROM upload INDEXED BY upload_waiting
+WHERE state = 'waiting' AND (boot <> :boot OR lease_ns <= :now OR lease_ns > :never)
+ORDER BY attempts, upload LIMIT :n
+
+-- name: lease_upload
+UPDATE upload SET owner = :owner, token = :token, boot = :boot, lease_ns = :lease_ns, attempts = attempts + 1
+WHERE upload = :upload
+
+-- name: postpone_upload
+UPDATE upload SET owner = NULL, token = NULL, boot = :boot, lease_ns = :lease_ns
+WHERE upload = :upload AND token = :token
+
+-- name: release_uploads
+UPDATE upload SET owner = NULL, token = NULL, lease_ns = 0
+WHERE state = 'waiting' AND (owner = :owner OR (owner IS NULL AND attempts = 0 AND home = :owner))
+
+-- name: settle_upload
+UPDATE upload SET state = :state, wanted = :wanted, reason = :reason, journal_id = :journal_id,
+  body = CASE WHEN :state = 'wanted' THEN body ELSE x'' END, owner = NULL, token = NULL
+WHERE upload = :upload AND token = :token AND state = 'waiting'
+
+-- name: wait_for_flags
+UPDATE upload SET state = :state, wanted = :wanted, reason = :reason, journal_id = :journal_id,
+  owner = NULL, token = NULL
+WHERE upload = :upload AND token = :token AND state = 'waiting'
+  AND NOT EXISTS (SELECT 1 FROM upload AS flags WHERE flags.report_id = upload.report_id AND flags.key = upload.key
+                  AND flags.form = 'packed' AND flags.state <> 'waiting')
+
+-- name: answer_first_half
+UPDATE upload SET state = :state, reason = :reason, body = x'' WHERE upload = :number AND state = 'wanted'
+
+-- name: wake_gaussians
+UPDATE upload SET state = 'waiting', lease_ns = 0, attempts = 0
+WHERE report_id = :report_id AND key = :key AND form = 'gaussians' AND state = 'early'
+
+-- name: release_flags
+UPDATE upload SET state = 'released', body = x''
+WHERE report_id = :report_id AND vehicle = :vehicle AND form = 'packed' AND state IN ('wanted', 'resend', 'quarantined')
+
+-- name: vehicle_of_report
+SELECT vehicle FROM report WHERE layer = :layer AND tile = :tile AND report_id = :report_id AND part = :part
+
+-- name: first_halves
+SELECT upload, vehicle, state, wanted, journal_id, body FROM upload
+WHERE report_id = :report_id AND key = :key AND form = 'packed' ORDER BY upload
+
+-- name: report_part
+SELECT report_id, layer, tile, vehicle, received_ns, body, base_sha, part FROM report
+WHERE layer = :layer AND tile = :tile AND report_id = :report_id AND part = 0
+
+-- name: upload_status
+SELECT CASE WHEN u.state = 'wanted' AND EXISTS (
+    SELECT 1 FROM upload AS half WHERE half.report_id = u.report_id AND half.key = u.key AND half.form = 'gaussians'
+    AND half.state = 'waiting') THEN 'waiting' ELSE u.state END AS state, u.wanted, u.reason
+FROM upload AS u WHERE u.report_id = :report_id AND u.vehicle = :vehicle ORDER BY u.upload DESC LIMIT 1
+
+-- name: upload_counts
+SELECT state, COUNT(*) FROM upload GROUP BY state
+
+-- name: oldest_upload
+SELECT MIN(received_ns) FROM upload WHERE state = 'waiting'
+
+-- name: forget_uploads
+DELETE FROM upload WHERE received_ns < :before_ns AND state <> 'waiting'

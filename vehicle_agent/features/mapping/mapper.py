@@ -153,9 +153,9 @@ class Mapper:
         reporter.report_all(drive.looks[-1].t_ns)
 
     def upload(self) -> None:
-        """Wait until the outbox is empty, for a bounded time."""
+        """Wait until the cloud has all that it wants of the reports, for a bounded time."""
         if not self.link.sender.drain(self.config.report.drain_s, self.stop):
-            _log.warning("%s: %d reports are not acknowledged", self.config.vehicle, self.link.outbox.counts().pending)
+            _log.warning("%s: %d reports are not released", self.config.vehicle, self.link.outbox.counts().open)
 
     def result(self) -> dict[str, Any]:
         """What the drive came to, as plain values."""

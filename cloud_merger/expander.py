@@ -1,0 +1,247 @@
+"""What was acknowledged is looked at: uploads become rows of the journal, and vehicles hear what is wanted.
+
+Any number of workers, threads or processes, may take from one store. An upload's rows, its state and what is wanted of
+it are written in one transaction, fenced by the lease: a worker that is killed leaves an upload that waits, one that
+comes late changes nothing.
+"""
+
+import logging
+from collections import OrderedDict
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from threading import Lock
+from typing import Final
+
+from ulid import ULID
+
+from cloud_merger.checking import MapCheck
+from cloud_merger.config import ShardConfig
+from cloud_merger.errors import BadReport, MergerError, NotUnderstood
+from cloud_merger.features.kept import FeatureInbox
+from cloud_merger.ingest import one_line
+from cloud_merger.short_reports import FirstSaid, ShortReports
+from cloud_merger.states import STATUS
+from gnd_map.errors import GndError
+from schemas.changes import ChangeReport, split
+from schemas.errors import SchemaError
+from schemas.features import FeatureReport
+from schemas.packed import PackedGaussians, PackedReport, crc_of, decode_upload
+from schemas.report_id import deterministic_report_id
+from schemas.report_states import ReportState
+from tile_store.errors import IdTaken, StoreError
+from tile_store.store import Store
+from tile_store.uploads import Answered, FirstHalf, Settled, UploadClaim
+from tile_store.values import ReportRow
+
+REMEMBERED_DISTRICTS: Final = 32
+_LOG = logging.getLogger(__name__)
+Tell = Callable[[str, ReportState], object]
+
+
+@dataclass(frozen=True, slots=True)
+class _Outcome:
+    """What is to become of an upload, whom to tell, and what was promised by it."""
+
+    settled: Settled
+    vehicle: str = ""
+    told: ReportState | None = None
+    asks: FirstSaid | None = None
+
+
+class Expander:
+    """Takes uploads and settles them. Safe in several threads.
+
+    Args:
+        store: of uploads, reports and tiles.
+        config: of the shard.
+        tell: called with a vehicle and how far its report has come, after that is durable.
+        on_journaled: called after reports have come into the journal.
+    """
+
+    def __init__(
+        self, store: Store, config: ShardConfig, tell: Tell, on_journaled: Callable[[], object] = lambda: None
+    ) -> None:
+        self._store, self._config, self._tell, self._on_journaled = store, config, tell, on_journaled
+        self._short = ShortReports(store, config.merge, config.want, config.waiting)
+        self._features = FeatureInbox(store, config.feature_limits, config.features.reach_m, config.ingest.reach_tiles)
+        self._map = MapCheck(store, config.ingest)
+        self._lock = Lock()
+        self._districts: OrderedDict[str, None] = OrderedDict()  # newest last
+
+    @property
+    def districts(self) -> tuple[str, ...]:
+        """Paths of the districts that reports were about lately, the newest first: their tiles are in memory."""
+        with self._lock:
+            return tuple(reversed(self._districts))
+
+    def work(self) -> int:
+        """Settle some uploads; how many were claimed.
+
+        Raises:
+            StoreError: the store has failed; what was claimed waits for the end of its lease.
+        """
+        claims = self._store.claim_uploads(self._config.shard_id, self._config.uploads_at_once, self._config.lease_s)
+        for claim in claims:
+            self._work_on(claim)
+        return len(claims)
+
+    def _work_on(self, claim: UploadClaim) -> None:
+        try:
+            outcome = self._settled(self._understood(claim))
+        except StoreError:
+            raise
+        except Exception as error:  # one upload never stops the others
+            _LOG.exception("upload %s failed, attempt %d", claim.upload.report_id, claim.attempts)
+            if claim.attempts < self._config.max_attempts:
+                self._store.postpone_upload(claim, self._config.retry_s * claim.attempts)
+                return
+            outcome = self._settled(self._set_aside(claim, f"{type(error).__name__}: {error}"))
+        if outcome is not None:
+            self._announce(outcome)
+
+    def _settled(self, outcome: _Outcome) -> _Outcome | None:
+        """The outcome as it is durable now; None: nothing was applied."""
+        try:
+            is_applied = self._store.settle_upload(outcome.settled)
+        except IdTaken as taken:
+            outcome = self._renamed(outcome, taken)
+            is_applied = self._store.settle_upload(outcome.settled)
+        if not is_applied and outcome.settled.state == "early":  # its flags have come meanwhile
+            self._store.postpone_upload(outcome.settled.claim, 0.0)
+        return outcome if is_applied else None
+
+    def _announce(self, outcome: _Outcome) -> None:
+        if outcome.settled.rows:
+            self._remember(outcome.settled.rows[0].tile.district.path)
+            self._on_journaled()
+        if outcome.asks is not None:
+            self._short.asks(outcome.asks)
+        elif outcome.settled.state != "early":
+            self._short.promises.forget(outcome.settled.claim.upload.report_id)
+        if outcome.told is not None:
+            self._tell(outcome.vehicle, outcome.told)
+
+    def _remember(self, path: str) -> None:
+        with self._lock:
+            self._districts.pop(path, None)
+            self._districts[path] = None
+            while len(self._districts) > REMEMBERED_DISTRICTS:
+                self._districts.popitem(last=False)
+
+    def _understood(self, claim: UploadClaim) -> _Outcome:
+        if claim.attempts > self._config.max_attempts:  # it may be what killed the workers that claimed it before
+            return self._set_aside(claim, "no worker that claimed it came to an end")
+        try:
+            return self._outcome(claim)
+        except NotUnderstood as error:
+            _LOG.info("asked for report %s whole: %s", claim.upload.report_id, error)
+            return self._told(Settled(claim, "resend", reason=one_line(str(error))))
+        except (SchemaError, BadReport) as error:
+            return self._refused(claim, one_line(f"{type(error).__name__}: {error}"))
+
+    def _outcome(self, claim: UploadClaim) -> _Outcome:
+        said = decode_upload(claim.upload.body)
+        if isinstance(said, FeatureReport):
+            self._features.check(claim.upload.key, said)
+            return self._released(claim, tuple(self._features.rows(said, claim.upload.received_ns)))
+        if isinstance(said, PackedGaussians):
+            return self._second_half(claim, said)
+        if isinstance(said, PackedReport):
+            return self._first_half(claim, said)
+        self._map.check(said)
+        return self._released(claim, self._rows_of_whole(claim, said))
+
+    def _first_half(self, claim: UploadClaim, packed: PackedReport) -> _Outcome:
+        report = self._short.expanded(claim.upload.key, packed)
+        self._map.check(report)
+        first = self._short.decided(report)
+        rows = rows_of(report, claim.upload.received_ns)
+        if not first.wanted:
+            return self._released(claim, rows)
+        return self._told(Settled(claim, "wanted", rows, first.wanted), asks=first)
+
+    def _second_half(self, claim: UploadClaim, gaussians: PackedGaussians) -> _Outcome:
+        """Gaussians belong to those flags of their id and key that have asked for them."""
+        key = claim.upload.key
+        halves = self._store.first_halves(key, gaussians.report_id)
+        if all(half.state == "waiting" for half in halves):
+            return _Outcome(Settled(claim, "early"))
+        asked = [half for half in halves if half.wanted and crc_of(half.wanted) == gaussians.wanted_crc]
+        open_ones = [half for half in asked if half.state == "wanted"]
+        if asked and not open_ones:
+            return _Outcome(Settled(claim, "released"))  # they came before, in other bytes, or have come whole
+        if not asked:
+            raise BadReport(
+                f"Gaussians of report {gaussians.report_id} answer mask {gaussians.wanted_crc:08x}; asked were "
+                + (", ".join(f"{crc_of(half.wanted):08x}" for half in halves if half.wanted) or "none")
+            )
+        return self._answered(claim, open_ones[0], gaussians)
+
+    def _answered(self, claim: UploadClaim, half: FirstHalf, gaussians: PackedGaussians) -> _Outcome:
+        try:
+            parts = self._short.completed(claim.upload.key, half, gaussians)
+            for part in parts:
+                self._map.check(part)
+        except (GndError, NotUnderstood) as error:
+            if isinstance(error, StoreError):
+                raise
+            reason = one_line(f"{type(error).__name__}: {error}")
+            settled = Settled(claim, "quarantined", reason=reason, first=Answered(half.number, "resend", reason))
+            return _Outcome(settled, half.vehicle, ReportState(gaussians.report_id, "resend", reason=reason))
+        rows = tuple(row for part in parts for row in rows_of(part, claim.upload.received_ns, part=1))
+        settled = Settled(claim, "released", rows, first=Answered(half.number, "released"))
+        return _Outcome(settled, half.vehicle, ReportState(gaussians.report_id, "released"))
+
+    def _rows_of_whole(self, claim: UploadClaim, report: ChangeReport) -> tuple[ReportRow, ...]:
+        """A whole report whose flags are in the journal takes their place; it keeps the id that they have there."""
+        halves = self._store.first_halves(claim.upload.key, report.report_id)
+        flags = [half for half in halves if half.journal_id and half.vehicle == report.vehicle]
+        if not flags:
+            return rows_of(report, claim.upload.received_ns)
+        renamed = replace(report, report_id=flags[0].journal_id)
+        return rows_of(renamed, claim.upload.received_ns, part=1)
+
+    def _renamed(self, outcome: _Outcome, taken: IdTaken) -> _Outcome:
+        """Another vehicle has this report id: the journal keeps this report under one of its own."""
+        settled = outcome.settled
+        rows = tuple(_under_own_id(row) for row in settled.rows)
+        _LOG.warning("%s; kept as %s", taken, rows[0].report_id)
+        return replace(outcome, settled=replace(settled, rows=rows))
+
+    def _released(self, claim: UploadClaim, rows: tuple[ReportRow, ...]) -> _Outcome:
+        return self._told(Settled(claim, "released", rows))
+
+    def _refused(self, claim: UploadClaim, reason: str) -> _Outcome:
+        _LOG.warning("quarantined %s of report %s: %s", claim.upload.form, claim.upload.report_id, reason)
+        return self._told(Settled(claim, "quarantined", reason=reason))
+
+    def _set_aside(self, claim: UploadClaim, why: str) -> _Outcome:
+        return self._refused(claim, one_line(f"set aside after {claim.attempts} attempts to read it: {why}"))
+
+    def _told(self, settled: Settled, asks: FirstSaid | None = None) -> _Outcome:
+        upload = settled.claim.upload
+        if not upload.vehicle:
+            return _Outcome(settled)  # Gaussians: whose they are, only their flags tell
+        told = ReportState(upload.report_id, STATUS[settled.state], settled.wanted, settled.reason)
+        return _Outcome(settled, upload.vehicle, told, asks)
+
+
+def rows_of(report: ChangeReport, received_ns: int, part: int = 0) -> tuple[ReportRow, ...]:
+    """A report as the journal keeps it: one row a tile."""
+    return tuple(
+        ReportRow(
+            report.report_id, report.layer, tile, report.vehicle, received_ns, body, change.base_sha, part,
+            is_quiet=not len(change.changed),
+        )
+        for change, (tile, body) in zip(report.tiles, split(report), strict=True)
+    )  # fmt: skip
+
+
+def _under_own_id(row: ReportRow) -> ReportRow:
+    """The row of a report under an id made of its own and its vehicle, with the same time."""
+    t_ms = ULID.from_str(row.report_id).milliseconds
+    own_id = deterministic_report_id(t_ms, "of another vehicle", row.report_id, row.vehicle)
+    said = decode_upload(row.body)
+    if not isinstance(said, (ChangeReport, FeatureReport)):
+        raise MergerError(f"row of report {row.report_id} holds a {type(said).__name__}")
+    return replace(row, report_id=own_id, body=replace(said, report_id=own_id).encode())

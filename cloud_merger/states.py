@@ -1,0 +1,69 @@
+"""Vehicles hear how far their reports have come: told once when it is known, and answered whenever they ask."""
+
+import logging
+from typing import Final
+
+from fleet_bus.bus import Bus
+from fleet_bus.errors import BusError, Refused
+from fleet_bus.serving import Request
+from schemas.errors import SchemaError
+from schemas.keys import parse_state_key, state_keys, want_key
+from schemas.report_states import ReportQuestion, ReportState, ReportStates, ReportStatus
+from tile_store.store import Store
+from tile_store.uploads import UploadState
+
+STATUS: Final[dict[UploadState, ReportStatus]] = {
+    "waiting": "waiting",
+    "early": "waiting",
+    "wanted": "wanted",
+    "released": "released",
+    "resend": "resend",
+    "quarantined": "quarantined",
+}
+_LOG = logging.getLogger(__name__)
+
+
+class States:
+    """Tells and answers; what it says is read from the store, so any shard may be asked.
+
+    Args:
+        store: of the uploads.
+        bus: open.
+    """
+
+    def __init__(self, store: Store, bus: Bus) -> None:
+        self._store, self._bus = store, bus
+
+    def open(self) -> None:
+        """Begin to answer."""
+        self._bus.serve(state_keys(), self._answer, complete=True, workers=2, kind="change")
+
+    def tell(self, vehicle: str, state: ReportState) -> None:
+        """Put a notice on the vehicle's key; one that is lost is asked for."""
+        try:
+            self._bus.publish(want_key(vehicle), ReportStates((state,)).encode(), kind="ack", wait_s=0.0)
+        except (BusError, SchemaError) as error:
+            _LOG.info("%s is not told that %s is %s: %s", vehicle, state.report_id, state.status, error)
+
+    def _answer(self, request: Request) -> bytes:
+        try:
+            return answer(self._store, request.key, request.payload)
+        except SchemaError as error:
+            raise Refused(str(error)) from error
+
+
+def answer(store: Store, key: str, payload: bytes) -> bytes:
+    """The encoded answer to a question on a vehicle's state key.
+
+    Raises:
+        SchemaError: no such key, no question.
+        StoreError: the store has failed.
+    """
+    vehicle, question = parse_state_key(key), ReportQuestion.decode(payload)
+    found = {one.report_id: one for one in store.upload_statuses(vehicle, question.report_ids)}
+    return ReportStates.fitting(
+        ReportState(report_id, STATUS[one.state], one.wanted if one.state == "wanted" else b"", one.reason)
+        if (one := found.get(report_id)) is not None
+        else ReportState(report_id, "unknown")
+        for report_id in question.report_ids
+    ).encode()

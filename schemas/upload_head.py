@@ -1,0 +1,100 @@
+"""What the outside of an upload says, without reading what it holds: enough to keep it and to answer."""
+
+from dataclasses import dataclass
+from typing import Final, Literal
+
+from gnd_map.tile_id import District
+from schemas import limits
+from schemas.errors import BadValue, TooLarge
+from schemas.features import check_feature_bytes
+from schemas.generated import change_report_pb2, feature_report_pb2, packed_report_pb2
+from schemas.report_id import check_report_id, report_id_of_bytes
+from schemas.wire import (
+    LAYER_PATTERN,
+    VEHICLE_PATTERN,
+    check_major,
+    check_text,
+    check_unsigned,
+    parse,
+    refusing,
+)
+
+UploadForm = Literal["packed", "gaussians", "whole", "features"]
+_SHORT: Final[tuple[Literal["packed", "gaussians", "features"], ...]] = ("packed", "gaussians", "features")
+_LIMITS: Final = {
+    "packed": limits.MAX_PACKED_REPORT_BYTES,
+    "gaussians": limits.MAX_PACKED_GAUSSIANS_BYTES,
+    "features": limits.MAX_FEATURE_REPORT_BYTES,
+    "whole": limits.MAX_CHANGE_REPORT_BYTES,
+}
+
+
+@dataclass(frozen=True, slots=True)
+class UploadHead:
+    """What an upload is and whose.
+
+    Attributes:
+        form: flags in short, Gaussians that were asked for, a whole report, or one about features.
+        report_id: ULID.
+        vehicle: pseudonym; "" of Gaussians, which do not tell it.
+        last_ns: time of the last scan that it rests on, UTC; 0 of Gaussians.
+        place: (layer, district) that it names itself; None where only its key does.
+    """
+
+    form: UploadForm
+    report_id: str
+    vehicle: str = ""
+    last_ns: int = 0
+    place: tuple[str, District] | None = None
+
+
+def head_of_upload(data: bytes) -> UploadHead:
+    """The head of whatever a vehicle has sent on the key of change reports.
+
+    Raises:
+        SchemaError: too large (checked before parsing), truncated, of another kind or major version; no report id, no
+            vehicle, times that cannot be; more than one form in one message.
+    """
+    check_feature_bytes(data)
+    message = parse(
+        change_report_pb2.ChangeReport, data, limits.MAX_CHANGE_REPORT_BYTES, max_fields=limits.MAX_REPORT_FIELDS
+    )
+    forms = [name for name in _SHORT if message.HasField(name)]
+    form: UploadForm = forms[0] if forms else "whole"
+    check_major(message, "ChangeReport")
+    if forms:
+        others = sorted(field.name for field, _ in message.ListFields() if field.name not in ("major", form))
+        if others:
+            raise BadValue(f"ChangeReport holds {form} and also {', '.join(others)}: one report in one form")
+    if len(data) > _LIMITS[form]:
+        raise TooLarge(f"upload in form {form} of {len(data)} bytes exceeds the limit of {_LIMITS[form]} bytes")
+    if form == "gaussians":
+        return UploadHead(form, report_id_of_bytes(message.gaussians.report_id))
+    if form == "packed":
+        return _head(form, report_id_of_bytes(message.packed.report_id), message.packed, message.packed.length_ns)
+    if form == "features":
+        features = message.features
+        report_id = report_id_of_bytes(features.report_id)
+        return _head(form, report_id, features, features.length_ns, (features.layer, features.district))
+    check_report_id(message.report_id)
+    length_ns = message.last_ns - message.first_ns
+    return _head(form, message.report_id, message, length_ns, (message.layer, message.district))
+
+
+def _head(
+    form: UploadForm,
+    report_id: str,
+    message: change_report_pb2.ChangeReport | packed_report_pb2.PackedReport | feature_report_pb2.FeatureReport,
+    length_ns: int,
+    place: tuple[str, str] | None = None,
+) -> UploadHead:
+    check_text("vehicle", message.vehicle, VEHICLE_PATTERN)
+    check_unsigned("first_ns", message.first_ns, bits=63)
+    check_unsigned("last_ns - first_ns", length_ns, bits=63)
+    named = None
+    if place is not None:
+        layer, path = place
+        check_text("layer", layer, LAYER_PATTERN)
+        with refusing("ChangeReport"):
+            named = layer, District(path)
+    return UploadHead(form, report_id, message.vehicle, message.first_ns + length_ns, named)

@@ -1,0 +1,135 @@
+"""Uploads in SQLite: each function runs inside the caller's transaction."""
+
+import secrets
+from collections.abc import Iterable, Sequence
+from hashlib import sha256
+from typing import Any, Final
+
+import apsw
+
+from gnd_map.tile_id import TileId
+from tile_store import lease_clock
+from tile_store import sqlite_inbox as inbox
+from tile_store.errors import IdTaken
+from tile_store.sqlite_connection import Row, change, fetch
+from tile_store.uploads import FirstHalf, Settled, Upload, UploadClaim, UploadCounts, UploadStatus
+from tile_store.values import PutStatus, ReportRow, StoreConfig
+
+NS_PER_S: Final = 1_000_000_000
+HEAD_START_NS: Final = NS_PER_S
+"""So long an upload is left to the shard that received it, which holds its tiles in memory."""
+
+
+def put(c: apsw.Connection, upload: Upload, home: str) -> PutStatus:
+    """Keep a message; the same bytes on the same key are known."""
+    told = {name: getattr(upload, name) for name in Upload.__slots__}
+    clock = {"boot": lease_clock.boot(), "lease_ns": lease_clock.now_ns() + HEAD_START_NS}
+    sha = sha256(upload.key.encode() + b"\0" + upload.body).digest()
+    return "stored" if change(c, "insert_upload", told | clock | {"sha": sha, "home": home}) else "duplicate"
+
+
+def any_claimable(c: apsw.Connection, owner: str) -> bool:
+    """Whether `claim` would find anything."""
+    return bool(fetch(c, "fresh_uploads", {"home": owner, "n": 1}) or fetch(c, "free_uploads", _clock() | {"n": 1}))
+
+
+def claim(c: apsw.Connection, owner: str, n: int, lease_s: float) -> list[UploadClaim]:
+    """Lease uploads, the oldest first. One that was claimed before comes alone: it may be what ended its worker."""
+    rows = fetch(c, "free_uploads", _clock() | {"n": n})
+    again = [row for row in rows if row[-1] > 0]
+    if again:
+        rows = again[:1]
+    else:
+        rows += fetch(c, "fresh_uploads", {"home": owner, "n": n - len(rows)})
+    return [_lease(c, owner, lease_s, *row) for row in {row[0]: row for row in rows}.values()]
+
+
+def _lease(c: apsw.Connection, owner: str, lease_s: float, number: int, *row: Any) -> UploadClaim:
+    *upload, attempts = row
+    token = secrets.randbits(62)
+    until = {"boot": lease_clock.boot(), "lease_ns": lease_clock.now_ns() + round(lease_s * NS_PER_S)}
+    change(c, "lease_upload", until | {"upload": number, "owner": owner, "token": token})
+    return UploadClaim(number, Upload(*upload), owner, token, attempts + 1)
+
+
+def postpone(c: apsw.Connection, claim: UploadClaim, delay_s: float) -> None:
+    """Give an upload back, to be claimed again after `delay_s`."""
+    until = {"boot": lease_clock.boot(), "lease_ns": lease_clock.now_ns() + round(delay_s * NS_PER_S)}
+    change(c, "postpone_upload", until | {"upload": claim.number, "token": claim.token})
+
+
+def release(c: apsw.Connection, owner: str) -> int:
+    """Free the uploads that an owner has leased or received; how many they were."""
+    return change(c, "release_uploads", {"owner": owner})
+
+
+def settle(c: apsw.Connection, settled: Settled, config: StoreConfig, now: int) -> bool:
+    """Apply what a worker has made of an upload; False, and nothing is applied, when its lease is another's.
+
+    Raises:
+        IdTaken: another vehicle has a report with this id about one of the tiles.
+    """
+    claim, upload = settled.claim, settled.claim.upload
+    journal_id = settled.rows[0].report_id if settled.rows else ""
+    told = {"state": settled.state, "wanted": settled.wanted, "reason": settled.reason, "journal_id": journal_id}
+    statement = "wait_for_flags" if settled.state == "early" else "settle_upload"
+    if not change(c, statement, told | {"upload": claim.number, "token": claim.token}):
+        return False
+    _journal(c, settled.rows, config, now)
+    if settled.first is not None:
+        answered = {name: getattr(settled.first, name) for name in type(settled.first).__slots__}
+        change(c, "answer_first_half", answered)
+    if settled.state == "quarantined":
+        row = {"sha": sha256(upload.body).digest(), "source": upload.key, "reason": settled.reason}
+        change(c, "insert_quarantine", row | {"body": upload.body, "received_ns": now})
+    if upload.form == "packed":
+        change(c, "wake_gaussians", {"report_id": upload.report_id, "key": upload.key})
+    if upload.form == "whole" and settled.state == "released":
+        change(c, "release_flags", {"report_id": upload.report_id, "vehicle": upload.vehicle})
+    return True
+
+
+def _journal(c: apsw.Connection, rows: Sequence[ReportRow], config: StoreConfig, now: int) -> None:
+    for row, status in zip(rows, inbox.put_reports(c, rows, config, now), strict=True):
+        if status == "duplicate":
+            place = {"layer": row.layer, "tile": row.tile.morton, "report_id": row.report_id, "part": row.part}
+            ((vehicle,),) = fetch(c, "vehicle_of_report", place)
+            if vehicle != row.vehicle:
+                raise IdTaken(f"report {row.report_id} of {row.vehicle}: its id is one of {vehicle}, tile {row.tile}")
+
+
+def first_halves(c: apsw.Connection, key: str, report_id: str) -> list[FirstHalf]:
+    """The flags that have come under a report id on a key: of one vehicle, unless another uses the same id."""
+    return [FirstHalf(*row) for row in fetch(c, "first_halves", {"key": key, "report_id": report_id})]
+
+
+def parts(c: apsw.Connection, layer: str, report_id: str, tiles: Iterable[TileId]) -> list[ReportRow]:
+    """What the journal holds under a report id about these tiles, in this order: parts 0."""
+    wanted = ({"layer": layer, "tile": tile.morton, "report_id": report_id} for tile in tiles)
+    rows: list[Row] = [row for place in wanted for row in fetch(c, "report_part", place)]
+    return [ReportRow(row[0], row[1], TileId(row[2]), *row[3:]) for row in rows]
+
+
+def statuses(c: apsw.Connection, vehicle: str, report_ids: Iterable[str]) -> list[UploadStatus]:
+    """How far a vehicle's reports have come, those of which the store holds anything."""
+    found = []
+    for report_id in report_ids:
+        rows = fetch(c, "upload_status", {"vehicle": vehicle, "report_id": report_id})
+        found += [UploadStatus(report_id, *row) for row in rows]
+    return found
+
+
+def counts(c: apsw.Connection) -> UploadCounts:
+    """How many there are, and how long the oldest has waited."""
+    by_state = {str(state): int(n) for state, n in fetch(c, "upload_counts")}
+    return UploadCounts(by_state, fetch(c, "oldest_upload")[0][0])
+
+
+def forget(c: apsw.Connection, before_ns: int) -> int:
+    """Forget uploads received before a time of which nothing is expected any more; how many they were."""
+    return change(c, "forget_uploads", {"before_ns": before_ns})
+
+
+def _clock() -> dict[str, Any]:
+    now_ns = lease_clock.now_ns()
+    return {"boot": lease_clock.boot(), "now": now_ns, "never": now_ns + lease_clock.LONGEST_LEASE_NS}
