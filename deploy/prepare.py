@@ -5,7 +5,7 @@ import importlib.resources
 import itertools
 import os
 import shutil
-from collections.abc import Callable, Iterable
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -17,7 +17,7 @@ from deploy.fleet_config import FleetConfig
 from deploy.mounts import with_wrong_mounts
 from deploy.run_folder import RunFolder
 from deploy.source import Source
-from fleet_sim.prepare import prepare_fleet_run, start_ranks
+from fleet_sim.prepare import prepare_fleet_run
 from schemas.drive_mcap import read_header
 from tile_store.build import build_map
 from tile_store.sqlite_store import SqliteStore
@@ -76,7 +76,7 @@ def prepare_simulated(config: FleetConfig, folder: RunFolder, worlds: Path | Non
     copy_store(base_map, folder.store)
     if config.feature_layers:
         put_base_layers(folder.store, world.features_path, config.feature_layers)
-    starts_s = starts(start_ranks(config.agents), headway_s)
+    starts_s = starts_of(config.agents, headway_s)
     return PreparedRun(tuple(world.agent_drives), world.truth_path, starts_s, world.world_path)
 
 
@@ -99,9 +99,9 @@ def forget_other_headways(home: Path, headway_s: float) -> None:
     noted.write_text(now, encoding="utf-8")
 
 
-def starts(ranks: Iterable[int], headway_s: float) -> tuple[float, ...]:
-    """Return when vehicles start of which so many start before each; nothing where all start at once."""
-    return tuple(rank * headway_s for rank in ranks) if headway_s > 0 else ()
+def starts_of(agents: int, headway_s: float) -> tuple[float, ...]:
+    """Return when each vehicle starts; nothing where all start at once."""
+    return tuple(number * headway_s for number in range(agents)) if headway_s > 0 else ()
 
 
 def sources_sha() -> str:
@@ -157,7 +157,7 @@ def prepare_recorded(config: FleetConfig, folder: RunFolder, source: Source) -> 
         copy_store(source.base_map, folder.store)
     count = len(found) if source.agents is None else config.agents
     drives = tuple(itertools.islice(itertools.cycle(found), count))
-    return PreparedRun(drives, None, starts(range(count), config.headway_s))
+    return PreparedRun(drives, None, starts_of(count, config.headway_s))
 
 
 def find_drives(paths: tuple[Path, ...]) -> list[Path]:

@@ -158,7 +158,7 @@ def summary_lines(summary: dict[str, Any]) -> list[str]:
         lines.append(
             f"map against the truth, macro F1: {f1['before']:.1f} % before, {_single_text(f1)}{f1['after']:.1f} % after"
         )
-    lines += learning_lines(summary["learning"])
+    lines += learning_lines(summary.get("learning", {}))
     lines += [
         f"{vehicle} doubts itself: {d['scans_shifted'] + d['scans_taken_back']} scans taken back, "
         f"{d['tiles_held_back']} tiles with {d['changes_held_back']} changes held back, {d['tiles_doubtful']} doubtful "

@@ -66,36 +66,31 @@ def mapping_configs(world_seed: int) -> tuple[DriveConfig, ...]:
     )
 
 
-def start_ranks(agents: int) -> tuple[int, ...]:
-    """Return for each vehicle how many start before it: neighbours in time come from different ends of the street."""
-    order = sorted(range(agents), key=lambda index: (index // 4, index % 2, index // 2 % 2))
-    return tuple(order.index(index) for index in range(agents))
-
-
 def agent_configs(world_seed: int, agents: int, headway_s: float = 0.0) -> tuple[DriveConfig, ...]:
     """Return one drive a vehicle: sensors and directions mixed evenly, every drive with its own parked cars.
 
     Args:
         world_seed: seed of the street.
         agents: number of vehicles.
-        headway_s: time between two starts, in the order of `start_ranks`; 0: the drives have nothing to do with each
-            other, and are stamped an hour apart in the order of their numbers.
+        headway_s: time between two starts, in the order of their numbers; 0: the drives have nothing to do with each
+            other, and are stamped an hour apart.
 
     Raises:
         SimError: fewer than one vehicle.
     """
     if agents < 1:
         raise SimError(f"a fleet needs at least one vehicle, got {agents}")
+    step_ns = round(headway_s * _NS_PER_S) or _HOUR_NS
     return tuple(
         DriveConfig(
             vehicle=f"vehicle-{index}",
             sensor=SENSORS[index % 2],
             direction=1 if index // 2 % 2 == 0 else -1,
             seed=1_000_003 * world_seed + index,
-            start_ns=EPOCH_NS + (round(rank * headway_s * _NS_PER_S) if headway_s else index * _HOUR_NS),
+            start_ns=EPOCH_NS + index * step_ns,
             camera=SignCamera(),
         )
-        for index, rank in enumerate(start_ranks(agents))
+        for index in range(agents)
     )
 
 

@@ -62,7 +62,7 @@ class ReportParameters:
     left_behind_m: float = 54.0
     """A tile farther from the vehicle gets no more evidence: its classes are decided. More than the range of detection
     by what the LiDAR stands from the vehicle's origin and what it drives during a scan."""
-    soon_s: float = 1.0
+    soon_s: float = 0.5
     """Changes wait this long for those of the next tiles ..."""
     soon_voxels: int = 8
     """... if there are so many; fewer weigh less than what a report costs."""

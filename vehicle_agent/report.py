@@ -146,6 +146,7 @@ class Reporter:
         self._numbers: Counter[District] = Counter()
         self._stretch: _Stretch | None = None
         self._looked_at: F64 | None = None
+        self._here_ns = start_ns  # time of the newest final pose
         self._open_districts: set[District] = set()
         self._stated_before: Counter[TileId] = Counter()  # in reports of an earlier life that have the same ids
         self._tracks = Tracks(detector.local_map.grid_frame.frame)
@@ -220,6 +221,7 @@ class Reporter:
 
     def leave_behind(self, estimate: PoseEstimate, odometer_m: float) -> None:
         """Decide the tiles that the refined pose has left, and report what has waited long enough."""
+        self._here_ns = estimate.t_ns
         self._decide_left(estimate, odometer_m)
         for district, pending in list(self._pending.items()):
             if district not in self._open_districts or pending.is_due(odometer_m, estimate.t_ns, self._parameters):
@@ -314,11 +316,11 @@ class Reporter:
         if change.doubt is not None:
             self.counts["tiles_doubtful"] += 1
             self.doubts.update(change.doubt.words)
-        district, now_ns = change.tile.district, self._now_ns
+        district = change.tile.district
         if district in self._pending and change.tile in self._pending[district].changes:
             self._report(district)  # the vehicle came back: one statement a tile and report
-        pending = self._pending.setdefault(district, _Pending(odometer_m, now_ns))
-        pending.add(change, base, odometer_m, now_ns)
+        pending = self._pending.setdefault(district, _Pending(odometer_m, self._here_ns))
+        pending.add(change, base, odometer_m, self._here_ns)
 
     def _said(self, found: Classification) -> TileChange:
         """What the report says of a tile; a study may let it say something else."""
