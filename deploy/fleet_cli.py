@@ -45,7 +45,7 @@ RUN_OPTIONS = (
         "--headway",
         "headway_s",
         type=float,
-        help="Seconds between the starts of two vehicles, in time of the drives; 0: all at once.  [default: 5]",
+        help="Seconds between the starts of two vehicles, in time of the drives; 0: all at once.  [default: 4]",
     ),
     click.option("--world-seed", type=int, help="Seed of the simulated world.  [default: 7]"),
     click.option(

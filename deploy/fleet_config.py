@@ -45,7 +45,7 @@ class FleetConfig:
     agents: int = 8
     shards: int = 2
     link: str = "4g"
-    headway_s: float = 5.0
+    headway_s: float = 4.0
     world_seed: int = 7
     port: int = 0
     detect_mode: str = "default"

@@ -62,10 +62,12 @@ class ReportParameters:
     left_behind_m: float = 54.0
     """A tile farther from the vehicle gets no more evidence: its classes are decided. More than the range of detection
     by what the LiDAR stands from the vehicle's origin and what it drives during a scan."""
-    soon_s: float = 0.5
-    """Changes wait this long for those of the next tiles ..."""
+    soon_s: float = 0.3
+    """Changes wait this long for those of other tiles that are left together ..."""
     soon_voxels: int = 8
     """... if there are so many; fewer weigh less than what a report costs."""
+    apart_s: float = 5.0
+    """Reports of changes follow each other no faster than this: where all has changed, many tiles share one."""
     longest_m: float = 300.0
     """Any change is reported at the latest after this much way ..."""
     longest_s: float = 20.0
@@ -89,10 +91,11 @@ class ReportParameters:
 
     def __post_init__(self) -> None:
         """A protocol that there is, and waiting times in order."""
-        if not 0 <= self.soon_s <= self.longest_s <= self.unchanged_s or self.soon_voxels < 1:
+        waits_s = (self.soon_s, self.apart_s, self.longest_s, self.unchanged_s)
+        if waits_s[0] < 0 or sorted(waits_s) != list(waits_s) or self.soon_voxels < 1:
             raise AgentConfigError(
-                f"soon_s = {self.soon_s}, longest_s = {self.longest_s} and unchanged_s = {self.unchanged_s} s must rise"
-                f" from 0 on; soon_voxels = {self.soon_voxels} must be 1 or more"
+                f"soon_s, apart_s, longest_s and unchanged_s = {waits_s} s must rise from 0 on; soon_voxels ="
+                f" {self.soon_voxels} must be 1 or more"
             )
         if not 0 <= self.longest_m <= self.unchanged_m:
             raise AgentConfigError(

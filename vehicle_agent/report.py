@@ -42,7 +42,7 @@ from vehicle_agent.segment.segmenter import SegmentedScan
 from vehicle_agent.surroundings import left_behind
 from vehicle_agent.tracks import Tracks
 
-STEP_M = 3.0  # tiles left behind are looked for after this much way
+STEP_M = 2.0  # tiles left behind are looked for after this much way
 
 _log = logging.getLogger(__name__)
 
@@ -89,15 +89,24 @@ class _Pending:
         if len(change.changed) and self.changed_ns is None:
             self.changed_m, self.changed_ns = odometer_m, t_ns
 
-    def is_due(self, odometer_m: float, t_ns: int, most: ReportParameters) -> bool:
-        """Whether it has waited long enough: for the next tiles, for more voxels, or for the district's end."""
+    def is_due(self, odometer_m: float, t_ns: int, reported_ns: int | None, most: ReportParameters) -> bool:
+        """Whether it has waited long enough: for the next tiles, for more voxels, or for the district's end.
+
+        Args:
+            odometer_m: way so far.
+            t_ns: time of the scan.
+            reported_ns: when changes were reported last; None: never.
+            most: how long is enough.
+        """
         if odometer_m - self.since_m > most.unchanged_m or t_ns - self.since_ns > most.unchanged_s * 1e9:
             return True
         if self.changed_m is None or self.changed_ns is None:
             return False
+        if odometer_m - self.changed_m > most.longest_m or t_ns - self.changed_ns > most.longest_s * 1e9:
+            return True
+        apart = reported_ns is None or t_ns - reported_ns > most.apart_s * 1e9
         many = sum(len(change.changed) for change in self.changes.values()) >= most.soon_voxels
-        longest_s = most.soon_s if many else most.longest_s
-        return odometer_m - self.changed_m > most.longest_m or t_ns - self.changed_ns > longest_s * 1e9
+        return many and apart and t_ns - self.changed_ns > most.soon_s * 1e9
 
 
 @dataclass(slots=True)
@@ -147,6 +156,7 @@ class Reporter:
         self._stretch: _Stretch | None = None
         self._looked_at: F64 | None = None
         self._here_ns = start_ns  # time of the newest final pose
+        self._reported_ns: int | None = None  # when changes were reported last
         self._open_districts: set[District] = set()
         self._stated_before: Counter[TileId] = Counter()  # in reports of an earlier life that have the same ids
         self._tracks = Tracks(detector.local_map.grid_frame.frame)
@@ -224,7 +234,8 @@ class Reporter:
         self._here_ns = estimate.t_ns
         self._decide_left(estimate, odometer_m)
         for district, pending in list(self._pending.items()):
-            if district not in self._open_districts or pending.is_due(odometer_m, estimate.t_ns, self._parameters):
+            due = pending.is_due(odometer_m, estimate.t_ns, self._reported_ns, self._parameters)
+            if due or district not in self._open_districts:
                 self._report(district)
 
     def _decide_left(self, estimate: PoseEstimate, odometer_m: float) -> None:
@@ -329,6 +340,8 @@ class Reporter:
     def _report(self, district: District) -> None:
         """One report of what is told, and one of what is held back: the short form would call its voxels observed."""
         pending = self._pending.pop(district)
+        if pending.changed_ns is not None:
+            self._reported_ns = self._here_ns
         held_back = {t for t, change in pending.changes.items() if change.doubt is not None and change.doubt.withheld}
         for tiles in (pending.changes.keys() - held_back, held_back):
             self._put(district, tiles, pending, whole=tiles is held_back)

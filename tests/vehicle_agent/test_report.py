@@ -102,7 +102,14 @@ def moment(x_m: float, t_s: float) -> PoseEstimate:
     return replace(estimate(x_m=x_m), t_ns=START_NS + int(t_s * 1e9))
 
 
-PATIENT = {"soon_s": 1000.0, "longest_s": 1000.0, "unchanged_s": 1000.0, "longest_m": 1e6, "unchanged_m": 1e6}
+PATIENT = {
+    "soon_s": 1000.0,
+    "apart_s": 1000.0,
+    "longest_s": 1000.0,
+    "unchanged_s": 1000.0,
+    "longest_m": 1e6,
+    "unchanged_m": 1e6,
+}
 
 
 def test_only_tiles_left_behind_are_decided(tiles: dict[TileId, Tile], outbox: Outbox, hits: np.ndarray) -> None:
@@ -131,9 +138,9 @@ def test_changes_are_reported_in_mid_district_a_moment_after_their_tiles_were_le
     drive.leave_behind(moment(74.0, 9.0), 74.0)  # the wall's tiles are left, others of their districts are not
     assert drive.classes["deleted"] >= ReportParameters().soon_voxels
     assert reports(outbox) == []  # those of the next tiles may come along
-    drive.leave_behind(moment(74.5, 9.3), 74.5)  # a few steps on: nothing is decided, but time passes
+    drive.leave_behind(moment(74.5, 9.2), 74.5)  # a few steps on: nothing is decided, but time passes
     assert reports(outbox) == []
-    drive.leave_behind(moment(75.0, 9.7), 75.0)
+    drive.leave_behind(moment(75.0, 9.4), 75.0)
     early = reports(outbox)
     assert changed_in(early) >= ReportParameters().soon_voxels
     drive.report_all(140.0)
@@ -142,7 +149,7 @@ def test_changes_are_reported_in_mid_district_a_moment_after_their_tiles_were_le
 
 
 @pytest.mark.parametrize(
-    ("soon_voxels", "wall_x_m", "waits_s"), [(8, 14.3, 0.5), (10_000, 14.3, 20.0), (8, 9.3, 60.0)], ids=str
+    ("soon_voxels", "wall_x_m", "waits_s"), [(8, 14.3, 0.3), (10_000, 14.3, 20.0), (8, 9.3, 60.0)], ids=str
 )
 def test_few_changes_wait_for_more_and_ground_that_is_as_it_was_waits_longest(
     tiles: dict[TileId, Tile], outbox: Outbox, soon_voxels: int, wall_x_m: float, waits_s: float
@@ -153,10 +160,26 @@ def test_few_changes_wait_for_more_and_ground_that_is_as_it_was_waits_longest(
     drive.leave_behind(moment(74.0, 0.0), 74.0)
     pending = drive.classes["deleted"] + drive.classes["new"] + drive.classes["modified"]
     assert (pending >= 8) == (wall_x_m != 9.3)
-    for t_s in (waits_s - 0.1, waits_s + 0.1):
+    for t_s in (waits_s - 0.05, waits_s + 0.05):
         assert reports(outbox) == []
         drive.leave_behind(moment(74.0, t_s), 74.0)  # it stands: time passes, no tile is left
     assert reports(outbox)
+
+
+def test_where_much_has_changed_reports_keep_apart(tiles: dict[TileId, Tile], outbox: Outbox, hits: np.ndarray) -> None:
+    drive = reporter(tiles, outbox, apart_s=5.0)
+    drive.add_scan(scan(hits))
+    for t_s in (9.0, 9.4):
+        drive.leave_behind(moment(74.0, t_s), 74.0)
+    first = len(reports(outbox))
+    assert first > 0
+    drive.add_scan(scan(hits, 10.0))
+    drive.leave_behind(moment(0.0, 10.0), 74.0)
+    for t_s in (10.5, 11.0, 14.3):  # left a second time: soon would be 10.8
+        drive.leave_behind(moment(74.0, t_s), 74.0)
+        assert len(reports(outbox)) == first
+    drive.leave_behind(moment(74.0, 14.5), 74.0)
+    assert len(reports(outbox)) > first
 
 
 @pytest.mark.parametrize(("wall_x_m", "way_m"), [(14.3, 300.0), (9.3, 1000.0)])
@@ -208,7 +231,7 @@ def test_a_restarted_agent_that_puts_other_tiles_together_states_each_tile_once_
 ) -> None:
     """It was killed on the way; its map is another by now, so it decides and reports at other moments."""
     for stops, ends in ((first_stops, not first_stops), (again_stops, True)):
-        drive = reporter(tiles, outbox, soon_s=0.0)
+        drive = reporter(tiles, outbox, soon_s=0.0, apart_s=0.0)
         drive.add_scan(scan(hits))
         for x_m in stops:
             drive.leave_behind(moment(x_m, x_m), x_m)
