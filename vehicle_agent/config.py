@@ -63,11 +63,11 @@ class ReportParameters:
     """A tile farther from the vehicle gets no more evidence: its classes are decided. More than the range of detection
     by what the LiDAR stands from the vehicle's origin and what it drives during a scan."""
     soon_s: float = 0.3
-    """Changes wait this long for those of other tiles that are left together ..."""
-    soon_voxels: int = 8
-    """... if there are so many; fewer weigh less than what a report costs."""
-    apart_s: float = 5.0
-    """Reports of changes follow each other no faster than this: where all has changed, many tiles share one."""
+    """Where much has changed, the report waits this long for tiles that are left together with the first ..."""
+    soon_voxels: int = 48
+    """... much: so many voxels of one tile. On ground that has not changed, detection errs in up to some 30."""
+    apart_s: float = 3.0
+    """Such reports follow each other no faster than this: a whole street that has changed shares a few."""
     longest_m: float = 300.0
     """Any change is reported at the latest after this much way ..."""
     longest_s: float = 20.0

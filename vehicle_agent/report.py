@@ -1,7 +1,7 @@
 """From evidence to the outbox: tiles that the vehicle has left are decided, and reported soon where they have changed.
 
-A report costs some 160 B beside what it says. So changes wait a moment for those of the next tiles, lone voxels for
-company, and ground that is as the map says it is for the end of the district, or for long.
+A report costs some 160 B beside what it says. So a tile in which much has changed waits a moment for those that are
+left with it, scattered voxels for others, and ground that is as the map says for the end of the district, or for long.
 """
 
 import logging
@@ -105,7 +105,7 @@ class _Pending:
         if odometer_m - self.changed_m > most.longest_m or t_ns - self.changed_ns > most.longest_s * 1e9:
             return True
         apart = reported_ns is None or t_ns - reported_ns > most.apart_s * 1e9
-        many = sum(len(change.changed) for change in self.changes.values()) >= most.soon_voxels
+        many = max(len(change.changed) for change in self.changes.values()) >= most.soon_voxels
         return many and apart and t_ns - self.changed_ns > most.soon_s * 1e9
 
 

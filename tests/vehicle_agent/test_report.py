@@ -133,16 +133,16 @@ def changed_in(found: list[ChangeReport]) -> int:
 def test_changes_are_reported_in_mid_district_a_moment_after_their_tiles_were_left(
     tiles: dict[TileId, Tile], outbox: Outbox, hits: np.ndarray
 ) -> None:
-    drive = reporter(tiles, outbox)
+    drive = reporter(tiles, outbox, soon_voxels=8)
     drive.add_scan(scan(hits))
     drive.leave_behind(moment(74.0, 9.0), 74.0)  # the wall's tiles are left, others of their districts are not
-    assert drive.classes["deleted"] >= ReportParameters().soon_voxels
+    assert drive.classes["deleted"] >= 8
     assert reports(outbox) == []  # those of the next tiles may come along
     drive.leave_behind(moment(74.5, 9.2), 74.5)  # a few steps on: nothing is decided, but time passes
     assert reports(outbox) == []
     drive.leave_behind(moment(75.0, 9.4), 75.0)
     early = reports(outbox)
-    assert changed_in(early) >= ReportParameters().soon_voxels
+    assert changed_in(early) >= 8
     drive.report_all(140.0)
     assert sorted(c.tile for r in reports(outbox) for c in r.tiles) == sorted(tiles)
     assert len({r.report_id for r in reports(outbox)}) == len(reports(outbox)) > len(early)
@@ -167,7 +167,7 @@ def test_few_changes_wait_for_more_and_ground_that_is_as_it_was_waits_longest(
 
 
 def test_where_much_has_changed_reports_keep_apart(tiles: dict[TileId, Tile], outbox: Outbox, hits: np.ndarray) -> None:
-    drive = reporter(tiles, outbox, apart_s=5.0)
+    drive = reporter(tiles, outbox, soon_voxels=8, apart_s=5.0)
     drive.add_scan(scan(hits))
     for t_s in (9.0, 9.4):
         drive.leave_behind(moment(74.0, t_s), 74.0)
@@ -231,7 +231,7 @@ def test_a_restarted_agent_that_puts_other_tiles_together_states_each_tile_once_
 ) -> None:
     """It was killed on the way; its map is another by now, so it decides and reports at other moments."""
     for stops, ends in ((first_stops, not first_stops), (again_stops, True)):
-        drive = reporter(tiles, outbox, soon_s=0.0, apart_s=0.0)
+        drive = reporter(tiles, outbox, soon_voxels=8, soon_s=0.0, apart_s=0.0)
         drive.add_scan(scan(hits))
         for x_m in stops:
             drive.leave_behind(moment(x_m, x_m), x_m)
