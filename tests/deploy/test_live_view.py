@@ -8,6 +8,7 @@ from rich.console import Console
 
 from deploy.live import FleetState, live_view, render
 from deploy.live_traffic import Rate, rate_between
+from deploy.map_use import MapUse
 from fleet_bus.links import UNLIMITED, LinkProfile
 from schemas.traffic import TrafficLine, TrafficSample
 
@@ -147,3 +148,15 @@ def test_without_a_terminal_a_line_tells_the_same():
     lines = console.file.getvalue().splitlines()
     assert len(lines) == 1, "one line, and no second one at once"
     assert lines[0].endswith("kB/km down tile 7.0; up control 0.1")
+
+
+def test_the_table_says_how_much_of_the_map_under_the_wheels_others_have_renewed() -> None:
+    state = FleetState()
+    for n in range(3):
+        state.on_traffic("", sample(1, vehicle=f"vehicle-0{n}").encode())
+    assert "map renewed" not in shown(state)
+    state.maps = {"vehicle-00": MapUse(0.0, None, None), "vehicle-01": MapUse(0.8, 30.0, 12.4)}
+    text = shown(state)
+    assert "0 %" in " ".join(row_of(text, "vehicle-00"))
+    assert "80 %, 12 s old" in " ".join(row_of(text, "vehicle-01"))
+    assert "%" not in " ".join(row_of(text, "vehicle-02"))
