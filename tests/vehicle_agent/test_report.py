@@ -149,7 +149,7 @@ def test_changes_are_reported_in_mid_district_a_moment_after_their_tiles_were_le
 
 
 @pytest.mark.parametrize(
-    ("soon_voxels", "wall_x_m", "waits_s"), [(8, 14.3, 0.3), (10_000, 14.3, 20.0), (8, 9.3, 60.0)], ids=str
+    ("soon_voxels", "wall_x_m", "waits_s"), [(8, 14.3, 0.3), (10_000, 14.3, 40.0), (8, 9.3, 120.0)], ids=str
 )
 def test_few_changes_wait_for_more_and_ground_that_is_as_it_was_waits_longest(
     tiles: dict[TileId, Tile], outbox: Outbox, soon_voxels: int, wall_x_m: float, waits_s: float
@@ -182,7 +182,7 @@ def test_where_much_has_changed_reports_keep_apart(tiles: dict[TileId, Tile], ou
     assert len(reports(outbox)) > first
 
 
-@pytest.mark.parametrize(("wall_x_m", "way_m"), [(14.3, 300.0), (9.3, 1000.0)])
+@pytest.mark.parametrize(("wall_x_m", "way_m"), [(14.3, 400.0), (9.3, 1000.0)])
 def test_a_long_way_in_a_district_is_reported_before_its_end(
     tiles: dict[TileId, Tile], outbox: Outbox, wall_x_m: float, way_m: float
 ) -> None:
@@ -245,7 +245,7 @@ def test_a_restarted_agent_that_puts_other_tiles_together_states_each_tile_once_
 
 
 @pytest.mark.parametrize(
-    "bad", [{"soon_s": 30.0}, {"longest_s": 90.0}, {"soon_s": -1.0}, {"soon_voxels": 0}, {"longest_m": 2000.0}]
+    "bad", [{"soon_s": 50.0}, {"longest_s": 150.0}, {"soon_s": -1.0}, {"soon_voxels": 0}, {"longest_m": 2000.0}]
 )
 def test_waiting_times_that_contradict_each_other_are_refused(bad: dict[str, float]) -> None:
     with pytest.raises(AgentConfigError):
