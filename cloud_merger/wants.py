@@ -175,15 +175,10 @@ def _remembered(own: Report, known: Known, ids: I32) -> tuple[NDArray[np.float64
     seat = np.searchsorted(ids, rows["voxel_id"])
     quotes_the_denied = (rows["kind"] == Kind.QUOTED) & is_epoch[seat]
     may_agree = (rows["kind"] != Kind.NOTHING) & ~quotes_the_denied
-    against = np.where(
-        rows["was"] == EPOCH, True, of_epoch["count"][seat] == 0
-    )  # the state that a claim was made against
-    in_hand = may_agree & (rows["kind"] == Kind.MEASURED) & is_epoch[seat] & against
-    return (
-        np.bincount(seat, rows["weight"] * may_agree, n),
-        np.bincount(seat, rows["weight"], n),
-        np.bincount(seat, in_hand, n).astype(np.float64),
-    )
+    same_was = is_epoch[seat] & ((rows["was"] == EPOCH) | (of_epoch["count"][seat] == 0))
+    in_hand = (may_agree & (rows["kind"] == Kind.MEASURED) & same_was).astype(np.float64)
+    weights = (rows["weight"] * may_agree, rows["weight"], in_hand)
+    return tuple(np.bincount(seat, weight, n).astype(np.float64) for weight in weights)
 
 
 def _sample(outvoted: NDArray[np.bool_], n: int) -> NDArray[np.bool_]:

@@ -26,19 +26,26 @@ class RunScores:
 
     Attributes:
         before: the base map, taken as if nothing had changed.
-        single: for each vehicle, the map as its own reports alone would have it.
+        single: for each vehicle that drove on the base map alone, the map as its own reports alone would have it.
+        helped: for each of the others, the same; but what it saw unchanged is as in the versions that it held, so
+            there is in it what others found.
         after: the newest map.
     """
 
     before: Evaluation
     single: dict[str, Evaluation]
+    helped: dict[str, Evaluation]
     after: Evaluation
 
     def as_dict(self) -> dict[str, Any]:
         """Return macro F1 in percent: scored voxels by stage, and all three levels below `levels`."""
         levels = {level: self._stages(level) for level in LEVELS}
-        by_vehicle = {name: round(score.f1("scored"), 2) for name, score in sorted(self.single.items())}
-        return {**levels["scored"], "levels": levels, "single_by_vehicle": by_vehicle}
+        return {
+            **levels["scored"],
+            "levels": levels,
+            "single_by_vehicle": _by_vehicle(self.single),
+            "helped_by_vehicle": _by_vehicle(self.helped),
+        }
 
     def _stages(self, level: Any) -> dict[str, float | None]:
         alone = [score.f1(level) for score in self.single.values()]
@@ -47,6 +54,10 @@ class RunScores:
             "single": round(statistics.fmean(alone), 2) if alone else None,
             "after": round(self.after.f1(level), 2),
         }
+
+
+def _by_vehicle(scores: dict[str, Evaluation]) -> dict[str, float]:
+    return {name: round(score.f1("scored"), 2) for name, score in sorted(scores.items())}
 
 
 NO_TRUTH: dict[str, Any] = {"before": None, "single": None, "after": None}
@@ -66,27 +77,36 @@ def score_run(truth: Truth, store: SqliteStore, histories: Iterable[TileHistory]
     held = list(histories)
     base = {history.tile.tile: history.before for history in held}
     final = {history.tile.tile: history.after for history in held}
-    single = {
-        vehicle: evaluate_maps(truth, base, alone) for vehicle, alone in maps_of_vehicles(store, base, final).items()
-    }
-    return RunScores(evaluate_maps(truth, base, base), single, evaluate_maps(truth, base, final))
+    maps, helped = maps_of_vehicles(store, base, final)
+    scores = {vehicle: evaluate_maps(truth, base, own) for vehicle, own in maps.items()}
+    return RunScores(
+        before=evaluate_maps(truth, base, base),
+        single={vehicle: score for vehicle, score in scores.items() if vehicle not in helped},
+        helped={vehicle: score for vehicle, score in scores.items() if vehicle in helped},
+        after=evaluate_maps(truth, base, final),
+    )
 
 
-def maps_of_vehicles(store: SqliteStore, base: Tiles, final: Tiles) -> dict[str, dict[TileId, Gaussians]]:
-    """Return for each vehicle the base map changed by its own reports and nothing else.
+def maps_of_vehicles(
+    store: SqliteStore, base: Tiles, final: Tiles
+) -> tuple[dict[str, dict[TileId, Gaussians]], set[str]]:
+    """Return for each vehicle the base map changed by its own reports, and which vehicles held more than the base map.
 
     A voxel that it observed is as it said: the new Gaussian, nothing, or as in the version that it held. Where the
     cloud had Gaussians enough and did not ask for the vehicle's own, that of the final map stands in for it.
     """
     maps: dict[str, dict[TileId, Gaussians]] = defaultdict(lambda: dict(base))
+    helped: set[str] = set()
     for row in store.reports():
         for change in ChangeReport.decode(row.body).tiles:
             held = _held(store, change, base)
+            if change.base_sha and held != base.get(change.tile, Gaussians.empty()):
+                helped.add(row.vehicle)
             alone = maps[row.vehicle]
             alone[change.tile] = with_statement(
                 alone.get(change.tile, Gaussians.empty()), held, change, final.get(change.tile, Gaussians.empty())
             )
-    return dict(maps)
+    return dict(maps), helped
 
 
 def with_statement(tile: Gaussians, held: Gaussians, change: TileChange, final: Gaussians) -> Gaussians:

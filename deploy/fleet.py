@@ -4,11 +4,12 @@ world -> base map -> router, store, shards, watcher -> agents drive, detect, upl
 """
 
 import logging
+import math
 import threading
 import time
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 from rich.console import Console
@@ -20,6 +21,7 @@ from deploy.errors import DeployError
 from deploy.fleet_config import FleetConfig
 from deploy.live import FleetState, View, live_view
 from deploy.live_traffic import LiveLedgers
+from deploy.map_use import Versions, map_use, read_ways
 from deploy.prepare import PreparedRun
 from deploy.processes import ProcessSpec, Supervisor
 from deploy.run_folder import RunFolder
@@ -33,9 +35,14 @@ from tile_store.values import StoreConfig
 from vehicle_agent.agent import AgentConfig
 from vehicle_agent.detect.parameters import DetectParameters
 from vehicle_agent.features.layer_parameters import FeatureParameters
+from vehicle_agent.world_clock import Departure, WorldClock, make_clock
 
 POLL_S = 0.2
+LOOK_S = 2.0
 SETTLE_S = 60.0
+EARLY_S = 3.0
+"""A process is started so long before its vehicle, in time of the drives: the others would have to wait for it."""
+LATE = "the agents did not finish"
 WATCHER_GRACE_S = 15.0
 
 _log = logging.getLogger(__name__)
@@ -91,10 +98,10 @@ def run_fleet(
         bus = stack.enter_context(open_bus(BusConfig(connect=(site.connect,)), name="fleet"))
         stack.enter_context(bus.subscribe(traffic_keys(), state.on_traffic))
         view = stack.enter_context(live_view(state, console))
-        run = _Run(config, folder, supervisor, opened, view, state, stop, opened.counts().versions)
+        run = _Run(config, folder, supervisor, opened, view, state, stop, opened.counts().versions, Versions(opened))
         run.wait_until(run.watcher_ready, SETTLE_S, "the watcher did not start")
-        start_agents(supervisor, config, folder, prepared, site)
-        run.wait_until(lambda: supervisor.finished("vehicle-"), config.deadline_s, "the agents did not finish")
+        waiting = Departures(supervisor, agent_processes(config, folder, prepared, site), folder, prepared.starts_s)
+        run.wait_until(lambda: waiting.all_gone() and supervisor.finished("vehicle-"), config.deadline_s, LATE)
         run.wait_until(run.settled, SETTLE_S, "the merges did not settle")
         run.wait_until(run.watcher_caught_up, WATCHER_GRACE_S, None)
     return FleetOutcome(time.monotonic() - started_s, state.published, dict(supervisor.restarts))
@@ -134,14 +141,48 @@ def cloud_processes(config: FleetConfig, folder: RunFolder, site: Site) -> list[
     ]
 
 
-def start_agents(
-    supervisor: Supervisor, config: FleetConfig, folder: RunFolder, prepared: PreparedRun, site: Site
-) -> None:
-    """Start one agent process a drive."""
+def agent_processes(config: FleetConfig, folder: RunFolder, prepared: PreparedRun, site: Site) -> list[ProcessSpec]:
+    """Return one agent process a drive, by the number of its vehicle."""
+    specs = []
     for number, (drive, place) in enumerate(zip(prepared.agent_drives, site.vehicles, strict=True)):
         name = vehicle_name(number)
-        agent = agent_config(config, name, drive, folder, place)
-        supervisor.start(ProcessSpec(name, roles.agent, (agent,), namespace=place.namespace))
+        departure = Departure(folder.clock, number, prepared.starts_s[number]) if prepared.starts_s else None
+        agent = replace(agent_config(config, name, drive, folder, place), departure=departure)
+        specs.append(ProcessSpec(name, roles.agent, (agent,), namespace=place.namespace))
+    return specs
+
+
+class Departures:
+    """Starts the processes of vehicles when their time comes, a little early: they drive off on time.
+
+    Args:
+        supervisor: starts them.
+        specs: one process a vehicle.
+        folder: where their common clock is written.
+        starts_s: when each starts; empty: all at once, each in a time of its own.
+    """
+
+    def __init__(
+        self, supervisor: Supervisor, specs: list[ProcessSpec], folder: RunFolder, starts_s: tuple[float, ...]
+    ) -> None:
+        self._supervisor = supervisor
+        self._waiting = list(zip(starts_s or (0.0,) * len(specs), specs, strict=True))
+        if starts_s:
+            make_clock(folder.clock, starts_s)
+        self._clock = WorldClock(folder.clock) if starts_s else None
+
+    def all_gone(self) -> bool:
+        """Start those whose time has come; tell whether none is left."""
+        now_s = self._clock.now_s if self._clock is not None else None
+        until_s = math.inf if now_s is None else now_s + EARLY_S
+        for start_s, spec in self._waiting:
+            if start_s <= until_s:
+                self._supervisor.start(spec)
+        self._waiting = [(start_s, spec) for start_s, spec in self._waiting if start_s > until_s]
+        if not self._waiting and self._clock is not None:
+            self._clock.close()
+            self._clock = None
+        return not self._waiting
 
 
 def vehicle_name(number: int) -> str:
@@ -187,6 +228,8 @@ class _Run:
     state: FleetState
     stop: threading.Event
     versions_before: int
+    versions: Versions
+    looked_s: float = 0.0
 
     def wait_until(self, done: Callable[[], bool], timeout_s: float, complaint: str | None) -> None:
         """Supervise and draw until a condition holds.
@@ -224,7 +267,14 @@ class _Run:
         self.state.published, self.state.reports = counts.versions - self.versions_before, counts.reports
         self.state.waiting = counts.dirty
         self.state.updates = count_lines(self.folder.updates)
+        if time.monotonic() - self.looked_s >= LOOK_S:
+            self._observe_ways()
         self.view.refresh()
+
+    def _observe_ways(self) -> None:
+        self.looked_s = time.monotonic()
+        found = {vehicle: map_use(way, self.versions) for vehicle, way in read_ways(self.folder).items()}
+        self.state.maps = {vehicle: use for vehicle, use in found.items() if use is not None}
 
 
 def count_lines(path: Path) -> int:

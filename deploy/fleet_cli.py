@@ -41,6 +41,12 @@ RUN_OPTIONS = (
     click.option(
         "--layers", callback=listed, help="Layers kept up to date, such as ndt,signs,streetlights.  [default: ndt]"
     ),
+    click.option(
+        "--headway",
+        "headway_s",
+        type=float,
+        help="Seconds between the starts of two vehicles, in time of the drives; 0: all at once.  [default: 4]",
+    ),
     click.option("--world-seed", type=int, help="Seed of the simulated world.  [default: 7]"),
     click.option(
         "--wrong-mount",

@@ -13,6 +13,7 @@ from gnd_map.config import from_mapping
 
 MAX_AGENTS = 200
 MAX_SHARDS = 32
+MAX_HEADWAY_S = 3600.0
 VOXEL_LAYER = "ndt"
 _WRONG_MOUNT = re.compile(r"(?P<vehicle>\d{1,3}):(?P<deg>[+-]?\d+(\.\d*)?)")
 FEATURE_LAYERS = ("signs", "streetlights", "poles")
@@ -27,6 +28,8 @@ class FleetConfig:
         agents: number of vehicle agent processes.
         shards: number of merger shard processes.
         link: link profile of every vehicle: 3g, 4g, 5g, none, or a TOML file.
+        headway_s: time of the drives between the starts of two vehicles, so that those behind drive on what those
+            ahead have found; 0: all start at once, and drive as fast as they can.
         world_seed: seed of the simulated world and of its drives.
         port: TCP port of the router on the loopback interface; 0 takes a free one.
         detect_mode: rules of change detection, `default` or `paper`.
@@ -42,11 +45,12 @@ class FleetConfig:
     agents: int = 8
     shards: int = 2
     link: str = "4g"
+    headway_s: float = 4.0
     world_seed: int = 7
     port: int = 0
     detect_mode: str = "default"
     merge_mode: str = "default"
-    merge_delay_s: float = 2.0
+    merge_delay_s: float = 0.5
     merge_after_reports: int = 16
     deadline_s: float = 1800.0
     wrong_mounts: tuple[str, ...] = ()
@@ -60,6 +64,8 @@ class FleetConfig:
         for name in ("detect_mode", "merge_mode"):
             value = getattr(self, name)
             _require(value in ("default", "paper"), f"{name} must be default or paper, got {value!r}")
+        longest_s = MAX_HEADWAY_S
+        _require(0 <= self.headway_s <= longest_s, f"headway_s must be 0 to {longest_s:g} s, got {self.headway_s}")
         _require(self.merge_delay_s >= 0, f"merge_delay_s must not be negative, got {self.merge_delay_s}")
         _require(self.merge_after_reports >= 1, f"merge_after_reports must be >= 1, got {self.merge_after_reports}")
         _require(self.deadline_s > 0, f"deadline_s must be positive, got {self.deadline_s}")

@@ -14,6 +14,7 @@ from rich.table import Table
 from rich.text import Text
 
 from deploy.live_traffic import LiveLedgers, kinds_table, link_of, plain_traffic, rate_cell
+from deploy.map_use import MapUse
 from fleet_bus.links import LinkProfile
 from schemas.errors import SchemaError
 from schemas.traffic import TrafficSample
@@ -22,11 +23,12 @@ HEALTH_STYLE = {"good": "green", "degraded": "yellow", "lost": "red"}
 PLAIN_PERIOD_S = 10.0
 WIDE = 108
 _COLUMNS = (
-    "vehicle", "position", "health", "driven", "down", "of link, down", "up", "of link, up", "tiles", "reports",
-    "doubts",
+    "vehicle", "position", "health", "driven", "map renewed", "down", "of link, down", "up", "of link, up", "tiles",
+    "reports", "doubts",
 )  # fmt: skip
 _TEXTS = ("vehicle", "position", "health")
 _WIDE_ONLY = ("position", "tiles", "reports")
+_RENEWED = "map renewed"
 
 
 @dataclass(slots=True)
@@ -40,6 +42,7 @@ class FleetState:
         updates: updates that the watcher has received.
         waiting: tiles that wait for a merge.
         events: the last things that happened, newest last.
+        maps: which map each vehicle drives on, as far as known.
         links: profile of each vehicle's link, as far as known.
         ledgers: what the vehicles have sent and received.
     """
@@ -50,6 +53,7 @@ class FleetState:
     updates: int = 0
     waiting: int = 0
     events: list[str] = field(default_factory=list)
+    maps: dict[str, MapUse] = field(default_factory=dict)
     links: dict[str, LinkProfile] = field(default_factory=dict)
     ledgers: LiveLedgers = field(default_factory=LiveLedgers)
     lock: threading.Lock = field(default_factory=threading.Lock)
@@ -89,7 +93,7 @@ def render(state: FleetState, width: int = WIDE) -> Group:
     table = Table(box=None, pad_edge=False, header_style="bold")
     doubts = any(map(doubts_text, state.samples.values()))
     shown = [name for name in _COLUMNS if width >= WIDE or name not in _WIDE_ONLY]
-    shown = [name for name in shown if doubts or name != "doubts"]
+    shown = [name for name in shown if (doubts or name != "doubts") and (state.maps or name != _RENEWED)]
     for name in shown:
         table.add_column(name.split(",")[0], justify="left" if name in _TEXTS else "right", no_wrap=True)
     with state.lock:
@@ -115,6 +119,7 @@ def _row(state: FleetState, sample: TrafficSample) -> tuple[str | Text, ...]:
         f"{math.degrees(sample.lat_rad):.5f} {math.degrees(sample.lon_rad):.5f}",
         Text(sample.health, style=HEALTH_STYLE.get(sample.health, "dim")),
         f"{driven_m:.0f} m",
+        renewed_text(state.maps.get(sample.vehicle)),
         size_text(traffic.down_wire_bytes if traffic else sample.wire_down_bytes),
         rate_cell(rate, link, "down", ledgers.clock()),
         size_text(traffic.up_wire_bytes if traffic else sample.wire_up_bytes),
@@ -123,6 +128,14 @@ def _row(state: FleetState, sample: TrafficSample) -> tuple[str | Text, ...]:
         str(sample.reports),
         Text(doubts_text(sample), style="yellow"),
     )
+
+
+def renewed_text(use: MapUse | None) -> str:
+    """What others found of the map under a vehicle's wheels: "80 %, 12 s old"; nothing where that is not known."""
+    if use is None:
+        return ""
+    age = f", {use.newest_age_s:.0f} s old" if use.newest_age_s is not None else ""
+    return f"{use.renewed_share:.0%}".replace("%", " %") + age
 
 
 def doubts_text(sample: TrafficSample) -> str:
@@ -171,9 +184,12 @@ class View:
             doubtful = sum(sample.tiles_doubtful for sample in self.state.samples.values())
             held_back = sum(sample.tiles_held_back for sample in self.state.samples.values())
             doubts = f"{doubtful} tiles doubtful ({held_back} held back); " if doubtful else ""
+            on_found = sum(use.renewed_share > 0 for use in self.state.maps.values())
+            found = f"{on_found} on what others found; " if on_found else ""
             return (
                 f"{len(self.state.samples)} agents, {driven_m:.0f} m driven, {self.state.reports} reports, "
                 f"{self.state.waiting} tiles waiting, {self.state.published} versions, {self.state.updates} updates; "
+                + found
                 + doubts
                 + plain_traffic(agents)
             )

@@ -30,11 +30,13 @@ class PreparedRun:
     Attributes:
         agent_drives: one recorded or simulated drive (MCAP) a vehicle.
         truth: the truth of a simulated world, None for recorded drives.
+        starts_s: when each starts, in a time that is common to all; empty: each drives in a time of its own.
         world: the simulated world itself, None for recorded drives.
     """
 
     agent_drives: tuple[Path, ...]
     truth: Path | None
+    starts_s: tuple[float, ...] = ()
     world: Path | None = None
 
 
@@ -63,15 +65,19 @@ def prepare_simulated(config: FleetConfig, folder: RunFolder, worlds: Path | Non
     """
     home = folder.world if worlds is None else worlds / f"seed-{config.world_seed}"
     forget_if_stale(home)
-    processes = os.cpu_count() or 1
-    world = prepare_fleet_run(config.world_seed, config.agents, home, progress, processes, reuse=True)
+    forget_other_headways(home, config.headway_s)
+    processes, headway_s = os.cpu_count() or 1, config.headway_s
+    world = prepare_fleet_run(
+        config.world_seed, config.agents, home, progress, processes, reuse=True, headway_s=headway_s
+    )
     base_map = home / "base.sqlite"
     if not base_map.exists():
         _build_base(base_map, world.base_drives, progress)
     copy_store(base_map, folder.store)
     if config.feature_layers:
         put_base_layers(folder.store, world.features_path, config.feature_layers)
-    return PreparedRun(tuple(world.agent_drives), world.truth_path, world.world_path)
+    starts_s = starts_of(config.agents, headway_s)
+    return PreparedRun(tuple(world.agent_drives), world.truth_path, starts_s, world.world_path)
 
 
 def forget_if_stale(home: Path) -> None:
@@ -82,6 +88,20 @@ def forget_if_stale(home: Path) -> None:
         (home / "base.sqlite").unlink(missing_ok=True)
     home.mkdir(parents=True, exist_ok=True)
     made_by.write_text(now, encoding="utf-8")
+
+
+def forget_other_headways(home: Path, headway_s: float) -> None:
+    """Remove the vehicles' drives that are stamped for another headway, and note which they are stamped for."""
+    noted, now = home / "headway_s.txt", f"{headway_s:g}"
+    if not noted.exists() or noted.read_text(encoding="utf-8") != now:
+        for drive in (home / "drives").glob("vehicle-*.mcap"):
+            drive.unlink()
+    noted.write_text(now, encoding="utf-8")
+
+
+def starts_of(agents: int, headway_s: float) -> tuple[float, ...]:
+    """Return when each vehicle starts; nothing where all start at once."""
+    return tuple(number * headway_s for number in range(agents)) if headway_s > 0 else ()
 
 
 def sources_sha() -> str:
@@ -136,7 +156,8 @@ def prepare_recorded(config: FleetConfig, folder: RunFolder, source: Source) -> 
     if source.base_map is not None:
         copy_store(source.base_map, folder.store)
     count = len(found) if source.agents is None else config.agents
-    return PreparedRun(tuple(itertools.islice(itertools.cycle(found), count)), None)
+    drives = tuple(itertools.islice(itertools.cycle(found), count))
+    return PreparedRun(drives, None, starts_of(count, config.headway_s))
 
 
 def find_drives(paths: tuple[Path, ...]) -> list[Path]:

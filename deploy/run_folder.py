@@ -43,6 +43,15 @@ class RunFolder:
         return self.root / "ledger"
 
     @property
+    def clock(self) -> Path:
+        """The time that the vehicles have in common, see `vehicle_agent.world_clock`."""
+        return self.root / "clock.bin"
+
+    def way(self, vehicle: str) -> Path:
+        """Which map a vehicle drove on where, see `vehicle_agent.way`."""
+        return self.agents / vehicle / "way.jsonl"
+
+    @property
     def store(self) -> Path:
         """The tile store: every version, every report."""
         return self.root / "store.sqlite"

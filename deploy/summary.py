@@ -9,12 +9,13 @@ from deploy.evaluation import NO_TRUTH, score_run
 from deploy.features import feature_lines, score_layers
 from deploy.fleet import FleetOutcome, count_lines
 from deploy.fleet_config import FleetConfig
+from deploy.learning import account_learning, learning_lines
 from deploy.live_traffic import traffic_lines
 from deploy.prepare import PreparedRun
 from deploy.run_folder import RunFolder
 from fleet_sim.ellipsoids import Tiles, ellipsoids_of_maps
 from fleet_sim.pictures import View, draw_healing, draw_map, draw_run
-from fleet_sim.truth import read_truth
+from fleet_sim.truth import Truth, read_truth
 from gnd_map.geodesy import LocalFrame
 from tile_store.sqlite_store import SqliteStore
 from tile_store.status import named_vehicles, waiting_totals
@@ -39,7 +40,9 @@ def write_summary(
     with SqliteStore(folder.store) as store:
         histories = tile_histories(store)
         summary = _counts(config, folder, prepared, outcome, results, store, histories)
-        summary["f1"] = _evaluate(folder, prepared, store, histories)
+        truth = read_truth(prepared.truth) if prepared.truth is not None else None
+        summary["f1"] = _evaluate(folder, truth, store, histories)
+        summary["learning"] = account_learning(folder, store, truth, {h.tile.tile: h.before for h in histories})
         summary["waiting_for_confirmation"] = waiting_totals(store)
         summary["named_vehicles"] = named_vehicles(store)
         summary["features"] = _score_features(config, prepared, store)
@@ -88,15 +91,14 @@ def _counts(
 
 
 def _evaluate(
-    folder: RunFolder, prepared: PreparedRun, store: SqliteStore, histories: list[TileHistory]
+    folder: RunFolder, truth: Truth | None, store: SqliteStore, histories: list[TileHistory]
 ) -> dict[str, Any]:
     """Compare with the truth where there is one; draw the maps in any case."""
     base = {history.tile.tile: history.before for history in histories}
     final = {history.tile.tile: history.after for history in histories}
-    if prepared.truth is None:
+    if truth is None:
         _draw_maps(folder, base, final)
         return dict(NO_TRUTH)
-    truth = read_truth(prepared.truth)
     draw_run(truth, base, final, folder.root)
     draw_healing(truth, base, final, folder.root / "healing.png")
     return score_run(truth, store, histories).as_dict()
@@ -153,9 +155,9 @@ def summary_lines(summary: dict[str, Any]) -> list[str]:
         )
     if f1["before"] is not None:
         lines.append(
-            f"map against the truth, macro F1: {f1['before']:.1f} % before, {f1['single']:.1f} % by a single drive, "
-            f"{f1['after']:.1f} % after"
+            f"map against the truth, macro F1: {f1['before']:.1f} % before, {_single_text(f1)}{f1['after']:.1f} % after"
         )
+    lines += learning_lines(summary.get("learning", {}))
     lines += [
         f"{vehicle} doubts itself: {d['scans_shifted'] + d['scans_taken_back']} scans taken back, "
         f"{d['tiles_held_back']} tiles with {d['changes_held_back']} changes held back, {d['tiles_doubtful']} doubtful "
@@ -165,3 +167,10 @@ def summary_lines(summary: dict[str, Any]) -> list[str]:
     ]
     lines += feature_lines(summary.get("features", {}))
     return lines
+
+
+def _single_text(f1: dict[str, Any]) -> str:
+    """What one vehicle alone finds, by those that had nothing from others."""
+    if f1["single"] is None:
+        return ""
+    return f"{f1['single']:.1f} % by a single drive (of {len(f1['single_by_vehicle'])} on the old map), "

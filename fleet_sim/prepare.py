@@ -21,8 +21,9 @@ from fleet_sim.world import write_world
 
 SENSORS: Final = ("VLP-16", "HDL-32E")
 FEATURES_FILE: Final = "features.json"
-_DAY_NS: Final = 86_400 * 1_000_000_000
-_HOUR_NS: Final = 3_600 * 1_000_000_000
+_NS_PER_S: Final = 1_000_000_000
+_DAY_NS: Final = 86_400 * _NS_PER_S
+_HOUR_NS: Final = 3_600 * _NS_PER_S
 _MAPPING_DAYS: Final = 72
 """The paper's map was made on 1 August 2019, its drives on 12 October (section 7.1)."""
 
@@ -65,21 +66,28 @@ def mapping_configs(world_seed: int) -> tuple[DriveConfig, ...]:
     )
 
 
-def agent_configs(world_seed: int, agents: int) -> tuple[DriveConfig, ...]:
+def agent_configs(world_seed: int, agents: int, headway_s: float = 0.0) -> tuple[DriveConfig, ...]:
     """Return one drive a vehicle: sensors and directions mixed evenly, every drive with its own parked cars.
+
+    Args:
+        world_seed: seed of the street.
+        agents: number of vehicles.
+        headway_s: time between two starts, in the order of their numbers; 0: the drives have nothing to do with each
+            other, and are stamped an hour apart.
 
     Raises:
         SimError: fewer than one vehicle.
     """
     if agents < 1:
         raise SimError(f"a fleet needs at least one vehicle, got {agents}")
+    step_ns = round(headway_s * _NS_PER_S) or _HOUR_NS
     return tuple(
         DriveConfig(
             vehicle=f"vehicle-{index}",
             sensor=SENSORS[index % 2],
             direction=1 if index // 2 % 2 == 0 else -1,
             seed=1_000_003 * world_seed + index,
-            start_ns=EPOCH_NS + index * _HOUR_NS,
+            start_ns=EPOCH_NS + index * step_ns,
             camera=SignCamera(),
         )
         for index in range(agents)
@@ -95,6 +103,7 @@ def prepare_fleet_run(
     scans: int | None = None,
     *,
     reuse: bool = False,
+    headway_s: float = 0.0,
 ) -> FleetWorld:
     """Make a world, its truth and all drives.
 
@@ -108,6 +117,7 @@ def prepare_fleet_run(
         processes: worker processes for the drives.
         scans: at most so many scans a drive, None for the whole street.
         reuse: keep the drives that are there; the caller vouches that this simulator made them for this world.
+        headway_s: time between the starts of two vehicles, see `agent_configs`.
 
     Returns:
         Where everything is.
@@ -116,7 +126,7 @@ def prepare_fleet_run(
         SimError: nonsense was asked for, or a file cannot be written.
         DriveError: a drive cannot be written.
     """
-    configs = [*mapping_configs(world_seed), *agent_configs(world_seed, agents)]
+    configs = [*mapping_configs(world_seed), *agent_configs(world_seed, agents, headway_s)]
     configs = [replace(config, scans=scans) for config in configs]
     folder = out_dir / "drives"
     try:

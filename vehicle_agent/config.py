@@ -13,6 +13,7 @@ from vehicle_agent.errors import AgentConfigError
 from vehicle_agent.features.layer_parameters import FeatureParameters
 from vehicle_agent.localise.parameters import LocaliserParameters
 from vehicle_agent.segment.parameters import SegmentParameters
+from vehicle_agent.world_clock import Departure
 
 
 @dataclass(frozen=True, slots=True)
@@ -58,10 +59,23 @@ class DownloadParameters:
 class ReportParameters:
     """When a tile is left, when a report is sent, which poses may make statements."""
 
-    left_behind_m: float = 60.0
-    """A tile farther from the vehicle gets no more evidence: its classes are decided."""
-    longest_m: float = 1000.0
-    """A district's changes are reported at the latest after this much way."""
+    left_behind_m: float = 54.0
+    """A tile farther from the vehicle gets no more evidence: its classes are decided. More than the range of detection
+    by what the LiDAR stands from the vehicle's origin and what it drives during a scan."""
+    soon_s: float = 0.3
+    """Where much has changed, the report waits this long for tiles that are left together with the first ..."""
+    soon_voxels: int = 48
+    """... much: so many voxels of one tile. On ground that has not changed, detection errs in up to some 30."""
+    apart_s: float = 3.0
+    """Such reports follow each other no faster than this: a whole street that has changed shares a few."""
+    longest_m: float = 400.0
+    """Any change is reported at the latest after this much way ..."""
+    longest_s: float = 40.0
+    """... or time. Such a report costs 0.3 to 0.5 kB with its answers: 20 s at 40 km/h would be 2 kB/km."""
+    unchanged_m: float = 1000.0
+    """Ground that is as the map says it is: at the latest after this much way ..."""
+    unchanged_s: float = 120.0
+    """... or time."""
     protocol: Literal["packed", "full"] = "packed"
     """How reports are sent: in short (flags and track first, then the Gaussians asked for), or at once and whole."""
     max_sigma_m: float = 0.15
@@ -76,7 +90,17 @@ class ReportParameters:
     """At the end of a drive the agent waits this long for its reports to be acknowledged."""
 
     def __post_init__(self) -> None:
-        """A protocol that there is."""
+        """A protocol that there is, and waiting times in order."""
+        waits_s = (self.soon_s, self.apart_s, self.longest_s, self.unchanged_s)
+        if waits_s[0] < 0 or sorted(waits_s) != list(waits_s) or self.soon_voxels < 1:
+            raise AgentConfigError(
+                f"soon_s, apart_s, longest_s and unchanged_s = {waits_s} s must rise from 0 on; soon_voxels ="
+                f" {self.soon_voxels} must be 1 or more"
+            )
+        if not 0 <= self.longest_m <= self.unchanged_m:
+            raise AgentConfigError(
+                f"longest_m = {self.longest_m}, unchanged_m = {self.unchanged_m} m: 0 or more, rising"
+            )
         if self.protocol not in ("packed", "full"):
             raise AgentConfigError(f"protocol = {self.protocol!r}: there are 'packed' and 'full'")
 
@@ -98,6 +122,8 @@ class AgentConfig:
     pace: float = 0.0
     open_timeout_s: float = 10.0
     """How long the agent waits for a router when it starts; then it drives without, on its cache."""
+    departure: Departure | None = None
+    """Where several vehicles drive in one world: when this one starts, and the clock that they share."""
     ledger_dir: Path | None = None
     localise: LocaliserParameters = field(default_factory=LocaliserParameters)
     segment: SegmentParameters = field(default_factory=SegmentParameters)

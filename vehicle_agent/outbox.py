@@ -269,6 +269,11 @@ class Outbox:
         rows = self._db.run("SELECT report_id, state FROM report ORDER BY report_id")
         return {str(report_id): str(state) for report_id, state in rows}
 
+    def body_of(self, report_id: str) -> bytes | None:
+        """The whole report that is kept under an id, None where there is none."""
+        rows = self._db.run("SELECT body FROM report WHERE report_id = ?", (report_id,))
+        return bytes(rows[0][0]) if rows else None
+
     def refused(self) -> list[tuple[str, str]]:
         """(report id, reason) of the quarantined reports."""
         rows = self._db.run("SELECT report_id, reason FROM report WHERE state = 'quarantined' ORDER BY report_id")

@@ -1,8 +1,12 @@
-"""From evidence to the outbox: tiles that the vehicle has left are decided, districts that it has left are reported."""
+"""From evidence to the outbox: tiles that the vehicle has left are decided, and reported soon where they have changed.
+
+A report costs some 160 B beside what it says. So a tile in which much has changed waits a moment for those that are
+left with it, scattered voxels for others, and ground that is as the map says for the end of the district, or for long.
+"""
 
 import logging
 from collections import Counter
-from collections.abc import Callable, Collection
+from collections.abc import Callable, Collection, Mapping, Set
 from dataclasses import dataclass, field, replace
 from importlib.metadata import version
 from typing import Any
@@ -38,7 +42,7 @@ from vehicle_agent.segment.segmenter import SegmentedScan
 from vehicle_agent.surroundings import left_behind
 from vehicle_agent.tracks import Tracks
 
-STEP_M = 3.0  # tiles left behind are looked for after this much way
+STEP_M = 2.0  # tiles left behind are looked for after this much way
 
 _log = logging.getLogger(__name__)
 
@@ -64,11 +68,45 @@ class _Stretch:
 
 @dataclass(slots=True)
 class _Pending:
-    """Changes of one district that wait for its other tiles."""
+    """Statements about tiles of one district that wait to be reported together.
+
+    Attributes:
+        since_m: odometer at the first of them ...
+        since_ns: ... and time of the scan.
+        changed_m, changed_ns: the same of the first that names a change; None: none does.
+    """
 
     since_m: float
+    since_ns: int
+    changed_m: float | None = None
+    changed_ns: int | None = None
     changes: dict[TileId, TileChange] = field(default_factory=dict)
     bases: dict[TileId, Tile] = field(default_factory=dict)
+
+    def add(self, change: TileChange, base: Tile, odometer_m: float, t_ns: int) -> None:
+        """Take a statement about a tile that there is none about yet."""
+        self.changes[change.tile], self.bases[change.tile] = change, base
+        if len(change.changed) and self.changed_ns is None:
+            self.changed_m, self.changed_ns = odometer_m, t_ns
+
+    def is_due(self, odometer_m: float, t_ns: int, reported_ns: int | None, most: ReportParameters) -> bool:
+        """Whether it has waited long enough: for the next tiles, for more voxels, or for the district's end.
+
+        Args:
+            odometer_m: way so far.
+            t_ns: time of the scan.
+            reported_ns: when changes were reported last; None: never.
+            most: how long is enough.
+        """
+        if odometer_m - self.since_m > most.unchanged_m or t_ns - self.since_ns > most.unchanged_s * 1e9:
+            return True
+        if self.changed_m is None or self.changed_ns is None:
+            return False
+        if odometer_m - self.changed_m > most.longest_m or t_ns - self.changed_ns > most.longest_s * 1e9:
+            return True
+        apart = reported_ns is None or t_ns - reported_ns > most.apart_s * 1e9
+        many = max(len(change.changed) for change in self.changes.values()) >= most.soon_voxels
+        return many and apart and t_ns - self.changed_ns > most.soon_s * 1e9
 
 
 @dataclass(slots=True)
@@ -85,13 +123,14 @@ class LargestShift:
 
 
 class Reporter:
-    """Feeds refined scans to the detector, decides the tiles left behind and puts a report a district into the outbox.
+    """Feeds refined scans to the detector, decides the tiles left behind and puts reports into the outbox.
 
     Scans are evidence only once their poses have stood the shift test (`trial`); a tile whose changes a shift explains
     is held back and reported as such, in a report of its own that is only sent whole.
 
     Report ids are made of vehicle, drive, district and the report's number in it, so a restarted agent, which drives
-    its recording again, makes the same ids. New Gaussians are moved onto the lattice that they travel on, so that the
+    its recording again, makes the same ids; where it would put other tiles together than in its first life, each is
+    stated once all the same. New Gaussians are moved onto the lattice that they travel on, so that the
     short form of a report and the whole one say the same, to the bit. `course` gives where the vehicle drives in its
     own frame, as far as it knows.
     """
@@ -116,6 +155,10 @@ class Reporter:
         self._numbers: Counter[District] = Counter()
         self._stretch: _Stretch | None = None
         self._looked_at: F64 | None = None
+        self._here_ns = start_ns  # time of the newest final pose
+        self._reported_ns: int | None = None  # when changes were reported last
+        self._open_districts: set[District] = set()
+        self._stated_before: Counter[TileId] = Counter()  # in reports of an earlier life that have the same ids
         self._tracks = Tracks(detector.local_map.grid_frame.frame)
         self._match_map = MatchMapCache(detector.local_map, RegistrationParameters().noise_m)
         self._trial = Trial(self._match_map, parameters.shift)
@@ -187,7 +230,15 @@ class Reporter:
         self._tracks.add_scan(scan)
 
     def leave_behind(self, estimate: PoseEstimate, odometer_m: float) -> None:
-        """Decide the tiles that the refined pose has left, report the districts that have none left to decide."""
+        """Decide the tiles that the refined pose has left, and report what has waited long enough."""
+        self._here_ns = estimate.t_ns
+        self._decide_left(estimate, odometer_m)
+        for district, pending in list(self._pending.items()):
+            due = pending.is_due(odometer_m, estimate.t_ns, self._reported_ns, self._parameters)
+            if due or district not in self._open_districts:
+                self._report(district)
+
+    def _decide_left(self, estimate: PoseEstimate, odometer_m: float) -> None:
         waiting = self._trial.oldest  # what it saw is not counted yet: its tiles are not left
         frame = self._detector.local_map.grid_frame.frame
         p_map = (estimate if waiting is None else waiting).T_map_vehicle[:3, 3]
@@ -200,11 +251,7 @@ class Reporter:
         left = left_behind(frame, open_tiles, p_map, self._parameters.left_behind_m)
         self._decide(left, odometer_m)
         self._doubts.forget(left_behind(frame, self._doubts.all_tiles(), p_map, self._parameters.left_behind_m))
-        open_districts = {t.district for t in open_tiles - set(left)}
-        for district, pending in list(self._pending.items()):
-            overdue = odometer_m - pending.since_m > self._parameters.longest_m
-            if overdue or district not in open_districts:
-                self._report(district)
+        self._open_districts = {t.district for t in open_tiles - set(left)}
 
     def report_all(self, odometer_m: float) -> None:
         """The drive has ended: decide and report everything."""
@@ -281,11 +328,10 @@ class Reporter:
             self.counts["tiles_doubtful"] += 1
             self.doubts.update(change.doubt.words)
         district = change.tile.district
-        pending = self._pending.setdefault(district, _Pending(odometer_m))
-        if change.tile in pending.changes:  # the vehicle came back: one statement a tile and report
-            self._report(district)
-            pending = self._pending.setdefault(district, _Pending(odometer_m))
-        pending.changes[change.tile], pending.bases[change.tile] = change, base
+        if district in self._pending and change.tile in self._pending[district].changes:
+            self._report(district)  # the vehicle came back: one statement a tile and report
+        pending = self._pending.setdefault(district, _Pending(odometer_m, self._here_ns))
+        pending.add(change, base, odometer_m, self._here_ns)
 
     def _said(self, found: Classification) -> TileChange:
         """What the report says of a tile; a study may let it say something else."""
@@ -294,39 +340,54 @@ class Reporter:
     def _report(self, district: District) -> None:
         """One report of what is told, and one of what is held back: the short form would call its voxels observed."""
         pending = self._pending.pop(district)
+        if pending.changed_ns is not None:
+            self._reported_ns = self._here_ns
         held_back = {t for t, change in pending.changes.items() if change.doubt is not None and change.doubt.withheld}
         for tiles in (pending.changes.keys() - held_back, held_back):
-            if tiles:
-                changes = {t: pending.changes[t] for t in tiles}
-                self._put(district, _Pending(pending.since_m, changes, pending.bases), whole=tiles is held_back)
+            self._put(district, tiles, pending, whole=tiles is held_back)
 
-    def _put(self, district: District, pending: _Pending, *, whole: bool) -> None:
-        stretch = self._stretch or _Stretch(self._start_ns, self._start_ns)
-        report = self._make(district, pending, stretch)
-        self._numbers[district] += 1
-        packed = b"" if whole else self._packed(report, pending)
-        needed = [pending.bases[c.tile] for c in report.tiles if c.base_sha and is_measured(c).any()] if packed else []
-        if self._outbox.put(report.report_id, change_key(report.layer, district), report.encode(), packed, needed):
-            self.counts["reports"] += 1
-            self.counts["changed_voxels"] += sum(len(change.changed) for change in report.tiles)
-        else:
-            self.counts["reports_known"] += 1  # this agent was restarted: its first statement stands
-        _log.info("report %s: %d tiles of district %s", report.report_id, len(report.tiles), district)
+    def _put(self, district: District, tiles: Set[TileId], pending: _Pending, *, whole: bool) -> None:
+        """Report these of the pending tiles; those that an earlier life of this agent has stated stand as they are."""
+        while tiles := self._unstated(tiles):
+            report = self._make(district, [pending.changes[t] for t in sorted(tiles)])
+            self._numbers[district] += 1
+            if self._put_report(report, pending.bases, whole=whole):
+                self.counts["reports"] += 1
+                self.counts["changed_voxels"] += sum(len(change.changed) for change in report.tiles)
+                _log.info("report %s: %d tiles of district %s", report.report_id, len(report.tiles), district)
+                return
+            self.counts["reports_known"] += 1
+            first = self._outbox.body_of(report.report_id)
+            self._stated_before.update(tiles if first is None else (c.tile for c in ChangeReport.decode(first).tiles))
 
-    def _packed(self, report: ChangeReport, pending: _Pending) -> bytes:
+    def _unstated(self, tiles: Set[TileId]) -> Set[TileId]:
+        """Those of `tiles` that no report of an earlier life has stated; each of its statements counts once."""
+        stated = {tile for tile in tiles if self._stated_before[tile] > 0}
+        self._stated_before.subtract(stated)
+        return tiles - stated
+
+    def _put_report(self, report: ChangeReport, bases: Mapping[TileId, Tile], *, whole: bool) -> bool:
+        packed = b"" if whole else self._packed(report, bases)
+        needed = [bases[c.tile] for c in report.tiles if c.base_sha and is_measured(c).any()] if packed else []
+        return self._outbox.put(
+            report.report_id, change_key(report.layer, report.district), report.encode(), packed, needed
+        )
+
+    def _packed(self, report: ChangeReport, bases: Mapping[TileId, Tile]) -> bytes:
         """The report's first half in short; empty where it can only be sent whole."""
         try:
-            track = self._tracks.take(report.district, pending.changes)
+            track = self._tracks.take(report.district, [change.tile for change in report.tiles])
             if self._parameters.protocol == "full":
                 return b""
-            bases = {c.base_sha: pending.bases[c.tile].gaussians for c in report.tiles if c.base_sha}
-            return pack(report, bases, track).encode()
+            of_sha = {c.base_sha: bases[c.tile].gaussians for c in report.tiles if c.base_sha}
+            return pack(report, of_sha, track).encode()
         except GndError as error:
             self.counts["reports_not_packed"] += 1
             _log.warning("report %s can only be sent whole: %s", report.report_id, error)
             return b""
 
-    def _make(self, district: District, pending: _Pending, stretch: _Stretch) -> ChangeReport:
+    def _make(self, district: District, changes: list[TileChange]) -> ChangeReport:
+        stretch = self._stretch or _Stretch(self._start_ns, self._start_ns)
         who, number = self._who, str(self._numbers[district])
         report_id = deterministic_report_id(
             self._start_ns // 1_000_000, who.vehicle, who.drive_id, who.layer, district.path, number
@@ -339,7 +400,7 @@ class Reporter:
             district=district,
             first_ns=stretch.first_ns,
             last_ns=stretch.last_ns,
-            tiles=tuple(change for _, change in sorted(pending.changes.items())),
+            tiles=tuple(changes),
             layer=who.layer,
             course=self._course(),
         )

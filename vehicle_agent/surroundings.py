@@ -27,8 +27,8 @@ FLOORS_BELOW, FLOORS_ABOVE = 8, 16  # of the vehicle, where the map alone does n
 class Surroundings:
     """Keeps `local_map` in step with the place and the cache; the agent's main thread owns it.
 
-    A tile about which there is evidence keeps its map until it is finished: newer versions stay in the
-    cache until then.
+    A tile about which there is evidence keeps its map until it is finished: what rays said about one version is never
+    counted for another. A newer version waits until then, and is what the next pass is compared with.
     """
 
     def __init__(
@@ -49,6 +49,7 @@ class Surroundings:
         self._plan_is_new = False
         self._near: tuple[TileId, ...] = ()
         self._arrived: dict[TileId, Tile | None] = {}
+        self._newer: dict[TileId, Tile] = {}  # of tiles about which there is evidence
         self.given_up: set[TileId] = set()
 
     def look_ahead(self, place: Place) -> tuple[TileId, ...]:
@@ -77,8 +78,14 @@ class Surroundings:
             self._arrived[tile.tile_id] = tile
             return True
         held = self._map.tile(tile.tile_id)
-        if held is None or held.sha == tile.sha or self._detector.touched(tile.tile_id):
+        if held is None or held.sha == tile.sha:
+            self._newer.pop(tile.tile_id, None)
             return False
+        if self._detector.touched(tile.tile_id):
+            self.counts["later"] += tile.tile_id not in self._newer
+            self._newer[tile.tile_id] = tile
+            return False
+        self._newer.pop(tile.tile_id, None)
         self._map.set_tile(tile)
         return True
 
@@ -103,6 +110,8 @@ class Surroundings:
         self._plan_is_new = True
         self._near = tuple(need.tile_id for need in self._plan if need.distance_m <= p.near_m)
         self._let_go(here)
+        for tile in list(self._newer.values()):
+            self.replace(tile)
 
     def _ask(self, *, patiently: bool) -> None:
         """Ask for the plan's tiles, all together, as soon as one of them is urgent; else only for those asked for
@@ -135,6 +144,7 @@ class Surroundings:
         for tile_id in left_behind(frame, self._map.tiles, here, limit_m):
             if not self._detector.touched(tile_id):
                 self._map.remove_tile(tile_id)
+                self._newer.pop(tile_id, None)
                 gone.append(tile_id)
         for tile_id in gone:
             self._fetcher.forget(tile_id)

@@ -37,6 +37,8 @@ from vehicle_agent.segment.segmenter import MotionSegmenter, SegmentedScan
 from vehicle_agent.surroundings import Surroundings
 from vehicle_agent.telemetry import Telemetry
 from vehicle_agent.updates import Updates
+from vehicle_agent.way import WAY_FILE, Way
+from vehicle_agent.world_clock import in_common_time
 
 if TYPE_CHECKING:
     from vehicle_agent.features.feature_work import FeatureWork
@@ -67,6 +69,7 @@ class Vehicle:
     reporter: Reporter
     place: Place
     evaluation: Evaluation
+    way: Way
     features: "FeatureWork | None"
     guard: Guard = field(default_factory=Guard)
     timeline: HealthTimeline = field(default_factory=HealthTimeline)
@@ -76,12 +79,14 @@ class Vehicle:
     damage: SchemaError | None = None
 
     def drive(self) -> Iterator[DriveItem]:
-        """The recording in time order, at the pace asked for, without what cannot be used, until its end or `stop`.
+        """The recording in time order, at its pace and in the common time, without what cannot be used, until its end
+        or `stop`.
 
         A recording that turns out to be damaged on the way ends there: what was seen until then is still reported, and
         `damage` says why.
         """
         items = paced(read_drive(self.config.drive), self.config.pace, self.stop)
+        items = in_common_time(items, self.config.departure, self.stop)
         try:
             for item in self.guard.usable(items):
                 if self.stop.is_set():
@@ -98,6 +103,7 @@ class Vehicle:
     def _note(self, item: DriveItem) -> None:
         """Keep the books on place, health and way after an item was worked on."""
         self.place.take(item, self.localiser.online)
+        self.way.note(self.place)
         if self.timeline.note(item.t_ns, self.place.health):
             self.reporter.take_back(item.t_ns)  # since when it was wrong is not known
             if self.features is not None:
@@ -249,8 +255,13 @@ def open_vehicle(config: AgentConfig, stop: threading.Event) -> Iterator[Vehicle
     # The map frame is the frame of the tile in which the vehicle starts.
     frame = LocalFrame.of_tile(TileId.from_geodetic(fix.lat_rad, fix.lon_rad))
     who = Identity(config.vehicle, header.drive_id, header.sensor_model, config.layer)
-    with open_link(config) as link, _features(config, link, frame, who, fix.t_ns) as features:
-        vehicle = _assemble(config, header, fix, (frame, who), link, stop, features)
+    local_map = LocalMap(GridFrame.around(frame, [TileId.from_geodetic(fix.lat_rad, fix.lon_rad)]))
+    with (
+        open_link(config) as link,
+        _features(config, link, frame, who, fix.t_ns) as features,
+        Way(config.work_dir / WAY_FILE, local_map) as way,
+    ):
+        vehicle = _assemble(config, header, fix, (frame, who), link, stop, features, local_map, way)
         telemetry = Telemetry(link.bus, config.vehicle, vehicle.sample)
         try:
             yield vehicle
@@ -277,9 +288,10 @@ def _assemble(
     link: Link,
     stop: threading.Event,
     features: "FeatureWork | None",
+    local_map: LocalMap,
+    way: Way,
 ) -> Vehicle:
     frame, identity = where_and_who
-    local_map = LocalMap(GridFrame.around(frame, [TileId.from_geodetic(fix.lat_rad, fix.lon_rad)]))
     detector = ChangeDetector(local_map, config.detect)
     surroundings = Surroundings(local_map, link.fetcher, detector, config.download)
     localiser = Localiser(
@@ -299,6 +311,7 @@ def _assemble(
         ),
         place=Place(frame, fix),
         evaluation=Evaluation.between(frame, header.anchor),
+        way=way,
         features=features,
     )
 

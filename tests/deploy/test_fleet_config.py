@@ -27,7 +27,16 @@ def test_an_unknown_key_is_named(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize(
     "overrides",
-    [{"agents": 0}, {"agents": 100_000}, {"shards": 0}, {"port": 70_000}, {"merge_mode": "magic"}, {"deadline_s": 0.0}],
+    [
+        {"agents": 0},
+        {"agents": 100_000},
+        {"shards": 0},
+        {"port": 70_000},
+        {"merge_mode": "magic"},
+        {"deadline_s": 0.0},
+        {"headway_s": -1.0},
+        {"headway_s": float("nan")},
+    ],
 )
 def test_values_out_of_range_are_refused(overrides: dict[str, object]) -> None:
     with pytest.raises(DeployError):

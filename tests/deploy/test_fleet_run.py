@@ -6,15 +6,18 @@ import signal
 from collections.abc import Callable
 from pathlib import Path
 
+import numpy as np
 import psutil
 import pytest
 from account_testing import assert_one_account
 from fleet_testing import Run
 
 from deploy.account import lost_reports, tile_histories
+from deploy.map_use import read_ways
 from deploy.run_folder import RunFolder
 from gnd_map.tile import content_sha
 from tile_store.sqlite_store import SqliteStore
+from vehicle_agent.world_clock import SLACK_S
 
 pytestmark = pytest.mark.slow
 Start = Callable[..., Run]
@@ -94,6 +97,25 @@ def test_ctrl_c_ends_every_process_in_order(start_run: Start) -> None:
     _, alive = psutil.wait_procs(processes, timeout=5)
     assert alive == []
     assert json.loads((run.folder / "pids.json").read_text()) == {}
+
+
+def test_vehicles_start_one_after_the_other_in_the_time_of_their_drives(start_run: Start) -> None:
+    run = start_run("--link", "none", "--headway", "3")
+    summary = run.finish()
+    assert_nothing_lost_or_doubled(run, summary)
+    ways = read_ways(RunFolder(run.folder))
+    assert list(ways) == ["vehicle-00", "vehicle-01"]
+    ahead, behind = ways.values()
+    wall_s = np.array([one.wall_ns for one in ahead]) * 1e-9
+    drive_s = np.array([one.t_ns - ahead[0].t_ns for one in ahead]) * 1e-9
+    while_both = [one for one in behind if one.wall_ns * 1e-9 < wall_s[-1]]
+    gaps_s = [np.interp(one.wall_ns * 1e-9, wall_s, drive_s) - (one.t_ns - behind[0].t_ns) * 1e-9 for one in while_both]
+    assert len(gaps_s) >= 3
+    # Milestones are up to 0.7 s apart, and one process may be so much ahead of the other as the clock allows.
+    assert min(gaps_s) >= 3.0 - SLACK_S - 0.2
+    assert max(gaps_s) <= 3.0 + SLACK_S + 0.7
+    assert summary["learning"]["vehicles"] == 2
+    assert summary["learning"]["known_share"] is None
 
 
 def test_killing_the_launcher_leaves_no_orphan(start_run: Start) -> None:

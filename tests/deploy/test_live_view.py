@@ -9,6 +9,7 @@ from rich.console import Console
 
 from deploy.live import FleetState, live_view, render
 from deploy.live_traffic import LiveLedgers, Rate
+from deploy.map_use import MapUse
 from fleet_bus.ledger import Direction, Ledger
 from fleet_bus.links import UNLIMITED, LinkProfile
 from fleet_bus.wire import WireBytes
@@ -185,3 +186,15 @@ def test_what_stays_on_the_terminal_is_the_whole_account(fleet):
     assert isinstance(console.file, io.StringIO)
     assert "5.678" in console.file.getvalue()
     assert "1.234" in console.file.getvalue()
+
+
+def test_the_table_says_how_much_of_the_map_under_the_wheels_others_have_renewed():
+    state = FleetState()
+    for n in range(3):
+        state.on_traffic("", sample(1, vehicle=f"vehicle-0{n}").encode())
+    assert "map renewed" not in shown(state)
+    state.maps = {"vehicle-00": MapUse(0.0, None, None), "vehicle-01": MapUse(0.8, 30.0, 12.4)}
+    text = shown(state)
+    assert "0 %" in " ".join(row_of(text, "vehicle-00"))
+    assert "80 %, 12 s old" in " ".join(row_of(text, "vehicle-01"))
+    assert "%" not in " ".join(row_of(text, "vehicle-02"))

@@ -1,5 +1,6 @@
 """Folders of simulated worlds that are used again, and forgotten when the programs have changed."""
 
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -29,6 +30,11 @@ def test_a_kept_world_is_used_again_until_the_programs_change(tmp_path: Path, mo
 
     first = made("first")
     assert made("second") == first
+    config = replace(config, headway_s=7.0)
+    third = made("third")  # its vehicles are stamped for another headway, its map is not
+    assert {name for name in third if third[name] != first[name]} == {"vehicle-0.mcap"}
     (home / "made_by.txt").write_text("another program")
     prepare.forget_if_stale(home)
-    assert sorted(path.name for path in home.iterdir()) == ["features.json", "made_by.txt", "truth.npz", "world.json"]
+    assert sorted(path.name for path in home.iterdir()) == [
+        "features.json", "headway_s.txt", "made_by.txt", "truth.npz", "world.json",
+    ]  # fmt: skip

@@ -3,6 +3,7 @@ import shutil
 from collections.abc import Callable
 from pathlib import Path
 
+import numpy as np
 import pytest
 from click.testing import CliRunner
 
@@ -10,7 +11,7 @@ from fleet_sim.cli import sim
 from fleet_sim.errors import SimError
 from fleet_sim.feature_files import read_feature_layers
 from fleet_sim.feature_truth import base_features, feature_truth
-from fleet_sim.prepare import prepare_fleet_run
+from fleet_sim.prepare import agent_configs, prepare_fleet_run
 from fleet_sim.street import StreetOptions, street
 from fleet_sim.truth import Truth, read_truth
 from fleet_sim.world import read_world
@@ -117,6 +118,12 @@ def test_a_fleet_run_is_prepared(truth_1: tuple[Truth, Path], tmp_path: Path) ->
     starts = [load_track(path).motion.t_ns[0] for path in (*fleet.base_drives, *fleet.agent_drives)]
     assert starts == sorted(starts)
     assert sorted(p.name for p in tmp_path.iterdir()) == ["drives", "features.json", "truth.npz", "world.json"]
+
+
+def test_drives_of_one_fleet_are_stamped_a_headway_apart() -> None:
+    for headway_s, step_s in ((4.0, 4.0), (0.0, 3600.0)):
+        starts_ns = [config.start_ns for config in agent_configs(1, 5, headway_s)]
+        assert np.diff(starts_ns).tolist() == [int(step_s * 1e9)] * 4
 
 
 def test_a_fleet_run_in_a_place_that_cannot_be_made_is_refused(tmp_path: Path) -> None:

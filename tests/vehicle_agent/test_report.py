@@ -1,5 +1,6 @@
 """From evidence to the outbox: when tiles are decided, when districts are reported, and under which ids."""
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -12,6 +13,7 @@ from schemas.changes import ChangeReport
 from schemas.keys import change_key
 from vehicle_agent.config import ReportParameters
 from vehicle_agent.detect.detector import ChangeDetector
+from vehicle_agent.errors import AgentConfigError
 from vehicle_agent.local_map import LocalMap
 from vehicle_agent.localise.estimates import PoseEstimate, RefinedScan
 from vehicle_agent.outbox import Outbox
@@ -96,8 +98,22 @@ def test_each_tile_tells_the_poses_that_saw_it_not_those_of_the_whole_stretch(
     assert max(sigma_m.values()) == pytest.approx(0.09)
 
 
+def moment(x_m: float, t_s: float) -> PoseEstimate:
+    return replace(estimate(x_m=x_m), t_ns=START_NS + int(t_s * 1e9))
+
+
+PATIENT = {
+    "soon_s": 1000.0,
+    "apart_s": 1000.0,
+    "longest_s": 1000.0,
+    "unchanged_s": 1000.0,
+    "longest_m": 1e6,
+    "unchanged_m": 1e6,
+}
+
+
 def test_only_tiles_left_behind_are_decided(tiles: dict[TileId, Tile], outbox: Outbox, hits: np.ndarray) -> None:
-    drive = reporter(tiles, outbox)
+    drive = reporter(tiles, outbox, **PATIENT)
     drive.add_scan(scan(hits))
     drive.leave_behind(estimate(x_m=0.0), 0.0)
     assert reports(outbox) == []
@@ -110,18 +126,71 @@ def test_only_tiles_left_behind_are_decided(tiles: dict[TileId, Tile], outbox: O
     assert drive.counts["reports"] == len(reports(outbox))
 
 
-def test_a_long_stay_in_a_district_is_reported_before_its_end(
+def changed_in(found: list[ChangeReport]) -> int:
+    return sum(len(c.changed) for r in found for c in r.tiles)
+
+
+def test_changes_are_reported_in_mid_district_a_moment_after_their_tiles_were_left(
     tiles: dict[TileId, Tile], outbox: Outbox, hits: np.ndarray
 ) -> None:
-    drive = reporter(tiles, outbox, longest_m=50.0)
+    drive = reporter(tiles, outbox, soon_voxels=8)
     drive.add_scan(scan(hits))
-    drive.leave_behind(estimate(x_m=80.0), 80.0)
-    drive.leave_behind(estimate(x_m=84.0), 131.0)
+    drive.leave_behind(moment(74.0, 9.0), 74.0)  # the wall's tiles are left, others of their districts are not
+    assert drive.classes["deleted"] >= 8
+    assert reports(outbox) == []  # those of the next tiles may come along
+    drive.leave_behind(moment(74.5, 9.2), 74.5)  # a few steps on: nothing is decided, but time passes
+    assert reports(outbox) == []
+    drive.leave_behind(moment(75.0, 9.4), 75.0)
     early = reports(outbox)
-    assert early
+    assert changed_in(early) >= 8
     drive.report_all(140.0)
     assert sorted(c.tile for r in reports(outbox) for c in r.tiles) == sorted(tiles)
     assert len({r.report_id for r in reports(outbox)}) == len(reports(outbox)) > len(early)
+
+
+@pytest.mark.parametrize(
+    ("soon_voxels", "wall_x_m", "waits_s"), [(8, 14.3, 0.3), (10_000, 14.3, 40.0), (8, 9.3, 120.0)], ids=str
+)
+def test_few_changes_wait_for_more_and_ground_that_is_as_it_was_waits_longest(
+    tiles: dict[TileId, Tile], outbox: Outbox, soon_voxels: int, wall_x_m: float, waits_s: float
+) -> None:
+    """A wall that was moved; the same where that counts as little; and a wall that stands where it stood."""
+    drive = reporter(tiles, outbox, soon_voxels=soon_voxels)
+    drive.add_scan(scan(look([(wall_x_m, -8.0, 8.0, 4.0)], np.random.default_rng(3))))
+    drive.leave_behind(moment(74.0, 0.0), 74.0)
+    pending = drive.classes["deleted"] + drive.classes["new"] + drive.classes["modified"]
+    assert (pending >= 8) == (wall_x_m != 9.3)
+    for t_s in (waits_s - 0.05, waits_s + 0.05):
+        assert reports(outbox) == []
+        drive.leave_behind(moment(74.0, t_s), 74.0)  # it stands: time passes, no tile is left
+    assert reports(outbox)
+
+
+def test_where_much_has_changed_reports_keep_apart(tiles: dict[TileId, Tile], outbox: Outbox, hits: np.ndarray) -> None:
+    drive = reporter(tiles, outbox, soon_voxels=8, apart_s=5.0)
+    drive.add_scan(scan(hits))
+    for t_s in (9.0, 9.4):
+        drive.leave_behind(moment(74.0, t_s), 74.0)
+    first = len(reports(outbox))
+    assert first > 0
+    drive.add_scan(scan(hits, 10.0))
+    drive.leave_behind(moment(0.0, 10.0), 74.0)
+    for t_s in (10.5, 11.0, 14.3):  # left a second time: soon would be 10.8
+        drive.leave_behind(moment(74.0, t_s), 74.0)
+        assert len(reports(outbox)) == first
+    drive.leave_behind(moment(74.0, 14.5), 74.0)
+    assert len(reports(outbox)) > first
+
+
+@pytest.mark.parametrize(("wall_x_m", "way_m"), [(14.3, 400.0), (9.3, 1000.0)])
+def test_a_long_way_in_a_district_is_reported_before_its_end(
+    tiles: dict[TileId, Tile], outbox: Outbox, wall_x_m: float, way_m: float
+) -> None:
+    drive = reporter(tiles, outbox, soon_voxels=10_000)
+    drive.add_scan(scan(look([(wall_x_m, -8.0, 8.0, 4.0)], np.random.default_rng(3))))
+    for further_m, reported in ((0.0, False), (way_m - 1.0, False), (way_m + 1.0, True)):
+        drive.leave_behind(estimate(x_m=74.0), 74.0 + further_m)  # up and down the same street
+        assert bool(reports(outbox)) == reported
 
 
 def test_a_tile_seen_again_later_is_stated_in_a_report_of_its_own(
@@ -150,6 +219,37 @@ def test_a_restarted_agent_makes_the_same_ids_and_its_first_statement_stands(
     assert [letter.body for letter in outbox.due(0, limit=100)] == bodies
     assert again.counts["reports"] == 0
     assert again.counts["reports_known"] == len(bodies)
+
+
+@pytest.mark.parametrize(("first_stops", "again_stops"), [((74.0,), ()), ((), (74.0,)), ((74.0,), (74.0, 84.0))])
+def test_a_restarted_agent_that_puts_other_tiles_together_states_each_tile_once_all_the_same(
+    tiles: dict[TileId, Tile],
+    outbox: Outbox,
+    hits: np.ndarray,
+    first_stops: tuple[float, ...],
+    again_stops: tuple[float, ...],
+) -> None:
+    """It was killed on the way; its map is another by now, so it decides and reports at other moments."""
+    for stops, ends in ((first_stops, not first_stops), (again_stops, True)):
+        drive = reporter(tiles, outbox, soon_voxels=8, soon_s=0.0, apart_s=0.0)
+        drive.add_scan(scan(hits))
+        for x_m in stops:
+            drive.leave_behind(moment(x_m, x_m), x_m)
+            drive.leave_behind(moment(x_m, x_m + 1.0), x_m)
+        if ends:
+            drive.report_all(200.0)
+        else:
+            assert 0 < len({c.tile for r in reports(outbox) for c in r.tiles}) < len(tiles)
+    stated = sorted(c.tile for r in reports(outbox) for c in r.tiles)
+    assert stated == sorted(tiles)
+
+
+@pytest.mark.parametrize(
+    "bad", [{"soon_s": 50.0}, {"longest_s": 150.0}, {"soon_s": -1.0}, {"soon_voxels": 0}, {"longest_m": 2000.0}]
+)
+def test_waiting_times_that_contradict_each_other_are_refused(bad: dict[str, float]) -> None:
+    with pytest.raises(AgentConfigError):
+        ReportParameters(**bad)  # type: ignore[arg-type]
 
 
 @pytest.mark.parametrize("bad", [{"health": "degraded"}, {"health": "lost"}, {"sigma_m": 0.3}, {"sigma_rad": 0.03}])

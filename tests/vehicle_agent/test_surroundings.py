@@ -166,6 +166,25 @@ def test_a_newer_version_replaces_a_held_tile_only_without_evidence(scene: Scene
     assert scene.surroundings.replace(newer[1])
 
 
+def test_a_version_that_came_in_mid_pass_is_what_the_next_pass_is_compared_with(scene: Scene) -> None:
+    """The vehicle turns on the spot: it never goes so far that the tile would be let go and asked for again."""
+    scene.surroundings.follow(at(0.0), NEVER, wait=True)
+    tile_id = max(scene.tiles, key=lambda t: len(scene.tiles[t].gaussians))
+    newer = [Tile(tile_id, v, scene.tiles[tile_id].gaussians.take(np.arange(v, 200))) for v in (2, 3)]
+    scene.detector.add_scan(look([], np.random.default_rng(1)), SENSOR)
+    for tile in newer:
+        assert not scene.surroundings.replace(tile)
+    scene.surroundings.follow(at(10.0), NEVER, wait=True)
+    held = scene.map.tile(tile_id)
+    assert held is not None
+    assert held.version == 1  # what rays said about version 1 is not counted for version 3
+    evidence = scene.detector.finish([tile_id])[tile_id]
+    assert evidence.base.version == 1
+    scene.surroundings.follow(at(20.0), NEVER, wait=True)
+    assert scene.map.tile(tile_id) == newer[1]
+    assert scene.surroundings.counts["later"] == 1
+
+
 def test_without_an_answer_the_drive_goes_on_after_a_while_and_does_not_wait_again(
     cloud: Bus, bus: Bus, tmp_path: Path
 ) -> None:

@@ -103,7 +103,8 @@ def open_features(
     """
     names = [layer.name for layer in config.features.layers]
     reporters = [
-        FeatureReporter(link.outbox, replace(identity, layer=name), start_ns, config.report.longest_m) for name in names
+        FeatureReporter(link.outbox, replace(identity, layer=name), start_ns, config.report.unchanged_m)
+        for name in names
     ]
     downloader = FeatureDownloader(link.bus, config.work_dir / "features.sqlite", names, config.download)
     layers = FeatureLayers(config.features, config.report, frame, reporters)

@@ -195,7 +195,7 @@ def open_mapper(config: AgentConfig, stop: threading.Event) -> Iterator[Mapper]:
         asked = tuple(dict.fromkeys((*names, LANES)))
         downloader = FeatureDownloader(link.bus, config.work_dir / "features.sqlite", asked, config.download)
         reporters = {
-            name: FeatureReporter(link.outbox, replace(who, layer=name), fix.t_ns, config.report.longest_m)
+            name: FeatureReporter(link.outbox, replace(who, layer=name), fix.t_ns, config.report.unchanged_m)
             for name in names
         }
         try:
