@@ -418,15 +418,15 @@ def pool(w: Window, filled: U64, state: I32, hits: I64, pooled: I64) -> None:
                         bit = word * 64 + _lowest_bit(bits)
                         bits &= bits - _ONE
                         total, n = 0, 0
-                        for j in range(y - 1, y + 2):
-                            for i in range(x - 1, x + 2):
-                                near = _three_bits(padded, j, i, bit)
-                                if j != y and i != x:
-                                    near &= np.uint64(2)  # a corner of the cube is no neighbour
-                                for k in range(3):
-                                    if (near >> np.uint64(k)) & _ONE != 0:
-                                        total += hits[state[base[j, i] + bit - 1 + k]]
-                                        n += 1
+                        for beside in range(9):
+                            j, i = y - 1 + beside // 3, x - 1 + beside % 3
+                            near = _three_bits(padded, j, i, bit)
+                            if beside in (0, 2, 6, 8):
+                                near &= np.uint64(2)  # what lies across a corner is no neighbour
+                            for k in range(3):
+                                if (near >> np.uint64(k)) & _ONE != 0:
+                                    total += hits[state[base[j, i] + bit - 1 + k]]
+                                    n += 1
                         pooled[state[base[y, x] + bit]] = total // n
 
 
