@@ -8,7 +8,7 @@ All lines of a fan share their azimuth, so they cross the same columns: these ar
 """
 
 import math
-from typing import Final, NamedTuple
+from typing import Any, Final, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -353,6 +353,21 @@ def _lowest_bit(bits: int) -> int:
     return n
 
 
+@bare_inlined
+def _three_bits(padded: U64, j: int, i: int, bit: int) -> Any:
+    """The bits below, at and above a floor, of 0 .. 7."""
+    word, at = bit // 64, bit % 64
+    if at == 0:
+        found = (padded[j, i, word] & np.uint64(3)) << _ONE
+        if word > 0:
+            found |= padded[j, i, word - 1] >> np.uint64(63)
+    else:
+        found = (padded[j, i, word] >> np.uint64(at - 1)) & np.uint64(7)
+        if at == 63 and word + 1 < padded.shape[2]:
+            found |= (padded[j, i, word + 1] & _ONE) << np.uint64(2)
+    return found
+
+
 @bare
 def _with_border(w: Window, slot: int, bits: U64, padded: U64, base: I64) -> None:
     """Bits of a slot's columns and of those around it.
@@ -403,13 +418,15 @@ def pool(w: Window, filled: U64, state: I32, hits: I64, pooled: I64) -> None:
                         bit = word * 64 + _lowest_bit(bits)
                         bits &= bits - _ONE
                         total, n = 0, 0
-                        for j in range(y - 1, y + 2):
-                            for i in range(x - 1, x + 2):
-                                reach = 1 if j == y or i == x else 0
-                                for k in range(max(bit - reach, 0), min(bit + reach + 1, 64 * words)):
-                                    if (padded[j, i, k // 64] >> np.uint64(k % 64)) & _ONE != 0:
-                                        total += hits[state[base[j, i] + k]]
-                                        n += 1
+                        for beside in range(9):
+                            j, i = y - 1 + beside // 3, x - 1 + beside % 3
+                            near = _three_bits(padded, j, i, bit)
+                            if beside in (0, 2, 6, 8):
+                                near &= np.uint64(2)  # what lies across a corner is no neighbour
+                            for k in range(3):
+                                if (near >> np.uint64(k)) & _ONE != 0:
+                                    total += hits[state[base[j, i] + bit - 1 + k]]
+                                    n += 1
                         pooled[state[base[y, x] + bit]] = total // n
 
 

@@ -62,8 +62,8 @@ class VisibilityParameters:
     """
 
     step_m: float = 8.0
-    azimuths: int = 48
-    lines: int = 16
+    azimuths: int = 64
+    lines: int = 8
     range_m: float = 50.0
     reach_m: float = 70.0
     noise_m: float = 0.05
