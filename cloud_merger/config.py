@@ -42,8 +42,8 @@ class ShardConfig:
         store: batching of the store.
         codec: how finely the Gaussians of tiles are rounded that no base map holds ("float": not at all); all shards of
             a store use the same. Other tiles stay as fine as their base.
-        tiles_at_once: tiles claimed and published together.
-        lease_s: how long a claim holds; longer than a merge of `tiles_at_once` tiles takes.
+        tiles_at_once: tiles claimed together; each is published as soon as it is merged.
+        lease_s: how long a claim holds that nobody renews: its shard has died or hangs.
         poll_s: how often to look for tiles and notices when nothing arrives here.
         max_attempts: a tile whose merge fails so often is set aside.
         retry_s: pause before a failed tile is tried again, times the number of attempts.
@@ -65,7 +65,7 @@ class ShardConfig:
     store: StoreConfig = field(default_factory=StoreConfig)
     codec: str = DEFAULT_CODEC
     tiles_at_once: int = 16
-    lease_s: float = 30.0
+    lease_s: float = 10.0
     poll_s: float = 0.2
     max_attempts: int = 5
     retry_s: float = 0.5

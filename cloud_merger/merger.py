@@ -2,11 +2,13 @@
 
 import logging
 import threading
+from typing import Final
 
 from cloud_merger.announce import Announcer
 from cloud_merger.config import ShardConfig
 from cloud_merger.features.kept import FeatureInbox
 from cloud_merger.ingest import Ingest
+from cloud_merger.leases import Leases
 from cloud_merger.ownership import Members
 from cloud_merger.reception import Reception
 from cloud_merger.short_reports import ShortReports
@@ -14,9 +16,11 @@ from cloud_merger.warm import warm_up
 from cloud_merger.work import Worker
 from fleet_bus.bus import open_bus
 from fleet_bus.config import BusConfig
+from tile_store.errors import StoreClosed, StoreError
 from tile_store.sqlite_store import SqliteStore
 
 __all__ = ["ShardConfig", "run_shard"]
+STORE_RETRY_S: Final = 1.0
 _LOG = logging.getLogger(__name__)
 
 
@@ -25,8 +29,10 @@ def run_shard(config: ShardConfig, stop: threading.Event) -> None:
 
     Any number of shards may share a store. What one leaves undone, when it ends or is killed, another does.
 
+    A store that fails (a full disk, another process that holds it for too long) is tried again until it works.
+
     Raises:
-        StoreError: the store cannot be opened or has failed.
+        StoreError: the store cannot be opened.
         NoRouter: no router answers at the start.
     """
     warm_up()  # or the first tile and the first report would wait for the kernels, and their leases with them
@@ -34,10 +40,10 @@ def run_shard(config: ShardConfig, stop: threading.Event) -> None:
     with (
         SqliteStore(config.store_path, config.store, create=False) as store,
         open_bus(bus_config, name=config.shard_id) as bus,
+        Leases(store, config.shard_id, config.lease_s) as leases,
     ):
         members = Members(config.shard_id)
         wake = threading.Event()
-        store.release(config.shard_id)  # leases of an earlier life
 
         # Ingest: check, keep, acknowledge, in threads of the bus.
         short = ShortReports(store, config.merge, config.want, config.waiting)
@@ -49,11 +55,19 @@ def run_shard(config: ShardConfig, stop: threading.Event) -> None:
 
         worker, announcer = Worker(store, config), Announcer(store, bus, members)
         while not stop.is_set():
-            claims = store.claim(config.shard_id, config.tiles_at_once, config.lease_s, prefer=reception.districts)
-            merged = worker.merge(claims)  # load, decode, cluster, decide
-            store.publish(merged)  # compare-and-swap; a stale one is refused and its tile claimed again
-            n_announced = announcer.announce(config.announce_at_once)  # after the commit
-            if not claims and not n_announced:
-                wake.wait(worker.idle_s(store.next_ready_ns()))
-                wake.clear()
-        store.release(config.shard_id)
+            try:
+                claims = store.claim(config.shard_id, config.tiles_at_once, config.lease_s, prefer=reception.districts)
+                leases.hold(claims)
+                for claim in claims:
+                    if not stop.is_set():
+                        worker.settle(claim)  # load, decode, cluster, decide, publish by compare-and-swap
+                    leases.drop(claim)
+                    announcer.announce(config.announce_at_once)  # after the commit
+                if not claims and not announcer.announce(config.announce_at_once):
+                    wake.wait(worker.idle_s(store.ready_in_s()))
+                    wake.clear()
+            except StoreClosed:
+                raise
+            except StoreError as error:
+                _LOG.error("%s: the store has failed, next try in %.0f s: %s", config.shard_id, STORE_RETRY_S, error)
+                stop.wait(STORE_RETRY_S)

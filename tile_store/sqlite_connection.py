@@ -7,22 +7,21 @@ from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 from types import MappingProxyType
-from typing import Any, Final
+from typing import Any, Final, TypeVar
 
 import apsw
 
-from tile_store.errors import StoreBusy, StoreClosed, StoreError, StoreUnavailable
+from tile_store.errors import StoreBusy, StoreClosed, StoreDamaged, StoreError, StoreUnavailable
+from tile_store.migrations import SCHEMA_VERSION, migrate, schema_of
 from tile_store.sql import statements
 
-SCHEMA_VERSION: Final = 1
-APPLICATION_ID: Final = 0x474E4453
-"""ASCII "GNDS" in the file's header: this database is a GND store."""
 SQL: Final = statements("sqlite")
 
 OLDEST_SQLITE: Final = (3, 51, 3)
 """Older ones can corrupt a WAL that several connections write and checkpoint."""
 
 
+T = TypeVar("T")
 Row = tuple[Any, ...]
 Bindings = Mapping[str, Any]
 
@@ -49,7 +48,9 @@ def as_store_error(error: Exception, path: str | Path) -> Exception:
     if isinstance(error, apsw.FullError):
         return StoreUnavailable(f"{path}: disk full; free space and try again, nothing was changed")
     if isinstance(error, apsw.CorruptError):
-        return StoreUnavailable(f"{path}: damaged ({error}); restore the newest backup")
+        return StoreDamaged(
+            f"{path}: damaged ({error}); `gnd map check` names what is, `gnd map restore` puts a backup back"
+        )
     if isinstance(error, apsw.Error):
         return StoreError(f"{path}: {type(error).__name__}: {error}")
     return error
@@ -79,62 +80,14 @@ def open_writer(path: Path, *, create: bool, busy_timeout_s: float) -> apsw.Conn
 
 def _prepare(connection: apsw.Connection, path: Path, busy_timeout_s: float) -> None:
     connection.set_busy_handler(_Patience(busy_timeout_s))
-    _retry_busy(lambda: _check_header(connection, path), busy_timeout_s)
+    found = _retry_busy(lambda: schema_of(connection, path), busy_timeout_s)
     _retry_busy(lambda: connection.pragma("journal_mode", "wal"), busy_timeout_s)
     connection.pragma("synchronous", "full")
     connection.pragma("trusted_schema", False)
-    if connection.pragma("application_id") == 0:
-        _create_schema(connection)
-        _check_header(connection, path)
     if connection.readonly("main"):
         raise StoreUnavailable(f"{path}: read-only; a store must be writable")
-    if not fetch(connection, "has_schema_of_confirmation"):
-        _in_one(connection, lambda: connection.execute(SQL["schema_of_confirmation"]))
-    if not fetch(connection, "has_schema_of_surveys"):
-        _in_one(connection, lambda: connection.execute(SQL["schema_of_surveys"]))
-
-
-def _check_header(connection: apsw.Connection, path: Path) -> None:
-    connection.execute("BEGIN")  # all at one instant: another process may be making the schema
-    try:
-        application_id = connection.pragma("application_id")
-        version = connection.pragma("user_version")
-        empty = not connection.execute("SELECT COUNT(*) FROM sqlite_schema").get
-    finally:
-        _undo(connection)
-    if application_id != APPLICATION_ID and not (empty and application_id == 0):
-        raise StoreUnavailable(f"{path}: an SQLite database of another program, not a tile store; choose another path")
-    if version > SCHEMA_VERSION:
-        raise StoreUnavailable(
-            f"{path}: store schema {version}, this release reads up to {SCHEMA_VERSION}; use the gnd that wrote it"
-        )
-
-
-def _create_schema(connection: apsw.Connection) -> None:
-    def create() -> None:
-        # Another process may have made it since we looked.
-        if connection.pragma("application_id") == 0:
-            connection.execute(SQL["schema"])
-            connection.pragma("user_version", SCHEMA_VERSION)
-            connection.pragma("application_id", APPLICATION_ID)
-
-    _in_one(connection, create)
-
-
-def _in_one(connection: apsw.Connection, work: Callable[[], object]) -> None:
-    """Run `work` in one write transaction."""
-    connection.execute("BEGIN IMMEDIATE")
-    try:
-        work()
-        connection.execute("COMMIT")
-    except BaseException:
-        _undo(connection)
-        raise
-
-
-def _undo(connection: apsw.Connection) -> None:
-    if connection.in_transaction:  # after some errors SQLite has ended it itself
-        connection.execute("ROLLBACK")
+    if found < SCHEMA_VERSION:
+        migrate(connection, path)
 
 
 class _Patience:
@@ -152,13 +105,12 @@ class _Patience:
         return now < self._deadline
 
 
-def _retry_busy(step: Callable[[], object], timeout_s: float) -> None:
+def _retry_busy(step: Callable[[], T], timeout_s: float) -> T:
     # Changing the journal mode does not call the busy handler.
     deadline = time.monotonic() + timeout_s
     while True:
         try:
-            step()
-            return
+            return step()
         except (apsw.BusyError, apsw.LockedError):
             if time.monotonic() > deadline:
                 raise

@@ -14,9 +14,16 @@ from tile_store.values import Claim, PutStatus, ReportRow, StoreConfig
 NS_PER_S: Final = 1_000_000_000
 
 
-def timing_of(config: StoreConfig, now: int) -> dict[str, Any]:
-    """When a dirty tile becomes ready: the statements' `now`, `delay` (both ns) and `merge_after` (reports)."""
-    return {"now": now, "delay": round(config.merge_delay_s * NS_PER_S), "merge_after": config.merge_after_reports}
+NEVER: Final = 2**62
+"""When a tile is ready that is set aside."""
+
+
+def timing_of(config: StoreConfig, now: int, steady: int) -> dict[str, Any]:
+    """The statements' times: `now` (UTC), and when a dirty tile becomes ready: `steady` (the queue's clock), `delay` (all
+    ns) and `merge_after` (reports).
+    """
+    delay = round(config.merge_delay_s * NS_PER_S)
+    return {"now": now, "steady": steady, "delay": delay, "merge_after": config.merge_after_reports}
 
 
 def put_reports(c: apsw.Connection, rows: Iterable[ReportRow], timing: dict[str, Any]) -> list[PutStatus]:
@@ -33,14 +40,14 @@ def _put_report(c: apsw.Connection, row: ReportRow, timing: dict[str, Any]) -> P
     return "stored"
 
 
-def claim(c: apsw.Connection, owner: str, n: int, lease_s: float, prefer: Sequence[str], now: int) -> list[Claim]:
+def claim(c: apsw.Connection, owner: str, n: int, lease_s: float, prefer: Sequence[str], steady: int) -> list[Claim]:
     """Lease ready tiles: those of the preferred regions first, then any, each group oldest first."""
-    lease_ns = now + round(lease_s * NS_PER_S)
+    lease_ns = steady + round(lease_s * NS_PER_S)
     claims: list[Claim] = []
     for first, end in map(morton_range, prefer):
-        wanted = {"now": now, "first": first, "end": end, "n": n - len(claims)}
+        wanted = {"steady": steady, "first": first, "end": end, "n": n - len(claims)}
         claims += _take(c, fetch(c, "claimable_in_region", wanted), owner, lease_ns)
-    return claims + _take(c, fetch(c, "claimable", {"now": now, "n": n - len(claims)}), owner, lease_ns)
+    return claims + _take(c, fetch(c, "claimable", {"steady": steady, "n": n - len(claims)}), owner, lease_ns)
 
 
 def _take(c: apsw.Connection, rows: Iterable[Row], owner: str, lease_ns: int) -> list[Claim]:
@@ -53,10 +60,32 @@ def _take(c: apsw.Connection, rows: Iterable[Row], owner: str, lease_ns: int) ->
     return claims
 
 
-def renew(c: apsw.Connection, claims: Iterable[Claim], lease_s: float, now: int) -> list[bool]:
+def renew(c: apsw.Connection, claims: Iterable[Claim], lease_s: float, steady: int) -> list[bool]:
     """Prolong the leases that are still held by these claims."""
-    lease_ns = now + round(lease_s * NS_PER_S)
+    lease_ns = steady + round(lease_s * NS_PER_S)
     return [change(c, "renew_lease", _lease(one) | {"lease_ns": lease_ns}) == 1 for one in claims]
+
+
+def begin(c: apsw.Connection, claim: Claim, lease_s: float, steady: int) -> bool:
+    """Count an attempt to merge a claimed tile, and prolong its lease; whether it is still held."""
+    return change(c, "begin_merge", _lease(claim) | {"lease_ns": steady + round(lease_s * NS_PER_S)}) == 1
+
+
+def set_aside(c: apsw.Connection, claim: Claim, reason: str, now: int) -> bool:
+    """Free one lease; the tile is not ready until a report arrives or somebody takes it up again."""
+    return change(c, "set_aside", _lease(claim) | {"never": NEVER, "now": now, "reason": reason}) == 1
+
+
+def take_up_again(c: apsw.Connection, tiles: Iterable[tuple[str, TileId]]) -> int:
+    """Make tiles that are set aside ready; how many of them were."""
+    return sum(change(c, "take_up_again", {"layer": layer, "tile": tile.morton}) for layer, tile in tiles)
+
+
+def enter_boot(c: apsw.Connection, boot: str) -> None:
+    """Free all leases when they are of another boot, whose clock was another one."""
+    if fetch(c, "boot_of_queue") != [(boot,)]:
+        change(c, "forget_leases", {})
+        change(c, "put_boot", {"boot": boot})
 
 
 def release(c: apsw.Connection, owner: str) -> int:

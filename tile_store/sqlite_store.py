@@ -1,5 +1,6 @@
 """The store in one SQLite file that several processes of a machine may open (WAL, every commit synced)."""
 
+import logging
 import time
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from hashlib import sha256
@@ -12,12 +13,13 @@ import apsw
 from gnd_map.content import AnyTile
 from gnd_map.tile_id import TileId
 from schemas.tiles import CatalogEntry
+from tile_store import clocks
 from tile_store import sqlite_accounts as accounts
 from tile_store import sqlite_confirmation as confirmation
 from tile_store import sqlite_inbox as inbox
 from tile_store import sqlite_refuted as refuted
 from tile_store import sqlite_versions as versions
-from tile_store.errors import StoreError, UnknownVersion
+from tile_store.errors import StoreDamaged, StoreError, UnknownVersion
 from tile_store.provenance import Provenance, decode_provenance
 from tile_store.regions import morton_range
 from tile_store.sqlite_connection import ReaderPool, change, fetch, open_writer
@@ -33,9 +35,11 @@ from tile_store.values import (
     PutStatus,
     Quarantined,
     ReportRow,
+    ShardSeen,
     StoreConfig,
     StoreCounts,
     StoredTile,
+    TileSetAside,
     TileWork,
     VehicleAccount,
     VersionInfo,
@@ -49,6 +53,7 @@ from tile_store.writer import GroupWriter
 _T = TypeVar("_T")
 NS_PER_S: Final = 1_000_000_000
 REPORTS_A_PAGE: Final = 256
+_LOG = logging.getLogger(__name__)
 
 
 class SqliteStore:
@@ -57,7 +62,8 @@ class SqliteStore:
     Args:
         path: the file; with `create` it is made when missing (its folder must exist).
         config: batching and waiting of this process.
-        now_ns: the clock, int ns UTC.
+        now_ns: the time of day, int ns UTC; it may step.
+        steady_ns: the clock of the queue, ns; it never steps, and is the same in all processes of the machine.
 
     Raises:
         StoreUnavailable: no such file or folder, no permission, not a store, written by a newer release.
@@ -70,13 +76,15 @@ class SqliteStore:
         *,
         create: bool = True,
         now_ns: Callable[[], int] = time.time_ns,
+        steady_ns: Callable[[], int] = clocks.steady_ns,
     ) -> None:
         self.path = Path(path)
         self._config = config or StoreConfig()
-        self._now_ns = now_ns
+        self._now_ns, self._steady_ns = now_ns, steady_ns
         connection = open_writer(self.path, create=create, busy_timeout_s=self._config.busy_timeout_s)
         self._writer = GroupWriter(connection, group_max=self._config.group_max)
         self._readers = ReaderPool(self.path, busy_timeout_s=self._config.busy_timeout_s)
+        self._enter_boot()
 
     def __enter__(self) -> "SqliteStore":
         return self
@@ -91,8 +99,21 @@ class SqliteStore:
         self._readers.close()
         self._writer.close()  # the last connection folds the log into the file, which a reader could not
 
+    def _enter_boot(self) -> None:
+        """What an earlier boot has left in the queue ends; a store is written to only where there is something."""
+        try:
+            with self._readers.snapshot() as c:
+                is_known = fetch(c, "boot_of_queue") == [(clocks.boot_id(),)]
+            if not is_known:
+                self._writer.run(lambda c: inbox.enter_boot(c, clocks.boot_id()))
+        except StoreDamaged as error:  # what can be read shall be read
+            _LOG.error("%s", error)
+        except BaseException:
+            self.close()
+            raise
+
     def _timing(self) -> dict[str, Any]:
-        return inbox.timing_of(self._config, self._now_ns())
+        return inbox.timing_of(self._config, self._now_ns(), self._steady_ns())
 
     # The inbox
 
@@ -138,14 +159,18 @@ class SqliteStore:
     def claim(self, owner: str, n: int, lease_s: float, prefer: Sequence[str] = ()) -> list[Claim]:
         """See `Store.claim`."""
         # Idle mergers look often: they take no write lock for nothing.
-        ready_ns = self.next_ready_ns()
-        if ready_ns is None or ready_ns > self._now_ns():
+        ready_in_s = self.ready_in_s()
+        if ready_in_s is None or ready_in_s > 0.0:
             return []
-        return self._writer.run(lambda c: inbox.claim(c, owner, n, lease_s, prefer, self._now_ns()))
+        return self._writer.run(lambda c: inbox.claim(c, owner, n, lease_s, prefer, self._steady_ns()))
+
+    def begin(self, claim: Claim, lease_s: float) -> bool:
+        """See `Store.begin`."""
+        return self._writer.run(lambda c: inbox.begin(c, claim, lease_s, self._steady_ns()))
 
     def renew(self, claims: Sequence[Claim], lease_s: float) -> list[bool]:
         """See `Store.renew`."""
-        return self._writer.run(lambda c: inbox.renew(c, claims, lease_s, self._now_ns()))
+        return self._writer.run(lambda c: inbox.renew(c, claims, lease_s, self._steady_ns()))
 
     def release(self, owner: str) -> int:
         """See `Store.release`."""
@@ -153,18 +178,74 @@ class SqliteStore:
 
     def postpone(self, claim: Claim, delay_s: float) -> None:
         """See `Store.postpone`."""
-        self._writer.run(lambda c: inbox.postpone(c, claim, self._now_ns() + round(delay_s * NS_PER_S)))
+        self._writer.run(lambda c: inbox.postpone(c, claim, self._steady_ns() + round(delay_s * NS_PER_S)))
+
+    def set_aside(self, claim: Claim, reason: str) -> bool:
+        """See `Store.set_aside`."""
+        return self._writer.run(lambda c: inbox.set_aside(c, claim, reason, self._now_ns()))
+
+    def tiles_set_aside(self) -> list[TileSetAside]:
+        """See `Store.tiles_set_aside`."""
+        with self._readers.snapshot() as c:
+            rows = fetch(c, "tiles_set_aside")
+        return [TileSetAside(layer, TileId(tile), *rest) for layer, tile, *rest in rows]
+
+    def take_up_again(self, tiles: Iterable[tuple[str, TileId]]) -> int:
+        """See `Store.take_up_again`."""
+        wanted = list(tiles)
+        return self._writer.run(lambda c: inbox.take_up_again(c, wanted))
+
+    # Shards
+
+    def join(self, owner: str) -> None:
+        """See `Store.join`."""
+        row = {"owner": owner, "boot": clocks.boot_id(), "steady": self._steady_ns(), "now": self._now_ns()}
+
+        def work(c: apsw.Connection) -> None:
+            inbox.release(c, owner)
+            change(c, "join", row)
+
+        self._writer.run(work)
+
+    def beat(self, owner: str, claims: Sequence[Claim], lease_s: float) -> list[bool]:
+        """See `Store.beat`."""
+        row = {"owner": owner, "boot": clocks.boot_id(), "steady": self._steady_ns(), "now": self._now_ns()}
+
+        def work(c: apsw.Connection) -> list[bool]:
+            change(c, "beat", row)
+            return inbox.renew(c, claims, lease_s, self._steady_ns())
+
+        return self._writer.run(work)
+
+    def leave(self, owner: str) -> None:
+        """See `Store.leave`."""
+
+        def work(c: apsw.Connection) -> None:
+            inbox.release(c, owner)
+            change(c, "leave", {"owner": owner})
+
+        self._writer.run(work)
+
+    def shards(self) -> list[ShardSeen]:
+        """See `Store.shards`."""
+        with self._readers.snapshot() as c:
+            rows = fetch(c, "shards")
+        steady, boot = self._steady_ns(), clocks.boot_id()
+        return [
+            ShardSeen(owner, since_ns, (steady - beat_ns) / NS_PER_S if of_boot == boot else None)
+            for owner, of_boot, beat_ns, since_ns in rows
+        ]
 
     def dirty_count(self) -> int:
         """See `Store.dirty_count`."""
         with self._readers.snapshot() as c:
             return int(fetch(c, "dirty_count")[0][0])
 
-    def next_ready_ns(self) -> int | None:
-        """See `Store.next_ready_ns`."""
+    def ready_in_s(self) -> float | None:
+        """See `Store.ready_in_s`."""
         with self._readers.snapshot() as c:
-            ready: int | None = fetch(c, "next_ready")[0][0]
-            return ready
+            ready_ns: int | None = fetch(c, "next_ready")[0][0]
+        return None if ready_ns is None else (ready_ns - self._steady_ns()) / NS_PER_S
 
     # Merging and publishing
 

@@ -18,8 +18,10 @@ from tile_store.values import (
     PutStatus,
     Quarantined,
     ReportRow,
+    ShardSeen,
     StoreCounts,
     StoredTile,
+    TileSetAside,
     TileWork,
     VehicleAccount,
     VersionInfo,
@@ -62,7 +64,13 @@ class Store(Protocol):
     # The queue
 
     def claim(self, owner: str, n: int, lease_s: float, prefer: Sequence[str] = ()) -> list[Claim]:
-        """Lease up to `n` tiles that are ready to merge, those in the regions `prefer` (path prefixes) first."""
+        """Lease up to `n` tiles that are ready to merge, those in the regions `prefer` (path prefixes) first.
+
+        Leases and delays run by a clock that does not step; those of an earlier boot of the machine are over.
+        """
+
+    def begin(self, claim: Claim, lease_s: float) -> bool:
+        """Count an attempt to merge a claimed tile and prolong its lease; False where that has gone to another owner."""
 
     def renew(self, claims: Sequence[Claim], lease_s: float) -> list[bool]:
         """Prolong leases; False where the lease has gone to another owner."""
@@ -74,10 +82,37 @@ class Store(Protocol):
         """Give a tile back, to be ready again after `delay_s` (its merge has failed)."""
 
     def dirty_count(self) -> int:
-        """Tiles that wait to be merged, leased ones included."""
+        """Tiles that wait to be merged, leased ones included, those set aside not."""
 
-    def next_ready_ns(self) -> int | None:
-        """When the next tile can be claimed (a lease's end included); None: nothing waits."""
+    def ready_in_s(self) -> float | None:
+        """How soon the next tile can be claimed (a lease's end included), negative when it could be by now; None: nothing
+        waits.
+        """
+
+    def set_aside(self, claim: Claim, reason: str) -> bool:
+        """Leave a tile that cannot be merged as it is; its reports go on waiting. It is tried again when a report about
+        it arrives, or when somebody takes it up again. False where the lease has gone to another owner.
+        """
+
+    def tiles_set_aside(self) -> list[TileSetAside]:
+        """The tiles that are set aside, by layer and tile."""
+
+    def take_up_again(self, tiles: Iterable[tuple[str, TileId]]) -> int:
+        """Make tiles that are set aside ready to merge; how many of them were."""
+
+    # Shards
+
+    def join(self, owner: str) -> None:
+        """A merger shard begins: leases of an earlier life of the same name are freed."""
+
+    def beat(self, owner: str, claims: Sequence[Claim], lease_s: float) -> list[bool]:
+        """A shard's sign of life, with which it prolongs its leases; False where one has gone to another owner."""
+
+    def leave(self, owner: str) -> None:
+        """A shard ends: its leases are freed."""
+
+    def shards(self) -> list[ShardSeen]:
+        """The shards that have joined and not left, by name."""
 
     # Merging and publishing
 

@@ -51,6 +51,9 @@ def lattice_named(codec: str) -> Lattice | None:
     return LATTICES.get(codec)
 
 
+SHARD_SILENT_S: Final = 15.0
+"""A shard that has been silent for so long counts as gone."""
+
 REFUTED_TESTS: Final = 3
 """A report is refuted after so many tiles in which it stands alone against others, ..."""
 REFUTED_SHARE: Final = 0.5
@@ -201,7 +204,7 @@ class VersionInfo:
 @dataclass(frozen=True, slots=True)
 class Claim:
     """A lease on a dirty tile. `seq` counts the reports that had arrived, `token` tells this lease from any other,
-    `attempts` says how often the tile was claimed since it was last published (1: the first time).
+    `attempts` says which attempt to merge the tile since it was last published begins with it (1: the first).
     """
 
     layer: str
@@ -243,6 +246,32 @@ class DirtyTile:
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "is_leased", bool(self.is_leased))
+
+
+@dataclass(frozen=True, slots=True)
+class TileSetAside:
+    """A tile that could not be read or merged, since when (UTC), after how many attempts, and why; its reports wait."""
+
+    layer: str
+    tile: TileId
+    since_ns: int
+    attempts: int
+    reports: int
+    reason: str
+
+
+@dataclass(frozen=True, slots=True)
+class ShardSeen:
+    """A merger shard: when it joined (UTC), and how long ago it gave its last sign of life (None: before this boot)."""
+
+    owner: str
+    since_ns: int
+    silent_s: float | None
+
+    @property
+    def is_alive(self) -> bool:
+        """Whether it has been heard of lately."""
+        return self.silent_s is not None and self.silent_s < SHARD_SILENT_S
 
 
 @dataclass(frozen=True, slots=True)
@@ -436,3 +465,4 @@ class StoreCounts:
     waiting: int
     dirty: int
     quarantined: int
+    set_aside: int = 0

@@ -12,7 +12,8 @@ import pytest
 from store_helpers import EAGER, TILE, report, report_id, tile_of_voxels
 
 from tile_store.errors import StoreBusy, StoreClosed, StoreError, StoreUnavailable
-from tile_store.sqlite_connection import APPLICATION_ID, SCHEMA_VERSION, open_writer
+from tile_store.migrations import APPLICATION_ID, SCHEMA_VERSION
+from tile_store.sqlite_connection import open_writer
 from tile_store.sqlite_store import SqliteStore
 from tile_store.values import StoreConfig
 
@@ -82,7 +83,10 @@ def test_a_truncated_store_is_named(tmp_path: Path) -> None:
     with SqliteStore(path) as store:
         store.put_tiles([tile_of_voxels(TILE, *range(2000))])
     path.write_bytes(path.read_bytes()[:8192])
-    with pytest.raises(StoreUnavailable, match=r"damaged .* restore the newest backup"), SqliteStore(path) as store:
+    with (
+        pytest.raises(StoreUnavailable, match=r"damaged .* `gnd map restore` puts a backup back"),
+        SqliteStore(path) as store,
+    ):
         store.get("ndt", TILE)
 
 

@@ -6,7 +6,6 @@ import sys
 from pathlib import Path
 from typing import Any
 
-import apsw
 import numpy as np
 import pytest
 from click.testing import CliRunner
@@ -234,11 +233,3 @@ def test_status_tells_what_waits_for_whom(path: Path) -> None:
     assert (claim_told["tile"], claim_told["vehicle"], claim_told["seen"]) == (TILE.path, "car-7", 300)
     shown = gnd_map("status", path)
     assert all(text in shown for text in ("car-7", TILE.path, "120", "1 messages in quarantine", "1 tiles to merge"))
-
-
-def test_a_store_of_an_older_release_gets_what_it_lacks_when_it_is_opened(path: Path) -> None:
-    with apsw.Connection(str(path)) as connection:
-        connection.execute(
-            "DROP TABLE waiting_change; DROP TABLE shift_test; DROP TABLE shifted_vehicle; DROP TABLE course_said"
-        )
-    assert as_json("status", path)["waiting_for_confirmation"]["tiles"] == 0

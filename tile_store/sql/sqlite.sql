@@ -207,7 +207,7 @@ SELECT layer, tile, vehicle, reason, voxels, seen, since_ns FROM waiting_change
 ORDER BY layer, tile, vehicle, reason
 
 -- name: dirty_tiles
-SELECT layer, tile, waiting, attempts, owner IS NOT NULL FROM dirty ORDER BY layer, tile
+SELECT layer, tile, waiting, attempts, owner IS NOT NULL FROM dirty WHERE aside_ns IS NULL ORDER BY layer, tile
 
 -- name: insert_report
 INSERT INTO report (layer, tile, report_id, vehicle, received_ns, seq, base_sha, body)
@@ -218,25 +218,31 @@ ON CONFLICT (layer, tile, report_id) DO NOTHING
 
 -- name: mark_dirty
 INSERT INTO dirty (layer, tile, seq, waiting, ready_ns)
-VALUES (:layer, :tile, 1, 1, CASE WHEN :merge_after <= 1 THEN :now ELSE :now + :delay END)
+VALUES (:layer, :tile, 1, 1, CASE WHEN :merge_after <= 1 THEN :steady ELSE :steady + :delay END)
 ON CONFLICT (layer, tile) DO UPDATE SET
   seq = seq + 1,
   waiting = waiting + 1,
-  ready_ns = MIN(ready_ns, CASE WHEN waiting + 1 >= :merge_after THEN :now ELSE :now + :delay END)
+  ready_ns = MIN(ready_ns, CASE WHEN waiting + 1 >= :merge_after THEN :steady ELSE :steady + :delay END),
+  attempts = CASE WHEN aside_ns IS NULL THEN attempts ELSE 0 END,
+  aside_ns = NULL,
+  aside_reason = NULL
 
 -- name: claimable
 SELECT layer, tile, seq, attempts FROM dirty INDEXED BY dirty_ready
-WHERE ready_ns <= :now AND (owner IS NULL OR lease_ns <= :now)
+WHERE ready_ns <= :steady AND (owner IS NULL OR lease_ns <= :steady)
 ORDER BY ready_ns, layer, tile LIMIT :n
 
 -- name: claimable_in_region
 SELECT layer, tile, seq, attempts FROM dirty INDEXED BY dirty_tile
-WHERE ready_ns <= :now AND (owner IS NULL OR lease_ns <= :now) AND tile >= :first AND tile < :end
+WHERE ready_ns <= :steady AND (owner IS NULL OR lease_ns <= :steady) AND tile >= :first AND tile < :end
 ORDER BY ready_ns, layer, tile LIMIT :n
 
 -- name: take_lease
-UPDATE dirty SET owner = :owner, token = :token, lease_ns = :lease_ns, attempts = attempts + 1
-WHERE layer = :layer AND tile = :tile
+UPDATE dirty SET owner = :owner, token = :token, lease_ns = :lease_ns WHERE layer = :layer AND tile = :tile
+
+-- name: begin_merge
+UPDATE dirty SET attempts = attempts + 1, lease_ns = :lease_ns
+WHERE layer = :layer AND tile = :tile AND token = :token
 
 -- name: renew_lease
 UPDATE dirty SET lease_ns = :lease_ns WHERE layer = :layer AND tile = :tile AND token = :token
@@ -269,7 +275,7 @@ DELETE FROM dirty WHERE layer = :layer AND tile = :tile AND seq = :seq
 UPDATE dirty SET owner = NULL, token = NULL, lease_ns = NULL, attempts = 0,
   waiting = (SELECT COUNT(*) FROM report WHERE layer = :layer AND tile = :tile AND merged_in IS NULL),
   ready_ns = CASE WHEN (SELECT COUNT(*) FROM report WHERE layer = :layer AND tile = :tile AND merged_in IS NULL)
-                       >= :merge_after THEN :now ELSE :now + :delay END
+                       >= :merge_after THEN :steady ELSE :steady + :delay END
 WHERE layer = :layer AND tile = :tile
 
 -- name: head
@@ -355,10 +361,11 @@ SELECT arrival, report_id, layer, tile, vehicle, received_ns, body, base_sha FRO
 WHERE arrival > :after AND layer = :layer AND (:vehicle IS NULL OR vehicle = :vehicle) ORDER BY arrival LIMIT :n
 
 -- name: dirty_count
-SELECT COUNT(*) FROM dirty
+SELECT COUNT(*) FROM dirty WHERE aside_ns IS NULL
 
 -- name: next_ready
 SELECT MIN(CASE WHEN owner IS NULL THEN ready_ns ELSE MAX(ready_ns, lease_ns) END) FROM dirty
+WHERE aside_ns IS NULL
 
 -- name: insert_quarantine
 INSERT INTO quarantine (sha, received_ns, source, reason, times, body)
@@ -382,8 +389,9 @@ RETURNING size_bytes
 -- name: counts
 SELECT (SELECT COUNT(*) FROM tile_head), (SELECT COUNT(*) FROM tile_version),
        (SELECT COUNT(*) FROM (SELECT DISTINCT report_id FROM report)), (SELECT COUNT(*) FROM report),
-       (SELECT COUNT(*) FROM report WHERE merged_in IS NULL), (SELECT COUNT(*) FROM dirty),
-       (SELECT COUNT(*) FROM quarantine)
+       (SELECT COUNT(*) FROM report WHERE merged_in IS NULL),
+       (SELECT COUNT(*) FROM dirty WHERE aside_ns IS NULL), (SELECT COUNT(*) FROM quarantine),
+       (SELECT COUNT(*) FROM dirty WHERE aside_ns IS NOT NULL)
 
 -- name: put_feature_source
 INSERT INTO feature_source (name, created_ns, about, body) VALUES (:name, :created_ns, :about, :body)
@@ -394,3 +402,86 @@ SELECT 1 FROM sqlite_schema WHERE type = 'table' AND name = 'feature_source'
 
 -- name: feature_sources
 SELECT name, about, body FROM feature_source ORDER BY name
+
+-- name: schema_of_operations
+-- Step of the schema: the queue by a clock that does not step, tiles that are set aside, shards, bounds of the quarantine.
+-- From here on `ready_ns` and `lease_ns` are times of the machine's monotonic clock, in the boot that `queue_boot` names.
+ALTER TABLE dirty ADD COLUMN aside_ns INTEGER;
+ALTER TABLE dirty ADD COLUMN aside_reason TEXT;
+UPDATE dirty SET ready_ns = 0, owner = NULL, token = NULL, lease_ns = NULL;
+CREATE TABLE queue_boot (
+  one  INTEGER NOT NULL PRIMARY KEY CHECK (one = 1),
+  boot TEXT    NOT NULL
+) STRICT, WITHOUT ROWID;
+
+-- The sign of life of each merger shard: `beat_ns` by the monotonic clock of that boot, `since_ns` UTC.
+CREATE TABLE shard (
+  owner    TEXT    NOT NULL PRIMARY KEY,
+  boot     TEXT    NOT NULL,
+  beat_ns  INTEGER NOT NULL,
+  since_ns INTEGER NOT NULL
+) STRICT, WITHOUT ROWID;
+
+-- How much the quarantine holds, kept by triggers: its bound is checked with each message that is refused.
+CREATE TABLE quarantine_size (
+  one      INTEGER NOT NULL PRIMARY KEY CHECK (one = 1),
+  messages INTEGER NOT NULL,
+  bytes    INTEGER NOT NULL
+) STRICT, WITHOUT ROWID;
+INSERT INTO quarantine_size (one, messages, bytes)
+SELECT 1, COUNT(*), COALESCE(SUM(LENGTH(body) + LENGTH(reason) + LENGTH(source)), 0) FROM quarantine;
+CREATE INDEX quarantine_received ON quarantine (received_ns);
+CREATE TRIGGER quarantine_grows AFTER INSERT ON quarantine BEGIN
+  UPDATE quarantine_size SET messages = messages + 1,
+    bytes = bytes + LENGTH(NEW.body) + LENGTH(NEW.reason) + LENGTH(NEW.source);
+END;
+CREATE TRIGGER quarantine_shrinks AFTER DELETE ON quarantine BEGIN
+  UPDATE quarantine_size SET messages = messages - 1,
+    bytes = bytes - LENGTH(OLD.body) - LENGTH(OLD.reason) - LENGTH(OLD.source);
+END;
+CREATE INDEX report_received ON report (received_ns);
+
+-- name: boot_of_queue
+SELECT boot FROM queue_boot
+
+-- name: put_boot
+INSERT INTO queue_boot (one, boot) VALUES (1, :boot) ON CONFLICT (one) DO UPDATE SET boot = excluded.boot
+
+-- name: forget_leases
+UPDATE dirty SET owner = NULL, token = NULL, lease_ns = NULL,
+  ready_ns = CASE WHEN aside_ns IS NULL THEN 0 ELSE ready_ns END
+
+-- name: set_aside
+UPDATE dirty SET owner = NULL, token = NULL, lease_ns = NULL, ready_ns = :never, aside_ns = :now, aside_reason = :reason
+WHERE layer = :layer AND tile = :tile AND token = :token
+
+-- name: tiles_set_aside
+SELECT layer, tile, aside_ns, attempts, waiting, aside_reason FROM dirty WHERE aside_ns IS NOT NULL ORDER BY layer, tile
+
+-- name: take_up_again
+UPDATE dirty SET ready_ns = 0, attempts = 0, aside_ns = NULL, aside_reason = NULL
+WHERE aside_ns IS NOT NULL AND layer = :layer AND tile = :tile
+
+-- name: beat
+INSERT INTO shard (owner, boot, beat_ns, since_ns) VALUES (:owner, :boot, :steady, :now)
+ON CONFLICT (owner) DO UPDATE SET boot = excluded.boot, beat_ns = excluded.beat_ns
+
+-- name: join
+INSERT INTO shard (owner, boot, beat_ns, since_ns) VALUES (:owner, :boot, :steady, :now)
+ON CONFLICT (owner) DO UPDATE SET boot = excluded.boot, beat_ns = excluded.beat_ns, since_ns = excluded.since_ns
+
+-- name: leave
+DELETE FROM shard WHERE owner = :owner
+
+-- name: shards
+SELECT owner, boot, beat_ns, since_ns FROM shard ORDER BY owner
+
+-- name: quarantine_size
+SELECT messages, bytes FROM quarantine_size
+
+-- name: forget_quarantined
+DELETE FROM quarantine WHERE sha IN (SELECT sha FROM quarantine ORDER BY received_ns, sha LIMIT 16)
+
+-- name: oldest_waiting
+SELECT MIN(r.received_ns) FROM dirty AS d JOIN report AS r USING (layer, tile)
+WHERE r.merged_in IS NULL AND d.aside_ns IS NULL
