@@ -39,7 +39,7 @@ class Worker:
         return [publication for publication in attempted if publication is not None]
 
     def settle(self, claim: Claim) -> PublishResult | None:
-        """Merge one claimed tile and publish it; None: it failed and is postponed or set aside, or its lease is gone."""
+        """Merge one claimed tile and publish it; None: it is postponed or set aside, or its lease is gone."""
         publication = self._attempt(claim)
         if publication is None:
             return None

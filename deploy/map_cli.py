@@ -104,5 +104,7 @@ def _bars() -> Progress:
 
 
 map_group = click.Group(
-    "map", commands=[build, *store_group.commands.values()], help="Build, inspect, compare, export and roll back maps."
+    "map",
+    commands=[build, *store_group.commands.values()],
+    help="Build, inspect, compare, export, back up and roll back maps.",
 )

@@ -1,7 +1,7 @@
-"""The clock of the queue: leases, and when a tile is ready to merge. It never steps, whatever is done to the time of day.
+"""The clock of the queue: leases, and when a tile is ready to merge. It never steps, whatever becomes of the time of day.
 
-A store lies on one machine, and all processes of a machine see the same monotonic clock. It begins anew at each boot, so
-the store remembers in which boot its queue was used: whoever held a lease in another one is dead.
+A store lies on one machine, and all processes of a machine see the same monotonic clock. It begins anew at each boot;
+so the store remembers in which boot its queue was used: whoever held a lease in another one is dead.
 """
 
 import time
@@ -17,6 +17,6 @@ steady_ns = time.monotonic_ns
 def boot_id() -> str:
     """What tells this boot of this machine from any other; where the system does not say so, its name stands for it."""
     try:
-        return _BOOT_ID.read_text(encoding="ascii").strip()
+        return _BOOT_ID.read_text(encoding="utf-8").strip()
     except OSError:
         return "unknown"

@@ -1,7 +1,7 @@
 """The steps of the store's schema: an older store takes those that it lacks, all in one transaction, when it is opened.
 
-A step is a number and a named block of SQL; it is run once in a store's life. A new step is added at the end. The schema
-that a new store begins with (`schema`, number 1) is never changed.
+A step is a number and a named block of SQL; it is run once in a store's life. A new step is added at the end. The
+schema that a new store begins with (`schema`, number 1) is never changed.
 """
 
 from pathlib import Path

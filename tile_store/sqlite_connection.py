@@ -1,5 +1,6 @@
 """Opening SQLite so that several processes may share the file and nothing acknowledged is lost."""
 
+import os
 import random
 import threading
 import time
@@ -8,6 +9,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from types import MappingProxyType
 from typing import Any, Final, TypeVar
+from urllib.parse import quote
 
 import apsw
 
@@ -17,6 +19,7 @@ from tile_store.sql import statements
 
 SQL: Final = statements("sqlite")
 
+READER_PATIENCE_S: Final = 30.0
 OLDEST_SQLITE: Final = (3, 51, 3)
 """Older ones can corrupt a WAL that several connections write and checkpoint."""
 
@@ -37,8 +40,10 @@ def change(connection: apsw.Connection, statement: str, bindings: Bindings) -> i
     return connection.changes()
 
 
-def as_store_error(error: Exception, path: str | Path) -> Exception:
+def as_store_error(error: Exception, path: str | Path, *, to_write: bool = True) -> Exception:
     """SQLite's errors as ours, in one line; any other exception as it is."""
+    if isinstance(error, (apsw.CantOpenError, apsw.PermissionsError, PermissionError)) and not to_write:
+        return StoreUnavailable(f"{path}: cannot be read; check its permissions and those of its folder")
     if isinstance(error, (apsw.BusyError, apsw.LockedError)):
         return StoreBusy(f"{path}: another process has held the write lock for too long; try again or stop it")
     if isinstance(error, apsw.NotADBError):
@@ -72,6 +77,59 @@ def open_writer(path: Path, *, create: bool, busy_timeout_s: float) -> apsw.Conn
     except apsw.Error as error:
         connection.close()
         raise as_store_error(error, path) from None
+    except BaseException:
+        connection.close()
+        raise
+    return connection
+
+
+def open_reader(path: Path) -> apsw.Connection:
+    """A connection that changes nothing, also where nothing can be written: in a folder or on a disk that is read-only.
+
+    There a store can be read that was closed cleanly, or whose log is in use by a process that may write.
+
+    Raises:
+        StoreUnavailable: no such store, not a store, or a log that cannot be read without writing.
+    """
+    if not path.is_file():
+        raise StoreUnavailable(f"{path}: no such store; `gnd map build` makes one")
+    try:
+        try:
+            return _opened_reader(str(path), path, 0)
+        except (apsw.CantOpenError, apsw.ReadOnlyError, apsw.PermissionsError):
+            if os.access(path.parent, os.W_OK):
+                raise
+            log = path.with_name(path.name + "-wal")
+            if log.exists() and log.stat().st_size:
+                raise StoreUnavailable(
+                    f"{path}: its log {log.name} is not yet part of it and its folder is read-only; copy both to a"
+                    " folder that can be written to"
+                ) from None
+            # A store in WAL mode wants to make files beside itself, unless it is told that nobody will change it.
+            return _opened_reader(f"file:{quote(str(path.resolve()))}?immutable=1", path, apsw.SQLITE_OPEN_URI)
+    except (apsw.Error, OSError) as error:
+        raise as_store_error(error, path, to_write=False) from None
+
+
+def require_current(path: Path) -> None:
+    """StoreUnavailable unless the store has the schema of this release, which cannot be given to it without writing."""
+    connection = open_reader(path)
+    try:
+        found = schema_of(connection, path)
+    finally:
+        connection.close()
+    if found < SCHEMA_VERSION:
+        raise StoreUnavailable(
+            f"{path}: store schema {found}, this release reads {SCHEMA_VERSION} and may not write here; copy the store"
+            " to a folder that can be written to, opening it there brings it up to date"
+        )
+
+
+def _opened_reader(name: str, path: Path, flags: int) -> apsw.Connection:
+    connection = apsw.Connection(name, flags=apsw.SQLITE_OPEN_READONLY | flags)
+    try:
+        connection.set_busy_handler(_Patience(READER_PATIENCE_S))
+        schema_of(connection, path)
     except BaseException:
         connection.close()
         raise
@@ -120,9 +178,8 @@ def _retry_busy(step: Callable[[], T], timeout_s: float) -> T:
 class ReaderPool:
     """Read-only connections, one for each thread that reads at the same time."""
 
-    def __init__(self, path: Path, *, busy_timeout_s: float) -> None:
+    def __init__(self, path: Path) -> None:
         self._path = path
-        self._busy_timeout_s = busy_timeout_s
         self._idle: list[apsw.Connection] = []
         self._lock = threading.Lock()
         self._closed = False
@@ -163,12 +220,7 @@ class ReaderPool:
                 raise StoreClosed(f"{self._path}: the store is closed")
             if self._idle:
                 return self._idle.pop()
-        try:
-            connection = apsw.Connection(str(self._path), flags=apsw.SQLITE_OPEN_READONLY)
-        except apsw.Error as error:
-            raise as_store_error(error, self._path) from None
-        connection.set_busy_handler(_Patience(self._busy_timeout_s))
-        return connection
+        return open_reader(self._path)
 
     def _give_back(self, connection: apsw.Connection) -> None:
         with self._lock:

@@ -19,8 +19,8 @@ NEVER: Final = 2**62
 
 
 def timing_of(config: StoreConfig, now: int, steady: int) -> dict[str, Any]:
-    """The statements' times: `now` (UTC), and when a dirty tile becomes ready: `steady` (the queue's clock), `delay` (all
-    ns) and `merge_after` (reports).
+    """The statements' times: `now` (UTC), and when a dirty tile becomes ready: `steady` (the queue's clock), `delay`
+    (all ns) and `merge_after` (reports).
     """
     delay = round(config.merge_delay_s * NS_PER_S)
     return {"now": now, "steady": steady, "delay": delay, "merge_after": config.merge_after_reports}
@@ -76,15 +76,16 @@ def set_aside(c: apsw.Connection, claim: Claim, reason: str, now: int) -> bool:
     return change(c, "set_aside", _lease(claim) | {"never": NEVER, "now": now, "reason": reason}) == 1
 
 
-def take_up_again(c: apsw.Connection, tiles: Iterable[tuple[str, TileId]]) -> int:
+def take_up_again(c: apsw.Connection, tiles: Iterable[tuple[str, TileId]], steady: int) -> int:
     """Make tiles that are set aside ready; how many of them were."""
-    return sum(change(c, "take_up_again", {"layer": layer, "tile": tile.morton}) for layer, tile in tiles)
+    places = [{"layer": layer, "tile": tile.morton, "steady": steady} for layer, tile in tiles]
+    return sum(change(c, "take_up_again", place) for place in places)
 
 
-def enter_boot(c: apsw.Connection, boot: str) -> None:
+def enter_boot(c: apsw.Connection, boot: str, steady: int) -> None:
     """Free all leases when they are of another boot, whose clock was another one."""
     if fetch(c, "boot_of_queue") != [(boot,)]:
-        change(c, "forget_leases", {})
+        change(c, "forget_leases", {"steady": steady})
         change(c, "put_boot", {"boot": boot})
 
 

@@ -19,21 +19,25 @@ from tile_store import sqlite_confirmation as confirmation
 from tile_store import sqlite_inbox as inbox
 from tile_store import sqlite_refuted as refuted
 from tile_store import sqlite_versions as versions
+from tile_store.backup import copy_store
 from tile_store.errors import StoreDamaged, StoreError, UnknownVersion
 from tile_store.provenance import Provenance, decode_provenance
 from tile_store.regions import morton_range
-from tile_store.sqlite_connection import ReaderPool, change, fetch, open_writer
+from tile_store.retention import trim_quarantine
+from tile_store.sqlite_connection import ReaderPool, change, fetch, open_writer, require_current
 from tile_store.values import (
     DEFAULT_LAYER,
     Claim,
     Content,
     DirtyTile,
     GcResult,
+    HeadLine,
     Notice,
     Publication,
     PublishResult,
     PutStatus,
     Quarantined,
+    QueueState,
     ReportRow,
     ShardSeen,
     StoreConfig,
@@ -48,11 +52,12 @@ from tile_store.values import (
     check_fits,
     check_layer,
 )
-from tile_store.writer import GroupWriter
+from tile_store.writer import GroupWriter, NoWriter
 
 _T = TypeVar("_T")
 NS_PER_S: Final = 1_000_000_000
 REPORTS_A_PAGE: Final = 256
+LAGS_LOOKED_AT: Final = 256
 _LOG = logging.getLogger(__name__)
 
 
@@ -62,6 +67,7 @@ class SqliteStore:
     Args:
         path: the file; with `create` it is made when missing (its folder must exist).
         config: batching and waiting of this process.
+        read_only: nothing is written, also not beside the file; whatever would write is StoreUnavailable.
         now_ns: the time of day, int ns UTC; it may step.
         steady_ns: the clock of the queue, ns; it never steps, and is the same in all processes of the machine.
 
@@ -75,16 +81,22 @@ class SqliteStore:
         config: StoreConfig | None = None,
         *,
         create: bool = True,
+        read_only: bool = False,
         now_ns: Callable[[], int] = time.time_ns,
         steady_ns: Callable[[], int] = clocks.steady_ns,
     ) -> None:
         self.path = Path(path)
         self._config = config or StoreConfig()
         self._now_ns, self._steady_ns = now_ns, steady_ns
-        connection = open_writer(self.path, create=create, busy_timeout_s=self._config.busy_timeout_s)
-        self._writer = GroupWriter(connection, group_max=self._config.group_max)
-        self._readers = ReaderPool(self.path, busy_timeout_s=self._config.busy_timeout_s)
-        self._enter_boot()
+        self._readers = ReaderPool(self.path)
+        self._writer: GroupWriter | NoWriter
+        if read_only:
+            require_current(self.path)
+            self._writer = NoWriter(self.path)
+        else:
+            connection = open_writer(self.path, create=create, busy_timeout_s=self._config.busy_timeout_s)
+            self._writer = GroupWriter(connection, group_max=self._config.group_max)
+            self._enter_boot()
 
     def __enter__(self) -> "SqliteStore":
         return self
@@ -105,7 +117,7 @@ class SqliteStore:
             with self._readers.snapshot() as c:
                 is_known = fetch(c, "boot_of_queue") == [(clocks.boot_id(),)]
             if not is_known:
-                self._writer.run(lambda c: inbox.enter_boot(c, clocks.boot_id()))
+                self._writer.run(lambda c: inbox.enter_boot(c, clocks.boot_id(), self._steady_ns()))
         except StoreDamaged as error:  # what can be read shall be read
             _LOG.error("%s", error)
         except BaseException:
@@ -147,7 +159,12 @@ class SqliteStore:
     def quarantine(self, body: bytes, reason: str, source: str = "") -> None:
         """See `Store.quarantine`."""
         row = {"sha": sha256(body).digest(), "source": source, "reason": reason, "body": body}
-        self._writer.run(lambda c: change(c, "insert_quarantine", row | {"received_ns": self._now_ns()}))
+
+        def work(c: apsw.Connection) -> None:
+            change(c, "insert_quarantine", row | {"received_ns": self._now_ns()})
+            trim_quarantine(c, self._config.quarantine_bytes)
+
+        self._writer.run(work)
 
     def quarantined(self) -> list[Quarantined]:
         """See `Store.quarantined`."""
@@ -193,7 +210,7 @@ class SqliteStore:
     def take_up_again(self, tiles: Iterable[tuple[str, TileId]]) -> int:
         """See `Store.take_up_again`."""
         wanted = list(tiles)
-        return self._writer.run(lambda c: inbox.take_up_again(c, wanted))
+        return self._writer.run(lambda c: inbox.take_up_again(c, wanted, self._steady_ns()))
 
     # Shards
 
@@ -246,6 +263,16 @@ class SqliteStore:
         with self._readers.snapshot() as c:
             ready_ns: int | None = fetch(c, "next_ready")[0][0]
         return None if ready_ns is None else (ready_ns - self._steady_ns()) / NS_PER_S
+
+    def queue_state(self) -> QueueState:
+        """See `Store.queue_state`."""
+        with self._readers.snapshot() as c:
+            ready_ns, oldest_ns = fetch(c, "queue_state")[0]
+            lags = fetch(c, "published_lags", {"n": LAGS_LOOKED_AT})
+            messages, refused_bytes = fetch(c, "quarantine_size")[0]
+        overdue_s = 0.0 if ready_ns is None else max(self._steady_ns() - ready_ns, 0) / NS_PER_S
+        waiting_s = 0.0 if oldest_ns is None else max(self._now_ns() - oldest_ns, 0) / NS_PER_S
+        return QueueState(overdue_s, waiting_s, tuple(lag / NS_PER_S for (lag,) in lags), messages, refused_bytes)
 
     # Merging and publishing
 
@@ -370,6 +397,13 @@ class SqliteStore:
             rows = fetch(c, "heads", {"layer": layer, "first": first, "end": end})
         return [CatalogEntry(TileId(tile), version, sha) for tile, version, sha in rows]
 
+    def head_lines(self, layer: str = DEFAULT_LAYER, prefix: str = "") -> list[HeadLine]:
+        """See `Store.head_lines`."""
+        first, end = morton_range(prefix)
+        with self._readers.snapshot() as c:
+            rows = fetch(c, "head_lines", {"layer": layer, "first": first, "end": end})
+        return [HeadLine(TileId(tile), *rest) for tile, *rest in rows]
+
     def history(self, layer: str, tile: TileId) -> list[VersionInfo]:
         """See `Store.history`."""
         with self._readers.snapshot() as c:
@@ -405,11 +439,8 @@ class SqliteStore:
         return self._writer.run(lambda c: versions.collect(c, keep_versions, self._config.citing_reports_of))
 
     def backup(self, path: str | Path) -> None:
-        """See `Store.backup` (VACUUM INTO)."""
-        if Path(path).exists():
-            raise StoreError(f"{path}: exists; a backup never overwrites")
-        with self._readers.connection() as c:
-            c.execute("VACUUM INTO ?", (str(path),))
+        """See `Store.backup`."""
+        copy_store(self.path, Path(path))
 
 
 def _content(tile: AnyTile, layer: str) -> Content:

@@ -12,11 +12,13 @@ from tile_store.values import (
     Claim,
     DirtyTile,
     GcResult,
+    HeadLine,
     Notice,
     Publication,
     PublishResult,
     PutStatus,
     Quarantined,
+    QueueState,
     ReportRow,
     ShardSeen,
     StoreCounts,
@@ -70,7 +72,7 @@ class Store(Protocol):
         """
 
     def begin(self, claim: Claim, lease_s: float) -> bool:
-        """Count an attempt to merge a claimed tile and prolong its lease; False where that has gone to another owner."""
+        """Count an attempt to merge a claimed tile and prolong its lease; False where another owner has it."""
 
     def renew(self, claims: Sequence[Claim], lease_s: float) -> list[bool]:
         """Prolong leases; False where the lease has gone to another owner."""
@@ -85,7 +87,7 @@ class Store(Protocol):
         """Tiles that wait to be merged, leased ones included, those set aside not."""
 
     def ready_in_s(self) -> float | None:
-        """How soon the next tile can be claimed (a lease's end included), negative when it could be by now; None: nothing
+        """How soon the next tile can be claimed (a lease's end included), at most 0 when it can be now; None: nothing
         waits.
         """
 
@@ -113,6 +115,9 @@ class Store(Protocol):
 
     def shards(self) -> list[ShardSeen]:
         """The shards that have joined and not left, by name."""
+
+    def queue_state(self) -> QueueState:
+        """How far the merging lags behind what has arrived, and how much is in quarantine."""
 
     # Merging and publishing
 
@@ -181,6 +186,9 @@ class Store(Protocol):
     def heads(self, layer: str = DEFAULT_LAYER, prefix: str = "") -> list[CatalogEntry]:
         """The newest versions of a region's tiles (a prefix of their path), sorted by tile."""
 
+    def head_lines(self, layer: str = DEFAULT_LAYER, prefix: str = "") -> list[HeadLine]:
+        """The same with their times, codecs and sizes; no body is read."""
+
     def history(self, layer: str, tile: TileId) -> list[VersionInfo]:
         """The versions of a tile that retention has left, oldest first."""
 
@@ -199,7 +207,7 @@ class Store(Protocol):
         """Remove old versions. Kept: a tile's newest `keep_versions`, its epoch, and what counting reports cite."""
 
     def backup(self, path: str | Path) -> None:
-        """A consistent copy while the store is in use."""
+        """A consistent copy while the store is in use, compared with its hashes; nothing is overwritten."""
 
     def close(self) -> None:
         """Finish what is queued and free the store. Calling it twice is harmless."""

@@ -2,6 +2,7 @@
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from math import ceil
 from typing import Final, Literal
 
 from gnd_map.codec import LATTICES, Lattice
@@ -97,16 +98,25 @@ class StoreConfig:
     """A writer waits this long for the writers of other processes."""
     group_max: int = 256
     """At most so many calls share one commit."""
+    quarantine_mb: float = 64.0
+    """Of the newest refused messages so much is kept: nobody can fill the disk with nonsense."""
 
     def __post_init__(self) -> None:
         if self.merge_delay_s < 0 or self.busy_timeout_s <= 0:
             raise StoreError(
                 f"merge_delay_s {self.merge_delay_s} and busy_timeout_s {self.busy_timeout_s} must be >= 0"
             )
+        if self.quarantine_mb <= 0:
+            raise StoreError(f"quarantine_mb {self.quarantine_mb} must be positive")
         if min(self.merge_after_reports, self.max_reports, self.group_max) < 1:
             raise StoreError("merge_after_reports, max_reports and group_max must be at least 1")
         if min(self.max_feature_reports, self.max_reports_of_vehicle) < 1:
             raise StoreError("max_feature_reports and max_reports_of_vehicle must be at least 1")
+
+    @property
+    def quarantine_bytes(self) -> int:
+        """The same in bytes."""
+        return round(self.quarantine_mb * 1e6)
 
     def max_reports_of(self, layer: str) -> int:
         """How many reports of a tile of this layer count."""
@@ -202,6 +212,17 @@ class VersionInfo:
 
 
 @dataclass(frozen=True, slots=True)
+class HeadLine:
+    """A tile's newest version without its body."""
+
+    tile: TileId
+    version: int
+    created_ns: int
+    codec_id: int
+    size_bytes: int
+
+
+@dataclass(frozen=True, slots=True)
 class Claim:
     """A lease on a dirty tile. `seq` counts the reports that had arrived, `token` tells this lease from any other,
     `attempts` says which attempt to merge the tile since it was last published begins with it (1: the first).
@@ -258,6 +279,29 @@ class TileSetAside:
     attempts: int
     reports: int
     reason: str
+
+
+@dataclass(frozen=True, slots=True)
+class QueueState:
+    """How the queue stands.
+
+    Attributes:
+        overdue_s: since when a tile that is ready has not been merged, by the queue's clock; 0: none is.
+        waiting_s: since when a report waits that no merge has read, by the time of day; tiles set aside do not count.
+        lags_s: from receipt to published version, of the newest report parts that made one, sorted.
+        quarantined: refused messages, ...
+        quarantined_bytes: ... and their bytes.
+    """
+
+    overdue_s: float
+    waiting_s: float
+    lags_s: tuple[float, ...]
+    quarantined: int
+    quarantined_bytes: int
+
+    def lag_s(self, share: float) -> float | None:
+        """The lag that this share of the newest parts did not exceed; None: nothing was published yet."""
+        return self.lags_s[ceil(share * len(self.lags_s)) - 1] if self.lags_s else None
 
 
 @dataclass(frozen=True, slots=True)

@@ -1,4 +1,4 @@
-"""Stores of older releases: `data/store_schema_1.sqlite.gz` was made by the release before schemas had steps (5cb8027)."""
+"""Stores of older releases; `data/store_schema_1.sqlite.gz` was made by the one before schemas had steps (5cb8027)."""
 
 import gzip
 import shutil

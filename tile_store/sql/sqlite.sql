@@ -449,7 +449,7 @@ INSERT INTO queue_boot (one, boot) VALUES (1, :boot) ON CONFLICT (one) DO UPDATE
 
 -- name: forget_leases
 UPDATE dirty SET owner = NULL, token = NULL, lease_ns = NULL,
-  ready_ns = CASE WHEN aside_ns IS NULL THEN 0 ELSE ready_ns END
+  ready_ns = CASE WHEN aside_ns IS NULL THEN :steady ELSE ready_ns END
 
 -- name: set_aside
 UPDATE dirty SET owner = NULL, token = NULL, lease_ns = NULL, ready_ns = :never, aside_ns = :now, aside_reason = :reason
@@ -459,7 +459,7 @@ WHERE layer = :layer AND tile = :tile AND token = :token
 SELECT layer, tile, aside_ns, attempts, waiting, aside_reason FROM dirty WHERE aside_ns IS NOT NULL ORDER BY layer, tile
 
 -- name: take_up_again
-UPDATE dirty SET ready_ns = 0, attempts = 0, aside_ns = NULL, aside_reason = NULL
+UPDATE dirty SET ready_ns = :steady, attempts = 0, aside_ns = NULL, aside_reason = NULL
 WHERE aside_ns IS NOT NULL AND layer = :layer AND tile = :tile
 
 -- name: beat
@@ -482,6 +482,58 @@ SELECT messages, bytes FROM quarantine_size
 -- name: forget_quarantined
 DELETE FROM quarantine WHERE sha IN (SELECT sha FROM quarantine ORDER BY received_ns, sha LIMIT 16)
 
--- name: oldest_waiting
-SELECT MIN(r.received_ns) FROM dirty AS d JOIN report AS r USING (layer, tile)
-WHERE r.merged_in IS NULL AND d.aside_ns IS NULL
+-- name: queue_state
+SELECT (SELECT MIN(ready_ns) FROM dirty WHERE aside_ns IS NULL),
+       (SELECT MIN(r.received_ns) FROM dirty AS d JOIN report AS r INDEXED BY report_waiting USING (layer, tile)
+        WHERE r.merged_in IS NULL AND d.aside_ns IS NULL)
+
+-- name: head_lines
+SELECT h.tile, v.version, v.created_ns, v.codec_id, v.size_bytes
+FROM tile_head AS h JOIN tile_version AS v USING (layer, tile, version)
+WHERE h.layer = :layer AND h.tile >= :first AND h.tile < :end ORDER BY h.tile
+
+-- name: version_at
+SELECT version FROM tile_version WHERE layer = :layer AND tile = :tile AND created_ns <= :at_ns
+ORDER BY version DESC LIMIT 1
+
+-- name: parent_of_next
+SELECT parent FROM tile_version WHERE layer = :layer AND tile = :tile AND version > :version ORDER BY version LIMIT 1
+
+-- name: sha_of_version
+SELECT sha FROM tile_version WHERE layer = :layer AND tile = :tile AND version = :version
+
+-- name: forget_reports
+-- Only those that count no more: consumed before the tile's epoch began.
+DELETE FROM report WHERE arrival IN (
+  SELECT r.arrival FROM report AS r JOIN tile_head AS h USING (layer, tile)
+  WHERE r.received_ns < :before AND r.merged_in < h.epoch ORDER BY r.received_ns LIMIT :n)
+RETURNING LENGTH(body)
+
+-- name: forget_old_quarantined
+DELETE FROM quarantine WHERE sha IN (SELECT sha FROM quarantine WHERE received_ns < :before ORDER BY received_ns LIMIT :n)
+RETURNING LENGTH(body)
+
+-- name: published_lags
+-- How long the newest report parts that made a version waited for it, ns; an unchanged tile's version is older than they.
+SELECT v.created_ns - r.received_ns FROM (SELECT layer, tile, merged_in, received_ns FROM report
+  WHERE merged_in IS NOT NULL ORDER BY arrival DESC LIMIT :n) AS r
+JOIN tile_version AS v ON v.layer = r.layer AND v.tile = r.tile AND v.version = r.merged_in
+WHERE v.created_ns >= r.received_ns ORDER BY 1
+
+-- name: keys_of_heads
+SELECT layer, tile, version, sha FROM tile_head ORDER BY layer, tile
+
+-- name: keys_of_versions
+SELECT layer, tile, version, sha FROM tile_version INDEXED BY tile_version_sha
+
+-- name: body_of_version
+SELECT sha, codec_id, body FROM tile_version WHERE layer = :layer AND tile = :tile AND version = :version
+
+-- name: keys_of_reports
+SELECT layer, tile, report_id, arrival FROM report INDEXED BY report_key
+
+-- name: body_of_report
+SELECT body FROM report WHERE arrival = :arrival
+
+-- name: end_of_a_copy
+DELETE FROM queue_boot; DELETE FROM shard
