@@ -1,4 +1,4 @@
-"""The clock of the queue: leases, and when a tile is ready to merge. It never steps, whatever becomes of the time of day.
+"""The clock of the queue: leases, and when a tile is ready to merge. It never steps, whatever the time of day does.
 
 A store lies on one machine, and all processes of a machine see the same monotonic clock. It begins anew at each boot;
 so the store remembers in which boot its queue was used: whoever held a lease in another one is dead.

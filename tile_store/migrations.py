@@ -5,7 +5,7 @@ schema that a new store begins with (`schema`, number 1) is never changed.
 """
 
 from pathlib import Path
-from typing import Final
+from typing import Any, Final
 
 import apsw
 
@@ -30,10 +30,11 @@ def schema_of(connection: apsw.Connection, path: Path) -> int:
     Raises:
         StoreUnavailable: a database of another program, or a store of a newer release.
     """
-    application_id, version, empty = connection.execute(
+    marks: list[Any] = connection.execute(
         "SELECT (SELECT application_id FROM pragma_application_id), (SELECT user_version FROM pragma_user_version),"
         " NOT EXISTS (SELECT 1 FROM sqlite_schema)"
-    ).fetchall()[0]
+    ).fetchall()
+    application_id, version, empty = marks[0]
     if application_id != APPLICATION_ID and not (empty and application_id == 0):
         raise StoreUnavailable(f"{path}: an SQLite database of another program, not a tile store; choose another path")
     if version > SCHEMA_VERSION:

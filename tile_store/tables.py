@@ -124,7 +124,7 @@ def checked(title: str, told: dict[str, Any]) -> Table:
     return table
 
 
-def rollback(steps: list[dict[str, Any]], meaning: Mapping[str, str]) -> Table:
+def rollback(steps: list[dict[str, Any]], meaning: Mapping[Any, str]) -> Table:
     """One row a tile."""
     table = Table("tile", "version", "content of", "it")
     for one in steps:

@@ -1,4 +1,4 @@
-"""What an operator does: backup and restore, check, retention, rollback by time, reading where nothing can be written."""
+"""What an operator does: backup, restore, check, retention, rollback by time, reading where nothing can be written."""
 
 import json
 import os
