@@ -46,7 +46,7 @@ class ShiftTests:
     """Shift tests of reports against the versions that they were compared with; remembered, each is made once."""
 
     def __init__(self, parameters: ShiftParameters) -> None:
-        self._parameters = parameters
+        self.parameters = parameters
         self._held: OrderedDict[tuple[str, int], Shift] = OrderedDict()
 
     def of(self, report: Report, bases: Mapping[bytes, Gaussians]) -> Shift:
@@ -56,7 +56,7 @@ class ShiftTests:
             return Shift(False, 0)
         key = (report.report_id, report.change.tile.morton)
         if key not in self._held:
-            self._held[key] = shift_of(report.change, base, self._parameters)
+            self._held[key] = shift_of(report.change, base, self.parameters)
             if len(self._held) > REMEMBERED:
                 self._held.popitem(last=False)
         return self._held[key]

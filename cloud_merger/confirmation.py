@@ -9,8 +9,8 @@ A pure function of the merged tile and the reports, as the merge itself: every n
 """
 
 from collections import Counter, defaultdict
-from collections.abc import Iterable, Mapping
-from dataclasses import dataclass
+from collections.abc import Collection, Iterable, Mapping
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.sparse import coo_array
@@ -19,12 +19,13 @@ from scipy.spatial import cKDTree
 
 from cloud_merger.errors import MergerError
 from cloud_merger.merge import MergedTile
-from cloud_merger.statements import Report
+from cloud_merger.statements import Report, Witness
 from gnd_map.gaussian import Gaussians
 from gnd_map.grid import VoxelGrid
 from gnd_map.tile import TileDelta, apply
 from tile_store.values import Unconfirmed, WaitingReason
 
+Who = Report | Witness
 VOUCHED_VOXELS = 12  # so many claims of a vehicle must others share at least before they vouch for the rest
 _NS_PER_S = 1_000_000_000
 
@@ -88,7 +89,7 @@ class _Witness:
     many others claim, too.
     """
 
-    lonely: Mapping[int, tuple[Report, ...]]
+    lonely: Mapping[int, tuple[Who, ...]]
     shared: int
 
 
@@ -98,6 +99,7 @@ def gate(
     reports: Iterable[Report],
     parameters: ConfirmationParameters | None = None,
     named: frozenset[str] = frozenset(),
+    witnesses: Iterable[Witness] = (),
 ) -> GatedTile:
     """Take back the changes that wait for confirmation.
 
@@ -112,28 +114,30 @@ def gate(
         parameters: see `ConfirmationParameters`.
         named: vehicles whose reports are shifted again and again: what they alone claim always waits, and they are
             never a second witness of themselves or of each other.
+        witnesses: whose claims of earlier windows take part in the merge.
     """
     parameters = parameters or ConfirmationParameters()
-    by_id = {report.report_id: report for report in reports}
+    by_report = {report.report_id: report for report in reports}
+    by_id = {witness.report_id: witness for witness in witnesses} | by_report
     waits: dict[int, tuple[str, WaitingReason]] = {}
-    isolated = _isolated(epoch, merged, by_id.values(), parameters.together_voxels)
+    isolated = _isolated(epoch, merged, by_report.values(), parameters.together_voxels)
     for vehicle, witness in sorted(_witnesses(merged, by_id, parameters, named).items()):
-        seen = _seen(vehicle, epoch, by_id.values())
+        seen = _seen(vehicle, epoch, by_report.values())
         reasons = _waiting_of(witness, seen, None if len(epoch) == 0 else isolated, parameters)
         if vehicle in named:
             reasons = dict.fromkeys(witness.lonely, "named")
         waits |= {voxel: (vehicle, reason) for voxel, reason in reasons.items()}
     if not waits:
         return GatedTile(merged)
-    return GatedTile(_without(epoch, merged, waits), _told(waits, merged, epoch, by_id))
+    return GatedTile(_without(epoch, merged, waits), _told(waits, merged, epoch, by_report.values()))
 
 
 def _witnesses(
-    merged: MergedTile, by_id: Mapping[str, Report], parameters: ConfirmationParameters, named: frozenset[str]
+    merged: MergedTile, by_id: Mapping[str, Who], parameters: ConfirmationParameters, named: frozenset[str]
 ) -> dict[str, _Witness]:
     """By vehicle, its part in the changes that won. Named vehicles do not confirm each other either."""
     drive = _drives(by_id.values(), parameters.second_drive_s, named)
-    lonely: dict[str, dict[int, tuple[Report, ...]]] = defaultdict(dict)
+    lonely: dict[str, dict[int, tuple[Who, ...]]] = defaultdict(dict)
     shared: Counter[str] = Counter()
     for voxel, ids in merged.provenance.items():
         vehicles = {by_id[one].vehicle for one in ids}
@@ -144,7 +148,7 @@ def _witnesses(
     return {vehicle: _Witness(own, shared[vehicle]) for vehicle, own in lonely.items()}
 
 
-def _drives(reports: Iterable[Report], second_drive_s: float, named: frozenset[str]) -> dict[str, tuple[str, int]]:
+def _drives(reports: Iterable[Who], second_drive_s: float, named: frozenset[str]) -> dict[str, tuple[str, int]]:
     """Of each report, who saw the tile when: vehicle and number of its drive."""
     found: dict[str, tuple[str, int]] = {}
     number, until_ns, before = 0, 0, ""
@@ -198,6 +202,8 @@ def _waiting_of(
 def _seen(vehicle: str, epoch: Gaussians, reports: Iterable[Report]) -> int:
     """Voxels of the tile that a vehicle observed and that hold something, before or by its word."""
     own = [report.change for report in reports if report.vehicle == vehicle]
+    if not own:
+        return 0  # it spoke in an earlier window
     before = [np.intersect1d(change.observed, epoch.voxel_id) for change in own]
     return len(np.unique(np.concatenate([*before, *(change.changed.voxel_id for change in own)])))
 
@@ -207,7 +213,8 @@ def _without(epoch: Gaussians, merged: MergedTile, waits: Mapping[int, object]) 
     held = np.array(sorted(waits), np.int32)
     now, was = merged.gaussians.select(held), epoch.select(held)
     back = TileDelta(np.setdiff1d(now.voxel_id, was.voxel_id), was)
-    return MergedTile(
+    return replace(
+        merged,
         gaussians=apply(merged.gaussians, back),
         changed=np.setdiff1d(merged.changed, held),
         provenance={voxel: ids for voxel, ids in merged.provenance.items() if voxel not in waits},
@@ -215,7 +222,7 @@ def _without(epoch: Gaussians, merged: MergedTile, waits: Mapping[int, object]) 
 
 
 def _told(
-    waits: Mapping[int, tuple[str, WaitingReason]], merged: MergedTile, epoch: Gaussians, by_id: Mapping[str, Report]
+    waits: Mapping[int, tuple[str, WaitingReason]], merged: MergedTile, epoch: Gaussians, reports: Collection[Report]
 ) -> tuple[Unconfirmed, ...]:
     """What waits, by vehicle and reason."""
     told: dict[tuple[str, WaitingReason], list[int]] = defaultdict(list)
@@ -226,7 +233,7 @@ def _told(
             vehicle=vehicle,
             report_ids=tuple(sorted({one for voxel in voxels for one in merged.provenance[voxel]})),
             voxels=len(voxels),
-            seen=max(_seen(vehicle, epoch, by_id.values()), len(voxels)),  # "as in an older version" claims, too
+            seen=max(_seen(vehicle, epoch, reports), len(voxels)),  # "as in an older version" claims, too
             reason=reason,
         )
         for (vehicle, reason), voxels in sorted(told.items())

@@ -4,7 +4,7 @@ The merged tile depends on the epoch tile and on the set of all reports since th
 on nothing else: in whatever batches and retries they came, the same reports give the same tile, bit for bit.
 """
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -29,11 +29,15 @@ class MergedTile:
         gaussians: the epoch's with the decided changes applied.
         changed: int32 (C,) sorted ids of the voxels that differ from the epoch by decision.
         provenance: for each changed voxel the ids of the reports in the cluster that won it.
+        for_change: (M,) which statements are in the cluster that changes their voxel.
+        for_epoch: (M,) which are in one that says it is as in the epoch.
     """
 
     gaussians: Gaussians
     changed: NDArray[np.int32]
     provenance: dict[int, tuple[str, ...]] = field(default_factory=dict)
+    for_change: NDArray[np.bool_] = field(default_factory=lambda: np.zeros(0, np.bool_))
+    for_epoch: NDArray[np.bool_] = field(default_factory=lambda: np.zeros(0, np.bool_))
 
 
 def merge_tile(epoch: Gaussians, statements: Statements, parameters: MergeParameters | None = None) -> MergedTile:
@@ -48,13 +52,28 @@ def merge_tile(epoch: Gaussians, statements: Statements, parameters: MergeParame
     rows = statements.rows
     if len(rows) == 0:
         return MergedTile(epoch, np.zeros(0, np.int32))
-    cluster = _joined(rows, _clusters(rows, parameters))
-    winner = _winners(rows, cluster, parameters)
-    rows, cluster = _members(rows, cluster, winner)
+    of_statement = _joined(rows, _clusters(rows, parameters))
+    winner = _winners(rows, of_statement, parameters)
+    rows, cluster = _members(rows, of_statement, winner)
     candidate = _representatives(rows, cluster, parameters)
     decided = _differs(epoch, candidate, _share(rows["denies"], cluster), parameters)
     decided &= ~_confirmed(rows, cluster)
-    return _merged(epoch, candidate[decided], statements, rows[decided[cluster]])
+    merged = _merged(epoch, candidate[decided], statements, rows[decided[cluster]])
+    return replace(
+        merged,
+        for_change=np.isin(of_statement, winner[decided]),
+        for_epoch=_says_epoch(statements.rows, of_statement, epoch),
+    )
+
+
+def _says_epoch(rows: Rows, cluster: Index, epoch: Gaussians) -> NDArray[np.bool_]:
+    """Which statements are in a cluster of which at least half say that the voxel is as in the epoch."""
+    nothing = (rows["kind"] == Kind.NOTHING) & (find(epoch.voxel_id, rows["voxel_id"]) < 0)
+    says = nothing | ((rows["kind"] == Kind.QUOTED) & (rows["was"] == EPOCH))
+    inside = cluster >= 0
+    n = int(cluster.max(initial=-1)) + 1
+    share = np.bincount(cluster[inside], says[inside], n) / np.maximum(np.bincount(cluster[inside], minlength=n), 1)
+    return np.asarray(inside & (np.append(share, 0.0)[cluster] >= 0.5))
 
 
 def _clusters(rows: Rows, parameters: MergeParameters) -> Index:
@@ -265,10 +284,12 @@ def _merged(epoch: Gaussians, changes: Rows, statements: Statements, members: Ro
     put = Gaussians(*(np.ascontiguousarray(there[name]) for name in ("voxel_id", "count", "cells", "mean_m", "cov_m2")))
     gone = np.ascontiguousarray(changes["voxel_id"][changes["count"] == 0])
     said_by: dict[int, list[str]] = {voxel: [] for voxel in changes["voxel_id"].tolist()}
-    for voxel, report in zip(members["voxel_id"].tolist(), members["report"].tolist(), strict=True):
-        said_by[voxel].append(statements.report_ids[report])
+    ids = statements.report_ids
+    spoken = members[members["report"] >= 0]  # the support of what was published is nobody's report
+    for voxel, report in zip(spoken["voxel_id"].tolist(), spoken["report"].tolist(), strict=True):
+        said_by[voxel].append(ids[report])
     return MergedTile(
         gaussians=apply(epoch, TileDelta(gone, put)),
         changed=np.ascontiguousarray(changes["voxel_id"]),
-        provenance={voxel: tuple(ids) for voxel, ids in said_by.items()},
+        provenance={voxel: tuple(dict.fromkeys(who)) for voxel, who in said_by.items()},
     )

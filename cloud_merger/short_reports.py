@@ -13,7 +13,6 @@ from cloud_merger.waiting import Waiting, WaitingLimits, WaitingRoom
 from cloud_merger.wants import Known, WantParameters, asked_voxels, wanted
 from gnd_map.codec import encode_mask
 from gnd_map.errors import GndError
-from gnd_map.gaussian import Gaussians
 from gnd_map.tile import Tile
 from gnd_map.tile_id import TileId
 from schemas.changes import ChangeReport, TileChange
@@ -114,11 +113,13 @@ class ShortReports:
         return found
 
     def _known(self, report: ChangeReport, change: TileChange) -> Known:
-        epoch, rows = self._store.in_play(report.layer, change.tile)
+        journal = self._store.in_play(report.layer, change.tile)
+        state, rows = self._bases.state(change.tile, journal), journal.reports
         shas = {row.base_sha for row in rows} | {change.base_sha}
         found = {sha: self._bases.content(report.layer, change.tile, sha) for sha in sorted(shas - {_NO_BASE})}
         return Known(
-            epoch=Gaussians.empty() if epoch is None else self._bases.decoded(epoch),
+            epoch=state.gaussians,
+            memory=state.memory,
             reports=[one for row in rows if (one := self._report(row)) is not None],
             bases={sha: gaussians for sha, gaussians in found.items() if gaussians is not None},
             promised=self.room.promised(change.tile, report.layer, but=report.report_id),

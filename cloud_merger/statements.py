@@ -8,17 +8,21 @@ rebased, not lost.
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from enum import IntEnum
-from typing import Any, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
 from gnd_map.accumulate import N_MIN_CELLS
 from gnd_map.classes import ChangeClass
+from gnd_map.day import day_of
 from gnd_map.gaussian import Gaussians
 from gnd_map.tile import diff
 from schemas.changes import TileChange
 from schemas.course import Course
+
+if TYPE_CHECKING:
+    from cloud_merger.memory import TileMemory
 
 Mode = Literal["paper", "default"]
 EPOCH = 1  # the number of the epoch's own Gaussian among the states of a voxel
@@ -46,6 +50,7 @@ STATEMENT = np.dtype(
         ("kind", np.uint8),
         ("was", np.int64),
         ("denies", np.bool_),
+        ("claim", np.bool_),
         ("weight", np.float64),
         ("pose_m2", np.float64),
         ("count", np.int32),
@@ -66,11 +71,13 @@ class Report:
         change: what it says.
         weight: of its votes, see `MergeParameters.report_of`.
         pose_m2: variance of what it measured by its poses, see `MergeParameters.pose_m2_of`.
-        vehicle: who made it; the merge does not look at it, confirmation does.
+        vehicle: who made it: of a vehicle's reports about a voxel the newest is its vote. "": not known, then each
+            report is a vote.
         first_ns: time of the first scan that it rests on, UTC.
         last_ns: time of the last.
-        is_doubtful: the vehicle does not fully believe it; nor does the merge look at this.
+        is_doubtful: the vehicle does not fully believe it; the merge does not look at this.
         course: where the vehicle drives in its own frame, None where it does not know.
+        received_ns: when it came, by the clock of the cloud.
     """
 
     report_id: str
@@ -82,37 +89,69 @@ class Report:
     last_ns: int = 0
     is_doubtful: bool = False
     course: Course | None = None
+    received_ns: int = 0
+
+    @property
+    def turn(self) -> tuple[int, int, str]:
+        """Orders the reports of one vehicle: the newest is its word."""
+        return self.last_ns, self.received_ns, self.report_id
+
+
+@dataclass(frozen=True, slots=True)
+class Witness:
+    """A report of an earlier window of which a claim is remembered; attributes as `Report`."""
+
+    report_id: str
+    vehicle: str
+    first_ns: int
+    last_ns: int
+    received_ns: int
+    is_doubtful: bool
+    pose_m2: float
 
 
 @dataclass(frozen=True, slots=True)
 class Statements:
-    """Statements sorted by voxel, then by report id; at most one a voxel and report.
+    """Statements sorted by voxel, then by report id, then what is remembered; at most one a voxel and vehicle.
 
     Attributes:
-        report_ids: (R,) sorted.
-        rows: STATEMENT (M,).
+        reports: (R,) sorted by id.
+        witnesses: (W,) of remembered claims.
+        rows: STATEMENT (M,); `report` numbers reports, then witnesses; -1: the support of what is published.
     """
 
-    report_ids: tuple[str, ...]
+    reports: tuple[Report, ...]
     rows: Rows
+    witnesses: tuple[Witness, ...] = ()
+
+    @property
+    def report_ids(self) -> tuple[str, ...]:
+        """(R + W,) of reports and witnesses."""
+        return (*(one.report_id for one in self.reports), *(one.report_id for one in self.witnesses))
 
 
 def statements_of(
-    epoch: Gaussians, reports: Iterable[Report], bases: Mapping[bytes, Gaussians], mode: Mode = "default"
+    epoch: Gaussians,
+    reports: Iterable[Report],
+    bases: Mapping[bytes, Gaussians],
+    mode: Mode = "default",
+    memory: "TileMemory | None" = None,
 ) -> Statements:
     """Every statement about the voxels on which not all agree with the epoch tile.
 
     A voxel of which every report says "as in the epoch" stays as it is whatever the parameters, so it is left out.
 
     Args:
-        epoch: the tile that all reports of this epoch are merged into.
-        reports: in any order; a report id that comes again is ignored.
+        epoch: the tile that all reports of this window are merged into.
+        reports: in any order; of a report id that comes again the last one counts.
         bases: Gaussians of the tile's versions by hash. Of an unknown base, "as in base version" abstains.
         mode: "paper" takes the uploaded changes only; "default" every observed voxel.
+        memory: of the windows before; None: there are none.
     """
     ordered = sorted({report.report_id: report for report in reports}.values(), key=lambda r: r.report_id)
     known = {NO_BASE: Gaussians.empty(), **bases} if mode == "default" else {}
-    voxels = _disputed(epoch, ordered, known)
+    claims = np.zeros(0, STATEMENT) if memory is None else memory.claims_beside(ordered)
+    voxels = np.union1d(_disputed(epoch, ordered, known), claims["voxel_id"]).astype(np.int32)
     quoted = _numbered_states(voxels, epoch, known)
     parts = [np.zeros(0, STATEMENT)]
     for k, report in enumerate(ordered):
@@ -120,9 +159,37 @@ def statements_of(
         said["weight"] = report.weight
         said["pose_m2"] = np.where(said["kind"] == Kind.MEASURED, report.pose_m2, 0.0)
         parts.append(said)
-    rows = np.concatenate(parts)
+    rows = _one_vote_a_vehicle(np.concatenate(parts), ordered)
+    if memory is not None:
+        claims = claims.copy()
+        claims["report"] += len(ordered)
+        day = max((day_of(one.last_ns) for one in ordered), default=0)
+        rows = np.concatenate([rows, claims, memory.support_rows(voxels, epoch, day)])
     rows = rows[np.argsort(rows["voxel_id"], kind="stable")]  # the parts came in the order of report ids
-    return Statements(tuple(report.report_id for report in ordered), rows)
+    return Statements(tuple(ordered), rows, () if memory is None else memory.witnesses)
+
+
+def _one_vote_a_vehicle(rows: Rows, reports: Sequence[Report]) -> Rows:
+    """Of several statements of a vehicle about one voxel only the newest; where that withholds its Gaussian, the newest
+    that measured one against the same state instead: it says the same, and more.
+    """
+    number = {vehicle: k for k, vehicle in enumerate(sorted({one.vehicle for one in reports if one.vehicle}))}
+    if len(number) == len(reports) or not len(rows):
+        return rows
+    vehicle = np.array([number.get(one.vehicle, len(number) + k) for k, one in enumerate(reports)], np.int64)
+    turn = np.empty(len(reports), np.int64)
+    turn[sorted(range(len(reports)), key=lambda k: reports[k].turn)] = np.arange(len(reports))
+    voter = rows["voxel_id"].astype(np.int64) * (len(number) + len(reports)) + vehicle[rows["report"]]
+    order = np.lexsort((turn[rows["report"]], voter))
+    last = np.append(voter[order][1:] != voter[order][:-1], True)
+    group = np.cumsum(last) - last
+    newest = order[last][group]  # of each row in this order, the newest row of its voter
+    shown = (rows["kind"][order] == Kind.MEASURED) & (rows["was"][order] == rows["was"][newest])
+    shown &= rows["kind"][newest] == Kind.WITHHELD
+    best = np.lexsort((np.arange(len(order)), shown, group))
+    chosen = order[best[np.append(group[best][1:] != group[best][:-1], True)]]
+    spoken: Rows = rows[np.sort(chosen)]
+    return spoken
 
 
 def _disputed(epoch: Gaussians, reports: Sequence[Report], known: Mapping[bytes, Gaussians]) -> NDArray[np.int32]:
@@ -159,7 +226,7 @@ def same_state(a: Rows, b: Rows) -> NDArray[np.bool_]:
 
 def _statements(report: int, change: TileChange, voxels: NDArray[np.int32], quoted: Rows | None) -> Rows:
     """One report's statements about those of `voxels` that it observed; without a base only its changes speak."""
-    voxel_id = np.intersect1d(change.observed, voxels, assume_unique=True)
+    voxel_id = voxels[find(change.observed, voxels) >= 0]
     rows = states_at(Gaussians.empty(), voxel_id, Kind.QUOTED) if quoted is None else quoted[find(voxels, voxel_id)]
     speaks = np.full(len(rows), quoted is not None)
     at, was = find(change.changed.voxel_id, voxel_id), rows["was"].copy()
@@ -167,6 +234,7 @@ def _statements(report: int, change: TileChange, voxels: NDArray[np.int32], quot
     rows["was"] = was
     rows["denies"] = (was == EPOCH) & np.isin(rows["kind"], (Kind.MEASURED, Kind.WITHHELD))
     speaks[at >= 0] = _speaks(change)[at[at >= 0]]
+    rows["claim"] = at >= 0
     rows["report"] = report
     spoken: Rows = rows[speaks]
     return spoken

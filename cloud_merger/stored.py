@@ -6,18 +6,29 @@ from functools import lru_cache
 from threading import Lock
 from typing import Final
 
+from cloud_merger.memory import TileMemory
 from cloud_merger.parameters import MergeParameters
 from cloud_merger.statements import Report
+from cloud_merger.window import TileState
+from gnd_map.codec import (
+    CODEC_ARCHIVE_ZSTD,
+    CODEC_COMPACT_ZSTD,
+    CODEC_FLOAT32_ZSTD,
+    CODEC_STANDARD_ZSTD,
+    best_codec,
+    codec_of,
+)
 from gnd_map.gaussian import Gaussians
 from gnd_map.tile import Tile
 from gnd_map.tile_id import TileId
 from schemas.changes import ChangeReport, TileChange
 from schemas.doubt import DoubtReason
 from tile_store.store import Store
-from tile_store.values import StoredTile
+from tile_store.values import StoredMemory, StoredTile, TileJournal
 
 REMEMBERED_REPORTS: Final = 1024  # some 20 kB each
 NEW_GROUND: Final = DoubtReason.IMPLAUSIBLE_SHARE | DoubtReason.POSE_NOT_CHECKED
+_STATE_CODECS: Final = (CODEC_STANDARD_ZSTD, CODEC_COMPACT_ZSTD, CODEC_ARCHIVE_ZSTD, CODEC_FLOAT32_ZSTD)  # quick ones
 REMEMBERED_TILES: Final = 512  # some 120 kB each
 
 
@@ -31,7 +42,7 @@ def said(body: bytes) -> ChangeReport:
     return ChangeReport.decode(body)
 
 
-def report_of(body: bytes, parameters: MergeParameters) -> Report:
+def report_of(body: bytes, parameters: MergeParameters, received_ns: int = 0) -> Report:
     """The same as the merge takes it.
 
     Raises:
@@ -47,6 +58,7 @@ def report_of(body: bytes, parameters: MergeParameters) -> Report:
         last_ns=report.last_ns,
         is_doubtful=is_doubtful(change),
         course=report.course,
+        received_ns=received_ns,
     )
 
 
@@ -58,6 +70,21 @@ def is_doubtful(change: TileChange) -> bool:
         return False
     excused = 0 if change.base_sha else int(NEW_GROUND)
     return int(change.doubt.reasons) & ~excused != 0  # as numbers: reasons of a newer vehicle have no names here
+
+
+def encode_state(tile: TileId, window: int, state: TileState) -> StoredMemory:
+    """What a tile's windows up to `window` have come to, for the store."""
+    codec_id = best_codec(state.gaussians, _STATE_CODECS)
+    return StoredMemory(window, codec_id, codec_of(codec_id).encode(tile, state.gaussians), state.memory.encode())
+
+
+def decode_state(tile: TileId, stored: StoredMemory) -> TileState:
+    """The same, as it was.
+
+    Raises:
+        MergerError, CodecError: it is damaged.
+    """
+    return TileState(codec_of(stored.codec_id).decode(tile, stored.body), TileMemory.decode(stored.memory))
 
 
 class Bases:
@@ -95,6 +122,17 @@ class Bases:
         """
         found = self._remembered(stored.tile, stored.sha)
         return self._remember(stored) if found is None else found
+
+    def state(self, tile: TileId, journal: TileJournal) -> TileState:
+        """What the closed windows of a tile have come to.
+
+        Raises:
+            MergerError, CodecError, SchemaError: it cannot be read.
+        """
+        if journal.memory is not None:
+            return decode_state(tile, journal.memory)
+        epoch = Gaussians.empty() if journal.epoch is None else self.decoded(journal.epoch)
+        return TileState(epoch, TileMemory())
 
     def _remembered(self, tile: TileId, sha: bytes) -> Gaussians | None:
         with self._lock:

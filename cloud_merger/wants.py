@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from cloud_merger.errors import MergerError
 from cloud_merger.expanding import is_askable
+from cloud_merger.memory import TileMemory
 from cloud_merger.parameters import MergeParameters
 from cloud_merger.statements import Kind, Report, Rows, statements_of
 from gnd_map.arrays import I32
@@ -54,15 +55,17 @@ class Known:
 
     Attributes:
         epoch: Gaussians of the version that all reports are merged into.
-        reports: since then, in any order.
+        reports: of the windows that are not folded into it, in any order.
         bases: Gaussians by content hash of the versions that these reports and the new one refer to.
         promised: (K,) voxels of which Gaussians were asked of other vehicles just now; a voxel may occur several times.
+        memory: of the windows before.
     """
 
     epoch: Gaussians
     reports: Sequence[Report] = ()
     bases: Mapping[bytes, Gaussians] = field(default_factory=dict)
     promised: I32 = field(default_factory=lambda: np.zeros(0, np.int32))
+    memory: TileMemory = field(default_factory=TileMemory)
 
 
 def wanted(
@@ -88,7 +91,8 @@ def _wanted_of_tile(own: Report, known: Known, merge: MergeParameters, want: Wan
     asked = is_askable(own.change)
     ids, modified = own.change.changed.voxel_id[asked], own.change.change_class[asked] == ChangeClass.MODIFIED
     others = [report for report in known.reports if report.report_id != own.report_id]
-    statements = statements_of(known.epoch, [*others, own], known.bases, merge.mode)
+    memory = None if merge.mode == "paper" else known.memory
+    statements = statements_of(known.epoch, [*others, own], known.bases, merge.mode, memory)
     rows = statements.rows[np.isin(statements.rows["voxel_id"], ids)]
     seat = np.searchsorted(ids, rows["voxel_id"])
     is_own = rows["report"] == statements.report_ids.index(own.report_id)

@@ -1,25 +1,25 @@
 """From claimed tiles to publications: load, decode, merge; a tile whose merge fails does not stop the others."""
 
 import logging
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
+from dataclasses import replace
 from typing import TypeVar
 
-from cloud_merger.belief import Believed, ShiftTests, believed, courses_of
+from cloud_merger.belief import ShiftTests, courses_of
 from cloud_merger.config import ShardConfig
-from cloud_merger.confirmation import GatedTile, gate
 from cloud_merger.features.kept import FeatureContents, said_of
 from cloud_merger.features.merge import merge_features
-from cloud_merger.merge import MergedTile, merge_tile
-from cloud_merger.statements import Report, statements_of
-from cloud_merger.stored import Bases, report_of
-from gnd_map.codec import Lattice, is_on, lattice_of, snap
+from cloud_merger.statements import Report
+from cloud_merger.stored import Bases, encode_state, report_of
+from cloud_merger.window import WindowMerger, fold, provenance_of
+from gnd_map.codec import Lattice, is_on, lattice_of
 from gnd_map.features import FeatureTile, is_feature_layer
 from gnd_map.gaussian import Gaussians
 from gnd_map.tile import Tile
 from schemas.errors import SchemaError
 from tile_store.errors import StoreDamaged, StoreError, UnknownReports
 from tile_store.store import Store
-from tile_store.values import Claim, Publication, PublishResult, ReportRow, TileWork, lattice_named
+from tile_store.values import Basis, Claim, Publication, PublishResult, ReportRow, TileWork, lattice_named
 
 _LOG = logging.getLogger(__name__)
 T = TypeVar("T")
@@ -80,40 +80,45 @@ class Worker:
             self._store.postpone(claim, self._config.retry_s * claim.attempts)
 
     def _publication(self, work: TileWork) -> Publication:
-        """Merge all reports since the epoch into the epoch's tile; the tile is None where the head has that content."""
-        epoch = Gaussians.empty() if work.epoch is None else self._contents.decoded(work.epoch)
-        reports = [report for row in work.reports if (report := self._report(row)) is not None]
-        bases = self._bases(work)
-        believed_in = self._believed(reports, bases)
-        statements = statements_of(epoch, believed_in.reports, bases, self._config.merge.mode)
-        gated = self._gated(epoch, merge_tile(epoch, statements, self._config.merge), believed_in)
-        gaussians = on_lattice(gated.merged.gaussians, self._lattice(work, epoch))
-        tile = Tile(work.claim.tile, work.base_version + 1, gaussians)
-        is_new = tile.sha != work.head.sha if work.head else len(gaussians) > 0
+        """Fold the windows that are closed, merge the open one into what they come to; the tile is None where the head
+        has that content.
+        """
+        tile, journal, config = work.claim.tile, work.journal, self._config
+        state = self._contents.state(tile, journal)
+        named = self._store.shifted_vehicles()
+        merger = WindowMerger(config.merge, config.confirmation, self._shifts, self._bases(work), named)
+        lattice = self._lattice(work, state.gaussians)
+        by_window = self._by_window(work)
+        closed = [window for window in sorted(by_window) if window < journal.window]
+        folded = []
+        for window in closed:
+            folded.append(merger.merge(state, by_window[window], lattice))
+            state = fold(state, folded[-1])
+        now = merger.merge(state, by_window.get(journal.window, []), lattice)
+        new = Tile(tile, work.base_version + 1, now.gaussians)
+        is_new = new.sha != work.head.sha if work.head else len(new.gaussians) > 0
         return Publication(
             claim=work.claim,
             base_version=work.base_version,
-            tile=tile if is_new else None,
+            tile=new if is_new else None,
             report_ids=_ids(work),
-            voxel_reports=gated.merged.provenance,
-            waiting=gated.waiting,
-            shift_tests=believed_in.tests,
-            courses=courses_of(reports),
+            voxel_reports=provenance_of([*folded, now]),
+            waiting=now.gated.waiting,
+            shift_tests=tuple(test for one in (*folded, now) for test in one.believed.tests),
+            courses=courses_of(one for reports in by_window.values() for one in reports),
+            basis=Basis(journal.window, journal.seq, named),
+            memory=encode_state(tile, closed[-1], state) if closed else None,
+            closed=tuple(closed),
         )
 
-    def _believed(self, reports: Sequence[Report], bases: Mapping[bytes, Gaussians]) -> Believed:
-        """The reports without those that a shift of their poses explains; the paper knows no such test."""
-        if self._config.merge.mode == "paper":
-            return Believed(tuple(reports), (), ())
-        shifts = {report.report_id: self._shifts.of(report, bases) for report in reports}
-        return believed(reports, shifts, self._config.shift, self._store.shifted_vehicles())
-
-    def _gated(self, epoch: Gaussians, merged: MergedTile, believed_in: Believed) -> GatedTile:
-        """What may be published of a merge, with all that waits; the paper knows no such gate."""
-        if self._config.merge.mode == "paper":
-            return GatedTile(merged)
-        found = gate(epoch, merged, believed_in.reports, self._config.confirmation, self._store.shifted_vehicles())
-        return GatedTile(found.merged, (*found.waiting, *believed_in.set_aside))
+    def _by_window(self, work: TileWork) -> dict[int, list[Report]]:
+        """The reports that can be read, by window; of a report that came in two parts the second, if it is there."""
+        found: dict[int, dict[str, Report]] = {}
+        for row in work.reports:
+            report = self._readable(row, lambda body: report_of(body, self._config.merge))
+            if report is not None:
+                found.setdefault(row.window, {})[row.report_id] = replace(report, received_ns=row.received_ns)
+        return {window: list(reports.values()) for window, reports in found.items()}
 
     def _of_features(self, work: TileWork) -> Publication:
         """The same of a tile of a feature layer."""
@@ -135,6 +140,7 @@ class Worker:
             report_ids=_ids(work),
             voxel_reports=merged.provenance,
             shift_tests=merged.tests,
+            basis=Basis(work.journal.window, work.journal.seq),
         )
 
     def _lattice(self, work: TileWork, epoch: Gaussians) -> Lattice | None:
@@ -147,9 +153,6 @@ class Worker:
         if work.epoch is None or len(epoch) == 0 or (configured is not None and is_on(epoch, configured)):
             return configured
         return lattice_of(work.epoch.codec_id)
-
-    def _report(self, row: ReportRow) -> Report | None:
-        return self._readable(row, lambda body: report_of(body, self._config.merge))
 
     def _readable(self, row: ReportRow, read: Callable[[bytes], T]) -> T | None:
         """What a stored report says; nothing when it can no longer be read (its vehicle has long had its ack)."""
@@ -171,11 +174,6 @@ class Worker:
         """Leave the tile as it is, by name; its reports go on waiting."""
         if self._store.set_aside(claim, reason):
             _LOG.error("tile %s is set aside after %d attempts to merge it: %s", claim.tile, claim.attempts, reason)
-
-
-def on_lattice(gaussians: Gaussians, lattice: Lattice | None) -> Gaussians:
-    """The Gaussians moved onto the lattice, those that lie on it untouched; as they are for None."""
-    return gaussians if lattice is None else snap(gaussians, lattice)
 
 
 def _ids(work: TileWork) -> tuple[str, ...]:

@@ -4,6 +4,7 @@ A step is a number and a named block of SQL; it is run once in a store's life. A
 schema that a new store begins with (`schema`, number 1) is never changed.
 """
 
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, Final
 
@@ -17,9 +18,11 @@ APPLICATION_ID: Final = 0x474E4453
 
 STEPS: Final = (
     (1, "schema"),
-    (2, "schema_of_confirmation"),  # releases without numbers for it added 2 and 3 where they were missing
+    (2, "schema_of_confirmation"),
     (3, "schema_of_surveys"),
-    (4, "schema_of_operations"),
+    (4, "schema_of_parts"),
+    (5, "schema_of_journal"),
+    (6, "schema_of_operations"),
 )
 SCHEMA_VERSION: Final = STEPS[-1][0]
 
@@ -51,7 +54,7 @@ def migrate(connection: apsw.Connection, path: Path) -> None:
     try:
         found = schema_of(connection, path)  # another process may have done it since somebody looked
         for number, name in STEPS:
-            if number > found:
+            if number > found and not _is_there(connection, sql, name):
                 connection.execute(sql[name])
         connection.pragma("user_version", SCHEMA_VERSION)
         connection.pragma("application_id", APPLICATION_ID)
@@ -60,3 +63,8 @@ def migrate(connection: apsw.Connection, path: Path) -> None:
         if connection.in_transaction:
             connection.execute("ROLLBACK")
         raise
+
+
+def _is_there(connection: apsw.Connection, sql: Mapping[str, str], name: str) -> bool:
+    """Whether a release before schemas had steps has added it: it looked for tables, and left the number as it was."""
+    return f"has_{name}" in sql and bool(connection.execute(sql[f"has_{name}"]).fetchall())

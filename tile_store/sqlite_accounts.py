@@ -9,6 +9,7 @@ import apsw
 
 from gnd_map.tile_id import TileId
 from tile_store.sqlite_connection import Row, change, fetch
+from tile_store.sqlite_inbox import merge_again
 from tile_store.values import CourseSaid, ShiftTest, VehicleAccount
 
 NEWEST_TESTS: Final = 40
@@ -45,7 +46,7 @@ def put_tests(c: apsw.Connection, layer: str, tile: TileId, tests: Iterable[Shif
             what = "trust_vehicle" if vehicle in known else "distrust_vehicle"
             change(c, what, {"vehicle": vehicle, "since_ns": timing["now"]})
             for one_layer, one_tile in fetch(c, "tiles_of_vehicle", {"vehicle": vehicle}):
-                change(c, "mark_dirty", {"layer": one_layer, "tile": one_tile} | timing)
+                merge_again(c, one_layer, TileId(one_tile), timing)
 
 
 def shifted_vehicles(c: apsw.Connection) -> frozenset[str]:

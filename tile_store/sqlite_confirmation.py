@@ -13,15 +13,14 @@ from tile_store.values import Unconfirmed, WaitingChange
 def keep(c: apsw.Connection, layer: str, tile: TileId, waiting: Iterable[Unconfirmed]) -> None:
     """Of this tile, this waits now and nothing else."""
     place: dict[str, Any] = {"layer": layer, "tile": tile.morton}
+    known = {(row[2], row[3]): row[6] for row in fetch(c, "waiting_changes_of_tile", place)}
     change(c, "delete_waiting", place)
     for one in waiting:
         told = {"vehicle": one.vehicle, "reason": one.reason, "voxels": one.voxels, "seen": one.seen}
-        since_ns = min(_received_ns(c, place | {"report_id": report_id}) for report_id in one.report_ids)
+        times = [fetch(c, "received", place | {"report_id": report_id})[0][0] for report_id in one.report_ids]
+        times.append(known.get((one.vehicle, one.reason)))  # the reports may have been removed since
+        since_ns = min((at_ns for at_ns in times if at_ns is not None), default=0)
         change(c, "insert_waiting", place | told | {"since_ns": since_ns})
-
-
-def _received_ns(c: apsw.Connection, place: dict[str, Any]) -> int:
-    return int(fetch(c, "received", place)[0][0])
 
 
 def waiting_changes(c: apsw.Connection) -> list[WaitingChange]:

@@ -7,6 +7,7 @@ from typing import Any, Final
 import apsw
 
 from gnd_map.tile_id import TileId
+from tile_store import sqlite_journal as journal
 from tile_store.regions import morton_range
 from tile_store.sqlite_connection import Row, change, fetch
 from tile_store.values import Claim, PutStatus, ReportRow, StoreConfig
@@ -26,18 +27,42 @@ def timing_of(config: StoreConfig, now: int, steady: int) -> dict[str, Any]:
     return {"now": now, "steady": steady, "delay": delay, "merge_after": config.merge_after_reports}
 
 
-def put_reports(c: apsw.Connection, rows: Iterable[ReportRow], timing: dict[str, Any]) -> list[PutStatus]:
-    """Insert the rows that are new, and mark their tiles dirty."""
-    return [_put_report(c, row, timing) for row in rows]
+def put_reports(
+    c: apsw.Connection, rows: Iterable[ReportRow], config: StoreConfig, timing: dict[str, Any]
+) -> list[PutStatus]:
+    """Insert the rows that are new, each with its place in the journal, and mark their tiles dirty."""
+    return [_put_report(c, row, config, timing) for row in rows]
 
 
-def _put_report(c: apsw.Connection, row: ReportRow, timing: dict[str, Any]) -> PutStatus:
+def _put_report(c: apsw.Connection, row: ReportRow, config: StoreConfig, timing: dict[str, Any]) -> PutStatus:
     place = {"layer": row.layer, "tile": row.tile.morton}
-    told = {"report_id": row.report_id, "vehicle": row.vehicle, "received_ns": row.received_ns}
-    if not change(c, "insert_report", place | told | {"base_sha": row.base_sha, "body": row.body}):
+    entry = journal.next_entry(c, row, config)
+    settled_in = None if entry.opens or not row.is_quiet else _version_that_it_confirms(c, row)
+    told: dict[str, Any] = {name: getattr(row, name) for name in ("report_id", "part", "vehicle", "received_ns")}
+    told |= {"base_sha": row.base_sha, "body": row.body, "merged_in": settled_in}
+    if not change(c, "insert_report", place | told | {"seq": entry.seq, "window": entry.window}):
         return "duplicate"
-    change(c, "mark_dirty", place | timing)
+    journal.put(c, row.layer, row.tile, entry)
+    if settled_in is None:
+        change(c, "mark_dirty", place | timing | {"seq": entry.seq})
     return "stored"
+
+
+def _version_that_it_confirms(c: apsw.Connection, row: ReportRow) -> int | None:
+    """The newest version, where a report says that all is as there and nothing else waits: one more vote for what is
+    published changes nothing. None: it has to be merged.
+    """
+    place = {"layer": row.layer, "tile": row.tile.morton}
+    head = fetch(c, "head", place)
+    if not head or head[0][2] != row.base_sha or fetch(c, "dirty_row", place):
+        return None
+    return int(head[0][0])
+
+
+def merge_again(c: apsw.Connection, layer: str, tile: TileId, timing: dict[str, Any]) -> None:
+    """Mark a tile dirty although no report has come."""
+    seq = journal.mark(c, layer, tile)
+    change(c, "mark_dirty", {"layer": layer, "tile": tile.morton, "seq": seq} | timing)
 
 
 def claim(c: apsw.Connection, owner: str, n: int, lease_s: float, prefer: Sequence[str], steady: int) -> list[Claim]:
@@ -105,13 +130,11 @@ def holds(c: apsw.Connection, claim: Claim) -> bool:
     return any(token == claim.token for _, token in rows)
 
 
-def consume(c: apsw.Connection, claim: Claim, report_ids: Iterable[str], version: int, timing: dict[str, Any]) -> None:
-    """The claim's reports are merged in `version`; the tile is clean unless a report has arrived since the claim."""
+def consume(c: apsw.Connection, claim: Claim, seq: int, version: int, timing: dict[str, Any]) -> None:
+    """The tile's reports up to number `seq` are merged in `version`; the tile is clean unless there are more."""
     place: dict[str, Any] = {"layer": claim.layer, "tile": claim.tile.morton}
-    change(c, "consume_reports", place | {"version": version, "seq": claim.seq})
-    for report_id in report_ids:  # some may have arrived between claim and load
-        change(c, "consume_report", place | {"version": version, "report_id": report_id})
-    if not change(c, "clean", place | {"seq": claim.seq}):
+    change(c, "consume_reports", place | {"version": version, "seq": seq})
+    if not change(c, "clean", place | {"seq": seq}):
         change(c, "still_dirty", place | timing)
 
 
@@ -121,16 +144,25 @@ def unknown_reports(c: apsw.Connection, claim: Claim, report_ids: Iterable[str])
     return [one for one in report_ids if not fetch(c, "report_exists", place | {"report_id": one})]
 
 
-def in_play(
-    c: apsw.Connection, layer: str, tile: TileId, epoch: int, n: int, of_vehicle: int | None = None
+def in_play(c: apsw.Connection, layer: str, tile: TileId, epoch: int, first: int, last: int) -> tuple[ReportRow, ...]:
+    """The reports of the windows `first` to `last` that count since the epoch, by report id and part."""
+    wanted = {"layer": layer, "tile": tile.morton, "epoch": epoch, "folded": first - 1, "last": last}
+    return tuple(_row(*values) for values in fetch(c, "reports_in_play", wanted))
+
+
+def in_play_of_vehicles(
+    c: apsw.Connection, layer: str, tile: TileId, epoch: int, config: StoreConfig
 ) -> tuple[ReportRow, ...]:
-    """The newest `n` reports that count since the epoch, and of each vehicle the newest `of_vehicle`, by report id."""
-    wanted = {"layer": layer, "tile": tile.morton, "epoch": epoch, "n": n}
-    if of_vehicle is None:
-        rows = fetch(c, "reports_in_play", wanted)
-    else:
-        rows = fetch(c, "reports_in_play_of_vehicles", wanted | {"of_vehicle": of_vehicle})
-    return tuple(_row(*values) for values in reversed(rows))
+    """Of a feature layer the newest reports that count since the epoch, of each vehicle only so many, by report id."""
+    limits = {"n": config.max_feature_reports, "of_vehicle": config.max_reports_of_vehicle}
+    wanted = {"layer": layer, "tile": tile.morton, "epoch": epoch} | limits
+    return tuple(_row(*values) for values in reversed(fetch(c, "reports_in_play_of_vehicles", wanted)))
+
+
+def of_windows(c: apsw.Connection, layer: str, tile: TileId, first: int, last: int, seq: int) -> tuple[ReportRow, ...]:
+    """All reports of the windows `first` to `last` with numbers up to `seq`, by report id and part."""
+    wanted = {"layer": layer, "tile": tile.morton, "first": first, "last": last, "seq": seq}
+    return tuple(_row(*values) for values in fetch(c, "reports_of_windows", wanted))
 
 
 def page(c: apsw.Connection, layer: str, vehicle: str | None, after: int, n: int) -> tuple[int, list[ReportRow]]:
@@ -140,7 +172,8 @@ def page(c: apsw.Connection, layer: str, vehicle: str | None, after: int, n: int
 
 
 def _row(report_id: str, layer: str, tile: int, *rest: Any) -> ReportRow:
-    return ReportRow(report_id, layer, TileId(tile), *rest)
+    vehicle, received_ns, body, base_sha, part, window, seq = rest
+    return ReportRow(report_id, layer, TileId(tile), vehicle, received_ns, body, base_sha, part, window=window, seq=seq)
 
 
 def _lease(claim: Claim) -> dict[str, Any]:

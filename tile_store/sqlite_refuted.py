@@ -5,7 +5,9 @@ from typing import Any
 
 import apsw
 
-from tile_store.sqlite_connection import change, fetch
+from gnd_map.tile_id import TileId
+from tile_store import sqlite_inbox as inbox
+from tile_store.sqlite_connection import fetch
 from tile_store.values import REFUTED_SHARE, REFUTED_TESTS
 
 
@@ -28,4 +30,4 @@ def merge_again(
     for vehicle in sorted({vehicle for _, vehicle in before.items() ^ now.items()}):
         for of_layer, tile in fetch(c, "tiles_of_vehicle", {"vehicle": vehicle}):
             if of_layer == layer:
-                change(c, "mark_dirty", {"layer": layer, "tile": tile} | timing)
+                inbox.merge_again(c, layer, TileId(tile), timing)

@@ -11,12 +11,14 @@ from typing import Any, Final, TypeVar
 import apsw
 
 from gnd_map.content import AnyTile
+from gnd_map.features import is_feature_layer
 from gnd_map.tile_id import TileId
 from schemas.tiles import CatalogEntry
 from tile_store import clocks
 from tile_store import sqlite_accounts as accounts
 from tile_store import sqlite_confirmation as confirmation
 from tile_store import sqlite_inbox as inbox
+from tile_store import sqlite_journal as journal
 from tile_store import sqlite_refuted as refuted
 from tile_store import sqlite_versions as versions
 from tile_store.backup import copy_store
@@ -27,6 +29,7 @@ from tile_store.retention import trim_quarantine
 from tile_store.sqlite_connection import ReaderPool, change, fetch, open_writer, require_current
 from tile_store.values import (
     DEFAULT_LAYER,
+    Basis,
     Claim,
     Content,
     DirtyTile,
@@ -43,12 +46,14 @@ from tile_store.values import (
     StoreConfig,
     StoreCounts,
     StoredTile,
+    TileJournal,
     TileSetAside,
     TileWork,
     VehicleAccount,
     VersionInfo,
     VersionKind,
     WaitingChange,
+    WindowCounts,
     check_fits,
     check_layer,
 )
@@ -58,6 +63,8 @@ _T = TypeVar("_T")
 NS_PER_S: Final = 1_000_000_000
 REPORTS_A_PAGE: Final = 256
 LAGS_LOOKED_AT: Final = 256
+WINDOWS_AT_ONCE: Final = 8
+"""So many windows of a tile are folded in one go, where it was left alone for long."""
 _LOG = logging.getLogger(__name__)
 
 
@@ -133,7 +140,7 @@ class SqliteStore:
         """See `Store.put_reports`."""
         if not rows:
             return []
-        return self._writer.run(lambda c: inbox.put_reports(c, rows, self._timing()))
+        return self._writer.run(lambda c: inbox.put_reports(c, rows, self._config, self._timing()))
 
     def reports(self, layer: str = DEFAULT_LAYER, vehicle: str | None = None) -> Iterator[ReportRow]:
         """See `Store.reports`."""
@@ -146,15 +153,25 @@ class SqliteStore:
         with self._readers.snapshot() as c:
             return inbox.page(c, layer, vehicle, after, REPORTS_A_PAGE)
 
-    def in_play(
-        self, layer: str, tile: TileId, max_reports: int | None = None
-    ) -> tuple[StoredTile | None, tuple[ReportRow, ...]]:
+    def in_play(self, layer: str, tile: TileId) -> TileJournal:
         """See `Store.in_play`."""
-        n = self._config.max_reports_of(layer) if max_reports is None else max_reports
         with self._readers.snapshot() as c:
-            epoch = versions.epoch_of(c, layer, tile)
-            base = versions.stored(c, "stored_version", layer, tile, version=epoch) if epoch else None
-            return base, inbox.in_play(c, layer, tile, epoch, n, self._config.of_vehicle(layer))
+            return self._in_play(c, layer, tile)
+
+    def _in_play(self, c: apsw.Connection, layer: str, tile: TileId) -> TileJournal:
+        version = versions.epoch_of(c, layer, tile)
+        epoch = versions.stored(c, "stored_version", layer, tile, version=version) if version else None
+        if is_feature_layer(layer):
+            rows = inbox.in_play_of_vehicles(c, layer, tile, version, self._config)
+            return TileJournal(epoch, rows, seq=journal.newest(c, layer, tile).seq)
+        first = journal.folded(c, layer, tile, version) + 1
+        last = first + WINDOWS_AT_ONCE - 1
+        rows = inbox.in_play(c, layer, tile, version, first, last)
+        memory = journal.memory_of(c, layer, tile, version)
+        newest = journal.newest(c, layer, tile)
+        if newest.window <= last:
+            return TileJournal(epoch, rows, memory, newest.window, newest.seq)
+        return TileJournal(epoch, rows, memory, last + 1, max(row.seq for row in rows), is_whole=False)
 
     def quarantine(self, body: bytes, reason: str, source: str = "") -> None:
         """See `Store.quarantine`."""
@@ -276,15 +293,31 @@ class SqliteStore:
 
     # Merging and publishing
 
-    def load(self, claim: Claim, max_reports: int | None = None) -> TileWork:
+    def load(self, claim: Claim) -> TileWork:
         """See `Store.load`."""
-        n = self._config.max_reports_of(claim.layer) if max_reports is None else max_reports
         with self._readers.snapshot() as c:
             head = versions.stored(c, "stored_head", claim.layer, claim.tile)
-            epoch = versions.epoch_of(c, claim.layer, claim.tile)
-            base = versions.stored(c, "stored_version", claim.layer, claim.tile, version=epoch) if epoch else None
-            of_vehicle = self._config.of_vehicle(claim.layer)
-            return TileWork(claim, head, base, inbox.in_play(c, claim.layer, claim.tile, epoch, n, of_vehicle))
+            return TileWork(claim, head, self._in_play(c, claim.layer, claim.tile))
+
+    def basis(self, layer: str, tile: TileId, version: int) -> Basis | None:
+        """See `Store.basis`."""
+        with self._readers.snapshot() as c:
+            return journal.basis_of(c, layer, tile, version)
+
+    def closed_windows(self, layer: str, tile: TileId) -> dict[int, frozenset[str]]:
+        """See `Store.closed_windows`."""
+        with self._readers.snapshot() as c:
+            return journal.closed_windows(c, layer, tile)
+
+    def reports_of_windows(self, layer: str, tile: TileId, first: int, last: int, seq: int) -> tuple[ReportRow, ...]:
+        """See `Store.reports_of_windows`."""
+        with self._readers.snapshot() as c:
+            return inbox.of_windows(c, layer, tile, first, last, seq)
+
+    def windows(self) -> list[WindowCounts]:
+        """See `Store.windows`."""
+        with self._readers.snapshot() as c:
+            return journal.windows(c)
 
     def publish(self, publications: Sequence[Publication]) -> list[PublishResult]:
         """See `Store.publish`."""
@@ -436,7 +469,7 @@ class SqliteStore:
         """See `Store.gc`."""
         if keep_versions < 1:
             raise StoreError(f"keep_versions is {keep_versions}; at least the newest version stays")
-        return self._writer.run(lambda c: versions.collect(c, keep_versions, self._config.citing_reports_of))
+        return self._writer.run(lambda c: versions.collect(c, keep_versions))
 
     def backup(self, path: str | Path) -> None:
         """See `Store.backup`."""

@@ -1,6 +1,5 @@
 """Tile versions in SQLite: each function runs inside the caller's transaction."""
 
-from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
@@ -11,6 +10,7 @@ from gnd_map.tile_id import TileId
 from tile_store import sqlite_accounts as accounts
 from tile_store import sqlite_confirmation as confirmation
 from tile_store import sqlite_inbox as inbox
+from tile_store import sqlite_journal as journal
 from tile_store import sqlite_refuted as refuted
 from tile_store.errors import StoreError, UnknownReports, UnknownVersion
 from tile_store.provenance import NOTHING, Provenance, encode_provenance
@@ -50,7 +50,13 @@ def publish(
     if content is not None and content.sha != head.sha:
         origin = _Origin(publication.reason, claim.owner, provenance)
         result = PublishResult("published", _append(c, claim.layer, claim.tile, content, origin, timing["now"]))
-    inbox.consume(c, claim, publication.report_ids, result.version, timing)
+    basis = publication.basis
+    if basis is not None and result.status == "published":
+        journal.put_basis(c, claim.layer, claim.tile, result.version, basis)
+    if publication.memory is not None and basis is not None:
+        closed = [(window, basis.named) for window in publication.closed]
+        journal.keep(c, claim.layer, claim.tile, head.epoch, publication.memory, closed)
+    inbox.consume(c, claim, claim.seq if basis is None else basis.seq, result.version, timing)
     if publication.waiting is not None:
         confirmation.keep(c, claim.layer, claim.tile, publication.waiting)
     accounts.put_courses(c, claim.layer, claim.tile, publication.courses)
@@ -109,13 +115,14 @@ def epoch_of(c: apsw.Connection, layer: str, tile: TileId) -> int:
     return _head(c, layer, tile).epoch
 
 
-def collect(c: apsw.Connection, keep_versions: int, max_reports_of: Callable[[str], int]) -> GcResult:
+def collect(c: apsw.Connection, keep_versions: int) -> GcResult:
     """Remove versions older than the newest `keep_versions` of each tile, but for epochs and what reports cite."""
     sizes: list[int] = []
     for layer, morton in fetch(c, "tiles_with_history", {"keep": keep_versions}):
         head = _head(c, layer, TileId(morton))
         wanted = {"layer": layer, "tile": morton, "epoch": head.epoch, "oldest": head.version - keep_versions + 1}
-        sizes += [size for (size,) in fetch(c, "delete_old_versions", wanted | {"max_reports": max_reports_of(layer)})]
+        folded = journal.folded(c, layer, TileId(morton), head.epoch)
+        sizes += [size for (size,) in fetch(c, "delete_old_versions", wanted | {"folded": folded})]
     return GcResult(len(sizes), sum(sizes))
 
 
@@ -148,6 +155,7 @@ def _append(c: apsw.Connection, layer: str, tile: TileId, content: Content, orig
         raise StoreError(f"tile {tile.path} of layer {layer}: head {head.version} has moved inside a transaction")
     if origin.kind != "merged":  # a new epoch: what waited is forgotten with the reports that claimed it
         confirmation.keep(c, layer, tile, ())
+        journal.begin_epoch(c, layer, tile, version)
     if head.version or origin.kind == "merged":  # what an import adds to the map is found through the catalog
         change(c, "insert_notice", row)
     return version
@@ -161,10 +169,10 @@ def _after_newest(c: apsw.Connection, layer: str, tile: TileId, now: int) -> int
 
 def _provenance(c: apsw.Connection, publication: Publication) -> Provenance:
     provenance = Provenance.of(publication.report_ids, publication.voxel_reports)
-    unknown = inbox.unknown_reports(c, publication.claim, provenance.report_ids)
-    if unknown:
+    unknown = inbox.unknown_reports(c, publication.claim, publication.report_ids)
+    if unknown:  # what is remembered of earlier windows may rest on reports that retention has removed
         raise UnknownReports(
             f"tile {publication.claim.tile.path} of layer {publication.claim.layer}: {len(unknown)} of"
-            f" {len(provenance.report_ids)} report ids are not in the store, first {unknown[0]}; nothing was published"
+            f" {len(publication.report_ids)} report ids are not in the store, first {unknown[0]}; nothing was published"
         )
     return provenance

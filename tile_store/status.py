@@ -70,9 +70,8 @@ def _doubts_of(store: Store, waiting: WaitingChange) -> list[str]:
     """In words why the vehicle itself doubts what waits, of all its reports about the tile that count."""
     if waiting.reason not in DOUBTED:
         return []
-    _, rows = store.in_play(waiting.layer, waiting.tile)
     words: dict[str, None] = {}
-    for row in rows:
+    for row in store.in_play(waiting.layer, waiting.tile).reports:
         if row.vehicle == waiting.vehicle:
             with suppress(SchemaError):  # a damaged body is the merger's to tell
                 doubts = (change.doubt for change in ChangeReport.decode(row.body).tiles)

@@ -9,6 +9,7 @@ from gnd_map.tile_id import TileId
 from schemas.tiles import CatalogEntry
 from tile_store.values import (
     DEFAULT_LAYER,
+    Basis,
     Claim,
     DirtyTile,
     GcResult,
@@ -23,12 +24,14 @@ from tile_store.values import (
     ShardSeen,
     StoreCounts,
     StoredTile,
+    TileJournal,
     TileSetAside,
     TileWork,
     VehicleAccount,
     VersionInfo,
     VersionKind,
     WaitingChange,
+    WindowCounts,
 )
 
 
@@ -42,19 +45,17 @@ class Store(Protocol):
     # The inbox
 
     def put_reports(self, rows: Sequence[ReportRow]) -> list[PutStatus]:
-        """Keep reports, all of a call or none. A row whose (layer, tile, report id) is known is a "duplicate" and
-        changes nothing. Each new row makes its tile dirty.
+        """Keep reports, all of a call or none. A row whose (layer, tile, report id, part) is known is a "duplicate" and
+        changes nothing. Each new row gets its place in the tile's journal, and makes the tile dirty unless it is quiet
+        about the newest version.
         """
 
     def reports(self, layer: str = DEFAULT_LAYER, vehicle: str | None = None) -> Iterator[ReportRow]:
         """All reports of a layer (and of one vehicle) in order of arrival, read in pages."""
 
-    def in_play(
-        self, layer: str, tile: TileId, max_reports: int | None = None
-    ) -> tuple[StoredTile | None, tuple[ReportRow, ...]]:
-        """A tile's epoch and the newest `max_reports` reports that count since, merged or not, sorted by report id.
-
-        Both are read at one instant. No epoch: the map has no such tile.
+    def in_play(self, layer: str, tile: TileId) -> TileJournal:
+        """What counts of a tile since its epoch: what closed windows have come to, and the reports of those that are
+        not folded. All is read at one instant.
         """
 
     def quarantine(self, body: bytes, reason: str, source: str = "") -> None:
@@ -121,8 +122,20 @@ class Store(Protocol):
 
     # Merging and publishing
 
-    def load(self, claim: Claim, max_reports: int | None = None) -> TileWork:
-        """All that the merge of a claimed tile needs, read at one instant; only the newest `max_reports` reports."""
+    def load(self, claim: Claim) -> TileWork:
+        """All that the merge of a claimed tile needs, read at one instant."""
+
+    def basis(self, layer: str, tile: TileId, version: int) -> Basis | None:
+        """What of its tile's journal a version was made of; None: it is older than the journal, or the first base."""
+
+    def closed_windows(self, layer: str, tile: TileId) -> dict[int, frozenset[str]]:
+        """Of each folded window of a tile the vehicles that were named when it was folded."""
+
+    def reports_of_windows(self, layer: str, tile: TileId, first: int, last: int, seq: int) -> tuple[ReportRow, ...]:
+        """The reports of the windows `first` to `last` with numbers up to `seq`, by report id and part."""
+
+    def windows(self) -> list[WindowCounts]:
+        """The open window of each tile that anybody has reported about, by layer and tile."""
 
     def publish(self, publications: Sequence[Publication]) -> list[PublishResult]:
         """Publish merges in one transaction: each by compare-and-swap of the head from `base_version`, together with
@@ -204,7 +217,9 @@ class Store(Protocol):
     # Upkeep
 
     def gc(self, keep_versions: int) -> GcResult:
-        """Remove old versions. Kept: a tile's newest `keep_versions`, its epoch, and what counting reports cite."""
+        """Remove old versions. Kept: a tile's newest `keep_versions`, its epoch, and what reports cite that are not
+        folded.
+        """
 
     def backup(self, path: str | Path) -> None:
         """A consistent copy while the store is in use, compared with its hashes; nothing is overwritten."""

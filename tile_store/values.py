@@ -8,7 +8,7 @@ from typing import Final, Literal
 from gnd_map.codec import LATTICES, Lattice
 from gnd_map.content import AnyTile, encode_content, fits_layer, noun_of
 from gnd_map.day import UNKNOWN_DAY, day_of
-from gnd_map.features import FeatureTile, is_feature_layer
+from gnd_map.features import FeatureTile
 from gnd_map.tile import Tile
 from gnd_map.tile_id import TileId
 from schemas.limits import MAX_TILE_BODY_BYTES
@@ -88,10 +88,15 @@ class StoreConfig:
     """A tile becomes ready to merge this long after its first waiting report,"""
     merge_after_reports: int = 8
     """or at once when so many reports wait."""
-    max_reports: int = 64
-    """`load` gives at most the newest so many reports of a tile (by report id),"""
+    window_s: float = 1800.0
+    """A tile's window closes when a report comes so long after its first (by receipt): a vehicle that comes back after
+    that has come on another drive,"""
+    window_vehicles: int = 32
+    """or one of another vehicle when so many have a vote in it,"""
+    window_reports: int = 96
+    """or any when it holds so many: what one merge has to read stays bounded."""
     max_feature_reports: int = 256
-    """of a tile of a feature layer so many: they are some 100 bytes each,"""
+    """Of a tile of a feature layer the newest so many reports count: they are some 100 bytes each,"""
     max_reports_of_vehicle: int = 16
     """and there so many of each vehicle: no vehicle can talk until the reports of others count no more."""
     busy_timeout_s: float = 30.0
@@ -108,27 +113,19 @@ class StoreConfig:
             )
         if self.quarantine_mb <= 0:
             raise StoreError(f"quarantine_mb {self.quarantine_mb} must be positive")
-        if min(self.merge_after_reports, self.max_reports, self.group_max) < 1:
-            raise StoreError("merge_after_reports, max_reports and group_max must be at least 1")
-        if min(self.max_feature_reports, self.max_reports_of_vehicle) < 1:
-            raise StoreError("max_feature_reports and max_reports_of_vehicle must be at least 1")
+        if self.window_s <= 0:
+            raise StoreError(f"window_s must be positive, got {self.window_s}")
+        for name in (
+            "merge_after_reports", "group_max", "window_vehicles", "window_reports", "max_feature_reports",
+            "max_reports_of_vehicle",
+        ):  # fmt: skip
+            if getattr(self, name) < 1:
+                raise StoreError(f"{name} must be at least 1, got {getattr(self, name)}")
 
     @property
     def quarantine_bytes(self) -> int:
-        """The same in bytes."""
+        """How much of the refused messages is kept, bytes."""
         return round(self.quarantine_mb * 1e6)
-
-    def max_reports_of(self, layer: str) -> int:
-        """How many reports of a tile of this layer count."""
-        return self.max_feature_reports if is_feature_layer(layer) else self.max_reports
-
-    def of_vehicle(self, layer: str) -> int | None:
-        """How many of them one vehicle may have sent; None: all."""
-        return self.max_reports_of_vehicle if is_feature_layer(layer) else None
-
-    def citing_reports_of(self, layer: str) -> int:
-        """Of how many newest reports of a tile gc keeps the bases; -1: of all, where one does not know which count."""
-        return -1 if is_feature_layer(layer) else self.max_reports
 
 
 @dataclass(frozen=True, slots=True)
@@ -145,10 +142,19 @@ class ReportRow:
     received_ns: int
     body: bytes = field(repr=False)
     base_sha: bytes = b""
+    part: int = 0
+    """0: flags, or the whole report; 1: the same with the Gaussians that were asked for later, in place of part 0."""
+    is_quiet: bool = field(default=False, compare=False)
+    """It says of all that it observed "as in the base": where that is the newest version, nothing has to be merged."""
+    window: int = field(default=0, compare=False)
+    """Of the tile's journal; the store assigns it, and the number in it, when the report becomes durable."""
+    seq: int = field(default=0, compare=False)
 
     def __post_init__(self) -> None:
         check_layer(self.layer)
         check_report_id(self.report_id)
+        if self.part not in (0, 1):
+            raise StoreError(f"report {self.report_id} has part {self.part}; there are 0 and 1")
         if len(self.base_sha) not in (0, SHA_BYTES):
             raise StoreError(f"base_sha has {len(self.base_sha)} bytes, need 0 or {SHA_BYTES}")
 
@@ -237,15 +243,81 @@ class Claim:
 
 
 @dataclass(frozen=True, slots=True)
-class TileWork:
-    """All that a merge needs, read at one instant: the newest version, the epoch's version (the latest base or
-    rollback) and the reports that count since then, merged or not, sorted by report id.
+class StoredMemory:
+    """What the closed windows of a tile up to `window` have come to: the Gaussians that the next window is merged into,
+    encoded, and what else is remembered, which the store does not read.
     """
+
+    window: int
+    codec_id: int
+    body: bytes = field(repr=False)
+    memory: bytes = field(repr=False)
+
+
+@dataclass(frozen=True, slots=True)
+class Basis:
+    """What of its tile's journal a version was made of: all windows before `window` since the epoch, and of that one
+    the entries up to number `seq`; and which vehicles were named then.
+    """
+
+    window: int
+    seq: int
+    named: frozenset[str] = frozenset()
+
+
+@dataclass(frozen=True, slots=True)
+class WindowCounts:
+    """The open window of a tile: its number, entries of the journal so far, when it was opened (None: it is empty),
+    its reports, and the newest window that is folded (None: none).
+    """
+
+    layer: str
+    tile: TileId
+    window: int
+    seq: int
+    opened_ns: int | None
+    reports: int
+    folded: int | None
+
+
+@dataclass(frozen=True, slots=True)
+class TileJournal:
+    """What counts of a tile, read at one instant.
+
+    Attributes:
+        epoch: the latest base or rollback; None: the map has no such tile.
+        reports: of the windows that are not folded, merged or not, sorted by report id and part.
+        memory: what the closed windows since the epoch have come to; None: none is folded.
+        window: the open one.
+        seq: number of the newest entry.
+        is_whole: the reports reach to the end of the journal; else `window` and `seq` say how far, and all are closed.
+    """
+
+    epoch: StoredTile | None
+    reports: tuple[ReportRow, ...] = ()
+    memory: StoredMemory | None = None
+    window: int = 0
+    seq: int = 0
+    is_whole: bool = True
+
+
+@dataclass(frozen=True, slots=True)
+class TileWork:
+    """All that a merge needs, read at one instant: the newest version, and what counts since the epoch."""
 
     claim: Claim
     head: StoredTile | None
-    epoch: StoredTile | None
-    reports: tuple[ReportRow, ...]
+    journal: TileJournal
+
+    @property
+    def epoch(self) -> StoredTile | None:
+        """The latest base or rollback."""
+        return self.journal.epoch
+
+    @property
+    def reports(self) -> tuple[ReportRow, ...]:
+        """Of the windows that are not folded, merged or not, sorted by report id and part."""
+        return self.journal.reports
 
     @property
     def base_version(self) -> int:
@@ -439,7 +511,8 @@ class Publication:
     `report_ids` are the reports that it comes from. `voxel_reports` names them for each changed voxel, or by the id of
     each changed feature, when known. `waiting` is what the reports claim and the content has not;
     None: as before. `shift_tests` and `courses` are those of this tile's reports, which add to the accounts
-    of their vehicles.
+    of their vehicles. `basis` says what of the journal the content was made of, `memory` what the windows `closed` have
+    come to, where any was folded.
     The store numbers versions itself: it publishes `base_version + 1`, whatever `tile.version` says.
     """
 
@@ -452,6 +525,9 @@ class Publication:
     waiting: tuple[Unconfirmed, ...] | None = None
     shift_tests: tuple[ShiftTest, ...] = ()
     courses: tuple[CourseSaid, ...] = ()
+    basis: Basis | None = None
+    memory: StoredMemory | None = None
+    closed: tuple[int, ...] = ()
 
     def __post_init__(self) -> None:
         if self.tile is not None and self.tile.tile_id != self.claim.tile:

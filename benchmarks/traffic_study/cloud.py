@@ -1,5 +1,6 @@
 """The cloud in this process: the store, ingest and merges as in a merger, reached by a call instead of a bus."""
 
+import time
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -20,6 +21,8 @@ from tile_store.values import DEFAULT_CODEC, DEFAULT_LAYER, StoreConfig
 _OWNER: Final = "traffic-study"
 _LEASE_S: Final = 3600.0
 _AT_ONCE: Final = 64
+_BETWEEN_NS: Final = 3600 * 1_000_000_000
+"""The vehicles that are on the street at a time come an hour after those before them."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -45,10 +48,11 @@ class Cloud:
         for old in path.parent.glob(f"{path.name}*"):
             old.unlink()
         config = ShardConfig(store_path=path, merge=merge, codec=codec, store=StoreConfig(merge_delay_s=0.0))
-        self.store = SqliteStore(path, config.store)
+        self._later_ns = 0
+        self.store = SqliteStore(path, config.store, now_ns=self._now_ns)
         self.store.put_tiles(Tile(tile, 1, gaussians) for tile, gaussians in base.tiles.items())
         short = ShortReports(self.store, config.merge, config.want, config.waiting)
-        self._ingest = Ingest(self.store, config.ingest, short=short)
+        self._ingest = Ingest(self.store, config.ingest, now_ns=self._now_ns, short=short)
         self._worker = Worker(self.store, config)
         self._messages: list[Message] = []
 
@@ -71,6 +75,9 @@ class Cloud:
         messages, self._messages = self._messages, []
         return messages
 
+    def _now_ns(self) -> int:
+        return time.time_ns() + self._later_ns
+
     def merge(self) -> int:
         """Merge everything that has been reported; return how many tiles got a new version.
 
@@ -83,6 +90,7 @@ class Cloud:
             if len(publications) != len(claims):
                 raise TrafficError(f"{len(claims) - len(publications)} of {len(claims)} tiles could not be merged")
             published += sum(result.status == "published" for result in self.store.publish(publications))
+        self._later_ns += _BETWEEN_NS
         bad = self.store.quarantined()
         if bad:
             raise TrafficError(f"{len(bad)} reports were refused, the first: {bad[0].reason}")

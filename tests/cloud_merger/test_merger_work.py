@@ -126,7 +126,7 @@ def test_a_tile_whose_merge_fails_is_set_aside_after_some_attempts_and_the_other
     (aside,) = store.tiles_set_aside()
     assert (aside.tile, aside.attempts, aside.reports) == (NEIGHBOUR, 3, 1)
     assert "damaged" in aside.reason
-    assert [row.report_id for row in store.in_play("ndt", NEIGHBOUR)[1]] == [failing]
+    assert [row.report_id for row in store.in_play("ndt", NEIGHBOUR).reports] == [failing]
     damage(store, NEIGHBOUR)  # the same bit again: it is whole
     assert store.take_up_again([("ndt", NEIGHBOUR)]) == 1
     assert [r.status for r in merge_once(store, worker)] == ["published"]

@@ -78,7 +78,8 @@ def changed_by_votes_alone(store, tiles, config):
     """Voxels that the merge without the gates would change."""
     found = 0
     for tile, base in tiles.items():
-        epoch, rows = store.in_play("ndt", tile)
+        journal = store.in_play("ndt", tile)
+        epoch, rows = journal.epoch, journal.reports
         reports = [report_of(row.body, config.merge) for row in rows]
         if epoch is not None and reports:
             statements = statements_of(base, reports, {epoch.sha: base})

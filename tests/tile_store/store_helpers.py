@@ -11,7 +11,7 @@ from gnd_map.tile_id import TileId
 from schemas.report_id import deterministic_report_id
 from tile_store.sqlite_store import SqliteStore
 from tile_store.store import Store
-from tile_store.values import Claim, Publication, ReportRow, StoreConfig, TileWork
+from tile_store.values import Basis, Claim, Publication, ReportRow, StoreConfig, TileWork
 
 TILE = TileId(497353963154)
 """The tile of Figure 2; its path is 13033/03021/23031/22102."""
@@ -73,7 +73,13 @@ def only_claim(store: Store, owner: str = "m1", lease_s: float = 10.0) -> Claim:
 def publication(work: TileWork, *voxels: int) -> Publication:
     """A publication of what was loaded: those voxels."""
     ids = tuple(row.report_id for row in work.reports)
-    return Publication(work.claim, work.base_version, tile_of_voxels(work.claim.tile, *voxels), report_ids=ids)
+    content = tile_of_voxels(work.claim.tile, *voxels)
+    return Publication(work.claim, work.base_version, content, report_ids=ids, basis=basis_of(work))
+
+
+def basis_of(work: TileWork) -> Basis:
+    """What a publication of all that was loaded rests on."""
+    return Basis(work.journal.window, work.journal.seq)
 
 
 def merge_once(store: Store, *voxels: int, owner: str = "m1") -> int:

@@ -16,10 +16,10 @@ from gnd_map.tile import Tile
 from gnd_map.tile_id import TileId
 from tile_store.sqlite_store import SqliteStore
 from tile_store.store import Store
-from tile_store.values import Publication, ReportRow, StoreConfig, TileWork
+from tile_store.values import Basis, Publication, ReportRow, StoreConfig, TileWork
 
 TILES = (TILE, *TILE.neighbours()[:3])
-HURRY = StoreConfig(merge_delay_s=0.02, merge_after_reports=5, max_reports=100_000)
+HURRY = StoreConfig(merge_delay_s=0.02, merge_after_reports=5, window_reports=1_000_000)
 
 
 def merged_tile(tile: TileId, reports: tuple[ReportRow, ...]) -> Tile:
@@ -33,7 +33,8 @@ def merged_tile(tile: TileId, reports: tuple[ReportRow, ...]) -> Tile:
 
 def publication_of(work: TileWork) -> Publication:
     ids = tuple(row.report_id for row in work.reports)
-    return Publication(work.claim, work.base_version, merged_tile(work.claim.tile, work.reports), report_ids=ids)
+    content, basis = merged_tile(work.claim.tile, work.reports), Basis(work.journal.window, work.journal.seq)
+    return Publication(work.claim, work.base_version, content, report_ids=ids, basis=basis)
 
 
 def run_reporter(store: Store, name: str, number: int) -> None:

@@ -1,6 +1,7 @@
 """The inbox: what was acknowledged is kept once, whoever sends it how often."""
 
 import threading
+from dataclasses import replace
 
 import pytest
 from store_helpers import EAST, FAR, TILE, Clock, SqliteMaker, merge_once, report, report_id
@@ -27,6 +28,28 @@ def test_a_duplicate_of_a_merged_report_does_not_make_its_tile_dirty_again(store
     merge_once(store, 1)
     assert store.put_reports([report(1)]) == ["duplicate"]
     assert store.dirty_count() == 0
+
+
+def test_the_second_part_of_a_report_comes_after_the_first_and_once(store: Store) -> None:
+    flags = report(1, body=b"flags")
+    gaussians = replace(flags, body=b"with Gaussians", part=1)
+    assert store.put_reports([flags, gaussians, gaussians]) == ["stored", "stored", "duplicate"]
+    assert [row.body for row in store.in_play("ndt", TILE).reports] == [b"flags", b"with Gaussians"]
+    assert list(store.reports()) == [flags, gaussians]
+    assert store.counts().reports == 1
+
+
+def test_the_second_part_counts_before_the_first_has_come(store: Store) -> None:
+    late = report(1, body=b"flags")
+    store.put_reports([replace(late, body=b"with Gaussians", part=1)])
+    merge_once(store, 1)
+    assert store.put_reports([late]) == ["stored"]
+    assert [row.part for row in store.in_play("ndt", TILE).reports] == [0, 1]
+
+
+def test_a_report_has_two_parts_at_most() -> None:
+    with pytest.raises(StoreError, match="part 2"):
+        replace(report(1), part=2)
 
 
 def test_one_report_covers_several_tiles_and_layers(store: Store) -> None:
@@ -112,7 +135,9 @@ def test_quarantine_keeps_bytes_reason_and_count(store: Store, clock: Clock) -> 
     [
         {"merge_delay_s": -1.0},
         {"busy_timeout_s": 0.0},
-        {"max_reports": 0},
+        {"window_s": 0.0},
+        {"window_vehicles": 0},
+        {"window_reports": 0},
         {"max_feature_reports": 0},
         {"max_reports_of_vehicle": 0},
         {"group_max": 0},

@@ -2,6 +2,7 @@
 
 import gzip
 import shutil
+from dataclasses import replace
 from pathlib import Path
 
 import apsw
@@ -66,6 +67,23 @@ def test_leases_of_the_old_queue_by_the_time_of_day_are_over(old: Path) -> None:
         assert {claim.tile for claim in claims} == {EAST, FAR}  # EAST was leased for a day
         store.put_reports([report(9, TILE)])
         assert [claim.tile for claim in store.claim("m1", 10, 10.0)] == [TILE]
+
+
+def test_reports_from_before_they_had_parts_are_known(old: Path) -> None:
+    with SqliteStore(old) as store:
+        wanted = [report(2, EAST), replace(report(2, EAST), part=1)]
+        assert store.put_reports(wanted) == ["duplicate", "stored"]
+        assert sorted(row.part for row in store.reports() if row.report_id == report_id(2)) == [0, 1]
+
+
+def test_a_store_that_has_got_journals_before_schemas_had_steps_is_taken_on(old: Path) -> None:
+    sql = statements("sqlite")
+    with apsw.Connection(str(old)) as connection:
+        connection.execute(sql["schema_of_parts"])
+        connection.execute(sql["schema_of_journal"])
+    with SqliteStore(old) as store:
+        assert len(store.put_reports([report(7)])) == 1
+    assert version_of(old) == SCHEMA_VERSION
 
 
 def test_a_store_of_a_release_without_days_and_accounts_gets_room_for_them(old: Path) -> None:

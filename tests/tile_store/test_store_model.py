@@ -8,7 +8,7 @@ import pytest
 from hypothesis import HealthCheck, settings
 from hypothesis import strategies as st
 from hypothesis.stateful import RuleBasedStateMachine, invariant, precondition, rule
-from store_helpers import EAGER, EAST, TILE, Clock, SqliteMaker, report, report_id, tile_of_voxels
+from store_helpers import EAGER, EAST, TILE, Clock, SqliteMaker, basis_of, report, report_id, tile_of_voxels
 
 from gnd_map.tile_id import TileId
 from tile_store.errors import UnknownVersion
@@ -136,7 +136,8 @@ class StoreMachine(RuleBasedStateMachine):
         numbers = {int(row.received_ns % 1000) for row in held.work.reports}
         content = tile_of_voxels(tile, *epoch, *(numbers - {9}))
         ids = tuple(row.report_id for row in held.work.reports)
-        (result,) = self.store.publish([Publication(held.work.claim, held.work.base_version, content, report_ids=ids)])
+        one = Publication(held.work.claim, held.work.base_version, content, report_ids=ids, basis=basis_of(held.work))
+        (result,) = self.store.publish([one])
         if not held.is_current or held.work.base_version != model.version:
             assert (result.status, result.version) == ("stale", model.version)
             if held.is_current:

@@ -150,6 +150,125 @@ END;
 -- name: has_schema_of_surveys
 SELECT 1 FROM sqlite_schema WHERE type = 'trigger' AND name = 'survey_goes'
 
+-- name: schema_of_parts
+-- Added later, too. A report in short comes in two parts: 0 its flags (or the whole report), 1 with its Gaussians.
+ALTER TABLE report ADD COLUMN part INTEGER NOT NULL DEFAULT 0 CHECK (part IN (0, 1));
+DROP INDEX report_key;
+CREATE UNIQUE INDEX report_key ON report (layer, tile, report_id, part);
+
+-- name: has_schema_of_parts
+SELECT 1 FROM pragma_table_info('report') WHERE name = 'part'
+
+-- name: schema_of_journal
+-- Added later, too. The journal of a tile: its reports, numbered (`seq`) in the order in which they became durable and cut
+-- into windows. Reports that are older than this table are window 0.
+ALTER TABLE report ADD COLUMN window INTEGER NOT NULL DEFAULT 0;
+CREATE INDEX report_window ON report (layer, tile, window, seq, vehicle);
+CREATE TABLE journal (
+  layer     TEXT    NOT NULL,
+  tile      INTEGER NOT NULL,
+  seq       INTEGER NOT NULL,  -- of the newest entry; a mark without a report takes a number, too
+  window    INTEGER NOT NULL,  -- that is open
+  opened_ns INTEGER,           -- receipt of its first report; NULL: it has none yet
+  PRIMARY KEY (layer, tile)
+) STRICT, WITHOUT ROWID;
+-- What the closed windows up to `window` have come to since version `epoch`: the next epoch, and what is remembered.
+CREATE TABLE tile_memory (
+  layer    TEXT    NOT NULL,
+  tile     INTEGER NOT NULL,
+  window   INTEGER NOT NULL,
+  epoch    INTEGER NOT NULL,
+  codec_id INTEGER NOT NULL,
+  body     BLOB    NOT NULL,
+  memory   BLOB    NOT NULL,
+  PRIMARY KEY (layer, tile)
+) STRICT;
+-- What of the journal a version was made of: all windows before `window`, and of it the entries up to `seq`; a base or a
+-- rollback begins with `window`. `named`: the vehicles that were named then.
+CREATE TABLE version_basis (
+  layer   TEXT    NOT NULL,
+  tile    INTEGER NOT NULL,
+  version INTEGER NOT NULL,
+  window  INTEGER NOT NULL,
+  seq     INTEGER NOT NULL,
+  named   TEXT    NOT NULL,
+  PRIMARY KEY (layer, tile, version)
+) STRICT, WITHOUT ROWID;
+CREATE TABLE closed_window (
+  layer  TEXT    NOT NULL,
+  tile   INTEGER NOT NULL,
+  window INTEGER NOT NULL,
+  named  TEXT    NOT NULL,
+  PRIMARY KEY (layer, tile, window)
+) STRICT, WITHOUT ROWID;
+
+-- name: has_schema_of_journal
+SELECT 1 FROM sqlite_schema WHERE type = 'table' AND name = 'closed_window'
+
+-- name: journal
+SELECT seq, window, opened_ns FROM journal WHERE layer = :layer AND tile = :tile
+
+-- name: newest_entry
+SELECT MAX(seq) FROM report WHERE layer = :layer AND tile = :tile
+
+-- name: put_journal
+INSERT INTO journal (layer, tile, seq, window, opened_ns) VALUES (:layer, :tile, :seq, :window, :opened_ns)
+ON CONFLICT (layer, tile) DO UPDATE SET seq = excluded.seq, window = excluded.window, opened_ns = excluded.opened_ns
+
+-- name: window_size
+SELECT COUNT(*), COUNT(DISTINCT vehicle), COALESCE(MAX(vehicle = :vehicle), 0) FROM report
+WHERE layer = :layer AND tile = :tile AND window = :window
+
+-- name: move_waiting
+UPDATE report SET window = :window WHERE layer = :layer AND tile = :tile AND merged_in IS NULL AND window > 0
+
+-- name: oldest_of_window
+SELECT MIN(received_ns) FROM report WHERE layer = :layer AND tile = :tile AND window = :window
+
+-- name: put_basis
+INSERT INTO version_basis (layer, tile, version, window, seq, named)
+VALUES (:layer, :tile, :version, :window, :seq, :named)
+
+-- name: basis
+SELECT window, seq, named FROM version_basis WHERE layer = :layer AND tile = :tile AND version = :version
+
+-- name: put_closed_window
+INSERT INTO closed_window (layer, tile, window, named) VALUES (:layer, :tile, :window, :named)
+ON CONFLICT (layer, tile, window) DO UPDATE SET named = excluded.named
+
+-- name: closed_windows
+SELECT window, named FROM closed_window WHERE layer = :layer AND tile = :tile ORDER BY window
+
+-- name: put_memory
+INSERT INTO tile_memory (layer, tile, window, epoch, codec_id, body, memory)
+VALUES (:layer, :tile, :window, :epoch, :codec_id, :body, :memory)
+ON CONFLICT (layer, tile) DO UPDATE SET window = excluded.window, epoch = excluded.epoch, codec_id = excluded.codec_id,
+  body = excluded.body, memory = excluded.memory
+
+-- name: memory
+SELECT window, codec_id, body, memory FROM tile_memory WHERE layer = :layer AND tile = :tile AND epoch = :epoch
+
+-- name: folded_window
+SELECT window FROM tile_memory WHERE layer = :layer AND tile = :tile AND epoch = :epoch
+
+-- name: forget_memory
+DELETE FROM tile_memory WHERE layer = :layer AND tile = :tile
+
+-- name: newest_epoch
+SELECT MAX(version) FROM tile_version
+WHERE layer = :layer AND tile = :tile AND version <= :version AND kind <> 'merged'
+
+-- name: reports_of_windows
+SELECT report_id, layer, tile, vehicle, received_ns, body, base_sha, part, window, seq FROM report
+WHERE layer = :layer AND tile = :tile AND window >= :first AND window <= :last AND seq <= :seq
+ORDER BY report_id, part
+
+-- name: windows
+SELECT layer, tile, window, seq, opened_ns,
+  (SELECT COUNT(*) FROM report AS r WHERE r.layer = j.layer AND r.tile = j.tile AND r.window = j.window),
+  (SELECT m.window FROM tile_memory AS m WHERE m.layer = j.layer AND m.tile = j.tile)
+FROM journal AS j ORDER BY layer, tile
+
 -- name: put_survey
 INSERT INTO survey (layer, tile, version, surveyed_ns) VALUES (:layer, :tile, :version, :surveyed_ns)
 ON CONFLICT (layer, tile, version) DO UPDATE SET surveyed_ns = MAX(surveyed_ns, excluded.surveyed_ns)
@@ -190,7 +309,9 @@ DELETE FROM shifted_vehicle WHERE vehicle = :vehicle
 
 -- name: tiles_of_vehicle
 SELECT DISTINCT r.layer, r.tile FROM report AS r LEFT JOIN tile_head AS h USING (layer, tile)
+  LEFT JOIN tile_memory AS m ON m.layer = r.layer AND m.tile = r.tile AND m.epoch = h.epoch
 WHERE r.vehicle = :vehicle AND (r.merged_in IS NULL OR r.merged_in >= COALESCE(h.epoch, 0))
+  AND r.window > COALESCE(m.window, -1)
 
 -- name: delete_waiting
 DELETE FROM waiting_change WHERE layer = :layer AND tile = :tile
@@ -200,27 +321,28 @@ INSERT INTO waiting_change (layer, tile, vehicle, reason, voxels, seen, since_ns
 VALUES (:layer, :tile, :vehicle, :reason, :voxels, :seen, :since_ns)
 
 -- name: received
-SELECT received_ns FROM report WHERE layer = :layer AND tile = :tile AND report_id = :report_id
+SELECT MIN(received_ns) FROM report WHERE layer = :layer AND tile = :tile AND report_id = :report_id
 
 -- name: waiting_changes
 SELECT layer, tile, vehicle, reason, voxels, seen, since_ns FROM waiting_change
 ORDER BY layer, tile, vehicle, reason
 
+-- name: waiting_changes_of_tile
+SELECT layer, tile, vehicle, reason, voxels, seen, since_ns FROM waiting_change WHERE layer = :layer AND tile = :tile
+
 -- name: dirty_tiles
 SELECT layer, tile, waiting, attempts, owner IS NOT NULL FROM dirty WHERE aside_ns IS NULL ORDER BY layer, tile
 
 -- name: insert_report
-INSERT INTO report (layer, tile, report_id, vehicle, received_ns, seq, base_sha, body)
-SELECT :layer, :tile, :report_id, :vehicle, :received_ns,
-       COALESCE((SELECT seq FROM dirty WHERE layer = :layer AND tile = :tile), 0) + 1, :base_sha, :body
-WHERE true
-ON CONFLICT (layer, tile, report_id) DO NOTHING
+INSERT INTO report (layer, tile, report_id, part, vehicle, received_ns, seq, window, merged_in, base_sha, body)
+VALUES (:layer, :tile, :report_id, :part, :vehicle, :received_ns, :seq, :window, :merged_in, :base_sha, :body)
+ON CONFLICT (layer, tile, report_id, part) DO NOTHING
 
 -- name: mark_dirty
 INSERT INTO dirty (layer, tile, seq, waiting, ready_ns)
-VALUES (:layer, :tile, 1, 1, CASE WHEN :merge_after <= 1 THEN :steady ELSE :steady + :delay END)
+VALUES (:layer, :tile, :seq, 1, CASE WHEN :merge_after <= 1 THEN :steady ELSE :steady + :delay END)
 ON CONFLICT (layer, tile) DO UPDATE SET
-  seq = seq + 1,
+  seq = excluded.seq,
   waiting = waiting + 1,
   ready_ns = MIN(ready_ns, CASE WHEN waiting + 1 >= :merge_after THEN :steady ELSE :steady + :delay END),
   attempts = CASE WHEN aside_ns IS NULL THEN attempts ELSE 0 END,
@@ -261,15 +383,11 @@ SELECT seq, token FROM dirty WHERE layer = :layer AND tile = :tile
 UPDATE report SET merged_in = :version
 WHERE layer = :layer AND tile = :tile AND merged_in IS NULL AND seq <= :seq
 
--- name: consume_report
-UPDATE report SET merged_in = :version
-WHERE layer = :layer AND tile = :tile AND report_id = :report_id AND merged_in IS NULL
-
 -- name: report_exists
 SELECT 1 FROM report WHERE layer = :layer AND tile = :tile AND report_id = :report_id
 
 -- name: clean
-DELETE FROM dirty WHERE layer = :layer AND tile = :tile AND seq = :seq
+DELETE FROM dirty WHERE layer = :layer AND tile = :tile AND seq <= :seq
 
 -- name: still_dirty
 UPDATE dirty SET owner = NULL, token = NULL, lease_ns = NULL, attempts = 0,
@@ -343,12 +461,13 @@ WHERE layer = :layer AND tile = :tile ORDER BY version
 SELECT provenance FROM tile_version WHERE layer = :layer AND tile = :tile AND version = :version
 
 -- name: reports_in_play
-SELECT report_id, layer, tile, vehicle, received_ns, body, base_sha FROM report
-WHERE layer = :layer AND tile = :tile AND (merged_in IS NULL OR merged_in >= :epoch)
-ORDER BY report_id DESC LIMIT :n
+SELECT report_id, layer, tile, vehicle, received_ns, body, base_sha, part, window, seq FROM report
+WHERE layer = :layer AND tile = :tile AND window > :folded AND window <= :last
+  AND (window > 0 OR merged_in IS NULL OR merged_in >= :epoch)
+ORDER BY report_id, part
 
 -- name: reports_in_play_of_vehicles
-SELECT report_id, layer, tile, vehicle, received_ns, body, base_sha FROM report
+SELECT report_id, layer, tile, vehicle, received_ns, body, base_sha, part, window, seq FROM report
 WHERE layer = :layer AND tile = :tile AND report_id IN (
   SELECT report_id FROM (
     SELECT report_id, ROW_NUMBER() OVER (PARTITION BY vehicle ORDER BY report_id DESC) AS turn FROM report
@@ -357,7 +476,7 @@ WHERE layer = :layer AND tile = :tile AND report_id IN (
 ORDER BY report_id DESC
 
 -- name: reports_page
-SELECT arrival, report_id, layer, tile, vehicle, received_ns, body, base_sha FROM report
+SELECT arrival, report_id, layer, tile, vehicle, received_ns, body, base_sha, part, window, seq FROM report
 WHERE arrival > :after AND layer = :layer AND (:vehicle IS NULL OR vehicle = :vehicle) ORDER BY arrival LIMIT :n
 
 -- name: dirty_count
@@ -382,8 +501,8 @@ SELECT layer, tile FROM tile_version GROUP BY layer, tile HAVING COUNT(*) > :kee
 DELETE FROM tile_version WHERE layer = :layer AND tile = :tile
   AND version < :oldest AND version <> :epoch
   AND sha NOT IN (SELECT base_sha FROM report
-                  WHERE layer = :layer AND tile = :tile AND (merged_in IS NULL OR merged_in >= :epoch)
-                  ORDER BY report_id DESC LIMIT :max_reports)
+                  WHERE layer = :layer AND tile = :tile AND window > :folded
+                    AND (window > 0 OR merged_in IS NULL OR merged_in >= :epoch))
 RETURNING size_bytes
 
 -- name: counts

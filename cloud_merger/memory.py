@@ -1,0 +1,153 @@
+"""What a tile remembers of the windows that are closed, beside the map itself: a bounded summary a voxel.
+
+- *Support*: by how many vehicles the voxel's present state was confirmed, by whom last, and on which day it was last
+  observed. It weighs as that many votes, few at most, fewer with time: a settled voxel does not change on one vehicle's
+  word, and a world that changes is followed all the same.
+- *Claims*: what vehicles said against the present state and nobody has decided yet, of each voxel the newest, of each
+  vehicle at most two. They vote in the windows that come, so vehicles that each saw too little decide together; each
+  later confirmation of the present state takes the oldest one away.
+
+Nothing here grows with the number of reports.
+"""
+
+import json
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any, Final
+
+import numpy as np
+import zstandard
+from numpy.typing import NDArray
+
+from cloud_merger.errors import MergerError
+from cloud_merger.statements import EPOCH, STATEMENT, Kind, Report, Rows, Witness, find, states_at
+from gnd_map.gaussian import Gaussians
+
+I32 = NDArray[np.int32]
+
+SUPPORT_MOST: Final = 2.0
+"""So many votes a settled voxel has at most: four vehicles that agree outvote it at once, two do not."""
+HALF_LIFE_DAYS: Final = 90.0
+"""What nobody has observed for so long has half of them left."""
+CLAIMS_OF_VOXEL: Final = 6
+CLAIMS_OF_VEHICLE: Final = 2
+"""A vehicle's claim of an earlier drive stays beside its newest one: saying the same again makes a second witness."""
+ANOTHER_DRIVE_S: Final = 1800.0
+"""Votes of one vehicle within so long, by receipt, are one vote, in however many windows they fall."""
+MOST_OBSERVERS: Final = 255
+_FORMAT: Final = 1
+_LEVEL: Final = 3
+_NS_PER_S: Final = 1_000_000_000
+
+# One remembered voxel. `observers`: vehicles that confirmed its state, counted up to 255; `last`: 16 bits of the hash
+# of the one that did so last; `day`: of the last observation, `gnd_map.day`.
+VOXEL: Final = np.dtype([("voxel_id", np.int32), ("observers", np.uint8), ("last", np.uint16), ("day", np.uint16)])
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class TileMemory:
+    """See the module's head.
+
+    Attributes:
+        voxels: VOXEL (N,) sorted by voxel id.
+        claims: STATEMENT (M,) by voxel, then by receipt; `report` indexes `witnesses`.
+        witnesses: the reports that claim them, without what they say.
+        voters: of each vehicle that voted within the last half hour of a closed window, when its newest report was
+            received, int ns UTC.
+    """
+
+    voxels: NDArray[Any] = field(default_factory=lambda: np.zeros(0, VOXEL))
+    claims: Rows = field(default_factory=lambda: np.zeros(0, STATEMENT))
+    witnesses: tuple[Witness, ...] = ()
+    voters: Mapping[str, int] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        if self.voxels.dtype != VOXEL or self.claims.dtype != STATEMENT:
+            raise MergerError(f"a memory of {self.voxels.dtype} and {self.claims.dtype}")
+        if (np.diff(self.voxels["voxel_id"]) <= 0).any():
+            raise MergerError(f"a memory of {len(self.voxels)} voxels that are not strictly ascending")
+        if len(self.claims) and not 0 <= self.claims["report"].min() <= self.claims["report"].max() < len(
+            self.witnesses
+        ):
+            raise MergerError(f"claims of {self.claims['report'].max() + 1} witnesses, there are {len(self.witnesses)}")
+
+    def is_fresh(self, report: Report) -> bool:
+        """Whether the vehicle has not voted in the closed windows of the last half hour."""
+        return report.received_ns - self.voters.get(report.vehicle, -(1 << 62)) >= ANOTHER_DRIVE_S * _NS_PER_S
+
+    def support_rows(self, voxels: I32, epoch: Gaussians, day: int) -> Rows:
+        """STATEMENT rows that stand for what the present state of some voxels is worth on a day; `report` is -1."""
+        at = find(self.voxels["voxel_id"], voxels)
+        known = self.voxels[at[at >= 0]]
+        age_days = np.maximum(day - known["day"].astype(np.int64), 0)
+        support = np.minimum(known["observers"], SUPPORT_MOST) * 0.5 ** (age_days / HALF_LIFE_DAYS)
+        said = states_at(epoch, voxels[at >= 0], Kind.QUOTED)
+        said["was"] = np.where(said["kind"] == Kind.QUOTED, EPOCH, 0)
+        said["report"] = -1
+        turns = [np.clip(support - turn, 0.0, 1.0) for turn in range(int(np.ceil(SUPPORT_MOST)))]
+        rows = np.concatenate([said] * len(turns)) if turns else said[:0]
+        rows["weight"] = np.concatenate(turns) if turns else 0.0
+        spoken: Rows = rows[rows["weight"] > 0.0]
+        return spoken
+
+    def claims_beside(self, reports: Sequence[Report]) -> Rows:
+        """The claims that vote beside the reports of a window: not those of a vehicle that speaks again within half an
+        hour about the same voxel, which replaces its earlier word.
+        """
+        again = {one.vehicle for one in reports if one.vehicle and not self.is_fresh(one)}
+        if not again or not len(self.claims):
+            return self.claims
+        stays = np.ones(len(self.claims), bool)
+        for vehicle in again:
+            own = [k for k, one in enumerate(self.witnesses) if one.vehicle == vehicle]
+            observed = [one.change.observed for one in reports if one.vehicle == vehicle]
+            seen = np.isin(self.claims["voxel_id"], np.concatenate(observed))
+            stays &= ~(seen & np.isin(self.claims["report"], own))
+        kept: Rows = self.claims[stays]
+        return kept
+
+    def encode(self) -> bytes:
+        """Bytes for the store: a head in JSON, the columns of voxels, the claims; zstd."""
+        head = json.dumps(
+            {
+                "format": _FORMAT,
+                "voxels": len(self.voxels),
+                "claims": len(self.claims),
+                "witnesses": [_told(one) for one in self.witnesses],
+                "voters": dict(self.voters),
+            }
+        ).encode()
+        columns = [np.ascontiguousarray(self.voxels[name]).tobytes() for name in ("observers", "last", "day")]
+        ids = np.diff(self.voxels["voxel_id"], prepend=np.int32(0)).astype("<i4").tobytes()
+        parts = [len(head).to_bytes(4, "little"), head, ids, *columns, self.claims.tobytes()]
+        return zstandard.ZstdCompressor(level=_LEVEL).compress(b"".join(parts))
+
+    @classmethod
+    def decode(cls, body: bytes) -> "TileMemory":
+        """The memory in `body`.
+
+        Raises:
+            MergerError: it is damaged or of another format.
+        """
+        try:
+            data = zstandard.ZstdDecompressor().decompress(body)
+            at = 4 + int.from_bytes(data[:4], "little")
+            head = json.loads(data[4:at])
+            if head["format"] != _FORMAT:
+                raise MergerError(f"a memory of format {head['format']}, this release reads {_FORMAT}")
+            n, rest = head["voxels"], memoryview(data)[at:]
+            voxels = np.zeros(n, VOXEL)
+            voxels["voxel_id"] = np.cumsum(np.frombuffer(rest[: 4 * n], "<i4"))
+            first = 4 * n
+            for name in ("observers", "last", "day"):
+                size = VOXEL[name].itemsize * n
+                voxels[name] = np.frombuffer(rest[first : first + size], VOXEL[name])
+                first += size
+            claims = np.frombuffer(rest[first:], STATEMENT, head["claims"]).copy()
+            return cls(voxels, claims, tuple(Witness(**one) for one in head["witnesses"]), head["voters"])
+        except (ValueError, KeyError, TypeError, zstandard.ZstdError) as error:
+            raise MergerError(f"a memory of {len(body)} bytes cannot be read: {error}") from error
+
+
+def _told(witness: Witness) -> dict[str, Any]:
+    return {name: getattr(witness, name) for name in Witness.__slots__}

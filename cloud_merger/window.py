@@ -1,0 +1,246 @@
+"""A window of a tile's journal: merged while it is open, folded into the next epoch when it is closed.
+
+A pure function of the tile's state before it and of the set of its reports: any order of work, any crash and any number
+of shards end in the same map, bit for bit, and `cloud_merger.verify` computes any version anew.
+"""
+
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any, Final
+from zlib import crc32
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cloud_merger.belief import Believed, ShiftTests, believed
+from cloud_merger.confirmation import ConfirmationParameters, GatedTile, gate
+from cloud_merger.memory import (
+    ANOTHER_DRIVE_S,
+    CLAIMS_OF_VEHICLE,
+    CLAIMS_OF_VOXEL,
+    MOST_OBSERVERS,
+    VOXEL,
+    TileMemory,
+)
+from cloud_merger.merge import MergeParameters, merge_tile
+from cloud_merger.statements import EPOCH, Report, Rows, Statements, Witness, find, statements_of
+from gnd_map.codec import Lattice, snap
+from gnd_map.day import day_of
+from gnd_map.gaussian import Gaussians
+
+I32 = NDArray[np.int32]
+
+MOST_CLAIMS: Final = 20_000
+"""Of a tile; the newest stay."""
+_DENSE: Final = 8_000_000
+_NS_PER_S: Final = 1_000_000_000
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class TileState:
+    """What a tile's closed windows have come to: the Gaussians that the next window is merged into, and the memory."""
+
+    gaussians: Gaussians
+    memory: TileMemory
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class MergedWindow:
+    """What a window gives.
+
+    Attributes:
+        believed: its reports, sorted out.
+        statements: of those that are believed, and of the memory.
+        gated: the tile as it may be published, and what waits.
+        gaussians: of that tile, on its lattice.
+    """
+
+    believed: Believed
+    statements: Statements
+    gated: GatedTile
+    gaussians: Gaussians
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class WindowMerger:
+    """Merges windows of one tile (GND section 5).
+
+    Attributes:
+        rules: how statements become changes.
+        confirmation: what a single vehicle may change.
+        shifts: tests of reports, each made once.
+        bases: Gaussians by content hash of the versions that the reports refer to.
+        named: vehicles whose reports are shifted again and again.
+    """
+
+    rules: MergeParameters
+    confirmation: ConfirmationParameters
+    shifts: ShiftTests
+    bases: Mapping[bytes, Gaussians]
+    named: frozenset[str]
+
+    def merge(self, state: TileState, reports: Sequence[Report], lattice: Lattice | None) -> MergedWindow:
+        """Merge the reports of a window, in any order, into what the windows before it have come to.
+
+        `lattice`: on which the tile lies; None: none.
+        """
+        rules, named = self.rules, self.named
+        if rules.mode == "paper":  # it knows neither shift tests nor a gate nor a memory
+            in_play = Believed(tuple(reports), (), ())
+            statements = statements_of(state.gaussians, reports, self.bases, "paper")
+            gated = GatedTile(merge_tile(state.gaussians, statements, rules))
+        else:
+            shifts = {one.report_id: self.shifts.of(one, self.bases) for one in reports}
+            in_play = believed(reports, shifts, self.shifts.parameters, named)
+            statements = statements_of(state.gaussians, in_play.reports, self.bases, "default", state.memory)
+            merged = merge_tile(state.gaussians, statements, rules)
+            by, seen = statements.witnesses, in_play.reports
+            found = gate(state.gaussians, merged, seen, self.confirmation, named, witnesses=by)
+            gated = GatedTile(found.merged, (*found.waiting, *in_play.set_aside))
+        gaussians = gated.merged.gaussians
+        return MergedWindow(in_play, statements, gated, gaussians if lattice is None else snap(gaussians, lattice))
+
+
+def provenance_of(windows: Iterable[MergedWindow]) -> dict[int, tuple[str, ...]]:
+    """The reports of each voxel that windows, one after the other, have changed: those of its last change."""
+    found: dict[int, tuple[str, ...]] = {}
+    for window in windows:
+        found |= window.gated.merged.provenance
+    return found
+
+
+def fold(state: TileState, window: MergedWindow) -> TileState:
+    """The state after a window that is closed: settled evidence as the epoch and its support, the rest as claims."""
+    rows, merged = window.statements.rows, window.gated.merged
+    is_changed = find(merged.changed, rows["voxel_id"]) >= 0
+    for_change = merged.for_change if len(merged.for_change) else np.zeros(len(rows), bool)
+    for_epoch = merged.for_epoch if len(merged.for_epoch) else np.zeros(len(rows), bool)
+    agrees = np.where(is_changed, for_change, for_epoch)
+    reports = window.believed.reports
+    n = len(window.statements.reports)
+    fresh = np.array([state.memory.is_fresh(one) for one in window.statements.reports] + [False], bool)
+    is_fresh = np.append(fresh[:n], False)[np.where((rows["report"] >= 0) & (rows["report"] < n), rows["report"], n)]
+    claims, witnesses = _claims_left(window.statements, agrees, is_fresh & agrees, is_changed)
+    voxels = _observed(state.memory, window, merged.changed, agrees)
+    return TileState(window.gaussians, TileMemory(voxels, claims, witnesses, _voters(state.memory, reports)))
+
+
+def _claims_left(
+    statements: Statements, agrees: NDArray[np.bool_], confirms: NDArray[np.bool_], is_changed: NDArray[np.bool_]
+) -> tuple[Rows, tuple[Witness, ...]]:
+    """Claims against what the tile holds now, of each voxel the newest: each confirmation takes the oldest away."""
+    rows, who = statements.rows, _voters_of(statements)
+    at = np.flatnonzero(rows["claim"] & ~agrees & (rows["report"] >= 0))
+    if not len(at):
+        return rows[:0], ()
+    order = sorted(range(len(who)), key=lambda k: (who[k].received_ns, who[k].report_id, k))
+    rank = np.empty(len(who), np.int64)
+    rank[order] = np.arange(len(who))
+    at = at[np.lexsort((-rank[rows["report"][at]], rows["voxel_id"][at]))]  # by voxel, the newest first
+    number = {vehicle: k for k, vehicle in enumerate(dict.fromkeys(one.vehicle for one in who))}
+    vehicle = np.array([number[one.vehicle] if one.vehicle else len(number) + k for k, one in enumerate(who)])
+    voxel = rows["voxel_id"][at].astype(np.int64)
+    voter = voxel * (len(number) + len(who)) + vehicle[rows["report"][at]]
+    at = at[_turn(voter) < CLAIMS_OF_VEHICLE]
+    voxel_id = rows["voxel_id"][at]
+    confirmed, n = np.unique(rows["voxel_id"][confirms], return_counts=True)
+    cancelled = np.append(n, 0)[find(confirmed.astype(np.int32), voxel_id)]
+    claimed = np.bincount(np.unique(voxel_id, return_inverse=True)[1])[np.unique(voxel_id, return_inverse=True)[1]]
+    stays = _turn(voxel_id.astype(np.int64)) < np.minimum(claimed - cancelled, CLAIMS_OF_VOXEL)
+    at = at[stays]
+    if len(at) > MOST_CLAIMS:
+        at = at[np.sort(np.argsort(-rank[rows["report"][at]], kind="stable")[:MOST_CLAIMS])]
+    at = at[np.lexsort((rank[rows["report"][at]], rows["voxel_id"][at]))]
+    claims: Rows = rows[at].copy()
+    claims["denies"] &= ~is_changed[at]
+    claims["was"] = np.where((claims["was"] == EPOCH) & ~is_changed[at], EPOCH, 0)
+    kept, claims["report"] = np.unique(claims["report"], return_inverse=True)
+    return claims, tuple(_witness(who[k]) for k in kept.tolist())
+
+
+def _voters_of(statements: Statements) -> list[Report | Witness]:
+    return [*statements.reports, *statements.witnesses]
+
+
+def _turn(key: NDArray[np.int64]) -> NDArray[np.int64]:
+    """(N,) how many rows with the same key come before each row."""
+    order = np.argsort(key, kind="stable")
+    first = np.append(True, key[order][1:] != key[order][:-1])[: len(key)]
+    start = np.maximum.accumulate(np.where(first, np.arange(len(key)), 0))
+    turn = np.empty(len(key), np.int64)
+    turn[order] = np.arange(len(key)) - start
+    return turn
+
+
+def _witness(one: Report | Witness) -> Witness:
+    return Witness(*(getattr(one, name) for name in Witness.__slots__))
+
+
+def _observed(memory: TileMemory, window: MergedWindow, changed: I32, agrees: NDArray[np.bool_]) -> NDArray[Any]:
+    """The remembered voxels after the window: who confirmed what the tile holds now, and when it was last observed."""
+    rows, reports = window.statements.rows, window.statements.reports
+    disputed = np.unique(rows["voxel_id"])
+    own = [rows["report"] == k for k in range(len(reports))]
+    seen = [one.change.observed for one in reports]
+    confirmed = [
+        np.concatenate([ids[find(disputed, ids) < 0], rows["voxel_id"][mine & agrees]])
+        for ids, mine in zip(seen, own, strict=True)
+    ]
+    every = np.concatenate([memory.voxels["voxel_id"], *seen, np.zeros(0, np.int32)])
+    table = _Table(np.unique(every).astype(np.int32) if len(every) else np.zeros(0, np.int32))
+    found = np.zeros(len(table.voxel_id), VOXEL)
+    found["voxel_id"] = table.voxel_id
+    found[table.at(memory.voxels["voxel_id"])] = memory.voxels
+    found["observers"][table.at(changed)] = 0  # another state, confirmed by nobody before this window
+    observers = found["observers"].astype(np.int64)
+    for one, ids in sorted(_by_vehicle(reports, confirmed), key=lambda pair: pair[0].turn):
+        at = table.at(ids)
+        mark = np.uint16(crc32(one.vehicle.encode()) & 0xFFFF)
+        is_new = (found["last"][at] != mark) | (observers[at] == 0)
+        if not memory.is_fresh(one):
+            is_new &= observers[at] == 0  # its vote of half an hour ago
+        observers[at[is_new]] += 1
+        found["last"][at] = mark
+    found["observers"] = np.minimum(observers, MOST_OBSERVERS)
+    for one, ids in zip(reports, seen, strict=True):
+        at = table.at(ids)
+        found["day"][at] = np.maximum(found["day"][at], day_of(one.last_ns))
+    return found
+
+
+def _by_vehicle(reports: Sequence[Report], confirmed: Sequence[I32]) -> Iterable[tuple[Report, I32]]:
+    """Of each vehicle its newest report and all voxels that any of its reports confirms."""
+    of: dict[str, list[int]] = {}
+    for k, one in enumerate(reports):
+        of.setdefault(one.vehicle or one.report_id, []).append(k)
+    for own in of.values():
+        ids = confirmed[own[0]] if len(own) == 1 else np.unique(np.concatenate([confirmed[k] for k in own]))
+        yield max((reports[k] for k in own), key=lambda one: one.turn), ids
+
+
+class _Table:
+    """Rows of sorted voxel ids by number: a dense table where they lie close together, as those of a tile do."""
+
+    def __init__(self, voxel_id: I32) -> None:
+        self.voxel_id = voxel_id
+        self._low = int(voxel_id[0]) if len(voxel_id) else 0
+        width = int(voxel_id[-1]) - self._low + 1 if len(voxel_id) else 0
+        self._row = None if width > _DENSE else np.zeros(width, np.int32)
+        if self._row is not None:
+            self._row[voxel_id - self._low] = np.arange(len(voxel_id))
+
+    def at(self, ids: I32) -> NDArray[np.int64]:
+        """Row of each id, all of which are here."""
+        if self._row is None:
+            return np.searchsorted(self.voxel_id, ids)
+        return self._row[ids - self._low].astype(np.int64)
+
+
+def _voters(memory: TileMemory, reports: Sequence[Report]) -> dict[str, int]:
+    """Who voted within the last half hour of the window, and when."""
+    voters = dict(memory.voters)
+    for one in reports:
+        if one.vehicle:
+            voters[one.vehicle] = max(one.received_ns, voters.get(one.vehicle, one.received_ns))
+    since_ns = max(voters.values(), default=0) - round(ANOTHER_DRIVE_S * _NS_PER_S)
+    return {vehicle: at_ns for vehicle, at_ns in sorted(voters.items()) if at_ns > since_ns}

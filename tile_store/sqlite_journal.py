@@ -1,0 +1,161 @@
+"""The journal of a tile in SQLite: numbers, windows and memories. Each function runs inside the caller's transaction.
+
+The assignment of a report to a window is made once, with the write that makes the report durable, and stored: whatever
+clocks, crashes and batches do afterwards, the map is a function of what stands here.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any, Final
+
+import apsw
+
+from gnd_map.features import is_feature_layer
+from gnd_map.tile_id import TileId
+from tile_store.sqlite_connection import change, fetch
+from tile_store.values import Basis, ReportRow, StoreConfig, StoredMemory, WindowCounts
+
+NO_WINDOWS: Final = 0
+"""The window of reports of feature layers, and of those that are older than the journal."""
+_NS_PER_S: Final = 1_000_000_000
+
+
+@dataclass(frozen=True, slots=True)
+class Entry:
+    """Where a report goes in its tile's journal; `opens`: it is the first of its window."""
+
+    seq: int
+    window: int
+    opened_ns: int | None
+    opens: bool
+
+    @property
+    def columns(self) -> dict[str, Any]:
+        """As the statements name them."""
+        return {"seq": self.seq, "window": self.window, "opened_ns": self.opened_ns}
+
+
+def next_entry(c: apsw.Connection, row: ReportRow, config: StoreConfig) -> Entry:
+    """The place of a new report: in the open window, or in a new one where that is old or full."""
+    place = {"layer": row.layer, "tile": row.tile.morton}
+    seq, window, opened_ns = _journal(c, place)
+    if is_feature_layer(row.layer):
+        return Entry(seq + 1, NO_WINDOWS, None, opens=False)
+    if opened_ns is None:
+        return Entry(seq + 1, max(window, 1), row.received_ns, opens=True)
+    if row.received_ns - opened_ns >= config.window_s * _NS_PER_S or _is_full(c, place, window, row.vehicle, config):
+        return Entry(seq + 1, window + 1, row.received_ns, opens=True)
+    return Entry(seq + 1, window, opened_ns, opens=False)
+
+
+def _is_full(c: apsw.Connection, place: dict[str, Any], window: int, vehicle: str, config: StoreConfig) -> bool:
+    """Whether the window takes no report of this vehicle any more. One that has a vote in it may say more, so none can
+    close a window by talking; the bound on reports only limits the work of one merge.
+    """
+    reports, vehicles, is_known = fetch(c, "window_size", place | {"window": window, "vehicle": vehicle})[0]
+    return reports >= config.window_reports or (vehicles >= config.window_vehicles and not is_known)
+
+
+def put(c: apsw.Connection, layer: str, tile: TileId, entry: Entry) -> None:
+    """Enter it."""
+    change(c, "put_journal", {"layer": layer, "tile": tile.morton} | entry.columns)
+
+
+def mark(c: apsw.Connection, layer: str, tile: TileId) -> int:
+    """The number of an entry without a report: something else has changed what the tile's merge gives."""
+    place = {"layer": layer, "tile": tile.morton}
+    seq, window, opened_ns = _journal(c, place)
+    change(c, "put_journal", place | {"seq": seq + 1, "window": window, "opened_ns": opened_ns})
+    return seq + 1
+
+
+def begin_epoch(c: apsw.Connection, layer: str, tile: TileId, version: int) -> None:
+    """A base or a rollback: what was merged counts no more, what was not goes into the new window."""
+    place = {"layer": layer, "tile": tile.morton}
+    if is_feature_layer(layer) or not fetch(c, "journal", place):
+        return  # nobody has reported about it, or it has no windows
+    seq, window, _ = _journal(c, place)
+    change(c, "forget_memory", place)
+    moved = change(c, "move_waiting", place | {"window": window + 1})
+    opened_ns = fetch(c, "oldest_of_window", place | {"window": window + 1})[0][0] if moved else None
+    change(c, "put_journal", place | {"seq": seq, "window": window + 1, "opened_ns": opened_ns})
+    change(c, "put_basis", place | {"version": version, "window": window + 1, "seq": seq, "named": ""})
+
+
+def basis_of(c: apsw.Connection, layer: str, tile: TileId, version: int) -> Basis | None:
+    """What a version was made of; None: it is older than the journal, or the tile's first base."""
+    rows = fetch(c, "basis", {"layer": layer, "tile": tile.morton, "version": version})
+    return Basis(rows[0][0], rows[0][1], _names(rows[0][2])) if rows else None
+
+
+def first_window(c: apsw.Connection, layer: str, tile: TileId, epoch: int) -> int:
+    """The window with which the epoch begins."""
+    basis = basis_of(c, layer, tile, epoch)
+    return NO_WINDOWS if basis is None else basis.window
+
+
+def memory_of(c: apsw.Connection, layer: str, tile: TileId, epoch: int) -> StoredMemory | None:
+    """What the closed windows since the epoch have come to; None: none has been folded."""
+    rows = fetch(c, "memory", {"layer": layer, "tile": tile.morton, "epoch": epoch})
+    return StoredMemory(*rows[0]) if rows else None
+
+
+def folded(c: apsw.Connection, layer: str, tile: TileId, epoch: int) -> int:
+    """The newest folded window; the one before the epoch's first where none is."""
+    rows = fetch(c, "folded_window", {"layer": layer, "tile": tile.morton, "epoch": epoch})
+    return int(rows[0][0]) if rows else first_window(c, layer, tile, epoch) - 1
+
+
+def keep(
+    c: apsw.Connection,
+    layer: str,
+    tile: TileId,
+    epoch: int,
+    memory: StoredMemory,
+    closed: Sequence[tuple[int, frozenset[str]]],
+) -> None:
+    """The result of folding windows, and which vehicles were named when that was done."""
+    place = {"layer": layer, "tile": tile.morton}
+    columns = {name: getattr(memory, name) for name in StoredMemory.__slots__}
+    change(c, "put_memory", place | columns | {"epoch": epoch})
+    for window, named in closed:
+        change(c, "put_closed_window", place | {"window": window, "named": _text(named)})
+
+
+def put_basis(c: apsw.Connection, layer: str, tile: TileId, version: int, basis: Basis) -> None:
+    """What a merged version was made of."""
+    place = {"layer": layer, "tile": tile.morton, "version": version}
+    change(c, "put_basis", place | {"window": basis.window, "seq": basis.seq, "named": _text(basis.named)})
+
+
+def closed_windows(c: apsw.Connection, layer: str, tile: TileId) -> dict[int, frozenset[str]]:
+    """Of each folded window the vehicles that were named when it was."""
+    rows = fetch(c, "closed_windows", {"layer": layer, "tile": tile.morton})
+    return {window: _names(named) for window, named in rows}
+
+
+def windows(c: apsw.Connection) -> list[WindowCounts]:
+    """The open window of each tile that anybody has reported about."""
+    return [WindowCounts(layer, TileId(tile), *rest) for layer, tile, *rest in fetch(c, "windows")]
+
+
+def newest(c: apsw.Connection, layer: str, tile: TileId) -> Entry:
+    """The newest entry."""
+    return Entry(*_journal(c, {"layer": layer, "tile": tile.morton}), opens=False)
+
+
+def _journal(c: apsw.Connection, place: dict[str, Any]) -> tuple[int, int, int | None]:
+    """(newest number, open window, since when) of a tile; nobody has reported about it: (0, 0, None)."""
+    rows = fetch(c, "journal", place)
+    if rows:
+        return rows[0][0], rows[0][1], rows[0][2]
+    older = fetch(c, "newest_entry", place)[0][0]  # of before there was a journal
+    return older or 0, NO_WINDOWS, None
+
+
+def _text(names: frozenset[str]) -> str:
+    return " ".join(sorted(names))  # pseudonyms hold no space
+
+
+def _names(text: str) -> frozenset[str]:
+    return frozenset(text.split())
