@@ -2,6 +2,7 @@
 
 import logging
 import threading
+from contextlib import ExitStack
 from typing import Final
 
 from cloud_merger.announce import Announcer
@@ -9,6 +10,7 @@ from cloud_merger.config import ShardConfig
 from cloud_merger.features.kept import FeatureInbox
 from cloud_merger.ingest import Ingest
 from cloud_merger.leases import Leases
+from cloud_merger.metrics import ShardMetrics
 from cloud_merger.ownership import Members
 from cloud_merger.reception import Reception
 from cloud_merger.short_reports import ShortReports
@@ -16,20 +18,28 @@ from cloud_merger.warm import warm_up
 from cloud_merger.work import Worker
 from fleet_bus.bus import open_bus
 from fleet_bus.config import BusConfig
+from fleet_bus.health import HealthServer
 from tile_store.errors import StoreClosed, StoreError
+from tile_store.metrics import store_checks
 from tile_store.sqlite_store import SqliteStore
+from tile_store.values import Claim
 
 __all__ = ["ShardConfig", "run_shard"]
 STORE_RETRY_S: Final = 1.0
 _LOG = logging.getLogger(__name__)
 
 
-def run_shard(config: ShardConfig, stop: threading.Event) -> None:
+def run_shard(config: ShardConfig, stop: threading.Event, metrics_at: tuple[str, int] | None = None) -> None:
     """Run one merger shard until `stop` is set.
 
     Any number of shards may share a store. What one leaves undone, when it ends or is killed, another does.
 
     A store that fails (a full disk, another process that holds it for too long) is tried again until it works.
+
+    Args:
+        config: its settings.
+        stop: ends it.
+        metrics_at: host and port at which it shows its metrics and its health; None: nowhere.
 
     Raises:
         StoreError: the store cannot be opened.
@@ -41,7 +51,12 @@ def run_shard(config: ShardConfig, stop: threading.Event) -> None:
         SqliteStore(config.store_path, config.store, create=False) as store,
         open_bus(bus_config, name=config.shard_id) as bus,
         Leases(store, config.shard_id, config.lease_s) as leases,
+        ExitStack() as stack,
     ):
+        metrics = ShardMetrics()
+        if metrics_at is not None:
+            host, port = metrics_at
+            stack.enter_context(HealthServer(port, metrics.registry, store_checks(store, bus), host=host))
         members = Members(config.shard_id)
         wake = threading.Event()
 
@@ -55,19 +70,27 @@ def run_shard(config: ShardConfig, stop: threading.Event) -> None:
 
         worker, announcer = Worker(store, config), Announcer(store, bus, members)
         while not stop.is_set():
+            claims: list[Claim] = []
             try:
                 claims = store.claim(config.shard_id, config.tiles_at_once, config.lease_s, prefer=reception.districts)
                 leases.hold(claims)
                 for claim in claims:
                     if not stop.is_set():
-                        worker.settle(claim)  # load, decode, cluster, decide, publish by compare-and-swap
+                        with metrics.merging():  # load, decode, cluster, decide, publish by compare-and-swap
+                            result = worker.settle(claim)
+                        metrics.settled(result)
                     leases.drop(claim)
-                    announcer.announce(config.announce_at_once)  # after the commit
-                if not claims and not announcer.announce(config.announce_at_once):
+                    metrics.announced(announcer.announce(config.announce_at_once))  # after the commit
+                n_announced = announcer.announce(config.announce_at_once)
+                metrics.announced(n_announced)
+                if not claims and not n_announced:
                     wake.wait(worker.idle_s(store.ready_in_s()))
                     wake.clear()
             except StoreClosed:
                 raise
             except StoreError as error:
+                metrics.store_failed()
                 _LOG.error("%s: the store has failed, next try in %.0f s: %s", config.shard_id, STORE_RETRY_S, error)
+                for claim in claims:
+                    leases.drop(claim)  # they run out, and whoever can work then has them
                 stop.wait(STORE_RETRY_S)

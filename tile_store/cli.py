@@ -11,15 +11,19 @@ from pathlib import Path
 from types import FrameType
 
 import click
+from prometheus_client import CollectorRegistry
 
 from fleet_bus.bus import open_bus
 from fleet_bus.config import DEFAULT_ENDPOINT, BusConfig
+from fleet_bus.health import HealthServer
+from fleet_bus.health_options import metrics_options
 from fleet_bus.router import wait_for_stop
 from tile_store import tables, upkeep_cli
 from tile_store.arguments import parse_tile, parse_time_ns, parse_versions
 from tile_store.compare import MapDiff, layer_info, layer_totals, map_diff, version_diff
 from tile_store.errors import StoreError
 from tile_store.export import FORMATS, export_map
+from tile_store.metrics import StoreCollector, store_checks
 from tile_store.options import PATH, existing, json_option, layer_option, region_option, show, to_read
 from tile_store.server import TileServer
 from tile_store.sqlite_store import SqliteStore
@@ -33,7 +37,8 @@ __all__ = ["PATH", "json_option", "layer_option", "map_group", "region_option", 
 @click.option("--path", required=True, type=PATH, help="The store; `gnd map build` makes one.")
 @click.option("--connect", multiple=True, default=(DEFAULT_ENDPOINT,), show_default=True, help="Endpoint of a router.")
 @click.option("--workers", default=4, show_default=True, type=click.IntRange(1, 64), help="Threads that answer.")
-def store(path: Path, connect: tuple[str, ...], workers: int) -> None:
+@metrics_options
+def store(path: Path, connect: tuple[str, ...], workers: int, metrics_port: int | None, metrics_host: str) -> None:
     """Run the tile server until Ctrl-C: it answers the vehicles' tile and catalog queries."""
     stop = threading.Event()
 
@@ -43,7 +48,16 @@ def store(path: Path, connect: tuple[str, ...], workers: int) -> None:
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, end)
     config = BusConfig(connect=connect)
-    with existing(path) as opened, open_bus(config, name="store") as bus, TileServer(opened, bus, workers=workers):
+    with (
+        existing(path) as opened,
+        open_bus(config, name="store") as bus,
+        TileServer(opened, bus, workers=workers),
+        ExitStack() as stack,
+    ):
+        if metrics_port is not None:
+            registry = CollectorRegistry()
+            registry.register(StoreCollector(opened))
+            stack.enter_context(HealthServer(metrics_port, registry, store_checks(opened, bus), host=metrics_host))
         counts = opened.counts()
         click.echo(f"tile server: {counts.tiles} tiles of {path} at {', '.join(connect)}; Ctrl-C ends it")
         wait_for_stop(stop)

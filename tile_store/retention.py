@@ -42,6 +42,8 @@ def retain(
     keep_versions: int | None = None,
     keep_days: float | None = None,
     quarantine_mb: float | None = None,
+    *,
+    folded: bool = False,
 ) -> Retained:
     """Remove what is beyond the bounds; None: no bound.
 
@@ -53,13 +55,15 @@ def retain(
         keep_versions: so many of the newest versions of each tile stay.
         keep_days: reports that count no more and refused messages stay so long after receipt.
         quarantine_mb: of the newest refused messages so much stays.
+        folded: reports that are folded into the memory of their tile count no more, either: the map stays as it is, but
+            the versions made of them cannot be computed anew.
     """
     if (keep_days is not None and keep_days < 0) or (quarantine_mb is not None and quarantine_mb < 0):
         raise StoreError(f"keep days {keep_days} and quarantine {quarantine_mb} MB must not be negative")
     reports: list[int] = []
     refused: list[int] = []
     if keep_days is not None:
-        reports += _older_than(store, "forget_reports", keep_days)
+        reports += _older_than(store, "forget_reports", keep_days, folded=folded)
         refused += _older_than(store, "forget_old_quarantined", keep_days)
     trimmed = (0, 0)
     if quarantine_mb is not None:
@@ -84,11 +88,11 @@ def trim_quarantine(c: apsw.Connection, max_bytes: int) -> tuple[int, int]:
     return before[0] - after[0], before[1] - after[1]
 
 
-def _older_than(store: Collectable, statement: str, days: float) -> list[int]:
+def _older_than(store: Collectable, statement: str, days: float, **more: bool) -> list[int]:
     sizes: list[int] = []
     while True:
         page = store.transact(
-            lambda c, now: fetch(c, statement, {"before": now - round(days * NS_A_DAY), "n": ROWS_AT_ONCE})
+            lambda c, now: fetch(c, statement, {"before": now - round(days * NS_A_DAY), "n": ROWS_AT_ONCE} | more)
         )
         sizes += [size for (size,) in page]
         if len(page) < ROWS_AT_ONCE:

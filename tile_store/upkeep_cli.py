@@ -79,10 +79,16 @@ def check(context: click.Context, path: Path, all_versions: bool, as_json: bool)
 @click.option(
     "--keep-days", type=click.FloatRange(0.0), help="So long reports that count no more and refused ones stay."
 )
+@click.option("--folded", is_flag=True, help="With --keep-days: old reports, too, that are folded into the map.")
 @click.option("--quarantine-mb", type=click.FloatRange(0.0), help="So much of the newest refused messages stays.")
 @json_option
 def gc(
-    path: Path, keep_versions: int | None, keep_days: float | None, quarantine_mb: float | None, as_json: bool
+    path: Path,
+    keep_versions: int | None,
+    keep_days: float | None,
+    folded: bool,
+    quarantine_mb: float | None,
+    as_json: bool,
 ) -> None:
     """Remove old versions, old reports and old refused messages.
 
@@ -91,7 +97,7 @@ def gc(
     if (keep_versions, keep_days, quarantine_mb) == (None, None, None):
         raise StoreError("gc: give --keep-versions N, --keep-days D or --quarantine-mb N; nothing was removed")
     with existing(path) as opened:
-        removed = retain(opened, keep_versions, keep_days, quarantine_mb)
+        removed = retain(opened, keep_versions, keep_days, quarantine_mb, folded=folded)
     line = (
         f"{path}: {removed.versions} versions removed, {removed.version_bytes / 1e6:.2f} MB; {removed.reports} report"
         f" parts, {removed.report_bytes / 1e6:.2f} MB; {removed.quarantined} refused messages,"

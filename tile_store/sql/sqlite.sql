@@ -622,10 +622,13 @@ SELECT parent FROM tile_version WHERE layer = :layer AND tile = :tile AND versio
 SELECT sha FROM tile_version WHERE layer = :layer AND tile = :tile AND version = :version
 
 -- name: forget_reports
--- Only those that count no more: consumed before the tile's epoch began.
+-- Only those that count no more: consumed before the tile's epoch began, or, if asked for, folded into its memory.
 DELETE FROM report WHERE arrival IN (
   SELECT r.arrival FROM report AS r JOIN tile_head AS h USING (layer, tile)
-  WHERE r.received_ns < :before AND r.merged_in < h.epoch ORDER BY r.received_ns LIMIT :n)
+    LEFT JOIN tile_memory AS m ON m.layer = r.layer AND m.tile = r.tile AND m.epoch = h.epoch
+  WHERE r.received_ns < :before AND r.merged_in IS NOT NULL
+    AND (r.merged_in < h.epoch OR (:folded AND r.window > 0 AND r.window <= m.window))
+  ORDER BY r.received_ns LIMIT :n)
 RETURNING LENGTH(body)
 
 -- name: forget_old_quarantined
@@ -656,3 +659,11 @@ SELECT body FROM report WHERE arrival = :arrival
 
 -- name: end_of_a_copy
 DELETE FROM queue_boot; DELETE FROM shard
+
+-- name: metrics
+SELECT (SELECT COUNT(*) FROM tile_head), (SELECT COALESCE(MAX(arrival), 0) FROM report),
+       (SELECT COUNT(*) FROM report INDEXED BY report_waiting WHERE merged_in IS NULL),
+       (SELECT COUNT(*) FROM dirty WHERE aside_ns IS NULL), (SELECT COUNT(*) FROM dirty WHERE aside_ns IS NOT NULL)
+
+-- name: touch
+UPDATE quarantine_size SET messages = messages
