@@ -40,6 +40,8 @@ def parse_place(text: str) -> TileId | str:
     if not text.endswith("/"):
         if text.count("/") in (1, 2):
             raise StoreError(f"{text!r} is not a whole path; a region ends in a slash: {text}/")
+        if len(text) in (5, 10, 15) and set(text) <= set("0123"):
+            raise StoreError(f"{text!r} may be the number of a tile; a region ends in a slash: {text}/")
         return parse_tile(text)
     region = text.rstrip("/")
     morton_range(region)

@@ -57,12 +57,16 @@ def show(values: dict[str, Any], as_json: bool, print_it: Callable[[Console], No
 def bars() -> Iterator[Callable[[str, int, int], None]]:
     """A progress bar for each step, on standard error."""
     columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn())
-    with Progress(*columns, console=Console(stderr=True)) as shown:
-        tasks: dict[str, TaskID] = {}
+    shown, tasks = Progress(*columns, console=Console(stderr=True)), dict[str, TaskID]()
 
-        def tell(step: str, done: int, total: int) -> None:
-            if step not in tasks:
-                tasks[step] = shown.add_task(step, total=total)
-            shown.update(tasks[step], completed=done, total=total)
+    def tell(step: str, done: int, total: int) -> None:
+        shown.start()  # only now: what is refused at once shows no bars
+        if step not in tasks:
+            tasks[step] = shown.add_task(step, total=total)
+        shown.update(tasks[step], completed=done, total=total)
 
+    try:
         yield tell
+    finally:
+        if tasks:
+            shown.stop()

@@ -94,6 +94,8 @@ def gc(
 
     Epochs, reports that count and what they cite stay. The file does not shrink: the room is used again.
     """
+    if folded and keep_days is None:
+        raise StoreError("gc: --folded needs --keep-days D; nothing was removed")
     if (keep_versions, keep_days, quarantine_mb) == (None, None, None):
         raise StoreError("gc: give --keep-versions N, --keep-days D or --quarantine-mb N; nothing was removed")
     with existing(path) as opened:

@@ -26,6 +26,7 @@ from tile_store.errors import StoreDamaged, StoreError, StoreUnavailable
 from tile_store.migrations import SCHEMA_VERSION
 from tile_store.retention import Retained, retain
 from tile_store.rollback import Target, plan, roll_back
+from tile_store.sqlite_connection import change
 from tile_store.sqlite_store import SqliteStore
 from tile_store.values import StoreConfig
 
@@ -200,6 +201,22 @@ def merge_once_of_all(store: SqliteStore) -> None:
     store.publish([publication(store.load(claim), 7) for claim in store.claim("m", 10, 10.0)])
 
 
+def test_reports_that_are_folded_go_only_when_asked_for(tmp_path: Path) -> None:
+    clock = Clock()
+    with SqliteStore(tmp_path / "s", EAGER, now_ns=clock, steady_ns=clock) as store:
+        store.put_tiles([tile_of_voxels(TILE, 1), tile_of_voxels(EAST, 1)])
+        store.put_reports([report(1), report(2, EAST)])
+        merge_once_of_all(store)
+        window = store.windows()[0].window
+        memory = {"layer": "ndt", "tile": TILE.morton, "window": window, "epoch": 1, "codec_id": 1}
+        store.transact(lambda c, _now: change(c, "put_memory", memory | {"body": b"", "memory": b""}))
+        store.put_reports([report(3)])
+        clock.advance(10 * DAY_S)
+        assert retain(store, keep_days=9).reports == 0
+        assert retain(store, keep_days=9, folded=True).reports == 1  # EAST is not folded, the newest waits
+        assert [row.report_id for row in store.reports()] == [report(2).report_id, report(3).report_id]
+
+
 def test_the_quarantine_has_a_bound_and_the_oldest_go(tmp_path: Path) -> None:
     clock = Clock()
     config = StoreConfig(quarantine_mb=0.1)
@@ -287,6 +304,8 @@ def test_rollback_on_the_command_line(path: Path) -> None:
     assert "2 of 2 tiles would change" in command("rollback", path, "13033/", "--to", "2001-01-01", "--dry-run")
     assert as_json("rollback", path, TILE.path, "--to", 1)["tiles"][0]["version"] == 3
     assert "0 of 3 tiles would change" in command("rollback", path, "/", "--to", "2199-01-01", "--dry-run")
+    assert "may be the number of a tile" in refused("rollback", path, "13033", "--to", "2001-01-01")
+    assert "--folded needs --keep-days" in refused("gc", path, "--folded")
     assert "goes back to a time" in refused("rollback", path, "13033/", "--to", 1)
     assert "ends in a slash" in refused("rollback", path, "13033/03021", "--to", "2001-01-01")
     assert "give --to" in refused("rollback", path, TILE.path)
