@@ -15,8 +15,11 @@ from tile_store.values import Claim, PutStatus, ReportRow, StoreConfig
 NS_PER_S: Final = 1_000_000_000
 
 
-NEVER: Final = 2**62
-"""When a tile is ready that is set aside."""
+ASIDE_S: Final = 60.0
+"""A tile that is set aside is tried once more after so long, then after twice as long each time, ..."""
+LONGEST_ASIDE_S: Final = 3600.0
+"""... at most after so long: whoever was to blame for it may be gone by then."""
+ATTEMPTS_IN_A_ROW: Final = 5
 
 
 def timing_of(config: StoreConfig, now: int, steady: int) -> dict[str, Any]:
@@ -77,8 +80,8 @@ def claim(c: apsw.Connection, owner: str, n: int, lease_s: float, prefer: Sequen
 
 def _take(c: apsw.Connection, rows: Iterable[Row], owner: str, lease_ns: int) -> list[Claim]:
     claims = [
-        Claim(layer, TileId(tile), seq, owner, secrets.randbits(62), attempts + 1)
-        for layer, tile, seq, attempts in rows
+        Claim(layer, TileId(tile), seq, owner, secrets.randbits(62), attempts + 1, bool(is_aside))
+        for layer, tile, seq, attempts, is_aside in rows
     ]
     for one in claims:
         change(c, "take_lease", _lease(one) | {"owner": owner, "lease_ns": lease_ns})
@@ -93,12 +96,19 @@ def renew(c: apsw.Connection, claims: Iterable[Claim], lease_s: float, steady: i
 
 def begin(c: apsw.Connection, claim: Claim, lease_s: float, steady: int) -> bool:
     """Count an attempt to merge a claimed tile, and prolong its lease; whether it is still held."""
-    return change(c, "begin_merge", _lease(claim) | {"lease_ns": steady + round(lease_s * NS_PER_S)}) == 1
+    times = {"lease_ns": steady + round(lease_s * NS_PER_S), "again_ns": _again_ns(claim, steady)}
+    return change(c, "begin_merge", _lease(claim) | times) == 1
 
 
-def set_aside(c: apsw.Connection, claim: Claim, reason: str, now: int) -> bool:
-    """Free one lease; the tile is not ready until a report arrives or somebody takes it up again."""
-    return change(c, "set_aside", _lease(claim) | {"never": NEVER, "now": now, "reason": reason}) == 1
+def set_aside(c: apsw.Connection, claim: Claim, reason: str, now: int, steady: int) -> bool:
+    """Free one lease; the tile is not ready for long, unless a report arrives or somebody takes it up again."""
+    told = {"again_ns": _again_ns(claim, steady), "now": now, "reason": reason}
+    return change(c, "set_aside", _lease(claim) | told) == 1
+
+
+def _again_ns(claim: Claim, steady: int) -> int:
+    pause_s = ASIDE_S * 2.0 ** min(max(claim.attempts - ATTEMPTS_IN_A_ROW, 0), 10)
+    return steady + round(min(pause_s, LONGEST_ASIDE_S) * NS_PER_S)
 
 
 def take_up_again(c: apsw.Connection, tiles: Iterable[tuple[str, TileId]], steady: int) -> int:

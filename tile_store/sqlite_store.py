@@ -216,7 +216,7 @@ class SqliteStore:
 
     def set_aside(self, claim: Claim, reason: str) -> bool:
         """See `Store.set_aside`."""
-        return self._writer.run(lambda c: inbox.set_aside(c, claim, reason, self._now_ns()))
+        return self._writer.run(lambda c: inbox.set_aside(c, claim, reason, self._now_ns(), self._steady_ns()))
 
     def tiles_set_aside(self) -> list[TileSetAside]:
         """See `Store.tiles_set_aside`."""

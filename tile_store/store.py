@@ -94,7 +94,8 @@ class Store(Protocol):
 
     def set_aside(self, claim: Claim, reason: str) -> bool:
         """Leave a tile that cannot be merged as it is; its reports go on waiting. It is tried again when a report about
-        it arrives, or when somebody takes it up again. False where the lease has gone to another owner.
+        it arrives, when somebody takes it up again, and once after a minute, then ever more seldom. False where the
+        lease has gone to another owner.
         """
 
     def tiles_set_aside(self) -> list[TileSetAside]:

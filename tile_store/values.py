@@ -231,7 +231,8 @@ class HeadLine:
 @dataclass(frozen=True, slots=True)
 class Claim:
     """A lease on a dirty tile. `seq` counts the reports that had arrived, `token` tells this lease from any other,
-    `attempts` says which attempt to merge the tile since it was last published begins with it (1: the first).
+    `attempts` says which attempt to merge the tile since it was last published begins with it (1: the first);
+    `is_retry`: the tile is set aside, and this is one more attempt after a pause.
     """
 
     layer: str
@@ -240,6 +241,7 @@ class Claim:
     owner: str
     token: int = 0
     attempts: int = 1
+    is_retry: bool = False
 
 
 @dataclass(frozen=True, slots=True)

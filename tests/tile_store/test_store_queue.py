@@ -200,7 +200,7 @@ def test_a_tile_set_aside_waits_with_its_reports_until_it_is_taken_up_again(stor
     claim = next(one for one in store.claim("m1", 2, 5.0) if one.tile == TILE)
     assert store.begin(claim, 5.0)
     assert store.set_aside(claim, "a page is damaged")
-    clock.advance(1e6)
+    clock.advance(59.0)
     assert [one.tile for one in store.claim("m1", 2, 5.0)] == [EAST]
     (aside,) = store.tiles_set_aside()
     assert (aside.tile, aside.attempts, aside.reports, aside.reason) == (TILE, 1, 2, "a page is damaged")
@@ -211,6 +211,27 @@ def test_a_tile_set_aside_waits_with_its_reports_until_it_is_taken_up_again(stor
     assert (again.tile, again.attempts, again.seq) == (TILE, 1, 2)
     store.publish([publication(store.load(again), 1)])
     assert (store.tiles_set_aside(), store.counts().waiting) == ([], 1)
+
+
+def test_a_tile_set_aside_is_tried_once_in_a_while_whatever_becomes_of_its_shard(store: Store, clock: Clock) -> None:
+    store.put_reports([report(1)])
+    for attempt in range(1, 6):
+        claim = only_claim(store)
+        assert (claim.attempts, claim.is_retry) == (attempt, False)
+        assert store.begin(claim, 10.0)
+        store.set_aside(claim, "why") if attempt == 5 else store.release("m1")
+    for pause_s in (60.0, 120.0, 240.0):
+        clock.advance(pause_s - 1.0)
+        assert store.claim("m1", 1, 10.0) == []
+        clock.advance(1.0)
+        claim = only_claim(store)
+        assert claim.is_retry
+        assert store.begin(claim, 10.0)
+        store.release("m1")  # it has killed this shard, too: no other is sent after it at once
+    clock.advance(1e5)
+    assert only_claim(store).is_retry
+    (aside,) = store.tiles_set_aside()
+    assert aside.attempts == 8
 
 
 def test_the_next_report_gives_a_tile_set_aside_another_chance(store: Store) -> None:

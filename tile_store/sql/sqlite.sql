@@ -350,12 +350,12 @@ ON CONFLICT (layer, tile) DO UPDATE SET
   aside_reason = NULL
 
 -- name: claimable
-SELECT layer, tile, seq, attempts FROM dirty INDEXED BY dirty_ready
+SELECT layer, tile, seq, attempts, aside_ns IS NOT NULL FROM dirty INDEXED BY dirty_ready
 WHERE ready_ns <= :steady AND (owner IS NULL OR lease_ns <= :steady)
 ORDER BY ready_ns, layer, tile LIMIT :n
 
 -- name: claimable_in_region
-SELECT layer, tile, seq, attempts FROM dirty INDEXED BY dirty_tile
+SELECT layer, tile, seq, attempts, aside_ns IS NOT NULL FROM dirty INDEXED BY dirty_tile
 WHERE ready_ns <= :steady AND (owner IS NULL OR lease_ns <= :steady) AND tile >= :first AND tile < :end
 ORDER BY ready_ns, layer, tile LIMIT :n
 
@@ -363,7 +363,8 @@ ORDER BY ready_ns, layer, tile LIMIT :n
 UPDATE dirty SET owner = :owner, token = :token, lease_ns = :lease_ns WHERE layer = :layer AND tile = :tile
 
 -- name: begin_merge
-UPDATE dirty SET attempts = attempts + 1, lease_ns = :lease_ns
+UPDATE dirty SET attempts = attempts + 1, lease_ns = :lease_ns,
+  ready_ns = CASE WHEN aside_ns IS NULL THEN ready_ns ELSE :again_ns END
 WHERE layer = :layer AND tile = :tile AND token = :token
 
 -- name: renew_lease
@@ -484,7 +485,6 @@ SELECT COUNT(*) FROM dirty WHERE aside_ns IS NULL
 
 -- name: next_ready
 SELECT MIN(CASE WHEN owner IS NULL THEN ready_ns ELSE MAX(ready_ns, lease_ns) END) FROM dirty
-WHERE aside_ns IS NULL
 
 -- name: insert_quarantine
 INSERT INTO quarantine (sha, received_ns, source, reason, times, body)
@@ -567,11 +567,11 @@ SELECT boot FROM queue_boot
 INSERT INTO queue_boot (one, boot) VALUES (1, :boot) ON CONFLICT (one) DO UPDATE SET boot = excluded.boot
 
 -- name: forget_leases
-UPDATE dirty SET owner = NULL, token = NULL, lease_ns = NULL,
-  ready_ns = CASE WHEN aside_ns IS NULL THEN :steady ELSE ready_ns END
+UPDATE dirty SET owner = NULL, token = NULL, lease_ns = NULL, ready_ns = :steady
 
 -- name: set_aside
-UPDATE dirty SET owner = NULL, token = NULL, lease_ns = NULL, ready_ns = :never, aside_ns = :now, aside_reason = :reason
+UPDATE dirty SET owner = NULL, token = NULL, lease_ns = NULL, ready_ns = :again_ns,
+  aside_ns = COALESCE(aside_ns, :now), aside_reason = :reason
 WHERE layer = :layer AND tile = :tile AND token = :token
 
 -- name: tiles_set_aside
