@@ -57,7 +57,8 @@ class Worker:
     def _attempt(self, claim: Claim) -> Publication | None:
         if not self._store.begin(claim, self._config.lease_s):
             return None  # another shard has it
-        if claim.attempts > self._config.max_attempts and not claim.is_retry:  # it may be what killed the shards that claimed it before
+        # It may be what killed the shards that merged it before.
+        if claim.attempts > self._config.max_attempts and not claim.is_retry:
             self._set_aside(claim, "no shard that merged it came to an end")
             return None
         try:
