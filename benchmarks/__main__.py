@@ -26,6 +26,7 @@ NAMES = (
     "gnss-noise",
     "poles",
     "features-merge",
+    "merging",
     "slamcu-step",
     "map-build",
 )

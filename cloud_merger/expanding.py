@@ -95,14 +95,19 @@ def _check_flags(report_id: str, flags: Sequence[Flags]) -> None:
     n = sum(len(one.voxel_id) for one in flags)
     if n > limits.MAX_FLAGS_OF_REPORT:
         raise BadReport(f"report {report_id} flags {n} voxels, the limit is {limits.MAX_FLAGS_OF_REPORT}")
-    ids = [np.concatenate([one.voxel_id, one.base.voxel_id]) for one in flags]
-    floors = [VoxelGrid.of(one.tile_id).unravel(voxel_id)[2] for one, voxel_id in zip(flags, ids, strict=True)]
-    all_floors = np.concatenate(floors)
+    all_floors = np.array([floor for one in flags for floor in _ends(one)], np.int64)
     if len(all_floors) and np.ptp(all_floors) > MAX_FLOORS:
         raise BadReport(
             f"report {report_id} and its bases span floors {all_floors.min()} … {all_floors.max()}, the limit is "
             f"{MAX_FLOORS} floors: such a report is read whole only"
         )
+
+
+def _ends(flags: Flags) -> list[int]:
+    """Lowest and highest floor of the flags and of their base, where there are any: ids ascend floor by floor."""
+    ends = [int(ids[at]) for ids in (flags.voxel_id, flags.base.voxel_id) if len(ids) for at in (0, -1)]
+    grid = VoxelGrid.of(flags.tile_id)
+    return [(voxel_id + grid.nx * grid.ny // 2) // (grid.nx * grid.ny) for voxel_id in ends]
 
 
 def _change(packed: PackedReport, base: Tile, sha: bytes, flags: Flags, observed: NDArray[np.int32]) -> TileChange:
@@ -111,14 +116,21 @@ def _change(packed: PackedReport, base: Tile, sha: bytes, flags: Flags, observed
         tile=base.tile_id,
         base_version=base.version,
         base_sha=sha,
-        observed=np.union1d(observed, flags.voxel_id).astype(np.int32),
-        changed=Gaussians.nothing_at(flags.voxel_id),
+        observed=observed,
+        changed=_nothing_at(flags.voxel_id),
         change_class=flags.change_class,
         evidence=np.zeros((n, 4), np.int32),
         pose_sigma_m=packed.pose_sigma_m,
         pose_sigma_rad=packed.pose_sigma_rad,
         doubt=packed.doubt_of(base.tile_id.morton % limits.MAX_TILES_OF_DISTRICT),
     )
+
+
+def _nothing_at(voxel_id: NDArray[np.int32]) -> Gaussians:
+    """No Gaussian at voxels (N,) whose ids ascend."""
+    n = len(voxel_id)
+    none = np.zeros(n, np.int32)
+    return Gaussians(voxel_id, none, none.copy(), np.zeros((n, 3), np.float32), np.zeros((n, 6), np.float32))
 
 
 def is_askable(change: TileChange) -> NDArray[np.bool_]:

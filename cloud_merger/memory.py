@@ -91,18 +91,20 @@ class TileMemory:
         return spoken
 
     def claims_beside(self, reports: Sequence[Report]) -> Rows:
-        """The claims that vote beside the reports of a window: not those of a vehicle that speaks again within half an
-        hour about the same voxel, which replaces its earlier word.
+        """The claims that vote beside the reports of a window. Where a vehicle speaks again about a voxel, its newest
+        earlier claim stays as that of another drive, unless that was less than half an hour ago: then it is replaced.
         """
-        again = {one.vehicle for one in reports if one.vehicle and not self.is_fresh(one)}
-        if not again or not len(self.claims):
-            return self.claims
         stays = np.ones(len(self.claims), bool)
-        for vehicle in again:
+        for vehicle in {one.vehicle for one in reports if one.vehicle}:
             own = [k for k, one in enumerate(self.witnesses) if one.vehicle == vehicle]
-            observed = [one.change.observed for one in reports if one.vehicle == vehicle]
-            seen = np.isin(self.claims["voxel_id"], np.concatenate(observed))
-            stays &= ~(seen & np.isin(self.claims["report"], own))
+            if own:
+                speaks = [one for one in reports if one.vehicle == vehicle]
+                again = np.isin(self.claims["voxel_id"], np.concatenate([one.change.observed for one in speaks]))
+                again &= np.isin(self.claims["report"], own)
+                at = np.flatnonzero(again)  # by voxel, the newest last
+                voxel = self.claims["voxel_id"][at]
+                newest = np.append(voxel[1:] != voxel[:-1], True)[: len(at)]
+                stays[at[~newest] if all(map(self.is_fresh, speaks)) else at] = False
         kept: Rows = self.claims[stays]
         return kept
 

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cloud_merger.cluster import Index, dbscan
+from cloud_merger.merge_kernels import clusters_of
 from cloud_merger.parameters import MergeParameters
 from cloud_merger.statements import EPOCH, Kind, Rows, Statements, find, states_at
 from gnd_map.gaussian import Gaussians
@@ -80,6 +81,11 @@ def _clusters(rows: Rows, parameters: MergeParameters) -> Index:
     """GND 5.1: the cluster of each statement, numbered by voxel, then by the cluster's first report; -1 is noise, and
     what is withheld.
     """
+    return clusters_of(rows, parameters) if parameters.mode == "default" else plain_clusters(rows, parameters)
+
+
+def plain_clusters(rows: Rows, parameters: MergeParameters) -> Index:
+    """The same over arrays of all pairs: for "paper" mode, and the twin of `clusters_of`."""
     shown = rows["kind"] != Kind.WITHHELD
     cluster = np.full(len(rows), -1, np.int64)
     cluster[shown] = _clusters_shown(rows[shown], parameters)
@@ -196,20 +202,33 @@ def _representatives(rows: Rows, cluster: Index, parameters: MergeParameters) ->
     """GND 5.2: one row a cluster, by the recursive update of sample mean and covariance over its measured statements.
 
     A quoted Gaussian is no new measurement: it represents its cluster only where nobody measured, and then once.
+    Measurements with much worse poses than the best of the cluster are left out.
 
-    In default mode a representative is renewed when the number of its measurements has doubled: it takes the first 1,
-    2, 4, 8 … of them. Else every report would move every changed voxel by a hair, and each move is sent to all vehicles
-    (8 drives over one street: 17,027 voxels published with all measurements, 9,492 so, at the same F1). Measurements
-    with much worse poses than the best of the cluster are left out.
+    In default mode a representative is looked at anew when the number of its measurements has doubled (the first 1, 2,
+    4, 8 … of them), and renewed only where the new one is less than `d_renewed` like it. Else every report would move
+    every changed voxel by a hair, and each move is sent to all vehicles.
     """
     first = np.unique(cluster, return_index=True)[1]
     measured = _measured_well(rows, cluster, parameters)
     before: Index = np.cumsum(measured) - measured
     turn: Index = before - before[first][cluster]
     n = np.bincount(cluster, weights=measured).astype(np.int64)
-    use = measured & (turn < (n if parameters.mode == "paper" else _power_of_two(n))[cluster])
+    if parameters.mode == "paper":
+        use = measured.copy()
+        use[first[n == 0]] = True
+        return _recursive_moments(rows[use], cluster[use])
+    use = measured & (turn == 0)
     use[first[n == 0]] = True
-    return _recursive_moments(rows[use], cluster[use])
+    found: Rows = rows[use]
+    of = 2
+    while of <= n.max(initial=0):
+        many = np.flatnonzero(n >= of)
+        use = measured & (turn < of) & (n >= of)[cluster]
+        anew = _recursive_moments(rows[use], np.searchsorted(many, cluster[use]))
+        renewed = _similarity(found[many], anew, parameters) < parameters.d_renewed
+        found[many[renewed]] = anew[renewed]
+        of *= 2
+    return found
 
 
 def _measured_well(rows: Rows, cluster: Index, parameters: MergeParameters) -> NDArray[np.bool_]:
@@ -218,11 +237,6 @@ def _measured_well(rows: Rows, cluster: Index, parameters: MergeParameters) -> N
     least = np.full(int(cluster.max(initial=-1)) + 1, np.inf)
     np.minimum.at(least, cluster[measured], rows["pose_m2"][measured])
     return np.asarray(measured & (rows["pose_m2"] <= least[cluster] + parameters.noise_m**2))
-
-
-def _power_of_two(n: Index) -> Index:
-    """The largest power of two that is at most n, 0 for 0."""
-    return np.where(n > 0, 1 << (np.frexp(n.astype(np.float64))[1].astype(np.int64) - 1).clip(0), 0)
 
 
 def _recursive_moments(rows: Rows, cluster: Index) -> Rows:

@@ -22,6 +22,7 @@ class MergeParameters:
             shape is judged less surely than a presence, and a parked car seldom touches what the map holds.
         d_update: published when the candidate's similarity to the epoch's voxel is smaller than this.
         d_denied: the same where most of the candidate's statements were compared with that voxel and deny it.
+        d_renewed: a representative of more measurements takes the place of an earlier one that is less like it.
         sensor_weights: weight of a vote by sensor model, 1 for the others; "paper" mode does not weigh.
         noise_m: added (squared) to the covariances that the default similarity compares. It stands for poses known to
             so much; what a report's poses are worse than that is added for this report.
@@ -37,6 +38,7 @@ class MergeParameters:
     xi_reshaped: float = 0.5
     d_update: float = 0.5
     d_denied: float = 0.95
+    d_renewed: float = 0.9
     noise_m: float = 0.05
     poses: bool = True
     pose_lever_m: float = 20.0
@@ -55,7 +57,7 @@ class MergeParameters:
         for name, share in (("xi", self.xi), ("xi_reshaped", self.xi_reshaped)):
             if not 0 <= share < 1:
                 raise MergerError(f"{name} must lie in [0, 1), got {share}")
-        for name, least in (("d_update", self.d_update), ("d_denied", self.d_denied)):
+        for name, least in (("d_update", self.d_update), ("d_denied", self.d_denied), ("d_renewed", self.d_renewed)):
             if not 0 <= least <= 1:
                 raise MergerError(f"{name} must lie in [0, 1], got {least}")
         self._check_poses()

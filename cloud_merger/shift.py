@@ -15,34 +15,28 @@ conditions: a LiDAR that hangs lower than its vehicle believes raises every road
 A pure function of a report and its base.
 """
 
+from collections import OrderedDict
 from dataclasses import dataclass, replace
-from math import cos, sin
+from functools import cached_property, lru_cache
+from threading import Lock
 from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
-from scipy.spatial import cKDTree
 
+from cloud_merger import shift_kernels as kernels
 from cloud_merger.errors import MergerError
+from cloud_merger.shift_kernels import Buckets, Mask, Planes
+from cloud_merger.statements import find
+from gnd_map.arrays import F64, I64
 from gnd_map.gaussian import Gaussians
 from gnd_map.grid import VoxelGrid
-from gnd_map.similarity import similarity
+from gnd_map.tile_id import TileId
 from schemas.changes import TileChange
 
-F64 = NDArray[np.float64]
-Mask = NDArray[np.bool_]
-
 MAX_GAUSSIANS: Final = 400  # of a report that are looked at, every second, third, ... where there are more
-_NEIGHBOURS: Final = 12  # base Gaussians that one is compared with
-_REACH_M: Final = 1.6  # beyond the largest shift
-_STEP_M: Final = 0.05  # of the search
-_ROUNDS: Final = 6
-_HUBER_M: Final = 0.05
-_FLAT: Final = 0.5  # of 0 (a ball) to 1 (a plane)
-_PARALLEL: Final = 0.95  # cosine
 _LEVEL: Final = 0.95  # cosine with the vertical
-_BESIDE_M: Final = 1.0  # Gaussians of one surface lie so near to each other
 _FAR_PER_M: Final = 0.05
+_STILL: Final = np.zeros(3)
 
 
 @dataclass(frozen=True, slots=True)
@@ -119,7 +113,7 @@ class Shift:
         return float(np.sqrt(self.east_m**2 + self.north_m**2 + self.up_m**2))
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@dataclass(frozen=True, eq=False)
 class _Surfaces:
     """Gaussians in the tile's frame: places (N, 3), covariances (N, 6), normals (N, 3), how flat (N,) 0 … 1."""
 
@@ -129,28 +123,67 @@ class _Surfaces:
     flat: F64
 
     @classmethod
-    def of(cls, grid: VoxelGrid, gaussians: Gaussians) -> "_Surfaces":
-        place = grid.centre_m(gaussians.voxel_id) + gaussians.mean_m.astype(np.float64)
-        value, vector = np.linalg.eigh(gaussians.full_cov())
-        flat = 1.0 - np.sqrt(np.maximum(value[:, 0], 0.0) / np.maximum(value[:, 1], 1e-9))
-        return cls(place.reshape(-1, 3), gaussians.cov_m2.astype(np.float64), vector[:, :, 0], flat)
+    def of(cls, grid: VoxelGrid, gaussians: Gaussians, rows: I64 | slice = slice(None)) -> "_Surfaces":
+        place = grid.centre_m(gaussians.voxel_id[rows]) + gaussians.mean_m[rows].astype(np.float64)
+        cov = gaussians.cov_m2[rows].astype(np.float64)
+        return cls(place.reshape(-1, 3), cov, *kernels.normals(cov))
+
+    def __len__(self) -> int:
+        return len(self.flat)
 
     @property
+    def planes(self) -> Planes:
+        """What the kernels take."""
+        return self.place_m, self.cov_m2, self.normal, self.flat
+
+    @cached_property
+    def buckets(self) -> Buckets:
+        """By which the kernels find those near a place."""
+        return kernels.buckets_of(self.place_m)
+
+    @cached_property
     def is_upright(self) -> Mask:
         """(N,) walls and the like."""
-        return np.asarray((self.flat > _FLAT) & (np.abs(self.normal[:, 2]) < 0.5))
+        return np.asarray((self.flat > kernels.FLAT) & (np.abs(self.normal[:, 2]) < 0.5))
 
-    @property
+    @cached_property
     def is_level(self) -> Mask:
         """(N,) roads and the like."""
-        return np.asarray((self.flat > _FLAT) & (np.abs(self.normal[:, 2]) > _LEVEL))
+        return np.asarray((self.flat > kernels.FLAT) & (np.abs(self.normal[:, 2]) > _LEVEL))
 
-    def raised(self, up_m: float) -> "_Surfaces":
-        """The same so much higher."""
-        return replace(self, place_m=self.place_m + np.array([0.0, 0.0, up_m]))
+    @cached_property
+    def level(self) -> "_Surfaces":
+        """The level ones alone."""
+        return self.take(self.is_level)
 
-    def take(self, index: NDArray[np.int64] | Mask) -> "_Surfaces":
+    def take(self, mask: Mask) -> "_Surfaces":
+        index = np.flatnonzero(mask)
         return _Surfaces(self.place_m[index], self.cov_m2[index], self.normal[index], self.flat[index])
+
+
+class _Known:
+    """Surfaces of the bases looked at last, by the very object: the reports of a street refer to few versions."""
+
+    def __init__(self, most: int) -> None:
+        self._most = most
+        self._held: OrderedDict[tuple[int, int], tuple[Gaussians, _Surfaces]] = OrderedDict()
+        self._lock = Lock()
+
+    def of(self, tile: TileId, base: Gaussians) -> _Surfaces:
+        key = (tile.morton, id(base))
+        with self._lock:
+            if key in self._held:
+                self._held.move_to_end(key)
+                return self._held[key][1]
+        found = _Surfaces.of(VoxelGrid.of(tile), base)
+        with self._lock:
+            self._held[key] = base, found  # held, so that no other object gets its id
+            if len(self._held) > self._most:
+                self._held.popitem(last=False)
+        return found
+
+
+_KNOWN: Final = _Known(64)
 
 
 def shift_of(change: TileChange, base: Gaussians, parameters: ShiftParameters | None = None) -> Shift:
@@ -162,156 +195,100 @@ def shift_of(change: TileChange, base: Gaussians, parameters: ShiftParameters | 
         parameters: see `ShiftParameters`.
     """
     parameters = parameters or ShiftParameters()
-    grid = VoxelGrid.of(change.tile)
-    there = change.changed.take(change.changed.exists)
-    if len(there) < parameters.least_gaussians or len(base) < parameters.least_gaussians:
-        return Shift(False, len(there))
-    surfaces, known = _Surfaces.of(grid, _thinned(there)), _Surfaces.of(grid, base)
-    tree = cKDTree(known.place_m)
-    strange = surfaces.take(~_fits(surfaces, known, tree, np.zeros(3), parameters))
-    if len(strange.place_m) < parameters.least_gaussians:
-        return Shift(False, len(strange.place_m))
-    is_seen, is_changed = (np.isin(base.voxel_id, ids) for ids in (change.observed, change.changed.voxel_id))
-    begin = _searched(strange, known.take(is_seen & ~is_changed), known, tree, parameters)
-    motion = _refined(begin, strange, known, tree, parameters)
-    fit = float(_fits(strange, known, tree, motion, parameters).mean())
-    others = [_fits(strange, known, tree, other, parameters).mean() for other in _elsewhere(motion)]
+    n = int(change.changed.exists.sum())
+    if n < parameters.least_gaussians or len(base) < parameters.least_gaussians:
+        return Shift(False, n)
+    surfaces = _Surfaces.of(VoxelGrid.of(change.tile), change.changed, _thinned(change.changed))
+    known = _KNOWN.of(change.tile, base)
+    strange = surfaces.take(~_fits(surfaces, known, _STILL, parameters))
+    if len(strange) < parameters.least_gaussians:
+        return Shift(False, len(strange))
+    is_seen, is_changed = (find(ids, base.voxel_id) >= 0 for ids in (change.observed, change.changed.voxel_id))
+    begin = _searched(strange, known, is_seen & ~is_changed, parameters)
+    motion = _refined(begin, strange, known, parameters)
+    fit = float(_fits(strange, known, motion, parameters).mean())
+    others = [_fits(strange, known, other, parameters).mean() for other in _elsewhere(motion)]
     chance = float(np.mean(others))
-    unchanged = _unchanged(known.take(is_seen), is_changed[is_seen], motion, parameters)
-    found = Shift(False, len(strange.place_m), fit, chance, unchanged, *motion.tolist())
-    upwards = found if found.meets(parameters) else _raised(strange, known, tree, is_seen, is_changed, parameters)
+    unchanged = kernels.unchanged_share(known.planes, is_seen, is_changed, motion, parameters.displaced_m)
+    found = Shift(False, len(strange), fit, chance, unchanged, *motion.tolist())
+    upwards = found if found.meets(parameters) else _raised(strange, known, is_seen, is_changed, parameters)
     return next((replace(one, is_explained=True) for one in (found, upwards) if one.meets(parameters)), found)
 
 
 def _raised(
-    strange: _Surfaces, known: _Surfaces, tree: cKDTree, is_seen: Mask, is_changed: Mask, parameters: ShiftParameters
+    strange: _Surfaces, known: _Surfaces, is_seen: Mask, is_changed: Mask, parameters: ShiftParameters
 ) -> Shift:
-    """The shift up or down that most level planes agree on, and what it explains."""
-    level, ground = strange.take(strange.is_level), known.take(known.is_level)
-    if len(level.place_m) < parameters.least_gaussians or not len(ground.place_m):
-        return Shift(False, len(strange.place_m))
-    near = cKDTree(ground.place_m[:, :2]).query_ball_point(level.place_m[:, :2], _BESIDE_M)
-    steps = np.arange(-parameters.max_m, parameters.max_m + _STEP_M / 2, _STEP_M)
-    votes = np.zeros(len(steps))
-    for place, others in zip(level.place_m, near, strict=True):
-        up_m = ground.place_m[others, 2] - place[2]
-        votes += (np.abs(up_m[:, None] - steps) < _STEP_M).any(axis=0)
+    """The shift up or down that most level planes agree on, and what it explains; nothing where the tile refutes it."""
+    level, ground, no = strange.level, known.level, Shift(False, len(strange))
+    if len(level) < parameters.least_gaussians or not len(ground):
+        return no
+    steps = _axis(parameters.max_m)
+    votes = kernels.votes_up(level.place_m, ground.place_m, ground.buckets, steps)
     best = float(steps[np.lexsort((np.abs(steps), -votes))[0]])
-    fit, chance = (
-        float(_fits(strange.raised(up_m), known, tree, np.zeros(3), parameters).mean()) for up_m in (best, -best)
-    )
     displaced = is_seen & known.is_level & (abs(best) > parameters.displaced_m)
     unchanged = float((~is_changed)[displaced].mean()) if displaced.any() else 1.0
-    return Shift(False, len(strange.place_m), fit, chance, unchanged, up_m=best)
+    if unchanged > parameters.refuted_share:
+        return no
+    fit, chance = (float(_fits(strange, known, _STILL, parameters, up_m).mean()) for up_m in (best, -best))
+    return replace(no, fit=fit, chance=chance, unchanged=unchanged, up_m=best)
 
 
-def _thinned(gaussians: Gaussians) -> Gaussians:
-    return gaussians.take(np.arange(0, len(gaussians), -(-len(gaussians) // MAX_GAUSSIANS)))
+def _thinned(gaussians: Gaussians) -> I64:
+    """Rows of those that are measured, `MAX_GAUSSIANS` at most."""
+    there = np.flatnonzero(gaussians.exists)
+    return there[:: -(-len(there) // MAX_GAUSSIANS)]
 
 
-def moved(place_m: F64, motion: F64) -> F64:
-    """(N, 3) places after a motion (east, north, turn)."""
-    c, s = cos(motion[2]), sin(motion[2])
-    x, y, z = place_m.T
-    return np.stack([c * x - s * y + motion[0], s * x + c * y + motion[1], z], axis=1)
-
-
-def _fits(surfaces: _Surfaces, known: _Surfaces, tree: cKDTree, motion: F64, parameters: ShiftParameters) -> Mask:
+def _fits(surfaces: _Surfaces, known: _Surfaces, motion: F64, parameters: ShiftParameters, up_m: float = 0.0) -> Mask:
     """(N,) whether a surface, moved, is like one of the base Gaussians around it.
 
     Along a surface its mean lies where the voxel has cut it, so only what the means differ by along the base's normal
     counts; the turn of at most a degree is left out of the covariances.
     """
-    place = moved(surfaces.place_m, motion)
-    row, other = _pairs(place, tree)
-    step = place[row] - known.place_m[other]
-    normal = known.normal[other]
-    along = np.einsum("ni,ni->n", step, normal)[:, None] * normal
-    step = np.where((known.flat[other] > _FLAT)[:, None], along, step)
-    yes = np.ones(len(row), bool)
-    alike = similarity(yes, np.zeros_like(step), known.cov_m2[other], yes, step, surfaces.cov_m2[row])
-    return np.bincount(row, weights=alike >= parameters.fits, minlength=len(place)) > 0
+    return kernels.fitting(surfaces.planes, known.planes, known.buckets, motion, up_m, parameters.fits)
 
 
-def _pairs(place: F64, tree: cKDTree) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Each place with the base Gaussians nearest to it, within a metre: rows, base rows."""
-    distance, at = tree.query(place, k=_NEIGHBOURS, distance_upper_bound=_BESIDE_M)
-    row, column = np.nonzero(np.isfinite(distance))
-    return row, at[row, column]
+def _axis(max_m: float) -> F64:
+    """The shifts along one axis that are looked at."""
+    return np.arange(-max_m, max_m + kernels.STEP_M / 2, kernels.STEP_M)
 
 
-def _searched(
-    surfaces: _Surfaces, unchanged: _Surfaces, known: _Surfaces, tree: cKDTree, parameters: ShiftParameters
-) -> F64:
+@lru_cache(maxsize=16)
+def _steps(max_m: float) -> tuple[F64, F64, F64]:
+    """East and north of all shifts, and what their length takes off their scores."""
+    east, north = (values.ravel() for values in np.meshgrid(_axis(max_m), _axis(max_m)))
+    return east, north, _FAR_PER_M * np.hypot(east, north)
+
+
+def _searched(surfaces: _Surfaces, known: _Surfaces, is_unchanged: Mask, parameters: ShiftParameters) -> F64:
     """The shift (east, north, 0) that most upright planes agree on.
 
     Each pair of parallel planes votes for the shifts that lay one into the other, each surface that is reported
     unchanged against those that would displace it: along a straight street nothing else would tell how far. Of shifts
     that are as good the smallest.
     """
-    axis = np.arange(-parameters.max_m, parameters.max_m + _STEP_M / 2, _STEP_M)
-    steps = np.stack([values.ravel() for values in np.meshgrid(axis, axis)])
     upright = surfaces.take(surfaces.is_upright)
-    votes = np.zeros(steps.shape[1])
-    for k, near in enumerate(tree.query_ball_point(upright.place_m, _REACH_M)):
-        other = known.take(np.array(sorted(near), np.int64))
-        other = other.take((other.flat > _FLAT) & (np.abs(other.normal @ upright.normal[k]) > _PARALLEL))
-        apart = other.place_m - upright.place_m[k]
-        off = np.einsum("ni,ni->n", apart, other.normal)[:, None] - other.normal[:, :2] @ steps
-        beside = np.hypot(apart[:, :1] - steps[0], apart[:, 1:2] - steps[1]) < _BESIDE_M
-        votes += ((np.abs(off) < _STEP_M) & beside & (np.abs(apart[:, 2:]) < _BESIDE_M)).any(axis=0)
-    still = unchanged.take(unchanged.is_upright)
-    against = (np.abs(still.normal[:, :2] @ steps) > parameters.displaced_m).sum(axis=0)
-    score = votes / max(len(upright.place_m), 1) - against / max(len(still.place_m), 1)
-    score -= _FAR_PER_M * np.hypot(*steps)
-    best = np.lexsort((steps[1], steps[0], -score))[0]
-    return np.array([*steps[:, best], 0.0])
+    votes = kernels.votes_of(upright.planes, known.planes, known.buckets, _axis(parameters.max_m))
+    east, north, far = _steps(parameters.max_m)
+    pro = votes / max(len(upright), 1)
+    x, y, _ = np.ascontiguousarray(known.normal[is_unchanged & known.is_upright].T)
+    best = kernels.best_shift(pro, far, east, north, x, y, parameters.displaced_m)
+    return np.array([east[best], north[best], 0.0])
 
 
-def _refined(begin: F64, surfaces: _Surfaces, known: _Surfaces, tree: cKDTree, parameters: ShiftParameters) -> F64:
+def _refined(begin: F64, surfaces: _Surfaces, known: _Surfaces, parameters: ShiftParameters) -> F64:
     """The motion after a few rounds of robust point-to-plane least squares, within the limits.
 
     One more measurement says that it is where it began: what no surface constrains, along a straight wall, stays there.
     """
-    motion, prior = begin, np.diag([1.0, 1.0, (_HUBER_M / parameters.max_rad) ** 2])
-    for _ in range(_ROUNDS):
-        place = moved(surfaces.place_m, motion)
-        row, other, off = _nearest_planes(place, surfaces, known, tree)
-        if len(row) < parameters.least_gaussians // 2:
-            break
-        normal, arm = known.normal[other], place[row]
-        jacobian = np.stack([normal[:, 0], normal[:, 1], normal[:, 1] * arm[:, 0] - normal[:, 0] * arm[:, 1]], axis=1)
-        weight = np.minimum(1.0, _HUBER_M / np.maximum(np.abs(off), 1e-9))
-        matrix = jacobian.T @ (weight[:, None] * jacobian) + prior
-        motion = motion + np.linalg.solve(matrix, -jacobian.T @ (weight * off) - prior @ (motion - begin))
+    prior = np.array([1.0, 1.0, (kernels.HUBER_M / parameters.max_rad) ** 2])
+    least = parameters.least_gaussians // 2
+    motion = kernels.refined(begin, surfaces.planes, known.planes, known.buckets, prior, least)
     limit = np.array([parameters.max_m, parameters.max_m, parameters.max_rad])
     return np.asarray(np.clip(motion, -limit, limit))
-
-
-def _nearest_planes(
-    place: F64, surfaces: _Surfaces, known: _Surfaces, tree: cKDTree
-) -> tuple[NDArray[np.int64], NDArray[np.int64], F64]:
-    """Of each place the parallel plane nearest along its normal: rows, base rows, signed distances."""
-    row, other = _pairs(place, tree)
-    parallel = np.abs(np.einsum("ni,ni->n", surfaces.normal[row], known.normal[other])) > _PARALLEL
-    parallel &= (known.flat[other] > _FLAT) & (surfaces.flat[row] > _FLAT)
-    row, other = row[parallel], other[parallel]
-    off = np.einsum("ni,ni->n", place[row] - known.place_m[other], known.normal[other])
-    near = np.abs(off) < 0.3
-    row, other, off = row[near], other[near], off[near]
-    order = np.lexsort((other, np.abs(off), row))
-    first = order[np.unique(row[order], return_index=True)[1]]
-    return row[first], other[first], off[first]
 
 
 def _elsewhere(motion: F64) -> list[F64]:
     """The same step towards the three other sides, turned the other way."""
     x, y, turn = motion.tolist()
     return [np.array([-y, x, -turn]), np.array([-x, -y, -turn]), np.array([y, -x, -turn])]
-
-
-def _unchanged(seen: _Surfaces, is_changed: Mask, motion: F64, parameters: ShiftParameters) -> float:
-    """Of the observed surfaces that the motion would have displaced, the share reported unchanged; 0 of none."""
-    step = moved(seen.place_m, motion) - seen.place_m
-    displaced = (np.abs(np.einsum("ni,ni->n", step, seen.normal)) > parameters.displaced_m) & (seen.flat > _FLAT)
-    return float((~is_changed)[displaced].mean()) if displaced.any() else 0.0

@@ -1,6 +1,8 @@
 """What lies in the store, as the merge reads it: the statements of reports, and tiles by version; both remembered."""
 
 from collections import OrderedDict
+from collections.abc import Iterable
+from contextlib import suppress
 from dataclasses import replace
 from functools import lru_cache
 from threading import Lock
@@ -15,16 +17,20 @@ from gnd_map.codec import (
     CODEC_COMPACT_ZSTD,
     CODEC_FLOAT32_ZSTD,
     CODEC_STANDARD_ZSTD,
+    Lattice,
     best_codec,
     codec_of,
+    is_on,
+    lattice_of,
 )
 from gnd_map.gaussian import Gaussians
 from gnd_map.tile import Tile
 from gnd_map.tile_id import TileId
 from schemas.changes import ChangeReport, TileChange
 from schemas.doubt import DoubtReason
+from schemas.errors import SchemaError
 from tile_store.store import Store
-from tile_store.values import StoredMemory, StoredTile, TileJournal
+from tile_store.values import ReportRow, StoredMemory, StoredTile, TileJournal, lattice_named
 
 REMEMBERED_REPORTS: Final = 1024  # some 20 kB each
 NEW_GROUND: Final = DoubtReason.IMPLAUSIBLE_SHARE | DoubtReason.POSE_NOT_CHECKED
@@ -60,6 +66,30 @@ def report_of(body: bytes, parameters: MergeParameters, received_ns: int = 0) ->
         course=report.course,
         received_ns=received_ns,
     )
+
+
+def reports_by_window(rows: Iterable[ReportRow], parameters: MergeParameters) -> dict[int, list[Report]]:
+    """The reports by window; of one that came in two parts the second, if it is there. `rows`: by id and part.
+
+    What can no longer be read is left out.
+    """
+    found: dict[int, dict[str, Report]] = {}
+    for row in rows:
+        with suppress(SchemaError):
+            found.setdefault(row.window, {})[row.report_id] = report_of(row.body, parameters, row.received_ns)
+    return {window: list(reports.values()) for window, reports in found.items()}
+
+
+def lattice_of_tile(epoch: StoredTile | None, gaussians: Gaussians, codec: str) -> Lattice | None:
+    """Where the merged tile lies: on the lattice of the epoch; a tile that the map has not yet, on the configured one.
+
+    The epoch lies on the configured one wherever that can be (few Gaussians may lie on several), and a map of plain
+    floats stays one: so every version is as fine as the base map was made.
+    """
+    configured = lattice_named(codec)
+    if epoch is None or len(gaussians) == 0 or (configured is not None and is_on(gaussians, configured)):
+        return configured
+    return lattice_of(epoch.codec_id)
 
 
 def is_doubtful(change: TileChange) -> bool:

@@ -2,6 +2,10 @@
 
 import numpy as np
 
+from cloud_merger.merge_kernels import clusters_of
+from cloud_merger.parameters import MergeParameters
+from cloud_merger.shift import ShiftParameters, shift_of
+from cloud_merger.statements import STATEMENT
 from gnd_map.classes import ChangeClass
 from gnd_map.codec import (
     REPORT,
@@ -18,6 +22,7 @@ from gnd_map.gaussian import Gaussians
 from gnd_map.tile_id import TileId
 from gnd_map.track import Piece, Track, View
 from gnd_map.visibility import observed_along
+from schemas.changes import TileChange
 from tile_store.warm import warm_up as warm_up_codecs
 
 _TILE = TileId(497353963154)
@@ -34,6 +39,18 @@ def warm_up() -> None:
     decode_mask(encode_mask(np.array([True])), 1)
     place = Piece(np.array([[32, 32, 4]], np.int32), 1)
     observed_along(Track(_TILE.district, View((-8, -6, -4, -2, 0, 2, 4, 6, 8)), (place,)), [found])
+    clusters_of(np.zeros(1, STATEMENT), MergeParameters())
+    _test_a_shift()
+
+
+def _test_a_shift() -> None:
+    """Level ground that is measured higher than it was: every kernel of the shift test has something to say."""
+    ids = np.arange(ShiftParameters().least_gaussians, dtype=np.int32)
+    n = len(ids)
+    count, cov = np.full(n, 40, np.int32), np.tile(np.array([0.08, 0.0, 0.0, 0.08, 0.0, 0.0004], np.float32), (n, 1))
+    low, high = (Gaussians(ids, count, count, np.full((n, 3), up_m, np.float32), cov) for up_m in (0.0, 0.4))
+    evidence, classes = np.zeros((n, 4), np.int32), np.full(n, ChangeClass.MODIFIED, np.uint8)
+    shift_of(TileChange(_TILE, 0, b"", ids, high, classes, evidence, 0.0, 0.0), low)
 
 
 def _base() -> Gaussians:

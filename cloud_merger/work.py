@@ -2,24 +2,21 @@
 
 import logging
 from collections.abc import Callable, Sequence
-from dataclasses import replace
 from typing import TypeVar
 
 from cloud_merger.belief import ShiftTests, courses_of
 from cloud_merger.config import ShardConfig
 from cloud_merger.features.kept import FeatureContents, said_of
 from cloud_merger.features.merge import merge_features
-from cloud_merger.statements import Report
-from cloud_merger.stored import Bases, encode_state, report_of
+from cloud_merger.stored import Bases, encode_state, lattice_of_tile, reports_by_window, said
 from cloud_merger.window import WindowMerger, fold, provenance_of
-from gnd_map.codec import Lattice, is_on, lattice_of
 from gnd_map.features import FeatureTile, is_feature_layer
 from gnd_map.gaussian import Gaussians
 from gnd_map.tile import Tile
 from schemas.errors import SchemaError
 from tile_store.errors import StoreDamaged, StoreError, UnknownReports
 from tile_store.store import Store
-from tile_store.values import Basis, Claim, Publication, PublishResult, ReportRow, TileWork, lattice_named
+from tile_store.values import Basis, Claim, Publication, PublishResult, ReportRow, TileWork
 
 _LOG = logging.getLogger(__name__)
 T = TypeVar("T")
@@ -85,11 +82,13 @@ class Worker:
         has that content.
         """
         tile, journal, config = work.claim.tile, work.journal, self._config
+        epoch = Gaussians.empty() if work.epoch is None else self._contents.decoded(work.epoch)
         state = self._contents.state(tile, journal)
         named = self._store.shifted_vehicles()
         merger = WindowMerger(config.merge, config.confirmation, self._shifts, self._bases(work), named)
-        lattice = self._lattice(work, state.gaussians)
-        by_window = self._by_window(work)
+        lattice = lattice_of_tile(work.epoch, epoch, config.codec)
+        rows = [row for row in work.reports if self._readable(row, said) is not None]
+        by_window = reports_by_window(rows, config.merge)
         closed = [window for window in sorted(by_window) if window < journal.window]
         folded = []
         for window in closed:
@@ -111,15 +110,6 @@ class Worker:
             memory=encode_state(tile, closed[-1], state) if closed else None,
             closed=tuple(closed),
         )
-
-    def _by_window(self, work: TileWork) -> dict[int, list[Report]]:
-        """The reports that can be read, by window; of a report that came in two parts the second, if it is there."""
-        found: dict[int, dict[str, Report]] = {}
-        for row in work.reports:
-            report = self._readable(row, lambda body: report_of(body, self._config.merge))
-            if report is not None:
-                found.setdefault(row.window, {})[row.report_id] = replace(report, received_ns=row.received_ns)
-        return {window: list(reports.values()) for window, reports in found.items()}
 
     def _of_features(self, work: TileWork) -> Publication:
         """The same of a tile of a feature layer."""
@@ -143,17 +133,6 @@ class Worker:
             shift_tests=merged.tests,
             basis=Basis(work.journal.window, work.journal.seq),
         )
-
-    def _lattice(self, work: TileWork, epoch: Gaussians) -> Lattice | None:
-        """Where the merged tile lies: on the lattice of the epoch; a tile that the map has not yet, on the configured.
-
-        The epoch lies on the configured one wherever that can be (few Gaussians may lie on several), and a map of plain
-        floats stays one: so every version is as fine as the base map was made.
-        """
-        configured = lattice_named(self._config.codec)
-        if work.epoch is None or len(epoch) == 0 or (configured is not None and is_on(epoch, configured)):
-            return configured
-        return lattice_of(work.epoch.codec_id)
 
     def _readable(self, row: ReportRow, read: Callable[[bytes], T]) -> T | None:
         """What a stored report says; nothing when it can no longer be read (its vehicle has long had its ack)."""

@@ -7,6 +7,7 @@ import click
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TaskID, TextColumn, TimeElapsedColumn
 
+from deploy.verify_cli import verify
 from tile_store import tables
 from tile_store.cli import PATH, json_option, layer_option, show, store_to_fill
 from tile_store.cli import map_group as store_group
@@ -105,6 +106,6 @@ def _bars() -> Progress:
 
 map_group = click.Group(
     "map",
-    commands=[build, *store_group.commands.values()],
-    help="Build, inspect, compare, export, back up and roll back maps.",
+    commands=[build, verify, *store_group.commands.values()],
+    help="Build, inspect, compare, verify, export, back up and roll back maps.",
 )

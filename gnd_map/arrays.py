@@ -32,6 +32,14 @@ def check_array(name: str, array: object, dtype: type[np.generic], shape: tuple[
         raise ShapeError(f"{name}: {int((~np.isfinite(array)).sum())} of {array.size} values are not finite")
 
 
+def are_in(sorted_values: Array, among: Array) -> npt.NDArray[np.bool_]:
+    """(N,) which of some values are among others (M,); both ascending. As `np.isin`, which sorts them first."""
+    if len(among) == 0:
+        return np.zeros(len(sorted_values), np.bool_)
+    at = np.minimum(np.searchsorted(among, sorted_values), len(among) - 1)
+    return np.asarray(among[at] == sorted_values)
+
+
 def shown_shape(shape: tuple[int | None, ...]) -> str:
     """`shape` with N for "any length": "(N, 3)"."""
     return "(" + ", ".join("N" if n is None else str(n) for n in shape) + ("," if len(shape) == 1 else "") + ")"

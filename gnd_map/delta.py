@@ -4,7 +4,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from gnd_map.arrays import I32, I64, check_array
+from gnd_map.arrays import I32, I64, are_in, check_array
 from gnd_map.errors import DeltaError
 from gnd_map.gaussian import Gaussians, concat
 
@@ -22,10 +22,9 @@ class TileDelta:
         check_array("removed", self.removed, np.int32, (None,))
         if (self.removed[1:] <= self.removed[:-1]).any():
             raise DeltaError(f"delta: the {len(self.removed)} removed voxel ids are not strictly increasing")
-        if np.isin(self.removed, self.put.voxel_id).any():
-            raise DeltaError(
-                f"delta: {int(np.isin(self.removed, self.put.voxel_id).sum())} voxels are both removed and put"
-            )
+        both = are_in(self.removed, self.put.voxel_id)
+        if both.any():
+            raise DeltaError(f"delta: {int(both.sum())} voxels are both removed and put")
         if not self.put.exists.all():
             raise DeltaError(f"delta: {int((~self.put.exists).sum())} voxels are put with count 0")
 
@@ -42,7 +41,7 @@ class TileDelta:
 
 def diff(old: Gaussians, new: Gaussians) -> TileDelta:
     """The smallest delta with apply(old, delta) == new, bit for bit."""
-    removed = np.setdiff1d(old.voxel_id, new.voxel_id, assume_unique=True)
+    removed = old.voxel_id[~are_in(old.voxel_id, new.voxel_id)]
     return TileDelta(removed, new.take(~_same_rows(old, new)))
 
 
@@ -52,22 +51,24 @@ def apply(old: Gaussians, delta: TileDelta) -> Gaussians:
     Raises:
         DeltaError: a voxel to remove is not there.
     """
-    absent = np.setdiff1d(delta.removed, old.voxel_id)
+    absent = delta.removed[~are_in(delta.removed, old.voxel_id)]
     if len(absent):
         raise DeltaError(f"delta: {len(absent)} of {len(delta.removed)} voxels to remove are absent, first {absent[0]}")
-    gone = np.isin(old.voxel_id, delta.removed) | np.isin(old.voxel_id, delta.put.voxel_id)
+    gone = are_in(old.voxel_id, delta.removed) | are_in(old.voxel_id, delta.put.voxel_id)
     return concat([old.take(~gone), delta.put])
 
 
 def _same_rows(old: Gaussians, new: Gaussians) -> "np.ndarray[tuple[int], np.dtype[np.bool_]]":
     """(len(new),) whether `old` holds the voxel with the same bits."""
-    same = np.zeros(len(new), dtype=np.bool_)
-    _, at_old, at_new = np.intersect1d(old.voxel_id, new.voxel_id, assume_unique=True, return_indices=True)
-    same[at_new] = (_bits(old)[at_old] == _bits(new)[at_new]).all(axis=1)
+    same = np.asarray(are_in(new.voxel_id, old.voxel_id))
+    at_new = np.flatnonzero(same)
+    at_old = np.searchsorted(old.voxel_id, new.voxel_id[at_new])
+    same[at_new] = _are_equal(old, at_old, new, at_new)
     return same
 
 
-def _bits(gaussians: Gaussians) -> I64:
-    """(N, 11) the values of each row but its id, as integers: exact comparison."""
-    floats = np.hstack([gaussians.mean_m, gaussians.cov_m2]) + np.float32(0.0)  # -0.0 and 0.0 are one value
-    return np.column_stack([gaussians.count, gaussians.cells, floats.view(np.int32)]).astype(np.int64)
+def _are_equal(old: Gaussians, at_old: I64, new: Gaussians, at_new: I64) -> "np.ndarray[tuple[int], np.dtype[np.bool_]]":
+    """(K,) whether pairs of rows hold the same values but for the ids; -0.0 and 0.0 are one value, and NaN is none."""
+    same = (old.count[at_old] == new.count[at_new]) & (old.cells[at_old] == new.cells[at_new])
+    same &= (old.mean_m[at_old] == new.mean_m[at_new]).all(axis=1)
+    return np.asarray(same & (old.cov_m2[at_old] == new.cov_m2[at_new]).all(axis=1))

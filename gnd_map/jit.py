@@ -11,11 +11,23 @@ F = TypeVar("F", bound=Callable[..., Any])
 def kernel(function: F) -> F:
     """Compile `function` with numba on its first call and keep the machine code on disk beside its module.
 
-    No fast-math: results must not depend on how a compiler orders sums. Division by zero gives inf or NaN, as in numpy.
+    Kernels run without the GIL: other threads go on. No fast-math: results must not depend on how a compiler orders sums. Division by zero gives inf or NaN, as in numpy.
     """
-    return cast("F", numba.njit(cache=True, error_model="numpy")(function))
+    return cast("F", numba.njit(cache=True, error_model="numpy", nogil=True)(function))
 
 
 def inlined(function: F) -> F:
     """As `kernel`, laid into its callers: for the few lines that run a hundred times a voxel."""
-    return cast("F", numba.njit(cache=True, error_model="numpy", forceinline=True)(function))
+    return cast("F", numba.njit(cache=True, error_model="numpy", nogil=True, forceinline=True)(function))
+
+
+def bare(function: F) -> F:
+    """As `kernel`, for functions that make no arrays and are called a hundred times a voxel: arrays given to them are
+    not counted as held, which takes two locked instructions an array and call.
+    """
+    return cast("F", numba.njit(cache=True, error_model="numpy", nogil=True, _nrt=False)(function))
+
+
+def bare_inlined(function: F) -> F:
+    """As `bare`, laid into its callers."""
+    return cast("F", numba.njit(cache=True, error_model="numpy", nogil=True, _nrt=False, forceinline=True)(function))

@@ -12,14 +12,16 @@ error stays the
   added.
 """
 
+import math
 from typing import Literal
 
 import numpy as np
 import numpy.typing as npt
 
 from gnd_map.arrays import F64, I64, Array, check_array
-from gnd_map.errors import ConfigError
+from gnd_map.errors import ConfigError, ShapeError
 from gnd_map.gaussian import full_matrices
+from gnd_map.jit import bare, bare_inlined
 from gnd_map.symmetric3 import add_to_diagonal, determinant, mahalanobis_squared
 
 SimilarityMode = Literal["paper", "default"]
@@ -62,11 +64,101 @@ def similarity(
     exist = [_checked(name, x, (n,), np.bool_) for name, x in (("exists_a", exists_a), ("exists_b", exists_b))]
     mean = [_checked(name, x, (n, 3), np.float64) for name, x in (("mean_a", mean_a), ("mean_b", mean_b))]
     cov = [_checked(name, x, (n, 6), np.float64) for name, x in (("cov_a", cov_a), ("cov_b", cov_b))]
-    result: F64 = (exist[0] == exist[1]).astype(np.float64)  # Eq. 14, with both empty = 1
-    both = np.flatnonzero(exist[0] & exist[1])
-    term = _paper_terms if mode == "paper" else _default_terms
-    result[both] = term(mean[1][both] - mean[0][both], cov[0][both], cov[1][both], noise[both])
+    if mode == "paper":
+        return similarity_plain(exist[0], mean[0], cov[0], exist[1], mean[1], cov[1], mode, noise)
+    row, result = np.arange(n), np.empty(n)
+    _default_kernel(row, row, exist[0], mean[0], cov[0], exist[1], mean[1], cov[1], noise**2, np.zeros(n), result)
     return result
+
+
+def similarity_pairs(
+    i: I64,
+    j: I64,
+    exists: Array,
+    mean: Array,
+    cov: Array,
+    mode: SimilarityMode = "default",
+    noise_m: float | F64 = 0.05,
+    pose_m2: Array | None = None,
+) -> F64:
+    """(P,) similarity of the rows i and j of one table; as `similarity`, without gathering both sides first.
+
+    Args:
+        i: (P,) int64 rows.
+        j: (P,) int64 rows.
+        exists: (N,) bool.
+        mean: (N, 3) metres.
+        cov: (N, 6) m².
+        mode: as in `similarity`.
+        noise_m: standard deviation added in "default" mode, one for all or (P,).
+        pose_m2: (N,) variance of each row's pose, added for both rows of a pair to that of `noise_m`; None = 0.
+
+    Raises:
+        ShapeError: as `similarity`, or a row that is not in the table.
+        ConfigError: as `similarity`.
+    """
+    n, pairs = len(exists), len(i)
+    noise = np.full(pairs, noise_m) if np.ndim(noise_m) == 0 else np.asarray(noise_m)
+    noise = _checked("noise_m", noise, (pairs,), np.float64)
+    _check_mode(mode, noise)
+    rows = [_checked(name, x, (pairs,), np.int64) for name, x in (("i", i), ("j", j))]
+    if pairs and not (0 <= min(r.min() for r in rows) and max(r.max() for r in rows) < n):
+        raise ShapeError(f"pairs of rows that are not all among {n}")
+    there = _checked("exists", exists, (n,), np.bool_)
+    at, shape = _checked("mean", mean, (n, 3), np.float64), _checked("cov", cov, (n, 6), np.float64)
+    pose = _checked("pose_m2", np.zeros(n) if pose_m2 is None else pose_m2, (n,), np.float64)
+    if mode == "paper":
+        sides = [(there[r], at[r], shape[r]) for r in rows]
+        return similarity_plain(*sides[0], *sides[1], mode, noise)
+    result = np.empty(pairs)
+    _default_kernel(rows[0], rows[1], there, at, shape, there, at, shape, noise**2, pose, result)
+    return result
+
+
+def similarity_plain(
+    exists_a: Array, mean_a: F64, cov_a: F64, exists_b: Array, mean_b: F64, cov_b: F64, mode: SimilarityMode,
+    noise_m: F64,
+) -> F64:  # fmt: skip
+    """`similarity` in plain numpy, unchecked: the twin of the kernel, and all there is of the paper's mode."""
+    result: F64 = (exists_a == exists_b).astype(np.float64)  # Eq. 14, with both empty = 1
+    both = np.flatnonzero(exists_a & exists_b)
+    term = _paper_terms if mode == "paper" else _default_terms
+    result[both] = term(mean_b[both] - mean_a[both], cov_a[both], cov_b[both], noise_m[both])
+    return result
+
+
+@bare_inlined
+def _determinant(xx: float, xy: float, xz: float, yy: float, yz: float, zz: float) -> float:
+    return xx * (yy * zz - yz * yz) - xy * (xy * zz - yz * xz) + xz * (xy * yz - yy * xz)
+
+
+@bare
+def _default_kernel(
+    i: I64, j: I64, exists_a: Array, mean_a: F64, cov_a: F64, exists_b: Array, mean_b: F64, cov_b: F64,
+    noise_m2: F64, pose_m2: F64, result: F64,
+) -> None:  # fmt: skip
+    """(P,) `_default_terms` of rows i of a and j of b, with Eq. 14; the variance of a pair is noise_m2 and what the
+    rows have in pose_m2.
+    """
+    for pair in range(len(i)):
+        a, b = i[pair], j[pair]
+        if not (exists_a[a] and exists_b[b]):
+            result[pair] = 1.0 if exists_a[a] == exists_b[b] else 0.0
+            continue
+        v = max(noise_m2[pair] + pose_m2[a] + pose_m2[b], _LEAST_VARIANCE_M2)
+        axx, axy, axz = cov_a[a, 0] + v, cov_a[a, 1], cov_a[a, 2]
+        ayy, ayz, azz = cov_a[a, 3] + v, cov_a[a, 4], cov_a[a, 5] + v
+        bxx, bxy, bxz = cov_b[b, 0] + v, cov_b[b, 1], cov_b[b, 2]
+        byy, byz, bzz = cov_b[b, 3] + v, cov_b[b, 4], cov_b[b, 5] + v
+        xx, xy, xz = cov_a[a, 0] + cov_b[b, 0] + v, axy + bxy, axz + bxz
+        yy, yz, zz = cov_a[a, 3] + cov_b[b, 3] + v, ayz + byz, cov_a[a, 5] + cov_b[b, 5] + v
+        dx, dy, dz = mean_b[b, 0] - mean_a[a, 0], mean_b[b, 1] - mean_a[a, 1], mean_b[b, 2] - mean_a[a, 2]
+        square = dx * dx * (yy * zz - yz * yz) + dy * dy * (xx * zz - xz * xz) + dz * dz * (xx * yy - xy * xy)
+        square += 2.0 * (dx * dy * (xz * yz - xy * zz) + dx * dz * (xy * yz - xz * yy) + dy * dz * (xy * xz - xx * yz))
+        l2 = math.exp(-0.5 * max(square / _determinant(xx, xy, xz, yy, yz, zz), 0.0))  # Eq. 15
+        both = _determinant(axx, axy, axz, ayy, ayz, azz) * _determinant(bxx, bxy, bxz, byy, byz, bzz)
+        middle = _determinant(axx + bxx, xy, xz, ayy + byy, yz, azz + bzz) / 8.0  # of half the sum
+        result[pair] = l2 * min(math.sqrt(math.sqrt(both)) / math.sqrt(middle), 1.0)
 
 
 def pairwise(

@@ -8,26 +8,32 @@ what the drive flags as new, but not what it flags as gone), and counts.
 The same track, flags and map give the same prediction.
 """
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
+import numpy.typing as npt
 
 from gnd_map.arrays import F64, I32, I64
 from gnd_map.classes import ChangeClass
 from gnd_map.codec import Flags
-from gnd_map.errors import ConfigError
-from gnd_map.gaussian import Gaussians, full_matrices
-from gnd_map.grid import VoxelGrid, join_voxel_id, zones
-from gnd_map.sight import NOTHING, OUTSIDE, cast_lines
-from gnd_map.tile_id import LON_TILES, TileId, interleave
-from gnd_map.track import SECTORS, Track
+from gnd_map.errors import ConfigError, TrackError
+from gnd_map.grid import VoxelGrid, zones
+from gnd_map import sight
+from gnd_map.sight import FACES, MOST_RAYS, NO_SLOT, NOTHING, STOP, Columns, Window
+from gnd_map.tile_id import LON_TILES, TileId, deinterleave
+from gnd_map.track import SECTORS, Track, View
 
-_CHUNK_M: Final = 100.0
+U64 = npt.NDArray[np.uint64]
+
 _GOLDEN: Final = 0.6180339887498949
-_MOST_PLACES: Final = 4_000
+_LEAST_PLACES, _MOST_PLACES = 4, 4_000
 _FLOORS_BELOW, _FLOORS_ABOVE = 3, 8
+_MOST_CELLS: Final = 1 << 26
+_PARTS: Final = 16  # of a ray: lines stand for so many of them
+_SLOPES: Final = 512
+_ROUND: Final = 2.0**24  # what trigonometry gives is rounded, so that no machine's last bit decides
 
 
 @dataclass(frozen=True, slots=True)
@@ -36,8 +42,8 @@ class VisibilityParameters:
 
     Attributes:
         step_m: places along the track are this far apart.
-        azimuths: lines of sight a whole turn at each place.
-        levels: elevations of the lines, shared out as the sensor's rays are.
+        azimuths: fans of lines of sight a whole turn at each place.
+        lines: of a fan, their elevations shared out as the sensor's rays are; a power of two.
         range_m: what lies farther is not observed; lines still end there.
         reach_m: how far lines are followed.
         noise_m: thickens the Gaussians that stop lines: of ranges and poses.
@@ -53,9 +59,9 @@ class VisibilityParameters:
             between Gaussians of the ground.
     """
 
-    step_m: float = 2.0
-    azimuths: int = 240
-    levels: int = 32
+    step_m: float = 8.0
+    azimuths: int = 64
+    lines: int = 16
     range_m: float = 50.0
     reach_m: float = 70.0
     noise_m: float = 0.05
@@ -63,19 +69,21 @@ class VisibilityParameters:
     new_radius_m: float = 0.5
     min_hits: float = 48.0
     min_passes: float = 256.0
-    hits_near: float = 3.0
+    hits_near: float = 6.0
     passes_near: float = 8.0
     open_rad: float = 0.04
 
     def __post_init__(self) -> None:
         for name, low, high in (
-            ("step_m", 0.25, 20.0), ("azimuths", SECTORS, 3600), ("levels", 2, 128), ("range_m", 5.0, 100.0),
+            ("step_m", 0.25, 20.0), ("azimuths", SECTORS, 3600), ("lines", 1, _SLOPES), ("range_m", 5.0, 100.0),
             ("reach_m", self.range_m, 150.0), ("noise_m", 0.005, 0.5), ("r2", 0.1, 100.0), ("new_radius_m", 0.0, 0.5),
             ("min_hits", 0.0, 1e6), ("min_passes", 0.0, 1e6), ("hits_near", 1.0, 1e3),
             ("passes_near", 1.0, 1e3), ("open_rad", 0.0, 1.6),
         ):  # fmt: skip
             if not low <= getattr(self, name) <= high:
                 raise ConfigError(f"visibility: {name} must lie in {low:g} … {high:g}, got {getattr(self, name):g}")
+        if _SLOPES % self.lines:
+            raise ConfigError(f"visibility: lines must be a power of two, got {self.lines}")
 
 
 def observed_along(
@@ -91,191 +99,229 @@ def observed_along(
 
     Returns:
         Sorted voxel ids (K,) of each tile; those flagged are always among them.
+
+    Raises:
+        TrackError: the way climbs so far that looking along it would take too much memory.
     """
     p = parameters or VisibilityParameters()
     by_tile = {flags.tile_id: flags for flags in told}
     found = {tile_id: flags.voxel_id for tile_id, flags in by_tile.items()}
     for group in zones(by_tile).values():
-        for tile_id, voxel_id in _Zone(track, [by_tile[t] for t in group], p).observed():
-            found[tile_id] = np.union1d(found[tile_id], voxel_id).astype(np.int32)
+        found |= _Zone([by_tile[tile_id] for tile_id in group], track, p).observed()
     return found
 
 
 @dataclass(frozen=True, slots=True)
 class _Places:
-    """Where lines start: grid coordinates (P, 3), cosine and sine of the heading (P, 2), rays that each line stands
-    for (P,), directions before the turn by the heading (R, 3), metres.
+    """Where fans start.
+
+    Attributes:
+        uv: (P, 2) tiles east and north of the zone's first tile's corner.
+        height_m: (P,).
+        turn: (P, 2) cosine and sine of the heading, a little more from place to place.
+        rays: (P,) that each line stands for, in 1 / _PARTS.
     """
 
-    g: F64
+    uv: F64
+    height_m: F64
     turn: F64
-    weight: F64
-    directions: F64
+    rays: I64
 
-    def __getitem__(self, part: slice) -> "_Places":
-        return _Places(self.g[part], self.turn[part], self.weight[part], self.directions)
+    def take(self, rows: npt.NDArray[np.bool_]) -> "_Places":
+        return _Places(self.uv[rows], self.height_m[rows], self.turn[rows], self.rays[rows])
 
 
 class _Zone:
-    """The tiles of one report that share their (nx, ny), in global grid coordinates (`GridFrame`)."""
+    """The tiles of one report that share their (nx, ny); tiles are counted from the first one on."""
 
-    def __init__(self, track: Track, told: Sequence[Flags], parameters: VisibilityParameters) -> None:
-        self._p, self._told = parameters, told
-        grid = VoxelGrid.of(told[0].tile_id)
-        self._nx, self._ny = grid.nx, grid.ny
-        self._metres = np.array([grid.dx_m, grid.dy_m, grid.dz_m])
-        self._first_lon = told[0].tile_id.lon_index
-        self._base_g = [self._grid(flags.tile_id, flags.base.voxel_id) for flags in told]
-        self._set_stops()
-        self._places = self._make_places(track)
+    def __init__(self, told: Sequence[Flags], track: Track, parameters: VisibilityParameters) -> None:
+        self._p, self._track, self._told = parameters, track, told
+        self._first, self._grid = told[0].tile_id, VoxelGrid.of(told[0].tile_id)
+        self._metres = np.array([self._grid.dx_m, self._grid.dy_m, self._grid.dz_m])
+        self._tile_m = self._metres[:2] * (self._grid.nx, self._grid.ny)
+        self._azimuth, self._slope = _azimuths(track.view, parameters), _slopes(track.view)
 
-    def observed(self) -> Iterator[tuple[TileId, I32]]:
-        """Tiles with the ids of their voxels that were seen, sorted; a tile may come several times."""
-        hits = np.zeros(len(self._g))
-        crossed = [self._look(part, hits) for part in self._chunks()]
-        near = self._faces(self._g, (ChangeClass.MODIFIED, ChangeClass.DELETED))
-        yield from self._by_tile(self._g[hits >= self._p.min_hits * self._p.hits_near**near])
-        if crossed:
-            g, member = np.unique(np.concatenate([g for g, _ in crossed]), axis=0, return_inverse=True)
-            passes = np.bincount(member.reshape(-1), weights=np.concatenate([n for _, n in crossed]))
-            near = self._faces(g, (ChangeClass.NEW,))
-            yield from self._by_tile(g[passes >= self._p.min_passes * self._p.passes_near**near])
+    def observed(self) -> dict[TileId, I32]:
+        """Of each tile that a line can reach the voxels seen and those flagged, sorted."""
+        corner = self._tiles()
+        places = self._make_places()
+        apart_m = _apart_m(places.uv * self._tile_m, corner * self._tile_m, self._tile_m)
+        within = apart_m <= self._p.reach_m
+        reached = np.flatnonzero(within.any(axis=1))
+        if len(reached) == 0:
+            return {}
+        shown = within[reached][:, within.any(axis=0)]
+        places, told = places.take(within.any(axis=0)), [self._told[k] for k in reached.tolist()]
+        w, origin = self._window(told, corner[reached], places, shown)
+        return _read(w, told, self._look(w, told, places, (places.uv - origin) * w.columns))
 
-    def _faces(self, g: I64, classes: tuple[ChangeClass, ...]) -> F64:
-        """(N,) behind how many of the faces of voxels (N, 3) the drive flags one of the classes."""
-        flagged = [f.voxel_id[np.isin(f.change_class, classes)] for f in self._told]
-        changed = [self._grid(f.tile_id, ids) for f, ids in zip(self._told, flagged, strict=True)]
-        key = self._key(np.concatenate(changed))
-        steps = np.concatenate([np.eye(3, dtype=np.int64), -np.eye(3, dtype=np.int64)])
-        return np.asarray(np.sum([np.isin(self._key(g + step), key) for step in steps], axis=0), np.float64)
-
-    def _key(self, g: I64) -> I64:
-        """One number a voxel (N, 3); the tiles told lie in one district or next to it."""
-        corner = np.array([self._first_lon * self._nx, self._told[0].tile_id.lat_index * self._ny, 0])
-        return np.asarray((g - corner) @ np.array([1 << 42, 1 << 21, 1]), np.int64)
-
-    def _grid(self, tile_id: TileId, voxel_id: I32) -> I64:
-        """(N, 3) global grid coordinates; along longitude unwrapped about the first tile."""
-        ix, iy, floor = VoxelGrid.of(tile_id).unravel(voxel_id)
+    def _tiles(self) -> I64:
+        """(T, 2) tiles east and north of the first one, along longitude the short way round."""
+        lon, lat = deinterleave(np.array([flags.tile_id.morton for flags in self._told], np.int64))
         half = LON_TILES // 2
-        lon = self._first_lon + (tile_id.lon_index - self._first_lon + half) % LON_TILES - half
-        return np.stack([lon * self._nx + ix, tile_id.lat_index * self._ny + iy, floor], axis=-1).astype(np.int64)
+        return np.stack([(lon - lon[0] + half) % LON_TILES - half, lat - lat[0]], axis=1)
 
-    def _set_stops(self) -> None:
-        """What stops lines: the map's Gaussians but those flagged as gone, and a ball in each new voxel."""
-        p, parts = self._p, [(np.zeros((0, 3), np.int64), Gaussians.empty())]
-        for flags, g in zip(self._told, self._base_g, strict=True):
-            gone = flags.voxel_id[flags.change_class == ChangeClass.DELETED]
-            stays = np.flatnonzero(~np.isin(flags.base.voxel_id, gone))
-            parts.append((g[stays], flags.base.take(stays)))
-        new = [f.voxel_id[f.change_class == ChangeClass.NEW] for f in self._told]
-        new_g = np.concatenate([self._grid(f.tile_id, ids) for f, ids in zip(self._told, new, strict=True)])
-        known_g = np.concatenate([g for g, _ in parts])
-        mean_m = np.concatenate([gaussians.mean_m for _, gaussians in parts])
-        cov = np.concatenate([full_matrices(gaussians.cov_m2) for _, gaussians in parts]) + np.eye(3) * p.noise_m**2
-        ball = np.broadcast_to(np.eye(3) * (max(p.new_radius_m, 0.01) ** 2 / p.r2), (len(new_g), 3, 3))
-        self._g = np.concatenate([known_g, new_g])
-        self._mean_m = np.concatenate([mean_m, np.zeros((len(new_g), 3))]).astype(np.float64)
-        self._whitening = np.linalg.inv(np.linalg.cholesky(np.concatenate([cov, ball])))
+    def _make_places(self) -> _Places:
+        lines = [self._line(number) for number in range(len(self._track.pieces))]
+        total_m = sum(float(_legs_m(line, self._tile_m)[1].sum()) for line in lines)
+        step_m = max(self._p.step_m, total_m / _MOST_PLACES)
+        parts = [_along(line, self._tile_m, step_m) for line in lines]
+        uvh = np.concatenate([np.zeros((0, 3)), *(at for at, _ in parts)])
+        ahead = np.concatenate([np.zeros((0, 2)), *(way for _, way in parts)])
+        scans = [piece.scans / len(at) for piece, (at, _) in zip(self._track.pieces, parts, strict=True)]
+        rays = np.array(scans) * self._track.view.rays * _PARTS / (len(self._azimuth) * self._p.lines)
+        each = np.clip(np.round(rays), 1, MOST_RAYS).astype(np.int64)
+        angle = np.arange(len(uvh)) * _GOLDEN % 1.0 * (2.0 * np.pi / self._p.azimuths)
+        cos, sin = np.cos(angle), np.sin(angle)
+        turn = np.stack([ahead[:, 0] * cos - ahead[:, 1] * sin, ahead[:, 1] * cos + ahead[:, 0] * sin], axis=1)
+        return _Places(uvh[:, :2], uvh[:, 2], _rounded(turn), np.repeat(each, [len(at) for at, _ in parts]))
 
-    def _make_places(self, track: Track) -> _Places:
-        p, view = self._p, track.view
-        total_m = sum(self._length_m(track, piece_number) for piece_number in range(len(track.pieces)))
-        step_m = max(p.step_m, total_m / _MOST_PLACES)
-        found = [self._along(track, k, step_m) for k in range(len(track.pieces))]
-        g = np.concatenate([np.zeros((0, 3)), *(part[0] for part in found)])
-        heading = np.concatenate([np.zeros(0), *(part[1] for part in found)])
-        scans = np.concatenate([np.zeros(0), *(part[2] for part in found)])
-        directions = self._directions(track)
-        jitter = np.arange(len(g)) * _GOLDEN % 1.0 * (2.0 * np.pi / p.azimuths)
-        turn = np.stack([np.cos(heading + jitter), np.sin(heading + jitter)], axis=1)
-        return _Places(g, turn, scans * view.rays / len(directions), directions)
-
-    def _line(self, track: Track, number: int) -> F64:
-        """(N, 3) vertices of a piece in grid coordinates."""
-        uvh = track.tile_coordinates(track.pieces[number])
+    def _line(self, number: int) -> F64:
+        """(N, 3) vertices of a piece: tiles east and north of the first tile's corner, metres up."""
+        uvh = self._track.tile_coordinates(self._track.pieces[number])
         half = LON_TILES // 2
-        u = self._first_lon + (uvh[:, 0] - self._first_lon + half) % LON_TILES - half
-        return np.column_stack([u * self._nx, uvh[:, 1] * self._ny, uvh[:, 2]])
+        uvh[:, 0] = (uvh[:, 0] - self._first.lon_index + half) % LON_TILES - half
+        uvh[:, 1] -= self._first.lat_index
+        return uvh
 
-    def _length_m(self, track: Track, number: int) -> float:
-        return float(np.linalg.norm(np.diff(self._line(track, number), axis=0) * self._metres, axis=1).sum())
+    def _window(
+        self, told: Sequence[Flags], corner: I64, places: _Places, shown: npt.NDArray[np.bool_]
+    ) -> tuple[Window, I64]:
+        """Room for the voxels of the tiles that lines can reach, and the tile in the window's corner.
 
-    def _along(self, track: Track, number: int, step_m: float) -> tuple[F64, F64, F64]:
-        """Places along a piece: grid coordinates (P, 3), headings (P,), scans that each stands for (P,)."""
-        line = self._line(track, number)
-        if len(line) == 1:
-            return line, np.zeros(1), np.full(1, float(track.pieces[number].scans))
-        leg = np.diff(line, axis=0) * self._metres
-        way_m = np.concatenate([[0.0], np.cumsum(np.linalg.norm(leg, axis=1))])
-        n = max(1, round(float(way_m[-1]) / step_m))
-        at_m = (np.arange(n) + 0.5) * way_m[-1] / n
-        g = np.column_stack([np.interp(at_m, way_m, line[:, axis]) for axis in range(3)])
-        of_leg = np.clip(np.searchsorted(way_m, at_m, side="right") - 1, 0, len(leg) - 1)
-        heading = np.arctan2(leg[of_leg, 1], leg[of_leg, 0])
-        return g, heading, np.full(n, track.pieces[number].scans / n)
-
-    def _directions(self, track: Track) -> F64:
-        """(R, 3) unit directions, x ahead: the sensor's sectors of azimuth, its elevations as its rays are shared."""
-        p, view = self._p, track.view
-        azimuth = (np.arange(p.azimuths) + 0.5) * (2.0 * np.pi / p.azimuths)
-        sector = (azimuth * (SECTORS / (2.0 * np.pi))).astype(np.int64)
-        azimuth = azimuth[(view.sectors >> sector) & 1 == 1]
-        share = (np.arange(p.levels) + 0.5) / p.levels
-        elevation = np.interp(share, np.linspace(0.0, 1.0, len(view.levels)), view.elevations_rad)
-        flat, up = np.cos(elevation), np.sin(elevation)
-        rows = [np.outer(flat, np.cos(azimuth)), np.outer(flat, np.sin(azimuth)), np.outer(up, np.ones(len(azimuth)))]
-        return np.ascontiguousarray(np.stack(rows, axis=-1).reshape(-1, 3))
-
-    def _chunks(self) -> Iterator[_Places]:
-        """Places in runs so short that the window about each stays small."""
-        g, start = self._places.g * self._metres, 0
-        for k in range(1, len(g) + 1):
-            if k == len(g) or np.abs(g[k] - g[start])[:2].max() > _CHUNK_M:
-                yield self._places[start:k]
-                start = k
-
-    def _look(self, places: _Places, hits: F64) -> tuple[I64, F64]:
-        """Follow the lines from some places: adds to `hits` (stops,), returns the empty voxels crossed, and how often.
-
-        Rays of lines that leave the tiles told are not counted there.
+        Args:
+            told: those tiles.
+            corner: (T, 2) where they lie.
+            places: that reach any.
+            shown: (T, P) which reaches which.
         """
-        origin, shape = self._window(places)
-        state = self._state(origin, shape)
-        passes = np.zeros(state.size)
-        cast_lines(
-            places.g - origin, places.turn, places.weight, places.directions, self._metres, state, shape,
-            (self._g - origin) * self._metres + 0.5 * self._metres + self._mean_m, self._whitening,
-            self._p.r2, self._p.range_m, self._p.reach_m, float(np.sin(self._p.open_rad)), hits, passes,
+        at = np.floor(places.uv).astype(np.int64)
+        origin = np.minimum(corner.min(axis=0), at.min(axis=0))
+        slot_of = np.full(np.maximum(corner.max(axis=0), at.max(axis=0)) - origin + 1, NO_SLOT, np.int32)
+        slot_of[tuple((corner - origin).T)] = np.arange(len(told))
+        steep = float(np.abs(self._slope).max())
+        rise_m = self._p.reach_m * steep / np.sqrt(1.0 + steep**2)
+        lowest, highest = self._known_floors(told, places.height_m)
+        bottom = np.where(shown, places.height_m, np.inf).min(axis=1) - rise_m
+        top = np.where(shown, places.height_m, -np.inf).max(axis=1) + rise_m
+        low = np.maximum(np.floor(bottom).astype(np.int64), lowest - _FLOORS_BELOW)
+        floors = np.maximum(np.minimum(np.floor(top).astype(np.int64), highest + _FLOORS_ABOVE) - low + 1, 0)
+        columns = self._grid.nx, self._grid.ny
+        offset = np.concatenate([[0], np.cumsum(floors * columns[0] * columns[1])])
+        if offset[-1] > _MOST_CELLS:
+            raise TrackError(f"lines of sight over {len(told)} tiles cross {offset[-1]} voxels: at most {_MOST_CELLS}")
+        first = ((corner - origin) * columns).astype(np.int32)
+        return Window(
+            columns, self._metres, slot_of, first, offset, low.astype(np.int32), floors.astype(np.int32), int(low.min())
+        ), origin
+
+    def _known_floors(self, told: Sequence[Flags], height_m: F64) -> tuple[int, int]:
+        """Lowest and highest floor of the map, the flags and the places."""
+        ends = [ids[[0, -1]] for flags in told for ids in (flags.base.voxel_id, flags.voxel_id) if len(ids)]
+        _, _, floor = self._grid.unravel(np.concatenate([np.zeros(0, np.int32), *ends]))
+        every = np.concatenate([floor, np.floor(height_m).astype(np.int64)])
+        return int(every.min()), int(every.max())
+
+    def _look(self, w: Window, told: Sequence[Flags], places: _Places, g: F64) -> U64:
+        """(T * nx * ny, words) a bit for each voxel seen or flagged."""
+        p = self._p
+        state, near = np.full(w.offset[-1], NOTHING, np.int32), np.zeros(w.offset[-1], np.uint8)
+        words = (int((w.low + w.floors).max()) - w.lowest) // 64 + 1
+        filled, seen, more = (np.zeros((len(told) * w.columns[0] * w.columns[1], words), np.uint64) for _ in range(3))
+        new = [flags.voxel_id[flags.change_class == ChangeClass.NEW] for flags in told]
+        known = [flags.base.voxel_id for flags in told]
+        slot, voxel_id = _slots([*known, *new], len(told)), np.concatenate([*known, *new])
+        stop = np.zeros((len(slot), STOP), np.float32)
+        hits, pooled = np.zeros(len(slot), np.int64), np.zeros(len(slot), np.int64)
+        mean_m = np.concatenate([flags.base.mean_m for flags in told])
+        cov_m2 = np.concatenate([flags.base.cov_m2 for flags in told])
+        ball_m2 = max(p.new_radius_m, 0.01) ** 2 / p.r2
+        sight.lay_out(w, slot, voxel_id, mean_m, cov_m2, ball_m2, p.noise_m**2, state, filled, stop)
+        flagged, classes = [flags.voxel_id for flags in told], [flags.change_class for flags in told]
+        where = _slots(flagged, len(told)), np.concatenate(flagged), np.concatenate(classes)
+        sight.mark(w, *where, state, filled, near, seen)
+        sight.cast_fans(
+            w, np.column_stack([g, places.height_m]), places.turn, places.rays, self._azimuth, self._slope, p.lines,
+            stop, filled, p.r2, p.range_m, p.reach_m, float(_rounded(np.tan(p.open_rad))), state, hits,
+            Columns.room(), np.empty(2),
         )  # fmt: skip
-        at = np.flatnonzero((passes > 0.0) & (state == NOTHING))
-        return np.stack(np.unravel_index(at, shape), axis=-1) + origin, passes[at]
+        sight.pool(w, filled, state, hits, pooled)
+        least_hits, least_passes = _least(p.min_hits, p.hits_near), _least(p.min_passes, p.passes_near)
+        sight.read_out(w, state, pooled, near, least_hits, least_passes, seen)
+        sight.fill(w, filled, near, seen, more)
+        return np.asarray(seen | more)
 
-    def _window(self, places: _Places) -> tuple[I64, tuple[int, int, int]]:
-        reach = self._p.reach_m / self._metres[:2]
-        low, high = places.g[:, :2].min(axis=0) - reach, places.g[:, :2].max(axis=0) + reach
-        floors = np.concatenate([self._g[:, 2], np.floor(places.g[:, 2]).astype(np.int64)])
-        origin = np.array([*np.floor(low), floors.min() - _FLOORS_BELOW]).astype(np.int64)
-        shape = np.array([*np.ceil(high), floors.max() + _FLOORS_ABOVE + 1]).astype(np.int64) - origin
-        return origin, (int(shape[0]), int(shape[1]), int(shape[2]))
 
-    def _state(self, origin: I64, shape: tuple[int, int, int]) -> I32:
-        """Flat int32 window: row of what stops lines, NOTHING, or OUTSIDE the tiles told."""
-        state = np.full(shape, OUTSIDE, np.int32)
-        for flags in self._told:
-            corner = self._grid(flags.tile_id, VoxelGrid.of(flags.tile_id).voxel_id([0], [0], [0]))[0, :2] - origin[:2]
-            low, high = np.maximum(corner, 0), np.maximum(corner + np.array([self._nx, self._ny]), 0)
-            state[low[0] : high[0], low[1] : high[1]] = NOTHING
-        at = self._g - origin
-        inside = np.flatnonzero(((at >= 0) & (at < shape)).all(axis=1))
-        state[tuple(at[inside].T)] = inside
-        return state.reshape(-1)
+def _apart_m(position_m: F64, corner_m: F64, size_m: F64) -> F64:
+    """(T, P) distance of places (P, 2) from tiles of one size, given by their corners (T, 2)."""
+    ahead = corner_m[:, None, :] - position_m[None, :, :]
+    outside = np.maximum(0.0, np.maximum(ahead, -ahead - size_m))
+    return np.asarray(np.sqrt((outside**2).sum(axis=2)))
 
-    def _by_tile(self, g: I64) -> Iterator[tuple[TileId, I32]]:
-        lon_index, ix = np.divmod(g[:, 0], self._nx)
-        lat_index, iy = np.divmod(g[:, 1], self._ny)
-        morton = interleave(lon_index % LON_TILES, lat_index)
-        voxel_id = join_voxel_id(ix, iy, g[:, 2], self._nx, self._ny)
-        for flags in self._told:
-            mine = np.flatnonzero(morton == flags.tile_id.morton)
-            yield flags.tile_id, np.unique(voxel_id[mine])
+
+def _legs_m(line: F64, tile_m: F64) -> tuple[F64, F64]:
+    """Legs (N - 1, 3) of a polyline in metres, and their lengths."""
+    leg = np.diff(line, axis=0) * [*tile_m, 1.0]
+    return leg, np.sqrt((leg**2).sum(axis=1))
+
+
+def _along(line: F64, tile_m: F64, step_m: float) -> tuple[F64, F64]:
+    """Places (P, 3) along a polyline, and the way ahead (P, 2), a unit vector. Where the vehicle stands still it looks
+    several times: each time along other lines.
+    """
+    leg, length_m = _legs_m(line, tile_m)
+    way_m = np.concatenate([[0.0], np.cumsum(length_m)])
+    n = max(_LEAST_PLACES, round(float(way_m[-1]) / step_m))
+    if way_m[-1] == 0.0:
+        return np.repeat(line[:1], n, axis=0), np.tile([1.0, 0.0], (n, 1))
+    at_m = (np.arange(n) + 0.5) * way_m[-1] / n
+    places = np.column_stack([np.interp(at_m, way_m, line[:, axis]) for axis in range(3)])
+    of_leg = np.clip(np.searchsorted(way_m, at_m, side="right") - 1, 0, len(leg) - 1)
+    flat = leg[of_leg, :2]
+    size = np.sqrt((flat**2).sum(axis=1))
+    return places, np.where(size[:, None] > 0.0, flat / np.maximum(size, 1e-9)[:, None], [1.0, 0.0])
+
+
+def _azimuths(view: View, p: VisibilityParameters) -> F64:
+    """(A, 2) unit vectors, x ahead: those that the sensor looks along."""
+    azimuth = (np.arange(p.azimuths) + 0.5) * (2.0 * np.pi / p.azimuths)
+    sector = (azimuth * (SECTORS / (2.0 * np.pi))).astype(np.int64)
+    azimuth = azimuth[(view.sectors >> sector) & 1 == 1]
+    return _rounded(np.stack([np.cos(azimuth), np.sin(azimuth)], axis=1))
+
+
+def _slopes(view: View) -> F64:
+    """(_SLOPES,) tangents of the elevations, shared out as the sensor's rays are."""
+    share = (np.arange(_SLOPES) + 0.5) / _SLOPES
+    return _rounded(np.tan(np.interp(share, np.linspace(0.0, 1.0, len(view.levels)), view.elevations_rad)))
+
+
+def _rounded(values: npt.ArrayLike) -> F64:
+    return np.asarray(np.round(np.asarray(values) * _ROUND) / _ROUND)
+
+
+def _least(rays: float, near: float) -> I64:
+    """(FACES + 1,) how many rays are enough by the number of faces, in 1 / _PARTS; at least some."""
+    parts = np.ceil(rays * near ** np.arange(FACES + 1) * _PARTS)
+    return np.clip(parts, 1, MOST_RAYS).astype(np.int64)
+
+
+def _slots(parts: Sequence[I32], tiles: int) -> I32:
+    """Slot of each voxel of parts that go round the tiles in order."""
+    return np.repeat(np.arange(len(parts), dtype=np.int32) % tiles, [len(part) for part in parts])
+
+
+def _read(w: Window, told: Sequence[Flags], seen: U64) -> dict[TileId, I32]:
+    """Sorted voxel ids of each tile, seen or flagged."""
+    ids, ends = sight.voxel_ids(w, seen)
+    columns, found = w.columns[0] * w.columns[1], {}
+    for slot, (flags, mine) in enumerate(zip(told, np.split(ids, ends[:-1]), strict=True)):
+        lowest = int(w.low[slot]) * columns - columns // 2
+        whole = _is_within(flags.voxel_id, lowest, lowest + int(w.floors[slot]) * columns)
+        found[flags.tile_id] = mine if whole else np.union1d(mine, flags.voxel_id).astype(np.int32)
+    return found
+
+
+def _is_within(voxel_id: I32, lowest: int, beyond: int) -> bool:
+    """Whether sorted voxel ids lie in lowest .. beyond - 1."""
+    return len(voxel_id) == 0 or (int(voxel_id[0]) >= lowest and int(voxel_id[-1]) < beyond)

@@ -12,7 +12,7 @@ from typing import Final, Literal
 import numpy as np
 import numpy.typing as npt
 
-from gnd_map.arrays import I32, check_array
+from gnd_map.arrays import I32, are_in, check_array
 from gnd_map.classes import ChangeClass
 from gnd_map.codec import CODEC_FLOAT32, codec_of, encode_gaussians
 from gnd_map.gaussian import Gaussians
@@ -54,6 +54,16 @@ _ROUNDING: Final = 1e-5
 """How negative an eigenvalue of a float32 covariance may be, relative to the largest: a plane's smallest is about 0."""
 
 
+@dataclass(frozen=True, slots=True)
+class _AboutTile:
+    """What an error is about; written out only when there is one, for that takes longer than the checks."""
+
+    tile: TileId
+
+    def __str__(self) -> str:
+        return f"change of tile {self.tile}"
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class TileChange:
     """What one drive found out about one tile."""
@@ -79,7 +89,7 @@ class TileChange:
     """Why the vehicle does not fully believe this; None = it does."""
 
     def __post_init__(self) -> None:
-        with refusing(f"change of tile {self.tile}"):
+        with refusing(_AboutTile(self.tile)):
             check_pair("base", self.base_version, self.base_sha)
             check_array("observed", self.observed, np.int32, (None,))
             check_array("change_class", self.change_class, np.uint8, (len(self.changed),))
@@ -96,9 +106,9 @@ class TileChange:
             )
 
     def _check_voxels(self) -> None:
-        if (np.diff(self.observed.astype(np.int64)) <= 0).any():
+        if not (self.observed[1:] > self.observed[:-1]).all():
             raise BadValue(f"the {len(self.observed)} observed voxels are not strictly increasing")
-        outside = ~np.isin(self.changed.voxel_id, self.observed)
+        outside = ~are_in(self.changed.voxel_id, self.observed)
         if outside.any():
             first = self.changed.voxel_id[outside][0]
             raise BadValue(f"{outside.sum()} changed voxels are not among the observed, first {first}")
@@ -145,7 +155,7 @@ def _check_floors(tile: TileId, voxel_id: I32) -> None:
 
 def _check_covariances(gaussians: Gaussians) -> None:
     """Refuse covariances that no points inside a voxel can have: not positive semi-definite, or too large."""
-    if len(gaussians) == 0:
+    if not gaussians.count.any():
         return
     eigenvalues = np.linalg.eigvalsh(gaussians.full_cov())
     smallest, largest = eigenvalues[:, 0], eigenvalues[:, -1]
@@ -284,7 +294,7 @@ def _check_observed(voxels: int, tiles: int) -> None:
 
 def _change_value(message: tile_change_pb2.TileChange) -> TileChange:
     tile = tile_id(message.tile)
-    with refusing(f"change of tile {tile}"):
+    with refusing(_AboutTile(tile)):
         observed = decode_observed(message.observed_first, message.observed_bitmap)
         changed = codec_of(message.codec_id).decode(tile, message.changed)
         evidence = _evidence_of(message, len(changed))

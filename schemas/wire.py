@@ -63,7 +63,7 @@ def serialise(message: Message, limit: int) -> bytes:
 
 
 @contextmanager
-def refusing(what: str, kind: type[SchemaError] = BadValue) -> Iterator[None]:
+def refusing(what: object, kind: type[SchemaError] = BadValue) -> Iterator[None]:
     """Errors of the values inside get `what` in front; `gnd_map`'s and numpy's become `kind`."""
     try:
         yield

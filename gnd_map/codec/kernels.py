@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gnd_map.arrays import I32, I64
-from gnd_map.jit import inlined, kernel
+from gnd_map.jit import bare, bare_inlined
 
 U8 = NDArray[np.uint8]
 State = Any  # (coder, buffer, places, weight): arrays, see `coding.Coder`; a place is probability << 8 | times seen
@@ -66,7 +66,7 @@ _LIMIT: Final = 250
 _MIX_RATE: Final = 6
 
 
-@kernel
+@bare
 def _shift_out(coder: I64, buffer: U8) -> None:
     """Move the bytes on which both ends of the interval agree."""
     while ((coder[LOW] ^ coder[HIGH]) & 0xFF000000) == 0:
@@ -90,7 +90,7 @@ def _shift_out(coder: I64, buffer: U8) -> None:
         coder[HIGH] = ((coder[HIGH] << 8) & _TOP) | 0xFF
 
 
-@inlined
+@bare_inlined
 def _code(coder: I64, buffer: U8, p: int, bit: int) -> int:
     """Write `bit`, or read one; `p` of 65536 is the probability of a 1."""
     span = coder[HIGH] - coder[LOW]
@@ -106,7 +106,7 @@ def _code(coder: I64, buffer: U8, p: int, bit: int) -> int:
     return bit
 
 
-@inlined
+@bare_inlined
 def _learnt(place: int, bit: int) -> int:
     """A context after a decision: its probability moves towards what came, the less the more it has seen."""
     p, n = place >> 8, place & 0xFF
@@ -115,7 +115,7 @@ def _learnt(place: int, bit: int) -> int:
     return learnt
 
 
-@kernel
+@bare
 def code_bit(state: State, at: int, bit: int) -> int:
     """One decision in one context."""
     coder, buffer, places, _ = state
@@ -125,7 +125,7 @@ def code_bit(state: State, at: int, bit: int) -> int:
     return bit
 
 
-@kernel
+@bare
 def code_mixed(state: State, a: int, b: int, c: int, w: int, bit: int) -> int:
     """One decision in three contexts, mixed by the weights at `w`."""
     coder, buffer, places, weight = state
@@ -149,7 +149,7 @@ _LEAD: Final = 15
 _LONGEST: Final = 14
 
 
-@kernel
+@bare
 def code_signed(state: State, a: int, b: int, c: int, w: int, value: int) -> int:
     """A signed number below 2^14 in three contexts of WIDTH places each; mixing weights from `w` on."""
     size = abs(value)
@@ -169,7 +169,7 @@ def code_signed(state: State, a: int, b: int, c: int, w: int, value: int) -> int
     return -found if sign == 1 else found
 
 
-@kernel
+@bare
 def code_plain(state: State, at: int, value: int) -> int:
     """A signed number below 2^31 in one context of 2 · 34 places."""
     coder = state[0]
@@ -191,7 +191,7 @@ def code_plain(state: State, at: int, value: int) -> int:
     return -found if code_bit(state, at + 33, 1 if value < 0 else 0) == 1 else found
 
 
-@kernel
+@bare
 def code_bits(state: State, at: int, bits: U8) -> None:
     """Decisions (N,) one after the other, each in the context of the three before."""
     before = 0
@@ -218,7 +218,7 @@ CELL_CONTEXTS: Final = CELL_A + CELL_B + CELL_C
 KIND_CONTEXTS: Final = 16
 
 
-@kernel
+@bare
 def code_flags(state: State, held: U8, flag: U8, mark: U8, at: int, w: int) -> int:
     """What becomes of each voxel; blocks of 4 x 4 x 4 without a flag cost one decision.
 
@@ -242,7 +242,7 @@ def code_flags(state: State, held: U8, flag: U8, mark: U8, at: int, w: int) -> i
     return _code_cells(state, held, flag, mark, at + BLOCK_CONTEXTS, w, some)
 
 
-@kernel
+@bare
 def _code_blocks(state: State, held: U8, flag: U8, mark: U8, at: int, some: int) -> None:
     """Which blocks hold a flag."""
     for bz in range(1, mark.shape[0] - 1):
@@ -263,7 +263,7 @@ def _code_blocks(state: State, held: U8, flag: U8, mark: U8, at: int, some: int)
             return
 
 
-@kernel
+@bare
 def _code_cells(state: State, held: U8, flag: U8, mark: U8, at: int, w: int, some: int) -> int:
     """The voxels of marked blocks in raster order."""
     count = 0
@@ -296,7 +296,7 @@ def _code_cells(state: State, held: U8, flag: U8, mark: U8, at: int, w: int, som
     return count
 
 
-@kernel
+@bare
 def _cell_contexts(held: U8, flag: U8, mark: U8, z: int, y: int, x: int, some: int) -> tuple[int, int, int]:
     """Three contexts of a voxel: flags that are known already, what is held around it, how many of both."""
     a = b = 0
@@ -328,7 +328,7 @@ def _cell_contexts(held: U8, flag: U8, mark: U8, z: int, y: int, x: int, some: i
     return a, b, c
 
 
-@kernel
+@bare
 def _pattern(flag: U8, z: int, y: int, x: int) -> int:
     """Ten neighbours that come before: one bit each."""
     found: int = (
@@ -346,7 +346,7 @@ def _pattern(flag: U8, z: int, y: int, x: int) -> int:
     return found
 
 
-@kernel
+@bare
 def _far_pattern(flag: U8, z: int, y: int, x: int) -> int:
     """Six neighbours in line, two deep, and two across the floor below."""
     found: int = (
@@ -362,7 +362,7 @@ def _far_pattern(flag: U8, z: int, y: int, x: int) -> int:
     return found
 
 
-@kernel
+@bare
 def _held_pattern(held: U8, z: int, y: int, x: int) -> int:
     """The six neighbours across faces: one bit each."""
     found: int = (
@@ -386,7 +386,8 @@ SLOPE: Final = 7  # ba, ca, cb
 STEP: Final = 10  # a, b, c
 COUNT: Final = 13
 SELF: Final = 14  # row that this one replaces, or -1
-COLUMNS: Final = 15
+TILT: Final = 15  # of the surface along a and b, 2^-16: follows from the others, found once for all that ask
+COLUMNS: Final = 17
 
 # Families of contexts of each number, three each.
 _FAMILIES: Final = (
@@ -414,13 +415,13 @@ NUMBER_CONTEXTS: Final = int(_START[-1])
 VOXEL_CONTEXTS: Final = AXIS_CONTEXTS + NUMBER_CONTEXTS
 VOXEL_WEIGHTS: Final = 2 + WIDTH * len(_FAMILIES)
 
-_MOST_REFS: Final = 4
+MOST_REFS: Final = 4
 _BITS: Final = 16
 
 
-@kernel
+@bare
 def code_voxels(
-    state: State, table: I32, first: int, where: I32, sd: I64, shape: I64, pitch: I64, at: int, w: int
+    state: State, table: I32, first: int, where: I32, sd: I64, shape: I64, pitch: I64, at: int, w: int, refs: I64
 ) -> None:
     """The Gaussians of the rows `first` … of a table, in order, each from its neighbours that are known already.
 
@@ -436,8 +437,10 @@ def code_voxels(
         pitch: (3,) size of a voxel along x, y, z, 2^-mean_bits m.
         at: first context.
         w: first mixing weights.
+        refs: (MOST_REFS,) int64, room to work in.
     """
-    refs = np.zeros(_MOST_REFS, np.int64)
+    for row in range(1, first):
+        _keep_tilts(table, row, sd, shape)
     for row in range(first, len(table)):
         _code_voxel(state, table, row, where, sd, shape, pitch, at, w, refs)
         where[table[row, Z], table[row, Y], table[row, X]] = row
@@ -455,7 +458,7 @@ _AROUND: Final = _around()
 _ANY_AXIS: Final = -1
 
 
-@kernel
+@bare
 def _neighbours(table: I32, row: int, where: I32, axis: int, most: int, refs: I64) -> int:
     """Rows of up to `most` known neighbours of one thin axis (or any), the replaced one first; how many."""
     n = 0
@@ -474,7 +477,7 @@ def _neighbours(table: I32, row: int, where: I32, axis: int, most: int, refs: I6
     return n
 
 
-@kernel
+@bare
 def _occupied(where: I32, z: int, y: int, x: int) -> int:
     """The six neighbours across faces that hold, or will hold, a Gaussian: one bit each."""
     found: int = (
@@ -488,7 +491,7 @@ def _occupied(where: I32, z: int, y: int, x: int) -> int:
     return found
 
 
-@kernel
+@bare
 def _bucket(value: int) -> int:
     """0, 1, 2-3, 4-7, 8-15, more: 0 … 5."""
     size = abs(value)
@@ -499,18 +502,18 @@ def _bucket(value: int) -> int:
     return k
 
 
-@kernel
+@bare
 def _ratio(numerator: int, denominator: int) -> int:
     """Nearest integer of a quotient, denominator > 0."""
     return (2 * numerator + denominator) // (2 * denominator)
 
 
-@kernel
+@bare
 def _clip(value: int, low: int, high: int) -> int:
     return min(max(value, low), high)
 
 
-@kernel
+@bare
 def _code_axis(
     state: State, table: I32, row: int, where: I32, refs: I64, occupied: int, kind: int, at: int, w: int
 ) -> int:
@@ -526,7 +529,7 @@ def _code_axis(
     return code_mixed(state, a + 1, b + 1, c + 1, w + 1, 1 if axis == 1 else 0)
 
 
-@inlined
+@bare_inlined
 def _number(state: State, which: int, a: int, b: int, c: int, at: int, w: int, value: int) -> int:
     """A number of family `which` in its contexts a, b, c."""
     at += AXIS_CONTEXTS
@@ -540,7 +543,7 @@ def _number(state: State, which: int, a: int, b: int, c: int, at: int, w: int, v
     )
 
 
-@kernel
+@bare
 def _code_voxel(
     state: State, table: I32, row: int, where: I32, sd: I64, shape: I64, pitch: I64, at: int, w: int, refs: I64
 ) -> None:
@@ -551,7 +554,7 @@ def _code_voxel(
     kind = 2 if table[row, SELF] >= 0 else shape[7]
     axis = _code_axis(state, table, row, where, refs, occupied, kind, at, w)
     table[row, AXIS] = axis
-    n = _neighbours(table, row, where, axis, _MOST_REFS, refs)
+    n = _neighbours(table, row, where, axis, MOST_REFS, refs)
     top = len(sd) - 1
     first = refs[0] if n > 0 else 0  # row 0 stands for nothing: typical values
     mean_c = mean_count = 0
@@ -595,7 +598,7 @@ def _code_voxel(
     low_a = low_b = 1 << 40
     high_a = high_b = -(1 << 40)
     for i in range(n):
-        ta, tb = _tilts(table, refs[i], sd, plane_step, slope_bits, shear_bits, up)
+        ta, tb = np.int64(table[refs[i], TILT]), np.int64(table[refs[i], TILT + 1])
         tilt_a, tilt_b = tilt_a + ta, tilt_b + tb
         low_a, high_a, low_b, high_b = min(low_a, ta), max(high_a, ta), min(low_b, tb), max(high_b, tb)
     if n > 0:
@@ -650,9 +653,10 @@ def _code_voxel(
     surprise = min(_bucket(odd_a), 3) * 4 + min(_bucket(odd_b), 3)
     m_c = want + _number(state, 9, min(n, 3) * 6 + doubt, thin, surprise * 3 + kind, at, w, table[row, STEP + 2] - want)
     table[row, STEP + 2] = m_c
+    _keep_tilts(table, row, sd, shape)
 
 
-@kernel
+@bare
 def _code_level(
     state: State, table: I32, row: int, which: int, family: int, first: int, kind: int, around: int, axis: int,
     other: int, plane_step: int, top: int, at: int, w: int,
@@ -667,21 +671,20 @@ def _code_level(
     return found
 
 
-@kernel
-def _tilts(
-    table: I32, row: int, sd: I64, plane_step: int, slope_bits: int, shear_bits: int, up: int
-) -> tuple[int, int]:
+@bare
+def _keep_tilts(table: I32, row: int, sd: I64, shape: I64) -> None:
     """Tilt of a known voxel's surface along a and b, 2^-16, at most 4 either way."""
+    plane_step, slope_bits, shear_bits, up = shape[0], shape[1], shape[2], shape[5] - 20
     D1, D2 = sd[table[row, LEVEL] * plane_step] << up, sd[table[row, LEVEL + 1] * plane_step] << up
     D3 = sd[table[row, LEVEL + 2]] << up
     L21 = table[row, SLOPE] * D2 >> shear_bits
     L31, L32 = table[row, SLOPE + 1] * D3 >> slope_bits, table[row, SLOPE + 2] * D3 >> slope_bits
     tilt_b = _clip((L32 << _BITS) // D2, -(4 << _BITS), 4 << _BITS)
-    tilt_a = _clip(((L31 << _BITS) - tilt_b * L21) // D1, -(4 << _BITS), 4 << _BITS)
-    return tilt_a, tilt_b
+    table[row, TILT] = _clip(((L31 << _BITS) - tilt_b * L21) // D1, -(4 << _BITS), 4 << _BITS)
+    table[row, TILT + 1] = tilt_b
 
 
-@kernel
+@bare
 def _height(table: I32, row: int, other: int, sd: I64, shape: I64, pitch: I64, axis: int, mu_a: int, mu_b: int) -> int:
     """Height along the thin axis at which another voxel's plane passes (mu_a, mu_b) of this one, 2^-mean_bits m."""
     plane_step, slope_bits, shear_bits = shape[0], shape[1], shape[2]
@@ -698,7 +701,7 @@ def _height(table: I32, row: int, other: int, sd: I64, shape: I64, pitch: I64, a
     to_a = step_y if axis == 0 else step_x
     to_b = step_y if axis == 2 else step_z
     to_c = step_x if axis == 0 else (step_y if axis == 1 else step_z)
-    tilt_a, tilt_b = _tilts(table, other, sd, plane_step, slope_bits, shear_bits, up)
+    tilt_a, tilt_b = np.int64(table[other, TILT]), np.int64(table[other, TILT + 1])
     off_a = mu_a - (D1 * ya + to_a)
     off_b = mu_b - (L21 * ya + D2 * yb + to_b)
     height: int = L31 * ya + L32 * yb + D3 * yc + to_c + (tilt_a * off_a + tilt_b * off_b >> _BITS)

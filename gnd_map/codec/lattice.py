@@ -24,6 +24,7 @@ import numpy as np
 import numpy.typing as npt
 
 from gnd_map.arrays import F32, F64, I32, I64, check_array
+from gnd_map.codec import lattice_kernels as k
 from gnd_map.errors import CodecError, ShapeError
 from gnd_map.gaussian import MAX_MEAN_M, Gaussians, concat
 
@@ -163,8 +164,11 @@ def dequantise(quantised: Quantised, lattice: Lattice) -> Gaussians:
     longest = int((~_is_short(quantised, lattice)).sum())
     if longest:
         raise CodecError(f"lattice {lattice.name}: {longest} of {len(quantised)} Gaussians reach {MAX_LENGTH_M} m")
-    mean_m, cov_m2 = _floats(quantised, lattice)
-    count = np.array(lattice.counts, np.int64)[quantised.count].astype(np.int32)
+    rows, (n, counts, _) = len(quantised), _numbers(lattice)
+    mean_m, cov_m2 = np.empty((rows, 3), np.float32), np.empty((rows, 6), np.float32)
+    _, axis, level, slope, step, number = (np.ascontiguousarray(getattr(quantised, f.name)) for f in fields(quantised))
+    k.floats_of(axis, level, slope, step, *_tables(lattice)[2:], n, mean_m, cov_m2)
+    count = counts[number].astype(np.int32)
     try:
         return Gaussians(quantised.voxel_id, count, np.minimum(count, CELLS).astype(np.int32), mean_m, cov_m2)
     except ShapeError as error:
@@ -397,14 +401,44 @@ def _with_means(gaussians: Gaussians, axis: I32, level: I32, slope: I32, lattice
 
 def _count_index(count: I32, lattice: Lattice) -> I32:
     """Nearest number of points on the lattice; what suffices for a Gaussian (20) still does."""
+    return np.searchsorted(_between(lattice), count).astype(np.int32)
+
+
+def _between(lattice: Lattice) -> F64:
+    """Where the nearest number of points changes."""
     counts = np.array(lattice.counts, np.float64)
     between = np.sqrt(counts[1:] * counts[:-1])
     between[counts[1:] == CELLS] = CELLS - 0.5
-    return np.searchsorted(between, count).astype(np.int32)
+    return np.asarray(between)
+
+
+@lru_cache(maxsize=16)
+def _numbers(lattice: Lattice) -> tuple[I64, I64, F64]:
+    """What the kernels know of a lattice, its numbers of points, and where they change."""
+    n = np.zeros(k.NUMBERS, np.int64)
+    n[k.PLANE_STEP], n[k.SLOPE_BITS], n[k.SHEAR_BITS] = lattice.plane_step, lattice.slope_bits, lattice.shear_bits
+    n[k.THIN_BITS], n[k.PLANE_BITS] = lattice.thin_bits, lattice.plane_bits
+    n[k.LENGTH_BITS], n[k.MEAN_BITS] = lattice.length_bits, lattice.mean_bits
+    n[k.CELLS_AT], n[k.LONGEST] = CELLS, MAX_LENGTH_M << lattice.length_bits
+    return n, np.array(lattice.counts, np.int64), _between(lattice)
 
 
 def _found(gaussians: Gaussians, lattice: Lattice) -> tuple[Quantised, npt.NDArray[np.bool_]]:
     """Integers of each Gaussian, and whether they give it back to the bit: each thin axis is tried."""
+    rows = len(gaussians)
+    axis, number, on = np.zeros(rows, np.int32), np.zeros(rows, np.int32), np.zeros(rows, np.int64)
+    level, slope, step = (np.zeros((rows, 3), np.int32) for _ in range(3))
+    n, counts, between = _numbers(lattice)
+    room = np.zeros((1, 3), np.float32), np.zeros((1, 6), np.float32)
+    _, count, cells, mean_m, cov_m2 = (np.ascontiguousarray(column) for column in gaussians.columns)
+    k.find_integers(
+        count, cells, mean_m, cov_m2, counts, between, *_tables(lattice), n, axis, level, slope, step, number, on, *room
+    )
+    return Quantised(gaussians.voxel_id, axis, level, slope, step, number), on.astype(np.bool_)
+
+
+def _found_plain(gaussians: Gaussians, lattice: Lattice) -> tuple[Quantised, npt.NDArray[np.bool_]]:
+    """`_found` in plain numpy: the kernel's twin."""
     cov = gaussians.full_cov()
     likely = _thin_axis(cov)
     found = _read_off(gaussians, cov, likely, lattice)

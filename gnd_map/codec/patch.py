@@ -7,7 +7,7 @@ from typing import Final
 import numpy as np
 import numpy.typing as npt
 
-from gnd_map.arrays import I32, check_array
+from gnd_map.arrays import I32, are_in, check_array
 from gnd_map.classes import ChangeClass
 from gnd_map.codec import kernels as k
 from gnd_map.codec.coding import Coder
@@ -45,9 +45,9 @@ class Flags:
         check_array("voxel_id", self.voxel_id, np.int32, (None,))
         check_array("change_class", self.change_class, np.uint8, (len(self.voxel_id),))
         flagged = (self.change_class >= ChangeClass.NEW) & (self.change_class <= ChangeClass.DELETED)
-        if (np.diff(self.voxel_id.astype(np.int64)) <= 0).any() or not flagged.all():
+        if not (self.voxel_id[1:] > self.voxel_id[:-1]).all() or not flagged.all():
             raise ShapeError(f"tile {self.tile_id}: flagged voxels must increase and be new, modified or deleted")
-        held = np.isin(self.voxel_id, self.base.voxel_id)
+        held = are_in(self.voxel_id, self.base.voxel_id)
         wrong = held == (self.change_class == ChangeClass.NEW)
         if wrong.any():
             raise ShapeError(
@@ -72,7 +72,7 @@ def encode_delta(tile_id: TileId, base: Gaussians, new: Gaussians) -> bytes:
     box = code_box(coder, tile_id, base.voxel_id, flagged)
     if box is not None:
         flag = np.asarray(box.empty(np.uint8, k.NONE), np.uint8)
-        flag[box.places(put.voxel_id)] = np.where(np.isin(put.voxel_id, base.voxel_id), k.REPLACED, k.PUT)
+        flag[box.places(put.voxel_id)] = np.where(are_in(put.voxel_id, base.voxel_id), k.REPLACED, k.PUT)
         flag[box.places(gone)] = k.GONE
         code_flags(coder, box, base.voxel_id, flag)
         known = _known(base, put.voxel_id, gone, lattice)
@@ -106,7 +106,7 @@ def decode_delta(tile_id: TileId, base: Gaussians, body: bytes) -> Gaussians:
 
 
 def _known(base: Gaussians, put: I32, gone: npt.NDArray[np.integer], lattice: Lattice) -> Known:
-    return known_of(base, np.isin(base.voxel_id, put), np.isin(base.voxel_id, gone), lattice)
+    return known_of(base, are_in(base.voxel_id, put), are_in(base.voxel_id, gone), lattice)
 
 
 def encode_flags(tiles: Sequence[Flags]) -> bytes:

@@ -151,8 +151,8 @@ def code_voxels(
     if quantised is not None:
         _fill(new, box, quantised, keep_self=True)
     shape, pitch = _numbers(lattice, box.grid, n_known > 0)
-    sd = np.array(lattice.sd, np.int64)
-    k.code_voxels(coder.state, table, 1 + n_known, where, sd, shape, pitch, VOXELS_AT, VOXEL_WEIGHTS_AT)
+    sd, refs = np.array(lattice.sd, np.int64), np.zeros(k.MOST_REFS, np.int64)
+    k.code_voxels(coder.state, table, 1 + n_known, where, sd, shape, pitch, VOXELS_AT, VOXEL_WEIGHTS_AT, refs)
     coder.check()
     return _read(new, voxel_id)
 

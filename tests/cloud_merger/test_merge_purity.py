@@ -162,8 +162,18 @@ def plain_representative(members, parameters):
         return members[0][1], 0.0
     best = min(pose_m2 for _, pose_m2 in measured)
     measured = [(state, pose_m2) for state, pose_m2 in measured if pose_m2 <= best + parameters.noise_m**2]
-    if parameters.mode == "default":
-        measured = measured[: 2 ** (len(measured).bit_length() - 1)]
+    if parameters.mode == "paper":
+        return plain_moments(measured)
+    found = measured[0]
+    for n in (2, 4, 8):
+        if n <= len(measured):
+            anew = plain_moments(measured[:n])
+            if plain_similarity(found[0], anew[0], parameters, found[1] + anew[1]) < parameters.d_renewed:
+                found = anew
+    return found
+
+
+def plain_moments(measured):
     total = Moments.zeros(1)
     for state, _ in measured:
         total = total + Moments.of(state)

@@ -84,7 +84,7 @@ def test_the_share_must_exceed_xi_not_only_reach_it():
 def test_the_biggest_cluster_wins_and_is_represented_by_its_moments():
     one = gaussians_of({1: POLE}, count=100, cells=40)
     two = gaussians_of({1: (*POLE[:2], 0.05, *POLE[3:])}, count=300, cells=55)
-    result = merged([change_of(EPOCH, [1], g) for g in (one, gaussians_of({1: BALL}), two)], xi=0.5)
+    result = merged([change_of(EPOCH, [1], g) for g in (one, gaussians_of({1: BALL}), two)], xi=0.5, d_renewed=1.0)
     expected = (Moments.of(one) + Moments.of(two)).to_gaussians([1])
     got = result.gaussians.select([1])
     assert (got.count.tolist(), got.cells.tolist()) == ([400], [55])
@@ -93,13 +93,21 @@ def test_the_biggest_cluster_wins_and_is_represented_by_its_moments():
     assert result.provenance == {1: (report_id(0), report_id(2))}
 
 
-def test_a_representative_is_renewed_when_its_measurements_have_doubled():
+def test_a_representative_is_looked_at_anew_when_its_measurements_have_doubled():
     poles = [change_of(EPOCH, [2], {2: (-0.3, 0.2, 0.01 * k, *POLE[3:])}) for k in range(9)]
-    counts = [merged(poles[:n]).gaussians.select([2]).count[0] // 200 for n in range(1, 10)]
+    counts = [merged(poles[:n], d_renewed=1.0).gaussians.select([2]).count[0] // 200 for n in range(1, 10)]
     assert counts == [1, 2, 2, 4, 4, 4, 4, 8, 8]
     assert merged(poles[:4]).gaussians == merged(poles[:7]).gaussians
     assert merged(poles[:7]).provenance[2] == tuple(map(report_id, range(7)))
     assert merged(poles[:7], mode="paper").gaussians.select([2]).count[0] == 7 * 200
+
+
+def test_a_representative_stays_while_those_of_more_measurements_are_like_it():
+    by_a_hair = [change_of(EPOCH, [2], {2: (-0.3 + 0.002 * k, *POLE[1:])}) for k in range(8)]
+    assert merged(by_a_hair).gaussians == merged(by_a_hair[:1]).gaussians
+    off = [change_of(EPOCH, [2], {2: (-0.3 + (0.08 if k else 0.0), *POLE[1:])}) for k in range(8)]
+    assert merged(off).gaussians.select([2]).count[0] > 200
+    assert merged(off).gaussians.select([2]).mean_m[0, 0] == pytest.approx(-0.24, abs=0.021)
 
 
 def test_of_equal_clusters_the_earliest_wins_when_xi_lets_any_win():

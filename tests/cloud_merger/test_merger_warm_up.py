@@ -5,19 +5,27 @@ import threading
 import numpy as np
 from merger_world import POLE, TILE, WALL_AGAIN
 from short_world import bases_of, drive_number, packed_of, tile_at
+from street_corner import displaced, mapped, seen_as, street
 
+from cloud_merger import merge_kernels, shift_kernels
 from cloud_merger.expanding import expand, with_measured
+from cloud_merger.merge_kernels import clusters_of
+from cloud_merger.parameters import MergeParameters
+from cloud_merger.shift import shift_of
+from cloud_merger.statements import STATEMENT
 from cloud_merger.warm import warm_up
 from gnd_map import sight
 from gnd_map.codec import encode_mask, kernels
 from schemas.packed import PackedReport
 from vehicle_agent.packing import askable, pack_measured
 
+CORNER = mapped(street(0))
+
 
 def signatures():
     return {
         f"{module.__name__}.{name}": len(value.signatures)
-        for module in (sight, kernels)
+        for module in (sight, kernels, merge_kernels, shift_kernels)
         for name, value in vars(module).items()
         if hasattr(value, "signatures")
     }
@@ -27,12 +35,15 @@ def test_warming_leaves_nothing_to_compile_for_the_first_report():
     threads = threading.active_count()
     warm_up()
     warm = signatures()
-    assert warm["gnd_map.sight.cast_lines"] == 1
+    assert warm["cloud_merger.shift_kernels.votes_up"] == warm["cloud_merger.merge_kernels.alike"] // 2 == 1
+    assert warm["gnd_map.sight.cast_fans"] == 1
     report = drive_number(1, new={3: POLE}, modified={1: WALL_AGAIN}, deleted=(2,))
     packed = PackedReport.decode(packed_of(report))
     expanded = expand(packed, "ndt", TILE.district, [tile_at()])
     mask = np.ones(askable(report), np.bool_)
     half = pack_measured(report, bases_of(report), encode_mask(mask))
     with_measured(expanded, {TILE: tile_at().gaussians}, mask, half.measured)
+    clusters_of(np.zeros(5, STATEMENT), MergeParameters())
+    assert shift_of(seen_as(CORNER, displaced(street(1), 0.2, 0.3)), CORNER).is_explained
     assert signatures() == warm
     assert threading.active_count() == threads

@@ -7,11 +7,13 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from merger_world import TILE
+from plain_shift import Surfaces, fits, moved, plain_shift_of
 from scipy.spatial import cKDTree
 from street_corner import WALLS, displaced, mapped, seen_as, street
 
+from cloud_merger import shift_kernels
 from cloud_merger.errors import MergerError
-from cloud_merger.shift import Shift, ShiftParameters, _fits, _Surfaces, moved, shift_of
+from cloud_merger.shift import Shift, ShiftParameters, _fits, _Surfaces, shift_of
 from gnd_map.gaussian import Gaussians, concat
 from gnd_map.grid import VoxelGrid
 from gnd_map.similarity import similarity
@@ -121,11 +123,69 @@ def plain_fits(surfaces, known, motion, parameters):
 @given(st.floats(-1, 1), st.floats(-1, 1), st.floats(-0.0175, 0.0175))
 def test_what_fits_is_what_the_plain_twin_says(east_m, north_m, turn_rad):
     grid = VoxelGrid.of(TILE)
-    known = _Surfaces.of(grid, BASE)
-    some = known.take(np.arange(0, len(BASE), 60))
+    known, plain = _Surfaces.of(grid, BASE), Surfaces.of(grid, BASE)
+    rows = np.arange(0, len(BASE), 60)
     motion, parameters = np.array([east_m, north_m, turn_rad]), ShiftParameters()
-    found = _fits(some, known, cKDTree(known.place_m), motion, parameters)
-    assert found.tolist() == plain_fits(some, known, motion, parameters)
+    found = _fits(_Surfaces.of(grid, BASE, rows), known, motion, parameters).tolist()
+    assert found == plain_fits(plain.take(rows), plain, motion, parameters)
+    assert found == fits(plain.take(rows), plain, cKDTree(plain.place_m), motion, parameters).tolist()
+
+
+@settings(max_examples=25, deadline=None)
+@given(
+    st.integers(0, 10_000),
+    st.floats(-0.9, 0.9),
+    st.floats(-0.9, 0.9),
+    st.floats(-0.5, 0.5),
+    st.floats(-0.017, 0.017),
+    st.sampled_from([WALLS, WALLS[:1], WALLS[1:], (*WALLS, (0, -3.0))]),
+)
+def test_the_kernels_say_what_plain_numpy_says(seed, east_m, north_m, up_m, turn_rad, walls):
+    """The same verdict from the same cell of the grid; figures that are rounded otherwise, no more."""
+    points = street(seed, walls, 0.02)[::4]
+    if seed % 3 == 0:
+        points = points + [0.0, 0.0, up_m]
+    else:
+        points = displaced(points, east_m, north_m, turn_rad)
+    change = seen_as(BASE, points)
+    ours, twin = shift_of(change, BASE), plain_shift_of(change, BASE)
+    assert (ours.is_explained, ours.gaussians) == (twin.is_explained, twin.gaussians)
+    for name in ("fit", "chance", "unchanged", "east_m", "north_m", "turn_rad", "up_m"):
+        assert getattr(ours, name) == pytest.approx(getattr(twin, name), abs=1e-9), name
+
+
+@settings(max_examples=100, deadline=None)
+@given(st.integers(0, 10_000), st.sampled_from(["ball", "line", "plane", "point", "any"]))
+def test_normals_are_those_of_an_eigenvalue_solver(seed, form):
+    rng = np.random.default_rng(seed)
+    deviation = {"ball": (1, 1, 1), "line": (0, 0, 1), "plane": (0, 1, 1), "point": (0, 0, 0), "any": rng.random(3)}
+    axes = np.linalg.qr(rng.normal(size=(3, 3)))[0] if seed % 2 else np.eye(3)
+    cov = (axes * (0.3 * np.array(deviation[form])) ** 2) @ axes.T
+    normal, flat = shift_kernels.normals(cov[[0, 0, 0, 1, 1, 2], [0, 1, 2, 1, 2, 2]][None])
+    value = np.linalg.eigvalsh(cov)
+    least = normal[0] @ cov @ normal[0]
+    assert np.linalg.norm(normal[0]) == pytest.approx(1.0, abs=1e-14)
+    assert least == pytest.approx(value[0], abs=1e-15)
+    expected = 1.0 - np.sqrt(max(value[0], 0.0) / max(value[1], 1e-9))
+    assert flat[0] == pytest.approx(expected, abs=1e-6)
+
+
+@settings(max_examples=100, deadline=None)
+@given(st.integers(0, 10_000), st.floats(1.0, 400.0))
+def test_buckets_find_what_a_tree_finds(seed, spread_m):
+    """Over a tile, and over more than the buckets span: then the last ones hold the rest."""
+    rng = np.random.default_rng(seed)
+    place, at = (
+        rng.uniform(0.0, 1.0, (300, 3)) * [spread_m, 20.0, 6.0],
+        rng.uniform(0.0, 1.0, 3) * [spread_m, 20.0, 6.0],
+    )
+    found, off = np.empty(len(place), np.int64), np.empty(len(place))
+    tree = cKDTree(place)
+    n = shift_kernels._within(*at, 1.6, place, shift_kernels.buckets_of(place), found, off)
+    assert sorted(found[:n].tolist()) == sorted(tree.query_ball_point(at, 1.6))
+    n = shift_kernels._nearest(*at, place, shift_kernels.buckets_of(place), found, off)
+    distance, nearest = tree.query(at, k=12, distance_upper_bound=1.0)
+    assert sorted(found[:n].tolist()) == sorted(nearest[np.isfinite(distance)].tolist())
 
 
 @pytest.mark.parametrize("bad", [{"max_m": 0.0}, {"fits": 1.2}, {"least_gaussians": 2}, {"displaced_m": float("nan")}])

@@ -8,7 +8,15 @@ from hypothesis import strategies as st
 from gnd_map.errors import ConfigError, ShapeError
 from gnd_map.gaussian import six_entries
 from gnd_map.se3 import exp_so3
-from gnd_map.similarity import SimilarityMode, pairs_within, pairwise, shape_types, similarity
+from gnd_map.similarity import (
+    SimilarityMode,
+    pairs_within,
+    pairwise,
+    shape_types,
+    similarity,
+    similarity_pairs,
+    similarity_plain,
+)
 
 MODES: list[SimilarityMode] = ["paper", "default"]
 PLANE = np.array([0.08, 0.08, 0.0004])
@@ -159,3 +167,28 @@ def test_wrong_arguments_are_refused() -> None:
         similarity(exists, mean, c, exists, mean, c, "new")  # type: ignore[arg-type]
     with pytest.raises(ConfigError, match="negative"):
         similarity(exists, mean, c, exists, mean, c, "default", -0.1)
+
+
+@given(seed=st.integers(0, 10**6), noise_m=st.floats(0.0, 0.3))
+def test_the_kernel_gives_what_plain_numpy_gives(seed: int, noise_m: float) -> None:
+    a, b = random_states(80, seed), random_states(80, seed + 1)
+    b = b[0], a[1] + 0.1 * b[1], a[2] * 1.2  # near enough that most are alike
+    noise = np.full(80, noise_m)
+    plain = similarity_plain(*a, *b, "default", noise)
+    np.testing.assert_allclose(similarity(*a, *b, "default", noise), plain, rtol=0.0, atol=2e-15)
+    assert (plain > 1e-3).sum() > 10
+
+
+@pytest.mark.parametrize("mode", MODES)
+def test_pairs_of_a_table_are_as_their_rows_gathered(mode: SimilarityMode) -> None:
+    rng, (exists, mean, cov6) = np.random.default_rng(3), random_states(70, 5)
+    i, j, pose_m2 = rng.integers(0, 70, 400), rng.integers(0, 70, 400), rng.uniform(0.0, 0.01, 70)
+    noise_m = np.sqrt(0.05**2 + pose_m2[i] + pose_m2[j])
+    gathered = similarity(exists[i], mean[i], cov6[i], exists[j], mean[j], cov6[j], mode, noise_m)
+    found = similarity_pairs(i, j, exists, mean, cov6, mode, 0.05, pose_m2)
+    np.testing.assert_allclose(found, gathered, rtol=1e-12, atol=1e-15)
+
+
+def test_a_pair_outside_the_table_is_refused() -> None:
+    with pytest.raises(ShapeError, match="not all among 5"):
+        similarity_pairs(np.array([0]), np.array([5]), *random_states(5, 1))

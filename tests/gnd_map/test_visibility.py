@@ -1,5 +1,8 @@
 """Lines of sight: the kernel against a plain twin, and what a drive past a wall can and cannot have observed."""
 
+import itertools
+import threading
+import time
 from itertools import pairwise
 
 import numpy as np
@@ -10,74 +13,151 @@ from hypothesis import strategies as st
 from gnd_map.classes import ChangeClass
 from gnd_map.codec import Flags
 from gnd_map.errors import ConfigError
-from gnd_map.gaussian import Gaussians
+from gnd_map.gaussian import Gaussians, full_matrices, six_entries
 from gnd_map.grid import VoxelGrid
-from gnd_map.sight import NOTHING, OUTSIDE, cast_lines
+from gnd_map.sight import NO_SLOT, NOTHING, STOP, Columns, Window, cast_fans, fill, lay_out, pool, voxel_ids
 from gnd_map.tile_id import TileId
 from gnd_map.track import Piece, Track, View
 from gnd_map.visibility import VisibilityParameters, observed_along
 
+COLUMNS, TILES_ALONG, FLOORS = (4, 5), (2, 2), 6
 METRES = np.array([0.97, 0.99, 1.0])
-R2, RANGE_M, REACH_M = 3.0, 7.0, 9.0
+R2, RANGE_M, REACH_M, LEVEL = 3.0, 5.0, 7.0, 0.2
 
 
-def plain_lines(places, turn, weight, directions, state, shape, mean, whitening, level):
-    """Voxel by voxel between sorted crossings; r² by looking at many points of each stretch."""
-    hits, passes = np.zeros(len(mean)), np.zeros(state.size)
-    for place, (cos, sin), w in zip(places, turn, weight, strict=True):
-        for x, y, z in directions:
-            d = np.array([cos * x - sin * y, sin * x + cos * y, z])
-            crossed, met = [], abs(z) < level
-            for t_in, t_out, cell in stretches(place, d / METRES, shape):
-                at = np.ravel_multi_index(cell, shape)
-                row = state[at]
-                if row >= 0:
-                    points = place * METRES + np.linspace(t_in, min(t_out, REACH_M), 4000)[:, None] * d
-                    off = (points - mean[row]) @ whitening[row].T
-                    if (off**2).sum(axis=1).min() <= R2:
-                        met, hits[row] = True, hits[row] + w * (t_in <= RANGE_M)
+def small_window(low):
+    """Two by two tiles of 4 x 5 columns, of which one is not at hand; the others' floors start at `low`."""
+    slot_of = np.array([[0, 1], [NO_SLOT, 2]], np.int32)
+    corner = np.array([(0, 0), (0, 5), (4, 5)], np.int32)
+    offset = np.arange(4) * 20 * FLOORS
+    return Window(COLUMNS, METRES, slot_of, corner, offset, np.array(low, np.int32), np.full(3, FLOORS, np.int32), min(low))
+
+
+def cells(w):
+    """{(column, row, floor): cell} of a window."""
+    found = {}
+    for slot, (x, y) in enumerate(w.corner.tolist()):
+        for i in range(COLUMNS[0]):
+            for j in range(COLUMNS[1]):
+                first = int(w.offset[slot]) + (j * COLUMNS[0] + i) * FLOORS
+                found |= {(x + i, y + j, int(w.low[slot]) + k): first + k for k in range(FLOORS)}
+    return found
+
+
+def plain_fans(w, place, turn, rays, azimuth, slope, lines, solid, state, hits):
+    """Line by line, voxel by voxel between sorted crossings of faces; r² by looking at many points of each stretch."""
+    at, phase, stride = cells(w), 0, len(slope) // lines
+    for start, (cos, sin), n in zip(place, turn, rays.tolist(), strict=True):
+        for x, y in azimuth:
+            phase = (phase + 40503) % 65536
+            for s in slope[phase * stride // 65536 :: stride]:
+                d, length = np.array([cos * x - sin * y, sin * x + cos * y, s]), np.sqrt(1.0 + s * s)
+                crossed, met = [], abs(s) < LEVEL
+                for t_in, t_out, t_column, voxel in stretches(start, d, REACH_M / length):
+                    row = state[at[voxel]] if voxel in at else NOTHING
+                    counts = t_column <= RANGE_M / length
+                    if row >= 0 and least_r2(start, d, t_in, t_out, *solid[row]) <= R2:
+                        met, hits[row] = True, hits[row] + n * counts
                         break
-                if t_in <= RANGE_M:
-                    crossed.append(at)
-            if met:
-                passes[crossed] += w
-    return hits, passes
+                    if row < 0 and voxel in at and counts:
+                        crossed.append(at[voxel])
+                if met:
+                    state[crossed] -= n
 
 
-def stretches(place, g, shape):
-    """(t_in, t_out, voxel) of a line until REACH_M or out of the window, from all faces at once."""
-    faces = [(k - place[axis]) / g[axis] for axis in range(3) if g[axis] for k in range(shape[axis] + 1)]
-    t = np.unique([0.0, *(x for x in faces if x > 0.0)])
+def stretches(start, d, reach):
+    """(t_in, t_out, t at which the column was entered, voxel) of a line until it leaves the tiles or its reach; t is
+    horizontal.
+    """
+    g, size = d / METRES, np.array([2 * COLUMNS[0], 2 * COLUMNS[1]])
+    walls = [(k - start[a]) / g[a] for a in (0, 1) if g[a] for k in range(size[a] + 1)]
+    floors = [(k - start[2]) / g[2] for k in range(-80, 40) if g[2]]
+    t = np.unique([0.0, *(x for x in (*walls, *floors) if x > 0.0)])
     for t_in, t_out in pairwise(t):
-        cell = np.floor(place + g * 0.5 * (t_in + t_out)).astype(int)
-        if t_in >= REACH_M or (cell < 0).any() or (cell >= shape).any():
+        voxel = np.floor(start + g * 0.5 * (t_in + t_out)).astype(int)
+        if t_in >= reach or (voxel[:2] < 0).any() or (voxel[:2] >= size).any():
             return
-        yield t_in, t_out, tuple(cell)
+        yield t_in, min(t_out, reach), max([0.0, *(x for x in walls if 0.0 < x <= t_in)]), tuple(voxel.tolist())
+
+
+def least_r2(start, d, t_in, t_out, mean, whitening):
+    points = start * METRES + np.linspace(t_in, t_out, 4000)[:, None] * d
+    return (((points - mean) @ whitening.T) ** 2).sum(axis=1).min()
 
 
 @settings(max_examples=40, deadline=None)
 @given(st.integers(0, 2**32 - 1))
 def test_the_kernel_sees_what_the_plain_twin_sees(seed):
     rng = np.random.default_rng(seed)
-    shape, n = (6, 7, 5), 40
-    state = np.where(rng.random(6 * 7 * 5) < 0.2, OUTSIDE, NOTHING).astype(np.int32)
-    cells = rng.choice(state.size, n, replace=False)
-    state[cells] = np.arange(n)
-    mean = (np.stack(np.unravel_index(cells, shape), axis=1) + rng.uniform(0.2, 0.8, (n, 3))) * METRES
+    w = small_window(rng.integers(-3, 3, 3).tolist() if seed % 2 else [-60, -58, -61])
+    n, grid = 60, cells(w)
+    voxels = np.array(sorted(grid))[rng.choice(len(grid), n, replace=False)]
+    slot = w.slot_of[voxels[:, 0] // COLUMNS[0], voxels[:, 1] // COLUMNS[1]]
+    column = voxels[:, 1] % COLUMNS[1] * COLUMNS[0] + voxels[:, 0] % COLUMNS[0]
+    ids = (voxels[:, 2] * 20 + column - 10).astype(np.int32)
+    mean = rng.uniform(-0.3, 0.3, (n, 3)).astype(np.float32)
     spread = rng.normal(size=(n, 3, 3)) * rng.choice([0.05, 0.3], (n, 1, 3))
-    whitening = np.linalg.inv(np.linalg.cholesky(spread @ spread.transpose(0, 2, 1) + 0.03**2 * np.eye(3)))
-    directions = rng.normal(size=(12, 3))
-    directions /= np.linalg.norm(directions, axis=1)[:, None]
-    angle = rng.uniform(0.0, 7.0, 3)
-    places, turn, weight = rng.uniform(0.1, [5.9, 6.9, 4.9], (3, 3)), np.stack([np.cos(angle), np.sin(angle)], 1), angle
-    hits, passes = np.zeros(n), np.zeros(state.size)
-    cast_lines(
-        places, turn, weight, directions, METRES, state, shape, mean, whitening,
-        R2, RANGE_M, REACH_M, 0.4, hits, passes,
+    cov = six_entries(spread @ spread.transpose(0, 2, 1)).astype(np.float32)
+    state, hits = np.full(w.offset[-1], NOTHING, np.int32), np.zeros(n, np.int64)
+    filled, stop = np.zeros((60, 2), np.uint64), np.zeros((n, STOP), np.float32)
+    lay_out(w, slot, ids, mean, cov, 0.03, 0.03**2, state, filled, stop)
+    noisy = full_matrices(cov) + 0.03**2 * np.eye(3)
+    solid = list(zip((voxels + 0.5) * METRES + mean, np.linalg.inv(np.linalg.cholesky(noisy)), strict=True))
+    low, angle = float(w.lowest), rng.uniform(0.0, 7.0, 3)
+    place = rng.uniform([0.1, 0.1, low + 0.1], [7.9, 9.9, low + 6.0], (3, 3))
+    turn, rays = np.stack([np.cos(angle), np.sin(angle)], 1), rng.integers(1, 100, 3)
+    azimuth, slope = np.array([(1.0, 0.0), (0.6, 0.8), (-0.8, 0.6), (0.28, -0.96)]), np.sort(rng.normal(size=16))
+    plain_state, plain_hits = state.copy(), hits.copy()
+    plain_fans(w, place, turn, rays, azimuth, slope, 4, solid, plain_state, plain_hits)
+    cast_fans(
+        w, place, turn, rays, azimuth, slope, 4, stop, filled, R2, RANGE_M, REACH_M, LEVEL, state, hits,
+        Columns.room(), np.empty(2),
     )  # fmt: skip
-    plain_hits, plain_passes = plain_lines(places, turn, weight, directions, state, shape, mean, whitening, 0.4)
-    np.testing.assert_allclose(hits, plain_hits)
-    np.testing.assert_allclose(passes, plain_passes)
+    np.testing.assert_array_equal(hits, plain_hits)
+    np.testing.assert_array_equal(state, plain_state)
+    assert (state < NOTHING).any()
+
+
+@settings(max_examples=20, deadline=None)
+@given(st.integers(0, 2**32 - 1))
+def test_pooling_filling_and_collecting_are_what_they_say(seed):
+    """Against sums over sets of voxels; floors over two words, tiles with neighbours and without."""
+    rng, low = np.random.default_rng(seed), [-3, 59, 60]
+    w = small_window(low)
+    grid = cells(w)
+    solid = {v: row for row, v in enumerate(v for v in sorted(grid) if rng.random() < 0.4)}
+    seen = {v for v in sorted(grid) if rng.random() < 0.6}
+    fenced = {v for v in sorted(grid) if rng.random() < 0.1}
+    hits, state = rng.integers(0, 1000, len(solid)), np.full(w.offset[-1], NOTHING, np.int32)
+    near = np.zeros(w.offset[-1], np.uint8)
+    for v, row in solid.items():
+        state[grid[v]] = row
+    near[[grid[v] for v in fenced]] = 1
+    filled, more = bits_of(w, solid), np.zeros((60, 2), np.uint64)
+    pooled = np.zeros(len(solid), np.int64)
+    pool(w, filled, state, hits, pooled)
+    fill(w, filled, near, bits_of(w, seen), more)
+    around = [d for d in itertools.product((-1, 0, 1), repeat=3) if np.abs(d).sum() <= 2]
+    for v, row in solid.items():
+        beside = [hits[solid[o]] for o in (tuple(np.add(v, d).tolist()) for d in around) if o in solid]
+        assert pooled[row] == sum(beside) // len(beside)
+    faces = [d for d in around if np.abs(d).sum() == 1]
+    between = {v for v in grid if sum(tuple(np.add(v, d).tolist()) in seen for d in faces) >= 4}
+    both = seen | {v for v in between if v not in solid and v not in fenced}
+    ids, ends = voxel_ids(w, bits_of(w, seen) | more)
+    parts = np.split(ids, ends[:-1])
+    for slot, (x, y) in enumerate(w.corner.tolist()):
+        mine = [v for v in both if w.slot_of[v[0] // 4, v[1] // 5] == slot]
+        assert parts[slot].tolist() == sorted(20 * k + (j - y) * 4 + i - x - 10 for i, j, k in mine)
+
+
+def bits_of(w, voxels):
+    """(60, 2) bits of voxels, as the kernels hold them."""
+    bits = np.zeros((60, 2), np.uint64)
+    for i, j, k in voxels:
+        row = int(w.slot_of[i // 4, j // 5]) * 20 + j % 5 * 4 + i % 4
+        bits[row, (k - w.lowest) // 64] |= np.uint64(1 << (k - w.lowest) % 64)
+    return bits
 
 
 # --- a street of one row of tiles: flat ground, a wall along its north side
@@ -148,11 +228,13 @@ def test_what_is_flagged_is_always_observed_and_stops_lines_unless_it_is_gone():
     assert behind not in seen()
     assert behind in seen(DRIVE, *gone)
     assert {v for v, _ in gone} <= seen(DRIVE, *gone)
-    fence = [(voxel(i, 18, GROUND + k), ChangeClass.NEW) for i in range(GRID.nx) for k in range(1, 6)]
+    across = itertools.product(range(GRID.nx), (18, 19, 20), range(1, 6))  # thick: lines slip between single balls
+    fence = [(voxel(i, j, GROUND + k), ChangeClass.NEW) for i, j, k in across]
     before = voxel(15, WALL_ROW, GROUND + 2)
     assert before in seen()
-    assert before not in seen(DRIVE, *fence)
-    assert {v for v, _ in fence} <= seen(DRIVE, *fence)
+    fenced = set(observed_along(DRIVE, [told(*fence), told(*fence, tile=TILES[1])])[WEST].tolist())
+    assert before not in fenced
+    assert {v for v, _ in fence} <= fenced
     moved = [(voxel(i, WALL_ROW, GROUND + k), ChangeClass.MODIFIED) for i in range(GRID.nx) for k in range(HIGH)]
     assert behind not in seen(DRIVE, *moved)
 
@@ -213,7 +295,37 @@ def test_tiles_of_two_latitude_zones_are_looked_at_apart():
     assert min(len(found[tile]) for tile in pair) > 200
 
 
-@pytest.mark.parametrize("name", ["step_m", "azimuths", "levels", "range_m", "noise_m", "r2", "hits_near"])
+def test_two_threads_look_at_once_and_a_third_goes_on():
+    """Kernels run without the GIL. While two threads look along a drive, a third that only counts keeps most of its
+    pace: with the GIL held it would stand still for whole looks.
+    """
+    told_all, fine = [told(), told(tile=TILES[1])], VisibilityParameters(step_m=1.0, azimuths=480, lines=32)
+    observed_along(DRIVE, told_all, fine)
+    gaps_s, stop = [], threading.Event()
+
+    def count():
+        before = time.perf_counter()
+        while not stop.is_set():
+            time.sleep(0.001)
+            gaps_s.append(time.perf_counter() - before)
+            before = time.perf_counter()
+
+    started = time.perf_counter()
+    observed_along(DRIVE, told_all, fine)
+    alone_s = time.perf_counter() - started
+    counter = threading.Thread(target=count)
+    lookers = [threading.Thread(target=observed_along, args=(DRIVE, told_all, fine)) for _ in range(2)]
+    for thread in (counter, *lookers):
+        thread.start()
+    for thread in lookers:
+        thread.join()
+    stop.set()
+    counter.join()
+    assert alone_s > 0.1  # else a gap would tell nothing
+    assert max(gaps_s) < 0.5 * alone_s
+
+
+@pytest.mark.parametrize("name", ["step_m", "azimuths", "lines", "range_m", "noise_m", "r2", "hits_near"])
 def test_parameters_outside_their_range_are_refused_with_the_value(name):
     with pytest.raises(ConfigError, match=f"{name} must lie in .* got -7"):
         VisibilityParameters(**{name: -7})

@@ -1,0 +1,225 @@
+"""The clusters of a tile's statements (GND 5.1), voxel by voxel in one kernel: no array of pairs is made.
+
+Similarity is the smooth one of `gnd_map.similarity` ("default"). The labels are those of its twin,
+`cloud_merger.merge.plain_clusters`. What saves most: a statement whose cluster is known is found by nobody any more.
+Where all agree that is one similarity each, not one a pair.
+"""
+
+import math
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cloud_merger.parameters import MergeParameters
+from cloud_merger.statements import Kind, Rows
+from gnd_map.arrays import F32, F64, I32, I64
+from gnd_map.jit import inlined, kernel
+
+U8 = NDArray[np.uint8]
+Said = tuple[U8, I64, I32, F64, F32, F32, float, float, float]
+"""Kind, was, count, pose_m2, mean_m and cov_m2 of the statements, noise in m², eps, `far_at` it."""
+NOISE = -1
+_LEAST_VARIANCE_M2 = 1e-6  # of `gnd_map.similarity`
+_NOTHING, _QUOTED, _MEASURED, _WITHHELD = (int(kind) for kind in Kind)
+
+
+def clusters_of(rows: Rows, parameters: MergeParameters) -> I64:
+    """(M,) the cluster of each statement, numbered by voxel, then by the cluster's first core; -1: noise and withheld.
+
+    Args:
+        rows: STATEMENT (M,), sorted by voxel.
+        parameters: `eps`, `min_samples` and `noise_m` are used; the mode is taken to be "default".
+    """
+    label = np.full(len(rows), NOISE, np.int64)
+    columns = ("voxel_id", "kind", "was", "count", "pose_m2", "mean_m", "cov_m2")
+    said = (rows[name].copy() for name in columns)  # aligned; a single row of a record is contiguous, but is not that
+    _label_voxels(*said, parameters.noise_m**2, parameters.eps, parameters.min_samples, label)
+    return label
+
+
+@kernel
+def _label_voxels(
+    voxel_id: I32,
+    kind: U8,
+    was: I64,
+    count: I32,
+    pose_m2: F64,
+    mean_m: F32,
+    cov_m2: F32,
+    noise_m2: float,
+    eps: float,
+    min_samples: int,
+    label: I64,
+) -> None:
+    """Label the statements (M,) of one voxel after the other; scratch is as long as the voxel with most of them."""
+    most = _most_in_a_voxel(voxel_id)
+    node, row, weight = np.empty(most, np.int64), np.empty(most, np.int64), np.empty(most, np.int64)
+    found, queue, rest = np.empty(most, np.int64), np.empty(most, np.int64), np.empty(most, np.int64)
+    begin, number, far = 0, 0, far_at(1.0 - eps)
+    while begin < len(voxel_id):
+        end = begin + 1
+        while end < len(voxel_id) and voxel_id[end] == voxel_id[begin]:
+            end += 1
+        n = _nodes(begin, end, kind, was, node, row, weight)
+        said = (kind, was, count, pose_m2, mean_m, cov_m2, noise_m2, eps, far)
+        _add_neighbours(n, row, weight, min_samples, said)
+        number = _cores(n, row, weight, min_samples, said, found, queue, rest, number)
+        _borders(n, row, weight, min_samples, said, found)
+        for k in range(begin, end):
+            if kind[k] != _WITHHELD:
+                label[k] = found[node[k - begin]]
+        begin = end
+
+
+@kernel
+def _most_in_a_voxel(voxel_id: I32) -> int:
+    most, n = 0, 0
+    for k in range(len(voxel_id)):
+        n = n + 1 if k > 0 and voxel_id[k] == voxel_id[k - 1] else 1
+        most = max(most, n)
+    return most
+
+
+@kernel
+def _nodes(begin: int, end: int, kind: U8, was: I64, node: I64, row: I64, weight: I64) -> int:
+    """Statements that say the same are one node, each measured one is its own: how many there are.
+
+    Fills the node of each statement, and of each node its first row and its number of statements.
+    """
+    n = 0
+    for k in range(begin, end):
+        if kind[k] == _WITHHELD:
+            continue
+        at = n
+        if kind[k] != _MEASURED:
+            said = was[k] if kind[k] == _QUOTED else 0
+            for other in range(n):
+                first = row[other]
+                if kind[first] != _MEASURED and said == (was[first] if kind[first] == _QUOTED else 0):
+                    at = other
+                    break
+        if at == n:
+            row[n], weight[n] = k, 0
+            n += 1
+        node[k - begin] = at
+        weight[at] += 1
+    return n
+
+
+@kernel
+def _add_neighbours(n: int, row: I64, weight: I64, min_samples: int, said: Said) -> None:
+    """Add to each node's weight that of its neighbours, until it is enough for a core."""
+    if min_samples <= 1:
+        return
+    own = weight[:n].copy()
+    for i in range(n):
+        for j in range(i + 1, n):
+            if (weight[i] < min_samples or weight[j] < min_samples) and _is_near(row[i], row[j], said):
+                weight[i] += own[j]
+                weight[j] += own[i]
+
+
+@kernel
+def _cores(
+    n: int, row: I64, weight: I64, min_samples: int, said: Said, found: I64, queue: I64, rest: I64, number: int
+) -> int:
+    """Label the connected components of the cores from `number` on by their first core; the next number."""
+    left = 0
+    for i in range(n):
+        found[i] = NOISE
+        if weight[i] >= min_samples:
+            rest[left] = i
+            left += 1
+    while left > 0:
+        queue[0], length, done = rest[0], 1, 0
+        found[rest[0]] = number
+        left -= 1
+        rest[:left] = rest[1 : left + 1]
+        while done < length and left > 0:
+            at, kept = queue[done], 0
+            for k in range(left):
+                other = rest[k]
+                if _is_near(row[min(at, other)], row[max(at, other)], said):
+                    found[other], queue[length] = number, other
+                    length += 1
+                else:
+                    rest[kept] = other
+                    kept += 1
+            left = kept
+            done += 1
+        number += 1
+    return number
+
+
+@kernel
+def _borders(n: int, row: I64, weight: I64, min_samples: int, said: Said, found: I64) -> None:  # type: ignore[no-untyped-def]
+    """A node near a core joins the first cluster that reaches it."""
+    for i in range(n):
+        if weight[i] >= min_samples:
+            continue
+        for j in range(n):
+            is_earlier = found[i] == NOISE or found[j] < found[i]
+            if weight[j] >= min_samples and is_earlier and _is_near(row[min(i, j)], row[max(i, j)], said):
+                found[i] = found[j]
+
+
+@kernel
+def _is_near(a: int, b: int, said: Said) -> bool:
+    """Whether two statements of a voxel lie within `eps` of each other."""
+    kind, was, count, pose_m2, mean_m, cov_m2, noise_m2, eps, far = said
+    if kind[a] == _NOTHING or kind[b] == _NOTHING:  # Eq. 14
+        return False
+    if was[a] == was[b] and was[a] > 0 and kind[a] != kind[b]:  # one denies what the other quotes
+        return False
+    if count[a] <= 0 or count[b] <= 0:
+        return (count[a] > 0) == (count[b] > 0)
+    noise_m = math.sqrt(noise_m2 + pose_m2[a] + pose_m2[b])
+    return 1.0 - alike(mean_m[a], cov_m2[a], mean_m[b], cov_m2[b], noise_m, far) <= eps
+
+
+@kernel
+def far_at(least: float) -> float:
+    """The squared Mahalanobis distance of means beyond which similarity is certainly below `least`."""
+    return 1e-9 - 2.0 * math.log(max(least, 1e-300))
+
+
+@kernel
+def alike(mean_a: F32, cov_a: F32, mean_b: F32, cov_b: F32, noise_m: float, far: float) -> float:
+    """Similarity of two Gaussians, means (3,), covariances (6,), as `gnd_map.similarity` has it in "default" mode; 0
+    where the squared Mahalanobis distance of the means is beyond `far`.
+    """
+    variance = max(noise_m * noise_m, _LEAST_VARIANCE_M2)
+    a, b = _raised(cov_a, variance), _raised(cov_b, variance)
+    xy, xz, yz = a[1] + b[1], a[2] + b[2], a[4] + b[4]
+    xx = np.float64(cov_a[0]) + np.float64(cov_b[0]) + variance
+    yy = np.float64(cov_a[3]) + np.float64(cov_b[3]) + variance
+    zz = np.float64(cov_a[5]) + np.float64(cov_b[5]) + variance
+    x = np.float64(mean_b[0]) - np.float64(mean_a[0])
+    y = np.float64(mean_b[1]) - np.float64(mean_a[1])
+    z = np.float64(mean_b[2]) - np.float64(mean_a[2])
+    form = x * x * (yy * zz - yz * yz) + y * y * (xx * zz - xz * xz) + z * z * (xx * yy - xy * xy)
+    form += 2.0 * (x * y * (xz * yz - xy * zz) + x * z * (xy * yz - xz * yy) + y * z * (xy * xz - xx * yz))
+    squared = max(form / _determinant(xx, xy, xz, yy, yz, zz), 0.0)
+    if squared > far:
+        return 0.0
+    middle = _determinant(0.5 * (a[0] + b[0]), 0.5 * xy, 0.5 * xz, 0.5 * (a[3] + b[3]), 0.5 * yz, 0.5 * (a[5] + b[5]))
+    shape = math.sqrt(math.sqrt(_determinant(*a) * _determinant(*b))) / math.sqrt(middle)
+    return math.exp(-0.5 * squared) * min(shape, 1.0)
+
+
+@inlined
+def _raised(cov: F32, variance: float) -> tuple[float, float, float, float, float, float]:
+    """A covariance with the variance added on each axis."""
+    return (
+        np.float64(cov[0]) + variance,
+        np.float64(cov[1]),
+        np.float64(cov[2]),
+        np.float64(cov[3]) + variance,
+        np.float64(cov[4]),
+        np.float64(cov[5]) + variance,
+    )
+
+
+@inlined
+def _determinant(xx: float, xy: float, xz: float, yy: float, yz: float, zz: float) -> float:
+    return xx * (yy * zz - yz * yz) - xy * (xy * zz - yz * xz) + xz * (xy * yz - yy * xz)

@@ -1,0 +1,60 @@
+"""`gnd map verify`: is every version what its journal gives?"""
+
+from collections import Counter
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+import click
+from rich.console import Console
+from rich.progress import track
+
+from tile_store import tables
+from tile_store.cli import PATH, json_option, layer_option, region_option, show
+from tile_store.options import to_read
+from tile_store.values import DEFAULT_CODEC, MAP_CODECS
+
+
+@click.command(short_help="Compute versions anew from what was reported, and compare.")
+@click.argument("path", type=PATH)
+@layer_option
+@region_option
+@click.option("--all-versions", is_flag=True, help="Every version that is kept, not the newest of each tile only.")
+@click.option("--codec", default=DEFAULT_CODEC, show_default=True, type=click.Choice(MAP_CODECS), help="Of the shards.")
+@click.option("--merge-mode", default="default", show_default=True, type=click.Choice(("default", "paper")))
+@json_option
+def verify(path: Path, layer: str, region: str, all_versions: bool, codec: str, merge_mode: Any, as_json: bool) -> None:
+    """Compute the tiles of store PATH anew from their journals and compare them bit for bit.
+
+    Ends with 1 where one differs. Versions whose reports retention has removed cannot be computed and are counted.
+    """
+    # loaded here: it loads scipy and numba, which the other commands do without
+    from cloud_merger.config import ShardConfig
+    from cloud_merger.parameters import MergeParameters
+    from cloud_merger.verify import Verified, Verifier
+
+    with to_read(path) as store:
+        config = ShardConfig(store_path=path, codec=codec, merge=MergeParameters(mode=merge_mode))
+        verifier = Verifier(store, config)
+        heads, found = store.heads(layer, region), list[Verified]()
+        for head in track(heads, "tiles", console=Console(stderr=True), transient=True):
+            known = verifier.history(layer, head.tile) if all_versions else ()
+            found += list(known) or [verifier.version(layer, head.tile, head.version)]
+    counts = Counter(one.status for one in found)
+    wrong = [asdict(one) | {"tile": one.tile.path} for one in found if one.status in ("differs", "unknown")]
+    values = {name: counts[name] for name in ("same", "given", "unknown", "differs")}
+    show(
+        values | {"identical": not counts["differs"], "versions": wrong},
+        as_json,
+        lambda console: _print(console, f"{path}, layer {layer}", values, wrong),
+    )
+    if counts["differs"]:
+        raise SystemExit(1)
+
+
+def _print(console: Console, title: str, values: dict[str, int], wrong: list[dict[str, Any]]) -> None:
+    console.print(tables.fields(title, values))
+    for one in wrong[:20]:
+        console.print(
+            f"{one['tile']} version {one['version']} {one['status']}: {one['reason']}", highlight=False, soft_wrap=True
+        )

@@ -1,0 +1,99 @@
+"""The clusters of the kernel against those over arrays of all pairs, and its similarity against the public one."""
+
+import numpy as np
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from cloud_merger.merge import plain_clusters
+from cloud_merger.merge_kernels import NOISE, alike, clusters_of, far_at
+from cloud_merger.parameters import MergeParameters
+from cloud_merger.statements import STATEMENT, Kind
+from gnd_map.similarity import similarity
+
+KINDS = [Kind.NOTHING, Kind.QUOTED, Kind.MEASURED, Kind.MEASURED, Kind.MEASURED, Kind.WITHHELD]
+
+
+def covariances(rng, n):
+    """(N, 6) of balls, planes and lines in any attitude, the thinnest of no thickness."""
+    axes = np.linalg.qr(rng.normal(size=(n, 3, 3)))[0]
+    deviation_m = rng.choice([0.0, 0.01, 0.05, 0.28], (n, 3))
+    full = (axes * deviation_m[:, None, :] ** 2) @ axes.transpose(0, 2, 1)
+    six = full[:, [0, 0, 0, 1, 1, 2], [0, 1, 2, 1, 2, 2]]
+    six[:, [0, 3, 5]] = np.maximum(six[:, [0, 3, 5]], 0.0)
+    return six.astype(np.float32)
+
+
+@st.composite
+def statements(draw):
+    """Statements of a few voxels: some alike, some apart, some that deny others, some with poor poses."""
+    rng = np.random.default_rng(draw(st.integers(0, 2**32 - 1)))
+    sizes = draw(st.lists(st.integers(1, 12), min_size=0, max_size=6))
+    n = sum(sizes)
+    rows = np.zeros(n, STATEMENT)
+    rows["voxel_id"] = np.repeat(np.arange(len(sizes)) - 2, sizes)
+    rows["kind"] = rng.choice(KINDS, n)
+    rows["was"] = rng.integers(0, draw(st.sampled_from([1, 2, 4])), n)
+    there = np.isin(rows["kind"], (Kind.QUOTED, Kind.MEASURED))
+    rows["count"] = np.where(there, 40, 0)
+    rows["pose_m2"] = np.where(rows["kind"] == Kind.MEASURED, rng.choice([0.0, 0.01, 0.3], n), 0.0)
+    spread_m = draw(st.sampled_from([0.02, 0.1, 0.4]))
+    rows["mean_m"] = np.where(there[:, None], rng.normal(0.0, spread_m, (n, 3)), 0.0)
+    forms = covariances(rng, 3)
+    rows["cov_m2"] = np.where(there[:, None], forms[rng.integers(0, draw(st.sampled_from([1, 3])), n)], 0.0)
+    return rows
+
+
+@settings(max_examples=200, deadline=None)
+@given(statements(), st.sampled_from([0.05, 0.3, 0.7, 0.95]), st.integers(1, 5))
+def test_labels_are_those_over_all_pairs(rows, eps, min_samples):
+    parameters = MergeParameters(eps=eps, min_samples=min_samples)
+    np.testing.assert_array_equal(clusters_of(rows, parameters), plain_clusters(rows, parameters))
+
+
+@settings(max_examples=200, deadline=None)
+@given(st.integers(0, 2**32 - 1), st.sampled_from([0.0, 0.05, 0.5]), st.sampled_from([0.001, 0.05, 0.5]))
+def test_similarity_is_the_public_one(seed, noise_m, spread_m):
+    rng = np.random.default_rng(seed)
+    n = 20
+    yes, mean = np.ones(n, bool), rng.normal(0.0, spread_m, (2, n, 3)).astype(np.float32)
+    a, b = covariances(rng, n), covariances(rng, n)
+    b[::2] = a[::2]
+    expected = similarity(yes, mean[0], a, yes, mean[1], b, noise_m=noise_m)
+    found = [alike(mean[0, k], a[k], mean[1, k], b[k], noise_m, np.inf) for k in range(n)]
+    np.testing.assert_allclose(found, expected, rtol=0.0, atol=2e-15)
+    swapped = [alike(mean[1, k], b[k], mean[0, k], a[k], noise_m, np.inf) for k in range(n)]
+    assert swapped == found
+    for least in (0.05, 0.3, 0.7):  # what is left out early would not have been near
+        early = [alike(mean[0, k], a[k], mean[1, k], b[k], noise_m, far_at(least)) for k in range(n)]
+        assert [value >= least for value in early] == [value >= least for value in found]
+
+
+def wall_at(offsets_m, voxel_id=0):
+    """Measured walls of one voxel, so far along their normal."""
+    rows = np.zeros(len(offsets_m), STATEMENT)
+    rows["voxel_id"], rows["kind"], rows["count"] = voxel_id, Kind.MEASURED, 40
+    rows["mean_m"][:, 0] = offsets_m
+    rows["cov_m2"] = (0.0004, 0.0, 0.0, 0.08, 0.0, 0.08)
+    return rows
+
+
+def test_a_chain_is_one_cluster_and_the_number_goes_by_the_first_report():
+    rows = np.concatenate([wall_at([0.24, 0.0, 0.08, 0.16]), wall_at([0.0, 0.4], 1)])
+    assert clusters_of(rows, MergeParameters()).tolist() == [0, 0, 0, 0, 1, 2]
+    assert clusters_of(rows, MergeParameters(eps=0.3)).tolist() == [0, 1, 2, 3, 4, 5]
+
+
+def test_what_is_withheld_and_what_is_alone_is_no_cluster():
+    rows = wall_at([0.0, 0.01, 0.5, 0.0])
+    rows["kind"][3], rows["count"][3] = Kind.WITHHELD, 0
+    rows[["mean_m", "cov_m2"]][3] = 0.0
+    assert clusters_of(rows, MergeParameters(min_samples=2)).tolist() == [0, 0, NOISE, NOISE]
+    assert clusters_of(rows, MergeParameters()).tolist() == [0, 0, 1, NOISE]
+
+
+def test_a_measurement_that_denies_what_another_quotes_is_not_its_neighbour():
+    rows = wall_at([0.0, 0.0])
+    rows["kind"][0], rows["was"] = Kind.QUOTED, 1
+    assert clusters_of(rows, MergeParameters()).tolist() == [0, 1]
+    rows["was"][1] = 2
+    assert clusters_of(rows, MergeParameters()).tolist() == [0, 0]
