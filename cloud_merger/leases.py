@@ -9,11 +9,12 @@ from typing import Final
 
 from tile_store.errors import StoreError
 from tile_store.store import Store
-from tile_store.values import Claim
+from tile_store.values import SHARD_SILENT_S, Claim
 
 LONGEST_WORK_S: Final = 300.0
 """A claim is renewed for so long: a merge that hangs must not keep its tile for ever."""
 BEATS_A_LEASE: Final = 4
+LONGEST_PAUSE_S: Final = SHARD_SILENT_S / 3
 _LOG = logging.getLogger(__name__)
 
 
@@ -23,7 +24,7 @@ class Leases:
     Args:
         store: that holds the leases.
         owner: the shard's name.
-        lease_s: length of a lease; it is renewed four times in that time.
+        lease_s: length of a lease; it is renewed at least four times in that time.
         steady_s: a clock that does not step.
     """
 
@@ -72,7 +73,7 @@ class Leases:
                 self.drop(claim)
 
     def _run(self) -> None:
-        while not self._stop.wait(self._lease_s / BEATS_A_LEASE):
+        while not self._stop.wait(min(self._lease_s / BEATS_A_LEASE, LONGEST_PAUSE_S)):
             try:
                 self.renew()
             except StoreError as error:  # the next time may succeed before they run out

@@ -63,6 +63,8 @@ _T = TypeVar("_T")
 NS_PER_S: Final = 1_000_000_000
 REPORTS_A_PAGE: Final = 256
 LAGS_LOOKED_AT: Final = 256
+SHARD_FORGOTTEN_NS: Final = 86_400 * NS_PER_S
+"""A shard that ended without saying so is told of for a day."""
 WINDOWS_AT_ONCE: Final = 8
 """So many windows of a tile are folded in one go, where it was left alone for long."""
 _LOG = logging.getLogger(__name__)
@@ -237,6 +239,7 @@ class SqliteStore:
 
         def work(c: apsw.Connection) -> None:
             inbox.release(c, owner)
+            change(c, "forget_shards", {"boot": row["boot"], "before": row["steady"] - SHARD_FORGOTTEN_NS})
             change(c, "join", row)
 
         self._writer.run(work)

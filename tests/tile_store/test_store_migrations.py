@@ -106,6 +106,12 @@ def test_a_step_that_fails_leaves_the_store_as_it_was(old: Path, monkeypatch: py
     assert (version_of(old), schema(old)) == (1, before)
 
 
+def test_an_old_store_that_may_not_be_written_says_what_to_do(old: Path) -> None:
+    with pytest.raises(StoreUnavailable, match=f"store schema 1, this release reads {SCHEMA_VERSION} and may"):
+        SqliteStore(old, read_only=True)
+    assert version_of(old) == 1
+
+
 def test_a_newer_store_is_refused_and_not_touched(old: Path) -> None:
     with apsw.Connection(str(old)) as connection:
         connection.pragma("user_version", SCHEMA_VERSION + 1)

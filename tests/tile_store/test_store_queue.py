@@ -259,5 +259,9 @@ def test_a_shard_shows_that_it_lives_and_keeps_its_leases(store: Store, clock: C
     assert not store.shards()[0].is_alive
     store.join("m1")
     assert len(store.claim("m1", 2, 5.0)) == 2
-    store.leave("m1")
+    clock.advance(86_401.0)
+    store.join("m2")  # a day later m1 is not told of any more
+    assert [one.owner for one in store.shards()] == ["m2"]
+    store.leave("m2")
+    store.release("m1")
     assert (store.shards(), len(store.claim("m2", 2, 5.0))) == ([], 2)

@@ -589,6 +589,9 @@ ON CONFLICT (owner) DO UPDATE SET boot = excluded.boot, beat_ns = excluded.beat_
 INSERT INTO shard (owner, boot, beat_ns, since_ns) VALUES (:owner, :boot, :steady, :now)
 ON CONFLICT (owner) DO UPDATE SET boot = excluded.boot, beat_ns = excluded.beat_ns, since_ns = excluded.since_ns
 
+-- name: forget_shards
+DELETE FROM shard WHERE boot <> :boot OR beat_ns < :before
+
 -- name: leave
 DELETE FROM shard WHERE owner = :owner
 
