@@ -25,8 +25,9 @@ from gnd_map.gaussian import Gaussians
 
 I32 = NDArray[np.int32]
 
-SUPPORT_MOST: Final = 2.0
-"""So many votes a settled voxel has at most: four vehicles that agree outvote it at once, two do not."""
+SUPPORT: Final = np.array([0.0, 1.0, 1.5, 2.0, 2.25, 2.5, 2.75, 3.0])
+"""Votes of a state that 0, 1, 2 … vehicles have confirmed, the last for all more: where only one vehicle drives, its
+second drive outvotes it; what many have confirmed takes five that agree, and two never do."""
 HALF_LIFE_DAYS: Final = 90.0
 """What nobody has observed for so long has half of them left."""
 CLAIMS_OF_VOXEL: Final = 6
@@ -80,11 +81,11 @@ class TileMemory:
         at = find(self.voxels["voxel_id"], voxels)
         known = self.voxels[at[at >= 0]]
         age_days = np.maximum(day - known["day"].astype(np.int64), 0)
-        support = np.minimum(known["observers"], SUPPORT_MOST) * 0.5 ** (age_days / HALF_LIFE_DAYS)
+        support = SUPPORT[np.minimum(known["observers"], len(SUPPORT) - 1)] * 0.5 ** (age_days / HALF_LIFE_DAYS)
         said = states_at(epoch, voxels[at >= 0], Kind.QUOTED)
         said["was"] = np.where(said["kind"] == Kind.QUOTED, EPOCH, 0)
         said["report"] = -1
-        turns = [np.clip(support - turn, 0.0, 1.0) for turn in range(int(np.ceil(SUPPORT_MOST)))]
+        turns = [np.clip(support - turn, 0.0, 1.0) for turn in range(int(SUPPORT[-1]))]
         rows = np.concatenate([said] * len(turns)) if turns else said[:0]
         rows["weight"] = np.concatenate(turns) if turns else 0.0
         spoken: Rows = rows[rows["weight"] > 0.0]

@@ -16,9 +16,11 @@ from gnd_map.arrays import F32, F64, I32, I64
 from gnd_map.jit import inlined, kernel
 
 U8 = NDArray[np.uint8]
+Floats = NDArray[np.floating]
 Said = tuple[U8, I64, I32, F64, F32, F32, float, float, float]
 """Kind, was, count, pose_m2, mean_m and cov_m2 of the statements, noise in m², eps, `far_at` it."""
 NOISE = -1
+_COLUMNS = ("voxel_id", "kind", "was", "count", "pose_m2", "mean_m", "cov_m2")
 _LEAST_VARIANCE_M2 = 1e-6  # of `gnd_map.similarity`
 _NOTHING, _QUOTED, _MEASURED, _WITHHELD = (int(kind) for kind in Kind)
 
@@ -31,9 +33,9 @@ def clusters_of(rows: Rows, parameters: MergeParameters) -> I64:
         parameters: `eps`, `min_samples` and `noise_m` are used; the mode is taken to be "default".
     """
     label = np.full(len(rows), NOISE, np.int64)
-    columns = ("voxel_id", "kind", "was", "count", "pose_m2", "mean_m", "cov_m2")
-    said = (rows[name].copy() for name in columns)  # aligned; a single row of a record is contiguous, but is not that
-    _label_voxels(*said, parameters.noise_m**2, parameters.eps, parameters.min_samples, label)
+    columns = {name: rows[name].copy() for name in _COLUMNS}  # aligned, as the fields of a record are not
+    noise_m2, eps, min_samples = parameters.noise_m**2, parameters.eps, parameters.min_samples
+    _label_voxels(**columns, noise_m2=noise_m2, eps=eps, min_samples=min_samples, label=label)
     return label
 
 
@@ -152,7 +154,7 @@ def _cores(
 
 
 @kernel
-def _borders(n: int, row: I64, weight: I64, min_samples: int, said: Said, found: I64) -> None:  # type: ignore[no-untyped-def]
+def _borders(n: int, row: I64, weight: I64, min_samples: int, said: Said, found: I64) -> None:
     """A node near a core joins the first cluster that reaches it."""
     for i in range(n):
         if weight[i] >= min_samples:
@@ -172,9 +174,9 @@ def _is_near(a: int, b: int, said: Said) -> bool:
     if was[a] == was[b] and was[a] > 0 and kind[a] != kind[b]:  # one denies what the other quotes
         return False
     if count[a] <= 0 or count[b] <= 0:
-        return (count[a] > 0) == (count[b] > 0)
+        return bool((count[a] > 0) == (count[b] > 0))
     noise_m = math.sqrt(noise_m2 + pose_m2[a] + pose_m2[b])
-    return 1.0 - alike(mean_m[a], cov_m2[a], mean_m[b], cov_m2[b], noise_m, far) <= eps
+    return bool(1.0 - alike(mean_m[a], cov_m2[a], mean_m[b], cov_m2[b], noise_m, far) <= eps)
 
 
 @kernel
@@ -184,7 +186,7 @@ def far_at(least: float) -> float:
 
 
 @kernel
-def alike(mean_a: F32, cov_a: F32, mean_b: F32, cov_b: F32, noise_m: float, far: float) -> float:
+def alike(mean_a: Floats, cov_a: Floats, mean_b: Floats, cov_b: Floats, noise_m: float, far: float) -> float:
     """Similarity of two Gaussians, means (3,), covariances (6,), as `gnd_map.similarity` has it in "default" mode; 0
     where the squared Mahalanobis distance of the means is beyond `far`.
     """
@@ -208,7 +210,7 @@ def alike(mean_a: F32, cov_a: F32, mean_b: F32, cov_b: F32, noise_m: float, far:
 
 
 @inlined
-def _raised(cov: F32, variance: float) -> tuple[float, float, float, float, float, float]:
+def _raised(cov: Floats, variance: float) -> tuple[float, float, float, float, float, float]:
     """A covariance with the variance added on each axis."""
     return (
         np.float64(cov[0]) + variance,

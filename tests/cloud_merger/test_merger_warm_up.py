@@ -35,7 +35,7 @@ def test_warming_leaves_nothing_to_compile_for_the_first_report():
     threads = threading.active_count()
     warm_up()
     warm = signatures()
-    assert warm["cloud_merger.shift_kernels.votes_up"] == warm["cloud_merger.merge_kernels.alike"] // 2 == 1
+    assert warm["cloud_merger.shift_kernels.votes_up"] == warm["cloud_merger.merge_kernels._label_voxels"] == 1
     assert warm["gnd_map.sight.cast_fans"] == 1
     report = drive_number(1, new={3: POLE}, modified={1: WALL_AGAIN}, deleted=(2,))
     packed = PackedReport.decode(packed_of(report))

@@ -143,10 +143,8 @@ def test_what_fits_is_what_the_plain_twin_says(east_m, north_m, turn_rad):
 def test_the_kernels_say_what_plain_numpy_says(seed, east_m, north_m, up_m, turn_rad, walls):
     """The same verdict from the same cell of the grid; figures that are rounded otherwise, no more."""
     points = street(seed, walls, 0.02)[::4]
-    if seed % 3 == 0:
-        points = points + [0.0, 0.0, up_m]
-    else:
-        points = displaced(points, east_m, north_m, turn_rad)
+    lifted = points + np.array([0.0, 0.0, up_m])
+    points = lifted if seed % 3 == 0 else displaced(points, east_m, north_m, turn_rad)
     change = seen_as(BASE, points)
     ours, twin = shift_of(change, BASE), plain_shift_of(change, BASE)
     assert (ours.is_explained, ours.gaussians) == (twin.is_explained, twin.gaussians)
@@ -167,7 +165,7 @@ def test_normals_are_those_of_an_eigenvalue_solver(seed, form):
     assert np.linalg.norm(normal[0]) == pytest.approx(1.0, abs=1e-14)
     assert least == pytest.approx(value[0], abs=1e-15)
     expected = 1.0 - np.sqrt(max(value[0], 0.0) / max(value[1], 1e-9))
-    assert flat[0] == pytest.approx(expected, abs=1e-6)
+    assert flat[0] == pytest.approx(expected, abs=3e-4)  # of a line: the root of what rounding leaves
 
 
 @settings(max_examples=100, deadline=None)
@@ -175,10 +173,8 @@ def test_normals_are_those_of_an_eigenvalue_solver(seed, form):
 def test_buckets_find_what_a_tree_finds(seed, spread_m):
     """Over a tile, and over more than the buckets span: then the last ones hold the rest."""
     rng = np.random.default_rng(seed)
-    place, at = (
-        rng.uniform(0.0, 1.0, (300, 3)) * [spread_m, 20.0, 6.0],
-        rng.uniform(0.0, 1.0, 3) * [spread_m, 20.0, 6.0],
-    )
+    *rest, at = rng.uniform(0.0, 1.0, (301, 3)) * [spread_m, 20.0, 6.0]
+    place = np.array(rest)
     found, off = np.empty(len(place), np.int64), np.empty(len(place))
     tree = cKDTree(place)
     n = shift_kernels._within(*at, 1.6, place, shift_kernels.buckets_of(place), found, off)

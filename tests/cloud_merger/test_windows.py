@@ -167,7 +167,7 @@ def test_a_world_that_changes_twice_and_back_is_followed(cloud):
     here = [0, 1, 2]
     for turn, there in enumerate(([0, 1, 2, 3], here, [0, 1, 2, 3], here)):
         gone = {3: BALL} if 3 in there else {3: None}
-        cloud.sees(crowd(5, f"turn-{turn}"), gone, observed=[3], base=cloud.head(), later_s=300)
+        cloud.sees(crowd(8, f"turn-{turn}"), gone, observed=[3], base=cloud.head(), later_s=200)
         cloud.sees(crowd(3, f"then-{turn}"), later_s=4000)
         assert cloud.ids() == there, turn
     assert set(cloud.verified()) == {"given", "same"}
@@ -196,15 +196,21 @@ def test_what_waits_for_a_second_witness_waits_over_windows(cloud):
     assert cloud.ids() == [0, 1, 2, 3, 4]
 
 
-def test_old_support_weighs_less(cloud):
-    cloud.sees(crowd(4), later_s=10)
+def test_support_grows_with_who_confirmed_and_fades_with_age(cloud):
+    cloud.sees(crowd(8), later_s=10)
     cloud.sees(["next"], later_s=4000)
     memory, head = cloud.state().memory, cloud.head()
     day = int(memory.voxels["day"].max())
-    weights = [memory.support_rows(np.array([1], np.int32), head, day + age)["weight"].sum() for age in (0, 90, 900)]
-    assert weights[0] == pytest.approx(2.0)
-    assert weights[1] == pytest.approx(1.0)
-    assert weights[2] < 0.01
+
+    def weight(age_days=0, observers=8):
+        voxels = memory.voxels.copy()
+        voxels["observers"] = observers
+        rows = replace(memory, voxels=voxels).support_rows(np.array([1], np.int32), head, day + age_days)
+        return rows["weight"].sum()
+
+    assert [weight(observers=n) for n in (0, 1, 2, 3, 7, 200)] == [0.0, 1.0, 1.5, 2.0, 3.0, 3.0]
+    assert weight(90) == pytest.approx(1.5)
+    assert weight(900) < 0.01
 
 
 def test_the_memory_of_a_voxel_is_bounded(cloud):
