@@ -235,11 +235,12 @@ class SqliteStore:
 
     def join(self, owner: str) -> None:
         """See `Store.join`."""
-        row = {"owner": owner, "boot": clocks.boot_id(), "steady": self._steady_ns(), "now": self._now_ns()}
+        boot, steady = clocks.boot_id(), self._steady_ns()
+        row = {"owner": owner, "boot": boot, "steady": steady, "now": self._now_ns()}
 
         def work(c: apsw.Connection) -> None:
             inbox.release(c, owner)
-            change(c, "forget_shards", {"boot": row["boot"], "before": row["steady"] - SHARD_FORGOTTEN_NS})
+            change(c, "forget_shards", {"boot": boot, "before": steady - SHARD_FORGOTTEN_NS})
             change(c, "join", row)
 
         self._writer.run(work)
