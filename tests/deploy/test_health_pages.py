@@ -131,6 +131,7 @@ def test_router_store_and_shard_show_how_they_are(parts: Parts) -> None:
     until("the store is well", lambda: parts.is_healthy("store"))
 
     parts.running["router"].kill()
+    parts.running["router"].wait()
     until("the router is missed", lambda: parts.told("merger")["router"] == "no router answers")
     until("by both", lambda: get(parts.ports["store"], "healthz")[0] == 503)
     parts.start("router")
