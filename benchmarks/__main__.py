@@ -20,6 +20,7 @@ NAMES = (
     "first-pose",
     "health",
     "ingest",
+    "short-reports",
     "sizes",
     "codec",
     "return-download",
@@ -29,8 +30,10 @@ NAMES = (
     "merging",
     "slamcu-step",
     "map-build",
+    "stalled",
+    "outage",
 )
-WITH_OPTIONS = ("codec", "return-download", "gnss-noise", "poles", "slamcu-step")
+WITH_OPTIONS = ("codec", "return-download", "gnss-noise", "poles", "slamcu-step", "short-reports")
 
 
 def main() -> None:

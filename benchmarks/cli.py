@@ -16,6 +16,10 @@ _COMMANDS: Final[dict[str, tuple[str, str]]] = {
         "Localisation in a changed world, before and after the map update.",
     ),
     "traffic": ("benchmarks.traffic_study.command:traffic", "What a map and its changes weigh on the way (Figure 23)."),
+    "steady-vehicle": (
+        "benchmarks.traffic_study.steady_command:steady_vehicle",
+        "All bytes of a vehicle that knows its street, over the real bus.",
+    ),
     "slamcu": (
         "benchmarks.slamcu_study.command:slamcu",
         "Signs that have gone or are new, found by single cars: the SLAMCU paper.",

@@ -20,6 +20,10 @@ from tile_store.store import Store
 from tile_store.values import Notice, StoredTile
 
 REMEMBERED_KEYS: Final = 256
+# A notice goes to everybody who listens: it carries what has changed only where that is little more than itself.
+# Who holds the tile asks for the rest.
+NOTICE_DELTA_BYTES: Final = 512
+NOTICE_DELTA_VOXELS: Final = 256  # more of them are not even encoded
 _LOG = logging.getLogger(__name__)
 
 
@@ -77,12 +81,17 @@ def update_of(stored: StoredTile, parent: StoredTile | None) -> TileUpdate:
 
 
 def _with_delta(update: TileUpdate, stored: StoredTile, parent: StoredTile) -> TileUpdate:
-    """The notice with what has changed: coded for features and on a lattice, else in plain columns."""
+    """The notice with what has changed, coded for features and on a lattice, else in plain columns; of a large change
+    only how much it is.
+    """
     try:
         before, after = parent.decode(), stored.decode()
+        put, removed = changed_between(before, after)
+        counted = replace(update, put_count=put, removed_count=removed)
+        if put + removed > NOTICE_DELTA_VOXELS:
+            return counted
         if isinstance(before, Tile) and isinstance(after, Tile) and not has_deltas(stored.codec_id):
             return replace(update, delta=diff(before.gaussians, after.gaussians))
-        put, removed = changed_between(before, after)
         coded = encode_content_delta(before, after)
         return replace(update, coded_delta=coded, put_voxels=put, removed_voxels=removed)
     except TooLarge:
@@ -93,8 +102,14 @@ def _with_delta(update: TileUpdate, stored: StoredTile, parent: StoredTile) -> T
 
 
 def encoded(update: TileUpdate) -> bytes:
-    """The notice's bytes; without its delta where that is larger than a notice may be."""
+    """The notice's bytes; of a delta that is more than `NOTICE_DELTA_BYTES` only how much it changes."""
+    put, removed = update.voxels or (0, 0)
+    counted = replace(
+        update, delta=None, coded_delta=b"", put_voxels=0, removed_voxels=0, put_count=put, removed_count=removed
+    )
+    bare = counted.encode()
     try:
-        return update.encode()
+        whole = update.encode()
     except TooLarge:
-        return replace(update, delta=None, coded_delta=b"", put_voxels=0, removed_voxels=0).encode()
+        return bare
+    return whole if len(whole) <= len(bare) + NOTICE_DELTA_BYTES else bare

@@ -27,7 +27,7 @@ from schemas import limits
 from schemas.changes import ChangeReport, TileChange
 from schemas.packed import PackedReport, digest_of
 
-MEASURED: Final = (ChangeClass.NEW, ChangeClass.MODIFIED)
+MEASURED: Final = (int(ChangeClass.NEW), int(ChangeClass.MODIFIED))
 MAX_FLOORS: Final = 400  # of 1 m: looking along a track takes memory for each
 
 
@@ -135,7 +135,7 @@ def _nothing_at(voxel_id: NDArray[np.int32]) -> Gaussians:
 
 def is_askable(change: TileChange) -> NDArray[np.bool_]:
     """(N,) which changed voxels have a Gaussian that can be asked for: those that are new or modified."""
-    return np.isin(change.change_class, MEASURED)
+    return np.asarray((change.change_class == MEASURED[0]) | (change.change_class == MEASURED[1]))
 
 
 def with_measured(

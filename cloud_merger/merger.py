@@ -43,10 +43,9 @@ def run_shard(config: ShardConfig, stop: threading.Event, metrics_at: tuple[str,
 
     Raises:
         StoreError: the store cannot be opened.
-        NoRouter: no router answers at the start.
     """
     warm_up()  # or the first tile and the first report would wait for the kernels, and their leases with them
-    bus_config = BusConfig(connect=config.connect, lease_ms=config.bus_lease_ms)
+    bus_config = BusConfig(connect=config.connect, lease_ms=config.bus_lease_ms, patient=True)
     with (
         SqliteStore(config.store_path, config.store, create=False) as store,
         open_bus(bus_config, name=config.shard_id) as bus,

@@ -5,10 +5,12 @@ here", or "as in base version v". The last is resolved by the hash of v, so a re
 rebased, not lost.
 """
 
+from collections import OrderedDict
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from enum import IntEnum
-from typing import TYPE_CHECKING, Any, Literal
+from threading import Lock
+from typing import TYPE_CHECKING, Any, Final, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -26,6 +28,7 @@ if TYPE_CHECKING:
 
 Mode = Literal["paper", "default"]
 EPOCH = 1  # the number of the epoch's own Gaussian among the states of a voxel
+REMEMBERED: Final = 2048
 NO_BASE = b""  # hash in the report of a vehicle that had no map of the tile
 
 
@@ -226,40 +229,83 @@ def same_state(a: Rows, b: Rows) -> NDArray[np.bool_]:
 
 def _statements(report: int, change: TileChange, voxels: NDArray[np.int32], quoted: Rows | None) -> Rows:
     """One report's statements about those of `voxels` that it observed; without a base only its changes speak."""
-    voxel_id = voxels[find(change.observed, voxels) >= 0]
-    rows = states_at(Gaussians.empty(), voxel_id, Kind.QUOTED) if quoted is None else quoted[find(voxels, voxel_id)]
-    speaks = np.full(len(rows), quoted is not None)
-    at, was = find(change.changed.voxel_id, voxel_id), rows["was"].copy()
-    rows[at >= 0] = _changed_states(change)[at[at >= 0]]
-    rows["was"] = was
-    rows["denies"] = (was == EPOCH) & np.isin(rows["kind"], (Kind.MEASURED, Kind.WITHHELD))
-    speaks[at >= 0] = _speaks(change)[at[at >= 0]]
-    rows["claim"] = at >= 0
+    seen = np.flatnonzero(find(change.observed, voxels) >= 0)
+    voxel_id = voxels[seen]
+    if quoted is None:
+        rows = np.zeros(len(seen), STATEMENT)
+        rows["voxel_id"] = voxel_id
+    else:
+        rows = quoted[seen]
+    changed = _CHANGED.of(change)
+    at = find(changed.rows["voxel_id"], voxel_id)
+    mine, said = np.flatnonzero(at >= 0), at[at >= 0]
+    was = rows["was"][mine]
+    rows[mine] = changed.rows[said]
+    rows["was"][mine] = was
+    rows["denies"][mine] = (was == EPOCH) & changed.denies[said]
+    rows["claim"][mine] = True
     rows["report"] = report
+    speaks = np.full(len(rows), quoted is not None)
+    speaks[mine] = changed.speaks[said]
     spoken: Rows = rows[speaks]
     return spoken
 
 
 def states_at(gaussians: Gaussians, voxel_id: NDArray[np.int32], kind: Kind) -> Rows:
     """STATEMENT (len(voxel_id),): what `gaussians` holds at each voxel, NOTHING where they hold none."""
-    states = np.concatenate([_states(gaussians, kind), np.zeros(1, STATEMENT)])  # found at -1: nothing
-    rows: Rows = states[find(gaussians.voxel_id, voxel_id)]
+    at = find(gaussians.voxel_id, voxel_id)
+    rows = np.zeros(len(voxel_id), STATEMENT)
+    there = np.flatnonzero(at >= 0)
+    rows[there] = _states(gaussians, at[there], kind)
     rows["voxel_id"] = voxel_id
     return rows
 
 
-def _states(gaussians: Gaussians, kind: Kind) -> Rows:
-    rows = np.zeros(len(gaussians), STATEMENT)
+def _states(gaussians: Gaussians, at: NDArray[np.int64], kind: Kind) -> Rows:
+    rows = np.zeros(len(at), STATEMENT)
     for name in ("voxel_id", "count", "cells", "mean_m", "cov_m2"):
-        rows[name] = getattr(gaussians, name)
-    rows["kind"] = np.where(gaussians.exists, kind, Kind.NOTHING)
+        rows[name] = getattr(gaussians, name)[at]
+    rows["kind"] = np.where(rows["count"] > 0, kind, Kind.NOTHING)
     return rows
 
 
-def _changed_states(change: TileChange) -> Rows:
-    rows = _states(change.changed, Kind.MEASURED)
-    rows["kind"][is_withheld(change)] = Kind.WITHHELD
-    return rows
+@dataclass(frozen=True, slots=True, eq=False)
+class _Changed:
+    """What a report says of the voxels that it found changed: STATEMENT (N,); which speak, and may deny, (N,) bool."""
+
+    change: TileChange
+    rows: Rows
+    speaks: NDArray[np.bool_]
+    denies: NDArray[np.bool_]
+
+    @classmethod
+    def made(cls, change: TileChange) -> "_Changed":
+        rows = _states(change.changed, np.arange(len(change.changed)), Kind.MEASURED)
+        rows["kind"][is_withheld(change)] = Kind.WITHHELD
+        return cls(change, rows, _speaks(change), np.isin(rows["kind"], (Kind.MEASURED, Kind.WITHHELD)))
+
+
+class _Remembered:
+    """The same of the reports used last: a window is merged again with each new report."""
+
+    def __init__(self) -> None:
+        self._held: OrderedDict[int, _Changed] = OrderedDict()
+        self._lock = Lock()
+
+    def of(self, change: TileChange) -> _Changed:
+        """Made once for each change that stays in memory."""
+        with self._lock:
+            found = self._held.get(id(change))
+        if found is None or found.change is not change:  # the number of an object that is gone may come again
+            found = _Changed.made(change)
+            with self._lock:
+                self._held[id(change)] = found
+                if len(self._held) > REMEMBERED:
+                    self._held.popitem(last=False)
+        return found
+
+
+_CHANGED: Final = _Remembered()
 
 
 def is_withheld(change: TileChange) -> NDArray[np.bool_]:

@@ -19,8 +19,9 @@ from gnd_map.codec import (
     snap,
 )
 from gnd_map.gaussian import Gaussians
+from gnd_map.similarity import similarity_pairs
 from gnd_map.tile_id import TileId
-from gnd_map.track import Piece, Track, View
+from gnd_map.track import STEPS, Piece, Track, View
 from gnd_map.visibility import observed_along
 from schemas.changes import TileChange
 from tile_store.warm import warm_up as warm_up_codecs
@@ -37,8 +38,8 @@ def warm_up() -> None:
     measured = encode_measured([(_TILE, base, base.take([0]))])
     decode_measured([(_TILE, base, found.voxel_id)], measured)
     decode_mask(encode_mask(np.array([True])), 1)
-    place = Piece(np.array([[32, 32, 4]], np.int32), 1)
-    observed_along(Track(_TILE.district, View((-8, -6, -4, -2, 0, 2, 4, 6, 8)), (place,)), [found])
+    observed_along(Track(_TILE.district, View((-8, -6, -4, -2, 0, 2, 4, 6, 8)), (_place(),)), [found])
+    similarity_pairs(np.array([0]), np.array([1]), base.exists, base.mean_m, base.cov_m2)
     clusters_of(np.zeros(1, STATEMENT), MergeParameters())
     _test_a_shift()
 
@@ -51,6 +52,13 @@ def _test_a_shift() -> None:
     low, high = (Gaussians(ids, count, count, np.full((n, 3), up_m, np.float32), cov) for up_m in (0.0, 0.4))
     evidence, classes = np.zeros((n, 4), np.int32), np.full(n, ChangeClass.MODIFIED, np.uint8)
     shift_of(TileChange(_TILE, 0, b"", ids, high, classes, evidence, 0.0, 0.0), low)
+
+
+def _place() -> Piece:
+    """In the middle of the tile, 2 m up."""
+    corner = TileId(_TILE.district.first_morton)
+    east, north = _TILE.lon_index - corner.lon_index, _TILE.lat_index - corner.lat_index
+    return Piece(np.array([[STEPS * east + STEPS // 2, STEPS * north + STEPS // 2, 4]], np.int32), 1)
 
 
 def _base() -> Gaussians:

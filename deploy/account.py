@@ -14,7 +14,7 @@ from deploy.traffic_page import write_page
 from fleet_bus.errors import LedgerError
 from fleet_bus.ledger_file import read_run
 from fleet_bus.links import load_link
-from fleet_bus.traffic import DEFAULT_LINKS, agent_traffic, fleet_lines
+from fleet_bus.traffic import DEFAULT_LINKS, AgentTraffic, agent_traffic, fleet_lines, fleet_totals
 from gnd_map.gaussian import Gaussians
 from gnd_map.tile import diff
 from tile_store.sqlite_store import SqliteStore
@@ -22,6 +22,7 @@ from tile_store.values import DEFAULT_LAYER, StoredTile
 from vehicle_agent.outbox import Outbox
 
 P95 = 0.95
+_SIZES = ("drive_km", "down_bytes", "up_bytes", "down_wire_bytes", "up_wire_bytes", "estimated_wire_bytes")
 
 _log = logging.getLogger(__name__)
 
@@ -46,16 +47,6 @@ class FleetResults:
         """Return the sum of a number over the vehicles."""
         return float(sum(result[key] for result in self.results))
 
-    def traffic(self) -> dict[str, float]:
-        """Return bytes of the application and on the wire, and kB a driven km, over all vehicles."""
-        names = ("down_bytes", "up_bytes", "down_wire_bytes", "up_wire_bytes")
-        sums = {name: sum(int(result["traffic"][name]) for result in self.results) for name in names}
-        drive_km = self.total("distance_km")
-        return sums | {
-            "kB_per_km_up": _per_km(sums["up_bytes"], drive_km),
-            "kB_per_km_down": _per_km(sums["down_bytes"], drive_km),
-        }
-
     def localisation_p95(self) -> dict[str, float | None]:
         """Return the 95 % quantile of the absolute errors of all refined scans of all vehicles together."""
         return {name: self._p95(name) for name in ("longitudinal_m", "lateral_m", "heading_deg")}
@@ -65,25 +56,31 @@ class FleetResults:
         return round(float(np.quantile(np.abs(errors), P95)), 4) if errors else None
 
 
-def _per_km(size: int, drive_km: float) -> float:
-    return round(size / 1000 / drive_km, 3) if drive_km > 0 else 0.0
+def account_traffic(folder: RunFolder, links: Sequence[str] = DEFAULT_LINKS) -> dict[str, Any]:
+    """Write the traffic page of a run and return the account of the whole fleet: totals, by kind, by vehicle.
 
-
-def account_traffic(folder: RunFolder, links: Sequence[str] = DEFAULT_LINKS) -> list[dict[str, Any]]:
-    """Write the traffic page of a run and return the account of the whole fleet by kind and direction.
+    Everything is computed from the ledgers, once the last message of the last vehicle has been written there: the page,
+    this account, `gnd traffic` and the table of a running fleet are the same sums of the same lines.
 
     Args:
-        folder: the run; a run whose ledgers cannot be read gets no page.
+        folder: the run; one whose ledgers cannot be read, or whose page cannot be written, has that as `problem`.
         links: profiles to compare with.
     """
     profiles = tuple(load_link(link) for link in links)
+    agents: tuple[AgentTraffic, ...] = ()
+    problem = ""
     try:
         agents = tuple(agent_traffic(ledger, profiles) for ledger in read_run(folder.root))
         write_page(folder.traffic_page, folder.root.resolve().name, agents, profiles)
     except (LedgerError, PageError) as error:
-        _log.warning("no traffic page: %s", error)
-        return []
-    return [asdict(line) for line in fleet_lines(agents)]
+        problem = str(error)
+        _log.warning("no traffic page: %s", problem)
+    return {
+        "problem": problem,
+        **{name: round(value, 4) for name, value in fleet_totals(agents).items()},
+        "by_kind": [asdict(line) for line in fleet_lines(agents)],
+        "by_vehicle": {agent.agent: {name: getattr(agent, name) for name in _SIZES} for agent in agents},
+    }
 
 
 def lost_reports(folder: RunFolder, store: SqliteStore, layers: Sequence[str] = (DEFAULT_LAYER,)) -> list[str]:

@@ -19,6 +19,7 @@ from deploy import roles
 from deploy.errors import DeployError
 from deploy.fleet_config import FleetConfig
 from deploy.live import FleetState, View, live_view
+from deploy.live_traffic import LiveLedgers
 from deploy.prepare import PreparedRun
 from deploy.processes import ProcessSpec, Supervisor
 from deploy.run_folder import RunFolder
@@ -81,7 +82,8 @@ def run_fleet(
     """
     started_s = time.monotonic()
     site = site or loopback_site(config, len(prepared.agent_drives))
-    state = FleetState(links={vehicle_name(n): load_link(place.link) for n, place in enumerate(site.vehicles)})
+    links = {vehicle_name(n): load_link(place.link) for n, place in enumerate(site.vehicles)}
+    state = FleetState(links=links, ledgers=LiveLedgers(folder.root))
     with ExitStack() as stack:
         supervisor = stack.enter_context(supervised(folder, state))
         start_cloud(supervisor, config, folder, site)

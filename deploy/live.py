@@ -3,7 +3,7 @@
 import math
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 
@@ -13,7 +13,7 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 from rich.table import Table
 from rich.text import Text
 
-from deploy.live_traffic import Rate, kinds_table, link_of, plain_traffic, rate_between, rate_cell
+from deploy.live_traffic import LiveLedgers, kinds_table, link_of, plain_traffic, rate_cell
 from fleet_bus.links import LinkProfile
 from schemas.errors import SchemaError
 from schemas.traffic import TrafficSample
@@ -41,8 +41,7 @@ class FleetState:
         waiting: tiles that wait for a merge.
         events: the last things that happened, newest last.
         links: profile of each vehicle's link, as far as known.
-        rates: what each vehicle's connection carries now.
-        clock: monotonic time, s.
+        ledgers: what the vehicles have sent and received.
     """
 
     samples: dict[str, TrafficSample] = field(default_factory=dict)
@@ -52,9 +51,7 @@ class FleetState:
     waiting: int = 0
     events: list[str] = field(default_factory=list)
     links: dict[str, LinkProfile] = field(default_factory=dict)
-    rates: dict[str, Rate] = field(default_factory=dict)
-    clock: Callable[[], float] = time.monotonic
-    came_s: dict[str, float] = field(default_factory=dict)
+    ledgers: LiveLedgers = field(default_factory=LiveLedgers)
     lock: threading.Lock = field(default_factory=threading.Lock)
 
     def on_traffic(self, key: str, payload: bytes) -> None:
@@ -67,15 +64,7 @@ class FleetState:
         with self.lock:
             known = self.samples.get(sample.vehicle)
             if known is None or sample.t_ns >= known.t_ns:
-                self._take(sample, known, self.clock())
-
-    def _take(self, sample: TrafficSample, known: TrafficSample | None, now_s: float) -> None:
-        rate = rate_between(known, self.came_s[sample.vehicle], sample, now_s) if known is not None else None
-        if rate is not None:
-            self.rates[sample.vehicle] = rate
-        else:
-            self.rates.pop(sample.vehicle, None)
-        self.samples[sample.vehicle], self.came_s[sample.vehicle] = sample, now_s
+                self.samples[sample.vehicle] = sample
 
     def note(self, text: str) -> None:
         """Remember an event; the last three are shown."""
@@ -112,21 +101,24 @@ def render(state: FleetState, width: int = WIDE) -> Group:
             f"   watcher: {state.updates} updates"
         )
         events = (Text(event, style="dim") for event in state.events)
-        kinds = (Text(), kinds_table(state.samples.values()), Text()) if state.samples else ()
+        agents = tuple(state.ledgers.agents.values())
+        kinds = (Text(), kinds_table(agents), Text()) if agents else ()
         return Group(table, *kinds, Text(totals, style="bold"), *events)
 
 
 def _row(state: FleetState, sample: TrafficSample) -> tuple[str | Text, ...]:
-    rate, link = state.rates.get(sample.vehicle), link_of(state.links, sample.vehicle)
+    ledgers, link = state.ledgers, link_of(state.links, sample.vehicle)
+    rate, traffic = ledgers.rates.get(sample.vehicle), ledgers.agents.get(sample.vehicle)
+    driven_m = max(sample.odometer_m, 1000 * traffic.drive_km if traffic else 0.0)
     return (
         sample.vehicle,
         f"{math.degrees(sample.lat_rad):.5f} {math.degrees(sample.lon_rad):.5f}",
         Text(sample.health, style=HEALTH_STYLE.get(sample.health, "dim")),
-        f"{sample.odometer_m:.0f} m",
-        size_text(sample.wire_down_bytes),
-        rate_cell(rate, link, "down", state.clock()),
-        size_text(sample.wire_up_bytes),
-        rate_cell(rate, link, "up", state.clock()),
+        f"{driven_m:.0f} m",
+        size_text(traffic.down_wire_bytes if traffic else sample.wire_down_bytes),
+        rate_cell(rate, link, "down", ledgers.clock()),
+        size_text(traffic.up_wire_bytes if traffic else sample.wire_up_bytes),
+        rate_cell(rate, link, "up", ledgers.clock()),
         str(sample.tiles),
         str(sample.reports),
         Text(doubts_text(sample), style="yellow"),
@@ -147,7 +139,11 @@ def live_view(state: FleetState, console: Console) -> Iterator["View"]:
         yield View(state, console, None)
         return
     with Live(render(state, console.width), console=console, refresh_per_second=2, transient=False) as live:
-        yield View(state, console, live)
+        try:
+            yield View(state, console, live)
+        finally:  # what stays on the screen is the account of the whole run
+            state.ledgers.refresh(now=True)
+            live.update(render(state, console.width))
 
 
 @dataclass(slots=True)
@@ -161,6 +157,7 @@ class View:
 
     def refresh(self) -> None:
         """Show the newest state."""
+        self.state.ledgers.refresh()
         if self.live is not None:
             self.live.update(render(self.state, self.console.width))
         elif time.monotonic() - self.printed_s >= PLAIN_PERIOD_S:
@@ -169,7 +166,8 @@ class View:
 
     def _plain(self) -> str:
         with self.state.lock:
-            driven_m = sum(sample.odometer_m for sample in self.state.samples.values())
+            agents = tuple(self.state.ledgers.agents.values())
+            driven_m = 1000 * sum(agent.drive_km for agent in agents)
             doubtful = sum(sample.tiles_doubtful for sample in self.state.samples.values())
             held_back = sum(sample.tiles_held_back for sample in self.state.samples.values())
             doubts = f"{doubtful} tiles doubtful ({held_back} held back); " if doubtful else ""
@@ -177,7 +175,7 @@ class View:
                 f"{len(self.state.samples)} agents, {driven_m:.0f} m driven, {self.state.reports} reports, "
                 f"{self.state.waiting} tiles waiting, {self.state.published} versions, {self.state.updates} updates; "
                 + doubts
-                + plain_traffic(self.state.samples.values())
+                + plain_traffic(agents)
             )
 
 

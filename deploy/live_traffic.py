@@ -1,29 +1,39 @@
-"""The traffic of a running fleet: rates of each vehicle against its link, and totals by kind."""
+"""The traffic of a running fleet: rates of each vehicle against its link, and totals by kind.
+
+All of it is read from the ledgers, which the vehicles write as they go: the bus carries no message for it, and the
+last table of a run is its account.
+"""
 
 import math
-from collections import defaultdict
-from collections.abc import Iterable
-from dataclasses import dataclass
-from typing import Final, Literal
+import time
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, Final, Literal
 
 from rich.table import Table
 
+from fleet_bus.errors import LedgerError
+from fleet_bus.ledger_file import AgentLedger, read_run
 from fleet_bus.links import UNLIMITED, LinkProfile
-from fleet_bus.traffic import per_km
-from schemas.traffic import TrafficSample
+from fleet_bus.traffic import AgentTraffic, agent_traffic, fleet_lines, fleet_totals, per_km
+from fleet_bus.traffic_wire import RESIDUES
 
 _OLD_S: Final = 15.0
-"""A vehicle that is well sends a sample every ten seconds at least."""
+"""A running vehicle notes what its connection carried every second."""
+_READ_EVERY_S: Final = 2.0
+_READ_SHARE: Final = 0.05
+"""Reading the ledgers may take this part of the time."""
 
 
 @dataclass(frozen=True, slots=True)
 class Rate:
-    """How much a vehicle's connection carried between its last two samples.
+    """How much a vehicle's connection carried between two looks at its ledger.
 
     Attributes:
         up_byte_s: from the vehicle, on the wire, byte/s.
         down_byte_s: to the vehicle.
-        at_s: when the newer sample came, monotonic clock, s.
+        at_s: when the ledger had grown last, monotonic clock, s.
     """
 
     up_byte_s: float
@@ -38,13 +48,52 @@ class Rate:
         return (self.up_byte_s if direction == "up" else self.down_byte_s) / rate_byte_s
 
 
-def rate_between(older: TrafficSample, older_s: float, newer: TrafficSample, newer_s: float) -> Rate | None:
-    """The rate between two samples and their times of arrival; None where the agent was started again meanwhile."""
-    up, down = newer.wire_up_bytes - older.wire_up_bytes, newer.wire_down_bytes - older.wire_down_bytes
-    passed_s = newer_s - older_s
-    if up < 0 or down < 0 or passed_s <= 0:
-        return None
-    return Rate(up / passed_s, down / passed_s, newer_s)
+@dataclass(slots=True)
+class LiveLedgers:
+    """The accounts of a run that goes on, read anew now and then.
+
+    Attributes:
+        run: folder of the run; None where there is none to read.
+        agents: accounts by vehicle.
+        rates: what each vehicle's connection carries now.
+        clock: monotonic time, s.
+    """
+
+    run: Path | None = None
+    agents: dict[str, AgentTraffic] = field(default_factory=dict)
+    rates: dict[str, Rate] = field(default_factory=dict)
+    clock: Callable[[], float] = time.monotonic
+    _grown_s: dict[str, float] = field(default_factory=dict)
+    _not_before_s: float = 0.0
+
+    def refresh(self, *, now: bool = False) -> None:
+        """Read the ledgers if it is time to, or `now`."""
+        begin_s = self.clock()
+        if self.run is None or (begin_s < self._not_before_s and not now):
+            return
+        try:
+            ledgers = read_run(self.run)
+        except LedgerError:  # none yet, or one without a whole line yet
+            ledgers = ()
+        for ledger in ledgers:
+            self._take(ledger, begin_s)
+        end_s = self.clock()
+        self._not_before_s = end_s + max(_READ_EVERY_S, (end_s - begin_s) / _READ_SHARE)
+
+    def _take(self, ledger: AgentLedger, now_s: float) -> None:
+        traffic, known = agent_traffic(ledger, ()), self.agents.get(ledger.agent)
+        if traffic == known:
+            return
+        if known is not None:
+            self.rates[ledger.agent] = rate_between(known, self._grown_s[ledger.agent], traffic, now_s)
+        self.agents[ledger.agent], self._grown_s[ledger.agent] = traffic, now_s
+
+
+def rate_between(older: AgentTraffic, older_s: float, newer: AgentTraffic, newer_s: float) -> Rate:
+    """The rate between two accounts of one vehicle and their times; restarts add to an account."""
+    passed_s = max(newer_s - older_s, 1e-3)
+    up, down = newer.up_wire_bytes - older.up_wire_bytes, newer.down_wire_bytes - older.down_wire_bytes
+    return Rate(max(up, 0) / passed_s, max(down, 0) / passed_s, newer_s)
 
 
 def rate_cell(rate: Rate | None, link: LinkProfile, direction: Literal["up", "down"], now_s: float) -> str:
@@ -60,44 +109,63 @@ def _percent(share: float) -> str:
     return f"{100 * share:.0f} %" if share >= 0.1 else f"{100 * share:.2g} %"
 
 
-def kinds_table(samples: Iterable[TrafficSample]) -> Table:
-    """Payload of all vehicles so far by kind, down and up, in kB and kB/km; the last row is what the wires carried."""
-    samples = tuple(samples)
-    drive_km = sum(sample.odometer_m for sample in samples) / 1000
-    table = Table("kind", box=None, pad_edge=False, header_style="bold")
+def kinds_table(agents: Sequence[AgentTraffic]) -> Table:
+    """Bytes of all vehicles so far by kind on the wire, down and up, in kB and kB/km; the last row is their sum."""
+    total, rows = fleet_totals(agents), _by_kind(agents)
+    table = Table("on the wire", box=None, pad_edge=False, header_style="bold")
     for column in ("down kB", "kB/km", "up kB", "kB/km"):
         table.add_column(column, justify="right")
-    for kind, sizes in sorted(_by_kind(samples).items()):
-        table.add_row(kind, *_cells(sizes["down"], drive_km), *_cells(sizes["up"], drive_km))
-    down, up = sum(s.wire_down_bytes for s in samples), sum(s.wire_up_bytes for s in samples)
-    table.add_row("on the wire", *_cells(down, drive_km), *_cells(up, drive_km), style="bold")
+    for kind, sizes in rows.items():
+        table.add_row(kind, *_cells(sizes["down"], total["drive_km"]), *_cells(sizes["up"], total["drive_km"]))
+    sums = (_cells(total[f"{way}_wire_bytes"], total["drive_km"]) for way in ("down", "up"))
+    table.add_row("all", *(cell for cells in sums for cell in cells), style="bold")
     return table
 
 
-def _by_kind(samples: Iterable[TrafficSample]) -> dict[str, dict[str, int]]:
-    sums: dict[str, dict[str, int]] = defaultdict(lambda: {"down": 0, "up": 0})
-    for line in (line for sample in samples for line in sample.lines):
-        sums[line.kind][line.direction] += line.app_bytes
+def _by_kind(agents: Sequence[AgentTraffic]) -> dict[str, dict[str, int]]:
+    """Wire bytes by kind and direction: kinds of messages first, then what the connections themselves cost."""
+    lines = fleet_lines(agents)
+    kinds = sorted({line.kind for line in lines if line.messages or line.app_bytes})
+    rest = [name for name in RESIDUES if any(line.kind == name for line in lines)]
+    sums = {kind: {"down": 0, "up": 0} for kind in (*kinds, *rest)}
+    for line in lines:
+        sums[line.kind][line.direction] += line.wire_bytes
     return sums
 
 
 def _cells(size_bytes: int, drive_km: float) -> tuple[str, str]:
     rate = f"{per_km(size_bytes, drive_km):.1f}" if drive_km > 0 and size_bytes else "–"
-    return f"{size_bytes / 1000:.1f}" if size_bytes else "–", rate
+    return f"{size_bytes / 1000:.3f}" if size_bytes else "–", rate
 
 
-def plain_traffic(samples: Iterable[TrafficSample]) -> str:
-    """The same in a line: kinds with their kB/km, down and up."""
-    samples = tuple(samples)
-    drive_km = sum(sample.odometer_m for sample in samples) / 1000
-    kinds = sorted(_by_kind(samples).items())
-    parts = (
-        f"{way} " + ", ".join(f"{kind} {per_km(sizes[way], drive_km):.1f}" for kind, sizes in kinds if sizes[way])
-        for way in ("down", "up")
-        if any(sizes[way] for _, sizes in kinds)
+def plain_traffic(agents: Sequence[AgentTraffic]) -> str:
+    """The same in a line: what there is on the wire a km, tiles and all else."""
+    total = fleet_totals(agents)
+    if not agents or total["drive_km"] <= 0:
+        return "no traffic yet"
+    return (
+        f"on the wire {total['all_kB_per_km']:.1f} kB/km: tiles {total['tiles_kB_per_km']:.1f}, "
+        f"all else {total['other_kB_per_km']:.1f}"
     )
-    text = "; ".join(parts)
-    return f"kB/km {text}" if text and drive_km > 0 else "no traffic yet"
+
+
+def traffic_lines(traffic: Mapping[str, Any]) -> list[str]:
+    """The account of a run in two lines for people: every byte on the wire, and what messages themselves hold.
+
+    Args:
+        traffic: `summary.json`'s "traffic", or `fleet_totals`.
+    """
+    wire = traffic["down_wire_bytes"] + traffic["up_wire_bytes"]
+    problem = [f"traffic is not accounted for: {traffic['problem']}"] if traffic.get("problem") else []
+    return [
+        *problem,
+        f"traffic, all bytes on the wire: {wire:,} B, {traffic['all_kB_per_km']:.1f} kB/km: "
+        f"tiles {traffic['tiles_kB_per_km']:.1f}, all else {traffic['other_kB_per_km']:.1f} "
+        f"(up {traffic['other_up_kB_per_km']:.1f}, down {traffic['other_down_kB_per_km']:.1f}; "
+        f"in it keep-alives {traffic['keep_alives_kB_per_km']:.2f}, telemetry {traffic['telemetry_kB_per_km']:.2f})",
+        f"of it messages themselves: {traffic['down_bytes']:,} B down, {traffic['up_bytes']:,} B up "
+        f"({traffic['kB_per_km_down']:.1f} and {traffic['kB_per_km_up']:.1f} kB/km)",
+    ]
 
 
 def link_of(links: dict[str, LinkProfile], vehicle: str) -> LinkProfile:

@@ -25,7 +25,8 @@ from deploy.lab.namespaces import enter_namespace
 PRELOAD: Final = ("deploy.preload",)
 STOP_GRACE_S: Final = 10.0
 MAX_RESTARTS: Final = 5
-RESTART_DELAY_S: Final = 0.3
+RESTART_DELAY_S: Final = 0.3  # times the number of deaths in a row that came at once
+STEADY_S: Final = 2.0  # a process that has lived so long is started again without delay
 
 Role = Callable[..., None]
 
@@ -58,6 +59,14 @@ class _Running:
     process: ForkServerProcess
     restarts: int = 0
     restart_at_s: float | None = None
+    started_s: float = field(default_factory=time.monotonic)
+    early_deaths: int = 0
+
+    def pause_s(self) -> float:
+        """How long to wait before it is started again: one that dies at once would die for ever."""
+        steady = time.monotonic() - self.started_s >= STEADY_S
+        self.early_deaths = 0 if steady else self.early_deaths + 1
+        return RESTART_DELAY_S * self.early_deaths
 
 
 @dataclass
@@ -82,7 +91,7 @@ class Supervisor:
         self._write_pids()
 
     def poll(self) -> None:
-        """Start dead processes again, after a short delay; call it a few times a second.
+        """Start dead processes again, at once where they lived for a while; call it a few times a second.
 
         Raises:
             ProcessDied: when a process has died more than `MAX_RESTARTS` times.
@@ -122,8 +131,7 @@ class Supervisor:
 
     def _restart(self, running: _Running, code: int) -> None:
         if running.restart_at_s is None:
-            running.restart_at_s = time.monotonic() + RESTART_DELAY_S * (1 + running.restarts)
-            return
+            running.restart_at_s = time.monotonic() + running.pause_s()
         if time.monotonic() < running.restart_at_s:
             return
         name = running.spec.name
@@ -135,7 +143,7 @@ class Supervisor:
         running.restart_at_s = None
         self.restarts[name] = running.restarts
         self.on_restart(name, code)
-        running.process = self._spawn(running.spec)
+        running.process, running.started_s = self._spawn(running.spec), time.monotonic()
         self._write_pids()
 
     def _spawn(self, spec: ProcessSpec) -> ForkServerProcess:

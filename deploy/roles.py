@@ -23,7 +23,7 @@ def store(path: Path, connect: str, *, stop: threading.Event) -> None:
     """Serve tiles and catalogs from the store."""
     with (
         SqliteStore(path, create=False) as opened,
-        open_bus(BusConfig(connect=(connect,)), name="store") as bus,
+        open_bus(BusConfig(connect=(connect,), patient=True), name="store") as bus,
         TileServer(opened, bus),
     ):
         wait_for_stop(stop)

@@ -9,7 +9,7 @@ from deploy.evaluation import NO_TRUTH, score_run
 from deploy.features import feature_lines, score_layers
 from deploy.fleet import FleetOutcome, count_lines
 from deploy.fleet_config import FleetConfig
-from deploy.live import size_text
+from deploy.live_traffic import traffic_lines
 from deploy.prepare import PreparedRun
 from deploy.run_folder import RunFolder
 from fleet_sim.ellipsoids import Tiles, ellipsoids_of_maps
@@ -46,7 +46,7 @@ def write_summary(
     summary["prepare_s"] = round(prepare_s, 1)
     summary["doubtful"] = doubtful_vehicles(results)
     summary["localisation_p95"] = results.localisation_p95()
-    summary["traffic"] = results.traffic() | {"by_kind": account_traffic(folder)}
+    summary["traffic"] = account_traffic(folder)
     _write(folder.summary, summary)
     return summary
 
@@ -139,8 +139,7 @@ def summary_lines(summary: dict[str, Any]) -> list[str]:
         f"{summary['reports_sent']} reports sent, {summary['reports_acknowledged']} acknowledged, "
         f"{summary['reports_lost']} lost; {summary['tiles_published']} tile versions published, "
         f"{summary['updates_received']} updates received, {summary['changed_voxels']} voxels changed",
-        f"traffic: {size_text(traffic['down_bytes'])} down, {size_text(traffic['up_bytes'])} up "
-        f"({traffic['kB_per_km_down']:.0f} and {traffic['kB_per_km_up']:.1f} kB/km)",
+        *traffic_lines(traffic),
     ]
     if waiting["voxels"]:
         lines.append(

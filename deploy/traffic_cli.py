@@ -36,7 +36,8 @@ def traffic(run: Path, as_json_: bool, as_csv_: bool, page: Path | None, links: 
     """Show what RUN (a folder, or a name below runs/) sent and received, and what mobile links make of it.
 
     Every byte on the wire is accounted for: by kind of message, and what the connections themselves cost
-    (acks: packets without data; resent; session: handshakes, declarations, keep-alives).
+    (acks: packets without data, those that answer tiles apart; resent; opening and closing of connections; keep-alives;
+    session: declarations and what else is left).
     """
     if as_json_ and as_csv_:
         raise click.UsageError("--json and --csv exclude each other: one output, one form")

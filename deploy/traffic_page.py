@@ -17,9 +17,11 @@ from fleet_bus.traffic_table import notes
 
 _HOW = """<p>Payload is what the messages themselves hold. On the wire are the bytes that the kernel counted on each
 vehicle's connection (TCP_INFO: stream and packet headers). They are shared out to the last one: each message has its
-payload, key, envelope and packets; <b>acks</b> are packets without data, <b>resent</b> is what was lost and sent again,
-and <b>session</b> is the rest: handshakes, declarations, keep-alives. A kind without messages of its own came as shares
-of others, as many tiles come in one answer.</p>"""
+payload, key, envelope and packets; <b>acks</b> are packets without data (<b>tile acks</b> those that answer tiles, by
+the share of packets), <b>resent</b> is what was lost and sent again, <b>opening</b> and <b>closing</b> are those of
+connections, <b>keep-alives</b> what a silent session says to live on, and <b>session</b> is the rest: declarations,
+answers that nobody waited for. A kind without messages of its own came as shares of others, as many tiles come in one
+answer.</p>"""
 _HEAD = """<meta charset="utf-8"><meta name="viewport" content="width=device-width, initial-scale=1">
 <meta name="color-scheme" content="light dark">"""
 

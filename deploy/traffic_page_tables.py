@@ -7,20 +7,24 @@ from html import escape
 
 from deploy.live import size_text
 from fleet_bus.links import LinkProfile
-from fleet_bus.traffic import AgentTraffic, KindTraffic, fleet_lines, fleet_totals, per_km
+from fleet_bus.traffic import AgentTraffic, KindTraffic, fleet_lines, fleet_totals, is_of_tiles, per_km
 
 PAPER_UP_KB_PER_KM = 56.32
 """Upload of the GND paper, kB/km (section 7.5 and abstract)."""
 
 
 def cards(agents: Sequence[AgentTraffic]) -> str:
-    """The totals, large."""
+    """The totals, large: all bytes on the wire first."""
     total = fleet_totals(agents)
     down, up = total["down_wire_bytes"], total["up_wire_bytes"]
     payload = total["down_bytes"] + total["up_bytes"]
+    tiles = sum(line.wire_bytes for line in fleet_lines(agents) if is_of_tiles(line))
     changes = sum(line.app_bytes for line in fleet_lines(agents) if (line.kind, line.direction) == ("change", "up"))
     extra = f"{100 * (down + up - payload) / (down + up):.1f} %" if down + up else "–"
     items = (
+        (_rate(down + up, total["drive_km"]), f"all bytes on the wire ({down + up:,} B)"),
+        (_rate(tiles, total["drive_km"]), "of it tiles, asking included"),
+        (_rate(down + up - tiles, total["drive_km"]), "of it all else, keep-alives and telemetry included"),
         (_rate(total["down_bytes"], total["drive_km"]), "down, payload"),
         (_rate(total["up_bytes"], total["drive_km"]), "up, payload"),
         (_rate(changes, total["drive_km"]), f"of it map changes (GND paper: {PAPER_UP_KB_PER_KM} kB/km)"),
@@ -194,7 +198,7 @@ def _cells(numbers: Iterable[str]) -> str:
 
 
 def _kb(size_bytes: float) -> str:
-    return f"{size_bytes / 1000:,.1f}"
+    return f"{size_bytes / 1000:,.3f}"
 
 
 def _per_km(size_bytes: float, drive_km: float) -> str:

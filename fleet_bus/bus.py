@@ -129,7 +129,8 @@ class Bus:
 
         Args:
             keyexpr: keys that are served.
-            handler: gives bytes (one answer on the asked key) or (key, payload) pairs (answers to a region). It may
+            handler: gives bytes (one answer on the asked key) or (key, payload) pairs (answers to a region, which are
+                given by one thread of their own, at `serving.REGION_BYTE_S`). It may
                 raise `NotMine` (no reply), `Refused` (never ask again); any other exception makes the asker try again.
             complete: whether this handler alone answers for all these keys; the router then asks no other.
             workers: number of threads.
@@ -143,7 +144,7 @@ class Bus:
     ) -> None:
         """Publishes a notice that its receivers can also read again: delivery is not confirmed.
 
-        A full queue blocks instead of dropping. A lost router is waited for.
+        The own link is waited for, and a lost router. A router drops the notice for subscribers that do not keep up.
 
         Args:
             key: key expression of `schemas.keys`.
@@ -238,6 +239,7 @@ class Bus:
             if self._connection.closed.is_set():
                 return
             self._connection.closed.set()
+        self._connection.meter.close_from_now()
         for part in parts:
             part.close()
         self._connection.close()

@@ -1,6 +1,7 @@
 """Settings of a bus session, checked, and their translation for zenoh."""
 
 import json
+import math
 from dataclasses import dataclass
 from typing import Any, Final, Literal
 
@@ -11,6 +12,24 @@ from fleet_bus.links import LinkProfile, load_link
 
 DEFAULT_ENDPOINT: Final = "tcp/127.0.0.1:7447"
 MAX_MESSAGE_BYTES: Final = 16 * 1024 * 1024
+READS: Final = ("gnd/v1/tile/**", "gnd/v1/tiles/**", "gnd/v1/catalog/**")
+"""Keys of questions that change nothing: whose link is full loses the answer, and asks again."""
+QUEUED_BATCHES: Final = 16
+"""How many batches a router keeps for each client and each lane (zenoh's most); allocated when needed."""
+
+# Knocking at a router that is down costs some 100 bytes a time.
+_RETRY_MS: Final = 200
+_RETRY_MOBILE_MS: Final = 1000
+# A client's own queue may be full for as long as its own weak link needs: it drops nothing itself.
+_OWN_LINK_WAIT_US: Final = 60_000_000
+# At a router somebody else waits meanwhile: who takes nothing for so long loses the connection.
+_OTHERS_WAIT_US: Final = 500_000
+# What may be dropped waits for room this long, once until the link moves again; a fragment at most twice as long.
+_DROP_WAIT_US: Final = 5_000
+ROUTER_LEASE_MS: Final = 120_000
+"""A router speaks to vehicles on mobile links: its keep-alives cost them as much as their own. A client notices a dead
+router by its own keep-alives, which nobody acknowledges, long before this (`WireMeter.transmit_timeout_ms`)."""
+_ROUTER_KEEP_ALIVES: Final = 2
 
 
 @dataclass(frozen=True, slots=True)
@@ -22,8 +41,10 @@ class BusConfig:
         connect: endpoints of routers, tried in order; a client fails over to the next.
         listen: endpoints to open (routers only).
         link: profile of the vehicle's link, by name, file or value; "none" paces nothing.
-        lease_ms: how long a silent session stays alive, ms; 0 takes the link's own.
+        lease_ms: how long a silent session stays alive, ms; 0 takes the link's own, for a router `ROUTER_LEASE_MS`.
         open_timeout_s: how long `open_bus` tries to reach a router, s.
+        patient: whether `open_bus` returns without a router, too, and looks for one as long as it takes: what is
+            declared until then is declared when it is found, requests wait for it.
         publish_wait_s: how long `Bus.publish` waits for a lost router to come back, s.
         max_message_bytes: limit for every message, both directions, bytes.
         max_sessions: how many sessions a router accepts.
@@ -36,6 +57,7 @@ class BusConfig:
     link: str | LinkProfile = "none"
     lease_ms: int = 0
     open_timeout_s: float = 10.0
+    patient: bool = False
     publish_wait_s: float = 10.0
     max_message_bytes: int = MAX_MESSAGE_BYTES
     max_sessions: int = 10_000
@@ -48,6 +70,8 @@ class BusConfig:
             raise BusConfigError("a client needs at least one endpoint of a router in `connect`")
         if self.mode == "client" and self.listen:
             raise BusConfigError(f"a client does not listen, got {', '.join(self.listen)}")
+        if self.patient and self.mode != "client":
+            raise BusConfigError("only a client waits for a router")
         for endpoint in (*self.connect, *self.listen):
             check_endpoint(endpoint)
         if self.lease_ms != 0 and self.lease_ms < 100:
@@ -105,18 +129,67 @@ def assert_rules(settings: zenoh.Config, config: BusConfig) -> None:
 def _same(want: Any, got: Any) -> bool:
     if isinstance(want, dict) and isinstance(got, dict):
         return all(_same(value, got.get(key)) for key, value in want.items())
+    if isinstance(want, list) and isinstance(got, list):
+        return len(want) == len(got) and all(map(_same, want, got))
     return bool(want == got)
 
 
 def _settings(config: BusConfig, link: LinkProfile) -> dict[str, Any]:
-    settings: dict[str, Any] = {
+    settings = _session_settings(config, link) | (_router_rules() if config.mode == "router" else {})
+    if link.send_buffer_bytes:
+        settings["transport/link/tcp/so_sndbuf"] = link.send_buffer_bytes
+    return settings | _patience(config)
+
+
+def _patience(config: BusConfig) -> dict[str, Any]:
+    """How long a full queue is waited for: by a client as long as its own link needs, by a router hardly at all."""
+    is_router = config.mode == "router"
+    drop_us = _DROP_WAIT_US if is_router else _OWN_LINK_WAIT_US
+    control = "transport/link/tx/queue/congestion_control"
+    return {
+        f"{control}/drop/wait_before_drop": drop_us,
+        f"{control}/drop/max_wait_before_drop_fragments": drop_us,
+        # Then the session is closed, and later puts would vanish.
+        f"{control}/block/wait_before_close": _OTHERS_WAIT_US if is_router else _OWN_LINK_WAIT_US,
+    }
+
+
+def _router_rules() -> dict[str, Any]:
+    """Whoever does not read loses its own messages, then its own connection, and nobody waits for it.
+
+    Answers have the congestion control of their question as it left the router; the end of the answers always blocks,
+    and where its lane is known to be full, zenoh closes that connection at once.
+    """
+    lanes = ("data_high", "data", "data_low")
+    return {
+        "transport/link/tx/queue/size": dict.fromkeys(lanes, QUEUED_BATCHES),
+        "qos/network": [
+            _rule("notices", ["put", "delete"], ["**"], {"congestion_control": "drop", "priority": "data_low"}),
+            _rule("reads", ["query"], list(READS), {"congestion_control": "drop"}),
+        ],
+    }
+
+
+def _rule(name: str, messages: list[str], keys: list[str], overwrite: dict[str, str]) -> dict[str, Any]:
+    return {"id": name, "messages": messages, "key_exprs": keys, "flows": ["ingress"], "overwrite": overwrite}
+
+
+def _session_settings(config: BusConfig, link: LinkProfile) -> dict[str, Any]:
+    is_router = config.mode == "router"
+    return {
         "mode": config.mode,
         "connect/endpoints": list(config.connect),
         # Endpoints come back by themselves after a lost connection.
-        "connect/retry": {"period_init_ms": 50, "period_max_ms": 1000, "period_increase_factor": 1.5},
+        "connect/retry": {
+            "period_init_ms": 50,
+            "period_max_ms": _RETRY_MS if math.isinf(link.up_bit_s) else _RETRY_MOBILE_MS,
+            "period_increase_factor": 1.5,
+        },
         "listen/endpoints": list(config.listen),
         "scouting/multicast/enabled": False,
         "scouting/gossip/enabled": False,
+        # A router would wait half a second for others to be found, though nobody scouts.
+        "scouting/delay": 0,
         # On by default; would carry messages past the socket and past the traffic account.
         "transport/shared_memory/enabled": False,
         "transport/unicast/max_sessions": config.max_sessions,
@@ -124,12 +197,8 @@ def _settings(config: BusConfig, link: LinkProfile) -> dict[str, Any]:
         "transport/unicast/open_timeout": max(100, min(10_000, round(1000 * config.open_timeout_s))),
         # Has no fragmentation.
         "transport/unicast/lowlatency": False,
-        "transport/link/tx/lease": config.lease_ms or link.lease_ms,
+        "transport/link/tx/lease": config.lease_ms or (ROUTER_LEASE_MS if is_router else link.lease_ms),
+        "transport/link/tx/keep_alive": _ROUTER_KEEP_ALIVES if is_router else link.keep_alives,
         "transport/link/tx/batch_size": link.batch_bytes,
-        # A full queue closes the session after this long, and later puts would vanish: longer than any slow link needs.
-        "transport/link/tx/queue/congestion_control/block/wait_before_close": 60_000_000,
         "transport/link/rx/max_message_size": config.max_message_bytes,
     }
-    if link.send_buffer_bytes:
-        settings["transport/link/tcp/so_sndbuf"] = link.send_buffer_bytes
-    return settings

@@ -1,10 +1,11 @@
 """The open session behind a bus: state that all its parts share."""
 
 import logging
+import math
 import os
 import threading
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from typing import Final, Self
 
@@ -20,6 +21,11 @@ from gnd_map.tile_id import TileId
 _LOG = logging.getLogger(__name__)
 _POLL_S: Final = 0.02
 _CLOSE_S: Final = 1.0
+_FIRST_WAIT_S: Final = 0.05
+_LONGEST_WAIT_S: Final = 1.0
+_SAY_S: Final = 60.0
+
+Declare = Callable[[zenoh.Session], None]
 
 
 class Connection:
@@ -28,39 +34,97 @@ class Connection:
     Everything sent or received passes `outgoing` or `incoming`, which check, pace and account for it.
     """
 
-    def __init__(self, session: zenoh.Session, config: BusConfig, ledger: Ledger | None, name: str) -> None:
-        self.session, self.config, self.ledger, self.name = session, config, ledger, name
+    def __init__(self, config: BusConfig, ledger: Ledger | None, name: str) -> None:
+        self.config, self.ledger, self.name = config, ledger, name
+        self._session: zenoh.Session | None = None
+        self._declarations: list[Declare] = []
+        self._opening = threading.RLock()
         self.closed = threading.Event()
-        self.meter = WireMeter()
+        self.meter = WireMeter(config.lease_ms or config.link_profile.lease_ms)
         self._pacer = Pacer(config.link_profile, self.closed)
         self._pid = os.getpid()
         self._calls = 0
         self._idle = threading.Condition()
         if ledger is not None:
             ledger.begin(config.link_profile)
-        if config.mode == "client":  # a router carries everybody's bytes, and needs its descriptors for them
-            self._links = session.info.declare_link_events_listener(self._on_link)
-            for link in session.info.links():  # now: the first event may come after the first message
-                self.meter.attach(link.src, link.dst)
 
     @classmethod
     def open(cls, config: BusConfig, ledger: Ledger | None, name: str) -> Self:
-        """Opens a session, trying again until `open_timeout_s` has passed.
+        """Opens a session, trying again until `open_timeout_s` has passed; a patient one goes on in a thread.
 
         Raises:
             NoRouter: nothing answers there.
             PortInUse: an endpoint to listen at is taken.
             BusConfigError: zenoh refuses the configuration.
         """
-        deadline_s = time.monotonic() + config.open_timeout_s
-        wait_s = 0.05
-        while True:
-            try:
-                return cls(zenoh.open(zenoh_config(config)), config, ledger, name)
-            except zenoh.ZError as error:
-                _explain(error, config, out_of_time=time.monotonic() + wait_s > deadline_s)
+        connection = cls(config, ledger, name)
+        deadline_s = time.monotonic() + (0.0 if config.patient else config.open_timeout_s)
+        wait_s = _FIRST_WAIT_S
+        while not connection._try_open():
+            if time.monotonic() + wait_s > deadline_s and not config.patient:
+                where = ", ".join(config.connect)
+                raise NoRouter(f"no router at {where} for {config.open_timeout_s:g} s: start one with `gnd router`")
+            if config.patient:
+                threading.Thread(target=connection._keep_trying, name=f"open {name}", daemon=True).start()
+                break
             time.sleep(wait_s)
-            wait_s = min(1.0, wait_s * 1.5)
+            wait_s = min(_LONGEST_WAIT_S, wait_s * 1.5)
+        return connection
+
+    def _keep_trying(self) -> None:
+        """For a patient connection: look for a router for as long as it takes, and say so now and then."""
+        began_s, wait_s, where = time.monotonic(), _FIRST_WAIT_S, ", ".join(self.config.connect)
+        said_s = -math.inf
+        while not self.closed.wait(wait_s):
+            if self._try_open():
+                _LOG.info("%s: found the router at %s after %.1f s", self.name, where, time.monotonic() - began_s)
+                return
+            if time.monotonic() - said_s >= _SAY_S:
+                said_s = time.monotonic()
+                _LOG.warning("%s: no router at %s for %.1f s: waiting for it", self.name, where, said_s - began_s)
+            wait_s = min(_LONGEST_WAIT_S, wait_s * 1.5)
+
+    def _try_open(self) -> bool:
+        """One attempt; False when no router answers."""
+        try:
+            session = zenoh.open(zenoh_config(self.config))
+        except zenoh.ZError as error:
+            _raise_if_final(error, self.config)
+            return False
+        with self._opening:
+            if self.closed.is_set():
+                session.close()  # type: ignore[no-untyped-call]  # zenoh's stub
+                return True
+            if self.config.mode == "client":  # a router carries everybody's bytes, and needs its descriptors for them
+                self._links = session.info.declare_link_events_listener(self._on_link)
+                for link in session.info.links():  # now: the first event may come after the first message
+                    self.meter.attach(link.src, link.dst)
+            self._session = session
+            for declare in self._declarations:
+                declare(session)
+            self._declarations.clear()
+        return True
+
+    def when_open(self, declare: Declare) -> None:
+        """Declares something as soon as there is a session, that is now unless it is patient; a lost router is told
+        again by zenoh.
+        """
+        with self._opening:
+            if self._session is None:
+                self._declarations.append(declare)
+            else:
+                declare(self._session)
+
+    @property
+    def session(self) -> zenoh.Session:
+        """The open session.
+
+        Raises:
+            NoRouter: a patient one that has not found a router yet.
+        """
+        if self._session is None:
+            raise NoRouter(f"no router at {', '.join(self.config.connect)} until now")
+        return self._session
 
     def check_open(self) -> None:
         """Raises `BusClosed` when the bus was closed, or belongs to the parent of a fork."""
@@ -138,7 +202,8 @@ class Connection:
 
     def is_connected(self) -> bool:
         """Whether a router is at the other end right now."""
-        return not self.session.is_closed() and bool(self.session.info.routers_zid())
+        session = self._session
+        return session is not None and not session.is_closed() and bool(session.info.routers_zid())
 
     def wait_connected(self, timeout_s: float) -> bool:
         """Waits for a router to be there; False when the time is over.
@@ -161,10 +226,13 @@ class Connection:
             # Calls wait for a stalled link and would hold the session open: cut the link off.
             self.meter.cut()
             self._wait_idle()
-        try:
-            self.session.close()  # type: ignore[no-untyped-call]  # zenoh's stub
-        except zenoh.ZError as error:
-            _LOG.warning("%s: session not closed cleanly: %s", self.name, error)
+        with self._opening:
+            session = self._session
+        if session is not None:
+            try:
+                session.close()  # type: ignore[no-untyped-call]  # zenoh's stub
+            except zenoh.ZError as error:
+                _LOG.warning("%s: session not closed cleanly: %s", self.name, error)
         self.meter.close()
 
     def _wait_idle(self) -> bool:
@@ -180,8 +248,8 @@ class Connection:
         _LOG.debug("%s: link %s -> %s %s", self.name, link.src, link.dst, event.kind)
 
 
-def _explain(error: zenoh.ZError, config: BusConfig, *, out_of_time: bool) -> None:
-    """Raises what the error means for the user; returns when another try may help."""
+def _raise_if_final(error: zenoh.ZError, config: BusConfig) -> None:
+    """Raises what the error means for the user, unless another try may help."""
     text = str(error)
     if "Address already in use" in text:
         where = ", ".join(config.listen)
@@ -190,6 +258,3 @@ def _explain(error: zenoh.ZError, config: BusConfig, *, out_of_time: bool) -> No
         ) from error
     if "nable to connect" not in text:
         raise BusConfigError(f"zenoh cannot open a session: {text}") from error
-    if out_of_time:
-        where = ", ".join(config.connect)
-        raise NoRouter(f"no router at {where} for {config.open_timeout_s:g} s: start one with `gnd router`") from error

@@ -18,9 +18,10 @@ from fleet_bus.wire import WireBytes
 from gnd_map.tile_id import TileId
 
 Direction = Literal["up", "down"]
-KINDS: Final = ("tile", "delta", "catalog", "change", "ack", "update", "control")
-LEDGER_VERSION: Final = 2
-"""Written at the head of every session. Version 1 had no heads, neither of ledgers nor of messages."""
+KINDS: Final = ("tile", "delta", "catalog", "change", "ack", "update", "telemetry", "control")
+LEDGER_VERSION: Final = 3
+"""Written at the head of every session. Version 1 had no heads, neither of ledgers nor of messages; version 2 booked
+telemetry as control, and did not tell opening and keep-alives apart from the rest of a session."""
 _LOG = logging.getLogger(__name__)
 
 

@@ -15,6 +15,7 @@ from gnd_map.config import from_mapping
 from gnd_map.errors import ConfigError
 
 _MOST: Final = 1 << 63
+_READ_VERSIONS: Final = (2, LEDGER_VERSION)
 _WIRE_FIELDS: Final = tuple(field.name for field in fields(WireBytes))
 _LINK_FIELDS: Final = frozenset(field.name for field in fields(LinkProfile))
 
@@ -70,8 +71,8 @@ def _rows(raw: list[bytes], path: Path) -> Iterator[Row]:
 
 def _check_version(values: dict[str, Any], where: str) -> None:
     version = values.get("ledger", LEDGER_VERSION)
-    if version != LEDGER_VERSION:
-        raise LedgerError(f"{where}: ledger of version {version!r}; this program reads version 1 and {LEDGER_VERSION}")
+    if version not in _READ_VERSIONS:
+        raise LedgerError(f"{where}: ledger of version {version!r}; this program reads versions 1 to {LEDGER_VERSION}")
 
 
 def _row(values: dict[str, Any]) -> Row:

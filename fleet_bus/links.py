@@ -30,6 +30,7 @@ class LinkProfile:
         batch_bytes: zenoh batch size, bytes; small ones let a short message pass bulk.
         send_buffer_bytes: SO_SNDBUF of the connection, bytes; 0 leaves the kernel's own.
         lease_ms: how long a silent session stays alive, ms.
+        keep_alives: so many are sent in a lease in which nothing else is; 2 is the least that keeps a session.
         rate_source: where the rates come from (publisher, year), or that they are assumed.
         delay_source: the same for the delay.
         loss_source: the same for the loss.
@@ -48,6 +49,7 @@ class LinkProfile:
     batch_bytes: int = 65_535
     send_buffer_bytes: int = 0
     lease_ms: int = 10_000
+    keep_alives: int = 4
     rate_source: str = ""
     delay_source: str = ""
     loss_source: str = ""
@@ -70,6 +72,8 @@ class LinkProfile:
             raise LinkError(f"link {self.name}: batch_bytes must be in 512 … 65535, got {self.batch_bytes}")
         if self.burst_bytes < 0 or self.send_buffer_bytes < 0 or self.lease_ms < 100:
             raise LinkError(f"link {self.name}: negative buffer or lease below 100 ms ({self.lease_ms} ms)")
+        if not 2 <= self.keep_alives <= 16:
+            raise LinkError(f"link {self.name}: keep_alives must be in 2 … 16, got {self.keep_alives}")
 
     @property
     def delay_s(self) -> float:

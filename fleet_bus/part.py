@@ -2,14 +2,41 @@
 
 import threading
 from abc import ABC, abstractmethod
-from typing import Self
+from collections.abc import Callable
+from typing import Any, Self
+
+import zenoh
+
+from fleet_bus.connection import Connection
 
 
 class Part(ABC):
-    """Something declared, which `close` or the end of a `with` block takes back once."""
+    """Something declared, which `close` or the end of a `with` block takes back once.
+
+    Attributes:
+        declared: zenoh's object; None while there is no session yet.
+    """
 
     def __init__(self) -> None:
+        self.declared: Any = None
         self._ended = threading.Event()
+        self._declaring = threading.Lock()
+
+    def declare(self, connection: Connection, declare: Callable[[zenoh.Session], Any]) -> None:
+        """Declares it as soon as there is a session, unless it was taken back before."""
+
+        def now(session: zenoh.Session) -> None:
+            with self._declaring:
+                if not self.is_closed:
+                    self.declared = declare(session)
+
+        connection.when_open(now)
+
+    def undeclare(self) -> None:
+        """Takes back what was declared, if it was."""
+        with self._declaring:
+            if self.declared is not None:
+                self.declared.undeclare()
 
     def __enter__(self) -> Self:
         return self

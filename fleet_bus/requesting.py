@@ -23,12 +23,16 @@ from gnd_map.tile_id import TileId
 
 END_OF_ANSWERS: Final = "gnd/end"
 """Encoding of the closing reply of a handler that gives many answers; its payload is their number in decimal."""
+COUNT_WANTED: Final = b"gnd/end"
+"""Attachment of a question about a region whose asker wants that closing reply."""
 REFUSED: Final = "gnd/refused"
 """Encoding of a reply that says: do not ask again."""
 FAILED: Final = "gnd/failed"
 """Encoding of a reply that says: the handler failed, ask again."""
 
 _REPLY_KIND: Final = {"change": "ack"}
+# Questions about the map are short and urgent; they and their answers pass reports and acknowledgements.
+_LANE: Final = dict.fromkeys(("tile", "delta", "catalog"), zenoh.Priority.DATA_HIGH)
 _POLL_S: Final = 0.2
 
 
@@ -166,6 +170,8 @@ class _Asking:
                 # Answers pass at once and one by one; the default would hold all back until the last has come.
                 consolidation=zenoh.ConsolidationMode.NONE,
                 congestion_control=zenoh.CongestionControl.BLOCK,
+                attachment=None if first_only else COUNT_WANTED,
+                priority=_LANE.get(self.kind, zenoh.Priority.DATA),
                 cancellation_token=cancel,
             )
         try:

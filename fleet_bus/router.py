@@ -5,6 +5,7 @@ server's.
 """
 
 import logging
+import os
 import resource
 import threading
 from collections.abc import Sequence
@@ -15,6 +16,8 @@ from fleet_bus.config import DEFAULT_ENDPOINT, BusConfig
 
 _LOG = logging.getLogger(__name__)
 _LOOK_UP_S: Final = 0.25
+# A thread that receives waits while it forwards to a full queue; zenoh's two would soon all wait.
+_RECEIVING_THREADS: Final = 16
 
 
 def open_router(listen: Sequence[str] = (DEFAULT_ENDPOINT,), connect: Sequence[str] = ()) -> Bus:
@@ -29,6 +32,7 @@ def open_router(listen: Sequence[str] = (DEFAULT_ENDPOINT,), connect: Sequence[s
         BusConfigError: malformed endpoint.
     """
     _raise_file_limit()
+    os.environ.setdefault("ZENOH_RUNTIME", f"(rx: (worker_threads: {_RECEIVING_THREADS}))")  # read at first use
     config = BusConfig(mode="router", listen=tuple(listen), connect=tuple(connect))
     return open_bus(config, name="router")
 

@@ -3,7 +3,7 @@
 import logging
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
-from typing import Any
+from typing import Final
 
 import zenoh
 
@@ -11,7 +11,7 @@ from fleet_bus.connection import Connection
 from fleet_bus.envelopes import REPLY_BYTES, REQUEST_BYTES, head_bytes
 from fleet_bus.errors import BusClosed, BusError, NotMine, Refused
 from fleet_bus.part import Part
-from fleet_bus.requesting import END_OF_ANSWERS, FAILED, REFUSED
+from fleet_bus.requesting import COUNT_WANTED, END_OF_ANSWERS, FAILED, REFUSED
 from fleet_bus.workers import Workers
 
 _LOG = logging.getLogger(__name__)
@@ -34,8 +34,17 @@ Answer = bytes | Iterable[tuple[str, bytes]]
 Handler = Callable[[Request], Answer]
 
 
+REGIONS_WAITING: Final = 64
+# Answers to a region leave no faster, so that they do not fill the queue of an asker with an ordinary link.
+REGION_BYTE_S: Final = 8_000_000
+
+
 class Serving(Part):
-    """A declared handler; `close` finishes requests in hand and drops waiting ones (their senders ask again)."""
+    """A declared handler; `close` finishes requests in hand and drops waiting ones (their senders ask again).
+
+    Questions about regions have one thread and a short mailbox of their own: nobody who asks for one thing waits for
+    somebody who asks for everything.
+    """
 
     def __init__(
         self, connection: Connection, keyexpr: str, handler: Handler, *, complete: bool, workers: int, kind: str
@@ -45,18 +54,22 @@ class Serving(Part):
         self._workers: Workers[zenoh.Query] = Workers(
             f"serve {keyexpr}", self._answer, workers, connection.config.queue_limit
         )
-        self._queryable: Any = connection.session.declare_queryable(keyexpr, self._accept, complete=complete)
+        self._regions = self._workers
+        if "*" in keyexpr:
+            self._regions = Workers(f"regions {keyexpr}", self._answer, 1, REGIONS_WAITING)
+        self.declare(connection, lambda session: session.declare_queryable(keyexpr, self._accept, complete=complete))
 
     def _end(self) -> None:
-        self._queryable.undeclare()
+        self.undeclare()
         self._workers.close()
+        self._regions.close()
 
     def _accept(self, query: zenoh.Query) -> None:
         # Runs in zenoh's thread: hand over, or say at once that we cannot.
-        if not self._workers.offer(query):
+        workers = self._regions if "*" in str(query.key_expr) else self._workers
+        if not workers.offer(query):
             with query:
-                limit = self._connection.config.queue_limit
-                query.reply_err(f"busy: {limit} requests are waiting", encoding=FAILED)
+                query.reply_err(f"busy: {workers.limit} requests are waiting", encoding=FAILED)
 
     def _answer(self, query: zenoh.Query) -> None:
         with query:
@@ -83,7 +96,10 @@ class Serving(Part):
         count = 0
         for count, (key, payload) in enumerate(answer, start=1):  # noqa: B007 - the last count is sent below
             self._send(query, key, payload)
-        query.reply_err(str(count), encoding=END_OF_ANSWERS)
+            self._connection.closed.wait(len(payload) / REGION_BYTE_S)
+        # To a program that knows only zenoh an error would mean that its question had failed.
+        if query.attachment is not None and query.attachment.to_bytes() == COUNT_WANTED:
+            query.reply_err(str(count), encoding=END_OF_ANSWERS)
 
     def _send(self, query: zenoh.Query, key: str, payload: bytes) -> None:
         if "*" in key:

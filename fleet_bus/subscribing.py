@@ -2,7 +2,7 @@
 
 import logging
 from collections.abc import Callable
-from typing import Any
+from typing import Any, Final
 
 import zenoh
 from zenoh import ext
@@ -15,6 +15,8 @@ from fleet_bus.workers import Workers
 from gnd_map.tile_id import TileId
 
 _LOG = logging.getLogger(__name__)
+# Notices let answers and acknowledgements pass.
+NOTICE_LANE: Final = zenoh.Priority.DATA_LOW
 OnMessage = Callable[[str, bytes], None]
 OnAlive = Callable[[str, bool], None]
 TileOf = Callable[[str], TileId | None]
@@ -43,10 +45,10 @@ class Subscription(Part):
         self._tile_of = tile_of if tile_of is not None else lambda _key: None
         limit = connection.config.queue_limit
         self._workers: Workers[zenoh.Sample] = Workers(f"subscribe {keyexpr}", self._deliver, 1, limit)
-        self._subscriber = _declare(connection.session, keyexpr, self._accept, history=history)
+        self.declare(connection, lambda session: _declare(session, keyexpr, self._accept, history=history))
 
     def _end(self) -> None:
-        self._subscriber.undeclare()
+        self.undeclare()
         self._workers.close()
 
     def _accept(self, sample: zenoh.Sample) -> None:
@@ -72,12 +74,13 @@ class AliveWatch(Part):
         super().__init__()
         self._callback = callback
         self._workers: Workers[zenoh.Sample] = Workers(f"alive {keyexpr}", self._deliver, 1, 1 << 20)
-        self._subscriber: Any = connection.session.liveliness().declare_subscriber(
-            keyexpr, self._workers.offer, history=True
+        self.declare(
+            connection,
+            lambda session: session.liveliness().declare_subscriber(keyexpr, self._workers.offer, history=True),
         )
 
     def _end(self) -> None:
-        self._subscriber.undeclare()
+        self.undeclare()
         self._workers.close()
 
     def _deliver(self, sample: zenoh.Sample) -> None:
@@ -89,10 +92,10 @@ class AliveToken(Part):
 
     def __init__(self, connection: Connection, key: str) -> None:
         super().__init__()
-        self._token: Any = connection.session.liveliness().declare_token(key)
+        self.declare(connection, lambda session: session.liveliness().declare_token(key))
 
     def _end(self) -> None:
-        self._token.undeclare()
+        self.undeclare()
 
 
 class RecallingPublisher(Part):
@@ -104,27 +107,34 @@ class RecallingPublisher(Part):
     def __init__(self, connection: Connection, key: str, *, kind: str, remember: int) -> None:
         super().__init__()
         self._connection, self._key, self._kind = connection, key, kind
-        self._publisher: Any = ext.declare_advanced_publisher(
-            connection.session,
-            key,
-            congestion_control=zenoh.CongestionControl.BLOCK,
-            cache=ext.CacheConfig(max_samples=remember),
-            sample_miss_detection=ext.MissDetectionConfig(heartbeat=None, sporadic_heartbeat=0.5),
-            publisher_detection=True,
+        self.declare(
+            connection,
+            lambda session: ext.declare_advanced_publisher(
+                session,
+                key,
+                congestion_control=zenoh.CongestionControl.BLOCK,
+                priority=NOTICE_LANE,
+                cache=ext.CacheConfig(max_samples=remember),
+                sample_miss_detection=ext.MissDetectionConfig(heartbeat=None, sporadic_heartbeat=0.5),
+                publisher_detection=True,
+            ),
         )
 
     def put(self, payload: bytes, *, tile: TileId | str | None = None) -> None:
         """Publishes; without a router the notice is remembered and fetched by subscribers after the reconnection.
 
         Raises:
+            NoRouter: there has not been one yet.
             MessageTooLarge, BusClosed.
         """
+        if self.declared is None:
+            raise NoRouter(f"no router until now: {len(payload)} bytes for {self._key} were not published")
         self._connection.outgoing(payload, self._kind, tile, head_bytes(self._key, NOTICE_BYTES))
         with self._connection.sending():
-            self._publisher.put(payload)
+            self.declared.put(payload)
 
     def _end(self) -> None:
-        self._publisher.undeclare()
+        self.undeclare()
 
 
 def publish(
@@ -138,7 +148,7 @@ def publish(
         raise NoRouter(f"no router at {where} for {wait_s:g} s: {len(payload)} bytes for {key} were not published")
     connection.outgoing(payload, kind, tile, head_bytes(key, NOTICE_BYTES))
     with connection.sending() as session:
-        session.put(key, payload, congestion_control=zenoh.CongestionControl.BLOCK)
+        session.put(key, payload, congestion_control=zenoh.CongestionControl.BLOCK, priority=NOTICE_LANE)
 
 
 def _declare(session: zenoh.Session, keyexpr: str, accept: Callable[[zenoh.Sample], Any], *, history: bool) -> Any:

@@ -2,7 +2,7 @@
 
 import math
 from collections import defaultdict
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass
 from typing import Any, Final
 
@@ -11,9 +11,10 @@ from fleet_bus.ledger_file import AgentLedger, Booking
 from fleet_bus.links import LinkProfile
 from fleet_bus.pacer import MESSAGE_OVERHEAD_BYTES
 from fleet_bus.traffic_links import Arrivals, LinkUse, link_use, measured_arrivals, tile_arrival_s
-from fleet_bus.traffic_wire import RESIDUES, WireAccount, wire_account
+from fleet_bus.traffic_wire import RESIDUES, TILE_KINDS, WireAccount, wire_account
 
 DEFAULT_LINKS: Final = ("3g", "4g", "5g")
+_TILES: Final = (*TILE_KINDS, "tile acks")
 _SERIES_POINTS: Final = 100
 
 
@@ -165,14 +166,42 @@ def fleet_totals(agents: Sequence[AgentTraffic]) -> dict[str, Any]:
         "estimated_wire_bytes": sum(agent.estimated_wire_bytes for agent in agents),
         "kB_per_km_up": per_km(up_bytes, drive_km),
         "kB_per_km_down": per_km(down_bytes, drive_km),
+        **headline(agents),
+    }
+
+
+def is_of_tiles(line: KindTraffic) -> bool:
+    """Whether a line is the map itself: questions about tiles, what they brought, and its acknowledgements."""
+    return line.kind in _TILES
+
+
+def headline(agents: Sequence[AgentTraffic]) -> dict[str, float]:
+    """All bytes on the wire, up and down together, a km: in all, tiles apart, all else together; then of this else
+    upload and download, and what keep-alives and telemetry are of it.
+    """
+    drive_km = sum(agent.drive_km for agent in agents)
+    lines = fleet_lines(agents)
+
+    def rate(wanted: Callable[[KindTraffic], bool]) -> float:
+        return per_km(sum(line.wire_bytes for line in lines if wanted(line)), drive_km)
+
+    return {
+        "all_kB_per_km": rate(lambda _: True),
+        "tiles_kB_per_km": rate(is_of_tiles),
+        "other_kB_per_km": rate(lambda line: not is_of_tiles(line)),
+        "other_up_kB_per_km": rate(lambda line: not is_of_tiles(line) and line.direction == "up"),
+        "other_down_kB_per_km": rate(lambda line: not is_of_tiles(line) and line.direction == "down"),
+        "keep_alives_kB_per_km": rate(lambda line: line.kind == "keep-alives"),
+        "telemetry_kB_per_km": rate(lambda line: line.kind == "telemetry"),
     }
 
 
 def fleet_lines(agents: Sequence[AgentTraffic]) -> tuple[KindTraffic, ...]:
     """The lines of all agents added up: download first, the connection's own lines last."""
-    sums: dict[tuple[Direction, bool, str], list[int]] = defaultdict(lambda: [0, 0, 0])
+    place = {name: number for number, name in enumerate(RESIDUES, start=1)}
+    sums: dict[tuple[Direction, int, str], list[int]] = defaultdict(lambda: [0, 0, 0])
     for line in (line for agent in agents for line in agent.lines):
-        total = sums[line.direction, line.kind in RESIDUES, line.kind]
+        total = sums[line.direction, place.get(line.kind, 0), line.kind]
         total[0] += line.messages
         total[1] += line.app_bytes
         total[2] += line.wire_bytes
@@ -199,9 +228,7 @@ def _lines(ledger: AgentLedger, accounts: tuple[WireAccount, WireAccount]) -> tu
         KindTraffic(line.kind, line.direction, line.messages, line.app_bytes, wire[line.direction].by_kind[line.kind])
         for line in ledger.lines()
     ]
-    rest = [
-        KindTraffic(name, account.direction, 0, 0, getattr(account, name)) for account in accounts for name in RESIDUES
-    ]
+    rest = [KindTraffic(name, account.direction, 0, 0, account.rest[name]) for account in accounts for name in RESIDUES]
     return (*messages, *(line for line in rest if line.wire_bytes))
 
 

@@ -59,8 +59,8 @@ def _add(table: Table, agent: str, lines: Iterable[KindTraffic], drive_km: float
         app, wire = line.app_bytes, line.wire_bytes
         table.add_row(
             agent, line.kind, line.direction, str(line.messages) if line.messages else "–",
-            f"{app / 1000:.1f}" if app else "–", _per_km(app, drive_km) if app else "–",
-            f"{wire / 1000:.1f}", _per_km(wire, drive_km),
+            f"{app / 1000:.3f}" if app else "–", _per_km(app, drive_km) if app else "–",
+            f"{wire / 1000:.3f}", _per_km(wire, drive_km),
         )  # fmt: skip
     table.add_section()
 
@@ -89,7 +89,9 @@ def caption(agents: tuple[AgentTraffic, ...]) -> str:
     total = fleet_totals(agents)
     return (
         f"{total['agents']} agents, {total['drive_km']:.2f} km: "
-        f"down {total['down_bytes'] / 1000:.1f} kB ({total['kB_per_km_down']:.1f} kB/km), "
-        f"up {total['up_bytes'] / 1000:.1f} kB ({total['kB_per_km_up']:.1f} kB/km); on the wire "
-        f"down {total['down_wire_bytes'] / 1000:.1f} kB, up {total['up_wire_bytes'] / 1000:.1f} kB"
+        f"down {total['down_bytes'] / 1000:.3f} kB ({total['kB_per_km_down']:.1f} kB/km), "
+        f"up {total['up_bytes'] / 1000:.3f} kB ({total['kB_per_km_up']:.1f} kB/km); on the wire "
+        f"down {total['down_wire_bytes'] / 1000:.3f} kB, up {total['up_wire_bytes'] / 1000:.3f} kB; "
+        f"all bytes {total['all_kB_per_km']:.2f} kB/km: tiles {total['tiles_kB_per_km']:.2f}, "
+        f"all else {total['other_kB_per_km']:.2f}"
     )

@@ -2,13 +2,16 @@
 
 Measured is only the total of each connection. It is laid out so:
 
-    measured = payloads + heads of messages + acknowledgements + sent again + session
+    measured = payloads + heads of messages + acks + resent + opening + closing + keep-alives + session
 
 Payloads are exact. A message's head is its key and envelope (exact but for some bytes) and its part of the headers of
 packets; a ledger of version 1 does not know keys and takes `MESSAGE_OVERHEAD_BYTES`. Acknowledgements (packets without
-data) and what was sent again are counted by the kernel. What is left is the session itself: handshake, declarations,
-keep-alives, answers that nobody waited for. Where messages travel together in packets less is left than their heads
-come to; then they share it.
+data) and what was sent again are counted by the kernel; acknowledgements are shared out by the packets that they
+answer, so that those of tiles stand with the tiles. The opening is what had passed when the connection was new,
+closing what passed since the session was being closed, keep-alives are known by their size (`fleet_bus.wire`); a ledger
+of version 2 knows none of them, there they are in the rest. What is left is the session itself: declarations, answers
+that nobody waited for. Where messages travel
+together in packets less is left than their heads come to; then they share it.
 """
 
 from collections import defaultdict
@@ -19,10 +22,12 @@ from typing import Final
 from fleet_bus.ledger import Direction
 from fleet_bus.ledger_file import AgentLedger, Booking
 from fleet_bus.pacer import MESSAGE_OVERHEAD_BYTES
-from fleet_bus.wire import WireBytes
+from fleet_bus.wire import KEEP_ALIVE_BYTES, WireBytes
 
-RESIDUES: Final = ("acks", "resent", "session")
+RESIDUES: Final = ("tile acks", "acks", "resent", "opening", "closing", "keep-alives", "session")
 """Lines of the account beside the kinds of messages."""
+TILE_KINDS: Final = ("tile", "delta")
+"""Questions about tiles and what they brought: the map itself. All else is what a vehicle costs that holds its map."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -35,9 +40,8 @@ class WireAccount:
         estimated: what no reading covers: sent after the last one before a kill, or the system counts nothing.
         by_kind: wire bytes of the messages of each kind.
         by_tile: wire bytes of the messages, or shares of them, about each tile.
-        acks: packets without data.
-        resent: data sent again.
-        session: handshakes, declarations, keep-alives, and the packets that carry them.
+        rest: the lines of `RESIDUES`: packets without data, those that answer tiles apart; data sent again; handshakes
+            of connections; their closing; keep-alives; declarations and what else the session carries.
     """
 
     direction: Direction
@@ -45,22 +49,19 @@ class WireAccount:
     estimated: int
     by_kind: dict[str, int]
     by_tile: dict[str, int]
-    acks: int
-    resent: int
-    session: int
+    rest: dict[str, int]
 
     @property
     def total(self) -> int:
         """Sum of all lines: `measured` + `estimated`."""
-        return sum(self.by_kind.values()) + self.acks + self.resent + self.session
+        return sum(self.by_kind.values()) + sum(self.rest.values())
 
 
 def wire_account(ledger: AgentLedger, direction: Direction) -> WireAccount:
     """Shares out what was measured in one direction over all sessions of an agent."""
     by_session: dict[str, list[Booking]] = {session: [] for session in ledger.wires}
     for booking in ledger.bookings:
-        if booking.direction == direction:
-            by_session.setdefault(booking.session, []).append(booking)
+        by_session.setdefault(booking.session, []).append(booking)
     parts = [
         _session_account(bookings, ledger.wires.get(session, WireBytes()), direction)
         for session, bookings in by_session.items()
@@ -84,38 +85,59 @@ def apportion(total: int, weights: Sequence[float]) -> list[int]:
     return result
 
 
-def _session_account(bookings: list[Booking], wire: WireBytes, direction: Direction) -> WireAccount:
-    measured, acks, resent = _counted(wire, direction)
+def _session_account(all_bookings: list[Booking], wire: WireBytes, direction: Direction) -> WireAccount:
+    bookings = [booking for booking in all_bookings if booking.direction == direction]
+    answered = [booking for booking in all_bookings if booking.direction != direction]
+    measured, counted = _counted(wire, direction, answered)
     payload = sum(booking.app_bytes for booking in bookings)
     heads = [_head_bytes(booking, wire) for booking in bookings]
-    room = measured - acks - resent - payload
+    room = measured - sum(counted.values()) - payload
     # Too little room for the payloads alone: the last reading is older than the last messages.
     share = round(sum(heads)) if room < 0 else min(round(sum(heads)), room)
     sizes = [b.app_bytes + head for b, head in zip(bookings, apportion(share, heads), strict=True)]
-    session = max(room - share, 0)
+    rest = counted | {"session": max(room - share, 0)}
     return WireAccount(
         direction=direction,
         measured=measured,
-        estimated=sum(sizes) + acks + resent + session - measured,
+        estimated=sum(sizes) + sum(rest.values()) - measured,
         by_kind=_totals((booking.kind, size) for booking, size in zip(bookings, sizes, strict=True)),
         by_tile=_totals((b.tile, size) for b, size in zip(bookings, sizes, strict=True) if b.tile is not None),
-        acks=acks,
-        resent=resent,
-        session=session,
+        rest=rest,
     )
 
 
-def _counted(wire: WireBytes, direction: Direction) -> tuple[int, int, int]:
-    """Measured total, and of it acknowledgements and what was sent again, bytes."""
-    return (wire.up, wire.up_acks, wire.up_resent) if direction == "up" else (wire.down, wire.down_acks, 0)
+def _counted(wire: WireBytes, direction: Direction, answered: list[Booking]) -> tuple[int, dict[str, int]]:
+    """Measured total, and of it what the meter itself could tell, bytes; `answered` came from the other side."""
+    if direction == "up":
+        tiles, acks = _acks(wire.up_acks, wire, answered, wire.down_alive)
+        parts = (tiles, acks, wire.up_resent, wire.up_opening, wire.up_closing, wire.up_alive)
+        return wire.up, dict(zip(RESIDUES, parts, strict=False))
+    tiles, acks = _acks(wire.down_acks, wire, answered, wire.up_alive)
+    parts = (tiles, acks, 0, wire.down_opening, wire.down_closing, wire.down_alive)
+    return wire.down, dict(zip(RESIDUES, parts, strict=False))
+
+
+def _acks(acks: int, wire: WireBytes, answered: list[Booking], alive_bytes: int) -> tuple[int, int]:
+    """Acknowledgements of tiles and of all else, in the proportion of the packets that were answered."""
+    alive = alive_bytes / (KEEP_ALIVE_BYTES + wire.header_bytes)
+    weights = [_packets(booking, wire) for booking in answered]
+    of_tiles = sum(n for booking, n in zip(answered, weights, strict=True) if booking.kind in TILE_KINDS)
+    tiles, rest = apportion(acks, (of_tiles, sum(weights) - of_tiles + alive))
+    return (tiles, rest) if tiles + rest == acks else (0, acks)
+
+
+def _packets(booking: Booking, wire: WireBytes) -> float:
+    """In how many packets a message travels: a share of one only fills them, the end of an answer has one more."""
+    size = booking.app_bytes + (booking.head_bytes or 0)
+    ends = booking.messages if booking.took_s is not None else 0
+    return ends + max(size / wire.segment_bytes if wire.segment_bytes else 0.0, float(booking.messages))
 
 
 def _head_bytes(booking: Booking, wire: WireBytes) -> float:
     """Estimate of what a message costs beside its payload: key, envelope, and headers of the packets that it fills."""
     if booking.head_bytes is None or not wire.segment_bytes:
         return float(MESSAGE_OVERHEAD_BYTES * booking.messages)
-    packets = (booking.app_bytes + booking.head_bytes) / wire.segment_bytes
-    return booking.head_bytes + wire.header_bytes * max(packets, float(booking.messages))
+    return booking.head_bytes + wire.header_bytes * _packets(booking, wire)
 
 
 def _totals(items: Iterator[tuple[str, int]]) -> dict[str, int]:
@@ -132,7 +154,5 @@ def _sum(parts: list[WireAccount], direction: Direction) -> WireAccount:
         estimated=sum(part.estimated for part in parts),
         by_kind=_totals(item for part in parts for item in part.by_kind.items()),
         by_tile=_totals(item for part in parts for item in part.by_tile.items()),
-        acks=sum(part.acks for part in parts),
-        resent=sum(part.resent for part in parts),
-        session=sum(part.session for part in parts),
+        rest={name: sum(part.rest[name] for part in parts) for name in RESIDUES},
     )

@@ -23,7 +23,7 @@ class Workers(Generic[_T]):
     """
 
     def __init__(self, name: str, handle: Callable[[_T], None], count: int, limit: int) -> None:
-        self._handle, self._limit = handle, limit
+        self._handle, self.limit = handle, limit
         self._items: deque[_T] = deque()
         self._changed = threading.Condition()
         self._closed = False
@@ -34,7 +34,7 @@ class Workers(Generic[_T]):
     def offer(self, item: _T) -> bool:
         """Hands an item over without ever blocking; False when the mailbox is full or closed."""
         with self._changed:
-            if self._closed or len(self._items) >= self._limit:
+            if self._closed or len(self._items) >= self.limit:
                 return False
             self._items.append(item)
             self._changed.notify()
@@ -43,7 +43,7 @@ class Workers(Generic[_T]):
     def offer_newest(self, item: _T) -> bool:
         """Hands an item over without ever blocking; drops the oldest of a full mailbox and then gives False."""
         with self._changed:
-            full = len(self._items) >= self._limit
+            full = len(self._items) >= self.limit
             if full:
                 self._items.popleft()
             self._items.append(item)

@@ -67,7 +67,9 @@ def _same_rows(old: Gaussians, new: Gaussians) -> "np.ndarray[tuple[int], np.dty
     return same
 
 
-def _are_equal(old: Gaussians, at_old: I64, new: Gaussians, at_new: I64) -> "np.ndarray[tuple[int], np.dtype[np.bool_]]":
+def _are_equal(
+    old: Gaussians, at_old: I64, new: Gaussians, at_new: I64
+) -> "np.ndarray[tuple[int], np.dtype[np.bool_]]":
     """(K,) whether pairs of rows hold the same values but for the ids; -0.0 and 0.0 are one value, and NaN is none."""
     same = (old.count[at_old] == new.count[at_new]) & (old.cells[at_old] == new.cells[at_new])
     same &= (old.mean_m[at_old] == new.mean_m[at_new]).all(axis=1)

@@ -122,9 +122,7 @@ def lay_out(
 
 
 @bare
-def mark(
-    w: Window, slot: I32, voxel_id: I32, change_class: U8, state: I32, filled: U64, near: U8, seen: U64
-) -> None:
+def mark(w: Window, slot: I32, voxel_id: I32, change_class: U8, state: I32, filled: U64, near: U8, seen: U64) -> None:
     """What is flagged has been seen; what is gone stops no line; neighbours across a face are told.
 
     Args:
@@ -203,7 +201,8 @@ class Columns(NamedTuple):
     def room(cls) -> "Columns":
         """For the longest fan."""
         n = MOST_COLUMNS
-        return cls(*(np.empty(n, np.int64) for _ in range(3)), np.empty(n, np.uint64), np.empty(n))
+        base, first, end = (np.empty(n, np.int64) for _ in range(3))
+        return cls(base, first, end, np.empty(n, np.uint64), np.empty(n))
 
 
 @bare
@@ -253,7 +252,7 @@ def _cross(w: Window, filled: U64, x: float, y: float, bottom: int, d: F64, reac
 
 
 @bare
-def cast_fans(  # noqa: C901, PLR0912, PLR0915  (one loop, as in the vehicle's ray kernel)
+def cast_fans(  # noqa: C901  (one loop, as in the vehicle's ray kernel)
     w: Window, place: F64, turn: F64, rays: I64, azimuth: F64, slope: F64, lines: int, stop: F32, filled: U64,
     r2: float, range_m: float, reach_m: float, level: float, state: I32, hits: I64, columns: Columns, ahead: F64,
 ) -> None:  # fmt: skip

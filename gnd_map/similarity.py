@@ -102,7 +102,7 @@ def similarity_pairs(
     noise = _checked("noise_m", noise, (pairs,), np.float64)
     _check_mode(mode, noise)
     rows = [_checked(name, x, (pairs,), np.int64) for name, x in (("i", i), ("j", j))]
-    if pairs and not (0 <= min(r.min() for r in rows) and max(r.max() for r in rows) < n):
+    if pairs and not (min(r.min() for r in rows) >= 0 and max(r.max() for r in rows) < n):
         raise ShapeError(f"pairs of rows that are not all among {n}")
     there = _checked("exists", exists, (n,), np.bool_)
     at, shape = _checked("mean", mean, (n, 3), np.float64), _checked("cov", cov, (n, 6), np.float64)
@@ -207,7 +207,7 @@ def _check_mode(mode: str, noise_m: F64) -> None:
 
 
 def _checked(name: str, array: Array, shape: tuple[int, ...], dtype: type[np.generic]) -> Array:
-    values = np.asarray(array).astype(dtype, copy=False)
+    values = np.require(array, dtype, ("C", "W"))  # of one kind, so that one kernel does for all
     check_array(name, values, dtype, shape)
     return values
 

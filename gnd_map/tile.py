@@ -28,6 +28,8 @@ class Tile:
     day: int = field(default=UNKNOWN_DAY, compare=False)
     """When the world looked so: the day of the survey, or of the merge that made the version (`gnd_map.day`). No part
     of the content: the hash does not know it."""
+    _sha: list[bytes] = field(default_factory=list, init=False, repr=False, compare=False)
+    """The hash, once it was asked for."""
 
     def __post_init__(self) -> None:
         if self.version < 0:
@@ -40,7 +42,9 @@ class Tile:
     @property
     def sha(self) -> bytes:
         """32 bytes: SHA-256 of the tile id (8 bytes little-endian) and the codec 0 body; the version does not enter."""
-        return content_sha(self.tile_id, self.gaussians)
+        if not self._sha:
+            self._sha.append(content_sha(self.tile_id, self.gaussians))
+        return self._sha[0]
 
 
 def content_sha(tile_id: TileId, gaussians: Gaussians) -> bytes:

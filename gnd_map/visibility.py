@@ -15,12 +15,12 @@ from typing import Final
 import numpy as np
 import numpy.typing as npt
 
+from gnd_map import sight
 from gnd_map.arrays import F64, I32, I64
 from gnd_map.classes import ChangeClass
 from gnd_map.codec import Flags
 from gnd_map.errors import ConfigError, TrackError
 from gnd_map.grid import VoxelGrid, zones
-from gnd_map import sight
 from gnd_map.sight import FACES, MOST_RAYS, NO_SLOT, NOTHING, STOP, Columns, Window
 from gnd_map.tile_id import LON_TILES, TileId, deinterleave
 from gnd_map.track import SECTORS, Track, View
@@ -28,9 +28,11 @@ from gnd_map.track import SECTORS, Track, View
 U64 = npt.NDArray[np.uint64]
 
 _GOLDEN: Final = 0.6180339887498949
+_NEW: Final = int(ChangeClass.NEW)
 _LEAST_PLACES, _MOST_PLACES = 4, 4_000
 _FLOORS_BELOW, _FLOORS_ABOVE = 3, 8
 _MOST_CELLS: Final = 1 << 26
+_MOST_WORDS: Final = 1 << 23  # of 64 floors of a column, from the lowest floor of all on
 _PARTS: Final = 16  # of a ray: lines stand for so many of them
 _SLOPES: Final = 512
 _ROUND: Final = 2.0**24  # what trigonometry gives is rounded, so that no machine's last bit decides
@@ -60,7 +62,7 @@ class VisibilityParameters:
     """
 
     step_m: float = 8.0
-    azimuths: int = 64
+    azimuths: int = 48
     lines: int = 16
     range_m: float = 50.0
     reach_m: float = 70.0
@@ -127,7 +129,7 @@ class _Places:
     turn: F64
     rays: I64
 
-    def take(self, rows: npt.NDArray[np.bool_]) -> "_Places":
+    def take(self, rows: I64) -> "_Places":
         return _Places(self.uv[rows], self.height_m[rows], self.turn[rows], self.rays[rows])
 
 
@@ -150,8 +152,9 @@ class _Zone:
         reached = np.flatnonzero(within.any(axis=1))
         if len(reached) == 0:
             return {}
-        shown = within[reached][:, within.any(axis=0)]
-        places, told = places.take(within.any(axis=0)), [self._told[k] for k in reached.tolist()]
+        of_use = np.flatnonzero(within.any(axis=0))
+        shown = within[reached][:, of_use]
+        places, told = places.take(of_use), [self._told[k] for k in reached.tolist()]
         w, origin = self._window(told, corner[reached], places, shown)
         return _read(w, told, self._look(w, told, places, (places.uv - origin) * w.columns))
 
@@ -208,8 +211,12 @@ class _Zone:
         floors = np.maximum(np.minimum(np.floor(top).astype(np.int64), highest + _FLOORS_ABOVE) - low + 1, 0)
         columns = self._grid.nx, self._grid.ny
         offset = np.concatenate([[0], np.cumsum(floors * columns[0] * columns[1])])
-        if offset[-1] > _MOST_CELLS:
-            raise TrackError(f"lines of sight over {len(told)} tiles cross {offset[-1]} voxels: at most {_MOST_CELLS}")
+        words = len(told) * columns[0] * columns[1] * (int((low + floors).max() - low.min()) // 64 + 1)
+        if offset[-1] > _MOST_CELLS or words > _MOST_WORDS:
+            raise TrackError(
+                f"lines of sight over {len(told)} tiles between floors {low.min()} and {(low + floors).max()} cross "
+                f"{offset[-1]} voxels, {words} words of floors: at most {_MOST_CELLS}, {_MOST_WORDS}"
+            )
         first = ((corner - origin) * columns).astype(np.int32)
         return Window(
             columns, self._metres, slot_of, first, offset, low.astype(np.int32), floors.astype(np.int32), int(low.min())
@@ -228,7 +235,7 @@ class _Zone:
         state, near = np.full(w.offset[-1], NOTHING, np.int32), np.zeros(w.offset[-1], np.uint8)
         words = (int((w.low + w.floors).max()) - w.lowest) // 64 + 1
         filled, seen, more = (np.zeros((len(told) * w.columns[0] * w.columns[1], words), np.uint64) for _ in range(3))
-        new = [flags.voxel_id[flags.change_class == ChangeClass.NEW] for flags in told]
+        new = [flags.voxel_id[flags.change_class == _NEW] for flags in told]
         known = [flags.base.voxel_id for flags in told]
         slot, voxel_id = _slots([*known, *new], len(told)), np.concatenate([*known, *new])
         stop = np.zeros((len(slot), STOP), np.float32)
@@ -303,7 +310,7 @@ def _rounded(values: npt.ArrayLike) -> F64:
 def _least(rays: float, near: float) -> I64:
     """(FACES + 1,) how many rays are enough by the number of faces, in 1 / _PARTS; at least some."""
     parts = np.ceil(rays * near ** np.arange(FACES + 1) * _PARTS)
-    return np.clip(parts, 1, MOST_RAYS).astype(np.int64)
+    return np.asarray(np.clip(parts, 1, MOST_RAYS), np.int64)
 
 
 def _slots(parts: Sequence[I32], tiles: int) -> I32:

@@ -50,6 +50,7 @@ U8 = npt.NDArray[np.uint8]
 AckStatus = Literal["stored", "duplicate", "quarantined", "wanted", "resend"]
 _STATUS: Final[dict[int, AckStatus]] = {1: "stored", 2: "duplicate", 3: "quarantined", 4: "wanted", 5: "resend"}
 _COUNTERS: Final = 4
+_LAST_CLASS: Final = int(max(ChangeClass))
 _ROUNDING: Final = 1e-5
 """How negative an eigenvalue of a float32 covariance may be, relative to the largest: a plane's smallest is about 0."""
 
@@ -116,8 +117,8 @@ class TileChange:
             _check_floors(self.tile, self.observed[[0, -1]])
 
     def _check_values(self) -> None:
-        if (self.change_class > max(ChangeClass)).any():
-            raise BadValue(f"change class {self.change_class.max()} is outside 0 .. {max(ChangeClass)}")
+        if (self.change_class > _LAST_CLASS).any():
+            raise BadValue(f"change class {self.change_class.max()} is outside 0 .. {_LAST_CLASS}")
         if (self.evidence < 0).any():
             raise BadValue(f"evidence of {self.evidence.min()} rays is negative")
         if not 0 <= self.pose_sigma_m <= limits.MAX_POSE_SIGMA_M:

@@ -32,7 +32,7 @@ KEY_TABLE: Final = (
         kind="query, any client → tile server",
         request="TileRequest, or nothing",
         reply="TileReply",
-        reliability="asked again until answered; a wildcard is answered with one reply a tile that exists",
+        reliability="asked again until answered; a wildcard is answered with a reply a tile, for at most 4,096",
     ),
     KeySpec(
         pattern=f"{ROOT}/tiles/<layer>/<q5>/<q10>/<q15>",
@@ -60,7 +60,7 @@ KEY_TABLE: Final = (
         kind="put, merger → anyone, after the commit",
         request="TileUpdate",
         reply="–",
-        reliability="blocks rather than drops; a late or lost one is found again through the catalog",
+        reliability="dropped for who does not keep up; a late or lost one is found again through the catalog",
     ),
     KeySpec(
         pattern=f"{ROOT}/traffic/<vehicle>",

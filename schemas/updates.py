@@ -53,13 +53,17 @@ class TileUpdate:
     delta: TileDelta | None = None
     """What turns the previous content into the new one, in plain columns; None = see `coded_delta`."""
     coded_delta: bytes = b""
-    """The same by `gnd_map.content.encode_content_delta`; with neither, fetch the tile."""
+    """The same by `gnd_map.content.encode_content_delta`; with neither, ask for what has changed."""
     put_voxels: int = 0
     """Voxels or features that come or are replaced by `coded_delta`."""
     removed_voxels: int = 0
     """Voxels or features that go by `coded_delta`."""
     day: int = UNKNOWN_DAY
     """When the world looked as the new version says (`gnd_map.day`)."""
+    put_count: int = 0
+    """Voxels or features that come or are replaced, where the notice has no delta to tell."""
+    removed_count: int = 0
+    """Voxels or features that go, where the notice has no delta to tell."""
 
     def __post_init__(self) -> None:
         check_text("layer", self.layer, LAYER_PATTERN)
@@ -70,6 +74,7 @@ class TileUpdate:
         _check_removed(0 if self.delta is None else len(self.delta.removed))
         check_length(f"delta of tile {self.tile}", len(self.coded_delta), limits.MAX_TILE_BODY_BYTES, "bytes")
         self._check_coded()
+        self._check_counts()
         check_day(self.day)
         if self.previous_version >= self.version:
             raise BadValue(f"update of tile {self.tile} to version {self.version} from {self.previous_version}")
@@ -85,17 +90,28 @@ class TileUpdate:
                 f" {len(self.coded_delta)} coded bytes: at most {limits.MAX_REMOVED_VOXELS}, none without a delta"
             )
 
+    def _check_counts(self) -> None:
+        told = self.put_count, self.removed_count
+        if max(told) > limits.MAX_REMOVED_VOXELS or (self.has_delta and any(told)):
+            raise BadValue(
+                f"update of tile {self.tile} counts {told} voxels beside its delta or more than"
+                f" {limits.MAX_REMOVED_VOXELS}"
+            )
+
     @property
     def has_delta(self) -> bool:
-        """Whether it says what has changed; else the tile is to be fetched."""
+        """Whether it says what has changed; else that is to be asked for."""
         return self.delta is not None or bool(self.coded_delta)
 
     @property
     def voxels(self) -> tuple[int, int] | None:
-        """(put, removed) by the delta; None without one."""
+        """(put, removed) by this version; None where the notice does not tell."""
         if self.delta is not None:
             return len(self.delta.put), len(self.delta.removed)
-        return (self.put_voxels, self.removed_voxels) if self.coded_delta else None
+        if self.coded_delta:
+            return self.put_voxels, self.removed_voxels
+        told = self.put_count, self.removed_count
+        return told if any(told) else None
 
     def encode(self) -> bytes:
         """Bytes of gnd.v1.TileUpdate."""
@@ -112,6 +128,8 @@ class TileUpdate:
             put_voxels=self.put_voxels,
             removed_voxels=self.removed_voxels,
             day=self.day,
+            put_count=self.put_count,
+            removed_count=self.removed_count,
         )
         message.reason = tile_update_pb2.TileUpdate.Reason.ValueType(number_of(self.reason, _REASON))
         return serialise(message, limits.MAX_TILE_UPDATE_BYTES)
@@ -137,6 +155,8 @@ class TileUpdate:
             put_voxels=message.put_voxels,
             removed_voxels=message.removed_voxels,
             day=message.day,
+            put_count=message.put_count,
+            removed_count=message.removed_count,
         )
 
 

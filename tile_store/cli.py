@@ -47,7 +47,7 @@ def store(path: Path, connect: tuple[str, ...], workers: int, metrics_port: int 
 
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, end)
-    config = BusConfig(connect=connect)
+    config = BusConfig(connect=connect, patient=True)
     with (
         existing(path) as opened,
         open_bus(config, name="store") as bus,

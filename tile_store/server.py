@@ -12,6 +12,7 @@ from gnd_map.content import FEATURE_CODECS
 from gnd_map.tile_id import District, TileId
 from schemas import keys
 from schemas.errors import SchemaError
+from schemas.limits import MAX_TILES_OF_DISTRICT
 from schemas.tiles import Catalog, TileRequest
 from schemas.tiles_batch import TilesRequest
 from tile_store.answers import Answers, reads_layer
@@ -19,6 +20,8 @@ from tile_store.regions import Region
 from tile_store.store import Store
 from tile_store.warm import warm_up
 
+# Four districts: 40 MB of tiles of a dense city, and what a wildcard may cost everybody else.
+MOST_TILES_OF_REGION: Final = 4 * MAX_TILES_OF_DISTRICT
 _ANY: Final = "x/**"
 # Only `schemas.keys` knows how a key begins.
 TILE_ROOT: Final = keys.tiles_key("x").removesuffix(_ANY)
@@ -64,7 +67,9 @@ class TileServer:
             self._servings.pop().close()
 
     def tiles(self, request: Request) -> Answer:
-        """Reply for the tile of an exact key, or for each tile that exists in a wildcard region."""
+        """Reply for the tile of an exact key, or for each tile that exists in a wildcard region that is not too large;
+        of a wildcard over layers for those that the client reads.
+        """
         try:
             wanted = TileRequest.decode(request.payload) if request.payload else PLAIN_REQUEST
             if not request.is_wild:
@@ -73,7 +78,18 @@ class TileServer:
             region = Region.of_key(request.key, TILE_ROOT)
         except SchemaError as error:
             raise _refusal(request, error) from None
-        return self._region(region, wanted)
+        found = [
+            (layer, tile)
+            for layer, tile in self._tiles(region)
+            if (region.layer is not None or reads_layer(layer, wanted.codecs))
+            and region.matches(layer, *tile.path.split("/"))
+        ]
+        if len(found) > MOST_TILES_OF_REGION:
+            raise Refused(
+                f"region with {len(found)} tiles, more than {MOST_TILES_OF_REGION}: ask for its catalogs, then for its"
+                f" districts (asked for {request.key[:160]})"
+            )
+        return self._region(found, wanted)
 
     def batch(self, request: Request) -> Answer:
         """Reply about several tiles of one district."""
@@ -95,13 +111,9 @@ class TileServer:
             raise _refusal(request, error) from None
         return self._catalogs(region)
 
-    def _region(self, region: Region, wanted: TileRequest) -> Iterator[tuple[str, bytes]]:
-        """Of a wildcard over layers only those that the client reads."""
-        for layer, tile in self._tiles(region):
-            if region.layer is None and not reads_layer(layer, wanted.codecs):
-                continue
-            if region.matches(layer, *tile.path.split("/")):
-                yield keys.tile_key(layer, tile), self._answers.one(self._store.get(layer, tile), wanted).encode()
+    def _region(self, found: list[tuple[str, TileId]], wanted: TileRequest) -> Iterator[tuple[str, bytes]]:
+        for layer, tile in found:
+            yield keys.tile_key(layer, tile), self._answers.one(self._store.get(layer, tile), wanted).encode()
 
     def _catalogs(self, region: Region) -> Iterator[tuple[str, bytes]]:
         for (layer, district), _ in groupby(self._tiles(region), lambda found: (found[0], found[1].district)):

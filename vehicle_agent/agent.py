@@ -49,6 +49,7 @@ def run_agent(config: AgentConfig, stop: threading.Event) -> dict[str, Any]:
         vehicle.report_the_rest()
         vehicle.upload()  # outbox -> acknowledged
         result = vehicle.result()
+    result["traffic"] = vehicle.link.traffic()  # the link is closed: nothing comes after it
     write_json(config.work_dir / "result.json", result)
     if vehicle.damage is not None:
         raise vehicle.damage

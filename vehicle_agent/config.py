@@ -97,7 +97,7 @@ class AgentConfig:
     layer: str = "ndt"
     pace: float = 0.0
     open_timeout_s: float = 10.0
-    """How long the agent looks for a router when it starts."""
+    """How long the agent waits for a router when it starts; then it drives without, on its cache."""
     ledger_dir: Path | None = None
     localise: LocaliserParameters = field(default_factory=LocaliserParameters)
     segment: SegmentParameters = field(default_factory=SegmentParameters)

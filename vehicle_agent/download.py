@@ -8,6 +8,7 @@ from collections.abc import Collection, Iterable, Sequence
 from typing import Generic
 
 from fleet_bus.bus import Bus
+from fleet_bus.config import QUEUED_BATCHES
 from fleet_bus.errors import BusClosed
 from fleet_bus.links import LinkProfile
 from gnd_map.content import TileT
@@ -21,6 +22,7 @@ from vehicle_agent.plan import batch_bytes
 __all__ = ["Fetched", "TileFetcher"]
 
 POLL_S = 0.25
+OFFLINE_WAIT_S = 0.5
 WRONG_TRIES = 3
 MOST_TILES = 1024  # of one district
 FIRST_GUESS_BYTES = 4_096
@@ -41,11 +43,14 @@ class TileFetcher(Generic[TileT]):
         self.counts: Counter[str] = Counter()
         self.last_error = ""
         self.link: LinkProfile = bus.config.link_profile
-        self._cache, self._parameters = cache, parameters
+        self._bus, self._cache, self._parameters = bus, cache, parameters
+        self._offline = False
         self._exchange = Exchange(bus, cache, parameters.request_s)
         rate_byte_s = self.link.rate_byte_s("down")
         self._batch_bytes = batch_bytes(rate_byte_s, parameters.batch_s)
-        self._window_bytes = rate_byte_s * (parameters.batch_s + 2 * self.link.delay_s)
+        # More on its way than the router keeps for us would be thrown away.
+        kept_bytes = 0.75 * QUEUED_BATCHES * self.link.batch_bytes
+        self._window_bytes = min(kept_bytes, rate_byte_s * (parameters.batch_s + 2 * self.link.delay_s))
         self._changed = threading.Condition()
         self._wanted: tuple[TileId, ...] = ()
         self._waiting: list[TileId] = []
@@ -53,6 +58,7 @@ class TileFetcher(Generic[TileT]):
         self._in_flight: dict[TileId, float] = {}  # with the bytes expected
         self._again: set[TileId] = set()  # in flight, and already known to have changed
         self._answered: set[TileId] = set()
+        self._answered_s: dict[TileId, float] = {}
         self._stale: set[TileId] = set()  # answered, but to be asked for again
         self._wrong: Counter[TileId] = Counter()
         self._whole = _Mean(FIRST_GUESS_BYTES)
@@ -83,16 +89,20 @@ class TileFetcher(Generic[TileT]):
                 self._not_before.pop(tile_id, None)
                 self._line_up(first=tile_id)
 
-    def recheck(self) -> None:
-        """Any tile may have changed unheard: ask for all that are wanted again."""
+    def recheck(self, older_than_s: float = 0.0) -> None:
+        """Tiles whose answer is older may have changed unheard: ask again for those that are wanted."""
+        before_s = time.monotonic() - older_than_s
         with self._changed:
-            self._stale |= self._answered
-            self._line_up()
+            old = {tile_id for tile_id in self._answered if self._answered_s.get(tile_id, 0.0) <= before_s}
+            if not old <= self._stale:
+                self._stale |= old
+                self._line_up()
 
     def forget(self, tile_id: TileId) -> None:
         """The tile was let go: the next `want` asks for it again."""
         with self._changed:
             self._answered.discard(tile_id)
+            self._answered_s.pop(tile_id, None)
             self._stale.discard(tile_id)
 
     def take(self) -> list[Fetched[TileT]]:
@@ -113,12 +123,15 @@ class TileFetcher(Generic[TileT]):
         return self._expected_bytes(tile_id)
 
     def wait_for(self, tiles: Collection[TileId], timeout_s: float, stop: threading.Event) -> set[TileId]:
-        """Wait until all of `tiles` are answered, time is up or `stop` is set; returns those that are not answered."""
+        """Wait until all of `tiles` are answered, time is up or `stop` is set; returns those that are not answered.
+
+        Without a router it waits only until the cache was asked.
+        """
         deadline_s = time.monotonic() + timeout_s
         with self._changed:
             while (missing := set(tiles) - self._answered) and not (stop.is_set() or self._closed):
                 left_s = deadline_s - time.monotonic()
-                if left_s <= 0:
+                if left_s <= 0 or (self._offline and missing <= self._not_before.keys()):
                     break
                 self._changed.wait(min(left_s, POLL_S))
             return missing
@@ -184,12 +197,23 @@ class TileFetcher(Generic[TileT]):
         with self._changed:
             whole = {tile_id for tile_id in batch if self._wrong[tile_id]}
         try:
+            if not self._has_router():
+                return Outcome[TileT]()
             return self._exchange.ask(batch, whole, self._batch_bytes)
         except BusClosed:
             return Outcome[TileT]()
         except Exception as error:  # whatever it was: a worker that ends would never fetch again
             self._note("failed", f"{len(batch)} tiles from {batch[0]} on: {error}")
             return Outcome[TileT]()
+
+    def _has_router(self) -> bool:
+        """Whether there is a router within a moment; else the cache has to do. Says so once."""
+        found = self._bus.wait_connected(OFFLINE_WAIT_S)
+        with self._changed:
+            changed, self._offline = self._offline == found, not found
+        if changed:
+            _log.warning("the router is there again" if found else "no router: tiles from the cache, as far as it goes")
+        return found
 
     def _cached(self, tiles: Iterable[TileId]) -> dict[TileId, TileT]:
         """The cached ones of `tiles` that nobody has been given yet."""
@@ -216,6 +240,7 @@ class TileFetcher(Generic[TileT]):
         self._not_before.pop(tile_id, None)
         self.counts[fetched.status] += 1
         self._answered.add(tile_id)
+        self._answered_s[tile_id] = time.monotonic()
         self._arrived.append(fetched)
         self._stale.discard(tile_id)
         if tile_id in self._again:

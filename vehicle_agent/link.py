@@ -1,5 +1,6 @@
 """The vehicle's side of the bus: session, ledger, cache, outbox, and the threads that download and send."""
 
+import logging
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -15,6 +16,8 @@ from vehicle_agent.download import TileFetcher
 from vehicle_agent.outbox import Outbox
 from vehicle_agent.sending import SenderThread
 
+_log = logging.getLogger(__name__)
+
 
 @dataclass(frozen=True, slots=True)
 class Link:
@@ -27,20 +30,33 @@ class Link:
     fetcher: TileFetcher[Tile]
     sender: SenderThread
 
+    def traffic(self) -> dict[str, int]:
+        """What this session came to, bytes; the whole of it once the link is closed."""
+        return {
+            "up_bytes": self.ledger.total_bytes("up"),
+            "down_bytes": self.ledger.total_bytes("down"),
+            "up_wire_bytes": self.ledger.wire.up,
+            "down_wire_bytes": self.ledger.wire.down,
+        }
+
 
 @contextmanager
 def open_link(config: AgentConfig) -> Iterator[Link]:
     """Open files, join the bus, show that the agent is alive, start the threads that download and send.
 
+    Without a router for `config.open_timeout_s` the vehicle drives on what its cache holds; reports wait in the outbox,
+    and the router is looked for all the time.
+
     Raises:
         OutboxError, CacheError: a file cannot be opened.
-        NoRouter: nothing answers at `config.connect`.
     """
     outbox = Outbox(config.work_dir / "outbox.sqlite")
     cache: TileCache[Tile] = TileCache(config.work_dir / "cache.sqlite", config.layer)
     ledger = Ledger(config.vehicle, config.ledger_path)
-    bus_config = BusConfig(connect=config.connect, link=config.link, open_timeout_s=config.open_timeout_s)
-    bus = open_bus(bus_config, ledger, config.vehicle)
+    bus = open_bus(BusConfig(connect=config.connect, link=config.link, patient=True), ledger, config.vehicle)
+    if not bus.wait_connected(config.open_timeout_s):
+        where = ", ".join(config.connect)
+        _log.warning("%s: no router at %s for %g s: off on the cache", config.vehicle, where, config.open_timeout_s)
     bus.declare_alive(alive_key("agent", config.vehicle))
     fetcher, sender = TileFetcher(bus, cache, config.download), SenderThread(bus, outbox)
     try:

@@ -1,12 +1,14 @@
-"""What the vehicle says about itself: after some way or time, and when something has happened.
+"""What the vehicle says about itself: by the way driven, and when its health or its doubts have changed.
 
-The next sample makes up for a lost one. A sample a second would be most of what a vehicle sends.
+The next sample makes up for a lost one, and that a report was acknowledged the cloud knows: a sample and its packets
+weigh as much as the flags of 300 changed voxels. Way and time are those of the drive, not of the clock: a vehicle on a
+busy machine, or one that stands, has no more to say.
 """
 
 import logging
 import threading
-import time
 from collections.abc import Callable
+from dataclasses import replace
 
 from fleet_bus.bus import Bus
 from fleet_bus.errors import BusClosed, BusError
@@ -14,8 +16,11 @@ from schemas.keys import traffic_key
 from schemas.traffic import TrafficSample
 
 LOOK_S = 1.0
-EVERY_M = 100.0
-EVERY_S = 10.0
+"""With each look goes a reading of the connection, by which the ledger tells keep-alives from messages."""
+EVERY_M = 1000.0
+EVERY_S = 600.0
+HEALTH_S = 10.0
+"""Health that wavers, and doubts that grow, are told no oftener than this."""
 PUBLISH_WAIT_S = 0.5
 
 _log = logging.getLogger(__name__)
@@ -27,13 +32,13 @@ class Telemetry:
     def __init__(self, bus: Bus, vehicle: str, sample: Callable[[], TrafficSample], *, look_s: float = LOOK_S) -> None:
         self._bus, self._key, self._sample, self._look_s = bus, traffic_key(vehicle), sample, look_s
         self._said: TrafficSample | None = None
-        self._said_s = 0.0
+        self._began_ns = 0
         self._stop = threading.Event()
         self._thread = threading.Thread(target=self._run, name="telemetry", daemon=True)
         self._thread.start()
 
     def close(self) -> None:
-        """Publish a last sample and end the thread."""
+        """Publish a last sample, which alone holds the ledger's totals by kind, and end the thread."""
         self._stop.set()
         self._thread.join()
         self._publish(self._sample())
@@ -42,25 +47,28 @@ class Telemetry:
         while not self._stop.wait(self._look_s):
             sample = self._sample()
             if self._is_news(sample):
-                self._publish(sample)
+                self._publish(replace(sample, lines=()))
 
     def _is_news(self, sample: TrafficSample) -> bool:
         said = self._said
-        if said is None or time.monotonic() - self._said_s >= EVERY_S:
+        if said is None:
+            self._began_ns = self._began_ns or sample.t_ns
+            return sample.health == "good" or (sample.t_ns - self._began_ns) * 1e-9 >= HEALTH_S
+        passed_s = (sample.t_ns - said.t_ns) * 1e-9
+        if _well_being(sample) != _well_being(said) and passed_s >= HEALTH_S:
             return True
-        happened = _told_at_once(sample) != _told_at_once(said)
-        return happened or sample.odometer_m - said.odometer_m >= EVERY_M
+        return passed_s >= EVERY_S or sample.odometer_m - said.odometer_m >= EVERY_M
 
     def _publish(self, sample: TrafficSample) -> None:
-        self._said, self._said_s = sample, time.monotonic()
+        self._said = sample
         try:
-            self._bus.publish(self._key, sample.encode(), kind="control", wait_s=PUBLISH_WAIT_S)
+            self._bus.publish(self._key, sample.encode(), kind="telemetry", wait_s=PUBLISH_WAIT_S)
         except BusClosed:
             self._stop.set()
         except BusError as error:
             _log.info("sample not published: %s", error)
 
 
-def _told_at_once(sample: TrafficSample) -> tuple[object, ...]:
+def _well_being(sample: TrafficSample) -> tuple[object, ...]:
     """Scans that are taken back come in rows: they wait for the next sample."""
-    return sample.health, sample.reports, sample.tiles_held_back, sample.tiles_doubtful
+    return sample.health, sample.tiles_held_back, sample.tiles_doubtful

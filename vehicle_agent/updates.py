@@ -2,6 +2,7 @@
 
 import logging
 import queue
+import time
 from collections import Counter
 from collections.abc import Callable, Collection
 from typing import Generic
@@ -17,6 +18,9 @@ from schemas.updates import TileUpdate, updated
 from vehicle_agent.cache import TileCache
 from vehicle_agent.download import TileFetcher
 
+RECHECK_S = 120.0
+"""A notice may be lost: what is held for so long is asked about again. Who drives has left it behind before."""
+RECHECK_LOOK_S = 1.0
 MOST_DISTRICTS = 4  # as many meet at a corner: a vehicle that turns there need not declare anything anew
 
 _log = logging.getLogger(__name__)
@@ -26,7 +30,8 @@ class Updates(Generic[TileT]):
     """Subscribes to the districts around and ahead; notices wait until the main thread applies them.
 
     Only what happens from now on is listened to: what happened before is in the answers to the vehicle's own
-    questions, which it puts after it has subscribed. After a lost connection it asks again about what it holds.
+    questions, which it puts after it has subscribed. After a lost connection, a notice that was dropped here, and every
+    two minutes (a router may drop notices, too) it asks again about what it holds.
     """
 
     def __init__(
@@ -36,7 +41,8 @@ class Updates(Generic[TileT]):
         self._bus, self._cache, self._fetcher, self._on_tile = bus, cache, fetcher, on_tile
         self._followed: dict[District, Subscription] = {}
         self._notices: queue.SimpleQueue[bytes] = queue.SimpleQueue()
-        self._connections = bus.connections
+        self._missed_at = (bus.connections, 0)
+        self._rechecked_s = time.monotonic()
 
     def follow(self, tiles: Collection[TileId]) -> None:
         """Listen to the districts of these tiles; those that were left first are no longer listened to."""
@@ -77,11 +83,14 @@ class Updates(Generic[TileT]):
                 _log.warning("update refused: %s", error)
 
     def _catch_up(self) -> None:
-        """Notices of the time without a router are lost."""
-        connections = self._bus.connections
-        if connections != self._connections:
-            self._connections = connections
+        """Notices of the time without a router are lost, and of those with one the router may drop some."""
+        connections, dropped = self._bus.connections, sum(one.dropped for one in self._followed.values())
+        if (connections, dropped) != self._missed_at:
+            self._missed_at = connections, dropped
             self._fetcher.recheck()
+        elif time.monotonic() - self._rechecked_s >= RECHECK_LOOK_S:
+            self._rechecked_s = time.monotonic()
+            self._fetcher.recheck(RECHECK_S)
 
     def _apply(self, update: TileUpdate) -> None:
         self.counts["received"] += 1

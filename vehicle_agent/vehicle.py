@@ -221,7 +221,7 @@ class Vehicle:
         }
 
     def _link_counts(self) -> dict[str, Any]:
-        reports, fetched, wire = self.link.outbox.counts(), self.link.fetcher.counts, self.link.bus.wire()
+        reports, fetched = self.link.outbox.counts(), self.link.fetcher.counts
         return {
             "tiles_downloaded": fetched["blob"],
             "tiles": dict(fetched),
@@ -234,12 +234,6 @@ class Vehicle:
             "report_messages": dict(self.link.sender.counts),
             "quarantined": dict(self.link.outbox.refused()),
             "last_error": self.link.sender.last_error or self.link.fetcher.last_error or self.guard.last_problem,
-            "traffic": {
-                "up_bytes": self.link.ledger.total_bytes("up"),
-                "down_bytes": self.link.ledger.total_bytes("down"),
-                "up_wire_bytes": wire.up,
-                "down_wire_bytes": wire.down,
-            },
         }
 
 
@@ -250,7 +244,6 @@ def open_vehicle(config: AgentConfig, stop: threading.Event) -> Iterator[Vehicle
     Raises:
         DriveError: the recording cannot be read.
         VehicleError: it has no GNSS fix to start from, or cache or outbox cannot be opened.
-        NoRouter: nothing answers at `config.connect`.
     """
     header, fix = read_header(config.drive), first_fix(config)
     # The map frame is the frame of the tile in which the vehicle starts.

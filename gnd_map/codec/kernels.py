@@ -598,7 +598,7 @@ def _code_voxel(
     low_a = low_b = 1 << 40
     high_a = high_b = -(1 << 40)
     for i in range(n):
-        ta, tb = np.int64(table[refs[i], TILT]), np.int64(table[refs[i], TILT + 1])
+        ta, tb = int(table[refs[i], TILT]), int(table[refs[i], TILT + 1])
         tilt_a, tilt_b = tilt_a + ta, tilt_b + tb
         low_a, high_a, low_b, high_b = min(low_a, ta), max(high_a, ta), min(low_b, tb), max(high_b, tb)
     if n > 0:
@@ -701,7 +701,7 @@ def _height(table: I32, row: int, other: int, sd: I64, shape: I64, pitch: I64, a
     to_a = step_y if axis == 0 else step_x
     to_b = step_y if axis == 2 else step_z
     to_c = step_x if axis == 0 else (step_y if axis == 1 else step_z)
-    tilt_a, tilt_b = np.int64(table[other, TILT]), np.int64(table[other, TILT + 1])
+    tilt_a, tilt_b = int(table[other, TILT]), int(table[other, TILT + 1])
     off_a = mu_a - (D1 * ya + to_a)
     off_b = mu_b - (L21 * ya + D2 * yb + to_b)
     height: int = L31 * ya + L32 * yb + D3 * yc + to_c + (tilt_a * off_a + tilt_b * off_b >> _BITS)

@@ -430,7 +430,8 @@ def _found(gaussians: Gaussians, lattice: Lattice) -> tuple[Quantised, npt.NDArr
     level, slope, step = (np.zeros((rows, 3), np.int32) for _ in range(3))
     n, counts, between = _numbers(lattice)
     room = np.zeros((1, 3), np.float32), np.zeros((1, 6), np.float32)
-    _, count, cells, mean_m, cov_m2 = (np.ascontiguousarray(column) for column in gaussians.columns)
+    count, cells = np.ascontiguousarray(gaussians.count), np.ascontiguousarray(gaussians.cells)
+    mean_m, cov_m2 = np.ascontiguousarray(gaussians.mean_m), np.ascontiguousarray(gaussians.cov_m2)
     k.find_integers(
         count, cells, mean_m, cov_m2, counts, between, *_tables(lattice), n, axis, level, slope, step, number, on, *room
     )

@@ -31,7 +31,17 @@ _SIX: Final = np.array([[0, 1, 2], [1, 3, 4], [2, 4, 5]])
 
 @bare
 def to_floats(
-    axis: I32, level: I32, slope: I32, step: I32, along: I64, across: I64, n: I64, row: int, mean: F32, cov: F32, at: int
+    axis: I32,
+    level: I32,
+    slope: I32,
+    step: I32,
+    along: I64,
+    across: I64,
+    n: I64,
+    row: int,
+    mean: F32,
+    cov: F32,
+    at: int,
 ) -> bool:
     """Mean (3,) and covariance (6,) of a row of integers into row `at`; False where an entry of L is too long."""
     a, b, c = along[level[row, 0]], along[level[row, 1]], across[level[row, 2]]
@@ -81,7 +91,8 @@ def _level(bounds: F64, sd_m: float) -> int:
 
 @bare
 def _rounded(value: float, limit: float) -> float:
-    return min(max(np.rint(value), -limit), limit)
+    nearest: float = np.rint(value)
+    return min(max(nearest, -limit), limit)
 
 
 @bare
@@ -94,16 +105,25 @@ def find_integers(
     where none does, those of the likely one stay.
 
     Args:
-        count: (N,) int32, as are cells.
+        count: (N,) int32.
+        cells: (N,) int32.
         mean: (N, 3) float32.
         cov: (N, 6) float32.
-        counts: (K,) int64 of the lattice; between: (K - 1,) float64 where its numbers of points change.
-        along_m: float64 between which standard deviations levels change, m, along the surface; across_m: across it.
-        along: int64 lengths of the levels; across: across the surface.
+        counts: (K,) int64 numbers of points of the lattice.
+        between: (K - 1,) float64 where they change.
+        along_m: float64 between which standard deviations levels change, m, along the surface.
+        across_m: the same across it.
+        along: int64 lengths of the levels along the surface.
+        across: the same across it.
         n: (NUMBERS,) int64.
-        axis: (N,) int32, filled, as are level (N, 3), slope (N, 3), step (N, 3) and number (N,) of points.
+        axis: (N,) int32, filled.
+        level: (N, 3) int32, filled.
+        slope: (N, 3) int32, filled.
+        step: (N, 3) int32, filled.
+        number: (N,) int32, filled: of points.
         on: (N,) int64, filled.
-        made_mean: (1, 3) float32 and made_cov (1, 6): room to work in.
+        made_mean: (1, 3) float32, room to work in.
+        made_cov: (1, 6) float32, as well.
     """
     half = 2.0 ** -float(n[LENGTH_BITS])
     for row in range(len(count)):
@@ -155,9 +175,7 @@ def _thin_axis(cov: F32, row: int) -> int:
 
 
 @bare
-def _whiten(
-    mean: F32, axis: I32, level: I32, slope: I32, step: I32, along: I64, across: I64, n: I64, row: int
-) -> None:
+def _whiten(mean: F32, axis: I32, level: I32, slope: I32, step: I32, along: I64, across: I64, n: I64, row: int) -> None:
     """The mean's steps, one whitened component after the other."""
     half = 2.0 ** -float(n[LENGTH_BITS])
     b, c = along[level[row, 1]], across[level[row, 2]]
@@ -177,7 +195,7 @@ def _is_same(mean: F32, cov: F32, row: int, made_mean: F32, made_cov: F32) -> bo
     for i in range(3):
         if mean[row, i] != made_mean[0, i]:
             return False
+    same = True
     for i in range(6):
-        if cov[row, i] != made_cov[0, i]:
-            return False
-    return True
+        same = same and cov[row, i] == made_cov[0, i]
+    return same

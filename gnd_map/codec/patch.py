@@ -27,6 +27,7 @@ MAX_TILES: Final = 1024
 _FLOATS: Final = 255
 _CLASS_OF: Final = np.array([ChangeClass.NORMAL, ChangeClass.NEW, ChangeClass.MODIFIED, ChangeClass.DELETED], np.uint8)
 """By flag: k.NONE, k.PUT, k.REPLACED, k.GONE."""
+_NEW, _DELETED = int(ChangeClass.NEW), int(ChangeClass.DELETED)  # numpy takes long over members of an enum
 _FLAG_OF: Final = np.array([k.NONE, k.PUT, k.REPLACED, k.GONE, k.NONE, k.NONE], np.uint8)
 
 
@@ -44,11 +45,11 @@ class Flags:
     def __post_init__(self) -> None:
         check_array("voxel_id", self.voxel_id, np.int32, (None,))
         check_array("change_class", self.change_class, np.uint8, (len(self.voxel_id),))
-        flagged = (self.change_class >= ChangeClass.NEW) & (self.change_class <= ChangeClass.DELETED)
+        flagged = (self.change_class >= _NEW) & (self.change_class <= _DELETED)
         if not (self.voxel_id[1:] > self.voxel_id[:-1]).all() or not flagged.all():
             raise ShapeError(f"tile {self.tile_id}: flagged voxels must increase and be new, modified or deleted")
         held = are_in(self.voxel_id, self.base.voxel_id)
-        wrong = held == (self.change_class == ChangeClass.NEW)
+        wrong = held == (self.change_class == _NEW)
         if wrong.any():
             raise ShapeError(
                 f"tile {self.tile_id}: {int(wrong.sum())} voxels are new but held, or changed but not held"
@@ -143,9 +144,9 @@ def _read_flags(coder: Coder, tile_id: TileId, base: Gaussians) -> Flags:
         return Flags(tile_id, base, np.empty(0, np.int32), np.empty(0, np.uint8))
     flag = np.asarray(box.empty(np.uint8, k.NONE), np.uint8)
     check_number(code_flags(coder, box, base.voxel_id, flag))
-    places = np.nonzero(flag)
+    places = np.unravel_index(np.flatnonzero(flag != k.NONE), flag.shape)
     try:
-        return Flags(tile_id, base, box.voxel_ids(*places), _CLASS_OF[flag[places]])
+        return Flags(tile_id, base, box.voxel_ids(places[0], places[1], places[2]), _CLASS_OF[flag[places]])
     except ShapeError as error:
         raise CodecError(f"flags of another base: {error}") from error
 

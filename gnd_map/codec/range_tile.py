@@ -46,7 +46,7 @@ def decode_tile(tile_id: TileId, body: bytes, lattice: Lattice) -> Gaussians:
         return Gaussians.empty()
     flag = np.asarray(box.empty(np.uint8, k.NONE), np.uint8)
     check_number(code_flags(coder, box, _NOTHING, flag))
-    voxel_id = box.voxel_ids(*np.nonzero(flag))
+    voxel_id = box.voxel_ids(*np.unravel_index(np.flatnonzero(flag != k.NONE), flag.shape))
     if len(voxel_id) == 0:
         raise CodecError("a tile that claims Gaussians and holds none")
     found = code_voxels(coder, box, voxel_id, NOTHING_KNOWN, lattice, None)

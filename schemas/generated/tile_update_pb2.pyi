@@ -60,6 +60,8 @@ class TileUpdate(_message.Message):
     PUT_VOXELS_FIELD_NUMBER: _builtins.int
     REMOVED_VOXELS_FIELD_NUMBER: _builtins.int
     DAY_FIELD_NUMBER: _builtins.int
+    PUT_COUNT_FIELD_NUMBER: _builtins.int
+    REMOVED_COUNT_FIELD_NUMBER: _builtins.int
     major: _builtins.int
     """Major version of this message; always 1."""
     tile: _builtins.int
@@ -77,7 +79,7 @@ class TileUpdate(_message.Message):
     reason: Global___TileUpdate.Reason.ValueType
     coded_delta: _builtins.bytes
     """The same, coded: of Gaussians by gnd_map.codec.encode_delta, of a feature layer by
-    gnd_map.features.encode_feature_delta; with neither, fetch the tile.
+    gnd_map.features.encode_feature_delta; with neither, ask for what has changed. Only small ones travel here.
     """
     put_voxels: _builtins.int
     """Voxels that `coded_delta` gives a Gaussian or another one; features that come or change. [voxels or features]"""
@@ -87,6 +89,10 @@ class TileUpdate(_message.Message):
     """Day on which the world looked so: of the survey, or of the merge that made the version.
     [days, 1 = 2000-01-01 UTC; 0 = not known]
     """
+    put_count: _builtins.int
+    """Voxels or features that come or change by this version, where the notice has no delta to tell. [voxels or features]"""
+    removed_count: _builtins.int
+    """Voxels or features that go by this version, where the notice has no delta to tell. [voxels or features]"""
     @_builtins.property
     def delta(self) -> _tile_delta_pb2.TileDelta:
         """What turns the previous content into the new one, in plain columns; missing = see `coded_delta`."""
@@ -107,10 +113,12 @@ class TileUpdate(_message.Message):
         put_voxels: _builtins.int = ...,
         removed_voxels: _builtins.int = ...,
         day: _builtins.int = ...,
+        put_count: _builtins.int = ...,
+        removed_count: _builtins.int = ...,
     ) -> None: ...
     _HasFieldArgType: _TypeAlias = _typing.Literal["delta", b"delta"]  # noqa: Y015
     def HasField(self, field_name: _HasFieldArgType) -> _builtins.bool: ...
-    _ClearFieldArgType: _TypeAlias = _typing.Literal["coded_delta", b"coded_delta", "day", b"day", "delta", b"delta", "layer", b"layer", "major", b"major", "previous_sha", b"previous_sha", "previous_version", b"previous_version", "put_voxels", b"put_voxels", "reason", b"reason", "removed_voxels", b"removed_voxels", "sha", b"sha", "tile", b"tile", "version", b"version"]  # noqa: Y015
+    _ClearFieldArgType: _TypeAlias = _typing.Literal["coded_delta", b"coded_delta", "day", b"day", "delta", b"delta", "layer", b"layer", "major", b"major", "previous_sha", b"previous_sha", "previous_version", b"previous_version", "put_count", b"put_count", "put_voxels", b"put_voxels", "reason", b"reason", "removed_count", b"removed_count", "removed_voxels", b"removed_voxels", "sha", b"sha", "tile", b"tile", "version", b"version"]  # noqa: Y015
     def ClearField(self, field_name: _ClearFieldArgType) -> None: ...
     def WhichOneof(self, oneof_group: _Never) -> None: ...
 

@@ -19,7 +19,7 @@ from merger_world import (
     tile_of_states,
 )
 
-from cloud_merger.announce import encoded, update_of
+from cloud_merger.announce import NOTICE_DELTA_BYTES, NOTICE_DELTA_VOXELS, encoded, update_of
 from cloud_merger.config import ShardConfig
 from cloud_merger.merger import run_shard
 from cloud_merger.work import Worker
@@ -166,19 +166,34 @@ def test_a_damaged_body_is_announced_without_a_delta(cloud):
     assert update_of(two, None).previous_version == 0
 
 
-def test_a_delta_that_is_too_large_for_a_notice_is_left_out(cloud):
+def test_a_large_delta_is_left_out_and_counted(cloud):
+    """A notice goes to everybody: who holds the tile asks for what has changed."""
     publish_without_notice(cloud, 1, {2: POLE})
     one, two = stored_versions(cloud)
-    n = 90_000
     pole = gaussians_of({2: POLE})
-    large = Gaussians(
-        gaussians_of(dict.fromkeys(range(n))).voxel_id, *(column.repeat(n, axis=0) for column in pole.columns[1:])
-    )
-    plain = TileDelta(gaussians_of({}).voxel_id, large)
-    update = TileUpdate(TILE, "ndt", 2, 1, two.sha, one.sha, "merged", plain)
-    assert not TileUpdate.decode(encoded(update)).has_delta
-    fullest = replace(update, delta=None, coded_delta=bytes(MAX_TILE_BODY_BYTES), put_voxels=n)
-    assert TileUpdate.decode(encoded(fullest)).coded_delta == fullest.coded_delta
+
+    def notice(n):
+        voxel_id = gaussians_of(dict.fromkeys(range(n))).voxel_id
+        put = Gaussians(voxel_id, *(column.repeat(n, axis=0) for column in pole.columns[1:]))
+        return TileUpdate(TILE, "ndt", 2, 1, two.sha, one.sha, "merged", TileDelta(gaussians_of({}).voxel_id, put))
+
+    small, large, fullest = (encoded(notice(n)) for n in (5, 20, 90_000))
+    assert TileUpdate.decode(small) == notice(5)
+    assert [TileUpdate.decode(one).has_delta for one in (large, fullest)] == [False, False]
+    assert [TileUpdate.decode(one).voxels for one in (large, fullest)] == [(20, 0), (90_000, 0)]
+    assert max(map(len, (large, fullest))) < 120
+    assert len(small) < 120 + NOTICE_DELTA_BYTES
+    coded = replace(notice(5), delta=None, coded_delta=bytes(MAX_TILE_BODY_BYTES), put_voxels=5)
+    assert not TileUpdate.decode(encoded(coded)).has_delta
+
+
+def test_a_change_of_many_voxels_is_not_even_encoded(cloud, monkeypatch):
+    many = on_standard(dict.fromkeys(range(NOTICE_DELTA_VOXELS + 10), WALL))
+    cloud.store.put_tiles([replace(many, tile_id=NEIGHBOUR)])
+    cloud.store.put_tiles([replace(on_standard({0: WALL}), tile_id=NEIGHBOUR)])
+    monkeypatch.setattr("cloud_merger.announce.encode_content_delta", lambda *_: pytest.fail("it was encoded"))
+    update = update_of(cloud.store.get("ndt", NEIGHBOUR, 2), cloud.store.get("ndt", NEIGHBOUR, 1))
+    assert (update.has_delta, update.voxels) == (False, (0, NOTICE_DELTA_VOXELS + 9))
 
 
 def test_a_shard_without_a_store_says_so(tmp_path):

@@ -14,8 +14,8 @@ from cloud_merger.parameters import MergeParameters
 from cloud_merger.shift import shift_of
 from cloud_merger.statements import STATEMENT
 from cloud_merger.warm import warm_up
-from gnd_map import sight
-from gnd_map.codec import encode_mask, kernels
+from gnd_map import sight, similarity
+from gnd_map.codec import encode_mask, kernels, lattice_kernels
 from schemas.packed import PackedReport
 from vehicle_agent.packing import askable, pack_measured
 
@@ -25,7 +25,7 @@ CORNER = mapped(street(0))
 def signatures():
     return {
         f"{module.__name__}.{name}": len(value.signatures)
-        for module in (sight, kernels, merge_kernels, shift_kernels)
+        for module in (sight, kernels, lattice_kernels, similarity, merge_kernels, shift_kernels)
         for name, value in vars(module).items()
         if hasattr(value, "signatures")
     }
@@ -42,7 +42,9 @@ def test_warming_leaves_nothing_to_compile_for_the_first_report():
     expanded = expand(packed, "ndt", TILE.district, [tile_at()])
     mask = np.ones(askable(report), np.bool_)
     half = pack_measured(report, bases_of(report), encode_mask(mask))
-    with_measured(expanded, {TILE: tile_at().gaussians}, mask, half.measured)
+    found = with_measured(expanded, {TILE: tile_at().gaussians}, mask, half.measured).tiles[0].changed
+    yes = found.exists
+    similarity.similarity(yes, found.mean_m, found.cov_m2, yes, found.mean_m, found.cov_m2)
     clusters_of(np.zeros(5, STATEMENT), MergeParameters())
     assert shift_of(seen_as(CORNER, displaced(street(1), 0.2, 0.3)), CORNER).is_explained
     assert signatures() == warm

@@ -124,8 +124,11 @@ def test_the_command_line_says_in_one_line_what_is_wrong(run, tmp_path, monkeypa
 def test_a_finished_run_has_its_page_and_its_lines(run, tmp_path):
     from deploy.account import account_traffic
 
-    lines = account_traffic(RunFolder(run))
-    assert sum(line["wire_bytes"] for line in lines) == 18_000
+    traffic = account_traffic(RunFolder(run))
+    assert sum(line["wire_bytes"] for line in traffic["by_kind"]) == 18_000
+    assert traffic["problem"] == ""
     assert "Traffic of run" in (run / "traffic.html").read_text()
     (run / "ledger" / "car-3.jsonl").write_text("no ledger")
-    assert account_traffic(RunFolder(run)) == [], "a run's summary does not fail for the sake of its page"
+    damaged = account_traffic(RunFolder(run))
+    assert damaged["by_kind"] == [], "a run's summary does not fail for the sake of its page"
+    assert "car-3.jsonl holds no ledger lines" in damaged["problem"]

@@ -96,7 +96,7 @@ def test_the_page_holds_the_figures_of_the_account(tmp_path):
         "0.250",
     ):
         assert word in read.words, word
-    assert f"{TILES[3].path} 8.0 8.5 0.0 {TILES[2].path}" in read.words, "two tiles of 4 kB come first"
+    assert f"{TILES[3].path} 8.0 8.6 0.0 {TILES[2].path}" in read.words, "two tiles of 4 kB come first"
     # 11.5 kB in 100 s of 5.1 Mbit/s, 4 kB of 1.9 Mbit/s.
     assert "3g 0.018 % 0.0168 %" in read.words
     assert read.count("rect") == len(TILES), "a square a tile"

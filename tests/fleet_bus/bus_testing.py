@@ -143,6 +143,11 @@ class RouterProcess:
         running.wait_line("router listens")
         return running
 
+    @property
+    def pid(self) -> int:
+        assert self._running is not None
+        return self._running.process.pid
+
     def kill(self) -> None:
         assert self._running is not None
         self._running.kill()

@@ -13,7 +13,7 @@ from fleet_bus.ledger import Ledger
 
 
 def test_a_burst_arrives_whole_and_in_order(router, client, key):
-    """zenoh's default drops half of it: updates block instead."""
+    """zenoh's default drops half of it: publishers block, and the router's queue is long."""
     sender, receiver = client(router), client(router, queue_limit=10_000)
     inbox = Inbox()
     receiver.subscribe(key, inbox)
@@ -24,7 +24,8 @@ def test_a_burst_arrives_whole_and_in_order(router, client, key):
     assert [int.from_bytes(payload[:4], "little") for payload in inbox.payloads] == list(range(5000))
 
 
-def test_publishing_asks_zenoh_to_block(router, client, key):
+def test_the_router_may_drop_any_notice_whatever_its_publisher_wants(router, client, key):
+    """Publishers wait for their own link; the router waits for no subscriber."""
     sender, receiver = client(router), client(router)
     samples: list[zenoh.Sample] = []
     subscriber = receiver._connection.session.declare_subscriber(key, samples.append)
@@ -32,7 +33,10 @@ def test_publishing_asks_zenoh_to_block(router, client, key):
     with sender.advanced_publisher(key) as publisher:
         publisher.put(b"advanced")
         wait_for(lambda: samples[-1].payload.to_bytes() == b"advanced", "an advanced notice")
-    assert all(sample.congestion_control == zenoh.CongestionControl.BLOCK for sample in samples)
+    sender._connection.session.put(key, b"", congestion_control=zenoh.CongestionControl.BLOCK)  # a foreign program
+    wait_for(lambda: samples[-1].payload.to_bytes() == b"", "a foreign notice")
+    assert all(sample.congestion_control == zenoh.CongestionControl.DROP for sample in samples)
+    assert all(sample.priority == zenoh.Priority.DATA_LOW for sample in samples)
     subscriber.undeclare()
 
 

@@ -4,14 +4,15 @@ import json
 import os
 import socket
 import threading
+from pathlib import Path
 
 import psutil
 import pytest
 import zenoh
-from bus_testing import Inbox, sockets_to, wait_for
+from bus_testing import Inbox, RouterProcess, sockets_to, wait_for
 
 from fleet_bus.bus import open_bus
-from fleet_bus.config import BusConfig, assert_rules, zenoh_config
+from fleet_bus.config import ROUTER_LEASE_MS, BusConfig, assert_rules, zenoh_config
 from fleet_bus.errors import BusClosed, BusConfigError, MessageTooLarge, NoRouter
 from fleet_bus.router import open_router
 
@@ -28,6 +29,30 @@ def test_shared_memory_and_scouting_are_off_in_every_mode(mode):
     assert setting(config, "scouting/multicast/enabled") is False
     assert setting(config, "scouting/gossip/enabled") is False
     assert setting(config, "transport/unicast/lowlatency") is False
+
+
+def test_a_client_waits_for_its_own_link_and_a_router_for_nobody():
+    control = "transport/link/tx/queue/congestion_control"
+    waits = ("block/wait_before_close", "drop/wait_before_drop", "drop/max_wait_before_drop_fragments")
+
+    def waits_us(config: BusConfig) -> list[int]:
+        return [setting(config, f"{control}/{wait}") for wait in waits]
+
+    assert waits_us(BusConfig()) == [60_000_000] * 3
+    router = BusConfig(mode="router", listen=("tcp/127.0.0.1:1",))
+    assert waits_us(router) == [500_000, 5_000, 5_000]
+    assert {rule["id"]: rule["overwrite"]["congestion_control"] for rule in setting(router, "qos/network")} == {
+        "notices": "drop",
+        "reads": "drop",
+    }
+    assert setting(BusConfig(), "qos/network") == []
+
+
+def test_a_router_receives_in_many_threads(router_process: RouterProcess, client):
+    """A thread that forwards to a full queue waits."""
+    client(router_process.endpoint).wait_connected(5)
+    tasks = Path(f"/proc/{router_process.pid}/task")
+    wait_for(lambda: sum((task / "comm").read_text().startswith("rx-") for task in tasks.iterdir()) == 16, "threads")
 
 
 def test_a_broken_rule_is_an_error_that_names_it():
@@ -103,8 +128,15 @@ def send_buffer_of(descriptor: int) -> int:
 
 def test_the_lease_can_be_set_and_otherwise_follows_the_link():
     assert setting(BusConfig(lease_ms=1500), "transport/link/tx/lease") == 1500
-    assert setting(BusConfig(link="4g"), "transport/link/tx/lease") == 30_000
+    assert setting(BusConfig(link="4g"), "transport/link/tx/lease") == 60_000
     assert setting(BusConfig(), "transport/link/tx/lease") == 10_000
+    assert setting(BusConfig(mode="router"), "transport/link/tx/lease") == ROUTER_LEASE_MS
+    assert setting(BusConfig(mode="router", lease_ms=1500), "transport/link/tx/lease") == 1500
+
+
+def test_keep_alives_follow_the_link():
+    assert setting(BusConfig(link="4g"), "transport/link/tx/keep_alive") == 2
+    assert setting(BusConfig(), "transport/link/tx/keep_alive") == 4
 
 
 def test_a_router_takes_more_sessions_than_zenoh_by_default():

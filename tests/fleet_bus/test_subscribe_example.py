@@ -7,12 +7,21 @@ import pytest
 from bus_testing import REPOSITORY, script, stays, wait_for
 
 from gnd_map.tile_id import TileId
-from schemas.keys import update_key
+from schemas.keys import catalog_key, catalog_keys, update_key
+from schemas.tiles import Catalog, CatalogEntry
 from schemas.updates import TileUpdate
 
 EXAMPLE = REPOSITORY / "examples" / "subscribe.py"
 INSIDE = TileId.from_path("13033/03021/23031/22102")
 NEIGHBOUR_REGION = TileId.from_path("13033/03022/00000/00000")
+
+
+NEIGHBOUR = TileId.from_path("13033/03021/23031/22103")
+
+
+def catalog(version: int) -> bytes:
+    """Of two tiles, one of which never changes."""
+    return Catalog((CatalogEntry(INSIDE, version, bytes(32)), CatalogEntry(NEIGHBOUR, 1, bytes(32)))).encode()
 
 
 def update(tile: TileId, version: int) -> TileUpdate:
@@ -35,6 +44,17 @@ def test_it_receives_its_region_and_nothing_outside(router, client):
     assert all(re.fullmatch(rf"{INSIDE.path} v\d+ -> v\d+ merged", line) for line in updates)
 
 
+def test_a_lost_notice_is_found_by_the_catalog(router, client):
+    bus, versions = client(router), iter(range(3, 1000))
+    bus.serve(
+        catalog_keys("ndt"),
+        lambda request: [(catalog_key("ndt", INSIDE.district), catalog(next(versions)))] if request.is_wild else b"",
+    )
+    with script(EXAMPLE.read_text(), "13033/03021", "--connect", router, "--every", "0.05") as program:
+        program.wait_line(f"{INSIDE.path} v3 -> v4 by the catalog")
+    assert not any(NEIGHBOUR.path in line for line in program.lines)
+
+
 def test_it_imports_only_zenoh_and_schemas():
     tree = ast.parse(EXAMPLE.read_text())
     imported = {
@@ -42,8 +62,8 @@ def test_it_imports_only_zenoh_and_schemas():
         for node in ast.walk(tree)
         if isinstance(node, ast.Import | ast.ImportFrom)
     }
-    assert imported == {"argparse", "zenoh", "schemas"}
-    assert len(EXAMPLE.read_text().splitlines()) <= 30
+    assert imported == {"argparse", "time", "zenoh", "schemas"}
+    assert len(EXAMPLE.read_text().splitlines()) <= 45
 
 
 @pytest.mark.parametrize("region", ["13033/0302", "elsewhere"])

@@ -33,15 +33,15 @@ def test_lines_of_the_account_by_hand():
     # A tile of 1950 B with a head of 50 B fills two packets of 40 B headers; the small message has one of its own.
     assert account.by_kind == {"ack": 100 + 50 + 40, "tile": 1950 + 50 + 2 * 40}
     assert account.by_tile == {TILE.path: 2080}
-    assert (account.acks, account.resent) == (520, 0)
-    assert account.session == 5000 - 520 - 190 - 2080
+    assert (account.rest["acks"], account.rest["resent"]) == (520, 0)
+    assert account.rest["session"] == 5000 - 520 - 190 - 2080
     assert (account.measured, account.estimated, account.total) == (5000, 0, 5000)
 
 
 def test_what_was_sent_again_is_a_line_of_its_own():
     up = Booking(1.0, 10.0, "up", "change", 1000, None, 1, 60, None, "s")
     account = wire_account(ledger_of(up, s=WireBytes(up=3000, up_acks=104, up_resent=700, segment_bytes=1400)), "up")
-    assert (account.acks, account.resent, account.by_kind) == (104, 700, {"change": 1060})
+    assert (account.rest["acks"], account.rest["resent"], account.by_kind) == (104, 700, {"change": 1060})
     assert account.total == 3000
 
 
@@ -49,7 +49,7 @@ def test_messages_that_travel_together_share_the_room_there_is():
     wire = WireBytes(down=1060, segment_bytes=1000, header_bytes=40)
     account = wire_account(ledger_of(*[down("update", 100, head=20) for _ in range(10)], s=wire), "down")
     assert account.by_kind == {"update": 1060}, "one packet, not ten"
-    assert account.session == 0
+    assert account.rest["session"] == 0
 
 
 def test_shares_of_a_message_cost_packets_but_no_second_head():
@@ -61,7 +61,7 @@ def test_shares_of_a_message_cost_packets_but_no_second_head():
 def test_a_ledger_that_knows_no_heads_takes_the_usual_ones():
     account = wire_account(ledger_of(down("ack", 32, head=None), s=WireBytes(down=1000)), "down")
     assert account.by_kind == {"ack": 32 + MESSAGE_OVERHEAD_BYTES}
-    assert account.session == 1000 - 32 - MESSAGE_OVERHEAD_BYTES
+    assert account.rest["session"] == 1000 - 32 - MESSAGE_OVERHEAD_BYTES
 
 
 def test_what_no_reading_covers_is_said_to_be_estimated():
@@ -70,7 +70,7 @@ def test_what_no_reading_covers_is_said_to_be_estimated():
     bookings = (down("tile", 2000, session="killed"), down("tile", 500, session="whole"))
     account = wire_account(ledger_of(*bookings, **wires), "down")
     assert (account.measured, account.estimated) == (1000, 2050 - 300)
-    assert account.session == 700 - 550
+    assert account.rest["session"] == 700 - 550
     assert account.total == account.measured + account.estimated
 
 
@@ -94,9 +94,26 @@ MESSAGES = st.builds(
 )
 COUNT = st.integers(0, 1 << 41)
 WIRES = st.builds(
-    WireBytes, up=COUNT, down=COUNT, up_acks=st.integers(0, 9999), down_acks=st.integers(0, 9999),
-    up_resent=st.integers(0, 9999), segment_bytes=st.sampled_from([0, 536, 1448, 65483]), header_bytes=st.just(52),
-)  # fmt: skip
+    WireBytes,
+    up=COUNT,
+    down=COUNT,
+    **{
+        name: st.integers(0, 9999)
+        for name in (
+            "up_acks",
+            "down_acks",
+            "up_resent",
+            "up_opening",
+            "down_opening",
+            "up_alive",
+            "down_alive",
+            "up_closing",
+            "down_closing",
+        )
+    },
+    segment_bytes=st.sampled_from([0, 536, 1448, 65483]),
+    header_bytes=st.just(52),
+)
 
 
 @given(st.lists(MESSAGES, max_size=30), st.dictionaries(st.sampled_from(["s1", "s3"]), WIRES))
@@ -107,7 +124,7 @@ def test_every_account_adds_up(bookings, wires):
         measured = ledger.wire_up if direction == "up" else ledger.wire_down
         assert account.measured == measured
         assert account.total == measured + account.estimated
-        assert min(account.estimated, account.acks, account.resent, account.session) >= 0
+        assert min(account.estimated, *account.rest.values()) >= 0
         for kind, size in account.by_kind.items():
             assert size >= sum(b.app_bytes for b in bookings if (b.kind, b.direction) == (kind, direction))
         assert sum(account.by_tile.values()) <= sum(account.by_kind.values())
@@ -208,3 +225,26 @@ def test_a_word_about_a_tile_is_no_tile_that_arrived(tmp_path, size):
     report = agent_traffic(read_ledger(tmp_path / "a.jsonl"), (load_link("3g"),))
     assert report.arrivals is None
     assert report.tile_arrival_s == {"3g": None}
+
+
+def test_acknowledgements_stand_with_what_they_answer():
+    """Ten packets of tiles and five of all else came down, two of them keep-alives: the vehicle sent 15 acks."""
+    wire = WireBytes(up=2000, up_acks=15 * 52, down_alive=2 * 55, segment_bytes=1000, header_bytes=52)
+    bookings = [down("tile", 9_950), *(down("ack", 40) for _ in range(3))]
+    account = wire_account(ledger_of(*bookings, s=wire), "up")
+    assert (account.rest["tile acks"], account.rest["acks"]) == (10 * 52, 5 * 52)
+    nothing = wire_account(ledger_of(s=wire), "up")
+    assert (nothing.rest["tile acks"], nothing.rest["acks"]) == (0, 15 * 52), "two keep-alives, and no tile"
+
+
+def test_without_anything_that_they_could_answer_acknowledgements_are_nobodys():
+    account = wire_account(ledger_of(s=WireBytes(up=104, up_acks=104)), "up")
+    assert account.rest == {
+        "tile acks": 0,
+        "acks": 104,
+        "resent": 0,
+        "opening": 0,
+        "closing": 0,
+        "keep-alives": 0,
+        "session": 0,
+    }

@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 
 from gnd_map.classes import ChangeClass
 from gnd_map.codec import Flags
-from gnd_map.errors import ConfigError
+from gnd_map.errors import ConfigError, TrackError
 from gnd_map.gaussian import Gaussians, full_matrices, six_entries
 from gnd_map.grid import VoxelGrid
 from gnd_map.sight import NO_SLOT, NOTHING, STOP, Columns, Window, cast_fans, fill, lay_out, pool, voxel_ids
@@ -30,7 +30,9 @@ def small_window(low):
     slot_of = np.array([[0, 1], [NO_SLOT, 2]], np.int32)
     corner = np.array([(0, 0), (0, 5), (4, 5)], np.int32)
     offset = np.arange(4) * 20 * FLOORS
-    return Window(COLUMNS, METRES, slot_of, corner, offset, np.array(low, np.int32), np.full(3, FLOORS, np.int32), min(low))
+    return Window(
+        COLUMNS, METRES, slot_of, corner, offset, np.array(low, np.int32), np.full(3, FLOORS, np.int32), min(low)
+    )
 
 
 def cells(w):
@@ -293,6 +295,16 @@ def test_tiles_of_two_latitude_zones_are_looked_at_apart():
     track = Track(pair[0].district, SEEN, (Piece(np.array(path, np.int32), 40),))
     found = observed_along(track, [told(tile=tile, base=Gaussians.empty()) for tile in pair])
     assert min(len(found[tile]) for tile in pair) > 200
+
+
+def test_a_track_that_jumps_by_kilometres_is_refused_before_it_takes_memory():
+    corner = TileId(WEST.district.first_morton)
+    tiles = [TileId.from_indices(corner.lon_index + i, corner.lat_index + j) for i in range(32) for j in range(32)]
+    spots = itertools.product(range(2, 32, 4), repeat=2)
+    pieces = [Piece(np.array([[64 * i, 64 * j, 18_000 * (i % 8 == 2)]], np.int32), 9) for i, j in spots]
+    empty = [told(tile=tile, base=Gaussians.empty()) for tile in sorted(tiles)]
+    with pytest.raises(TrackError, match=r"between floors -\d+ and 90\d\d cross .* at most"):
+        observed_along(Track(WEST.district, SEEN, tuple(pieces)), empty)
 
 
 def test_two_threads_look_at_once_and_a_third_goes_on():

@@ -9,11 +9,13 @@ import time
 from collections.abc import Iterator
 from pathlib import Path
 
+import numpy as np
 import pytest
+import zenoh
 from store_helpers import EAGER, EAST, FAR, TILE, merge_once, report, report_id, tile_of_voxels
 
 from fleet_bus.bus import Bus, open_bus
-from fleet_bus.config import BusConfig
+from fleet_bus.config import READS, BusConfig
 from fleet_bus.errors import RequestFailed, RequestRefused
 from fleet_bus.requesting import RetryPolicy
 from fleet_bus.router import open_router
@@ -238,12 +240,12 @@ def test_a_closed_server_answers_no_more_and_a_new_one_does(client: Bus, endpoin
             assert ask(client, TILE).status == "blob"
 
 
-def start_process(path: Path, endpoint: str) -> subprocess.Popen[str]:
-    """`gnd store` as a process that answers."""
+def start_process(path: Path, endpoint: str, first_line: str = "tile server: ") -> subprocess.Popen[str]:
+    """`gnd store` as a process that has said this."""
     command = [sys.executable, "-m", "deploy.cli", "store", "--path", str(path), "--connect", endpoint]
     process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True)
     assert process.stdout is not None
-    assert "tile server: " in process.stdout.readline()
+    assert first_line in process.stdout.readline()
     return process
 
 
@@ -302,6 +304,43 @@ def ask_again(client: Bus, endpoint: str, store: SqliteStore) -> StoredTile:
     assert stored is not None
     assert blob == stored.to_blob()
     return stored
+
+
+def test_a_store_started_before_its_router_waits_for_it(store: SqliteStore, free_port: int) -> None:
+    at = f"tcp/127.0.0.1:{free_port}"
+    process = start_process(store.path, at, f"store: no router at {at} for")
+    try:
+        with open_router((at,)), open_bus(BusConfig(connect=(at,)), name="client") as client:
+            assert ask(client, TILE).status == "blob"
+    finally:
+        output = end(process, signal.SIGINT)
+    assert "tile server ended" in output
+
+
+@pytest.mark.usefixtures("server")
+def test_a_region_that_is_too_large_is_refused_with_its_size(client: Bus, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A wildcard over everything would keep the server busy for everybody else."""
+    monkeypatch.setattr("tile_store.server.MOST_TILES_OF_REGION", 2)
+    with pytest.raises(RequestRefused, match="region with 3 tiles, more than 2: ask for its catalogs"):
+        client.request_many(keys.tiles_key("ndt"), b"", kind="tile", timeout_s=20.0)
+    assert len(client.request_many(keys.tiles_key("ndt", "13033/03021"), b"", kind="tile", timeout_s=20.0)) == 2
+
+
+@pytest.mark.usefixtures("server")
+def test_a_foreign_program_gets_a_region_without_an_error(client: Bus) -> None:
+    """One that knows only zenoh takes any error reply for a failure of its question."""
+    for key in (keys.tiles_key("ndt"), keys.catalog_keys("ndt"), keys.tiles_key("nothing")):
+        replies = list(client._connection.session.get(key, timeout=10.0))
+        assert all(reply.ok is not None for reply in replies)
+        assert len(replies) == {keys.tiles_key("ndt"): 3, keys.catalog_keys("ndt"): 2}.get(key, 0)
+
+
+def test_a_router_knows_the_keys_whose_answers_it_may_drop() -> None:
+    """And no others: reports and their acknowledgements are never dropped."""
+    district = keys.tile_key("ndt", TILE), keys.batch_key("ndt", TILE.district), keys.catalog_key("ndt", TILE.district)
+    reads = [zenoh.KeyExpr(one) for one in READS]
+    assert [[one.includes(zenoh.KeyExpr(key)) for key in district] for one in reads] == np.eye(3, dtype=bool).tolist()
+    assert not any(one.intersects(zenoh.KeyExpr(keys.change_keys())) for one in reads)
 
 
 def test_a_store_process_that_cannot_start_says_why_in_one_line(tmp_path: Path, free_port: int) -> None:

@@ -16,7 +16,6 @@ from waiting import wait_until
 from cloud_merger.config import ShardConfig
 from cloud_merger.merger import run_shard
 from fleet_bus.bus import Bus
-from fleet_bus.errors import NoRouter
 from fleet_sim.drives import PERFECT, DriveConfig, simulate_drive
 from fleet_sim.street import street
 from gnd_map.tile_id import TileId
@@ -192,11 +191,35 @@ def test_a_stopped_agent_ends_at_once_in_order(cloud_of: Cloud, config: AgentCon
     assert cloud_of.reports() == {}
 
 
-def test_without_a_router_the_agent_says_so(recordings: Path, tmp_path: Path, free_port: int) -> None:
-    nowhere = (f"tcp/127.0.0.1:{free_port}",)
-    config = AgentConfig("probe", recordings / "probe.mcap", tmp_path / "w", connect=nowhere, open_timeout_s=0.5)
-    with pytest.raises(NoRouter, match=str(free_port)):
-        run_agent(config, NEVER)
+def offline(config: AgentConfig, port: int) -> AgentConfig:
+    nowhere = (f"tcp/127.0.0.1:{port}",)
+    return replace(config, connect=nowhere, open_timeout_s=0.2, report=replace(config.report, drain_s=0.2))
+
+
+def test_an_agent_starts_without_a_router_and_says_so(
+    recordings: Path, tmp_path: Path, free_port: int, caplog: pytest.LogCaptureFixture
+) -> None:
+    config = offline(AgentConfig("probe", recordings / "probe.mcap", tmp_path / "w"), free_port)
+    stop = threading.Event()
+    stop.set()
+    assert run_agent(config, stop)["scans"] == 0
+    assert f"no router at tcp/127.0.0.1:{free_port} for 0.2 s" in caplog.text
+
+
+@pytest.mark.slow
+def test_without_a_router_the_agent_drives_on_its_cache_and_reports_later(cloud_of: Cloud, config: AgentConfig) -> None:
+    before = run_agent(config, NEVER)
+    (config.work_dir / "outbox.sqlite").rename(config.work_dir / "old.sqlite")
+    without = run_agent(offline(config, 1), NEVER)  # nobody listens at port 1
+    assert without["finished"]
+    assert without["tiles"].keys() <= {"cached", "failed"}
+    assert without["scans_used"] > 0.9 * before["scans_used"]
+    assert without["reports_pending"] == without["reports_sent"] >= 1
+    stop = threading.Event()
+    stop.set()
+    later = run_agent(replace(config), stop)
+    wait_until(lambda: cloud_of.reports() != {})
+    assert later["reports_sent"] == without["reports_sent"]
 
 
 def test_a_recording_that_is_cut_off_is_one_clear_error(endpoint: str, recordings: Path, tmp_path: Path) -> None:

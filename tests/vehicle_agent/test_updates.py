@@ -97,6 +97,27 @@ def test_a_missed_version_is_made_up_for_by_asking(world: World) -> None:
     assert world.fetcher.counts == {"blob": 1, "delta": 1}
 
 
+def test_a_lost_notice_is_made_up_for_without_another(world: World, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Nothing tells a vehicle that stands still that a router has dropped a notice for it."""
+    download(world)
+    world.next_version(cut=5)
+    world.updates.apply()
+    assert world.fetcher.is_known(world.tile_id)
+    monkeypatch.setattr("vehicle_agent.updates.RECHECK_S", 0.1)
+    monkeypatch.setattr("vehicle_agent.updates.RECHECK_LOOK_S", 0.05)
+    wait_until(lambda: world.updates.apply() or cached(world) == 2)
+    assert world.updates.counts["received"] == 0
+
+
+def test_what_was_just_answered_is_not_asked_for_again(world: World, monkeypatch: pytest.MonkeyPatch) -> None:
+    download(world)
+    monkeypatch.setattr("vehicle_agent.updates.RECHECK_LOOK_S", 0.0)
+    for _ in range(20):
+        world.updates.apply()
+    assert world.fetcher.is_known(world.tile_id)
+    assert world.fetcher.counts == {"blob": 1}
+
+
 def test_a_notice_without_delta_makes_the_vehicle_fetch(world: World) -> None:
     download(world)
     update = world.next_version(cut=5)

@@ -63,6 +63,7 @@ def run_mapper(config: AgentConfig, stop: threading.Event) -> dict[str, Any]:
         mapper.map()
         mapper.upload()  # outbox -> acknowledged
         result = mapper.result()
+    result["traffic"] = mapper.link.traffic()  # the link is closed: nothing comes after it
     write_json(config.work_dir / "result.json", result)
     return result
 
@@ -158,7 +159,7 @@ class Mapper:
 
     def result(self) -> dict[str, Any]:
         """What the drive came to, as plain values."""
-        reports, wire = self.link.outbox.counts(), self.link.bus.wire()
+        reports = self.link.outbox.counts()
         return {
             "vehicle": self.config.vehicle,
             "drive_id": self.header.drive_id,
@@ -175,12 +176,6 @@ class Mapper:
             "reports_pending": reports.pending,
             "quarantined": dict(self.link.outbox.refused()),
             "last_error": self.link.sender.last_error or self.guard.last_problem,
-            "traffic": {
-                "up_bytes": self.link.ledger.total_bytes("up"),
-                "down_bytes": self.link.ledger.total_bytes("down"),
-                "up_wire_bytes": wire.up,
-                "down_wire_bytes": wire.down,
-            },
         }
 
 
@@ -191,7 +186,6 @@ def open_mapper(config: AgentConfig, stop: threading.Event) -> Iterator[Mapper]:
     Raises:
         DriveError: the recording cannot be read.
         VehicleError: it has no GNSS fix to start from, or a file cannot be opened.
-        NoRouter: nothing answers at `config.connect`.
     """
     names = [layer.name for layer in config.features.layers]
     header, fix = read_header(config.drive), first_fix(config)

@@ -197,3 +197,7 @@ def memory(run: Path, n: int, seed: int, json_path: Path | None) -> None:
         json_path.write_text(json.dumps(found, indent=1))
     for name, value in found.items():
         click.echo(f"{name:>24}  {json.dumps(value)}")
+
+
+if __name__ == "__main__":
+    memory()
