@@ -12,6 +12,7 @@ import click
 from cloud_merger.config import ShardConfig
 from cloud_merger.errors import MergerError
 from cloud_merger.merger import run_shard
+from fleet_bus.health_options import metrics_options
 
 
 @click.command()
@@ -20,8 +21,15 @@ from cloud_merger.merger import run_shard
 @click.option("--connect", multiple=True, help="Endpoint of a router, tcp/host:port; may be repeated.")
 @click.option("--mode", type=click.Choice(["default", "paper"]), help="How votes are counted.  [default: default]")
 @click.option("--config", "config_path", type=click.Path(path_type=Path), help="TOML file; options go before it.")
+@metrics_options
 def merger(
-    shard_id: str | None, store_path: str | None, connect: tuple[str, ...], mode: str | None, config_path: Path | None
+    shard_id: str | None,
+    store_path: str | None,
+    connect: tuple[str, ...],
+    mode: str | None,
+    config_path: Path | None,
+    metrics_port: int | None,
+    metrics_host: str,
 ) -> None:
     """Run one merger shard: takes reports, merges tiles, publishes versions. Ctrl-C ends it cleanly."""
     options = {"shard_id": shard_id, "store_path": store_path, "connect": list(connect) or None}
@@ -31,7 +39,7 @@ def merger(
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, lambda *_: stop.set())
     click.echo(f"merger {config.shard_id}: store {config.store_path}, mode {config.merge.mode}", err=True)
-    run_shard(config, stop)
+    run_shard(config, stop, None if metrics_port is None else (metrics_host, metrics_port))
 
 
 def read_config(path: Path | None, options: dict[str, Any], mode: str | None = None) -> ShardConfig:

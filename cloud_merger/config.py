@@ -42,10 +42,10 @@ class ShardConfig:
         store: batching of the store.
         codec: how finely the Gaussians of tiles are rounded that no base map holds ("float": not at all); all shards of
             a store use the same. Other tiles stay as fine as their base.
-        tiles_at_once: tiles claimed and published together.
+        tiles_at_once: tiles claimed together; each is published as soon as it is merged.
         expanders: threads that look at what was acknowledged.
         uploads_at_once: uploads that such a thread claims together.
-        lease_s: how long a claim holds; longer than a merge of `tiles_at_once` tiles takes.
+        lease_s: how long a claim holds that nobody renews: its shard has died or hangs.
         poll_s: how often to look for tiles and notices when nothing arrives here.
         max_attempts: a tile whose merge fails so often is set aside; so is an upload that cannot be read so often.
         retry_s: pause before a failed tile or upload is tried again, times the number of attempts.
@@ -69,7 +69,7 @@ class ShardConfig:
     tiles_at_once: int = 16
     expanders: int = 2
     uploads_at_once: int = 8
-    lease_s: float = 30.0
+    lease_s: float = 10.0
     poll_s: float = 0.2
     max_attempts: int = 5
     retry_s: float = 0.5

@@ -2,33 +2,47 @@
 
 import logging
 import threading
+from contextlib import ExitStack
+from typing import Final
 
 from cloud_merger.announce import Announcer
 from cloud_merger.config import ShardConfig
 from cloud_merger.expander import Expander
 from cloud_merger.expander_threads import working
 from cloud_merger.ingest import Ingest
+from cloud_merger.leases import Leases
+from cloud_merger.metrics import ShardMetrics
 from cloud_merger.ownership import Members, following
 from cloud_merger.reception import Reception
 from cloud_merger.states import States
 from cloud_merger.warm import warm_up
 from cloud_merger.work import Worker
-from cloud_merger.worker_process import worker_process
+from cloud_merger.worker_process import Address, worker_process
 from fleet_bus.bus import open_bus
 from fleet_bus.config import BusConfig
+from fleet_bus.health import HealthServer
+from tile_store.errors import StoreClosed, StoreError
+from tile_store.metrics import store_checks
 from tile_store.sqlite_store import SqliteStore
+from tile_store.values import Claim
 
 __all__ = ["ShardConfig", "run_shard", "run_worker"]
+STORE_RETRY_S: Final = 1.0
 _LOG = logging.getLogger(__name__)
 
 
-def run_shard(config: ShardConfig, stop: threading.Event) -> None:
+def run_shard(config: ShardConfig, stop: threading.Event, metrics_at: Address | None = None) -> None:
     """Run one merger shard until `stop` is set: this process receives and acknowledges, its worker does the rest.
 
     Any number of shards may share a store. What one leaves undone, when it ends or is killed, another does.
 
+    Args:
+        config: its settings.
+        stop: ends it.
+        metrics_at: host and port at which its worker shows metrics and health; None: nowhere.
+
     Raises:
-        StoreError: the store cannot be opened or has failed.
+        StoreError: the store cannot be opened.
     """
     bus_config = BusConfig(connect=config.connect, lease_ms=config.bus_lease_ms, patient=True)
     with (
@@ -36,7 +50,7 @@ def run_shard(config: ShardConfig, stop: threading.Event) -> None:
         open_bus(bus_config, name=config.shard_id) as bus,
     ):
         store.release(config.shard_id)  # leases of an earlier life
-        with worker_process(config) as worker:
+        with worker_process(config, metrics_at) as worker:
             ingest = Ingest(store, config.shard_id, on_stored=worker.wake)  # look at the outside, keep the bytes
             members = Members(config.shard_id)
             States(store, bus).open()
@@ -49,29 +63,57 @@ def run_shard(config: ShardConfig, stop: threading.Event) -> None:
         store.release(config.shard_id)
 
 
-def run_worker(config: ShardConfig, stop: threading.Event, arrived: threading.Event) -> None:
+def run_worker(
+    config: ShardConfig, stop: threading.Event, arrived: threading.Event, metrics_at: Address | None = None
+) -> None:
     """Expand, merge and announce until `stop` is set; `arrived` is set when something has come.
 
+    A store that fails (a full disk, another process that holds it for too long) is tried again until it works.
+
     Raises:
-        StoreError, NoRouter: as `run_shard`.
+        StoreError: the store cannot be opened.
     """
     warm_up()  # or the first tile and the first report would wait for the kernels, and their leases with them
-    bus_config = BusConfig(connect=config.connect, lease_ms=config.bus_lease_ms)
+    bus_config = BusConfig(connect=config.connect, lease_ms=config.bus_lease_ms, patient=True)
     with (
         SqliteStore(config.store_path, config.store, create=False) as store,
         open_bus(bus_config, name=f"{config.shard_id}-worker") as bus,
+        Leases(store, config.shard_id, config.lease_s) as leases,
+        ExitStack() as stack,
     ):
+        metrics = ShardMetrics()
+        if metrics_at is not None:
+            host, port = metrics_at
+            stack.enter_context(HealthServer(port, metrics.registry, store_checks(store, bus), host=host))
         members, wake = following(bus, config.shard_id), threading.Event()
 
         # Expand: what was acknowledged becomes reports of tiles, and vehicles hear what is wanted; in threads.
         expander = Expander(store, config, States(store, bus).tell, on_journaled=wake.set)
+        stack.enter_context(working(expander.work, arrived, config.expanders, config.poll_s))
+
         worker, announcer = Worker(store, config), Announcer(store, bus, members)
-        with working(expander.work, arrived, config.expanders, config.poll_s):
-            while not stop.is_set():
+        while not stop.is_set():
+            claims: list[Claim] = []
+            try:
                 claims = store.claim(config.shard_id, config.tiles_at_once, config.lease_s, prefer=expander.districts)
-                merged = worker.merge(claims)  # load, decode, cluster, decide
-                store.publish(merged)  # compare-and-swap; a stale one is refused and its tile claimed again
-                n_announced = announcer.announce(config.announce_at_once)  # after the commit
+                leases.hold(claims)
+                for claim in claims:
+                    if not stop.is_set():
+                        with metrics.merging():  # load, fold, merge, decide, publish by compare-and-swap
+                            result = worker.settle(claim)
+                        metrics.settled(result)
+                    leases.drop(claim)
+                    metrics.announced(announcer.announce(config.announce_at_once))  # after the commit
+                n_announced = announcer.announce(config.announce_at_once)
+                metrics.announced(n_announced)
                 if not claims and not n_announced:
-                    wake.wait(worker.idle_s(store.next_ready_ns()))
+                    wake.wait(worker.idle_s(store.ready_in_s()))
                     wake.clear()
+            except StoreClosed:
+                raise
+            except StoreError as error:
+                metrics.store_failed()
+                _LOG.error("%s: the store has failed, next try in %.0f s: %s", config.shard_id, STORE_RETRY_S, error)
+                for claim in claims:
+                    leases.drop(claim)  # they run out, and whoever can work then has them
+                stop.wait(STORE_RETRY_S)

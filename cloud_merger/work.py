@@ -1,7 +1,6 @@
 """From claimed tiles to publications: load, decode, merge; a tile whose merge fails does not stop the others."""
 
 import logging
-import time
 from collections.abc import Callable, Sequence
 from typing import TypeVar
 
@@ -15,8 +14,9 @@ from gnd_map.features import FeatureTile, is_feature_layer
 from gnd_map.gaussian import Gaussians
 from gnd_map.tile import Tile
 from schemas.errors import SchemaError
+from tile_store.errors import StoreDamaged, StoreError, UnknownReports
 from tile_store.store import Store
-from tile_store.values import Basis, Claim, Publication, ReportRow, TileWork
+from tile_store.values import Basis, Claim, Publication, PublishResult, ReportRow, TileWork
 
 _LOG = logging.getLogger(__name__)
 T = TypeVar("T")
@@ -35,24 +35,47 @@ class Worker:
         attempted = [self._attempt(claim) for claim in claims]
         return [publication for publication in attempted if publication is not None]
 
-    def idle_s(self, next_ready_ns: int | None) -> float:
+    def settle(self, claim: Claim) -> PublishResult | None:
+        """Merge one claimed tile and publish it; None: it is postponed or set aside, or its lease is gone."""
+        publication = self._attempt(claim)
+        if publication is None:
+            return None
+        try:
+            (result,) = self._store.publish([publication])
+        except (StoreDamaged, UnknownReports) as error:  # any other is the store's failure, not the tile's
+            self._failed(claim, error)
+            return None
+        return result
+
+    def idle_s(self, ready_in_s: float | None) -> float:
         """How long to sleep: until the next tile is ready, at most `poll_s`."""
-        if next_ready_ns is None:
-            return self._config.poll_s
-        return min(max((next_ready_ns - time.time_ns()) / 1e9, 0.005), self._config.poll_s)
+        return self._config.poll_s if ready_in_s is None else min(max(ready_in_s, 0.005), self._config.poll_s)
 
     def _attempt(self, claim: Claim) -> Publication | None:
-        work = self._store.load(claim)
-        if claim.attempts > self._config.max_attempts:  # it may be what killed the shards that claimed it before
-            return self._set_aside(work, "no shard that claimed it came to an end")
-        try:
-            return self._of_features(work) if is_feature_layer(claim.layer) else self._publication(work)
-        except Exception as error:
-            _LOG.exception("merge of %s failed, attempt %d", claim.tile, claim.attempts)
-            if claim.attempts == self._config.max_attempts:
-                return self._set_aside(work, f"{type(error).__name__}: {error}")
-            self._store.postpone(claim, self._config.retry_s * claim.attempts)
+        if not self._store.begin(claim, self._config.lease_s):
+            return None  # another shard has it
+        # It may be what killed the shards that merged it before.
+        if claim.attempts > self._config.max_attempts and not claim.is_retry:
+            self._set_aside(claim, "no shard that merged it came to an end")
             return None
+        try:
+            work = self._store.load(claim)
+            return self._of_features(work) if is_feature_layer(claim.layer) else self._publication(work)
+        except StoreError as error:
+            if not isinstance(error, StoreDamaged):
+                raise  # the store's failure, not the tile's
+            self._failed(claim, error)
+        except Exception as error:
+            self._failed(claim, error)
+        return None
+
+    def _failed(self, claim: Claim, error: Exception) -> None:
+        """Try again later, not for ever."""
+        _LOG.error("merge of %s failed, attempt %d", claim.tile, claim.attempts, exc_info=error)
+        if claim.attempts >= self._config.max_attempts:
+            self._set_aside(claim, f"{type(error).__name__}: {error}")
+        else:
+            self._store.postpone(claim, self._config.retry_s * claim.attempts)
 
     def _publication(self, work: TileWork) -> Publication:
         """Fold the windows that are closed, merge the open one into what they come to; the tile is None where the head
@@ -127,14 +150,10 @@ class Worker:
         found = {sha: self._contents.content(work.claim.layer, work.claim.tile, sha) for sha in sorted(shas)}
         return {sha: gaussians for sha, gaussians in found.items() if gaussians is not None}
 
-    def _set_aside(self, work: TileWork, reason: str) -> Publication:
-        """Leave the tile as it is and consume its reports, which stay in the store; say so in the quarantine."""
-        reason = f"tile {work.claim.tile} set aside after {work.claim.attempts} attempts to merge it: {reason}"
-        _LOG.error("%s", reason)
-        body = "\n".join([f"{work.claim.layer} {work.claim.tile}", *_ids(work)])
-        self._store.quarantine(body.encode(), reason, source="merge")
-        basis = Basis(work.journal.window, work.journal.seq)
-        return Publication(work.claim, work.base_version, None, report_ids=_ids(work), basis=basis)
+    def _set_aside(self, claim: Claim, reason: str) -> None:
+        """Leave the tile as it is, by name; its reports go on waiting."""
+        if self._store.set_aside(claim, reason):
+            _LOG.error("tile %s is set aside after %d attempts to merge it: %s", claim.tile, claim.attempts, reason)
 
 
 def _ids(work: TileWork) -> tuple[str, ...]:

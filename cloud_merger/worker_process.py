@@ -22,14 +22,16 @@ ENDS_IN_S: Final = 5.0
 NICER: Final = 5
 """Acks and queries go first where the cores do not suffice for all."""
 _RESTART_S: Final = 1.0
+Address = tuple[str, int]
+"""Host and port."""
 _LOG = logging.getLogger(__name__)
 
 
 class WorkerProcess:
     """The worker of a shard; one that has ended is started again. Use it by `worker_process`."""
 
-    def __init__(self, config: ShardConfig) -> None:
-        self._config = pickle.dumps(config)
+    def __init__(self, config: ShardConfig, metrics_at: Address | None = None) -> None:
+        self._config = pickle.dumps((config, metrics_at))
         self._started_s = 0.0
         self._process = self._start()
 
@@ -70,9 +72,9 @@ class WorkerProcess:
 
 
 @contextmanager
-def worker_process(config: ShardConfig) -> Iterator[WorkerProcess]:
-    """The worker of a shard, running while the block runs."""
-    worker = WorkerProcess(config)
+def worker_process(config: ShardConfig, metrics_at: Address | None = None) -> Iterator[WorkerProcess]:
+    """The worker of a shard, running while the block runs; `metrics_at`: where it shows its metrics."""
+    worker = WorkerProcess(config, metrics_at)
     try:
         yield worker
     finally:
@@ -95,10 +97,10 @@ def main() -> None:
     logging.basicConfig(level=logging.INFO, format="%(asctime)s %(name)s %(levelname)s %(message)s")
     os.nice(NICER)
     size = int.from_bytes(_exactly(8), "little")
-    config = pickle.loads(_exactly(size))  # noqa: S301 - written by the process that has started this one
+    config, metrics_at = pickle.loads(_exactly(size))  # noqa: S301 - written by the process that has started this one
     stop, arrived = threading.Event(), threading.Event()
     threading.Thread(target=_listen, args=(stop, arrived), name="line", daemon=True).start()
-    run_worker(config, stop, arrived)
+    run_worker(config, stop, arrived, metrics_at)
 
 
 def _exactly(count: int) -> bytes:

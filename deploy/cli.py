@@ -15,7 +15,7 @@ COMMANDS: Final[dict[str, tuple[str, str]]] = {
     "lab": ("deploy.lab.command:lab", "Run a fleet over real shaped links in network namespaces (root)."),
     "watch": ("deploy.watch_cli:watch", "Print the tile updates of a region as they are published."),
     "traffic": ("deploy.traffic_cli:traffic", "Account for every byte of a run against 3G, 4G and 5G; as a page, too."),
-    "map": ("deploy.map_cli:map_group", "Build, inspect, compare, export and roll back maps."),
+    "map": ("deploy.map_cli:map_group", "Build, inspect, compare, export, back up and roll back maps."),
     "features": ("deploy.features_cli:features", "Import, export and list feature layers: Lanelet2, GeoJSON, ..."),
     "import": ("vehicle_agent.importer_cli:import_drives", "Turn a recording (KITTI, PCD, ROS 2, ...) into a drive."),
     "localise": ("vehicle_agent.localise_drive.command:localise", "Localise a recorded drive on a map."),

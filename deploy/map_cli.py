@@ -107,5 +107,5 @@ def _bars() -> Progress:
 map_group = click.Group(
     "map",
     commands=[build, verify, *store_group.commands.values()],
-    help="Build, inspect, compare, export and roll back maps.",
+    help="Build, inspect, compare, verify, export, back up and roll back maps.",
 )

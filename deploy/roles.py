@@ -22,7 +22,7 @@ def router(listen: str, *, stop: threading.Event) -> None:
 def store(path: Path, connect: str, *, stop: threading.Event) -> None:
     """Serve tiles and catalogs from the store."""
     with (
-        SqliteStore(path) as opened,
+        SqliteStore(path, create=False) as opened,
         open_bus(BusConfig(connect=(connect,), patient=True), name="store") as bus,
         TileServer(opened, bus),
     ):

@@ -11,7 +11,7 @@ from rich.progress import track
 
 from tile_store import tables
 from tile_store.cli import PATH, json_option, layer_option, region_option, show
-from tile_store.sqlite_store import SqliteStore
+from tile_store.options import to_read
 from tile_store.values import DEFAULT_CODEC, MAP_CODECS
 
 
@@ -33,7 +33,7 @@ def verify(path: Path, layer: str, region: str, all_versions: bool, codec: str, 
     from cloud_merger.parameters import MergeParameters
     from cloud_merger.verify import Verified, Verifier
 
-    with SqliteStore(path, create=False) as store:
+    with to_read(path) as store:
         config = ShardConfig(store_path=path, codec=codec, merge=MergeParameters(mode=merge_mode))
         verifier = Verifier(store, config)
         heads, found = store.heads(layer, region), list[Verified]()

@@ -215,6 +215,10 @@ class Bus:
         """How many connections to a router there have been: more than before = notices were missed (Linux)."""
         return self._connection.meter.read().connections
 
+    def neighbours(self) -> list[str]:
+        """What is connected to this session right now: "client", "router" or "peer" for each."""
+        return [str(transport.whatami) for transport in self._connection.session.info.transports()]
+
     def is_connected(self) -> bool:
         """Whether a router is at the other end right now; a lost one is looked for without being asked."""
         return self._connection.is_connected()

@@ -18,7 +18,7 @@ def kernel(function: F) -> F:
 
 
 def inlined(function: F) -> F:
-    """As `kernel`, laid into its callers."""
+    """As `kernel`, laid into its callers: for the few lines that run a hundred times a voxel."""
     return cast("F", numba.njit(cache=True, error_model="numpy", nogil=True, forceinline=True)(function))
 
 

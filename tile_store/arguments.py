@@ -8,6 +8,7 @@ from typing import Final
 from gnd_map.errors import MapError
 from gnd_map.tile_id import TileId
 from tile_store.errors import StoreError
+from tile_store.regions import morton_range
 
 _VERSIONS: Final = re.compile(r"(\d+)\.\.(\d+)")
 
@@ -30,6 +31,23 @@ def parse_tile(text: str) -> TileId:
         ) from None
 
 
+def parse_place(text: str) -> TileId | str:
+    """A tile as `parse_tile` reads it, or a region: the leading part of paths and a slash ("/": everywhere).
+
+    Raises:
+        StoreError: it is neither.
+    """
+    if not text.endswith("/"):
+        if text.count("/") in (1, 2):
+            raise StoreError(f"{text!r} is not a whole path; a region ends in a slash: {text}/")
+        if len(text) in (5, 10, 15) and set(text) <= set("0123"):
+            raise StoreError(f"{text!r} may be the number of a tile; a region ends in a slash: {text}/")
+        return parse_tile(text)
+    region = text.rstrip("/")
+    morton_range(region)
+    return region
+
+
 def parse_time_ns(text: str) -> int:
     """ISO 8601 (2026-01-31T12:00:00Z; UTC when it names no zone) as int ns UTC; StoreError when it is no time."""
     try:
@@ -38,7 +56,10 @@ def parse_time_ns(text: str) -> int:
         raise StoreError(f"time {text!r} is not like 2026-01-31T12:00:00Z") from None
     moment = moment if moment.tzinfo else moment.replace(tzinfo=UTC)
     since = moment - datetime(1970, 1, 1, tzinfo=UTC)
-    return ((since.days * 86_400 + since.seconds) * 1_000_000 + since.microseconds) * 1_000
+    time_ns = ((since.days * 86_400 + since.seconds) * 1_000_000 + since.microseconds) * 1_000
+    if not 0 <= time_ns < 2**63:
+        raise StoreError(f"time {text!r} is not between 1970 and 2262")
+    return time_ns
 
 
 def parse_versions(text: str) -> tuple[int, int]:

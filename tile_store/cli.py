@@ -1,59 +1,44 @@
 """`gnd store` and `gnd map`: thin commands over the library."""
 
-import json
 import os
 import signal
 import threading
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
 from dataclasses import asdict
 from hashlib import sha256
 from pathlib import Path
 from types import FrameType
-from typing import Any, Final, TypeVar
 
 import click
-from rich.console import Console
+from prometheus_client import CollectorRegistry
 
 from fleet_bus.bus import open_bus
 from fleet_bus.config import DEFAULT_ENDPOINT, BusConfig
+from fleet_bus.health import HealthServer
+from fleet_bus.health_options import metrics_options
 from fleet_bus.router import wait_for_stop
-from tile_store import tables
+from tile_store import tables, upkeep_cli
 from tile_store.arguments import parse_tile, parse_time_ns, parse_versions
-from tile_store.compare import MapDiff, layer_info, map_diff, version_diff
+from tile_store.compare import MapDiff, layer_info, layer_totals, map_diff, version_diff
 from tile_store.errors import StoreError
 from tile_store.export import FORMATS, export_map
+from tile_store.metrics import StoreCollector, store_checks
+from tile_store.options import PATH, existing, json_option, layer_option, region_option, show, to_read
 from tile_store.server import TileServer
 from tile_store.sqlite_store import SqliteStore
 from tile_store.status import status
 from tile_store.store import Store
-from tile_store.values import DEFAULT_LAYER
 
-PATH: Final = click.Path(path_type=Path)
-_F = TypeVar("_F", bound=Callable[..., Any])
-
-
-def layer_option(command: _F) -> _F:
-    """Adds --layer."""
-    return click.option("--layer", default=DEFAULT_LAYER, show_default=True, help="Layer of the map.")(command)
-
-
-def region_option(command: _F) -> _F:
-    """Adds --region."""
-    help_text = "Leading part of tile paths, such as 13033/03021.  [default: everywhere]"
-    return click.option("--region", default="", help=help_text)(command)
-
-
-def json_option(command: _F) -> _F:
-    """Adds --json."""
-    return click.option("--json", "as_json", is_flag=True, help="Print JSON instead of tables.")(command)
+__all__ = ["PATH", "json_option", "layer_option", "map_group", "region_option", "show", "store", "store_to_fill"]
 
 
 @click.command()
-@click.option("--path", required=True, type=PATH, help="The store; it is made when missing.")
+@click.option("--path", required=True, type=PATH, help="The store; `gnd map build` makes one.")
 @click.option("--connect", multiple=True, default=(DEFAULT_ENDPOINT,), show_default=True, help="Endpoint of a router.")
 @click.option("--workers", default=4, show_default=True, type=click.IntRange(1, 64), help="Threads that answer.")
-def store(path: Path, connect: tuple[str, ...], workers: int) -> None:
+@metrics_options
+def store(path: Path, connect: tuple[str, ...], workers: int, metrics_port: int | None, metrics_host: str) -> None:
     """Run the tile server until Ctrl-C: it answers the vehicles' tile and catalog queries."""
     stop = threading.Event()
 
@@ -63,7 +48,16 @@ def store(path: Path, connect: tuple[str, ...], workers: int) -> None:
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, end)
     config = BusConfig(connect=connect, patient=True)
-    with SqliteStore(path) as opened, open_bus(config, name="store") as bus, TileServer(opened, bus, workers=workers):
+    with (
+        existing(path) as opened,
+        open_bus(config, name="store") as bus,
+        TileServer(opened, bus, workers=workers),
+        ExitStack() as stack,
+    ):
+        if metrics_port is not None:
+            registry = CollectorRegistry()
+            registry.register(StoreCollector(opened))
+            stack.enter_context(HealthServer(metrics_port, registry, store_checks(opened, bus), host=metrics_host))
         counts = opened.counts()
         click.echo(f"tile server: {counts.tiles} tiles of {path} at {', '.join(connect)}; Ctrl-C ends it")
         wait_for_stop(stop)
@@ -75,18 +69,21 @@ def map_group() -> None:
     """Inspect, compare, export and roll back maps; `gnd map build` is in `deploy.map_cli`, above the segmentation."""
 
 
-map_group.add_command(status)
+for _command in (status, *upkeep_cli.COMMANDS):
+    map_group.add_command(_command)
 
 
 @map_group.command(short_help="What a store holds, in numbers.")
 @click.argument("path", metavar="STORE", type=PATH)
+@click.option("--deep", is_flag=True, help="Decode every tile: Gaussians, features, heights.")
 @region_option
 @layer_option
 @json_option
-def info(path: Path, region: str, layer: str, as_json: bool) -> None:
+def info(path: Path, deep: bool, region: str, layer: str, as_json: bool) -> None:
     """What STORE holds: its newest versions in numbers, its queue and its quarantine."""
-    with _existing(path) as opened:
-        values = {"layers": opened.layers()} | layer_info(opened, layer=layer, prefix=region).as_dict()
+    with to_read(path) as opened:
+        totals = (layer_info if deep else layer_totals)(opened, layer=layer, prefix=region)
+        values = {"layers": opened.layers()} | totals.as_dict()
         values["store"] = asdict(opened.counts())
     show(values, as_json, lambda console: console.print(tables.info(str(path), values)))
 
@@ -100,7 +97,7 @@ def info(path: Path, region: str, layer: str, as_json: bool) -> None:
 @json_option
 def export(path: Path, out: Path, region: str, layer: str, kind: str | None, as_json: bool) -> None:
     """Write the newest tiles of STORE to FILE: Gaussians as PCD or PLY, tiles as GeoJSON."""
-    with _existing(path) as opened:
+    with to_read(path) as opened:
         result = export_map(opened, layer, region, out, kind)
     values = asdict(result) | {"path": str(result.path)}
     line = f"{out}: {result.gaussians} Gaussians of {result.tiles} tiles, {result.size_bytes / 1e6:.2f} MB"
@@ -130,14 +127,14 @@ def diff(
     if sum(way is not None for way in (new, since, tile)) != 1 or (versions and not tile):
         raise StoreError("diff: give either OTHER, --since TIME, or --tile TILE [--versions A..B]")
     with ExitStack() as stack:
-        first = stack.enter_context(_existing(old))
+        first = stack.enter_context(to_read(old))
         if tile is not None:
             result = _version_diff(first, layer, tile, versions)
         elif since is not None:
             result = map_diff(first, first, layer=layer, prefix=region, old_at_ns=parse_time_ns(since))
         else:
             assert new is not None
-            result = map_diff(first, stack.enter_context(_existing(new)), layer=layer, prefix=region)
+            result = map_diff(first, stack.enter_context(to_read(new)), layer=layer, prefix=region)
     show(result.as_dict(), as_json, lambda console: tables.print_diff(console, result))
 
 
@@ -149,7 +146,7 @@ def diff(
 def history(path: Path, tile: str, layer: str, as_json: bool) -> None:
     """The versions of TILE (path, number, or lat,lon in degrees), and the reports that each comes from."""
     tile_id = parse_tile(tile)
-    with _existing(path) as opened:
+    with to_read(path) as opened:
         lines = opened.history(layer, tile_id)
         if not lines:
             raise StoreError(f"tile {tile_id.path} of layer {layer} is not in {path}")
@@ -161,43 +158,13 @@ def history(path: Path, tile: str, layer: str, as_json: bool) -> None:
     show(values, as_json, lambda console: console.print(tables.history(values)))
 
 
-@map_group.command(short_help="Publish an older version of a tile again.")
-@click.argument("path", metavar="STORE", type=PATH)
-@click.argument("tile")
-@click.argument("version", type=int)
-@layer_option
-@json_option
-def rollback(path: Path, tile: str, version: int, layer: str, as_json: bool) -> None:
-    """Publish the content of an older VERSION of TILE as its next one; merged reports count no more.
-
-    Running mergers announce it to the vehicles.
-    """
-    with _existing(path) as opened:
-        current = opened.rollback(layer, parse_tile(tile), version)
-    values = {"tile": current.tile.path, "layer": layer, "version": current.version, "content_of": version}
-    line = f"tile {current.tile.path}: version {current.version} has the content of version {version}"
-    show(values, as_json, lambda console: console.print(line, highlight=False))
-
-
-@map_group.command(short_help="Remove old versions.")
-@click.argument("path", metavar="STORE", type=PATH)
-@click.option("--keep", required=True, type=click.IntRange(1), help="So many of the newest versions of each tile stay.")
-@json_option
-def gc(path: Path, keep: int, as_json: bool) -> None:
-    """Remove old versions; the base and what waiting reports refer to stay."""
-    with _existing(path) as opened:
-        result = opened.gc(keep)
-    line = f"{path}: {result.versions} versions removed, {result.bytes / 1e6:.2f} MB"
-    show(asdict(result), as_json, lambda console: console.print(line, highlight=False))
-
-
 @map_group.command(short_help="The messages that were refused, and why.")
 @click.argument("path", metavar="STORE", type=PATH)
 @click.option("--save", type=PATH, help="Write the refused bytes into this folder, a file each.")
 @json_option
 def quarantine(path: Path, save: Path | None, as_json: bool) -> None:
     """The messages that were refused, and why."""
-    with _existing(path) as opened:
+    with to_read(path) as opened:
         found = opened.quarantined()
     rows = [
         {"received_ns": one.received_ns, "times": one.times, "bytes": len(one.body), "source": one.source}
@@ -228,10 +195,6 @@ def _version_diff(store: Store, layer: str, tile: str, versions: str | None) -> 
     return version_diff(store, layer, tile_id, lines[-2].version, lines[-1].version)
 
 
-def _existing(path: Path) -> SqliteStore:
-    return SqliteStore(path, create=False)
-
-
 @contextmanager
 def store_to_fill(path: Path) -> Iterator[SqliteStore]:
     """The store at `path`; a new one gets its name only when it is filled."""
@@ -249,11 +212,3 @@ def store_to_fill(path: Path) -> Iterator[SqliteStore]:
     finally:
         for suffix in ("", "-wal", "-shm"):
             partial.with_name(partial.name + suffix).unlink(missing_ok=True)
-
-
-def show(values: dict[str, Any], as_json: bool, print_it: Callable[[Console], None]) -> None:
-    """Print an answer: as JSON, or as `print_it` does."""
-    if as_json:
-        click.echo(json.dumps(values, indent=1))
-    else:
-        print_it(Console(width=120))

@@ -8,6 +8,8 @@ from typing import Any
 import numpy as np
 
 from gnd_map.codec import codec_of
+from gnd_map.content import FEATURE_CODECS
+from gnd_map.errors import CodecError
 from gnd_map.features import is_feature_layer
 from gnd_map.gaussian import Gaussians
 from gnd_map.grid import VoxelGrid
@@ -51,6 +53,64 @@ class MapInfo:
     def as_dict(self) -> dict[str, Any]:
         """JSON-able."""
         return asdict(self)
+
+
+@dataclass(frozen=True, slots=True)
+class LayerTotals:
+    """What is known of a region's newest versions without decoding any."""
+
+    layer: str
+    prefix: str
+    tiles: int
+    districts: int
+    body_bytes: int
+    codecs: dict[str, int]
+    """Tiles in each codec, by its name."""
+    lowest_version: int
+    highest_version: int
+    updated_ns: int
+    """Time of the newest version, UTC."""
+    south_deg: float
+    west_deg: float
+    north_deg: float
+    east_deg: float
+
+    def as_dict(self) -> dict[str, Any]:
+        """JSON-able."""
+        return asdict(self)
+
+
+def layer_totals(store: Store, *, layer: str = DEFAULT_LAYER, prefix: str = "") -> LayerTotals:
+    """Totals of a region's newest versions of any layer, at once; `StoreError` when there are no tiles."""
+    lines = store.head_lines(layer, prefix)
+    if not lines:
+        raise StoreError(f"no tiles in layer {layer!r}, region {prefix or 'everywhere'!r}")
+    south, west, north, east = bounds_deg([one.tile for one in lines])
+    return LayerTotals(
+        layer=layer,
+        prefix=prefix,
+        tiles=len(lines),
+        districts=len({one.tile.district for one in lines}),
+        body_bytes=sum(one.size_bytes for one in lines),
+        codecs=dict(Counter(codec_name(one.codec_id) for one in lines)),
+        lowest_version=min(one.version for one in lines),
+        highest_version=max(one.version for one in lines),
+        updated_ns=max(one.created_ns for one in lines),
+        south_deg=south,
+        west_deg=west,
+        north_deg=north,
+        east_deg=east,
+    )
+
+
+def codec_name(codec_id: int) -> str:
+    """The codec's name, also where this program cannot read it."""
+    if codec_id in FEATURE_CODECS:
+        return "features"
+    try:
+        return codec_of(codec_id).name
+    except CodecError:
+        return f"codec {codec_id}"
 
 
 def layer_info(store: Store, *, layer: str = DEFAULT_LAYER, prefix: str = "") -> MapInfo | FeatureMapInfo:

@@ -3,6 +3,7 @@
 GndError
 StoreError             a store cannot do what was asked
 StoreUnavailable     it cannot be opened: no such file, no permission, not a store, a newer schema
+StoreDamaged       a part of it cannot be read
 StoreBusy            another process has held the write lock for too long
 StoreClosed          it was used after close()
 UnknownVersion       the tile has no such version
@@ -19,6 +20,10 @@ class StoreError(GndError):
 
 class StoreUnavailable(StoreError):
     """The store cannot be opened, or has failed while it was in use."""
+
+
+class StoreDamaged(StoreUnavailable):
+    """A page of the store cannot be read; what does not lie on it can."""
 
 
 class StoreBusy(StoreError):

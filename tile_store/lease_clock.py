@@ -4,25 +4,19 @@ A lease is a time of this clock together with the boot that it counts from. One 
 it is gone. Setting the machine's date neither ends a lease nor keeps it.
 """
 
-import time
-from functools import cache
-from pathlib import Path
 from typing import Final
+
+from tile_store import clocks
 
 LONGEST_LEASE_NS: Final = 3_600_000_000_000
 """A lease that ends later than this from now was not written by this clock: it counts as ended."""
-_BOOT_ID: Final = Path("/proc/sys/kernel/random/boot_id")
 
 
-@cache
 def boot() -> str:
-    """Which run of the machine `now_ns` counts from; the same in all its processes ("" where the system tells none)."""
-    try:
-        return _BOOT_ID.read_text(encoding="ascii").strip()
-    except OSError:
-        return ""
+    """Which run of the machine `now_ns` counts from; the same in all its processes."""
+    return clocks.boot_id()
 
 
 def now_ns() -> int:
     """Time since the machine started, int ns."""
-    return time.monotonic_ns()
+    return clocks.steady_ns()

@@ -1,5 +1,6 @@
 """Opening SQLite so that several processes may share the file and nothing acknowledged is lost."""
 
+import os
 import random
 import threading
 import time
@@ -7,22 +8,23 @@ from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 from types import MappingProxyType
-from typing import Any, Final
+from typing import Any, Final, TypeVar
+from urllib.parse import quote
 
 import apsw
 
-from tile_store.errors import StoreBusy, StoreClosed, StoreError, StoreUnavailable
+from tile_store.errors import StoreBusy, StoreClosed, StoreDamaged, StoreError, StoreUnavailable
+from tile_store.migrations import SCHEMA_VERSION, migrate, schema_of
 from tile_store.sql import statements
 
-SCHEMA_VERSION: Final = 1
-APPLICATION_ID: Final = 0x474E4453
-"""ASCII "GNDS" in the file's header: this database is a GND store."""
 SQL: Final = statements("sqlite")
 
+READER_PATIENCE_S: Final = 30.0
 OLDEST_SQLITE: Final = (3, 51, 3)
 """Older ones can corrupt a WAL that several connections write and checkpoint."""
 
 
+T = TypeVar("T")
 Row = tuple[Any, ...]
 Bindings = Mapping[str, Any]
 
@@ -38,8 +40,10 @@ def change(connection: apsw.Connection, statement: str, bindings: Bindings) -> i
     return connection.changes()
 
 
-def as_store_error(error: Exception, path: str | Path) -> Exception:
+def as_store_error(error: Exception, path: str | Path, *, to_write: bool = True) -> Exception:
     """SQLite's errors as ours, in one line; any other exception as it is."""
+    if isinstance(error, (apsw.CantOpenError, apsw.PermissionsError, PermissionError)) and not to_write:
+        return StoreUnavailable(f"{path}: cannot be read; check its permissions and those of its folder")
     if isinstance(error, (apsw.BusyError, apsw.LockedError)):
         return StoreBusy(f"{path}: another process has held the write lock for too long; try again or stop it")
     if isinstance(error, apsw.NotADBError):
@@ -49,7 +53,9 @@ def as_store_error(error: Exception, path: str | Path) -> Exception:
     if isinstance(error, apsw.FullError):
         return StoreUnavailable(f"{path}: disk full; free space and try again, nothing was changed")
     if isinstance(error, apsw.CorruptError):
-        return StoreUnavailable(f"{path}: damaged ({error}); restore the newest backup")
+        return StoreDamaged(
+            f"{path}: damaged ({error}); `gnd map check` names what is, `gnd map restore` puts a backup back"
+        )
     if isinstance(error, apsw.Error):
         return StoreError(f"{path}: {type(error).__name__}: {error}")
     return error
@@ -77,80 +83,69 @@ def open_writer(path: Path, *, create: bool, busy_timeout_s: float) -> apsw.Conn
     return connection
 
 
-def _prepare(connection: apsw.Connection, path: Path, busy_timeout_s: float) -> None:
-    connection.set_busy_handler(_Patience(busy_timeout_s))
-    _retry_busy(lambda: _check_header(connection, path), busy_timeout_s)
-    _retry_busy(lambda: connection.pragma("journal_mode", "wal"), busy_timeout_s)
-    connection.pragma("synchronous", "full")
-    connection.pragma("trusted_schema", False)
-    if connection.pragma("application_id") == 0:
-        _create_schema(connection)
-        _check_header(connection, path)
-    if connection.readonly("main"):
-        raise StoreUnavailable(f"{path}: read-only; a store must be writable")
-    if not fetch(connection, "has_schema_of_confirmation"):
-        _in_one(connection, lambda: connection.execute(SQL["schema_of_confirmation"]))
-    if not fetch(connection, "has_schema_of_surveys"):
-        _in_one(connection, lambda: connection.execute(SQL["schema_of_surveys"]))
-    if not fetch(connection, "has_schema_of_parts"):
-        _in_one(connection, lambda: _add_parts(connection))
-    if not fetch(connection, "has_schema_of_journal"):
-        _in_one(connection, lambda: _add_journal(connection))
-    if not fetch(connection, "has_schema_of_uploads"):
-        _in_one(connection, lambda: connection.execute(SQL["schema_of_uploads"]))
+def open_reader(path: Path) -> apsw.Connection:
+    """A connection that changes nothing, also where nothing can be written: in a folder or on a disk that is read-only.
 
+    There a store can be read that was closed cleanly, or whose log is in use by a process that may write.
 
-def _add_parts(connection: apsw.Connection) -> None:
-    if not fetch(connection, "has_schema_of_parts"):  # another process may have added them since we looked
-        connection.execute(SQL["schema_of_parts"])
-
-
-def _add_journal(connection: apsw.Connection) -> None:
-    if not fetch(connection, "has_schema_of_journal"):
-        connection.execute(SQL["schema_of_journal"])
-
-
-def _check_header(connection: apsw.Connection, path: Path) -> None:
-    connection.execute("BEGIN")  # all at one instant: another process may be making the schema
+    Raises:
+        StoreUnavailable: no such store, not a store, or a log that cannot be read without writing.
+    """
+    if not path.is_file():
+        raise StoreUnavailable(f"{path}: no such store; `gnd map build` makes one")
     try:
-        application_id = connection.pragma("application_id")
-        version = connection.pragma("user_version")
-        empty = not connection.execute("SELECT COUNT(*) FROM sqlite_schema").get
+        try:
+            return _opened_reader(str(path), path, 0)
+        except (apsw.CantOpenError, apsw.ReadOnlyError, apsw.PermissionsError):
+            if os.access(path.parent, os.W_OK):
+                raise
+            log = path.with_name(path.name + "-wal")
+            if log.exists() and log.stat().st_size:
+                raise StoreUnavailable(
+                    f"{path}: its log {log.name} is not yet part of it and its folder is read-only; copy both to a"
+                    " folder that can be written to"
+                ) from None
+            # A store in WAL mode wants to make files beside itself, unless it is told that nobody will change it.
+            return _opened_reader(f"file:{quote(str(path.resolve()))}?immutable=1", path, apsw.SQLITE_OPEN_URI)
+    except (apsw.Error, OSError) as error:
+        raise as_store_error(error, path, to_write=False) from None
+
+
+def require_current(path: Path) -> None:
+    """StoreUnavailable unless the store has the schema of this release, which cannot be given to it without writing."""
+    connection = open_reader(path)
+    try:
+        found = schema_of(connection, path)
     finally:
-        _undo(connection)
-    if application_id != APPLICATION_ID and not (empty and application_id == 0):
-        raise StoreUnavailable(f"{path}: an SQLite database of another program, not a tile store; choose another path")
-    if version > SCHEMA_VERSION:
+        connection.close()
+    if found < SCHEMA_VERSION:
         raise StoreUnavailable(
-            f"{path}: store schema {version}, this release reads up to {SCHEMA_VERSION}; use the gnd that wrote it"
+            f"{path}: store schema {found}, this release reads {SCHEMA_VERSION} and may not write here; copy the store"
+            " to a folder that can be written to, opening it there brings it up to date"
         )
 
 
-def _create_schema(connection: apsw.Connection) -> None:
-    def create() -> None:
-        # Another process may have made it since we looked.
-        if connection.pragma("application_id") == 0:
-            connection.execute(SQL["schema"])
-            connection.pragma("user_version", SCHEMA_VERSION)
-            connection.pragma("application_id", APPLICATION_ID)
-
-    _in_one(connection, create)
-
-
-def _in_one(connection: apsw.Connection, work: Callable[[], object]) -> None:
-    """Run `work` in one write transaction."""
-    connection.execute("BEGIN IMMEDIATE")
+def _opened_reader(name: str, path: Path, flags: int) -> apsw.Connection:
+    connection = apsw.Connection(name, flags=apsw.SQLITE_OPEN_READONLY | flags)
     try:
-        work()
-        connection.execute("COMMIT")
+        connection.set_busy_handler(_Patience(READER_PATIENCE_S))
+        schema_of(connection, path)
     except BaseException:
-        _undo(connection)
+        connection.close()
         raise
+    return connection
 
 
-def _undo(connection: apsw.Connection) -> None:
-    if connection.in_transaction:  # after some errors SQLite has ended it itself
-        connection.execute("ROLLBACK")
+def _prepare(connection: apsw.Connection, path: Path, busy_timeout_s: float) -> None:
+    connection.set_busy_handler(_Patience(busy_timeout_s))
+    found = _retry_busy(lambda: schema_of(connection, path), busy_timeout_s)
+    _retry_busy(lambda: connection.pragma("journal_mode", "wal"), busy_timeout_s)
+    connection.pragma("synchronous", "full")
+    connection.pragma("trusted_schema", False)
+    if connection.readonly("main"):
+        raise StoreUnavailable(f"{path}: read-only; a store must be writable")
+    if found < SCHEMA_VERSION:
+        migrate(connection, path)
 
 
 class _Patience:
@@ -168,13 +163,12 @@ class _Patience:
         return now < self._deadline
 
 
-def _retry_busy(step: Callable[[], object], timeout_s: float) -> None:
+def _retry_busy(step: Callable[[], T], timeout_s: float) -> T:
     # Changing the journal mode does not call the busy handler.
     deadline = time.monotonic() + timeout_s
     while True:
         try:
-            step()
-            return
+            return step()
         except (apsw.BusyError, apsw.LockedError):
             if time.monotonic() > deadline:
                 raise
@@ -184,9 +178,8 @@ def _retry_busy(step: Callable[[], object], timeout_s: float) -> None:
 class ReaderPool:
     """Read-only connections, one for each thread that reads at the same time."""
 
-    def __init__(self, path: Path, *, busy_timeout_s: float) -> None:
+    def __init__(self, path: Path) -> None:
         self._path = path
-        self._busy_timeout_s = busy_timeout_s
         self._idle: list[apsw.Connection] = []
         self._lock = threading.Lock()
         self._closed = False
@@ -227,12 +220,7 @@ class ReaderPool:
                 raise StoreClosed(f"{self._path}: the store is closed")
             if self._idle:
                 return self._idle.pop()
-        try:
-            connection = apsw.Connection(str(self._path), flags=apsw.SQLITE_OPEN_READONLY)
-        except apsw.Error as error:
-            raise as_store_error(error, self._path) from None
-        connection.set_busy_handler(_Patience(self._busy_timeout_s))
-        return connection
+        return open_reader(self._path)
 
     def _give_back(self, connection: apsw.Connection) -> None:
         with self._lock:

@@ -15,17 +15,29 @@ from tile_store.values import Claim, PutStatus, ReportRow, StoreConfig
 NS_PER_S: Final = 1_000_000_000
 
 
-def timing_of(config: StoreConfig, now: int) -> dict[str, Any]:
-    """When a dirty tile becomes ready: the statements' `now`, `delay` (both ns) and `merge_after` (reports)."""
-    return {"now": now, "delay": round(config.merge_delay_s * NS_PER_S), "merge_after": config.merge_after_reports}
+ASIDE_S: Final = 60.0
+"""A tile that is set aside is tried once more after so long, then after twice as long each time, ..."""
+LONGEST_ASIDE_S: Final = 3600.0
+"""... at most after so long: whoever was to blame for it may be gone by then."""
+ATTEMPTS_IN_A_ROW: Final = 5
 
 
-def put_reports(c: apsw.Connection, rows: Iterable[ReportRow], config: StoreConfig, now: int) -> list[PutStatus]:
+def timing_of(config: StoreConfig, now: int, steady: int) -> dict[str, Any]:
+    """The statements' times: `now` (UTC), and when a dirty tile becomes ready: `steady` (the queue's clock), `delay`
+    (all ns) and `merge_after` (reports).
+    """
+    delay = round(config.merge_delay_s * NS_PER_S)
+    return {"now": now, "steady": steady, "delay": delay, "merge_after": config.merge_after_reports}
+
+
+def put_reports(
+    c: apsw.Connection, rows: Iterable[ReportRow], config: StoreConfig, timing: dict[str, Any]
+) -> list[PutStatus]:
     """Insert the rows that are new, each with its place in the journal, and mark their tiles dirty."""
-    return [_put_report(c, row, config, now) for row in rows]
+    return [_put_report(c, row, config, timing) for row in rows]
 
 
-def _put_report(c: apsw.Connection, row: ReportRow, config: StoreConfig, now: int) -> PutStatus:
+def _put_report(c: apsw.Connection, row: ReportRow, config: StoreConfig, timing: dict[str, Any]) -> PutStatus:
     place = {"layer": row.layer, "tile": row.tile.morton}
     entry = journal.next_entry(c, row, config)
     settled_in = None if entry.opens or not row.is_quiet else _version_that_it_confirms(c, row)
@@ -35,7 +47,7 @@ def _put_report(c: apsw.Connection, row: ReportRow, config: StoreConfig, now: in
         return "duplicate"
     journal.put(c, row.layer, row.tile, entry)
     if settled_in is None:
-        change(c, "mark_dirty", place | timing_of(config, now) | {"seq": entry.seq})
+        change(c, "mark_dirty", place | timing | {"seq": entry.seq})
     return "stored"
 
 
@@ -56,30 +68,60 @@ def merge_again(c: apsw.Connection, layer: str, tile: TileId, timing: dict[str, 
     change(c, "mark_dirty", {"layer": layer, "tile": tile.morton, "seq": seq} | timing)
 
 
-def claim(c: apsw.Connection, owner: str, n: int, lease_s: float, prefer: Sequence[str], now: int) -> list[Claim]:
+def claim(c: apsw.Connection, owner: str, n: int, lease_s: float, prefer: Sequence[str], steady: int) -> list[Claim]:
     """Lease ready tiles: those of the preferred regions first, then any, each group oldest first."""
-    lease_ns = now + round(lease_s * NS_PER_S)
+    lease_ns = steady + round(lease_s * NS_PER_S)
     claims: list[Claim] = []
     for first, end in map(morton_range, prefer):
-        wanted = {"now": now, "first": first, "end": end, "n": n - len(claims)}
+        wanted = {"steady": steady, "first": first, "end": end, "n": n - len(claims)}
         claims += _take(c, fetch(c, "claimable_in_region", wanted), owner, lease_ns)
-    return claims + _take(c, fetch(c, "claimable", {"now": now, "n": n - len(claims)}), owner, lease_ns)
+    return claims + _take(c, fetch(c, "claimable", {"steady": steady, "n": n - len(claims)}), owner, lease_ns)
 
 
 def _take(c: apsw.Connection, rows: Iterable[Row], owner: str, lease_ns: int) -> list[Claim]:
     claims = [
-        Claim(layer, TileId(tile), seq, owner, secrets.randbits(62), attempts + 1)
-        for layer, tile, seq, attempts in rows
+        Claim(layer, TileId(tile), seq, owner, secrets.randbits(62), attempts + 1, bool(is_aside))
+        for layer, tile, seq, attempts, is_aside in rows
     ]
     for one in claims:
         change(c, "take_lease", _lease(one) | {"owner": owner, "lease_ns": lease_ns})
     return claims
 
 
-def renew(c: apsw.Connection, claims: Iterable[Claim], lease_s: float, now: int) -> list[bool]:
+def renew(c: apsw.Connection, claims: Iterable[Claim], lease_s: float, steady: int) -> list[bool]:
     """Prolong the leases that are still held by these claims."""
-    lease_ns = now + round(lease_s * NS_PER_S)
+    lease_ns = steady + round(lease_s * NS_PER_S)
     return [change(c, "renew_lease", _lease(one) | {"lease_ns": lease_ns}) == 1 for one in claims]
+
+
+def begin(c: apsw.Connection, claim: Claim, lease_s: float, steady: int) -> bool:
+    """Count an attempt to merge a claimed tile, and prolong its lease; whether it is still held."""
+    times = {"lease_ns": steady + round(lease_s * NS_PER_S), "again_ns": _again_ns(claim, steady)}
+    return change(c, "begin_merge", _lease(claim) | times) == 1
+
+
+def set_aside(c: apsw.Connection, claim: Claim, reason: str, now: int, steady: int) -> bool:
+    """Free one lease; the tile is not ready for long, unless a report arrives or somebody takes it up again."""
+    told = {"again_ns": _again_ns(claim, steady), "now": now, "reason": reason}
+    return change(c, "set_aside", _lease(claim) | told) == 1
+
+
+def _again_ns(claim: Claim, steady: int) -> int:
+    pause_s = ASIDE_S * 2.0 ** min(max(claim.attempts - ATTEMPTS_IN_A_ROW, 0), 10)
+    return steady + round(min(pause_s, LONGEST_ASIDE_S) * NS_PER_S)
+
+
+def take_up_again(c: apsw.Connection, tiles: Iterable[tuple[str, TileId]], steady: int) -> int:
+    """Make tiles that are set aside ready; how many of them were."""
+    places = [{"layer": layer, "tile": tile.morton, "steady": steady} for layer, tile in tiles]
+    return sum(change(c, "take_up_again", place) for place in places)
+
+
+def enter_boot(c: apsw.Connection, boot: str, steady: int) -> None:
+    """Free all leases when they are of another boot, whose clock was another one."""
+    if fetch(c, "boot_of_queue") != [(boot,)]:
+        change(c, "forget_leases", {"steady": steady})
+        change(c, "put_boot", {"boot": boot})
 
 
 def release(c: apsw.Connection, owner: str) -> int:

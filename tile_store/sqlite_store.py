@@ -1,5 +1,6 @@
 """The store in one SQLite file that several processes of a machine may open (WAL, every commit synced)."""
 
+import logging
 import time
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from hashlib import sha256
@@ -13,6 +14,7 @@ from gnd_map.content import AnyTile
 from gnd_map.features import is_feature_layer
 from gnd_map.tile_id import TileId
 from schemas.tiles import CatalogEntry
+from tile_store import clocks
 from tile_store import sqlite_accounts as accounts
 from tile_store import sqlite_confirmation as confirmation
 from tile_store import sqlite_inbox as inbox
@@ -20,10 +22,12 @@ from tile_store import sqlite_journal as journal
 from tile_store import sqlite_refuted as refuted
 from tile_store import sqlite_uploads as uploads
 from tile_store import sqlite_versions as versions
-from tile_store.errors import StoreError, UnknownVersion
+from tile_store.backup import copy_store
+from tile_store.errors import StoreDamaged, StoreError, UnknownVersion
 from tile_store.provenance import Provenance, decode_provenance
 from tile_store.regions import morton_range
-from tile_store.sqlite_connection import ReaderPool, change, fetch, open_writer
+from tile_store.retention import trim_quarantine
+from tile_store.sqlite_connection import ReaderPool, change, fetch, open_writer, require_current
 from tile_store.uploads import FirstHalf, Settled, Upload, UploadClaim, UploadCounts, UploadStatus
 from tile_store.values import (
     DEFAULT_LAYER,
@@ -32,16 +36,20 @@ from tile_store.values import (
     Content,
     DirtyTile,
     GcResult,
+    HeadLine,
     Notice,
     Publication,
     PublishResult,
     PutStatus,
     Quarantined,
+    QueueState,
     ReportRow,
+    ShardSeen,
     StoreConfig,
     StoreCounts,
     StoredTile,
     TileJournal,
+    TileSetAside,
     TileWork,
     VehicleAccount,
     VersionInfo,
@@ -51,13 +59,17 @@ from tile_store.values import (
     check_fits,
     check_layer,
 )
-from tile_store.writer import GroupWriter
+from tile_store.writer import GroupWriter, NoWriter
 
 _T = TypeVar("_T")
 NS_PER_S: Final = 1_000_000_000
 REPORTS_A_PAGE: Final = 256
+LAGS_LOOKED_AT: Final = 256
+SHARD_FORGOTTEN_NS: Final = 86_400 * NS_PER_S
+"""A shard that ended without saying so is told of for a day."""
 WINDOWS_AT_ONCE: Final = 8
 """So many windows of a tile are folded in one go, where it was left alone for long."""
+_LOG = logging.getLogger(__name__)
 
 
 class SqliteStore:
@@ -66,7 +78,9 @@ class SqliteStore:
     Args:
         path: the file; with `create` it is made when missing (its folder must exist).
         config: batching and waiting of this process.
-        now_ns: the clock, int ns UTC.
+        read_only: nothing is written, also not beside the file; whatever would write is StoreUnavailable.
+        now_ns: the time of day, int ns UTC; it may step.
+        steady_ns: the clock of the queue, ns; it never steps, and is the same in all processes of the machine.
 
     Raises:
         StoreUnavailable: no such file or folder, no permission, not a store, written by a newer release.
@@ -78,14 +92,22 @@ class SqliteStore:
         config: StoreConfig | None = None,
         *,
         create: bool = True,
+        read_only: bool = False,
         now_ns: Callable[[], int] = time.time_ns,
+        steady_ns: Callable[[], int] = clocks.steady_ns,
     ) -> None:
         self.path = Path(path)
         self._config = config or StoreConfig()
-        self._now_ns = now_ns
-        connection = open_writer(self.path, create=create, busy_timeout_s=self._config.busy_timeout_s)
-        self._writer = GroupWriter(connection, group_max=self._config.group_max)
-        self._readers = ReaderPool(self.path, busy_timeout_s=self._config.busy_timeout_s)
+        self._now_ns, self._steady_ns = now_ns, steady_ns
+        self._readers = ReaderPool(self.path)
+        self._writer: GroupWriter | NoWriter
+        if read_only:
+            require_current(self.path)
+            self._writer = NoWriter(self.path)
+        else:
+            connection = open_writer(self.path, create=create, busy_timeout_s=self._config.busy_timeout_s)
+            self._writer = GroupWriter(connection, group_max=self._config.group_max)
+            self._enter_boot()
 
     def __enter__(self) -> "SqliteStore":
         return self
@@ -100,8 +122,21 @@ class SqliteStore:
         self._readers.close()
         self._writer.close()  # the last connection folds the log into the file, which a reader could not
 
+    def _enter_boot(self) -> None:
+        """What an earlier boot has left in the queue ends; a store is written to only where there is something."""
+        try:
+            with self._readers.snapshot() as c:
+                is_known = fetch(c, "boot_of_queue") == [(clocks.boot_id(),)]
+            if not is_known:
+                self._writer.run(lambda c: inbox.enter_boot(c, clocks.boot_id(), self._steady_ns()))
+        except StoreDamaged as error:  # what can be read shall be read
+            _LOG.error("%s", error)
+        except BaseException:
+            self.close()
+            raise
+
     def _timing(self) -> dict[str, Any]:
-        return inbox.timing_of(self._config, self._now_ns())
+        return inbox.timing_of(self._config, self._now_ns(), self._steady_ns())
 
     # Uploads
 
@@ -123,7 +158,7 @@ class SqliteStore:
 
     def settle_upload(self, settled: Settled) -> bool:
         """See `Store.settle_upload`."""
-        return self._writer.run(lambda c: uploads.settle(c, settled, self._config, self._now_ns()))
+        return self._writer.run(lambda c: uploads.settle(c, settled, self._config, self._timing()))
 
     def first_halves(self, key: str, report_id: str) -> list[FirstHalf]:
         """See `Store.first_halves`."""
@@ -155,7 +190,7 @@ class SqliteStore:
         """See `Store.put_reports`."""
         if not rows:
             return []
-        return self._writer.run(lambda c: inbox.put_reports(c, rows, self._config, self._now_ns()))
+        return self._writer.run(lambda c: inbox.put_reports(c, rows, self._config, self._timing()))
 
     def reports(self, layer: str = DEFAULT_LAYER, vehicle: str | None = None) -> Iterator[ReportRow]:
         """See `Store.reports`."""
@@ -191,7 +226,12 @@ class SqliteStore:
     def quarantine(self, body: bytes, reason: str, source: str = "") -> None:
         """See `Store.quarantine`."""
         row = {"sha": sha256(body).digest(), "source": source, "reason": reason, "body": body}
-        self._writer.run(lambda c: change(c, "insert_quarantine", row | {"received_ns": self._now_ns()}))
+
+        def work(c: apsw.Connection) -> None:
+            change(c, "insert_quarantine", row | {"received_ns": self._now_ns()})
+            trim_quarantine(c, self._config.quarantine_bytes)
+
+        self._writer.run(work)
 
     def quarantined(self) -> list[Quarantined]:
         """See `Store.quarantined`."""
@@ -203,14 +243,18 @@ class SqliteStore:
     def claim(self, owner: str, n: int, lease_s: float, prefer: Sequence[str] = ()) -> list[Claim]:
         """See `Store.claim`."""
         # Idle mergers look often: they take no write lock for nothing.
-        ready_ns = self.next_ready_ns()
-        if ready_ns is None or ready_ns > self._now_ns():
+        ready_in_s = self.ready_in_s()
+        if ready_in_s is None or ready_in_s > 0.0:
             return []
-        return self._writer.run(lambda c: inbox.claim(c, owner, n, lease_s, prefer, self._now_ns()))
+        return self._writer.run(lambda c: inbox.claim(c, owner, n, lease_s, prefer, self._steady_ns()))
+
+    def begin(self, claim: Claim, lease_s: float) -> bool:
+        """See `Store.begin`."""
+        return self._writer.run(lambda c: inbox.begin(c, claim, lease_s, self._steady_ns()))
 
     def renew(self, claims: Sequence[Claim], lease_s: float) -> list[bool]:
         """See `Store.renew`."""
-        return self._writer.run(lambda c: inbox.renew(c, claims, lease_s, self._now_ns()))
+        return self._writer.run(lambda c: inbox.renew(c, claims, lease_s, self._steady_ns()))
 
     def release(self, owner: str) -> int:
         """See `Store.release`."""
@@ -218,18 +262,88 @@ class SqliteStore:
 
     def postpone(self, claim: Claim, delay_s: float) -> None:
         """See `Store.postpone`."""
-        self._writer.run(lambda c: inbox.postpone(c, claim, self._now_ns() + round(delay_s * NS_PER_S)))
+        self._writer.run(lambda c: inbox.postpone(c, claim, self._steady_ns() + round(delay_s * NS_PER_S)))
+
+    def set_aside(self, claim: Claim, reason: str) -> bool:
+        """See `Store.set_aside`."""
+        return self._writer.run(lambda c: inbox.set_aside(c, claim, reason, self._now_ns(), self._steady_ns()))
+
+    def tiles_set_aside(self) -> list[TileSetAside]:
+        """See `Store.tiles_set_aside`."""
+        with self._readers.snapshot() as c:
+            rows = fetch(c, "tiles_set_aside")
+        return [TileSetAside(layer, TileId(tile), *rest) for layer, tile, *rest in rows]
+
+    def take_up_again(self, tiles: Iterable[tuple[str, TileId]]) -> int:
+        """See `Store.take_up_again`."""
+        wanted = list(tiles)
+        return self._writer.run(lambda c: inbox.take_up_again(c, wanted, self._steady_ns()))
+
+    # Shards
+
+    def join(self, owner: str) -> None:
+        """See `Store.join`."""
+        boot, steady = clocks.boot_id(), self._steady_ns()
+        row = {"owner": owner, "boot": boot, "steady": steady, "now": self._now_ns()}
+
+        def work(c: apsw.Connection) -> None:
+            inbox.release(c, owner)
+            uploads.release(c, owner)
+            change(c, "forget_shards", {"boot": boot, "before": steady - SHARD_FORGOTTEN_NS})
+            change(c, "join", row)
+
+        self._writer.run(work)
+
+    def beat(self, owner: str, claims: Sequence[Claim], lease_s: float) -> list[bool]:
+        """See `Store.beat`."""
+        row = {"owner": owner, "boot": clocks.boot_id(), "steady": self._steady_ns(), "now": self._now_ns()}
+
+        def work(c: apsw.Connection) -> list[bool]:
+            change(c, "beat", row)
+            return inbox.renew(c, claims, lease_s, self._steady_ns())
+
+        return self._writer.run(work)
+
+    def leave(self, owner: str) -> None:
+        """See `Store.leave`."""
+
+        def work(c: apsw.Connection) -> None:
+            inbox.release(c, owner)
+            uploads.release(c, owner)
+            change(c, "leave", {"owner": owner})
+
+        self._writer.run(work)
+
+    def shards(self) -> list[ShardSeen]:
+        """See `Store.shards`."""
+        with self._readers.snapshot() as c:
+            rows = fetch(c, "shards")
+        steady, boot = self._steady_ns(), clocks.boot_id()
+        return [
+            ShardSeen(owner, since_ns, (steady - beat_ns) / NS_PER_S if of_boot == boot else None)
+            for owner, of_boot, beat_ns, since_ns in rows
+        ]
 
     def dirty_count(self) -> int:
         """See `Store.dirty_count`."""
         with self._readers.snapshot() as c:
             return int(fetch(c, "dirty_count")[0][0])
 
-    def next_ready_ns(self) -> int | None:
-        """See `Store.next_ready_ns`."""
+    def ready_in_s(self) -> float | None:
+        """See `Store.ready_in_s`."""
         with self._readers.snapshot() as c:
-            ready: int | None = fetch(c, "next_ready")[0][0]
-            return ready
+            ready_ns: int | None = fetch(c, "next_ready")[0][0]
+        return None if ready_ns is None else (ready_ns - self._steady_ns()) / NS_PER_S
+
+    def queue_state(self) -> QueueState:
+        """See `Store.queue_state`."""
+        with self._readers.snapshot() as c:
+            ready_ns, oldest_ns = fetch(c, "queue_state")[0]
+            lags = fetch(c, "published_lags", {"n": LAGS_LOOKED_AT})
+            messages, refused_bytes = fetch(c, "quarantine_size")[0]
+        overdue_s = 0.0 if ready_ns is None else max(self._steady_ns() - ready_ns, 0) / NS_PER_S
+        waiting_s = 0.0 if oldest_ns is None else max(self._now_ns() - oldest_ns, 0) / NS_PER_S
+        return QueueState(overdue_s, waiting_s, tuple(lag / NS_PER_S for (lag,) in lags), messages, refused_bytes)
 
     # Merging and publishing
 
@@ -370,6 +484,13 @@ class SqliteStore:
             rows = fetch(c, "heads", {"layer": layer, "first": first, "end": end})
         return [CatalogEntry(TileId(tile), version, sha) for tile, version, sha in rows]
 
+    def head_lines(self, layer: str = DEFAULT_LAYER, prefix: str = "") -> list[HeadLine]:
+        """See `Store.head_lines`."""
+        first, end = morton_range(prefix)
+        with self._readers.snapshot() as c:
+            rows = fetch(c, "head_lines", {"layer": layer, "first": first, "end": end})
+        return [HeadLine(TileId(tile), *rest) for tile, *rest in rows]
+
     def history(self, layer: str, tile: TileId) -> list[VersionInfo]:
         """See `Store.history`."""
         with self._readers.snapshot() as c:
@@ -405,11 +526,8 @@ class SqliteStore:
         return self._writer.run(lambda c: versions.collect(c, keep_versions))
 
     def backup(self, path: str | Path) -> None:
-        """See `Store.backup` (VACUUM INTO)."""
-        if Path(path).exists():
-            raise StoreError(f"{path}: exists; a backup never overwrites")
-        with self._readers.connection() as c:
-            c.execute("VACUUM INTO ?", (str(path),))
+        """See `Store.backup`."""
+        copy_store(self.path, Path(path))
 
 
 def _content(tile: AnyTile, layer: str) -> Content:

@@ -11,6 +11,7 @@ from gnd_map.tile_id import TileId
 from tile_store import lease_clock
 from tile_store import sqlite_inbox as inbox
 from tile_store.errors import IdTaken
+from tile_store.retention import trim_quarantine
 from tile_store.sqlite_connection import Row, change, fetch
 from tile_store.uploads import FirstHalf, Settled, Upload, UploadClaim, UploadCounts, UploadStatus
 from tile_store.values import PutStatus, ReportRow, StoreConfig
@@ -63,7 +64,7 @@ def release(c: apsw.Connection, owner: str) -> int:
     return change(c, "release_uploads", {"owner": owner})
 
 
-def settle(c: apsw.Connection, settled: Settled, config: StoreConfig, now: int) -> bool:
+def settle(c: apsw.Connection, settled: Settled, config: StoreConfig, timing: dict[str, Any]) -> bool:
     """Apply what a worker has made of an upload; False, and nothing is applied, when its lease is another's.
 
     Raises:
@@ -75,13 +76,14 @@ def settle(c: apsw.Connection, settled: Settled, config: StoreConfig, now: int) 
     statement = "wait_for_flags" if settled.state == "early" else "settle_upload"
     if not change(c, statement, told | {"upload": claim.number, "token": claim.token}):
         return False
-    _journal(c, settled.rows, config, now)
+    _journal(c, settled.rows, config, timing)
     if settled.first is not None:
         answered = {name: getattr(settled.first, name) for name in type(settled.first).__slots__}
         change(c, "answer_first_half", answered)
     if settled.state == "quarantined":
         row = {"sha": sha256(upload.body).digest(), "source": upload.key, "reason": settled.reason}
-        change(c, "insert_quarantine", row | {"body": upload.body, "received_ns": now})
+        change(c, "insert_quarantine", row | {"body": upload.body, "received_ns": timing["now"]})
+        trim_quarantine(c, config.quarantine_bytes)
     if upload.form == "packed":
         change(c, "wake_gaussians", {"report_id": upload.report_id, "key": upload.key})
     if upload.form == "whole" and settled.state == "released":
@@ -89,8 +91,8 @@ def settle(c: apsw.Connection, settled: Settled, config: StoreConfig, now: int) 
     return True
 
 
-def _journal(c: apsw.Connection, rows: Sequence[ReportRow], config: StoreConfig, now: int) -> None:
-    for row, status in zip(rows, inbox.put_reports(c, rows, config, now), strict=True):
+def _journal(c: apsw.Connection, rows: Sequence[ReportRow], config: StoreConfig, timing: dict[str, Any]) -> None:
+    for row, status in zip(rows, inbox.put_reports(c, rows, config, timing), strict=True):
         if status == "duplicate":
             place = {"layer": row.layer, "tile": row.tile.morton, "report_id": row.report_id, "part": row.part}
             ((vehicle,),) = fetch(c, "vehicle_of_report", place)

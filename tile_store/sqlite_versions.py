@@ -43,7 +43,7 @@ def publish(
     if not inbox.holds(c, claim):
         return PublishResult("stale", head.version)
     if head.version != publication.base_version:
-        inbox.postpone(c, claim, timing["now"])  # ready at once, against the head as it is now
+        inbox.postpone(c, claim, timing["steady"])  # ready at once, against the head as it is now
         return PublishResult("stale", head.version)
     provenance = _provenance(c, publication)
     result = PublishResult("unchanged", head.version)

@@ -1,6 +1,5 @@
 """`gnd map status`: what a map is waiting for."""
 
-import json
 from contextlib import suppress
 from dataclasses import asdict
 from datetime import UTC, datetime
@@ -14,7 +13,7 @@ from rich.table import Table
 
 from schemas.changes import ChangeReport
 from schemas.errors import SchemaError
-from tile_store.sqlite_store import SqliteStore
+from tile_store.options import json_option, show, to_read
 from tile_store.store import Store
 from tile_store.values import VehicleAccount, WaitingChange, WaitingReason
 
@@ -33,27 +32,37 @@ DOUBTED: Final = ("doubtful", "shift")
 
 @click.command(short_help="What the map waits for: confirmation, merging, people.")
 @click.argument("path", metavar="STORE", type=click.Path(path_type=Path))
-@click.option("--json", "as_json", is_flag=True, help="Print JSON instead of tables.")
+@json_option
 def status(path: Path, as_json: bool) -> None:
-    """What STORE waits for: unconfirmed changes, vehicles to be checked, tiles to merge, refused messages."""
-    with SqliteStore(path, create=False) as store:
+    """How STORE stands: its shards and its queue, tiles set aside, unconfirmed changes, vehicles to be checked, refused
+    messages.
+    """
+    with to_read(path) as store:
         values = status_of(store)
-    if as_json:
-        click.echo(json.dumps(values, indent=1))
-    else:
-        print_status(Console(width=120), str(path), values)
+    show(values, as_json, lambda console: print_status(console, str(path), values))
 
 
 def status_of(store: Store) -> dict[str, Any]:
-    """All that waits, in plain values: `waiting_for_confirmation`, `named_vehicles`, `to_merge`, `quarantined`."""
+    """How the store stands, in plain values; each key is one table or line of `gnd map status`."""
     claims = [
         asdict(one) | {"tile": one.tile.path, "doubts": _doubts_of(store, one)} for one in store.waiting_changes()
     ]
+    state, counts = store.queue_state(), store.counts()
     return {
+        "shards": [asdict(one) | {"is_alive": one.is_alive} for one in store.shards()],
+        "queue": {
+            "tiles": counts.dirty,
+            "report_parts": counts.waiting,
+            "overdue_s": state.overdue_s,
+            "waiting_s": state.waiting_s,
+        },
+        "merge_lag_s": {"p50": state.lag_s(0.5), "p95": state.lag_s(0.95), "max": state.lag_s(1.0)},
+        "set_aside": [asdict(one) | {"tile": one.tile.path} for one in store.tiles_set_aside()],
         "waiting_for_confirmation": waiting_totals(store) | {"claims": claims},
         "named_vehicles": named_vehicles(store),
         "to_merge": [asdict(one) | {"tile": one.tile.path} for one in store.dirty_tiles()],
-        "quarantined": store.counts().quarantined,
+        "quarantined": state.quarantined,
+        "quarantined_bytes": state.quarantined_bytes,
     }
 
 
@@ -112,23 +121,58 @@ def _side(length_m: float, ahead: str, behind: str) -> str:
 
 
 def print_status(console: Console, title: str, values: dict[str, Any]) -> None:
-    """One table for each thing that waits, and one line where nothing does."""
+    """One line for shards and queue, then one table for each thing that waits, and one line where nothing does."""
     waiting, to_merge, named = values["waiting_for_confirmation"], values["to_merge"], values["named_vehicles"]
-    for one in named:
-        console.print(one["says"], highlight=False, soft_wrap=True)
+    lines = [_shards_line(values["shards"]), *_queue_lines(values)]
+    for line in [*lines, *(one["says"] for one in named)]:
+        console.print(line, highlight=False, soft_wrap=True)
+    if values["set_aside"]:
+        console.print(_aside_table(values["set_aside"]))
     if waiting["claims"]:
         console.print(_waiting_table(waiting))
     if to_merge:
         console.print(_merge_table(to_merge))
     if values["quarantined"]:
-        line = f"{values['quarantined']} messages in quarantine: see `gnd map quarantine`"
-        console.print(line, highlight=False, soft_wrap=True)
-    if not (named or waiting["claims"] or to_merge or values["quarantined"]):
+        size = f"{values['quarantined']} messages in quarantine ({values['quarantined_bytes'] / 1e6:.2f} MB)"
+        console.print(f"{size}: see `gnd map quarantine`", highlight=False, soft_wrap=True)
+    if not (named or waiting["claims"] or to_merge or values["quarantined"] or values["set_aside"]):
         console.print(
             f"{title}: all reports merged, nothing waits for confirmation, none refused",
             highlight=False,
             soft_wrap=True,
         )
+
+
+def _shards_line(shards: list[dict[str, Any]]) -> str:
+    alive = [one["owner"] for one in shards if one["is_alive"]]
+    gone = [one["owner"] for one in shards if not one["is_alive"]]
+    line = f"merger shards: {', '.join(alive) or 'none is running'}"
+    return f"{line}; ended without saying so: {', '.join(gone)}" if gone else line
+
+
+def _queue_lines(values: dict[str, Any]) -> list[str]:
+    queue, lag = values["queue"], values["merge_lag_s"]
+    lines = []
+    if queue["tiles"]:
+        lines.append(
+            f"queue: {queue['tiles']} tiles, {queue['report_parts']} report parts, the oldest waits for"
+            f" {queue['waiting_s']:.1f} s; the first tile is overdue by {queue['overdue_s']:.1f} s"
+        )
+    if lag["p50"] is not None:
+        lines.append(
+            f"from receipt to published version: median {lag['p50']:.2f} s, 95 % {lag['p95']:.2f} s,"
+            f" longest {lag['max']:.2f} s"
+        )
+    return lines
+
+
+def _aside_table(aside: list[dict[str, Any]]) -> Table:
+    title = f"{len(aside)} tiles set aside; their reports wait (`gnd map check`, then `gnd map retry`)"
+    table = Table("layer", "tile", "reports", "attempts", "since (UTC)", "because", title=title)
+    for one in aside:
+        numbers = (str(one["reports"]), str(one["attempts"]), _time(one["since_ns"]))
+        table.add_row(one["layer"], one["tile"], *numbers, one["reason"])
+    return table
 
 
 def _waiting_table(waiting: dict[str, Any]) -> Table:

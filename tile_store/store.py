@@ -14,15 +14,19 @@ from tile_store.values import (
     Claim,
     DirtyTile,
     GcResult,
+    HeadLine,
     Notice,
     Publication,
     PublishResult,
     PutStatus,
     Quarantined,
+    QueueState,
     ReportRow,
+    ShardSeen,
     StoreCounts,
     StoredTile,
     TileJournal,
+    TileSetAside,
     TileWork,
     VehicleAccount,
     VersionInfo,
@@ -96,7 +100,13 @@ class Store(Protocol):
     # The queue
 
     def claim(self, owner: str, n: int, lease_s: float, prefer: Sequence[str] = ()) -> list[Claim]:
-        """Lease up to `n` tiles that are ready to merge, those in the regions `prefer` (path prefixes) first."""
+        """Lease up to `n` tiles that are ready to merge, those in the regions `prefer` (path prefixes) first.
+
+        Leases and delays run by a clock that does not step; those of an earlier boot of the machine are over.
+        """
+
+    def begin(self, claim: Claim, lease_s: float) -> bool:
+        """Count an attempt to merge a claimed tile and prolong its lease; False where another owner has it."""
 
     def renew(self, claims: Sequence[Claim], lease_s: float) -> list[bool]:
         """Prolong leases; False where the lease has gone to another owner."""
@@ -108,10 +118,41 @@ class Store(Protocol):
         """Give a tile back, to be ready again after `delay_s` (its merge has failed)."""
 
     def dirty_count(self) -> int:
-        """Tiles that wait to be merged, leased ones included."""
+        """Tiles that wait to be merged, leased ones included, those set aside not."""
 
-    def next_ready_ns(self) -> int | None:
-        """When the next tile can be claimed (a lease's end included); None: nothing waits."""
+    def ready_in_s(self) -> float | None:
+        """How soon the next tile can be claimed (a lease's end included), at most 0 when it can be now; None: nothing
+        waits.
+        """
+
+    def set_aside(self, claim: Claim, reason: str) -> bool:
+        """Leave a tile that cannot be merged as it is; its reports go on waiting. It is tried again when a report about
+        it arrives, when somebody takes it up again, and once after a minute, then ever more seldom. False where the
+        lease has gone to another owner.
+        """
+
+    def tiles_set_aside(self) -> list[TileSetAside]:
+        """The tiles that are set aside, by layer and tile."""
+
+    def take_up_again(self, tiles: Iterable[tuple[str, TileId]]) -> int:
+        """Make tiles that are set aside ready to merge; how many of them were."""
+
+    # Shards
+
+    def join(self, owner: str) -> None:
+        """A merger shard begins: leases of an earlier life of the same name are freed."""
+
+    def beat(self, owner: str, claims: Sequence[Claim], lease_s: float) -> list[bool]:
+        """A shard's sign of life, with which it prolongs its leases; False where one has gone to another owner."""
+
+    def leave(self, owner: str) -> None:
+        """A shard ends: its leases are freed."""
+
+    def shards(self) -> list[ShardSeen]:
+        """The shards that have joined and not left, by name."""
+
+    def queue_state(self) -> QueueState:
+        """How far the merging lags behind what has arrived, and how much is in quarantine."""
 
     # Merging and publishing
 
@@ -192,6 +233,9 @@ class Store(Protocol):
     def heads(self, layer: str = DEFAULT_LAYER, prefix: str = "") -> list[CatalogEntry]:
         """The newest versions of a region's tiles (a prefix of their path), sorted by tile."""
 
+    def head_lines(self, layer: str = DEFAULT_LAYER, prefix: str = "") -> list[HeadLine]:
+        """The same with their times, codecs and sizes; no body is read."""
+
     def history(self, layer: str, tile: TileId) -> list[VersionInfo]:
         """The versions of a tile that retention has left, oldest first."""
 
@@ -212,7 +256,7 @@ class Store(Protocol):
         """
 
     def backup(self, path: str | Path) -> None:
-        """A consistent copy while the store is in use."""
+        """A consistent copy while the store is in use, compared with its hashes; nothing is overwritten."""
 
     def close(self) -> None:
         """Finish what is queued and free the store. Calling it twice is harmless."""

@@ -1,5 +1,6 @@
 """The answers of `gnd map` as tables for people."""
 
+from collections.abc import Mapping
 from datetime import UTC, datetime
 from typing import Any
 
@@ -20,23 +21,35 @@ def fields(title: str, values: dict[str, Any]) -> Table:
 def info(title: str, told: dict[str, Any]) -> Table:
     """What a store holds: the map of a region, then the store's inbox, queue and quarantine."""
     store = told["store"]
+    heights = {}
+    if "lowest_m" in told:
+        heights["heights"] = f"{told['lowest_m']} m to {told['highest_m']} m above the ellipsoid"
     return fields(
         title,
         {
             "layer": f"{told['layer']} of {', '.join(told['layers'])}",
             "region": told["prefix"] or "everywhere",
             "tiles": f"{told['tiles']} in {told['districts']} districts",
-            **(_features(told) if "features" in told else _gaussians(told)),
+            **_content(told),
             "versions": f"{told['lowest_version']} to {told['highest_version']}",
             "updated": f"{_time(told['updated_ns'])} UTC",
             "south-west": f"{told['south_deg']:.6f}, {told['west_deg']:.6f}",
             "north-east": f"{told['north_deg']:.6f}, {told['east_deg']:.6f}",
-            "heights": f"{told['lowest_m']} m to {told['highest_m']} m above the ellipsoid",
+            **heights,
             "reports": f"{store['reports']} over {store['report_rows']} tiles, {store['waiting']} to merge",
             "tiles to merge": store["dirty"],
+            "tiles set aside": store["set_aside"],
             "in quarantine": store["quarantined"],
         },
     )
+
+
+def _content(told: dict[str, Any]) -> dict[str, Any]:
+    if "features" in told:
+        return _features(told)
+    if "gaussians" in told:
+        return _gaussians(told)
+    return {"size": f"{told['body_bytes'] / 1e6:.3f} MB", "codecs": _listed(told["codecs"], " tiles")}
 
 
 def _gaussians(told: dict[str, Any]) -> dict[str, Any]:
@@ -101,3 +114,20 @@ def quarantine(rows: list[dict[str, Any]]) -> Table:
 
 def _time(t_ns: int) -> str:
     return datetime.fromtimestamp(t_ns / 1e9, UTC).strftime("%Y-%m-%d %H:%M:%S")
+
+
+def checked(title: str, told: dict[str, Any]) -> Table:
+    """One row a thing that is not whole."""
+    table = Table("what", "which", "why", title=f"{title}: {len(told['damages'])} damages")
+    for one in told["damages"]:
+        table.add_row(one["kind"], one["name"], one["why"])
+    return table
+
+
+def rollback(steps: list[dict[str, Any]], meaning: Mapping[Any, str]) -> Table:
+    """One row a tile."""
+    table = Table("tile", "version", "content of", "it")
+    for one in steps:
+        content = str(one["to_version"]) if one["to_version"] else "nothing"
+        table.add_row(one["tile"], str(one["from_version"]), content, meaning[one["action"]])
+    return table

@@ -2,6 +2,7 @@
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from math import ceil
 from typing import Final, Literal
 
 from gnd_map.codec import LATTICES, Lattice
@@ -51,6 +52,9 @@ def lattice_named(codec: str) -> Lattice | None:
     return LATTICES.get(codec)
 
 
+SHARD_SILENT_S: Final = 15.0
+"""A shard that has been silent for so long counts as gone."""
+
 REFUTED_TESTS: Final = 3
 """A report is refuted after so many tiles in which it stands alone against others, ..."""
 REFUTED_SHARE: Final = 0.5
@@ -99,12 +103,16 @@ class StoreConfig:
     """A writer waits this long for the writers of other processes."""
     group_max: int = 256
     """At most so many calls share one commit."""
+    quarantine_mb: float = 64.0
+    """Of the newest refused messages so much is kept: nobody can fill the disk with nonsense."""
 
     def __post_init__(self) -> None:
         if self.merge_delay_s < 0 or self.busy_timeout_s <= 0:
             raise StoreError(
                 f"merge_delay_s {self.merge_delay_s} and busy_timeout_s {self.busy_timeout_s} must be >= 0"
             )
+        if self.quarantine_mb <= 0:
+            raise StoreError(f"quarantine_mb {self.quarantine_mb} must be positive")
         if self.window_s <= 0:
             raise StoreError(f"window_s must be positive, got {self.window_s}")
         for name in (
@@ -113,6 +121,11 @@ class StoreConfig:
         ):  # fmt: skip
             if getattr(self, name) < 1:
                 raise StoreError(f"{name} must be at least 1, got {getattr(self, name)}")
+
+    @property
+    def quarantine_bytes(self) -> int:
+        """How much of the refused messages is kept, bytes."""
+        return round(self.quarantine_mb * 1e6)
 
 
 @dataclass(frozen=True, slots=True)
@@ -205,9 +218,21 @@ class VersionInfo:
 
 
 @dataclass(frozen=True, slots=True)
+class HeadLine:
+    """A tile's newest version without its body."""
+
+    tile: TileId
+    version: int
+    created_ns: int
+    codec_id: int
+    size_bytes: int
+
+
+@dataclass(frozen=True, slots=True)
 class Claim:
     """A lease on a dirty tile. `seq` counts the reports that had arrived, `token` tells this lease from any other,
-    `attempts` says how often the tile was claimed since it was last published (1: the first time).
+    `attempts` says which attempt to merge the tile since it was last published begins with it (1: the first);
+    `is_retry`: the tile is set aside, and this is one more attempt after a pause.
     """
 
     layer: str
@@ -216,6 +241,7 @@ class Claim:
     owner: str
     token: int = 0
     attempts: int = 1
+    is_retry: bool = False
 
 
 @dataclass(frozen=True, slots=True)
@@ -315,6 +341,55 @@ class DirtyTile:
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "is_leased", bool(self.is_leased))
+
+
+@dataclass(frozen=True, slots=True)
+class TileSetAside:
+    """A tile that could not be read or merged, since when (UTC), after how many attempts, and why; its reports wait."""
+
+    layer: str
+    tile: TileId
+    since_ns: int
+    attempts: int
+    reports: int
+    reason: str
+
+
+@dataclass(frozen=True, slots=True)
+class QueueState:
+    """How the queue stands.
+
+    Attributes:
+        overdue_s: since when a tile that is ready has not been merged, by the queue's clock; 0: none is.
+        waiting_s: since when a report waits that no merge has read, by the time of day; tiles set aside do not count.
+        lags_s: from receipt to published version, of the newest report parts that made one, sorted.
+        quarantined: refused messages, ...
+        quarantined_bytes: ... and their bytes.
+    """
+
+    overdue_s: float
+    waiting_s: float
+    lags_s: tuple[float, ...]
+    quarantined: int
+    quarantined_bytes: int
+
+    def lag_s(self, share: float) -> float | None:
+        """The lag that this share of the newest parts did not exceed; None: nothing was published yet."""
+        return self.lags_s[ceil(share * len(self.lags_s)) - 1] if self.lags_s else None
+
+
+@dataclass(frozen=True, slots=True)
+class ShardSeen:
+    """A merger shard: when it joined (UTC), and how long ago it gave its last sign of life (None: before this boot)."""
+
+    owner: str
+    since_ns: int
+    silent_s: float | None
+
+    @property
+    def is_alive(self) -> bool:
+        """Whether it has been heard of lately."""
+        return self.silent_s is not None and self.silent_s < SHARD_SILENT_S
 
 
 @dataclass(frozen=True, slots=True)
@@ -512,3 +587,4 @@ class StoreCounts:
     waiting: int
     dirty: int
     quarantined: int
+    set_aside: int = 0

@@ -6,11 +6,12 @@ import threading
 from collections.abc import Callable
 from concurrent.futures import Future
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import Any, TypeVar
 
 import apsw
 
-from tile_store.errors import StoreClosed
+from tile_store.errors import StoreClosed, StoreUnavailable
 from tile_store.sqlite_connection import as_store_error
 
 T = TypeVar("T")
@@ -21,6 +22,20 @@ _log = logging.getLogger(__name__)
 class _Job:
     work: Callable[[apsw.Connection], Any]
     future: "Future[Any]" = field(default_factory=Future)
+
+
+class NoWriter:
+    """Stands where a store is only read: whatever would write is refused."""
+
+    def __init__(self, path: Path) -> None:
+        self._path = path
+
+    def run(self, _work: Callable[[apsw.Connection], T]) -> T:
+        """Always StoreUnavailable."""
+        raise StoreUnavailable(f"{self._path}: opened for reading only")
+
+    def close(self) -> None:
+        """Nothing to close."""
 
 
 class GroupWriter:

@@ -3,6 +3,7 @@
 import logging
 
 import apsw
+import numpy as np
 import pytest
 from merger_world import (
     GROUND,
@@ -20,6 +21,8 @@ from upload_desk import Desk
 
 from cloud_merger.config import ShardConfig
 from cloud_merger.work import Worker
+from gnd_map.gaussian import Gaussians
+from gnd_map.tile import Tile
 from gnd_map.tile_id import TileId
 from schemas.keys import change_key
 from tile_store.sqlite_store import SqliteStore
@@ -118,22 +121,66 @@ def test_a_tile_whose_merge_fails_is_set_aside_after_some_attempts_and_the_other
         assert [r.status for r in merge_once(store, worker)] == ["published"]
         assert store.dirty_count() == 1
         assert merge_once(store, worker) == []
-        assert [r.status for r in merge_once(store, worker)] == ["unchanged"]
+        assert merge_once(store, worker) == []
     assert store.dirty_count() == 0
-    (kept,) = store.quarantined()
-    assert "set aside after 3 attempts" in kept.reason
-    assert "damaged" in kept.reason
-    assert kept.body.decode().split() == ["ndt", NEIGHBOUR.path, failing]
-    assert store.counts().report_rows == 2  # the report itself is not lost
+    (aside,) = store.tiles_set_aside()
+    assert (aside.tile, aside.attempts, aside.reports) == (NEIGHBOUR, 3, 1)
+    assert "damaged" in aside.reason
+    assert [row.report_id for row in store.in_play("ndt", NEIGHBOUR).reports] == [failing]
+    damage(store, NEIGHBOUR)  # the same bit again: it is whole
+    assert store.take_up_again([("ndt", NEIGHBOUR)]) == 1
+    assert [r.status for r in merge_once(store, worker)] == ["published"]
+    assert store.provenance("ndt", NEIGHBOUR, 2) == (failing,)
+    assert (store.tiles_set_aside(), store.counts().waiting) == ([], 0)
+
+
+def test_a_damaged_page_stops_its_own_tile_only(tmp_path, caplog):
+    path = tmp_path / "damaged.sqlite"
+    config = ShardConfig(store_path=path, retry_s=0.0, max_attempts=2, confirmation=VOXEL_BY_VOXEL)
+    with SqliteStore(path, StoreConfig(merge_delay_s=0.0)) as store:
+        store.put_tiles([large_tile(NEIGHBOUR), tile_of_states(STATES, TILE)])
+        body = store.get("ndt", NEIGHBOUR).body
+    damage_page(path, body)
+    with SqliteStore(path, StoreConfig(merge_delay_s=0.0)) as store, caplog.at_level(logging.CRITICAL):
+        failing = put(store, 1, tile=NEIGHBOUR, base=None)
+        put(store, 2)
+        worker = Worker(store, config)
+        results = []
+        while claims := store.claim("one", 16, 30.0):
+            results += [worker.settle(claim) for claim in claims]
+        assert [r.status for r in results if r] == ["published"]
+        (aside,) = store.tiles_set_aside()
+        assert (aside.tile, aside.attempts) == (NEIGHBOUR, 2)
+        assert "StoreDamaged" in aside.reason
+        assert [row.report_id for row in store.reports() if row.tile == NEIGHBOUR] == [failing]
+
+
+def large_tile(tile):
+    """One that needs several pages."""
+    random = np.random.default_rng(5)
+    n = 2000
+    ids = np.arange(n, dtype=np.int32)
+    half = np.tile(np.array([0.01, 0, 0, 0.01, 0, 0.01], dtype=np.float32), (n, 1))
+    mean_m = random.uniform(0.1, 0.9, (n, 3)).astype(np.float32)
+    return Tile(tile, 0, Gaussians(ids, np.full(n, 50, np.int32), np.full(n, 9, np.int32), mean_m, half))
+
+
+def damage_page(path, body):
+    """Break the chain of pages in the middle of a body, as a failing disk would."""
+    raw = bytearray(path.read_bytes())
+    at = raw.index(body[len(body) // 2 : len(body) // 2 + 64]) // 4096 * 4096
+    raw[at : at + 4] = b"\xff" * 4
+    path.write_bytes(raw)
 
 
 def test_a_tile_that_kills_its_shards_is_set_aside_without_another_attempt(store, worker):
     first = put(store, 1)
     for shard in ("a", "b", "c"):
-        assert store.claim(shard, 1, 30.0)
+        (claim,) = store.claim(shard, 1, 30.0)
+        assert store.begin(claim, 30.0)
         store.release(shard)  # as the others do when it has died
-    assert [r.status for r in merge_once(store, worker)] == ["unchanged"]
-    assert "no shard that claimed it came to an end" in store.quarantined()[0].reason
+    assert merge_once(store, worker) == []
+    assert "no shard that merged it came to an end" in store.tiles_set_aside()[0].reason
     second = put(store, 2)  # the next report gives both another chance
     assert [r.status for r in merge_once(store, worker)] == ["published"]
     assert store.provenance("ndt", TILE, 2) == (first, second)
@@ -157,6 +204,15 @@ def test_a_lease_that_was_lost_publishes_nothing(store, worker):
     assert store.get("ndt", TILE).version == 2
 
 
+def test_a_lease_that_was_lost_before_its_turn_is_no_work_and_no_crash(store, worker):
+    put(store, 1)
+    (claim,) = store.claim("slow", 16, 30.0)
+    store.release("slow")
+    assert [r.status for r in merge_once(store, worker)] == ["published"]
+    assert worker.settle(claim) is None
+    assert (store.get("ndt", TILE).version, store.dirty_count(), store.tiles_set_aside()) == (2, 0, [])
+
+
 def test_idle_time_ends_when_the_next_tile_is_ready(store, worker):
     assert worker.idle_s(None) == ShardConfig().poll_s
-    assert worker.idle_s(0) == pytest.approx(0.005)
+    assert worker.idle_s(-3.0) == pytest.approx(0.005)

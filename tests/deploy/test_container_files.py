@@ -21,7 +21,7 @@ def _compose_commands() -> list[list[str]]:
 
 def _systemd_commands() -> list[list[str]]:
     lines = [re.search(r"^ExecStart=(.*)$", path.read_text(), re.M) for path in (DEPLOY / "systemd").glob("*.service")]
-    return [shlex.split(line.group(1))[1:] for line in lines if line]
+    return [shlex.split(line.group(1).replace("%i", "0"))[1:] for line in lines if line]
 
 
 def _documented_commands() -> list[list[str]]:

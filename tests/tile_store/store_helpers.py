@@ -40,7 +40,8 @@ class SqliteMaker:
     path: Path
 
     def open(self, config: StoreConfig = EAGER, clock: Clock | None = None) -> Store:
-        return SqliteStore(self.path, config, now_ns=clock or Clock())
+        clock = clock or Clock()
+        return SqliteStore(self.path, config, now_ns=clock, steady_ns=clock)
 
 
 def tile_of_voxels(tile: TileId, *voxels: int) -> Tile:

@@ -277,10 +277,10 @@ def test_commands_with_a_layer(store: SqliteStore) -> None:
     put(store, tile(TILE, sign(1), sign(2)))
     put(store, tile(TILE, sign(2), lane(6)))
     path = store.path
-    shown = gnd_map("info", path, "--layer", "signs")
+    shown = gnd_map("info", path, "--layer", "signs", "--deep")
     assert "2 in 2 pieces with 4 points" in shown
     assert "lane_boundary (1), traffic_sign (1)" in shown
-    assert json.loads(gnd_map("info", path, "--layer", "signs", "--json"))["kinds"] == {
+    assert json.loads(gnd_map("info", path, "--layer", "signs", "--deep", "--json"))["kinds"] == {
         "lane_boundary": 1,
         "traffic_sign": 1,
     }

@@ -5,7 +5,6 @@ import subprocess
 import sys
 import threading
 import time
-from dataclasses import replace
 from pathlib import Path
 
 import apsw
@@ -13,7 +12,8 @@ import pytest
 from store_helpers import EAGER, TILE, report, report_id, tile_of_voxels
 
 from tile_store.errors import StoreBusy, StoreClosed, StoreError, StoreUnavailable
-from tile_store.sqlite_connection import APPLICATION_ID, SCHEMA_VERSION, open_writer
+from tile_store.migrations import APPLICATION_ID, SCHEMA_VERSION
+from tile_store.sqlite_connection import open_writer
 from tile_store.sqlite_store import SqliteStore
 from tile_store.values import StoreConfig
 
@@ -78,25 +78,15 @@ def test_a_store_of_a_newer_release_is_refused(tmp_path: Path) -> None:
     assert f"store schema {SCHEMA_VERSION + 1}, this release reads up to {SCHEMA_VERSION}" in opens_as(path)
 
 
-def test_a_store_from_before_reports_had_parts_gets_them_and_keeps_its_reports(tmp_path: Path) -> None:
-    path = tmp_path / "s.db"
-    with SqliteStore(path) as store:
-        store.put_reports([report(1)])
-    older = apsw.Connection(str(path))
-    older.execute("DROP INDEX report_key; ALTER TABLE report DROP COLUMN part")
-    older.execute("CREATE UNIQUE INDEX report_key ON report (layer, tile, report_id)")
-    older.close()
-    with SqliteStore(path) as store:
-        assert store.put_reports([report(1), replace(report(1), part=1)]) == ["duplicate", "stored"]
-        assert [row.part for row in store.reports()] == [0, 1]
-
-
 def test_a_truncated_store_is_named(tmp_path: Path) -> None:
     path = tmp_path / "s.db"
     with SqliteStore(path) as store:
         store.put_tiles([tile_of_voxels(TILE, *range(2000))])
     path.write_bytes(path.read_bytes()[:8192])
-    with pytest.raises(StoreUnavailable, match=r"damaged .* restore the newest backup"), SqliteStore(path) as store:
+    with (
+        pytest.raises(StoreUnavailable, match=r"damaged .* `gnd map restore` puts a backup back"),
+        SqliteStore(path) as store,
+    ):
         store.get("ndt", TILE)
 
 

@@ -5,7 +5,9 @@ import threading
 import pytest
 from store_helpers import EAGER, EAST, FAR, TILE, Clock, SqliteMaker, only_claim, publication, report
 
+from tile_store import clocks
 from tile_store.errors import StoreError
+from tile_store.sqlite_store import SqliteStore
 from tile_store.store import Store
 from tile_store.values import StoreConfig
 
@@ -14,17 +16,16 @@ PATIENT = StoreConfig(merge_delay_s=2.0, merge_after_reports=3)
 
 def test_nothing_to_do_in_an_empty_store(store: Store) -> None:
     assert store.claim("m1", 10, 10.0) == []
-    assert store.next_ready_ns() is None
+    assert store.ready_in_s() is None
     assert store.dirty_count() == 0
 
 
 def test_a_tile_is_ready_a_delay_after_its_first_report(maker: SqliteMaker, clock: Clock) -> None:
     store = maker.open(PATIENT, clock)
-    first = clock.ns
     store.put_reports([report(1)])
     clock.advance(1.5)
     store.put_reports([report(2)])
-    assert store.next_ready_ns() == first + 2_000_000_000
+    assert store.ready_in_s() == pytest.approx(0.5)
     assert store.claim("m1", 1, 10.0) == []
     clock.advance(0.5)
     assert only_claim(store).seq == 2
@@ -51,9 +52,10 @@ def test_a_claimed_tile_is_nobody_elses_until_the_lease_ends(store: Store, clock
     store.put_reports([report(1)])
     first = only_claim(store, "m1", lease_s=5.0)
     assert first.attempts == 1
+    assert store.begin(first, 5.0)
     assert store.claim("m2", 10, 5.0) == []
     assert store.claim("m1", 10, 5.0) == []
-    assert store.next_ready_ns() == clock.ns + 5_000_000_000
+    assert store.ready_in_s() == pytest.approx(5.0)
     clock.advance(5.0)
     second = only_claim(store, "m2")
     assert second.attempts == 2
@@ -83,7 +85,9 @@ def test_the_leases_of_the_dead_are_freed_at_once(store: Store) -> None:
 
 def test_a_postponed_tile_waits_and_counts_its_attempts(store: Store, clock: Clock) -> None:
     store.put_reports([report(1)])
-    store.postpone(only_claim(store), 3.0)
+    claim = only_claim(store)
+    assert store.begin(claim, 10.0)
+    store.postpone(claim, 3.0)
     assert store.claim("m2", 1, 10.0) == []
     clock.advance(3.0)
     assert only_claim(store, "m2").attempts == 2
@@ -146,3 +150,118 @@ def test_attempts_start_anew_after_a_publication(store: Store) -> None:
     store.publish([publication(store.load(claim), 1)])
     store.put_reports([report(3)])
     assert only_claim(store).attempts == 1
+
+
+def test_only_a_merge_that_was_begun_counts_as_an_attempt(store: Store) -> None:
+    store.put_reports([report(1), report(1, EAST)])
+    first, second = store.claim("killed", 2, 10.0)
+    assert store.begin(first, 10.0)
+    store.release("killed")
+    assert {claim.tile: claim.attempts for claim in store.claim("m2", 2, 10.0)} == {first.tile: 2, second.tile: 1}
+    assert not store.begin(second, 10.0)
+
+
+@pytest.mark.parametrize("step_s", [-86_400.0, 86_400.0])
+def test_the_time_of_day_may_step_and_the_queue_does_not_care(maker: SqliteMaker, step_s: float) -> None:
+    day, steady = Clock(), Clock()
+    with SqliteStore(maker.path, PATIENT, now_ns=day, steady_ns=steady) as store:
+        store.put_reports([report(1)])
+        day.advance(step_s)
+        assert store.claim("m1", 1, 10.0) == []
+        assert store.ready_in_s() == pytest.approx(2.0)
+        steady.advance(2.0)
+        claim = only_claim(store, "m1", lease_s=10.0)
+        day.advance(-2 * step_s)
+        assert store.claim("m2", 1, 10.0) == []
+        assert store.renew([claim], 10.0) == [True]
+        steady.advance(10.0)
+        assert only_claim(store, "m2").token != claim.token
+
+
+def test_leases_and_delays_of_another_boot_are_over(maker: SqliteMaker, monkeypatch: pytest.MonkeyPatch) -> None:
+    late, early = Clock(), Clock()
+    early.ns = 5_000_000_000
+    with SqliteStore(maker.path, PATIENT, steady_ns=late) as store:
+        store.put_reports([report(1), report(2), report(3), report(1, EAST)])
+        held = only_claim(store, "dead", lease_s=600.0)
+        assert [one.is_alive for one in store.shards()] == []
+        store.join("alive")
+        assert [one.is_alive for one in store.shards()] == [True]
+    monkeypatch.setattr(clocks, "boot_id", lambda: "another")
+    with SqliteStore(maker.path, PATIENT, steady_ns=early) as store:
+        assert [one.is_alive for one in store.shards()] == [False]
+        assert {one.tile for one in store.claim("m1", 10, 10.0)} == {TILE, EAST}
+        assert store.renew([held], 10.0) == [False]
+        assert store.claim("m2", 10, 10.0) == []
+
+
+def test_a_tile_set_aside_waits_with_its_reports_until_it_is_taken_up_again(store: Store, clock: Clock) -> None:
+    store.put_reports([report(1), report(2), report(1, EAST)])
+    claim = next(one for one in store.claim("m1", 2, 5.0) if one.tile == TILE)
+    assert store.begin(claim, 5.0)
+    assert store.set_aside(claim, "a page is damaged")
+    clock.advance(59.0)
+    assert [one.tile for one in store.claim("m1", 2, 5.0)] == [EAST]
+    (aside,) = store.tiles_set_aside()
+    assert (aside.tile, aside.attempts, aside.reports, aside.reason) == (TILE, 1, 2, "a page is damaged")
+    assert (store.dirty_count(), store.counts().dirty, store.counts().waiting, store.counts().set_aside) == (1, 1, 3, 1)
+    assert not store.set_aside(claim, "a lease that is gone")
+    assert store.take_up_again([("ndt", TILE), ("ndt", EAST), ("signs", TILE)]) == 1
+    again = only_claim(store)
+    assert (again.tile, again.attempts, again.seq) == (TILE, 1, 2)
+    store.publish([publication(store.load(again), 1)])
+    assert (store.tiles_set_aside(), store.counts().waiting) == ([], 1)
+
+
+def test_a_tile_set_aside_is_tried_once_in_a_while_whatever_becomes_of_its_shard(store: Store, clock: Clock) -> None:
+    store.put_reports([report(1)])
+    for attempt in range(1, 6):
+        claim = only_claim(store)
+        assert (claim.attempts, claim.is_retry) == (attempt, False)
+        assert store.begin(claim, 10.0)
+        store.set_aside(claim, "why") if attempt == 5 else store.release("m1")
+    for pause_s in (60.0, 120.0, 240.0):
+        clock.advance(pause_s - 1.0)
+        assert store.claim("m1", 1, 10.0) == []
+        clock.advance(1.0)
+        claim = only_claim(store)
+        assert claim.is_retry
+        assert store.begin(claim, 10.0)
+        store.release("m1")  # it has killed this shard, too: no other is sent after it at once
+    clock.advance(1e5)
+    assert only_claim(store).is_retry
+    (aside,) = store.tiles_set_aside()
+    assert aside.attempts == 8
+
+
+def test_the_next_report_gives_a_tile_set_aside_another_chance(store: Store) -> None:
+    store.put_reports([report(1)])
+    claim = only_claim(store)
+    assert store.begin(claim, 5.0)
+    store.set_aside(claim, "why")
+    store.put_reports([report(2)])
+    assert store.tiles_set_aside() == []
+    again = only_claim(store)
+    assert (again.seq, again.attempts) == (2, 1)
+
+
+def test_a_shard_shows_that_it_lives_and_keeps_its_leases(store: Store, clock: Clock) -> None:
+    store.put_reports([report(1), report(1, EAST)])
+    store.join("m1")
+    claims = store.claim("m1", 2, 5.0)
+    clock.advance(4.0)
+    assert store.beat("m1", claims, 5.0) == [True, True]
+    clock.advance(4.0)
+    assert store.claim("m2", 2, 5.0) == []
+    (seen,) = store.shards()
+    assert (seen.owner, seen.silent_s, seen.is_alive) == ("m1", 4.0, True)
+    clock.advance(11.0)
+    assert not store.shards()[0].is_alive
+    store.join("m1")
+    assert len(store.claim("m1", 2, 5.0)) == 2
+    clock.advance(86_401.0)
+    store.join("m2")  # a day later m1 is not told of any more
+    assert [one.owner for one in store.shards()] == ["m2"]
+    store.leave("m2")
+    store.release("m1")
+    assert (store.shards(), len(store.claim("m2", 2, 5.0))) == ([], 2)

@@ -347,18 +347,6 @@ def test_a_base_of_which_nobody_told_when_it_was_surveyed_has_no_day(store: Stor
     assert day_of_head(store) == UNKNOWN_DAY
 
 
-def test_a_store_of_a_release_without_days_gets_room_for_them(store: Store, maker: SqliteMaker) -> None:
-    store.put_tiles([tile_of_voxels(TILE, 1)], surveyed_ns=1_700_000_000_000_000_000)
-    store.close()
-    with apsw.Connection(str(maker.path)) as connection:
-        connection.execute("DROP TRIGGER survey_goes; DROP TABLE survey")
-    again = maker.open()
-    assert day_of_head(again) == UNKNOWN_DAY
-    again.put_tiles([tile_of_voxels(TILE, 1)], surveyed_ns=1_700_000_000_000_000_000)
-    assert day_of_head(again) == day_of(1_700_000_000_000_000_000)
-    again.close()
-
-
 def test_a_survey_goes_with_its_version(store: Store, maker: SqliteMaker) -> None:
     for k in range(4):
         store.put_tiles([tile_of_voxels(TILE, k)], surveyed_ns=1_700_000_000_000_000_000)

@@ -331,7 +331,7 @@ ORDER BY layer, tile, vehicle, reason
 SELECT layer, tile, vehicle, reason, voxels, seen, since_ns FROM waiting_change WHERE layer = :layer AND tile = :tile
 
 -- name: dirty_tiles
-SELECT layer, tile, waiting, attempts, owner IS NOT NULL FROM dirty ORDER BY layer, tile
+SELECT layer, tile, waiting, attempts, owner IS NOT NULL FROM dirty WHERE aside_ns IS NULL ORDER BY layer, tile
 
 -- name: insert_report
 INSERT INTO report (layer, tile, report_id, part, vehicle, received_ns, seq, window, merged_in, base_sha, body)
@@ -340,25 +340,32 @@ ON CONFLICT (layer, tile, report_id, part) DO NOTHING
 
 -- name: mark_dirty
 INSERT INTO dirty (layer, tile, seq, waiting, ready_ns)
-VALUES (:layer, :tile, :seq, 1, CASE WHEN :merge_after <= 1 THEN :now ELSE :now + :delay END)
+VALUES (:layer, :tile, :seq, 1, CASE WHEN :merge_after <= 1 THEN :steady ELSE :steady + :delay END)
 ON CONFLICT (layer, tile) DO UPDATE SET
   seq = excluded.seq,
   waiting = waiting + 1,
-  ready_ns = MIN(ready_ns, CASE WHEN waiting + 1 >= :merge_after THEN :now ELSE :now + :delay END)
+  ready_ns = MIN(ready_ns, CASE WHEN waiting + 1 >= :merge_after THEN :steady ELSE :steady + :delay END),
+  attempts = CASE WHEN aside_ns IS NULL THEN attempts ELSE 0 END,
+  aside_ns = NULL,
+  aside_reason = NULL
 
 -- name: claimable
-SELECT layer, tile, seq, attempts FROM dirty INDEXED BY dirty_ready
-WHERE ready_ns <= :now AND (owner IS NULL OR lease_ns <= :now)
+SELECT layer, tile, seq, attempts, aside_ns IS NOT NULL FROM dirty INDEXED BY dirty_ready
+WHERE ready_ns <= :steady AND (owner IS NULL OR lease_ns <= :steady)
 ORDER BY ready_ns, layer, tile LIMIT :n
 
 -- name: claimable_in_region
-SELECT layer, tile, seq, attempts FROM dirty INDEXED BY dirty_tile
-WHERE ready_ns <= :now AND (owner IS NULL OR lease_ns <= :now) AND tile >= :first AND tile < :end
+SELECT layer, tile, seq, attempts, aside_ns IS NOT NULL FROM dirty INDEXED BY dirty_tile
+WHERE ready_ns <= :steady AND (owner IS NULL OR lease_ns <= :steady) AND tile >= :first AND tile < :end
 ORDER BY ready_ns, layer, tile LIMIT :n
 
 -- name: take_lease
-UPDATE dirty SET owner = :owner, token = :token, lease_ns = :lease_ns, attempts = attempts + 1
-WHERE layer = :layer AND tile = :tile
+UPDATE dirty SET owner = :owner, token = :token, lease_ns = :lease_ns WHERE layer = :layer AND tile = :tile
+
+-- name: begin_merge
+UPDATE dirty SET attempts = attempts + 1, lease_ns = :lease_ns,
+  ready_ns = CASE WHEN aside_ns IS NULL THEN ready_ns ELSE :again_ns END
+WHERE layer = :layer AND tile = :tile AND token = :token
 
 -- name: renew_lease
 UPDATE dirty SET lease_ns = :lease_ns WHERE layer = :layer AND tile = :tile AND token = :token
@@ -387,7 +394,7 @@ DELETE FROM dirty WHERE layer = :layer AND tile = :tile AND seq <= :seq
 UPDATE dirty SET owner = NULL, token = NULL, lease_ns = NULL, attempts = 0,
   waiting = (SELECT COUNT(*) FROM report WHERE layer = :layer AND tile = :tile AND merged_in IS NULL),
   ready_ns = CASE WHEN (SELECT COUNT(*) FROM report WHERE layer = :layer AND tile = :tile AND merged_in IS NULL)
-                       >= :merge_after THEN :now ELSE :now + :delay END
+                       >= :merge_after THEN :steady ELSE :steady + :delay END
 WHERE layer = :layer AND tile = :tile
 
 -- name: head
@@ -474,7 +481,7 @@ SELECT arrival, report_id, layer, tile, vehicle, received_ns, body, base_sha, pa
 WHERE arrival > :after AND layer = :layer AND (:vehicle IS NULL OR vehicle = :vehicle) ORDER BY arrival LIMIT :n
 
 -- name: dirty_count
-SELECT COUNT(*) FROM dirty
+SELECT COUNT(*) FROM dirty WHERE aside_ns IS NULL
 
 -- name: next_ready
 SELECT MIN(CASE WHEN owner IS NULL THEN ready_ns ELSE MAX(ready_ns, lease_ns) END) FROM dirty
@@ -501,8 +508,9 @@ RETURNING size_bytes
 -- name: counts
 SELECT (SELECT COUNT(*) FROM tile_head), (SELECT COUNT(*) FROM tile_version),
        (SELECT COUNT(*) FROM (SELECT DISTINCT report_id FROM report)), (SELECT COUNT(*) FROM report),
-       (SELECT COUNT(*) FROM report WHERE merged_in IS NULL), (SELECT COUNT(*) FROM dirty),
-       (SELECT COUNT(*) FROM quarantine)
+       (SELECT COUNT(*) FROM report WHERE merged_in IS NULL),
+       (SELECT COUNT(*) FROM dirty WHERE aside_ns IS NULL), (SELECT COUNT(*) FROM quarantine),
+       (SELECT COUNT(*) FROM dirty WHERE aside_ns IS NOT NULL)
 
 -- name: put_feature_source
 INSERT INTO feature_source (name, created_ns, about, body) VALUES (:name, :created_ns, :about, :body)
@@ -620,3 +628,152 @@ SELECT MIN(received_ns) FROM upload WHERE state = 'waiting'
 
 -- name: forget_uploads
 DELETE FROM upload WHERE received_ns < :before_ns AND state <> 'waiting'
+
+-- name: schema_of_operations
+-- Step of the schema: the queue by a clock that does not step, tiles that are set aside, shards, bounds of the quarantine.
+-- From here on `ready_ns` and `lease_ns` are times of the machine's monotonic clock, in the boot that `queue_boot` names.
+ALTER TABLE dirty ADD COLUMN aside_ns INTEGER;
+ALTER TABLE dirty ADD COLUMN aside_reason TEXT;
+UPDATE dirty SET ready_ns = 0, owner = NULL, token = NULL, lease_ns = NULL;
+CREATE TABLE queue_boot (
+  one  INTEGER NOT NULL PRIMARY KEY CHECK (one = 1),
+  boot TEXT    NOT NULL
+) STRICT, WITHOUT ROWID;
+
+-- The sign of life of each merger shard: `beat_ns` by the monotonic clock of that boot, `since_ns` UTC.
+CREATE TABLE shard (
+  owner    TEXT    NOT NULL PRIMARY KEY,
+  boot     TEXT    NOT NULL,
+  beat_ns  INTEGER NOT NULL,
+  since_ns INTEGER NOT NULL
+) STRICT, WITHOUT ROWID;
+
+-- How much the quarantine holds, kept by triggers: its bound is checked with each message that is refused.
+CREATE TABLE quarantine_size (
+  one      INTEGER NOT NULL PRIMARY KEY CHECK (one = 1),
+  messages INTEGER NOT NULL,
+  bytes    INTEGER NOT NULL
+) STRICT, WITHOUT ROWID;
+INSERT INTO quarantine_size (one, messages, bytes)
+SELECT 1, COUNT(*), COALESCE(SUM(LENGTH(body) + LENGTH(reason) + LENGTH(source)), 0) FROM quarantine;
+CREATE INDEX quarantine_received ON quarantine (received_ns);
+CREATE TRIGGER quarantine_grows AFTER INSERT ON quarantine BEGIN
+  UPDATE quarantine_size SET messages = messages + 1,
+    bytes = bytes + LENGTH(NEW.body) + LENGTH(NEW.reason) + LENGTH(NEW.source);
+END;
+CREATE TRIGGER quarantine_shrinks AFTER DELETE ON quarantine BEGIN
+  UPDATE quarantine_size SET messages = messages - 1,
+    bytes = bytes - LENGTH(OLD.body) - LENGTH(OLD.reason) - LENGTH(OLD.source);
+END;
+CREATE INDEX report_received ON report (received_ns);
+
+-- name: boot_of_queue
+SELECT boot FROM queue_boot
+
+-- name: put_boot
+INSERT INTO queue_boot (one, boot) VALUES (1, :boot) ON CONFLICT (one) DO UPDATE SET boot = excluded.boot
+
+-- name: forget_leases
+UPDATE dirty SET owner = NULL, token = NULL, lease_ns = NULL, ready_ns = :steady
+
+-- name: set_aside
+UPDATE dirty SET owner = NULL, token = NULL, lease_ns = NULL, ready_ns = :again_ns,
+  aside_ns = COALESCE(aside_ns, :now), aside_reason = :reason
+WHERE layer = :layer AND tile = :tile AND token = :token
+
+-- name: tiles_set_aside
+SELECT layer, tile, aside_ns, attempts, waiting, aside_reason FROM dirty WHERE aside_ns IS NOT NULL ORDER BY layer, tile
+
+-- name: take_up_again
+UPDATE dirty SET ready_ns = :steady, attempts = 0, aside_ns = NULL, aside_reason = NULL
+WHERE aside_ns IS NOT NULL AND layer = :layer AND tile = :tile
+
+-- name: beat
+INSERT INTO shard (owner, boot, beat_ns, since_ns) VALUES (:owner, :boot, :steady, :now)
+ON CONFLICT (owner) DO UPDATE SET boot = excluded.boot, beat_ns = excluded.beat_ns
+
+-- name: join
+INSERT INTO shard (owner, boot, beat_ns, since_ns) VALUES (:owner, :boot, :steady, :now)
+ON CONFLICT (owner) DO UPDATE SET boot = excluded.boot, beat_ns = excluded.beat_ns, since_ns = excluded.since_ns
+
+-- name: forget_shards
+DELETE FROM shard WHERE boot <> :boot OR beat_ns < :before
+
+-- name: leave
+DELETE FROM shard WHERE owner = :owner
+
+-- name: shards
+SELECT owner, boot, beat_ns, since_ns FROM shard ORDER BY owner
+
+-- name: quarantine_size
+SELECT messages, bytes FROM quarantine_size
+
+-- name: forget_quarantined
+DELETE FROM quarantine WHERE sha IN (SELECT sha FROM quarantine ORDER BY received_ns, sha LIMIT 16)
+
+-- name: queue_state
+SELECT (SELECT MIN(ready_ns) FROM dirty WHERE aside_ns IS NULL),
+       (SELECT MIN(r.received_ns) FROM dirty AS d JOIN report AS r INDEXED BY report_waiting USING (layer, tile)
+        WHERE r.merged_in IS NULL AND d.aside_ns IS NULL)
+
+-- name: head_lines
+SELECT h.tile, v.version, v.created_ns, v.codec_id, v.size_bytes
+FROM tile_head AS h JOIN tile_version AS v USING (layer, tile, version)
+WHERE h.layer = :layer AND h.tile >= :first AND h.tile < :end ORDER BY h.tile
+
+-- name: version_at
+SELECT version FROM tile_version WHERE layer = :layer AND tile = :tile AND created_ns <= :at_ns
+ORDER BY version DESC LIMIT 1
+
+-- name: parent_of_next
+SELECT parent FROM tile_version WHERE layer = :layer AND tile = :tile AND version > :version ORDER BY version LIMIT 1
+
+-- name: sha_of_version
+SELECT sha FROM tile_version WHERE layer = :layer AND tile = :tile AND version = :version
+
+-- name: forget_reports
+-- Only those that count no more: consumed before the tile's epoch began, or, if asked for, folded into its memory.
+DELETE FROM report WHERE arrival IN (
+  SELECT r.arrival FROM report AS r JOIN tile_head AS h USING (layer, tile)
+    LEFT JOIN tile_memory AS m ON m.layer = r.layer AND m.tile = r.tile AND m.epoch = h.epoch
+  WHERE r.received_ns < :before AND r.merged_in IS NOT NULL
+    AND (r.merged_in < h.epoch OR (:folded AND r.window > 0 AND r.window <= m.window))
+  ORDER BY r.received_ns LIMIT :n)
+RETURNING LENGTH(body)
+
+-- name: forget_old_quarantined
+DELETE FROM quarantine WHERE sha IN (SELECT sha FROM quarantine WHERE received_ns < :before ORDER BY received_ns LIMIT :n)
+RETURNING LENGTH(body)
+
+-- name: published_lags
+-- How long the newest report parts that made a version waited for it, ns; an unchanged tile's version is older than they.
+SELECT v.created_ns - r.received_ns FROM (SELECT layer, tile, merged_in, received_ns FROM report
+  WHERE merged_in IS NOT NULL ORDER BY arrival DESC LIMIT :n) AS r
+JOIN tile_version AS v ON v.layer = r.layer AND v.tile = r.tile AND v.version = r.merged_in
+WHERE v.created_ns >= r.received_ns ORDER BY 1
+
+-- name: keys_of_heads
+SELECT layer, tile, version, sha FROM tile_head ORDER BY layer, tile
+
+-- name: keys_of_versions
+SELECT layer, tile, version, sha FROM tile_version INDEXED BY tile_version_sha
+
+-- name: body_of_version
+SELECT sha, codec_id, body FROM tile_version WHERE layer = :layer AND tile = :tile AND version = :version
+
+-- name: keys_of_reports
+SELECT layer, tile, report_id, arrival FROM report INDEXED BY report_key
+
+-- name: body_of_report
+SELECT body FROM report WHERE arrival = :arrival
+
+-- name: end_of_a_copy
+DELETE FROM queue_boot; DELETE FROM shard
+
+-- name: metrics
+SELECT (SELECT COUNT(*) FROM tile_head), (SELECT COALESCE(MAX(arrival), 0) FROM report),
+       (SELECT COUNT(*) FROM report INDEXED BY report_waiting WHERE merged_in IS NULL),
+       (SELECT COUNT(*) FROM dirty WHERE aside_ns IS NULL), (SELECT COUNT(*) FROM dirty WHERE aside_ns IS NOT NULL)
+
+-- name: touch
+UPDATE quarantine_size SET messages = messages

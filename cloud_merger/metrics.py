@@ -1,0 +1,52 @@
+"""What a merger shard shows of itself to Prometheus."""
+
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+
+from prometheus_client import CollectorRegistry, Counter, Histogram
+
+from tile_store.values import PublishResult
+
+MERGE_BUCKETS_S = (0.005, 0.01, 0.02, 0.05, 0.1, 0.2, 0.5, 1.0, 2.0, 5.0, 10.0, 30.0)
+
+
+class ShardMetrics:
+    """Counts of what one shard has done since it began."""
+
+    def __init__(self) -> None:
+        self.registry = CollectorRegistry()
+        self._settled = Counter(
+            "gnd_merges", "Merges of tiles by what came of them.", ["outcome"], registry=self.registry
+        )
+        for outcome in ("published", "unchanged", "stale", "failed"):
+            self._settled.labels(outcome)
+        self._seconds = Histogram(
+            "gnd_merge_seconds",
+            "From the claim's turn to the commit.",
+            buckets=MERGE_BUCKETS_S,
+            registry=self.registry,
+        )
+        self._notices = Counter("gnd_notices", "Update notices that have gone out.", registry=self.registry)
+        self._failures = Counter(
+            "gnd_store_failures", "How often the store could not do what was asked.", registry=self.registry
+        )
+
+    @contextmanager
+    def merging(self) -> Iterator[None]:
+        """Times one merge."""
+        begin_s = time.monotonic()
+        yield
+        self._seconds.observe(time.monotonic() - begin_s)
+
+    def settled(self, result: PublishResult | None) -> None:
+        """Counts one merge; None: it has failed or its lease was gone."""
+        self._settled.labels("failed" if result is None else result.status).inc()
+
+    def announced(self, n: int) -> None:
+        """Counts notices."""
+        self._notices.inc(n)
+
+    def store_failed(self) -> None:
+        """Counts a failure of the store."""
+        self._failures.inc()

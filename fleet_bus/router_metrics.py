@@ -1,0 +1,29 @@
+"""What a router shows of itself: who is connected, over how many links."""
+
+from collections import Counter
+from collections.abc import Iterator
+
+from prometheus_client import CollectorRegistry
+from prometheus_client.core import GaugeMetricFamily
+from prometheus_client.registry import Collector
+
+from fleet_bus.bus import Bus
+from fleet_bus.health import HealthServer
+
+
+class _Router(Collector):
+    def __init__(self, router: Bus) -> None:
+        self._router = router
+
+    def collect(self) -> Iterator[GaugeMetricFamily]:
+        sessions = GaugeMetricFamily("gnd_router_sessions", "Sessions connected to this router.", labels=["kind"])
+        for kind, n in sorted((Counter({"client": 0}) | Counter(self._router.neighbours())).items()):
+            sessions.add_metric([kind], n)
+        yield sessions
+
+
+def watch_router(router: Bus, port: int, host: str) -> HealthServer:
+    """Metrics and health of a router that runs in this process."""
+    registry = CollectorRegistry()
+    registry.register(_Router(router))
+    return HealthServer(port, registry, {"router": lambda: "it is closed" if router.is_closed else None}, host=host)

@@ -1,0 +1,71 @@
+"""The steps of the store's schema: an older store takes those that it lacks, all in one transaction, when it is opened.
+
+A step is a number and a named block of SQL; it is run once in a store's life. A new step is added at the end. The
+schema that a new store begins with (`schema`, number 1) is never changed.
+"""
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any, Final
+
+import apsw
+
+from tile_store.errors import StoreUnavailable
+from tile_store.sql import statements
+
+APPLICATION_ID: Final = 0x474E4453
+"""ASCII "GNDS" in the file's header: this database is a GND store."""
+
+STEPS: Final = (
+    (1, "schema"),
+    (2, "schema_of_confirmation"),
+    (3, "schema_of_surveys"),
+    (4, "schema_of_parts"),
+    (5, "schema_of_journal"),
+    (6, "schema_of_operations"),
+    (7, "schema_of_uploads"),
+)
+SCHEMA_VERSION: Final = STEPS[-1][0]
+
+
+def schema_of(connection: apsw.Connection, path: Path) -> int:
+    """The number of a store's schema, 0 of an empty file; both of its marks are read at one instant.
+
+    Raises:
+        StoreUnavailable: a database of another program, or a store of a newer release.
+    """
+    marks: list[Any] = connection.execute(
+        "SELECT (SELECT application_id FROM pragma_application_id), (SELECT user_version FROM pragma_user_version),"
+        " NOT EXISTS (SELECT 1 FROM sqlite_schema)"
+    ).fetchall()
+    application_id, version, empty = marks[0]
+    if application_id != APPLICATION_ID and not (empty and application_id == 0):
+        raise StoreUnavailable(f"{path}: an SQLite database of another program, not a tile store; choose another path")
+    if version > SCHEMA_VERSION:
+        raise StoreUnavailable(
+            f"{path}: store schema {version}, this release reads up to {SCHEMA_VERSION}; use the gnd that wrote it"
+        )
+    return int(version) if application_id == APPLICATION_ID else 0
+
+
+def migrate(connection: apsw.Connection, path: Path) -> None:
+    """Run the steps that the store lacks; on any error it stays as it was."""
+    sql = statements("sqlite")
+    connection.execute("BEGIN IMMEDIATE")
+    try:
+        found = schema_of(connection, path)  # another process may have done it since somebody looked
+        for number, name in STEPS:
+            if number > found and not _is_there(connection, sql, name):
+                connection.execute(sql[name])
+        connection.pragma("user_version", SCHEMA_VERSION)
+        connection.pragma("application_id", APPLICATION_ID)
+        connection.execute("COMMIT")
+    except BaseException:
+        if connection.in_transaction:
+            connection.execute("ROLLBACK")
+        raise
+
+
+def _is_there(connection: apsw.Connection, sql: Mapping[str, str], name: str) -> bool:
+    """Whether a release before schemas had steps has added it: it looked for tables, and left the number as it was."""
+    return f"has_{name}" in sql and bool(connection.execute(sql[f"has_{name}"]).fetchall())
