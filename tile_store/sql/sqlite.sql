@@ -768,7 +768,8 @@ SELECT layer, tile, report_id, arrival FROM report INDEXED BY report_key
 SELECT body FROM report WHERE arrival = :arrival
 
 -- name: end_of_a_copy
-DELETE FROM queue_boot; DELETE FROM shard
+DELETE FROM queue_boot; DELETE FROM shard;
+UPDATE upload SET owner = NULL, token = NULL, lease_ns = 0 WHERE state = 'waiting'
 
 -- name: metrics
 SELECT (SELECT COUNT(*) FROM tile_head), (SELECT COALESCE(MAX(arrival), 0) FROM report),
