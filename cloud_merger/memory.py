@@ -79,9 +79,7 @@ class TileMemory:
     def support_rows(self, voxels: I32, epoch: Gaussians, day: int) -> Rows:
         """STATEMENT rows that stand for what the present state of some voxels is worth on a day; `report` is -1."""
         at = find(self.voxels["voxel_id"], voxels)
-        known = self.voxels[at[at >= 0]]
-        age_days = np.maximum(day - known["day"].astype(np.int64), 0)
-        support = SUPPORT[np.minimum(known["observers"], len(SUPPORT) - 1)] * 0.5 ** (age_days / HALF_LIFE_DAYS)
+        support = self.weights(day)[at[at >= 0]]
         said = states_at(epoch, voxels[at >= 0], Kind.QUOTED)
         said["was"] = np.where(said["kind"] == Kind.QUOTED, EPOCH, 0)
         said["report"] = -1
@@ -90,6 +88,12 @@ class TileMemory:
         rows["weight"] = np.concatenate(turns) if turns else 0.0
         spoken: Rows = rows[rows["weight"] > 0.0]
         return spoken
+
+    def weights(self, day: int) -> NDArray[np.float64]:
+        """(N,) what the present state of each remembered voxel is worth on a day, in votes."""
+        age_days = np.maximum(day - self.voxels["day"].astype(np.int64), 0)
+        votes = SUPPORT[np.minimum(self.voxels["observers"], len(SUPPORT) - 1)]
+        return np.asarray(votes * 0.5 ** (age_days / HALF_LIFE_DAYS))
 
     def claims_beside(self, reports: Sequence[Report]) -> Rows:
         """The claims that vote beside the reports of a window. Where a vehicle speaks again about a voxel, its newest

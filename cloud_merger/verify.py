@@ -1,6 +1,6 @@
 """Compute any version of a tile anew from its journal, and compare: the map is a pure function of what was reported."""
 
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from typing import Literal
 
@@ -92,6 +92,22 @@ class Verifier:
         sha = Tile(tile, version, self._computed(layer, tile, epoch, basis, rows)).sha
         reason = f"the journal gives {sha.hex()[:16]}…, published was {content.sha.hex()[:16]}…"
         return ("same", "") if sha == content.sha else ("differs", reason)
+
+    def without(
+        self, layer: str, tile: TileId, version: int, is_out: Callable[[ReportRow], bool]
+    ) -> tuple[int, str, Gaussians | None]:
+        """A version computed without some reports: how many they are, and its Gaussians; None: why it cannot be."""
+        stored, basis = self._store.get(layer, tile, version=version), self._store.basis(layer, tile, version)
+        if stored is None or stored.kind != "merged" or basis is None:
+            return 0, "it is a base or a rollback, or older than the journal", None
+        epoch = _epoch_of(self._store.history(layer, tile), version)
+        first = self._first_window(layer, tile, epoch)
+        rows = self._store.reports_of_windows(layer, tile, first, basis.window, basis.seq)
+        missing = self._missing(layer, tile, version, rows, first, basis)
+        if missing:
+            return 0, missing, None
+        kept = [row for row in rows if not is_out(row)]
+        return len(rows) - len(kept), "", self._computed(layer, tile, epoch, basis, kept)
 
     def _first_window(self, layer: str, tile: TileId, epoch: VersionInfo | None) -> int:
         basis = None if epoch is None else self._store.basis(layer, tile, epoch.version)

@@ -7,6 +7,8 @@ import click
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TaskID, TextColumn, TimeElapsedColumn
 
+from deploy.tile_memory_cli import memory
+from deploy.vehicle_rollback_cli import rollback
 from deploy.verify_cli import verify
 from tile_store import tables
 from tile_store.cli import PATH, json_option, layer_option, show, store_to_fill
@@ -104,8 +106,9 @@ def _bars() -> Progress:
     return Progress(*columns, TimeElapsedColumn(), console=Console(stderr=True))
 
 
+_COMMANDS = {**store_group.commands, "rollback": rollback}
 map_group = click.Group(
     "map",
-    commands=[build, verify, *store_group.commands.values()],
-    help="Build, inspect, compare, verify, export, back up and roll back maps.",
+    commands=[build, verify, memory, *_COMMANDS.values()],
+    help="Build, inspect, compare, export, verify and roll back maps.",
 )

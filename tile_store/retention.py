@@ -21,6 +21,9 @@ class Collectable(Protocol):
     def gc(self, keep_versions: int) -> GcResult:
         """See `Store.gc`."""
 
+    def forget_uploads(self, before_ns: int) -> int:
+        """See `Store.forget_uploads`."""
+
     def transact(self, work: Callable[[apsw.Connection, int], T]) -> T:
         """Run `work(connection, now)` in one durable write transaction."""
 
@@ -35,6 +38,7 @@ class Retained:
     report_bytes: int = 0
     quarantined: int = 0
     quarantined_bytes: int = 0
+    uploads: int = 0
 
 
 def retain(
@@ -62,7 +66,10 @@ def retain(
         raise StoreError(f"keep days {keep_days} and quarantine {quarantine_mb} MB must not be negative")
     reports: list[int] = []
     refused: list[int] = []
+    uploads = 0
     if keep_days is not None:
+        days_ns = round(keep_days * NS_A_DAY)
+        uploads = store.forget_uploads(store.transact(lambda _c, now: now - days_ns))
         reports += _older_than(store, "forget_reports", keep_days, folded=folded)
         refused += _older_than(store, "forget_old_quarantined", keep_days)
     trimmed = (0, 0)
@@ -76,6 +83,7 @@ def retain(
         sum(reports),
         len(refused) + trimmed[0],
         sum(refused) + trimmed[1],
+        uploads,
     )
 
 

@@ -61,8 +61,22 @@ def status_of(store: Store) -> dict[str, Any]:
         "waiting_for_confirmation": waiting_totals(store) | {"claims": claims},
         "named_vehicles": named_vehicles(store),
         "to_merge": [asdict(one) | {"tile": one.tile.path} for one in store.dirty_tiles()],
+        "uploads": dict(store.upload_counts().by_state),
+        "windows": _windows(store),
         "quarantined": state.quarantined,
         "quarantined_bytes": state.quarantined_bytes,
+    }
+
+
+def _windows(store: Store) -> dict[str, int]:
+    """Tiles with a journal, their open windows' reports, windows folded so far, and the most that wait to be folded."""
+    windows = [one for one in store.windows() if one.window > 0]
+    behind = [one.window - 1 - (one.folded or 0) for one in windows]
+    return {
+        "tiles": len(windows),
+        "reports_in_open": sum(one.reports for one in windows),
+        "folded": sum(one.folded or 0 for one in windows),
+        "most_behind": max(behind, default=0),
     }
 
 
@@ -163,6 +177,15 @@ def _queue_lines(values: dict[str, Any]) -> list[str]:
             f"from receipt to published version: median {lag['p50']:.2f} s, 95 % {lag['p95']:.2f} s,"
             f" longest {lag['max']:.2f} s"
         )
+    windows, uploads = values["windows"], values["uploads"]
+    if windows["tiles"]:
+        lines.append(
+            f"windows: {windows['reports_in_open']} reports in the open windows of {windows['tiles']} tiles,"
+            f" {windows['folded']} windows folded, at most {max(windows['most_behind'], 0)} behind"
+        )
+    open_uploads = [f"{n} {state}" for state, n in uploads.items() if n and state in ("waiting", "early", "wanted")]
+    if open_uploads:
+        lines.append(f"uploads acknowledged and not settled: {', '.join(open_uploads)}")
     return lines
 
 

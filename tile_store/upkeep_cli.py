@@ -103,7 +103,7 @@ def gc(
     line = (
         f"{path}: {removed.versions} versions removed, {removed.version_bytes / 1e6:.2f} MB; {removed.reports} report"
         f" parts, {removed.report_bytes / 1e6:.2f} MB; {removed.quarantined} refused messages,"
-        f" {removed.quarantined_bytes / 1e6:.2f} MB"
+        f" {removed.quarantined_bytes / 1e6:.2f} MB; {removed.uploads} settled uploads"
     )
     show(asdict(removed), as_json, lambda console: console.print(line, highlight=False, soft_wrap=True))
 

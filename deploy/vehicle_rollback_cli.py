@@ -1,0 +1,83 @@
+"""`gnd map rollback STORE vehicle:NAME`: take back what one vehicle has said; other targets are the store's own."""
+
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+import click
+from rich.console import Console
+from rich.table import Table
+
+from tile_store.arguments import parse_time_ns
+from tile_store.errors import StoreError
+from tile_store.options import PATH, existing, json_option, layer_option, show, to_read
+from tile_store.upkeep_cli import rollback as store_rollback
+from tile_store.values import DEFAULT_CODEC, MAP_CODECS
+
+PREFIX = "vehicle:"
+
+
+@click.command(short_help="Bring tiles back to an older state, or take back a vehicle's word.")
+@click.argument("path", metavar="STORE", type=PATH)
+@click.argument("place", metavar="TILE|REGION|vehicle:NAME")
+@click.argument("version", type=int, required=False)
+@click.option("--to", help="A version of the tile (3), or a time (2026-01-31T12:00:00Z).")
+@click.option("--dry-run", is_flag=True, help="Only say what would change.")
+@click.option("--codec", default=DEFAULT_CODEC, show_default=True, type=click.Choice(MAP_CODECS), help="Of the shards.")
+@layer_option
+@json_option
+@click.pass_context
+def rollback(
+    context: click.Context,
+    path: Path,
+    place: str,
+    version: int | None,
+    to: str | None,
+    dry_run: bool,
+    codec: str,
+    layer: str,
+    as_json: bool,
+) -> None:
+    """Publish older content of a TILE as its next version; merged reports count no more.
+
+    TILE is a path, a number, or lat,lon. REGION is the leading part of tile paths with a slash at its end, such as
+    13033/ or 13033/03021/, and / is everywhere: its tiles go back to a time, all or none. Tiles that were not there yet
+    become empty.
+
+    vehicle:NAME computes every tile that a vehicle spoke of anew from what the others said, without its reports (all,
+    or those received since --to TIME), and publishes what differs. Running mergers announce it to the vehicles.
+    """
+    if not place.startswith(PREFIX):
+        context.invoke(
+            store_rollback,
+            path=path, place=place, version=version, to=to, dry_run=dry_run, layer=layer, as_json=as_json,
+        )  # fmt: skip
+        return
+    if version is not None:
+        raise StoreError("rollback vehicle:NAME goes back to a time, not to a version")
+    # loaded here: they load scipy and numba, which the other commands do without
+    from cloud_merger.config import ShardConfig
+    from cloud_merger.expel import without_vehicle
+
+    since_ns = 0 if to is None else parse_time_ns(to)
+    with to_read(path) if dry_run else existing(path) as store:
+        config = ShardConfig(store_path=path, codec=codec)
+        found = list(without_vehicle(store, config, layer, place.removeprefix(PREFIX), since_ns))
+        changed = [tile for _, tile in found if tile is not None]
+        if changed and not dry_run:
+            store.put_tiles(changed, "rollback", layer)
+    if not found:
+        raise StoreError(f"{path}: {place.removeprefix(PREFIX)} has reported nothing about layer {layer} since then")
+    rows = [asdict(one) | {"tile": one.tile.path} for one, _ in found]
+    verb = "would change" if dry_run else "have changed"
+    title = f"{path}, layer {layer}: {len(changed)} of {len(rows)} tiles {verb}"
+    values = {"layer": layer, "vehicle": place.removeprefix(PREFIX), "dry_run": dry_run, "tiles": rows}
+    show(values, as_json, lambda console: _print(console, title, rows))
+
+
+def _print(console: Console, title: str, rows: list[dict[str, Any]]) -> None:
+    console.print(title, highlight=False, soft_wrap=True)
+    table = Table("tile", "its reports", "voxels", "")
+    for one in rows:
+        table.add_row(one["tile"], str(one["reports"]), str(one["voxels"]), one["reason"] or one["status"])
+    console.print(table)
