@@ -4,6 +4,7 @@ from typing import Any
 
 from deploy.account import FleetResults
 from deploy.summary import doubtful_vehicles, summary_lines
+from fleet_bus.traffic import fleet_totals
 
 COUNTS = ("scans_shifted", "scans_taken_back", "tiles_doubtful", "tiles_held_back", "changes_held_back")
 SHIFTED = {"tiles": {"explained_by_shift": 3}, "largest_shift_m": 0.213, "largest_turn_deg": 0.5}
@@ -24,7 +25,7 @@ def test_a_line_says_what_was_held_back_and_how_far_off_the_vehicle_was() -> Non
     summary: dict[str, Any] = {
         "agents": 2, "drive_km": 1.0, "link": "4g", "wall_s": 10.0, "tiles_downloaded": 5, "reports_sent": 2,
         "reports_acknowledged": 2, "reports_lost": 0, "tiles_published": 1, "updates_received": 1, "changed_voxels": 9,
-        "traffic": {"down_bytes": 1, "up_bytes": 1, "kB_per_km_down": 1.0, "kB_per_km_up": 1.0},
+        "traffic": fleet_totals([]),
         "localisation_p95": {"longitudinal_m": None}, "f1": {"before": None},
         "waiting_for_confirmation": {"tiles": 0, "voxels": 0}, "named_vehicles": [],
         "doubtful": doubtful_vehicles(FleetResults((result("car-2", 40, 5, 3, 3, 314, doubts=SHIFTED),))),
