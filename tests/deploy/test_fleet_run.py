@@ -108,12 +108,13 @@ def test_vehicles_start_one_after_the_other_in_the_time_of_their_drives(start_ru
     ahead, behind = ways.values()
     wall_s = np.array([one.wall_ns for one in ahead]) * 1e-9
     drive_s = np.array([one.t_ns - ahead[0].t_ns for one in ahead]) * 1e-9
-    while_both = [one for one in behind if one.wall_ns * 1e-9 < wall_s[-1]]
-    gaps_s = [np.interp(one.wall_ns * 1e-9, wall_s, drive_s) - (one.t_ns - behind[0].t_ns) * 1e-9 for one in while_both]
-    assert len(gaps_s) >= 3
-    # Milestones are up to 0.7 s apart, and one process may be so much ahead of the other as the clock allows.
-    assert min(gaps_s) >= 3.0 - SLACK_S - 0.2
-    assert max(gaps_s) <= 3.0 + SLACK_S + 0.7
+    while_both = [one for one in behind if wall_s[0] <= one.wall_ns * 1e-9 < wall_s[-1]]
+    assert len(while_both) >= 3
+    for one in while_both:  # the one ahead was between two of its milestones, however long they took on this machine
+        after = int(np.searchsorted(wall_s, one.wall_ns * 1e-9, side="right"))
+        own_s = (one.t_ns - behind[0].t_ns) * 1e-9
+        assert drive_s[after] - own_s >= 3.0 - SLACK_S - 0.2
+        assert drive_s[after - 1] - own_s <= 3.0 + SLACK_S + 0.2
     assert summary["learning"]["vehicles"] == 2
     assert summary["learning"]["known_share"] is None
 
