@@ -104,7 +104,8 @@ def test_router_store_and_shard_show_how_they_are(parts: Parts) -> None:
         parts.start(name)
     for name in parts.running:
         until(f"{name} is well", lambda name=name: parts.is_healthy(name))
-    until("both are connected", lambda: metrics(parts.ports["router"])["gnd_router_sessions", "client"] == 2)
+    sessions = "gnd_router_sessions", "client"  # of the store, the shard and its worker
+    until("all are connected", lambda: metrics(parts.ports["router"])[sessions] == 3)
     of_store = metrics(parts.ports["store"])
     assert of_store[("gnd_tiles",)] == 1
     assert of_store["gnd_shard_alive", "shard-0"] == 1
