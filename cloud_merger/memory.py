@@ -25,12 +25,13 @@ from gnd_map.gaussian import Gaussians
 
 I32 = NDArray[np.int32]
 
-SUPPORT: Final = np.array([0.0, 1.0, 1.5, 2.0, 2.25, 2.5, 2.75, 3.0])
-"""Votes of a state that 0, 1, 2 … vehicles have confirmed, the last for all more: where only one vehicle drives, its
-second drive outvotes it; what many have confirmed takes five that agree, and two never do."""
+CONFIRMED_BY: Final = np.array([0, 1, 2, 3, 5, 7, 15, 40, 100])
+SUPPORT: Final = np.array([0.0, 1.0, 1.5, 2.0, 2.5, 3.0, 4.0, 5.0, 6.0])
+"""Votes of a state that so many vehicles have confirmed. Where only one vehicle drives, its second drive outvotes it;
+what seven have confirmed takes five that agree, and two never do; where a hundred came by, ten soon come."""
 HALF_LIFE_DAYS: Final = 90.0
 """What nobody has observed for so long has half of them left."""
-CLAIMS_OF_VOXEL: Final = 6
+CLAIMS_OF_VOXEL: Final = 12
 CLAIMS_OF_VEHICLE: Final = 2
 """A vehicle's claim of an earlier drive stays beside its newest one: saying the same again makes a second witness."""
 ANOTHER_DRIVE_S: Final = 1800.0
@@ -92,7 +93,7 @@ class TileMemory:
     def weights(self, day: int) -> NDArray[np.float64]:
         """(N,) what the present state of each remembered voxel is worth on a day, in votes."""
         age_days = np.maximum(day - self.voxels["day"].astype(np.int64), 0)
-        votes = SUPPORT[np.minimum(self.voxels["observers"], len(SUPPORT) - 1)]
+        votes = SUPPORT[np.searchsorted(CONFIRMED_BY, self.voxels["observers"], side="right") - 1]
         return np.asarray(votes * 0.5 ** (age_days / HALF_LIFE_DAYS))
 
     def claims_beside(self, reports: Sequence[Report]) -> Rows:

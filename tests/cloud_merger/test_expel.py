@@ -65,7 +65,7 @@ def test_a_tile_tells_what_it_remembers(cloud):
     told = json.loads(call(cloud, "memory", TILE.path, "--json").output)
     assert (told["window"], told["voxels"], told["with a Gaussian"]) == (2, 6, 6)
     ball = told["each"][3]
-    assert (ball["is_there"], ball["observers"], ball["votes"]) == (True, 4, 2.25)
+    assert (ball["is_there"], ball["observers"], ball["votes"]) == (True, 4, 2.0)
     assert ball["last_day"].startswith("2027-01-15")
 
 

@@ -208,7 +208,7 @@ def test_support_grows_with_who_confirmed_and_fades_with_age(cloud):
         rows = replace(memory, voxels=voxels).support_rows(np.array([1], np.int32), head, day + age_days)
         return rows["weight"].sum()
 
-    assert [weight(observers=n) for n in (0, 1, 2, 3, 7, 200)] == [0.0, 1.0, 1.5, 2.0, 3.0, 3.0]
+    assert [weight(observers=n) for n in (0, 1, 2, 4, 7, 99, 200)] == [0.0, 1.0, 1.5, 2.0, 3.0, 5.0, 6.0]
     assert weight(90) == pytest.approx(1.5)
     assert weight(900) < 0.01
 
