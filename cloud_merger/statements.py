@@ -236,7 +236,7 @@ def _statements(report: int, change: TileChange, voxels: NDArray[np.int32], quot
         rows["voxel_id"] = voxel_id
     else:
         rows = quoted[seen]
-    changed = _CHANGED.of(change)
+    changed = changed_of(change)
     at = find(changed.rows["voxel_id"], voxel_id)
     mine, said = np.flatnonzero(at >= 0), at[at >= 0]
     was = rows["was"][mine]
@@ -270,7 +270,7 @@ def _states(gaussians: Gaussians, at: NDArray[np.int64], kind: Kind) -> Rows:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class _Changed:
+class Changed:
     """What a report says of the voxels that it found changed: STATEMENT (N,); which speak, and may deny, (N,) bool."""
 
     change: TileChange
@@ -279,25 +279,26 @@ class _Changed:
     denies: NDArray[np.bool_]
 
     @classmethod
-    def made(cls, change: TileChange) -> "_Changed":
+    def made(cls, change: TileChange) -> "Changed":
+        """Lay it out."""
         rows = _states(change.changed, np.arange(len(change.changed)), Kind.MEASURED)
-        rows["kind"] = kinds_of_changed(change)
-        return cls(change, rows, speaks_of_changed(change), np.isin(rows["kind"], (Kind.MEASURED, Kind.WITHHELD)))
+        rows["kind"] = _kinds_of_changed(change)
+        return cls(change, rows, _speaks_of_changed(change), np.isin(rows["kind"], (Kind.MEASURED, Kind.WITHHELD)))
 
 
 class _Remembered:
     """The same of the reports used last: a window is merged again with each new report."""
 
     def __init__(self) -> None:
-        self._held: OrderedDict[int, _Changed] = OrderedDict()
+        self._held: OrderedDict[int, Changed] = OrderedDict()
         self._lock = Lock()
 
-    def of(self, change: TileChange) -> _Changed:
+    def of(self, change: TileChange) -> Changed:
         """Made once for each change that stays in memory."""
         with self._lock:
             found = self._held.get(id(change))
         if found is None or found.change is not change:  # the number of an object that is gone may come again
-            found = _Changed.made(change)
+            found = Changed.made(change)
             with self._lock:
                 self._held[id(change)] = found
                 if len(self._held) > REMEMBERED:
@@ -308,7 +309,12 @@ class _Remembered:
 _CHANGED: Final = _Remembered()
 
 
-def kinds_of_changed(change: TileChange) -> NDArray[np.uint8]:
+def changed_of(change: TileChange) -> Changed:
+    """What a report says of the voxels that it found changed; laid out once."""
+    return _CHANGED.of(change)
+
+
+def _kinds_of_changed(change: TileChange) -> NDArray[np.uint8]:
     """(N,) the `Kind` of statement that each changed entry makes, if it speaks."""
     kinds = np.where(change.changed.exists, Kind.MEASURED, Kind.NOTHING).astype(np.uint8)
     kinds[is_withheld(change)] = Kind.WITHHELD
@@ -321,7 +327,7 @@ def is_withheld(change: TileChange) -> NDArray[np.bool_]:
     return np.asarray(flagged & ~change.changed.exists)
 
 
-def speaks_of_changed(change: TileChange) -> NDArray[np.bool_]:
+def _speaks_of_changed(change: TileChange) -> NDArray[np.bool_]:
     """Changed entries that are a statement: not unmeasured, and no Gaussian from too few sub-cells."""
     weak = change.changed.exists & (change.changed.cells < N_MIN_CELLS)
     return np.asarray(~weak & (change.change_class != ChangeClass.UNMEASURED))

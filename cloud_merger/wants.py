@@ -21,10 +21,9 @@ from cloud_merger.statements import (
     Kind,
     Report,
     Rows,
+    changed_of,
     find,
-    kinds_of_changed,
     same_state,
-    speaks_of_changed,
     states_at,
 )
 from gnd_map.arrays import I32
@@ -155,9 +154,9 @@ def _said(change: TileChange, ids: I32, quoted: Rows | None, same_was: NDArray[n
         kind[:] = quoted["kind"]
         speaks[:] = find(change.observed, ids) >= 0
     if is_changed.any():
-        rows = at[is_changed]
-        kind[is_changed] = kinds_of_changed(change)[rows]
-        speaks[is_changed] = speaks_of_changed(change)[rows]
+        rows, changed = at[is_changed], changed_of(change)
+        kind[is_changed] = changed.rows["kind"][rows]
+        speaks[is_changed] = changed.speaks[rows]
     quotes_the_denied = (kind == Kind.QUOTED) & same_was
     may_agree = speaks & (kind != Kind.NOTHING) & ~quotes_the_denied
     return _Said(speaks, may_agree, may_agree & (kind == Kind.MEASURED) & same_was)
