@@ -220,6 +220,8 @@ def test_status_of_a_map_that_waits_for_nothing_is_one_line(path: Path) -> None:
         "waiting_for_confirmation": {"tiles": 0, "voxels": 0, "claims": []},
         "named_vehicles": [],
         "to_merge": [],
+        "uploads": {},
+        "windows": {"tiles": 1, "reports_in_open": 1, "folded": 0, "most_behind": 0},
         "quarantined": 0,
         "quarantined_bytes": 0,
     }
