@@ -60,7 +60,8 @@ class Cloud:
         self._later_ns = 0
         self.store = SqliteStore(path, config.store, now_ns=self._now_ns)
         self.store.put_tiles(Tile(tile, 1, gaussians) for tile, gaussians in base.tiles.items())
-        self._ingest, self._expander = Ingest(self.store, _OWNER), Expander(self.store, config, self._tell)
+        self._ingest = Ingest(self.store, _OWNER, now_ns=self._now_ns)
+        self._expander = Expander(self.store, config, self._tell)
         self._worker = Worker(self.store, config)
         self._messages: list[Message] = []
         self._hearers: dict[str, Callable[[str, bytes], None]] = {}
