@@ -95,7 +95,8 @@ def test_interrupted_it_leaves_nothing(tmp_path: Path) -> None:
             wait_until(lambda name=name: len(namespaces_of(name)) == 2, "the lab is there")  # type: ignore[misc]
             process.send_signal(number)
             code, _, err = finished(process)
-        assert (code, err.strip().splitlines()[-1]) == (130, "gnd: interrupted")
+        assert code == 130
+        assert "gnd: interrupted" in err.splitlines()  # a relay that was just starting may complain behind it
         assert not has_namespaces(name)
 
 
