@@ -416,7 +416,8 @@ class SqliteStore:
 
     def notices(self, older_than_s: float = 0.0, n: int = 1000) -> list[Notice]:
         """See `Store.notices`."""
-        before = self._now_ns() - round(older_than_s * NS_PER_S)
+        # All are all: the clock may have been set back since they were written.
+        before = self._now_ns() - round(older_than_s * NS_PER_S) if older_than_s else 2**63 - 1
         with self._readers.snapshot() as c:
             rows = fetch(c, "notices", {"before": before, "n": n})
             return [Notice(layer, TileId(tile), version) for layer, tile, version in rows]
