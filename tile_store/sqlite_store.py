@@ -1,7 +1,6 @@
 """The store in one SQLite file that several processes of a machine may open (WAL, every commit synced)."""
 
 import logging
-import time
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from hashlib import sha256
 from pathlib import Path
@@ -93,7 +92,7 @@ class SqliteStore:
         *,
         create: bool = True,
         read_only: bool = False,
-        now_ns: Callable[[], int] = time.time_ns,
+        now_ns: Callable[[], int] = clocks.day_ns,
         steady_ns: Callable[[], int] = clocks.steady_ns,
     ) -> None:
         self.path = Path(path)
