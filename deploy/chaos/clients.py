@@ -37,6 +37,7 @@ OPEN_SUFFIX: Final = ".open"
 _LOOK_S: Final = 0.2
 _ASK_EVERY_S: Final = 0.1
 _ASK_S: Final = 5.0
+_NEW_SHARE: Final = 0.3
 _QUICK: Final = RetryPolicy(longest_wait_s=0.2, attempt_timeout_s=2.0)
 
 
@@ -187,9 +188,9 @@ class _Follower:
         else:
             self.ask(update.tile)
 
-    def ask(self, tile: TileId) -> None:
-        """Ask for a tile, saying what is held."""
-        held = self._held.get(tile.morton)
+    def ask(self, tile: TileId, *, as_if_new: bool = False) -> None:
+        """Ask for a tile, saying what is held; or nothing of it, as one that has just come."""
+        held = None if as_if_new else self._held.get(tile.morton)
         wanted = TileRequest() if held is None else TileRequest(held.version, held.sha)
         payload = self._bus.request(tile_key(LAYER, tile), wanted.encode(), kind="tile", retry=_QUICK, timeout_s=_ASK_S)
         reply = TileReply.decode(payload)
@@ -226,7 +227,7 @@ def follower(connect: str, name: str, log: Path, *, stop: threading.Event) -> No
             try:
                 if time.monotonic() - asked_s >= _ASK_EVERY_S:
                     asked_s = time.monotonic()
-                    follows.ask(rng.choice(street.tiles).tile_id)
+                    follows.ask(rng.choice(street.tiles).tile_id, as_if_new=rng.random() < _NEW_SHARE)
                 follows.hear(notices.get(timeout=_ASK_EVERY_S))
             except queue.Empty:
                 continue

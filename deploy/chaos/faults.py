@@ -14,7 +14,8 @@ class Kind:
     Attributes:
         name: as the account names it.
         group: what is done.
-        part: to which part: "router", "store", "shard", "worker", "vehicle", "follower"; "" none in particular.
+        part: to which part: "router", "store", "shard", "worker", "vehicle", "follower"; "" none in particular. Of
+            pages: which one is killed with it.
         held_s: between these it lasts; (0, 0): it is over at once.
     """
 
@@ -42,7 +43,8 @@ KINDS: Final = (
     Kind("late line", "line", "", (0.5, 4.0)),
     Kind("full disk of shard", "disk", "shard", (0.5, 2.0)),
     Kind("full disk of vehicle", "disk", "vehicle", (0.5, 2.0)),
-    Kind("damaged page", "page", "", (0.5, 3.0)),
+    Kind("damaged pages", "page", "", (0.5, 3.0)),
+    Kind("damaged pages, cold", "page", "worker", (2.0, 5.0)),
     Kind("clock step", "clock", "", (0.5, 3.0)),
     Kind("twice", "message", ""),
     Kind("out of order", "message", ""),

@@ -29,6 +29,7 @@ from vehicle_agent.sending import SenderThread
 
 SMALL_BYTES: Final = 4_096
 MESSENGER: Final = "messenger"
+DAMAGED_BODIES: Final = 3
 _SEND_S: Final = 8.0
 _LOG: Final = logging.getLogger(__name__)
 
@@ -50,6 +51,7 @@ class Inflictor:
         self._outbox = Outbox(cloud.vehicles / f"{MESSENGER}-000.sqlite")
         self._sender = SenderThread(bus, self._outbox, MESSENGER)
         self._threads: list[threading.Thread] = []
+        self._damaged: set[int] = set()
 
     def begin(self, fault: Fault) -> tuple[str, End]:
         """Do it; what was hit, in words, and how to end it."""
@@ -101,19 +103,27 @@ class Inflictor:
         return end
 
     def _damage(self, fault: Fault) -> tuple[str, End]:
-        """Other bytes into the body of a version, as a failing disk would; then those that its mirror had."""
-        found = _page_of_a_body(self._cloud, random.Random(fault.draw))
-        if found is None:
-            return "no page of a body was in the file", _nothing
-        at, name = found
-        was = page.write(self._cloud.path, at, b"\xff" * page.SAMPLE_BYTES)
+        """Other bytes into the bodies of some versions, as a failing disk would; then those that its mirror had.
+
+        Who has read them before goes on with what it remembers; so a worker may be killed with it, whose next life
+        remembers nothing.
+        """
+        rng, part = random.Random(fault.draw), BY_NAME[fault.kind].part
+        found = _places_of_bodies(self._cloud, rng, self._damaged)
+        self._damaged |= set(found)
+        was = {at: page.write(self._cloud.path, at, b"\xff" * page.SAMPLE_BYTES) for at in found}
+        names = rng.sample(self._cloud.names("worker"), 1) if part else []
+        for name in names:
+            self._kill(part, name, self._cloud.pids(part, name))
 
         def end() -> None:
-            page.write(self._cloud.path, at, was)
+            for at, before in was.items():
+                page.write(self._cloud.path, at, before)
+            self._damaged -= set(was)
             with suppress(StoreError):
                 self._cloud.retry()
 
-        return f"{name}, page {at // page.PAGE_BYTES + 1}", end
+        return ", ".join([*found.values(), *(f"worker of {name} killed" for name in names)]), end
 
     def _send(self, fault: Fault) -> tuple[str, End]:
         """Messages go from a thread of their own: the next fault does not wait for answers."""
@@ -208,14 +218,16 @@ def _limit_files(pid: int, limit: int) -> None:
         resource.prlimit(pid, resource.RLIMIT_FSIZE, (limit, hard))
 
 
-def _page_of_a_body(cloud: Cloud, rng: random.Random) -> tuple[int, str] | None:
-    """Offset of a page in the middle of the body of a version that is in the file, not only in its log."""
-    heads = cloud.store.heads(LAYER)
+def _places_of_bodies(cloud: Cloud, rng: random.Random, damaged: set[int]) -> dict[int, str]:
+    """Offsets in bodies of newest versions that are in the file, not only in its log, and whole; and whose they are."""
+    heads, found = cloud.store.heads(LAYER), dict[int, str]()
     for head in rng.sample(heads, len(heads)):
-        stored = cloud.store.get(LAYER, head.tile, version=rng.choice((1, head.version)))
+        stored = cloud.store.get(LAYER, head.tile)
         if stored is None or len(stored.body) <= page.PAGE_BYTES:
             continue
         at = page.find(cloud.path, stored.body)
-        if at is not None:
-            return at, f"{stored.tile.path} version {stored.version}"
-    return None
+        if at is not None and at not in damaged:
+            found[at] = f"{stored.tile.path} version {stored.version} at byte {at}"
+        if len(found) == DAMAGED_BODIES:
+            break
+    return found
