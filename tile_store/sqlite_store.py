@@ -252,10 +252,6 @@ class SqliteStore:
         """See `Store.begin`."""
         return self._writer.run(lambda c: inbox.begin(c, claim, lease_s, self._steady_ns()))
 
-    def renew(self, claims: Sequence[Claim], lease_s: float) -> list[bool]:
-        """See `Store.renew`."""
-        return self._writer.run(lambda c: inbox.renew(c, claims, lease_s, self._steady_ns()))
-
     def release(self, owner: str) -> int:
         """See `Store.release`."""
         return self._writer.run(lambda c: (inbox.release(c, owner), uploads.release(c, owner))[0])

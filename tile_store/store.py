@@ -108,9 +108,6 @@ class Store(Protocol):
     def begin(self, claim: Claim, lease_s: float) -> bool:
         """Count an attempt to merge a claimed tile and prolong its lease; False where another owner has it."""
 
-    def renew(self, claims: Sequence[Claim], lease_s: float) -> list[bool]:
-        """Prolong leases; False where the lease has gone to another owner."""
-
     def release(self, owner: str) -> int:
         """Free all leases of an owner (it has died), those of uploads too; the number of tiles freed."""
 
