@@ -15,6 +15,7 @@ from tile_store.values import (
     DirtyTile,
     GcResult,
     HeadLine,
+    JournalMark,
     Notice,
     Publication,
     PublishResult,
@@ -89,6 +90,11 @@ class Store(Protocol):
     def in_play(self, layer: str, tile: TileId) -> TileJournal:
         """What counts of a tile since its epoch: what closed windows have come to, and the reports of those that are
         not folded. All is read at one instant.
+        """
+
+    def in_play_since(self, layer: str, tile: TileId, mark: JournalMark) -> tuple[JournalMark, list[ReportRow]] | None:
+        """The reports in play that have come since, by number, and how far that reaches; None: a window has been folded
+        or another epoch has begun since, so `in_play` is to be read again.
         """
 
     def quarantine(self, body: bytes, reason: str, source: str = "") -> None:

@@ -463,6 +463,12 @@ WHERE layer = :layer AND tile = :tile AND window > :folded AND window <= :last
   AND (window > 0 OR merged_in IS NULL OR merged_in >= :epoch)
 ORDER BY report_id, part
 
+-- name: reports_since
+SELECT report_id, layer, tile, vehicle, received_ns, body, base_sha, part, window, seq FROM report
+WHERE layer = :layer AND tile = :tile AND window > :folded AND seq > :seq
+  AND (window > 0 OR merged_in IS NULL OR merged_in >= :epoch)
+ORDER BY seq
+
 -- name: reports_in_play_of_vehicles
 SELECT report_id, layer, tile, vehicle, received_ns, body, base_sha, part, window, seq FROM report
 WHERE layer = :layer AND tile = :tile AND report_id IN (
