@@ -11,7 +11,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from cloud_merger.statements import NO_BASE, Kind, Report, changed_of, same_state, states_at
+from cloud_merger.statements import NO_BASE, Kind, Report, changed_of, index_of, same_state, states_at
 from gnd_map.arrays import F64, I32, I64
 from gnd_map.gaussian import Gaussians
 from gnd_map.jit import kernel
@@ -133,11 +133,11 @@ def _tally(
         s = base[r]
         mine, seen = changed[changed_end[r] : changed_end[r + 1]], observed[observed_end[r] : observed_end[r + 1]]
         for k in range(len(voxel_id)):
-            at = _find(mine, voxel_id[k])
+            at = index_of(voxel_id[k], mine)
             if at >= 0:
                 said, is_said = kind[changed_end[r] + at], speaks[changed_end[r] + at]
             else:
-                said, is_said = quoted[s, k], is_known[s] and _find(seen, voxel_id[k]) >= 0
+                said, is_said = quoted[s, k], is_known[s] and index_of(voxel_id[k], seen) >= 0
             if not is_said:
                 continue
             result[1, k] += weight[r]
@@ -146,16 +146,3 @@ def _tally(
             result[0, k] += weight[r]
             if said == _MEASURED and same_was[s, k]:
                 result[2, k] += 1.0
-
-
-@kernel
-def _find(ids: I32, wanted: int) -> int:
-    """Index of an id among sorted ones, -1 where it is missing."""
-    low, high = 0, len(ids)
-    while low < high:
-        middle = (low + high) // 2
-        if ids[middle] < wanted:
-            low = middle + 1
-        else:
-            high = middle
-    return low if low < len(ids) and ids[low] == wanted else -1
