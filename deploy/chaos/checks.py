@@ -218,7 +218,7 @@ def _unmerged(c: apsw.Connection) -> list[tuple[int, str]]:
     queued = c.execute("SELECT tile, coalesce(aside_reason, 'is waiting to be merged') FROM dirty").fetchall()
     rows = c.execute("SELECT tile, count(*) FROM report WHERE merged_in IS NULL GROUP BY layer, tile").fetchall()
     known = {tile for tile, _ in queued}
-    return [*queued, *((tile, f"{n} reports are in no version") for tile, n in rows if tile not in known)]  # type: ignore[list-item, misc]
+    return [*queued, *((tile, f"{n} reports are in no version") for tile, n in rows if tile not in known)]  # type: ignore[list-item]
 
 
 def verified(store: Path) -> tuple[dict[str, int], bool]:

@@ -9,7 +9,7 @@ import queue
 import random
 import threading
 import time
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
@@ -24,7 +24,7 @@ from gnd_map.tile import Tile, content_sha
 from gnd_map.tile_id import TileId
 from schemas.errors import SchemaError
 from schemas.keys import tile_key, update_keys
-from schemas.tiles import TileReply, TileRequest, tile_after, tile_of
+from schemas.tiles import CodedDelta, TileBlob, TileReply, TileRequest, tile_after, tile_of
 from schemas.updates import TileUpdate, updated
 from vehicle_agent.errors import OutboxError
 from vehicle_agent.outbox import Outbox
@@ -181,10 +181,7 @@ class _Follower:
         if held is not None and held.version >= update.version:
             return
         if held is not None and held.sha == update.previous_sha and update.has_delta:
-            try:
-                self._received("notice", update.version, update.sha, updated(update, held))
-            except SchemaError:
-                self._note(Receipt(update.tile, update.version, update.sha, b"", "notice"))
+            self._take("notice", update, lambda: updated(update, held))
         else:
             self.ask(update.tile)
 
@@ -193,16 +190,22 @@ class _Follower:
         held = None if as_if_new else self._held.get(tile.morton)
         wanted = TileRequest() if held is None else TileRequest(held.version, held.sha)
         payload = self._bus.request(tile_key(LAYER, tile), wanted.encode(), kind="tile", retry=_QUICK, timeout_s=_ASK_S)
-        reply = TileReply.decode(payload)
-        for how, part in (("blob", reply.blob), ("delta", reply.delta)):
-            if part is None:
-                continue
-            try:
-                found = tile_of(reply.blob) if reply.blob else tile_after(reply.delta, held)  # type: ignore[type-var, arg-type]
-            except SchemaError:
-                self._note(Receipt(tile, part.version, part.sha, b"", how))
-                continue
-            self._received(how, part.version, part.sha, found)
+        reply, kept = TileReply.decode(payload), held
+        if reply.blob is not None:
+            blob = reply.blob
+            self._take("blob", blob, lambda: tile_of(blob))
+        elif reply.delta is not None and kept is not None:
+            delta = reply.delta
+            self._take("delta", delta, lambda: tile_after(delta, kept))
+
+    def _take(self, how: str, part: TileBlob | CodedDelta | TileUpdate, decode: Callable[[], Tile]) -> None:
+        """Write down what came, whether anything can be made of it or not."""
+        try:
+            tile = decode()
+        except SchemaError:
+            self._note(Receipt(part.tile, part.version, part.sha, b"", how))
+        else:
+            self._received(how, part.version, part.sha, tile)
 
     def _received(self, how: str, version: int, sha: bytes, tile: Tile) -> None:
         self._note(Receipt(tile.tile_id, version, sha, content_sha(tile.tile_id, tile.gaussians), how))

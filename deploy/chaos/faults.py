@@ -64,7 +64,7 @@ class Fault:
         at_s: after the first report was merged, s.
         held_s: how long it lasts; 0: until the supervisor has started again what was killed.
         draw: in [0, 1): which of several parts, lines, pages.
-        step_s: of the clock.
+        clock_s: by which the time of day is wrong.
     """
 
     number: int
@@ -72,7 +72,7 @@ class Fault:
     at_s: float
     held_s: float
     draw: float
-    step_s: float = 0.0
+    clock_s: float = 0.0
 
     @property
     def group(self) -> Group:
@@ -89,8 +89,10 @@ class Fault:
         return asdict(self)
 
 
-def plan(seed: int, count: int, kinds: tuple[Kind, ...] = KINDS) -> tuple[Fault, ...]:
-    """The faults of a run: every kind about as often, in an order drawn, 1.5 to 2.5 s apart; long ones overlap."""
+def plan(
+    seed: int, count: int, kinds: tuple[Kind, ...] = KINDS, step_s: tuple[float, float] = STEP_S
+) -> tuple[Fault, ...]:
+    """The faults of a run: every kind about as often, in an order drawn, `step_s` apart; long ones overlap."""
     rng = random.Random(f"chaos {seed}")
     deck: list[Kind] = []
     faults: list[Fault] = []
@@ -99,8 +101,8 @@ def plan(seed: int, count: int, kinds: tuple[Kind, ...] = KINDS) -> tuple[Fault,
         if not deck:
             deck = rng.sample(kinds, len(kinds))
         kind = deck.pop()
-        at_s += rng.uniform(*STEP_S)
+        at_s += rng.uniform(*step_s)
         held_s = rng.uniform(*kind.held_s) if any(kind.held_s) else 0.0
-        step_s = rng.choice(CLOCK_STEPS_S) * rng.choice((-1, 1)) if kind.group == "clock" else 0.0
-        faults.append(Fault(number, kind.name, round(at_s, 3), round(held_s, 3), rng.random(), step_s))
+        clock_s = rng.choice(CLOCK_STEPS_S) * rng.choice((-1, 1)) if kind.group == "clock" else 0.0
+        faults.append(Fault(number, kind.name, round(at_s, 3), round(held_s, 3), rng.random(), clock_s))
     return tuple(faults)

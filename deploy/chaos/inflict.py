@@ -57,8 +57,8 @@ class Inflictor:
         """Do it; what was hit, in words, and how to end it."""
         kind = BY_NAME[fault.kind]
         if kind.group == "clock":
-            self._cloud.step_clock(fault.step_s)
-            return f"{fault.step_s:+g} s", lambda: self._cloud.step_clock(0.0)
+            self._cloud.step_clock(fault.clock_s)
+            return f"{fault.clock_s:+g} s", lambda: self._cloud.step_clock(0.0)
         if kind.group == "page":
             return self._damage(fault)
         if kind.group == "line":

@@ -33,7 +33,7 @@ def test_a_seed_draws_the_same_faults_every_kind_about_as_often() -> None:
     assert set(counts) == {kind.name for kind in KINDS}
     assert max(counts.values()) - min(counts.values()) <= 1
     assert 1.5 * 200 <= faults[-1].at_s <= 2.5 * 200
-    assert all(fault.step_s for fault in faults if fault.kind == "clock step")
+    assert all(fault.clock_s for fault in faults if fault.kind == "clock step")
 
 
 def test_a_vehicle_says_the_same_again_and_two_say_something_else() -> None:
