@@ -162,9 +162,10 @@ class Receipt:
 
 
 def read_receipts(path: Path) -> Iterator[Receipt]:
-    """The lines of a log; the last may have been cut off by a kill."""
-    for line in path.read_text(encoding="utf-8").split("\n")[:-1]:
-        yield Receipt.of_line(line)
+    """The lines of a log; a kill may have cut one off."""
+    for line in path.read_text(encoding="utf-8").splitlines():
+        if line.endswith("]"):
+            yield Receipt.of_line(line)
 
 
 class _Follower:
@@ -173,6 +174,7 @@ class _Follower:
     def __init__(self, bus: Bus, log: Path) -> None:
         self._bus, self._log = bus, log.open("a", encoding="utf-8")
         self._held: dict[int, Tile] = {}
+        self._log.write("\n")  # a line that a kill has cut off ends here
 
     def hear(self, payload: bytes) -> None:
         """Follow a notice: by its delta where that fits what is held, else by asking."""
