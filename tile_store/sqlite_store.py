@@ -152,9 +152,9 @@ class SqliteStore:
                 return []
         return self._writer.run(lambda c: uploads.claim(c, owner, n, lease_s))
 
-    def postpone_upload(self, claim: UploadClaim, delay_s: float) -> None:
+    def postpone_upload(self, claim: UploadClaim, delay_s: float, *, blameless: bool = False) -> None:
         """See `Store.postpone_upload`."""
-        self._writer.run(lambda c: uploads.postpone(c, claim, delay_s))
+        self._writer.run(lambda c: uploads.postpone(c, claim, delay_s, blameless=blameless))
 
     def settle_upload(self, settled: Settled) -> bool:
         """See `Store.settle_upload`."""
