@@ -104,6 +104,7 @@ def print_outcome(console: Console, outcome: "Outcome") -> None:
         "versions merged": told["versions"],
         "stuck": told["stuck_tiles"],
         "map as its journal gives it": "yes" if told["identical_map"] else f"NO: {told['verify']}",
+        "parts that died by themselves": told["deaths"] or "none",
         "settled after": "not at all" if told["settled_s"] is None else f"{told['settled_s']:.1f} s",
     }
     for name, value in rows.items():

@@ -12,7 +12,7 @@ import signal
 import sys
 import threading
 import time
-from collections import deque
+from collections import Counter, deque
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from multiprocessing import connection
@@ -90,6 +90,8 @@ class Supervisor:
         log_dir: folder of one log file per process.
         pid_file: JSON object from process name to process id, rewritten at every start.
         on_restart: called with the name and the exit code of a process that is started again.
+        restarts: how often each process was started again.
+        deaths: how often it had died by itself, not by `kill`.
     """
 
     log_dir: Path
@@ -97,6 +99,7 @@ class Supervisor:
     on_restart: Callable[[str, int], None] = lambda name, code: None  # noqa: ARG005  (the default ignores both)
     _running: dict[str, _Running] = field(default_factory=dict)
     restarts: dict[str, int] = field(default_factory=dict)
+    deaths: Counter[str] = field(default_factory=Counter)
 
     def start(self, spec: ProcessSpec) -> None:
         """Start one process."""
@@ -152,6 +155,7 @@ class Supervisor:
     def _restart(self, running: _Running, code: int) -> None:
         name = running.spec.name
         if running.restart_at_s is None:  # seen dead for the first time
+            self.deaths[name] += not running.is_killed
             deaths = running.count_death()
             if deaths > MAX_RESTARTS:
                 raise ProcessDied(

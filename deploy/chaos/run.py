@@ -46,6 +46,7 @@ class Outcome:
         gaps: without service.
         inflicted: the faults that there were: what was hit, and when they really began and ended, s.
         restarts: how often each process was started again, those that were killed on purpose included.
+        deaths: how often one had died by itself.
         died: parts that would not live.
     """
 
@@ -57,6 +58,7 @@ class Outcome:
     gaps: Gaps
     inflicted: tuple[dict[str, Any], ...]
     restarts: dict[str, int]
+    deaths: dict[str, int]
     died: tuple[str, ...]
 
     @property
@@ -84,6 +86,7 @@ class Outcome:
                 for kind, values in sorted(self.gaps.by_kind.items())
             },
             "restarts": self.restarts,
+            "deaths": self.deaths,
             "list": list(self.inflicted),
         }
 
@@ -124,13 +127,22 @@ def run_chaos(
         on_step("settling", len(timeline.rows))
         settled_s = _settle(cloud, inflictor, HURRIED_S if stop.is_set() else SETTLE_S)
         restarts, died = dict(cloud.supervisor.restarts), tuple(cloud.died)
+        deaths = {name: n for name, n in cloud.supervisor.deaths.items() if n}
         on_step("ending", len(timeline.rows))
     on_step("checking", len(timeline.rows))
     findings = look(cloud.path, sorted(cloud.vehicles.glob("*.sqlite")), sorted(cloud.receipts.glob("*.jsonl")))
     return Outcome(
-        seed, end_s - timeline.start_s, settled_s, stop.is_set(), findings, found_gaps, tuple(timeline.rows), restarts,
-        died,
-    )  # fmt: skip
+        seed=seed,
+        seconds=end_s - timeline.start_s,
+        settled_s=settled_s,
+        interrupted=stop.is_set(),
+        findings=findings,
+        gaps=found_gaps,
+        inflicted=tuple(timeline.rows),
+        restarts=restarts,
+        deaths=deaths,
+        died=died,
+    )
 
 
 def _wait_for_merges(cloud: Cloud, stop: threading.Event) -> None:

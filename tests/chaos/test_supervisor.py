@@ -45,6 +45,7 @@ def test_a_process_that_is_killed_on_purpose_is_started_again_as_often_as_that(s
         supervisor.kill("part")
         poll_until(supervisor, kills, "part")
     assert supervisor.restarts == {"part": MAX_RESTARTS + 3}
+    assert supervisor.deaths["part"] == 0
 
 
 def test_a_process_that_dies_by_itself_again_and_again_is_given_up(
@@ -55,6 +56,7 @@ def test_a_process_that_dies_by_itself_again_and_again_is_given_up(
     with pytest.raises(ProcessDied, match=f"part ended {MAX_RESTARTS + 1} times within 60 s"):
         poll_until(supervisor, 99, "part")
     assert supervisor.restarts == {"part": MAX_RESTARTS}
+    assert supervisor.deaths["part"] == MAX_RESTARTS + 1
 
 
 def test_deaths_of_long_ago_count_no_more(supervisor: Supervisor, monkeypatch: pytest.MonkeyPatch) -> None:
