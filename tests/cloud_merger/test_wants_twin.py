@@ -84,5 +84,5 @@ def test_what_is_wanted_is_what_all_statements_say(seed, mode):
     )
     merge = MergeParameters(mode=mode)
     want = WantParameters(enough=int(rng.integers(0, 4)), sample=int(rng.choice([0, 2])))
-    found = _wanted_of_tile(own, known, merge, want)
+    _, found = _wanted_of_tile(own, known, merge, want)
     assert found.tolist() == by_statements(own, reports, known, merge, want).tolist()
