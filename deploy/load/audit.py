@@ -103,7 +103,7 @@ class Auditor:
     def backlog(self, at_s: float) -> Backlog:
         """What waits now."""
         uploads, tiles, received = self._row(_BACKLOG)
-        return Backlog(at_s, int(uploads), int(tiles), int(received or 0))
+        return Backlog(at_s, uploads, tiles, received)
 
     def ledger(self) -> Ledger:
         """All that the load has left behind."""
@@ -117,15 +117,16 @@ class Auditor:
             with_gaussians=frozenset(report_id for report_id, part in parts if part == 1),
             kept={str(report_id): str(state) for report_id, state in self._connection.execute(_KEPT)},
             merged=merged,
-            unmerged=int(self._row(_WAITING)[0]),
-            aside=int(self._row(_ASIDE)[0]),
-            quarantined=int(self._row(_REFUSED)[0]),
+            unmerged=self._row(_WAITING)[0],
+            aside=self._row(_ASIDE)[0],
+            quarantined=self._row(_REFUSED)[0],
         )
 
     def close(self) -> None:
         """Close the file."""
         self._connection.close()
 
-    def _row(self, sql: str) -> tuple[int, ...]:
+    def _row(self, sql: str) -> list[int]:
+        """One row of counts; there is none of an empty table: 0."""
         (row,) = self._connection.execute(sql)
-        return row  # type: ignore[return-value]
+        return [int(value or 0) for value in row]

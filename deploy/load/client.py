@@ -12,6 +12,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
 
+from deploy.load.drives import KeptRuns
 from deploy.load.plan import Due, LoadOptions, Timetable
 from deploy.load.sending import Account, Measured, Open, Sender, opened
 from deploy.load.shift import Shift
@@ -40,7 +41,7 @@ class ClientConfig:
         number: of the client.
         vehicles: whose reports it sends.
         options: of the load.
-        run: folder of the kept drives.
+        runs: the kept drives.
         connect: endpoint of the router.
         folder: where it tells that it is ready, reads when to begin, and writes its accounts.
     """
@@ -48,7 +49,7 @@ class ClientConfig:
     number: int
     vehicles: range
     options: LoadOptions
-    run: Path
+    runs: KeptRuns
     connect: str
     folder: Path
 
@@ -84,7 +85,7 @@ def start_file(folder: Path) -> Path:
 
 def client(config: ClientConfig, *, stop: threading.Event) -> None:
     """Send all reports of the client's vehicles, then wait until all are released, at most `drain_s`."""
-    streets = Streets.of(config.run, config.options)
+    streets = Streets.of(config.runs, config.options)
     table = streets.timetable()
     bus_config = BusConfig(connect=(config.connect,))
     with open_bus(bus_config, name=f"client-{config.number}") as bus:

@@ -16,7 +16,7 @@ from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 from rich.table import Table
 
-from deploy.load.making import kept_run
+from deploy.load.making import kept_runs
 from deploy.load.plan import LoadOptions
 from deploy.load.run import Tell, run_load
 from deploy.load.verdict import summary
@@ -39,6 +39,7 @@ PATH: Final = click.Path(path_type=Path)
 @click.option(
     "--drives", type=PATH, help="A finished run of `gnd fleet`.  [default: runs/load-drives, made where it is missing]"
 )
+@click.option("--settled", type=PATH, help="A run of the same street on its healed map, for --changed-share.")
 @click.option("--seed", type=int, default=1, show_default=True, help="Of starting places and report ids.")
 @click.option("--per-street", type=int, default=4, show_default=True, help="Vehicles on a street at the same time.")
 @click.option(
@@ -58,7 +59,7 @@ PATH: Final = click.Path(path_type=Path)
 @click.option(
     "--json", "json_file", type=click.Path(path_type=Path, allow_dash=True), help="Write the figures; `-`: print them."
 )
-def load(drives: Path | None, keep: Path | None, json_file: Path | None, **given: Any) -> None:
+def load(drives: Path | None, settled: Path | None, keep: Path | None, json_file: Path | None, **given: Any) -> None:
     """Send the reports of a few kept drives again, as those of many vehicles on many streets, and measure the cloud.
 
     Router, tile server and merger shards run as processes of their own. Each street is a copy of the kept one at
@@ -66,9 +67,9 @@ def load(drives: Path | None, keep: Path | None, json_file: Path | None, **given
     """
     options = LoadOptions(**given)
     console = Console(stderr=True)
-    run, stop = kept_run(drives, console), threading.Event()
+    runs, stop = kept_runs(drives, settled, console), threading.Event()
     with _ending(stop), _folder(keep) as folder, _bar(console) as tell:
-        figures = summary(run_load(options, run, folder, tell, stop))
+        figures = summary(run_load(options, runs, folder, tell, stop))
     text = json.dumps(figures, indent=2)
     if json_file is not None and str(json_file) != "-":
         json_file.write_text(text + "\n", encoding="utf-8")
@@ -92,8 +93,7 @@ def table_of(figures: dict[str, Any]) -> Table:
         "vehicles hear what is wanted after": _spread(figures["word_s"], "s"),
         "receipt to published tile": f"{_spread(figures['merge_lag_s'], 's')}; {figures['versions']} versions",
         "deciding report to notice": _spread(figures["notice_lag_s"], "s"),
-        "CPU a report": f"{figures['cpu_ms_per_report']} ms: "
-        + ", ".join(f"{name} {ms}" for name, ms in figures["cpu_ms_by_part"].items()),
+        "CPU a report": _cpu(figures),
         "share of all cores": ", ".join(f"{name} {100 * share:.0f} %" for name, share in figures["cpu_share"].items()),
         "queue": f"at most {figures['backlog_max']} uploads and tiles; empty "
         + (f"{drained} s after the last report" if drained is not None else "not in time"),
@@ -104,6 +104,13 @@ def table_of(figures: dict[str, Any]) -> Table:
     for name, value in rows.items():
         table.add_row(name, value)
     return table
+
+
+def _cpu(figures: dict[str, Any]) -> str:
+    if figures["cpu_ms_per_report"] is None:
+        return "not known: not all was merged"
+    parts = ", ".join(f"{name} {ms}" for name, ms in figures["cpu_ms_by_part"].items())
+    return f"{figures['cpu_ms_per_report']} ms: {parts}"
 
 
 def _spread(values: dict[str, float | None], unit: str) -> str:

@@ -14,6 +14,13 @@ def cpu_s(pid: int) -> float:
     return sum((_own_s(pid), *(cpu_s(child) for child in children(pid))))
 
 
+def busy_s() -> float:
+    """CPU seconds that all programs of the machine have used since it was started."""
+    line = Path("/proc/stat").read_text(encoding="ascii").partition("\n")[0].split()[1:]
+    user, nice, system, _idle, _iowait, irq, softirq, *_ = map(int, line)
+    return _TICK_S * (user + nice + system + irq + softirq)
+
+
 def children(pid: int) -> list[int]:
     """The processes that a process has started and that run."""
     found: set[int] = set()

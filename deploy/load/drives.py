@@ -33,6 +33,19 @@ _SENT = (
 )
 
 
+@dataclass(frozen=True, slots=True)
+class KeptRuns:
+    """Finished runs of `gnd fleet`.
+
+    Attributes:
+        changed: whose vehicles drove on a map that was older than the world.
+        settled: whose vehicles drove on a map that was as the world is; None: there is none.
+    """
+
+    changed: Path
+    settled: Path | None = None
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class KeptReport:
     """One report as its vehicle has sent it.
@@ -68,13 +81,11 @@ class KeptStreet:
 
     Attributes:
         tiles: the map before anybody had reported.
-        healed: the map after all had.
         drives: that were made against `tiles`.
         left_out: other drives of the run.
     """
 
     tiles: Mapping[TileId, Tile]
-    healed: Mapping[TileId, Tile]
     drives: tuple[KeptDrive, ...]
     left_out: int
 
@@ -82,11 +93,6 @@ class KeptStreet:
     def length_m(self) -> float:
         """Of the longest drive."""
         return max(drive.length_m for drive in self.drives)
-
-    @property
-    def reports(self) -> int:
-        """Of all drives."""
-        return sum(len(drive.reports) for drive in self.drives)
 
 
 def read_street(run: Path) -> KeptStreet:
@@ -99,7 +105,7 @@ def read_street(run: Path) -> KeptStreet:
     if not folder.mark.exists() or not folder.store.exists():
         raise LoadError(f"{run} holds no run of `gnd fleet` ({folder.mark.name} or {folder.store.name} is missing)")
     with to_read(folder.store) as store:
-        tiles, healed = _tiles(store, first=True), _tiles(store, first=False)
+        tiles = _tiles(store, first=True)
     homes = sorted(path.parent for path in folder.agents.glob(f"*/{WAY_FILE}"))
     found = [_drive(home) for home in homes]
     drives = tuple(drive for drive in found if drive is not None and _is_of(drive, tiles))
@@ -108,7 +114,13 @@ def read_street(run: Path) -> KeptStreet:
             f"{run}: none of its {len(homes)} drives can be replayed. Its vehicles must have kept their reports in "
             f"short and have driven on the map as it was before: `gnd fleet --headway 0` of this release"
         )
-    return KeptStreet(tiles, healed, drives, len(homes) - len(drives))
+    return KeptStreet(tiles, drives, len(homes) - len(drives))
+
+
+def healed_map(folder: RunFolder) -> dict[TileId, Tile]:
+    """The map at the end of a run, every tile as version 1."""
+    with to_read(folder.store) as store:
+        return {tile: Tile(tile, 1, one.gaussians, one.day) for tile, one in _tiles(store, first=False).items()}
 
 
 def _tiles(store: Store, *, first: bool) -> dict[TileId, Tile]:

@@ -123,19 +123,18 @@ class Timetable:
         """How many they are."""
         return sum(1 for vehicle in vehicles for _ in self._of(vehicle))
 
-    def drive_of(self, vehicle: int) -> int:
-        """The drive that a vehicle repeats: those that share a street repeat different ones, as far as there are."""
-        return (vehicle // self.options.streets) % len(self.changed_at_m)
-
     def _of(self, vehicle: int) -> Iterator[Due]:
-        """It begins somewhere in its first street, so that all together send evenly from the first second on."""
-        options, drive = self.options, self.drive_of(vehicle)
+        """It begins somewhere in its first street, so that all together send evenly from the first second on. Vehicles
+        that share a street repeat different drives, as far as there are.
+        """
+        options = self.options
         first_m = float(np.random.default_rng((options.seed, vehicle)).uniform(0.0, self.length_m))
         last_m, passage = first_m + 1000.0 * options.km, 0
         while passage * self.length_m < last_m:
             street = (vehicle + passage) % options.streets
-            at_m = self.changed_at_m if options.is_changed(street) else self.settled_at_m
-            for number, here_m in enumerate(at_m[drive]):
+            drives = self.changed_at_m if options.is_changed(street) else self.settled_at_m
+            drive = (vehicle // options.streets) % len(drives)
+            for number, here_m in enumerate(drives[drive]):
                 way_m = passage * self.length_m + here_m
                 at_s = (way_m - first_m) / options.speed_m_s
                 if first_m <= way_m < last_m and (at_s <= options.seconds or options.pace == "max"):

@@ -17,8 +17,8 @@ from deploy.fleet import shard_config
 from deploy.fleet_config import FleetConfig
 from deploy.load.audit import Auditor, Backlog
 from deploy.load.client import ClientConfig, client, read_accounts, start_file
-from deploy.load.cpu import by_part
-from deploy.load.drives import LAYER
+from deploy.load.cpu import busy_s, by_part
+from deploy.load.drives import LAYER, KeptRuns
 from deploy.load.plan import LoadOptions, shared_out
 from deploy.load.sending import Account
 from deploy.load.streets import Streets
@@ -99,12 +99,12 @@ class Running:
         return True
 
 
-def run_load(options: LoadOptions, run: Path, folder: Path, tell: Tell, stop: threading.Event) -> Outcome:
-    """Replay the drives of a run as many vehicles.
+def run_load(options: LoadOptions, runs: KeptRuns, folder: Path, tell: Tell, stop: threading.Event) -> Outcome:
+    """Replay kept drives as many vehicles.
 
     Args:
         options: what to replay.
-        run: folder of a finished `gnd fleet` run.
+        runs: the kept drives.
         folder: empty; for store, logs and accounts.
         tell: is told how far it is.
         stop: ends the run early: what was measured until then is the outcome.
@@ -113,10 +113,10 @@ def run_load(options: LoadOptions, run: Path, folder: Path, tell: Tell, stop: th
         LoadError: the drives cannot be replayed.
         DeployError: the cloud does not start, or does not stay alive.
     """
-    streets = Streets.of(run, options)
+    streets = Streets.of(runs, options)
     _put_streets(streets, folder / "store.sqlite", tell, stop)
     start_fork_server()
-    with _cloud(options, run, folder, stop) as running:
+    with _cloud(options, runs, folder, stop) as running:
         tell("start", 0, 1)
         planned = _ready(running)
         return _measured(running, options, planned, tell)
@@ -133,12 +133,12 @@ def _put_streets(streets: Streets, path: Path, tell: Tell, stop: threading.Event
 
 
 @contextmanager
-def _cloud(options: LoadOptions, run: Path, folder: Path, stop: threading.Event) -> Iterator[Running]:
+def _cloud(options: LoadOptions, runs: KeptRuns, folder: Path, stop: threading.Event) -> Iterator[Running]:
     connect = f"tcp/127.0.0.1:{claim_port(0)}"
     store = folder / "store.sqlite"
     shards = [shard_config(FleetConfig(), f"shard-{n}", store, connect) for n in range(options.shards)]
     clients = [
-        ClientConfig(number, vehicles, options, run.resolve(), connect, folder)
+        ClientConfig(number, vehicles, options, runs, connect, folder)
         for number, vehicles in enumerate(shared_out(options.vehicles, options.clients))
     ]
     with ExitStack() as stack:
@@ -202,7 +202,8 @@ def _ready(running: Running) -> int:
 
 
 def _measured(running: Running, options: LoadOptions, planned: int, tell: Tell) -> Outcome:
-    cloud_before, own_before_s = running.cloud_cpu_s(), time.process_time()
+    cloud_before, own_before_s, busy_before_s = running.cloud_cpu_s(), time.process_time(), busy_s()
+    measured_s = time.monotonic()
     start_s = time.monotonic() + LEAD_S
     _say_start(running.folder, start_s)
     first = running.look().received
@@ -222,6 +223,7 @@ def _measured(running: Running, options: LoadOptions, planned: int, tell: Tell) 
     offered_at_s = time.monotonic() if offered_s is None else time.monotonic() - (time.time() - offered_s)
     drained_s = _drained(running, offered_at_s + options.drain_s, look)
     cloud, own_s = running.cloud_cpu_s(), time.process_time() - own_before_s
+    machine_s, measured_s = busy_s() - busy_before_s, time.monotonic() - measured_s
     accounts = _ended(running)
     return Outcome(
         options=options,
@@ -233,7 +235,8 @@ def _measured(running: Running, options: LoadOptions, planned: int, tell: Tell) 
         drained_s=drained_s,
         cpu_s={name: used_s - cloud_before[name] for name, used_s in cloud.items()},
         client_cpu_s=running.client_cpu_s() + own_s,
-        cores=os.cpu_count() or 1,
+        machine_cpu_s=machine_s,
+        capacity_s=(os.cpu_count() or 1) * measured_s,
         ledger=running.auditor.ledger(),
         notices_s=dict(running.notices_s),
         restarts=sum(running.supervisor.restarts.values()),

@@ -34,8 +34,10 @@ class Outcome:
         backlog: what waited, every half second, from the start until all was done.
         start_s, offered_s: when the first report was due, when the last one had been sent, monotonic.
         drained_s: when nothing waited any more; None: something still did when the time was over.
-        cpu_s: CPU seconds of the cloud's parts, and of the clients (with this process), over that time.
-        cores: of the machine.
+        cpu_s: CPU seconds of the cloud's parts over that time.
+        client_cpu_s: of the clients and of the process that watches over them.
+        machine_cpu_s: of all programs of the machine.
+        capacity_s: what all its cores could have done.
         ledger: what the store holds.
         notices_s: when the subscriber had heard of each (tile, version), s UTC.
         restarts: how often a process of the cloud was started again.
@@ -50,7 +52,8 @@ class Outcome:
     drained_s: float | None
     cpu_s: Mapping[str, float]
     client_cpu_s: float
-    cores: int
+    machine_cpu_s: float
+    capacity_s: float
     ledger: Ledger
     notices_s: Mapping[tuple[int, int], float] = field(repr=False)
     restarts: int = 0
@@ -75,11 +78,10 @@ class Outcome:
         """From the first report to the last one."""
         return max(self.offered_s - self.start_s, 1e-3)
 
-    @property
-    def all_s(self) -> float:
-        """From the first report until all was merged, or the end of waiting."""
-        last_s = self.backlog[-1].at_s if self.backlog else self.offered_s
-        return max((last_s if self.drained_s is None else self.drained_s) - self.start_s, 1e-3)
+    def cpu_ms(self, used_s: float) -> float | None:
+        """CPU a report, ms; None: not all was merged, and what is not done yet costs, too."""
+        done = self.drained_s is not None and self.acknowledged
+        return _rounded(1e3 * used_s / len(self.acknowledged)) if done else None
 
 
 def why_not(outcome: Outcome) -> list[str]:
@@ -151,7 +153,7 @@ def _lagging(outcome: Outcome) -> Iterable[str]:
     for what, first, last in (("word", waits[:n], waits[-n:]), ("merge", lags[:m], lags[-m:])):
         if not len(first):
             continue
-        a, b = float(np.quantile(first, 0.95)), float(np.quantile(last, 0.95))
+        a, b = (float(np.quantile(part, 0.95, method="higher")) for part in (first, last))
         if b > max(LAG_FACTOR * a, LAG_S):
             found.append(f"p95 of the wait for {what}: {a:.2f} s in the first tenth, {b:.2f} s in the last")
     return found
@@ -173,13 +175,11 @@ def summary(outcome: Outcome) -> dict[str, Any]:
         "lost": outcome.lost,
         "acks_per_s": _rounded(len(acknowledged) / outcome.wall_s),
         "ack_ms": _quantiles(took_ms, {"p50": 0.5, "p99": 0.99}),
-        "cpu_ms_per_report": _rounded(1e3 * sum(outcome.cpu_s.values()) / max(len(acknowledged), 1)),
+        "cpu_ms_per_report": outcome.cpu_ms(sum(outcome.cpu_s.values())),
         "merge_lag_s": _quantiles(np.array([one.lag_s for one in outcome.ledger.merged]), _LAGS),
         "kept_up": not reasons,
         "why_not": reasons,
-        "cpu_ms_by_part": {
-            name: _rounded(1e3 * used_s / max(len(acknowledged), 1)) for name, used_s in outcome.cpu_s.items()
-        },
+        "cpu_ms_by_part": {name: outcome.cpu_ms(used_s) for name, used_s in outcome.cpu_s.items()},
         "notice_lag_s": _quantiles(_notice_lags_s(outcome), _LAGS),
         "word_s": _quantiles(np.array([_word_lag_s(one) for one in acknowledged if one.word_s]), _LAGS),
         "second_halves": sum(one.halves for one in sent),
@@ -211,12 +211,10 @@ def _notice_lags_s(outcome: Outcome) -> F64:
 
 
 def cpu_shares(outcome: Outcome) -> dict[str, float]:
-    """Shares of all cores that cloud and clients used while reports came."""
-    whole_s = outcome.cores * outcome.all_s
-    return {
-        "cloud": _rounded(sum(outcome.cpu_s.values()) / whole_s),
-        "clients": _rounded(outcome.client_cpu_s / whole_s),
-    }
+    """Shares of all cores that the cloud, the clients and other programs used, from the start until all was done."""
+    cloud_s, clients_s = sum(outcome.cpu_s.values()), outcome.client_cpu_s
+    used_s = {"cloud": cloud_s, "clients": clients_s, "others": max(0.0, outcome.machine_cpu_s - cloud_s - clients_s)}
+    return {name: round(s / outcome.capacity_s, 3) for name, s in used_s.items()}
 
 
 def limit_of(outcome: Outcome, reasons: Sequence[str]) -> str:
