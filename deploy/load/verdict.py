@@ -17,7 +17,8 @@ LATE_S: Final = 1.0
 ON_TIME: Final = 0.99
 """Share of reports that must be sent at that pace."""
 GROWTH_S: Final = 1.0
-"""From the third quarter of a run to the last one the queue may grow by what comes in so long a time."""
+"""From the third quarter of a run to the last one the queue may grow by the reports of so long a time."""
+SLOW_ACK_S: Final = 0.25
 LAG_FACTOR: Final = 2.0
 LAG_S: Final = 1.0
 """The last tenth of the reports may wait twice as long as the first one, or so long."""
@@ -127,19 +128,20 @@ def _not_done(outcome: Outcome) -> Iterable[str]:
 
 
 def _growing(outcome: Outcome) -> Iterable[str]:
-    third, last = (_mean_items(outcome, part) for part in ((0.5, 0.75), (0.75, 1.0)))
+    third, last = (_least_items(outcome, part) for part in ((0.5, 0.75), (0.75, 1.0)))
     if third is None or last is None:
         return ["the run was too short to see whether the queue grows"]
     allowed = GROWTH_S * len(outcome.sent) / outcome.wall_s
     if last - third > allowed:
-        return [f"the queue grew from {third:.0f} in the third quarter to {last:.0f} in the last"]
+        return [f"the queue grew: at least {third} waited in the third quarter, {last} in the last"]
     return []
 
 
-def _mean_items(outcome: Outcome, part: tuple[float, float]) -> float | None:
+def _least_items(outcome: Outcome, part: tuple[float, float]) -> int | None:
+    """The shortest that the queue was: reports come in bursts, and one that is worked off is short between them."""
     first_s, last_s = (outcome.start_s + share * outcome.wall_s for share in part)
     items = [one.items for one in outcome.backlog if first_s <= one.at_s <= last_s]
-    return float(np.mean(items)) if items else None
+    return min(items, default=None)
 
 
 def _lagging(outcome: Outcome) -> Iterable[str]:
@@ -218,13 +220,17 @@ def cpu_shares(outcome: Outcome) -> dict[str, float]:
 
 
 def limit_of(outcome: Outcome, reasons: Sequence[str]) -> str:
-    """Who could not do more: "none" where nobody was at the limit."""
-    if any("late" in one or "were sent" in one for one in reasons):
-        queue = [one.items for one in outcome.backlog]
-        return "cloud" if queue and np.mean(queue) > len(outcome.sent) / outcome.wall_s else "clients"
-    if reasons or outcome.options.pace == "max":
+    """Who could not do more: "cloud", "clients", "none" where nobody was at the limit.
+
+    Clients are, where the cloud has kept up with all that they sent, but they were late or sent as fast as they could.
+    """
+    late = set(_not_offered(outcome))
+    if set(reasons) - late:
         return "cloud"
-    return "none"
+    acks_s = [one.acked_s - one.sent_s for one in outcome.acknowledged]
+    if late and acks_s and float(np.median(acks_s)) > SLOW_ACK_S:
+        return "cloud"  # all that may be under way waits for acks
+    return "clients" if late or outcome.options.pace == "max" else "none"
 
 
 def _quantiles(values: F64, which: Mapping[str, float]) -> dict[str, float | None]:

@@ -62,7 +62,11 @@ def change_of(tile: Tile) -> TileChange:
     nothing = _gaussians(gone)
     zeros = np.zeros(len(gone), np.int32)
     nothing = Gaussians(
-        nothing.voxel_id, zeros, zeros.copy(), np.zeros((len(gone), 3), np.float32), np.zeros((len(gone), 6), np.float32)
+        nothing.voxel_id,
+        zeros,
+        zeros.copy(),
+        np.zeros((len(gone), 3), np.float32),
+        np.zeros((len(gone), 6), np.float32),
     )
     parts = [*changed, nothing]
     kinds = [ChangeClass.NEW, ChangeClass.MODIFIED, ChangeClass.DELETED]

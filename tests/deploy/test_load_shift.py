@@ -60,7 +60,9 @@ def test_the_gaussians_of_a_report_are_read_where_it_was_moved_to():
     assert np.array_equal(told.voxel_id, said.voxel_id)
     assert np.array_equal(told.mean_m, said.mean_m)
     # It is what a vehicle there would have coded.
-    assert pack_measured(shift.whole(whole), {moved_tile.sha: tile.gaussians}, encode_mask(mask)).measured == half.measured
+    assert (
+        pack_measured(shift.whole(whole), {moved_tile.sha: tile.gaussians}, encode_mask(mask)).measured == half.measured
+    )
 
 
 def test_a_report_that_was_not_moved_with_its_street_is_not_understood_there():
