@@ -106,7 +106,11 @@ class Auditor:
         return Backlog(at_s, uploads, tiles, received)
 
     def ledger(self) -> Ledger:
-        """All that the load has left behind."""
+        """All that the load has left behind, as it is at one moment: workers may still be busy."""
+        with self._connection:  # one snapshot: else an upload that is settled meanwhile would be seen nowhere
+            return self._ledger()
+
+    def _ledger(self) -> Ledger:
         parts = [(str(report_id), int(part)) for report_id, part in self._connection.execute(_JOURNALED)]
         merged = tuple(
             Merged(int(tile), int(version), received_ns / NS_PER_S, (created_ns - received_ns) / NS_PER_S)

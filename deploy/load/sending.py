@@ -93,12 +93,12 @@ class Measured:
     """
 
     bases: Mapping[bytes, Gaussians]
-    _coded: dict[tuple[str, bytes], PackedGaussians] = field(default_factory=dict)
+    _coded: dict[tuple[KeptReport, bytes], PackedGaussians] = field(default_factory=dict)
     _lock: threading.Lock = field(default_factory=threading.Lock)
 
     def half(self, kept: KeptReport, wanted: bytes, report_id: str) -> bytes:
         """The encoded second half that answers a mask."""
-        at = (kept.whole.report_id, wanted)
+        at = (kept, wanted)  # the very report: the same vehicle says other things of another map under the same id
         with self._lock:
             found = self._coded.get(at)
         if found is None:
