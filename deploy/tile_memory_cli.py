@@ -37,7 +37,7 @@ def memory(path: Path, tile: str, layer: str, as_json: bool) -> None:
         raise StoreError(f"tile {tile_id.path} of layer {layer}: no window is closed yet, so nothing is remembered")
     state = decode_state(tile_id, journal.memory)
     voxels, claims = state.memory.voxels, state.memory.claims
-    weight = state.memory.weights(int(voxels["day"].max(initial=0)))
+    weight = state.memory.support(voxels["voxel_id"], int(voxels["day"].max(initial=0)))
     held = set(state.gaussians.voxel_id.tolist())
     rows = [
         {"voxel_id": voxel, "is_there": voxel in held, "observers": observers, "last_day": _date(day), "votes": votes}
