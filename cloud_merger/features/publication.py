@@ -92,6 +92,8 @@ class Story:
         for number in sorted(n for n in self.track.votes if n < 0):
             self._cast(number)
         self._weigh()
+        if self.is_away:
+            return
         self._confirm()
         self._decide()
         self._go_home()
@@ -106,7 +108,9 @@ class Story:
             is_new = self._measure(report, self.track.measured[report])
         if report in self.track.votes:
             self._cast(report)
-            self._weigh()
+        if self.is_away:
+            return  # only who measured it is remembered
+        self._weigh()
         self._decide()
         if self.is_published:
             self._renew(is_new)
@@ -136,7 +140,7 @@ class Story:
         self._longest_m = max(self._longest_m, length_m)
         self._least_m2[vehicle] = self._fused(own).least_m2
         was_even, self._is_even = self._is_even, self._even()
-        if not is_new or is_longer or not (was_even and self._is_even):
+        if not is_new or is_longer or self.is_away or not (was_even and self._is_even):
             self._is_stale = True
         elif not self._is_stale:
             self._state = place if self._state is None else step(self._state, place)
