@@ -2,17 +2,22 @@
 it can be computed anew."""
 
 import json
+import signal
+import subprocess
+import sys
 from time import process_time
 
 import numpy as np
 import pytest
 import zstandard
+from click.testing import CliRunner
 from feature_cloud import ABSENT, EXIST, TILE, change, feature, found, line, published, report, report_id, seen
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from cloud_merger.config import ShardConfig
 from cloud_merger.errors import MergerError
+from cloud_merger.expel import without_vehicle
 from cloud_merger.features import FeatureMergeParameters
 from cloud_merger.features import fold as folding
 from cloud_merger.features.check import FeatureLimits
@@ -21,6 +26,7 @@ from cloud_merger.features.kept import FeatureInbox
 from cloud_merger.features.memory import LayerMemory
 from cloud_merger.verify import Verifier
 from cloud_merger.work import Worker
+from deploy.map_cli import map_group
 from gnd_map.features import FeatureTile
 from schemas.features import EVERY_CELL
 from tile_store.sqlite_store import SqliteStore
@@ -396,3 +402,77 @@ def test_the_order_of_reports_within_a_window_does_not_matter(tmp_path_factory, 
         got.append((cloud.store.get("signs", TILE).sha, stored.memory))
         cloud.store.close()
     assert got[0] == got[1]
+
+
+DIES = """
+import os, signal, sys
+from pathlib import Path
+from cloud_merger.config import ShardConfig
+from cloud_merger.work import Worker
+from tile_store.sqlite_store import SqliteStore
+
+store = SqliteStore(sys.argv[1])
+publish = store.publish
+
+def dies(publications):
+    if sys.argv[2] == "after":
+        publish(publications)
+    os.kill(os.getpid(), signal.SIGKILL)
+
+store.publish = dies
+worker = Worker(store, ShardConfig("victim", Path(sys.argv[1])))
+for claim in store.claim("victim", 4, 0.01):
+    worker.settle(claim)
+"""
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("when", ["before", "after"])
+def test_a_shard_killed_between_journal_and_publication_loses_and_doubles_nothing(tmp_path, when):
+    """At each of four merges, of which each closes windows, a process dies with its work in hand, or just done."""
+    clouds = [Cloud(tmp_path / f"{name}.sqlite", window_reports=8) for name in ("faulty", "plain")]
+    for turn in range(4):
+        for cloud in clouds:
+            for k in range(12):
+                said = seen(GONE, ABSENT if turn % 2 else EXIST, (-5.0, 3.1)), found(2.0 + 0.1 * k, 2.0 + 3 * turn)
+                cloud.hears(f"car-{turn}-{k}", *said, base=MAP, later_s=60)
+            cloud.keeps()
+        victim = [sys.executable, "-c", DIES, str(clouds[0].store.path), when]
+        died = subprocess.run(victim, check=False, capture_output=True)
+        assert died.returncode == -signal.SIGKILL, died.stderr
+        assert clouds[0].store.dirty_count() == (when == "before")
+        clouds[0].store.release("victim")
+        for cloud in clouds:
+            cloud.merges()
+    faulty, plain = ([cloud.head(), cloud.memory().encode(), cloud.store.counts()] for cloud in clouds)
+    assert faulty == plain
+    assert set(clouds[0].verified()) == {"given", "same"}
+    assert len(clouds[0].memory().tracks) >= len(MAP) + 4
+    for cloud in clouds:
+        cloud.store.close()
+
+
+def test_a_layer_without_a_vehicle_is_computed_from_the_others(cloud):
+    cloud.sees(crowd(2), seen(GONE, ABSENT), base=MAP)
+    cloud.sees(["liar", "friend"], found(2.0, 2.0), base=MAP, later_s=HOUR_S)
+    cloud.sees(["idle"], seen(FAR), later_s=HOUR_S)
+    assert len(cloud.ids()) == 3
+    config = ShardConfig(store_path=cloud.store.path)
+    ((told, content),) = without_vehicle(cloud.store, config, "signs", "liar")
+    assert (told.status, told.reports, told.voxels) == ("changes", 1, 1)
+    assert {one.feature_id for one in content.features} == {STAYS, FAR}
+    cloud.store.put_tiles([content], "rollback", "signs")
+    assert cloud.ids() == {STAYS, FAR}
+    ((told, content),) = without_vehicle(cloud.store, config, "signs", "liar")
+    assert (told.status, content) == ("same", None)
+
+
+def test_the_command_tells_what_a_layer_remembers(cloud):
+    heal(cloud)
+    cloud.sees(["one"], found(-9.0, -9.0), later_s=HOUR_S)
+    cloud.sees(["two"], seen(STAYS), later_s=HOUR_S)
+    arguments = ["memory", str(cloud.store.path), TILE.path, "--layer", "signs", "--json"]
+    told = json.loads(CliRunner().invoke(map_group, arguments).output)
+    assert (told["features"], told["published"], told["found by one vehicle"]) == (5, 3, 1)
+    (gone,) = [one for one in told["each"] if one["feature_id"] == GONE]
+    assert (gone["is_published"], gone["votes_for"], gone["votes_against"]) == (False, 0, 6)
