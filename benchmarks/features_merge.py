@@ -163,7 +163,7 @@ def _long_journal() -> list[Figure]:
     return [
         Figure("late report", float(each_ms[-2:].sum() / each_ms[:2].sum()), "",
                f"CPU of the last 64 of {JOURNAL_REPORTS} reports to the first 64, {each_ms[0]:.1f} ms each at first"),
-        Figure("memory", sizes[-1] / 1e3, "kB", f"of a tile with four lights; {sizes[9] / 1e3:.2f} kB after 320 reports"),
+        Figure("memory", sizes[-1] / 1e3, "kB", f"of a tile of four lights, {sizes[9] / 1e3:.2f} kB after 320 reports"),
     ]  # fmt: skip
 
 
