@@ -10,7 +10,7 @@ from gnd_map.tile_id import TileId
 from tile_store import sqlite_journal as journal
 from tile_store.regions import morton_range
 from tile_store.sqlite_connection import Row, change, fetch
-from tile_store.values import Claim, PutStatus, ReportRow, StoreConfig
+from tile_store.values import Claim, JournalMark, PutStatus, ReportRow, StoreConfig
 
 NS_PER_S: Final = 1_000_000_000
 
@@ -158,6 +158,12 @@ def in_play(c: apsw.Connection, layer: str, tile: TileId, epoch: int, first: int
     """The reports of the windows `first` to `last` that count since the epoch, by report id and part."""
     wanted = {"layer": layer, "tile": tile.morton, "epoch": epoch, "folded": first - 1, "last": last}
     return tuple(_row(*values) for values in fetch(c, "reports_in_play", wanted))
+
+
+def since(c: apsw.Connection, layer: str, tile: TileId, mark: JournalMark) -> list[ReportRow]:
+    """The reports in play with numbers beyond the mark, by number."""
+    wanted = {"layer": layer, "tile": tile.morton, "epoch": mark.epoch, "folded": mark.folded, "seq": mark.seq}
+    return [_row(*values) for values in fetch(c, "reports_since", wanted)]
 
 
 def of_windows(c: apsw.Connection, layer: str, tile: TileId, first: int, last: int, seq: int) -> tuple[ReportRow, ...]:

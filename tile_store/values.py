@@ -289,6 +289,21 @@ class WindowCounts:
 
 
 @dataclass(frozen=True, slots=True)
+class JournalMark:
+    """How far a tile's journal has been read.
+
+    Attributes:
+        epoch: version of the latest base or rollback; 0: the map has no such tile.
+        folded: the newest window that is folded into it.
+        seq: number of the newest entry.
+    """
+
+    epoch: int
+    folded: int
+    seq: int
+
+
+@dataclass(frozen=True, slots=True)
 class TileJournal:
     """What counts of a tile, read at one instant.
 
@@ -299,6 +314,7 @@ class TileJournal:
         window: the open one.
         seq: number of the newest entry.
         is_whole: the reports reach to the end of the journal; else `window` and `seq` say how far, and all are closed.
+        mark: to ask for what comes later; None: not whole, or a layer without windows.
     """
 
     epoch: StoredTile | None
@@ -307,6 +323,7 @@ class TileJournal:
     window: int = 0
     seq: int = 0
     is_whole: bool = True
+    mark: JournalMark | None = None
 
 
 @dataclass(frozen=True, slots=True)

@@ -66,12 +66,12 @@ def test_a_renewed_lease_lasts_longer_and_a_lost_one_cannot_be_renewed(store: St
     store.put_reports([report(1)])
     claim = only_claim(store, "m1", lease_s=5.0)
     clock.advance(4.0)
-    assert store.renew([claim], 5.0) == [True]
+    assert store.beat("m1", [claim], 5.0) == [True]
     clock.advance(4.0)
     assert store.claim("m2", 10, 5.0) == []
     clock.advance(1.0)
     only_claim(store, "m2")
-    assert store.renew([claim], 5.0) == [False]
+    assert store.beat("m1", [claim], 5.0) == [False]
 
 
 def test_the_leases_of_the_dead_are_freed_at_once(store: Store) -> None:
@@ -173,7 +173,7 @@ def test_the_time_of_day_may_step_and_the_queue_does_not_care(maker: SqliteMaker
         claim = only_claim(store, "m1", lease_s=10.0)
         day.advance(-2 * step_s)
         assert store.claim("m2", 1, 10.0) == []
-        assert store.renew([claim], 10.0) == [True]
+        assert store.beat("m1", [claim], 10.0) == [True]
         steady.advance(10.0)
         assert only_claim(store, "m2").token != claim.token
 
@@ -191,7 +191,7 @@ def test_leases_and_delays_of_another_boot_are_over(maker: SqliteMaker, monkeypa
     with SqliteStore(maker.path, PATIENT, steady_ns=early) as store:
         assert [one.is_alive for one in store.shards()] == [False]
         assert {one.tile for one in store.claim("m1", 10, 10.0)} == {TILE, EAST}
-        assert store.renew([held], 10.0) == [False]
+        assert store.beat("dead", [held], 10.0) == [False]
         assert store.claim("m2", 10, 10.0) == []
 
 
