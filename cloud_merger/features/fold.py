@@ -21,7 +21,7 @@ MEASURERS_KEPT: Final = 8
 NAMES_KEPT: Final = 8
 FORGOTTEN_DAYS: Final = 180
 """What is not published and not the map's, and has been claimed by nobody for so long, is forgotten."""
-MOST_LONELY: Final = 2048
+MOST_LONELY: Final = 256
 """What single vehicles have found, of a tile; where it is more, who has found most loses what it found first."""
 
 

@@ -135,8 +135,9 @@ def test_wrong_assumptions_are_said_to_be_assumptions(tmp_path):
     assert cloud.ids() == [0, 1, 2, 3]
     assert call(cloud, "verify", "--json").exit_code == 0
     forget_parameters(cloud)
-    wrong = json.loads(call(cloud, "verify", "--json").output)["versions"]
-    assert not wrong or "does not say with which parameters" in wrong[0]["reason"]
+    (wrong,) = json.loads(call(cloud, "verify", "--json").output)["versions"]
+    assert wrong["status"] == "differs"
+    assert "does not say with which parameters it was merged, assumed were" in wrong["reason"]
     assert json.loads(call(cloud, "verify", "--json", "--merge-mode", "paper").output)["identical"]
     cloud.store.close()
 

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 import zstandard
 from click.testing import CliRunner
-from feature_cloud import ABSENT, EXIST, TILE, change, feature, found, line, published, report, report_id, seen
+from feature_cloud import ABSENT, EAST, EXIST, TILE, change, feature, found, line, published, report, report_id, seen
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -27,7 +27,7 @@ from cloud_merger.features.memory import LayerMemory
 from cloud_merger.verify import Verifier
 from cloud_merger.work import Worker
 from deploy.map_cli import map_group
-from gnd_map.features import FeatureTile
+from gnd_map.features import FeatureTile, geodetic_in_tile, points_in_tile
 from schemas.features import EVERY_CELL
 from tile_store.sqlite_store import SqliteStore
 from tile_store.values import StoreConfig
@@ -213,6 +213,41 @@ def test_a_place_becomes_as_sure_over_windows_as_in_one(tmp_path):
     assert np.hypot(*(one.points_m - many.points_m)[0, :2]) < 0.02
     assert 0.5 < many.cov_m2[0] / one.cov_m2[0] < 1.1
     assert many.vehicles >= 40
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_a_lamp_at_the_border_is_published_once_however_the_windows_cut(tmp_path, seed):
+    """Found now in this tile, now in the next, by vehicles that know their place to metres; two or three a window."""
+    rng = np.random.default_rng([17, seed])
+    (south, _), (north, east) = TILE.south_west_rad, TILE.north_east_rad
+    border_m = points_in_tile(TILE, (south + north) / 2, east, 0.0)[0, 0]
+    cloud = Cloud(tmp_path / "map.sqlite")
+    others = 0  # reports about the next tile only, which its neighbour does not hear of
+    for k in range(30):
+        at = np.array([[border_m + rng.normal(0.1, 1.5), rng.normal(0, 0.3), 0.0]])
+        tile = TILE if at[0, 0] < border_m else EAST
+        local = points_in_tile(tile, *geodetic_in_tile(TILE, at))[0]
+        cloud.now_ns += round(rng.uniform(300, 900) * 1e9)
+        lamp = change(found(local[0], local[1], sigma_m=1.5, kind="streetlight"), tile=tile)
+        cloud.heard += cloud.inbox.rows(report(2 * k, lamp, vehicle=f"car-{k}"), cloud.now_ns)
+        if rng.random() < 0.5:
+            far = change(found(10.0, 0.0, sigma_m=0.2), tile=EAST)
+            cloud.heard += cloud.inbox.rows(report(2 * k + 1, far, vehicle=f"other-{k}"), cloud.now_ns)
+            others += 1
+        cloud.merges()
+        lamps = [one for tile in (TILE, EAST) for one in features_of(cloud, tile) if one.kind == "streetlight"]
+        assert len(lamps) == (k > 0)
+    assert others > 5
+    assert lamps[0].vehicles > 15
+    assert all(one.is_away for one in cloud.memory().tracks if one.kind == "streetlight") == (
+        lamps[0] not in features_of(cloud, TILE)
+    )
+    cloud.store.close()
+
+
+def features_of(cloud, tile):
+    stored = cloud.store.get("signs", tile)
+    return () if stored is None else stored.decode_features().features
 
 
 def test_lines_are_carried_on(tmp_path):
