@@ -11,15 +11,15 @@ from cloud_merger.features.kept import FeatureContents
 from cloud_merger.features.window import LayerMerger, LayerState, refuted_of, windows_of
 from cloud_merger.map_parameters import digest_of, text_of, with_text
 from cloud_merger.memory import TileMemory
+from cloud_merger.statements import Report
 from cloud_merger.stored import Bases, lattice_of_tile, reports_by_window
-from cloud_merger.window import TileState, WindowMerger, fold
+from cloud_merger.window import MergedWindow, TileState, WindowMerger, fold
 from gnd_map.content import AnyTile
 from gnd_map.errors import GndError
 from gnd_map.features import FeatureTile, is_feature_layer
 from gnd_map.gaussian import Gaussians
 from gnd_map.tile import Tile
 from gnd_map.tile_id import TileId
-from tile_store.errors import StoreDamaged
 from tile_store.store import Store
 from tile_store.values import Basis, ClosedWindow, ReportRow, StoredTile, VersionInfo
 
@@ -68,10 +68,14 @@ class _Journal:
         return self.closed.get(window, ClosedWindow(frozenset()))
 
     @property
+    def windows_before(self) -> list[int]:
+        """The closed ones that hold reports, in order."""
+        return sorted({row.window for row in self.rows} - {self.basis.window})
+
+    @property
     def is_told(self) -> bool:
         """Whether the store knows the parameters of all of it."""
-        windows = {row.window for row in self.rows} | {self.basis.window}
-        return all(self.how(window).parameters for window in windows)
+        return all(self.how(window).parameters for window in [*self.windows_before, self.basis.window])
 
     def without(self, is_out: Callable[[ReportRow], bool]) -> "_Journal":
         """The same without some reports."""
@@ -108,9 +112,7 @@ class Verifier:
             return self._checked(layer, tile, version)
         except MergerError as error:  # parameters of another release
             return Verified(layer, tile, version, "unknown", str(error))
-        except StoreDamaged as error:  # parameters, or a page
-            return Verified(layer, tile, version, "differs", str(error))
-        except GndError as error:  # a body that is not what its hash says
+        except GndError as error:  # a body, or parameters, that are not what their hash says
             return Verified(layer, tile, version, "differs", str(error))
 
     def _checked(self, layer: str, tile: TileId, version: int) -> Verified:
@@ -201,17 +203,21 @@ class Verifier:
         shas = {row.base_sha for row in journal.rows if row.base_sha}
         found = {sha: self._bases.content(layer, tile, sha) for sha in sorted(shas)}
         bases = {sha: gaussians for sha, gaussians in found.items() if gaussians is not None}
-        for window in _in_order(journal):
+
+        def said(window: int) -> list[Report]:
+            rows = [row for row in journal.rows if row.window == window]
+            return reports_by_window(rows, self._with(journal.how(window).parameters)[0].merge).get(window, [])
+
+        def merged(window: int, reports: Sequence[Report]) -> MergedWindow:
             how = journal.how(window)
             config, shifts = self._with(how.parameters)
             merger = WindowMerger(config.merge, config.confirmation, shifts, bases, how.named)
-            rows = [row for row in journal.rows if row.window == window]
-            reports = reports_by_window(rows, config.merge).get(window, [])
-            merged = merger.merge(state, reports, lattice_of_tile(begun, epoch, config.codec))
-            if window == journal.basis.window:
-                return merged.gaussians
-            state = fold(state, merged) if reports else state
-        raise AssertionError("the open window comes last")
+            return merger.merge(state, reports, lattice_of_tile(begun, epoch, config.codec))
+
+        for window in journal.windows_before:
+            if reports := said(window):  # of one that can no longer be read nothing was folded
+                state = fold(state, merged(window, reports))
+        return merged(journal.basis.window, said(journal.basis.window)).gaussians
 
     def _computed_features(self, journal: _Journal) -> FeatureTile:
         layer, tile = journal.layer, journal.tile
@@ -220,20 +226,16 @@ class Verifier:
         found = {sha: self._features.content(layer, tile, sha) for sha in shas}
         bases = {sha: features for sha, features in found.items() if features is not None}
         by_window = windows_of(journal.rows)
-        for window in _in_order(journal):
-            how, said = journal.how(window), by_window.get(window)
-            config, _ = self._with(how.parameters)
-            merger = LayerMerger(tile, config.features, bases, refuted_of(how.named))
-            merged = merger.merge(state, said)
-            if window == journal.basis.window:
-                return FeatureTile(tile, journal.version, merged.features)
-            state = state if said is None else merger.fold(state, merged, said)
-        raise AssertionError("the open window comes last")
 
+        def merger(window: int) -> LayerMerger:
+            how = journal.how(window)
+            return LayerMerger(tile, self._with(how.parameters)[0].features, bases, refuted_of(how.named))
 
-def _in_order(journal: _Journal) -> list[int]:
-    """The windows that hold reports, and the one that was open."""
-    return sorted({row.window for row in journal.rows} | {journal.basis.window})
+        for window in journal.windows_before:
+            if (said := by_window.get(window)) is not None:
+                state = merger(window).fold(state, merger(window).merge(state, said), said)
+        open_window = journal.basis.window
+        return FeatureTile(tile, journal.version, merger(open_window).merge(state, by_window.get(open_window)).features)
 
 
 def _epoch_of(history: Iterable[VersionInfo], version: int) -> VersionInfo | None:
