@@ -49,7 +49,7 @@ def _voxels(tile: TileId, stored: StoredMemory) -> tuple[dict[str, Any], list[di
 
     state = decode_state(tile, stored)
     voxels, claims = state.memory.voxels, state.memory.claims
-    weight = state.memory.weights(int(voxels["day"].max(initial=0)))
+    weight = state.memory.support(voxels["voxel_id"], int(voxels["day"].max(initial=0)))
     held = set(state.gaussians.voxel_id.tolist())
     rows = [
         {"voxel_id": voxel, "is_there": voxel in held, "observers": observers, "last_day": _date(day), "votes": votes}

@@ -139,7 +139,10 @@ class ReportRow:
     part: int = 0
     """0: flags, or the whole report; 1: the same with the Gaussians that were asked for later, in place of part 0."""
     is_quiet: bool = field(default=False, compare=False)
-    """It says of all that it observed "as in the base": where that is the newest version, nothing has to be merged."""
+    """It says of all that it observed "as in the base", or nothing that could win: where the base is the newest version
+    and nothing else waits, it is counted when the tile is merged for another reason."""
+    is_half: bool = field(default=False, compare=False)
+    """Its Gaussians are asked for: the tile is not merged on its account alone before they had time to come."""
     window: int = field(default=0, compare=False)
     """Of the tile's journal; the store assigns it, and the number in it, when the report becomes durable."""
     seq: int = field(default=0, compare=False)
