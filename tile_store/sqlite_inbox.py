@@ -174,15 +174,6 @@ def since(c: apsw.Connection, layer: str, tile: TileId, mark: JournalMark) -> li
     return [_row(*values) for values in fetch(c, "reports_since", wanted)]
 
 
-def in_play_of_vehicles(
-    c: apsw.Connection, layer: str, tile: TileId, epoch: int, config: StoreConfig
-) -> tuple[ReportRow, ...]:
-    """Of a feature layer the newest reports that count since the epoch, of each vehicle only so many, by report id."""
-    limits = {"n": config.max_feature_reports, "of_vehicle": config.max_reports_of_vehicle}
-    wanted = {"layer": layer, "tile": tile.morton, "epoch": epoch} | limits
-    return tuple(_row(*values) for values in reversed(fetch(c, "reports_in_play_of_vehicles", wanted)))
-
-
 def of_windows(c: apsw.Connection, layer: str, tile: TileId, first: int, last: int, seq: int) -> tuple[ReportRow, ...]:
     """All reports of the windows `first` to `last` with numbers up to `seq`, by report id and part."""
     wanted = {"layer": layer, "tile": tile.morton, "first": first, "last": last, "seq": seq}
