@@ -35,10 +35,12 @@ class FirstSaid:
     Attributes:
         report: expanded, all Gaussians withheld.
         mask: (N,) bool, of which of its new and modified voxels Gaussians are wanted.
+        hopeless: tiles of which nothing that it flags could win.
     """
 
     report: ChangeReport
     mask: NDArray[np.bool_]
+    hopeless: frozenset[TileId] = frozenset()
 
     @property
     def wanted(self) -> bytes:
@@ -76,7 +78,8 @@ class ShortReports:
     def decided(self, report: ChangeReport) -> FirstSaid:
         """An expanded report with what is wanted of it, by what the store holds now."""
         known = {c.tile: self._known(report, c) for c in report.tiles if is_askable(c).any()}
-        return FirstSaid(report, wanted(report, known, self._merge, self._want))
+        found = wanted(report, known, self._merge, self._want)
+        return FirstSaid(report, found.mask, found.hopeless)
 
     def asks(self, first: FirstSaid) -> None:
         """The vehicle is asked: until its Gaussians come, others are not asked for the same."""

@@ -5,17 +5,16 @@ here", or "as in base version v". The last is resolved by the hash of v, so a re
 rebased, not lost.
 """
 
-from collections import OrderedDict
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from enum import IntEnum
-from threading import Lock
 from typing import TYPE_CHECKING, Any, Final, Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
 from gnd_map.accumulate import N_MIN_CELLS
+from gnd_map.by_object import ByObject
 from gnd_map.classes import ChangeClass
 from gnd_map.day import day_of
 from gnd_map.gaussian import Gaussians
@@ -330,32 +329,12 @@ class Changed:
         return cls(change, rows, _speaks_of_changed(change), np.isin(rows["kind"], (Kind.MEASURED, Kind.WITHHELD)))
 
 
-class _Remembered:
-    """The same of the reports used last: a window is merged again with each new report."""
-
-    def __init__(self) -> None:
-        self._held: OrderedDict[int, Changed] = OrderedDict()
-        self._lock = Lock()
-
-    def of(self, change: TileChange) -> Changed:
-        """Made once for each change that stays in memory."""
-        with self._lock:
-            found = self._held.get(id(change))
-        if found is None or found.change is not change:  # the number of an object that is gone may come again
-            found = Changed.made(change)
-            with self._lock:
-                self._held[id(change)] = found
-                if len(self._held) > REMEMBERED:
-                    self._held.popitem(last=False)
-        return found
-
-
-_CHANGED: Final = _Remembered()
+_CHANGED: Final[ByObject[Changed]] = ByObject(REMEMBERED)
 
 
 def changed_of(change: TileChange) -> Changed:
-    """What a report says of the voxels that it found changed; laid out once."""
-    return _CHANGED.of(change)
+    """What a report says of the voxels that it found changed; laid out once, for a window is merged again and again."""
+    return _CHANGED.of(change, lambda: Changed.made(change))
 
 
 def _kinds_of_changed(change: TileChange) -> NDArray[np.uint8]:

@@ -77,10 +77,21 @@ class Known:
     memory: TileMemory = field(default_factory=TileMemory)
 
 
-def wanted(
-    report: ChangeReport, known: Mapping[TileId, Known], merge: MergeParameters, want: WantParameters
-) -> NDArray[np.bool_]:
-    """(N,) bool: for each new or modified voxel of the report, in order of tile and voxel id, whether to ask for it.
+@dataclass(frozen=True, slots=True, eq=False)
+class Wanted:
+    """What is wanted of a report.
+
+    Attributes:
+        mask: (N,) bool for each new or modified voxel of the report, in order of tile and voxel id: whether to ask.
+        hopeless: tiles of which it flags such voxels only, none is asked for, and none could win whatever it is.
+    """
+
+    mask: NDArray[np.bool_]
+    hopeless: frozenset[TileId] = frozenset()
+
+
+def wanted(report: ChangeReport, known: Mapping[TileId, Known], merge: MergeParameters, want: WantParameters) -> Wanted:
+    """Which Gaussians of a report to ask for.
 
     Args:
         report: with its Gaussians withheld (`expanding.expand`) or not: they are not looked at.
@@ -88,15 +99,22 @@ def wanted(
         merge: how the statements will be merged.
         want: when to ask.
     """
-    parts = [np.zeros(0, np.bool_)]
+    parts, hopeless = [np.zeros(0, np.bool_)], set()
     for change in report.tiles:
-        if is_askable(change).any():
+        is_asked = is_askable(change)
+        if is_asked.any():
             own = merge.report_of(report.report_id, report.sensor_model, change)
-            parts.append(_wanted_of_tile(own, known[change.tile], merge, want))
-    return np.concatenate(parts)
+            may_win, ask = _wanted_of_tile(own, known[change.tile], merge, want)
+            parts.append(ask)
+            if is_asked.all() and not (may_win | ask).any():
+                hopeless.add(change.tile)
+    return Wanted(np.concatenate(parts), frozenset(hopeless))
 
 
-def _wanted_of_tile(own: Report, known: Known, merge: MergeParameters, want: WantParameters) -> NDArray[np.bool_]:
+def _wanted_of_tile(
+    own: Report, known: Known, merge: MergeParameters, want: WantParameters
+) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
+    """Of each flagged voxel of a tile whether it may win the vote, and whether to ask for its Gaussian."""
     asked = is_askable(own.change)
     ids, modified = own.change.changed.voxel_id[asked], own.change.change_class[asked] == ChangeClass.MODIFIED
     bases = quotable(known.bases) if merge.mode == "default" else {}
@@ -108,25 +126,29 @@ def _wanted_of_tile(own: Report, known: Known, merge: MergeParameters, want: Wan
     xi = np.where(modified & (merge.mode == "default"), merge.xi_reshaped, merge.xi)
     may_win = votes > want.share * xi * cast
     asked_anyway = _sample(~may_win, 0 if merge.mode == "paper" else want.sample)
-    return np.asarray((may_win & (in_hand < want.enough)) | asked_anyway)
+    return may_win, np.asarray((may_win & (in_hand < want.enough)) | asked_anyway)
 
 
 def _remembered(own: Report, known: Known, ids: I32) -> tuple[NDArray[np.float64], ...]:
     """Of these voxels what the windows before say: votes that may agree with the flag, all votes, Gaussians in hand."""
-    n = len(ids)
+    memory, n = known.memory, len(ids)
+    may_agree, cast, in_hand = np.zeros((3, n))
+    if not len(memory.voxels) + len(memory.claims):
+        return may_agree, cast, in_hand
     was = states_at(known.bases.get(own.change.base_sha, Gaussians.empty()), ids, Kind.QUOTED)
     of_epoch = states_at(known.epoch, ids, Kind.QUOTED)
     is_epoch = same_state(was, of_epoch)
-    support = known.memory.support_rows(ids, known.epoch, day_of(own.last_ns))
-    claims = known.memory.claims[find(ids, known.memory.claims["voxel_id"]) >= 0]
-    rows = np.concatenate([support, claims])
-    seat = np.searchsorted(ids, rows["voxel_id"])
-    quotes_the_denied = (rows["kind"] == Kind.QUOTED) & is_epoch[seat]
-    may_agree = (rows["kind"] != Kind.NOTHING) & ~quotes_the_denied
-    same_was = is_epoch[seat] & ((rows["was"] == EPOCH) | (of_epoch["count"][seat] == 0))
-    in_hand = (may_agree & (rows["kind"] == Kind.MEASURED) & same_was).astype(np.float64)
-    weights = (rows["weight"] * may_agree, rows["weight"], in_hand)
-    return tuple(np.bincount(seat, weight, n).astype(np.float64) for weight in weights)
+    cast += memory.support(ids, day_of(own.last_ns))
+    may_agree += np.where((of_epoch["kind"] == Kind.QUOTED) & ~is_epoch, cast, 0.0)
+    claims = memory.claims[find(ids, memory.claims["voxel_id"]) >= 0]
+    seat = np.searchsorted(ids, claims["voxel_id"])
+    quotes_the_denied = (claims["kind"] == Kind.QUOTED) & is_epoch[seat]
+    agrees = (claims["kind"] != Kind.NOTHING) & ~quotes_the_denied
+    same_was = is_epoch[seat] & ((claims["was"] == EPOCH) | (of_epoch["count"][seat] == 0))
+    np.add.at(cast, seat, claims["weight"])
+    np.add.at(may_agree, seat, claims["weight"] * agrees)
+    np.add.at(in_hand, seat, agrees & (claims["kind"] == Kind.MEASURED) & same_was)
+    return may_agree, cast, in_hand
 
 
 def _sample(outvoted: NDArray[np.bool_], n: int) -> NDArray[np.bool_]:

@@ -10,7 +10,6 @@ from typing import Any, Final, TypeVar
 import apsw
 
 from gnd_map.content import AnyTile
-from gnd_map.features import is_feature_layer
 from gnd_map.tile_id import TileId
 from schemas.tiles import CatalogEntry
 from tile_store import clocks
@@ -32,6 +31,7 @@ from tile_store.values import (
     DEFAULT_LAYER,
     Basis,
     Claim,
+    ClosedWindow,
     Content,
     DirtyTile,
     GcResult,
@@ -211,9 +211,6 @@ class SqliteStore:
     def _in_play(self, c: apsw.Connection, layer: str, tile: TileId) -> TileJournal:
         version = versions.epoch_of(c, layer, tile)
         epoch = versions.stored(c, "stored_version", layer, tile, version=version) if version else None
-        if is_feature_layer(layer):
-            rows = inbox.in_play_of_vehicles(c, layer, tile, version, self._config)
-            return TileJournal(epoch, rows, seq=journal.newest(c, layer, tile).seq)
         first = journal.folded(c, layer, tile, version) + 1
         last = first + WINDOWS_AT_ONCE - 1
         rows = inbox.in_play(c, layer, tile, version, first, last)
@@ -364,7 +361,7 @@ class SqliteStore:
         with self._readers.snapshot() as c:
             return journal.basis_of(c, layer, tile, version)
 
-    def closed_windows(self, layer: str, tile: TileId) -> dict[int, frozenset[str]]:
+    def closed_windows(self, layer: str, tile: TileId) -> dict[int, ClosedWindow]:
         """See `Store.closed_windows`."""
         with self._readers.snapshot() as c:
             return journal.closed_windows(c, layer, tile)

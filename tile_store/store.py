@@ -12,6 +12,7 @@ from tile_store.values import (
     DEFAULT_LAYER,
     Basis,
     Claim,
+    ClosedWindow,
     DirtyTile,
     GcResult,
     HeadLine,
@@ -163,10 +164,18 @@ class Store(Protocol):
         """All that the merge of a claimed tile needs, read at one instant."""
 
     def basis(self, layer: str, tile: TileId, version: int) -> Basis | None:
-        """What of its tile's journal a version was made of; None: it is older than the journal, or the first base."""
+        """What of its tile's journal a version was made of; None: it is older than the journal, or the first base.
 
-    def closed_windows(self, layer: str, tile: TileId) -> dict[int, frozenset[str]]:
-        """Of each folded window of a tile the vehicles that were named when it was folded."""
+        Raises:
+            StoreDamaged: its parameters are not what their digest says.
+        """
+
+    def closed_windows(self, layer: str, tile: TileId) -> dict[int, ClosedWindow]:
+        """How each folded window of a tile was folded.
+
+        Raises:
+            StoreDamaged: parameters are not what their digest says.
+        """
 
     def reports_of_windows(self, layer: str, tile: TileId, first: int, last: int, seq: int) -> tuple[ReportRow, ...]:
         """The reports of the windows `first` to `last` with numbers up to `seq`, by report id and part."""

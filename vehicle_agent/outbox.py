@@ -70,9 +70,9 @@ _MIGRATION = (
     "DROP TABLE report_before",
 )
 _INDEX = "CREATE INDEX IF NOT EXISTS report_open ON report (next_ns) WHERE state IN ('pending', 'stored')"
-# What a report in short needed goes with its release; a base goes with the last report that needs it.
+# What a second half needs goes with the release, a base with the last report that needs it. The first half, a hundredth
+# of the report, stays beside it, so that a kept drive can be sent again as it was (`gnd load`).
 _FORGET = (
-    "DELETE FROM packed WHERE report_id = ?",
     "DELETE FROM base WHERE sha IN (SELECT sha FROM needs WHERE report_id = ?1)"
     " AND NOT EXISTS (SELECT 1 FROM needs WHERE needs.sha = base.sha AND needs.report_id <> ?1)",
     "DELETE FROM needs WHERE report_id = ?",
@@ -321,7 +321,7 @@ def _hear_of_held(c: apsw.Connection, state: ReportState, now_ns: int) -> None:
 
 
 def _whole(c: apsw.Connection, report_id: str, reason: str) -> None:
-    for sql in _FORGET:
+    for sql in ("DELETE FROM packed WHERE report_id = ?", *_FORGET):
         c.execute(sql, (report_id,))
     sql = "UPDATE report SET state = 'pending', wanted = x'', attempts = 0, next_ns = 0, reason = ? WHERE report_id = ?"
     c.execute(sql, (reason, report_id))

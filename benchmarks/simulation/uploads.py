@@ -83,7 +83,7 @@ class _Cloud:
 
     def _wanted(self, expanded: ChangeReport) -> NDArray[np.bool_]:
         known = {change.tile: self._known(change.tile) for change in expanded.tiles if is_askable(change).any()}
-        return wanted(expanded, known, self._merge, WantParameters())
+        return wanted(expanded, known, self._merge, WantParameters()).mask
 
     def _known(self, tile: TileId) -> Known:
         epoch = self._base.tiles.get(tile, Gaussians.empty())

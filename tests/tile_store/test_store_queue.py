@@ -1,6 +1,7 @@
 """The queue of dirty tiles: when a tile is ready, who may merge it, and what happens when that one dies."""
 
 import threading
+from dataclasses import replace
 
 import pytest
 from store_helpers import EAGER, EAST, FAR, TILE, Clock, SqliteMaker, only_claim, publication, report
@@ -38,6 +39,23 @@ def test_a_tile_is_ready_at_once_when_enough_reports_wait(maker: SqliteMaker, cl
     assert store.claim("m1", 1, 10.0) == []
     store.put_reports([report(3)])
     assert only_claim(store).seq == 3
+    store.close()
+
+
+def test_what_is_half_said_waits_for_its_gaussians_but_not_for_ever(maker: SqliteMaker, clock: Clock) -> None:
+    store = maker.open(PATIENT, clock)
+    half = replace(report(1), is_half=True)
+    store.put_reports([half])
+    assert store.ready_in_s() == pytest.approx(8.0)
+    clock.advance(1.0)
+    store.put_reports([replace(half, part=1, is_half=False)])
+    assert store.ready_in_s() == pytest.approx(2.0), "its other half has come"
+    store.put_reports([replace(report(2, EAST), is_half=True), replace(report(3, EAST), is_half=True)])
+    store.put_reports([replace(report(4, EAST), is_half=True)])
+    clock.advance(2.0)
+    assert only_claim(store).tile == TILE
+    store.put_reports([report(5, EAST)])
+    assert only_claim(store).tile == EAST, "enough wait, and one of them is whole"
     store.close()
 
 

@@ -1,0 +1,1 @@
+"""`gnd load`: the reports of a few kept drives, sent again as those of many vehicles on many streets."""

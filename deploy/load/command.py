@@ -1,0 +1,165 @@
+"""`gnd load`: how many vehicles does a cloud on this machine keep up with?"""
+
+import json
+import math
+import signal
+import tempfile
+import threading
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from types import FrameType
+from typing import Any, Final
+
+import click
+from rich.console import Console
+from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
+from rich.table import Table
+
+from deploy.load.making import kept_runs
+from deploy.load.plan import LoadOptions
+from deploy.load.run import Tell, run_load
+from deploy.load.verdict import summary
+
+PATH: Final = click.Path(path_type=Path)
+
+
+@click.command(short_help="Replay kept drives as many vehicles and see whether the cloud keeps up.")
+@click.option("--vehicles", type=int, default=100, show_default=True, help="How many.")
+@click.option("--km", type=float, default=1.0, show_default=True, help="Way of each.")
+@click.option(
+    "--pace",
+    type=click.Choice(["real", "max"]),
+    default="real",
+    show_default=True,
+    help="Real driving, or as fast as it goes.",
+)
+@click.option("--kmh", type=float, default=30.0, show_default=True, help="Speed, for --pace real.")
+@click.option("--seconds", type=float, default=math.inf, help="Send nothing later than this after the start.")
+@click.option(
+    "--drives", type=PATH, help="A finished run of `gnd fleet`.  [default: runs/load-drives, made where it is missing]"
+)
+@click.option("--settled", type=PATH, help="A run of the same street on its healed map, for --changed-share.")
+@click.option("--seed", type=int, default=1, show_default=True, help="Of starting places and report ids.")
+@click.option("--per-street", type=int, default=4, show_default=True, help="Vehicles on a street at the same time.")
+@click.option(
+    "--changed-share",
+    type=float,
+    default=1.0,
+    show_default=True,
+    help="Share of streets whose map is older than their changes.",
+)
+@click.option("--shards", type=int, default=2, show_default=True, help="Merger shards.")
+@click.option("--clients", type=int, default=2, show_default=True, help="Processes that are the vehicles.")
+@click.option("--in-flight", type=int, default=50, show_default=True, help="Requests under way, of each client.")
+@click.option(
+    "--drain", "drain_s", type=float, default=10.0, show_default=True, help="Seconds after which all must be merged."
+)
+@click.option("--keep", type=PATH, help="Empty folder for store, logs and accounts, to look at afterwards.")
+@click.option(
+    "--json", "json_file", type=click.Path(path_type=Path, allow_dash=True), help="Write the figures; `-`: print them."
+)
+def load(drives: Path | None, settled: Path | None, keep: Path | None, json_file: Path | None, **given: Any) -> None:
+    """Send the reports of a few kept drives again, as those of many vehicles on many streets, and measure the cloud.
+
+    Router, tile server and merger shards run as processes of their own. Each street is a copy of the kept one at
+    another place, with its map and the reports that were made on it.
+    """
+    options = LoadOptions(**given)
+    console = Console(stderr=True)
+    runs, stop = kept_runs(drives, settled, console), threading.Event()
+    with _ending(stop), _folder(keep) as folder, _bar(console) as tell:
+        figures = summary(run_load(options, runs, folder, tell, stop))
+    text = json.dumps(figures, indent=2)
+    if json_file is not None and str(json_file) != "-":
+        json_file.write_text(text + "\n", encoding="utf-8")
+    if json_file is not None and str(json_file) == "-":
+        click.echo(text)
+    else:
+        Console(width=110).print(table_of(figures))
+
+
+def table_of(figures: dict[str, Any]) -> Table:
+    """The figures for people."""
+    yes = "yes" if figures["kept_up"] else "no: " + "; ".join(figures["why_not"])
+    drained = figures["drained_after_s"]
+    rows = {
+        "vehicles": f"{figures['vehicles']} on {figures['streets']} streets, pace {figures['pace']}",
+        "reports": f"{figures['reports']} sent in {figures['offered_s']} s, {figures['acknowledged']} acknowledged, "
+        f"{figures['lost']} lost",
+        "of them": f"{figures['second_halves']} second halves, {figures['sent_whole']} sent whole, "
+        f"{figures['questions']} asked after",
+        "acks": f"{figures['acks_per_s']} a second; {_spread(figures['ack_ms'], 'ms')}",
+        "vehicles hear what is wanted after": _spread(figures["word_s"], "s"),
+        "receipt to published tile": f"{_spread(figures['merge_lag_s'], 's')}; {figures['versions']} versions",
+        "deciding report to notice": _spread(figures["notice_lag_s"], "s"),
+        "CPU a report": _cpu(figures),
+        "share of all cores": ", ".join(f"{name} {100 * share:.0f} %" for name, share in figures["cpu_share"].items()),
+        "queue": f"at most {figures['backlog_max']} uploads and tiles; empty "
+        + (f"{drained} s after the last report" if drained is not None else "not in time"),
+        "kept up": yes,
+        "limit": figures["limit"],
+    }
+    table = Table(show_header=False, title=f"{figures['vehicles']} vehicles")
+    for name, value in rows.items():
+        table.add_row(name, value)
+    return table
+
+
+def _cpu(figures: dict[str, Any]) -> str:
+    if figures["cpu_ms_per_report"] is None:
+        return "not known: not all was merged"
+    parts = ", ".join(f"{name} {ms}" for name, ms in figures["cpu_ms_by_part"].items())
+    return f"{figures['cpu_ms_per_report']} ms: {parts}"
+
+
+def _spread(values: dict[str, float | None], unit: str) -> str:
+    said = [f"{name} {value:g} {unit}" for name, value in values.items() if value is not None]
+    return ", ".join(said) or "none"
+
+
+@contextmanager
+def _ending(stop: threading.Event) -> Iterator[None]:
+    """Ctrl-C and SIGTERM end the run in order: what was measured until then is told. A second one ends it at once."""
+
+    def end(number: int, _frame: FrameType | None) -> None:
+        if stop.is_set():
+            raise KeyboardInterrupt
+        stop.set()
+        signal.signal(number, signal.default_int_handler)
+
+    before = {number: signal.signal(number, end) for number in (signal.SIGINT, signal.SIGTERM)}
+    try:
+        yield
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
+
+
+@contextmanager
+def _folder(keep: Path | None) -> Iterator[Path]:
+    if keep is not None:
+        keep.mkdir(parents=True, exist_ok=True)
+        if any(keep.iterdir()):
+            raise click.BadParameter(f"{keep} is not empty", param_hint="--keep")
+        yield keep
+        return
+    with tempfile.TemporaryDirectory(prefix="gnd-load-", ignore_cleanup_errors=True) as name:
+        yield Path(name)
+
+
+@contextmanager
+def _bar(console: Console) -> Iterator[Tell]:
+    columns = (
+        TextColumn("{task.description}"),
+        BarColumn(),
+        TextColumn("{task.completed:.0f}/{task.total:.0f}"),
+        TimeElapsedColumn(),
+    )
+    with Progress(*columns, console=console) as progress:
+        task = progress.add_task("drives", total=1)
+
+        def tell(what: str, done: float, total: float) -> None:
+            progress.update(task, description=what, completed=done, total=total)
+
+        yield tell

@@ -1,0 +1,275 @@
+"""A load run: streets into a store, the processes of a cloud, clients that send, and what it came to."""
+
+import math
+import os
+import threading
+import time
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack, contextmanager
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Final
+
+from cloud_merger.config import ShardConfig
+from deploy import roles
+from deploy.errors import DeployError
+from deploy.fleet import shard_config
+from deploy.fleet_config import FleetConfig
+from deploy.load.audit import Auditor, Backlog
+from deploy.load.client import ClientConfig, client, read_accounts, start_file
+from deploy.load.cpu import busy_s, by_part
+from deploy.load.drives import LAYER, KeptRuns
+from deploy.load.plan import LoadOptions, shared_out
+from deploy.load.sending import Account
+from deploy.load.streets import Streets
+from deploy.load.verdict import Outcome
+from deploy.ports import claim_port
+from deploy.processes import ProcessSpec, Supervisor, start_fork_server
+from fleet_bus.bus import Bus, open_bus
+from fleet_bus.config import BusConfig
+from schemas.keys import parse_update_key, update_keys
+from schemas.updates import TileUpdate
+from tile_store.sqlite_store import SqliteStore
+
+LOOK_S: Final = 0.5
+READY_S: Final = 120.0
+LEAD_S: Final = 1.0
+"""Between the word to start and the first report."""
+END_S: Final = 30.0
+"""Clients that have not ended so long after their time are ended."""
+
+Tell = Callable[[str, float, float], None]
+"""Called with what is being done, how much of it is done, and of how much."""
+
+
+@dataclass(slots=True)
+class Running:
+    """A cloud with its clients while they run.
+
+    Attributes:
+        folder: of store, logs and accounts.
+        supervisor: of all processes.
+        connect: endpoint of the router.
+        clients: what was started.
+        auditor: of the store's file.
+        notices_s: when each (tile, version) was heard of here, s UTC.
+        backlog: what was waiting when.
+        names: of the processes of the cloud.
+    """
+
+    folder: Path
+    supervisor: Supervisor
+    connect: str
+    clients: list[ClientConfig]
+    auditor: Auditor
+    stop: threading.Event
+    names: tuple[str, ...]
+    notices_s: dict[tuple[int, int], float] = field(default_factory=dict)
+    backlog: list[Backlog] = field(default_factory=list)
+
+    def on_update(self, key: str, payload: bytes) -> None:
+        """Note a notice."""
+        now_s = time.time()
+        self.notices_s.setdefault((parse_update_key(key)[1].morton, TileUpdate.decode(payload).version), now_s)
+
+    def look(self) -> Backlog:
+        """Supervise, and note what waits."""
+        self.supervisor.poll()
+        now = self.auditor.backlog(time.monotonic())
+        self.backlog.append(now)
+        return now
+
+    def cloud_cpu_s(self) -> dict[str, float]:
+        """CPU of the cloud's parts so far."""
+        pids = self.supervisor.pids()
+        return by_part({name: pids[name] for name in self.names if name in pids})
+
+    def client_cpu_s(self) -> float:
+        """CPU of the clients, which have ended."""
+        files = [one.cpu for one in self.clients if one.cpu.exists()]
+        return sum(float(file.read_text(encoding="utf-8")) for file in files)
+
+    def wait_until(self, done: Callable[[], bool], until_s: float, each: Callable[[], object]) -> bool:
+        """Look again and again until something holds; False: the time is over, or the run was told to stop."""
+        while not done():
+            if self.stop.is_set() or time.monotonic() > until_s:
+                return False
+            each()
+            self.stop.wait(LOOK_S)
+        return True
+
+
+def run_load(options: LoadOptions, runs: KeptRuns, folder: Path, tell: Tell, stop: threading.Event) -> Outcome:
+    """Replay kept drives as many vehicles.
+
+    Args:
+        options: what to replay.
+        runs: the kept drives.
+        folder: empty; for store, logs and accounts.
+        tell: is told how far it is.
+        stop: ends the run early: what was measured until then is the outcome.
+
+    Raises:
+        LoadError: the drives cannot be replayed.
+        DeployError: the cloud does not start, or does not stay alive.
+    """
+    streets = Streets.of(runs, options)
+    _put_streets(streets, folder / "store.sqlite", tell, stop)
+    start_fork_server()
+    with _cloud(options, runs, folder, stop) as running:
+        tell("start", 0, 1)
+        planned = _ready(running)
+        return _measured(running, options, planned, tell)
+
+
+def _put_streets(streets: Streets, path: Path, tell: Tell, stop: threading.Event) -> None:
+    count = streets.options.streets
+    with SqliteStore(path) as store:
+        for street in range(count):
+            if stop.is_set():
+                raise KeyboardInterrupt
+            store.put_tiles(streets.tiles(street))
+            tell("streets", street + 1, count)
+
+
+@contextmanager
+def _cloud(options: LoadOptions, runs: KeptRuns, folder: Path, stop: threading.Event) -> Iterator[Running]:
+    connect = f"tcp/127.0.0.1:{claim_port(0)}"
+    store = folder / "store.sqlite"
+    shards = [shard_config(FleetConfig(), f"shard-{n}", store, connect) for n in range(options.shards)]
+    clients = [
+        ClientConfig(number, vehicles, options, runs, connect, folder)
+        for number, vehicles in enumerate(shared_out(options.vehicles, options.clients))
+    ]
+    with ExitStack() as stack:
+        supervisor = Supervisor(folder, folder / "pids.json")
+        stack.callback(supervisor.stop)
+        specs = _processes(connect, store, shards)
+        for spec in specs:
+            supervisor.start(spec)
+        auditor = Auditor(store)
+        stack.callback(auditor.close)
+        bus = stack.enter_context(open_bus(BusConfig(connect=(connect,), open_timeout_s=READY_S), name="load"))
+        running = Running(folder, supervisor, connect, clients, auditor, stop, tuple(spec.name for spec in specs))
+        stack.enter_context(_subscribed(bus, running))
+        for one in clients:
+            supervisor.start(ProcessSpec(_name(one), client, (one,), restart=False))
+        yield running
+
+
+@contextmanager
+def _subscribed(bus: Bus, running: Running) -> Iterator[None]:
+    with bus.subscribe(update_keys(LAYER), running.on_update):
+        yield
+
+
+def _processes(connect: str, store: Path, shards: list[ShardConfig]) -> list[ProcessSpec]:
+    return [
+        ProcessSpec("router", roles.router, (connect,)),
+        ProcessSpec("store", roles.store, (store, connect)),
+        *(ProcessSpec(f"merger-{n}", roles.merger, (shard,)) for n, shard in enumerate(shards)),
+    ]
+
+
+def _name(one: ClientConfig) -> str:
+    return f"client-{one.number}"
+
+
+def _ready(running: Running) -> int:
+    """Wait until all clients are connected and all shards can work; how many reports the clients have.
+
+    Raises:
+        DeployError: that takes too long.
+    """
+    shards = sum(name.startswith("merger-") for name in running.names)
+    with SqliteStore(running.folder / "store.sqlite", create=False) as store:
+        until_s = time.monotonic() + READY_S
+        is_ready = running.wait_until(
+            lambda: (
+                all(one.ready.exists() for one in running.clients)
+                and sum(seen.is_alive for seen in store.shards()) == shards
+            ),
+            until_s,
+            running.supervisor.poll,
+        )
+    if not is_ready:
+        if running.stop.is_set():
+            raise KeyboardInterrupt
+        raise DeployError(
+            f"clients and shards were not ready within {READY_S:.0f} s: read the logs in {running.folder}"
+        )
+    return sum(int(one.ready.read_text(encoding="utf-8")) for one in running.clients)
+
+
+def _measured(running: Running, options: LoadOptions, planned: int, tell: Tell) -> Outcome:
+    cloud_before, own_before_s, busy_before_s = running.cloud_cpu_s(), time.process_time(), busy_s()
+    measured_s = time.monotonic()
+    start_s = time.monotonic() + LEAD_S
+    _say_start(running.folder, start_s)
+    first = running.look().received
+
+    longest_s = options.seconds if options.pace == "max" else min(options.seconds, 3600.0 * options.km / options.kmh)
+
+    def look() -> None:
+        waits = running.look()
+        done, total = waits.received - first, planned
+        if options.pace == "real":
+            done, total = round(min(waits.at_s - start_s, longest_s)), round(longest_s)
+        tell(f"{waits.received - first} messages, {waits.items} wait", max(done, 0), total)
+
+    until_s = start_s + longest_s + (END_S if math.isfinite(longest_s) else math.inf)
+    running.wait_until(lambda: _all_offered(running), until_s, look)
+    offered_s = max((one.offered.stat().st_mtime for one in running.clients if one.offered.exists()), default=None)
+    offered_at_s = time.monotonic() if offered_s is None else time.monotonic() - (time.time() - offered_s)
+    drained_s = _drained(running, offered_at_s + options.drain_s, look)
+    cloud, own_s = running.cloud_cpu_s(), time.process_time() - own_before_s
+    machine_s, measured_s = busy_s() - busy_before_s, time.monotonic() - measured_s
+    accounts = _ended(running)
+    return Outcome(
+        options=options,
+        planned=planned if math.isinf(options.seconds) or options.pace == "real" else None,
+        accounts=accounts,
+        backlog=running.backlog,
+        start_s=start_s,
+        offered_s=offered_at_s,
+        drained_s=drained_s,
+        cpu_s={name: used_s - cloud_before[name] for name, used_s in cloud.items()},
+        client_cpu_s=running.client_cpu_s() + own_s,
+        machine_cpu_s=machine_s,
+        capacity_s=(os.cpu_count() or 1) * measured_s,
+        ledger=running.auditor.ledger(),
+        notices_s=dict(running.notices_s),
+        restarts=sum(running.supervisor.restarts.values()),
+    )
+
+
+def _say_start(folder: Path, start_s: float) -> None:
+    path = start_file(folder)
+    path.with_suffix(".tmp").write_text(repr(start_s), encoding="utf-8")
+    path.with_suffix(".tmp").replace(path)
+
+
+def _all_offered(running: Running) -> bool:
+    return all(one.offered.exists() for one in running.clients)
+
+
+def _drained(running: Running, until_s: float, look: Callable[[], object]) -> float | None:
+    """When nothing waited any more and every vehicle had heard all it was to hear; None: not in time."""
+    while not running.stop.is_set():
+        look()
+        now = running.backlog[-1]
+        if not now.items and running.supervisor.finished("client-"):
+            return now.at_s
+        if now.at_s > until_s:
+            return None
+        running.stop.wait(LOOK_S / 5)
+    return None
+
+
+def _ended(running: Running) -> list[Account]:
+    """What the clients have written, after they have ended."""
+    until_s = time.monotonic() + END_S
+    while not running.supervisor.finished("client-") and time.monotonic() < until_s and not running.stop.is_set():
+        time.sleep(LOOK_S / 5)
+    running.supervisor.stop(tuple(map(_name, running.clients)))
+    return [account for one in running.clients for account in read_accounts(one.accounts)]

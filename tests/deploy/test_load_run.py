@@ -1,0 +1,78 @@
+"""Real processes: a cloud that keeps up with a few vehicles, and one whose workers hang."""
+
+import json
+import os
+import signal
+import threading
+import time
+from contextlib import closing
+
+import apsw
+import pytest
+from load_testing import make_run
+
+from deploy.load.client import start_file
+from deploy.load.cpu import children
+from deploy.load.drives import KeptRuns
+from deploy.load.plan import LoadOptions
+from deploy.load.run import run_load
+from deploy.load.verdict import summary
+
+OPTIONS = LoadOptions(vehicles=4, km=0.25, kmh=180.0, per_street=2, shards=1, clients=1, in_flight=8)
+
+
+def loaded(tmp_path, options):
+    run, folder = make_run(tmp_path / "run"), tmp_path / "load"
+    folder.mkdir()
+    return run_load(options, KeptRuns(run), folder, lambda *_: None, threading.Event()), folder
+
+
+@pytest.mark.slow
+def test_a_cloud_keeps_up_with_a_few_vehicles(tmp_path):
+    outcome, folder = loaded(tmp_path, OPTIONS)
+    told = summary(outcome)
+    assert told["why_not"] == []
+    assert told["kept_up"] is True
+    assert told["reports"] == told["acknowledged"] == outcome.planned > 25
+    assert told["lost"] == 0
+    with closing(apsw.Connection(str(folder / "store.sqlite"), flags=apsw.SQLITE_OPEN_READONLY)) as store:
+        journaled = {report_id for (report_id,) in store.execute("SELECT DISTINCT report_id FROM report")}
+        (heads,) = store.execute("SELECT COUNT(*) FROM tile_head WHERE version > 1")
+    assert {one.report_id for one in outcome.acknowledged} == journaled
+    assert heads[0] == 6  # the three tiles of both streets
+    assert told["second_halves"] > 0
+    assert told["sent_whole"] == 0
+    assert len(outcome.notices_s) == told["versions"] >= 6
+    assert told["cpu_ms_per_report"] > 0
+    assert {name for name, ms in told["cpu_ms_by_part"].items() if ms > 0} >= {"workers", "shards"}
+    assert told["cpu_share"]["clients"] > 0
+
+
+def hang_workers(folder, after_s, for_s):
+    """Stop the workers of all shards some time after the start, and let them go on later, so that they can end."""
+    while not start_file(folder).exists():
+        time.sleep(0.05)
+    time.sleep(after_s)
+    pids = json.loads((folder / "pids.json").read_text(encoding="utf-8"))
+    workers = [child for name, pid in pids.items() if name.startswith("merger-") for child in children(pid)]
+    for worker in workers:
+        os.kill(worker, signal.SIGSTOP)
+    time.sleep(for_s)
+    for worker in workers:
+        os.kill(worker, signal.SIGCONT)
+
+
+@pytest.mark.slow
+def test_a_cloud_whose_workers_hang_does_not_keep_up(tmp_path):
+    options = LoadOptions(vehicles=4, km=0.3, kmh=180.0, per_street=2, shards=1, clients=1, in_flight=8, drain_s=2.0)
+    hanging = threading.Thread(target=hang_workers, args=(tmp_path / "load", 2.0, 9.0))
+    hanging.start()
+    outcome, _ = loaded(tmp_path, options)
+    hanging.join()
+    told = summary(outcome)
+    assert told["kept_up"] is False
+    assert told["acknowledged"] == told["reports"] > 30  # acks are a disk write and go on
+    assert told["lost"] == 0
+    assert any("not empty" in one for one in told["why_not"])
+    assert told["limit"] == "cloud"
+    assert told["cpu_ms_per_report"] is None
