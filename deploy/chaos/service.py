@@ -1,8 +1,8 @@
 """How long each service was not given: a tile to who asks, an acknowledgement to who reports, a notice to who listens.
 
 Three clients ask and listen all the time, straight at the router. A pause between two answers belongs to the newest
-fault that began before it ended. As long as a process is stopped, or its disk full, it cannot serve: that time is taken
-off, and what is left is what the cloud took to come back.
+fault that began before it ended. As long as a process that gives the service is stopped, or its disk full, it cannot
+serve: that time is taken off, and what is left is what the cloud took to come back.
 """
 
 import itertools
@@ -13,7 +13,7 @@ from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, field
 from typing import Final
 
-from deploy.chaos.faults import Fault
+from deploy.chaos.faults import BY_NAME, Fault
 from deploy.chaos.street import LAYER, Sent
 from fleet_bus.bus import Bus, open_bus
 from fleet_bus.config import BusConfig
@@ -22,6 +22,7 @@ from gnd_map.tile import Tile
 from schemas.keys import tile_key, update_keys
 
 SERVICES: Final = ("tile", "report", "update")
+SERVED_BY: Final = {"tile": ("router", "store"), "report": ("router", "shard"), "update": ("router", "shard", "worker")}
 HELD: Final = ("stop", "disk")
 """While a fault of these groups is held, its part cannot serve, whatever the cloud does; what others cost counts."""
 _ASK_EVERY_S: Final = 0.01
@@ -66,8 +67,8 @@ def gaps(served: Served, faults: Sequence[Fault], start_s: float, end_s: float) 
         end_s: when the account ends, monotonic, s.
     """
     by_kind: dict[str, dict[str, float]] = {fault.kind: dict.fromkeys(SERVICES, 0.0) for fault in faults}
-    held = _union([(start_s + one.at_s, start_s + one.end_s) for one in faults if one.held_s and one.group in HELD])
     for service, pauses in served.pauses_s(start_s, end_s).items():
+        held = _union([(start_s + one.at_s, start_s + one.end_s) for one in faults if _excuses(one, service)])
         for begin_s, until_s in pauses:
             blamed = _blamed(faults, begin_s - start_s, until_s - start_s)
             if blamed is None:
@@ -87,6 +88,11 @@ def _blamed(faults: Sequence[Fault], begin_s: float, until_s: float) -> Fault | 
         return (kills or inside)[0]
     before = [one for one in faults if one.at_s < begin_s]
     return before[-1] if before else None
+
+
+def _excuses(fault: Fault, service: str) -> bool:
+    """Whether a part that gives the service could not while the fault was held."""
+    return fault.group in HELD and BY_NAME[fault.kind].part in SERVED_BY[service]
 
 
 def _union(spans: list[tuple[float, float]]) -> list[tuple[float, float]]:

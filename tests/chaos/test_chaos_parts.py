@@ -150,6 +150,17 @@ def test_of_a_part_that_was_stopped_only_the_time_after_it_counts() -> None:
     assert told.by_kind["stop store"]["tile"] == pytest.approx(2.0 - 1.5)
 
 
+def test_a_client_that_is_stalled_excuses_no_pause_of_the_others() -> None:
+    faults = [
+        Fault(0, "stall follower", 1.0, 6.0, 0.5),
+        Fault(1, "stop store", 1.5, 5.0, 0.5),
+        Fault(2, "kill shard", 2.0, 0, 0.5),
+    ]
+    pause = [k / 10 for k in range(101) if not 20 < k < 60]
+    told = gaps(served(tile=pause, report=pause, update=pause), faults, 0.0, 10.0)
+    assert told.of_kills == pytest.approx({"tile": 0.0, "report": 4.0, "update": 4.0})
+
+
 def test_a_service_that_never_comes_back_is_a_pause_to_the_end() -> None:
     faults = [Fault(0, "kill router", 2.0, 0.0, 0.5)]
     told = gaps(served(update=[0.0, 1.0, 1.9]), faults, 0.0, 10.0)
