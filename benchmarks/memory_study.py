@@ -1,6 +1,7 @@
 """Does a healed map stay healed? The reports of a finished run of `gnd fleet`, then thousands of partial passes.
 
-The passes are cut from the run's own reports, all made against the stale base map, with their errors: of one tile each
+The passes are cut from the run's own reports with their errors, of one tile each. In a run with `--headway 0` most of
+them were made against the stale base map:
 
 - `other`: what the vehicle saw of the voxels that it did not find changed;
 - `half`: the western half of what it saw and said;

@@ -15,7 +15,8 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from benchmarks.figures import Figure
-from benchmarks.small_cloud import READY_S, SmallCloud, change_report, repeated, small_cloud
+from benchmarks.flat_tile import change_report
+from benchmarks.small_cloud import READY_S, SmallCloud, repeated, small_cloud
 from fleet_bus.bus import Bus, open_bus
 from fleet_bus.config import BusConfig
 from fleet_bus.errors import BusClosed, RequestFailed

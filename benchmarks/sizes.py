@@ -5,20 +5,13 @@ import zlib
 import numpy as np
 
 from benchmarks.figures import Figure
+from benchmarks.flat_tile import CHANGED, base_tile, change_report
 from gnd_map.codec import encode_gaussians
-from gnd_map.gaussian import Gaussians
-from gnd_map.tile import Tile, diff
-from gnd_map.tile_id import TileId
-from schemas.changes import ChangeReport, TileChange
-from schemas.report_id import deterministic_report_id
+from gnd_map.tile import diff
 from schemas.tiles import blob_of
 from schemas.updates import TileUpdate
 
 COMMAND = "python -m benchmarks sizes"
-TILE = TileId(497353963154)
-VOXELS = 2_000
-CHANGED = 40
-T0_MS = 1_700_000_000_000
 
 
 def run() -> list[Figure]:
@@ -35,38 +28,3 @@ def run() -> list[Figure]:
         Figure("change report", len(report) / CHANGED, "B/change", f"{CHANGED} changes, 500 observed, {len(report)} B"),
         Figure("update notice", len(update), "B", f"{CHANGED} voxels removed"),
     ]
-
-
-def base_tile(voxels: int = VOXELS) -> Tile:
-    """Return a tile of flat Gaussians on the ground floor."""
-    voxel_id = np.arange(-voxels // 2, voxels // 2, dtype=np.int32)
-    cov = np.tile(np.array([0.08, 0, 0, 0.08, 0, 0.0009], np.float32), (voxels, 1))
-    full = np.full(voxels, 200, np.int32), np.full(voxels, 60, np.int32)
-    return Tile(TILE, 1, Gaussians(voxel_id, *full, np.zeros((voxels, 3), np.float32), cov))
-
-
-def change_report(number: int, base: Tile) -> ChangeReport:
-    """Return one vehicle's report about one tile: 500 voxels observed, 40 of them changed."""
-    observed = base.gaussians.voxel_id[:500]
-    changed = base.gaussians.take(np.arange(CHANGED))
-    change = TileChange(
-        tile=TILE,
-        base_version=1,
-        base_sha=base.sha,
-        observed=observed,
-        changed=changed,
-        change_class=np.full(CHANGED, 2, np.uint8),
-        evidence=np.full((CHANGED, 4), 9, np.int32),
-        pose_sigma_m=0.03,
-        pose_sigma_rad=0.001,
-    )
-    return ChangeReport(
-        report_id=deterministic_report_id(T0_MS + number, "benchmark"),
-        vehicle=f"bench-{number % 100}",
-        sensor_model="VLP-16",
-        software="benchmark",
-        district=TILE.district,
-        first_ns=T0_MS * 1_000_000,
-        last_ns=T0_MS * 1_000_000 + 1,
-        tiles=(change,),
-    )

@@ -9,6 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
+from benchmarks.flat_tile import base_tile
 from cloud_merger.config import ShardConfig
 from deploy import roles
 from deploy.fleet import POLL_S
@@ -19,18 +20,12 @@ from fleet_bus.config import BusConfig
 from gnd_map.gaussian import Gaussians
 from gnd_map.tile import Tile
 from gnd_map.tile_id import TileId
-from schemas.changes import ChangeReport, TileChange
 from schemas.keys import tile_key
-from schemas.report_id import deterministic_report_id
 from tile_store.sqlite_store import SqliteStore
 
 READY_S = 60.0
 SHARD_POLL_S = 0.02
 TILES = 8
-VOXELS = 2_000
-CHANGED = 40
-T0_MS = 1_700_000_000_000
-_TILE = TileId(497353963154)
 
 
 @dataclass(slots=True)
@@ -106,7 +101,7 @@ def repeated(work: Callable[[int], object], every_s: float) -> Iterator[None]:
 
 def tiles() -> list[Tile]:
     """Neighbouring tiles of flat Gaussians."""
-    first = base_tile(VOXELS)
+    first = base_tile()
     ids = [TileId(first.tile_id.morton + n) for n in range(TILES)]
     return [Tile(tile_id, 1, first.gaussians) for tile_id in ids]
 
@@ -133,38 +128,3 @@ def _changed(tile: Tile, number: int) -> Tile:
     half = mean_m[::2]
     half[:] = np.random.default_rng(number).uniform(-0.1, 0.1, half.shape)
     return Tile(tile.tile_id, 1, Gaussians(g.voxel_id, g.count, g.cells, mean_m, g.cov_m2))
-
-
-def base_tile(voxels: int = VOXELS) -> Tile:
-    """Return a tile of flat Gaussians on the ground floor."""
-    voxel_id = np.arange(-voxels // 2, voxels // 2, dtype=np.int32)
-    cov = np.tile(np.array([0.08, 0, 0, 0.08, 0, 0.0009], np.float32), (voxels, 1))
-    full = np.full(voxels, 200, np.int32), np.full(voxels, 60, np.int32)
-    return Tile(_TILE, 1, Gaussians(voxel_id, *full, np.zeros((voxels, 3), np.float32), cov))
-
-
-def change_report(number: int, base: Tile) -> ChangeReport:
-    """Return one vehicle's report about one tile: 500 voxels observed, 40 of them changed."""
-    observed = base.gaussians.voxel_id[:500]
-    changed = base.gaussians.take(np.arange(CHANGED))
-    change = TileChange(
-        tile=_TILE,
-        base_version=1,
-        base_sha=base.sha,
-        observed=observed,
-        changed=changed,
-        change_class=np.full(CHANGED, 2, np.uint8),
-        evidence=np.full((CHANGED, 4), 9, np.int32),
-        pose_sigma_m=0.03,
-        pose_sigma_rad=0.001,
-    )
-    return ChangeReport(
-        report_id=deterministic_report_id(T0_MS + number, "benchmark"),
-        vehicle=f"bench-{number % 100}",
-        sensor_model="VLP-16",
-        software="benchmark",
-        district=_TILE.district,
-        first_ns=T0_MS * 1_000_000,
-        last_ns=T0_MS * 1_000_000 + 1,
-        tiles=(change,),
-    )

@@ -20,7 +20,8 @@ from pathlib import Path
 import psutil
 
 from benchmarks.figures import Figure
-from benchmarks.small_cloud import READY_S, SmallCloud, change_report, repeated, small_cloud
+from benchmarks.flat_tile import change_report
+from benchmarks.small_cloud import READY_S, SmallCloud, repeated, small_cloud
 from benchmarks.small_cloud import tiles as map_tiles
 from deploy.processes import ProcessSpec
 from fleet_bus.bus import Bus, open_bus

@@ -119,9 +119,12 @@ def gate(
     parameters = parameters or ConfirmationParameters()
     by_report = {report.report_id: report for report in reports}
     by_id = {witness.report_id: witness for witness in witnesses} | by_report
+    lonely = _witnesses(merged, by_id, parameters, named)
+    if not lonely:
+        return GatedTile(merged)
     waits: dict[int, tuple[str, WaitingReason]] = {}
     isolated = _isolated(epoch, merged, by_report.values(), parameters.together_voxels)
-    for vehicle, witness in sorted(_witnesses(merged, by_id, parameters, named).items()):
+    for vehicle, witness in sorted(lonely.items()):
         seen = _seen(vehicle, epoch, by_report.values())
         reasons = _waiting_of(witness, seen, None if len(epoch) == 0 else isolated, parameters)
         if vehicle in named:
@@ -139,12 +142,15 @@ def _witnesses(
     drive = _drives(by_id.values(), parameters.second_drive_s, named)
     lonely: dict[str, dict[int, tuple[Who, ...]]] = defaultdict(dict)
     shared: Counter[str] = Counter()
+    voxels: dict[tuple[str, ...], list[int]] = defaultdict(list)
     for voxel, ids in merged.provenance.items():
+        voxels[ids].append(voxel)
+    for ids, told in voxels.items():
         vehicles = {by_id[one].vehicle for one in ids}
         if len({drive[one] for one in ids}) == 1 or vehicles <= named:
-            lonely[min(vehicles)][voxel] = tuple(by_id[one] for one in ids)
+            lonely[min(vehicles)] |= dict.fromkeys(told, tuple(by_id[one] for one in ids))
         else:
-            shared.update(vehicles)
+            shared.update(dict.fromkeys(vehicles, len(told)))
     return {vehicle: _Witness(own, shared[vehicle]) for vehicle, own in lonely.items()}
 
 

@@ -21,6 +21,7 @@ from cloud_merger.features.kept import FeatureInbox
 from cloud_merger.ingest import one_line
 from cloud_merger.short_reports import FirstSaid, ShortReports
 from cloud_merger.states import STATUS
+from cloud_merger.wants import asked_voxels
 from gnd_map.errors import GndError
 from schemas.changes import ChangeReport, split
 from schemas.errors import SchemaError
@@ -155,7 +156,11 @@ class Expander:
         report = self._short.expanded(claim.upload.key, packed)
         self._map.check(report)
         first = self._short.decided(report)
-        rows = rows_of(report, claim.upload.received_ns)
+        asked = {tile for tile, ids in asked_voxels(report, first.mask).items() if len(ids)}
+        rows = tuple(
+            replace(row, is_half=row.tile in asked, is_quiet=row.is_quiet or row.tile in first.hopeless)
+            for row in rows_of(report, claim.upload.received_ns)
+        )
         if not first.wanted:
             return self._released(claim, rows)
         return self._told(Settled(claim, "wanted", rows, first.wanted), asks=first)

@@ -5,6 +5,7 @@ on nothing else: in whatever batches and retries they came, the same reports giv
 """
 
 from dataclasses import dataclass, field, replace
+from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
@@ -297,13 +298,24 @@ def _merged(epoch: Gaussians, changes: Rows, statements: Statements, members: Ro
     there = changes[changes["count"] > 0]
     put = Gaussians(*(np.ascontiguousarray(there[name]) for name in ("voxel_id", "count", "cells", "mean_m", "cov_m2")))
     gone = np.ascontiguousarray(changes["voxel_id"][changes["count"] == 0])
-    said_by: dict[int, list[str]] = {voxel: [] for voxel in changes["voxel_id"].tolist()}
-    ids = statements.report_ids
-    spoken = members[members["report"] >= 0]  # the support of what was published is nobody's report
-    for voxel, report in zip(spoken["voxel_id"].tolist(), spoken["report"].tolist(), strict=True):
-        said_by[voxel].append(ids[report])
     return MergedTile(
         gaussians=apply(epoch, TileDelta(gone, put)),
         changed=np.ascontiguousarray(changes["voxel_id"]),
-        provenance={voxel: tuple(dict.fromkeys(who)) for voxel, who in said_by.items()},
+        provenance=_said_by(changes["voxel_id"], statements, members),
     )
+
+
+def _said_by(voxel_id: NDArray[np.int32], statements: Statements, members: Rows) -> dict[int, tuple[str, ...]]:
+    """Of each changed voxel the ids of the reports in the cluster that won; members come voxel by voxel."""
+    ids = statements.report_ids
+    spoken = members[members["report"] >= 0]  # the support of what was published is nobody's report
+    voxel, report = spoken["voxel_id"].copy(), spoken["report"].copy()
+    first = np.append(np.flatnonzero(np.append(True, voxel[1:] != voxel[:-1])[: len(voxel)]), len(voxel)).tolist()
+    told: dict[bytes, tuple[str, ...]] = {}  # most voxels were told by the same reports
+    found: dict[int, tuple[str, ...]] = dict.fromkeys(voxel_id.tolist(), ())
+    for begin, end in pairwise(first):
+        key = report[begin:end].tobytes()
+        if key not in told:
+            told[key] = tuple(dict.fromkeys(ids[k] for k in report[begin:end].tolist()))
+        found[int(voxel[begin])] = told[key]
+    return found

@@ -5,23 +5,20 @@ Similarity is the smooth one of `gnd_map.similarity` ("default"). The labels are
 Where all agree that is one similarity each, not one a pair.
 """
 
-import math
-
 import numpy as np
 from numpy.typing import NDArray
 
 from cloud_merger.parameters import MergeParameters
 from cloud_merger.statements import Kind, Rows
 from gnd_map.arrays import F32, F64, I32, I64
-from gnd_map.jit import inlined, kernel
+from gnd_map.jit import kernel
+from gnd_map.similarity import alike, far_at
 
 U8 = NDArray[np.uint8]
-Floats = NDArray[np.floating]
 Said = tuple[U8, I64, I32, F64, F32, F32, float, float, float]
 """Kind, was, count, pose_m2, mean_m and cov_m2 of the statements, noise in m², eps, `far_at` it."""
 NOISE = -1
 _COLUMNS = ("voxel_id", "kind", "was", "count", "pose_m2", "mean_m", "cov_m2")
-_LEAST_VARIANCE_M2 = 1e-6  # of `gnd_map.similarity`
 _NOTHING, _QUOTED, _MEASURED, _WITHHELD = (int(kind) for kind in Kind)
 
 
@@ -175,53 +172,5 @@ def _is_near(a: int, b: int, said: Said) -> bool:
         return False
     if count[a] <= 0 or count[b] <= 0:
         return bool((count[a] > 0) == (count[b] > 0))
-    noise_m = math.sqrt(noise_m2 + pose_m2[a] + pose_m2[b])
-    return bool(1.0 - alike(mean_m[a], cov_m2[a], mean_m[b], cov_m2[b], noise_m, far) <= eps)
-
-
-@kernel
-def far_at(least: float) -> float:
-    """The squared Mahalanobis distance of means beyond which similarity is certainly below `least`."""
-    return 1e-9 - 2.0 * math.log(max(least, 1e-300))
-
-
-@kernel
-def alike(mean_a: Floats, cov_a: Floats, mean_b: Floats, cov_b: Floats, noise_m: float, far: float) -> float:
-    """Similarity of two Gaussians, means (3,), covariances (6,), as `gnd_map.similarity` has it in "default" mode; 0
-    where the squared Mahalanobis distance of the means is beyond `far`.
-    """
-    variance = max(noise_m * noise_m, _LEAST_VARIANCE_M2)
-    a, b = _raised(cov_a, variance), _raised(cov_b, variance)
-    xy, xz, yz = a[1] + b[1], a[2] + b[2], a[4] + b[4]
-    xx = np.float64(cov_a[0]) + np.float64(cov_b[0]) + variance
-    yy = np.float64(cov_a[3]) + np.float64(cov_b[3]) + variance
-    zz = np.float64(cov_a[5]) + np.float64(cov_b[5]) + variance
-    x = np.float64(mean_b[0]) - np.float64(mean_a[0])
-    y = np.float64(mean_b[1]) - np.float64(mean_a[1])
-    z = np.float64(mean_b[2]) - np.float64(mean_a[2])
-    form = x * x * (yy * zz - yz * yz) + y * y * (xx * zz - xz * xz) + z * z * (xx * yy - xy * xy)
-    form += 2.0 * (x * y * (xz * yz - xy * zz) + x * z * (xy * yz - xz * yy) + y * z * (xy * xz - xx * yz))
-    squared = max(form / _determinant(xx, xy, xz, yy, yz, zz), 0.0)
-    if squared > far:
-        return 0.0
-    middle = _determinant(0.5 * (a[0] + b[0]), 0.5 * xy, 0.5 * xz, 0.5 * (a[3] + b[3]), 0.5 * yz, 0.5 * (a[5] + b[5]))
-    shape = math.sqrt(math.sqrt(_determinant(*a) * _determinant(*b))) / math.sqrt(middle)
-    return math.exp(-0.5 * squared) * min(shape, 1.0)
-
-
-@inlined
-def _raised(cov: Floats, variance: float) -> tuple[float, float, float, float, float, float]:
-    """A covariance with the variance added on each axis."""
-    return (
-        np.float64(cov[0]) + variance,
-        np.float64(cov[1]),
-        np.float64(cov[2]),
-        np.float64(cov[3]) + variance,
-        np.float64(cov[4]),
-        np.float64(cov[5]) + variance,
-    )
-
-
-@inlined
-def _determinant(xx: float, xy: float, xz: float, yy: float, yz: float, zz: float) -> float:
-    return xx * (yy * zz - yz * yz) - xy * (xy * zz - yz * xz) + xz * (xy * yz - yy * xz)
+    variance_m2 = noise_m2 + pose_m2[a] + pose_m2[b]
+    return bool(1.0 - alike(mean_m[a], cov_m2[a], mean_m[b], cov_m2[b], variance_m2, far) <= eps)

@@ -20,8 +20,8 @@ from schemas.changes import ChangeAck
 from schemas.errors import SchemaError
 from schemas.keys import alive_key, alive_keys, change_key, change_keys, parse_alive_key, parse_change_key
 
-MAX_DECLARED: Final = 128
-WORKERS: Final = 8  # threads of each: acks that come at the same time share a commit
+MAX_DECLARED: Final = 4096
+WORKERS: Final = 32  # threads of all of them: acks that come at the same time share a commit
 _LOG = logging.getLogger(__name__)
 
 Place = tuple[str, District]  # layer and district
@@ -42,11 +42,12 @@ class Reception:
         self._bus, self._members, self._answer, self._on_death = bus, members, answer, on_death
         self._lock = threading.Lock()
         self._declared: dict[Place, Serving] = {}  # oldest first
+        self._every: Serving | None = None
 
     def open(self) -> None:
         """Begin to receive; the sign of life comes last."""
         self._bus.watch_alive(alive_keys(ROLE), self._on_alive)
-        self._bus.serve(change_keys(), self._fallback, workers=WORKERS, kind="change")
+        self._every = self._bus.serve(change_keys(), self._fallback, workers=WORKERS, kind="change")
         self._bus.declare_alive(alive_key(ROLE, self._members.own))
 
     @property
@@ -60,7 +61,7 @@ class Reception:
         with self._lock:
             if place in self._declared or not self._members.is_mine(place[1]):
                 return
-            serving = self._bus.serve(change_key(*place), self._own, complete=True, workers=WORKERS, kind="change")
+            serving = self._bus.serve(change_key(*place), self._own, complete=True, kind="change", beside=self._every)
             self._declared[place] = serving
             if len(self._declared) > MAX_DECLARED:
                 self._declared.pop(next(iter(self._declared))).close()

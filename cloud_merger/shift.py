@@ -15,10 +15,8 @@ conditions: a LiDAR that hangs lower than its vehicle believes raises every road
 A pure function of a report and its base.
 """
 
-from collections import OrderedDict
 from dataclasses import dataclass, replace
 from functools import cached_property, lru_cache
-from threading import Lock
 from typing import Final
 
 import numpy as np
@@ -28,9 +26,9 @@ from cloud_merger.errors import MergerError
 from cloud_merger.shift_kernels import Buckets, Mask, Planes
 from cloud_merger.statements import find
 from gnd_map.arrays import F64, I64
+from gnd_map.by_object import ByObject
 from gnd_map.gaussian import Gaussians
 from gnd_map.grid import VoxelGrid
-from gnd_map.tile_id import TileId
 from schemas.changes import TileChange
 
 MAX_GAUSSIANS: Final = 400  # of a report that are looked at, every second, third, ... where there are more
@@ -161,29 +159,8 @@ class _Surfaces:
         return _Surfaces(self.place_m[index], self.cov_m2[index], self.normal[index], self.flat[index])
 
 
-class _Known:
-    """Surfaces of the bases looked at last, by the very object: the reports of a street refer to few versions."""
-
-    def __init__(self, most: int) -> None:
-        self._most = most
-        self._held: OrderedDict[tuple[int, int], tuple[Gaussians, _Surfaces]] = OrderedDict()
-        self._lock = Lock()
-
-    def of(self, tile: TileId, base: Gaussians) -> _Surfaces:
-        key = (tile.morton, id(base))
-        with self._lock:
-            if key in self._held:
-                self._held.move_to_end(key)
-                return self._held[key][1]
-        found = _Surfaces.of(VoxelGrid.of(tile), base)
-        with self._lock:
-            self._held[key] = base, found  # held, so that no other object gets its id
-            if len(self._held) > self._most:
-                self._held.popitem(last=False)
-        return found
-
-
-_KNOWN: Final = _Known(64)
+_KNOWN: Final[ByObject[_Surfaces]] = ByObject(64)
+"""Surfaces of the bases looked at last: the reports of a street refer to few versions."""
 
 
 def shift_of(change: TileChange, base: Gaussians, parameters: ShiftParameters | None = None) -> Shift:
@@ -199,7 +176,7 @@ def shift_of(change: TileChange, base: Gaussians, parameters: ShiftParameters | 
     if n < parameters.least_gaussians or len(base) < parameters.least_gaussians:
         return Shift(False, n)
     surfaces = _Surfaces.of(VoxelGrid.of(change.tile), change.changed, _thinned(change.changed))
-    known = _KNOWN.of(change.tile, base)
+    known = _KNOWN.of(base, lambda: _Surfaces.of(VoxelGrid.of(change.tile), base), change.tile)
     strange = surfaces.take(~_fits(surfaces, known, _STILL, parameters))
     if len(strange) < parameters.least_gaussians:
         return Shift(False, len(strange))

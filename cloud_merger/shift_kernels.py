@@ -8,9 +8,9 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from cloud_merger.merge_kernels import alike, far_at
 from gnd_map.arrays import F64, I64
 from gnd_map.jit import inlined, kernel
+from gnd_map.similarity import alike, far_at
 
 Mask = NDArray[np.bool_]
 Planes = tuple[F64, F64, F64, F64]
@@ -175,7 +175,7 @@ def fitting(surfaces: Planes, known: Planes, buckets: Buckets, motion: F64, up_m
             if flat[j] > FLAT:
                 along = step[0] * normal[j, 0] + step[1] * normal[j, 1] + step[2] * normal[j, 2]
                 step[0], step[1], step[2] = along * normal[j, 0], along * normal[j, 1], along * normal[j, 2]
-            if alike(zero, base_cov[j], step, cov[k], NOISE_M, far) >= fits:
+            if alike(zero, base_cov[j], step, cov[k], NOISE_M**2, far) >= fits:
                 result[k] = True
                 break
     return result

@@ -9,9 +9,9 @@ from numpy.typing import NDArray
 
 from cloud_merger.errors import BadReport, MissingBase
 from cloud_merger.expanding import base_versions, expand, is_askable, with_measured
+from cloud_merger.in_play import TilesInPlay
 from cloud_merger.parameters import MergeParameters
-from cloud_merger.statements import Report
-from cloud_merger.stored import Bases, report_of, said
+from cloud_merger.stored import Bases, said
 from cloud_merger.waiting import Promises, WaitingLimits
 from cloud_merger.wants import Known, WantParameters, asked_voxels, wanted
 from gnd_map.codec import decode_mask, encode_mask
@@ -20,12 +20,10 @@ from gnd_map.gaussian import Gaussians
 from gnd_map.tile import Tile
 from gnd_map.tile_id import TileId
 from schemas.changes import ChangeReport, TileChange
-from schemas.errors import SchemaError
 from schemas.keys import parse_change_key
 from schemas.packed import PackedGaussians, PackedReport
 from tile_store.store import Store
 from tile_store.uploads import FirstHalf
-from tile_store.values import ReportRow
 
 _NO_BASE: Final = b""
 
@@ -37,10 +35,12 @@ class FirstSaid:
     Attributes:
         report: expanded, all Gaussians withheld.
         mask: (N,) bool, of which of its new and modified voxels Gaussians are wanted.
+        hopeless: tiles of which nothing that it flags could win.
     """
 
     report: ChangeReport
     mask: NDArray[np.bool_]
+    hopeless: frozenset[TileId] = frozenset()
 
     @property
     def wanted(self) -> bytes:
@@ -62,6 +62,7 @@ class ShortReports:
         self.promises = Promises(waiting)
         self._store, self._merge, self._want = store, merge, want
         self._bases = Bases(store)
+        self._in_play = TilesInPlay(store, merge, self._bases)
 
     def expanded(self, key: str, packed: PackedReport) -> ChangeReport:
         """The report that the flags stand for, all Gaussians withheld.
@@ -77,7 +78,8 @@ class ShortReports:
     def decided(self, report: ChangeReport) -> FirstSaid:
         """An expanded report with what is wanted of it, by what the store holds now."""
         known = {c.tile: self._known(report, c) for c in report.tiles if is_askable(c).any()}
-        return FirstSaid(report, wanted(report, known, self._merge, self._want))
+        found = wanted(report, known, self._merge, self._want)
+        return FirstSaid(report, found.mask, found.hopeless)
 
     def asks(self, first: FirstSaid) -> None:
         """The vehicle is asked: until its Gaussians come, others are not asked for the same."""
@@ -120,24 +122,16 @@ class ShortReports:
         return found
 
     def _known(self, report: ChangeReport, change: TileChange) -> Known:
-        journal = self._store.in_play(report.layer, change.tile)
-        state, rows = self._bases.state(change.tile, journal), journal.reports
-        shas = {row.base_sha for row in rows} | {change.base_sha}
-        found = {sha: self._bases.content(report.layer, change.tile, sha) for sha in sorted(shas - {_NO_BASE})}
+        tile = self._in_play.of(report.layer, change.tile)
+        shas = {*tile.votes.shas, change.base_sha} - {_NO_BASE}
+        found = {sha: self._bases.content(report.layer, change.tile, sha) for sha in sorted(shas)}
         return Known(
-            epoch=state.gaussians,
-            memory=state.memory,
-            reports=[one for row in rows if (one := self._report(row)) is not None],
+            epoch=tile.state.gaussians,
+            memory=tile.state.memory,
+            votes=tile.votes,
             bases={sha: gaussians for sha, gaussians in found.items() if gaussians is not None},
             promised=self.promises.of(change.tile, report.layer, but=report.report_id),
         )
-
-    def _report(self, row: ReportRow) -> Report | None:
-        """What a stored report says; nothing where it can no longer be read, which the merge will tell."""
-        try:
-            return report_of(row.body, self._merge)
-        except SchemaError:
-            return None
 
 
 def _mask(first: FirstHalf, changes: Sequence[TileChange]) -> NDArray[np.bool_]:

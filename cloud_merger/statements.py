@@ -5,20 +5,20 @@ here", or "as in base version v". The last is resolved by the hash of v, so a re
 rebased, not lost.
 """
 
-from collections import OrderedDict
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from enum import IntEnum
-from threading import Lock
 from typing import TYPE_CHECKING, Any, Final, Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
 from gnd_map.accumulate import N_MIN_CELLS
+from gnd_map.by_object import ByObject
 from gnd_map.classes import ChangeClass
 from gnd_map.day import day_of
 from gnd_map.gaussian import Gaussians
+from gnd_map.jit import kernel
 from gnd_map.tile import diff
 from schemas.changes import TileChange
 from schemas.course import Course
@@ -156,19 +156,13 @@ def statements_of(
     claims = np.zeros(0, STATEMENT) if memory is None else memory.claims_beside(ordered)
     voxels = np.union1d(_disputed(epoch, ordered, known), claims["voxel_id"]).astype(np.int32)
     quoted = _numbered_states(voxels, epoch, known)
-    parts = [np.zeros(0, STATEMENT)]
-    for k, report in enumerate(ordered):
-        said = _statements(k, report.change, voxels, quoted.get(report.change.base_sha))
-        said["weight"] = report.weight
-        said["pose_m2"] = np.where(said["kind"] == Kind.MEASURED, report.pose_m2, 0.0)
-        parts.append(said)
-    rows = _one_vote_a_vehicle(np.concatenate(parts), ordered)
-    if memory is not None:
+    rows = _one_vote_a_vehicle(_spoken(voxels, ordered, quoted), ordered)
+    if memory is not None and len(memory.voxels) + len(claims):
         claims = claims.copy()
         claims["report"] += len(ordered)
         day = max((day_of(one.last_ns) for one in ordered), default=0)
         rows = np.concatenate([rows, claims, memory.support_rows(voxels, epoch, day)])
-    rows = rows[np.argsort(rows["voxel_id"], kind="stable")]  # the parts came in the order of report ids
+        rows = rows[np.argsort(rows["voxel_id"], kind="stable")]
     return Statements(tuple(ordered), rows, () if memory is None else memory.witnesses)
 
 
@@ -227,28 +221,77 @@ def same_state(a: Rows, b: Rows) -> NDArray[np.bool_]:
     return np.asarray(same & (a["cov_m2"] == b["cov_m2"]).all(axis=1))
 
 
-def _statements(report: int, change: TileChange, voxels: NDArray[np.int32], quoted: Rows | None) -> Rows:
-    """One report's statements about those of `voxels` that it observed; without a base only its changes speak."""
-    seen = np.flatnonzero(find(change.observed, voxels) >= 0)
-    voxel_id = voxels[seen]
-    if quoted is None:
-        rows = np.zeros(len(seen), STATEMENT)
-        rows["voxel_id"] = voxel_id
-    else:
-        rows = quoted[seen]
-    changed = changed_of(change)
-    at = find(changed.rows["voxel_id"], voxel_id)
-    mine, said = np.flatnonzero(at >= 0), at[at >= 0]
-    was = rows["was"][mine]
-    rows[mine] = changed.rows[said]
+def _spoken(voxels: NDArray[np.int32], reports: Sequence[Report], quoted: Mapping[bytes, Rows]) -> Rows:
+    """The reports' statements about those of `voxels` that each observed, by voxel, then by report; of a report
+    without a base only its changes speak.
+    """
+    laid_out = [changed_of(one.change) for one in reports]
+    changed = np.concatenate([np.zeros(0, STATEMENT), *(one.rows for one in laid_out)])
+    number = {sha: k for k, sha in enumerate(quoted)}
+    base = np.array([number.get(one.change.base_sha, -1) for one in reports], np.int64)
+    seat, report, at = _who_speaks(
+        voxels,
+        base,
+        *_end_to_end([one.change.observed for one in reports], np.int32),
+        *_end_to_end([one.rows["voxel_id"] for one in laid_out], np.int32),
+        _end_to_end([one.speaks for one in laid_out], np.bool_)[0],
+    )
+    held = np.concatenate([np.zeros(0, STATEMENT), *quoted.values()])
+    here = np.where(base[report] >= 0, base[report] * len(voxels) + seat, -1)
+    rows = np.concatenate([held, changed])[np.where(at >= 0, len(held) + at, here)]
+    mine = np.flatnonzero(at >= 0)
+    was = np.append(held["was"], 0)[here[mine]]
+    denies = _end_to_end([one.denies for one in laid_out], np.bool_)[0]
     rows["was"][mine] = was
-    rows["denies"][mine] = (was == EPOCH) & changed.denies[said]
+    rows["denies"][mine] = (was == EPOCH) & denies[at[mine]]
     rows["claim"][mine] = True
     rows["report"] = report
-    speaks = np.full(len(rows), quoted is not None)
-    speaks[mine] = changed.speaks[said]
-    spoken: Rows = rows[speaks]
-    return spoken
+    rows["weight"] = np.array([one.weight for one in reports])[report]
+    pose_m2 = np.array([one.pose_m2 for one in reports])[report]
+    rows["pose_m2"] = np.where(rows["kind"] == Kind.MEASURED, pose_m2, 0.0)
+    return rows
+
+
+def _end_to_end(parts: Sequence[NDArray[Any]], dtype: type[np.generic]) -> tuple[NDArray[Any], NDArray[np.int64]]:
+    """The parts one behind the other, and (len(parts) + 1,) where each begins."""
+    begin = np.cumsum([0, *(len(part) for part in parts)])
+    return np.concatenate([np.zeros(0, dtype), *parts]), begin
+
+
+@kernel
+def _who_speaks(
+    voxels: NDArray[np.int32], base: NDArray[np.int64], observed: NDArray[np.int32],
+    observed_begin: NDArray[np.int64], changed: NDArray[np.int32], changed_begin: NDArray[np.int64],
+    speaks: NDArray[np.bool_],
+) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.int64]]:  # fmt: skip
+    """(M,) each, sorted by voxel, then by report: index of the voxel, the report, and its row among the changed ones,
+    -1 where it says "as in the base".
+    """
+    n, most = 0, len(voxels) * len(base)
+    seat, report, at = np.empty(most, np.int64), np.empty(most, np.int64), np.empty(most, np.int64)
+    for k in range(len(voxels)):
+        for r in range(len(base)):
+            if index_of(voxels[k], observed[observed_begin[r] : observed_begin[r + 1]]) < 0:
+                continue
+            own = index_of(voxels[k], changed[changed_begin[r] : changed_begin[r + 1]])
+            is_said = speaks[changed_begin[r] + own] if own >= 0 else base[r] >= 0
+            if is_said:
+                seat[n], report[n], at[n] = k, r, changed_begin[r] + own if own >= 0 else -1
+                n += 1
+    return seat[:n].copy(), report[:n].copy(), at[:n].copy()
+
+
+@kernel
+def index_of(wanted: int, ids: NDArray[np.int32]) -> int:
+    """Index of an id among sorted ones, -1 where it is missing; `find` of one, for kernels."""
+    low, high = 0, len(ids)
+    while low < high:
+        middle = (low + high) // 2
+        if ids[middle] < wanted:
+            low = middle + 1
+        else:
+            high = middle
+    return low if low < len(ids) and ids[low] == wanted else -1
 
 
 def states_at(gaussians: Gaussians, voxel_id: NDArray[np.int32], kind: Kind) -> Rows:
@@ -286,32 +329,12 @@ class Changed:
         return cls(change, rows, _speaks_of_changed(change), np.isin(rows["kind"], (Kind.MEASURED, Kind.WITHHELD)))
 
 
-class _Remembered:
-    """The same of the reports used last: a window is merged again with each new report."""
-
-    def __init__(self) -> None:
-        self._held: OrderedDict[int, Changed] = OrderedDict()
-        self._lock = Lock()
-
-    def of(self, change: TileChange) -> Changed:
-        """Made once for each change that stays in memory."""
-        with self._lock:
-            found = self._held.get(id(change))
-        if found is None or found.change is not change:  # the number of an object that is gone may come again
-            found = Changed.made(change)
-            with self._lock:
-                self._held[id(change)] = found
-                if len(self._held) > REMEMBERED:
-                    self._held.popitem(last=False)
-        return found
-
-
-_CHANGED: Final = _Remembered()
+_CHANGED: Final[ByObject[Changed]] = ByObject(REMEMBERED)
 
 
 def changed_of(change: TileChange) -> Changed:
-    """What a report says of the voxels that it found changed; laid out once."""
-    return _CHANGED.of(change)
+    """What a report says of the voxels that it found changed; laid out once, for a window is merged again and again."""
+    return _CHANGED.of(change, lambda: Changed.made(change))
 
 
 def _kinds_of_changed(change: TileChange) -> NDArray[np.uint8]:

@@ -5,7 +5,7 @@ can ask without a bus. Asking too little costs quality, asking too much costs by
 flag without its Gaussian is a vote already.
 """
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -17,15 +17,13 @@ from cloud_merger.memory import TileMemory
 from cloud_merger.parameters import MergeParameters
 from cloud_merger.statements import (
     EPOCH,
-    NO_BASE,
     Kind,
     Report,
-    Rows,
-    changed_of,
     find,
     same_state,
     states_at,
 )
+from cloud_merger.votes import TileVotes, quotable
 from gnd_map.arrays import I32
 from gnd_map.classes import ChangeClass
 from gnd_map.day import day_of
@@ -66,23 +64,34 @@ class Known:
 
     Attributes:
         epoch: Gaussians of the version that all reports are merged into.
-        reports: of the windows that are not folded into it, in any order.
+        votes: of the reports of the windows that are not folded into it.
         bases: Gaussians by content hash of the versions that these reports and the new one refer to.
         promised: (K,) voxels of which Gaussians were asked of other vehicles just now; a voxel may occur several times.
         memory: of the windows before.
     """
 
     epoch: Gaussians
-    reports: Sequence[Report] = ()
+    votes: TileVotes = field(default_factory=TileVotes)
     bases: Mapping[bytes, Gaussians] = field(default_factory=dict)
     promised: I32 = field(default_factory=lambda: np.zeros(0, np.int32))
     memory: TileMemory = field(default_factory=TileMemory)
 
 
-def wanted(
-    report: ChangeReport, known: Mapping[TileId, Known], merge: MergeParameters, want: WantParameters
-) -> NDArray[np.bool_]:
-    """(N,) bool: for each new or modified voxel of the report, in order of tile and voxel id, whether to ask for it.
+@dataclass(frozen=True, slots=True, eq=False)
+class Wanted:
+    """What is wanted of a report.
+
+    Attributes:
+        mask: (N,) bool for each new or modified voxel of the report, in order of tile and voxel id: whether to ask.
+        hopeless: tiles of which it flags such voxels only, none is asked for, and none could win whatever it is.
+    """
+
+    mask: NDArray[np.bool_]
+    hopeless: frozenset[TileId] = frozenset()
+
+
+def wanted(report: ChangeReport, known: Mapping[TileId, Known], merge: MergeParameters, want: WantParameters) -> Wanted:
+    """Which Gaussians of a report to ask for.
 
     Args:
         report: with its Gaussians withheld (`expanding.expand`) or not: they are not looked at.
@@ -90,22 +99,26 @@ def wanted(
         merge: how the statements will be merged.
         want: when to ask.
     """
-    parts = [np.zeros(0, np.bool_)]
+    parts, hopeless = [np.zeros(0, np.bool_)], set()
     for change in report.tiles:
-        if is_askable(change).any():
+        is_asked = is_askable(change)
+        if is_asked.any():
             own = merge.report_of(report.report_id, report.sensor_model, change)
-            parts.append(_wanted_of_tile(own, known[change.tile], merge, want))
-    return np.concatenate(parts)
+            may_win, ask = _wanted_of_tile(own, known[change.tile], merge, want)
+            parts.append(ask)
+            if is_asked.all() and not (may_win | ask).any():
+                hopeless.add(change.tile)
+    return Wanted(np.concatenate(parts), frozenset(hopeless))
 
 
-def _wanted_of_tile(own: Report, known: Known, merge: MergeParameters, want: WantParameters) -> NDArray[np.bool_]:
+def _wanted_of_tile(
+    own: Report, known: Known, merge: MergeParameters, want: WantParameters
+) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
+    """Of each flagged voxel of a tile whether it may win the vote, and whether to ask for its Gaussian."""
     asked = is_askable(own.change)
     ids, modified = own.change.changed.voxel_id[asked], own.change.change_class[asked] == ChangeClass.MODIFIED
-    votes, cast, in_hand = np.zeros((3, len(ids)))
-    for other, said in _said_by_others(own, known, merge, ids):
-        votes += other.weight * said.may_agree
-        cast += other.weight * said.speaks
-        in_hand += said.is_same
+    bases = quotable(known.bases) if merge.mode == "default" else {}
+    votes, cast, in_hand = known.votes.about(ids, own.change.base_sha, bases, but=own.report_id)
     if merge.mode == "default":
         remembered = _remembered(own, known, ids)
         votes, cast, in_hand = votes + remembered[0], cast + remembered[1], in_hand + remembered[2]
@@ -113,59 +126,13 @@ def _wanted_of_tile(own: Report, known: Known, merge: MergeParameters, want: Wan
     xi = np.where(modified & (merge.mode == "default"), merge.xi_reshaped, merge.xi)
     may_win = votes > want.share * xi * cast
     asked_anyway = _sample(~may_win, 0 if merge.mode == "paper" else want.sample)
-    return np.asarray((may_win & (in_hand < want.enough)) | asked_anyway)
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class _Said:
-    """What another report says of the flagged voxels, each (N,) bool.
-
-    Attributes:
-        speaks: it makes a statement.
-        may_agree: one that may be of the Gaussian that was flagged: not that there is nothing, nor a quotation of the
-            very Gaussian which the flag denies.
-        is_same: a measured Gaussian of the same change: against the same state of the voxel.
-    """
-
-    speaks: NDArray[np.bool_]
-    may_agree: NDArray[np.bool_]
-    is_same: NDArray[np.bool_]
-
-
-def _said_by_others(own: Report, known: Known, merge: MergeParameters, ids: I32) -> Iterator[tuple[Report, _Said]]:
-    """What `statements_of` says of these voxels, without making statements of all others: by report id."""
-    bases = {NO_BASE: Gaussians.empty(), **known.bases} if merge.mode == "default" else {}
-    others = {report.report_id: report for report in known.reports if report.report_id != own.report_id}
-    held: dict[bytes, Rows] = {}
-    for sha in {own.change.base_sha} | {other.change.base_sha for other in others.values()}:
-        held[sha] = states_at(bases.get(sha, Gaussians.empty()), ids, Kind.QUOTED)
-    was = held[own.change.base_sha]
-    same_was = {sha: same_state(was, rows) for sha, rows in held.items()}
-    for _, other in sorted(others.items()):
-        sha = other.change.base_sha
-        yield other, _said(other.change, ids, held[sha] if sha in bases else None, same_was[sha])
-
-
-def _said(change: TileChange, ids: I32, quoted: Rows | None, same_was: NDArray[np.bool_]) -> _Said:
-    at = find(change.changed.voxel_id, ids)
-    is_changed = at >= 0
-    kind, speaks = np.full(len(ids), Kind.NOTHING, np.uint8), np.zeros(len(ids), np.bool_)
-    if quoted is not None:
-        kind[:] = quoted["kind"]
-        speaks[:] = find(change.observed, ids) >= 0
-    if is_changed.any():
-        rows, changed = at[is_changed], changed_of(change)
-        kind[is_changed] = changed.rows["kind"][rows]
-        speaks[is_changed] = changed.speaks[rows]
-    quotes_the_denied = (kind == Kind.QUOTED) & same_was
-    may_agree = speaks & (kind != Kind.NOTHING) & ~quotes_the_denied
-    return _Said(speaks, may_agree, may_agree & (kind == Kind.MEASURED) & same_was)
+    return may_win, np.asarray((may_win & (in_hand < want.enough)) | asked_anyway)
 
 
 def _remembered(own: Report, known: Known, ids: I32) -> tuple[NDArray[np.float64], ...]:
     """Of these voxels what the windows before say: votes that may agree with the flag, all votes, Gaussians in hand."""
-    n, bases = len(ids), {NO_BASE: Gaussians.empty(), **known.bases}
-    was = states_at(bases.get(own.change.base_sha, Gaussians.empty()), ids, Kind.QUOTED)
+    n = len(ids)
+    was = states_at(known.bases.get(own.change.base_sha, Gaussians.empty()), ids, Kind.QUOTED)
     of_epoch = states_at(known.epoch, ids, Kind.QUOTED)
     is_epoch = same_state(was, of_epoch)
     support = known.memory.support_rows(ids, known.epoch, day_of(own.last_ns))

@@ -19,7 +19,7 @@ from gnd_map.codec import (
     snap,
 )
 from gnd_map.gaussian import Gaussians
-from gnd_map.similarity import similarity_pairs
+from gnd_map.similarity import similarity
 from gnd_map.tile_id import TileId
 from gnd_map.track import STEPS, Piece, Track, View
 from gnd_map.visibility import observed_along
@@ -39,7 +39,7 @@ def warm_up() -> None:
     decode_measured([(_TILE, base, found.voxel_id)], measured)
     decode_mask(encode_mask(np.array([True])), 1)
     observed_along(Track(_TILE.district, View((-8, -6, -4, -2, 0, 2, 4, 6, 8)), (_place(),)), [found])
-    similarity_pairs(np.array([0]), np.array([1]), base.exists, base.mean_m, base.cov_m2)
+    similarity(base.exists, base.mean_m, base.cov_m2, base.exists, base.mean_m, base.cov_m2)
     clusters_of(np.zeros(1, STATEMENT), MergeParameters())
     _test_a_shift()
 

@@ -123,7 +123,14 @@ class Bus:
         return requesting.request_many(self._connection, keyexpr, payload, kind=kind, retry=retry, timeout_s=timeout_s)
 
     def serve(
-        self, keyexpr: str, handler: Handler, *, complete: bool = False, workers: int = 4, kind: str = "control"
+        self,
+        keyexpr: str,
+        handler: Handler,
+        *,
+        complete: bool = False,
+        workers: int = 4,
+        kind: str = "control",
+        beside: Serving | None = None,
     ) -> Serving:
         """Answers requests in threads of our own, so that a handler may itself ask, wait or compute.
 
@@ -135,9 +142,13 @@ class Bus:
             complete: whether this handler alone answers for all these keys; the router then asks no other.
             workers: number of threads.
             kind: ledger kind of requests and answers.
+            beside: a handler that lives longer: its threads answer, and `workers` is not looked at.
         """
         self._connection.check_open()
-        return self._keep(Serving(self._connection, keyexpr, handler, complete=complete, workers=workers, kind=kind))
+        serving = Serving(
+            self._connection, keyexpr, handler, complete=complete, workers=workers, kind=kind, beside=beside
+        )
+        return self._keep(serving)
 
     def publish(
         self, key: str, payload: bytes, *, kind: str, tile: TileId | str | None = None, wait_s: float | None = None

@@ -39,39 +39,58 @@ REGIONS_WAITING: Final = 64
 REGION_BYTE_S: Final = 8_000_000
 
 
+_Asked = tuple["Serving", zenoh.Query]
+
+
+def _answer(asked: _Asked) -> None:
+    serving, query = asked
+    serving.answer(query)
+
+
 class Serving(Part):
     """A declared handler; `close` finishes requests in hand and drops waiting ones (their senders ask again).
 
     Questions about regions have one thread and a short mailbox of their own: nobody who asks for one thing waits for
-    somebody who asks for everything.
+    somebody who asks for everything. One that serves `beside` another has the threads and the mailbox of that one.
     """
 
     def __init__(
-        self, connection: Connection, keyexpr: str, handler: Handler, *, complete: bool, workers: int, kind: str
+        self,
+        connection: Connection,
+        keyexpr: str,
+        handler: Handler,
+        *,
+        complete: bool,
+        workers: int,
+        kind: str,
+        beside: "Serving | None" = None,
     ) -> None:
         super().__init__()
         self._connection, self._handler, self._kind = connection, handler, kind
-        self._workers: Workers[zenoh.Query] = Workers(
-            f"serve {keyexpr}", self._answer, workers, connection.config.queue_limit
-        )
+        self._own: list[Workers[_Asked]] = []
+        if beside is None:
+            self._own.append(Workers(f"serve {keyexpr}", _answer, workers, connection.config.queue_limit))
+        self._workers: Workers[_Asked] = self._own[0] if beside is None else beside._workers
         self._regions = self._workers
         if "*" in keyexpr:
-            self._regions = Workers(f"regions {keyexpr}", self._answer, 1, REGIONS_WAITING)
+            self._regions = Workers(f"regions {keyexpr}", _answer, 1, REGIONS_WAITING)
+            self._own.append(self._regions)
         self.declare(connection, lambda session: session.declare_queryable(keyexpr, self._accept, complete=complete))
 
     def _end(self) -> None:
         self.undeclare()
-        self._workers.close()
-        self._regions.close()
+        for workers in self._own:
+            workers.close()
 
     def _accept(self, query: zenoh.Query) -> None:
         # Runs in zenoh's thread: hand over, or say at once that we cannot.
         workers = self._regions if "*" in str(query.key_expr) else self._workers
-        if not workers.offer(query):
+        if not workers.offer((self, query)):
             with query:
                 query.reply_err(f"busy: {workers.limit} requests are waiting", encoding=FAILED)
 
-    def _answer(self, query: zenoh.Query) -> None:
+    def answer(self, query: zenoh.Query) -> None:
+        """Answer one query, in the caller's thread."""
         with query:
             try:
                 self._reply(query)

@@ -19,7 +19,7 @@ import numpy as np
 import numpy.typing as npt
 
 from gnd_map.arrays import F64, I64, Array, check_array
-from gnd_map.errors import ConfigError, ShapeError
+from gnd_map.errors import ConfigError
 from gnd_map.gaussian import full_matrices
 from gnd_map.jit import bare, bare_inlined
 from gnd_map.symmetric3 import add_to_diagonal, determinant, mahalanobis_squared
@@ -66,52 +66,8 @@ def similarity(
     cov = [_checked(name, x, (n, 6), np.float64) for name, x in (("cov_a", cov_a), ("cov_b", cov_b))]
     if mode == "paper":
         return similarity_plain(exist[0], mean[0], cov[0], exist[1], mean[1], cov[1], mode, noise)
-    row, result = np.arange(n), np.empty(n)
-    _default_kernel(row, row, exist[0], mean[0], cov[0], exist[1], mean[1], cov[1], noise**2, np.zeros(n), result)
-    return result
-
-
-def similarity_pairs(
-    i: I64,
-    j: I64,
-    exists: Array,
-    mean: Array,
-    cov: Array,
-    mode: SimilarityMode = "default",
-    noise_m: float | F64 = 0.05,
-    pose_m2: Array | None = None,
-) -> F64:
-    """(P,) similarity of the rows i and j of one table; as `similarity`, without gathering both sides first.
-
-    Args:
-        i: (P,) int64 rows.
-        j: (P,) int64 rows.
-        exists: (N,) bool.
-        mean: (N, 3) metres.
-        cov: (N, 6) m².
-        mode: as in `similarity`.
-        noise_m: standard deviation added in "default" mode, one for all or (P,).
-        pose_m2: (N,) variance of each row's pose, added for both rows of a pair to that of `noise_m`; None = 0.
-
-    Raises:
-        ShapeError: as `similarity`, or a row that is not in the table.
-        ConfigError: as `similarity`.
-    """
-    n, pairs = len(exists), len(i)
-    noise = np.full(pairs, noise_m) if np.ndim(noise_m) == 0 else np.asarray(noise_m)
-    noise = _checked("noise_m", noise, (pairs,), np.float64)
-    _check_mode(mode, noise)
-    rows = [_checked(name, x, (pairs,), np.int64) for name, x in (("i", i), ("j", j))]
-    if pairs and not (min(r.min() for r in rows) >= 0 and max(r.max() for r in rows) < n):
-        raise ShapeError(f"pairs of rows that are not all among {n}")
-    there = _checked("exists", exists, (n,), np.bool_)
-    at, shape = _checked("mean", mean, (n, 3), np.float64), _checked("cov", cov, (n, 6), np.float64)
-    pose = _checked("pose_m2", np.zeros(n) if pose_m2 is None else pose_m2, (n,), np.float64)
-    if mode == "paper":
-        sides = [(there[r], at[r], shape[r]) for r in rows]
-        return similarity_plain(*sides[0], *sides[1], mode, noise)
-    result = np.empty(pairs)
-    _default_kernel(rows[0], rows[1], there, at, shape, there, at, shape, noise**2, pose, result)
+    result = np.empty(n)
+    _default_kernel(exist[0], mean[0], cov[0], exist[1], mean[1], cov[1], noise**2, result)
     return result
 
 
@@ -127,6 +83,56 @@ def similarity_plain(
     return result
 
 
+@bare
+def far_at(least: float) -> float:
+    """The squared Mahalanobis distance of means beyond which similarity is certainly below `least`."""
+    return 1e-9 - 2.0 * math.log(max(least, 1e-300))
+
+
+@bare_inlined
+def alike(mean_a: Array, cov_a: Array, mean_b: Array, cov_b: Array, noise_m2: float, far: float) -> float:
+    """Similarity in "default" mode of two Gaussians that exist, for kernels.
+
+    Args:
+        mean_a: (3,) metres, any common origin.
+        cov_a: (6,) m².
+        mean_b: as a.
+        cov_b: as a.
+        noise_m2: the variance that is added on each axis, m².
+        far: squared Mahalanobis distance of the means beyond which the answer is 0; see `far_at`.
+    """
+    v = max(noise_m2, _LEAST_VARIANCE_M2)
+    a, b = _raised(cov_a, v), _raised(cov_b, v)
+    xy, xz, yz = a[1] + b[1], a[2] + b[2], a[4] + b[4]
+    xx = np.float64(cov_a[0]) + np.float64(cov_b[0]) + v
+    yy = np.float64(cov_a[3]) + np.float64(cov_b[3]) + v
+    zz = np.float64(cov_a[5]) + np.float64(cov_b[5]) + v
+    x = np.float64(mean_b[0]) - np.float64(mean_a[0])
+    y = np.float64(mean_b[1]) - np.float64(mean_a[1])
+    z = np.float64(mean_b[2]) - np.float64(mean_a[2])
+    square: float = x * x * (yy * zz - yz * yz) + y * y * (xx * zz - xz * xz) + z * z * (xx * yy - xy * xy)
+    square += 2.0 * (x * y * (xz * yz - xy * zz) + x * z * (xy * yz - xz * yy) + y * z * (xy * xz - xx * yz))
+    squared = max(square / _determinant(xx, xy, xz, yy, yz, zz), 0.0)
+    if squared > far:
+        return 0.0
+    middle = _determinant(a[0] + b[0], xy, xz, a[3] + b[3], yz, a[5] + b[5]) / 8.0  # of half the sum
+    shape = math.sqrt(math.sqrt(_determinant(*a) * _determinant(*b))) / math.sqrt(middle)
+    return math.exp(-0.5 * squared) * min(shape, 1.0)  # Eq. 15, and Bhattacharyya's coefficient
+
+
+@bare_inlined
+def _raised(cov: Array, variance: float) -> tuple[float, float, float, float, float, float]:
+    """A covariance with the variance added on each axis."""
+    return (
+        np.float64(cov[0]) + variance,
+        np.float64(cov[1]),
+        np.float64(cov[2]),
+        np.float64(cov[3]) + variance,
+        np.float64(cov[4]),
+        np.float64(cov[5]) + variance,
+    )
+
+
 @bare_inlined
 def _determinant(xx: float, xy: float, xz: float, yy: float, yz: float, zz: float) -> float:
     return xx * (yy * zz - yz * yz) - xy * (xy * zz - yz * xz) + xz * (xy * yz - yy * xz)
@@ -134,31 +140,14 @@ def _determinant(xx: float, xy: float, xz: float, yy: float, yz: float, zz: floa
 
 @bare
 def _default_kernel(
-    i: I64, j: I64, exists_a: Array, mean_a: F64, cov_a: F64, exists_b: Array, mean_b: F64, cov_b: F64,
-    noise_m2: F64, pose_m2: F64, result: F64,
-) -> None:  # fmt: skip
-    """(P,) `_default_terms` of rows i of a and j of b, with Eq. 14; the variance of a pair is noise_m2 and what the
-    rows have in pose_m2.
-    """
-    for pair in range(len(i)):
-        a, b = i[pair], j[pair]
-        if not (exists_a[a] and exists_b[b]):
-            result[pair] = 1.0 if exists_a[a] == exists_b[b] else 0.0
-            continue
-        v = max(noise_m2[pair] + pose_m2[a] + pose_m2[b], _LEAST_VARIANCE_M2)
-        axx, axy, axz = cov_a[a, 0] + v, cov_a[a, 1], cov_a[a, 2]
-        ayy, ayz, azz = cov_a[a, 3] + v, cov_a[a, 4], cov_a[a, 5] + v
-        bxx, bxy, bxz = cov_b[b, 0] + v, cov_b[b, 1], cov_b[b, 2]
-        byy, byz, bzz = cov_b[b, 3] + v, cov_b[b, 4], cov_b[b, 5] + v
-        xx, xy, xz = cov_a[a, 0] + cov_b[b, 0] + v, axy + bxy, axz + bxz
-        yy, yz, zz = cov_a[a, 3] + cov_b[b, 3] + v, ayz + byz, cov_a[a, 5] + cov_b[b, 5] + v
-        dx, dy, dz = mean_b[b, 0] - mean_a[a, 0], mean_b[b, 1] - mean_a[a, 1], mean_b[b, 2] - mean_a[a, 2]
-        square = dx * dx * (yy * zz - yz * yz) + dy * dy * (xx * zz - xz * xz) + dz * dz * (xx * yy - xy * xy)
-        square += 2.0 * (dx * dy * (xz * yz - xy * zz) + dx * dz * (xy * yz - xz * yy) + dy * dz * (xy * xz - xx * yz))
-        l2 = math.exp(-0.5 * max(square / _determinant(xx, xy, xz, yy, yz, zz), 0.0))  # Eq. 15
-        both = _determinant(axx, axy, axz, ayy, ayz, azz) * _determinant(bxx, bxy, bxz, byy, byz, bzz)
-        middle = _determinant(axx + bxx, xy, xz, ayy + byy, yz, azz + bzz) / 8.0  # of half the sum
-        result[pair] = l2 * min(math.sqrt(math.sqrt(both)) / math.sqrt(middle), 1.0)
+    exists_a: Array, mean_a: F64, cov_a: F64, exists_b: Array, mean_b: F64, cov_b: F64, noise_m2: F64, result: F64
+) -> None:
+    """(N,) `_default_terms` of N pairs, with Eq. 14."""
+    for k in range(len(result)):
+        if exists_a[k] and exists_b[k]:
+            result[k] = alike(mean_a[k], cov_a[k], mean_b[k], cov_b[k], noise_m2[k], np.inf)
+        else:
+            result[k] = 1.0 if exists_a[k] == exists_b[k] else 0.0
 
 
 def pairwise(

@@ -10,7 +10,7 @@ from gnd_map.tile_id import TileId
 from tile_store import sqlite_journal as journal
 from tile_store.regions import morton_range
 from tile_store.sqlite_connection import Row, change, fetch
-from tile_store.values import Claim, PutStatus, ReportRow, StoreConfig
+from tile_store.values import Claim, JournalMark, PutStatus, ReportRow, StoreConfig
 
 NS_PER_S: Final = 1_000_000_000
 
@@ -20,6 +20,9 @@ ASIDE_S: Final = 60.0
 LONGEST_ASIDE_S: Final = 3600.0
 """... at most after so long: whoever was to blame for it may be gone by then."""
 ATTEMPTS_IN_A_ROW: Final = 5
+HALVES_WAIT: Final = 4
+"""Merge delays that a tile waits for the Gaussians that were asked for, if nothing else is said about it."""
+NEVER_AT_ONCE: Final = 1 << 30
 
 
 def timing_of(config: StoreConfig, now: int, steady: int) -> dict[str, Any]:
@@ -47,8 +50,13 @@ def _put_report(c: apsw.Connection, row: ReportRow, config: StoreConfig, timing:
         return "duplicate"
     journal.put(c, row.layer, row.tile, entry)
     if settled_in is None:
-        change(c, "mark_dirty", place | timing | {"seq": entry.seq})
+        change(c, "mark_dirty", place | timing | _patience(row, timing) | {"seq": entry.seq})
     return "stored"
+
+
+def _patience(row: ReportRow, timing: dict[str, Any]) -> dict[str, Any]:
+    """The timing of a report that is half said: its other half saves a merge, where it comes in time."""
+    return {"delay": HALVES_WAIT * timing["delay"], "merge_after": NEVER_AT_ONCE} if row.is_half else {}
 
 
 def _version_that_it_confirms(c: apsw.Connection, row: ReportRow) -> int | None:
@@ -158,6 +166,12 @@ def in_play(c: apsw.Connection, layer: str, tile: TileId, epoch: int, first: int
     """The reports of the windows `first` to `last` that count since the epoch, by report id and part."""
     wanted = {"layer": layer, "tile": tile.morton, "epoch": epoch, "folded": first - 1, "last": last}
     return tuple(_row(*values) for values in fetch(c, "reports_in_play", wanted))
+
+
+def since(c: apsw.Connection, layer: str, tile: TileId, mark: JournalMark) -> list[ReportRow]:
+    """The reports in play with numbers beyond the mark, by number."""
+    wanted = {"layer": layer, "tile": tile.morton, "epoch": mark.epoch, "folded": mark.folded, "seq": mark.seq}
+    return [_row(*values) for values in fetch(c, "reports_since", wanted)]
 
 
 def in_play_of_vehicles(

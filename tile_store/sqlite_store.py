@@ -37,6 +37,7 @@ from tile_store.values import (
     DirtyTile,
     GcResult,
     HeadLine,
+    JournalMark,
     Notice,
     Publication,
     PublishResult,
@@ -220,8 +221,18 @@ class SqliteStore:
         memory = journal.memory_of(c, layer, tile, version)
         newest = journal.newest(c, layer, tile)
         if newest.window <= last:
-            return TileJournal(epoch, rows, memory, newest.window, newest.seq)
+            mark = JournalMark(version, first - 1, newest.seq)
+            return TileJournal(epoch, rows, memory, newest.window, newest.seq, mark=mark)
         return TileJournal(epoch, rows, memory, last + 1, max(row.seq for row in rows), is_whole=False)
+
+    def in_play_since(self, layer: str, tile: TileId, mark: JournalMark) -> tuple[JournalMark, list[ReportRow]] | None:
+        """See `Store.in_play_since`."""
+        with self._readers.snapshot() as c:
+            epoch = versions.epoch_of(c, layer, tile)
+            now = JournalMark(epoch, journal.folded(c, layer, tile, epoch), journal.newest(c, layer, tile).seq)
+            if (now.epoch, now.folded) != (mark.epoch, mark.folded):
+                return None
+            return now, inbox.since(c, layer, tile, mark) if now.seq > mark.seq else []
 
     def quarantine(self, body: bytes, reason: str, source: str = "") -> None:
         """See `Store.quarantine`."""
@@ -251,10 +262,6 @@ class SqliteStore:
     def begin(self, claim: Claim, lease_s: float) -> bool:
         """See `Store.begin`."""
         return self._writer.run(lambda c: inbox.begin(c, claim, lease_s, self._steady_ns()))
-
-    def renew(self, claims: Sequence[Claim], lease_s: float) -> list[bool]:
-        """See `Store.renew`."""
-        return self._writer.run(lambda c: inbox.renew(c, claims, lease_s, self._steady_ns()))
 
     def release(self, owner: str) -> int:
         """See `Store.release`."""

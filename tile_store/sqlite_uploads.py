@@ -8,7 +8,7 @@ from typing import Any, Final
 import apsw
 
 from gnd_map.tile_id import TileId
-from tile_store import lease_clock
+from tile_store import clocks
 from tile_store import sqlite_inbox as inbox
 from tile_store.errors import IdTaken
 from tile_store.retention import trim_quarantine
@@ -19,12 +19,14 @@ from tile_store.values import PutStatus, ReportRow, StoreConfig
 NS_PER_S: Final = 1_000_000_000
 HEAD_START_NS: Final = NS_PER_S
 """So long an upload is left to the shard that received it, which holds its tiles in memory."""
+LONGEST_LEASE_NS: Final = 3600 * NS_PER_S
+"""A lease that ends later than this from now was not written by this clock: it counts as ended."""
 
 
 def put(c: apsw.Connection, upload: Upload, home: str) -> PutStatus:
     """Keep a message; the same bytes on the same key are known."""
     told = {name: getattr(upload, name) for name in Upload.__slots__}
-    clock = {"boot": lease_clock.boot(), "lease_ns": lease_clock.now_ns() + HEAD_START_NS}
+    clock = {"boot": clocks.boot_id(), "lease_ns": clocks.steady_ns() + HEAD_START_NS}
     sha = sha256(upload.key.encode() + b"\0" + upload.body).digest()
     return "stored" if change(c, "insert_upload", told | clock | {"sha": sha, "home": home}) else "duplicate"
 
@@ -48,14 +50,14 @@ def claim(c: apsw.Connection, owner: str, n: int, lease_s: float) -> list[Upload
 def _lease(c: apsw.Connection, owner: str, lease_s: float, number: int, *row: Any) -> UploadClaim:
     *upload, attempts = row
     token = secrets.randbits(62)
-    until = {"boot": lease_clock.boot(), "lease_ns": lease_clock.now_ns() + round(lease_s * NS_PER_S)}
+    until = {"boot": clocks.boot_id(), "lease_ns": clocks.steady_ns() + round(lease_s * NS_PER_S)}
     change(c, "lease_upload", until | {"upload": number, "owner": owner, "token": token})
     return UploadClaim(number, Upload(*upload), owner, token, attempts + 1)
 
 
 def postpone(c: apsw.Connection, claim: UploadClaim, delay_s: float) -> None:
     """Give an upload back, to be claimed again after `delay_s`."""
-    until = {"boot": lease_clock.boot(), "lease_ns": lease_clock.now_ns() + round(delay_s * NS_PER_S)}
+    until = {"boot": clocks.boot_id(), "lease_ns": clocks.steady_ns() + round(delay_s * NS_PER_S)}
     change(c, "postpone_upload", until | {"upload": claim.number, "token": claim.token})
 
 
@@ -133,5 +135,5 @@ def forget(c: apsw.Connection, before_ns: int) -> int:
 
 
 def _clock() -> dict[str, Any]:
-    now_ns = lease_clock.now_ns()
-    return {"boot": lease_clock.boot(), "now": now_ns, "never": now_ns + lease_clock.LONGEST_LEASE_NS}
+    now_ns = clocks.steady_ns()
+    return {"boot": clocks.boot_id(), "now": now_ns, "never": now_ns + LONGEST_LEASE_NS}

@@ -15,6 +15,7 @@ from tile_store.values import (
     DirtyTile,
     GcResult,
     HeadLine,
+    JournalMark,
     Notice,
     Publication,
     PublishResult,
@@ -91,6 +92,11 @@ class Store(Protocol):
         not folded. All is read at one instant.
         """
 
+    def in_play_since(self, layer: str, tile: TileId, mark: JournalMark) -> tuple[JournalMark, list[ReportRow]] | None:
+        """The reports in play that have come since, by number, and how far that reaches; None: a window has been folded
+        or another epoch has begun since, so `in_play` is to be read again.
+        """
+
     def quarantine(self, body: bytes, reason: str, source: str = "") -> None:
         """Keep refused bytes with the reason; the same bytes again are only counted."""
 
@@ -107,9 +113,6 @@ class Store(Protocol):
 
     def begin(self, claim: Claim, lease_s: float) -> bool:
         """Count an attempt to merge a claimed tile and prolong its lease; False where another owner has it."""
-
-    def renew(self, claims: Sequence[Claim], lease_s: float) -> list[bool]:
-        """Prolong leases; False where the lease has gone to another owner."""
 
     def release(self, owner: str) -> int:
         """Free all leases of an owner (it has died), those of uploads too; the number of tiles freed."""

@@ -145,7 +145,10 @@ class ReportRow:
     part: int = 0
     """0: flags, or the whole report; 1: the same with the Gaussians that were asked for later, in place of part 0."""
     is_quiet: bool = field(default=False, compare=False)
-    """It says of all that it observed "as in the base": where that is the newest version, nothing has to be merged."""
+    """It says of all that it observed "as in the base", or nothing that could win: where the base is the newest version
+    and nothing else waits, it is counted when the tile is merged for another reason."""
+    is_half: bool = field(default=False, compare=False)
+    """Its Gaussians are asked for: the tile is not merged on its account alone before they had time to come."""
     window: int = field(default=0, compare=False)
     """Of the tile's journal; the store assigns it, and the number in it, when the report becomes durable."""
     seq: int = field(default=0, compare=False)
@@ -283,6 +286,21 @@ class WindowCounts:
 
 
 @dataclass(frozen=True, slots=True)
+class JournalMark:
+    """How far a tile's journal has been read.
+
+    Attributes:
+        epoch: version of the latest base or rollback; 0: the map has no such tile.
+        folded: the newest window that is folded into it.
+        seq: number of the newest entry.
+    """
+
+    epoch: int
+    folded: int
+    seq: int
+
+
+@dataclass(frozen=True, slots=True)
 class TileJournal:
     """What counts of a tile, read at one instant.
 
@@ -293,6 +311,7 @@ class TileJournal:
         window: the open one.
         seq: number of the newest entry.
         is_whole: the reports reach to the end of the journal; else `window` and `seq` say how far, and all are closed.
+        mark: to ask for what comes later; None: not whole, or a layer without windows.
     """
 
     epoch: StoredTile | None
@@ -301,6 +320,7 @@ class TileJournal:
     window: int = 0
     seq: int = 0
     is_whole: bool = True
+    mark: JournalMark | None = None
 
 
 @dataclass(frozen=True, slots=True)

@@ -13,6 +13,7 @@ from benchmarks.simulation.result import VehicleResult
 from cloud_merger.expanding import base_versions, expand, is_askable, with_measured
 from cloud_merger.merge import MergeParameters
 from cloud_merger.statements import Report
+from cloud_merger.votes import TileVotes
 from cloud_merger.wants import Known, WantParameters, wanted
 from gnd_map.codec import encode_mask
 from gnd_map.gaussian import Gaussians
@@ -82,12 +83,12 @@ class _Cloud:
 
     def _wanted(self, expanded: ChangeReport) -> NDArray[np.bool_]:
         known = {change.tile: self._known(change.tile) for change in expanded.tiles if is_askable(change).any()}
-        return wanted(expanded, known, self._merge, WantParameters())
+        return wanted(expanded, known, self._merge, WantParameters()).mask
 
     def _known(self, tile: TileId) -> Known:
         epoch = self._base.tiles.get(tile, Gaussians.empty())
         bases = {self._base.shas[tile]: epoch} if tile in self._base.shas else {}
-        return Known(epoch, self._held[tile], bases)
+        return Known(epoch, TileVotes.of(self._held[tile]), bases)
 
     def _tile(self, tile: TileId, version: int) -> Tile:
         return Tile(tile, version, self._base.tiles.get(tile, Gaussians.empty()))

@@ -270,10 +270,16 @@ def integers_of(gaussians: Gaussians, lattice: Lattice) -> Quantised:
     return found
 
 
+def integers_on(gaussians: Gaussians, lattice: Lattice) -> Quantised | None:
+    """As `integers_of`; None where not all lie on the lattice."""
+    found, on = _found(gaussians, lattice)
+    return found if on.all() and gaussians.exists.all() else None
+
+
 def nearest_integers(gaussians: Gaussians, lattice: Lattice) -> Quantised:
     """As `integers_of` where all lie on the lattice, else as `quantise`."""
-    found, on = _found(gaussians, lattice)
-    return found if on.all() and gaussians.exists.all() else quantise(gaussians, lattice)
+    found = integers_on(gaussians, lattice)
+    return quantise(gaussians, lattice) if found is None else found
 
 
 def quantise(gaussians: Gaussians, lattice: Lattice) -> Quantised:

@@ -7,9 +7,10 @@ import numpy as np
 import numpy.typing as npt
 
 from gnd_map.arrays import I32, I64
+from gnd_map.by_object import ByObject
 from gnd_map.codec import kernels as k
 from gnd_map.codec.coding import Coder
-from gnd_map.codec.lattice import Lattice, Quantised, nearest_integers
+from gnd_map.codec.lattice import Lattice, Quantised, integers_on, nearest_integers
 from gnd_map.codec.priors import FLAGS_AT, VOXEL_WEIGHTS_AT, VOXELS_AT, number_at
 from gnd_map.errors import CodecError
 from gnd_map.gaussian import Gaussians
@@ -112,6 +113,10 @@ def code_flags(coder: Coder, box: Box, held: I32, flag: U8) -> int:
     return n
 
 
+_INTEGERS: Final[ByObject[Quantised | None]] = ByObject(128)
+"""Of the bases used last: many messages refer to one version of a tile."""
+
+
 @dataclass(frozen=True, slots=True)
 class Known:
     """Gaussians that both sides hold, as integers of a lattice (nearest where they do not lie on it)."""
@@ -123,8 +128,10 @@ class Known:
 
 def known_of(base: Gaussians, replaced: npt.NDArray[np.bool_], gone: npt.NDArray[np.bool_], lattice: Lattice) -> Known:
     """What the base tells about those that come."""
-    kept = base.take(~gone)
-    return Known(nearest_integers(kept, lattice), replaced[~gone])
+    all_of_it = _INTEGERS.of(base, lambda: integers_on(base, lattice), lattice)
+    if all_of_it is None:
+        return Known(nearest_integers(base.take(~gone), lattice), replaced[~gone])
+    return Known(all_of_it.take(~gone), replaced[~gone])
 
 
 NOTHING_KNOWN: Final = Known(

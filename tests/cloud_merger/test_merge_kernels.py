@@ -1,14 +1,13 @@
-"""The clusters of the kernel against those over arrays of all pairs, and its similarity against the public one."""
+"""The clusters of the kernel against those over arrays of all pairs."""
 
 import numpy as np
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from cloud_merger.merge import plain_clusters
-from cloud_merger.merge_kernels import NOISE, alike, clusters_of, far_at
+from cloud_merger.merge_kernels import NOISE, clusters_of
 from cloud_merger.parameters import MergeParameters
 from cloud_merger.statements import STATEMENT, Kind
-from gnd_map.similarity import similarity
 
 KINDS = [Kind.NOTHING, Kind.QUOTED, Kind.MEASURED, Kind.MEASURED, Kind.MEASURED, Kind.WITHHELD]
 
@@ -48,24 +47,6 @@ def statements(draw):
 def test_labels_are_those_over_all_pairs(rows, eps, min_samples):
     parameters = MergeParameters(eps=eps, min_samples=min_samples)
     np.testing.assert_array_equal(clusters_of(rows, parameters), plain_clusters(rows, parameters))
-
-
-@settings(max_examples=200, deadline=None)
-@given(st.integers(0, 2**32 - 1), st.sampled_from([0.0, 0.05, 0.5]), st.sampled_from([0.001, 0.05, 0.5]))
-def test_similarity_is_the_public_one(seed, noise_m, spread_m):
-    rng = np.random.default_rng(seed)
-    n = 20
-    yes, mean = np.ones(n, bool), rng.normal(0.0, spread_m, (2, n, 3)).astype(np.float32)
-    a, b = covariances(rng, n), covariances(rng, n)
-    b[::2] = a[::2]
-    expected = similarity(yes, mean[0], a, yes, mean[1], b, noise_m=noise_m)
-    found = [alike(mean[0, k], a[k], mean[1, k], b[k], noise_m, np.inf) for k in range(n)]
-    np.testing.assert_allclose(found, expected, rtol=0.0, atol=2e-15)
-    swapped = [alike(mean[1, k], b[k], mean[0, k], a[k], noise_m, np.inf) for k in range(n)]
-    assert swapped == found
-    for least in (0.05, 0.3, 0.7):  # what is left out early would not have been near
-        early = [alike(mean[0, k], a[k], mean[1, k], b[k], noise_m, far_at(least)) for k in range(n)]
-        assert [value >= least for value in early] == [value >= least for value in found]
 
 
 def wall_at(offsets_m, voxel_id=0):

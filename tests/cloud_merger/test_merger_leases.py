@@ -104,7 +104,7 @@ def test_a_stolen_lease_is_dropped_and_the_others_are_renewed(path):
         store.postpone(stolen, 0.0)
         (taken,) = [one for one in store.claim("b", 100, 60.0) if one.tile == stolen.tile]
         leases.renew()
-        assert store.renew([taken, kept], 60.0) == [True, True]
+        assert store.beat("a", [taken, kept], 60.0) == [True, True]
         assert list(leases._held) == [kept]
 
 

@@ -1,5 +1,7 @@
 """Reception on a real router: what one shard declares, answers and gives up."""
 
+import threading
+
 import pytest
 from merger_processes import Cloud, all_acks, raw_session, wait_for
 from merger_world import POLE, TILE, change_of, report_of
@@ -43,6 +45,10 @@ def shard(cloud):
         yield shard
 
 
+def serving_threads():
+    return sum(thread.name.startswith("serve ") for thread in threading.enumerate())
+
+
 def districts(reports):
     return tuple(sorted(report.district.path for report in reports))
 
@@ -53,6 +59,16 @@ def test_a_district_is_declared_with_its_first_good_report(cloud, shard):
         for report in (*REPORTS, *REPORTS):
             assert len(all_acks(session, report)) == 1
     assert shard.districts == districts(REPORTS[:-1])
+
+
+def test_a_district_more_takes_no_thread_more(cloud, shard):
+    with raw_session(cloud.endpoint) as session:
+        all_acks(session, REPORTS[0])
+        before = serving_threads()
+        for report in REPORTS:
+            assert len(all_acks(session, report)) == 1
+        assert serving_threads() == before > 0
+    assert len(shard.districts) == len(REPORTS) - 1
 
 
 def test_only_so_many_districts_are_declared_and_the_others_are_answered_all_the_same(cloud, shard, monkeypatch):

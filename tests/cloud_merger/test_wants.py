@@ -10,6 +10,7 @@ from short_world import BASE, flagged
 from cloud_merger.errors import MergerError
 from cloud_merger.parameters import MergeParameters
 from cloud_merger.statements import Report
+from cloud_merger.votes import TileVotes
 from cloud_merger.wants import Known, WantParameters, asked_voxels, wanted
 from gnd_map.gaussian import Gaussians, concat
 from schemas.changes import ChangeReport, TileChange
@@ -25,11 +26,11 @@ def withheld(change: TileChange) -> TileChange:
 
 def known(*changes: TileChange, bases=None, promised=()) -> Known:
     reports = [Report(f"{n:026d}", change) for n, change in enumerate(changes)]
-    return Known(BASE, reports, BASES | (bases or {}), np.array(promised, np.int32))
+    return Known(BASE, TileVotes.of(reports), BASES | (bases or {}), np.array(promised, np.int32))
 
 
 def mask(change: TileChange, held: Known, want: WantParameters | None = None, merge: MergeParameters = MERGE) -> list:
-    return wanted(report_of(99, change), {change.tile: held}, merge, want or WantParameters()).tolist()
+    return wanted(report_of(99, change), {change.tile: held}, merge, want or WantParameters()).mask.tolist()
 
 
 NEW, MODIFIED = flagged(new={3: POLE}), flagged(modified={1: WALL_AGAIN})
@@ -96,13 +97,13 @@ def test_who_saw_the_published_change_confirmed_supports_whoever_flags_it_anew()
 
 def test_the_own_report_among_the_known_does_not_count():
     own = report_of(99, NEW)
-    held = Known(BASE, [Report(own.report_id, NEW)] * 9, BASES)
-    assert wanted(own, {TILE: held}, MERGE, WantParameters(enough=1)).tolist() == [True]
+    held = Known(BASE, TileVotes.of([Report(own.report_id, NEW)] * 9), BASES)
+    assert wanted(own, {TILE: held}, MERGE, WantParameters(enough=1)).mask.tolist() == [True]
 
 
 def test_votes_are_weighed_as_the_merge_weighs_them():
     """The only witness against it has a poor sensor."""
-    weak = Known(BASE, [Report(f"{n:026d}", SAME, weight=0.5) for n in range(2)], BASES)
+    weak = Known(BASE, TileVotes.of([Report(f"{n:026d}", SAME, weight=0.5) for n in range(2)]), BASES)
     assert mask(NEW, weak) == [True]
     assert mask(NEW, known(SAME, SAME)) == [False]
 
@@ -116,8 +117,8 @@ def test_masks_run_over_tiles_and_voxels_in_order():
     first, second = sorted(changes[:2], key=lambda change: change.tile)
     report: ChangeReport = report_of(99, first, second)
     bases = {sha_of(BASE, tile): BASE for tile in (TILE, NEIGHBOUR)}
-    full = Known(BASE, [Report(f"{n:026d}", changes[0]) for n in range(9)], bases)
-    found = wanted(report, {TILE: full, NEIGHBOUR: Known(BASE, (), bases)}, MERGE, WantParameters())
+    full = Known(BASE, TileVotes.of([Report(f"{n:026d}", changes[0]) for n in range(9)]), bases)
+    found = wanted(report, {TILE: full, NEIGHBOUR: Known(BASE, bases=bases)}, MERGE, WantParameters()).mask
     asked = asked_voxels(report, found)
     assert {tile: ids.tolist() for tile, ids in asked.items()} == {TILE: [], NEIGHBOUR: [1]}
     assert sorted(found.tolist()) == [False, False, True]
@@ -142,3 +143,17 @@ def test_absurd_parameters_are_refused():
         WantParameters(share=1.5)
     with pytest.raises(MergerError, match="enough must be at least 0, got -1"):
         WantParameters(enough=-1)
+
+
+def test_a_tile_is_hopeless_where_nothing_that_is_flagged_could_win():
+    def hopeless(change, *others):
+        found = wanted(report_of(99, change), {TILE: known(*others)}, MERGE, WantParameters())
+        return found.hopeless == {TILE}
+
+    assert hopeless(NEW, SAME, SAME)
+    assert not hopeless(NEW, SAME)
+    assert not hopeless(flagged(new={3: POLE}, deleted=(2,)), SAME, SAME), "what is gone needs no Gaussian to win"
+    assert not hopeless(NEW, *[NEW] * 4), "enough Gaussians are in hand, and it wins"
+    assert not hopeless(SAME, SAME)
+    many = {3 + k: POLE for k in range(100)}
+    assert not hopeless(flagged(new=many), *[flagged(observed=range(103))] * 3), "some are asked for to test the poses"

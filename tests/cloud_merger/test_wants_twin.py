@@ -10,6 +10,7 @@ from merger_world import TILE, change_of, gaussians_of
 from cloud_merger.expanding import is_askable
 from cloud_merger.parameters import MergeParameters
 from cloud_merger.statements import Kind, Report, statements_of
+from cloud_merger.votes import TileVotes
 from cloud_merger.wants import Known, WantParameters, _promised, _sample, _wanted_of_tile
 from gnd_map.classes import ChangeClass
 from gnd_map.gaussian import Gaussians
@@ -18,11 +19,11 @@ from gnd_map.tile import content_sha
 GROUND, WALL = (0.0, 0.0, -0.2, 0.28, 0.28, 0.02), (0.3, 0.0, 0.0, 0.02, 0.28, 0.28)
 
 
-def by_statements(own, known, merge, want):
+def by_statements(own, reports, known, merge, want):
     """The plain way: all statements of all reports, then those about the flagged voxels."""
     asked = is_askable(own.change)
     ids, modified = own.change.changed.voxel_id[asked], own.change.change_class[asked] == ChangeClass.MODIFIED
-    others = [report for report in known.reports if report.report_id != own.report_id]
+    others = [report for report in reports if report.report_id != own.report_id]
     statements = statements_of(known.epoch, [*others, own], known.bases, merge.mode)
     rows = statements.rows[np.isin(statements.rows["voxel_id"], ids)]
     seat = np.searchsorted(ids, rows["voxel_id"])
@@ -73,14 +74,15 @@ def test_what_is_wanted_is_what_all_statements_say(seed, mode):
         Report(f"{n:02d}", any_change(rng, told[rng.integers(4)]), weight=float(rng.choice([1.0, 0.5, 0.3])))
         for n in rng.permutation(rng.integers(1, 9))
     ]
-    own = withheld(reports.pop())
+    reports.insert(0, replace(reports[0], change=any_change(rng, bases[0])))  # it comes again
+    own, split = withheld(reports.pop()), int(rng.integers(0, 9))
     known = Known(
         epoch=bases[0],
-        reports=reports,
+        votes=TileVotes.of(reports[:split]).with_reports(reports[split:]),
         bases={content_sha(TILE, base): base for base in bases[: rng.integers(1, 4)]},  # one may have gone
         promised=rng.integers(0, 24, rng.integers(0, 9)).astype(np.int32),
     )
     merge = MergeParameters(mode=mode)
     want = WantParameters(enough=int(rng.integers(0, 4)), sample=int(rng.choice([0, 2])))
-    found = _wanted_of_tile(own, known, merge, want)
-    assert found.tolist() == by_statements(own, known, merge, want).tolist()
+    _, found = _wanted_of_tile(own, known, merge, want)
+    assert found.tolist() == by_statements(own, reports, known, merge, want).tolist()

@@ -10,11 +10,12 @@ from gnd_map.gaussian import six_entries
 from gnd_map.se3 import exp_so3
 from gnd_map.similarity import (
     SimilarityMode,
+    alike,
+    far_at,
     pairs_within,
     pairwise,
     shape_types,
     similarity,
-    similarity_pairs,
     similarity_plain,
 )
 
@@ -179,16 +180,15 @@ def test_the_kernel_gives_what_plain_numpy_gives(seed: int, noise_m: float) -> N
     assert (plain > 1e-3).sum() > 10
 
 
-@pytest.mark.parametrize("mode", MODES)
-def test_pairs_of_a_table_are_as_their_rows_gathered(mode: SimilarityMode) -> None:
-    rng, (exists, mean, cov6) = np.random.default_rng(3), random_states(70, 5)
-    i, j, pose_m2 = rng.integers(0, 70, 400), rng.integers(0, 70, 400), rng.uniform(0.0, 0.01, 70)
-    noise_m = np.sqrt(0.05**2 + pose_m2[i] + pose_m2[j])
-    gathered = similarity(exists[i], mean[i], cov6[i], exists[j], mean[j], cov6[j], mode, noise_m)
-    found = similarity_pairs(i, j, exists, mean, cov6, mode, 0.05, pose_m2)
-    np.testing.assert_allclose(found, gathered, rtol=1e-12, atol=1e-15)
-
-
-def test_a_pair_outside_the_table_is_refused() -> None:
-    with pytest.raises(ShapeError, match="not all among 5"):
-        similarity_pairs(np.array([0]), np.array([5]), *random_states(5, 1))
+@given(st.integers(0, 2**32 - 1), st.sampled_from([0.0, 0.05, 0.5]), st.sampled_from([0.01, 0.1, 1.0]))
+def test_one_pair_in_a_kernel_is_as_plain_numpy_has_it(seed: int, noise_m: float, apart: float) -> None:
+    (yes, a, cov_a), (_, other, cov_b) = random_states(20, seed), random_states(20, seed + 1)
+    yes, b = np.ones_like(yes), a + apart * other
+    cov_b[::2] = cov_a[::2]
+    plain = similarity_plain(yes, a, cov_a, yes, b, cov_b, "default", np.full(20, noise_m))
+    found = [alike(a[k], cov_a[k], b[k], cov_b[k], noise_m**2, np.inf) for k in range(20)]
+    np.testing.assert_allclose(found, plain, rtol=0.0, atol=2e-15)
+    assert found == [alike(b[k], cov_b[k], a[k], cov_a[k], noise_m**2, np.inf) for k in range(20)]
+    for least in (0.05, 0.3, 0.7):  # what is left out early would not have been near
+        early = [alike(a[k], cov_a[k], b[k], cov_b[k], noise_m**2, far_at(least)) for k in range(20)]
+        assert [value >= least for value in early] == [value >= least for value in found]

@@ -1,6 +1,7 @@
 """The queue of dirty tiles: when a tile is ready, who may merge it, and what happens when that one dies."""
 
 import threading
+from dataclasses import replace
 
 import pytest
 from store_helpers import EAGER, EAST, FAR, TILE, Clock, SqliteMaker, only_claim, publication, report
@@ -41,6 +42,23 @@ def test_a_tile_is_ready_at_once_when_enough_reports_wait(maker: SqliteMaker, cl
     store.close()
 
 
+def test_what_is_half_said_waits_for_its_gaussians_but_not_for_ever(maker: SqliteMaker, clock: Clock) -> None:
+    store = maker.open(PATIENT, clock)
+    half = replace(report(1), is_half=True)
+    store.put_reports([half])
+    assert store.ready_in_s() == pytest.approx(8.0)
+    clock.advance(1.0)
+    store.put_reports([replace(half, part=1, is_half=False)])
+    assert store.ready_in_s() == pytest.approx(2.0), "its other half has come"
+    store.put_reports([replace(report(2, EAST), is_half=True), replace(report(3, EAST), is_half=True)])
+    store.put_reports([replace(report(4, EAST), is_half=True)])
+    clock.advance(2.0)
+    assert only_claim(store).tile == TILE
+    store.put_reports([report(5, EAST)])
+    assert only_claim(store).tile == EAST, "enough wait, and one of them is whole"
+    store.close()
+
+
 def test_one_report_can_be_enough(maker: SqliteMaker, clock: Clock) -> None:
     store = maker.open(StoreConfig(merge_delay_s=60, merge_after_reports=1), clock)
     store.put_reports([report(1)])
@@ -66,12 +84,12 @@ def test_a_renewed_lease_lasts_longer_and_a_lost_one_cannot_be_renewed(store: St
     store.put_reports([report(1)])
     claim = only_claim(store, "m1", lease_s=5.0)
     clock.advance(4.0)
-    assert store.renew([claim], 5.0) == [True]
+    assert store.beat("m1", [claim], 5.0) == [True]
     clock.advance(4.0)
     assert store.claim("m2", 10, 5.0) == []
     clock.advance(1.0)
     only_claim(store, "m2")
-    assert store.renew([claim], 5.0) == [False]
+    assert store.beat("m1", [claim], 5.0) == [False]
 
 
 def test_the_leases_of_the_dead_are_freed_at_once(store: Store) -> None:
@@ -173,7 +191,7 @@ def test_the_time_of_day_may_step_and_the_queue_does_not_care(maker: SqliteMaker
         claim = only_claim(store, "m1", lease_s=10.0)
         day.advance(-2 * step_s)
         assert store.claim("m2", 1, 10.0) == []
-        assert store.renew([claim], 10.0) == [True]
+        assert store.beat("m1", [claim], 10.0) == [True]
         steady.advance(10.0)
         assert only_claim(store, "m2").token != claim.token
 
@@ -191,7 +209,7 @@ def test_leases_and_delays_of_another_boot_are_over(maker: SqliteMaker, monkeypa
     with SqliteStore(maker.path, PATIENT, steady_ns=early) as store:
         assert [one.is_alive for one in store.shards()] == [False]
         assert {one.tile for one in store.claim("m1", 10, 10.0)} == {TILE, EAST}
-        assert store.renew([held], 10.0) == [False]
+        assert store.beat("dead", [held], 10.0) == [False]
         assert store.claim("m2", 10, 10.0) == []
 
 

@@ -8,7 +8,7 @@ from dataclasses import replace
 import pytest
 from store_helpers import TILE, Clock, SqliteMaker, report, report_id
 
-from tile_store import lease_clock
+from tile_store import clocks
 from tile_store.errors import IdTaken, StoreError
 from tile_store.store import Store
 from tile_store.uploads import Answered, Settled, Upload, UploadClaim
@@ -30,8 +30,8 @@ class Machine:
 @pytest.fixture
 def machine(monkeypatch: pytest.MonkeyPatch) -> Machine:
     machine = Machine()
-    monkeypatch.setattr(lease_clock, "now_ns", lambda: machine.now)
-    monkeypatch.setattr(lease_clock, "boot", lambda: machine.name)
+    monkeypatch.setattr(clocks, "steady_ns", lambda: machine.now)
+    monkeypatch.setattr(clocks, "boot_id", lambda: machine.name)
     return machine
 
 
@@ -252,8 +252,8 @@ def test_an_upload_that_cannot_be_is_refused(bad: dict[str, str]) -> None:
 
 
 def test_the_clock_of_leases_is_one_for_all_processes_of_the_machine() -> None:
-    ask = "from tile_store import lease_clock; print(lease_clock.boot(), lease_clock.now_ns())"
-    before_ns = lease_clock.now_ns()
+    ask = "from tile_store import clocks; print(clocks.boot_id(), clocks.steady_ns())"
+    before_ns = clocks.steady_ns()
     *boot, now_ns = subprocess.check_output([sys.executable, "-c", ask], text=True).split(" ")
-    assert boot == [lease_clock.boot()]
-    assert before_ns < int(now_ns) < lease_clock.now_ns()
+    assert boot == [clocks.boot_id()]
+    assert before_ns < int(now_ns) < clocks.steady_ns()

@@ -254,10 +254,6 @@ SELECT window FROM tile_memory WHERE layer = :layer AND tile = :tile AND epoch =
 -- name: forget_memory
 DELETE FROM tile_memory WHERE layer = :layer AND tile = :tile
 
--- name: newest_epoch
-SELECT MAX(version) FROM tile_version
-WHERE layer = :layer AND tile = :tile AND version <= :version AND kind <> 'merged'
-
 -- name: reports_of_windows
 SELECT report_id, layer, tile, vehicle, received_ns, body, base_sha, part, window, seq FROM report
 WHERE layer = :layer AND tile = :tile AND window >= :first AND window <= :last AND seq <= :seq
@@ -466,6 +462,12 @@ SELECT report_id, layer, tile, vehicle, received_ns, body, base_sha, part, windo
 WHERE layer = :layer AND tile = :tile AND window > :folded AND window <= :last
   AND (window > 0 OR merged_in IS NULL OR merged_in >= :epoch)
 ORDER BY report_id, part
+
+-- name: reports_since
+SELECT report_id, layer, tile, vehicle, received_ns, body, base_sha, part, window, seq FROM report
+WHERE layer = :layer AND tile = :tile AND window > :folded AND seq > :seq
+  AND (window > 0 OR merged_in IS NULL OR merged_in >= :epoch)
+ORDER BY seq
 
 -- name: reports_in_play_of_vehicles
 SELECT report_id, layer, tile, vehicle, received_ns, body, base_sha, part, window, seq FROM report
