@@ -107,7 +107,8 @@ class Store(Protocol):
     # The queue
 
     def claim(self, owner: str, n: int, lease_s: float, prefer: Sequence[str] = ()) -> list[Claim]:
-        """Lease up to `n` tiles that are ready to merge, those in the regions `prefer` (path prefixes) first.
+        """Lease up to `n` tiles that are ready to merge: overdue ones, then those in the regions `prefer` (path
+        prefixes), then any.
 
         Leases and delays run by a clock that does not step; those of an earlier boot of the machine are over.
         """
