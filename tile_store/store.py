@@ -53,8 +53,8 @@ class Store(Protocol):
     def claim_uploads(self, owner: str, n: int, lease_s: float) -> list[UploadClaim]:
         """Lease up to `n` uploads that wait, the oldest first; one that was claimed before comes alone."""
 
-    def postpone_upload(self, claim: UploadClaim, delay_s: float) -> None:
-        """Give an upload back, to be claimed again after `delay_s`."""
+    def postpone_upload(self, claim: UploadClaim, delay_s: float, *, blameless: bool = False) -> None:
+        """Give an upload back, to be claimed again after `delay_s`; blameless: its attempts until now do not count."""
 
     def settle_upload(self, settled: Settled) -> bool:
         """Apply what has become of a claimed upload, all or nothing: its rows in the journal, its state, that of the
@@ -107,7 +107,8 @@ class Store(Protocol):
     # The queue
 
     def claim(self, owner: str, n: int, lease_s: float, prefer: Sequence[str] = ()) -> list[Claim]:
-        """Lease up to `n` tiles that are ready to merge, those in the regions `prefer` (path prefixes) first.
+        """Lease up to `n` tiles that are ready to merge: overdue ones, then those in the regions `prefer` (path
+        prefixes), then any.
 
         Leases and delays run by a clock that does not step; those of an earlier boot of the machine are over.
         """

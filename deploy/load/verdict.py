@@ -22,6 +22,8 @@ SLOW_ACK_S: Final = 0.25
 LAG_FACTOR: Final = 2.0
 LAG_S: Final = 1.0
 """The last tenth of the reports may wait twice as long as the first one, or so long."""
+LONGEST_LAG_S: Final = 5.0
+"""Of all report parts 95 % must be in a version so soon: a queue that only stays as long as it was is not enough."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -152,6 +154,8 @@ def _lagging(outcome: Outcome) -> Iterable[str]:
     waits = np.array([_word_lag_s(one) for one in sent])
     merged = sorted(outcome.ledger.merged, key=lambda one: one.received_s)
     lags, m = np.array([one.lag_s for one in merged]), max(1, len(merged) // 10)
+    if len(lags) and (p95 := float(np.quantile(lags, 0.95))) > LONGEST_LAG_S:
+        found.append(f"95 % of the report parts were merged within {p95:.1f} s only")
     for what, first, last in (("word", waits[:n], waits[-n:]), ("merge", lags[:m], lags[-m:])):
         if not len(first):
             continue

@@ -133,6 +133,13 @@ def test_tiles_that_are_merged_later_and_later():
     assert "p95 of the wait for merge" in said(good(ledger=replace(good().ledger, merged=merged)))
 
 
+def test_tiles_that_always_wait_for_long():
+    merged = tuple(Merged(1, n + 2, float(n), 7.0) for n in range(N))
+    assert "95 % of the report parts were merged within 7.0 s only" in said(
+        good(ledger=replace(good().ledger, merged=merged))
+    )
+
+
 def test_what_is_left_undone():
     ledger = good().ledger
     assert "3 report parts are not merged" in said(good(ledger=replace(ledger, unmerged=3)))

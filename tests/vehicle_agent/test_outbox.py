@@ -192,7 +192,11 @@ def test_base_tiles_stay_as_long_as_a_pending_report_needs_them(outbox: Outbox) 
     assert outbox.bases_of(A) == {}
     assert outbox.bases_of(B) == {t.sha: t.gaussians for t in (both, two)}
     outbox.answered(B, "quarantined", "its letter is not sent again")
-    assert [outbox._db.run(f"SELECT * FROM {table}") for table in ("base", "needs", "packed")] == [[], [], []]
+    assert [outbox._db.run(f"SELECT * FROM {table}") for table in ("base", "needs")] == [[], []]
+    # First halves stay beside their reports: a kept drive can be sent again as it was.
+    assert outbox._db.run("SELECT report_id, body FROM packed ORDER BY 1") == [(A, b"short a"), (B, b"short b")]
+    assert not outbox.due(1 << 62)
+    assert not outbox.unheard(1 << 62)
 
 
 def test_a_known_report_brings_no_base_tiles(outbox: Outbox) -> None:

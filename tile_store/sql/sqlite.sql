@@ -600,7 +600,8 @@ UPDATE upload SET owner = :owner, token = :token, boot = :boot, lease_ns = :leas
 WHERE upload = :upload
 
 -- name: postpone_upload
-UPDATE upload SET owner = NULL, token = NULL, boot = :boot, lease_ns = :lease_ns
+UPDATE upload SET owner = NULL, token = NULL, boot = :boot, lease_ns = :lease_ns,
+  attempts = CASE WHEN :blameless THEN 1 ELSE attempts END
 WHERE upload = :upload AND token = :token
 
 -- name: release_uploads
