@@ -18,6 +18,8 @@ VOTES_KEPT: Final = 16
 """Of a feature the votes of so many vehicles, the newest, or of as many as decide (`FeatureMergeParameters.voters`)."""
 MEASURERS_KEPT: Final = 8
 """So many vehicles that measured it last stay apart; those before are one estimate."""
+GONE_KEPT: Final = 256
+"""Of the vehicles before those the newest so many by name: who comes back is known."""
 NAMES_KEPT: Final = 8
 FORGOTTEN_DAYS: Final = 180
 """What is not published and not the map's, and has been claimed by nobody for so long, is forgotten."""
@@ -97,21 +99,25 @@ def _remembered(
     story: Story, votes: tuple[tuple[int, Vote], ...], names: tuple[int, ...], apart: frozenset[int], day: int
 ) -> Remembered:
     track = story.track
-    gone = [cast.vote for cast in list(story.votes.values())[: len(story.votes) - len(votes)]]
-    ayes = [vote for vote in gone if vote.existence.state == "exist"]
+    dropped = [cast.vote for cast in list(story.votes.values())[: len(story.votes) - len(votes)]]
+    ayes = [vote for vote in dropped if vote.existence.state == "exist"]
     newest = sorted(story.measured, key=lambda vehicle: story.last.get(vehicle, -1))
-    before = set(newest[:-MEASURERS_KEPT])
+    before = newest[:-MEASURERS_KEPT]
+    gone = story.gone | {one: story.measured[one].earlier + story.measured[one].repeats for one in before}
+    ayes_gone = story.ayes_gone | {vote.vehicle: vote.hits for vote in ayes}
     return Remembered(
         track.feature_id, track.kind, names, track.state, track.epoch, track.quoted, story.shown, story.is_published,
         story.is_settled, story.is_away,
         votes=votes,
         measured=tuple(own for vehicle, own in story.measured.items() if vehicle not in before),
-        known=_known(story, before),
+        known=_known(story, set(before)),
         vehicles_before=story.vehicles_before + len(before),
         ayes_before=story.ayes_before + len(ayes),
         hits_before=story.hits_before + sum(vote.hits for vote in ayes),
         apart=apart,
         day=day,
+        gone=tuple(gone.items())[-GONE_KEPT:],
+        ayes_gone=tuple(ayes_gone.items())[-GONE_KEPT:],
     )  # fmt: skip
 
 

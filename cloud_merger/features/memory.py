@@ -58,6 +58,7 @@ class Own:
         place: recursive estimate of them, as if their errors had nothing in common.
         attributes: its newest word.
         is_finder: it found the feature anew.
+        earlier: how many of its measurements are in `Remembered.known`; these here weigh what they add to those.
     """
 
     vehicle: str
@@ -65,6 +66,7 @@ class Own:
     place: Place
     attributes: Attributes = ()
     is_finder: bool = False
+    earlier: int = 0
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -88,6 +90,8 @@ class Remembered:
         vehicles_before: how many these are, ...
         ayes_before: ... how many whose votes are no longer among `votes` said that it exists, ...
         hits_before: ... and their looks.
+        gone: of the newest of those vehicles how often each has measured it: it may come back, ...
+        ayes_gone: ... and of the newest of those votes whose and with how many looks.
         apart: numbers of those with which it is not one: a report has told them apart.
         day: `gnd_map.day` of the newest receipt of a report that speaks for it.
     """
@@ -110,6 +114,18 @@ class Remembered:
     hits_before: int
     apart: frozenset[int]
     day: int
+    gone: tuple[tuple[str, int], ...] = ()
+    ayes_gone: tuple[tuple[str, int], ...] = ()
+
+    @property
+    def repeats(self) -> dict[str, int]:
+        """How often each vehicle has measured it, as far as that is known."""
+        return dict(self.gone) | {own.vehicle: own.earlier + own.repeats for own in self.measured}
+
+    @property
+    def n_forgotten(self) -> int:
+        """How many vehicles have measured it of which nothing else is known."""
+        return max(self.vehicles_before - len(self.gone), 0)
 
     @property
     def is_of_map(self) -> bool:
@@ -189,17 +205,18 @@ def _told(track: Remembered, features: _Table) -> list[Any]:
     counts = [track.vehicles_before, track.ayes_before, track.hits_before, track.day]
     votes = [[number, one.vehicle, _masses(one.existence), one.hits, one.elsewhere] for number, one in track.votes]
     measured = [
-        [one.vehicle, one.repeats, _place(one.place), one.attributes, int(one.is_finder)] for one in track.measured
+        [one.vehicle, one.repeats, _place(one.place), one.attributes, int(one.is_finder), one.earlier]
+        for one in track.measured
     ]
     place = None if track.known is None else _place(track.known)
     head = [track.feature_id, track.kind, list(track.names), _place(track.state)]
-    return [*head, known, flags, votes, measured, place, counts, sorted(track.apart)]
+    return [*head, known, flags, votes, measured, place, counts, sorted(track.apart), track.gone, track.ayes_gone]
 
 
 def _remembered(said: Sequence[Any], features: Sequence[Feature]) -> Remembered:
-    feature_id, kind, names, state, known, flags, votes, measured, place, counts, apart = said
+    feature_id, kind, names, state, known, flags, votes, measured, place, counts, apart, gone, ayes = said
     epoch, quoted, shown = (None if number < 0 else features[number] for number in known)
-    vehicles, ayes, hits, day = counts
+    vehicles_before, ayes_before, hits_before, day = counts
     is_published, is_settled, is_away = map(bool, flags)
     return Remembered(
         feature_id,
@@ -214,15 +231,17 @@ def _remembered(said: Sequence[Any], features: Sequence[Feature]) -> Remembered:
         is_away,
         votes=tuple((n, Vote(vehicle, Existence(*m), h, name)) for n, vehicle, m, h, name in votes),
         measured=tuple(
-            Own(vehicle, repeats, _place_of(at), _attributes(of), bool(is_finder))
-            for vehicle, repeats, at, of, is_finder in measured
+            Own(vehicle, repeats, _place_of(at), _attributes(of), bool(is_finder), earlier)
+            for vehicle, repeats, at, of, is_finder, earlier in measured
         ),
         known=None if place is None else _place_of(place),
-        vehicles_before=vehicles,
-        ayes_before=ayes,
-        hits_before=hits,
+        vehicles_before=vehicles_before,
+        ayes_before=ayes_before,
+        hits_before=hits_before,
         apart=frozenset(apart),
         day=day,
+        gone=tuple((vehicle, n) for vehicle, n in gone),
+        ayes_gone=tuple((vehicle, n) for vehicle, n in ayes),
     )
 
 

@@ -4,6 +4,7 @@ nothing moves by a hair.
 
 from collections import Counter
 from dataclasses import dataclass, replace
+from typing import Final
 
 import numpy as np
 
@@ -18,6 +19,8 @@ from cloud_merger.features.tracks import Measured, Track
 from gnd_map.features import Existence, Feature, full_covariance, geodetic_in_tile
 from gnd_map.features.feature import MAX_COUNT
 from gnd_map.tile_id import TileId
+
+_LEAST_ADDED: Final = 1e-6
 
 
 @dataclass(frozen=True, slots=True)
@@ -69,12 +72,15 @@ class Story:
         self.last: dict[str, int] = {}  # number of each vehicle's newest measurement
         self.votes: dict[str, _Cast] = {}  # the newest of each vehicle, the newest last
         self.vehicles_before = self.ayes_before = self.hits_before = 0
+        self.gone: dict[str, int] = {}
+        self.ayes_gone: dict[str, int] = {}
         if before is not None:
             self.known, self.shown, self.is_published = before.known, before.shown, before.is_published
             self.is_settled, self.is_away = before.is_settled, before.is_away
             self.measured = {own.vehicle: own for own in before.measured}
             self.vehicles_before, self.ayes_before = before.vehicles_before, before.ayes_before
             self.hits_before = before.hits_before
+            self.gone, self.ayes_gone = dict(before.gone), dict(before.ayes_gone)
         self._before = self.shown if self.is_published else None
         self._prior = prior_of(track, parameters)
         self.masses = self._prior
@@ -119,6 +125,11 @@ class Story:
     def _cast(self, report: int) -> None:
         vote = self.track.votes[report]
         self.votes.pop(vote.vehicle, None)
+        if vote.vehicle in self.ayes_gone:  # it is back
+            self.ayes_before, self.hits_before = (
+                self.ayes_before - 1,
+                self.hits_before - self.ayes_gone.pop(vote.vehicle),
+            )
         self.votes[vote.vehicle] = _Cast(report, vote, vote.existence.discounted(self._parameters.reliability))
 
     def _weigh(self) -> None:
@@ -126,14 +137,16 @@ class Story:
 
     def _measure(self, report: int, measured: Measured) -> bool:
         """Whether the vehicle measures it for the first time."""
-        vehicle, place = measured.vehicle, measured.place
-        own = self.measured.get(vehicle)
-        is_new = own is None
+        vehicle, own = measured.vehicle, self.measured.get(measured.vehicle)
+        earlier = self.gone.pop(vehicle, 0) if own is None else own.earlier
+        place = measured.place if earlier == 0 else measured.place.scaled(1.0 / max(self._adds(earlier), _LEAST_ADDED))
+        is_new = own is None and earlier == 0
         if own is None:
-            own = Own(vehicle, 1, place, measured.attributes, measured.is_found)
+            self.vehicles_before -= earlier > 0
+            own = Own(vehicle, 1, place, measured.attributes, measured.is_found, earlier)
         else:
             is_finder = own.is_finder or measured.is_found
-            own = Own(vehicle, own.repeats + 1, step(own.place, place), measured.attributes, is_finder)
+            own = Own(vehicle, own.repeats + 1, step(own.place, place), measured.attributes, is_finder, earlier)
         self.measured[vehicle], self.last[vehicle] = own, report
         length_m = length_of(place.points_m)
         is_longer = self.grows and length_m > self._longest_m
@@ -161,6 +174,10 @@ class Story:
     def _even(self) -> bool:
         known_m2 = None if self.known is None else self.known.least_m2
         return is_even(list(self._least_m2.values()), known_m2, self._parameters.most_weight)
+
+    def _adds(self, earlier: int) -> float:
+        """What one more measurement of a vehicle weighs beside so many."""
+        return self._parameters.information_of(earlier + 1) - self._parameters.information_of(earlier)
 
     def _fused(self, own: Own) -> Place:
         return fused(own.place, own.repeats, self._parameters.information_of(own.repeats))

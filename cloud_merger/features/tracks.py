@@ -86,8 +86,12 @@ class Track:
     @property
     def witnesses(self) -> int:
         """Vehicles that it rests on; the map counts as two."""
-        before = 0 if self.before is None else self.before.vehicles_before
-        return len(self.repeats) + before + (2 if self.is_of_map else 0)
+        return self.measurers + (2 if self.is_of_map else 0)
+
+    @property
+    def measurers(self) -> int:
+        """Vehicles that have measured it."""
+        return len(self.repeats) + (0 if self.before is None else self.before.n_forgotten)
 
     def measure(self, report: int, measured: Measured, parameters: FeatureMergeParameters) -> None:
         """Take a measurement. The n-th of one vehicle weighs what it adds to what n of them weigh."""
@@ -128,11 +132,10 @@ class Tracks:
         n = len(memory.witnesses)
         for one in memory.tracks:
             votes = {number - n: vote for number, vote in one.votes}
-            repeats = {own.vehicle: own.repeats for own in one.measured}
             self._begin(
                 Track(
                     one.feature_id, one.kind, one.state, one.epoch, one.quoted,
-                    votes=votes, repeats=repeats, before=one, apart=set(one.apart),
+                    votes=votes, repeats=one.repeats, before=one, apart=set(one.apart),
                 )
             )  # fmt: skip
             self._begun.update([one.finder] if one.finder else ())
@@ -239,8 +242,7 @@ class Tracks:
                     track.votes[report] = vote.denied
 
     def _confirms(self, track: Track) -> bool:
-        before = 0 if track.before is None else track.before.vehicles_before
-        return len(track.repeats) + before >= self._parameters.min_vehicles
+        return track.measurers >= self._parameters.min_vehicles
 
     def names_of(self) -> dict[int, list[int]]:
         """All ids under which each track (by `serial`) has been known, in the order in which they came."""
@@ -289,7 +291,7 @@ class Tracks:
         known = early.epoch or early.quoted
         if early.before is not None:
             early.state = early.before.state
-            early.repeats = {own.vehicle: own.repeats for own in early.before.measured}
+            early.repeats = early.before.repeats
         elif known is None:
             (number, first), *measured = measured
             early.state, early.measured[number], early.repeats[first.vehicle] = first.place, first, 1
@@ -327,12 +329,17 @@ def joined(early: Remembered | None, late: Remembered | None) -> Remembered | No
         ayes_before=early.ayes_before + late.ayes_before,
         hits_before=early.hits_before + late.hits_before,
         day=max(early.day, late.day),
+        gone=tuple((dict(early.gone) | dict(late.gone)).items()),
+        ayes_gone=tuple((dict(early.ayes_gone) | dict(late.ayes_gone)).items()),
     )
 
 
 def _together(one: Own, other: Own) -> Own:
     place = step(one.place, other.place)
-    return Own(one.vehicle, one.repeats + other.repeats, place, other.attributes, one.is_finder or other.is_finder)
+    is_finder = one.is_finder or other.is_finder
+    return Own(
+        one.vehicle, one.repeats + other.repeats, place, other.attributes, is_finder, one.earlier + other.earlier
+    )
 
 
 def _of_map(feature: Feature, epoch: Feature | None = None, quoted: Feature | None = None) -> Track:

@@ -2,13 +2,14 @@
 
 import numpy as np
 import pytest
-from feature_cloud import change, found, merge, report
+from feature_cloud import TILE, change, found, merge, report
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.stats import chi2
 
 from cloud_merger.features import FeatureMergeParameters
 from cloud_merger.features.rls import Place, estimate, fused, step
+from cloud_merger.features.window import LayerMerger, LayerState, LayerWindow
 from gnd_map.features import full_covariance, hit, six_of
 from schemas.features import Found
 
@@ -121,3 +122,31 @@ def test_more_vehicles_more_accurate():
         errors[vehicles] = np.mean(squares) ** 0.5
     assert errors[8] < 0.7 * errors[2]
     assert errors[32] < 0.7 * errors[8]
+
+
+@pytest.mark.parametrize(("vehicles", "repeats"), [(24, 1), (12, 4)])
+def test_covariances_stay_honest_over_windows(vehicles, repeats):
+    """The same, in windows of four reports, of vehicles that come by again when eight others have been there."""
+    squares = []
+    for seed in range(RUNS):
+        rng = np.random.default_rng([13, seed])
+        truth = rng.uniform(-8, 8, 2)
+        common = rng.normal(0, 0.3, (vehicles, 2))
+        finds = []
+        for number in range(vehicles * repeats):
+            error = common[number % vehicles]
+            error = (error + rng.normal(0, 0.3, 2)) * 0.5**0.5 if repeats > 1 else error
+            finds.append(report(number, change(found(*(truth + error))), vehicle=f"car-{number % vehicles}"))
+        merger = LayerMerger(TILE, FeatureMergeParameters(renewal_gain=1.0), {}, {})
+        state = LayerState(())
+        for first in range(0, len(finds), 4):
+            window = LayerWindow(tuple(finds[first : first + 4]), 1)
+            merged = merger.merge(state, window)
+            state = merger.fold(state, merged, window)
+        got = max(merged.estimates, key=lambda one: one.vehicles)  # one find in a thousand misses the gate
+        error = got.points_m[0, :2] - truth
+        squares.append(error @ np.linalg.solve(full_covariance(got.cov_m2)[:2, :2], error))
+        assert vehicles - 1 <= got.vehicles <= vehicles
+        assert got.cov_m2[0] < 1.2 * 0.09 * (1 + 0.5 * (repeats - 1)) / repeats / vehicles
+    low, high = band(RUNS, 2)
+    assert low < np.mean(squares) < high
