@@ -108,7 +108,8 @@ class Auditor:
     def ledger(self) -> Ledger:
         """All that the load has left behind, as it is at one moment: workers may still be busy."""
         with self._connection:  # one snapshot: else an upload that is settled meanwhile would be seen nowhere
-            return self._ledger()
+            found = self._ledger()
+        return found
 
     def _ledger(self) -> Ledger:
         parts = [(str(report_id), int(part)) for report_id, part in self._connection.execute(_JOURNALED)]
