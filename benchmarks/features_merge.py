@@ -6,6 +6,7 @@ decimetres across it, as low-cost GNSS with lanes leaves them, and each light by
 
 from collections import defaultdict
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from time import process_time
 from typing import Final
 
@@ -13,6 +14,7 @@ import numpy as np
 
 from benchmarks.figures import Figure
 from cloud_merger.features import FeatureMergeParameters, MergedFeatures, merge_features, merge_layer
+from cloud_merger.features.window import LayerMerger, LayerState, LayerWindow
 from gnd_map.arrays import F64
 from gnd_map.features import Feature, full_covariance, geodetic_in_tile, hit, miss, points_in_tile
 from gnd_map.geodesy import LocalFrame
@@ -29,6 +31,8 @@ EACH_M: Final = 0.3
 VEHICLES: Final = 11
 SEEN_SHARE: Final = 0.9
 BUSY_REPORTS: Final = 256
+JOURNAL_REPORTS: Final = 9_984
+WINDOW_REPORTS: Final = 32
 SEEDS: Final = range(11, 16)
 T0_MS: Final = 1_700_000_000_000
 FRAME: Final = LocalFrame(0.651, 2.2165)
@@ -52,6 +56,7 @@ def run() -> list[Figure]:
             "reports/s",
             f"{len(busy)} reports on one tile in {each_s:.2f} s of one core",
         ),
+        *_long_journal(),
         *_quality(),
     ]
 
@@ -120,7 +125,7 @@ def _report(vehicle: str, number: int, tiles: Sequence[tuple[TileId, list[Found]
 
 
 def _busy_tile() -> list[FeatureReport]:
-    """As many reports as count of one tile: four lights in it, found by 64 vehicles again and again."""
+    """Many reports on one tile: four lights in it, found by 64 vehicles again and again."""
     rng = np.random.default_rng(11)
     tile = TileId.from_geodetic(FRAME.lat_rad, FRAME.lon_rad)
     truth_m = np.array([[-8.0, -8.0], [8.0, -8.0], [-8.0, 8.0], [8.0, 8.0]])
@@ -134,6 +139,38 @@ def _busy_tile() -> list[FeatureReport]:
         ]
         reports.append(_report(f"car-{n % 64}", n, [(tile, found)]))
     return reports
+
+
+def _long_journal() -> list[Figure]:
+    """What a report costs after thousands, each merged when it comes into windows of 32; and what is remembered."""
+    begun, tile = _busy_tile(), TileId.from_geodetic(FRAME.lat_rad, FRAME.lon_rad)
+    parameters = FeatureMergeParameters()
+    merger = LayerMerger(tile, parameters, {}, {})
+    state, spent_s, sizes = LayerState(()), [], []
+    for number in range(JOURNAL_REPORTS // WINDOW_REPORTS):
+        first = number * WINDOW_REPORTS
+        reports = [_later(begun[k % len(begun)], k) for k in range(first, first + WINDOW_REPORTS)]
+        is_timed = not 2 <= number < JOURNAL_REPORTS // WINDOW_REPORTS - 2
+        start_s = process_time()
+        for n in range(1, WINDOW_REPORTS) if is_timed else ():
+            merger.merge(state, LayerWindow(tuple(reports[:n]), 1))
+        window = LayerWindow(tuple(reports), 1)
+        state = merger.fold(state, merger.merge(state, window), window)
+        if is_timed:
+            spent_s.append(process_time() - start_s)
+        sizes.append(len(state.encoded(number).memory))
+    each_ms = 1e3 / WINDOW_REPORTS * np.array(spent_s)
+    return [
+        Figure("late report", float(each_ms[-2:].sum() / each_ms[:2].sum()), "",
+               f"CPU of the last 64 of {JOURNAL_REPORTS} reports to the first 64, {each_ms[0]:.1f} ms each at first"),
+        Figure("memory", sizes[-1] / 1e3, "kB", f"of a tile of four lights, {sizes[9] / 1e3:.2f} kB after 320 reports"),
+    ]  # fmt: skip
+
+
+def _later(report: FeatureReport, number: int) -> FeatureReport:
+    """The same by another vehicle, one of 700."""
+    name = deterministic_report_id(T0_MS + number, "later")
+    return replace(report, report_id=name, vehicle=f"car-{number % 700}")
 
 
 def _quality() -> list[Figure]:

@@ -3,7 +3,9 @@ transaction; so a notice outlives the shard that published the version, and goes
 """
 
 import logging
+import time
 from collections import OrderedDict
+from collections.abc import Sequence
 from dataclasses import replace
 from typing import Final
 
@@ -24,11 +26,15 @@ REMEMBERED_KEYS: Final = 256
 # Who holds the tile asks for the rest.
 NOTICE_DELTA_BYTES: Final = 512
 NOTICE_DELTA_VOXELS: Final = 256  # more of them are not even encoded
+# The worker of an owner that lives may be starting, stopped, or without room on its disk: its notices go out all the
+# same.
+OTHERS_AFTER_S: Final = 0.3
 _LOG = logging.getLogger(__name__)
 
 
 class Announcer:
-    """Announces the versions of the districts that this shard owns, oldest first, then unmarks them.
+    """Announces the versions of the districts that this shard owns, oldest first, then unmarks them; and those of
+    others that have waited for `OTHERS_AFTER_S` before its eyes.
 
     The last notice of each of the newest `REMEMBERED_KEYS` tiles is repeated to late subscribers.
     """
@@ -36,17 +42,24 @@ class Announcer:
     def __init__(self, store: Store, bus: Bus, members: Members) -> None:
         self._store, self._bus, self._members = store, bus, members
         self._publishers: OrderedDict[str, RecallingPublisher] = OrderedDict()
+        self._seen_s: dict[Notice, float] = {}  # notices of others, since when, by the monotonic clock
 
     def announce(self, at_most: int) -> int:
         """Announce what waits, up to `at_most` versions; the number announced (0 without a router)."""
         if not self._bus.is_connected():
             return 0  # a notice put without a router would vanish in silence
-        waiting = [one for one in self._store.notices(n=at_most) if self._members.is_mine(one.tile.district)]
+        waiting = self._own_and_late(self._store.notices(n=at_most))
         for notice in waiting:
             self._announce(notice)
         if waiting:
             self._store.announced(waiting)
         return len(waiting)
+
+    def _own_and_late(self, waiting: Sequence[Notice]) -> list[Notice]:
+        now_s = time.monotonic()
+        foreign = [one for one in waiting if not self._members.is_mine(one.tile.district)]
+        self._seen_s = {one: self._seen_s.get(one, now_s) for one in foreign}
+        return [one for one in waiting if now_s - self._seen_s.get(one, 0.0) >= OTHERS_AFTER_S]
 
     def _announce(self, notice: Notice) -> None:
         stored = self._store.get(notice.layer, notice.tile, notice.version)

@@ -29,12 +29,13 @@ from schemas.features import FeatureReport
 from schemas.packed import PackedGaussians, PackedReport, crc_of, decode_upload
 from schemas.report_id import deterministic_report_id
 from schemas.report_states import ReportState
-from tile_store.errors import IdTaken, StoreError
+from tile_store.errors import IdTaken, StoreDamaged, StoreError
 from tile_store.store import Store
 from tile_store.uploads import Answered, FirstHalf, Settled, UploadClaim
 from tile_store.values import ReportRow
 
 REMEMBERED_DISTRICTS: Final = 32
+DAMAGED_RETRY_S: Final = 2.0
 _LOG = logging.getLogger(__name__)
 Tell = Callable[[str, ReportState], object]
 
@@ -89,6 +90,10 @@ class Expander:
     def _work_on(self, claim: UploadClaim) -> None:
         try:
             outcome = self._settled(self._understood(claim))
+        except StoreDamaged as error:  # the store's fault, not the upload's: it waits until the page is mended
+            _LOG.error("upload %s waits: %s", claim.upload.report_id, error)
+            self._store.postpone_upload(claim, DAMAGED_RETRY_S, blameless=True)
+            return
         except StoreError:
             raise
         except Exception as error:  # one upload never stops the others

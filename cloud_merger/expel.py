@@ -6,7 +6,8 @@ from typing import Literal
 
 from cloud_merger.config import ShardConfig
 from cloud_merger.verify import Verifier
-from gnd_map.features import is_feature_layer
+from gnd_map.content import AnyTile
+from gnd_map.features import FeatureTile
 from gnd_map.tile import Tile, diff
 from gnd_map.tile_id import TileId
 from tile_store.store import Store
@@ -19,7 +20,7 @@ class Expelled:
     Attributes:
         tile: of which the vehicle has spoken.
         reports: of it there since the tile's epoch, and since the time asked for.
-        voxels: that differ without them.
+        voxels: that differ without them; features in a feature layer.
         status: "changes"; "same": the others say the same; "unknown": it cannot be computed any more.
         reason: why it is unknown.
     """
@@ -33,41 +34,47 @@ class Expelled:
 
 def without_vehicle(
     store: Store, config: ShardConfig, layer: str, vehicle: str, since_ns: int = 0
-) -> Iterator[tuple[Expelled, Tile | None]]:
+) -> Iterator[tuple[Expelled, AnyTile | None]]:
     """Every tile that a vehicle has reported about since its epoch, and its content without that (None: it stays).
 
     Args:
         store: only read.
-        config: parameters of the shards that published.
-        layer: of Gaussians.
+        config: parameters of what was merged before stores kept them.
+        layer: of Gaussians or features.
         vehicle: its pseudonym.
         since_ns: what it said before, by receipt, stays; int ns UTC.
-
-    Feature layers are left out: their merges are not kept as windows.
     """
     verifier = Verifier(store, config)
     tiles = sorted({row.tile for row in store.reports(layer, vehicle) if row.received_ns >= since_ns})
     for tile in tiles:
         head = store.get(layer, tile)
-        if head is None or is_feature_layer(layer):
+        if head is None:
             continue
         if head.kind != "merged":
             yield Expelled(tile, 0, 0, "same"), None  # nothing that anybody said since has changed it
             continue
-        n, reason, gaussians = verifier.without(
+        n, reason, new = verifier.without(
             layer, tile, head.version, lambda row: row.vehicle == vehicle and row.received_ns >= since_ns
         )
-        if gaussians is None:
+        if new is None:
             yield Expelled(tile, n, 0, "unknown", reason), None
-            continue
-        new, old = Tile(tile, head.version + 1, gaussians), head.decode_gaussians()
-        if n == 0 or new.sha == old.sha:
+        elif n == 0 or new.sha == head.sha:
             yield Expelled(tile, n, 0, "same"), None
         else:
-            yield Expelled(tile, n, differing(old, new), "changes"), new
+            yield Expelled(tile, n, differing(head.decode(), new), "changes"), _next(new, head.version + 1)
 
 
-def differing(old: Tile, new: Tile) -> int:
-    """How many voxels of two versions differ."""
+def _next(content: AnyTile, version: int) -> AnyTile:
+    if isinstance(content, FeatureTile):
+        return FeatureTile(content.tile_id, version, content.features)
+    return Tile(content.tile_id, version, content.gaussians)
+
+
+def differing(old: AnyTile, new: AnyTile) -> int:
+    """How many voxels, or features, of two versions differ."""
+    if isinstance(old, FeatureTile) or isinstance(new, FeatureTile):
+        assert isinstance(old, FeatureTile)
+        assert isinstance(new, FeatureTile)
+        return len({one.key for one in set(old.features) ^ set(new.features)})
     delta = diff(old.gaussians, new.gaussians)
     return len(delta.removed) + len(delta.put)

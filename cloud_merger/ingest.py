@@ -5,7 +5,6 @@ time share. What the bytes say is found out later (`expander`), and told on the 
 """
 
 import logging
-import time
 from collections.abc import Callable
 
 from cloud_merger.errors import BadReport
@@ -15,6 +14,7 @@ from schemas.errors import SchemaError
 from schemas.keys import parse_change_key
 from schemas.limits import MAX_AHEAD_NS, MAX_REASON_CHARACTERS
 from schemas.upload_head import UploadHead, head_of_upload
+from tile_store import clocks
 from tile_store.store import Store
 from tile_store.uploads import Upload
 
@@ -36,7 +36,7 @@ class Ingest:
         store: Store,
         home: str,
         on_stored: Callable[[], object] = lambda: None,
-        now_ns: Callable[[], int] = time.time_ns,
+        now_ns: Callable[[], int] = clocks.day_ns,
     ) -> None:
         self._store, self._home, self._on_stored, self._now_ns = store, home, on_stored, now_ns
 

@@ -79,9 +79,9 @@ class TileMemory:
 
     def support_rows(self, voxels: I32, epoch: Gaussians, day: int) -> Rows:
         """STATEMENT rows that stand for what the present state of some voxels is worth on a day; `report` is -1."""
-        at = find(self.voxels["voxel_id"], voxels)
-        support = self.weights(day)[at[at >= 0]]
-        said = states_at(epoch, voxels[at >= 0], Kind.QUOTED)
+        support = self.support(voxels, day)
+        known = support > 0.0
+        support, said = support[known], states_at(epoch, voxels[known], Kind.QUOTED)
         said["was"] = np.where(said["kind"] == Kind.QUOTED, EPOCH, 0)
         said["report"] = -1
         turns = [np.clip(support - turn, 0.0, 1.0) for turn in range(int(SUPPORT[-1]))]
@@ -90,11 +90,15 @@ class TileMemory:
         spoken: Rows = rows[rows["weight"] > 0.0]
         return spoken
 
-    def weights(self, day: int) -> NDArray[np.float64]:
-        """(N,) what the present state of each remembered voxel is worth on a day, in votes."""
-        age_days = np.maximum(day - self.voxels["day"].astype(np.int64), 0)
-        votes = SUPPORT[np.searchsorted(CONFIRMED_BY, self.voxels["observers"], side="right") - 1]
-        return np.asarray(votes * 0.5 ** (age_days / HALF_LIFE_DAYS))
+    def support(self, voxels: I32, day: int) -> NDArray[np.float64]:
+        """(N,) what the present state of some voxels is worth on a day, in votes; 0 where nothing is remembered."""
+        at = find(self.voxels["voxel_id"], voxels)
+        of = self.voxels[at[at >= 0]]
+        age_days = np.maximum(day - of["day"].astype(np.int64), 0)
+        votes = SUPPORT[np.searchsorted(CONFIRMED_BY, of["observers"], side="right") - 1]
+        found = np.zeros(len(voxels))
+        found[at >= 0] = votes * 0.5 ** (age_days / HALF_LIFE_DAYS)
+        return found
 
     def claims_beside(self, reports: Sequence[Report]) -> Rows:
         """The claims that vote beside the reports of a window. Where a vehicle speaks again about a voxel, its newest

@@ -1,22 +1,27 @@
 """Compute any version of a tile anew from its journal, and compare: the map is a pure function of what was reported."""
 
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Literal
 
 from cloud_merger.belief import ShiftTests
 from cloud_merger.config import ShardConfig
+from cloud_merger.errors import MergerError
+from cloud_merger.features.kept import FeatureContents
+from cloud_merger.features.window import LayerMerger, LayerState, refuted_of, windows_of
+from cloud_merger.map_parameters import digest_of, text_of, with_text
 from cloud_merger.memory import TileMemory
 from cloud_merger.statements import Report
 from cloud_merger.stored import Bases, lattice_of_tile, reports_by_window
-from cloud_merger.window import TileState, WindowMerger, fold
+from cloud_merger.window import MergedWindow, TileState, WindowMerger, fold
+from gnd_map.content import AnyTile
 from gnd_map.errors import GndError
-from gnd_map.features import is_feature_layer
+from gnd_map.features import FeatureTile, is_feature_layer
 from gnd_map.gaussian import Gaussians
 from gnd_map.tile import Tile
 from gnd_map.tile_id import TileId
 from tile_store.store import Store
-from tile_store.values import Basis, ReportRow, VersionInfo
+from tile_store.values import Basis, ClosedWindow, ReportRow, StoredTile, VersionInfo
 
 Status = Literal["same", "differs", "given", "unknown"]
 
@@ -32,6 +37,8 @@ class Verified:
         status: "same": the same content, bit for bit; "differs": it is not what its journal gives; "given": a base or a
             rollback, whose bytes were compared with their hash only; "unknown": it cannot be computed any more.
         reason: why it differs or is unknown.
+        assumed: digest of the parameters that were taken because the store does not say which it was merged with; "":
+            it does.
     """
 
     layer: str
@@ -39,19 +46,55 @@ class Verified:
     version: int
     status: Status
     reason: str = ""
+    assumed: str = ""
+
+
+@dataclass(frozen=True, slots=True)
+class _Journal:
+    """What a version was made of: its epoch (None: it began with a merge), the reports, how its windows were merged."""
+
+    layer: str
+    tile: TileId
+    version: int
+    epoch: StoredTile | None
+    basis: Basis
+    closed: Mapping[int, ClosedWindow]
+    rows: Sequence[ReportRow]
+
+    def how(self, window: int) -> ClosedWindow:
+        """How one of its windows was merged."""
+        if window == self.basis.window:
+            return ClosedWindow(self.basis.named, self.basis.parameters)
+        return self.closed.get(window, ClosedWindow(frozenset()))
+
+    @property
+    def windows_before(self) -> list[int]:
+        """The closed ones that hold reports, in order."""
+        return sorted({row.window for row in self.rows} - {self.basis.window})
+
+    @property
+    def is_told(self) -> bool:
+        """Whether the store knows the parameters of all of it."""
+        return all(self.how(window).parameters for window in [*self.windows_before, self.basis.window])
+
+    def without(self, is_out: Callable[[ReportRow], bool]) -> "_Journal":
+        """The same without some reports."""
+        kept = [row for row in self.rows if not is_out(row)]
+        return _Journal(self.layer, self.tile, self.version, self.epoch, self.basis, self.closed, kept)
 
 
 class Verifier:
-    """Computes versions anew.
+    """Computes versions anew, each window with the parameters that it was merged with.
 
     Args:
         store: only read.
-        config: the parameters of the shards that published.
+        config: parameters of what was merged before stores kept them.
     """
 
     def __init__(self, store: Store, config: ShardConfig) -> None:
         self._store, self._config = store, config
-        self._bases, self._shifts = Bases(store), ShiftTests(config.shift)
+        self._bases, self._features = Bases(store), FeatureContents(store)
+        self._configs: dict[str, tuple[ShardConfig, ShiftTests]] = {}
 
     def heads(self, layer: str, region: str = "") -> Iterator[Verified]:
         """The newest version of every tile of a region."""
@@ -66,90 +109,133 @@ class Verifier:
     def version(self, layer: str, tile: TileId, version: int) -> Verified:
         """One version of a tile."""
         try:
-            status, reason = self._checked(layer, tile, version)
-        except GndError as error:  # a body that is not what its hash says
-            status, reason = "differs", str(error)
-        return Verified(layer, tile, version, status, reason)
+            return self._checked(layer, tile, version)
+        except MergerError as error:  # parameters of another release
+            return Verified(layer, tile, version, "unknown", str(error))
+        except GndError as error:  # a body, or parameters, that are not what their hash says
+            return Verified(layer, tile, version, "differs", str(error))
 
-    def _checked(self, layer: str, tile: TileId, version: int) -> tuple[Status, str]:
+    def _checked(self, layer: str, tile: TileId, version: int) -> Verified:
         stored = self._store.get(layer, tile, version=version)
         if stored is None:
-            return "unknown", "the store has no such version any more"
+            return Verified(layer, tile, version, "unknown", "the store has no such version any more")
         content = stored.decode()
         if stored.kind != "merged":
-            return "given", ""
-        if is_feature_layer(layer):
-            return "unknown", f"{layer} holds features, whose merges are not kept as windows"
-        basis = self._store.basis(layer, tile, version)
-        if basis is None:
-            return "unknown", "it is older than the journal"
-        epoch = _epoch_of(self._store.history(layer, tile), version)
-        first = self._first_window(layer, tile, epoch)
-        rows = self._store.reports_of_windows(layer, tile, first, basis.window, basis.seq)
-        missing = self._missing(layer, tile, version, rows, first, basis)
-        if missing:
-            return "unknown", missing
-        sha = Tile(tile, version, self._computed(layer, tile, epoch, basis, rows)).sha
-        reason = f"the journal gives {sha.hex()[:16]}…, published was {content.sha.hex()[:16]}…"
-        return ("same", "") if sha == content.sha else ("differs", reason)
+            return Verified(layer, tile, version, "given")
+        journal = self._journal(stored)
+        if isinstance(journal, str):
+            return Verified(layer, tile, version, "unknown", journal)
+        computed = self._computed(journal)
+        assumed = "" if journal.is_told else digest_of(text_of(self._config))
+        if computed.sha == content.sha:
+            return Verified(layer, tile, version, "same", assumed=assumed)
+        reason = f"the journal gives {computed.sha.hex()[:16]}…, published was {content.sha.hex()[:16]}…"
+        if assumed:
+            reason += f"; the store does not say with which parameters it was merged, assumed were {assumed[:16]}…"
+        return Verified(layer, tile, version, "differs", reason, assumed)
 
     def without(
         self, layer: str, tile: TileId, version: int, is_out: Callable[[ReportRow], bool]
-    ) -> tuple[int, str, Gaussians | None]:
-        """A version computed without some reports: how many they are, and its Gaussians; None: why it cannot be."""
-        stored, basis = self._store.get(layer, tile, version=version), self._store.basis(layer, tile, version)
-        if stored is None or stored.kind != "merged" or basis is None:
-            return 0, "it is a base or a rollback, or older than the journal", None
+    ) -> tuple[int, str, AnyTile | None]:
+        """A version computed without some reports: how many they are, and its content; None: why it cannot be."""
+        stored = self._store.get(layer, tile, version=version)
+        if stored is None or stored.kind != "merged":
+            return 0, "it is a base or a rollback", None
+        journal = self._journal(stored)
+        if isinstance(journal, str):
+            return 0, journal, None
+        kept = journal.without(is_out)
+        return len(journal.rows) - len(kept.rows), "", self._computed(kept)
+
+    def _journal(self, stored: StoredTile) -> _Journal | str:
+        """What a merged version was made of; a text: why that is not known any more."""
+        layer, tile, version = stored.layer, stored.tile, stored.version
+        basis = self._store.basis(layer, tile, version)
+        if basis is None:
+            return "it is older than the journal"
+        if is_feature_layer(layer) and not basis.parameters:
+            return "it is older than the windows of feature layers"
         epoch = _epoch_of(self._store.history(layer, tile), version)
-        first = self._first_window(layer, tile, epoch)
+        begun = None if epoch is None else self._store.get(layer, tile, version=epoch.version)
+        of_epoch = None if epoch is None else self._store.basis(layer, tile, epoch.version)
+        first = 0 if of_epoch is None else of_epoch.window
         rows = self._store.reports_of_windows(layer, tile, first, basis.window, basis.seq)
-        missing = self._missing(layer, tile, version, rows, first, basis)
-        if missing:
-            return 0, missing, None
-        kept = [row for row in rows if not is_out(row)]
-        return len(rows) - len(kept), "", self._computed(layer, tile, epoch, basis, kept)
+        closed = self._store.closed_windows(layer, tile)
+        closed = {window: how for window, how in closed.items() if first <= window < basis.window}
+        journal = _Journal(layer, tile, version, begun, basis, closed, rows)
+        return self._missing(journal) or journal
 
-    def _first_window(self, layer: str, tile: TileId, epoch: VersionInfo | None) -> int:
-        basis = None if epoch is None else self._store.basis(layer, tile, epoch.version)
-        return 0 if basis is None else basis.window
-
-    def _missing(
-        self, layer: str, tile: TileId, version: int, rows: Sequence[ReportRow], first: int, basis: Basis
-    ) -> str:
+    def _missing(self, journal: _Journal) -> str:
         """What the computation would need and retention has removed; "": nothing."""
-        known = {row.report_id for row in rows}
-        cited = set(self._store.provenance(layer, tile, version)) - known
+        layer, tile = journal.layer, journal.tile
+        known = {row.report_id for row in journal.rows}
+        cited = set(self._store.provenance(layer, tile, journal.version)) - known
         if cited:
             return f"{len(cited)} reports that it rests on are gone, first {min(cited)}"
-        windows = {row.window for row in rows}
-        emptied = [window for window in self._store.closed_windows(layer, tile) if first <= window < basis.window]
-        emptied = [window for window in emptied if window not in windows]
+        windows = {row.window for row in journal.rows}
+        emptied = [window for window in journal.closed if window not in windows]
         if emptied:
             return f"the reports of {len(emptied)} closed windows are gone, first of window {emptied[0]}"
-        shas = {row.base_sha for row in rows if row.base_sha}
-        gone = sorted(sha.hex()[:16] for sha in shas if self._bases.content(layer, tile, sha) is None)
+        shas = {row.base_sha for row in journal.rows if row.base_sha}
+        gone = sorted(sha.hex()[:16] for sha in shas if self._base(layer, tile, sha) is None)
         return f"{len(gone)} versions that reports refer to are gone, first {gone[0]}…" if gone else ""
 
-    def _computed(
-        self, layer: str, tile: TileId, epoch: VersionInfo | None, basis: Basis, rows: Iterable[ReportRow]
-    ) -> Gaussians:
-        begun = None if epoch is None else self._store.get(layer, tile, version=epoch.version)
+    def _base(self, layer: str, tile: TileId, sha: bytes) -> object | None:
+        of_features = is_feature_layer(layer)
+        return self._features.content(layer, tile, sha) if of_features else self._bases.content(layer, tile, sha)
+
+    def _with(self, parameters: str) -> tuple[ShardConfig, ShiftTests]:
+        """The configuration with which a window was merged, and the shift tests made with it."""
+        if parameters not in self._configs:
+            config = with_text(self._config, parameters)
+            self._configs[parameters] = config, ShiftTests(config.shift)
+        return self._configs[parameters]
+
+    def _computed(self, journal: _Journal) -> AnyTile:
+        if is_feature_layer(journal.layer):
+            return self._computed_features(journal)
+        return Tile(journal.tile, journal.version, self._computed_gaussians(journal))
+
+    def _computed_gaussians(self, journal: _Journal) -> Gaussians:
+        layer, tile, begun = journal.layer, journal.tile, journal.epoch
         state = TileState(Gaussians.empty() if begun is None else self._bases.decoded(begun), TileMemory())
-        lattice = lattice_of_tile(begun, state.gaussians, self._config.codec)
-        by_window = reports_by_window(rows, self._config.merge)
-        shas = {one.change.base_sha for reports in by_window.values() for one in reports if one.change.base_sha}
+        epoch = state.gaussians
+        shas = {row.base_sha for row in journal.rows if row.base_sha}
         found = {sha: self._bases.content(layer, tile, sha) for sha in sorted(shas)}
         bases = {sha: gaussians for sha, gaussians in found.items() if gaussians is not None}
-        closed = self._store.closed_windows(layer, tile)
 
-        def merger(named: frozenset[str]) -> WindowMerger:
-            return WindowMerger(self._config.merge, self._config.confirmation, self._shifts, bases, named)
+        def said(window: int) -> list[Report]:
+            rows = [row for row in journal.rows if row.window == window]
+            return reports_by_window(rows, self._with(journal.how(window).parameters)[0].merge).get(window, [])
 
-        for window in sorted(by_window):
-            if window < basis.window:
-                state = fold(state, merger(closed.get(window, frozenset())).merge(state, by_window[window], lattice))
-        now: list[Report] = by_window.get(basis.window, [])
-        return merger(basis.named).merge(state, now, lattice).gaussians
+        def merged(window: int, reports: Sequence[Report]) -> MergedWindow:
+            how = journal.how(window)
+            config, shifts = self._with(how.parameters)
+            merger = WindowMerger(config.merge, config.confirmation, shifts, bases, how.named)
+            return merger.merge(state, reports, lattice_of_tile(begun, epoch, config.codec))
+
+        for window in journal.windows_before:
+            if reports := said(window):  # of one that can no longer be read nothing was folded
+                state = fold(state, merged(window, reports))
+        return merged(journal.basis.window, said(journal.basis.window)).gaussians
+
+    def _computed_features(self, journal: _Journal) -> FeatureTile:
+        layer, tile = journal.layer, journal.tile
+        state = LayerState(() if journal.epoch is None else journal.epoch.decode_features().features)
+        shas = sorted({row.base_sha for row in journal.rows})
+        found = {sha: self._features.content(layer, tile, sha) for sha in shas}
+        bases = {sha: features for sha, features in found.items() if features is not None}
+        by_window = windows_of(journal.rows)
+
+        def merger(window: int) -> LayerMerger:
+            how = journal.how(window)
+            return LayerMerger(tile, self._with(how.parameters)[0].features, bases, refuted_of(how.named))
+
+        for window in journal.windows_before:
+            if (said := by_window.get(window)) is not None:
+                state = merger(window).fold(state, merger(window).merge(state, said), said)
+        open_window = journal.basis.window
+        return FeatureTile(tile, journal.version, merger(open_window).merge(state, by_window.get(open_window)).features)
 
 
 def _epoch_of(history: Iterable[VersionInfo], version: int) -> VersionInfo | None:

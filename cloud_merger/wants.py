@@ -131,20 +131,24 @@ def _wanted_of_tile(
 
 def _remembered(own: Report, known: Known, ids: I32) -> tuple[NDArray[np.float64], ...]:
     """Of these voxels what the windows before say: votes that may agree with the flag, all votes, Gaussians in hand."""
-    n = len(ids)
+    memory, n = known.memory, len(ids)
+    may_agree, cast, in_hand = np.zeros((3, n))
+    if not len(memory.voxels) + len(memory.claims):
+        return may_agree, cast, in_hand
     was = states_at(known.bases.get(own.change.base_sha, Gaussians.empty()), ids, Kind.QUOTED)
     of_epoch = states_at(known.epoch, ids, Kind.QUOTED)
     is_epoch = same_state(was, of_epoch)
-    support = known.memory.support_rows(ids, known.epoch, day_of(own.last_ns))
-    claims = known.memory.claims[find(ids, known.memory.claims["voxel_id"]) >= 0]
-    rows = np.concatenate([support, claims])
-    seat = np.searchsorted(ids, rows["voxel_id"])
-    quotes_the_denied = (rows["kind"] == Kind.QUOTED) & is_epoch[seat]
-    may_agree = (rows["kind"] != Kind.NOTHING) & ~quotes_the_denied
-    same_was = is_epoch[seat] & ((rows["was"] == EPOCH) | (of_epoch["count"][seat] == 0))
-    in_hand = (may_agree & (rows["kind"] == Kind.MEASURED) & same_was).astype(np.float64)
-    weights = (rows["weight"] * may_agree, rows["weight"], in_hand)
-    return tuple(np.bincount(seat, weight, n).astype(np.float64) for weight in weights)
+    cast += memory.support(ids, day_of(own.last_ns))
+    may_agree += np.where((of_epoch["kind"] == Kind.QUOTED) & ~is_epoch, cast, 0.0)
+    claims = memory.claims[find(ids, memory.claims["voxel_id"]) >= 0]
+    seat = np.searchsorted(ids, claims["voxel_id"])
+    quotes_the_denied = (claims["kind"] == Kind.QUOTED) & is_epoch[seat]
+    agrees = (claims["kind"] != Kind.NOTHING) & ~quotes_the_denied
+    same_was = is_epoch[seat] & ((claims["was"] == EPOCH) | (of_epoch["count"][seat] == 0))
+    np.add.at(cast, seat, claims["weight"])
+    np.add.at(may_agree, seat, claims["weight"] * agrees)
+    np.add.at(in_hand, seat, agrees & (claims["kind"] == Kind.MEASURED) & same_was)
+    return may_agree, cast, in_hand
 
 
 def _sample(outvoted: NDArray[np.bool_], n: int) -> NDArray[np.bool_]:

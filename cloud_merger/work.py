@@ -7,10 +7,11 @@ from typing import TypeVar
 from cloud_merger.belief import ShiftTests, courses_of
 from cloud_merger.config import ShardConfig
 from cloud_merger.features.kept import FeatureContents, said_of
-from cloud_merger.features.merge import merge_features
+from cloud_merger.features.window import LayerMerger, LayerState, names_of, refuted_of, windows_of
+from cloud_merger.map_parameters import text_of
 from cloud_merger.stored import Bases, encode_state, lattice_of_tile, reports_by_window, said
 from cloud_merger.window import WindowMerger, fold, provenance_of
-from gnd_map.features import FeatureTile, is_feature_layer
+from gnd_map.features import Feature, FeatureTile, is_feature_layer
 from gnd_map.gaussian import Gaussians
 from gnd_map.tile import Tile
 from schemas.errors import SchemaError
@@ -28,7 +29,7 @@ class Worker:
     def __init__(self, store: Store, config: ShardConfig) -> None:
         self._store, self._config = store, config
         self._contents, self._features = Bases(store), FeatureContents(store)
-        self._shifts = ShiftTests(config.shift)
+        self._shifts, self._parameters = ShiftTests(config.shift), text_of(config)
 
     def merge(self, claims: Sequence[Claim]) -> list[Publication]:
         """What to publish for these claims; a tile that failed is postponed, or set aside after `max_attempts`."""
@@ -106,33 +107,46 @@ class Worker:
             waiting=now.gated.waiting,
             shift_tests=tuple(test for one in (*folded, now) for test in one.believed.tests),
             courses=courses_of(one for reports in by_window.values() for one in reports),
-            basis=Basis(journal.window, journal.seq, named),
+            basis=Basis(journal.window, journal.seq, named, self._parameters),
             memory=encode_state(tile, closed[-1], state) if closed else None,
             closed=tuple(closed),
         )
 
     def _of_features(self, work: TileWork) -> Publication:
         """The same of a tile of a feature layer."""
-        layer, tile = work.claim.layer, work.claim.tile
+        layer, tile, journal = work.claim.layer, work.claim.tile, work.journal
         epoch = () if work.epoch is None else work.epoch.decode_features().features
-        parts = [part for row in work.reports if (part := self._readable(row, said_of)) is not None]
-        found = {
-            sha: self._features.content(layer, tile, sha) for sha in sorted({row.base_sha for row in work.reports})
-        }
-        bases = {sha: features for sha, features in found.items() if features is not None}
-        refuted = self._store.refuted_reports(layer, {row.vehicle for row in work.reports})
-        merged = merge_features(tile, epoch, parts, self._config.features, bases, refuted)
-        new = FeatureTile(tile, work.base_version + 1, merged.features)
-        is_new = new.sha != work.head.sha if work.head else len(merged.features) > 0
+        state = LayerState.stored(epoch, journal.memory)
+        rows = [row for row in work.reports if self._readable(row, said_of) is not None]
+        named = names_of(self._store.refuted_reports(layer, {row.vehicle for row in rows}), rows)
+        merger = LayerMerger(tile, self._config.features, self._feature_bases(work), refuted_of(named))
+        by_window = windows_of(rows)
+        closed = [window for window in by_window if window < journal.window]
+        merges = []
+        for window in closed:
+            merges.append(merger.merge(state, by_window[window]))
+            state = merger.fold(state, merges[-1], by_window[window])
+        now = merger.merge(state, by_window.get(journal.window))
+        merges.append(now)
+        new = FeatureTile(tile, work.base_version + 1, now.features)
+        is_new = new.sha != work.head.sha if work.head else len(now.features) > 0
         return Publication(
             claim=work.claim,
             base_version=work.base_version,
             tile=new if is_new else None,
             report_ids=_ids(work),
-            voxel_reports=merged.provenance,
-            shift_tests=merged.tests,
-            basis=Basis(work.journal.window, work.journal.seq),
+            voxel_reports={feature: ids for one in merges for feature, ids in one.provenance.items()},
+            shift_tests=tuple(test for one in merges for test in one.tests),
+            basis=Basis(journal.window, journal.seq, named, self._parameters),
+            memory=state.encoded(closed[-1]) if closed else None,
+            closed=tuple(closed),
         )
+
+    def _feature_bases(self, work: TileWork) -> dict[bytes, tuple[Feature, ...]]:
+        """The versions that reports about features refer to, by hash; those that the store has lost are missing."""
+        shas = sorted({row.base_sha for row in work.reports})
+        found = {sha: self._features.content(work.claim.layer, work.claim.tile, sha) for sha in shas}
+        return {sha: features for sha, features in found.items() if features is not None}
 
     def _readable(self, row: ReportRow, read: Callable[[bytes], T]) -> T | None:
         """What a stored report says; nothing when it can no longer be read (its vehicle has long had its ack)."""

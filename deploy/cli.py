@@ -14,6 +14,7 @@ COMMANDS: Final[dict[str, tuple[str, str]]] = {
     "fleet": ("deploy.fleet_cli:fleet", "Run a whole fleet on this machine and watch the map heal."),
     "lab": ("deploy.lab.command:lab", "Run a fleet over real shaped links in network namespaces (root)."),
     "load": ("deploy.load.command:load", "Replay kept drives as many vehicles: does the cloud keep up?"),
+    "chaos": ("deploy.chaos_cli:chaos", "Hurt a whole cloud of real processes, and check what it promised."),
     "watch": ("deploy.watch_cli:watch", "Print the tile updates of a region as they are published."),
     "traffic": ("deploy.traffic_cli:traffic", "Account for every byte of a run against 3G, 4G and 5G; as a page, too."),
     "map": ("deploy.map_cli:map_group", "Build, inspect, compare, export, back up and roll back maps."),

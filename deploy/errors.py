@@ -7,6 +7,7 @@ GndError
     ├── LabError           namespaces or shaped links cannot be made or are taken
     │   └── LabRuns        a lab of that name is running
     ├── PageError          a page cannot be written
+    ├── ChaosError         a chaos run cannot start, or its street cannot be read
     └── RegionError        a region that is no wildcard, tile or circle
 """
 
@@ -39,3 +40,7 @@ class RegionError(DeployError):
 
 class PageError(DeployError):
     """A page cannot be written."""
+
+
+class ChaosError(DeployError):
+    """A chaos run cannot start, or its street cannot be read."""

@@ -12,6 +12,7 @@ import signal
 import sys
 import threading
 import time
+from collections import Counter, deque
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from multiprocessing import connection
@@ -24,7 +25,8 @@ from deploy.lab.namespaces import enter_namespace
 
 PRELOAD: Final = ("deploy.preload",)
 STOP_GRACE_S: Final = 10.0
-MAX_RESTARTS: Final = 5
+MAX_RESTARTS: Final = 5  # within `RESTARTS_SPAN_S`: a part that dies more often by itself will not live
+RESTARTS_SPAN_S: Final = 60.0
 RESTART_DELAY_S: Final = 0.3  # times the number of deaths in a row that came at once
 STEADY_S: Final = 2.0  # a process that has lived so long is started again without delay
 
@@ -61,12 +63,23 @@ class _Running:
     restart_at_s: float | None = None
     started_s: float = field(default_factory=time.monotonic)
     early_deaths: int = 0
+    deaths_s: deque[float] = field(default_factory=deque)
+    is_killed: bool = False
 
     def pause_s(self) -> float:
         """How long to wait before it is started again: one that dies at once would die for ever."""
-        steady = time.monotonic() - self.started_s >= STEADY_S
+        steady = self.is_killed or time.monotonic() - self.started_s >= STEADY_S
         self.early_deaths = 0 if steady else self.early_deaths + 1
         return RESTART_DELAY_S * self.early_deaths
+
+    def count_death(self) -> int:
+        """How often it has died by itself within the span that counts, this time included."""
+        now_s = time.monotonic()
+        if not self.is_killed:
+            self.deaths_s.append(now_s)
+        while self.deaths_s and self.deaths_s[0] < now_s - RESTARTS_SPAN_S:
+            self.deaths_s.popleft()
+        return len(self.deaths_s)
 
 
 @dataclass
@@ -77,6 +90,8 @@ class Supervisor:
         log_dir: folder of one log file per process.
         pid_file: JSON object from process name to process id, rewritten at every start.
         on_restart: called with the name and the exit code of a process that is started again.
+        restarts: how often each process was started again.
+        deaths: how often it had died by itself, not by `kill`.
     """
 
     log_dir: Path
@@ -84,17 +99,25 @@ class Supervisor:
     on_restart: Callable[[str, int], None] = lambda name, code: None  # noqa: ARG005  (the default ignores both)
     _running: dict[str, _Running] = field(default_factory=dict)
     restarts: dict[str, int] = field(default_factory=dict)
+    deaths: Counter[str] = field(default_factory=Counter)
 
     def start(self, spec: ProcessSpec) -> None:
         """Start one process."""
         self._running[spec.name] = _Running(spec, self._spawn(spec))
         self._write_pids()
 
+    def kill(self, name: str) -> None:
+        """End a process by SIGKILL, so that it is started again: a death that says nothing about the process."""
+        running = self._running[name]
+        if running.process.is_alive():
+            running.is_killed = True
+            running.process.kill()
+
     def poll(self) -> None:
         """Start dead processes again, at once where they lived for a while; call it a few times a second.
 
         Raises:
-            ProcessDied: when a process has died more than `MAX_RESTARTS` times.
+            ProcessDied: when a process has died by itself more than `MAX_RESTARTS` times within `RESTARTS_SPAN_S`.
         """
         for running in self._running.values():
             code = running.process.exitcode
@@ -130,17 +153,20 @@ class Supervisor:
             process.join()
 
     def _restart(self, running: _Running, code: int) -> None:
-        if running.restart_at_s is None:
+        name = running.spec.name
+        if running.restart_at_s is None:  # seen dead for the first time
+            self.deaths[name] += not running.is_killed
+            deaths = running.count_death()
+            if deaths > MAX_RESTARTS:
+                raise ProcessDied(
+                    f"{name} ended {deaths} times within {RESTARTS_SPAN_S:.0f} s, last with exit code {code}: read"
+                    f" {self.log_dir / name}.log"
+                )
             running.restart_at_s = time.monotonic() + running.pause_s()
         if time.monotonic() < running.restart_at_s:
             return
-        name = running.spec.name
-        if running.restarts >= MAX_RESTARTS:
-            raise ProcessDied(
-                f"{name} ended {running.restarts + 1} times, last with exit code {code}: read {self.log_dir / name}.log"
-            )
         running.restarts += 1
-        running.restart_at_s = None
+        running.restart_at_s, running.is_killed = None, False
         self.restarts[name] = running.restarts
         self.on_restart(name, code)
         running.process, running.started_s = self._spawn(running.spec), time.monotonic()

@@ -8,6 +8,7 @@ import click
 from rich.console import Console
 from rich.table import Table
 
+from gnd_map.features import is_feature_layer
 from tile_store.arguments import parse_time_ns
 from tile_store.errors import StoreError
 from tile_store.options import PATH, existing, json_option, layer_option, show, to_read
@@ -15,6 +16,7 @@ from tile_store.upkeep_cli import rollback as store_rollback
 from tile_store.values import DEFAULT_CODEC, MAP_CODECS
 
 PREFIX = "vehicle:"
+_OLD = "Of the shards, where the store does not say: it was merged by an older release."
 
 
 @click.command(short_help="Bring tiles back to an older state, or take back a vehicle's word.")
@@ -23,7 +25,7 @@ PREFIX = "vehicle:"
 @click.argument("version", type=int, required=False)
 @click.option("--to", help="A version of the tile (3), or a time (2026-01-31T12:00:00Z).")
 @click.option("--dry-run", is_flag=True, help="Only say what would change.")
-@click.option("--codec", default=DEFAULT_CODEC, show_default=True, type=click.Choice(MAP_CODECS), help="Of the shards.")
+@click.option("--codec", default=DEFAULT_CODEC, show_default=True, type=click.Choice(MAP_CODECS), help=_OLD)
 @layer_option
 @json_option
 @click.pass_context
@@ -72,12 +74,12 @@ def rollback(
     verb = "would change" if dry_run else "have changed"
     title = f"{path}, layer {layer}: {len(changed)} of {len(rows)} tiles {verb}"
     values = {"layer": layer, "vehicle": place.removeprefix(PREFIX), "dry_run": dry_run, "tiles": rows}
-    show(values, as_json, lambda console: _print(console, title, rows))
+    show(values, as_json, lambda console: _print(console, title, layer, rows))
 
 
-def _print(console: Console, title: str, rows: list[dict[str, Any]]) -> None:
+def _print(console: Console, title: str, layer: str, rows: list[dict[str, Any]]) -> None:
     console.print(title, highlight=False, soft_wrap=True)
-    table = Table("tile", "its reports", "voxels", "")
+    table = Table("tile", "its reports", "features" if is_feature_layer(layer) else "voxels", "")
     for one in rows:
         table.add_row(one["tile"], str(one["reports"]), str(one["voxels"]), one["reason"] or one["status"])
     console.print(table)

@@ -3,7 +3,7 @@
 from collections import Counter
 from dataclasses import asdict
 from pathlib import Path
-from typing import Any
+from typing import Any, Final
 
 import click
 from rich.console import Console
@@ -14,17 +14,21 @@ from tile_store.cli import PATH, json_option, layer_option, region_option, show
 from tile_store.options import to_read
 from tile_store.values import DEFAULT_CODEC, MAP_CODECS
 
+_OLD: Final = "Of the shards, where the store does not say: it was merged by an older release."
+
 
 @click.command(short_help="Compute versions anew from what was reported, and compare.")
 @click.argument("path", type=PATH)
 @layer_option
 @region_option
 @click.option("--all-versions", is_flag=True, help="Every version that is kept, not the newest of each tile only.")
-@click.option("--codec", default=DEFAULT_CODEC, show_default=True, type=click.Choice(MAP_CODECS), help="Of the shards.")
-@click.option("--merge-mode", default="default", show_default=True, type=click.Choice(("default", "paper")))
+@click.option("--codec", default=DEFAULT_CODEC, show_default=True, type=click.Choice(MAP_CODECS), help=_OLD)
+@click.option("--merge-mode", default="default", show_default=True, type=click.Choice(("default", "paper")), help=_OLD)
 @json_option
 def verify(path: Path, layer: str, region: str, all_versions: bool, codec: str, merge_mode: Any, as_json: bool) -> None:
     """Compute the tiles of store PATH anew from their journals and compare them bit for bit.
+
+    Each window is merged with the parameters that its shard had, which the store keeps.
 
     Ends with 1 where one differs. Versions whose reports retention has removed cannot be computed and are counted.
     """
@@ -42,7 +46,10 @@ def verify(path: Path, layer: str, region: str, all_versions: bool, codec: str, 
             found += list(known) or [verifier.version(layer, head.tile, head.version)]
     counts = Counter(one.status for one in found)
     wrong = [asdict(one) | {"tile": one.tile.path} for one in found if one.status in ("differs", "unknown")]
-    values = {name: counts[name] for name in ("same", "given", "unknown", "differs")}
+    values: dict[str, Any] = {name: counts[name] for name in ("same", "given", "unknown", "differs")}
+    assumed = [one for one in found if one.assumed]
+    old = f"codec {codec}, merge mode {merge_mode}, else defaults: {assumed[0].assumed[:16]}…" if assumed else ""
+    values |= {"with parameters assumed": len(assumed), "assumed": old} if assumed else {}
     show(
         values | {"identical": not counts["differs"], "versions": wrong},
         as_json,
@@ -52,7 +59,7 @@ def verify(path: Path, layer: str, region: str, all_versions: bool, codec: str, 
         raise SystemExit(1)
 
 
-def _print(console: Console, title: str, values: dict[str, int], wrong: list[dict[str, Any]]) -> None:
+def _print(console: Console, title: str, values: dict[str, Any], wrong: list[dict[str, Any]]) -> None:
     console.print(tables.fields(title, values))
     for one in wrong[:20]:
         console.print(

@@ -1,6 +1,7 @@
 """Report ids: ULIDs that a restarted agent makes again for the same report, so that sending twice applies once."""
 
 import hashlib
+from functools import lru_cache
 
 from ulid import ULID
 
@@ -25,6 +26,7 @@ def deterministic_report_id(t_ms: int, *parts: str | bytes) -> str:
     return str(ULID.from_bytes(t_ms.to_bytes(_TIME_BYTES, "big") + digest.digest()))
 
 
+@lru_cache(maxsize=4096)  # of a report many times: once a tile, part and reader
 def check_report_id(report_id: str) -> None:
     """`BadValue` unless `report_id` is a ULID in its one canonical spelling (26 upper-case characters)."""
     with refusing(f"report id {report_id[:40]!r}"):

@@ -9,6 +9,7 @@ import logging
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Final, Literal
+from zlib import crc32
 
 from fleet_bus.errors import Refused
 from gnd_map.codec import CODECS, best_codec, codec_of, lattice_of
@@ -22,6 +23,7 @@ from schemas.errors import SchemaError
 from schemas.limits import MAX_TILE_BODY_BYTES
 from schemas.tiles import CatalogEntry, CodedDelta, TileBlob, TileReply, TileRequest, as_kind
 from schemas.tiles_batch import ANSWER_HASH_BYTES, TileAnswer, TilesReply, TilesRequest, digest_of, index_of
+from tile_store.errors import StoreDamaged
 from tile_store.memory import Memory
 from tile_store.store import Store
 from tile_store.values import StoredTile
@@ -29,6 +31,7 @@ from tile_store.values import StoredTile
 BYTES_A_VOXEL: Final = 48
 BYTES_A_FEATURE: Final = 2_000  # as Python objects, with its points and attributes
 BYTES_A_POINT: Final = 24
+BYTES_A_CRC: Final = 200  # with its key
 REMEMBERED_BYTES: Final = 64 * 1024 * 1024  # of decoded tiles, and again of deltas and bodies in other codecs
 _LOG = logging.getLogger(__name__)
 
@@ -49,6 +52,7 @@ class Answers:
         self._store = store
         self._decoded: Memory[AnyTile] = Memory(remembered_bytes, _bytes_of)
         self._encoded: Memory[bytes] = Memory(remembered_bytes, len)
+        self._whole: Memory[int] = Memory(remembered_bytes, lambda _crc: BYTES_A_CRC)
 
     def one(self, stored: StoredTile | None, wanted: TileRequest) -> TileReply:
         """The answer about one tile; `Refused` when it cannot be written in a codec that the client reads."""
@@ -70,8 +74,8 @@ class Answers:
 
         Raises:
             Refused: a tile cannot be written in a codec that the client reads.
-            StoreError: the store has failed.
-            SchemaError: nothing but damaged bodies is left to send.
+            StoreError: the store has failed, or nothing but damaged bodies is left to send.
+            SchemaError: nothing but bodies that cannot be decoded is left to send.
         """
         tiles = request.tiles(district)
         heads = {entry.tile: entry for entry in self._store.heads(layer, district.path)}
@@ -84,7 +88,7 @@ class Answers:
                 break
             try:
                 answer = self._answer(layer, tile, held[tile] or b"", request.codecs)
-            except (SchemaError, CodecError) as error:
+            except (SchemaError, CodecError, StoreDamaged) as error:
                 _LOG.error("tile %s cannot be sent: %s", tile, error)
                 damaged.append(error)
                 continue
@@ -160,6 +164,7 @@ class Answers:
         """Codec and bytes of the version for a client that reads these codecs, in its order of preference."""
         codec_id = self._codec_for(stored, codecs)
         if codec_id == stored.codec_id:
+            self._check(stored)
             return codec_id, stored.body
         encode, tile = codec_of(codec_id).encode, as_kind(self._tile(stored), Tile)
         body = self._encoded.get((stored.tile, stored.sha, codec_id), lambda: encode(stored.tile, tile.gaussians))
@@ -169,6 +174,26 @@ class Answers:
                 f" {MAX_TILE_BODY_BYTES}; it comes in codec {stored.codec_id}"
             )
         return codec_id, body
+
+    def _check(self, stored: StoredTile) -> None:
+        """StoreDamaged where the body is not what its hash says: no client could use it, and all would ask again.
+
+        It is decoded once; from then on its checksum tells whether the same bytes were read.
+        """
+
+        def crc_of_a_whole_one() -> int:
+            stored.decode()
+            return crc32(stored.body)
+
+        name = f"tile {stored.tile.path} version {stored.version}"
+        try:
+            is_whole = self._whole.get((stored.tile, stored.sha, stored.codec_id), crc_of_a_whole_one) == crc32(
+                stored.body
+            )
+        except SchemaError as error:
+            raise StoreDamaged(f"{name}: damaged: {error}") from error
+        if not is_whole:
+            raise StoreDamaged(f"{name}: damaged: other bytes than before")
 
     def _codec_for(self, stored: StoredTile, codecs: Sequence[int]) -> int:
         """The first codec of the client that can express the version.

@@ -24,6 +24,7 @@ STEPS: Final = (
     (5, "schema_of_journal"),
     (6, "schema_of_operations"),
     (7, "schema_of_uploads"),
+    (8, "schema_of_parameters"),
 )
 SCHEMA_VERSION: Final = STEPS[-1][0]
 

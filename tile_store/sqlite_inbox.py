@@ -20,6 +20,8 @@ ASIDE_S: Final = 60.0
 LONGEST_ASIDE_S: Final = 3600.0
 """... at most after so long: whoever was to blame for it may be gone by then."""
 ATTEMPTS_IN_A_ROW: Final = 5
+OVERDUE_S: Final = 0.5
+"""A tile that has been ready for so long goes before all preferred ones."""
 HALVES_WAIT: Final = 4
 """Merge delays that a tile waits for the Gaussians that were asked for, if nothing else is said about it."""
 NEVER_AT_ONCE: Final = 1 << 30
@@ -77,9 +79,13 @@ def merge_again(c: apsw.Connection, layer: str, tile: TileId, timing: dict[str, 
 
 
 def claim(c: apsw.Connection, owner: str, n: int, lease_s: float, prefer: Sequence[str], steady: int) -> list[Claim]:
-    """Lease ready tiles: those of the preferred regions first, then any, each group oldest first."""
+    """Lease ready tiles: overdue ones, then those of the preferred regions, then any; each group oldest first.
+
+    Preferred tiles are in somebody's memory, but under load there are always some: nobody else's would ever be merged.
+    """
     lease_ns = steady + round(lease_s * NS_PER_S)
-    claims: list[Claim] = []
+    overdue = {"steady": steady - round(OVERDUE_S * NS_PER_S), "n": n}
+    claims = _take(c, fetch(c, "claimable", overdue), owner, lease_ns)
     for first, end in map(morton_range, prefer):
         wanted = {"steady": steady, "first": first, "end": end, "n": n - len(claims)}
         claims += _take(c, fetch(c, "claimable_in_region", wanted), owner, lease_ns)
@@ -172,15 +178,6 @@ def since(c: apsw.Connection, layer: str, tile: TileId, mark: JournalMark) -> li
     """The reports in play with numbers beyond the mark, by number."""
     wanted = {"layer": layer, "tile": tile.morton, "epoch": mark.epoch, "folded": mark.folded, "seq": mark.seq}
     return [_row(*values) for values in fetch(c, "reports_since", wanted)]
-
-
-def in_play_of_vehicles(
-    c: apsw.Connection, layer: str, tile: TileId, epoch: int, config: StoreConfig
-) -> tuple[ReportRow, ...]:
-    """Of a feature layer the newest reports that count since the epoch, of each vehicle only so many, by report id."""
-    limits = {"n": config.max_feature_reports, "of_vehicle": config.max_reports_of_vehicle}
-    wanted = {"layer": layer, "tile": tile.morton, "epoch": epoch} | limits
-    return tuple(_row(*values) for values in reversed(fetch(c, "reports_in_play_of_vehicles", wanted)))
 
 
 def of_windows(c: apsw.Connection, layer: str, tile: TileId, first: int, last: int, seq: int) -> tuple[ReportRow, ...]:

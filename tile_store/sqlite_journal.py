@@ -4,19 +4,21 @@ The assignment of a report to a window is made once, with the write that makes t
 clocks, crashes and batches do afterwards, the map is a function of what stands here.
 """
 
-from collections.abc import Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
+from hashlib import sha256
 from typing import Any, Final
 
 import apsw
 
 from gnd_map.features import is_feature_layer
 from gnd_map.tile_id import TileId
+from tile_store.errors import StoreDamaged
 from tile_store.sqlite_connection import change, fetch
-from tile_store.values import Basis, ReportRow, StoreConfig, StoredMemory, WindowCounts
+from tile_store.values import Basis, ClosedWindow, ReportRow, StoreConfig, StoredMemory, WindowCounts
 
 NO_WINDOWS: Final = 0
-"""The window of reports of feature layers, and of those that are older than the journal."""
+"""The window of reports that are older than the journal of their layer."""
 _NS_PER_S: Final = 1_000_000_000
 
 
@@ -39,13 +41,19 @@ def next_entry(c: apsw.Connection, row: ReportRow, config: StoreConfig) -> Entry
     """The place of a new report: in the open window, or in a new one where that is old or full."""
     place = {"layer": row.layer, "tile": row.tile.morton}
     seq, window, opened_ns = _journal(c, place)
-    if is_feature_layer(row.layer):
-        return Entry(seq + 1, NO_WINDOWS, None, opens=False)
     if opened_ns is None:
         return Entry(seq + 1, max(window, 1), row.received_ns, opens=True)
-    if row.received_ns - opened_ns >= config.window_s * _NS_PER_S or _is_full(c, place, window, row.vehicle, config):
+    if _is_over(row, opened_ns, config) or _is_full(c, place, window, row.vehicle, config):
         return Entry(seq + 1, window + 1, row.received_ns, opens=True)
     return Entry(seq + 1, window, opened_ns, opens=False)
+
+
+def _is_over(row: ReportRow, opened_ns: int, config: StoreConfig) -> bool:
+    """Whether the time of a window has passed when a report comes."""
+    length_ns = round(config.window_s * _NS_PER_S)
+    if is_feature_layer(row.layer):  # cut alike in all tiles, see `StoreConfig.window_s`
+        return row.received_ns // length_ns > opened_ns // length_ns
+    return row.received_ns - opened_ns >= length_ns
 
 
 def _is_full(c: apsw.Connection, place: dict[str, Any], window: int, vehicle: str, config: StoreConfig) -> bool:
@@ -72,26 +80,29 @@ def mark(c: apsw.Connection, layer: str, tile: TileId) -> int:
 def begin_epoch(c: apsw.Connection, layer: str, tile: TileId, version: int) -> None:
     """A base or a rollback: what was merged counts no more, what was not goes into the new window."""
     place = {"layer": layer, "tile": tile.morton}
-    if is_feature_layer(layer) or not fetch(c, "journal", place):
-        return  # nobody has reported about it, or it has no windows
+    if not fetch(c, "journal", place):
+        return  # nobody has reported about it
     seq, window, _ = _journal(c, place)
     change(c, "forget_memory", place)
     moved = change(c, "move_waiting", place | {"window": window + 1})
     opened_ns = fetch(c, "oldest_of_window", place | {"window": window + 1})[0][0] if moved else None
     change(c, "put_journal", place | {"seq": seq, "window": window + 1, "opened_ns": opened_ns})
-    change(c, "put_basis", place | {"version": version, "window": window + 1, "seq": seq, "named": ""})
+    put_basis(c, layer, tile, version, Basis(window + 1, seq))
 
 
 def basis_of(c: apsw.Connection, layer: str, tile: TileId, version: int) -> Basis | None:
     """What a version was made of; None: it is older than the journal, or the tile's first base."""
     rows = fetch(c, "basis", {"layer": layer, "tile": tile.morton, "version": version})
-    return Basis(rows[0][0], rows[0][1], _names(rows[0][2])) if rows else None
+    if not rows:
+        return None
+    window, seq, named, number = rows[0]
+    return Basis(window, seq, _names(named), _parameters(c, number))
 
 
 def first_window(c: apsw.Connection, layer: str, tile: TileId, epoch: int) -> int:
     """The window with which the epoch begins."""
-    basis = basis_of(c, layer, tile, epoch)
-    return NO_WINDOWS if basis is None else basis.window
+    rows = fetch(c, "basis", {"layer": layer, "tile": tile.morton, "version": epoch})
+    return int(rows[0][0]) if rows else NO_WINDOWS
 
 
 def memory_of(c: apsw.Connection, layer: str, tile: TileId, epoch: int) -> StoredMemory | None:
@@ -112,26 +123,54 @@ def keep(
     tile: TileId,
     epoch: int,
     memory: StoredMemory,
-    closed: Sequence[tuple[int, frozenset[str]]],
+    closed: Mapping[int, ClosedWindow],
 ) -> None:
-    """The result of folding windows, and which vehicles were named when that was done."""
+    """The result of folding windows, and how that was done."""
     place = {"layer": layer, "tile": tile.morton}
     columns = {name: getattr(memory, name) for name in StoredMemory.__slots__}
     change(c, "put_memory", place | columns | {"epoch": epoch})
-    for window, named in closed:
-        change(c, "put_closed_window", place | {"window": window, "named": _text(named)})
+    for window, how in closed.items():
+        told = {"window": window, "named": _text(how.named), "parameters": _number(c, how.parameters)}
+        change(c, "put_closed_window", place | told)
 
 
 def put_basis(c: apsw.Connection, layer: str, tile: TileId, version: int, basis: Basis) -> None:
     """What a merged version was made of."""
     place = {"layer": layer, "tile": tile.morton, "version": version}
-    change(c, "put_basis", place | {"window": basis.window, "seq": basis.seq, "named": _text(basis.named)})
+    told = {"window": basis.window, "seq": basis.seq, "named": _text(basis.named)}
+    change(c, "put_basis", place | told | {"parameters": _number(c, basis.parameters)})
 
 
-def closed_windows(c: apsw.Connection, layer: str, tile: TileId) -> dict[int, frozenset[str]]:
-    """Of each folded window the vehicles that were named when it was."""
+def closed_windows(c: apsw.Connection, layer: str, tile: TileId) -> dict[int, ClosedWindow]:
+    """How each folded window was folded."""
     rows = fetch(c, "closed_windows", {"layer": layer, "tile": tile.morton})
-    return {window: _names(named) for window, named in rows}
+    return {window: ClosedWindow(_names(named), _parameters(c, number)) for window, named, number in rows}
+
+
+def _number(c: apsw.Connection, parameters: str) -> int | None:
+    """The number under which a text of parameters stands in the store, which keeps each once; None of "not known"."""
+    if not parameters:
+        return None
+    digest = sha256(parameters.encode()).digest()
+    change(c, "put_parameters", {"digest": digest, "body": parameters})
+    return int(fetch(c, "number_of_parameters", {"digest": digest})[0][0])
+
+
+def _parameters(c: apsw.Connection, number: int | None) -> str:
+    """The text of that number."""
+    if number is None:
+        return ""
+    rows = fetch(c, "parameters", {"number": number})
+    if not rows:
+        raise StoreDamaged(f"merge parameters {number} are named and not in the store")
+    told, body = rows[0]
+    digest = sha256(body.encode()).digest()
+    if digest != told:
+        raise StoreDamaged(
+            f"merge parameters {number} are not what they were: their digest is {digest.hex()[:16]}…, that written down"
+            f" {told.hex()[:16]}…"
+        )
+    return str(body)
 
 
 def windows(c: apsw.Connection) -> list[WindowCounts]:

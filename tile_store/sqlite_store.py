@@ -1,7 +1,6 @@
 """The store in one SQLite file that several processes of a machine may open (WAL, every commit synced)."""
 
 import logging
-import time
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from hashlib import sha256
 from pathlib import Path
@@ -11,7 +10,6 @@ from typing import Any, Final, TypeVar
 import apsw
 
 from gnd_map.content import AnyTile
-from gnd_map.features import is_feature_layer
 from gnd_map.tile_id import TileId
 from schemas.tiles import CatalogEntry
 from tile_store import clocks
@@ -33,6 +31,7 @@ from tile_store.values import (
     DEFAULT_LAYER,
     Basis,
     Claim,
+    ClosedWindow,
     Content,
     DirtyTile,
     GcResult,
@@ -94,7 +93,7 @@ class SqliteStore:
         *,
         create: bool = True,
         read_only: bool = False,
-        now_ns: Callable[[], int] = time.time_ns,
+        now_ns: Callable[[], int] = clocks.day_ns,
         steady_ns: Callable[[], int] = clocks.steady_ns,
     ) -> None:
         self.path = Path(path)
@@ -153,9 +152,9 @@ class SqliteStore:
                 return []
         return self._writer.run(lambda c: uploads.claim(c, owner, n, lease_s))
 
-    def postpone_upload(self, claim: UploadClaim, delay_s: float) -> None:
+    def postpone_upload(self, claim: UploadClaim, delay_s: float, *, blameless: bool = False) -> None:
         """See `Store.postpone_upload`."""
-        self._writer.run(lambda c: uploads.postpone(c, claim, delay_s))
+        self._writer.run(lambda c: uploads.postpone(c, claim, delay_s, blameless=blameless))
 
     def settle_upload(self, settled: Settled) -> bool:
         """See `Store.settle_upload`."""
@@ -212,9 +211,6 @@ class SqliteStore:
     def _in_play(self, c: apsw.Connection, layer: str, tile: TileId) -> TileJournal:
         version = versions.epoch_of(c, layer, tile)
         epoch = versions.stored(c, "stored_version", layer, tile, version=version) if version else None
-        if is_feature_layer(layer):
-            rows = inbox.in_play_of_vehicles(c, layer, tile, version, self._config)
-            return TileJournal(epoch, rows, seq=journal.newest(c, layer, tile).seq)
         first = journal.folded(c, layer, tile, version) + 1
         last = first + WINDOWS_AT_ONCE - 1
         rows = inbox.in_play(c, layer, tile, version, first, last)
@@ -365,7 +361,7 @@ class SqliteStore:
         with self._readers.snapshot() as c:
             return journal.basis_of(c, layer, tile, version)
 
-    def closed_windows(self, layer: str, tile: TileId) -> dict[int, frozenset[str]]:
+    def closed_windows(self, layer: str, tile: TileId) -> dict[int, ClosedWindow]:
         """See `Store.closed_windows`."""
         with self._readers.snapshot() as c:
             return journal.closed_windows(c, layer, tile)
@@ -423,7 +419,8 @@ class SqliteStore:
 
     def notices(self, older_than_s: float = 0.0, n: int = 1000) -> list[Notice]:
         """See `Store.notices`."""
-        before = self._now_ns() - round(older_than_s * NS_PER_S)
+        # All are all: the clock may have been set back since they were written.
+        before = self._now_ns() - round(older_than_s * NS_PER_S) if older_than_s else 2**63 - 1
         with self._readers.snapshot() as c:
             rows = fetch(c, "notices", {"before": before, "n": n})
             return [Notice(layer, TileId(tile), version) for layer, tile, version in rows]

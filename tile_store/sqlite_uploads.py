@@ -55,10 +55,10 @@ def _lease(c: apsw.Connection, owner: str, lease_s: float, number: int, *row: An
     return UploadClaim(number, Upload(*upload), owner, token, attempts + 1)
 
 
-def postpone(c: apsw.Connection, claim: UploadClaim, delay_s: float) -> None:
-    """Give an upload back, to be claimed again after `delay_s`."""
+def postpone(c: apsw.Connection, claim: UploadClaim, delay_s: float, *, blameless: bool) -> None:
+    """Give an upload back, to be claimed again after `delay_s`; blameless: as if it had been claimed once only."""
     until = {"boot": clocks.boot_id(), "lease_ns": clocks.steady_ns() + round(delay_s * NS_PER_S)}
-    change(c, "postpone_upload", until | {"upload": claim.number, "token": claim.token})
+    change(c, "postpone_upload", until | {"upload": claim.number, "token": claim.token, "blameless": blameless})
 
 
 def release(c: apsw.Connection, owner: str) -> int:

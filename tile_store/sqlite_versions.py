@@ -15,7 +15,7 @@ from tile_store import sqlite_refuted as refuted
 from tile_store.errors import StoreError, UnknownReports, UnknownVersion
 from tile_store.provenance import NOTHING, Provenance, encode_provenance
 from tile_store.sqlite_connection import change, fetch
-from tile_store.values import Content, GcResult, Publication, PublishResult, StoredTile, VersionKind
+from tile_store.values import ClosedWindow, Content, GcResult, Publication, PublishResult, StoredTile, VersionKind
 
 
 @dataclass(frozen=True, slots=True)
@@ -54,7 +54,8 @@ def publish(
     if basis is not None and result.status == "published":
         journal.put_basis(c, claim.layer, claim.tile, result.version, basis)
     if publication.memory is not None and basis is not None:
-        closed = [(window, basis.named) for window in publication.closed]
+        how = ClosedWindow(basis.named, basis.parameters)
+        closed = dict.fromkeys(publication.closed, how)
         journal.keep(c, claim.layer, claim.tile, head.epoch, publication.memory, closed)
     inbox.consume(c, claim, claim.seq if basis is None else basis.seq, result.version, timing)
     if publication.waiting is not None:

@@ -12,6 +12,7 @@ from tile_store.values import (
     DEFAULT_LAYER,
     Basis,
     Claim,
+    ClosedWindow,
     DirtyTile,
     GcResult,
     HeadLine,
@@ -52,8 +53,8 @@ class Store(Protocol):
     def claim_uploads(self, owner: str, n: int, lease_s: float) -> list[UploadClaim]:
         """Lease up to `n` uploads that wait, the oldest first; one that was claimed before comes alone."""
 
-    def postpone_upload(self, claim: UploadClaim, delay_s: float) -> None:
-        """Give an upload back, to be claimed again after `delay_s`."""
+    def postpone_upload(self, claim: UploadClaim, delay_s: float, *, blameless: bool = False) -> None:
+        """Give an upload back, to be claimed again after `delay_s`; blameless: its attempts until now do not count."""
 
     def settle_upload(self, settled: Settled) -> bool:
         """Apply what has become of a claimed upload, all or nothing: its rows in the journal, its state, that of the
@@ -106,7 +107,8 @@ class Store(Protocol):
     # The queue
 
     def claim(self, owner: str, n: int, lease_s: float, prefer: Sequence[str] = ()) -> list[Claim]:
-        """Lease up to `n` tiles that are ready to merge, those in the regions `prefer` (path prefixes) first.
+        """Lease up to `n` tiles that are ready to merge: overdue ones, then those in the regions `prefer` (path
+        prefixes), then any.
 
         Leases and delays run by a clock that does not step; those of an earlier boot of the machine are over.
         """
@@ -163,10 +165,18 @@ class Store(Protocol):
         """All that the merge of a claimed tile needs, read at one instant."""
 
     def basis(self, layer: str, tile: TileId, version: int) -> Basis | None:
-        """What of its tile's journal a version was made of; None: it is older than the journal, or the first base."""
+        """What of its tile's journal a version was made of; None: it is older than the journal, or the first base.
 
-    def closed_windows(self, layer: str, tile: TileId) -> dict[int, frozenset[str]]:
-        """Of each folded window of a tile the vehicles that were named when it was folded."""
+        Raises:
+            StoreDamaged: its parameters are not what their digest says.
+        """
+
+    def closed_windows(self, layer: str, tile: TileId) -> dict[int, ClosedWindow]:
+        """How each folded window of a tile was folded.
+
+        Raises:
+            StoreDamaged: parameters are not what their digest says.
+        """
 
     def reports_of_windows(self, layer: str, tile: TileId, first: int, last: int, seq: int) -> tuple[ReportRow, ...]:
         """The reports of the windows `first` to `last` with numbers up to `seq`, by report id and part."""

@@ -90,15 +90,12 @@ class StoreConfig:
     """or at once when so many reports wait."""
     window_s: float = 1800.0
     """A tile's window closes when a report comes so long after its first (by receipt): a vehicle that comes back after
-    that has come on another drive,"""
+    that has come on another drive; in feature layers where the time of day passes a multiple of it, so that neighbours,
+    who hear the same of what lies at their border, cut alike,"""
     window_vehicles: int = 32
     """or one of another vehicle when so many have a vote in it,"""
     window_reports: int = 96
     """or any when it holds so many: what one merge has to read stays bounded."""
-    max_feature_reports: int = 256
-    """Of a tile of a feature layer the newest so many reports count: they are some 100 bytes each,"""
-    max_reports_of_vehicle: int = 16
-    """and there so many of each vehicle: no vehicle can talk until the reports of others count no more."""
     busy_timeout_s: float = 30.0
     """A writer waits this long for the writers of other processes."""
     group_max: int = 256
@@ -115,10 +112,7 @@ class StoreConfig:
             raise StoreError(f"quarantine_mb {self.quarantine_mb} must be positive")
         if self.window_s <= 0:
             raise StoreError(f"window_s must be positive, got {self.window_s}")
-        for name in (
-            "merge_after_reports", "group_max", "window_vehicles", "window_reports", "max_feature_reports",
-            "max_reports_of_vehicle",
-        ):  # fmt: skip
+        for name in ("merge_after_reports", "group_max", "window_vehicles", "window_reports"):
             if getattr(self, name) < 1:
                 raise StoreError(f"{name} must be at least 1, got {getattr(self, name)}")
 
@@ -262,12 +256,24 @@ class StoredMemory:
 @dataclass(frozen=True, slots=True)
 class Basis:
     """What of its tile's journal a version was made of: all windows before `window` since the epoch, and of that one
-    the entries up to number `seq`; and which vehicles were named then.
+    the entries up to number `seq`; which vehicles were named then (of a feature layer: which reports were refuted), and
+    the parameters that it was merged with, as a text that the store does not read ("": not known).
     """
 
     window: int
     seq: int
     named: frozenset[str] = frozenset()
+    parameters: str = ""
+
+
+@dataclass(frozen=True, slots=True)
+class ClosedWindow:
+    """How a window was folded: which vehicles (of a feature layer: reports) were named then, and with which parameters;
+    "": they are not known.
+    """
+
+    named: frozenset[str]
+    parameters: str = ""
 
 
 @dataclass(frozen=True, slots=True)

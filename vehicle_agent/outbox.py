@@ -269,6 +269,10 @@ class Outbox:
         rows = self._db.run("SELECT report_id, state FROM report ORDER BY report_id")
         return {str(report_id): str(state) for report_id, state in rows}
 
+    def answers(self) -> dict[str, int]:
+        """How often Gaussians of each report were acknowledged, by its id."""
+        return {str(report_id): int(n) for report_id, n in self._db.run("SELECT report_id, answers FROM report")}
+
     def body_of(self, report_id: str) -> bytes | None:
         """The whole report that is kept under an id, None where there is none."""
         rows = self._db.run("SELECT body FROM report WHERE report_id = ?", (report_id,))

@@ -25,6 +25,7 @@ from vehicle_agent.packing import pack_measured
 POLL_S = 0.2
 REQUEST_S = 20.0
 QUESTION_S = 5.0
+STORE_PAUSE_S = 1.0
 
 _log = logging.getLogger(__name__)
 
@@ -43,7 +44,9 @@ class SenderThread:
         self.counts: Counter[str] = Counter()  # messages by form: flags, gaussians, whole, questions
         self._bus, self._outbox, self._vehicle = bus, outbox, vehicle
         self._stop, self._wake = threading.Event(), threading.Event()
-        outbox.retry_now()  # what an earlier life of this agent left here goes first
+        # What an earlier life of this agent left here goes first; and its waits are times of a clock that begins anew
+        # with the machine. It never steps: a date that is set back keeps no report from going.
+        outbox.retry_now()
         bus.subscribe(want_key(vehicle), self._on_notice, kind="ack")
         self._thread = threading.Thread(target=self._run, name="outbox", daemon=True)
         self._thread.start()
@@ -64,14 +67,23 @@ class SenderThread:
 
     def _run(self) -> None:
         while not self._stop.is_set():
-            self._wake.clear()
-            letters = self._outbox.due(time.time_ns())
-            for letter in letters:
-                if self._stop.is_set():
-                    return
-                self._send(letter)
-            if not letters and not self._ask_after():
-                self._wake.wait(POLL_S)
+            try:
+                self._round()
+            except Exception as error:  # a full disk: not even the failure can be recorded, nothing can be sent
+                self.last_error = str(error)
+                _log.warning("the outbox cannot be used, next try in %g s: %s", STORE_PAUSE_S, error)
+                self._stop.wait(STORE_PAUSE_S)
+
+    def _round(self) -> None:
+        """Send what is due; without any, ask after what is held, or wait. Raises OutboxError."""
+        self._wake.clear()
+        letters = self._outbox.due(time.monotonic_ns())
+        for letter in letters:
+            if self._stop.is_set():
+                return
+            self._send(letter)
+        if not letters and not self._ask_after():
+            self._wake.wait(POLL_S)
 
     def _send(self, letter: Letter) -> None:
         try:
@@ -83,7 +95,7 @@ class SenderThread:
         except (CodecError, PackingError) as error:  # no Gaussians can be made of what the outbox holds
             self._go_whole(letter, str(error))
         except Exception as error:  # whatever it was: this thread is all that empties the outbox
-            self._outbox.failed(letter, time.time_ns(), str(error))
+            self._outbox.failed(letter, time.monotonic_ns(), str(error))
             self.last_error = str(error)
             _log.warning("report %s not acknowledged: %s", letter.report_id, error)
 
@@ -105,11 +117,11 @@ class SenderThread:
         if form == "whole" and ack.status not in ANSWERS:
             raise SchemaError(f"report {letter.report_id} was sent whole and answered {ack.status!r}")
         if ack.status == "wanted":
-            self._outbox.told(ReportState(letter.report_id, "wanted", ack.wanted), time.time_ns())
+            self._outbox.told(ReportState(letter.report_id, "wanted", ack.wanted), time.monotonic_ns())
         elif ack.status in ("quarantined", "resend"):
             self._refused(letter, ack.reason)
         else:
-            now_ns, is_short = time.time_ns(), form != "whole"
+            now_ns, is_short = time.monotonic_ns(), form != "whole"
             self._outbox.answered(letter.report_id, ack.status, now_ns=now_ns, wanted=letter.wanted, is_short=is_short)
 
     def _refused(self, letter: Letter, reason: str) -> None:
@@ -128,16 +140,16 @@ class SenderThread:
 
     def _hear(self, states: ReportStates) -> None:
         for state in states.states:
-            self._outbox.told(state, time.time_ns())
+            self._outbox.told(state, time.monotonic_ns())
         self._wake.set()
 
     def _ask_after(self) -> bool:
         """Ask after reports of which no word has come; False when there are none."""
         try:
-            report_ids = self._outbox.unheard(time.time_ns())
+            report_ids = self._outbox.unheard(time.monotonic_ns())
             if not report_ids:
                 return False
-            self._outbox.asked(report_ids, time.time_ns())
+            self._outbox.asked(report_ids, time.monotonic_ns())
             self.counts["questions"] += 1
             question = ReportQuestion(tuple(report_ids)).encode()
             answer = self._bus.request(state_key(self._vehicle), question, kind="change", timeout_s=QUESTION_S)

@@ -5,9 +5,10 @@ from math import prod
 
 import numpy as np
 
+from cloud_merger.features.memory import Vote
 from cloud_merger.features.parameters import FeatureMergeParameters
 from cloud_merger.features.statements import Statement
-from cloud_merger.features.tracks import Bases, Track, Tracks, Vote
+from cloud_merger.features.tracks import Bases, Track, Tracks
 from gnd_map.features import VACUOUS, Existence, miss
 from gnd_map.geodesy import LocalFrame
 from gnd_map.tile_id import TileId
@@ -54,13 +55,13 @@ def add_views(
     """
     absent, names_of = miss(parameters.absence), tracks.names_of()
     for track in tracks.all:
-        cells, names = _cells(tile, track, parameters.view_margin_m), names_of[id(track)]
+        cells, names = _cells(tile, track, parameters.view_margin_m), names_of[track.serial]
         for number in range(max(track.first, 0), len(said)):
             one = said[number]
             if one.viewed & cells != cells or number in track.votes or one.base_sha is None:
                 continue
             known = bases.get(one.base_sha) if one.base_sha else {}
-            if known is not None and names.isdisjoint(known):
+            if known is not None and known.keys().isdisjoint(names):
                 track.votes[number] = Vote(one.vehicle, absent)
 
 

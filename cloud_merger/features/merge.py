@@ -7,20 +7,36 @@ same reports give the same features, bit for bit.
 """
 
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from types import MappingProxyType
 
 from cloud_merger.features.existence import add_views
+from cloud_merger.features.memory import LayerMemory
 from cloud_merger.features.parameters import FeatureMergeParameters
-from cloud_merger.features.publication import Outcome, outcome_of
+from cloud_merger.features.publication import Outcome, Story, story_of
 from cloud_merger.features.refuted import heard, left_out, refuted_of, tests_of
 from cloud_merger.features.spread import spread
 from cloud_merger.features.statements import Statement, contents_of, statements_of
-from cloud_merger.features.tracks import Bases, Track, Tracks
+from cloud_merger.features.tracks import Bases, Tracks
 from gnd_map.features import Feature, FeatureTile
 from gnd_map.tile_id import TileId
 from schemas.features import FeatureReport
 from tile_store.values import ShiftTest
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Hypotheses:
+    """What a window leaves behind: all that is to be folded when it is closed.
+
+    Attributes:
+        stories: of all hypotheses, in the order in which they began.
+        names: ids under which each track (by `serial`) has been known.
+        report_ids: of the statements, then of the witnesses of closed windows: numbers of reports index it.
+    """
+
+    stories: tuple[Story, ...]
+    names: Mapping[int, Sequence[int]]
+    report_ids: tuple[str, ...]
 
 
 @dataclass(frozen=True, slots=True)
@@ -33,12 +49,14 @@ class MergedFeatures:
             by id and part.
         provenance: for each feature that differs from the epoch's by decision the ids of the reports that say so.
         tests: of each report that others can be compared with, whether they contradict it; sorted by report id.
+        hypotheses: for `fold`.
     """
 
     features: tuple[Feature, ...]
     estimates: tuple[Feature, ...]
     provenance: dict[int, tuple[str, ...]]
     tests: tuple[ShiftTest, ...] = ()
+    hypotheses: Hypotheses = field(default=Hypotheses((), {}, ()), compare=False, repr=False)
 
 
 def merge_features(
@@ -48,36 +66,41 @@ def merge_features(
     parameters: FeatureMergeParameters | None = None,
     bases: Mapping[bytes, Sequence[Feature]] | None = None,
     refuted: Mapping[str, str] = MappingProxyType({}),
+    memory: LayerMemory | None = None,
 ) -> MergedFeatures:
-    """Decide what the reports change in the features of a tile.
+    """Decide what the reports of a window change in the features of a tile.
 
     Args:
         tile: whose features; frames are its own.
         epoch: the tile's features at its last base or rollback, () for an unmapped one.
-        reports: all since the epoch, in any order; of each the part about this tile, and what was found in its
+        reports: all of the window, in any order; of each the part about this tile, and what was found in its
             neighbours near it, count. Reports that come again are ignored.
         parameters: see `FeatureMergeParameters`.
         bases: the features of the versions that reports refer to, by hash. The epoch's and "none" need not be given; a
             report about an unknown version says nothing of features that it does not name.
         refuted: reports that others contradict again and again, and whose each is (`refuted.py`): they are compared as
             all are, and say nothing.
+        memory: what the windows since the epoch that are closed have come to; None: there are none.
     """
     parameters = parameters or FeatureMergeParameters()
     own = FeatureTile.of(tile, 0, epoch)
     contents = contents_of({b"": (), own.sha: own.features, **(bases or {})})
     reports = list(reports)
     said = statements_of(tile, reports, parameters.reach_m)
-    tracks = _tracks_of(tile, epoch, said, contents, parameters)
+    tracks = _tracks_of(tile, epoch, said, contents, parameters, memory)
     tests = tests_of(heard(tracks.all), said, {one.report_id: one.last_ns for one in reports})
     if out := left_out(said, tests, refuted):
         said = tuple(one for one in said if one.report_id not in out)
-        tracks = _tracks_of(tile, epoch, said, contents, parameters)
-    outcomes = [(track, outcome) for track in tracks.all if (outcome := outcome_of(tile, track, parameters))]
+        tracks = _tracks_of(tile, epoch, said, contents, parameters, memory)
+    stories = tuple(story_of(tile, track, parameters) for track in tracks.all)
+    told = [(story, outcome) for story in stories if (outcome := story.outcome())]
+    ids = (*(one.report_id for one in said), *(() if memory is None else memory.witnesses))
     return MergedFeatures(
-        features=FeatureTile.of(tile, 0, [o.published for _, o in outcomes if o.published is not None]).features,
-        estimates=tuple(sorted((o.estimate for _, o in outcomes), key=lambda feature: feature.key)),
-        provenance=_provenance(outcomes, [one.report_id for one in said]),
+        features=FeatureTile.of(tile, 0, [o.published for _, o in told if o.published is not None]).features,
+        estimates=tuple(sorted((o.estimate for _, o in told), key=lambda feature: feature.key)),
+        provenance=_provenance(told, ids),
         tests=tests,
+        hypotheses=Hypotheses(stories, tracks.names_of(), ids),
     )
 
 
@@ -87,8 +110,9 @@ def _tracks_of(
     said: Sequence[Statement],
     contents: Bases,
     parameters: FeatureMergeParameters,
+    memory: LayerMemory | None,
 ) -> Tracks:
-    tracks = Tracks(epoch, contents, parameters)
+    tracks = Tracks(epoch, contents, parameters, memory)
     for number, statement in enumerate(said):
         tracks.hear(number, statement)
     tracks.settle()
@@ -96,11 +120,12 @@ def _tracks_of(
     return tracks
 
 
-def _provenance(outcomes: Iterable[tuple[Track, Outcome]], ids: Sequence[str]) -> dict[int, tuple[str, ...]]:
+def _provenance(told: Iterable[tuple[Story, Outcome]], ids: Sequence[str]) -> dict[int, tuple[str, ...]]:
     found: dict[int, set[str]] = {}
-    for track, outcome in outcomes:
-        if outcome.published is not track.epoch:
-            found.setdefault(track.feature_id, set()).update(ids[number] for number in outcome.reports)
+    for story, outcome in told:
+        if outcome.is_decided:
+            # numbers below 0 are those of witnesses, who stand at the end
+            found.setdefault(story.track.feature_id, set()).update(ids[number] for number in outcome.reports)
     return {feature_id: tuple(sorted(reports)) for feature_id, reports in sorted(found.items())}
 
 

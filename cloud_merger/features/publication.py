@@ -9,11 +9,12 @@ import numpy as np
 
 from cloud_merger.features.association import HEIGHT_KNOWN_M2
 from cloud_merger.features.existence import prior_of, verdict
+from cloud_merger.features.memory import Own, Vote
 from cloud_merger.features.parameters import FeatureMergeParameters
 from cloud_merger.features.rls import Place, balanced, estimate, fused, is_even, step
 from cloud_merger.features.shapes import length_of
 from cloud_merger.features.statements import Attributes
-from cloud_merger.features.tracks import Measured, Track, Vote
+from cloud_merger.features.tracks import Measured, Track
 from gnd_map.features import Existence, Feature, full_covariance, geodetic_in_tile
 from gnd_map.features.feature import MAX_COUNT
 from gnd_map.tile_id import TileId
@@ -27,21 +28,22 @@ class Outcome:
         published: the feature as it is to be published; None: not at all.
         estimate: all that is known of it now, published or not.
         reports: numbers of the reports that speak for what is published, or for its removal.
+        is_decided: what is published is not what was published before.
     """
 
     published: Feature | None
     estimate: Feature
     reports: tuple[int, ...]
+    is_decided: bool
 
 
-def outcome_of(tile: TileId, track: Track, parameters: FeatureMergeParameters) -> Outcome | None:
-    """What has come of a hypothesis; None when it is the neighbour's."""
-    story = _Story(track, parameters)
+def story_of(tile: TileId, track: Track, parameters: FeatureMergeParameters) -> "Story":
+    """What becomes of a hypothesis, report by report."""
+    story = Story(tile, track, parameters)
     for report in sorted(track.votes.keys() | track.measured.keys()):
-        story.take(report)
-        if not story.is_home(tile):
-            return None
-    return Outcome(story.shown if story.is_published else None, story.now(), story.witnesses())
+        if report >= 0:
+            story.take(report)
+    return story
 
 
 @dataclass(frozen=True, slots=True)
@@ -53,80 +55,138 @@ class _Cast:
     weight: Existence
 
 
-class _Story:
-    """A hypothesis after some of its reports."""
+class Story:
+    """A hypothesis after some of its reports; see `Remembered` for the attributes."""
 
-    def __init__(self, track: Track, parameters: FeatureMergeParameters) -> None:
-        self._track, self._parameters = track, parameters
-        known = track.epoch
-        self._known = None if known is None else Place.of(known.points_m, known.cov_m2)
-        self.shown: Feature | None = track.epoch
-        self.is_published = known is not None
+    def __init__(self, tile: TileId, track: Track, parameters: FeatureMergeParameters) -> None:
+        self.track, self._tile, self._parameters = track, tile, parameters
+        known, before = track.epoch, track.before
+        self.known = None if known is None else Place.of(known.points_m, known.cov_m2)
+        self.shown: Feature | None = known
+        self.is_published, self.is_away = known is not None, False
+        self.is_settled = track.is_of_map or not track.is_point
+        self.measured: dict[str, Own] = {}
+        self.last: dict[str, int] = {}  # number of each vehicle's newest measurement
+        self.votes: dict[str, _Cast] = {}  # the newest of each vehicle, the newest last
+        self.vehicles_before = self.ayes_before = self.hits_before = 0
+        if before is not None:
+            self.known, self.shown, self.is_published = before.known, before.shown, before.is_published
+            self.is_settled, self.is_away = before.is_settled, before.is_away
+            self.measured = {own.vehicle: own for own in before.measured}
+            self.vehicles_before, self.ayes_before = before.vehicles_before, before.ayes_before
+            self.hits_before = before.hits_before
+        self._before = self.shown if self.is_published else None
         self._prior = prior_of(track, parameters)
-        self._masses = self._prior
-        self._votes: dict[str, _Cast] = {}  # the newest of each vehicle, the newest last
-        self._measured: dict[str, list[Measured]] = {}
-        self._state: Place | None = self._known
-        self._is_stale = False
-        self._longest_m = 0.0  # of the measured polylines
-        self._least_m2 = [] if self._known is None else [self._known.least_m2]
-        self._is_even, self._has_repeats = True, False
-        self._finders: set[str] = set()
+        self.masses = self._prior
+        self._state: Place | None = self.known
+        self._is_stale = bool(self.measured)
+        self._longest_m = max((length_of(place.points_m) for place in self._places()), default=0.0)
+        self._least_m2 = {vehicle: self._fused(own).least_m2 for vehicle, own in self.measured.items()}
+        self._is_even = self._even()
         self._first_confirmed: Place | None = None
-        known = track.epoch or track.quoted
-        self._is_settled = known is not None or len(track.state.points_m) > 1
+        if before is not None:
+            self._recall()
+
+    def _recall(self) -> None:
+        """Hear the votes of closed windows again: what the newest reports show may give them another meaning."""
+        for number in sorted(n for n in self.track.votes if n < 0):
+            self._cast(number)
+        self._weigh()
+        if self.is_away:
+            return
+        self._confirm()
+        self._decide()
+        self._go_home()
+
+    def _places(self) -> list[Place]:
+        return [*([] if self.known is None else [self.known]), *(own.place for own in self.measured.values())]
 
     def take(self, report: int) -> None:
         """One more report."""
         is_new = False
-        if report in self._track.measured:
-            is_new = self._measure(self._track.measured[report])
-        if report in self._track.votes:
-            vote = self._track.votes[report]
-            self._votes.pop(vote.vehicle, None)
-            self._votes[vote.vehicle] = _Cast(report, vote, vote.existence.discounted(self._parameters.reliability))
-            self._masses = verdict(self._prior, (cast.weight for cast in self._newest()), self._parameters)
+        if report in self.track.measured:
+            is_new = self._measure(report, self.track.measured[report])
+        if report in self.track.votes:
+            self._cast(report)
+        if self.is_away:
+            return  # only who measured it is remembered
+        self._weigh()
         self._decide()
         if self.is_published:
             self._renew(is_new)
+        self._go_home()
 
-    def _measure(self, measured: Measured) -> bool:
+    def _cast(self, report: int) -> None:
+        vote = self.track.votes[report]
+        self.votes.pop(vote.vehicle, None)
+        self.votes[vote.vehicle] = _Cast(report, vote, vote.existence.discounted(self._parameters.reliability))
+
+    def _weigh(self) -> None:
+        self.masses = verdict(self._prior, (cast.weight for cast in self._newest()), self._parameters)
+
+    def _measure(self, report: int, measured: Measured) -> bool:
         """Whether the vehicle measures it for the first time."""
-        own = self._measured.setdefault(measured.vehicle, [])
-        own.append(measured)
-        length_m = length_of(measured.place.points_m)
-        is_longer = self._known is None and length_m > self._longest_m
+        vehicle, place = measured.vehicle, measured.place
+        own = self.measured.get(vehicle)
+        is_new = own is None
+        if own is None:
+            own = Own(vehicle, 1, place, measured.attributes, measured.is_found)
+        else:
+            is_finder = own.is_finder or measured.is_found
+            own = Own(vehicle, own.repeats + 1, step(own.place, place), measured.attributes, is_finder)
+        self.measured[vehicle], self.last[vehicle] = own, report
+        length_m = length_of(place.points_m)
+        is_longer = self.grows and length_m > self._longest_m
         self._longest_m = max(self._longest_m, length_m)
-        self._least_m2.append(measured.place.least_m2)
-        was_even, self._is_even = self._is_even, is_even(self._least_m2, self._parameters.most_weight)
-        self._has_repeats |= len(own) > 1
-        if self._has_repeats or is_longer or not (was_even and self._is_even):
+        self._least_m2[vehicle] = self._fused(own).least_m2
+        was_even, self._is_even = self._is_even, self._even()
+        if not is_new or is_longer or self.is_away or not (was_even and self._is_even):
             self._is_stale = True
         elif not self._is_stale:
-            self._state = measured.place if self._state is None else step(self._state, measured.place)
-        self._finders |= {measured.vehicle} if measured.is_found else set()
-        if not self._is_settled and len(self._finders) >= self._parameters.min_vehicles:
-            self._first_confirmed = self._place()
-        return len(own) == 1
+            self._state = place if self._state is None else step(self._state, place)
+        self._confirm()
+        return is_new
 
-    def _place(self) -> Place:
+    def _confirm(self) -> None:
+        """Take down where it lies when enough vehicles have found it."""
+        finders = sum(own.is_finder for own in self.measured.values())
+        if not self.is_settled and finders >= self._parameters.min_vehicles:
+            self._first_confirmed = self.place()
+
+    @property
+    def grows(self) -> bool:
+        """Whether it takes the vertices of the longest piece that anybody has measured: the map's own stay."""
+        return self.track.epoch is None
+
+    def _even(self) -> bool:
+        known_m2 = None if self.known is None else self.known.least_m2
+        return is_even(list(self._least_m2.values()), known_m2, self._parameters.most_weight)
+
+    def _fused(self, own: Own) -> Place:
+        return fused(own.place, own.repeats, self._parameters.information_of(own.repeats))
+
+    def place(self) -> Place:
         """The estimate of all vehicles, each with what its measurements say together."""
         if self._is_stale or self._state is None:
-            each = [
-                fused([one.place for one in own], self._parameters.information_of(len(own)))
-                for own in self._measured.values()
-            ]
-            each.sort(key=lambda place: -length_of(place.points_m))  # the longest piece of a line lends its vertices
-            self._state, self._is_stale = self._estimate(each), False
+            self._state, self._is_stale = self._estimate(list(self.balanced().values())), False
         return self._state
 
+    def balanced(self) -> dict[str, Place]:
+        """What the measurements of each vehicle say together, and weigh beside those of the others."""
+        each = [self._fused(own) for own in self.measured.values()]
+        return dict(zip(self.measured, balanced(each, self.known, self._parameters.most_weight), strict=True))
+
     def _estimate(self, each: list[Place]) -> Place:
-        if not each and self._known is None:
-            return self._track.state  # quoted from an older version, measured by nobody since
-        return estimate(balanced(each, self._known, self._parameters.most_weight), self._known)
+        known = self.known
+        if not each and known is None:
+            return self.track.state  # quoted from an older version, measured by nobody since
+        if self.grows and known is not None and len(known.points_m) > 1:
+            each, known = [known, *each], None
+        each.sort(key=lambda place: -length_of(place.points_m))  # the longest piece of a line lends its vertices
+        return estimate(each, known)
 
     def _newest(self) -> list[_Cast]:
-        return list(self._votes.values())[-self._parameters.voters :]
+        return list(self.votes.values())[-self._parameters.voters :]
 
     def _sides(self) -> tuple[list[int], list[int]]:
         """Reports that vote for it, and against it; one a vehicle."""
@@ -136,33 +196,37 @@ class _Story:
     def _decide(self) -> None:
         """Published when enough different vehicles say that it exists and their mass wins; gone likewise."""
         ayes, noes = self._sides()
-        state = self._masses.state
+        state = self.masses.state
         if not self.is_published and len(ayes) >= self._parameters.min_vehicles and state == "exist":
             self.is_published, self.shown = True, self.shown or self._first_shown()
         elif self.is_published and len(noes) >= self._parameters.min_vehicles and state == "absent":
             self.is_published = False
 
+    @property
+    def _n_measured(self) -> int:
+        return len(self.measured) + self.vehicles_before
+
     def _first_shown(self) -> Feature:
-        quoted = self._track.quoted
-        enough = len(self._measured) >= self._parameters.min_vehicles
-        return self.now() if quoted is None or enough else replace(quoted, existence=self._masses)
+        quoted = self.track.quoted
+        enough = self._n_measured >= self._parameters.min_vehicles
+        return self.now() if quoted is None or enough else replace(quoted, existence=self.masses)
 
     def _renew(self, is_new: bool) -> None:
         shown = self.shown
         assert shown is not None  # what is published is shown
-        enough = len(self._measured) >= self._parameters.min_vehicles
+        enough = self._n_measured >= self._parameters.min_vehicles
         if is_new and enough and self._is_worth_it(shown):
             self.shown = self.now()
             return
         ayes, noes = self._sides()
-        change = self._masses.exist - shown.existence.exist
+        change = self.masses.exist - shown.existence.exist
         agree = len(ayes if change > 0 else noes) >= self._parameters.min_vehicles
         if agree and abs(change) > self._parameters.renewal_mass:
-            self.shown = replace(shown, existence=self._masses)
+            self.shown = replace(shown, existence=self.masses)
 
     def _is_worth_it(self, shown: Feature) -> bool:
         """Whether the estimate is surer than the published one by the gain, or farther from it than its sigma."""
-        place, was = self._place(), full_covariance(shown.cov_m2)
+        place, was = self.place(), full_covariance(shown.cov_m2)
         gain = self._parameters.renewal_gain
         before, after = (np.minimum(np.diag(cov), HEIGHT_KNOWN_M2) for cov in (was, place.cov_m2))
         if gain == 1.0 or (before >= gain * after * (1 - 1e-9)).any():
@@ -174,24 +238,24 @@ class _Story:
 
     def now(self) -> Feature:
         """The feature as all reports so far have it."""
-        place, known = self._place(), self._track.epoch or self._track.quoted
-        ayes = [cast.vote for cast in self._votes.values() if cast.vote.existence.state == "exist"]
-        hits = sum(vote.hits for vote in ayes)
+        place, known = self.place(), self.track.epoch or self.track.quoted
+        ayes = [cast.vote for cast in self.votes.values() if cast.vote.existence.state == "exist"]
+        hits, n_ayes = self.hits_before + sum(vote.hits for vote in ayes), self.ayes_before + len(ayes)
         begun = known or Feature(
-            self._track.feature_id, self._track.kind, place.points_m, place.six(), attributes=self._agreed()
+            self.track.feature_id, self.track.kind, place.points_m, place.six(), attributes=self._agreed()
         )
         return replace(
             begun,
             points_m=place.points_m,
             cov_m2=place.six(),
-            existence=self._masses,
+            existence=self.masses,
             hits=min(hits + begun.hits, MAX_COUNT),
-            vehicles=max(len(ayes), begun.vehicles),
+            vehicles=max(min(n_ayes, MAX_COUNT), begun.vehicles),
         )
 
     def _agreed(self) -> Attributes:
         """What enough vehicles say of it, and more than say otherwise; of each vehicle its newest word."""
-        newest = [own[-1].attributes for own in self._measured.values()]
+        newest = [own.attributes for own in self.measured.values()]
         said = Counter(pair for attributes in newest for pair in attributes)
         of_key: dict[str, list[tuple[int, str]]] = {}
         for (key, value), n in said.items():
@@ -199,15 +263,22 @@ class _Story:
         best = {key: min(values) for key, values in of_key.items()}
         return tuple((key, value) for key, (n, value) in sorted(best.items()) if -n >= self._parameters.min_vehicles)
 
-    def is_home(self, tile: TileId) -> bool:
-        """Whether it belongs to this tile: it lay here when it was first confirmed by vehicles that found it."""
-        if self._is_settled or self._first_confirmed is None:
-            return True
-        place, self._is_settled = self._first_confirmed, True
-        lat, lon, _ = geodetic_in_tile(tile, place.points_m)
-        return TileId.from_geodetic(float(lat[0]), float(lon[0])) == tile
+    def _go_home(self) -> None:
+        """Decide to which tile it belongs: that where it lay when it was first confirmed by vehicles that found it."""
+        if self.is_settled or self._first_confirmed is None:
+            return
+        place, self.is_settled = self._first_confirmed, True
+        lat, lon, _ = geodetic_in_tile(self._tile, place.points_m)
+        self.is_away = TileId.from_geodetic(float(lat[0]), float(lon[0])) != self._tile
 
-    def witnesses(self) -> tuple[int, ...]:
+    def outcome(self) -> Outcome | None:
+        """What has come of it; None when it is the neighbour's."""
+        if self.is_away:
+            return None
+        published = self.shown if self.is_published else None
+        return Outcome(published, self.now(), self._witnesses(), published is not self._before)
+
+    def _witnesses(self) -> tuple[int, ...]:
         """Reports on the winning side."""
         state = "exist" if self.is_published else "absent"
-        return tuple(sorted(cast.report for cast in self._votes.values() if cast.vote.existence.state == state))
+        return tuple(sorted(cast.report for cast in self.votes.values() if cast.vote.existence.state == state))

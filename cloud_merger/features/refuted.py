@@ -71,6 +71,7 @@ def heard(tracks: Sequence[Track]) -> tuple[Heard, ...]:
     return tuple(
         Heard(number, vehicles[number], agreed[number], alone[number], float(np.mean(off_m.get(number, [0.0]))))
         for number in sorted(agreed.keys() | alone.keys())
+        if number >= 0  # those of closed windows have had their test
     )
 
 

@@ -84,22 +84,30 @@ def estimate(measured: Sequence[Place], known: Place | None = None) -> Place:
     return state
 
 
-def fused(repeats: Sequence[Place], information: float) -> Place:
+def fused(together: Place, repeats: int, information: float) -> Place:
     """One vehicle's measurements of one feature as a single one.
 
     Its n errors have something in common. Of n equally good ones with correlation ρ each, the mean has the variance
     R (1 + (n - 1) ρ) / n, which is what this gives.
 
     Args:
-        repeats: n >= 1 measurements.
+        together: `estimate` of the n measurements.
+        repeats: n >= 1.
         information: n / (1 + (n - 1) ρ), `FeatureMergeParameters.information_of`.
     """
-    return estimate(repeats).scaled(len(repeats) / information)
+    return together.scaled(repeats / information)
 
 
-def is_even(least_m2: Sequence[float], most: float) -> bool:
-    """Whether none of these variances is more than `most` times smaller than the next."""
-    return len(least_m2) < 2 or sorted(least_m2)[1] <= most * min(least_m2)
+def is_even(measured_m2: Sequence[float], known_m2: float | None, most: float) -> bool:
+    """Whether no measurement's variance is more than `most` times smaller than the next; the map's own may be.
+
+    Args:
+        measured_m2: smallest variances, one a vehicle.
+        known_m2: that of what the map knows, which is a witness too; None: nothing.
+        most: see `balanced`.
+    """
+    all_m2 = sorted([*measured_m2, *([] if known_m2 is None else [known_m2])])
+    return len(all_m2) < 2 or all_m2[1] <= most * min(measured_m2, default=np.inf)
 
 
 def balanced(measured: Sequence[Place], known: Place | None, most: float) -> list[Place]:
@@ -110,8 +118,8 @@ def balanced(measured: Sequence[Place], known: Place | None, most: float) -> lis
         known: what the map knows, which is a witness too.
         most: no variance is more than this times smaller than the second smallest; the covariance is scaled up to that.
     """
-    least_m2 = [one.least_m2 for one in measured] + ([] if known is None else [known.least_m2])
-    if is_even(least_m2, most):
+    least_m2, known_m2 = [one.least_m2 for one in measured], None if known is None else known.least_m2
+    if is_even(least_m2, known_m2, most):
         return list(measured)
-    bound_m2 = sorted(least_m2)[1] / most
+    bound_m2 = sorted([*least_m2, *([] if known_m2 is None else [known_m2])])[1] / most
     return [one.scaled(max(1.0, bound_m2 / max(one.least_m2, 1e-12))) for one in measured]

@@ -2,15 +2,16 @@
 
 from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
 from cloud_merger.features.association import costs, fits, pairs
+from cloud_merger.features.memory import LayerMemory, Own, Remembered, Vote
 from cloud_merger.features.parameters import FeatureMergeParameters
 from cloud_merger.features.rls import Place, step
 from cloud_merger.features.statements import Attributes, Claimed, Statement
-from gnd_map.features import Existence, Feature, feature_id_of
+from gnd_map.features import Feature, feature_id_of
 from schemas.feature_change import Seen
 
 Bases = Mapping[bytes, Mapping[int, tuple[Feature, ...]]]
@@ -26,15 +27,6 @@ class Measured:
     attributes: Attributes
 
 
-@dataclass(frozen=True, slots=True)
-class Vote:
-    """One report's verdict on a feature."""
-
-    vehicle: str
-    existence: Existence
-    hits: int = 0
-
-
 @dataclass(slots=True, eq=False)
 class Track:
     """A hypothesis about one feature.
@@ -46,8 +38,11 @@ class Track:
         epoch: the map's feature; None: a candidate.
         quoted: a feature of a later version whose finders are no longer among the reports.
         measured: by number of the report.
-        votes: by number of the report.
+        votes: by number of the report; numbers below 0 are those of witnesses of closed windows.
         repeats: how often each vehicle has measured it.
+        before: what the closed windows have come to.
+        serial: its number among all of the tile.
+        apart: serial numbers of those that a report of a closed window has told from it.
     """
 
     feature_id: int
@@ -58,6 +53,24 @@ class Track:
     measured: dict[int, Measured] = field(default_factory=dict)
     votes: dict[int, Vote] = field(default_factory=dict)
     repeats: dict[str, int] = field(default_factory=dict)
+    before: Remembered | None = None
+    serial: int = -1
+    apart: set[int] = field(default_factory=set)
+
+    @property
+    def is_point(self) -> bool:
+        """Whether it is a point, not a polyline."""
+        return len(self.state.points_m) == 1
+
+    @property
+    def is_of_map(self) -> bool:
+        """Whether the map, this or a later version of it, knows it."""
+        return self.epoch is not None or self.quoted is not None
+
+    def is_apart(self, other: "Track") -> bool:
+        """Whether a report has told the two apart."""
+        known = other.serial in self.apart or self.serial in other.apart
+        return known or not self.votes.keys().isdisjoint(other.votes)
 
     @property
     def attributes(self) -> Attributes:
@@ -67,13 +80,14 @@ class Track:
 
     @property
     def first(self) -> int:
-        """Number of the first report that speaks for it; -1 for a feature of the map."""
-        return -1 if self.epoch is not None or self.quoted is not None else min(self.measured, default=-1)
+        """Number of the first report that speaks for it; -1 for one that is known from before."""
+        return -1 if self.is_of_map or self.before is not None else min(self.measured, default=-1)
 
     @property
     def witnesses(self) -> int:
         """Vehicles that it rests on; the map counts as two."""
-        return len(self.repeats) + (0 if self.epoch is None and self.quoted is None else 2)
+        before = 0 if self.before is None else self.before.vehicles_before
+        return len(self.repeats) + before + (2 if self.is_of_map else 0)
 
     def measure(self, report: int, measured: Measured, parameters: FeatureMergeParameters) -> None:
         """Take a measurement. The n-th of one vehicle weighs what it adds to what n of them weigh."""
@@ -92,16 +106,39 @@ class Tracks:
         epoch: the map's features.
         bases: contents of the versions that reports refer to, by hash.
         parameters: of the merge.
+        memory: of the closed windows; None: none is folded, so what is known is the epoch.
     """
 
-    def __init__(self, epoch: Iterable[Feature], bases: Bases, parameters: FeatureMergeParameters) -> None:
+    def __init__(
+        self, epoch: Iterable[Feature], bases: Bases, parameters: FeatureMergeParameters, memory: LayerMemory | None
+    ) -> None:
         self._parameters, self._bases = parameters, bases
         self.all: list[Track] = []
         self._by_id: dict[int, list[Track]] = {}
         self._begun: Counter[str] = Counter()
-        self._elsewhere: list[tuple[Track, int, int]] = []  # map feature, report, id of the claim that it moved
-        for feature in epoch:
-            self._begin(_of_map(feature, epoch=feature))
+        self._n_serials = 0
+        if memory is None:
+            for feature in epoch:
+                self._begin(_of_map(feature, epoch=feature))
+        else:
+            self._remember(memory)
+
+    def _remember(self, memory: LayerMemory) -> None:
+        """Begin with what the closed windows have come to."""
+        n = len(memory.witnesses)
+        for one in memory.tracks:
+            votes = {number - n: vote for number, vote in one.votes}
+            repeats = {own.vehicle: own.repeats for own in one.measured}
+            self._begin(
+                Track(
+                    one.feature_id, one.kind, one.state, one.epoch, one.quoted,
+                    votes=votes, repeats=repeats, before=one, apart=set(one.apart),
+                )
+            )  # fmt: skip
+            self._begun.update([one.finder] if one.finder else ())
+        for one, track in zip(memory.tracks, self.all, strict=True):
+            for name in one.names:
+                self._by_id.setdefault(name, [track])
 
     def hear(self, report: int, said: Statement) -> None:
         """Take all that one report says: verdicts first, then what is found among what it has not judged."""
@@ -126,6 +163,7 @@ class Tracks:
         return self._by_id.get(feature_id, [])
 
     def _begin(self, track: Track) -> Track:
+        track.serial, self._n_serials = self._n_serials, self._n_serials + 1
         self.all.append(track)
         self._by_id.setdefault(track.feature_id, []).append(track)
         return track
@@ -147,7 +185,7 @@ class Tracks:
         if np.hypot(apart[0], apart[1]) <= self._parameters.moved_m or seen.existence.exist <= seen.existence.absent:
             return None
         name = feature_id_of(said.report_id, "elsewhere", track.feature_id)
-        self._elsewhere.append((track, report, name))
+        track.votes[report] = Vote(said.vehicle, seen.existence, seen.hits, elsewhere=name)
         return Claimed(name, track.kind, place, seen.existence, seen.hits, track.attributes, is_found=False)
 
     def _associate(self, report: int, said: Statement, claims: Sequence[Claimed], judged: set[int]) -> None:
@@ -194,21 +232,22 @@ class Tracks:
         measured it where several vehicles agree that it stands now.
         """
         self._join_all()
-        for track, report, name in self._elsewhere:
-            if any(self._confirms(other) and other is not track for other in self._by_id.get(name, [])):
-                vote = track.votes[report]
-                there = vote.existence
-                track.votes[report] = Vote(vote.vehicle, Existence(there.absent, there.exist, there.unknown), vote.hits)
+        for track in self.all:
+            for report, vote in track.votes.items():
+                there = self._by_id.get(vote.elsewhere, []) if vote.elsewhere else []
+                if any(self._confirms(other) and other is not track for other in there):
+                    track.votes[report] = vote.denied
 
     def _confirms(self, track: Track) -> bool:
-        return len(track.repeats) >= self._parameters.min_vehicles
+        before = 0 if track.before is None else track.before.vehicles_before
+        return len(track.repeats) + before >= self._parameters.min_vehicles
 
-    def names_of(self) -> dict[int, set[int]]:
-        """All ids under which each track (by `id`) has been known."""
-        names: dict[int, set[int]] = {}
+    def names_of(self) -> dict[int, list[int]]:
+        """All ids under which each track (by `serial`) has been known, in the order in which they came."""
+        names: dict[int, list[int]] = {}
         for name, tracks in self._by_id.items():
             for track in tracks:
-                names.setdefault(id(track), set()).add(name)
+                names.setdefault(track.serial, []).append(name)
         return names
 
     def _join_all(self) -> None:
@@ -237,13 +276,21 @@ class Tracks:
     def _join(self, early: Track, late: Track) -> None:
         """All that was said of the later hypothesis counts for the earlier, in the order of the reports."""
         self.all.remove(late)
+        early.apart |= late.apart
+        for track in self.all:
+            if late.serial in track.apart:
+                track.apart.add(early.serial)
         for tracks in self._by_id.values():
             tracks[:] = [early if track is late else track for track in tracks]
         measured = sorted({**early.measured, **late.measured}.items())
         early.votes = dict(sorted({**early.votes, **late.votes}.items()))
         early.measured, early.repeats = {}, {}
+        early.before = joined(early.before, late.before)
         known = early.epoch or early.quoted
-        if known is None:
+        if early.before is not None:
+            early.state = early.before.state
+            early.repeats = {own.vehicle: own.repeats for own in early.before.measured}
+        elif known is None:
             (number, first), *measured = measured
             early.state, early.measured[number], early.repeats[first.vehicle] = first.place, first, 1
         else:
@@ -253,8 +300,39 @@ class Tracks:
 
 
 def _may_be_one(a: Track, b: Track) -> bool:
-    alike = a.kind == b.kind and (len(a.state.points_m) == 1) == (len(b.state.points_m) == 1)
-    return alike and a.votes.keys().isdisjoint(b.votes)
+    return a.kind == b.kind and a.is_point == b.is_point and not a.is_apart(b)
+
+
+def joined(early: Remembered | None, late: Remembered | None) -> Remembered | None:
+    """What the closed windows have come to of two hypotheses that turned out to be one."""
+    if early is None or late is None:
+        return early or late
+    state = step(early.state, late.state)
+    known = early.known if late.known is None else late.known if early.known is None else step(early.known, late.known)
+    own = {one.vehicle: one for one in early.measured}
+    for one in late.measured:
+        other = own.get(one.vehicle)
+        own[one.vehicle] = one if other is None else _together(other, one)
+    is_late = late.is_published and not early.is_published
+    return replace(
+        early,
+        state=state,
+        shown=late.shown if is_late or early.shown is None else early.shown,
+        is_published=early.is_published or late.is_published,
+        is_settled=early.is_settled or late.is_settled,
+        is_away=early.is_away and late.is_away,
+        measured=tuple(own.values()),
+        known=known,
+        vehicles_before=early.vehicles_before + late.vehicles_before,
+        ayes_before=early.ayes_before + late.ayes_before,
+        hits_before=early.hits_before + late.hits_before,
+        day=max(early.day, late.day),
+    )
+
+
+def _together(one: Own, other: Own) -> Own:
+    place = step(one.place, other.place)
+    return Own(one.vehicle, one.repeats + other.repeats, place, other.attributes, one.is_finder or other.is_finder)
 
 
 def _of_map(feature: Feature, epoch: Feature | None = None, quoted: Feature | None = None) -> Track:

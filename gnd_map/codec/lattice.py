@@ -270,16 +270,32 @@ def integers_of(gaussians: Gaussians, lattice: Lattice) -> Quantised:
     return found
 
 
-def integers_on(gaussians: Gaussians, lattice: Lattice) -> Quantised | None:
-    """As `integers_of`; None where not all lie on the lattice."""
-    found, on = _found(gaussians, lattice)
-    return found if on.all() and gaussians.exists.all() else None
+@dataclass(frozen=True, slots=True, eq=False)
+class Integers:
+    """The integers of all Gaussians of a tile, of which any part can be taken.
 
+    Attributes:
+        found: those that give a Gaussian back to the bit, where it lies on the lattice.
+        is_on: (N,) where that is.
+        rounded: the nearest ones; the same object where all lie on it.
+    """
 
-def nearest_integers(gaussians: Gaussians, lattice: Lattice) -> Quantised:
-    """As `integers_of` where all lie on the lattice, else as `quantise`."""
-    found = integers_on(gaussians, lattice)
-    return quantise(gaussians, lattice) if found is None else found
+    found: Quantised
+    is_on: npt.NDArray[np.bool_]
+    rounded: Quantised
+
+    @classmethod
+    def of(cls, gaussians: Gaussians, lattice: Lattice) -> "Integers":
+        """Find them."""
+        found, on = _found(gaussians, lattice)
+        is_on = np.asarray(on & gaussians.exists)
+        return cls(found, is_on, found if is_on.all() else quantise(gaussians, lattice))
+
+    def nearest(self, kept: npt.NDArray[np.bool_]) -> Quantised:
+        """Of some of the Gaussians, (N,) bool, the integers that both sides of a message use: those that give them
+        back to the bit where all of these lie on the lattice, else the nearest ones. They depend on no other Gaussian.
+        """
+        return (self.found if self.is_on[kept].all() else self.rounded).take(kept)
 
 
 def quantise(gaussians: Gaussians, lattice: Lattice) -> Quantised:

@@ -10,7 +10,7 @@ from gnd_map.arrays import I32, I64
 from gnd_map.by_object import ByObject
 from gnd_map.codec import kernels as k
 from gnd_map.codec.coding import Coder
-from gnd_map.codec.lattice import Lattice, Quantised, integers_on, nearest_integers
+from gnd_map.codec.lattice import Integers, Lattice, Quantised
 from gnd_map.codec.priors import FLAGS_AT, VOXEL_WEIGHTS_AT, VOXELS_AT, number_at
 from gnd_map.errors import CodecError
 from gnd_map.gaussian import Gaussians
@@ -113,7 +113,7 @@ def code_flags(coder: Coder, box: Box, held: I32, flag: U8) -> int:
     return n
 
 
-_INTEGERS: Final[ByObject[Quantised | None]] = ByObject(128)
+_INTEGERS: Final[ByObject[Integers]] = ByObject(128)
 """Of the bases used last: many messages refer to one version of a tile."""
 
 
@@ -128,10 +128,8 @@ class Known:
 
 def known_of(base: Gaussians, replaced: npt.NDArray[np.bool_], gone: npt.NDArray[np.bool_], lattice: Lattice) -> Known:
     """What the base tells about those that come."""
-    all_of_it = _INTEGERS.of(base, lambda: integers_on(base, lattice), lattice)
-    if all_of_it is None:
-        return Known(nearest_integers(base.take(~gone), lattice), replaced[~gone])
-    return Known(all_of_it.take(~gone), replaced[~gone])
+    integers = _INTEGERS.of(base, lambda: Integers.of(base, lattice), lattice)
+    return Known(integers.nearest(~gone), replaced[~gone])
 
 
 NOTHING_KNOWN: Final = Known(

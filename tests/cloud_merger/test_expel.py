@@ -1,6 +1,7 @@
 """`gnd map rollback vehicle:NAME`, `memory` and `verify` on a store whose history is known."""
 
 import json
+from dataclasses import replace
 
 import pytest
 from click.testing import CliRunner
@@ -8,6 +9,10 @@ from merger_world import BALL, POLE, TILE, gaussians_of
 from test_windows import BASE, Cloud, crowd
 
 from cloud_merger.config import ShardConfig
+from cloud_merger.errors import MergerError
+from cloud_merger.features import FeatureMergeParameters
+from cloud_merger.map_parameters import digest_of, text_of, with_text
+from cloud_merger.parameters import MergeParameters
 from deploy.map_cli import map_group
 
 
@@ -77,3 +82,97 @@ def test_verify_ends_with_one_where_a_version_is_not_what_was_reported(cloud):
     new = "UPDATE tile_version SET body = ?, sha = ?, codec_id = ? WHERE version = 2"
     cloud.store.transact(lambda c, _now: c.execute(new, (base.body, base.sha, base.codec_id)))
     assert call(cloud, "verify", "--json", "--all-versions").exit_code == 1
+
+
+# Parameters travel with the journal
+
+
+OTHERWISE = ShardConfig(
+    merge=MergeParameters(mode="paper"), codec="compact", features=FeatureMergeParameters(reliability=0.8)
+)
+
+
+def test_a_map_of_other_parameters_is_what_its_journal_gives(tmp_path):
+    cloud = Cloud(tmp_path / "map.sqlite")
+    cloud.config = replace(OTHERWISE, store_path=cloud.store.path)
+    cloud.sees(crowd(3), THREE, base=gaussians_of(BASE))
+    cloud.sees(["later"], {7: POLE}, later_s=4000)
+    cloud.config = ShardConfig(store_path=cloud.store.path)  # a shard of other parameters goes on
+    cloud.sees(crowd(3, "then"), {8: POLE}, later_s=4000)
+    told = json.loads(call(cloud, "verify", "--json", "--all-versions").output)
+    assert (told["identical"], told["unknown"], told["given"]) == (True, 0, 1)
+    assert told["same"] == len(cloud.store.history("ndt", TILE)) - 1 > 2
+    assert "assumed" not in told
+    without = json.loads(call(cloud, "rollback", "vehicle:later", "--dry-run", "--json").output)
+    assert without["tiles"][0]["status"] in ("same", "changes")
+    cloud.store.close()
+
+
+def forget_parameters(cloud):
+    def work(c, _now):
+        c.execute("UPDATE version_basis SET parameters = NULL")
+        c.execute("UPDATE closed_window SET parameters = NULL")
+        c.execute("DELETE FROM merge_parameters")
+
+    cloud.store.transact(work)
+
+
+def test_a_store_of_before_says_which_parameters_were_assumed(cloud):
+    cloud.sees(crowd(3), THREE, base=gaussians_of(BASE))
+    cloud.sees(["later"], later_s=4000)
+    forget_parameters(cloud)
+    told = json.loads(call(cloud, "verify", "--json").output)
+    digest = digest_of(text_of(ShardConfig()))
+    assert (told["same"], told["with parameters assumed"]) == (1, 1)
+    assert told["assumed"] == f"codec standard, merge mode default, else defaults: {digest[:16]}…"
+    assert "assumed" in call(cloud, "verify").output
+
+
+def test_wrong_assumptions_are_said_to_be_assumptions(tmp_path):
+    cloud = Cloud(tmp_path / "map.sqlite")
+    cloud.config = ShardConfig(store_path=cloud.store.path, merge=MergeParameters(mode="paper"))
+    cloud.sees(["one"], {3: BALL}, base=gaussians_of(BASE))  # in the mode of the paper one vehicle is enough
+    assert cloud.ids() == [0, 1, 2, 3]
+    assert call(cloud, "verify", "--json").exit_code == 0
+    forget_parameters(cloud)
+    (wrong,) = json.loads(call(cloud, "verify", "--json").output)["versions"]
+    assert wrong["status"] == "differs"
+    assert "does not say with which parameters it was merged, assumed were" in wrong["reason"]
+    assert json.loads(call(cloud, "verify", "--json", "--merge-mode", "paper").output)["identical"]
+    cloud.store.close()
+
+
+@pytest.mark.parametrize(
+    ("how", "says"),
+    [
+        (
+            "UPDATE merge_parameters SET body = replace(body, 'standard', 'compact')",
+            "not what they were: their digest is",
+        ),
+        ("DELETE FROM merge_parameters", "are named and not in the store"),
+    ],
+)
+def test_parameters_that_are_not_what_their_digest_says_are_told(cloud, how, says):
+    cloud.sees(crowd(3), THREE, base=gaussians_of(BASE))
+    cloud.store.transact(lambda c, _now: c.execute(how))
+    told = call(cloud, "verify", "--json")
+    assert told.exit_code == 1
+    assert says in json.loads(told.output)["versions"][0]["reason"]
+    cloud.sees(crowd(2, "then"), {4: BALL})  # and the merging goes on
+    assert 4 in cloud.ids()
+
+
+def test_parameters_come_back_from_their_text_and_say_when_they_cannot():
+    assert with_text(ShardConfig(), text_of(OTHERWISE)) == OTHERWISE
+    assert text_of(OTHERWISE) != text_of(ShardConfig()) == text_of(ShardConfig("another", poll_s=1.0))
+    said = json.loads(text_of(OTHERWISE))
+    for wrong in (said | {"format": 2}, said | {"merge": {"knob": 1}}, {"format": 1}, []):
+        with pytest.raises(MergerError, match=r"parameters"):
+            with_text(ShardConfig(), json.dumps(wrong))
+
+
+def test_a_text_stands_in_the_store_once(cloud):
+    cloud.sees(crowd(3), THREE, base=gaussians_of(BASE))
+    cloud.sees(crowd(4), {7: POLE}, later_s=4000)
+    n = cloud.store.look(lambda c: c.execute("SELECT COUNT(*) FROM merge_parameters").fetchall()[0][0])
+    assert n == 1

@@ -11,6 +11,7 @@ from cloud_merger.features import FeatureMergeParameters, merge_layer
 from cloud_merger.features import merge as merging
 from cloud_merger.features.check import FeatureLimits
 from cloud_merger.features.kept import FeatureInbox
+from cloud_merger.verify import Verifier
 from cloud_merger.work import Worker
 from gnd_map.features import FeatureTile, hit
 from gnd_map.tile_id import TileId
@@ -133,3 +134,27 @@ def test_a_shard_leaves_the_lost_vehicle_out_and_names_it(tmp_path) -> None:
     assert [one["vehicle"] for one in named] == ["car-3"]
     assert "21" in named[0]["says"] or "contradicted" in named[0]["says"]
     assert nobody == []
+
+
+def test_who_was_refuted_goes_into_the_journal_so_the_layer_can_be_computed_anew(tmp_path) -> None:
+    """The drives an hour apart, so that each is folded before the next; then every version is verified."""
+    with SqliteStore(tmp_path / "map.sqlite", StoreConfig(merge_delay_s=0.0)) as store:
+        store.put_tiles([FeatureTile.of(tile, 1, mapped(n)) for n, tile in enumerate(ROAD)], layer="signs")
+        inbox = FeatureInbox(store, FeatureLimits(), FeatureMergeParameters().reach_m, reach_tiles=3)
+        config = ShardConfig(store_path=store.path)
+        worker = Worker(store, config)
+        for hour, (car, lost) in enumerate([(1, None), (2, None), (3, LOST), (4, None), (5, None), (6, None)]):
+            rows = [row for one in drive(car, lost) for row in inbox.rows(one, hour * 3600 * 10**9)]
+            store.put_reports(rows)
+            while claims := store.claim("one", 64, 30.0):
+                store.publish(worker.merge(claims))
+        verifier = Verifier(store, config)
+        checked = [one for tile in ROAD for one in verifier.history("signs", tile)]
+        heads = {tile: store.get("signs", tile).decode_features().features for tile in ROAD}
+        refuted = store.refuted_reports("signs", ["car-3"])
+    assert {one.status for one in checked} == {"given", "same"}
+    assert len(checked) > 2 * len(ROAD)
+    assert refuted
+    others = layer_of([one for car in (1, 2, 4, 5, 6) for one in drive(car)])
+    stretch = [ROAD[n] for n in LOST]  # elsewhere it tells the truth, and counts
+    assert alike({tile: heads[tile] for tile in stretch}, {tile: others[tile] for tile in stretch}, 0.3)

@@ -12,6 +12,7 @@ from cloud_merger.features import FeatureMergeParameters
 from cloud_merger.features.check import FeatureLimits
 from cloud_merger.features.kept import FeatureInbox
 from cloud_merger.ownership import owner_of
+from cloud_merger.verify import Verifier
 from cloud_merger.work import Worker
 from fleet_bus.requesting import RetryPolicy
 from gnd_map.features import FeatureTile, apply_features, read_feature_delta
@@ -73,14 +74,14 @@ def report_number(n):
     return report(n, *changes, vehicle=f"car-{n // 8 % 5}")
 
 
-def fault_free(path, reports):
-    """Head hashes when one worker merges the reports one by one, in order."""
+def fault_free(path, reports, received_ns):
+    """Head hashes when one worker merges the reports one by one, in order of receipt."""
     with SqliteStore(path, StoreConfig(merge_delay_s=0.0)) as store:
         store.put_tiles([FeatureTile.of(tile, 1, MAP) for tile in TILES], layer=LAYER)
         inbox = FeatureInbox(store, FeatureLimits(), FeatureMergeParameters().reach_m, reach_tiles=3)
         worker = Worker(store, ShardConfig(store_path=path))
-        for one in reports:
-            store.put_reports(inbox.rows(one, 0))
+        for one in sorted(reports, key=lambda one: received_ns[one.report_id]):
+            store.put_reports(inbox.rows(one, received_ns[one.report_id]))
             while claims := store.claim("one", 16, 30.0):
                 store.publish(worker.merge(claims))
         return {head.tile: head.sha for head in store.heads(LAYER)}, store.counts().report_rows
@@ -108,10 +109,13 @@ def test_a_shard_killed_while_feature_reports_flow_loses_nothing_and_applies_not
     assert {ack.status for ack in acks} <= {"stored", "duplicate"}
     assert cloud.shards["left"].wait(5) == -signal.SIGKILL
     wait_for("all is merged and announced", cloud.is_settled)
-    heads, n_rows = fault_free(tmp_path / "plain.sqlite", reports)
+    received_ns = {row.report_id: row.received_ns for row in cloud.store.reports(LAYER)}
+    heads, n_rows = fault_free(tmp_path / "plain.sqlite", reports, received_ns)
     assert {head.tile: head.sha for head in cloud.store.heads(LAYER)} == heads
     assert (cloud.store.counts().reports, cloud.store.counts().report_rows) == (len(reports), n_rows)
     assert cloud.store.quarantined() == []
+    verifier = Verifier(cloud.store, ShardConfig())
+    assert {one.status for tile in TILES for one in verifier.history(LAYER, tile)} == {"given", "same"}
     wait_for("the watcher has heard of all", lambda: cloud.versions() <= cloud.announced())
     assert cloud.updates == []  # who watches Gaussians hears nothing of signs
     assert "Traceback" not in cloud.log("right")

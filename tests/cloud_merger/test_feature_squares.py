@@ -68,7 +68,7 @@ def test_repeats_of_one_vehicle_weigh_what_correlated_errors_leave(correlation):
     parameters = FeatureMergeParameters(repeat_correlation=correlation)
     (one,) = some_places(4, 1)
     repeats = [Place(one.points_m + k, one.cov_m2) for k in range(4)]
-    got = fused(repeats, parameters.information_of(4))
+    got = fused(estimate(repeats), 4, parameters.information_of(4))
     joint = np.kron(np.full((4, 4), correlation) + (1 - correlation) * np.eye(4), one.cov_m2)
     H = np.vstack([np.eye(3)] * 4)
     inverse = np.linalg.pinv(joint)

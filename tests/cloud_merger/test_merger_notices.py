@@ -22,6 +22,7 @@ from merger_world import (
 from cloud_merger.announce import NOTICE_DELTA_BYTES, NOTICE_DELTA_VOXELS, encoded, update_of
 from cloud_merger.config import ShardConfig
 from cloud_merger.merger import run_shard
+from cloud_merger.ownership import owner_of
 from cloud_merger.work import Worker
 from fleet_bus.bus import open_bus
 from fleet_bus.config import BusConfig
@@ -102,6 +103,17 @@ def test_a_notice_that_a_dead_shard_owed_is_sent_by_the_next(cloud, shard):
     assert first.previous_sha == tile_of_states(STATES).sha
     assert updated(second, updated(first, tile_of_states(STATES))) == cloud.store.get("ndt", TILE).decode()
     assert [update.voxels for update in (first, second)] == [(1, 0), (0, 1)]  # the pole is like what it was
+    wait_for("none is owed", cloud.is_settled)
+
+
+def test_a_notice_of_an_owner_that_lives_but_does_not_announce_is_sent_by_another(cloud, shard):
+    """Its worker is being started, is stopped, or has no room on its disk."""
+    names = (f"ghost-{n}" for n in range(99))
+    owner = next(name for name in names if owner_of(TILE.district, {"merger-1", name}) == name)
+    cloud.bus.declare_alive(alive_key("merger", owner))
+    publish_without_notice(cloud, 1, {2: POLE})
+    shard()
+    wait_for("it is announced", lambda: [update.version for update in cloud.updates] == [2])
     wait_for("none is owed", cloud.is_settled)
 
 

@@ -8,11 +8,13 @@ from hypothesis import strategies as st
 from merger_world import TILE, change_of, gaussians_of
 
 from cloud_merger.expanding import is_askable
+from cloud_merger.memory import VOXEL, TileMemory
 from cloud_merger.parameters import MergeParameters
 from cloud_merger.statements import Kind, Report, statements_of
 from cloud_merger.votes import TileVotes
 from cloud_merger.wants import Known, WantParameters, _promised, _sample, _wanted_of_tile
 from gnd_map.classes import ChangeClass
+from gnd_map.day import day_of
 from gnd_map.gaussian import Gaussians
 from gnd_map.tile import content_sha
 
@@ -24,7 +26,7 @@ def by_statements(own, reports, known, merge, want):
     asked = is_askable(own.change)
     ids, modified = own.change.changed.voxel_id[asked], own.change.change_class[asked] == ChangeClass.MODIFIED
     others = [report for report in reports if report.report_id != own.report_id]
-    statements = statements_of(known.epoch, [*others, own], known.bases, merge.mode)
+    statements = statements_of(known.epoch, [*others, own], known.bases, merge.mode, known.memory)
     rows = statements.rows[np.isin(statements.rows["voxel_id"], ids)]
     seat = np.searchsorted(ids, rows["voxel_id"])
     is_own = rows["report"] == statements.report_ids.index(own.report_id)
@@ -58,6 +60,14 @@ def any_change(rng, base):
     return replace(change, change_class=kinds.astype(np.uint8))
 
 
+def any_memory(rng):
+    """Of none, or of some voxels: confirmed by some, on the day of the reports."""
+    ids = np.flatnonzero(rng.random(24) < rng.choice([0.0, 0.5]))
+    voxels = np.zeros(len(ids), VOXEL)
+    voxels["voxel_id"], voxels["observers"], voxels["day"] = ids, rng.integers(0, 9, len(ids)), day_of(0)
+    return TileMemory(voxels)
+
+
 def withheld(report):
     """As flags stand for it: without Gaussians."""
     ids = report.change.changed.voxel_id
@@ -81,6 +91,7 @@ def test_what_is_wanted_is_what_all_statements_say(seed, mode):
         votes=TileVotes.of(reports[:split]).with_reports(reports[split:]),
         bases={content_sha(TILE, base): base for base in bases[: rng.integers(1, 4)]},  # one may have gone
         promised=rng.integers(0, 24, rng.integers(0, 9)).astype(np.int32),
+        memory=any_memory(rng) if mode == "default" else TileMemory(),
     )
     merge = MergeParameters(mode=mode)
     want = WantParameters(enough=int(rng.integers(0, 4)), sample=int(rng.choice([0, 2])))

@@ -7,8 +7,8 @@ import pytest
 from codec_samples import TILES, street
 
 from gnd_map.codec import LATTICES, REPORT, Lattice, snap
-from gnd_map.codec.lattice import _floats, _found, _found_plain, dequantise, quantise
-from gnd_map.gaussian import Gaussians, six_entries
+from gnd_map.codec.lattice import Integers, _floats, _found, _found_plain, dequantise, quantise
+from gnd_map.gaussian import Gaussians, concat, six_entries
 
 ALL = [*LATTICES.values(), REPORT]
 
@@ -41,3 +41,17 @@ def test_floats_are_those_of_numpy(lattice: Lattice) -> None:
     made, (mean_m, cov_m2) = dequantise(integers, lattice), _floats(integers, lattice)
     np.testing.assert_array_equal(made.mean_m, mean_m)
     np.testing.assert_array_equal(made.cov_m2, cov_m2)
+
+
+@pytest.mark.parametrize("lattice", ALL, ids=lambda lattice: lattice.name)
+def test_a_part_of_a_tile_has_the_integers_that_it_has_alone(lattice: Lattice) -> None:
+    rng = np.random.default_rng(5)
+    free, on = street(TILES[0], rng, 300), snap(street(TILES[0], rng, 300), lattice)
+    mixed = concat([free.take(np.arange(100)), on.select(on.voxel_id[~np.isin(on.voxel_id, free.voxel_id[:100])])])
+    for gaussians in (free, on, mixed):
+        whole = Integers.of(gaussians, lattice)
+        for kept in (*(rng.random((4, len(gaussians))) < 0.7), whole.is_on, np.zeros(len(gaussians), np.bool_)):
+            alone = Integers.of(gaussians.take(kept), lattice)
+            part, expected = whole.nearest(kept), alone.nearest(np.ones(len(alone.is_on), np.bool_))
+            for field in fields(part):
+                np.testing.assert_array_equal(getattr(part, field.name), getattr(expected, field.name))

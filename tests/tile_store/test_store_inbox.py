@@ -138,8 +138,6 @@ def test_quarantine_keeps_bytes_reason_and_count(store: Store, clock: Clock) -> 
         {"window_s": 0.0},
         {"window_vehicles": 0},
         {"window_reports": 0},
-        {"max_feature_reports": 0},
-        {"max_reports_of_vehicle": 0},
         {"group_max": 0},
     ],
 )

@@ -203,13 +203,16 @@ def test_layers_are_apart(store: Store) -> None:
     assert [entry.version for entry in store.heads("ndt_summer")] == [1]
 
 
-def test_of_a_feature_layer_no_vehicle_crowds_out_the_reports_of_others(maker: SqliteMaker) -> None:
-    config = StoreConfig(merge_delay_s=0.0, max_feature_reports=6, max_reports_of_vehicle=3)
-    store = maker.open(config)
-    talker = [dataclasses.replace(report(10 + i), layer="signs", vehicle="talker") for i in range(20)]
-    others = [dataclasses.replace(report(i), layer="signs", vehicle=f"car-{i}") for i in range(5)]
-    store.put_reports([*others, *talker])
-    rows = store.load(only_claim(store)).reports
-    assert [row.report_id for row in rows] == [report_id(i) for i in (2, 3, 4, 27, 28, 29)]
-    assert store.in_play("signs", rows[0].tile).reports == rows
+def test_the_reports_of_a_feature_layer_are_cut_into_windows_by_the_time_of_day(maker: SqliteMaker) -> None:
+    """Neighbouring tiles, which hear the same of what lies at their border, cut alike whoever speaks first."""
+    store = maker.open(StoreConfig(merge_delay_s=0.0, window_s=100.0))
+    seconds = [130, 190, 199, 200, 150, 299, 305]  # one clock steps back
+    rows = [
+        dataclasses.replace(report(i, tile=tile), layer="signs", received_ns=t * 10**9)
+        for i, t in enumerate(seconds)
+        for tile in (TILE, EAST)[: 1 + (i > 0)]  # the other tile hears from the second on
+    ]
+    store.put_reports(rows)
+    windows = [[row.window for row in store.in_play("signs", tile).reports] for tile in (TILE, EAST)]
+    assert windows == [[1, 1, 1, 2, 2, 2, 3], [1, 1, 2, 2, 2, 3]]
     store.close()

@@ -120,6 +120,16 @@ def test_only_the_holder_can_postpone(store: Store, clock: Clock) -> None:
     assert store.claim("m3", 1, 10.0) == []
 
 
+def test_a_tile_of_nobodys_region_does_not_wait_for_ever(store: Store, clock: Clock) -> None:
+    own = "13033/03021/23031"
+    store.put_reports([report(1, FAR)])
+    clock.advance(1.0)
+    store.put_reports([report(1, TILE)])
+    assert [claim.tile for claim in store.claim("m1", 1, 10.0, prefer=[own])] == [FAR], "it is overdue"
+    store.put_reports([report(2, EAST)])
+    assert [claim.tile for claim in store.claim("m1", 2, 10.0, prefer=[own])] == [TILE, EAST]
+
+
 def test_own_regions_come_first_then_any(store: Store) -> None:
     store.put_reports([report(1, FAR), report(1, TILE), report(1, EAST)])
     (first,) = store.claim("m1", 1, 10.0, prefer=["13033/03021/23031"])

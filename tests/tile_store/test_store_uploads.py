@@ -133,6 +133,11 @@ def test_an_upload_that_was_given_back_waits(store: Store, machine: Machine) -> 
     store.postpone_upload(claimed(store)[0], 2.0)
     assert claimed(store) == []
     machine.now += 2 * SECOND
+    again = claimed(store)[0]
+    assert again.attempts == 2
+    store.postpone_upload(again, 2.0, blameless=True)
+    assert claimed(store) == [], "it waits, too"
+    machine.now += 2 * SECOND
     assert claimed(store)[0].attempts == 2
 
 

@@ -241,6 +241,8 @@ def test_each_change_of_a_known_tile_leaves_a_notice_until_it_is_announced(store
     assert store.notices() == [Notice("ndt", TILE, 2), Notice("ndt", TILE, 3)]
     assert store.notices(n=1) == [Notice("ndt", TILE, 2)]
     assert store.notices(older_than_s=5.0) == [Notice("ndt", TILE, 2)]
+    clock.advance(-86_400.0)
+    assert store.notices() == [Notice("ndt", TILE, 2), Notice("ndt", TILE, 3)], "a date set back keeps none of them"
     store.announced([Notice("ndt", TILE, 2), Notice("ndt", EAST, 9)])
     assert store.notices() == [Notice("ndt", TILE, 3)]
 

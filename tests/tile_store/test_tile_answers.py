@@ -26,6 +26,7 @@ from schemas.errors import SchemaError, WrongHash
 from schemas.tiles import TileRequest, tile_after, tile_of
 from schemas.tiles_batch import HeldTile, TileAnswer, TilesReply, TilesRequest, tile_of_answer
 from tile_store.answers import Answers, same_lattice
+from tile_store.errors import StoreDamaged
 from tile_store.memory import Memory
 from tile_store.sqlite_store import SqliteStore
 from tile_store.values import StoredTile
@@ -182,6 +183,19 @@ def test_a_damaged_base_gives_the_whole_tile(store: SqliteStore, caplog: pytest.
     assert reply.blob is not None
     assert tile_of(reply.blob) == new
     assert "no delta from version 1 to 2" in caplog.text
+
+
+def test_a_damaged_body_is_not_sent_whether_it_was_sent_before_or_not(store: SqliteStore) -> None:
+    put(store, street(TILE, 1))
+    fresh, knowing = Answers(store), Answers(store)
+    assert knowing.one(store.get("ndt", TILE), TileRequest()).blob is not None
+    damage(store, 1)
+    for answers in (fresh, knowing):
+        with pytest.raises(StoreDamaged, match="version 1: damaged"):
+            answers.one(store.get("ndt", TILE), TileRequest())
+    damage(store, 1)  # the same bit again: it is whole
+    for answers in (fresh, knowing):
+        assert answers.one(store.get("ndt", TILE), TileRequest()).blob is not None
 
 
 # Several tiles

@@ -1,6 +1,7 @@
 """The outbox thread over a real bus: nobody there, a slow answer, a refusal, a restart."""
 
 import threading
+import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
@@ -15,6 +16,7 @@ from schemas.changes import ChangeAck
 from schemas.keys import change_key, change_keys, state_key, state_keys, want_key
 from schemas.report_id import deterministic_report_id
 from schemas.report_states import ReportQuestion, ReportState, ReportStates
+from vehicle_agent.errors import OutboxError
 from vehicle_agent.outbox import Outbox
 from vehicle_agent.sending import SenderThread
 
@@ -173,3 +175,43 @@ def test_a_cloud_that_has_forgotten_a_report_gets_it_again(start: Opener, outbox
     cloud.serve(change_keys(), inbox := Inbox(cloud))
     assert start().drain(15.0, NEVER)
     assert inbox.bodies == [report_id(1).encode()]
+
+
+def test_a_full_disk_under_the_outbox_does_not_end_the_sender(
+    start: Opener, outbox: Outbox, cloud: Bus, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("vehicle_agent.sending.STORE_PAUSE_S", 0.05)
+    fails = {"due": 2, "answered": 1, "failed": 1}
+
+    def failing(name: str) -> Callable[..., object]:
+        real: Callable[..., object] = getattr(outbox, name)
+
+        def call(*arguments: object, **named: object) -> object:
+            if fails[name]:
+                fails[name] -= 1
+                raise OutboxError("disk I/O error")
+            return real(*arguments, **named)
+
+        return call
+
+    for name in fails:
+        monkeypatch.setattr(outbox, name, failing(name))
+    inbox = Inbox(cloud)
+    cloud.serve(change_keys(), inbox)
+    outbox.put(report_id(1), KEY, report_id(1).encode())
+    sender = start()
+    assert sender.drain(10.0, NEVER), sender.last_error
+    assert fails == {"due": 0, "answered": 0, "failed": 0}
+
+
+def test_a_date_that_is_set_back_keeps_no_report_from_going(
+    start: Opener, outbox: Outbox, cloud: Bus, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    outbox.put(report_id(1), KEY, report_id(1).encode())
+    sender = start()
+    wait_until(lambda: sender.last_error != "" or sender.counts["whole"] > 0)
+    before_ns = time.time_ns()
+    monkeypatch.setattr(time, "time_ns", lambda: before_ns - 86_400 * 10**9)
+    cloud.serve(change_keys(), Inbox(cloud))
+    outbox.failed(outbox.due(2**62)[0], time.monotonic_ns(), "no answer")  # waits half a second, not a day
+    assert sender.drain(10.0, NEVER), sender.last_error

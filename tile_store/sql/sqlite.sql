@@ -205,6 +205,39 @@ CREATE TABLE closed_window (
 -- name: has_schema_of_journal
 SELECT 1 FROM sqlite_schema WHERE type = 'table' AND name = 'closed_window'
 
+-- name: schema_of_parameters
+-- Step of the schema. What versions and folded windows were merged with, each text once; `digest` is its SHA-256. NULL: it
+-- was merged before this step. Feature layers get windows: their reports that counted until now (of a vehicle the newest
+-- 16, of a tile 256) are their window 0, the others count no more.
+CREATE TABLE merge_parameters (
+  number INTEGER PRIMARY KEY,
+  digest BLOB    NOT NULL UNIQUE CHECK (length(digest) = 32),
+  body   TEXT    NOT NULL
+) STRICT;
+ALTER TABLE version_basis ADD COLUMN parameters INTEGER;
+ALTER TABLE closed_window ADD COLUMN parameters INTEGER;
+UPDATE report SET window = -1 WHERE substr(layer, 1, 3) <> 'ndt' AND arrival NOT IN (
+  SELECT arrival FROM (
+    SELECT arrival, ROW_NUMBER() OVER (PARTITION BY layer, tile ORDER BY report_id DESC) AS place FROM (
+      SELECT r.arrival, r.layer, r.tile, r.report_id,
+        ROW_NUMBER() OVER (PARTITION BY r.layer, r.tile, r.vehicle ORDER BY r.report_id DESC) AS turn
+      FROM report AS r LEFT JOIN tile_head AS h USING (layer, tile)
+      WHERE r.merged_in IS NULL OR r.merged_in >= COALESCE(h.epoch, 0))
+    WHERE turn <= 16)
+  WHERE place <= 256);
+
+-- name: has_schema_of_parameters
+SELECT 1 FROM sqlite_schema WHERE type = 'table' AND name = 'merge_parameters'
+
+-- name: put_parameters
+INSERT INTO merge_parameters (digest, body) VALUES (:digest, :body) ON CONFLICT (digest) DO NOTHING
+
+-- name: number_of_parameters
+SELECT number FROM merge_parameters WHERE digest = :digest
+
+-- name: parameters
+SELECT digest, body FROM merge_parameters WHERE number = :number
+
 -- name: journal
 SELECT seq, window, opened_ns FROM journal WHERE layer = :layer AND tile = :tile
 
@@ -220,24 +253,25 @@ SELECT COUNT(*), COUNT(DISTINCT vehicle), COALESCE(MAX(vehicle = :vehicle), 0) F
 WHERE layer = :layer AND tile = :tile AND window = :window
 
 -- name: move_waiting
-UPDATE report SET window = :window WHERE layer = :layer AND tile = :tile AND merged_in IS NULL AND window > 0
+UPDATE report SET window = :window WHERE layer = :layer AND tile = :tile AND merged_in IS NULL AND window >= 0
 
 -- name: oldest_of_window
 SELECT MIN(received_ns) FROM report WHERE layer = :layer AND tile = :tile AND window = :window
 
 -- name: put_basis
-INSERT INTO version_basis (layer, tile, version, window, seq, named)
-VALUES (:layer, :tile, :version, :window, :seq, :named)
+INSERT INTO version_basis (layer, tile, version, window, seq, named, parameters)
+VALUES (:layer, :tile, :version, :window, :seq, :named, :parameters)
 
 -- name: basis
-SELECT window, seq, named FROM version_basis WHERE layer = :layer AND tile = :tile AND version = :version
+SELECT window, seq, named, parameters FROM version_basis WHERE layer = :layer AND tile = :tile AND version = :version
 
 -- name: put_closed_window
-INSERT INTO closed_window (layer, tile, window, named) VALUES (:layer, :tile, :window, :named)
-ON CONFLICT (layer, tile, window) DO UPDATE SET named = excluded.named
+INSERT INTO closed_window (layer, tile, window, named, parameters)
+VALUES (:layer, :tile, :window, :named, :parameters)
+ON CONFLICT (layer, tile, window) DO UPDATE SET named = excluded.named, parameters = excluded.parameters
 
 -- name: closed_windows
-SELECT window, named FROM closed_window WHERE layer = :layer AND tile = :tile ORDER BY window
+SELECT window, named, parameters FROM closed_window WHERE layer = :layer AND tile = :tile ORDER BY window
 
 -- name: put_memory
 INSERT INTO tile_memory (layer, tile, window, epoch, codec_id, body, memory)
@@ -469,15 +503,6 @@ WHERE layer = :layer AND tile = :tile AND window > :folded AND seq > :seq
   AND (window > 0 OR merged_in IS NULL OR merged_in >= :epoch)
 ORDER BY seq
 
--- name: reports_in_play_of_vehicles
-SELECT report_id, layer, tile, vehicle, received_ns, body, base_sha, part, window, seq FROM report
-WHERE layer = :layer AND tile = :tile AND report_id IN (
-  SELECT report_id FROM (
-    SELECT report_id, ROW_NUMBER() OVER (PARTITION BY vehicle ORDER BY report_id DESC) AS turn FROM report
-    WHERE layer = :layer AND tile = :tile AND (merged_in IS NULL OR merged_in >= :epoch))
-  WHERE turn <= :of_vehicle ORDER BY report_id DESC LIMIT :n)
-ORDER BY report_id DESC
-
 -- name: reports_page
 SELECT arrival, report_id, layer, tile, vehicle, received_ns, body, base_sha, part, window, seq FROM report
 WHERE arrival > :after AND layer = :layer AND (:vehicle IS NULL OR vehicle = :vehicle) ORDER BY arrival LIMIT :n
@@ -575,7 +600,8 @@ UPDATE upload SET owner = :owner, token = :token, boot = :boot, lease_ns = :leas
 WHERE upload = :upload
 
 -- name: postpone_upload
-UPDATE upload SET owner = NULL, token = NULL, boot = :boot, lease_ns = :lease_ns
+UPDATE upload SET owner = NULL, token = NULL, boot = :boot, lease_ns = :lease_ns,
+  attempts = CASE WHEN :blameless THEN 1 ELSE attempts END
 WHERE upload = :upload AND token = :token
 
 -- name: release_uploads
@@ -739,7 +765,7 @@ DELETE FROM report WHERE arrival IN (
   SELECT r.arrival FROM report AS r JOIN tile_head AS h USING (layer, tile)
     LEFT JOIN tile_memory AS m ON m.layer = r.layer AND m.tile = r.tile AND m.epoch = h.epoch
   WHERE r.received_ns < :before AND r.merged_in IS NOT NULL
-    AND (r.merged_in < h.epoch OR (:folded AND r.window > 0 AND r.window <= m.window))
+    AND (r.merged_in < h.epoch OR r.window < 0 OR (:folded AND r.window > 0 AND r.window <= m.window))
   ORDER BY r.received_ns LIMIT :n)
 RETURNING LENGTH(body)
 

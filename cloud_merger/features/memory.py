@@ -1,0 +1,258 @@
+"""What a tile of a feature layer remembers of its closed windows: of each feature what its estimators have come to.
+
+Existence and place are recursive estimates, so they can be carried on: of a feature the votes of the vehicles that
+spoke last, what the measurements of the last vehicles come to, each on its own (so that one more of the same vehicle
+weighs what it adds), and those of all before as one place. What is carried is bounded of each feature, and of what a
+vehicle alone has found by vehicle: neither grows with the number of reports.
+"""
+
+import json
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from typing import Any, Final
+
+import numpy as np
+import zstandard
+
+from cloud_merger.errors import MergerError
+from cloud_merger.features.rls import Place
+from cloud_merger.features.statements import Attributes
+from gnd_map.arrays import F64
+from gnd_map.features import Existence, Feature
+
+_FORMAT: Final = 1
+_LEVEL: Final = 3
+
+
+@dataclass(frozen=True, slots=True)
+class Vote:
+    """One report's verdict on a feature.
+
+    Attributes:
+        vehicle: whose.
+        existence: its evidence, not discounted.
+        hits: looks that detected it.
+        elsewhere: name of the claim that the feature stands in another place now; 0: none. It counts as one against
+            the feature when several vehicles measure it there.
+    """
+
+    vehicle: str
+    existence: Existence
+    hits: int = 0
+    elsewhere: int = 0
+
+    @property
+    def denied(self) -> "Vote":
+        """The same against the feature."""
+        said = self.existence
+        return Vote(self.vehicle, Existence(said.absent, said.exist, said.unknown), self.hits)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Own:
+    """What the measurements of one vehicle come to.
+
+    Attributes:
+        vehicle: whose.
+        repeats: how many.
+        place: recursive estimate of them, as if their errors had nothing in common.
+        attributes: its newest word.
+        is_finder: it found the feature anew.
+    """
+
+    vehicle: str
+    repeats: int
+    place: Place
+    attributes: Attributes = ()
+    is_finder: bool = False
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Remembered:
+    """A feature, or what may be one, after the closed windows.
+
+    Attributes:
+        feature_id: its id.
+        kind: of it.
+        names: other ids under which reports have known it, the newest last.
+        state: running estimate for association.
+        epoch: the map's feature; None: it is none.
+        quoted: a feature of a later version that nobody here has found.
+        shown: as it is published, or was last; None: never.
+        is_published: whether it is.
+        is_settled: whether it is decided to which tile it belongs.
+        is_away: it belongs to the neighbour.
+        votes: (number of a witness, its vote), one a vehicle, the newest last.
+        measured: of the vehicles that measured it last, in the order of their first measurements.
+        known: the map's place with the measurements of all vehicles before those; None: neither.
+        vehicles_before: how many these are, ...
+        ayes_before: ... how many whose votes are no longer among `votes` said that it exists, ...
+        hits_before: ... and their looks.
+        apart: numbers of those with which it is not one: a report has told them apart.
+        day: `gnd_map.day` of the newest receipt of a report that speaks for it.
+    """
+
+    feature_id: int
+    kind: str
+    names: tuple[int, ...]
+    state: Place
+    epoch: Feature | None
+    quoted: Feature | None
+    shown: Feature | None
+    is_published: bool
+    is_settled: bool
+    is_away: bool
+    votes: tuple[tuple[int, Vote], ...]
+    measured: tuple[Own, ...]
+    known: Place | None
+    vehicles_before: int
+    ayes_before: int
+    hits_before: int
+    apart: frozenset[int]
+    day: int
+
+    @property
+    def is_of_map(self) -> bool:
+        """Whether the map, this or a later version of it, knows it."""
+        return self.epoch is not None or self.quoted is not None
+
+    @property
+    def finder(self) -> str:
+        """The only vehicle that has measured it, where that has never been published; else ""."""
+        alone = self.shown is None and not self.is_of_map and self.vehicles_before == 0 and len(self.measured) == 1
+        return self.measured[0].vehicle if alone else ""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class LayerMemory:
+    """See the module's head.
+
+    Attributes:
+        tracks: of each feature; in the order in which they began.
+        witnesses: reports of closed windows that votes are of, in the order in which they were heard.
+    """
+
+    tracks: tuple[Remembered, ...] = ()
+    witnesses: tuple[str, ...] = ()
+
+    def __post_init__(self) -> None:
+        for track in self.tracks:
+            numbers = [number for number, _ in track.votes]
+            if any(not 0 <= number < len(self.witnesses) for number in numbers):
+                raise MergerError(f"votes of witnesses {numbers}, there are {len(self.witnesses)}")
+            if any(not 0 <= other < len(self.tracks) for other in track.apart):
+                raise MergerError(f"a feature apart from {sorted(track.apart)}, there are {len(self.tracks)}")
+
+    def encode(self) -> bytes:
+        """Bytes for the store: JSON, zstd. Floats come back bit for bit."""
+        features = _Table()
+        tracks = [_told(track, features) for track in self.tracks]
+        said = {"format": _FORMAT, "witnesses": self.witnesses, "features": features.told, "tracks": tracks}
+        return zstandard.ZstdCompressor(level=_LEVEL).compress(json.dumps(said, separators=(",", ":")).encode())
+
+    @classmethod
+    def decode(cls, body: bytes) -> "LayerMemory":
+        """The memory in `body`.
+
+        Raises:
+            MergerError: it is damaged or of another format.
+        """
+        try:
+            said = json.loads(zstandard.ZstdDecompressor().decompress(body))
+            if said["format"] != _FORMAT:
+                raise MergerError(f"a memory of layers of format {said['format']}, this release reads {_FORMAT}")
+            features = [_feature(one) for one in said["features"]]
+            return cls(tuple(_remembered(one, features) for one in said["tracks"]), tuple(said["witnesses"]))
+        except (ValueError, KeyError, TypeError, IndexError, zstandard.ZstdError) as error:
+            raise MergerError(f"a memory of {len(body)} bytes cannot be read: {error}") from error
+
+
+class _Table:
+    """Features, each told once: what is published is mostly what the map has."""
+
+    def __init__(self) -> None:
+        self.told: list[Any] = []
+        self._number: dict[Feature, int] = {}
+
+    def number(self, feature: Feature | None) -> int:
+        if feature is None:
+            return -1
+        if feature not in self._number:
+            self._number[feature] = len(self.told)
+            self.told.append(_told_feature(feature))
+        return self._number[feature]
+
+
+def _told(track: Remembered, features: _Table) -> list[Any]:
+    known = [features.number(one) for one in (track.epoch, track.quoted, track.shown)]
+    flags = [int(one) for one in (track.is_published, track.is_settled, track.is_away)]
+    counts = [track.vehicles_before, track.ayes_before, track.hits_before, track.day]
+    votes = [[number, one.vehicle, _masses(one.existence), one.hits, one.elsewhere] for number, one in track.votes]
+    measured = [
+        [one.vehicle, one.repeats, _place(one.place), one.attributes, int(one.is_finder)] for one in track.measured
+    ]
+    place = None if track.known is None else _place(track.known)
+    head = [track.feature_id, track.kind, list(track.names), _place(track.state)]
+    return [*head, known, flags, votes, measured, place, counts, sorted(track.apart)]
+
+
+def _remembered(said: Sequence[Any], features: Sequence[Feature]) -> Remembered:
+    feature_id, kind, names, state, known, flags, votes, measured, place, counts, apart = said
+    epoch, quoted, shown = (None if number < 0 else features[number] for number in known)
+    vehicles, ayes, hits, day = counts
+    is_published, is_settled, is_away = map(bool, flags)
+    return Remembered(
+        feature_id,
+        kind,
+        tuple(names),
+        _place_of(state),
+        epoch,
+        quoted,
+        shown,
+        is_published,
+        is_settled,
+        is_away,
+        votes=tuple((n, Vote(vehicle, Existence(*m), h, name)) for n, vehicle, m, h, name in votes),
+        measured=tuple(
+            Own(vehicle, repeats, _place_of(at), _attributes(of), bool(is_finder))
+            for vehicle, repeats, at, of, is_finder in measured
+        ),
+        known=None if place is None else _place_of(place),
+        vehicles_before=vehicles,
+        ayes_before=ayes,
+        hits_before=hits,
+        apart=frozenset(apart),
+        day=day,
+    )
+
+
+def _masses(said: Existence) -> list[float]:
+    return [said.exist, said.absent, said.unknown, said.conflict]
+
+
+def _place(place: Place) -> list[Any]:
+    return [place.points_m.ravel().tolist(), place.cov_m2.ravel().tolist()]
+
+
+def _place_of(said: Sequence[Any]) -> Place:
+    points_m, cov_m2 = said
+    return Place(_array(points_m).reshape(-1, 3), _array(cov_m2).reshape(3, 3))
+
+
+def _told_feature(one: Feature) -> list[Any]:
+    head = [one.feature_id, one.kind, one.points_m.ravel().tolist(), one.cov_m2.tolist(), _masses(one.existence)]
+    return [*head, one.attributes, one.part, one.cuts, one.hits, one.vehicles]
+
+
+def _feature(said: Sequence[Any]) -> Feature:
+    feature_id, kind, points_m, cov_m2, masses, attributes, *counts = said
+    points = _array(points_m).reshape(-1, 3)
+    return Feature(feature_id, kind, points, _array(cov_m2), Existence(*masses), _attributes(attributes), *counts)
+
+
+def _attributes(said: Iterable[Sequence[str]]) -> Attributes:
+    return tuple((key, value) for key, value in said)
+
+
+def _array(values: Sequence[float]) -> F64:
+    return np.array(values, np.float64)

@@ -1,0 +1,123 @@
+"""`gnd chaos`: hurt a whole cloud of real processes in every way that a seed draws, and see if it keeps its word."""
+
+import json
+import signal
+import tempfile
+import threading
+from contextlib import ExitStack
+from pathlib import Path
+from types import FrameType
+from typing import TYPE_CHECKING
+
+import click
+from rich.console import Console
+from rich.table import Table
+
+from deploy.errors import ChaosError
+
+if TYPE_CHECKING:
+    from deploy.chaos.run import Outcome
+
+PATH = click.Path(path_type=Path)
+WIDTH = 120
+
+
+@click.command()
+@click.option("--kills", type=click.IntRange(1, 10_000), default=60, show_default=True, help="Faults, some 2 s apart.")
+@click.option("--seed", type=int, default=1, show_default=True, help="Draws faults and reports.")
+@click.option("--json", "json_file", type=PATH, help="Write the outcome to this file; - prints it.")
+@click.option("--out", type=PATH, help="Keep store, outboxes and logs in this folder.  [default: only if it failed]")
+def chaos(kills: int, seed: int, json_file: Path | None, out: Path | None) -> None:
+    """Kill, stop, cut off and mislead the parts of a cloud and its clients while they work; then check what is left.
+
+    Ends with 1 where a report was lost or doubled, a tile torn or stuck, or the map is not what its journal gives.
+    Ctrl-C ends the faults; what was found until then is checked and printed.
+    """
+    # The heavy imports wait until the options have been found good.
+    from deploy.chaos.faults import plan
+    from deploy.chaos.run import run_chaos
+    from deploy.live import progress_bars
+
+    console = Console(stderr=True)
+    folder = _folder(out)
+    stop = _stop_on_interrupt()
+    with ExitStack() as stack:
+        progress = stack.enter_context(progress_bars(console))
+        task = progress.add_task("starting", total=kills)
+        outcome = run_chaos(
+            seed, plan(seed, kills), folder, stop,
+            lambda what, n: progress.update(task, description=what, completed=n),
+        )  # fmt: skip
+    told = json.dumps(outcome.as_dict(), indent=2)
+    if json_file is not None and str(json_file) != "-":
+        json_file.write_text(told + "\n", encoding="utf-8")
+    if str(json_file) == "-":
+        click.echo(told)
+    else:
+        print_outcome(Console(width=WIDTH), outcome)
+    if out is None and not outcome.failures:
+        _remove(folder)
+    else:
+        console.print(f"everything else: {folder}", highlight=False, soft_wrap=True)
+    if outcome.failures:
+        raise SystemExit(1)
+
+
+def _folder(out: Path | None) -> Path:
+    if out is None:
+        return Path(tempfile.mkdtemp(prefix="gnd-chaos-"))
+    if out.exists() and (not out.is_dir() or any(out.iterdir())):
+        raise ChaosError(f"{out}: exists and is not empty; choose another folder for --out")
+    out.mkdir(parents=True, exist_ok=True)
+    return out.resolve()
+
+
+def _remove(folder: Path) -> None:
+    for path in sorted(folder.rglob("*"), reverse=True):
+        path.rmdir() if path.is_dir() else path.unlink()
+    folder.rmdir()
+
+
+def _stop_on_interrupt() -> threading.Event:
+    """An event that Ctrl-C or SIGTERM sets; the second Ctrl-C ends at once."""
+    stop = threading.Event()
+
+    def end(_signal: int, _frame: FrameType | None) -> None:
+        if stop.is_set():
+            raise KeyboardInterrupt
+        stop.set()
+
+    signal.signal(signal.SIGINT, end)
+    signal.signal(signal.SIGTERM, end)
+    return stop
+
+
+def print_outcome(console: Console, outcome: "Outcome") -> None:
+    """Tables for people: what must be 0, and what each kind of fault cost."""
+    told = outcome.as_dict()
+    table = Table(title=f"seed {outcome.seed}: {told['faults']} faults in {told['seconds']:.0f} s", show_header=False)
+    rows = {
+        "reports acknowledged": f"{told['acknowledged']} of {told['reports']}",
+        "lost": told["lost"],
+        "doubled": told["doubled"],
+        "tiles received / torn": f"{told['received_tiles']} / {told['torn_tiles']}",
+        "versions merged": told["versions"],
+        "stuck": told["stuck_tiles"],
+        "map as its journal gives it": "yes" if told["identical_map"] else f"NO: {told['verify']}",
+        "parts that died by themselves": told["deaths"] or "none",
+        "settled after": "not at all" if told["settled_s"] is None else f"{told['settled_s']:.1f} s",
+    }
+    for name, value in rows.items():
+        table.add_row(name, str(value))
+    console.print(table)
+    gaps = Table("fault", "times", "tile", "report", "update", title="longest time without service, s")
+    for kind, values in told["gap_s_by_kind"].items():
+        gaps.add_row(
+            kind, str(told["by_kind"][kind]), *(f"{values[name]:.2f}" for name in ("tile", "report", "update"))
+        )
+    console.print(gaps)
+    for name, lines in told["found"].items():
+        for line in lines:
+            console.print(f"{name}: {line}", highlight=False, soft_wrap=True)
+    verdict = "; ".join(outcome.failures) if outcome.failures else "nothing lost, doubled, torn or stuck"
+    console.print(("interrupted: " if outcome.interrupted else "") + verdict, highlight=False, soft_wrap=True)
