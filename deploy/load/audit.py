@@ -107,8 +107,11 @@ class Auditor:
 
     def ledger(self) -> Ledger:
         """All that the load has left behind, as it is at one moment: workers may still be busy."""
-        with self._connection:  # one snapshot: else an upload that is settled meanwhile would be seen nowhere
+        self._connection.execute("BEGIN")  # one snapshot: an upload that is settled meanwhile would be seen nowhere
+        try:
             return self._ledger()
+        finally:
+            self._connection.execute("ROLLBACK")
 
     def _ledger(self) -> Ledger:
         parts = [(str(report_id), int(part)) for report_id, part in self._connection.execute(_JOURNALED)]

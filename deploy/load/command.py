@@ -3,6 +3,7 @@
 import json
 import math
 import signal
+import sys
 import tempfile
 import threading
 from collections.abc import Iterator
@@ -66,6 +67,8 @@ def load(drives: Path | None, settled: Path | None, keep: Path | None, json_file
     another place, with its map and the reports that were made on it.
     """
     options = LoadOptions(**given)
+    if json_file is not None and str(json_file) != "-" and not json_file.absolute().parent.is_dir():
+        raise click.BadParameter(f"there is no folder {json_file.absolute().parent}", param_hint="--json")
     console = Console(stderr=True)
     runs, stop = kept_runs(drives, settled, console), threading.Event()
     with _ending(stop), _folder(keep) as folder, _bar(console) as tell:
@@ -77,6 +80,9 @@ def load(drives: Path | None, settled: Path | None, keep: Path | None, json_file
         click.echo(text)
     else:
         Console(width=110).print(table_of(figures))
+
+    if figures["why_not"] == ["the run was interrupted"]:
+        sys.exit(130)
 
 
 def table_of(figures: dict[str, Any]) -> Table:

@@ -240,6 +240,7 @@ def _measured(running: Running, options: LoadOptions, planned: int, tell: Tell) 
         ledger=running.auditor.ledger(),
         notices_s=dict(running.notices_s),
         restarts=sum(running.supervisor.restarts.values()),
+        interrupted=running.stop.is_set(),
     )
 
 

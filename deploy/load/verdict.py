@@ -44,6 +44,7 @@ class Outcome:
         ledger: what the store holds.
         notices_s: when the subscriber had heard of each (tile, version), s UTC.
         restarts: how often a process of the cloud was started again.
+        interrupted: whether somebody ended the run before its time.
     """
 
     options: LoadOptions
@@ -60,6 +61,7 @@ class Outcome:
     ledger: Ledger
     notices_s: Mapping[tuple[int, int], float] = field(repr=False)
     restarts: int = 0
+    interrupted: bool = False
 
     @property
     def sent(self) -> list[Account]:
@@ -89,6 +91,8 @@ class Outcome:
 
 def why_not(outcome: Outcome) -> list[str]:
     """What speaks against the cloud having kept up; nothing: it has."""
+    if outcome.interrupted:
+        return ["the run was interrupted"]
     found = [*_not_offered(outcome), *_not_done(outcome), *_growing(outcome), *_lagging(outcome)]
     return [one for one in found if one]
 
@@ -228,6 +232,8 @@ def limit_of(outcome: Outcome, reasons: Sequence[str]) -> str:
 
     Clients are, where the cloud has kept up with all that they sent, but they were late or sent as fast as they could.
     """
+    if outcome.interrupted:
+        return "none"
     late = set(_not_offered(outcome))
     if set(reasons) - late:
         return "cloud"

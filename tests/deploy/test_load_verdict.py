@@ -148,5 +148,10 @@ def test_what_is_left_undone():
     assert "1 processes of the cloud had to be started again" in said(good(restarts=1))
 
 
+def test_a_run_that_was_interrupted():
+    assert said(good(interrupted=True)) == "the run was interrupted"
+    assert summary(good(interrupted=True))["limit"] == "none"
+
+
 def test_a_run_too_short_to_tell():
     assert "too short" in said(good(backlog=[Backlog(0.0, 0, 0, 0)]))
