@@ -5,14 +5,15 @@ transaction; so a notice outlives the shard that published the version, and goes
 import logging
 import time
 from collections import OrderedDict
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from typing import Final
 
 from cloud_merger.ownership import Members
+from cloud_merger.stored import Bases
 from fleet_bus.bus import Bus
 from fleet_bus.subscribing import RecallingPublisher
-from gnd_map.content import changed_between, encode_content_delta, has_deltas
+from gnd_map.content import AnyTile, changed_between, encode_content_delta, has_deltas
 from gnd_map.errors import CodecError
 from gnd_map.tile import Tile, diff
 from schemas.errors import SchemaError, TooLarge
@@ -21,7 +22,7 @@ from schemas.updates import TileUpdate
 from tile_store.store import Store
 from tile_store.values import Notice, StoredTile
 
-REMEMBERED_KEYS: Final = 256
+REMEMBERED_KEYS: Final = 2048
 # A notice goes to everybody who listens: it carries what has changed only where that is little more than itself.
 # Who holds the tile asks for the rest.
 NOTICE_DELTA_BYTES: Final = 512
@@ -30,17 +31,19 @@ NOTICE_DELTA_VOXELS: Final = 256  # more of them are not even encoded
 # same.
 OTHERS_AFTER_S: Final = 0.3
 _LOG = logging.getLogger(__name__)
+Read = Callable[[StoredTile], AnyTile]
 
 
 class Announcer:
     """Announces the versions of the districts that this shard owns, oldest first, then unmarks them; and those of
     others that have waited for `OTHERS_AFTER_S` before its eyes.
 
-    The last notice of each of the newest `REMEMBERED_KEYS` tiles is repeated to late subscribers.
+    The last notice of each of the newest `REMEMBERED_KEYS` tiles is repeated to late subscribers. Versions that were
+    merged here lie in `bases`, and are not decoded again.
     """
 
-    def __init__(self, store: Store, bus: Bus, members: Members) -> None:
-        self._store, self._bus, self._members = store, bus, members
+    def __init__(self, store: Store, bus: Bus, members: Members, bases: Bases) -> None:
+        self._store, self._bus, self._members, self._bases = store, bus, members, bases
         self._publishers: OrderedDict[str, RecallingPublisher] = OrderedDict()
         self._seen_s: dict[Notice, float] = {}  # notices of others, since when, by the monotonic clock
 
@@ -68,7 +71,7 @@ class Announcer:
             return
         parent = self._store.get(notice.layer, notice.tile, stored.parent) if stored.parent else None
         key = update_key(notice.layer, notice.tile)
-        self._publisher(key).put(encoded(update_of(stored, parent)), tile=notice.tile)
+        self._publisher(key).put(encoded(update_of(stored, parent, self._bases.tile)), tile=notice.tile)
 
     def _publisher(self, key: str) -> RecallingPublisher:
         publisher = self._publishers.pop(key, None) or self._bus.advanced_publisher(key)
@@ -78,8 +81,11 @@ class Announcer:
         return publisher
 
 
-def update_of(stored: StoredTile, parent: StoredTile | None) -> TileUpdate:
-    """The notice of a version; without its parent (new tile, or gone from the store) it carries no delta."""
+def update_of(stored: StoredTile, parent: StoredTile | None, read: Read = StoredTile.decode) -> TileUpdate:
+    """The notice of a version; without its parent (new tile, or gone from the store) it carries no delta.
+
+    `read` decodes a version.
+    """
     update = TileUpdate(
         tile=stored.tile,
         layer=stored.layer,
@@ -90,15 +96,15 @@ def update_of(stored: StoredTile, parent: StoredTile | None) -> TileUpdate:
         reason=stored.kind,
         day=stored.day,
     )
-    return _with_delta(update, stored, parent) if parent else update
+    return _with_delta(update, stored, parent, read) if parent else update
 
 
-def _with_delta(update: TileUpdate, stored: StoredTile, parent: StoredTile) -> TileUpdate:
+def _with_delta(update: TileUpdate, stored: StoredTile, parent: StoredTile, read: Read) -> TileUpdate:
     """The notice with what has changed, coded for features and on a lattice, else in plain columns; of a large change
     only how much it is.
     """
     try:
-        before, after = parent.decode(), stored.decode()
+        before, after = read(parent), read(stored)
         put, removed = changed_between(before, after)
         counted = replace(update, put_count=put, removed_count=removed)
         if put + removed > NOTICE_DELTA_VOXELS:

@@ -21,6 +21,7 @@ from cloud_merger.features.kept import FeatureInbox
 from cloud_merger.ingest import one_line
 from cloud_merger.short_reports import FirstSaid, ShortReports
 from cloud_merger.states import STATUS
+from cloud_merger.stored import Bases
 from cloud_merger.wants import asked_voxels
 from gnd_map.errors import GndError
 from schemas.changes import ChangeReport, split
@@ -58,13 +59,19 @@ class Expander:
         config: of the shard.
         tell: called with a vehicle and how far its report has come, after that is durable.
         on_journaled: called after reports have come into the journal.
+        bases: versions of tiles in memory, if others use them, too.
     """
 
     def __init__(
-        self, store: Store, config: ShardConfig, tell: Tell, on_journaled: Callable[[], object] = lambda: None
+        self,
+        store: Store,
+        config: ShardConfig,
+        tell: Tell,
+        on_journaled: Callable[[], object] = lambda: None,
+        bases: Bases | None = None,
     ) -> None:
         self._store, self._config, self._tell, self._on_journaled = store, config, tell, on_journaled
-        self._short = ShortReports(store, config.merge, config.want, config.waiting)
+        self._short = ShortReports(store, config.merge, config.want, config.waiting, bases or Bases(store))
         self._features = FeatureInbox(store, config.feature_limits, config.features.reach_m, config.ingest.reach_tiles)
         self._map = MapCheck(store, config.ingest)
         self._lock = Lock()

@@ -15,6 +15,7 @@ from cloud_merger.metrics import ShardMetrics
 from cloud_merger.ownership import Members, following
 from cloud_merger.reception import Reception
 from cloud_merger.states import States
+from cloud_merger.stored import Bases
 from cloud_merger.warm import warm_up
 from cloud_merger.work import Worker
 from cloud_merger.worker_process import Address, worker_process
@@ -88,10 +89,11 @@ def run_worker(
         members, wake = following(bus, config.shard_id), threading.Event()
 
         # Expand: what was acknowledged becomes reports of tiles, and vehicles hear what is wanted; in threads.
-        expander = Expander(store, config, States(store, bus).tell, on_journaled=wake.set)
+        bases = Bases(store)  # what one has decoded or made, the others need next
+        expander = Expander(store, config, States(store, bus).tell, on_journaled=wake.set, bases=bases)
         stack.enter_context(working(expander.work, arrived, config.expanders, config.poll_s))
 
-        worker, announcer = Worker(store, config), Announcer(store, bus, members)
+        worker, announcer = Worker(store, config, bases), Announcer(store, bus, members, bases)
         while not stop.is_set():
             claims: list[Claim] = []
             try:

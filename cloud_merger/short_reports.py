@@ -56,12 +56,15 @@ class ShortReports:
         merge: how statements will be merged.
         want: which Gaussians are asked for.
         waiting: how many promises are remembered.
+        bases: versions of tiles in memory.
     """
 
-    def __init__(self, store: Store, merge: MergeParameters, want: WantParameters, waiting: WaitingLimits) -> None:
+    def __init__(
+        self, store: Store, merge: MergeParameters, want: WantParameters, waiting: WaitingLimits, bases: Bases
+    ) -> None:
         self.promises = Promises(waiting)
         self._store, self._merge, self._want = store, merge, want
-        self._bases = Bases(store)
+        self._bases = bases
         self._in_play = TilesInPlay(store, merge, self._bases)
 
     def expanded(self, key: str, packed: PackedReport) -> ChangeReport:

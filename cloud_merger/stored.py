@@ -23,6 +23,8 @@ from gnd_map.codec import (
     is_on,
     lattice_of,
 )
+from gnd_map.content import AnyTile
+from gnd_map.features import is_feature_layer
 from gnd_map.gaussian import Gaussians
 from gnd_map.tile import Tile
 from gnd_map.tile_id import TileId
@@ -35,7 +37,7 @@ from tile_store.values import ReportRow, StoredMemory, StoredTile, TileJournal, 
 REMEMBERED_REPORTS: Final = 1024  # some 20 kB each
 NEW_GROUND: Final = DoubtReason.IMPLAUSIBLE_SHARE | DoubtReason.POSE_NOT_CHECKED
 _STATE_CODECS: Final = (CODEC_STANDARD_ZSTD, CODEC_COMPACT_ZSTD, CODEC_ARCHIVE_ZSTD, CODEC_FLOAT32_ZSTD)  # quick ones
-REMEMBERED_TILES: Final = 512  # some 120 kB each
+REMEMBERED_TILES: Final = 1024  # some 120 kB each
 
 
 @lru_cache(maxsize=REMEMBERED_REPORTS)
@@ -153,6 +155,22 @@ class Bases:
         found = self._remembered(stored.tile, stored.sha)
         return self._remember(stored) if found is None else found
 
+    def tile(self, stored: StoredTile) -> AnyTile:
+        """A version that was read, of any layer.
+
+        Raises:
+            SchemaError: it cannot be decoded, or is not what the hash says.
+        """
+        return (
+            stored.decode()
+            if is_feature_layer(stored.layer)
+            else Tile(stored.tile, stored.version, self.decoded(stored))
+        )
+
+    def keep(self, tile: Tile) -> None:
+        """Remember a tile that was made here: it will be announced, and quoted by the next reports."""
+        self._put(tile.tile_id, tile.sha, tile.gaussians)
+
     def state(self, tile: TileId, journal: TileJournal) -> TileState:
         """What the closed windows of a tile have come to.
 
@@ -172,8 +190,11 @@ class Bases:
 
     def _remember(self, stored: StoredTile) -> Gaussians:
         gaussians = stored.decode_gaussians().gaussians
+        self._put(stored.tile, stored.sha, gaussians)
+        return gaussians
+
+    def _put(self, tile: TileId, sha: bytes, gaussians: Gaussians) -> None:
         with self._lock:
-            self._held[stored.tile, stored.sha] = gaussians
+            self._held[tile, sha] = gaussians
             while len(self._held) > REMEMBERED_TILES:
                 self._held.popitem(last=False)
-        return gaussians

@@ -24,11 +24,17 @@ T = TypeVar("T")
 
 
 class Worker:
-    """Merges claimed tiles."""
+    """Merges claimed tiles.
 
-    def __init__(self, store: Store, config: ShardConfig) -> None:
+    Args:
+        store: of reports and tiles.
+        config: of the shard.
+        bases: versions of tiles in memory, if others use them, too.
+    """
+
+    def __init__(self, store: Store, config: ShardConfig, bases: Bases | None = None) -> None:
         self._store, self._config = store, config
-        self._contents, self._features = Bases(store), FeatureContents(store)
+        self._contents, self._features = bases or Bases(store), FeatureContents(store)
         self._shifts, self._parameters = ShiftTests(config.shift), text_of(config)
 
     def merge(self, claims: Sequence[Claim]) -> list[Publication]:
@@ -98,6 +104,7 @@ class Worker:
         now = merger.merge(state, by_window.get(journal.window, []), lattice)
         new = Tile(tile, work.base_version + 1, now.gaussians)
         is_new = new.sha != work.head.sha if work.head else len(new.gaussians) > 0
+        self._contents.keep(new)
         return Publication(
             claim=work.claim,
             base_version=work.base_version,
