@@ -20,8 +20,10 @@ ASIDE_S: Final = 60.0
 LONGEST_ASIDE_S: Final = 3600.0
 """... at most after so long: whoever was to blame for it may be gone by then."""
 ATTEMPTS_IN_A_ROW: Final = 5
-OVERDUE_S: Final = 0.5
-"""A tile that has been ready for so long goes before all preferred ones."""
+OVERDUE_S: Final = 2.0
+"""A tile that has been ready for so long goes before all preferred ones: under load there are always some."""
+LOOKED_AT: Final = 8
+"""Times as many of the oldest tiles as can be claimed are looked at for preferred ones."""
 HALVES_WAIT: Final = 4
 """Merge delays that a tile waits for the Gaussians that were asked for, if nothing else is said about it."""
 NEVER_AT_ONCE: Final = 1 << 30
@@ -79,23 +81,25 @@ def merge_again(c: apsw.Connection, layer: str, tile: TileId, timing: dict[str, 
 
 
 def claim(c: apsw.Connection, owner: str, n: int, lease_s: float, prefer: Sequence[str], steady: int) -> list[Claim]:
-    """Lease ready tiles: overdue ones, then those of the preferred regions, then any; each group oldest first.
-
-    Preferred tiles are in somebody's memory, but under load there are always some: nobody else's would ever be merged.
+    """Lease ready tiles: those that have waited for long, then those of the preferred regions, then any; each group
+    oldest first. Preferred tiles are in the owner's memory.
     """
-    lease_ns = steady + round(lease_s * NS_PER_S)
-    overdue = {"steady": steady - round(OVERDUE_S * NS_PER_S), "n": n}
-    claims = _take(c, fetch(c, "claimable", overdue), owner, lease_ns)
-    for first, end in map(morton_range, prefer):
-        wanted = {"steady": steady, "first": first, "end": end, "n": n - len(claims)}
-        claims += _take(c, fetch(c, "claimable_in_region", wanted), owner, lease_ns)
-    return claims + _take(c, fetch(c, "claimable", {"steady": steady, "n": n - len(claims)}), owner, lease_ns)
+    ranges = [morton_range(prefix) for prefix in prefer]
+    rows = fetch(c, "claimable", {"steady": steady, "n": LOOKED_AT * n if ranges else n})
+
+    def turn(row: Row) -> int:
+        _, tile, *_, ready_ns = row
+        if steady - ready_ns >= OVERDUE_S * NS_PER_S:
+            return 0
+        return 1 if any(first <= tile < end for first, end in ranges) else 2
+
+    return _take(c, sorted(rows, key=turn)[:n], owner, steady + round(lease_s * NS_PER_S))
 
 
 def _take(c: apsw.Connection, rows: Iterable[Row], owner: str, lease_ns: int) -> list[Claim]:
     claims = [
         Claim(layer, TileId(tile), seq, owner, secrets.randbits(62), attempts + 1, bool(is_aside))
-        for layer, tile, seq, attempts, is_aside in rows
+        for layer, tile, seq, attempts, is_aside, _ in rows
     ]
     for one in claims:
         change(c, "take_lease", _lease(one) | {"owner": owner, "lease_ns": lease_ns})

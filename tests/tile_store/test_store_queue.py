@@ -123,7 +123,7 @@ def test_only_the_holder_can_postpone(store: Store, clock: Clock) -> None:
 def test_a_tile_of_nobodys_region_does_not_wait_for_ever(store: Store, clock: Clock) -> None:
     own = "13033/03021/23031"
     store.put_reports([report(1, FAR)])
-    clock.advance(1.0)
+    clock.advance(3.0)
     store.put_reports([report(1, TILE)])
     assert [claim.tile for claim in store.claim("m1", 1, 10.0, prefer=[own])] == [FAR], "it is overdue"
     store.put_reports([report(2, EAST)])

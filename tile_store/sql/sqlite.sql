@@ -380,13 +380,8 @@ ON CONFLICT (layer, tile) DO UPDATE SET
   aside_reason = NULL
 
 -- name: claimable
-SELECT layer, tile, seq, attempts, aside_ns IS NOT NULL FROM dirty INDEXED BY dirty_ready
+SELECT layer, tile, seq, attempts, aside_ns IS NOT NULL, ready_ns FROM dirty INDEXED BY dirty_ready
 WHERE ready_ns <= :steady AND (owner IS NULL OR lease_ns <= :steady)
-ORDER BY ready_ns, layer, tile LIMIT :n
-
--- name: claimable_in_region
-SELECT layer, tile, seq, attempts, aside_ns IS NOT NULL FROM dirty INDEXED BY dirty_tile
-WHERE ready_ns <= :steady AND (owner IS NULL OR lease_ns <= :steady) AND tile >= :first AND tile < :end
 ORDER BY ready_ns, layer, tile LIMIT :n
 
 -- name: take_lease
