@@ -28,7 +28,7 @@ def measure(path: Path) -> dict[str, float]:
         (claim,) = store.claim("shard", 1, 60.0)
         begin_s, begin_cpu_s = time.perf_counter(), time.process_time()
         for _ in range(BEGINS):
-            store.begin(claim, 60.0)
+            store.begin([claim], 60.0)
         return {
             "refused_mb": REFUSED * REFUSED_BYTES / 1e6,
             "refused_s": refused_s,

@@ -3,6 +3,7 @@ transaction; so a notice outlives the shard that published the version, and goes
 """
 
 import logging
+import math
 import time
 from collections import OrderedDict
 from collections.abc import Callable, Sequence
@@ -45,12 +46,17 @@ class Announcer:
     def __init__(self, store: Store, bus: Bus, members: Members, bases: Bases) -> None:
         self._store, self._bus, self._members, self._bases = store, bus, members, bases
         self._publishers: OrderedDict[str, RecallingPublisher] = OrderedDict()
+        self._last_s = -math.inf
         self._seen_s: dict[Notice, float] = {}  # notices of others, since when, by the monotonic clock
 
-    def announce(self, at_most: int) -> int:
-        """Announce what waits, up to `at_most` versions; the number announced (0 without a router)."""
-        if not self._bus.is_connected():
+    def announce(self, at_most: int, every_s: float = 0.0) -> int:
+        """Announce what waits, up to `at_most` versions; the number announced (0 without a router, and where the last
+        round was less than `every_s` ago).
+        """
+        now_s = time.monotonic()
+        if now_s - self._last_s < every_s or not self._bus.is_connected():
             return 0  # a notice put without a router would vanish in silence
+        self._last_s = now_s
         waiting = self._own_and_late(self._store.notices(n=at_most))
         for notice in waiting:
             self._announce(notice)

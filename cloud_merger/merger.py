@@ -29,6 +29,7 @@ from tile_store.values import Claim
 
 __all__ = ["ShardConfig", "run_shard", "run_worker"]
 STORE_RETRY_S: Final = 1.0
+ANNOUNCE_EVERY_S: Final = 0.05
 _LOG = logging.getLogger(__name__)
 
 
@@ -99,13 +100,15 @@ def run_worker(
             try:
                 claims = store.claim(config.shard_id, config.tiles_at_once, config.lease_s, prefer=expander.districts)
                 leases.hold(claims)
+                worker.begin(claims)
                 for claim in claims:
                     if not stop.is_set():
                         with metrics.merging():  # load, fold, merge, decide, publish by compare-and-swap
                             result = worker.settle(claim)
                         metrics.settled(result)
                     leases.drop(claim)
-                    metrics.announced(announcer.announce(config.announce_at_once))  # after the commit
+                    # after the commit; tiles of one batch are announced together
+                    metrics.announced(announcer.announce(config.announce_at_once, every_s=ANNOUNCE_EVERY_S))
                 n_announced = announcer.announce(config.announce_at_once)
                 metrics.announced(n_announced)
                 if not claims and not n_announced:

@@ -36,11 +36,20 @@ class Worker:
         self._store, self._config = store, config
         self._contents, self._features = bases or Bases(store), FeatureContents(store)
         self._shifts, self._parameters = ShiftTests(config.shift), text_of(config)
+        self._begun: dict[Claim, bool] = {}  # whether the lease was still held
 
     def merge(self, claims: Sequence[Claim]) -> list[Publication]:
         """What to publish for these claims; a tile that failed is postponed, or set aside after `max_attempts`."""
         attempted = [self._attempt(claim) for claim in claims]
         return [publication for publication in attempted if publication is not None]
+
+    def begin(self, claims: Sequence[Claim]) -> None:
+        """Count the first attempts of these claims together: one synced write, not one a tile. A tile that was tried
+        before is counted when its turn comes, so that a merge that kills shards counts against its own tile alone.
+        """
+        first = [claim for claim in claims if claim.attempts == 1 and not claim.is_retry]
+        begun = self._store.begin(first, self._config.lease_s) if len(first) > 1 else []
+        self._begun = dict(zip(first, begun, strict=False))
 
     def settle(self, claim: Claim) -> PublishResult | None:
         """Merge one claimed tile and publish it; None: it is postponed or set aside, or its lease is gone."""
@@ -59,7 +68,10 @@ class Worker:
         return self._config.poll_s if ready_in_s is None else min(max(ready_in_s, 0.005), self._config.poll_s)
 
     def _attempt(self, claim: Claim) -> Publication | None:
-        if not self._store.begin(claim, self._config.lease_s):
+        is_held = self._begun.pop(claim, None)
+        if is_held is None:
+            (is_held,) = self._store.begin([claim], self._config.lease_s)
+        if not is_held:
             return None  # another shard has it
         # It may be what killed the shards that merged it before.
         if claim.attempts > self._config.max_attempts and not claim.is_retry:

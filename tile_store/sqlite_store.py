@@ -255,9 +255,9 @@ class SqliteStore:
             return []
         return self._writer.run(lambda c: inbox.claim(c, owner, n, lease_s, prefer, self._steady_ns()))
 
-    def begin(self, claim: Claim, lease_s: float) -> bool:
+    def begin(self, claims: Sequence[Claim], lease_s: float) -> list[bool]:
         """See `Store.begin`."""
-        return self._writer.run(lambda c: inbox.begin(c, claim, lease_s, self._steady_ns()))
+        return self._writer.run(lambda c: [inbox.begin(c, one, lease_s, self._steady_ns()) for one in claims])
 
     def release(self, owner: str) -> int:
         """See `Store.release`."""

@@ -113,8 +113,8 @@ class Store(Protocol):
         Leases and delays run by a clock that does not step; those of an earlier boot of the machine are over.
         """
 
-    def begin(self, claim: Claim, lease_s: float) -> bool:
-        """Count an attempt to merge a claimed tile and prolong its lease; False where another owner has it."""
+    def begin(self, claims: Sequence[Claim], lease_s: float) -> list[bool]:
+        """Count an attempt to merge each of these tiles and prolong its lease; False where another owner has it."""
 
     def release(self, owner: str) -> int:
         """Free all leases of an owner (it has died), those of uploads too; the number of tiles freed."""

@@ -177,7 +177,7 @@ def test_a_tile_that_kills_its_shards_is_set_aside_without_another_attempt(store
     first = put(store, 1)
     for shard in ("a", "b", "c"):
         (claim,) = store.claim(shard, 1, 30.0)
-        assert store.begin(claim, 30.0)
+        assert store.begin([claim], 30.0) == [True]
         store.release(shard)  # as the others do when it has died
     assert merge_once(store, worker) == []
     assert "no shard that merged it came to an end" in store.tiles_set_aside()[0].reason

@@ -70,7 +70,7 @@ def test_a_claimed_tile_is_nobody_elses_until_the_lease_ends(store: Store, clock
     store.put_reports([report(1)])
     first = only_claim(store, "m1", lease_s=5.0)
     assert first.attempts == 1
-    assert store.begin(first, 5.0)
+    assert store.begin([first], 5.0) == [True]
     assert store.claim("m2", 10, 5.0) == []
     assert store.claim("m1", 10, 5.0) == []
     assert store.ready_in_s() == pytest.approx(5.0)
@@ -104,7 +104,7 @@ def test_the_leases_of_the_dead_are_freed_at_once(store: Store) -> None:
 def test_a_postponed_tile_waits_and_counts_its_attempts(store: Store, clock: Clock) -> None:
     store.put_reports([report(1)])
     claim = only_claim(store)
-    assert store.begin(claim, 10.0)
+    assert store.begin([claim], 10.0) == [True]
     store.postpone(claim, 3.0)
     assert store.claim("m2", 1, 10.0) == []
     clock.advance(3.0)
@@ -183,10 +183,10 @@ def test_attempts_start_anew_after_a_publication(store: Store) -> None:
 def test_only_a_merge_that_was_begun_counts_as_an_attempt(store: Store) -> None:
     store.put_reports([report(1), report(1, EAST)])
     first, second = store.claim("killed", 2, 10.0)
-    assert store.begin(first, 10.0)
+    assert store.begin([first], 10.0) == [True]
     store.release("killed")
     assert {claim.tile: claim.attempts for claim in store.claim("m2", 2, 10.0)} == {first.tile: 2, second.tile: 1}
-    assert not store.begin(second, 10.0)
+    assert store.begin([second], 10.0) == [False]
 
 
 @pytest.mark.parametrize("step_s", [-86_400.0, 86_400.0])
@@ -226,7 +226,7 @@ def test_leases_and_delays_of_another_boot_are_over(maker: SqliteMaker, monkeypa
 def test_a_tile_set_aside_waits_with_its_reports_until_it_is_taken_up_again(store: Store, clock: Clock) -> None:
     store.put_reports([report(1), report(2), report(1, EAST)])
     claim = next(one for one in store.claim("m1", 2, 5.0) if one.tile == TILE)
-    assert store.begin(claim, 5.0)
+    assert store.begin([claim], 5.0) == [True]
     assert store.set_aside(claim, "a page is damaged")
     clock.advance(59.0)
     assert [one.tile for one in store.claim("m1", 2, 5.0)] == [EAST]
@@ -246,7 +246,7 @@ def test_a_tile_set_aside_is_tried_once_in_a_while_whatever_becomes_of_its_shard
     for attempt in range(1, 6):
         claim = only_claim(store)
         assert (claim.attempts, claim.is_retry) == (attempt, False)
-        assert store.begin(claim, 10.0)
+        assert store.begin([claim], 10.0) == [True]
         store.set_aside(claim, "why") if attempt == 5 else store.release("m1")
     for pause_s in (60.0, 120.0, 240.0):
         clock.advance(pause_s - 1.0)
@@ -254,7 +254,7 @@ def test_a_tile_set_aside_is_tried_once_in_a_while_whatever_becomes_of_its_shard
         clock.advance(1.0)
         claim = only_claim(store)
         assert claim.is_retry
-        assert store.begin(claim, 10.0)
+        assert store.begin([claim], 10.0) == [True]
         store.release("m1")  # it has killed this shard, too: no other is sent after it at once
     clock.advance(1e5)
     assert only_claim(store).is_retry
@@ -265,7 +265,7 @@ def test_a_tile_set_aside_is_tried_once_in_a_while_whatever_becomes_of_its_shard
 def test_the_next_report_gives_a_tile_set_aside_another_chance(store: Store) -> None:
     store.put_reports([report(1)])
     claim = only_claim(store)
-    assert store.begin(claim, 5.0)
+    assert store.begin([claim], 5.0) == [True]
     store.set_aside(claim, "why")
     store.put_reports([report(2)])
     assert store.tiles_set_aside() == []

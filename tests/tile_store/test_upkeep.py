@@ -320,7 +320,7 @@ def test_rollback_on_the_command_line(path: Path) -> None:
 def test_tiles_set_aside_are_shown_and_taken_up_again(path: Path) -> None:
     with SqliteStore(path, EAGER) as store:
         (claim,) = store.claim("m1", 10, 10.0)
-        store.begin(claim, 10.0)
+        store.begin([claim], 10.0)
         store.set_aside(claim, "StoreDamaged: page 7")
     assert "StoreDamaged: page 7" in command("status", path)
     assert [one["tile"] for one in as_json("status", path)["set_aside"]] == [EAST.path]
