@@ -27,7 +27,9 @@ REMEMBERED_KEYS: Final = 2048
 # A notice goes to everybody who listens: it carries what has changed only where that is little more than itself.
 # Who holds the tile asks for the rest.
 NOTICE_DELTA_BYTES: Final = 512
-NOTICE_DELTA_VOXELS: Final = 256  # more of them are not even encoded
+# More voxels, or more Gaussians among them, are not even encoded: they would not fit.
+NOTICE_DELTA_VOXELS: Final = 256
+NOTICE_DELTA_PUT: Final = 128
 # The worker of an owner that lives may be starting, stopped, or without room on its disk: its notices go out all the
 # same.
 OTHERS_AFTER_S: Final = 0.3
@@ -113,7 +115,7 @@ def _with_delta(update: TileUpdate, stored: StoredTile, parent: StoredTile, read
         before, after = read(parent), read(stored)
         put, removed = changed_between(before, after)
         counted = replace(update, put_count=put, removed_count=removed)
-        if put + removed > NOTICE_DELTA_VOXELS:
+        if put + removed > NOTICE_DELTA_VOXELS or put > NOTICE_DELTA_PUT:
             return counted
         if isinstance(before, Tile) and isinstance(after, Tile) and not has_deltas(stored.codec_id):
             return replace(update, delta=diff(before.gaussians, after.gaussians))
