@@ -1,8 +1,7 @@
 """Router, tile server and merger shards as `gnd fleet` starts them, with a map that changes: for studies of service."""
 
-import threading
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -15,6 +14,7 @@ from deploy import roles
 from deploy.fleet import POLL_S
 from deploy.ports import claim_port
 from deploy.processes import ProcessSpec, Supervisor, start_fork_server
+from deploy.repeating import repeated
 from fleet_bus.bus import open_bus
 from fleet_bus.config import BusConfig
 from gnd_map.gaussian import Gaussians
@@ -77,26 +77,6 @@ def small_cloud(folder: Path, shards: int = 1) -> Iterator[SmallCloud]:
         with open_bus(BusConfig(connect=(connect,), open_timeout_s=READY_S), name="probe") as bus:
             bus.request(tile_key("ndt", base[0].tile_id), b"", kind="tile", timeout_s=READY_S)
         yield SmallCloud(connect, supervisor, store, base, folder)
-
-
-@contextmanager
-def repeated(work: Callable[[int], object], every_s: float) -> Iterator[None]:
-    """Call `work` with 0, 1, 2 … every `every_s` from a thread of its own while the block runs."""
-    stop = threading.Event()
-
-    def run() -> None:
-        number = 0
-        while not stop.wait(every_s):
-            work(number)
-            number += 1
-
-    thread = threading.Thread(target=run, name="repeated")
-    thread.start()
-    try:
-        yield
-    finally:
-        stop.set()
-        thread.join()
 
 
 def tiles() -> list[Tile]:

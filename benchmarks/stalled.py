@@ -21,9 +21,10 @@ import psutil
 
 from benchmarks.figures import Figure
 from benchmarks.flat_tile import change_report
-from benchmarks.small_cloud import READY_S, SmallCloud, repeated, small_cloud
+from benchmarks.small_cloud import READY_S, SmallCloud, small_cloud
 from benchmarks.small_cloud import tiles as map_tiles
 from deploy.processes import ProcessSpec
+from deploy.repeating import repeated
 from fleet_bus.bus import Bus, open_bus
 from fleet_bus.config import BusConfig
 from fleet_bus.errors import BusError

@@ -39,7 +39,7 @@ Read = Callable[[StoredTile], AnyTile]
 
 class Announcer:
     """Announces the versions of the districts that this shard owns, oldest first, then unmarks them; and those of
-    others that have waited for `OTHERS_AFTER_S` before its eyes.
+    others that still wait `OTHERS_AFTER_S` after it has seen them first.
 
     The last notice of each of the newest `REMEMBERED_KEYS` tiles is repeated to late subscribers. Versions that were
     merged here lie in `bases`, and are not decoded again.

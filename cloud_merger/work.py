@@ -48,8 +48,8 @@ class Worker:
         before is counted when its turn comes, so that a merge that kills shards counts against its own tile alone.
         """
         first = [claim for claim in claims if claim.attempts == 1 and not claim.is_retry]
-        begun = self._store.begin(first, self._config.lease_s) if len(first) > 1 else []
-        self._begun = dict(zip(first, begun, strict=False))
+        held = self._store.begin(first, self._config.lease_s) if first else []
+        self._begun = dict(zip(first, held, strict=True))
 
     def settle(self, claim: Claim) -> PublishResult | None:
         """Merge one claimed tile and publish it; None: it is postponed or set aside, or its lease is gone."""

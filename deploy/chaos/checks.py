@@ -215,10 +215,12 @@ def find_stuck(found: Findings, store: SqliteStore) -> None:
 
 
 def _unmerged(c: apsw.Connection) -> list[tuple[int, str]]:
-    queued = c.execute("SELECT tile, coalesce(aside_reason, 'is waiting to be merged') FROM dirty").fetchall()
+    queue = c.execute("SELECT tile, coalesce(aside_reason, 'is waiting to be merged') FROM dirty")
+    queued = [(int(str(tile)), str(why)) for tile, why in queue]
     rows = c.execute("SELECT tile, count(*) FROM report WHERE merged_in IS NULL GROUP BY layer, tile").fetchall()
     known = {tile for tile, _ in queued}
-    return [*queued, *((tile, f"{n} reports are in no version") for tile, n in rows if tile not in known)]  # type: ignore[list-item]
+    forgotten = [(int(str(tile)), f"{n} reports are in no version") for tile, n in rows if tile not in known]
+    return queued + forgotten
 
 
 def verified(store: Path) -> tuple[dict[str, int], bool]:

@@ -3,8 +3,7 @@
 import logging
 import os
 import struct
-import threading
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -20,6 +19,7 @@ from deploy.chaos.street import LAYER, Street
 from deploy.chaos.wire import Wires
 from deploy.ports import claim_port
 from deploy.processes import ProcessSpec, Supervisor, start_fork_server
+from deploy.repeating import repeated
 from fleet_bus.bus import open_bus
 from fleet_bus.config import BusConfig
 from gnd_map.errors import GndError
@@ -149,8 +149,8 @@ def running(folder: Path, street: Street, seed: int) -> Iterator[Cloud]:
             bus.request(tile_key(LAYER, beacon.tile_id), b"", kind="tile", timeout_s=READY_S)
         for spec in _client_processes(cloud, seed):
             supervisor.start(spec)
-        stack.enter_context(_repeated(lambda _n: _poll(cloud), POLL_S, "supervisor"))
-        stack.enter_context(_repeated(cloud.shine, BEACON_EVERY_S, "beacon"))
+        stack.enter_context(repeated(lambda _n: _poll(cloud), POLL_S, "supervisor"))
+        stack.enter_context(repeated(cloud.shine, BEACON_EVERY_S, "beacon"))
         yield cloud
 
 
@@ -189,26 +189,6 @@ def _poll(cloud: Cloud) -> None:
     except GndError as error:
         if str(error) not in cloud.died:
             cloud.died.append(str(error))
-
-
-@contextmanager
-def _repeated(work: Callable[[int], object], every_s: float, name: str) -> Iterator[None]:
-    """Call `work` with 0, 1, 2 … from a thread of its own while the block runs."""
-    stop = threading.Event()
-
-    def run() -> None:
-        number = 0
-        while not stop.wait(every_s):
-            work(number)
-            number += 1
-
-    thread = threading.Thread(target=run, name=name)
-    thread.start()
-    try:
-        yield
-    finally:
-        stop.set()
-        thread.join()
 
 
 @contextmanager

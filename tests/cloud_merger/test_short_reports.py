@@ -14,7 +14,10 @@ from short_world import KEY, bases_of, drive_number, flagged, packed_of, tile_at
 from upload_desk import NOW, Desk
 
 from cloud_merger import short_reports
+from cloud_merger.config import ShardConfig
+from cloud_merger.verify import Verifier
 from cloud_merger.wants import WantParameters
+from cloud_merger.work import Worker
 from gnd_map.classes import ChangeClass
 from gnd_map.codec import decode_mask, encode_flags, encode_mask
 from gnd_map.gaussian import Gaussians
@@ -25,6 +28,7 @@ from schemas.keys import change_key
 from schemas.packed import PackedReport, crc_of, decode_upload
 from tile_store.errors import StoreClosed
 from tile_store.sqlite_store import SqliteStore
+from tile_store.values import StoreConfig
 from vehicle_agent.packing import askable, pack, pack_measured
 
 # Back and forth through the district; its ends are near enough.
@@ -167,6 +171,7 @@ import os, signal, sys
 from cloud_merger.config import ShardConfig
 from cloud_merger.expander import Expander
 from tile_store.sqlite_store import SqliteStore
+from tile_store.values import StoreConfig
 
 store = SqliteStore(sys.argv[1])
 settle = store.settle_upload
@@ -401,3 +406,36 @@ def test_the_district_of_the_key_says_where_the_tiles_lie(store, desk):
     assert told.status == "resend"
     assert "has no version 1 here" in told.reason
     assert isinstance(decode_upload(PACKED), PackedReport)
+
+
+def test_what_could_not_win_makes_no_merge_and_counts_in_the_next(tmp_path):
+    """Two against one: nothing is asked of the one. With three more it wins, and its own vote is among theirs."""
+    with SqliteStore(tmp_path / "lazy.sqlite", StoreConfig(merge_delay_s=0.0)) as store:
+        store.put_tiles([tile_at(TILE), tile_at(NEIGHBOUR)])
+        desk = Desk(store)
+        worker = Worker(store, ShardConfig("desk"))
+
+        def merge():
+            while claims := store.claim("desk", 10, 60.0):
+                for claim in claims:
+                    worker.settle(claim)
+
+        def drives(number, **said):
+            report = drive_number(number, **said)
+            told = desk.send(KEY, packed_of(report))
+            if told.wanted:
+                desk.send(KEY, second_half(report, told))
+            return told
+
+        for number in (1, 2):
+            drives(number)
+        merge()
+        assert not drives(3, new={3: POLE}).wanted
+        assert store.dirty_count() == 0, "it waits for another reason to merge"
+        assert drives(4, new={3: POLE}).wanted
+        for number in (5, 6):
+            drives(number, new={3: POLE})
+        merge()
+        changed = store.get("ndt", TILE).decode_gaussians()
+        assert 3 in changed.gaussians.voxel_id, "four of six; without the one that waited three of five, too few"
+        assert {one.status for one in Verifier(store, ShardConfig("desk")).history("ndt", TILE)} <= {"same", "given"}
