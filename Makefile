@@ -32,14 +32,14 @@ check: setup     ## what CI runs beside the tests: style, types, layers, generat
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
 	$(BIN)/lint-imports
-	$(BIN)/python -m schemas.generate --check
+	$(BIN)/python -m gnd.schemas.generate --check
 	$(BIN)/pytest --collect-only --quiet --quiet > /dev/null
 
 bench: setup     ## print the benchmarks with their commands
-	$(BIN)/python -m benchmarks $(ARGS)
+	$(BIN)/python -m studies $(ARGS)
 
 schemas: setup   ## generate Python from schemas/*.proto
-	$(BIN)/python -m schemas.generate
+	$(BIN)/python -m gnd.schemas.generate
 
 clean:           ## remove what was made
 	rm -rf $(VENV) build *.egg-info .mypy_cache .ruff_cache .pytest_cache

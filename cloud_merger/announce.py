@@ -10,18 +10,18 @@ from collections.abc import Callable, Sequence
 from dataclasses import replace
 from typing import Final
 
-from cloud_merger.ownership import Members
-from cloud_merger.stored import Bases
-from fleet_bus.bus import Bus
-from fleet_bus.subscribing import RecallingPublisher
-from gnd_map.content import AnyTile, changed_between, encode_content_delta, has_deltas
-from gnd_map.errors import CodecError
-from gnd_map.tile import Tile, diff
-from schemas.errors import SchemaError, TooLarge
-from schemas.keys import update_key
-from schemas.updates import TileUpdate
-from tile_store.store import Store
-from tile_store.values import Notice, StoredTile
+from gnd.cloud_merger.ownership import Members
+from gnd.cloud_merger.stored import Bases
+from gnd.fleet_bus.bus import Bus
+from gnd.fleet_bus.subscribing import RecallingPublisher
+from gnd.gnd_map.content import AnyTile, changed_between, encode_content_delta, has_deltas
+from gnd.gnd_map.errors import CodecError
+from gnd.gnd_map.tile import Tile, diff
+from gnd.schemas.errors import SchemaError, TooLarge
+from gnd.schemas.keys import update_key
+from gnd.schemas.updates import TileUpdate
+from gnd.tile_store.store import Store
+from gnd.tile_store.values import Notice, StoredTile
 
 REMEMBERED_KEYS: Final = 2048
 # A notice goes to everybody who listens: it carries what has changed only where that is little more than itself.

@@ -13,13 +13,13 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from cloud_merger.shift import Shift, ShiftParameters, shift_of
-from cloud_merger.statements import Report, is_withheld
-from gnd_map.gaussian import Gaussians
-from gnd_map.similarity import similarity
-from schemas.changes import TileChange
-from schemas.doubt import DoubtReason
-from tile_store.values import CourseSaid, ShiftTest, Unconfirmed
+from gnd.cloud_merger.shift import Shift, ShiftParameters, shift_of
+from gnd.cloud_merger.statements import Report, is_withheld
+from gnd.gnd_map.gaussian import Gaussians
+from gnd.gnd_map.similarity import similarity
+from gnd.schemas.changes import TileChange
+from gnd.schemas.doubt import DoubtReason
+from gnd.tile_store.values import CourseSaid, ShiftTest, Unconfirmed
 
 ALIKE: Final = 0.5  # similarity of two claims
 AGREE_VOXELS: Final = 12

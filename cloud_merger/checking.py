@@ -6,11 +6,11 @@ from typing import Final
 
 import numpy as np
 
-from cloud_merger.errors import BadReport, MergerError
-from cloud_merger.features.kept import districts_of, square
-from gnd_map.tile_id import TileId
-from schemas.changes import ChangeReport, TileChange
-from tile_store.store import Store
+from gnd.cloud_merger.errors import BadReport, MergerError
+from gnd.cloud_merger.features.kept import districts_of, square
+from gnd.gnd_map.tile_id import TileId
+from gnd.schemas.changes import ChangeReport, TileChange
+from gnd.tile_store.store import Store
 
 MAX_CELLS: Final = 1000  # sub-cells of 10 cm in a voxel of 1 m
 REMEMBERED_PLACES: Final = 65_536

@@ -9,10 +9,10 @@ from typing import Any
 
 import click
 
-from cloud_merger.config import ShardConfig
-from cloud_merger.errors import MergerError
-from cloud_merger.merger import run_shard
-from fleet_bus.health_options import metrics_options
+from gnd.cloud_merger.config import ShardConfig
+from gnd.cloud_merger.errors import MergerError
+from gnd.cloud_merger.merger import run_shard
+from gnd.fleet_bus.health_options import metrics_options
 
 
 @click.command()

@@ -6,18 +6,18 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Final
 
-from cloud_merger.checking import IngestLimits
-from cloud_merger.confirmation import ConfirmationParameters
-from cloud_merger.errors import MergerError
-from cloud_merger.features.check import FeatureLimits
-from cloud_merger.features.parameters import FeatureMergeParameters
-from cloud_merger.merge import MergeParameters
-from cloud_merger.shift import ShiftParameters
-from cloud_merger.waiting import WaitingLimits
-from cloud_merger.wants import WantParameters
-from fleet_bus.config import DEFAULT_ENDPOINT
-from gnd_map.config import from_mapping
-from tile_store.values import DEFAULT_CODEC, StoreConfig, lattice_named
+from gnd.cloud_merger.checking import IngestLimits
+from gnd.cloud_merger.confirmation import ConfirmationParameters
+from gnd.cloud_merger.errors import MergerError
+from gnd.cloud_merger.features.check import FeatureLimits
+from gnd.cloud_merger.features.parameters import FeatureMergeParameters
+from gnd.cloud_merger.merge import MergeParameters
+from gnd.cloud_merger.shift import ShiftParameters
+from gnd.cloud_merger.waiting import WaitingLimits
+from gnd.cloud_merger.wants import WantParameters
+from gnd.fleet_bus.config import DEFAULT_ENDPOINT
+from gnd.gnd_map.config import from_mapping
+from gnd.tile_store.values import DEFAULT_CODEC, StoreConfig, lattice_named
 
 _SHARD_ID: Final = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,63}")
 

@@ -17,13 +17,13 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
-from cloud_merger.errors import MergerError
-from cloud_merger.merge import MergedTile
-from cloud_merger.statements import Report, Witness
-from gnd_map.gaussian import Gaussians
-from gnd_map.grid import VoxelGrid
-from gnd_map.tile import TileDelta, apply
-from tile_store.values import Unconfirmed, WaitingReason
+from gnd.cloud_merger.errors import MergerError
+from gnd.cloud_merger.merge import MergedTile
+from gnd.cloud_merger.statements import Report, Witness
+from gnd.gnd_map.gaussian import Gaussians
+from gnd.gnd_map.grid import VoxelGrid
+from gnd.gnd_map.tile import TileDelta, apply
+from gnd.tile_store.values import Unconfirmed, WaitingReason
 
 Who = Report | Witness
 VOUCHED_VOXELS = 12  # so many claims of a vehicle must others share at least before they vouch for the rest

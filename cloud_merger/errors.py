@@ -7,7 +7,7 @@ GndError
         └── MissingBase a version that it was coded against is not here
 """
 
-from gnd_map.errors import GndError
+from gnd.gnd_map.errors import GndError
 
 
 class MergerError(GndError):

@@ -14,26 +14,26 @@ from typing import Final
 
 from ulid import ULID
 
-from cloud_merger.checking import MapCheck
-from cloud_merger.config import ShardConfig
-from cloud_merger.errors import BadReport, MergerError, NotUnderstood
-from cloud_merger.features.kept import FeatureInbox
-from cloud_merger.ingest import one_line
-from cloud_merger.short_reports import FirstSaid, ShortReports
-from cloud_merger.states import STATUS
-from cloud_merger.stored import Bases
-from cloud_merger.wants import asked_voxels
-from gnd_map.errors import GndError
-from schemas.changes import ChangeReport, split
-from schemas.errors import SchemaError
-from schemas.features import FeatureReport
-from schemas.packed import PackedGaussians, PackedReport, crc_of, decode_upload
-from schemas.report_id import deterministic_report_id
-from schemas.report_states import ReportState
-from tile_store.errors import IdTaken, StoreDamaged, StoreError
-from tile_store.store import Store
-from tile_store.uploads import Answered, FirstHalf, Settled, UploadClaim
-from tile_store.values import ReportRow
+from gnd.cloud_merger.checking import MapCheck
+from gnd.cloud_merger.config import ShardConfig
+from gnd.cloud_merger.errors import BadReport, MergerError, NotUnderstood
+from gnd.cloud_merger.features.kept import FeatureInbox
+from gnd.cloud_merger.ingest import one_line
+from gnd.cloud_merger.short_reports import FirstSaid, ShortReports
+from gnd.cloud_merger.states import STATUS
+from gnd.cloud_merger.stored import Bases
+from gnd.cloud_merger.wants import asked_voxels
+from gnd.gnd_map.errors import GndError
+from gnd.schemas.changes import ChangeReport, split
+from gnd.schemas.errors import SchemaError
+from gnd.schemas.features import FeatureReport
+from gnd.schemas.packed import PackedGaussians, PackedReport, crc_of, decode_upload
+from gnd.schemas.report_id import deterministic_report_id
+from gnd.schemas.report_states import ReportState
+from gnd.tile_store.errors import IdTaken, StoreDamaged, StoreError
+from gnd.tile_store.store import Store
+from gnd.tile_store.uploads import Answered, FirstHalf, Settled, UploadClaim
+from gnd.tile_store.values import ReportRow
 
 REMEMBERED_DISTRICTS: Final = 32
 DAMAGED_RETRY_S: Final = 2.0

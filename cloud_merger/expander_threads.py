@@ -6,7 +6,7 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from typing import Final
 
-from tile_store.errors import StoreClosed
+from gnd.tile_store.errors import StoreClosed
 
 _PAUSE_S: Final = 1.0
 _LOG = logging.getLogger(__name__)

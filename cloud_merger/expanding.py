@@ -1,6 +1,6 @@
 """From a packed report back to an ordinary one: flags and track against the base tiles, then the Gaussians asked for.
 
-Pure functions, the counterpart of `vehicle_agent.packing`. What comes out is a `ChangeReport` as if the vehicle had
+Pure functions, the counterpart of `gnd.vehicle_agent.packing`. What comes out is a `ChangeReport` as if the vehicle had
 sent it whole, but for four things: observed voxels are those that the track predicts, rays are not counted (evidence
 0), poses are as uncertain as those of the report's worst tile, and a voxel that is new or modified whose Gaussian was
 not asked for has count 0 ("withheld"; its class tells it from one that is deleted).
@@ -13,19 +13,19 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from cloud_merger.errors import BadReport, MissingBase
-from gnd_map.classes import ChangeClass
-from gnd_map.codec import Flags, decode_flags, decode_measured
-from gnd_map.errors import CodecError, ConfigError, GndError, ShapeError, TrackError
-from gnd_map.gaussian import Gaussians, concat
-from gnd_map.grid import VoxelGrid
-from gnd_map.tile import Tile
-from gnd_map.tile_id import District, TileId
-from gnd_map.track import Track, decode_track
-from gnd_map.visibility import observed_along
-from schemas import limits
-from schemas.changes import ChangeReport, TileChange
-from schemas.packed import PackedReport, digest_of
+from gnd.cloud_merger.errors import BadReport, MissingBase
+from gnd.gnd_map.classes import ChangeClass
+from gnd.gnd_map.codec import Flags, decode_flags, decode_measured
+from gnd.gnd_map.errors import CodecError, ConfigError, GndError, ShapeError, TrackError
+from gnd.gnd_map.gaussian import Gaussians, concat
+from gnd.gnd_map.grid import VoxelGrid
+from gnd.gnd_map.tile import Tile
+from gnd.gnd_map.tile_id import District, TileId
+from gnd.gnd_map.track import Track, decode_track
+from gnd.gnd_map.visibility import observed_along
+from gnd.schemas import limits
+from gnd.schemas.changes import ChangeReport, TileChange
+from gnd.schemas.packed import PackedReport, digest_of
 
 MEASURED: Final = (int(ChangeClass.NEW), int(ChangeClass.MODIFIED))
 MAX_FLOORS: Final = 400  # of 1 m: looking along a track takes memory for each

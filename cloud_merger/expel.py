@@ -4,13 +4,13 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Literal
 
-from cloud_merger.config import ShardConfig
-from cloud_merger.verify import Verifier
-from gnd_map.content import AnyTile
-from gnd_map.features import FeatureTile
-from gnd_map.tile import Tile, diff
-from gnd_map.tile_id import TileId
-from tile_store.store import Store
+from gnd.cloud_merger.config import ShardConfig
+from gnd.cloud_merger.verify import Verifier
+from gnd.gnd_map.content import AnyTile
+from gnd.gnd_map.features import FeatureTile
+from gnd.gnd_map.tile import Tile, diff
+from gnd.gnd_map.tile_id import TileId
+from gnd.tile_store.store import Store
 
 
 @dataclass(frozen=True, slots=True)

@@ -7,15 +7,15 @@ from dataclasses import dataclass
 from threading import Lock
 from typing import Final
 
-from cloud_merger.parameters import MergeParameters
-from cloud_merger.statements import Report
-from cloud_merger.stored import Bases, report_of
-from cloud_merger.votes import TileVotes
-from cloud_merger.window import TileState
-from gnd_map.tile_id import TileId
-from schemas.errors import SchemaError
-from tile_store.store import Store
-from tile_store.values import JournalMark, ReportRow
+from gnd.cloud_merger.parameters import MergeParameters
+from gnd.cloud_merger.statements import Report
+from gnd.cloud_merger.stored import Bases, report_of
+from gnd.cloud_merger.votes import TileVotes
+from gnd.cloud_merger.window import TileState
+from gnd.gnd_map.tile_id import TileId
+from gnd.schemas.errors import SchemaError
+from gnd.tile_store.store import Store
+from gnd.tile_store.values import JournalMark, ReportRow
 
 REMEMBERED_TILES: Final = 256  # some 400 kB each where a window is full
 

@@ -7,16 +7,16 @@ time share. What the bytes say is found out later (`expander`), and told on the 
 import logging
 from collections.abc import Callable
 
-from cloud_merger.errors import BadReport
-from gnd_map.features import is_feature_layer
-from schemas.changes import ChangeAck
-from schemas.errors import SchemaError
-from schemas.keys import parse_change_key
-from schemas.limits import MAX_AHEAD_NS, MAX_REASON_CHARACTERS
-from schemas.upload_head import UploadHead, head_of_upload
-from tile_store import clocks
-from tile_store.store import Store
-from tile_store.uploads import Upload
+from gnd.cloud_merger.errors import BadReport
+from gnd.gnd_map.features import is_feature_layer
+from gnd.schemas.changes import ChangeAck
+from gnd.schemas.errors import SchemaError
+from gnd.schemas.keys import parse_change_key
+from gnd.schemas.limits import MAX_AHEAD_NS, MAX_REASON_CHARACTERS
+from gnd.schemas.upload_head import UploadHead, head_of_upload
+from gnd.tile_store import clocks
+from gnd.tile_store.store import Store
+from gnd.tile_store.uploads import Upload
 
 _LOG = logging.getLogger(__name__)
 

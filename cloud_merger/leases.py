@@ -7,9 +7,9 @@ from collections.abc import Callable, Iterable
 from types import TracebackType
 from typing import Final
 
-from tile_store.errors import StoreError
-from tile_store.store import Store
-from tile_store.values import SHARD_SILENT_S, Claim
+from gnd.tile_store.errors import StoreError
+from gnd.tile_store.store import Store
+from gnd.tile_store.values import SHARD_SILENT_S, Claim
 
 LONGEST_WORK_S: Final = 300.0
 """A claim is renewed for so long: a merge that hangs must not keep its tile for ever."""

@@ -8,14 +8,14 @@ from dataclasses import replace
 from hashlib import sha256
 from typing import Any, Final
 
-from cloud_merger.config import ShardConfig
-from cloud_merger.confirmation import ConfirmationParameters
-from cloud_merger.errors import MergerError
-from cloud_merger.features.parameters import FeatureMergeParameters
-from cloud_merger.parameters import MergeParameters
-from cloud_merger.shift import ShiftParameters
-from gnd_map.config import from_mapping, to_mapping
-from gnd_map.errors import ConfigError
+from gnd.cloud_merger.config import ShardConfig
+from gnd.cloud_merger.confirmation import ConfirmationParameters
+from gnd.cloud_merger.errors import MergerError
+from gnd.cloud_merger.features.parameters import FeatureMergeParameters
+from gnd.cloud_merger.parameters import MergeParameters
+from gnd.cloud_merger.shift import ShiftParameters
+from gnd.gnd_map.config import from_mapping, to_mapping
+from gnd.gnd_map.errors import ConfigError
 
 _FORMAT: Final = 1
 _GROUPS: Final[dict[str, type[Any]]] = {

@@ -19,9 +19,9 @@ import numpy as np
 import zstandard
 from numpy.typing import NDArray
 
-from cloud_merger.errors import MergerError
-from cloud_merger.statements import EPOCH, STATEMENT, Kind, Report, Rows, Witness, find, states_at
-from gnd_map.gaussian import Gaussians
+from gnd.cloud_merger.errors import MergerError
+from gnd.cloud_merger.statements import EPOCH, STATEMENT, Kind, Report, Rows, Witness, find, states_at
+from gnd.gnd_map.gaussian import Gaussians
 
 I32 = NDArray[np.int32]
 
@@ -42,7 +42,7 @@ _LEVEL: Final = 3
 _NS_PER_S: Final = 1_000_000_000
 
 # One remembered voxel. `observers`: vehicles that confirmed its state, counted up to 255; `last`: 16 bits of the hash
-# of the one that did so last; `day`: of the last observation, `gnd_map.day`.
+# of the one that did so last; `day`: of the last observation, `gnd.gnd_map.day`.
 VOXEL: Final = np.dtype([("voxel_id", np.int32), ("observers", np.uint8), ("last", np.uint16), ("day", np.uint16)])
 
 

@@ -10,13 +10,13 @@ from itertools import pairwise
 import numpy as np
 from numpy.typing import NDArray
 
-from cloud_merger.cluster import Index, dbscan
-from cloud_merger.merge_kernels import clusters_of
-from cloud_merger.parameters import MergeParameters
-from cloud_merger.statements import EPOCH, Kind, Rows, Statements, find, states_at
-from gnd_map.gaussian import Gaussians
-from gnd_map.similarity import pairs_within, similarity
-from gnd_map.tile import TileDelta, apply
+from gnd.cloud_merger.cluster import Index, dbscan
+from gnd.cloud_merger.merge_kernels import clusters_of
+from gnd.cloud_merger.parameters import MergeParameters
+from gnd.cloud_merger.statements import EPOCH, Kind, Rows, Statements, find, states_at
+from gnd.gnd_map.gaussian import Gaussians
+from gnd.gnd_map.similarity import pairs_within, similarity
+from gnd.gnd_map.tile import TileDelta, apply
 
 __all__ = ["MergeParameters", "MergedTile", "merge_tile"]
 

@@ -1,6 +1,6 @@
 """The clusters of a tile's statements (GND 5.1), voxel by voxel in one kernel: no array of pairs is made.
 
-Similarity is the smooth one of `gnd_map.similarity` ("default"). The labels are those of its twin,
+Similarity is the smooth one of `gnd.gnd_map.similarity` ("default"). The labels are those of its twin,
 `cloud_merger.merge.plain_clusters`. What saves most: a statement whose cluster is known is found by nobody any more.
 Where all agree that is one similarity each, not one a pair.
 """
@@ -8,11 +8,11 @@ Where all agree that is one similarity each, not one a pair.
 import numpy as np
 from numpy.typing import NDArray
 
-from cloud_merger.parameters import MergeParameters
-from cloud_merger.statements import Kind, Rows
-from gnd_map.arrays import F32, F64, I32, I64
-from gnd_map.jit import kernel
-from gnd_map.similarity import alike, far_at
+from gnd.cloud_merger.parameters import MergeParameters
+from gnd.cloud_merger.statements import Kind, Rows
+from gnd.gnd_map.arrays import F32, F64, I32, I64
+from gnd.gnd_map.jit import kernel
+from gnd.gnd_map.similarity import alike, far_at
 
 U8 = NDArray[np.uint8]
 Said = tuple[U8, I64, I32, F64, F32, F32, float, float, float]

@@ -5,27 +5,27 @@ import threading
 from contextlib import ExitStack
 from typing import Final
 
-from cloud_merger.announce import Announcer
-from cloud_merger.config import ShardConfig
-from cloud_merger.expander import Expander
-from cloud_merger.expander_threads import working
-from cloud_merger.ingest import Ingest
-from cloud_merger.leases import Leases
-from cloud_merger.metrics import ShardMetrics
-from cloud_merger.ownership import Members, following
-from cloud_merger.reception import Reception
-from cloud_merger.states import States
-from cloud_merger.stored import Bases
-from cloud_merger.warm import warm_up
-from cloud_merger.work import Worker
-from cloud_merger.worker_process import Address, worker_process
-from fleet_bus.bus import open_bus
-from fleet_bus.config import BusConfig
-from fleet_bus.health import HealthServer
-from tile_store.errors import StoreClosed, StoreError
-from tile_store.metrics import store_checks
-from tile_store.sqlite_store import SqliteStore
-from tile_store.values import Claim
+from gnd.cloud_merger.announce import Announcer
+from gnd.cloud_merger.config import ShardConfig
+from gnd.cloud_merger.expander import Expander
+from gnd.cloud_merger.expander_threads import working
+from gnd.cloud_merger.ingest import Ingest
+from gnd.cloud_merger.leases import Leases
+from gnd.cloud_merger.metrics import ShardMetrics
+from gnd.cloud_merger.ownership import Members, following
+from gnd.cloud_merger.reception import Reception
+from gnd.cloud_merger.states import States
+from gnd.cloud_merger.stored import Bases
+from gnd.cloud_merger.warm import warm_up
+from gnd.cloud_merger.work import Worker
+from gnd.cloud_merger.worker_process import Address, worker_process
+from gnd.fleet_bus.bus import open_bus
+from gnd.fleet_bus.config import BusConfig
+from gnd.fleet_bus.health import HealthServer
+from gnd.tile_store.errors import StoreClosed, StoreError
+from gnd.tile_store.metrics import store_checks
+from gnd.tile_store.sqlite_store import SqliteStore
+from gnd.tile_store.values import Claim
 
 __all__ = ["ShardConfig", "run_shard", "run_worker"]
 STORE_RETRY_S: Final = 1.0

@@ -9,9 +9,9 @@ from collections.abc import Collection
 from hashlib import blake2b
 from typing import Final
 
-from fleet_bus.bus import Bus
-from gnd_map.tile_id import District
-from schemas.keys import alive_keys, parse_alive_key
+from gnd.fleet_bus.bus import Bus
+from gnd.gnd_map.tile_id import District
+from gnd.schemas.keys import alive_keys, parse_alive_key
 
 ROLE: Final = "merger"
 

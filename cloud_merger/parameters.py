@@ -3,9 +3,9 @@
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 
-from cloud_merger.errors import MergerError
-from cloud_merger.statements import Mode, Report
-from schemas.changes import TileChange
+from gnd.cloud_merger.errors import MergerError
+from gnd.cloud_merger.statements import Mode, Report
+from gnd.schemas.changes import TileChange
 
 
 @dataclass(frozen=True, slots=True)

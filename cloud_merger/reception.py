@@ -11,14 +11,14 @@ import threading
 from collections.abc import Callable
 from typing import Final
 
-from cloud_merger.ownership import ROLE, Members
-from fleet_bus.bus import Bus
-from fleet_bus.errors import NotMine
-from fleet_bus.serving import Request, Serving
-from gnd_map.tile_id import District
-from schemas.changes import ChangeAck
-from schemas.errors import SchemaError
-from schemas.keys import alive_key, alive_keys, change_key, change_keys, parse_alive_key, parse_change_key
+from gnd.cloud_merger.ownership import ROLE, Members
+from gnd.fleet_bus.bus import Bus
+from gnd.fleet_bus.errors import NotMine
+from gnd.fleet_bus.serving import Request, Serving
+from gnd.gnd_map.tile_id import District
+from gnd.schemas.changes import ChangeAck
+from gnd.schemas.errors import SchemaError
+from gnd.schemas.keys import alive_key, alive_keys, change_key, change_keys, parse_alive_key, parse_change_key
 
 MAX_DECLARED: Final = 4096
 WORKERS: Final = 32  # threads of all of them: acks that come at the same time share a commit

@@ -5,7 +5,7 @@ all by the same step. So the measured Gaussians of a report are laid back onto t
 one small rigid motion over the ground (east, north, turn): a coarse search by votes of pairs of planes, then a robust
 point-to-plane fit (Chen and Medioni 1992; weights of Huber). The changes are explained by it where
 
-1. most of the Gaussians that fit nothing before fit afterwards (`gnd_map.similarity`), many more than by the same
+1. most of the Gaussians that fit nothing before fit afterwards (`gnd.gnd_map.similarity`), many more than by the same
    motion in other directions, which is what chance gives, and
 2. the rest of the tile agrees: of the surfaces that such a motion would displace, most are not reported as unchanged.
 
@@ -21,15 +21,15 @@ from typing import Final
 
 import numpy as np
 
-from cloud_merger import shift_kernels as kernels
-from cloud_merger.errors import MergerError
-from cloud_merger.shift_kernels import Buckets, Mask, Planes
-from cloud_merger.statements import find
-from gnd_map.arrays import F64, I64
-from gnd_map.by_object import ByObject
-from gnd_map.gaussian import Gaussians
-from gnd_map.grid import VoxelGrid
-from schemas.changes import TileChange
+from gnd.cloud_merger import shift_kernels as kernels
+from gnd.cloud_merger.errors import MergerError
+from gnd.cloud_merger.shift_kernels import Buckets, Mask, Planes
+from gnd.cloud_merger.statements import find
+from gnd.gnd_map.arrays import F64, I64
+from gnd.gnd_map.by_object import ByObject
+from gnd.gnd_map.gaussian import Gaussians
+from gnd.gnd_map.grid import VoxelGrid
+from gnd.schemas.changes import TileChange
 
 MAX_GAUSSIANS: Final = 400  # of a report that are looked at, every second, third, ... where there are more
 _LEVEL: Final = 0.95  # cosine with the vertical

@@ -8,9 +8,9 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from gnd_map.arrays import F64, I64
-from gnd_map.jit import inlined, kernel
-from gnd_map.similarity import alike, far_at
+from gnd.gnd_map.arrays import F64, I64
+from gnd.gnd_map.jit import inlined, kernel
+from gnd.gnd_map.similarity import alike, far_at
 
 Mask = NDArray[np.bool_]
 Planes = tuple[F64, F64, F64, F64]

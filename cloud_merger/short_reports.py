@@ -7,23 +7,23 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from cloud_merger.errors import BadReport, MissingBase
-from cloud_merger.expanding import base_versions, expand, is_askable, with_measured
-from cloud_merger.in_play import TilesInPlay
-from cloud_merger.parameters import MergeParameters
-from cloud_merger.stored import Bases, said
-from cloud_merger.waiting import Promises, WaitingLimits
-from cloud_merger.wants import Known, WantParameters, asked_voxels, wanted
-from gnd_map.codec import decode_mask, encode_mask
-from gnd_map.errors import CodecError
-from gnd_map.gaussian import Gaussians
-from gnd_map.tile import Tile
-from gnd_map.tile_id import TileId
-from schemas.changes import ChangeReport, TileChange
-from schemas.keys import parse_change_key
-from schemas.packed import PackedGaussians, PackedReport
-from tile_store.store import Store
-from tile_store.uploads import FirstHalf
+from gnd.cloud_merger.errors import BadReport, MissingBase
+from gnd.cloud_merger.expanding import base_versions, expand, is_askable, with_measured
+from gnd.cloud_merger.in_play import TilesInPlay
+from gnd.cloud_merger.parameters import MergeParameters
+from gnd.cloud_merger.stored import Bases, said
+from gnd.cloud_merger.waiting import Promises, WaitingLimits
+from gnd.cloud_merger.wants import Known, WantParameters, asked_voxels, wanted
+from gnd.gnd_map.codec import decode_mask, encode_mask
+from gnd.gnd_map.errors import CodecError
+from gnd.gnd_map.gaussian import Gaussians
+from gnd.gnd_map.tile import Tile
+from gnd.gnd_map.tile_id import TileId
+from gnd.schemas.changes import ChangeReport, TileChange
+from gnd.schemas.keys import parse_change_key
+from gnd.schemas.packed import PackedGaussians, PackedReport
+from gnd.tile_store.store import Store
+from gnd.tile_store.uploads import FirstHalf
 
 _NO_BASE: Final = b""
 

@@ -13,18 +13,18 @@ from typing import TYPE_CHECKING, Any, Final, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from gnd_map.accumulate import N_MIN_CELLS
-from gnd_map.by_object import ByObject
-from gnd_map.classes import ChangeClass
-from gnd_map.day import day_of
-from gnd_map.gaussian import Gaussians
-from gnd_map.jit import kernel
-from gnd_map.tile import diff
-from schemas.changes import TileChange
-from schemas.course import Course
+from gnd.gnd_map.accumulate import N_MIN_CELLS
+from gnd.gnd_map.by_object import ByObject
+from gnd.gnd_map.classes import ChangeClass
+from gnd.gnd_map.day import day_of
+from gnd.gnd_map.gaussian import Gaussians
+from gnd.gnd_map.jit import kernel
+from gnd.gnd_map.tile import diff
+from gnd.schemas.changes import TileChange
+from gnd.schemas.course import Course
 
 if TYPE_CHECKING:
-    from cloud_merger.memory import TileMemory
+    from gnd.cloud_merger.memory import TileMemory
 
 Mode = Literal["paper", "default"]
 EPOCH = 1  # the number of the epoch's own Gaussian among the states of a voxel

@@ -3,14 +3,14 @@
 import logging
 from typing import Final
 
-from fleet_bus.bus import Bus
-from fleet_bus.errors import BusError, Refused
-from fleet_bus.serving import Request
-from schemas.errors import SchemaError
-from schemas.keys import parse_state_key, state_keys, want_key
-from schemas.report_states import ReportQuestion, ReportState, ReportStates, ReportStatus
-from tile_store.store import Store
-from tile_store.uploads import UploadState
+from gnd.fleet_bus.bus import Bus
+from gnd.fleet_bus.errors import BusError, Refused
+from gnd.fleet_bus.serving import Request
+from gnd.schemas.errors import SchemaError
+from gnd.schemas.keys import parse_state_key, state_keys, want_key
+from gnd.schemas.report_states import ReportQuestion, ReportState, ReportStates, ReportStatus
+from gnd.tile_store.store import Store
+from gnd.tile_store.uploads import UploadState
 
 STATUS: Final[dict[UploadState, ReportStatus]] = {
     "waiting": "waiting",

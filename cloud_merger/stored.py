@@ -8,11 +8,11 @@ from functools import lru_cache
 from threading import Lock
 from typing import Final
 
-from cloud_merger.memory import TileMemory
-from cloud_merger.parameters import MergeParameters
-from cloud_merger.statements import Report
-from cloud_merger.window import TileState
-from gnd_map.codec import (
+from gnd.cloud_merger.memory import TileMemory
+from gnd.cloud_merger.parameters import MergeParameters
+from gnd.cloud_merger.statements import Report
+from gnd.cloud_merger.window import TileState
+from gnd.gnd_map.codec import (
     CODEC_ARCHIVE_ZSTD,
     CODEC_COMPACT_ZSTD,
     CODEC_FLOAT32_ZSTD,
@@ -23,16 +23,16 @@ from gnd_map.codec import (
     is_on,
     lattice_of,
 )
-from gnd_map.content import AnyTile
-from gnd_map.features import is_feature_layer
-from gnd_map.gaussian import Gaussians
-from gnd_map.tile import Tile
-from gnd_map.tile_id import TileId
-from schemas.changes import ChangeReport, TileChange
-from schemas.doubt import DoubtReason
-from schemas.errors import SchemaError
-from tile_store.store import Store
-from tile_store.values import ReportRow, StoredMemory, StoredTile, TileJournal, lattice_named
+from gnd.gnd_map.content import AnyTile
+from gnd.gnd_map.features import is_feature_layer
+from gnd.gnd_map.gaussian import Gaussians
+from gnd.gnd_map.tile import Tile
+from gnd.gnd_map.tile_id import TileId
+from gnd.schemas.changes import ChangeReport, TileChange
+from gnd.schemas.doubt import DoubtReason
+from gnd.schemas.errors import SchemaError
+from gnd.tile_store.store import Store
+from gnd.tile_store.values import ReportRow, StoredMemory, StoredTile, TileJournal, lattice_named
 
 REMEMBERED_REPORTS: Final = 1024  # some 20 kB each
 NEW_GROUND: Final = DoubtReason.IMPLAUSIBLE_SHARE | DoubtReason.POSE_NOT_CHECKED

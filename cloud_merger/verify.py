@@ -4,24 +4,24 @@ from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Literal
 
-from cloud_merger.belief import ShiftTests
-from cloud_merger.config import ShardConfig
-from cloud_merger.errors import MergerError
-from cloud_merger.features.kept import FeatureContents
-from cloud_merger.features.window import LayerMerger, LayerState, refuted_of, windows_of
-from cloud_merger.map_parameters import digest_of, text_of, with_text
-from cloud_merger.memory import TileMemory
-from cloud_merger.statements import Report
-from cloud_merger.stored import Bases, lattice_of_tile, reports_by_window
-from cloud_merger.window import MergedWindow, TileState, WindowMerger, fold
-from gnd_map.content import AnyTile
-from gnd_map.errors import GndError
-from gnd_map.features import FeatureTile, is_feature_layer
-from gnd_map.gaussian import Gaussians
-from gnd_map.tile import Tile
-from gnd_map.tile_id import TileId
-from tile_store.store import Store
-from tile_store.values import Basis, ClosedWindow, ReportRow, StoredTile, VersionInfo
+from gnd.cloud_merger.belief import ShiftTests
+from gnd.cloud_merger.config import ShardConfig
+from gnd.cloud_merger.errors import MergerError
+from gnd.cloud_merger.features.kept import FeatureContents
+from gnd.cloud_merger.features.window import LayerMerger, LayerState, refuted_of, windows_of
+from gnd.cloud_merger.map_parameters import digest_of, text_of, with_text
+from gnd.cloud_merger.memory import TileMemory
+from gnd.cloud_merger.statements import Report
+from gnd.cloud_merger.stored import Bases, lattice_of_tile, reports_by_window
+from gnd.cloud_merger.window import MergedWindow, TileState, WindowMerger, fold
+from gnd.gnd_map.content import AnyTile
+from gnd.gnd_map.errors import GndError
+from gnd.gnd_map.features import FeatureTile, is_feature_layer
+from gnd.gnd_map.gaussian import Gaussians
+from gnd.gnd_map.tile import Tile
+from gnd.gnd_map.tile_id import TileId
+from gnd.tile_store.store import Store
+from gnd.tile_store.values import Basis, ClosedWindow, ReportRow, StoredTile, VersionInfo
 
 Status = Literal["same", "differs", "given", "unknown"]
 

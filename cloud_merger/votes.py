@@ -11,10 +11,10 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from cloud_merger.statements import NO_BASE, Kind, Report, changed_of, index_of, same_state, states_at
-from gnd_map.arrays import F64, I32, I64
-from gnd_map.gaussian import Gaussians
-from gnd_map.jit import kernel
+from gnd.cloud_merger.statements import NO_BASE, Kind, Report, changed_of, index_of, same_state, states_at
+from gnd.gnd_map.arrays import F64, I32, I64
+from gnd.gnd_map.gaussian import Gaussians
+from gnd.gnd_map.jit import kernel
 
 U8 = NDArray[np.uint8]
 Mask = NDArray[np.bool_]

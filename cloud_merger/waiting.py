@@ -13,9 +13,9 @@ from typing import Final
 
 import numpy as np
 
-from cloud_merger.errors import MergerError
-from gnd_map.arrays import I32
-from gnd_map.tile_id import TileId
+from gnd.cloud_merger.errors import MergerError
+from gnd.gnd_map.arrays import I32
+from gnd.gnd_map.tile_id import TileId
 
 _NS_PER_S: Final = 1_000_000_000
 

@@ -11,11 +11,11 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
-from cloud_merger.errors import MergerError
-from cloud_merger.expanding import is_askable
-from cloud_merger.memory import TileMemory
-from cloud_merger.parameters import MergeParameters
-from cloud_merger.statements import (
+from gnd.cloud_merger.errors import MergerError
+from gnd.cloud_merger.expanding import is_askable
+from gnd.cloud_merger.memory import TileMemory
+from gnd.cloud_merger.parameters import MergeParameters
+from gnd.cloud_merger.statements import (
     EPOCH,
     Kind,
     Report,
@@ -23,13 +23,13 @@ from cloud_merger.statements import (
     same_state,
     states_at,
 )
-from cloud_merger.votes import TileVotes, quotable
-from gnd_map.arrays import I32
-from gnd_map.classes import ChangeClass
-from gnd_map.day import day_of
-from gnd_map.gaussian import Gaussians
-from gnd_map.tile_id import TileId
-from schemas.changes import ChangeReport, TileChange
+from gnd.cloud_merger.votes import TileVotes, quotable
+from gnd.gnd_map.arrays import I32
+from gnd.gnd_map.classes import ChangeClass
+from gnd.gnd_map.day import day_of
+from gnd.gnd_map.gaussian import Gaussians
+from gnd.gnd_map.tile_id import TileId
+from gnd.schemas.changes import ChangeReport, TileChange
 
 
 @dataclass(frozen=True, slots=True)

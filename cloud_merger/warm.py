@@ -2,12 +2,12 @@
 
 import numpy as np
 
-from cloud_merger.merge_kernels import clusters_of
-from cloud_merger.parameters import MergeParameters
-from cloud_merger.shift import ShiftParameters, shift_of
-from cloud_merger.statements import STATEMENT
-from gnd_map.classes import ChangeClass
-from gnd_map.codec import (
+from gnd.cloud_merger.merge_kernels import clusters_of
+from gnd.cloud_merger.parameters import MergeParameters
+from gnd.cloud_merger.shift import ShiftParameters, shift_of
+from gnd.cloud_merger.statements import STATEMENT
+from gnd.gnd_map.classes import ChangeClass
+from gnd.gnd_map.codec import (
     REPORT,
     Flags,
     decode_flags,
@@ -18,13 +18,13 @@ from gnd_map.codec import (
     encode_measured,
     snap,
 )
-from gnd_map.gaussian import Gaussians
-from gnd_map.similarity import similarity
-from gnd_map.tile_id import TileId
-from gnd_map.track import STEPS, Piece, Track, View
-from gnd_map.visibility import observed_along
-from schemas.changes import TileChange
-from tile_store.warm import warm_up as warm_up_codecs
+from gnd.gnd_map.gaussian import Gaussians
+from gnd.gnd_map.similarity import similarity
+from gnd.gnd_map.tile_id import TileId
+from gnd.gnd_map.track import STEPS, Piece, Track, View
+from gnd.gnd_map.visibility import observed_along
+from gnd.schemas.changes import TileChange
+from gnd.tile_store.warm import warm_up as warm_up_codecs
 
 _TILE = TileId(497353963154)
 

@@ -1,7 +1,7 @@
 """A window of a tile's journal: merged while it is open, folded into the next epoch when it is closed.
 
 A pure function of the tile's state before it and of the set of its reports: any order of work, any crash and any number
-of shards end in the same map, bit for bit, and `cloud_merger.verify` computes any version anew.
+of shards end in the same map, bit for bit, and `gnd.cloud_merger.verify` computes any version anew.
 """
 
 from collections.abc import Iterable, Mapping, Sequence
@@ -12,9 +12,9 @@ from zlib import crc32
 import numpy as np
 from numpy.typing import NDArray
 
-from cloud_merger.belief import Believed, ShiftTests, believed
-from cloud_merger.confirmation import ConfirmationParameters, GatedTile, gate
-from cloud_merger.memory import (
+from gnd.cloud_merger.belief import Believed, ShiftTests, believed
+from gnd.cloud_merger.confirmation import ConfirmationParameters, GatedTile, gate
+from gnd.cloud_merger.memory import (
     ANOTHER_DRIVE_S,
     CLAIMS_OF_VEHICLE,
     CLAIMS_OF_VOXEL,
@@ -22,11 +22,11 @@ from cloud_merger.memory import (
     VOXEL,
     TileMemory,
 )
-from cloud_merger.merge import MergeParameters, merge_tile
-from cloud_merger.statements import EPOCH, Report, Rows, Statements, Witness, find, statements_of
-from gnd_map.codec import Lattice, snap
-from gnd_map.day import day_of
-from gnd_map.gaussian import Gaussians
+from gnd.cloud_merger.merge import MergeParameters, merge_tile
+from gnd.cloud_merger.statements import EPOCH, Report, Rows, Statements, Witness, find, statements_of
+from gnd.gnd_map.codec import Lattice, snap
+from gnd.gnd_map.day import day_of
+from gnd.gnd_map.gaussian import Gaussians
 
 I32 = NDArray[np.int32]
 

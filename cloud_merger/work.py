@@ -4,20 +4,20 @@ import logging
 from collections.abc import Callable, Sequence
 from typing import TypeVar
 
-from cloud_merger.belief import ShiftTests, courses_of
-from cloud_merger.config import ShardConfig
-from cloud_merger.features.kept import FeatureContents, said_of
-from cloud_merger.features.window import LayerMerger, LayerState, names_of, refuted_of, windows_of
-from cloud_merger.map_parameters import text_of
-from cloud_merger.stored import Bases, encode_state, lattice_of_tile, reports_by_window, said
-from cloud_merger.window import WindowMerger, fold, provenance_of
-from gnd_map.features import Feature, FeatureTile, is_feature_layer
-from gnd_map.gaussian import Gaussians
-from gnd_map.tile import Tile
-from schemas.errors import SchemaError
-from tile_store.errors import StoreDamaged, StoreError, UnknownReports
-from tile_store.store import Store
-from tile_store.values import Basis, Claim, Publication, PublishResult, ReportRow, TileWork
+from gnd.cloud_merger.belief import ShiftTests, courses_of
+from gnd.cloud_merger.config import ShardConfig
+from gnd.cloud_merger.features.kept import FeatureContents, said_of
+from gnd.cloud_merger.features.window import LayerMerger, LayerState, names_of, refuted_of, windows_of
+from gnd.cloud_merger.map_parameters import text_of
+from gnd.cloud_merger.stored import Bases, encode_state, lattice_of_tile, reports_by_window, said
+from gnd.cloud_merger.window import WindowMerger, fold, provenance_of
+from gnd.gnd_map.features import Feature, FeatureTile, is_feature_layer
+from gnd.gnd_map.gaussian import Gaussians
+from gnd.gnd_map.tile import Tile
+from gnd.schemas.errors import SchemaError
+from gnd.tile_store.errors import StoreDamaged, StoreError, UnknownReports
+from gnd.tile_store.store import Store
+from gnd.tile_store.values import Basis, Claim, Publication, PublishResult, ReportRow, TileWork
 
 _LOG = logging.getLogger(__name__)
 T = TypeVar("T")

@@ -16,7 +16,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import Final
 
-from cloud_merger.config import ShardConfig
+from gnd.cloud_merger.config import ShardConfig
 
 ENDS_IN_S: Final = 5.0
 NICER: Final = 5
@@ -92,7 +92,7 @@ def _listen(stop: threading.Event, arrived: threading.Event) -> None:
 
 def main() -> None:
     """Read the configuration, then work until the line ends."""
-    from cloud_merger.merger import run_worker
+    from gnd.cloud_merger.merger import run_worker
 
     logging.basicConfig(level=logging.INFO, format="%(asctime)s %(name)s %(levelname)s %(message)s")
     os.nice(NICER)

@@ -8,18 +8,18 @@ from typing import Any
 
 import numpy as np
 
-from deploy.errors import PageError
-from deploy.run_folder import RunFolder
-from deploy.traffic_page import write_page
-from fleet_bus.errors import LedgerError
-from fleet_bus.ledger_file import read_run
-from fleet_bus.links import load_link
-from fleet_bus.traffic import DEFAULT_LINKS, AgentTraffic, agent_traffic, fleet_lines, fleet_totals
-from gnd_map.gaussian import Gaussians
-from gnd_map.tile import diff
-from tile_store.sqlite_store import SqliteStore
-from tile_store.values import DEFAULT_LAYER, StoredTile
-from vehicle_agent.outbox import Outbox
+from gnd.deploy.errors import PageError
+from gnd.deploy.run_folder import RunFolder
+from gnd.deploy.traffic_page import write_page
+from gnd.fleet_bus.errors import LedgerError
+from gnd.fleet_bus.ledger_file import read_run
+from gnd.fleet_bus.links import load_link
+from gnd.fleet_bus.traffic import DEFAULT_LINKS, AgentTraffic, agent_traffic, fleet_lines, fleet_totals
+from gnd.gnd_map.gaussian import Gaussians
+from gnd.gnd_map.tile import diff
+from gnd.tile_store.sqlite_store import SqliteStore
+from gnd.tile_store.values import DEFAULT_LAYER, StoredTile
+from gnd.vehicle_agent.outbox import Outbox
 
 P95 = 0.95
 _SIZES = ("drive_km", "down_bytes", "up_bytes", "down_wire_bytes", "up_wire_bytes", "estimated_wire_bytes")

@@ -13,10 +13,10 @@ import click
 from rich.console import Console
 from rich.table import Table
 
-from deploy.errors import ChaosError
+from gnd.deploy.errors import ChaosError
 
 if TYPE_CHECKING:
-    from deploy.chaos.run import Outcome
+    from gnd.deploy.chaos.run import Outcome
 
 PATH = click.Path(path_type=Path)
 WIDTH = 120
@@ -34,9 +34,9 @@ def chaos(kills: int, seed: int, json_file: Path | None, out: Path | None) -> No
     Ctrl-C ends the faults; what was found until then is checked and printed.
     """
     # The heavy imports wait until the options have been found good.
-    from deploy.chaos.faults import plan
-    from deploy.chaos.run import run_chaos
-    from deploy.live import progress_bars
+    from gnd.deploy.chaos.faults import plan
+    from gnd.deploy.chaos.run import run_chaos
+    from gnd.deploy.live import progress_bars
 
     console = Console(stderr=True)
     folder = _folder(out)

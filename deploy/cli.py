@@ -8,25 +8,31 @@ from typing import Any, Final
 
 import click
 
-from gnd_map.errors import GndError
+from gnd.gnd_map.errors import GndError
 
 COMMANDS: Final[dict[str, tuple[str, str]]] = {
-    "fleet": ("deploy.fleet_cli:fleet", "Run a whole fleet on this machine and watch the map heal."),
-    "lab": ("deploy.lab.command:lab", "Run a fleet over real shaped links in network namespaces (root)."),
-    "load": ("deploy.load.command:load", "Replay kept drives as many vehicles: does the cloud keep up?"),
-    "chaos": ("deploy.chaos_cli:chaos", "Hurt a whole cloud of real processes, and check what it promised."),
-    "watch": ("deploy.watch_cli:watch", "Print the tile updates of a region as they are published."),
-    "traffic": ("deploy.traffic_cli:traffic", "Account for every byte of a run against 3G, 4G and 5G; as a page, too."),
-    "map": ("deploy.map_cli:map_group", "Build, inspect, compare, export, back up and roll back maps."),
-    "features": ("deploy.features_cli:features", "Import, export and list feature layers: Lanelet2, GeoJSON, ..."),
-    "import": ("vehicle_agent.importer_cli:import_drives", "Turn a recording (KITTI, PCD, ROS 2, ...) into a drive."),
-    "localise": ("vehicle_agent.localise_drive.command:localise", "Localise a recorded drive on a map."),
-    "sim": ("fleet_sim.cli:sim", "Write and look at simulated worlds and drives."),
-    "reproduce": ("benchmarks.cli:reproduce", "Reproduce the papers' results and set ours beside them."),
-    "router": ("fleet_bus.cli:router", "Run the Zenoh router alone."),
-    "store": ("tile_store.cli:store", "Run the tile server alone."),
-    "merger": ("cloud_merger.cli:merger", "Run one merger shard alone."),
-    "agent": ("vehicle_agent.cli:agent", "Run one vehicle agent alone."),
+    "fleet": ("gnd.deploy.fleet_cli:fleet", "Run a whole fleet on this machine and watch the map heal."),
+    "lab": ("gnd.deploy.lab.command:lab", "Run a fleet over real shaped links in network namespaces (root)."),
+    "load": ("gnd.deploy.load.command:load", "Replay kept drives as many vehicles: does the cloud keep up?"),
+    "chaos": ("gnd.deploy.chaos_cli:chaos", "Hurt a whole cloud of real processes, and check what it promised."),
+    "watch": ("gnd.deploy.watch_cli:watch", "Print the tile updates of a region as they are published."),
+    "traffic": (
+        "gnd.deploy.traffic_cli:traffic",
+        "Account for every byte of a run against 3G, 4G and 5G; as a page, too.",
+    ),
+    "map": ("gnd.deploy.map_cli:map_group", "Build, inspect, compare, export, back up and roll back maps."),
+    "features": ("gnd.deploy.features_cli:features", "Import, export and list feature layers: Lanelet2, GeoJSON, ..."),
+    "import": (
+        "gnd.vehicle_agent.importer_cli:import_drives",
+        "Turn a recording (KITTI, PCD, ROS 2, ...) into a drive.",
+    ),
+    "localise": ("gnd.vehicle_agent.localise_drive.command:localise", "Localise a recorded drive on a map."),
+    "sim": ("gnd.fleet_sim.cli:sim", "Write and look at simulated worlds and drives."),
+    "reproduce": ("gnd.deploy.reproduce:reproduce", "Reproduce the papers' results and set ours beside them."),
+    "router": ("gnd.fleet_bus.cli:router", "Run the Zenoh router alone."),
+    "store": ("gnd.tile_store.cli:store", "Run the tile server alone."),
+    "merger": ("gnd.cloud_merger.cli:merger", "Run one merger shard alone."),
+    "agent": ("gnd.vehicle_agent.cli:agent", "Run one vehicle agent alone."),
 }
 
 

@@ -8,10 +8,11 @@ GndError
     │   └── LabRuns        a lab of that name is running
     ├── PageError          a page cannot be written
     ├── ChaosError         a chaos run cannot start, or its street cannot be read
+    ├── NoStudies          the papers' results can be reproduced in a checkout only
     └── RegionError        a region that is no wildcard, tile or circle
 """
 
-from gnd_map.errors import GndError
+from gnd.gnd_map.errors import GndError
 
 
 class DeployError(GndError):
@@ -44,3 +45,7 @@ class PageError(DeployError):
 
 class ChaosError(DeployError):
     """A chaos run cannot start, or its street cannot be read."""
+
+
+class NoStudies(DeployError):
+    """The studies are not there: the papers' results can be reproduced in a checkout only."""

@@ -8,16 +8,16 @@ from typing import Any
 
 import numpy as np
 
-from cloud_merger.expanding import is_askable
-from deploy.account import TileHistory
-from fleet_sim.evaluate import Evaluation, Tiles, evaluate_maps
-from fleet_sim.truth import LEVELS, Truth
-from gnd_map.gaussian import Gaussians, concat
-from gnd_map.tile import TileDelta, apply, diff
-from gnd_map.tile_id import TileId
-from schemas.changes import ChangeReport, TileChange
-from tile_store.sqlite_store import SqliteStore
-from tile_store.values import DEFAULT_LAYER
+from gnd.cloud_merger.expanding import is_askable
+from gnd.deploy.account import TileHistory
+from gnd.fleet_sim.evaluate import Evaluation, Tiles, evaluate_maps
+from gnd.fleet_sim.truth import LEVELS, Truth
+from gnd.gnd_map.gaussian import Gaussians, concat
+from gnd.gnd_map.tile import TileDelta, apply, diff
+from gnd.gnd_map.tile_id import TileId
+from gnd.schemas.changes import ChangeReport, TileChange
+from gnd.tile_store.sqlite_store import SqliteStore
+from gnd.tile_store.values import DEFAULT_LAYER
 
 
 @dataclass(frozen=True, slots=True)

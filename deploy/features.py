@@ -6,14 +6,14 @@ from pathlib import Path
 from statistics import fmean
 from typing import Any
 
-from fleet_sim.feature_files import read_feature_layers
-from fleet_sim.feature_scores import FeatureScore, score_features, tiles_of_one_drive
-from fleet_sim.feature_truth import FeatureTruth, feature_truth
-from fleet_sim.world import read_world
-from gnd_map.features import Feature, FeatureTile, feature_id_of
-from gnd_map.tile_id import TileId
-from schemas.features import FeatureReport
-from tile_store.sqlite_store import SqliteStore
+from gnd.fleet_sim.feature_files import read_feature_layers
+from gnd.fleet_sim.feature_scores import FeatureScore, score_features, tiles_of_one_drive
+from gnd.fleet_sim.feature_truth import FeatureTruth, feature_truth
+from gnd.fleet_sim.world import read_world
+from gnd.gnd_map.features import Feature, FeatureTile, feature_id_of
+from gnd.gnd_map.tile_id import TileId
+from gnd.schemas.features import FeatureReport
+from gnd.tile_store.sqlite_store import SqliteStore
 
 
 def put_base_layers(store: Path, features: Path, layers: Sequence[str]) -> None:

@@ -10,16 +10,16 @@ import click
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TaskID, TaskProgressColumn, TextColumn, TimeElapsedColumn
 
-from deploy import features_tables as tables
-from tile_store.cli import PATH, json_option, region_option, show, store_to_fill
-from tile_store.feature_io.about import about_options
-from tile_store.feature_io.errors import FeatureFileError
-from tile_store.feature_io.formats import FORMATS, WRITTEN, export_features, format_of, read_features
-from tile_store.feature_io.geojson_export import as_geojson
-from tile_store.feature_io.placement import Placement
-from tile_store.feature_io.stored import import_features, load_features, sources_of
-from tile_store.feature_io.values import LEFT_OUT, SIGMA_M, SURE, ImportOptions, MapFeature, default_source
-from tile_store.sqlite_store import SqliteStore
+from gnd.deploy import features_tables as tables
+from gnd.tile_store.cli import PATH, json_option, region_option, show, store_to_fill
+from gnd.tile_store.feature_io.about import about_options
+from gnd.tile_store.feature_io.errors import FeatureFileError
+from gnd.tile_store.feature_io.formats import FORMATS, WRITTEN, export_features, format_of, read_features
+from gnd.tile_store.feature_io.geojson_export import as_geojson
+from gnd.tile_store.feature_io.placement import Placement
+from gnd.tile_store.feature_io.stored import import_features, load_features, sources_of
+from gnd.tile_store.feature_io.values import LEFT_OUT, SIGMA_M, SURE, ImportOptions, MapFeature, default_source
+from gnd.tile_store.sqlite_store import SqliteStore
 
 GEOREFERENCE_HELP: Final = (
     "Where local coordinates lie: latlon (the file's lat and lon hold), LAT,LON[,HEIGHT[,BEARING]] of the local origin "
@@ -99,7 +99,7 @@ def _placement(said: str | None, poses: Path | None, fixes: Path | None) -> Plac
     if said == "track":
         if poses is None or fixes is None:
             raise FeatureFileError("--georeference track needs --poses FILE and --fixes FILE")
-        from vehicle_agent.localise.drawn_map import placement_by_track  # it loads gtsam
+        from gnd.vehicle_agent.localise.drawn_map import placement_by_track  # it loads gtsam
 
         return placement_by_track(poses, fixes)
     if poses is not None or fixes is not None:

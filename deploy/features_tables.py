@@ -5,11 +5,11 @@ from typing import Any
 from rich.console import Console
 from rich.table import Table
 
-from tile_store import tables
-from tile_store.feature_io.formats import ExportResult
-from tile_store.feature_io.stored import ImportResult, layer_tiles
-from tile_store.feature_io.values import MapFeature
-from tile_store.sqlite_store import SqliteStore
+from gnd.tile_store import tables
+from gnd.tile_store.feature_io.formats import ExportResult
+from gnd.tile_store.feature_io.stored import ImportResult, layer_tiles
+from gnd.tile_store.feature_io.values import MapFeature
+from gnd.tile_store.sqlite_store import SqliteStore
 
 
 def print_import(console: Console, path: str, result: ImportResult) -> None:

@@ -14,28 +14,28 @@ from pathlib import Path
 
 from rich.console import Console
 
-from cloud_merger.merge import MergeParameters
-from cloud_merger.merger import ShardConfig
-from deploy import roles
-from deploy.errors import DeployError
-from deploy.fleet_config import FleetConfig
-from deploy.live import FleetState, View, live_view
-from deploy.live_traffic import LiveLedgers
-from deploy.map_use import Versions, map_use, read_ways
-from deploy.prepare import PreparedRun
-from deploy.processes import ProcessSpec, Supervisor
-from deploy.run_folder import RunFolder
-from deploy.site import Site, VehicleSite, loopback_site
-from fleet_bus.bus import open_bus
-from fleet_bus.config import BusConfig
-from fleet_bus.links import load_link
-from schemas.keys import traffic_keys
-from tile_store.sqlite_store import SqliteStore
-from tile_store.values import StoreConfig
-from vehicle_agent.agent import AgentConfig
-from vehicle_agent.detect.parameters import DetectParameters
-from vehicle_agent.features.layer_parameters import FeatureParameters
-from vehicle_agent.world_clock import Departure, WorldClock, make_clock
+from gnd.cloud_merger.merge import MergeParameters
+from gnd.cloud_merger.merger import ShardConfig
+from gnd.deploy import roles
+from gnd.deploy.errors import DeployError
+from gnd.deploy.fleet_config import FleetConfig
+from gnd.deploy.live import FleetState, View, live_view
+from gnd.deploy.live_traffic import LiveLedgers
+from gnd.deploy.map_use import Versions, map_use, read_ways
+from gnd.deploy.prepare import PreparedRun
+from gnd.deploy.processes import ProcessSpec, Supervisor
+from gnd.deploy.run_folder import RunFolder
+from gnd.deploy.site import Site, VehicleSite, loopback_site
+from gnd.fleet_bus.bus import open_bus
+from gnd.fleet_bus.config import BusConfig
+from gnd.fleet_bus.links import load_link
+from gnd.schemas.keys import traffic_keys
+from gnd.tile_store.sqlite_store import SqliteStore
+from gnd.tile_store.values import StoreConfig
+from gnd.vehicle_agent.agent import AgentConfig
+from gnd.vehicle_agent.detect.parameters import DetectParameters
+from gnd.vehicle_agent.features.layer_parameters import FeatureParameters
+from gnd.vehicle_agent.world_clock import Departure, WorldClock, make_clock
 
 POLL_S = 0.2
 LOOK_S = 2.0

@@ -13,12 +13,12 @@ from typing import Any, TypeVar
 import click
 from rich.console import Console
 
-from deploy.fleet_config import FleetConfig, load_fleet_config
-from deploy.ports import claim_port
-from deploy.run_folder import RunFolder, create_run_folder, default_run_path
-from deploy.site import Site
-from deploy.source import Source
-from fleet_bus.links import load_link
+from gnd.deploy.fleet_config import FleetConfig, load_fleet_config
+from gnd.deploy.ports import claim_port
+from gnd.deploy.run_folder import RunFolder, create_run_folder, default_run_path
+from gnd.deploy.site import Site
+from gnd.deploy.source import Source
+from gnd.fleet_bus.links import load_link
 
 PATH = click.Path(path_type=Path)
 
@@ -134,10 +134,10 @@ def run(
         The content of `summary.json`.
     """
     # The heavy imports wait until the options have been found good.
-    from deploy import prepare, summary
-    from deploy.fleet import run_fleet
-    from deploy.live import progress_bars
-    from deploy.processes import start_fork_server
+    from gnd.deploy import prepare, summary
+    from gnd.deploy.fleet import run_fleet
+    from gnd.deploy.live import progress_bars
+    from gnd.deploy.processes import start_fork_server
 
     console = Console(stderr=True)
     stop, started_s = _stop_on_sigterm(), time.monotonic()
@@ -163,7 +163,7 @@ def _stop_on_sigterm() -> threading.Event:
 
 def summary_text(summary: dict[str, Any], folder: RunFolder) -> str:
     """Return the summary as a few lines for people."""
-    from deploy.summary import summary_lines
+    from gnd.deploy.summary import summary_lines
 
     lines = [*summary_lines(summary), f"everything else: {folder.root}"]
     if folder.traffic_page.exists():

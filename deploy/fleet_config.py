@@ -8,8 +8,8 @@ from math import radians
 from pathlib import Path
 from typing import Any
 
-from deploy.errors import DeployError
-from gnd_map.config import from_mapping
+from gnd.deploy.errors import DeployError
+from gnd.gnd_map.config import from_mapping
 
 MAX_AGENTS = 200
 MAX_SHARDS = 32
@@ -123,7 +123,7 @@ def load_fleet_config(path: Path | None, overrides: dict[str, Any]) -> FleetConf
 
 
 def _shipped_defaults() -> dict[str, Any]:
-    text = resources.files("deploy").joinpath("fleet.toml").read_text(encoding="utf-8")
+    text = resources.files("gnd.deploy").joinpath("fleet.toml").read_text(encoding="utf-8")
     return tomllib.loads(text)
 
 

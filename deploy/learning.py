@@ -14,20 +14,20 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from deploy.map_use import Versions, Ways, map_use, read_ways
-from deploy.run_folder import RunFolder
-from fleet_sim.evaluate import Tiles, classes_of_maps, voxel_rows
-from fleet_sim.truth import Truth
-from gnd_map.arrays import F64
-from gnd_map.classes import CHANGED
-from gnd_map.gaussian import Gaussians
-from gnd_map.grid import VoxelGrid
-from gnd_map.tile_id import TileId
-from schemas.changes import ChangeReport, TileChange
-from tile_store.sqlite_store import SqliteStore
-from tile_store.values import DEFAULT_LAYER
-from vehicle_agent.detect.parameters import DetectParameters
-from vehicle_agent.way import Milestone
+from gnd.deploy.map_use import Versions, Ways, map_use, read_ways
+from gnd.deploy.run_folder import RunFolder
+from gnd.fleet_sim.evaluate import Tiles, classes_of_maps, voxel_rows
+from gnd.fleet_sim.truth import Truth
+from gnd.gnd_map.arrays import F64
+from gnd.gnd_map.classes import CHANGED
+from gnd.gnd_map.gaussian import Gaussians
+from gnd.gnd_map.grid import VoxelGrid
+from gnd.gnd_map.tile_id import TileId
+from gnd.schemas.changes import ChangeReport, TileChange
+from gnd.tile_store.sqlite_store import SqliteStore
+from gnd.tile_store.values import DEFAULT_LAYER
+from gnd.vehicle_agent.detect.parameters import DetectParameters
+from gnd.vehicle_agent.way import Milestone
 
 _NS_PER_S: Final = 1e9
 NO_TRUTH: Final = {"known_share": None, "first_update_after_s": None, "first_update_after_drive_s": None}

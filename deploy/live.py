@@ -13,11 +13,11 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 from rich.table import Table
 from rich.text import Text
 
-from deploy.live_traffic import LiveLedgers, kinds_table, link_of, plain_traffic, rate_cell
-from deploy.map_use import MapUse
-from fleet_bus.links import LinkProfile
-from schemas.errors import SchemaError
-from schemas.traffic import TrafficSample
+from gnd.deploy.live_traffic import LiveLedgers, kinds_table, link_of, plain_traffic, rate_cell
+from gnd.deploy.map_use import MapUse
+from gnd.fleet_bus.links import LinkProfile
+from gnd.schemas.errors import SchemaError
+from gnd.schemas.traffic import TrafficSample
 
 HEALTH_STYLE = {"good": "green", "degraded": "yellow", "lost": "red"}
 PLAIN_PERIOD_S = 10.0

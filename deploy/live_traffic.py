@@ -13,11 +13,11 @@ from typing import Any, Final, Literal
 
 from rich.table import Table
 
-from fleet_bus.errors import LedgerError
-from fleet_bus.ledger_file import AgentLedger, read_run
-from fleet_bus.links import UNLIMITED, LinkProfile
-from fleet_bus.traffic import AgentTraffic, agent_traffic, fleet_lines, fleet_totals, per_km
-from fleet_bus.traffic_wire import RESIDUES
+from gnd.fleet_bus.errors import LedgerError
+from gnd.fleet_bus.ledger_file import AgentLedger, read_run
+from gnd.fleet_bus.links import UNLIMITED, LinkProfile
+from gnd.fleet_bus.traffic import AgentTraffic, agent_traffic, fleet_lines, fleet_totals, per_km
+from gnd.fleet_bus.traffic_wire import RESIDUES
 
 _OLD_S: Final = 15.0
 """A running vehicle notes what its connection carried every second."""

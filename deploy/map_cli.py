@@ -7,13 +7,13 @@ import click
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TaskID, TextColumn, TimeElapsedColumn
 
-from deploy.tile_memory_cli import memory
-from deploy.vehicle_rollback_cli import rollback
-from deploy.verify_cli import verify
-from tile_store import tables
-from tile_store.cli import PATH, json_option, layer_option, show, store_to_fill
-from tile_store.cli import map_group as store_group
-from tile_store.values import DEFAULT_CODEC, MAP_CODECS
+from gnd.deploy.tile_memory_cli import memory
+from gnd.deploy.vehicle_rollback_cli import rollback
+from gnd.deploy.verify_cli import verify
+from gnd.tile_store import tables
+from gnd.tile_store.cli import PATH, json_option, layer_option, show, store_to_fill
+from gnd.tile_store.cli import map_group as store_group
+from gnd.tile_store.values import DEFAULT_CODEC, MAP_CODECS
 
 CODEC_HELP: Final = "How finely Gaussians are rounded."
 REFINE_HELP: Final = (
@@ -47,10 +47,10 @@ def build(
     poses from odometry do, loops are closed first; several drives become one map. What is out of bounds is said.
     """
     # loaded here: they load numba, gtsam and matplotlib, which the other commands do without
-    from deploy.map_page import check_writable, write_map_page
-    from vehicle_agent.map_build.build import build_recorded_map
-    from vehicle_agent.map_build.quality import measure
-    from vehicle_agent.map_build.result import summary
+    from gnd.deploy.map_page import check_writable, write_map_page
+    from gnd.vehicle_agent.map_build.build import build_recorded_map
+    from gnd.vehicle_agent.map_build.quality import measure
+    from gnd.vehicle_agent.map_build.result import summary
 
     if report is not None:
         check_writable(report)

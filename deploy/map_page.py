@@ -8,13 +8,13 @@ from html import escape
 from pathlib import Path
 from typing import Any, Final
 
-from deploy.errors import PageError
-from deploy.map_page_pictures import height_picture, map_picture, thickness_picture
-from deploy.traffic_page_style import STYLE
-from vehicle_agent.map_build.build import BuiltMap
-from vehicle_agent.map_build.quality import MOST_DOUBLED_ROAD, MOST_DOUBLED_WALLS, MOST_THICK_M, Quality
-from vehicle_agent.map_build.refine_poses import PassDrift
-from vehicle_agent.map_build.result import summary
+from gnd.deploy.errors import PageError
+from gnd.deploy.map_page_pictures import height_picture, map_picture, thickness_picture
+from gnd.deploy.traffic_page_style import STYLE
+from gnd.vehicle_agent.map_build.build import BuiltMap
+from gnd.vehicle_agent.map_build.quality import MOST_DOUBLED_ROAD, MOST_DOUBLED_WALLS, MOST_THICK_M, Quality
+from gnd.vehicle_agent.map_build.refine_poses import PassDrift
+from gnd.vehicle_agent.map_build.result import summary
 
 _MORE_STYLE: Final = """
 figure img{display:block;width:100%;max-width:52rem;height:auto;border-radius:.5rem;background:#fff}

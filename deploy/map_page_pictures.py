@@ -7,9 +7,9 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from vehicle_agent.localise_drive.style import FAINT, INK, dress
-from vehicle_agent.map_build.build import BuiltMap
-from vehicle_agent.map_build.quality import MOUNT_M, Quality
+from gnd.vehicle_agent.localise_drive.style import FAINT, INK, dress
+from gnd.vehicle_agent.map_build.build import BuiltMap
+from gnd.vehicle_agent.map_build.quality import MOUNT_M, Quality
 
 DRIVES: Final = ("#2a6fbb", "#c8641a", "#007d79", "#8a3ffc", "#a98600")
 DOUBLE: Final = "#d1433f"

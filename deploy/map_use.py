@@ -6,11 +6,11 @@ from typing import Final
 
 import numpy as np
 
-from deploy.run_folder import RunFolder
-from gnd_map.tile_id import TileId
-from tile_store.sqlite_store import SqliteStore
-from tile_store.values import DEFAULT_LAYER, VersionInfo
-from vehicle_agent.way import Milestone, read_way
+from gnd.deploy.run_folder import RunFolder
+from gnd.gnd_map.tile_id import TileId
+from gnd.tile_store.sqlite_store import SqliteStore
+from gnd.tile_store.values import DEFAULT_LAYER, VersionInfo
+from gnd.vehicle_agent.way import Milestone, read_way
 
 _NS_PER_S: Final = 1e9
 

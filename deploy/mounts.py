@@ -6,9 +6,9 @@ from pathlib import Path
 
 import numpy as np
 
-from deploy.errors import DeployError
-from gnd_map.se3 import exp_so3
-from schemas.drive_mcap import DriveWriter, read_drive, read_header
+from gnd.deploy.errors import DeployError
+from gnd.gnd_map.se3 import exp_so3
+from gnd.schemas.drive_mcap import DriveWriter, read_drive, read_header
 
 
 def with_wrong_mounts(drives: Sequence[Path], wrong: Mapping[int, float], folder: Path) -> tuple[Path, ...]:

@@ -2,7 +2,7 @@
 
 import socket
 
-from deploy.errors import DeployError
+from gnd.deploy.errors import DeployError
 
 
 def claim_port(port: int) -> int:

@@ -8,14 +8,14 @@ import gc
 import logging
 import os
 
-import cloud_merger.merger
-import deploy.roles
-import tile_store.server
-import vehicle_agent.agent
-import vehicle_agent.features.feature_work
-from vehicle_agent.warm import warm_up
+import gnd.cloud_merger.merger
+import gnd.deploy.roles
+import gnd.tile_store.server
+import gnd.vehicle_agent.agent
+import gnd.vehicle_agent.features.feature_work
+from gnd.vehicle_agent.warm import warm_up
 
-__all__ = ["cloud_merger", "deploy", "tile_store", "vehicle_agent"]
+__all__ = ["gnd"]
 
 
 def _compile_in_a_child() -> None:

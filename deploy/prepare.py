@@ -11,16 +11,16 @@ from pathlib import Path
 
 from rich.progress import Progress, TaskID
 
-from deploy.errors import DeployError
-from deploy.features import put_base_layers
-from deploy.fleet_config import FleetConfig
-from deploy.mounts import with_wrong_mounts
-from deploy.run_folder import RunFolder
-from deploy.source import Source
-from fleet_sim.prepare import prepare_fleet_run
-from schemas.drive_mcap import read_header
-from tile_store.build import build_map
-from tile_store.sqlite_store import SqliteStore
+from gnd.deploy.errors import DeployError
+from gnd.deploy.features import put_base_layers
+from gnd.deploy.fleet_config import FleetConfig
+from gnd.deploy.mounts import with_wrong_mounts
+from gnd.deploy.run_folder import RunFolder
+from gnd.deploy.source import Source
+from gnd.fleet_sim.prepare import prepare_fleet_run
+from gnd.schemas.drive_mcap import read_header
+from gnd.tile_store.build import build_map
+from gnd.tile_store.sqlite_store import SqliteStore
 
 
 @dataclass(frozen=True, slots=True)
@@ -107,7 +107,7 @@ def starts_of(agents: int, headway_s: float) -> tuple[float, ...]:
 def sources_sha() -> str:
     """Return a hash over the programs that decide what a simulated world, its drives and its base map are."""
     names = ("fleet_sim", "gnd_map", "schemas", "tile_store")
-    folders = [Path(str(importlib.resources.files(name))) for name in names]
+    folders = [Path(str(importlib.resources.files(f"gnd.{name}"))) for name in names]
     files = sorted(file for folder in folders for file in folder.rglob("*.py"))
     return hashlib.sha256(b"".join(file.read_bytes() for file in files)).hexdigest()
 

@@ -20,10 +20,10 @@ from multiprocessing.context import ForkServerProcess
 from pathlib import Path
 from typing import Any, Final
 
-from deploy.errors import ProcessDied
-from deploy.lab.namespaces import enter_namespace
+from gnd.deploy.errors import ProcessDied
+from gnd.deploy.lab.namespaces import enter_namespace
 
-PRELOAD: Final = ("deploy.preload",)
+PRELOAD: Final = ("gnd.deploy.preload",)
 STOP_GRACE_S: Final = 10.0
 MAX_RESTARTS: Final = 5  # within `RESTARTS_SPAN_S`: a part that dies more often by itself will not live
 RESTARTS_SPAN_S: Final = 60.0

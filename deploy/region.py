@@ -4,9 +4,9 @@ import math
 import posixpath
 from dataclasses import dataclass
 
-from deploy.errors import RegionError
-from gnd_map.errors import GndError
-from gnd_map.tile_id import TileId, covering_circle
+from gnd.deploy.errors import RegionError
+from gnd.gnd_map.errors import GndError
+from gnd.gnd_map.tile_id import TileId, covering_circle
 
 MAX_RADIUS_M = 20_000.0
 

@@ -3,15 +3,15 @@
 import threading
 from pathlib import Path
 
-from cloud_merger.merger import ShardConfig, run_shard
-from deploy.region import Region
-from deploy.watch import record_updates
-from fleet_bus.bus import open_bus
-from fleet_bus.config import BusConfig
-from fleet_bus.router import run_router, wait_for_stop
-from tile_store.server import TileServer
-from tile_store.sqlite_store import SqliteStore
-from vehicle_agent.agent import AgentConfig, run_agent
+from gnd.cloud_merger.merger import ShardConfig, run_shard
+from gnd.deploy.region import Region
+from gnd.deploy.watch import record_updates
+from gnd.fleet_bus.bus import open_bus
+from gnd.fleet_bus.config import BusConfig
+from gnd.fleet_bus.router import run_router, wait_for_stop
+from gnd.tile_store.server import TileServer
+from gnd.tile_store.sqlite_store import SqliteStore
+from gnd.vehicle_agent.agent import AgentConfig, run_agent
 
 
 def router(listen: str, *, stop: threading.Event) -> None:

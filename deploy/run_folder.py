@@ -7,7 +7,7 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
-from deploy.errors import RunFolderError
+from gnd.deploy.errors import RunFolderError
 
 MARK = "run.json"
 
@@ -44,11 +44,11 @@ class RunFolder:
 
     @property
     def clock(self) -> Path:
-        """The time that the vehicles have in common, see `vehicle_agent.world_clock`."""
+        """The time that the vehicles have in common, see `gnd.vehicle_agent.world_clock`."""
         return self.root / "clock.bin"
 
     def way(self, vehicle: str) -> Path:
-        """Which map a vehicle drove on where, see `vehicle_agent.way`."""
+        """Which map a vehicle drove on where, see `gnd.vehicle_agent.way`."""
         return self.agents / vehicle / "way.jsonl"
 
     @property

@@ -2,10 +2,10 @@
 
 from dataclasses import dataclass
 
-from deploy.fleet_config import FleetConfig
-from deploy.ports import claim_port
-from deploy.processes import ProcessSpec
-from fleet_bus.links import LinkProfile
+from gnd.deploy.fleet_config import FleetConfig
+from gnd.deploy.ports import claim_port
+from gnd.deploy.processes import ProcessSpec
+from gnd.fleet_bus.links import LinkProfile
 
 
 @dataclass(frozen=True, slots=True)

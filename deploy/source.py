@@ -3,7 +3,7 @@
 from dataclasses import dataclass
 from pathlib import Path
 
-from deploy.errors import DeployError
+from gnd.deploy.errors import DeployError
 
 
 @dataclass(frozen=True, slots=True)

@@ -4,21 +4,21 @@ import json
 from pathlib import Path
 from typing import Any
 
-from deploy.account import FleetResults, TileHistory, account_traffic, lost_reports, tile_histories
-from deploy.evaluation import NO_TRUTH, score_run
-from deploy.features import feature_lines, score_layers
-from deploy.fleet import FleetOutcome, count_lines
-from deploy.fleet_config import FleetConfig
-from deploy.learning import account_learning, learning_lines
-from deploy.live_traffic import traffic_lines
-from deploy.prepare import PreparedRun
-from deploy.run_folder import RunFolder
-from fleet_sim.ellipsoids import Tiles, ellipsoids_of_maps
-from fleet_sim.pictures import View, draw_healing, draw_map, draw_run
-from fleet_sim.truth import Truth, read_truth
-from gnd_map.geodesy import LocalFrame
-from tile_store.sqlite_store import SqliteStore
-from tile_store.status import named_vehicles, waiting_totals
+from gnd.deploy.account import FleetResults, TileHistory, account_traffic, lost_reports, tile_histories
+from gnd.deploy.evaluation import NO_TRUTH, score_run
+from gnd.deploy.features import feature_lines, score_layers
+from gnd.deploy.fleet import FleetOutcome, count_lines
+from gnd.deploy.fleet_config import FleetConfig
+from gnd.deploy.learning import account_learning, learning_lines
+from gnd.deploy.live_traffic import traffic_lines
+from gnd.deploy.prepare import PreparedRun
+from gnd.deploy.run_folder import RunFolder
+from gnd.fleet_sim.ellipsoids import Tiles, ellipsoids_of_maps
+from gnd.fleet_sim.pictures import View, draw_healing, draw_map, draw_run
+from gnd.fleet_sim.truth import Truth, read_truth
+from gnd.gnd_map.geodesy import LocalFrame
+from gnd.tile_store.sqlite_store import SqliteStore
+from gnd.tile_store.status import named_vehicles, waiting_totals
 
 
 def write_summary(

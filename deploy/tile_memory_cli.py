@@ -7,14 +7,14 @@ from typing import Any
 import click
 from rich.console import Console
 
-from gnd_map.day import UNKNOWN_DAY, ns_of
-from gnd_map.features import is_feature_layer
-from gnd_map.tile_id import TileId
-from tile_store import tables
-from tile_store.arguments import parse_tile
-from tile_store.errors import StoreError
-from tile_store.options import PATH, json_option, layer_option, show, to_read
-from tile_store.values import StoredMemory
+from gnd.gnd_map.day import UNKNOWN_DAY, ns_of
+from gnd.gnd_map.features import is_feature_layer
+from gnd.gnd_map.tile_id import TileId
+from gnd.tile_store import tables
+from gnd.tile_store.arguments import parse_tile
+from gnd.tile_store.errors import StoreError
+from gnd.tile_store.options import PATH, json_option, layer_option, show, to_read
+from gnd.tile_store.values import StoredMemory
 
 
 @click.command(short_help="What a tile remembers: when voxels were last observed, by how many, how sure they are.")
@@ -45,7 +45,7 @@ def memory(path: Path, tile: str, layer: str, as_json: bool) -> None:
 
 def _voxels(tile: TileId, stored: StoredMemory) -> tuple[dict[str, Any], list[dict[str, Any]]]:
     # loaded here: it loads scipy and numba, which the other commands do without
-    from cloud_merger.stored import decode_state
+    from gnd.cloud_merger.stored import decode_state
 
     state = decode_state(tile, stored)
     voxels, claims = state.memory.voxels, state.memory.claims
@@ -68,7 +68,7 @@ def _voxels(tile: TileId, stored: StoredMemory) -> tuple[dict[str, Any], list[di
 
 
 def _features(_tile: TileId, stored: StoredMemory) -> tuple[dict[str, Any], list[dict[str, Any]]]:
-    from cloud_merger.features.memory import LayerMemory  # loaded here: it loads scipy
+    from gnd.cloud_merger.features.memory import LayerMemory  # loaded here: it loads scipy
 
     tracks = LayerMemory.decode(stored.memory).tracks
     rows = [

@@ -9,13 +9,13 @@ from typing import Final
 import click
 from rich.console import Console
 
-from deploy.traffic_page import write_page
-from fleet_bus.errors import LinkError
-from fleet_bus.ledger_file import read_run, run_folder
-from fleet_bus.links import LinkProfile, load_link
-from fleet_bus.traffic import DEFAULT_LINKS, agent_traffic, as_json
-from fleet_bus.traffic_csv import as_csv
-from fleet_bus.traffic_table import print_tables
+from gnd.deploy.traffic_page import write_page
+from gnd.fleet_bus.errors import LinkError
+from gnd.fleet_bus.ledger_file import read_run, run_folder
+from gnd.fleet_bus.links import LinkProfile, load_link
+from gnd.fleet_bus.traffic import DEFAULT_LINKS, agent_traffic, as_json
+from gnd.fleet_bus.traffic_csv import as_csv
+from gnd.fleet_bus.traffic_table import print_tables
 
 _WIDTH: Final = 110
 

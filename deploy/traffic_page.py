@@ -6,14 +6,14 @@ from collections.abc import Sequence
 from html import escape
 from pathlib import Path
 
-from deploy.errors import PageError
-from deploy.traffic_page_chart import curves
-from deploy.traffic_page_map import tile_map
-from deploy.traffic_page_style import STYLE
-from deploy.traffic_page_tables import agents_table, arrivals_text, cards, kinds_table, links_table, sources
-from fleet_bus.links import LinkProfile
-from fleet_bus.traffic import AgentTraffic, fleet_tiles
-from fleet_bus.traffic_table import notes
+from gnd.deploy.errors import PageError
+from gnd.deploy.traffic_page_chart import curves
+from gnd.deploy.traffic_page_map import tile_map
+from gnd.deploy.traffic_page_style import STYLE
+from gnd.deploy.traffic_page_tables import agents_table, arrivals_text, cards, kinds_table, links_table, sources
+from gnd.fleet_bus.links import LinkProfile
+from gnd.fleet_bus.traffic import AgentTraffic, fleet_tiles
+from gnd.fleet_bus.traffic_table import notes
 
 _HOW = """<p>Payload is what the messages themselves hold. On the wire are the bytes that the kernel counted on each
 vehicle's connection (TCP_INFO: stream and packet headers). They are shared out to the last one: each message has its

@@ -7,10 +7,10 @@ from dataclasses import dataclass
 from html import escape
 from typing import Final
 
-from deploy.live import size_text
-from fleet_bus.ledger import Direction
-from fleet_bus.links import LinkProfile
-from fleet_bus.traffic import AgentTraffic
+from gnd.deploy.live import size_text
+from gnd.fleet_bus.ledger import Direction
+from gnd.fleet_bus.links import LinkProfile
+from gnd.fleet_bus.traffic import AgentTraffic
 
 _WIDTH, _HEIGHT = 460, 330
 _LEFT, _RIGHT, _TOP, _BOTTOM = 62, 40, 10, 42

@@ -4,10 +4,10 @@ import math
 from collections.abc import Sequence
 from typing import Final
 
-from deploy.live import size_text
-from fleet_bus.traffic import TileTraffic
-from gnd_map.errors import GndError
-from gnd_map.tile_id import TileId
+from gnd.deploy.live import size_text
+from gnd.fleet_bus.traffic import TileTraffic
+from gnd.gnd_map.errors import GndError
+from gnd.gnd_map.tile_id import TileId
 
 _SIZE: Final = 420.0
 _LEAST_PX: Final = 2.0

@@ -5,9 +5,9 @@ import math
 from collections.abc import Iterable, Sequence
 from html import escape
 
-from deploy.live import size_text
-from fleet_bus.links import LinkProfile
-from fleet_bus.traffic import AgentTraffic, KindTraffic, fleet_lines, fleet_totals, is_of_tiles, per_km
+from gnd.deploy.live import size_text
+from gnd.fleet_bus.links import LinkProfile
+from gnd.fleet_bus.traffic import AgentTraffic, KindTraffic, fleet_lines, fleet_totals, is_of_tiles, per_km
 
 PAPER_UP_KB_PER_KM = 56.32
 """Upload of the GND paper, kB/km (section 7.5 and abstract)."""

@@ -8,12 +8,12 @@ import click
 from rich.console import Console
 from rich.table import Table
 
-from gnd_map.features import is_feature_layer
-from tile_store.arguments import parse_time_ns
-from tile_store.errors import StoreError
-from tile_store.options import PATH, existing, json_option, layer_option, show, to_read
-from tile_store.upkeep_cli import rollback as store_rollback
-from tile_store.values import DEFAULT_CODEC, MAP_CODECS
+from gnd.gnd_map.features import is_feature_layer
+from gnd.tile_store.arguments import parse_time_ns
+from gnd.tile_store.errors import StoreError
+from gnd.tile_store.options import PATH, existing, json_option, layer_option, show, to_read
+from gnd.tile_store.upkeep_cli import rollback as store_rollback
+from gnd.tile_store.values import DEFAULT_CODEC, MAP_CODECS
 
 PREFIX = "vehicle:"
 _OLD = "Of the shards, where the store does not say: it was merged by an older release."
@@ -58,8 +58,8 @@ def rollback(
     if version is not None:
         raise StoreError("rollback vehicle:NAME goes back to a time, not to a version")
     # loaded here: they load scipy and numba, which the other commands do without
-    from cloud_merger.config import ShardConfig
-    from cloud_merger.expel import without_vehicle
+    from gnd.cloud_merger.config import ShardConfig
+    from gnd.cloud_merger.expel import without_vehicle
 
     since_ns = 0 if to is None else parse_time_ns(to)
     with to_read(path) if dry_run else existing(path) as store:

@@ -9,10 +9,10 @@ import click
 from rich.console import Console
 from rich.progress import track
 
-from tile_store import tables
-from tile_store.cli import PATH, json_option, layer_option, region_option, show
-from tile_store.options import to_read
-from tile_store.values import DEFAULT_CODEC, MAP_CODECS
+from gnd.tile_store import tables
+from gnd.tile_store.cli import PATH, json_option, layer_option, region_option, show
+from gnd.tile_store.options import to_read
+from gnd.tile_store.values import DEFAULT_CODEC, MAP_CODECS
 
 _OLD: Final = "Of the shards, where the store does not say: it was merged by an older release."
 
@@ -33,9 +33,9 @@ def verify(path: Path, layer: str, region: str, all_versions: bool, codec: str, 
     Ends with 1 where one differs. Versions whose reports retention has removed cannot be computed and are counted.
     """
     # loaded here: it loads scipy and numba, which the other commands do without
-    from cloud_merger.config import ShardConfig
-    from cloud_merger.parameters import MergeParameters
-    from cloud_merger.verify import Verified, Verifier
+    from gnd.cloud_merger.config import ShardConfig
+    from gnd.cloud_merger.parameters import MergeParameters
+    from gnd.cloud_merger.verify import Verified, Verifier
 
     with to_read(path) as store:
         config = ShardConfig(store_path=path, codec=codec, merge=MergeParameters(mode=merge_mode))

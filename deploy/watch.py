@@ -14,15 +14,15 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Final
 
-from deploy.region import Region
-from fleet_bus.bus import Bus
-from fleet_bus.errors import BusError
-from gnd_map.features import is_feature_layer
-from gnd_map.tile_id import TileId
-from schemas.errors import SchemaError
-from schemas.keys import catalog_keys, update_keys
-from schemas.tiles import Catalog
-from schemas.updates import TileUpdate
+from gnd.deploy.region import Region
+from gnd.fleet_bus.bus import Bus
+from gnd.fleet_bus.errors import BusError
+from gnd.gnd_map.features import is_feature_layer
+from gnd.gnd_map.tile_id import TileId
+from gnd.schemas.errors import SchemaError
+from gnd.schemas.keys import catalog_keys, update_keys
+from gnd.schemas.tiles import Catalog
+from gnd.schemas.updates import TileUpdate
 
 LAYER: Final = "ndt"
 CATALOG_PERIOD_S: Final = 3.0

@@ -5,10 +5,10 @@ import threading
 
 import click
 
-from deploy.region import parse_region
-from deploy.watch import TileWatch
-from fleet_bus.bus import open_bus
-from fleet_bus.config import BusConfig
+from gnd.deploy.region import parse_region
+from gnd.deploy.watch import TileWatch
+from gnd.fleet_bus.bus import open_bus
+from gnd.fleet_bus.config import BusConfig
 
 
 @click.command()

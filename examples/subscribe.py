@@ -5,9 +5,9 @@ import time
 
 import zenoh
 
-from schemas.keys import catalog_keys, update_keys
-from schemas.tiles import Catalog
-from schemas.updates import TileUpdate
+from gnd.schemas.keys import catalog_keys, update_keys
+from gnd.schemas.tiles import Catalog
+from gnd.schemas.updates import TileUpdate
 
 parser = argparse.ArgumentParser(description=__doc__)
 parser.add_argument("region", nargs="?", default="", help="one to four chunks of a tile path; nothing = everywhere")

@@ -1,8 +1,8 @@
 """The bus: sessions, requests, notices, signs of life, traffic ledger, link profiles. Nobody else imports zenoh."""
 
-from fleet_bus.bus import Bus, open_bus
-from fleet_bus.config import DEFAULT_ENDPOINT, BusConfig
-from fleet_bus.errors import (
+from gnd.fleet_bus.bus import Bus, open_bus
+from gnd.fleet_bus.config import DEFAULT_ENDPOINT, BusConfig
+from gnd.fleet_bus.errors import (
     BusClosed,
     BusConfigError,
     BusError,
@@ -16,12 +16,12 @@ from fleet_bus.errors import (
     RequestFailed,
     RequestRefused,
 )
-from fleet_bus.ledger import KINDS, Ledger, LedgerLine
-from fleet_bus.links import LinkProfile, load_link
-from fleet_bus.requesting import RetryPolicy
-from fleet_bus.router import open_router, run_router
-from fleet_bus.serving import Request
-from fleet_bus.wire import WireBytes
+from gnd.fleet_bus.ledger import KINDS, Ledger, LedgerLine
+from gnd.fleet_bus.links import LinkProfile, load_link
+from gnd.fleet_bus.requesting import RetryPolicy
+from gnd.fleet_bus.router import open_router, run_router
+from gnd.fleet_bus.serving import Request
+from gnd.fleet_bus.wire import WireBytes
 
 __all__ = [
     "DEFAULT_ENDPOINT",

@@ -3,16 +3,24 @@
 import threading
 from typing import Self, TypeVar
 
-from fleet_bus import leftovers, requesting, subscribing
-from fleet_bus.config import BusConfig
-from fleet_bus.connection import Connection
-from fleet_bus.ledger import Ledger, SharesOf
-from fleet_bus.part import Part
-from fleet_bus.requesting import RetryPolicy
-from fleet_bus.serving import Handler, Serving
-from fleet_bus.subscribing import AliveToken, AliveWatch, OnAlive, OnMessage, RecallingPublisher, Subscription, TileOf
-from fleet_bus.wire import WireBytes
-from gnd_map.tile_id import TileId
+from gnd.fleet_bus import leftovers, requesting, subscribing
+from gnd.fleet_bus.config import BusConfig
+from gnd.fleet_bus.connection import Connection
+from gnd.fleet_bus.ledger import Ledger, SharesOf
+from gnd.fleet_bus.part import Part
+from gnd.fleet_bus.requesting import RetryPolicy
+from gnd.fleet_bus.serving import Handler, Serving
+from gnd.fleet_bus.subscribing import (
+    AliveToken,
+    AliveWatch,
+    OnAlive,
+    OnMessage,
+    RecallingPublisher,
+    Subscription,
+    TileOf,
+)
+from gnd.fleet_bus.wire import WireBytes
+from gnd.gnd_map.tile_id import TileId
 
 _DEFAULT_RETRY = RetryPolicy()
 
@@ -75,7 +83,7 @@ class Bus:
         """Asks until answered. The request may arrive more than once: it must be idempotent.
 
         Args:
-            key: key expression of `schemas.keys`.
+            key: key expression of `gnd.schemas.keys`.
             payload: encoded message.
             kind: ledger kind.
             tile: the tile it is about, for the ledger.
@@ -158,7 +166,7 @@ class Bus:
         The own link is waited for, and a lost router. A router drops the notice for subscribers that do not keep up.
 
         Args:
-            key: key expression of `schemas.keys`.
+            key: key expression of `gnd.schemas.keys`.
             payload: encoded message.
             kind: ledger kind.
             tile: the tile it is about, for the ledger.

@@ -7,10 +7,10 @@ from types import FrameType
 
 import click
 
-from fleet_bus.config import DEFAULT_ENDPOINT
-from fleet_bus.health_options import metrics_options
-from fleet_bus.router import open_router, wait_for_stop
-from fleet_bus.router_metrics import watch_router
+from gnd.fleet_bus.config import DEFAULT_ENDPOINT
+from gnd.fleet_bus.health_options import metrics_options
+from gnd.fleet_bus.router import open_router, wait_for_stop
+from gnd.fleet_bus.router_metrics import watch_router
 
 
 @click.command()

@@ -7,8 +7,8 @@ from typing import Any, Final, Literal
 
 import zenoh
 
-from fleet_bus.errors import BusConfigError
-from fleet_bus.links import LinkProfile, load_link
+from gnd.fleet_bus.errors import BusConfigError
+from gnd.fleet_bus.links import LinkProfile, load_link
 
 DEFAULT_ENDPOINT: Final = "tcp/127.0.0.1:7447"
 MAX_MESSAGE_BYTES: Final = 16 * 1024 * 1024

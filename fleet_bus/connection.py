@@ -11,12 +11,12 @@ from typing import Final, Self
 
 import zenoh
 
-from fleet_bus.config import BusConfig, zenoh_config
-from fleet_bus.errors import BusClosed, BusConfigError, MessageTooLarge, NoRouter, PortInUse
-from fleet_bus.ledger import Ledger, Share, SharesOf
-from fleet_bus.pacer import Pacer
-from fleet_bus.wire import WireMeter
-from gnd_map.tile_id import TileId
+from gnd.fleet_bus.config import BusConfig, zenoh_config
+from gnd.fleet_bus.errors import BusClosed, BusConfigError, MessageTooLarge, NoRouter, PortInUse
+from gnd.fleet_bus.ledger import Ledger, Share, SharesOf
+from gnd.fleet_bus.pacer import Pacer
+from gnd.fleet_bus.wire import WireMeter
+from gnd.gnd_map.tile_id import TileId
 
 _LOG = logging.getLogger(__name__)
 _POLL_S: Final = 0.02

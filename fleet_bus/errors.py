@@ -13,7 +13,7 @@ BusError
 └── LedgerError         a ledger file or run folder that cannot be read
 """
 
-from gnd_map.errors import GndError
+from gnd.gnd_map.errors import GndError
 
 
 class BusError(GndError):

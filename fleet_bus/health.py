@@ -15,7 +15,7 @@ from typing import Any, Final, Self
 from prometheus_client import CollectorRegistry, ProcessCollector
 from prometheus_client.exposition import CONTENT_TYPE_LATEST, generate_latest
 
-from fleet_bus.errors import PortInUse
+from gnd.fleet_bus.errors import PortInUse
 
 CHECK_S: Final = 3.0
 """A check that takes longer has failed."""

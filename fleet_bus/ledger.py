@@ -12,10 +12,10 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any, Final, Literal
 
-from fleet_bus.errors import LedgerError
-from fleet_bus.links import LinkProfile
-from fleet_bus.wire import WireBytes
-from gnd_map.tile_id import TileId
+from gnd.fleet_bus.errors import LedgerError
+from gnd.fleet_bus.links import LinkProfile
+from gnd.fleet_bus.wire import WireBytes
+from gnd.gnd_map.tile_id import TileId
 
 Direction = Literal["up", "down"]
 KINDS: Final = ("tile", "delta", "catalog", "change", "ack", "update", "telemetry", "control")

@@ -3,11 +3,11 @@
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from fleet_bus.errors import LedgerError
-from fleet_bus.ledger import Direction, LedgerLine
-from fleet_bus.ledger_rows import Row, parse_rows
-from fleet_bus.links import LinkProfile
-from fleet_bus.wire import WireBytes
+from gnd.fleet_bus.errors import LedgerError
+from gnd.fleet_bus.ledger import Direction, LedgerLine
+from gnd.fleet_bus.ledger_rows import Row, parse_rows
+from gnd.fleet_bus.links import LinkProfile
+from gnd.fleet_bus.wire import WireBytes
 
 
 @dataclass(frozen=True, slots=True)

@@ -7,12 +7,12 @@ from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Any, Final
 
-from fleet_bus.errors import LedgerError, LinkError
-from fleet_bus.ledger import KINDS, LEDGER_VERSION, Direction
-from fleet_bus.links import LinkProfile
-from fleet_bus.wire import WireBytes
-from gnd_map.config import from_mapping
-from gnd_map.errors import ConfigError
+from gnd.fleet_bus.errors import LedgerError, LinkError
+from gnd.fleet_bus.ledger import KINDS, LEDGER_VERSION, Direction
+from gnd.fleet_bus.links import LinkProfile
+from gnd.fleet_bus.wire import WireBytes
+from gnd.gnd_map.config import from_mapping
+from gnd.gnd_map.errors import ConfigError
 
 _MOST: Final = 1 << 63
 _READ_VERSIONS: Final = (2, LEDGER_VERSION)

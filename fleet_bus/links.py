@@ -6,9 +6,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final
 
-from fleet_bus.errors import LinkError
-from gnd_map.config import from_mapping
-from gnd_map.errors import ConfigError
+from gnd.fleet_bus.errors import LinkError
+from gnd.gnd_map.config import from_mapping
+from gnd.gnd_map.errors import ConfigError
 
 SEGMENT_BYTES: Final = 1400
 """Payload of one IP packet on a mobile link (1500 less headers and the carrier's tunnel)."""

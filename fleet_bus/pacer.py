@@ -11,8 +11,8 @@ import time
 from collections.abc import Callable
 from typing import Final, Literal
 
-from fleet_bus.errors import BusClosed
-from fleet_bus.links import SEGMENT_BYTES, LinkProfile
+from gnd.fleet_bus.errors import BusClosed
+from gnd.fleet_bus.links import SEGMENT_BYTES, LinkProfile
 
 Direction = Literal["up", "down"]
 

@@ -7,7 +7,7 @@ from typing import Any, Self
 
 import zenoh
 
-from fleet_bus.connection import Connection
+from gnd.fleet_bus.connection import Connection
 
 
 class Part(ABC):

@@ -15,11 +15,11 @@ from typing import Final
 
 import zenoh
 
-from fleet_bus.connection import Connection
-from fleet_bus.envelopes import REPLY_BYTES, REQUEST_BYTES, head_bytes
-from fleet_bus.errors import BusClosed, BusConfigError, RequestFailed, RequestRefused
-from fleet_bus.ledger import SharesOf
-from gnd_map.tile_id import TileId
+from gnd.fleet_bus.connection import Connection
+from gnd.fleet_bus.envelopes import REPLY_BYTES, REQUEST_BYTES, head_bytes
+from gnd.fleet_bus.errors import BusClosed, BusConfigError, RequestFailed, RequestRefused
+from gnd.fleet_bus.ledger import SharesOf
+from gnd.gnd_map.tile_id import TileId
 
 END_OF_ANSWERS: Final = "gnd/end"
 """Encoding of the closing reply of a handler that gives many answers; its payload is their number in decimal."""

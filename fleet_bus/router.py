@@ -11,8 +11,8 @@ import threading
 from collections.abc import Sequence
 from typing import Final
 
-from fleet_bus.bus import Bus, open_bus
-from fleet_bus.config import DEFAULT_ENDPOINT, BusConfig
+from gnd.fleet_bus.bus import Bus, open_bus
+from gnd.fleet_bus.config import DEFAULT_ENDPOINT, BusConfig
 
 _LOG = logging.getLogger(__name__)
 _LOOK_UP_S: Final = 0.25

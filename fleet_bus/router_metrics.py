@@ -7,8 +7,8 @@ from prometheus_client import CollectorRegistry
 from prometheus_client.core import GaugeMetricFamily
 from prometheus_client.registry import Collector
 
-from fleet_bus.bus import Bus
-from fleet_bus.health import HealthServer
+from gnd.fleet_bus.bus import Bus
+from gnd.fleet_bus.health import HealthServer
 
 
 class _Router(Collector):

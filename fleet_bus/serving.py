@@ -7,12 +7,12 @@ from typing import Final
 
 import zenoh
 
-from fleet_bus.connection import Connection
-from fleet_bus.envelopes import REPLY_BYTES, REQUEST_BYTES, head_bytes
-from fleet_bus.errors import BusClosed, BusError, NotMine, Refused
-from fleet_bus.part import Part
-from fleet_bus.requesting import COUNT_WANTED, END_OF_ANSWERS, FAILED, REFUSED
-from fleet_bus.workers import Workers
+from gnd.fleet_bus.connection import Connection
+from gnd.fleet_bus.envelopes import REPLY_BYTES, REQUEST_BYTES, head_bytes
+from gnd.fleet_bus.errors import BusClosed, BusError, NotMine, Refused
+from gnd.fleet_bus.part import Part
+from gnd.fleet_bus.requesting import COUNT_WANTED, END_OF_ANSWERS, FAILED, REFUSED
+from gnd.fleet_bus.workers import Workers
 
 _LOG = logging.getLogger(__name__)
 

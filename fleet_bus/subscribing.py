@@ -7,12 +7,12 @@ from typing import Any, Final
 import zenoh
 from zenoh import ext
 
-from fleet_bus.connection import Connection
-from fleet_bus.envelopes import NOTICE_BYTES, head_bytes
-from fleet_bus.errors import BusClosed, NoRouter
-from fleet_bus.part import Part
-from fleet_bus.workers import Workers
-from gnd_map.tile_id import TileId
+from gnd.fleet_bus.connection import Connection
+from gnd.fleet_bus.envelopes import NOTICE_BYTES, head_bytes
+from gnd.fleet_bus.errors import BusClosed, NoRouter
+from gnd.fleet_bus.part import Part
+from gnd.fleet_bus.workers import Workers
+from gnd.gnd_map.tile_id import TileId
 
 _LOG = logging.getLogger(__name__)
 # Notices let answers and acknowledgements pass.

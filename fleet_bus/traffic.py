@@ -6,12 +6,12 @@ from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass
 from typing import Any, Final
 
-from fleet_bus.ledger import Direction
-from fleet_bus.ledger_file import AgentLedger, Booking
-from fleet_bus.links import LinkProfile
-from fleet_bus.pacer import MESSAGE_OVERHEAD_BYTES
-from fleet_bus.traffic_links import Arrivals, LinkUse, link_use, measured_arrivals, tile_arrival_s
-from fleet_bus.traffic_wire import RESIDUES, TILE_KINDS, WireAccount, wire_account
+from gnd.fleet_bus.ledger import Direction
+from gnd.fleet_bus.ledger_file import AgentLedger, Booking
+from gnd.fleet_bus.links import LinkProfile
+from gnd.fleet_bus.pacer import MESSAGE_OVERHEAD_BYTES
+from gnd.fleet_bus.traffic_links import Arrivals, LinkUse, link_use, measured_arrivals, tile_arrival_s
+from gnd.fleet_bus.traffic_wire import RESIDUES, TILE_KINDS, WireAccount, wire_account
 
 DEFAULT_LINKS: Final = ("3g", "4g", "5g")
 _TILES: Final = (*TILE_KINDS, "tile acks")

@@ -4,8 +4,8 @@ import csv
 import io
 from collections.abc import Iterator
 
-from fleet_bus.links import LinkProfile
-from fleet_bus.traffic import AgentTraffic, KindTraffic, per_km
+from gnd.fleet_bus.links import LinkProfile
+from gnd.fleet_bus.traffic import AgentTraffic, KindTraffic, per_km
 
 
 def as_csv(agents: tuple[AgentTraffic, ...], links: tuple[LinkProfile, ...]) -> str:

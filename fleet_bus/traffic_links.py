@@ -5,10 +5,10 @@ from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import Final
 
-from fleet_bus.ledger import Direction
-from fleet_bus.ledger_file import AgentLedger, Booking
-from fleet_bus.links import LinkProfile
-from fleet_bus.pacer import MESSAGE_OVERHEAD_BYTES, Bucket
+from gnd.fleet_bus.ledger import Direction
+from gnd.fleet_bus.ledger_file import AgentLedger, Booking
+from gnd.fleet_bus.links import LinkProfile
+from gnd.fleet_bus.pacer import MESSAGE_OVERHEAD_BYTES, Bucket
 
 _NO_CONTENT_BYTES: Final = 40
 """An answer about a tile that is no longer than this says "unchanged" or "there is none": it brought no tile."""

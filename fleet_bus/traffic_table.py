@@ -5,7 +5,7 @@ from collections.abc import Iterable
 from rich.console import Console
 from rich.table import Table
 
-from fleet_bus.traffic import AgentTraffic, KindTraffic, fleet_lines, fleet_totals, per_km
+from gnd.fleet_bus.traffic import AgentTraffic, KindTraffic, fleet_lines, fleet_totals, per_km
 
 
 def print_tables(agents: tuple[AgentTraffic, ...], console: Console) -> None:

@@ -19,10 +19,10 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from typing import Final
 
-from fleet_bus.ledger import Direction
-from fleet_bus.ledger_file import AgentLedger, Booking
-from fleet_bus.pacer import MESSAGE_OVERHEAD_BYTES
-from fleet_bus.wire import KEEP_ALIVE_BYTES, WireBytes
+from gnd.fleet_bus.ledger import Direction
+from gnd.fleet_bus.ledger_file import AgentLedger, Booking
+from gnd.fleet_bus.pacer import MESSAGE_OVERHEAD_BYTES
+from gnd.fleet_bus.wire import KEEP_ALIVE_BYTES, WireBytes
 
 RESIDUES: Final = ("tile acks", "acks", "resent", "opening", "closing", "keep-alives", "session")
 """Lines of the account beside the kinds of messages."""

@@ -12,15 +12,15 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from fleet_sim.errors import DriveSimError
-from fleet_sim.feature_truth import KIND_OF, LAYER_OF, facing_street, plate_of, position_street_m
-from fleet_sim.movers import Movers
-from fleet_sim.raycast import Scene
-from fleet_sim.shapes import Block
-from fleet_sim.trajectory import Motion
-from fleet_sim.world import State, World
-from gnd_map.se3 import T_inverse
-from schemas.drive import Detections
+from gnd.fleet_sim.errors import DriveSimError
+from gnd.fleet_sim.feature_truth import KIND_OF, LAYER_OF, facing_street, plate_of, position_street_m
+from gnd.fleet_sim.movers import Movers
+from gnd.fleet_sim.raycast import Scene
+from gnd.fleet_sim.shapes import Block
+from gnd.fleet_sim.trajectory import Motion
+from gnd.fleet_sim.world import State, World
+from gnd.gnd_map.se3 import T_inverse
+from gnd.schemas.drive import Detections
 
 FloatArray = NDArray[np.float64]
 

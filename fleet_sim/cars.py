@@ -5,10 +5,10 @@ from typing import Final
 
 import numpy as np
 
-from fleet_sim import parts
-from fleet_sim.errors import DriveSimError
-from fleet_sim.shapes import Block, Post, Shape
-from fleet_sim.world import State, World
+from gnd.fleet_sim import parts
+from gnd.fleet_sim.errors import DriveSimError
+from gnd.fleet_sim.shapes import Block, Post, Shape
+from gnd.fleet_sim.world import State, World
 
 SLOT_M: Final = 6.2
 LANE_M: Final = 1.05

@@ -7,10 +7,10 @@ from typing import Any
 
 import click
 
-from fleet_sim.sensors import SHORT_NAMES
-from fleet_sim.street import SITES, StreetOptions, street
-from fleet_sim.world import STATES, World, read_world, write_world
-from fleet_sim.world_summary import as_text, summary
+from gnd.fleet_sim.sensors import SHORT_NAMES
+from gnd.fleet_sim.street import SITES, StreetOptions, street
+from gnd.fleet_sim.world import STATES, World, read_world, write_world
+from gnd.fleet_sim.world_summary import as_text, summary
 
 
 @click.group()
@@ -56,9 +56,9 @@ def inspect(file: Path, as_json: bool) -> None:
 )
 def picture(file: Path, png: Path, truth_file: Path | None, dpi: int) -> None:
     """Draw what changes in the world of FILE, as classes of voxels (some 10 s for 200 m without a kept truth)."""
-    from fleet_sim.ellipsoids import ellipsoids_of_truth
-    from fleet_sim.pictures import draw_map
-    from fleet_sim.truth import load_or_make_truth, make_truth
+    from gnd.fleet_sim.ellipsoids import ellipsoids_of_truth
+    from gnd.fleet_sim.pictures import draw_map
+    from gnd.fleet_sim.truth import load_or_make_truth, make_truth
 
     made = read_world(file)
     truth = load_or_make_truth(made, truth_file) if truth_file else make_truth(made)
@@ -72,8 +72,8 @@ def picture(file: Path, png: Path, truth_file: Path | None, dpi: int) -> None:
 @click.option("--mapped-streetlights", default=0.0, show_default=True, help="Share of the lamps that the map holds.")
 def features(file: Path, layers: Path, mapped_streetlights: float) -> None:
     """Write the feature layers of the map before the changes of the world in FILE to LAYERS (JSON)."""
-    from fleet_sim.feature_files import write_feature_layers
-    from fleet_sim.feature_truth import base_features, feature_truth
+    from gnd.fleet_sim.feature_files import write_feature_layers
+    from gnd.fleet_sim.feature_truth import base_features, feature_truth
 
     truth = feature_truth(read_world(file), mapped_streetlights)
     write_feature_layers(base_features(truth), layers)
@@ -112,9 +112,9 @@ def drive(
     camera: bool,
 ) -> None:
     """Drive through the world of WORLD_FILE and write what the sensors give to FILE (MCAP, opens in Foxglove)."""
-    from fleet_sim.camera import SignCamera
-    from fleet_sim.drives import DriveConfig, simulate_drive
-    from fleet_sim.traffic import Traffic
+    from gnd.fleet_sim.camera import SignCamera
+    from gnd.fleet_sim.drives import DriveConfig, simulate_drive
+    from gnd.fleet_sim.traffic import Traffic
 
     config = DriveConfig(
         vehicle=vehicle,
@@ -143,9 +143,9 @@ def road() -> None:
 @click.option("--drive", "drive_seed", default=1, show_default=True, help="Seed of the drive.")
 def road_picture(kind: str, png: Path, seed: int, drive_seed: int) -> None:
     """Draw a road of KIND and one drive along it to PNG."""
-    from fleet_sim.roads.drive import drive_route
-    from fleet_sim.roads.pictures import draw_drive
-    from fleet_sim.roads.routes import route_named
+    from gnd.fleet_sim.roads.drive import drive_route
+    from gnd.fleet_sim.roads.pictures import draw_drive
+    from gnd.fleet_sim.roads.routes import route_named
 
     driven = drive_route(route_named(kind, seed), drive_seed)
     draw_drive(driven, png)

@@ -12,10 +12,10 @@ from typing import Final, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from fleet_sim.raycast import Scene
-from fleet_sim.shapes import Shape
-from fleet_sim.world import STATES, State, World
-from gnd_map.jit import kernel
+from gnd.fleet_sim.raycast import Scene
+from gnd.fleet_sim.shapes import Shape
+from gnd.fleet_sim.world import STATES, State, World
+from gnd.gnd_map.jit import kernel
 
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int32]

@@ -12,14 +12,14 @@ from typing import Final, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from fleet_sim.dense_rays import AFTER_COME, AFTER_KEPT, BEFORE_GONE, BEFORE_KEPT, ScanPlan, Shots, shots
-from fleet_sim.errors import TruthError
-from fleet_sim.world import World
-from gnd_map.accumulate import VoxelAccumulator
-from gnd_map.grid import GridFrame, zones
-from gnd_map.jit import kernel
-from gnd_map.near_grid import grid_near
-from gnd_map.tile_id import covering_corridor
+from gnd.fleet_sim.dense_rays import AFTER_COME, AFTER_KEPT, BEFORE_GONE, BEFORE_KEPT, ScanPlan, Shots, shots
+from gnd.fleet_sim.errors import TruthError
+from gnd.fleet_sim.world import World
+from gnd.gnd_map.accumulate import VoxelAccumulator
+from gnd.gnd_map.grid import GridFrame, zones
+from gnd.gnd_map.jit import kernel
+from gnd.gnd_map.near_grid import grid_near
+from gnd.gnd_map.tile_id import covering_corridor
 
 __all__ = ["AFTER_COME", "AFTER_KEPT", "BEFORE_GONE", "BEFORE_KEPT", "DenseScan", "ScanPlan", "Window", "dense_scans"]
 

@@ -9,19 +9,19 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from fleet_sim.camera import Sightings, SignCamera, look_times_ns, looks_of, sightings
-from fleet_sim.cars import parked_cars
-from fleet_sim.errors import DriveSimError
-from fleet_sim.lidar import Lidar, column_poses
-from fleet_sim.raycast import Scene
-from fleet_sim.sensors import MODELS, LidarModel
-from fleet_sim.stage import Stage
-from fleet_sim.traffic import Traffic, movers_of
-from fleet_sim.trajectory import Direction, DrivingStyle, gauss_markov, lane_motion
-from fleet_sim.world import State, World
-from gnd_map.se3 import exp_so3
-from schemas.drive import Detections, DriveHeader, DriveItem, GnssFix, MotionSample, ReferencePose, Scan
-from schemas.drive_mcap import DriveWriter
+from gnd.fleet_sim.camera import Sightings, SignCamera, look_times_ns, looks_of, sightings
+from gnd.fleet_sim.cars import parked_cars
+from gnd.fleet_sim.errors import DriveSimError
+from gnd.fleet_sim.lidar import Lidar, column_poses
+from gnd.fleet_sim.raycast import Scene
+from gnd.fleet_sim.sensors import MODELS, LidarModel
+from gnd.fleet_sim.stage import Stage
+from gnd.fleet_sim.traffic import Traffic, movers_of
+from gnd.fleet_sim.trajectory import Direction, DrivingStyle, gauss_markov, lane_motion
+from gnd.fleet_sim.world import State, World
+from gnd.gnd_map.se3 import exp_so3
+from gnd.schemas.drive import Detections, DriveHeader, DriveItem, GnssFix, MotionSample, ReferencePose, Scan
+from gnd.schemas.drive_mcap import DriveWriter
 
 _NS_PER_S: Final = 1_000_000_000
 EPOCH_NS: Final = 1_570_838_400 * _NS_PER_S

@@ -6,13 +6,13 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from fleet_sim.truth import Truth
-from gnd_map.classes import ChangeClass
-from gnd_map.gaussian import Gaussians, concat
-from gnd_map.geodesy import LocalFrame
-from gnd_map.grid import GridFrame
-from gnd_map.tile import diff
-from gnd_map.tile_id import TileId
+from gnd.fleet_sim.truth import Truth
+from gnd.gnd_map.classes import ChangeClass
+from gnd.gnd_map.gaussian import Gaussians, concat
+from gnd.gnd_map.geodesy import LocalFrame
+from gnd.gnd_map.grid import GridFrame
+from gnd.gnd_map.tile import diff
+from gnd.gnd_map.tile_id import TileId
 
 FloatArray = NDArray[np.float64]
 Tiles = Mapping[TileId, Gaussians]

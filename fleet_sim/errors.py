@@ -1,6 +1,6 @@
 """Errors of the simulator; every one is a `SimError`."""
 
-from gnd_map.errors import GndError
+from gnd.gnd_map.errors import GndError
 
 
 class SimError(GndError):

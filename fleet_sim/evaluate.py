@@ -11,12 +11,12 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from fleet_sim.errors import EvaluationError
-from fleet_sim.truth import LEVELS, Level, Truth
-from gnd_map.classes import ChangeClass
-from gnd_map.gaussian import Gaussians
-from gnd_map.tile import diff
-from gnd_map.tile_id import TileId
+from gnd.fleet_sim.errors import EvaluationError
+from gnd.fleet_sim.truth import LEVELS, Level, Truth
+from gnd.gnd_map.classes import ChangeClass
+from gnd.gnd_map.gaussian import Gaussians
+from gnd.gnd_map.tile import diff
+from gnd.gnd_map.tile_id import TileId
 
 Tiles = Mapping[TileId, Gaussians]
 ClassArray = NDArray[np.uint8]

@@ -6,11 +6,11 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Final
 
-from fleet_sim.errors import WorldError
-from fleet_sim.strict_json import items, mapping, parsed
-from gnd_map.errors import GndError
-from gnd_map.features import FeatureTile, decode_features, encode_features, is_feature_layer
-from gnd_map.tile_id import TileId
+from gnd.fleet_sim.errors import WorldError
+from gnd.fleet_sim.strict_json import items, mapping, parsed
+from gnd.gnd_map.errors import GndError
+from gnd.gnd_map.features import FeatureTile, decode_features, encode_features, is_feature_layer
+from gnd.gnd_map.tile_id import TileId
 
 _FORMAT: Final = "gnd.features"
 _VERSION: Final = 1

@@ -13,11 +13,11 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from fleet_sim.errors import EvaluationError
-from fleet_sim.feature_truth import FeatureClass, FeatureTruth, TrueFeature
-from gnd_map.features import Feature, FeatureTile, geodetic_in_tile
-from gnd_map.geodesy import LocalFrame
-from gnd_map.tile_id import TileId
+from gnd.fleet_sim.errors import EvaluationError
+from gnd.fleet_sim.feature_truth import FeatureClass, FeatureTruth, TrueFeature
+from gnd.gnd_map.features import Feature, FeatureTile, geodetic_in_tile
+from gnd.gnd_map.geodesy import LocalFrame
+from gnd.gnd_map.tile_id import TileId
 
 FloatArray = NDArray[np.float64]
 

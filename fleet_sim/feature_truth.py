@@ -11,11 +11,11 @@ from typing import Final, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from fleet_sim.errors import WorldError
-from fleet_sim.shapes import Ball, Block, Post, Shape
-from fleet_sim.world import World, WorldObject
-from gnd_map.features import UNKNOWN_HEIGHT_M2, Feature, FeatureTile, feature_id_of, points_in_tile, prior
-from gnd_map.tile_id import TileId
+from gnd.fleet_sim.errors import WorldError
+from gnd.fleet_sim.shapes import Ball, Block, Post, Shape
+from gnd.fleet_sim.world import World, WorldObject
+from gnd.gnd_map.features import UNKNOWN_HEIGHT_M2, Feature, FeatureTile, feature_id_of, points_in_tile, prior
+from gnd.gnd_map.tile_id import TileId
 
 FloatArray = NDArray[np.float64]
 FeatureClass = Literal["normal", "deleted", "new"]

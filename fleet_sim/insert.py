@@ -12,13 +12,13 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from fleet_sim.errors import SimError
-from fleet_sim.raycast import Scene
-from fleet_sim.shapes import Block, Post, Shape
-from gnd_map.accumulate import N_MIN_CELLS, VoxelAccumulator
-from gnd_map.gaussian import Gaussians
-from gnd_map.grid import GridFrame
-from gnd_map.tile_id import TileId
+from gnd.fleet_sim.errors import SimError
+from gnd.fleet_sim.raycast import Scene
+from gnd.fleet_sim.shapes import Block, Post, Shape
+from gnd.gnd_map.accumulate import N_MIN_CELLS, VoxelAccumulator
+from gnd.gnd_map.gaussian import Gaussians
+from gnd.gnd_map.grid import GridFrame
+from gnd.gnd_map.tile_id import TileId
 
 FloatArray = NDArray[np.float64]
 

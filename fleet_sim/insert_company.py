@@ -8,11 +8,11 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from fleet_sim.errors import SimError
-from fleet_sim.insert import Inserter
-from fleet_sim.shapes import Block
-from schemas.drive import Scan
-from schemas.drive_mcap import DriveWriter, read_drive, read_header
+from gnd.fleet_sim.errors import SimError
+from gnd.fleet_sim.insert import Inserter
+from gnd.fleet_sim.shapes import Block
+from gnd.schemas.drive import Scan
+from gnd.schemas.drive_mcap import DriveWriter, read_drive, read_header
 
 _LENGTH_M: Final = 5.6
 _WIDTH_M: Final = 2.0

@@ -7,12 +7,12 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from fleet_sim.errors import SimError
-from fleet_sim.insert import Inserter
-from fleet_sim.shapes import Shape
-from gnd_map.motion import Trajectory
-from schemas.drive import DriveHeader, DriveItem, Scan
-from schemas.drive_mcap import DriveWriter, load_track, read_drive, read_header
+from gnd.fleet_sim.errors import SimError
+from gnd.fleet_sim.insert import Inserter
+from gnd.fleet_sim.shapes import Shape
+from gnd.gnd_map.motion import Trajectory
+from gnd.schemas.drive import DriveHeader, DriveItem, Scan
+from gnd.schemas.drive_mcap import DriveWriter, load_track, read_drive, read_header
 
 _STEP_NS = 1_000_000
 """Poses within a sweep are taken this often: at 30 m/s the sensor moves 3 cm meanwhile."""

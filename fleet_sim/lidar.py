@@ -12,13 +12,13 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from fleet_sim.courses.foliage import Foliage
-from fleet_sim.errors import SceneError
-from fleet_sim.movers import Movers
-from fleet_sim.ray_kernels import FloatArray, IntArray, cast_sweep
-from fleet_sim.raycast import Scene
-from fleet_sim.sensors import LidarModel
-from fleet_sim.shapes import reflectivity_of
+from gnd.fleet_sim.courses.foliage import Foliage
+from gnd.fleet_sim.errors import SceneError
+from gnd.fleet_sim.movers import Movers
+from gnd.fleet_sim.ray_kernels import FloatArray, IntArray, cast_sweep
+from gnd.fleet_sim.raycast import Scene
+from gnd.fleet_sim.sensors import LidarModel
+from gnd.fleet_sim.shapes import reflectivity_of
 
 _NS_PER_S: Final = 1_000_000_000
 _POINT_STEP_M: Final = 1.0 / 512

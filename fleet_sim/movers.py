@@ -14,9 +14,9 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from fleet_sim.errors import DriveSimError
-from fleet_sim.ray_kernels import BLOCK_COLUMNS, Crowd, FloatArray, IntArray, cast_crowd
-from fleet_sim.shapes import Ball, Shape, pack
+from gnd.fleet_sim.errors import DriveSimError
+from gnd.fleet_sim.ray_kernels import BLOCK_COLUMNS, Crowd, FloatArray, IntArray, cast_crowd
+from gnd.fleet_sim.shapes import Ball, Shape, pack
 
 STATE: Final = 5
 """A sample of a track: x, y, z [m], yaw [rad], stride [m]."""

@@ -9,7 +9,7 @@ from math import cos, sin
 
 import numpy as np
 
-from fleet_sim.shapes import Ball, Block, Post, Shape
+from gnd.fleet_sim.shapes import Ball, Block, Post, Shape
 
 ASPHALT, CONCRETE, PLASTER, METAL, LEAF, SIGN = 0.15, 0.3, 0.4, 0.25, 0.45, 0.9
 """Diffuse reflectivities at 905 nm of the materials used here (typical values of rangefinder data sheets)."""

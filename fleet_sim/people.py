@@ -7,9 +7,9 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from fleet_sim.movers import Mover
-from fleet_sim.shapes import Ball, Post, Shape
-from fleet_sim.stage import Stage
+from gnd.fleet_sim.movers import Mover
+from gnd.fleet_sim.shapes import Ball, Post, Shape
+from gnd.fleet_sim.stage import Stage
 
 FloatArray = NDArray[np.float64]
 

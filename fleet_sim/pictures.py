@@ -14,10 +14,10 @@ from matplotlib.lines import Line2D
 from matplotlib.patheffects import withStroke
 from numpy.typing import NDArray
 
-from fleet_sim.ellipsoids import Ellipsoids, Tiles, ellipsoids_of_maps, ellipsoids_of_truth
-from fleet_sim.errors import SimError
-from fleet_sim.truth import Truth
-from gnd_map.classes import CLASS_COLOURS, ChangeClass
+from gnd.fleet_sim.ellipsoids import Ellipsoids, Tiles, ellipsoids_of_maps, ellipsoids_of_truth
+from gnd.fleet_sim.errors import SimError
+from gnd.fleet_sim.truth import Truth
+from gnd.gnd_map.classes import CLASS_COLOURS, ChangeClass
 
 FloatArray = NDArray[np.float64]
 

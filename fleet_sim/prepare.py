@@ -9,15 +9,15 @@ from typing import Final
 
 from rich.progress import Progress
 
-from fleet_sim.camera import SignCamera
-from fleet_sim.drives import EPOCH_NS, PERFECT, DriveConfig, simulate_drive
-from fleet_sim.errors import SimError
-from fleet_sim.feature_files import write_feature_layers
-from fleet_sim.feature_truth import base_features, feature_truth
-from fleet_sim.street import street
-from fleet_sim.trajectory import Direction
-from fleet_sim.truth import load_or_make_truth
-from fleet_sim.world import write_world
+from gnd.fleet_sim.camera import SignCamera
+from gnd.fleet_sim.drives import EPOCH_NS, PERFECT, DriveConfig, simulate_drive
+from gnd.fleet_sim.errors import SimError
+from gnd.fleet_sim.feature_files import write_feature_layers
+from gnd.fleet_sim.feature_truth import base_features, feature_truth
+from gnd.fleet_sim.street import street
+from gnd.fleet_sim.trajectory import Direction
+from gnd.fleet_sim.truth import load_or_make_truth
+from gnd.fleet_sim.world import write_world
 
 SENSORS: Final = ("VLP-16", "HDL-32E")
 FEATURES_FILE: Final = "features.json"
@@ -35,9 +35,9 @@ class FleetWorld:
     Attributes:
         base_drives: drives of a mapping vehicle through the state before, with exact reference poses.
         agent_drives: one drive a vehicle through the state after.
-        truth_path: what changed, see `fleet_sim.truth`.
+        truth_path: what changed, see `gnd.fleet_sim.truth`.
         world_path: the world itself.
-        features_path: the feature layers of the map before, see `fleet_sim.feature_files`.
+        features_path: the feature layers of the map before, see `gnd.fleet_sim.feature_files`.
     """
 
     base_drives: tuple[Path, ...]

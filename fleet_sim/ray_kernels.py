@@ -12,8 +12,8 @@ from typing import Final, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from fleet_sim.shapes import BALL, BLOCK, BOX, COLUMNS, POST
-from gnd_map.jit import kernel
+from gnd.fleet_sim.shapes import BALL, BLOCK, BOX, COLUMNS, POST
+from gnd.gnd_map.jit import kernel
 
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int32]

@@ -1,7 +1,7 @@
 """Exact intersection of rays with the primitives of a street, by a walk over a flat grid of primitive lists.
 
 Nothing here is shared with the vehicle's ray caster: the simulator stays an independent witness. The kernels are those
-of `fleet_sim.ray_kernels`.
+of `gnd.fleet_sim.ray_kernels`.
 """
 
 from collections.abc import Sequence
@@ -11,9 +11,9 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from fleet_sim.errors import SceneError
-from fleet_sim.ray_kernels import FloatArray, Grid, IntArray, cast_fan, cast_rays
-from fleet_sim.shapes import Shape, pack
+from gnd.fleet_sim.errors import SceneError
+from gnd.fleet_sim.ray_kernels import FloatArray, Grid, IntArray, cast_fan, cast_rays
+from gnd.fleet_sim.shapes import Shape, pack
 
 CELL_M: Final = 2.0
 

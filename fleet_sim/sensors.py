@@ -15,7 +15,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from fleet_sim.errors import SceneError
+from gnd.fleet_sim.errors import SceneError
 
 FloatArray = NDArray[np.float64]
 

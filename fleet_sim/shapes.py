@@ -1,7 +1,7 @@
 """The three primitives that a simulated street is made of.
 
 All live in the *street frame*: x along the street, y to the left, z upwards from the sloping reference plane of the
-street (see `fleet_sim.world`). Solid and opaque: a ray stops at the first surface that it enters.
+street (see `gnd.fleet_sim.world`). Solid and opaque: a ray stops at the first surface that it enters.
 """
 
 from collections.abc import Sequence
@@ -12,7 +12,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from fleet_sim.errors import ShapeError
+from gnd.fleet_sim.errors import ShapeError
 
 BLOCK: Final = 0
 POST: Final = 1

@@ -6,10 +6,10 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from fleet_sim.raycast import Scene
-from fleet_sim.shapes import Shape
-from fleet_sim.trajectory import Motion
-from fleet_sim.world import World
+from gnd.fleet_sim.raycast import Scene
+from gnd.fleet_sim.shapes import Shape
+from gnd.fleet_sim.trajectory import Motion
+from gnd.fleet_sim.world import World
 
 FloatArray = NDArray[np.float64]
 

@@ -11,11 +11,11 @@ from typing import Final, Literal, get_args
 
 import numpy as np
 
-from fleet_sim.errors import WorldError
-from fleet_sim.street_before import CROWN, KERB_M, PAVEMENT_M, built, drawn_plan
-from fleet_sim.street_edits import partly_edited, rebuild
-from fleet_sim.world import World
-from gnd_map.geodesy import LocalFrame
+from gnd.fleet_sim.errors import WorldError
+from gnd.fleet_sim.street_before import CROWN, KERB_M, PAVEMENT_M, built, drawn_plan
+from gnd.fleet_sim.street_edits import partly_edited, rebuild
+from gnd.fleet_sim.world import World
+from gnd.gnd_map.geodesy import LocalFrame
 
 SiteName = Literal["border", "wangsimni", "north49"]
 SITES: Final[tuple[SiteName, ...]] = get_args(SiteName)

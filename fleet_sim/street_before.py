@@ -8,10 +8,10 @@ from typing import Final
 
 import numpy as np
 
-from fleet_sim import parts
-from fleet_sim.parts import Lot
-from fleet_sim.shapes import Block, Shape
-from fleet_sim.world import WorldObject
+from gnd.fleet_sim import parts
+from gnd.fleet_sim.parts import Lot
+from gnd.fleet_sim.shapes import Block, Shape
+from gnd.fleet_sim.world import WorldObject
 
 KERB_M: Final = 6.2
 CROWN: Final = 0.02

@@ -11,12 +11,12 @@ from typing import Final
 
 import numpy as np
 
-from fleet_sim import parts
-from fleet_sim.parts import Lot
-from fleet_sim.street_before import StreetPlan
-from fleet_sim.street_site import Site, x_of, y_of
-from fleet_sim.street_works import add_works
-from fleet_sim.world import STATES, Edit, WorldObject
+from gnd.fleet_sim import parts
+from gnd.fleet_sim.parts import Lot
+from gnd.fleet_sim.street_before import StreetPlan
+from gnd.fleet_sim.street_site import Site, x_of, y_of
+from gnd.fleet_sim.street_works import add_works
+from gnd.fleet_sim.world import STATES, Edit, WorldObject
 
 _END_M: Final = 15.0
 """Nothing is edited so near to the end of the street."""

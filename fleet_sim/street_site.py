@@ -3,8 +3,8 @@
 from collections.abc import Sequence
 from dataclasses import replace
 
-from fleet_sim.shapes import Ball, Block, Post, Shape
-from fleet_sim.world import Edit, WorldObject
+from gnd.fleet_sim.shapes import Ball, Block, Post, Shape
+from gnd.fleet_sim.world import Edit, WorldObject
 
 
 class Site:

@@ -6,11 +6,11 @@ from typing import Final
 
 import numpy as np
 
-from fleet_sim import parts
-from fleet_sim.parts import Lot
-from fleet_sim.shapes import Shape
-from fleet_sim.street_site import Site, x_of, y_of
-from fleet_sim.world import Edit, WorldObject
+from gnd.fleet_sim import parts
+from gnd.fleet_sim.parts import Lot
+from gnd.fleet_sim.shapes import Shape
+from gnd.fleet_sim.street_site import Site, x_of, y_of
+from gnd.fleet_sim.world import Edit, WorldObject
 
 ZONE_REACH_M: Final = 85.0
 """The construction zone and what belongs to it lie within this distance of the street's middle."""

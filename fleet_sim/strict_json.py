@@ -5,7 +5,7 @@ from collections.abc import Iterable, Mapping
 from dataclasses import MISSING, fields
 from typing import Any, Final
 
-from fleet_sim.errors import WorldError
+from gnd.fleet_sim.errors import WorldError
 
 MAX_NUMBER: Final = 1e6
 """No coordinate, length or angle of a world is larger."""

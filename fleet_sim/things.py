@@ -5,9 +5,9 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from fleet_sim.shapes import BALL, POST, pack
-from fleet_sim.truth import Truth, grids_of
-from fleet_sim.world import World
+from gnd.fleet_sim.shapes import BALL, POST, pack
+from gnd.fleet_sim.truth import Truth, grids_of
+from gnd.fleet_sim.world import World
 
 FloatArray = NDArray[np.float64]
 

@@ -13,13 +13,13 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from fleet_sim import parts
-from fleet_sim.errors import DriveSimError
-from fleet_sim.movers import Mover, Movers
-from fleet_sim.people import pedestrians
-from fleet_sim.stage import STEP_S, Stage
-from fleet_sim.trajectory import Direction
-from fleet_sim.world import World
+from gnd.fleet_sim import parts
+from gnd.fleet_sim.errors import DriveSimError
+from gnd.fleet_sim.movers import Mover, Movers
+from gnd.fleet_sim.people import pedestrians
+from gnd.fleet_sim.stage import STEP_S, Stage
+from gnd.fleet_sim.trajectory import Direction
+from gnd.fleet_sim.world import World
 
 FloatArray = NDArray[np.float64]
 

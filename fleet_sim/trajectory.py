@@ -12,9 +12,9 @@ from typing import Final, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from fleet_sim.errors import DriveSimError
-from fleet_sim.world import World
-from gnd_map.se3 import T_inverse, exp_so3, log_so3
+from gnd.fleet_sim.errors import DriveSimError
+from gnd.fleet_sim.world import World
+from gnd.gnd_map.se3 import T_inverse, exp_so3, log_so3
 
 FloatArray = NDArray[np.float64]
 

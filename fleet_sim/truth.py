@@ -24,16 +24,16 @@ from typing import Any, Final, Literal, get_args
 import numpy as np
 from numpy.typing import NDArray
 
-from fleet_sim import dense_scan
-from fleet_sim.dense_scan import DenseScan, ScanPlan
-from fleet_sim.errors import TruthError
-from fleet_sim.world import STATES, World, to_json
-from gnd_map.accumulate import N_MIN_CELLS
-from gnd_map.classes import ChangeClass
-from gnd_map.gaussian import Gaussians
-from gnd_map.geodesy import LocalFrame
-from gnd_map.grid import GridFrame, zones
-from gnd_map.tile_id import TileId
+from gnd.fleet_sim import dense_scan
+from gnd.fleet_sim.dense_scan import DenseScan, ScanPlan
+from gnd.fleet_sim.errors import TruthError
+from gnd.fleet_sim.world import STATES, World, to_json
+from gnd.gnd_map.accumulate import N_MIN_CELLS
+from gnd.gnd_map.classes import ChangeClass
+from gnd.gnd_map.gaussian import Gaussians
+from gnd.gnd_map.geodesy import LocalFrame
+from gnd.gnd_map.grid import GridFrame, zones
+from gnd.gnd_map.tile_id import TileId
 
 Level = Literal["all", "marginal_excluded", "scored"]
 LEVELS: Final[tuple[Level, ...]] = get_args(Level)

@@ -17,10 +17,10 @@ from typing import Any, Final, Literal, get_args
 import numpy as np
 from numpy.typing import NDArray
 
-from fleet_sim.errors import ShapeError, WorldError
-from fleet_sim.shapes import Ball, Block, Post, Shape
-from fleet_sim.strict_json import arguments, items, mapping, parsed
-from gnd_map.geodesy import LocalFrame
+from gnd.fleet_sim.errors import ShapeError, WorldError
+from gnd.fleet_sim.shapes import Ball, Block, Post, Shape
+from gnd.fleet_sim.strict_json import arguments, items, mapping, parsed
+from gnd.gnd_map.geodesy import LocalFrame
 
 State = Literal["before", "after"]
 Edit = Literal["kept", "added", "removed", "moved", "reshaped"]

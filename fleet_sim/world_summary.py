@@ -7,9 +7,9 @@ from typing import Final
 
 import numpy as np
 
-from fleet_sim.street_site import x_of
-from fleet_sim.world import EDITS, STATES, World
-from gnd_map.tile_id import TileId
+from gnd.fleet_sim.street_site import x_of
+from gnd.fleet_sim.world import EDITS, STATES, World
+from gnd.gnd_map.tile_id import TileId
 
 PLACE_M: Final = 50.0
 """Length of the stretches by which edits are counted."""

@@ -14,13 +14,13 @@ from collections.abc import Collection
 import numpy as np
 import numpy.typing as npt
 
-from gnd_map.arrays import F64, I32, I64, points_3d
-from gnd_map.gaussian import Gaussians, Moments, full_matrices, six_entries
-from gnd_map.geodesy import enu_axes
-from gnd_map.grid import MAX_HEIGHT_M, GridFrame, tile_axes
-from gnd_map.jit import kernel
-from gnd_map.near_grid import grid_near
-from gnd_map.tile_id import TileId
+from gnd.gnd_map.arrays import F64, I32, I64, points_3d
+from gnd.gnd_map.gaussian import Gaussians, Moments, full_matrices, six_entries
+from gnd.gnd_map.geodesy import enu_axes
+from gnd.gnd_map.grid import MAX_HEIGHT_M, GridFrame, tile_axes
+from gnd.gnd_map.jit import kernel
+from gnd.gnd_map.near_grid import grid_near
+from gnd.gnd_map.tile_id import TileId
 
 N_MIN_CELLS = 20
 CELLS_A_SIDE = 10

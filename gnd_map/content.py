@@ -6,10 +6,10 @@ The codec id says which of the two a body is; the name of a layer says which of 
 from dataclasses import replace
 from typing import Final, TypeAlias, TypeVar, cast
 
-from gnd_map.codec import PREFERRED, best_codec, codec_of, decode_delta, encode_delta, lattice_of
-from gnd_map.day import UNKNOWN_DAY
-from gnd_map.errors import CodecError
-from gnd_map.features import (
+from gnd.gnd_map.codec import PREFERRED, best_codec, codec_of, decode_delta, encode_delta, lattice_of
+from gnd.gnd_map.day import UNKNOWN_DAY
+from gnd.gnd_map.errors import CodecError
+from gnd.gnd_map.features import (
     CODEC_FEATURES,
     FeatureTile,
     decode_feature_delta,
@@ -19,8 +19,8 @@ from gnd_map.features import (
     encode_features,
     is_feature_layer,
 )
-from gnd_map.tile import Tile, diff
-from gnd_map.tile_id import TileId
+from gnd.gnd_map.tile import Tile, diff
+from gnd.gnd_map.tile_id import TileId
 
 AnyTile: TypeAlias = Tile | FeatureTile
 TileT = TypeVar("TileT", bound=Tile | FeatureTile)

@@ -4,9 +4,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from gnd_map.arrays import I32, I64, are_in, check_array
-from gnd_map.errors import DeltaError
-from gnd_map.gaussian import Gaussians, concat
+from gnd.gnd_map.arrays import I32, I64, are_in, check_array
+from gnd.gnd_map.errors import DeltaError
+from gnd.gnd_map.gaussian import Gaussians, concat
 
 
 @dataclass(frozen=True, slots=True)

@@ -18,8 +18,8 @@ from enum import IntEnum
 import numpy as np
 import numpy.typing as npt
 
-from gnd_map.arrays import F64, check_array
-from gnd_map.errors import ConfigError
+from gnd.gnd_map.arrays import F64, check_array
+from gnd.gnd_map.errors import ConfigError
 
 
 @dataclass(frozen=True, slots=True)

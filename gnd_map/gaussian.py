@@ -11,8 +11,8 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from gnd_map.arrays import F32, F64, I32, I64, check_array
-from gnd_map.errors import ShapeError
+from gnd.gnd_map.arrays import F32, F64, I32, I64, check_array
+from gnd.gnd_map.errors import ShapeError
 
 MAX_MEAN_M = 2.0
 _DIAGONAL = (0, 3, 5)  # xx, yy, zz among xx, xy, xz, yy, yz, zz

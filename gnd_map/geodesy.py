@@ -12,11 +12,11 @@ from typing import TYPE_CHECKING
 import numpy as np
 import numpy.typing as npt
 
-from gnd_map.arrays import F64
-from gnd_map.errors import GeodesyError
+from gnd.gnd_map.arrays import F64
+from gnd.gnd_map.errors import GeodesyError
 
 if TYPE_CHECKING:
-    from gnd_map.tile_id import TileId
+    from gnd.gnd_map.tile_id import TileId
 
 WGS84_A_M = 6378137.0  # semi-major axis, defining constant
 WGS84_F = 1.0 / 298.257223563  # flattening, defining constant

@@ -19,15 +19,15 @@ from functools import lru_cache
 import numpy as np
 import numpy.typing as npt
 
-from gnd_map.arrays import F64, I32, I64, check_array, points_3d
-from gnd_map.errors import TileError
-from gnd_map.geodesy import (
+from gnd.gnd_map.arrays import F64, I32, I64, check_array, points_3d
+from gnd.gnd_map.errors import TileError
+from gnd.gnd_map.geodesy import (
     LocalFrame,
     enu_axes,
     meridian_radius_m,
     normal_radius_m,
 )
-from gnd_map.tile_id import (
+from gnd.gnd_map.tile_id import (
     LAT_TILES,
     LON_TILES,
     TILE_RAD,

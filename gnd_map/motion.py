@@ -5,10 +5,10 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from gnd_map.arrays import F64, I64, Array, check_array, points_3d
-from gnd_map.errors import MotionError
-from gnd_map.jit import kernel
-from gnd_map.se3 import T_inverse, interpolate_poses
+from gnd.gnd_map.arrays import F64, I64, Array, check_array, points_3d
+from gnd.gnd_map.errors import MotionError
+from gnd.gnd_map.jit import kernel
+from gnd.gnd_map.se3 import T_inverse, interpolate_poses
 
 TOLERANCE_NS = 100_000_000  # one sweep at 10 Hz: its last points come after its last pose
 _KNOT_NS = 1_000_000  # at 1 rad/s, blending rotations over 1 ms is off by 1.3e-7 rad

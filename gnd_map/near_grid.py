@@ -6,11 +6,11 @@ wider clouds and nearer to a pole take `GridFrame.grid_of`. The tests compare th
 
 import numpy as np
 
-from gnd_map.arrays import F64
-from gnd_map.geodesy import WGS84_E2, enu_axes, meridian_radius_m, normal_radius_m
-from gnd_map.grid import VOXEL_M, GridFrame
-from gnd_map.jit import kernel
-from gnd_map.tile_id import TILE_RAD
+from gnd.gnd_map.arrays import F64
+from gnd.gnd_map.geodesy import WGS84_E2, enu_axes, meridian_radius_m, normal_radius_m
+from gnd.gnd_map.grid import VOXEL_M, GridFrame
+from gnd.gnd_map.jit import kernel
+from gnd.gnd_map.tile_id import TILE_RAD
 
 RADIUS_M = 300.0
 _MAX_LAT_RAD = np.radians(80.0)

@@ -9,8 +9,8 @@ import math
 import numpy as np
 import numpy.typing as npt
 
-from gnd_map.arrays import F64, I64, check_array
-from gnd_map.errors import MotionError, ShapeError
+from gnd.gnd_map.arrays import F64, I64, check_array
+from gnd.gnd_map.errors import MotionError, ShapeError
 
 
 def R_from_quaternion_xyzw(q: npt.ArrayLike) -> F64:

@@ -13,9 +13,9 @@ from typing import Any, Final, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from gnd_map.arrays import F32, F64, I32, I64
-from gnd_map.classes import ChangeClass
-from gnd_map.jit import bare, bare_inlined, kernel
+from gnd.gnd_map.arrays import F32, F64, I32, I64
+from gnd.gnd_map.classes import ChangeClass
+from gnd.gnd_map.jit import bare, bare_inlined, kernel
 
 U8 = NDArray[np.uint8]
 U64 = NDArray[np.uint64]

@@ -18,11 +18,11 @@ from typing import Literal
 import numpy as np
 import numpy.typing as npt
 
-from gnd_map.arrays import F64, I64, Array, check_array
-from gnd_map.errors import ConfigError
-from gnd_map.gaussian import full_matrices
-from gnd_map.jit import bare, bare_inlined
-from gnd_map.symmetric3 import add_to_diagonal, determinant, mahalanobis_squared
+from gnd.gnd_map.arrays import F64, I64, Array, check_array
+from gnd.gnd_map.errors import ConfigError
+from gnd.gnd_map.gaussian import full_matrices
+from gnd.gnd_map.jit import bare, bare_inlined
+from gnd.gnd_map.symmetric3 import add_to_diagonal, determinant, mahalanobis_squared
 
 SimilarityMode = Literal["paper", "default"]
 

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from gnd_map.arrays import F64
+from gnd.gnd_map.arrays import F64
 
 
 def determinant(s: F64) -> F64:

@@ -1,14 +1,14 @@
-"""A version of a tile and its content hash; deltas between versions are in `gnd_map.delta`."""
+"""A version of a tile and its content hash; deltas between versions are in `gnd.gnd_map.delta`."""
 
 import hashlib
 from dataclasses import dataclass, field
 
-from gnd_map.codec import encode_gaussians
-from gnd_map.day import LAST_DAY, UNKNOWN_DAY
-from gnd_map.delta import TileDelta, apply, diff
-from gnd_map.errors import ShapeError
-from gnd_map.gaussian import Gaussians
-from gnd_map.tile_id import TileId
+from gnd.gnd_map.codec import encode_gaussians
+from gnd.gnd_map.day import LAST_DAY, UNKNOWN_DAY
+from gnd.gnd_map.delta import TileDelta, apply, diff
+from gnd.gnd_map.errors import ShapeError
+from gnd.gnd_map.gaussian import Gaussians
+from gnd.gnd_map.tile_id import TileId
 
 __all__ = ["Tile", "TileDelta", "apply", "content_sha", "diff"]
 

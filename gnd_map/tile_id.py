@@ -14,9 +14,9 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from gnd_map.arrays import F64, I64
-from gnd_map.errors import TileError
-from gnd_map.geodesy import check_geodetic, ecef_from_geodetic, meridian_radius_m, normal_radius_m
+from gnd.gnd_map.arrays import F64, I64
+from gnd.gnd_map.errors import TileError
+from gnd.gnd_map.geodesy import check_geodetic, ecef_from_geodetic, meridian_radius_m, normal_radius_m
 
 LON_TILES = 1 << 20
 LAT_TILES = 1 << 19

@@ -17,9 +17,9 @@ from typing import Final
 
 import numpy as np
 
-from gnd_map.arrays import F64, I32, check_array
-from gnd_map.errors import CodecError, TrackError
-from gnd_map.tile_id import District, TileId
+from gnd.gnd_map.arrays import F64, I32, check_array
+from gnd.gnd_map.errors import CodecError, TrackError
+from gnd.gnd_map.tile_id import District, TileId
 
 STEPS: Final = 64
 """Horizontal units in a tile."""

@@ -6,11 +6,11 @@ from typing import Final, TypeAlias
 import numpy as np
 import numpy.typing as npt
 
-from gnd_map.arrays import F64, I64
-from gnd_map.errors import TrackError
-from gnd_map.geodesy import LocalFrame, meridian_radius_m, normal_radius_m
-from gnd_map.tile_id import LON_TILES, TILE_RAD, District, TileId, tile_coordinates
-from gnd_map.track import HEIGHT_UNIT_M, LEVEL_DEG, LEVELS, SECTORS, STEPS, Piece, Track, View
+from gnd.gnd_map.arrays import F64, I64
+from gnd.gnd_map.errors import TrackError
+from gnd.gnd_map.geodesy import LocalFrame, meridian_radius_m, normal_radius_m
+from gnd.gnd_map.tile_id import LON_TILES, TILE_RAD, District, TileId, tile_coordinates
+from gnd.gnd_map.track import HEIGHT_UNIT_M, LEVEL_DEG, LEVELS, SECTORS, STEPS, Piece, Track, View
 
 Mask: TypeAlias = npt.NDArray[np.bool_]
 

@@ -7,9 +7,9 @@ the tests. Source: Karney, "Transverse Mercator with an accuracy of a few nanome
 import numpy as np
 import numpy.typing as npt
 
-from gnd_map.arrays import F64
-from gnd_map.errors import GeodesyError
-from gnd_map.geodesy import WGS84_A_M, WGS84_E2, WGS84_F
+from gnd.gnd_map.arrays import F64
+from gnd.gnd_map.errors import GeodesyError
+from gnd.gnd_map.geodesy import WGS84_A_M, WGS84_E2, WGS84_F
 
 SCALE = 0.9996
 FALSE_EASTING_M = 500_000.0

@@ -15,15 +15,15 @@ from typing import Final
 import numpy as np
 import numpy.typing as npt
 
-from gnd_map import sight
-from gnd_map.arrays import F64, I32, I64
-from gnd_map.classes import ChangeClass
-from gnd_map.codec import Flags
-from gnd_map.errors import ConfigError, TrackError
-from gnd_map.grid import VoxelGrid, zones
-from gnd_map.sight import FACES, MOST_RAYS, NO_SLOT, NOTHING, STOP, Columns, Window
-from gnd_map.tile_id import LON_TILES, TileId, deinterleave
-from gnd_map.track import SECTORS, Track, View
+from gnd.gnd_map import sight
+from gnd.gnd_map.arrays import F64, I32, I64
+from gnd.gnd_map.classes import ChangeClass
+from gnd.gnd_map.codec import Flags
+from gnd.gnd_map.errors import ConfigError, TrackError
+from gnd.gnd_map.grid import VoxelGrid, zones
+from gnd.gnd_map.sight import FACES, MOST_RAYS, NO_SLOT, NOTHING, STOP, Columns, Window
+from gnd.gnd_map.tile_id import LON_TILES, TileId, deinterleave
+from gnd.gnd_map.track import SECTORS, Track, View
 
 U64 = npt.NDArray[np.uint64]
 

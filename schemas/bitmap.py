@@ -4,9 +4,9 @@ import zlib
 
 import numpy as np
 
-from gnd_map.arrays import I32
-from schemas import limits
-from schemas.errors import BadValue, Malformed, TooLarge
+from gnd.gnd_map.arrays import I32
+from gnd.schemas import limits
+from gnd.schemas.errors import BadValue, Malformed, TooLarge
 
 _LEVEL = 9
 

@@ -12,20 +12,20 @@ from typing import Final, Literal
 import numpy as np
 import numpy.typing as npt
 
-from gnd_map.arrays import I32, are_in, check_array
-from gnd_map.classes import ChangeClass
-from gnd_map.codec import CODEC_FLOAT32, codec_of, encode_gaussians
-from gnd_map.gaussian import Gaussians
-from gnd_map.grid import VoxelGrid
-from gnd_map.tile_id import District, TileId
-from schemas import limits
-from schemas.bitmap import decode_observed, encode_observed
-from schemas.course import Course, course_message, course_value
-from schemas.doubt import Doubt, doubt_message, doubt_value
-from schemas.errors import BadValue, TooLarge
-from schemas.generated import change_ack_pb2, change_report_pb2, tile_change_pb2
-from schemas.report_id import check_report_id
-from schemas.wire import (
+from gnd.gnd_map.arrays import I32, are_in, check_array
+from gnd.gnd_map.classes import ChangeClass
+from gnd.gnd_map.codec import CODEC_FLOAT32, codec_of, encode_gaussians
+from gnd.gnd_map.gaussian import Gaussians
+from gnd.gnd_map.grid import VoxelGrid
+from gnd.gnd_map.tile_id import District, TileId
+from gnd.schemas import limits
+from gnd.schemas.bitmap import decode_observed, encode_observed
+from gnd.schemas.course import Course, course_message, course_value
+from gnd.schemas.doubt import Doubt, doubt_message, doubt_value
+from gnd.schemas.errors import BadValue, TooLarge
+from gnd.schemas.generated import change_ack_pb2, change_report_pb2, tile_change_pb2
+from gnd.schemas.report_id import check_report_id
+from gnd.schemas.wire import (
     LAYER_PATTERN,
     MAJOR,
     PRINTABLE_PATTERN,
@@ -338,7 +338,7 @@ class ChangeAck:
     reason: str = ""
     """Why it was quarantined or is to be sent again, in one line with numbers."""
     wanted: bytes = b""
-    """Status "wanted": of which new and modified voxels Gaussians are asked for (`gnd_map.codec.encode_mask`)."""
+    """Status "wanted": of which new and modified voxels Gaussians are asked for (`gnd.gnd_map.codec.encode_mask`)."""
 
     def __post_init__(self) -> None:
         if self.report_id or self.status != "quarantined":

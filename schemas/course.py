@@ -4,8 +4,8 @@ from dataclasses import dataclass
 from math import ceil
 from typing import Final
 
-from schemas.errors import BadValue
-from schemas.generated import course_pb2
+from gnd.schemas.errors import BadValue
+from gnd.schemas.generated import course_pb2
 
 MAX_TURN_10URAD: Final = 314_160
 _STEPS_PER_RAD: Final = 1e5

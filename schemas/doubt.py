@@ -5,9 +5,9 @@ from dataclasses import dataclass
 from enum import IntFlag
 from typing import Final
 
-from schemas.errors import BadValue
-from schemas.generated import doubt_pb2
-from schemas.wire import check_unsigned
+from gnd.schemas.errors import BadValue
+from gnd.schemas.generated import doubt_pb2
+from gnd.schemas.wire import check_unsigned
 
 _REASON_BITS: Final = 32
 _COUNT_BITS: Final = 32

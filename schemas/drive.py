@@ -12,15 +12,15 @@ from typing import Final, Literal, NamedTuple, TypeVar, get_args
 import numpy as np
 import numpy.typing as npt
 
-from gnd_map.arrays import F32, F64, I64, check_array
-from gnd_map.geodesy import LocalFrame, check_geodetic
-from schemas import limits
-from schemas.errors import BadValue
-from schemas.looks import LOOK_SENSORS as LOOK_SENSORS
-from schemas.looks import Detections as Detections
-from schemas.looks import LaneLook as LaneLook
-from schemas.looks import LookSensor as LookSensor
-from schemas.wire import (
+from gnd.gnd_map.arrays import F32, F64, I64, check_array
+from gnd.gnd_map.geodesy import LocalFrame, check_geodetic
+from gnd.schemas import limits
+from gnd.schemas.errors import BadValue
+from gnd.schemas.looks import LOOK_SENSORS as LOOK_SENSORS
+from gnd.schemas.looks import Detections as Detections
+from gnd.schemas.looks import LaneLook as LaneLook
+from gnd.schemas.looks import LookSensor as LookSensor
+from gnd.schemas.wire import (
     PRINTABLE_PATTERN,
     VEHICLE_PATTERN,
     check_length,

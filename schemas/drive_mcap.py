@@ -32,9 +32,9 @@ from mcap.summary import Summary
 from mcap.writer import CompressionType, Writer
 from mcap_protobuf.schema import register_schema
 
-from gnd_map.arrays import F64
-from schemas import limits
-from schemas.drive import (
+from gnd.gnd_map.arrays import F64
+from gnd.schemas import limits
+from gnd.schemas.drive import (
     Detections,
     DriveHeader,
     DriveItem,
@@ -46,7 +46,7 @@ from schemas.drive import (
     Scan,
     track_of,
 )
-from schemas.drive_messages import (
+from gnd.schemas.drive_messages import (
     LIDAR_FRAME,
     MAP_FRAME,
     VEHICLE_FRAME,
@@ -61,13 +61,13 @@ from schemas.drive_messages import (
     scan_of,
     transform_message_of,
 )
-from schemas.drive_metadata import METADATA, header_of, metadata_of
-from schemas.errors import DriveError
-from schemas.generated import detections_pb2, lane_look_pb2
-from schemas.generated.vehicle_motion_pb2 import VehicleMotion
-from schemas.look_messages import detections_message_of, detections_of, lane_message_of, lanes_of
-from schemas.mcap_file import open_mcap, write_errors
-from schemas.wire import parse
+from gnd.schemas.drive_metadata import METADATA, header_of, metadata_of
+from gnd.schemas.errors import DriveError
+from gnd.schemas.generated import detections_pb2, lane_look_pb2
+from gnd.schemas.generated.vehicle_motion_pb2 import VehicleMotion
+from gnd.schemas.look_messages import detections_message_of, detections_of, lane_message_of, lanes_of
+from gnd.schemas.mcap_file import open_mcap, write_errors
+from gnd.schemas.wire import parse
 
 POINTS_TOPIC: Final = "/lidar/points"
 MOTION_TOPIC: Final = "/vehicle/motion"

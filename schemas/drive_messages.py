@@ -21,13 +21,13 @@ from foxglove_schemas_protobuf.Quaternion_pb2 import Quaternion
 from foxglove_schemas_protobuf.Vector3_pb2 import Vector3
 from google.protobuf.timestamp_pb2 import Timestamp
 
-from gnd_map.arrays import F64
-from gnd_map.se3 import R_from_quaternion_xyzw, T_from_R_t, quaternion_xyzw_from_R
-from schemas import limits
-from schemas.drive import GnssFix, MotionSample, ReferencePose, Scan
-from schemas.errors import BadValue
-from schemas.generated.vehicle_motion_pb2 import VehicleMotion
-from schemas.wire import check_length, refusing
+from gnd.gnd_map.arrays import F64
+from gnd.gnd_map.se3 import R_from_quaternion_xyzw, T_from_R_t, quaternion_xyzw_from_R
+from gnd.schemas import limits
+from gnd.schemas.drive import GnssFix, MotionSample, ReferencePose, Scan
+from gnd.schemas.errors import BadValue
+from gnd.schemas.generated.vehicle_motion_pb2 import VehicleMotion
+from gnd.schemas.wire import check_length, refusing
 
 LIDAR_FRAME: Final = "lidar"
 VEHICLE_FRAME: Final = "vehicle"

@@ -8,10 +8,10 @@ import zlib
 from collections.abc import Mapping
 from typing import Any, Final
 
-from gnd_map.arrays import F64
-from gnd_map.geodesy import LocalFrame
-from schemas.drive import DriveHeader, MountSigma
-from schemas.errors import DriveError
+from gnd.gnd_map.arrays import F64
+from gnd.gnd_map.geodesy import LocalFrame
+from gnd.schemas.drive import DriveHeader, MountSigma
+from gnd.schemas.errors import DriveError
 
 METADATA: Final = "gnd.drive"
 _FIELDS: Final = (

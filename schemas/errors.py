@@ -3,7 +3,7 @@
 SchemaError
 ├── BadKey          a key expression that is none of ours
 ├── WrongVersion    another major version, in a key or a message
-├── TooLarge        more bytes or items than `schemas.limits` allows
+├── TooLarge        more bytes or items than `gnd.schemas.limits` allows
 ├── Malformed       bytes that are not the message they should be
 ├── BadValue        a field whose value cannot be
 ├── WrongHash       content that does not have the hash it claims
@@ -11,7 +11,7 @@ SchemaError
 └── TrajectoryError a file of poses that cannot be read or written
 """
 
-from gnd_map.errors import GndError
+from gnd.gnd_map.errors import GndError
 
 
 class SchemaError(GndError):
@@ -27,7 +27,7 @@ class WrongVersion(SchemaError):
 
 
 class TooLarge(SchemaError):
-    """More bytes or items than `schemas.limits` allows."""
+    """More bytes or items than `gnd.schemas.limits` allows."""
 
 
 class Malformed(SchemaError):

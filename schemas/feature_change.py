@@ -7,13 +7,13 @@ from typing import Final
 
 import numpy as np
 
-from gnd_map.arrays import F64, check_array
-from gnd_map.features import Existence, Feature, check_simple_polyline, snapped
-from gnd_map.geodesy import LocalFrame
-from gnd_map.tile_id import TileId
-from schemas import limits
-from schemas.errors import BadValue
-from schemas.wire import check_length, check_pair, check_unsigned, refusing
+from gnd.gnd_map.arrays import F64, check_array
+from gnd.gnd_map.features import Existence, Feature, check_simple_polyline, snapped
+from gnd.gnd_map.geodesy import LocalFrame
+from gnd.gnd_map.tile_id import TileId
+from gnd.schemas import limits
+from gnd.schemas.errors import BadValue
+from gnd.schemas.wire import check_length, check_pair, check_unsigned, refusing
 
 GRID: Final = 8
 """Rows and columns of the cells of `FeatureChange.viewed`."""

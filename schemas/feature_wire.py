@@ -4,15 +4,15 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from gnd_map.arrays import F64
-from gnd_map.features import Existence, decode_features, encode_features
-from gnd_map.features.covariance import MAX_RATIO_STEPS, TOP_LEVEL, covariance_of, levels_of
-from gnd_map.features.feature import M_PER_STEP, MASS_STEPS, existence_of_steps
-from schemas import limits
-from schemas.errors import BadValue
-from schemas.feature_change import FeatureChange, Found, Seen
-from schemas.generated import feature_change_pb2
-from schemas.wire import check_length, refusing, tile_id
+from gnd.gnd_map.arrays import F64
+from gnd.gnd_map.features import Existence, decode_features, encode_features
+from gnd.gnd_map.features.covariance import MAX_RATIO_STEPS, TOP_LEVEL, covariance_of, levels_of
+from gnd.gnd_map.features.feature import M_PER_STEP, MASS_STEPS, existence_of_steps
+from gnd.schemas import limits
+from gnd.schemas.errors import BadValue
+from gnd.schemas.feature_change import FeatureChange, Found, Seen
+from gnd.schemas.generated import feature_change_pb2
+from gnd.schemas.wire import check_length, refusing, tile_id
 
 Place = tuple[F64 | None, F64 | None]
 """Position and covariance; None where nothing was measured."""

@@ -12,15 +12,15 @@ from typing import Final
 
 from ulid import ULID
 
-from gnd_map.features import is_feature_layer
-from gnd_map.tile_id import District, TileId
-from schemas import limits
-from schemas.errors import BadValue
-from schemas.feature_change import EVERY_CELL, GRID, FeatureChange, Found, Seen, cell_of
-from schemas.feature_wire import change_message, change_of
-from schemas.generated import change_report_pb2, feature_change_pb2, feature_report_pb2
-from schemas.report_id import check_report_id, report_id_of_bytes
-from schemas.wire import (
+from gnd.gnd_map.features import is_feature_layer
+from gnd.gnd_map.tile_id import District, TileId
+from gnd.schemas import limits
+from gnd.schemas.errors import BadValue
+from gnd.schemas.feature_change import EVERY_CELL, GRID, FeatureChange, Found, Seen, cell_of
+from gnd.schemas.feature_wire import change_message, change_of
+from gnd.schemas.generated import change_report_pb2, feature_change_pb2, feature_report_pb2
+from gnd.schemas.report_id import check_report_id, report_id_of_bytes
+from gnd.schemas.wire import (
     LAYER_PATTERN,
     MAJOR,
     PRINTABLE_PATTERN,
@@ -33,7 +33,7 @@ from schemas.wire import (
     refusing,
     serialise,
 )
-from schemas.wire_fields import check_field_count, submessages
+from gnd.schemas.wire_fields import check_field_count, submessages
 
 __all__ = [
     "EVERY_CELL",

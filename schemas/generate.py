@@ -1,6 +1,6 @@
 """Generates `schemas/generated` from `schemas/*.proto`, and refuses changes that break the wire format.
 
-`python -m schemas.generate` writes the code and the golden descriptor set; `--check` only compares, for CI.
+`python -m gnd.schemas.generate` writes the code and the golden descriptor set; `--check` only compares, for CI.
 Needs the development tools (grpcio-tools, mypy-protobuf).
 """
 
@@ -11,8 +11,8 @@ from pathlib import Path
 
 from google.protobuf.descriptor_pb2 import FileDescriptorSet
 
-from schemas.compatibility import breaking_changes
-from schemas.errors import SchemaError
+from gnd.schemas.compatibility import breaking_changes
+from gnd.schemas.errors import SchemaError
 
 SOURCES = Path(__file__).parent
 GENERATED = SOURCES / "generated"
@@ -47,7 +47,9 @@ def check() -> None:
     different = sorted(n for n in files.keys() | committed.keys() if files.get(n) != committed.get(n))
     if different or descriptors != _golden():
         what = ", ".join(different) or GOLDEN.name
-        raise GenerateError(f"generated code differs from schemas/*.proto in {what}: run `python -m schemas.generate`")
+        raise GenerateError(
+            f"generated code differs from schemas/*.proto in {what}: run `python -m gnd.schemas.generate`"
+        )
 
 
 def _refuse_breaking(descriptors: FileDescriptorSet) -> None:
@@ -96,13 +98,13 @@ def _protoc(out: Path) -> None:
 def _relocated(code: str) -> str:
     """The generated modules import each other by protobuf's folders; here they are one package."""
     return code.replace(f"from {PROTO_PACKAGE} import", "from . import").replace(
-        f"'{PROTO_PACKAGE}.", "'schemas.generated."
+        f"'{PROTO_PACKAGE}.", "'gnd.schemas.generated."
     )
 
 
 def main(arguments: list[str] | None = None) -> int:
     """The command; returns the exit code."""
-    parser = argparse.ArgumentParser(prog="python -m schemas.generate", description=__doc__)
+    parser = argparse.ArgumentParser(prog="python -m gnd.schemas.generate", description=__doc__)
     parser.add_argument("--check", action="store_true", help="compare only; exit code 1 when something differs")
     try:
         check() if parser.parse_args(arguments).check else generate()

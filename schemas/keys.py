@@ -8,9 +8,9 @@ import re
 from dataclasses import dataclass
 from typing import Final
 
-from gnd_map.tile_id import District, TileId
-from schemas.errors import BadKey, WrongVersion
-from schemas.wire import LAYER_PATTERN, MAJOR, VEHICLE_PATTERN, WORD_PATTERN, refusing
+from gnd.gnd_map.tile_id import District, TileId
+from gnd.schemas.errors import BadKey, WrongVersion
+from gnd.schemas.wire import LAYER_PATTERN, MAJOR, VEHICLE_PATTERN, WORD_PATTERN, refusing
 
 ROOT: Final = f"gnd/v{MAJOR}"
 

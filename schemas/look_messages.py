@@ -4,13 +4,13 @@ from collections.abc import Iterable
 
 import numpy as np
 
-from gnd_map.arrays import F32
-from schemas import limits
-from schemas.drive import LOOK_SENSORS, Detections, LaneLook
-from schemas.drive_messages import ns_of, timestamp_of
-from schemas.errors import BadValue
-from schemas.generated import detections_pb2, lane_look_pb2
-from schemas.wire import check_length
+from gnd.gnd_map.arrays import F32
+from gnd.schemas import limits
+from gnd.schemas.drive import LOOK_SENSORS, Detections, LaneLook
+from gnd.schemas.drive_messages import ns_of, timestamp_of
+from gnd.schemas.errors import BadValue
+from gnd.schemas.generated import detections_pb2, lane_look_pb2
+from gnd.schemas.wire import check_length
 
 
 def detections_message_of(look: Detections) -> detections_pb2.Detections:

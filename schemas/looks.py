@@ -6,11 +6,11 @@ from typing import Final, Literal, get_args
 
 import numpy as np
 
-from gnd_map.arrays import F32, check_array
-from gnd_map.features.feature import KIND_PATTERN
-from schemas import limits
-from schemas.errors import BadValue
-from schemas.wire import LAYER_PATTERN, check_length, check_text, check_unsigned, refusing
+from gnd.gnd_map.arrays import F32, check_array
+from gnd.gnd_map.features.feature import KIND_PATTERN
+from gnd.schemas import limits
+from gnd.schemas.errors import BadValue
+from gnd.schemas.wire import LAYER_PATTERN, check_length, check_text, check_unsigned, refusing
 
 _TIME_BITS: Final = 63
 _PI32: Final = float(np.float32(math.pi))

@@ -15,9 +15,9 @@ from mcap.reader import SeekingReader
 from mcap.summary import Summary
 from mcap.writer import MCAP0_MAGIC
 
-from gnd_map.errors import GndError
-from schemas import limits
-from schemas.errors import DriveError
+from gnd.gnd_map.errors import GndError
+from gnd.schemas import limits
+from gnd.schemas.errors import DriveError
 
 # Magic, then the footer record: opcode, length, summary start, summary offset start, summary CRC.
 _TAIL: Final = struct.Struct("<BQQQI8s")

@@ -3,7 +3,7 @@
 
 Both travel in the message ChangeReport on the key of change reports. What they hold is coded against the versions of
 the tiles that vehicle and cloud both have, so these values only carry the bytes: `vehicle_agent.packing` makes them,
-`cloud_merger.expanding` understands them.
+`gnd.cloud_merger.expanding` understands them.
 """
 
 import hashlib
@@ -14,16 +14,16 @@ from typing import Final
 
 from ulid import ULID
 
-from gnd_map.codec import decode_tiles, encode_tiles
-from schemas import limits
-from schemas.changes import ChangeReport
-from schemas.course import Course, course_message, course_value
-from schemas.doubt import Doubt, doubt_message, doubt_value
-from schemas.errors import BadValue, TooLarge
-from schemas.features import FeatureReport, check_feature_bytes, report_of
-from schemas.generated import change_report_pb2, packed_gaussians_pb2, packed_report_pb2
-from schemas.report_id import check_report_id, report_id_of_bytes
-from schemas.wire import (
+from gnd.gnd_map.codec import decode_tiles, encode_tiles
+from gnd.schemas import limits
+from gnd.schemas.changes import ChangeReport
+from gnd.schemas.course import Course, course_message, course_value
+from gnd.schemas.doubt import Doubt, doubt_message, doubt_value
+from gnd.schemas.errors import BadValue, TooLarge
+from gnd.schemas.features import FeatureReport, check_feature_bytes, report_of
+from gnd.schemas.generated import change_report_pb2, packed_gaussians_pb2, packed_report_pb2
+from gnd.schemas.report_id import check_report_id, report_id_of_bytes
+from gnd.schemas.wire import (
     MAJOR,
     PRINTABLE_PATTERN,
     VEHICLE_PATTERN,
@@ -69,9 +69,9 @@ class PackedReport:
     base_digest: bytes
     """`digest_of` the bases."""
     flags: bytes
-    """Of `gnd_map.codec.encode_flags`."""
+    """Of `gnd.gnd_map.codec.encode_flags`."""
     track: bytes
-    """Of `gnd_map.track.encode_track`."""
+    """Of `gnd.gnd_map.track.encode_track`."""
     pose_sigma_tenth_mm: int
     """Largest of the tiles' standard deviations of the refined position, 0.1 mm, rounded up."""
     pose_sigma_10urad: int
@@ -174,7 +174,7 @@ class PackedGaussians:
     report_id: str
     """ULID of the report."""
     measured: bytes
-    """Of `gnd_map.codec.encode_measured`."""
+    """Of `gnd.gnd_map.codec.encode_measured`."""
     wanted_crc: int
     """`crc_of` the bytes of the mask that asked for them."""
 

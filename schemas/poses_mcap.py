@@ -28,12 +28,12 @@ from google.protobuf.message import Message
 from mcap.writer import CompressionType, Writer
 from mcap_protobuf.schema import register_schema
 
-from gnd_map.arrays import F64
-from gnd_map.geodesy import LocalFrame
-from gnd_map.motion import Trajectory
-from schemas.drive import ReferencePose
-from schemas.drive_messages import MAP_FRAME, VEHICLE_FRAME, pose_message_of, timestamp_of, transform_message_of
-from schemas.errors import BadValue, TrajectoryError
+from gnd.gnd_map.arrays import F64
+from gnd.gnd_map.geodesy import LocalFrame
+from gnd.gnd_map.motion import Trajectory
+from gnd.schemas.drive import ReferencePose
+from gnd.schemas.drive_messages import MAP_FRAME, VEHICLE_FRAME, pose_message_of, timestamp_of, transform_message_of
+from gnd.schemas.errors import BadValue, TrajectoryError
 
 METADATA: Final = "gnd.poses"
 TF_TOPIC: Final = "/tf"

@@ -5,8 +5,8 @@ from functools import lru_cache
 
 from ulid import ULID
 
-from schemas.errors import BadValue
-from schemas.wire import refusing
+from gnd.schemas.errors import BadValue
+from gnd.schemas.wire import refusing
 
 _RANDOM_BYTES = 10
 _TIME_BYTES = 6

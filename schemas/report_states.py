@@ -4,11 +4,11 @@ from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import Final, Literal
 
-from schemas import limits
-from schemas.errors import BadValue
-from schemas.generated import report_question_pb2, report_state_pb2, report_states_pb2
-from schemas.report_id import bytes_of_report_id, check_report_id, report_id_of_bytes
-from schemas.wire import (
+from gnd.schemas import limits
+from gnd.schemas.errors import BadValue
+from gnd.schemas.generated import report_question_pb2, report_state_pb2, report_states_pb2
+from gnd.schemas.report_id import bytes_of_report_id, check_report_id, report_id_of_bytes
+from gnd.schemas.wire import (
     MAJOR,
     REASON_PATTERN,
     check_length,
@@ -39,7 +39,7 @@ class ReportState:
     report_id: str
     status: ReportStatus
     wanted: bytes = b""
-    """Status "wanted": of which new and modified voxels Gaussians are asked for (`gnd_map.codec.encode_mask`)."""
+    """Status "wanted": of which new and modified voxels Gaussians are asked for (`gnd.gnd_map.codec.encode_mask`)."""
     reason: str = ""
     """Why it was quarantined or is to be sent whole, in one line with numbers."""
 

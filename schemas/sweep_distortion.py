@@ -4,7 +4,7 @@ import math
 from collections.abc import Callable
 from typing import Final, NamedTuple
 
-from schemas.drive import Deskew, DriveHeader
+from gnd.schemas.drive import Deskew, DriveHeader
 
 USUAL_SWEEP_S: Final = 0.1
 """Taken where a drive does not say how long its sweeps last: most LiDARs turn at 10 Hz."""

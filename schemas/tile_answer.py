@@ -3,14 +3,14 @@
 from dataclasses import dataclass
 from typing import Final, Literal
 
-from gnd_map.content import AnyTile, TileT, dated, decode_content
-from gnd_map.day import UNKNOWN_DAY
-from gnd_map.tile import Tile
-from gnd_map.tile_id import TileId
-from schemas import limits
-from schemas.errors import BadValue, WrongHash
-from schemas.tiles import as_kind, check_day, check_hash, tile_from_delta
-from schemas.wire import check_length, check_version, check_word, refusing
+from gnd.gnd_map.content import AnyTile, TileT, dated, decode_content
+from gnd.gnd_map.day import UNKNOWN_DAY
+from gnd.gnd_map.tile import Tile
+from gnd.gnd_map.tile_id import TileId
+from gnd.schemas import limits
+from gnd.schemas.errors import BadValue, WrongHash
+from gnd.schemas.tiles import as_kind, check_day, check_hash, tile_from_delta
+from gnd.schemas.wire import check_length, check_version, check_word, refusing
 
 ANSWER_HASH_BYTES: Final = 4
 """So much of a hash goes with what is brought. Bodies have checksums of their own, the base of a delta is agreed upon
@@ -43,9 +43,9 @@ class TileAnswer:
     codec_id: int = 0
     """Codec of a blob; else 0."""
     body: bytes = b""
-    """Of a blob in its codec, or of a delta by `gnd_map.content.encode_content_delta`; else empty."""
+    """Of a blob in its codec, or of a delta by `gnd.gnd_map.content.encode_content_delta`; else empty."""
     day: int = UNKNOWN_DAY
-    """When the world looked as a blob or delta says (`gnd_map.day`); else not known."""
+    """When the world looked as a blob or delta says (`gnd.gnd_map.day`); else not known."""
 
     def __post_init__(self) -> None:
         check_word(self.status, ANSWER_STATUS, "answer status")

@@ -4,16 +4,16 @@ from dataclasses import dataclass
 from itertools import pairwise
 from typing import Final, Literal
 
-from gnd_map.codec import CODEC_FLOAT32, PREFERRED, codec_of
-from gnd_map.content import AnyTile, TileT, dated, decode_content, decode_content_delta, noun_of
-from gnd_map.day import LAST_DAY, UNKNOWN_DAY
-from gnd_map.errors import GndError
-from gnd_map.features import FeatureTile
-from gnd_map.tile import Tile
-from gnd_map.tile_id import TileId
-from schemas import limits
-from schemas.errors import BadValue, WrongHash
-from schemas.generated import (
+from gnd.gnd_map.codec import CODEC_FLOAT32, PREFERRED, codec_of
+from gnd.gnd_map.content import AnyTile, TileT, dated, decode_content, decode_content_delta, noun_of
+from gnd.gnd_map.day import LAST_DAY, UNKNOWN_DAY
+from gnd.gnd_map.errors import GndError
+from gnd.gnd_map.features import FeatureTile
+from gnd.gnd_map.tile import Tile
+from gnd.gnd_map.tile_id import TileId
+from gnd.schemas import limits
+from gnd.schemas.errors import BadValue, WrongHash
+from gnd.schemas.generated import (
     catalog_entry_pb2,
     catalog_pb2,
     coded_delta_pb2,
@@ -21,7 +21,7 @@ from schemas.generated import (
     tile_reply_pb2,
     tile_request_pb2,
 )
-from schemas.wire import (
+from gnd.schemas.wire import (
     MAJOR,
     check_length,
     check_major,
@@ -95,7 +95,7 @@ class TileBlob:
     codec_id: int
     body: bytes
     day: int = UNKNOWN_DAY
-    """When the world looked so (`gnd_map.day`)."""
+    """When the world looked so (`gnd.gnd_map.day`)."""
 
     def __post_init__(self) -> None:
         check_version("tile version", self.version, lowest=1)
@@ -188,9 +188,9 @@ class CodedDelta:
     sha: bytes
     """SHA-256 of the content that comes out."""
     body: bytes
-    """`gnd_map.content.encode_content_delta` against what the client holds."""
+    """`gnd.gnd_map.content.encode_content_delta` against what the client holds."""
     day: int = UNKNOWN_DAY
-    """When the world looked so (`gnd_map.day`)."""
+    """When the world looked so (`gnd.gnd_map.day`)."""
 
     def __post_init__(self) -> None:
         check_version("tile version", self.version, lowest=1)

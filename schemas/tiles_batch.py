@@ -8,14 +8,21 @@ from dataclasses import dataclass
 from itertools import groupby, pairwise
 from typing import Final, Self
 
-from gnd_map.codec import PREFERRED, decode_tiles, encode_tiles
-from gnd_map.tile_id import District, TileId
-from schemas import limits
-from schemas.errors import BadValue
-from schemas.generated import tiles_reply_pb2, tiles_request_pb2
-from schemas.tile_answer import ANSWER_HASH_BYTES, ANSWER_STATUS, WITH_BODY, AnswerStatus, TileAnswer, tile_of_answer
-from schemas.tiles import check_codecs
-from schemas.wire import (
+from gnd.gnd_map.codec import PREFERRED, decode_tiles, encode_tiles
+from gnd.gnd_map.tile_id import District, TileId
+from gnd.schemas import limits
+from gnd.schemas.errors import BadValue
+from gnd.schemas.generated import tiles_reply_pb2, tiles_request_pb2
+from gnd.schemas.tile_answer import (
+    ANSWER_HASH_BYTES,
+    ANSWER_STATUS,
+    WITH_BODY,
+    AnswerStatus,
+    TileAnswer,
+    tile_of_answer,
+)
+from gnd.schemas.tiles import check_codecs
+from gnd.schemas.wire import (
     MAJOR,
     check_length,
     check_major,

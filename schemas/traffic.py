@@ -4,11 +4,11 @@ import math
 from dataclasses import dataclass
 from typing import Final, Literal
 
-from schemas import limits
-from schemas.doubt import DoubtReason
-from schemas.errors import BadValue
-from schemas.generated import traffic_line_pb2, traffic_sample_pb2
-from schemas.wire import (
+from gnd.schemas import limits
+from gnd.schemas.doubt import DoubtReason
+from gnd.schemas.errors import BadValue
+from gnd.schemas.generated import traffic_line_pb2, traffic_sample_pb2
+from gnd.schemas.wire import (
     MAJOR,
     VEHICLE_PATTERN,
     WORD_PATTERN,

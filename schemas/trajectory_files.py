@@ -18,11 +18,11 @@ from typing import Final, TypeVar
 
 import numpy as np
 
-from gnd_map.arrays import F64, I64
-from gnd_map.motion import Trajectory
-from gnd_map.se3 import R_from_quaternion_xyzw, T_from_R_t, quaternion_xyzw_from_R
-from schemas.drive import check_rigid
-from schemas.errors import SchemaError, TrajectoryError
+from gnd.gnd_map.arrays import F64, I64
+from gnd.gnd_map.motion import Trajectory
+from gnd.gnd_map.se3 import R_from_quaternion_xyzw, T_from_R_t, quaternion_xyzw_from_R
+from gnd.schemas.drive import check_rigid
+from gnd.schemas.errors import SchemaError, TrajectoryError
 
 _NS: Final = 1_000_000_000
 _TIME: Final = re.compile(r"(\d{1,10})(?:\.(\d*))?")

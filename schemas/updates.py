@@ -5,17 +5,17 @@ from typing import Final, Literal, cast
 
 import numpy as np
 
-from gnd_map.codec import CODEC_FLOAT32, codec_of, encode_gaussians
-from gnd_map.content import TileT, dated
-from gnd_map.day import UNKNOWN_DAY
-from gnd_map.errors import GndError
-from gnd_map.tile import Tile, TileDelta, apply
-from gnd_map.tile_id import TileId
-from schemas import limits
-from schemas.errors import BadValue, WrongHash
-from schemas.generated import tile_delta_pb2, tile_update_pb2
-from schemas.tiles import check_day, check_hash, tile_from_delta
-from schemas.wire import (
+from gnd.gnd_map.codec import CODEC_FLOAT32, codec_of, encode_gaussians
+from gnd.gnd_map.content import TileT, dated
+from gnd.gnd_map.day import UNKNOWN_DAY
+from gnd.gnd_map.errors import GndError
+from gnd.gnd_map.tile import Tile, TileDelta, apply
+from gnd.gnd_map.tile_id import TileId
+from gnd.schemas import limits
+from gnd.schemas.errors import BadValue, WrongHash
+from gnd.schemas.generated import tile_delta_pb2, tile_update_pb2
+from gnd.schemas.tiles import check_day, check_hash, tile_from_delta
+from gnd.schemas.wire import (
     LAYER_PATTERN,
     MAJOR,
     check_length,
@@ -53,13 +53,13 @@ class TileUpdate:
     delta: TileDelta | None = None
     """What turns the previous content into the new one, in plain columns; None = see `coded_delta`."""
     coded_delta: bytes = b""
-    """The same by `gnd_map.content.encode_content_delta`; with neither, ask for what has changed."""
+    """The same by `gnd.gnd_map.content.encode_content_delta`; with neither, ask for what has changed."""
     put_voxels: int = 0
     """Voxels or features that come or are replaced by `coded_delta`."""
     removed_voxels: int = 0
     """Voxels or features that go by `coded_delta`."""
     day: int = UNKNOWN_DAY
-    """When the world looked as the new version says (`gnd_map.day`)."""
+    """When the world looked as the new version says (`gnd.gnd_map.day`)."""
     put_count: int = 0
     """Voxels or features that come or are replaced, where the notice has no delta to tell."""
     removed_count: int = 0

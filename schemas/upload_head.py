@@ -3,13 +3,13 @@
 from dataclasses import dataclass
 from typing import Final, Literal
 
-from gnd_map.tile_id import District
-from schemas import limits
-from schemas.errors import BadValue, TooLarge
-from schemas.features import check_feature_bytes
-from schemas.generated import change_report_pb2, feature_report_pb2, packed_report_pb2
-from schemas.report_id import check_report_id, report_id_of_bytes
-from schemas.wire import (
+from gnd.gnd_map.tile_id import District
+from gnd.schemas import limits
+from gnd.schemas.errors import BadValue, TooLarge
+from gnd.schemas.features import check_feature_bytes
+from gnd.schemas.generated import change_report_pb2, feature_report_pb2, packed_report_pb2
+from gnd.schemas.report_id import check_report_id, report_id_of_bytes
+from gnd.schemas.wire import (
     LAYER_PATTERN,
     VEHICLE_PATTERN,
     check_major,

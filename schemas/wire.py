@@ -7,10 +7,10 @@ from typing import Final, Protocol, TypeVar
 
 from google.protobuf.message import DecodeError, Message
 
-from gnd_map.errors import GndError
-from gnd_map.tile_id import TileId
-from schemas.errors import BadValue, Malformed, SchemaError, TooLarge, WrongVersion
-from schemas.wire_fields import check_field_count
+from gnd.gnd_map.errors import GndError
+from gnd.gnd_map.tile_id import TileId
+from gnd.schemas.errors import BadValue, Malformed, SchemaError, TooLarge, WrongVersion
+from gnd.schemas.wire_fields import check_field_count
 
 MAJOR: Final = 1
 SHA_BYTES: Final = 32

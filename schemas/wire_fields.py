@@ -7,7 +7,7 @@ So the messages that hold many submessages are counted before they are parsed.
 from collections.abc import Iterator
 from typing import Final
 
-from schemas.errors import Malformed, TooLarge
+from gnd.schemas.errors import Malformed, TooLarge
 
 _VARINT, _FIXED64, _BYTES, _FIXED32 = 0, 1, 2, 5
 _FIXED_BYTES: Final = {_FIXED64: 8, _FIXED32: 4}

@@ -11,22 +11,22 @@ from dataclasses import dataclass
 from typing import Final, Literal
 from zlib import crc32
 
-from fleet_bus.errors import Refused
-from gnd_map.codec import CODECS, best_codec, codec_of, lattice_of
-from gnd_map.content import FEATURE_CODECS, AnyTile, codecs_of_layer, encode_content_delta, has_deltas
-from gnd_map.day import UNKNOWN_DAY
-from gnd_map.errors import CodecError, GndError
-from gnd_map.features import FeatureTile
-from gnd_map.tile import Tile
-from gnd_map.tile_id import District, TileId
-from schemas.errors import SchemaError
-from schemas.limits import MAX_TILE_BODY_BYTES
-from schemas.tiles import CatalogEntry, CodedDelta, TileBlob, TileReply, TileRequest, as_kind
-from schemas.tiles_batch import ANSWER_HASH_BYTES, TileAnswer, TilesReply, TilesRequest, digest_of, index_of
-from tile_store.errors import StoreDamaged
-from tile_store.memory import Memory
-from tile_store.store import Store
-from tile_store.values import StoredTile
+from gnd.fleet_bus.errors import Refused
+from gnd.gnd_map.codec import CODECS, best_codec, codec_of, lattice_of
+from gnd.gnd_map.content import FEATURE_CODECS, AnyTile, codecs_of_layer, encode_content_delta, has_deltas
+from gnd.gnd_map.day import UNKNOWN_DAY
+from gnd.gnd_map.errors import CodecError, GndError
+from gnd.gnd_map.features import FeatureTile
+from gnd.gnd_map.tile import Tile
+from gnd.gnd_map.tile_id import District, TileId
+from gnd.schemas.errors import SchemaError
+from gnd.schemas.limits import MAX_TILE_BODY_BYTES
+from gnd.schemas.tiles import CatalogEntry, CodedDelta, TileBlob, TileReply, TileRequest, as_kind
+from gnd.schemas.tiles_batch import ANSWER_HASH_BYTES, TileAnswer, TilesReply, TilesRequest, digest_of, index_of
+from gnd.tile_store.errors import StoreDamaged
+from gnd.tile_store.memory import Memory
+from gnd.tile_store.store import Store
+from gnd.tile_store.values import StoredTile
 
 BYTES_A_VOXEL: Final = 48
 BYTES_A_FEATURE: Final = 2_000  # as Python objects, with its points and attributes

@@ -5,10 +5,10 @@ import re
 from datetime import UTC, datetime
 from typing import Final
 
-from gnd_map.errors import MapError
-from gnd_map.tile_id import TileId
-from tile_store.errors import StoreError
-from tile_store.regions import morton_range
+from gnd.gnd_map.errors import MapError
+from gnd.gnd_map.tile_id import TileId
+from gnd.tile_store.errors import StoreError
+from gnd.tile_store.regions import morton_range
 
 _VERSIONS: Final = re.compile(r"(\d+)\.\.(\d+)")
 

@@ -6,10 +6,10 @@ from typing import Final
 
 import apsw
 
-from tile_store.check import Checked, Progress, require_whole, silent
-from tile_store.errors import StoreError, StoreUnavailable
-from tile_store.migrations import SCHEMA_VERSION, schema_of
-from tile_store.sqlite_connection import SQL, as_store_error, open_reader
+from gnd.tile_store.check import Checked, Progress, require_whole, silent
+from gnd.tile_store.errors import StoreError, StoreUnavailable
+from gnd.tile_store.migrations import SCHEMA_VERSION, schema_of
+from gnd.tile_store.sqlite_connection import SQL, as_store_error, open_reader
 
 PAGES_A_STEP: Final = 2048
 LOGS: Final = ("-wal", "-shm", "-journal")

@@ -14,23 +14,23 @@ from typing import Final
 
 import numpy as np
 
-from gnd_map.accumulate import N_MIN_CELLS, VoxelAccumulator
-from gnd_map.arrays import F64
-from gnd_map.codec import Lattice, snap
-from gnd_map.errors import MotionError
-from gnd_map.features import is_feature_layer
-from gnd_map.gaussian import Gaussians
-from gnd_map.geodesy import LocalFrame
-from gnd_map.grid import GridFrame, zones
-from gnd_map.motion import Trajectory, deskew
-from gnd_map.se3 import log_so3, transform
-from gnd_map.tile import Tile
-from gnd_map.tile_id import TileId, covering_corridor
-from schemas.drive import DriveHeader, GnssTrack, ReferenceTrack, Scan
-from schemas.drive_mcap import drive_counts, load_track, read_drive, read_header
-from tile_store.errors import StoreError
-from tile_store.store import Store
-from tile_store.values import DEFAULT_CODEC, DEFAULT_LAYER, lattice_named
+from gnd.gnd_map.accumulate import N_MIN_CELLS, VoxelAccumulator
+from gnd.gnd_map.arrays import F64
+from gnd.gnd_map.codec import Lattice, snap
+from gnd.gnd_map.errors import MotionError
+from gnd.gnd_map.features import is_feature_layer
+from gnd.gnd_map.gaussian import Gaussians
+from gnd.gnd_map.geodesy import LocalFrame
+from gnd.gnd_map.grid import GridFrame, zones
+from gnd.gnd_map.motion import Trajectory, deskew
+from gnd.gnd_map.se3 import log_so3, transform
+from gnd.gnd_map.tile import Tile
+from gnd.gnd_map.tile_id import TileId, covering_corridor
+from gnd.schemas.drive import DriveHeader, GnssTrack, ReferenceTrack, Scan
+from gnd.schemas.drive_mcap import drive_counts, load_track, read_drive, read_header
+from gnd.tile_store.errors import StoreError
+from gnd.tile_store.store import Store
+from gnd.tile_store.values import DEFAULT_CODEC, DEFAULT_LAYER, lattice_named
 
 _TILE_M: Final = 40.0
 

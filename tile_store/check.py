@@ -7,12 +7,12 @@ from typing import Any, Final
 
 import apsw
 
-from gnd_map.content import decode_content
-from gnd_map.errors import GndError
-from gnd_map.tile_id import TileId
-from tile_store.errors import StoreError
-from tile_store.migrations import schema_of
-from tile_store.sqlite_connection import as_store_error, fetch, open_reader
+from gnd.gnd_map.content import decode_content
+from gnd.gnd_map.errors import GndError
+from gnd.gnd_map.tile_id import TileId
+from gnd.tile_store.errors import StoreError
+from gnd.tile_store.migrations import schema_of
+from gnd.tile_store.sqlite_connection import as_store_error, fetch, open_reader
 
 MOST_PAGES_NAMED: Final = 100
 

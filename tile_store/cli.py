@@ -13,22 +13,22 @@ from types import FrameType
 import click
 from prometheus_client import CollectorRegistry
 
-from fleet_bus.bus import open_bus
-from fleet_bus.config import DEFAULT_ENDPOINT, BusConfig
-from fleet_bus.health import HealthServer
-from fleet_bus.health_options import metrics_options
-from fleet_bus.router import wait_for_stop
-from tile_store import tables, upkeep_cli
-from tile_store.arguments import parse_tile, parse_time_ns, parse_versions
-from tile_store.compare import MapDiff, layer_info, layer_totals, map_diff, version_diff
-from tile_store.errors import StoreError
-from tile_store.export import FORMATS, export_map
-from tile_store.metrics import StoreCollector, store_checks
-from tile_store.options import PATH, existing, json_option, layer_option, region_option, show, to_read
-from tile_store.server import TileServer
-from tile_store.sqlite_store import SqliteStore
-from tile_store.status import status
-from tile_store.store import Store
+from gnd.fleet_bus.bus import open_bus
+from gnd.fleet_bus.config import DEFAULT_ENDPOINT, BusConfig
+from gnd.fleet_bus.health import HealthServer
+from gnd.fleet_bus.health_options import metrics_options
+from gnd.fleet_bus.router import wait_for_stop
+from gnd.tile_store import tables, upkeep_cli
+from gnd.tile_store.arguments import parse_tile, parse_time_ns, parse_versions
+from gnd.tile_store.compare import MapDiff, layer_info, layer_totals, map_diff, version_diff
+from gnd.tile_store.errors import StoreError
+from gnd.tile_store.export import FORMATS, export_map
+from gnd.tile_store.metrics import StoreCollector, store_checks
+from gnd.tile_store.options import PATH, existing, json_option, layer_option, region_option, show, to_read
+from gnd.tile_store.server import TileServer
+from gnd.tile_store.sqlite_store import SqliteStore
+from gnd.tile_store.status import status
+from gnd.tile_store.store import Store
 
 __all__ = ["PATH", "json_option", "layer_option", "map_group", "region_option", "show", "store", "store_to_fill"]
 

@@ -7,19 +7,19 @@ from typing import Any
 
 import numpy as np
 
-from gnd_map.codec import codec_of
-from gnd_map.content import FEATURE_CODECS
-from gnd_map.errors import CodecError
-from gnd_map.features import is_feature_layer
-from gnd_map.gaussian import Gaussians
-from gnd_map.grid import VoxelGrid
-from gnd_map.tile import diff
-from gnd_map.tile_id import TileId
-from tile_store.compare_features import FeatureMapInfo, feature_map_info, feature_tile_diff
-from tile_store.errors import StoreError, UnknownVersion
-from tile_store.regions import bounds_deg
-from tile_store.store import Store
-from tile_store.values import DEFAULT_LAYER, StoredTile
+from gnd.gnd_map.codec import codec_of
+from gnd.gnd_map.content import FEATURE_CODECS
+from gnd.gnd_map.errors import CodecError
+from gnd.gnd_map.features import is_feature_layer
+from gnd.gnd_map.gaussian import Gaussians
+from gnd.gnd_map.grid import VoxelGrid
+from gnd.gnd_map.tile import diff
+from gnd.gnd_map.tile_id import TileId
+from gnd.tile_store.compare_features import FeatureMapInfo, feature_map_info, feature_tile_diff
+from gnd.tile_store.errors import StoreError, UnknownVersion
+from gnd.tile_store.regions import bounds_deg
+from gnd.tile_store.store import Store
+from gnd.tile_store.values import DEFAULT_LAYER, StoredTile
 
 
 @dataclass(frozen=True, slots=True)

@@ -7,11 +7,11 @@ from typing import Any
 
 import numpy as np
 
-from gnd_map.features import Feature, FeatureTile, diff_features
-from gnd_map.tile_id import TileId
-from tile_store.errors import StoreError
-from tile_store.regions import bounds_deg
-from tile_store.values import StoredTile
+from gnd.gnd_map.features import Feature, FeatureTile, diff_features
+from gnd.gnd_map.tile_id import TileId
+from gnd.tile_store.errors import StoreError
+from gnd.tile_store.regions import bounds_deg
+from gnd.tile_store.values import StoredTile
 
 
 @dataclass(frozen=True, slots=True)

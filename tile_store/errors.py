@@ -11,7 +11,7 @@ UnknownReports       a publication names reports that the store does not hold
 IdTaken              a report has the id of another vehicle's
 """
 
-from gnd_map.errors import GndError
+from gnd.gnd_map.errors import GndError
 
 
 class StoreError(GndError):

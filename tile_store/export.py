@@ -14,13 +14,13 @@ from typing import IO, Any, Final
 import numpy as np
 import numpy.typing as npt
 
-from gnd_map.features import is_feature_layer
-from gnd_map.gaussian import six_entries
-from gnd_map.geodesy import LocalFrame
-from gnd_map.grid import VoxelGrid
-from gnd_map.tile import Tile
-from tile_store.errors import StoreError
-from tile_store.store import Store
+from gnd.gnd_map.features import is_feature_layer
+from gnd.gnd_map.gaussian import six_entries
+from gnd.gnd_map.geodesy import LocalFrame
+from gnd.gnd_map.grid import VoxelGrid
+from gnd.gnd_map.tile import Tile
+from gnd.tile_store.errors import StoreError
+from gnd.tile_store.store import Store
 
 POINT_TYPE: Final = np.dtype(
     [

@@ -7,10 +7,10 @@ from typing import Final
 from prometheus_client.core import CounterMetricFamily, GaugeMetricFamily, Metric
 from prometheus_client.registry import Collector
 
-from fleet_bus.bus import Bus
-from fleet_bus.health import Check
-from tile_store.sqlite_connection import change, fetch
-from tile_store.sqlite_store import SqliteStore
+from gnd.fleet_bus.bus import Bus
+from gnd.fleet_bus.health import Check
+from gnd.tile_store.sqlite_connection import change, fetch
+from gnd.tile_store.sqlite_store import SqliteStore
 
 OVERDUE_S: Final = 60.0
 """A tile that has been ready for so long and is not merged makes the store ill."""

@@ -10,8 +10,8 @@ from typing import Any, Final
 
 import apsw
 
-from tile_store.errors import StoreUnavailable
-from tile_store.sql import statements
+from gnd.tile_store.errors import StoreUnavailable
+from gnd.tile_store.sql import statements
 
 APPLICATION_ID: Final = 0x474E4453
 """ASCII "GNDS" in the file's header: this database is a GND store."""

@@ -11,8 +11,8 @@ import click
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TaskID, TextColumn, TimeElapsedColumn
 
-from tile_store.sqlite_store import SqliteStore
-from tile_store.values import DEFAULT_LAYER
+from gnd.tile_store.sqlite_store import SqliteStore
+from gnd.tile_store.values import DEFAULT_LAYER
 
 PATH: Final = click.Path(path_type=Path)
 _F = TypeVar("_F", bound=Callable[..., Any])

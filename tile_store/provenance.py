@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Final
 
-from tile_store.errors import StoreError
+from gnd.tile_store.errors import StoreError
 
 
 @dataclass(frozen=True, slots=True)

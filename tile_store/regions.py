@@ -7,10 +7,10 @@ from typing import Final, Self
 
 import numpy as np
 
-from gnd_map.tile_id import TileId
-from schemas.errors import BadKey
-from schemas.wire import LAYER_PATTERN
-from tile_store.errors import StoreError
+from gnd.gnd_map.tile_id import TileId
+from gnd.schemas.errors import BadKey
+from gnd.schemas.wire import LAYER_PATTERN
+from gnd.tile_store.errors import StoreError
 
 LEVELS: Final = 20
 """Base-4 digits of a tile's path: four chunks of five."""

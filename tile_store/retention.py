@@ -6,9 +6,9 @@ from typing import Final, Protocol, TypeVar
 
 import apsw
 
-from tile_store.errors import StoreError
-from tile_store.sqlite_connection import change, fetch
-from tile_store.values import GcResult
+from gnd.tile_store.errors import StoreError
+from gnd.tile_store.sqlite_connection import change, fetch
+from gnd.tile_store.values import GcResult
 
 T = TypeVar("T")
 NS_A_DAY: Final = 86_400_000_000_000

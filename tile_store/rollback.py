@@ -6,17 +6,17 @@ from typing import Final, Literal
 
 import apsw
 
-from gnd_map.content import AnyTile
-from gnd_map.features import FeatureTile, is_feature_layer
-from gnd_map.gaussian import Gaussians
-from gnd_map.tile import Tile
-from gnd_map.tile_id import TileId
-from tile_store import sqlite_versions as versions
-from tile_store.errors import StoreError, UnknownVersion
-from tile_store.regions import morton_range
-from tile_store.sqlite_connection import fetch
-from tile_store.sqlite_store import SqliteStore
-from tile_store.values import Content
+from gnd.gnd_map.content import AnyTile
+from gnd.gnd_map.features import FeatureTile, is_feature_layer
+from gnd.gnd_map.gaussian import Gaussians
+from gnd.gnd_map.tile import Tile
+from gnd.gnd_map.tile_id import TileId
+from gnd.tile_store import sqlite_versions as versions
+from gnd.tile_store.errors import StoreError, UnknownVersion
+from gnd.tile_store.regions import morton_range
+from gnd.tile_store.sqlite_connection import fetch
+from gnd.tile_store.sqlite_store import SqliteStore
+from gnd.tile_store.values import Content
 
 Action = Literal["rollback", "empty", "same", "unknown"]
 MEANING: Final[dict[Action, str]] = {

@@ -4,26 +4,26 @@ from collections.abc import Iterator
 from itertools import groupby
 from typing import Final, Self
 
-from fleet_bus.bus import Bus
-from fleet_bus.errors import Refused
-from fleet_bus.serving import Answer, Request, Serving
-from gnd_map.codec import CODEC_FLOAT32
-from gnd_map.content import FEATURE_CODECS
-from gnd_map.tile_id import District, TileId
-from schemas import keys
-from schemas.errors import SchemaError
-from schemas.limits import MAX_TILES_OF_DISTRICT
-from schemas.tiles import Catalog, TileRequest
-from schemas.tiles_batch import TilesRequest
-from tile_store.answers import Answers, reads_layer
-from tile_store.regions import Region
-from tile_store.store import Store
-from tile_store.warm import warm_up
+from gnd.fleet_bus.bus import Bus
+from gnd.fleet_bus.errors import Refused
+from gnd.fleet_bus.serving import Answer, Request, Serving
+from gnd.gnd_map.codec import CODEC_FLOAT32
+from gnd.gnd_map.content import FEATURE_CODECS
+from gnd.gnd_map.tile_id import District, TileId
+from gnd.schemas import keys
+from gnd.schemas.errors import SchemaError
+from gnd.schemas.limits import MAX_TILES_OF_DISTRICT
+from gnd.schemas.tiles import Catalog, TileRequest
+from gnd.schemas.tiles_batch import TilesRequest
+from gnd.tile_store.answers import Answers, reads_layer
+from gnd.tile_store.regions import Region
+from gnd.tile_store.store import Store
+from gnd.tile_store.warm import warm_up
 
 # Four districts: 40 MB of tiles of a dense city, and what a wildcard may cost everybody else.
 MOST_TILES_OF_REGION: Final = 4 * MAX_TILES_OF_DISTRICT
 _ANY: Final = "x/**"
-# Only `schemas.keys` knows how a key begins.
+# Only `gnd.schemas.keys` knows how a key begins.
 TILE_ROOT: Final = keys.tiles_key("x").removesuffix(_ANY)
 # Who asks without a message reads what everybody reads.
 PLAIN_REQUEST: Final = TileRequest(codecs=(CODEC_FLOAT32, *FEATURE_CODECS), deltas=False)

@@ -7,10 +7,10 @@ from typing import Any, Final
 
 import apsw
 
-from gnd_map.tile_id import TileId
-from tile_store.sqlite_connection import Row, change, fetch
-from tile_store.sqlite_inbox import merge_again
-from tile_store.values import CourseSaid, ShiftTest, VehicleAccount
+from gnd.gnd_map.tile_id import TileId
+from gnd.tile_store.sqlite_connection import Row, change, fetch
+from gnd.tile_store.sqlite_inbox import merge_again
+from gnd.tile_store.values import CourseSaid, ShiftTest, VehicleAccount
 
 NEWEST_TESTS: Final = 40
 """So many of a vehicle's newest tests count: a vehicle that was repaired is trusted again."""

@@ -5,9 +5,9 @@ from typing import Any
 
 import apsw
 
-from gnd_map.tile_id import TileId
-from tile_store.sqlite_connection import change, fetch
-from tile_store.values import Unconfirmed, WaitingChange
+from gnd.gnd_map.tile_id import TileId
+from gnd.tile_store.sqlite_connection import change, fetch
+from gnd.tile_store.values import Unconfirmed, WaitingChange
 
 
 def keep(c: apsw.Connection, layer: str, tile: TileId, waiting: Iterable[Unconfirmed]) -> None:

@@ -13,9 +13,9 @@ from urllib.parse import quote
 
 import apsw
 
-from tile_store.errors import StoreBusy, StoreClosed, StoreDamaged, StoreError, StoreUnavailable
-from tile_store.migrations import SCHEMA_VERSION, migrate, schema_of
-from tile_store.sql import statements
+from gnd.tile_store.errors import StoreBusy, StoreClosed, StoreDamaged, StoreError, StoreUnavailable
+from gnd.tile_store.migrations import SCHEMA_VERSION, migrate, schema_of
+from gnd.tile_store.sql import statements
 
 SQL: Final = statements("sqlite")
 

@@ -6,11 +6,11 @@ from typing import Any, Final
 
 import apsw
 
-from gnd_map.tile_id import TileId
-from tile_store import sqlite_journal as journal
-from tile_store.regions import morton_range
-from tile_store.sqlite_connection import Row, change, fetch
-from tile_store.values import Claim, JournalMark, PutStatus, ReportRow, StoreConfig
+from gnd.gnd_map.tile_id import TileId
+from gnd.tile_store import sqlite_journal as journal
+from gnd.tile_store.regions import morton_range
+from gnd.tile_store.sqlite_connection import Row, change, fetch
+from gnd.tile_store.values import Claim, JournalMark, PutStatus, ReportRow, StoreConfig
 
 NS_PER_S: Final = 1_000_000_000
 

@@ -11,11 +11,11 @@ from typing import Any, Final
 
 import apsw
 
-from gnd_map.features import is_feature_layer
-from gnd_map.tile_id import TileId
-from tile_store.errors import StoreDamaged
-from tile_store.sqlite_connection import change, fetch
-from tile_store.values import Basis, ClosedWindow, ReportRow, StoreConfig, StoredMemory, WindowCounts
+from gnd.gnd_map.features import is_feature_layer
+from gnd.gnd_map.tile_id import TileId
+from gnd.tile_store.errors import StoreDamaged
+from gnd.tile_store.sqlite_connection import change, fetch
+from gnd.tile_store.values import Basis, ClosedWindow, ReportRow, StoreConfig, StoredMemory, WindowCounts
 
 NO_WINDOWS: Final = 0
 """The window of reports that are older than the journal of their layer."""

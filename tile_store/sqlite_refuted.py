@@ -5,10 +5,10 @@ from typing import Any
 
 import apsw
 
-from gnd_map.tile_id import TileId
-from tile_store import sqlite_inbox as inbox
-from tile_store.sqlite_connection import fetch
-from tile_store.values import REFUTED_SHARE, REFUTED_TESTS
+from gnd.gnd_map.tile_id import TileId
+from gnd.tile_store import sqlite_inbox as inbox
+from gnd.tile_store.sqlite_connection import fetch
+from gnd.tile_store.values import REFUTED_SHARE, REFUTED_TESTS
 
 
 def refuted(c: apsw.Connection, layer: str, vehicles: Iterable[str]) -> dict[str, str]:

@@ -9,25 +9,25 @@ from typing import Any, Final, TypeVar
 
 import apsw
 
-from gnd_map.content import AnyTile
-from gnd_map.tile_id import TileId
-from schemas.tiles import CatalogEntry
-from tile_store import clocks
-from tile_store import sqlite_accounts as accounts
-from tile_store import sqlite_confirmation as confirmation
-from tile_store import sqlite_inbox as inbox
-from tile_store import sqlite_journal as journal
-from tile_store import sqlite_refuted as refuted
-from tile_store import sqlite_uploads as uploads
-from tile_store import sqlite_versions as versions
-from tile_store.backup import copy_store
-from tile_store.errors import StoreDamaged, StoreError, UnknownVersion
-from tile_store.provenance import Provenance, decode_provenance
-from tile_store.regions import morton_range
-from tile_store.retention import trim_quarantine
-from tile_store.sqlite_connection import ReaderPool, change, fetch, open_writer, require_current
-from tile_store.uploads import FirstHalf, Settled, Upload, UploadClaim, UploadCounts, UploadStatus
-from tile_store.values import (
+from gnd.gnd_map.content import AnyTile
+from gnd.gnd_map.tile_id import TileId
+from gnd.schemas.tiles import CatalogEntry
+from gnd.tile_store import clocks
+from gnd.tile_store import sqlite_accounts as accounts
+from gnd.tile_store import sqlite_confirmation as confirmation
+from gnd.tile_store import sqlite_inbox as inbox
+from gnd.tile_store import sqlite_journal as journal
+from gnd.tile_store import sqlite_refuted as refuted
+from gnd.tile_store import sqlite_uploads as uploads
+from gnd.tile_store import sqlite_versions as versions
+from gnd.tile_store.backup import copy_store
+from gnd.tile_store.errors import StoreDamaged, StoreError, UnknownVersion
+from gnd.tile_store.provenance import Provenance, decode_provenance
+from gnd.tile_store.regions import morton_range
+from gnd.tile_store.retention import trim_quarantine
+from gnd.tile_store.sqlite_connection import ReaderPool, change, fetch, open_writer, require_current
+from gnd.tile_store.uploads import FirstHalf, Settled, Upload, UploadClaim, UploadCounts, UploadStatus
+from gnd.tile_store.values import (
     DEFAULT_LAYER,
     Basis,
     Claim,
@@ -59,7 +59,7 @@ from tile_store.values import (
     check_fits,
     check_layer,
 )
-from tile_store.writer import GroupWriter, NoWriter
+from gnd.tile_store.writer import GroupWriter, NoWriter
 
 _T = TypeVar("_T")
 NS_PER_S: Final = 1_000_000_000

@@ -7,14 +7,14 @@ from typing import Any, Final
 
 import apsw
 
-from gnd_map.tile_id import TileId
-from tile_store import clocks
-from tile_store import sqlite_inbox as inbox
-from tile_store.errors import IdTaken
-from tile_store.retention import trim_quarantine
-from tile_store.sqlite_connection import Row, change, fetch
-from tile_store.uploads import FirstHalf, Settled, Upload, UploadClaim, UploadCounts, UploadStatus
-from tile_store.values import PutStatus, ReportRow, StoreConfig
+from gnd.gnd_map.tile_id import TileId
+from gnd.tile_store import clocks
+from gnd.tile_store import sqlite_inbox as inbox
+from gnd.tile_store.errors import IdTaken
+from gnd.tile_store.retention import trim_quarantine
+from gnd.tile_store.sqlite_connection import Row, change, fetch
+from gnd.tile_store.uploads import FirstHalf, Settled, Upload, UploadClaim, UploadCounts, UploadStatus
+from gnd.tile_store.values import PutStatus, ReportRow, StoreConfig
 
 NS_PER_S: Final = 1_000_000_000
 HEAD_START_NS: Final = NS_PER_S

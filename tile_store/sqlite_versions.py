@@ -5,17 +5,17 @@ from typing import Any
 
 import apsw
 
-from gnd_map.features import is_feature_layer
-from gnd_map.tile_id import TileId
-from tile_store import sqlite_accounts as accounts
-from tile_store import sqlite_confirmation as confirmation
-from tile_store import sqlite_inbox as inbox
-from tile_store import sqlite_journal as journal
-from tile_store import sqlite_refuted as refuted
-from tile_store.errors import StoreError, UnknownReports, UnknownVersion
-from tile_store.provenance import NOTHING, Provenance, encode_provenance
-from tile_store.sqlite_connection import change, fetch
-from tile_store.values import ClosedWindow, Content, GcResult, Publication, PublishResult, StoredTile, VersionKind
+from gnd.gnd_map.features import is_feature_layer
+from gnd.gnd_map.tile_id import TileId
+from gnd.tile_store import sqlite_accounts as accounts
+from gnd.tile_store import sqlite_confirmation as confirmation
+from gnd.tile_store import sqlite_inbox as inbox
+from gnd.tile_store import sqlite_journal as journal
+from gnd.tile_store import sqlite_refuted as refuted
+from gnd.tile_store.errors import StoreError, UnknownReports, UnknownVersion
+from gnd.tile_store.provenance import NOTHING, Provenance, encode_provenance
+from gnd.tile_store.sqlite_connection import change, fetch
+from gnd.tile_store.values import ClosedWindow, Content, GcResult, Publication, PublishResult, StoredTile, VersionKind
 
 
 @dataclass(frozen=True, slots=True)

@@ -11,11 +11,11 @@ import click
 from rich.console import Console
 from rich.table import Table
 
-from schemas.changes import ChangeReport
-from schemas.errors import SchemaError
-from tile_store.options import json_option, show, to_read
-from tile_store.store import Store
-from tile_store.values import VehicleAccount, WaitingChange, WaitingReason
+from gnd.schemas.changes import ChangeReport
+from gnd.schemas.errors import SchemaError
+from gnd.tile_store.options import json_option, show, to_read
+from gnd.tile_store.store import Store
+from gnd.tile_store.values import VehicleAccount, WaitingChange, WaitingReason
 
 WORDS: Final[dict[WaitingReason, str]] = {
     "share": "more of the tile than one vehicle is believed",

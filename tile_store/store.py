@@ -4,11 +4,11 @@ from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import Protocol
 
-from gnd_map.content import AnyTile
-from gnd_map.tile_id import TileId
-from schemas.tiles import CatalogEntry
-from tile_store.uploads import FirstHalf, Settled, Upload, UploadClaim, UploadCounts, UploadStatus
-from tile_store.values import (
+from gnd.gnd_map.content import AnyTile
+from gnd.gnd_map.tile_id import TileId
+from gnd.schemas.tiles import CatalogEntry
+from gnd.tile_store.uploads import FirstHalf, Settled, Upload, UploadClaim, UploadCounts, UploadStatus
+from gnd.tile_store.values import (
     DEFAULT_LAYER,
     Basis,
     Claim,

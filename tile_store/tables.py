@@ -7,7 +7,7 @@ from typing import Any
 from rich.console import Console
 from rich.table import Table
 
-from tile_store.compare import MapDiff
+from gnd.tile_store.compare import MapDiff
 
 
 def fields(title: str, values: dict[str, Any]) -> Table:

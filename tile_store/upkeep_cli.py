@@ -7,14 +7,14 @@ from typing import Any, Final
 import click
 from rich.console import Console
 
-from tile_store import tables
-from tile_store.arguments import parse_place, parse_tile, parse_time_ns
-from tile_store.backup import copy_store
-from tile_store.check import check_store
-from tile_store.errors import StoreError
-from tile_store.options import PATH, bars, existing, json_option, layer_option, show, to_read
-from tile_store.retention import retain
-from tile_store.rollback import MEANING, Step, Target, plan, roll_back
+from gnd.tile_store import tables
+from gnd.tile_store.arguments import parse_place, parse_tile, parse_time_ns
+from gnd.tile_store.backup import copy_store
+from gnd.tile_store.check import check_store
+from gnd.tile_store.errors import StoreError
+from gnd.tile_store.options import PATH, bars, existing, json_option, layer_option, show, to_read
+from gnd.tile_store.retention import retain
+from gnd.tile_store.rollback import MEANING, Step, Target, plan, roll_back
 
 STORE: Final = click.argument("path", metavar="STORE", type=PATH)
 

@@ -3,9 +3,9 @@
 from dataclasses import dataclass, field
 from typing import Final, Literal
 
-from schemas.report_id import check_report_id
-from tile_store.errors import StoreError
-from tile_store.values import ReportRow
+from gnd.schemas.report_id import check_report_id
+from gnd.tile_store.errors import StoreError
+from gnd.tile_store.values import ReportRow
 
 UploadForm = Literal["packed", "gaussians", "whole", "features"]
 UploadState = Literal["waiting", "early", "wanted", "released", "resend", "quarantined"]

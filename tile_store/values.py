@@ -5,17 +5,17 @@ from dataclasses import dataclass, field
 from math import ceil
 from typing import Final, Literal
 
-from gnd_map.codec import LATTICES, Lattice
-from gnd_map.content import AnyTile, encode_content, fits_layer, noun_of
-from gnd_map.day import UNKNOWN_DAY, day_of
-from gnd_map.features import FeatureTile
-from gnd_map.tile import Tile
-from gnd_map.tile_id import TileId
-from schemas.limits import MAX_TILE_BODY_BYTES
-from schemas.report_id import check_report_id
-from schemas.tiles import TileBlob, content_of, features_of, tile_of
-from schemas.wire import LAYER_PATTERN
-from tile_store.errors import StoreError
+from gnd.gnd_map.codec import LATTICES, Lattice
+from gnd.gnd_map.content import AnyTile, encode_content, fits_layer, noun_of
+from gnd.gnd_map.day import UNKNOWN_DAY, day_of
+from gnd.gnd_map.features import FeatureTile
+from gnd.gnd_map.tile import Tile
+from gnd.gnd_map.tile_id import TileId
+from gnd.schemas.limits import MAX_TILE_BODY_BYTES
+from gnd.schemas.report_id import check_report_id
+from gnd.schemas.tiles import TileBlob, content_of, features_of, tile_of
+from gnd.schemas.wire import LAYER_PATTERN
+from gnd.tile_store.errors import StoreError
 
 VersionKind = Literal["base", "merged", "rollback"]
 PutStatus = Literal["stored", "duplicate"]

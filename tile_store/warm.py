@@ -2,9 +2,18 @@
 
 import numpy as np
 
-from gnd_map.codec import LATTICES, best_codec, codec_of, decode_delta, decode_tiles, encode_delta, encode_tiles, snap
-from gnd_map.gaussian import Gaussians
-from gnd_map.tile_id import TileId
+from gnd.gnd_map.codec import (
+    LATTICES,
+    best_codec,
+    codec_of,
+    decode_delta,
+    decode_tiles,
+    encode_delta,
+    encode_tiles,
+    snap,
+)
+from gnd.gnd_map.gaussian import Gaussians
+from gnd.gnd_map.tile_id import TileId
 
 
 def warm_up() -> None:

@@ -11,8 +11,8 @@ from typing import Any, TypeVar
 
 import apsw
 
-from tile_store.errors import StoreClosed, StoreUnavailable
-from tile_store.sqlite_connection import as_store_error
+from gnd.tile_store.errors import StoreClosed, StoreUnavailable
+from gnd.tile_store.sqlite_connection import as_store_error
 
 T = TypeVar("T")
 _log = logging.getLogger(__name__)

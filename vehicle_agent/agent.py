@@ -6,11 +6,11 @@ Feature layers go the same way: `judge` is for them what `detect` and `report` a
 import threading
 from typing import Any
 
-from schemas.drive import Scan
-from vehicle_agent.config import AgentConfig
-from vehicle_agent.memory import keep_small
-from vehicle_agent.result import write_json
-from vehicle_agent.vehicle import open_vehicle
+from gnd.schemas.drive import Scan
+from gnd.vehicle_agent.config import AgentConfig
+from gnd.vehicle_agent.memory import keep_small
+from gnd.vehicle_agent.result import write_json
+from gnd.vehicle_agent.vehicle import open_vehicle
 
 __all__ = ["AgentConfig", "run_agent"]
 
@@ -30,7 +30,7 @@ def run_agent(config: AgentConfig, stop: threading.Event) -> dict[str, Any]:
     """
     keep_small()
     if config.localise_by == "graph":  # no LiDAR: features are mapped stretch by stretch
-        from vehicle_agent.features.mapping.mapper import run_mapper
+        from gnd.vehicle_agent.features.mapping.mapper import run_mapper
 
         return run_mapper(config, stop)
     with open_vehicle(config, stop) as vehicle:

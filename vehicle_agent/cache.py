@@ -9,12 +9,12 @@ from collections.abc import Iterable
 from pathlib import Path
 from typing import Generic, cast
 
-from gnd_map.content import TileT, day_of_tile, encode_content, kind_of_layer
-from gnd_map.errors import GndError
-from gnd_map.tile_id import TileId
-from schemas.tiles import TileBlob, as_kind, content_of
-from vehicle_agent.errors import CacheError
-from vehicle_agent.sqlite import Database
+from gnd.gnd_map.content import TileT, day_of_tile, encode_content, kind_of_layer
+from gnd.gnd_map.errors import GndError
+from gnd.gnd_map.tile_id import TileId
+from gnd.schemas.tiles import TileBlob, as_kind, content_of
+from gnd.vehicle_agent.errors import CacheError
+from gnd.vehicle_agent.sqlite import Database
 
 SCHEMA = """
 CREATE TABLE IF NOT EXISTS tile (

@@ -8,7 +8,7 @@ from typing import Literal
 
 import click
 
-from fleet_bus.config import DEFAULT_ENDPOINT
+from gnd.fleet_bus.config import DEFAULT_ENDPOINT
 
 
 @click.command()
@@ -42,9 +42,9 @@ def agent(
     verbose: bool,
 ) -> None:
     """Drive a recording: download tiles, localise, detect changes, upload them until acknowledged."""
-    from vehicle_agent.agent import AgentConfig, run_agent
-    from vehicle_agent.detect.parameters import DetectParameters
-    from vehicle_agent.features.layer_parameters import FeatureParameters
+    from gnd.vehicle_agent.agent import AgentConfig, run_agent
+    from gnd.vehicle_agent.detect.parameters import DetectParameters
+    from gnd.vehicle_agent.features.layer_parameters import FeatureParameters
 
     logging.basicConfig(level=logging.INFO if verbose else logging.ERROR, format="%(asctime)s %(name)s %(message)s")
     config = AgentConfig(

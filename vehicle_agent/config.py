@@ -4,16 +4,16 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Literal
 
-from fleet_bus.config import DEFAULT_ENDPOINT
-from fleet_bus.links import LinkProfile
-from gnd_map.features import is_feature_layer
-from vehicle_agent.detect.parameters import DetectParameters
-from vehicle_agent.detect.shift import ShiftParameters
-from vehicle_agent.errors import AgentConfigError
-from vehicle_agent.features.layer_parameters import FeatureParameters
-from vehicle_agent.localise.parameters import LocaliserParameters
-from vehicle_agent.segment.parameters import SegmentParameters
-from vehicle_agent.world_clock import Departure
+from gnd.fleet_bus.config import DEFAULT_ENDPOINT
+from gnd.fleet_bus.links import LinkProfile
+from gnd.gnd_map.features import is_feature_layer
+from gnd.vehicle_agent.detect.parameters import DetectParameters
+from gnd.vehicle_agent.detect.shift import ShiftParameters
+from gnd.vehicle_agent.errors import AgentConfigError
+from gnd.vehicle_agent.features.layer_parameters import FeatureParameters
+from gnd.vehicle_agent.localise.parameters import LocaliserParameters
+from gnd.vehicle_agent.segment.parameters import SegmentParameters
+from gnd.vehicle_agent.world_clock import Departure
 
 
 @dataclass(frozen=True, slots=True)

@@ -7,17 +7,17 @@ from collections import Counter
 from collections.abc import Collection, Iterable, Sequence
 from typing import Generic
 
-from fleet_bus.bus import Bus
-from fleet_bus.config import QUEUED_BATCHES
-from fleet_bus.errors import BusClosed
-from fleet_bus.links import LinkProfile
-from gnd_map.content import TileT
-from gnd_map.tile_id import TileId
-from vehicle_agent.cache import TileCache
-from vehicle_agent.config import DownloadParameters
-from vehicle_agent.errors import CacheError
-from vehicle_agent.exchange import Exchange, Fetched, Outcome
-from vehicle_agent.plan import batch_bytes
+from gnd.fleet_bus.bus import Bus
+from gnd.fleet_bus.config import QUEUED_BATCHES
+from gnd.fleet_bus.errors import BusClosed
+from gnd.fleet_bus.links import LinkProfile
+from gnd.gnd_map.content import TileT
+from gnd.gnd_map.tile_id import TileId
+from gnd.vehicle_agent.cache import TileCache
+from gnd.vehicle_agent.config import DownloadParameters
+from gnd.vehicle_agent.errors import CacheError
+from gnd.vehicle_agent.exchange import Exchange, Fetched, Outcome
+from gnd.vehicle_agent.plan import batch_bytes
 
 __all__ = ["Fetched", "TileFetcher"]
 

@@ -1,6 +1,6 @@
 """Errors of the vehicle's half of the loop. Messages carry numbers and say what to do."""
 
-from gnd_map.errors import GndError
+from gnd.gnd_map.errors import GndError
 
 
 class VehicleError(GndError):

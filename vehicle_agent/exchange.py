@@ -6,18 +6,18 @@ from dataclasses import dataclass, field
 from functools import partial
 from typing import Generic, Literal
 
-from fleet_bus.bus import Bus
-from fleet_bus.ledger import Share
-from fleet_bus.requesting import RetryPolicy
-from gnd_map.content import TileT, codecs_of_layer
-from gnd_map.tile_id import District, TileId
-from schemas.errors import SchemaError, WrongHash
-from schemas.keys import batch_key
-from schemas.tile_answer import content_of_answer
-from schemas.tiles import TileBlob
-from schemas.tiles_batch import HeldTile, TileAnswer, TilesReply, TilesRequest
-from vehicle_agent.cache import TileCache
-from vehicle_agent.errors import CacheError
+from gnd.fleet_bus.bus import Bus
+from gnd.fleet_bus.ledger import Share
+from gnd.fleet_bus.requesting import RetryPolicy
+from gnd.gnd_map.content import TileT, codecs_of_layer
+from gnd.gnd_map.tile_id import District, TileId
+from gnd.schemas.errors import SchemaError, WrongHash
+from gnd.schemas.keys import batch_key
+from gnd.schemas.tile_answer import content_of_answer
+from gnd.schemas.tiles import TileBlob
+from gnd.schemas.tiles_batch import HeldTile, TileAnswer, TilesReply, TilesRequest
+from gnd.vehicle_agent.cache import TileCache
+from gnd.vehicle_agent.errors import CacheError
 
 Head = tuple[int, bytes]
 """Version and sha of what is held."""

@@ -13,24 +13,24 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from gnd_map.motion import Trajectory
-from gnd_map.se3 import T_inverse, exp_so3, log_so3
-from schemas.drive import DriveHeader, DriveItem, GnssFix, MotionSample, ReferencePose
-from schemas.drive_mcap import DriveWriter
-from vehicle_agent.errors import ImportDriveError
-from vehicle_agent.importers.apollo import open_apollo
-from vehicle_agent.importers.cleaning import MAX_RANGE_M, Cleaned, cleaned
-from vehicle_agent.importers.deskewing import with_times
-from vehicle_agent.importers.detect_format import format_of
-from vehicle_agent.importers.kitti import open_kitti
-from vehicle_agent.importers.lidar_odometry import Progress, lidar_odometry
-from vehicle_agent.importers.mcap_clouds import open_mcap_clouds
-from vehicle_agent.importers.mounting import levelled, with_mount
-from vehicle_agent.importers.pcd import open_pcd
-from vehicle_agent.importers.planes import open_planes
-from vehicle_agent.importers.radiate import open_radiate
-from vehicle_agent.importers.recording import GNSS_SIGMA_M, Anchor, Recording
-from vehicle_agent.importers.splits import chosen_scans
+from gnd.gnd_map.motion import Trajectory
+from gnd.gnd_map.se3 import T_inverse, exp_so3, log_so3
+from gnd.schemas.drive import DriveHeader, DriveItem, GnssFix, MotionSample, ReferencePose
+from gnd.schemas.drive_mcap import DriveWriter
+from gnd.vehicle_agent.errors import ImportDriveError
+from gnd.vehicle_agent.importers.apollo import open_apollo
+from gnd.vehicle_agent.importers.cleaning import MAX_RANGE_M, Cleaned, cleaned
+from gnd.vehicle_agent.importers.deskewing import with_times
+from gnd.vehicle_agent.importers.detect_format import format_of
+from gnd.vehicle_agent.importers.kitti import open_kitti
+from gnd.vehicle_agent.importers.lidar_odometry import Progress, lidar_odometry
+from gnd.vehicle_agent.importers.mcap_clouds import open_mcap_clouds
+from gnd.vehicle_agent.importers.mounting import levelled, with_mount
+from gnd.vehicle_agent.importers.pcd import open_pcd
+from gnd.vehicle_agent.importers.planes import open_planes
+from gnd.vehicle_agent.importers.radiate import open_radiate
+from gnd.vehicle_agent.importers.recording import GNSS_SIGMA_M, Anchor, Recording
+from gnd.vehicle_agent.importers.splits import chosen_scans
 
 F64 = NDArray[np.float64]
 

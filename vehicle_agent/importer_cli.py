@@ -8,10 +8,10 @@ import click
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TaskID, TextColumn, TimeElapsedColumn
 
-from vehicle_agent.errors import ImportDriveError
-from vehicle_agent.importer import AUTO, FORMATS, import_recording
-from vehicle_agent.importers.recording import Anchor
-from vehicle_agent.importers.splits import CHOICES
+from gnd.vehicle_agent.errors import ImportDriveError
+from gnd.vehicle_agent.importer import AUTO, FORMATS, import_recording
+from gnd.vehicle_agent.importers.recording import Anchor
+from gnd.vehicle_agent.importers.splits import CHOICES
 
 
 @click.command(name="import")

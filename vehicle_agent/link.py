@@ -5,16 +5,16 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 
-from fleet_bus.bus import Bus, open_bus
-from fleet_bus.config import BusConfig
-from fleet_bus.ledger import Ledger
-from gnd_map.tile import Tile
-from schemas.keys import alive_key
-from vehicle_agent.cache import TileCache
-from vehicle_agent.config import AgentConfig
-from vehicle_agent.download import TileFetcher
-from vehicle_agent.outbox import Outbox
-from vehicle_agent.sending import SenderThread
+from gnd.fleet_bus.bus import Bus, open_bus
+from gnd.fleet_bus.config import BusConfig
+from gnd.fleet_bus.ledger import Ledger
+from gnd.gnd_map.tile import Tile
+from gnd.schemas.keys import alive_key
+from gnd.vehicle_agent.cache import TileCache
+from gnd.vehicle_agent.config import AgentConfig
+from gnd.vehicle_agent.download import TileFetcher
+from gnd.vehicle_agent.outbox import Outbox
+from gnd.vehicle_agent.sending import SenderThread
 
 _log = logging.getLogger(__name__)
 

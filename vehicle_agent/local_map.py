@@ -9,12 +9,12 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from gnd_map.gaussian import Gaussians, full_matrices, six_entries
-from gnd_map.geodesy import LocalFrame
-from gnd_map.grid import GridFrame, VoxelGrid
-from gnd_map.tile import Tile
-from gnd_map.tile_id import TileId
-from vehicle_agent.errors import WindowTooLarge
+from gnd.gnd_map.gaussian import Gaussians, full_matrices, six_entries
+from gnd.gnd_map.geodesy import LocalFrame
+from gnd.gnd_map.grid import GridFrame, VoxelGrid
+from gnd.gnd_map.tile import Tile
+from gnd.gnd_map.tile_id import TileId
+from gnd.vehicle_agent.errors import WindowTooLarge
 
 EMPTY = -1
 UNKNOWN = -(2**31)

@@ -16,14 +16,14 @@ from typing import Final
 
 import apsw
 
-from gnd_map.codec import CODEC_FLOAT32_ZSTD, CODEC_STANDARD_ZSTD, best_codec, codec_of
-from gnd_map.errors import GndError
-from gnd_map.gaussian import Gaussians
-from gnd_map.tile import Tile, content_sha
-from gnd_map.tile_id import TileId
-from schemas.report_states import ReportState
-from vehicle_agent.errors import OutboxError
-from vehicle_agent.sqlite import Database
+from gnd.gnd_map.codec import CODEC_FLOAT32_ZSTD, CODEC_STANDARD_ZSTD, best_codec, codec_of
+from gnd.gnd_map.errors import GndError
+from gnd.gnd_map.gaussian import Gaussians
+from gnd.gnd_map.tile import Tile, content_sha
+from gnd.gnd_map.tile_id import TileId
+from gnd.schemas.report_states import ReportState
+from gnd.vehicle_agent.errors import OutboxError
+from gnd.vehicle_agent.sqlite import Database
 
 _COLUMNS = """
     report_id TEXT PRIMARY KEY,

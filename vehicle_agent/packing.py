@@ -1,7 +1,7 @@
 """A report in two short halves: flags coded against the base tiles and the track; then the Gaussians asked for.
 
 Pure functions: what they make depends on the report, its base tiles and the track only, so a restarted agent packs the
-same bytes again, and a study of the traffic can pack without a bus. `cloud_merger.expanding` undoes it.
+same bytes again, and a study of the traffic can pack without a bus. `gnd.cloud_merger.expanding` undoes it.
 """
 
 import math
@@ -10,16 +10,16 @@ from collections.abc import Mapping
 import numpy as np
 from numpy.typing import NDArray
 
-from gnd_map.arrays import I32
-from gnd_map.classes import CHANGED, ChangeClass
-from gnd_map.codec import Flags, decode_mask, encode_flags, encode_measured
-from gnd_map.gaussian import Gaussians
-from gnd_map.tile_id import TileId
-from gnd_map.track import Track, encode_track
-from schemas import limits
-from schemas.changes import ChangeReport, TileChange
-from schemas.packed import PackedGaussians, PackedReport, crc_of, digest_of
-from vehicle_agent.errors import PackingError
+from gnd.gnd_map.arrays import I32
+from gnd.gnd_map.classes import CHANGED, ChangeClass
+from gnd.gnd_map.codec import Flags, decode_mask, encode_flags, encode_measured
+from gnd.gnd_map.gaussian import Gaussians
+from gnd.gnd_map.tile_id import TileId
+from gnd.gnd_map.track import Track, encode_track
+from gnd.schemas import limits
+from gnd.schemas.changes import ChangeReport, TileChange
+from gnd.schemas.packed import PackedGaussians, PackedReport, crc_of, digest_of
+from gnd.vehicle_agent.errors import PackingError
 
 Bases = Mapping[bytes, Gaussians]
 """The Gaussians of base tiles by content hash; b"" (the vehicle had no map of the tile) need not be among them."""

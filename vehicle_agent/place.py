@@ -4,11 +4,11 @@ import math
 
 import numpy as np
 
-from gnd_map.arrays import F64
-from gnd_map.geodesy import LocalFrame
-from schemas.drive import DriveItem, GnssFix, MotionSample
-from vehicle_agent.localise.estimates import PoseEstimate
-from vehicle_agent.plan import Course
+from gnd.gnd_map.arrays import F64
+from gnd.gnd_map.geodesy import LocalFrame
+from gnd.schemas.drive import DriveItem, GnssFix, MotionSample
+from gnd.vehicle_agent.localise.estimates import PoseEstimate
+from gnd.vehicle_agent.plan import Course
 
 LONGEST_STEP_S = 1.0  # a gap in the wheel speed is not driven
 HEADING_BASE_M = 3.0  # satellites give a heading from fixes this far apart

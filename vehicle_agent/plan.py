@@ -10,9 +10,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from gnd_map.arrays import F64
-from gnd_map.geodesy import LocalFrame
-from gnd_map.tile_id import TileId
+from gnd.gnd_map.arrays import F64
+from gnd.gnd_map.geodesy import LocalFrame
+from gnd.gnd_map.tile_id import TileId
 
 SLOWEST_MPS = 3.0
 """A vehicle that stands may start: what is ahead keeps its order."""

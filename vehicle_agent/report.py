@@ -13,34 +13,41 @@ from typing import Any
 
 import numpy as np
 
-from gnd_map.arrays import F64
-from gnd_map.classes import ChangeClass
-from gnd_map.codec import REPORT, snap
-from gnd_map.day import day_of
-from gnd_map.errors import GndError
-from gnd_map.tile import Tile
-from gnd_map.tile_id import District, TileId
-from schemas.changes import ChangeReport, TileChange
-from schemas.course import Course
-from schemas.keys import change_key
-from schemas.report_id import deterministic_report_id
-from vehicle_agent.config import ReportParameters
-from vehicle_agent.detect.beyond import beyond_map
-from vehicle_agent.detect.classify import Classification, classify, tile_change
-from vehicle_agent.detect.detector import ChangeDetector
-from vehicle_agent.detect.doubts import LEAST_WITHHELD, Account, TileDoubts, changed_share_of, doubt_of, withheld_change
-from vehicle_agent.detect.shift import Shift, costs_at
-from vehicle_agent.detect.tile_shift import pose_error_of_tile
-from vehicle_agent.detect.trial import POINTS_OF_POOR_SCAN, Trial, some_of
-from vehicle_agent.detect.uncertainty import PoseUncertainty
-from vehicle_agent.localise.estimates import PoseEstimate
-from vehicle_agent.localise.match_map import MatchMapCache
-from vehicle_agent.localise.parameters import RegistrationParameters
-from vehicle_agent.outbox import Outbox
-from vehicle_agent.packing import is_measured, pack
-from vehicle_agent.segment.segmenter import SegmentedScan
-from vehicle_agent.surroundings import left_behind
-from vehicle_agent.tracks import Tracks
+from gnd.gnd_map.arrays import F64
+from gnd.gnd_map.classes import ChangeClass
+from gnd.gnd_map.codec import REPORT, snap
+from gnd.gnd_map.day import day_of
+from gnd.gnd_map.errors import GndError
+from gnd.gnd_map.tile import Tile
+from gnd.gnd_map.tile_id import District, TileId
+from gnd.schemas.changes import ChangeReport, TileChange
+from gnd.schemas.course import Course
+from gnd.schemas.keys import change_key
+from gnd.schemas.report_id import deterministic_report_id
+from gnd.vehicle_agent.config import ReportParameters
+from gnd.vehicle_agent.detect.beyond import beyond_map
+from gnd.vehicle_agent.detect.classify import Classification, classify, tile_change
+from gnd.vehicle_agent.detect.detector import ChangeDetector
+from gnd.vehicle_agent.detect.doubts import (
+    LEAST_WITHHELD,
+    Account,
+    TileDoubts,
+    changed_share_of,
+    doubt_of,
+    withheld_change,
+)
+from gnd.vehicle_agent.detect.shift import Shift, costs_at
+from gnd.vehicle_agent.detect.tile_shift import pose_error_of_tile
+from gnd.vehicle_agent.detect.trial import POINTS_OF_POOR_SCAN, Trial, some_of
+from gnd.vehicle_agent.detect.uncertainty import PoseUncertainty
+from gnd.vehicle_agent.localise.estimates import PoseEstimate
+from gnd.vehicle_agent.localise.match_map import MatchMapCache
+from gnd.vehicle_agent.localise.parameters import RegistrationParameters
+from gnd.vehicle_agent.outbox import Outbox
+from gnd.vehicle_agent.packing import is_measured, pack
+from gnd.vehicle_agent.segment.segmenter import SegmentedScan
+from gnd.vehicle_agent.surroundings import left_behind
+from gnd.vehicle_agent.tracks import Tracks
 
 STEP_M = 2.0  # tiles left behind are looked for after this much way
 

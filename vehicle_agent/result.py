@@ -10,14 +10,14 @@ from typing import Any
 
 import numpy as np
 
-from gnd_map.arrays import F64
-from gnd_map.geodesy import LocalFrame
-from gnd_map.motion import Trajectory
-from gnd_map.se3 import T_inverse
-from schemas.drive import ReferencePose
-from vehicle_agent.errors import LocaliseError
-from vehicle_agent.localise.consistency import nees_of
-from vehicle_agent.localise.estimates import PoseEstimate, localisation_error
+from gnd.gnd_map.arrays import F64
+from gnd.gnd_map.geodesy import LocalFrame
+from gnd.gnd_map.motion import Trajectory
+from gnd.gnd_map.se3 import T_inverse
+from gnd.schemas.drive import ReferencePose
+from gnd.vehicle_agent.errors import LocaliseError
+from gnd.vehicle_agent.localise.consistency import nees_of
+from gnd.vehicle_agent.localise.estimates import PoseEstimate, localisation_error
 
 
 @dataclass(slots=True)

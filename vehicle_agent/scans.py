@@ -5,9 +5,9 @@ from collections.abc import Iterable, Iterator
 
 import numpy as np
 
-from gnd_map.arrays import F32
-from schemas.drive import DriveItem, GnssFix, MotionSample, Scan
-from vehicle_agent.errors import BadScan
+from gnd.gnd_map.arrays import F32
+from gnd.schemas.drive import DriveItem, GnssFix, MotionSample, Scan
+from gnd.vehicle_agent.errors import BadScan
 
 MIN_POINTS = 50
 MIN_FINITE = 0.5  # share of the points

@@ -11,16 +11,16 @@ import threading
 import time
 from collections import Counter
 
-from fleet_bus.bus import Bus
-from fleet_bus.errors import BusClosed, MessageTooLarge, RequestRefused
-from gnd_map.errors import CodecError, GndError
-from schemas.changes import ChangeAck, ChangeReport
-from schemas.errors import SchemaError
-from schemas.keys import state_key, want_key
-from schemas.report_states import ReportQuestion, ReportState, ReportStates
-from vehicle_agent.errors import PackingError
-from vehicle_agent.outbox import ANSWERS, Letter, Outbox
-from vehicle_agent.packing import pack_measured
+from gnd.fleet_bus.bus import Bus
+from gnd.fleet_bus.errors import BusClosed, MessageTooLarge, RequestRefused
+from gnd.gnd_map.errors import CodecError, GndError
+from gnd.schemas.changes import ChangeAck, ChangeReport
+from gnd.schemas.errors import SchemaError
+from gnd.schemas.keys import state_key, want_key
+from gnd.schemas.report_states import ReportQuestion, ReportState, ReportStates
+from gnd.vehicle_agent.errors import PackingError
+from gnd.vehicle_agent.outbox import ANSWERS, Letter, Outbox
+from gnd.vehicle_agent.packing import pack_measured
 
 POLL_S = 0.2
 REQUEST_S = 20.0

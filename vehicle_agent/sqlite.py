@@ -8,7 +8,7 @@ from typing import Any, Literal
 
 import apsw
 
-from vehicle_agent.errors import VehicleError
+from gnd.vehicle_agent.errors import VehicleError
 
 
 class Database:

@@ -7,17 +7,17 @@ from collections.abc import Iterable
 
 import numpy as np
 
-from gnd_map.arrays import F64
-from gnd_map.errors import TileError
-from gnd_map.geodesy import LocalFrame
-from gnd_map.tile import Tile
-from gnd_map.tile_id import TileId, covering_corridor
-from vehicle_agent.config import DownloadParameters
-from vehicle_agent.detect.detector import ChangeDetector
-from vehicle_agent.download import Fetched, TileFetcher
-from vehicle_agent.local_map import LocalMap
-from vehicle_agent.place import Place
-from vehicle_agent.plan import Need, in_time, needs
+from gnd.gnd_map.arrays import F64
+from gnd.gnd_map.errors import TileError
+from gnd.gnd_map.geodesy import LocalFrame
+from gnd.gnd_map.tile import Tile
+from gnd.gnd_map.tile_id import TileId, covering_corridor
+from gnd.vehicle_agent.config import DownloadParameters
+from gnd.vehicle_agent.detect.detector import ChangeDetector
+from gnd.vehicle_agent.download import Fetched, TileFetcher
+from gnd.vehicle_agent.local_map import LocalMap
+from gnd.vehicle_agent.place import Place
+from gnd.vehicle_agent.plan import Need, in_time, needs
 
 STEP_M = 5.0  # the wanted tiles are looked at again after this much way
 AHEAD_STEP_M = 20.0  # every small change of speed would be a reason to look again

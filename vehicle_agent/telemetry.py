@@ -10,10 +10,10 @@ import threading
 from collections.abc import Callable
 from dataclasses import replace
 
-from fleet_bus.bus import Bus
-from fleet_bus.errors import BusClosed, BusError
-from schemas.keys import traffic_key
-from schemas.traffic import TrafficSample
+from gnd.fleet_bus.bus import Bus
+from gnd.fleet_bus.errors import BusClosed, BusError
+from gnd.schemas.keys import traffic_key
+from gnd.schemas.traffic import TrafficSample
 
 LOOK_S = 1.0
 """With each look goes a reading of the connection, by which the ledger tells keep-alives from messages."""

@@ -2,11 +2,11 @@
 
 from collections.abc import Collection, Iterable
 
-from gnd_map.geodesy import LocalFrame
-from gnd_map.tile_id import District, TileId
-from gnd_map.track import Track
-from gnd_map.track_builder import TrackBuilder
-from vehicle_agent.localise.estimates import RefinedScan
+from gnd.gnd_map.geodesy import LocalFrame
+from gnd.gnd_map.tile_id import District, TileId
+from gnd.gnd_map.track import Track
+from gnd.gnd_map.track_builder import TrackBuilder
+from gnd.vehicle_agent.localise.estimates import RefinedScan
 
 
 class Tracks:

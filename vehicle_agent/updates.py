@@ -7,16 +7,16 @@ from collections import Counter
 from collections.abc import Callable, Collection
 from typing import Generic
 
-from fleet_bus.bus import Bus
-from fleet_bus.subscribing import Subscription
-from gnd_map.content import TileT
-from gnd_map.errors import GndError
-from gnd_map.tile_id import District, TileId
-from schemas.errors import WrongHash
-from schemas.keys import parse_update_key, update_keys
-from schemas.updates import TileUpdate, updated
-from vehicle_agent.cache import TileCache
-from vehicle_agent.download import TileFetcher
+from gnd.fleet_bus.bus import Bus
+from gnd.fleet_bus.subscribing import Subscription
+from gnd.gnd_map.content import TileT
+from gnd.gnd_map.errors import GndError
+from gnd.gnd_map.tile_id import District, TileId
+from gnd.schemas.errors import WrongHash
+from gnd.schemas.keys import parse_update_key, update_keys
+from gnd.schemas.updates import TileUpdate, updated
+from gnd.vehicle_agent.cache import TileCache
+from gnd.vehicle_agent.download import TileFetcher
 
 RECHECK_S = 120.0
 """A notice may be lost: what is held for so long is asked about again. Who drives has left it behind before."""

@@ -8,40 +8,40 @@ from contextlib import AbstractContextManager, contextmanager, nullcontext
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
-from gnd_map.geodesy import LocalFrame
-from gnd_map.grid import GridFrame
-from gnd_map.tile import Tile
-from gnd_map.tile_id import TileId
-from schemas.course import Course
-from schemas.doubt import tiles_by_reason
-from schemas.drive import Detections, DriveHeader, DriveItem, GnssFix, MotionSample, ReferencePose, Scan
-from schemas.drive_mcap import read_drive, read_header
-from schemas.errors import SchemaError
-from schemas.sweep_distortion import distortion_of
-from schemas.traffic import TrafficLine, TrafficSample
-from vehicle_agent.config import AgentConfig
-from vehicle_agent.detect.detector import ChangeDetector
-from vehicle_agent.errors import VehicleError
-from vehicle_agent.link import Link, open_link
-from vehicle_agent.local_map import LocalMap
-from vehicle_agent.localise.calibration import MotionCalibration
-from vehicle_agent.localise.estimates import RefinedScan
-from vehicle_agent.localise.localiser import Localiser
-from vehicle_agent.localise.remount import header_sigma
-from vehicle_agent.memory import MemoryMeter
-from vehicle_agent.place import Place
-from vehicle_agent.report import Identity, Reporter
-from vehicle_agent.result import Evaluation, HealthTimeline
-from vehicle_agent.scans import Guard
-from vehicle_agent.segment.segmenter import MotionSegmenter, SegmentedScan
-from vehicle_agent.surroundings import Surroundings
-from vehicle_agent.telemetry import Telemetry
-from vehicle_agent.updates import Updates
-from vehicle_agent.way import WAY_FILE, Way
-from vehicle_agent.world_clock import in_common_time
+from gnd.gnd_map.geodesy import LocalFrame
+from gnd.gnd_map.grid import GridFrame
+from gnd.gnd_map.tile import Tile
+from gnd.gnd_map.tile_id import TileId
+from gnd.schemas.course import Course
+from gnd.schemas.doubt import tiles_by_reason
+from gnd.schemas.drive import Detections, DriveHeader, DriveItem, GnssFix, MotionSample, ReferencePose, Scan
+from gnd.schemas.drive_mcap import read_drive, read_header
+from gnd.schemas.errors import SchemaError
+from gnd.schemas.sweep_distortion import distortion_of
+from gnd.schemas.traffic import TrafficLine, TrafficSample
+from gnd.vehicle_agent.config import AgentConfig
+from gnd.vehicle_agent.detect.detector import ChangeDetector
+from gnd.vehicle_agent.errors import VehicleError
+from gnd.vehicle_agent.link import Link, open_link
+from gnd.vehicle_agent.local_map import LocalMap
+from gnd.vehicle_agent.localise.calibration import MotionCalibration
+from gnd.vehicle_agent.localise.estimates import RefinedScan
+from gnd.vehicle_agent.localise.localiser import Localiser
+from gnd.vehicle_agent.localise.remount import header_sigma
+from gnd.vehicle_agent.memory import MemoryMeter
+from gnd.vehicle_agent.place import Place
+from gnd.vehicle_agent.report import Identity, Reporter
+from gnd.vehicle_agent.result import Evaluation, HealthTimeline
+from gnd.vehicle_agent.scans import Guard
+from gnd.vehicle_agent.segment.segmenter import MotionSegmenter, SegmentedScan
+from gnd.vehicle_agent.surroundings import Surroundings
+from gnd.vehicle_agent.telemetry import Telemetry
+from gnd.vehicle_agent.updates import Updates
+from gnd.vehicle_agent.way import WAY_FILE, Way
+from gnd.vehicle_agent.world_clock import in_common_time
 
 if TYPE_CHECKING:
-    from vehicle_agent.features.feature_work import FeatureWork
+    from gnd.vehicle_agent.features.feature_work import FeatureWork
 
 COUNTS = (
     "scans_used", "scans_uncertain", "scans_disagreeing", "scans_shifted", "scans_taken_back", "points",
@@ -275,7 +275,7 @@ def _features(
     """The part for feature layers; a vehicle that knows voxels only does not even load it."""
     if not config.features.layers:
         return nullcontext(None)
-    from vehicle_agent.features.feature_work import open_features
+    from gnd.vehicle_agent.features.feature_work import open_features
 
     return open_features(config, link, frame, who, start_ns)
 

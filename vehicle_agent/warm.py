@@ -4,33 +4,33 @@ from dataclasses import replace
 
 import numpy as np
 
-from gnd_map.accumulate import VoxelAccumulator
-from gnd_map.arrays import F64
-from gnd_map.classes import ChangeClass
-from gnd_map.codec import encode_mask
-from gnd_map.geodesy import LocalFrame
-from gnd_map.grid import GridFrame
-from gnd_map.tile import Tile
-from gnd_map.tile_id import TileId
-from gnd_map.track_builder import TrackBuilder
-from schemas.changes import ChangeReport, TileChange
-from schemas.drive import GnssFix, MotionSample, Scan
-from schemas.report_id import deterministic_report_id
-from vehicle_agent.detect.classify import classify, tile_change
-from vehicle_agent.detect.detector import ChangeDetector
-from vehicle_agent.detect.shift import ShiftParameters
-from vehicle_agent.detect.trial import Trial
-from vehicle_agent.features.poles.detector import PoleDetector
-from vehicle_agent.local_map import LocalMap
-from vehicle_agent.localise.estimates import PoseEstimate, RefinedScan
-from vehicle_agent.localise.localiser import Localiser
-from vehicle_agent.localise.match_map import MatchMapCache
-from vehicle_agent.localise.parameters import RegistrationParameters
-from vehicle_agent.localise.rolling_map import RollingMap
-from vehicle_agent.localise.scan_odometry_parameters import ScanOdometryParameters
-from vehicle_agent.packing import pack, pack_measured
-from vehicle_agent.report import on_lattice
-from vehicle_agent.segment import MotionSegmenter, SegmentedScan
+from gnd.gnd_map.accumulate import VoxelAccumulator
+from gnd.gnd_map.arrays import F64
+from gnd.gnd_map.classes import ChangeClass
+from gnd.gnd_map.codec import encode_mask
+from gnd.gnd_map.geodesy import LocalFrame
+from gnd.gnd_map.grid import GridFrame
+from gnd.gnd_map.tile import Tile
+from gnd.gnd_map.tile_id import TileId
+from gnd.gnd_map.track_builder import TrackBuilder
+from gnd.schemas.changes import ChangeReport, TileChange
+from gnd.schemas.drive import GnssFix, MotionSample, Scan
+from gnd.schemas.report_id import deterministic_report_id
+from gnd.vehicle_agent.detect.classify import classify, tile_change
+from gnd.vehicle_agent.detect.detector import ChangeDetector
+from gnd.vehicle_agent.detect.shift import ShiftParameters
+from gnd.vehicle_agent.detect.trial import Trial
+from gnd.vehicle_agent.features.poles.detector import PoleDetector
+from gnd.vehicle_agent.local_map import LocalMap
+from gnd.vehicle_agent.localise.estimates import PoseEstimate, RefinedScan
+from gnd.vehicle_agent.localise.localiser import Localiser
+from gnd.vehicle_agent.localise.match_map import MatchMapCache
+from gnd.vehicle_agent.localise.parameters import RegistrationParameters
+from gnd.vehicle_agent.localise.rolling_map import RollingMap
+from gnd.vehicle_agent.localise.scan_odometry_parameters import ScanOdometryParameters
+from gnd.vehicle_agent.packing import pack, pack_measured
+from gnd.vehicle_agent.report import on_lattice
+from gnd.vehicle_agent.segment import MotionSegmenter, SegmentedScan
 
 _LIDAR_HEIGHT_M = 2.0
 _STEP_NS = 20_000_000

@@ -12,10 +12,10 @@ from pathlib import Path
 from types import TracebackType
 from typing import Final, Self
 
-from gnd_map.tile_id import TileId
-from vehicle_agent.errors import VehicleError
-from vehicle_agent.local_map import LocalMap
-from vehicle_agent.place import Place
+from gnd.gnd_map.tile_id import TileId
+from gnd.vehicle_agent.errors import VehicleError
+from gnd.vehicle_agent.local_map import LocalMap
+from gnd.vehicle_agent.place import Place
 
 WAY_FILE: Final = "way.jsonl"
 EVERY_M: Final = 5.0

@@ -14,9 +14,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
 
-from schemas.drive import DriveItem
-from schemas.errors import SchemaError
-from vehicle_agent.errors import AgentConfigError
+from gnd.schemas.drive import DriveItem
+from gnd.schemas.errors import SchemaError
+from gnd.vehicle_agent.errors import AgentConfigError
 
 SLACK_S: Final = 0.5
 """Less makes processes wait for each other at every scan."""

@@ -6,10 +6,10 @@ from typing import Final
 import numpy as np
 from scipy.optimize import linear_sum_assignment
 
-from cloud_merger.features.parameters import FeatureMergeParameters
-from cloud_merger.features.rls import Place
-from cloud_merger.features.shapes import across
-from gnd_map.arrays import F64
+from gnd.cloud_merger.features.parameters import FeatureMergeParameters
+from gnd.cloud_merger.features.rls import Place
+from gnd.cloud_merger.features.shapes import across
+from gnd.gnd_map.arrays import F64
 
 _NEVER: Final = 1e9
 HEIGHT_KNOWN_M2: Final = 100.0

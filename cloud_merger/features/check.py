@@ -10,15 +10,15 @@ from typing import Final
 import numpy as np
 from scipy.spatial import cKDTree
 
-from cloud_merger.errors import BadReport, MergerError
-from cloud_merger.features.association import HEIGHT_KNOWN_M2
-from gnd_map.arrays import F64
-from gnd_map.errors import FeatureError
-from gnd_map.features import UNKNOWN_HEIGHT_M2, check_simple_polyline, full_covariance
-from gnd_map.geodesy import LocalFrame
-from gnd_map.tile_id import TileId
-from schemas.feature_change import LANE_KINDS, FeatureChange, Found
-from schemas.features import FeatureReport
+from gnd.cloud_merger.errors import BadReport, MergerError
+from gnd.cloud_merger.features.association import HEIGHT_KNOWN_M2
+from gnd.gnd_map.arrays import F64
+from gnd.gnd_map.errors import FeatureError
+from gnd.gnd_map.features import UNKNOWN_HEIGHT_M2, check_simple_polyline, full_covariance
+from gnd.gnd_map.geodesy import LocalFrame
+from gnd.gnd_map.tile_id import TileId
+from gnd.schemas.feature_change import LANE_KINDS, FeatureChange, Found
+from gnd.schemas.features import FeatureReport
 
 _ROUNDING: Final = 1.01
 """Covariances travel on levels that are some per cent apart; a limit that is met before is met after."""

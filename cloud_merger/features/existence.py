@@ -5,14 +5,14 @@ from math import prod
 
 import numpy as np
 
-from cloud_merger.features.memory import Vote
-from cloud_merger.features.parameters import FeatureMergeParameters
-from cloud_merger.features.statements import Statement
-from cloud_merger.features.tracks import Bases, Track, Tracks
-from gnd_map.features import VACUOUS, Existence, miss
-from gnd_map.geodesy import LocalFrame
-from gnd_map.tile_id import TileId
-from schemas.feature_change import GRID
+from gnd.cloud_merger.features.memory import Vote
+from gnd.cloud_merger.features.parameters import FeatureMergeParameters
+from gnd.cloud_merger.features.statements import Statement
+from gnd.cloud_merger.features.tracks import Bases, Track, Tracks
+from gnd.gnd_map.features import VACUOUS, Existence, miss
+from gnd.gnd_map.geodesy import LocalFrame
+from gnd.gnd_map.tile_id import TileId
+from gnd.schemas.feature_change import GRID
 
 
 def pooled(bodies: Iterable[Existence]) -> Existence:

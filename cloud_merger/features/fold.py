@@ -6,13 +6,13 @@ from typing import Final
 
 import numpy as np
 
-from cloud_merger.features.memory import LayerMemory, Remembered, Vote
-from cloud_merger.features.merge import Hypotheses, MergedFeatures
-from cloud_merger.features.parameters import FeatureMergeParameters
-from cloud_merger.features.publication import Story
-from cloud_merger.features.rls import Place, estimate
-from cloud_merger.features.shapes import length_of
-from cloud_merger.features.tracks import Track
+from gnd.cloud_merger.features.memory import LayerMemory, Remembered, Vote
+from gnd.cloud_merger.features.merge import Hypotheses, MergedFeatures
+from gnd.cloud_merger.features.parameters import FeatureMergeParameters
+from gnd.cloud_merger.features.publication import Story
+from gnd.cloud_merger.features.rls import Place, estimate
+from gnd.cloud_merger.features.shapes import length_of
+from gnd.cloud_merger.features.tracks import Track
 
 VOTES_KEPT: Final = 16
 """Of a feature the votes of so many vehicles, the newest, or of as many as decide (`FeatureMergeParameters.voters`)."""
@@ -33,7 +33,7 @@ def fold(merged: MergedFeatures, parameters: FeatureMergeParameters, day: int) -
     Args:
         merged: the window, whole.
         parameters: with which it was merged.
-        day: `gnd_map.day` of the newest receipt of its reports.
+        day: `gnd.gnd_map.day` of the newest receipt of its reports.
     """
     what = merged.hypotheses
     stories = [story for story in what.stories if not _is_refuted(story, parameters)]

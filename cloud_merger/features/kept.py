@@ -5,15 +5,15 @@ from functools import lru_cache
 from threading import Lock
 from typing import Final
 
-from cloud_merger.errors import BadReport
-from cloud_merger.features.check import FeatureLimits, check_feature_report
-from cloud_merger.features.spread import spread
-from gnd_map.features import Feature, is_feature_layer
-from gnd_map.tile_id import LAT_TILES, LON_TILES, District, TileId
-from schemas.features import FeatureReport
-from schemas.keys import parse_change_key
-from tile_store.store import Store
-from tile_store.values import ReportRow
+from gnd.cloud_merger.errors import BadReport
+from gnd.cloud_merger.features.check import FeatureLimits, check_feature_report
+from gnd.cloud_merger.features.spread import spread
+from gnd.gnd_map.features import Feature, is_feature_layer
+from gnd.gnd_map.tile_id import LAT_TILES, LON_TILES, District, TileId
+from gnd.schemas.features import FeatureReport
+from gnd.schemas.keys import parse_change_key
+from gnd.tile_store.store import Store
+from gnd.tile_store.values import ReportRow
 
 REMEMBERED_REPORTS: Final = 8192  # some kB each
 REMEMBERED_TILES: Final = 4096  # some kB each

@@ -14,11 +14,11 @@ from typing import Any, Final
 import numpy as np
 import zstandard
 
-from cloud_merger.errors import MergerError
-from cloud_merger.features.rls import Place
-from cloud_merger.features.statements import Attributes
-from gnd_map.arrays import F64
-from gnd_map.features import Existence, Feature
+from gnd.cloud_merger.errors import MergerError
+from gnd.cloud_merger.features.rls import Place
+from gnd.cloud_merger.features.statements import Attributes
+from gnd.gnd_map.arrays import F64
+from gnd.gnd_map.features import Existence, Feature
 
 _FORMAT: Final = 1
 _LEVEL: Final = 3
@@ -93,7 +93,7 @@ class Remembered:
         gone: of the newest of those vehicles how often each has measured it: it may come back, ...
         ayes_gone: ... and of the newest of those votes whose and with how many looks.
         apart: numbers of those with which it is not one: a report has told them apart.
-        day: `gnd_map.day` of the newest receipt of a report that speaks for it.
+        day: `gnd.gnd_map.day` of the newest receipt of a report that speaks for it.
     """
 
     feature_id: int

@@ -10,18 +10,18 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from types import MappingProxyType
 
-from cloud_merger.features.existence import add_views
-from cloud_merger.features.memory import LayerMemory
-from cloud_merger.features.parameters import FeatureMergeParameters
-from cloud_merger.features.publication import Outcome, Story, story_of
-from cloud_merger.features.refuted import heard, left_out, refuted_of, tests_of
-from cloud_merger.features.spread import spread
-from cloud_merger.features.statements import Statement, contents_of, statements_of
-from cloud_merger.features.tracks import Bases, Tracks
-from gnd_map.features import Feature, FeatureTile
-from gnd_map.tile_id import TileId
-from schemas.features import FeatureReport
-from tile_store.values import ShiftTest
+from gnd.cloud_merger.features.existence import add_views
+from gnd.cloud_merger.features.memory import LayerMemory
+from gnd.cloud_merger.features.parameters import FeatureMergeParameters
+from gnd.cloud_merger.features.publication import Outcome, Story, story_of
+from gnd.cloud_merger.features.refuted import heard, left_out, refuted_of, tests_of
+from gnd.cloud_merger.features.spread import spread
+from gnd.cloud_merger.features.statements import Statement, contents_of, statements_of
+from gnd.cloud_merger.features.tracks import Bases, Tracks
+from gnd.gnd_map.features import Feature, FeatureTile
+from gnd.gnd_map.tile_id import TileId
+from gnd.schemas.features import FeatureReport
+from gnd.tile_store.values import ShiftTest
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -6,7 +6,7 @@ from typing import Final
 
 from scipy.stats import chi2
 
-from cloud_merger.errors import MergerError
+from gnd.cloud_merger.errors import MergerError
 
 _SHARES: Final = ("gate", "reliability", "prior", "absence", "ceiling")
 

@@ -8,17 +8,17 @@ from typing import Final
 
 import numpy as np
 
-from cloud_merger.features.association import HEIGHT_KNOWN_M2
-from cloud_merger.features.existence import prior_of, verdict
-from cloud_merger.features.memory import Own, Vote
-from cloud_merger.features.parameters import FeatureMergeParameters
-from cloud_merger.features.rls import Place, balanced, estimate, fused, is_even, step
-from cloud_merger.features.shapes import length_of
-from cloud_merger.features.statements import Attributes
-from cloud_merger.features.tracks import Measured, Track
-from gnd_map.features import Existence, Feature, full_covariance, geodetic_in_tile
-from gnd_map.features.feature import MAX_COUNT
-from gnd_map.tile_id import TileId
+from gnd.cloud_merger.features.association import HEIGHT_KNOWN_M2
+from gnd.cloud_merger.features.existence import prior_of, verdict
+from gnd.cloud_merger.features.memory import Own, Vote
+from gnd.cloud_merger.features.parameters import FeatureMergeParameters
+from gnd.cloud_merger.features.rls import Place, balanced, estimate, fused, is_even, step
+from gnd.cloud_merger.features.shapes import length_of
+from gnd.cloud_merger.features.statements import Attributes
+from gnd.cloud_merger.features.tracks import Measured, Track
+from gnd.gnd_map.features import Existence, Feature, full_covariance, geodetic_in_tile
+from gnd.gnd_map.features.feature import MAX_COUNT
+from gnd.gnd_map.tile_id import TileId
 
 _LEAST_ADDED: Final = 1e-6
 

@@ -13,9 +13,9 @@ from typing import Final
 
 import numpy as np
 
-from cloud_merger.features.statements import Statement
-from cloud_merger.features.tracks import Track
-from tile_store.values import REFUTED_SHARE, REFUTED_TESTS, ShiftTest
+from gnd.cloud_merger.features.statements import Statement
+from gnd.cloud_merger.features.tracks import Track
+from gnd.tile_store.values import REFUTED_SHARE, REFUTED_TESTS, ShiftTest
 
 OPPOSING: Final = 2
 """So many other vehicles must say otherwise."""

@@ -10,9 +10,9 @@ from typing import Final
 
 import numpy as np
 
-from cloud_merger.features.shapes import onto
-from gnd_map.arrays import F64
-from gnd_map.features import UNKNOWN_HEIGHT_M2, full_covariance, six_of
+from gnd.cloud_merger.features.shapes import onto
+from gnd.gnd_map.arrays import F64
+from gnd.gnd_map.features import UNKNOWN_HEIGHT_M2, full_covariance, six_of
 
 _I3: Final = np.eye(3)
 _NOTHING_M2: Final = 1e12

@@ -3,7 +3,7 @@
 import numpy as np
 from numpy.typing import NDArray
 
-from gnd_map.arrays import F64
+from gnd.gnd_map.arrays import F64
 
 
 def onto(points_m: F64, other_m: F64) -> F64:

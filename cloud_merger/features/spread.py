@@ -11,11 +11,11 @@ from typing import Final
 
 import numpy as np
 
-from gnd_map.arrays import F64
-from gnd_map.geodesy import LocalFrame
-from gnd_map.tile_id import TileId
-from schemas.feature_change import FeatureChange, Found
-from schemas.features import FeatureReport
+from gnd.gnd_map.arrays import F64
+from gnd.gnd_map.geodesy import LocalFrame
+from gnd.gnd_map.tile_id import TileId
+from gnd.schemas.feature_change import FeatureChange, Found
+from gnd.schemas.features import FeatureReport
 
 _SIGMAS: Final = 4.0
 _LEAST_M: Final = 1.0

@@ -5,13 +5,13 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from cloud_merger.features.rls import Place
-from cloud_merger.features.spread import around, between, near_border
-from gnd_map.arrays import F64
-from gnd_map.features import Existence, Feature, feature_id_of
-from gnd_map.tile_id import TileId
-from schemas.feature_change import FeatureChange, Found, Seen
-from schemas.features import FeatureReport
+from gnd.cloud_merger.features.rls import Place
+from gnd.cloud_merger.features.spread import around, between, near_border
+from gnd.gnd_map.arrays import F64
+from gnd.gnd_map.features import Existence, Feature, feature_id_of
+from gnd.gnd_map.tile_id import TileId
+from gnd.schemas.feature_change import FeatureChange, Found, Seen
+from gnd.schemas.features import FeatureReport
 
 Attributes = tuple[tuple[str, str], ...]
 

@@ -6,13 +6,13 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from cloud_merger.features.association import costs, fits, pairs
-from cloud_merger.features.memory import LayerMemory, Own, Remembered, Vote
-from cloud_merger.features.parameters import FeatureMergeParameters
-from cloud_merger.features.rls import Place, step
-from cloud_merger.features.statements import Attributes, Claimed, Statement
-from gnd_map.features import Feature, feature_id_of
-from schemas.feature_change import Seen
+from gnd.cloud_merger.features.association import costs, fits, pairs
+from gnd.cloud_merger.features.memory import LayerMemory, Own, Remembered, Vote
+from gnd.cloud_merger.features.parameters import FeatureMergeParameters
+from gnd.cloud_merger.features.rls import Place, step
+from gnd.cloud_merger.features.statements import Attributes, Claimed, Statement
+from gnd.gnd_map.features import Feature, feature_id_of
+from gnd.schemas.feature_change import Seen
 
 Bases = Mapping[bytes, Mapping[int, tuple[Feature, ...]]]
 

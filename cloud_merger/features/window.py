@@ -5,17 +5,17 @@ from contextlib import suppress
 from dataclasses import dataclass
 from typing import Final
 
-from cloud_merger.features.fold import fold
-from cloud_merger.features.kept import said_of
-from cloud_merger.features.memory import LayerMemory
-from cloud_merger.features.merge import MergedFeatures, merge_features
-from cloud_merger.features.parameters import FeatureMergeParameters
-from gnd_map.day import day_of
-from gnd_map.features import Feature
-from gnd_map.tile_id import TileId
-from schemas.errors import SchemaError
-from schemas.features import FeatureReport
-from tile_store.values import ReportRow, StoredMemory
+from gnd.cloud_merger.features.fold import fold
+from gnd.cloud_merger.features.kept import said_of
+from gnd.cloud_merger.features.memory import LayerMemory
+from gnd.cloud_merger.features.merge import MergedFeatures, merge_features
+from gnd.cloud_merger.features.parameters import FeatureMergeParameters
+from gnd.gnd_map.day import day_of
+from gnd.gnd_map.features import Feature
+from gnd.gnd_map.tile_id import TileId
+from gnd.schemas.errors import SchemaError
+from gnd.schemas.features import FeatureReport
+from gnd.tile_store.values import ReportRow, StoredMemory
 
 _ID_LENGTH: Final = 26  # of a report id
 _NO_CODEC: Final = 0
@@ -23,7 +23,7 @@ _NO_CODEC: Final = 0
 
 @dataclass(frozen=True, slots=True)
 class LayerWindow:
-    """What was reported about a tile in a window: the parts, and the day of the newest receipt (`gnd_map.day`)."""
+    """What was reported about a tile in a window: the parts, and the day of the newest receipt (`gnd.gnd_map.day`)."""
 
     reports: tuple[FeatureReport, ...]
     day: int

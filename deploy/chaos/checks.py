@@ -16,13 +16,13 @@ from typing import Any, Final
 
 import apsw
 
-from deploy.chaos.clients import Receipt, held_by, read_receipts
-from deploy.chaos.street import LAYER
-from gnd_map.tile_id import TileId
-from schemas.changes import ChangeReport, TileChange
-from tile_store.check import check_store
-from tile_store.sqlite_store import SqliteStore
-from vehicle_agent.outbox import Outbox
+from gnd.deploy.chaos.clients import Receipt, held_by, read_receipts
+from gnd.deploy.chaos.street import LAYER
+from gnd.gnd_map.tile_id import TileId
+from gnd.schemas.changes import ChangeReport, TileChange
+from gnd.tile_store.check import check_store
+from gnd.tile_store.sqlite_store import SqliteStore
+from gnd.vehicle_agent.outbox import Outbox
 
 MOST_NAMED: Final = 20
 _UNREAD: Final = ("waiting", "early")
@@ -225,7 +225,7 @@ def _unmerged(c: apsw.Connection) -> list[tuple[int, str]]:
 
 def verified(store: Path) -> tuple[dict[str, int], bool]:
     """What `gnd map verify` says, in a process of its own: its counts, and whether all that was merged is the same."""
-    command = [sys.executable, "-m", "deploy.cli", "map", "verify", str(store), "--json"]
+    command = [sys.executable, "-m", "gnd.deploy.cli", "map", "verify", str(store), "--json"]
     done = subprocess.run(command, capture_output=True, text=True, check=False)  # noqa: S603 - nothing in it is given
     try:
         told = json.loads(done.stdout)

@@ -14,21 +14,21 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
 
-from deploy.chaos.street import LAYER, Sent, Street, read_street
-from fleet_bus.bus import Bus, open_bus
-from fleet_bus.config import BusConfig
-from fleet_bus.errors import BusClosed, BusError
-from fleet_bus.requesting import RetryPolicy
-from gnd_map.errors import GndError
-from gnd_map.tile import Tile, content_sha
-from gnd_map.tile_id import TileId
-from schemas.errors import SchemaError
-from schemas.keys import tile_key, update_keys
-from schemas.tiles import CodedDelta, TileBlob, TileReply, TileRequest, tile_after, tile_of
-from schemas.updates import TileUpdate, updated
-from vehicle_agent.errors import OutboxError
-from vehicle_agent.outbox import Outbox
-from vehicle_agent.sending import SenderThread
+from gnd.deploy.chaos.street import LAYER, Sent, Street, read_street
+from gnd.fleet_bus.bus import Bus, open_bus
+from gnd.fleet_bus.config import BusConfig
+from gnd.fleet_bus.errors import BusClosed, BusError
+from gnd.fleet_bus.requesting import RetryPolicy
+from gnd.gnd_map.errors import GndError
+from gnd.gnd_map.tile import Tile, content_sha
+from gnd.gnd_map.tile_id import TileId
+from gnd.schemas.errors import SchemaError
+from gnd.schemas.keys import tile_key, update_keys
+from gnd.schemas.tiles import CodedDelta, TileBlob, TileReply, TileRequest, tile_after, tile_of
+from gnd.schemas.updates import TileUpdate, updated
+from gnd.vehicle_agent.errors import OutboxError
+from gnd.vehicle_agent.outbox import Outbox
+from gnd.vehicle_agent.sending import SenderThread
 
 REPORTS_OF_TRIP: Final = 6
 ENOUGH: Final = "enough"

@@ -12,24 +12,24 @@ from typing import Final
 import numpy as np
 import psutil
 
-from cloud_merger.config import ShardConfig
-from deploy import roles
-from deploy.chaos import clients
-from deploy.chaos.street import LAYER, Street
-from deploy.chaos.wire import Wires
-from deploy.ports import claim_port
-from deploy.processes import ProcessSpec, Supervisor, start_fork_server
-from deploy.repeating import repeated
-from fleet_bus.bus import open_bus
-from fleet_bus.config import BusConfig
-from gnd_map.errors import GndError
-from gnd_map.gaussian import Gaussians
-from gnd_map.tile import Tile
-from gnd_map.tile_id import TileId
-from schemas.keys import tile_key
-from tile_store import clocks
-from tile_store.errors import StoreError
-from tile_store.sqlite_store import SqliteStore
+from gnd.cloud_merger.config import ShardConfig
+from gnd.deploy import roles
+from gnd.deploy.chaos import clients
+from gnd.deploy.chaos.street import LAYER, Street
+from gnd.deploy.chaos.wire import Wires
+from gnd.deploy.ports import claim_port
+from gnd.deploy.processes import ProcessSpec, Supervisor, start_fork_server
+from gnd.deploy.repeating import repeated
+from gnd.fleet_bus.bus import open_bus
+from gnd.fleet_bus.config import BusConfig
+from gnd.gnd_map.errors import GndError
+from gnd.gnd_map.gaussian import Gaussians
+from gnd.gnd_map.tile import Tile
+from gnd.gnd_map.tile_id import TileId
+from gnd.schemas.keys import tile_key
+from gnd.tile_store import clocks
+from gnd.tile_store.errors import StoreError
+from gnd.tile_store.sqlite_store import SqliteStore
 
 SHARDS: Final = 2
 VEHICLES: Final = 3

@@ -13,19 +13,19 @@ from typing import Final
 import apsw
 import numpy as np
 
-from deploy.chaos import page
-from deploy.chaos.clients import put
-from deploy.chaos.cloud import Cloud
-from deploy.chaos.faults import BY_NAME, Fault
-from deploy.chaos.street import LAYER, Sent, Street
-from fleet_bus.bus import Bus
-from fleet_bus.errors import BusError
-from gnd_map.codec import encode_mask
-from gnd_map.errors import GndError
-from tile_store.errors import StoreError
-from vehicle_agent.outbox import Outbox
-from vehicle_agent.packing import askable, pack_measured
-from vehicle_agent.sending import SenderThread
+from gnd.deploy.chaos import page
+from gnd.deploy.chaos.clients import put
+from gnd.deploy.chaos.cloud import Cloud
+from gnd.deploy.chaos.faults import BY_NAME, Fault
+from gnd.deploy.chaos.street import LAYER, Sent, Street
+from gnd.fleet_bus.bus import Bus
+from gnd.fleet_bus.errors import BusError
+from gnd.gnd_map.codec import encode_mask
+from gnd.gnd_map.errors import GndError
+from gnd.tile_store.errors import StoreError
+from gnd.vehicle_agent.outbox import Outbox
+from gnd.vehicle_agent.packing import askable, pack_measured
+from gnd.vehicle_agent.sending import SenderThread
 
 SMALL_BYTES: Final = 4_096
 MESSENGER: Final = "messenger"

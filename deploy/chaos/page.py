@@ -2,8 +2,8 @@
 
 Whoever opens and closes a file that SQLite has open in the same process loses SQLite's locks on it.
 
-    python -m deploy.chaos.page find PATH < BODY     offset of 64 of these bytes, -1: there is no place
-    python -m deploy.chaos.page write PATH AT HEX    what was there, as hex
+    python -m gnd.deploy.chaos.page find PATH < BODY     offset of 64 of these bytes, -1: there is no place
+    python -m gnd.deploy.chaos.page write PATH AT HEX    what was there, as hex
 """
 
 import mmap

@@ -9,17 +9,17 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Final
 
-from deploy.chaos.checks import Findings, look
-from deploy.chaos.clients import ENOUGH, OPEN_SUFFIX
-from deploy.chaos.cloud import Cloud, running
-from deploy.chaos.faults import Fault
-from deploy.chaos.inflict import MESSENGER, End, Inflictor
-from deploy.chaos.service import SERVICES, Gaps, gaps, watched
-from deploy.chaos.street import read_street
-from deploy.errors import ChaosError
-from fleet_bus.bus import open_bus
-from fleet_bus.config import BusConfig
-from tile_store.errors import StoreError
+from gnd.deploy.chaos.checks import Findings, look
+from gnd.deploy.chaos.clients import ENOUGH, OPEN_SUFFIX
+from gnd.deploy.chaos.cloud import Cloud, running
+from gnd.deploy.chaos.faults import Fault
+from gnd.deploy.chaos.inflict import MESSENGER, End, Inflictor
+from gnd.deploy.chaos.service import SERVICES, Gaps, gaps, watched
+from gnd.deploy.chaos.street import read_street
+from gnd.deploy.errors import ChaosError
+from gnd.fleet_bus.bus import open_bus
+from gnd.fleet_bus.config import BusConfig
+from gnd.tile_store.errors import StoreError
 
 SETTLE_S: Final = 120.0
 HURRIED_S: Final = 30.0

@@ -13,13 +13,13 @@ from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, field
 from typing import Final
 
-from deploy.chaos.faults import BY_NAME, Fault
-from deploy.chaos.street import LAYER, Sent
-from fleet_bus.bus import Bus, open_bus
-from fleet_bus.config import BusConfig
-from fleet_bus.errors import BusClosed, RequestFailed
-from gnd_map.tile import Tile
-from schemas.keys import tile_key, update_keys
+from gnd.deploy.chaos.faults import BY_NAME, Fault
+from gnd.deploy.chaos.street import LAYER, Sent
+from gnd.fleet_bus.bus import Bus, open_bus
+from gnd.fleet_bus.config import BusConfig
+from gnd.fleet_bus.errors import BusClosed, RequestFailed
+from gnd.gnd_map.tile import Tile
+from gnd.schemas.keys import tile_key, update_keys
 
 SERVICES: Final = ("tile", "report", "update")
 SERVED_BY: Final = {"tile": ("router", "store"), "report": ("router", "shard"), "update": ("router", "shard", "worker")}

@@ -1,6 +1,6 @@
 """What the vehicles of a chaos run drive past and report: a street with its real short reports, kept in `street.bin`.
 
-`python -m benchmarks.chaos_street` makes the file of simulated drives: the map of the street, and of each report its
+`python -m studies.chaos_street` makes the file of simulated drives: the map of the street, and of each report its
 two halves. A vehicle of a run says what one of these reports says, or a part of it, in one of the districts that the
 street is laid down in; which, is drawn from the seed, so the same seed gives the same reports, byte by byte.
 """
@@ -14,18 +14,18 @@ from typing import Any, Final
 
 import numpy as np
 
-from cloud_merger.expanding import expand, is_askable, with_measured
-from deploy.errors import ChaosError
-from gnd_map.codec import CODEC_STANDARD_ZSTD, codec_of
-from gnd_map.gaussian import Gaussians
-from gnd_map.tile import Tile
-from gnd_map.tile_id import District, TileId
-from gnd_map.track import Track, decode_track
-from schemas.changes import ChangeReport, TileChange
-from schemas.keys import change_key
-from schemas.packed import PackedGaussians, PackedReport, decode_upload
-from schemas.report_id import deterministic_report_id
-from vehicle_agent.packing import pack
+from gnd.cloud_merger.expanding import expand, is_askable, with_measured
+from gnd.deploy.errors import ChaosError
+from gnd.gnd_map.codec import CODEC_STANDARD_ZSTD, codec_of
+from gnd.gnd_map.gaussian import Gaussians
+from gnd.gnd_map.tile import Tile
+from gnd.gnd_map.tile_id import District, TileId
+from gnd.gnd_map.track import Track, decode_track
+from gnd.schemas.changes import ChangeReport, TileChange
+from gnd.schemas.keys import change_key
+from gnd.schemas.packed import PackedGaussians, PackedReport, decode_upload
+from gnd.schemas.report_id import deterministic_report_id
+from gnd.vehicle_agent.packing import pack
 
 FILE: Final = Path(__file__).with_name("street.bin")
 LAYER: Final = "ndt"

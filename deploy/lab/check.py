@@ -9,12 +9,12 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any, Final
 
-from deploy.errors import LabError
-from deploy.lab.groups import LabLink
-from deploy.lab.lab import Lab
-from deploy.lab.probes import Bulk, Direction, Stream, bulk, flood, stream
-from deploy.lab.run import relay_processes
-from deploy.processes import Supervisor
+from gnd.deploy.errors import LabError
+from gnd.deploy.lab.groups import LabLink
+from gnd.deploy.lab.lab import Lab
+from gnd.deploy.lab.probes import Bulk, Direction, Stream, bulk, flood, stream
+from gnd.deploy.lab.run import relay_processes
+from gnd.deploy.processes import Supervisor
 
 READY_S: Final = 30.0
 DIRECTIONS: Final[tuple[Direction, ...]] = ("down", "up")

@@ -10,18 +10,18 @@ from typing import Any
 import click
 from rich.console import Console
 
-from deploy.fleet_cli import run, run_options, summary_text
-from deploy.fleet_config import load_fleet_config
-from deploy.lab.check import DIRECTIONS, carried, congestion_control, measure
-from deploy.lab.check import as_json as check_as_json
-from deploy.lab.groups import DEFAULT_GROUPS, parse_groups
-from deploy.lab.lab import clean as clean_up
-from deploy.lab.lab import open_lab
-from deploy.lab.run import LabRun
-from deploy.lab.tables import check_table, run_table, run_verdict
-from deploy.lab.tools import check_rights
-from deploy.run_folder import create_run_folder, default_run_path
-from deploy.source import Source
+from gnd.deploy.fleet_cli import run, run_options, summary_text
+from gnd.deploy.fleet_config import load_fleet_config
+from gnd.deploy.lab.check import DIRECTIONS, carried, congestion_control, measure
+from gnd.deploy.lab.check import as_json as check_as_json
+from gnd.deploy.lab.groups import DEFAULT_GROUPS, parse_groups
+from gnd.deploy.lab.lab import clean as clean_up
+from gnd.deploy.lab.lab import open_lab
+from gnd.deploy.lab.run import LabRun
+from gnd.deploy.lab.tables import check_table, run_table, run_verdict
+from gnd.deploy.lab.tools import check_rights
+from gnd.deploy.run_folder import create_run_folder, default_run_path
+from gnd.deploy.source import Source
 
 WIDTH = 170
 

@@ -5,8 +5,8 @@ import re
 from dataclasses import dataclass
 from typing import Any, Final, TextIO
 
-from deploy.lab.groups import LabLink
-from deploy.lab.namespaces import inside, run_tool
+from gnd.deploy.lab.groups import LabLink
+from gnd.deploy.lab.namespaces import inside, run_tool
 
 ETHERNET_BYTES: Final = 14
 """Header that a veth interface counts with each packet, and a TUN interface has not."""

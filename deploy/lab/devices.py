@@ -7,8 +7,8 @@ Each side limits what it sends: the vehicle's the rate up, the cloud's the rate 
 import math
 from typing import Final
 
-from deploy.lab.groups import LabLink
-from fleet_bus.links import SEGMENT_BYTES, LinkProfile
+from gnd.deploy.lab.groups import LabLink
+from gnd.fleet_bus.links import SEGMENT_BYTES, LinkProfile
 
 HEADER_BYTES: Final = 52
 """IPv4 and TCP with time stamps."""

@@ -4,9 +4,9 @@ import re
 from dataclasses import dataclass, replace
 from typing import Final
 
-from deploy.errors import LabError
-from deploy.fleet_config import MAX_AGENTS
-from fleet_bus.links import LinkProfile, load_link
+from gnd.deploy.errors import LabError
+from gnd.deploy.fleet_config import MAX_AGENTS
+from gnd.fleet_bus.links import LinkProfile, load_link
 
 DEFAULT_GROUPS: Final = "3g:1,4g:1,5g:1"
 PREFIX: Final = "gndlab"

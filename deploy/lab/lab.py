@@ -17,11 +17,11 @@ from typing import Final
 
 import psutil
 
-from deploy.errors import LabError, LabRuns
-from deploy.lab.devices import link_commands
-from deploy.lab.groups import PREFIX, Group, LabLink, check_lab_name, links_of, namespace_name
-from deploy.lab.namespaces import add_namespace, namespaces, pids_in, remove_namespace, run_all
-from deploy.lab.tools import Offer, check_offer, kernel_offer, needs_carrying
+from gnd.deploy.errors import LabError, LabRuns
+from gnd.deploy.lab.devices import link_commands
+from gnd.deploy.lab.groups import PREFIX, Group, LabLink, check_lab_name, links_of, namespace_name
+from gnd.deploy.lab.namespaces import add_namespace, namespaces, pids_in, remove_namespace, run_all
+from gnd.deploy.lab.tools import Offer, check_offer, kernel_offer, needs_carrying
 
 LOCK_FOLDER: Final = Path("/run") / PREFIX
 END_WITHIN_S: Final = 10.0

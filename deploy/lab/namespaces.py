@@ -12,7 +12,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Final
 
-from deploy.errors import LabError
+from gnd.deploy.errors import LabError
 
 NETNS_FOLDER: Final = Path("/run/netns")
 COMMAND_TIMEOUT_S: Final = 20.0

@@ -18,10 +18,10 @@ from typing import Final, Literal
 
 import numpy as np
 
-from deploy.errors import LabError
-from deploy.lab.devices import MTU_BYTES
-from deploy.lab.groups import LabLink
-from deploy.lab.namespaces import inside
+from gnd.deploy.errors import LabError
+from gnd.deploy.lab.devices import MTU_BYTES
+from gnd.deploy.lab.groups import LabLink
+from gnd.deploy.lab.namespaces import inside
 
 Direction = Literal["up", "down"]
 

@@ -20,11 +20,11 @@ from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Final
 
-from deploy.errors import LabError
-from deploy.lab.groups import LabLink
-from deploy.lab.namespaces import inside
-from deploy.lab.tools import TUN_DEVICE
-from fleet_bus.links import LinkProfile
+from gnd.deploy.errors import LabError
+from gnd.deploy.lab.groups import LabLink
+from gnd.deploy.lab.namespaces import inside
+from gnd.deploy.lab.tools import TUN_DEVICE
+from gnd.fleet_bus.links import LinkProfile
 
 _TUNSETIFF: Final = 0x400454CA  # linux/if_tun.h
 _IFF_TUN_NO_PI: Final = 0x1001

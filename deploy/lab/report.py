@@ -12,12 +12,12 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any, Final
 
-from deploy.lab.counters import Counts, Drops, read_counts, read_drops
-from deploy.lab.groups import Group, LabLink
-from deploy.lab.lab import Lab
-from deploy.lab.relay import LineCount
-from deploy.lab.sampler import LinkSeen
-from fleet_bus.ledger_file import AgentLedger
+from gnd.deploy.lab.counters import Counts, Drops, read_counts, read_drops
+from gnd.deploy.lab.groups import Group, LabLink
+from gnd.deploy.lab.lab import Lab
+from gnd.deploy.lab.relay import LineCount
+from gnd.deploy.lab.sampler import LinkSeen
+from gnd.fleet_bus.ledger_file import AgentLedger
 
 TOLERANCE: Final = 0.05
 """Ledger and interface must agree within this share of the interface's bytes."""

@@ -6,17 +6,17 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Final
 
-from deploy.lab.groups import ROUTER_FROM_CLOUD, ROUTER_LISTENS, unpaced
-from deploy.lab.lab import Lab
-from deploy.lab.namespaces import inside
-from deploy.lab.relay import read_account, run_relay
-from deploy.lab.report import Evidence, account, as_json, count_links, write_account
-from deploy.lab.sampler import sampling
-from deploy.processes import ProcessSpec
-from deploy.run_folder import RunFolder
-from deploy.site import Site, VehicleSite
-from fleet_bus.errors import LedgerError
-from fleet_bus.ledger_file import AgentLedger, read_ledger
+from gnd.deploy.lab.groups import ROUTER_FROM_CLOUD, ROUTER_LISTENS, unpaced
+from gnd.deploy.lab.lab import Lab
+from gnd.deploy.lab.namespaces import inside
+from gnd.deploy.lab.relay import read_account, run_relay
+from gnd.deploy.lab.report import Evidence, account, as_json, count_links, write_account
+from gnd.deploy.lab.sampler import sampling
+from gnd.deploy.processes import ProcessSpec
+from gnd.deploy.run_folder import RunFolder
+from gnd.deploy.site import Site, VehicleSite
+from gnd.fleet_bus.errors import LedgerError
+from gnd.fleet_bus.ledger_file import AgentLedger, read_ledger
 
 RELAYS: Final = "relays"
 ACCOUNT: Final = "lab.json"

@@ -10,10 +10,10 @@ from contextlib import contextmanager
 from dataclasses import dataclass, field
 from typing import Final
 
-from deploy.errors import LabError
-from deploy.lab.counters import DeviceReader, TcpSample, tcp_samples
-from deploy.lab.groups import LabLink
-from deploy.lab.lab import Lab
+from gnd.deploy.errors import LabError
+from gnd.deploy.lab.counters import DeviceReader, TcpSample, tcp_samples
+from gnd.deploy.lab.groups import LabLink
+from gnd.deploy.lab.lab import Lab
 
 PERIOD_S: Final = 0.1
 WINDOW_S: Final = 1.0

@@ -4,7 +4,7 @@ from typing import Any
 
 from rich.table import Table
 
-from deploy.lab.check import Measured
+from gnd.deploy.lab.check import Measured
 
 
 def rate_text(bit_s: float | None) -> str:

@@ -6,9 +6,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
 
-from deploy.errors import LabError
-from deploy.lab.namespaces import add_namespace, remove_namespace, run_tool
-from fleet_bus.links import LinkProfile
+from gnd.deploy.errors import LabError
+from gnd.deploy.lab.namespaces import add_namespace, remove_namespace, run_tool
+from gnd.fleet_bus.links import LinkProfile
 
 TUN_DEVICE: Final = Path("/dev/net/tun")
 TOOLS: Final = ("ip", "tc", "ss")

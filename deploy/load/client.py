@@ -12,18 +12,18 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
 
-from deploy.load.drives import KeptRuns
-from deploy.load.plan import Due, LoadOptions, Timetable
-from deploy.load.sending import Account, Measured, Open, Sender, opened
-from deploy.load.shift import Shift
-from deploy.load.streets import Streets
-from fleet_bus.bus import Bus, open_bus
-from fleet_bus.config import BusConfig
-from gnd_map.errors import GndError
-from schemas.errors import SchemaError
-from schemas.keys import ROOT
-from schemas.limits import MAX_REPORTS_OF_QUESTION
-from schemas.report_states import ReportState, ReportStates
+from gnd.deploy.load.drives import KeptRuns
+from gnd.deploy.load.plan import Due, LoadOptions, Timetable
+from gnd.deploy.load.sending import Account, Measured, Open, Sender, opened
+from gnd.deploy.load.shift import Shift
+from gnd.deploy.load.streets import Streets
+from gnd.fleet_bus.bus import Bus, open_bus
+from gnd.fleet_bus.config import BusConfig
+from gnd.gnd_map.errors import GndError
+from gnd.schemas.errors import SchemaError
+from gnd.schemas.keys import ROOT
+from gnd.schemas.limits import MAX_REPORTS_OF_QUESTION
+from gnd.schemas.report_states import ReportState, ReportStates
 
 POLL_S: Final = 0.05
 LOOK_S: Final = 0.5

@@ -17,10 +17,10 @@ from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 from rich.table import Table
 
-from deploy.load.making import kept_runs
-from deploy.load.plan import LoadOptions
-from deploy.load.run import Tell, run_load
-from deploy.load.verdict import summary
+from gnd.deploy.load.making import kept_runs
+from gnd.deploy.load.plan import LoadOptions
+from gnd.deploy.load.run import Tell, run_load
+from gnd.deploy.load.verdict import summary
 
 PATH: Final = click.Path(path_type=Path)
 

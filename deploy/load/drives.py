@@ -14,17 +14,17 @@ from pathlib import Path
 import apsw
 import numpy as np
 
-from deploy.load.errors import LoadError
-from deploy.run_folder import RunFolder
-from gnd_map.gaussian import Gaussians
-from gnd_map.tile import Tile
-from gnd_map.tile_id import TileId
-from schemas.changes import ChangeReport
-from schemas.keys import parse_change_key
-from schemas.packed import PackedReport
-from tile_store.options import to_read
-from tile_store.store import Store
-from vehicle_agent.way import WAY_FILE
+from gnd.deploy.load.errors import LoadError
+from gnd.deploy.run_folder import RunFolder
+from gnd.gnd_map.gaussian import Gaussians
+from gnd.gnd_map.tile import Tile
+from gnd.gnd_map.tile_id import TileId
+from gnd.schemas.changes import ChangeReport
+from gnd.schemas.keys import parse_change_key
+from gnd.schemas.packed import PackedReport
+from gnd.tile_store.options import to_read
+from gnd.tile_store.store import Store
+from gnd.vehicle_agent.way import WAY_FILE
 
 LAYER = "ndt"
 _SENT = (

@@ -1,6 +1,6 @@
 """Errors of `gnd load`."""
 
-from deploy.errors import DeployError
+from gnd.deploy.errors import DeployError
 
 
 class LoadError(DeployError):

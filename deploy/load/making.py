@@ -9,13 +9,13 @@ from typing import Final
 
 from rich.console import Console
 
-from deploy.fleet_cli import run as run_fleet
-from deploy.fleet_config import FleetConfig
-from deploy.load.drives import KeptRuns, healed_map
-from deploy.load.errors import LoadError
-from deploy.run_folder import RunFolder, create_run_folder
-from deploy.source import Source
-from tile_store.sqlite_store import SqliteStore
+from gnd.deploy.fleet_cli import run as run_fleet
+from gnd.deploy.fleet_config import FleetConfig
+from gnd.deploy.load.drives import KeptRuns, healed_map
+from gnd.deploy.load.errors import LoadError
+from gnd.deploy.run_folder import RunFolder, create_run_folder
+from gnd.deploy.source import Source
+from gnd.tile_store.sqlite_store import SqliteStore
 
 DRIVES: Final = Path("runs/load-drives")
 AGENTS: Final = 4

@@ -10,26 +10,26 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Final
 
-from cloud_merger.config import ShardConfig
-from deploy import roles
-from deploy.errors import DeployError
-from deploy.fleet import shard_config
-from deploy.fleet_config import FleetConfig
-from deploy.load.audit import Auditor, Backlog
-from deploy.load.client import ClientConfig, client, read_accounts, start_file
-from deploy.load.cpu import busy_s, by_part
-from deploy.load.drives import LAYER, KeptRuns
-from deploy.load.plan import LoadOptions, shared_out
-from deploy.load.sending import Account
-from deploy.load.streets import Streets
-from deploy.load.verdict import Outcome
-from deploy.ports import claim_port
-from deploy.processes import ProcessSpec, Supervisor, start_fork_server
-from fleet_bus.bus import Bus, open_bus
-from fleet_bus.config import BusConfig
-from schemas.keys import parse_update_key, update_keys
-from schemas.updates import TileUpdate
-from tile_store.sqlite_store import SqliteStore
+from gnd.cloud_merger.config import ShardConfig
+from gnd.deploy import roles
+from gnd.deploy.errors import DeployError
+from gnd.deploy.fleet import shard_config
+from gnd.deploy.fleet_config import FleetConfig
+from gnd.deploy.load.audit import Auditor, Backlog
+from gnd.deploy.load.client import ClientConfig, client, read_accounts, start_file
+from gnd.deploy.load.cpu import busy_s, by_part
+from gnd.deploy.load.drives import LAYER, KeptRuns
+from gnd.deploy.load.plan import LoadOptions, shared_out
+from gnd.deploy.load.sending import Account
+from gnd.deploy.load.streets import Streets
+from gnd.deploy.load.verdict import Outcome
+from gnd.deploy.ports import claim_port
+from gnd.deploy.processes import ProcessSpec, Supervisor, start_fork_server
+from gnd.fleet_bus.bus import Bus, open_bus
+from gnd.fleet_bus.config import BusConfig
+from gnd.schemas.keys import parse_update_key, update_keys
+from gnd.schemas.updates import TileUpdate
+from gnd.tile_store.sqlite_store import SqliteStore
 
 LOOK_S: Final = 0.5
 READY_S: Final = 120.0

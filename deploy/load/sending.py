@@ -6,21 +6,21 @@ from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field, replace
 from typing import Any, Final
 
-from deploy.load.drives import KeptReport
-from deploy.load.plan import Due
-from deploy.load.shift import Shift, shifted_district
-from fleet_bus.bus import Bus
-from fleet_bus.errors import BusError
-from gnd_map.gaussian import Gaussians
-from schemas.changes import ChangeAck
-from schemas.errors import SchemaError
-from schemas.keys import change_key, state_key
-from schemas.packed import PackedGaussians
-from schemas.report_id import deterministic_report_id
-from schemas.report_states import ReportQuestion, ReportState, ReportStates
-from vehicle_agent.outbox import FIRST_ASK_S, LONGEST_ASK_S
-from vehicle_agent.packing import pack_measured
-from vehicle_agent.sending import QUESTION_S, REQUEST_S
+from gnd.deploy.load.drives import KeptReport
+from gnd.deploy.load.plan import Due
+from gnd.deploy.load.shift import Shift, shifted_district
+from gnd.fleet_bus.bus import Bus
+from gnd.fleet_bus.errors import BusError
+from gnd.gnd_map.gaussian import Gaussians
+from gnd.schemas.changes import ChangeAck
+from gnd.schemas.errors import SchemaError
+from gnd.schemas.keys import change_key, state_key
+from gnd.schemas.packed import PackedGaussians
+from gnd.schemas.report_id import deterministic_report_id
+from gnd.schemas.report_states import ReportQuestion, ReportState, ReportStates
+from gnd.vehicle_agent.outbox import FIRST_ASK_S, LONGEST_ASK_S
+from gnd.vehicle_agent.packing import pack_measured
+from gnd.vehicle_agent.sending import QUESTION_S, REQUEST_S
 
 NS_PER_S: Final = 1_000_000_000
 PATIENCE: Final = 3

@@ -10,11 +10,11 @@ from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, replace
 from typing import Final
 
-from deploy.load.errors import LoadError
-from gnd_map.tile import Tile, content_sha
-from gnd_map.tile_id import LON_TILES, District, TileId
-from schemas.changes import ChangeReport
-from schemas.packed import PackedReport, digest_of
+from gnd.deploy.load.errors import LoadError
+from gnd.gnd_map.tile import Tile, content_sha
+from gnd.gnd_map.tile_id import LON_TILES, District, TileId
+from gnd.schemas.changes import ChangeReport
+from gnd.schemas.packed import PackedReport, digest_of
 
 DISTRICT_TILES: Final = 32
 """Tiles along one side of a district."""

@@ -2,12 +2,12 @@
 
 from dataclasses import dataclass
 
-from deploy.load.drives import KeptRuns, KeptStreet, gaussians_by_sha, read_street
-from deploy.load.errors import LoadError
-from deploy.load.plan import LoadOptions, Timetable
-from deploy.load.shift import Shift, places_of_streets, shifted_tile
-from gnd_map.gaussian import Gaussians
-from gnd_map.tile import Tile
+from gnd.deploy.load.drives import KeptRuns, KeptStreet, gaussians_by_sha, read_street
+from gnd.deploy.load.errors import LoadError
+from gnd.deploy.load.plan import LoadOptions, Timetable
+from gnd.deploy.load.shift import Shift, places_of_streets, shifted_tile
+from gnd.gnd_map.gaussian import Gaussians
+from gnd.gnd_map.tile import Tile
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -7,9 +7,9 @@ from typing import Any, Final
 import numpy as np
 import numpy.typing as npt
 
-from deploy.load.audit import Backlog, Ledger
-from deploy.load.plan import LoadOptions
-from deploy.load.sending import Account
+from gnd.deploy.load.audit import Backlog, Ledger
+from gnd.deploy.load.plan import LoadOptions
+from gnd.deploy.load.sending import Account
 
 F64 = npt.NDArray[np.float64]
 LATE_S: Final = 1.0

@@ -10,11 +10,11 @@ from typing import Final
 
 import numpy as np
 
-from fleet_sim import parts
-from fleet_sim.courses.motion import CourseMotion
-from fleet_sim.movers import Mover, Movers
-from fleet_sim.shapes import Block, Shape
-from gnd_map.arrays import F64
+from gnd.fleet_sim import parts
+from gnd.fleet_sim.courses.motion import CourseMotion
+from gnd.fleet_sim.movers import Mover, Movers
+from gnd.fleet_sim.shapes import Block, Shape
+from gnd.gnd_map.arrays import F64
 
 STEP_S: Final = 0.02
 _LEAD_S: Final = 0.5

@@ -3,14 +3,14 @@
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 
-from fleet_sim.courses.company import Companion
-from fleet_sim.courses.faults import Faults
-from fleet_sim.courses.foliage import Leaves
-from fleet_sim.courses.path import Path
-from fleet_sim.courses.ride import Ride
-from fleet_sim.courses.terrain import Ground
-from fleet_sim.shapes import Shape
-from fleet_sim.world import State, World
+from gnd.fleet_sim.courses.company import Companion
+from gnd.fleet_sim.courses.faults import Faults
+from gnd.fleet_sim.courses.foliage import Leaves
+from gnd.fleet_sim.courses.path import Path
+from gnd.fleet_sim.courses.ride import Ride
+from gnd.fleet_sim.courses.terrain import Ground
+from gnd.fleet_sim.shapes import Shape
+from gnd.fleet_sim.world import State, World
 
 
 @dataclass(frozen=True, eq=False)

@@ -7,19 +7,19 @@ from typing import Final
 
 import numpy as np
 
-from fleet_sim.courses.company import movers_of
-from fleet_sim.courses.course import Course
-from fleet_sim.courses.foliage import Foliage
-from fleet_sim.courses.motion import CourseMotion
-from fleet_sim.drives import EPOCH_NS, SensorErrors
-from fleet_sim.errors import DriveSimError
-from fleet_sim.lidar import Lidar, column_poses
-from fleet_sim.raycast import Scene
-from fleet_sim.sensors import MODELS, LidarModel
-from fleet_sim.trajectory import gauss_markov
-from gnd_map.arrays import F64
-from gnd_map.se3 import exp_so3
-from schemas.drive import DriveHeader, DriveItem, GnssFix, MotionSample, ReferencePose, Scan
+from gnd.fleet_sim.courses.company import movers_of
+from gnd.fleet_sim.courses.course import Course
+from gnd.fleet_sim.courses.foliage import Foliage
+from gnd.fleet_sim.courses.motion import CourseMotion
+from gnd.fleet_sim.drives import EPOCH_NS, SensorErrors
+from gnd.fleet_sim.errors import DriveSimError
+from gnd.fleet_sim.lidar import Lidar, column_poses
+from gnd.fleet_sim.raycast import Scene
+from gnd.fleet_sim.sensors import MODELS, LidarModel
+from gnd.fleet_sim.trajectory import gauss_markov
+from gnd.gnd_map.arrays import F64
+from gnd.gnd_map.se3 import exp_so3
+from gnd.schemas.drive import DriveHeader, DriveItem, GnssFix, MotionSample, ReferencePose, Scan
 
 _NS_PER_S: Final = 1_000_000_000
 _LEAD_S: Final = 0.2

@@ -6,10 +6,10 @@ from typing import Final
 
 import numpy as np
 
-from fleet_sim.errors import DriveSimError
-from gnd_map.arrays import F64
-from gnd_map.se3 import exp_so3
-from schemas.drive import Scan
+from gnd.fleet_sim.errors import DriveSimError
+from gnd.gnd_map.arrays import F64
+from gnd.gnd_map.se3 import exp_so3
+from gnd.schemas.drive import Scan
 
 _NS_PER_S: Final = 1_000_000_000
 _DIRT_M: Final = 0.3

@@ -10,9 +10,9 @@ from typing import Final
 
 import numpy as np
 
-from fleet_sim.errors import DriveSimError
-from fleet_sim.ray_kernels import BLOCK_COLUMNS, FloatArray, IntArray, cast_leaves
-from fleet_sim.shapes import Ball, pack
+from gnd.fleet_sim.errors import DriveSimError
+from gnd.fleet_sim.ray_kernels import BLOCK_COLUMNS, FloatArray, IntArray, cast_leaves
+from gnd.fleet_sim.shapes import Ball, pack
 
 _LEAF: Final = 0.45
 _WIDE_RAD: Final = 0.5

@@ -5,13 +5,13 @@ from typing import Final
 
 import numpy as np
 
-from fleet_sim.courses.path import Path
-from fleet_sim.courses.ride import Ride
-from fleet_sim.courses.terrain import Ground
-from fleet_sim.trajectory import swaying
-from fleet_sim.world import World
-from gnd_map.arrays import F64
-from gnd_map.se3 import T_inverse, exp_so3, log_so3
+from gnd.fleet_sim.courses.path import Path
+from gnd.fleet_sim.courses.ride import Ride
+from gnd.fleet_sim.courses.terrain import Ground
+from gnd.fleet_sim.trajectory import swaying
+from gnd.fleet_sim.world import World
+from gnd.gnd_map.arrays import F64
+from gnd.gnd_map.se3 import T_inverse, exp_so3, log_so3
 
 _STEP_S: Final = 0.5e-3
 

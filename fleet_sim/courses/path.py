@@ -7,8 +7,8 @@ import numpy as np
 from scipy.interpolate import CubicSpline
 from scipy.ndimage import gaussian_filter1d
 
-from fleet_sim.errors import DriveSimError
-from gnd_map.arrays import F64
+from gnd.fleet_sim.errors import DriveSimError
+from gnd.gnd_map.arrays import F64
 
 _STEP_M: Final = 1.0
 

@@ -7,18 +7,18 @@ from typing import Final
 
 import numpy as np
 
-from fleet_sim import parts
-from fleet_sim.courses.company import keeping, van
-from fleet_sim.courses.course import Place
-from fleet_sim.courses.foliage import Leaves, crown, hedge
-from fleet_sim.courses.path import Path, lane, smoothed
-from fleet_sim.courses.terrain import LEVEL, Ground, Profile, raised
-from fleet_sim.parts import Lot
-from fleet_sim.shapes import Block, Post, Shape
-from fleet_sim.street import BORDER_LON_RAD, HEIGHT_M, LANE_OFFSET_M, LAT_RAD, StreetOptions, street
-from fleet_sim.street_before import KERB_M, PAVEMENT_M
-from fleet_sim.world import STATES, Edit, State, World, WorldObject
-from gnd_map.arrays import F64
+from gnd.fleet_sim import parts
+from gnd.fleet_sim.courses.company import keeping, van
+from gnd.fleet_sim.courses.course import Place
+from gnd.fleet_sim.courses.foliage import Leaves, crown, hedge
+from gnd.fleet_sim.courses.path import Path, lane, smoothed
+from gnd.fleet_sim.courses.terrain import LEVEL, Ground, Profile, raised
+from gnd.fleet_sim.parts import Lot
+from gnd.fleet_sim.shapes import Block, Post, Shape
+from gnd.fleet_sim.street import BORDER_LON_RAD, HEIGHT_M, LANE_OFFSET_M, LAT_RAD, StreetOptions, street
+from gnd.fleet_sim.street_before import KERB_M, PAVEMENT_M
+from gnd.fleet_sim.world import STATES, Edit, State, World, WorldObject
+from gnd.gnd_map.arrays import F64
 
 LENGTH_M: Final = 160.0
 _FEW_EDITS: Final = 0.15

@@ -7,8 +7,8 @@ import numpy as np
 from scipy.interpolate import CubicHermiteSpline
 from scipy.ndimage import gaussian_filter1d
 
-from fleet_sim.errors import DriveSimError
-from gnd_map.arrays import F64
+from gnd.fleet_sim.errors import DriveSimError
+from gnd.gnd_map.arrays import F64
 
 RIDE_STEP_S: Final = 0.02
 _LEAD_S: Final = 2.0

@@ -5,16 +5,16 @@ from typing import Final
 
 import numpy as np
 
-from fleet_sim.courses.company import movers_of
-from fleet_sim.courses.course import Place
-from fleet_sim.courses.foliage import Foliage
-from fleet_sim.courses.motion import CourseMotion
-from fleet_sim.courses.ride import RIDE_STEP_S, Ride
-from fleet_sim.lidar import Lidar
-from fleet_sim.raycast import Scene
-from fleet_sim.sensors import HDL32E
-from gnd_map.arrays import F64
-from gnd_map.se3 import transform
+from gnd.fleet_sim.courses.company import movers_of
+from gnd.fleet_sim.courses.course import Place
+from gnd.fleet_sim.courses.foliage import Foliage
+from gnd.fleet_sim.courses.motion import CourseMotion
+from gnd.fleet_sim.courses.ride import RIDE_STEP_S, Ride
+from gnd.fleet_sim.lidar import Lidar
+from gnd.fleet_sim.raycast import Scene
+from gnd.fleet_sim.sensors import HDL32E
+from gnd.gnd_map.arrays import F64
+from gnd.gnd_map.se3 import transform
 
 STEP_M: Final = 2.0
 _SPEED_MPS: Final = 10.0

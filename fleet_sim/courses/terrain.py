@@ -7,10 +7,10 @@ from typing import Final
 import numpy as np
 from scipy.interpolate import CubicSpline
 
-from fleet_sim.errors import DriveSimError
-from fleet_sim.shapes import Ball, Block, Shape
-from fleet_sim.world import World, WorldObject
-from gnd_map.arrays import F64
+from gnd.fleet_sim.errors import DriveSimError
+from gnd.fleet_sim.shapes import Ball, Block, Shape
+from gnd.fleet_sim.world import World, WorldObject
+from gnd.gnd_map.arrays import F64
 
 _PIECE_M: Final = 2.0
 """The ground is laid in level-edged pieces of this length: over a crest of 300 m radius they are off by 2 mm."""

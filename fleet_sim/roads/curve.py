@@ -7,7 +7,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from fleet_sim.errors import RoadError
+from gnd.fleet_sim.errors import RoadError
 
 FloatArray = NDArray[np.float64]
 

@@ -9,16 +9,16 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from fleet_sim.drives import EPOCH_NS, SensorErrors
-from fleet_sim.errors import RoadError
-from fleet_sim.roads.curve import FloatArray
-from fleet_sim.roads.looks import DetectorNoise, detected, lane_looks
-from fleet_sim.roads.motion import Cruise, RoadMotion
-from fleet_sim.roads.route import IntArray, Route
-from fleet_sim.roads.sight import CAMERA, LIDAR, BoolArray, View, hidden, occluder_ranges, placed_boxes, polar
-from fleet_sim.roads.traffic import EMPTY, Boxes, RoadTraffic, drawn_boxes, lanes_taken
-from fleet_sim.trajectory import gauss_markov
-from schemas.drive import Detections, LaneLook, MotionTrack
+from gnd.fleet_sim.drives import EPOCH_NS, SensorErrors
+from gnd.fleet_sim.errors import RoadError
+from gnd.fleet_sim.roads.curve import FloatArray
+from gnd.fleet_sim.roads.looks import DetectorNoise, detected, lane_looks
+from gnd.fleet_sim.roads.motion import Cruise, RoadMotion
+from gnd.fleet_sim.roads.route import IntArray, Route
+from gnd.fleet_sim.roads.sight import CAMERA, LIDAR, BoolArray, View, hidden, occluder_ranges, placed_boxes, polar
+from gnd.fleet_sim.roads.traffic import EMPTY, Boxes, RoadTraffic, drawn_boxes, lanes_taken
+from gnd.fleet_sim.trajectory import gauss_markov
+from gnd.schemas.drive import Detections, LaneLook, MotionTrack
 
 MOTION_HZ: Final = 50
 LANES_HZ: Final = 15
@@ -30,7 +30,7 @@ GNSS_CEP_M: Final = 2.5
 """Median horizontal error: u-blox 6 data sheet, the papers' "2.5 m positioning errors"."""
 GNSS_CORRELATION_S: Final = 13.4
 GNSS_WHITE_SHARE: Final = 0.30
-"""`python -m benchmarks gnss-noise`: of a car's single-point fixes against its reference."""
+"""`python -m studies gnss-noise`: of a car's single-point fixes against its reference."""
 
 
 def road_errors(cep_m: float = GNSS_CEP_M) -> SensorErrors:

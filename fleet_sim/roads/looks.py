@@ -13,11 +13,11 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from fleet_sim.errors import RoadError
-from fleet_sim.roads.curve import FloatArray
-from fleet_sim.roads.route import Features, IntArray, Route
-from fleet_sim.roads.sight import BoolArray, View
-from schemas.drive import Detections, LaneLook
+from gnd.fleet_sim.errors import RoadError
+from gnd.fleet_sim.roads.curve import FloatArray
+from gnd.fleet_sim.roads.route import Features, IntArray, Route
+from gnd.fleet_sim.roads.sight import BoolArray, View
+from gnd.schemas.drive import Detections, LaneLook
 
 BEARING_DEG: Final = 2.5
 """Bearing noise for l = 1."""

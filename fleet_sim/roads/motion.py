@@ -6,8 +6,8 @@ from typing import Final
 
 import numpy as np
 
-from fleet_sim.roads.curve import FloatArray
-from fleet_sim.roads.route import IntArray, Route
+from gnd.fleet_sim.roads.curve import FloatArray
+from gnd.fleet_sim.roads.route import IntArray, Route
 
 STEP_S: Final = 0.05
 _HALF_S: Final = 0.01

@@ -11,11 +11,11 @@ from typing import Final
 
 import numpy as np
 
-from fleet_sim.errors import RoadError
-from fleet_sim.roads.alignment import Bends, drawn_bends
-from fleet_sim.roads.curve import of_curvature
-from fleet_sim.roads.route import FeatureState, Route, placed
-from gnd_map.geodesy import LocalFrame
+from gnd.fleet_sim.errors import RoadError
+from gnd.fleet_sim.roads.alignment import Bends, drawn_bends
+from gnd.fleet_sim.roads.curve import of_curvature
+from gnd.fleet_sim.roads.route import FeatureState, Route, placed
+from gnd.gnd_map.geodesy import LocalFrame
 
 LENGTH_M: Final = 20_000.0
 NORMAL: Final = 55

@@ -5,8 +5,8 @@ from typing import Any, Final
 
 import numpy as np
 
-from fleet_sim.roads.curve import FloatArray
-from fleet_sim.roads.drive import RoadDrive
+from gnd.fleet_sim.roads.curve import FloatArray
+from gnd.fleet_sim.roads.drive import RoadDrive
 
 _COLOURS: Final = {"normal": "#1f5fbf", "deleted": "#2e9e4f", "new": "#d62728"}
 _STRETCH_M: Final = 150.0

@@ -7,9 +7,9 @@ from typing import Final
 
 import numpy as np
 
-from fleet_sim.roads.drive import RoadDrive
-from schemas.drive import DriveHeader, DriveItem, GnssFix, MotionSample, ReferencePose
-from schemas.drive_mcap import DriveWriter
+from gnd.fleet_sim.roads.drive import RoadDrive
+from gnd.schemas.drive import DriveHeader, DriveItem, GnssFix, MotionSample, ReferencePose
+from gnd.schemas.drive_mcap import DriveWriter
 
 _REFERENCE_EVERY: Final = 5
 

@@ -8,9 +8,9 @@ from typing import Final, Literal, get_args
 import numpy as np
 from numpy.typing import NDArray
 
-from fleet_sim.errors import RoadError
-from fleet_sim.roads.curve import Centreline, FloatArray
-from gnd_map.geodesy import LocalFrame
+from gnd.fleet_sim.errors import RoadError
+from gnd.fleet_sim.roads.curve import Centreline, FloatArray
+from gnd.gnd_map.geodesy import LocalFrame
 
 IntArray = NDArray[np.int64]
 FeatureState = Literal["normal", "deleted", "new"]

@@ -4,11 +4,11 @@ from collections.abc import Callable
 from functools import partial
 from typing import Final
 
-from fleet_sim.errors import RoadError
-from fleet_sim.roads.motorway import motorway
-from fleet_sim.roads.route import Route
-from fleet_sim.roads.streetlights import streetlight_motorway
-from fleet_sim.roads.test_track import test_track
+from gnd.fleet_sim.errors import RoadError
+from gnd.fleet_sim.roads.motorway import motorway
+from gnd.fleet_sim.roads.route import Route
+from gnd.fleet_sim.roads.streetlights import streetlight_motorway
+from gnd.fleet_sim.roads.test_track import test_track
 
 _KINDS: Final[dict[str, Callable[[int], Route]]] = {
     "motorway": motorway,

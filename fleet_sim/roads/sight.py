@@ -10,11 +10,11 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from fleet_sim.errors import RoadError
-from fleet_sim.roads.curve import FloatArray
-from fleet_sim.roads.route import Route
-from fleet_sim.roads.traffic import NEAR_M, Boxes
-from schemas.drive import LookSensor
+from gnd.fleet_sim.errors import RoadError
+from gnd.fleet_sim.roads.curve import FloatArray
+from gnd.fleet_sim.roads.route import Route
+from gnd.fleet_sim.roads.traffic import NEAR_M, Boxes
+from gnd.schemas.drive import LookSensor
 
 BoolArray = NDArray[np.bool_]
 

@@ -9,12 +9,12 @@ from typing import Final
 
 import numpy as np
 
-from fleet_sim.errors import RoadError
-from fleet_sim.roads.alignment import Bends, drawn_bends
-from fleet_sim.roads.curve import of_curvature
-from fleet_sim.roads.motorway import LANES, MARKINGS
-from fleet_sim.roads.route import FeatureState, Route, placed
-from gnd_map.geodesy import LocalFrame
+from gnd.fleet_sim.errors import RoadError
+from gnd.fleet_sim.roads.alignment import Bends, drawn_bends
+from gnd.fleet_sim.roads.curve import of_curvature
+from gnd.fleet_sim.roads.motorway import LANES, MARKINGS
+from gnd.fleet_sim.roads.route import FeatureState, Route, placed
+from gnd.gnd_map.geodesy import LocalFrame
 
 LENGTH_M: Final = 5_000.0
 EVERY_M: Final = 40.0

@@ -9,10 +9,10 @@ from typing import Final
 
 import numpy as np
 
-from fleet_sim.errors import RoadError
-from fleet_sim.roads.curve import Centreline, of_figure
-from fleet_sim.roads.route import FeatureState, Route, placed
-from gnd_map.geodesy import LocalFrame
+from gnd.fleet_sim.errors import RoadError
+from gnd.fleet_sim.roads.curve import Centreline, of_figure
+from gnd.fleet_sim.roads.route import FeatureState, Route, placed
+from gnd.gnd_map.geodesy import LocalFrame
 
 LENGTH_M: Final = 2_000.0
 LANE_M: Final = 3.5

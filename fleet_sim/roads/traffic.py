@@ -9,10 +9,10 @@ from typing import Final
 
 import numpy as np
 
-from fleet_sim.errors import RoadError
-from fleet_sim.roads.curve import FloatArray
-from fleet_sim.roads.motion import RoadMotion
-from fleet_sim.roads.route import IntArray, Route
+from gnd.fleet_sim.errors import RoadError
+from gnd.fleet_sim.roads.curve import FloatArray
+from gnd.fleet_sim.roads.motion import RoadMotion
+from gnd.fleet_sim.roads.route import IntArray, Route
 
 NEAR_M: Final = 110.0
 """Nothing farther away hides anything within 80 m, whatever its length."""

@@ -1,8 +1,8 @@
 """Encodings of Gaussians: of whole tiles, of deltas, of what vehicles report. A codec id never changes its meaning."""
 
-from gnd_map.codec.floats import CODEC_FLOAT32, MAX_BODY_BYTES, MAX_VOXELS, decode_gaussians, encode_gaussians
-from gnd_map.codec.lattice import LATTICES, REPORT, Lattice, is_on, snap
-from gnd_map.codec.patch import (
+from gnd.gnd_map.codec.floats import CODEC_FLOAT32, MAX_BODY_BYTES, MAX_VOXELS, decode_gaussians, encode_gaussians
+from gnd.gnd_map.codec.lattice import LATTICES, REPORT, Lattice, is_on, snap
+from gnd.gnd_map.codec.patch import (
     Flags,
     decode_delta,
     decode_flags,
@@ -15,7 +15,7 @@ from gnd_map.codec.patch import (
     encode_measured,
     encode_tiles,
 )
-from gnd_map.codec.registry import (
+from gnd.gnd_map.codec.registry import (
     CODEC_ARCHIVE,
     CODEC_ARCHIVE_ZSTD,
     CODEC_COMPACT,

@@ -7,10 +7,10 @@ from typing import Final
 import numpy as np
 import numpy.typing as npt
 
-from gnd_map.arrays import I32, I64
-from gnd_map.codec import kernels as k
-from gnd_map.codec.priors import Priors
-from gnd_map.errors import CodecError
+from gnd.gnd_map.arrays import I32, I64
+from gnd.gnd_map.codec import kernels as k
+from gnd.gnd_map.codec.priors import Priors
+from gnd.gnd_map.errors import CodecError
 
 CHECK_BYTES: Final = 2
 _HALF: Final = 1 << 15

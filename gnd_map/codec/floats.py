@@ -9,8 +9,8 @@ import struct
 
 import numpy as np
 
-from gnd_map.errors import CodecError, ShapeError
-from gnd_map.gaussian import Gaussians
+from gnd.gnd_map.errors import CodecError, ShapeError
+from gnd.gnd_map.gaussian import Gaussians
 
 CODEC_FLOAT32 = 0
 MAX_VOXELS = 200_000  # of one tile: 1209 columns x 165 floors

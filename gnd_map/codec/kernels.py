@@ -13,8 +13,8 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from gnd_map.arrays import I32, I64
-from gnd_map.jit import bare, bare_inlined
+from gnd.gnd_map.arrays import I32, I64
+from gnd.gnd_map.jit import bare, bare_inlined
 
 U8 = NDArray[np.uint8]
 State = Any  # (coder, buffer, places, weight): arrays, see `coding.Coder`; a place is probability << 8 | times seen

@@ -23,10 +23,10 @@ from typing import Final
 import numpy as np
 import numpy.typing as npt
 
-from gnd_map.arrays import F32, F64, I32, I64, check_array
-from gnd_map.codec import lattice_kernels as k
-from gnd_map.errors import CodecError, ShapeError
-from gnd_map.gaussian import MAX_MEAN_M, Gaussians, concat
+from gnd.gnd_map.arrays import F32, F64, I32, I64, check_array
+from gnd.gnd_map.codec import lattice_kernels as k
+from gnd.gnd_map.errors import CodecError, ShapeError
+from gnd.gnd_map.gaussian import MAX_MEAN_M, Gaussians, concat
 
 UNIT_BITS: Final = 20
 """Standard deviations are integers of 2^-20 m."""

@@ -8,8 +8,8 @@ from typing import Final
 
 import numpy as np
 
-from gnd_map.arrays import F32, F64, I32, I64
-from gnd_map.jit import bare
+from gnd.gnd_map.arrays import F32, F64, I32, I64
+from gnd.gnd_map.jit import bare
 
 PLANE_STEP: Final = 0
 SLOPE_BITS: Final = 1

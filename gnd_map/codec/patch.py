@@ -7,19 +7,19 @@ from typing import Final
 import numpy as np
 import numpy.typing as npt
 
-from gnd_map.arrays import I32, are_in, check_array
-from gnd_map.classes import ChangeClass
-from gnd_map.codec import kernels as k
-from gnd_map.codec.coding import Coder
-from gnd_map.codec.floats import check_number, decode_gaussians, encode_gaussians
-from gnd_map.codec.lattice import LATTICES, REPORT, Lattice, dequantise, integers_of, is_on, lattice_with
-from gnd_map.codec.priors import mask_at, number_at, priors_of
-from gnd_map.codec.volume import Box, Known, code_box, code_flags, code_voxels, floors_of, known_of
-from gnd_map.delta import TileDelta, apply, diff
-from gnd_map.errors import CodecError, ShapeError
-from gnd_map.gaussian import Gaussians
-from gnd_map.grid import VoxelGrid
-from gnd_map.tile_id import TileId
+from gnd.gnd_map.arrays import I32, are_in, check_array
+from gnd.gnd_map.classes import ChangeClass
+from gnd.gnd_map.codec import kernels as k
+from gnd.gnd_map.codec.coding import Coder
+from gnd.gnd_map.codec.floats import check_number, decode_gaussians, encode_gaussians
+from gnd.gnd_map.codec.lattice import LATTICES, REPORT, Lattice, dequantise, integers_of, is_on, lattice_with
+from gnd.gnd_map.codec.priors import mask_at, number_at, priors_of
+from gnd.gnd_map.codec.volume import Box, Known, code_box, code_flags, code_voxels, floors_of, known_of
+from gnd.gnd_map.delta import TileDelta, apply, diff
+from gnd.gnd_map.errors import CodecError, ShapeError
+from gnd.gnd_map.gaussian import Gaussians
+from gnd.gnd_map.grid import VoxelGrid
+from gnd.gnd_map.tile_id import TileId
 
 U8 = npt.NDArray[np.uint8]
 MAX_TILES: Final = 1024

@@ -1,6 +1,6 @@
 """Where the contexts start: probabilities, how much they count, and mixing weights, learnt once and frozen.
 
-`priors.bin` was made by `python -m benchmarks.codec_priors`; its hash is part of what the codecs mean, a test holds it.
+`priors.bin` was made by `python -m studies.codec_priors`; its hash is part of what the codecs mean, a test holds it.
 """
 
 import zlib
@@ -14,8 +14,8 @@ from typing import Final
 
 import numpy as np
 
-from gnd_map.arrays import I32, I64
-from gnd_map.codec import kernels as k
+from gnd.gnd_map.arrays import I32, I64
+from gnd.gnd_map.codec import kernels as k
 
 _PLAIN: Final = 70
 FLAG_CONTEXTS: Final = k.BLOCK_CONTEXTS + k.CELL_CONTEXTS + k.KIND_CONTEXTS
@@ -77,7 +77,7 @@ FILE: Final = "priors.bin"
 
 @lru_cache(maxsize=1)
 def _frozen() -> dict[str, Priors]:
-    return unpack(resources.files("gnd_map.codec").joinpath(FILE).read_bytes())
+    return unpack(resources.files("gnd.gnd_map.codec").joinpath(FILE).read_bytes())
 
 
 _learning: ContextVar[dict[str, "Learning"] | None] = ContextVar("learning", default=None)

@@ -2,15 +2,15 @@
 
 import numpy as np
 
-from gnd_map.codec import kernels as k
-from gnd_map.codec.coding import Coder
-from gnd_map.codec.floats import check_number
-from gnd_map.codec.lattice import Lattice, dequantise, integers_of
-from gnd_map.codec.priors import priors_of
-from gnd_map.codec.volume import NOTHING_KNOWN, code_box, code_flags, code_voxels
-from gnd_map.errors import CodecError
-from gnd_map.gaussian import Gaussians
-from gnd_map.tile_id import TileId
+from gnd.gnd_map.codec import kernels as k
+from gnd.gnd_map.codec.coding import Coder
+from gnd.gnd_map.codec.floats import check_number
+from gnd.gnd_map.codec.lattice import Lattice, dequantise, integers_of
+from gnd.gnd_map.codec.priors import priors_of
+from gnd.gnd_map.codec.volume import NOTHING_KNOWN, code_box, code_flags, code_voxels
+from gnd.gnd_map.errors import CodecError
+from gnd.gnd_map.gaussian import Gaussians
+from gnd.gnd_map.tile_id import TileId
 
 _NOTHING = np.empty(0, np.int32)
 

@@ -4,18 +4,18 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from types import MappingProxyType
 
-from gnd_map.codec.floats import CODEC_FLOAT32, decode_gaussians, encode_gaussians
-from gnd_map.codec.lattice import ARCHIVE, COMPACT, STANDARD, Lattice, is_on
-from gnd_map.codec.range_tile import decode_tile, encode_tile
-from gnd_map.codec.zstd_columns import (
+from gnd.gnd_map.codec.floats import CODEC_FLOAT32, decode_gaussians, encode_gaussians
+from gnd.gnd_map.codec.lattice import ARCHIVE, COMPACT, STANDARD, Lattice, is_on
+from gnd.gnd_map.codec.range_tile import decode_tile, encode_tile
+from gnd.gnd_map.codec.zstd_columns import (
     decode_float_columns,
     decode_lattice_columns,
     encode_float_columns,
     encode_lattice_columns,
 )
-from gnd_map.errors import CodecError
-from gnd_map.gaussian import Gaussians
-from gnd_map.tile_id import TileId
+from gnd.gnd_map.errors import CodecError
+from gnd.gnd_map.gaussian import Gaussians
+from gnd.gnd_map.tile_id import TileId
 
 CODEC_FLOAT32_ZSTD = 1
 CODEC_ARCHIVE, CODEC_STANDARD, CODEC_COMPACT = 2, 3, 4

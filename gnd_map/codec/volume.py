@@ -6,16 +6,16 @@ from typing import Final
 import numpy as np
 import numpy.typing as npt
 
-from gnd_map.arrays import I32, I64
-from gnd_map.by_object import ByObject
-from gnd_map.codec import kernels as k
-from gnd_map.codec.coding import Coder
-from gnd_map.codec.lattice import Integers, Lattice, Quantised
-from gnd_map.codec.priors import FLAGS_AT, VOXEL_WEIGHTS_AT, VOXELS_AT, number_at
-from gnd_map.errors import CodecError
-from gnd_map.gaussian import Gaussians
-from gnd_map.grid import VoxelGrid
-from gnd_map.tile_id import TileId
+from gnd.gnd_map.arrays import I32, I64
+from gnd.gnd_map.by_object import ByObject
+from gnd.gnd_map.codec import kernels as k
+from gnd.gnd_map.codec.coding import Coder
+from gnd.gnd_map.codec.lattice import Integers, Lattice, Quantised
+from gnd.gnd_map.codec.priors import FLAGS_AT, VOXEL_WEIGHTS_AT, VOXELS_AT, number_at
+from gnd.gnd_map.errors import CodecError
+from gnd.gnd_map.gaussian import Gaussians
+from gnd.gnd_map.grid import VoxelGrid
+from gnd.gnd_map.tile_id import TileId
 
 U8 = npt.NDArray[np.uint8]
 MAX_VOLUME: Final = 1 << 22

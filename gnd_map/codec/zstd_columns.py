@@ -5,7 +5,7 @@ A body is, little-endian: the number of voxels N (uint32), a CRC-32 (uint32) of 
 k planes of N bytes, least significant first, one after the other.
 
 Codec 1 holds codec 0's columns: voxel id (differences), count, cells as int32, means and covariances as float32; -0.0
-is written as 0.0. Codecs 5, 6, 7 hold the integers of a lattice (`gnd_map.codec.lattice`): voxel id (differences, 4
+is written as 0.0. Codecs 5, 6, 7 hold the integers of a lattice (`gnd.gnd_map.codec.lattice`): voxel id (differences, 4
 bytes), axis, levels (1), slopes, steps (2), count (1). The first voxel id and slopes and steps, which may be
 negative, are zigzag numbers: 0, -1, 1, -2, 2 … as 0, 1, 2, 3, 4 …
 """
@@ -19,12 +19,12 @@ import numpy as np
 import numpy.typing as npt
 import zstandard
 
-from gnd_map.arrays import I32
-from gnd_map.codec.floats import check_number
-from gnd_map.codec.lattice import Lattice, Quantised, dequantise, integers_of
-from gnd_map.errors import CodecError, ShapeError
-from gnd_map.gaussian import Gaussians
-from gnd_map.tile_id import TileId
+from gnd.gnd_map.arrays import I32
+from gnd.gnd_map.codec.floats import check_number
+from gnd.gnd_map.codec.lattice import Lattice, Quantised, dequantise, integers_of
+from gnd.gnd_map.errors import CodecError, ShapeError
+from gnd.gnd_map.gaussian import Gaussians
+from gnd.gnd_map.tile_id import TileId
 
 U8 = npt.NDArray[np.uint8]
 _FLOAT32_ZSTD: Final = 1

@@ -1,8 +1,8 @@
 """Features of HD maps in tiles: what they are, whether they exist, how they are written."""
 
-from gnd_map.features.covariance import full_covariance, six_of, snapped_covariance
-from gnd_map.features.existence import VACUOUS, Existence, combine, hit, miss, prior
-from gnd_map.features.feature import (
+from gnd.gnd_map.features.covariance import full_covariance, six_of, snapped_covariance
+from gnd.gnd_map.features.existence import VACUOUS, Existence, combine, hit, miss, prior
+from gnd.gnd_map.features.feature import (
     CUT_END,
     CUT_START,
     LAYERS_KNOWN,
@@ -12,13 +12,13 @@ from gnd_map.features.feature import (
     is_feature_layer,
     snapped,
 )
-from gnd_map.features.feature_codec import (
+from gnd.gnd_map.features.feature_codec import (
     CODEC_FEATURES,
     MAX_FEATURES_OF_TILE,
     decode_features,
     encode_features,
 )
-from gnd_map.features.feature_tile import (
+from gnd.gnd_map.features.feature_tile import (
     FeatureDelta,
     FeatureTile,
     apply_features,
@@ -27,7 +27,7 @@ from gnd_map.features.feature_tile import (
     encode_feature_delta,
     read_feature_delta,
 )
-from gnd_map.features.polylines import (
+from gnd.gnd_map.features.polylines import (
     check_simple_polyline,
     cut_polyline,
     geodetic_in_tile,

@@ -10,8 +10,8 @@ from typing import Final
 
 import numpy as np
 
-from gnd_map.arrays import F64, check_array
-from gnd_map.errors import FeatureError
+from gnd.gnd_map.arrays import F64, check_array
+from gnd.gnd_map.errors import FeatureError
 
 SMALLEST_SIGMA_M: Final = 1e-3
 LEVEL_RATIO: Final = 1.05

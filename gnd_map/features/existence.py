@@ -10,8 +10,8 @@ from typing import Final, Literal
 
 import numpy as np
 
-from gnd_map.arrays import F64
-from gnd_map.errors import FeatureError
+from gnd.gnd_map.arrays import F64
+from gnd.gnd_map.errors import FeatureError
 
 State = Literal["exist", "absent", "unknown"]
 

@@ -12,10 +12,10 @@ from typing import Final
 
 import numpy as np
 
-from gnd_map.arrays import F64, check_array
-from gnd_map.errors import FeatureError
-from gnd_map.features.covariance import check_covariance, snapped_covariance
-from gnd_map.features.existence import VACUOUS, Existence
+from gnd.gnd_map.arrays import F64, check_array
+from gnd.gnd_map.errors import FeatureError
+from gnd.gnd_map.features.covariance import check_covariance, snapped_covariance
+from gnd.gnd_map.features.existence import VACUOUS, Existence
 
 MAX_ID: Final = 2**63 - 1
 MAX_POINTS_OF_FEATURE: Final = 4096

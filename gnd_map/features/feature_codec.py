@@ -13,9 +13,9 @@ from typing import Final
 
 import numpy as np
 
-from gnd_map.errors import CodecError, GndError
-from gnd_map.features.covariance import MAX_RATIO_STEPS, TOP_LEVEL, covariance_of, levels_of
-from gnd_map.features.feature import (
+from gnd.gnd_map.errors import CodecError, GndError
+from gnd.gnd_map.features.covariance import MAX_RATIO_STEPS, TOP_LEVEL, covariance_of, levels_of
+from gnd.gnd_map.features.feature import (
     M_PER_STEP,
     MASS_STEPS,
     MAX_ATTRIBUTES,

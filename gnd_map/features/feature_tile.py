@@ -6,9 +6,9 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from typing import Final
 
-from gnd_map.errors import CodecError, DeltaError, FeatureError
-from gnd_map.features.feature import MAX_ID, MAX_PART, Feature, snapped
-from gnd_map.features.feature_codec import (
+from gnd.gnd_map.errors import CodecError, DeltaError, FeatureError
+from gnd.gnd_map.features.feature import MAX_ID, MAX_PART, Feature, snapped
+from gnd.gnd_map.features.feature_codec import (
     MAX_FEATURES_OF_TILE,
     Reader,
     check_features,
@@ -17,7 +17,7 @@ from gnd_map.features.feature_codec import (
     encode_features,
     put_numbers,
 )
-from gnd_map.tile_id import TileId
+from gnd.gnd_map.tile_id import TileId
 
 _DELTA_FORMAT: Final = 2
 

@@ -12,11 +12,11 @@ from typing import Final
 import numpy as np
 import numpy.typing as npt
 
-from gnd_map.arrays import F64, I64, check_array
-from gnd_map.errors import FeatureError
-from gnd_map.features.feature import CUT_END, CUT_START, Feature
-from gnd_map.geodesy import LocalFrame
-from gnd_map.tile_id import TileId, geodetic_of_tile_coordinates, tile_coordinates
+from gnd.gnd_map.arrays import F64, I64, check_array
+from gnd.gnd_map.errors import FeatureError
+from gnd.gnd_map.features.feature import CUT_END, CUT_START, Feature
+from gnd.gnd_map.geodesy import LocalFrame
+from gnd.gnd_map.tile_id import TileId, geodetic_of_tile_coordinates, tile_coordinates
 
 Piece = tuple[TileId, F64, int]
 """Tile, points (N, 3) in its ENU frame, cuts."""

@@ -9,20 +9,20 @@ import apsw
 import numpy as np
 import pytest
 
-from cloud_merger.config import ShardConfig
-from cloud_merger.expander import Expander
-from cloud_merger.ingest import Ingest
-from cloud_merger.work import Worker
-from deploy.chaos.checks import Findings, look
-from deploy.chaos.clients import Receipt, put
-from deploy.chaos.street import LAYER, Sent, Street, read_street
-from gnd_map.codec import encode_mask
-from schemas.report_id import deterministic_report_id
-from schemas.report_states import ReportState
-from tile_store.sqlite_store import SqliteStore
-from tile_store.values import StoreConfig
-from vehicle_agent.outbox import Outbox
-from vehicle_agent.packing import askable, pack_measured
+from gnd.cloud_merger.config import ShardConfig
+from gnd.cloud_merger.expander import Expander
+from gnd.cloud_merger.ingest import Ingest
+from gnd.cloud_merger.work import Worker
+from gnd.deploy.chaos.checks import Findings, look
+from gnd.deploy.chaos.clients import Receipt, put
+from gnd.deploy.chaos.street import LAYER, Sent, Street, read_street
+from gnd.gnd_map.codec import encode_mask
+from gnd.schemas.report_id import deterministic_report_id
+from gnd.schemas.report_states import ReportState
+from gnd.tile_store.sqlite_store import SqliteStore
+from gnd.tile_store.values import StoreConfig
+from gnd.vehicle_agent.outbox import Outbox
+from gnd.vehicle_agent.packing import askable, pack_measured
 
 Verify = Callable[[Path], tuple[dict[str, int], bool]]
 SEED, VEHICLES, REPORTS = 5, ("car-0", "car-1"), 3

@@ -9,18 +9,18 @@ from pathlib import Path
 
 import pytest
 
-from deploy.chaos import page
-from deploy.chaos.faults import KINDS, Fault, plan
-from deploy.chaos.service import SERVICES, Served, gaps
-from deploy.chaos.street import DISTRICTS, read_street
-from deploy.chaos.wire import Wires
-from deploy.errors import ChaosError
-from gnd_map.tile import content_sha
-from schemas.tiles import TileRequest
-from tile_store.answers import Answers
-from tile_store.check import check_store
-from tile_store.errors import StoreDamaged
-from tile_store.sqlite_store import SqliteStore
+from gnd.deploy.chaos import page
+from gnd.deploy.chaos.faults import KINDS, Fault, plan
+from gnd.deploy.chaos.service import SERVICES, Served, gaps
+from gnd.deploy.chaos.street import DISTRICTS, read_street
+from gnd.deploy.chaos.wire import Wires
+from gnd.deploy.errors import ChaosError
+from gnd.gnd_map.tile import content_sha
+from gnd.schemas.tiles import TileRequest
+from gnd.tile_store.answers import Answers
+from gnd.tile_store.check import check_store
+from gnd.tile_store.errors import StoreDamaged
+from gnd.tile_store.sqlite_store import SqliteStore
 
 PATIENCE_S = 5.0
 

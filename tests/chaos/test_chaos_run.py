@@ -10,9 +10,9 @@ from pathlib import Path
 
 import pytest
 
-from deploy.chaos.faults import KINDS, plan
-from deploy.chaos.run import run_chaos
-from deploy.chaos.service import SERVICES
+from gnd.deploy.chaos.faults import KINDS, plan
+from gnd.deploy.chaos.run import run_chaos
+from gnd.deploy.chaos.service import SERVICES
 
 SEED = 1_003
 APART_S = (0.3, 0.5)
@@ -39,7 +39,7 @@ def test_a_cloud_keeps_its_word_through_one_fault_of_every_kind(tmp_path: Path) 
 
 @pytest.mark.slow
 def test_the_command_ends_early_and_cleanly_and_tells_what_was_found(tmp_path: Path) -> None:
-    command = [sys.executable, "-m", "deploy.cli", "chaos", "--kills", "500", "--seed", "9"]
+    command = [sys.executable, "-m", "gnd.deploy.cli", "chaos", "--kills", "500", "--seed", "9"]
     file, out = tmp_path / "chaos.json", tmp_path / "run"
     process = subprocess.Popen(
         [*command, "--json", str(file), "--out", str(out)], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True

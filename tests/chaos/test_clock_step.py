@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from tile_store import clocks
+from gnd.tile_store import clocks
 
 HOUR_NS = 3_600 * 10**9
 

@@ -4,14 +4,14 @@ from pathlib import Path
 
 import pytest
 
-from cloud_merger import expander as module
-from cloud_merger.config import ShardConfig
-from cloud_merger.expander import Expander
-from cloud_merger.ingest import Ingest
-from deploy.chaos.page import PAGE_BYTES
-from deploy.chaos.street import Sent, Street, read_street
-from tile_store.errors import StoreDamaged
-from tile_store.sqlite_store import SqliteStore
+from gnd.cloud_merger import expander as module
+from gnd.cloud_merger.config import ShardConfig
+from gnd.cloud_merger.expander import Expander
+from gnd.cloud_merger.ingest import Ingest
+from gnd.deploy.chaos.page import PAGE_BYTES
+from gnd.deploy.chaos.street import Sent, Street, read_street
+from gnd.tile_store.errors import StoreDamaged
+from gnd.tile_store.sqlite_store import SqliteStore
 
 HEADER_BYTES = 8
 

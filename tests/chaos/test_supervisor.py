@@ -7,10 +7,10 @@ from pathlib import Path
 
 import pytest
 
-from deploy import processes
-from deploy.errors import ProcessDied
-from deploy.processes import MAX_RESTARTS, ProcessSpec, Supervisor, start_fork_server
-from fleet_bus.router import wait_for_stop
+from gnd.deploy import processes
+from gnd.deploy.errors import ProcessDied
+from gnd.deploy.processes import MAX_RESTARTS, ProcessSpec, Supervisor, start_fork_server
+from gnd.fleet_bus.router import wait_for_stop
 
 POLL_S, PATIENCE_S = 0.02, 60.0
 

@@ -4,13 +4,13 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from cloud_merger.features import FeatureMergeParameters
-from cloud_merger.features.merge import MergedFeatures, merge_features
-from gnd_map.arrays import F64
-from gnd_map.features import Existence, Feature, FeatureTile, hit, miss, prior
-from gnd_map.tile_id import TileId
-from schemas.features import FeatureChange, FeatureReport, Found, Seen
-from schemas.report_id import deterministic_report_id
+from gnd.cloud_merger.features import FeatureMergeParameters
+from gnd.cloud_merger.features.merge import MergedFeatures, merge_features
+from gnd.gnd_map.arrays import F64
+from gnd.gnd_map.features import Existence, Feature, FeatureTile, hit, miss, prior
+from gnd.gnd_map.tile_id import TileId
+from gnd.schemas.features import FeatureChange, FeatureReport, Found, Seen
+from gnd.schemas.report_id import deterministic_report_id
 
 TILE = TileId(497353963154)
 EAST = TileId.from_indices(TILE.lon_index + 1, TILE.lat_index)

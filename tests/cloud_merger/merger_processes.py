@@ -13,15 +13,15 @@ from pathlib import Path
 import pytest
 import zenoh
 
-from fleet_bus.bus import Bus, open_bus
-from fleet_bus.config import BusConfig, zenoh_config
-from fleet_bus.requesting import RetryPolicy
-from fleet_bus.router import open_router
-from gnd_map.tile_id import TileId
-from schemas.changes import ChangeAck, ChangeReport
-from schemas.keys import alive_keys, change_key, parse_alive_key, update_keys
-from schemas.updates import TileUpdate
-from tile_store.sqlite_store import SqliteStore
+from gnd.fleet_bus.bus import Bus, open_bus
+from gnd.fleet_bus.config import BusConfig, zenoh_config
+from gnd.fleet_bus.requesting import RetryPolicy
+from gnd.fleet_bus.router import open_router
+from gnd.gnd_map.tile_id import TileId
+from gnd.schemas.changes import ChangeAck, ChangeReport
+from gnd.schemas.keys import alive_keys, change_key, parse_alive_key, update_keys
+from gnd.schemas.updates import TileUpdate
+from gnd.tile_store.sqlite_store import SqliteStore
 
 DEADLINE_S = 30.0
 FAST = """poll_s = 0.05
@@ -87,7 +87,7 @@ class Cloud:
         """Start shards and wait until they show that they live."""
         for name in names:
             options = ["--id", name, "--store", str(self.path), "--connect", self.endpoint]
-            command = "from cloud_merger.cli import merger; merger()"
+            command = "from gnd.cloud_merger.cli import merger; merger()"
             with (self._log / f"{name}.log").open("ab") as log:
                 self.shards[name] = subprocess.Popen(
                     [sys.executable, "-c", command, *options, "--config", str(self.config_path)],

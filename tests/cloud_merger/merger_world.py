@@ -4,13 +4,13 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 
-from cloud_merger.confirmation import ConfirmationParameters
-from gnd_map.classes import ChangeClass
-from gnd_map.gaussian import Gaussians
-from gnd_map.tile import Tile, content_sha
-from gnd_map.tile_id import TileId
-from schemas.changes import ChangeReport, TileChange
-from schemas.report_id import deterministic_report_id
+from gnd.cloud_merger.confirmation import ConfirmationParameters
+from gnd.gnd_map.classes import ChangeClass
+from gnd.gnd_map.gaussian import Gaussians
+from gnd.gnd_map.tile import Tile, content_sha
+from gnd.gnd_map.tile_id import TileId
+from gnd.schemas.changes import ChangeReport, TileChange
+from gnd.schemas.report_id import deterministic_report_id
 
 TILE = TileId(497353963154)  # Figure 2 of the paper
 NEIGHBOUR = TileId(497353963155)

@@ -1,4 +1,4 @@
-"""The shift test in plain numpy, the twin of `cloud_merger.shift`: with a k-d tree and arrays of pairs."""
+"""The shift test in plain numpy, the twin of `gnd.cloud_merger.shift`: with a k-d tree and arrays of pairs."""
 
 from dataclasses import dataclass, replace
 from math import cos, sin
@@ -8,11 +8,11 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from cloud_merger.shift import Shift, ShiftParameters
-from gnd_map.gaussian import Gaussians
-from gnd_map.grid import VoxelGrid
-from gnd_map.similarity import similarity
-from schemas.changes import TileChange
+from gnd.cloud_merger.shift import Shift, ShiftParameters
+from gnd.gnd_map.gaussian import Gaussians
+from gnd.gnd_map.grid import VoxelGrid
+from gnd.gnd_map.similarity import similarity
+from gnd.schemas.changes import TileChange
 
 F64 = NDArray[np.float64]
 Mask = NDArray[np.bool_]

@@ -6,15 +6,15 @@ from collections.abc import Mapping
 import numpy as np
 from merger_world import GROUND, TILE, WALL, State, change_of, gaussians_of, report_of
 
-from gnd_map.classes import ChangeClass
-from gnd_map.codec import LATTICES, REPORT, snap
-from gnd_map.gaussian import Gaussians
-from gnd_map.tile import Tile, content_sha
-from gnd_map.tile_id import TileId
-from gnd_map.track import STEPS, Piece, Track, View
-from schemas.changes import ChangeReport, TileChange
-from schemas.keys import change_key
-from vehicle_agent.packing import pack
+from gnd.gnd_map.classes import ChangeClass
+from gnd.gnd_map.codec import LATTICES, REPORT, snap
+from gnd.gnd_map.gaussian import Gaussians
+from gnd.gnd_map.tile import Tile, content_sha
+from gnd.gnd_map.tile_id import TileId
+from gnd.gnd_map.track import STEPS, Piece, Track, View
+from gnd.schemas.changes import ChangeReport, TileChange
+from gnd.schemas.keys import change_key
+from gnd.vehicle_agent.packing import pack
 
 KEY = change_key("ndt", TILE.district)
 BASE = snap(gaussians_of({0: GROUND, 1: WALL, 2: GROUND}), LATTICES["standard"])

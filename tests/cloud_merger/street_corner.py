@@ -5,12 +5,12 @@ from math import cos, sin
 import numpy as np
 from merger_world import TILE, sha_of
 
-from gnd_map.accumulate import VoxelAccumulator
-from gnd_map.classes import ChangeClass
-from gnd_map.gaussian import Gaussians, concat
-from gnd_map.grid import GridFrame, VoxelGrid
-from gnd_map.similarity import similarity
-from schemas.changes import TileChange
+from gnd.gnd_map.accumulate import VoxelAccumulator
+from gnd.gnd_map.classes import ChangeClass
+from gnd.gnd_map.gaussian import Gaussians, concat
+from gnd.gnd_map.grid import GridFrame, VoxelGrid
+from gnd.gnd_map.similarity import similarity
+from gnd.schemas.changes import TileChange
 
 WALLS = ((0, 6.0), (1, 7.0), (1, -5.0))
 _TURN = 0.37  # the walls do not run along the grid

@@ -10,18 +10,18 @@ from merger_world import TILE, gaussians_of, report_of, sha_of
 from rich.console import Console
 from street_corner import WALLS, displaced, mapped, seen_as, street
 
-from cloud_merger.belief import believed
-from cloud_merger.config import ShardConfig
-from cloud_merger.shift import ShiftParameters, shift_of
-from cloud_merger.statements import Report
-from cloud_merger.work import Worker
-from gnd_map.tile import Tile
-from schemas.changes import split
-from schemas.course import Course
-from schemas.doubt import Doubt, DoubtReason
-from tile_store.sqlite_store import SqliteStore
-from tile_store.status import named_vehicles, naming_line, print_status, status_of
-from tile_store.values import ReportRow, StoreConfig, VehicleAccount
+from gnd.cloud_merger.belief import believed
+from gnd.cloud_merger.config import ShardConfig
+from gnd.cloud_merger.shift import ShiftParameters, shift_of
+from gnd.cloud_merger.statements import Report
+from gnd.cloud_merger.work import Worker
+from gnd.gnd_map.tile import Tile
+from gnd.schemas.changes import split
+from gnd.schemas.course import Course
+from gnd.schemas.doubt import Doubt, DoubtReason
+from gnd.tile_store.sqlite_store import SqliteStore
+from gnd.tile_store.status import named_vehicles, naming_line, print_status, status_of
+from gnd.tile_store.values import ReportRow, StoreConfig, VehicleAccount
 
 BASE = mapped(street(0))
 OFF = displaced(street(1), 0.3, 0.1)

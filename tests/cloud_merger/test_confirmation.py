@@ -8,20 +8,20 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from merger_world import GROUND, POLE, TILE, WALL, change_of, gaussians_of, report_of, sha_of
 
-from cloud_merger.config import ShardConfig
-from cloud_merger.confirmation import ConfirmationParameters, gate
-from cloud_merger.errors import MergerError
-from cloud_merger.merge import MergeParameters, merge_tile
-from cloud_merger.statements import Report, statements_of
-from cloud_merger.stored import report_of as stored_report
-from cloud_merger.work import Worker
-from gnd_map.gaussian import Gaussians
-from gnd_map.grid import VoxelGrid
-from gnd_map.tile import Tile
-from schemas.changes import split
-from schemas.doubt import Doubt, DoubtReason
-from tile_store.sqlite_store import SqliteStore
-from tile_store.values import ReportRow, StoreConfig
+from gnd.cloud_merger.config import ShardConfig
+from gnd.cloud_merger.confirmation import ConfirmationParameters, gate
+from gnd.cloud_merger.errors import MergerError
+from gnd.cloud_merger.merge import MergeParameters, merge_tile
+from gnd.cloud_merger.statements import Report, statements_of
+from gnd.cloud_merger.stored import report_of as stored_report
+from gnd.cloud_merger.work import Worker
+from gnd.gnd_map.gaussian import Gaussians
+from gnd.gnd_map.grid import VoxelGrid
+from gnd.gnd_map.tile import Tile
+from gnd.schemas.changes import split
+from gnd.schemas.doubt import Doubt, DoubtReason
+from gnd.tile_store.sqlite_store import SqliteStore
+from gnd.tile_store.values import ReportRow, StoreConfig
 
 VOXELS = range(300)
 EPOCH = gaussians_of(dict.fromkeys(VOXELS, GROUND))

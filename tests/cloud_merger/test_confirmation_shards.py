@@ -6,7 +6,7 @@ import pytest
 from merger_processes import Cloud, wait_for
 from merger_world import GROUND, TILE, WALL, change_of, gaussians_of, report_of
 
-from gnd_map.tile import Tile
+from gnd.gnd_map.tile import Tile
 
 VOXELS = range(300)
 EPOCH = gaussians_of(dict.fromkeys(VOXELS, GROUND))

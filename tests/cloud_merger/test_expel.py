@@ -8,12 +8,12 @@ from click.testing import CliRunner
 from merger_world import BALL, POLE, TILE, gaussians_of
 from test_windows import BASE, Cloud, crowd
 
-from cloud_merger.config import ShardConfig
-from cloud_merger.errors import MergerError
-from cloud_merger.features import FeatureMergeParameters
-from cloud_merger.map_parameters import digest_of, text_of, with_text
-from cloud_merger.parameters import MergeParameters
-from deploy.map_cli import map_group
+from gnd.cloud_merger.config import ShardConfig
+from gnd.cloud_merger.errors import MergerError
+from gnd.cloud_merger.features import FeatureMergeParameters
+from gnd.cloud_merger.map_parameters import digest_of, text_of, with_text
+from gnd.cloud_merger.parameters import MergeParameters
+from gnd.deploy.map_cli import map_group
 
 
 @pytest.fixture

@@ -9,14 +9,14 @@ from feature_cloud import ABSENT, EAST, EXIST, TILE, change, feature, found, lin
 from merger_world import GROUND, POLE, change_of, gaussians_of, report_of
 from upload_desk import NOW, Desk
 
-from cloud_merger.errors import BadReport, MergerError
-from cloud_merger.features.check import FeatureLimits, check_feature_report
-from gnd_map.features import FeatureTile
-from gnd_map.tile_id import TileId
-from schemas.errors import SchemaError
-from schemas.features import FeatureReport
-from schemas.keys import change_key
-from tile_store.sqlite_store import SqliteStore
+from gnd.cloud_merger.errors import BadReport, MergerError
+from gnd.cloud_merger.features.check import FeatureLimits, check_feature_report
+from gnd.gnd_map.features import FeatureTile
+from gnd.gnd_map.tile_id import TileId
+from gnd.schemas.errors import SchemaError
+from gnd.schemas.features import FeatureReport
+from gnd.schemas.keys import change_key
+from gnd.tile_store.sqlite_store import SqliteStore
 
 MAP = published([feature(n, -12.0 + 2.5 * n, 0.0) for n in range(1, 10)])
 KEY = change_key("signs", TILE.district)

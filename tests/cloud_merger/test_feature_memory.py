@@ -15,22 +15,22 @@ from feature_cloud import ABSENT, EAST, EXIST, TILE, change, feature, found, lin
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from cloud_merger.config import ShardConfig
-from cloud_merger.errors import MergerError
-from cloud_merger.expel import without_vehicle
-from cloud_merger.features import FeatureMergeParameters
-from cloud_merger.features import fold as folding
-from cloud_merger.features.check import FeatureLimits
-from cloud_merger.features.fold import MEASURERS_KEPT, NAMES_KEPT, VOTES_KEPT
-from cloud_merger.features.kept import FeatureInbox
-from cloud_merger.features.memory import LayerMemory
-from cloud_merger.verify import Verifier
-from cloud_merger.work import Worker
-from deploy.map_cli import map_group
-from gnd_map.features import FeatureTile, geodetic_in_tile, points_in_tile
-from schemas.features import EVERY_CELL
-from tile_store.sqlite_store import SqliteStore
-from tile_store.values import StoreConfig
+from gnd.cloud_merger.config import ShardConfig
+from gnd.cloud_merger.errors import MergerError
+from gnd.cloud_merger.expel import without_vehicle
+from gnd.cloud_merger.features import FeatureMergeParameters
+from gnd.cloud_merger.features import fold as folding
+from gnd.cloud_merger.features.check import FeatureLimits
+from gnd.cloud_merger.features.fold import MEASURERS_KEPT, NAMES_KEPT, VOTES_KEPT
+from gnd.cloud_merger.features.kept import FeatureInbox
+from gnd.cloud_merger.features.memory import LayerMemory
+from gnd.cloud_merger.verify import Verifier
+from gnd.cloud_merger.work import Worker
+from gnd.deploy.map_cli import map_group
+from gnd.gnd_map.features import FeatureTile, geodetic_in_tile, points_in_tile
+from gnd.schemas.features import EVERY_CELL
+from gnd.tile_store.sqlite_store import SqliteStore
+from gnd.tile_store.values import StoreConfig
 
 MAP = published([feature(7, -5.0, 3.0), feature(9, 6.0, -2.0), feature(10, -6.0, -8.0)])
 GONE, STAYS, FAR = 7, 9, 10
@@ -443,9 +443,9 @@ def test_the_order_of_reports_within_a_window_does_not_matter(tmp_path_factory, 
 DIES = """
 import os, signal, sys
 from pathlib import Path
-from cloud_merger.config import ShardConfig
-from cloud_merger.work import Worker
-from tile_store.sqlite_store import SqliteStore
+from gnd.cloud_merger.config import ShardConfig
+from gnd.cloud_merger.work import Worker
+from gnd.tile_store.sqlite_store import SqliteStore
 
 store = SqliteStore(sys.argv[1])
 publish = store.publish

@@ -21,10 +21,10 @@ from feature_cloud import (
     seen,
 )
 
-from cloud_merger.errors import MergerError
-from cloud_merger.features import FeatureMergeParameters, merge_features, merge_layer, spread
-from gnd_map.features import Existence, geodetic_in_tile, points_in_tile
-from schemas.features import EVERY_CELL
+from gnd.cloud_merger.errors import MergerError
+from gnd.cloud_merger.features import FeatureMergeParameters, merge_features, merge_layer, spread
+from gnd.gnd_map.features import Existence, geodetic_in_tile, points_in_tile
+from gnd.schemas.features import EVERY_CELL
 
 SIGN, OTHER = feature(7, -5.0, 3.0), feature(9, 6.0, -2.0)
 MAP = published([SIGN, OTHER])

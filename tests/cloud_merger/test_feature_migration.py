@@ -11,15 +11,15 @@ from pathlib import Path
 import pytest
 from feature_cloud import EXIST, TILE, change, feature, found, published, report, seen
 
-from cloud_merger.config import ShardConfig
-from cloud_merger.features import FeatureMergeParameters
-from cloud_merger.features.check import FeatureLimits
-from cloud_merger.features.kept import FeatureInbox
-from cloud_merger.features.memory import LayerMemory
-from cloud_merger.verify import Verifier
-from cloud_merger.work import Worker
-from tile_store.sqlite_store import SqliteStore
-from tile_store.values import StoreConfig
+from gnd.cloud_merger.config import ShardConfig
+from gnd.cloud_merger.features import FeatureMergeParameters
+from gnd.cloud_merger.features.check import FeatureLimits
+from gnd.cloud_merger.features.kept import FeatureInbox
+from gnd.cloud_merger.features.memory import LayerMemory
+from gnd.cloud_merger.verify import Verifier
+from gnd.cloud_merger.work import Worker
+from gnd.tile_store.sqlite_store import SqliteStore
+from gnd.tile_store.values import StoreConfig
 
 OLD = Path(__file__).parents[1] / "tile_store" / "data" / "store_schema_7.sqlite.gz"
 MAP = published([feature(7, -5.0, 3.0), feature(9, 6.0, -2.0)])

@@ -22,16 +22,16 @@ from feature_cloud import (
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from cloud_merger.config import ShardConfig
-from cloud_merger.features import FeatureMergeParameters
-from cloud_merger.features.check import FeatureLimits
-from cloud_merger.features.existence import pooled
-from cloud_merger.features.kept import FeatureInbox
-from cloud_merger.work import Worker
-from gnd_map.features import Existence, FeatureTile
-from schemas.features import EVERY_CELL
-from tile_store.sqlite_store import SqliteStore
-from tile_store.values import StoreConfig
+from gnd.cloud_merger.config import ShardConfig
+from gnd.cloud_merger.features import FeatureMergeParameters
+from gnd.cloud_merger.features.check import FeatureLimits
+from gnd.cloud_merger.features.existence import pooled
+from gnd.cloud_merger.features.kept import FeatureInbox
+from gnd.cloud_merger.work import Worker
+from gnd.gnd_map.features import Existence, FeatureTile
+from gnd.schemas.features import EVERY_CELL
+from gnd.tile_store.sqlite_store import SqliteStore
+from gnd.tile_store.values import StoreConfig
 
 MAP = published([feature(7, -5.0, 3.0), feature(9, 6.0, -2.0)])
 OLDER = published([feature(7, -5.0, 3.0), feature(8, 0.0, 0.0)])

@@ -6,19 +6,19 @@ import numpy as np
 import pytest
 from feature_cloud import ABSENT, TILE, change, feature, found, report, seen
 
-from cloud_merger.config import ShardConfig
-from cloud_merger.features import FeatureMergeParameters, merge_layer
-from cloud_merger.features import merge as merging
-from cloud_merger.features.check import FeatureLimits
-from cloud_merger.features.kept import FeatureInbox
-from cloud_merger.verify import Verifier
-from cloud_merger.work import Worker
-from gnd_map.features import FeatureTile, hit
-from gnd_map.tile_id import TileId
-from schemas.features import FeatureReport
-from tile_store.sqlite_store import SqliteStore
-from tile_store.status import status_of
-from tile_store.values import StoreConfig
+from gnd.cloud_merger.config import ShardConfig
+from gnd.cloud_merger.features import FeatureMergeParameters, merge_layer
+from gnd.cloud_merger.features import merge as merging
+from gnd.cloud_merger.features.check import FeatureLimits
+from gnd.cloud_merger.features.kept import FeatureInbox
+from gnd.cloud_merger.verify import Verifier
+from gnd.cloud_merger.work import Worker
+from gnd.gnd_map.features import FeatureTile, hit
+from gnd.gnd_map.tile_id import TileId
+from gnd.schemas.features import FeatureReport
+from gnd.tile_store.sqlite_store import SqliteStore
+from gnd.tile_store.status import status_of
+from gnd.tile_store.values import StoreConfig
 
 ROAD = [TileId.from_indices(TILE.lon_index + 4 * n, TILE.lat_index) for n in range(66)]
 """A tile each 150 m: 10 km."""

@@ -7,21 +7,21 @@ import pytest
 from feature_cloud import ABSENT, EXIST, change, feature, found, report, seen
 from merger_processes import DEADLINE_S, Cloud, in_threads, wait_for
 
-from cloud_merger.config import ShardConfig
-from cloud_merger.features import FeatureMergeParameters
-from cloud_merger.features.check import FeatureLimits
-from cloud_merger.features.kept import FeatureInbox
-from cloud_merger.ownership import owner_of
-from cloud_merger.verify import Verifier
-from cloud_merger.work import Worker
-from fleet_bus.requesting import RetryPolicy
-from gnd_map.features import FeatureTile, apply_features, read_feature_delta
-from gnd_map.tile_id import TileId
-from schemas.changes import ChangeAck
-from schemas.keys import change_key, update_keys
-from schemas.updates import TileUpdate
-from tile_store.sqlite_store import SqliteStore
-from tile_store.values import StoreConfig
+from gnd.cloud_merger.config import ShardConfig
+from gnd.cloud_merger.features import FeatureMergeParameters
+from gnd.cloud_merger.features.check import FeatureLimits
+from gnd.cloud_merger.features.kept import FeatureInbox
+from gnd.cloud_merger.ownership import owner_of
+from gnd.cloud_merger.verify import Verifier
+from gnd.cloud_merger.work import Worker
+from gnd.fleet_bus.requesting import RetryPolicy
+from gnd.gnd_map.features import FeatureTile, apply_features, read_feature_delta
+from gnd.gnd_map.tile_id import TileId
+from gnd.schemas.changes import ChangeAck
+from gnd.schemas.keys import change_key, update_keys
+from gnd.schemas.updates import TileUpdate
+from gnd.tile_store.sqlite_store import SqliteStore
+from gnd.tile_store.values import StoreConfig
 
 LAYER = "signs"
 SHARDS = ("left", "right")

@@ -7,11 +7,11 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.stats import chi2
 
-from cloud_merger.features import FeatureMergeParameters
-from cloud_merger.features.rls import Place, estimate, fused, step
-from cloud_merger.features.window import LayerMerger, LayerState, LayerWindow
-from gnd_map.features import full_covariance, hit, six_of
-from schemas.features import Found
+from gnd.cloud_merger.features import FeatureMergeParameters
+from gnd.cloud_merger.features.rls import Place, estimate, fused, step
+from gnd.cloud_merger.features.window import LayerMerger, LayerState, LayerWindow
+from gnd.gnd_map.features import full_covariance, hit, six_of
+from gnd.schemas.features import Found
 
 RUNS = 100
 

@@ -4,15 +4,15 @@ import pytest
 from feature_cloud import ABSENT, EAST, TILE, change, feature, found, published, report, report_id, seen
 from merger_world import GROUND, WALL, change_of, gaussians_of, report_of, tile_of_states
 
-from cloud_merger.config import ShardConfig
-from cloud_merger.features import FeatureMergeParameters
-from cloud_merger.features.check import FeatureLimits
-from cloud_merger.features.kept import FeatureInbox
-from cloud_merger.work import Worker
-from gnd_map.features import FeatureTile
-from schemas.changes import split
-from tile_store.sqlite_store import SqliteStore
-from tile_store.values import ReportRow, StoreConfig
+from gnd.cloud_merger.config import ShardConfig
+from gnd.cloud_merger.features import FeatureMergeParameters
+from gnd.cloud_merger.features.check import FeatureLimits
+from gnd.cloud_merger.features.kept import FeatureInbox
+from gnd.cloud_merger.work import Worker
+from gnd.gnd_map.features import FeatureTile
+from gnd.schemas.changes import split
+from gnd.tile_store.sqlite_store import SqliteStore
+from gnd.tile_store.values import ReportRow, StoreConfig
 
 MAP = published([feature(7, -5.0, 3.0), feature(9, 6.0, -2.0)])
 

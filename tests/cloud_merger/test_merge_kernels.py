@@ -4,10 +4,10 @@ import numpy as np
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from cloud_merger.merge import plain_clusters
-from cloud_merger.merge_kernels import NOISE, clusters_of
-from cloud_merger.parameters import MergeParameters
-from cloud_merger.statements import STATEMENT, Kind
+from gnd.cloud_merger.merge import plain_clusters
+from gnd.cloud_merger.merge_kernels import NOISE, clusters_of
+from gnd.cloud_merger.parameters import MergeParameters
+from gnd.cloud_merger.statements import STATEMENT, Kind
 
 KINDS = [Kind.NOTHING, Kind.QUOTED, Kind.MEASURED, Kind.MEASURED, Kind.MEASURED, Kind.WITHHELD]
 

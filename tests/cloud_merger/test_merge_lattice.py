@@ -7,16 +7,16 @@ import numpy as np
 import pytest
 from merger_world import BALL, POLE, TILE, VOXEL_BY_VOXEL, WALL, WALL_AGAIN, change_of, gaussians_of, report_of
 
-from cloud_merger.config import ShardConfig
-from cloud_merger.work import Worker
-from gnd_map.codec import LATTICES, is_on, lattice_of, snap
-from gnd_map.gaussian import Gaussians
-from gnd_map.tile import Tile
-from gnd_map.tile_id import TileId
-from schemas.changes import split
-from tile_store.errors import StoreError
-from tile_store.sqlite_store import SqliteStore
-from tile_store.values import ReportRow, StoreConfig
+from gnd.cloud_merger.config import ShardConfig
+from gnd.cloud_merger.work import Worker
+from gnd.gnd_map.codec import LATTICES, is_on, lattice_of, snap
+from gnd.gnd_map.gaussian import Gaussians
+from gnd.gnd_map.tile import Tile
+from gnd.gnd_map.tile_id import TileId
+from gnd.schemas.changes import split
+from gnd.tile_store.errors import StoreError
+from gnd.tile_store.sqlite_store import SqliteStore
+from gnd.tile_store.values import ReportRow, StoreConfig
 
 # Shapes that lie on no lattice by chance.
 STATES = {voxel: (0.013 * voxel, 0.031, -0.2 + 0.0017 * voxel, 0.28, 0.27, 0.021) for voxel in range(30)}

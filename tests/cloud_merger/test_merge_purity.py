@@ -21,17 +21,17 @@ from merger_world import (
 )
 from sklearn.cluster import DBSCAN
 
-from cloud_merger.config import ShardConfig
-from cloud_merger.merge import MergeParameters, merge_tile
-from cloud_merger.statements import Report, statements_of
-from cloud_merger.work import Worker
-from gnd_map.classes import ChangeClass
-from gnd_map.gaussian import Gaussians, Moments, concat
-from gnd_map.similarity import similarity
-from gnd_map.tile import Tile
-from schemas.changes import split
-from tile_store.sqlite_store import SqliteStore
-from tile_store.values import ReportRow, StoreConfig
+from gnd.cloud_merger.config import ShardConfig
+from gnd.cloud_merger.merge import MergeParameters, merge_tile
+from gnd.cloud_merger.statements import Report, statements_of
+from gnd.cloud_merger.work import Worker
+from gnd.gnd_map.classes import ChangeClass
+from gnd.gnd_map.gaussian import Gaussians, Moments, concat
+from gnd.gnd_map.similarity import similarity
+from gnd.gnd_map.tile import Tile
+from gnd.schemas.changes import split
+from gnd.tile_store.sqlite_store import SqliteStore
+from gnd.tile_store.values import ReportRow, StoreConfig
 
 VOXELS = range(4)
 EPOCH = gaussians_of({0: GROUND, 1: WALL})

@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 from merger_world import change_of, report_id, sha_of
 
-from cloud_merger.merge import MergeParameters, merge_tile
-from cloud_merger.statements import Report, statements_of
-from gnd_map.codec import encode_gaussians
-from gnd_map.gaussian import Gaussians
-from gnd_map.similarity import similarity
+from gnd.cloud_merger.merge import MergeParameters, merge_tile
+from gnd.cloud_merger.statements import Report, statements_of
+from gnd.gnd_map.codec import encode_gaussians
+from gnd.gnd_map.gaussian import Gaussians
+from gnd.gnd_map.similarity import similarity
 
 N = 600  # voxels: the first half holds Gaussians in the map
 SHAPES = np.array([[0.28, 0.28, 0.03], [0.03, 0.28, 0.28], [0.03, 0.03, 0.28], [0.2, 0.2, 0.2]])

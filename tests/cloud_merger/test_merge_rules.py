@@ -17,11 +17,11 @@ from merger_world import (
     sha_of,
 )
 
-from cloud_merger.errors import MergerError
-from cloud_merger.merge import MergeParameters, merge_tile
-from cloud_merger.statements import Report, statements_of
-from gnd_map.classes import ChangeClass
-from gnd_map.gaussian import Gaussians, Moments
+from gnd.cloud_merger.errors import MergerError
+from gnd.cloud_merger.merge import MergeParameters, merge_tile
+from gnd.cloud_merger.statements import Report, statements_of
+from gnd.gnd_map.classes import ChangeClass
+from gnd.gnd_map.gaussian import Gaussians, Moments
 
 EPOCH = gaussians_of({0: GROUND, 1: WALL})
 

@@ -1,12 +1,12 @@
 import pytest
 from click.testing import CliRunner
 
-from cloud_merger.cli import merger, read_config
-from cloud_merger.config import ShardConfig
-from cloud_merger.errors import MergerError
-from cloud_merger.merge import MergeParameters
-from gnd_map.config import to_mapping
-from gnd_map.errors import ConfigError, GndError
+from gnd.cloud_merger.cli import merger, read_config
+from gnd.cloud_merger.config import ShardConfig
+from gnd.cloud_merger.errors import MergerError
+from gnd.cloud_merger.merge import MergeParameters
+from gnd.gnd_map.config import to_mapping
+from gnd.gnd_map.errors import ConfigError, GndError
 
 
 def test_options_go_before_the_file(tmp_path):

@@ -2,8 +2,8 @@ import numpy as np
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from cloud_merger.cluster import dbscan, dbscan_sklearn
-from gnd_map.similarity import pairs_within
+from gnd.cloud_merger.cluster import dbscan, dbscan_sklearn
+from gnd.gnd_map.similarity import pairs_within
 
 
 @st.composite

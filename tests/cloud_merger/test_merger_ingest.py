@@ -7,16 +7,16 @@ import pytest
 from merger_world import GROUND, NEIGHBOUR, POLE, TILE, WALL, change_of, gaussians_of, report_of, tile_of_states
 from upload_desk import NOW, Desk
 
-from cloud_merger import expander
-from cloud_merger.checking import IngestLimits
-from cloud_merger.errors import MergerError
-from gnd_map.gaussian import Gaussians
-from gnd_map.tile_id import TileId
-from schemas.changes import ChangeReport
-from schemas.keys import change_key
-from schemas.packed import decode_upload
-from tile_store.errors import StoreClosed
-from tile_store.sqlite_store import SqliteStore
+from gnd.cloud_merger import expander
+from gnd.cloud_merger.checking import IngestLimits
+from gnd.cloud_merger.errors import MergerError
+from gnd.gnd_map.gaussian import Gaussians
+from gnd.gnd_map.tile_id import TileId
+from gnd.schemas.changes import ChangeReport
+from gnd.schemas.keys import change_key
+from gnd.schemas.packed import decode_upload
+from gnd.tile_store.errors import StoreClosed
+from gnd.tile_store.sqlite_store import SqliteStore
 
 BASE = gaussians_of({0: GROUND, 1: WALL})
 KEY = change_key("ndt", TILE.district)

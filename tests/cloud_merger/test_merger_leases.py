@@ -6,13 +6,13 @@ import time
 import pytest
 from merger_world import GROUND, POLE, VOXEL_BY_VOXEL, WALL, change_of, gaussians_of, report_of, tile_of_states
 
-from cloud_merger.config import ShardConfig
-from cloud_merger.leases import LONGEST_WORK_S, Leases
-from cloud_merger.work import Worker
-from gnd_map.tile_id import TileId
-from schemas.changes import split
-from tile_store.sqlite_store import SqliteStore
-from tile_store.values import ReportRow, StoreConfig
+from gnd.cloud_merger.config import ShardConfig
+from gnd.cloud_merger.leases import LONGEST_WORK_S, Leases
+from gnd.cloud_merger.work import Worker
+from gnd.gnd_map.tile_id import TileId
+from gnd.schemas.changes import split
+from gnd.tile_store.sqlite_store import SqliteStore
+from gnd.tile_store.values import ReportRow, StoreConfig
 
 STATES = {0: GROUND, 1: WALL}
 BASE = gaussians_of(STATES)

@@ -19,22 +19,22 @@ from merger_world import (
     tile_of_states,
 )
 
-from cloud_merger.announce import NOTICE_DELTA_BYTES, NOTICE_DELTA_VOXELS, encoded, update_of
-from cloud_merger.config import ShardConfig
-from cloud_merger.merger import run_shard
-from cloud_merger.ownership import owner_of
-from cloud_merger.work import Worker
-from fleet_bus.bus import open_bus
-from fleet_bus.config import BusConfig
-from gnd_map.codec import LATTICES, snap
-from gnd_map.gaussian import Gaussians
-from gnd_map.tile import Tile, TileDelta
-from schemas.changes import split
-from schemas.keys import alive_key, update_key
-from schemas.limits import MAX_TILE_BODY_BYTES
-from schemas.updates import TileUpdate, updated
-from tile_store.errors import StoreUnavailable
-from tile_store.values import ReportRow, StoreConfig
+from gnd.cloud_merger.announce import NOTICE_DELTA_BYTES, NOTICE_DELTA_VOXELS, encoded, update_of
+from gnd.cloud_merger.config import ShardConfig
+from gnd.cloud_merger.merger import run_shard
+from gnd.cloud_merger.ownership import owner_of
+from gnd.cloud_merger.work import Worker
+from gnd.fleet_bus.bus import open_bus
+from gnd.fleet_bus.config import BusConfig
+from gnd.gnd_map.codec import LATTICES, snap
+from gnd.gnd_map.gaussian import Gaussians
+from gnd.gnd_map.tile import Tile, TileDelta
+from gnd.schemas.changes import split
+from gnd.schemas.keys import alive_key, update_key
+from gnd.schemas.limits import MAX_TILE_BODY_BYTES
+from gnd.schemas.updates import TileUpdate, updated
+from gnd.tile_store.errors import StoreUnavailable
+from gnd.tile_store.values import ReportRow, StoreConfig
 
 STATES = {0: GROUND, 1: WALL}
 BASE = gaussians_of(STATES)
@@ -203,7 +203,7 @@ def test_a_change_of_many_voxels_is_not_even_encoded(cloud, monkeypatch):
     many = on_standard(dict.fromkeys(range(NOTICE_DELTA_VOXELS + 10), WALL))
     cloud.store.put_tiles([replace(many, tile_id=NEIGHBOUR)])
     cloud.store.put_tiles([replace(on_standard({0: WALL}), tile_id=NEIGHBOUR)])
-    monkeypatch.setattr("cloud_merger.announce.encode_content_delta", lambda *_: pytest.fail("it was encoded"))
+    monkeypatch.setattr("gnd.cloud_merger.announce.encode_content_delta", lambda *_: pytest.fail("it was encoded"))
     update = update_of(cloud.store.get("ndt", NEIGHBOUR, 2), cloud.store.get("ndt", NEIGHBOUR, 1))
     assert (update.has_delta, update.voxels) == (False, (0, NOTICE_DELTA_VOXELS + 9))
 

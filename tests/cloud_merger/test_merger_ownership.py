@@ -2,8 +2,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 from merger_world import TILE
 
-from cloud_merger.ownership import Members, owner_of
-from gnd_map.tile_id import District, TileId
+from gnd.cloud_merger.ownership import Members, owner_of
+from gnd.gnd_map.tile_id import District, TileId
 
 DISTRICTS = [TileId((TILE.morton & ~1023) + k * 1024).district for k in range(400)]
 names = st.sets(st.from_regex(r"[a-z0-9]{1,8}", fullmatch=True), min_size=1, max_size=6)

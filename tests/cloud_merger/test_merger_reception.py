@@ -6,14 +6,14 @@ import pytest
 from merger_processes import Cloud, all_acks, raw_session, wait_for
 from merger_world import POLE, TILE, change_of, report_of
 
-from cloud_merger import reception
-from cloud_merger.ownership import Members, owner_of
-from cloud_merger.reception import Reception
-from fleet_bus.bus import open_bus
-from fleet_bus.config import BusConfig
-from gnd_map.tile_id import TileId
-from schemas.changes import ChangeAck, ChangeReport
-from schemas.keys import alive_key
+from gnd.cloud_merger import reception
+from gnd.cloud_merger.ownership import Members, owner_of
+from gnd.cloud_merger.reception import Reception
+from gnd.fleet_bus.bus import open_bus
+from gnd.fleet_bus.config import BusConfig
+from gnd.gnd_map.tile_id import TileId
+from gnd.schemas.changes import ChangeAck, ChangeReport
+from gnd.schemas.keys import alive_key
 
 TILES = [TileId((TILE.morton & ~1023) + k * 1024 + 5) for k in range(8)]
 REPORTS = [report_of(n, change_of(None, [0], {0: POLE}, tile=tile)) for n, tile in enumerate(TILES)]

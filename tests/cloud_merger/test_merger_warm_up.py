@@ -7,17 +7,17 @@ from merger_world import POLE, TILE, WALL_AGAIN
 from short_world import bases_of, drive_number, packed_of, tile_at
 from street_corner import displaced, mapped, seen_as, street
 
-from cloud_merger import merge_kernels, shift_kernels
-from cloud_merger.expanding import expand, with_measured
-from cloud_merger.merge_kernels import clusters_of
-from cloud_merger.parameters import MergeParameters
-from cloud_merger.shift import shift_of
-from cloud_merger.statements import STATEMENT
-from cloud_merger.warm import warm_up
-from gnd_map import sight, similarity
-from gnd_map.codec import encode_mask, kernels, lattice_kernels
-from schemas.packed import PackedReport
-from vehicle_agent.packing import askable, pack_measured
+from gnd.cloud_merger import merge_kernels, shift_kernels
+from gnd.cloud_merger.expanding import expand, with_measured
+from gnd.cloud_merger.merge_kernels import clusters_of
+from gnd.cloud_merger.parameters import MergeParameters
+from gnd.cloud_merger.shift import shift_of
+from gnd.cloud_merger.statements import STATEMENT
+from gnd.cloud_merger.warm import warm_up
+from gnd.gnd_map import sight, similarity
+from gnd.gnd_map.codec import encode_mask, kernels, lattice_kernels
+from gnd.schemas.packed import PackedReport
+from gnd.vehicle_agent.packing import askable, pack_measured
 
 CORNER = mapped(street(0))
 
@@ -35,8 +35,8 @@ def test_warming_leaves_nothing_to_compile_for_the_first_report():
     threads = threading.active_count()
     warm_up()
     warm = signatures()
-    assert warm["cloud_merger.shift_kernels.votes_up"] == warm["cloud_merger.merge_kernels._label_voxels"] == 1
-    assert warm["gnd_map.sight.cast_fans"] == 1
+    assert warm["gnd.cloud_merger.shift_kernels.votes_up"] == warm["gnd.cloud_merger.merge_kernels._label_voxels"] == 1
+    assert warm["gnd.gnd_map.sight.cast_fans"] == 1
     report = drive_number(1, new={3: POLE}, modified={1: WALL_AGAIN}, deleted=(2,))
     packed = PackedReport.decode(packed_of(report))
     expanded = expand(packed, "ndt", TILE.district, [tile_at()])

@@ -19,14 +19,14 @@ from merger_world import (
 )
 from upload_desk import Desk
 
-from cloud_merger.config import ShardConfig
-from cloud_merger.work import Worker
-from gnd_map.gaussian import Gaussians
-from gnd_map.tile import Tile
-from gnd_map.tile_id import TileId
-from schemas.keys import change_key
-from tile_store.sqlite_store import SqliteStore
-from tile_store.values import ReportRow, StoreConfig
+from gnd.cloud_merger.config import ShardConfig
+from gnd.cloud_merger.work import Worker
+from gnd.gnd_map.gaussian import Gaussians
+from gnd.gnd_map.tile import Tile
+from gnd.gnd_map.tile_id import TileId
+from gnd.schemas.keys import change_key
+from gnd.tile_store.sqlite_store import SqliteStore
+from gnd.tile_store.values import ReportRow, StoreConfig
 
 STATES = {0: GROUND, 1: WALL}
 BASE = gaussians_of(STATES)

@@ -19,13 +19,13 @@ from merger_world import (
     tile_of_states,
 )
 
-from cloud_merger.config import ShardConfig
-from cloud_merger.ownership import owner_of
-from cloud_merger.work import Worker
-from gnd_map.tile_id import TileId
-from schemas.changes import split
-from tile_store.sqlite_store import SqliteStore
-from tile_store.values import ReportRow, StoreConfig
+from gnd.cloud_merger.config import ShardConfig
+from gnd.cloud_merger.ownership import owner_of
+from gnd.cloud_merger.work import Worker
+from gnd.gnd_map.tile_id import TileId
+from gnd.schemas.changes import split
+from gnd.tile_store.sqlite_store import SqliteStore
+from gnd.tile_store.values import ReportRow, StoreConfig
 
 SHARDS = ("left", "right")
 STATES = {0: GROUND, 1: WALL}

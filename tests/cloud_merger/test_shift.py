@@ -11,12 +11,12 @@ from plain_shift import Surfaces, fits, moved, plain_shift_of
 from scipy.spatial import cKDTree
 from street_corner import WALLS, displaced, mapped, seen_as, street
 
-from cloud_merger import shift_kernels
-from cloud_merger.errors import MergerError
-from cloud_merger.shift import Shift, ShiftParameters, _fits, _Surfaces, shift_of
-from gnd_map.gaussian import Gaussians, concat
-from gnd_map.grid import VoxelGrid
-from gnd_map.similarity import similarity
+from gnd.cloud_merger import shift_kernels
+from gnd.cloud_merger.errors import MergerError
+from gnd.cloud_merger.shift import Shift, ShiftParameters, _fits, _Surfaces, shift_of
+from gnd.gnd_map.gaussian import Gaussians, concat
+from gnd.gnd_map.grid import VoxelGrid
+from gnd.gnd_map.similarity import similarity
 
 BASE = mapped(street(0))
 

@@ -8,24 +8,24 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from benchmarks.simulation.base_map import BaseMap
-from benchmarks.simulation.method import MethodParameters
-from benchmarks.simulation.pose_source import PoseSource
-from benchmarks.simulation.vehicle import VehicleTask, drive
-from benchmarks.simulation.voxel_rows import VoxelRows
-from cloud_merger.config import ShardConfig
-from cloud_merger.merge import merge_tile
-from cloud_merger.statements import statements_of
-from cloud_merger.stored import report_of
-from cloud_merger.work import Worker
-from fleet_sim.drives import PERFECT, DriveConfig, DriveSimulation, simulate_drive
-from fleet_sim.prepare import mapping_configs
-from fleet_sim.street import street
-from schemas.changes import ChangeReport, split
-from schemas.drive import ReferencePose
-from tile_store.build import build_map
-from tile_store.sqlite_store import SqliteStore
-from tile_store.values import ReportRow, StoreConfig
+from gnd.cloud_merger.config import ShardConfig
+from gnd.cloud_merger.merge import merge_tile
+from gnd.cloud_merger.statements import statements_of
+from gnd.cloud_merger.stored import report_of
+from gnd.cloud_merger.work import Worker
+from gnd.fleet_sim.drives import PERFECT, DriveConfig, DriveSimulation, simulate_drive
+from gnd.fleet_sim.prepare import mapping_configs
+from gnd.fleet_sim.street import street
+from gnd.schemas.changes import ChangeReport, split
+from gnd.schemas.drive import ReferencePose
+from gnd.tile_store.build import build_map
+from gnd.tile_store.sqlite_store import SqliteStore
+from gnd.tile_store.values import ReportRow, StoreConfig
+from studies.simulation.base_map import BaseMap
+from studies.simulation.method import MethodParameters
+from studies.simulation.pose_source import PoseSource
+from studies.simulation.vehicle import VehicleTask, drive
+from studies.simulation.voxel_rows import VoxelRows
 
 SEED, SCANS = 41, 60
 OFF_M = (0.1, 0.3)  # forward, left

@@ -6,14 +6,14 @@ from hypothesis import strategies as st
 from merger_world import NEIGHBOUR, TILE, change_of, report_of
 from short_world import track_by
 
-from cloud_merger.expanding import expand, with_measured
-from cloud_merger.wants import asked_voxels
-from gnd_map.classes import ChangeClass
-from gnd_map.codec import LATTICES, REPORT, decode_mask, encode_mask, snap
-from gnd_map.gaussian import Gaussians, concat
-from gnd_map.tile import Tile
-from schemas.packed import PackedGaussians, PackedReport, crc_of
-from vehicle_agent.packing import askable, pack, pack_measured
+from gnd.cloud_merger.expanding import expand, with_measured
+from gnd.cloud_merger.wants import asked_voxels
+from gnd.gnd_map.classes import ChangeClass
+from gnd.gnd_map.codec import LATTICES, REPORT, decode_mask, encode_mask, snap
+from gnd.gnd_map.gaussian import Gaussians, concat
+from gnd.gnd_map.tile import Tile
+from gnd.schemas.packed import PackedGaussians, PackedReport, crc_of
+from gnd.vehicle_agent.packing import askable, pack, pack_measured
 
 VOXELS = np.arange(-700, 2400, 7)
 

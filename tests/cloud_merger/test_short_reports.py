@@ -13,23 +13,23 @@ from merger_world import BALL, NEIGHBOUR, POLE, TILE, WALL_AGAIN, report_of
 from short_world import KEY, bases_of, drive_number, flagged, packed_of, tile_at, track_by
 from upload_desk import NOW, Desk
 
-from cloud_merger import short_reports
-from cloud_merger.config import ShardConfig
-from cloud_merger.verify import Verifier
-from cloud_merger.wants import WantParameters
-from cloud_merger.work import Worker
-from gnd_map.classes import ChangeClass
-from gnd_map.codec import decode_mask, encode_flags, encode_mask
-from gnd_map.gaussian import Gaussians
-from gnd_map.tile_id import District, TileId
-from gnd_map.track import Piece, encode_track
-from schemas.changes import ChangeAck, ChangeReport
-from schemas.keys import change_key
-from schemas.packed import PackedReport, crc_of, decode_upload
-from tile_store.errors import StoreClosed
-from tile_store.sqlite_store import SqliteStore
-from tile_store.values import StoreConfig
-from vehicle_agent.packing import askable, pack, pack_measured
+from gnd.cloud_merger import short_reports
+from gnd.cloud_merger.config import ShardConfig
+from gnd.cloud_merger.verify import Verifier
+from gnd.cloud_merger.wants import WantParameters
+from gnd.cloud_merger.work import Worker
+from gnd.gnd_map.classes import ChangeClass
+from gnd.gnd_map.codec import decode_mask, encode_flags, encode_mask
+from gnd.gnd_map.gaussian import Gaussians
+from gnd.gnd_map.tile_id import District, TileId
+from gnd.gnd_map.track import Piece, encode_track
+from gnd.schemas.changes import ChangeAck, ChangeReport
+from gnd.schemas.keys import change_key
+from gnd.schemas.packed import PackedReport, crc_of, decode_upload
+from gnd.tile_store.errors import StoreClosed
+from gnd.tile_store.sqlite_store import SqliteStore
+from gnd.tile_store.values import StoreConfig
+from gnd.vehicle_agent.packing import askable, pack, pack_measured
 
 # Back and forth through the district; its ends are near enough.
 LONG = dataclasses.replace(
@@ -168,10 +168,10 @@ def test_what_is_wanted_outlives_every_shard(store, desk):
 
 DIES = """
 import os, signal, sys
-from cloud_merger.config import ShardConfig
-from cloud_merger.expander import Expander
-from tile_store.sqlite_store import SqliteStore
-from tile_store.values import StoreConfig
+from gnd.cloud_merger.config import ShardConfig
+from gnd.cloud_merger.expander import Expander
+from gnd.tile_store.sqlite_store import SqliteStore
+from gnd.tile_store.values import StoreConfig
 
 store = SqliteStore(sys.argv[1])
 settle = store.settle_upload

@@ -11,20 +11,20 @@ from merger_processes import DEADLINE_S, Cloud, in_threads, wait_for
 from merger_world import BALL, POLE, TILE, VOXEL_BY_VOXEL, WALL_AGAIN, report_of
 from short_world import bases_of, flagged, packed_of, tile_at
 
-from cloud_merger.config import ShardConfig
-from cloud_merger.work import Worker
-from fleet_bus.bus import open_bus
-from fleet_bus.config import BusConfig
-from fleet_bus.requesting import RetryPolicy
-from gnd_map.tile_id import TileId
-from schemas.changes import ChangeAck, ChangeReport
-from schemas.keys import change_key, state_key
-from schemas.report_states import ReportQuestion, ReportState, ReportStates
-from tile_store.sqlite_store import SqliteStore
-from tile_store.values import StoreConfig
-from vehicle_agent.outbox import Outbox
-from vehicle_agent.packing import pack_measured
-from vehicle_agent.sending import SenderThread
+from gnd.cloud_merger.config import ShardConfig
+from gnd.cloud_merger.work import Worker
+from gnd.fleet_bus.bus import open_bus
+from gnd.fleet_bus.config import BusConfig
+from gnd.fleet_bus.requesting import RetryPolicy
+from gnd.gnd_map.tile_id import TileId
+from gnd.schemas.changes import ChangeAck, ChangeReport
+from gnd.schemas.keys import change_key, state_key
+from gnd.schemas.report_states import ReportQuestion, ReportState, ReportStates
+from gnd.tile_store.sqlite_store import SqliteStore
+from gnd.tile_store.values import StoreConfig
+from gnd.vehicle_agent.outbox import Outbox
+from gnd.vehicle_agent.packing import pack_measured
+from gnd.vehicle_agent.sending import SenderThread
 
 SHARDS = ("left", "right")
 FIRST = [TileId((TILE.morton & ~1023) + k * 1024 + 5) for k in range(8)]

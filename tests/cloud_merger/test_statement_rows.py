@@ -7,10 +7,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from merger_world import TILE, change_of, gaussians_of
 
-from cloud_merger.statements import EPOCH, STATEMENT, Kind, Report, changed_of, find, statements_of, states_at
-from gnd_map.classes import ChangeClass
-from gnd_map.gaussian import Gaussians
-from gnd_map.tile import content_sha, diff
+from gnd.cloud_merger.statements import EPOCH, STATEMENT, Kind, Report, changed_of, find, statements_of, states_at
+from gnd.gnd_map.classes import ChangeClass
+from gnd.gnd_map.gaussian import Gaussians
+from gnd.gnd_map.tile import content_sha, diff
 
 GROUND, WALL = (0.0, 0.0, -0.2, 0.28, 0.28, 0.02), (0.3, 0.0, 0.0, 0.02, 0.28, 0.28)
 VOXELS = 24

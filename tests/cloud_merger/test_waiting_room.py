@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 from merger_world import NEIGHBOUR, TILE
 
-from cloud_merger.errors import MergerError
-from cloud_merger.waiting import Promises, WaitingLimits
+from gnd.cloud_merger.errors import MergerError
+from gnd.cloud_merger.waiting import Promises, WaitingLimits
 
 SECOND = 1_000_000_000
 

@@ -7,13 +7,13 @@ import pytest
 from merger_world import GROUND_AGAIN, NEIGHBOUR, POLE, TILE, WALL_AGAIN, report_of, sha_of
 from short_world import BASE, flagged
 
-from cloud_merger.errors import MergerError
-from cloud_merger.parameters import MergeParameters
-from cloud_merger.statements import Report
-from cloud_merger.votes import TileVotes
-from cloud_merger.wants import Known, WantParameters, asked_voxels, wanted
-from gnd_map.gaussian import Gaussians, concat
-from schemas.changes import ChangeReport, TileChange
+from gnd.cloud_merger.errors import MergerError
+from gnd.cloud_merger.parameters import MergeParameters
+from gnd.cloud_merger.statements import Report
+from gnd.cloud_merger.votes import TileVotes
+from gnd.cloud_merger.wants import Known, WantParameters, asked_voxels, wanted
+from gnd.gnd_map.gaussian import Gaussians, concat
+from gnd.schemas.changes import ChangeReport, TileChange
 
 BASES = {sha_of(BASE): BASE}
 MERGE = MergeParameters(poses=False)

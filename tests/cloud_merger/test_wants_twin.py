@@ -7,16 +7,16 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from merger_world import TILE, change_of, gaussians_of
 
-from cloud_merger.expanding import is_askable
-from cloud_merger.memory import VOXEL, TileMemory
-from cloud_merger.parameters import MergeParameters
-from cloud_merger.statements import Kind, Report, statements_of
-from cloud_merger.votes import TileVotes
-from cloud_merger.wants import Known, WantParameters, _promised, _sample, _wanted_of_tile
-from gnd_map.classes import ChangeClass
-from gnd_map.day import day_of
-from gnd_map.gaussian import Gaussians
-from gnd_map.tile import content_sha
+from gnd.cloud_merger.expanding import is_askable
+from gnd.cloud_merger.memory import VOXEL, TileMemory
+from gnd.cloud_merger.parameters import MergeParameters
+from gnd.cloud_merger.statements import Kind, Report, statements_of
+from gnd.cloud_merger.votes import TileVotes
+from gnd.cloud_merger.wants import Known, WantParameters, _promised, _sample, _wanted_of_tile
+from gnd.gnd_map.classes import ChangeClass
+from gnd.gnd_map.day import day_of
+from gnd.gnd_map.gaussian import Gaussians
+from gnd.gnd_map.tile import content_sha
 
 GROUND, WALL = (0.0, 0.0, -0.2, 0.28, 0.28, 0.02), (0.3, 0.0, 0.0, 0.02, 0.28, 0.28)
 

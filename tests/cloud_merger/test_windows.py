@@ -21,15 +21,15 @@ from merger_world import (
     report_of,
 )
 
-from cloud_merger.config import ShardConfig
-from cloud_merger.memory import CLAIMS_OF_VEHICLE, CLAIMS_OF_VOXEL, TileMemory
-from cloud_merger.stored import decode_state
-from cloud_merger.verify import Verifier
-from cloud_merger.work import Worker
-from gnd_map.tile import Tile
-from schemas.changes import split
-from tile_store.sqlite_store import SqliteStore
-from tile_store.values import ReportRow, StoreConfig
+from gnd.cloud_merger.config import ShardConfig
+from gnd.cloud_merger.memory import CLAIMS_OF_VEHICLE, CLAIMS_OF_VOXEL, TileMemory
+from gnd.cloud_merger.stored import decode_state
+from gnd.cloud_merger.verify import Verifier
+from gnd.cloud_merger.work import Worker
+from gnd.gnd_map.tile import Tile
+from gnd.schemas.changes import split
+from gnd.tile_store.sqlite_store import SqliteStore
+from gnd.tile_store.values import ReportRow, StoreConfig
 
 BASE = {0: GROUND, 1: WALL, 2: POLE}
 EVERYTHING = [0, 1, 2, 3, 4, 5]

@@ -1,12 +1,12 @@
 """Ingest and expander at one desk: what is sent is acknowledged, looked at, and what is told can be read."""
 
-from cloud_merger.config import ShardConfig
-from cloud_merger.expander import Expander
-from cloud_merger.ingest import Ingest
-from cloud_merger.states import answer
-from schemas.changes import ChangeAck
-from schemas.keys import state_key
-from schemas.report_states import ReportQuestion, ReportState, ReportStates
+from gnd.cloud_merger.config import ShardConfig
+from gnd.cloud_merger.expander import Expander
+from gnd.cloud_merger.ingest import Ingest
+from gnd.cloud_merger.states import answer
+from gnd.schemas.changes import ChangeAck
+from gnd.schemas.keys import state_key
+from gnd.schemas.report_states import ReportQuestion, ReportState, ReportStates
 
 NOW = 1_700_000_100_000_000_000
 

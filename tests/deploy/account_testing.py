@@ -10,8 +10,8 @@ from typing import Any
 from click.testing import CliRunner
 from rich.console import Console
 
-from deploy.live_traffic import LiveLedgers, kinds_table
-from deploy.traffic_cli import traffic as traffic_command
+from gnd.deploy.live_traffic import LiveLedgers, kinds_table
+from gnd.deploy.traffic_cli import traffic as traffic_command
 
 WAYS = ("up", "down")
 

@@ -2,11 +2,11 @@
 
 import numpy as np
 
-from gnd_map.classes import ChangeClass
-from gnd_map.gaussian import Gaussians
-from gnd_map.tile_id import TileId
-from schemas.changes import ChangeReport, TileChange
-from schemas.report_id import deterministic_report_id
+from gnd.gnd_map.classes import ChangeClass
+from gnd.gnd_map.gaussian import Gaussians
+from gnd.gnd_map.tile_id import TileId
+from gnd.schemas.changes import ChangeReport, TileChange
+from gnd.schemas.report_id import deterministic_report_id
 
 TILE = TileId(497353963154)
 

@@ -8,10 +8,10 @@ from pathlib import Path
 import pytest
 from fleet_testing import Run
 
-from fleet_sim.drives import PERFECT, DriveConfig, simulate_drive
-from fleet_sim.street import street
-from tile_store.build import build_map
-from tile_store.sqlite_store import SqliteStore
+from gnd.fleet_sim.drives import PERFECT, DriveConfig, simulate_drive
+from gnd.fleet_sim.street import street
+from gnd.tile_store.build import build_map
+from gnd.tile_store.sqlite_store import SqliteStore
 
 SEED = 11
 SCANS = 70

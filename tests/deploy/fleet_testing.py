@@ -19,7 +19,7 @@ class Run:
     def __init__(self, folder: Path, *arguments: str, timeout_s: float = RUN_TIMEOUT_S) -> None:
         self.folder, self.timeout_s = folder, timeout_s
         self.process = subprocess.Popen(
-            [sys.executable, "-m", "deploy.cli", "fleet", "--out", str(folder), *arguments],
+            [sys.executable, "-m", "gnd.deploy.cli", "fleet", "--out", str(folder), *arguments],
             stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
         )  # fmt: skip
 

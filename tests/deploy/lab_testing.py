@@ -14,10 +14,10 @@ from pathlib import Path
 
 import pytest
 
-from deploy.lab.lab import namespaces_of
-from deploy.lab.tools import TUN_DEVICE
-from fleet_bus import BusConfig, Ledger, open_bus
-from fleet_bus.router import run_router, wait_for_stop
+from gnd.deploy.lab.lab import namespaces_of
+from gnd.deploy.lab.tools import TUN_DEVICE
+from gnd.fleet_bus import BusConfig, Ledger, open_bus
+from gnd.fleet_bus.router import run_router, wait_for_stop
 
 DEADLINE_S = 60.0
 KEY = "gnd/v1/lab/test"
@@ -35,7 +35,7 @@ def own_name() -> str:
 
 def gnd_lab(*arguments: str, **options: object) -> subprocess.Popen[str]:
     return subprocess.Popen(  # type: ignore[call-overload, no-any-return]
-        [sys.executable, "-m", "deploy.cli", "lab", *arguments],
+        [sys.executable, "-m", "gnd.deploy.cli", "lab", *arguments],
         stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, **options,
     )  # fmt: skip
 
@@ -75,7 +75,7 @@ def profile_file(folder: Path, text: str, name: str = "links.toml") -> Path:
 
 
 def router_role(listen: str, *, stop: threading.Event) -> None:
-    """The router, without the imports of `deploy.roles`."""
+    """The router, without the imports of `gnd.deploy.roles`."""
     run_router((listen,), stop=stop)
 
 

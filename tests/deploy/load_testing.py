@@ -6,21 +6,21 @@ from pathlib import Path
 
 import numpy as np
 
-from deploy.run_folder import RunFolder, create_run_folder
-from gnd_map.classes import ChangeClass
-from gnd_map.codec import LATTICES, REPORT, snap
-from gnd_map.gaussian import Gaussians
-from gnd_map.grid import VoxelGrid
-from gnd_map.tile import Tile
-from gnd_map.tile_id import TileId
-from gnd_map.track import STEPS, Piece, Track, View
-from schemas.changes import ChangeReport, TileChange
-from schemas.keys import change_key
-from schemas.report_id import deterministic_report_id
-from schemas.report_states import ReportState
-from tile_store.sqlite_store import SqliteStore
-from vehicle_agent.outbox import Outbox
-from vehicle_agent.packing import pack
+from gnd.deploy.run_folder import RunFolder, create_run_folder
+from gnd.gnd_map.classes import ChangeClass
+from gnd.gnd_map.codec import LATTICES, REPORT, snap
+from gnd.gnd_map.gaussian import Gaussians
+from gnd.gnd_map.grid import VoxelGrid
+from gnd.gnd_map.tile import Tile
+from gnd.gnd_map.tile_id import TileId
+from gnd.gnd_map.track import STEPS, Piece, Track, View
+from gnd.schemas.changes import ChangeReport, TileChange
+from gnd.schemas.keys import change_key
+from gnd.schemas.report_id import deterministic_report_id
+from gnd.schemas.report_states import ReportState
+from gnd.tile_store.sqlite_store import SqliteStore
+from gnd.vehicle_agent.outbox import Outbox
+from gnd.vehicle_agent.packing import pack
 
 FIRST = TileId(497353963154)
 T0_NS = 1_700_000_000_000_000_000

@@ -11,7 +11,7 @@ import pytest
 
 def gnd(*words: str) -> subprocess.CompletedProcess[str]:
     return subprocess.run(
-        [sys.executable, "-m", "deploy.cli", *words], capture_output=True, text=True, timeout=120, check=False
+        [sys.executable, "-m", "gnd.deploy.cli", *words], capture_output=True, text=True, timeout=120, check=False
     )
 
 
@@ -97,7 +97,8 @@ def test_an_unknown_command() -> None:
 
 
 def test_help_needs_no_heavy_library() -> None:
-    code = "import sys, deploy.cli; deploy.cli.gnd.main(['--help'], standalone_mode=False); print(sorted(sys.modules))"
+    start = "import sys, gnd.deploy.cli; "
+    code = f"{start}gnd.deploy.cli.gnd.main(['--help'], standalone_mode=False); print(sorted(sys.modules))"
     result = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     for heavy in ("numba", "zenoh", "gtsam", "sklearn", "matplotlib"):
         assert f"'{heavy}'" not in result.stdout

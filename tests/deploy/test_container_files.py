@@ -9,7 +9,7 @@ import click
 import pytest
 import yaml
 
-from deploy.cli import gnd
+from gnd.deploy.cli import gnd
 
 DEPLOY = Path(__file__).resolve().parents[2] / "deploy"
 

@@ -2,9 +2,9 @@
 
 from typing import Any
 
-from deploy.account import FleetResults
-from deploy.summary import doubtful_vehicles, summary_lines
-from fleet_bus.traffic import fleet_totals
+from gnd.deploy.account import FleetResults
+from gnd.deploy.summary import doubtful_vehicles, summary_lines
+from gnd.fleet_bus.traffic import fleet_totals
 
 COUNTS = ("scans_shifted", "scans_taken_back", "tiles_doubtful", "tiles_held_back", "changes_held_back")
 SHIFTED = {"tiles": {"explained_by_shift": 3}, "largest_shift_m": 0.213, "largest_turn_deg": 0.5}

@@ -3,8 +3,8 @@
 import numpy as np
 from change_testing import at, change
 
-from deploy.evaluation import with_statement
-from gnd_map.gaussian import Gaussians, concat
+from gnd.deploy.evaluation import with_statement
+from gnd.gnd_map.gaussian import Gaussians, concat
 
 NOTHING = Gaussians.empty()
 

@@ -5,16 +5,16 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from deploy.features import feature_lines, put_base_layers, score_layers, tiles_of_vehicles
-from fleet_sim.feature_files import write_feature_layers
-from fleet_sim.feature_truth import base_features, feature_truth
-from fleet_sim.street import street
-from fleet_sim.world import write_world
-from gnd_map.features import hit, miss
-from schemas.features import FeatureChange, FeatureReport, Found, Seen, split_features
-from schemas.report_id import deterministic_report_id
-from tile_store.sqlite_store import SqliteStore
-from tile_store.values import ReportRow
+from gnd.deploy.features import feature_lines, put_base_layers, score_layers, tiles_of_vehicles
+from gnd.fleet_sim.feature_files import write_feature_layers
+from gnd.fleet_sim.feature_truth import base_features, feature_truth
+from gnd.fleet_sim.street import street
+from gnd.fleet_sim.world import write_world
+from gnd.gnd_map.features import hit, miss
+from gnd.schemas.features import FeatureChange, FeatureReport, Found, Seen, split_features
+from gnd.schemas.report_id import deterministic_report_id
+from gnd.tile_store.sqlite_store import SqliteStore
+from gnd.tile_store.values import ReportRow
 
 WORLD = street(101)
 TRUTH = feature_truth(WORLD)

@@ -2,9 +2,9 @@ from pathlib import Path
 
 import pytest
 
-from deploy.errors import DeployError
-from deploy.fleet_config import FleetConfig, load_fleet_config
-from gnd_map.errors import GndError
+from gnd.deploy.errors import DeployError
+from gnd.deploy.fleet_config import FleetConfig, load_fleet_config
+from gnd.gnd_map.errors import GndError
 
 
 def test_the_shipped_file_holds_the_defaults() -> None:

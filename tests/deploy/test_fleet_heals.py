@@ -7,7 +7,7 @@ from typing import Any
 import pytest
 from fleet_testing import Run
 
-from fleet_sim.truth import LEVELS
+from gnd.fleet_sim.truth import LEVELS
 
 pytestmark = [pytest.mark.slow, pytest.mark.timeout(600)]
 

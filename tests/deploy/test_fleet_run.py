@@ -12,12 +12,12 @@ import pytest
 from account_testing import assert_one_account
 from fleet_testing import Run
 
-from deploy.account import lost_reports, tile_histories
-from deploy.map_use import read_ways
-from deploy.run_folder import RunFolder
-from gnd_map.tile import content_sha
-from tile_store.sqlite_store import SqliteStore
-from vehicle_agent.world_clock import SLACK_S
+from gnd.deploy.account import lost_reports, tile_histories
+from gnd.deploy.map_use import read_ways
+from gnd.deploy.run_folder import RunFolder
+from gnd.gnd_map.tile import content_sha
+from gnd.tile_store.sqlite_store import SqliteStore
+from gnd.vehicle_agent.world_clock import SLACK_S
 
 pytestmark = pytest.mark.slow
 Start = Callable[..., Run]

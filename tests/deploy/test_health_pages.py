@@ -17,12 +17,12 @@ import pytest
 from prometheus_client import CollectorRegistry
 from prometheus_client.parser import text_string_to_metric_families
 
-from fleet_bus.errors import PortInUse
-from fleet_bus.health import CHECK_S, HealthServer
-from gnd_map.gaussian import Gaussians
-from gnd_map.tile import Tile
-from gnd_map.tile_id import TileId
-from tile_store.sqlite_store import SqliteStore
+from gnd.fleet_bus.errors import PortInUse
+from gnd.fleet_bus.health import CHECK_S, HealthServer
+from gnd.gnd_map.gaussian import Gaussians
+from gnd.gnd_map.tile import Tile
+from gnd.gnd_map.tile_id import TileId
+from gnd.tile_store.sqlite_store import SqliteStore
 
 TILE = TileId(497353963154)
 
@@ -78,7 +78,7 @@ class Parts:
             "store": ["--path", str(self.path), "--connect", self.endpoint],
             "merger": ["--id", "shard-0", "--store", str(self.path), "--connect", self.endpoint],
         }[name]
-        command = [sys.executable, "-m", "deploy.cli", name, *options, "--metrics-port", str(self.ports[name])]
+        command = [sys.executable, "-m", "gnd.deploy.cli", name, *options, "--metrics-port", str(self.ports[name])]
         self.running[name] = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
 
     def is_healthy(self, name: str) -> bool:
@@ -140,7 +140,7 @@ def test_router_store_and_shard_show_how_they_are(parts: Parts) -> None:
 
 
 def test_a_store_that_is_not_there_is_not_made(tmp_path: Path) -> None:
-    command = [sys.executable, "-m", "deploy.cli", "store", "--path", str(tmp_path / "TYPO")]
+    command = [sys.executable, "-m", "gnd.deploy.cli", "store", "--path", str(tmp_path / "TYPO")]
     done = subprocess.run(command, capture_output=True, text=True)
     assert done.returncode == 2
     assert done.stderr == f"gnd: {tmp_path / 'TYPO'}: no such store; `gnd map build` makes one\n"

@@ -12,9 +12,9 @@ import psutil
 import pytest
 from lab_testing import finished, gnd_lab, has_namespaces, needs_root, own_name, profile_file, started, wait_until
 
-from deploy.lab.lab import lab_lock, namespaces_of
-from deploy.lab.namespaces import add_namespace
-from deploy.lab.tools import TUN_DEVICE
+from gnd.deploy.lab.lab import lab_lock, namespaces_of
+from gnd.deploy.lab.namespaces import add_namespace
+from gnd.deploy.lab.tools import TUN_DEVICE
 
 TINY = "[tiny]\ndown_bit_s = 2e6\nup_bit_s = 1e6\ndelay_ms = 10\njitter_ms = 2\nloss = 0.02\n"
 PROJECT = Path(__file__).resolve().parents[2]
@@ -22,8 +22,8 @@ PROJECT = Path(__file__).resolve().parents[2]
 
 NOBODY = """
 import os, sys
-import deploy.lab.command
-from deploy.cli import main
+import gnd.deploy.lab.command
+from gnd.deploy.cli import main
 if os.geteuid() == 0:
     os.setuid(65534)
 sys.argv = ["gnd", "lab", *sys.argv[1:]]
@@ -37,7 +37,7 @@ def test_without_the_right_it_is_refused(tmp_path: Path, arguments: tuple[str, .
     script.write_text(NOBODY)
     done = subprocess.run(
         [sys.executable, str(script), *arguments], capture_output=True, text=True, timeout=60, check=False,
-        env={**os.environ, "PYTHONPATH": str(PROJECT)},
+        env={**os.environ, "PYTHONPATH": str(PROJECT / "src")},
     )  # fmt: skip
     assert (done.returncode, done.stdout) == (2, "")
     assert "gnd: network namespaces need root, this is user" in done.stderr

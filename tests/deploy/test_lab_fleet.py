@@ -10,7 +10,7 @@ import psutil
 import pytest
 from lab_testing import has_namespaces, needs_root, own_name, profile_file, started, wait_until
 
-from deploy.lab.devices import MTU_BYTES
+from gnd.deploy.lab.devices import MTU_BYTES
 
 if TYPE_CHECKING:
     from conftest import SmallWorld

@@ -5,15 +5,15 @@ import math
 import pytest
 from lab_testing import profile_file
 
-from deploy.errors import LabError
-from deploy.lab.counters import parse_ss
-from deploy.lab.devices import MTU_BYTES, link_commands, netem_words, tbf_words
-from deploy.lab.groups import LabLink, check_lab_name, links_of, parse_groups, unpaced
-from deploy.lab.lab import relayed_links
-from deploy.lab.sampler import LinkSeen
-from deploy.lab.tools import Offer, check_offer, needs_carrying
-from fleet_bus.errors import LinkError
-from fleet_bus.links import LinkProfile, load_link
+from gnd.deploy.errors import LabError
+from gnd.deploy.lab.counters import parse_ss
+from gnd.deploy.lab.devices import MTU_BYTES, link_commands, netem_words, tbf_words
+from gnd.deploy.lab.groups import LabLink, check_lab_name, links_of, parse_groups, unpaced
+from gnd.deploy.lab.lab import relayed_links
+from gnd.deploy.lab.sampler import LinkSeen
+from gnd.deploy.lab.tools import Offer, check_offer, needs_carrying
+from gnd.fleet_bus.errors import LinkError
+from gnd.fleet_bus.links import LinkProfile, load_link
 
 SLOW = LinkProfile("slow", down_bit_s=4e6, up_bit_s=1e6, delay_ms=30, jitter_ms=5, loss=0.01)
 

@@ -18,20 +18,20 @@ from lab_testing import (
     wait_until,
 )
 
-from deploy.errors import LabError, LabRuns
-from deploy.lab.check import carried
-from deploy.lab.counters import read_counts
-from deploy.lab.groups import ROUTER_FROM_CLOUD, ROUTER_LISTENS, Group, parse_groups
-from deploy.lab.lab import LOCK_FOLDER, Lab, lab_lock, labs, namespaces_of, open_lab
-from deploy.lab.namespaces import add_namespace, enter_namespace, inside, remove_namespace, run_tool
-from deploy.lab.probes import bulk, flood, stream
-from deploy.lab.relay import read_account
-from deploy.lab.report import Evidence, GroupAccount, account, as_json, count_links
-from deploy.lab.run import relay_processes
-from deploy.lab.sampler import sampling
-from deploy.lab.tables import run_table, run_verdict
-from deploy.processes import ProcessSpec, Supervisor
-from fleet_bus.ledger_file import read_ledger
+from gnd.deploy.errors import LabError, LabRuns
+from gnd.deploy.lab.check import carried
+from gnd.deploy.lab.counters import read_counts
+from gnd.deploy.lab.groups import ROUTER_FROM_CLOUD, ROUTER_LISTENS, Group, parse_groups
+from gnd.deploy.lab.lab import LOCK_FOLDER, Lab, lab_lock, labs, namespaces_of, open_lab
+from gnd.deploy.lab.namespaces import add_namespace, enter_namespace, inside, remove_namespace, run_tool
+from gnd.deploy.lab.probes import bulk, flood, stream
+from gnd.deploy.lab.relay import read_account
+from gnd.deploy.lab.report import Evidence, GroupAccount, account, as_json, count_links
+from gnd.deploy.lab.run import relay_processes
+from gnd.deploy.lab.sampler import sampling
+from gnd.deploy.lab.tables import run_table, run_verdict
+from gnd.deploy.processes import ProcessSpec, Supervisor
+from gnd.fleet_bus.ledger_file import read_ledger
 
 pytestmark = needs_root
 

@@ -10,8 +10,8 @@ import numpy as np
 from hypothesis import given
 from hypothesis import strategies as st
 
-from deploy.lab.relay import Jitter, Line, LineCount, Wire, carry, read_account
-from fleet_bus.links import LinkProfile
+from gnd.deploy.lab.relay import Jitter, Line, LineCount, Wire, carry, read_account
+from gnd.fleet_bus.links import LinkProfile
 
 STEPS = st.lists(st.floats(0, 0.2), min_size=1, max_size=200)
 

@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 from change_testing import TILE, at, change, report_of
 
-from deploy.evaluation import maps_of_vehicles
-from deploy.learning import (
+from gnd.deploy.evaluation import maps_of_vehicles
+from gnd.deploy.learning import (
     account_learning,
     clock_of,
     first_left_s,
@@ -21,17 +21,17 @@ from deploy.learning import (
     learning_lines,
     left_at_s,
 )
-from deploy.map_use import Versions, map_use
-from deploy.run_folder import RunFolder
-from fleet_sim.dense_rays import ScanPlan
-from fleet_sim.truth import Truth
-from gnd_map.classes import ChangeClass
-from gnd_map.gaussian import Gaussians, concat
-from gnd_map.geodesy import LocalFrame
-from gnd_map.tile import Tile
-from tile_store.sqlite_store import SqliteStore
-from tile_store.values import ReportRow
-from vehicle_agent.way import Milestone
+from gnd.deploy.map_use import Versions, map_use
+from gnd.deploy.run_folder import RunFolder
+from gnd.fleet_sim.dense_rays import ScanPlan
+from gnd.fleet_sim.truth import Truth
+from gnd.gnd_map.classes import ChangeClass
+from gnd.gnd_map.gaussian import Gaussians, concat
+from gnd.gnd_map.geodesy import LocalFrame
+from gnd.gnd_map.tile import Tile
+from gnd.tile_store.sqlite_store import SqliteStore
+from gnd.tile_store.values import ReportRow
+from gnd.vehicle_agent.way import Milestone
 
 BASE, HEALED = at([1, 3, 4]), concat([at([1, 2]), at([3], up_m=0.3)])
 T0_NS, WALL_NS = 1_570_838_400 * 10**9, 1_800_000_000 * 10**9

@@ -7,13 +7,13 @@ from pathlib import Path
 import pytest
 from rich.console import Console
 
-from deploy.live import FleetState, live_view, render
-from deploy.live_traffic import LiveLedgers, Rate
-from deploy.map_use import MapUse
-from fleet_bus.ledger import Direction, Ledger
-from fleet_bus.links import UNLIMITED, LinkProfile
-from fleet_bus.wire import WireBytes
-from schemas.traffic import TrafficSample
+from gnd.deploy.live import FleetState, live_view, render
+from gnd.deploy.live_traffic import LiveLedgers, Rate
+from gnd.deploy.map_use import MapUse
+from gnd.fleet_bus.ledger import Direction, Ledger
+from gnd.fleet_bus.links import UNLIMITED, LinkProfile
+from gnd.fleet_bus.wire import WireBytes
+from gnd.schemas.traffic import TrafficSample
 
 LINK = LinkProfile("test", down_bit_s=8_000_000, up_bit_s=800_000)
 

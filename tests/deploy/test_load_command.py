@@ -2,9 +2,9 @@ import pytest
 from click.testing import CliRunner
 from load_testing import make_run
 
-from deploy.cli import gnd
-from deploy.load.command import table_of
-from deploy.load.errors import LoadError
+from gnd.deploy.cli import gnd
+from gnd.deploy.load.command import table_of
+from gnd.deploy.load.errors import LoadError
 
 
 def said(*arguments):

@@ -2,14 +2,14 @@ import numpy as np
 import pytest
 from load_testing import LENGTH_M, against, make_run, put_vehicle, street_tiles, whole_report
 
-from deploy.load.drives import KeptRuns, read_street
-from deploy.load.errors import LoadError
-from deploy.load.plan import LoadOptions, Timetable, shared_out
-from deploy.load.streets import Streets
-from deploy.run_folder import RunFolder
-from schemas.keys import change_key
-from schemas.packed import PackedReport
-from vehicle_agent.outbox import Outbox
+from gnd.deploy.load.drives import KeptRuns, read_street
+from gnd.deploy.load.errors import LoadError
+from gnd.deploy.load.plan import LoadOptions, Timetable, shared_out
+from gnd.deploy.load.streets import Streets
+from gnd.deploy.run_folder import RunFolder
+from gnd.schemas.keys import change_key
+from gnd.schemas.packed import PackedReport
+from gnd.vehicle_agent.outbox import Outbox
 
 
 def table(**options):

@@ -11,12 +11,12 @@ import apsw
 import pytest
 from load_testing import make_run
 
-from deploy.load.client import start_file
-from deploy.load.cpu import children
-from deploy.load.drives import KeptRuns
-from deploy.load.plan import LoadOptions
-from deploy.load.run import run_load
-from deploy.load.verdict import summary
+from gnd.deploy.load.client import start_file
+from gnd.deploy.load.cpu import children
+from gnd.deploy.load.drives import KeptRuns
+from gnd.deploy.load.plan import LoadOptions
+from gnd.deploy.load.run import run_load
+from gnd.deploy.load.verdict import summary
 
 OPTIONS = LoadOptions(vehicles=4, km=0.25, kmh=180.0, per_street=2, shards=1, clients=1, in_flight=8)
 

@@ -2,10 +2,10 @@ import numpy as np
 import pytest
 from load_testing import FIRST, street_tiles, track_along, whole_report
 
-from cloud_merger.errors import MissingBase
-from cloud_merger.expanding import expand, with_measured
-from deploy.load.errors import LoadError
-from deploy.load.shift import (
+from gnd.cloud_merger.errors import MissingBase
+from gnd.cloud_merger.expanding import expand, with_measured
+from gnd.deploy.load.errors import LoadError
+from gnd.deploy.load.shift import (
     DISTRICT_TILES,
     DISTRICTS_ROUND,
     Shift,
@@ -14,9 +14,9 @@ from deploy.load.shift import (
     shifted_tile,
     shifted_tile_id,
 )
-from gnd_map.codec import encode_mask
-from gnd_map.tile_id import LON_TILES, TileId
-from vehicle_agent.packing import askable, pack, pack_measured
+from gnd.gnd_map.codec import encode_mask
+from gnd.gnd_map.tile_id import LON_TILES, TileId
+from gnd.vehicle_agent.packing import askable, pack, pack_measured
 
 
 @pytest.mark.parametrize("districts", [0, 1, -1, 7, -1000, 20_000])

@@ -4,10 +4,10 @@ from dataclasses import replace
 
 import pytest
 
-from deploy.load.audit import Backlog, Ledger, Merged
-from deploy.load.plan import LoadOptions
-from deploy.load.sending import Account
-from deploy.load.verdict import Outcome, summary, why_not
+from gnd.deploy.load.audit import Backlog, Ledger, Merged
+from gnd.deploy.load.plan import LoadOptions
+from gnd.deploy.load.sending import Account
+from gnd.deploy.load.verdict import Outcome, summary, why_not
 
 N, RUN_S = 200, 100.0
 

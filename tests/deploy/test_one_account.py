@@ -5,16 +5,16 @@ from pathlib import Path
 
 from account_testing import assert_one_account
 
-from deploy.account import account_traffic
-from deploy.live_traffic import LiveLedgers, traffic_lines
-from deploy.ports import claim_port
-from deploy.run_folder import RunFolder
-from fleet_bus.bus import open_bus
-from fleet_bus.config import BusConfig
-from fleet_bus.ledger import Ledger
-from fleet_bus.router import open_router
-from fleet_bus.wire import WireBytes
-from gnd_map.tile_id import TileId
+from gnd.deploy.account import account_traffic
+from gnd.deploy.live_traffic import LiveLedgers, traffic_lines
+from gnd.deploy.ports import claim_port
+from gnd.deploy.run_folder import RunFolder
+from gnd.fleet_bus.bus import open_bus
+from gnd.fleet_bus.config import BusConfig
+from gnd.fleet_bus.ledger import Ledger
+from gnd.fleet_bus.router import open_router
+from gnd.fleet_bus.wire import WireBytes
+from gnd.gnd_map.tile_id import TileId
 
 TILE = TileId.from_path("13033/03021/23031/22102")
 

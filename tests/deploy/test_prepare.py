@@ -6,10 +6,10 @@ from pathlib import Path
 import pytest
 from rich.progress import Progress
 
-from deploy import prepare
-from deploy.fleet_config import FleetConfig
-from deploy.run_folder import create_run_folder
-from deploy.source import Source
+from gnd.deploy import prepare
+from gnd.deploy.fleet_config import FleetConfig
+from gnd.deploy.run_folder import create_run_folder
+from gnd.deploy.source import Source
 
 pytestmark = pytest.mark.slow
 

@@ -11,16 +11,16 @@ import numpy as np
 import pytest
 from fleet_testing import Run
 
-from deploy.account import TileHistory, tile_histories
-from fleet_sim.insert_drive import rewrite_drive
-from fleet_sim.shapes import Block
-from gnd_map.accumulate import VoxelAccumulator
-from gnd_map.grid import GridFrame
-from gnd_map.tile_id import TileId, covering_circle
-from schemas.drive_mcap import load_track, read_header
-from tile_store.build import build_map
-from tile_store.sqlite_store import SqliteStore
-from vehicle_agent.importer import import_recording
+from gnd.deploy.account import TileHistory, tile_histories
+from gnd.fleet_sim.insert_drive import rewrite_drive
+from gnd.fleet_sim.shapes import Block
+from gnd.gnd_map.accumulate import VoxelAccumulator
+from gnd.gnd_map.grid import GridFrame
+from gnd.gnd_map.tile_id import TileId, covering_circle
+from gnd.schemas.drive_mcap import load_track, read_header
+from gnd.tile_store.build import build_map
+from gnd.tile_store.sqlite_store import SqliteStore
+from gnd.vehicle_agent.importer import import_recording
 
 pytestmark = pytest.mark.slow
 

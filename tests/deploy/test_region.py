@@ -2,9 +2,9 @@ import math
 
 import pytest
 
-from deploy.errors import RegionError
-from deploy.region import parse_region
-from gnd_map.tile_id import TileId
+from gnd.deploy.errors import RegionError
+from gnd.deploy.region import parse_region
+from gnd.gnd_map.tile_id import TileId
 
 SEOUL = TileId(497353963154)
 

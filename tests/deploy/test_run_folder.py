@@ -2,8 +2,8 @@ from pathlib import Path
 
 import pytest
 
-from deploy.errors import RunFolderError
-from deploy.run_folder import create_run_folder
+from gnd.deploy.errors import RunFolderError
+from gnd.deploy.run_folder import create_run_folder
 
 
 def test_a_new_folder_has_its_parts(tmp_path: Path) -> None:

@@ -8,13 +8,13 @@ import sys
 import pytest
 from click.testing import CliRunner
 
-from deploy.cli import main
-from deploy.errors import PageError
-from deploy.run_folder import RunFolder
-from deploy.traffic_cli import traffic
-from fleet_bus.errors import LinkError
-from fleet_bus.ledger import Ledger
-from fleet_bus.wire import WireBytes
+from gnd.deploy.cli import main
+from gnd.deploy.errors import PageError
+from gnd.deploy.run_folder import RunFolder
+from gnd.deploy.traffic_cli import traffic
+from gnd.fleet_bus.errors import LinkError
+from gnd.fleet_bus.ledger import Ledger
+from gnd.fleet_bus.wire import WireBytes
 
 
 @pytest.fixture
@@ -122,7 +122,7 @@ def test_the_command_line_says_in_one_line_what_is_wrong(run, tmp_path, monkeypa
 
 
 def test_a_finished_run_has_its_page_and_its_lines(run, tmp_path):
-    from deploy.account import account_traffic
+    from gnd.deploy.account import account_traffic
 
     traffic = account_traffic(RunFolder(run))
     assert sum(line["wire_bytes"] for line in traffic["by_kind"]) == 18_000

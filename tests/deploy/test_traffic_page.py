@@ -8,15 +8,15 @@ from pathlib import Path
 
 import pytest
 
-from deploy.errors import PageError
-from deploy.traffic_page import page, write_page
-from deploy.traffic_page_chart import Axes, apart, curves, time_ticks
-from fleet_bus.ledger import Ledger
-from fleet_bus.ledger_file import read_ledger
-from fleet_bus.links import LinkProfile, load_link
-from fleet_bus.traffic import AgentTraffic, agent_traffic
-from fleet_bus.wire import WireBytes
-from gnd_map.tile_id import TileId
+from gnd.deploy.errors import PageError
+from gnd.deploy.traffic_page import page, write_page
+from gnd.deploy.traffic_page_chart import Axes, apart, curves, time_ticks
+from gnd.fleet_bus.ledger import Ledger
+from gnd.fleet_bus.ledger_file import read_ledger
+from gnd.fleet_bus.links import LinkProfile, load_link
+from gnd.fleet_bus.traffic import AgentTraffic, agent_traffic
+from gnd.fleet_bus.wire import WireBytes
+from gnd.gnd_map.tile_id import TileId
 
 TILES = [TileId.from_path(f"13033/03021/23031/2210{digit}") for digit in range(4)]
 LINKS = tuple(load_link(name) for name in ("3g", "4g", "5g"))

@@ -8,18 +8,18 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from deploy.region import parse_region
-from deploy.watch import TileWatch, WatchEvent
-from fleet_bus.bus import Bus, open_bus
-from fleet_bus.config import BusConfig
-from fleet_bus.router import open_router
-from gnd_map.gaussian import Gaussians
-from gnd_map.tile import Tile, diff
-from gnd_map.tile_id import TileId
-from schemas.keys import update_key
-from schemas.updates import TileUpdate
-from tile_store.server import TileServer
-from tile_store.sqlite_store import SqliteStore
+from gnd.deploy.region import parse_region
+from gnd.deploy.watch import TileWatch, WatchEvent
+from gnd.fleet_bus.bus import Bus, open_bus
+from gnd.fleet_bus.config import BusConfig
+from gnd.fleet_bus.router import open_router
+from gnd.gnd_map.gaussian import Gaussians
+from gnd.gnd_map.tile import Tile, diff
+from gnd.gnd_map.tile_id import TileId
+from gnd.schemas.keys import update_key
+from gnd.schemas.updates import TileUpdate
+from gnd.tile_store.server import TileServer
+from gnd.tile_store.sqlite_store import SqliteStore
 
 HERE, ELSEWHERE = TileId(497353963154), TileId(0)
 DEADLINE_S = 30.0

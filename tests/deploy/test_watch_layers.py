@@ -11,17 +11,17 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from cloud_merger.announce import encoded, update_of
-from deploy.region import parse_region
-from deploy.watch import TileWatch, WatchEvent
-from fleet_bus.bus import Bus, open_bus
-from fleet_bus.config import BusConfig
-from fleet_bus.router import open_router
-from gnd_map.features import Feature, FeatureTile, hit
-from gnd_map.tile_id import TileId
-from schemas.keys import update_key
-from tile_store.server import TileServer
-from tile_store.sqlite_store import SqliteStore
+from gnd.cloud_merger.announce import encoded, update_of
+from gnd.deploy.region import parse_region
+from gnd.deploy.watch import TileWatch, WatchEvent
+from gnd.fleet_bus.bus import Bus, open_bus
+from gnd.fleet_bus.config import BusConfig
+from gnd.fleet_bus.router import open_router
+from gnd.gnd_map.features import Feature, FeatureTile, hit
+from gnd.gnd_map.tile_id import TileId
+from gnd.schemas.keys import update_key
+from gnd.tile_store.server import TileServer
+from gnd.tile_store.sqlite_store import SqliteStore
 
 HERE, ELSEWHERE = TileId(497353963154), TileId(0)
 LAYERS = ("signs", "streetlights", "poles")
@@ -134,7 +134,7 @@ def printed(bus: Bus, lines: "queue.Queue[str]", key: str, notice: bytes) -> str
 
 def test_the_command_follows_several_layers(endpoint: str, bus: Bus, store: SqliteStore) -> None:
     region = ["13033/03021/**", "--layer", "signs", "--layer", "streetlights", "--json", "--connect", endpoint]
-    command = [sys.executable, "-m", "deploy.cli", "watch", *region]
+    command = [sys.executable, "-m", "gnd.deploy.cli", "watch", *region]
     lines: queue.Queue[str] = queue.Queue()
     with subprocess.Popen(command, stdout=subprocess.PIPE, text=True, cwd=SUBSCRIBE.parents[1]) as process:
         reader = threading.Thread(target=lambda: [lines.put(line.strip()) for line in process.stdout or ()])

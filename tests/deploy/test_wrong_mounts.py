@@ -6,13 +6,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from deploy.errors import DeployError
-from deploy.fleet_config import FleetConfig
-from deploy.mounts import with_wrong_mounts
-from gnd_map.geodesy import LocalFrame
-from gnd_map.se3 import exp_so3
-from schemas.drive import DriveHeader, GnssFix, MotionSample, Scan
-from schemas.drive_mcap import DriveWriter, read_drive, read_header
+from gnd.deploy.errors import DeployError
+from gnd.deploy.fleet_config import FleetConfig
+from gnd.deploy.mounts import with_wrong_mounts
+from gnd.gnd_map.geodesy import LocalFrame
+from gnd.gnd_map.se3 import exp_so3
+from gnd.schemas.drive import DriveHeader, GnssFix, MotionSample, Scan
+from gnd.schemas.drive_mcap import DriveWriter, read_drive, read_header
 
 T_VEHICLE_LIDAR = np.eye(4)
 T_VEHICLE_LIDAR[:3, :3] = exp_so3(np.array([0.1, 0.0, 0.0]))

@@ -3,14 +3,14 @@
 import numpy as np
 from vehicle_scene import FIGURE_2
 
-from gnd_map.classes import ChangeClass
-from gnd_map.gaussian import Gaussians
-from gnd_map.grid import VoxelGrid
-from gnd_map.tile import Tile
-from vehicle_agent.detect.beyond import beyond_map
-from vehicle_agent.detect.classify import Classification
-from vehicle_agent.detect.detector import tile_evidence
-from vehicle_agent.detect.doubts import changed_share_of
+from gnd.gnd_map.classes import ChangeClass
+from gnd.gnd_map.gaussian import Gaussians
+from gnd.gnd_map.grid import VoxelGrid
+from gnd.gnd_map.tile import Tile
+from gnd.vehicle_agent.detect.beyond import beyond_map
+from gnd.vehicle_agent.detect.classify import Classification
+from gnd.vehicle_agent.detect.detector import tile_evidence
+from gnd.vehicle_agent.detect.doubts import changed_share_of
 
 TILE = FIGURE_2[0]
 GRID = VoxelGrid.of(TILE)

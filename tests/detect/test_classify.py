@@ -6,14 +6,14 @@ import numpy as np
 import pytest
 from vehicle_scene import FIGURE_2
 
-from gnd_map.classes import ChangeClass
-from gnd_map.gaussian import Gaussians
-from gnd_map.tile import Tile
-from schemas.changes import TileChange
-from vehicle_agent.detect.classify import Classification, classify, tile_change
-from vehicle_agent.detect.evidence import TileEvidence
-from vehicle_agent.detect.parameters import DetectParameters
-from vehicle_agent.detect.uncertainty import PoseUncertainty
+from gnd.gnd_map.classes import ChangeClass
+from gnd.gnd_map.gaussian import Gaussians
+from gnd.gnd_map.tile import Tile
+from gnd.schemas.changes import TileChange
+from gnd.vehicle_agent.detect.classify import Classification, classify, tile_change
+from gnd.vehicle_agent.detect.evidence import TileEvidence
+from gnd.vehicle_agent.detect.parameters import DetectParameters
+from gnd.vehicle_agent.detect.uncertainty import PoseUncertainty
 
 PLANE = (0.0008, 0.0, 0.0, 0.08, 0.0, 0.08)  # upright, facing x
 FIRST_VOXEL = 36_000

@@ -6,17 +6,17 @@ import numpy as np
 import pytest
 from vehicle_scene import FIGURE_2, GRID_FRAME, HEIGHT_M, SENSOR, ground, look, tiles_of, wall
 
-from gnd_map.classes import ChangeClass
-from gnd_map.errors import ShapeError
-from gnd_map.gaussian import Gaussians
-from gnd_map.tile import Tile
-from gnd_map.tile_id import TileId
-from vehicle_agent.detect.classify import classify
-from vehicle_agent.detect.detector import ChangeDetector
-from vehicle_agent.detect.evidence import TileEvidence
-from vehicle_agent.detect.parameters import DetectParameters
-from vehicle_agent.errors import MapChanged
-from vehicle_agent.local_map import LocalMap
+from gnd.gnd_map.classes import ChangeClass
+from gnd.gnd_map.errors import ShapeError
+from gnd.gnd_map.gaussian import Gaussians
+from gnd.gnd_map.tile import Tile
+from gnd.gnd_map.tile_id import TileId
+from gnd.vehicle_agent.detect.classify import classify
+from gnd.vehicle_agent.detect.detector import ChangeDetector
+from gnd.vehicle_agent.detect.evidence import TileEvidence
+from gnd.vehicle_agent.detect.parameters import DetectParameters
+from gnd.vehicle_agent.errors import MapChanged
+from gnd.vehicle_agent.local_map import LocalMap
 
 NEAR, FAR = (9.3, -8.0, 8.0, 4.0), (14.3, -8.0, 8.0, 4.0)
 MODES = {"default": DetectParameters(), "paper": DetectParameters.paper()}

@@ -4,12 +4,12 @@ import numpy as np
 import pytest
 from vehicle_scene import FIGURE_2
 
-from gnd_map.gaussian import Gaussians
-from gnd_map.grid import VoxelGrid
-from gnd_map.tile import Tile
-from vehicle_agent.detect.extension import extends_neighbour
-from vehicle_agent.detect.parameters import DetectParameters
-from vehicle_agent.detect.records import planar_normals
+from gnd.gnd_map.gaussian import Gaussians
+from gnd.gnd_map.grid import VoxelGrid
+from gnd.gnd_map.tile import Tile
+from gnd.vehicle_agent.detect.extension import extends_neighbour
+from gnd.vehicle_agent.detect.parameters import DetectParameters
+from gnd.vehicle_agent.detect.records import planar_normals
 
 TILE = FIGURE_2[0]
 GRID = VoxelGrid.of(TILE)

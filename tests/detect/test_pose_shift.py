@@ -5,12 +5,12 @@ import pytest
 from gate_scene import CORRIDOR, POSE, WALLS, Wall, map_of, match_maps, seen, shift
 from numpy.typing import NDArray
 
-from gnd_map.se3 import T_inverse, transform
-from vehicle_agent.detect.fit_kernel import UNKNOWN_COST
-from vehicle_agent.detect.shift import Shift, ShiftError, ShiftParameters, costs_at, find_shift
-from vehicle_agent.detect.uncertainty import PoseUncertainty
-from vehicle_agent.local_map import LocalMap
-from vehicle_agent.localise.match_map import MatchMap
+from gnd.gnd_map.se3 import T_inverse, transform
+from gnd.vehicle_agent.detect.fit_kernel import UNKNOWN_COST
+from gnd.vehicle_agent.detect.shift import Shift, ShiftError, ShiftParameters, costs_at, find_shift
+from gnd.vehicle_agent.detect.uncertainty import PoseUncertainty
+from gnd.vehicle_agent.local_map import LocalMap
+from gnd.vehicle_agent.localise.match_map import MatchMap
 
 PARAMETERS, SURE = ShiftParameters(), PoseUncertainty(0.01, 0.0005)
 ERRORS = {

@@ -7,12 +7,12 @@ import pytest
 import scipy.stats
 from plain_rays import PlainDetector, PlainMap
 
-from vehicle_agent.detect.chi_square import confidence, quantile
-from vehicle_agent.detect.kernel import cast_rays, kernel_parameters, window_affine
-from vehicle_agent.detect.parameters import DetectParameterError, DetectParameters
-from vehicle_agent.detect.records import N_BI, N_BO, N_PI, N_PO, make_records
-from vehicle_agent.detect.uncertainty import PoseUncertainty
-from vehicle_agent.local_map import EMPTY, UNKNOWN
+from gnd.vehicle_agent.detect.chi_square import confidence, quantile
+from gnd.vehicle_agent.detect.kernel import cast_rays, kernel_parameters, window_affine
+from gnd.vehicle_agent.detect.parameters import DetectParameterError, DetectParameters
+from gnd.vehicle_agent.detect.records import N_BI, N_BO, N_PI, N_PO, make_records
+from gnd.vehicle_agent.detect.uncertainty import PoseUncertainty
+from gnd.vehicle_agent.local_map import EMPTY, UNKNOWN
 
 SHAPE = (14, 12, 9)
 A_GRID = np.array([[1.021, 0.013, 0.0], [-0.011, 1.018, 0.0002], [0.0, 0.0001, 1.0]])  # a grid turned and stretched

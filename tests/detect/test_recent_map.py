@@ -4,11 +4,11 @@ import numpy as np
 import pytest
 from gate_scene import POSE, START_NS, WALLS, map_of, match_maps, scan, seen, shift
 
-from gnd_map.se3 import T_inverse, transform
-from vehicle_agent.detect.recent_map import recent_map
-from vehicle_agent.detect.shift import ShiftParameters, costs_at, find_shift, gain
-from vehicle_agent.detect.trial import Trial
-from vehicle_agent.detect.uncertainty import PoseUncertainty
+from gnd.gnd_map.se3 import T_inverse, transform
+from gnd.vehicle_agent.detect.recent_map import recent_map
+from gnd.vehicle_agent.detect.shift import ShiftParameters, costs_at, find_shift, gain
+from gnd.vehicle_agent.detect.trial import Trial
+from gnd.vehicle_agent.detect.uncertainty import PoseUncertainty
 
 REBUILT = [((a[0] + 0.4, a[1]), (b[0] + 0.4, b[1])) for a, b in WALLS]
 """All that stands has moved by 40 cm alike: what no test against the base map can tell."""

@@ -7,10 +7,10 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from benchmarks.fit_shape_change import Examples, fit, forest_of
-from gnd_map.gaussian import Gaussians
-from vehicle_agent.detect.parameters import DetectParameters
-from vehicle_agent.detect.shape_change import FEATURES, MONOTONE, Forest, ShapeModelError, fitted, shape_features
+from gnd.gnd_map.gaussian import Gaussians
+from gnd.vehicle_agent.detect.parameters import DetectParameters
+from gnd.vehicle_agent.detect.shape_change import FEATURES, MONOTONE, Forest, ShapeModelError, fitted, shape_features
+from studies.fit_shape_change import Examples, fit, forest_of
 
 
 def examples(n: int = 3000) -> Examples:

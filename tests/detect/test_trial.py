@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 from gate_scene import CORRIDOR, START_NS, WALLS, map_of, match_maps, scan, seen, shift
 
-from vehicle_agent.detect.shift import ShiftParameters
-from vehicle_agent.detect.trial import Trial
-from vehicle_agent.local_map import LocalMap
+from gnd.vehicle_agent.detect.shift import ShiftParameters
+from gnd.vehicle_agent.detect.trial import Trial
+from gnd.vehicle_agent.local_map import LocalMap
 
 SEGMENT = 5  # scans of 0.1 s
 

@@ -6,16 +6,16 @@ import numpy as np
 import pytest
 from vehicle_scene import GRID_FRAME, SENSOR, ground, look, tiles_of, wall
 
-from gnd_map.arrays import F64
-from gnd_map.classes import ChangeClass
-from gnd_map.tile import Tile
-from gnd_map.tile_id import TileId
-from vehicle_agent.detect.classify import classify
-from vehicle_agent.detect.detector import ChangeDetector
-from vehicle_agent.detect.parameters import DetectParameterError, DetectParameters, SoftParameters
-from vehicle_agent.detect.uncertainty import PoseUncertainty, TileUncertainties, UncertaintyError
-from vehicle_agent.local_map import LocalMap
-from vehicle_agent.localise.estimates import PoseEstimate
+from gnd.gnd_map.arrays import F64
+from gnd.gnd_map.classes import ChangeClass
+from gnd.gnd_map.tile import Tile
+from gnd.gnd_map.tile_id import TileId
+from gnd.vehicle_agent.detect.classify import classify
+from gnd.vehicle_agent.detect.detector import ChangeDetector
+from gnd.vehicle_agent.detect.parameters import DetectParameterError, DetectParameters, SoftParameters
+from gnd.vehicle_agent.detect.uncertainty import PoseUncertainty, TileUncertainties, UncertaintyError
+from gnd.vehicle_agent.local_map import LocalMap
+from gnd.vehicle_agent.localise.estimates import PoseEstimate
 
 Tiles = dict[TileId, Tile]
 

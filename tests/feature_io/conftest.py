@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pytest
 
-from tile_store.sqlite_store import SqliteStore
+from gnd.tile_store.sqlite_store import SqliteStore
 
 
 @pytest.fixture

@@ -4,11 +4,11 @@ from pathlib import Path
 
 import numpy as np
 
-from tile_store.feature_io.about import about_options
-from tile_store.feature_io.formats import export_features, read_features
-from tile_store.feature_io.stored import ImportResult, import_features
-from tile_store.feature_io.values import ImportOptions, MapFeature
-from tile_store.sqlite_store import SqliteStore
+from gnd.tile_store.feature_io.about import about_options
+from gnd.tile_store.feature_io.formats import export_features, read_features
+from gnd.tile_store.feature_io.stored import ImportResult, import_features
+from gnd.tile_store.feature_io.values import ImportOptions, MapFeature
+from gnd.tile_store.sqlite_store import SqliteStore
 
 STREET = b"""<?xml version='1.0' encoding='UTF-8'?>
 <!-- drawn by hand; kept -->
@@ -81,6 +81,6 @@ def apart_m(a: MapFeature, b: MapFeature) -> float:
 
 
 def _frame(feature: MapFeature):  # type: ignore[no-untyped-def]
-    from gnd_map.geodesy import LocalFrame
+    from gnd.gnd_map.geodesy import LocalFrame
 
     return LocalFrame(float(feature.lat_rad[0]), float(feature.lon_rad[0]), float(feature.height_m[0]))

@@ -8,9 +8,9 @@ import numpy as np
 import pyproj
 import pytest
 
-from tile_store.feature_io import errors
-from tile_store.feature_io.argoverse import CITIES, city_of, geodetic_of_city, read_argoverse
-from tile_store.feature_io.values import ImportOptions
+from gnd.tile_store.feature_io import errors
+from gnd.tile_store.feature_io.argoverse import CITIES, city_of, geodetic_of_city, read_argoverse
+from gnd.tile_store.feature_io.values import ImportOptions
 
 NAME = "log_map_archive_00000000____PIT_city_1.json"
 

@@ -7,16 +7,16 @@ import numpy as np
 import pytest
 from small_maps import STREET, put, write
 
-from gnd_map.errors import GndError
-from tile_store.feature_io import errors
-from tile_store.feature_io.formats import format_of, read_features
-from tile_store.feature_io.json_file import read_json
-from tile_store.feature_io.lane_crossing import crossing_of
-from tile_store.feature_io.osm_document import read_osm
-from tile_store.feature_io.placement import Placement
-from tile_store.feature_io.values import ImportOptions
-from tile_store.feature_io.xml_spans import read_bytes, read_root
-from tile_store.sqlite_store import SqliteStore
+from gnd.gnd_map.errors import GndError
+from gnd.tile_store.feature_io import errors
+from gnd.tile_store.feature_io.formats import format_of, read_features
+from gnd.tile_store.feature_io.json_file import read_json
+from gnd.tile_store.feature_io.lane_crossing import crossing_of
+from gnd.tile_store.feature_io.osm_document import read_osm
+from gnd.tile_store.feature_io.placement import Placement
+from gnd.tile_store.feature_io.values import ImportOptions
+from gnd.tile_store.feature_io.xml_spans import read_bytes, read_root
+from gnd.tile_store.sqlite_store import SqliteStore
 
 NODES = '<node id="1" lat="49" lon="8"/><node id="2" lat="49.0001" lon="8.0001"/>'
 BOMB = """<?xml version="1.0"?>

@@ -5,10 +5,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from gnd_map.geodesy import LocalFrame
-from gnd_map.se3 import T_from_R_t, exp_so3
-from vehicle_agent.errors import LocaliseError
-from vehicle_agent.localise.drawn_map import placement_by_track, read_fixes, read_track
+from gnd.gnd_map.geodesy import LocalFrame
+from gnd.gnd_map.se3 import T_from_R_t, exp_so3
+from gnd.vehicle_agent.errors import LocaliseError
+from gnd.vehicle_agent.localise.drawn_map import placement_by_track, read_fixes, read_track
 
 FRAME = LocalFrame(np.radians(48.0), np.radians(11.0), 0.0)
 TURN = 0.7

@@ -11,13 +11,13 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from small_maps import STREET, put, write
 
-from gnd_map.features import Existence
-from tile_store.feature_io.formats import export_features, read_features
-from tile_store.feature_io.geojson_export import write_geojson
-from tile_store.feature_io.geojson_import import read_geojson
-from tile_store.feature_io.stored import import_features, load_features
-from tile_store.feature_io.values import ImportOptions, MapFeature
-from tile_store.sqlite_store import SqliteStore
+from gnd.gnd_map.features import Existence
+from gnd.tile_store.feature_io.formats import export_features, read_features
+from gnd.tile_store.feature_io.geojson_export import write_geojson
+from gnd.tile_store.feature_io.geojson_import import read_geojson
+from gnd.tile_store.feature_io.stored import import_features, load_features
+from gnd.tile_store.feature_io.values import ImportOptions, MapFeature
+from gnd.tile_store.sqlite_store import SqliteStore
 
 GEOD = pyproj.Geod(ellps="WGS84")
 

@@ -12,24 +12,24 @@ from matplotlib.path import Path as Outline
 from scipy.spatial import cKDTree
 from test_feature_geojson import check_rfc7946
 
-from deploy.features_cli import features
-from fleet_bus.bus import open_bus
-from fleet_bus.config import BusConfig
-from fleet_bus.router import open_router
-from gnd_map.content import codecs_of_layer
-from gnd_map.features import FeatureTile
-from gnd_map.geodesy import LocalFrame
-from schemas import keys
-from schemas.tiles import TileReply, TileRequest, features_of
-from tile_store.feature_io.about import options_about
-from tile_store.feature_io.lanelet2_export import write_lanelet2
-from tile_store.feature_io.lanelet2_import import drawn_features
-from tile_store.feature_io.osm_document import read_osm
-from tile_store.feature_io.stored import feature_layers, load_features, sources_of
-from tile_store.feature_io.values import MapFeature
-from tile_store.server import TileServer
-from tile_store.sqlite_store import SqliteStore
-from vehicle_agent.localise.drawn_map import read_fixes, read_track
+from gnd.deploy.features_cli import features
+from gnd.fleet_bus.bus import open_bus
+from gnd.fleet_bus.config import BusConfig
+from gnd.fleet_bus.router import open_router
+from gnd.gnd_map.content import codecs_of_layer
+from gnd.gnd_map.features import FeatureTile
+from gnd.gnd_map.geodesy import LocalFrame
+from gnd.schemas import keys
+from gnd.schemas.tiles import TileReply, TileRequest, features_of
+from gnd.tile_store.feature_io.about import options_about
+from gnd.tile_store.feature_io.lanelet2_export import write_lanelet2
+from gnd.tile_store.feature_io.lanelet2_import import drawn_features
+from gnd.tile_store.feature_io.osm_document import read_osm
+from gnd.tile_store.feature_io.stored import feature_layers, load_features, sources_of
+from gnd.tile_store.feature_io.values import MapFeature
+from gnd.tile_store.server import TileServer
+from gnd.tile_store.sqlite_store import SqliteStore
+from gnd.vehicle_agent.localise.drawn_map import read_fixes, read_track
 
 OSM, POSES, FIXES = "lanelet2_route_1.osm", "route1_pose_kitti.txt", "route_1_GPS.txt"
 AV2 = ("3bffdcff", "7fab2350")

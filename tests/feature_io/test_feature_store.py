@@ -7,14 +7,14 @@ import numpy as np
 import pytest
 from small_maps import STREET, STREET_IDS, put, write
 
-from gnd_map.features import FeatureTile
-from tile_store.feature_io import stored
-from tile_store.feature_io.errors import BadGeometry, DuplicateId, FeatureFileError
-from tile_store.feature_io.formats import export_features, read_features
-from tile_store.feature_io.sources import Source
-from tile_store.feature_io.stored import import_features, layer_tiles, load_features, sources_of
-from tile_store.feature_io.values import FeatureFile, ImportOptions
-from tile_store.sqlite_store import SqliteStore
+from gnd.gnd_map.features import FeatureTile
+from gnd.tile_store.feature_io import stored
+from gnd.tile_store.feature_io.errors import BadGeometry, DuplicateId, FeatureFileError
+from gnd.tile_store.feature_io.formats import export_features, read_features
+from gnd.tile_store.feature_io.sources import Source
+from gnd.tile_store.feature_io.stored import import_features, layer_tiles, load_features, sources_of
+from gnd.tile_store.feature_io.values import FeatureFile, ImportOptions
+from gnd.tile_store.sqlite_store import SqliteStore
 
 
 def ids(store: SqliteStore) -> set[int]:

@@ -11,10 +11,10 @@ import pytest
 from click.testing import CliRunner
 from small_maps import STREET, write
 
-from deploy.features_cli import features
-from gnd_map.errors import GndError
-from gnd_map.geodesy import LocalFrame
-from tile_store.sqlite_store import SqliteStore
+from gnd.deploy.features_cli import features
+from gnd.gnd_map.errors import GndError
+from gnd.gnd_map.geodesy import LocalFrame
+from gnd.tile_store.sqlite_store import SqliteStore
 
 LOCAL = """<osm version="0.6"><node id="1" lat="0" lon="0"><tag k="type" v="pole"/><tag k="local_x" v="10"/>
 <tag k="local_y" v="20"/></node></osm>"""
@@ -125,7 +125,7 @@ def test_a_georeference_is_an_anchor_latlon_or_a_track(tmp_path: Path) -> None:
 
 
 def test_the_command_tells_errors_in_one_line(tmp_path: Path) -> None:
-    command = [sys.executable, "-m", "deploy.cli", "features", "import", str(tmp_path / "no.osm"), "-o", "x"]
+    command = [sys.executable, "-m", "gnd.deploy.cli", "features", "import", str(tmp_path / "no.osm"), "-o", "x"]
     done = subprocess.run(command, capture_output=True, text=True, check=False)
     assert (done.returncode, done.stdout) == (2, "")
     assert done.stderr == f"gnd: {tmp_path / 'no.osm'}: cannot be read: No such file or directory\n"

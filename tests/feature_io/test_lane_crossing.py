@@ -4,7 +4,7 @@ import numpy as np
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from tile_store.feature_io.lane_crossing import crossing_of
+from gnd.tile_store.feature_io.lane_crossing import crossing_of
 
 
 def side(a: np.ndarray, b: np.ndarray, p: np.ndarray) -> float:

@@ -10,16 +10,16 @@ import numpy as np
 import pytest
 from small_maps import STREET, STREET_IDS, exported, put, write
 
-from gnd_map.features import FeatureTile, feature_id_of
-from gnd_map.geodesy import LocalFrame
-from tile_store.feature_io.about import about_options, options_about
-from tile_store.feature_io.formats import export_features, read_features
-from tile_store.feature_io.lanelet2_export import write_lanelet2
-from tile_store.feature_io.lanelet2_import import read_lanelet2
-from tile_store.feature_io.placement import Placement
-from tile_store.feature_io.stored import layer_tiles, load_features, sources_of
-from tile_store.feature_io.values import ImportOptions, MapFeature
-from tile_store.sqlite_store import SqliteStore
+from gnd.gnd_map.features import FeatureTile, feature_id_of
+from gnd.gnd_map.geodesy import LocalFrame
+from gnd.tile_store.feature_io.about import about_options, options_about
+from gnd.tile_store.feature_io.formats import export_features, read_features
+from gnd.tile_store.feature_io.lanelet2_export import write_lanelet2
+from gnd.tile_store.feature_io.lanelet2_import import read_lanelet2
+from gnd.tile_store.feature_io.placement import Placement
+from gnd.tile_store.feature_io.stored import layer_tiles, load_features, sources_of
+from gnd.tile_store.feature_io.values import ImportOptions, MapFeature
+from gnd.tile_store.sqlite_store import SqliteStore
 
 SOURCE = "street.osm"
 MM = 1e-3

@@ -6,11 +6,11 @@ import numpy as np
 import pyproj
 import pytest
 
-from gnd_map.geodesy import LocalFrame
-from tile_store.feature_io import errors
-from tile_store.feature_io.opendrive_import import read_opendrive
-from tile_store.feature_io.placement import Placement
-from tile_store.feature_io.values import FeatureFile, ImportOptions
+from gnd.gnd_map.geodesy import LocalFrame
+from gnd.tile_store.feature_io import errors
+from gnd.tile_store.feature_io.opendrive_import import read_opendrive
+from gnd.tile_store.feature_io.placement import Placement
+from gnd.tile_store.feature_io.values import FeatureFile, ImportOptions
 
 PROJ = "+proj=tmerc +lat_0=48 +lon_0=11 +k=1 +x_0=0 +y_0=0 +datum=WGS84 +units=m +no_defs"
 HEADER = f'<header revMajor="1" revMinor="7"><geoReference><![CDATA[{PROJ}]]></geoReference></header>'

@@ -5,12 +5,12 @@ import xml.etree.ElementTree as ET
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from tile_store.feature_io.lanelet2_export import write_lanelet2
-from tile_store.feature_io.lanelet2_import import read_lanelet2
-from tile_store.feature_io.osm_document import OsmDocument, read_osm
-from tile_store.feature_io.osm_edit import Edits, line_of, with_nodes, with_values, without_members
-from tile_store.feature_io.values import ImportOptions
-from tile_store.feature_io.xml_spans import escaped, read_root, tag_of, with_attributes
+from gnd.tile_store.feature_io.lanelet2_export import write_lanelet2
+from gnd.tile_store.feature_io.lanelet2_import import read_lanelet2
+from gnd.tile_store.feature_io.osm_document import OsmDocument, read_osm
+from gnd.tile_store.feature_io.osm_edit import Edits, line_of, with_nodes, with_values, without_members
+from gnd.tile_store.feature_io.values import ImportOptions
+from gnd.tile_store.feature_io.xml_spans import escaped, read_root, tag_of, with_attributes
 
 TEXT = st.text(
     st.characters(codec="utf-8", exclude_categories=["Cc", "Cs"], exclude_characters="\ufffe\uffff"), max_size=12

@@ -3,10 +3,10 @@
 import numpy as np
 import pytest
 
-from gnd_map.geodesy import LocalFrame
-from gnd_map.se3 import T_from_R_t, exp_so3
-from tile_store.feature_io.errors import BadGeometry, FeatureFileError
-from tile_store.feature_io.placement import Placement
+from gnd.gnd_map.geodesy import LocalFrame
+from gnd.gnd_map.se3 import T_from_R_t, exp_so3
+from gnd.tile_store.feature_io.errors import BadGeometry, FeatureFileError
+from gnd.tile_store.feature_io.placement import Placement
 
 RNG = np.random.default_rng(5)
 

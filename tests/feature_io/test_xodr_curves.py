@@ -6,7 +6,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.integrate import quad
 
-from tile_store.feature_io.xodr_curves import (
+from gnd.tile_store.feature_io.xodr_curves import (
     Piece,
     Profile,
     ReferenceLine,

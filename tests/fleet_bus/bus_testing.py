@@ -13,7 +13,7 @@ from pathlib import Path
 
 import psutil
 
-from fleet_bus.bus import Bus
+from gnd.fleet_bus.bus import Bus
 
 REPOSITORY = Path(__file__).resolve().parents[2]
 DEADLINE_S = 15.0
@@ -82,7 +82,7 @@ class Script:
             stderr=subprocess.STDOUT,
             text=True,
             cwd=REPOSITORY,
-            env=os.environ | {"PYTHONPATH": str(REPOSITORY), "PYTHONUNBUFFERED": "1"},
+            env=os.environ | {"PYTHONPATH": str(REPOSITORY / "src"), "PYTHONUNBUFFERED": "1"},
         )
         self.lines: list[str] = []
         self._reader = threading.Thread(target=self._read, daemon=True)

@@ -4,11 +4,11 @@ from collections.abc import Callable, Iterator
 import pytest
 from bus_testing import RouterProcess, new_endpoint
 
-from fleet_bus.bus import Bus, open_bus
-from fleet_bus.config import BusConfig
-from fleet_bus.ledger import Ledger
-from fleet_bus.links import LinkProfile
-from fleet_bus.router import open_router
+from gnd.fleet_bus.bus import Bus, open_bus
+from gnd.fleet_bus.config import BusConfig
+from gnd.fleet_bus.ledger import Ledger
+from gnd.fleet_bus.links import LinkProfile
+from gnd.fleet_bus.router import open_router
 
 _NUMBERS = itertools.count()
 

@@ -7,9 +7,9 @@ import pytest
 import zenoh
 from bus_testing import PROBE, Inbox, RouterProcess, script, stays, wait_for
 
-from fleet_bus.bus import Bus
-from fleet_bus.errors import BusClosed, NoRouter
-from fleet_bus.ledger import Ledger
+from gnd.fleet_bus.bus import Bus
+from gnd.fleet_bus.errors import BusClosed, NoRouter
+from gnd.fleet_bus.ledger import Ledger
 
 
 def test_a_burst_arrives_whole_and_in_order(router, client, key):
@@ -178,8 +178,8 @@ def test_notices_survive_kill_and_restart_of_the_router(router_process: RouterPr
 
 HOLDER = """
 import sys, threading
-from fleet_bus.bus import open_bus
-from fleet_bus.config import BusConfig
+from gnd.fleet_bus.bus import open_bus
+from gnd.fleet_bus.config import BusConfig
 with open_bus(BusConfig(connect=(sys.argv[1],), lease_ms=int(sys.argv[3]))) as bus:
     bus.declare_alive(sys.argv[2])
     print("alive", flush=True)

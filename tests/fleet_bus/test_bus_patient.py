@@ -5,9 +5,9 @@ import logging
 import pytest
 from bus_testing import Inbox, RouterProcess, wait_for
 
-from fleet_bus.bus import Bus, open_bus
-from fleet_bus.config import BusConfig
-from fleet_bus.errors import BusConfigError, NoRouter, RequestFailed
+from gnd.fleet_bus.bus import Bus, open_bus
+from gnd.fleet_bus.config import BusConfig
+from gnd.fleet_bus.errors import BusConfigError, NoRouter, RequestFailed
 
 
 @pytest.fixture

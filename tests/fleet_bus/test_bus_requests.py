@@ -6,11 +6,11 @@ import pytest
 import zenoh
 from bus_testing import script, stays, wait_for
 
-from fleet_bus.bus import Bus
-from fleet_bus.config import BusConfig, zenoh_config
-from fleet_bus.errors import BusClosed, BusConfigError, NotMine, Refused, RequestFailed, RequestRefused
-from fleet_bus.ledger import Ledger
-from fleet_bus.requesting import RetryPolicy
+from gnd.fleet_bus.bus import Bus
+from gnd.fleet_bus.config import BusConfig, zenoh_config
+from gnd.fleet_bus.errors import BusClosed, BusConfigError, NotMine, Refused, RequestFailed, RequestRefused
+from gnd.fleet_bus.ledger import Ledger
+from gnd.fleet_bus.requesting import RetryPolicy
 
 QUICK = RetryPolicy(first_wait_s=0.02, longest_wait_s=0.1, attempt_timeout_s=0.3)
 
@@ -89,7 +89,7 @@ def test_empty_replies_are_asked_again_until_a_server_comes(router, client, key)
 
 KILLED_IN_HAND = """
 import os, sys, threading
-from fleet_bus import BusConfig, open_bus
+from gnd.fleet_bus import BusConfig, open_bus
 with open_bus(BusConfig(connect=(sys.argv[1],))) as bus:
     bus.serve(sys.argv[2], lambda request: os._exit(9))
     print("serving", flush=True)

@@ -7,11 +7,11 @@ import threading
 import pytest
 from bus_testing import RouterProcess, new_endpoint, script, wait_for
 
-from fleet_bus.bus import open_bus
-from fleet_bus.config import BusConfig
-from fleet_bus.errors import NoRouter, PortInUse, RequestFailed
-from fleet_bus.requesting import RetryPolicy
-from fleet_bus.router import open_router, run_router
+from gnd.fleet_bus.bus import open_bus
+from gnd.fleet_bus.config import BusConfig
+from gnd.fleet_bus.errors import NoRouter, PortInUse, RequestFailed
+from gnd.fleet_bus.requesting import RetryPolicy
+from gnd.fleet_bus.router import open_router, run_router
 
 QUICK = RetryPolicy(first_wait_s=0.02, longest_wait_s=0.1, attempt_timeout_s=0.5)
 
@@ -41,7 +41,7 @@ def test_a_port_in_use_is_said_so(router):
 
 
 def test_the_command_says_that_the_port_is_in_use(router):
-    with script("from deploy.cli import main; main()", "router", "--listen", router) as command:
+    with script("from gnd.deploy.cli import main; main()", "router", "--listen", router) as command:
         assert command.wait() == 2
         assert len(command.lines) == 1
         assert "port in use" in command.lines[0]
@@ -49,7 +49,7 @@ def test_the_command_says_that_the_port_is_in_use(router):
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
 def test_the_command_ends_cleanly_on_ctrl_c_and_on_terminate(endpoint, number):
-    with script("from deploy.cli import main; main()", "router", "--listen", endpoint) as command:
+    with script("from gnd.deploy.cli import main; main()", "router", "--listen", endpoint) as command:
         command.wait_line("router listens at")
         with open_bus(BusConfig(connect=(endpoint,))):
             command.signal(number)
@@ -92,8 +92,8 @@ def test_without_router_the_failure_says_so(router_process: RouterProcess, clien
 
 HANGING_ROUTER = """
 import sys, threading
-from fleet_bus.bus import open_bus
-from fleet_bus.config import BusConfig
+from gnd.fleet_bus.bus import open_bus
+from gnd.fleet_bus.config import BusConfig
 with open_bus(BusConfig(mode="router", connect=(), listen=(sys.argv[1],), lease_ms=500)):
     print("up", flush=True)
     threading.Event().wait()
@@ -142,8 +142,8 @@ def test_two_linked_routers_forward_notices_and_requests(router, client, key):
 
 ENDS = """
 import sys
-from fleet_bus.bus import open_bus
-from fleet_bus.config import BusConfig
+from gnd.fleet_bus.bus import open_bus
+from gnd.fleet_bus.config import BusConfig
 bus = open_bus(BusConfig(connect=(sys.argv[1],)))
 bus.subscribe("test/**", print)
 bus.serve("test/served", lambda request: b"")
@@ -165,8 +165,8 @@ def test_a_process_with_a_subscriber_ends(router, how):
 
 INTERRUPTED = """
 import sys
-from fleet_bus.bus import open_bus
-from fleet_bus.config import BusConfig
+from gnd.fleet_bus.bus import open_bus
+from gnd.fleet_bus.config import BusConfig
 with open_bus(BusConfig(connect=(sys.argv[1],))) as bus:
     bus.subscribe("test/**", print)
     print("asking", flush=True)

@@ -11,10 +11,10 @@ import pytest
 import zenoh
 from bus_testing import Inbox, RouterProcess, sockets_to, wait_for
 
-from fleet_bus.bus import open_bus
-from fleet_bus.config import ROUTER_LEASE_MS, BusConfig, assert_rules, zenoh_config
-from fleet_bus.errors import BusClosed, BusConfigError, MessageTooLarge, NoRouter
-from fleet_bus.router import open_router
+from gnd.fleet_bus.bus import open_bus
+from gnd.fleet_bus.config import ROUTER_LEASE_MS, BusConfig, assert_rules, zenoh_config
+from gnd.fleet_bus.errors import BusClosed, BusConfigError, MessageTooLarge, NoRouter
+from gnd.fleet_bus.router import open_router
 
 
 def setting(config: BusConfig, key: str):

@@ -9,10 +9,10 @@ import pytest
 import zenoh
 from bus_testing import Inbox, wait_for
 
-from fleet_bus.config import BusConfig, zenoh_config
-from fleet_bus.errors import BusClosed, RequestFailed
-from fleet_bus.links import LinkProfile
-from fleet_bus.requesting import RetryPolicy
+from gnd.fleet_bus.config import BusConfig, zenoh_config
+from gnd.fleet_bus.errors import BusClosed, RequestFailed
+from gnd.fleet_bus.links import LinkProfile
+from gnd.fleet_bus.requesting import RetryPolicy
 
 CELLULAR = LinkProfile("buffers of 3g, no pacing", batch_bytes=8192, send_buffer_bytes=16_384)
 STALL_S = 6.5  # zenoh's default gives a session up after 5 s of a full queue

@@ -7,8 +7,8 @@ import sys
 import pytest
 from bus_testing import REPOSITORY, RouterProcess, wait_for
 
-from fleet_bus.ledger import Ledger
-from fleet_bus.wire import WireBytes, WireMeter
+from gnd.fleet_bus.ledger import Ledger
+from gnd.fleet_bus.wire import WireBytes, WireMeter
 
 
 def test_wire_bytes_are_payload_and_overhead(router, client, key):
@@ -61,9 +61,9 @@ def test_a_connection_that_is_not_ours_counts_nothing():
 AGAINST_THE_INTERFACE = """
 import pathlib, subprocess, sys
 subprocess.run(["ip", "link", "set", "lo", "up"], check=True)
-from fleet_bus.bus import open_bus
-from fleet_bus.config import BusConfig
-from fleet_bus.router import open_router
+from gnd.fleet_bus.bus import open_bus
+from gnd.fleet_bus.config import BusConfig
+from gnd.fleet_bus.router import open_router
 
 def interface():
     line = next(l for l in pathlib.Path("/proc/net/dev").read_text().splitlines() if l.strip().startswith("lo:"))
@@ -100,7 +100,7 @@ def test_wire_bytes_agree_with_the_counters_of_the_interface():
         capture_output=True,
         text=True,
         cwd=REPOSITORY,
-        env={"PYTHONPATH": str(REPOSITORY), "PATH": "/usr/sbin:/usr/bin:/sbin:/bin"},
+        env={"PYTHONPATH": str(REPOSITORY / "src"), "PATH": "/usr/sbin:/usr/bin:/sbin:/bin"},
         timeout=60,
         check=False,
     )

@@ -8,13 +8,13 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from fleet_bus.errors import LedgerError
-from fleet_bus.ledger import LEDGER_VERSION, Ledger
-from fleet_bus.ledger_file import read_ledger, read_run
-from fleet_bus.ledger_rows import parse_rows
-from fleet_bus.links import LinkProfile, load_link
-from fleet_bus.traffic import agent_traffic
-from fleet_bus.wire import WireBytes
+from gnd.fleet_bus.errors import LedgerError
+from gnd.fleet_bus.ledger import LEDGER_VERSION, Ledger
+from gnd.fleet_bus.ledger_file import read_ledger, read_run
+from gnd.fleet_bus.ledger_rows import parse_rows
+from gnd.fleet_bus.links import LinkProfile, load_link
+from gnd.fleet_bus.traffic import agent_traffic
+from gnd.fleet_bus.wire import WireBytes
 
 LINES_OF_VERSION_1 = """\
 {"agent":"vehicle-00","session":"18ea-2449","t_ns":1795271920172767542,"odometer_m":1.435,"drive_ns":1570838399980000000,\

@@ -4,10 +4,10 @@ from pathlib import Path
 
 import pytest
 
-from fleet_bus.errors import LedgerError
-from fleet_bus.ledger import Ledger, LedgerLine, Share
-from fleet_bus.ledger_file import read_ledger
-from gnd_map.tile_id import TileId
+from gnd.fleet_bus.errors import LedgerError
+from gnd.fleet_bus.ledger import Ledger, LedgerLine, Share
+from gnd.fleet_bus.ledger_file import read_ledger
+from gnd.gnd_map.tile_id import TileId
 
 TILE = TileId.from_path("13033/03021/23031/22102")
 SHARES = (Share("tile", 30), Share("tile", 3000, TILE), Share("delta", 120, "13033/03021/23031/22103"))

@@ -10,10 +10,10 @@ from bus_testing import Inbox, wait_for
 from hypothesis import given
 from hypothesis import strategies as st
 
-from fleet_bus.errors import BusClosed, LinkError
-from fleet_bus.ledger import Ledger
-from fleet_bus.links import SEGMENT_BYTES, UNLIMITED, LinkProfile, load_link, read_links
-from fleet_bus.pacer import MESSAGE_OVERHEAD_BYTES, Bucket, Pacer
+from gnd.fleet_bus.errors import BusClosed, LinkError
+from gnd.fleet_bus.ledger import Ledger
+from gnd.fleet_bus.links import SEGMENT_BYTES, UNLIMITED, LinkProfile, load_link, read_links
+from gnd.fleet_bus.pacer import MESSAGE_OVERHEAD_BYTES, Bucket, Pacer
 
 
 @pytest.mark.parametrize("name", ["3g", "4g", "5g"])

@@ -6,10 +6,10 @@ import re
 import pytest
 from bus_testing import REPOSITORY, script, stays, wait_for
 
-from gnd_map.tile_id import TileId
-from schemas.keys import catalog_key, catalog_keys, update_key
-from schemas.tiles import Catalog, CatalogEntry
-from schemas.updates import TileUpdate
+from gnd.gnd_map.tile_id import TileId
+from gnd.schemas.keys import catalog_key, catalog_keys, update_key
+from gnd.schemas.tiles import Catalog, CatalogEntry
+from gnd.schemas.updates import TileUpdate
 
 EXAMPLE = REPOSITORY / "examples" / "subscribe.py"
 INSIDE = TileId.from_path("13033/03021/23031/22102")

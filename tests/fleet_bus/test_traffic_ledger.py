@@ -6,11 +6,11 @@ from pathlib import Path
 
 import pytest
 
-from fleet_bus.errors import LedgerError
-from fleet_bus.ledger import Ledger, LedgerLine
-from fleet_bus.ledger_file import read_ledger
-from fleet_bus.wire import WireBytes
-from gnd_map.tile_id import TileId
+from gnd.fleet_bus.errors import LedgerError
+from gnd.fleet_bus.ledger import Ledger, LedgerLine
+from gnd.fleet_bus.ledger_file import read_ledger
+from gnd.fleet_bus.wire import WireBytes
+from gnd.gnd_map.tile_id import TileId
 
 TILE = TileId.from_path("13033/03021/23031/22102")
 

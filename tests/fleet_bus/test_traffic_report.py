@@ -5,15 +5,15 @@ import json
 import pytest
 from click.testing import CliRunner
 
-from deploy.traffic_cli import traffic
-from fleet_bus.errors import LedgerError, LinkError
-from fleet_bus.ledger import Ledger
-from fleet_bus.ledger_file import read_run
-from fleet_bus.links import LinkProfile
-from fleet_bus.pacer import MESSAGE_OVERHEAD_BYTES
-from fleet_bus.traffic import agent_traffic
-from fleet_bus.traffic_links import link_use
-from fleet_bus.wire import WireBytes
+from gnd.deploy.traffic_cli import traffic
+from gnd.fleet_bus.errors import LedgerError, LinkError
+from gnd.fleet_bus.ledger import Ledger
+from gnd.fleet_bus.ledger_file import read_run
+from gnd.fleet_bus.links import LinkProfile
+from gnd.fleet_bus.pacer import MESSAGE_OVERHEAD_BYTES
+from gnd.fleet_bus.traffic import agent_traffic
+from gnd.fleet_bus.traffic_links import link_use
+from gnd.fleet_bus.wire import WireBytes
 
 LINK = LinkProfile("test", down_bit_s=80_000, up_bit_s=8_000, delay_ms=250, burst_bytes=0)
 

@@ -5,14 +5,14 @@ from bus_testing import wait_for
 from hypothesis import given
 from hypothesis import strategies as st
 
-from fleet_bus.ledger import KINDS, Ledger, Share
-from fleet_bus.ledger_file import AgentLedger, Booking, read_ledger
-from fleet_bus.links import load_link
-from fleet_bus.pacer import MESSAGE_OVERHEAD_BYTES
-from fleet_bus.traffic import agent_traffic, fleet_lines
-from fleet_bus.traffic_wire import apportion, wire_account
-from fleet_bus.wire import WireBytes
-from gnd_map.tile_id import TileId
+from gnd.fleet_bus.ledger import KINDS, Ledger, Share
+from gnd.fleet_bus.ledger_file import AgentLedger, Booking, read_ledger
+from gnd.fleet_bus.links import load_link
+from gnd.fleet_bus.pacer import MESSAGE_OVERHEAD_BYTES
+from gnd.fleet_bus.traffic import agent_traffic, fleet_lines
+from gnd.fleet_bus.traffic_wire import apportion, wire_account
+from gnd.fleet_bus.wire import WireBytes
+from gnd.gnd_map.tile_id import TileId
 
 TILE = TileId.from_path("13033/03021/23031/22102")
 OTHER = TileId.from_path("13033/03021/23031/22103")

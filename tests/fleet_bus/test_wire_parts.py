@@ -8,13 +8,13 @@ import time
 import pytest
 from bus_testing import REPOSITORY, new_endpoint
 
-from fleet_bus.bus import open_bus
-from fleet_bus.config import BusConfig
-from fleet_bus.ledger import Ledger
-from fleet_bus.ledger_file import read_ledger
-from fleet_bus.links import LinkProfile
-from fleet_bus.traffic import agent_traffic
-from fleet_bus.wire import WireBytes
+from gnd.fleet_bus.bus import open_bus
+from gnd.fleet_bus.config import BusConfig
+from gnd.fleet_bus.ledger import Ledger
+from gnd.fleet_bus.ledger_file import read_ledger
+from gnd.fleet_bus.links import LinkProfile
+from gnd.fleet_bus.traffic import agent_traffic
+from gnd.fleet_bus.wire import WireBytes
 
 QUIET = LinkProfile("quiet", lease_ms=1000, keep_alives=4)
 KEEP_ALIVE_BYTES = 52 + 3
@@ -87,10 +87,10 @@ import subprocess, time
 def lo(state):
     subprocess.run(["ip", "link", "set", "lo", state], check=True)
 lo("up")
-from fleet_bus.bus import open_bus
-from fleet_bus.config import BusConfig
-from fleet_bus.links import LinkProfile
-from fleet_bus.router import open_router
+from gnd.fleet_bus.bus import open_bus
+from gnd.fleet_bus.config import BusConfig
+from gnd.fleet_bus.links import LinkProfile
+from gnd.fleet_bus.router import open_router
 at = "tcp/127.0.0.1:7447"
 link = LinkProfile("test", lease_ms=2000, keep_alives=2)
 with open_router([at]), open_bus(BusConfig(connect=(at,), link=link)) as bus:
@@ -119,7 +119,7 @@ def test_a_dead_link_is_noticed_by_what_is_not_acknowledged_long_before_the_rout
         capture_output=True,
         text=True,
         cwd=REPOSITORY,
-        env={"PYTHONPATH": str(REPOSITORY), "PATH": "/usr/sbin:/usr/bin:/sbin:/bin"},
+        env={"PYTHONPATH": str(REPOSITORY / "src"), "PATH": "/usr/sbin:/usr/bin:/sbin:/bin"},
         timeout=60,
         check=False,
     )

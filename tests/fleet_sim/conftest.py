@@ -5,10 +5,10 @@ from pathlib import Path
 import pytest
 from sim_worlds import BOTH, COARSE, small_world, thing
 
-from fleet_sim import parts
-from fleet_sim.street import street
-from fleet_sim.truth import Truth, load_or_make_truth, make_truth
-from fleet_sim.world import World
+from gnd.fleet_sim import parts
+from gnd.fleet_sim.street import street
+from gnd.fleet_sim.truth import Truth, load_or_make_truth, make_truth
+from gnd.fleet_sim.world import World
 
 
 @pytest.fixture(scope="session")

@@ -4,7 +4,7 @@ import math
 
 import numpy as np
 
-from fleet_sim.shapes import Ball, Block, Post, Shape
+from gnd.fleet_sim.shapes import Ball, Block, Post, Shape
 
 
 def _planes(block: Block) -> list[tuple[np.ndarray, float]]:

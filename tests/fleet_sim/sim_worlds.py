@@ -2,11 +2,11 @@
 
 import numpy as np
 
-from fleet_sim import parts
-from fleet_sim.dense_scan import ScanPlan
-from fleet_sim.shapes import Block, Shape
-from fleet_sim.street import BORDER_LON_RAD, LAT_RAD
-from fleet_sim.world import Edit, State, World, WorldObject
+from gnd.fleet_sim import parts
+from gnd.fleet_sim.dense_scan import ScanPlan
+from gnd.fleet_sim.shapes import Block, Shape
+from gnd.fleet_sim.street import BORDER_LON_RAD, LAT_RAD
+from gnd.fleet_sim.world import Edit, State, World, WorldObject
 
 COARSE = ScanPlan(spacing_m=1.0, step_rad=np.radians(0.7), end_margin_m=1.0)
 BOTH: tuple[State, ...] = ("before", "after")

@@ -6,18 +6,18 @@ from math import radians
 import numpy as np
 import pytest
 
-from fleet_sim.courses.company import car, keeping, lagging, lorry, movers_of, passing, van
-from fleet_sim.courses.course import Course
-from fleet_sim.courses.drive import CourseConfig, CourseDrive
-from fleet_sim.courses.faults import Faults
-from fleet_sim.courses.places import PLACES, place_of
-from fleet_sim.courses.ride import cruise, lively
-from fleet_sim.courses.survey import survey_points
-from fleet_sim.drives import EPOCH_NS, PERFECT
-from fleet_sim.errors import DriveSimError
-from fleet_sim.street_before import PAVEMENT_M
-from gnd_map.se3 import T_inverse, log_so3
-from schemas.drive import GnssFix, MotionSample, ReferencePose, Scan
+from gnd.fleet_sim.courses.company import car, keeping, lagging, lorry, movers_of, passing, van
+from gnd.fleet_sim.courses.course import Course
+from gnd.fleet_sim.courses.drive import CourseConfig, CourseDrive
+from gnd.fleet_sim.courses.faults import Faults
+from gnd.fleet_sim.courses.places import PLACES, place_of
+from gnd.fleet_sim.courses.ride import cruise, lively
+from gnd.fleet_sim.courses.survey import survey_points
+from gnd.fleet_sim.drives import EPOCH_NS, PERFECT
+from gnd.fleet_sim.errors import DriveSimError
+from gnd.fleet_sim.street_before import PAVEMENT_M
+from gnd.gnd_map.se3 import T_inverse, log_so3
+from gnd.schemas.drive import GnssFix, MotionSample, ReferencePose, Scan
 
 SCANS = 12
 

@@ -5,12 +5,12 @@ from dataclasses import astuple
 import numpy as np
 import pytest
 
-from fleet_sim.courses.foliage import Foliage, Leaves
-from fleet_sim.errors import DriveSimError
-from fleet_sim.lidar import Lidar
-from fleet_sim.raycast import Scene
-from fleet_sim.sensors import VLP16
-from fleet_sim.shapes import Block
+from gnd.fleet_sim.courses.foliage import Foliage, Leaves
+from gnd.fleet_sim.errors import DriveSimError
+from gnd.fleet_sim.lidar import Lidar
+from gnd.fleet_sim.raycast import Scene
+from gnd.fleet_sim.sensors import VLP16
+from gnd.fleet_sim.shapes import Block
 
 COLUMNS, BEAMS = 500, 20
 HEDGE = Leaves(10.0, 0.0, 0.0, 1.0, 3.0, 3.0, 0.8, box=True)

@@ -3,14 +3,14 @@
 import numpy as np
 import pytest
 
-from fleet_sim.courses.motion import CourseMotion
-from fleet_sim.courses.path import Path, lane, smoothed
-from fleet_sim.courses.places import place_of
-from fleet_sim.courses.ride import Ride, cruise, halting, lively
-from fleet_sim.courses.terrain import LEVEL, Ground, Profile
-from fleet_sim.errors import DriveSimError
-from fleet_sim.raycast import Scene
-from gnd_map.se3 import T_inverse, log_so3
+from gnd.fleet_sim.courses.motion import CourseMotion
+from gnd.fleet_sim.courses.path import Path, lane, smoothed
+from gnd.fleet_sim.courses.places import place_of
+from gnd.fleet_sim.courses.ride import Ride, cruise, halting, lively
+from gnd.fleet_sim.courses.terrain import LEVEL, Ground, Profile
+from gnd.fleet_sim.errors import DriveSimError
+from gnd.fleet_sim.raycast import Scene
+from gnd.gnd_map.se3 import T_inverse, log_so3
 
 STILL = (0.0,) * 9
 

@@ -8,16 +8,16 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from fleet_sim import parts
-from fleet_sim.errors import EvaluationError, WorldError
-from fleet_sim.feature_files import read_feature_layers, write_feature_layers
-from fleet_sim.feature_scores import ClassScore, FeatureScore, driven, score_features, tiles_of_one_drive
-from fleet_sim.feature_truth import FeatureTruth, TrueFeature, base_features, feature_truth, holds
-from fleet_sim.shapes import Ball, Block, Post, Shape
-from fleet_sim.street import street
-from fleet_sim.world import Edit, State, World, WorldObject
-from gnd_map.features import Feature, FeatureTile, geodetic_in_tile, hit, points_in_tile
-from gnd_map.tile_id import TileId
+from gnd.fleet_sim import parts
+from gnd.fleet_sim.errors import EvaluationError, WorldError
+from gnd.fleet_sim.feature_files import read_feature_layers, write_feature_layers
+from gnd.fleet_sim.feature_scores import ClassScore, FeatureScore, driven, score_features, tiles_of_one_drive
+from gnd.fleet_sim.feature_truth import FeatureTruth, TrueFeature, base_features, feature_truth, holds
+from gnd.fleet_sim.shapes import Ball, Block, Post, Shape
+from gnd.fleet_sim.street import street
+from gnd.fleet_sim.world import Edit, State, World, WorldObject
+from gnd.gnd_map.features import Feature, FeatureTile, geodetic_in_tile, hit, points_in_tile
+from gnd.gnd_map.tile_id import TileId
 
 BOTH: tuple[State, ...] = ("before", "after")
 

@@ -8,19 +8,19 @@ import numpy as np
 import pytest
 from click.testing import CliRunner
 
-from fleet_sim.cli import sim
-from fleet_sim.drives import SensorErrors
-from fleet_sim.errors import DriveSimError, RoadError
-from fleet_sim.roads.drive import ROAD_ERRORS, RoadDrive, RoadDriveOptions, drive_route, road_errors
-from fleet_sim.roads.looks import DetectorNoise
-from fleet_sim.roads.motion import Cruise, RoadMotion
-from fleet_sim.roads.motorway import motorway
-from fleet_sim.roads.pictures import detection_places
-from fleet_sim.roads.route import Route
-from fleet_sim.roads.sight import View
-from fleet_sim.roads.streetlights import streetlight_motorway
-from fleet_sim.roads.test_track import test_track
-from fleet_sim.roads.traffic import EMPTY, RoadTraffic, drawn_boxes, lanes_taken
+from gnd.fleet_sim.cli import sim
+from gnd.fleet_sim.drives import SensorErrors
+from gnd.fleet_sim.errors import DriveSimError, RoadError
+from gnd.fleet_sim.roads.drive import ROAD_ERRORS, RoadDrive, RoadDriveOptions, drive_route, road_errors
+from gnd.fleet_sim.roads.looks import DetectorNoise
+from gnd.fleet_sim.roads.motion import Cruise, RoadMotion
+from gnd.fleet_sim.roads.motorway import motorway
+from gnd.fleet_sim.roads.pictures import detection_places
+from gnd.fleet_sim.roads.route import Route
+from gnd.fleet_sim.roads.sight import View
+from gnd.fleet_sim.roads.streetlights import streetlight_motorway
+from gnd.fleet_sim.roads.test_track import test_track
+from gnd.fleet_sim.roads.traffic import EMPTY, RoadTraffic, drawn_boxes, lanes_taken
 
 SHORT = RoadDriveOptions(length_m=2500.0)
 NO_ERRORS = SensorErrors(0.0, 0.0, 0.0, 0.0, 0.0, 40.0, 0.0, 0.0, 0.0)

@@ -3,14 +3,14 @@
 import numpy as np
 import pytest
 
-from fleet_sim.errors import RoadError
-from fleet_sim.roads.alignment import Bends, drawn_bends
-from fleet_sim.roads.curve import STEP_M, Centreline, of_curvature, of_figure
-from fleet_sim.roads.motorway import LANE_M, motorway
-from fleet_sim.roads.route import Features, Route
-from fleet_sim.roads.routes import route_named
-from fleet_sim.roads.streetlights import streetlight_motorway
-from fleet_sim.roads.test_track import SHARPEST_M, test_track
+from gnd.fleet_sim.errors import RoadError
+from gnd.fleet_sim.roads.alignment import Bends, drawn_bends
+from gnd.fleet_sim.roads.curve import STEP_M, Centreline, of_curvature, of_figure
+from gnd.fleet_sim.roads.motorway import LANE_M, motorway
+from gnd.fleet_sim.roads.route import Features, Route
+from gnd.fleet_sim.roads.routes import route_named
+from gnd.fleet_sim.roads.streetlights import streetlight_motorway
+from gnd.fleet_sim.roads.test_track import SHARPEST_M, test_track
 
 
 @pytest.fixture(scope="module")

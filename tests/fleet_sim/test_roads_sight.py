@@ -3,11 +3,11 @@
 import numpy as np
 import pytest
 
-from fleet_sim.roads.curve import of_curvature
-from fleet_sim.roads.route import Route, placed
-from fleet_sim.roads.sight import CAMERA, LIDAR, PlacedBoxes, hidden, occluder_ranges, placed_boxes, polar
-from fleet_sim.roads.traffic import Boxes
-from gnd_map.geodesy import LocalFrame
+from gnd.fleet_sim.roads.curve import of_curvature
+from gnd.fleet_sim.roads.route import Route, placed
+from gnd.fleet_sim.roads.sight import CAMERA, LIDAR, PlacedBoxes, hidden, occluder_ranges, placed_boxes, polar
+from gnd.fleet_sim.roads.traffic import Boxes
+from gnd.gnd_map.geodesy import LocalFrame
 
 
 def scattered(rng: np.random.Generator, looks: int, boxes: int) -> PlacedBoxes:

@@ -7,20 +7,20 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from fleet_sim import parts
-from fleet_sim.camera import Sightings, SignCamera, looks_of, sightings
-from fleet_sim.drives import DriveConfig, DriveSimulation, simulate_drive
-from fleet_sim.errors import DriveSimError
-from fleet_sim.feature_truth import feature_truth
-from fleet_sim.movers import Mover, Movers
-from fleet_sim.prepare import agent_configs, mapping_configs
-from fleet_sim.raycast import Scene
-from fleet_sim.trajectory import DrivingStyle, lane_motion
-from fleet_sim.world import State, World, WorldObject
-from schemas.drive import Detections, DriveItem, GnssFix, MotionSample, ReferencePose, Scan
-from schemas.drive_mcap import drive_counts, read_drive
-from tile_store.build import build_map
-from tile_store.sqlite_store import SqliteStore
+from gnd.fleet_sim import parts
+from gnd.fleet_sim.camera import Sightings, SignCamera, looks_of, sightings
+from gnd.fleet_sim.drives import DriveConfig, DriveSimulation, simulate_drive
+from gnd.fleet_sim.errors import DriveSimError
+from gnd.fleet_sim.feature_truth import feature_truth
+from gnd.fleet_sim.movers import Mover, Movers
+from gnd.fleet_sim.prepare import agent_configs, mapping_configs
+from gnd.fleet_sim.raycast import Scene
+from gnd.fleet_sim.trajectory import DrivingStyle, lane_motion
+from gnd.fleet_sim.world import State, World, WorldObject
+from gnd.schemas.drive import Detections, DriveItem, GnssFix, MotionSample, ReferencePose, Scan
+from gnd.schemas.drive_mcap import drive_counts, read_drive
+from gnd.tile_store.build import build_map
+from gnd.tile_store.sqlite_store import SqliteStore
 
 BOTH: tuple[State, ...] = ("before", "after")
 QUIET = SignCamera(level=1e-6, miss_rate=0.0, false_alarms=0.0)

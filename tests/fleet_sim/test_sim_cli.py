@@ -7,16 +7,16 @@ import numpy as np
 import pytest
 from click.testing import CliRunner
 
-from fleet_sim.cli import sim
-from fleet_sim.errors import SimError
-from fleet_sim.feature_files import read_feature_layers
-from fleet_sim.feature_truth import base_features, feature_truth
-from fleet_sim.prepare import agent_configs, prepare_fleet_run
-from fleet_sim.street import StreetOptions, street
-from fleet_sim.truth import Truth, read_truth
-from fleet_sim.world import read_world
-from gnd_map.errors import GndError
-from schemas.drive_mcap import drive_counts, load_track, read_header
+from gnd.fleet_sim.cli import sim
+from gnd.fleet_sim.errors import SimError
+from gnd.fleet_sim.feature_files import read_feature_layers
+from gnd.fleet_sim.feature_truth import base_features, feature_truth
+from gnd.fleet_sim.prepare import agent_configs, prepare_fleet_run
+from gnd.fleet_sim.street import StreetOptions, street
+from gnd.fleet_sim.truth import Truth, read_truth
+from gnd.fleet_sim.world import read_world
+from gnd.gnd_map.errors import GndError
+from gnd.schemas.drive_mcap import drive_counts, load_track, read_header
 
 
 def run(*arguments: object) -> str:

@@ -8,19 +8,19 @@ import numpy as np
 import pytest
 from sim_worlds import BOTH, COARSE, small_world, thing
 
-import fleet_sim.dense_scan
-from fleet_sim import parts
-from fleet_sim.dense_rays import AFTER_COME, AFTER_KEPT, BEFORE_GONE, BEFORE_KEPT, ScanPlan, shots
-from fleet_sim.dense_scan import dense_scan, dense_scans, world_grid, world_grids
-from fleet_sim.drives import PERFECT, DriveConfig, simulate_drive
-from fleet_sim.errors import TruthError
-from fleet_sim.raycast import Scene
-from fleet_sim.street import SITES, SiteName, StreetOptions, street
-from fleet_sim.truth import Truth, grid_of, grids_of, make_truth, read_truth, write_truth
-from fleet_sim.world import STATES, World
-from gnd_map.grid import VoxelGrid
-from gnd_map.tile_id import TILE_RAD, TileId
-from schemas.drive_mcap import load_track, read_header
+import gnd.fleet_sim.dense_scan
+from gnd.fleet_sim import parts
+from gnd.fleet_sim.dense_rays import AFTER_COME, AFTER_KEPT, BEFORE_GONE, BEFORE_KEPT, ScanPlan, shots
+from gnd.fleet_sim.dense_scan import dense_scan, dense_scans, world_grid, world_grids
+from gnd.fleet_sim.drives import PERFECT, DriveConfig, simulate_drive
+from gnd.fleet_sim.errors import TruthError
+from gnd.fleet_sim.raycast import Scene
+from gnd.fleet_sim.street import SITES, SiteName, StreetOptions, street
+from gnd.fleet_sim.truth import Truth, grid_of, grids_of, make_truth, read_truth, write_truth
+from gnd.fleet_sim.world import STATES, World
+from gnd.gnd_map.grid import VoxelGrid
+from gnd.gnd_map.tile_id import TILE_RAD, TileId
+from gnd.schemas.drive_mcap import load_track, read_header
 
 SPARSE = ScanPlan(spacing_m=12.0, step_rad=radians(0.8))
 BAND_LAT_RAD = (world_grid(small_world()).lat_index_range[1] + 1) * TILE_RAD - pi / 2
@@ -60,11 +60,11 @@ def test_rays_that_meet_a_kept_thing_in_both_states_end_in_one_point(edited_worl
 
 def test_a_table_that_grows_gives_the_same_scan(edited_world: World, monkeypatch: pytest.MonkeyPatch) -> None:
     large = dense_scan(edited_world, SPARSE)
-    monkeypatch.setattr(fleet_sim.dense_scan, "_FIRST_VOXELS", 64)
+    monkeypatch.setattr(gnd.fleet_sim.dense_scan, "_FIRST_VOXELS", 64)
     small = dense_scan(edited_world, SPARSE)
     for name in ("g", "cells", "row", "passes", "unexplained", "shell"):
         np.testing.assert_array_equal(getattr(small, name), getattr(large, name))
-    monkeypatch.setattr(fleet_sim.dense_scan, "_MAX_VOXELS", 128)
+    monkeypatch.setattr(gnd.fleet_sim.dense_scan, "_MAX_VOXELS", 128)
     with pytest.raises(TruthError, match="more than 128 voxels"):
         dense_scan(edited_world, SPARSE)
 

@@ -5,17 +5,17 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from fleet_sim.drives import EPOCH_NS, PERFECT, DriveConfig, DriveSimulation, SensorErrors, simulate_drive
-from fleet_sim.errors import DriveSimError
-from fleet_sim.prepare import agent_configs, mapping_configs
-from fleet_sim.sensors import HDL32E
-from fleet_sim.trajectory import DrivingStyle, gauss_markov, lane_motion
-from fleet_sim.world import World
-from gnd_map.errors import GndError
-from gnd_map.motion import Trajectory, deskew
-from gnd_map.se3 import T_inverse
-from schemas.drive import DriveItem, GnssFix, MotionSample, ReferencePose, Scan
-from schemas.drive_mcap import load_track, read_drive, read_header
+from gnd.fleet_sim.drives import EPOCH_NS, PERFECT, DriveConfig, DriveSimulation, SensorErrors, simulate_drive
+from gnd.fleet_sim.errors import DriveSimError
+from gnd.fleet_sim.prepare import agent_configs, mapping_configs
+from gnd.fleet_sim.sensors import HDL32E
+from gnd.fleet_sim.trajectory import DrivingStyle, gauss_markov, lane_motion
+from gnd.fleet_sim.world import World
+from gnd.gnd_map.errors import GndError
+from gnd.gnd_map.motion import Trajectory, deskew
+from gnd.gnd_map.se3 import T_inverse
+from gnd.schemas.drive import DriveItem, GnssFix, MotionSample, ReferencePose, Scan
+from gnd.schemas.drive_mcap import load_track, read_drive, read_header
 
 SHORT = DriveConfig(vehicle="v-1", sensor="VLP-16", seed=3, scans=5)
 

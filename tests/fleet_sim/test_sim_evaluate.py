@@ -4,12 +4,12 @@ import numpy as np
 import pytest
 from sklearn.metrics import confusion_matrix, f1_score, precision_score, recall_score
 
-from fleet_sim.errors import EvaluationError
-from fleet_sim.evaluate import CLASSES, classes_of_maps, evaluate, evaluate_changes, evaluate_maps
-from fleet_sim.truth import LEVELS, Truth
-from gnd_map.classes import ChangeClass
-from gnd_map.gaussian import Gaussians, concat
-from gnd_map.tile_id import TileId
+from gnd.fleet_sim.errors import EvaluationError
+from gnd.fleet_sim.evaluate import CLASSES, classes_of_maps, evaluate, evaluate_changes, evaluate_maps
+from gnd.fleet_sim.truth import LEVELS, Truth
+from gnd.gnd_map.classes import ChangeClass
+from gnd.gnd_map.gaussian import Gaussians, concat
+from gnd.gnd_map.tile_id import TileId
 
 
 def perfect_map(edited: Truth) -> dict[TileId, Gaussians]:

@@ -8,13 +8,13 @@ import numpy as np
 import pytest
 from sim_worlds import small_world
 
-from fleet_sim.drives import EPOCH_NS, PERFECT, DriveConfig, DriveSimulation, simulate_drive
-from fleet_sim.sensors import MODELS
-from fleet_sim.traffic import Traffic
-from fleet_sim.world import World
-from gnd_map.motion import Trajectory, deskew
-from schemas.drive import ReferencePose, Scan
-from schemas.drive_mcap import load_track, read_drive, read_header
+from gnd.fleet_sim.drives import EPOCH_NS, PERFECT, DriveConfig, DriveSimulation, simulate_drive
+from gnd.fleet_sim.sensors import MODELS
+from gnd.fleet_sim.traffic import Traffic
+from gnd.fleet_sim.world import World
+from gnd.gnd_map.motion import Trajectory, deskew
+from gnd.schemas.drive import ReferencePose, Scan
+from gnd.schemas.drive_mcap import load_track, read_drive, read_header
 
 BASE = DriveConfig(vehicle="v-1", sensor="VLP-16", seed=3, scans=3, errors=PERFECT, traffic=Traffic.urban())
 

@@ -4,14 +4,14 @@ import numpy as np
 import pytest
 from sim_worlds import small_world
 
-from fleet_sim.dense_scan import world_grid
-from fleet_sim.errors import SimError
-from fleet_sim.insert import Inserter, surface_points, surface_voxels
-from fleet_sim.lidar import Lidar
-from fleet_sim.raycast import Scene
-from fleet_sim.sensors import VLP16
-from fleet_sim.shapes import Block, Post, Shape
-from gnd_map.se3 import exp_so3
+from gnd.fleet_sim.dense_scan import world_grid
+from gnd.fleet_sim.errors import SimError
+from gnd.fleet_sim.insert import Inserter, surface_points, surface_voxels
+from gnd.fleet_sim.lidar import Lidar
+from gnd.fleet_sim.raycast import Scene
+from gnd.fleet_sim.sensors import VLP16
+from gnd.fleet_sim.shapes import Block, Post, Shape
+from gnd.gnd_map.se3 import exp_so3
 
 ROOM: list[Shape] = [
     Block(0.0, 0.0, 40.0, 40.0, -1.0, 0.0),

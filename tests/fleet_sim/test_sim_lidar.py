@@ -1,12 +1,12 @@
 import numpy as np
 import pytest
 
-from fleet_sim.errors import SceneError
-from fleet_sim.lidar import Lidar, Sweep, column_poses
-from fleet_sim.raycast import Scene
-from fleet_sim.sensors import MODELS, VLP16, LidarModel
-from fleet_sim.shapes import Ball, Block, Post, Shape
-from gnd_map.se3 import exp_so3
+from gnd.fleet_sim.errors import SceneError
+from gnd.fleet_sim.lidar import Lidar, Sweep, column_poses
+from gnd.fleet_sim.raycast import Scene
+from gnd.fleet_sim.sensors import MODELS, VLP16, LidarModel
+from gnd.fleet_sim.shapes import Ball, Block, Post, Shape
+from gnd.gnd_map.se3 import exp_so3
 
 # A room: floor, four walls, a column, a ball; the sensor stands in its middle.
 ROOM: list[Shape] = [

@@ -7,16 +7,16 @@ import numpy as np
 import pytest
 from plain_caster import plain_range
 
-from fleet_sim import parts
-from fleet_sim.errors import DriveSimError
-from fleet_sim.lidar import Lidar, column_poses
-from fleet_sim.movers import Mover, Movers
-from fleet_sim.people import person
-from fleet_sim.ray_kernels import state_at
-from fleet_sim.raycast import Scene
-from fleet_sim.sensors import HDL64E, SCALA, VLP16, LidarModel
-from fleet_sim.shapes import Ball, Block, Post, Shape
-from gnd_map.se3 import exp_so3
+from gnd.fleet_sim import parts
+from gnd.fleet_sim.errors import DriveSimError
+from gnd.fleet_sim.lidar import Lidar, column_poses
+from gnd.fleet_sim.movers import Mover, Movers
+from gnd.fleet_sim.people import person
+from gnd.fleet_sim.ray_kernels import state_at
+from gnd.fleet_sim.raycast import Scene
+from gnd.fleet_sim.sensors import HDL64E, SCALA, VLP16, LidarModel
+from gnd.fleet_sim.shapes import Ball, Block, Post, Shape
+from gnd.gnd_map.se3 import exp_so3
 
 STEP_S = 0.02
 TIMES = np.arange(-1.0, 1.0, STEP_S)

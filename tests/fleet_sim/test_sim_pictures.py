@@ -5,12 +5,12 @@ import pytest
 from matplotlib.colors import to_rgb
 from matplotlib.image import imread
 
-from fleet_sim.ellipsoids import Ellipsoids, ellipsoids_of_maps, ellipsoids_of_truth
-from fleet_sim.errors import SimError
-from fleet_sim.pictures import View, draw_map, draw_run
-from fleet_sim.truth import Truth
-from fleet_sim.world import World
-from gnd_map.classes import CLASS_COLOURS, ChangeClass
+from gnd.fleet_sim.ellipsoids import Ellipsoids, ellipsoids_of_maps, ellipsoids_of_truth
+from gnd.fleet_sim.errors import SimError
+from gnd.fleet_sim.pictures import View, draw_map, draw_run
+from gnd.fleet_sim.truth import Truth
+from gnd.fleet_sim.world import World
+from gnd.gnd_map.classes import CLASS_COLOURS, ChangeClass
 
 
 def share_of_hue(path: Path, change_class: ChangeClass) -> float:

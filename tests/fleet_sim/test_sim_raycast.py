@@ -8,9 +8,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from plain_caster import plain_range
 
-from fleet_sim.errors import SceneError
-from fleet_sim.raycast import Scene
-from fleet_sim.shapes import Ball, Block, Post, Shape
+from gnd.fleet_sim.errors import SceneError
+from gnd.fleet_sim.raycast import Scene
+from gnd.fleet_sim.shapes import Ball, Block, Post, Shape
 
 
 def random_shapes(rng: np.random.Generator, count: int) -> list[Shape]:

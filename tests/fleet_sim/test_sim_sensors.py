@@ -5,8 +5,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from fleet_sim.errors import SceneError
-from fleet_sim.sensors import HDL32E, HDL64E, MODELS, RS16, RS32, SCALA, SHORT_NAMES, VLP16, LidarModel
+from gnd.fleet_sim.errors import SceneError
+from gnd.fleet_sim.sensors import HDL32E, HDL64E, MODELS, RS16, RS32, SCALA, SHORT_NAMES, VLP16, LidarModel
 
 SPINNING = (VLP16, HDL32E, HDL64E, RS16, RS32)
 

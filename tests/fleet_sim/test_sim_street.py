@@ -7,11 +7,11 @@ from typing import Any
 import numpy as np
 import pytest
 
-from fleet_sim.errors import WorldError
-from fleet_sim.shapes import Ball
-from fleet_sim.street import SITES, SiteName, StreetOptions, street
-from fleet_sim.world import World, to_json
-from gnd_map.tile_id import TileId
+from gnd.fleet_sim.errors import WorldError
+from gnd.fleet_sim.shapes import Ball
+from gnd.fleet_sim.street import SITES, SiteName, StreetOptions, street
+from gnd.fleet_sim.world import World, to_json
+from gnd.gnd_map.tile_id import TileId
 
 PINNED = {
     1: "6be8c9916764804a2bc5ef5b57c4eb4a343465f2471a13fef975b907b6a42013",

@@ -5,11 +5,11 @@ from collections import Counter
 import numpy as np
 import pytest
 
-from fleet_sim.shapes import Ball, Block, Post, Shape, pack
-from fleet_sim.things import _gaps, things_at, things_of_voxels
-from fleet_sim.truth import Truth
-from fleet_sim.world import World
-from gnd_map.classes import ChangeClass
+from gnd.fleet_sim.shapes import Ball, Block, Post, Shape, pack
+from gnd.fleet_sim.things import _gaps, things_at, things_of_voxels
+from gnd.fleet_sim.truth import Truth
+from gnd.fleet_sim.world import World
+from gnd.gnd_map.classes import ChangeClass
 
 
 @pytest.mark.parametrize(

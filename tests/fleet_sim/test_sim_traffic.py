@@ -8,17 +8,17 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from fleet_sim.cars import parked_cars
-from fleet_sim.drives import PERFECT, DriveConfig, DriveSimulation, simulate_drive
-from fleet_sim.errors import DriveSimError
-from fleet_sim.movers import Mover
-from fleet_sim.people import free_stretches
-from fleet_sim.shapes import Ball
-from fleet_sim.stage import Stage
-from fleet_sim.traffic import STEP_S, Traffic, drive_lane, least_gap_m
-from fleet_sim.world import World
-from schemas.drive import Scan
-from schemas.drive_mcap import read_drive
+from gnd.fleet_sim.cars import parked_cars
+from gnd.fleet_sim.drives import PERFECT, DriveConfig, DriveSimulation, simulate_drive
+from gnd.fleet_sim.errors import DriveSimError
+from gnd.fleet_sim.movers import Mover
+from gnd.fleet_sim.people import free_stretches
+from gnd.fleet_sim.shapes import Ball
+from gnd.fleet_sim.stage import Stage
+from gnd.fleet_sim.traffic import STEP_S, Traffic, drive_lane, least_gap_m
+from gnd.fleet_sim.world import World
+from gnd.schemas.drive import Scan
+from gnd.schemas.drive_mcap import read_drive
 
 SHORT = DriveConfig(vehicle="v-1", sensor="VLP-16", seed=3, scans=4)
 BUSY = Traffic(cars_per_100m=6.0, pedestrians_per_100m=8.0)

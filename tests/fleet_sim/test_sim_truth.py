@@ -8,11 +8,11 @@ import numpy as np
 import pytest
 from sim_worlds import BOTH, COARSE, small_world, thing
 
-import fleet_sim.dense_rays
-import fleet_sim.dense_scan
-import fleet_sim.truth
-from fleet_sim import parts
-from fleet_sim.dense_scan import (
+import gnd.fleet_sim.dense_rays
+import gnd.fleet_sim.dense_scan
+import gnd.fleet_sim.truth
+from gnd.fleet_sim import parts
+from gnd.fleet_sim.dense_scan import (
     AFTER_COME,
     BEFORE_GONE,
     CELLS,
@@ -27,8 +27,8 @@ from fleet_sim.dense_scan import (
     dense_scan,
     world_grid,
 )
-from fleet_sim.errors import TruthError
-from fleet_sim.truth import (
+from gnd.fleet_sim.errors import TruthError
+from gnd.fleet_sim.truth import (
     LEVELS,
     Truth,
     TruthRules,
@@ -40,8 +40,8 @@ from fleet_sim.truth import (
     world_sha,
     write_truth,
 )
-from fleet_sim.world import World
-from gnd_map.classes import ChangeClass
+from gnd.fleet_sim.world import World
+from gnd.gnd_map.classes import ChangeClass
 
 
 def class_at(truth: Truth, world: World, x: float, y: float, z: float) -> ChangeClass:
@@ -149,7 +149,7 @@ def test_the_rules_are_fixed() -> None:
     }
 
 
-@pytest.mark.parametrize("module", [fleet_sim.truth, fleet_sim.dense_scan, fleet_sim.dense_rays])
+@pytest.mark.parametrize("module", [gnd.fleet_sim.truth, gnd.fleet_sim.dense_scan, gnd.fleet_sim.dense_rays])
 def test_truth_uses_nothing_of_the_method(module: object) -> None:
     tree = ast.parse(inspect.getsource(module))  # type: ignore[arg-type]
     imports = {n.module for n in ast.walk(tree) if isinstance(n, ast.ImportFrom)}

@@ -4,12 +4,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from fleet_sim.cars import SLOT_M, parked_cars
-from fleet_sim.errors import DriveSimError, ShapeError, WorldError
-from fleet_sim.shapes import Ball, Block, Post
-from fleet_sim.street import street
-from fleet_sim.world import World, from_json, read_world, to_json, write_world
-from gnd_map.tile_id import TileId
+from gnd.fleet_sim.cars import SLOT_M, parked_cars
+from gnd.fleet_sim.errors import DriveSimError, ShapeError, WorldError
+from gnd.fleet_sim.shapes import Ball, Block, Post
+from gnd.fleet_sim.street import street
+from gnd.fleet_sim.world import World, from_json, read_world, to_json, write_world
+from gnd.gnd_map.tile_id import TileId
 
 
 def test_the_same_seed_gives_the_same_world_to_the_bit(street_1: World) -> None:

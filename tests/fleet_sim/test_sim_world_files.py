@@ -11,10 +11,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 from sim_worlds import BOTH, small_world, thing
 
-from fleet_sim import parts
-from fleet_sim.errors import WorldError
-from fleet_sim.shapes import Ball, Post
-from fleet_sim.world import from_json, read_world, to_json
+from gnd.fleet_sim import parts
+from gnd.fleet_sim.errors import WorldError
+from gnd.fleet_sim.shapes import Ball, Post
+from gnd.fleet_sim.world import from_json, read_world, to_json
 
 SMALL = small_world(
     thing("stays", BOTH, "kept", parts.slab(-3, 3, 8.0, 8.3, -0.2, 3.0), Post(1.0, 5.0, 0.1, 0.0, 3.0)),

@@ -1,8 +1,8 @@
-"""Damaged messages for every decoder of `gnd_map.codec`: seeded, with checksums left wrong or made right again.
+"""Damaged messages for every decoder of `gnd.gnd_map.codec`: seeded, with checksums left wrong or made right again.
 
 For longer runs than the tests', and for compiled code that checks its indices:
 
-    NUMBA_BOUNDSCHECK=1 NUMBA_CACHE_DIR=$(mktemp -d) PYTHONPATH=. python tests/gnd_map/codec_fuzzing.py ROUNDS SEED
+    NUMBA_BOUNDSCHECK=1 NUMBA_CACHE_DIR=$(mktemp -d) PYTHONPATH=src python tests/gnd_map/codec_fuzzing.py ROUNDS SEED
 """
 
 import struct
@@ -14,7 +14,7 @@ from random import Random
 import numpy as np
 from codec_samples import ARCTIC, changed, gaussians_of, ids_in, street
 
-from gnd_map.codec import (
+from gnd.gnd_map.codec import (
     CODECS,
     LATTICES,
     REPORT,
@@ -32,11 +32,11 @@ from gnd_map.codec import (
     encode_tiles,
     snap,
 )
-from gnd_map.codec.coding import CHECK_BYTES, checksum
-from gnd_map.codec.zstd_columns import seal
-from gnd_map.errors import CodecError
-from gnd_map.gaussian import Gaussians
-from gnd_map.tile_id import TileId
+from gnd.gnd_map.codec.coding import CHECK_BYTES, checksum
+from gnd.gnd_map.codec.zstd_columns import seal
+from gnd.gnd_map.errors import CodecError
+from gnd.gnd_map.gaussian import Gaussians
+from gnd.gnd_map.tile_id import TileId
 
 TILE = ARCTIC  # one voxel wide, 39 long: small boxes, so that a million messages take a minute
 FORGED = (0, 1, 199_999, 200_000, 200_001, 10**9, 2**31 - 1, 2**31, 2**32 - 1)

@@ -4,9 +4,9 @@ import numpy as np
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
-from gnd_map.gaussian import Gaussians, concat, six_entries
-from gnd_map.grid import VoxelGrid
-from gnd_map.tile_id import TileId
+from gnd.gnd_map.gaussian import Gaussians, concat, six_entries
+from gnd.gnd_map.grid import VoxelGrid
+from gnd.gnd_map.tile_id import TileId
 
 EQUATOR = TileId.from_geodetic(np.radians(0.0001), np.radians(10.0))
 KARLSRUHE = TileId.from_geodetic(np.radians(49.0), np.radians(8.4))

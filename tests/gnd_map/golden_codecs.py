@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
-from gnd_map.codec import (
+from gnd.gnd_map.codec import (
     CODECS,
     LATTICES,
     REPORT,
@@ -21,11 +21,11 @@ from gnd_map.codec import (
     encode_measured,
     encode_tiles,
 )
-from gnd_map.codec.lattice import Quantised, dequantise
-from gnd_map.gaussian import Gaussians
-from gnd_map.grid import VoxelGrid
-from gnd_map.tile import content_sha
-from gnd_map.tile_id import TileId
+from gnd.gnd_map.codec.lattice import Quantised, dequantise
+from gnd.gnd_map.gaussian import Gaussians
+from gnd.gnd_map.grid import VoxelGrid
+from gnd.gnd_map.tile import content_sha
+from gnd.gnd_map.tile_id import TileId
 
 FILE = Path(__file__).with_name("golden") / "codecs.json"
 TILE, OTHER = TileId(497353963154), TileId(497353963155)

@@ -5,12 +5,12 @@ from collections import defaultdict
 import numpy as np
 import pytest
 
-from gnd_map.accumulate import N_MIN_CELLS, VoxelAccumulator
-from gnd_map.errors import ShapeError
-from gnd_map.gaussian import full_matrices
-from gnd_map.geodesy import LocalFrame
-from gnd_map.grid import GridFrame, VoxelGrid
-from gnd_map.tile_id import LON_TILES, TileId
+from gnd.gnd_map.accumulate import N_MIN_CELLS, VoxelAccumulator
+from gnd.gnd_map.errors import ShapeError
+from gnd.gnd_map.gaussian import full_matrices
+from gnd.gnd_map.geodesy import LocalFrame
+from gnd.gnd_map.grid import GridFrame, VoxelGrid
+from gnd.gnd_map.tile_id import LON_TILES, TileId
 
 WANGSIMNI = TileId(497353963154)
 FRAME = GridFrame.around(LocalFrame(*WANGSIMNI.centre_rad, 31.0), [WANGSIMNI])

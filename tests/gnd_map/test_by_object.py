@@ -2,7 +2,7 @@
 
 import threading
 
-from gnd_map.by_object import ByObject
+from gnd.gnd_map.by_object import ByObject
 
 
 def test_each_object_is_worked_on_once_whatever_it_equals():

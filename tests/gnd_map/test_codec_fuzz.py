@@ -10,14 +10,14 @@ import pytest
 from codec_fuzzing import FORGED, TILE, Decoder, damaged, decoders, foreign_messages, refused, resealed
 from codec_samples import ARCTIC, EQUATOR, SEOUL
 
-from gnd_map.codec import CODECS, MAX_VOXELS, Codec
-from gnd_map.codec import kernels as k
-from gnd_map.codec.coding import Coder
-from gnd_map.codec.priors import number_at, priors_of
-from gnd_map.codec.zstd_columns import seal
-from gnd_map.errors import CodecError
-from gnd_map.gaussian import Gaussians
-from gnd_map.tile_id import TileId
+from gnd.gnd_map.codec import CODECS, MAX_VOXELS, Codec
+from gnd.gnd_map.codec import kernels as k
+from gnd.gnd_map.codec.coding import Coder
+from gnd.gnd_map.codec.priors import number_at, priors_of
+from gnd.gnd_map.codec.zstd_columns import seal
+from gnd.gnd_map.errors import CodecError
+from gnd.gnd_map.gaussian import Gaussians
+from gnd.gnd_map.tile_id import TileId
 
 DECODERS = {decoder.name: decoder for decoder in decoders()}
 FOREIGN = foreign_messages(list(DECODERS.values()))

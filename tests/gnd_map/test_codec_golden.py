@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from golden_codecs import ENTRIES, FILE, MASK, OTHER, TILE, flags_of, hashes, messages, state, tables
 
-from gnd_map.codec import (
+from gnd.gnd_map.codec import (
     CODECS,
     LATTICES,
     REPORT,
@@ -20,7 +20,7 @@ from gnd_map.codec import (
     is_on,
     snap,
 )
-from gnd_map.gaussian import Gaussians
+from gnd.gnd_map.gaussian import Gaussians
 
 GOLDEN: dict[str, Any] = json.loads(FILE.read_text())
 BODIES = {name: bytes.fromhex(body) for name, body in GOLDEN["messages"].items()}

@@ -11,8 +11,8 @@ import pytest
 from codec_samples import TILES, changed, street
 from golden_codecs import messages
 
-from gnd_map.codec import CODECS, LATTICES, REPORT, encode_delta, snap
-from gnd_map.tile import content_sha
+from gnd.gnd_map.codec import CODECS, LATTICES, REPORT, encode_delta, snap
+from gnd.gnd_map.tile import content_sha
 
 
 def fingerprint() -> str:
@@ -44,7 +44,7 @@ def test_machines_without_vector_instructions_give_the_same_bytes() -> None:
     here = Path(__file__).parent
     environment = os.environ | {
         "NPY_DISABLE_CPU_FEATURES": " ".join(features),
-        "PYTHONPATH": os.pathsep.join([str(here.parents[1]), str(here)]),
+        "PYTHONPATH": os.pathsep.join([str(here.parents[1] / "src"), str(here)]),
     }
     program = "import test_codec_machines as t; assert not t.optional_features(); print(t.fingerprint())"
     done = subprocess.run([sys.executable, "-c", program], env=environment, capture_output=True, text=True, check=False)

@@ -7,7 +7,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
-from gnd_map.codec import (
+from gnd.gnd_map.codec import (
     CODECS,
     LATTICES,
     MAX_VOXELS,
@@ -30,11 +30,11 @@ from gnd_map.codec import (
     snap,
     volume,
 )
-from gnd_map.errors import CodecError
-from gnd_map.gaussian import Gaussians
-from gnd_map.grid import VoxelGrid
-from gnd_map.tile import content_sha
-from gnd_map.tile_id import TileId
+from gnd.gnd_map.errors import CodecError
+from gnd.gnd_map.gaussian import Gaussians
+from gnd.gnd_map.grid import VoxelGrid
+from gnd.gnd_map.tile import content_sha
+from gnd.gnd_map.tile_id import TileId
 
 ALL_LATTICES = [*LATTICES.values(), REPORT]
 by_lattice = pytest.mark.parametrize("lattice", ALL_LATTICES, ids=lambda lattice: lattice.name)

@@ -5,8 +5,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from gnd_map.errors import ConfigError, ShapeError
-from gnd_map.evidence import ChangeState, MassParameters, masses, states
+from gnd.gnd_map.errors import ConfigError, ShapeError
+from gnd.gnd_map.evidence import ChangeState, MassParameters, masses, states
 
 Mass = dict[frozenset[str], float]
 S, C, OMEGA = frozenset("S"), frozenset("C"), frozenset("SC")

@@ -9,8 +9,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from gnd_map.errors import CodecError, DeltaError, FeatureError
-from gnd_map.features import (
+from gnd.gnd_map.errors import CodecError, DeltaError, FeatureError
+from gnd.gnd_map.features import (
     CUT_END,
     CUT_START,
     VACUOUS,
@@ -40,8 +40,8 @@ from gnd_map.features import (
     snapped,
     snapped_covariance,
 )
-from gnd_map.features.covariance import covariance_of, levels_of
-from gnd_map.tile_id import TILE_RAD, TileId
+from gnd.gnd_map.features.covariance import covariance_of, levels_of
+from gnd.gnd_map.tile_id import TILE_RAD, TileId
 
 TILE = TileId.from_path("13033/03021/23031/22102")
 COV = np.array([0.04, 0.01, 0.0, 0.09, 0.0, 1e4])

@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from gnd_map.errors import ShapeError
-from gnd_map.gaussian import Gaussians, Moments, concat, full_matrices, six_entries
+from gnd.gnd_map.errors import ShapeError
+from gnd.gnd_map.gaussian import Gaussians, Moments, concat, full_matrices, six_entries
 
 
 def some(ids: list[int], seed: int = 0) -> Gaussians:

@@ -8,11 +8,11 @@ from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
-from gnd_map.codec import CODECS, MAX_VOXELS, codec_of, decode_gaussians, encode_gaussians
-from gnd_map.errors import CodecError
-from gnd_map.gaussian import Gaussians
-from gnd_map.tile import Tile, content_sha
-from gnd_map.tile_id import TileId
+from gnd.gnd_map.codec import CODECS, MAX_VOXELS, codec_of, decode_gaussians, encode_gaussians
+from gnd.gnd_map.errors import CodecError
+from gnd.gnd_map.gaussian import Gaussians
+from gnd.gnd_map.tile import Tile, content_sha
+from gnd.gnd_map.tile_id import TileId
 
 GOLDEN = bytes.fromhex(
     "02000000"  # two voxels

@@ -6,8 +6,8 @@ from hypothesis import example, given
 from hypothesis import strategies as st
 from pyproj import Transformer
 
-from gnd_map.errors import GeodesyError
-from gnd_map.geodesy import (
+from gnd.gnd_map.errors import GeodesyError
+from gnd.gnd_map.geodesy import (
     LocalFrame,
     ecef_from_geodetic,
     enu_axes,
@@ -15,7 +15,7 @@ from gnd_map.geodesy import (
     meridian_radius_m,
     normal_radius_m,
 )
-from gnd_map.tile_id import TileId
+from gnd.gnd_map.tile_id import TileId
 
 SEOUL = LocalFrame(np.radians(37.56), np.radians(127.0365), 30.0)
 latitudes = st.floats(-np.pi / 2, np.pi / 2)

@@ -5,11 +5,11 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from gnd_map.errors import ShapeError, TileError
-from gnd_map.geodesy import LocalFrame
-from gnd_map.grid import GridFrame, VoxelGrid, divisions, zones
-from gnd_map.near_grid import RADIUS_M, grid_near
-from gnd_map.tile_id import LAT_TILES, LON_TILES, TileId, covering_circle, geodetic_of_tile_coordinates, morton_of
+from gnd.gnd_map.errors import ShapeError, TileError
+from gnd.gnd_map.geodesy import LocalFrame
+from gnd.gnd_map.grid import GridFrame, VoxelGrid, divisions, zones
+from gnd.gnd_map.near_grid import RADIUS_M, grid_near
+from gnd.gnd_map.tile_id import LAT_TILES, LON_TILES, TileId, covering_circle, geodetic_of_tile_coordinates, morton_of
 
 WANGSIMNI = TileId(497353963154)
 EQUATOR = TileId.from_geodetic(1e-9, 0.3)

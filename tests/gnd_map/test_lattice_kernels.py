@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 from codec_samples import TILES, street
 
-from gnd_map.codec import LATTICES, REPORT, Lattice, snap
-from gnd_map.codec.lattice import Integers, _floats, _found, _found_plain, dequantise, quantise
-from gnd_map.gaussian import Gaussians, concat, six_entries
+from gnd.gnd_map.codec import LATTICES, REPORT, Lattice, snap
+from gnd.gnd_map.codec.lattice import Integers, _floats, _found, _found_plain, dequantise, quantise
+from gnd.gnd_map.gaussian import Gaussians, concat, six_entries
 
 ALL = [*LATTICES.values(), REPORT]
 

@@ -3,9 +3,9 @@
 import numpy as np
 import pytest
 
-from gnd_map.errors import MotionError, ShapeError
-from gnd_map.motion import Trajectory, deskew
-from gnd_map.se3 import T_from_R_t, T_inverse, exp_so3, interpolate_poses, transform
+from gnd.gnd_map.errors import MotionError, ShapeError
+from gnd.gnd_map.motion import Trajectory, deskew
+from gnd.gnd_map.se3 import T_from_R_t, T_inverse, exp_so3, interpolate_poses, transform
 
 START_NS = 1_790_000_000_000_000_000
 FAR_AWAY_M = np.array([4000.0, 3000.0, 30.0])

@@ -7,10 +7,10 @@ from importlib import resources
 import numpy as np
 import pytest
 
-from gnd_map.codec import kernels as k
-from gnd_map.codec.coding import Coder
-from gnd_map.codec.priors import FILE, Priors, priors_of
-from gnd_map.errors import CodecError
+from gnd.gnd_map.codec import kernels as k
+from gnd.gnd_map.codec.coding import Coder
+from gnd.gnd_map.codec.priors import FILE, Priors, priors_of
+from gnd.gnd_map.errors import CodecError
 
 FROZEN = "59f266be96f04858921f72c0eebf9769bceb723fc4746d964717212d90baab01"
 KNOTS = k._KNOTS
@@ -123,4 +123,4 @@ def test_a_stream_read_too_far_or_not_to_its_end_is_refused() -> None:
 
 def test_the_frozen_start_never_changes() -> None:
     """Another file makes other bytes of the same tile: the codec ids would change their meaning."""
-    assert hashlib.sha256(resources.files("gnd_map.codec").joinpath(FILE).read_bytes()).hexdigest() == FROZEN
+    assert hashlib.sha256(resources.files("gnd.gnd_map.codec").joinpath(FILE).read_bytes()).hexdigest() == FROZEN

@@ -6,8 +6,8 @@ from hypothesis import example, given
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation, Slerp
 
-from gnd_map.errors import MotionError, ShapeError
-from gnd_map.se3 import (
+from gnd.gnd_map.errors import MotionError, ShapeError
+from gnd.gnd_map.se3 import (
     R_from_quaternion_xyzw,
     T_from_R_t,
     T_inverse,

@@ -5,10 +5,10 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from gnd_map.errors import ConfigError, ShapeError
-from gnd_map.gaussian import six_entries
-from gnd_map.se3 import exp_so3
-from gnd_map.similarity import (
+from gnd.gnd_map.errors import ConfigError, ShapeError
+from gnd.gnd_map.gaussian import six_entries
+from gnd.gnd_map.se3 import exp_so3
+from gnd.gnd_map.similarity import (
     SimilarityMode,
     alike,
     far_at,

@@ -5,8 +5,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from gnd_map.errors import FeatureError
-from gnd_map.features import check_simple_polyline
+from gnd.gnd_map.errors import FeatureError
+from gnd.gnd_map.features import check_simple_polyline
 
 Vertex = tuple[int, int]
 

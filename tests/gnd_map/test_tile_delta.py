@@ -5,10 +5,10 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from gnd_map.errors import DeltaError, ShapeError
-from gnd_map.gaussian import Gaussians
-from gnd_map.tile import Tile, TileDelta, apply, diff
-from gnd_map.tile_id import TileId
+from gnd.gnd_map.errors import DeltaError, ShapeError
+from gnd.gnd_map.gaussian import Gaussians
+from gnd.gnd_map.tile import Tile, TileDelta, apply, diff
+from gnd.gnd_map.tile_id import TileId
 
 TILE = TileId(497353963154)
 

@@ -5,8 +5,8 @@ import pytest
 from hypothesis import example, given
 from hypothesis import strategies as st
 
-from gnd_map.errors import GeodesyError, TileError
-from gnd_map.tile_id import (
+from gnd.gnd_map.errors import GeodesyError, TileError
+from gnd.gnd_map.tile_id import (
     LAT_TILES,
     LON_TILES,
     District,

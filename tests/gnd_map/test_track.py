@@ -9,11 +9,11 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from gnd_map.errors import CodecError, TrackError
-from gnd_map.geodesy import LocalFrame
-from gnd_map.tile_id import LON_TILES, District, TileId
-from gnd_map.track import MAX_TRACK_BYTES, Piece, Track, View, decode_track, encode_track
-from gnd_map.track_builder import TrackBuilder
+from gnd.gnd_map.errors import CodecError, TrackError
+from gnd.gnd_map.geodesy import LocalFrame
+from gnd.gnd_map.tile_id import LON_TILES, District, TileId
+from gnd.gnd_map.track import MAX_TRACK_BYTES, Piece, Track, View, decode_track, encode_track
+from gnd.gnd_map.track_builder import TrackBuilder
 
 DISTRICT = TileId(497353963154).district
 LEVELS = (-60, -52, -36, -20, -4, 12, 28, 44, 60)

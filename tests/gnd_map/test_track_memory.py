@@ -4,8 +4,8 @@ import weakref
 
 import numpy as np
 
-from gnd_map.geodesy import LocalFrame
-from gnd_map.track_builder import TrackBuilder
+from gnd.gnd_map.geodesy import LocalFrame
+from gnd.gnd_map.track_builder import TrackBuilder
 
 
 def test_a_scan_is_not_kept_for_its_position() -> None:

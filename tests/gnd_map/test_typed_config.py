@@ -7,9 +7,9 @@ from typing import Any, Literal
 
 import pytest
 
-from gnd_map.config import from_mapping, to_mapping
-from gnd_map.errors import ConfigError
-from gnd_map.evidence import MassParameters
+from gnd.gnd_map.config import from_mapping, to_mapping
+from gnd.gnd_map.errors import ConfigError
+from gnd.gnd_map.evidence import MassParameters
 
 
 class Colour(Enum):

@@ -4,8 +4,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 from pyproj import Geod, Proj, Transformer
 
-from gnd_map.errors import GeodesyError
-from gnd_map.utm import central_meridian_rad, convergence_rad, geodetic_from_utm, utm_from_geodetic
+from gnd.gnd_map.errors import GeodesyError
+from gnd.gnd_map.utm import central_meridian_rad, convergence_rad, geodetic_from_utm, utm_from_geodetic
 
 LATITUDES = st.floats(-80.0, 84.0)
 OFFSETS = st.floats(-4.0, 4.0)

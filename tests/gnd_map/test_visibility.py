@@ -10,15 +10,15 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from gnd_map.classes import ChangeClass
-from gnd_map.codec import Flags
-from gnd_map.errors import ConfigError, TrackError
-from gnd_map.gaussian import Gaussians, full_matrices, six_entries
-from gnd_map.grid import VoxelGrid
-from gnd_map.sight import NO_SLOT, NOTHING, STOP, Columns, Window, cast_fans, fill, lay_out, pool, voxel_ids
-from gnd_map.tile_id import TileId
-from gnd_map.track import Piece, Track, View
-from gnd_map.visibility import VisibilityParameters, observed_along
+from gnd.gnd_map.classes import ChangeClass
+from gnd.gnd_map.codec import Flags
+from gnd.gnd_map.errors import ConfigError, TrackError
+from gnd.gnd_map.gaussian import Gaussians, full_matrices, six_entries
+from gnd.gnd_map.grid import VoxelGrid
+from gnd.gnd_map.sight import NO_SLOT, NOTHING, STOP, Columns, Window, cast_fans, fill, lay_out, pool, voxel_ids
+from gnd.gnd_map.tile_id import TileId
+from gnd.gnd_map.track import Piece, Track, View
+from gnd.gnd_map.visibility import VisibilityParameters, observed_along
 
 COLUMNS, TILES_ALONG, FLOORS = (4, 5), (2, 2), 6
 METRES = np.array([0.97, 0.99, 1.0])

@@ -8,11 +8,11 @@ import pytest
 import zstandard
 from codec_samples import KARLSRUHE, SEOUL, street
 
-from gnd_map.codec import CODECS, LATTICES, snap
-from gnd_map.codec.lattice import integers_of
-from gnd_map.codec.zstd_columns import MAX_WINDOW_BYTES, seal
-from gnd_map.errors import CodecError
-from gnd_map.gaussian import Gaussians
+from gnd.gnd_map.codec import CODECS, LATTICES, snap
+from gnd.gnd_map.codec.lattice import integers_of
+from gnd.gnd_map.codec.zstd_columns import MAX_WINDOW_BYTES, seal
+from gnd.gnd_map.errors import CodecError
+from gnd.gnd_map.gaussian import Gaussians
 
 FLOATS = CODECS[1]
 STREET = street(SEOUL, np.random.default_rng(11), 60)

@@ -5,13 +5,13 @@ from pathlib import Path
 
 import numpy as np
 
-from fleet_sim.drives import PERFECT, DriveConfig, simulate_drive
-from fleet_sim.street import street
-from gnd_map.motion import Trajectory, deskew
-from gnd_map.se3 import T_inverse, transform
-from schemas.drive import Scan
-from schemas.drive_mcap import load_track, read_drive, read_header
-from vehicle_agent.importers.recording import Anchor, Recording
+from gnd.fleet_sim.drives import PERFECT, DriveConfig, simulate_drive
+from gnd.fleet_sim.street import street
+from gnd.gnd_map.motion import Trajectory, deskew
+from gnd.gnd_map.se3 import T_inverse, transform
+from gnd.schemas.drive import Scan
+from gnd.schemas.drive_mcap import load_track, read_drive, read_header
+from gnd.vehicle_agent.importers.recording import Anchor, Recording
 
 
 def drive_of(path: Path, sensor: str = "VLP-16", seed: int = 2, scans: int = 40, world: int = 1) -> Path:

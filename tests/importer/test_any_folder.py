@@ -19,16 +19,16 @@ from mcap_protobuf.schema import register_schema
 from mcap_ros2.decoder import DecoderFactory
 from recording_testing import scan_of, true_pose, write_bin
 
-from schemas.drive import Scan
-from schemas.drive_mcap import load_track, read_drive, read_header
-from schemas.errors import DriveError
-from vehicle_agent.errors import ImportDriveError
-from vehicle_agent.importer import import_recording, open_recording
-from vehicle_agent.importer_cli import import_drives
-from vehicle_agent.importers.detect_format import format_of
-from vehicle_agent.importers.fields import offsets_ns
-from vehicle_agent.importers.point_cloud2 import decode_cloud
-from vehicle_agent.importers.recording import Anchor
+from gnd.schemas.drive import Scan
+from gnd.schemas.drive_mcap import load_track, read_drive, read_header
+from gnd.schemas.errors import DriveError
+from gnd.vehicle_agent.errors import ImportDriveError
+from gnd.vehicle_agent.importer import import_recording, open_recording
+from gnd.vehicle_agent.importer_cli import import_drives
+from gnd.vehicle_agent.importers.detect_format import format_of
+from gnd.vehicle_agent.importers.fields import offsets_ns
+from gnd.vehicle_agent.importers.point_cloud2 import decode_cloud
+from gnd.vehicle_agent.importers.recording import Anchor
 
 ANCHOR = Anchor(37.56, 127.03, 30.0)
 START = 1_700_000_000 * SECOND

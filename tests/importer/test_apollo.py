@@ -4,15 +4,15 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from gnd_map.se3 import T_inverse, transform
-from gnd_map.utm import geodetic_from_utm, utm_from_geodetic
-from schemas.drive_mcap import load_track, read_header
-from vehicle_agent.errors import ImportDriveError
-from vehicle_agent.importer import import_recording, open_recording
-from vehicle_agent.importers.apollo import is_apollo, open_apollo, utm_zone
-from vehicle_agent.importers.apollo_map import read_ndt_map
-from vehicle_agent.importers.detect_format import format_of
-from vehicle_agent.importers.recording import Recording
+from gnd.gnd_map.se3 import T_inverse, transform
+from gnd.gnd_map.utm import geodetic_from_utm, utm_from_geodetic
+from gnd.schemas.drive_mcap import load_track, read_header
+from gnd.vehicle_agent.errors import ImportDriveError
+from gnd.vehicle_agent.importer import import_recording, open_recording
+from gnd.vehicle_agent.importers.apollo import is_apollo, open_apollo, utm_zone
+from gnd.vehicle_agent.importers.apollo_map import read_ndt_map
+from gnd.vehicle_agent.importers.detect_format import format_of
+from gnd.vehicle_agent.importers.recording import Recording
 
 
 @pytest.fixture(scope="module")

@@ -5,16 +5,16 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from fleet_sim.drives import DriveConfig, simulate_drive
-from fleet_sim.street import street
-from gnd_map.gaussian import Gaussians
-from gnd_map.motion import Trajectory
-from gnd_map.se3 import T_inverse
-from schemas.drive import Scan
-from schemas.drive_mcap import load_track, read_drive, read_header
-from vehicle_agent.importer import no_progress
-from vehicle_agent.importers.lidar_odometry import _lies_as_a_line, lidar_odometry
-from vehicle_agent.importers.recording import Anchor, Recording
+from gnd.fleet_sim.drives import DriveConfig, simulate_drive
+from gnd.fleet_sim.street import street
+from gnd.gnd_map.gaussian import Gaussians
+from gnd.gnd_map.motion import Trajectory
+from gnd.gnd_map.se3 import T_inverse
+from gnd.schemas.drive import Scan
+from gnd.schemas.drive_mcap import load_track, read_drive, read_header
+from gnd.vehicle_agent.importer import no_progress
+from gnd.vehicle_agent.importers.lidar_odometry import _lies_as_a_line, lidar_odometry
+from gnd.vehicle_agent.importers.recording import Anchor, Recording
 
 
 def recording_of(path: Path) -> Recording:

@@ -9,15 +9,15 @@ import pytest
 from click.testing import CliRunner
 from recording_testing import STEP_M, scan_of, true_pose, write_bin
 
-from gnd_map.errors import GndError
-from gnd_map.se3 import T_inverse, exp_so3, log_so3
-from schemas.drive import Scan
-from schemas.drive_mcap import drive_counts, load_track, read_drive, read_header
-from vehicle_agent.errors import ImportDriveError
-from vehicle_agent.importer import fit_heading_and_position, import_recording, open_recording
-from vehicle_agent.importer_cli import import_drives
-from vehicle_agent.importers.recording import Anchor
-from vehicle_agent.importers.splits import chosen_scans
+from gnd.gnd_map.errors import GndError
+from gnd.gnd_map.se3 import T_inverse, exp_so3, log_so3
+from gnd.schemas.drive import Scan
+from gnd.schemas.drive_mcap import drive_counts, load_track, read_drive, read_header
+from gnd.vehicle_agent.errors import ImportDriveError
+from gnd.vehicle_agent.importer import fit_heading_and_position, import_recording, open_recording
+from gnd.vehicle_agent.importer_cli import import_drives
+from gnd.vehicle_agent.importers.recording import Anchor
+from gnd.vehicle_agent.importers.splits import chosen_scans
 
 ANCHOR = Anchor(37.56, 127.03, 30.0)
 

@@ -6,13 +6,13 @@ import numpy as np
 import pytest
 from sweep_testing import drive_of, mounted_otherwise, recording_of, scans_of, truth_of
 
-from gnd_map.motion import Trajectory
-from gnd_map.se3 import T_from_R_t, exp_so3, log_so3
-from schemas.drive import Scan
-from schemas.drive_mcap import read_header
-from vehicle_agent.importer import prepared
-from vehicle_agent.importers.mount import GroundSeen, Refused, YawSeen, ground_of, ground_of_scans, yaw_of_track
-from vehicle_agent.importers.mounting import angles_of, levelled, with_mount
+from gnd.gnd_map.motion import Trajectory
+from gnd.gnd_map.se3 import T_from_R_t, exp_so3, log_so3
+from gnd.schemas.drive import Scan
+from gnd.schemas.drive_mcap import read_header
+from gnd.vehicle_agent.importer import prepared
+from gnd.vehicle_agent.importers.mount import GroundSeen, Refused, YawSeen, ground_of, ground_of_scans, yaw_of_track
+from gnd.vehicle_agent.importers.mounting import angles_of, levelled, with_mount
 
 
 @pytest.fixture(scope="module")

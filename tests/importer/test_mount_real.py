@@ -5,9 +5,9 @@ import dataclasses
 import numpy as np
 import pytest
 
-from vehicle_agent.importer import open_recording, prepared
-from vehicle_agent.importers.mounting import angles_of
-from vehicle_agent.importers.recording import Recording
+from gnd.vehicle_agent.importer import open_recording, prepared
+from gnd.vehicle_agent.importers.mounting import angles_of
+from gnd.vehicle_agent.importers.recording import Recording
 
 
 def forgotten(recording: Recording, first: int, last: int) -> Recording:

@@ -6,8 +6,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 from lzf_testing import lzf_compress
 
-from vehicle_agent.errors import ImportDriveError
-from vehicle_agent.importers.pcd_format import _lzf_decompress, read_pcd
+from gnd.vehicle_agent.errors import ImportDriveError
+from gnd.vehicle_agent.importers.pcd_format import _lzf_decompress, read_pcd
 
 HEADER = """# .PCD v0.7 - Point Cloud Data file format
 VERSION 0.7

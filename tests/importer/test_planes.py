@@ -7,11 +7,11 @@ import numpy as np
 import pytest
 from recording_testing import scan_of
 
-from gnd_map.se3 import T_inverse
-from schemas.drive_mcap import load_track, read_header
-from vehicle_agent.errors import ImportDriveError
-from vehicle_agent.importer import import_recording, open_recording
-from vehicle_agent.importers.planes import scan_times
+from gnd.gnd_map.se3 import T_inverse
+from gnd.schemas.drive_mcap import load_track, read_header
+from gnd.vehicle_agent.errors import ImportDriveError
+from gnd.vehicle_agent.importer import import_recording, open_recording
+from gnd.vehicle_agent.importers.planes import scan_times
 
 HEAD = "scan,t_s,lat_deg,lon_deg,alt_m,roll_rad,pitch_rad,yaw_rad,speed_mps\n"
 

@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 from sweep_testing import drive_of, freed_of_motion, mirrored, recording_of, ring_by_ring, scans_of, without_times
 
-from schemas.drive import Scan
-from vehicle_agent.importers.deskewing import share_by_azimuth, with_times
-from vehicle_agent.importers.firing_order import firing_share
-from vehicle_agent.importers.plane_thickness import compared, thickness_of
-from vehicle_agent.importers.sweep_times import BINS, AzimuthTimes, Sweep, fit_sweep, middle_of_bins_rad
+from gnd.schemas.drive import Scan
+from gnd.vehicle_agent.importers.deskewing import share_by_azimuth, with_times
+from gnd.vehicle_agent.importers.firing_order import firing_share
+from gnd.vehicle_agent.importers.plane_thickness import compared, thickness_of
+from gnd.vehicle_agent.importers.sweep_times import BINS, AzimuthTimes, Sweep, fit_sweep, middle_of_bins_rad
 
 SWEEP_NS = 100_000_000
 

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from yard import local_map_of, yard
 
-from vehicle_agent.local_map import LocalMap
+from gnd.vehicle_agent.local_map import LocalMap
 
 
 @pytest.fixture(scope="session")

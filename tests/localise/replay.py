@@ -7,17 +7,17 @@ from pathlib import Path
 
 import numpy as np
 
-from gnd_map.accumulate import N_MIN_CELLS, VoxelAccumulator
-from gnd_map.geodesy import LocalFrame
-from gnd_map.grid import GridFrame
-from gnd_map.motion import Trajectory, deskew
-from gnd_map.se3 import transform
-from gnd_map.tile import Tile
-from gnd_map.tile_id import TileId, covering_corridor
-from schemas.drive import GnssFix, MotionSample, ReferencePose, Scan
-from schemas.drive_mcap import load_track, read_drive, read_header
-from vehicle_agent.local_map import LocalMap
-from vehicle_agent.localise import Localiser, LocaliserParameters, PoseEstimate
+from gnd.gnd_map.accumulate import N_MIN_CELLS, VoxelAccumulator
+from gnd.gnd_map.geodesy import LocalFrame
+from gnd.gnd_map.grid import GridFrame
+from gnd.gnd_map.motion import Trajectory, deskew
+from gnd.gnd_map.se3 import transform
+from gnd.gnd_map.tile import Tile
+from gnd.gnd_map.tile_id import TileId, covering_corridor
+from gnd.schemas.drive import GnssFix, MotionSample, ReferencePose, Scan
+from gnd.schemas.drive_mcap import load_track, read_drive, read_header
+from gnd.vehicle_agent.local_map import LocalMap
+from gnd.vehicle_agent.localise import Localiser, LocaliserParameters, PoseEstimate
 
 REACH_M = 70.0
 

@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 from yard import pose
 
-from vehicle_agent.localise.arbiter import Motion, believing_neither, who_is_wrong
-from vehicle_agent.localise.registration import RegistrationResult
-from vehicle_agent.localise.scan_odometry import ScanStep
+from gnd.vehicle_agent.localise.arbiter import Motion, believing_neither, who_is_wrong
+from gnd.vehicle_agent.localise.registration import RegistrationResult
+from gnd.vehicle_agent.localise.scan_odometry import ScanStep
 
 BEFORE = pose(3.0, -2.0, 30.0)
 KNOWN = np.diag([1e-6, 1e-6, 1e-6, 0.03**2, 0.03**2, 0.01**2])

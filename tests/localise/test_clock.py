@@ -5,10 +5,10 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from gnd_map.se3 import T_from_R_t, exp_so3
-from vehicle_agent.localise.clock import MOST_S, PRIOR_S, ClockEstimator, _whitened
-from vehicle_agent.localise.odometry import ClockModel, MotionBuffer
-from vehicle_agent.localise.scan_odometry import ScanStep
+from gnd.gnd_map.se3 import T_from_R_t, exp_so3
+from gnd.vehicle_agent.localise.clock import MOST_S, PRIOR_S, ClockEstimator, _whitened
+from gnd.vehicle_agent.localise.odometry import ClockModel, MotionBuffer
+from gnd.vehicle_agent.localise.scan_odometry import ScanStep
 
 S = 1_000_000_000
 START_NS = 1_600_000_000 * S

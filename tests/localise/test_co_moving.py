@@ -6,25 +6,25 @@ from functools import lru_cache
 import numpy as np
 import pytest
 
-from fleet_sim.insert_company import VanAhead, put_behind_a_van
-from fleet_sim.raycast import Scene
-from fleet_sim.shapes import Block
-from gnd_map.motion import deskew
-from schemas.drive import MotionSample, Scan
-from schemas.drive_mcap import read_drive, read_header
-from vehicle_agent.importer import map_track, open_recording, write_drive
-from vehicle_agent.localise import co_moving_kernels as kernels
-from vehicle_agent.localise.co_moving import CoMoving
-from vehicle_agent.localise.odometry import MotionBuffer
-from vehicle_agent.localise.parameters import SamplingParameters
-from vehicle_agent.localise.sampling import sample_scan
-from vehicle_agent.localise.scan_odometry import (
+from gnd.fleet_sim.insert_company import VanAhead, put_behind_a_van
+from gnd.fleet_sim.raycast import Scene
+from gnd.fleet_sim.shapes import Block
+from gnd.gnd_map.motion import deskew
+from gnd.schemas.drive import MotionSample, Scan
+from gnd.schemas.drive_mcap import read_drive, read_header
+from gnd.vehicle_agent.importer import map_track, open_recording, write_drive
+from gnd.vehicle_agent.localise import co_moving_kernels as kernels
+from gnd.vehicle_agent.localise.co_moving import CoMoving
+from gnd.vehicle_agent.localise.odometry import MotionBuffer
+from gnd.vehicle_agent.localise.parameters import SamplingParameters
+from gnd.vehicle_agent.localise.sampling import sample_scan
+from gnd.vehicle_agent.localise.scan_odometry import (
     OFF_GROUND_M,
     OFF_GROUND_SLOPE,
     ScanOdometry,
     ScanOdometryParameters,
 )
-from vehicle_agent.localise.scan_pool import standing_points
+from gnd.vehicle_agent.localise.scan_pool import standing_points
 
 SWEEP_S, AZIMUTHS, LAYERS = 0.1, 720, 16
 HEIGHT_M = 1.9

@@ -3,10 +3,10 @@
 import numpy as np
 import pytest
 
-from gnd_map.motion import Trajectory
-from gnd_map.se3 import T_from_R_t, exp_so3
-from vehicle_agent.localise.consistency import Innovations, nees_of
-from vehicle_agent.localise.estimates import PoseEstimate
+from gnd.gnd_map.motion import Trajectory
+from gnd.gnd_map.se3 import T_from_R_t, exp_so3
+from gnd.vehicle_agent.localise.consistency import Innovations, nees_of
+from gnd.vehicle_agent.localise.estimates import PoseEstimate
 
 SIGMAS = np.array([1e-3, 1e-3, 2e-3, 0.03, 0.02, 0.05])
 REFERENCE = Trajectory(np.array([0, 10**9]), np.stack([np.eye(4), T_from_R_t(np.eye(3), [10.0, 0.0, 0.0])]))

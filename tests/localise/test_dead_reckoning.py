@@ -3,10 +3,10 @@
 import numpy as np
 import pytest
 
-from gnd_map.se3 import T_inverse
-from vehicle_agent.localise.calibration import MotionTeacher
-from vehicle_agent.localise.odometry import MotionBuffer
-from vehicle_agent.localise.parameters import OdometryParameters
+from gnd.gnd_map.se3 import T_inverse
+from gnd.vehicle_agent.localise.calibration import MotionTeacher
+from gnd.vehicle_agent.localise.odometry import MotionBuffer
+from gnd.vehicle_agent.localise.parameters import OdometryParameters
 
 S = 1_000_000_000
 

@@ -4,15 +4,15 @@ import numpy as np
 import pytest
 from pyproj import Geod
 
-from gnd_map.geodesy import LocalFrame
-from gnd_map.motion import Trajectory
-from gnd_map.se3 import T_from_R_t, T_inverse, exp_so3, log_so3
-from gnd_map.tile_id import TileId
-from schemas.drive import GnssFix
-from vehicle_agent.errors import LocaliseError
-from vehicle_agent.localise.georeference import Georeferenced, georeference
-from vehicle_agent.localise.path_association import Untimed, _viterbi, georeference_untimed, matched_way_m
-from vehicle_agent.localise.track_alignment import FixTable, GeoreferenceParameters
+from gnd.gnd_map.geodesy import LocalFrame
+from gnd.gnd_map.motion import Trajectory
+from gnd.gnd_map.se3 import T_from_R_t, T_inverse, exp_so3, log_so3
+from gnd.gnd_map.tile_id import TileId
+from gnd.schemas.drive import GnssFix
+from gnd.vehicle_agent.errors import LocaliseError
+from gnd.vehicle_agent.localise.georeference import Georeferenced, georeference
+from gnd.vehicle_agent.localise.path_association import Untimed, _viterbi, georeference_untimed, matched_way_m
+from gnd.vehicle_agent.localise.track_alignment import FixTable, GeoreferenceParameters
 
 PLACE = (np.radians(48.2644), np.radians(11.669))
 FRAME = LocalFrame.of_tile(TileId.from_geodetic(*PLACE))

@@ -3,12 +3,12 @@
 import numpy as np
 import pytest
 
-from vehicle_agent.localise import witness
-from vehicle_agent.localise.doubt_parameters import CauseParameters
-from vehicle_agent.localise.health import HealthMonitor, named_directions
-from vehicle_agent.localise.parameters import HealthParameters
-from vehicle_agent.localise.registration import RegistrationResult
-from vehicle_agent.localise.witness import CROSSED, GONE, HIT, KNOWN, NEW
+from gnd.vehicle_agent.localise import witness
+from gnd.vehicle_agent.localise.doubt_parameters import CauseParameters
+from gnd.vehicle_agent.localise.health import HealthMonitor, named_directions
+from gnd.vehicle_agent.localise.parameters import HealthParameters
+from gnd.vehicle_agent.localise.registration import RegistrationResult
+from gnd.vehicle_agent.localise.witness import CROSSED, GONE, HIT, KNOWN, NEW
 
 S = 1_000_000_000
 FREE = np.empty((0, 6))

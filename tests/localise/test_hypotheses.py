@@ -4,14 +4,14 @@ import numpy as np
 import pytest
 from yard import GROUND_M, local_map_of, match_map_of, offset, pose, rectangle, seen_from
 
-from gnd_map.se3 import T_inverse, transform
-from vehicle_agent.localise.doubt_parameters import HypothesisParameters, PoolParameters
-from vehicle_agent.localise.first_pose import FirstPose, Place
-from vehicle_agent.localise.hypotheses import Hypotheses
-from vehicle_agent.localise.initialise import Around, probabilities, search
-from vehicle_agent.localise.match_map import MatchMapCache
-from vehicle_agent.localise.parameters import InitialiseParameters, LocaliserParameters, RegistrationParameters
-from vehicle_agent.localise.scan_pool import ScanPool
+from gnd.gnd_map.se3 import T_inverse, transform
+from gnd.vehicle_agent.localise.doubt_parameters import HypothesisParameters, PoolParameters
+from gnd.vehicle_agent.localise.first_pose import FirstPose, Place
+from gnd.vehicle_agent.localise.hypotheses import Hypotheses
+from gnd.vehicle_agent.localise.initialise import Around, probabilities, search
+from gnd.vehicle_agent.localise.match_map import MatchMapCache
+from gnd.vehicle_agent.localise.parameters import InitialiseParameters, LocaliserParameters, RegistrationParameters
+from gnd.vehicle_agent.localise.scan_pool import ScanPool
 
 STEP_M = 1.0
 

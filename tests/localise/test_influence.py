@@ -6,13 +6,13 @@ import numpy as np
 import pytest
 from yard import local_map_of, match_map_of, pose, seen_from
 
-from gnd_map.se3 import T_from_R_t, T_inverse, exp_so3
-from vehicle_agent.localise.influence import FEW, SeenScan, _of_pieces, influence
-from vehicle_agent.localise.kernels import linearise, pulls
-from vehicle_agent.localise.parameters import RegistrationParameters
-from vehicle_agent.localise.refine import WINDOW, told_by_scans
-from vehicle_agent.localise.registration import linearised
-from vehicle_agent.localise.stretch import N_SHARED, Belief, Knot, Step, log_se3, shared_of, solve_stretch
+from gnd.gnd_map.se3 import T_from_R_t, T_inverse, exp_so3
+from gnd.vehicle_agent.localise.influence import FEW, SeenScan, _of_pieces, influence
+from gnd.vehicle_agent.localise.kernels import linearise, pulls
+from gnd.vehicle_agent.localise.parameters import RegistrationParameters
+from gnd.vehicle_agent.localise.refine import WINDOW, told_by_scans
+from gnd.vehicle_agent.localise.registration import linearised
+from gnd.vehicle_agent.localise.stretch import N_SHARED, Belief, Knot, Step, log_se3, shared_of, solve_stretch
 
 PAR = RegistrationParameters()
 SCALE = 2.0

@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 from yard import GROUND_M, local_map_of, match_map_of, offset, pose, rectangle, seen_from
 
-from vehicle_agent.localise.initialise import initialise
-from vehicle_agent.localise.parameters import InitialiseParameters
+from gnd.vehicle_agent.localise.initialise import initialise
+from gnd.vehicle_agent.localise.parameters import InitialiseParameters
 
 
 @pytest.mark.parametrize("seed", range(8))

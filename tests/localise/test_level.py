@@ -4,11 +4,11 @@ import numpy as np
 import pytest
 from yard import GROUND_M, local_map_of, match_map_of, pose, yard
 
-from fleet_sim.sensors import MODELS
-from gnd_map.se3 import T_inverse, log_so3
-from vehicle_agent.localise.graph import SmoothedPose
-from vehicle_agent.localise.level import SIGMA_M, SIGMA_RAD, on_the_road, sees_tilt
-from vehicle_agent.localise.parameters import RegistrationParameters
+from gnd.fleet_sim.sensors import MODELS
+from gnd.gnd_map.se3 import T_inverse, log_so3
+from gnd.vehicle_agent.localise.graph import SmoothedPose
+from gnd.vehicle_agent.localise.level import SIGMA_M, SIGMA_RAD, on_the_road, sees_tilt
+from gnd.vehicle_agent.localise.parameters import RegistrationParameters
 
 
 @pytest.fixture(scope="module")

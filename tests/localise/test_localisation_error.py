@@ -3,10 +3,10 @@
 import numpy as np
 import pytest
 
-from gnd_map.motion import Trajectory
-from gnd_map.se3 import T_from_R_t, exp_so3
-from vehicle_agent.errors import LocaliseError
-from vehicle_agent.localise import PoseEstimate, localisation_error
+from gnd.gnd_map.motion import Trajectory
+from gnd.gnd_map.se3 import T_from_R_t, exp_so3
+from gnd.vehicle_agent.errors import LocaliseError
+from gnd.vehicle_agent.localise import PoseEstimate, localisation_error
 
 S = 1_000_000_000
 

@@ -5,11 +5,11 @@ from pathlib import Path
 import pytest
 from replay import grid_frame_of, map_of, reference_of, replay
 
-from fleet_sim.drives import PERFECT, DriveConfig, simulate_drive
-from fleet_sim.street import street
-from vehicle_agent.importer import map_track, open_recording, write_drive
-from vehicle_agent.localise import LocalisationError, LocaliserParameters, localisation_error
-from vehicle_agent.localise.refine_parameters import RefineParameters
+from gnd.fleet_sim.drives import PERFECT, DriveConfig, simulate_drive
+from gnd.fleet_sim.street import street
+from gnd.vehicle_agent.importer import map_track, open_recording, write_drive
+from gnd.vehicle_agent.localise import LocalisationError, LocaliserParameters, localisation_error
+from gnd.vehicle_agent.localise.refine_parameters import RefineParameters
 
 SEED = 5  # of no street on which anything was tuned
 

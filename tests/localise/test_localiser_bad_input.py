@@ -7,13 +7,13 @@ import numpy as np
 import pytest
 from yard import FRAME, GRID_FRAME, offset, pose, seen_from
 
-from gnd_map.tile import Tile
-from gnd_map.tile_id import TileId, covering_circle
-from schemas.drive import GnssFix, MotionSample, Scan
-from schemas.errors import BadValue
-from vehicle_agent.local_map import LocalMap
-from vehicle_agent.localise import Localiser, LocaliserParameters
-from vehicle_agent.localise.refine_parameters import RefineParameters
+from gnd.gnd_map.tile import Tile
+from gnd.gnd_map.tile_id import TileId, covering_circle
+from gnd.schemas.drive import GnssFix, MotionSample, Scan
+from gnd.schemas.errors import BadValue
+from gnd.vehicle_agent.local_map import LocalMap
+from gnd.vehicle_agent.localise import Localiser, LocaliserParameters
+from gnd.vehicle_agent.localise.refine_parameters import RefineParameters
 
 S = 1_000_000_000
 SWEEP_NS = S // 10

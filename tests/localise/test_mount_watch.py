@@ -5,8 +5,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from gnd_map.se3 import T_inverse, exp_so3, transform
-from vehicle_agent.localise.mount import MountResidual, MountWatch, near_points
+from gnd.gnd_map.se3 import T_inverse, exp_so3, transform
+from gnd.vehicle_agent.localise.mount import MountResidual, MountWatch, near_points
 
 S = 1_000_000_000
 HEIGHT_M = 1.9

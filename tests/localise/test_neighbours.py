@@ -3,9 +3,9 @@
 import numpy as np
 from yard import local_map_of, match_map_of, pose, rectangle, seen_from
 
-from vehicle_agent.localise.neighbours import FAR_M, NEAR_M, WEAK_M, hedged
-from vehicle_agent.localise.parameters import RegistrationParameters
-from vehicle_agent.localise.registration import register
+from gnd.vehicle_agent.localise.neighbours import FAR_M, NEAR_M, WEAK_M, hedged
+from gnd.vehicle_agent.localise.parameters import RegistrationParameters
+from gnd.vehicle_agent.localise.registration import register
 
 PAR = RegistrationParameters()
 

@@ -6,16 +6,16 @@ import numpy as np
 import pytest
 from replay import grid_frame_of, map_of, reference_of
 
-from fleet_sim.drives import PERFECT, DriveConfig, simulate_drive
-from fleet_sim.street import street
-from gnd_map.classes import ChangeClass
-from gnd_map.motion import deskew
-from gnd_map.se3 import transform
-from schemas.drive import Scan
-from schemas.drive_mcap import read_drive, read_header
-from vehicle_agent.detect.classify import classify
-from vehicle_agent.detect.detector import ChangeDetector
-from vehicle_agent.localise.packed_scan import pack
+from gnd.fleet_sim.drives import PERFECT, DriveConfig, simulate_drive
+from gnd.fleet_sim.street import street
+from gnd.gnd_map.classes import ChangeClass
+from gnd.gnd_map.motion import deskew
+from gnd.gnd_map.se3 import transform
+from gnd.schemas.drive import Scan
+from gnd.schemas.drive_mcap import read_drive, read_header
+from gnd.vehicle_agent.detect.classify import classify
+from gnd.vehicle_agent.detect.detector import ChangeDetector
+from gnd.vehicle_agent.localise.packed_scan import pack
 
 SCANS = 60
 CHANGED = (ChangeClass.NEW, ChangeClass.MODIFIED, ChangeClass.DELETED)

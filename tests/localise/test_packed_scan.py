@@ -4,10 +4,10 @@ import numpy as np
 import pytest
 from yard import pose
 
-from gnd_map.motion import Trajectory, deskew
-from gnd_map.se3 import transform
-from schemas.drive import Scan
-from vehicle_agent.localise.packed_scan import MAX_REACH_M, pack
+from gnd.gnd_map.motion import Trajectory, deskew
+from gnd.gnd_map.se3 import transform
+from gnd.schemas.drive import Scan
+from gnd.vehicle_agent.localise.packed_scan import MAX_REACH_M, pack
 
 SWEEP_NS = 100_000_000
 MOUNT = pose(1.2, 0.1, 5.0, roll_deg=1.0, z=1.9)

@@ -4,10 +4,10 @@ import numpy as np
 from test_localiser_bad_input import PARAMETERS, S
 from yard import GROUND_M, NOISE_M, corridor, local_map_of, match_map_of, offset, pose, seen_from
 
-from schemas.drive import MotionSample, Scan
-from vehicle_agent.localise import Localiser
-from vehicle_agent.localise.parameters import RegistrationParameters
-from vehicle_agent.localise.registration import register
+from gnd.schemas.drive import MotionSample, Scan
+from gnd.vehicle_agent.localise import Localiser
+from gnd.vehicle_agent.localise.parameters import RegistrationParameters
+from gnd.vehicle_agent.localise.registration import register
 
 SPEED_MPS = 10.0
 

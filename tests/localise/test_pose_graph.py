@@ -3,9 +3,9 @@
 import gtsam
 import numpy as np
 
-from gnd_map.se3 import exp_so3
-from vehicle_agent.localise.graph import MapMatch, Odometry, PoseGraph, Position
-from vehicle_agent.localise.parameters import GraphParameters
+from gnd.gnd_map.se3 import exp_so3
+from gnd.vehicle_agent.localise.graph import MapMatch, Odometry, PoseGraph, Position
+from gnd.vehicle_agent.localise.parameters import GraphParameters
 
 STEP_NS = 100_000_000
 SIGMAS = np.array([3e-3, 3e-3, 6e-4, 0.01, 0.01, 0.02])

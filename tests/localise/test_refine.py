@@ -6,16 +6,16 @@ import numpy as np
 import pytest
 from yard import FRAME, GROUND_M, local_map_of, moved, offset, pose, seen_from
 
-from gnd_map.se3 import T_from_R_t, T_inverse, exp_so3
-from schemas.drive import GnssFix, MotionSample, Scan
-from vehicle_agent.localise import Localiser, LocaliserParameters
-from vehicle_agent.localise.calibration import MotionTeacher
-from vehicle_agent.localise.graph import SmoothedPose
-from vehicle_agent.localise.match_map import MatchMapCache
-from vehicle_agent.localise.odometry import MotionBuffer
-from vehicle_agent.localise.parameters import GraphParameters, OdometryParameters, RegistrationParameters
-from vehicle_agent.localise.refine import Refiner, between
-from vehicle_agent.localise.refine_parameters import RefineParameters
+from gnd.gnd_map.se3 import T_from_R_t, T_inverse, exp_so3
+from gnd.schemas.drive import GnssFix, MotionSample, Scan
+from gnd.vehicle_agent.localise import Localiser, LocaliserParameters
+from gnd.vehicle_agent.localise.calibration import MotionTeacher
+from gnd.vehicle_agent.localise.graph import SmoothedPose
+from gnd.vehicle_agent.localise.match_map import MatchMapCache
+from gnd.vehicle_agent.localise.odometry import MotionBuffer
+from gnd.vehicle_agent.localise.parameters import GraphParameters, OdometryParameters, RegistrationParameters
+from gnd.vehicle_agent.localise.refine import Refiner, between
+from gnd.vehicle_agent.localise.refine_parameters import RefineParameters
 
 S = 1_000_000_000
 EVERY_NS = S // 10

@@ -4,10 +4,10 @@ from dataclasses import fields, replace
 
 import pytest
 
-from gnd_map.config import from_mapping
-from gnd_map.errors import ConfigError
-from vehicle_agent.localise import LocaliserParameters
-from vehicle_agent.localise.refine_parameters import RefineParameters
+from gnd.gnd_map.config import from_mapping
+from gnd.gnd_map.errors import ConfigError
+from gnd.vehicle_agent.localise import LocaliserParameters
+from gnd.vehicle_agent.localise.refine_parameters import RefineParameters
 
 POSITIVE = (
     "every_m", "every_s", "knot_m", "knot_s", "correlated_m", "length_m", "length_s", "longest_s", "near_m", "fit_m",

@@ -14,13 +14,13 @@ from yard import (
     seen_from,
 )
 
-from gnd_map.gaussian import full_matrices
-from gnd_map.se3 import T_from_R_t, exp_so3
-from vehicle_agent.errors import RegistrationError
-from vehicle_agent.localise.kernels import linearise, tapered_information
-from vehicle_agent.localise.match_map import MatchMap
-from vehicle_agent.localise.parameters import RegistrationParameters
-from vehicle_agent.localise.registration import register
+from gnd.gnd_map.gaussian import full_matrices
+from gnd.gnd_map.se3 import T_from_R_t, exp_so3
+from gnd.vehicle_agent.errors import RegistrationError
+from gnd.vehicle_agent.localise.kernels import linearise, tapered_information
+from gnd.vehicle_agent.localise.match_map import MatchMap
+from gnd.vehicle_agent.localise.parameters import RegistrationParameters
+from gnd.vehicle_agent.localise.registration import register
 
 UNIFORM = 1.0 / 12.0
 

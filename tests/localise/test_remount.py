@@ -3,15 +3,15 @@
 import numpy as np
 import pytest
 
-from gnd_map.se3 import T_inverse, exp_so3, log_so3
-from schemas.drive import MountSigma
-from vehicle_agent.localise.calibration import MotionTeacher
-from vehicle_agent.localise.first_course import FirstCourse
-from vehicle_agent.localise.mount import MountResidual
-from vehicle_agent.localise.odometry import MotionBuffer
-from vehicle_agent.localise.parameters import OdometryParameters
-from vehicle_agent.localise.registration import WHEELS_M
-from vehicle_agent.localise.remount import (
+from gnd.gnd_map.se3 import T_inverse, exp_so3, log_so3
+from gnd.schemas.drive import MountSigma
+from gnd.vehicle_agent.localise.calibration import MotionTeacher
+from gnd.vehicle_agent.localise.first_course import FirstCourse
+from gnd.vehicle_agent.localise.mount import MountResidual
+from gnd.vehicle_agent.localise.odometry import MotionBuffer
+from gnd.vehicle_agent.localise.parameters import OdometryParameters
+from gnd.vehicle_agent.localise.registration import WHEELS_M
+from gnd.vehicle_agent.localise.remount import (
     TRUSTED,
     TRUSTED_RAD,
     Mounting,
@@ -20,7 +20,7 @@ from vehicle_agent.localise.remount import (
     lever_covariance,
     tilted,
 )
-from vehicle_agent.localise.scan_odometry import ScanStep
+from gnd.vehicle_agent.localise.scan_odometry import ScanStep
 
 S = 1_000_000_000
 DEG = np.radians(1.0)

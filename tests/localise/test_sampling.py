@@ -5,8 +5,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from vehicle_agent.localise.parameters import SamplingParameters
-from vehicle_agent.localise.sampling import sample_scan
+from gnd.vehicle_agent.localise.parameters import SamplingParameters
+from gnd.vehicle_agent.localise.sampling import sample_scan
 
 
 def cloud(n, seed=0, reach=50.0):

@@ -6,12 +6,12 @@ import numpy as np
 import pytest
 from yard import GROUND_M, corridor, offset, pose, seen_from, yard
 
-from gnd_map.se3 import T_inverse, transform
-from vehicle_agent.localise.kernels import tapered_information
-from vehicle_agent.localise.match_map import UNIFORM_VOXEL_M2
-from vehicle_agent.localise.rolling_map import RollingMap
-from vehicle_agent.localise.scan_odometry import ScanOdometry, ScanStep, joint_step
-from vehicle_agent.localise.scan_odometry_parameters import RollingMapParameters, ScanOdometryParameters
+from gnd.gnd_map.se3 import T_inverse, transform
+from gnd.vehicle_agent.localise.kernels import tapered_information
+from gnd.vehicle_agent.localise.match_map import UNIFORM_VOXEL_M2
+from gnd.vehicle_agent.localise.rolling_map import RollingMap
+from gnd.vehicle_agent.localise.scan_odometry import ScanOdometry, ScanStep, joint_step
+from gnd.vehicle_agent.localise.scan_odometry_parameters import RollingMapParameters, ScanOdometryParameters
 
 STEP_NS = 100_000_000
 RINGLESS = ScanOdometryParameters(min_standing_share=0.0)  # points of the yard's ground lie in no rings

@@ -4,10 +4,10 @@ import numpy as np
 import pytest
 from yard import local_map_of, match_map_of, rectangle
 
-from gnd_map.se3 import T_from_R_t, exp_so3, transform
-from vehicle_agent.errors import RegistrationError
-from vehicle_agent.localise.parameters import RegistrationParameters
-from vehicle_agent.localise.registration import WHEELS_M, settle
+from gnd.gnd_map.se3 import T_from_R_t, exp_so3, transform
+from gnd.vehicle_agent.errors import RegistrationError
+from gnd.vehicle_agent.localise.parameters import RegistrationParameters
+from gnd.vehicle_agent.localise.registration import WHEELS_M, settle
 
 SLOPE_E, SLOPE_N = 0.05, -0.03
 HEIGHT_M = 0.4

@@ -5,13 +5,13 @@ import pytest
 from test_refine import EVERY_NS, SHORT, SPEED_MPS, S, circle, samples
 from yard import moved, seen_from
 
-from gnd_map.se3 import T_inverse
-from vehicle_agent.localise.calibration import MotionTeacher
-from vehicle_agent.localise.match_map import MatchMapCache
-from vehicle_agent.localise.odometry import MotionBuffer
-from vehicle_agent.localise.parameters import OdometryParameters, RegistrationParameters
-from vehicle_agent.localise.refine import Refiner
-from vehicle_agent.localise.scan_odometry import ScanStep
+from gnd.gnd_map.se3 import T_inverse
+from gnd.vehicle_agent.localise.calibration import MotionTeacher
+from gnd.vehicle_agent.localise.match_map import MatchMapCache
+from gnd.vehicle_agent.localise.odometry import MotionBuffer
+from gnd.vehicle_agent.localise.parameters import OdometryParameters, RegistrationParameters
+from gnd.vehicle_agent.localise.refine import Refiner
+from gnd.vehicle_agent.localise.scan_odometry import ScanStep
 
 SLIP = 45  # the scan before which the wheels begin to spin
 SEEN = np.diag([1e-4, 1e-4, 2e-4, 0.006, 0.006, 0.006]) ** 2

@@ -7,11 +7,11 @@ import numpy as np
 import pytest
 from yard import corridor, local_map_of, pose, seen_from
 
-from gnd_map.se3 import T_from_R_t, T_inverse, exp_so3
-from vehicle_agent.localise.match_map import MatchMapCache
-from vehicle_agent.localise.parameters import RegistrationParameters
-from vehicle_agent.localise.registration import linearised
-from vehicle_agent.localise.stretch import (
+from gnd.gnd_map.se3 import T_from_R_t, T_inverse, exp_so3
+from gnd.vehicle_agent.localise.match_map import MatchMapCache
+from gnd.vehicle_agent.localise.parameters import RegistrationParameters
+from gnd.vehicle_agent.localise.registration import linearised
+from gnd.vehicle_agent.localise.stretch import (
     BIAS,
     LEFT,
     N_SHARED,

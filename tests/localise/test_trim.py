@@ -3,12 +3,12 @@
 import numpy as np
 import pytest
 
-from vehicle_agent.localise.calibration import MAX_TRIM_RAD, MotionTeacher
-from vehicle_agent.localise.doubt_parameters import CauseParameters
-from vehicle_agent.localise.drift import Drift, Slope
-from vehicle_agent.localise.health import HealthMonitor
-from vehicle_agent.localise.odometry import MotionBuffer
-from vehicle_agent.localise.parameters import HealthParameters, OdometryParameters
+from gnd.vehicle_agent.localise.calibration import MAX_TRIM_RAD, MotionTeacher
+from gnd.vehicle_agent.localise.doubt_parameters import CauseParameters
+from gnd.vehicle_agent.localise.drift import Drift, Slope
+from gnd.vehicle_agent.localise.health import HealthMonitor
+from gnd.vehicle_agent.localise.odometry import MotionBuffer
+from gnd.vehicle_agent.localise.parameters import HealthParameters, OdometryParameters
 
 SURE, NOTHING = 1e-5, Slope(0.0, np.inf)
 

@@ -4,16 +4,16 @@ import numpy as np
 import pytest
 from yard import FRAME, GROUND_M, corridor, local_map_of, match_map_of, pose, rectangle, seen_from, yard
 
-from gnd_map.gaussian import full_matrices
-from schemas.drive import GnssFix, MotionSample, Scan
-from vehicle_agent.localise import Localiser
-from vehicle_agent.localise.first_pose import Place
-from vehicle_agent.localise.health import HealthMonitor
-from vehicle_agent.localise.match_map import MatchMapCache
-from vehicle_agent.localise.parameters import HealthParameters, LocaliserParameters, RegistrationParameters
-from vehicle_agent.localise.scan_pool import standing_points
-from vehicle_agent.localise.uniqueness import Uniqueness, View, ahead, ahead_of_both, fits_at, patches_of
-from vehicle_agent.localise.uniqueness_parameters import UniquenessParameters
+from gnd.gnd_map.gaussian import full_matrices
+from gnd.schemas.drive import GnssFix, MotionSample, Scan
+from gnd.vehicle_agent.localise import Localiser
+from gnd.vehicle_agent.localise.first_pose import Place
+from gnd.vehicle_agent.localise.health import HealthMonitor
+from gnd.vehicle_agent.localise.match_map import MatchMapCache
+from gnd.vehicle_agent.localise.parameters import HealthParameters, LocaliserParameters, RegistrationParameters
+from gnd.vehicle_agent.localise.scan_pool import standing_points
+from gnd.vehicle_agent.localise.uniqueness import Uniqueness, View, ahead, ahead_of_both, fits_at, patches_of
+from gnd.vehicle_agent.localise.uniqueness_parameters import UniquenessParameters
 
 PERIOD_M = 5.0
 ODD_FROM_M = 40.0

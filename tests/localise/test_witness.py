@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 from yard import GROUND_M, local_map_of, match_map_of, pose, rectangle, seen_from
 
-from gnd_map.se3 import transform
-from vehicle_agent.localise.doubt_parameters import WitnessParameters
-from vehicle_agent.localise.witness import CROSSED, GONE, HIT, KNOWN, NEW, witnessed
+from gnd.gnd_map.se3 import transform
+from gnd.vehicle_agent.localise.doubt_parameters import WitnessParameters
+from gnd.vehicle_agent.localise.witness import CROSSED, GONE, HIT, KNOWN, NEW, witnessed
 
 SENSOR_M = np.array([0.0, 0.0, 1.8])
 PAR = WitnessParameters(n_rays=400)

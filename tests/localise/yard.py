@@ -2,14 +2,14 @@
 
 import numpy as np
 
-from gnd_map.accumulate import VoxelAccumulator
-from gnd_map.geodesy import LocalFrame
-from gnd_map.grid import GridFrame
-from gnd_map.se3 import T_from_R_t, T_inverse, exp_so3, transform
-from gnd_map.tile import Tile
-from gnd_map.tile_id import covering_circle
-from vehicle_agent.local_map import LocalMap
-from vehicle_agent.localise.match_map import MatchMap, MatchMapCache
+from gnd.gnd_map.accumulate import VoxelAccumulator
+from gnd.gnd_map.geodesy import LocalFrame
+from gnd.gnd_map.grid import GridFrame
+from gnd.gnd_map.se3 import T_from_R_t, T_inverse, exp_so3, transform
+from gnd.gnd_map.tile import Tile
+from gnd.gnd_map.tile_id import covering_circle
+from gnd.vehicle_agent.local_map import LocalMap
+from gnd.vehicle_agent.localise.match_map import MatchMap, MatchMapCache
 
 FRAME = LocalFrame(np.radians(37.5597), np.radians(127.0364), 30.0)
 GRID_FRAME = GridFrame.around(FRAME, covering_circle(FRAME.lat_rad, FRAME.lon_rad, 90.0))

@@ -7,14 +7,14 @@ from typing import Any
 
 from click.testing import CliRunner, Result
 
-from deploy.cli import gnd
-from fleet_sim.drives import PERFECT, DriveConfig, simulate_drive
-from fleet_sim.street import StreetOptions, street
-from gnd_map.errors import GndError
-from schemas.drive import DriveItem, GnssFix
-from schemas.drive_mcap import DriveWriter, read_drive, read_header
-from tile_store.build import build_map
-from tile_store.sqlite_store import SqliteStore
+from gnd.deploy.cli import gnd
+from gnd.fleet_sim.drives import PERFECT, DriveConfig, simulate_drive
+from gnd.fleet_sim.street import StreetOptions, street
+from gnd.gnd_map.errors import GndError
+from gnd.schemas.drive import DriveItem, GnssFix
+from gnd.schemas.drive_mcap import DriveWriter, read_drive, read_header
+from gnd.tile_store.build import build_map
+from gnd.tile_store.sqlite_store import SqliteStore
 
 SCANS = 40
 MAPPED = 45

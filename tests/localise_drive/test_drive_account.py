@@ -10,25 +10,25 @@ import numpy as np
 import pytest
 from rich.console import Console
 
-from gnd_map.accumulate import VoxelAccumulator
-from gnd_map.geodesy import LocalFrame
-from gnd_map.grid import GridFrame
-from gnd_map.motion import Trajectory
-from gnd_map.se3 import T_from_R_t, exp_so3
-from gnd_map.tile import Tile
-from gnd_map.tile_id import TileId
-from schemas.drive import DriveHeader, GnssTrack
-from vehicle_agent.errors import LocaliseError
-from vehicle_agent.localise.estimates import Health, PoseEstimate, localisation_error
-from vehicle_agent.localise_drive.account import health_json, print_account, summary
-from vehicle_agent.localise_drive.accuracy import error_series, error_summary
-from vehicle_agent.localise_drive.geo import geojson_text
-from vehicle_agent.localise_drive.map_picture import View, nice_m
-from vehicle_agent.localise_drive.map_raster import GROUND, OTHER, WALL, MapRaster, disc, kinds_of
-from vehicle_agent.localise_drive.outputs import position_cov_m2
-from vehicle_agent.localise_drive.pictures import draw_pictures
-from vehicle_agent.localise_drive.run import Counts, LocalisedDrive, Moment
-from vehicle_agent.localise_drive.stretches import stretches_of
+from gnd.gnd_map.accumulate import VoxelAccumulator
+from gnd.gnd_map.geodesy import LocalFrame
+from gnd.gnd_map.grid import GridFrame
+from gnd.gnd_map.motion import Trajectory
+from gnd.gnd_map.se3 import T_from_R_t, exp_so3
+from gnd.gnd_map.tile import Tile
+from gnd.gnd_map.tile_id import TileId
+from gnd.schemas.drive import DriveHeader, GnssTrack
+from gnd.vehicle_agent.errors import LocaliseError
+from gnd.vehicle_agent.localise.estimates import Health, PoseEstimate, localisation_error
+from gnd.vehicle_agent.localise_drive.account import health_json, print_account, summary
+from gnd.vehicle_agent.localise_drive.accuracy import error_series, error_summary
+from gnd.vehicle_agent.localise_drive.geo import geojson_text
+from gnd.vehicle_agent.localise_drive.map_picture import View, nice_m
+from gnd.vehicle_agent.localise_drive.map_raster import GROUND, OTHER, WALL, MapRaster, disc, kinds_of
+from gnd.vehicle_agent.localise_drive.outputs import position_cov_m2
+from gnd.vehicle_agent.localise_drive.pictures import draw_pictures
+from gnd.vehicle_agent.localise_drive.run import Counts, LocalisedDrive, Moment
+from gnd.vehicle_agent.localise_drive.stretches import stretches_of
 
 T0_NS = 1_700_000_000_000_000_000
 STEP_NS = 100_000_000

@@ -13,18 +13,18 @@ import pytest
 from localised_street import SCANS, Ran, changed, localise, moved_north, refusal
 from mcap.reader import make_reader
 
-from deploy.cli import gnd
-from gnd_map.motion import Trajectory
-from gnd_map.se3 import T_inverse
-from schemas.drive import DriveItem, GnssFix, ReferencePose, Scan
-from schemas.drive_mcap import load_track, read_header
-from schemas.trajectory_files import read_kitti, read_tum
-from tile_store.sqlite_store import SqliteStore
-from vehicle_agent.localise_drive.command import ended_by_ctrl_c
-from vehicle_agent.localise_drive.outputs import NAMES
-from vehicle_agent.localise_drive.run import localise_drive
-from vehicle_agent.localise_drive.stretches import stretches_of
-from vehicle_agent.localise_drive.tiles import StoreMap
+from gnd.deploy.cli import gnd
+from gnd.gnd_map.motion import Trajectory
+from gnd.gnd_map.se3 import T_inverse
+from gnd.schemas.drive import DriveItem, GnssFix, ReferencePose, Scan
+from gnd.schemas.drive_mcap import load_track, read_header
+from gnd.schemas.trajectory_files import read_kitti, read_tum
+from gnd.tile_store.sqlite_store import SqliteStore
+from gnd.vehicle_agent.localise_drive.command import ended_by_ctrl_c
+from gnd.vehicle_agent.localise_drive.outputs import NAMES
+from gnd.vehicle_agent.localise_drive.run import localise_drive
+from gnd.vehicle_agent.localise_drive.stretches import stretches_of
+from gnd.vehicle_agent.localise_drive.tiles import StoreMap
 
 
 def offsets_m(found: Trajectory, true: Trajectory) -> np.ndarray:

@@ -10,15 +10,15 @@ import pytest
 from localised_street import localise
 from rich.console import Console
 
-from gnd_map.se3 import T_inverse
-from schemas.drive_mcap import DriveWriter, read_drive, read_header
-from tile_store.build import build_map
-from tile_store.sqlite_store import SqliteStore
-from vehicle_agent.importer import open_recording, prepared, write_drive
-from vehicle_agent.importers.recording import Anchor, Recording
-from vehicle_agent.localise_drive.account import print_account, summary
-from vehicle_agent.localise_drive.run import LocalisedDrive, localise_drive
-from vehicle_agent.localise_drive.tiles import StoreMap
+from gnd.gnd_map.se3 import T_inverse
+from gnd.schemas.drive_mcap import DriveWriter, read_drive, read_header
+from gnd.tile_store.build import build_map
+from gnd.tile_store.sqlite_store import SqliteStore
+from gnd.vehicle_agent.importer import open_recording, prepared, write_drive
+from gnd.vehicle_agent.importers.recording import Anchor, Recording
+from gnd.vehicle_agent.localise_drive.account import print_account, summary
+from gnd.vehicle_agent.localise_drive.run import LocalisedDrive, localise_drive
+from gnd.vehicle_agent.localise_drive.tiles import StoreMap
 
 HEIGHT_M = 1.73
 """Of the LiDAR of KITTI's car above the road."""

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from vehicle_agent.map_build.bodywork import MIN_SCANS, BodyworkSurvey
+from gnd.vehicle_agent.map_build.bodywork import MIN_SCANS, BodyworkSurvey
 
 RNG = np.random.default_rng(3)
 

@@ -4,11 +4,11 @@ of the kernel."""
 import numpy as np
 import pytest
 
-from gnd_map.accumulate import VoxelAccumulator
-from gnd_map.geodesy import LocalFrame
-from gnd_map.grid import GridFrame
-from gnd_map.tile_id import covering_circle
-from vehicle_agent.map_build.double_layers import (
+from gnd.gnd_map.accumulate import VoxelAccumulator
+from gnd.gnd_map.geodesy import LocalFrame
+from gnd.gnd_map.grid import GridFrame
+from gnd.gnd_map.tile_id import covering_circle
+from gnd.vehicle_agent.map_build.double_layers import (
     COLUMNS,
     DOUBLE_SHARE,
     LEAST_APART,

@@ -3,11 +3,11 @@
 import numpy as np
 import pytest
 
-from gnd_map.motion import Trajectory
-from gnd_map.se3 import T_from_R_t, T_inverse, exp_so3
-from vehicle_agent.map_build.loops import Loop
-from vehicle_agent.map_build.pose_graph import Fixes, bent, solve
-from vehicle_agent.map_build.refine_poses import drift
+from gnd.gnd_map.motion import Trajectory
+from gnd.gnd_map.se3 import T_from_R_t, T_inverse, exp_so3
+from gnd.vehicle_agent.map_build.loops import Loop
+from gnd.vehicle_agent.map_build.pose_graph import Fixes, bent, solve
+from gnd.vehicle_agent.map_build.refine_poses import drift
 
 NO_FIXES = Fixes(np.empty(0, np.int64), np.empty((0, 3)), np.empty(0))
 N = 60  # anchors of one round of 600 m

@@ -9,24 +9,24 @@ import numpy as np
 import pytest
 from click.testing import CliRunner
 
-from benchmarks.drifting_drives import Drift, drift_drive, relative_errors
-from deploy.map_cli import map_group
-from deploy.map_page import write_map_page
-from fleet_sim.drives import PERFECT, DriveConfig, DriveSimulation, simulate_drive
-from fleet_sim.street import StreetOptions, street
-from fleet_sim.traffic import Traffic
-from gnd_map.errors import GndError
-from gnd_map.geodesy import LocalFrame
-from gnd_map.motion import Trajectory
-from schemas.drive import DriveHeader, ReferencePose, Scan
-from schemas.drive_mcap import DriveWriter, read_drive, read_header
-from tile_store.build import BuildError, BuildParameters, drive_sources
-from tile_store.sqlite_store import SqliteStore
-from vehicle_agent.map_build.build import BuiltMap, build_recorded_map, no_progress
-from vehicle_agent.map_build.quality import Quality, measure
-from vehicle_agent.map_build.refine_poses import refine_poses
-from vehicle_agent.map_build.result import summary
-from vehicle_agent.map_build.survey import look_over
+from gnd.deploy.map_cli import map_group
+from gnd.deploy.map_page import write_map_page
+from gnd.fleet_sim.drives import PERFECT, DriveConfig, DriveSimulation, simulate_drive
+from gnd.fleet_sim.street import StreetOptions, street
+from gnd.fleet_sim.traffic import Traffic
+from gnd.gnd_map.errors import GndError
+from gnd.gnd_map.geodesy import LocalFrame
+from gnd.gnd_map.motion import Trajectory
+from gnd.schemas.drive import DriveHeader, ReferencePose, Scan
+from gnd.schemas.drive_mcap import DriveWriter, read_drive, read_header
+from gnd.tile_store.build import BuildError, BuildParameters, drive_sources
+from gnd.tile_store.sqlite_store import SqliteStore
+from gnd.vehicle_agent.map_build.build import BuiltMap, build_recorded_map, no_progress
+from gnd.vehicle_agent.map_build.quality import Quality, measure
+from gnd.vehicle_agent.map_build.refine_poses import refine_poses
+from gnd.vehicle_agent.map_build.result import summary
+from gnd.vehicle_agent.map_build.survey import look_over
+from studies.drifting_drives import Drift, drift_drive, relative_errors
 
 SEED = 103
 PASSES = ((1, 11), (-1, 12))

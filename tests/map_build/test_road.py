@@ -3,10 +3,10 @@
 import numpy as np
 import pytest
 
-from vehicle_agent.map_build.bodywork import BodyworkSurvey
-from vehicle_agent.map_build.quality import mount_height
-from vehicle_agent.map_build.road import road_below
-from vehicle_agent.map_build.survey import DriveSurvey
+from gnd.vehicle_agent.map_build.bodywork import BodyworkSurvey
+from gnd.vehicle_agent.map_build.quality import mount_height
+from gnd.vehicle_agent.map_build.road import road_below
+from gnd.vehicle_agent.map_build.survey import DriveSurvey
 
 LIDAR = np.array([0.5, 0.0, 1.8])
 

@@ -5,11 +5,11 @@ from typing import NamedTuple
 
 import numpy as np
 
-from gnd_map.arrays import F64
-from schemas.drive import Detections, LaneLook, MotionTrack
-from vehicle_agent.features.mapping.dead_reckoning import composed, relative
-from vehicle_agent.features.mapping.feature_drive import FeatureDrive, Fixes
-from vehicle_agent.features.mapping.parameters import GnssNoise, LaneParameters, MotionNoise, NewLayerParameters
+from gnd.gnd_map.arrays import F64
+from gnd.schemas.drive import Detections, LaneLook, MotionTrack
+from gnd.vehicle_agent.features.mapping.dead_reckoning import composed, relative
+from gnd.vehicle_agent.features.mapping.feature_drive import FeatureDrive, Fixes
+from gnd.vehicle_agent.features.mapping.parameters import GnssNoise, LaneParameters, MotionNoise, NewLayerParameters
 
 T0_NS = 1_700_000_000_000_000_000
 

@@ -4,11 +4,11 @@ import numpy as np
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from vehicle_agent.features.mapping.bias_chain import gauss_markov_springs
-from vehicle_agent.features.mapping.dead_reckoning import Steps
-from vehicle_agent.features.mapping.graph import solve
-from vehicle_agent.features.mapping.graph_edges import FixNodes, PoseMatches, Problem, State
-from vehicle_agent.features.mapping.parameters import GnssNoise, NewLayerParameters
+from gnd.vehicle_agent.features.mapping.bias_chain import gauss_markov_springs
+from gnd.vehicle_agent.features.mapping.dead_reckoning import Steps
+from gnd.vehicle_agent.features.mapping.graph import solve
+from gnd.vehicle_agent.features.mapping.graph_edges import FixNodes, PoseMatches, Problem, State
+from gnd.vehicle_agent.features.mapping.parameters import GnssNoise, NewLayerParameters
 
 
 def precision(t_s, sigma, tau):

@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 from plane_scene import Noise, Scene, drive
 
-from gnd_map.geodesy import LocalFrame
-from schemas.drive import GnssFix, MotionSample
-from vehicle_agent.features.mapping.feature_drive import FeatureDrive
-from vehicle_agent.features.mapping.parameters import (
+from gnd.gnd_map.geodesy import LocalFrame
+from gnd.schemas.drive import GnssFix, MotionSample
+from gnd.vehicle_agent.features.mapping.feature_drive import FeatureDrive
+from gnd.vehicle_agent.features.mapping.parameters import (
     GnssNoise,
     LandmarkParameters,
     LaneParameters,

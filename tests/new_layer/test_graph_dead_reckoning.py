@@ -1,9 +1,9 @@
 import numpy as np
 import pytest
 
-from schemas.drive import MotionTrack
-from vehicle_agent.features.mapping.dead_reckoning import DeadReckoning, composed, relative
-from vehicle_agent.features.mapping.parameters import MotionNoise
+from gnd.schemas.drive import MotionTrack
+from gnd.vehicle_agent.features.mapping.dead_reckoning import DeadReckoning, composed, relative
+from gnd.vehicle_agent.features.mapping.parameters import MotionNoise
 
 NOISE = MotionNoise()
 

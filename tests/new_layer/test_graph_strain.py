@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 from plane_scene import PAPER, Scene, drive, parameters
 
-from schemas.drive import MotionTrack
-from vehicle_agent.features.mapping.feature_drive import Fixes
-from vehicle_agent.features.mapping.new_layer import NewLayer, lane_map, map_new_layer
+from gnd.schemas.drive import MotionTrack
+from gnd.vehicle_agent.features.mapping.feature_drive import Fixes
+from gnd.vehicle_agent.features.mapping.new_layer import NewLayer, lane_map, map_new_layer
 
 SCENE = Scene(seconds=40.0, features=np.array([[20.0 * n, (8.0, -7.0)[n % 2]] for n in range(1, 19)]))
 TRUTH = SCENE.truth()

@@ -4,14 +4,14 @@ import numpy as np
 import pytest
 from plane_scene import Noise, Scene, drive, parameters
 
-from gnd_map.errors import ShapeError
-from vehicle_agent.errors import NewLayerError
-from vehicle_agent.features.mapping.dead_reckoning import composed, relative
-from vehicle_agent.features.mapping.drive_nodes import DriveNodes
-from vehicle_agent.features.mapping.lane_looks import Polylines, choices, offsets
-from vehicle_agent.features.mapping.lane_map import LaneMap, gicp
-from vehicle_agent.features.mapping.lanes import LaneMatcher, logarithm, moved, solved
-from vehicle_agent.features.mapping.parameters import LaneParameters
+from gnd.gnd_map.errors import ShapeError
+from gnd.vehicle_agent.errors import NewLayerError
+from gnd.vehicle_agent.features.mapping.dead_reckoning import composed, relative
+from gnd.vehicle_agent.features.mapping.drive_nodes import DriveNodes
+from gnd.vehicle_agent.features.mapping.lane_looks import Polylines, choices, offsets
+from gnd.vehicle_agent.features.mapping.lane_map import LaneMap, gicp
+from gnd.vehicle_agent.features.mapping.lanes import LaneMatcher, logarithm, moved, solved
+from gnd.vehicle_agent.features.mapping.parameters import LaneParameters
 
 SHARP = Noise(lane_m=0.05, lane_rad=0.002)
 

@@ -6,12 +6,12 @@ import numpy as np
 import pytest
 from plane_scene import PAPER, T0_NS, Noise, Scene, drive, fixes, lane_looks, look, looks, motion, parameters
 
-from gnd_map.errors import ShapeError
-from schemas.drive import MotionTrack
-from vehicle_agent.errors import NewLayerError
-from vehicle_agent.features.look import MapFeatures
-from vehicle_agent.features.mapping.feature_drive import FeatureDrive, Fixes, KnownPoses, Measurements
-from vehicle_agent.features.mapping.new_layer import lane_map, localise_with_features, map_new_layer
+from gnd.gnd_map.errors import ShapeError
+from gnd.schemas.drive import MotionTrack
+from gnd.vehicle_agent.errors import NewLayerError
+from gnd.vehicle_agent.features.look import MapFeatures
+from gnd.vehicle_agent.features.mapping.feature_drive import FeatureDrive, Fixes, KnownPoses, Measurements
+from gnd.vehicle_agent.features.mapping.new_layer import lane_map, localise_with_features, map_new_layer
 
 EXACT = Noise()
 

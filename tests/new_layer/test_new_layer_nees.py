@@ -7,7 +7,7 @@ import pytest
 from plane_scene import PAPER, Scene, drive, parameters
 from scipy.stats import chi2
 
-from vehicle_agent.features.mapping.new_layer import lane_map, map_new_layer
+from gnd.vehicle_agent.features.mapping.new_layer import lane_map, map_new_layer
 
 RUNS = 100
 FIRST_SEED = {False: 1000, True: 5000}  # with lanes others than those on which their share of information was chosen

@@ -5,10 +5,10 @@ from dataclasses import replace
 import numpy as np
 from scipy.optimize import least_squares
 
-from vehicle_agent.features.mapping.dead_reckoning import Steps, composed, relative, wrapped
-from vehicle_agent.features.mapping.graph import root_of, solve
-from vehicle_agent.features.mapping.graph_edges import Anchors, FixNodes, PoseMatches, Problem, State, Ties
-from vehicle_agent.features.mapping.parameters import (
+from gnd.vehicle_agent.features.mapping.dead_reckoning import Steps, composed, relative, wrapped
+from gnd.vehicle_agent.features.mapping.graph import root_of, solve
+from gnd.vehicle_agent.features.mapping.graph_edges import Anchors, FixNodes, PoseMatches, Problem, State, Ties
+from gnd.vehicle_agent.features.mapping.parameters import (
     GnssNoise,
     LandmarkParameters,
     LaneParameters,

@@ -3,8 +3,8 @@
 import pytest
 from pcd_world import PLAN, box_world, scans
 
-from benchmarks.pcd import PcdDetector, PcdMap, PcdReport, base_pcd
-from fleet_sim.world import World
+from gnd.fleet_sim.world import World
+from studies.pcd import PcdDetector, PcdMap, PcdReport, base_pcd
 
 
 @pytest.fixture(scope="session")

@@ -2,12 +2,12 @@
 
 import numpy as np
 
-from fleet_sim import parts
-from fleet_sim.dense_rays import ScanPlan
-from fleet_sim.raycast import Scene
-from fleet_sim.shapes import Block
-from fleet_sim.street import BORDER_LON_RAD, LAT_RAD
-from fleet_sim.world import World, WorldObject
+from gnd.fleet_sim import parts
+from gnd.fleet_sim.dense_rays import ScanPlan
+from gnd.fleet_sim.raycast import Scene
+from gnd.fleet_sim.shapes import Block
+from gnd.fleet_sim.street import BORDER_LON_RAD, LAT_RAD
+from gnd.fleet_sim.world import World, WorldObject
 
 PLAN = ScanPlan(spacing_m=1.0, step_rad=np.radians(0.6), end_margin_m=1.0)
 STAYS, GOES, COMES = (-6.0, -2.0, 6.0, 6.4), (1.0, 3.5, 6.0, 8.0), (-2.0, 1.5, -8.0, -6.0)  # x0, x1, y0, y1 street

@@ -3,11 +3,11 @@ import pytest
 from pcd_world import scans
 from plain_pcd import PlainPcd
 
-from benchmarks.pcd import PcdDetector, PcdDetectParameters, PcdError, PcdMap
-from benchmarks.pcd.detector import box_sums
-from benchmarks.pcd.index import index_of
-from benchmarks.pcd.kernel import EMPTY, support_sums, surface_normals
-from gnd_map.errors import ShapeError
+from gnd.gnd_map.errors import ShapeError
+from studies.pcd import PcdDetector, PcdDetectParameters, PcdError, PcdMap
+from studies.pcd.detector import box_sums
+from studies.pcd.index import index_of
+from studies.pcd.kernel import EMPTY, support_sums, surface_normals
 
 
 @pytest.fixture(scope="module")
@@ -51,7 +51,7 @@ def test_one_origin_for_all_is_the_same(cloud, some_scans):
 
 
 def test_rows_for_new_blocks_grow(cloud, some_scans, monkeypatch):
-    monkeypatch.setattr("benchmarks.pcd.detector._FIRST_ROWS", 1)
+    monkeypatch.setattr("studies.pcd.detector._FIRST_ROWS", 1)
     small = PcdDetector(cloud)
     monkeypatch.undo()
     large = PcdDetector(cloud)

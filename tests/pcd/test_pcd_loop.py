@@ -6,12 +6,12 @@ import numpy as np
 import pytest
 from pcd_world import COMES, GOES, PLAN, STAYS, inside
 
-from benchmarks.pcd import PcdError, PcdMap, PcdMergeParameters, evaluate_gnd, gnd_of, merge_pcd, settled
-from benchmarks.pcd.merge import count_votes
-from benchmarks.pcd.points import cell_keys, cells_of, downsample, key_cells
-from fleet_sim.evaluate import evaluate_maps
-from fleet_sim.truth import grid_of, make_truth
-from gnd_map.similarity import similarity
+from gnd.fleet_sim.evaluate import evaluate_maps
+from gnd.fleet_sim.truth import grid_of, make_truth
+from gnd.gnd_map.similarity import similarity
+from studies.pcd import PcdError, PcdMap, PcdMergeParameters, evaluate_gnd, gnd_of, merge_pcd, settled
+from studies.pcd.merge import count_votes
+from studies.pcd.points import cell_keys, cells_of, downsample, key_cells
 
 
 @pytest.fixture(scope="module")

@@ -4,10 +4,10 @@ import zstandard
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from benchmarks.pcd import PcdCodecError, PcdError, PcdMap, PcdReport
-from benchmarks.pcd.points import cells_of
-from benchmarks.pcd.report import CODECS
-from gnd_map.geodesy import LocalFrame
+from gnd.gnd_map.geodesy import LocalFrame
+from studies.pcd import PcdCodecError, PcdError, PcdMap, PcdReport
+from studies.pcd.points import cells_of
+from studies.pcd.report import CODECS
 
 GOLDEN = {
     "points": (

@@ -8,10 +8,10 @@ import numpy as np
 from hypothesis import strategies as st
 from schema_values import EAST, REPORT_ID, SHA, TILE, names, pairs, texts
 
-from gnd_map.features import Existence, snapped_covariance
-from gnd_map.tile_id import TileId
-from schemas.features import FeatureChange, FeatureReport, Found, Seen
-from schemas.report_id import deterministic_report_id
+from gnd.gnd_map.features import Existence, snapped_covariance
+from gnd.gnd_map.tile_id import TileId
+from gnd.schemas.features import FeatureChange, FeatureReport, Found, Seen
+from gnd.schemas.report_id import deterministic_report_id
 
 SIGN_M = np.array([[4.25, -7.5, 31.062]])
 LANE_M = np.array([[-15.0, -3.5, 30.0], [-4.0, -3.25, 30.125], [9.0, -2.0, 30.25]])

@@ -10,19 +10,19 @@ from typing import Any
 import numpy as np
 from hypothesis import strategies as st
 
-from gnd_map.codec import LATTICES, encode_gaussians, snap
-from gnd_map.gaussian import Gaussians
-from gnd_map.tile import Tile, TileDelta
-from gnd_map.tile_id import TileId
-from schemas.changes import ChangeAck, ChangeReport, TileChange
-from schemas.course import Course
-from schemas.doubt import Doubt, DoubtReason
-from schemas.packed import PackedGaussians, PackedReport, digest_of
-from schemas.report_id import deterministic_report_id
-from schemas.tiles import Catalog, CatalogEntry, CodedDelta, TileBlob, TileReply, TileRequest, blob_of
-from schemas.tiles_batch import TileAnswer, TilesReply, TilesRequest
-from schemas.traffic import TrafficLine, TrafficSample
-from schemas.updates import TileUpdate
+from gnd.gnd_map.codec import LATTICES, encode_gaussians, snap
+from gnd.gnd_map.gaussian import Gaussians
+from gnd.gnd_map.tile import Tile, TileDelta
+from gnd.gnd_map.tile_id import TileId
+from gnd.schemas.changes import ChangeAck, ChangeReport, TileChange
+from gnd.schemas.course import Course
+from gnd.schemas.doubt import Doubt, DoubtReason
+from gnd.schemas.packed import PackedGaussians, PackedReport, digest_of
+from gnd.schemas.report_id import deterministic_report_id
+from gnd.schemas.tiles import Catalog, CatalogEntry, CodedDelta, TileBlob, TileReply, TileRequest, blob_of
+from gnd.schemas.tiles_batch import TileAnswer, TilesReply, TilesRequest
+from gnd.schemas.traffic import TrafficLine, TrafficSample
+from gnd.schemas.updates import TileUpdate
 
 GOLDEN_DIR = Path(__file__).parent / "golden"
 

@@ -5,10 +5,10 @@ from math import radians
 import pytest
 from schema_values import GOLDEN, report
 
-from schemas.changes import ChangeReport, split
-from schemas.course import Course
-from schemas.errors import BadValue
-from schemas.generated import change_report_pb2
+from gnd.schemas.changes import ChangeReport, split
+from gnd.schemas.course import Course
+from gnd.schemas.errors import BadValue
+from gnd.schemas.generated import change_report_pb2
 
 
 def test_a_course_is_rounded_and_its_sigma_rounded_up() -> None:

@@ -5,11 +5,11 @@ from typing import Any
 import pytest
 from schema_values import EAST, GOLDEN, MUCH, NOTHING, SHIFTED, change, report
 
-from schemas.changes import ChangeReport, split
-from schemas.doubt import Doubt, DoubtReason, doubt_message, doubt_value
-from schemas.errors import BadValue, SchemaError
-from schemas.generated import change_report_pb2
-from schemas.packed import decode_upload
+from gnd.schemas.changes import ChangeReport, split
+from gnd.schemas.doubt import Doubt, DoubtReason, doubt_message, doubt_value
+from gnd.schemas.errors import BadValue, SchemaError
+from gnd.schemas.generated import change_report_pb2
+from gnd.schemas.packed import decode_upload
 
 
 @pytest.mark.parametrize(

@@ -9,10 +9,10 @@ from foxglove_schemas_protobuf.LocationFix_pb2 import LocationFix
 from mcap.writer import Writer
 from mcap_protobuf.schema import register_schema
 
-from gnd_map.geodesy import LocalFrame
-from schemas.drive import DriveHeader, GnssFix, MotionSample, ReferencePose, Scan
-from schemas.drive_mcap import DriveWriter, drive_counts, load_track, read_drive, read_header
-from schemas.errors import DriveError
+from gnd.gnd_map.geodesy import LocalFrame
+from gnd.schemas.drive import DriveHeader, GnssFix, MotionSample, ReferencePose, Scan
+from gnd.schemas.drive_mcap import DriveWriter, drive_counts, load_track, read_drive, read_header
+from gnd.schemas.errors import DriveError
 
 T0_NS = 1_700_000_000_000_000_000
 
@@ -165,6 +165,6 @@ def test_a_chunk_that_would_unpack_to_too_much_is_refused(
 ) -> None:
     path = tmp_path / "drive.mcap"
     path.write_bytes(good)
-    monkeypatch.setattr("schemas.limits.MAX_CHUNK_BYTES", 10_000)
+    monkeypatch.setattr("gnd.schemas.limits.MAX_CHUNK_BYTES", 10_000)
     with pytest.raises(DriveError, match=r"chunk at byte \d+ unpacks to \d+ bytes, the limit is 10000"):
         list(read_drive(path))

@@ -6,11 +6,11 @@ import math
 import numpy as np
 import pytest
 
-from gnd_map.geodesy import LocalFrame
-from schemas.drive import DriveHeader, MountSigma
-from schemas.drive_metadata import header_of, metadata_of
-from schemas.errors import BadValue, DriveError
-from schemas.sweep_distortion import distortion_sigma
+from gnd.gnd_map.geodesy import LocalFrame
+from gnd.schemas.drive import DriveHeader, MountSigma
+from gnd.schemas.drive_metadata import header_of, metadata_of
+from gnd.schemas.errors import BadValue, DriveError
+from gnd.schemas.sweep_distortion import distortion_sigma
 
 OLD = DriveHeader("drive-1", "car-1", "VLP-16", LocalFrame(0.6555, 2.2172, 30.25), np.eye(4), "made by a test")
 OLD_KEYS = {

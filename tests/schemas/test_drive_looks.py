@@ -10,13 +10,13 @@ from hypothesis import strategies as st
 from mcap.reader import make_reader
 from mcap_protobuf.decoder import DecoderFactory
 
-from gnd_map.geodesy import LocalFrame
-from schemas import limits
-from schemas.drive import Detections, DriveHeader, DriveItem, GnssFix, LaneLook, MotionSample
-from schemas.drive_mcap import DETECTIONS_TOPIC, LANES_TOPIC, DriveWriter, drive_counts, load_track, read_drive
-from schemas.errors import BadValue, DriveError, TooLarge
-from schemas.generated import detections_pb2, lane_look_pb2
-from schemas.look_messages import detections_message_of, detections_of, lane_message_of, lanes_of
+from gnd.gnd_map.geodesy import LocalFrame
+from gnd.schemas import limits
+from gnd.schemas.drive import Detections, DriveHeader, DriveItem, GnssFix, LaneLook, MotionSample
+from gnd.schemas.drive_mcap import DETECTIONS_TOPIC, LANES_TOPIC, DriveWriter, drive_counts, load_track, read_drive
+from gnd.schemas.errors import BadValue, DriveError, TooLarge
+from gnd.schemas.generated import detections_pb2, lane_look_pb2
+from gnd.schemas.look_messages import detections_message_of, detections_of, lane_message_of, lanes_of
 
 T0_NS = 1_700_000_000_000_000_000
 HEADER = DriveHeader("drive-1", "car-1", "VLP-16", LocalFrame(0.6555, 2.2172, 30.25), np.eye(4))

@@ -16,12 +16,12 @@ from hypothesis import strategies as st
 from mcap.reader import make_reader
 from mcap_protobuf.decoder import DecoderFactory
 
-from gnd_map.geodesy import LocalFrame
-from gnd_map.se3 import T_from_R_t, exp_so3
-from schemas.drive import DriveHeader, DriveItem, GnssFix, MotionSample, ReferencePose, Scan
-from schemas.drive_mcap import DriveWriter, drive_counts, load_track, read_drive, read_header
-from schemas.drive_messages import cloud_of, scan_of
-from schemas.errors import BadValue, DriveError, TooLarge
+from gnd.gnd_map.geodesy import LocalFrame
+from gnd.gnd_map.se3 import T_from_R_t, exp_so3
+from gnd.schemas.drive import DriveHeader, DriveItem, GnssFix, MotionSample, ReferencePose, Scan
+from gnd.schemas.drive_mcap import DriveWriter, drive_counts, load_track, read_drive, read_header
+from gnd.schemas.drive_messages import cloud_of, scan_of
+from gnd.schemas.errors import BadValue, DriveError, TooLarge
 
 T0_NS = 1_700_000_000_000_000_000
 S = 1_000_000_000

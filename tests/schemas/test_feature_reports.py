@@ -26,14 +26,14 @@ from hypothesis import strategies as st
 from schema_values import EAST, GOLDEN, SHA, TILE, report
 from test_schema_fuzz import disturb, mutated
 
-from gnd_map.features import Existence, encode_features
-from gnd_map.geodesy import LocalFrame
-from schemas import limits
-from schemas.changes import ChangeReport
-from schemas.errors import BadValue, Malformed, SchemaError, TooLarge, WrongVersion
-from schemas.features import EVERY_CELL, FeatureChange, FeatureReport, Found, Seen, cell_of, split_features
-from schemas.generated import change_report_pb2
-from schemas.packed import PackedReport, decode_upload
+from gnd.gnd_map.features import Existence, encode_features
+from gnd.gnd_map.geodesy import LocalFrame
+from gnd.schemas import limits
+from gnd.schemas.changes import ChangeReport
+from gnd.schemas.errors import BadValue, Malformed, SchemaError, TooLarge, WrongVersion
+from gnd.schemas.features import EVERY_CELL, FeatureChange, FeatureReport, Found, Seen, cell_of, split_features
+from gnd.schemas.generated import change_report_pb2
+from gnd.schemas.packed import PackedReport, decode_upload
 
 GOLDEN_DIR = Path(__file__).parent / "golden_features"
 REPORT = FEATURE_GOLDEN["FeatureReport-two_tiles"]

@@ -10,13 +10,13 @@ import pytest
 from schema_values import SHA, TILE
 from test_schema_fuzz import mutated
 
-from gnd_map.content import encode_content, encode_content_delta
-from gnd_map.features import Existence, Feature, FeatureTile
-from schemas.errors import BadValue, SchemaError, WrongHash
-from schemas.tile_answer import content_of_answer
-from schemas.tiles import CodedDelta, TileBlob, TileReply, TileRequest, content_of, tile_after
-from schemas.tiles_batch import HeldTile, TileAnswer, TilesReply, TilesRequest
-from schemas.updates import TileUpdate, updated
+from gnd.gnd_map.content import encode_content, encode_content_delta
+from gnd.gnd_map.features import Existence, Feature, FeatureTile
+from gnd.schemas.errors import BadValue, SchemaError, WrongHash
+from gnd.schemas.tile_answer import content_of_answer
+from gnd.schemas.tiles import CodedDelta, TileBlob, TileReply, TileRequest, content_of, tile_after
+from gnd.schemas.tiles_batch import HeldTile, TileAnswer, TilesReply, TilesRequest
+from gnd.schemas.updates import TileUpdate, updated
 
 GOLDEN_DIR = Path(__file__).parent / "golden_feature_tiles"
 COV_M2 = np.array([0.04, 0.01, 0.0, 0.09, 0.0, 1e4])

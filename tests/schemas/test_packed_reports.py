@@ -9,14 +9,14 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from schema_values import GOLDEN, MUCH, REPORT_ID, SHA, SHIFTED, TILE, any_doubt, names, report, texts
 
-from gnd_map.codec import encode_mask, encode_tiles
-from schemas import limits
-from schemas.changes import ChangeAck, ChangeReport
-from schemas.course import Course
-from schemas.errors import BadValue, Malformed, SchemaError, TooLarge, WrongVersion
-from schemas.generated import change_report_pb2
-from schemas.packed import PackedGaussians, PackedReport, crc_of, decode_upload, digest_of
-from schemas.report_id import deterministic_report_id
+from gnd.gnd_map.codec import encode_mask, encode_tiles
+from gnd.schemas import limits
+from gnd.schemas.changes import ChangeAck, ChangeReport
+from gnd.schemas.course import Course
+from gnd.schemas.errors import BadValue, Malformed, SchemaError, TooLarge, WrongVersion
+from gnd.schemas.generated import change_report_pb2
+from gnd.schemas.packed import PackedGaussians, PackedReport, crc_of, decode_upload, digest_of
+from gnd.schemas.report_id import deterministic_report_id
 
 
 def packed(**values: Any) -> PackedReport:

@@ -10,11 +10,11 @@ import pytest
 from mcap.reader import make_reader
 from mcap_protobuf.decoder import DecoderFactory
 
-from gnd_map.geodesy import LocalFrame
-from gnd_map.motion import Trajectory
-from gnd_map.se3 import T_from_R_t, exp_so3
-from schemas.errors import BadValue, TrajectoryError
-from schemas.poses_mcap import HealthNote, PoseTrack, write_poses_mcap
+from gnd.gnd_map.geodesy import LocalFrame
+from gnd.gnd_map.motion import Trajectory
+from gnd.gnd_map.se3 import T_from_R_t, exp_so3
+from gnd.schemas.errors import BadValue, TrajectoryError
+from gnd.schemas.poses_mcap import HealthNote, PoseTrack, write_poses_mcap
 
 T0_NS = 1_700_000_000_123_456_789
 COV_M2 = np.stack([np.diag([0.01, 0.04, 0.09]) + 0.002, 2.0 * np.eye(3), 3.0 * np.eye(3)])

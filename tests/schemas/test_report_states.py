@@ -4,10 +4,10 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from schemas import limits
-from schemas.errors import BadValue, Malformed, SchemaError, WrongVersion
-from schemas.report_id import deterministic_report_id
-from schemas.report_states import ReportQuestion, ReportState, ReportStates
+from gnd.schemas import limits
+from gnd.schemas.errors import BadValue, Malformed, SchemaError, WrongVersion
+from gnd.schemas.report_id import deterministic_report_id
+from gnd.schemas.report_states import ReportQuestion, ReportState, ReportStates
 
 IDS = [deterministic_report_id(1_570_838_400_000 + n, "car") for n in range(70)]
 

@@ -7,9 +7,9 @@ from pathlib import Path
 import pytest
 from google.protobuf.descriptor_pb2 import DescriptorProto, EnumDescriptorProto, FieldDescriptorProto, FileDescriptorSet
 
-from schemas import generate
-from schemas.compatibility import breaking_changes
-from schemas.generate import GenerateError
+from gnd.schemas import generate
+from gnd.schemas.compatibility import breaking_changes
+from gnd.schemas.generate import GenerateError
 
 GOLDEN = FileDescriptorSet.FromString(generate.GOLDEN.read_bytes())
 

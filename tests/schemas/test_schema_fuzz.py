@@ -11,8 +11,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from schema_values import GOLDEN, HELD, KINDS, TILE, kind_of
 
-from schemas.errors import SchemaError
-from schemas.generated import (
+from gnd.schemas.errors import SchemaError
+from gnd.schemas.generated import (
     catalog_pb2,
     change_ack_pb2,
     change_report_pb2,
@@ -23,9 +23,9 @@ from schemas.generated import (
     tiles_request_pb2,
     traffic_sample_pb2,
 )
-from schemas.tiles import TileReply, tile_after, tile_of
-from schemas.tiles_batch import TilesReply, tile_of_answer
-from schemas.updates import TileUpdate, updated
+from gnd.schemas.tiles import TileReply, tile_after, tile_of
+from gnd.schemas.tiles_batch import TilesReply, tile_of_answer
+from gnd.schemas.updates import TileUpdate, updated
 
 MESSAGES: dict[str, type[Message]] = {
     "TileRequest": tile_request_pb2.TileRequest,

@@ -8,9 +8,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from gnd_map.tile_id import TileId
-from schemas import keys
-from schemas.errors import BadKey, WrongVersion
+from gnd.gnd_map.tile_id import TileId
+from gnd.schemas import keys
+from gnd.schemas.errors import BadKey, WrongVersion
 
 TILE = TileId(497353963154)
 PATH = "13033/03021/23031/22102"

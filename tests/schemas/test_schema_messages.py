@@ -31,18 +31,24 @@ from schema_values import (
     versions,
 )
 
-from gnd_map.gaussian import Gaussians
-from gnd_map.tile import Tile, TileDelta
-from gnd_map.tile_id import TileId
-from schemas import limits
-from schemas.bitmap import decode_observed, encode_observed
-from schemas.changes import ChangeAck, ChangeReport, split
-from schemas.errors import BadValue, Malformed, SchemaError, TooLarge, WrongHash, WrongVersion
-from schemas.generated import change_report_pb2, tile_change_pb2, tile_reply_pb2, tile_update_pb2, traffic_sample_pb2
-from schemas.report_id import check_report_id, deterministic_report_id
-from schemas.tiles import Catalog, CatalogEntry, TileBlob, TileReply, TileRequest, blob_of, tile_of
-from schemas.traffic import TrafficLine, TrafficSample
-from schemas.updates import TileUpdate
+from gnd.gnd_map.gaussian import Gaussians
+from gnd.gnd_map.tile import Tile, TileDelta
+from gnd.gnd_map.tile_id import TileId
+from gnd.schemas import limits
+from gnd.schemas.bitmap import decode_observed, encode_observed
+from gnd.schemas.changes import ChangeAck, ChangeReport, split
+from gnd.schemas.errors import BadValue, Malformed, SchemaError, TooLarge, WrongHash, WrongVersion
+from gnd.schemas.generated import (
+    change_report_pb2,
+    tile_change_pb2,
+    tile_reply_pb2,
+    tile_update_pb2,
+    traffic_sample_pb2,
+)
+from gnd.schemas.report_id import check_report_id, deterministic_report_id
+from gnd.schemas.tiles import Catalog, CatalogEntry, TileBlob, TileReply, TileRequest, blob_of, tile_of
+from gnd.schemas.traffic import TrafficLine, TrafficSample
+from gnd.schemas.updates import TileUpdate
 
 golden = pytest.mark.parametrize("name", GOLDEN)
 # The halves of reports travel inside ChangeReport: test_packed_reports.py.
@@ -241,7 +247,7 @@ def tampered(**fields: Any) -> bytes:
 
 def with_value(column: str, value: float) -> bytes:
     """Codec 0 bytes of six Gaussians, the first of which has `value` in a float column."""
-    from gnd_map.codec import encode_gaussians
+    from gnd.gnd_map.codec import encode_gaussians
 
     at = {"mean_x": 0, "cov_xx": 3, "cov_xy": 4, "cov_yy": 6}[column]
     body = bytearray(encode_gaussians(change().changed))
@@ -304,7 +310,7 @@ def test_the_untampered_report_is_accepted() -> None:
 
 
 def test_a_voxel_given_twice_is_refused() -> None:
-    from gnd_map.codec import encode_gaussians
+    from gnd.gnd_map.codec import encode_gaussians
 
     body = bytearray(encode_gaussians(change().changed))
     body[4:8] = body[8:12]
@@ -397,7 +403,7 @@ def test_a_tile_in_an_unknown_codec_or_with_a_broken_body_is_refused() -> None:
 
 
 def test_a_published_tile_with_an_empty_voxel_is_refused() -> None:
-    from gnd_map.codec import encode_gaussians
+    from gnd.gnd_map.codec import encode_gaussians
 
     body = encode_gaussians(Gaussians.nothing_at([4]))
     with pytest.raises(BadValue, match="1 voxels have count 0"):

@@ -8,14 +8,14 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from schema_values import EAST, HELD, NEXT, OTHER_SHA, SHA, TILE, gaussians, shas, versions
 
-from gnd_map.codec import CODEC_STANDARD, CODEC_STANDARD_ZSTD, encode_delta, encode_gaussians, encode_tiles
-from gnd_map.tile import Tile
-from gnd_map.tile_id import TileId
-from schemas import limits
-from schemas.errors import BadValue, Malformed, TooLarge, WrongHash
-from schemas.generated import tiles_reply_pb2, tiles_request_pb2
-from schemas.tiles import CodedDelta, TileReply, blob_of, tile_after, tile_of
-from schemas.tiles_batch import (
+from gnd.gnd_map.codec import CODEC_STANDARD, CODEC_STANDARD_ZSTD, encode_delta, encode_gaussians, encode_tiles
+from gnd.gnd_map.tile import Tile
+from gnd.gnd_map.tile_id import TileId
+from gnd.schemas import limits
+from gnd.schemas.errors import BadValue, Malformed, TooLarge, WrongHash
+from gnd.schemas.generated import tiles_reply_pb2, tiles_request_pb2
+from gnd.schemas.tiles import CodedDelta, TileReply, blob_of, tile_after, tile_of
+from gnd.schemas.tiles_batch import (
     EVERY_CODEC,
     HeldTile,
     TileAnswer,
@@ -25,7 +25,7 @@ from schemas.tiles_batch import (
     index_of,
     tile_of_answer,
 )
-from schemas.updates import TileUpdate, updated
+from gnd.schemas.updates import TileUpdate, updated
 
 DISTRICT = TILE.district
 DELTA = encode_delta(TILE, HELD.gaussians, NEXT.gaussians)

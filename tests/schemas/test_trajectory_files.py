@@ -8,10 +8,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
-from gnd_map.motion import Trajectory
-from gnd_map.se3 import T_from_R_t, exp_so3
-from schemas.errors import TrajectoryError
-from schemas.trajectory_files import (
+from gnd.gnd_map.motion import Trajectory
+from gnd.gnd_map.se3 import T_from_R_t, exp_so3
+from gnd.schemas.errors import TrajectoryError
+from gnd.schemas.trajectory_files import (
     kitti_text,
     nanoseconds,
     read_kitti,

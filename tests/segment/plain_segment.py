@@ -4,9 +4,9 @@ import math
 
 import numpy as np
 
-from vehicle_agent.segment.ground_kernels import Grid
-from vehicle_agent.segment.image_kernels import BINS, FAR_CM, GROUND_BIT, Judge, Optics
-from vehicle_agent.segment.voxel_kernels import GROUND, LOW
+from gnd.vehicle_agent.segment.ground_kernels import Grid
+from gnd.vehicle_agent.segment.image_kernels import BINS, FAR_CM, GROUND_BIT, Judge, Optics
+from gnd.vehicle_agent.segment.voxel_kernels import GROUND, LOW
 
 
 def lowest(points: np.ndarray, grid: Grid, near_m: float) -> np.ndarray:

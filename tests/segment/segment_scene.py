@@ -5,8 +5,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from gnd_map.se3 import exp_so3
-from vehicle_agent.localise.estimates import PoseEstimate, RefinedScan
+from gnd.gnd_map.se3 import exp_so3
+from gnd.vehicle_agent.localise.estimates import PoseEstimate, RefinedScan
 
 START_NS = 1_570_838_400_000_000_000
 HOUSES = ((-60.0, 9.0, 120.0, 10.0, 9.0), (-60.0, -10.0, 45.0, -9.0, 9.0), (-8.0, -10.0, 120.0, -9.0, 6.0))

@@ -8,12 +8,12 @@ from hypothesis import strategies as st
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
-from gnd_map.se3 import exp_so3
-from vehicle_agent.segment.evidence import WEIGHTS, belief
-from vehicle_agent.segment.ground_kernels import Grid, ground_heights, lowest_heights, remember_ground
-from vehicle_agent.segment.image_kernels import BINS, Judge, Optics, draw_image, layer_gap, vote
-from vehicle_agent.segment.scene import hash_table
-from vehicle_agent.segment.voxel_kernels import GROUND, LOW, OUTSIDE, components, find_objects, moving_points
+from gnd.gnd_map.se3 import exp_so3
+from gnd.vehicle_agent.segment.evidence import WEIGHTS, belief
+from gnd.vehicle_agent.segment.ground_kernels import Grid, ground_heights, lowest_heights, remember_ground
+from gnd.vehicle_agent.segment.image_kernels import BINS, Judge, Optics, draw_image, layer_gap, vote
+from gnd.vehicle_agent.segment.scene import hash_table
+from gnd.vehicle_agent.segment.voxel_kernels import GROUND, LOW, OUTSIDE, components, find_objects, moving_points
 
 GRID = Grid(-20.0, -20.0, 1.0, 40, 40)
 LEVEL = np.array([0.0, 0.0, -1.9, 0.0, 0.0, 1.0])  # the road under the vehicle and its normal

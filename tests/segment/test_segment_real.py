@@ -10,11 +10,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from gnd_map.se3 import transform
-from vehicle_agent.importer import map_track, open_recording
-from vehicle_agent.importers.recording import Recording
-from vehicle_agent.localise.estimates import PoseEstimate, RefinedScan
-from vehicle_agent.segment import MotionSegmenter, SegmentedScan
+from gnd.gnd_map.se3 import transform
+from gnd.vehicle_agent.importer import map_track, open_recording
+from gnd.vehicle_agent.importers.recording import Recording
+from gnd.vehicle_agent.localise.estimates import PoseEstimate, RefinedScan
+from gnd.vehicle_agent.segment import MotionSegmenter, SegmentedScan
 
 pytestmark = [pytest.mark.slow, pytest.mark.timeout(300)]
 

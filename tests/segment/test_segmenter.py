@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from segment_scene import PARKED, SENSORS, Mover, scans
 
-from vehicle_agent.localise.estimates import RefinedScan
-from vehicle_agent.segment import MotionSegmenter, SegmentedScan, SegmentParameterError, SegmentParameters
+from gnd.vehicle_agent.localise.estimates import RefinedScan
+from gnd.vehicle_agent.segment import MotionSegmenter, SegmentedScan, SegmentParameterError, SegmentParameters
 
 NOISY = (0.04, 0.08)
 CAR = (4.4, 1.8, 1.5)

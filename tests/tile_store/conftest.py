@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 from store_helpers import Clock, SqliteMaker
 
-from tile_store.store import Store
+from gnd.tile_store.store import Store
 
 
 @pytest.fixture(params=["sqlite"])

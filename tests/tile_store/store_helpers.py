@@ -5,13 +5,13 @@ from pathlib import Path
 
 import numpy as np
 
-from gnd_map.gaussian import Gaussians
-from gnd_map.tile import Tile
-from gnd_map.tile_id import TileId
-from schemas.report_id import deterministic_report_id
-from tile_store.sqlite_store import SqliteStore
-from tile_store.store import Store
-from tile_store.values import Basis, Claim, Publication, ReportRow, StoreConfig, TileWork
+from gnd.gnd_map.gaussian import Gaussians
+from gnd.gnd_map.tile import Tile
+from gnd.gnd_map.tile_id import TileId
+from gnd.schemas.report_id import deterministic_report_id
+from gnd.tile_store.sqlite_store import SqliteStore
+from gnd.tile_store.store import Store
+from gnd.tile_store.values import Basis, Claim, Publication, ReportRow, StoreConfig, TileWork
 
 TILE = TileId(497353963154)
 """The tile of Figure 2; its path is 13033/03021/23031/22102."""

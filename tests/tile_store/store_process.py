@@ -11,12 +11,12 @@ from pathlib import Path
 import numpy as np
 from store_helpers import TILE, report
 
-from gnd_map.gaussian import Gaussians
-from gnd_map.tile import Tile
-from gnd_map.tile_id import TileId
-from tile_store.sqlite_store import SqliteStore
-from tile_store.store import Store
-from tile_store.values import Basis, Publication, ReportRow, StoreConfig, TileWork
+from gnd.gnd_map.gaussian import Gaussians
+from gnd.gnd_map.tile import Tile
+from gnd.gnd_map.tile_id import TileId
+from gnd.tile_store.sqlite_store import SqliteStore
+from gnd.tile_store.store import Store
+from gnd.tile_store.values import Basis, Publication, ReportRow, StoreConfig, TileWork
 
 TILES = (TILE, *TILE.neighbours()[:3])
 HURRY = StoreConfig(merge_delay_s=0.02, merge_after_reports=5, window_reports=1_000_000)

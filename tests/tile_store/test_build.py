@@ -6,19 +6,19 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from gnd_map.accumulate import VoxelAccumulator
-from gnd_map.codec import LATTICES, is_on, snap
-from gnd_map.day import day_of
-from gnd_map.geodesy import LocalFrame
-from gnd_map.grid import GridFrame, VoxelGrid
-from gnd_map.tile_id import TileId
-from schemas.drive import DriveHeader, GnssFix, ReferencePose, Scan
-from schemas.drive_mcap import DriveWriter
-from schemas.errors import DriveError
-from tile_store.build import BuildError, BuildParameters, build_map
-from tile_store.compare import map_info
-from tile_store.errors import StoreError
-from tile_store.sqlite_store import SqliteStore
+from gnd.gnd_map.accumulate import VoxelAccumulator
+from gnd.gnd_map.codec import LATTICES, is_on, snap
+from gnd.gnd_map.day import day_of
+from gnd.gnd_map.geodesy import LocalFrame
+from gnd.gnd_map.grid import GridFrame, VoxelGrid
+from gnd.gnd_map.tile_id import TileId
+from gnd.schemas.drive import DriveHeader, GnssFix, ReferencePose, Scan
+from gnd.schemas.drive_mcap import DriveWriter
+from gnd.schemas.errors import DriveError
+from gnd.tile_store.build import BuildError, BuildParameters, build_map
+from gnd.tile_store.compare import map_info
+from gnd.tile_store.errors import StoreError
+from gnd.tile_store.sqlite_store import SqliteStore
 
 ANCHOR = LocalFrame(np.radians(37.5597), np.radians(127.0365), 30.0)
 T0_NS = 1_700_000_000_000_000_000

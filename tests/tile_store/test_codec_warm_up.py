@@ -6,15 +6,17 @@ import pkgutil
 import numpy as np
 from store_helpers import TILE
 
-import gnd_map.codec
-from gnd_map.codec import LATTICES, best_codec, codec_of, decode_delta, encode_delta, snap
-from gnd_map.gaussian import Gaussians
-from tile_store.warm import warm_up
+import gnd.gnd_map.codec
+from gnd.gnd_map.codec import LATTICES, best_codec, codec_of, decode_delta, encode_delta, snap
+from gnd.gnd_map.gaussian import Gaussians
+from gnd.tile_store.warm import warm_up
 
 
 def compiled() -> dict[str, int]:
     """How many signatures of each kernel of the codecs are ready."""
-    modules = [importlib.import_module(f"gnd_map.codec.{m.name}") for m in pkgutil.iter_modules(gnd_map.codec.__path__)]
+    modules = [
+        importlib.import_module(f"gnd.gnd_map.codec.{m.name}") for m in pkgutil.iter_modules(gnd.gnd_map.codec.__path__)
+    ]
     return {
         f"{module.__name__}.{name}": len(found.signatures)
         for module in modules

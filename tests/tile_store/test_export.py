@@ -9,14 +9,14 @@ import pyproj
 import pytest
 from store_helpers import EAST, FAR, TILE, Clock, SqliteMaker, tile_of_voxels
 
-from gnd_map.gaussian import Gaussians
-from gnd_map.geodesy import LocalFrame
-from gnd_map.grid import VoxelGrid
-from gnd_map.tile import Tile
-from tile_store.compare import map_diff, map_info, version_diff
-from tile_store.errors import StoreError, UnknownVersion
-from tile_store.export import ExportError, export_map, points_of, region_frame, region_tiles
-from tile_store.store import Store
+from gnd.gnd_map.gaussian import Gaussians
+from gnd.gnd_map.geodesy import LocalFrame
+from gnd.gnd_map.grid import VoxelGrid
+from gnd.gnd_map.tile import Tile
+from gnd.tile_store.compare import map_diff, map_info, version_diff
+from gnd.tile_store.errors import StoreError, UnknownVersion
+from gnd.tile_store.export import ExportError, export_map, points_of, region_frame, region_tiles
+from gnd.tile_store.store import Store
 
 
 @pytest.fixture

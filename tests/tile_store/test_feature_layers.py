@@ -12,27 +12,27 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from store_helpers import EAGER, EAST, TILE, only_claim, report, report_id, tile_of_voxels
 
-from cloud_merger.announce import encoded, update_of
-from fleet_bus.errors import Refused
-from gnd_map.codec import PREFERRED
-from gnd_map.content import codecs_of_layer, encode_content_delta
-from gnd_map.errors import GndError
-from gnd_map.features import CODEC_FEATURES, Existence, Feature, FeatureTile, hit
-from gnd_map.tile import Tile
-from gnd_map.tile_id import TileId
-from schemas.errors import BadValue, SchemaError, WrongHash
-from schemas.tile_answer import content_of_answer
-from schemas.tiles import TileBlob, TileReply, TileRequest, content_of, features_of, tile_after, tile_of
-from schemas.tiles_batch import HeldTile, TileAnswer, TilesReply, TilesRequest
-from schemas.updates import TileUpdate, updated
-from tile_store.answers import Answers
-from tile_store.build import build_map
-from tile_store.cli import map_group
-from tile_store.compare import layer_info, map_diff, version_diff
-from tile_store.errors import StoreError
-from tile_store.export import ExportError, export_map
-from tile_store.sqlite_store import SqliteStore
-from tile_store.values import Publication
+from gnd.cloud_merger.announce import encoded, update_of
+from gnd.fleet_bus.errors import Refused
+from gnd.gnd_map.codec import PREFERRED
+from gnd.gnd_map.content import codecs_of_layer, encode_content_delta
+from gnd.gnd_map.errors import GndError
+from gnd.gnd_map.features import CODEC_FEATURES, Existence, Feature, FeatureTile, hit
+from gnd.gnd_map.tile import Tile
+from gnd.gnd_map.tile_id import TileId
+from gnd.schemas.errors import BadValue, SchemaError, WrongHash
+from gnd.schemas.tile_answer import content_of_answer
+from gnd.schemas.tiles import TileBlob, TileReply, TileRequest, content_of, features_of, tile_after, tile_of
+from gnd.schemas.tiles_batch import HeldTile, TileAnswer, TilesReply, TilesRequest
+from gnd.schemas.updates import TileUpdate, updated
+from gnd.tile_store.answers import Answers
+from gnd.tile_store.build import build_map
+from gnd.tile_store.cli import map_group
+from gnd.tile_store.compare import layer_info, map_diff, version_diff
+from gnd.tile_store.errors import StoreError
+from gnd.tile_store.export import ExportError, export_map
+from gnd.tile_store.sqlite_store import SqliteStore
+from gnd.tile_store.values import Publication
 
 DISTRICT = TILE.district
 READS = codecs_of_layer("signs")

@@ -8,7 +8,7 @@ import apsw
 import pytest
 from store_helpers import EAGER, TILE, merge_once, report, report_id, tile_of_voxels
 
-from tile_store.sqlite_store import SqliteStore
+from gnd.tile_store.sqlite_store import SqliteStore
 
 
 class SyncWatcher(apsw.VFS):

@@ -11,11 +11,11 @@ import apsw
 import pytest
 from store_helpers import EAGER, TILE, report, report_id, tile_of_voxels
 
-from tile_store.errors import StoreBusy, StoreClosed, StoreError, StoreUnavailable
-from tile_store.migrations import APPLICATION_ID, SCHEMA_VERSION
-from tile_store.sqlite_connection import open_writer
-from tile_store.sqlite_store import SqliteStore
-from tile_store.values import StoreConfig
+from gnd.tile_store.errors import StoreBusy, StoreClosed, StoreError, StoreUnavailable
+from gnd.tile_store.migrations import APPLICATION_ID, SCHEMA_VERSION
+from gnd.tile_store.sqlite_connection import open_writer
+from gnd.tile_store.sqlite_store import SqliteStore
+from gnd.tile_store.values import StoreConfig
 
 
 def opens_as(path: Path, **options: bool) -> str:
@@ -103,8 +103,8 @@ def test_a_folder_without_write_access(tmp_path: Path) -> None:
             parent.chmod(0o755)
     script = (
         "import os, sys\n"
-        "from tile_store.errors import StoreError\n"
-        "from tile_store.sqlite_store import SqliteStore\n"
+        "from gnd.tile_store.errors import StoreError\n"
+        "from gnd.tile_store.sqlite_store import SqliteStore\n"
         "if os.getuid() == 0: os.setuid(65534)\n"
         "for name in sys.argv[1:]:\n"
         "    try: SqliteStore(name)\n"

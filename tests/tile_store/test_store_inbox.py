@@ -6,10 +6,10 @@ from dataclasses import replace
 import pytest
 from store_helpers import EAST, FAR, TILE, Clock, SqliteMaker, merge_once, report, report_id
 
-from schemas.errors import SchemaError
-from tile_store.errors import StoreError
-from tile_store.store import Store
-from tile_store.values import ReportRow, StoreConfig
+from gnd.schemas.errors import SchemaError
+from gnd.tile_store.errors import StoreError
+from gnd.tile_store.store import Store
+from gnd.tile_store.values import ReportRow, StoreConfig
 
 
 def test_a_report_sent_twice_is_kept_once(store: Store) -> None:

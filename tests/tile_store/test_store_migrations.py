@@ -9,12 +9,12 @@ import apsw
 import pytest
 from store_helpers import EAGER, EAST, FAR, TILE, report, report_id, tile_of_voxels
 
-from gnd_map.day import UNKNOWN_DAY, day_of
-from tile_store import migrations
-from tile_store.errors import StoreError, StoreUnavailable
-from tile_store.migrations import SCHEMA_VERSION, STEPS
-from tile_store.sql import statements
-from tile_store.sqlite_store import SqliteStore
+from gnd.gnd_map.day import UNKNOWN_DAY, day_of
+from gnd.tile_store import migrations
+from gnd.tile_store.errors import StoreError, StoreUnavailable
+from gnd.tile_store.migrations import SCHEMA_VERSION, STEPS
+from gnd.tile_store.sql import statements
+from gnd.tile_store.sqlite_store import SqliteStore
 
 OLD = Path(__file__).parent / "data" / "store_schema_1.sqlite.gz"
 

@@ -10,9 +10,9 @@ from hypothesis import strategies as st
 from hypothesis.stateful import RuleBasedStateMachine, invariant, precondition, rule
 from store_helpers import EAGER, EAST, TILE, Clock, SqliteMaker, basis_of, report, report_id, tile_of_voxels
 
-from gnd_map.tile_id import TileId
-from tile_store.errors import UnknownVersion
-from tile_store.values import Publication, TileWork
+from gnd.gnd_map.tile_id import TileId
+from gnd.tile_store.errors import UnknownVersion
+from gnd.tile_store.values import Publication, TileWork
 
 LEASE_S = 10.0
 TILES = st.sampled_from([TILE, EAST])

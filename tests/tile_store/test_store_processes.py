@@ -13,7 +13,7 @@ import apsw
 import pytest
 from store_process import HURRY, TILES, merged_tile, publication_of
 
-from tile_store.sqlite_store import SqliteStore
+from gnd.tile_store.sqlite_store import SqliteStore
 
 SCRIPT = Path(__file__).with_name("store_process.py")
 KILLS = 20

@@ -16,9 +16,9 @@ from store_helpers import (
     tile_of_voxels,
 )
 
-from tile_store.errors import StoreError, UnknownReports
-from tile_store.store import Store
-from tile_store.values import Publication, PublishResult, StoreConfig
+from gnd.tile_store.errors import StoreError, UnknownReports
+from gnd.tile_store.store import Store
+from gnd.tile_store.values import Publication, PublishResult, StoreConfig
 
 
 def test_a_publication_makes_the_next_version_and_cleans_the_tile(store: Store) -> None:

@@ -6,11 +6,11 @@ from dataclasses import replace
 import pytest
 from store_helpers import EAGER, EAST, FAR, TILE, Clock, SqliteMaker, only_claim, publication, report
 
-from tile_store import clocks
-from tile_store.errors import StoreError
-from tile_store.sqlite_store import SqliteStore
-from tile_store.store import Store
-from tile_store.values import StoreConfig
+from gnd.tile_store import clocks
+from gnd.tile_store.errors import StoreError
+from gnd.tile_store.sqlite_store import SqliteStore
+from gnd.tile_store.store import Store
+from gnd.tile_store.values import StoreConfig
 
 PATIENT = StoreConfig(merge_delay_s=2.0, merge_after_reports=3)
 

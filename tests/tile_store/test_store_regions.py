@@ -8,11 +8,11 @@ from hypothesis import given
 from hypothesis import strategies as st
 from store_helpers import TILE
 
-from gnd_map.tile_id import TileId
-from schemas.errors import BadKey
-from tile_store.arguments import parse_tile, parse_time_ns, parse_versions
-from tile_store.errors import StoreError
-from tile_store.regions import ALL_TILES, Region, morton_range
+from gnd.gnd_map.tile_id import TileId
+from gnd.schemas.errors import BadKey
+from gnd.tile_store.arguments import parse_tile, parse_time_ns, parse_versions
+from gnd.tile_store.errors import StoreError
+from gnd.tile_store.regions import ALL_TILES, Region, morton_range
 
 ROOT = "gnd/v1/tile/"
 tiles = st.integers(0, 2**39 - 1).map(TileId)

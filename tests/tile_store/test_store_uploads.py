@@ -8,10 +8,10 @@ from dataclasses import replace
 import pytest
 from store_helpers import TILE, Clock, SqliteMaker, report, report_id
 
-from tile_store import clocks
-from tile_store.errors import IdTaken, StoreError
-from tile_store.store import Store
-from tile_store.uploads import Answered, Settled, Upload, UploadClaim
+from gnd.tile_store import clocks
+from gnd.tile_store.errors import IdTaken, StoreError
+from gnd.tile_store.store import Store
+from gnd.tile_store.uploads import Answered, Settled, Upload, UploadClaim
 
 KEY = "gnd/v1/change/ndt/13033/03021/23031"
 SECOND = 1_000_000_000

@@ -19,13 +19,13 @@ from store_helpers import (
     tile_of_voxels,
 )
 
-from gnd_map.codec import LATTICES, best_codec, encode_gaussians, snap
-from gnd_map.day import UNKNOWN_DAY, day_of
-from gnd_map.tile import Tile
-from schemas.errors import SchemaError, WrongHash
-from tile_store.errors import StoreError, UnknownVersion
-from tile_store.store import Store
-from tile_store.values import GcResult, Notice, Publication, PublishResult, ReportRow
+from gnd.gnd_map.codec import LATTICES, best_codec, encode_gaussians, snap
+from gnd.gnd_map.day import UNKNOWN_DAY, day_of
+from gnd.gnd_map.tile import Tile
+from gnd.schemas.errors import SchemaError, WrongHash
+from gnd.tile_store.errors import StoreError, UnknownVersion
+from gnd.tile_store.store import Store
+from gnd.tile_store.values import GcResult, Notice, Publication, PublishResult, ReportRow
 
 DAY_NS = 86_400_000_000_000
 

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 from store_helpers import EAGER, EAST, TILE, tile_of_voxels
 
-from fleet_bus.errors import Refused
-from gnd_map.codec import (
+from gnd.fleet_bus.errors import Refused
+from gnd.gnd_map.codec import (
     CODEC_FLOAT32,
     CODEC_FLOAT32_ZSTD,
     CODEC_STANDARD,
@@ -19,17 +19,17 @@ from gnd_map.codec import (
     encode_gaussians,
     snap,
 )
-from gnd_map.gaussian import Gaussians
-from gnd_map.tile import Tile
-from gnd_map.tile_id import TileId
-from schemas.errors import SchemaError, WrongHash
-from schemas.tiles import TileRequest, tile_after, tile_of
-from schemas.tiles_batch import HeldTile, TileAnswer, TilesReply, TilesRequest, tile_of_answer
-from tile_store.answers import Answers, same_lattice
-from tile_store.errors import StoreDamaged
-from tile_store.memory import Memory
-from tile_store.sqlite_store import SqliteStore
-from tile_store.values import StoredTile
+from gnd.gnd_map.gaussian import Gaussians
+from gnd.gnd_map.tile import Tile
+from gnd.gnd_map.tile_id import TileId
+from gnd.schemas.errors import SchemaError, WrongHash
+from gnd.schemas.tiles import TileRequest, tile_after, tile_of
+from gnd.schemas.tiles_batch import HeldTile, TileAnswer, TilesReply, TilesRequest, tile_of_answer
+from gnd.tile_store.answers import Answers, same_lattice
+from gnd.tile_store.errors import StoreDamaged
+from gnd.tile_store.memory import Memory
+from gnd.tile_store.sqlite_store import SqliteStore
+from gnd.tile_store.values import StoredTile
 
 DISTRICT = TILE.district
 
@@ -160,7 +160,7 @@ def test_a_tile_too_large_for_a_message_in_the_clients_codec_is_refused(
     store: SqliteStore, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     put(store, street(TILE, 1))
-    monkeypatch.setattr("tile_store.answers.MAX_TILE_BODY_BYTES", 10_000)
+    monkeypatch.setattr("gnd.tile_store.answers.MAX_TILE_BODY_BYTES", 10_000)
     answers, head = Answers(store), store.get("ndt", TILE)
     with pytest.raises(Refused, match=r"has 14404 bytes in codec 0, a message holds 10000; it comes in codec 3"):
         answers.one(head, TileRequest(codecs=(CODEC_FLOAT32,)))
@@ -308,7 +308,7 @@ def test_equal_questions_are_worked_out_once(store: SqliteStore, monkeypatch: py
     answers = Answers(store)
     requests = [TilesRequest.of(held(old)), TilesRequest.of(held(TILE), codecs=(CODEC_FLOAT32,))]
     first = [asked(answers, request) for request in requests]
-    monkeypatch.setattr("tile_store.answers.encode_content_delta", lambda *_: pytest.fail("worked out again"))
+    monkeypatch.setattr("gnd.tile_store.answers.encode_content_delta", lambda *_: pytest.fail("worked out again"))
     monkeypatch.setattr(StoredTile, "decode", lambda *_: pytest.fail("decoded again"))
     assert [asked(answers, request) for request in requests] == first
 

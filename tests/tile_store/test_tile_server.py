@@ -14,20 +14,20 @@ import pytest
 import zenoh
 from store_helpers import EAGER, EAST, FAR, TILE, merge_once, report, report_id, tile_of_voxels
 
-from fleet_bus.bus import Bus, open_bus
-from fleet_bus.config import READS, BusConfig
-from fleet_bus.errors import RequestFailed, RequestRefused
-from fleet_bus.requesting import RetryPolicy
-from fleet_bus.router import open_router
-from gnd_map.day import day_of
-from gnd_map.tile_id import TileId
-from schemas import keys
-from schemas.tiles import Catalog, TileReply, TileRequest, tile_of
-from schemas.tiles_batch import HeldTile, TileAnswer, TilesReply, TilesRequest, tile_of_answer
-from tile_store.errors import StoreError
-from tile_store.server import TileServer
-from tile_store.sqlite_store import SqliteStore
-from tile_store.values import StoredTile
+from gnd.fleet_bus.bus import Bus, open_bus
+from gnd.fleet_bus.config import READS, BusConfig
+from gnd.fleet_bus.errors import RequestFailed, RequestRefused
+from gnd.fleet_bus.requesting import RetryPolicy
+from gnd.fleet_bus.router import open_router
+from gnd.gnd_map.day import day_of
+from gnd.gnd_map.tile_id import TileId
+from gnd.schemas import keys
+from gnd.schemas.tiles import Catalog, TileReply, TileRequest, tile_of
+from gnd.schemas.tiles_batch import HeldTile, TileAnswer, TilesReply, TilesRequest, tile_of_answer
+from gnd.tile_store.errors import StoreError
+from gnd.tile_store.server import TileServer
+from gnd.tile_store.sqlite_store import SqliteStore
+from gnd.tile_store.values import StoredTile
 
 ONCE = RetryPolicy(attempt_timeout_s=5.0)
 
@@ -242,7 +242,7 @@ def test_a_closed_server_answers_no_more_and_a_new_one_does(client: Bus, endpoin
 
 def start_process(path: Path, endpoint: str, first_line: str = "tile server: ") -> subprocess.Popen[str]:
     """`gnd store` as a process that has said this."""
-    command = [sys.executable, "-m", "deploy.cli", "store", "--path", str(path), "--connect", endpoint]
+    command = [sys.executable, "-m", "gnd.deploy.cli", "store", "--path", str(path), "--connect", endpoint]
     process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True)
     assert process.stdout is not None
     assert first_line in process.stdout.readline()
@@ -320,7 +320,7 @@ def test_a_store_started_before_its_router_waits_for_it(store: SqliteStore, free
 @pytest.mark.usefixtures("server")
 def test_a_region_that_is_too_large_is_refused_with_its_size(client: Bus, monkeypatch: pytest.MonkeyPatch) -> None:
     """A wildcard over everything would keep the server busy for everybody else."""
-    monkeypatch.setattr("tile_store.server.MOST_TILES_OF_REGION", 2)
+    monkeypatch.setattr("gnd.tile_store.server.MOST_TILES_OF_REGION", 2)
     with pytest.raises(RequestRefused, match="region with 3 tiles, more than 2: ask for its catalogs"):
         client.request_many(keys.tiles_key("ndt"), b"", kind="tile", timeout_s=20.0)
     assert len(client.request_many(keys.tiles_key("ndt", "13033/03021"), b"", kind="tile", timeout_s=20.0)) == 2
@@ -345,7 +345,7 @@ def test_a_router_knows_the_keys_whose_answers_it_may_drop() -> None:
 
 def test_a_store_process_that_cannot_start_says_why_in_one_line(tmp_path: Path, free_port: int) -> None:
     (tmp_path / "s.db").write_text("not a store, whatever its name says " * 10)
-    command = [sys.executable, "-m", "deploy.cli", "store", "--path", str(tmp_path / "s.db")]
+    command = [sys.executable, "-m", "gnd.deploy.cli", "store", "--path", str(tmp_path / "s.db")]
     done = subprocess.run(
         [*command, "--connect", f"tcp/127.0.0.1:{free_port}"], capture_output=True, text=True, env=os.environ
     )

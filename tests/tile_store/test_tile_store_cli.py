@@ -11,13 +11,13 @@ import pytest
 from click.testing import CliRunner
 from store_helpers import EAGER, EAST, FAR, TILE, merge_once, report, report_id, tile_of_voxels
 
-from deploy.map_cli import map_group
-from gnd_map.errors import GndError
-from gnd_map.geodesy import LocalFrame
-from schemas.drive import DriveHeader, ReferencePose, Scan
-from schemas.drive_mcap import DriveWriter
-from tile_store.sqlite_store import SqliteStore
-from tile_store.values import Publication, Unconfirmed
+from gnd.deploy.map_cli import map_group
+from gnd.gnd_map.errors import GndError
+from gnd.gnd_map.geodesy import LocalFrame
+from gnd.schemas.drive import DriveHeader, ReferencePose, Scan
+from gnd.schemas.drive_mcap import DriveWriter
+from gnd.tile_store.sqlite_store import SqliteStore
+from gnd.tile_store.values import Publication, Unconfirmed
 
 T0_NS = 1_700_000_000_000_000_000
 
@@ -202,7 +202,7 @@ def test_what_cannot_be_is_said_in_one_line_and_nothing_is_made(path: Path, tmp_
 
 
 def test_the_command_line_turns_errors_into_one_line_and_exit_code_2(tmp_path: Path) -> None:
-    command = [sys.executable, "-m", "deploy.cli", "map", "info", str(tmp_path / "missing.db")]
+    command = [sys.executable, "-m", "gnd.deploy.cli", "map", "info", str(tmp_path / "missing.db")]
     done = subprocess.run(command, capture_output=True, text=True)
     assert (done.returncode, done.stdout) == (2, "")
     assert done.stderr == f"gnd: {tmp_path / 'missing.db'}: no such store; `gnd map build` makes one\n"

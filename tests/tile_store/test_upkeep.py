@@ -15,20 +15,20 @@ import pytest
 from click.testing import CliRunner
 from store_helpers import EAGER, EAST, FAR, TILE, Clock, merge_once, publication, report, tile_of_voxels
 
-from deploy.map_cli import map_group
-from gnd_map.errors import GndError
-from gnd_map.features import Feature, FeatureTile, hit
-from gnd_map.gaussian import Gaussians
-from gnd_map.tile import Tile
-from tile_store.backup import copy_store
-from tile_store.check import check_store
-from tile_store.errors import StoreDamaged, StoreError, StoreUnavailable
-from tile_store.migrations import SCHEMA_VERSION
-from tile_store.retention import Retained, retain
-from tile_store.rollback import Target, plan, roll_back
-from tile_store.sqlite_connection import change
-from tile_store.sqlite_store import SqliteStore
-from tile_store.values import StoreConfig
+from gnd.deploy.map_cli import map_group
+from gnd.gnd_map.errors import GndError
+from gnd.gnd_map.features import Feature, FeatureTile, hit
+from gnd.gnd_map.gaussian import Gaussians
+from gnd.gnd_map.tile import Tile
+from gnd.tile_store.backup import copy_store
+from gnd.tile_store.check import check_store
+from gnd.tile_store.errors import StoreDamaged, StoreError, StoreUnavailable
+from gnd.tile_store.migrations import SCHEMA_VERSION
+from gnd.tile_store.retention import Retained, retain
+from gnd.tile_store.rollback import Target, plan, roll_back
+from gnd.tile_store.sqlite_connection import change
+from gnd.tile_store.sqlite_store import SqliteStore
+from gnd.tile_store.values import StoreConfig
 
 T0_NS = 1_700_000_000_000_000_000
 DAY_S = 86_400.0
@@ -334,9 +334,9 @@ def test_tiles_set_aside_are_shown_and_taken_up_again(path: Path) -> None:
 
 AS_NOBODY = (
     "import os, sys\n"
-    "import deploy.map_cli, gnd_map.content\n"
+    "import gnd.deploy.map_cli, gnd.gnd_map.content\n"
     "if os.getuid() == 0: os.setgroups([]); os.setgid(65534); os.setuid(65534)\n"
-    "from deploy.cli import main\n"
+    "from gnd.deploy.cli import main\n"
     "sys.argv = ['gnd', *sys.argv[1:]]\n"
     "main()\n"
 )
@@ -405,7 +405,7 @@ def test_a_copy_that_is_damaged_on_the_way_does_not_get_its_name(
     def fail(*_arguments: object) -> None:
         raise StoreError("1 damages, first tile ...")
 
-    monkeypatch.setattr("tile_store.backup.require_whole", fail)
+    monkeypatch.setattr("gnd.tile_store.backup.require_whole", fail)
     with pytest.raises(StoreError, match="1 damages"):
         copy_store(path, tmp_path / "b")
     assert [one.name for one in tmp_path.iterdir() if "b" in one.name.split(".")[0]] == []

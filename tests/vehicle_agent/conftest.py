@@ -4,9 +4,9 @@ from collections.abc import Iterator
 
 import pytest
 
-from fleet_bus.bus import Bus, open_bus
-from fleet_bus.config import BusConfig
-from fleet_bus.router import open_router
+from gnd.fleet_bus.bus import Bus, open_bus
+from gnd.fleet_bus.config import BusConfig
+from gnd.fleet_bus.router import open_router
 
 
 @pytest.fixture

@@ -5,14 +5,14 @@ from collections.abc import Sequence
 import numpy as np
 from vehicle_scene import FIGURE_2, GRID_FRAME, GROUND_M
 
-from gnd_map.accumulate import VoxelAccumulator
-from gnd_map.se3 import T_inverse, exp_so3, transform
-from gnd_map.tile import Tile
-from gnd_map.tile_id import TileId
-from vehicle_agent.local_map import LocalMap
-from vehicle_agent.localise.estimates import PoseEstimate, RefinedScan
-from vehicle_agent.localise.match_map import MatchMapCache
-from vehicle_agent.segment import SegmentedScan
+from gnd.gnd_map.accumulate import VoxelAccumulator
+from gnd.gnd_map.se3 import T_inverse, exp_so3, transform
+from gnd.gnd_map.tile import Tile
+from gnd.gnd_map.tile_id import TileId
+from gnd.vehicle_agent.local_map import LocalMap
+from gnd.vehicle_agent.localise.estimates import PoseEstimate, RefinedScan
+from gnd.vehicle_agent.localise.match_map import MatchMapCache
+from gnd.vehicle_agent.segment import SegmentedScan
 
 START_NS = 1_570_838_400_000_000_000
 EYE_M = np.array([0.0, 0.0, GROUND_M + 1.9])

@@ -4,13 +4,13 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from fleet_sim import parts
-from fleet_sim.lidar import Lidar
-from fleet_sim.raycast import Scene
-from fleet_sim.sensors import MODELS
-from fleet_sim.shapes import Block, Post, Shape
-from gnd_map.arrays import F64
-from vehicle_agent.features.poles.detector import Rays
+from gnd.fleet_sim import parts
+from gnd.fleet_sim.lidar import Lidar
+from gnd.fleet_sim.raycast import Scene
+from gnd.fleet_sim.sensors import MODELS
+from gnd.fleet_sim.shapes import Block, Post, Shape
+from gnd.gnd_map.arrays import F64
+from gnd.vehicle_agent.features.poles.detector import Rays
 
 LIDAR_M = 1.9
 GROUND = Block(0.0, 0.0, 150.0, 150.0, -1.0, 0.0)

@@ -6,10 +6,10 @@ from math import atan2, hypot, radians
 
 import numpy as np
 
-from vehicle_agent.features.look import Look, MapFeatures
-from vehicle_agent.features.slamcu.parameters import FilterParameters, SlamcuParameters
-from vehicle_agent.features.slamcu.slamcu import Slamcu
-from vehicle_agent.features.view import CAMERA, Occlusion
+from gnd.vehicle_agent.features.look import Look, MapFeatures
+from gnd.vehicle_agent.features.slamcu.parameters import FilterParameters, SlamcuParameters
+from gnd.vehicle_agent.features.slamcu.slamcu import Slamcu
+from gnd.vehicle_agent.features.view import CAMERA, Occlusion
 
 PERIOD_S = 1.0 / 15.0
 FEW = SlamcuParameters(filter=FilterParameters(particles=300))

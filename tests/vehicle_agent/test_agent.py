@@ -13,24 +13,24 @@ import pytest
 from click.testing import CliRunner
 from waiting import wait_until
 
-from cloud_merger.config import ShardConfig
-from cloud_merger.merger import run_shard
-from fleet_bus.bus import Bus
-from fleet_sim.drives import PERFECT, DriveConfig, simulate_drive
-from fleet_sim.street import street
-from gnd_map.tile_id import TileId
-from schemas.changes import ChangeReport
-from schemas.drive import Scan
-from schemas.drive_mcap import DriveWriter, read_drive, read_header
-from schemas.errors import DriveError
-from schemas.keys import traffic_key
-from schemas.traffic import TrafficSample
-from tile_store.build import build_map
-from tile_store.server import TileServer
-from tile_store.sqlite_store import SqliteStore
-from vehicle_agent.agent import AgentConfig, run_agent
-from vehicle_agent.cli import agent as agent_command
-from vehicle_agent.errors import VehicleError
+from gnd.cloud_merger.config import ShardConfig
+from gnd.cloud_merger.merger import run_shard
+from gnd.fleet_bus.bus import Bus
+from gnd.fleet_sim.drives import PERFECT, DriveConfig, simulate_drive
+from gnd.fleet_sim.street import street
+from gnd.gnd_map.tile_id import TileId
+from gnd.schemas.changes import ChangeReport
+from gnd.schemas.drive import Scan
+from gnd.schemas.drive_mcap import DriveWriter, read_drive, read_header
+from gnd.schemas.errors import DriveError
+from gnd.schemas.keys import traffic_key
+from gnd.schemas.traffic import TrafficSample
+from gnd.tile_store.build import build_map
+from gnd.tile_store.server import TileServer
+from gnd.tile_store.sqlite_store import SqliteStore
+from gnd.vehicle_agent.agent import AgentConfig, run_agent
+from gnd.vehicle_agent.cli import agent as agent_command
+from gnd.vehicle_agent.errors import VehicleError
 
 SEED = 101
 NEVER = threading.Event()
@@ -136,7 +136,7 @@ def test_a_drive_ends_with_everything_acknowledged_and_a_second_life_sends_nothi
 
 @pytest.mark.slow
 def test_an_agent_killed_on_the_way_is_started_again_and_loses_nothing(cloud_of: Cloud, config: AgentConfig) -> None:
-    program = "from vehicle_agent.cli import agent; agent()"
+    program = "from gnd.vehicle_agent.cli import agent; agent()"
     arguments = ["--vehicle", "probe", "--drive", str(config.drive), "--work-dir", str(config.work_dir)]
     arguments += ["--connect", config.connect[0], "--pace", "0.5"]
     with subprocess.Popen([sys.executable, "-c", program, *arguments]) as process:

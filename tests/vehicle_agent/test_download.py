@@ -9,20 +9,20 @@ import pytest
 from vehicle_scene import ground, published
 from waiting import wait_until
 
-from fleet_bus.bus import Bus, open_bus
-from fleet_bus.config import BusConfig
-from fleet_bus.links import LinkProfile
-from fleet_bus.serving import Request
-from gnd_map.tile import Tile
-from gnd_map.tile_id import TileId
-from schemas.keys import batch_key, batch_keys
-from schemas.tiles import blob_of
-from schemas.tiles_batch import TileAnswer, TilesReply, TilesRequest
-from tile_store.server import TileServer
-from tile_store.sqlite_store import SqliteStore
-from vehicle_agent.cache import TileCache
-from vehicle_agent.config import DownloadParameters
-from vehicle_agent.download import TileFetcher
+from gnd.fleet_bus.bus import Bus, open_bus
+from gnd.fleet_bus.config import BusConfig
+from gnd.fleet_bus.links import LinkProfile
+from gnd.fleet_bus.serving import Request
+from gnd.gnd_map.tile import Tile
+from gnd.gnd_map.tile_id import TileId
+from gnd.schemas.keys import batch_key, batch_keys
+from gnd.schemas.tiles import blob_of
+from gnd.schemas.tiles_batch import TileAnswer, TilesReply, TilesRequest
+from gnd.tile_store.server import TileServer
+from gnd.tile_store.sqlite_store import SqliteStore
+from gnd.vehicle_agent.cache import TileCache
+from gnd.vehicle_agent.config import DownloadParameters
+from gnd.vehicle_agent.download import TileFetcher
 
 QUICK = DownloadParameters(request_s=0.6, retry_s=0.1, in_flight=3)
 NEVER = threading.Event()

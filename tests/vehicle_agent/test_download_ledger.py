@@ -13,29 +13,29 @@ import pytest
 from vehicle_scene import FRAME, GRID_FRAME, HEIGHT_M, ground, published
 from waiting import wait_until
 
-from fleet_bus.bus import Bus, open_bus
-from fleet_bus.config import BusConfig
-from fleet_bus.ledger import Ledger
-from fleet_bus.ledger_file import Booking, read_ledger
-from fleet_bus.links import LinkProfile
-from fleet_bus.router import open_router
-from gnd_map.codec import LATTICES, encode_delta, snap
-from gnd_map.tile import Tile
-from gnd_map.tile_id import TileId
-from schemas.drive import GnssFix
-from schemas.keys import update_key
-from schemas.tiles_batch import ANSWER_HASH_BYTES
-from schemas.updates import TileUpdate
-from tile_store.server import TileServer
-from tile_store.sqlite_store import SqliteStore
-from vehicle_agent.cache import TileCache
-from vehicle_agent.config import DownloadParameters
-from vehicle_agent.detect.detector import ChangeDetector
-from vehicle_agent.download import TileFetcher
-from vehicle_agent.local_map import LocalMap
-from vehicle_agent.place import Place
-from vehicle_agent.surroundings import Surroundings
-from vehicle_agent.updates import Updates
+from gnd.fleet_bus.bus import Bus, open_bus
+from gnd.fleet_bus.config import BusConfig
+from gnd.fleet_bus.ledger import Ledger
+from gnd.fleet_bus.ledger_file import Booking, read_ledger
+from gnd.fleet_bus.links import LinkProfile
+from gnd.fleet_bus.router import open_router
+from gnd.gnd_map.codec import LATTICES, encode_delta, snap
+from gnd.gnd_map.tile import Tile
+from gnd.gnd_map.tile_id import TileId
+from gnd.schemas.drive import GnssFix
+from gnd.schemas.keys import update_key
+from gnd.schemas.tiles_batch import ANSWER_HASH_BYTES
+from gnd.schemas.updates import TileUpdate
+from gnd.tile_store.server import TileServer
+from gnd.tile_store.sqlite_store import SqliteStore
+from gnd.vehicle_agent.cache import TileCache
+from gnd.vehicle_agent.config import DownloadParameters
+from gnd.vehicle_agent.detect.detector import ChangeDetector
+from gnd.vehicle_agent.download import TileFetcher
+from gnd.vehicle_agent.local_map import LocalMap
+from gnd.vehicle_agent.place import Place
+from gnd.vehicle_agent.surroundings import Surroundings
+from gnd.vehicle_agent.updates import Updates
 
 NEVER = threading.Event()
 PARAMETERS = DownloadParameters(near_m=30.0, ahead_m=60.0, forget_m=60.0, retry_s=0.1)
@@ -182,14 +182,14 @@ def test_what_a_notice_brought_is_not_downloaded_and_the_other_way_round(
 DOWNLOADER = """
 import sys, threading
 from pathlib import Path
-from fleet_bus.bus import open_bus
-from fleet_bus.config import BusConfig
-from fleet_bus.ledger import Ledger
-from fleet_bus.links import LinkProfile
-from gnd_map.tile_id import TileId
-from vehicle_agent.cache import TileCache
-from vehicle_agent.config import DownloadParameters
-from vehicle_agent.download import TileFetcher
+from gnd.fleet_bus.bus import open_bus
+from gnd.fleet_bus.config import BusConfig
+from gnd.fleet_bus.ledger import Ledger
+from gnd.fleet_bus.links import LinkProfile
+from gnd.gnd_map.tile_id import TileId
+from gnd.vehicle_agent.cache import TileCache
+from gnd.vehicle_agent.config import DownloadParameters
+from gnd.vehicle_agent.download import TileFetcher
 
 folder, tiles = Path(sys.argv[2]), [TileId(int(morton)) for morton in sys.argv[3:]]
 thin = LinkProfile("thin", down_bit_s=2.2e5, up_bit_s=2.2e5, delay_ms=5.0, burst_bytes=0)

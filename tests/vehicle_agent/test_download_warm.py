@@ -11,14 +11,14 @@ PROGRAM = textwrap.dedent(
     """
     import json, sys
     import numpy as np
-    from gnd_map.codec import LATTICES, best_codec, decode_delta, encode_delta, snap
-    from gnd_map.tile import Tile
-    from gnd_map.tile_id import TileId
-    from schemas.tiles import blob_of, tile_of
-    from vehicle_agent.warm import _map_of, _room, warm_up
-    from gnd_map.geodesy import LocalFrame
-    from gnd_map.grid import GridFrame
-    import vehicle_agent.agent
+    from gnd.gnd_map.codec import LATTICES, best_codec, decode_delta, encode_delta, snap
+    from gnd.gnd_map.tile import Tile
+    from gnd.gnd_map.tile_id import TileId
+    from gnd.schemas.tiles import blob_of, tile_of
+    from gnd.vehicle_agent.warm import _map_of, _room, warm_up
+    from gnd.gnd_map.geodesy import LocalFrame
+    from gnd.gnd_map.grid import GridFrame
+    import gnd.vehicle_agent.agent
 
     warm_up()
     def compiled():

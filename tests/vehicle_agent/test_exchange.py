@@ -11,21 +11,21 @@ import pytest
 from vehicle_scene import ground, published
 from waiting import wait_until
 
-from fleet_bus.bus import Bus
-from fleet_bus.serving import Request
-from gnd_map.codec import encode_delta
-from gnd_map.tile import Tile
-from gnd_map.tile_id import TileId
-from schemas.errors import SchemaError
-from schemas.keys import batch_key
-from schemas.tiles import blob_of
-from schemas.tiles_batch import TileAnswer, TilesReply, TilesRequest
-from tile_store.server import TileServer
-from tile_store.sqlite_store import SqliteStore
-from vehicle_agent.cache import TileCache
-from vehicle_agent.config import DownloadParameters
-from vehicle_agent.download import TileFetcher
-from vehicle_agent.exchange import Exchange, shares_of
+from gnd.fleet_bus.bus import Bus
+from gnd.fleet_bus.serving import Request
+from gnd.gnd_map.codec import encode_delta
+from gnd.gnd_map.tile import Tile
+from gnd.gnd_map.tile_id import TileId
+from gnd.schemas.errors import SchemaError
+from gnd.schemas.keys import batch_key
+from gnd.schemas.tiles import blob_of
+from gnd.schemas.tiles_batch import TileAnswer, TilesReply, TilesRequest
+from gnd.tile_store.server import TileServer
+from gnd.tile_store.sqlite_store import SqliteStore
+from gnd.vehicle_agent.cache import TileCache
+from gnd.vehicle_agent.config import DownloadParameters
+from gnd.vehicle_agent.download import TileFetcher
+from gnd.vehicle_agent.exchange import Exchange, shares_of
 
 LARGE = 1 << 20
 

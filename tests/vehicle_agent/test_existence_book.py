@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from vehicle_agent.features.slamcu.existence_book import (
+from gnd.vehicle_agent.features.slamcu.existence_book import (
     Entry,
     ExistenceBook,
     FeatureClass,
@@ -15,7 +15,7 @@ from vehicle_agent.features.slamcu.existence_book import (
     doubted,
     existence_of,
 )
-from vehicle_agent.features.slamcu.parameters import SlamcuParameters
+from gnd.vehicle_agent.features.slamcu.parameters import SlamcuParameters
 
 BOOK = ExistenceBook(SlamcuParameters())
 SETS = (frozenset({"yes"}), frozenset({"no"}), frozenset({"yes", "no"}))

@@ -5,12 +5,12 @@ from math import pi, radians
 import numpy as np
 import pytest
 
-from gnd_map.geodesy import LocalFrame
-from gnd_map.tile_id import TileId
-from schemas.feature_change import GRID, cell_of
-from vehicle_agent.features.coverage import Coverage, CoverageParameters
-from vehicle_agent.features.errors import FeatureLayerError
-from vehicle_agent.features.view import CAMERA, LIDAR, Occlusion
+from gnd.gnd_map.geodesy import LocalFrame
+from gnd.gnd_map.tile_id import TileId
+from gnd.schemas.feature_change import GRID, cell_of
+from gnd.vehicle_agent.features.coverage import Coverage, CoverageParameters
+from gnd.vehicle_agent.features.errors import FeatureLayerError
+from gnd.vehicle_agent.features.view import CAMERA, LIDAR, Occlusion
 
 START = TileId.from_path("13033/03021/23031/22102")
 FRAME = LocalFrame.of_tile(START)

@@ -9,21 +9,21 @@ import numpy as np
 import pytest
 from waiting import wait_until
 
-from cloud_merger.announce import encoded, update_of
-from fleet_bus.bus import Bus, open_bus
-from fleet_bus.config import BusConfig
-from fleet_bus.router import open_router
-from gnd_map.errors import GndError
-from gnd_map.features import Feature, FeatureTile, hit
-from gnd_map.tile_id import TileId
-from schemas.keys import update_key
-from schemas.tiles import TileBlob
-from tile_store.server import TileServer
-from tile_store.sqlite_store import SqliteStore
-from vehicle_agent.cache import TileCache
-from vehicle_agent.config import AgentConfig, DownloadParameters
-from vehicle_agent.errors import AgentConfigError
-from vehicle_agent.features.download import FeatureDownloader
+from gnd.cloud_merger.announce import encoded, update_of
+from gnd.fleet_bus.bus import Bus, open_bus
+from gnd.fleet_bus.config import BusConfig
+from gnd.fleet_bus.router import open_router
+from gnd.gnd_map.errors import GndError
+from gnd.gnd_map.features import Feature, FeatureTile, hit
+from gnd.gnd_map.tile_id import TileId
+from gnd.schemas.keys import update_key
+from gnd.schemas.tiles import TileBlob
+from gnd.tile_store.server import TileServer
+from gnd.tile_store.sqlite_store import SqliteStore
+from gnd.vehicle_agent.cache import TileCache
+from gnd.vehicle_agent.config import AgentConfig, DownloadParameters
+from gnd.vehicle_agent.errors import AgentConfigError
+from gnd.vehicle_agent.features.download import FeatureDownloader
 
 TILE, EAST = TileId(497353963154), TileId(497353963155)
 COV_M2 = np.array([0.04, 0.0, 0.0, 0.04, 0.0, 1e4])

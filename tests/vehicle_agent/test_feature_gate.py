@@ -7,12 +7,12 @@ import numpy as np
 import pytest
 from test_feature_layer import FRAME, GONE, NEW, STANDS, look_from, mapped
 
-from schemas.drive import Detections
-from vehicle_agent.config import ReportParameters
-from vehicle_agent.features.layer_parameters import LAYERS, FeatureParameters
-from vehicle_agent.features.layers import FeatureLayers
-from vehicle_agent.localise.estimates import PoseEstimate, RefinedScan
-from vehicle_agent.segment.segmenter import SegmentedScan
+from gnd.schemas.drive import Detections
+from gnd.vehicle_agent.config import ReportParameters
+from gnd.vehicle_agent.features.layer_parameters import LAYERS, FeatureParameters
+from gnd.vehicle_agent.features.layers import FeatureLayers
+from gnd.vehicle_agent.localise.estimates import PoseEstimate, RefinedScan
+from gnd.vehicle_agent.segment.segmenter import SegmentedScan
 
 STEP_NS = 66_000_000
 Wrong = Literal["none", "poor", "disagrees", "taken back", "shifted", "a moment"]

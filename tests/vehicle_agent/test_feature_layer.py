@@ -5,20 +5,20 @@ from math import atan2, hypot
 import numpy as np
 import pytest
 
-from gnd_map.features import VACUOUS, Feature, FeatureTile, feature_id_of, hit, miss, prior
-from gnd_map.geodesy import LocalFrame
-from gnd_map.se3 import exp_so3
-from gnd_map.tile_id import TileId
-from schemas.drive import Detections
-from schemas.features import FeatureChange
-from vehicle_agent.features.coverage import CoverageParameters
-from vehicle_agent.features.errors import FeatureLayerError
-from vehicle_agent.features.feature_map import place_in_tile
-from vehicle_agent.features.layer import FeatureLayer, PlacedLook, of_counts
-from vehicle_agent.features.layer_parameters import LAYERS, FeatureParameters, LayerParameters
-from vehicle_agent.features.layers import placed
-from vehicle_agent.features.look import Look
-from vehicle_agent.localise.estimates import PoseEstimate, RefinedScan
+from gnd.gnd_map.features import VACUOUS, Feature, FeatureTile, feature_id_of, hit, miss, prior
+from gnd.gnd_map.geodesy import LocalFrame
+from gnd.gnd_map.se3 import exp_so3
+from gnd.gnd_map.tile_id import TileId
+from gnd.schemas.drive import Detections
+from gnd.schemas.features import FeatureChange
+from gnd.vehicle_agent.features.coverage import CoverageParameters
+from gnd.vehicle_agent.features.errors import FeatureLayerError
+from gnd.vehicle_agent.features.feature_map import place_in_tile
+from gnd.vehicle_agent.features.layer import FeatureLayer, PlacedLook, of_counts
+from gnd.vehicle_agent.features.layer_parameters import LAYERS, FeatureParameters, LayerParameters
+from gnd.vehicle_agent.features.layers import placed
+from gnd.vehicle_agent.features.look import Look
+from gnd.vehicle_agent.localise.estimates import PoseEstimate, RefinedScan
 
 START = TileId.from_path("13033/03021/23031/22102")
 FRAME = LocalFrame.of_tile(START)

@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 from rbpf_plain import h
 
-from vehicle_agent.features.slamcu.identities import NONE, best_identities
-from vehicle_agent.features.slamcu.parameters import FilterParameters, SlamcuParameters
-from vehicle_agent.features.slamcu.rbpf import Rbpf
+from gnd.vehicle_agent.features.slamcu.identities import NONE, best_identities
+from gnd.vehicle_agent.features.slamcu.parameters import FilterParameters, SlamcuParameters
+from gnd.vehicle_agent.features.slamcu.rbpf import Rbpf
 
 VARIANCE = np.array([0.2, radians(0.4)]) ** 2
 TRUE = np.zeros(3)

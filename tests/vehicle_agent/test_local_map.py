@@ -4,14 +4,14 @@ import numpy as np
 import pytest
 from vehicle_scene import FIGURE_2, FRAME, GRID_FRAME, ground, tiles_of, wall
 
-from gnd_map.gaussian import Gaussians
-from gnd_map.geodesy import LocalFrame
-from gnd_map.grid import VoxelGrid
-from gnd_map.tile import Tile
-from gnd_map.tile_id import TileId
-from vehicle_agent import local_map as local_map_module
-from vehicle_agent.errors import WindowTooLarge
-from vehicle_agent.local_map import EMPTY, UNKNOWN, LocalMap
+from gnd.gnd_map.gaussian import Gaussians
+from gnd.gnd_map.geodesy import LocalFrame
+from gnd.gnd_map.grid import VoxelGrid
+from gnd.gnd_map.tile import Tile
+from gnd.gnd_map.tile_id import TileId
+from gnd.vehicle_agent import local_map as local_map_module
+from gnd.vehicle_agent.errors import WindowTooLarge
+from gnd.vehicle_agent.local_map import EMPTY, UNKNOWN, LocalMap
 
 
 @pytest.fixture(scope="module")

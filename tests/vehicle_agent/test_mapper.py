@@ -10,22 +10,22 @@ import numpy as np
 import pytest
 from waiting import wait_until
 
-from cloud_merger.config import ShardConfig
-from cloud_merger.merger import run_shard
-from fleet_bus.bus import Bus
-from fleet_sim.roads.drive import RoadDrive, RoadDriveOptions, drive_route
-from fleet_sim.roads.recording import write_road_drive
-from fleet_sim.roads.route import Route
-from fleet_sim.roads.streetlights import streetlight_motorway
-from gnd_map.features import Feature, FeatureTile, feature_id_of, geodetic_in_tile, pieces_of, prior
-from gnd_map.tile_id import TileId
-from schemas.features import FeatureReport
-from tile_store.server import TileServer
-from tile_store.sqlite_store import SqliteStore
-from tile_store.values import StoreConfig
-from vehicle_agent.agent import AgentConfig, run_agent
-from vehicle_agent.errors import AgentConfigError
-from vehicle_agent.features.layer_parameters import LAYERS, FeatureParameters
+from gnd.cloud_merger.config import ShardConfig
+from gnd.cloud_merger.merger import run_shard
+from gnd.fleet_bus.bus import Bus
+from gnd.fleet_sim.roads.drive import RoadDrive, RoadDriveOptions, drive_route
+from gnd.fleet_sim.roads.recording import write_road_drive
+from gnd.fleet_sim.roads.route import Route
+from gnd.fleet_sim.roads.streetlights import streetlight_motorway
+from gnd.gnd_map.features import Feature, FeatureTile, feature_id_of, geodetic_in_tile, pieces_of, prior
+from gnd.gnd_map.tile_id import TileId
+from gnd.schemas.features import FeatureReport
+from gnd.tile_store.server import TileServer
+from gnd.tile_store.sqlite_store import SqliteStore
+from gnd.tile_store.values import StoreConfig
+from gnd.vehicle_agent.agent import AgentConfig, run_agent
+from gnd.vehicle_agent.errors import AgentConfigError
+from gnd.vehicle_agent.features.layer_parameters import LAYERS, FeatureParameters
 
 pytestmark = pytest.mark.slow
 

@@ -6,12 +6,12 @@ import textwrap
 
 import pytest
 
-from vehicle_agent.memory import keep_small
+from gnd.vehicle_agent.memory import keep_small
 
 PROGRAM = textwrap.dedent(
     """
     import numpy as np, psutil
-    from vehicle_agent.memory import keep_small, trim
+    from gnd.vehicle_agent.memory import keep_small, trim
     small = {small}
     if small:
         assert keep_small()

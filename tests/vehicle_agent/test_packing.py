@@ -8,30 +8,30 @@ import numpy as np
 import pytest
 from vehicle_scene import GRID_FRAME, SENSOR, ground, look, tiles_of, wall
 
-from gnd_map.classes import ChangeClass
-from gnd_map.codec import LATTICES, REPORT, decode_flags, decode_measured, encode_mask, is_on, snap
-from gnd_map.errors import GndError
-from gnd_map.gaussian import Gaussians
-from gnd_map.tile import Tile
-from gnd_map.tile_id import TileId
-from gnd_map.track import decode_track
-from schemas.changes import ChangeReport
-from schemas.course import Course
-from schemas.doubt import Doubt, DoubtReason
-from schemas.packed import PackedReport, decode_upload, digest_of
-from vehicle_agent.config import ReportParameters
-from vehicle_agent.detect.detector import ChangeDetector
-from vehicle_agent.errors import AgentConfigError, PackingError
-from vehicle_agent.local_map import LocalMap
-from vehicle_agent.localise.calibration import MotionTeacher
-from vehicle_agent.localise.estimates import PoseEstimate, RefinedScan
-from vehicle_agent.localise.odometry import MotionBuffer
-from vehicle_agent.localise.parameters import OdometryParameters
-from vehicle_agent.outbox import Letter, Outbox
-from vehicle_agent.packing import Bases, askable, asked_for, is_measured, pack, pack_measured
-from vehicle_agent.report import Identity, Reporter
-from vehicle_agent.segment import SegmentedScan
-from vehicle_agent.vehicle import known_course
+from gnd.gnd_map.classes import ChangeClass
+from gnd.gnd_map.codec import LATTICES, REPORT, decode_flags, decode_measured, encode_mask, is_on, snap
+from gnd.gnd_map.errors import GndError
+from gnd.gnd_map.gaussian import Gaussians
+from gnd.gnd_map.tile import Tile
+from gnd.gnd_map.tile_id import TileId
+from gnd.gnd_map.track import decode_track
+from gnd.schemas.changes import ChangeReport
+from gnd.schemas.course import Course
+from gnd.schemas.doubt import Doubt, DoubtReason
+from gnd.schemas.packed import PackedReport, decode_upload, digest_of
+from gnd.vehicle_agent.config import ReportParameters
+from gnd.vehicle_agent.detect.detector import ChangeDetector
+from gnd.vehicle_agent.errors import AgentConfigError, PackingError
+from gnd.vehicle_agent.local_map import LocalMap
+from gnd.vehicle_agent.localise.calibration import MotionTeacher
+from gnd.vehicle_agent.localise.estimates import PoseEstimate, RefinedScan
+from gnd.vehicle_agent.localise.odometry import MotionBuffer
+from gnd.vehicle_agent.localise.parameters import OdometryParameters
+from gnd.vehicle_agent.outbox import Letter, Outbox
+from gnd.vehicle_agent.packing import Bases, askable, asked_for, is_measured, pack, pack_measured
+from gnd.vehicle_agent.report import Identity, Reporter
+from gnd.vehicle_agent.segment import SegmentedScan
+from gnd.vehicle_agent.vehicle import known_course
 
 START_NS = 1_570_838_400_000_000_000
 

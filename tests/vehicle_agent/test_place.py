@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 from vehicle_scene import FRAME
 
-from schemas.drive import GnssFix, MotionSample
-from vehicle_agent.localise.estimates import PoseEstimate
-from vehicle_agent.place import Place
+from gnd.schemas.drive import GnssFix, MotionSample
+from gnd.vehicle_agent.localise.estimates import PoseEstimate
+from gnd.vehicle_agent.place import Place
 
 SECOND = 1_000_000_000
 

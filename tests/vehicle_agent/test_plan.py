@@ -8,10 +8,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from vehicle_scene import FIGURE_2, FRAME
 
-from gnd_map.tile_id import TileId, covering_circle
-from vehicle_agent.config import DownloadParameters
-from vehicle_agent.errors import AgentConfigError
-from vehicle_agent.plan import (
+from gnd.gnd_map.tile_id import TileId, covering_circle
+from gnd.vehicle_agent.config import DownloadParameters
+from gnd.vehicle_agent.errors import AgentConfigError
+from gnd.vehicle_agent.plan import (
     LARGEST_BATCH_BYTES,
     SLOWEST_MPS,
     SMALLEST_BATCH_BYTES,
@@ -22,7 +22,7 @@ from vehicle_agent.plan import (
     needs,
     tile_boxes_m,
 )
-from vehicle_agent.surroundings import tile_distance_m
+from gnd.vehicle_agent.surroundings import tile_distance_m
 
 AROUND = covering_circle(*FIGURE_2[0].centre_rad, 150.0)
 NEAR_M = 60.0

@@ -6,8 +6,8 @@ from math import pi
 import numpy as np
 import pytest
 
-from gnd_map.arrays import F64, I64
-from vehicle_agent.features.poles.kernels import (
+from gnd.gnd_map.arrays import F64, I64
+from gnd.vehicle_agent.features.poles.kernels import (
     HIDDEN,
     JOINED,
     STEP_RAD,
@@ -19,7 +19,7 @@ from vehicle_agent.features.poles.kernels import (
     row_order,
     thin_slices,
 )
-from vehicle_agent.features.poles.place_kernels import (
+from gnd.vehicle_agent.features.poles.place_kernels import (
     Ground,
     around,
     by_cell,

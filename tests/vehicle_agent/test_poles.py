@@ -6,13 +6,13 @@ import numpy as np
 import pytest
 from pole_scene import LIDAR_M, lamp, origin, post, rays_of, sign, tree
 
-from fleet_sim import parts
-from fleet_sim.shapes import Shape
-from gnd_map.se3 import exp_so3, transform
-from schemas.limits import MAX_DETECTIONS_OF_LOOK
-from vehicle_agent.features.poles.detector import Pole, PoleDetector, Rays, detections_of
-from vehicle_agent.features.poles.parameters import PoleInputError, PoleParameterError, PoleParameters
-from vehicle_agent.features.poles.slices import PoseSigma
+from gnd.fleet_sim import parts
+from gnd.fleet_sim.shapes import Shape
+from gnd.gnd_map.se3 import exp_so3, transform
+from gnd.schemas.limits import MAX_DETECTIONS_OF_LOOK
+from gnd.vehicle_agent.features.poles.detector import Pole, PoleDetector, Rays, detections_of
+from gnd.vehicle_agent.features.poles.parameters import PoleInputError, PoleParameterError, PoleParameters
+from gnd.vehicle_agent.features.poles.slices import PoseSigma
 
 PLACE = np.zeros(3)
 

@@ -7,17 +7,17 @@ import numpy as np
 import pytest
 from gate_scene import START_NS, WALLS, map_of, scan, seen, shift
 
-from gnd_map.classes import ChangeClass
-from gnd_map.day import UNKNOWN_DAY, day_of
-from schemas.changes import ChangeReport, TileChange
-from schemas.doubt import DoubtReason
-from vehicle_agent.config import ReportParameters
-from vehicle_agent.detect.detector import ChangeDetector
-from vehicle_agent.local_map import LocalMap
-from vehicle_agent.outbox import Outbox
-from vehicle_agent.report import Identity, Reporter
-from vehicle_agent.result import HealthTimeline
-from vehicle_agent.segment import SegmentedScan
+from gnd.gnd_map.classes import ChangeClass
+from gnd.gnd_map.day import UNKNOWN_DAY, day_of
+from gnd.schemas.changes import ChangeReport, TileChange
+from gnd.schemas.doubt import DoubtReason
+from gnd.vehicle_agent.config import ReportParameters
+from gnd.vehicle_agent.detect.detector import ChangeDetector
+from gnd.vehicle_agent.local_map import LocalMap
+from gnd.vehicle_agent.outbox import Outbox
+from gnd.vehicle_agent.report import Identity, Reporter
+from gnd.vehicle_agent.result import HealthTimeline
+from gnd.vehicle_agent.segment import SegmentedScan
 
 WHO = Identity("vehicle-7", "drive-7", "VLP-16", "ndt", software="test 1")
 NEW_WALL = ((-9.0, -3.2), (-2.0, -3.2))

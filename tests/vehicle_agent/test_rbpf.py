@@ -9,11 +9,11 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from rbpf_plain import ekf, h, log_normal, unpacked
 
-from vehicle_agent.features.errors import SlamcuParameterError
-from vehicle_agent.features.slamcu import measurement
-from vehicle_agent.features.slamcu.blind import GNSS_X, HEADING, X, Y
-from vehicle_agent.features.slamcu.parameters import FilterParameters, MotionNoise, SlamcuParameters
-from vehicle_agent.features.slamcu.rbpf import Rbpf, effective, systematic
+from gnd.vehicle_agent.features.errors import SlamcuParameterError
+from gnd.vehicle_agent.features.slamcu import measurement
+from gnd.vehicle_agent.features.slamcu.blind import GNSS_X, HEADING, X, Y
+from gnd.vehicle_agent.features.slamcu.parameters import FilterParameters, MotionNoise, SlamcuParameters
+from gnd.vehicle_agent.features.slamcu.rbpf import Rbpf, effective, systematic
 
 VARIANCE = np.array([1.0, radians(2.5) ** 2])
 NO_NOISE = MotionNoise(0.0, 0.0, 0.0, 0.0, 0.0, 0.0)

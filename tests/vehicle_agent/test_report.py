@@ -7,18 +7,18 @@ import numpy as np
 import pytest
 from vehicle_scene import GRID_FRAME, SENSOR, ground, look, tiles_of, wall
 
-from gnd_map.tile import Tile
-from gnd_map.tile_id import TileId
-from schemas.changes import ChangeReport
-from schemas.keys import change_key
-from vehicle_agent.config import ReportParameters
-from vehicle_agent.detect.detector import ChangeDetector
-from vehicle_agent.errors import AgentConfigError
-from vehicle_agent.local_map import LocalMap
-from vehicle_agent.localise.estimates import PoseEstimate, RefinedScan
-from vehicle_agent.outbox import Outbox
-from vehicle_agent.report import Identity, Reporter
-from vehicle_agent.segment import SegmentedScan
+from gnd.gnd_map.tile import Tile
+from gnd.gnd_map.tile_id import TileId
+from gnd.schemas.changes import ChangeReport
+from gnd.schemas.keys import change_key
+from gnd.vehicle_agent.config import ReportParameters
+from gnd.vehicle_agent.detect.detector import ChangeDetector
+from gnd.vehicle_agent.errors import AgentConfigError
+from gnd.vehicle_agent.local_map import LocalMap
+from gnd.vehicle_agent.localise.estimates import PoseEstimate, RefinedScan
+from gnd.vehicle_agent.outbox import Outbox
+from gnd.vehicle_agent.report import Identity, Reporter
+from gnd.vehicle_agent.segment import SegmentedScan
 
 START_NS = 1_570_838_400_000_000_000
 WHO = Identity("vehicle-7", "drive-7", "VLP-16", "ndt")

@@ -3,9 +3,9 @@
 import numpy as np
 import pytest
 
-from schemas.drive import DriveItem, GnssFix, MotionSample, ReferencePose, Scan
-from vehicle_agent.errors import BadScan
-from vehicle_agent.scans import Guard, check_points, spread_m
+from gnd.schemas.drive import DriveItem, GnssFix, MotionSample, ReferencePose, Scan
+from gnd.vehicle_agent.errors import BadScan
+from gnd.vehicle_agent.scans import Guard, check_points, spread_m
 
 RNG = np.random.default_rng(11)
 

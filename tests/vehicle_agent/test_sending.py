@@ -8,17 +8,17 @@ from pathlib import Path
 import pytest
 from waiting import wait_until
 
-from fleet_bus.bus import Bus
-from fleet_bus.errors import Refused
-from fleet_bus.serving import Request
-from gnd_map.tile_id import District
-from schemas.changes import ChangeAck
-from schemas.keys import change_key, change_keys, state_key, state_keys, want_key
-from schemas.report_id import deterministic_report_id
-from schemas.report_states import ReportQuestion, ReportState, ReportStates
-from vehicle_agent.errors import OutboxError
-from vehicle_agent.outbox import Outbox
-from vehicle_agent.sending import SenderThread
+from gnd.fleet_bus.bus import Bus
+from gnd.fleet_bus.errors import Refused
+from gnd.fleet_bus.serving import Request
+from gnd.gnd_map.tile_id import District
+from gnd.schemas.changes import ChangeAck
+from gnd.schemas.keys import change_key, change_keys, state_key, state_keys, want_key
+from gnd.schemas.report_id import deterministic_report_id
+from gnd.schemas.report_states import ReportQuestion, ReportState, ReportStates
+from gnd.vehicle_agent.errors import OutboxError
+from gnd.vehicle_agent.outbox import Outbox
+from gnd.vehicle_agent.sending import SenderThread
 
 DISTRICT = District("13033/03021/23031")
 KEY = change_key("ndt", DISTRICT)
@@ -180,7 +180,7 @@ def test_a_cloud_that_has_forgotten_a_report_gets_it_again(start: Opener, outbox
 def test_a_full_disk_under_the_outbox_does_not_end_the_sender(
     start: Opener, outbox: Outbox, cloud: Bus, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("vehicle_agent.sending.STORE_PAUSE_S", 0.05)
+    monkeypatch.setattr("gnd.vehicle_agent.sending.STORE_PAUSE_S", 0.05)
     fails = {"due": 2, "answered": 1, "failed": 1}
 
     def failing(name: str) -> Callable[..., object]:

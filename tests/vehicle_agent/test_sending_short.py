@@ -14,22 +14,22 @@ import pytest
 from vehicle_scene import ground, tiles_of
 from waiting import wait_until
 
-from fleet_bus.bus import Bus
-from fleet_bus.errors import Refused
-from fleet_bus.serving import Request
-from gnd_map.classes import ChangeClass
-from gnd_map.codec import LATTICES, REPORT, decode_measured, encode_mask, snap
-from gnd_map.gaussian import Gaussians
-from gnd_map.tile import Tile
-from gnd_map.track import Piece, Track, View
-from schemas.changes import ChangeAck, ChangeReport, TileChange
-from schemas.keys import change_key, change_keys, state_keys, want_key
-from schemas.packed import PackedGaussians, PackedReport, decode_upload
-from schemas.report_id import deterministic_report_id
-from schemas.report_states import ReportState, ReportStates, ReportStatus
-from vehicle_agent.outbox import Outbox, OutboxCounts
-from vehicle_agent.packing import pack
-from vehicle_agent.sending import SenderThread
+from gnd.fleet_bus.bus import Bus
+from gnd.fleet_bus.errors import Refused
+from gnd.fleet_bus.serving import Request
+from gnd.gnd_map.classes import ChangeClass
+from gnd.gnd_map.codec import LATTICES, REPORT, decode_measured, encode_mask, snap
+from gnd.gnd_map.gaussian import Gaussians
+from gnd.gnd_map.tile import Tile
+from gnd.gnd_map.track import Piece, Track, View
+from gnd.schemas.changes import ChangeAck, ChangeReport, TileChange
+from gnd.schemas.keys import change_key, change_keys, state_keys, want_key
+from gnd.schemas.packed import PackedGaussians, PackedReport, decode_upload
+from gnd.schemas.report_id import deterministic_report_id
+from gnd.schemas.report_states import ReportState, ReportStates, ReportStatus
+from gnd.vehicle_agent.outbox import Outbox, OutboxCounts
+from gnd.vehicle_agent.packing import pack
+from gnd.vehicle_agent.sending import SenderThread
 
 NEVER = threading.Event()
 REPORT_ID = deterministic_report_id(1_570_838_400_000, "vehicle", "1")
@@ -235,10 +235,10 @@ def test_an_agent_killed_after_the_ack_of_its_flags_asks_what_is_wanted_and_send
         f"""
         import threading
         from pathlib import Path
-        from fleet_bus.bus import open_bus
-        from fleet_bus.config import BusConfig
-        from vehicle_agent.outbox import Outbox
-        from vehicle_agent.sending import SenderThread
+        from gnd.fleet_bus.bus import open_bus
+        from gnd.fleet_bus.config import BusConfig
+        from gnd.vehicle_agent.outbox import Outbox
+        from gnd.vehicle_agent.sending import SenderThread
         with open_bus(BusConfig(connect=({endpoint!r},)), name="first") as bus:
             SenderThread(bus, Outbox(Path({str(tmp_path / "outbox.sqlite")!r})), "vehicle")
             threading.Event().wait(60)

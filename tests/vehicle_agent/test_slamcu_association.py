@@ -7,7 +7,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.stats import multivariate_normal
 
-from vehicle_agent.features.slamcu.association import FORBIDDEN, associate, pair_costs
+from gnd.vehicle_agent.features.slamcu.association import FORBIDDEN, associate, pair_costs
 
 
 def cheapest(cost: np.ndarray, alone: float) -> float:

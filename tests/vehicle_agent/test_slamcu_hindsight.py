@@ -7,8 +7,8 @@ from math import exp, radians, sqrt
 import numpy as np
 import pytest
 
-from vehicle_agent.features.slamcu.blind import Belief
-from vehicle_agent.features.slamcu.hindsight import (
+from gnd.vehicle_agent.features.slamcu.blind import Belief
+from gnd.vehicle_agent.features.slamcu.hindsight import (
     GATE_SURE,
     Hindsight,
     Smoothed,
@@ -17,7 +17,7 @@ from vehicle_agent.features.slamcu.hindsight import (
     held,
     speaks_against,
 )
-from vehicle_agent.features.slamcu.parameters import SlamcuParameters
+from gnd.vehicle_agent.features.slamcu.parameters import SlamcuParameters
 
 SIGMA_M = 2.12
 DT_S = 0.1

@@ -7,11 +7,11 @@ import numpy as np
 import pytest
 from sign_road import CERTAIN, FEW, PERIOD_S, Road, driven
 
-from vehicle_agent.features.errors import BadLook, BadMapFeatures, BadPose
-from vehicle_agent.features.look import Look, MapFeatures
-from vehicle_agent.features.slamcu.existence_book import FeatureClass
-from vehicle_agent.features.slamcu.slamcu import Slamcu
-from vehicle_agent.features.view import CAMERA, Occlusion
+from gnd.vehicle_agent.features.errors import BadLook, BadMapFeatures, BadPose
+from gnd.vehicle_agent.features.look import Look, MapFeatures
+from gnd.vehicle_agent.features.slamcu.existence_book import FeatureClass
+from gnd.vehicle_agent.features.slamcu.slamcu import Slamcu
+from gnd.vehicle_agent.features.view import CAMERA, Occlusion
 
 NORMAL, DELETED, NEW = FeatureClass.NORMAL, FeatureClass.DELETED, FeatureClass.NEW
 LEFT, RIGHT, GONE = (150.0, 8.0), (152.0, -8.0), (180.0, -9.0)

@@ -9,12 +9,12 @@ import pytest
 from sign_road import FEW, PERIOD_S, Road
 from sign_road import NO_SHIFT as HERE
 
-from vehicle_agent.features.slamcu.blind import Belief, BlindFilter
-from vehicle_agent.features.slamcu.existence_book import FeatureClass
-from vehicle_agent.features.slamcu.parameters import SlamcuParameters
-from vehicle_agent.features.slamcu.watch import Alarm, Watch
-from vehicle_agent.features.slamcu.watched import WatchedSlamcu
-from vehicle_agent.features.view import CAMERA
+from gnd.vehicle_agent.features.slamcu.blind import Belief, BlindFilter
+from gnd.vehicle_agent.features.slamcu.existence_book import FeatureClass
+from gnd.vehicle_agent.features.slamcu.parameters import SlamcuParameters
+from gnd.vehicle_agent.features.slamcu.watch import Alarm, Watch
+from gnd.vehicle_agent.features.slamcu.watched import WatchedSlamcu
+from gnd.vehicle_agent.features.view import CAMERA
 
 NORMAL = FeatureClass.NORMAL
 SIGMA_M = 2.12

@@ -10,27 +10,27 @@ import pytest
 from vehicle_scene import FRAME, GRID_FRAME, HEIGHT_M, SENSOR, ground, look, tiles_of
 from waiting import wait_until
 
-from fleet_bus.bus import Bus, open_bus
-from fleet_bus.config import BusConfig
-from fleet_bus.ledger import Ledger
-from fleet_bus.links import LinkProfile
-from fleet_bus.serving import Request
-from gnd_map.geodesy import LocalFrame
-from gnd_map.grid import VoxelGrid
-from gnd_map.tile import Tile
-from gnd_map.tile_id import TileId
-from schemas.drive import GnssFix
-from schemas.keys import batch_keys, parse_batch_key
-from schemas.tiles_batch import TileAnswer, TilesReply, TilesRequest
-from tile_store.server import TileServer
-from tile_store.sqlite_store import SqliteStore
-from vehicle_agent.cache import TileCache
-from vehicle_agent.config import DownloadParameters
-from vehicle_agent.detect.detector import ChangeDetector
-from vehicle_agent.download import TileFetcher
-from vehicle_agent.local_map import LocalMap
-from vehicle_agent.place import Place
-from vehicle_agent.surroundings import Surroundings, left_behind, tile_distance_m, tiles_along
+from gnd.fleet_bus.bus import Bus, open_bus
+from gnd.fleet_bus.config import BusConfig
+from gnd.fleet_bus.ledger import Ledger
+from gnd.fleet_bus.links import LinkProfile
+from gnd.fleet_bus.serving import Request
+from gnd.gnd_map.geodesy import LocalFrame
+from gnd.gnd_map.grid import VoxelGrid
+from gnd.gnd_map.tile import Tile
+from gnd.gnd_map.tile_id import TileId
+from gnd.schemas.drive import GnssFix
+from gnd.schemas.keys import batch_keys, parse_batch_key
+from gnd.schemas.tiles_batch import TileAnswer, TilesReply, TilesRequest
+from gnd.tile_store.server import TileServer
+from gnd.tile_store.sqlite_store import SqliteStore
+from gnd.vehicle_agent.cache import TileCache
+from gnd.vehicle_agent.config import DownloadParameters
+from gnd.vehicle_agent.detect.detector import ChangeDetector
+from gnd.vehicle_agent.download import TileFetcher
+from gnd.vehicle_agent.local_map import LocalMap
+from gnd.vehicle_agent.place import Place
+from gnd.vehicle_agent.surroundings import Surroundings, left_behind, tile_distance_m, tiles_along
 
 NEVER = threading.Event()
 PARAMETERS = DownloadParameters(near_m=30.0, ahead_m=60.0, forget_m=100.0, wait_s=10.0)

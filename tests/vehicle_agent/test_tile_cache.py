@@ -8,13 +8,13 @@ import numpy as np
 import pytest
 from vehicle_scene import ground, tiles_of
 
-from gnd_map.codec import CODEC_FLOAT32, CODEC_FLOAT32_ZSTD, CODEC_STANDARD, CODEC_STANDARD_ZSTD, LATTICES, snap
-from gnd_map.day import UNKNOWN_DAY
-from gnd_map.tile import Tile
-from gnd_map.tile_id import TileId
-from schemas.tiles import blob_of
-from vehicle_agent.cache import TileCache
-from vehicle_agent.errors import CacheError
+from gnd.gnd_map.codec import CODEC_FLOAT32, CODEC_FLOAT32_ZSTD, CODEC_STANDARD, CODEC_STANDARD_ZSTD, LATTICES, snap
+from gnd.gnd_map.day import UNKNOWN_DAY
+from gnd.gnd_map.tile import Tile
+from gnd.gnd_map.tile_id import TileId
+from gnd.schemas.tiles import blob_of
+from gnd.vehicle_agent.cache import TileCache
+from gnd.vehicle_agent.errors import CacheError
 
 
 @pytest.fixture(scope="module")

@@ -3,11 +3,11 @@
 import numpy as np
 import pytest
 
-from gnd_map.errors import TrackError
-from gnd_map.geodesy import LocalFrame
-from gnd_map.tile_id import TileId
-from vehicle_agent.localise.estimates import PoseEstimate, RefinedScan
-from vehicle_agent.tracks import Tracks
+from gnd.gnd_map.errors import TrackError
+from gnd.gnd_map.geodesy import LocalFrame
+from gnd.gnd_map.tile_id import TileId
+from gnd.vehicle_agent.localise.estimates import PoseEstimate, RefinedScan
+from gnd.vehicle_agent.tracks import Tracks
 
 SECOND = 1_000_000_000
 # Tiles from west to east; the map frame is that of the first.

@@ -8,17 +8,17 @@ import pytest
 from vehicle_scene import ground, published
 from waiting import wait_until
 
-from fleet_bus.bus import Bus
-from gnd_map.tile import Tile, TileDelta, diff
-from gnd_map.tile_id import TileId
-from schemas.keys import update_key
-from schemas.updates import TileUpdate
-from tile_store.server import TileServer
-from tile_store.sqlite_store import SqliteStore
-from vehicle_agent.cache import TileCache
-from vehicle_agent.config import DownloadParameters
-from vehicle_agent.download import TileFetcher
-from vehicle_agent.updates import Updates
+from gnd.fleet_bus.bus import Bus
+from gnd.gnd_map.tile import Tile, TileDelta, diff
+from gnd.gnd_map.tile_id import TileId
+from gnd.schemas.keys import update_key
+from gnd.schemas.updates import TileUpdate
+from gnd.tile_store.server import TileServer
+from gnd.tile_store.sqlite_store import SqliteStore
+from gnd.vehicle_agent.cache import TileCache
+from gnd.vehicle_agent.config import DownloadParameters
+from gnd.vehicle_agent.download import TileFetcher
+from gnd.vehicle_agent.updates import Updates
 
 
 class World:
@@ -103,15 +103,15 @@ def test_a_lost_notice_is_made_up_for_without_another(world: World, monkeypatch:
     world.next_version(cut=5)
     world.updates.apply()
     assert world.fetcher.is_known(world.tile_id)
-    monkeypatch.setattr("vehicle_agent.updates.RECHECK_S", 0.1)
-    monkeypatch.setattr("vehicle_agent.updates.RECHECK_LOOK_S", 0.05)
+    monkeypatch.setattr("gnd.vehicle_agent.updates.RECHECK_S", 0.1)
+    monkeypatch.setattr("gnd.vehicle_agent.updates.RECHECK_LOOK_S", 0.05)
     wait_until(lambda: world.updates.apply() or cached(world) == 2)
     assert world.updates.counts["received"] == 0
 
 
 def test_what_was_just_answered_is_not_asked_for_again(world: World, monkeypatch: pytest.MonkeyPatch) -> None:
     download(world)
-    monkeypatch.setattr("vehicle_agent.updates.RECHECK_LOOK_S", 0.0)
+    monkeypatch.setattr("gnd.vehicle_agent.updates.RECHECK_LOOK_S", 0.0)
     for _ in range(20):
         world.updates.apply()
     assert world.fetcher.is_known(world.tile_id)

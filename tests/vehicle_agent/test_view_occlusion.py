@@ -5,8 +5,8 @@ from math import inf, nan, pi, radians
 import numpy as np
 import pytest
 
-from vehicle_agent.features.errors import BadLook
-from vehicle_agent.features.view import CAMERA, LIDAR, Occlusion, SensorView
+from gnd.vehicle_agent.features.errors import BadLook
+from gnd.vehicle_agent.features.view import CAMERA, LIDAR, Occlusion, SensorView
 
 
 def test_inside_and_soft_edges() -> None:

@@ -9,25 +9,25 @@ import pytest
 from vehicle_scene import ground, published
 from waiting import wait_until
 
-from cloud_merger.announce import encoded, update_of
-from fleet_bus.bus import Bus, open_bus
-from fleet_bus.config import BusConfig
-from fleet_bus.errors import BusError
-from fleet_bus.router import open_router
-from gnd_map.codec import PREFERRED
-from gnd_map.features import Feature, FeatureTile, hit
-from gnd_map.tile import Tile
-from gnd_map.tile_id import TileId
-from schemas import keys
-from schemas.tiles import TileReply, TileRequest, content_of
-from schemas.tiles_batch import HeldTile, TilesRequest
-from tile_store.server import PLAIN_REQUEST, TILE_ROOT, TileServer
-from tile_store.sqlite_store import SqliteStore
-from vehicle_agent.cache import TileCache
-from vehicle_agent.config import DownloadParameters
-from vehicle_agent.download import TileFetcher
-from vehicle_agent.features.download import FeatureDownloader
-from vehicle_agent.updates import Updates
+from gnd.cloud_merger.announce import encoded, update_of
+from gnd.fleet_bus.bus import Bus, open_bus
+from gnd.fleet_bus.config import BusConfig
+from gnd.fleet_bus.errors import BusError
+from gnd.fleet_bus.router import open_router
+from gnd.gnd_map.codec import PREFERRED
+from gnd.gnd_map.features import Feature, FeatureTile, hit
+from gnd.gnd_map.tile import Tile
+from gnd.gnd_map.tile_id import TileId
+from gnd.schemas import keys
+from gnd.schemas.tiles import TileReply, TileRequest, content_of
+from gnd.schemas.tiles_batch import HeldTile, TilesRequest
+from gnd.tile_store.server import PLAIN_REQUEST, TILE_ROOT, TileServer
+from gnd.tile_store.sqlite_store import SqliteStore
+from gnd.vehicle_agent.cache import TileCache
+from gnd.vehicle_agent.config import DownloadParameters
+from gnd.vehicle_agent.download import TileFetcher
+from gnd.vehicle_agent.features.download import FeatureDownloader
+from gnd.vehicle_agent.updates import Updates
 
 BASE = published(ground(12.0))
 TILE = max(BASE, key=lambda t: len(BASE[t].gaussians))

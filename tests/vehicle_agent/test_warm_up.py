@@ -10,12 +10,12 @@ import pytest
 PROGRAM = textwrap.dedent(
     """
     import json, sys, threading
-    import vehicle_agent.agent
-    from vehicle_agent.detect import fit_kernel, kernel
-    from vehicle_agent.warm import warm_up
-    from vehicle_agent.localise import kernels, packed_scan, registration, rolling_kernels
-    from vehicle_agent.features.poles import kernels as poles, place_kernels as places
-    from gnd_map.codec import kernels as coders
+    import gnd.vehicle_agent.agent
+    from gnd.vehicle_agent.detect import fit_kernel, kernel
+    from gnd.vehicle_agent.warm import warm_up
+    from gnd.vehicle_agent.localise import kernels, packed_scan, registration, rolling_kernels
+    from gnd.vehicle_agent.features.poles import kernels as poles, place_kernels as places
+    from gnd.gnd_map.codec import kernels as coders
     USED = ("code_bit", "code_bits", "code_flags", "code_plain", "code_voxels")
     before = len(kernel.cast_rays.signatures)
     warm_up()

@@ -6,12 +6,12 @@ import numpy as np
 import pytest
 from vehicle_scene import FRAME, GRID_FRAME, HEIGHT_M, ground, tiles_of
 
-from gnd_map.tile_id import TileId
-from schemas.drive import GnssFix
-from vehicle_agent.errors import VehicleError
-from vehicle_agent.local_map import LocalMap
-from vehicle_agent.place import Place
-from vehicle_agent.way import Way, read_way
+from gnd.gnd_map.tile_id import TileId
+from gnd.schemas.drive import GnssFix
+from gnd.vehicle_agent.errors import VehicleError
+from gnd.vehicle_agent.local_map import LocalMap
+from gnd.vehicle_agent.place import Place
+from gnd.vehicle_agent.way import Way, read_way
 
 
 def place_at(east_m: float) -> Place:

@@ -7,10 +7,10 @@ from pathlib import Path
 
 import pytest
 
-from schemas.drive import DriveItem, MotionSample
-from schemas.errors import DriveError
-from vehicle_agent.errors import AgentConfigError
-from vehicle_agent.world_clock import SLACK_S, Departure, WorldClock, in_common_time, make_clock
+from gnd.schemas.drive import DriveItem, MotionSample
+from gnd.schemas.errors import DriveError
+from gnd.vehicle_agent.errors import AgentConfigError
+from gnd.vehicle_agent.world_clock import SLACK_S, Departure, WorldClock, in_common_time, make_clock
 
 NEVER = threading.Event()
 HZ = 50

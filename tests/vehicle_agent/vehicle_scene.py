@@ -2,12 +2,12 @@
 
 import numpy as np
 
-from gnd_map.accumulate import VoxelAccumulator
-from gnd_map.codec import LATTICES, snap
-from gnd_map.geodesy import LocalFrame
-from gnd_map.grid import GridFrame
-from gnd_map.tile import Tile
-from gnd_map.tile_id import TileId
+from gnd.gnd_map.accumulate import VoxelAccumulator
+from gnd.gnd_map.codec import LATTICES, snap
+from gnd.gnd_map.geodesy import LocalFrame
+from gnd.gnd_map.grid import GridFrame
+from gnd.gnd_map.tile import Tile
+from gnd.gnd_map.tile_id import TileId
 
 FIGURE_2 = tuple(TileId(morton) for morton in (497353963152, 497353963153, 497353963154, 497353963155))
 FRAME = LocalFrame.of_tile(FIGURE_2[0])

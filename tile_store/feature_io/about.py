@@ -3,9 +3,9 @@
 from collections.abc import Mapping
 from typing import Any
 
-from tile_store.feature_io.errors import FeatureFileError
-from tile_store.feature_io.placement import Placement
-from tile_store.feature_io.values import ImportOptions
+from gnd.tile_store.feature_io.errors import FeatureFileError
+from gnd.tile_store.feature_io.placement import Placement
+from gnd.tile_store.feature_io.values import ImportOptions
 
 
 def about_options(options: ImportOptions) -> dict[str, Any]:

@@ -16,14 +16,14 @@ from typing import Any, Final
 
 import numpy as np
 
-from gnd_map.arrays import F64
-from gnd_map.features import feature_id_of
-from gnd_map.utm import geodetic_from_utm, utm_from_geodetic
-from tile_store.feature_io.errors import BadElement, BadGeometry, DuplicateId, NeedsGeoreference
-from tile_store.feature_io.json_file import as_text, member, read_json, real_number
-from tile_store.feature_io.lane_crossing import crossing_of
-from tile_store.feature_io.osm_document import Progress
-from tile_store.feature_io.values import (
+from gnd.gnd_map.arrays import F64
+from gnd.gnd_map.features import feature_id_of
+from gnd.gnd_map.utm import geodetic_from_utm, utm_from_geodetic
+from gnd.tile_store.feature_io.errors import BadElement, BadGeometry, DuplicateId, NeedsGeoreference
+from gnd.tile_store.feature_io.json_file import as_text, member, read_json, real_number
+from gnd.tile_store.feature_io.lane_crossing import crossing_of
+from gnd.tile_store.feature_io.osm_document import Progress
+from gnd.tile_store.feature_io.values import (
     LEFT_OUT,
     FeatureFile,
     ImportOptions,

@@ -13,7 +13,7 @@ NeedsGeoreference  local coordinates, and nothing says where they lie
 MissingLibrary     an optional library is needed and not installed
 """
 
-from tile_store.errors import StoreError
+from gnd.tile_store.errors import StoreError
 
 
 class FeatureFileError(StoreError):

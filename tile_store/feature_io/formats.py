@@ -6,23 +6,23 @@ from functools import partial
 from pathlib import Path
 from typing import Final, Literal, get_args
 
-from tile_store.feature_io.about import options_about
-from tile_store.feature_io.argoverse import read_argoverse
-from tile_store.feature_io.errors import FeatureFileError, UnknownFormat
-from tile_store.feature_io.geojson_export import write_geojson
-from tile_store.feature_io.geojson_import import read_geojson
-from tile_store.feature_io.json_file import MAX_JSON_BYTES
-from tile_store.feature_io.lanelet2_export import EMPTY, Changes, write_lanelet2
-from tile_store.feature_io.lanelet2_import import FORMAT as LANELET2
-from tile_store.feature_io.lanelet2_import import read_lanelet2
-from tile_store.feature_io.opendrive_import import read_opendrive
-from tile_store.feature_io.osm_document import MAX_FILE_BYTES, Progress
-from tile_store.feature_io.sources import Source
-from tile_store.feature_io.stored import load_features, sources_of
-from tile_store.feature_io.values import FeatureFile, ImportOptions, MapFeature
-from tile_store.feature_io.whole_file import write_whole
-from tile_store.feature_io.xml_spans import read_bytes
-from tile_store.sqlite_store import SqliteStore
+from gnd.tile_store.feature_io.about import options_about
+from gnd.tile_store.feature_io.argoverse import read_argoverse
+from gnd.tile_store.feature_io.errors import FeatureFileError, UnknownFormat
+from gnd.tile_store.feature_io.geojson_export import write_geojson
+from gnd.tile_store.feature_io.geojson_import import read_geojson
+from gnd.tile_store.feature_io.json_file import MAX_JSON_BYTES
+from gnd.tile_store.feature_io.lanelet2_export import EMPTY, Changes, write_lanelet2
+from gnd.tile_store.feature_io.lanelet2_import import FORMAT as LANELET2
+from gnd.tile_store.feature_io.lanelet2_import import read_lanelet2
+from gnd.tile_store.feature_io.opendrive_import import read_opendrive
+from gnd.tile_store.feature_io.osm_document import MAX_FILE_BYTES, Progress
+from gnd.tile_store.feature_io.sources import Source
+from gnd.tile_store.feature_io.stored import load_features, sources_of
+from gnd.tile_store.feature_io.values import FeatureFile, ImportOptions, MapFeature
+from gnd.tile_store.feature_io.whole_file import write_whole
+from gnd.tile_store.feature_io.xml_spans import read_bytes
+from gnd.tile_store.sqlite_store import SqliteStore
 
 Format = Literal["lanelet2", "opendrive", "geojson", "argoverse2"]
 FORMATS: Final[tuple[Format, ...]] = get_args(Format)

@@ -10,7 +10,7 @@ from typing import Any, Final
 
 import numpy as np
 
-from tile_store.feature_io.values import MapFeature
+from gnd.tile_store.feature_io.values import MapFeature
 
 FORMAT_VERSION: Final = 1
 MEMBER: Final = "gnd"

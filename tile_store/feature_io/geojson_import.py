@@ -11,16 +11,16 @@ from typing import Any, Final
 
 import numpy as np
 
-from gnd_map.arrays import F64
-from gnd_map.errors import GndError
-from gnd_map.features import Existence, feature_id_of, is_feature_layer
-from gnd_map.features.feature import KIND_PATTERN
-from schemas.wire import LAYER_PATTERN
-from tile_store.feature_io.errors import BadElement, BadGeometry, FeatureFileError, FileTooLarge, UnknownFormat
-from tile_store.feature_io.geojson_export import FORMAT_VERSION, MEMBER
-from tile_store.feature_io.json_file import as_text, member, read_json, real_number
-from tile_store.feature_io.osm_document import Progress
-from tile_store.feature_io.values import (
+from gnd.gnd_map.arrays import F64
+from gnd.gnd_map.errors import GndError
+from gnd.gnd_map.features import Existence, feature_id_of, is_feature_layer
+from gnd.gnd_map.features.feature import KIND_PATTERN
+from gnd.schemas.wire import LAYER_PATTERN
+from gnd.tile_store.feature_io.errors import BadElement, BadGeometry, FeatureFileError, FileTooLarge, UnknownFormat
+from gnd.tile_store.feature_io.geojson_export import FORMAT_VERSION, MEMBER
+from gnd.tile_store.feature_io.json_file import as_text, member, read_json, real_number
+from gnd.tile_store.feature_io.osm_document import Progress
+from gnd.tile_store.feature_io.values import (
     LEFT_OUT,
     FeatureFile,
     ImportOptions,

@@ -4,7 +4,7 @@ import json
 from math import isfinite
 from typing import Any, Final, NoReturn
 
-from tile_store.feature_io.errors import BadElement, NotWellFormed
+from gnd.tile_store.feature_io.errors import BadElement, NotWellFormed
 
 MAX_JSON_BYTES: Final = 500_000_000
 

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from gnd_map.arrays import F64
+from gnd.gnd_map.arrays import F64
 
 _INSIDE = 1e-9
 """Lines that only share an end do not cross: lanes begin and end in a point."""

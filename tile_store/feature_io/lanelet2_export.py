@@ -11,11 +11,11 @@ from typing import Final
 
 import numpy as np
 
-from gnd_map.arrays import F64
-from gnd_map.geodesy import meridian_radius_m, normal_radius_m
-from tile_store.feature_io.lanelet2_import import Drawn, Places, drawn_features, places_of
-from tile_store.feature_io.osm_document import OsmDocument, OsmNode, OsmWay, read_osm
-from tile_store.feature_io.osm_edit import (
+from gnd.gnd_map.arrays import F64
+from gnd.gnd_map.geodesy import meridian_radius_m, normal_radius_m
+from gnd.tile_store.feature_io.lanelet2_import import Drawn, Places, drawn_features, places_of
+from gnd.tile_store.feature_io.osm_document import OsmDocument, OsmNode, OsmWay, read_osm
+from gnd.tile_store.feature_io.osm_edit import (
     Edits,
     degrees,
     line_of,
@@ -26,8 +26,8 @@ from tile_store.feature_io.osm_edit import (
     with_values,
     without_members,
 )
-from tile_store.feature_io.osm_kinds import POINT_KINDS
-from tile_store.feature_io.values import ImportOptions, MapFeature
+from gnd.tile_store.feature_io.osm_kinds import POINT_KINDS
+from gnd.tile_store.feature_io.values import ImportOptions, MapFeature
 
 EMPTY: Final = b"""<?xml version="1.0" encoding="UTF-8"?>
 <osm version="0.6" generator="gnd">

@@ -13,13 +13,13 @@ from typing import Final
 
 import numpy as np
 
-from gnd_map.arrays import F64
-from gnd_map.features import feature_id_of
-from tile_store.feature_io.errors import BadGeometry, NeedsGeoreference
-from tile_store.feature_io.lane_crossing import crossing_of
-from tile_store.feature_io.osm_document import OsmDocument, OsmNode, OsmWay, Progress, read_osm, real
-from tile_store.feature_io.osm_kinds import POINT_KINDS, kind_of, told_of
-from tile_store.feature_io.values import (
+from gnd.gnd_map.arrays import F64
+from gnd.gnd_map.features import feature_id_of
+from gnd.tile_store.feature_io.errors import BadGeometry, NeedsGeoreference
+from gnd.tile_store.feature_io.lane_crossing import crossing_of
+from gnd.tile_store.feature_io.osm_document import OsmDocument, OsmNode, OsmWay, Progress, read_osm, real
+from gnd.tile_store.feature_io.osm_kinds import POINT_KINDS, kind_of, told_of
+from gnd.tile_store.feature_io.values import (
     LEFT_OUT,
     FeatureFile,
     ImportOptions,

@@ -12,10 +12,10 @@ from typing import Final, TypeAlias
 
 import numpy as np
 
-from gnd_map.arrays import F64
-from gnd_map.features import feature_id_of
-from gnd_map.features.feature import KIND_PATTERN
-from tile_store.feature_io.errors import (
+from gnd.gnd_map.arrays import F64
+from gnd.gnd_map.features import feature_id_of
+from gnd.gnd_map.features.feature import KIND_PATTERN
+from gnd.tile_store.feature_io.errors import (
     BadElement,
     DuplicateId,
     FileTooLarge,
@@ -23,8 +23,8 @@ from tile_store.feature_io.errors import (
     NeedsGeoreference,
     UnknownFormat,
 )
-from tile_store.feature_io.osm_document import Progress
-from tile_store.feature_io.values import (
+from gnd.tile_store.feature_io.osm_document import Progress
+from gnd.tile_store.feature_io.values import (
     LEFT_OUT,
     FeatureFile,
     ImportOptions,
@@ -32,9 +32,9 @@ from tile_store.feature_io.values import (
     attributes_of,
     check_simple,
 )
-from tile_store.feature_io.xml_spans import Element, read_root
-from tile_store.feature_io.xodr_curves import simplified
-from tile_store.feature_io.xodr_road import Road, road_of, value
+from gnd.tile_store.feature_io.xml_spans import Element, read_root
+from gnd.tile_store.feature_io.xodr_curves import simplified
+from gnd.tile_store.feature_io.xodr_road import Road, road_of, value
 
 FORMAT: Final = "opendrive"
 STEP_M: Final = 0.5

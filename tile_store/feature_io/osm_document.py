@@ -9,8 +9,8 @@ from dataclasses import dataclass, field
 from math import isfinite
 from typing import Final, TypeVar
 
-from tile_store.feature_io.errors import BadElement, DuplicateId, FileTooLarge, MissingReference, UnknownFormat
-from tile_store.feature_io.xml_spans import Element, read_root
+from gnd.tile_store.feature_io.errors import BadElement, DuplicateId, FileTooLarge, MissingReference, UnknownFormat
+from gnd.tile_store.feature_io.xml_spans import Element, read_root
 
 MAX_FILE_BYTES: Final = 1_000_000_000
 MAX_NODES: Final = 1_000_000

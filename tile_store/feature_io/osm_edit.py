@@ -4,8 +4,8 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Final
 
-from tile_store.feature_io.osm_document import OsmElement
-from tile_store.feature_io.xml_spans import Element, escaped, read_root, tag_of, with_attributes
+from gnd.tile_store.feature_io.osm_document import OsmElement
+from gnd.tile_store.feature_io.xml_spans import Element, escaped, read_root, tag_of, with_attributes
 
 INDENT: Final = b"  "
 

@@ -7,7 +7,7 @@ Key:highway, Key:traffic_sign, Key:man_made, Key:power.
 from collections.abc import Mapping
 from typing import Final
 
-from gnd_map.features.feature import KIND_PATTERN
+from gnd.gnd_map.features.feature import KIND_PATTERN
 
 POINT_KINDS: Final = frozenset({"traffic_sign", "traffic_light", "pole", "streetlight"})
 """Whatever is drawn for these, the feature is one point: where it stands."""

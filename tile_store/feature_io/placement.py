@@ -13,10 +13,10 @@ from typing import Any, Final, Self
 import numpy as np
 from scipy.spatial import cKDTree
 
-from gnd_map.arrays import F64, I64, check_array
-from gnd_map.geodesy import LocalFrame
-from gnd_map.se3 import T_from_R_t, exp_so3, transform
-from tile_store.feature_io.errors import BadGeometry, FeatureFileError
+from gnd.gnd_map.arrays import F64, I64, check_array
+from gnd.gnd_map.geodesy import LocalFrame
+from gnd.gnd_map.se3 import T_from_R_t, exp_so3, transform
+from gnd.tile_store.feature_io.errors import BadGeometry, FeatureFileError
 
 MAX_DISTANCE_M: Final = 50_000.0
 """Of a local point from the nearest pose: beyond, the plane of the frame has left the ground by 200 m."""

@@ -13,9 +13,9 @@ from typing import Any, Final
 import apsw
 import zstandard
 
-from tile_store.errors import StoreError
-from tile_store.feature_io.errors import FeatureFileError
-from tile_store.sqlite_connection import change, fetch
+from gnd.tile_store.errors import StoreError
+from gnd.tile_store.feature_io.errors import FeatureFileError
+from gnd.tile_store.sqlite_connection import change, fetch
 
 MAX_DOCUMENT_BYTES: Final = 1_000_000_000
 _LEVEL: Final = 9

@@ -6,18 +6,18 @@ from typing import Any, Final
 
 import apsw
 
-from gnd_map.errors import GndError
-from gnd_map.features import MAX_FEATURES_OF_TILE, Feature, FeatureTile, is_feature_layer
-from gnd_map.tile_id import TileId
-from tile_store import sqlite_versions as versions
-from tile_store.feature_io.errors import BadGeometry, DuplicateId, FeatureFileError
-from tile_store.feature_io.osm_document import Progress
-from tile_store.feature_io.sources import Source, get_sources, put_source
-from tile_store.feature_io.tiling import cut, whole
-from tile_store.feature_io.values import FeatureFile, MapFeature
-from tile_store.sqlite_connection import fetch
-from tile_store.sqlite_store import SqliteStore
-from tile_store.values import Content, check_layer
+from gnd.gnd_map.errors import GndError
+from gnd.gnd_map.features import MAX_FEATURES_OF_TILE, Feature, FeatureTile, is_feature_layer
+from gnd.gnd_map.tile_id import TileId
+from gnd.tile_store import sqlite_versions as versions
+from gnd.tile_store.feature_io.errors import BadGeometry, DuplicateId, FeatureFileError
+from gnd.tile_store.feature_io.osm_document import Progress
+from gnd.tile_store.feature_io.sources import Source, get_sources, put_source
+from gnd.tile_store.feature_io.tiling import cut, whole
+from gnd.tile_store.feature_io.values import FeatureFile, MapFeature
+from gnd.tile_store.sqlite_connection import fetch
+from gnd.tile_store.sqlite_store import SqliteStore
+from gnd.tile_store.values import Content, check_layer
 
 _EVERY: Final = 64
 

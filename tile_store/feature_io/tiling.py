@@ -7,13 +7,13 @@ from typing import TypeAlias
 
 import numpy as np
 
-from gnd_map.errors import FeatureError, MapError
-from gnd_map.features import Feature, FeatureTile, join_pieces, pieces_of
-from gnd_map.features.feature import M_PER_STEP
-from gnd_map.tile_id import TileId
-from tile_store.feature_io.errors import BadGeometry, FeatureFileError
-from tile_store.feature_io.osm_document import Progress
-from tile_store.feature_io.values import MapFeature
+from gnd.gnd_map.errors import FeatureError, MapError
+from gnd.gnd_map.features import Feature, FeatureTile, join_pieces, pieces_of
+from gnd.gnd_map.features.feature import M_PER_STEP
+from gnd.gnd_map.tile_id import TileId
+from gnd.tile_store.feature_io.errors import BadGeometry, FeatureFileError
+from gnd.tile_store.feature_io.osm_document import Progress
+from gnd.tile_store.feature_io.values import MapFeature
 
 Pieces: TypeAlias = dict[str, dict[TileId, list[Feature]]]
 """By layer and tile."""

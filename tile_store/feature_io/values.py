@@ -9,9 +9,9 @@ from typing import Any, Final
 
 import numpy as np
 
-from gnd_map.arrays import F64
-from gnd_map.errors import FeatureError
-from gnd_map.features import (
+from gnd.gnd_map.arrays import F64
+from gnd.gnd_map.errors import FeatureError
+from gnd.gnd_map.features import (
     UNKNOWN_HEIGHT_M2,
     Existence,
     Feature,
@@ -19,12 +19,12 @@ from gnd_map.features import (
     is_feature_layer,
     prior,
 )
-from gnd_map.features.feature import KIND_PATTERN, MAX_ATTRIBUTES, MAX_KEY_CHARACTERS, MAX_VALUE_CHARACTERS
-from gnd_map.geodesy import LocalFrame
-from schemas.limits import MAX_FLOOR, MIN_FLOOR
-from tile_store.feature_io.errors import BadGeometry, DuplicateId, FeatureFileError, FileTooLarge
-from tile_store.feature_io.placement import Placement
-from tile_store.values import check_layer
+from gnd.gnd_map.features.feature import KIND_PATTERN, MAX_ATTRIBUTES, MAX_KEY_CHARACTERS, MAX_VALUE_CHARACTERS
+from gnd.gnd_map.geodesy import LocalFrame
+from gnd.schemas.limits import MAX_FLOOR, MIN_FLOOR
+from gnd.tile_store.feature_io.errors import BadGeometry, DuplicateId, FeatureFileError, FileTooLarge
+from gnd.tile_store.feature_io.placement import Placement
+from gnd.tile_store.values import check_layer
 
 LAYER_OF_KIND: Final[Mapping[str, str]] = {
     "traffic_sign": "signs",
@@ -101,7 +101,7 @@ class MapFeature:
     """One feature on the Earth, whole: not cut into tiles.
 
     name: what its file calls it, for messages. lat_rad, lon_rad, height_m (ellipsoidal): (N,) each, one vertex is a
-    point. The rest is as in `gnd_map.features.Feature`.
+    point. The rest is as in `gnd.gnd_map.features.Feature`.
     """
 
     feature_id: int

@@ -3,7 +3,7 @@
 import os
 from pathlib import Path
 
-from tile_store.feature_io.errors import FeatureFileError
+from gnd.tile_store.feature_io.errors import FeatureFileError
 
 
 def write_whole(target: Path, body: bytes) -> None:

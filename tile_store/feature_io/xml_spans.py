@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Final
 from xml.parsers import expat  # S405 does not hold: expat is what the safe wrappers use, and document types are refused
 
-from tile_store.feature_io.errors import FileTooLarge, NotWellFormed, UnknownFormat, UnsafeFile
+from gnd.tile_store.feature_io.errors import FileTooLarge, NotWellFormed, UnknownFormat, UnsafeFile
 
 MAX_DEPTH: Final = 64
 _TAG: Final = re.compile(rb"""<[^>"']*(?:"[^"]*"[^>"']*|'[^']*'[^>"']*)*>""")

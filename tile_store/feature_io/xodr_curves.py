@@ -11,7 +11,7 @@ from typing import Final, TypeAlias
 import numpy as np
 from scipy.special import fresnel
 
-from gnd_map.arrays import F64
+from gnd.gnd_map.arrays import F64
 
 Curve: TypeAlias = Callable[[F64], tuple[F64, F64, F64]]
 """From distances (N,) along a piece to x, y in its own frame and heading, each (N,)."""

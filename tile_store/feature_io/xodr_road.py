@@ -7,11 +7,11 @@ from typing import Final
 
 import numpy as np
 
-from gnd_map.arrays import F64
-from tile_store.feature_io.errors import BadElement
-from tile_store.feature_io.osm_document import real
-from tile_store.feature_io.xml_spans import Element
-from tile_store.feature_io.xodr_curves import (
+from gnd.gnd_map.arrays import F64
+from gnd.tile_store.feature_io.errors import BadElement
+from gnd.tile_store.feature_io.osm_document import real
+from gnd.tile_store.feature_io.xml_spans import Element
+from gnd.tile_store.feature_io.xodr_curves import (
     Curve,
     Piece,
     Profile,

@@ -9,9 +9,9 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import binary_dilation
 
-from gnd_map.classes import ChangeClass
-from gnd_map.grid import VoxelGrid
-from vehicle_agent.detect.classify import Classification
+from gnd.gnd_map.classes import ChangeClass
+from gnd.gnd_map.grid import VoxelGrid
+from gnd.vehicle_agent.detect.classify import Classification
 
 
 def beyond_map(found: Classification) -> NDArray[np.bool_]:

@@ -6,14 +6,14 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from gnd_map.classes import CHANGED, ChangeClass
-from gnd_map.evidence import ChangeState, masses, states
-from gnd_map.gaussian import Gaussians, concat
-from schemas.changes import TileChange
-from vehicle_agent.detect.evidence import TileEvidence
-from vehicle_agent.detect.extension import extends_neighbour
-from vehicle_agent.detect.parameters import DetectParameters
-from vehicle_agent.detect.shape_change import NOISE_M, fitted, shape_features
+from gnd.gnd_map.classes import CHANGED, ChangeClass
+from gnd.gnd_map.evidence import ChangeState, masses, states
+from gnd.gnd_map.gaussian import Gaussians, concat
+from gnd.schemas.changes import TileChange
+from gnd.vehicle_agent.detect.evidence import TileEvidence
+from gnd.vehicle_agent.detect.extension import extends_neighbour
+from gnd.vehicle_agent.detect.parameters import DetectParameters
+from gnd.vehicle_agent.detect.shape_change import NOISE_M, fitted, shape_features
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -6,19 +6,19 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from gnd_map.accumulate import VoxelAccumulator
-from gnd_map.arrays import F64, I32, points_3d
-from gnd_map.errors import ShapeError
-from gnd_map.gaussian import Gaussians
-from gnd_map.tile import Tile
-from gnd_map.tile_id import TileId
-from vehicle_agent.detect.evidence import TileEvidence
-from vehicle_agent.detect.kernel import CERTAIN, cast_rays, kernel_parameters, window_affine
-from vehicle_agent.detect.parameters import DetectParameters
-from vehicle_agent.detect.records import N_BI, N_BO, N_PI, N_PO, Records, make_records
-from vehicle_agent.detect.uncertainty import PoseUncertainty, TileUncertainties
-from vehicle_agent.errors import MapChanged
-from vehicle_agent.local_map import EMPTY, UNKNOWN, LocalMap
+from gnd.gnd_map.accumulate import VoxelAccumulator
+from gnd.gnd_map.arrays import F64, I32, points_3d
+from gnd.gnd_map.errors import ShapeError
+from gnd.gnd_map.gaussian import Gaussians
+from gnd.gnd_map.tile import Tile
+from gnd.gnd_map.tile_id import TileId
+from gnd.vehicle_agent.detect.evidence import TileEvidence
+from gnd.vehicle_agent.detect.kernel import CERTAIN, cast_rays, kernel_parameters, window_affine
+from gnd.vehicle_agent.detect.parameters import DetectParameters
+from gnd.vehicle_agent.detect.records import N_BI, N_BO, N_PI, N_PO, Records, make_records
+from gnd.vehicle_agent.detect.uncertainty import PoseUncertainty, TileUncertainties
+from gnd.vehicle_agent.errors import MapChanged
+from gnd.vehicle_agent.local_map import EMPTY, UNKNOWN, LocalMap
 
 
 @dataclass(slots=True)

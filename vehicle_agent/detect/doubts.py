@@ -7,20 +7,20 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from gnd_map.arrays import F64
-from gnd_map.classes import ChangeClass
-from gnd_map.day import UNKNOWN_DAY
-from gnd_map.gaussian import Gaussians
-from gnd_map.grid import GridFrame
-from gnd_map.tile import Tile
-from gnd_map.tile_id import TileId
-from schemas.changes import TileChange
-from schemas.doubt import Doubt, DoubtReason
-from vehicle_agent.detect.beyond import beyond_map
-from vehicle_agent.detect.classify import Classification
-from vehicle_agent.detect.shift import Shift, no_shift
-from vehicle_agent.detect.trial import Tried
-from vehicle_agent.detect.uncertainty import PoseUncertainty
+from gnd.gnd_map.arrays import F64
+from gnd.gnd_map.classes import ChangeClass
+from gnd.gnd_map.day import UNKNOWN_DAY
+from gnd.gnd_map.gaussian import Gaussians
+from gnd.gnd_map.grid import GridFrame
+from gnd.gnd_map.tile import Tile
+from gnd.gnd_map.tile_id import TileId
+from gnd.schemas.changes import TileChange
+from gnd.schemas.doubt import Doubt, DoubtReason
+from gnd.vehicle_agent.detect.beyond import beyond_map
+from gnd.vehicle_agent.detect.classify import Classification
+from gnd.vehicle_agent.detect.shift import Shift, no_shift
+from gnd.vehicle_agent.detect.trial import Tried
+from gnd.vehicle_agent.detect.uncertainty import PoseUncertainty
 
 BAD_SHARE: Final = 0.1
 """From this share of scans with poor health, or that disagree, a tile is doubtful."""
@@ -123,7 +123,7 @@ def plausible_share(base_day: int, day: int) -> float:
     plausible that would not be so anyway.
 
     Args:
-        base_day: of the tile, `gnd_map.day`.
+        base_day: of the tile, `gnd.gnd_map.day`.
         day: of the drive.
     """
     if UNKNOWN_DAY in (base_day, day) or day < base_day:
@@ -133,7 +133,7 @@ def plausible_share(base_day: int, day: int) -> float:
 
 def doubt_of(found: Classification, account: Account, day: int = UNKNOWN_DAY) -> Doubt | None:
     """Why a tile that is told all the same is not fully believed; None where nothing speaks against it, or where
-    nothing has changed. `day`: of the drive, `gnd_map.day`.
+    nothing has changed. `day`: of the drive, `gnd.gnd_map.day`.
     """
     reasons, changed_share = DoubtReason.NONE, changed_share_of(found)
     if not found.changed.any():

@@ -5,10 +5,10 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
-from gnd_map.arrays import check_array
-from gnd_map.gaussian import Gaussians
-from gnd_map.tile import Tile
-from vehicle_agent.detect.uncertainty import PoseUncertainty
+from gnd.gnd_map.arrays import check_array
+from gnd.gnd_map.gaussian import Gaussians
+from gnd.gnd_map.tile import Tile
+from gnd.vehicle_agent.detect.uncertainty import PoseUncertainty
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -10,12 +10,12 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from gnd_map.arrays import I32
-from gnd_map.gaussian import Gaussians
-from gnd_map.grid import VoxelGrid
-from gnd_map.tile import Tile
-from vehicle_agent.detect.parameters import DetectParameters
-from vehicle_agent.detect.records import planar_normals
+from gnd.gnd_map.arrays import I32
+from gnd.gnd_map.gaussian import Gaussians
+from gnd.gnd_map.grid import VoxelGrid
+from gnd.gnd_map.tile import Tile
+from gnd.vehicle_agent.detect.parameters import DetectParameters
+from gnd.vehicle_agent.detect.records import planar_normals
 
 _AROUND: Final = tuple(step for step in product((-1, 0, 1), repeat=3) if any(step))
 

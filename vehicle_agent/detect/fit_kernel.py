@@ -3,8 +3,8 @@
 import numpy as np
 from numpy.typing import NDArray
 
-from gnd_map.arrays import F64
-from gnd_map.jit import kernel
+from gnd.gnd_map.arrays import F64
+from gnd.gnd_map.jit import kernel
 
 UNKNOWN_COST = -1.0
 """Of a point where the map is not known, or at the edge of the window."""

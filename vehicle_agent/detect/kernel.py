@@ -13,12 +13,12 @@ import numba
 import numpy as np
 from numpy.typing import NDArray
 
-from gnd_map.arrays import F32, F64, I32
-from gnd_map.jit import kernel
-from vehicle_agent.detect.chi_square import quantile
-from vehicle_agent.detect.parameters import DetectParameters
-from vehicle_agent.detect.records import N_BI, N_BO, N_PI, N_PO
-from vehicle_agent.detect.uncertainty import PoseUncertainty
+from gnd.gnd_map.arrays import F32, F64, I32
+from gnd.gnd_map.jit import kernel
+from gnd.vehicle_agent.detect.chi_square import quantile
+from gnd.vehicle_agent.detect.parameters import DetectParameters
+from gnd.vehicle_agent.detect.records import N_BI, N_BO, N_PI, N_PO
+from gnd.vehicle_agent.detect.uncertainty import PoseUncertainty
 
 CERTAIN = PoseUncertainty()
 RULES = {"ml": 0, "ahead": 1, "plane": 2}

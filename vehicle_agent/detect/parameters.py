@@ -3,9 +3,9 @@
 from dataclasses import dataclass, field
 from typing import Literal
 
-from gnd_map.evidence import MassParameters
-from vehicle_agent.detect.uncertainty import PoseUncertainty
-from vehicle_agent.errors import VehicleError
+from gnd.gnd_map.evidence import MassParameters
+from gnd.vehicle_agent.detect.uncertainty import PoseUncertainty
+from gnd.vehicle_agent.errors import VehicleError
 
 Mode = Literal["paper", "default"]
 PassRule = Literal["ml", "ahead", "plane"]

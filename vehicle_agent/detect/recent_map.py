@@ -9,8 +9,8 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from gnd_map.arrays import F64
-from vehicle_agent.localise.match_map import MatchMap
+from gnd.gnd_map.arrays import F64
+from gnd.vehicle_agent.localise.match_map import MatchMap
 
 _LEAST_POINTS: Final = 6
 _MARGIN: Final = 2  # voxels around, so that points beside what was seen are inside the window

@@ -10,8 +10,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from gnd_map.gaussian import full_matrices
-from vehicle_agent.detect.parameters import DetectParameters
+from gnd.gnd_map.gaussian import full_matrices
+from gnd.vehicle_agent.detect.parameters import DetectParameters
 
 WORDS = 16
 MEAN = slice(6, 9)

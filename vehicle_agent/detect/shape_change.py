@@ -3,7 +3,7 @@
 The similarity of GND Eq. (13) judges two Gaussians alone: a thick one resembles almost anything, a thin one almost
 nothing, and what the rays said is left out. Here ten figures of the two Gaussians and the counters are weighed
 together by boosted regression trees, each monotone in what must only speak for or against a change. They were fitted on
-simulated worlds that no figure of merit is reported on (`python -m benchmarks.fit_shape_change`); the vehicle
+simulated worlds that no figure of merit is reported on (`python -m studies.fit_shape_change`); the vehicle
 evaluates them alone, without the library that fitted them.
 """
 
@@ -16,11 +16,11 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from gnd_map.arrays import F64, I32, check_array
-from gnd_map.gaussian import Gaussians
-from gnd_map.jit import kernel
-from gnd_map.similarity import similarity
-from vehicle_agent.errors import VehicleError
+from gnd.gnd_map.arrays import F64, I32, check_array
+from gnd.gnd_map.gaussian import Gaussians
+from gnd.gnd_map.jit import kernel
+from gnd.gnd_map.similarity import similarity
+from gnd.vehicle_agent.errors import VehicleError
 
 FEATURES: Final = (
     "map_offset_m",
@@ -130,7 +130,7 @@ def _leaves(
 @lru_cache(maxsize=1)
 def fitted() -> Forest:
     """Return the trees that were fitted (`shape_change.json` beside this file)."""
-    return Forest.from_json((files("vehicle_agent.detect") / "shape_change.json").read_text(encoding="utf-8"))
+    return Forest.from_json((files("gnd.vehicle_agent.detect") / "shape_change.json").read_text(encoding="utf-8"))
 
 
 def shape_features(was: Gaussians, now: Gaussians, n_bi: I32, n_bo: I32, n_pi: I32, noise_m: float = NOISE_M) -> F64:

@@ -13,14 +13,14 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from gnd_map.arrays import F64
-from gnd_map.se3 import T_from_R_t, T_inverse, exp_so3, log_so3
-from vehicle_agent.detect.fit_kernel import point_costs
-from vehicle_agent.detect.uncertainty import PoseUncertainty
-from vehicle_agent.errors import RegistrationError, VehicleError
-from vehicle_agent.localise.match_map import MatchMap
-from vehicle_agent.localise.parameters import RegistrationParameters
-from vehicle_agent.localise.registration import RegistrationResult, Start, register
+from gnd.gnd_map.arrays import F64
+from gnd.gnd_map.se3 import T_from_R_t, T_inverse, exp_so3, log_so3
+from gnd.vehicle_agent.detect.fit_kernel import point_costs
+from gnd.vehicle_agent.detect.uncertainty import PoseUncertainty
+from gnd.vehicle_agent.errors import RegistrationError, VehicleError
+from gnd.vehicle_agent.localise.match_map import MatchMap
+from gnd.vehicle_agent.localise.parameters import RegistrationParameters
+from gnd.vehicle_agent.localise.registration import RegistrationResult, Start, register
 
 _GRID_M: Final = 1.0
 """Voxels are told apart on a plain grid of the map frame: which of them a point is in matters little here."""

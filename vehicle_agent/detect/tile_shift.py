@@ -10,15 +10,15 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from gnd_map.arrays import F64
-from gnd_map.classes import ChangeClass
-from gnd_map.gaussian import Gaussians
-from gnd_map.geodesy import LocalFrame
-from gnd_map.grid import VoxelGrid
-from gnd_map.se3 import T_inverse, transform
-from vehicle_agent.detect.classify import Classification
-from vehicle_agent.detect.shift import Shift, ShiftParameters, costs_at, find_shift
-from vehicle_agent.localise.match_map import MatchMapCache
+from gnd.gnd_map.arrays import F64
+from gnd.gnd_map.classes import ChangeClass
+from gnd.gnd_map.gaussian import Gaussians
+from gnd.gnd_map.geodesy import LocalFrame
+from gnd.gnd_map.grid import VoxelGrid
+from gnd.gnd_map.se3 import T_inverse, transform
+from gnd.vehicle_agent.detect.classify import Classification
+from gnd.vehicle_agent.detect.shift import Shift, ShiftParameters, costs_at, find_shift
+from gnd.vehicle_agent.localise.match_map import MatchMapCache
 
 _LEAST_CHANGES: Final = 5
 """A tile with fewer is told as it is."""

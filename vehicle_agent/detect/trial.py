@@ -14,17 +14,17 @@ from typing import Final, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from gnd_map.arrays import F32, F64
-from gnd_map.se3 import T_inverse, transform
-from vehicle_agent.detect.recent_map import recent_map
-from vehicle_agent.detect.shift import Shift, ShiftParameters, find_shift, gain
-from vehicle_agent.detect.uncertainty import PoseUncertainty
-from vehicle_agent.localise.estimates import PoseEstimate, RefinedScan
-from vehicle_agent.localise.level import sees_tilt
-from vehicle_agent.localise.match_map import MatchMapCache
-from vehicle_agent.localise.parameters import SamplingParameters
-from vehicle_agent.localise.sampling import sample_scan
-from vehicle_agent.segment.segmenter import SegmentedScan
+from gnd.gnd_map.arrays import F32, F64
+from gnd.gnd_map.se3 import T_inverse, transform
+from gnd.vehicle_agent.detect.recent_map import recent_map
+from gnd.vehicle_agent.detect.shift import Shift, ShiftParameters, find_shift, gain
+from gnd.vehicle_agent.detect.uncertainty import PoseUncertainty
+from gnd.vehicle_agent.localise.estimates import PoseEstimate, RefinedScan
+from gnd.vehicle_agent.localise.level import sees_tilt
+from gnd.vehicle_agent.localise.match_map import MatchMapCache
+from gnd.vehicle_agent.localise.parameters import SamplingParameters
+from gnd.vehicle_agent.localise.sampling import sample_scan
+from gnd.vehicle_agent.segment.segmenter import SegmentedScan
 
 Verdict = Literal["good", "shifted", "unchecked"]
 

@@ -5,11 +5,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from gnd_map.arrays import F64
-from gnd_map.grid import GridFrame
-from gnd_map.tile_id import TileId
-from vehicle_agent.errors import VehicleError
-from vehicle_agent.localise.estimates import PoseEstimate
+from gnd.gnd_map.arrays import F64
+from gnd.gnd_map.grid import GridFrame
+from gnd.gnd_map.tile_id import TileId
+from gnd.vehicle_agent.errors import VehicleError
+from gnd.vehicle_agent.localise.estimates import PoseEstimate
 
 POINTS_OF_A_SCAN = 1024
 """So many of a scan's points tell how its evidence is shared out among tiles."""

@@ -1,7 +1,7 @@
 """Where a drive has looked: the cells of each tile in which it would have confirmed a feature had there been one.
 
 A fleet can only forget a feature, or a false one never come to be, when vehicles say where they looked and saw nothing.
-Each tile has 8 x 8 cells of some 4 m (`schemas.feature_change.cell_of`): eight bytes say it.
+Each tile has 8 x 8 cells of some 4 m (`gnd.schemas.feature_change.cell_of`): eight bytes say it.
 """
 
 from dataclasses import dataclass
@@ -10,12 +10,12 @@ from typing import Final
 
 import numpy as np
 
-from gnd_map.arrays import F64, I32, I64
-from gnd_map.geodesy import LocalFrame
-from gnd_map.tile_id import TileId, geodetic_of_tile_coordinates, tile_coordinates
-from schemas.feature_change import GRID
-from vehicle_agent.features.errors import FeatureLayerError
-from vehicle_agent.features.view import Occlusion, SensorView
+from gnd.gnd_map.arrays import F64, I32, I64
+from gnd.gnd_map.geodesy import LocalFrame
+from gnd.gnd_map.tile_id import TileId, geodetic_of_tile_coordinates, tile_coordinates
+from gnd.schemas.feature_change import GRID
+from gnd.vehicle_agent.features.errors import FeatureLayerError
+from gnd.vehicle_agent.features.view import Occlusion, SensorView
 
 _BASE_M: Final = 100.0
 """Cells are laid by a linear map about the vehicle, measured over this length and within it exact to a millimetre."""
@@ -76,7 +76,7 @@ class Coverage:
         return True
 
     def viewed(self, tile: TileId) -> int:
-        """The mask of `schemas.features.FeatureChange.viewed`."""
+        """The mask of `gnd.schemas.features.FeatureChange.viewed`."""
         looks = self._looks.get(tile)
         if looks is None:
             return 0

@@ -14,16 +14,16 @@ from pathlib import Path
 from types import MappingProxyType
 from typing import Final, Self
 
-from fleet_bus.bus import Bus
-from gnd_map.features import FeatureTile, is_feature_layer
-from gnd_map.tile_id import TileId
-from schemas.wire import LAYER_PATTERN
-from vehicle_agent.cache import TileCache
-from vehicle_agent.config import DownloadParameters
-from vehicle_agent.download import TileFetcher
-from vehicle_agent.errors import AgentConfigError, CacheError
-from vehicle_agent.exchange import Fetched
-from vehicle_agent.updates import Updates
+from gnd.fleet_bus.bus import Bus
+from gnd.gnd_map.features import FeatureTile, is_feature_layer
+from gnd.gnd_map.tile_id import TileId
+from gnd.schemas.wire import LAYER_PATTERN
+from gnd.vehicle_agent.cache import TileCache
+from gnd.vehicle_agent.config import DownloadParameters
+from gnd.vehicle_agent.download import TileFetcher
+from gnd.vehicle_agent.errors import AgentConfigError, CacheError
+from gnd.vehicle_agent.exchange import Fetched
+from gnd.vehicle_agent.updates import Updates
 
 MOST_IN_FLIGHT: Final = 2
 """Questions of a layer at a time: its tiles are small, a district's are one question."""

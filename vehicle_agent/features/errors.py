@@ -1,6 +1,6 @@
 """Errors of the vehicle's feature layers. Messages carry numbers and say what to do."""
 
-from vehicle_agent.errors import VehicleError
+from gnd.vehicle_agent.errors import VehicleError
 
 
 class FeatureLayerError(VehicleError):

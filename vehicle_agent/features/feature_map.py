@@ -4,11 +4,11 @@ from collections.abc import Iterable
 
 import numpy as np
 
-from gnd_map.arrays import F64
-from gnd_map.features import UNKNOWN_HEIGHT_M2, Feature, FeatureTile, full_covariance, six_of
-from gnd_map.geodesy import LocalFrame
-from gnd_map.tile_id import TileId
-from vehicle_agent.features.look import MapFeatures
+from gnd.gnd_map.arrays import F64
+from gnd.gnd_map.features import UNKNOWN_HEIGHT_M2, Feature, FeatureTile, full_covariance, six_of
+from gnd.gnd_map.geodesy import LocalFrame
+from gnd.gnd_map.tile_id import TileId
+from gnd.vehicle_agent.features.look import MapFeatures
 
 
 def features_in_map(frame: LocalFrame, tile: FeatureTile, kinds: Iterable[str] = ()) -> MapFeatures:

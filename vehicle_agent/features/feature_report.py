@@ -5,12 +5,12 @@ from collections import Counter
 from collections.abc import Collection
 from dataclasses import dataclass, field
 
-from gnd_map.tile_id import District, TileId
-from schemas.features import FeatureChange, FeatureReport
-from schemas.keys import change_key
-from schemas.report_id import deterministic_report_id
-from vehicle_agent.outbox import Outbox
-from vehicle_agent.report import Identity
+from gnd.gnd_map.tile_id import District, TileId
+from gnd.schemas.features import FeatureChange, FeatureReport
+from gnd.schemas.keys import change_key
+from gnd.schemas.report_id import deterministic_report_id
+from gnd.vehicle_agent.outbox import Outbox
+from gnd.vehicle_agent.report import Identity
 
 _log = logging.getLogger(__name__)
 

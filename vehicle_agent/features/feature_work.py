@@ -6,18 +6,18 @@ from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from typing import Any, Final
 
-from gnd_map.geodesy import LocalFrame
-from gnd_map.tile_id import TileId
-from schemas.drive import Detections
-from vehicle_agent.config import AgentConfig
-from vehicle_agent.features.download import FeatureDownloader
-from vehicle_agent.features.feature_report import FeatureReporter
-from vehicle_agent.features.layers import FeatureLayers
-from vehicle_agent.link import Link
-from vehicle_agent.place import Place
-from vehicle_agent.report import Identity
-from vehicle_agent.segment.segmenter import SegmentedScan
-from vehicle_agent.surroundings import tiles_along
+from gnd.gnd_map.geodesy import LocalFrame
+from gnd.gnd_map.tile_id import TileId
+from gnd.schemas.drive import Detections
+from gnd.vehicle_agent.config import AgentConfig
+from gnd.vehicle_agent.features.download import FeatureDownloader
+from gnd.vehicle_agent.features.feature_report import FeatureReporter
+from gnd.vehicle_agent.features.layers import FeatureLayers
+from gnd.vehicle_agent.link import Link
+from gnd.vehicle_agent.place import Place
+from gnd.vehicle_agent.report import Identity
+from gnd.vehicle_agent.segment.segmenter import SegmentedScan
+from gnd.vehicle_agent.surroundings import tiles_along
 
 AHEAD_M: Final = 250.0
 """Feature tiles weigh little and are mostly empty: they are asked for far ahead, so that few questions are needed."""

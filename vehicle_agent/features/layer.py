@@ -7,19 +7,19 @@ from typing import Final
 
 import numpy as np
 
-from gnd_map.arrays import F64, I64
-from gnd_map.features import Existence, FeatureTile
-from gnd_map.geodesy import LocalFrame
-from gnd_map.tile_id import TileId
-from schemas.features import FeatureChange, Found, Seen
-from vehicle_agent.features.coverage import Coverage, CoverageParameters
-from vehicle_agent.features.feature_map import features_in_map, place_in_tile, with_height
-from vehicle_agent.features.layer_parameters import LayerParameters
-from vehicle_agent.features.look import Look, MapFeatures
-from vehicle_agent.features.slamcu.slamcu import Slamcu
-from vehicle_agent.features.slamcu.verdicts import KnownState
-from vehicle_agent.features.view import Occlusion
-from vehicle_agent.surroundings import left_behind
+from gnd.gnd_map.arrays import F64, I64
+from gnd.gnd_map.features import Existence, FeatureTile
+from gnd.gnd_map.geodesy import LocalFrame
+from gnd.gnd_map.tile_id import TileId
+from gnd.schemas.features import FeatureChange, Found, Seen
+from gnd.vehicle_agent.features.coverage import Coverage, CoverageParameters
+from gnd.vehicle_agent.features.feature_map import features_in_map, place_in_tile, with_height
+from gnd.vehicle_agent.features.layer_parameters import LayerParameters
+from gnd.vehicle_agent.features.look import Look, MapFeatures
+from gnd.vehicle_agent.features.slamcu.slamcu import Slamcu
+from gnd.vehicle_agent.features.slamcu.verdicts import KnownState
+from gnd.vehicle_agent.features.view import Occlusion
+from gnd.vehicle_agent.surroundings import left_behind
 
 SIGMA_HEIGHT_M: Final = 0.5
 """Of a height that a detector has told."""

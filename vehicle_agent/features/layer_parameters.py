@@ -4,11 +4,11 @@ from dataclasses import dataclass, field
 from math import isfinite, radians
 from typing import Final, Literal
 
-from schemas.wire import LAYER_PATTERN
-from vehicle_agent.features.coverage import CoverageParameters
-from vehicle_agent.features.errors import FeatureLayerError
-from vehicle_agent.features.slamcu.parameters import FilterParameters, SlamcuParameters
-from vehicle_agent.features.view import SensorView
+from gnd.schemas.wire import LAYER_PATTERN
+from gnd.vehicle_agent.features.coverage import CoverageParameters
+from gnd.vehicle_agent.features.errors import FeatureLayerError
+from gnd.vehicle_agent.features.slamcu.parameters import FilterParameters, SlamcuParameters
+from gnd.vehicle_agent.features.view import SensorView
 
 
 @dataclass(frozen=True, slots=True)

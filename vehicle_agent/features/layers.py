@@ -10,25 +10,25 @@ from typing import Final, NamedTuple
 
 import numpy as np
 
-from gnd_map.arrays import F64, I64
-from gnd_map.features import FeatureTile
-from gnd_map.geodesy import LocalFrame
-from gnd_map.se3 import interpolate_poses
-from gnd_map.tile_id import TileId
-from schemas.drive import Detections
-from schemas.features import FeatureChange
-from vehicle_agent.config import ReportParameters
-from vehicle_agent.detect.uncertainty import PoseUncertainty
-from vehicle_agent.features.feature_report import FeatureReporter
-from vehicle_agent.features.layer import FeatureLayer, PlacedLook, pose_of
-from vehicle_agent.features.layer_parameters import FeatureParameters
-from vehicle_agent.features.look import MAX_RANGE_M, Look
-from vehicle_agent.features.poles.detector import PoleDetector, Rays, detections_of
-from vehicle_agent.features.poles.slices import PoseSigma
-from vehicle_agent.features.pose_doubts import GOOD, POOR, WRONG, PoseDoubts
-from vehicle_agent.features.view import Occlusion
-from vehicle_agent.localise.estimates import RefinedScan
-from vehicle_agent.segment.segmenter import SegmentedScan
+from gnd.gnd_map.arrays import F64, I64
+from gnd.gnd_map.features import FeatureTile
+from gnd.gnd_map.geodesy import LocalFrame
+from gnd.gnd_map.se3 import interpolate_poses
+from gnd.gnd_map.tile_id import TileId
+from gnd.schemas.drive import Detections
+from gnd.schemas.features import FeatureChange
+from gnd.vehicle_agent.config import ReportParameters
+from gnd.vehicle_agent.detect.uncertainty import PoseUncertainty
+from gnd.vehicle_agent.features.feature_report import FeatureReporter
+from gnd.vehicle_agent.features.layer import FeatureLayer, PlacedLook, pose_of
+from gnd.vehicle_agent.features.layer_parameters import FeatureParameters
+from gnd.vehicle_agent.features.look import MAX_RANGE_M, Look
+from gnd.vehicle_agent.features.poles.detector import PoleDetector, Rays, detections_of
+from gnd.vehicle_agent.features.poles.slices import PoseSigma
+from gnd.vehicle_agent.features.pose_doubts import GOOD, POOR, WRONG, PoseDoubts
+from gnd.vehicle_agent.features.view import Occlusion
+from gnd.vehicle_agent.localise.estimates import RefinedScan
+from gnd.vehicle_agent.segment.segmenter import SegmentedScan
 
 SCANS_TOGETHER: Final = 5
 """Poles are looked for in so many scans at a time: half a second."""

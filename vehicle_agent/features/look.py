@@ -6,8 +6,8 @@ from typing import Final
 
 import numpy as np
 
-from gnd_map.arrays import F64, I64
-from vehicle_agent.features.errors import BadLook, BadMapFeatures
+from gnd.gnd_map.arrays import F64, I64
+from gnd.vehicle_agent.features.errors import BadLook, BadMapFeatures
 
 MAX_RANGE_M: Final = 1000.0
 MAX_DETECTIONS: Final = 1024

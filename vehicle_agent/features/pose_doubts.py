@@ -9,8 +9,8 @@ from collections import Counter
 from collections.abc import Iterable
 from typing import Final
 
-from gnd_map.tile_id import TileId
-from vehicle_agent.detect.doubts import BAD_SHARE
+from gnd.gnd_map.tile_id import TileId
+from gnd.vehicle_agent.detect.doubts import BAD_SHARE
 
 WRONG: Final = "wrong"
 POOR: Final = "poor"

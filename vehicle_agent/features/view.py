@@ -13,8 +13,8 @@ from typing import Final
 import numpy as np
 import numpy.typing as npt
 
-from gnd_map.arrays import F64, points_3d
-from vehicle_agent.features.errors import BadLook
+from gnd.gnd_map.arrays import F64, points_3d
+from gnd.vehicle_agent.features.errors import BadLook
 
 _TURN: Final = 2.0 * pi
 TYPICAL_HEIGHT_M: Final = 2.5

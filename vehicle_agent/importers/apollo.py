@@ -13,14 +13,14 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from gnd_map.geodesy import LocalFrame
-from gnd_map.motion import Trajectory
-from gnd_map.se3 import R_from_quaternion_xyzw, T_from_R_t, exp_so3
-from gnd_map.utm import convergence_rad, geodetic_from_utm
-from vehicle_agent.errors import ImportDriveError
-from vehicle_agent.importers.files import check_folder, files_of
-from vehicle_agent.importers.pcd import read_scan, scan_number, table_of
-from vehicle_agent.importers.recording import Anchor, Recording
+from gnd.gnd_map.geodesy import LocalFrame
+from gnd.gnd_map.motion import Trajectory
+from gnd.gnd_map.se3 import R_from_quaternion_xyzw, T_from_R_t, exp_so3
+from gnd.gnd_map.utm import convergence_rad, geodetic_from_utm
+from gnd.vehicle_agent.errors import ImportDriveError
+from gnd.vehicle_agent.importers.files import check_folder, files_of
+from gnd.vehicle_agent.importers.pcd import read_scan, scan_number, table_of
+from gnd.vehicle_agent.importers.recording import Anchor, Recording
 
 F64 = NDArray[np.float64]
 

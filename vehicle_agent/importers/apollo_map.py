@@ -17,9 +17,9 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from vehicle_agent.errors import ImportDriveError
-from vehicle_agent.importers.apollo import utm_zone, zone_folders
-from vehicle_agent.importers.files import read_file
+from gnd.vehicle_agent.errors import ImportDriveError
+from gnd.vehicle_agent.importers.apollo import utm_zone, zone_folders
+from gnd.vehicle_agent.importers.files import read_file
 
 F64 = NDArray[np.float64]
 

@@ -5,8 +5,8 @@ from typing import Final
 
 import numpy as np
 
-from gnd_map.arrays import F32
-from schemas.drive import U16, U32, Scan
+from gnd.gnd_map.arrays import F32
+from gnd.schemas.drive import U16, U32, Scan
 
 MAX_RANGE_M: Final = 500.0
 """No LiDAR of a car measures farther; such points are errors of a driver or of a unit."""

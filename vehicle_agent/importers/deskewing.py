@@ -14,17 +14,17 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from gnd_map.errors import MotionError
-from gnd_map.motion import Trajectory, deskew
-from gnd_map.se3 import T_inverse, transform
-from schemas.drive import Deskew, Scan
-from vehicle_agent.errors import ImportDriveError
-from vehicle_agent.importers.cleaning import RawScan, cleaned
-from vehicle_agent.importers.firing_order import firing_share
-from vehicle_agent.importers.lidar_odometry import track_of_scans
-from vehicle_agent.importers.plane_thickness import Comparison, Thickness, compared, thickness_of
-from vehicle_agent.importers.recording import Recording
-from vehicle_agent.importers.sweep_times import (
+from gnd.gnd_map.errors import MotionError
+from gnd.gnd_map.motion import Trajectory, deskew
+from gnd.gnd_map.se3 import T_inverse, transform
+from gnd.schemas.drive import Deskew, Scan
+from gnd.vehicle_agent.errors import ImportDriveError
+from gnd.vehicle_agent.importers.cleaning import RawScan, cleaned
+from gnd.vehicle_agent.importers.firing_order import firing_share
+from gnd.vehicle_agent.importers.lidar_odometry import track_of_scans
+from gnd.vehicle_agent.importers.plane_thickness import Comparison, Thickness, compared, thickness_of
+from gnd.vehicle_agent.importers.recording import Recording
+from gnd.vehicle_agent.importers.sweep_times import (
     Sweep,
     SweepFit,
     azimuth_times,

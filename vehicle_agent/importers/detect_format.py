@@ -3,9 +3,9 @@
 from pathlib import Path
 from typing import Final
 
-from vehicle_agent.errors import ImportDriveError
-from vehicle_agent.importers.apollo import is_apollo
-from vehicle_agent.importers.files import files_below, files_of
+from gnd.vehicle_agent.errors import ImportDriveError
+from gnd.vehicle_agent.importers.apollo import is_apollo
+from gnd.vehicle_agent.importers.files import files_below, files_of
 
 ENDINGS: Final = {
     "kitti": (".bin", ".bin.xz"),

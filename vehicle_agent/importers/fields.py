@@ -10,8 +10,8 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from vehicle_agent.errors import ImportDriveError
-from vehicle_agent.importers.cleaning import RawScan
+from gnd.vehicle_agent.errors import ImportDriveError
+from gnd.vehicle_agent.importers.cleaning import RawScan
 
 RING_FIELDS: Final = ("ring", "channel", "line", "laser_id")
 TIME_FIELDS: Final = ("t_offset", "t", "time", "timestamp", "time_stamp", "offset_time", "timeOffset")

@@ -5,7 +5,7 @@ from collections import Counter
 from pathlib import Path
 from typing import Final
 
-from vehicle_agent.errors import ImportDriveError
+from gnd.vehicle_agent.errors import ImportDriveError
 
 MAX_FILE_BYTES: Final = 1 << 30
 """One scan, unpacked: 64 million points of 16 bytes."""

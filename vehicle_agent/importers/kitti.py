@@ -12,12 +12,12 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from gnd_map.se3 import T_inverse
-from schemas.drive import GnssFix
-from vehicle_agent.errors import ImportDriveError
-from vehicle_agent.importers.cleaning import RawScan
-from vehicle_agent.importers.files import check_folder, files_below, files_of, read_file
-from vehicle_agent.importers.recording import GNSS_SIGMA_M, NOMINAL, Anchor, Recording, mount
+from gnd.gnd_map.se3 import T_inverse
+from gnd.schemas.drive import GnssFix
+from gnd.vehicle_agent.errors import ImportDriveError
+from gnd.vehicle_agent.importers.cleaning import RawScan
+from gnd.vehicle_agent.importers.files import check_folder, files_below, files_of, read_file
+from gnd.vehicle_agent.importers.recording import GNSS_SIGMA_M, NOMINAL, Anchor, Recording, mount
 
 F64 = NDArray[np.float64]
 

@@ -13,23 +13,23 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from gnd_map.accumulate import N_MIN_CELLS, VoxelAccumulator
-from gnd_map.gaussian import Gaussians
-from gnd_map.grid import GridFrame
-from gnd_map.motion import Trajectory, deskew
-from gnd_map.se3 import T_from_R_t, T_inverse, exp_so3, log_so3, transform
-from gnd_map.tile import Tile
-from gnd_map.tile_id import TileId, covering_circle
-from schemas.drive import Scan
-from vehicle_agent.errors import ImportDriveError, RegistrationError
-from vehicle_agent.importers.cleaning import cleaned
-from vehicle_agent.importers.recording import Recording
-from vehicle_agent.local_map import LocalMap
-from vehicle_agent.localise.match_map import MatchMap, MatchMapCache
-from vehicle_agent.localise.odometry import MotionBuffer
-from vehicle_agent.localise.parameters import RegistrationParameters, SamplingParameters
-from vehicle_agent.localise.registration import RegistrationResult, Start, register
-from vehicle_agent.localise.sampling import sample_scan
+from gnd.gnd_map.accumulate import N_MIN_CELLS, VoxelAccumulator
+from gnd.gnd_map.gaussian import Gaussians
+from gnd.gnd_map.grid import GridFrame
+from gnd.gnd_map.motion import Trajectory, deskew
+from gnd.gnd_map.se3 import T_from_R_t, T_inverse, exp_so3, log_so3, transform
+from gnd.gnd_map.tile import Tile
+from gnd.gnd_map.tile_id import TileId, covering_circle
+from gnd.schemas.drive import Scan
+from gnd.vehicle_agent.errors import ImportDriveError, RegistrationError
+from gnd.vehicle_agent.importers.cleaning import cleaned
+from gnd.vehicle_agent.importers.recording import Recording
+from gnd.vehicle_agent.local_map import LocalMap
+from gnd.vehicle_agent.localise.match_map import MatchMap, MatchMapCache
+from gnd.vehicle_agent.localise.odometry import MotionBuffer
+from gnd.vehicle_agent.localise.parameters import RegistrationParameters, SamplingParameters
+from gnd.vehicle_agent.localise.registration import RegistrationResult, Start, register
+from gnd.vehicle_agent.localise.sampling import sample_scan
 
 F64 = NDArray[np.float64]
 Progress = Callable[[str, int, int], None]

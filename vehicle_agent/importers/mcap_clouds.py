@@ -14,19 +14,19 @@ import numpy as np
 from foxglove_schemas_protobuf.PointCloud_pb2 import PointCloud
 from mcap.summary import Summary
 
-from gnd_map.motion import Trajectory
-from schemas.drive import GnssFix, MotionSample
-from schemas.drive_mcap import POINTS_TOPIC, load_track, read_header
-from schemas.drive_messages import ns_of
-from schemas.drive_metadata import METADATA
-from schemas.mcap_file import open_mcap
-from vehicle_agent.errors import ImportDriveError
-from vehicle_agent.importers.cleaning import RawScan
-from vehicle_agent.importers.fields import Field, scan_of_fields, unpack
-from vehicle_agent.importers.files import files_below
-from vehicle_agent.importers.point_cloud2 import SCHEMA as POINT_CLOUD2
-from vehicle_agent.importers.point_cloud2 import decode_cloud, stamp_ns
-from vehicle_agent.importers.recording import NOMINAL, Anchor, Recording
+from gnd.gnd_map.motion import Trajectory
+from gnd.schemas.drive import GnssFix, MotionSample
+from gnd.schemas.drive_mcap import POINTS_TOPIC, load_track, read_header
+from gnd.schemas.drive_messages import ns_of
+from gnd.schemas.drive_metadata import METADATA
+from gnd.schemas.mcap_file import open_mcap
+from gnd.vehicle_agent.errors import ImportDriveError
+from gnd.vehicle_agent.importers.cleaning import RawScan
+from gnd.vehicle_agent.importers.fields import Field, scan_of_fields, unpack
+from gnd.vehicle_agent.importers.files import files_below
+from gnd.vehicle_agent.importers.point_cloud2 import SCHEMA as POINT_CLOUD2
+from gnd.vehicle_agent.importers.point_cloud2 import decode_cloud, stamp_ns
+from gnd.vehicle_agent.importers.recording import NOMINAL, Anchor, Recording
 
 FOXGLOVE_CLOUD: Final = "foxglove.PointCloud"
 _ENCODINGS: Final = {POINT_CLOUD2: "cdr", FOXGLOVE_CLOUD: "protobuf"}

@@ -15,8 +15,8 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from gnd_map.se3 import T_inverse, exp_so3, log_so3
-from vehicle_agent.importers.voxels import voxels_of
+from gnd.gnd_map.se3 import T_inverse, exp_so3, log_so3
+from gnd.vehicle_agent.importers.voxels import voxels_of
 
 F64 = NDArray[np.float64]
 

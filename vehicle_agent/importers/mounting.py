@@ -10,11 +10,11 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from gnd_map.motion import Trajectory
-from gnd_map.se3 import T_inverse, exp_so3
-from schemas.drive import MountSigma
-from vehicle_agent.importers.cleaning import cleaned
-from vehicle_agent.importers.mount import (
+from gnd.gnd_map.motion import Trajectory
+from gnd.gnd_map.se3 import T_inverse, exp_so3
+from gnd.schemas.drive import MountSigma
+from gnd.vehicle_agent.importers.cleaning import cleaned
+from gnd.vehicle_agent.importers.mount import (
     CROWN_RAD,
     FLOOR_RAD,
     GroundSeen,
@@ -25,7 +25,7 @@ from vehicle_agent.importers.mount import (
     upright,
     yaw_of_track,
 )
-from vehicle_agent.importers.recording import Recording
+from gnd.vehicle_agent.importers.recording import Recording
 
 F64 = NDArray[np.float64]
 

@@ -13,13 +13,13 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from gnd_map.motion import Trajectory
-from gnd_map.se3 import R_from_quaternion_xyzw, T_from_R_t
-from vehicle_agent.errors import ImportDriveError
-from vehicle_agent.importers.cleaning import RawScan
-from vehicle_agent.importers.files import check_folder, files_below, files_of
-from vehicle_agent.importers.pcd_format import read_pcd
-from vehicle_agent.importers.recording import Anchor, Recording
+from gnd.gnd_map.motion import Trajectory
+from gnd.gnd_map.se3 import R_from_quaternion_xyzw, T_from_R_t
+from gnd.vehicle_agent.errors import ImportDriveError
+from gnd.vehicle_agent.importers.cleaning import RawScan
+from gnd.vehicle_agent.importers.files import check_folder, files_below, files_of
+from gnd.vehicle_agent.importers.pcd_format import read_pcd
+from gnd.vehicle_agent.importers.recording import Anchor, Recording
 
 F64 = NDArray[np.float64]
 I64 = NDArray[np.int64]

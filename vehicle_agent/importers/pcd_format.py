@@ -7,9 +7,9 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from gnd_map.jit import kernel
-from vehicle_agent.errors import ImportDriveError
-from vehicle_agent.importers.files import read_file
+from gnd.gnd_map.jit import kernel
+from gnd.vehicle_agent.errors import ImportDriveError
+from gnd.vehicle_agent.importers.files import read_file
 
 U8 = NDArray[np.uint8]
 

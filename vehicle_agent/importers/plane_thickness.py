@@ -7,7 +7,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from vehicle_agent.importers.voxels import block_keys, covariances_of, voxel_keys, voxels_of
+from gnd.vehicle_agent.importers.voxels import block_keys, covariances_of, voxel_keys, voxels_of
 
 F64 = NDArray[np.float64]
 I64 = NDArray[np.int64]

@@ -11,8 +11,8 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from vehicle_agent.errors import ImportDriveError
-from vehicle_agent.importers.fields import Field, unpack
+from gnd.vehicle_agent.errors import ImportDriveError
+from gnd.vehicle_agent.importers.fields import Field, unpack
 
 SCHEMA: Final = "sensor_msgs/msg/PointCloud2"
 MAX_FIELDS: Final = 64

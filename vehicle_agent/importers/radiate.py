@@ -11,11 +11,11 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from schemas.drive import GnssFix, MotionSample
-from vehicle_agent.errors import ImportDriveError
-from vehicle_agent.importers.cleaning import RawScan
-from vehicle_agent.importers.files import check_folder, files_of, read_file
-from vehicle_agent.importers.recording import GNSS_SIGMA_M, Anchor, Recording, mount
+from gnd.schemas.drive import GnssFix, MotionSample
+from gnd.vehicle_agent.errors import ImportDriveError
+from gnd.vehicle_agent.importers.cleaning import RawScan
+from gnd.vehicle_agent.importers.files import check_folder, files_of, read_file
+from gnd.vehicle_agent.importers.recording import GNSS_SIGMA_M, Anchor, Recording, mount
 
 F64 = NDArray[np.float64]
 I64 = NDArray[np.int64]

@@ -7,12 +7,12 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from gnd_map.geodesy import LocalFrame
-from gnd_map.motion import Trajectory
-from gnd_map.se3 import exp_so3
-from schemas.drive import Deskew, GnssFix, MotionSample, MountSigma, MountSource, Scan
-from vehicle_agent.errors import ImportDriveError
-from vehicle_agent.importers.cleaning import RawScan
+from gnd.gnd_map.geodesy import LocalFrame
+from gnd.gnd_map.motion import Trajectory
+from gnd.gnd_map.se3 import exp_so3
+from gnd.schemas.drive import Deskew, GnssFix, MotionSample, MountSigma, MountSource, Scan
+from gnd.vehicle_agent.errors import ImportDriveError
+from gnd.vehicle_agent.importers.cleaning import RawScan
 
 F64 = NDArray[np.float64]
 

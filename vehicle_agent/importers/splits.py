@@ -5,7 +5,7 @@ import re
 import numpy as np
 from numpy.typing import NDArray
 
-from vehicle_agent.errors import ImportDriveError
+from gnd.vehicle_agent.errors import ImportDriveError
 
 CHOICES = "all, even, odd, first-half, second-half or A:B"
 

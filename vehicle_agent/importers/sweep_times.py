@@ -20,8 +20,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from gnd_map.se3 import T_inverse, log_so3, transform
-from vehicle_agent.importers.voxels import covariances_of, voxels_of
+from gnd.gnd_map.se3 import T_inverse, log_so3, transform
+from gnd.vehicle_agent.importers.voxels import covariances_of, voxels_of
 
 F64 = NDArray[np.float64]
 I64 = NDArray[np.int64]

@@ -6,17 +6,17 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from gnd_map.se3 import T_inverse, log_so3
-from vehicle_agent.importers.mounting import angles_of
-from vehicle_agent.localise.clock import ClockDoubt, ClockEstimator
-from vehicle_agent.localise.drift import Drift
-from vehicle_agent.localise.estimates import Cause, Health
-from vehicle_agent.localise.first_course import FirstCourse
-from vehicle_agent.localise.mount import DOUBTFUL_RAD, SIGMAS, MountDoubt, MountResidual
-from vehicle_agent.localise.odometry import MotionBuffer
-from vehicle_agent.localise.parameters import OdometryParameters
-from vehicle_agent.localise.remount import Mounting, left_over, left_sigma
-from vehicle_agent.localise.scan_odometry import ScanStep
+from gnd.gnd_map.se3 import T_inverse, log_so3
+from gnd.vehicle_agent.importers.mounting import angles_of
+from gnd.vehicle_agent.localise.clock import ClockDoubt, ClockEstimator
+from gnd.vehicle_agent.localise.drift import Drift
+from gnd.vehicle_agent.localise.estimates import Cause, Health
+from gnd.vehicle_agent.localise.first_course import FirstCourse
+from gnd.vehicle_agent.localise.mount import DOUBTFUL_RAD, SIGMAS, MountDoubt, MountResidual
+from gnd.vehicle_agent.localise.odometry import MotionBuffer
+from gnd.vehicle_agent.localise.parameters import OdometryParameters
+from gnd.vehicle_agent.localise.remount import Mounting, left_over, left_sigma
+from gnd.vehicle_agent.localise.scan_odometry import ScanStep
 
 F64 = NDArray[np.float64]
 

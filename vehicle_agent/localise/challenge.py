@@ -5,12 +5,12 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from vehicle_agent.localise.first_pose import Place
-from vehicle_agent.localise.hypotheses import Hypotheses
-from vehicle_agent.localise.initialise import Around, near_pose, search, thinned
-from vehicle_agent.localise.match_map import MatchMap
-from vehicle_agent.localise.parameters import LocaliserParameters
-from vehicle_agent.localise.registration import fit_of
+from gnd.vehicle_agent.localise.first_pose import Place
+from gnd.vehicle_agent.localise.hypotheses import Hypotheses
+from gnd.vehicle_agent.localise.initialise import Around, near_pose, search, thinned
+from gnd.vehicle_agent.localise.match_map import MatchMap
+from gnd.vehicle_agent.localise.parameters import LocaliserParameters
+from gnd.vehicle_agent.localise.registration import fit_of
 
 F64 = NDArray[np.float64]
 

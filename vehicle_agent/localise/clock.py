@@ -18,8 +18,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import cho_solve_banded, cholesky_banded
 
-from vehicle_agent.localise.odometry import ClockModel, MotionBuffer
-from vehicle_agent.localise.scan_odometry import ScanStep
+from gnd.vehicle_agent.localise.odometry import ClockModel, MotionBuffer
+from gnd.vehicle_agent.localise.scan_odometry import ScanStep
 
 F64 = NDArray[np.float64]
 ClockDoubt = Literal["none", "large", "unsure", "drifting", "jumped"]

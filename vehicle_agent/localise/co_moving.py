@@ -12,9 +12,9 @@ from typing import Final, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from gnd_map.arrays import F32, F64
-from gnd_map.se3 import T_inverse
-from vehicle_agent.localise.co_moving_kernels import COLUMNS, MIN_PASSED, ROWS, compare, draw_sweep, grown
+from gnd.gnd_map.arrays import F32, F64
+from gnd.gnd_map.se3 import T_inverse
+from gnd.vehicle_agent.localise.co_moving_kernels import COLUMNS, MIN_PASSED, ROWS, compare, draw_sweep, grown
 
 Mask = NDArray[np.bool_]
 U8 = NDArray[np.uint8]

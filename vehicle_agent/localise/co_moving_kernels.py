@@ -6,8 +6,8 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from gnd_map.arrays import F32, F64, I64
-from gnd_map.jit import kernel
+from gnd.gnd_map.arrays import F32, F64, I64
+from gnd.gnd_map.jit import kernel
 
 U16 = NDArray[np.uint16]
 U8 = NDArray[np.uint8]

@@ -8,9 +8,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from gnd_map.motion import Trajectory
-from gnd_map.se3 import T_inverse, log_so3
-from vehicle_agent.localise.estimates import PoseEstimate
+from gnd.gnd_map.motion import Trajectory
+from gnd.gnd_map.se3 import T_inverse, log_so3
+from gnd.vehicle_agent.localise.estimates import PoseEstimate
 
 F64 = NDArray[np.float64]
 

@@ -9,13 +9,13 @@ from typing import Final
 
 import numpy as np
 
-from gnd_map.arrays import F64
-from gnd_map.errors import MotionError, ShapeError
-from gnd_map.motion import Trajectory
-from gnd_map.se3 import T_inverse
-from tile_store.feature_io.placement import Placement
-from vehicle_agent.errors import LocaliseError
-from vehicle_agent.localise.path_association import Untimed, georeference_untimed
+from gnd.gnd_map.arrays import F64
+from gnd.gnd_map.errors import MotionError, ShapeError
+from gnd.gnd_map.motion import Trajectory
+from gnd.gnd_map.se3 import T_inverse
+from gnd.tile_store.feature_io.placement import Placement
+from gnd.vehicle_agent.errors import LocaliseError
+from gnd.vehicle_agent.localise.path_association import Untimed, georeference_untimed
 
 SIGMA_M: Final = 0.5
 """Of an axis of a fix, whose recording does not state it."""

@@ -7,9 +7,9 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from gnd_map.motion import Trajectory
-from gnd_map.se3 import T_inverse
-from vehicle_agent.errors import LocaliseError
+from gnd.gnd_map.motion import Trajectory
+from gnd.gnd_map.se3 import T_inverse
+from gnd.vehicle_agent.errors import LocaliseError
 
 F64 = NDArray[np.float64]
 Health = Literal["good", "degraded", "lost"]

@@ -9,7 +9,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from vehicle_agent.localise.scan_odometry import ScanStep
+from gnd.vehicle_agent.localise.scan_odometry import ScanStep
 
 F64 = NDArray[np.float64]
 

@@ -5,14 +5,14 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from vehicle_agent.errors import RegistrationError
-from vehicle_agent.localise.estimates import Cause
-from vehicle_agent.localise.hypotheses import Hypotheses
-from vehicle_agent.localise.initialise import Around, InitialPose, search
-from vehicle_agent.localise.match_map import MatchMap, MatchMapCache
-from vehicle_agent.localise.parameters import LocaliserParameters
-from vehicle_agent.localise.registration import register
-from vehicle_agent.localise.scan_pool import ScanPool
+from gnd.vehicle_agent.errors import RegistrationError
+from gnd.vehicle_agent.localise.estimates import Cause
+from gnd.vehicle_agent.localise.hypotheses import Hypotheses
+from gnd.vehicle_agent.localise.initialise import Around, InitialPose, search
+from gnd.vehicle_agent.localise.match_map import MatchMap, MatchMapCache
+from gnd.vehicle_agent.localise.parameters import LocaliserParameters
+from gnd.vehicle_agent.localise.registration import register
+from gnd.vehicle_agent.localise.scan_pool import ScanPool
 
 F64 = NDArray[np.float64]
 

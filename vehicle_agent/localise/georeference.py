@@ -12,12 +12,12 @@ import gtsam
 import numpy as np
 from numpy.typing import NDArray
 
-from gnd_map.geodesy import LocalFrame
-from gnd_map.motion import Trajectory
-from gnd_map.se3 import T_inverse
-from gnd_map.tile_id import TileId
-from vehicle_agent.errors import LocaliseError
-from vehicle_agent.localise.track_alignment import Alignment, FixTable, GeoreferenceParameters, align
+from gnd.gnd_map.geodesy import LocalFrame
+from gnd.gnd_map.motion import Trajectory
+from gnd.gnd_map.se3 import T_inverse
+from gnd.gnd_map.tile_id import TileId
+from gnd.vehicle_agent.errors import LocaliseError
+from gnd.vehicle_agent.localise.track_alignment import Alignment, FixTable, GeoreferenceParameters, align
 
 F64 = NDArray[np.float64]
 I64 = NDArray[np.int64]

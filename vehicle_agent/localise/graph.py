@@ -7,8 +7,8 @@ import gtsam
 import numpy as np
 from numpy.typing import NDArray
 
-from vehicle_agent.localise.parameters import GraphParameters
-from vehicle_agent.localise.scan_odometry import ScanStep
+from gnd.vehicle_agent.localise.parameters import GraphParameters
+from gnd.vehicle_agent.localise.scan_odometry import ScanStep
 
 F64 = NDArray[np.float64]
 

@@ -12,12 +12,12 @@ from collections import deque
 import numpy as np
 from numpy.typing import NDArray
 
-from gnd_map.se3 import T_inverse, log_so3
-from vehicle_agent.localise.doubt_parameters import CauseParameters
-from vehicle_agent.localise.estimates import Cause, Health
-from vehicle_agent.localise.parameters import HealthParameters
-from vehicle_agent.localise.registration import RegistrationResult
-from vehicle_agent.localise.witness import Testimony
+from gnd.gnd_map.se3 import T_inverse, log_so3
+from gnd.vehicle_agent.localise.doubt_parameters import CauseParameters
+from gnd.vehicle_agent.localise.estimates import Cause, Health
+from gnd.vehicle_agent.localise.parameters import HealthParameters
+from gnd.vehicle_agent.localise.registration import RegistrationResult
+from gnd.vehicle_agent.localise.witness import Testimony
 
 F64 = NDArray[np.float64]
 

@@ -6,14 +6,14 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from gnd_map.motion import Trajectory
-from gnd_map.se3 import T_inverse
-from schemas.drive import Scan
-from vehicle_agent.localise.estimates import Cause, Health, PoseEstimate
-from vehicle_agent.localise.graph import SmoothedPose
-from vehicle_agent.localise.packed_scan import PackedScan
-from vehicle_agent.localise.scan_odometry import ScanStep
-from vehicle_agent.localise.stretch import log_se3
+from gnd.gnd_map.motion import Trajectory
+from gnd.gnd_map.se3 import T_inverse
+from gnd.schemas.drive import Scan
+from gnd.vehicle_agent.localise.estimates import Cause, Health, PoseEstimate
+from gnd.vehicle_agent.localise.graph import SmoothedPose
+from gnd.vehicle_agent.localise.packed_scan import PackedScan
+from gnd.vehicle_agent.localise.scan_odometry import ScanStep
+from gnd.vehicle_agent.localise.stretch import log_se3
 
 F64 = NDArray[np.float64]
 

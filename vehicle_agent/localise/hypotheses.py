@@ -5,13 +5,13 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from gnd_map.se3 import T_inverse, log_so3
-from vehicle_agent.errors import RegistrationError
-from vehicle_agent.localise.doubt_parameters import HypothesisParameters
-from vehicle_agent.localise.initialise import Candidate, InitialPose, near_pose, probabilities, thinned
-from vehicle_agent.localise.match_map import MatchMap
-from vehicle_agent.localise.parameters import RegistrationParameters
-from vehicle_agent.localise.registration import RegistrationResult, fit_of, register
+from gnd.gnd_map.se3 import T_inverse, log_so3
+from gnd.vehicle_agent.errors import RegistrationError
+from gnd.vehicle_agent.localise.doubt_parameters import HypothesisParameters
+from gnd.vehicle_agent.localise.initialise import Candidate, InitialPose, near_pose, probabilities, thinned
+from gnd.vehicle_agent.localise.match_map import MatchMap
+from gnd.vehicle_agent.localise.parameters import RegistrationParameters
+from gnd.vehicle_agent.localise.registration import RegistrationResult, fit_of, register
 
 F64 = NDArray[np.float64]
 

@@ -16,10 +16,10 @@ from typing import Final, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from vehicle_agent.localise.kernels import pulls
-from vehicle_agent.localise.match_map import MatchMap
-from vehicle_agent.localise.parameters import RegistrationParameters
-from vehicle_agent.localise.registration import Linearised
+from gnd.vehicle_agent.localise.kernels import pulls
+from gnd.vehicle_agent.localise.match_map import MatchMap
+from gnd.vehicle_agent.localise.parameters import RegistrationParameters
+from gnd.vehicle_agent.localise.registration import Linearised
 
 F64 = NDArray[np.float64]
 

@@ -11,13 +11,13 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from gnd_map.jit import kernel
-from gnd_map.se3 import T_from_R_t, exp_so3
-from vehicle_agent.errors import RegistrationError
-from vehicle_agent.localise.doubt_parameters import HypothesisParameters
-from vehicle_agent.localise.match_map import MatchMap
-from vehicle_agent.localise.parameters import InitialiseParameters, RegistrationParameters
-from vehicle_agent.localise.registration import RegistrationResult, Start, fit_of, register
+from gnd.gnd_map.jit import kernel
+from gnd.gnd_map.se3 import T_from_R_t, exp_so3
+from gnd.vehicle_agent.errors import RegistrationError
+from gnd.vehicle_agent.localise.doubt_parameters import HypothesisParameters
+from gnd.vehicle_agent.localise.match_map import MatchMap
+from gnd.vehicle_agent.localise.parameters import InitialiseParameters, RegistrationParameters
+from gnd.vehicle_agent.localise.registration import RegistrationResult, Start, fit_of, register
 
 F64 = NDArray[np.float64]
 U8 = NDArray[np.uint8]

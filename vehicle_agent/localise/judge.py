@@ -5,19 +5,19 @@ from typing import Final, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from gnd_map.se3 import transform
-from vehicle_agent.local_map import EMPTY
-from vehicle_agent.localise.challenge import Challenger
-from vehicle_agent.localise.estimates import Cause
-from vehicle_agent.localise.first_pose import Place
-from vehicle_agent.localise.health import HealthMonitor
-from vehicle_agent.localise.initialise import ground_below, thinned
-from vehicle_agent.localise.match_map import MatchMap
-from vehicle_agent.localise.parameters import LocaliserParameters
-from vehicle_agent.localise.registration import RegistrationResult, fit_of
-from vehicle_agent.localise.scan_pool import ScanPool
-from vehicle_agent.localise.uniqueness import Uniqueness
-from vehicle_agent.localise.witness import witnessed
+from gnd.gnd_map.se3 import transform
+from gnd.vehicle_agent.local_map import EMPTY
+from gnd.vehicle_agent.localise.challenge import Challenger
+from gnd.vehicle_agent.localise.estimates import Cause
+from gnd.vehicle_agent.localise.first_pose import Place
+from gnd.vehicle_agent.localise.health import HealthMonitor
+from gnd.vehicle_agent.localise.initialise import ground_below, thinned
+from gnd.vehicle_agent.localise.match_map import MatchMap
+from gnd.vehicle_agent.localise.parameters import LocaliserParameters
+from gnd.vehicle_agent.localise.registration import RegistrationResult, fit_of
+from gnd.vehicle_agent.localise.scan_pool import ScanPool
+from gnd.vehicle_agent.localise.uniqueness import Uniqueness
+from gnd.vehicle_agent.localise.witness import witnessed
 
 F64 = NDArray[np.float64]
 

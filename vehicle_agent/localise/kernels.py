@@ -3,7 +3,7 @@
 import numpy as np
 from numpy.typing import NDArray
 
-from gnd_map.jit import kernel
+from gnd.gnd_map.jit import kernel
 
 F64 = NDArray[np.float64]
 I32 = NDArray[np.int32]

@@ -12,11 +12,11 @@ from typing import Final
 import numpy as np
 import numpy.typing as npt
 
-from vehicle_agent.errors import RegistrationError
-from vehicle_agent.localise.graph import MapMatch, SmoothedPose
-from vehicle_agent.localise.match_map import MatchMap
-from vehicle_agent.localise.parameters import RegistrationParameters
-from vehicle_agent.localise.registration import WHEELS_M, settle
+from gnd.vehicle_agent.errors import RegistrationError
+from gnd.vehicle_agent.localise.graph import MapMatch, SmoothedPose
+from gnd.vehicle_agent.localise.match_map import MatchMap
+from gnd.vehicle_agent.localise.parameters import RegistrationParameters
+from gnd.vehicle_agent.localise.registration import WHEELS_M, settle
 
 LEAST_SPREAD_DEG: Final = 8.0
 """A sensor whose rays lie within so much of elevation does not see its tilt: a Scala has 3.2°, a VLP-16 30°."""

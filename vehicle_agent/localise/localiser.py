@@ -8,21 +8,21 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from gnd_map.motion import Trajectory, deskew
-from gnd_map.se3 import T_inverse
-from schemas.drive import GnssFix, MotionSample, MountSigma, Scan
-from schemas.sweep_distortion import DistortionSigma
-from vehicle_agent.errors import RegistrationError
-from vehicle_agent.local_map import LocalMap
-from vehicle_agent.localise.arbiter import Motion, Wrong, believing_neither, who_is_wrong
-from vehicle_agent.localise.calibration import MotionCalibration, MotionTeacher
-from vehicle_agent.localise.co_moving import CoMoving
-from vehicle_agent.localise.consistency import Innovations
-from vehicle_agent.localise.estimates import Cause, Health, PoseEstimate, RefinedScan
-from vehicle_agent.localise.first_pose import FirstPose, Place
-from vehicle_agent.localise.graph import MapMatch, Odometry, PoseGraph, Position, SmoothedPose
-from vehicle_agent.localise.health import HealthMonitor
-from vehicle_agent.localise.held_scan import (
+from gnd.gnd_map.motion import Trajectory, deskew
+from gnd.gnd_map.se3 import T_inverse
+from gnd.schemas.drive import GnssFix, MotionSample, MountSigma, Scan
+from gnd.schemas.sweep_distortion import DistortionSigma
+from gnd.vehicle_agent.errors import RegistrationError
+from gnd.vehicle_agent.local_map import LocalMap
+from gnd.vehicle_agent.localise.arbiter import Motion, Wrong, believing_neither, who_is_wrong
+from gnd.vehicle_agent.localise.calibration import MotionCalibration, MotionTeacher
+from gnd.vehicle_agent.localise.co_moving import CoMoving
+from gnd.vehicle_agent.localise.consistency import Innovations
+from gnd.vehicle_agent.localise.estimates import Cause, Health, PoseEstimate, RefinedScan
+from gnd.vehicle_agent.localise.first_pose import FirstPose, Place
+from gnd.vehicle_agent.localise.graph import MapMatch, Odometry, PoseGraph, Position, SmoothedPose
+from gnd.vehicle_agent.localise.health import HealthMonitor
+from gnd.vehicle_agent.localise.held_scan import (
     POSE_SHARE,
     SURE,
     HeldScan,
@@ -34,19 +34,19 @@ from vehicle_agent.localise.held_scan import (
     sigmas_of,
     sweep_variance,
 )
-from vehicle_agent.localise.judge import Judge, Matched
-from vehicle_agent.localise.level import on_the_road, sees_tilt, settled
-from vehicle_agent.localise.match_map import MatchMapCache
-from vehicle_agent.localise.mount import near_points
-from vehicle_agent.localise.neighbours import FAR_M, UNSURE_M, hedged, weakest
-from vehicle_agent.localise.odometry import MotionBuffer
-from vehicle_agent.localise.packed_scan import pack
-from vehicle_agent.localise.parameters import LocaliserParameters
-from vehicle_agent.localise.refine import Refiner
-from vehicle_agent.localise.registration import RegistrationResult, Start, register
-from vehicle_agent.localise.remount import TRUSTED, Mounting, lever_covariance
-from vehicle_agent.localise.sampling import sample_scan
-from vehicle_agent.localise.scan_odometry import JointStep, ScanOdometry, ScanStep, joint_step
+from gnd.vehicle_agent.localise.judge import Judge, Matched
+from gnd.vehicle_agent.localise.level import on_the_road, sees_tilt, settled
+from gnd.vehicle_agent.localise.match_map import MatchMapCache
+from gnd.vehicle_agent.localise.mount import near_points
+from gnd.vehicle_agent.localise.neighbours import FAR_M, UNSURE_M, hedged, weakest
+from gnd.vehicle_agent.localise.odometry import MotionBuffer
+from gnd.vehicle_agent.localise.packed_scan import pack
+from gnd.vehicle_agent.localise.parameters import LocaliserParameters
+from gnd.vehicle_agent.localise.refine import Refiner
+from gnd.vehicle_agent.localise.registration import RegistrationResult, Start, register
+from gnd.vehicle_agent.localise.remount import TRUSTED, Mounting, lever_covariance
+from gnd.vehicle_agent.localise.sampling import sample_scan
+from gnd.vehicle_agent.localise.scan_odometry import JointStep, ScanOdometry, ScanStep, joint_step
 
 F64 = NDArray[np.float64]
 Distortion = Callable[[float, float], DistortionSigma]

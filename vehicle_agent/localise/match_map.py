@@ -5,8 +5,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from vehicle_agent.local_map import LocalMap
-from vehicle_agent.localise.kernels import tapered_information
+from gnd.vehicle_agent.local_map import LocalMap
+from gnd.vehicle_agent.localise.kernels import tapered_information
 
 F64 = NDArray[np.float64]
 

@@ -12,8 +12,8 @@ from typing import Final, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from gnd_map.se3 import T_inverse, transform
-from vehicle_agent.importers.mount import (
+from gnd.gnd_map.se3 import T_inverse, transform
+from gnd.vehicle_agent.importers.mount import (
     CROWN_RAD,
     LANE_WITHIN_M,
     GroundSeen,

@@ -10,12 +10,12 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from gnd_map.se3 import T_inverse
-from vehicle_agent.errors import RegistrationError
-from vehicle_agent.localise.match_map import MatchMap
-from vehicle_agent.localise.parameters import RegistrationParameters
-from vehicle_agent.localise.registration import WHEELS_M, RegistrationResult, register
-from vehicle_agent.localise.stretch import log_se3
+from gnd.gnd_map.se3 import T_inverse
+from gnd.vehicle_agent.errors import RegistrationError
+from gnd.vehicle_agent.localise.match_map import MatchMap
+from gnd.vehicle_agent.localise.parameters import RegistrationParameters
+from gnd.vehicle_agent.localise.registration import WHEELS_M, RegistrationResult, register
+from gnd.vehicle_agent.localise.stretch import log_se3
 
 F64 = NDArray[np.float64]
 

@@ -7,8 +7,8 @@ from itertools import pairwise
 import numpy as np
 from numpy.typing import NDArray
 
-from gnd_map.motion import Trajectory
-from gnd_map.se3 import T_inverse
+from gnd.gnd_map.motion import Trajectory
+from gnd.gnd_map.se3 import T_inverse
 
 F64 = NDArray[np.float64]
 

@@ -10,10 +10,10 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from gnd_map.jit import kernel
-from gnd_map.motion import Trajectory
-from gnd_map.se3 import T_inverse
-from schemas.drive import Scan
+from gnd.gnd_map.jit import kernel
+from gnd.gnd_map.motion import Trajectory
+from gnd.gnd_map.se3 import T_inverse
+from gnd.schemas.drive import Scan
 
 F64 = NDArray[np.float64]
 Points = NDArray[np.int16] | NDArray[np.float32]
@@ -22,7 +22,7 @@ Ticks = NDArray[np.uint16] | NDArray[np.uint32]
 LEVELS, TICKS = 32767, 65535
 MAX_REACH_M = 131.0  # steps of 4 mm
 MIN_TICK_NS = 2000
-KNOT_NS = 1_000_000  # as in `gnd_map.motion`: at 1 rad/s, blending rotations over 1 ms is off by 1.3e-7 rad
+KNOT_NS = 1_000_000  # as in `gnd.gnd_map.motion`: at 1 rad/s, blending rotations over 1 ms is off by 1.3e-7 rad
 
 
 @dataclass(frozen=True, slots=True, eq=False)

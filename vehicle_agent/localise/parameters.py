@@ -2,16 +2,16 @@
 
 from dataclasses import dataclass, field
 
-from vehicle_agent.localise.doubt_parameters import (
+from gnd.vehicle_agent.localise.doubt_parameters import (
     CauseParameters,
     ChallengeParameters,
     HypothesisParameters,
     PoolParameters,
     WitnessParameters,
 )
-from vehicle_agent.localise.refine_parameters import RefineParameters
-from vehicle_agent.localise.scan_odometry_parameters import ScanOdometryParameters
-from vehicle_agent.localise.uniqueness_parameters import UniquenessParameters
+from gnd.vehicle_agent.localise.refine_parameters import RefineParameters
+from gnd.vehicle_agent.localise.scan_odometry_parameters import ScanOdometryParameters
+from gnd.vehicle_agent.localise.uniqueness_parameters import UniquenessParameters
 
 
 @dataclass(frozen=True, slots=True)

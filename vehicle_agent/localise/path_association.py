@@ -13,11 +13,11 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import solveh_banded
 
-from gnd_map.geodesy import LocalFrame
-from gnd_map.motion import Trajectory
-from vehicle_agent.errors import LocaliseError
-from vehicle_agent.localise.georeference import Georeferenced, georeference
-from vehicle_agent.localise.track_alignment import FixTable, GeoreferenceParameters
+from gnd.gnd_map.geodesy import LocalFrame
+from gnd.gnd_map.motion import Trajectory
+from gnd.vehicle_agent.errors import LocaliseError
+from gnd.vehicle_agent.localise.georeference import Georeferenced, georeference
+from gnd.vehicle_agent.localise.track_alignment import FixTable, GeoreferenceParameters
 
 F64 = NDArray[np.float64]
 I64 = NDArray[np.int64]

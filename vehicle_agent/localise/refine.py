@@ -13,16 +13,16 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from gnd_map.se3 import T_from_R_t, T_inverse, exp_so3, log_so3
-from vehicle_agent.localise.calibration import MotionTeacher
-from vehicle_agent.localise.drift import Drift, Slope
-from vehicle_agent.localise.graph import MapMatch, SmoothedPose
-from vehicle_agent.localise.match_map import MatchMapCache
-from vehicle_agent.localise.odometry import SLIP_LASTS_NS, MotionBuffer
-from vehicle_agent.localise.parameters import RegistrationParameters
-from vehicle_agent.localise.refine_parameters import RefineParameters
-from vehicle_agent.localise.scan_odometry import ScanStep
-from vehicle_agent.localise.stretch import (
+from gnd.gnd_map.se3 import T_from_R_t, T_inverse, exp_so3, log_so3
+from gnd.vehicle_agent.localise.calibration import MotionTeacher
+from gnd.vehicle_agent.localise.drift import Drift, Slope
+from gnd.vehicle_agent.localise.graph import MapMatch, SmoothedPose
+from gnd.vehicle_agent.localise.match_map import MatchMapCache
+from gnd.vehicle_agent.localise.odometry import SLIP_LASTS_NS, MotionBuffer
+from gnd.vehicle_agent.localise.parameters import RegistrationParameters
+from gnd.vehicle_agent.localise.refine_parameters import RefineParameters
+from gnd.vehicle_agent.localise.scan_odometry import ScanStep
+from gnd.vehicle_agent.localise.stretch import (
     BIAS,
     LEFT,
     N_SHARED,

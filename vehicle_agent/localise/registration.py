@@ -6,11 +6,11 @@ from typing import Literal
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from gnd_map.se3 import exp_so3
-from vehicle_agent.errors import RegistrationError
-from vehicle_agent.localise.kernels import linearise
-from vehicle_agent.localise.match_map import MatchMap
-from vehicle_agent.localise.parameters import RegistrationParameters
+from gnd.gnd_map.se3 import exp_so3
+from gnd.vehicle_agent.errors import RegistrationError
+from gnd.vehicle_agent.localise.kernels import linearise
+from gnd.vehicle_agent.localise.match_map import MatchMap
+from gnd.vehicle_agent.localise.parameters import RegistrationParameters
 
 F64 = NDArray[np.float64]
 

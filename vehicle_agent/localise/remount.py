@@ -10,11 +10,11 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from gnd_map.se3 import T_inverse, exp_so3, transform
-from schemas.drive import DriveHeader, MountSigma
-from vehicle_agent.importers.mount import HEIGHTS_M
-from vehicle_agent.localise.mount import AXES, SIGMAS, TOLERANCE, WRONG, MountResidual, MountWatch
-from vehicle_agent.localise.registration import WHEELS_M
+from gnd.gnd_map.se3 import T_inverse, exp_so3, transform
+from gnd.schemas.drive import DriveHeader, MountSigma
+from gnd.vehicle_agent.importers.mount import HEIGHTS_M
+from gnd.vehicle_agent.localise.mount import AXES, SIGMAS, TOLERANCE, WRONG, MountResidual, MountWatch
+from gnd.vehicle_agent.localise.registration import WHEELS_M
 
 F64 = NDArray[np.float64]
 

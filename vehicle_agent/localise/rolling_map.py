@@ -3,10 +3,10 @@
 import numpy as np
 from numpy.typing import NDArray
 
-from vehicle_agent.localise.kernels import tapered_information
-from vehicle_agent.localise.match_map import UNIFORM_VOXEL_M2, MatchMap
-from vehicle_agent.localise.rolling_kernels import SUMS, add_points, move_window, refresh
-from vehicle_agent.localise.scan_odometry_parameters import RollingMapParameters
+from gnd.vehicle_agent.localise.kernels import tapered_information
+from gnd.vehicle_agent.localise.match_map import UNIFORM_VOXEL_M2, MatchMap
+from gnd.vehicle_agent.localise.rolling_kernels import SUMS, add_points, move_window, refresh
+from gnd.vehicle_agent.localise.scan_odometry_parameters import RollingMapParameters
 
 F64 = NDArray[np.float64]
 

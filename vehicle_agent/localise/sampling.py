@@ -3,8 +3,8 @@
 import numpy as np
 from numpy.typing import NDArray
 
-from gnd_map.jit import kernel
-from vehicle_agent.localise.parameters import SamplingParameters
+from gnd.gnd_map.jit import kernel
+from gnd.vehicle_agent.localise.parameters import SamplingParameters
 
 TABLE_BITS = 16
 CANDIDATES_PER_POINT = 12  # points looked at for each one kept

@@ -12,14 +12,14 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from gnd_map.motion import Trajectory
-from gnd_map.se3 import T_from_R_t, T_inverse, exp_so3, log_so3, transform
-from vehicle_agent.errors import RegistrationError
-from vehicle_agent.localise.parameters import RegistrationParameters
-from vehicle_agent.localise.registration import register
-from vehicle_agent.localise.rolling_map import RollingMap
-from vehicle_agent.localise.scan_odometry_parameters import ScanOdometryParameters
-from vehicle_agent.localise.scan_pool import standing_points
+from gnd.gnd_map.motion import Trajectory
+from gnd.gnd_map.se3 import T_from_R_t, T_inverse, exp_so3, log_so3, transform
+from gnd.vehicle_agent.errors import RegistrationError
+from gnd.vehicle_agent.localise.parameters import RegistrationParameters
+from gnd.vehicle_agent.localise.registration import register
+from gnd.vehicle_agent.localise.rolling_map import RollingMap
+from gnd.vehicle_agent.localise.scan_odometry_parameters import ScanOdometryParameters
+from gnd.vehicle_agent.localise.scan_pool import standing_points
 
 F64 = NDArray[np.float64]
 

@@ -5,9 +5,9 @@ from collections import deque
 import numpy as np
 from numpy.typing import NDArray
 
-from gnd_map.se3 import T_inverse, transform
-from vehicle_agent.localise.doubt_parameters import PoolParameters
-from vehicle_agent.localise.initialise import ground_below, thinned
+from gnd.gnd_map.se3 import T_inverse, transform
+from gnd.vehicle_agent.localise.doubt_parameters import PoolParameters
+from gnd.vehicle_agent.localise.initialise import ground_below, thinned
 
 F64 = NDArray[np.float64]
 

@@ -16,11 +16,11 @@ from typing import Final, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from gnd_map.se3 import T_inverse, exp_so3, log_so3
-from vehicle_agent.localise.influence import SeenScan, influence
-from vehicle_agent.localise.match_map import MatchMap
-from vehicle_agent.localise.parameters import RegistrationParameters
-from vehicle_agent.localise.registration import LEVER_M, WHEELS_M, Linearised, linearised
+from gnd.gnd_map.se3 import T_inverse, exp_so3, log_so3
+from gnd.vehicle_agent.localise.influence import SeenScan, influence
+from gnd.vehicle_agent.localise.match_map import MatchMap
+from gnd.vehicle_agent.localise.parameters import RegistrationParameters
+from gnd.vehicle_agent.localise.registration import LEVER_M, WHEELS_M, Linearised, linearised
 
 F64 = NDArray[np.float64]
 

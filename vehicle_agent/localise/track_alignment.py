@@ -11,10 +11,10 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from gnd_map.geodesy import LocalFrame
-from gnd_map.se3 import T_from_R_t, exp_so3, transform
-from schemas.drive import GnssFix
-from vehicle_agent.errors import LocaliseError
+from gnd.gnd_map.geodesy import LocalFrame
+from gnd.gnd_map.se3 import T_from_R_t, exp_so3, transform
+from gnd.schemas.drive import GnssFix
+from gnd.vehicle_agent.errors import LocaliseError
 
 F64 = NDArray[np.float64]
 I64 = NDArray[np.int64]

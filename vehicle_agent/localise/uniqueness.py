@@ -19,14 +19,14 @@ from typing import Final, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from gnd_map.se3 import T_from_R_t, T_inverse, exp_so3, transform
-from vehicle_agent.errors import RegistrationError
-from vehicle_agent.localise.first_pose import Place
-from vehicle_agent.localise.initialise import Around, search, thinned
-from vehicle_agent.localise.kernels import point_fits
-from vehicle_agent.localise.match_map import MatchMap
-from vehicle_agent.localise.parameters import LocaliserParameters, RegistrationParameters
-from vehicle_agent.localise.registration import Start, register
+from gnd.gnd_map.se3 import T_from_R_t, T_inverse, exp_so3, transform
+from gnd.vehicle_agent.errors import RegistrationError
+from gnd.vehicle_agent.localise.first_pose import Place
+from gnd.vehicle_agent.localise.initialise import Around, search, thinned
+from gnd.vehicle_agent.localise.kernels import point_fits
+from gnd.vehicle_agent.localise.match_map import MatchMap
+from gnd.vehicle_agent.localise.parameters import LocaliserParameters, RegistrationParameters
+from gnd.vehicle_agent.localise.registration import Start, register
 
 F64 = NDArray[np.float64]
 I64 = NDArray[np.int64]

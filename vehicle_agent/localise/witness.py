@@ -10,9 +10,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from gnd_map.jit import kernel
-from vehicle_agent.localise.doubt_parameters import WitnessParameters
-from vehicle_agent.localise.match_map import MatchMap
+from gnd.gnd_map.jit import kernel
+from gnd.vehicle_agent.localise.doubt_parameters import WitnessParameters
+from gnd.vehicle_agent.localise.match_map import MatchMap
 
 F64 = NDArray[np.float64]
 I32 = NDArray[np.int32]

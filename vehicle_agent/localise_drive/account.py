@@ -7,11 +7,11 @@ import numpy as np
 from rich.console import Console
 from rich.table import Table
 
-from vehicle_agent.localise.consistency import nees_of
-from vehicle_agent.localise.estimates import PoseEstimate
-from vehicle_agent.localise_drive.accuracy import LIMITS, error_series, error_summary, healthy, limits_json
-from vehicle_agent.localise_drive.run import LocalisedDrive
-from vehicle_agent.localise_drive.stretches import Stretch, health_shares, stretches_of
+from gnd.vehicle_agent.localise.consistency import nees_of
+from gnd.vehicle_agent.localise.estimates import PoseEstimate
+from gnd.vehicle_agent.localise_drive.accuracy import LIMITS, error_series, error_summary, healthy, limits_json
+from gnd.vehicle_agent.localise_drive.run import LocalisedDrive
+from gnd.vehicle_agent.localise_drive.stretches import Stretch, health_shares, stretches_of
 
 SHOWN_STRETCHES: Final = 30
 STYLES: Final = {"good": "green", "degraded": "yellow", "lost": "red"}

@@ -6,10 +6,10 @@ from typing import Any, Final
 
 import numpy as np
 
-from gnd_map.arrays import F64, I64
-from gnd_map.motion import Trajectory
-from gnd_map.se3 import T_inverse
-from vehicle_agent.localise.estimates import PoseEstimate
+from gnd.gnd_map.arrays import F64, I64
+from gnd.gnd_map.motion import Trajectory
+from gnd.gnd_map.se3 import T_inverse
+from gnd.vehicle_agent.localise.estimates import PoseEstimate
 
 
 @dataclass(frozen=True, slots=True)

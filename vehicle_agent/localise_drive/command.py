@@ -15,16 +15,16 @@ import click
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
-from tile_store.arguments import parse_time_ns
-from tile_store.sqlite_store import SqliteStore
-from tile_store.values import DEFAULT_LAYER
-from vehicle_agent.errors import LocaliseError
-from vehicle_agent.localise.parameters import LocaliserParameters
-from vehicle_agent.localise_drive.account import print_account, summary
-from vehicle_agent.localise_drive.outputs import FORMATS, make_folder, write_outputs
-from vehicle_agent.localise_drive.run import LocalisedDrive, check_is_drive, localise_drive
-from vehicle_agent.localise_drive.stretches import stretches_of
-from vehicle_agent.localise_drive.tiles import StoreMap
+from gnd.tile_store.arguments import parse_time_ns
+from gnd.tile_store.sqlite_store import SqliteStore
+from gnd.tile_store.values import DEFAULT_LAYER
+from gnd.vehicle_agent.errors import LocaliseError
+from gnd.vehicle_agent.localise.parameters import LocaliserParameters
+from gnd.vehicle_agent.localise_drive.account import print_account, summary
+from gnd.vehicle_agent.localise_drive.outputs import FORMATS, make_folder, write_outputs
+from gnd.vehicle_agent.localise_drive.run import LocalisedDrive, check_is_drive, localise_drive
+from gnd.vehicle_agent.localise_drive.stretches import stretches_of
+from gnd.vehicle_agent.localise_drive.tiles import StoreMap
 
 INTERRUPTED = 130
 
@@ -58,7 +58,7 @@ def localise(
         values = {"map": str(store), "layer": layer, "at": at, "submaps": not without_submaps} | summary(found)
         written = write_outputs(found, values, folder, chosen)
         if not no_plots:
-            from vehicle_agent.localise_drive.pictures import draw_pictures  # it loads matplotlib
+            from gnd.vehicle_agent.localise_drive.pictures import draw_pictures  # it loads matplotlib
 
             written += draw_pictures(found, tiles, folder)
         interrupted = stop.is_set()

@@ -11,12 +11,12 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 
-from gnd_map.arrays import F64, I64
-from vehicle_agent.localise.estimates import PoseEstimate
-from vehicle_agent.localise_drive.accuracy import LIMITS, ErrorSeries, Limit, error_series, healthy
-from vehicle_agent.localise_drive.run import LocalisedDrive
-from vehicle_agent.localise_drive.stretches import HEALTHS, Stretch, stretches_of
-from vehicle_agent.localise_drive.style import (
+from gnd.gnd_map.arrays import F64, I64
+from gnd.vehicle_agent.localise.estimates import PoseEstimate
+from gnd.vehicle_agent.localise_drive.accuracy import LIMITS, ErrorSeries, Limit, error_series, healthy
+from gnd.vehicle_agent.localise_drive.run import LocalisedDrive
+from gnd.vehicle_agent.localise_drive.stretches import HEALTHS, Stretch, stretches_of
+from gnd.vehicle_agent.localise_drive.style import (
     HEALTH_COLOURS,
     INK,
     MUTED,

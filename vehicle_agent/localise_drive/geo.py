@@ -6,11 +6,11 @@ from typing import Any, Final
 
 import numpy as np
 
-from gnd_map.arrays import F64
-from vehicle_agent.localise.estimates import PoseEstimate
-from vehicle_agent.localise_drive.accuracy import ErrorSeries, error_series
-from vehicle_agent.localise_drive.run import LocalisedDrive, Moment, trajectory_of
-from vehicle_agent.localise_drive.stretches import Stretch, stretches_of
+from gnd.gnd_map.arrays import F64
+from gnd.vehicle_agent.localise.estimates import PoseEstimate
+from gnd.vehicle_agent.localise_drive.accuracy import ErrorSeries, error_series
+from gnd.vehicle_agent.localise_drive.run import LocalisedDrive, Moment, trajectory_of
+from gnd.vehicle_agent.localise_drive.stretches import Stretch, stretches_of
 
 COLUMNS: Final = (
     "t_ns", "t_s", "way_m", "latitude_deg", "longitude_deg", "height_m", "heading_deg", "sigma_m", "sigma_deg",

@@ -12,13 +12,13 @@ from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 from matplotlib.patheffects import withStroke
 
-from gnd_map.arrays import F64
-from vehicle_agent.localise_drive.curves import GAP_NS
-from vehicle_agent.localise_drive.map_raster import COLOURS, KINDS, MapRaster
-from vehicle_agent.localise_drive.run import LocalisedDrive, trajectory_of
-from vehicle_agent.localise_drive.stretches import HEALTHS
-from vehicle_agent.localise_drive.style import DPI, FAINT, HEALTH_COLOURS, INK, MUTED, new_figure, save_figure
-from vehicle_agent.localise_drive.tiles import TileSource
+from gnd.gnd_map.arrays import F64
+from gnd.vehicle_agent.localise_drive.curves import GAP_NS
+from gnd.vehicle_agent.localise_drive.map_raster import COLOURS, KINDS, MapRaster
+from gnd.vehicle_agent.localise_drive.run import LocalisedDrive, trajectory_of
+from gnd.vehicle_agent.localise_drive.stretches import HEALTHS
+from gnd.vehicle_agent.localise_drive.style import DPI, FAINT, HEALTH_COLOURS, INK, MUTED, new_figure, save_figure
+from gnd.vehicle_agent.localise_drive.tiles import TileSource
 
 MARGIN_M: Final = 30.0
 _WIDTH_IN: Final = 12.6

@@ -6,11 +6,11 @@ from typing import Final
 import numpy as np
 import numpy.typing as npt
 
-from gnd_map.arrays import F64
-from gnd_map.gaussian import full_matrices
-from gnd_map.geodesy import LocalFrame
-from gnd_map.grid import VoxelGrid
-from gnd_map.tile import Tile
+from gnd.gnd_map.arrays import F64
+from gnd.gnd_map.gaussian import full_matrices
+from gnd.gnd_map.geodesy import LocalFrame
+from gnd.gnd_map.grid import VoxelGrid
+from gnd.gnd_map.tile import Tile
 
 GROUND, WALL, OTHER = 0, 1, 2
 KINDS: Final = ("ground", "walls", "other")

@@ -20,16 +20,16 @@ from typing import Any, Final
 
 import numpy as np
 
-from gnd_map.arrays import F64
-from gnd_map.motion import Trajectory
-from schemas.poses_mcap import HealthNote, PoseTrack, write_poses_mcap
-from schemas.trajectory_files import write_kitti, write_text, write_times, write_tum
-from vehicle_agent.errors import LocaliseError
-from vehicle_agent.localise.estimates import PoseEstimate
-from vehicle_agent.localise_drive.account import health_json
-from vehicle_agent.localise_drive.geo import csv_text, geojson_text
-from vehicle_agent.localise_drive.run import LocalisedDrive, trajectory_of
-from vehicle_agent.localise_drive.stretches import stretches_of
+from gnd.gnd_map.arrays import F64
+from gnd.gnd_map.motion import Trajectory
+from gnd.schemas.poses_mcap import HealthNote, PoseTrack, write_poses_mcap
+from gnd.schemas.trajectory_files import write_kitti, write_text, write_times, write_tum
+from gnd.vehicle_agent.errors import LocaliseError
+from gnd.vehicle_agent.localise.estimates import PoseEstimate
+from gnd.vehicle_agent.localise_drive.account import health_json
+from gnd.vehicle_agent.localise_drive.geo import csv_text, geojson_text
+from gnd.vehicle_agent.localise_drive.run import LocalisedDrive, trajectory_of
+from gnd.vehicle_agent.localise_drive.stretches import stretches_of
 
 NAMES: Final = (
     "poses.tum", "online.tum", "reference.tum", "poses.kitti", "times.txt", "reference.kitti", "poses.mcap",

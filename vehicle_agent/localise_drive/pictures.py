@@ -2,11 +2,11 @@
 
 from pathlib import Path
 
-from vehicle_agent.localise_drive.accuracy import error_series
-from vehicle_agent.localise_drive.curves import draw_errors, draw_quality
-from vehicle_agent.localise_drive.map_picture import draw_map
-from vehicle_agent.localise_drive.run import LocalisedDrive
-from vehicle_agent.localise_drive.tiles import TileSource
+from gnd.vehicle_agent.localise_drive.accuracy import error_series
+from gnd.vehicle_agent.localise_drive.curves import draw_errors, draw_quality
+from gnd.vehicle_agent.localise_drive.map_picture import draw_map
+from gnd.vehicle_agent.localise_drive.run import LocalisedDrive
+from gnd.vehicle_agent.localise_drive.tiles import TileSource
 
 
 def draw_pictures(drive: LocalisedDrive, tiles: TileSource, folder: Path) -> list[Path]:

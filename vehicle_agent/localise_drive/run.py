@@ -9,26 +9,26 @@ from typing import Final
 
 import numpy as np
 
-from gnd_map.arrays import F64
-from gnd_map.geodesy import LocalFrame
-from gnd_map.grid import GridFrame
-from gnd_map.motion import Trajectory
-from gnd_map.tile_id import TileId
-from schemas.drive import DriveHeader, DriveItem, DriveTrack, GnssFix, GnssTrack, MotionSample, Scan
-from schemas.drive_mcap import drive_counts, load_track, read_drive, read_header
-from schemas.errors import SchemaError
-from schemas.sweep_distortion import distortion_of
-from vehicle_agent.config import DownloadParameters
-from vehicle_agent.errors import LocaliseError
-from vehicle_agent.local_map import LocalMap
-from vehicle_agent.localise.calibration import MotionCalibration
-from vehicle_agent.localise.estimates import Cause, Health, PoseEstimate, RefinedScan
-from vehicle_agent.localise.localiser import Localiser
-from vehicle_agent.localise.parameters import LocaliserParameters
-from vehicle_agent.localise.remount import header_sigma
-from vehicle_agent.localise_drive.tiles import MapAround, StoreMap
-from vehicle_agent.place import Place
-from vehicle_agent.scans import Guard
+from gnd.gnd_map.arrays import F64
+from gnd.gnd_map.geodesy import LocalFrame
+from gnd.gnd_map.grid import GridFrame
+from gnd.gnd_map.motion import Trajectory
+from gnd.gnd_map.tile_id import TileId
+from gnd.schemas.drive import DriveHeader, DriveItem, DriveTrack, GnssFix, GnssTrack, MotionSample, Scan
+from gnd.schemas.drive_mcap import drive_counts, load_track, read_drive, read_header
+from gnd.schemas.errors import SchemaError
+from gnd.schemas.sweep_distortion import distortion_of
+from gnd.vehicle_agent.config import DownloadParameters
+from gnd.vehicle_agent.errors import LocaliseError
+from gnd.vehicle_agent.local_map import LocalMap
+from gnd.vehicle_agent.localise.calibration import MotionCalibration
+from gnd.vehicle_agent.localise.estimates import Cause, Health, PoseEstimate, RefinedScan
+from gnd.vehicle_agent.localise.localiser import Localiser
+from gnd.vehicle_agent.localise.parameters import LocaliserParameters
+from gnd.vehicle_agent.localise.remount import header_sigma
+from gnd.vehicle_agent.localise_drive.tiles import MapAround, StoreMap
+from gnd.vehicle_agent.place import Place
+from gnd.vehicle_agent.scans import Guard
 
 DRIVE_ENDING: Final = ".mcap"
 
@@ -155,7 +155,7 @@ class _Record:
 
 
 class _Run:
-    """The parts of `vehicle_agent.vehicle` that localisation needs; the map frame is that of the first tile."""
+    """The parts of `gnd.vehicle_agent.vehicle` that localisation needs; the map frame is that of the first tile."""
 
     def __init__(self, header: DriveHeader, fix: GnssFix, tiles: StoreMap, parameters: LocaliserParameters) -> None:
         start = TileId.from_geodetic(fix.lat_rad, fix.lon_rad)

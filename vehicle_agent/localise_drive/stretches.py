@@ -5,8 +5,8 @@ from dataclasses import dataclass
 from itertools import groupby
 from typing import Any, Final
 
-from vehicle_agent.localise.estimates import Cause, Health
-from vehicle_agent.localise_drive.run import Moment
+from gnd.vehicle_agent.localise.estimates import Cause, Health
+from gnd.vehicle_agent.localise_drive.run import Moment
 
 HEALTHS: Final[tuple[Health, ...]] = ("good", "degraded", "lost")
 

@@ -6,8 +6,8 @@ from typing import Any, Final
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from vehicle_agent.errors import LocaliseError
-from vehicle_agent.localise_drive.stretches import Stretch
+from gnd.vehicle_agent.errors import LocaliseError
+from gnd.vehicle_agent.localise_drive.stretches import Stretch
 
 INK: Final = "#1c2430"
 MUTED: Final = "#5a6675"

@@ -5,18 +5,18 @@ from typing import Final, Protocol
 
 import numpy as np
 
-from gnd_map.arrays import F64
-from gnd_map.errors import TileError
-from gnd_map.geodesy import LocalFrame
-from gnd_map.tile import Tile
-from gnd_map.tile_id import TileId, covering_corridor
-from tile_store.store import Store
-from tile_store.values import DEFAULT_LAYER
-from vehicle_agent.config import DownloadParameters
-from vehicle_agent.errors import LocaliseError
-from vehicle_agent.local_map import LocalMap
-from vehicle_agent.place import Place
-from vehicle_agent.surroundings import FLOORS_ABOVE, FLOORS_BELOW, STEP_M, left_behind, tiles_along
+from gnd.gnd_map.arrays import F64
+from gnd.gnd_map.errors import TileError
+from gnd.gnd_map.geodesy import LocalFrame
+from gnd.gnd_map.tile import Tile
+from gnd.gnd_map.tile_id import TileId, covering_corridor
+from gnd.tile_store.store import Store
+from gnd.tile_store.values import DEFAULT_LAYER
+from gnd.vehicle_agent.config import DownloadParameters
+from gnd.vehicle_agent.errors import LocaliseError
+from gnd.vehicle_agent.local_map import LocalMap
+from gnd.vehicle_agent.place import Place
+from gnd.vehicle_agent.surroundings import FLOORS_ABOVE, FLOORS_BELOW, STEP_M, left_behind, tiles_along
 
 
 class TileSource(Protocol):

@@ -11,11 +11,11 @@ from typing import Final
 
 import numpy as np
 
-from gnd_map.arrays import F64, I64
-from gnd_map.motion import Trajectory
-from gnd_map.se3 import T_inverse, transform
-from vehicle_agent.localise.match_map import MatchMap
-from vehicle_agent.map_build.survey import DriveSurvey
+from gnd.gnd_map.arrays import F64, I64
+from gnd.gnd_map.motion import Trajectory
+from gnd.gnd_map.se3 import T_inverse, transform
+from gnd.vehicle_agent.localise.match_map import MatchMap
+from gnd.vehicle_agent.map_build.survey import DriveSurvey
 
 EVERY_M: Final = 10.0
 CLOUD_M, MAP_M = 10.0, 35.0

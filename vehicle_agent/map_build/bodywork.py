@@ -11,7 +11,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from gnd_map.arrays import F64
+from gnd.gnd_map.arrays import F64
 
 Mask = NDArray[np.bool_]
 

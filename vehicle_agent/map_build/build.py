@@ -13,11 +13,11 @@ from typing import Final
 
 import numpy as np
 
-from gnd_map.accumulate import N_MIN_CELLS
-from gnd_map.arrays import F64
-from gnd_map.se3 import T_inverse, transform
-from gnd_map.tile import Tile
-from tile_store.build import (
+from gnd.gnd_map.accumulate import N_MIN_CELLS
+from gnd.gnd_map.arrays import F64
+from gnd.gnd_map.se3 import T_inverse, transform
+from gnd.gnd_map.tile import Tile
+from gnd.tile_store.build import (
     BuildError,
     BuildParameters,
     MapPoints,
@@ -27,14 +27,14 @@ from tile_store.build import (
     put_map,
     surveyed_ns,
 )
-from tile_store.store import Store
-from tile_store.values import DEFAULT_CODEC, DEFAULT_LAYER
-from vehicle_agent.localise.estimates import RefinedScan
-from vehicle_agent.map_build.bodywork import HIGH_M, LOW_M, Bodywork
-from vehicle_agent.map_build.placed_scans import NoPose, drive_scans, placed, why_no_pose
-from vehicle_agent.map_build.refine_poses import PosesReport, RefineMode, refine_poses
-from vehicle_agent.map_build.survey import DriveSurvey, Progress, look_over
-from vehicle_agent.segment import MotionSegmenter, SegmentedScan, SegmentParameters
+from gnd.tile_store.store import Store
+from gnd.tile_store.values import DEFAULT_CODEC, DEFAULT_LAYER
+from gnd.vehicle_agent.localise.estimates import RefinedScan
+from gnd.vehicle_agent.map_build.bodywork import HIGH_M, LOW_M, Bodywork
+from gnd.vehicle_agent.map_build.placed_scans import NoPose, drive_scans, placed, why_no_pose
+from gnd.vehicle_agent.map_build.refine_poses import PosesReport, RefineMode, refine_poses
+from gnd.vehicle_agent.map_build.survey import DriveSurvey, Progress, look_over
+from gnd.vehicle_agent.segment import MotionSegmenter, SegmentedScan, SegmentParameters
 
 MOVERS: Final = SegmentParameters(range_max_m=80.0)
 """As on the vehicle, but as far as points are taken."""

@@ -14,8 +14,8 @@ from typing import Final
 import numpy as np
 import numpy.typing as npt
 
-from gnd_map.arrays import I32, I64
-from gnd_map.jit import kernel
+from gnd.gnd_map.arrays import I32, I64
+from gnd.gnd_map.jit import kernel
 
 CELL_M: Final = 0.1
 THICK: Final = 3

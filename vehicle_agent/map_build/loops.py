@@ -11,14 +11,14 @@ from typing import Final
 
 import numpy as np
 
-from gnd_map.arrays import F64
-from gnd_map.se3 import T_inverse, log_so3
-from vehicle_agent.errors import RegistrationError
-from vehicle_agent.localise.initialise import Around, Candidate, near_pose, search
-from vehicle_agent.localise.match_map import MatchMap
-from vehicle_agent.localise.parameters import InitialiseParameters, RegistrationParameters
-from vehicle_agent.localise.registration import register
-from vehicle_agent.map_build.anchors import Anchors
+from gnd.gnd_map.arrays import F64
+from gnd.gnd_map.se3 import T_inverse, log_so3
+from gnd.vehicle_agent.errors import RegistrationError
+from gnd.vehicle_agent.localise.initialise import Around, Candidate, near_pose, search
+from gnd.vehicle_agent.localise.match_map import MatchMap
+from gnd.vehicle_agent.localise.parameters import InitialiseParameters, RegistrationParameters
+from gnd.vehicle_agent.localise.registration import register
+from gnd.vehicle_agent.map_build.anchors import Anchors
 
 APART_M: Final = 60.0
 """Way between two anchors of one drive from which on they are two passes: their maps share no scan."""

@@ -5,12 +5,12 @@ from typing import Final, Literal
 
 import numpy as np
 
-from gnd_map.motion import TOLERANCE_NS, Trajectory, deskew
-from gnd_map.se3 import transform
-from schemas.drive import Scan
-from schemas.drive_mcap import read_drive
-from tile_store.build import Source
-from vehicle_agent.localise.estimates import PoseEstimate, RefinedScan
+from gnd.gnd_map.motion import TOLERANCE_NS, Trajectory, deskew
+from gnd.gnd_map.se3 import transform
+from gnd.schemas.drive import Scan
+from gnd.schemas.drive_mcap import read_drive
+from gnd.tile_store.build import Source
+from gnd.vehicle_agent.localise.estimates import PoseEstimate, RefinedScan
 
 NoPose = Literal["before the first pose", "after the last pose", "without a point in range"]
 REASONS: Final[tuple[NoPose, ...]] = ("before the first pose", "after the last pose", "without a point in range")

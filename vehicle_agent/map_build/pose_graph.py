@@ -12,10 +12,10 @@ import gtsam
 import numpy as np
 from numpy.typing import NDArray
 
-from gnd_map.arrays import F64, I64
-from gnd_map.motion import Trajectory
-from gnd_map.se3 import T_inverse, exp_so3, log_so3
-from vehicle_agent.map_build.loops import Loop
+from gnd.gnd_map.arrays import F64, I64
+from gnd.gnd_map.motion import Trajectory
+from gnd.gnd_map.se3 import T_inverse, exp_so3, log_so3
+from gnd.vehicle_agent.map_build.loops import Loop
 
 STEP_SHARE, STEP_M = 0.01, 0.01
 """One sigma of an odometry step along each axis: of its length, and at least."""

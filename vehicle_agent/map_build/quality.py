@@ -7,15 +7,15 @@ from typing import Final
 
 import numpy as np
 
-from gnd_map.arrays import F64
-from gnd_map.geodesy import LocalFrame
-from gnd_map.grid import VoxelGrid
-from gnd_map.se3 import transform
-from gnd_map.tile import Tile
-from vehicle_agent.map_build.build import BuiltMap
-from vehicle_agent.map_build.double_layers import DoubleLayers, find_double_layers
-from vehicle_agent.map_build.placed_scans import NoPose
-from vehicle_agent.map_build.survey import DriveSurvey
+from gnd.gnd_map.arrays import F64
+from gnd.gnd_map.geodesy import LocalFrame
+from gnd.gnd_map.grid import VoxelGrid
+from gnd.gnd_map.se3 import transform
+from gnd.gnd_map.tile import Tile
+from gnd.vehicle_agent.map_build.build import BuiltMap
+from gnd.vehicle_agent.map_build.double_layers import DoubleLayers, find_double_layers
+from gnd.vehicle_agent.map_build.placed_scans import NoPose
+from gnd.vehicle_agent.map_build.survey import DriveSurvey
 
 WALLS, ROAD = (0, 1), (2,)
 

@@ -10,14 +10,14 @@ from typing import Final, Literal
 
 import numpy as np
 
-from gnd_map.arrays import F64
-from gnd_map.motion import Trajectory
-from gnd_map.se3 import T_inverse, log_so3, transform
-from tile_store.build import Source
-from vehicle_agent.map_build.anchors import EVERY_M, Anchors
-from vehicle_agent.map_build.loops import Loop, LoopCounts, find_loops, pairs, sigma_between
-from vehicle_agent.map_build.pose_graph import GNSS_CORRELATION_S, Fixes, bent, solve
-from vehicle_agent.map_build.survey import DriveSurvey, Progress
+from gnd.gnd_map.arrays import F64
+from gnd.gnd_map.motion import Trajectory
+from gnd.gnd_map.se3 import T_inverse, log_so3, transform
+from gnd.tile_store.build import Source
+from gnd.vehicle_agent.map_build.anchors import EVERY_M, Anchors
+from gnd.vehicle_agent.map_build.loops import Loop, LoopCounts, find_loops, pairs, sigma_between
+from gnd.vehicle_agent.map_build.pose_graph import GNSS_CORRELATION_S, Fixes, bent, solve
+from gnd.vehicle_agent.map_build.survey import DriveSurvey, Progress
 
 RefineMode = Literal["auto", "always", "never"]
 MODES: Final[tuple[RefineMode, ...]] = ("auto", "always", "never")

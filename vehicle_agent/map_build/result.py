@@ -6,10 +6,10 @@ from typing import Any
 
 import numpy as np
 
-from vehicle_agent.map_build.build import BuiltMap
-from vehicle_agent.map_build.double_layers import DoubleLayers
-from vehicle_agent.map_build.placed_scans import NoPose
-from vehicle_agent.map_build.quality import Quality
+from gnd.vehicle_agent.map_build.build import BuiltMap
+from gnd.vehicle_agent.map_build.double_layers import DoubleLayers
+from gnd.vehicle_agent.map_build.placed_scans import NoPose
+from gnd.vehicle_agent.map_build.quality import Quality
 
 
 def summary(built: BuiltMap, quality: Quality) -> dict[str, Any]:

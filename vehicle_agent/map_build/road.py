@@ -4,7 +4,7 @@ from typing import Final
 
 import numpy as np
 
-from gnd_map.arrays import F64
+from gnd.gnd_map.arrays import F64
 
 RING_M: Final = (2.5, 15.0)
 """Where the ground is looked for, from the LiDAR, horizontally."""

@@ -6,16 +6,16 @@ from typing import Final
 
 import numpy as np
 
-from gnd_map.arrays import F32, F64, I64
-from gnd_map.motion import Trajectory
-from gnd_map.se3 import T_inverse, transform
-from schemas.drive import Scan
-from tile_store.build import BuildParameters, Source
-from vehicle_agent.localise.parameters import SamplingParameters
-from vehicle_agent.localise.sampling import sample_scan
-from vehicle_agent.map_build.bodywork import EVERY_M, Bodywork, BodyworkSurvey
-from vehicle_agent.map_build.placed_scans import drive_scans, middle_ns, placed, why_no_pose
-from vehicle_agent.map_build.road import road_below
+from gnd.gnd_map.arrays import F32, F64, I64
+from gnd.gnd_map.motion import Trajectory
+from gnd.gnd_map.se3 import T_inverse, transform
+from gnd.schemas.drive import Scan
+from gnd.tile_store.build import BuildParameters, Source
+from gnd.vehicle_agent.localise.parameters import SamplingParameters
+from gnd.vehicle_agent.localise.sampling import sample_scan
+from gnd.vehicle_agent.map_build.bodywork import EVERY_M, Bodywork, BodyworkSurvey
+from gnd.vehicle_agent.map_build.placed_scans import drive_scans, middle_ns, placed, why_no_pose
+from gnd.vehicle_agent.map_build.road import road_below
 
 Progress = Callable[[str, int, int], None]
 """Called with what is done, how much of it is, and of how much."""

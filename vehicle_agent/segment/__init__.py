@@ -1,6 +1,6 @@
 """Motion segmentation: points on moving objects are found before evidence is counted ([50] in GND)."""
 
-from vehicle_agent.segment.parameters import SegmentParameterError, SegmentParameters
-from vehicle_agent.segment.segmenter import MotionSegmenter, SegmentedScan
+from gnd.vehicle_agent.segment.parameters import SegmentParameterError, SegmentParameters
+from gnd.vehicle_agent.segment.segmenter import MotionSegmenter, SegmentedScan
 
 __all__ = ["MotionSegmenter", "SegmentParameterError", "SegmentParameters", "SegmentedScan"]

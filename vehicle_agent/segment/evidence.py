@@ -3,7 +3,7 @@
 import numpy as np
 from numpy.typing import NDArray
 
-from gnd_map.arrays import F64
+from gnd.gnd_map.arrays import F64
 
 U8 = NDArray[np.uint8]
 

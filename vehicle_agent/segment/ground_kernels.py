@@ -9,8 +9,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from gnd_map.arrays import F32, F64
-from gnd_map.jit import kernel
+from gnd.gnd_map.arrays import F32, F64
+from gnd.gnd_map.jit import kernel
 
 PIT_M = 0.3
 REACH_CELLS = 5

@@ -6,9 +6,9 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from gnd_map.arrays import F32, F64, I32
-from gnd_map.jit import kernel
-from vehicle_agent.segment.voxel_kernels import GROUND, LOW
+from gnd.gnd_map.arrays import F32, F64, I32
+from gnd.gnd_map.jit import kernel
+from gnd.vehicle_agent.segment.voxel_kernels import GROUND, LOW
 
 U16 = NDArray[np.uint16]
 U8 = NDArray[np.uint8]

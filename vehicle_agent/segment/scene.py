@@ -6,12 +6,12 @@ from math import ceil, radians, tan
 import numpy as np
 from numpy.typing import NDArray
 
-from gnd_map.arrays import F32, F64, I32
-from vehicle_agent.segment.evidence import WEIGHTS
-from vehicle_agent.segment.ground_kernels import Grid, ground_heights, lowest_heights, remember_ground
-from vehicle_agent.segment.image_kernels import Judge, Optics, draw_image, elevation_span, layer_gap, vote
-from vehicle_agent.segment.parameters import SegmentParameters
-from vehicle_agent.segment.voxel_kernels import find_objects
+from gnd.gnd_map.arrays import F32, F64, I32
+from gnd.vehicle_agent.segment.evidence import WEIGHTS
+from gnd.vehicle_agent.segment.ground_kernels import Grid, ground_heights, lowest_heights, remember_ground
+from gnd.vehicle_agent.segment.image_kernels import Judge, Optics, draw_image, elevation_span, layer_gap, vote
+from gnd.vehicle_agent.segment.parameters import SegmentParameters
+from gnd.vehicle_agent.segment.voxel_kernels import find_objects
 
 U8 = NDArray[np.uint8]
 U16 = NDArray[np.uint16]

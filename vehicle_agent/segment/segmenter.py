@@ -7,12 +7,20 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from gnd_map.arrays import F32, F64
-from vehicle_agent.localise.estimates import PoseEstimate, RefinedScan
-from vehicle_agent.segment.evidence import belief
-from vehicle_agent.segment.parameters import SegmentParameters
-from vehicle_agent.segment.scene import GroundMap, Objects, RangeImage, find_all_objects, hash_table, image_of, judge_of
-from vehicle_agent.segment.voxel_kernels import components, moving_points
+from gnd.gnd_map.arrays import F32, F64
+from gnd.vehicle_agent.localise.estimates import PoseEstimate, RefinedScan
+from gnd.vehicle_agent.segment.evidence import belief
+from gnd.vehicle_agent.segment.parameters import SegmentParameters
+from gnd.vehicle_agent.segment.scene import (
+    GroundMap,
+    Objects,
+    RangeImage,
+    find_all_objects,
+    hash_table,
+    image_of,
+    judge_of,
+)
+from gnd.vehicle_agent.segment.voxel_kernels import components, moving_points
 
 I16 = NDArray[np.int16]
 Mask = NDArray[np.bool_]

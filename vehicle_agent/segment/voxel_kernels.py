@@ -5,9 +5,9 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from gnd_map.arrays import F32, I32
-from gnd_map.jit import kernel
-from vehicle_agent.segment.ground_kernels import Grid
+from gnd.gnd_map.arrays import F32, I32
+from gnd.gnd_map.jit import kernel
+from gnd.vehicle_agent.segment.ground_kernels import Grid
 
 I64 = NDArray[np.int64]
 U8 = NDArray[np.uint8]

@@ -10,7 +10,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from gnd_map.arrays import F64
+from gnd.gnd_map.arrays import F64
 
 
 class Springs(NamedTuple):

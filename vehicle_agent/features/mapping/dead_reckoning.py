@@ -8,9 +8,9 @@ from typing import NamedTuple
 
 import numpy as np
 
-from gnd_map.arrays import F64, I64
-from schemas.drive import MotionTrack
-from vehicle_agent.features.mapping.parameters import MotionNoise
+from gnd.gnd_map.arrays import F64, I64
+from gnd.schemas.drive import MotionTrack
+from gnd.vehicle_agent.features.mapping.parameters import MotionNoise
 
 GAP_S = 0.1  # samples farther apart leave something unknown between them
 LEAST_M2, LEAST_RAD2 = 1e-6, 1e-9  # variances of a step: stiffer ones leave the graph ill-conditioned

@@ -4,13 +4,20 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from gnd_map.arrays import F64, I64
-from vehicle_agent.features.mapping.dead_reckoning import DeadReckoning, composed, relative, rotated
-from vehicle_agent.features.mapping.feature_drive import FeatureDrive, Fixes, KnownPoses
-from vehicle_agent.features.mapping.graph import solve
-from vehicle_agent.features.mapping.graph_edges import NO_FIX_NODES, NO_MATCHES, FixNodes, PoseMatches, Problem, State
-from vehicle_agent.features.mapping.landmarks import Sight
-from vehicle_agent.features.mapping.parameters import GnssNoise, NewLayerParameters
+from gnd.gnd_map.arrays import F64, I64
+from gnd.vehicle_agent.features.mapping.dead_reckoning import DeadReckoning, composed, relative, rotated
+from gnd.vehicle_agent.features.mapping.feature_drive import FeatureDrive, Fixes, KnownPoses
+from gnd.vehicle_agent.features.mapping.graph import solve
+from gnd.vehicle_agent.features.mapping.graph_edges import (
+    NO_FIX_NODES,
+    NO_MATCHES,
+    FixNodes,
+    PoseMatches,
+    Problem,
+    State,
+)
+from gnd.vehicle_agent.features.mapping.landmarks import Sight
+from gnd.vehicle_agent.features.mapping.parameters import GnssNoise, NewLayerParameters
 
 SMOOTHINGS = 2  # of motion and fixes, each with the wheel scale and gyro bias of the one before
 CHORD_M = 60.0  # GNSS tells a direction over so long a way

@@ -7,16 +7,16 @@ from typing import Any, Final, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from gnd_map.arrays import F64, I64, check_array
-from gnd_map.geodesy import LocalFrame
-from schemas.drive import Detections, DriveItem, LaneLook, MotionTrack, track_of
-from vehicle_agent.errors import NewLayerError
+from gnd.gnd_map.arrays import F64, I64, check_array
+from gnd.gnd_map.geodesy import LocalFrame
+from gnd.schemas.drive import Detections, DriveItem, LaneLook, MotionTrack, track_of
+from gnd.vehicle_agent.errors import NewLayerError
 
 EDGE_NS: Final = 100_000_000
 
 
 class PolarLook(Protocol):
-    """One look at features, N found: `schemas.drive.Detections`, or any other value with these columns."""
+    """One look at features, N found: `gnd.schemas.drive.Detections`, or any other value with these columns."""
 
     @property
     def t_ns(self) -> int:

@@ -14,11 +14,11 @@ from typing import Any
 import gtsam
 import numpy as np
 
-from gnd_map.arrays import F64, I64
-from vehicle_agent.errors import NewLayerError
-from vehicle_agent.features.mapping.bias_chain import gauss_markov_springs
-from vehicle_agent.features.mapping.graph_edges import Anchors, FixNodes, PoseMatches, Problem, State, Ties
-from vehicle_agent.features.mapping.parameters import NewLayerParameters
+from gnd.gnd_map.arrays import F64, I64
+from gnd.vehicle_agent.errors import NewLayerError
+from gnd.vehicle_agent.features.mapping.bias_chain import gauss_markov_springs
+from gnd.vehicle_agent.features.mapping.graph_edges import Anchors, FixNodes, PoseMatches, Problem, State, Ties
+from gnd.vehicle_agent.features.mapping.parameters import NewLayerParameters
 
 CALIBRATION = gtsam.symbol("c", 0)
 PINNED_RAD = 1e-3  # sigma of the rotation of what has none

@@ -5,8 +5,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from gnd_map.arrays import F64, I64
-from vehicle_agent.features.mapping.dead_reckoning import Steps
+from gnd.gnd_map.arrays import F64, I64
+from gnd.vehicle_agent.features.mapping.dead_reckoning import Steps
 
 
 class FixNodes(NamedTuple):

@@ -6,13 +6,13 @@ from typing import Final
 
 import numpy as np
 
-from gnd_map.arrays import F64
-from gnd_map.features import CUT_START, Feature, FeatureTile
-from gnd_map.geodesy import LocalFrame
-from gnd_map.tile_id import TileId
-from vehicle_agent.features.feature_map import features_in_map
-from vehicle_agent.features.look import MapFeatures
-from vehicle_agent.features.mapping.lane_map import LaneMap
+from gnd.gnd_map.arrays import F64
+from gnd.gnd_map.features import CUT_START, Feature, FeatureTile
+from gnd.gnd_map.geodesy import LocalFrame
+from gnd.gnd_map.tile_id import TileId
+from gnd.vehicle_agent.features.feature_map import features_in_map
+from gnd.vehicle_agent.features.look import MapFeatures
+from gnd.vehicle_agent.features.mapping.lane_map import LaneMap
 
 LANES: Final = "lanes"
 LEAST_LANE_M: Final = 5.0

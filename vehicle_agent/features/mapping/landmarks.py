@@ -11,13 +11,13 @@ from typing import NamedTuple
 
 import numpy as np
 
-from gnd_map.arrays import F64, I64
-from vehicle_agent.features.mapping.dead_reckoning import composed, relative, rotated, wrapped
-from vehicle_agent.features.mapping.feature_drive import Measurements
-from vehicle_agent.features.mapping.graph import bearing_range
-from vehicle_agent.features.mapping.graph_edges import Ties
-from vehicle_agent.features.mapping.parameters import LandmarkParameters
-from vehicle_agent.features.slamcu.association import FORBIDDEN, associate
+from gnd.gnd_map.arrays import F64, I64
+from gnd.vehicle_agent.features.mapping.dead_reckoning import composed, relative, rotated, wrapped
+from gnd.vehicle_agent.features.mapping.feature_drive import Measurements
+from gnd.vehicle_agent.features.mapping.graph import bearing_range
+from gnd.vehicle_agent.features.mapping.graph_edges import Ties
+from gnd.vehicle_agent.features.mapping.parameters import LandmarkParameters
+from gnd.vehicle_agent.features.slamcu.association import FORBIDDEN, associate
 
 NONE = -1  # a measurement of no feature
 FAR_M = 25.0  # a feature farther than this from a measurement's place is not looked at

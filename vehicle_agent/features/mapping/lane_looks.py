@@ -13,11 +13,11 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from gnd_map.arrays import F64, I64
-from schemas.drive import LaneLook
-from vehicle_agent.features.mapping.dead_reckoning import composed, rotated
-from vehicle_agent.features.mapping.lane_map import SAMPLE_M, LaneMap
-from vehicle_agent.features.mapping.parameters import LaneParameters
+from gnd.gnd_map.arrays import F64, I64
+from gnd.schemas.drive import LaneLook
+from gnd.vehicle_agent.features.mapping.dead_reckoning import composed, rotated
+from gnd.vehicle_agent.features.mapping.lane_map import SAMPLE_M, LaneMap
+from gnd.vehicle_agent.features.mapping.parameters import LaneParameters
 
 POINTS = 8  # of a polyline that are compared with the map
 MAX_LANES = 8  # beside each other that are looked at

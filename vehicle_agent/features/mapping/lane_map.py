@@ -9,8 +9,8 @@ import small_gicp
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from gnd_map.arrays import F64, I64, check_array
-from vehicle_agent.errors import NewLayerError
+from gnd.gnd_map.arrays import F64, I64, check_array
+from gnd.vehicle_agent.errors import NewLayerError
 
 SAMPLE_M = 0.1
 RIBBON_M = (-0.05, 0.05)

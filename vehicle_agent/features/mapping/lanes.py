@@ -12,14 +12,14 @@ from typing import NamedTuple
 import gtsam
 import numpy as np
 
-from gnd_map.arrays import F64, I64
-from schemas.drive import LaneLook
-from vehicle_agent.features.mapping.dead_reckoning import composed, relative, rotated
-from vehicle_agent.features.mapping.drive_nodes import DriveNodes, nearest
-from vehicle_agent.features.mapping.graph_edges import NO_MATCHES, PoseMatches
-from vehicle_agent.features.mapping.lane_looks import Offsets, Polylines, choices, offsets
-from vehicle_agent.features.mapping.lane_map import LaneMap, gicp
-from vehicle_agent.features.mapping.parameters import LaneParameters
+from gnd.gnd_map.arrays import F64, I64
+from gnd.schemas.drive import LaneLook
+from gnd.vehicle_agent.features.mapping.dead_reckoning import composed, relative, rotated
+from gnd.vehicle_agent.features.mapping.drive_nodes import DriveNodes, nearest
+from gnd.vehicle_agent.features.mapping.graph_edges import NO_MATCHES, PoseMatches
+from gnd.vehicle_agent.features.mapping.lane_looks import Offsets, Polylines, choices, offsets
+from gnd.vehicle_agent.features.mapping.lane_map import LaneMap, gicp
+from gnd.vehicle_agent.features.mapping.parameters import LaneParameters
 
 __all__ = ["LaneMap", "LaneMatcher"]
 

@@ -5,17 +5,17 @@ from math import nan
 
 import numpy as np
 
-from gnd_map.arrays import F64, I64
-from gnd_map.tile_id import TileId
-from schemas.features import FeatureChange, Found, Seen
-from vehicle_agent.features.coverage import Coverage, CoverageParameters
-from vehicle_agent.features.feature_map import features_in_map, place_in_tile, with_height
-from vehicle_agent.features.layer import of_counts
-from vehicle_agent.features.layer_parameters import LayerParameters
-from vehicle_agent.features.mapping.feature_drive import FeatureDrive
-from vehicle_agent.features.mapping.held_map import HeldMap
-from vehicle_agent.features.mapping.new_layer import NewLayer
-from vehicle_agent.features.view import wrapped
+from gnd.gnd_map.arrays import F64, I64
+from gnd.gnd_map.tile_id import TileId
+from gnd.schemas.features import FeatureChange, Found, Seen
+from gnd.vehicle_agent.features.coverage import Coverage, CoverageParameters
+from gnd.vehicle_agent.features.feature_map import features_in_map, place_in_tile, with_height
+from gnd.vehicle_agent.features.layer import of_counts
+from gnd.vehicle_agent.features.layer_parameters import LayerParameters
+from gnd.vehicle_agent.features.mapping.feature_drive import FeatureDrive
+from gnd.vehicle_agent.features.mapping.held_map import HeldMap
+from gnd.vehicle_agent.features.mapping.new_layer import NewLayer
+from gnd.vehicle_agent.features.view import wrapped
 
 
 def changes_of(

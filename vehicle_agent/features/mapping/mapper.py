@@ -12,27 +12,27 @@ from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from typing import Any, Final
 
-from gnd_map.geodesy import LocalFrame
-from gnd_map.tile_id import TileId
-from schemas.drive import DriveHeader, DriveItem, MotionSample, ReferencePose
-from schemas.drive_mcap import read_drive, read_header
-from schemas.errors import SchemaError
-from vehicle_agent.config import AgentConfig
-from vehicle_agent.errors import NewLayerError
-from vehicle_agent.features.download import FeatureDownloader
-from vehicle_agent.features.feature_report import FeatureReporter
-from vehicle_agent.features.layer_parameters import LayerParameters
-from vehicle_agent.features.mapping.feature_drive import FeatureDrive
-from vehicle_agent.features.mapping.held_map import LANES, HeldMap
-from vehicle_agent.features.mapping.mapped import changes_of
-from vehicle_agent.features.mapping.new_layer import map_new_layer
-from vehicle_agent.link import Link, open_link
-from vehicle_agent.place import Place
-from vehicle_agent.report import Identity
-from vehicle_agent.result import write_json
-from vehicle_agent.scans import Guard
-from vehicle_agent.surroundings import tiles_along
-from vehicle_agent.vehicle import first_fix, paced
+from gnd.gnd_map.geodesy import LocalFrame
+from gnd.gnd_map.tile_id import TileId
+from gnd.schemas.drive import DriveHeader, DriveItem, MotionSample, ReferencePose
+from gnd.schemas.drive_mcap import read_drive, read_header
+from gnd.schemas.errors import SchemaError
+from gnd.vehicle_agent.config import AgentConfig
+from gnd.vehicle_agent.errors import NewLayerError
+from gnd.vehicle_agent.features.download import FeatureDownloader
+from gnd.vehicle_agent.features.feature_report import FeatureReporter
+from gnd.vehicle_agent.features.layer_parameters import LayerParameters
+from gnd.vehicle_agent.features.mapping.feature_drive import FeatureDrive
+from gnd.vehicle_agent.features.mapping.held_map import LANES, HeldMap
+from gnd.vehicle_agent.features.mapping.mapped import changes_of
+from gnd.vehicle_agent.features.mapping.new_layer import map_new_layer
+from gnd.vehicle_agent.link import Link, open_link
+from gnd.vehicle_agent.place import Place
+from gnd.vehicle_agent.report import Identity
+from gnd.vehicle_agent.result import write_json
+from gnd.vehicle_agent.scans import Guard
+from gnd.vehicle_agent.surroundings import tiles_along
+from gnd.vehicle_agent.vehicle import first_fix, paced
 
 AHEAD_M: Final = 300.0
 BESIDE_M: Final = 100.0

@@ -9,13 +9,13 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from gnd_map.arrays import F64, I64
-from vehicle_agent.features.look import MapFeatures
-from vehicle_agent.features.mapping.drive_nodes import DriveNodes
-from vehicle_agent.features.mapping.feature_drive import FeatureDrive, Measurements
-from vehicle_agent.features.mapping.graph import Solution, solve
-from vehicle_agent.features.mapping.graph_edges import Anchors, Problem, State
-from vehicle_agent.features.mapping.landmarks import (
+from gnd.gnd_map.arrays import F64, I64
+from gnd.vehicle_agent.features.look import MapFeatures
+from gnd.vehicle_agent.features.mapping.drive_nodes import DriveNodes
+from gnd.vehicle_agent.features.mapping.feature_drive import FeatureDrive, Measurements
+from gnd.vehicle_agent.features.mapping.graph import Solution, solve
+from gnd.vehicle_agent.features.mapping.graph_edges import Anchors, Problem, State
+from gnd.vehicle_agent.features.mapping.landmarks import (
     NONE,
     Places,
     Sight,
@@ -26,10 +26,10 @@ from vehicle_agent.features.mapping.landmarks import (
     spread,
     tied,
 )
-from vehicle_agent.features.mapping.lanes import LaneMap, LaneMatcher
-from vehicle_agent.features.mapping.parameters import NewLayerParameters
-from vehicle_agent.features.mapping.smoothed_path import SmoothedPath
-from vehicle_agent.features.mapping.strain import Strain, strains
+from gnd.vehicle_agent.features.mapping.lanes import LaneMap, LaneMatcher
+from gnd.vehicle_agent.features.mapping.parameters import NewLayerParameters
+from gnd.vehicle_agent.features.mapping.smoothed_path import SmoothedPath
+from gnd.vehicle_agent.features.mapping.strain import Strain, strains
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -4,8 +4,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from gnd_map.arrays import F64, I64
-from vehicle_agent.features.mapping.dead_reckoning import DeadReckoning, composed, relative, wrapped
+from gnd.gnd_map.arrays import F64, I64
+from gnd.vehicle_agent.features.mapping.dead_reckoning import DeadReckoning, composed, relative, wrapped
 
 
 @dataclass(frozen=True, slots=True, eq=False)

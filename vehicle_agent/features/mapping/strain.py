@@ -11,10 +11,10 @@ from typing import Final
 import numpy as np
 from scipy.stats import binom, chi2
 
-from gnd_map.arrays import F64, I64
-from vehicle_agent.features.mapping.dead_reckoning import relative, wrapped
-from vehicle_agent.features.mapping.graph_edges import FixNodes, Problem, State
-from vehicle_agent.features.mapping.parameters import NewLayerParameters
+from gnd.gnd_map.arrays import F64, I64
+from gnd.vehicle_agent.features.mapping.dead_reckoning import relative, wrapped
+from gnd.vehicle_agent.features.mapping.graph_edges import FixNodes, Problem, State
+from gnd.vehicle_agent.features.mapping.parameters import NewLayerParameters
 
 WINDOW_S: Final = 120.0
 """Stretches of this length are asked: nine time constants of the GNSS's slow error."""

@@ -9,9 +9,9 @@ from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
-from gnd_map.arrays import F64, I64
-from vehicle_agent.features.poles.parameters import PoleParameters
-from vehicle_agent.features.poles.slices import Slices, take
+from gnd.gnd_map.arrays import F64, I64
+from gnd.vehicle_agent.features.poles.parameters import PoleParameters
+from gnd.vehicle_agent.features.poles.slices import Slices, take
 
 FRONT = pi / 4
 """Of the radius: mean distance from the visible half of a cylinder to the plane through its axis, seen from afar."""

@@ -13,14 +13,14 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from gnd_map.arrays import F64, I64
-from schemas.drive import Detections
-from schemas.limits import MAX_DETECTIONS_OF_LOOK
-from vehicle_agent.features.poles.columns import Columns, columns_of, stacked
-from vehicle_agent.features.poles.kinds import Surroundings, bottoms, is_free, kinds_of, look_around, tops
-from vehicle_agent.features.poles.parameters import PoleInputError, PoleParameters
-from vehicle_agent.features.poles.place_kernels import rays_below
-from vehicle_agent.features.poles.slices import (
+from gnd.gnd_map.arrays import F64, I64
+from gnd.schemas.drive import Detections
+from gnd.schemas.limits import MAX_DETECTIONS_OF_LOOK
+from gnd.vehicle_agent.features.poles.columns import Columns, columns_of, stacked
+from gnd.vehicle_agent.features.poles.kinds import Surroundings, bottoms, is_free, kinds_of, look_around, tops
+from gnd.vehicle_agent.features.poles.parameters import PoleInputError, PoleParameters
+from gnd.vehicle_agent.features.poles.place_kernels import rays_below
+from gnd.vehicle_agent.features.poles.slices import (
     EXACT,
     GroundHeights,
     PoseSigma,

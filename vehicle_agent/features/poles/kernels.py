@@ -9,8 +9,8 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from gnd_map.arrays import F64, I64
-from gnd_map.jit import kernel
+from gnd.gnd_map.arrays import F64, I64
+from gnd.gnd_map.jit import kernel
 
 U8 = NDArray[np.uint8]
 

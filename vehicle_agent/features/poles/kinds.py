@@ -5,11 +5,11 @@ from typing import Final, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from gnd_map.arrays import F64, I64
-from vehicle_agent.features.poles.columns import Columns
-from vehicle_agent.features.poles.parameters import PoleParameters
-from vehicle_agent.features.poles.place_kernels import around, by_cell
-from vehicle_agent.features.poles.slices import GroundHeights
+from gnd.gnd_map.arrays import F64, I64
+from gnd.vehicle_agent.features.poles.columns import Columns
+from gnd.vehicle_agent.features.poles.parameters import PoleParameters
+from gnd.vehicle_agent.features.poles.place_kernels import around, by_cell
+from gnd.vehicle_agent.features.poles.slices import GroundHeights
 
 Mask = NDArray[np.bool_]
 

@@ -2,7 +2,7 @@
 
 from dataclasses import dataclass
 
-from vehicle_agent.errors import VehicleError
+from gnd.vehicle_agent.errors import VehicleError
 
 
 class PoleError(VehicleError):

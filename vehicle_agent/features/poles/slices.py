@@ -7,8 +7,8 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from gnd_map.arrays import F64, I64
-from vehicle_agent.features.poles.kernels import (
+from gnd.gnd_map.arrays import F64, I64
+from gnd.vehicle_agent.features.poles.kernels import (
     Beside,
     Rows,
     azimuth_step,
@@ -17,8 +17,8 @@ from vehicle_agent.features.poles.kernels import (
     row_order,
     thin_slices,
 )
-from vehicle_agent.features.poles.parameters import PoleInputError, PoleParameters
-from vehicle_agent.features.poles.place_kernels import Ground, cone_heights, heights_over, lowest_heights
+from gnd.vehicle_agent.features.poles.parameters import PoleInputError, PoleParameters
+from gnd.vehicle_agent.features.poles.place_kernels import Ground, cone_heights, heights_over, lowest_heights
 
 U8 = NDArray[np.uint8]
 

@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import linear_sum_assignment
 
-from gnd_map.arrays import F64, I64
+from gnd.gnd_map.arrays import F64, I64
 
 FORBIDDEN: Final = 1e9
 

@@ -10,9 +10,9 @@ from typing import Final
 
 import numpy as np
 
-from gnd_map.arrays import F64
-from vehicle_agent.features.slamcu.parameters import SlamcuParameters
-from vehicle_agent.features.view import wrapped
+from gnd.gnd_map.arrays import F64
+from gnd.vehicle_agent.features.slamcu.parameters import SlamcuParameters
+from gnd.vehicle_agent.features.view import wrapped
 
 X, Y, HEADING, SCALE, BIAS, GNSS_X, GNSS_Y = range(7)
 JUMP: Final = 30.0

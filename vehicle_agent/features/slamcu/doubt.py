@@ -12,10 +12,10 @@ from typing import Final
 
 import numpy as np
 
-from gnd_map.arrays import F64
-from vehicle_agent.features.slamcu.existence_book import Entry, ExistenceBook
-from vehicle_agent.features.slamcu.rbpf import Rbpf
-from vehicle_agent.features.slamcu.tracked import Tracked
+from gnd.gnd_map.arrays import F64
+from gnd.vehicle_agent.features.slamcu.existence_book import Entry, ExistenceBook
+from gnd.vehicle_agent.features.slamcu.rbpf import Rbpf
+from gnd.vehicle_agent.features.slamcu.tracked import Tracked
 
 ALIKE: Final = 0.5
 """Cosine of the angle between two steps that may be one, and the least ratio of their lengths."""

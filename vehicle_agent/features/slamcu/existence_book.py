@@ -9,9 +9,9 @@ from typing import Any, Final
 
 import numpy as np
 
-from gnd_map.arrays import F64
-from gnd_map.features import VACUOUS, Existence, combine, hit, miss, prior
-from vehicle_agent.features.slamcu.parameters import SlamcuParameters
+from gnd.gnd_map.arrays import F64
+from gnd.gnd_map.features import VACUOUS, Existence, combine, hit, miss, prior
+from gnd.vehicle_agent.features.slamcu.parameters import SlamcuParameters
 
 HISTORY: Final = 1024
 """So many steps of a feature's masses are kept."""

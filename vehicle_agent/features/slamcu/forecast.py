@@ -5,11 +5,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from gnd_map.arrays import F64
-from vehicle_agent.features.slamcu.blind import HEADING
-from vehicle_agent.features.slamcu.existence_book import Entry
-from vehicle_agent.features.slamcu.rbpf import Rbpf
-from vehicle_agent.features.view import wrapped
+from gnd.gnd_map.arrays import F64
+from gnd.vehicle_agent.features.slamcu.blind import HEADING
+from gnd.vehicle_agent.features.slamcu.existence_book import Entry
+from gnd.vehicle_agent.features.slamcu.rbpf import Rbpf
+from gnd.vehicle_agent.features.view import wrapped
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -12,9 +12,9 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from gnd_map.arrays import F64
-from vehicle_agent.features.slamcu.blind import Belief, BlindFilter
-from vehicle_agent.features.slamcu.parameters import SlamcuParameters
+from gnd.gnd_map.arrays import F64
+from gnd.vehicle_agent.features.slamcu.blind import Belief, BlindFilter
+from gnd.vehicle_agent.features.slamcu.parameters import SlamcuParameters
 
 LASTING_M: Final = 0.5
 """What a GNSS may be off by all the while (ionosphere, the antenna's place), each axis."""

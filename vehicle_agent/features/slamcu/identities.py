@@ -13,9 +13,9 @@ from typing import Final, NamedTuple
 import numpy as np
 from scipy.optimize import linear_sum_assignment
 
-from gnd_map.arrays import F64
-from vehicle_agent.features.slamcu import measurement
-from vehicle_agent.features.slamcu.rbpf import Rbpf
+from gnd.gnd_map.arrays import F64
+from gnd.vehicle_agent.features.slamcu import measurement
+from gnd.vehicle_agent.features.slamcu.rbpf import Rbpf
 
 NONE: Final = -1
 """Of a feature of the map that none of the estimates is."""

@@ -8,8 +8,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from gnd_map.arrays import F64
-from vehicle_agent.features.view import wrapped
+from gnd.gnd_map.arrays import F64
+from gnd.vehicle_agent.features.view import wrapped
 
 
 class Predicted(NamedTuple):

@@ -3,14 +3,14 @@
 from dataclasses import dataclass, field
 from math import isfinite, radians
 
-from vehicle_agent.features.errors import SlamcuParameterError
+from gnd.vehicle_agent.features.errors import SlamcuParameterError
 
 
 @dataclass(frozen=True, slots=True)
 class MotionNoise:
     """What is wrong with wheels and gyro. Noise per square root of a second, so that it does not depend on their rate.
 
-    Twice the white noise that `fleet_sim.drives.SensorErrors` gives its sensors at 50 Hz: wheels also slip.
+    Twice the white noise that `gnd.fleet_sim.drives.SensorErrors` gives its sensors at 50 Hz: wheels also slip.
     """
 
     speed_m: float = 0.006
@@ -35,7 +35,7 @@ class MotionNoise:
 class GnssNoise:
     """Errors of a low-cost GNSS: a slow one (Gauss-Markov) and a white one, together of the sigma that the fix tells.
 
-    As `python -m benchmarks gnss-noise` finds them in a car's single-point fixes.
+    As `python -m studies gnss-noise` finds them in a car's single-point fixes.
     """
 
     white_share: float = 0.30

@@ -17,11 +17,11 @@ from typing import Final
 
 import numpy as np
 
-from gnd_map.arrays import F64, I64
-from vehicle_agent.features.slamcu import measurement
-from vehicle_agent.features.slamcu.blind import BIAS, GNSS_X, HEADING, SCALE, STANDING_MPS, Belief, X, Y
-from vehicle_agent.features.slamcu.parameters import SlamcuParameters
-from vehicle_agent.features.view import wrapped
+from gnd.gnd_map.arrays import F64, I64
+from gnd.vehicle_agent.features.slamcu import measurement
+from gnd.vehicle_agent.features.slamcu.blind import BIAS, GNSS_X, HEADING, SCALE, STANDING_MPS, Belief, X, Y
+from gnd.vehicle_agent.features.slamcu.parameters import SlamcuParameters
+from gnd.vehicle_agent.features.view import wrapped
 
 Prior = tuple[F64, F64]
 """Position (2,) and covariance (3,) xx, xy, yy."""

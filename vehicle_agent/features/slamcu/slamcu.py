@@ -12,20 +12,20 @@ from typing import Final
 
 import numpy as np
 
-from gnd_map.arrays import F64, I64
-from vehicle_agent.features.errors import BadPose
-from vehicle_agent.features.look import Look, MapFeatures
-from vehicle_agent.features.slamcu.association import Association, associate, pair_costs
-from vehicle_agent.features.slamcu.blind import STANDING_MPS, Belief, BlindFilter
-from vehicle_agent.features.slamcu.existence_book import Entry, ExistenceBook, FeatureClass, existence_of
-from vehicle_agent.features.slamcu.forecast import Forecast, forecast
-from vehicle_agent.features.slamcu.identities import LN_NONE, LN_NONE_DOUBTED
-from vehicle_agent.features.slamcu.parameters import SlamcuParameters
-from vehicle_agent.features.slamcu.rbpf import Rbpf
-from vehicle_agent.features.slamcu.tidying import Innovation, Tidying
-from vehicle_agent.features.slamcu.tracked import Tracked
-from vehicle_agent.features.slamcu.verdicts import KnownState, NewFeature
-from vehicle_agent.features.view import Occlusion, SensorView, wrapped
+from gnd.gnd_map.arrays import F64, I64
+from gnd.vehicle_agent.features.errors import BadPose
+from gnd.vehicle_agent.features.look import Look, MapFeatures
+from gnd.vehicle_agent.features.slamcu.association import Association, associate, pair_costs
+from gnd.vehicle_agent.features.slamcu.blind import STANDING_MPS, Belief, BlindFilter
+from gnd.vehicle_agent.features.slamcu.existence_book import Entry, ExistenceBook, FeatureClass, existence_of
+from gnd.vehicle_agent.features.slamcu.forecast import Forecast, forecast
+from gnd.vehicle_agent.features.slamcu.identities import LN_NONE, LN_NONE_DOUBTED
+from gnd.vehicle_agent.features.slamcu.parameters import SlamcuParameters
+from gnd.vehicle_agent.features.slamcu.rbpf import Rbpf
+from gnd.vehicle_agent.features.slamcu.tidying import Innovation, Tidying
+from gnd.vehicle_agent.features.slamcu.tracked import Tracked
+from gnd.vehicle_agent.features.slamcu.verdicts import KnownState, NewFeature
+from gnd.vehicle_agent.features.view import Occlusion, SensorView, wrapped
 
 NEAR_M: Final = 30.0
 """Features so much farther than the view's range cannot be what was measured."""

@@ -5,14 +5,14 @@ from typing import Final, NamedTuple
 
 import numpy as np
 
-from gnd_map.arrays import F64
-from vehicle_agent.features.slamcu.blind import BlindFilter
-from vehicle_agent.features.slamcu.doubt import Doubt, Step
-from vehicle_agent.features.slamcu.existence_book import Entry, ExistenceBook, FeatureClass
-from vehicle_agent.features.slamcu.identities import LN_NONE, LN_NONE_DOUBTED, NONE, best_identities
-from vehicle_agent.features.slamcu.parameters import SlamcuParameters
-from vehicle_agent.features.slamcu.rbpf import Rbpf
-from vehicle_agent.features.slamcu.tracked import Tracked
+from gnd.gnd_map.arrays import F64
+from gnd.vehicle_agent.features.slamcu.blind import BlindFilter
+from gnd.vehicle_agent.features.slamcu.doubt import Doubt, Step
+from gnd.vehicle_agent.features.slamcu.existence_book import Entry, ExistenceBook, FeatureClass
+from gnd.vehicle_agent.features.slamcu.identities import LN_NONE, LN_NONE_DOUBTED, NONE, best_identities
+from gnd.vehicle_agent.features.slamcu.parameters import SlamcuParameters
+from gnd.vehicle_agent.features.slamcu.rbpf import Rbpf
+from gnd.vehicle_agent.features.slamcu.tracked import Tracked
 
 SAME_GATE: Final = 9.0
 """Two features within this squared Mahalanobis distance may be one."""

@@ -5,12 +5,12 @@ from math import nan
 
 import numpy as np
 
-from gnd_map.arrays import F64
-from vehicle_agent.features.errors import BadMapFeatures
-from vehicle_agent.features.look import MapFeatures
-from vehicle_agent.features.slamcu.existence_book import Entry, ExistenceBook
-from vehicle_agent.features.slamcu.parameters import SlamcuParameters
-from vehicle_agent.features.slamcu.rbpf import Prior, Rbpf
+from gnd.gnd_map.arrays import F64
+from gnd.vehicle_agent.features.errors import BadMapFeatures
+from gnd.vehicle_agent.features.look import MapFeatures
+from gnd.vehicle_agent.features.slamcu.existence_book import Entry, ExistenceBook
+from gnd.vehicle_agent.features.slamcu.parameters import SlamcuParameters
+from gnd.vehicle_agent.features.slamcu.rbpf import Prior, Rbpf
 
 
 class Tracked:

@@ -2,9 +2,9 @@
 
 from dataclasses import dataclass, field
 
-from gnd_map.arrays import F64
-from gnd_map.features import Existence
-from vehicle_agent.features.slamcu.existence_book import FeatureClass, MassesAt
+from gnd.gnd_map.arrays import F64
+from gnd.gnd_map.features import Existence
+from gnd.vehicle_agent.features.slamcu.existence_book import FeatureClass, MassesAt
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -18,12 +18,12 @@ from typing import Final
 
 import numpy as np
 
-from gnd_map.arrays import F64
-from vehicle_agent.features.slamcu.blind import Belief, apart
-from vehicle_agent.features.slamcu.existence_book import FeatureClass
-from vehicle_agent.features.slamcu.parameters import GnssNoise
-from vehicle_agent.features.slamcu.slamcu import Passed
-from vehicle_agent.features.slamcu.tidying import Innovation
+from gnd.gnd_map.arrays import F64
+from gnd.vehicle_agent.features.slamcu.blind import Belief, apart
+from gnd.vehicle_agent.features.slamcu.existence_book import FeatureClass
+from gnd.vehicle_agent.features.slamcu.parameters import GnssNoise
+from gnd.vehicle_agent.features.slamcu.slamcu import Passed
+from gnd.vehicle_agent.features.slamcu.tidying import Innovation
 
 WINDOWS_S: Final = (40.0, 160.0)
 """Over these times offsets are averaged: three and twelve time constants of the slow error."""

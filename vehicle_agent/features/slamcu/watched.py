@@ -15,11 +15,11 @@ from typing import Final
 
 import numpy as np
 
-from gnd_map.arrays import F64
-from vehicle_agent.features.look import Look, MapFeatures
-from vehicle_agent.features.slamcu.blind import Belief
-from vehicle_agent.features.slamcu.existence_book import FeatureClass
-from vehicle_agent.features.slamcu.hindsight import (
+from gnd.gnd_map.arrays import F64
+from gnd.vehicle_agent.features.look import Look, MapFeatures
+from gnd.vehicle_agent.features.slamcu.blind import Belief
+from gnd.vehicle_agent.features.slamcu.existence_book import FeatureClass
+from gnd.vehicle_agent.features.slamcu.hindsight import (
     GATE,
     GATE_SURE,
     Contradiction,
@@ -31,11 +31,11 @@ from vehicle_agent.features.slamcu.hindsight import (
     held,
     speaks_against,
 )
-from vehicle_agent.features.slamcu.parameters import SlamcuParameters
-from vehicle_agent.features.slamcu.slamcu import Slamcu
-from vehicle_agent.features.slamcu.verdicts import KnownState, NewFeature
-from vehicle_agent.features.slamcu.watch import DELETED_COST, NEW_COST, Alarm, Watch
-from vehicle_agent.features.view import Occlusion, SensorView
+from gnd.vehicle_agent.features.slamcu.parameters import SlamcuParameters
+from gnd.vehicle_agent.features.slamcu.slamcu import Slamcu
+from gnd.vehicle_agent.features.slamcu.verdicts import KnownState, NewFeature
+from gnd.vehicle_agent.features.slamcu.watch import DELETED_COST, NEW_COST, Alarm, Watch
+from gnd.vehicle_agent.features.view import Occlusion, SensorView
 
 KEEP_EVERY_M: Final = 300.0
 """A state is kept so often, when nothing is in view."""

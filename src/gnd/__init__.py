@@ -1,0 +1,1 @@
+"""Keeps a LiDAR map up to date with a fleet of vehicles, over Zenoh."""

@@ -1,0 +1,184 @@
+"""One run of the localiser over a hard case, every pose kept with its covariance."""
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+from math import pi
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from gnd.gnd_map.arrays import F64, I64
+from gnd.gnd_map.geodesy import LocalFrame
+from gnd.gnd_map.grid import GridFrame
+from gnd.gnd_map.motion import Trajectory
+from gnd.gnd_map.se3 import T_inverse, log_so3
+from gnd.gnd_map.tile_id import TileId
+from gnd.schemas.drive import DriveHeader, DriveItem, GnssFix, MotionSample, ReferencePose, Scan
+from gnd.vehicle_agent.local_map import LocalMap
+from gnd.vehicle_agent.localise.estimates import PoseEstimate
+from gnd.vehicle_agent.localise.localiser import Localiser
+from gnd.vehicle_agent.localise.parameters import LocaliserParameters
+from gnd.vehicle_agent.place import Place
+from gnd.vehicle_agent.scans import Guard
+from studies.hard_cases.cases import Kidnap
+from studies.simulation.base_map import BaseMap
+from studies.simulation.held_tiles import HeldTiles
+from studies.simulation.streams import first_fix
+
+HEALTHS: Final = ("lost", "degraded", "good")
+_HEADING, _X, _Y = 2, 3, 4
+"""Entries of a pose's covariance: rotation before position."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Poses:
+    """N poses of a run against the truth.
+
+    Attributes:
+        t_ns: int64 (N,).
+        error: float64 (N, 3), along and across the true heading [m], heading [rad].
+        covariance: float64 (N, 3, 3) of the same three in the same order, as the vehicle claims it; NaN where it
+            claims none.
+        health: uint8 (N,), index of `HEALTHS`.
+    """
+
+    t_ns: I64
+    error: F64
+    covariance: F64
+    health: NDArray[np.uint8]
+
+    def __len__(self) -> int:
+        return len(self.t_ns)
+
+    @classmethod
+    def of(cls, estimates: Iterable[PoseEstimate], true: Trajectory) -> "Poses":
+        """Return the errors of the estimates that lie within the truth's time; frames must be the same."""
+        within = [e for e in estimates if true.t_ns[0] <= e.t_ns <= true.t_ns[-1]]
+        t_ns = np.array([e.t_ns for e in within], np.int64)
+        health = np.array([HEALTHS.index(e.health) for e in within], np.uint8)
+        if not within:
+            return cls(t_ns, np.empty((0, 3)), np.empty((0, 3, 3)), health)
+        error = T_inverse(true.at(t_ns)) @ np.stack([e.T_map_vehicle for e in within])
+        off = np.column_stack([error[:, 0, 3], error[:, 1, 3], log_so3(error[:, :3, :3])[:, 2]])
+        return cls(t_ns, off, np.stack([_claimed(e) for e in within]), health)
+
+
+def _claimed(estimate: PoseEstimate) -> F64:
+    """Covariance (3, 3) of place and heading."""
+    if estimate.covariance is None:
+        return np.full((3, 3), np.nan)
+    rows = [_X, _Y, _HEADING]
+    return estimate.covariance[np.ix_(rows, rows)]
+
+
+@dataclass(frozen=True, slots=True)
+class ClockOffset:
+    """What the localiser says of the time between its clocks [s]: samples stamped so much too late, and one sigma."""
+
+    offset_s: float
+    sigma_s: float
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class CaseRun:
+    """What a run gave: refined and online poses, scans that arrived, and the clock offset where it was estimated."""
+
+    refined: Poses
+    online: Poses
+    scans: int
+    clock: ClockOffset | None
+
+
+def clock_offset_of(localiser: Localiser) -> ClockOffset | None:
+    """Return the clock offset that a localiser has found."""
+    known = localiser.calibration
+    return ClockOffset(known.time_offset_s, known.time_offset_sigma_s)
+
+
+def run_case(
+    header: DriveHeader,
+    items: Iterable[DriveItem],
+    base: BaseMap,
+    parameters: LocaliserParameters,
+    kidnap: Kidnap | None,
+    seed: int,
+) -> CaseRun:
+    """Run the localiser over a drive, the map's tiles held around the vehicle as the agent does.
+
+    Args:
+        header: of the drive.
+        items: in time order, with reference poses, which the vehicle never sees.
+        base: the map.
+        parameters: of the localiser.
+        kidnap: a wrong pose that it is told at the first scan, None for none.
+        seed: of where that pose is.
+
+    Raises:
+        ReproduceError: the drive has no GNSS fix.
+    """
+    fix, stream = first_fix(iter(items))
+    start = TileId.from_geodetic(fix.lat_rad, fix.lon_rad)
+    frame = LocalFrame.of_tile(start)
+    vehicle = _Vehicle(header, fix, base, LocalMap(GridFrame.around(frame, [start])), parameters)
+    all_items = list(stream)
+    poses = [item for item in all_items if isinstance(item, ReferencePose)]
+    T_map_anchor = frame.T_self_other(header.anchor)
+    true = Trajectory(
+        np.array([p.t_ns for p in poses], np.int64), T_map_anchor @ np.stack([p.T_map_vehicle for p in poses])
+    )
+    if kidnap is not None:
+        first_ns = next(item.t_ns for item in all_items if isinstance(item, Scan))
+        vehicle.localiser.start_at(first_ns, _displaced(true.at(first_ns), kidnap, seed), trusted=True)
+    for item in Guard().usable(item for item in all_items if not isinstance(item, ReferencePose)):
+        vehicle.push(item)
+    refined = Poses.of(vehicle.finish(), true)
+    return CaseRun(refined, Poses.of(vehicle.online, true), vehicle.scans, clock_offset_of(vehicle.localiser))
+
+
+class _Vehicle:
+    """A localiser over held tiles; keeps its online pose of every scan.
+
+    Attributes:
+        localiser: of the vehicle.
+        online: one pose a scan, those called lost too.
+        scans: that arrived.
+    """
+
+    def __init__(
+        self, header: DriveHeader, fix: GnssFix, base: BaseMap, local_map: LocalMap, parameters: LocaliserParameters
+    ) -> None:
+        self.localiser = Localiser(local_map, header.T_vehicle_lidar, parameters)
+        self.online: list[PoseEstimate] = []
+        self.scans = 0
+        self._held = HeldTiles(base, local_map, None)
+        self._place = Place(local_map.grid_frame.frame, fix)
+        self._refined: list[PoseEstimate] = []
+
+    def push(self, item: DriveItem) -> None:
+        """Take a measurement."""
+        if isinstance(item, Scan):
+            self.scans += 1
+            self._held.follow(self._place)
+            self._refined += [refined.estimate for refined in self.localiser.push_scan(item)]
+        elif isinstance(item, MotionSample):
+            self.localiser.push_motion(item)
+        elif isinstance(item, GnssFix):
+            self.localiser.push_gnss(item)
+        online = self.localiser.online
+        if online is not None and (not self.online or online.t_ns > self.online[-1].t_ns):
+            self.online.append(online)
+        self._place.take(item, online)
+
+    def finish(self) -> list[PoseEstimate]:
+        """End the drive and give all refined poses."""
+        return [*self._refined, *(refined.estimate for refined in self.localiser.flush())]
+
+
+def _displaced(T_map_vehicle: F64, kidnap: Kidnap, seed: int) -> F64:
+    """Return a pose so far off, in a direction of its own."""
+    rng = np.random.default_rng([seed, 0x41D])
+    way_m, turn = rng.uniform(kidnap.nearest_m, kidnap.farthest_m), rng.uniform(-pi, pi)
+    T = T_map_vehicle.copy()
+    T[:3, 3] += way_m * np.array([np.cos(turn), np.sin(turn), 0.0])
+    return T

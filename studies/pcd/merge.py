@@ -1,0 +1,100 @@
+"""The cloud's side of the point-cloud framework: votes of many drives for new and against old points."""
+
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from gnd.gnd_map.arrays import F32, F64, I32, I64
+from gnd.gnd_map.jit import kernel
+from studies.pcd.errors import PcdError
+from studies.pcd.index import PcdIndex, index_of
+from studies.pcd.parameters import PcdDetectParameters, PcdMergeParameters
+from studies.pcd.points import PcdMap, cell_keys, cells_of, key_cells, without
+from studies.pcd.report import PcdReport
+
+
+def merge_pcd(base: PcdMap, reports: Sequence[PcdReport], parameters: PcdMergeParameters | None = None) -> PcdMap:
+    """The map after the changes on which more than ξ of the observers agree; the order of reports does not matter.
+
+    Raises:
+        PcdError: a report refers to another map.
+    """
+    parameters = parameters or PcdMergeParameters()
+    for report in reports:
+        if report.map_size != len(base):
+            raise PcdError(f"a report refers to a map of {report.map_size} points, this one has {len(base)}")
+    if not reports:
+        return base
+    index = index_of(base, PcdDetectParameters().planar_ratio)
+    seen = _Observers(index, reports)
+    return without(base, _deleted(base, index, seen, reports, parameters), _new(index, seen, reports, parameters))
+
+
+class _Observers:
+    """How many reports observed each block."""
+
+    def __init__(self, index: PcdIndex, reports: Sequence[PcdReport]) -> None:
+        self._count = np.zeros(len(index.state), np.int32)
+        for report in reports:
+            self._count[report.observed] += 1
+
+    def of(self, blocks: I64) -> I32:
+        return np.asarray(np.where(blocks >= 0, self._count[blocks], 0), np.int32)
+
+
+def _deleted(
+    base: PcdMap, index: PcdIndex, seen: _Observers, reports: Sequence[PcdReport], p: PcdMergeParameters
+) -> NDArray[np.bool_]:
+    votes = np.zeros(len(base), np.int32)
+    for report in reports:
+        votes[report.deleted_index] += 1
+    blocks = index.blocks_of(index.cells.astype(np.int64))[index.cell_of_point]
+    return np.asarray(votes > p.xi * np.maximum(seen.of(blocks), votes))
+
+
+def _new(index: PcdIndex, seen: _Observers, reports: Sequence[PcdReport], p: PcdMergeParameters) -> F32:
+    """Centroids of the new cells for which enough reports have a new point in or beside the cell."""
+    clouds = [report.new_points.astype(np.float64) for report in reports]
+    cells = [cells_of(cloud, index.grid_frame) for cloud in clouds]
+    key, which = np.unique(cell_keys(np.concatenate(cells), index.grid_frame), return_inverse=True)
+    owner = np.repeat(np.arange(len(reports)), [len(c) for c in cells])
+    said = np.zeros((len(key), -(-len(reports) // 64)), np.uint64)
+    np.bitwise_or.at(said, (which, owner // 64), np.uint64(1) << (owner % 64).astype(np.uint64))
+    votes = count_votes(key, said, p.reach_cells)
+    blocks = index.blocks_of(key_cells(key, index.grid_frame) - index.origin_c)
+    accepted = votes > p.xi * np.maximum(seen.of(blocks), votes)
+    return _means(np.concatenate(clouds), which, len(key))[accepted]
+
+
+def _means(points: F64, which: I64, n: int) -> F32:
+    """(n, 3) float32 means of points (N, 3) by group."""
+    count = np.bincount(which, minlength=n)
+    sums = [np.bincount(which, weights=points[:, a], minlength=n) for a in range(3)]
+    return (np.stack(sums, axis=1) / count[:, None]).astype(np.float32)
+
+
+@kernel
+def count_votes(keys: I64, said: NDArray[np.uint64], reach: int) -> I32:
+    """(C,) int32: how many reports have a point within `reach` cells of each cell.
+
+    `keys` (C,) sorted cell keys; `said` (C, W): bit r of word w is set where report 64 w + r has a point.
+    """
+    votes = np.zeros(len(keys), np.int32)
+    word = np.empty(said.shape[1], np.uint64)
+    for c in range(len(keys)):
+        word[:] = 0
+        for dx in range(-reach, reach + 1):
+            for dy in range(-reach, reach + 1):
+                middle = keys[c] + (np.int64(dx) << 42) + (np.int64(dy) << 21)
+                at = np.searchsorted(keys, middle - reach)
+                while at < len(keys) and keys[at] <= middle + reach:
+                    for w in range(len(word)):
+                        word[w] |= said[at, w]
+                    at += 1
+        for w in range(len(word)):
+            bits = word[w]
+            while bits != np.uint64(0):
+                bits &= bits - np.uint64(1)
+                votes[c] += 1
+    return votes

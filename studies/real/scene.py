@@ -1,0 +1,145 @@
+"""A recording with its track, laid on the grid in one of many ways: which way it lies there is chance, not quality."""
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from gnd.gnd_map.accumulate import VoxelAccumulator
+from gnd.gnd_map.geodesy import LocalFrame
+from gnd.gnd_map.grid import GridFrame
+from gnd.gnd_map.motion import Trajectory, deskew
+from gnd.gnd_map.se3 import exp_so3, transform
+from gnd.gnd_map.tile_id import covering_corridor
+from gnd.schemas.drive import GnssFix, MotionSample, Scan
+from gnd.vehicle_agent.importer import fixes_of, map_track, motion_of
+from gnd.vehicle_agent.importers.cleaning import cleaned
+from gnd.vehicle_agent.importers.lidar_odometry import Progress, reference_ns
+from gnd.vehicle_agent.importers.recording import Recording
+from gnd.vehicle_agent.localise.estimates import PoseEstimate, RefinedScan
+from studies.real.errors import RealDataError
+
+F64 = NDArray[np.float64]
+I64 = NDArray[np.int64]
+
+AROUND_M = 130.0
+MIN_RANGE_M, MAP_RANGE_M = 2.0, 80.0
+"""What `gnd map build` takes."""
+_STEP_NS = 1_000_000
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Scene:
+    """Scans in time order, the vehicle's poses at them, and the grid."""
+
+    name: str
+    scans: tuple[Scan, ...]
+    poses: Trajectory
+    T_vehicle_lidar: F64
+    grid_frame: GridFrame
+    motion: tuple[MotionSample, ...]
+    gnss: tuple[GnssFix, ...]
+
+    def __len__(self) -> int:
+        return len(self.scans)
+
+    @property
+    def positions_m(self) -> F64:
+        """(P, 3) where the vehicle was."""
+        return self.poses.T_dst_vehicle[:, :3, 3]
+
+    def T_map_lidar(self, scan: Scan) -> F64:
+        """(N, 4, 4) pose of the LiDAR at each point, or (4, 4) where the scan is freed of motion distortion."""
+        if not scan.t_offset_ns.any():
+            return np.asarray(self.poses.at(scan.t_ns) @ self.T_vehicle_lidar)
+        step, at = np.unique(scan.t_offset_ns // _STEP_NS, return_inverse=True)
+        return np.asarray((self.poses.at(scan.t_ns + step.astype(np.int64) * _STEP_NS) @ self.T_vehicle_lidar)[at])
+
+    def refined(self, scan: Scan) -> RefinedScan:
+        """A scan at its reference pose, as a localiser without error would give it."""
+        t_ns = reference_ns(scan)
+        T = self.poses.at(t_ns)
+        points, origins = (
+            transform(T, deskew(p, scan.t_offset_ns, scan.t_ns, self.poses, self.T_vehicle_lidar, t_ns))
+            for p in (scan.points_m, np.zeros_like(scan.points_m))
+        )
+        return RefinedScan(t_ns, points, origins, PoseEstimate(t_ns, T, 0.0, 0.0, 1.0, "good"))
+
+    def accumulated(self, scans: Sequence[RefinedScan] | Iterator[RefinedScan]) -> VoxelAccumulator:
+        """The points of scans as a map build takes them."""
+        accumulator = VoxelAccumulator(self.grid_frame)
+        for scan in scans:
+            accumulator.add(scan.points_map_m[in_range(scan)])
+        return accumulator
+
+
+def in_range(scan: RefinedScan, farthest_m: float = MAP_RANGE_M) -> NDArray[np.bool_]:
+    """(N,) bool, the points of a scan that are neither the vehicle itself nor too far."""
+    range_m = np.linalg.norm(scan.points_map_m - scan.origins_map_m, axis=1)
+    return np.asarray((range_m >= MIN_RANGE_M) & (range_m <= farthest_m))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Recorded:
+    """The scans of a recording in memory, with the track over all of them; `left_out` tells what was not used."""
+
+    name: str
+    scans: tuple[Scan, ...]
+    track: Trajectory
+    recording: Recording
+    left_out: tuple[str, ...]
+
+
+def load(recording: Recording, at_most: int, progress: Progress) -> Recorded:
+    """Read a recording and find its track.
+
+    Args:
+        recording: of any format.
+        at_most: its first scans only: all of them are held in memory.
+        progress: as the importer's.
+
+    Raises:
+        RealDataError: fewer than four usable scans.
+        ImportDriveError: damaged files, scans that do not fit together.
+    """
+    whole, n = len(recording), min(len(recording), at_most)
+    recording = replace(recording, t_ns=recording.t_ns[:n]) if n > 1 else recording
+    track = map_track(recording, progress)
+    found, empty = [], 0
+    for i in range(n):
+        scan = cleaned(recording.read(i)).scan
+        empty += scan is None
+        if scan is not None and track.t_ns[0] <= reference_ns(scan) <= track.t_ns[-1]:
+            found.append(scan)
+        progress("reading scans", i + 1, n)
+    if len(found) < 4:
+        raise RealDataError(f"{recording.name}: {len(found)} usable scans of {n}; at least 4 are needed for two halves")
+    left_out = list(recording.notes)
+    left_out += [f"{empty} scans without a usable point: left out"] if empty else []
+    left_out += [f"scans after the first {n} of {whole}: left out"] if n < whole else []
+    return Recorded(recording.name, tuple(found), track, recording, tuple(left_out))
+
+
+def place(recorded: Recorded, number: int, seed: int = 0) -> Scene:
+    """The recording turned about the vertical and shifted by less than a voxel, seeded; number 0 is as recorded."""
+    rng, A = np.random.default_rng([77, seed, number]), np.eye(4)
+    if number:
+        A[:3, :3] = exp_so3([0.0, 0.0, rng.uniform(0.0, 2.0 * np.pi)])
+        A[:3, 3] = rng.uniform(-0.5, 0.5, 3)
+    poses = Trajectory(recorded.track.t_ns, A @ recorded.track.T_dst_vehicle)
+    frame = recorded.recording.anchor.frame
+    return Scene(
+        name=recorded.name,
+        scans=recorded.scans,
+        poses=poses,
+        T_vehicle_lidar=recorded.recording.T_vehicle_lidar,
+        grid_frame=_grid_frame(frame, poses),
+        motion=recorded.recording.motion or tuple(motion_of(poses)),
+        gnss=tuple(fixes_of(recorded.recording, poses)),
+    )
+
+
+def _grid_frame(frame: LocalFrame, poses: Trajectory) -> GridFrame:
+    lat, lon, _ = frame.geodetic_from_enu(poses.T_dst_vehicle[:, :3, 3])
+    return GridFrame.around(frame, covering_corridor(lat, lon, AROUND_M))

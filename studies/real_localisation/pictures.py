@@ -1,0 +1,131 @@
+"""Maps from above with tracks, and what tracks are off by."""
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Final
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.collections import PolyCollection
+from matplotlib.figure import Figure
+from numpy.typing import NDArray
+
+from gnd.gnd_map.motion import Trajectory
+from gnd.gnd_map.se3 import T_inverse
+from gnd.vehicle_agent.localise import PoseEstimate
+from gnd.vehicle_agent.localise.georeference import Georeferenced
+from studies.real.scene import Recorded
+from studies.real_localisation.errors import RealLocalisationError
+from studies.real_localisation.flexmap import Drawn
+from studies.real_localisation.halves import METHODS, Half, localised
+from studies.real_localisation.nagoya import read_reference, track_off
+from studies.real_localisation.odometry import Odometry
+
+F64 = NDArray[np.float64]
+
+COLOURS: Final = ("#1f5fbf", "#d9542b", "#2c8c4a", "#8d5bb5", "#b8860b")
+MAP: Final = "#b9c3d0"
+INK: Final = "#1c2430"
+DPI: Final = 110
+
+
+def draw_halves(recorded: Recorded, tracks: Sequence[Odometry], halves: Sequence[Half], folder: Path) -> list[Path]:
+    """The map of the interleaved half with all odometries and the localised poses, and what these are off by."""
+    half = halves[0]
+    figure = Figure(figsize=(15.0, 8.0), layout="constrained")
+    above, errors = figure.subplots(1, 2, width_ratios=(1.5, 1.0))
+    _map_above(above, half)
+    known = [(one.name, one.track) for one in tracks if one.track is not None]
+    first = half.scene.poses.T_dst_vehicle[0]
+    for colour, (name, track) in zip(COLOURS, known, strict=False):
+        p = (first @ track.T_dst_vehicle)[:, :3, 3]
+        above.plot(p[:, 0], p[:, 1], "-", color=colour, lw=1.3, label=name)
+    for (method, parameters), marker in zip(METHODS.items(), ("o", "x"), strict=False):
+        estimates = localised(half, 0, parameters).estimates
+        _errors_of(errors, estimates, half.scene.poses, method.replace("_", " "), marker)
+        p = np.array([e.T_map_vehicle[:3, 3] for e in estimates]).reshape(-1, 3)
+        above.plot(p[:, 0], p[:, 1], marker, color=INK, ms=4, mfc="none", label=f"localised {method.replace('_', ' ')}")
+    above.legend(loc="best", fontsize=8)
+    above.set_title(f"{recorded.name}: {half.name}")
+    return [_saved(figure, folder / f"{recorded.name}_localised.png")]
+
+
+def _map_above(axes: Axes, half: Half) -> None:
+    """Gaussians of the map around the track as points, the higher the darker."""
+    p, track = half.local_map.mean_map_m, half.scene.positions_m
+    axes.scatter(p[:, 0], p[:, 1], s=2.0, c=p[:, 2], cmap="Greys", vmin=float(np.quantile(p[:, 2], 0.02)) - 4.0)
+    low, high = track.min(axis=0) - 25.0, track.max(axis=0) + 25.0
+    axes.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]), aspect="equal", xlabel="east m", ylabel="north m")
+
+
+def _errors_of(axes: Axes, estimates: Sequence[PoseEstimate], reference: Trajectory, name: str, marker: str) -> None:
+    """Along, across and heading over the way."""
+    if not len(estimates):
+        return
+    T = np.stack([e.T_map_vehicle for e in estimates])
+    off = T_inverse(reference.at(np.array([e.t_ns for e in estimates], np.int64))) @ T
+    at_s = (np.array([e.t_ns for e in estimates]) - reference.t_ns[0]) * 1e-9
+    heading = np.degrees(np.arctan2(off[:, 1, 0], off[:, 0, 0]))
+    values = (100 * off[:, 0, 3], 100 * off[:, 1, 3], 10 * heading)
+    for colour, label, value in zip(COLOURS, ("along, cm", "across, cm", "heading, 0.1°"), values, strict=False):
+        axes.plot(at_s, value, f"-{marker}", color=colour, lw=0.8, ms=4, mfc="none", label=f"{label}, {name}")
+    axes.set(xlabel="time s", title="against the LiDAR track")
+    axes.axhline(0.0, color=INK, lw=0.5)
+    axes.legend(fontsize=8)
+
+
+def draw_flexmap(drawn: Drawn, name: str, folder: Path) -> list[Path]:
+    """Lanes, both tracks and the fixes, whole and from near."""
+    figure = Figure(figsize=(16.0, 8.5), layout="constrained")
+    whole, near = figure.subplots(1, 2)
+    fixes = drawn.fixes.enu_m(drawn.bent.frame)
+    rigid = (drawn.bent.frame.T_self_other(drawn.rigid.frame) @ drawn.rigid.track.T_dst_vehicle)[:, :3, 3]
+    for axes in (whole, near):
+        axes.add_collection(PolyCollection(list(drawn.lanes), facecolor="#dfe5ec", edgecolor=MAP, lw=0.5))
+        axes.plot(rigid[:, 0], rigid[:, 1], "-", color=COLOURS[1], lw=1.0, label="track, rigid")
+        axes.plot(*_xy(drawn.bent), "-", color=COLOURS[0], lw=1.2, label="track, bent")
+        for chosen, colour, label in ((~drawn.held_out, COLOURS[2], "used"), (drawn.held_out, INK, "held out")):
+            axes.plot(fixes[chosen, 0], fixes[chosen, 1], ".", color=colour, ms=2.0, label=f"GNSS, {label}")
+        axes.set(aspect="equal", xlabel="east m", ylabel="north m")
+    whole.set_title(f"{name}: SLAM track and lanes on the Earth")
+    whole.legend(loc="best", fontsize=8)
+    corner = np.array(_xy(drawn.bent)).T[int(0.3 * len(drawn.bent.track))]
+    near.set(xlim=(corner[0] - 45, corner[0] + 45), ylim=(corner[1] - 45, corner[1] + 45), title="from near")
+    return [_saved(figure, folder / f"{name}_georeferenced.png")]
+
+
+def draw_nagoya(source: Path, tracks: dict[str, Georeferenced], name: str, folder: Path) -> list[Path]:
+    """The reference and the tracks by each kind of fixes, and what they are off by."""
+    whole = read_reference(source / "reference.csv")
+    figure = Figure(figsize=(16.0, 7.5), layout="constrained")
+    above, errors = figure.subplots(1, 2, width_ratios=(1.0, 1.4))
+    frame = next(iter(tracks.values())).frame
+    p = whole.enu_m(frame)
+    above.plot(p[:, 0], p[:, 1], "-", color=INK, lw=3.0, alpha=0.35, label="reference")
+    for colour, (label, found) in zip(COLOURS, tracks.items(), strict=False):
+        at = np.isin(whole.t_ns, found.track.t_ns)
+        p = (frame.T_self_other(found.frame) @ found.track.T_dst_vehicle)[:, :3, 3]
+        above.plot(p[:, 0], p[:, 1], "-", color=colour, lw=1.0, label=label)
+        off = track_off(found, whole.chosen(np.flatnonzero(at)))
+        errors.semilogy(
+            (found.track.t_ns - whole.t_ns[0]) * 1e-9, np.maximum(off, 1e-3), color=colour, lw=0.9, label=label
+        )
+    above.set(aspect="equal", xlabel="east m", ylabel="north m", title=f"{name}: wheel and gyro put on the Earth")
+    above.legend(fontsize=8)
+    errors.set(xlabel="time s", ylabel="horizontal distance from the reference m")
+    errors.legend(fontsize=8)
+    return [_saved(figure, folder / f"{name}_georeferenced.png")]
+
+
+def _xy(found: Georeferenced) -> tuple[F64, F64]:
+    p = found.track.T_dst_vehicle
+    return p[:, 0, 3], p[:, 1, 3]
+
+
+def _saved(figure: Figure, path: Path) -> Path:
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        figure.savefig(path, dpi=DPI)
+    except OSError as error:
+        raise RealLocalisationError(f"{path}: cannot be written: {error.strerror or error}") from error
+    return path

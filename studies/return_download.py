@@ -1,0 +1,162 @@
+"""What a vehicle that comes back downloads: bytes a tile for a map of which it holds an older version.
+
+A simulated street is mapped before and after its changes. The vehicle holds all tiles as they were; in each tile so
+many voxels are then as they are after the changes, those nearest to one place. Questions and answers go through the
+tile server's own code, keys included; a district is one question.
+"""
+
+import argparse
+import tempfile
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from itertools import groupby
+from pathlib import Path
+
+import numpy as np
+
+from gnd.fleet_sim.street import StreetOptions, street
+from gnd.fleet_sim.world import State
+from gnd.gnd_map.arrays import F64, I32, I64
+from gnd.gnd_map.codec import LATTICES, snap
+from gnd.gnd_map.gaussian import Gaussians, concat
+from gnd.gnd_map.grid import VoxelGrid
+from gnd.gnd_map.tile import Tile, diff
+from gnd.gnd_map.tile_id import TileId
+from gnd.schemas.keys import batch_key
+from gnd.schemas.tiles_batch import HeldTile, TilesRequest
+from gnd.tile_store.answers import Answers
+from gnd.tile_store.sqlite_store import SqliteStore
+from gnd.tile_store.values import DEFAULT_CODEC, DEFAULT_LAYER
+from studies.codec_scenes import LENGTH_M, SEED
+from studies.figures import Figure
+from studies.simulation.base_map import BaseMap, driven, read_base
+
+COMMAND = "python -m studies return-download"
+CHANGED = 0.02
+
+Tiles = dict[TileId, Gaussians]
+
+
+@dataclass(frozen=True, slots=True)
+class ReturnOptions:
+    """seed: of the simulated street. before, after: its maps, None to make them. codec: how finely they are rounded.
+
+    changed: share of the voxels that has changed.
+    """
+
+    seed: int = SEED
+    before: Path | None = None
+    after: Path | None = None
+    codec: str = DEFAULT_CODEC
+    changed: float = CHANGED
+
+
+def options(arguments: Sequence[str]) -> ReturnOptions:
+    """The options of the command line."""
+    parser = argparse.ArgumentParser(prog=COMMAND, description=__doc__)
+    parser.add_argument("--seed", type=int, default=SEED, help=f"world of the simulated street (default {SEED})")
+    parser.add_argument("--before", type=Path, help="its map before the changes, a file of `write_base`")
+    parser.add_argument("--after", type=Path, help="its map after the changes, a file of `write_base`")
+    parser.add_argument("--codec", choices=list(LATTICES), default=DEFAULT_CODEC, help="how finely it is rounded")
+    parser.add_argument("--changed", type=float, default=CHANGED, help=f"share of changed voxels (default {CHANGED})")
+    return ReturnOptions(**vars(parser.parse_args(arguments)))
+
+
+def run(chosen: ReturnOptions | None = None) -> list[Figure]:
+    """Measure the first download, the one after changes, and the one when nothing has changed."""
+    chosen = chosen or ReturnOptions()
+    before = _map(chosen, chosen.before, "before")
+    after = _map(chosen, chosen.after, "after")
+    new = partly_changed(before, after, chosen.changed, np.random.default_rng(chosen.seed))
+    changed = sum(len(diff(before[tile], new[tile])) for tile in before) / len(before)
+    voxels = sum(map(len, before.values())) / len(before)
+    with tempfile.TemporaryDirectory() as folder, SqliteStore(Path(folder) / "map.sqlite") as store:
+        held = _put(store, before)
+        first = _exchanged(store, [HeldTile(one.tile) for one in held])
+        now = _put(store, new)
+        returned, again = _exchanged(store, held), _exchanged(store, now)
+    detail = f"{len(before)} tiles of {voxels:.0f} voxels, {chosen.codec}"
+    return [
+        *_figures("first", first, detail),
+        *_figures("return", returned, f"{detail}, {changed:.1f} changed voxels a tile"),
+        *_figures("nothing changed", again, detail),
+    ]
+
+
+def partly_changed(before: Tiles, after: Tiles, share: float, rng: np.random.Generator) -> Tiles:
+    """The tiles in which `share` of all voxels are as after the changes, in each tile those nearest to one place."""
+    edited = {tile: _edited(g, after.get(tile, Gaussians.empty())) for tile, g in before.items()}
+    counts = _shared_out(
+        np.array([len(ids) for ids in edited.values()]), share * np.array([len(g) for g in before.values()])
+    )
+    return {
+        tile: _with_edits(g, after.get(tile, Gaussians.empty()), _near(tile, edited[tile], int(count), rng))
+        for (tile, g), count in zip(before.items(), counts, strict=True)
+    }
+
+
+def _edited(before: Gaussians, after: Gaussians) -> I32:
+    """The voxels that differ."""
+    delta = diff(before, after)
+    return np.union1d(delta.removed, delta.put.voxel_id).astype(np.int32)
+
+
+def _shared_out(there: I64, wanted: F64) -> I64:
+    """So many of what is `there` in each tile that all together are as many as `wanted`, where that can be.
+
+    A tile in which less has changed than is wanted gives all; the others give more, in proportion.
+    """
+    factor = 1.0
+    for _ in range(50):
+        factor *= wanted.sum() / max(np.minimum(there, factor * wanted).sum(), 1.0)
+    return np.minimum(there, np.round(factor * wanted)).astype(np.int64)
+
+
+def _near(tile: TileId, voxel_ids: I32, count: int, rng: np.random.Generator) -> I32:
+    """The `count` of these voxels that lie nearest to one of them."""
+    if count == 0:
+        return voxel_ids[:0]
+    centre_m = VoxelGrid.of(tile).centre_m(voxel_ids)
+    far_m = np.linalg.norm(centre_m - centre_m[rng.integers(len(voxel_ids))], axis=1)
+    return voxel_ids[np.argsort(far_m, kind="stable")[:count]]
+
+
+def _with_edits(before: Gaussians, after: Gaussians, voxel_ids: I32) -> Gaussians:
+    return concat([before.take(~np.isin(before.voxel_id, voxel_ids)), after.select(voxel_ids)])
+
+
+def _map(chosen: ReturnOptions, path: Path | None, state: State) -> Tiles:
+    """The street's map on the lattice; tiles without a Gaussian are left out."""
+    base = _driven(chosen.seed, state) if path is None else read_base(path)
+    return {tile: snap(g, LATTICES[chosen.codec]) for tile, g in sorted(base.tiles.items()) if len(g)}
+
+
+def _driven(seed: int, state: State) -> BaseMap:
+    return driven(street(seed, StreetOptions(length_m=LENGTH_M, site="wangsimni")), state)
+
+
+def _put(store: SqliteStore, tiles: Tiles) -> list[HeldTile]:
+    """Publish the tiles; what a vehicle holds that has them."""
+    made = [Tile(tile, 0, gaussians) for tile, gaussians in tiles.items()]
+    results = store.put_tiles(made)
+    return [HeldTile(one.tile_id, result.version, one.sha) for one, result in zip(made, results, strict=True)]
+
+
+def _exchanged(store: SqliteStore, held: Sequence[HeldTile]) -> tuple[float, float]:
+    """Bytes up and down a tile when a vehicle that holds this asks for all of it."""
+    sizes = np.array(list(_questions(Answers(store), held)))
+    up, down = sizes.sum(axis=0) / len(held)
+    return float(up), float(down)
+
+
+def _questions(answers: Answers, held: Sequence[HeldTile]) -> Iterator[tuple[int, int]]:
+    for district, tiles in groupby(sorted(held, key=lambda one: one.tile), lambda one: one.tile.district):
+        request = TilesRequest.of(tiles)
+        reply = answers.many(DEFAULT_LAYER, district, request)
+        key = len(batch_key(DEFAULT_LAYER, district))
+        yield key + len(request.encode()), key + len(reply.encode())
+
+
+def _figures(name: str, up_down: tuple[float, float], detail: str) -> list[Figure]:
+    up, down = up_down
+    return [Figure(f"{name}: download", down, "B/tile", detail), Figure(f"{name}: question", up, "B/tile")]

@@ -1,0 +1,85 @@
+"""The point-cloud baseline beside: the same scans, poses and movers, another map and upload (GND, section 7.4)."""
+
+from collections.abc import Mapping
+from pathlib import Path
+
+import numpy as np
+
+from gnd.fleet_sim.evaluate import Evaluation
+from gnd.fleet_sim.truth import Truth, grid_of
+from gnd.fleet_sim.world import World
+from gnd.gnd_map.gaussian import Gaussians
+from gnd.gnd_map.geodesy import LocalFrame
+from gnd.gnd_map.se3 import transform
+from gnd.gnd_map.tile_id import TileId
+from gnd.vehicle_agent.segment import SegmentedScan
+from studies.pcd import PcdDetector, PcdMap, PcdReport, base_pcd, evaluate_gnd, gnd_of, merge_pcd
+from studies.pcd.report import CODECS, Codec
+from studies.simulation.errors import FolderError
+
+UPLOADED: Codec = "points"
+"""What counts as the baseline's upload, as in the paper: every new and every deleted point with its coordinates."""
+
+
+def write_cloud(world: World, path: Path) -> None:
+    """Make the baseline's map of the state before and write it; the file appears complete or not at all."""
+    keep_cloud(base_pcd(world), path)
+
+
+def keep_cloud(cloud: PcdMap, path: Path) -> None:
+    """Write a cloud; the file appears complete or not at all."""
+    frame = cloud.frame
+    partial = path.with_name(f".{path.name}.part")
+    with partial.open("wb") as file:
+        np.savez(file, points_m=cloud.points_m, anchor=np.array([frame.lat_rad, frame.lon_rad, frame.height_m]))
+    partial.replace(path)
+
+
+def read_cloud(path: Path) -> PcdMap:
+    """Read the baseline's map.
+
+    Raises:
+        FolderError: it is missing or damaged.
+    """
+    try:
+        with np.load(path, allow_pickle=False) as file:
+            return PcdMap(file["points_m"], LocalFrame(*file["anchor"].tolist()))
+    except (OSError, ValueError, KeyError, EOFError) as error:
+        raise FolderError(f"cannot read the point cloud {path}: {error}") from error
+
+
+class CloudVehicle:
+    """The baseline's vehicle: sees what the detector sees."""
+
+    def __init__(self, base: PcdMap, map_frame: LocalFrame) -> None:
+        self._base = base
+        self._detector = PcdDetector(base)
+        self._T_cloud_map = base.frame.T_self_other(map_frame)
+
+    def add_scan(self, segmented: SegmentedScan) -> None:
+        """Count the rays of a scan, given in the vehicle's map frame."""
+        scan, T = segmented.scan, self._T_cloud_map
+        points, origins = transform(T, scan.points_map_m), transform(T, scan.origins_map_m)
+        self._detector.add_scan(points, origins, segmented.moving)
+
+    def report(self) -> tuple[bytes, Mapping[str, int]]:
+        """Return what is uploaded, and its size in each of the baseline's codecs."""
+        found = self._detector.finish()
+        sizes: dict[str, int] = {codec: len(found.encode(codec, self._base)) for codec in CODECS}
+        return found.encode(UPLOADED, self._base), sizes
+
+
+class Clouds:
+    """The baseline's cloud and its scores."""
+
+    def __init__(self, truth: Truth, base: PcdMap) -> None:
+        self._truth, self._base = truth, base
+        self._before = self._gaussians(base)
+
+    def score(self, bodies: list[bytes]) -> Evaluation:
+        """Return the score of the map that the baseline makes of these uploads."""
+        reports = [PcdReport.decode(body, self._base) for body in bodies]
+        return evaluate_gnd(self._truth, self._before, self._gaussians(merge_pcd(self._base, reports)))
+
+    def _gaussians(self, cloud: PcdMap) -> dict[TileId, Gaussians]:
+        return gnd_of(cloud, grid_of(self._truth))

@@ -1,0 +1,19 @@
+"""Errors of the reproduction; each is one line for the command line."""
+
+from gnd.gnd_map.errors import GndError
+
+
+class ReproduceError(GndError):
+    """Base of everything that `gnd reproduce simulation` refuses."""
+
+
+class OptionError(ReproduceError):
+    """An option that cannot work; the message says what can."""
+
+
+class FolderError(ReproduceError):
+    """A folder that holds no such run, or cannot be written."""
+
+
+class Stopped(ReproduceError):
+    """The run was asked to end early; what is done is kept."""

@@ -1,0 +1,192 @@
+"""The figures of a reproduction: map changes (GND, Figure 16), F1 by number of vehicles (Figure 17), masses."""
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.ticker import MaxNLocator
+
+from gnd.fleet_sim.ellipsoids import ellipsoids_of_maps, ellipsoids_of_truth
+from gnd.fleet_sim.pictures import View, draw_map, save_figure
+from gnd.fleet_sim.truth import LEVELS, Truth, read_truth
+from gnd.gnd_map.arrays import F64, I32, I64
+from gnd.gnd_map.classes import CLASS_COLOURS
+from gnd.gnd_map.evidence import MassParameters, masses
+from studies.simulation import reference
+from studies.simulation.cloud import map_of_one, merged_map
+from studies.simulation.masses import WATCHED, Watch, choose, most_telling
+from studies.simulation.run import Outcome, WorldOutcome
+from studies.simulation.targets import target_single
+from studies.simulation.uploads import arrived
+from studies.simulation.worlds import read_world_base
+
+_INK: Final = "#1c2430"
+_MASSES: Final = (("m(S) sustained", "#2f6fb5"), ("m(C) changed", "#d1433f"), ("m(Ω) unknown", "#8a94a3"))
+_LEVEL_NAMES: Final = {"all": "all voxels", "marginal_excluded": "marginal excluded", "scored": "scored voxels"}
+_LEVEL_STYLE: Final = {"scored": "-", "marginal_excluded": "--", "all": ":"}
+
+
+def draw_figures(outcome: Outcome, summary: Mapping[str, Any], folder: Path) -> list[Path]:
+    """Draw all figures of the first world into the folder and return their paths.
+
+    Raises:
+        SimError: a file cannot be written.
+    """
+    world = outcome.worlds[0]
+    truth = read_truth(world.files.truth)
+    paths = draw_changes(outcome, world, truth, folder)
+    paths.append(draw_curve(summary, folder / "f1_by_vehicles.png"))
+    watch = choose(truth)
+    watched = next((vehicle for vehicle in world.vehicles if len(vehicle.watched[0])), None)
+    if watch is not None and watched is not None:
+        parameters = outcome.options.method.detect.masses
+        paths.append(draw_masses(watch, watched.watched, parameters, watched.sensor, folder / "masses.png"))
+    return paths
+
+
+def draw_changes(outcome: Outcome, world: WorldOutcome, truth: Truth, folder: Path) -> list[Path]:
+    """Draw Figure 16: changes found by one drive, by the fleet, and the truth, in one view."""
+    base, true = read_world_base(world.files), ellipsoids_of_truth(truth)
+    view, n = View.around(true), max(outcome.options.vehicles)
+    one = next((vehicle for vehicle in world.vehicles if vehicle.sensor in reference.TARGET_SENSORS), world.vehicles[0])
+    merge = outcome.options.method.merge
+    held = arrived(base, world.vehicles[:n], merge, outcome.options.upload)
+    merged = merged_map(base, [body for sent in held for body in sent.bodies], merge)
+    alone, fleet = (
+        f"F1 {scored.f1():.2f} % of scored voxels" for scored in (world.single[one.vehicle], world.fleet[n])
+    )
+    pictures = (
+        ("single.png", ellipsoids_of_maps(truth.frame, base.tiles, map_of_one(base, one.reports)),
+         f"One drive, {one.sensor}", alone),
+        ("merged.png", ellipsoids_of_maps(truth.frame, base.tiles, merged), f"{n} vehicles", fleet),
+        ("truth.png", true, "Truth", f"world seed {world.seed}"),
+    )  # fmt: skip
+    for name, ellipsoids, title, note in pictures:
+        draw_map(ellipsoids, folder / name, title, note, view)
+    return [folder / name for name, *_ in pictures]
+
+
+def draw_curve(summary: Mapping[str, Any], path: Path) -> Path:
+    """Draw Figure 17: F1 of scored voxels by number of vehicles; thin lines are the other two levels.
+
+    The axis is broken: the stale map lies far below everything else.
+    """
+    figure = Figure(figsize=(9.4, 6.4), dpi=150, facecolor="white")
+    axes, below = figure.add_axes((0.08, 0.27, 0.89, 0.61)), figure.add_axes((0.08, 0.095, 0.89, 0.13))
+    numbers = sorted(int(n) for n in summary["fleet"])
+    drawn = [*_curves(axes, summary, numbers), *_baseline(axes, summary)]
+    stale = summary["stale"]["f1"]["scored"]
+    below.axhline(stale, color="#2f6fb5", linewidth=1.8)
+    axes.plot([], [], color="#2f6fb5", linewidth=1.8, label=f"stale map: {stale:.2f} (paper {reference.STALE})")
+    paper = {1: reference.SINGLE, **reference.FLEET_READ_OFF, **reference.FLEET}
+    shown = [n for n in paper if n <= max(numbers)]
+    axes.plot(shown, [paper[n] for n in shown], "x", color=_INK, markersize=7, label="paper", clip_on=False, zorder=5)
+    for part in (axes, below):
+        _dress(part, "", "")
+        part.set_xlim(min(numbers) - 0.3, max(*numbers, 2) + 0.3)
+        part.xaxis.set_major_locator(MaxNLocator(integer=True))
+    axes.set_ylim(np.floor(min(*drawn, reference.SINGLE)) - 1.5, 100.5)
+    axes.tick_params(labelbottom=False)
+    axes.spines["bottom"].set_visible(False)
+    below.set_ylim(stale - 6, stale + 6)
+    below.set_xlabel("vehicles", color=_INK)
+    axes.set_ylabel("macro F1 in percent", color=_INK)
+    axes.legend(frameon=False, fontsize=9.5, loc="lower right", labelcolor=_INK, ncols=2)
+    seeds = ", ".join(map(str, summary["seeds"]))
+    _title(figure, "F1 by number of vehicles", f"world seed {seeds}, poses {summary['parameters']['poses']}")
+    save_figure(figure, path)
+    return path
+
+
+def _curves(axes: Axes, summary: Mapping[str, Any], numbers: list[int]) -> list[float]:
+    """Draw the fleet at the three levels and the line of one drive; give all values."""
+    _spread(axes, summary, numbers)
+    drawn: list[float] = []
+    for level in reversed(LEVELS):
+        values = [summary["fleet"][str(n)]["f1"][level] for n in numbers]
+        width, label = 2.4 if level == "scored" else 1.3, f"fleet, {_LEVEL_NAMES[level]}"
+        axes.plot(numbers, values, _LEVEL_STYLE[level], color="#2e8b57", linewidth=width, label=label)
+        drawn += values
+    single, of = _one_drive(summary)
+    axes.axhline(single, color="#e0a020", linewidth=1.8, label=f"one drive, {of}: {single:.2f}")
+    return [*drawn, single]
+
+
+def _one_drive(summary: Mapping[str, Any]) -> tuple[float, str]:
+    """Mean F1 of a drive alone and whose it is: of the 16- and 32-layer sensors, of all where none of them drove."""
+    target = target_single(summary)
+    if target is not None:
+        return target["scored"], "16/32 layers"
+    return float(np.mean([stage["f1"]["scored"] for stage in summary["single"].values()])), "all sensors"
+
+
+def _spread(axes: Axes, summary: Mapping[str, Any], numbers: list[int]) -> None:
+    """Shade what lies between the best and the worst of several worlds."""
+    worlds = list(summary.get("by_seed", {}).values())
+    if worlds:
+        each = np.array([[world["fleet"][str(n)]["f1"]["scored"] for n in numbers] for world in worlds])
+        axes.fill_between(numbers, each.min(axis=0), each.max(axis=0), color="#2e8b57", alpha=0.15, linewidth=0)
+
+
+def _baseline(axes: Axes, summary: Mapping[str, Any]) -> list[float]:
+    """Draw the point-cloud baseline, where it ran; give its values."""
+    fleet = summary.get("pcd", {}).get("fleet", {})
+    numbers = sorted(int(n) for n in fleet)
+    values = [float(fleet[str(n)]["f1"]["scored"]) for n in numbers]
+    if values:
+        axes.plot(numbers, values, "o-", color="#8455a8", linewidth=1.6, markersize=4, label="point clouds, scored")
+    return values
+
+
+def draw_masses(watch: Watch, history: tuple[I64, I32], parameters: MassParameters, sensor: str, path: Path) -> Path:
+    """Draw m(S), m(C), m(Ω) of one voxel of each class over the scans of one drive."""
+    figure = Figure(figsize=(11.0, 6.8), dpi=150, facecolor="white")
+    t_ns, counters = history
+    axes = figure.subplots(2, 2, sharex=True, sharey=True)
+    figure.subplots_adjust(left=0.065, right=0.985, top=0.84, bottom=0.08, hspace=0.22, wspace=0.07)
+    for panel, index, change_class in zip(axes.flat, most_telling(watch, counters), WATCHED, strict=True):
+        _dress(panel, "", "")
+        name = f"a {change_class.name.lower()} voxel"
+        if index >= 0:
+            _mass_lines(panel, (t_ns - t_ns[0]) * 1e-9, counters[:, index], parameters)
+            rays = dict(zip(("BI", "BO", "BE", "PI"), counters[-1, index].tolist(), strict=True))
+            name += "  (" + ", ".join(f"{k} {v}" for k, v in rays.items() if v) + ")"
+        panel.set_title(name, fontsize=11, color=CLASS_COLOURS[change_class], loc="left", weight="bold")
+        panel.set_ylim(-0.03, 1.03)
+    for panel in axes[1]:
+        panel.set_xlabel("seconds since the first ray", color=_INK)
+    handles, labels = axes.flat[0].get_legend_handles_labels()
+    figure.legend(handles, labels, loc="upper right", bbox_to_anchor=(0.99, 0.985), ncols=3, frameon=False)
+    _title(figure, "Masses of single voxels", f"one drive, {sensor}; rays counted in brackets")
+    save_figure(figure, path)
+    return path
+
+
+def _mass_lines(axes: Axes, t_s: F64, counters: I32, parameters: MassParameters) -> None:
+    """Eq. (11) after each scan, from counters (S, 4) n_BI, n_BO, n_BE, n_PI up to it."""
+    n_bi, n_bo, n_be, n_pi = counters.T
+    values = masses(n_bi, n_bo, n_be, n_pi, parameters)
+    for column, (label, colour) in enumerate(_MASSES):
+        axes.step(t_s, values[:, column], where="post", color=colour, linewidth=1.9, label=label)
+
+
+def _dress(axes: Axes, x: str, y: str) -> None:
+    axes.set_xlabel(x, color=_INK)
+    axes.set_ylabel(y, color=_INK)
+    axes.grid(color="#e3e7ed", linewidth=0.8)
+    axes.tick_params(colors=_INK, labelsize=9)
+    for name, spine in axes.spines.items():
+        spine.set(visible=name in ("left", "bottom"), color="#c3ccd8")
+
+
+def _title(figure: Figure, title: str, note: str) -> None:
+    figure.text(0.03, 0.955, title, fontsize=16, weight="bold", color=_INK, va="center")
+    figure.text(0.03, 0.912, note, fontsize=10, color="#5a6675", va="center")
+
+
+def pictures_of(paths: Sequence[Path]) -> str:
+    """Return the names of pictures for the last line of the output."""
+    return ", ".join(path.name for path in paths)

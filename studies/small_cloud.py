@@ -1,0 +1,110 @@
+"""Router, tile server and merger shards as `gnd fleet` starts them, with a map that changes: for studies of service."""
+
+import time
+from collections.abc import Iterator, Sequence
+from contextlib import ExitStack, contextmanager
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+
+from gnd.cloud_merger.config import ShardConfig
+from gnd.deploy import roles
+from gnd.deploy.fleet import POLL_S
+from gnd.deploy.ports import claim_port
+from gnd.deploy.processes import ProcessSpec, Supervisor, start_fork_server
+from gnd.deploy.repeating import repeated
+from gnd.fleet_bus.bus import open_bus
+from gnd.fleet_bus.config import BusConfig
+from gnd.gnd_map.gaussian import Gaussians
+from gnd.gnd_map.tile import Tile
+from gnd.gnd_map.tile_id import TileId
+from gnd.schemas.keys import tile_key
+from gnd.tile_store.sqlite_store import SqliteStore
+from studies.flat_tile import base_tile
+
+READY_S = 60.0
+SHARD_POLL_S = 0.02
+TILES = 8
+
+
+@dataclass(slots=True)
+class SmallCloud:
+    """A running cloud of one machine.
+
+    Attributes:
+        connect: endpoint of its router.
+        supervisor: starts again what dies, from a thread of its own.
+        store: open here too, to publish by.
+        base: the tiles as they were first.
+        folder: of logs and whatever clients write.
+        put_s: when each (tile, version) was committed here, by the monotonic clock, s.
+    """
+
+    connect: str
+    supervisor: Supervisor
+    store: SqliteStore
+    base: Sequence[Tile]
+    folder: Path
+    put_s: dict[tuple[int, int], float] = field(default_factory=dict)
+
+    def pid(self, name: str) -> int:
+        """The process that bears this name now."""
+        return self.supervisor.pids()[name]
+
+    def publish(self, number: int) -> None:
+        """Commit another version of one of the tiles: half of its voxels have another mean."""
+        tile = self.base[number % len(self.base)]
+        (result,) = self.store.put_tiles([_changed(tile, number)])
+        self.put_s[tile.tile_id.morton, result.version] = time.monotonic()
+
+
+@contextmanager
+def small_cloud(folder: Path, shards: int = 1) -> Iterator[SmallCloud]:
+    """Start a cloud, wait until it answers, end it with the block."""
+    start_fork_server()
+    connect = f"tcp/127.0.0.1:{claim_port(0)}"
+    base = tiles()
+    folder.mkdir(parents=True, exist_ok=True)
+    with ExitStack() as stack:
+        store = stack.enter_context(SqliteStore(folder / "store.sqlite"))
+        store.put_tiles(base)
+        supervisor = Supervisor(folder, folder / "pids.json")
+        stack.callback(supervisor.stop)
+        for spec in _processes(connect, folder, shards):
+            supervisor.start(spec)
+        stack.enter_context(_supervised(supervisor))
+        with open_bus(BusConfig(connect=(connect,), open_timeout_s=READY_S), name="probe") as bus:
+            bus.request(tile_key("ndt", base[0].tile_id), b"", kind="tile", timeout_s=READY_S)
+        yield SmallCloud(connect, supervisor, store, base, folder)
+
+
+def tiles() -> list[Tile]:
+    """Neighbouring tiles of flat Gaussians."""
+    first = base_tile()
+    ids = [TileId(first.tile_id.morton + n) for n in range(TILES)]
+    return [Tile(tile_id, 1, first.gaussians) for tile_id in ids]
+
+
+def _processes(connect: str, folder: Path, shards: int) -> list[ProcessSpec]:
+    store = folder / "store.sqlite"
+    configs = [ShardConfig(f"shard-{n}", store, (connect,), poll_s=SHARD_POLL_S) for n in range(shards)]
+    return [
+        ProcessSpec("router", roles.router, (connect,)),
+        ProcessSpec("store", roles.store, (store, connect)),
+        *(ProcessSpec(f"merger-{n}", roles.merger, (config,)) for n, config in enumerate(configs)),
+    ]
+
+
+@contextmanager
+def _supervised(supervisor: Supervisor) -> Iterator[None]:
+    with repeated(lambda _number: supervisor.poll(), POLL_S):
+        yield
+
+
+def _changed(tile: Tile, number: int) -> Tile:
+    g = tile.gaussians
+    mean_m = g.mean_m.copy()
+    half = mean_m[::2]
+    half[:] = np.random.default_rng(number).uniform(-0.1, 0.1, half.shape)
+    return Tile(tile.tile_id, 1, Gaussians(g.voxel_id, g.count, g.cells, mean_m, g.cov_m2))

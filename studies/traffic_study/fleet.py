@@ -1,0 +1,188 @@
+"""The drives of a study, one after the other through the same cloud: what each uploads, what map comes of it."""
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+from rich.progress import Progress
+
+from gnd.fleet_sim.drives import EPOCH_NS, DriveConfig
+from gnd.fleet_sim.evaluate import evaluate_maps
+from gnd.fleet_sim.traffic import Traffic
+from gnd.fleet_sim.truth import Level, Truth, read_truth
+from gnd.gnd_map.codec import Lattice, snap
+from gnd.gnd_map.config import to_mapping
+from studies.simulation.base_map import BaseMap, read_base, write_base
+from studies.simulation.errors import FolderError
+from studies.simulation.pool import Job, run_jobs
+from studies.simulation.result import VehicleResult, read_result
+from studies.simulation.scoring import Scored
+from studies.simulation.sources import PCD, SIMULATOR, VEHICLE, key_of, sources_sha
+from studies.simulation.vehicle import VehicleTask, run_vehicle
+from studies.simulation.worlds import WorldFiles
+from studies.traffic_study.cloud import Cloud
+from studies.traffic_study.options import TrafficOptions
+from studies.traffic_study.uploads import DriveUpload, upload
+
+_HOUR_NS = 3_600 * 1_000_000_000
+
+
+@dataclass(frozen=True, slots=True)
+class Way:
+    """How maps and reports travel.
+
+    Attributes:
+        name: of its files.
+        lattice: on which the published map lies; None: it stays as it was measured, and reports go whole, in floats.
+    """
+
+    name: str
+    lattice: Lattice | None
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class FleetOutcome:
+    """What came of the drives.
+
+    Attributes:
+        uploads: of each drive, in order.
+        base: the map that the first vehicles drove with.
+        final: the map after the last drive.
+        f1: macro F1 in percent by level after `scored_after` drives, and after all (`final_f1`), of the stale map
+            (`stale_f1`).
+        published: new tile versions after each round.
+    """
+
+    uploads: tuple[DriveUpload, ...]
+    base: BaseMap
+    final: BaseMap
+    stale_f1: dict[Level, float]
+    f1: dict[Level, float]
+    final_f1: dict[Level, float]
+    published: tuple[int, ...]
+
+
+@dataclass(frozen=True, slots=True)
+class Fleet:
+    """The drives of one study on one world."""
+
+    options: TrafficOptions
+    files: WorldFiles
+
+    def run(self, way: Way, drives: int, processes: int, progress: Progress) -> FleetOutcome:
+        """Drive and merge, `options.at_once` vehicles at a time; drives whose results are kept are not driven again.
+
+        Args:
+            way: how maps and reports travel.
+            drives: how many.
+            processes: worker processes.
+            progress: gets the bars.
+
+        Raises:
+            GndError: something cannot be made as asked, or an upload did not get through.
+        """
+        truth = read_truth(self.files.truth)
+        base = _published(read_base(self.files.base), way.lattice)
+        uploads: list[DriveUpload] = []
+        published: list[int] = []
+        scores: dict[int, dict[Level, float]] = {}
+        store, merge = self.files.home / f"cloud-{way.name}.sqlite", self.options.method.merge
+        with Cloud(store, base, merge, way.lattice.name if way.lattice else "float") as cloud:
+            for first in range(0, drives, self.options.at_once):
+                held = cloud.map()
+                numbers = range(first, min(first + self.options.at_once, drives))
+                driven = self._driven(way, held, numbers, processes, progress)
+                uploads += [upload(result, held, cloud) for result in driven]
+                published.append(cloud.merge())
+                scores[len(uploads)] = _f1(truth, base, cloud.map())
+            final = cloud.map()
+        after = min((n for n in scores if n >= self.options.f1_drives), default=drives)
+        stale = _f1(truth, base, base)
+        return FleetOutcome(tuple(uploads), base, final, stale, scores[after], scores[drives], tuple(published))
+
+    def _driven(
+        self, way: Way, held: BaseMap, numbers: range, processes: int, progress: Progress
+    ) -> Iterator[VehicleResult]:
+        """The results of drives that begin with the map `held`, in order."""
+        path = self.files.home / f"map-{way.name}-{numbers.start:02d}.npz"
+        write_base(held, path)
+        tasks = [self._task(way, held, path, number) for number in numbers]
+        jobs = [Job(f"{t.drive.vehicle} {way.name}", run_vehicle, (t,), ticks=True) for t in tasks if not _is_done(t)]
+        run_jobs(jobs, processes, progress, f"drives {numbers.start + 1} to {numbers.stop}, {way.name}")
+        return (read_result(task.result, task.key) for task in tasks)
+
+    def _task(self, way: Way, held: BaseMap, path: Path, number: int) -> VehicleTask:
+        options, drive = self.options, drive_config(self.options, number)
+        cloud = self.files.cloud if way.lattice is not None and number < options.pcd_drives else None
+        key = self._key(way, held, drive, with_pcd=cloud is not None)
+        return VehicleTask(
+            world=self.files.world,
+            base=path,
+            voxels=self.files.voxels,
+            sensor=options.sensor,
+            drive=drive,
+            poses=options.poses,
+            method=_method(options, way),
+            result=self.files.home / "vehicles" / f"{drive.vehicle}-{way.name}-{key}.npz",
+            key=key,
+            cloud=cloud,
+            rounded=way.lattice is not None,
+        )
+
+    def _key(self, way: Way, held: BaseMap, drive: DriveConfig, *, with_pcd: bool) -> str:
+        """A hash of everything that decides what the vehicle reports."""
+        method: Any = to_mapping(_method(self.options, way))
+        return key_of(
+            sources=sources_sha(VEHICLE),
+            truth=sources_sha(SIMULATOR),
+            world=self.files.home.name,
+            base=held.sha,
+            versions=sorted((tile.morton, held.version(tile)) for tile in held.tiles),
+            drive=to_mapping(drive),
+            poses=str(self.options.poses),
+            rounded=way.lattice is not None,
+            pcd=sources_sha(PCD) if with_pcd else None,
+            method={name: method[name] for name in ("localise", "segment", "detect", "report")},
+        )
+
+
+def drive_config(options: TrafficOptions, number: int) -> DriveConfig:
+    """Return the drive of a number, 0 the first: directions alternate, cars and traffic are others each time."""
+    return DriveConfig(
+        vehicle=f"vehicle-{number:02d}",
+        sensor=options.sensor_model,
+        direction=1 if number % 2 == 0 else -1,
+        seed=1_000_003 * options.seed + number,
+        car_share=options.parking,
+        traffic=Traffic.urban() if options.traffic else Traffic(),
+        scans=options.scans,
+        start_ns=EPOCH_NS + number * _HOUR_NS,
+    )
+
+
+def _method(options: TrafficOptions, way: Way) -> Any:
+    """The parameters; floats go whole."""
+    if way.lattice is not None:
+        return options.method
+    return replace(options.method, report=replace(options.method.report, protocol="full"))
+
+
+def _published(base: BaseMap, lattice: Lattice | None) -> BaseMap:
+    if lattice is None:
+        return base
+    return BaseMap({tile: snap(gaussians, lattice) for tile, gaussians in base.tiles.items()})
+
+
+def _is_done(task: VehicleTask) -> bool:
+    try:
+        read_result(task.result, task.key)
+        return True
+    except FolderError:
+        return False
+
+
+def _f1(truth: Truth, base: BaseMap, final: BaseMap) -> dict[Level, float]:
+    scored = Scored.of(evaluate_maps(truth, base.tiles, final.tiles))
+    levels: Sequence[Level] = ("all", "marginal_excluded", "scored")
+    return {level: scored.f1(level) for level in levels}

@@ -1,0 +1,116 @@
+"""What the lattices weigh on this street, what they do to Gaussians and poses, and how long coding takes."""
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from time import process_time
+from typing import Final
+
+import numpy as np
+
+from gnd.fleet_sim.world import World
+from gnd.gnd_map.arrays import F64
+from gnd.gnd_map.codec import CODECS, LATTICES, Codec, lattice_of, snap
+from gnd.gnd_map.gaussian import Gaussians
+from gnd.gnd_map.motion import Trajectory, deskew
+from gnd.gnd_map.tile_id import TileId
+from gnd.schemas.drive import Scan
+from studies.codec_quality import PosedScan, kl_median, pose_shift_cm
+from studies.plain_protobuf import plain_protobuf
+from studies.short_drives import Street
+
+TILE_VOXELS: Final = 2_500
+_SCANS: Final = 40
+_REPEATS: Final = 15
+_MARGIN_M: Final = 100.0
+
+Tiles = Mapping[TileId, Gaussians]
+
+
+@dataclass(frozen=True, slots=True)
+class CodecMeasures:
+    """What the range codec of one lattice does.
+
+    Attributes:
+        bytes_per_voxel: of tile bodies.
+        zstd_bytes_per_voxel: of the second codec's bodies.
+        kl_median: divergence of the decoded Gaussians from the original ones, nats.
+        pose_shift_cm_median: how far apart the poses are that scans find on the original and on the decoded map.
+        encode_ms, decode_ms: a tile of `TILE_VOXELS`, one core.
+    """
+
+    bytes_per_voxel: float
+    zstd_bytes_per_voxel: float
+    kl_median: float
+    pose_shift_cm_median: float
+    encode_ms: float
+    decode_ms: float
+
+
+def codec_measures(world: World, tiles: Tiles, sensor_model: str) -> dict[str, CodecMeasures]:
+    """Return the measures of every lattice on a map that is on none.
+
+    Args:
+        world: the street; scans are taken in its state before.
+        tiles: its map.
+        sensor_model: of the scans.
+    """
+    street = Street(world, _MARGIN_M)
+    scans = _posed_scans(street, sensor_model)
+    found = {}
+    for name, lattice in LATTICES.items():
+        snapped = {tile: snap(gaussians, lattice) for tile, gaussians in tiles.items()}
+        first, second = (codec for codec in CODECS.values() if lattice_of(codec.codec_id) is lattice)
+        encode_ms, decode_ms = _times_ms(first, snapped)
+        shift = pose_shift_cm(street.grid_frame, tiles, snapped, scans)
+        found[name] = CodecMeasures(
+            bytes_per_voxel=_bytes_per_voxel(first, snapped),
+            zstd_bytes_per_voxel=_bytes_per_voxel(second, snapped),
+            kl_median=kl_median(tiles, snapped),
+            pose_shift_cm_median=float(np.median(shift)),
+            encode_ms=encode_ms,
+            decode_ms=decode_ms,
+        )
+    return found
+
+
+def protobuf_bytes(tiles: Tiles) -> int:
+    """Return the size of the tiles as the paper writes them: protobuf, a message a voxel, doubles."""
+    return sum(len(plain_protobuf(tile, gaussians, "double")) for tile, gaussians in tiles.items())
+
+
+def _bytes_per_voxel(codec: Codec, tiles: Tiles) -> float:
+    size = sum(len(codec.encode(tile, gaussians)) for tile, gaussians in tiles.items())
+    return size / sum(map(len, tiles.values()))
+
+
+def _times_ms(codec: Codec, tiles: Tiles) -> tuple[float, float]:
+    """Of the largest tile, brought to `TILE_VOXELS`; the processor's time, so that other work does not count."""
+    tile, gaussians = max(tiles.items(), key=lambda item: len(item[1]))
+    body, scale = codec.encode(tile, gaussians), 1e3 * TILE_VOXELS / len(gaussians)
+    encode_s, decode_s = _spent_s(lambda: codec.encode(tile, gaussians)), _spent_s(lambda: codec.decode(tile, body))
+    return encode_s * scale, decode_s * scale
+
+
+def _spent_s(call: Callable[[], object]) -> float:
+    """Median time of the processor, after a first call that compiles."""
+    call()
+    return float(np.median([_once_s(call) for _ in range(_REPEATS)]))
+
+
+def _once_s(call: Callable[[], object]) -> float:
+    started_s = process_time()
+    call()
+    return process_time() - started_s
+
+
+def _posed_scans(street: Street, sensor_model: str) -> list[PosedScan]:
+    """Scans evenly along a drive before the changes, sweep motion removed, with their true poses."""
+    drive = street.drive(sensor_model, "before", 1, street.world.seed)
+    scans = [item for item in drive.items() if isinstance(item, Scan)]
+    every = max(1, len(scans) // _SCANS)
+    return [_posed(drive.truth, drive.T_vehicle_lidar, scan) for scan in scans[every::every]]
+
+
+def _posed(truth: Trajectory, T_vehicle_lidar: F64, scan: Scan) -> PosedScan:
+    points = deskew(scan.points_m, scan.t_offset_ns, scan.t_ns, truth, T_vehicle_lidar, scan.t_ns)
+    return points, truth.at(scan.t_ns)

@@ -1,0 +1,217 @@
+"""What a vehicle sends and receives on a street that it knows: every byte of the wire, over the real bus.
+
+Router, tile server and merger are processes of their own, as in a fleet run; the vehicle is an agent that drives at the
+pace of the recording, so that keep-alives are those of as long a drive. Its cache holds the map when it starts. What is
+counted is what the kernel counted on its connection.
+"""
+
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Final
+
+from gnd.deploy import roles
+from gnd.deploy.fleet import cloud_processes
+from gnd.deploy.fleet_config import FleetConfig
+from gnd.deploy.processes import ProcessSpec, Supervisor, start_fork_server
+from gnd.deploy.run_folder import RunFolder, create_run_folder
+from gnd.deploy.site import loopback_site
+from gnd.fleet_bus.ledger_file import read_ledger
+from gnd.fleet_bus.traffic import AgentTraffic, agent_traffic, headline, per_km
+from gnd.fleet_sim.drives import DriveConfig, simulate_drive
+from gnd.fleet_sim.sensors import SHORT_NAMES
+from gnd.fleet_sim.street import StreetOptions
+from gnd.fleet_sim.traffic import Traffic
+from gnd.fleet_sim.world import read_world
+from gnd.gnd_map.codec import LATTICES, snap
+from gnd.gnd_map.tile import Tile
+from gnd.tile_store.sqlite_store import SqliteStore
+from gnd.tile_store.values import DEFAULT_LAYER
+from gnd.vehicle_agent.agent import AgentConfig
+from gnd.vehicle_agent.cache import TileCache
+from studies.simulation.base_map import read_base
+from studies.simulation.options import RunOptions
+from studies.simulation.worlds import WorldFiles, prepare_world, world_name
+from studies.traffic_study.errors import TrafficError
+
+MUST_KB_PER_KM: Final = 2.0
+AIM_KB_PER_KM: Final = 1.0
+_ONCE_A_DRIVE: Final = ("opening", "closing", "session")
+_VEHICLE: Final = "vehicle-00"
+_LOOK_S: Final = 0.5
+_SETTLE_S: Final = 1.0
+
+
+@dataclass(frozen=True, slots=True)
+class SteadyOptions:
+    """One drive of a vehicle that knows the street.
+
+    Attributes:
+        seed: of the world; nothing of it has changed since it was mapped.
+        length_m: of the street.
+        parking: share of parking slots that are taken; on the map there is no car.
+        speed_kmh: once under way.
+        sensor: short name.
+        link: profile of the vehicle's link.
+        pace: times real time; a slower pace has more keep-alives a km.
+        deadline_s: the drive is given up after this long.
+    """
+
+    seed: int = 201
+    length_m: float = 1000.0
+    parking: float = 0.0
+    speed_kmh: float = 40.0
+    sensor: str = "vlp16"
+    link: str = "4g"
+    pace: float = 1.0
+    deadline_s: float = 1800.0
+
+    def __post_init__(self) -> None:
+        if not (self.speed_kmh > 0 and self.pace > 0 and self.deadline_s > 0):
+            raise TrafficError(
+                f"speed, pace, deadline must be positive: {self.speed_kmh} km/h, {self.pace}, {self.deadline_s} s"
+            )
+        if self.sensor not in SHORT_NAMES:
+            raise TrafficError(f"unknown sensor {self.sensor!r}, use one of {', '.join(SHORT_NAMES)}")
+
+
+def steady(options: SteadyOptions, home: Path) -> dict[str, Any]:
+    """Make street, map and drive (kept in `home`), drive, and return the account.
+
+    Raises:
+        GndError: something cannot be made as asked, or the drive did not come to its end.
+    """
+    start_fork_server()  # before any thread of this process
+    drive, base = _prepared(options, home)
+    folder = create_run_folder(home / "run", overwrite=True)
+    folder.write_mark({"steady": str(options)})
+    _fill_store_and_cache(folder, base)
+    started_s = time.monotonic()
+    _drive(options, folder, drive)
+    traffic = agent_traffic(read_ledger(folder.ledger / f"{_VEHICLE}.jsonl"), ())
+    return account(traffic, time.monotonic() - started_s)
+
+
+def account(traffic: AgentTraffic, wall_s: float) -> dict[str, Any]:
+    """The account of a drive as plain values, and what of it is reached.
+
+    Must and aim hold for a vehicle under way: what comes once a drive, however long, is told by itself.
+    """
+    total = headline((traffic,))
+    once_a_drive = sum(line.wire_bytes for line in traffic.lines if line.kind in _ONCE_A_DRIVE)
+    under_way = total["other_kB_per_km"] - per_km(once_a_drive, traffic.drive_km)
+    return {
+        "km": round(traffic.drive_km, 4),
+        "drive_s": round(traffic.drive_s, 1),
+        "wall_s": round(wall_s, 1),
+        **total,
+        "once_a_drive_bytes": once_a_drive,
+        "under_way_kB_per_km": under_way,
+        "estimated_wire_bytes": traffic.estimated_wire_bytes,
+        "rows": [
+            {
+                "kind": line.kind,
+                "direction": line.direction,
+                "messages": line.messages,
+                "app_bytes": line.app_bytes,
+                "wire_bytes": line.wire_bytes,
+                "wire_kB_per_km": round(per_km(line.wire_bytes, traffic.drive_km), 4),
+            }
+            for line in traffic.lines
+        ],
+        "must_kB_per_km": MUST_KB_PER_KM,
+        "aim_kB_per_km": AIM_KB_PER_KM,
+        "met": under_way <= MUST_KB_PER_KM,
+        "aim_met": under_way <= AIM_KB_PER_KM,
+    }
+
+
+def lines_of(found: dict[str, Any]) -> list[str]:
+    """An account as lines for people."""
+    lines = [
+        f"{row['kind']:12} {row['direction']:5} {row['messages']:4} messages {row['wire_bytes']:7} B "
+        f"{row['wire_kB_per_km']:8.3f} kB/km"
+        for row in found["rows"]
+    ]
+    reached = "aim met" if found["aim_met"] else "must met" if found["met"] else "missed"
+    return [
+        *lines,
+        f"{found['km']:.3f} km in {found['drive_s']:.0f} s of driving ({found['wall_s']:.0f} s by the clock): "
+        f"all bytes {found['all_kB_per_km']:.2f} kB/km, tiles {found['tiles_kB_per_km']:.2f}",
+        f"all but tiles: {found['other_kB_per_km']:.2f} kB/km of this drive, of it once a drive (opening, declaring, "
+        f"closing) {found['once_a_drive_bytes']} B",
+        f"all but tiles, under way: {found['under_way_kB_per_km']:.2f} kB/km "
+        f"(must {MUST_KB_PER_KM:g}, aim {AIM_KB_PER_KM:g}: {reached})",
+    ]
+
+
+def _prepared(options: SteadyOptions, home: Path) -> tuple[Path, WorldFiles]:
+    """The drive and the map, made where they are missing."""
+    street = StreetOptions(options.length_m, "wangsimni", edit_share=0.0)
+    files = WorldFiles(home / world_name(options.seed, street), "surveyed")
+    files.home.mkdir(parents=True, exist_ok=True)
+    prepare_world(files, options.seed, RunOptions(seeds=(options.seed,), street=street, base="surveyed"))
+    config = DriveConfig(
+        vehicle=_VEHICLE,
+        sensor=SHORT_NAMES[options.sensor],
+        seed=1_000_003 * options.seed,
+        cruise_mps=options.speed_kmh / 3.6,
+        car_share=options.parking,
+        traffic=Traffic.urban(),
+    )
+    drive = files.home / f"{options.sensor}-{options.speed_kmh:g}kmh-parking{100 * options.parking:g}.mcap"
+    if not drive.exists():
+        simulate_drive(read_world(files.world), config, drive)
+    return drive, files
+
+
+def _fill_store_and_cache(folder: RunFolder, files: WorldFiles) -> None:
+    """The cloud holds the map as it is published, and so does the vehicle."""
+    base = read_base(files.base)
+    with SqliteStore(folder.store) as store:
+        store.put_tiles(Tile(i, 1, snap(gaussians, LATTICES["standard"])) for i, gaussians in base.tiles.items())
+        cache = TileCache[Tile](folder.agents / _VEHICLE / "cache.sqlite", DEFAULT_LAYER)
+        for entry in store.heads(DEFAULT_LAYER):
+            stored = store.get(DEFAULT_LAYER, entry.tile)
+            if stored is not None:
+                cache.put(stored.decode_gaussians())
+        cache.close()
+
+
+def _drive(options: SteadyOptions, folder: RunFolder, drive: Path) -> None:
+    config = FleetConfig(agents=1, shards=1, link=options.link)
+    site = loopback_site(config, 1)
+    agent = AgentConfig(
+        vehicle=_VEHICLE,
+        drive=drive,
+        work_dir=folder.agents / _VEHICLE,
+        connect=(site.connect,),
+        link=options.link,
+        pace=options.pace,
+        ledger_dir=folder.ledger,
+    )
+    with _supervised(folder) as supervisor:
+        for spec in cloud_processes(config, folder, site):
+            supervisor.start(spec)
+        time.sleep(_SETTLE_S)
+        supervisor.start(ProcessSpec(_VEHICLE, roles.agent, (agent,), restart=False))
+        deadline_s = time.monotonic() + options.deadline_s
+        while not supervisor.finished(_VEHICLE):
+            if time.monotonic() > deadline_s:
+                raise TrafficError(f"the drive did not end within {options.deadline_s:g} s: read {folder.logs}")
+            supervisor.poll()
+            time.sleep(_LOOK_S)
+
+
+@contextmanager
+def _supervised(folder: RunFolder) -> Iterator[Supervisor]:
+    """The vehicle ends first, the router last."""
+    supervisor = Supervisor(folder.logs, folder.pids)
+    try:
+        yield supervisor
+    finally:
+        names = tuple(supervisor.pids())
+        for group in ("vehicle-", "merger-", "watcher", "store", "router"):
+            supervisor.stop(tuple(name for name in names if name.startswith(group)))
