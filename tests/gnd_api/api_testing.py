@@ -1,5 +1,6 @@
 """What the tests of the Python API share: small tiles, a cloud that publishes, programs in processes of their own."""
 
+import os
 import queue
 import subprocess
 import sys
@@ -31,7 +32,7 @@ def gaussian_tile(tile: TileId, *voxels: int) -> Tile:
     """A tile as maps hold it: on the lattice, so that the range coder writes it."""
     ids = np.unique(np.array(voxels, np.int32))
     n = len(ids)
-    mean_m = np.repeat((ids % 97).astype(np.float32)[:, None] / 100, 3, axis=1)
+    mean_m = np.repeat((ids % 41).astype(np.float32)[:, None] / 100, 3, axis=1)
     cov_m2 = np.tile(np.array([0.04, 0.01, 0, 0.03, 0, 0.001], np.float32), (n, 1))
     count = np.full(n, 100, np.int32)
     return Tile(tile, 0, snap(Gaussians(ids, count, count // 4, mean_m, cov_m2), LATTICES["standard"]))
@@ -71,7 +72,7 @@ class Program:
             stderr=subprocess.STDOUT,
             text=True,
             cwd=folder,
-            env={"PYTHONPATH": str(ROOT / "src"), "PYTHONUNBUFFERED": "1", "PATH": "/usr/bin:/bin"},
+            env=os.environ | {"PYTHONPATH": str(ROOT / "src"), "PYTHONUNBUFFERED": "1"},
         )
         self.lines: list[str] = []
         self._new: queue.Queue[str] = queue.Queue()
