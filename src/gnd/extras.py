@@ -7,9 +7,7 @@ from typing import Final
 
 from gnd.gnd_map.errors import GndError
 
-LEFT_OUT: Final = frozenset(
-    ("gtsam", "matplotlib", "mpl_toolkits", "prometheus_client", "psutil", "scipy", "sklearn", "small_gicp")
-)
+LEFT_OUT: Final = frozenset(("gtsam", "matplotlib", "mpl_toolkits", "psutil", "scipy", "sklearn", "small_gicp"))
 """Modules of other projects that only extras bring; pyproject.toml has the same table by extra."""
 EXTRA_OF: Final = {
     "gnd.vehicle_agent": "vehicle",
@@ -17,7 +15,7 @@ EXTRA_OF: Final = {
     "gnd.tile_store": "cloud",
     "gnd.fleet_sim": "sim",
 }
-"""By the package that wanted one of them. The bus alone wants the cloud's; any other: all."""
+"""By the package that wanted one of them; any other: all."""
 
 
 class MissingExtra(GndError):
@@ -30,8 +28,7 @@ def missing_extra(error: ModuleNotFoundError) -> MissingExtra | None:
     if module not in LEFT_OUT:
         return None
     packages = [".".join(name.split(".")[:2]) for name in _modules(error.__traceback__)]
-    other = "cloud" if "gnd.fleet_bus" in packages else "all"
-    extra = next((EXTRA_OF[package] for package in reversed(packages) if package in EXTRA_OF), other)
+    extra = next((EXTRA_OF[package] for package in reversed(packages) if package in EXTRA_OF), "all")
     return MissingExtra(f"{module} is not installed; it comes with: pip install 'gnd-fleet[{extra}]'")
 
 
