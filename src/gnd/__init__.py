@@ -1,15 +1,15 @@
 """Keeps a LiDAR map up to date with a fleet of vehicles, over Zenoh.
 
 What a program needs that is no part of a fleet: `connect` to a router and read or follow the map; open a map's file as
-a `Map`; read a recorded drive (`open_drive`) and `localise` it. Each name is loaded when it is first used, so that
-`import gnd` costs nothing. Everything raises subclasses of `GndError`. With examples: docs/api.md.
+a `Map`; read a recorded drive (`open_drive`) and `localise` it; feed a `Vehicle`. Each name is loaded when it is first
+used, so that `import gnd` costs nothing. Everything raises subclasses of `GndError`. With examples: docs/api.md.
 """
 
 import importlib
 from typing import TYPE_CHECKING, Any, Final
 
 if TYPE_CHECKING:
-    from gnd.client import Client, MapUpdate, UpdateStream, connect
+    from gnd.client import Client, MapUpdate, ReportRefused, UpdateStream, connect
     from gnd.extras import MissingExtra
     from gnd.gnd_map.errors import GndError
     from gnd.gnd_map.features import Feature, FeatureTile
@@ -17,6 +17,7 @@ if TYPE_CHECKING:
     from gnd.gnd_map.region import Region
     from gnd.gnd_map.tile import Tile
     from gnd.gnd_map.tile_id import TileId
+    from gnd.live_vehicle import NoPosition, Vehicle
     from gnd.map_reader import GaussianColumns, Map, PlacedFeature
     from gnd.recorded import RecordedDrive, localise, open_drive, trajectory_of
 
@@ -30,12 +31,15 @@ __all__ = [
     "Map",
     "MapUpdate",
     "MissingExtra",
+    "NoPosition",
     "PlacedFeature",
     "RecordedDrive",
     "Region",
+    "ReportRefused",
     "Tile",
     "TileId",
     "UpdateStream",
+    "Vehicle",
     "connect",
     "localise",
     "open_drive",
@@ -52,12 +56,15 @@ _WHERE: Final = {
     "Map": "gnd.map_reader",
     "MapUpdate": "gnd.client",
     "MissingExtra": "gnd.extras",
+    "NoPosition": "gnd.live_vehicle",
     "PlacedFeature": "gnd.map_reader",
     "RecordedDrive": "gnd.recorded",
     "Region": "gnd.gnd_map.region",
+    "ReportRefused": "gnd.client",
     "Tile": "gnd.gnd_map.tile",
     "TileId": "gnd.gnd_map.tile_id",
     "UpdateStream": "gnd.client",
+    "Vehicle": "gnd.live_vehicle",
     "connect": "gnd.client",
     "localise": "gnd.recorded",
     "open_drive": "gnd.recorded",

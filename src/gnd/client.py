@@ -7,19 +7,24 @@ import time
 from collections import OrderedDict, deque
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
-from typing import Final, Self
+from typing import TYPE_CHECKING, Final, Self
 
 from gnd.fetching import TileServerClient
 from gnd.fleet_bus.bus import Bus, open_bus
 from gnd.fleet_bus.config import DEFAULT_ENDPOINT, BusConfig
 from gnd.fleet_bus.errors import BusClosed, BusError
 from gnd.gnd_map.content import AnyTile
+from gnd.gnd_map.errors import GndError
 from gnd.gnd_map.region import Region, as_region
 from gnd.gnd_map.tile_id import TileId
+from gnd.schemas.changes import ChangeAck
 from gnd.schemas.errors import SchemaError, WrongHash
 from gnd.schemas.keys import update_keys
 from gnd.schemas.tiles import CatalogEntry
 from gnd.schemas.updates import TileUpdate, updated
+
+if TYPE_CHECKING:
+    from gnd.vehicle_agent.report_sink import OutgoingReport
 
 GAUSSIANS: Final = "ndt"
 """The layer of Gaussians; every layer whose name does not begin so holds features."""
@@ -33,6 +38,10 @@ _log = logging.getLogger(__name__)
 AnyRegion = Region | TileId | str | None
 """A region as users give it: a wildcard `13033/03021/**`, a tile (its path or number), a circle `lat,lon,radius` in
 degrees and metres, a `Region`, a `TileId`, or None: everywhere."""
+
+
+class ReportRefused(GndError):
+    """The cloud has refused a report by name: trying again does not help."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -115,6 +124,31 @@ class Client:
         asking = self._asking(layer)
         known = [entry.tile for entry in asking.catalog(as_region(region))]
         return asking.fetch(known)
+
+    def fetch(self, tiles: Sequence[TileId], *, layer: str = GAUSSIANS) -> Iterator[AnyTile]:
+        """The newest versions of these tiles, by tile; those that are not there are left out.
+
+        Raises:
+            RequestFailed, SchemaError: as `tiles`.
+        """
+        return self._asking(layer).fetch(tiles)
+
+    def upload(self, report: "OutgoingReport") -> str:
+        """Hand a report of a `Vehicle` to the cloud. It may be handed over again: it counts once.
+
+        Returns:
+            "stored", or "duplicate": it was there already. Both are said only when it is on the cloud's disk; until
+            then keep it, and try again.
+
+        Raises:
+            RequestFailed: no merger answers within `timeout_s`.
+            ReportRefused: it can never be taken.
+        """
+        payload = self._bus.request(report.key, report.body, kind="change", timeout_s=self._timeout_s)
+        ack = ChangeAck.decode(payload)
+        if ack.status not in ("stored", "duplicate"):
+            raise ReportRefused(f"report {report.report_id}: {ack.status}: {ack.reason}")
+        return ack.status
 
     def subscribe(
         self,
