@@ -4,7 +4,7 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import pytest
-from api_testing import EAST, FAR, HERE, Cloud, Program, gaussian_tile, sign_tile
+from api_testing import EAST, FAR, HERE, Cloud, Program, gaussian_tile, make_street, sign_tile
 
 from gnd.fleet_bus.bus import open_bus
 from gnd.fleet_bus.config import BusConfig
@@ -45,3 +45,9 @@ def start(tmp_path: Path) -> Iterator[Callable[..., Program]]:
         program.end()
         assert program.process.stdout is not None
         program.process.stdout.close()
+
+
+@pytest.fixture(scope="session")
+def street_files(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
+    """A drive and the map of its street."""
+    return make_street(tmp_path_factory.mktemp("street"))
