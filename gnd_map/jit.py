@@ -26,10 +26,10 @@ class LazyKernel:
         self._function, self._options = function, options
         self._dispatcher: Any = None
 
-    def __call__(self, *arguments: Any) -> Any:
+    def __call__(self, *arguments: Any, **named: Any) -> Any:
         """Call the compiled kernel."""
         dispatcher = self._dispatcher
-        return self.dispatcher(*arguments) if dispatcher is None else dispatcher(*arguments)
+        return self.dispatcher(*arguments, **named) if dispatcher is None else dispatcher(*arguments, **named)
 
     @property
     def dispatcher(self) -> Any:
