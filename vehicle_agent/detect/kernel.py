@@ -6,15 +6,13 @@ Whatever is measured in metres (distances to a Gaussian, to a plane, to the hit)
 """
 
 import math
-from collections.abc import Callable
-from typing import Any, NamedTuple, TypeVar, cast
+from typing import NamedTuple
 
-import numba
 import numpy as np
 from numpy.typing import NDArray
 
 from gnd.gnd_map.arrays import F32, F64, I32
-from gnd.gnd_map.jit import kernel
+from gnd.gnd_map.jit import kernel, pasted
 from gnd.vehicle_agent.detect.chi_square import quantile
 from gnd.vehicle_agent.detect.parameters import DetectParameters
 from gnd.vehicle_agent.detect.records import N_BI, N_BO, N_PI, N_PO
@@ -23,13 +21,6 @@ from gnd.vehicle_agent.detect.uncertainty import PoseUncertainty
 CERTAIN = PoseUncertainty()
 RULES = {"ml": 0, "ahead": 1, "plane": 2}
 UNKNOWN = -(2**31)
-
-T = TypeVar("T", bound=Callable[..., Any])
-
-
-def inlined(function: T) -> T:
-    """Compile a part of a kernel into its caller."""
-    return cast("T", numba.njit(inline="always", error_model="numpy")(function))
 
 
 class KernelParameters(NamedTuple):
@@ -78,7 +69,7 @@ def kernel_parameters(p: DetectParameters, pose: PoseUncertainty = CERTAIN) -> K
     )
 
 
-@inlined
+@pasted
 def _whitened(W: F32, row: int, x: float, y: float, z: float) -> tuple[float, float, float]:
     """W d for the lower triangle in `W[row, :6]`."""
     return (
@@ -88,7 +79,7 @@ def _whitened(W: F32, row: int, x: float, y: float, z: float) -> tuple[float, fl
     )
 
 
-@inlined
+@pasted
 def _r2_on_ray(
     records: F32, row: int, dx: float, dy: float, dz: float, vx: float, vy: float, vz: float, t: float
 ) -> float:
@@ -97,7 +88,7 @@ def _r2_on_ray(
     return x * x + y * y + z * z
 
 
-@inlined
+@pasted
 def _ml_parameter(
     records: F32,
     row: int,
@@ -117,7 +108,7 @@ def _ml_parameter(
     return min(max(t, t_in), t_out)
 
 
-@inlined
+@pasted
 def _passes(
     records: F32,
     row: int,
@@ -148,14 +139,14 @@ def _passes(
     return _r2_on_ray(records, row, dx, dy, dz, vx, vy, vz, t) <= p.r2_pass  # Eq. (4)
 
 
-@inlined
+@pasted
 def _r2_block(block: F32, records: F32, row: int, px: float, py: float, pz: float) -> float:
     """Eq. (2) for a point, with the measurement noise added to Σ."""
     x, y, z = _whitened(block, row, px - records[row, 6], py - records[row, 7], pz - records[row, 8])
     return x * x + y * y + z * z
 
 
-@inlined
+@pasted
 def _neighbour_explains(
     state: I32,
     at: int,
@@ -182,7 +173,7 @@ def _neighbour_explains(
     return _r2_block(block, records, row, px, py, pz) <= p.r2_face
 
 
-@inlined
+@pasted
 def _first_face(g: float, d: float, i: int, n: int) -> tuple[float, float]:
     """Ray parameter of the first face along one axis and the step between faces; infinite when none is crossed."""
     if n == 0:
@@ -191,7 +182,7 @@ def _first_face(g: float, d: float, i: int, n: int) -> tuple[float, float]:
     return (face - g) / d, 1.0 / abs(d)
 
 
-@inlined
+@pasted
 def _clip(g: float, d: float, n: int, t0: float, t1: float) -> tuple[float, float]:
     """The part of [t0, t1] where g + t d lies inside [0, n]; empty when t0 > t1."""
     if d == 0.0:
@@ -200,7 +191,7 @@ def _clip(g: float, d: float, n: int, t0: float, t1: float) -> tuple[float, floa
     return max(t0, min(a, b)), min(t1, max(a, b))
 
 
-@inlined
+@pasted
 def _index(g: float, n: int) -> int:
     """floor(g), kept inside the window against rounding at its faces."""
     return min(max(math.floor(g), 0), n - 1)
