@@ -23,6 +23,12 @@ from gnd.vehicle_agent.features.slamcu.blind import BIAS, GNSS_X, HEADING, SCALE
 from gnd.vehicle_agent.features.slamcu.parameters import SlamcuParameters
 from gnd.vehicle_agent.features.view import wrapped
 
+_RESAMPLE_BELOW: Final = 0.5
+"""α of Eq. (20): resample when the effective number falls below this share of M."""
+_FLOOR: Final = 0.0004
+"""Density, 1/(m·rad), of a measurement that belongs to something else although it was associated: about one false alarm
+in fifty looks over 80 m x 40°. It keeps a wrong association from deciding about the particles."""
+
 Prior = tuple[F64, F64]
 """Position (2,) and covariance (3,) xx, xy, yy."""
 FLOOR_PER_M2: Final = 1e-5
@@ -191,7 +197,7 @@ class Rbpf:
     def resample_if_needed(self) -> None:
         """Systematic resampling when the effective number of particles is small. Eq. (20), with squared weights."""
         weights = _normalised(self.log_weight)
-        if self.m > 1 and effective(weights) < self._p.filter.resample_below * self.m:
+        if self.m > 1 and effective(weights) < _RESAMPLE_BELOW * self.m:
             self._resample(weights)
 
     def moments(self, slot: int, weights: F64) -> tuple[F64, F64]:
@@ -218,7 +224,7 @@ class Rbpf:
         return measurement.update(self.state[:3], self.mu[slot], self.sigma[slot], z, variance)
 
     def _floored(self, log_likelihood: F64) -> F64:
-        return np.asarray(np.logaddexp(log_likelihood, np.log(max(self._p.filter.floor, 1e-300))))
+        return np.asarray(np.logaddexp(log_likelihood, np.log(max(_FLOOR, 1e-300))))
 
     def _off(self, xy_m: F64) -> F64:
         """(M,) squared distances of a fix from where each particle expects it."""
@@ -250,7 +256,7 @@ class Rbpf:
 
     def _bearable(self, log: F64, most: float) -> float:
         """The largest share of a log likelihood that leaves enough effective particles."""
-        enough = 0.9 * self._p.filter.resample_below * self.m
+        enough = 0.9 * _RESAMPLE_BELOW * self.m
 
         def bears(share: float) -> bool:
             return effective(_normalised(self.log_weight + share * log)) >= enough
