@@ -8,6 +8,7 @@ import numpy as np
 
 from gnd.cloud_merger.errors import BadReport, MergerError
 from gnd.cloud_merger.features.kept import districts_of, square
+from gnd.gnd_map.settings import check_settings, setting
 from gnd.gnd_map.tile_id import TileId
 from gnd.schemas.changes import ChangeReport, TileChange
 from gnd.tile_store.store import Store
@@ -18,21 +19,34 @@ REMEMBERED_PLACES: Final = 65_536
 
 @dataclass(frozen=True, slots=True)
 class IngestLimits:
-    """What a statement about this map may say, beyond what `schemas` accepts of any.
+    """What a statement about this map may say, beyond what `schemas` accepts of any."""
 
-    Attributes:
-        max_mean_m: a mean farther than this from its voxel's centre along an axis is absurd.
-        max_variance_m2: so is a larger variance along an axis (points within 1 m have at most 0.25 m²).
-        max_pose_sigma_m: a vehicle that knows its position no better than this says nothing about voxels of 1 m.
-        max_pose_sigma_rad: the same for its heading.
-        reach_tiles: a tile that the map does not hold may be this many tiles away from one that it holds.
-    """
-
-    max_mean_m: float = 0.75
-    max_variance_m2: float = 0.5
-    max_pose_sigma_m: float = 0.5
-    max_pose_sigma_rad: float = 0.05
-    reach_tiles: int = 3
+    max_mean_m: float = setting(
+        0.75,
+        "A mean farther than this from its voxel's centre along an axis is absurd.",
+        unit="m",
+        above=0,
+    )
+    max_variance_m2: float = setting(
+        0.5,
+        "So is a larger variance along an axis (points within 1 m have at most 0.25 m²).",
+        unit="m²",
+        above=0,
+    )
+    max_pose_sigma_m: float = setting(
+        0.5,
+        "A vehicle that knows its position no better than this says nothing about voxels of 1 m.",
+        unit="m",
+        above=0,
+    )
+    max_pose_sigma_rad: float = setting(0.05, "The same for its heading.", unit="rad", above=0)
+    reach_tiles: int = setting(
+        3,
+        "A tile that the map does not hold may be this many tiles away from one that it holds.",
+        unit="tiles",
+        least=0,
+        most=32,
+    )
 
     def __post_init__(self) -> None:
         for name in ("max_mean_m", "max_variance_m2", "max_pose_sigma_m", "max_pose_sigma_rad"):
@@ -40,6 +54,7 @@ class IngestLimits:
                 raise MergerError(f"{name} must be positive, got {getattr(self, name)}")
         if not 0 <= self.reach_tiles <= 32:
             raise MergerError(f"reach_tiles must lie in 0 … 32, got {self.reach_tiles}")
+        check_settings(self, MergerError)
 
 
 class MapCheck:

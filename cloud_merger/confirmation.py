@@ -22,6 +22,7 @@ from gnd.cloud_merger.merge import MergedTile
 from gnd.cloud_merger.statements import Report, Witness
 from gnd.gnd_map.gaussian import Gaussians
 from gnd.gnd_map.grid import VoxelGrid
+from gnd.gnd_map.settings import check_settings, setting
 from gnd.gnd_map.tile import TileDelta, apply
 from gnd.tile_store.values import Unconfirmed, WaitingReason
 
@@ -32,30 +33,46 @@ _NS_PER_S = 1_000_000_000
 
 @dataclass(frozen=True, slots=True)
 class ConfirmationParameters:
-    """What a single witness may change.
+    """What a single witness may change."""
 
-    Attributes:
-        few_voxels: so many changed voxels of a tile, ...
-        few_share: ... or this share of what the witness saw of the tile, whichever is more, are few. Beyond that all of
-            its lonely claims in the tile wait.
-        together_voxels: a lonely claim is well supported in a group of changes, voxel beside voxel, in which at least
-            so many appear or vanish. What has come or gone is larger than a voxel or two; what detection errs about is
-            not: edges, leaves, a surface that the map just missed. Changes of shape alone are told less surely.
-        vouched_share: but if at least this share of all its claims that won was made by others, too, the rest is
-            believed with it, whatever else speaks against it: its poses were right there, and it sees a construction
-            site from where others do not.
-        well_known_m: the lonely claims of a report whose poses are worse than this, beyond what the merge expects of
-            all, wait however few they are.
-        second_drive_s: a vehicle that comes back after so long is a second witness. Passes in a row are one: they share
-            the state of localisation, the parked cars and the mount.
-    """
-
-    few_voxels: int = 8
-    few_share: float = 0.02
-    together_voxels: int = 3
-    vouched_share: float = 0.5
-    well_known_m: float = 0.1
-    second_drive_s: float = 1800.0
+    few_voxels: int = setting(8, "So many changed voxels of a tile, ...", least=0)
+    few_share: float = setting(
+        0.02,
+        "... or this share of what the witness saw of the tile, whichever is more, are few. Beyond that all "
+        "of its lonely claims in the tile wait.",
+        least=0,
+        most=1,
+    )
+    together_voxels: int = setting(
+        3,
+        "A lonely claim is well supported in a group of changes, voxel beside voxel, in which at least so "
+        "many appear or vanish. What has come or gone is larger than a voxel or two; what detection errs "
+        "about is not: edges, leaves, a surface that the map just missed. Changes of shape alone are told "
+        "less surely.",
+        least=1,
+    )
+    vouched_share: float = setting(
+        0.5,
+        "But if at least this share of all its claims that won was made by others, too, the rest is believed "
+        "with it, whatever else speaks against it: its poses were right there, and it sees a construction "
+        "site from where others do not.",
+        least=0,
+        most=1,
+    )
+    well_known_m: float = setting(
+        0.1,
+        "The lonely claims of a report whose poses are worse than this, beyond what the merge expects of all, "
+        "wait however few they are.",
+        unit="m",
+        above=0,
+    )
+    second_drive_s: float = setting(
+        1800.0,
+        "A vehicle that comes back after so long is a second witness. Passes in a row are one: they share the "
+        "state of localisation, the parked cars and the mount.",
+        unit="s",
+        above=0,
+    )
 
     def __post_init__(self) -> None:
         if self.few_voxels < 0:
@@ -68,6 +85,7 @@ class ConfirmationParameters:
         for name in ("well_known_m", "second_drive_s"):
             if not getattr(self, name) > 0:
                 raise MergerError(f"{name} must be positive, got {getattr(self, name)}")
+        check_settings(self, MergerError)
 
 
 @dataclass(frozen=True, slots=True)

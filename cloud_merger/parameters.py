@@ -1,49 +1,88 @@
 """How statements become changes: the parameters of the cloud merge."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 from gnd.cloud_merger.errors import MergerError
 from gnd.cloud_merger.statements import Mode, Report
+from gnd.gnd_map.settings import check_settings, setting
 from gnd.schemas.changes import TileChange
 
 
 @dataclass(frozen=True, slots=True)
 class MergeParameters:
-    """How statements become changes.
+    """How statements become changes."""
 
-    Attributes:
-        mode: "paper": only uploaded changes count (GND as printed, with the corrections without which it cannot run);
-            "default": the votes are those of all who observed the voxel, and similarity is the smooth one.
-        eps: DBSCAN's neighbourhood on 1 - similarity; 0.5 splits the votes of vehicles that saw parts of one thing.
-        min_samples: DBSCAN's core weight.
-        xi: a cluster must hold more than this share of the voxel's statements (ξ_update).
-        xi_reshaped: the same for a cluster most of which denies the epoch's own Gaussian ("modified"). Lower, because a
-            shape is judged less surely than a presence, and a parked car seldom touches what the map holds.
-        d_update: published when the candidate's similarity to the epoch's voxel is smaller than this.
-        d_denied: the same where most of the candidate's statements were compared with that voxel and deny it.
-        d_renewed: a representative of more measurements takes the place of an earlier one that is less like it.
-        sensor_weights: weight of a vote by sensor model, 1 for the others; "paper" mode does not weigh.
-        noise_m: added (squared) to the covariances that the default similarity compares. It stands for poses known to
-            so much; what a report's poses are worse than that is added for this report.
-        poses: whether what the reports tell of their poses counts at all.
-        pose_lever_m: at this range the heading of a report's poses is counted as a position.
-        pose_weight_m: a report whose poses are this much worse than `noise_m` has half a vote; 0: poses do not weigh.
-    """
-
-    mode: Mode = "default"
-    eps: float = 0.7
-    min_samples: int = 1
-    xi: float = 0.6
-    xi_reshaped: float = 0.5
-    d_update: float = 0.5
-    d_denied: float = 0.95
-    d_renewed: float = 0.9
-    noise_m: float = 0.05
-    poses: bool = True
-    pose_lever_m: float = 20.0
-    pose_weight_m: float = 0.1
-    sensor_weights: Mapping[str, float] = field(default_factory=lambda: {"Scala": 0.5})
+    mode: Mode = setting(
+        "default",
+        '"paper": only uploaded changes count (GND as printed, with the corrections without which it cannot '
+        'run); "default": the votes are those of all who observed the voxel, and similarity is the smooth '
+        "one.",
+    )
+    eps: float = setting(
+        0.7,
+        "DBSCAN's neighbourhood on 1 - similarity; 0.5 splits the votes of vehicles that saw parts of one thing.",
+        above=0,
+        below=1,
+    )
+    min_samples: int = setting(1, "DBSCAN's core weight.", least=1)
+    xi: float = setting(
+        0.6,
+        "A cluster must hold more than this share of the voxel's statements (ξ_update).",
+        least=0,
+        below=1,
+    )
+    xi_reshaped: float = setting(
+        0.5,
+        'The same for a cluster most of which denies the epoch\'s own Gaussian ("modified"). Lower, because a '
+        "shape is judged less surely than a presence, and a parked car seldom touches what the map holds.",
+        least=0,
+        below=1,
+    )
+    d_update: float = setting(
+        0.5,
+        "Published when the candidate's similarity to the epoch's voxel is smaller than this.",
+        least=0,
+        most=1,
+    )
+    d_denied: float = setting(
+        0.95,
+        "The same where most of the candidate's statements were compared with that voxel and deny it.",
+        least=0,
+        most=1,
+    )
+    d_renewed: float = setting(
+        0.9,
+        "A representative of more measurements takes the place of an earlier one that is less like it.",
+        least=0,
+        most=1,
+    )
+    noise_m: float = setting(
+        0.05,
+        "Added (squared) to the covariances that the default similarity compares. It stands for poses known "
+        "to so much; what a report's poses are worse than that is added for this report.",
+        unit="m",
+        least=0,
+    )
+    poses: bool = setting(True, "Whether what the reports tell of their poses counts at all.")
+    pose_lever_m: float = setting(
+        20.0,
+        "At this range the heading of a report's poses is counted as a position.",
+        unit="m",
+        least=0,
+        most=1000,
+    )
+    pose_weight_m: float = setting(
+        0.1,
+        "A report whose poses are this much worse than `noise_m` has half a vote; 0: poses do not weigh.",
+        unit="m",
+        least=0,
+        most=1000,
+    )
+    sensor_weights: Mapping[str, float] = setting(
+        {"Scala": 0.5},
+        'Weight of a vote by sensor model, 1 for the others; "paper" mode does not weigh.',
+    )
 
     def __post_init__(self) -> None:
         if self.mode not in ("paper", "default"):
@@ -64,6 +103,7 @@ class MergeParameters:
         for model, weight in self.sensor_weights.items():
             if not 0 < weight <= 1:
                 raise MergerError(f"the weight of {model} must lie in (0, 1], got {weight}")
+        check_settings(self, MergerError)
 
     def _check_poses(self) -> None:
         for name, length_m in (("pose_lever_m", self.pose_lever_m), ("pose_weight_m", self.pose_weight_m)):

@@ -29,6 +29,7 @@ from gnd.gnd_map.arrays import F64, I64
 from gnd.gnd_map.by_object import ByObject
 from gnd.gnd_map.gaussian import Gaussians
 from gnd.gnd_map.grid import VoxelGrid
+from gnd.gnd_map.settings import check_settings, setting
 from gnd.schemas.changes import TileChange
 
 MAX_GAUSSIANS: Final = 400  # of a report that are looked at, every second, third, ... where there are more
@@ -39,27 +40,36 @@ _STILL: Final = np.zeros(3)
 
 @dataclass(frozen=True, slots=True)
 class ShiftParameters:
-    """When changes are explained by a shift.
+    """When changes are explained by a shift."""
 
-    Attributes:
-        max_m: largest shift that is looked for, on each axis.
-        max_rad: largest turn.
-        least_gaussians: so many measured Gaussians that fit nothing must be there, or the test says nothing.
-        fits: similarity at which a Gaussian fits the base.
-        explained_share: of these Gaussians so many must fit after the shift, ...
-        beyond_chance: ... and so many more than after shifts of that size in other directions.
-        displaced_m: a surface that the shift moves by so much along its normal would have been found changed.
-        refuted_share: where more of these surfaces are reported unchanged, it was no shift.
-    """
-
-    max_m: float = 1.0
-    max_rad: float = 0.0175
-    least_gaussians: int = 12
-    fits: float = 0.5
-    explained_share: float = 0.65
-    beyond_chance: float = 0.3
-    displaced_m: float = 0.12
-    refuted_share: float = 0.5
+    max_m: float = setting(1.0, "Largest shift that is looked for, on each axis.", unit="m", above=0, most=2)
+    max_rad: float = setting(0.0175, "Largest turn.", unit="rad", above=0, most=2)
+    least_gaussians: int = setting(
+        12,
+        "So many measured Gaussians that fit nothing must be there, or the test says nothing.",
+        least=3,
+    )
+    fits: float = setting(0.5, "Similarity at which a Gaussian fits the base.", least=0, most=1)
+    explained_share: float = setting(0.65, "Of these Gaussians so many must fit after the shift, ...", least=0, most=1)
+    beyond_chance: float = setting(
+        0.3,
+        "... and so many more than after shifts of that size in other directions.",
+        least=0,
+        most=1,
+    )
+    displaced_m: float = setting(
+        0.12,
+        "A surface that the shift moves by so much along its normal would have been found changed.",
+        unit="m",
+        above=0,
+        most=2,
+    )
+    refuted_share: float = setting(
+        0.5,
+        "Where more of these surfaces are reported unchanged, it was no shift.",
+        least=0,
+        most=1,
+    )
 
     def __post_init__(self) -> None:
         for name in ("max_m", "max_rad", "displaced_m"):
@@ -70,6 +80,7 @@ class ShiftParameters:
                 raise MergerError(f"{name} must lie in [0, 1], got {getattr(self, name)}")
         if self.least_gaussians < 3:
             raise MergerError(f"least_gaussians must be at least 3, got {self.least_gaussians}")
+        check_settings(self, MergerError)
 
 
 @dataclass(frozen=True, slots=True)

@@ -6,6 +6,7 @@ Feature layers go the same way: `judge` is for them what `detect` and `report` a
 import threading
 from typing import Any
 
+from gnd.fleet_bus.settings_file import write_settings
 from gnd.schemas.drive import Scan
 from gnd.vehicle_agent.config import AgentConfig
 from gnd.vehicle_agent.memory import keep_small
@@ -50,6 +51,7 @@ def run_agent(config: AgentConfig, stop: threading.Event) -> dict[str, Any]:
         vehicle.upload()  # outbox -> acknowledged
         result = vehicle.result()
     result["traffic"] = vehicle.link.traffic()  # the link is closed: nothing comes after it
+    result["settings_sha256"] = write_settings(config, config.work_dir)
     write_json(config.work_dir / "result.json", result)
     if vehicle.damage is not None:
         raise vehicle.damage

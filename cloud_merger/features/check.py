@@ -16,6 +16,7 @@ from gnd.gnd_map.arrays import F64
 from gnd.gnd_map.errors import FeatureError
 from gnd.gnd_map.features import UNKNOWN_HEIGHT_M2, check_simple_polyline, full_covariance
 from gnd.gnd_map.geodesy import LocalFrame
+from gnd.gnd_map.settings import check_settings, setting
 from gnd.gnd_map.tile_id import TileId
 from gnd.schemas.feature_change import LANE_KINDS, FeatureChange, Found
 from gnd.schemas.features import FeatureReport
@@ -30,27 +31,42 @@ IdsOf = Callable[[TileId, bytes], Collection[int] | None]
 
 @dataclass(frozen=True, slots=True)
 class FeatureLimits:
-    """What a statement about features may say.
+    """What a statement about features may say."""
 
-    Attributes:
-        min_sigma_m: no vehicle knows a place better in any direction: below the millimetre is a mistake of units.
-        max_sigma_m: horizontally; a place known no better than this is none.
-        max_outside_m: a measured map feature may lie this far outside its tile.
-        max_features_of_tile: found and judged features of one tile of 38 m.
-        max_vertices: vertices of a found polyline in one tile.
-        min_verdicts: from so many judged map features on the share of deleted ones is looked at.
-        max_deleted_share: a drive that finds a larger share of the map's features gone has not looked, or lies.
-        duplicate_m: two found features of one kind that are nearer than this and alike are one, sent twice.
-    """
-
-    min_sigma_m: float = 1e-3
-    max_sigma_m: float = 30.0
-    max_outside_m: float = 25.0
-    max_features_of_tile: int = 256
-    max_vertices: int = 512
-    min_verdicts: int = 5
-    max_deleted_share: float = 0.5
-    duplicate_m: float = 0.1
+    min_sigma_m: float = setting(
+        1e-3,
+        "No vehicle knows a place better in any direction: below the millimetre is a mistake of units.",
+        unit="m",
+        above=0,
+        most=100,
+    )
+    max_sigma_m: float = setting(
+        30.0,
+        "Horizontally; a place known no better than this is none.",
+        unit="m",
+        above=0,
+        most=100,
+    )
+    max_outside_m: float = setting(25.0, "A measured map feature may lie this far outside its tile.", unit="m", least=0)
+    max_features_of_tile: int = setting(256, "Found and judged features of one tile of 38 m.", least=1)
+    max_vertices: int = setting(512, "Vertices of a found polyline in one tile.", least=1)
+    min_verdicts: int = setting(
+        5,
+        "From so many judged map features on the share of deleted ones is looked at.",
+        least=1,
+    )
+    max_deleted_share: float = setting(
+        0.5,
+        "A drive that finds a larger share of the map's features gone has not looked, or lies.",
+        above=0,
+        most=1,
+    )
+    duplicate_m: float = setting(
+        0.1,
+        "Two found features of one kind that are nearer than this and alike are one, sent twice.",
+        unit="m",
+        least=0,
+    )
 
     def __post_init__(self) -> None:
         if not 0 < self.min_sigma_m < self.max_sigma_m <= 100:
@@ -65,6 +81,7 @@ class FeatureLimits:
             raise MergerError("max_features_of_tile, max_vertices and min_verdicts must be at least 1")
         if not 0 < self.max_deleted_share <= 1:
             raise MergerError(f"max_deleted_share must lie in (0, 1], got {self.max_deleted_share}")
+        check_settings(self, MergerError)
 
 
 def check_feature_report(report: FeatureReport, limits: FeatureLimits, ids_of: IdsOf) -> None:

@@ -10,6 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from gnd.vehicle_agent.detect import kernel, records
+from gnd.vehicle_agent.detect.parameters import INCLUDED_M
 
 
 @dataclass
@@ -82,7 +83,7 @@ class PlainDetector:
         if self.pose is None:
             return 0.0
         end = self.pose.sigma_m**2 + (self.pose.sigma_rad * length) ** 2
-        return max(end - self.p.soft.included_m**2, 0.0)
+        return max(end - INCLUDED_M**2, 0.0)
 
     def _pass(self, voxel, origin, point, t_in, t_out, length, s2) -> None:
         row = self.world.index[voxel]
@@ -96,10 +97,10 @@ class PlainDetector:
         v, mean = point - origin, self.world.mean[row]
         cov = self.world.cov[row] + np.eye(3) * records._PASS_NOISE_M**2
         values, vectors = np.linalg.eigh(cov)
-        if self.p.passing_rule == "plane" and values[1] >= self.p.planar_ratio * values[0]:
+        if self.p.passing_rule == "plane" and values[1] >= records._PLANAR_RATIO * values[0]:
             normal = vectors[:, 0]
             t = normal @ (mean - origin) / (normal @ v)
-            behind = math.hypot(self.p.beyond_m, self.p.soft.beyond_sigmas * math.sqrt(s2))
+            behind = math.hypot(kernel._BEYOND_M, kernel._BEYOND_SIGMAS * math.sqrt(s2) if self.p.soft else 0.0)
             if not t_in <= t <= t_out or (1 - t) * abs(normal @ v) <= behind:
                 return False
             return self.world.r2(row, origin + t * v, records._PASS_NOISE_M) <= self.quantile(kernel._ETA_PLANE)
@@ -133,6 +134,6 @@ class PlainDetector:
             if step == 0 or not is_inside_window(tuple(beside), self.world.shape):
                 continue
             row = self.world.index[tuple(beside)]
-            if row >= 0 and self.world.r2(row, point, self.p.block_noise_m) <= self.p.face_sigma**2:
+            if row >= 0 and self.world.r2(row, point, self.p.block_noise_m) <= kernel._FACE_SIGMA**2:
                 return True
         return False

@@ -12,6 +12,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from typing import Any, Final
 
+from gnd.fleet_bus.settings_file import write_settings
 from gnd.gnd_map.geodesy import LocalFrame
 from gnd.gnd_map.tile_id import TileId
 from gnd.schemas.drive import DriveHeader, DriveItem, MotionSample, ReferencePose
@@ -64,6 +65,7 @@ def run_mapper(config: AgentConfig, stop: threading.Event) -> dict[str, Any]:
         mapper.upload()  # outbox -> acknowledged
         result = mapper.result()
     result["traffic"] = mapper.link.traffic()  # the link is closed: nothing comes after it
+    result["settings_sha256"] = write_settings(config, config.work_dir)
     write_json(config.work_dir / "result.json", result)
     return result
 

@@ -60,12 +60,16 @@ class FilterParameters:
     jitter: float = 0.45
     """h: a resampled particle keeps √(1-h²) of its distance from the mean; h of that of another pair makes up for it.
     0 is plain resampling."""
+    floor: float = 4e-4
+    """Density, 1/(m·rad), of a measurement that belongs to something else although it was associated: about one false
+    alarm in fifty looks over 80 m x 40°. It keeps a wrong association from deciding about the particles."""
     horizon_m: float = 2000.0
     """A new feature left behind by this way no longer learns from what comes."""
 
     def __post_init__(self) -> None:
         _check("filter.particles", self.particles, 1, 100_000)
         _check("filter.jitter", self.jitter, 0.0, 0.9)
+        _check("filter.floor", self.floor, 0.0, 1.0)
         _check("filter.horizon_m", self.horizon_m, 0.0, 1e6)
 
 

@@ -25,9 +25,6 @@ from gnd.vehicle_agent.features.view import wrapped
 
 _RESAMPLE_BELOW: Final = 0.5
 """α of Eq. (20): resample when the effective number falls below this share of M."""
-_FLOOR: Final = 0.0004
-"""Density, 1/(m·rad), of a measurement that belongs to something else although it was associated: about one false alarm
-in fifty looks over 80 m x 40°. It keeps a wrong association from deciding about the particles."""
 
 Prior = tuple[F64, F64]
 """Position (2,) and covariance (3,) xx, xy, yy."""
@@ -224,7 +221,7 @@ class Rbpf:
         return measurement.update(self.state[:3], self.mu[slot], self.sigma[slot], z, variance)
 
     def _floored(self, log_likelihood: F64) -> F64:
-        return np.asarray(np.logaddexp(log_likelihood, np.log(max(_FLOOR, 1e-300))))
+        return np.asarray(np.logaddexp(log_likelihood, np.log(max(self._p.filter.floor, 1e-300))))
 
     def _off(self, xy_m: F64) -> F64:
         """(M,) squared distances of a fix from where each particle expects it."""
