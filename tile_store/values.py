@@ -87,23 +87,23 @@ class StoreConfig:
 
     merge_delay_s: float = setting(
         1.0,
-        "A tile becomes ready to merge this long after its first waiting report,",
+        "A tile becomes ready to merge this long after its first waiting report ...",
         unit="s",
         least=0,
     )
-    merge_after_reports: int = setting(8, "Or at once when so many reports wait.", least=1)
+    merge_after_reports: int = setting(8, "... or at once when so many reports wait.", least=1)
     window_s: float = setting(
         1800.0,
         "A tile's window closes when a report comes so long after its first (by receipt): a vehicle that "
         "comes back after that has come on another drive; in feature layers where the time of day passes a "
-        "multiple of it, so that neighbours, who hear the same of what lies at their border, cut alike,",
+        "multiple of it, so that neighbours, who hear the same of what lies at their border, cut alike ...",
         unit="s",
         above=0,
     )
-    window_vehicles: int = setting(32, "Or one of another vehicle when so many have a vote in it,", least=1)
+    window_vehicles: int = setting(32, "... or one of another vehicle when so many have a vote in it ...", least=1)
     window_reports: int = setting(
         96,
-        "Or any when it holds so many: what one merge has to read stays bounded.",
+        "... or any when it holds so many: what one merge has to read stays bounded.",
         least=1,
     )
     busy_timeout_s: float = setting(

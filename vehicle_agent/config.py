@@ -150,7 +150,7 @@ class AgentConfig:
     link: str | LinkProfile = setting("none", "Mobile link to feel: 3g, 4g, 5g, none or a TOML file.")
     layer: str = setting("ndt", "Layer of the voxel map.")
     pace: float = setting(
-        0.0, "1 drives in real time, 2 twice as fast, 0 as fast as the recording can be worked on.", least=0
+        0.0, "Speed of the drive: 1 in real time, 0 as fast as the recording can be worked on.", least=0
     )
     open_timeout_s: float = setting(
         10.0,

@@ -6,7 +6,6 @@ from typing import Final, Literal
 
 from gnd.gnd_map.settings import check_settings, setting
 from gnd.schemas.wire import LAYER_PATTERN
-from gnd.vehicle_agent.features.coverage import CoverageParameters
 from gnd.vehicle_agent.features.errors import FeatureLayerError
 from gnd.vehicle_agent.features.slamcu.parameters import FilterParameters, SlamcuParameters
 from gnd.vehicle_agent.features.view import SensorView
@@ -82,19 +81,11 @@ class FeatureParameters:
     layers: tuple[LayerParameters, ...] = setting(
         (), "Layers, each by name (signs, streetlights, poles) or as a table; none: the agent knows voxels only."
     )
-    coverage: CoverageParameters = setting(CoverageParameters, "When a place counts as looked at.")
-    margin_m: float = setting(
-        10.0,
-        "A tile this much farther away than a sensor sees is left: it is decided.",
-        unit="m",
-    )
 
     def __post_init__(self) -> None:
         names = [layer.name for layer in self.layers]
         if len(set(names)) != len(names):
             raise FeatureLayerError(f"layers {', '.join(names)}: one comes twice")
-        if not self.margin_m > 0:
-            raise FeatureLayerError(f"margin_m = {self.margin_m} must be positive")
         check_settings(self, FeatureLayerError)
 
     @classmethod

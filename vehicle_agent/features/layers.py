@@ -19,6 +19,7 @@ from gnd.schemas.drive import Detections
 from gnd.schemas.features import FeatureChange
 from gnd.vehicle_agent.config import ReportParameters
 from gnd.vehicle_agent.detect.uncertainty import PoseUncertainty
+from gnd.vehicle_agent.features.coverage import CoverageParameters
 from gnd.vehicle_agent.features.feature_report import FeatureReporter
 from gnd.vehicle_agent.features.layer import FeatureLayer, PlacedLook, pose_of
 from gnd.vehicle_agent.features.layer_parameters import FeatureParameters
@@ -37,6 +38,9 @@ LONGEST_GAP_NS: Final = 500_000_000
 MOST_WAITING: Final = 4096
 STEP_M: Final = 3.0
 """Tiles left behind are looked for after this much way."""
+
+_MARGIN_M: Final = 10.0
+"""A tile this much farther away than a sensor sees is left: it is decided."""
 
 
 class _Pose(NamedTuple):
@@ -63,7 +67,7 @@ class FeatureLayers:
     ) -> None:
         self.counts: Counter[str] = Counter()
         self._parameters, self._report = parameters, report
-        self.layers = {one.name: FeatureLayer(one, parameters.coverage, frame) for one in parameters.layers}
+        self.layers = {one.name: FeatureLayer(one, CoverageParameters(), frame) for one in parameters.layers}
         self._reporters = dict(zip(self.layers, reporters, strict=True))
         self._detector = PoleDetector()
         self._looks: deque[Detections] = deque(maxlen=MOST_WAITING)
@@ -187,7 +191,7 @@ class FeatureLayers:
             return
         self._looked_at = p_map_m.copy()
         for name, layer in self.layers.items():
-            reporter, reach_m = self._reporters[name], layer.parameters.range_m + self._parameters.margin_m
+            reporter, reach_m = self._reporters[name], layer.parameters.range_m + _MARGIN_M
             for change in layer.leave(p_map_m, reach_m):
                 self._say(name, change, odometer_m)
             reporter.report(layer.tiles, self._t_ns, odometer_m)

@@ -3,7 +3,7 @@
 What nobody turns is a constant beside its use.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Final
 
 from gnd.gnd_map.settings import check_settings, setting
@@ -38,50 +38,49 @@ class RegistrationParameters:
         above=0,
         most=1,
     )
-    scales: tuple[float, ...] = setting(
-        (4.0, 2.0),
-        "Geman-McClure scales, one a stage, wide to narrow, when the start is known to some 10 cm: where the world has"
-        " changed, a narrow kernel stays with what has not.",
-        unit="sigmas",
-        above=0,
-    )
-    correlation: float = setting(
-        10.0, "So many points share one error (of the map, of the mount); multiplies the covariance.", above=0
-    )
-    floor_m: float = setting(0.01, "Least sigma of a position, whatever the Hessian says.", unit="m", least=0)
-    floor_rad: float = setting(3e-4, "The same of an angle.", unit="rad", least=0)
-    degenerate_m: float = setting(
-        0.2,
-        "A direction whose sigma exceeds this (turns taken at 10 m) is reported and not moved along.",
-        unit="m",
-        above=0,
-    )
     wheel_sigma_m: float = setting(
         0.02, "How well the wheels keep the vehicle on the road; 0: wheels are no witness.", unit="m", least=0
     )
-    max_iterations: int = setting(15, "Steps of a match at most.", least=1, most=1000)
-    stop_m: float = setting(5e-4, "A match ends with a step shorter than this ...", unit="m", above=0)
-    stop_rad: float = setting(1e-4, "... that turns less than this.", unit="rad", above=0)
+    scales: tuple[float, ...] = (4.0, 2.0)
+    """Geman-McClure scales in sigmas, one a stage, wide to narrow, when the start is known to some 10 cm: where the
+    world has changed, a narrow kernel stays with what has not. This and what follows is what matches of scans with each
+    other, and of codecs with the exact map, do otherwise; no setting."""
+    correlation: float = 10.0
+    """So many points share one error (of the map, of the mount); multiplies the covariance."""
+    floor_m: float = 0.01
+    floor_rad: float = 3e-4
+    """The least sigma claimed along an axis, whatever the Hessian says."""
+    degenerate_m: float = 0.2
+    """A direction whose sigma exceeds this (turns taken at 10 m) is reported and not moved along."""
+    max_iterations: int = 15
+    stop_m: float = 5e-4
+    stop_rad: float = 1e-4
+    """A match ends with a shorter step."""
 
     def __post_init__(self) -> None:
         check_settings(self)
-        if not self.scales:
-            raise ValueError("scales: at least one is required")
+        if not self.scales or min(*self.scales, self.max_iterations) <= 0:
+            raise ValueError(f"at least one scale and one iteration are required, all positive, got {self}")
 
 
 @dataclass(frozen=True, slots=True)
 class InitialiseParameters:
-    """Search for the first pose around a GNSS position."""
+    """How a search for poses goes about it: around a GNSS position, around a tracked pose, along a loop. No settings.
 
-    step_m: float = setting(1.0, "Distance of the coarse hypotheses.", unit="m", above=0)
-    step_deg: float = setting(5.0, "The same of their headings.", unit="deg", above=0, most=180)
-    n_refined: int = setting(24, "So many of the best are refined by registration.", least=1, most=10_000)
-    n_kept: int = setting(8, "So many of these are refined to the end.", least=1, most=1000)
-    same_m: float = setting(0.2, "Refined poses nearer than this ...", unit="m", least=0)
-    same_deg: float = setting(1.0, "... that are turned by less are one.", unit="deg", least=0)
+    step_m, step_deg: spacing of the coarse hypotheses; n_refined: how many of the best are refined by registration;
+    n_kept: how many of these are refined to the end; same_m, same_deg: refined poses nearer than this are one.
+    """
+
+    step_m: float = 1.0
+    step_deg: float = 5.0
+    n_refined: int = 24
+    n_kept: int = 8
+    same_m: float = 0.2
+    same_deg: float = 1.0
 
     def __post_init__(self) -> None:
-        check_settings(self)
+        if min(self.step_m, self.step_deg, self.n_refined) <= 0:
+            raise ValueError(f"steps and counts must be positive, got {self}")
 
 
 @dataclass(frozen=True, slots=True)
@@ -184,7 +183,7 @@ class LocaliserParameters:
 
     sampling: SamplingParameters = setting(SamplingParameters, "Which points of a scan are matched.")
     registration: RegistrationParameters = setting(RegistrationParameters, "Scan-to-map matching.")
-    initialise: InitialiseParameters = setting(InitialiseParameters, "Search for the first pose.")
+    initialise: InitialiseParameters = field(default_factory=InitialiseParameters)
     odometry: OdometryParameters = setting(OdometryParameters, "Wheels and gyro.")
     graph: GraphParameters = setting(GraphParameters, "The fixed-lag pose graph.")
     health: HealthParameters = setting(HealthParameters, "When a match is believed.")

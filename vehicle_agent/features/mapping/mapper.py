@@ -20,6 +20,7 @@ from gnd.schemas.drive_mcap import read_drive, read_header
 from gnd.schemas.errors import SchemaError
 from gnd.vehicle_agent.config import AgentConfig
 from gnd.vehicle_agent.errors import NewLayerError
+from gnd.vehicle_agent.features.coverage import CoverageParameters
 from gnd.vehicle_agent.features.download import FeatureDownloader
 from gnd.vehicle_agent.features.feature_report import FeatureReporter
 from gnd.vehicle_agent.features.layer_parameters import LayerParameters
@@ -150,7 +151,7 @@ class Mapper:
             raise NewLayerError("the graph contradicts itself: " + "; ".join(map(str, found.strains)))
         self.counts["stretches"] += 1
         reporter = self.reporters[layer.name]
-        for change in changes_of(found, drive, self.held, layer, self.config.features.coverage, self.place.height_m):
+        for change in changes_of(found, drive, self.held, layer, CoverageParameters(), self.place.height_m):
             reporter.add(change, drive.looks[0].t_ns, self.place.odometer_m)
         reporter.report_all(drive.looks[-1].t_ns)
 
