@@ -83,13 +83,6 @@ class ShardConfig:
         if not _SHARD_ID.fullmatch(self.shard_id):
             raise MergerError(f"shard id {self.shard_id!r} must be 1 to 64 of letters, digits, '.', '_', '-'")
         lattice_named(self.codec)
-        at_least_one = ("tiles_at_once", "expanders", "uploads_at_once", "max_attempts", "announce_at_once")
-        if min(getattr(self, name) for name in at_least_one) < 1:
-            raise MergerError(f"{', '.join(at_least_one)} must be at least 1")
-        if min(self.lease_s, self.poll_s) <= 0 or self.retry_s < 0:
-            raise MergerError(
-                f"lease_s {self.lease_s} and poll_s {self.poll_s} must be positive, retry_s {self.retry_s} >= 0"
-            )
         check_settings(self, MergerError)
 
     @classmethod

@@ -75,16 +75,6 @@ class ConfirmationParameters:
     )
 
     def __post_init__(self) -> None:
-        if self.few_voxels < 0:
-            raise MergerError(f"few_voxels must not be negative, got {self.few_voxels}")
-        if self.together_voxels < 1:
-            raise MergerError(f"together_voxels must be at least 1, got {self.together_voxels}")
-        for name in ("few_share", "vouched_share"):
-            if not 0 <= getattr(self, name) <= 1:
-                raise MergerError(f"{name} must lie in [0, 1], got {getattr(self, name)}")
-        for name in ("well_known_m", "second_drive_s"):
-            if not getattr(self, name) > 0:
-                raise MergerError(f"{name} must be positive, got {getattr(self, name)}")
         check_settings(self, MergerError)
 
 

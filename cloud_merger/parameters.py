@@ -87,28 +87,10 @@ class MergeParameters:
     def __post_init__(self) -> None:
         if self.mode not in ("paper", "default"):
             raise MergerError(f"mode must be 'paper' or 'default', got {self.mode!r}")
-        if not 0 < self.eps < 1:
-            raise MergerError(
-                f"eps must lie in (0, 1), got {self.eps}: at 1 Gaussians that share nothing are neighbours"
-            )
-        if self.min_samples < 1:
-            raise MergerError(f"min_samples must be at least 1, got {self.min_samples}")
-        for name, share in (("xi", self.xi), ("xi_reshaped", self.xi_reshaped)):
-            if not 0 <= share < 1:
-                raise MergerError(f"{name} must lie in [0, 1), got {share}")
-        for name, least in (("d_update", self.d_update), ("d_denied", self.d_denied), ("d_renewed", self.d_renewed)):
-            if not 0 <= least <= 1:
-                raise MergerError(f"{name} must lie in [0, 1], got {least}")
-        self._check_poses()
+        check_settings(self, MergerError)
         for model, weight in self.sensor_weights.items():
             if not 0 < weight <= 1:
                 raise MergerError(f"the weight of {model} must lie in (0, 1], got {weight}")
-        check_settings(self, MergerError)
-
-    def _check_poses(self) -> None:
-        for name, length_m in (("pose_lever_m", self.pose_lever_m), ("pose_weight_m", self.pose_weight_m)):
-            if not 0 <= length_m <= 1000:
-                raise MergerError(f"{name} must lie in [0, 1000] m, got {length_m}")
 
     def weight_of(self, sensor_model: str) -> float:
         """Return the weight of a vote of this sensor."""

@@ -72,14 +72,6 @@ class ShiftParameters:
     )
 
     def __post_init__(self) -> None:
-        for name in ("max_m", "max_rad", "displaced_m"):
-            if not 0 < getattr(self, name) <= 2:
-                raise MergerError(f"{name} must lie in (0, 2], got {getattr(self, name)}")
-        for name in ("fits", "explained_share", "beyond_chance", "refuted_share"):
-            if not 0 <= getattr(self, name) <= 1:
-                raise MergerError(f"{name} must lie in [0, 1], got {getattr(self, name)}")
-        if self.least_gaussians < 3:
-            raise MergerError(f"least_gaussians must be at least 3, got {self.least_gaussians}")
         check_settings(self, MergerError)
 
 

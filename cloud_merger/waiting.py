@@ -29,8 +29,6 @@ class WaitingLimits:
     keep_s: float = setting(120.0, "For so long a Gaussian that was asked for counts as promised.", unit="s", above=0)
 
     def __post_init__(self) -> None:
-        if self.reports < 1 or self.keep_s <= 0:
-            raise MergerError(f"limits of promised Gaussians must be positive, got {self}")
         check_settings(self, MergerError)
 
 

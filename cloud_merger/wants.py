@@ -58,12 +58,6 @@ class WantParameters:
     )
 
     def __post_init__(self) -> None:
-        if not 0 <= self.share <= 1:
-            raise MergerError(f"share must lie in [0, 1], got {self.share}")
-        if self.enough < 0:
-            raise MergerError(f"enough must be at least 0, got {self.enough}")
-        if self.sample < 0:
-            raise MergerError(f"sample must be at least 0, got {self.sample}")
         check_settings(self, MergerError)
 
 

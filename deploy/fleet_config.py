@@ -64,20 +64,12 @@ class FleetConfig:
 
     def __post_init__(self) -> None:
         """Refuse values outside their range."""
-        _require(1 <= self.agents <= MAX_AGENTS, f"agents must be 1 to {MAX_AGENTS}, got {self.agents}")
-        _require(1 <= self.shards <= MAX_SHARDS, f"shards must be 1 to {MAX_SHARDS}, got {self.shards}")
-        _require(0 <= self.port <= 65535, f"port must be 0 to 65535, got {self.port}")
+        check_settings(self, DeployError)
         for name in ("detect_mode", "merge_mode"):
             value = getattr(self, name)
             _require(value in ("default", "paper"), f"{name} must be default or paper, got {value!r}")
-        longest_s = MAX_HEADWAY_S
-        _require(0 <= self.headway_s <= longest_s, f"headway_s must be 0 to {longest_s:g} s, got {self.headway_s}")
-        _require(self.merge_delay_s >= 0, f"merge_delay_s must not be negative, got {self.merge_delay_s}")
-        _require(self.merge_after_reports >= 1, f"merge_after_reports must be >= 1, got {self.merge_after_reports}")
-        _require(self.deadline_s > 0, f"deadline_s must be positive, got {self.deadline_s}")
         _ = self.wrong_mounts_rad
         self._check_layers()
-        check_settings(self, DeployError)
 
     def _check_layers(self) -> None:
         unfit = [layer for layer in self.layers if layer != VOXEL_LAYER and layer not in FEATURE_LAYERS]

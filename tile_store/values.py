@@ -121,17 +121,6 @@ class StoreConfig:
     )
 
     def __post_init__(self) -> None:
-        if self.merge_delay_s < 0 or self.busy_timeout_s <= 0:
-            raise StoreError(
-                f"merge_delay_s {self.merge_delay_s} and busy_timeout_s {self.busy_timeout_s} must be >= 0"
-            )
-        if self.quarantine_mb <= 0:
-            raise StoreError(f"quarantine_mb {self.quarantine_mb} must be positive")
-        if self.window_s <= 0:
-            raise StoreError(f"window_s must be positive, got {self.window_s}")
-        for name in ("merge_after_reports", "group_max", "window_vehicles", "window_reports"):
-            if getattr(self, name) < 1:
-                raise StoreError(f"{name} must be at least 1, got {getattr(self, name)}")
         check_settings(self, StoreError)
 
     @property

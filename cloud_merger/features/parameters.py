@@ -2,14 +2,11 @@
 
 from dataclasses import dataclass
 from functools import lru_cache
-from typing import Final
 
 from scipy.stats import chi2
 
 from gnd.cloud_merger.errors import MergerError
 from gnd.gnd_map.settings import check_settings, setting
-
-_SHARES: Final = ("gate", "reliability", "prior", "absence", "ceiling")
 
 
 @dataclass(frozen=True, slots=True)
@@ -119,35 +116,9 @@ class FeatureMergeParameters:
     )
 
     def __post_init__(self) -> None:
-        for name in _SHARES:
-            if not 0 < getattr(self, name) < 1:
-                raise MergerError(f"{name} must lie in (0, 1), got {getattr(self, name)}")
-        for name in ("reach_m", "line_reach_m"):
-            if not 0 < getattr(self, name) <= 100:
-                raise MergerError(f"{name} must lie in (0, 100] m, got {getattr(self, name)}")
-        for name in ("moved_m", "view_margin_m"):
-            if not 0 <= getattr(self, name) <= 100:
-                raise MergerError(f"{name} must lie in [0, 100] m, got {getattr(self, name)}")
-        if self.min_vehicles < 2 or self.voters < self.min_vehicles:
-            raise MergerError(
-                f"min_vehicles {self.min_vehicles} must be at least 2 (one vehicle alone changes nothing), voters "
-                f"{self.voters} at least as many"
-            )
-        if not 0 <= self.repeat_correlation <= 1 or not 0 < self.renewal_mass <= 1:
-            raise MergerError(
-                f"repeat_correlation {self.repeat_correlation} must lie in [0, 1], renewal_mass {self.renewal_mass} in "
-                "(0, 1]"
-            )
-        self._check_bounds()
         check_settings(self, MergerError)
-
-    def _check_bounds(self) -> None:
-        if not 1 <= self.renewal_gain <= 16:
-            raise MergerError(f"renewal_gain must lie in [1, 16], got {self.renewal_gain}")
-        if self.most_weight < 1 or self.max_begun < 1:
-            raise MergerError(
-                f"most_weight {self.most_weight} and max_begun {self.max_begun} must be at least 1: a vehicle counts"
-            )
+        if self.voters < self.min_vehicles:
+            raise MergerError(f"voters {self.voters} must be at least min_vehicles {self.min_vehicles}")
 
     def gate_of(self, dimensions: int) -> float:
         """The largest squared Mahalanobis distance of a measurement of 1, 2 or 3 dimensions that passes."""

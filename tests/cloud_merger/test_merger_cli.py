@@ -36,7 +36,7 @@ def test_defaults_run_and_survive_being_written_down():
         ("lease = 3", r"there is no setting lease; did you mean .*lease_s"),
         ("[merge]\nepsilon = 0.5", "there is no setting merge.epsilon"),
         ("[merge]\nmode = 'best'", "'paper'"),
-        ("[merge]\nxi = 1.5", "xi must lie in"),
+        ("[merge]\nxi = 1.5", r"xi = 1\.5 lies outside ≥ 0 and < 1"),
         ("tiles_at_once = 0", "tiles_at_once"),
         ("lease_s = 0", "lease_s"),
         ("shard_id = 'a/b'", "shard id 'a/b'"),

@@ -34,8 +34,6 @@ class CoverageParameters:
     step_m: float = setting(1.0, "Places are so far apart.", unit="m", above=0)
 
     def __post_init__(self) -> None:
-        if self.looks < 1 or not self.step_m > 0:
-            raise FeatureLayerError(f"coverage after {self.looks} looks {self.step_m} m apart: need >= 1 and > 0")
         check_settings(self, FeatureLayerError)
 
 
