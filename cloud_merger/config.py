@@ -12,7 +12,6 @@ from gnd.cloud_merger.errors import MergerError
 from gnd.cloud_merger.features.check import FeatureLimits
 from gnd.cloud_merger.features.parameters import FeatureMergeParameters
 from gnd.cloud_merger.merge import MergeParameters
-from gnd.cloud_merger.shift import ShiftParameters
 from gnd.cloud_merger.waiting import WaitingLimits
 from gnd.cloud_merger.wants import WantParameters
 from gnd.fleet_bus.config import DEFAULT_ENDPOINT
@@ -33,7 +32,6 @@ class ShardConfig:
     bus_lease_ms: int = setting(0, "How long a silent shard counts as alive; 0: the bus's own.", unit="ms", least=0)
     merge: MergeParameters = setting(MergeParameters, "How statements become changes.")
     confirmation: ConfirmationParameters = setting(ConfirmationParameters, "What a single vehicle may change.")
-    shift: ShiftParameters = setting(ShiftParameters, "When changes are an error of the vehicle's poses.")
     features: FeatureMergeParameters = setting(
         FeatureMergeParameters,
         "How statements become changes in feature layers.",

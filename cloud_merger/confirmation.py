@@ -11,6 +11,7 @@ A pure function of the merged tile and the reports, as the merge itself: every n
 from collections import Counter, defaultdict
 from collections.abc import Collection, Iterable, Mapping
 from dataclasses import dataclass, replace
+from typing import Final
 
 import numpy as np
 from scipy.sparse import coo_array
@@ -25,6 +26,16 @@ from gnd.gnd_map.grid import VoxelGrid
 from gnd.gnd_map.settings import check_settings, setting
 from gnd.gnd_map.tile import TileDelta, apply
 from gnd.tile_store.values import Unconfirmed, WaitingReason
+
+CONFIRMATION_VOUCHED_SHARE: Final = 0.5
+"""But if at least this share of all its claims that won was made by others, too, the rest is believed with it, whatever
+else speaks against it: its poses were right there, and it sees a construction site from where others do not."""
+CONFIRMATION_WELL_KNOWN_M: Final = 0.1
+"""The lonely claims of a report whose poses are worse than this, beyond what the merge expects of all, wait however few
+they are."""
+CONFIRMATION_SECOND_DRIVE_S: Final = 1800.0
+"""A vehicle that comes back after so long is a second witness. Passes in a row are one: they share the state of
+localisation, the parked cars and the mount."""
 
 Who = Report | Witness
 VOUCHED_VOXELS = 12  # so many claims of a vehicle must others share at least before they vouch for the rest
@@ -50,28 +61,6 @@ class ConfirmationParameters:
         "about is not: edges, leaves, a surface that the map just missed. Changes of shape alone are told "
         "less surely.",
         least=1,
-    )
-    vouched_share: float = setting(
-        0.5,
-        "But if at least this share of all its claims that won was made by others, too, the rest is believed "
-        "with it, whatever else speaks against it: its poses were right there, and it sees a construction "
-        "site from where others do not.",
-        least=0,
-        most=1,
-    )
-    well_known_m: float = setting(
-        0.1,
-        "The lonely claims of a report whose poses are worse than this, beyond what the merge expects of all, "
-        "wait however few they are.",
-        unit="m",
-        above=0,
-    )
-    second_drive_s: float = setting(
-        1800.0,
-        "A vehicle that comes back after so long is a second witness. Passes in a row are one: they share the "
-        "state of localisation, the parked cars and the mount.",
-        unit="s",
-        above=0,
     )
 
     def __post_init__(self) -> None:
@@ -127,7 +116,7 @@ def gate(
     parameters = parameters or ConfirmationParameters()
     by_report = {report.report_id: report for report in reports}
     by_id = {witness.report_id: witness for witness in witnesses} | by_report
-    lonely = _witnesses(merged, by_id, parameters, named)
+    lonely = _witnesses(merged, by_id, named)
     if not lonely:
         return GatedTile(merged)
     waits: dict[int, tuple[str, WaitingReason]] = {}
@@ -143,11 +132,9 @@ def gate(
     return GatedTile(_without(epoch, merged, waits), _told(waits, merged, epoch, by_report.values()))
 
 
-def _witnesses(
-    merged: MergedTile, by_id: Mapping[str, Who], parameters: ConfirmationParameters, named: frozenset[str]
-) -> dict[str, _Witness]:
+def _witnesses(merged: MergedTile, by_id: Mapping[str, Who], named: frozenset[str]) -> dict[str, _Witness]:
     """By vehicle, its part in the changes that won. Named vehicles do not confirm each other either."""
-    drive = _drives(by_id.values(), parameters.second_drive_s, named)
+    drive = _drives(by_id.values(), CONFIRMATION_SECOND_DRIVE_S, named)
     lonely: dict[str, dict[int, tuple[Who, ...]]] = defaultdict(dict)
     shared: Counter[str] = Counter()
     voxels: dict[tuple[str, ...], list[int]] = defaultdict(list)
@@ -198,12 +185,12 @@ def _waiting_of(
     None on new ground, where nothing is too much or too little.
     """
     waits: dict[int, WaitingReason] = {}
-    if witness.shared >= max(VOUCHED_VOXELS, parameters.vouched_share * (witness.shared + len(witness.lonely))):
+    if witness.shared >= max(VOUCHED_VOXELS, CONFIRMATION_VOUCHED_SHARE * (witness.shared + len(witness.lonely))):
         return waits
     for voxel, reports in witness.lonely.items():
         if all(report.is_doubtful for report in reports):
             waits[voxel] = "doubtful"
-        elif all(report.pose_m2 > parameters.well_known_m**2 for report in reports):
+        elif all(report.pose_m2 > CONFIRMATION_WELL_KNOWN_M**2 for report in reports):
             waits[voxel] = "poses"
     rest = witness.lonely.keys() - waits.keys()
     if isolated is None:

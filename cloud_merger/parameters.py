@@ -2,11 +2,18 @@
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from typing import Final
 
 from gnd.cloud_merger.errors import MergerError
 from gnd.cloud_merger.statements import Mode, Report
 from gnd.gnd_map.settings import check_settings, setting
 from gnd.schemas.changes import TileChange
+
+MERGE_NOISE_M: Final = 0.05
+"""Added (squared) to the covariances that the default similarity compares. It stands for poses known to so much; what a
+report's poses are worse than that is added for this report."""
+MERGE_POSE_LEVER_M: Final = 20.0
+"""At this range the heading of a report's poses is counted as a position."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -32,46 +39,7 @@ class MergeParameters:
         least=0,
         below=1,
     )
-    xi_reshaped: float = setting(
-        0.5,
-        'The same for a cluster most of which denies the epoch\'s own Gaussian ("modified"). Lower, because a '
-        "shape is judged less surely than a presence, and a parked car seldom touches what the map holds.",
-        least=0,
-        below=1,
-    )
-    d_update: float = setting(
-        0.5,
-        "Published when the candidate's similarity to the epoch's voxel is smaller than this.",
-        least=0,
-        most=1,
-    )
-    d_denied: float = setting(
-        0.95,
-        "The same where most of the candidate's statements were compared with that voxel and deny it.",
-        least=0,
-        most=1,
-    )
-    d_renewed: float = setting(
-        0.9,
-        "A representative of more measurements takes the place of an earlier one that is less like it.",
-        least=0,
-        most=1,
-    )
-    noise_m: float = setting(
-        0.05,
-        "Added (squared) to the covariances that the default similarity compares. It stands for poses known "
-        "to so much; what a report's poses are worse than that is added for this report.",
-        unit="m",
-        least=0,
-    )
     poses: bool = setting(True, "Whether what the reports tell of their poses counts at all.")
-    pose_lever_m: float = setting(
-        20.0,
-        "At this range the heading of a report's poses is counted as a position.",
-        unit="m",
-        least=0,
-        most=1000,
-    )
     pose_weight_m: float = setting(
         0.1,
         "A report whose poses are this much worse than `noise_m` has half a vote; 0: poses do not weigh.",
@@ -100,8 +68,8 @@ class MergeParameters:
         """Return the variance of what a report measured by its poses, beyond what `noise_m` stands for."""
         if self.mode == "paper" or not self.poses:
             return 0.0
-        at_lever_m = self.pose_lever_m * change.pose_sigma_rad
-        return max(change.pose_sigma_m**2 + at_lever_m**2 - self.noise_m**2, 0.0)
+        at_lever_m = MERGE_POSE_LEVER_M * change.pose_sigma_rad
+        return max(change.pose_sigma_m**2 + at_lever_m**2 - MERGE_NOISE_M**2, 0.0)
 
     def report_of(self, report_id: str, sensor_model: str, change: TileChange) -> Report:
         """Return a report's part about one tile with the weight of its votes, by sensor and poses."""

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from gnd.cloud_merger.errors import MergerError
 from gnd.cloud_merger.expanding import is_askable
 from gnd.cloud_merger.memory import TileMemory
+from gnd.cloud_merger.merge import MERGE_XI_RESHAPED
 from gnd.cloud_merger.parameters import MergeParameters
 from gnd.cloud_merger.statements import (
     EPOCH,
@@ -126,7 +127,7 @@ def _wanted_of_tile(
         remembered = _remembered(own, known, ids)
         votes, cast, in_hand = votes + remembered[0], cast + remembered[1], in_hand + remembered[2]
     votes, cast, in_hand = votes + own.weight, cast + own.weight, in_hand + _promised(known.promised, ids)
-    xi = np.where(modified & (merge.mode == "default"), merge.xi_reshaped, merge.xi)
+    xi = np.where(modified & (merge.mode == "default"), MERGE_XI_RESHAPED, merge.xi)
     may_win = votes > want.share * xi * cast
     asked_anyway = _sample(~may_win, 0 if merge.mode == "paper" else want.sample)
     return may_win, np.asarray((may_win & (in_hand < want.enough)) | asked_anyway)

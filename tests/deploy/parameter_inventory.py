@@ -18,7 +18,7 @@ NAMES = re.compile(r"(Parameters|Limits|Config|Noise)$")
 
 @dataclass
 class Parameter:
-    """A field: its class, name, file, type; whether it is a setting or holds a group; the files in which it is given."""
+    """A field: class, name, file, type; whether it is a setting or holds a group; the files in which it is given."""
 
     owner: str
     name: str

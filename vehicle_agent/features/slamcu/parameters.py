@@ -57,6 +57,8 @@ class FilterParameters:
 
     particles: int = 1000
     """M; one is enough where the poses are given and certain."""
+    resample_below: float = 0.5
+    """α of Eq. (20): resample when the effective number falls below this share of M."""
     jitter: float = 0.45
     """h: a resampled particle keeps √(1-h²) of its distance from the mean; h of that of another pair makes up for it.
     0 is plain resampling."""
@@ -68,6 +70,7 @@ class FilterParameters:
 
     def __post_init__(self) -> None:
         _check("filter.particles", self.particles, 1, 100_000)
+        _check("filter.resample_below", self.resample_below, 0.0, 1.0)
         _check("filter.jitter", self.jitter, 0.0, 0.9)
         _check("filter.floor", self.floor, 0.0, 1.0)
         _check("filter.horizon_m", self.horizon_m, 0.0, 1e6)

@@ -23,9 +23,6 @@ from gnd.vehicle_agent.features.slamcu.blind import BIAS, GNSS_X, HEADING, SCALE
 from gnd.vehicle_agent.features.slamcu.parameters import SlamcuParameters
 from gnd.vehicle_agent.features.view import wrapped
 
-_RESAMPLE_BELOW: Final = 0.5
-"""α of Eq. (20): resample when the effective number falls below this share of M."""
-
 Prior = tuple[F64, F64]
 """Position (2,) and covariance (3,) xx, xy, yy."""
 FLOOR_PER_M2: Final = 1e-5
@@ -194,7 +191,7 @@ class Rbpf:
     def resample_if_needed(self) -> None:
         """Systematic resampling when the effective number of particles is small. Eq. (20), with squared weights."""
         weights = _normalised(self.log_weight)
-        if self.m > 1 and effective(weights) < _RESAMPLE_BELOW * self.m:
+        if self.m > 1 and effective(weights) < self._p.filter.resample_below * self.m:
             self._resample(weights)
 
     def moments(self, slot: int, weights: F64) -> tuple[F64, F64]:
@@ -253,7 +250,7 @@ class Rbpf:
 
     def _bearable(self, log: F64, most: float) -> float:
         """The largest share of a log likelihood that leaves enough effective particles."""
-        enough = 0.9 * _RESAMPLE_BELOW * self.m
+        enough = 0.9 * self._p.filter.resample_below * self.m
 
         def bears(share: float) -> bool:
             return effective(_normalised(self.log_weight + share * log)) >= enough
