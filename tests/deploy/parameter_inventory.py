@@ -1,8 +1,8 @@
 """Which parameters there are, and who turns them: `python tests/deploy/parameter_inventory.py [FOLDER]`.
 
-Counts the fields of all parameter classes of the product (dataclasses named ...Parameters, ...Limits, ...Config or
-...Noise), whether each is a documented setting, and where each is given another value: in the product, the studies, the
-tests. The simulator's worlds and sensors are inputs, not parameters.
+Counts the fields with defaults of all parameter classes of the product (dataclasses named ...Parameters, ...Limits,
+...Config or ...Noise), whether each is a documented setting, and where each is given another value: in the product, the
+studies, the tests. The simulator's worlds and sensors are inputs, not parameters.
 """
 
 import ast
@@ -68,6 +68,8 @@ def _of(path: Path, tree: ast.Module) -> Iterator[Parameter]:
             if isinstance(line, ast.AnnAssign) and isinstance(line.target, ast.Name):
                 value = line.value
                 declared = isinstance(value, ast.Call) and ast.unparse(value.func) == "setting"
+                if value is None or ast.unparse(value).startswith("setting(..."):
+                    continue  # what must be given is an input
                 yield Parameter(node.name, line.target.id, path, ast.unparse(line.annotation), declared)
 
 

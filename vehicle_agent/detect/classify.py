@@ -13,7 +13,7 @@ from gnd.gnd_map.gaussian import Gaussians, concat
 from gnd.schemas.changes import TileChange
 from gnd.vehicle_agent.detect.evidence import TileEvidence
 from gnd.vehicle_agent.detect.extension import extends_neighbour
-from gnd.vehicle_agent.detect.parameters import MIN_CELLS, NEW_CELLS_AT_EDGE, DetectParameters
+from gnd.vehicle_agent.detect.parameters import MIN_CELLS, DetectParameters
 from gnd.vehicle_agent.detect.shape_change import NOISE_M, fitted, shape_features
 
 _MANY_RAYS: Final = 100
@@ -102,9 +102,9 @@ def _decide_of_empty(e: TileEvidence, p: DetectParameters) -> NDArray[np.int64]:
 def _least_cells_of_new(e: TileEvidence, p: DetectParameters) -> NDArray[np.int64]:
     """(K,) sub-cells that make a new Gaussian: more where it may be the edge of a surface that the map holds."""
     least = np.full(len(e), p.new_cells)
-    rows = np.flatnonzero(~e.in_map & (e.measured.cells >= p.new_cells) & (e.measured.cells < NEW_CELLS_AT_EDGE))
+    rows = np.flatnonzero(~e.in_map & (e.measured.cells >= p.new_cells) & (e.measured.cells < p.new_cells_at_edge))
     edge = extends_neighbour(e.base, e.measured.take(rows))
-    least[rows[edge]] = NEW_CELLS_AT_EDGE
+    least[rows[edge]] = p.new_cells_at_edge
     return least
 
 

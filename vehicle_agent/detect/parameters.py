@@ -13,8 +13,6 @@ PassRule = Literal["ml", "ahead", "plane"]
 
 MIN_CELLS: Final = 20
 """Occupied 10 cm sub-cells that make a Gaussian, the same rule as the map's."""
-NEW_CELLS_AT_EDGE: Final = 45
-"""As `new_cells` at the edge of a known surface: near the plane of a planar Gaussian of the map next door."""
 INCLUDED_M: Final = 0.05
 """So much uncertainty of the poses `block_noise_m` and the others stand for: poses that good soften nothing."""
 
@@ -72,7 +70,14 @@ class DetectParameters:
         "Occupied 10 cm sub-cells that make a Gaussian where the map has none: noise and the error of poses thicken a"
         " surface, on real scans nine in ten false new voxels had fewer than 38.",
         least=MIN_CELLS,
-        most=NEW_CELLS_AT_EDGE,
+        most=1000,
+    )
+    new_cells_at_edge: int = setting(
+        45,
+        "The same at the edge of a known surface: within 15 cm of the plane of a planar Gaussian of the map next door;"
+        " at least `new_cells`.",
+        least=MIN_CELLS,
+        most=1000,
     )
     weak_cells: int = setting(
         5, "From here on a voxel has hits, but too few for a Gaussian: it abstains.", least=1, most=MIN_CELLS
@@ -84,6 +89,10 @@ class DetectParameters:
     def __post_init__(self) -> None:
         """Each value within its range, or `DetectParameterError` with the value."""
         check_settings(self, DetectParameterError)
+        if self.new_cells_at_edge < self.new_cells:
+            raise DetectParameterError(
+                f"new_cells_at_edge = {self.new_cells_at_edge} must be at least new_cells = {self.new_cells}"
+            )
         if self.range_max_m <= self.range_min_m:
             raise DetectParameterError(f"range_max_m = {self.range_max_m} must exceed range_min_m = {self.range_min_m}")
 
