@@ -203,7 +203,11 @@ def changed(config: T, changes: Sequence[str], *, origin: str = "--set") -> T:
         ConfigError: no such setting, or a value that it refuses.
     """
     cls = type(config)
-    return from_mapping(cls, merged(to_mapping(config), of_changes(cls, changes, origin=origin)), where=origin)
+    said = of_changes(cls, changes, origin=origin)
+    try:
+        return from_mapping(cls, merged(to_mapping(config), said))
+    except ConfigError as error:
+        raise ConfigError(f"{origin} {error}") from error
 
 
 def from_settings(cls: type[T], mapping: Mapping[str, Any], *, where: str) -> T:

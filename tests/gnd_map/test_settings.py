@@ -131,7 +131,7 @@ def test_what_is_written_can_be_read_again() -> None:
 def test_changed_keeps_the_rest() -> None:
     agent = changed(Agent("a", on=False), ["report.protocol=full"])
     assert agent == Agent("a", on=False, report=Report(protocol="full"))
-    with pytest.raises(ConfigError, match=r"--set\.report: expected|expected one of"):
+    with pytest.raises(ConfigError, match=r"--set report\.protocol: expected one of"):
         changed(agent, ["report.protocol=morse"])
 
 
