@@ -37,7 +37,7 @@ A name that no setting has is an error that names near ones; a value outside its
 range. `gnd config check PROGRAM FILE` looks at a file and runs nothing. The effective settings are written beside every
 result: `settings.toml` in the folder of an agent and of a fleet run, and their SHA-256 as `settings_sha256` in
 `result.json` and `summary.json`. A file of the fleet holds those of its agents and shards in the tables `[agent]` and
-`[merger]`:
+`[merger]` (in the environment: `GND_FLEET__AGENT__REPORT__LONGEST_S`; its agents do not read `GND_AGENT__...`):
 
 ```toml
 agents = 4
