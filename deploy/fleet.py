@@ -33,7 +33,7 @@ from gnd.schemas.keys import traffic_keys
 from gnd.tile_store.sqlite_store import SqliteStore
 from gnd.vehicle_agent.agent import AgentConfig
 from gnd.vehicle_agent.settings import agent_of
-from gnd.vehicle_agent.world_clock import Departure, WorldClock, make_clock
+from gnd.vehicle_agent.sources.world_clock import Departure, WorldClock, make_clock
 
 POLL_S = 0.2
 LOOK_S = 2.0

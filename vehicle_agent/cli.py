@@ -24,8 +24,8 @@ from gnd.gnd_map.settings import settings_text
 @click.option("--layers", help="Layers to keep up to date: ndt,signs,streetlights,poles.  [default: ndt]")
 @click.option(
     "--localise-by",
-    type=click.Choice(["lidar", "graph"]),
-    help="Scans on the voxel map; or, without LiDAR, a graph of motion, GNSS, features and lanes.",
+    type=click.Choice(["lidar", "slamcu", "graph"]),
+    help="Scans on the voxel map; or, without LiDAR, a particle filter by features, or a graph of stretches.",
 )
 @settings_options
 @click.option("--verbose", "-v", is_flag=True, help="Log every report and retry.")
@@ -77,6 +77,11 @@ def summary_line(result: dict[str, object]) -> str:
     if "stretches" in result:
         return (
             f"{result['vehicle']}: {result['distance_km']} km in {result['stretches']} stretches, "
+            f"{result['reports_acknowledged']} of {result['reports_sent']} reports acknowledged"
+        )
+    if "scans" not in result:
+        return (
+            f"{result['vehicle']}: {result['distance_km']} km by features, {result['scans_refined']} poses, "
             f"{result['reports_acknowledged']} of {result['reports_sent']} reports acknowledged"
         )
     return (

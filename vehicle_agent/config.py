@@ -1,8 +1,8 @@
 """The settings of one agent; the defaults run."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Final, Literal
+from typing import Final, Literal, get_args
 
 from gnd.fleet_bus.config import DEFAULT_ENDPOINT
 from gnd.fleet_bus.links import LinkProfile
@@ -13,7 +13,11 @@ from gnd.vehicle_agent.errors import AgentConfigError
 from gnd.vehicle_agent.features.layer_parameters import FeatureParameters
 from gnd.vehicle_agent.localise.parameters import LocaliserParameters
 from gnd.vehicle_agent.segment.parameters import SegmentParameters
-from gnd.vehicle_agent.world_clock import Departure
+from gnd.vehicle_agent.sources.world_clock import Departure
+
+LocaliseBy = Literal["lidar", "slamcu", "graph"]
+"""By scans on the voxel map; or, without LiDAR, by a particle filter of motion, GNSS and the features of one layer
+(SLAMCU), or by one graph of motion, GNSS, features and lanes for each stretch (the new-feature-layer paper)."""
 
 LEAD_S: Final = 6.0
 """A question is sent when something is needed within this time; with it goes all that is ahead."""
@@ -136,6 +140,17 @@ class ReportParameters:
 
 
 @dataclass(frozen=True, slots=True)
+class PipelineParameters:
+    """What a vehicle's algorithms go by."""
+
+    localise: LocaliserParameters = field(default_factory=LocaliserParameters)
+    segment: SegmentParameters = field(default_factory=SegmentParameters)
+    detect: DetectParameters = field(default_factory=DetectParameters)
+    report: ReportParameters = field(default_factory=ReportParameters)
+    features: FeatureParameters = field(default_factory=FeatureParameters)
+
+
+@dataclass(frozen=True, slots=True)
 class AgentConfig:
     """One vehicle agent.
 
@@ -166,9 +181,10 @@ class AgentConfig:
     download: DownloadParameters = setting(DownloadParameters, "Download of tiles.")
     report: ReportParameters = setting(ReportParameters, "Reports.")
     features: FeatureParameters = setting(FeatureParameters, "Feature layers.")
-    localise_by: Literal["lidar", "graph"] = setting(
+    localise_by: LocaliseBy = setting(
         "lidar",
-        "Scans on the voxel map; or, without LiDAR, one graph of motion, GNSS, features and lanes for each stretch.",
+        "Scans on the voxel map; or, without LiDAR, a particle filter of motion, GNSS and the features of one layer"
+        " (slamcu), or one graph of motion, GNSS, features and lanes for each stretch (graph).",
     )
 
     def __post_init__(self) -> None:
@@ -178,9 +194,9 @@ class AgentConfig:
             raise AgentConfigError("the vehicle needs a name (its pseudonym)")
         if is_feature_layer(self.layer):
             raise AgentConfigError(f"layer = {self.layer!r} holds features; that of the voxel map begins with ndt")
-        if self.localise_by not in ("lidar", "graph"):
-            raise AgentConfigError(f"localise_by = {self.localise_by!r}: there are 'lidar' and 'graph'")
-        if self.localise_by == "graph" and not self.features.layers:
+        if self.localise_by not in get_args(LocaliseBy):
+            raise AgentConfigError(f"localise_by = {self.localise_by!r}: there are {', '.join(get_args(LocaliseBy))}")
+        if self.localise_by != "lidar" and not self.features.layers:
             raise AgentConfigError("a vehicle without LiDAR maps features: name at least one feature layer")
         if self.report.left_behind_m <= self.detect.range_max_m:
             raise AgentConfigError(
@@ -192,6 +208,11 @@ class AgentConfig:
     def ledger_path(self) -> Path:
         """The traffic ledger of this vehicle."""
         return (self.ledger_dir or self.work_dir.parent / "ledger") / f"{self.vehicle}.jsonl"
+
+    @property
+    def pipeline(self) -> PipelineParameters:
+        """What the algorithms go by."""
+        return PipelineParameters(self.localise, self.segment, self.detect, self.report, self.features)
 
     @property
     def waits_for_tiles(self) -> bool:

@@ -31,8 +31,10 @@ SEEN_M: Final = 80.0
 _VEHICLE: Final = (
     *SIMULATOR,
     "vehicle_agent/localise",
-    *(f"vehicle_agent/{name}.py" for name in ("local_map", "place", "scans", "surroundings")),
-    "studies/simulation/held_tiles.py",
+    *(
+        f"vehicle_agent/{name}.py"
+        for name in ("local_map", "pipeline", "place", "scans", "surroundings", "tiles_at_hand")
+    ),
     *(f"studies/hard_cases/{name}.py" for name in ("cases", "localising", "work")),
 )
 _MAPS: Final = (*SIMULATOR, "studies/hard_cases/work.py", "studies/simulation/base_map.py")

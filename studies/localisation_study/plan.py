@@ -23,8 +23,11 @@ _MAPS: Final = (*SIMULATOR, "studies/simulation/base_map.py")
 _LOCALISER: Final = (
     *SIMULATOR,
     "vehicle_agent/localise",
-    *(f"vehicle_agent/{name}.py" for name in ("local_map", "place", "scans", "surroundings")),
-    *(f"studies/simulation/{name}.py" for name in ("held_tiles", "poses", "streams")),
+    *(
+        f"vehicle_agent/{name}.py"
+        for name in ("local_map", "pipeline", "place", "scans", "surroundings", "tiles_at_hand")
+    ),
+    *(f"studies/simulation/{name}.py" for name in ("poses", "streams")),
     *_STUDY,
 )
 _CLOUD: Final = (*VEHICLE, "cloud_merger", "studies/simulation/cloud.py")

@@ -22,7 +22,7 @@ from gnd.vehicle_agent.detect.uncertainty import PoseUncertainty
 from gnd.vehicle_agent.features.coverage import CoverageParameters
 from gnd.vehicle_agent.features.feature_report import FeatureReporter
 from gnd.vehicle_agent.features.layer import FeatureLayer, PlacedLook, pose_of
-from gnd.vehicle_agent.features.layer_parameters import FeatureParameters
+from gnd.vehicle_agent.features.layer_parameters import MARGIN_M, FeatureParameters
 from gnd.vehicle_agent.features.look import MAX_RANGE_M, Look
 from gnd.vehicle_agent.features.poles.detector import PoleDetector, Rays, detections_of
 from gnd.vehicle_agent.features.poles.slices import PoseSigma
@@ -38,9 +38,6 @@ LONGEST_GAP_NS: Final = 500_000_000
 MOST_WAITING: Final = 4096
 STEP_M: Final = 3.0
 """Tiles left behind are looked for after this much way."""
-
-_MARGIN_M: Final = 10.0
-"""A tile this much farther away than a sensor sees is left: it is decided."""
 
 
 class _Pose(NamedTuple):
@@ -191,7 +188,7 @@ class FeatureLayers:
             return
         self._looked_at = p_map_m.copy()
         for name, layer in self.layers.items():
-            reporter, reach_m = self._reporters[name], layer.parameters.range_m + _MARGIN_M
+            reporter, reach_m = self._reporters[name], layer.parameters.range_m + MARGIN_M
             for change in layer.leave(p_map_m, reach_m):
                 self._say(name, change, odometer_m)
             reporter.report(layer.tiles, self._t_ns, odometer_m)
