@@ -33,6 +33,7 @@ check: setup     ## what CI runs beside the tests: style, types, layers, generat
 	$(BIN)/mypy
 	$(BIN)/lint-imports
 	$(BIN)/python -m gnd.schemas.generate --check
+	$(BIN)/python -m gnd.deploy.configuration_page --check
 	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --quiet --strict
 	$(BIN)/pytest --collect-only --quiet --quiet > /dev/null
 

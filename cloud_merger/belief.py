@@ -13,7 +13,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from gnd.cloud_merger.shift import Shift, ShiftParameters, shift_of
+from gnd.cloud_merger.shift import SHIFT_LEAST_GAUSSIANS, Shift, shift_of
 from gnd.cloud_merger.statements import Report, is_withheld
 from gnd.gnd_map.gaussian import Gaussians
 from gnd.gnd_map.similarity import similarity
@@ -45,8 +45,7 @@ class Believed:
 class ShiftTests:
     """Shift tests of reports against the versions that they were compared with; remembered, each is made once."""
 
-    def __init__(self, parameters: ShiftParameters) -> None:
-        self.parameters = parameters
+    def __init__(self) -> None:
         self._held: OrderedDict[tuple[str, int], Shift] = OrderedDict()
 
     def of(self, report: Report, bases: Mapping[bytes, Gaussians]) -> Shift:
@@ -56,7 +55,7 @@ class ShiftTests:
             return Shift(False, 0)
         key = (report.report_id, report.change.tile.morton)
         if key not in self._held:
-            self._held[key] = shift_of(report.change, base, self.parameters)
+            self._held[key] = shift_of(report.change, base)
             if len(self._held) > REMEMBERED:
                 self._held.popitem(last=False)
         return self._held[key]
@@ -65,7 +64,6 @@ class ShiftTests:
 def believed(
     reports: Iterable[Report],
     shifts: Mapping[str, Shift],
-    parameters: ShiftParameters,
     named: frozenset[str] = frozenset(),
 ) -> Believed:
     """Sort out the reports of a tile.
@@ -73,7 +71,6 @@ def believed(
     Args:
         reports: in any order.
         shifts: of each by its id.
-        parameters: of the shift test.
         named: vehicles whose reports are shifted again and again.
 
     An account takes no notice of `named`: a report counts as explained there unless one that is not explained itself
@@ -86,7 +83,7 @@ def believed(
     cleared = {one.report_id for one in ordered if one.report_id in doubted and _is_shared(one, sure)}
     alike = cleared | {one.report_id for one in unnamed if one.report_id in doubted and _is_shared(one, unnamed)}
     out = [one for one in ordered if one.report_id in doubted - alike]
-    tested = (one for one in ordered if _can_tell(one, shifts, parameters))
+    tested = (one for one in ordered if _can_tell(one, shifts))
     return Believed(
         reports=tuple(one for one in ordered if one.report_id not in doubted - alike),
         set_aside=_claims(out),
@@ -108,8 +105,8 @@ def _doubts_by_shift(report: Report) -> bool:
     return doubt is not None and bool(doubt.reasons & DoubtReason.EXPLAINED_BY_SHIFT)
 
 
-def _can_tell(report: Report, shifts: Mapping[str, Shift], parameters: ShiftParameters) -> bool:
-    return shifts[report.report_id].gaussians >= parameters.least_gaussians or _doubts_by_shift(report)
+def _can_tell(report: Report, shifts: Mapping[str, Shift]) -> bool:
+    return shifts[report.report_id].gaussians >= SHIFT_LEAST_GAUSSIANS or _doubts_by_shift(report)
 
 
 def _is_shared(report: Report, reports: Iterable[Report]) -> bool:

@@ -8,6 +8,7 @@ import numpy as np
 
 from gnd.cloud_merger.errors import BadReport, MergerError
 from gnd.cloud_merger.features.kept import districts_of, square
+from gnd.gnd_map.settings import check_settings, setting
 from gnd.gnd_map.tile_id import TileId
 from gnd.schemas.changes import ChangeReport, TileChange
 from gnd.tile_store.store import Store
@@ -15,31 +16,30 @@ from gnd.tile_store.store import Store
 MAX_CELLS: Final = 1000  # sub-cells of 10 cm in a voxel of 1 m
 REMEMBERED_PLACES: Final = 65_536
 
+_MAX_MEAN_M: Final = 0.75
+"""A mean farther than this from its voxel's centre along an axis is absurd."""
+_MAX_VARIANCE_M2: Final = 0.5
+"""So is a larger variance along an axis (points within 1 m have at most 0.25 m²)."""
+_MAX_POSE_SIGMA_M: Final = 0.5
+"""A vehicle that knows its position no better than this says nothing about voxels of 1 m."""
+_MAX_POSE_SIGMA_RAD: Final = 0.05
+"""The same for its heading."""
+
 
 @dataclass(frozen=True, slots=True)
 class IngestLimits:
-    """What a statement about this map may say, beyond what `schemas` accepts of any.
+    """What a statement about this map may say, beyond what `schemas` accepts of any."""
 
-    Attributes:
-        max_mean_m: a mean farther than this from its voxel's centre along an axis is absurd.
-        max_variance_m2: so is a larger variance along an axis (points within 1 m have at most 0.25 m²).
-        max_pose_sigma_m: a vehicle that knows its position no better than this says nothing about voxels of 1 m.
-        max_pose_sigma_rad: the same for its heading.
-        reach_tiles: a tile that the map does not hold may be this many tiles away from one that it holds.
-    """
-
-    max_mean_m: float = 0.75
-    max_variance_m2: float = 0.5
-    max_pose_sigma_m: float = 0.5
-    max_pose_sigma_rad: float = 0.05
-    reach_tiles: int = 3
+    reach_tiles: int = setting(
+        3,
+        "A tile that the map does not hold may be this many tiles away from one that it holds.",
+        unit="tiles",
+        least=0,
+        most=32,
+    )
 
     def __post_init__(self) -> None:
-        for name in ("max_mean_m", "max_variance_m2", "max_pose_sigma_m", "max_pose_sigma_rad"):
-            if not getattr(self, name) > 0:
-                raise MergerError(f"{name} must be positive, got {getattr(self, name)}")
-        if not 0 <= self.reach_tiles <= 32:
-            raise MergerError(f"reach_tiles must lie in 0 … 32, got {self.reach_tiles}")
+        check_settings(self, MergerError)
 
 
 class MapCheck:
@@ -64,7 +64,7 @@ class MapCheck:
             BadReport: with numbers.
         """
         for change in report.tiles:
-            check_change(change, self._limits)
+            check_change(change)
             self._check_place(report.layer, change)
 
     def _check_place(self, layer: str, change: TileChange) -> None:
@@ -89,22 +89,22 @@ class MapCheck:
         return (head.tile for district in districts_of(near) for head in self._store.heads(layer, district.path))
 
 
-def check_change(change: TileChange, limits: IngestLimits) -> None:
+def check_change(change: TileChange) -> None:
     """Refuse Gaussians that no points of their voxel can have, and poses too vague to speak of voxels.
 
     Raises:
         BadReport: says which voxel, with numbers.
     """
-    if change.pose_sigma_m > limits.max_pose_sigma_m or change.pose_sigma_rad > limits.max_pose_sigma_rad:
+    if change.pose_sigma_m > _MAX_POSE_SIGMA_M or change.pose_sigma_rad > _MAX_POSE_SIGMA_RAD:
         raise BadReport(
             f"tile {change.tile}: pose known to {change.pose_sigma_m:.3g} m, {change.pose_sigma_rad:.3g} rad only; "
-            f"the limits are {limits.max_pose_sigma_m:g} m, {limits.max_pose_sigma_rad:g} rad"
+            f"the limits are {_MAX_POSE_SIGMA_M:g} m, {_MAX_POSE_SIGMA_RAD:g} rad"
         )
     changed = change.changed
     variance = changed.cov_m2[:, (0, 3, 5)]
     checks = (
-        ("mean of {:.3g} m from the voxel's centre", np.abs(changed.mean_m).max(axis=1, initial=0), limits.max_mean_m),
-        ("variance of {:.3g} m²", variance.max(axis=1, initial=0), limits.max_variance_m2),
+        ("mean of {:.3g} m from the voxel's centre", np.abs(changed.mean_m).max(axis=1, initial=0), _MAX_MEAN_M),
+        ("variance of {:.3g} m²", variance.max(axis=1, initial=0), _MAX_VARIANCE_M2),
         ("{:d} occupied sub-cells", changed.cells, MAX_CELLS),
         ("{:d} sub-cells more than points", changed.cells.astype(np.int64) - changed.count, 0),
     )

@@ -11,6 +11,7 @@ A pure function of the merged tile and the reports, as the merge itself: every n
 from collections import Counter, defaultdict
 from collections.abc import Collection, Iterable, Mapping
 from dataclasses import dataclass, replace
+from typing import Final
 
 import numpy as np
 from scipy.sparse import coo_array
@@ -22,8 +23,19 @@ from gnd.cloud_merger.merge import MergedTile
 from gnd.cloud_merger.statements import Report, Witness
 from gnd.gnd_map.gaussian import Gaussians
 from gnd.gnd_map.grid import VoxelGrid
+from gnd.gnd_map.settings import check_settings, setting
 from gnd.gnd_map.tile import TileDelta, apply
 from gnd.tile_store.values import Unconfirmed, WaitingReason
+
+CONFIRMATION_VOUCHED_SHARE: Final = 0.5
+"""But if at least this share of all its claims that won was made by others, too, the rest is believed with it, whatever
+else speaks against it: its poses were right there, and it sees a construction site from where others do not."""
+CONFIRMATION_WELL_KNOWN_M: Final = 0.1
+"""The lonely claims of a report whose poses are worse than this, beyond what the merge expects of all, wait however few
+they are."""
+CONFIRMATION_SECOND_DRIVE_S: Final = 1800.0
+"""A vehicle that comes back after so long is a second witness. Passes in a row are one: they share the state of
+localisation, the parked cars and the mount."""
 
 Who = Report | Witness
 VOUCHED_VOXELS = 12  # so many claims of a vehicle must others share at least before they vouch for the rest
@@ -32,42 +44,27 @@ _NS_PER_S = 1_000_000_000
 
 @dataclass(frozen=True, slots=True)
 class ConfirmationParameters:
-    """What a single witness may change.
+    """What a single witness may change."""
 
-    Attributes:
-        few_voxels: so many changed voxels of a tile, ...
-        few_share: ... or this share of what the witness saw of the tile, whichever is more, are few. Beyond that all of
-            its lonely claims in the tile wait.
-        together_voxels: a lonely claim is well supported in a group of changes, voxel beside voxel, in which at least
-            so many appear or vanish. What has come or gone is larger than a voxel or two; what detection errs about is
-            not: edges, leaves, a surface that the map just missed. Changes of shape alone are told less surely.
-        vouched_share: but if at least this share of all its claims that won was made by others, too, the rest is
-            believed with it, whatever else speaks against it: its poses were right there, and it sees a construction
-            site from where others do not.
-        well_known_m: the lonely claims of a report whose poses are worse than this, beyond what the merge expects of
-            all, wait however few they are.
-        second_drive_s: a vehicle that comes back after so long is a second witness. Passes in a row are one: they share
-            the state of localisation, the parked cars and the mount.
-    """
-
-    few_voxels: int = 8
-    few_share: float = 0.02
-    together_voxels: int = 3
-    vouched_share: float = 0.5
-    well_known_m: float = 0.1
-    second_drive_s: float = 1800.0
+    few_voxels: int = setting(8, "So many changed voxels of a tile, ...", least=0)
+    few_share: float = setting(
+        0.02,
+        "... or this share of what the witness saw of the tile, whichever is more, are few. Beyond that all "
+        "of its lonely claims in the tile wait.",
+        least=0,
+        most=1,
+    )
+    together_voxels: int = setting(
+        3,
+        "A lonely claim is well supported in a group of changes, voxel beside voxel, in which at least so "
+        "many appear or vanish. What has come or gone is larger than a voxel or two; what detection errs "
+        "about is not: edges, leaves, a surface that the map just missed. Changes of shape alone are told "
+        "less surely.",
+        least=1,
+    )
 
     def __post_init__(self) -> None:
-        if self.few_voxels < 0:
-            raise MergerError(f"few_voxels must not be negative, got {self.few_voxels}")
-        if self.together_voxels < 1:
-            raise MergerError(f"together_voxels must be at least 1, got {self.together_voxels}")
-        for name in ("few_share", "vouched_share"):
-            if not 0 <= getattr(self, name) <= 1:
-                raise MergerError(f"{name} must lie in [0, 1], got {getattr(self, name)}")
-        for name in ("well_known_m", "second_drive_s"):
-            if not getattr(self, name) > 0:
-                raise MergerError(f"{name} must be positive, got {getattr(self, name)}")
+        check_settings(self, MergerError)
 
 
 @dataclass(frozen=True, slots=True)
@@ -119,7 +116,7 @@ def gate(
     parameters = parameters or ConfirmationParameters()
     by_report = {report.report_id: report for report in reports}
     by_id = {witness.report_id: witness for witness in witnesses} | by_report
-    lonely = _witnesses(merged, by_id, parameters, named)
+    lonely = _witnesses(merged, by_id, named)
     if not lonely:
         return GatedTile(merged)
     waits: dict[int, tuple[str, WaitingReason]] = {}
@@ -135,11 +132,9 @@ def gate(
     return GatedTile(_without(epoch, merged, waits), _told(waits, merged, epoch, by_report.values()))
 
 
-def _witnesses(
-    merged: MergedTile, by_id: Mapping[str, Who], parameters: ConfirmationParameters, named: frozenset[str]
-) -> dict[str, _Witness]:
+def _witnesses(merged: MergedTile, by_id: Mapping[str, Who], named: frozenset[str]) -> dict[str, _Witness]:
     """By vehicle, its part in the changes that won. Named vehicles do not confirm each other either."""
-    drive = _drives(by_id.values(), parameters.second_drive_s, named)
+    drive = _drives(by_id.values(), CONFIRMATION_SECOND_DRIVE_S, named)
     lonely: dict[str, dict[int, tuple[Who, ...]]] = defaultdict(dict)
     shared: Counter[str] = Counter()
     voxels: dict[tuple[str, ...], list[int]] = defaultdict(list)
@@ -190,12 +185,12 @@ def _waiting_of(
     None on new ground, where nothing is too much or too little.
     """
     waits: dict[int, WaitingReason] = {}
-    if witness.shared >= max(VOUCHED_VOXELS, parameters.vouched_share * (witness.shared + len(witness.lonely))):
+    if witness.shared >= max(VOUCHED_VOXELS, CONFIRMATION_VOUCHED_SHARE * (witness.shared + len(witness.lonely))):
         return waits
     for voxel, reports in witness.lonely.items():
         if all(report.is_doubtful for report in reports):
             waits[voxel] = "doubtful"
-        elif all(report.pose_m2 > parameters.well_known_m**2 for report in reports):
+        elif all(report.pose_m2 > CONFIRMATION_WELL_KNOWN_M**2 for report in reports):
             waits[voxel] = "poses"
     rest = witness.lonely.keys() - waits.keys()
     if isolated is None:

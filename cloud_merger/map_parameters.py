@@ -9,26 +9,83 @@ from hashlib import sha256
 from typing import Any, Final
 
 from gnd.cloud_merger.config import ShardConfig
-from gnd.cloud_merger.confirmation import ConfirmationParameters
+from gnd.cloud_merger.confirmation import (
+    CONFIRMATION_SECOND_DRIVE_S,
+    CONFIRMATION_VOUCHED_SHARE,
+    CONFIRMATION_WELL_KNOWN_M,
+    ConfirmationParameters,
+)
 from gnd.cloud_merger.errors import MergerError
+from gnd.cloud_merger.features.association import FEATURE_LINE_REACH_M
+from gnd.cloud_merger.features.existence import FEATURE_ABSENCE, FEATURE_CEILING, FEATURE_PRIOR, FEATURE_VIEW_MARGIN_M
 from gnd.cloud_merger.features.parameters import FeatureMergeParameters
-from gnd.cloud_merger.parameters import MergeParameters
-from gnd.cloud_merger.shift import ShiftParameters
+from gnd.cloud_merger.features.publication import FEATURE_MOST_WEIGHT, FEATURE_RENEWAL_MASS, FEATURE_VOTERS
+from gnd.cloud_merger.features.tracks import FEATURE_MAX_BEGUN, FEATURE_MOVED_M
+from gnd.cloud_merger.merge import MERGE_D_DENIED, MERGE_D_RENEWED, MERGE_D_UPDATE, MERGE_XI_RESHAPED
+from gnd.cloud_merger.parameters import MERGE_NOISE_M, MERGE_POSE_LEVER_M, MergeParameters
+from gnd.cloud_merger.shift import (
+    SHIFT_BEYOND_CHANCE,
+    SHIFT_DISPLACED_M,
+    SHIFT_EXPLAINED_SHARE,
+    SHIFT_FITS,
+    SHIFT_LEAST_GAUSSIANS,
+    SHIFT_MAX_M,
+    SHIFT_MAX_RAD,
+    SHIFT_REFUTED_SHARE,
+)
 from gnd.gnd_map.config import from_mapping, to_mapping
 from gnd.gnd_map.errors import ConfigError
+from gnd.gnd_map.settings import merged
 
 _FORMAT: Final = 1
 _GROUPS: Final[dict[str, type[Any]]] = {
     "merge": MergeParameters,
     "confirmation": ConfirmationParameters,
-    "shift": ShiftParameters,
     "features": FeatureMergeParameters,
 }
+_CONSTANTS: Final[dict[str, dict[str, float]]] = {
+    "merge": {
+        "xi_reshaped": MERGE_XI_RESHAPED,
+        "d_update": MERGE_D_UPDATE,
+        "d_denied": MERGE_D_DENIED,
+        "d_renewed": MERGE_D_RENEWED,
+        "noise_m": MERGE_NOISE_M,
+        "pose_lever_m": MERGE_POSE_LEVER_M,
+    },
+    "confirmation": {
+        "vouched_share": CONFIRMATION_VOUCHED_SHARE,
+        "well_known_m": CONFIRMATION_WELL_KNOWN_M,
+        "second_drive_s": CONFIRMATION_SECOND_DRIVE_S,
+    },
+    "shift": {
+        "max_m": SHIFT_MAX_M,
+        "max_rad": SHIFT_MAX_RAD,
+        "least_gaussians": SHIFT_LEAST_GAUSSIANS,
+        "fits": SHIFT_FITS,
+        "explained_share": SHIFT_EXPLAINED_SHARE,
+        "beyond_chance": SHIFT_BEYOND_CHANCE,
+        "displaced_m": SHIFT_DISPLACED_M,
+        "refuted_share": SHIFT_REFUTED_SHARE,
+    },
+    "features": {
+        "line_reach_m": FEATURE_LINE_REACH_M,
+        "moved_m": FEATURE_MOVED_M,
+        "prior": FEATURE_PRIOR,
+        "absence": FEATURE_ABSENCE,
+        "view_margin_m": FEATURE_VIEW_MARGIN_M,
+        "voters": FEATURE_VOTERS,
+        "most_weight": FEATURE_MOST_WEIGHT,
+        "renewal_mass": FEATURE_RENEWAL_MASS,
+        "max_begun": FEATURE_MAX_BEGUN,
+        "ceiling": FEATURE_CEILING,
+    },
+}
+"""What the map depends on and nobody sets. It travels, too: a release with another value knows that it has one."""
 
 
 def text_of(config: ShardConfig) -> str:
     """The canonical text: JSON with sorted keys. Equal parameters give equal texts; floats come back bit for bit."""
-    said = {name: to_mapping(getattr(config, name)) for name in _GROUPS}
+    said: dict[str, Any] = merged(_CONSTANTS, {name: to_mapping(getattr(config, name)) for name in _GROUPS})
     return json.dumps(said | {"codec": config.codec, "format": _FORMAT}, sort_keys=True, separators=(",", ":"))
 
 
@@ -49,9 +106,23 @@ def with_text(config: ShardConfig, text: str) -> ShardConfig:
         said = json.loads(text)
         if said["format"] != _FORMAT:
             raise MergerError(f"parameters of format {said['format']}, this release reads {_FORMAT}")
+        _take_constants(said)
         groups = {name: from_mapping(kind, said[name], where=name) for name, kind in _GROUPS.items()}
         return replace(config, codec=said["codec"], **groups)
-    except (ValueError, KeyError, TypeError, ConfigError) as error:
+    except (ValueError, KeyError, TypeError, AttributeError, ConfigError) as error:
         raise MergerError(
             f"merge parameters {digest_of(text)[:16]}… cannot be read by this release: {error}"
         ) from error
+
+
+def _take_constants(said: dict[str, Any]) -> None:
+    """Take the constants out of a text, which is changed.
+
+    Raises:
+        MergerError: one has another value in this release.
+    """
+    for group, constants in _CONSTANTS.items():
+        for name, value in constants.items():
+            told = said[group].pop(name, value)
+            if told != value:
+                raise MergerError(f"{group}.{name} is {told!r}; it is {value!r} in this release, and nobody sets it")

@@ -6,17 +6,28 @@ on nothing else: in whatever batches and retries they came, the same reports giv
 
 from dataclasses import dataclass, field, replace
 from itertools import pairwise
+from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
 
 from gnd.cloud_merger.cluster import Index, dbscan, dbscan_sklearn
 from gnd.cloud_merger.merge_kernels import clusters_of
-from gnd.cloud_merger.parameters import MergeParameters
+from gnd.cloud_merger.parameters import MERGE_NOISE_M, MergeParameters
 from gnd.cloud_merger.statements import EPOCH, Kind, Rows, Statements, find, states_at
 from gnd.gnd_map.gaussian import Gaussians
 from gnd.gnd_map.similarity import pairs_within, similarity
 from gnd.gnd_map.tile import TileDelta, apply
+
+MERGE_XI_RESHAPED: Final = 0.5
+"""The same for a cluster most of which denies the epoch's own Gaussian ("modified"). Lower, because a shape is judged
+less surely than a presence, and a parked car seldom touches what the map holds."""
+MERGE_D_UPDATE: Final = 0.5
+"""Published when the candidate's similarity to the epoch's voxel is smaller than this."""
+MERGE_D_DENIED: Final = 0.95
+"""The same where most of the candidate's statements were compared with that voxel and deny it."""
+MERGE_D_RENEWED: Final = 0.9
+"""A representative of more measurements takes the place of an earlier one that is less like it."""
 
 __all__ = ["MergeParameters", "MergedTile", "merge_tile"]
 
@@ -170,7 +181,7 @@ def _similarity(a: Rows, b: Rows, parameters: MergeParameters) -> NDArray[np.flo
         b["mean_m"],
         b["cov_m2"],
         parameters.mode,
-        noise_m=np.sqrt(parameters.noise_m**2 + a["pose_m2"] + b["pose_m2"]),
+        noise_m=np.sqrt(MERGE_NOISE_M**2 + a["pose_m2"] + b["pose_m2"]),
     )
 
 
@@ -188,7 +199,7 @@ def _winners(rows: Rows, cluster: Index, parameters: MergeParameters) -> Index:
     observed, seat = np.unique(rows["voxel_id"], return_inverse=True)
     cast = np.bincount(seat, weights=rows["weight"])[np.searchsorted(observed, voxel[best])]
     denying = _share(rows["denies"][in_cluster], member)[best] if len(best) else np.zeros(0)
-    xi = np.where((denying > 0.5) & (parameters.mode == "default"), parameters.xi_reshaped, parameters.xi)
+    xi = np.where((denying > 0.5) & (parameters.mode == "default"), MERGE_XI_RESHAPED, parameters.xi)
     return np.sort(number[best[votes[best] > xi * cast]])
 
 
@@ -211,7 +222,7 @@ def _representatives(rows: Rows, cluster: Index, parameters: MergeParameters) ->
     every changed voxel by a hair, and each move is sent to all vehicles.
     """
     first = np.unique(cluster, return_index=True)[1]
-    measured = _measured_well(rows, cluster, parameters)
+    measured = _measured_well(rows, cluster)
     before: Index = np.cumsum(measured) - measured
     turn: Index = before - before[first][cluster]
     n = np.bincount(cluster, weights=measured).astype(np.int64)
@@ -227,18 +238,18 @@ def _representatives(rows: Rows, cluster: Index, parameters: MergeParameters) ->
         many = np.flatnonzero(n >= of)
         use = measured & (turn < of) & (n >= of)[cluster]
         anew = _recursive_moments(rows[use], np.searchsorted(many, cluster[use]))
-        renewed = _similarity(found[many], anew, parameters) < parameters.d_renewed
+        renewed = _similarity(found[many], anew, parameters) < MERGE_D_RENEWED
         found[many[renewed]] = anew[renewed]
         of *= 2
     return found
 
 
-def _measured_well(rows: Rows, cluster: Index, parameters: MergeParameters) -> NDArray[np.bool_]:
+def _measured_well(rows: Rows, cluster: Index) -> NDArray[np.bool_]:
     """Measured statements whose pose variance exceeds the least of their cluster by no more than `noise_m`²."""
     measured = rows["kind"] == Kind.MEASURED
     least = np.full(int(cluster.max(initial=-1)) + 1, np.inf)
     np.minimum.at(least, cluster[measured], rows["pose_m2"][measured])
-    return np.asarray(measured & (rows["pose_m2"] <= least[cluster] + parameters.noise_m**2))
+    return np.asarray(measured & (rows["pose_m2"] <= least[cluster] + MERGE_NOISE_M**2))
 
 
 def _recursive_moments(rows: Rows, cluster: Index) -> Rows:
@@ -276,7 +287,7 @@ def _differs(
     Where most of its statements were compared with that very voxel and deny it, anything less than equal will do.
     """
     was = states_at(epoch, candidate["voxel_id"], Kind.QUOTED)
-    limit = np.where(denying > 0.5, parameters.d_denied, parameters.d_update)
+    limit = np.where(denying > 0.5, MERGE_D_DENIED, MERGE_D_UPDATE)
     return np.asarray(_similarity(was, candidate, parameters) < limit)
 
 

@@ -8,7 +8,7 @@ Where all agree that is one similarity each, not one a pair.
 import numpy as np
 from numpy.typing import NDArray
 
-from gnd.cloud_merger.parameters import MergeParameters
+from gnd.cloud_merger.parameters import MERGE_NOISE_M, MergeParameters
 from gnd.cloud_merger.statements import Kind, Rows
 from gnd.gnd_map.arrays import F32, F64, I32, I64
 from gnd.gnd_map.jit import kernel
@@ -31,7 +31,7 @@ def clusters_of(rows: Rows, parameters: MergeParameters) -> I64:
     """
     label = np.full(len(rows), NOISE, np.int64)
     columns = {name: rows[name].copy() for name in _COLUMNS}  # aligned, as the fields of a record are not
-    noise_m2, eps, min_samples = parameters.noise_m**2, parameters.eps, parameters.min_samples
+    noise_m2, eps, min_samples = MERGE_NOISE_M**2, parameters.eps, parameters.min_samples
     _label_voxels(**columns, noise_m2=noise_m2, eps=eps, min_samples=min_samples, label=label)
     return label
 

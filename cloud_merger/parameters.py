@@ -1,74 +1,64 @@
 """How statements become changes: the parameters of the cloud merge."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass
+from typing import Final
 
 from gnd.cloud_merger.errors import MergerError
 from gnd.cloud_merger.statements import Mode, Report
+from gnd.gnd_map.settings import check_settings, setting
 from gnd.schemas.changes import TileChange
+
+MERGE_NOISE_M: Final = 0.05
+"""Added (squared) to the covariances that the default similarity compares. It stands for poses known to so much; what a
+report's poses are worse than that is added for this report."""
+MERGE_POSE_LEVER_M: Final = 20.0
+"""At this range the heading of a report's poses is counted as a position."""
 
 
 @dataclass(frozen=True, slots=True)
 class MergeParameters:
-    """How statements become changes.
+    """How statements become changes."""
 
-    Attributes:
-        mode: "paper": only uploaded changes count (GND as printed, with the corrections without which it cannot run);
-            "default": the votes are those of all who observed the voxel, and similarity is the smooth one.
-        eps: DBSCAN's neighbourhood on 1 - similarity; 0.5 splits the votes of vehicles that saw parts of one thing.
-        min_samples: DBSCAN's core weight.
-        xi: a cluster must hold more than this share of the voxel's statements (ξ_update).
-        xi_reshaped: the same for a cluster most of which denies the epoch's own Gaussian ("modified"). Lower, because a
-            shape is judged less surely than a presence, and a parked car seldom touches what the map holds.
-        d_update: published when the candidate's similarity to the epoch's voxel is smaller than this.
-        d_denied: the same where most of the candidate's statements were compared with that voxel and deny it.
-        d_renewed: a representative of more measurements takes the place of an earlier one that is less like it.
-        sensor_weights: weight of a vote by sensor model, 1 for the others; "paper" mode does not weigh.
-        noise_m: added (squared) to the covariances that the default similarity compares. It stands for poses known to
-            so much; what a report's poses are worse than that is added for this report.
-        poses: whether what the reports tell of their poses counts at all.
-        pose_lever_m: at this range the heading of a report's poses is counted as a position.
-        pose_weight_m: a report whose poses are this much worse than `noise_m` has half a vote; 0: poses do not weigh.
-    """
-
-    mode: Mode = "default"
-    eps: float = 0.7
-    min_samples: int = 1
-    xi: float = 0.6
-    xi_reshaped: float = 0.5
-    d_update: float = 0.5
-    d_denied: float = 0.95
-    d_renewed: float = 0.9
-    noise_m: float = 0.05
-    poses: bool = True
-    pose_lever_m: float = 20.0
-    pose_weight_m: float = 0.1
-    sensor_weights: Mapping[str, float] = field(default_factory=lambda: {"Scala": 0.5})
+    mode: Mode = setting(
+        "default",
+        '"paper": only uploaded changes count (GND as printed, with the corrections without which it cannot '
+        'run); "default": the votes are those of all who observed the voxel, and similarity is the smooth '
+        "one.",
+    )
+    eps: float = setting(
+        0.7,
+        "DBSCAN's neighbourhood on 1 - similarity; 0.5 splits the votes of vehicles that saw parts of one thing.",
+        above=0,
+        below=1,
+    )
+    min_samples: int = setting(1, "DBSCAN's core weight.", least=1)
+    xi: float = setting(
+        0.6,
+        "A cluster must hold more than this share of the voxel's statements (ξ_update).",
+        least=0,
+        below=1,
+    )
+    poses: bool = setting(True, "Whether what the reports tell of their poses counts at all.")
+    pose_weight_m: float = setting(
+        0.1,
+        "A report whose poses are this much worse than `noise_m` has half a vote; 0: poses do not weigh.",
+        unit="m",
+        least=0,
+        most=1000,
+    )
+    sensor_weights: Mapping[str, float] = setting(
+        {"Scala": 0.5},
+        'Weight of a vote by sensor model, 1 for the others; "paper" mode does not weigh.',
+    )
 
     def __post_init__(self) -> None:
         if self.mode not in ("paper", "default"):
             raise MergerError(f"mode must be 'paper' or 'default', got {self.mode!r}")
-        if not 0 < self.eps < 1:
-            raise MergerError(
-                f"eps must lie in (0, 1), got {self.eps}: at 1 Gaussians that share nothing are neighbours"
-            )
-        if self.min_samples < 1:
-            raise MergerError(f"min_samples must be at least 1, got {self.min_samples}")
-        for name, share in (("xi", self.xi), ("xi_reshaped", self.xi_reshaped)):
-            if not 0 <= share < 1:
-                raise MergerError(f"{name} must lie in [0, 1), got {share}")
-        for name, least in (("d_update", self.d_update), ("d_denied", self.d_denied), ("d_renewed", self.d_renewed)):
-            if not 0 <= least <= 1:
-                raise MergerError(f"{name} must lie in [0, 1], got {least}")
-        self._check_poses()
+        check_settings(self, MergerError)
         for model, weight in self.sensor_weights.items():
             if not 0 < weight <= 1:
                 raise MergerError(f"the weight of {model} must lie in (0, 1], got {weight}")
-
-    def _check_poses(self) -> None:
-        for name, length_m in (("pose_lever_m", self.pose_lever_m), ("pose_weight_m", self.pose_weight_m)):
-            if not 0 <= length_m <= 1000:
-                raise MergerError(f"{name} must lie in [0, 1000] m, got {length_m}")
 
     def weight_of(self, sensor_model: str) -> float:
         """Return the weight of a vote of this sensor."""
@@ -78,8 +68,8 @@ class MergeParameters:
         """Return the variance of what a report measured by its poses, beyond what `noise_m` stands for."""
         if self.mode == "paper" or not self.poses:
             return 0.0
-        at_lever_m = self.pose_lever_m * change.pose_sigma_rad
-        return max(change.pose_sigma_m**2 + at_lever_m**2 - self.noise_m**2, 0.0)
+        at_lever_m = MERGE_POSE_LEVER_M * change.pose_sigma_rad
+        return max(change.pose_sigma_m**2 + at_lever_m**2 - MERGE_NOISE_M**2, 0.0)
 
     def report_of(self, report_id: str, sensor_model: str, change: TileChange) -> Report:
         """Return a report's part about one tile with the weight of its votes, by sensor and poses."""

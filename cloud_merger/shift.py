@@ -22,7 +22,6 @@ from typing import Final
 import numpy as np
 
 from gnd.cloud_merger import shift_kernels as kernels
-from gnd.cloud_merger.errors import MergerError
 from gnd.cloud_merger.shift_kernels import Buckets, Mask, Planes
 from gnd.cloud_merger.statements import find
 from gnd.gnd_map.arrays import F64, I64
@@ -31,45 +30,27 @@ from gnd.gnd_map.gaussian import Gaussians
 from gnd.gnd_map.grid import VoxelGrid
 from gnd.schemas.changes import TileChange
 
+SHIFT_MAX_M: Final = 1.0
+"""Largest shift that is looked for, on each axis."""
+SHIFT_MAX_RAD: Final = 0.0175
+"""Largest turn."""
+SHIFT_LEAST_GAUSSIANS: Final = 12
+"""So many measured Gaussians that fit nothing must be there, or the test says nothing."""
+SHIFT_FITS: Final = 0.5
+"""Similarity at which a Gaussian fits the base."""
+SHIFT_EXPLAINED_SHARE: Final = 0.65
+"""Of these Gaussians so many must fit after the shift, ..."""
+SHIFT_BEYOND_CHANCE: Final = 0.3
+"""... and so many more than after shifts of that size in other directions."""
+SHIFT_DISPLACED_M: Final = 0.12
+"""A surface that the shift moves by so much along its normal would have been found changed."""
+SHIFT_REFUTED_SHARE: Final = 0.5
+"""Where more of these surfaces are reported unchanged, it was no shift."""
+
 MAX_GAUSSIANS: Final = 400  # of a report that are looked at, every second, third, ... where there are more
 _LEVEL: Final = 0.95  # cosine with the vertical
 _FAR_PER_M: Final = 0.05
 _STILL: Final = np.zeros(3)
-
-
-@dataclass(frozen=True, slots=True)
-class ShiftParameters:
-    """When changes are explained by a shift.
-
-    Attributes:
-        max_m: largest shift that is looked for, on each axis.
-        max_rad: largest turn.
-        least_gaussians: so many measured Gaussians that fit nothing must be there, or the test says nothing.
-        fits: similarity at which a Gaussian fits the base.
-        explained_share: of these Gaussians so many must fit after the shift, ...
-        beyond_chance: ... and so many more than after shifts of that size in other directions.
-        displaced_m: a surface that the shift moves by so much along its normal would have been found changed.
-        refuted_share: where more of these surfaces are reported unchanged, it was no shift.
-    """
-
-    max_m: float = 1.0
-    max_rad: float = 0.0175
-    least_gaussians: int = 12
-    fits: float = 0.5
-    explained_share: float = 0.65
-    beyond_chance: float = 0.3
-    displaced_m: float = 0.12
-    refuted_share: float = 0.5
-
-    def __post_init__(self) -> None:
-        for name in ("max_m", "max_rad", "displaced_m"):
-            if not 0 < getattr(self, name) <= 2:
-                raise MergerError(f"{name} must lie in (0, 2], got {getattr(self, name)}")
-        for name in ("fits", "explained_share", "beyond_chance", "refuted_share"):
-            if not 0 <= getattr(self, name) <= 1:
-                raise MergerError(f"{name} must lie in [0, 1], got {getattr(self, name)}")
-        if self.least_gaussians < 3:
-            raise MergerError(f"least_gaussians must be at least 3, got {self.least_gaussians}")
 
 
 @dataclass(frozen=True, slots=True)
@@ -97,12 +78,12 @@ class Shift:
     turn_rad: float = 0.0
     up_m: float = 0.0
 
-    def meets(self, parameters: ShiftParameters) -> bool:
+    def meets(self) -> bool:
         """Whether it explains the changes: most fit, many more than by chance, and the rest of the tile agrees."""
         return (
-            self.fit >= parameters.explained_share
-            and self.fit - self.chance >= parameters.beyond_chance
-            and self.unchanged <= parameters.refuted_share
+            self.fit >= SHIFT_EXPLAINED_SHARE
+            and self.fit - self.chance >= SHIFT_BEYOND_CHANCE
+            and self.unchanged <= SHIFT_REFUTED_SHARE
         )
 
     @property
@@ -163,50 +144,46 @@ _KNOWN: Final[ByObject[_Surfaces]] = ByObject(64)
 """Surfaces of the bases looked at last: the reports of a street refer to few versions."""
 
 
-def shift_of(change: TileChange, base: Gaussians, parameters: ShiftParameters | None = None) -> Shift:
+def shift_of(change: TileChange, base: Gaussians) -> Shift:
     """Test whether a small shift explains what a report says about a tile.
 
     Args:
         change: the report's part about the tile. Gaussians that were not asked for take no part.
         base: the tile's Gaussians that the vehicle compared with.
-        parameters: see `ShiftParameters`.
     """
-    parameters = parameters or ShiftParameters()
     n = int(change.changed.exists.sum())
-    if n < parameters.least_gaussians or len(base) < parameters.least_gaussians:
+    if n < SHIFT_LEAST_GAUSSIANS or len(base) < SHIFT_LEAST_GAUSSIANS:
         return Shift(False, n)
     surfaces = _Surfaces.of(VoxelGrid.of(change.tile), change.changed, _thinned(change.changed))
     known = _KNOWN.of(base, lambda: _Surfaces.of(VoxelGrid.of(change.tile), base), change.tile)
-    strange = surfaces.take(~_fits(surfaces, known, _STILL, parameters))
-    if len(strange) < parameters.least_gaussians:
+    strange = surfaces.take(~_fits(surfaces, known, _STILL))
+    if len(strange) < SHIFT_LEAST_GAUSSIANS:
         return Shift(False, len(strange))
     is_seen, is_changed = (find(ids, base.voxel_id) >= 0 for ids in (change.observed, change.changed.voxel_id))
-    begin = _searched(strange, known, is_seen & ~is_changed, parameters)
-    motion = _refined(begin, strange, known, parameters)
-    fit = float(_fits(strange, known, motion, parameters).mean())
-    others = [_fits(strange, known, other, parameters).mean() for other in _elsewhere(motion)]
+    begin = _searched(strange, known, is_seen & ~is_changed)
+    motion = _refined(begin, strange, known)
+    fit = float(_fits(strange, known, motion).mean())
+    others = [_fits(strange, known, other).mean() for other in _elsewhere(motion)]
     chance = float(np.mean(others))
-    unchanged = kernels.unchanged_share(known.planes, is_seen, is_changed, motion, parameters.displaced_m)
+    unchanged = kernels.unchanged_share(known.planes, is_seen, is_changed, motion, SHIFT_DISPLACED_M)
     found = Shift(False, len(strange), fit, chance, unchanged, *motion.tolist())
-    upwards = found if found.meets(parameters) else _raised(strange, known, is_seen, is_changed, parameters)
-    return next((replace(one, is_explained=True) for one in (found, upwards) if one.meets(parameters)), found)
+    upwards = found if found.meets() else _raised(strange, known, is_seen, is_changed)
+    return next((replace(one, is_explained=True) for one in (found, upwards) if one.meets()), found)
 
 
-def _raised(
-    strange: _Surfaces, known: _Surfaces, is_seen: Mask, is_changed: Mask, parameters: ShiftParameters
-) -> Shift:
+def _raised(strange: _Surfaces, known: _Surfaces, is_seen: Mask, is_changed: Mask) -> Shift:
     """The shift up or down that most level planes agree on, and what it explains; nothing where the tile refutes it."""
     level, ground, no = strange.level, known.level, Shift(False, len(strange))
-    if len(level) < parameters.least_gaussians or not len(ground):
+    if len(level) < SHIFT_LEAST_GAUSSIANS or not len(ground):
         return no
-    steps = _axis(parameters.max_m)
+    steps = _axis(SHIFT_MAX_M)
     votes = kernels.votes_up(level.place_m, ground.place_m, ground.buckets, steps)
     best = float(steps[np.lexsort((np.abs(steps), -votes))[0]])
-    displaced = is_seen & known.is_level & (abs(best) > parameters.displaced_m)
+    displaced = is_seen & known.is_level & (abs(best) > SHIFT_DISPLACED_M)
     unchanged = float((~is_changed)[displaced].mean()) if displaced.any() else 1.0
-    if unchanged > parameters.refuted_share:
+    if unchanged > SHIFT_REFUTED_SHARE:
         return no
-    fit, chance = (float(_fits(strange, known, _STILL, parameters, up_m).mean()) for up_m in (best, -best))
+    fit, chance = (float(_fits(strange, known, _STILL, up_m).mean()) for up_m in (best, -best))
     return replace(no, fit=fit, chance=chance, unchanged=unchanged, up_m=best)
 
 
@@ -216,13 +193,13 @@ def _thinned(gaussians: Gaussians) -> I64:
     return there[:: -(-len(there) // MAX_GAUSSIANS)]
 
 
-def _fits(surfaces: _Surfaces, known: _Surfaces, motion: F64, parameters: ShiftParameters, up_m: float = 0.0) -> Mask:
+def _fits(surfaces: _Surfaces, known: _Surfaces, motion: F64, up_m: float = 0.0) -> Mask:
     """(N,) whether a surface, moved, is like one of the base Gaussians around it.
 
     Along a surface its mean lies where the voxel has cut it, so only what the means differ by along the base's normal
     counts; the turn of at most a degree is left out of the covariances.
     """
-    return kernels.fitting(surfaces.planes, known.planes, known.buckets, motion, up_m, parameters.fits)
+    return kernels.fitting(surfaces.planes, known.planes, known.buckets, motion, up_m, SHIFT_FITS)
 
 
 def _axis(max_m: float) -> F64:
@@ -237,7 +214,7 @@ def _steps(max_m: float) -> tuple[F64, F64, F64]:
     return east, north, _FAR_PER_M * np.hypot(east, north)
 
 
-def _searched(surfaces: _Surfaces, known: _Surfaces, is_unchanged: Mask, parameters: ShiftParameters) -> F64:
+def _searched(surfaces: _Surfaces, known: _Surfaces, is_unchanged: Mask) -> F64:
     """The shift (east, north, 0) that most upright planes agree on.
 
     Each pair of parallel planes votes for the shifts that lay one into the other, each surface that is reported
@@ -245,23 +222,23 @@ def _searched(surfaces: _Surfaces, known: _Surfaces, is_unchanged: Mask, paramet
     that are as good the smallest.
     """
     upright = surfaces.take(surfaces.is_upright)
-    votes = kernels.votes_of(upright.planes, known.planes, known.buckets, _axis(parameters.max_m))
-    east, north, far = _steps(parameters.max_m)
+    votes = kernels.votes_of(upright.planes, known.planes, known.buckets, _axis(SHIFT_MAX_M))
+    east, north, far = _steps(SHIFT_MAX_M)
     pro = votes / max(len(upright), 1)
     x, y, _ = np.ascontiguousarray(known.normal[is_unchanged & known.is_upright].T)
-    best = kernels.best_shift(pro, far, east, north, x, y, parameters.displaced_m)
+    best = kernels.best_shift(pro, far, east, north, x, y, SHIFT_DISPLACED_M)
     return np.array([east[best], north[best], 0.0])
 
 
-def _refined(begin: F64, surfaces: _Surfaces, known: _Surfaces, parameters: ShiftParameters) -> F64:
+def _refined(begin: F64, surfaces: _Surfaces, known: _Surfaces) -> F64:
     """The motion after a few rounds of robust point-to-plane least squares, within the limits.
 
     One more measurement says that it is where it began: what no surface constrains, along a straight wall, stays there.
     """
-    prior = np.array([1.0, 1.0, (kernels.HUBER_M / parameters.max_rad) ** 2])
-    least = parameters.least_gaussians // 2
+    prior = np.array([1.0, 1.0, (kernels.HUBER_M / SHIFT_MAX_RAD) ** 2])
+    least = SHIFT_LEAST_GAUSSIANS // 2
     motion = kernels.refined(begin, surfaces.planes, known.planes, known.buckets, prior, least)
-    limit = np.array([parameters.max_m, parameters.max_m, parameters.max_rad])
+    limit = np.array([SHIFT_MAX_M, SHIFT_MAX_M, SHIFT_MAX_RAD])
     return np.asarray(np.clip(motion, -limit, limit))
 
 

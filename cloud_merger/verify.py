@@ -188,7 +188,7 @@ class Verifier:
         """The configuration with which a window was merged, and the shift tests made with it."""
         if parameters not in self._configs:
             config = with_text(self._config, parameters)
-            self._configs[parameters] = config, ShiftTests(config.shift)
+            self._configs[parameters] = config, ShiftTests()
         return self._configs[parameters]
 
     def _computed(self, journal: _Journal) -> AnyTile:

@@ -15,6 +15,7 @@ import numpy as np
 
 from gnd.cloud_merger.errors import MergerError
 from gnd.gnd_map.arrays import I32
+from gnd.gnd_map.settings import check_settings, setting
 from gnd.gnd_map.tile_id import TileId
 
 _NS_PER_S: Final = 1_000_000_000
@@ -22,19 +23,13 @@ _NS_PER_S: Final = 1_000_000_000
 
 @dataclass(frozen=True, slots=True)
 class WaitingLimits:
-    """How much may be promised.
+    """How much may be promised."""
 
-    Attributes:
-        reports: at most so many; the oldest are forgotten first.
-        keep_s: for so long a Gaussian that was asked for counts as promised.
-    """
-
-    reports: int = 1024
-    keep_s: float = 120.0
+    reports: int = setting(1024, "At most so many; the oldest are forgotten first.", least=1)
+    keep_s: float = setting(120.0, "For so long a Gaussian that was asked for counts as promised.", unit="s", above=0)
 
     def __post_init__(self) -> None:
-        if self.reports < 1 or self.keep_s <= 0:
-            raise MergerError(f"limits of promised Gaussians must be positive, got {self}")
+        check_settings(self, MergerError)
 
 
 class Promises:

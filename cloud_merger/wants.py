@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from gnd.cloud_merger.errors import MergerError
 from gnd.cloud_merger.expanding import is_askable
 from gnd.cloud_merger.memory import TileMemory
+from gnd.cloud_merger.merge import MERGE_XI_RESHAPED
 from gnd.cloud_merger.parameters import MergeParameters
 from gnd.cloud_merger.statements import (
     EPOCH,
@@ -28,34 +29,37 @@ from gnd.gnd_map.arrays import I32
 from gnd.gnd_map.classes import ChangeClass
 from gnd.gnd_map.day import day_of
 from gnd.gnd_map.gaussian import Gaussians
+from gnd.gnd_map.settings import check_settings, setting
 from gnd.gnd_map.tile_id import TileId
 from gnd.schemas.changes import ChangeReport, TileChange
 
 
 @dataclass(frozen=True, slots=True)
 class WantParameters:
-    """When a flagged voxel's Gaussian is asked for.
+    """When a flagged voxel's Gaussian is asked for."""
 
-    Attributes:
-        share: all that could agree with it, itself included, must hold more than this share of ξ of the votes; below 1
-            because votes that come later may lift it over ξ.
-        enough: so many measured Gaussians that may agree with it are enough; 0: none is ever asked for.
-        sample: where at least so many flags of a tile, and most of them, are outvoted, about so many of their Gaussians
-            are asked for all the same: they cannot change the map, but they tell whether the vehicle's poses are off
-            (`shift`); 0: none.
-    """
-
-    share: float = 0.8
-    enough: int = 4
-    sample: int = 32
+    share: float = setting(
+        0.8,
+        "All that could agree with it, itself included, must hold more than this share of ξ of the votes; "
+        "below 1 because votes that come later may lift it over ξ.",
+        least=0,
+        most=1,
+    )
+    enough: int = setting(
+        4,
+        "So many measured Gaussians that may agree with it are enough; 0: none is ever asked for.",
+        least=0,
+    )
+    sample: int = setting(
+        32,
+        "Where at least so many flags of a tile, and most of them, are outvoted, about so many of their "
+        "Gaussians are asked for all the same: they cannot change the map, but they tell whether the "
+        "vehicle's poses are off (`shift`); 0: none.",
+        least=0,
+    )
 
     def __post_init__(self) -> None:
-        if not 0 <= self.share <= 1:
-            raise MergerError(f"share must lie in [0, 1], got {self.share}")
-        if self.enough < 0:
-            raise MergerError(f"enough must be at least 0, got {self.enough}")
-        if self.sample < 0:
-            raise MergerError(f"sample must be at least 0, got {self.sample}")
+        check_settings(self, MergerError)
 
 
 @dataclass(frozen=True, slots=True)
@@ -123,7 +127,7 @@ def _wanted_of_tile(
         remembered = _remembered(own, known, ids)
         votes, cast, in_hand = votes + remembered[0], cast + remembered[1], in_hand + remembered[2]
     votes, cast, in_hand = votes + own.weight, cast + own.weight, in_hand + _promised(known.promised, ids)
-    xi = np.where(modified & (merge.mode == "default"), merge.xi_reshaped, merge.xi)
+    xi = np.where(modified & (merge.mode == "default"), MERGE_XI_RESHAPED, merge.xi)
     may_win = votes > want.share * xi * cast
     asked_anyway = _sample(~may_win, 0 if merge.mode == "paper" else want.sample)
     return may_win, np.asarray((may_win & (in_hand < want.enough)) | asked_anyway)

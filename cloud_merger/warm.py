@@ -4,7 +4,7 @@ import numpy as np
 
 from gnd.cloud_merger.merge_kernels import clusters_of
 from gnd.cloud_merger.parameters import MergeParameters
-from gnd.cloud_merger.shift import ShiftParameters, shift_of
+from gnd.cloud_merger.shift import SHIFT_LEAST_GAUSSIANS, shift_of
 from gnd.cloud_merger.statements import STATEMENT
 from gnd.gnd_map.classes import ChangeClass
 from gnd.gnd_map.codec import (
@@ -46,7 +46,7 @@ def warm_up() -> None:
 
 def _test_a_shift() -> None:
     """Level ground that is measured higher than it was: every kernel of the shift test has something to say."""
-    ids = np.arange(ShiftParameters().least_gaussians, dtype=np.int32)
+    ids = np.arange(SHIFT_LEAST_GAUSSIANS, dtype=np.int32)
     n = len(ids)
     count, cov = np.full(n, 40, np.int32), np.tile(np.array([0.08, 0.0, 0.0, 0.08, 0.0, 0.0004], np.float32), (n, 1))
     low, high = (Gaussians(ids, count, count, np.full((n, 3), up_m, np.float32), cov) for up_m in (0.0, 0.4))

@@ -91,7 +91,7 @@ class WindowMerger:
             gated = GatedTile(merge_tile(state.gaussians, statements, rules))
         else:
             shifts = {one.report_id: self.shifts.of(one, self.bases) for one in reports}
-            in_play = believed(reports, shifts, self.shifts.parameters, named)
+            in_play = believed(reports, shifts, named)
             statements = statements_of(state.gaussians, in_play.reports, self.bases, "default", state.memory)
             merged = merge_tile(state.gaussians, statements, rules)
             by, seen = statements.witnesses, in_play.reports

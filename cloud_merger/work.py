@@ -35,7 +35,7 @@ class Worker:
     def __init__(self, store: Store, config: ShardConfig, bases: Bases | None = None) -> None:
         self._store, self._config = store, config
         self._contents, self._features = bases or Bases(store), FeatureContents(store)
-        self._shifts, self._parameters = ShiftTests(config.shift), text_of(config)
+        self._shifts, self._parameters = ShiftTests(), text_of(config)
         self._begun: dict[Claim, bool] = {}  # whether the lease was still held
 
     def merge(self, claims: Sequence[Claim]) -> list[Publication]:

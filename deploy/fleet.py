@@ -14,7 +14,6 @@ from pathlib import Path
 
 from rich.console import Console
 
-from gnd.cloud_merger.merge import MergeParameters
 from gnd.cloud_merger.merger import ShardConfig
 from gnd.deploy import roles
 from gnd.deploy.errors import DeployError
@@ -29,12 +28,11 @@ from gnd.deploy.site import Site, VehicleSite, loopback_site
 from gnd.fleet_bus.bus import open_bus
 from gnd.fleet_bus.config import BusConfig
 from gnd.fleet_bus.links import load_link
+from gnd.gnd_map.settings import from_settings, merged
 from gnd.schemas.keys import traffic_keys
 from gnd.tile_store.sqlite_store import SqliteStore
-from gnd.tile_store.values import StoreConfig
 from gnd.vehicle_agent.agent import AgentConfig
-from gnd.vehicle_agent.detect.parameters import DetectParameters
-from gnd.vehicle_agent.features.layer_parameters import FeatureParameters
+from gnd.vehicle_agent.settings import agent_of
 from gnd.vehicle_agent.sources.world_clock import Departure, WorldClock, make_clock
 
 POLL_S = 0.2
@@ -192,28 +190,25 @@ def vehicle_name(number: int) -> str:
 
 def shard_config(config: FleetConfig, shard_id: str, store: Path, connect: str) -> ShardConfig:
     """Return the configuration of one merger shard."""
-    return ShardConfig(
-        shard_id=shard_id,
-        store_path=store,
-        connect=(connect,),
-        merge=MergeParameters(mode="paper" if config.merge_mode == "paper" else "default"),
-        store=StoreConfig(merge_delay_s=config.merge_delay_s, merge_after_reports=config.merge_after_reports),
-    )
+    of_fleet = {
+        "merge": {"mode": config.merge_mode},
+        "store": {"merge_delay_s": config.merge_delay_s, "merge_after_reports": config.merge_after_reports},
+    }
+    own = {"shard_id": shard_id, "store_path": str(store), "connect": [connect]}
+    return from_settings(ShardConfig, merged(of_fleet, config.merger, own), where="fleet: merger")
 
 
 def agent_config(config: FleetConfig, vehicle: str, drive: Path, folder: RunFolder, place: VehicleSite) -> AgentConfig:
     """Return the configuration of one vehicle agent."""
-    paper = config.detect_mode == "paper"
-    return AgentConfig(
-        vehicle=vehicle,
-        drive=drive,
-        work_dir=folder.agents / vehicle,
-        connect=(place.connect,),
-        link=place.link,
-        ledger_dir=folder.ledger,
-        detect=DetectParameters.paper() if paper else DetectParameters(),
-        features=FeatureParameters.of(*config.feature_layers),
-    )
+    of_fleet = {"detect": {"mode": config.detect_mode}, "features": {"layers": list(config.feature_layers)}}
+    own = {
+        "vehicle": vehicle,
+        "drive": str(drive),
+        "work_dir": str(folder.agents / vehicle),
+        "connect": [place.connect],
+        "ledger_dir": str(folder.ledger),
+    }
+    return replace(agent_of(merged(of_fleet, config.agent, own), where="fleet: agent"), link=place.link)
 
 
 @dataclass(slots=True)

@@ -19,6 +19,9 @@ from gnd.deploy.run_folder import RunFolder, create_run_folder, default_run_path
 from gnd.deploy.site import Site
 from gnd.deploy.source import Source
 from gnd.fleet_bus.links import load_link
+from gnd.fleet_bus.settings_file import write_settings
+from gnd.fleet_bus.settings_options import settings_options
+from gnd.gnd_map.settings import settings_text
 
 PATH = click.Path(path_type=Path)
 
@@ -62,8 +65,7 @@ RUN_OPTIONS = (
     click.option("--overwrite", is_flag=True, help="Replace an earlier run in that folder."),
     click.option("--merge-mode", type=click.Choice(["default", "paper"]), help="Rules of merging."),
     click.option("--detect-mode", type=click.Choice(["default", "paper"]), help="Rules of detection."),
-    click.option("--config", "config_file", type=PATH, help="TOML file in the form of deploy/fleet.toml."),
-    click.option("--dump-config", is_flag=True, help="Print the effective configuration and end."),
+    settings_options,
     click.option("--keep-drives", is_flag=True, help="Keep the simulated drives (some hundred MB) after the run."),
     click.option("--json", "as_json", is_flag=True, help="Print the summary as JSON."),
 )
@@ -89,6 +91,7 @@ def fleet(
     out: Path | None,
     overwrite: bool,
     config_file: Path | None,
+    changes: tuple[str, ...],
     dump_config: bool,
     keep_drives: bool,
     as_json: bool,
@@ -100,14 +103,15 @@ def fleet(
     truth. The folder of the run holds the logs, the traffic ledger and its page,
     the store, three pictures and summary.json.
     """
-    config = load_fleet_config(config_file, options)
+    config = load_fleet_config(config_file, options, changes)
     if dump_config:
-        click.echo(json.dumps(dataclasses.asdict(config), indent=2))
+        click.echo(settings_text(config), nl=False)
         return
     source = Source(drives, base_map, worlds, options["agents"])
     load_link(config.link)  # what cannot work is refused before anything is written
     claim_port(config.port)
     folder = create_run_folder(out or default_run_path(), overwrite=overwrite)
+    write_settings(config, folder.root)
     folder.write_mark({"config": dataclasses.asdict(config), "drives": [str(path) for path in drives]})
     summary = run(config, folder, source, keep_drives=keep_drives)
     click.echo(json.dumps(summary, indent=2) if as_json else summary_text(summary, folder))

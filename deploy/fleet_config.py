@@ -2,6 +2,7 @@
 
 import re
 import tomllib
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from importlib import resources
 from math import radians
@@ -9,7 +10,8 @@ from pathlib import Path
 from typing import Any
 
 from gnd.deploy.errors import DeployError
-from gnd.gnd_map.config import from_mapping
+from gnd.fleet_bus.settings_file import layers_of
+from gnd.gnd_map.settings import check_settings, from_settings, merged, setting
 
 MAX_AGENTS = 200
 MAX_SHARDS = 32
@@ -22,53 +24,50 @@ FEATURE_LAYERS = ("signs", "streetlights", "poles")
 
 @dataclass(frozen=True, slots=True)
 class FleetConfig:
-    """What a fleet run does.
+    """What a fleet run does."""
 
-    Attributes:
-        agents: number of vehicle agent processes.
-        shards: number of merger shard processes.
-        link: link profile of every vehicle: 3g, 4g, 5g, none, or a TOML file.
-        headway_s: time of the drives between the starts of two vehicles, so that those behind drive on what those
-            ahead have found; 0: all start at once, and drive as fast as they can.
-        world_seed: seed of the simulated world and of its drives.
-        port: TCP port of the router on the loopback interface; 0 takes a free one.
-        detect_mode: rules of change detection, `default` or `paper`.
-        merge_mode: rules of merging and publishing, `default` or `paper`.
-        merge_delay_s: a tile is merged this long after its first unmerged report ...
-        merge_after_reports: ... or as soon as this many reports wait.
-        deadline_s: a run that takes longer is ended with an error.
-        wrong_mounts: vehicles whose drives tell a wrong mount, such as "3:0.5": that of vehicle 3 is turned by 0.5
-            degrees (counter-clockwise seen from above) against the one that it was driven with.
-        layers: layers of the map that vehicles keep up to date; "ndt", on which they localise, is always among them.
-    """
+    agents: int = setting(8, "Number of vehicle agent processes.", least=1, most=MAX_AGENTS)
+    shards: int = setting(2, "Number of merger shard processes.", least=1, most=MAX_SHARDS)
+    link: str = setting("4g", "Link profile of every vehicle: 3g, 4g, 5g, none, or a TOML file.")
+    headway_s: float = setting(
+        4.0,
+        "Time of the drives between the starts of two vehicles, so that those behind drive on what those "
+        "ahead have found; 0: all start at once, and drive as fast as they can.",
+        unit="s",
+        least=0,
+        most=MAX_HEADWAY_S,
+    )
+    world_seed: int = setting(7, "Seed of the simulated world and of its drives.")
+    port: int = setting(0, "TCP port of the router on the loopback interface; 0 takes a free one.", least=0, most=65535)
+    detect_mode: str = setting("default", "Rules of change detection, `default` or `paper`.")
+    merge_mode: str = setting("default", "Rules of merging and publishing, `default` or `paper`.")
+    merge_delay_s: float = setting(
+        0.5,
+        "A tile is merged this long after its first unmerged report ...",
+        unit="s",
+        least=0,
+    )
+    merge_after_reports: int = setting(16, "... or as soon as this many reports wait.", least=1)
+    deadline_s: float = setting(1800.0, "A run that takes longer is ended with an error.", unit="s", above=0)
+    wrong_mounts: tuple[str, ...] = setting(
+        (),
+        'Vehicles whose drives tell a wrong mount, such as "3:0.5": that of vehicle 3 is turned by 0.5 '
+        "degrees (counter-clockwise seen from above) against the one that it was driven with.",
+    )
+    layers: tuple[str, ...] = setting(
+        (VOXEL_LAYER,),
+        'Layers of the map that vehicles keep up to date; "ndt", on which they localise, is always among them.',
+    )
 
-    agents: int = 8
-    shards: int = 2
-    link: str = "4g"
-    headway_s: float = 4.0
-    world_seed: int = 7
-    port: int = 0
-    detect_mode: str = "default"
-    merge_mode: str = "default"
-    merge_delay_s: float = 0.5
-    merge_after_reports: int = 16
-    deadline_s: float = 1800.0
-    wrong_mounts: tuple[str, ...] = ()
-    layers: tuple[str, ...] = (VOXEL_LAYER,)
+    agent: Mapping[str, Any] = setting({}, "Settings of every agent, as `gnd agent --config` takes them.")
+    merger: Mapping[str, Any] = setting({}, "Settings of every shard, as `gnd merger --config` takes them.")
 
     def __post_init__(self) -> None:
         """Refuse values outside their range."""
-        _require(1 <= self.agents <= MAX_AGENTS, f"agents must be 1 to {MAX_AGENTS}, got {self.agents}")
-        _require(1 <= self.shards <= MAX_SHARDS, f"shards must be 1 to {MAX_SHARDS}, got {self.shards}")
-        _require(0 <= self.port <= 65535, f"port must be 0 to 65535, got {self.port}")
+        check_settings(self, DeployError)
         for name in ("detect_mode", "merge_mode"):
             value = getattr(self, name)
             _require(value in ("default", "paper"), f"{name} must be default or paper, got {value!r}")
-        longest_s = MAX_HEADWAY_S
-        _require(0 <= self.headway_s <= longest_s, f"headway_s must be 0 to {longest_s:g} s, got {self.headway_s}")
-        _require(self.merge_delay_s >= 0, f"merge_delay_s must not be negative, got {self.merge_delay_s}")
-        _require(self.merge_after_reports >= 1, f"merge_after_reports must be >= 1, got {self.merge_after_reports}")
-        _require(self.deadline_s > 0, f"deadline_s must be positive, got {self.deadline_s}")
         _ = self.wrong_mounts_rad
         self._check_layers()
 
@@ -78,6 +77,22 @@ class FleetConfig:
         _require(not unfit, f"no vehicle of the fleet detects the layers {', '.join(unfit)}; it knows {known}")
         _require(VOXEL_LAYER in self.layers, f"layers must hold {VOXEL_LAYER!r}, on which vehicles localise")
         _require(len(set(self.layers)) == len(self.layers), f"layers {', '.join(self.layers)}: one comes twice")
+
+    def check_parts(self) -> None:
+        """Refuse settings of agents and shards that there are not, before any process starts.
+
+        Raises:
+            ConfigError: with near names.
+            GndError: a value out of its range.
+        """
+        if self.agent:
+            from gnd.vehicle_agent.settings import agent_of
+
+            agent_of(merged(self.agent, {"vehicle": "v", "drive": "d"}), where="fleet: agent")
+        if self.merger:
+            from gnd.cloud_merger.config import ShardConfig
+
+            from_settings(ShardConfig, self.merger, where="fleet: merger")
 
     @property
     def wrong_mounts_rad(self) -> dict[int, float]:
@@ -103,34 +118,34 @@ def _require(condition: bool, message: str) -> None:
         raise DeployError(message)
 
 
-def load_fleet_config(path: Path | None, overrides: dict[str, Any]) -> FleetConfig:
-    """Read the configuration: the shipped defaults, then a file, then the options that were given.
+def load_fleet_config(
+    path: Path | None,
+    overrides: dict[str, Any],
+    changes: Sequence[str] = (),
+    environment: Mapping[str, str] | None = None,
+) -> FleetConfig:
+    """Read the settings: the shipped defaults, then a file, the environment, --set, and the options that were given.
 
     Args:
         path: TOML file, or None for the shipped `deploy/fleet.toml`.
         overrides: values by field name; None means not given.
+        changes: NAME=VALUE, as of --set.
+        environment: None: of this process (GND_FLEET__AGENTS=4).
 
     Returns:
-        The checked configuration.
+        The checked settings; those of agents and shards, too.
 
     Raises:
-        DeployError: the file cannot be read or a value is out of range.
-        ConfigError: an unknown key or a value of the wrong type.
+        DeployError: a value is out of range.
+        ConfigError: the file cannot be read, an unknown setting or a value of the wrong type.
     """
-    values = _read_toml(path) if path is not None else _shipped_defaults()
-    values |= {key: value for key, value in overrides.items() if value is not None}
-    return from_mapping(FleetConfig, values, where=str(path or "deploy/fleet.toml"))
+    said = layers_of(FleetConfig, "fleet", path, changes, overrides, environment)
+    values = said if path is not None else merged(_shipped_defaults(), said)
+    config = from_settings(FleetConfig, values, where=str(path or "deploy/fleet.toml"))
+    config.check_parts()
+    return config
 
 
 def _shipped_defaults() -> dict[str, Any]:
     text = resources.files("gnd.deploy").joinpath("fleet.toml").read_text(encoding="utf-8")
     return tomllib.loads(text)
-
-
-def _read_toml(path: Path) -> dict[str, Any]:
-    try:
-        return tomllib.loads(path.read_text(encoding="utf-8"))
-    except OSError as error:
-        raise DeployError(f"cannot read the configuration {path}: {error.strerror}") from error
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
-        raise DeployError(f"{path} is no valid TOML: {error}") from error

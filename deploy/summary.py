@@ -17,6 +17,7 @@ from gnd.fleet_sim.ellipsoids import Tiles, ellipsoids_of_maps
 from gnd.fleet_sim.pictures import View, draw_healing, draw_map, draw_run
 from gnd.fleet_sim.truth import Truth, read_truth
 from gnd.gnd_map.geodesy import LocalFrame
+from gnd.gnd_map.settings import settings_sha256
 from gnd.tile_store.sqlite_store import SqliteStore
 from gnd.tile_store.status import named_vehicles, waiting_totals
 
@@ -50,6 +51,7 @@ def write_summary(
     summary["doubtful"] = doubtful_vehicles(results)
     summary["localisation_p95"] = results.localisation_p95()
     summary["traffic"] = account_traffic(folder)
+    summary["settings_sha256"] = settings_sha256(config)
     _write(folder.summary, summary)
     return summary
 

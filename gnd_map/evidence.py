@@ -20,23 +20,23 @@ import numpy.typing as npt
 
 from gnd.gnd_map.arrays import F64, check_array
 from gnd.gnd_map.errors import ConfigError
+from gnd.gnd_map.settings import check_settings, setting
 
 
 @dataclass(frozen=True, slots=True)
 class MassParameters:
     """The probabilities of the evidence model, each in [0, 1)."""
 
-    lambda_s_block: float = 0.2
-    """λs,block: a point blocked inside the Gaussian says "sustained" (Eq. 5)."""
-    lambda_c_block: float = 0.05
-    """λc,block: a blocked point says "changed" (Eq. 5, 6, 9)."""
-    lambda_c_pass: float = 0.02
-    """λc,pass: a ray through the Gaussian says "changed" (Eq. 7)."""
+    lambda_s_block: float = setting(
+        0.2, 'λs,block: a point blocked inside the Gaussian says "sustained" (Eq. 5).', least=0, below=1
+    )
+    lambda_c_block: float = setting(0.05, 'λc,block: a blocked point says "changed" (Eq. 5, 6, 9).', least=0, below=1)
+    lambda_c_pass: float = setting(
+        0.02, 'λc,pass: a ray through the Gaussian says "changed" (Eq. 7).', least=0, below=1
+    )
 
     def __post_init__(self) -> None:
-        for name in ("lambda_s_block", "lambda_c_block", "lambda_c_pass"):
-            if not 0.0 <= getattr(self, name) < 1.0:
-                raise ConfigError(f"{name} = {getattr(self, name)} is not in [0, 1)")
+        check_settings(self, ConfigError)
         if self.lambda_s_block + self.lambda_c_block > 1.0:
             raise ConfigError(
                 f"lambda_s_block + lambda_c_block = {self.lambda_s_block + self.lambda_c_block} exceeds 1: "

@@ -19,7 +19,7 @@ from gnd.gnd_map import sight
 from gnd.gnd_map.arrays import F64, I32, I64
 from gnd.gnd_map.classes import ChangeClass
 from gnd.gnd_map.codec import Flags
-from gnd.gnd_map.errors import ConfigError, TrackError
+from gnd.gnd_map.errors import TrackError
 from gnd.gnd_map.grid import VoxelGrid, zones
 from gnd.gnd_map.sight import FACES, MOST_RAYS, NO_SLOT, NOTHING, STOP, Columns, Window
 from gnd.gnd_map.tile_id import LON_TILES, TileId, deinterleave
@@ -38,66 +38,45 @@ _SLOPES: Final = 512
 _ROUND: Final = 2.0**24  # what trigonometry gives is rounded, so that no machine's last bit decides
 
 
-@dataclass(frozen=True, slots=True)
-class VisibilityParameters:
-    """How lines of sight become observed voxels.
-
-    Attributes:
-        step_m: places along the track are this far apart.
-        azimuths: fans of lines of sight a whole turn at each place.
-        lines: of a fan, their elevations shared out as the sensor's rays are; a power of two.
-        range_m: what lies farther is not observed; lines still end there.
-        reach_m: how far lines are followed.
-        noise_m: thickens the Gaussians that stop lines: of ranges and poses.
-        r2: squared Mahalanobis distance up to which a Gaussian stops a line.
-        new_radius_m: of the ball that stands for a new voxel, whose Gaussian is not at hand.
-        min_hits: rays that must end in a voxel in which the map has a Gaussian.
-        min_passes: rays that must cross a voxel in which it has none.
-        hits_near: so many times more for each face behind which the drive flags a Gaussian as gone or modified: where
-            something goes on to change, drives often cannot tell, and abstain.
-        passes_near: so many times more for each face behind which it flags something new, for the same reason.
-        open_rad: a line that leaves the known map met something there if its elevation is at most this, up or down: far
-            down a street. A higher one went into the sky, and nothing came back; a steeper one slipped through a gap
-            between Gaussians of the ground.
-    """
-
-    step_m: float = 8.0
-    azimuths: int = 64
-    lines: int = 8
-    range_m: float = 50.0
-    reach_m: float = 70.0
-    noise_m: float = 0.05
-    r2: float = 3.0
-    new_radius_m: float = 0.5
-    min_hits: float = 48.0
-    min_passes: float = 256.0
-    hits_near: float = 6.0
-    passes_near: float = 8.0
-    open_rad: float = 0.04
-
-    def __post_init__(self) -> None:
-        for name, low, high in (
-            ("step_m", 0.25, 20.0), ("azimuths", SECTORS, 3600), ("lines", 1, _SLOPES), ("range_m", 5.0, 100.0),
-            ("reach_m", self.range_m, 150.0), ("noise_m", 0.005, 0.5), ("r2", 0.1, 100.0), ("new_radius_m", 0.0, 0.5),
-            ("min_hits", 0.0, 1e6), ("min_passes", 0.0, 1e6), ("hits_near", 1.0, 1e3),
-            ("passes_near", 1.0, 1e3), ("open_rad", 0.0, 1.6),
-        ):  # fmt: skip
-            if not low <= getattr(self, name) <= high:
-                raise ConfigError(f"visibility: {name} must lie in {low:g} … {high:g}, got {getattr(self, name):g}")
-        if _SLOPES % self.lines:
-            raise ConfigError(f"visibility: lines must be a power of two, got {self.lines}")
+# How lines of sight become observed voxels: vehicle and cloud have to agree, so nobody can set them.
+_STEP_M: Final = 8.0
+"""Places along the track are this far apart."""
+_AZIMUTHS: Final = 64
+"""Fans of lines of sight a whole turn at each place."""
+_LINES: Final = 8
+"""Of a fan, their elevations shared out as the sensor's rays are; a power of two."""
+_RANGE_M: Final = 50.0
+"""What lies farther is not observed; lines still end there."""
+_REACH_M: Final = 70.0
+"""How far lines are followed."""
+_NOISE_M: Final = 0.05
+"""Thickens the Gaussians that stop lines: of ranges and poses."""
+_R2: Final = 3.0
+"""Squared Mahalanobis distance up to which a Gaussian stops a line."""
+_NEW_RADIUS_M: Final = 0.5
+"""Of the ball that stands for a new voxel, whose Gaussian is not at hand."""
+_MIN_HITS: Final = 48.0
+"""Rays that must end in a voxel in which the map has a Gaussian."""
+_MIN_PASSES: Final = 256.0
+"""Rays that must cross a voxel in which it has none."""
+_HITS_NEAR: Final = 6.0
+"""So many times more for each face behind which the drive flags a Gaussian as gone or modified: where something goes
+on to change, drives often cannot tell, and abstain."""
+_PASSES_NEAR: Final = 8.0
+"""So many times more for each face behind which it flags something new, for the same reason."""
+_OPEN_RAD: Final = 0.04
+"""A line that leaves the known map met something there if its elevation is at most this, up or down: far down a
+street. A higher one went into the sky, and nothing came back; a steeper one slipped through a gap between Gaussians
+of the ground."""
 
 
-def observed_along(
-    track: Track, told: Sequence[Flags], parameters: VisibilityParameters | None = None
-) -> dict[TileId, I32]:
+def observed_along(track: Track, told: Sequence[Flags]) -> dict[TileId, I32]:
     """Predict what a drive has observed.
 
     Args:
         track: of the drive.
         told: of each tile of the report what the vehicle compared with (no Gaussians where it had no map), and the
             voxels that it flags.
-        parameters: see `VisibilityParameters`.
 
     Returns:
         Sorted voxel ids (K,) of each tile; those flagged are always among them.
@@ -105,11 +84,10 @@ def observed_along(
     Raises:
         TrackError: the way climbs so far that looking along it would take too much memory.
     """
-    p = parameters or VisibilityParameters()
     by_tile = {flags.tile_id: flags for flags in told}
     found = {tile_id: flags.voxel_id for tile_id, flags in by_tile.items()}
     for group in zones(by_tile).values():
-        found |= _Zone([by_tile[tile_id] for tile_id in group], track, p).observed()
+        found |= _Zone([by_tile[tile_id] for tile_id in group], track).observed()
     return found
 
 
@@ -136,19 +114,19 @@ class _Places:
 class _Zone:
     """The tiles of one report that share their (nx, ny); tiles are counted from the first one on."""
 
-    def __init__(self, told: Sequence[Flags], track: Track, parameters: VisibilityParameters) -> None:
-        self._p, self._track, self._told = parameters, track, told
+    def __init__(self, told: Sequence[Flags], track: Track) -> None:
+        self._track, self._told = track, told
         self._first, self._grid = told[0].tile_id, VoxelGrid.of(told[0].tile_id)
         self._metres = np.array([self._grid.dx_m, self._grid.dy_m, self._grid.dz_m])
         self._tile_m = self._metres[:2] * (self._grid.nx, self._grid.ny)
-        self._azimuth, self._slope = _azimuths(track.view, parameters), _slopes(track.view)
+        self._azimuth, self._slope = _azimuths(track.view), _slopes(track.view)
 
     def observed(self) -> dict[TileId, I32]:
         """Of each tile that a line can reach the voxels seen and those flagged, sorted."""
         corner = self._tiles()
         places = self._make_places()
         apart_m = _apart_m(places.uv * self._tile_m, corner * self._tile_m, self._tile_m)
-        within = apart_m <= self._p.reach_m
+        within = apart_m <= _REACH_M
         reached = np.flatnonzero(within.any(axis=1))
         if len(reached) == 0:
             return {}
@@ -167,14 +145,14 @@ class _Zone:
     def _make_places(self) -> _Places:
         lines = [self._line(number) for number in range(len(self._track.pieces))]
         total_m = sum(float(_legs_m(line, self._tile_m)[1].sum()) for line in lines)
-        step_m = max(self._p.step_m, total_m / _MOST_PLACES)
+        step_m = max(_STEP_M, total_m / _MOST_PLACES)
         parts = [_along(line, self._tile_m, step_m) for line in lines]
         uvh = np.concatenate([np.zeros((0, 3)), *(at for at, _ in parts)])
         ahead = np.concatenate([np.zeros((0, 2)), *(way for _, way in parts)])
         scans = [piece.scans / len(at) for piece, (at, _) in zip(self._track.pieces, parts, strict=True)]
-        rays = np.array(scans) * self._track.view.rays * _PARTS / (len(self._azimuth) * self._p.lines)
+        rays = np.array(scans) * self._track.view.rays * _PARTS / (len(self._azimuth) * _LINES)
         each = np.clip(np.round(rays), 1, MOST_RAYS).astype(np.int64)
-        angle = np.arange(len(uvh)) * _GOLDEN % 1.0 * (2.0 * np.pi / self._p.azimuths)
+        angle = np.arange(len(uvh)) * _GOLDEN % 1.0 * (2.0 * np.pi / _AZIMUTHS)
         cos, sin = np.cos(angle), np.sin(angle)
         turn = np.stack([ahead[:, 0] * cos - ahead[:, 1] * sin, ahead[:, 1] * cos + ahead[:, 0] * sin], axis=1)
         return _Places(uvh[:, :2], uvh[:, 2], _rounded(turn), np.repeat(each, [len(at) for at, _ in parts]))
@@ -203,7 +181,7 @@ class _Zone:
         slot_of = np.full(np.maximum(corner.max(axis=0), at.max(axis=0)) - origin + 1, NO_SLOT, np.int32)
         slot_of[tuple((corner - origin).T)] = np.arange(len(told))
         steep = float(np.abs(self._slope).max())
-        rise_m = self._p.reach_m * steep / np.sqrt(1.0 + steep**2)
+        rise_m = _REACH_M * steep / np.sqrt(1.0 + steep**2)
         lowest, highest = self._known_floors(told, places.height_m)
         bottom = np.where(shown, places.height_m, np.inf).min(axis=1) - rise_m
         top = np.where(shown, places.height_m, -np.inf).max(axis=1) + rise_m
@@ -231,7 +209,6 @@ class _Zone:
 
     def _look(self, w: Window, told: Sequence[Flags], places: _Places, g: F64) -> U64:
         """(T * nx * ny, words) a bit for each voxel seen or flagged."""
-        p = self._p
         state, near = np.full(w.offset[-1], NOTHING, np.int32), np.zeros(w.offset[-1], np.uint8)
         words = (int((w.low + w.floors).max()) - w.lowest) // 64 + 1
         filled, seen, more = (np.zeros((len(told) * w.columns[0] * w.columns[1], words), np.uint64) for _ in range(3))
@@ -242,18 +219,18 @@ class _Zone:
         hits, pooled = np.zeros(len(slot), np.int64), np.zeros(len(slot), np.int64)
         mean_m = np.concatenate([flags.base.mean_m for flags in told])
         cov_m2 = np.concatenate([flags.base.cov_m2 for flags in told])
-        ball_m2 = max(p.new_radius_m, 0.01) ** 2 / p.r2
-        sight.lay_out(w, slot, voxel_id, mean_m, cov_m2, ball_m2, p.noise_m**2, state, filled, stop)
+        ball_m2 = max(_NEW_RADIUS_M, 0.01) ** 2 / _R2
+        sight.lay_out(w, slot, voxel_id, mean_m, cov_m2, ball_m2, _NOISE_M**2, state, filled, stop)
         flagged, classes = [flags.voxel_id for flags in told], [flags.change_class for flags in told]
         where = _slots(flagged, len(told)), np.concatenate(flagged), np.concatenate(classes)
         sight.mark(w, *where, state, filled, near, seen)
         sight.cast_fans(
-            w, np.column_stack([g, places.height_m]), places.turn, places.rays, self._azimuth, self._slope, p.lines,
-            stop, filled, p.r2, p.range_m, p.reach_m, float(_rounded(np.tan(p.open_rad))), state, hits,
+            w, np.column_stack([g, places.height_m]), places.turn, places.rays, self._azimuth, self._slope, _LINES,
+            stop, filled, _R2, _RANGE_M, _REACH_M, float(_rounded(np.tan(_OPEN_RAD))), state, hits,
             Columns.room(), np.empty(2),
         )  # fmt: skip
         sight.pool(w, filled, state, hits, pooled)
-        least_hits, least_passes = _least(p.min_hits, p.hits_near), _least(p.min_passes, p.passes_near)
+        least_hits, least_passes = _least(_MIN_HITS, _HITS_NEAR), _least(_MIN_PASSES, _PASSES_NEAR)
         sight.read_out(w, state, pooled, near, least_hits, least_passes, seen)
         sight.fill(w, filled, near, seen, more)
         return np.asarray(seen | more)
@@ -289,9 +266,9 @@ def _along(line: F64, tile_m: F64, step_m: float) -> tuple[F64, F64]:
     return places, np.where(size[:, None] > 0.0, flat / np.maximum(size, 1e-9)[:, None], [1.0, 0.0])
 
 
-def _azimuths(view: View, p: VisibilityParameters) -> F64:
+def _azimuths(view: View) -> F64:
     """(A, 2) unit vectors, x ahead: those that the sensor looks along."""
-    azimuth = (np.arange(p.azimuths) + 0.5) * (2.0 * np.pi / p.azimuths)
+    azimuth = (np.arange(_AZIMUTHS) + 0.5) * (2.0 * np.pi / _AZIMUTHS)
     sector = (azimuth * (SECTORS / (2.0 * np.pi))).astype(np.int64)
     azimuth = azimuth[(view.sectors >> sector) & 1 == 1]
     return _rounded(np.stack([np.cos(azimuth), np.sin(azimuth)], axis=1))

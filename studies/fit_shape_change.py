@@ -26,9 +26,10 @@ from gnd.gnd_map.arrays import F64
 from gnd.gnd_map.classes import ChangeClass
 from gnd.gnd_map.grid import GridFrame
 from gnd.gnd_map.tile import Tile
+from gnd.vehicle_agent.detect.classify import DETECT_RESHAPED_LOG_ODDS
 from gnd.vehicle_agent.detect.detector import ChangeDetector
 from gnd.vehicle_agent.detect.evidence import TileEvidence
-from gnd.vehicle_agent.detect.parameters import DetectParameters
+from gnd.vehicle_agent.detect.parameters import MIN_CELLS
 from gnd.vehicle_agent.detect.shape_change import MONOTONE, Forest, shape_features
 from gnd.vehicle_agent.local_map import LocalMap
 from studies.simulation.fleet import fleet_configs
@@ -78,7 +79,7 @@ def examples_of_tile(truth: Truth, e: TileEvidence) -> Examples:
     at = voxel_rows(truth, e.base.tile_id, e.voxel_id)
     true_class = np.where(at >= 0, truth.change_class[at], ChangeClass.EMPTY)
     both = np.isin(true_class, (ChangeClass.NORMAL, ChangeClass.MODIFIED)) & e.in_map
-    rows = np.flatnonzero(both & (e.measured.cells >= DetectParameters().min_cells))
+    rows = np.flatnonzero(both & (e.measured.cells >= MIN_CELLS))
     was = e.base.gaussians.take(e.map_row[rows])
     features = shape_features(was, e.measured.take(rows), e.n_bi[rows], e.n_bo[rows], e.n_pi[rows])
     return Examples(features, true_class[rows] == ChangeClass.MODIFIED, truth.mask("scored")[at[rows]])
@@ -128,7 +129,7 @@ def f1(said: NDArray[np.bool_], true: NDArray[np.bool_]) -> float:
 
 def judged(train: Examples, test: Examples) -> dict[str, float]:
     """Return the F1 of "modified" among scored voxels by each rule, fitted on other worlds than it is judged on."""
-    limit = DetectParameters().reshaped_log_odds
+    limit = DETECT_RESHAPED_LOG_ODDS
     odds = {
         "similarity below 0.5": 0.5 - test.features[:, 2] + limit,
         "similarity alone": _linear(train, test, [2]) + limit,

@@ -17,7 +17,7 @@ from gnd.cloud_merger.memory import TileMemory
 from gnd.cloud_merger.merge import plain_clusters
 from gnd.cloud_merger.merge_kernels import clusters_of
 from gnd.cloud_merger.parameters import MergeParameters
-from gnd.cloud_merger.shift import ShiftParameters, shift_of
+from gnd.cloud_merger.shift import shift_of
 from gnd.cloud_merger.statements import Report, statements_of
 from gnd.cloud_merger.window import TileState, WindowMerger
 from gnd.gnd_map.classes import ChangeClass
@@ -49,7 +49,7 @@ def merge_figure(base: Gaussians, reports: int, changed: int) -> Figure:
     """Return the processor time of a merge, with that of its clusters in the kernel and in numpy."""
     said, rules = reports_of(base, reports, changed), MergeParameters()
     sha = content_sha(TILE, base)
-    tests = ShiftTests(ShiftParameters())
+    tests = ShiftTests()
     merger = WindowMerger(rules, ConfirmationParameters(), tests, {sha: base}, frozenset())
     state = TileState(base, TileMemory())
     rows = statements_of(base, said, {sha: base}).rows

@@ -42,6 +42,16 @@ class BuildError(StoreError):
     """Drives that cannot become a map: no poses, impossible poses, nothing measured."""
 
 
+_MAX_SPEED_MPS: Final = 60.0
+"""A faster track jumps."""
+_MAX_TURN_RADPS: Final = 3.0
+"""A track that turns faster jumps."""
+_MAX_GAP_S: Final = 1.0
+"""Longer gaps between poses are refused, unless the vehicle stands."""
+_STANDING_M: Final = 0.5
+"""A vehicle that moved less in a gap stands."""
+
+
 @dataclass(frozen=True, slots=True)
 class BuildParameters:
     """Which points are used, and what a track of poses may do."""
@@ -50,23 +60,14 @@ class BuildParameters:
     """Nearer points are the vehicle itself."""
     max_range_m: float = 80.0
     """Farther points are blurred by the heading's error: 0.1 degrees are 14 cm at 80 m."""
-    max_speed_mps: float = 60.0
-    """A faster track jumps."""
-    max_turn_radps: float = 3.0
-    """A track that turns faster jumps."""
-    max_gap_s: float = 1.0
-    """Longer gaps between poses are refused, unless the vehicle stands."""
-    standing_m: float = 0.5
-    """A vehicle that moved less in a gap stands."""
     max_gnss_offset_m: float = 30.0
     """Median horizontal distance of poses from GNSS fixes (or five sigma, if larger); beyond, the anchor is wrong."""
 
     def __post_init__(self) -> None:
         if not 0 <= self.min_range_m < self.max_range_m:
             raise BuildError(f"range from {self.min_range_m} m to {self.max_range_m} m is empty")
-        positive = (self.max_speed_mps, self.max_turn_radps, self.max_gap_s, self.max_gnss_offset_m)
-        if not all(limit > 0 for limit in positive):
-            raise BuildError(f"limits of poses must be positive, got {positive}")
+        if not self.max_gnss_offset_m > 0:
+            raise BuildError(f"max_gnss_offset_m must be positive, got {self.max_gnss_offset_m}")
 
 
 @dataclass(frozen=True, slots=True)
@@ -206,7 +207,7 @@ def drive_sources(drives: Sequence[Path], parameters: BuildParameters) -> list[S
 
 def _source(path: Path, anchor: LocalFrame, parameters: BuildParameters) -> Source:
     header, track = read_header(path), load_track(path)
-    check_poses(path, track.reference, parameters)
+    check_poses(path, track.reference)
     _check_gnss(path, header.anchor, track.reference, track.gnss, parameters)
     T_map_vehicle = anchor.T_self_other(header.anchor) @ track.reference.T_map_vehicle
     poses = Trajectory(track.reference.t_ns, T_map_vehicle)
@@ -214,7 +215,7 @@ def _source(path: Path, anchor: LocalFrame, parameters: BuildParameters) -> Sour
     return Source(path, header, poses, drive_counts(path).scans, track.gnss, T_map_drive)
 
 
-def check_poses(path: Path, reference: ReferenceTrack, parameters: BuildParameters) -> None:
+def check_poses(path: Path, reference: ReferenceTrack) -> None:
     """Refuse a track that no vehicle can drive.
 
     Raises:
@@ -227,9 +228,9 @@ def check_poses(path: Path, reference: ReferenceTrack, parameters: BuildParamete
     _refuse(path, "is not later than the one before", step_s <= 0, step_s, "s")
     step_m = np.linalg.norm(np.diff(T[:, :3, 3], axis=0), axis=1)
     turn_rad = np.linalg.norm(log_so3(np.swapaxes(T[:-1, :3, :3], 1, 2) @ T[1:, :3, :3]), axis=1)
-    _refuse(path, "jumps", step_m > parameters.max_speed_mps * step_s, step_m / step_s, "m/s")
-    _refuse(path, "jumps in heading", turn_rad > parameters.max_turn_radps * step_s, turn_rad / step_s, "rad/s")
-    gap = (step_s > parameters.max_gap_s) & (step_m > parameters.standing_m)
+    _refuse(path, "jumps", step_m > _MAX_SPEED_MPS * step_s, step_m / step_s, "m/s")
+    _refuse(path, "jumps in heading", turn_rad > _MAX_TURN_RADPS * step_s, turn_rad / step_s, "rad/s")
+    gap = (step_s > _MAX_GAP_S) & (step_m > _STANDING_M)
     _refuse(path, "comes after a gap", gap, step_s, "s")
 
 

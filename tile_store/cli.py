@@ -5,7 +5,7 @@ import signal
 import threading
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
-from dataclasses import asdict
+from dataclasses import asdict, dataclass
 from hashlib import sha256
 from pathlib import Path
 from types import FrameType
@@ -18,6 +18,9 @@ from gnd.fleet_bus.config import DEFAULT_ENDPOINT, BusConfig
 from gnd.fleet_bus.health import HealthServer
 from gnd.fleet_bus.health_options import metrics_options
 from gnd.fleet_bus.router import wait_for_stop
+from gnd.fleet_bus.settings_file import load_settings
+from gnd.fleet_bus.settings_options import settings_options
+from gnd.gnd_map.settings import check_settings, setting, settings_text
 from gnd.tile_store import tables, upkeep_cli
 from gnd.tile_store.arguments import parse_tile, parse_time_ns, parse_versions
 from gnd.tile_store.compare import MapDiff, layer_info, layer_totals, map_diff, version_diff
@@ -33,13 +36,40 @@ from gnd.tile_store.store import Store
 __all__ = ["PATH", "json_option", "layer_option", "map_group", "region_option", "show", "store", "store_to_fill"]
 
 
+@dataclass(frozen=True, slots=True)
+class TileServerConfig:
+    """The tile server."""
+
+    path: Path = setting(..., "The store; `gnd map build` makes one.")
+    connect: tuple[str, ...] = setting((DEFAULT_ENDPOINT,), "Endpoints of routers, tried in order.")
+    workers: int = setting(4, "Threads that answer.", least=1, most=64)
+
+    def __post_init__(self) -> None:
+        check_settings(self, StoreError)
+
+
 @click.command()
-@click.option("--path", required=True, type=PATH, help="The store; `gnd map build` makes one.")
-@click.option("--connect", multiple=True, default=(DEFAULT_ENDPOINT,), show_default=True, help="Endpoint of a router.")
-@click.option("--workers", default=4, show_default=True, type=click.IntRange(1, 64), help="Threads that answer.")
+@click.option("--path", type=PATH, help="The store; `gnd map build` makes one.")
+@click.option("--connect", multiple=True, help=f"Endpoint of a router; repeatable.  [default: {DEFAULT_ENDPOINT}]")
+@click.option("--workers", type=int, help="Threads that answer, 1 to 64.  [default: 4]")
+@settings_options
 @metrics_options
-def store(path: Path, connect: tuple[str, ...], workers: int, metrics_port: int | None, metrics_host: str) -> None:
+def store(
+    path: Path | None,
+    connect: tuple[str, ...],
+    workers: int | None,
+    config_file: Path | None,
+    changes: tuple[str, ...],
+    dump_config: bool,
+    metrics_port: int | None,
+    metrics_host: str,
+) -> None:
     """Run the tile server until Ctrl-C: it answers the vehicles' tile and catalog queries."""
+    options = {"path": None if path is None else str(path), "connect": list(connect) or None, "workers": workers}
+    server = load_settings(TileServerConfig, "store", config_file, changes, options)
+    if dump_config:
+        click.echo(settings_text(server), nl=False)
+        return
     stop = threading.Event()
 
     def end(_signal: int, _frame: FrameType | None) -> None:
@@ -47,11 +77,11 @@ def store(path: Path, connect: tuple[str, ...], workers: int, metrics_port: int 
 
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, end)
-    config = BusConfig(connect=connect, patient=True)
+    config = BusConfig(connect=server.connect, patient=True)
     with (
-        existing(path) as opened,
+        existing(server.path) as opened,
         open_bus(config, name="store") as bus,
-        TileServer(opened, bus, workers=workers),
+        TileServer(opened, bus, workers=server.workers),
         ExitStack() as stack,
     ):
         if metrics_port is not None:
@@ -59,7 +89,7 @@ def store(path: Path, connect: tuple[str, ...], workers: int, metrics_port: int 
             registry.register(StoreCollector(opened))
             stack.enter_context(HealthServer(metrics_port, registry, store_checks(opened, bus), host=metrics_host))
         counts = opened.counts()
-        click.echo(f"tile server: {counts.tiles} tiles of {path} at {', '.join(connect)}; Ctrl-C ends it")
+        click.echo(f"tile server: {counts.tiles} tiles of {server.path} at {', '.join(server.connect)}; Ctrl-C ends it")
         wait_for_stop(stop)
     click.echo("tile server ended")
 

@@ -9,6 +9,7 @@ from gnd.gnd_map.codec import LATTICES, Lattice
 from gnd.gnd_map.content import AnyTile, encode_content, fits_layer, noun_of
 from gnd.gnd_map.day import UNKNOWN_DAY, day_of
 from gnd.gnd_map.features import FeatureTile
+from gnd.gnd_map.settings import check_settings, setting
 from gnd.gnd_map.tile import Tile
 from gnd.gnd_map.tile_id import TileId
 from gnd.schemas.limits import MAX_TILE_BODY_BYTES
@@ -84,37 +85,43 @@ class Content:
 class StoreConfig:
     """How a store batches and waits; each process may use its own."""
 
-    merge_delay_s: float = 1.0
-    """A tile becomes ready to merge this long after its first waiting report,"""
-    merge_after_reports: int = 8
-    """or at once when so many reports wait."""
-    window_s: float = 1800.0
-    """A tile's window closes when a report comes so long after its first (by receipt): a vehicle that comes back after
-    that has come on another drive; in feature layers where the time of day passes a multiple of it, so that neighbours,
-    who hear the same of what lies at their border, cut alike,"""
-    window_vehicles: int = 32
-    """or one of another vehicle when so many have a vote in it,"""
-    window_reports: int = 96
-    """or any when it holds so many: what one merge has to read stays bounded."""
-    busy_timeout_s: float = 30.0
-    """A writer waits this long for the writers of other processes."""
-    group_max: int = 256
-    """At most so many calls share one commit."""
-    quarantine_mb: float = 64.0
-    """Of the newest refused messages so much is kept: nobody can fill the disk with nonsense."""
+    merge_delay_s: float = setting(
+        1.0,
+        "A tile becomes ready to merge this long after its first waiting report ...",
+        unit="s",
+        least=0,
+    )
+    merge_after_reports: int = setting(8, "... or at once when so many reports wait.", least=1)
+    window_s: float = setting(
+        1800.0,
+        "A tile's window closes when a report comes so long after its first (by receipt): a vehicle that "
+        "comes back after that has come on another drive; in feature layers where the time of day passes a "
+        "multiple of it, so that neighbours, who hear the same of what lies at their border, cut alike ...",
+        unit="s",
+        above=0,
+    )
+    window_vehicles: int = setting(32, "... or one of another vehicle when so many have a vote in it ...", least=1)
+    window_reports: int = setting(
+        96,
+        "... or any when it holds so many: what one merge has to read stays bounded.",
+        least=1,
+    )
+    busy_timeout_s: float = setting(
+        30.0,
+        "A writer waits this long for the writers of other processes.",
+        unit="s",
+        above=0,
+    )
+    group_max: int = setting(256, "At most so many calls share one commit.", least=1)
+    quarantine_mb: float = setting(
+        64.0,
+        "Of the newest refused messages so much is kept: nobody can fill the disk with nonsense.",
+        unit="MB",
+        above=0,
+    )
 
     def __post_init__(self) -> None:
-        if self.merge_delay_s < 0 or self.busy_timeout_s <= 0:
-            raise StoreError(
-                f"merge_delay_s {self.merge_delay_s} and busy_timeout_s {self.busy_timeout_s} must be >= 0"
-            )
-        if self.quarantine_mb <= 0:
-            raise StoreError(f"quarantine_mb {self.quarantine_mb} must be positive")
-        if self.window_s <= 0:
-            raise StoreError(f"window_s must be positive, got {self.window_s}")
-        for name in ("merge_after_reports", "group_max", "window_vehicles", "window_reports"):
-            if getattr(self, name) < 1:
-                raise StoreError(f"{name} must be at least 1, got {getattr(self, name)}")
+        check_settings(self, StoreError)
 
     @property
     def quarantine_bytes(self) -> int:

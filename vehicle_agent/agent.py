@@ -3,6 +3,7 @@
 import threading
 from typing import Any
 
+from gnd.fleet_bus.settings_file import write_settings
 from gnd.vehicle_agent.config import AgentConfig
 from gnd.vehicle_agent.memory import keep_small
 from gnd.vehicle_agent.result import write_json
@@ -32,6 +33,7 @@ def run_agent(config: AgentConfig, stop: threading.Event) -> dict[str, Any]:
         vehicle.upload()  # outbox -> acknowledged
         result = vehicle.result()
     result["traffic"] = vehicle.link.traffic()  # the link is closed: nothing comes after it
+    result["settings_sha256"] = write_settings(config, config.work_dir)
     write_json(config.work_dir / "result.json", result)
     if vehicle.damage is not None:
         raise vehicle.damage

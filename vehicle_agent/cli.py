@@ -4,60 +4,63 @@ import logging
 import signal
 import threading
 from pathlib import Path
-from typing import Literal
+from typing import Any
 
 import click
 
 from gnd.fleet_bus.config import DEFAULT_ENDPOINT
+from gnd.fleet_bus.settings_options import settings_options
+from gnd.gnd_map.settings import settings_text
 
 
 @click.command()
-@click.option("--drive", required=True, type=click.Path(path_type=Path), help="Recording (MCAP) to drive.")
-@click.option("--vehicle", default="vehicle", show_default=True, help="Pseudonym of the vehicle.")
-@click.option("--connect", multiple=True, default=(DEFAULT_ENDPOINT,), show_default=True, help="Router; repeatable.")
-@click.option("--link", default="none", show_default=True, help="Mobile link to feel: 3g, 4g, 5g, none or a TOML file.")
-@click.option("--work-dir", type=click.Path(path_type=Path), help="Cache, outbox and result. [default: runs/VEHICLE]")
-@click.option("--pace", default=0.0, show_default=True, help="1 = real time, 0 = as fast as possible.")
-@click.option("--mode", type=click.Choice(["default", "paper"]), default="default", help="Rules of change detection.")
-@click.option(
-    "--layers", default="ndt", show_default=True, help="Layers to keep up to date: ndt,signs,streetlights,poles."
-)
+@click.option("--drive", type=click.Path(path_type=Path), help="Recording (MCAP) to drive.")
+@click.option("--vehicle", help="Pseudonym of the vehicle.  [default: vehicle]")
+@click.option("--connect", multiple=True, help=f"Router; repeatable.  [default: {DEFAULT_ENDPOINT}]")
+@click.option("--link", help="Mobile link to feel: 3g, 4g, 5g, none or a TOML file.  [default: none]")
+@click.option("--work-dir", type=click.Path(path_type=Path), help="Cache, outbox and result.  [default: runs/VEHICLE]")
+@click.option("--pace", type=float, help="1 = real time, 0 = as fast as possible.  [default: 0]")
+@click.option("--mode", type=click.Choice(["default", "paper"]), help="Rules of change detection.")
+@click.option("--layers", help="Layers to keep up to date: ndt,signs,streetlights,poles.  [default: ndt]")
 @click.option(
     "--localise-by",
     type=click.Choice(["lidar", "slamcu", "graph"]),
-    default="lidar",
     help="Scans on the voxel map; or, without LiDAR, a particle filter by features, or a graph of stretches.",
 )
+@settings_options
 @click.option("--verbose", "-v", is_flag=True, help="Log every report and retry.")
 def agent(
-    drive: Path,
-    vehicle: str,
-    connect: tuple[str, ...],
-    link: str,
+    drive: Path | None,
     work_dir: Path | None,
-    pace: float,
-    mode: str,
-    layers: str,
-    localise_by: Literal["lidar", "slamcu", "graph"],
+    connect: tuple[str, ...],
+    mode: str | None,
+    layers: str | None,
+    config_file: Path | None,
+    changes: tuple[str, ...],
+    dump_config: bool,
     verbose: bool,
+    **plain: Any,
 ) -> None:
-    """Drive a recording: download tiles, localise, detect changes, upload them until acknowledged."""
-    from gnd.vehicle_agent.agent import AgentConfig, run_agent
-    from gnd.vehicle_agent.detect.parameters import DetectParameters
-    from gnd.vehicle_agent.features.layer_parameters import FeatureParameters
+    """Drive a recording: download tiles, localise, detect changes, upload them until acknowledged.
+
+    All settings: docs/configuration.md. They come from --config FILE, the environment (GND_AGENT__PACE=1) and --set
+    (report.longest_s=30), in this order; options go before all.
+    """
+    from gnd.vehicle_agent.agent import run_agent
+    from gnd.vehicle_agent.settings import load_agent
 
     logging.basicConfig(level=logging.INFO if verbose else logging.ERROR, format="%(asctime)s %(name)s %(message)s")
-    config = AgentConfig(
-        vehicle=vehicle,
-        drive=drive,
-        work_dir=work_dir or Path("runs") / vehicle,
-        connect=connect,
-        link=link,
-        pace=pace,
-        detect=DetectParameters.paper() if mode == "paper" else DetectParameters(),
-        features=FeatureParameters.of(*feature_layers(layers)),
-        localise_by=localise_by,
-    )
+    options = plain | {
+        "drive": None if drive is None else str(drive),
+        "work_dir": None if work_dir is None else str(work_dir),
+        "connect": list(connect) or None,
+        "detect": {"mode": mode},
+        "features": {"layers": None if layers is None else feature_layers(layers)},
+    }
+    config = load_agent(config_file, changes, options)
+    if dump_config:
+        click.echo(settings_text(config), nl=False)
+        return
     stop = threading.Event()
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, lambda *_: stop.set())

@@ -2,13 +2,13 @@
 
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Literal, get_args
+from typing import Final, Literal, get_args
 
 from gnd.fleet_bus.config import DEFAULT_ENDPOINT
 from gnd.fleet_bus.links import LinkProfile
 from gnd.gnd_map.features import is_feature_layer
+from gnd.gnd_map.settings import check_settings, setting
 from gnd.vehicle_agent.detect.parameters import DetectParameters
-from gnd.vehicle_agent.detect.shift import ShiftParameters
 from gnd.vehicle_agent.errors import AgentConfigError
 from gnd.vehicle_agent.features.layer_parameters import FeatureParameters
 from gnd.vehicle_agent.localise.parameters import LocaliserParameters
@@ -19,92 +19,122 @@ LocaliseBy = Literal["lidar", "slamcu", "graph"]
 """By scans on the voxel map; or, without LiDAR, by a particle filter of motion, GNSS and the features of one layer
 (SLAMCU), or by one graph of motion, GNSS, features and lanes for each stretch (the new-feature-layer paper)."""
 
+LEAD_S: Final = 6.0
+"""A question is sent when something is needed within this time; with it goes all that is ahead."""
+
 
 @dataclass(frozen=True, slots=True)
 class DownloadParameters:
     """Which tiles are asked for, and how patiently."""
 
-    near_m: float = 60.0
-    """Tiles this near are held in memory, and needed now: beyond the range of detection."""
-    ahead_m: float = 120.0
-    """How far along the heading tiles are asked for in advance, at least."""
-    ahead_s: float = 15.0
-    """The same in time: a faster vehicle looks farther."""
-    lead_s: float = 6.0
-    """A question is sent when something is needed within this time; with it goes all that is ahead."""
-    batch_s: float = 0.25
-    """One answer holds what the link carries in this time (4 to 128 kB): something more urgent waits no longer."""
-    link_share: float = 0.8
-    """Part of the link's rate that the plan counts on."""
-    in_flight: int = 8
-    """Requests at a time; one at a time leaves a 5G link at 15 %."""
-    request_s: float = 20.0
-    """One request, its retries included."""
-    retry_s: float = 1.0
-    """Pause after a request that failed."""
-    wait_s: float = 30.0
-    """A drive that is not paced waits this long for a tile that is near; then it goes on without."""
-    forget_m: float = 90.0
-    """Tiles farther away leave the memory (not the cache) once their evidence is reported."""
+    near_m: float = setting(
+        60.0,
+        "Tiles this near are held in memory, and needed now: beyond the range of detection.",
+        unit="m",
+        above=0,
+    )
+    ahead_m: float = setting(
+        120.0, "How far along the heading tiles are asked for in advance, at least.", unit="m", least=0
+    )
+    ahead_s: float = setting(15.0, "The same in time: a faster vehicle looks farther.", unit="s", least=LEAD_S)
+    link_share: float = setting(0.8, "Part of the link's rate that the plan counts on.", above=0, most=1)
+    in_flight: int = setting(8, "Requests at a time; one at a time leaves a 5G link at 15 %.", least=1, most=64)
+    request_s: float = setting(20.0, "Time for one request, its retries included.", unit="s", above=0)
+    retry_s: float = setting(1.0, "Pause after a request that failed.", unit="s", least=0)
+    wait_s: float = setting(
+        30.0,
+        "A drive that is not paced waits this long for a tile that is near; then it goes on without.",
+        unit="s",
+        least=0,
+    )
+    forget_m: float = setting(
+        90.0,
+        "Tiles farther away leave the memory (not the cache) once their evidence is reported; at least `near_m`.",
+        unit="m",
+        above=0,
+    )
 
     def __post_init__(self) -> None:
         """Distances in order, at least one request in flight."""
-        if not 0 < self.near_m <= self.forget_m or self.ahead_m < 0:
-            raise AgentConfigError(f"near_m = {self.near_m}, ahead_m = {self.ahead_m}, forget_m = {self.forget_m} m")
-        if not 0 <= self.lead_s <= self.ahead_s:
-            raise AgentConfigError(f"lead_s = {self.lead_s} s must lie between 0 and ahead_s = {self.ahead_s} s")
-        if not (0 < self.link_share <= 1 and self.batch_s > 0):
-            raise AgentConfigError(f"link_share = {self.link_share} (0 ... 1), batch_s = {self.batch_s} s")
-        if not 1 <= self.in_flight <= 64:
-            raise AgentConfigError(f"in_flight = {self.in_flight} lies outside 1 ... 64")
+        check_settings(self, AgentConfigError)
+        if self.near_m > self.forget_m:
+            raise AgentConfigError(f"near_m = {self.near_m} m must not exceed forget_m = {self.forget_m} m")
 
 
 @dataclass(frozen=True, slots=True)
 class ReportParameters:
     """When a tile is left, when a report is sent, which poses may make statements."""
 
-    left_behind_m: float = 54.0
-    """A tile farther from the vehicle gets no more evidence: its classes are decided. More than the range of detection
-    by what the LiDAR stands from the vehicle's origin and what it drives during a scan."""
-    soon_s: float = 0.3
-    """Where much has changed, the report waits this long for tiles that are left together with the first ..."""
-    soon_voxels: int = 48
-    """... much: so many voxels of one tile. On ground that has not changed, detection errs in up to some 30."""
-    apart_s: float = 3.0
-    """Such reports follow each other no faster than this: a whole street that has changed shares a few."""
-    longest_m: float = 400.0
-    """Any change is reported at the latest after this much way ..."""
-    longest_s: float = 40.0
-    """... or time. Such a report costs 0.3 to 0.5 kB with its answers: 20 s at 40 km/h would be 2 kB/km."""
-    unchanged_m: float = 1000.0
-    """Ground that is as the map says it is: at the latest after this much way ..."""
-    unchanged_s: float = 120.0
-    """... or time."""
-    protocol: Literal["packed", "full"] = "packed"
-    """How reports are sent: in short (flags and track first, then the Gaussians asked for), or at once and whole."""
-    max_sigma_m: float = 0.15
-    """Scans whose refined position is less certain (in its worst direction) are no evidence."""
-    max_sigma_rad: float = 0.02
-    """The same for the attitude: about its worst axis, 40 cm at 20 m."""
-    check_poses: bool = True
-    """Scans are evidence only once no small shift lays them better onto the map; off for studies of what that costs."""
-    shift: ShiftParameters = field(default_factory=ShiftParameters)
-    """When a shift is one."""
-    drain_s: float = 120.0
-    """At the end of a drive the agent waits this long for its reports to be acknowledged."""
+    left_behind_m: float = setting(
+        54.0,
+        "A tile farther from the vehicle gets no more evidence: its classes are decided. More than the range of"
+        " detection by what the LiDAR stands from the vehicle's origin and what it drives during a scan.",
+        unit="m",
+        above=0,
+    )
+    soon_s: float = setting(
+        0.3,
+        "Where much has changed, the report waits this long for tiles that are left together with the first ...",
+        unit="s",
+        least=0,
+    )
+    soon_voxels: int = setting(
+        48,
+        "... much: so many voxels of one tile. On ground that has not changed, detection errs in up to some 30.",
+        least=1,
+    )
+    apart_s: float = setting(
+        3.0,
+        "Such reports follow each other no faster than this; at least `soon_s`.",
+        unit="s",
+        least=0,
+    )
+    longest_m: float = setting(400.0, "Any change is reported at the latest after this much way ...", unit="m", least=0)
+    longest_s: float = setting(
+        40.0,
+        "... or time; at least `apart_s`. Such a report costs 0.3 to 0.5 kB with its answers: 20 s at 40 km/h would be"
+        " 2 kB/km.",
+        unit="s",
+        least=0,
+    )
+    unchanged_m: float = setting(
+        1000.0,
+        "Ground that is as the map says: at the latest after this much way (at least `longest_m`) ...",
+        unit="m",
+        least=0,
+    )
+    unchanged_s: float = setting(120.0, "... or time; at least `longest_s`.", unit="s", least=0)
+    protocol: Literal["packed", "full"] = setting(
+        "packed",
+        "How reports are sent: in short (flags and track first, then the Gaussians asked for), or at once and whole.",
+    )
+    max_sigma_m: float = setting(
+        0.15,
+        "Scans whose refined position is less certain (in its worst direction) are no evidence.",
+        unit="m",
+        above=0,
+    )
+    max_sigma_rad: float = setting(
+        0.02, "The same for the attitude: about its worst axis, 40 cm at 20 m.", unit="rad", above=0
+    )
+    check_poses: bool = setting(
+        True, "Scans are evidence only once no small shift lays them better onto the map; off only for studies."
+    )
+    drain_s: float = setting(
+        120.0,
+        "At the end of a drive the agent waits this long for its reports to be acknowledged.",
+        unit="s",
+        least=0,
+    )
 
     def __post_init__(self) -> None:
         """A protocol that there is, and waiting times in order."""
+        check_settings(self, AgentConfigError)
         waits_s = (self.soon_s, self.apart_s, self.longest_s, self.unchanged_s)
-        if waits_s[0] < 0 or sorted(waits_s) != list(waits_s) or self.soon_voxels < 1:
-            raise AgentConfigError(
-                f"soon_s, apart_s, longest_s and unchanged_s = {waits_s} s must rise from 0 on; soon_voxels ="
-                f" {self.soon_voxels} must be 1 or more"
-            )
-        if not 0 <= self.longest_m <= self.unchanged_m:
-            raise AgentConfigError(
-                f"longest_m = {self.longest_m}, unchanged_m = {self.unchanged_m} m: 0 or more, rising"
-            )
+        if sorted(waits_s) != list(waits_s):
+            raise AgentConfigError(f"soon_s, apart_s, longest_s and unchanged_s = {waits_s} s must rise")
+        if self.longest_m > self.unchanged_m:
+            raise AgentConfigError(f"longest_m = {self.longest_m}, unchanged_m = {self.unchanged_m} m must rise")
         if self.protocol not in ("packed", "full"):
             raise AgentConfigError(f"protocol = {self.protocol!r}: there are 'packed' and 'full'")
 
@@ -124,39 +154,46 @@ class PipelineParameters:
 class AgentConfig:
     """One vehicle agent.
 
-    `pace` 0 drives as fast as the recording can be worked on, 1 in real time, 2 twice as fast. The ledger goes to
-    `ledger_dir`, by default the folder `ledger` beside `work_dir`.
+    The ledger goes to `ledger_dir`, by default the folder `ledger` beside `work_dir`. `departure`: where several
+    vehicles drive in one world, when this one starts, and the clock that they share; no setting.
     """
 
-    vehicle: str
-    drive: Path
-    work_dir: Path
-    connect: tuple[str, ...] = (DEFAULT_ENDPOINT,)
-    link: str | LinkProfile = "none"
-    layer: str = "ndt"
-    pace: float = 0.0
-    open_timeout_s: float = 10.0
-    """How long the agent waits for a router when it starts; then it drives without, on its cache."""
+    vehicle: str = setting(..., "Pseudonym of the vehicle.")
+    drive: Path = setting(..., "Recording (MCAP) to drive.")
+    work_dir: Path = setting(..., "Folder of cache, outbox and result.")
+    connect: tuple[str, ...] = setting((DEFAULT_ENDPOINT,), "Endpoints of routers, tried in order.")
+    link: str | LinkProfile = setting("none", "Mobile link to feel: 3g, 4g, 5g, none or a TOML file.")
+    layer: str = setting("ndt", "Layer of the voxel map.")
+    pace: float = setting(
+        0.0, "Speed of the drive: 1 in real time, 0 as fast as the recording can be worked on.", least=0
+    )
+    open_timeout_s: float = setting(
+        10.0,
+        "The agent waits this long for a router when it starts; then it drives without, on its cache.",
+        unit="s",
+        least=0,
+    )
     departure: Departure | None = None
-    """Where several vehicles drive in one world: when this one starts, and the clock that they share."""
-    ledger_dir: Path | None = None
-    localise: LocaliserParameters = field(default_factory=LocaliserParameters)
-    segment: SegmentParameters = field(default_factory=SegmentParameters)
-    detect: DetectParameters = field(default_factory=DetectParameters)
-    download: DownloadParameters = field(default_factory=DownloadParameters)
-    report: ReportParameters = field(default_factory=ReportParameters)
-    features: FeatureParameters = field(default_factory=FeatureParameters)
-    localise_by: LocaliseBy = "lidar"
-    """See `LocaliseBy`."""
+    ledger_dir: Path | None = setting(None, "Folder of the traffic ledger; by default `ledger` beside `work_dir`.")
+    localise: LocaliserParameters = setting(LocaliserParameters, "Localisation.")
+    segment: SegmentParameters = setting(SegmentParameters, "Segmentation of what moves.")
+    detect: DetectParameters = setting(DetectParameters, "Detection of changes.")
+    download: DownloadParameters = setting(DownloadParameters, "Download of tiles.")
+    report: ReportParameters = setting(ReportParameters, "Reports.")
+    features: FeatureParameters = setting(FeatureParameters, "Feature layers.")
+    localise_by: LocaliseBy = setting(
+        "lidar",
+        "Scans on the voxel map; or, without LiDAR, a particle filter of motion, GNSS and the features of one layer"
+        " (slamcu), or one graph of motion, GNSS, features and lanes for each stretch (graph).",
+    )
 
     def __post_init__(self) -> None:
         """A name and a pace that can work."""
+        check_settings(self, AgentConfigError)
         if not self.vehicle:
             raise AgentConfigError("the vehicle needs a name (its pseudonym)")
         if is_feature_layer(self.layer):
             raise AgentConfigError(f"layer = {self.layer!r} holds features; that of the voxel map begins with ndt")
-        if not 0 <= self.pace < float("inf"):
-            raise AgentConfigError(f"pace = {self.pace}: 0 is as fast as possible, 1 real time")
         if self.localise_by not in get_args(LocaliseBy):
             raise AgentConfigError(f"localise_by = {self.localise_by!r}: there are {', '.join(get_args(LocaliseBy))}")
         if self.localise_by != "lidar" and not self.features.layers:

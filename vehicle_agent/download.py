@@ -5,7 +5,7 @@ import threading
 import time
 from collections import Counter
 from collections.abc import Collection, Iterable, Sequence
-from typing import Generic
+from typing import Final, Generic
 
 from gnd.fleet_bus.bus import Bus
 from gnd.fleet_bus.config import QUEUED_BATCHES
@@ -18,6 +18,9 @@ from gnd.vehicle_agent.config import DownloadParameters
 from gnd.vehicle_agent.errors import CacheError
 from gnd.vehicle_agent.exchange import Exchange, Fetched, Outcome
 from gnd.vehicle_agent.plan import batch_bytes
+
+DOWNLOAD_BATCH_S: Final = 0.25
+"""One answer holds what the link carries in this time (4 to 128 kB): something more urgent waits no longer."""
 
 __all__ = ["Fetched", "TileFetcher"]
 
@@ -47,10 +50,10 @@ class TileFetcher(Generic[TileT]):
         self._offline = False
         self._exchange = Exchange(bus, cache, parameters.request_s)
         rate_byte_s = self.link.rate_byte_s("down")
-        self._batch_bytes = batch_bytes(rate_byte_s, parameters.batch_s)
+        self._batch_bytes = batch_bytes(rate_byte_s, DOWNLOAD_BATCH_S)
         # More on its way than the router keeps for us would be thrown away.
         kept_bytes = 0.75 * QUEUED_BATCHES * self.link.batch_bytes
-        self._window_bytes = min(kept_bytes, rate_byte_s * (parameters.batch_s + 2 * self.link.delay_s))
+        self._window_bytes = min(kept_bytes, rate_byte_s * (DOWNLOAD_BATCH_S + 2 * self.link.delay_s))
         self._changed = threading.Condition()
         self._wanted: tuple[TileId, ...] = ()
         self._waiting: list[TileId] = []

@@ -36,7 +36,7 @@ from gnd.vehicle_agent.detect.doubts import (
     doubt_of,
     withheld_change,
 )
-from gnd.vehicle_agent.detect.shift import Shift, costs_at
+from gnd.vehicle_agent.detect.shift import Shift, ShiftParameters, costs_at
 from gnd.vehicle_agent.detect.tile_shift import pose_error_of_tile
 from gnd.vehicle_agent.detect.trial import POINTS_OF_POOR_SCAN, Trial, some_of
 from gnd.vehicle_agent.detect.uncertainty import PoseUncertainty
@@ -170,7 +170,7 @@ class Reporter:
         self._stated_before: Counter[TileId] = Counter()  # in reports of an earlier life that have the same ids
         self._tracks = Tracks(detector.local_map.grid_frame.frame)
         self._match_map = MatchMapCache(detector.local_map, RegistrationParameters().noise_m)
-        self._trial = Trial(self._match_map, parameters.shift)
+        self._trial = Trial(self._match_map, ShiftParameters())
         self._doubts = TileDoubts(detector.local_map.grid_frame)
         self._T_map_vehicle: F64 | None = None  # of the newest scan that counted
         self._shifted = 0

@@ -12,7 +12,7 @@ from gnd.gnd_map.errors import TileError
 from gnd.gnd_map.geodesy import LocalFrame
 from gnd.gnd_map.tile import Tile
 from gnd.gnd_map.tile_id import TileId, covering_corridor
-from gnd.vehicle_agent.config import DownloadParameters
+from gnd.vehicle_agent.config import LEAD_S, DownloadParameters
 from gnd.vehicle_agent.download import Fetched, TileFetcher
 from gnd.vehicle_agent.local_map import LocalMap, Touched
 from gnd.vehicle_agent.place import Place
@@ -118,7 +118,7 @@ class Surroundings:
         """
         self._plan_is_new = False
         plan = self._plan if patiently else self._in_time()
-        lead_s = self._parameters.lead_s + self._download_s(plan)
+        lead_s = LEAD_S + self._download_s(plan)
         if any(need.from_s <= lead_s and not self._fetcher.is_known(need.tile_id) for need in plan):
             self._asked = {need.tile_id for need in plan}
         self._fetcher.want([need.tile_id for need in plan if need.tile_id in self._asked])

@@ -25,9 +25,8 @@ from gnd.vehicle_agent.local_map import LocalMap
 from gnd.vehicle_agent.localise.estimates import PoseEstimate, RefinedScan
 from gnd.vehicle_agent.localise.localiser import Localiser
 from gnd.vehicle_agent.localise.match_map import MatchMapCache
-from gnd.vehicle_agent.localise.parameters import RegistrationParameters
-from gnd.vehicle_agent.localise.rolling_map import RollingMap
-from gnd.vehicle_agent.localise.scan_odometry_parameters import ScanOdometryParameters
+from gnd.vehicle_agent.localise.parameters import NOISE_M, RegistrationParameters
+from gnd.vehicle_agent.localise.rolling_map import ROLLING_MOVE_M, RollingMap
 from gnd.vehicle_agent.packing import pack, pack_measured
 from gnd.vehicle_agent.report import on_lattice
 from gnd.vehicle_agent.segment import MotionSegmenter, SegmentedScan
@@ -82,9 +81,8 @@ def _try(local_map: LocalMap, scans: list[RefinedScan]) -> None:
 
 def _rolled(points_m: F64) -> None:
     """Scan-to-scan odometry of a vehicle that moves: its map rolls on only after some metres."""
-    parameters = ScanOdometryParameters()
-    rolling = RollingMap(parameters.rolling_map, parameters.noise_m)
-    for x_m in (0.0, 2.0 * parameters.rolling_map.move_m):
+    rolling = RollingMap(NOISE_M)
+    for x_m in (0.0, 2.0 * ROLLING_MOVE_M):
         rolling.add(points_m, np.array([x_m, 0.0, 0.0]))
 
 

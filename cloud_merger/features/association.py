@@ -11,6 +11,9 @@ from gnd.cloud_merger.features.rls import Place
 from gnd.cloud_merger.features.shapes import across
 from gnd.gnd_map.arrays import F64
 
+FEATURE_LINE_REACH_M: Final = 1.5
+"""The same for polylines, across the line: less than half the width of a lane."""
+
 _NEVER: Final = 1e9
 HEIGHT_KNOWN_M2: Final = 100.0
 """Where the variance of a difference of heights is larger, it is not a dimension that was measured."""
@@ -47,7 +50,7 @@ def costs(measured: Sequence[Place], known: Sequence[Place], parameters: Feature
     offset, reach_m = _offsets(measured, known)
     of_point = len(known[0].points_m) == 1
     S = np.stack([one.cov_m2 for one in known])[None] + np.stack([one.cov_m2 for one in measured])[:, None]
-    near = reach_m <= (parameters.reach_m if of_point else parameters.line_reach_m)
+    near = reach_m <= (parameters.reach_m if of_point else FEATURE_LINE_REACH_M)
     offset = np.where(near[..., None], offset, 0.0)
     square = np.einsum("ijk,ijk->ij", offset, np.linalg.solve(S, offset[..., None])[..., 0])
     gate = np.where(S[..., 2, 2] > HEIGHT_KNOWN_M2, parameters.gate_of(2), parameters.gate_of(3))

@@ -16,6 +16,7 @@ from gnd.gnd_map.arrays import F64
 from gnd.gnd_map.errors import FeatureError
 from gnd.gnd_map.features import UNKNOWN_HEIGHT_M2, check_simple_polyline, full_covariance
 from gnd.gnd_map.geodesy import LocalFrame
+from gnd.gnd_map.settings import check_settings, setting
 from gnd.gnd_map.tile_id import TileId
 from gnd.schemas.feature_change import LANE_KINDS, FeatureChange, Found
 from gnd.schemas.features import FeatureReport
@@ -27,44 +28,29 @@ Numbered = tuple[int, Found]
 IdsOf = Callable[[TileId, bytes], Collection[int] | None]
 """Ids of the features of a version of a tile, by hash; None: there is no such version."""
 
+_MIN_SIGMA_M: Final = 1e-3
+"""No vehicle knows a place better in any direction: below the millimetre is a mistake of units."""
+_MAX_SIGMA_M: Final = 30.0
+"""Horizontally; a place known no better than this is none."""
+_MAX_OUTSIDE_M: Final = 25.0
+"""A measured map feature may lie this far outside its tile."""
+_MIN_VERDICTS: Final = 5
+"""From so many judged map features on the share of deleted ones is looked at."""
+_MAX_DELETED_SHARE: Final = 0.5
+"""A drive that finds a larger share of the map's features gone has not looked, or lies."""
+_DUPLICATE_M: Final = 0.1
+"""Two found features of one kind that are nearer than this and alike are one, sent twice."""
+
 
 @dataclass(frozen=True, slots=True)
 class FeatureLimits:
-    """What a statement about features may say.
+    """What a statement about features may say."""
 
-    Attributes:
-        min_sigma_m: no vehicle knows a place better in any direction: below the millimetre is a mistake of units.
-        max_sigma_m: horizontally; a place known no better than this is none.
-        max_outside_m: a measured map feature may lie this far outside its tile.
-        max_features_of_tile: found and judged features of one tile of 38 m.
-        max_vertices: vertices of a found polyline in one tile.
-        min_verdicts: from so many judged map features on the share of deleted ones is looked at.
-        max_deleted_share: a drive that finds a larger share of the map's features gone has not looked, or lies.
-        duplicate_m: two found features of one kind that are nearer than this and alike are one, sent twice.
-    """
-
-    min_sigma_m: float = 1e-3
-    max_sigma_m: float = 30.0
-    max_outside_m: float = 25.0
-    max_features_of_tile: int = 256
-    max_vertices: int = 512
-    min_verdicts: int = 5
-    max_deleted_share: float = 0.5
-    duplicate_m: float = 0.1
+    max_features_of_tile: int = setting(256, "Found and judged features of one tile of 38 m.", least=1)
+    max_vertices: int = setting(512, "Vertices of a found polyline in one tile.", least=1)
 
     def __post_init__(self) -> None:
-        if not 0 < self.min_sigma_m < self.max_sigma_m <= 100:
-            raise MergerError(
-                f"min_sigma_m {self.min_sigma_m} and max_sigma_m {self.max_sigma_m} must ascend in (0, 100] m"
-            )
-        if min(self.max_outside_m, self.duplicate_m) < 0:
-            raise MergerError(
-                f"max_outside_m {self.max_outside_m} and duplicate_m {self.duplicate_m} must not be negative"
-            )
-        if min(self.max_features_of_tile, self.max_vertices, self.min_verdicts) < 1:
-            raise MergerError("max_features_of_tile, max_vertices and min_verdicts must be at least 1")
-        if not 0 < self.max_deleted_share <= 1:
-            raise MergerError(f"max_deleted_share must lie in (0, 1], got {self.max_deleted_share}")
+        check_settings(self, MergerError)
 
 
 def check_feature_report(report: FeatureReport, limits: FeatureLimits, ids_of: IdsOf) -> None:
@@ -78,27 +64,27 @@ def check_feature_report(report: FeatureReport, limits: FeatureLimits, ids_of: I
     Raises:
         BadReport: says what is wrong with it, and where, with numbers.
     """
-    _check_verdicts(report, limits)
+    _check_verdicts(report)
     for change in report.tiles:
         _check_amount(change, limits)
         _check_base(change, ids_of)
         for seen in change.seen:
             if seen.position_m is not None and seen.cov_m2 is not None:
                 name = f"tile {change.tile}, map feature {seen.feature_id}"
-                _check_covariance(name, seen.cov_m2, limits)
-                _check_inside(name, change.tile, seen.position_m, limits)
+                _check_covariance(name, seen.cov_m2)
+                _check_inside(name, change.tile, seen.position_m)
         for number, found in enumerate(change.found):
             _check_found(f"tile {change.tile}, found {found.kind} {number}", found, limits)
-        _check_duplicates(change, limits)
+        _check_duplicates(change)
 
 
-def _check_verdicts(report: FeatureReport, limits: FeatureLimits) -> None:
+def _check_verdicts(report: FeatureReport) -> None:
     judged = [seen.existence.state for change in report.tiles for seen in change.seen]
     gone = judged.count("absent")
-    if len(judged) >= limits.min_verdicts and gone > limits.max_deleted_share * len(judged):
+    if len(judged) >= _MIN_VERDICTS and gone > _MAX_DELETED_SHARE * len(judged):
         raise BadReport(
             f"{gone} of {len(judged)} judged features are said to be deleted, the limit is "
-            f"{limits.max_deleted_share:g} of {limits.min_verdicts} or more: so much does not go at once"
+            f"{_MAX_DELETED_SHARE:g} of {_MIN_VERDICTS} or more: so much does not go at once"
         )
 
 
@@ -125,7 +111,7 @@ def _check_base(change: FeatureChange, ids_of: IdsOf) -> None:
 
 
 def _check_found(name: str, found: Found, limits: FeatureLimits) -> None:
-    _check_covariance(name, found.cov_m2, limits)
+    _check_covariance(name, found.cov_m2)
     if len(found.points_m) > limits.max_vertices:
         raise BadReport(f"{name} has {len(found.points_m)} vertices, the limit is {limits.max_vertices} a tile")
     if len(found.points_m) > 2 and found.kind.startswith(LANE_KINDS):
@@ -135,45 +121,43 @@ def _check_found(name: str, found: Found, limits: FeatureLimits) -> None:
             raise BadReport(str(error)) from error
 
 
-def _check_covariance(name: str, cov_m2: F64, limits: FeatureLimits) -> None:
+def _check_covariance(name: str, cov_m2: F64) -> None:
     cov = full_covariance(cov_m2)
     least = float(np.linalg.eigvalsh(cov)[0])
-    if least * _ROUNDING < limits.min_sigma_m**2:
+    if least * _ROUNDING < _MIN_SIGMA_M**2:
         what = "not positive" if least <= 0 else f"{least**0.5:.2g} m in one direction"
-        raise BadReport(f"{name}: sigma {what}, nobody measures better than {limits.min_sigma_m:g} m")
+        raise BadReport(f"{name}: sigma {what}, nobody measures better than {_MIN_SIGMA_M:g} m")
     most = float(np.linalg.eigvalsh(cov[:2, :2])[-1])
-    if most > limits.max_sigma_m**2 * _ROUNDING:
-        raise BadReport(f"{name}: known to {most**0.5:.3g} m only, the limit is {limits.max_sigma_m:g} m")
+    if most > _MAX_SIGMA_M**2 * _ROUNDING:
+        raise BadReport(f"{name}: known to {most**0.5:.3g} m only, the limit is {_MAX_SIGMA_M:g} m")
     if cov[2, 2] > UNKNOWN_HEIGHT_M2 * _ROUNDING**2 * 1.1:
         raise BadReport(
             f"{name}: variance {cov[2, 2]:.3g} m² of its height, {UNKNOWN_HEIGHT_M2:g} m² stands for unknown"
         )
 
 
-def _check_inside(name: str, tile: TileId, position_m: F64, limits: FeatureLimits) -> None:
+def _check_inside(name: str, tile: TileId, position_m: F64) -> None:
     (south, west), (north, east) = tile.south_west_rad, tile.north_east_rad
     corners = LocalFrame.of_tile(tile).enu_from_geodetic([south, south, north, north], [west, east, west, east], 0.0)
     outside_m = float((np.abs(position_m[:2]) - np.abs(corners[:, :2]).max(axis=0)).max())
-    if outside_m > limits.max_outside_m:
-        raise BadReport(
-            f"{name} was measured {outside_m:.1f} m outside its tile, the limit is {limits.max_outside_m:g} m"
-        )
+    if outside_m > _MAX_OUTSIDE_M:
+        raise BadReport(f"{name} was measured {outside_m:.1f} m outside its tile, the limit is {_MAX_OUTSIDE_M:g} m")
 
 
-def _check_duplicates(change: FeatureChange, limits: FeatureLimits) -> None:
+def _check_duplicates(change: FeatureChange) -> None:
     """Found points of one kind at the same place, within their own covariances, of which nothing tells them apart."""
     points = [(number, found) for number, found in enumerate(change.found) if len(found.points_m) == 1]
-    for (i, a), (j, b) in _near(points, limits.duplicate_m):
+    for (i, a), (j, b) in _near(points, _DUPLICATE_M):
         if (a.kind, a.attributes) != (b.kind, b.attributes):
             continue
         apart, both = a.points_m[0] - b.points_m[0], full_covariance(a.cov_m2 + b.cov_m2)
         has_heights = both[2, 2] < HEIGHT_KNOWN_M2
-        if has_heights and abs(apart[2]) > limits.duplicate_m:
+        if has_heights and abs(apart[2]) > _DUPLICATE_M:
             continue
         if apart @ np.linalg.solve(both, apart) <= 1.0:
             raise BadReport(
                 f"tile {change.tile}: found {a.kind} {i} and {j} lie {float(np.hypot(*apart[:2])):.3f} m apart, less "
-                f"than their sigma and {limits.duplicate_m:g} m: one feature twice"
+                f"than their sigma and {_DUPLICATE_M:g} m: one feature twice"
             )
 
 

@@ -2,17 +2,26 @@
 
 from collections.abc import Iterable, Sequence
 from math import prod
+from typing import Final
 
 import numpy as np
 
 from gnd.cloud_merger.features.memory import Vote
-from gnd.cloud_merger.features.parameters import FeatureMergeParameters
 from gnd.cloud_merger.features.statements import Statement
 from gnd.cloud_merger.features.tracks import Bases, Track, Tracks
 from gnd.gnd_map.features import VACUOUS, Existence, miss
 from gnd.gnd_map.geodesy import LocalFrame
 from gnd.gnd_map.tile_id import TileId
 from gnd.schemas.feature_change import GRID
+
+FEATURE_PRIOR: Final = 0.95
+"""What the map itself says of its features never weighs more than this. λ_HD of SLAMCU, Eq. (3)."""
+FEATURE_ABSENCE: Final = 0.8
+"""Mass of "absent" of a vehicle that viewed a place without finding what others found there."""
+FEATURE_VIEW_MARGIN_M: Final = 0.5
+"""Such a vehicle must have viewed all cells within this of the feature, or within its sigma."""
+FEATURE_CEILING: Final = 0.99
+"""No published feature has a larger mass than this, or no evidence could change it any more."""
 
 
 def pooled(bodies: Iterable[Existence]) -> Existence:
@@ -36,26 +45,24 @@ def capped(existence: Existence, most: float) -> Existence:
     return existence if known <= most else existence.discounted(most / known)
 
 
-def prior_of(track: Track, parameters: FeatureMergeParameters) -> Existence:
+def prior_of(track: Track) -> Existence:
     """What the map itself says of a feature."""
-    return VACUOUS if track.epoch is None else capped(track.epoch.existence, parameters.prior)
+    return VACUOUS if track.epoch is None else capped(track.epoch.existence, FEATURE_PRIOR)
 
 
-def verdict(prior: Existence, votes: Iterable[Existence], parameters: FeatureMergeParameters) -> Existence:
+def verdict(prior: Existence, votes: Iterable[Existence]) -> Existence:
     """What the map (`prior_of`) and votes, one a vehicle and discounted already, say together."""
-    return capped(pooled([prior, *votes]), parameters.ceiling)
+    return capped(pooled([prior, *votes]), FEATURE_CEILING)
 
 
-def add_views(
-    tile: TileId, tracks: Tracks, said: Sequence[Statement], bases: Bases, parameters: FeatureMergeParameters
-) -> None:
+def add_views(tile: TileId, tracks: Tracks, said: Sequence[Statement], bases: Bases) -> None:
     """Let those vote "absent" who looked where a feature is said to be, had it not in their map, and found nothing.
 
     Those who passed before anyone had seen it speak of another time. A report whose base is not known abstains.
     """
-    absent, names_of = miss(parameters.absence), tracks.names_of()
+    absent, names_of = miss(FEATURE_ABSENCE), tracks.names_of()
     for track in tracks.all:
-        cells, names = _cells(tile, track, parameters.view_margin_m), names_of[track.serial]
+        cells, names = _cells(tile, track, FEATURE_VIEW_MARGIN_M), names_of[track.serial]
         for number in range(max(track.first, 0), len(said)):
             one = said[number]
             if one.viewed & cells != cells or number in track.votes or one.base_sha is None:

@@ -9,7 +9,7 @@ import numpy as np
 from gnd.cloud_merger.features.memory import LayerMemory, Remembered, Vote
 from gnd.cloud_merger.features.merge import Hypotheses, MergedFeatures
 from gnd.cloud_merger.features.parameters import FeatureMergeParameters
-from gnd.cloud_merger.features.publication import Story
+from gnd.cloud_merger.features.publication import FEATURE_VOTERS, Story
 from gnd.cloud_merger.features.rls import Place, estimate
 from gnd.cloud_merger.features.shapes import length_of
 from gnd.cloud_merger.features.tracks import Track
@@ -40,7 +40,7 @@ def fold(merged: MergedFeatures, parameters: FeatureMergeParameters, day: int) -
     days = {story.track.serial: _day_of(story, day) for story in stories}
     stories = [story for story in stories if _is_kept(story) or day - days[story.track.serial] <= FORGOTTEN_DAYS]
     stories = _fair(stories)
-    votes = {story.track.serial: _votes_of(story, parameters) for story in stories}
+    votes = {story.track.serial: _votes_of(story) for story in stories}
     heard = sorted({number for own in votes.values() for number, _ in own})
     cited = {vote.elsewhere for own in votes.values() for _, vote in own}
     witness = {number: k for k, number in enumerate(heard)}
@@ -90,8 +90,8 @@ def _finder(story: Story) -> str:
     return next(iter(story.measured)) if alone and len(story.measured) == 1 else ""
 
 
-def _votes_of(story: Story, parameters: FeatureMergeParameters) -> tuple[tuple[int, Vote], ...]:
-    casts = list(story.votes.values())[-max(VOTES_KEPT, parameters.voters) :]
+def _votes_of(story: Story) -> tuple[tuple[int, Vote], ...]:
+    casts = list(story.votes.values())[-max(VOTES_KEPT, FEATURE_VOTERS) :]
     return tuple((cast.report, cast.vote) for cast in casts)
 
 

@@ -116,7 +116,7 @@ def _tracks_of(
     for number, statement in enumerate(said):
         tracks.hear(number, statement)
     tracks.settle()
-    add_views(tile, tracks, said, contents, parameters)
+    add_views(tile, tracks, said, contents)
     return tracks
 
 

@@ -20,6 +20,15 @@ from gnd.gnd_map.features import Existence, Feature, full_covariance, geodetic_i
 from gnd.gnd_map.features.feature import MAX_COUNT
 from gnd.gnd_map.tile_id import TileId
 
+FEATURE_VOTERS: Final = 6
+"""Of the vehicles that speak of a feature, the so many whose reports are newest vote: so a world that changes again is
+followed."""
+FEATURE_MOST_WEIGHT: Final = 4.0
+"""A vehicle that claims to be surer than all others (and the map) weighs at most this times the second surest, until
+another is as sure."""
+FEATURE_RENEWAL_MASS: Final = 0.1
+"""Published masses are renewed when "exist" has changed by more than this."""
+
 _LEAST_ADDED: Final = 1e-6
 
 
@@ -82,7 +91,7 @@ class Story:
             self.hits_before = before.hits_before
             self.gone, self.ayes_gone = dict(before.gone), dict(before.ayes_gone)
         self._before = self.shown if self.is_published else None
-        self._prior = prior_of(track, parameters)
+        self._prior = prior_of(track)
         self.masses = self._prior
         self._state: Place | None = self.known
         self._is_stale = bool(self.measured)
@@ -133,7 +142,7 @@ class Story:
         self.votes[vote.vehicle] = _Cast(report, vote, vote.existence.discounted(self._parameters.reliability))
 
     def _weigh(self) -> None:
-        self.masses = verdict(self._prior, (cast.weight for cast in self._newest()), self._parameters)
+        self.masses = verdict(self._prior, (cast.weight for cast in self._newest()))
 
     def _measure(self, report: int, measured: Measured) -> bool:
         """Whether the vehicle measures it for the first time."""
@@ -173,7 +182,7 @@ class Story:
 
     def _even(self) -> bool:
         known_m2 = None if self.known is None else self.known.least_m2
-        return is_even(list(self._least_m2.values()), known_m2, self._parameters.most_weight)
+        return is_even(list(self._least_m2.values()), known_m2, FEATURE_MOST_WEIGHT)
 
     def _adds(self, earlier: int) -> float:
         """What one more measurement of a vehicle weighs beside so many."""
@@ -191,7 +200,7 @@ class Story:
     def balanced(self) -> dict[str, Place]:
         """What the measurements of each vehicle say together, and weigh beside those of the others."""
         each = [self._fused(own) for own in self.measured.values()]
-        return dict(zip(self.measured, balanced(each, self.known, self._parameters.most_weight), strict=True))
+        return dict(zip(self.measured, balanced(each, self.known, FEATURE_MOST_WEIGHT), strict=True))
 
     def _estimate(self, each: list[Place]) -> Place:
         known = self.known
@@ -203,7 +212,7 @@ class Story:
         return estimate(each, known)
 
     def _newest(self) -> list[_Cast]:
-        return list(self.votes.values())[-self._parameters.voters :]
+        return list(self.votes.values())[-FEATURE_VOTERS:]
 
     def _sides(self) -> tuple[list[int], list[int]]:
         """Reports that vote for it, and against it; one a vehicle."""
@@ -238,7 +247,7 @@ class Story:
         ayes, noes = self._sides()
         change = self.masses.exist - shown.existence.exist
         agree = len(ayes if change > 0 else noes) >= self._parameters.min_vehicles
-        if agree and abs(change) > self._parameters.renewal_mass:
+        if agree and abs(change) > FEATURE_RENEWAL_MASS:
             self.shown = replace(shown, existence=self.masses)
 
     def _is_worth_it(self, shown: Feature) -> bool:

@@ -3,6 +3,7 @@
 from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from typing import Final
 
 import numpy as np
 
@@ -13,6 +14,11 @@ from gnd.cloud_merger.features.rls import Place, step
 from gnd.cloud_merger.features.statements import Attributes, Claimed, Statement
 from gnd.gnd_map.features import Feature, feature_id_of
 from gnd.schemas.feature_change import Seen
+
+FEATURE_MOVED_M: Final = 0.3
+"""A map feature that is measured outside the gate has moved only if it is farther off than this."""
+FEATURE_MAX_BEGUN: Final = 128
+"""A vehicle begins at most so many candidates in a tile; what else it finds must be known already."""
 
 Bases = Mapping[bytes, Mapping[int, tuple[Feature, ...]]]
 
@@ -185,7 +191,7 @@ class Tracks:
             track.measure(report, Measured(said.vehicle, place, False, ()), self._parameters)
             return None
         apart = place.points_m[0] - track.state.points_m[0]
-        if np.hypot(apart[0], apart[1]) <= self._parameters.moved_m or seen.existence.exist <= seen.existence.absent:
+        if np.hypot(apart[0], apart[1]) <= FEATURE_MOVED_M or seen.existence.exist <= seen.existence.absent:
             return None
         name = feature_id_of(said.report_id, "elsewhere", track.feature_id)
         track.votes[report] = Vote(said.vehicle, seen.existence, seen.hits, elsewhere=name)
@@ -220,7 +226,7 @@ class Tracks:
     def _take(self, report: int, said: Statement, claim: Claimed, track: Track | None) -> None:
         measured = Measured(said.vehicle, claim.place, claim.is_found, claim.attributes)
         if track is None:
-            if self._begun[said.vehicle] >= self._parameters.max_begun:
+            if self._begun[said.vehicle] >= FEATURE_MAX_BEGUN:
                 return
             self._begun[said.vehicle] += 1
             track = self._begin(Track(claim.feature_id, claim.kind, claim.place))  # NFL, Eq. (11)

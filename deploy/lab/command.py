@@ -22,6 +22,8 @@ from gnd.deploy.lab.tables import check_table, run_table, run_verdict
 from gnd.deploy.lab.tools import check_rights
 from gnd.deploy.run_folder import create_run_folder, default_run_path
 from gnd.deploy.source import Source
+from gnd.fleet_bus.settings_file import write_settings
+from gnd.gnd_map.settings import settings_text
 
 WIDTH = 170
 
@@ -46,6 +48,7 @@ def lab(
     out: Path | None,
     overwrite: bool,
     config_file: Path | None,
+    changes: tuple[str, ...],
     dump_config: bool,
     keep_drives: bool,
     as_json: bool,
@@ -60,15 +63,16 @@ def lab(
     if context.invoked_subcommand is not None:
         return
     parsed = parse_groups(groups)
-    config = load_fleet_config(config_file, options | {"agents": sum(g.count for g in parsed), "link": groups})
+    config = load_fleet_config(config_file, options | {"agents": sum(g.count for g in parsed), "link": groups}, changes)
     if dump_config:
-        click.echo(json.dumps(dataclasses.asdict(config), indent=2))
+        click.echo(settings_text(config), nl=False)
         return
     source = Source(drives, base_map, worlds, config.agents)
     check_rights()
     end_on_sigterm()
     with open_lab(name, parsed, relay_all=relay_all) as opened:
         folder = create_run_folder(out or default_run_path(), overwrite=overwrite)
+        write_settings(config, folder.root)
         folder.write_mark({"config": dataclasses.asdict(config), "lab": name, "drives": [str(path) for path in drives]})
         lab_run = LabRun(opened, folder)
         summary = run(config, folder, source, keep_drives=keep_drives, place=lab_run.place)

@@ -8,7 +8,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gnd.gnd_map.gaussian import full_matrices
-from gnd.vehicle_agent.detect.parameters import DetectParameters
 from gnd.vehicle_agent.detect.records import planar_normals
 from gnd.vehicle_agent.local_map import LocalMap
 from studies.real.drive import local_map_of
@@ -46,11 +45,11 @@ class Surfaces:
     roughness: NDArray[np.float64]
 
     @classmethod
-    def of(cls, local_map: LocalMap, parameters: DetectParameters) -> "Surfaces":
+    def of(cls, local_map: LocalMap) -> "Surfaces":
         """From a map window."""
         cov = full_matrices(local_map.cov_m2)
         values = np.linalg.eigvalsh(cov) if len(cov) else np.ones((0, 3))
-        normal = planar_normals(cov, parameters)
+        normal = planar_normals(cov)
         roughness = values[:, 0] / np.maximum(values[:, 2], 1e-9)
         return cls(local_map.index, local_map.window_origin_g, local_map.mean_map_m, normal, roughness)
 
@@ -84,7 +83,7 @@ def cause_of(one: Round, rows: NDArray[np.int64]) -> list[str]:
         return []
     u = one.untouched
     keys, mean = u.found.keys[rows], u.found.mean_m[rows]
-    surfaces = Surfaces.of(local_map_of(one.scene, u.tiles), DetectParameters())
+    surfaces = Surfaces.of(local_map_of(one.scene, u.tiles))
     mapped, in_map = u.mapped.cells_at(keys), u.found.in_map[rows]
     distance = np.linalg.norm(one.scene.positions_m[:, None, :2] - mean[None, :, :2], axis=2).min(axis=0)
     weak = ~in_map & (mapped >= WEAK_CELLS)

@@ -1,13 +1,15 @@
 """What a run of `gnd reproduce real` is made of, checked before anything is read."""
 
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass, fields, replace
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from gnd.gnd_map import settings
+from gnd.gnd_map.errors import GndError
 from gnd.vehicle_agent.detect.parameters import DetectParameters
 from gnd.vehicle_agent.importers.splits import chosen_scans
 from gnd.vehicle_agent.segment.parameters import SegmentParameters
@@ -76,18 +78,9 @@ def changed(parameters: DetectParameters, changes: Sequence[str]) -> DetectParam
     """Parameters of detection with some replaced, each given as FIELD=VALUE.
 
     Raises:
-        RealDataError: no such field, or a value that is none.
-        DetectParameterError: a value out of its range.
+        RealDataError: no such field, or a value that is none or out of its range.
     """
-    given: dict[str, int | float | str] = {}
-    known = {field.name: getattr(parameters, field.name) for field in fields(parameters)}
-    for change in changes:
-        name, _, value = change.partition("=")
-        if not isinstance(known.get(name), int | float | str):
-            simple = ", ".join(k for k, v in known.items() if isinstance(v, int | float | str))
-            raise RealDataError(f"--set {change}: expected FIELD=VALUE with one of {simple}")
-        try:
-            given[name] = type(known[name])(value)
-        except ValueError as error:
-            raise RealDataError(f"--set {change}: {value!r} is no {type(known[name]).__name__}") from error
-    return replace(parameters, **given)  # type: ignore[arg-type]  # each value has its field's own type, see above
+    try:
+        return settings.changed(parameters, changes)
+    except GndError as error:
+        raise RealDataError(str(error)) from error

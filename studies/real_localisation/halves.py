@@ -21,8 +21,7 @@ from gnd.vehicle_agent.importers.recording import GNSS_SIGMA_M
 from gnd.vehicle_agent.importers.splits import chosen_scans
 from gnd.vehicle_agent.local_map import LocalMap
 from gnd.vehicle_agent.localise import LocaliserParameters, PoseEstimate, localisation_error
-from gnd.vehicle_agent.localise.parameters import RegistrationParameters
-from gnd.vehicle_agent.localise.refine_parameters import RefineParameters
+from gnd.vehicle_agent.localise.parameters import RefineParameters, RegistrationParameters
 from gnd.vehicle_agent.tiles_at_hand import localising_on
 from studies.real.drive import local_map_of
 from studies.real.scene import Scene, in_range

@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from gnd.gnd_map.arrays import I32, I64
 from gnd.gnd_map.classes import ChangeClass
-from gnd.vehicle_agent.detect.parameters import DetectParameters
+from gnd.vehicle_agent.detect.parameters import MIN_CELLS, DetectParameters
 from studies.simulation.result import EVIDENCE, VehicleResult
 
 RIGHT: Final = "right"
@@ -46,7 +46,7 @@ def causes(true_class: NDArray[np.uint8], e: Mapping[str, I32], p: DetectParamet
     """
     said, t = e["change_class"], true_class
     silent = said == int(ChangeClass.UNMEASURED)
-    weak = (e["cells"] >= p.weak_cells) & (e["cells"] < np.where(e["map_cells"] > 0, p.min_cells, p.new_cells))
+    weak = (e["cells"] >= p.weak_cells) & (e["cells"] < np.where(e["map_cells"] > 0, MIN_CELLS, p.new_cells))
     many = (e["map_cells"] == 0) & (e["cells"] >= p.new_cells)
     part = e["cells"] < 0.5 * e["map_cells"]
     cases = (
@@ -58,7 +58,7 @@ def causes(true_class: NDArray[np.uint8], e: Mapping[str, I32], p: DetectParamet
         ((t == A) & (said == E) & (e["cells"] > 0), "empty: too few sub-cells met"),
         ((t == A) & (said == E), "empty: rays pass, nothing met"),
         ((t == E) & (said == A), "new: something stood or moved there"),
-        ((t == M) & (said == N) & (e["cells"] < p.min_cells), "normal: too few sub-cells for a Gaussian"),
+        ((t == M) & (said == N) & (e["cells"] < MIN_CELLS), "normal: too few sub-cells for a Gaussian"),
         ((t == M) & (said == N) & part, "normal: only a part of it seen"),
         ((t == M) & (said == N), "normal: the Gaussians are too alike"),
         ((t == M) & (said == D), "deleted: rays pass, too few sub-cells"),

@@ -22,7 +22,8 @@ from gnd.schemas.tiles_batch import HeldTile, TilesReply, TilesRequest
 from gnd.tile_store.answers import Answers
 from gnd.tile_store.sqlite_store import SqliteStore
 from gnd.tile_store.values import DEFAULT_LAYER
-from gnd.vehicle_agent.config import DownloadParameters
+from gnd.vehicle_agent.config import LEAD_S, DownloadParameters
+from gnd.vehicle_agent.download import DOWNLOAD_BATCH_S
 from gnd.vehicle_agent.plan import Course, batch_bytes, needs
 from gnd.vehicle_agent.surroundings import STEP_M, tiles_along
 from studies.traffic_study.fleet import drive_config
@@ -110,7 +111,7 @@ def along_drive(
         codecs: that it reads, best first.
     """
     parameters, held, known = DownloadParameters(), held or {}, set[TileId]()
-    most = batch_bytes(link.rate_byte_s("down"), parameters.batch_s)
+    most = batch_bytes(link.rate_byte_s("down"), DOWNLOAD_BATCH_S)
     questions: list[Question] = []
     for k in range(len(track.t_s)):
         waiting = _due(track, k, parameters, known)
@@ -137,7 +138,7 @@ def _due(track: Track, k: int, parameters: DownloadParameters, known: set[TileId
     tiles = tiles_along(track.frame, np.stack([here, end]), parameters.near_m)
     planned = needs(track.frame, tiles, Course(float(here[0]), float(here[1]), heading, speed), parameters.near_m)
     new = [need for need in planned if need.tile_id not in known]
-    return [need.tile_id for need in new] if any(need.from_s <= parameters.lead_s for need in new) else []
+    return [need.tile_id for need in new] if any(need.from_s <= LEAD_S for need in new) else []
 
 
 def total_bytes(questions: Iterable[Question]) -> int:

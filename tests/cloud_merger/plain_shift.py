@@ -8,7 +8,14 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from gnd.cloud_merger.shift import Shift, ShiftParameters
+from gnd.cloud_merger.shift import (
+    SHIFT_DISPLACED_M,
+    SHIFT_FITS,
+    SHIFT_LEAST_GAUSSIANS,
+    SHIFT_MAX_M,
+    SHIFT_MAX_RAD,
+    Shift,
+)
 from gnd.gnd_map.gaussian import Gaussians
 from gnd.gnd_map.grid import VoxelGrid
 from gnd.gnd_map.similarity import similarity
@@ -64,54 +71,48 @@ class Surfaces:
         return Surfaces(self.place_m[index], self.cov_m2[index], self.normal[index], self.flat[index])
 
 
-def plain_shift_of(change: TileChange, base: Gaussians, parameters: ShiftParameters | None = None) -> Shift:
+def plain_shift_of(change: TileChange, base: Gaussians) -> Shift:
     """Test whether a small shift explains what a report says about a tile.
 
     Args:
         change: the report's part about the tile. Gaussians that were not asked for take no part.
         base: the tile's Gaussians that the vehicle compared with.
-        parameters: see `ShiftParameters`.
     """
-    parameters = parameters or ShiftParameters()
     grid = VoxelGrid.of(change.tile)
     there = change.changed.take(change.changed.exists)
-    if len(there) < parameters.least_gaussians or len(base) < parameters.least_gaussians:
+    if len(there) < SHIFT_LEAST_GAUSSIANS or len(base) < SHIFT_LEAST_GAUSSIANS:
         return Shift(False, len(there))
     surfaces, known = Surfaces.of(grid, _thinned(there)), Surfaces.of(grid, base)
     tree = cKDTree(known.place_m)
-    strange = surfaces.take(~fits(surfaces, known, tree, np.zeros(3), parameters))
-    if len(strange.place_m) < parameters.least_gaussians:
+    strange = surfaces.take(~fits(surfaces, known, tree, np.zeros(3)))
+    if len(strange.place_m) < SHIFT_LEAST_GAUSSIANS:
         return Shift(False, len(strange.place_m))
     is_seen, is_changed = (np.isin(base.voxel_id, ids) for ids in (change.observed, change.changed.voxel_id))
-    begin = searched(strange, known.take(is_seen & ~is_changed), known, tree, parameters)
-    motion = _refined(begin, strange, known, tree, parameters)
-    fit = float(fits(strange, known, tree, motion, parameters).mean())
-    others = [fits(strange, known, tree, other, parameters).mean() for other in _elsewhere(motion)]
+    begin = searched(strange, known.take(is_seen & ~is_changed), known, tree)
+    motion = _refined(begin, strange, known, tree)
+    fit = float(fits(strange, known, tree, motion).mean())
+    others = [fits(strange, known, tree, other).mean() for other in _elsewhere(motion)]
     chance = float(np.mean(others))
-    unchanged = _unchanged(known.take(is_seen), is_changed[is_seen], motion, parameters)
+    unchanged = _unchanged(known.take(is_seen), is_changed[is_seen], motion)
     found = Shift(False, len(strange.place_m), fit, chance, unchanged, *motion.tolist())
-    upwards = found if found.meets(parameters) else _raised(strange, known, tree, is_seen, is_changed, parameters)
-    return next((replace(one, is_explained=True) for one in (found, upwards) if one.meets(parameters)), found)
+    upwards = found if found.meets() else _raised(strange, known, tree, is_seen, is_changed)
+    return next((replace(one, is_explained=True) for one in (found, upwards) if one.meets()), found)
 
 
-def _raised(
-    strange: Surfaces, known: Surfaces, tree: cKDTree, is_seen: Mask, is_changed: Mask, parameters: ShiftParameters
-) -> Shift:
+def _raised(strange: Surfaces, known: Surfaces, tree: cKDTree, is_seen: Mask, is_changed: Mask) -> Shift:
     """The shift up or down that most level planes agree on, and what it explains."""
     level, ground = strange.take(strange.is_level), known.take(known.is_level)
-    if len(level.place_m) < parameters.least_gaussians or not len(ground.place_m):
+    if len(level.place_m) < SHIFT_LEAST_GAUSSIANS or not len(ground.place_m):
         return Shift(False, len(strange.place_m))
     near = cKDTree(ground.place_m[:, :2]).query_ball_point(level.place_m[:, :2], _BESIDE_M)
-    steps = np.arange(-parameters.max_m, parameters.max_m + _STEP_M / 2, _STEP_M)
+    steps = np.arange(-SHIFT_MAX_M, SHIFT_MAX_M + _STEP_M / 2, _STEP_M)
     votes = np.zeros(len(steps))
     for place, others in zip(level.place_m, near, strict=True):
         up_m = ground.place_m[others, 2] - place[2]
         votes += (np.abs(up_m[:, None] - steps) < _STEP_M).any(axis=0)
     best = float(steps[np.lexsort((np.abs(steps), -votes))[0]])
-    fit, chance = (
-        float(fits(strange.raised(up_m), known, tree, np.zeros(3), parameters).mean()) for up_m in (best, -best)
-    )
-    displaced = is_seen & known.is_level & (abs(best) > parameters.displaced_m)
+    fit, chance = (float(fits(strange.raised(up_m), known, tree, np.zeros(3)).mean()) for up_m in (best, -best))
+    displaced = is_seen & known.is_level & (abs(best) > SHIFT_DISPLACED_M)
     unchanged = float((~is_changed)[displaced].mean()) if displaced.any() else 1.0
     return Shift(False, len(strange.place_m), fit, chance, unchanged, up_m=best)
 
@@ -127,7 +128,7 @@ def moved(place_m: F64, motion: F64) -> F64:
     return np.stack([c * x - s * y + motion[0], s * x + c * y + motion[1], z], axis=1)
 
 
-def fits(surfaces: Surfaces, known: Surfaces, tree: cKDTree, motion: F64, parameters: ShiftParameters) -> Mask:
+def fits(surfaces: Surfaces, known: Surfaces, tree: cKDTree, motion: F64) -> Mask:
     """(N,) whether a surface, moved, is like one of the base Gaussians around it.
 
     Along a surface its mean lies where the voxel has cut it, so only what the means differ by along the base's normal
@@ -141,7 +142,7 @@ def fits(surfaces: Surfaces, known: Surfaces, tree: cKDTree, motion: F64, parame
     step = np.where((known.flat[other] > _FLAT)[:, None], along, step)
     yes = np.ones(len(row), bool)
     alike = similarity(yes, np.zeros_like(step), known.cov_m2[other], yes, step, surfaces.cov_m2[row])
-    return np.bincount(row, weights=alike >= parameters.fits, minlength=len(place)) > 0
+    return np.bincount(row, weights=alike >= SHIFT_FITS, minlength=len(place)) > 0
 
 
 def _pairs(place: F64, tree: cKDTree) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
@@ -151,16 +152,14 @@ def _pairs(place: F64, tree: cKDTree) -> tuple[NDArray[np.int64], NDArray[np.int
     return row, at[row, column]
 
 
-def searched(
-    surfaces: Surfaces, unchanged: Surfaces, known: Surfaces, tree: cKDTree, parameters: ShiftParameters
-) -> F64:
+def searched(surfaces: Surfaces, unchanged: Surfaces, known: Surfaces, tree: cKDTree) -> F64:
     """The shift (east, north, 0) that most upright planes agree on.
 
     Each pair of parallel planes votes for the shifts that lay one into the other, each surface that is reported
     unchanged against those that would displace it: along a straight street nothing else would tell how far. Of shifts
     that are as good the smallest.
     """
-    axis = np.arange(-parameters.max_m, parameters.max_m + _STEP_M / 2, _STEP_M)
+    axis = np.arange(-SHIFT_MAX_M, SHIFT_MAX_M + _STEP_M / 2, _STEP_M)
     steps = np.stack([values.ravel() for values in np.meshgrid(axis, axis)])
     upright = surfaces.take(surfaces.is_upright)
     votes = np.zeros(steps.shape[1])
@@ -174,32 +173,30 @@ def searched(
         beside = np.hypot(apart[:, :1] - steps[0], apart[:, 1:2] - steps[1]) < _BESIDE_M
         votes += ((np.abs(off) < _STEP_M) & beside & (np.abs(apart[:, 2:]) < _BESIDE_M)).any(axis=0)
     still = unchanged.take(unchanged.is_upright)
-    against = (np.abs(still.normal[:, :1] * steps[0] + still.normal[:, 1:2] * steps[1]) > parameters.displaced_m).sum(
-        axis=0
-    )
+    against = (np.abs(still.normal[:, :1] * steps[0] + still.normal[:, 1:2] * steps[1]) > SHIFT_DISPLACED_M).sum(axis=0)
     score = votes / max(len(upright.place_m), 1) - against / max(len(still.place_m), 1)
     score -= _FAR_PER_M * np.hypot(*steps)
     best = np.lexsort((steps[1], steps[0], -score))[0]
     return np.array([*steps[:, best], 0.0])
 
 
-def _refined(begin: F64, surfaces: Surfaces, known: Surfaces, tree: cKDTree, parameters: ShiftParameters) -> F64:
+def _refined(begin: F64, surfaces: Surfaces, known: Surfaces, tree: cKDTree) -> F64:
     """The motion after a few rounds of robust point-to-plane least squares, within the limits.
 
     One more measurement says that it is where it began: what no surface constrains, along a straight wall, stays there.
     """
-    motion, prior = begin, np.diag([1.0, 1.0, (_HUBER_M / parameters.max_rad) ** 2])
+    motion, prior = begin, np.diag([1.0, 1.0, (_HUBER_M / SHIFT_MAX_RAD) ** 2])
     for _ in range(_ROUNDS):
         place = moved(surfaces.place_m, motion)
         row, other, off = _nearest_planes(place, surfaces, known, tree)
-        if len(row) < parameters.least_gaussians // 2:
+        if len(row) < SHIFT_LEAST_GAUSSIANS // 2:
             break
         normal, arm = known.normal[other], place[row]
         jacobian = np.stack([normal[:, 0], normal[:, 1], normal[:, 1] * arm[:, 0] - normal[:, 0] * arm[:, 1]], axis=1)
         weight = np.minimum(1.0, _HUBER_M / np.maximum(np.abs(off), 1e-9))
         matrix = jacobian.T @ (weight[:, None] * jacobian) + prior
         motion = motion + np.linalg.solve(matrix, -jacobian.T @ (weight * off) - prior @ (motion - begin))
-    limit = np.array([parameters.max_m, parameters.max_m, parameters.max_rad])
+    limit = np.array([SHIFT_MAX_M, SHIFT_MAX_M, SHIFT_MAX_RAD])
     return np.asarray(np.clip(motion, -limit, limit))
 
 
@@ -225,8 +222,8 @@ def _elsewhere(motion: F64) -> list[F64]:
     return [np.array([-y, x, -turn]), np.array([-x, -y, -turn]), np.array([y, -x, -turn])]
 
 
-def _unchanged(seen: Surfaces, is_changed: Mask, motion: F64, parameters: ShiftParameters) -> float:
+def _unchanged(seen: Surfaces, is_changed: Mask, motion: F64) -> float:
     """Of the observed surfaces that the motion would have displaced, the share reported unchanged; 0 of none."""
     step = moved(seen.place_m, motion) - seen.place_m
-    displaced = (np.abs(np.einsum("ni,ni->n", step, seen.normal)) > parameters.displaced_m) & (seen.flat > _FLAT)
+    displaced = (np.abs(np.einsum("ni,ni->n", step, seen.normal)) > SHIFT_DISPLACED_M) & (seen.flat > _FLAT)
     return float((~is_changed)[displaced].mean()) if displaced.any() else 0.0

@@ -12,7 +12,7 @@ from street_corner import WALLS, displaced, mapped, seen_as, street
 
 from gnd.cloud_merger.belief import believed
 from gnd.cloud_merger.config import ShardConfig
-from gnd.cloud_merger.shift import ShiftParameters, shift_of
+from gnd.cloud_merger.shift import shift_of
 from gnd.cloud_merger.statements import Report
 from gnd.cloud_merger.work import Worker
 from gnd.gnd_map.tile import Tile
@@ -28,12 +28,11 @@ OFF = displaced(street(1), 0.3, 0.1)
 SHIFTED = seen_as(BASE, OFF)
 HONEST = seen_as(BASE, street(2))
 REBUILT = seen_as(BASE, street(3, (*WALLS, (0, -3.0), (1, 2.0))))
-P = ShiftParameters()
 
 
 def sorted_out(*reports, named=frozenset()):
     shifts = {one.report_id: shift_of(one.change, BASE) for one in reports}
-    return believed(reports, shifts, P, named)
+    return believed(reports, shifts, named)
 
 
 def by(vehicle, change, number=1):

@@ -177,7 +177,7 @@ def test_on_new_ground_only_doubts_about_the_poses_count(reasons, on_the_map, on
 
 @pytest.mark.parametrize(
     "bad",
-    [{"few_voxels": -1}, {"together_voxels": 0}, {"few_share": 1.5}, {"vouched_share": -0.1}, {"second_drive_s": 0.0}],
+    [{"few_voxels": -1}, {"together_voxels": 0}, {"few_share": 1.5}],
 )
 def test_parameters_out_of_range_are_refused(bad):
     with pytest.raises(MergerError, match=next(iter(bad))):

@@ -171,6 +171,19 @@ def test_parameters_come_back_from_their_text_and_say_when_they_cannot():
             with_text(ShardConfig(), json.dumps(wrong))
 
 
+def test_constants_travel_as_the_parameters_that_they_were(tmp_path):
+    """Stores of releases in which they could be set are read: where one was set, it is named."""
+    text = text_of(ShardConfig())
+    assert digest_of(text) == "fec419397cc2370937fc8a2786944d7487ac42eabbef8353687dbe22f00cbc94"
+    said = json.loads(text)
+    assert said["shift"]["max_m"] == 1.0
+    said["shift"]["max_m"] = 0.5
+    with pytest.raises(MergerError, match=r"shift\.max_m is 0\.5; it is 1\.0 in this release"):
+        with_text(ShardConfig(), json.dumps(said))
+    del said["shift"]["max_m"]  # an older text that lacks it
+    assert with_text(ShardConfig(), json.dumps(said)) == ShardConfig()
+
+
 def test_a_text_stands_in_the_store_once(cloud):
     cloud.sees(crowd(3), THREE, base=gaussians_of(BASE))
     cloud.sees(crowd(4), {7: POLE}, later_s=4000)

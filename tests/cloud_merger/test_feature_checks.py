@@ -117,13 +117,8 @@ def test_verdicts_on_what_the_version_has_not_are_refused():
 @pytest.mark.parametrize(
     "wrong",
     [
-        {"min_sigma_m": 0.0},
-        {"max_sigma_m": 1e-4},
-        {"max_outside_m": -1.0},
         {"max_features_of_tile": 0},
-        {"min_verdicts": 0},
-        {"max_deleted_share": 0.0},
-        {"duplicate_m": -0.1},
+        {"max_vertices": 0},
     ],
 )
 def test_limits_without_meaning_are_refused(wrong):

@@ -352,16 +352,11 @@ def test_masses_never_become_so_sure_that_nothing_could_change_them():
     [
         {"gate": 1.0},
         {"reach_m": 0.0},
-        {"moved_m": -1.0},
         {"min_vehicles": 1},
-        {"voters": 1},
+        {"min_vehicles": 7},
         {"reliability": 1.0},
         {"repeat_correlation": 1.1},
         {"renewal_gain": 0.5},
-        {"renewal_mass": 0.0},
-        {"max_begun": 0},
-        {"most_weight": 0.5},
-        {"ceiling": 1.0},
     ],
 )
 def test_parameters_without_meaning_are_refused(wrong):

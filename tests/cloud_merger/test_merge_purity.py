@@ -22,7 +22,15 @@ from merger_world import (
 from sklearn.cluster import DBSCAN
 
 from gnd.cloud_merger.config import ShardConfig
-from gnd.cloud_merger.merge import MergeParameters, merge_tile
+from gnd.cloud_merger.merge import (
+    MERGE_D_DENIED,
+    MERGE_D_RENEWED,
+    MERGE_D_UPDATE,
+    MERGE_XI_RESHAPED,
+    MergeParameters,
+    merge_tile,
+)
+from gnd.cloud_merger.parameters import MERGE_NOISE_M
 from gnd.cloud_merger.statements import Report, statements_of
 from gnd.cloud_merger.work import Worker
 from gnd.gnd_map.classes import ChangeClass
@@ -108,7 +116,7 @@ def plain_similarity(a, b, parameters, pose_m2=0.0):
     def one(g):
         return np.array([len(g) > 0]), *(g.columns[3:] if len(g) else (np.zeros((1, 3)), np.zeros((1, 6))))
 
-    return float(similarity(*one(a), *one(b), parameters.mode, (parameters.noise_m**2 + pose_m2) ** 0.5)[0])
+    return float(similarity(*one(a), *one(b), parameters.mode, (MERGE_NOISE_M**2 + pose_m2) ** 0.5)[0])
 
 
 def plain_decision(was, votes, parameters):
@@ -129,11 +137,11 @@ def plain_decision(was, votes, parameters):
     members = [vote for vote, cluster in zip(votes, label, strict=True) if cluster == winner]
     denying = sum((measured or state is None) and len(was) > 0 and base == was for _, state, measured, base in members)
     denied = 2 * denying > len(members)
-    if not sizes[winner] > (parameters.xi_reshaped if denied else parameters.xi) * weight.sum():
+    if not sizes[winner] > (MERGE_XI_RESHAPED if denied else parameters.xi) * weight.sum():
         return None
     now, pose_m2 = plain_representative(members, parameters)
     quotes = sum(quotes_epoch(was, vote) for vote in members)
-    limit = parameters.d_denied if denied else parameters.d_update
+    limit = MERGE_D_DENIED if denied else MERGE_D_UPDATE
     if plain_similarity(was, now, parameters, pose_m2) >= limit or 2 * quotes >= len(members):
         return None
     return now, tuple(report_id for (report_id, *_), *_ in members)
@@ -161,14 +169,14 @@ def plain_representative(members, parameters):
     if not measured:
         return members[0][1], 0.0
     best = min(pose_m2 for _, pose_m2 in measured)
-    measured = [(state, pose_m2) for state, pose_m2 in measured if pose_m2 <= best + parameters.noise_m**2]
+    measured = [(state, pose_m2) for state, pose_m2 in measured if pose_m2 <= best + MERGE_NOISE_M**2]
     if parameters.mode == "paper":
         return plain_moments(measured)
     found = measured[0]
     for n in (2, 4, 8):
         if n <= len(measured):
             anew = plain_moments(measured[:n])
-            if plain_similarity(found[0], anew[0], parameters, found[1] + anew[1]) < parameters.d_renewed:
+            if plain_similarity(found[0], anew[0], parameters, found[1] + anew[1]) < MERGE_D_RENEWED:
                 found = anew
     return found
 

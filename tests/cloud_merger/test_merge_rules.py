@@ -17,6 +17,7 @@ from merger_world import (
     sha_of,
 )
 
+from gnd.cloud_merger import merge
 from gnd.cloud_merger.errors import MergerError
 from gnd.cloud_merger.merge import MergeParameters, merge_tile
 from gnd.cloud_merger.statements import Report, statements_of
@@ -81,10 +82,11 @@ def test_the_share_must_exceed_xi_not_only_reach_it():
     assert merged([yes, yes, yes, no, no], xi=0.59).changed.tolist() == [2]
 
 
-def test_the_biggest_cluster_wins_and_is_represented_by_its_moments():
+def test_the_biggest_cluster_wins_and_is_represented_by_its_moments(monkeypatch):
+    monkeypatch.setattr(merge, "MERGE_D_RENEWED", 1.0)
     one = gaussians_of({1: POLE}, count=100, cells=40)
     two = gaussians_of({1: (*POLE[:2], 0.05, *POLE[3:])}, count=300, cells=55)
-    result = merged([change_of(EPOCH, [1], g) for g in (one, gaussians_of({1: BALL}), two)], xi=0.5, d_renewed=1.0)
+    result = merged([change_of(EPOCH, [1], g) for g in (one, gaussians_of({1: BALL}), two)], xi=0.5)
     expected = (Moments.of(one) + Moments.of(two)).to_gaussians([1])
     got = result.gaussians.select([1])
     assert (got.count.tolist(), got.cells.tolist()) == ([400], [55])
@@ -93,9 +95,11 @@ def test_the_biggest_cluster_wins_and_is_represented_by_its_moments():
     assert result.provenance == {1: (report_id(0), report_id(2))}
 
 
-def test_a_representative_is_looked_at_anew_when_its_measurements_have_doubled():
+def test_a_representative_is_looked_at_anew_when_its_measurements_have_doubled(monkeypatch):
     poles = [change_of(EPOCH, [2], {2: (-0.3, 0.2, 0.01 * k, *POLE[3:])}) for k in range(9)]
-    counts = [merged(poles[:n], d_renewed=1.0).gaussians.select([2]).count[0] // 200 for n in range(1, 10)]
+    with monkeypatch.context() as patch:
+        patch.setattr(merge, "MERGE_D_RENEWED", 1.0)
+        counts = [merged(poles[:n]).gaussians.select([2]).count[0] // 200 for n in range(1, 10)]
     assert counts == [1, 2, 2, 4, 4, 4, 4, 8, 8]
     assert merged(poles[:4]).gaussians == merged(poles[:7]).gaussians
     assert merged(poles[:7]).provenance[2] == tuple(map(report_id, range(7)))
@@ -235,7 +239,7 @@ def test_paper_mode_takes_the_same_shape_only():
 
 @pytest.mark.parametrize(
     ("name", "value"),
-    [("mode", "best"), ("eps", 0.0), ("eps", 1.0), ("min_samples", 0), ("xi", 1.0), ("xi", -0.1), ("d_update", 1.1)],
+    [("mode", "best"), ("eps", 0.0), ("eps", 1.0), ("min_samples", 0), ("xi", 1.0), ("xi", -0.1)],
 )
 def test_absurd_parameters_are_refused(name, value):
     with pytest.raises(MergerError, match=name):
@@ -281,7 +285,7 @@ def test_good_poses_weigh_the_same_and_add_nothing():
 
 
 def test_a_vote_weighs_less_the_worse_its_poses_are():
-    change, p = change_of(EPOCH, [2], {2: POLE}), MergeParameters(pose_weight_m=0.1, pose_lever_m=20.0)
+    change, p = change_of(EPOCH, [2], {2: POLE}), MergeParameters(pose_weight_m=0.1)
     worse = p.report_of(report_id(0), "VLP-16", posed(change, np.hypot(0.05, 0.1)))
     assert worse.weight == pytest.approx(0.5)
     assert worse.pose_m2 == pytest.approx(0.01)
@@ -323,19 +327,20 @@ def test_the_gaussian_is_taken_from_those_who_knew_their_place():
     assert merged_as_reported(vague).gaussians.select([2]).mean_m[0, 0] == np.float32(shifted[0])
 
 
-@pytest.mark.parametrize("bad", [{"pose_lever_m": -1.0}, {"pose_weight_m": float("nan")}])
+@pytest.mark.parametrize("bad", [{"pose_weight_m": -1.0}, {"pose_weight_m": float("nan")}])
 def test_lengths_of_poses_out_of_range_are_refused(bad):
     with pytest.raises(MergerError, match=next(iter(bad))):
         MergeParameters(**bad)
 
 
-def test_a_denied_voxel_needs_the_lower_share():
+def test_a_denied_voxel_needs_the_lower_share(monkeypatch):
     denies, quotes = change_of(EPOCH, [0, 1], {1: POLE}), change_of(EPOCH, [0, 1], {})
     assert merged([denies] * 5 + [quotes] * 4).changed.tolist() == [1]
-    assert merged([denies] * 5 + [quotes] * 4, xi_reshaped=0.6).gaussians == EPOCH
+    monkeypatch.setattr(merge, "MERGE_XI_RESHAPED", 0.6)
+    assert merged([denies] * 5 + [quotes] * 4).gaussians == EPOCH
 
 
-@pytest.mark.parametrize("bad", [{"xi": 1.0}, {"xi_reshaped": -0.1}, {"d_update": 1.5}, {"d_denied": 2.0}])
+@pytest.mark.parametrize("bad", [{"xi": 1.0}, {"xi": -0.1}, {"eps": 1.0}])
 def test_shares_and_limits_out_of_range_are_refused(bad):
     with pytest.raises(MergerError, match=next(iter(bad))):
         MergeParameters(**bad)

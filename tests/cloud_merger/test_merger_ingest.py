@@ -245,7 +245,5 @@ def test_many_threads_may_report_and_look_at_once(store, desk):
 
 
 def test_absurd_limits_are_refused():
-    with pytest.raises(MergerError, match="max_mean_m"):
-        IngestLimits(max_mean_m=0.0)
     with pytest.raises(MergerError, match="reach_tiles"):
         IngestLimits(reach_tiles=-1)

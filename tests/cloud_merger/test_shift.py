@@ -12,8 +12,7 @@ from scipy.spatial import cKDTree
 from street_corner import WALLS, displaced, mapped, seen_as, street
 
 from gnd.cloud_merger import shift_kernels
-from gnd.cloud_merger.errors import MergerError
-from gnd.cloud_merger.shift import Shift, ShiftParameters, _fits, _Surfaces, shift_of
+from gnd.cloud_merger.shift import SHIFT_FITS, SHIFT_LEAST_GAUSSIANS, Shift, _fits, _Surfaces, shift_of
 from gnd.gnd_map.gaussian import Gaussians, concat
 from gnd.gnd_map.grid import VoxelGrid
 from gnd.gnd_map.similarity import similarity
@@ -54,7 +53,7 @@ def test_a_road_of_which_half_was_raised_is_no_shift():
 def test_an_unchanged_street_says_nothing():
     found = shift_of(seen_as(BASE, street(2)), BASE)
     assert not found.is_explained
-    assert found.gaussians < ShiftParameters().least_gaussians
+    assert found.gaussians < SHIFT_LEAST_GAUSSIANS
 
 
 @pytest.mark.parametrize(
@@ -102,7 +101,7 @@ def test_it_is_a_pure_function():
     assert shift_of(change, BASE) == shift_of(replace(change), BASE.take(np.arange(len(BASE))))
 
 
-def plain_fits(surfaces, known, motion, parameters):
+def plain_fits(surfaces, known, motion):
     """One pair at a time, all base Gaussians within a metre."""
     found = []
     for place, cov in zip(moved(surfaces.place_m, motion), surfaces.cov_m2, strict=True):
@@ -115,7 +114,7 @@ def plain_fits(surfaces, known, motion, parameters):
                 step = (step @ known.normal[k]) * known.normal[k]
             yes, zero = np.ones(1, bool), np.zeros((1, 3))
             best = max(best, similarity(yes, zero, known.cov_m2[k][None], yes, step[None], cov[None])[0])
-        found.append(best >= parameters.fits)
+        found.append(best >= SHIFT_FITS)
     return found
 
 
@@ -125,10 +124,10 @@ def test_what_fits_is_what_the_plain_twin_says(east_m, north_m, turn_rad):
     grid = VoxelGrid.of(TILE)
     known, plain = _Surfaces.of(grid, BASE), Surfaces.of(grid, BASE)
     rows = np.arange(0, len(BASE), 60)
-    motion, parameters = np.array([east_m, north_m, turn_rad]), ShiftParameters()
-    found = _fits(_Surfaces.of(grid, BASE, rows), known, motion, parameters).tolist()
-    assert found == plain_fits(plain.take(rows), plain, motion, parameters)
-    assert found == fits(plain.take(rows), plain, cKDTree(plain.place_m), motion, parameters).tolist()
+    motion = np.array([east_m, north_m, turn_rad])
+    found = _fits(_Surfaces.of(grid, BASE, rows), known, motion).tolist()
+    assert found == plain_fits(plain.take(rows), plain, motion)
+    assert found == fits(plain.take(rows), plain, cKDTree(plain.place_m), motion).tolist()
 
 
 @settings(max_examples=25, deadline=None)
@@ -182,9 +181,3 @@ def test_buckets_find_what_a_tree_finds(seed, spread_m):
     n = shift_kernels._nearest(*at, place, shift_kernels.buckets_of(place), found, off)
     distance, nearest = tree.query(at, k=12, distance_upper_bound=1.0)
     assert sorted(found[:n].tolist()) == sorted(nearest[np.isfinite(distance)].tolist())
-
-
-@pytest.mark.parametrize("bad", [{"max_m": 0.0}, {"fits": 1.2}, {"least_gaussians": 2}, {"displaced_m": float("nan")}])
-def test_parameters_out_of_range_are_refused(bad):
-    with pytest.raises(MergerError, match=next(iter(bad))):
-        ShiftParameters(**bad)

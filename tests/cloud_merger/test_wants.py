@@ -137,11 +137,11 @@ def test_of_many_outvoted_flags_some_are_asked_for_to_test_the_poses():
 
 
 def test_absurd_parameters_are_refused():
-    with pytest.raises(MergerError, match="sample must be at least 0, got -1"):
+    with pytest.raises(MergerError, match="sample = -1 lies outside ≥ 0"):
         WantParameters(sample=-1)
-    with pytest.raises(MergerError, match="share must lie in"):
+    with pytest.raises(MergerError, match=r"share = 1\.5 lies outside 0 … 1"):
         WantParameters(share=1.5)
-    with pytest.raises(MergerError, match="enough must be at least 0, got -1"):
+    with pytest.raises(MergerError, match="enough = -1 lies outside ≥ 0"):
         WantParameters(enough=-1)
 
 

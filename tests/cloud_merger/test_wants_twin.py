@@ -9,6 +9,7 @@ from merger_world import TILE, change_of, gaussians_of
 
 from gnd.cloud_merger.expanding import is_askable
 from gnd.cloud_merger.memory import VOXEL, TileMemory
+from gnd.cloud_merger.merge import MERGE_XI_RESHAPED
 from gnd.cloud_merger.parameters import MergeParameters
 from gnd.cloud_merger.statements import Kind, Report, statements_of
 from gnd.cloud_merger.votes import TileVotes
@@ -39,7 +40,7 @@ def by_statements(own, reports, known, merge, want):
     cast = own.weight + np.bincount(seat, rows["weight"], len(ids))
     measured = may_agree & (rows["kind"] == Kind.MEASURED) & (rows["was"] == was[seat])
     in_hand = np.bincount(seat, measured, len(ids)) + _promised(known.promised, ids)
-    xi = np.where(modified & (merge.mode == "default"), merge.xi_reshaped, merge.xi)
+    xi = np.where(modified & (merge.mode == "default"), MERGE_XI_RESHAPED, merge.xi)
     may_win = votes > want.share * xi * cast
     anyway = _sample(~may_win, 0 if merge.mode == "paper" else want.sample)
     return (may_win & (in_hand < want.enough)) | anyway

@@ -4,7 +4,7 @@ import pytest
 
 from gnd.deploy.errors import DeployError
 from gnd.deploy.fleet_config import FleetConfig, load_fleet_config
-from gnd.gnd_map.errors import GndError
+from gnd.gnd_map.errors import ConfigError, GndError
 
 
 def test_the_shipped_file_holds_the_defaults() -> None:
@@ -46,9 +46,9 @@ def test_values_out_of_range_are_refused(overrides: dict[str, object]) -> None:
 def test_a_broken_file_is_refused(tmp_path: Path) -> None:
     path = tmp_path / "fleet.toml"
     path.write_text("agents = = 3")
-    with pytest.raises(DeployError, match="no valid TOML"):
+    with pytest.raises(ConfigError, match="no valid TOML"):
         load_fleet_config(path, {})
-    with pytest.raises(DeployError, match="cannot read"):
+    with pytest.raises(ConfigError, match="cannot read"):
         load_fleet_config(tmp_path / "missing.toml", {})
 
 

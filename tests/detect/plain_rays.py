@@ -9,6 +9,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from gnd.vehicle_agent.detect import kernel, records
+from gnd.vehicle_agent.detect.parameters import INCLUDED_M
+
 
 @dataclass
 class PlainMap:
@@ -80,7 +83,7 @@ class PlainDetector:
         if self.pose is None:
             return 0.0
         end = self.pose.sigma_m**2 + (self.pose.sigma_rad * length) ** 2
-        return max(end - self.p.soft.included_m**2, 0.0)
+        return max(end - INCLUDED_M**2, 0.0)
 
     def _pass(self, voxel, origin, point, t_in, t_out, length, s2) -> None:
         row = self.world.index[voxel]
@@ -92,27 +95,27 @@ class PlainDetector:
 
     def _passes(self, row, origin, point, t_in, t_out, length, s2) -> bool:
         v, mean = point - origin, self.world.mean[row]
-        cov = self.world.cov[row] + np.eye(3) * self.p.pass_noise_m**2
+        cov = self.world.cov[row] + np.eye(3) * records._PASS_NOISE_M**2
         values, vectors = np.linalg.eigh(cov)
-        if self.p.passing_rule == "plane" and values[1] >= self.p.planar_ratio * values[0]:
+        if self.p.passing_rule == "plane" and values[1] >= records._PLANAR_RATIO * values[0]:
             normal = vectors[:, 0]
             t = normal @ (mean - origin) / (normal @ v)
-            behind = math.hypot(self.p.beyond_m, self.p.soft.beyond_sigmas * math.sqrt(s2))
+            behind = math.hypot(kernel._BEYOND_M, kernel._BEYOND_SIGMAS * math.sqrt(s2) if self.p.soft else 0.0)
             if not t_in <= t <= t_out or (1 - t) * abs(normal @ v) <= behind:
                 return False
-            return self.world.r2(row, origin + t * v, self.p.pass_noise_m) <= self.quantile(self.p.eta_plane)
+            return self.world.r2(row, origin + t * v, records._PASS_NOISE_M) <= self.quantile(kernel._ETA_PLANE)
         information = np.linalg.inv(cov)
         t = min(max(v @ information @ (mean - origin) / (v @ information @ v), t_in), t_out)
-        if self.p.passing_rule != "ml" and (1 - t) * length < self.p.ahead_m:
+        if self.p.passing_rule != "ml" and (1 - t) * length < kernel._AHEAD_M:
             return False
-        return self.world.r2(row, origin + t * v, self.p.pass_noise_m) <= self.quantile(self.p.eta_pass)
+        return self.world.r2(row, origin + t * v, records._PASS_NOISE_M) <= self.quantile(self.p.eta_pass)
 
     def _block(self, voxel, point, g, s2) -> None:
         row = self.world.index[voxel]
         if row < -1:
             return
         noise2 = self.p.block_noise_m**2
-        limit = self.quantile(self.p.eta_block) * (noise2 + self.p.soft.block * s2) / noise2
+        limit = self.quantile(kernel._ETA_BLOCK) * (noise2 + (s2 if self.p.soft else 0.0)) / noise2
         if row >= 0 and self.world.r2(row, point, self.p.block_noise_m) <= limit:
             self.bi[row] += 1
         elif self._explained(voxel, point, g):
@@ -131,6 +134,6 @@ class PlainDetector:
             if step == 0 or not is_inside_window(tuple(beside), self.world.shape):
                 continue
             row = self.world.index[tuple(beside)]
-            if row >= 0 and self.world.r2(row, point, self.p.block_noise_m) <= self.p.face_sigma**2:
+            if row >= 0 and self.world.r2(row, point, self.p.block_noise_m) <= kernel._FACE_SIGMA**2:
                 return True
         return False

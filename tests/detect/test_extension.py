@@ -7,8 +7,7 @@ from vehicle_scene import FIGURE_2
 from gnd.gnd_map.gaussian import Gaussians
 from gnd.gnd_map.grid import VoxelGrid
 from gnd.gnd_map.tile import Tile
-from gnd.vehicle_agent.detect.extension import extends_neighbour
-from gnd.vehicle_agent.detect.parameters import DetectParameters
+from gnd.vehicle_agent.detect.extension import DETECT_EDGE_M, extends_neighbour
 from gnd.vehicle_agent.detect.records import planar_normals
 
 TILE = FIGURE_2[0]
@@ -40,37 +39,37 @@ def test_what_continues_the_plane_next_door(
     place: tuple[int, int, int], z_m: float, cov: tuple[float, ...], continues: bool
 ) -> None:
     base = Tile(TILE, 1, gaussians([(10, 10, 31)], [0.0], cov))
-    assert extends_neighbour(base, gaussians([place], [z_m]), DetectParameters()).tolist() == [continues]
+    assert extends_neighbour(base, gaussians([place], [z_m])).tolist() == [continues]
 
 
 def test_the_row_at_the_edge_of_the_tile_does_not_go_on_at_the_other_edge() -> None:
     base = Tile(TILE, 1, gaussians([(GRID.nx - 1, 10, 31)], [0.0]))
-    assert not extends_neighbour(base, gaussians([(0, 11, 31)], [0.0]), DetectParameters()).any()
+    assert not extends_neighbour(base, gaussians([(0, 11, 31)], [0.0])).any()
 
 
 def test_nothing_measured_or_nothing_mapped_is_no_edge() -> None:
     some = gaussians([(10, 10, 31)], [0.0])
-    assert extends_neighbour(Tile(TILE, 1, some), Gaussians.empty(), DetectParameters()).shape == (0,)
-    assert not extends_neighbour(Tile(TILE, 0, Gaussians.empty()), some, DetectParameters()).any()
+    assert extends_neighbour(Tile(TILE, 1, some), Gaussians.empty()).shape == (0,)
+    assert not extends_neighbour(Tile(TILE, 0, Gaussians.empty()), some).any()
 
 
 def test_a_plain_search_through_all_pairs_finds_the_same() -> None:
-    rng, p = np.random.default_rng(3), DetectParameters()
+    rng = np.random.default_rng(3)
     cells = [(x, y, f) for x in range(8) for y in range(8) for f in (30, 31, 32)]
     mapped = rng.random(len(cells)) < 0.3
     base = gaussians(
         [c for c, m in zip(cells, mapped, strict=True) if m], rng.uniform(-0.3, 0.3, mapped.sum()).tolist()
     )
     new = gaussians([c for c, m in zip(cells, mapped, strict=True) if not m], rng.uniform(-0.4, 0.4, (~mapped).sum()))
-    normal = planar_normals(base.full_cov(), p)
+    normal = planar_normals(base.full_cov())
     at = [np.stack(GRID.unravel(g.voxel_id), axis=1) for g in (base, new)]
     mean = [GRID.centre_m(g.voxel_id) + g.mean_m for g in (base, new)]
     expected = [
         any(
-            np.abs(at[0][j] - at[1][i]).max() == 1 and abs(normal[j] @ (mean[1][i] - mean[0][j])) <= p.edge_m
+            np.abs(at[0][j] - at[1][i]).max() == 1 and abs(normal[j] @ (mean[1][i] - mean[0][j])) <= DETECT_EDGE_M
             for j in range(len(base))
         )
         for i in range(len(new))
     ]
-    assert extends_neighbour(Tile(TILE, 1, base), new, p).tolist() == expected
+    assert extends_neighbour(Tile(TILE, 1, base), new).tolist() == expected
     assert 0 < sum(expected) < len(new)

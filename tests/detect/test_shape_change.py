@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from gnd.gnd_map.gaussian import Gaussians
-from gnd.vehicle_agent.detect.parameters import DetectParameters
+from gnd.vehicle_agent.detect.classify import DETECT_RESHAPED_LOG_ODDS
 from gnd.vehicle_agent.detect.shape_change import FEATURES, MONOTONE, Forest, ShapeModelError, fitted, shape_features
 from studies.fit_shape_change import Examples, fit, forest_of
 
@@ -64,7 +64,7 @@ def plates(offset_m: float, normal: int = 0) -> Gaussians:
 def test_a_plate_that_moved_or_turned_is_of_another_shape(now: Gaussians, outside: int, reshaped: bool) -> None:
     n_bi, n_bo, n_pi = (np.array([n], np.int32) for n in (250 - outside, outside, 0))
     odds = fitted().log_odds(shape_features(plates(0.0), now, n_bi, n_bo, n_pi))
-    assert (odds[0] > DetectParameters().reshaped_log_odds) == reshaped
+    assert (odds[0] > DETECT_RESHAPED_LOG_ODDS) == reshaped
 
 
 @pytest.mark.parametrize(

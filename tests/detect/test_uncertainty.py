@@ -12,7 +12,7 @@ from gnd.gnd_map.tile import Tile
 from gnd.gnd_map.tile_id import TileId
 from gnd.vehicle_agent.detect.classify import classify
 from gnd.vehicle_agent.detect.detector import ChangeDetector
-from gnd.vehicle_agent.detect.parameters import DetectParameterError, DetectParameters, SoftParameters
+from gnd.vehicle_agent.detect.parameters import DetectParameters
 from gnd.vehicle_agent.detect.uncertainty import PoseUncertainty, TileUncertainties, UncertaintyError
 from gnd.vehicle_agent.local_map import LocalMap
 from gnd.vehicle_agent.localise.estimates import PoseEstimate
@@ -140,9 +140,7 @@ def test_good_poses_change_nothing(tiles: Tiles, sigma_m: float) -> None:
     assert counted(tiles, PoseUncertainty(sigma_m)) == counted(tiles, PoseUncertainty())
 
 
-def changes_called(
-    tiles: Tiles, walls: list[tuple[float, float, float, float]], soft: SoftParameters
-) -> dict[str, int]:
+def changes_called(tiles: Tiles, walls: list[tuple[float, float, float, float]], soft: bool) -> dict[str, int]:
     """Classes that ten scans give whose poses are off by 10 cm along each axis, known to 10 cm and 0.15 degrees."""
     rng, classes = np.random.default_rng(5), np.zeros(6, np.int64)
     detector = detector_of(tiles, replace(DetectParameters(), soft=soft))
@@ -156,7 +154,7 @@ def changes_called(
 
 def test_an_unchanged_place_seen_from_uncertain_poses_is_called_changed_less_often(tiles: Tiles) -> None:
     place = [(9.3, -8.0, 8.0, 4.0)]
-    soft, hard = (changes_called(tiles, place, s) for s in (SoftParameters(), SoftParameters.off()))
+    soft, hard = (changes_called(tiles, place, s) for s in (True, False))
     assert hard["modified"] > 20
     assert soft["modified"] < 0.5 * hard["modified"]
     assert soft["deleted"] <= hard["deleted"]
@@ -165,7 +163,7 @@ def test_an_unchanged_place_seen_from_uncertain_poses_is_called_changed_less_oft
 
 def test_what_has_gone_and_what_is_new_is_found_all_the_same(tiles: Tiles) -> None:
     place = [(13.4, -8.0, 8.0, 4.0)]  # the wall stands four metres farther back now
-    soft, hard = (changes_called(tiles, place, s) for s in (SoftParameters(), SoftParameters.off()))
+    soft, hard = (changes_called(tiles, place, s) for s in (True, False))
     for name in ("deleted", "new"):
         assert hard[name] > 20
         assert soft[name] >= 0.9 * hard[name]
@@ -173,10 +171,5 @@ def test_what_has_gone_and_what_is_new_is_found_all_the_same(tiles: Tiles) -> No
 
 def test_paper_mode_takes_every_pose_for_exact(tiles: Tiles) -> None:
     paper = DetectParameters.paper()
-    assert paper.soft == SoftParameters.off()
+    assert not paper.soft
     assert counted(tiles, PoseUncertainty(0.12), paper) == counted(tiles, PoseUncertainty(), paper)
-
-
-def test_softening_out_of_range_is_refused_with_its_value() -> None:
-    with pytest.raises(DetectParameterError, match=r"soft\.block = -1"):
-        replace(DetectParameters().soft, block=-1.0)

@@ -89,7 +89,7 @@ def test_every_kind_of_value() -> None:
         ({"vehicle": "a", "masses": 3}, "masses: expected a table of MassParameters, got int 3"),
         ({"vehicle": "a", "link": 3}, "link: expected one of str, Link"),
         ({"vehicle": "a", "limits": {"tiles": "x"}}, "limits.tiles: expected int"),
-        ({"vehicle": "a", "masses": {"lambda_s_block": 2.0}}, r"lambda_s_block = 2.0 is not in \[0, 1\)"),
+        ({"vehicle": "a", "masses": {"lambda_s_block": 2.0}}, "lambda_s_block = 2.0 lies outside ≥ 0 and < 1"),
     ],
 )
 def test_errors_name_the_place_and_what_is_known(mapping: dict[str, Any], message: str) -> None:

@@ -10,15 +10,16 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from gnd.gnd_map import visibility
 from gnd.gnd_map.classes import ChangeClass
 from gnd.gnd_map.codec import Flags
-from gnd.gnd_map.errors import ConfigError, TrackError
+from gnd.gnd_map.errors import TrackError
 from gnd.gnd_map.gaussian import Gaussians, full_matrices, six_entries
 from gnd.gnd_map.grid import VoxelGrid
 from gnd.gnd_map.sight import NO_SLOT, NOTHING, STOP, Columns, Window, cast_fans, fill, lay_out, pool, voxel_ids
 from gnd.gnd_map.tile_id import TileId
 from gnd.gnd_map.track import Piece, Track, View
-from gnd.gnd_map.visibility import VisibilityParameters, observed_along
+from gnd.gnd_map.visibility import observed_along
 
 COLUMNS, TILES_ALONG, FLOORS = (4, 5), (2, 2), 6
 METRES = np.array([0.97, 0.99, 1.0])
@@ -200,8 +201,8 @@ def told(*flagged, tile=WEST, base=STREET):
     return Flags(tile, base, np.array(ids, np.int32), np.array(classes, np.uint8))
 
 
-def seen(track=DRIVE, *flagged, **how):
-    return set(observed_along(track, [told(*flagged), told(tile=TILES[1])], **how)[WEST].tolist())
+def seen(track=DRIVE, *flagged):
+    return set(observed_along(track, [told(*flagged), told(tile=TILES[1])])[WEST].tolist())
 
 
 def share(found, rows, floor):
@@ -240,11 +241,13 @@ def test_what_is_flagged_is_always_observed_and_stops_lines_unless_it_is_gone():
     assert behind not in seen(DRIVE, *moved)
 
 
-def test_next_to_changes_more_rays_are_needed():
+def test_next_to_changes_more_rays_are_needed(monkeypatch):
     beside = [(voxel(15 + i, 18 + j, GROUND + 1), ChangeClass.NEW) for i, j in ((1, 0), (-1, 0), (0, 1))]
     air = voxel(15, 18, GROUND + 1)
-    assert air in seen(DRIVE, *beside, parameters=VisibilityParameters(passes_near=1.0))
-    assert air not in seen(DRIVE, *beside, parameters=VisibilityParameters(passes_near=1000.0))
+    monkeypatch.setattr(visibility, "_PASSES_NEAR", 1.0)
+    assert air in seen(DRIVE, *beside)
+    monkeypatch.setattr(visibility, "_PASSES_NEAR", 1000.0)
+    assert air not in seen(DRIVE, *beside)
 
 
 def test_a_sensor_that_looks_ahead_only_does_not_see_what_it_starts_beside():
@@ -254,9 +257,10 @@ def test_a_sensor_that_looks_ahead_only_does_not_see_what_it_starts_beside():
     assert start not in seen(Track(WEST.district, narrow, DRIVE.pieces))
 
 
-def test_where_there_is_no_map_nothing_stops_a_line():
+def test_where_there_is_no_map_nothing_stops_a_line(monkeypatch):
+    monkeypatch.setattr(visibility, "_OPEN_RAD", 1.0)
     empty = [told(base=Gaussians.empty()), told(tile=TILES[1], base=Gaussians.empty())]
-    found = observed_along(DRIVE, empty, VisibilityParameters(open_rad=1.0))
+    found = observed_along(DRIVE, empty)
     below = set(found[WEST].tolist())
     assert voxel(15, 18, GROUND + 1) in below
     assert voxel(15, WALL_ROW + 6, GROUND + 1) in below
@@ -306,12 +310,14 @@ def test_a_track_that_jumps_by_kilometres_is_refused_before_it_takes_memory():
         observed_along(Track(WEST.district, SEEN, tuple(pieces)), empty)
 
 
-def test_two_threads_look_at_once_and_a_third_goes_on():
+def test_two_threads_look_at_once_and_a_third_goes_on(monkeypatch):
     """Kernels run without the GIL. While two threads look along a drive, a third that only counts keeps most of its
     pace: with the GIL held it would stand still for whole looks.
     """
-    told_all, fine = [told(), told(tile=TILES[1])], VisibilityParameters(step_m=0.5, azimuths=960, lines=32)
-    observed_along(DRIVE, told_all, fine)
+    for name, value in (("_STEP_M", 0.5), ("_AZIMUTHS", 960), ("_LINES", 32)):
+        monkeypatch.setattr(visibility, name, value)
+    told_all = [told(), told(tile=TILES[1])]
+    observed_along(DRIVE, told_all)
     gaps_s, stop = [], threading.Event()
 
     def count():
@@ -322,10 +328,10 @@ def test_two_threads_look_at_once_and_a_third_goes_on():
             before = time.perf_counter()
 
     started = time.perf_counter()
-    observed_along(DRIVE, told_all, fine)
+    observed_along(DRIVE, told_all)
     alone_s = time.perf_counter() - started
     counter = threading.Thread(target=count)
-    lookers = [threading.Thread(target=observed_along, args=(DRIVE, told_all, fine)) for _ in range(2)]
+    lookers = [threading.Thread(target=observed_along, args=(DRIVE, told_all)) for _ in range(2)]
     for thread in (counter, *lookers):
         thread.start()
     for thread in lookers:
@@ -334,9 +340,3 @@ def test_two_threads_look_at_once_and_a_third_goes_on():
     counter.join()
     assert alone_s > 0.05  # else a gap would tell nothing
     assert max(gaps_s) < 0.5 * alone_s
-
-
-@pytest.mark.parametrize("name", ["step_m", "azimuths", "lines", "range_m", "noise_m", "r2", "hits_near"])
-def test_parameters_outside_their_range_are_refused_with_the_value(name):
-    with pytest.raises(ConfigError, match=f"{name} must lie in .* got -7"):
-        VisibilityParameters(**{name: -7})

@@ -177,5 +177,5 @@ def test_values_are_checked() -> None:
     assert table.sigma_up_m.tolist() == [5.0, 5.0]
     with pytest.raises(LocaliseError, match="sigma must be positive"):
         FixTable(table.t_ns, table.lat_rad, table.lon_rad, table.height_m, np.zeros(2), table.sigma_up_m)
-    with pytest.raises(ValueError, match="robust_k"):
-        GeoreferenceParameters(robust_k=0.0)
+    with pytest.raises(ValueError, match="inflation"):
+        GeoreferenceParameters(inflation=0.0)

@@ -4,7 +4,6 @@ import numpy as np
 import pytest
 
 from gnd.vehicle_agent.localise import witness
-from gnd.vehicle_agent.localise.doubt_parameters import CauseParameters
 from gnd.vehicle_agent.localise.health import HealthMonitor, named_directions
 from gnd.vehicle_agent.localise.parameters import HealthParameters
 from gnd.vehicle_agent.localise.registration import RegistrationResult
@@ -145,8 +144,10 @@ def test_directions_have_names():
 
 
 def test_settings_that_make_no_sense_are_refused():
-    with pytest.raises(ValueError, match="positive"):
-        CauseParameters(testimonies=0)
+    with pytest.raises(ValueError, match="must not exceed lost_after_s"):
+        HealthParameters(degraded_after_s=5.0)
+    with pytest.raises(ValueError, match=r"min_matching_ratio = 1\.5 lies outside 0 … 1"):
+        HealthParameters(min_matching_ratio=1.5)
 
 
 def elsewhere(monitor, t_ns, fit):

@@ -5,7 +5,6 @@ import pytest
 from yard import GROUND_M, local_map_of, match_map_of, offset, pose, rectangle, seen_from
 
 from gnd.gnd_map.se3 import T_inverse, transform
-from gnd.vehicle_agent.localise.doubt_parameters import HypothesisParameters, PoolParameters
 from gnd.vehicle_agent.localise.first_pose import FirstPose, Place
 from gnd.vehicle_agent.localise.hypotheses import Hypotheses
 from gnd.vehicle_agent.localise.initialise import Around, probabilities, search
@@ -113,7 +112,7 @@ def test_poses_that_run_into_each_other_become_one(yard_map, yard_points):
     T, par = pose(3.0, -2.0, 140.0), InitialiseParameters()
     m, points = match_map_of(yard_map), seen_from(np.random.default_rng(2), yard_points, T, 2500)
     found, _ = search(points, Around(T[:3, 3], 4.0), m, par, RegistrationParameters())
-    hypotheses = Hypotheses(HypothesisParameters(), RegistrationParameters())
+    hypotheses = Hypotheses(RegistrationParameters())
     hypotheses.add(found)
     hypotheses.add(found)
     assert len(hypotheses) <= len(found)
@@ -122,17 +121,16 @@ def test_poses_that_run_into_each_other_become_one(yard_map, yard_points):
 
 
 def test_probabilities_follow_fits_views_and_what_is_said_against():
-    par = HypothesisParameters()
-    one = probabilities(np.array([0.7, 0.6]), 1.0, par)
-    two = probabilities(np.array([0.7, 0.6]), 2.0, par)
+    one = probabilities(np.array([0.7, 0.6]), 1.0)
+    two = probabilities(np.array([0.7, 0.6]), 2.0)
     assert one[0] < two[0] < 1.0
     assert one.sum() < 1.0
-    assert probabilities(np.array([0.7, 0.6]), 1.0, par, np.array([20.0, 0.0]))[0] < 0.01
-    assert probabilities(np.array([0.1, 0.1]), 1.0, par).sum() < 0.01  # rather none of them
+    assert probabilities(np.array([0.7, 0.6]), 1.0, np.array([20.0, 0.0]))[0] < 0.01
+    assert probabilities(np.array([0.1, 0.1]), 1.0).sum() < 0.01  # rather none of them
 
 
 def test_a_pool_shows_the_last_scans_where_they_were_seen(yard_points):
-    rng, pool = np.random.default_rng(3), ScanPool(PoolParameters(every_m=1.0, reach_m=4.0))
+    rng, pool = np.random.default_rng(3), ScanPool(every_m=1.0, reach_m=4.0)
     poses = [pose(x, 0.3 * x, 4.0 * x) for x in np.arange(0.0, 9.0, 1.0)]
     before = poses[0]
     for T in poses:
@@ -146,7 +144,7 @@ def test_a_pool_shows_the_last_scans_where_they_were_seen(yard_points):
 
 
 def test_a_standing_pool_is_the_newest_scan(yard_points):
-    rng, pool, T = np.random.default_rng(3), ScanPool(PoolParameters()), pose(0.0, 0.0, 0.0)
+    rng, pool, T = np.random.default_rng(3), ScanPool(), pose(0.0, 0.0, 0.0)
     for _ in range(5):
         pool.push(seen_from(rng, yard_points, T, 800), np.eye(4))
     assert pool.stands

@@ -11,7 +11,7 @@ from gnd.vehicle_agent.localise.influence import FEW, SeenScan, _of_pieces, infl
 from gnd.vehicle_agent.localise.kernels import linearise, pulls
 from gnd.vehicle_agent.localise.parameters import RegistrationParameters
 from gnd.vehicle_agent.localise.refine import WINDOW, told_by_scans
-from gnd.vehicle_agent.localise.registration import linearised
+from gnd.vehicle_agent.localise.registration import REGISTRATION_GATE_PER_SCALE, linearised
 from gnd.vehicle_agent.localise.stretch import N_SHARED, Belief, Knot, Step, log_se3, shared_of, solve_stretch
 
 PAR = RegistrationParameters()
@@ -24,7 +24,7 @@ def test_the_pulls_of_all_pieces_are_the_gradient_and_the_information(yard_map, 
     rng = np.random.default_rng(1)
     T, m = pose(3.0, -2.0, 20.0), match_map_of(yard_map)
     points, along = seen_from(rng, yard_points[::7], T, 1500), rng.normal(size=(4, 6))
-    gate_m2 = (PAR.gate_per_scale * SCALE) ** 2
+    gate_m2 = (REGISTRATION_GATE_PER_SCALE * SCALE) ** 2
     there = (np.ascontiguousarray(T[:3, :3]), T[:3, 3].copy(), m.index, m.A, m.b, m.mean_m, m.information)
     H, g, pull, weight = np.zeros((6, 6)), np.zeros(6), np.zeros((len(m), 4)), np.zeros((len(m), 4))
     linearise(points, *there, SCALE**2, gate_m2, H, g)
@@ -55,7 +55,7 @@ def test_a_piece_that_decides_alone_does_not_prove_itself_right():
 def test_nothing_seen_changes_nothing(yard_map):
     T = pose(500.0, 500.0, 0.0)
     m, far = match_map_of(yard_map), np.zeros((100, 3))
-    seen = influence([SeenScan(far, linearised(far, T, m, PAR, SCALE), np.eye(3, 6))], m, PAR)
+    seen = influence([SeenScan(far, linearised(far, T, m, PAR, SCALE), np.eye(3, 6))], m)
     np.testing.assert_array_equal(seen.factor, 1.0)
 
 

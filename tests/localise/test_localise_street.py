@@ -9,7 +9,7 @@ from gnd.fleet_sim.drives import PERFECT, DriveConfig, simulate_drive
 from gnd.fleet_sim.street import street
 from gnd.vehicle_agent.importer import map_track, open_recording, write_drive
 from gnd.vehicle_agent.localise import LocalisationError, LocaliserParameters, localisation_error
-from gnd.vehicle_agent.localise.refine_parameters import RefineParameters
+from gnd.vehicle_agent.localise.parameters import RefineParameters
 
 SEED = 5  # of no street on which anything was tuned
 

@@ -10,8 +10,7 @@ from yard import FRAME, GROUND_M, local_map_of, match_map_of, offset, pose, seen
 from gnd.gnd_map.se3 import T_inverse, transform
 from gnd.schemas.drive import GnssFix, MotionSample, Scan
 from gnd.vehicle_agent.localise import Localiser, LocaliserParameters
-from gnd.vehicle_agent.localise.parameters import GraphParameters, RegistrationParameters
-from gnd.vehicle_agent.localise.refine_parameters import RefineParameters
+from gnd.vehicle_agent.localise.parameters import GraphParameters, RefineParameters, RegistrationParameters
 from gnd.vehicle_agent.localise.registration import fit_of
 
 S = 1_000_000_000

@@ -13,7 +13,7 @@ from gnd.schemas.drive import GnssFix, MotionSample, Scan
 from gnd.schemas.errors import BadValue
 from gnd.vehicle_agent.local_map import LocalMap
 from gnd.vehicle_agent.localise import Localiser, LocaliserParameters
-from gnd.vehicle_agent.localise.refine_parameters import RefineParameters
+from gnd.vehicle_agent.localise.parameters import RefineParameters
 
 S = 1_000_000_000
 SWEEP_NS = S // 10

@@ -4,7 +4,7 @@ import gtsam
 import numpy as np
 
 from gnd.gnd_map.se3 import exp_so3
-from gnd.vehicle_agent.localise.graph import MapMatch, Odometry, PoseGraph, Position
+from gnd.vehicle_agent.localise.graph import GRAPH_ROBUST_K, MapMatch, Odometry, PoseGraph, Position
 from gnd.vehicle_agent.localise.parameters import GraphParameters
 
 STEP_NS = 100_000_000
@@ -89,7 +89,7 @@ def test_gnss_bounds_what_nothing_else_tells():
 def test_agrees_with_one_batch_over_all_factors():
     """The oracle: Levenberg-Marquardt over every factor at once, nothing marginalised."""
     rng, factors, values = np.random.default_rng(0), gtsam.NonlinearFactorGraph(), gtsam.Values()
-    cauchy = gtsam.noiseModel.mEstimator.Cauchy.Create(GraphParameters().robust_k)
+    cauchy = gtsam.noiseModel.mEstimator.Cauchy.Create(GRAPH_ROBUST_K)
     noise = gtsam.noiseModel.Robust.Create(cauchy, gtsam.noiseModel.Gaussian.Covariance(MATCH_COVARIANCE))
     for k in range(60):
         factors.add(gtsam.PriorFactorPose3(k, gtsam.Pose3(noisy(rng, true_pose(k))), noise))

@@ -13,9 +13,13 @@ from gnd.vehicle_agent.localise.calibration import MotionTeacher
 from gnd.vehicle_agent.localise.graph import SmoothedPose
 from gnd.vehicle_agent.localise.match_map import MatchMapCache
 from gnd.vehicle_agent.localise.odometry import MotionBuffer
-from gnd.vehicle_agent.localise.parameters import GraphParameters, OdometryParameters, RegistrationParameters
-from gnd.vehicle_agent.localise.refine import Refiner, between
-from gnd.vehicle_agent.localise.refine_parameters import RefineParameters
+from gnd.vehicle_agent.localise.parameters import (
+    GraphParameters,
+    OdometryParameters,
+    RefineParameters,
+    RegistrationParameters,
+)
+from gnd.vehicle_agent.localise.refine import REFINE_LEARNT_DEGPS, Refiner, between
 
 S = 1_000_000_000
 EVERY_NS = S // 10
@@ -82,7 +86,7 @@ class Bench:
             points = seen_from(rng, self.surfaces[k % 7 :: 7], T, 1500)
             self.final += self.refiner.push(k, k * EVERY_NS, points, moved(rng, T, online_m, online_deg))
             self.waiting_s.append((k - (self.final[-1].number + 1 if self.final else 0)) * EVERY_NS / S)
-            self.learnt.append(self.teacher.uncertainty[1] < np.radians(self.refiner.parameters.learnt_degps))
+            self.learnt.append(self.teacher.uncertainty[1] < np.radians(REFINE_LEARNT_DEGPS))
         return self
 
     def errors(self, poses=None):

@@ -219,11 +219,9 @@ def test_points_in_tiles_that_are_not_held_do_not_count_against_the_match(yard_p
     assert part.matching_ratio > 0.95
 
 
-@pytest.mark.parametrize(
-    "values", [{"noise_m": 0.0}, {"scales": ()}, {"scales": (4.0, -1.0)}, {"min_matched": 3}, {"max_iterations": 0}]
-)
+@pytest.mark.parametrize("values", [{"noise_m": 0.0}, {"scales": ()}, {"scales": (4.0, -1.0)}, {"max_iterations": 0}])
 def test_parameters_that_cannot_work_are_refused(values):
-    with pytest.raises(ValueError, match="required"):
+    with pytest.raises(ValueError, match=r"required|lies outside"):
         RegistrationParameters(**values)
 
 

@@ -57,7 +57,7 @@ def test_every_ring_of_a_sensor_is_sampled():
 
 
 def test_parameters_that_cannot_work_are_refused():
-    with pytest.raises(ValueError, match="min_range_m < max_range_m"):
+    with pytest.raises(ValueError, match=r"min_range_m = 9\.0 must be less than max_range_m = 3\.0"):
         SamplingParameters(min_range_m=9.0, max_range_m=3.0)
 
 

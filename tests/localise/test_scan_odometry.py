@@ -7,11 +7,12 @@ import pytest
 from yard import GROUND_M, corridor, offset, pose, seen_from, yard
 
 from gnd.gnd_map.se3 import T_inverse, transform
+from gnd.vehicle_agent.localise import rolling_map
 from gnd.vehicle_agent.localise.kernels import tapered_information
 from gnd.vehicle_agent.localise.match_map import UNIFORM_VOXEL_M2
+from gnd.vehicle_agent.localise.parameters import ScanOdometryParameters
 from gnd.vehicle_agent.localise.rolling_map import RollingMap
 from gnd.vehicle_agent.localise.scan_odometry import ScanOdometry, ScanStep, joint_step
-from gnd.vehicle_agent.localise.scan_odometry_parameters import RollingMapParameters, ScanOdometryParameters
 
 STEP_NS = 100_000_000
 RINGLESS = ScanOdometryParameters(min_standing_share=0.0)  # points of the yard's ground lie in no rings
@@ -163,7 +164,7 @@ def test_a_scan_of_too_few_points_is_no_step(sweep):
 # --- the rolling map -------------------------------------------------------------------------------------------------
 
 
-def plain_map(scans, parameters, noise_m):
+def plain_map(scans, noise_m):
     """Shown voxels to (mean, covariance), summed point by point with the weights that fading gives."""
     held = {}
     for points in scans:
@@ -173,29 +174,28 @@ def plain_map(scans, parameters, noise_m):
         for v, ps in voxels.items():
             weights, old, cells = held.get(v, (np.empty(0), np.empty((0, 3)), set()))
             cells = cells | {tuple(np.floor((p - v) * 4).astype(int)) for p in ps}
-            held[v] = (np.r_[weights * parameters.fade, np.ones(len(ps))], np.r_[old, ps], cells)
+            held[v] = (np.r_[weights * rolling_map._FADE, np.ones(len(ps))], np.r_[old, ps], cells)
     shown = {}
     for v, (w, ps, cells) in held.items():
         mean = np.average(ps, axis=0, weights=w)
         cov = np.einsum("n,ni,nj->ij", w / w.sum(), ps - mean, ps - mean)
         values = np.sort(np.linalg.eigvalsh(cov))[::-1]
-        r = parameters.line_ratio
+        r = rolling_map._LINE_RATIO
         line = (
             values[0] * values[1] + values[0] * values[2] + values[1] * values[2] < r / (1 + r) ** 2 * cov.trace() ** 2
         )
-        if len(cells) >= parameters.min_cells and not (line and cov[2, 2] < parameters.upright**2 * cov.trace()):
+        if len(cells) >= rolling_map._MIN_CELLS and not (line and cov[2, 2] < rolling_map._UPRIGHT**2 * cov.trace()):
             shown[v] = mean, cov
     return shown
 
 
 def test_the_rolling_map_is_what_plain_sums_give(sweep):
-    parameters = RollingMapParameters()
-    rolling = RollingMap(parameters, 0.04)
+    rolling = RollingMap(0.04)
     rolling.clear(np.zeros(3))
     scans = [transform(true_pose(k), sweep(k)) for k in range(3)]
     for points in scans:
         rolling.add(points, np.zeros(3))
-    m, want = rolling.match_map(), plain_map(scans, parameters, 0.04)
+    m, want = rolling.match_map(), plain_map(scans, 0.04)
     at = np.argwhere(m.index >= 0)
     found = {tuple(np.round(a - m.b).astype(int)): m.index[tuple(a)] for a in at}
     assert found.keys() == want.keys()
@@ -209,7 +209,7 @@ def test_the_rolling_map_is_what_plain_sums_give(sweep):
 
 
 def test_one_ring_is_hidden_and_a_post_is_not():
-    rolling = RollingMap(RollingMapParameters(), 0.04)
+    rolling = RollingMap(0.04)
     rolling.clear(np.zeros(3))
     t = np.linspace(0.02, 0.98, 60)
     ring = np.column_stack([3.0 + t, 5.2 + 0.02 * t, np.full(60, 0.31)])
@@ -227,8 +227,7 @@ def test_one_ring_is_hidden_and_a_post_is_not():
 
 def test_the_window_follows_and_forgets(sweep):
     """What is left far behind goes; what is near stays as it was, at its place."""
-    parameters = RollingMapParameters(reach_m=30.0, keep_scans=3)
-    rolling = RollingMap(parameters, 0.04)
+    rolling = RollingMap(0.04, reach_m=30.0, keep_scans=3)
     rolling.clear(np.zeros(3))
     near = np.random.default_rng(1).uniform([14.0, -2.0, 0.0], [18.0, 2.0, 2.0], (3000, 3))
     behind = near - [40.0, 0.0, 0.0]
@@ -246,22 +245,14 @@ def test_the_window_follows_and_forgets(sweep):
 
 
 def test_a_full_map_takes_no_more_and_goes_on(sweep):
-    rolling = RollingMap(RollingMapParameters(max_voxels=100), 0.04)
+    rolling = RollingMap(0.04, max_voxels=100)
     rolling.clear(np.zeros(3))
     for k in range(6):
         rolling.add(transform(true_pose(k), sweep(k)), true_pose(k)[:3, 3])
     assert len(rolling) == 100
 
 
-@pytest.mark.parametrize(
-    "wrong", [{"fade": 0.0}, {"max_voxels": 0}, {"reach_m": 0.5}, {"height_m": 8.0}, {"reach_m": 1000.0}]
-)
-def test_settings_that_cannot_work_are_refused(wrong):
-    with pytest.raises(ValueError, match="required"):
-        RollingMapParameters(**wrong)
-
-
-@pytest.mark.parametrize("wrong", [{"n_points": 10}, {"gate_m": 0.0}, {"min_fit": 1.5}, {"first_scans": 0}])
-def test_odometry_settings_that_cannot_work_are_refused(wrong):
-    with pytest.raises(ValueError, match="required"):
-        ScanOdometryParameters(**wrong)
+@pytest.mark.parametrize("share", [-0.1, 1.0, float("nan")])
+def test_odometry_settings_that_cannot_work_are_refused(share):
+    with pytest.raises(ValueError, match=r"min_standing_share = .* lies outside ≥ 0 and < 1"):
+        ScanOdometryParameters(min_standing_share=share)

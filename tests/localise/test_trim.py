@@ -4,9 +4,8 @@ import numpy as np
 import pytest
 
 from gnd.vehicle_agent.localise.calibration import MAX_TRIM_RAD, MotionTeacher
-from gnd.vehicle_agent.localise.doubt_parameters import CauseParameters
 from gnd.vehicle_agent.localise.drift import Drift, Slope
-from gnd.vehicle_agent.localise.health import HealthMonitor
+from gnd.vehicle_agent.localise.health import HEALTH_GNSS_COUNT, HealthMonitor
 from gnd.vehicle_agent.localise.odometry import MotionBuffer
 from gnd.vehicle_agent.localise.parameters import HealthParameters, OdometryParameters
 
@@ -49,7 +48,7 @@ def test_a_header_that_is_likely_wrong_makes_the_heading_doubtful_until_it_is_kn
 
 
 def fitting(scans_prove):
-    monitor = HealthMonitor(HealthParameters(), 0, CauseParameters())
+    monitor = HealthMonitor(HealthParameters(), 0)
     monitor.scans_prove = scans_prove
     monitor.see_match(0.95, 0.95, np.empty((0, 6)))
     return monitor
@@ -69,6 +68,6 @@ def test_submaps_that_leave_no_doubt_overrule_a_rival_but_not_gnss():
     assert monitor.judge(0)[0] == "lost"
     monitor.certain = True
     assert monitor.judge(0)[0] == "good"
-    for _ in range(HealthParameters().gnss_count):
+    for _ in range(HEALTH_GNSS_COUNT):
         monitor.see_fix(np.array([60.0, 0.0]), 2.5)
     assert monitor.judge(0) == ("lost", "wrong_pose")

@@ -10,10 +10,15 @@ from gnd.vehicle_agent.localise import Localiser
 from gnd.vehicle_agent.localise.first_pose import Place
 from gnd.vehicle_agent.localise.health import HealthMonitor
 from gnd.vehicle_agent.localise.match_map import MatchMapCache
-from gnd.vehicle_agent.localise.parameters import HealthParameters, LocaliserParameters, RegistrationParameters
+from gnd.vehicle_agent.localise.parameters import (
+    HealthParameters,
+    LocaliserParameters,
+    RegistrationParameters,
+    UniquenessParameters,
+)
+from gnd.vehicle_agent.localise.registration import REGISTRATION_GATE_PER_SCALE
 from gnd.vehicle_agent.localise.scan_pool import standing_points
 from gnd.vehicle_agent.localise.uniqueness import Uniqueness, View, ahead, ahead_of_both, fits_at, patches_of
-from gnd.vehicle_agent.localise.uniqueness_parameters import UniquenessParameters
 
 PERIOD_M = 5.0
 ODD_FROM_M = 40.0
@@ -147,7 +152,7 @@ def test_the_kernel_agrees_with_its_plain_twin():
     m, par, T = match_map_of(local_map_of(points)), RegistrationParameters(), pose(1.0, -2.0, 10.0)
     seen = np.concatenate([seen_from(rng, points, T, 300), rng.uniform(-80, 80, (100, 3))])
     scale2 = par.scales[-1] ** 2
-    expected = [plain_fit(T[:3, :3] @ p + T[:3, 3], m, scale2, par.gate_per_scale**2 * scale2) for p in seen]
+    expected = [plain_fit(T[:3, :3] @ p + T[:3, 3], m, scale2, REGISTRATION_GATE_PER_SCALE**2 * scale2) for p in seen]
     fits = fits_at(seen, T, m, par)
     assert fits == pytest.approx(expected, abs=1e-12)
     assert 0.3 < fits[:300].mean() < 1.0
@@ -239,11 +244,3 @@ def test_the_localiser_calls_no_pose_good_before_it_has_seen_that_it_is_the_only
     assert not [x for x, _, health in online if health == "good" and x < ODD_FROM_M - REACH_M]
     if off_m == 0.0:
         assert online[-1][2] == "good"
-
-
-@pytest.mark.parametrize(
-    "bad", [{"won": 0.0}, {"won": 6.0}, {"way_m": float("nan")}, {"n_kept": 99}, {"every_m": 30.0}]
-)
-def test_parameters_check_themselves(bad):
-    with pytest.raises(ValueError, match=r"required|positive"):
-        UniquenessParameters(**bad)

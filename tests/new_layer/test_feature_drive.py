@@ -50,13 +50,9 @@ def test_looks_of_another_layer_or_sensor_are_not_taken(truth):
         (MotionNoise, "wheel_scale", 0.0),
         (MotionNoise, "slip_rad", -1.0),
         (GnssNoise, "correlation_s", 0.0),
-        (LandmarkParameters, "min_hits", 0),
-        (LandmarkParameters, "gate_chi2", -1.0),
-        (LaneParameters, "sigma_m", 0.0),
-        (LaneParameters, "information", 1.5),
-        (LaneParameters, "min_polylines", 0),
+        (LandmarkParameters, "robust_k", 0.0),
+        (LaneParameters, "map_sigma_m", -1.0),
         (NewLayerParameters, "rounds", 0),
-        (NewLayerParameters, "keyframe_m", 0.0),
     ],
 )
 def test_parameters_that_cannot_be_are_refused(kind, field, value):

@@ -11,7 +11,6 @@ from gnd.vehicle_agent.features.mapping.drive_nodes import DriveNodes
 from gnd.vehicle_agent.features.mapping.lane_looks import Polylines, choices, offsets
 from gnd.vehicle_agent.features.mapping.lane_map import LaneMap, gicp
 from gnd.vehicle_agent.features.mapping.lanes import LaneMatcher, logarithm, moved, solved
-from gnd.vehicle_agent.features.mapping.parameters import LaneParameters
 
 SHARP = Noise(lane_m=0.05, lane_rad=0.002)
 
@@ -87,9 +86,8 @@ def test_a_circle_lets_slide_along_it():
     radius, lines = 80.0, arc()
     A = np.zeros((1, 3, 3))
     polylines = np.stack([line[130:290:20][:8] for line in lines])
-    p = LaneParameters()
     o = offsets(Polylines(np.zeros(3, np.int64), polylines, np.tile([1.0, 0.04], (3, 1))), LaneMap.of(lines),
-                np.zeros((1, 3)), np.zeros((1, 3)), p)  # fmt: skip
+                np.zeros((1, 3)), np.zeros((1, 3)))  # fmt: skip
     for n in range(3):
         J = o.by_pose[n, np.argmin(o.cost[n])]
         A[0] += J.T @ np.diag([1.0, 625.0]) @ J
@@ -120,14 +118,13 @@ def test_a_start_one_lane_off_is_found_out():
 
 def test_polylines_of_a_look_keep_their_order():
     lanes = LaneMap.of(straight(0.0))
-    p = LaneParameters()
     x = np.linspace(5.0, 40.0, 8)
     # Two of three, at -5.0 and +1.6: the first and the last, though 1.6 m would be nearer to the middle one if moved.
     lines = Polylines(np.zeros(2, np.int64), np.stack([np.column_stack([x, np.full(8, y)]) for y in (1.6, -5.0)]),
                       np.tile([1.0, 0.04], (2, 1)))  # fmt: skip
     at = np.array([[2.0, 3.0, 0.0]])
-    o = offsets(lines, lanes, at, at, p)
-    column, cost = choices(lines, o, np.zeros(1), p)
+    o = offsets(lines, lanes, at, at)
+    column, cost = choices(lines, o, np.zeros(1))
     assert column[:, 0].tolist() == [2, 0]
     assert cost[0, 0] == pytest.approx((0.15**2 + 0.25**2) / (1.0 + 0.3**2), rel=0.01)
     np.testing.assert_allclose(o.told[[0, 1], column[:, 0]], [[-0.15, 0.0], [0.25, 0.0]], atol=1e-6)
@@ -139,7 +136,7 @@ def test_more_polylines_than_lanes_leaves_one_over():
     lines = Polylines(np.zeros(3, np.int64), np.stack([np.column_stack([x, np.full(8, y)]) for y in (-1.7, 1.8, 5.0)]),
                       np.tile([0.5, 0.04], (3, 1)))  # fmt: skip
     at = np.array([[2.0, 3.0, 0.0]])
-    column, _ = choices(lines, offsets(lines, lanes, at, at, LaneParameters()), np.zeros(1), LaneParameters())
+    column, _ = choices(lines, offsets(lines, lanes, at, at), np.zeros(1))
     assert column[:, 0].tolist() == [0, 1, -1]
 
 

@@ -149,8 +149,8 @@ def test_poses_of_the_vehicles_own_localiser(street_drive):
     [
         ({"drive_scans": "even"}, "share 8 of 16 scans"),
         ({"map_scans": "third"}, "expected all, even"),
-        ({"changes": ("new_cell=3",)}, "--set new_cell=3: expected FIELD=VALUE with one of"),
-        ({"changes": ("new_cells=many",)}, "'many' is no int"),
+        ({"changes": ("new_cell=3",)}, "--set: there is no setting new_cell; did you mean new_cells"),
+        ({"changes": ("new_cells=many",)}, "--set new_cells: expected int, got str 'many'"),
         ({"changes": ("new_cells=3",)}, "new_cells = 3.* lies outside 20"),
         ({"rounds": 0}, "rounds >= 1"),
         ({"kind": "bag"}, "format 'bag' is not known"),

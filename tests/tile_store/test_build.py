@@ -269,8 +269,8 @@ def test_no_drives_missing_files_and_sparse_scans_are_refused(tmp_path: Path, st
 def test_parameters_check_themselves() -> None:
     with pytest.raises(BuildError, match=r"range from 5\.0 m to 5\.0 m is empty"):
         BuildParameters(min_range_m=5.0, max_range_m=5.0)
-    with pytest.raises(BuildError, match="must be positive"):
-        BuildParameters(max_gap_s=0.0)
+    with pytest.raises(BuildError, match="max_gnss_offset_m must be positive"):
+        BuildParameters(max_gnss_offset_m=0.0)
 
 
 def test_a_drive_across_a_change_of_the_voxel_grid_fills_both_sides(tmp_path: Path, store: SqliteStore) -> None:

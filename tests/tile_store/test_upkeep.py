@@ -239,7 +239,7 @@ def test_the_quarantine_has_a_bound_and_the_oldest_go(tmp_path: Path) -> None:
         assert retain(store, keep_days=1).quarantined > 0
         assert [o.body for o in store.quarantined()] == [b"today"]
         assert retain(store, quarantine_mb=0).quarantined == 1
-    with pytest.raises(StoreError, match="quarantine_mb 0 must be positive"):
+    with pytest.raises(StoreError, match="quarantine_mb = 0 lies outside > 0"):
         StoreConfig(quarantine_mb=0)
 
 

@@ -78,5 +78,5 @@ def test_a_tile_that_was_reported_is_forgotten() -> None:
 
 
 def test_parameters_that_cannot_work_are_refused() -> None:
-    with pytest.raises(FeatureLayerError, match="0 looks"):
+    with pytest.raises(FeatureLayerError, match="looks = 0 lies outside"):
         CoverageParameters(looks=0)

@@ -11,7 +11,7 @@ from gnd.fleet_sim.shapes import Shape
 from gnd.gnd_map.se3 import exp_so3, transform
 from gnd.schemas.limits import MAX_DETECTIONS_OF_LOOK
 from gnd.vehicle_agent.features.poles.detector import Pole, PoleDetector, Rays, detections_of
-from gnd.vehicle_agent.features.poles.parameters import PoleInputError, PoleParameterError, PoleParameters
+from gnd.vehicle_agent.features.poles.errors import PoleInputError
 from gnd.vehicle_agent.features.poles.slices import PoseSigma
 
 PLACE = np.zeros(3)
@@ -125,10 +125,11 @@ def test_errors_of_poses_go_into_the_covariance() -> None:
     assert placed.cov_m2[1, 1] - exact.cov_m2[1, 1] == pytest.approx(0.05**2 + 0.02**2, rel=0.05)
 
 
-def test_covariances_are_honest_without_the_floor() -> None:
+def test_covariances_are_honest_without_the_floor(monkeypatch: pytest.MonkeyPatch) -> None:
     """NEES of 2 is expected; less is allowed: layers are taken to see the same edges, which they only half do."""
+    monkeypatch.setattr("gnd.vehicle_agent.features.poles.columns._SIGMA_FLOOR_M", 0.001)
     rng, nees = np.random.default_rng(3), []
-    detector = PoleDetector(PoleParameters(sigma_floor_m=0.001))
+    detector = PoleDetector()
     for seed in range(10):
         turn, away = rng.uniform(0.0, 0.4) + np.arange(8) * pi / 4, rng.uniform(4.0, 20.0, 8)
         places = away[:, None] * np.column_stack([np.cos(turn), np.sin(turn)])
@@ -221,12 +222,3 @@ def test_what_is_no_scan_is_refused(points: np.ndarray[tuple[int, ...], np.dtype
 def test_a_place_that_is_none_is_refused() -> None:
     with pytest.raises(PoleInputError, match="3 finite numbers"):
         PoleDetector().window([rays_of(())], np.array([0.0, np.nan, 0.0]))
-
-
-@pytest.mark.parametrize(
-    "wrong", [{"range_max_m": 1.0}, {"min_slices": 1}, {"sigma_range_m": 0.0}, {"lean_max": 2.0}, {"clear_m": -1.0}]
-)
-def test_parameters_outside_their_range_are_refused(wrong: dict[str, float]) -> None:
-    ((name, value),) = wrong.items()
-    with pytest.raises(PoleParameterError, match=f"{name} = {value}"):
-        PoleParameters(**wrong)  # type: ignore[arg-type]

@@ -30,7 +30,7 @@ from gnd.vehicle_agent.detect.detector import ChangeDetector
 from gnd.vehicle_agent.download import TileFetcher
 from gnd.vehicle_agent.local_map import LocalMap
 from gnd.vehicle_agent.place import Place
-from gnd.vehicle_agent.surroundings import Surroundings, left_behind, tile_distance_m, tiles_along
+from gnd.vehicle_agent.surroundings import LEAD_S, Surroundings, left_behind, tile_distance_m, tiles_along
 
 NEVER = threading.Event()
 PARAMETERS = DownloadParameters(near_m=30.0, ahead_m=60.0, forget_m=100.0, wait_s=10.0)
@@ -105,7 +105,7 @@ def test_what_is_ahead_is_asked_for_together(scene: Scene) -> None:
         scene.surroundings.follow(place, NEVER, wait=True)
     ledger = scene.ledger.totals()
     (asked,) = [line.messages for line in ledger if (line.kind, line.direction) == ("tile", "up")]
-    assert asked <= 2 + 120.0 / (10.0 * (PARAMETERS.ahead_s - PARAMETERS.lead_s)) * 2  # twice that: two districts
+    assert asked <= 2 + 120.0 / (10.0 * (PARAMETERS.ahead_s - LEAD_S)) * 2  # twice that: two districts
 
 
 @pytest.mark.parametrize(("rate_bit_s", "all_of_them"), [(1e6, True), (3e4, False)])

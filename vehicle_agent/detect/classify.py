@@ -2,6 +2,7 @@
 
 import math
 from dataclasses import dataclass
+from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,8 +13,15 @@ from gnd.gnd_map.gaussian import Gaussians, concat
 from gnd.schemas.changes import TileChange
 from gnd.vehicle_agent.detect.evidence import TileEvidence
 from gnd.vehicle_agent.detect.extension import extends_neighbour
-from gnd.vehicle_agent.detect.parameters import DetectParameters
+from gnd.vehicle_agent.detect.parameters import MIN_CELLS, DetectParameters
 from gnd.vehicle_agent.detect.shape_change import NOISE_M, fitted, shape_features
+
+_MANY_RAYS: Final = 100
+"""So many rays into a voxel without a Gaussian make too few hits a statement: by the one rule it is empty."""
+_EMPTY_CELLS: Final = 15
+"""From here on a voxel is never called empty: another vehicle may find the sub-cells that are missing."""
+DETECT_RESHAPED_LOG_ODDS: Final = -0.4
+"""A measured Gaussian is of another shape than the map's from these log-odds on (see `shape_change`)."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -53,7 +61,7 @@ def _decide_paper(e: TileEvidence, p: DetectParameters) -> NDArray[np.int64]:
     """GND 4.4 plainly: a changed voxel with points has a new Gaussian, one without is deleted."""
     state = _state(e, p)
     sustained, changed = state == ChangeState.SUSTAINED, state == ChangeState.CHANGED
-    has_gaussian, has_points = e.measured.cells >= p.min_cells, e.measured.count > 0
+    has_gaussian, has_points = e.measured.cells >= MIN_CELLS, e.measured.count > 0
     of_map = np.select(
         [sustained, changed & has_gaussian, changed & ~has_points],
         [ChangeClass.NORMAL, ChangeClass.MODIFIED, ChangeClass.DELETED],
@@ -72,7 +80,7 @@ def _decide_default(e: TileEvidence, p: DetectParameters) -> NDArray[np.int64]:
 def _decide_of_map(e: TileEvidence, p: DetectParameters) -> NDArray[np.int64]:
     """Voxels in which the map has a Gaussian: normal, modified or deleted."""
     state = _state(e, p)
-    has_gaussian = e.measured.cells >= p.min_cells
+    has_gaussian = e.measured.cells >= MIN_CELLS
     sustained, changed = state == ChangeState.SUSTAINED, state == ChangeState.CHANGED
     reshaped = has_gaussian & ~_same_shape(e, p)
     gone = changed & (e.measured.cells < p.weak_cells) & (e.n_pi >= p.min_pass_inside)
@@ -86,8 +94,8 @@ def _decide_of_map(e: TileEvidence, p: DetectParameters) -> NDArray[np.int64]:
 def _decide_of_empty(e: TileEvidence, p: DetectParameters) -> NDArray[np.int64]:
     """Voxels in which the map has none: new or empty; few passes abstain, and weak hits unless many rays looked."""
     new = e.measured.cells >= _least_cells_of_new(e, p)
-    weak = (e.measured.cells >= p.weak_cells) & (e.n_pe + e.n_be < p.many_rays)
-    empty = ~weak & (e.measured.cells < p.empty_cells) & (e.n_pe >= p.min_passes)
+    weak = (e.measured.cells >= p.weak_cells) & (e.n_pe + e.n_be < _MANY_RAYS)
+    empty = ~weak & (e.measured.cells < _EMPTY_CELLS) & (e.n_pe >= p.min_passes)
     return np.select([new, empty], [ChangeClass.NEW, ChangeClass.EMPTY], ChangeClass.UNMEASURED)
 
 
@@ -95,7 +103,7 @@ def _least_cells_of_new(e: TileEvidence, p: DetectParameters) -> NDArray[np.int6
     """(K,) sub-cells that make a new Gaussian: more where it may be the edge of a surface that the map holds."""
     least = np.full(len(e), p.new_cells)
     rows = np.flatnonzero(~e.in_map & (e.measured.cells >= p.new_cells) & (e.measured.cells < p.new_cells_at_edge))
-    edge = extends_neighbour(e.base, e.measured.take(rows), p)
+    edge = extends_neighbour(e.base, e.measured.take(rows))
     least[rows[edge]] = p.new_cells_at_edge
     return least
 
@@ -103,12 +111,12 @@ def _least_cells_of_new(e: TileEvidence, p: DetectParameters) -> NDArray[np.int6
 def _same_shape(e: TileEvidence, p: DetectParameters) -> NDArray[np.bool_]:
     """(K,) whether the new Gaussian shows the surface that the map holds; False where there are not both."""
     result = np.zeros(len(e), np.bool_)
-    rows = np.flatnonzero(e.in_map & (e.measured.cells >= p.min_cells))
+    rows = np.flatnonzero(e.in_map & (e.measured.cells >= MIN_CELLS))
     if len(rows):
         was = e.base.gaussians.take(e.map_row[rows])
-        noise_m = math.sqrt(NOISE_M**2 + p.soft.similarity * p.soft.excess_m2(e.pose))  # the pose's Σ in Eq. (15)
+        noise_m = math.sqrt(NOISE_M**2 + p.excess_m2(e.pose))  # the pose's Σ in Eq. (15)
         features = shape_features(was, e.measured.take(rows), e.n_bi[rows], e.n_bo[rows], e.n_pi[rows], noise_m)
-        result[rows] = fitted().log_odds(features) <= p.reshaped_log_odds
+        result[rows] = fitted().log_odds(features) <= DETECT_RESHAPED_LOG_ODDS
     return result
 
 

@@ -14,13 +14,15 @@ from gnd.gnd_map.arrays import I32
 from gnd.gnd_map.gaussian import Gaussians
 from gnd.gnd_map.grid import VoxelGrid
 from gnd.gnd_map.tile import Tile
-from gnd.vehicle_agent.detect.parameters import DetectParameters
 from gnd.vehicle_agent.detect.records import planar_normals
+
+DETECT_EDGE_M: Final = 0.15
+"""So near to the plane of a planar Gaussian next door a voxel lies at the edge of a known surface."""
 
 _AROUND: Final = tuple(step for step in product((-1, 0, 1), repeat=3) if any(step))
 
 
-def extends_neighbour(base: Tile, measured: Gaussians, parameters: DetectParameters) -> NDArray[np.bool_]:
+def extends_neighbour(base: Tile, measured: Gaussians) -> NDArray[np.bool_]:
     """Return which measured Gaussians (K,) continue a planar one of the map in one of the 26 voxels around.
 
     Neighbours in other tiles are not looked at.
@@ -36,12 +38,12 @@ def extends_neighbour(base: Tile, measured: Gaussians, parameters: DetectParamet
     grid = VoxelGrid.of(base.tile_id)
     here = np.stack(grid.unravel(measured.voxel_id), axis=1)
     p_tile_m = grid.centre_m(measured.voxel_id) + measured.mean_m
-    normal = planar_normals(base.gaussians.full_cov(), parameters)  # zeros where not planar
+    normal = planar_normals(base.gaussians.full_cov())  # zeros where not planar
     q_tile_m = grid.centre_m(base.gaussians.voxel_id) + base.gaussians.mean_m
     for step in _AROUND:
         row = _rows(grid, base.gaussians.voxel_id, here + step)
         off_m = np.abs(np.einsum("ni,ni->n", normal[row], p_tile_m - q_tile_m[row]))
-        found |= (row >= 0) & normal[row].any(axis=1) & (off_m <= parameters.edge_m)
+        found |= (row >= 0) & normal[row].any(axis=1) & (off_m <= DETECT_EDGE_M)
     return found
 
 

@@ -6,7 +6,7 @@ Whatever is measured in metres (distances to a Gaussian, to a plane, to the hit)
 """
 
 import math
-from typing import NamedTuple
+from typing import Final, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,9 +14,22 @@ from numpy.typing import NDArray
 from gnd.gnd_map.arrays import F32, F64, I32
 from gnd.gnd_map.jit import kernel, pasted
 from gnd.vehicle_agent.detect.chi_square import quantile
-from gnd.vehicle_agent.detect.parameters import DetectParameters
+from gnd.vehicle_agent.detect.parameters import INCLUDED_M, DetectParameters
 from gnd.vehicle_agent.detect.records import N_BI, N_BO, N_PI, N_PO
 from gnd.vehicle_agent.detect.uncertainty import PoseUncertainty
+
+_ETA_BLOCK: Final = 0.95
+"""η_bound of Eq. (1) for points that end in a voxel."""
+_ETA_PLANE: Final = 0.97
+"""The same for the point where a ray crosses the plane of a planar Gaussian."""
+_AHEAD_M: Final = 1.0
+"""Of the rule `ahead`: how far before the hit the crossing must lie."""
+_BEYOND_M: Final = 0.15
+"""Of the rule `plane`: how far behind the plane a ray must end."""
+_BEYOND_SIGMAS: Final = 2.0
+"""A ray must end farther behind the plane by this many sigmas of the pose (root of the sum of squares with
+`_BEYOND_M`)."""
+_FACE_SIGMA: Final = 3.0
 
 CERTAIN = PoseUncertainty()
 RULES = {"ml": 0, "ahead": 1, "plane": 2}
@@ -52,20 +65,20 @@ def kernel_parameters(p: DetectParameters, pose: PoseUncertainty = CERTAIN) -> K
     """
     return KernelParameters(
         rule=RULES[p.passing_rule],
-        r2_block=quantile(p.eta_block),
+        r2_block=quantile(_ETA_BLOCK),
         r2_pass=quantile(p.eta_pass),
-        r2_plane=quantile(p.eta_plane),
-        r2_face=p.face_sigma**2,
-        ahead_m=p.ahead_m,
-        beyond_m=p.beyond_m,
+        r2_plane=quantile(_ETA_PLANE),
+        r2_face=_FACE_SIGMA**2,
+        ahead_m=_AHEAD_M,
+        beyond_m=_BEYOND_M,
         face_m=p.face_m,
         range_min_m=p.range_min_m,
         range_max_m=p.range_max_m,
         pose_m2=float(pose.sigma_m**2),
         pose_rad2=float(pose.sigma_rad**2),
-        included_m2=float(p.soft.included_m**2),
-        block_gain=p.soft.block / p.block_noise_m**2,
-        beyond_gain=float(p.soft.beyond_sigmas**2),
+        included_m2=INCLUDED_M**2,
+        block_gain=1.0 / p.block_noise_m**2 if p.soft else 0.0,
+        beyond_gain=_BEYOND_SIGMAS**2 if p.soft else 0.0,
     )
 
 

@@ -6,12 +6,18 @@ planar), 12-15 the int32 counters BI, BO, PI, PO.
 """
 
 from dataclasses import dataclass
+from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
 
 from gnd.gnd_map.gaussian import full_matrices
 from gnd.vehicle_agent.detect.parameters import DetectParameters
+
+_PASS_NOISE_M: Final = 0.01
+"""Keeps the whitening of flat Gaussians finite."""
+_PLANAR_RATIO: Final = 10.0
+"""λ2 / λ1 from which a Gaussian is planar (the paper's ratio, Eq. 16)."""
 
 WORDS = 16
 MEAN = slice(6, 9)
@@ -45,9 +51,9 @@ def make_records(
     cov = full_matrices(cov_m2)
     words = np.zeros((len(cov), WORDS), np.int32)
     floats = words.view(np.float32)
-    floats[:, :6] = whitening(cov + np.eye(3) * parameters.pass_noise_m**2)
+    floats[:, :6] = whitening(cov + np.eye(3) * _PASS_NOISE_M**2)
     floats[:, MEAN] = mean_map_m - anchor_map_m
-    floats[:, NORMAL] = planar_normals(cov, parameters)
+    floats[:, NORMAL] = planar_normals(cov)
     return Records(words, whitening(cov + np.eye(3) * parameters.block_noise_m**2).astype(np.float32))
 
 
@@ -59,10 +65,10 @@ def whitening(cov: NDArray[np.float64]) -> NDArray[np.float64]:
     return np.asarray(W[:, [0, 1, 1, 2, 2, 2], [0, 0, 1, 0, 1, 2]])
 
 
-def planar_normals(cov: NDArray[np.float64], parameters: DetectParameters) -> NDArray[np.float64]:
+def planar_normals(cov: NDArray[np.float64]) -> NDArray[np.float64]:
     """(M, 3) unit normals of the Gaussians that are planar (λ2 >= ratio λ1, Eq. 16), zeros for the others."""
     if not len(cov):
         return np.empty((0, 3))
-    values, vectors = np.linalg.eigh(cov + np.eye(3) * parameters.pass_noise_m**2)
-    planar = values[:, 1] >= parameters.planar_ratio * values[:, 0]
+    values, vectors = np.linalg.eigh(cov + np.eye(3) * _PASS_NOISE_M**2)
+    planar = values[:, 1] >= _PLANAR_RATIO * values[:, 0]
     return np.where(planar[:, None], vectors[:, :, 0], 0.0)

@@ -12,6 +12,7 @@ import numpy as np
 
 from gnd.gnd_map.arrays import F64, I32, I64
 from gnd.gnd_map.geodesy import LocalFrame
+from gnd.gnd_map.settings import check_settings, setting
 from gnd.gnd_map.tile_id import TileId, geodetic_of_tile_coordinates, tile_coordinates
 from gnd.schemas.feature_change import GRID
 from gnd.vehicle_agent.features.errors import FeatureLayerError
@@ -23,19 +24,17 @@ _BASE_M: Final = 100.0
 
 @dataclass(frozen=True, slots=True)
 class CoverageParameters:
-    """When a cell counts as looked at.
+    """When a cell counts as looked at."""
 
-    Attributes:
-        looks: from so many places a feature in the cell would have been in view and not hidden.
-        step_m: places are so far apart.
-    """
-
-    looks: int = 4
-    step_m: float = 1.0
+    looks: int = setting(
+        4,
+        "From so many places a feature in the cell would have been in view and not hidden.",
+        least=1,
+    )
+    step_m: float = setting(1.0, "Places are so far apart.", unit="m", above=0)
 
     def __post_init__(self) -> None:
-        if self.looks < 1 or not self.step_m > 0:
-            raise FeatureLayerError(f"coverage after {self.looks} looks {self.step_m} m apart: need >= 1 and > 0")
+        check_settings(self, FeatureLayerError)
 
 
 class Coverage:

@@ -1,50 +1,54 @@
 """Which feature layers a vehicle keeps up to date, and with which of its sensors."""
 
-from dataclasses import dataclass, field
-from math import isfinite, radians
+from dataclasses import dataclass
+from math import radians
 from typing import Final, Literal
 
+from gnd.gnd_map.settings import check_settings, setting
 from gnd.schemas.wire import LAYER_PATTERN
-from gnd.vehicle_agent.features.coverage import CoverageParameters
 from gnd.vehicle_agent.features.errors import FeatureLayerError
 from gnd.vehicle_agent.features.slamcu.parameters import FilterParameters, SlamcuParameters
 from gnd.vehicle_agent.features.view import SensorView
 
+MARGIN_M: Final = 10.0
+"""A tile this much farther away than a sensor sees is left: it is decided."""
+
 
 @dataclass(frozen=True, slots=True)
 class LayerParameters:
-    """One feature layer and what looks for its features.
+    """One feature layer and what looks for its features."""
 
-    Attributes:
-        name: of the layer, such as "signs".
-        sensor: "camera": looks that the recording brings; "lidar": the pole detector on the vehicle's own scans.
-        kinds: of features that belong to the layer; others of the same detector do not.
-        field_deg: field of view, ahead; 360 all around.
-        range_m: the farthest look.
-        rate_hz: looks a second.
-        height_m: usual height of the features above the vehicle's origin: what decides what hides them.
-        detection_confidence: λ of SLAMCU, Eq. (1) and (2).
-        alone_m: two features of the layer never stand nearer to each other: found so, they are something else (the tall
-            posts of a scaffold are no lamps); 0 = they may.
-    """
-
-    name: str
-    sensor: Literal["camera", "lidar"]
-    kinds: tuple[str, ...]
-    field_deg: float = 360.0
-    range_m: float = 25.0
-    rate_hz: float = 10.0
-    height_m: float = 2.5
-    detection_confidence: float = 0.9
-    alone_m: float = 0.0
+    name: str = setting(..., 'Of the layer, such as "signs".')
+    sensor: Literal["camera", "lidar"] = setting(
+        ...,
+        '"camera": looks that the recording brings; "lidar": the pole detector on the vehicle\'s own scans.',
+    )
+    kinds: tuple[str, ...] = setting(..., "Of features that belong to the layer; others of the same detector do not.")
+    field_deg: float = setting(360.0, "Field of view, ahead; 360 all around.", unit="deg", above=0, most=360)
+    range_m: float = setting(25.0, "The farthest look.", unit="m", above=0, most=1000)
+    rate_hz: float = setting(10.0, "Looks a second.", unit="Hz", above=0, most=1000)
+    height_m: float = setting(
+        2.5,
+        "Usual height of the features above the vehicle's origin: what decides what hides them.",
+        unit="m",
+    )
+    detection_confidence: float = setting(
+        0.9, "Confidence in a detection: λ of SLAMCU, Eq. (1) and (2).", least=1e-3, most=0.999
+    )
+    alone_m: float = setting(
+        0.0,
+        "Two features of the layer never stand nearer to each other: found so, they are something else (the "
+        "tall posts of a scaffold are no lamps); 0 = they may.",
+        unit="m",
+        least=0,
+    )
 
     def __post_init__(self) -> None:
         if not LAYER_PATTERN.fullmatch(self.name) or self.name.startswith("ndt"):
             raise FeatureLayerError(f"layer {self.name[:80]!r} is no feature layer: {LAYER_PATTERN.pattern}, not ndt…")
-        if not self.kinds or not isfinite(self.height_m) or not self.alone_m >= 0:
-            raise FeatureLayerError(
-                f"layer {self.name}: {len(self.kinds)} kinds, height {self.height_m} m, alone within {self.alone_m} m"
-            )
+        if not self.kinds:
+            raise FeatureLayerError(f"layer {self.name} needs at least one kind of features")
+        check_settings(self, FeatureLayerError)
         _ = self.view, self.slamcu  # they check the rest
 
     @property
@@ -75,24 +79,17 @@ LAYERS: Final = {
 
 @dataclass(frozen=True, slots=True)
 class FeatureParameters:
-    """The feature layers of one agent.
+    """The feature layers of one agent."""
 
-    Attributes:
-        layers: none: the agent knows voxels only.
-        coverage: when a place counts as looked at.
-        margin_m: a tile this much farther away than a sensor sees is left: it is decided.
-    """
-
-    layers: tuple[LayerParameters, ...] = ()
-    coverage: CoverageParameters = field(default_factory=CoverageParameters)
-    margin_m: float = 10.0
+    layers: tuple[LayerParameters, ...] = setting(
+        (), "Layers, each by name (signs, streetlights, poles) or as a table; none: the agent knows voxels only."
+    )
 
     def __post_init__(self) -> None:
         names = [layer.name for layer in self.layers]
         if len(set(names)) != len(names):
             raise FeatureLayerError(f"layers {', '.join(names)}: one comes twice")
-        if not self.margin_m > 0:
-            raise FeatureLayerError(f"margin_m = {self.margin_m} must be positive")
+        check_settings(self, FeatureLayerError)
 
     @classmethod
     def of(cls, *names: str) -> "FeatureParameters":

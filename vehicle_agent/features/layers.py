@@ -19,9 +19,10 @@ from gnd.schemas.drive import Detections
 from gnd.schemas.features import FeatureChange
 from gnd.vehicle_agent.config import ReportParameters
 from gnd.vehicle_agent.detect.uncertainty import PoseUncertainty
+from gnd.vehicle_agent.features.coverage import CoverageParameters
 from gnd.vehicle_agent.features.feature_report import FeatureReporter
 from gnd.vehicle_agent.features.layer import FeatureLayer, PlacedLook, pose_of
-from gnd.vehicle_agent.features.layer_parameters import FeatureParameters
+from gnd.vehicle_agent.features.layer_parameters import MARGIN_M, FeatureParameters
 from gnd.vehicle_agent.features.look import MAX_RANGE_M, Look
 from gnd.vehicle_agent.features.poles.detector import PoleDetector, Rays, detections_of
 from gnd.vehicle_agent.features.poles.slices import PoseSigma
@@ -63,7 +64,7 @@ class FeatureLayers:
     ) -> None:
         self.counts: Counter[str] = Counter()
         self._parameters, self._report = parameters, report
-        self.layers = {one.name: FeatureLayer(one, parameters.coverage, frame) for one in parameters.layers}
+        self.layers = {one.name: FeatureLayer(one, CoverageParameters(), frame) for one in parameters.layers}
         self._reporters = dict(zip(self.layers, reporters, strict=True))
         self._detector = PoleDetector()
         self._looks: deque[Detections] = deque(maxlen=MOST_WAITING)
@@ -187,7 +188,7 @@ class FeatureLayers:
             return
         self._looked_at = p_map_m.copy()
         for name, layer in self.layers.items():
-            reporter, reach_m = self._reporters[name], layer.parameters.range_m + self._parameters.margin_m
+            reporter, reach_m = self._reporters[name], layer.parameters.range_m + MARGIN_M
             for change in layer.leave(p_map_m, reach_m):
                 self._say(name, change, odometer_m)
             reporter.report(layer.tiles, self._t_ns, odometer_m)

@@ -1,7 +1,7 @@
 """What the map teaches about the vehicle's own motion sensors, and how far to trust them until it has."""
 
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import Any, Final, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,6 +17,25 @@ from gnd.vehicle_agent.localise.odometry import MotionBuffer
 from gnd.vehicle_agent.localise.parameters import OdometryParameters
 from gnd.vehicle_agent.localise.remount import Mounting, left_over, left_sigma
 from gnd.vehicle_agent.localise.scan_odometry import ScanStep
+
+_LONGITUDINAL_M: Final = 0.003
+_LATERAL_M: Final = 0.003
+_VERTICAL_M: Final = 0.01
+_DISTANCE_SHARE: Final = 0.007
+_ROLL_PITCH_RAD: Final = 0.003
+_YAW_RAD: Final = 0.0006
+"""Of a step between two scans, the share being of its length, once scale, bias and course are learnt."""
+ODOMETRY_SCALE_DRIFT: Final = 0.0001
+ODOMETRY_BIAS_DRIFT_RADPS: Final = 1e-05
+"""Their change in a root second."""
+_STRETCH_M: Final = 0.03
+_STRETCH_RAD: Final = 0.002
+"""Of the motion over a second that two map matches tell."""
+_LEAST_SCALE: Final = 0.0005
+_LEAST_BIAS_RADPS: Final = 7e-05
+"""The least sigma of what a stretch of submaps tells about scale and bias."""
+_EXCESS_GAIN: Final = 0.2
+"""Weight of the newest step in the running judgement of how much worse than all this the odometry is."""
 
 F64 = NDArray[np.float64]
 
@@ -124,12 +143,12 @@ class MotionTeacher:
 
     def sigmas(self, odometry: F64, dt_s: float) -> F64:
         """(6,) one sigma of a motion (4, 4) that took `dt_s`: roll, pitch, yaw [rad], forward, left, up [m]."""
-        par, way_m = self.parameters, float(np.linalg.norm(odometry[:3, 3]))
-        yaw = np.hypot(par.yaw_rad, np.sqrt(self._bias_var) * dt_s)
-        forward = np.hypot(par.longitudinal_m + par.distance_share * way_m, np.sqrt(self._scale_var) * way_m)
-        across = np.array([par.lateral_m, par.vertical_m]) + par.distance_share * way_m
+        way_m = float(np.linalg.norm(odometry[:3, 3]))
+        yaw = np.hypot(_YAW_RAD, np.sqrt(self._bias_var) * dt_s)
+        forward = np.hypot(_LONGITUDINAL_M + _DISTANCE_SHARE * way_m, np.sqrt(self._scale_var) * way_m)
+        across = np.array([_LATERAL_M, _VERTICAL_M]) + _DISTANCE_SHARE * way_m
         left, up = np.hypot(across, np.sqrt(self._course_var) * way_m)
-        known = np.array([par.roll_pitch_rad, par.roll_pitch_rad, yaw, forward, left, up])
+        known = np.array([_ROLL_PITCH_RAD, _ROLL_PITCH_RAD, yaw, forward, left, up])
         return np.asarray(np.hypot(known, np.sqrt(np.maximum(self._excess_var, 0.0))))
 
     def sigmas_between(self, first_ns: int, last_ns: int, odometry: F64) -> F64:
@@ -299,36 +318,36 @@ class MotionTeacher:
         driven = self._motion.delta(first.t_ns, last.t_ns)
         off = T_inverse(driven) @ T_inverse(first.T_map_vehicle) @ last.T_map_vehicle
         square = np.concatenate([log_so3(off[:3, :3]), off[:3, 3]]) ** 2
-        self._excess_var += self.parameters.excess_gain * (square - 2.0 * match_var - self._excess_var)
+        self._excess_var += _EXCESS_GAIN * (square - 2.0 * match_var - self._excess_var)
 
     def correct(self, drift: Drift, overlap: float) -> None:
         """Take off what a whole stretch says, where it knows better than what was learnt so far.
 
         `overlap`: in how many of the stretch's matches each scan takes part, so that they are not independent.
         """
-        par, grown = self.parameters, float(np.sqrt(overlap))
-        bias = max(drift.yaw_radps.sigma * grown, par.least_bias_radps)
+        grown = float(np.sqrt(overlap))
+        bias = max(drift.yaw_radps.sigma * grown, _LEAST_BIAS_RADPS)
         if bias**2 < KEEPS * self._bias_var:
             self._motion.yaw_bias_radps += drift.yaw_radps.value
             self._bias_var = bias**2
-        scale = max(drift.forward.sigma * grown, par.least_scale)
+        scale = max(drift.forward.sigma * grown, _LEAST_SCALE)
         if scale**2 < KEEPS * self._scale_var:
             self._motion.speed_scale *= 1.0 - drift.forward.value
             self._scale_var = scale**2
-        course = max(drift.left.sigma * grown, par.least_scale)
+        course = max(drift.left.sigma * grown, _LEAST_SCALE)
         if course**2 < KEEPS * self._course_var:
             self._motion.course -= [drift.left.value, drift.up.value]
             self._course_var = course**2
 
     def _compare(self, first: Stamped, last: Stamped) -> None:
-        par, dt_s = self.parameters, (last.t_ns - first.t_ns) * 1e-9
-        self._scale_var += par.scale_drift**2 * dt_s
-        self._bias_var += par.bias_drift_radps**2 * dt_s
+        dt_s = (last.t_ns - first.t_ns) * 1e-9
+        self._scale_var += ODOMETRY_SCALE_DRIFT**2 * dt_s
+        self._bias_var += ODOMETRY_BIAS_DRIFT_RADPS**2 * dt_s
         seen = T_inverse(first.T_map_vehicle) @ last.T_map_vehicle
         driven = self._motion.delta(first.t_ns, last.t_ns)
-        self._learn_course(driven, seen, par.stretch_m)
-        self._learn_scale(driven[0, 3] / self._motion.speed_scale, seen[0, 3], par.stretch_m)
-        self._learn_bias(_yaw(driven) + self._motion.yaw_bias_radps * dt_s, _yaw(seen), dt_s, par.stretch_rad)
+        self._learn_course(driven, seen, _STRETCH_M)
+        self._learn_scale(driven[0, 3] / self._motion.speed_scale, seen[0, 3], _STRETCH_M)
+        self._learn_bias(_yaw(driven) + self._motion.yaw_bias_radps * dt_s, _yaw(seen), dt_s, _STRETCH_RAD)
 
     def _learn_scale(self, wheel_m: float, map_m: float, sigma_m: float) -> None:
         gain = self._scale_var * wheel_m / (wheel_m**2 * self._scale_var + sigma_m**2)

@@ -1,16 +1,53 @@
 """Is there a better pose than the tracked one? Rivals are searched now and then, followed beside it, and judged."""
 
 from dataclasses import replace
+from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
 
-from gnd.vehicle_agent.localise.first_pose import Place
-from gnd.vehicle_agent.localise.hypotheses import Hypotheses
-from gnd.vehicle_agent.localise.initialise import Around, near_pose, search, thinned
+from gnd.vehicle_agent.localise.first_pose import INITIALISE_FAIR_FIT, INITIALISE_GOOD_FIT, Place
+from gnd.vehicle_agent.localise.hypotheses import (
+    HYPOTHESIS_APART_DEG,
+    HYPOTHESIS_APART_M,
+    HYPOTHESIS_LEAST_SCANS,
+    HYPOTHESIS_VIEW_M,
+    Hypotheses,
+)
+from gnd.vehicle_agent.localise.initialise import (
+    HYPOTHESIS_GAIN,
+    INITIALISE_MIN_FIT,
+    INITIALISE_N_REFINING,
+    Around,
+    near_pose,
+    search,
+    thinned,
+)
 from gnd.vehicle_agent.localise.match_map import MatchMap
 from gnd.vehicle_agent.localise.parameters import LocaliserParameters
 from gnd.vehicle_agent.localise.registration import fit_of
+
+_PERIOD_S: Final = 2.0
+_DOUBTFUL_S: Final = 0.8
+"""Pause between two searches, and when the pose is in doubt."""
+_TURN_DEG: Final = 12.0
+"""Headings within this of the tracked one."""
+_N_REFINED: Final = 5
+"""How many are refined."""
+_LEAD: Final = 0.03
+"""A rival must fit better by this much to be one."""
+_PRIOR: Final = 6.0
+"""How much likelier the tracked pose is before anything is seen."""
+_MOST_VIEWS: Final = 8.0
+"""How many views may speak against it."""
+_CONTESTED: Final = -2.0
+_BEATEN: Final = 4.0
+_DROPPED: Final = -12.0
+"""Odds of a rival from which on the tracked pose is degraded, is lost, and below which the rival is given up. All odds
+are logarithms."""
+_NEAR_M: Final = 1.0
+_NEAR_DEG: Final = 3.0
+"""A rival nearer than this must fit well to win."""
 
 F64 = NDArray[np.float64]
 
@@ -24,12 +61,8 @@ class Challenger:
 
     def __init__(self, parameters: LocaliserParameters) -> None:
         self._par = parameters
-        self._how = replace(
-            parameters.initialise, n_refined=parameters.challenge.n_refined, n_kept=parameters.challenge.n_refined
-        )
-        self.rivals = Hypotheses(
-            replace(parameters.hypotheses, most_views=parameters.challenge.most_views), parameters.registration
-        )
+        self._how = replace(parameters.initialise, n_refined=_N_REFINED, n_kept=_N_REFINED)
+        self.rivals = Hypotheses(parameters.registration, _MOST_VIEWS)
         self._searched_ns = -(2**62)
         self._T_tracked = np.eye(4)
         self._way_m = 0.0
@@ -50,10 +83,9 @@ class Challenger:
         self._way_m += float(np.hypot(*T_before_now[:2, 3]))
         if len(self.rivals) and new:
             self._weigh(points_m, standing_m, T_tracked, match_map)
-        par = self._par.challenge
-        if t_ns - self._searched_ns >= (par.doubtful_s if doubtful and not any_heading else par.period_s) * 1e9:
+        if t_ns - self._searched_ns >= (_DOUBTFUL_S if doubtful and not any_heading else _PERIOD_S) * 1e9:
             self._searched_ns = t_ns
-            turn_rad = np.pi if any_heading else np.radians(par.turn_deg)
+            turn_rad = np.pi if any_heading else np.radians(_TURN_DEG)
             self._search(points_m, standing_m, T_tracked, _around(place, T_tracked, turn_rad), match_map)
 
     def rest(self, t_ns: int) -> None:
@@ -65,25 +97,24 @@ class Challenger:
         """Logarithm of how much likelier the best rival is than the tracked pose; -inf without one."""
         if not len(self.rivals):
             return -np.inf
-        best, par = self.rivals.best, self._par
+        best = self.rivals.best
         ahead = best.mean_fit - self._own_mean()
-        return float(par.hypotheses.gain * best.views * ahead - best.surprise - par.challenge.prior)
+        return float(HYPOTHESIS_GAIN * best.views * ahead - best.surprise - _PRIOR)
 
     @property
     def contested(self) -> bool:
         """True when a rival makes the tracked pose doubtful."""
-        par = self._par
-        return self.odds > par.challenge.contested and self.rivals.best.mean_fit >= par.initialise.min_fit
+        return self.odds > _CONTESTED and self.rivals.best.mean_fit >= INITIALISE_MIN_FIT
 
     @property
     def beaten(self) -> bool:
         """True when a rival has won: one nearby only if it fits well, because a facade that has moved looks like it."""
-        if self.odds <= self._par.challenge.beaten:
+        if self.odds <= _BEATEN:
             return False
-        best, par = self.rivals.best, self._par
-        near = near_pose(best.T_map_vehicle[None], self._T_tracked, par.challenge.near_m, par.challenge.near_deg)[0]
-        least = par.initialise.good_fit if near else par.initialise.fair_fit
-        return bool(best.scans >= par.hypotheses.least_scans and best.mean_fit >= least)
+        best = self.rivals.best
+        near = near_pose(best.T_map_vehicle[None], self._T_tracked, _NEAR_M, _NEAR_DEG)[0]
+        least = INITIALISE_GOOD_FIT if near else INITIALISE_FAIR_FIT
+        return bool(best.scans >= HYPOTHESIS_LEAST_SCANS and best.mean_fit >= least)
 
     def _weigh(self, points_m: F64, standing_m: F64, T_tracked: F64, match_map: MatchMap) -> None:
         self.rivals.weigh(points_m, standing_m, match_map)
@@ -91,21 +122,20 @@ class Challenger:
         if not len(self.rivals):
             self._own_fits.clear()
             return
-        share, self._way_m = min(1.0, self._way_m / self._par.hypotheses.view_m), 0.0
+        share, self._way_m = min(1.0, self._way_m / HYPOTHESIS_VIEW_M), 0.0
         self._take_own(standing_m, T_tracked, match_map, share)
-        if self.odds < self._par.challenge.dropped:
+        if self.odds < _DROPPED:
             self.rivals.clear()
             self._own_fits.clear()
 
     def _search(self, points_m: F64, standing_m: F64, T_tracked: F64, around: Around, match_map: MatchMap) -> None:
         par, own = self._par, self._fit(standing_m, T_tracked, match_map)
         found, _ = search(points_m, around, match_map, self._how, par.registration, standing_m)
-        apart = par.hypotheses.apart_m, par.hypotheses.apart_deg
+        apart = HYPOTHESIS_APART_M, HYPOTHESIS_APART_DEG
         rivals = [
             one
             for one in found
-            if one.fit > own + par.challenge.lead
-            and not near_pose(one.registration.T_map_vehicle[None], T_tracked, *apart)[0]
+            if one.fit > own + _LEAD and not near_pose(one.registration.T_map_vehicle[None], T_tracked, *apart)[0]
         ]
         if rivals and not self._own_fits:
             self._own_fits.append((own, 1.0))
@@ -128,7 +158,7 @@ class Challenger:
         return total / max(weight, 1e-9)
 
     def _fit(self, standing_m: F64, T: F64, match_map: MatchMap) -> float:
-        few = thinned(standing_m, self._par.initialise.n_refining)
+        few = thinned(standing_m, INITIALISE_N_REFINING)
         return fit_of(few, T, match_map, self._par.registration)
 
 

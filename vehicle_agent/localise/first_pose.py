@@ -1,18 +1,26 @@
 """From no pose to the first: search where GNSS says, follow what was found, answer when one pose has won."""
 
 from dataclasses import dataclass, replace
+from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
 
 from gnd.vehicle_agent.errors import RegistrationError
 from gnd.vehicle_agent.localise.estimates import Cause
-from gnd.vehicle_agent.localise.hypotheses import Hypotheses
-from gnd.vehicle_agent.localise.initialise import Around, InitialPose, search
+from gnd.vehicle_agent.localise.hypotheses import HYPOTHESIS_MOST_VIEWS, HYPOTHESIS_SURE, Hypotheses
+from gnd.vehicle_agent.localise.initialise import INITIALISE_MIN_FIT, Around, InitialPose, search
 from gnd.vehicle_agent.localise.match_map import MatchMap, MatchMapCache
 from gnd.vehicle_agent.localise.parameters import LocaliserParameters
-from gnd.vehicle_agent.localise.registration import register
+from gnd.vehicle_agent.localise.registration import REGISTRATION_MIN_MATCHED, register
 from gnd.vehicle_agent.localise.scan_pool import ScanPool
+
+INITIALISE_GOOD_FIT: Final = 0.65
+INITIALISE_FAIR_FIT: Final = 0.48
+"""A fit of `good_fit` is taken at once; one of `fair_fit` when it stays the best for some way: where much has changed,
+a pose decimetres off can fit best, and a vehicle that moves soon sees something else."""
+_RETRY_S: Final = 0.8
+"""Pause between two searches for the first pose."""
 
 F64 = NDArray[np.float64]
 
@@ -31,9 +39,9 @@ class FirstPose:
 
     def __init__(self, parameters: LocaliserParameters) -> None:
         self._par = parameters
-        self.hypotheses = Hypotheses(parameters.hypotheses, parameters.registration)
+        self.hypotheses = Hypotheses(parameters.registration)
         self.cause: Cause = "searching"
-        self._pool = ScanPool(parameters.pool)
+        self._pool = ScanPool()
         self._searched_ns = -(2**62)
 
     def see(
@@ -66,7 +74,7 @@ class FirstPose:
 
     def _look_around(self, t_ns: int, place: Place, match_map: MatchMap) -> None:
         """Search, now and then; what is followed is judged by the position too."""
-        if t_ns - self._searched_ns >= self._par.health.retry_s * 1e9:
+        if t_ns - self._searched_ns >= _RETRY_S * 1e9:
             self._search(t_ns, place, match_map)
         self.hypotheses.see_position(place.p_map_m, place.sigma_m)
 
@@ -79,20 +87,19 @@ class FirstPose:
 
     def _good_enough(self, found: InitialPose) -> bool:
         """True for a clear answer that fits well; where much has changed only after some way on which it stayed so."""
-        par = self._par.initialise
-        proven = self.hypotheses.best.views >= self._par.hypotheses.most_views
-        return found.found and (found.fit >= par.good_fit or (proven and found.fit >= par.fair_fit))
+        proven = self.hypotheses.best.views >= HYPOTHESIS_MOST_VIEWS
+        return found.found and (found.fit >= INITIALISE_GOOD_FIT or (proven and found.fit >= INITIALISE_FAIR_FIT))
 
     def _why(self, answer: InitialPose | None, place: Place | None, match_map: MatchMap, points_m: F64) -> Cause:
         if answer is None and place is None:
             return "no_position"
-        if len(points_m) < self._par.registration.min_matched:
+        if len(points_m) < REGISTRATION_MIN_MATCHED:
             return "bad_scan"
         if answer is None:
             return "no_match" if _known_at(match_map, place) else "no_map"
-        if answer.fit < self._par.initialise.min_fit:
+        if answer.fit < INITIALISE_MIN_FIT:
             return "no_match"
-        return "searching" if answer.probability >= self._par.hypotheses.sure else "ambiguous"
+        return "searching" if answer.probability >= HYPOTHESIS_SURE else "ambiguous"
 
     def _with_all_points(self, answer: InitialPose, points_m: F64, m: MatchMap) -> InitialPose | None:
         """The same answer, its pose refined once more with all points."""

@@ -17,7 +17,18 @@ from gnd.gnd_map.motion import Trajectory
 from gnd.gnd_map.se3 import T_inverse
 from gnd.gnd_map.tile_id import TileId
 from gnd.vehicle_agent.errors import LocaliseError
-from gnd.vehicle_agent.localise.track_alignment import Alignment, FixTable, GeoreferenceParameters, align
+from gnd.vehicle_agent.localise.track_alignment import (
+    TRACK_LASTING_M,
+    TRACK_ROBUST_K,
+    TRACK_STEP_M,
+    TRACK_STEP_RAD,
+    TRACK_STEP_RAD_PER_ROOT_M,
+    TRACK_STEP_SHARE,
+    Alignment,
+    FixTable,
+    GeoreferenceParameters,
+    align,
+)
 
 F64 = NDArray[np.float64]
 I64 = NDArray[np.int64]
@@ -119,18 +130,18 @@ def _bent(track: Trajectory, p_frame_m: F64, fixes: FixTable, par: GeoreferenceP
     """
     near = _nearest(track.t_ns, fixes.t_ns)
     arms = transform_each(T_inverse(track.T_dst_vehicle[near]), track.at(fixes.t_ns)[:, :3, 3])
-    steps = _steps(track.T_dst_vehicle, par)
+    steps = _steps(track.T_dst_vehicle)
     T = track.T_dst_vehicle
     for kind, k in _COSTS:
         graph = gtsam.NonlinearFactorGraph(steps)
         for number, p, arm, sigmas in zip(near.tolist(), p_frame_m, arms, _sigmas(fixes, par), strict=True):
             noise = gtsam.noiseModel.Robust.Create(
-                kind.Create(k * par.robust_k), gtsam.noiseModel.Diagonal.Sigmas(sigmas)
+                kind.Create(k * TRACK_ROBUST_K), gtsam.noiseModel.Diagonal.Sigmas(sigmas)
             )
             graph.add(gtsam.GPSFactorArm(number, p, arm, noise))
         T = _optimised(graph, T)
     off = (p_frame_m - transform_each(T[near], arms)) / _sigmas(fixes, par)
-    return T, (1.0 + (off**2).sum(axis=1) / par.robust_k**2) ** -2
+    return T, (1.0 + (off**2).sum(axis=1) / TRACK_ROBUST_K**2) ** -2
 
 
 def _sigmas(fixes: FixTable, par: GeoreferenceParameters) -> F64:
@@ -138,12 +149,12 @@ def _sigmas(fixes: FixTable, par: GeoreferenceParameters) -> F64:
     return np.column_stack([par.inflation * fixes.sigma_m, par.inflation * fixes.sigma_m, up])
 
 
-def _steps(T: F64, par: GeoreferenceParameters) -> gtsam.NonlinearFactorGraph:
+def _steps(T: F64) -> gtsam.NonlinearFactorGraph:
     """The track's steps, and a loose hold on the first pose: fixes on a straight line leave the roll free."""
     graph, step = gtsam.NonlinearFactorGraph(), T_inverse(T[:-1]) @ T[1:]
     length_m = np.linalg.norm(step[:, :3, 3], axis=1)
-    turn = np.hypot(par.step_rad, par.step_rad_per_root_m * np.sqrt(length_m))
-    move = np.hypot(par.step_m, par.step_share * np.sqrt(length_m * par.lasting_m))
+    turn = np.hypot(TRACK_STEP_RAD, TRACK_STEP_RAD_PER_ROOT_M * np.sqrt(length_m))
+    move = np.hypot(TRACK_STEP_M, TRACK_STEP_SHARE * np.sqrt(length_m * TRACK_LASTING_M))
     for i, (a, m) in enumerate(zip(turn.tolist(), move.tolist(), strict=True)):
         noise = gtsam.noiseModel.Diagonal.Sigmas(np.array([a, a, a, m, m, m]))
         graph.add(gtsam.BetweenFactorPose3(i, i + 1, gtsam.Pose3(step[i]), noise))

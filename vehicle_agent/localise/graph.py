@@ -1,7 +1,7 @@
 """The pose graph: a fixed-lag smoother over the last seconds of poses (GTSAM, built-in factors only)."""
 
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import Final, NamedTuple
 
 import gtsam
 import numpy as np
@@ -9,6 +9,11 @@ from numpy.typing import NDArray
 
 from gnd.vehicle_agent.localise.parameters import GraphParameters
 from gnd.vehicle_agent.localise.scan_odometry import ScanStep
+
+_GNSS_VERTICAL: Final = 2.0
+"""Its vertical sigma in horizontal ones."""
+GRAPH_ROBUST_K: Final = 2.0
+"""Cauchy scale of map matches and GNSS, in sigmas."""
 
 F64 = NDArray[np.float64]
 
@@ -140,9 +145,9 @@ class PoseGraph:
         return poses
 
     def _gnss_noise(self, sigma_m: float) -> gtsam.noiseModel.Base:
-        axes = np.array([1.0, 1.0, self.parameters.gnss_vertical])
+        axes = np.array([1.0, 1.0, _GNSS_VERTICAL])
         return self._robust(gtsam.noiseModel.Diagonal.Sigmas(sigma_m * self.parameters.gnss_inflation * axes))
 
     def _robust(self, noise: gtsam.noiseModel.Base) -> gtsam.noiseModel.Base:
-        cauchy = gtsam.noiseModel.mEstimator.Cauchy.Create(self.parameters.robust_k)
+        cauchy = gtsam.noiseModel.mEstimator.Cauchy.Create(GRAPH_ROBUST_K)
         return gtsam.noiseModel.Robust.Create(cauchy, noise)

@@ -1,17 +1,43 @@
 """Several poses at once: each is followed by odometry and registration until one of them has clearly won."""
 
 from dataclasses import dataclass
+from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
 
 from gnd.gnd_map.se3 import T_inverse, log_so3
 from gnd.vehicle_agent.errors import RegistrationError
-from gnd.vehicle_agent.localise.doubt_parameters import HypothesisParameters
 from gnd.vehicle_agent.localise.initialise import Candidate, InitialPose, near_pose, probabilities, thinned
 from gnd.vehicle_agent.localise.match_map import MatchMap
 from gnd.vehicle_agent.localise.parameters import RegistrationParameters
 from gnd.vehicle_agent.localise.registration import RegistrationResult, fit_of, register
+
+_N_MOST: Final = 8
+"""How many are followed."""
+_N_POINTS: Final = 1000
+"""That each is registered with."""
+HYPOTHESIS_APART_M: Final = 0.3
+HYPOTHESIS_APART_DEG: Final = 1.0
+"""Two poses nearer than this are one."""
+HYPOTHESIS_VIEW_M: Final = 2.0
+"""The way after which a scan is a new view, and how many views count: what is stale stays so."""
+_INNOVATION_M: Final = 0.1
+_INNOVATION_DEG: Final = 0.4
+"""One sigma of how far a right pose's registration moves it from where odometry has put it."""
+_TWIN_M: Final = 0.5
+_TWIN_DEG: Final = 2.0
+"""Poses nearer than this share their probability."""
+HYPOTHESIS_MOST_VIEWS: Final = 3.0
+"""So many views count: what is stale stays so."""
+HYPOTHESIS_SURE: Final = 0.99
+"""Least probability of a winner, after `least_scans` scans."""
+HYPOTHESIS_LEAST_SCANS: Final = 3
+_AT_ONCE: Final = 0.75
+_ALONE: Final = 0.75
+"""A fit so good, with a runner-up of less than this share of it, wins at the first."""
+_DROPPED: Final = 1e-06
+"""A hypothesis this much less probable than the best is given up."""
 
 F64 = NDArray[np.float64]
 
@@ -44,8 +70,8 @@ class Hypotheses:
     (standing still tells nothing new), by how far registration moves each from where odometry has put it, and by GNSS.
     """
 
-    def __init__(self, parameters: HypothesisParameters, registration: RegistrationParameters) -> None:
-        self.parameters = parameters
+    def __init__(self, registration: RegistrationParameters, most_views: float = HYPOTHESIS_MOST_VIEWS) -> None:
+        self._most_views = most_views
         self._registration = registration
         self._held: list[Hypothesis] = []
         self._way_m = 0.0  # since the last view
@@ -76,8 +102,8 @@ class Hypotheses:
         """Register every pose with a view: `points_m` (N, 3) in the vehicle frame, and those of them that stand above
         the ground. A pose that matches nothing is given up.
         """
-        new, self._way_m = min(1.0, self._way_m / self.parameters.view_m), 0.0
-        few, standing = thinned(points_m, self.parameters.n_points), thinned(standing_m, self.parameters.n_points)
+        new, self._way_m = min(1.0, self._way_m / HYPOTHESIS_VIEW_M), 0.0
+        few, standing = thinned(points_m, _N_POINTS), thinned(standing_m, _N_POINTS)
         self._held = [one for one in self._held if self._weighed(one, few, standing, match_map, new)]
         self._prune()
 
@@ -86,7 +112,7 @@ class Hypotheses:
         if result is None:
             return False
         fit = fit_of(standing_m, result.T_map_vehicle, m, self._registration)
-        one.take(result, fit, self._surprise(one.T_map_vehicle, result.T_map_vehicle), new, self.parameters.most_views)
+        one.take(result, fit, self._surprise(one.T_map_vehicle, result.T_map_vehicle), new, self._most_views)
         return True
 
     @property
@@ -99,7 +125,7 @@ class Hypotheses:
         """Of the best one and its twins, 0 without any; the others and "none of them" share the rest."""
         if not self._held:
             return 0.0
-        twins = self._near(self.best.T_map_vehicle, self.parameters.twin_m, self.parameters.twin_deg)
+        twins = self._near(self.best.T_map_vehicle, _TWIN_M, _TWIN_DEG)
         return float(self._probabilities()[twins].sum())
 
     def drop_near(self, T_map_vehicle: F64) -> None:
@@ -115,12 +141,12 @@ class Hypotheses:
         """The best pose as it stands now; `found` when it has won."""
         if not self._held:
             return None
-        par, best = self.parameters, self.best
-        twins = self._near(best.T_map_vehicle, par.twin_m, par.twin_deg)
+        best = self.best
+        twins = self._near(best.T_map_vehicle, _TWIN_M, _TWIN_DEG)
         fits = np.array([one.mean_fit for one in self._held])
         runner_up = float(fits[~twins].max(initial=0.0))
-        at_once = best.mean_fit >= par.at_once and runner_up <= par.alone * best.mean_fit
-        won = at_once or (best.scans >= par.least_scans and self.probability >= par.sure)
+        at_once = best.mean_fit >= _AT_ONCE and runner_up <= _ALONE * best.mean_fit
+        won = at_once or (best.scans >= HYPOTHESIS_LEAST_SCANS and self.probability >= HYPOTHESIS_SURE)
         return InitialPose(best.registration, best.mean_fit, runner_up, len(fits), won, self.probability)
 
     def _registered(self, points: F64, predicted: F64, m: MatchMap) -> RegistrationResult | None:
@@ -131,9 +157,9 @@ class Hypotheses:
 
     def _surprise(self, T_predicted: F64, T_found: F64) -> float:
         """Half the squared distance between two poses in sigmas, at most 8."""
-        par, off = self.parameters, T_inverse(T_predicted) @ T_found
-        shift = float(np.hypot(off[0, 3], off[1, 3])) / par.innovation_m
-        turn = float(np.degrees(np.linalg.norm(log_so3(off[:3, :3])))) / par.innovation_deg
+        off = T_inverse(T_predicted) @ T_found
+        shift = float(np.hypot(off[0, 3], off[1, 3])) / _INNOVATION_M
+        turn = float(np.degrees(np.linalg.norm(log_so3(off[:3, :3])))) / _INNOVATION_DEG
         return min(0.5 * (shift**2 + turn**2), 8.0)
 
     def _probabilities(self) -> F64:
@@ -142,21 +168,20 @@ class Hypotheses:
             return np.empty(0)
         fits = np.array([one.mean_fit for one in self._held])
         views = max(one.views for one in self._held)
-        return probabilities(fits, views, self.parameters, np.array([one.surprise + one.far for one in self._held]))
+        return probabilities(fits, views, np.array([one.surprise + one.far for one in self._held]))
 
     def _near(self, T: F64, apart_m: float | None = None, apart_deg: float | None = None) -> NDArray[np.bool_]:
         """(K,) which poses lie near another, by default so near that they are one."""
-        par = self.parameters
         held = np.stack([one.T_map_vehicle for one in self._held]) if self._held else np.empty((0, 4, 4))
-        return near_pose(held, T, apart_m or par.apart_m, apart_deg or par.apart_deg)
+        return near_pose(held, T, apart_m or HYPOTHESIS_APART_M, apart_deg or HYPOTHESIS_APART_DEG)
 
     def _prune(self) -> None:
         """Leave out what has become improbable, what has run into a better one, and the least probable beyond the
         number that is followed.
         """
         p = self._probabilities()
-        order = [k for k in np.argsort(-p, kind="stable") if p[k] >= self.parameters.dropped * p.max()]
+        order = [k for k in np.argsort(-p, kind="stable") if p[k] >= _DROPPED * p.max()]
         held, self._held = self._held, []
-        for k in order[: 2 * self.parameters.n_most]:
-            if len(self._held) < self.parameters.n_most and not self._near(held[k].T_map_vehicle).any():
+        for k in order[: 2 * _N_MOST]:
+            if len(self._held) < _N_MOST and not self._near(held[k].T_map_vehicle).any():
                 self._held.append(held[k])

@@ -18,8 +18,7 @@ from numpy.typing import NDArray
 
 from gnd.vehicle_agent.localise.kernels import pulls
 from gnd.vehicle_agent.localise.match_map import MatchMap
-from gnd.vehicle_agent.localise.parameters import RegistrationParameters
-from gnd.vehicle_agent.localise.registration import Linearised
+from gnd.vehicle_agent.localise.registration import REGISTRATION_GATE_PER_SCALE, Linearised
 
 F64 = NDArray[np.float64]
 
@@ -49,18 +48,17 @@ class Influence(NamedTuple):
     pieces: F64
 
 
-def influence(seen: Sequence[SeenScan], match_map: MatchMap, registration: RegistrationParameters) -> Influence:
+def influence(seen: Sequence[SeenScan], match_map: MatchMap) -> Influence:
     """What the errors of the map, as residuals show them, do to quantities that are estimated from scans.
 
     Args:
         seen: the scans, each at its present pose.
         match_map: the map that they were matched with.
-        registration: noise of points and gates.
     """
     n = seen[0].v.shape[0] if seen else 0
     pull, weight = np.zeros((len(match_map), n)), np.zeros((len(match_map), n))
     for scan in seen:
-        _add(pull, weight, scan, match_map, registration)
+        _add(pull, weight, scan, match_map)
     touched = np.flatnonzero(weight.any(axis=1))
     if not len(touched):
         return Influence(np.ones(n), np.zeros(n))
@@ -81,14 +79,14 @@ def _of_pieces(pull: F64, weight: F64) -> Influence:
     return Influence((pieces * seen + FEW * usual) / (pieces + FEW), pieces)
 
 
-def _add(pull: F64, weight: F64, scan: SeenScan, match_map: MatchMap, par: RegistrationParameters) -> None:
+def _add(pull: F64, weight: F64, scan: SeenScan, match_map: MatchMap) -> None:
     R, t = scan.match.T_map_vehicle[:3, :3], scan.match.T_map_vehicle[:3, 3]
     v = scan.v @ scan.match.told.T
     along_map = np.concatenate([v[:, :3] @ R.T, v[:, 3:] @ R.T], axis=1)
     m, scale = match_map, scan.match.scale
     pulls(
         np.ascontiguousarray(scan.points_m), np.ascontiguousarray(R), np.ascontiguousarray(t), m.index, m.A, m.b,
-        m.mean_m, m.information, scale**2, (par.gate_per_scale * scale) ** 2, along_map, pull, weight,
+        m.mean_m, m.information, scale**2, (REGISTRATION_GATE_PER_SCALE * scale) ** 2, along_map, pull, weight,
     )  # fmt: skip
 
 

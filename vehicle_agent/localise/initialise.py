@@ -7,6 +7,7 @@ says how sure it is; `Hypotheses` (hypotheses.py) follows the candidates of a pl
 
 from collections.abc import Iterable
 from dataclasses import dataclass, replace
+from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,10 +15,29 @@ from numpy.typing import NDArray
 from gnd.gnd_map.jit import kernel
 from gnd.gnd_map.se3 import T_from_R_t, exp_so3
 from gnd.vehicle_agent.errors import RegistrationError
-from gnd.vehicle_agent.localise.doubt_parameters import HypothesisParameters
 from gnd.vehicle_agent.localise.match_map import MatchMap
 from gnd.vehicle_agent.localise.parameters import InitialiseParameters, RegistrationParameters
 from gnd.vehicle_agent.localise.registration import RegistrationResult, Start, fit_of, register
+
+HYPOTHESIS_GAIN: Final = 50.0
+"""How many times likelier a pose is (as a logarithm) for a whole unit of mean fit more, one view."""
+_NONE_FIT: Final = 0.35
+"""Mean fit of the hypothesis that it is none of them."""
+INITIALISE_RADIUS_SIGMAS: Final = 3.0
+"""How far around the position, in its sigmas."""
+_N_POINTS: Final = 400
+"""Points that score one."""
+_N_CHECKED: Final = 400
+INITIALISE_N_REFINING: Final = 1000
+INITIALISE_MIN_FIT: Final = 0.4
+"""Least fit (0 ... 1) that counts as found."""
+_AMBIGUITY: Final = 0.9
+"""The runner-up may reach this share of the best fit."""
+_APART_M: Final = 1.0
+_APART_DEG: Final = 5.0
+"""Two poses nearer than this are the same answer."""
+STANDING_ABOVE_M: Final = 0.4
+"""Points that stand are higher than this above the ground, which fits everywhere."""
 
 F64 = NDArray[np.float64]
 U8 = NDArray[np.uint8]
@@ -85,9 +105,9 @@ def initialise(
         registration: of the refinement.
     """
     par, registration = parameters or InitialiseParameters(), registration or RegistrationParameters()
-    around = Around(np.asarray(p_gnss_m, np.float64), par.radius_sigmas * sigma_m)
+    around = Around(np.asarray(p_gnss_m, np.float64), INITIALISE_RADIUS_SIGMAS * sigma_m)
     candidates, n = search(points_m, around, match_map, par, registration)
-    answer = _answer(candidates, n, par)
+    answer = _answer(candidates, n)
     return _with_all_points(answer, points_m, match_map, registration)
 
 
@@ -110,15 +130,15 @@ def search(
         return [], 0
     ground_below_m = ground_below(points_m)
     if standing_m is None:
-        standing_m = points_m[points_m[:, 2] > ground_below_m + par.above_ground_m]  # ground fits everywhere
+        standing_m = points_m[points_m[:, 2] > ground_below_m + STANDING_ABOVE_M]  # ground fits everywhere
     standing = standing_m
     hypotheses = _hypotheses(around, ground, ground_below_m, par)
-    scores = _score(thinned(standing, par.n_points), hypotheses, match_map)
+    scores = _score(thinned(standing, _N_POINTS), hypotheses, match_map)
     poses = hypotheses[_distinct_best(hypotheses, scores, par.n_refined)]
-    checked = _refined(thinned(points_m, par.n_checked), standing, poses, match_map, registration, "capture", par)
+    checked = _refined(thinned(points_m, _N_CHECKED), standing, poses, match_map, registration, "capture")
     best = [c.registration.T_map_vehicle for c in _distinct(checked, par)[: par.n_kept]]
-    few = thinned(points_m, par.n_refining)
-    return _distinct(_refined(few, standing, best, match_map, registration, "near", par), par), len(hypotheses)
+    few = thinned(points_m, INITIALISE_N_REFINING)
+    return _distinct(_refined(few, standing, best, match_map, registration, "near"), par), len(hypotheses)
 
 
 def _distinct(candidates: list[Candidate], par: InitialiseParameters) -> list[Candidate]:
@@ -262,10 +282,9 @@ def near_pose(T: F64, other: F64, apart_m: float, apart_deg: float) -> NDArray[n
 
 def _refined(
     points_m: F64, standing_m: F64, poses: Iterable[F64], m: MatchMap, par: RegistrationParameters, start: Start,
-    how: InitialiseParameters,
 ) -> list[Candidate]:  # fmt: skip
     """Registrations from each pose with the fit of what stands above the ground; those that match nothing left out."""
-    standing_m = thinned(standing_m, how.n_refining)
+    standing_m = thinned(standing_m, INITIALISE_N_REFINING)
     candidates = []
     for T in poses:
         try:
@@ -276,26 +295,26 @@ def _refined(
     return candidates
 
 
-def _answer(candidates: list[Candidate], n: int, par: InitialiseParameters) -> InitialPose | None:
+def _answer(candidates: list[Candidate], n: int) -> InitialPose | None:
     """The best candidate, compared with the best that is a different answer."""
     if not candidates:
         return None
     best = candidates[0]
     T = np.stack([c.registration.T_map_vehicle for c in candidates])
     fits = np.array([c.fit for c in candidates])
-    others = fits[~near_pose(T, T[0], par.apart_m, par.apart_deg)]
+    others = fits[~near_pose(T, T[0], _APART_M, _APART_DEG)]
     runner_up = float(others.max()) if len(others) else 0.0
-    found = best.fit >= par.min_fit and runner_up <= par.ambiguity * best.fit
-    probability = float(probabilities(np.concatenate([[best.fit], others]), 1.0, HypothesisParameters())[0])
+    found = best.fit >= INITIALISE_MIN_FIT and runner_up <= _AMBIGUITY * best.fit
+    probability = float(probabilities(np.concatenate([[best.fit], others]), 1.0)[0])
     return InitialPose(best.registration, best.fit, runner_up, n, found, probability)
 
 
-def probabilities(fits: F64, views: float, par: HypothesisParameters, penalties: F64 | float = 0.0) -> F64:
+def probabilities(fits: F64, views: float, penalties: F64 | float = 0.0) -> F64:
     """(K,) probabilities of poses with mean fits (K,) over so many views, beside that of being none of them.
 
     `penalties` (K,) are logarithms taken off: what odometry and GNSS say against a pose.
     """
-    log = par.gain * views * (np.concatenate([fits, [par.none_fit]])) - np.append(penalties + 0.0 * fits, 0.0)
+    log = HYPOTHESIS_GAIN * views * (np.concatenate([fits, [_NONE_FIT]])) - np.append(penalties + 0.0 * fits, 0.0)
     weight = np.exp(log - log.max())
     return np.asarray(weight[:-1] / weight.sum())
 

@@ -11,13 +11,23 @@ from gnd.vehicle_agent.localise.challenge import Challenger
 from gnd.vehicle_agent.localise.estimates import Cause
 from gnd.vehicle_agent.localise.first_pose import Place
 from gnd.vehicle_agent.localise.health import HealthMonitor
-from gnd.vehicle_agent.localise.initialise import ground_below, thinned
+from gnd.vehicle_agent.localise.initialise import INITIALISE_N_REFINING, INITIALISE_RADIUS_SIGMAS, ground_below, thinned
 from gnd.vehicle_agent.localise.match_map import MatchMap
 from gnd.vehicle_agent.localise.parameters import LocaliserParameters
-from gnd.vehicle_agent.localise.registration import RegistrationResult, fit_of
+from gnd.vehicle_agent.localise.registration import REGISTRATION_MIN_MATCHED, RegistrationResult, fit_of
 from gnd.vehicle_agent.localise.scan_pool import ScanPool
 from gnd.vehicle_agent.localise.uniqueness import Uniqueness
 from gnd.vehicle_agent.localise.witness import witnessed
+
+_PERIOD_S: Final = 0.5
+_WAY_M: Final = 5.0
+_REACH_M: Final = 5.0
+"""Around the tracked pose where there is no GNSS."""
+_LEAST_KNOWN: Final = 0.3
+"""A smaller share of the points in known voxels means that there is no map."""
+_MOTION_GAP_S: Final = 0.3
+_GAP_S: Final = 2.0
+"""After so long without motion samples, or without a believed match, the pose must prove itself again."""
 
 F64 = NDArray[np.float64]
 
@@ -51,10 +61,10 @@ class Judge:
     def __init__(self, parameters: LocaliserParameters, origin_m: F64, now_ns: int) -> None:
         self._par = parameters
         self._origin_m = np.ascontiguousarray(origin_m, dtype=np.float64)
-        self.monitor = HealthMonitor(parameters.health, now_ns, parameters.causes)
+        self.monitor = HealthMonitor(parameters.health, now_ns)
         self.challenger = Challenger(parameters)
         self.uniqueness = Uniqueness(parameters)
-        self._pool = ScanPool(parameters.pool)
+        self._pool = ScanPool()
         self._witness_ns = -(2**62)
         self._way_m = 0.0
         self._T_looked_now = np.eye(4)  # motion since the last scan that had points enough to look at
@@ -69,18 +79,18 @@ class Judge:
     def see_position(self, p_map_m: F64, sigma_m: float, T_now: F64) -> None:
         """Take where GNSS says that the vehicle, tracked at `T_now` (4, 4), is now: (3,), one sigma of an axis."""
         self.monitor.see_fix(p_map_m[:2] - T_now[:2, 3], sigma_m)
-        self._place = Place(p_map_m, sigma_m, self._par.initialise.radius_sigmas * sigma_m)
+        self._place = Place(p_map_m, sigma_m, INITIALISE_RADIUS_SIGMAS * sigma_m)
 
     def see(self, scan: Matched, match_map: MatchMap) -> None:
         """Take a scan: what its rays say, how well it fits, whether another pose fits better."""
-        if scan.motion_gap_s > self._par.causes.motion_gap_s or self.monitor.gap_s(scan.t_ns) > self._par.causes.gap_s:
+        if scan.motion_gap_s > _MOTION_GAP_S or self.monitor.gap_s(scan.t_ns) > _GAP_S:
             self.monitor.distrust()
-            self.uniqueness.distrust(moved=scan.motion_gap_s > self._par.causes.motion_gap_s)
+            self.uniqueness.distrust(moved=scan.motion_gap_s > _MOTION_GAP_S)
         self.monitor.see_scan(self._what_is_wrong(scan, match_map))
         self.monitor.matching_ratio = 0.0 if scan.result is None else scan.result.matching_ratio
         self._way_m += float(np.linalg.norm(scan.T_before_now[:3, 3]))
         self._T_looked_now = self._T_looked_now @ scan.T_before_now
-        if len(scan.points_m) < self._par.registration.min_matched:
+        if len(scan.points_m) < REGISTRATION_MIN_MATCHED:
             return
         scan, self._T_looked_now = scan._replace(T_before_now=self._T_looked_now), np.eye(4)
         new = self._pool.push(scan.points_m, scan.T_before_now)
@@ -92,7 +102,7 @@ class Judge:
         self._challenge(scan, new or self._pool.stands, match_map)
         if scan.result is not None and scan.believed:
             fit = fit_of(
-                thinned(self._pool.standing_m, self._par.initialise.n_refining),
+                thinned(self._pool.standing_m, INITIALISE_N_REFINING),
                 scan.T_now,
                 match_map,
                 self._par.registration,
@@ -101,17 +111,15 @@ class Judge:
 
     def _ask(self, scan: Matched, match_map: MatchMap) -> None:
         """The witness, now and then, and whenever a match is not believed."""
-        par = self._par.witness
-        rested = scan.t_ns - self._witness_ns >= par.period_s * 1e9 or self._way_m >= par.way_m
+        rested = scan.t_ns - self._witness_ns >= _PERIOD_S * 1e9 or self._way_m >= _WAY_M
         if scan.believed and not rested:
             return
         self._witness_ns, self._way_m = scan.t_ns, 0.0
         below_m = ground_below(scan.points_m)
-        self.monitor.see_testimony(witnessed(scan.points_m, self._origin_m, below_m, scan.T_now, match_map, par))
+        self.monitor.see_testimony(witnessed(scan.points_m, self._origin_m, below_m, scan.T_now, match_map))
 
     def _challenge(self, scan: Matched, new: bool, match_map: MatchMap) -> None:
-        par = self._par.challenge
-        place = self._place or Place(scan.T_now[:3, 3], par.reach_m, par.reach_m)
+        place = self._place or Place(scan.T_now[:3, 3], _REACH_M, _REACH_M)
         self._place = None
         monitor = self.monitor
         doubtful = not scan.believed or monitor.doubtful(scan.result) or monitor.suspicious or not monitor.trusted
@@ -125,12 +133,12 @@ class Judge:
         """With the scan itself, whatever it matches."""
         if scan.repeated or len(scan.points_m) < FEWEST_POINTS:
             return "bad_scan"
-        if len(scan.points_m) < self._par.registration.min_matched:
+        if len(scan.points_m) < REGISTRATION_MIN_MATCHED:
             return "poor_place"
         known = _known_ratio(scan, match_map) if scan.result is None else scan.result.known_ratio
-        if known < self._par.causes.least_known:
+        if known < _LEAST_KNOWN:
             return "no_map"
-        return "no_motion" if scan.motion_gap_s > self._par.causes.motion_gap_s else scan.cause
+        return "no_motion" if scan.motion_gap_s > _MOTION_GAP_S else scan.cause
 
 
 def _known_ratio(scan: Matched, m: MatchMap) -> float:

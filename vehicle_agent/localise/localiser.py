@@ -21,7 +21,7 @@ from gnd.vehicle_agent.localise.consistency import Innovations
 from gnd.vehicle_agent.localise.estimates import Cause, Health, PoseEstimate, RefinedScan
 from gnd.vehicle_agent.localise.first_pose import FirstPose, Place
 from gnd.vehicle_agent.localise.graph import MapMatch, Odometry, PoseGraph, Position, SmoothedPose
-from gnd.vehicle_agent.localise.health import HealthMonitor
+from gnd.vehicle_agent.localise.health import CAUSE_POOR_SIGMA_M, HealthMonitor
 from gnd.vehicle_agent.localise.held_scan import (
     POSE_SHARE,
     SURE,
@@ -34,6 +34,7 @@ from gnd.vehicle_agent.localise.held_scan import (
     sigmas_of,
     sweep_variance,
 )
+from gnd.vehicle_agent.localise.initialise import INITIALISE_RADIUS_SIGMAS
 from gnd.vehicle_agent.localise.judge import Judge, Matched
 from gnd.vehicle_agent.localise.level import on_the_road, sees_tilt, settled
 from gnd.vehicle_agent.localise.match_map import MatchMapCache
@@ -47,6 +48,11 @@ from gnd.vehicle_agent.localise.registration import RegistrationResult, Start, r
 from gnd.vehicle_agent.localise.remount import TRUSTED, Mounting, lever_covariance
 from gnd.vehicle_agent.localise.sampling import sample_scan
 from gnd.vehicle_agent.localise.scan_odometry import JointStep, ScanOdometry, ScanStep, joint_step
+
+_LOST_GAP_S: Final = 15.0
+"""After so long without scans it is lost."""
+_TEACHING_FIT: Final = 0.75
+"""Least fit of a match that teaches: where much has changed, matches are off together."""
 
 F64 = NDArray[np.float64]
 Distortion = Callable[[float, float], DistortionSigma]
@@ -115,7 +121,7 @@ class Localiser:
         self._motion = MotionBuffer()
         self._teacher = MotionTeacher(self._motion, self.parameters.odometry, self._mounting)
         self._map = MatchMapCache(local_map, self.parameters.registration.noise_m)
-        self._scan_odometry = ScanOdometry(self.parameters.scan_odometry)
+        self._scan_odometry = ScanOdometry(self.parameters.scan_odometry, self.parameters.registration.noise_m)
         self._co_moving = CoMoving(self._mounting.T_used)
         self._fix: GnssFix | None = None
         self._pending: Scan | None = None
@@ -227,7 +233,7 @@ class Localiser:
         points = self._deskewed(scan, chosen, scan.points_m[chosen])
         chosen, points = self._without_company(scan, chosen, points)
         last_ns = scan.t_ns if self._last_ns is None else self._last_ns
-        if self._track is not None and (scan.t_ns - last_ns) * 1e-9 > self.parameters.causes.lost_gap_s:
+        if self._track is not None and (scan.t_ns - last_ns) * 1e-9 > _LOST_GAP_S:
             self._lose(self._track, "gap")
         if self._track is None:
             self._start(scan, points)
@@ -292,7 +298,7 @@ class Localiser:
             self.innovations.see(predicted, before, *match)
             if joint.slipped:
                 self._teacher.forget()
-            elif result.fit >= self.parameters.odometry.teaching_fit and not len(result.degenerate):
+            elif result.fit >= _TEACHING_FIT and not len(result.degenerate):
                 self._teacher.learn(t_ns, result.T_map_vehicle, result.covariance)
         odometry = Odometry(odometry.T_before_now, joint.driven_sigmas)
         gnss, T_now = self._gnss_at(track, t_ns, predicted), predicted if match is None else match.T_map_vehicle
@@ -351,7 +357,7 @@ class Localiser:
     def _reach(self, track: _Track, odometry: Odometry) -> F64:
         """(6,) one sigma of where a match may lie: of the motion, and of a pose that is poorly known itself."""
         covariance = track.held[track.graph.newest].online.covariance
-        if np.sqrt(np.linalg.eigvalsh(covariance[3:5, 3:5])[1]) < self.parameters.causes.poor_sigma_m:
+        if np.sqrt(np.linalg.eigvalsh(covariance[3:5, 3:5])[1]) < CAUSE_POOR_SIGMA_M:
             return odometry.sigmas
         return np.asarray(np.hypot(odometry.sigmas, np.sqrt(np.diag(covariance))))
 
@@ -529,7 +535,7 @@ class Localiser:
 
     def _place(self, t_ns: int) -> Place | None:
         """Where the last fix says that the vehicle is; how far it has driven since is not known in which direction."""
-        fix, sigmas = self._fix, self.parameters.initialise.radius_sigmas
+        fix, sigmas = self._fix, INITIALISE_RADIUS_SIGMAS
         if fix is None or abs(t_ns - fix.t_ns) > MAX_GNSS_AGE_NS:
             return None
         moved_m = abs(self._motion.speed_mps * (t_ns - fix.t_ns) * 1e-9)
@@ -560,7 +566,7 @@ class Localiser:
             return
         age_s = (now_ns - self.online.t_ns) * 1e-9
         if age_s > self.parameters.health.degraded_after_s:
-            health: Health = "lost" if age_s > self.parameters.causes.lost_gap_s else "degraded"
+            health: Health = "lost" if age_s > _LOST_GAP_S else "degraded"
             self.online = replace(self.online, health=health, cause="gap")
 
     def _see_past(self, scan: Scan) -> None:

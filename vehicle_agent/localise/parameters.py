@@ -1,222 +1,192 @@
-"""Settings of localisation: one frozen dataclass a step, with defaults that run; units are in the names."""
+"""Settings of localisation: one frozen dataclass a step, with defaults that run; units are in the names.
+
+What nobody turns is a constant beside its use.
+"""
 
 from dataclasses import dataclass, field
+from typing import Final
 
-from gnd.vehicle_agent.localise.doubt_parameters import (
-    CauseParameters,
-    ChallengeParameters,
-    HypothesisParameters,
-    PoolParameters,
-    WitnessParameters,
-)
-from gnd.vehicle_agent.localise.refine_parameters import RefineParameters
-from gnd.vehicle_agent.localise.scan_odometry_parameters import ScanOdometryParameters
-from gnd.vehicle_agent.localise.uniqueness_parameters import UniquenessParameters
+from gnd.gnd_map.settings import check_settings, setting
+
+NOISE_M: Final = 0.04
+"""One sigma of range noise, distortion left in the sweep and voxel rounding together: of map matches and of steps."""
 
 
 @dataclass(frozen=True, slots=True)
 class SamplingParameters:
-    """Which points of a scan are matched: about `n_points`, at most one in a cube of `leaf_m`."""
+    """Which points of a scan are matched."""
 
-    n_points: int = 2500
-    leaf_m: float = 0.3
-    min_range_m: float = 2.5
-    max_range_m: float = 60.0
+    n_points: int = setting(2500, "About so many points of a scan are matched.", least=100, most=100_000)
+    leaf_m: float = setting(0.3, "At most one of them lies in a cube of this side.", unit="m", above=0, most=10)
+    min_range_m: float = setting(2.5, "Nearer points are the vehicle itself.", unit="m", least=0)
+    max_range_m: float = setting(60.0, "Farther points are not matched; more than `min_range_m`.", unit="m", above=0)
 
     def __post_init__(self) -> None:
-        if self.n_points < 100 or self.leaf_m <= 0 or not 0 <= self.min_range_m < self.max_range_m:
-            raise ValueError(f"n_points >= 100, leaf_m > 0 and 0 <= min_range_m < max_range_m are required, got {self}")
+        check_settings(self)
+        if not self.min_range_m < self.max_range_m:
+            raise ValueError(f"min_range_m = {self.min_range_m} must be less than max_range_m = {self.max_range_m}")
 
 
 @dataclass(frozen=True, slots=True)
 class RegistrationParameters:
-    """Scan-to-map matching.
+    """Scan-to-map matching."""
 
-    noise_m: one sigma of range noise, distortion left in the sweep and voxel rounding together.
-    scales: Geman-McClure scales in sigmas, one a stage, wide to narrow, when the start is known to some 10 cm: where
-        the world has changed, a narrow kernel stays with what has not.
-    wide_scales: the stages when the start is known to 1 m and 3 degrees; capture_scales: to 2 m and 5 degrees.
-    gate_per_scale: a point farther than this many scales from every Gaussian is no match.
-    correlation: how many points share one error (of the map, of the mount); multiplies the covariance.
-    floor_m, floor_rad: the least sigma claimed along an axis, whatever the Hessian says.
-    degenerate_m: a direction whose sigma exceeds this (turns taken at 10 m) is reported and not moved along;
-        degenerate_share: so is a horizontal one with less than this share of the strongest direction's information.
-    """
-
-    noise_m: float = 0.04
+    noise_m: float = setting(
+        NOISE_M,
+        "One sigma of range noise, distortion left in the sweep and voxel rounding together.",
+        unit="m",
+        above=0,
+        most=1,
+    )
+    wheel_sigma_m: float = setting(
+        0.02, "How well the wheels keep the vehicle on the road; 0: wheels are no witness.", unit="m", least=0
+    )
     scales: tuple[float, ...] = (4.0, 2.0)
-    wide_scales: tuple[float, ...] = (8.0, 4.0, 2.0)
-    capture_scales: tuple[float, ...] = (30.0, 10.0, 4.0, 2.0)
-    gate_per_scale: float = 2.5
+    """Geman-McClure scales in sigmas, one a stage, wide to narrow, when the start is known to some 10 cm: where the
+    world has changed, a narrow kernel stays with what has not. This and what follows is what matches of scans with each
+    other, and of codecs with the exact map, do otherwise; no setting."""
+    correlation: float = 10.0
+    """So many points share one error (of the map, of the mount); multiplies the covariance."""
+    floor_m: float = 0.01
+    floor_rad: float = 3e-4
+    """The least sigma claimed along an axis, whatever the Hessian says."""
+    degenerate_m: float = 0.2
+    """A direction whose sigma exceeds this (turns taken at 10 m) is reported and not moved along."""
     max_iterations: int = 15
     stop_m: float = 5e-4
     stop_rad: float = 1e-4
-    min_matched: int = 60
-    correlation: float = 10.0
-    floor_m: float = 0.01
-    floor_rad: float = 3e-4
-    degenerate_m: float = 0.2
-    degenerate_share: float = 0.01
-    wheel_sigma_m: float = 0.02
+    """A match ends with a shorter step."""
 
     def __post_init__(self) -> None:
-        stages = (*self.scales, *self.wide_scales, *self.capture_scales)
-        if not (self.scales and self.wide_scales and self.capture_scales) or min(*stages, self.noise_m) <= 0:
-            raise ValueError(f"noise_m and at least one scale, all positive, are required, got {self}")
-        if self.min_matched < 6 or self.max_iterations < 1:
-            raise ValueError(f"min_matched >= 6 and max_iterations >= 1 are required, got {self}")
+        check_settings(self)
+        if not self.scales or min(*self.scales, self.max_iterations) <= 0:
+            raise ValueError(f"at least one scale and one iteration are required, all positive, got {self}")
 
 
 @dataclass(frozen=True, slots=True)
 class InitialiseParameters:
-    """Search for the first pose around a GNSS position.
+    """How a search for poses goes about it: around a GNSS position, around a tracked pose, along a loop. No settings.
 
-    radius_sigmas: how far around the position, in its sigmas; step_m, step_deg: spacing of the coarse hypotheses;
-    n_points: points that score one; n_refined: how many of the best are refined by registration, with `n_checked`
-        points; n_kept: how many of these are refined to the end, with `n_refining` points; same_m, same_deg: refined
-        poses nearer than this are one;
-    min_fit: least fit (0 ... 1) that counts as found; ambiguity: the runner-up may reach this share of the best fit;
-    good_fit, fair_fit: a fit of `good_fit` is taken at once; one of `fair_fit` when it stays the best for some way:
-        where much has changed, a pose decimetres off can fit best, and a vehicle that moves soon sees something else;
-    apart_m, apart_deg: two poses nearer than this are the same answer.
+    step_m, step_deg: spacing of the coarse hypotheses; n_refined: how many of the best are refined by registration;
+    n_kept: how many of these are refined to the end; same_m, same_deg: refined poses nearer than this are one.
     """
 
-    radius_sigmas: float = 3.0
     step_m: float = 1.0
     step_deg: float = 5.0
-    n_points: int = 400
     n_refined: int = 24
-    n_checked: int = 400
     n_kept: int = 8
-    n_refining: int = 1000
     same_m: float = 0.2
     same_deg: float = 1.0
-    min_fit: float = 0.4
-    good_fit: float = 0.65
-    fair_fit: float = 0.48
-    ambiguity: float = 0.9
-    apart_m: float = 1.0
-    apart_deg: float = 5.0
-    above_ground_m: float = 0.4
 
     def __post_init__(self) -> None:
-        if min(self.step_m, self.step_deg, self.radius_sigmas) <= 0 or min(self.n_points, self.n_refined) < 1:
-            raise ValueError(f"steps, radius and counts must be positive, got {self}")
-        if not (0 < self.min_fit < 1 and 0 < self.ambiguity <= 1):
-            raise ValueError(f"0 < min_fit < 1 and 0 < ambiguity <= 1 are required, got {self}")
+        if min(self.step_m, self.step_deg, self.n_refined) <= 0:
+            raise ValueError(f"steps and counts must be positive, got {self}")
 
 
 @dataclass(frozen=True, slots=True)
 class OdometryParameters:
-    """How far to trust wheel speed and yaw rate, one sigma each.
+    """What is known of wheels and gyro before anything is learnt, one sigma each."""
 
-    longitudinal_m, lateral_m, vertical_m, distance_share, roll_pitch_rad, yaw_rad: of a step between two scans, the
-        share being of its length, once scale, bias and course are learnt.
-    scale_prior, bias_prior_radps, course_prior: of the wheel scale, of the gyro's bias, and of the motion sideways and
-        upwards per metre forward (the LiDAR's mount is not aligned with the wheels) before anything is learnt.
-    scale_drift, bias_drift_radps: their change in a root second.
-    stretch_m, stretch_rad: of the motion over a second that two map matches tell.
-    least_scale, least_bias_radps: the least sigma of what a stretch of submaps tells about scale and bias.
-    teaching_fit: least fit of a match that teaches: where much has changed, matches are off together.
-    excess_gain: weight of the newest step in the running judgement of how much worse than all this the odometry is.
-    """
-
-    longitudinal_m: float = 0.003
-    lateral_m: float = 0.003
-    vertical_m: float = 0.01
-    distance_share: float = 0.007
-    roll_pitch_rad: float = 3e-3
-    yaw_rad: float = 6e-4
-    scale_prior: float = 0.02
-    bias_prior_radps: float = 0.005
-    course_prior: float = 0.02
-    scale_drift: float = 1e-4
-    bias_drift_radps: float = 1e-5
-    stretch_m: float = 0.03
-    stretch_rad: float = 2e-3
-    least_scale: float = 5e-4
-    least_bias_radps: float = 7e-5
-    teaching_fit: float = 0.75
-    excess_gain: float = 0.2
+    scale_prior: float = setting(0.02, "Of the wheel scale, as a share.", above=0, most=1)
+    bias_prior_radps: float = setting(0.005, "Of the gyro's bias.", unit="rad/s", above=0)
+    course_prior: float = setting(
+        0.02,
+        "Of the motion sideways and upwards per metre forward: the LiDAR's mount is not aligned with the wheels.",
+        above=0,
+        most=1,
+    )
 
     def __post_init__(self) -> None:
-        steps = (self.longitudinal_m, self.lateral_m, self.vertical_m, self.roll_pitch_rad, self.yaw_rad)
-        if min(*steps, self.stretch_m, self.stretch_rad) <= 0 or self.distance_share < 0:
-            raise ValueError(f"sigmas must be positive and distance_share not negative, got {self}")
+        check_settings(self)
 
 
 @dataclass(frozen=True, slots=True)
 class GraphParameters:
-    """The fixed-lag pose graph.
+    """The fixed-lag pose graph."""
 
-    lag_s: a pose is final when it is this old.
-    gnss_inflation: GNSS errors last for tens of seconds, so a fix counts for less than its sigma says; gnss_vertical:
-        its vertical sigma in horizontal ones.
-    robust_k: Cauchy scale of map matches and GNSS, in sigmas.
-    """
-
-    lag_s: float = 3.0
-    gnss_inflation: float = 5.0
-    gnss_vertical: float = 2.0
-    robust_k: float = 2.0
+    lag_s: float = setting(3.0, "A pose is final when it is this old.", unit="s", above=0)
+    gnss_inflation: float = setting(
+        5.0, "GNSS errors last for tens of seconds, so a fix's sigma is taken this many times.", least=1
+    )
 
     def __post_init__(self) -> None:
-        if self.lag_s <= 0 or self.gnss_inflation < 1 or min(self.gnss_vertical, self.robust_k) <= 0:
-            raise ValueError(f"positive values and gnss_inflation >= 1 are required, got {self}")
+        check_settings(self)
 
 
 @dataclass(frozen=True, slots=True)
 class HealthParameters:
-    """When a match is believed, and when the pose is called degraded or lost.
+    """When a match is believed, and when the pose is called degraded or lost."""
 
-    min_matching_ratio: least share of the points with a Gaussian nearby.
-    trusted_fit: a pose is degraded until one match has had this fit: where much has changed, a wrong pose can fit best.
-    better_fit, better_count: this many scans in a row that fit better by so much at a pose farther off make the pose
-        suspicious.
-    gate_m, gate_m_per_s, gate_deg, gate_deg_per_s: how far a match may lie from the prediction, at once and for every
-        second without a believed match; three sigmas of the odometry come on top.
-    degraded_after_s, lost_after_s: time without a believed match.
-    gnss_sigmas, gnss_count: this many fixes in a row farther than this from the pose mean that the pose is wrong,
-        however well the scan seems to fit.
-    retry_s: pause between two searches for the first pose.
-    """
-
-    min_matching_ratio: float = 0.5
-    trusted_fit: float = 0.65
-    better_fit: float = 0.1
-    better_count: int = 5
-    gate_m: float = 0.15
-    gate_m_per_s: float = 0.15
-    gate_deg: float = 0.4
-    gate_deg_per_s: float = 0.25
-    degraded_after_s: float = 0.6
-    lost_after_s: float = 4.0
-    gnss_sigmas: float = 5.0
-    gnss_count: int = 5
-    retry_s: float = 0.8
+    min_matching_ratio: float = setting(0.5, "Least share of the points with a Gaussian nearby.", least=0, most=1)
+    degraded_after_s: float = setting(
+        0.6, "Without a believed match for so long the pose is degraded.", unit="s", above=0
+    )
+    lost_after_s: float = setting(
+        4.0, "Without one for so long it is lost; at least `degraded_after_s`.", unit="s", above=0
+    )
 
     def __post_init__(self) -> None:
-        if not 0 < self.degraded_after_s <= self.lost_after_s or self.gnss_count < 1:
-            raise ValueError(f"0 < degraded_after_s <= lost_after_s and gnss_count >= 1 are required, got {self}")
-        if min(self.gate_m, self.gate_deg, self.gnss_sigmas) <= 0 or not 0 <= self.min_matching_ratio <= 1:
-            raise ValueError(f"gates must be positive and min_matching_ratio within 0 ... 1, got {self}")
+        check_settings(self)
+        if self.degraded_after_s > self.lost_after_s:
+            raise ValueError(
+                f"degraded_after_s = {self.degraded_after_s} must not exceed lost_after_s = {self.lost_after_s}"
+            )
+
+
+@dataclass(frozen=True, slots=True)
+class ScanOdometryParameters:
+    """Scan-to-scan odometry."""
+
+    enabled: bool = setting(True, "Without, the step between two scans is left to wheel speed and yaw rate alone.")
+    min_standing_share: float = setting(
+        0.25,
+        "So many of a scan's points must stand above the ground. Rings on open ground keep their place relative to the"
+        " vehicle: they fit best where it stood before, and it seems to be slower than it is.",
+        least=0,
+        below=1,
+    )
+
+    def __post_init__(self) -> None:
+        check_settings(self)
+
+
+@dataclass(frozen=True, slots=True)
+class RefineParameters:
+    """Hierarchical GraphSLAM (GND, 3 (ii) and 6.2): the scans of a stretch onto the map, together."""
+
+    enabled: bool = setting(True, "Without, poses are final as they leave the graph of single scans (no submaps).")
+    every_m: float = setting(4.0, "The stretch is solved after this much way ...", unit="m", above=0)
+    every_s: float = setting(1.0, "... or time.", unit="s", above=0)
+    length_m: float = setting(
+        25.0, "Length of the stretch; what is older is remembered as a belief about its first scan.", unit="m", above=0
+    )
+    lag_m: float = setting(10.0, "A scan is final when one this much further on takes part ...", unit="m", least=0)
+    longest_s: float = setting(4.0, "... or when it is this old.", unit="s", above=0)
+    unlearnt_s: float = setting(
+        8.0, "Until the gyro's bias is known scans may wait so long instead.", unit="s", above=0
+    )
+
+    def __post_init__(self) -> None:
+        check_settings(self)
+
+
+@dataclass(frozen=True, slots=True)
+class UniquenessParameters:
+    """Is there another place that looks the same?"""
+
+    enabled: bool = setting(True, "Without, no pose has to be the only one.")
 
 
 @dataclass(frozen=True, slots=True)
 class LocaliserParameters:
     """Everything of the localiser."""
 
-    sampling: SamplingParameters = field(default_factory=SamplingParameters)
-    registration: RegistrationParameters = field(default_factory=RegistrationParameters)
+    sampling: SamplingParameters = setting(SamplingParameters, "Which points of a scan are matched.")
+    registration: RegistrationParameters = setting(RegistrationParameters, "Scan-to-map matching.")
     initialise: InitialiseParameters = field(default_factory=InitialiseParameters)
-    odometry: OdometryParameters = field(default_factory=OdometryParameters)
-    graph: GraphParameters = field(default_factory=GraphParameters)
-    health: HealthParameters = field(default_factory=HealthParameters)
-    witness: WitnessParameters = field(default_factory=WitnessParameters)
-    pool: PoolParameters = field(default_factory=PoolParameters)
-    hypotheses: HypothesisParameters = field(default_factory=HypothesisParameters)
-    challenge: ChallengeParameters = field(default_factory=ChallengeParameters)
-    causes: CauseParameters = field(default_factory=CauseParameters)
-    scan_odometry: ScanOdometryParameters = field(default_factory=ScanOdometryParameters)
-    refine: RefineParameters = field(default_factory=RefineParameters)
-    uniqueness: UniquenessParameters = field(default_factory=UniquenessParameters)
+    odometry: OdometryParameters = setting(OdometryParameters, "Wheels and gyro.")
+    graph: GraphParameters = setting(GraphParameters, "The fixed-lag pose graph.")
+    health: HealthParameters = setting(HealthParameters, "When a match is believed.")
+    scan_odometry: ScanOdometryParameters = setting(ScanOdometryParameters, "Scan-to-scan odometry.")
+    refine: RefineParameters = setting(RefineParameters, "Submaps.")
+    uniqueness: UniquenessParameters = setting(UniquenessParameters, "Whether a pose must be the only one.")

@@ -14,13 +14,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gnd.gnd_map.se3 import T_from_R_t, T_inverse, exp_so3, log_so3
-from gnd.vehicle_agent.localise.calibration import MotionTeacher
+from gnd.vehicle_agent.localise.calibration import ODOMETRY_BIAS_DRIFT_RADPS, ODOMETRY_SCALE_DRIFT, MotionTeacher
 from gnd.vehicle_agent.localise.drift import Drift, Slope
 from gnd.vehicle_agent.localise.graph import MapMatch, SmoothedPose
 from gnd.vehicle_agent.localise.match_map import MatchMapCache
 from gnd.vehicle_agent.localise.odometry import SLIP_LASTS_NS, MotionBuffer
-from gnd.vehicle_agent.localise.parameters import RegistrationParameters
-from gnd.vehicle_agent.localise.refine_parameters import RefineParameters
+from gnd.vehicle_agent.localise.parameters import RefineParameters, RegistrationParameters
 from gnd.vehicle_agent.localise.scan_odometry import ScanStep
 from gnd.vehicle_agent.localise.stretch import (
     BIAS,
@@ -38,6 +37,46 @@ from gnd.vehicle_agent.localise.stretch import (
     shared_of,
     solve_stretch,
 )
+
+_KNOT_M: Final = 0.7
+_KNOT_S: Final = 0.5
+"""A scan takes part when the vehicle has moved so far, or so much time has passed, since the last."""
+_N_POINTS: Final = 2500
+"""Of a scan."""
+_CORRELATED_M: Final = 2.0
+"""Scans nearer to each other see the same surfaces of the map, wrong by the same: they share one say."""
+_LENGTH_S: Final = 15.0
+"""Of the stretch; what is older is remembered as a belief about its first scan."""
+_YAW_DEG: Final = 0.02
+_LONGITUDINAL_M: Final = 0.01
+_LATERAL_M: Final = 0.003
+"""One sigma of the odometry over 5 m beside what all steps share, growing with the root of the way."""
+_ROLL_PITCH_DEG: Final = 0.2
+_VERTICAL_M: Final = 0.01
+"""Of attitude and height from scan to scan, which no wheel tells."""
+_SCALES: Final = (2.0, 1.5)
+"""Geman-McClure scales of the match."""
+_FIRST_SCALES: Final = (4.0, 2.0, 1.5)
+"""When the prediction is off by more than `near_m`."""
+_NEAR_M: Final = 0.04
+REFINE_LEARNT_DEGPS: Final = 0.06
+"""Sigma of the gyro's bias below which it is known; until then scans may wait so long."""
+_FIT_M: Final = 20.0
+"""The newest part of the stretch that says how well all fits."""
+_FIRM_FIT: Final = 0.35
+"""Fit of a stretch that is beyond doubt."""
+_LEAST_FIT: Final = 0.15
+"""Below, it tells nothing."""
+_MOST_MISFIT: Final = 4.0
+"""Of a firm one."""
+_CERTAIN_M: Final = 0.1
+"""One sigma of a pose that no rival can question."""
+_FLOOR_M: Final = 0.002
+_FLOOR_DEG: Final = 0.004
+"""The least sigma of a final pose: what map and mount are wrong by, no match can tell."""
+_CORRECT_M: Final = 0.06
+_CORRECT_DEG: Final = 0.12
+"""An online pose farther off than this from what the stretch says begins anew from there."""
 
 F64 = NDArray[np.float64]
 
@@ -151,7 +190,7 @@ class Refiner:
     def supported(self) -> bool:
         """True just after the stretch was solved, not for the first time, when it is whole and its newest scans fit."""
         whole = self._solved is not None and not self._solved.torn
-        return self._news and whole and self._solutions > SUPPORTED and self._fit() >= self.parameters.least_fit
+        return self._news and whole and self._solutions > SUPPORTED and self._fit() >= _LEAST_FIT
 
     @property
     def certain(self) -> bool:
@@ -162,12 +201,12 @@ class Refiner:
         """Where the newest scan is, when its online pose (4, 4) is farther from there than either is uncertain."""
         if not self.supported:
             return None
-        par, newest = self.parameters, self._scans[-1]
+        newest = self._scans[-1]
         assert newest.knot is not None  # only then is there news
         T, covariance = newest.knot.T_map_vehicle, self._covariance(-1)
         off, sigma = T_inverse(T) @ T_map_vehicle, np.sqrt(np.diag(covariance))
-        far = np.hypot(off[0, 3], off[1, 3]) > par.correct_m + 3.0 * sigma[3:5].max()
-        turned = abs(off[1, 0]) > np.radians(par.correct_deg) + 3.0 * sigma[2]
+        far = np.hypot(off[0, 3], off[1, 3]) > _CORRECT_M + 3.0 * sigma[3:5].max()
+        turned = abs(off[1, 0]) > np.radians(_CORRECT_DEG) + 3.0 * sigma[2]
         return MapMatch(T, covariance) if far or turned else None
 
     # --- the stretch -----------------------------------------------------------------------------------------------
@@ -176,7 +215,6 @@ class Refiner:
         self, number: int, t_ns: int, points_m: F64, T_online: F64, T_before_now: F64 | None, seen: ScanStep | None
     ) -> _Scan:
         """The scan as the stretch takes it: a knot, if the vehicle has moved on or time has passed since the last."""
-        par = self.parameters
         if not self._scans:
             knot = Knot(self._thinned(points_m), T_online.copy(), LEAST_WEIGHT, wheels_m=self._teacher.mount.wheels_m)
             return _Scan(number, t_ns, 0.0, np.eye(4), np.zeros(6), None, knot)
@@ -186,8 +224,8 @@ class Refiner:
         way_m = last.way_m + float(np.linalg.norm(driven[:3, 3]))
         scan = _Scan(number, t_ns, way_m, T, self._variance(driven, t_ns - last.t_ns), seen, None)
         since_m, since_ns = way_m - before.way_m, t_ns - before.t_ns
-        if since_m >= par.knot_m or since_ns >= par.knot_s * 1e9:
-            weight = float(np.clip(since_m / par.correlated_m, LEAST_WEIGHT, 1.0))
+        if since_m >= _KNOT_M or since_ns >= _KNOT_S * 1e9:
+            weight = float(np.clip(since_m / _CORRELATED_M, LEAST_WEIGHT, 1.0))
             T_carried, wheels_m = self._carried(before, scan), self._teacher.mount.wheels_m
             scan.knot = Knot(self._thinned(points_m), T_carried, weight, wheels_m=wheels_m)
         return scan
@@ -198,17 +236,16 @@ class Refiner:
         A single step that is far off counts less (`STEP_CHI2`); odometry that is worse all along is found out by
         `_judge_steps`. Single scans are not asked what it is off by: they follow walls that were moved.
         """
-        par = self.parameters
         grown = np.sqrt(max(float(np.linalg.norm(driven[:3, 3])), dt_ns * 1e-9) / NOISE_WAY_M)
-        roll_pitch = np.radians(par.roll_pitch_deg)
+        roll_pitch = np.radians(_ROLL_PITCH_DEG)
         sigmas = np.array([
-            roll_pitch, roll_pitch, grown * np.radians(par.yaw_deg),
-            grown * par.longitudinal_m, grown * par.lateral_m, par.vertical_m,
+            roll_pitch, roll_pitch, grown * np.radians(_YAW_DEG),
+            grown * _LONGITUDINAL_M, grown * _LATERAL_M, _VERTICAL_M,
         ])  # fmt: skip
         return sigmas**2
 
     def _thinned(self, points_m: F64) -> F64:
-        every = max(1, len(points_m) // self.parameters.n_points)
+        every = max(1, len(points_m) // _N_POINTS)
         return np.ascontiguousarray(points_m[::every], dtype=np.float64)
 
     def _last_knot(self) -> _Scan:
@@ -268,16 +305,16 @@ class Refiner:
 
     def _solve(self) -> None:
         """Place all scans of the stretch anew, let wheels and gyro learn from it, and let go of its old scans."""
-        par, scans = self.parameters, self._knots()
+        scans = self._knots()
         knots = [scan.knot for scan in scans if scan.knot is not None]
         assert self._belief is not None
         current = self._motion.shared()
-        known = self._solved is not None and np.sqrt(np.diag(self._covariance(-1))[3:5]).max() < par.near_m
+        known = self._solved is not None and np.sqrt(np.diag(self._covariance(-1))[3:5]).max() < _NEAR_M
         belief = _recentred(self._belief, current)
         match_map = self._map.near(knots[len(knots) // 2].T_map_vehicle[:3, 3])
         steps = self._steps(scans)
         self._solved = solve_stretch(
-            knots, steps, belief, match_map, self.registration, par.scales if known else par.first_scales
+            knots, steps, belief, match_map, self.registration, _SCALES if known else _FIRST_SCALES
         )
         self._judge_steps(self._solved, steps, self._solved.shared - belief.shared)
         self._news, self._solutions = True, self._solutions + 1
@@ -285,8 +322,8 @@ class Refiner:
         before_ns = self._solved_ns
         dt_s = (newest.t_ns - before_ns) * 1e-9
         self._solved_way_m, self._solved_ns = newest.way_m, newest.t_ns
-        fits_well = self._fit() >= par.firm_fit and self._solved.misfit < par.most_misfit
-        if self._solved.torn or self._fit() < par.least_fit:
+        fits_well = self._fit() >= _FIRM_FIT and self._solved.misfit < _MOST_MISFIT
+        if self._solved.torn or self._fit() < _LEAST_FIT:
             self._firm = 0
         elif self._motion.slipped(before_ns, newest.t_ns) and not self._scans_hold(scans, steps, before_ns):
             self._firm = min(self._firm, FIRM_AFTER_SLIP)
@@ -330,19 +367,18 @@ class Refiner:
         )
         gone = self._index(scans[first])
         self._scans, self._final = self._scans[gone:], self._final - gone
-        odometry = self._teacher.parameters
-        drift = np.array([odometry.bias_drift_radps, odometry.scale_drift, odometry.scale_drift, odometry.scale_drift])
+        drift = np.array([ODOMETRY_BIAS_DRIFT_RADPS, ODOMETRY_SCALE_DRIFT, ODOMETRY_SCALE_DRIFT, ODOMETRY_SCALE_DRIFT])
         return _loosened(kept, drift**2 * dt_s)
 
     def _is_done_with(self, scan: _Scan, newest: _Scan) -> bool:
         par = self.parameters
-        old = newest.way_m - scan.way_m > par.length_m or newest.t_ns - scan.t_ns > par.length_s * 1e9
+        old = newest.way_m - scan.way_m > par.length_m or newest.t_ns - scan.t_ns > _LENGTH_S * 1e9
         return old and self._index(scan) <= self._final
 
     def _teach(self) -> None:
         """Wheels and gyro learn from the stretch: single scans of a sparse sensor seldom fit well enough to teach."""
         assert self._solved is not None
-        if self._fit() < self.parameters.least_fit:
+        if self._fit() < _LEAST_FIT:
             return
         more, variance = self._solved.shared - self._motion.shared(), np.diag(self._solved.shared_covariance)
         sigma = np.sqrt(variance * max(1.0, self._solved.misfit))
@@ -361,7 +397,7 @@ class Refiner:
         if self._solved is None:
             return 0.0
         knots = self._knots()[-len(self._solved.fit) :]
-        near = np.array([self._scans[-1].way_m - scan.way_m <= self.parameters.fit_m for scan in knots])
+        near = np.array([self._scans[-1].way_m - scan.way_m <= _FIT_M for scan in knots])
         return float((self._solved.fit * self._solved.known)[: len(near)][near].mean()) if near.any() else 0.0
 
     # --- scans -----------------------------------------------------------------------------------------------------
@@ -369,7 +405,7 @@ class Refiner:
     def _leaving(self, newest: _Scan) -> list[SmoothedPose]:
         """The poses of scans that lie `lag_m` behind the newest knot, or are too old to wait."""
         par = self.parameters
-        learnt = self._teacher.uncertainty[1] < np.radians(par.learnt_degps)
+        learnt = self._teacher.uncertainty[1] < np.radians(REFINE_LEARNT_DEGPS)
         longest_s, n = (par.longest_s if learnt else par.unlearnt_s), self._final
         while n < len(self._scans):
             scan = self._scans[n]
@@ -407,9 +443,8 @@ class Refiner:
 
     def _covariance(self, knot: int) -> F64:
         """(6, 6) of a knot's pose: what the stretch leaves open, more where it disagrees with itself, and the least."""
-        par = self.parameters
         assert self._solved is not None
-        floor = np.diag([np.radians(par.floor_deg) ** 2] * 3 + [par.floor_m**2] * 3)
+        floor = np.diag([np.radians(_FLOOR_DEG) ** 2] * 3 + [_FLOOR_M**2] * 3)
         grown = np.sqrt(self._grown)
         return np.asarray(grown[:, None] * self._solved.covariance[knot] * grown + floor)
 
@@ -427,7 +462,7 @@ class Refiner:
 
     def _axle_variance(self, knot: int) -> float:
         assert self._solved is not None
-        floor = np.radians(self.parameters.floor_deg) ** 2
+        floor = np.radians(_FLOOR_DEG) ** 2
         return float(self._solved.axle_variance[knot] * self._grown[2] + floor)
 
     def as_seen(self, covariance: F64) -> F64:
@@ -440,7 +475,7 @@ class Refiner:
 
     def _is_certain(self, covariance: F64) -> bool:
         sigma_m = float(np.sqrt(np.diag(covariance)[3:5]).max())
-        return self._firm >= FIRM and sigma_m < self.parameters.certain_m
+        return self._firm >= FIRM and sigma_m < _CERTAIN_M
 
     def _share(self, i: int, low: int, high: int) -> float:
         """How far along the way from one knot to the next a scan is, 0 ... 1."""

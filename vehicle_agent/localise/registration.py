@@ -1,7 +1,7 @@
 """Point-to-Gaussian registration of a scan on the dense voxel grid: annealed robust Gauss-Newton (DESIGN 8)."""
 
 from dataclasses import dataclass
-from typing import Literal
+from typing import Final, Literal
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -11,6 +11,16 @@ from gnd.vehicle_agent.errors import RegistrationError
 from gnd.vehicle_agent.localise.kernels import linearise
 from gnd.vehicle_agent.localise.match_map import MatchMap
 from gnd.vehicle_agent.localise.parameters import RegistrationParameters
+
+_WIDE_SCALES: Final = (8.0, 4.0, 2.0)
+"""The stages when the start is known to 1 m and 3 degrees."""
+_CAPTURE_SCALES: Final = (30.0, 10.0, 4.0, 2.0)
+"""To 2 m and 5 degrees."""
+REGISTRATION_GATE_PER_SCALE: Final = 2.5
+"""A point farther than this many scales from every Gaussian is no match."""
+REGISTRATION_MIN_MATCHED: Final = 60
+_DEGENERATE_SHARE: Final = 0.01
+"""So is a horizontal one with less than this share of the strongest direction's information."""
 
 F64 = NDArray[np.float64]
 
@@ -93,7 +103,7 @@ def register(
     T = np.array(T_map_vehicle, dtype=np.float64)
     state = _State(T[:3, :3].copy(), T[:3, 3].copy(), np.zeros((6, 6)), np.zeros(6), wheels_m)
     points = np.ascontiguousarray(points_m, dtype=np.float64)
-    scales = {"near": par.scales, "wide": par.wide_scales, "capture": par.capture_scales}[start]
+    scales = {"near": par.scales, "wide": _WIDE_SCALES, "capture": _CAPTURE_SCALES}[start]
     iterations, converged = 0, False
     for stage, scale in enumerate(scales):
         coarse = 1.0 if stage == len(scales) - 1 else 10.0
@@ -143,7 +153,7 @@ def linearised(
     """
     T = np.asarray(T_map_vehicle, dtype=np.float64)
     state = _State(T[:3, :3].copy(), T[:3, 3].copy(), np.zeros((6, 6)), np.zeros(6), wheels_m)
-    m, gate_m2 = match_map, (parameters.gate_per_scale * scale) ** 2
+    m, gate_m2 = match_map, (REGISTRATION_GATE_PER_SCALE * scale) ** 2
     state.cost, state.matched, state.inside = linearise(
         np.ascontiguousarray(points_m), state.R, state.t, m.index, m.A, m.b, m.mean_m, m.information, scale**2, gate_m2,
         state.H, state.g,
@@ -152,18 +162,18 @@ def linearised(
     turn = np.zeros((6, 6))
     turn[:3, :3] = turn[3:, 3:] = state.R
     H, g = turn.T @ state.H @ turn, turn.T @ state.g
-    told = _without_hints(H, parameters)
+    told = _without_hints(H)
     return Linearised(T.copy(), scale, told.T @ H @ told, told.T @ g, state.cost, state.matched, state.inside, told)
 
 
-def _without_hints(H: F64, par: RegistrationParameters) -> F64:
+def _without_hints(H: F64) -> F64:
     """(6, 6) that takes from a motion the horizontal directions for which H (6, 6) has less than `degenerate_share` of
     the strongest.
     """
     values, vectors, scale = _principal(H)
     horizontal = vectors[3] ** 2 + vectors[4] ** 2 > 0.5
     strongest = float(values[horizontal].max(initial=0.0))
-    told = ~horizontal | (values > par.degenerate_share * strongest)
+    told = ~horizontal | (values > _DEGENERATE_SHARE * strongest)
     along = vectors[:, told]
     return np.eye(6) if told.all() else np.asarray((along @ along.T) * scale[:, None] / scale)
 
@@ -178,7 +188,7 @@ def fit_of(points_m: F64, T_map_vehicle: F64, match_map: MatchMap, parameters: R
     m, scale = match_map, parameters.scales[-1]
     cost, _, inside = linearise(
         np.ascontiguousarray(points_m), R, t, m.index, m.A, m.b, m.mean_m, m.information, scale**2,
-        (parameters.gate_per_scale * scale) ** 2, np.empty((6, 6)), np.empty(6),
+        (REGISTRATION_GATE_PER_SCALE * scale) ** 2, np.empty((6, 6)), np.empty(6),
     )  # fmt: skip
     return (inside - cost / scale**2) / len(points_m)
 
@@ -212,15 +222,15 @@ def settle(
 
 def _linearise(points: F64, s: _State, m: MatchMap, par: RegistrationParameters, scale: float) -> None:
     """Refresh the normal equations of `s`; RegistrationError when too little matches."""
-    gate_m2 = (par.gate_per_scale * scale) ** 2
+    gate_m2 = (REGISTRATION_GATE_PER_SCALE * scale) ** 2
     s.cost, s.matched, s.inside = linearise(
         points, s.R, s.t, m.index, m.A, m.b, m.mean_m, m.information, scale**2, gate_m2, s.H, s.g
     )
     _add_wheels(s, m, par, scale)
-    if s.matched < par.min_matched:
+    if s.matched < REGISTRATION_MIN_MATCHED:
         raise RegistrationError(
             f"{s.matched} of {len(points)} points have a Gaussian nearby ({s.inside} lie in known voxels),"
-            f" {par.min_matched} are needed: is the start within 2 m, is the map loaded?"
+            f" {REGISTRATION_MIN_MATCHED} are needed: is the start within 2 m, is the map loaded?"
         )
 
 
@@ -233,7 +243,7 @@ def _add_wheels(s: _State, m: MatchMap, par: RegistrationParameters, scale: floa
         return 0
     scale = max(scale, WHEEL_SCALE)
     H, g = np.empty((6, 6)), np.empty(6)
-    gate_m2 = (par.gate_per_scale * scale) ** 2
+    gate_m2 = (REGISTRATION_GATE_PER_SCALE * scale) ** 2
     _, on_ground, _ = linearise(
         s.wheels_m, s.R, s.t, m.index, m.A, m.b, m.mean_m, m.information, scale**2, gate_m2, H, g
     )
@@ -279,7 +289,7 @@ def _strong(values: F64, vectors: F64, par: RegistrationParameters) -> NDArray[n
     horizontal = vectors[3] ** 2 + vectors[4] ** 2 > 0.5
     least = par.correlation / par.degenerate_m**2
     strongest = float(values[horizontal].max(initial=0.0))  # not the vertical, which wheels on the road hold firmly
-    return np.asarray(values > np.where(horizontal, max(least, par.degenerate_share * strongest), least))
+    return np.asarray(values > np.where(horizontal, max(least, _DEGENERATE_SHARE * strongest), least))
 
 
 def _unmoved(s: _State, T_start: F64, par: RegistrationParameters) -> bool:

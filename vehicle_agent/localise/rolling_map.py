@@ -1,12 +1,33 @@
 """The last scans as a map: Gaussians in a dense window of 1 m voxels that rolls along in a drifting odometry frame."""
 
+from typing import Final
+
 import numpy as np
 from numpy.typing import NDArray
 
 from gnd.vehicle_agent.localise.kernels import tapered_information
 from gnd.vehicle_agent.localise.match_map import UNIFORM_VOXEL_M2, MatchMap
 from gnd.vehicle_agent.localise.rolling_kernels import SUMS, add_points, move_window, refresh
-from gnd.vehicle_agent.localise.scan_odometry_parameters import RollingMapParameters
+
+_HEIGHT_M: Final = 28.0
+_BELOW_M: Final = 8.0
+"""The window's height, and how much of that lies below the vehicle."""
+ROLLING_REACH_M: Final = 60.0
+"""The window's half side."""
+ROLLING_MAX_VOXELS: Final = 8192
+"""Room for so many."""
+ROLLING_KEEP_SCANS: Final = 20
+"""A voxel not seen in so many added scans is forgotten when the window moves."""
+ROLLING_MOVE_M: Final = 8.0
+"""The window moves when the vehicle is so far from its middle."""
+_FADE: Final = 0.9
+"""What a voxel's points count for each later scan that sees it."""
+_MIN_CELLS: Final = 6
+"""So many of 64 sub-cells must have been hit."""
+_LINE_RATIO: Final = 0.1
+_UPRIGHT: Final = 0.7
+"""A Gaussian whose second variance is less than this share of the first is one ring, unless it is a post (cosine to the
+vertical)."""
 
 F64 = NDArray[np.float64]
 
@@ -16,11 +37,18 @@ VOXEL_M = 1.0  # what UNIFORM_VOXEL_M2 and the registration's scales are measure
 class RollingMap:
     """Takes the points of scan after scan, in metres in the odometry frame; what is not seen again is forgotten."""
 
-    def __init__(self, parameters: RollingMapParameters, noise_m: float) -> None:
-        self.parameters = parameters
+    def __init__(
+        self,
+        noise_m: float,
+        *,
+        reach_m: float = ROLLING_REACH_M,
+        max_voxels: int = ROLLING_MAX_VOXELS,
+        keep_scans: int = ROLLING_KEEP_SCANS,
+    ) -> None:
+        self._keep_scans = keep_scans
         self.noise_m = noise_m
-        side, height = 2 * round(parameters.reach_m / VOXEL_M), round(parameters.height_m / VOXEL_M)
-        rows = parameters.max_voxels
+        side, height = 2 * round(reach_m / VOXEL_M), round(_HEIGHT_M / VOXEL_M)
+        rows = max_voxels
         self._index = np.full((side, side, height), -1, np.int32)
         self._origin = np.zeros(3, np.int64)
         self._voxel, self._last = np.zeros((rows, 3), np.int32), np.zeros(rows, np.int32)
@@ -49,7 +77,7 @@ class RollingMap:
         self._follow(p_odom_m)
         self._calls += 1
         self._used, n = add_points(
-            points_odom_m, 1.0 / VOXEL_M, self._origin, self.parameters.fade, self._calls, self._used, self._index,
+            points_odom_m, 1.0 / VOXEL_M, self._origin, _FADE, self._calls, self._used, self._index,
             self._voxel, self._last, self._mask, self._sums, self._touched,
         )  # fmt: skip
         self._refresh(self._touched[:n])
@@ -61,10 +89,9 @@ class RollingMap:
         return MatchMap(self._index, A, b, self._mean[:n], self._information[:n])
 
     def _refresh(self, rows: NDArray[np.int64]) -> None:
-        par = self.parameters
         cov, information = np.empty((len(rows), 6)), np.empty((len(rows), 6))
         refresh(
-            rows, 1.0 / VOXEL_M, self._origin, par.min_cells, par.line_ratio, par.upright, self._voxel, self._mask,
+            rows, 1.0 / VOXEL_M, self._origin, _MIN_CELLS, _LINE_RATIO, _UPRIGHT, self._voxel, self._mask,
             self._sums, self._index, self._mean, cov,
         )  # fmt: skip
         tapered_information(cov, self.noise_m**2, UNIFORM_VOXEL_M2, information)
@@ -74,9 +101,9 @@ class RollingMap:
         """Move the window when the vehicle has left its middle, or when there is no room for another scan."""
         origin = self._around(p_odom_m)
         full = self._used > 0.8 * len(self._mask)
-        if not full and np.abs(origin - self._origin).max() * VOXEL_M < self.parameters.move_m:
+        if not full and np.abs(origin - self._origin).max() * VOXEL_M < ROLLING_MOVE_M:
             return
-        oldest = self._calls - self.parameters.keep_scans
+        oldest = self._calls - self._keep_scans
         self._used = move_window(
             self._origin, origin, oldest, self._used, self._index, self._voxel, self._last, self._mask, self._sums,
             self._mean, self._information,
@@ -84,6 +111,6 @@ class RollingMap:
         self._origin = origin
 
     def _around(self, p_odom_m: F64) -> NDArray[np.int64]:
-        below = round(self.parameters.below_m / VOXEL_M)
+        below = round(_BELOW_M / VOXEL_M)
         half = np.array([self._index.shape[0] // 2, self._index.shape[1] // 2, below])
         return np.asarray(np.floor(p_odom_m / VOXEL_M).astype(np.int64) - half)

@@ -7,7 +7,7 @@ here too: voxels that hold one or two rings of a scan say where the rings are, n
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import Final, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,11 +15,41 @@ from numpy.typing import NDArray
 from gnd.gnd_map.motion import Trajectory
 from gnd.gnd_map.se3 import T_from_R_t, T_inverse, exp_so3, log_so3, transform
 from gnd.vehicle_agent.errors import RegistrationError
-from gnd.vehicle_agent.localise.parameters import RegistrationParameters
+from gnd.vehicle_agent.localise.parameters import NOISE_M, RegistrationParameters, ScanOdometryParameters
 from gnd.vehicle_agent.localise.registration import register
 from gnd.vehicle_agent.localise.rolling_map import RollingMap
-from gnd.vehicle_agent.localise.scan_odometry_parameters import ScanOdometryParameters
 from gnd.vehicle_agent.localise.scan_pool import standing_points
+
+_N_POINTS: Final = 1250
+"""So many of a scan's sampled points are matched."""
+_SCALES: Final = (4.0, 2.0)
+_CORRELATION: Final = 3.0
+_FLOOR_M: Final = 0.005
+_FLOOR_RAD: Final = 0.0001
+_DEGENERATE_M: Final = 0.05
+"""As in `RegistrationParameters`."""
+_STEP_SHARE: Final = 0.2
+"""A step's variance in that of a match: the matches of a stretch of road share most of their errors."""
+_STEADY_M: Final = 0.03
+_STEADY_RAD: Final = 0.002
+"""Sigmas of going on as in the step before, which is tried where wheels and gyro lead nowhere."""
+_COAST_S: Final = 0.5
+"""For so long a vehicle with slipping wheels is taken to go on over scans that match nowhere."""
+_MIN_FIT: Final = 0.4
+_MIN_STEADY_FIT: Final = 0.6
+"""The same when going on as before."""
+_MIN_MATCHING_RATIO: Final = 0.5
+"""A match that fits worse is not given."""
+_GATE_M: Final = 0.08
+_GATE_DEG: Final = 0.1
+"""How far a step may lie from the prediction, beyond three of its sigmas."""
+_ADD_M: Final = 1.5
+_ADD_DEG: Final = 5.0
+"""A scan joins the map when the vehicle has moved so far since the last that did; the first `first_scans` join in any
+case."""
+_FIRST_SCANS: Final = 3
+_MAX_GAP_S: Final = 1.0
+"""After a longer time without a scan the map begins anew."""
 
 F64 = NDArray[np.float64]
 
@@ -106,10 +136,10 @@ class ScanOdometry:
     with every match. A step is what two filtered poses differ by.
     """
 
-    def __init__(self, parameters: ScanOdometryParameters) -> None:
+    def __init__(self, parameters: ScanOdometryParameters, noise_m: float = NOISE_M) -> None:
         self.parameters = parameters
-        self._registration = _registration(parameters)
-        self._map = RollingMap(parameters.rolling_map, parameters.noise_m)
+        self._registration = _registration(noise_m)
+        self._map = RollingMap(noise_m)
         self._before_ns: int | None = None
         self._T_odom_before = np.eye(4)
         self._covariance = np.zeros((6, 6))
@@ -148,7 +178,7 @@ class ScanOdometry:
             sigmas: (6,) its sigmas, rotation [rad] first, then position [m].
             points_going_on: gives the points with the motion removed that `steady` says; asked when the wheels slip.
         """
-        if self._before_ns is None or not 0 < t_ns - self._before_ns <= self.parameters.max_gap_s * 1e9:
+        if self._before_ns is None or not 0 < t_ns - self._before_ns <= _MAX_GAP_S * 1e9:
             self.begin(t_ns, points_vehicle_m)
             return None
         dt_ns, self._before_ns = t_ns - self._before_ns, t_ns
@@ -167,32 +197,30 @@ class ScanOdometry:
         if match is None:
             return None
         self._steady = SteadyMotion(T_before_now, dt_ns)
-        step = ScanStep(T_before_now, self.parameters.step_share * match.covariance, slipped)
+        step = ScanStep(T_before_now, _STEP_SHARE * match.covariance, slipped)
         self._slipping = joint_step(T_before_now_predicted, sigmas, step).slipped
         return step
 
     def _coast(self, steady: SteadyMotion, dt_ns: int, points_m: F64) -> ScanStep | None:
         """Go on as before over a scan that matches nowhere while the wheels slip, for a short time."""
-        par = self.parameters
         self._coasted_ns += dt_ns
-        if self._coasted_ns > par.coast_s * 1e9:
+        if self._coasted_ns > _COAST_S * 1e9:
             return None
         going_on = _Prediction(steady.after(dt_ns), self._steady_sigmas(), points_m)
         return ScanStep(self._advance(going_on, None), np.diag(going_on.sigmas**2), slipping=True)
 
     def _steady_sigmas(self) -> F64:
-        return np.array([self.parameters.steady_rad] * 3 + [self.parameters.steady_m] * 3)
+        return np.array([_STEADY_RAD] * 3 + [_STEADY_M] * 3)
 
     def _matched(self, driven: _Prediction, going_on: Callable[[], _Prediction] | None) -> _Match | None:
         """The match near to what wheels and gyro say, or near to going on as before: that comes first while the
         wheels slip.
         """
-        par = self.parameters
         if going_on is None:
-            return self._match_near(driven, par.min_fit)
+            return self._match_near(driven, _MIN_FIT)
         if self._slipping:
-            return self._match_near(going_on(), par.min_steady_fit) or self._match_near(driven, par.min_fit)
-        return self._match_near(driven, par.min_fit) or self._match_near(going_on(), par.min_steady_fit)
+            return self._match_near(going_on(), _MIN_STEADY_FIT) or self._match_near(driven, _MIN_FIT)
+        return self._match_near(driven, _MIN_FIT) or self._match_near(going_on(), _MIN_STEADY_FIT)
 
     def _going_on(self, dt_ns: int, points_going_on: Callable[[], F64] | None) -> Callable[[], _Prediction] | None:
         """The motion of the step before, for as long as this one took."""
@@ -203,22 +231,21 @@ class ScanOdometry:
 
     def _match_near(self, prediction: _Prediction, min_fit: float) -> _Match | None:
         """The match, if it fits well enough and lies near enough to the prediction."""
-        par, T_predicted = self.parameters, self._T_odom_before @ prediction.T_before_now
-        chosen = prediction.points_m[:: max(1, len(prediction.points_m) // par.n_points)]
+        T_predicted = self._T_odom_before @ prediction.T_before_now
+        chosen = prediction.points_m[:: max(1, len(prediction.points_m) // _N_POINTS)]
         try:
             result = register(chosen, T_predicted, self._map.match_map(), self._registration, "near")
         except RegistrationError:
             return None
-        if not result.converged or result.fit < min_fit or result.matching_ratio < par.min_matching_ratio:
+        if not result.converged or result.fit < min_fit or result.matching_ratio < _MIN_MATCHING_RATIO:
             return None
         if not self._near(_log(T_inverse(T_predicted) @ result.T_map_vehicle), prediction.sigmas):
             return None
         return _Match(result.T_map_vehicle, result.covariance, result.fit, prediction)
 
     def _near(self, off: F64, sigmas: F64) -> bool:
-        par = self.parameters
-        limit_m = par.gate_m + 3.0 * float(np.linalg.norm(sigmas[3:]))
-        limit_rad = np.radians(par.gate_deg) + 3.0 * float(np.linalg.norm(sigmas[:3]))
+        limit_m = _GATE_M + 3.0 * float(np.linalg.norm(sigmas[3:]))
+        limit_rad = np.radians(_GATE_DEG) + 3.0 * float(np.linalg.norm(sigmas[:3]))
         return bool(np.linalg.norm(off[3:]) <= limit_m and np.linalg.norm(off[:3]) <= limit_rad)
 
     def _advance(self, prediction: _Prediction, match: _Match | None) -> F64:
@@ -236,18 +263,18 @@ class ScanOdometry:
 
     def _add(self, points_m: F64) -> None:
         """The scan joins the map when the vehicle has moved on since the last that did."""
-        T, par = self._T_odom_before, self.parameters
+        T = self._T_odom_before
         moved = _log(T_inverse(self._T_odom_added) @ T)
-        far = np.linalg.norm(moved[3:]) >= par.add_m or np.linalg.norm(moved[:3]) >= np.radians(par.add_deg)
-        if far or self._map.scans < par.first_scans:
+        far = np.linalg.norm(moved[3:]) >= _ADD_M or np.linalg.norm(moved[:3]) >= np.radians(_ADD_DEG)
+        if far or self._map.scans < _FIRST_SCANS:
             self._T_odom_added = T
             self._map.add(transform(T, points_m), T[:3, 3])
 
 
-def _registration(par: ScanOdometryParameters) -> RegistrationParameters:
+def _registration(noise_m: float) -> RegistrationParameters:
     return RegistrationParameters(
-        noise_m=par.noise_m, scales=par.scales, correlation=par.correlation, floor_m=par.floor_m,
-        floor_rad=par.floor_rad, degenerate_m=par.degenerate_m,
+        noise_m=noise_m, scales=_SCALES, correlation=_CORRELATION, floor_m=_FLOOR_M,
+        floor_rad=_FLOOR_RAD, degenerate_m=_DEGENERATE_M,
     )  # fmt: skip
 
 

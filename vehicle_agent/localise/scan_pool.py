@@ -1,13 +1,19 @@
 """The last scans together, in the frame of the newest: one view of a place that is wider than one scan's."""
 
 from collections import deque
+from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
 
 from gnd.gnd_map.se3 import T_inverse, transform
-from gnd.vehicle_agent.localise.doubt_parameters import PoolParameters
-from gnd.vehicle_agent.localise.initialise import ground_below, thinned
+from gnd.vehicle_agent.localise.initialise import STANDING_ABOVE_M, ground_below, thinned
+
+_EVERY_M: Final = 0.7
+"""A scan is kept every so many metres ..."""
+_REACH_M: Final = 10.0
+"""... for so much way."""
+_N_POINTS: Final = 400
 
 F64 = NDArray[np.float64]
 
@@ -20,8 +26,8 @@ class ScanPool:
     Scans enter every so many metres, and leave after so many; a standing vehicle's pool is its newest scan.
     """
 
-    def __init__(self, parameters: PoolParameters) -> None:
-        self.parameters = parameters
+    def __init__(self, every_m: float = _EVERY_M, reach_m: float = _REACH_M) -> None:
+        self._every_m, self._reach_m = every_m, reach_m
         self._older: deque[tuple[F64, F64, float]] = deque()  # points, those that stand, way since
         self._newest: tuple[F64, F64] = (np.empty((0, 3)), np.empty((0, 3)))
         self._since_m = np.inf
@@ -34,14 +40,14 @@ class ScanPool:
         way_m = float(np.hypot(T_before_now[0, 3], T_before_now[1, 3]))
         T = T_inverse(T_before_now)
         moved = [(transform(T, p), transform(T, s), way + way_m) for p, s, way in self._older]
-        self._older = deque(one for one in moved if one[2] <= self.parameters.reach_m)
+        self._older = deque(one for one in moved if one[2] <= self._reach_m)
         self.stands = way_m < STANDING_M
         self._since_m += way_m
-        self._newest = points_m, standing_points(points_m, self.parameters.above_ground_m)
-        if self._since_m < self.parameters.every_m:
+        self._newest = points_m, standing_points(points_m, STANDING_ABOVE_M)
+        if self._since_m < self._every_m:
             return False
         self._since_m = 0.0
-        few = self.parameters.n_points
+        few = _N_POINTS
         self._older.append((thinned(self._newest[0], few), thinned(self._newest[1], few), 0.0))
         return True
 

@@ -301,7 +301,7 @@ def _as_seen(
             scans.append(SeenScan(knot.points_m, knot.match, weight * v))
     first = np.r_[0:6, len(covariance) - N_SHARED : len(covariance)]
     matched += np.einsum("di,ij,dj->d", answers[:, first], belief.information, answers[:, first])
-    seen = influence(scans, match_map, par).factor if scans else np.ones(3)
+    seen = influence(scans, match_map).factor if scans else np.ones(3)
     share = np.clip(matched / np.diag(covariance)[rows], 0.0, 1.0)
     return seen, np.asarray(share)
 

@@ -16,6 +16,17 @@ from gnd.gnd_map.se3 import T_from_R_t, exp_so3, transform
 from gnd.schemas.drive import GnssFix
 from gnd.vehicle_agent.errors import LocaliseError
 
+TRACK_ROBUST_K: Final = 2.0
+"""Where the robust cost begins to give way, in sigmas of a fix."""
+TRACK_STEP_M: Final = 0.01
+TRACK_STEP_SHARE: Final = 0.01
+TRACK_LASTING_M: Final = 50.0
+"""An error of scale of so much lasts for so long a way; steps get the sigma with which they add up to it."""
+TRACK_STEP_RAD: Final = 0.0005
+"""One sigma of a step of the track, whatever its length."""
+TRACK_STEP_RAD_PER_ROOT_M: Final = 0.001
+"""Of its turn, with it."""
+
 F64 = NDArray[np.float64]
 I64 = NDArray[np.int64]
 
@@ -29,28 +40,17 @@ class GeoreferenceParameters:
     """How far to trust the track and the fixes.
 
     tilt: find roll and pitch as well (a SLAM frame that does not know the vertical); needs heights.
-    robust_k: where the robust cost begins to give way, in sigmas of a fix.
-    step_m, step_rad: one sigma of a step of the track, whatever its length; step_rad_per_root_m: of its turn, with it.
-    step_share, lasting_m: an error of scale of so much lasts for so long a way; steps get the sigma with which they add
-        up to it.
     inflation: GNSS errors last for tens of seconds, so that fixes count for less than their number says.
     spacing_m: of the fixes along the track, at least: a standing vehicle's do not add up.
     """
 
     tilt: bool = False
-    robust_k: float = 2.0
-    step_m: float = 0.01
-    step_share: float = 0.01
-    lasting_m: float = 50.0
-    step_rad: float = 5e-4
-    step_rad_per_root_m: float = 1e-3
     inflation: float = 3.0
     spacing_m: float = 1.0
 
     def __post_init__(self) -> None:
-        positive = (self.robust_k, self.step_m, self.step_rad, self.inflation, self.lasting_m)
-        if min(positive) <= 0 or min(self.step_share, self.step_rad_per_root_m, self.spacing_m) < 0:
-            raise ValueError(f"positive sigmas, robust_k and inflation, and spacing_m >= 0 are required, got {self}")
+        if self.inflation <= 0 or self.spacing_m < 0:
+            raise ValueError(f"inflation > 0 and spacing_m >= 0 are required, got {self}")
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -127,7 +127,7 @@ def align(p_local_m: F64, p_frame_m: F64, fixes: FixTable, parameters: Georefere
         off_m = np.linalg.norm((p_frame_m - transform(T, p_local_m))[:, : 3 if parameters.tilt else 2], axis=1)
         variance = fixes.sigma_m**2 + float(np.median(off_m)) ** 2
         ratio = off_m / np.sqrt(variance)
-        scale = max(parameters.robust_k, min(scale, float(ratio.max())) / _SHRINK)
+        scale = max(TRACK_ROBUST_K, min(scale, float(ratio.max())) / _SHRINK)
         robust = (1.0 + (ratio / scale) ** 2) ** -2  # Geman-McClure
     return Alignment(T, robust, off_m)
 

@@ -22,11 +22,44 @@ from numpy.typing import NDArray
 from gnd.gnd_map.se3 import T_from_R_t, T_inverse, exp_so3, transform
 from gnd.vehicle_agent.errors import RegistrationError
 from gnd.vehicle_agent.localise.first_pose import Place
-from gnd.vehicle_agent.localise.initialise import Around, search, thinned
+from gnd.vehicle_agent.localise.initialise import INITIALISE_N_REFINING, Around, search, thinned
 from gnd.vehicle_agent.localise.kernels import point_fits
 from gnd.vehicle_agent.localise.match_map import MatchMap
 from gnd.vehicle_agent.localise.parameters import LocaliserParameters, RegistrationParameters
-from gnd.vehicle_agent.localise.registration import Start, register
+from gnd.vehicle_agent.localise.registration import REGISTRATION_GATE_PER_SCALE, Start, register
+
+_WAY_M: Final = 25.0
+_EVERY_M: Final = 0.7
+_N_POINTS: Final = 300
+"""The view is of the scans of so much way, one every so many metres, of each so many points."""
+_N_COMPARED: Final = 2000
+"""Points of the view by which poses are compared."""
+_PATCH_M: Final = 2.0
+"""Points of one square of this side are one piece of evidence, and fewer than `full_points` of them a smaller one."""
+_FULL_POINTS: Final = 8
+_HIGH_M: Final = 2.2
+"""Above the vehicle's origin; no car is so high."""
+_UNPROVEN_M: Final = 3.0
+_PROVEN_M: Final = 20.0
+"""Way between two tests."""
+_REACH_M: Final = 7.5
+"""Around the tracked pose where GNSS tells nothing."""
+_TURN_DEG: Final = 10.0
+"""Headings within this of the tracked one, all as long as less than `course_m` have been driven."""
+_COURSE_M: Final = 8.0
+_N_REFINED: Final = 16
+_N_KEPT: Final = 8
+"""Other poses tried by registration, and kept."""
+_APART_M: Final = 0.4
+_APART_DEG: Final = 1.5
+"""Two poses nearer are one."""
+_BESIDE_M: Final = 1.5
+"""So far along and across from the tracked pose others are tried that a search might leave out."""
+_WON: Final = 2.5
+_WON_AT_ONCE: Final = 5.0
+"""By how many sigmas the pose must beat each other one to be proven: three times in a row, or at once."""
+_LOST: Final = 3.0
+"""By how many it must be beaten, twice in a row, to be no longer so."""
 
 F64 = NDArray[np.float64]
 I64 = NDArray[np.int64]
@@ -130,15 +163,15 @@ class Uniqueness:
         par = self._par
         self._how = replace(
             parameters.initialise,
-            n_refined=par.n_refined,
-            n_kept=par.n_kept,
-            same_m=par.apart_m,
-            same_deg=par.apart_deg,
+            n_refined=_N_REFINED,
+            n_kept=_N_KEPT,
+            same_m=_APART_M,
+            same_deg=_APART_DEG,
         )
         self.proven = not par.enabled
         self.margin = 0.0
         """Sigmas by which the tracked pose was ahead of the best other one at the last test."""
-        self._view = View(par.way_m, par.every_m, par.n_points)
+        self._view = View(_WAY_M, _EVERY_M, _N_POINTS)
         self._beaten = self._ahead = 0  # tests in a row
         self._next_m = 0.0  # odometer of the next test
         self._tested_m = self._told_m = 0.0  # odometer of the last test, and of the last that told the place along
@@ -150,8 +183,8 @@ class Uniqueness:
         if self.proven:
             self.proven, self._ahead, self._beaten, self._next_m = False, 0, 0, self._view.way_m
         if moved:
-            self._view = View(self._par.way_m, self._par.every_m, self._par.n_points)
-            self._next_m = self._par.every_m
+            self._view = View(_WAY_M, _EVERY_M, _N_POINTS)
+            self._next_m = _EVERY_M
             self._tested_m = self._told_m = 0.0
 
     def see(
@@ -192,43 +225,40 @@ class Uniqueness:
         """A few metres of a place that repeats prove any pose now and then: the proof stands once three tests in a row
         agree, or one by far, and until the view is whole any other pose that is ahead by a sigma takes it away.
         """
-        par = self._par
-        self._beaten = self._beaten + 1 if self.margin <= -par.lost else 0
-        self._ahead = self._ahead + 1 if self.margin >= par.won else 0
-        won = self._ahead >= WON_IN_A_ROW or self.margin >= par.won_at_once
-        whole = self._view.way_m >= par.way_m
+        self._beaten = self._beaten + 1 if self.margin <= -_LOST else 0
+        self._ahead = self._ahead + 1 if self.margin >= _WON else 0
+        won = self._ahead >= WON_IN_A_ROW or self.margin >= _WON_AT_ONCE
+        whole = self._view.way_m >= _WAY_M
         self.proven = (self.proven or won) and not self.beaten and (whole or self.margin >= -TOLD)
         steady = self.proven and whole and not self._beaten
-        self._next_m = self._view.way_m + (par.proven_m if steady else par.unproven_m)
+        self._next_m = self._view.way_m + (_PROVEN_M if steady else _UNPROVEN_M)
 
     def _tested(self, T_tracked: F64, match_map: MatchMap) -> float:
         """Sigmas by which the tracked pose is ahead of each other one."""
-        points = thinned(self._view.points_m, self._par.n_compared)
+        points = thinned(self._view.points_m, _N_COMPARED)
         own = self._registered(points, T_tracked, match_map, "near")
         if own is None:
             return 0.0
         if self._apart(own, T_tracked):
             own = T_tracked  # what it was drawn to is another pose
-        patches, high = patches_of(points, self._par.patch_m), points[:, 2] > self._par.high_m
+        patches, high = patches_of(points, _PATCH_M), points[:, 2] > _HIGH_M
         fits = self._fits(points, own, match_map)
 
         def least(others: list[F64]) -> float:
             against = [self._fits(points, T, match_map) for T in others]
-            return min(
-                (ahead_of_both(fits - fit, patches, high, self._par.full_points) for fit in against), default=np.inf
-            )
+            return min((ahead_of_both(fits - fit, patches, high, _FULL_POINTS) for fit in against), default=np.inf)
 
         along, across = (self._beside(points, own, match_map, axis) for axis in (0, 1))
         if least(along) >= TOLD:
             self._told_m = self._view.way_m
         others = [T for T in [*self._elsewhere(points, own, match_map), *along, *across] if self._view.allowed(T, own)]
-        return least(others) if others else ahead(fits, patches, self._par.full_points)
+        return least(others) if others else ahead(fits, patches, _FULL_POINTS)
 
     def _elsewhere(self, points: F64, own: F64, match_map: MatchMap) -> list[F64]:
         """Other poses (4, 4) about where GNSS says, as good as registration can make them."""
-        par, place = self._par, self._view.place
-        turn_rad = np.radians(par.turn_deg) if self._view.way_m >= par.course_m else np.pi
-        p_m, reach_m = (own[:3, 3], par.reach_m) if place is None else place
+        place = self._view.place
+        turn_rad = np.radians(_TURN_DEG) if self._view.way_m >= _COURSE_M else np.pi
+        p_m, reach_m = (own[:3, 3], _REACH_M) if place is None else place
         around = Around(p_m, reach_m, _yaw(own), turn_rad)
         found, _ = search(points, around, match_map, self._how, self._registration, points)
         poses = [one.registration.T_map_vehicle for one in found]
@@ -239,7 +269,7 @@ class Uniqueness:
         and where the map does not tell the place along that axis, they stay there.
         """
         poses = []
-        for side_m in (self._par.beside_m, -self._par.beside_m):
+        for side_m in (_BESIDE_M, -_BESIDE_M):
             shift = np.zeros(3)
             shift[axis] = side_m
             poses.append(self._registered(points, own @ T_from_R_t(np.eye(3), shift), match_map, "wide"))
@@ -247,13 +277,11 @@ class Uniqueness:
 
     def _apart(self, T: F64, own: F64) -> bool:
         off = T_inverse(own) @ T
-        return bool(
-            np.hypot(off[0, 3], off[1, 3]) > self._par.apart_m or abs(_yaw(off)) > np.radians(self._par.apart_deg)
-        )
+        return bool(np.hypot(off[0, 3], off[1, 3]) > _APART_M or abs(_yaw(off)) > np.radians(_APART_DEG))
 
     def _registered(self, points: F64, T: F64, m: MatchMap, start: Start) -> F64 | None:
         try:
-            return register(thinned(points, self._how.n_refining), T, m, self._registration, start).T_map_vehicle
+            return register(thinned(points, INITIALISE_N_REFINING), T, m, self._registration, start).T_map_vehicle
         except RegistrationError:
             return None
 
@@ -267,7 +295,7 @@ def fits_at(points_m: F64, T_map_vehicle: F64, m: MatchMap, parameters: Registra
     """
     fits, scale = np.empty(len(points_m)), parameters.scales[-1]
     R, t = np.ascontiguousarray(T_map_vehicle[:3, :3]), np.ascontiguousarray(T_map_vehicle[:3, 3])
-    gate_m2 = (parameters.gate_per_scale * scale) ** 2
+    gate_m2 = (REGISTRATION_GATE_PER_SCALE * scale) ** 2
     point_fits(
         np.ascontiguousarray(points_m), R, t, m.index, m.A, m.b, m.mean_m, m.information, scale**2, gate_m2, fits
     )

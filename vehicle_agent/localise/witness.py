@@ -6,13 +6,29 @@ shows new and gone in some places and hits in the rest; a wrong pose takes the h
 """
 
 from dataclasses import dataclass
+from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
 
 from gnd.gnd_map.jit import kernel
-from gnd.vehicle_agent.localise.doubt_parameters import WitnessParameters
+from gnd.vehicle_agent.localise.initialise import STANDING_ABOVE_M
 from gnd.vehicle_agent.localise.match_map import MatchMap
+
+_N_RAYS: Final = 600
+"""Asked at a time, every `period_s` or `way_m`."""
+_SECTORS: Final = 12
+"""Around the vehicle, counted with `least_points`."""
+_LEAST_POINTS: Final = 8
+_HIT_SIGMAS: Final = 3.0
+_FAR_SIGMAS: Final = 8.0
+"""A point nearer than the one to a Gaussian is a hit, farther than the other from all is new."""
+_BEHIND_M: Final = 1.0
+"""A Gaussian is gone when a ray went on for so long behind it."""
+_LEAST_ALONG_PER_M2: Final = 50.0
+"""Least information of the Gaussian along the ray, so that grazing rays say nothing."""
+_MAX_WAY_M: Final = 60.0
+"""A ray is followed no farther than this."""
 
 F64 = NDArray[np.float64]
 I32 = NDArray[np.int32]
@@ -73,7 +89,6 @@ def _share(counts: I64, part: int, whole: int) -> float:
 
 def witnessed(
     points_m: F64, origin_m: F64, ground_below_m: float, T_map_vehicle: F64, match_map: MatchMap,
-    parameters: WitnessParameters,
 ) -> Testimony:  # fmt: skip
     """Ask a sample of the scan's rays.
 
@@ -85,14 +100,14 @@ def witnessed(
         match_map: the map window.
         parameters: of the witness.
     """
-    par, m = parameters, match_map
-    points = np.ascontiguousarray(points_m[:: max(1, len(points_m) // par.n_rays)], dtype=np.float64)
-    standing = points[:, 2] > ground_below_m + par.above_ground_m
-    counts = np.zeros((par.sectors, 5), np.int64)
+    m = match_map
+    points = np.ascontiguousarray(points_m[:: max(1, len(points_m) // _N_RAYS)], dtype=np.float64)
+    standing = points[:, 2] > ground_below_m + STANDING_ABOVE_M
+    counts = np.zeros((_SECTORS, 5), np.int64)
     R, t = np.ascontiguousarray(T_map_vehicle[:3, :3]), np.ascontiguousarray(T_map_vehicle[:3, 3])
-    limits = np.array([par.hit_sigmas**2, par.far_sigmas**2, par.behind_m, par.least_along_per_m2, par.max_way_m])
+    limits = np.array([_HIT_SIGMAS**2, _FAR_SIGMAS**2, _BEHIND_M, _LEAST_ALONG_PER_M2, _MAX_WAY_M])
     ask_rays(points, standing, origin_m, R, t, m.index, m.A, m.b, m.mean_m, m.information, limits, counts)
-    return Testimony(counts, int(standing.sum()), par.least_points)
+    return Testimony(counts, int(standing.sum()), _LEAST_POINTS)
 
 
 @kernel

@@ -2,6 +2,7 @@
 
 from dataclasses import dataclass
 from math import ceil, radians, tan
+from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,6 +13,32 @@ from gnd.vehicle_agent.segment.ground_kernels import Grid, ground_heights, lowes
 from gnd.vehicle_agent.segment.image_kernels import Judge, Optics, draw_image, elevation_span, layer_gap, vote
 from gnd.vehicle_agent.segment.parameters import SegmentParameters
 from gnd.vehicle_agent.segment.voxel_kernels import find_objects
+
+_SETTLED_S: Final = 1.0
+"""A return at the same place counts the less the nearer in time below this: what moves still covers its place."""
+_COLUMN_DEG: Final = 0.3
+"""Width of the range images' columns, at least the spacing of the sensor's shots."""
+_ROW_DEG: Final = 0.4
+"""Height of their rows at the horizon; rows are even in the tangent of the elevation."""
+_REACH_ACROSS_M: Final = 0.15
+"""How far from a point a ray may pass at its side and still speak about it."""
+_REACH_UP_M: Final = 0.3
+"""The same above and below: layers are far apart."""
+_MARGIN_M: Final = 0.45
+"""A ray passes a point where it ends farther behind it than this …"""
+_MARGIN_SHARE: Final = 0.01
+"""… plus this share of the range."""
+_GROUND_CELL_M: Final = 1.0
+_GROUND_SLOPE: Final = 0.15
+"""The ground rises no steeper than this."""
+_ROAD_SLOPE: Final = 0.02
+"""It rises no steeper than this over the plane of the road under the vehicle."""
+_GROUND_M: Final = 0.25
+"""What lies lower than this over the ground is no object by itself; it goes with what stands above it."""
+_FEET_M: Final = 0.1
+"""What lies lower than this over the ground is the ground."""
+SEGMENT_VOXEL_M: Final = 0.3
+"""Points this near to each other are judged together, and objects farther apart are two."""
 
 U8 = NDArray[np.uint8]
 U16 = NDArray[np.uint16]
@@ -46,12 +73,12 @@ class RangeImage:
         """Usual distance of layers, as tangent."""
         return layer_gap(self.ranges, GAP_SHARE) * self.optics.tan_step
 
-    def vote(self, t_ns: int, objects: "Objects", centre_m: F64, judge: Judge, p: SegmentParameters) -> None:
+    def vote(self, t_ns: int, objects: "Objects", centre_m: F64, judge: Judge) -> None:
         """Vote on the objects of the scan at `t_ns`, whose points are relative to `centre_m`.
 
         What moves may still cover its own place for a while: a return there says the more the longer after.
         """
-        share = min(1.0, abs(t_ns - self.t_ns) / (p.settled_s * NS))
+        share = min(1.0, abs(t_ns - self.t_ns) / (_SETTLED_S * NS))
         weight = max(1, round(share * WEIGHTS))
         vote(
             objects.points, centre_m - self.centre_m, self.ranges, self.places, self.R, self.optics, judge, weight,
@@ -82,17 +109,17 @@ def hash_table(n: int) -> tuple[I64, I32]:
     return np.full(size, -1, np.int64), np.empty(size, np.int32)
 
 
-def judge_of(p: SegmentParameters, gap_tan: float) -> Judge:
+def judge_of(gap_tan: float) -> Judge:
     """What a vote needs: parameters, and the distance of the sensor's layers."""
-    return Judge(p.reach_across_m, p.reach_up_m, p.margin_m, p.margin_share, 1.2 * gap_tan, ENOUGH * WEIGHTS)
+    return Judge(_REACH_ACROSS_M, _REACH_UP_M, _MARGIN_M, _MARGIN_SHARE, 1.2 * gap_tan, ENOUGH * WEIGHTS)
 
 
 class GroundMap:
     """The ground around the vehicle, remembered from scan to scan in squares that lie still in the map frame."""
 
     def __init__(self, p: SegmentParameters) -> None:
-        self._cell_m, self._slope, self._road_slope = p.ground_cell_m, p.ground_slope, p.road_slope
-        self._half = ceil(p.range_max_m / p.ground_cell_m) + 1
+        self._cell_m, self._slope, self._road_slope = _GROUND_CELL_M, _GROUND_SLOPE, _ROAD_SLOPE
+        self._half = ceil(p.range_max_m / _GROUND_CELL_M) + 1
         self._memory = np.full((2 * self._half, 2 * self._half), np.inf, np.float32)
         self._corner = np.zeros(2, np.int64)
 
@@ -129,20 +156,18 @@ def find_all_objects(
 ) -> Objects:
     """Voxels of a scan's points (N, 3), relative to its centre; `gap_tan`: distance of its layers."""
     voxel_of, first, index = find_objects(
-        points, origins, *ground, p.ground_m, p.feet_m, p.voxel_m, p.range_min_m, p.range_max_m,
+        points, origins, *ground, _GROUND_M, _FEET_M, SEGMENT_VOXEL_M, p.range_min_m, p.range_max_m,
         *hash_table(len(points)),
     )  # fmt: skip
     votes = np.zeros((2, len(first)), np.uint8)
-    reach = np.ceil(np.hypot(points[first, 0], points[first, 1]) * (1.2 * gap_tan / p.voxel_m))
+    reach = np.ceil(np.hypot(points[first, 0], points[first, 1]) * (1.2 * gap_tan / SEGMENT_VOXEL_M))
     return Objects(points[first], index, votes[0], votes[1], np.clip(reach, 1, MOST_REACH).astype(np.uint8), voxel_of)
 
 
-def image_of(
-    t_ns: int, centre_m: F64, R: F64, points: F32, origins: F32, voxel_of: I32, p: SegmentParameters
-) -> RangeImage:
+def image_of(t_ns: int, centre_m: F64, R: F64, points: F32, origins: F32, voxel_of: I32) -> RangeImage:
     """The range image of a scan."""
     low, high = elevation_span(points, origins, R)
-    step = tan(radians(p.row_deg))
+    step = tan(radians(_ROW_DEG))
     rows = int((high - low) / step) + 1 if high >= low else 1
-    optics = Optics(round(360.0 / p.column_deg), rows, float(low), step)
+    optics = Optics(round(360.0 / _COLUMN_DEG), rows, float(low), step)
     return RangeImage(t_ns, centre_m, R, optics, *draw_image(points, origins, voxel_of, R, optics, SPREAD_M))

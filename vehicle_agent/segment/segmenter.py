@@ -3,6 +3,7 @@
 from collections import deque
 from collections.abc import Iterator
 from dataclasses import dataclass
+from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,6 +13,7 @@ from gnd.vehicle_agent.localise.estimates import PoseEstimate, RefinedScan
 from gnd.vehicle_agent.segment.evidence import belief
 from gnd.vehicle_agent.segment.parameters import SegmentParameters
 from gnd.vehicle_agent.segment.scene import (
+    SEGMENT_VOXEL_M,
     GroundMap,
     Objects,
     RangeImage,
@@ -21,6 +23,21 @@ from gnd.vehicle_agent.segment.scene import (
     judge_of,
 )
 from gnd.vehicle_agent.segment.voxel_kernels import components, moving_points
+
+_EVERY_S: Final = 0.3
+"""Time between the scans that are kept for comparison."""
+_APART_S: Final = 0.15
+"""Scans nearer in time show too little motion."""
+_MASS_MOVING: Final = 0.5
+"""Mass that one passing ray gives to "moving"."""
+_MASS_STATIC: Final = 0.6
+"""Mass that one return at the same place gives to "static"."""
+_MOVING_SHARE: Final = 0.3
+"""Share of moving voxels that makes a whole object move."""
+_MIN_VOXELS: Final = 2
+"""Moving voxels that an object needs."""
+_PART_VOXELS: Final = 6
+"""Adjacent moving voxels that are taken out of an object which as a whole stands."""
 
 I16 = NDArray[np.int16]
 Mask = NDArray[np.bool_]
@@ -60,7 +77,7 @@ class MotionSegmenter:
 
     def __init__(self, parameters: SegmentParameters | None = None) -> None:
         self.parameters = parameters or SegmentParameters()
-        self._judge = judge_of(self.parameters, 0.0)
+        self._judge = judge_of(0.0)
         self._held: deque[_Held] = deque()
         self._images: deque[RangeImage] = deque()
         self._ground = GroundMap(self.parameters)
@@ -89,24 +106,23 @@ class MotionSegmenter:
             ground = self._ground.around(points, centre, scan.estimate.T_map_vehicle, self._tan_low)
             objects = find_all_objects(points, origins, ground, self._gap_tan, p)
             self._hear_the_past(scan.t_ns, objects, centre)
-            if not self._images or scan.t_ns - self._images[-1].t_ns >= p.every_s * _S - _S // 50:
+            if not self._images or scan.t_ns - self._images[-1].t_ns >= _EVERY_S * _S - _S // 50:
                 R = scan.estimate.T_map_vehicle[:3, :3].T.copy()
-                image = image_of(scan.t_ns, centre, R, points, origins, objects.voxel_of, p)
+                image = image_of(scan.t_ns, centre, R, points, origins, objects.voxel_of)
                 self._tell_the_held(image)
                 self._images.append(image)
                 self._gap_tan, self._tan_low = image.gap_tan, image.optics.tan_low
-                self._judge = judge_of(p, self._gap_tan)
+                self._judge = judge_of(self._gap_tan)
         step_m = max(float(np.abs(origins).max(initial=0.0)) / 32767, 1e-4)
         self._held.append(
             _Held(scan.t_ns, scan.estimate, centre, points, np.rint(origins / step_m).astype(np.int16), step_m, objects)
         )
 
     def _hear_the_past(self, t_ns: int, objects: Objects, centre_m: F64) -> None:
-        p = self.parameters
         self._thin_out(t_ns)
         for image in self._images:
-            if t_ns - image.t_ns >= p.apart_s * _S:
-                image.vote(t_ns, objects, centre_m, self._judge, p)
+            if t_ns - image.t_ns >= _APART_S * _S:
+                image.vote(t_ns, objects, centre_m, self._judge)
 
     def _thin_out(self, t_ns: int) -> None:
         """Forget images that are too old; of the older half keep one of `OLD_STEP` times `every_s`."""
@@ -114,15 +130,15 @@ class MotionSegmenter:
         for image in self._images:
             age_ns, last_ns = t_ns - image.t_ns, kept[-1].t_ns if kept else -(2**62)
             young = age_ns <= p.future_s * _S
-            if age_ns <= p.past_s * _S and (young or image.t_ns - last_ns >= OLD_STEP * p.every_s * _S - _S // 50):
+            if age_ns <= p.past_s * _S and (young or image.t_ns - last_ns >= OLD_STEP * _EVERY_S * _S - _S // 50):
                 kept.append(image)
         self._images = kept
 
     def _tell_the_held(self, image: RangeImage) -> None:
         p = self.parameters
         for held in self._held:
-            if p.apart_s * _S <= image.t_ns - held.t_ns <= p.future_s * _S and held.objects is not None:
-                image.vote(held.t_ns, held.objects, held.centre_m, self._judge, p)
+            if _APART_S * _S <= image.t_ns - held.t_ns <= p.future_s * _S and held.objects is not None:
+                image.vote(held.t_ns, held.objects, held.centre_m, self._judge)
 
     def _released(self, until_ns: int | None) -> Iterator[SegmentedScan]:
         while self._held and (until_ns is None or self._held[0].t_ns <= until_ns):
@@ -133,26 +149,26 @@ class MotionSegmenter:
         objects = held.objects
         if objects is None:
             return np.zeros(len(held.points), np.bool_)
-        moves = decide(objects, self.parameters)
+        moves = decide(objects)
         if not moves.any():
             return np.zeros(len(held.points), np.bool_)
         table = hash_table(int(moves.sum()))
-        return moving_points(held.points, objects.voxel_of, objects.index, moves, self.parameters.voxel_m, *table)
+        return moving_points(held.points, objects.voxel_of, objects.index, moves, SEGMENT_VOXEL_M, *table)
 
 
-def decide(objects: Objects, p: SegmentParameters) -> Mask:
+def decide(objects: Objects) -> Mask:
     """(V,) bool: voxels of moving objects.
 
     An object moves as a whole when the share of its voxels that were passed is large; from one that stands, parts of
     adjacent passed voxels are taken (somebody who walks along a wall).
     """
-    moving, static = belief(objects.passed, objects.met, p.mass_moving, p.mass_static)
+    moving, static = belief(objects.passed, objects.met, _MASS_MOVING, _MASS_STATIC)
     goes, stays = moving > static, static > moving
     if not goes.any():
         return goes
     whole = components(objects.index, objects.reach, np.ones(len(goes), np.bool_), *hash_table(len(goes)))
     n_goes, n_stays = np.bincount(whole, goes), np.bincount(whole, stays)
-    moves = (n_goes >= p.min_voxels) & (n_goes >= p.moving_share * (n_goes + n_stays))
+    moves = (n_goes >= _MIN_VOXELS) & (n_goes >= _MOVING_SHARE * (n_goes + n_stays))
     part = components(objects.index, objects.reach, goes, *hash_table(int(goes.sum())))
-    large = np.append(np.bincount(part[part >= 0]) >= p.part_voxels, False)
+    large = np.append(np.bincount(part[part >= 0]) >= _PART_VOXELS, False)
     return np.asarray(moves[whole] | large[part])

@@ -1,6 +1,7 @@
 """The nodes of a drive's graph: keyframes, first poses by smoothing motion and GNSS, fixes put together."""
 
 from dataclasses import dataclass, replace
+from typing import Final
 
 import numpy as np
 
@@ -18,6 +19,10 @@ from gnd.vehicle_agent.features.mapping.graph_edges import (
 )
 from gnd.vehicle_agent.features.mapping.landmarks import Sight
 from gnd.vehicle_agent.features.mapping.parameters import GnssNoise, NewLayerParameters
+
+_KEYFRAME_M: Final = 5.0
+_KEYFRAME_S: Final = 1.0
+"""A pose of the graph every so many metres, and every so many seconds."""
 
 SMOOTHINGS = 2  # of motion and fixes, each with the wheel scale and gyro bias of the one before
 CHORD_M = 60.0  # GNSS tells a direction over so long a way
@@ -37,7 +42,7 @@ class DriveNodes:
     def of(cls, drive: FeatureDrive, parameters: NewLayerParameters) -> "DriveNodes":
         """Keyframes by the way driven; no wheel scale and gyro bias known yet."""
         reckoning = DeadReckoning.of(drive.motion, parameters.motion, 0.0, 0.0)
-        t_ns = reckoning.keyframes(parameters.keyframe_m, parameters.keyframe_s)
+        t_ns = reckoning.keyframes(_KEYFRAME_M, _KEYFRAME_S)
         return cls(drive, parameters, t_ns, reckoning, np.zeros(2))
 
     def calibrated(self, calibration: F64) -> "DriveNodes":

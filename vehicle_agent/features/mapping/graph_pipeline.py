@@ -15,6 +15,7 @@ from gnd.gnd_map.tile_id import TileId
 from gnd.schemas.drive import DriveItem, GnssFix, MotionSample, ReferencePose
 from gnd.vehicle_agent.config import PipelineParameters
 from gnd.vehicle_agent.errors import NewLayerError
+from gnd.vehicle_agent.features.coverage import CoverageParameters
 from gnd.vehicle_agent.features.feature_report import FeatureReporter
 from gnd.vehicle_agent.features.layer_parameters import LayerParameters
 from gnd.vehicle_agent.features.mapping.feature_drive import FeatureDrive
@@ -138,7 +139,7 @@ class GraphPipeline:
             self.counts["stretches_contradicting"] += 1
             raise NewLayerError("the graph contradicts itself: " + "; ".join(map(str, found.strains)))
         self.counts["stretches"] += 1
-        reporter, coverage = self._reporters[layer.name], self._parameters.features.coverage
+        reporter, coverage = self._reporters[layer.name], CoverageParameters()
         for change in changes_of(found, drive, self._held, layer, coverage, self.place.height_m):
             reporter.add(change, drive.looks[0].t_ns, self.place.odometer_m)
         reporter.report_all(drive.looks[-1].t_ns)

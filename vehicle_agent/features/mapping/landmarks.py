@@ -7,7 +7,7 @@ is known best: the same as all of them as edges of their own, and far fewer.
 """
 
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import Final, NamedTuple
 
 import numpy as np
 
@@ -16,8 +16,22 @@ from gnd.vehicle_agent.features.mapping.dead_reckoning import composed, relative
 from gnd.vehicle_agent.features.mapping.feature_drive import Measurements
 from gnd.vehicle_agent.features.mapping.graph import bearing_range
 from gnd.vehicle_agent.features.mapping.graph_edges import Ties
-from gnd.vehicle_agent.features.mapping.parameters import LandmarkParameters
 from gnd.vehicle_agent.features.slamcu.association import FORBIDDEN, associate
+
+_GATE_CHI2: Final = 13.8
+"""A measurement farther than this from a feature (two degrees of freedom) is none of it; 0.1 % of the right ones
+are."""
+LANDMARK_MIN_HITS: Final = 5
+"""A feature with fewer measurements is a ghost and not told."""
+LANDMARK_REVISIT_M: Final = 1.5
+"""Sigma of what the first poses are off by against those of a passage `revisit_way_m` before."""
+_REVISIT_WAY_M: Final = 150.0
+LANDMARK_DRIFT_M: Final = 0.1
+"""Sigma of what the first poses are off by within a passage."""
+_MERGE_CHI2: Final = 9.2
+"""Two of one kind that are nearer than this, and not seen side by side, are one."""
+_APART_SHARE: Final = 0.3
+"""They count as seen side by side in more than this share of the looks of the rarer."""
 
 NONE = -1  # a measurement of no feature
 FAR_M = 25.0  # a feature farther than this from a measurement's place is not looked at
@@ -70,13 +84,13 @@ def places(m: Measurements, sight: Sight, pose: F64) -> tuple[F64, F64]:
     return xy, np.asarray(np.einsum("mij,mj,mkj->mik", R, variance, R))
 
 
-def clustered(m: Measurements, sight: Sight, pose: F64, parameters: LandmarkParameters) -> tuple[I64, F64]:
+def clustered(m: Measurements, sight: Sight, pose: F64) -> tuple[I64, F64]:
     """The first association: (M,) feature of each measurement, and (N, 2) features; all hits count, ghosts too."""
     xy, cov = places(m, sight, pose)
     c = _Clusters(np.empty((0, 2)), np.empty((0, 2, 2)), np.empty(0, np.int64), np.empty(0), np.empty(0, np.int64))
     owner = np.full(len(m), NONE, np.int64)
     for rows in _looks(m.look):
-        owner[rows] = _take(c, xy[rows], cov[rows], m.kind[rows], float(sight.way_m[rows[0]]), parameters)
+        owner[rows] = _take(c, xy[rows], cov[rows], m.kind[rows], float(sight.way_m[rows[0]]))
     return owner, c.xy_m
 
 
@@ -87,13 +101,13 @@ def _looks(look: I64) -> list[I64]:
     return np.split(np.arange(len(look)), np.flatnonzero(np.diff(look)) + 1)
 
 
-def _take(c: _Clusters, xy: F64, cov: F64, kind: I64, way_m: float, parameters: LandmarkParameters) -> I64:
+def _take(c: _Clusters, xy: F64, cov: F64, kind: I64, way_m: float) -> I64:
     """The clusters of the measurements of one look, which join them or begin new ones."""
     near = np.flatnonzero((np.abs(c.xy_m[None] - xy[:, None]).max(axis=2) < FAR_M).any(axis=0))
-    cost = _squared(xy, cov, c, near, way_m, parameters)
+    cost = _squared(xy, cov, c, near, way_m)
     cost[kind[:, None] != c.kind[near]] = FORBIDDEN
-    cost[cost > parameters.gate_chi2] = FORBIDDEN
-    pairs = associate(cost, parameters.gate_chi2)
+    cost[cost > _GATE_CHI2] = FORBIDDEN
+    pairs = associate(cost, _GATE_CHI2)
     owner = np.full(len(xy), NONE, np.int64)
     for row, column in zip(pairs.measurement, near[pairs.feature], strict=True):
         _join(c, int(column), xy[row], cov[row], way_m)
@@ -103,10 +117,10 @@ def _take(c: _Clusters, xy: F64, cov: F64, kind: I64, way_m: float, parameters: 
     return owner
 
 
-def _squared(xy: F64, cov: F64, c: _Clusters, near: I64, way_m: float, parameters: LandmarkParameters) -> F64:
+def _squared(xy: F64, cov: F64, c: _Clusters, near: I64, way_m: float) -> F64:
     """(Z, C) squared Mahalanobis distances of measurements and clusters, with what the poses may be off by."""
-    again = way_m - c.way_m[near] > parameters.revisit_way_m
-    drift = np.where(again, parameters.revisit_m, parameters.drift_m) ** 2
+    again = way_m - c.way_m[near] > _REVISIT_WAY_M
+    drift = np.where(again, LANDMARK_REVISIT_M, LANDMARK_DRIFT_M) ** 2
     S = cov[:, None] + c.cov[near][None] + (drift[:, None, None] * np.eye(2))[None]
     off = xy[:, None] - c.xy_m[near][None]
     return np.asarray(np.einsum("zci,zcij,zcj->zc", off, np.linalg.inv(S), off))
@@ -126,9 +140,7 @@ def _begin(c: _Clusters, xy: F64, cov: F64, kind: int, way_m: float) -> int:
     return len(c.xy_m) - 1
 
 
-def assigned(
-    m: Measurements, sight: Sight, pose: F64, xy_m: F64, kind: I64, slack_m: F64, parameters: LandmarkParameters
-) -> I64:
+def assigned(m: Measurements, sight: Sight, pose: F64, xy_m: F64, kind: I64, slack_m: F64) -> I64:
     """Measurements given to known features anew, from better poses: (M,) feature, `NONE` = of none.
 
     Args:
@@ -147,8 +159,8 @@ def assigned(
         near = np.flatnonzero((np.abs(xy_m[None] - seen[rows][:, None]).max(axis=2) < FAR_M).any(axis=0))
         cost = _polar_squared(m, rows, at[rows[0]], xy_m[near], slack_m[near])
         cost[m.kind[rows][:, None] != kind[near]] = FORBIDDEN
-        cost[cost > parameters.gate_chi2] = FORBIDDEN
-        pairs = associate(cost, parameters.gate_chi2)
+        cost[cost > _GATE_CHI2] = FORBIDDEN
+        pairs = associate(cost, _GATE_CHI2)
         owner[rows[pairs.measurement]] = near[pairs.feature]
     return owner
 
@@ -211,7 +223,7 @@ def kept(owner: I64, hits_needed: int) -> I64:
     return np.where(owner >= 0, np.append(number, NONE)[owner], NONE)
 
 
-def doubles(m: Measurements, owner: I64, at: Places, parameters: LandmarkParameters) -> list[tuple[int, int]]:
+def doubles(m: Measurements, owner: I64, at: Places) -> list[tuple[int, int]]:
     """Pairs of features (first, second) that are one: near each other, of one kind, and not seen side by side.
 
     Two that are in view at the same time and never seen in one look are one if a measurement could be of either. Two of
@@ -226,18 +238,18 @@ def doubles(m: Measurements, owner: I64, at: Places, parameters: LandmarkParamet
     looks = [np.unique(m.look[owner == n]) for n in range(len(at.xy_m))]
     distance = np.hypot(*np.moveaxis(at.xy_m[:, None] - at.xy_m[None], 2, 0))
     near = np.triu(distance < FAR_M, 1) & (at.kind[:, None] == at.kind[None])
-    return [(int(a), int(b)) for a, b in np.argwhere(near) if _same(at, looks, int(a), int(b), parameters)]
+    return [(int(a), int(b)) for a, b in np.argwhere(near) if _same(at, looks, int(a), int(b))]
 
 
-def _same(at: Places, looks: list[I64], a: int, b: int, parameters: LandmarkParameters) -> bool:
+def _same(at: Places, looks: list[I64], a: int, b: int) -> bool:
     first, second = looks[a], looks[b]
     together = len(np.intersect1d(first, second))
-    if together > parameters.apart_share * min(len(first), len(second)):
+    if together > _APART_SHARE * min(len(first), len(second)):
         return False
     low, high = max(first[0], second[0]), min(first[-1], second[-1])
     both = min(int(((x >= low) & (x <= high)).sum()) for x in (first, second))
     S = at.cov[a] + at.cov[b]
-    if both >= parameters.min_hits:
+    if both >= LANDMARK_MIN_HITS:
         S = S + at.spread[a] + at.spread[b]
     off = at.xy_m[a] - at.xy_m[b]
-    return bool(off @ np.linalg.solve(S, off) <= parameters.merge_chi2)
+    return bool(off @ np.linalg.solve(S, off) <= _MERGE_CHI2)

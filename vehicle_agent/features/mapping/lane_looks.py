@@ -8,7 +8,8 @@ all polylines of a look together, as they lie side by side: alone, one that is 2
 from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import combinations
-from typing import NamedTuple
+from math import radians
+from typing import Final, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,7 +18,15 @@ from gnd.gnd_map.arrays import F64, I64
 from gnd.schemas.drive import LaneLook
 from gnd.vehicle_agent.features.mapping.dead_reckoning import composed, rotated
 from gnd.vehicle_agent.features.mapping.lane_map import SAMPLE_M, LaneMap
-from gnd.vehicle_agent.features.mapping.parameters import LaneParameters
+
+_SIGMA_M: Final = 1.0
+_SIGMA_RAD: Final = radians(2.5)
+"""Of a polyline of one look: how far off it lies beside the vehicle, and how far it is turned (Table 1 of the paper
+with l = 1); used where the look does not say."""
+_BESIDE_M: Final = 15.0
+"""Lanes this far beside the vehicle are looked at."""
+LANE_GATE: Final = 3.5
+"""A polyline farther than this many sigmas from a line is none of it."""
 
 POINTS = 8  # of a polyline that are compared with the map
 MAX_LANES = 8  # beside each other that are looked at
@@ -38,10 +47,10 @@ class Polylines:
     sigma: F64
 
     @classmethod
-    def of(cls, looks: Sequence[LaneLook], parameters: LaneParameters) -> "Polylines":
+    def of(cls, looks: Sequence[LaneLook]) -> "Polylines":
         """Sample each polyline at `POINTS` of its points."""
         rows = [(n, line) for n, look in enumerate(looks) for line in look.polylines]
-        sigmas = [(look.sigma_m or parameters.sigma_m, look.sigma_rad or parameters.sigma_rad) for look in looks]
+        sigmas = [(look.sigma_m or _SIGMA_M, look.sigma_rad or _SIGMA_RAD) for look in looks]
         points = [line[np.linspace(0, len(line) - 1, POINTS).round().astype(np.int64)] for _, line in rows]
         look = np.array([n for n, _ in rows], np.int64)
         xy = np.array(points, np.float64).reshape(-1, POINTS, 2)
@@ -71,7 +80,7 @@ class Offsets(NamedTuple):
     """(P, M), `IMPOSSIBLE` where the lane is none or too short."""
 
 
-def offsets(lines: Polylines, lanes: LaneMap, at: F64, base: F64, p: LaneParameters) -> Offsets:
+def offsets(lines: Polylines, lanes: LaneMap, at: F64, base: F64) -> Offsets:
     """Compare each polyline with each lane beside the vehicle.
 
     Args:
@@ -81,7 +90,7 @@ def offsets(lines: Polylines, lanes: LaneMap, at: F64, base: F64, p: LaneParamet
         base: (L, 3) poses of their windows.
         p: how far to look.
     """
-    beside = _beside(lanes, at, p)
+    beside = _beside(lanes, at)
     lane, sample, left = beside[0][lines.look], beside[1][lines.look], beside[2][lines.look]
     at, base = at[lines.look], base[lines.look]
     valid_lane = np.maximum(lane, 0)
@@ -127,13 +136,13 @@ def _fit(E: F64, valid: NDArray[np.bool_], xy_m: F64) -> tuple[F64, NDArray[np.b
     return np.asarray(np.linalg.solve(A, np.swapaxes(E, 2, 3))), np.asarray(enough)
 
 
-def _beside(lanes: LaneMap, at: F64, p: LaneParameters) -> tuple[I64, I64, F64]:
+def _beside(lanes: LaneMap, at: F64) -> tuple[I64, I64, F64]:
     """(L, M) lanes beside each pose, from right to left, -1 = none; of each the nearest sample, and how far left."""
     n_looks = len(at)
     distance = np.full((n_looks, len(lanes)), np.inf)
     sample = np.zeros((n_looks, len(lanes)), np.int64)
     for lane in range(len(lanes)):
-        distance[:, lane], sample[:, lane] = lanes.nearest(lane, at[:, :2], p.beside_m)
+        distance[:, lane], sample[:, lane] = lanes.nearest(lane, at[:, :2], _BESIDE_M)
     nearest = np.argsort(distance, axis=1, kind="stable")[:, :MAX_LANES]
     row = lanes.first[nearest] + np.take_along_axis(sample, nearest, axis=1)
     left = rotated(np.broadcast_to(-at[:, None, 2], nearest.shape), lanes.xy_m[row] - at[:, None, :2])[..., 1]
@@ -146,7 +155,7 @@ def _beside(lanes: LaneMap, at: F64, p: LaneParameters) -> tuple[I64, I64, F64]:
     return beside[:, :used], np.where(beside >= 0, ordered, 0)[:, :used], left[:, :used]
 
 
-def choices(lines: Polylines, o: Offsets, aside_m: F64, p: LaneParameters) -> tuple[I64, F64]:
+def choices(lines: Polylines, o: Offsets, aside_m: F64) -> tuple[I64, F64]:
     """Which lane each polyline of a look is, side by side, for each of G sideways moves of the vehicle.
 
     Args:
@@ -171,18 +180,18 @@ def choices(lines: Polylines, o: Offsets, aside_m: F64, p: LaneParameters) -> tu
     for n_seen, n_lanes in {(int(a), int(b)) for a, b in zip(seen, n_beside, strict=True) if a and b}:
         looks = np.flatnonzero((seen == n_seen) & (n_beside == n_lanes))
         rows = first[looks][:, None] + np.arange(n_seen)
-        found, cost[looks] = _side_by_side(_pair_costs(lines, o, rows, n_lanes, aside[looks], p), left[rows])
+        found, cost[looks] = _side_by_side(_pair_costs(lines, o, rows, n_lanes, aside[looks]), left[rows])
         column[rows] = found
     return column, cost
 
 
-def _pair_costs(lines: Polylines, o: Offsets, rows: I64, n_lanes: int, aside: F64, p: LaneParameters) -> F64:
+def _pair_costs(lines: Polylines, o: Offsets, rows: I64, n_lanes: int, aside: F64) -> F64:
     """(L, S, M, G) cost of each polyline for each lane and move; never more than the gate."""
     off = o.told[rows, :n_lanes, 0, None] + aside[:, None, None]
     turn = o.told[rows, :n_lanes, 1, None] / lines.tolerance[rows, 1][..., None, None]
     cost = (off / lines.tolerance[rows, 0][..., None, None]) ** 2 + turn**2
     cost = np.where(o.cost[rows, :n_lanes, None] >= IMPOSSIBLE, np.inf, cost)
-    return np.minimum(cost, 2.0 * p.gate**2)
+    return np.minimum(cost, 2.0 * LANE_GATE**2)
 
 
 def _side_by_side(cost: F64, left: F64) -> tuple[I64, F64]:

@@ -7,7 +7,7 @@ depend on the pose, by the lanes' geometry. Along straight lanes, and along circ
 """
 
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import Final, NamedTuple
 
 import gtsam
 import numpy as np
@@ -17,9 +17,21 @@ from gnd.schemas.drive import LaneLook
 from gnd.vehicle_agent.features.mapping.dead_reckoning import composed, relative, rotated
 from gnd.vehicle_agent.features.mapping.drive_nodes import DriveNodes, nearest
 from gnd.vehicle_agent.features.mapping.graph_edges import NO_MATCHES, PoseMatches
-from gnd.vehicle_agent.features.mapping.lane_looks import Offsets, Polylines, choices, offsets
+from gnd.vehicle_agent.features.mapping.lane_looks import LANE_GATE, Offsets, Polylines, choices, offsets
 from gnd.vehicle_agent.features.mapping.lane_map import LaneMap, gicp
 from gnd.vehicle_agent.features.mapping.parameters import LaneParameters
+
+_WINDOW_M: Final = 20.0
+"""Looks of so long a way are put together."""
+_SEARCH_M: Final = 4.0
+"""The first match tries so far to either side."""
+_MAX_CORRESPONDENCE_M: Final = 1.5
+"""Of GICP."""
+_MIN_POLYLINES: Final = 3
+"""A window of fewer polylines is not matched."""
+_INFORMATION: Final = 0.75
+"""The share of what polylines would say if it were certain which lane each is. With the paper's noise some are taken
+for their neighbour; with 0.75 the squared errors of features are as large as they should be."""
 
 __all__ = ["LaneMap", "LaneMatcher"]
 
@@ -65,9 +77,9 @@ class LaneMatcher:
         self, lanes: LaneMap, looks: tuple[LaneLook, ...], nodes: DriveNodes, parameters: LaneParameters
     ) -> None:
         self.lanes, self.parameters = lanes, parameters
-        self.lines = Polylines.of(looks, parameters)
+        self.lines = Polylines.of(looks)
         self.t_ns = np.array([look.t_ns for look in looks], np.int64)
-        self.keys = _spaced(nodes.sight(nodes.t_ns).way_m, parameters.window_m)
+        self.keys = _spaced(nodes.sight(nodes.t_ns).way_m, _WINDOW_M)
         self.window = nearest(nodes.t_ns[self.keys], self.t_ns) if len(looks) else np.empty(0, np.int64)
         self._searched = False
 
@@ -81,7 +93,7 @@ class LaneMatcher:
         base = pose[self.keys]
         driven = nodes.reckoning.at(nodes.t_ns[self.keys])[self.window]
         at = composed(base[self.window], relative(driven, nodes.reckoning.at(self.t_ns)))
-        o = offsets(self.lines, self.lanes, at, base[self.window], self.parameters)
+        o = offsets(self.lines, self.lanes, at, base[self.window])
         chosen = self._chosen(o)
         found = self._fitted(chosen, base)
         rows = np.flatnonzero(np.trace(found.information, axis1=1, axis2=2) > 0.0)
@@ -89,15 +101,15 @@ class LaneMatcher:
         return PoseMatches(found.key[rows], base[rows], off[rows], found.information[rows])
 
     def _chosen(self, o: Offsets) -> _Chosen:
-        p, n_looks = self.parameters, int(self.lines.look.max()) + 1
+        n_looks = int(self.lines.look.max()) + 1
         aside = np.zeros((n_looks, 1)) if self._searched else self._search(o, n_looks)
         self._searched = True
-        column = choices(self.lines, o, aside, p)[0][:, 0]
+        column = choices(self.lines, o, aside)[0][:, 0]
         rows = np.arange(len(column))
         told = o.told[rows, column]
         moved = told[:, 0] + aside[self.lines.look, 0]
         squared = np.stack([moved, told[:, 1]], axis=1) ** 2 / self.lines.tolerance**2
-        good = (column >= 0) & (squared.max(axis=1) <= p.gate**2) & (o.cost[rows, column] < 1e5)
+        good = (column >= 0) & (squared.max(axis=1) <= LANE_GATE**2) & (o.cost[rows, column] < 1e5)
         window, lane = self.window[self.lines.look], o.lane[rows, column]
         variance = self._variance(window, lane, good)
         kept = np.flatnonzero(good)
@@ -115,9 +127,8 @@ class LaneMatcher:
         """(L, 1) the move sideways at which the looks of some windows together fit best; the first poses may be a lane
         off.
         """
-        p = self.parameters
-        aside = np.arange(-p.search_m, p.search_m + 1e-9, ASIDE_STEP_M)
-        _, cost = choices(self.lines, o, aside, p)
+        aside = np.arange(-_SEARCH_M, _SEARCH_M + 1e-9, ASIDE_STEP_M)
+        _, cost = choices(self.lines, o, aside)
         total = np.zeros((len(self.keys), len(aside)))
         np.add.at(total, self.window[:n_looks], cost)
         summed = np.cumsum(np.concatenate([np.zeros((1, len(aside))), total]), axis=0)
@@ -129,10 +140,10 @@ class LaneMatcher:
     def _fitted(self, c: _Chosen, base: F64) -> WindowMatch:
         """Least squares of the polylines of each window."""
         A, g = _normal_equations(c, c.window, len(self.keys))
-        few = np.bincount(c.window, minlength=len(self.keys)) < self.parameters.min_polylines
+        few = np.bincount(c.window, minlength=len(self.keys)) < _MIN_POLYLINES
         A[few] = 0.0
         off, information, strong = solved(A, -g)
-        return WindowMatch(self.keys, base, off, self.parameters.information * information, strong)
+        return WindowMatch(self.keys, base, off, _INFORMATION * information, strong)
 
     def _polished(self, found: WindowMatch, c: _Chosen, rows: I64) -> F64:
         """(W, 3) what the poses of windows are off by GICP, Eq. (8), where lanes say it well."""
@@ -157,7 +168,7 @@ class LaneMatcher:
         target = near[(ahead > SEEN_M[0] - MARGIN_M) & (ahead < SEEN_M[1] + MARGIN_M)]
         if len(target) < 20:
             return None
-        return gicp(target, source, pose, self.parameters.max_correspondence_m)
+        return gicp(target, source, pose, _MAX_CORRESPONDENCE_M)
 
     def _as_seen(self, lane: int, base: F64, off: F64) -> F64:
         """(N, 2) a lane of the map, in the frame of the window, moved to where the looks saw it on average."""

@@ -6,6 +6,7 @@ of the whole drive gives the features and how certain they are, all in the map f
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import Final
 
 import numpy as np
 
@@ -16,6 +17,9 @@ from gnd.vehicle_agent.features.mapping.feature_drive import FeatureDrive, Measu
 from gnd.vehicle_agent.features.mapping.graph import Solution, solve
 from gnd.vehicle_agent.features.mapping.graph_edges import Anchors, Problem, State
 from gnd.vehicle_agent.features.mapping.landmarks import (
+    LANDMARK_DRIFT_M,
+    LANDMARK_MIN_HITS,
+    LANDMARK_REVISIT_M,
     NONE,
     Places,
     Sight,
@@ -30,6 +34,9 @@ from gnd.vehicle_agent.features.mapping.lanes import LaneMap, LaneMatcher
 from gnd.vehicle_agent.features.mapping.parameters import NewLayerParameters
 from gnd.vehicle_agent.features.mapping.smoothed_path import SmoothedPath
 from gnd.vehicle_agent.features.mapping.strain import Strain, strains
+
+_SETTLED_M: Final = 0.01
+"""Rounds end when no feature moves by more."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -130,15 +137,15 @@ class _Mapping:
         """Rounds of association, matching and optimisation."""
         if self.lanes is not None:
             self._solve_without_features()
-        slack_m = self.parameters.landmarks.revisit_m
+        slack_m = LANDMARK_REVISIT_M
         for turn in range(self.parameters.rounds):
             before = self.xy_m
             self._associate(slack_m)
             solution = self._solve()
-            slack_m = self.parameters.landmarks.drift_m
+            slack_m = LANDMARK_DRIFT_M
             if turn > 0 and self._merge(solution):
                 continue
-            if turn > 0 and before.shape == self.xy_m.shape and self._moved(before) < self.parameters.settled_m:
+            if turn > 0 and before.shape == self.xy_m.shape and self._moved(before) < _SETTLED_M:
                 break
         return self._result(self._solve(polish=True))
 
@@ -160,20 +167,20 @@ class _Mapping:
 
     def _associate(self, slack_m: float) -> None:
         """Measurements to known and new features; those left over may make further new ones."""
-        p, sight, pose = self.parameters.landmarks, self.sight, self.state.pose
-        slack = np.full(len(self.xy_m), p.drift_m)
-        slack[: len(self.known.xy_m)] = slack_m if self.trust_known else p.revisit_m
-        self.owner = assigned(self.m, sight, pose, self.xy_m, self.kind, slack, p)
+        sight, pose = self.sight, self.state.pose
+        slack = np.full(len(self.xy_m), LANDMARK_DRIFT_M)
+        slack[: len(self.known.xy_m)] = slack_m if self.trust_known else LANDMARK_REVISIT_M
+        self.owner = assigned(self.m, sight, pose, self.xy_m, self.kind, slack)
         if self.find_new:
             self._find_new(sight, pose)
         self._drop_ghosts()
 
     def _find_new(self, sight: Sight, pose: F64) -> None:
-        p, left = self.parameters.landmarks, np.flatnonzero(self.owner == NONE)
+        left = np.flatnonzero(self.owner == NONE)
         rest = replace(self.m, **{c: getattr(self.m, c)[left] for c in _COLUMNS})
         where = Sight(sight.key[left], sight.offset[left], sight.way_m[left])
-        found, xy_m = clustered(rest, where, pose, p)
-        new = kept(found, p.min_hits)
+        found, xy_m = clustered(rest, where, pose)
+        new = kept(found, LANDMARK_MIN_HITS)
         _, first = np.unique(found[new >= 0], return_index=True)
         rows = left[new >= 0]
         self.owner[rows] = len(self.xy_m) + new[new >= 0]
@@ -184,7 +191,7 @@ class _Mapping:
         """New features with too few measurements go; known ones stay, seen or not."""
         n_known, n = len(self.known.xy_m), len(self.xy_m)
         hits = np.bincount(self.owner[self.owner >= 0], minlength=n)
-        stays = (hits >= self.parameters.landmarks.min_hits) | (np.arange(n) < n_known)
+        stays = (hits >= LANDMARK_MIN_HITS) | (np.arange(n) < n_known)
         number = np.append(np.where(stays, np.cumsum(stays) - 1, NONE), NONE)
         self.owner = np.where(self.owner >= 0, number[self.owner], NONE)
         self.xy_m, self.kind = self.xy_m[stays], self.kind[stays]
@@ -221,7 +228,7 @@ class _Mapping:
         number[new] = np.arange(len(new))
         owner = number[self.owner]
         at = Places(self.xy_m[new], cov, spread(self.m, self.sight, self.state.pose, owner, len(new)), self.kind[new])
-        same = doubles(self.m, owner, at, self.parameters.landmarks)
+        same = doubles(self.m, owner, at)
         for first, second in same:
             self.owner[self.owner == new[second]] = new[first]
         self._drop_ghosts()

@@ -1,7 +1,7 @@
 """From slices to columns: what lies one above the other, its axis and its diameter, and how well both are known."""
 
 from math import pi
-from typing import NamedTuple
+from typing import Final, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -10,8 +10,24 @@ from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
 from gnd.gnd_map.arrays import F64, I64
-from gnd.vehicle_agent.features.poles.parameters import PoleParameters
 from gnd.vehicle_agent.features.poles.slices import Slices, take
+
+_AXIS_M: Final = 0.25
+"""Slices one above the other lie so near to each other in plan."""
+POLE_LAYERS_APART: Final = 1.6
+"""A pole goes on where the next slice is so many layers of the sensor away …"""
+POLE_GAP_M: Final = 0.6
+"""… or so far above."""
+_WIDER_M: Final = 0.15
+"""Slices that are wider than the thin ones of their pole by this much are a plate or a foot."""
+_MIN_SLICES: Final = 3
+_MIN_POINTS: Final = 4
+_MIN_LENGTH_M: Final = 0.8
+"""Length of the thin part that is visible."""
+_SIGMA_RANGE_M: Final = 0.03
+"""Noise of a range: VLP-16 user manual 63-9243, ±3 cm."""
+_SIGMA_FLOOR_M: Final = 0.015
+"""What more points do not improve: calibration of the lasers, the pose within the sweep."""
 
 FRONT = pi / 4
 """Of the radius: mean distance from the visible half of a cylinder to the plane through its axis, seen from afar."""
@@ -65,37 +81,37 @@ class Columns(NamedTuple):
     hidden: F64
 
 
-def stacked(slices: Slices, layer_tan: float, p: PoleParameters) -> tuple[Slices, I64]:
+def stacked(slices: Slices, layer_tan: float) -> tuple[Slices, I64]:
     """Which slices lie one above the other: those that do, sorted by column, and their column (S,) 0 … C - 1.
 
     Columns that are too short, or of too few slices, are left out, and slices off their column's axis.
     """
-    label = _linked(slices, layer_tan, p)
+    label = _linked(slices, layer_tan)
     for _ in range(2):
-        slices, label = _large(slices, _on_one_axis(slices, label, p), p)
+        slices, label = _large(slices, _on_one_axis(slices, label))
         off = slices.xy_m - _axis_at(slices, label)
-        near = np.flatnonzero((np.hypot(*off.T) <= p.axis_m) & ~_much_wider(slices, label, p))
+        near = np.flatnonzero((np.hypot(*off.T) <= _AXIS_M) & ~_much_wider(slices, label))
         slices, label = take(slices, near), label[near]
-    return _large(slices, label, p)
+    return _large(slices, label)
 
 
-def _linked(slices: Slices, layer_tan: float, p: PoleParameters) -> I64:
+def _linked(slices: Slices, layer_tan: float) -> I64:
     n = len(slices.z_m)
-    if n < p.min_slices:
+    if n < _MIN_SLICES:
         return np.zeros(n, np.int64)
-    a, b = cKDTree(slices.xy_m).query_pairs(p.axis_m, output_type="ndarray").T
-    gap = np.maximum(p.gap_m, p.layers_apart * layer_tan * slices.range_m[a])
+    a, b = cKDTree(slices.xy_m).query_pairs(_AXIS_M, output_type="ndarray").T
+    gap = np.maximum(POLE_GAP_M, POLE_LAYERS_APART * layer_tan * slices.range_m[a])
     close = np.abs(slices.z_m[a] - slices.z_m[b]) <= gap
     return _components(np.column_stack([a[close], b[close]]), n)
 
 
-def _on_one_axis(slices: Slices, label: I64, p: PoleParameters) -> I64:
+def _on_one_axis(slices: Slices, label: I64) -> I64:
     """Labels with columns about one axis joined: a post goes on above its plate."""
     if not len(label):
         return label
     order = np.argsort(label, kind="stable")
     axes = _axes(take(slices, order), label[order])
-    pairs = cKDTree(axes).query_pairs(0.5 * p.axis_m, output_type="ndarray")
+    pairs = cKDTree(axes).query_pairs(0.5 * _AXIS_M, output_type="ndarray")
     return _components(pairs, len(axes))[np.unique(label, return_inverse=True)[1]]
 
 
@@ -104,7 +120,7 @@ def _components(pairs: I64, n: int) -> I64:
     return np.asarray(connected_components(graph, directed=False)[1].astype(np.int64))
 
 
-def _large(slices: Slices, label: I64, p: PoleParameters) -> tuple[Slices, I64]:
+def _large(slices: Slices, label: I64) -> tuple[Slices, I64]:
     """Columns with enough slices over enough height, numbered anew, sorted."""
     if not len(label):
         return slices, label
@@ -114,7 +130,7 @@ def _large(slices: Slices, label: I64, p: PoleParameters) -> tuple[Slices, I64]:
     count = np.diff(at, append=len(label))
     length = np.maximum.reduceat(slices.height_m, at) - np.minimum.reduceat(slices.height_m, at)
     points = np.add.reduceat(slices.points, at)
-    good = (count >= p.min_slices) & (length >= p.min_length_m) & (points >= p.min_points)
+    good = (count >= _MIN_SLICES) & (length >= _MIN_LENGTH_M) & (points >= _MIN_POINTS)
     kept = np.flatnonzero(np.repeat(good, count))
     return take(slices, kept), np.repeat(np.cumsum(good) - 1, count)[kept]
 
@@ -129,11 +145,11 @@ def _axes(slices: Slices, label: I64) -> F64:
     return np.column_stack([_medians(slices.xy_m[:, 0], label), _medians(slices.xy_m[:, 1], label)])
 
 
-def _much_wider(slices: Slices, label: I64, p: PoleParameters) -> NDArray[np.bool_]:
+def _much_wider(slices: Slices, label: I64) -> NDArray[np.bool_]:
     """(S,) whether slices are too wide for the thin ones of their column: small plates, feet."""
     width = slices.extent_m + slices.step_m
     thin = _medians(width, label, THIN_QUANTILE)[label] if len(label) else width
-    return np.asarray(width > thin + p.wider_m + slices.step_m)
+    return np.asarray(width > thin + _WIDER_M + slices.step_m)
 
 
 def _medians(values: F64, label: I64, quantile: float = 0.5) -> F64:
@@ -144,18 +160,18 @@ def _medians(values: F64, label: I64, quantile: float = 0.5) -> F64:
     return np.asarray(by_value[at + (quantile * last).astype(np.int64)])
 
 
-def columns_of(slices: Slices, label: I64, p: PoleParameters) -> Columns:
+def columns_of(slices: Slices, label: I64) -> Columns:
     """Axes and diameters of columns, from slices (S,) sorted by their column (S,) as `stacked` gives them."""
     at = np.flatnonzero(np.diff(label, prepend=-1))
     n = np.diff(at, append=len(label)).astype(np.int64)
     points = np.add.reduceat(slices.points, at) if len(at) else n
-    diameter, sigma_diameter, scans = _diameters(slices, label, p)
+    diameter, sigma_diameter, scans = _diameters(slices, label)
     centre = slices.xy_m + FRONT * 0.5 * diameter[label, None] * slices.toward
     height = _sums(slices.height_m, label, n) / n
     lean = _leans(slices, label, centre, height, n)
     upright = centre - lean[label] * (slices.height_m - height[label])[:, None]
-    xy, cov, toward = _fused(slices, label, upright, len(n), p)
-    spread = _scatter(slices, label, upright - xy[label], n, p)
+    xy, cov, toward = _fused(slices, label, upright, len(n))
+    spread = _scatter(slices, label, upright - xy[label], n)
     cov += (FRONT * 0.5 * sigma_diameter)[:, None, None] ** 2 * toward[:, :, None] * toward[:, None, :]
     cov += (spread**2 / n)[:, None, None] * np.eye(2)
     return Columns(
@@ -171,7 +187,7 @@ def _sums(values: F64, label: I64, n: I64) -> F64:
     return np.asarray(np.bincount(label, values, len(n)), np.float64)
 
 
-def _diameters(slices: Slices, label: I64, p: PoleParameters) -> tuple[F64, F64, I64]:
+def _diameters(slices: Slices, label: I64) -> tuple[F64, F64, I64]:
     """Diameters, their sigmas, and how many scans saw each column.
 
     A width of w is met by w / step rays on average, which span w - step. Rays of all layers of a scan lie at nearly the
@@ -185,7 +201,7 @@ def _diameters(slices: Slices, label: I64, p: PoleParameters) -> tuple[F64, F64,
     step = _medians(slices.step_m, label)
     n = np.bincount(label)
     width = np.maximum(_sums(slices.extent_m + slices.step_m, label, n) / n, SMALLEST_M)
-    sigma = np.maximum(WIDTH_SIGMA * step / np.sqrt(scans), 0.5 * p.sigma_floor_m)
+    sigma = np.maximum(WIDTH_SIGMA * step / np.sqrt(scans), 0.5 * _SIGMA_FLOOR_M)
     return width, sigma, scans
 
 
@@ -198,7 +214,7 @@ def _leans(slices: Slices, label: I64, centre: F64, height: F64, n: I64) -> F64:
     return np.column_stack([_sums(up * (centre[:, k] - middle[label, k]), label, n) / moment for k in range(2)])
 
 
-def _fused(slices: Slices, label: I64, places: F64, count: int, p: PoleParameters) -> tuple[F64, F64, F64]:
+def _fused(slices: Slices, label: I64, places: F64, count: int) -> tuple[F64, F64, F64]:
     """Axes (C, 2), their covariances (C, 2, 2), mean direction from the sensors (C, 2): what each scan says, fused.
 
     A scan knows the axis along its rays by the mean of its ranges, across them by the place between two rays.
@@ -209,8 +225,8 @@ def _fused(slices: Slices, label: I64, places: F64, count: int, p: PoleParameter
     mean = np.column_stack([np.bincount(member, places[:, k], len(group)) / n for k in range(2)])
     toward = np.column_stack([np.bincount(member, slices.toward[:, k], len(group)) / n for k in range(2)])
     own = [np.bincount(member, s, len(group)) / n for s in (slices.sigma_along_m, slices.sigma_across_m)]
-    along = p.sigma_range_m**2 / np.bincount(member, slices.points, len(group)) + p.sigma_floor_m**2 + own[0] ** 2
-    across = (EDGE_SIGMA * np.bincount(member, slices.step_m, len(group)) / n) ** 2 + p.sigma_floor_m**2 + own[1] ** 2
+    along = _SIGMA_RANGE_M**2 / np.bincount(member, slices.points, len(group)) + _SIGMA_FLOOR_M**2 + own[0] ** 2
+    across = (EDGE_SIGMA * np.bincount(member, slices.step_m, len(group)) / n) ** 2 + _SIGMA_FLOOR_M**2 + own[1] ** 2
     uu = toward[:, :, None] * toward[:, None, :]
     information = uu / along[:, None, None] + (np.eye(2) - uu) / across[:, None, None]
     total, weighted, middle = np.zeros((count, 2, 2)), np.zeros((count, 2)), np.zeros((count, 2))
@@ -222,8 +238,8 @@ def _fused(slices: Slices, label: I64, places: F64, count: int, p: PoleParameter
     return (cov @ weighted[:, :, None])[:, :, 0], cov, middle
 
 
-def _scatter(slices: Slices, label: I64, off: F64, n: I64, p: PoleParameters) -> F64:
+def _scatter(slices: Slices, label: I64, off: F64, n: I64) -> F64:
     """(C,) standard deviation of the slices about the axis, less what noise of range and distance of rays make."""
-    made = p.sigma_range_m**2 / slices.points + (EDGE_SIGMA * slices.step_m) ** 2 + p.sigma_floor_m**2
+    made = _SIGMA_RANGE_M**2 / slices.points + (EDGE_SIGMA * slices.step_m) ** 2 + _SIGMA_FLOOR_M**2
     made = made + slices.sigma_along_m**2 + slices.sigma_across_m**2
     return np.sqrt(np.maximum(_sums((off**2).sum(axis=1) - made, label, n) / n, 0.0))

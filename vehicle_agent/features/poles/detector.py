@@ -9,6 +9,7 @@ by π/4 of the radius on average, and the radius follows from the angle that a s
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,12 +17,14 @@ from numpy.typing import NDArray
 from gnd.gnd_map.arrays import F64, I64
 from gnd.schemas.drive import Detections
 from gnd.schemas.limits import MAX_DETECTIONS_OF_LOOK
-from gnd.vehicle_agent.features.poles.columns import Columns, columns_of, stacked
+from gnd.vehicle_agent.features.poles.columns import POLE_GAP_M, POLE_LAYERS_APART, Columns, columns_of, stacked
+from gnd.vehicle_agent.features.poles.errors import PoleInputError
 from gnd.vehicle_agent.features.poles.kinds import Surroundings, bottoms, is_free, kinds_of, look_around, tops
-from gnd.vehicle_agent.features.poles.parameters import PoleInputError, PoleParameters
 from gnd.vehicle_agent.features.poles.place_kernels import rays_below
 from gnd.vehicle_agent.features.poles.slices import (
     EXACT,
+    POLE_DIAMETER_MAX_M,
+    POLE_RANGE_MAX_M,
     GroundHeights,
     PoseSigma,
     Seen,
@@ -30,6 +33,25 @@ from gnd.vehicle_agent.features.poles.slices import (
     joined,
     slices_of,
 )
+
+_MIN_TOP_M: Final = 1.9
+"""Height over the ground that it reaches."""
+_LEAN_MAX: Final = 0.12
+"""Horizontal metres a metre upwards."""
+_SCATTER_MAX_M: Final = 0.08
+"""Standard deviation of the slices about the axis, beside what the sensor's noise and its rays' distance make."""
+_HIDDEN_SHARE_MAX: Final = 0.65
+"""Share of its slices beside which something nearer stands: all of them are beside an edge, not on a thin thing."""
+_SEEN_SHARE_MIN: Final = 0.4
+"""Share of the sensor's layers between bottom and top that meet it."""
+_FOOT_M: Final = 0.5
+"""A pole begins no higher over the ground, but for the next lower layer, unless its foot is hidden."""
+_BODY_DIAMETER_M: Final = 0.3
+"""What is thicker than this …"""
+_BODY_TOP_M: Final = 2.2
+"""… and lower than this is somebody who stands there."""
+_SIGMA_TILT_RAD: Final = 0.02
+"""Of a vehicle that does not know how it and the road are tilted: of single looks in its own frame."""
 
 Mask = NDArray[np.bool_]
 
@@ -88,9 +110,6 @@ class Rays:
 class PoleDetector:
     """Finds poles in single scans, or in some scans together; keeps nothing between calls."""
 
-    def __init__(self, parameters: PoleParameters | None = None) -> None:
-        self.parameters = parameters or PoleParameters()
-
     def look(self, points_vehicle_m: F64, origins_vehicle_m: F64, t_ns: int = 0) -> Detections:
         """What one scan shows, as a look of the layer "poles".
 
@@ -111,7 +130,7 @@ class PoleDetector:
         height at which the axis is seen.
         """
         found = self.window([Rays(points_vehicle_m, origins_vehicle_m)], np.zeros(3))
-        tilt = self.parameters.sigma_tilt_rad
+        tilt = _SIGMA_TILT_RAD
         return tuple(replace(pole, cov_m2=pole.cov_m2 + (tilt * pole.middle_m) ** 2 * np.eye(2)) for pole in found)
 
     def window(self, scans: Sequence[Rays], place_m: F64) -> tuple[Pole, ...]:
@@ -127,7 +146,7 @@ class PoleDetector:
         Raises:
             PoleInputError: other shapes, or a place that is not finite.
         """
-        p, place = self.parameters, np.asarray(place_m, np.float64)
+        place = np.asarray(place_m, np.float64)
         if place.shape != (3,) or not np.isfinite(place).all():
             raise PoleInputError(f"the vehicle's place must be 3 finite numbers, got {place_m!r}")
         rays = [check_rays(scan.points_m, scan.origins_m) for scan in scans]
@@ -135,13 +154,13 @@ class PoleDetector:
         near = [(points - place, origins - place) for points, origins in rays]
         if not sum(len(points) for points, _ in near):
             return ()
-        ground = ground_around(_together([points for points, _ in near]), np.zeros(3), p)
+        ground = ground_around(_together([points for points, _ in near]), np.zeros(3))
         sigmas = [scan.sigma for scan in scans]
-        seen = [slices_of(*one, ground, p, k, sigma) for k, (one, sigma) in enumerate(zip(near, sigmas, strict=True))]
+        seen = [slices_of(*one, ground, k, sigma) for k, (one, sigma) in enumerate(zip(near, sigmas, strict=True))]
         layer_tan = float(np.median([one.layer_tan for one in seen]))
-        slices, label = stacked(joined([one.slices for one in seen]), layer_tan, p)
-        columns = columns_of(slices, label, p)
-        return _judged(columns, seen, near, ground, layer_tan, p, place)
+        slices, label = stacked(joined([one.slices for one in seen]), layer_tan)
+        columns = columns_of(slices, label)
+        return _judged(columns, seen, near, ground, layer_tan, place)
 
 
 def detections_of(poles: Sequence[Pole], T_map_vehicle: F64, t_ns: int) -> Detections:
@@ -173,38 +192,34 @@ def detections_of(poles: Sequence[Pole], T_map_vehicle: F64, t_ns: int) -> Detec
 
 def _judged(
     columns: Columns, seen: list[Seen], rays: list[tuple[F64, F64]], ground: GroundHeights, layer_tan: float,
-    p: PoleParameters, place: F64,
+    place: F64,
 ) -> tuple[Pole, ...]:  # fmt: skip
     """The columns that are poles."""
-    columns = _take(columns, np.flatnonzero(_straight(columns, layer_tan, p)))
+    columns = _take(columns, np.flatnonzero(_straight(columns, layer_tan)))
     points, height = _together([one.points_m for one in seen]), np.concatenate([one.height_m for one in seen])
     near = look_around(columns, points, height, ground)
-    gap = np.maximum(p.gap_m, p.layers_apart * layer_tan * columns.range_m)
+    gap = np.maximum(POLE_GAP_M, POLE_LAYERS_APART * layer_tan * columns.range_m)
     top, bottom, foot = tops(columns, near, gap), bottoms(columns, near, gap), ground.at(columns.xy_m)
-    good = is_free(columns, near, p) & (top >= p.min_top_m)
-    good &= ~((columns.diameter_m > p.body_diameter_m) & (top < p.body_top_m))
-    good &= np.hypot(*columns.xy_m.T) <= p.range_max_m
-    good[good] = _stands(_take(columns, np.flatnonzero(good)), bottom[good], foot[good], gap[good], rays, p)
+    good = is_free(columns, near) & (top >= _MIN_TOP_M)
+    good &= ~((columns.diameter_m > _BODY_DIAMETER_M) & (top < _BODY_TOP_M))
+    good &= np.hypot(*columns.xy_m.T) <= POLE_RANGE_MAX_M
+    good[good] = _stands(_take(columns, np.flatnonzero(good)), bottom[good], foot[good], gap[good], rays)
     kept = np.flatnonzero(good)
     kept = kept[np.argsort(np.hypot(*columns.xy_m[kept].T), kind="stable")]
-    return _values(
-        _take(columns, kept), Surroundings._make(part[kept] for part in near), top[kept], foot[kept], place, p
-    )
+    return _values(_take(columns, kept), Surroundings._make(part[kept] for part in near), top[kept], foot[kept], place)
 
 
-def _straight(columns: Columns, layer_tan: float, p: PoleParameters) -> Mask:
+def _straight(columns: Columns, layer_tan: float) -> Mask:
     """Whether columns (C,) are straight, upright, met by enough of the layers between their ends, and no edge."""
     expected = (columns.top_m - columns.bottom_m) / np.maximum(layer_tan * columns.range_m, 1e-3) + 1.0
-    met = columns.slices / np.maximum(columns.scans, 1) >= p.seen_share_min * expected
-    met &= (columns.diameter_m <= p.diameter_max_m) & (columns.hidden <= p.hidden_share_max)
-    return np.asarray(met & (np.hypot(*columns.lean.T) <= p.lean_max) & (columns.scatter_m <= p.scatter_max_m))
+    met = columns.slices / np.maximum(columns.scans, 1) >= _SEEN_SHARE_MIN * expected
+    met &= (columns.diameter_m <= POLE_DIAMETER_MAX_M) & (columns.hidden <= _HIDDEN_SHARE_MAX)
+    return np.asarray(met & (np.hypot(*columns.lean.T) <= _LEAN_MAX) & (columns.scatter_m <= _SCATTER_MAX_M))
 
 
-def _stands(
-    columns: Columns, bottom_m: F64, foot_z: F64, gap_m: F64, rays: list[tuple[F64, F64]], p: PoleParameters
-) -> Mask:
+def _stands(columns: Columns, bottom_m: F64, foot_z: F64, gap_m: F64, rays: list[tuple[F64, F64]]) -> Mask:
     """Whether columns (C,) begin near the ground, or what is below them is hidden rather than free."""
-    stands = bottom_m <= p.foot_m + gap_m - p.gap_m
+    stands = bottom_m <= _FOOT_M + gap_m - POLE_GAP_M
     high = np.flatnonzero(~stands)
     places = np.column_stack([columns.xy_m, foot_z, foot_z + bottom_m])[high]
     below = np.sum([rays_below(points, origins, places, RAY_HALF_M) for points, origins in rays], axis=0)
@@ -212,10 +227,8 @@ def _stands(
     return np.asarray(stands)
 
 
-def _values(
-    columns: Columns, near: Surroundings, top: F64, foot: F64, place: F64, p: PoleParameters
-) -> tuple[Pole, ...]:
-    kinds = kinds_of(columns, near, top, p)
+def _values(columns: Columns, near: Surroundings, top: F64, foot: F64, place: F64) -> tuple[Pole, ...]:
+    kinds = kinds_of(columns, near, top)
     return tuple(
         Pole(
             columns.xy_m[k] + place[:2],

@@ -7,9 +7,15 @@ from numpy.typing import NDArray
 
 from gnd.gnd_map.arrays import F64, I64
 from gnd.vehicle_agent.features.poles.columns import Columns
-from gnd.vehicle_agent.features.poles.parameters import PoleParameters
 from gnd.vehicle_agent.features.poles.place_kernels import around, by_cell
 from gnd.vehicle_agent.features.poles.slices import GroundHeights
+
+_RING_SHARE_MAX: Final = 0.5
+"""Share of the heights of a pole's thin part at which something stands in the ring around it …"""
+_FREE_M: Final = 0.75
+"""… and length of a part of it at which nothing does."""
+_STREETLIGHT_M: Final = 5.0
+"""Lower posts are no streetlights."""
 
 Mask = NDArray[np.bool_]
 
@@ -60,7 +66,7 @@ def look_around(columns: Columns, points_m: F64, height_m: F64, ground: GroundHe
     return Surroundings(*around(points_m, height_m, *cells, ground.cells, axes, belts, BIN_M, BINS))
 
 
-def is_free(columns: Columns, seen: Surroundings, p: PoleParameters) -> Mask:
+def is_free(columns: Columns, seen: Surroundings) -> Mask:
     """(C,) whether nothing stands in the ring around the thin part at most of its heights, and over one length."""
     core = _within(columns.bottom_m, columns.top_m) & (seen.counts[:, :, CORE] > 0)
     ring = core & (seen.counts[:, :, RING] > 0)
@@ -71,7 +77,7 @@ def is_free(columns: Columns, seen: Surroundings, p: PoleParameters) -> Mask:
         run = np.where(ring[:, b], 0.0, np.where(free, b + 1.0 - first, run))
         longest = np.maximum(longest, run)
     share = ring.sum(axis=1) / np.maximum(core.sum(axis=1), 1)
-    return np.asarray((share <= p.ring_share_max) & (longest * BIN_M >= p.free_m))
+    return np.asarray((share <= _RING_SHARE_MAX) & (longest * BIN_M >= _FREE_M))
 
 
 def _within(low_m: F64, high_m: F64) -> Mask:
@@ -105,7 +111,7 @@ def bottoms(columns: Columns, seen: Surroundings, gap_m: F64) -> F64:
     return bottom
 
 
-def kinds_of(columns: Columns, seen: Surroundings, top_m: F64, p: PoleParameters) -> tuple[str, ...]:
+def kinds_of(columns: Columns, seen: Surroundings, top_m: F64) -> tuple[str, ...]:
     """The kind of each column: "trunk", "traffic_sign", "streetlight" or "pole".
 
     Args:
@@ -123,7 +129,7 @@ def kinds_of(columns: Columns, seen: Surroundings, top_m: F64, p: PoleParameters
     plate = (points >= PLATE_POINTS) & (across <= PLATE_THICK_M) & (along >= PLATE_WIDE_M) & (high <= PLATE_HIGH_M)
     over = _within(np.maximum(columns.top_m, LOWEST_CROWN_M), columns.top_m + CROWN_HIGH_M)
     leaves = (seen.counts[:, :, FAR] * over).sum(axis=1) >= CROWN_POINTS
-    tall = (top_m >= p.streetlight_m) & (columns.top_m >= MAST_SHARE * p.streetlight_m)
+    tall = (top_m >= _STREETLIGHT_M) & (columns.top_m >= MAST_SHARE * _STREETLIGHT_M)
     mast = tall & (_beside_it(columns, seen, full) | (~crown & (full.sum(axis=1) * BIN_M <= HEAD_M)))
     kinds = ["streetlight", "trunk", "traffic_sign", "trunk"]
     return tuple(np.select([mast, crown | tall, plate, leaves], kinds, "pole").tolist())

@@ -2,12 +2,13 @@
 
 from dataclasses import dataclass
 from math import ceil, radians, tan
-from typing import NamedTuple
+from typing import Final, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from gnd.gnd_map.arrays import F64, I64
+from gnd.vehicle_agent.features.poles.errors import PoleInputError
 from gnd.vehicle_agent.features.poles.kernels import (
     Beside,
     Rows,
@@ -17,8 +18,27 @@ from gnd.vehicle_agent.features.poles.kernels import (
     row_order,
     thin_slices,
 )
-from gnd.vehicle_agent.features.poles.parameters import PoleInputError, PoleParameters
 from gnd.vehicle_agent.features.poles.place_kernels import Ground, cone_heights, heights_over, lowest_heights
+
+_RANGE_MIN_M: Final = 2.0
+"""Nearer points are the vehicle itself."""
+POLE_RANGE_MAX_M: Final = 40.0
+"""Farther points are left out: a ring hits a post once or not at all there."""
+_GROUND_CELL_M: Final = 1.0
+_GROUND_SLOPE: Final = 0.12
+"""The ground rises no steeper than this."""
+_FEET_M: Final = 0.25
+"""What lies lower over the ground is the ground."""
+_ROW_DEG: Final = 0.4
+"""Rays whose elevations differ by less are neighbours of a row; rows are even in the tangent of the elevation."""
+_LINK_M: Final = 0.25
+"""Neighbours of a row whose ranges differ by less lie on one thing."""
+POLE_DIAMETER_MAX_M: Final = 0.55
+"""Beams have a width: 0.5 m of a trunk measure this."""
+_CLEAR_M: Final = 0.35
+"""So far beside a pole nothing stands at its range, on at least one side …"""
+_JUMP_M: Final = 0.4
+"""… nor behind it by less than this."""
 
 U8 = NDArray[np.uint8]
 
@@ -140,7 +160,7 @@ def check_rays(points_m: F64, origins_m: F64) -> tuple[F64, F64]:
     return points, origins
 
 
-def ground_around(points_m: F64, centre_m: F64, p: PoleParameters) -> GroundHeights:
+def ground_around(points_m: F64, centre_m: F64) -> GroundHeights:
     """The ground around a place on the road: no higher than what is seen, no steeper than it may be.
 
     Args:
@@ -148,17 +168,17 @@ def ground_around(points_m: F64, centre_m: F64, p: PoleParameters) -> GroundHeig
         centre_m: (3,) the vehicle's origin: the road lies there.
         p: parameters.
     """
-    half = ceil((p.range_max_m + 3.0) / p.ground_cell_m)
-    side = half * p.ground_cell_m
-    cells = Ground(float(centre_m[0]) - side, float(centre_m[1]) - side, p.ground_cell_m, 2 * half)
-    low = lowest_heights(points_m, cells, float(centre_m[2]), p.ground_slope, PIT_M)
+    half = ceil((POLE_RANGE_MAX_M + 3.0) / _GROUND_CELL_M)
+    side = half * _GROUND_CELL_M
+    cells = Ground(float(centre_m[0]) - side, float(centre_m[1]) - side, _GROUND_CELL_M, 2 * half)
+    low = lowest_heights(points_m, cells, float(centre_m[2]), _GROUND_SLOPE, PIT_M)
     low[half - 1 : half + 1, half - 1 : half + 1] = centre_m[2]
-    z = cone_heights(low, p.ground_slope * p.ground_cell_m)
+    z = cone_heights(low, _GROUND_SLOPE * _GROUND_CELL_M)
     return GroundHeights(cells, z, np.where(low <= z, low, np.inf))
 
 
 def slices_of(
-    points_m: F64, origins_m: F64, ground: GroundHeights, p: PoleParameters, number: int = 0,
+    points_m: F64, origins_m: F64, ground: GroundHeights, number: int = 0,
     pose: PoseSigma = EXACT,
 ) -> Seen:  # fmt: skip
     """The slices of one scan.
@@ -171,20 +191,18 @@ def slices_of(
         number: of the scan in its window.
         pose: how well the scan's own place is known.
     """
-    kept, polar = polar_of(points_m, origins_m, p.range_min_m, p.range_max_m)
+    kept, polar = polar_of(points_m, origins_m, _RANGE_MIN_M, POLE_RANGE_MAX_M)
     points = points_m[kept]
     height = ground.under(points)
-    step_tan = tan(radians(p.row_deg))
+    step_tan = tan(radians(_ROW_DEG))
     rows = Rows(-TAN_MAX, step_tan, ceil(2 * TAN_MAX / step_tan), COLUMNS)
     layer_tan = _layer_gap(layer_gaps(polar, rows)) * step_tan
-    high = np.flatnonzero((height > p.feet_m) & (height < np.inf))
+    high = np.flatnonzero((height > _FEET_M) & (height < np.inf))
     everything, points, height, polar = polar, points[high], height[high], polar[high]
     order, start = row_order(polar, rows)
-    step = azimuth_step(polar, order, start, p.link_m) or azimuth_step(
-        everything, *row_order(everything, rows), p.link_m
-    )
+    step = azimuth_step(polar, order, start, _LINK_M) or azimuth_step(everything, *row_order(everything, rows), _LINK_M)
     step = max(step, MIN_STEP_RAD)
-    found = thin_slices(polar, order, start, step, Beside(p.link_m, p.diameter_max_m, p.clear_m, p.jump_m))
+    found = thin_slices(polar, order, start, step, Beside(_LINK_M, POLE_DIAMETER_MAX_M, _CLEAR_M, _JUMP_M))
     origins = origins_m if len(origins_m) == 1 else origins_m[kept[high]]
     slices = _described(*found, points, height, polar, origins, step, number)
     if pose != EXACT:

@@ -17,9 +17,11 @@ from gnd.gnd_map.tile_id import TileId
 from gnd.schemas.drive import Detections, DriveItem, GnssFix, MotionSample, ReferencePose
 from gnd.vehicle_agent.config import PipelineParameters
 from gnd.vehicle_agent.errors import AgentConfigError
+from gnd.vehicle_agent.features.coverage import CoverageParameters
 from gnd.vehicle_agent.features.errors import BadPose
 from gnd.vehicle_agent.features.feature_report import FeatureReporter
 from gnd.vehicle_agent.features.layer import FeatureLayer
+from gnd.vehicle_agent.features.layer_parameters import MARGIN_M
 from gnd.vehicle_agent.features.layers import look_of
 from gnd.vehicle_agent.features.look import MAX_RANGE_M, MapFeatures
 from gnd.vehicle_agent.features.slamcu.first_pose import AFTER_S, first_pose_of
@@ -179,7 +181,7 @@ class CameraPipeline:
         layer = self._layer_parameters
         parameters = SlamcuParameters(detection_confidence=layer.detection_confidence)
         self.slamcu = WatchedSlamcu(parameters, MapFeatures.none(), first.pose, first.cov, self._seed, sigma_m)
-        self._layer = FeatureLayer(layer, self._parameters.features.coverage, self.place.frame, self.slamcu)
+        self._layer = FeatureLayer(layer, CoverageParameters(), self.place.frame, self.slamcu)
         self._motion_ns = first.t_ns
         self._before.clear()
 
@@ -229,7 +231,7 @@ class CameraPipeline:
         here = [one.pose for one in slamcu.path[max(until - 1, 0) :: EVERY_LOOK]]
         if poses and here:
             slamcu.claim()
-            reach_m = self._layer_parameters.range_m + self._parameters.features.margin_m
+            reach_m = self._layer_parameters.range_m + MARGIN_M
             points = np.array([(x, y, 0.0) for x, y, _ in here])
             for change in layer.leave(points, reach_m):
                 self._reporter.add(change, self._looks[until - 1].t_ns, self.place.odometer_m)

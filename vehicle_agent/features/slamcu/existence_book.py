@@ -13,6 +13,9 @@ from gnd.gnd_map.arrays import F64
 from gnd.gnd_map.features import VACUOUS, Existence, combine, hit, miss, prior
 from gnd.vehicle_agent.features.slamcu.parameters import SlamcuParameters
 
+_MIN_HITS: Final = 3
+"""A new feature exists for others once it was measured so often: two false alarms at one place happen."""
+
 HISTORY: Final = 1024
 """So many steps of a feature's masses are kept."""
 DOUBT: Final = 1e-15
@@ -136,7 +139,7 @@ class ExistenceBook:
         if entry.known:
             known = {"exist": FeatureClass.NORMAL, "absent": FeatureClass.DELETED}
             return known.get(state, FeatureClass.UNCLASSIFIED)
-        enough = entry.hits >= self._p.min_hits
+        enough = entry.hits >= _MIN_HITS
         return FeatureClass.NEW if state == "exist" and enough else FeatureClass.UNCLASSIFIED
 
     def usable(self, entry: Entry) -> bool:

@@ -67,8 +67,6 @@ class FilterParameters:
     alarm in fifty looks over 80 m x 40°. It keeps a wrong association from deciding about the particles."""
     horizon_m: float = 2000.0
     """A new feature left behind by this way no longer learns from what comes."""
-    horizon_features: int = 32
-    """At most this many features are kept in the particles; the oldest go first."""
 
     def __post_init__(self) -> None:
         _check("filter.particles", self.particles, 1, 100_000)
@@ -76,7 +74,6 @@ class FilterParameters:
         _check("filter.jitter", self.jitter, 0.0, 0.9)
         _check("filter.floor", self.floor, 0.0, 1.0)
         _check("filter.horizon_m", self.horizon_m, 0.0, 1e6)
-        _check("filter.horizon_features", self.horizon_features, 1, 4096)
 
 
 @dataclass(frozen=True, slots=True)
@@ -87,29 +84,8 @@ class SlamcuParameters:
     """λ of Eq. (1) and (2)."""
     map_confidence: float = 0.95
     """λ_HD of Eq. (3)."""
-    min_hits: int = 3
-    """A new feature exists for others once it was measured so often: two false alarms at one place happen."""
-    gate: float = 13.8
-    """Largest squared Mahalanobis distance of an association: χ² of 2 degrees of freedom, 99.9 %."""
-    new_density: float = 1e-3
-    """Density, 1/(m·rad), of measurements of features not yet known, or false: what an association must beat."""
-    edge_sigmas: float = 2.0
-    """Nearer to the border of the view, or of what hides it, than this many sigmas: no evidence of absence."""
-    edge_m: float = 1.0
-    """The same, in range, at least."""
-    edge_rad: float = radians(1.0)
-    """The same, in bearing, at least."""
     map_sigma_m: float = 0.05
     """Error of each axis of a map feature's position on top of the covariance that the map gives it."""
-    moved_gate: float = 14.0
-    """A map feature measured this far off (squared Mahalanobis) has moved: deleted here, new there. χ² of 2 degrees of
-    freedom, 99.9 %."""
-    moved_m: float = 2.0
-    """And at least this far: less than a lane, more than a pose that is surer than it should be errs by."""
-    settle_s: float = 0.5
-    """A feature of the map is compared with its map position when it was out of view for this time."""
-    settle_hits: int = 60
-    """Or when it was measured so often: at a red light nothing leaves the view."""
     motion: MotionNoise = field(default_factory=MotionNoise)
     gnss: GnssNoise = field(default_factory=GnssNoise)
     filter: FilterParameters = field(default_factory=FilterParameters)
@@ -117,12 +93,7 @@ class SlamcuParameters:
     def __post_init__(self) -> None:
         _check("detection_confidence", self.detection_confidence, 1e-3, 0.999)
         _check("map_confidence", self.map_confidence, 0.0, 0.999)
-        for name in ("min_hits", "settle_hits"):
-            _check(name, getattr(self, name), 1, 1_000_000)
-        for name in ("gate", "new_density", "moved_gate"):
-            _check(name, getattr(self, name), 1e-12, 1e6)
-        for name in ("edge_sigmas", "edge_m", "edge_rad", "map_sigma_m", "moved_m", "settle_s"):
-            _check(name, getattr(self, name), 0.0, 1e3)
+        _check("map_sigma_m", self.map_sigma_m, 0.0, 1e3)
 
 
 def _check(name: str, value: float, low: float, high: float) -> None:

@@ -7,7 +7,7 @@ existence, those measured gain it (4.3.2); what is new is registered; what exist
 from collections.abc import Collection
 from copy import deepcopy
 from dataclasses import dataclass
-from math import isfinite
+from math import isfinite, radians
 from typing import Final
 
 import numpy as np
@@ -26,6 +26,17 @@ from gnd.vehicle_agent.features.slamcu.tidying import Innovation, Tidying
 from gnd.vehicle_agent.features.slamcu.tracked import Tracked
 from gnd.vehicle_agent.features.slamcu.verdicts import KnownState, NewFeature
 from gnd.vehicle_agent.features.view import Occlusion, SensorView, wrapped
+
+_GATE: Final = 13.8
+"""Largest squared Mahalanobis distance of an association: χ² of 2 degrees of freedom, 99.9 %."""
+_NEW_DENSITY: Final = 0.001
+"""Density, 1/(m·rad), of measurements of features not yet known, or false: what an association must beat."""
+_EDGE_SIGMAS: Final = 2.0
+"""Nearer to the border of the view, or of what hides it, than this many sigmas: no evidence of absence."""
+_EDGE_M: Final = 1.0
+"""The same, in range, at least."""
+_EDGE_RAD: Final = radians(1.0)
+"""The same, in bearing, at least."""
 
 NEAR_M: Final = 30.0
 """Features so much farther than the view's range cannot be what was measured."""
@@ -292,9 +303,9 @@ class Slamcu:
         same = np.array([[kind == entry.kind for entry in near] for kind in look.kinds], bool).reshape(
             len(look), len(near)
         )
-        cost = pair_costs(innovation, ahead.cov[None] + noise, same, self._p.gate)
+        cost = pair_costs(innovation, ahead.cov[None] + noise, same, _GATE)
         plausible = np.array([max(entry.masses[0] + entry.masses[2], LEAST_PLAUSIBLE) for entry in near])
-        return associate(cost - np.log(plausible), -np.log(self._p.new_density))
+        return associate(cost - np.log(plausible), -np.log(_NEW_DENSITY))
 
     def _missed(
         self, near: list[Entry], ahead: Forecast, measured: I64, view: SensorView, occlusion: Occlusion | None
@@ -302,8 +313,8 @@ class Slamcu:
         """Features well in view that nothing hides and that were not measured: they get Eq. (2)."""
         if not near:
             return []
-        sigma = self._p.edge_sigmas * ahead.sigma
-        edge_m, edge_rad = np.maximum(sigma[:, 0], self._p.edge_m), np.maximum(sigma[:, 1], self._p.edge_rad)
+        sigma = _EDGE_SIGMAS * ahead.sigma
+        edge_m, edge_rad = np.maximum(sigma[:, 0], _EDGE_M), np.maximum(sigma[:, 1], _EDGE_RAD)
         in_view = view.inside(ahead.z[:, 0], ahead.z[:, 1])
         for i in np.flatnonzero(in_view):
             near[i].in_view_s = self.now_s

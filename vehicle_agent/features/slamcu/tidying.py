@@ -14,6 +14,18 @@ from gnd.vehicle_agent.features.slamcu.parameters import SlamcuParameters
 from gnd.vehicle_agent.features.slamcu.rbpf import Rbpf
 from gnd.vehicle_agent.features.slamcu.tracked import Tracked
 
+_MOVED_GATE: Final = 14.0
+"""A map feature measured this far off (squared Mahalanobis) has moved: deleted here, new there. χ² of 2 degrees of
+freedom, 99.9 %."""
+_MOVED_M: Final = 2.0
+"""And at least this far: less than a lane, more than a pose that is surer than it should be errs by."""
+_SETTLE_S: Final = 0.5
+"""A feature of the map is compared with its map position when it was out of view for this time."""
+_SETTLE_HITS: Final = 60
+"""Or when it was measured so often: at a red light nothing leaves the view."""
+_HORIZON_FEATURES: Final = 32
+"""At most this many features are kept in the particles; the oldest go first."""
+
 SAME_GATE: Final = 9.0
 """Two features within this squared Mahalanobis distance may be one."""
 SAME_M: Final = 4.0
@@ -93,11 +105,11 @@ class Tidying:
         for entry in list(self._tracked.live):
             if entry.slot is None:
                 continue
-            out_of_view = now_s - entry.in_view_s > self._p.settle_s
+            out_of_view = now_s - entry.in_view_s > _SETTLE_S
             if self._rbpf.priors[entry.slot] is not None:
                 if not self._rbpf.provisional[entry.slot] and now_s - self._asked_s < ASK_EVERY_S:
                     continue
-                if out_of_view or entry.pass_hits >= self._p.settle_hits:
+                if out_of_view or entry.pass_hits >= _SETTLE_HITS:
                     self._settle(entry, t_ns)
             elif out_of_view:
                 self._leave(entry, odometer_m)
@@ -217,8 +229,8 @@ class Tidying:
             self._book.recount(each, hits + each.pass_hits, misses + each.pass_misses, t_ns)
 
     def _moved(self, entry: Entry, xy_m: F64, cov: F64) -> bool:
-        far = float(np.hypot(*(xy_m - entry.xy_m))) > self._p.moved_m
-        return far and innovation_of(entry, xy_m, cov).squared > self._p.moved_gate
+        far = float(np.hypot(*(xy_m - entry.xy_m))) > _MOVED_M
+        return far and innovation_of(entry, xy_m, cov).squared > _MOVED_GATE
 
     def _split(self, entry: Entry, t_ns: int) -> None:
         """A moved feature is a deleted one and a new one (section 2.3)."""
@@ -248,7 +260,7 @@ class Tidying:
         self._tracked.leave(entry)
 
     def _leave_oldest(self) -> None:
-        while len(self._tracked.live) > self._p.filter.horizon_features:
+        while len(self._tracked.live) > _HORIZON_FEATURES:
             oldest = min(self._tracked.live, key=lambda entry: entry.in_view_s)
             if oldest.known:
                 self._tracked.leave(oldest)

@@ -1,0 +1,54 @@
+"""`gnd config`: show and check settings without running anything."""
+
+from pathlib import Path
+from typing import Any
+
+import click
+
+from gnd.deploy.configuration_page import programs
+from gnd.deploy.errors import DeployError
+from gnd.gnd_map.settings import described, settings_text
+
+_PROGRAM = click.argument("program", type=click.Choice(["agent", "fleet", "merger", "store"]))
+
+
+@click.group()
+def config() -> None:
+    """Settings of the programs; docs/configuration.md has them all."""
+
+
+@config.command(short_help="Name, default, unit, range and effect of settings.")
+@_PROGRAM
+@click.argument("part", default="")
+def show(program: str, part: str) -> None:
+    """The settings of PROGRAM whose names hold PART."""
+    rows = [row for row in described(programs()[program][0]) if part in row.path]
+    if not rows:
+        raise DeployError(f"no setting of gnd {program} holds {part!r}")
+    for row in rows:
+        told = row.setting
+        unit = f" {told.unit}" if told.unit else ""
+        click.echo(
+            f"{row.path} = {row.default or '(must be given)'}{unit}  [{told.range or row.kind}]\n    {told.effect}"
+        )
+
+
+@config.command(short_help="Whether a file of settings can be used.")
+@_PROGRAM
+@click.argument("file", type=click.Path(path_type=Path))
+def check(program: str, file: Path) -> None:
+    """Look at FILE as `gnd PROGRAM --config FILE` would, and print the settings that come of it."""
+    click.echo(settings_text(_loaded(program, file)), nl=False)
+
+
+def _loaded(program: str, file: Path) -> Any:
+    from gnd.deploy.fleet_config import load_fleet_config
+    from gnd.fleet_bus.settings_file import load_settings, read_toml
+    from gnd.vehicle_agent.settings import agent_of
+
+    if program == "fleet":
+        return load_fleet_config(file, {})
+    if program == "agent":
+        return agent_of({"drive": "drive.mcap"} | read_toml(file), where=str(file))
+    needed = {"path": "map.sqlite"} if program == "store" and "path" not in read_toml(file) else {}
+    return load_settings(programs()[program][0], program, file, (), needed, {})

@@ -1,0 +1,104 @@
+"""`python -m gnd.deploy.configuration_page`: docs/configuration.md from the code; --check says whether it is so."""
+
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any, Final
+
+import click
+
+from gnd.gnd_map.settings import Described, described
+
+PAGE: Final = Path("docs/configuration.md")
+_HEAD: Final = """\
+# Configuration
+
+Made from the code: `python -m gnd.deploy.configuration_page`.
+
+Four programs take settings: `gnd agent`, `gnd fleet` (and `gnd lab`), `gnd merger` and `gnd store`. Each has the same
+three options:
+
+| option | what it does |
+|---|---|
+| `--config FILE` | takes settings from a TOML file |
+| `--set NAME=VALUE` | replaces one setting, such as `report.longest_s=30`; values as in JSON; repeatable |
+| `--dump-config` | prints the effective settings, exactly as `--config` takes them, and ends |
+
+Where a setting is said more than once, the later one wins:
+
+1. the defaults of this page,
+2. the file,
+3. the environment: `GND_AGENT__REPORT__LONGEST_S=30` is `report.longest_s` of the agent (`GND_`, the program, the
+   name in capitals; two underscores for each dot),
+4. `--set`,
+5. the program's own options, such as `--link 4g`.
+
+A name that no setting has is an error that names near ones; a value outside its range is an error with value and
+range. `gnd config check PROGRAM FILE` looks at a file and runs nothing. The effective settings are written beside every
+result: `settings.toml` in the folder of an agent and of a fleet run, and their SHA-256 as `settings_sha256` in
+`result.json` and `summary.json`. A file of the fleet holds those of its agents and shards in the tables `[agent]` and
+`[merger]` (in the environment: `GND_FLEET__AGENT__REPORT__LONGEST_S`; its agents do not read `GND_AGENT__...`):
+
+```toml
+agents = 4
+
+[agent.report]
+longest_s = 30.0
+
+[merger]
+poll_s = 0.5
+```
+
+The studies' `--set` (`gnd reproduce simulation --set detect.new_cells=35`) has the same names; those of the merge begin
+with `merge.`. What nobody turns is no setting but a constant beside its use.
+"""
+
+
+def programs() -> dict[str, tuple[type[Any], str]]:
+    """The programs that take settings: the class of the settings, and what the program does."""
+    from gnd.cloud_merger.config import ShardConfig
+    from gnd.deploy.fleet_config import FleetConfig
+    from gnd.tile_store.cli import TileServerConfig
+    from gnd.vehicle_agent.config import AgentConfig
+
+    return {
+        "agent": (AgentConfig, "one vehicle"),
+        "fleet": (FleetConfig, "a whole fleet on one machine"),
+        "merger": (ShardConfig, "one merger shard"),
+        "store": (TileServerConfig, "the tile server"),
+    }
+
+
+def page() -> str:
+    """The page as Markdown."""
+    parts = [_HEAD]
+    for name, (cls, what) in programs().items():
+        rows = list(described(cls))
+        parts.append(f"## gnd {name}\n\nSettings of {what}: {len(rows)}.\n\n" + "".join(_table(rows)))
+    return "\n".join(parts)
+
+
+def _table(rows: list[Described]) -> Iterator[str]:
+    yield "| name | default | unit | range | effect |\n|---|---|---|---|---|\n"
+    for row in rows:
+        told = row.setting
+        default = f"`{row.default}`" if row.default else ""
+        cells = (f"`{row.path}`", default, told.unit, told.range or row.kind, told.effect)
+        yield "| " + " | ".join(cell.replace("|", "\\|") for cell in cells) + " |\n"
+
+
+@click.command()
+@click.option("--check", is_flag=True, help="Write nothing; end with 1 where the page is not what the code says.")
+@click.option("--out", type=click.Path(path_type=Path), default=PAGE, show_default=True, help="The page.")
+def main(check: bool, out: Path) -> None:
+    """Write the page of settings from the code."""
+    text = page()
+    if not check:
+        out.write_text(text, encoding="utf-8")
+    elif not out.exists() or out.read_text(encoding="utf-8") != text:
+        click.echo(f"{out} is not what the code says: run python -m gnd.deploy.configuration_page", err=True)
+        sys.exit(1)
+
+
+if __name__ == "__main__":
+    main()

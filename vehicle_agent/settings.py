@@ -1,0 +1,63 @@
+"""The settings of an agent from file, environment, --set and options."""
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from gnd.fleet_bus.settings_file import layers_of
+from gnd.gnd_map.config import to_mapping
+from gnd.gnd_map.settings import from_settings, merged, plain_settings
+from gnd.vehicle_agent.config import AgentConfig
+from gnd.vehicle_agent.detect.parameters import DetectParameters
+from gnd.vehicle_agent.features.layer_parameters import FeatureParameters
+
+
+def load_agent(
+    file: Path | None,
+    changes: Sequence[str],
+    options: Mapping[str, Any],
+    environment: Mapping[str, str] | None = None,
+) -> AgentConfig:
+    """The effective settings of an agent.
+
+    Args:
+        file: TOML, or None.
+        changes: NAME=VALUE, as of --set.
+        options: nested by group; None means not given.
+        environment: None: of this process (GND_AGENT__REPORT__LONGEST_S=30).
+
+    Raises:
+        ConfigError: an unknown setting (with near names), one that is missing, or a value of the wrong type.
+        GndError: a value out of its range.
+    """
+    said = layers_of(AgentConfig, "agent", file, changes, options, environment)
+    return agent_of(said, where="agent" if file is None else str(file))
+
+
+def agent_of(said: Mapping[str, Any], *, where: str = "agent") -> AgentConfig:
+    """An agent with the settings that are said; the mode of detection chooses the defaults of detection.
+
+    Args:
+        said: nested mapping; `features.layers` may hold names of known layers instead of tables.
+        where: they come from, for messages.
+
+    Raises:
+        ConfigError: as of `load_agent`.
+    """
+    values = merged({"vehicle": "vehicle"}, _defaults_of_mode(said), said)
+    values.setdefault("work_dir", f"runs/{values['vehicle']}")
+    features = values.get("features")
+    if isinstance(features, Mapping) and isinstance(layers := features.get("layers"), list | tuple):
+        values["features"] = {**features, "layers": [_table(layer) for layer in layers]}
+    return from_settings(AgentConfig, values, where=where)
+
+
+def _defaults_of_mode(said: Mapping[str, Any]) -> dict[str, Any]:
+    detect = said.get("detect")
+    if isinstance(detect, Mapping) and detect.get("mode") == "paper":
+        return {"detect": plain_settings(DetectParameters.paper())}
+    return {}
+
+
+def _table(layer: object) -> object:
+    return to_mapping(FeatureParameters.of(layer).layers[0]) if isinstance(layer, str) else layer
