@@ -31,9 +31,7 @@ from gnd.vehicle_agent.detect.evidence import TileEvidence
 from gnd.vehicle_agent.detect.parameters import DetectParameters
 from gnd.vehicle_agent.detect.shape_change import MONOTONE, Forest, shape_features
 from gnd.vehicle_agent.local_map import LocalMap
-from studies.simulation.fleet import fleet_configs
-from studies.simulation.options import RunOptions
-from studies.simulation.pose_source import PoseSource
+from studies.simulation.options import PoseSource, RunOptions, fleet_configs
 from studies.simulation.poses import FromReference
 
 SEEDS = (101, 102, 103)

@@ -83,7 +83,7 @@ def horizontal_errors(folder: Path) -> tuple[F64, F64]:
     """Times float64 (N,) [s] and errors east, north float64 (N, 2) [m] of the single-point fixes of a recording.
 
     Raises:
-        RealLocalisationError: a file is missing or has another form.
+        RealDataError: a file is missing or has another form.
     """
     fixes, _ = read_pos(folder / "rover_1Hz_spp.pos")
     reference = read_reference(folder / "reference.csv")

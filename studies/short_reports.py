@@ -15,7 +15,6 @@ from time import thread_time
 
 import numpy as np
 from numpy.typing import NDArray
-from rich.progress import Progress
 
 from gnd.cloud_merger.expanding import base_versions, expand
 from gnd.cloud_merger.merge import MergeParameters
@@ -34,14 +33,14 @@ from gnd.gnd_map.visibility import observed_along
 from gnd.schemas.changes import ChangeReport
 from gnd.schemas.packed import PackedReport
 from studies.figures import Figure
+from studies.frame.command import Bench
+from studies.frame.folder import RunFolder
 from studies.simulation.base_map import BaseMap
-from studies.simulation.cloud import merged_map
-from studies.simulation.folder import RunFolder
+from studies.simulation.cloud import arrived, merged_map
 from studies.simulation.options import RunOptions, Upload
 from studies.simulation.result import VehicleResult
-from studies.simulation.run import reproduce
-from studies.simulation.scoring import Scored, VehicleFile
-from studies.simulation.uploads import arrived
+from studies.simulation.scores import Scored, VehicleFile
+from studies.simulation.study import reproduce
 from studies.simulation.worlds import WorldFiles, read_world_base
 
 COMMAND = "python -m studies short-reports"
@@ -115,8 +114,8 @@ def _driven(wanted: ShortReportOptions, folder: Path) -> list[Street]:
         seeds=wanted.seeds, street=StreetOptions(wanted.length_m, "wangsimni"), vehicles=(len(SENSORS),),
         sensors=SENSORS, pcd=False, upload="packed",
     )  # fmt: skip
-    with Progress(disable=True) as progress:
-        outcome = reproduce(fleet, RunFolder.create(folder / "run"), 1, progress)
+    home = RunFolder.create(folder / "run")
+    outcome = reproduce(fleet, home, Bench(home))
     return [Street(world.files, read_world_base(world.files), world.vehicles) for world in outcome.worlds]
 
 

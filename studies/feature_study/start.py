@@ -8,7 +8,7 @@ import numpy as np
 
 from gnd.fleet_sim.roads.drive import RoadDrive
 from gnd.gnd_map.arrays import F64
-from studies.simulation.errors import ReproduceError
+from studies.frame.errors import ReproduceError
 
 AFTER_S: Final = 5.0
 

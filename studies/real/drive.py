@@ -22,7 +22,7 @@ from gnd.vehicle_agent.local_map import LocalMap
 from gnd.vehicle_agent.localise import Localiser, RefinedScan
 from gnd.vehicle_agent.segment.parameters import SegmentParameters
 from gnd.vehicle_agent.segment.segmenter import MotionSegmenter, SegmentedScan
-from studies.real.errors import RealDataError
+from studies.frame.errors import RealDataError
 from studies.real.scene import Scene
 from studies.real.voxels import keys_of
 

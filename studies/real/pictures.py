@@ -15,8 +15,8 @@ from numpy.typing import NDArray
 
 from gnd.fleet_sim.shapes import Block
 from gnd.gnd_map.classes import CLASS_COLOURS, ChangeClass
+from studies.frame.errors import RealDataError
 from studies.real.drive import Found
-from studies.real.errors import RealDataError
 from studies.real.places import Placed
 from studies.real.rounds import Round
 

@@ -18,7 +18,7 @@ from gnd.vehicle_agent.importers.cleaning import cleaned
 from gnd.vehicle_agent.importers.lidar_odometry import Progress, reference_ns
 from gnd.vehicle_agent.importers.recording import Recording
 from gnd.vehicle_agent.localise.estimates import PoseEstimate, RefinedScan
-from studies.real.errors import RealDataError
+from studies.frame.errors import RealDataError
 
 F64 = NDArray[np.float64]
 I64 = NDArray[np.int64]

@@ -1,78 +1,53 @@
-"""The result for people."""
+"""The result as tables."""
 
 from typing import Any
 
-from rich import box
-from rich.console import Console
-from rich.table import Table
-
+from studies.frame.tables import Sheet, fixed, sheet
 from studies.real.causes import CAUSES
 
 
-def print_tables(found: dict[str, Any], console: Console | None = None) -> None:
-    """Print false changes, their causes, and what became of the inserted objects."""
-    console = console or Console()
-    untouched, inserted = found["untouched"], found["inserted"]
-    console.print(
+def sheets_of(found: dict[str, Any]) -> list[Sheet]:
+    """Return what was measured: false changes, their causes, and what became of the inserted objects."""
+    head = Sheet(
         f"{found['recording']}: {found['scans']} scans, {found['scans_driven']} driven in"
-        f" {found['options']['rounds']} rounds, {found['runtime_s']} s"
+        f" {found['options']['rounds']} rounds, {found['runtime_s']} s",
+        notes=list(found["left_out"]),
     )
-    for sentence in found["left_out"]:
-        console.print(f"  {sentence}")
-    console.print(_false_changes(untouched))
-    seen = found["untouched_seen"]
-    console.print(
-        f"  Where the map's half had looked: {sum(seen['false'].values()):,} of {seen['observed']:,} observed,"
-        f" {_number(seen['false_per_1000'])} of 1,000\n"
+    false, seen = _false_changes(found["untouched"]), found["untouched_seen"]
+    false.notes.append(
+        f"Where the map's half had looked: {sum(seen['false'].values()):,} of {seen['observed']:,} observed,"
+        f" {fixed(seen['false_per_1000'])} of 1,000"
     )
-    console.print(_causes(untouched["causes"]))
-    console.print(_inserted(inserted))
+    return [head, false, _causes(found["untouched"]["causes"]), _inserted(found["inserted"])]
 
 
-def _table(title: str, *columns: str) -> Table:
-    table = Table(title=title, title_justify="left", box=box.SIMPLE_HEAD)
-    for number, column in enumerate(columns):
-        table.add_column(column, justify="right" if number else "left")
-    return table
-
-
-def _false_changes(untouched: dict[str, Any]) -> Table:
-    table = _table("Nothing changed: reported nevertheless", "", "voxels", "a 1,000 observed", "a 1,000 Gaussians")
+def _false_changes(untouched: dict[str, Any]) -> Sheet:
+    table = sheet("Nothing changed: reported nevertheless", "", "voxels", "a 1,000 observed", "a 1,000 Gaussians")
     gaussians = max(untouched["observed_gaussian"], 1)
     for name, n in untouched["false"].items():
-        table.add_row(
-            name, f"{n:,}", _number(untouched["false_per_1000_by_class"][name]), f"{1000 * n / gaussians:.2f}"
-        )
+        table.add(name, f"{n:,}", fixed(untouched["false_per_1000_by_class"][name]), f"{1000 * n / gaussians:.2f}")
     total = sum(untouched["false"].values())
-    rates = _number(untouched["false_per_1000"]), _number(untouched["false_per_1000_gaussian"])
-    table.add_row("all", f"{total:,}", *rates, style="bold")
-    table.add_row("observed", f"{untouched['observed']:,}", f"{untouched['observed_gaussian']:,} Gaussians", "")
+    rates = fixed(untouched["false_per_1000"]), fixed(untouched["false_per_1000_gaussian"])
+    table.add("all", f"{total:,}", *rates, style="bold")
+    table.add("observed", f"{untouched['observed']:,}", f"{untouched['observed_gaussian']:,} Gaussians", "")
     return table
 
 
-def _causes(causes: dict[str, dict[str, int]]) -> Table:
-    table = _table("Why", "first that holds", *causes)
+def _causes(causes: dict[str, dict[str, int]]) -> Sheet:
+    table = sheet("Why", "first that holds", *causes)
     for cause, meaning in CAUSES.items():
         numbers = [counts[cause] for counts in causes.values()]
         if any(numbers):
-            table.add_row(f"{cause}: {meaning}" if meaning else cause, *map(str, numbers))
+            table.add(f"{cause}: {meaning}" if meaning else cause, *map(str, numbers))
     return table
 
 
-def _inserted(inserted: dict[str, Any]) -> Table:
-    table = _table(
-        "Objects inserted", "", "objects", "voxels", "recall", "precision", "precision within 3 m of objects"
-    )
+def _inserted(inserted: dict[str, Any]) -> Sheet:
+    table = sheet("Objects inserted", "", "objects", "voxels", "recall", "precision", "precision within 3 m of objects")
     for name in ("new", "deleted"):
         one = inserted[name]
-        shares = (_percent(one[key]) for key in ("recall", "precision", "precision_near_objects"))
-        table.add_row(name, str(inserted["objects"][name]), str(one["true"]), *shares)
+        shares = (
+            "–" if one[key] is None else f"{one[key]:.1%}" for key in ("recall", "precision", "precision_near_objects")
+        )
+        table.add(name, str(inserted["objects"][name]), str(one["true"]), *shares)
     return table
-
-
-def _number(value: float | None) -> str:
-    return "-" if value is None else f"{value:.2f}"
-
-
-def _percent(value: float | None) -> str:
-    return "-" if value is None else f"{value:.1%}"

@@ -18,7 +18,7 @@ from gnd.gnd_map.motion import Trajectory
 from gnd.gnd_map.se3 import T_from_R_t, exp_so3
 from gnd.vehicle_agent.localise.georeference import Georeferenced, georeference
 from gnd.vehicle_agent.localise.track_alignment import FixTable
-from studies.real_localisation.errors import RealLocalisationError
+from studies.frame.errors import RealDataError
 from studies.real_localisation.rtklib import FIXED, gps_ns, read_pos
 
 F64 = NDArray[np.float64]
@@ -62,14 +62,14 @@ def read_reference(path: Path) -> Reference:
     """The reference trajectory.
 
     Raises:
-        RealLocalisationError: the file cannot be read or has other columns.
+        RealDataError: the file cannot be read or has other columns.
     """
     try:
         rows = np.loadtxt(path, delimiter=",", skiprows=1, ndmin=2)
     except (OSError, ValueError) as error:
-        raise RealLocalisationError(f"{path}: no reference trajectory: {error}") from error
+        raise RealDataError(f"{path}: no reference trajectory: {error}") from error
     if rows.shape[1] != _COLUMNS:
-        raise RealLocalisationError(f"{path}: {rows.shape[1]} columns; {_COLUMNS} are needed")
+        raise RealDataError(f"{path}: {rows.shape[1]} columns; {_COLUMNS} are needed")
     t_ns = np.array([gps_ns(week, second) for second, week in rows[:, :2]], np.int64)
     lat, lon, heading = np.radians(rows[:, [2, 3, 10]]).T
     speed = rows[:, 11] * np.sin(heading) + rows[:, 12] * np.cos(heading)  # less than nothing when it reverses

@@ -14,8 +14,8 @@ from gnd.gnd_map.motion import Trajectory
 from gnd.gnd_map.se3 import T_inverse
 from gnd.vehicle_agent.localise import PoseEstimate
 from gnd.vehicle_agent.localise.georeference import Georeferenced
+from studies.frame.errors import RealDataError
 from studies.real.scene import Recorded
-from studies.real_localisation.errors import RealLocalisationError
 from studies.real_localisation.flexmap import Drawn
 from studies.real_localisation.halves import METHODS, Half, localised
 from studies.real_localisation.nagoya import read_reference, track_off
@@ -127,5 +127,5 @@ def _saved(figure: Figure, path: Path) -> Path:
         path.parent.mkdir(parents=True, exist_ok=True)
         figure.savefig(path, dpi=DPI)
     except OSError as error:
-        raise RealLocalisationError(f"{path}: cannot be written: {error.strerror or error}") from error
+        raise RealDataError(f"{path}: cannot be written: {error.strerror or error}") from error
     return path

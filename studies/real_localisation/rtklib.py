@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gnd.vehicle_agent.localise.track_alignment import FixTable
-from studies.real_localisation.errors import RealLocalisationError
+from studies.frame.errors import RealDataError
 
 I64 = NDArray[np.int64]
 
@@ -30,16 +30,16 @@ def read_pos(path: Path) -> tuple[FixTable, I64]:
     """Fixes (times are GPS time) and the quality of each.
 
     Raises:
-        RealLocalisationError: the file cannot be read, or holds no such lines.
+        RealDataError: the file cannot be read, or holds no such lines.
     """
     try:
         lines = [line.split() for line in path.read_text("ascii").splitlines() if line and not line.startswith("%")]
         t_ns = np.array([_time_ns(*line[:_FIRST]) for line in lines], np.int64)
         rows = np.array([line[_FIRST : _FIRST + 8] for line in lines], np.float64).reshape(-1, 8)
     except (OSError, ValueError, TypeError) as error:
-        raise RealLocalisationError(f"{path}: no positions of RTKLIB: {error}") from error
+        raise RealDataError(f"{path}: no positions of RTKLIB: {error}") from error
     if not len(rows):
-        raise RealLocalisationError(f"{path}: no positions")
+        raise RealDataError(f"{path}: no positions")
     lat, lon, height, quality, _, north, east, up = rows.T
     sigma = np.maximum(np.hypot(north, east) / np.sqrt(2.0), FLOOR_M)
     table = FixTable(t_ns, np.radians(lat), np.radians(lon), height, sigma, np.maximum(up, FLOOR_M))

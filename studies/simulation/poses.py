@@ -15,7 +15,7 @@ from gnd.vehicle_agent.local_map import LocalMap
 from gnd.vehicle_agent.localise.estimates import PoseEstimate, RefinedScan
 from gnd.vehicle_agent.localise.localiser import Localiser
 from gnd.vehicle_agent.localise.parameters import LocaliserParameters
-from studies.simulation.pose_source import PoseSource
+from studies.simulation.options import PoseSource
 
 TIME_CONSTANT_S: Final = 2.0
 _KEPT_NS: Final = 200_000_000

@@ -27,18 +27,22 @@ from gnd.vehicle_agent.place import Place
 from gnd.vehicle_agent.report import Identity, Reporter
 from gnd.vehicle_agent.scans import Guard
 from gnd.vehicle_agent.segment import MotionSegmenter, SegmentedScan
+from studies.frame.pool import Tick
 from studies.simulation.base_map import BaseMap, read_base
 from studies.simulation.baseline import CloudVehicle, read_cloud
 from studies.simulation.held_tiles import HeldTiles
-from studies.simulation.kept_evidence import RecordingDetector, evidence_columns
-from studies.simulation.labels import MoverLabels
 from studies.simulation.masses import Watch, Watcher
-from studies.simulation.method import MethodParameters
-from studies.simulation.pose_source import PoseSource
+from studies.simulation.options import MethodParameters, PoseSource
 from studies.simulation.poses import FromReference, Localisation, Localising
-from studies.simulation.result import VehicleResult, write_result
-from studies.simulation.streams import Tick, as_recorded, first_fix, recorded, ticking
-from studies.simulation.voxel_rows import VoxelRows
+from studies.simulation.result import (
+    MoverLabels,
+    RecordingDetector,
+    VehicleResult,
+    VoxelRows,
+    evidence_columns,
+    write_result,
+)
+from studies.simulation.streams import as_recorded, first_fix, recorded, ticking
 
 _ALL_LETTERS = 1_000_000
 

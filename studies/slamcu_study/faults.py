@@ -9,7 +9,7 @@ import numpy as np
 from gnd.fleet_sim.roads.drive import RoadDrive
 from gnd.gnd_map.arrays import F64
 from gnd.schemas.drive import Detections
-from studies.simulation.errors import OptionError
+from studies.frame.errors import OptionError
 
 SIGN_RANGE: Final = 0.05
 SIGN_BEARING_RAD: Final = np.radians(1.0)

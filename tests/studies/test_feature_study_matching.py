@@ -3,11 +3,10 @@
 import numpy as np
 import pytest
 
-from studies.feature_study.averages import distances_plain, mean_over, rounded, std_over
 from studies.feature_study.honesty import Honesty, nees
 from studies.feature_study.matching import match_one_to_one
-from studies.feature_study.targets import judged
-from studies.traffic_study.targets import Target
+from studies.frame.averages import distances_plain, mean_over, rounded, std_over
+from studies.frame.targets import Target, judged
 
 
 def xy(*points: tuple[float, float]) -> np.ndarray:

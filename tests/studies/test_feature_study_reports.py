@@ -21,8 +21,8 @@ from studies.feature_study.reporting import (
     reports_of,
     write_reports,
 )
-from studies.localisation_study.kept import Kept
-from studies.simulation.errors import FolderError
+from studies.frame.errors import FolderError
+from studies.frame.kept import Kept
 
 FRAME = LocalFrame(0.86, 0.045, 90.0)
 KNOWN = np.array([[9000.0, 4.0], [9050.0, -4.0]])

@@ -13,11 +13,11 @@ from gnd.schemas.drive import Scan
 from gnd.schemas.drive_mcap import read_drive, read_header
 from gnd.vehicle_agent.localise.parameters import LocaliserParameters
 from studies.cli import reproduce
+from studies.frame.errors import FolderError, OptionError
 from studies.hard_cases.cases import CASES
 from studies.hard_cases.localising import _displaced
-from studies.hard_cases.study import HardOptions
-from studies.hard_cases.work import read_result, task_of
-from studies.simulation.errors import FolderError, OptionError
+from studies.hard_cases.scores import CaseResult
+from studies.hard_cases.study import HardOptions, task_of
 
 ASKED = (
     "platoon_van", "lorries", "traffic_jam", "stop_and_go", "clock_m50", "clock_m20", "clock_m10", "clock_p10",
@@ -96,7 +96,7 @@ def test_a_changed_parameter_is_another_result_and_cases_of_one_place_share_its_
     assert task.base == other.base == task_of(tmp_path, "rebuilt", "scala", 3, plain).base
     assert task.base != task_of(tmp_path, "street", "vlp16", 4, plain).base
     with pytest.raises(FolderError):
-        read_result(task.kept)
+        task.kept.read(CaseResult)
 
 
 @pytest.mark.slow
@@ -126,5 +126,5 @@ def test_two_cases_give_the_json_that_was_promised_and_a_second_start_continues(
     written = {path: path.stat().st_mtime_ns for path in (out / "runs").iterdir()}
     again = run(*options, "--out", out, "--markdown", "-")
     assert again.exit_code == 0
-    assert again.output.count("\n") == 4
+    assert sum(line.startswith("| ") for line in again.output.splitlines()) == 4
     assert {path: path.stat().st_mtime_ns for path in (out / "runs").iterdir()} == written

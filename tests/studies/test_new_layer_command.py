@@ -11,9 +11,7 @@ from click.testing import CliRunner, Result
 from gnd.deploy.cli import gnd
 from gnd.gnd_map.errors import GndError
 from studies.new_layer_study.driving import STRAIGHT, TRACK, RouteTask, along_and_across, drive_of, layer_truth
-from studies.new_layer_study.options import NewLayerOptions
-from studies.new_layer_study.study import noisy_tracks, tasks_of
-from studies.simulation.folder import RunFolder
+from studies.new_layer_study.study import NewLayerOptions, noisy_tracks, tasks_of
 
 SHORT = (
     "--seeds", "14", "--lap", "150", "--km", "0.5", "--drives", "2", "--motorway-drives", "2", "--levels", "none",
@@ -74,11 +72,11 @@ def test_a_second_start_drives_no_more_shows_tables_and_draws(
 
     monkeypatch.setattr("studies.new_layer_study.study.map_drive", never)
     monkeypatch.setattr("studies.new_layer_study.study.localise_drive", never)
-    shown = run(finished[0], *SHORT, "--pictures", str(tmp_path / "pictures"))
+    shown = run(finished[0], *SHORT)
     assert shown.exit_code == 0, f"{shown.output}{shown.exception!r}"
     for text in ("Figure 6", "Figure 7", "Table 2", "5.2718 ± 0.6877", "Table 3", "targets"):
         assert text in shown.stdout
-    names = {path.name for path in (tmp_path / "pictures").iterdir()}
+    names = {path.name for path in finished[0].glob("*.png")}
     assert names == {
         "new_layer_beacons.png",
         "new_layer_by_drives.png",
@@ -101,7 +99,7 @@ def test_a_second_start_drives_no_more_shows_tables_and_draws(
         (("--gnss-bias", "-1"), "--gnss-bias must be 0"),
         (("--lap", "20"), "--lap must be 0 or 100"),
         (("--km", "0.2"), "--km must be 0.5 … 20, got 0.2"),
-        (("--processes", "-1"), "--processes must be at least 1, got -1"),
+        (("--processes", "-1"), "at least one process is needed, got -1"),
     ],
 )
 def test_bad_options_are_refused_before_anything_runs(tmp_path: Path, options: tuple[str, ...], says: str) -> None:
@@ -118,7 +116,7 @@ def test_the_sweep_shares_its_middle_with_the_usual_drives(tmp_path: Path) -> No
     assert list(tracks["beacon"]) == [0.5, 1.0, 2.0]
     assert tracks["beacon"][1.0] == tracks["lane"][1.0] == RouteTask(TRACK, 14, 0.0)
     assert noisy_tracks(options, 15) == {}
-    plan = tasks_of(options, 14, RunFolder.create(tmp_path / "run", "new-feature-layer"))
+    plan = tasks_of(options, 14, tmp_path / "run")
     assert sum(task.kind == TRACK for task in plan.routes) == 5
     assert sum(len(drives) for task, drives in plan.routes.items() if task.kind == TRACK) == 15
     keys = {drive.key for drives in plan.routes.values() for drive in drives}

@@ -3,8 +3,16 @@
 import numpy as np
 import pytest
 
-from studies.new_layer_study.layers import Layer, LayerTruth, pooled, score
-from studies.new_layer_study.outcome import DriveLayers, Localised, MotorwayOutcome, RouteOutcome
+from studies.new_layer_study.layers import (
+    DriveLayers,
+    Layer,
+    LayerTruth,
+    Localised,
+    MotorwayOutcome,
+    RouteOutcome,
+    pooled,
+    score,
+)
 from studies.new_layer_study.summary import localisation_summary, motorway_summary, noise_summary
 
 TRUTH = LayerTruth(np.array([[0.0, 0.0], [0.0, 40.0]]), np.array([[0.0, 1.0], [0.0, 1.0]]))  # northwards

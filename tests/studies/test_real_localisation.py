@@ -12,16 +12,16 @@ from gnd.gnd_map.se3 import T_inverse
 from gnd.vehicle_agent.importer import map_track, no_progress, open_recording
 from gnd.vehicle_agent.importers.cleaning import cleaned
 from gnd.vehicle_agent.localise import localisation_error
+from studies.frame.errors import RealDataError
 from studies.real.scene import Recorded, Scene, load, place
 from studies.real_localisation.apollo import apollo_map, gaussians_apart, on_apollos_map
 from studies.real_localisation.convergence import convergence_of
-from studies.real_localisation.errors import RealLocalisationError
 from studies.real_localisation.flexmap import flexmap_of, is_flexmap
 from studies.real_localisation.halves import METHODS, Half, gicp_reference, localised
 from studies.real_localisation.nagoya import dead_reckoned, is_nagoya, nagoya_of, read_reference
 from studies.real_localisation.odometry import compared, odometries
-from studies.real_localisation.options import RealLocalisationOptions
 from studies.real_localisation.rtklib import gps_ns, read_pos
+from studies.real_localisation.study import RealLocalisationOptions
 
 
 @pytest.fixture(scope="module")
@@ -124,19 +124,19 @@ def test_both_kinds_of_times_in_rtklib_files_are_one(tmp_path: Path) -> None:
     assert quality.tolist() == [1]
     assert a.sigma_m.tolist() == [0.02]  # the least that is believed
     (tmp_path / "c.pos").write_text("no positions here\n")
-    with pytest.raises(RealLocalisationError, match=r"c\.pos"):
+    with pytest.raises(RealDataError, match=r"c\.pos"):
         read_pos(tmp_path / "c.pos")
 
 
 def test_options_are_checked(tmp_path: Path) -> None:
-    with pytest.raises(RealLocalisationError, match="no such file or folder"):
-        RealLocalisationOptions.of(f"{tmp_path / 'none'}", 200, 0)
-    with pytest.raises(RealLocalisationError, match="0 recordings"):
-        RealLocalisationOptions.of(" , ", 200, 0)
+    with pytest.raises(RealDataError, match="no such file or folder"):
+        RealLocalisationOptions((tmp_path / "none",))
+    with pytest.raises(RealDataError, match="--scans none"):
+        RealLocalisationOptions(())
     (tmp_path / "a" / "x").mkdir(parents=True)
     (tmp_path / "b" / "x").mkdir(parents=True)
-    with pytest.raises(RealLocalisationError, match="one name twice"):
-        RealLocalisationOptions.of(f"{tmp_path / 'a' / 'x'},{tmp_path / 'b' / 'x'}", 200, 0)
+    with pytest.raises(RealDataError, match="one name twice"):
+        RealLocalisationOptions((tmp_path / "a" / "x", tmp_path / "b" / "x"))
 
 
 @pytest.mark.slow

@@ -5,8 +5,7 @@ from pathlib import Path
 import pytest
 
 from gnd.vehicle_agent.importer import no_progress
-from studies.real.options import RealOptions
-from studies.real.run import reproduce_real
+from studies.real.study import RealOptions, reproduce_real
 
 pytestmark = pytest.mark.slow
 

@@ -14,13 +14,11 @@ from gnd.gnd_map.accumulate import VoxelAccumulator
 from gnd.gnd_map.errors import GndError
 from gnd.vehicle_agent.detect.parameters import DetectParameters
 from gnd.vehicle_agent.importer import no_progress, open_recording
-from studies.real.command import real
-from studies.real.errors import RealDataError
+from studies.frame.errors import RealDataError
 from studies.real.insertion import Painter, changed_by_shadow, truth_of
-from studies.real.options import RealOptions, changed
 from studies.real.places import KINDS, Surroundings, choose_places
-from studies.real.run import reproduce_real
 from studies.real.scene import Recorded, Scene, load, place
+from studies.real.study import RealOptions, changed, real, reproduce_real
 from studies.real.voxels import Cells, keys_of
 
 
@@ -152,7 +150,7 @@ def test_poses_of_the_vehicles_own_localiser(street_drive):
         ({"changes": ("new_cell=3",)}, "--set new_cell=3: expected FIELD=VALUE with one of"),
         ({"changes": ("new_cells=many",)}, "'many' is no int"),
         ({"changes": ("new_cells=3",)}, "new_cells = 3.* lies outside 20"),
-        ({"rounds": 0}, "rounds >= 1"),
+        ({"rounds": 0}, "--rounds must be at least 1"),
         ({"kind": "bag"}, "format 'bag' is not known"),
         ({"scans": Path("nowhere")}, "no such file or folder"),
     ],

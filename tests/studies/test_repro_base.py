@@ -13,9 +13,9 @@ from gnd.gnd_map.grid import GridFrame
 from gnd.gnd_map.tile_id import TileId
 from gnd.tile_store.build import build_map
 from gnd.tile_store.sqlite_store import SqliteStore
+from studies.frame.errors import FolderError
 from studies.simulation import base_map
 from studies.simulation.base_map import BaseMap, driven, read_base, surveyed, write_base
-from studies.simulation.errors import FolderError
 
 
 def some_tiles() -> dict[TileId, Gaussians]:
@@ -46,7 +46,7 @@ def test_a_damaged_base_map_is_refused(tmp_path: Path) -> None:
     body = bytearray(path.read_bytes())
     body[len(body) // 2] ^= 1
     path.write_bytes(body)
-    with pytest.raises(FolderError, match="base map"):
+    with pytest.raises(FolderError, match="cannot read|base map"):
         read_base(path)
     with pytest.raises(FolderError, match="cannot read"):
         read_base(tmp_path / "missing.npz")
@@ -55,7 +55,7 @@ def test_a_damaged_base_map_is_refused(tmp_path: Path) -> None:
 def test_a_driven_base_map_is_what_map_build_makes(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     world = street(3, StreetOptions(100.0, "wangsimni"))
     configs = tuple(replace(config, scans=4) for config in mapping_configs(3))
-    monkeypatch.setattr(base_map, "survey_configs", lambda seed: configs)
+    monkeypatch.setattr(base_map, "mapping_configs", lambda seed: configs)
     ours = driven(world)
     drives = [simulate_drive(world, config, tmp_path / f"{config.vehicle}.mcap") for config in configs]
     with SqliteStore(tmp_path / "map.sqlite") as store:

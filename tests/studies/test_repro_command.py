@@ -102,8 +102,8 @@ def test_a_damaged_result_is_made_again(finished: Finished, tmp_path: Path, capl
 @pytest.mark.parametrize(
     ("options", "says"),
     [
-        (("--sensors", "vlp17"), "unknown sensor vlp17"),
-        (("--vehicles", "0"), "numbers of vehicles must lie in 1"),
+        (("--sensors", "vlp17"), "there is no vlp17"),
+        (("--vehicles", "0"), "--vehicles must be 1 … 200, got 0"),
         (("--vehicles", "one"), "expected numbers"),
         (("--poses", "noisy:xx"), "noisy:4cm:0.08deg"),
         (("--parking", "1.5"), "0 … 1"),
@@ -111,8 +111,8 @@ def test_a_damaged_result_is_made_again(finished: Finished, tmp_path: Path, capl
         (("--set", "detect.new_cells=many"), "new_cells"),
         (("--length", "7"), "100"),
         (("--jobs", "0"), "at least one process"),
-        (("--scans", "0"), "at least one scan"),
-        (("--world-seed", "-1"), "world seeds"),
+        (("--scans", "0"), "--scans must be at least 1"),
+        (("--world-seed", "-1"), "--seeds must be different integers"),
     ],
 )
 def test_bad_options_are_refused(tmp_path: Path, options: tuple[str, ...], says: str) -> None:

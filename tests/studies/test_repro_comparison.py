@@ -9,10 +9,10 @@ from click.testing import CliRunner
 from repro_world import copy_world, reproduce, without_times
 
 from gnd.deploy.cli import gnd
-from studies.simulation.comparison import comparison_of, folder_of, pose_sources, rows_of, worst_of
-from studies.simulation.errors import OptionError
-from studies.simulation.folder import RunFolder
-from studies.simulation.pose_source import PoseSource
+from studies.frame.errors import OptionError
+from studies.frame.folder import RunFolder
+from studies.simulation.options import PoseSource
+from studies.simulation.scores import comparison_of, rows_of, worst_loss
 
 NOISY = "noisy:30cm:0.5deg"
 
@@ -41,8 +41,8 @@ def test_the_loss_of_each_row_is_the_difference_of_its_f1() -> None:
 
 
 def test_a_loss_of_exactly_one_point_is_allowed() -> None:
-    assert worst_of({"fleet.5": {"scored": 1.0}})["met"]
-    assert not worst_of({"fleet.5": {"scored": 1.0001}, "fleet.1": {"scored": -3.0}})["met"]
+    assert worst_loss({"fleet.5": {"scored": 1.0}})["met"]
+    assert not worst_loss({"fleet.5": {"scored": 1.0001}, "fleet.1": {"scored": -3.0}})["met"]
 
 
 def test_the_row_of_16_and_32_layers_is_their_mean() -> None:
@@ -51,17 +51,17 @@ def test_the_row_of_16_and_32_layers_is_their_mean() -> None:
 
 
 def test_sources_of_poses_are_read_in_their_order_and_each_once() -> None:
-    assert pose_sources("true, noisy:4cm:0.08deg") == (PoseSource("true", 0.0, 0.0), PoseSource())
+    assert PoseSource.several("true, noisy:4cm:0.08deg") == (PoseSource("true", 0.0, 0.0), PoseSource())
     with pytest.raises(OptionError, match="each source of poses once"):
-        pose_sources("noisy:4cm:0.08deg,noisy:40mm:0.08deg")
+        PoseSource.several("noisy:4cm:0.08deg,noisy:40mm:0.08deg")
     with pytest.raises(OptionError, match="poses are true, estimated"):
-        pose_sources("true,")
+        PoseSource.several("true,")
 
 
 @pytest.mark.slow
 def test_one_command_tells_what_bad_poses_lose(finished: tuple[Path, dict[str, Any]], tmp_path: Path) -> None:
     root = RunFolder.begun(tmp_path / "compared").root
-    copy_world(finished[0], folder_of(root, PoseSource("true", 0.0, 0.0)))
+    copy_world(finished[0], root / "true")
     ran = reproduce(root, "--poses", f"true,{NOISY}", "--json", "-")
     assert ran.exit_code == 0, ran.output
     found = json.loads(ran.stdout)

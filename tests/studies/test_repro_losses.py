@@ -4,10 +4,21 @@ import pytest
 from gnd.fleet_sim.evaluate import Score
 from gnd.gnd_map.classes import ChangeClass
 from gnd.vehicle_agent.detect.parameters import DetectParameters
-from studies.simulation.causes import EDGE, FEW_CELLS, FEW_RAYS, RIGHT, UNSEEN, causes, columns_at
-from studies.simulation.losses import Loss, _gain, _pattern, mean_losses
+from studies.simulation.losses import (
+    EDGE,
+    FEW_CELLS,
+    FEW_RAYS,
+    RIGHT,
+    UNSEEN,
+    Loss,
+    _gain,
+    _pattern,
+    causes,
+    columns_at,
+    mean_losses,
+)
 from studies.simulation.result import EVIDENCE, VehicleResult
-from studies.simulation.summary import mean_of
+from studies.simulation.scores import mean_of
 
 N, A, M, D, E, U = (int(c) for c in ChangeClass)
 

@@ -5,11 +5,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from gnd.gnd_map.config import to_mapping
-from studies.simulation.errors import OptionError
-from studies.simulation.fleet import fleet_configs, fleet_sensors
-from studies.simulation.method import MethodParameters
-from studies.simulation.options import RunOptions
-from studies.simulation.pose_source import PoseSource
+from studies.frame.errors import OptionError
+from studies.simulation.options import MethodParameters, PoseSource, RunOptions, fleet_configs, fleet_sensors
 
 
 @pytest.mark.parametrize(

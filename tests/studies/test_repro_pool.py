@@ -6,8 +6,8 @@ import pytest
 from rich.progress import Progress
 
 from gnd.gnd_map.tile_id import TileId
-from studies.simulation.errors import FolderError, ReproduceError
-from studies.simulation.pool import Job, run_jobs
+from studies.frame.errors import FolderError, ReproduceError
+from studies.frame.pool import Job, run_jobs
 
 
 @pytest.mark.parametrize("processes", [1, 2])

@@ -12,8 +12,8 @@ from repro_world import reproduce, result_of
 from gnd.cloud_merger.merge import MergeParameters
 from gnd.schemas.changes import ChangeReport
 from studies.simulation.base_map import read_base
+from studies.simulation.cloud import arrived
 from studies.simulation.result import VehicleResult, read_result
-from studies.simulation.uploads import arrived
 
 Finished = tuple[Path, dict[str, Any]]
 

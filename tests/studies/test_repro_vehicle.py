@@ -17,19 +17,15 @@ from gnd.schemas.changes import ChangeReport
 from gnd.schemas.drive import DriveHeader, ReferencePose, Scan
 from gnd.schemas.drive_mcap import read_drive, read_header
 from gnd.vehicle_agent.local_map import LocalMap
+from studies.frame.folder import RunFolder
 from studies.simulation.base_map import read_base
-from studies.simulation.folder import RunFolder
 from studies.simulation.masses import WATCHED, choose, most_telling
-from studies.simulation.method import MethodParameters
-from studies.simulation.options import RunOptions
-from studies.simulation.pose_source import PoseSource
+from studies.simulation.options import MethodParameters, PoseSource, RunOptions
 from studies.simulation.poses import TIME_CONSTANT_S, FromReference
-from studies.simulation.result import VehicleResult
+from studies.simulation.result import VehicleResult, VoxelRows
 from studies.simulation.streams import as_recorded
-from studies.simulation.tasks import vehicle_tasks
 from studies.simulation.vehicle import VehicleTask, drive
-from studies.simulation.voxel_rows import VoxelRows
-from studies.simulation.worlds import WorldFiles, world_files
+from studies.simulation.worlds import WorldFiles, vehicle_tasks, world_files
 
 Finished = tuple[Path, dict[str, Any]]
 

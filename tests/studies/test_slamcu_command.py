@@ -22,8 +22,8 @@ from studies.slamcu_study.driving import (
     sign_truth,
     verdicts_of,
 )
-from studies.slamcu_study.options import FULL
-from studies.slamcu_study.summary import drive_summary
+from studies.slamcu_study.scores import drive_summary
+from studies.slamcu_study.signs import FULL
 
 SHORT = ("--seeds", "14", "--km", "5", "--drives", "2", "--processes", "1", "--no-ablations")
 Finished = tuple[Path, dict[str, Any]]
@@ -87,11 +87,12 @@ def test_a_second_start_drives_no_more_shows_tables_and_draws(
         raise AssertionError("a drive was made again")
 
     monkeypatch.setattr("studies.slamcu_study.study.run_drive", never)
-    shown = run(finished[0], *SHORT, "--pictures", str(tmp_path / "pictures"))
+    shown = run(finished[0], *SHORT, "--markdown", str(tmp_path / "tables.md"))
     assert shown.exit_code == 0, f"{shown.output}{shown.exception!r}"
     for text in ("Table 1", "Unclassified", "(96.12 %)", "what matters", "targets"):
         assert text in shown.stdout
-    names = sorted(path.name for path in (tmp_path / "pictures").iterdir())
+    assert "**what matters: the first drive once more**" in (tmp_path / "tables.md").read_text()
+    names = sorted(path.name for path in finished[0].glob("*.png"))
     assert names == ["slamcu_confusion.png", "slamcu_masses.png", "slamcu_position_errors.png"]
     again = json.loads((finished[0] / "result.json").read_text())
     assert again["slamcu"] == finished[1]["slamcu"]
@@ -106,7 +107,7 @@ def test_a_second_start_drives_no_more_shows_tables_and_draws(
         (("--seeds", "-1"), ">= 0"),
         (("--drives", "0"), "--drives must be 1 … 100, got 0"),
         (("--km", "2"), "--km must be 5 … 100, got 2"),
-        (("--processes", "0"), "--processes must be at least 1, got 0"),
+        (("--processes", "0"), "at least one process is needed, got 0"),
     ],
 )
 def test_bad_options_are_refused_before_anything_runs(tmp_path: Path, options: tuple[str, ...], says: str) -> None:

@@ -5,9 +5,9 @@ import pytest
 
 from gnd.fleet_sim.roads.drive import RoadDrive, RoadDriveOptions, drive_route
 from gnd.fleet_sim.roads.motorway import motorway
-from studies.simulation.errors import OptionError
+from studies.frame.errors import OptionError
 from studies.slamcu_study.faults import FAULTS, JUMP_M, with_faults
-from studies.slamcu_study.options import SlamcuOptions
+from studies.slamcu_study.study import SlamcuOptions
 
 
 @pytest.fixture(scope="module")
@@ -46,5 +46,5 @@ def test_reflections_come_and_go(drive: RoadDrive) -> None:
 
 def test_a_fault_that_there_is_not_is_refused() -> None:
     assert SlamcuOptions(faults=tuple(FAULTS)).faults == tuple(FAULTS)
-    with pytest.raises(OptionError, match="there are camera, gnss, signs"):
+    with pytest.raises(OptionError, match="known are camera, gnss, signs"):
         SlamcuOptions(faults=("rain",))

@@ -6,31 +6,32 @@ import click
 import numpy as np
 import pytest
 
-from studies.localisation_study.kept import Kept
-from studies.simulation.errors import FolderError
-from studies.slamcu_study.command import seeds_of
+from studies.frame.errors import FolderError
+from studies.frame.kept import Kept
+from studies.frame.options import numbers
 from studies.slamcu_study.figures import most_telling, outliers
-from studies.slamcu_study.outcome import MergedSigns
-from studies.slamcu_study.reference import PAPER_ACCURACY, PAPER_CONFUSION
-from studies.slamcu_study.scores import UNCLASSIFIED, accuracy_of, score
-from studies.slamcu_study.summary import (
+from studies.slamcu_study.scores import (
+    UNCLASSIFIED,
+    accuracy_of,
     drive_summary,
     lost_without_knowing,
     merged_score,
     parts_of_errors,
+    score,
     scored_drive,
     worst_of,
 )
-from studies.slamcu_study.verdicts import (
+from studies.slamcu_study.signs import (
     ABSENT,
     DELETED,
     EXIST,
     NEW,
     NORMAL,
+    PAPER_ACCURACY,
+    PAPER_CONFUSION,
+    MergedSigns,
     SignTruth,
     Verdicts,
-    read_verdicts,
-    write_verdicts,
 )
 
 TRUTH = SignTruth(
@@ -153,13 +154,13 @@ def test_outliers_are_looks_that_spoke_for_the_wrong_state() -> None:
 
 def test_kept_verdicts_come_back_as_they_were(tmp_path: Path) -> None:
     kept, found = Kept(tmp_path, "drive", "ab12"), verdicts()
-    write_verdicts(found, TRUTH, kept)
-    again, truth = read_verdicts(kept)
+    kept.write((found, TRUTH))
+    again, truth = kept.read(tuple[Verdicts, SignTruth])
     assert drive_summary(again, truth) == drive_summary(found, TRUTH)
     np.testing.assert_array_equal(again.trace_masses, found.trace_masses)
     kept.path.write_bytes(kept.path.read_bytes()[:200])
     with pytest.raises(FolderError, match="delete it and start again"):
-        read_verdicts(kept)
+        kept.read(tuple[Verdicts, SignTruth])
 
 
 def off_by(metres: float, looks: int, chi2: float, **changes: object) -> Verdicts:
@@ -191,7 +192,7 @@ def test_the_worst_drive_and_the_lost_ones_are_told() -> None:
 
 
 def test_seeds_are_numbers_and_ranges() -> None:
-    assert seeds_of("7,1000-1003") == (7, 1000, 1001, 1002, 1003)
+    assert numbers("--seeds", "7,1000-1003") == (7, 1000, 1001, 1002, 1003)
     for text in ("5-3", "a-b", "1-", "-1-2"):
         with pytest.raises(click.BadParameter):
-            seeds_of(text)
+            numbers("--seeds", text)

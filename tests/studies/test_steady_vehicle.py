@@ -8,8 +8,8 @@ from gnd.fleet_bus.ledger_file import read_ledger
 from gnd.fleet_bus.traffic import agent_traffic
 from gnd.fleet_bus.wire import WireBytes
 from studies.cli import reproduce
-from studies.traffic_study.errors import TrafficError
-from studies.traffic_study.steady import SteadyOptions, account, lines_of
+from studies.frame.errors import ReproduceError
+from studies.traffic_study.steady import SteadyOptions, account, sheet_of_account
 
 
 def driven(tmp_path, up: int, down: int):
@@ -50,7 +50,7 @@ def test_must_and_aim_are_judged_by_all_bytes_but_tiles(tmp_path, wire, met, aim
     assert found["other_kB_per_km"] == pytest.approx(found["all_kB_per_km"] - found["tiles_kB_per_km"])
     assert (found["met"], found["aim_met"]) == (met, aim_met)
     assert sum(row["wire_bytes"] for row in found["rows"]) == sum(wire)
-    assert f"aim 1: {said}" in "\n".join(lines_of(found))
+    assert f"aim 1: {said}" in sheet_of_account(found).markdown()
 
 
 def test_what_comes_once_a_drive_is_told_apart(tmp_path):
@@ -62,7 +62,7 @@ def test_what_comes_once_a_drive_is_told_apart(tmp_path):
 
 @pytest.mark.parametrize("wrong", [{"speed_kmh": 0.0}, {"pace": -1.0}, {"sensor": "eyes"}])
 def test_what_cannot_be_driven_is_refused(wrong):
-    with pytest.raises(TrafficError):
+    with pytest.raises(ReproduceError):
         SteadyOptions(**wrong)
 
 

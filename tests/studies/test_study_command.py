@@ -9,7 +9,7 @@ from study_world import json_of, run_study
 
 from gnd.deploy.cli import gnd
 from gnd.gnd_map.errors import GndError
-from studies.localisation_study.reference import QUANTITIES, STATISTICS
+from studies.localisation_study.series import QUANTITIES, STATISTICS
 from studies.localisation_study.summary import ROWS
 from studies.localisation_study.variants import VARIANTS
 
@@ -101,18 +101,18 @@ def test_pictures_and_markdown(studied: Studied, tmp_path: Path) -> None:
     for name in ("vlp16_submaps", "vlp16_update"):
         assert (out / f"{name}.png").read_bytes().startswith(b"\x89PNG")
     text = (tmp_path / "tables.md").read_text()
-    assert text.startswith("`gnd reproduce localisation --world-seed 5 ")
+    assert text.startswith("`gnd reproduce localisation --seeds 5 ")
     assert "**vlp16**, 95 % / maximum:" in text
 
 
 @pytest.mark.parametrize(
     ("options", "says"),
     [
-        (("--sensors", "vlp17"), "--sensors: unknown sensor vlp17"),
-        (("--sensors", ""), "--sensors: unknown sensor (none)"),
-        (("--sensors", "vlp16,vlp16"), "each sensor drives once"),
+        (("--sensors", "vlp17"), "--sensors: there is no vlp17"),
+        (("--sensors", ""), "--sensors: each once, got none"),
+        (("--sensors", "vlp16,vlp16"), "each once, got vlp16, vlp16"),
         (("--variants", "scala"), "'scala' does not drive; driving are vlp16"),
-        (("--world-seed", "-3"), "world seeds must be different integers >= 0"),
+        (("--world-seed", "-3"), "must be different integers >= 0"),
         (("--world-seed", "7,7"), "different"),
         (("--world-seed", "seven"), "expected numbers"),
         (("--fleet", "0"), "--fleet must be at least 1, got 0"),

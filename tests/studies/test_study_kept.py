@@ -3,11 +3,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from studies.localisation_study.kept import Kept, read_localised, read_trials, write_localised, write_trials
+from studies.frame.errors import FolderError
+from studies.frame.kept import Kept
 from studies.localisation_study.localising import Localised
 from studies.localisation_study.series import PoseSeries
+from studies.localisation_study.study import RunResult
 from studies.localisation_study.trials import Trial
-from studies.simulation.errors import FolderError
 
 
 def series(n: int) -> PoseSeries:
@@ -18,33 +19,35 @@ def series(n: int) -> PoseSeries:
 def test_a_run_comes_back_as_it_was(tmp_path: Path) -> None:
     kept = Kept(tmp_path / "runs", "vlp16-fresh", "abc")
     assert not kept.done
-    write_localised(Localised(series(30), series(32), 33), 1.5, kept)
+    kept.write(RunResult(Localised(series(30), series(32), 33), 1.5))
     assert kept.done
-    found, cpu_s = read_localised(kept)
-    assert (found.scans, cpu_s) == (33, 1.5)
-    for one, other in ((found.final, series(30)), (found.online, series(32))):
+    again = kept.read(RunResult)
+    assert (again.found.scans, again.cpu_s) == (33, 1.5)
+    for one, other in ((again.found.final, series(30)), (again.found.online, series(32))):
         for column in ("t_ns", "error", "health"):
             assert np.array_equal(getattr(one, column), getattr(other, column))
     assert not Kept(kept.home, kept.name, "abd").done
 
 
-def test_trials_come_back_as_they_were(tmp_path: Path) -> None:
+def test_plain_values_bytes_and_tables_come_back_as_they_were(tmp_path: Path) -> None:
     kept = Kept(tmp_path, "trials", "abc")
     trials = [Trial(1, 0.3, True, 0, 30), Trial(2, None, False, 2, 100)]
-    write_trials(trials, 1.0, kept)
-    assert read_trials(kept) == trials
+    kept.write(trials)
+    assert kept.read(list[Trial]) == trials
+    kept.write({"a": (b"", b"xyz"), "b": ()})
+    assert kept.read(dict[str, tuple[bytes, ...]]) == {"a": (b"", b"xyz"), "b": ()}
 
 
 def test_a_damaged_result_is_named(tmp_path: Path) -> None:
     kept = Kept(tmp_path, "vlp16-updated", "abc")
-    write_localised(Localised(series(30), series(32), 33), 1.5, kept)
+    kept.write(RunResult(Localised(series(30), series(32), 33), 1.5))
     kept.path.write_bytes(kept.path.read_bytes()[:100])
     with pytest.raises(FolderError, match=r"vlp16-updated-abc.npz.*delete it and start again"):
-        read_localised(kept)
+        kept.read(RunResult)
 
 
 def test_a_result_of_another_kind_is_named(tmp_path: Path) -> None:
     kept = Kept(tmp_path, "vlp16-trials", "abc")
-    write_trials([], 1.0, kept)
+    kept.write(Trial(1, 0.3, True, 0, 30))
     with pytest.raises(FolderError, match="lacks"):
-        read_localised(kept)
+        kept.read(RunResult)

@@ -4,9 +4,7 @@ import numpy as np
 import pytest
 from study_rows import no_pose, result, sensor
 
-from studies.localisation_study.changes import NEAR_M, share_near
-from studies.localisation_study.figures import broken
-from studies.localisation_study.overview import draw_overview
+from studies.localisation_study.figures import NEAR_M, broken, draw_overview, share_near
 
 
 def test_the_share_of_what_is_near() -> None:

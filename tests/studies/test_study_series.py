@@ -5,8 +5,7 @@ from gnd.gnd_map.motion import Trajectory
 from gnd.gnd_map.se3 import T_from_R_t, exp_so3
 from gnd.schemas.drive import MotionSample
 from gnd.vehicle_agent.localise.estimates import Health, PoseEstimate, localisation_error
-from studies.localisation_study.reference import QUANTITIES
-from studies.localisation_study.series import HEALTHS, PoseSeries
+from studies.localisation_study.series import HEALTHS, QUANTITIES, PoseSeries
 from studies.localisation_study.trials import Trial, begin_times, judged, trials_row
 
 STEP_NS = 100_000_000

@@ -3,10 +3,10 @@ from typing import Any
 import pytest
 from study_rows import no_pose, result, row, sensor
 
-from studies.localisation_study import reference
-from studies.localisation_study.summary import ROWS, worst_of
-from studies.localisation_study.tables import lines_of, markdown_of
-from studies.localisation_study.targets import targets_of, within
+from studies.frame.averages import worst_of
+from studies.frame.tables import markdown_of
+from studies.localisation_study import series as reference
+from studies.localisation_study.summary import ROWS, SMALLEST_IS_WORST, sheets_of, targets_of, within
 from studies.localisation_study.variants import VARIANTS
 
 
@@ -68,7 +68,7 @@ def test_of_several_seeds_the_worst_counts() -> None:
     a, b = sensor(), sensor(with_submap=row(0.02, 0.005, 0.05), online=no_pose())
     a["with_submap"]["coverage"], b["reinitialisation"]["right_share"] = 0.5, 0.6
     b["reinitialisation"]["wrong_called_good"] = 2
-    found = worst_of([a, b])
+    found = worst_of([a, b], SMALLEST_IS_WORST)
     assert found["with_submap"]["longitudinal_m"] == {"p95": 0.02, "max": 0.04}
     assert found["with_submap"]["lateral_m"] == {"p95": 0.01, "max": 0.02}
     assert found["with_submap"]["coverage"] == 0.5
@@ -77,22 +77,23 @@ def test_of_several_seeds_the_worst_counts() -> None:
 
 
 def test_tables_show_every_row_and_the_papers() -> None:
-    lines = list(lines_of(sensor()))
-    assert len([line for line in lines if not line.paper]) == len(ROWS) + len(VARIANTS)
-    assert len([line for line in lines if line.paper]) == len(reference.PAPER)
-    without = lines[1].cells
+    rows = sheets_of(result(vlp16=sensor()))[1].rows
+    assert len([cells for cells, style in rows if not style]) == len(ROWS) + len(VARIANTS)
+    assert len([cells for cells, style in rows if style == "dim"]) == len(reference.PAPER)
+    without = rows[1][0]
     assert without[:4] == (
         "paper, Table 2, without submap", "0.0841 / 0.2002", "0.3012 / 1.4518", "1.1388 / 6.2191",
     )  # fmt: skip
     assert without[5] == "FAIL / FAIL"
-    assert lines[0].cells[4:7] == ("97.1 %", "pass / pass", "pass / pass")
+    assert rows[0][0][4:7] == ("97.1 %", "pass / pass", "pass / pass")
 
 
 def test_markdown_is_one_table_a_sensor_with_equal_columns() -> None:
-    text = markdown_of(result(vlp16=sensor(), scala=sensor(with_submap=no_pose())), "gnd reproduce localisation")
+    sheets = sheets_of(result(vlp16=sensor(), scala=sensor(with_submap=no_pose())))
+    text = markdown_of(sheets, "gnd reproduce localisation")
     tables = [line for line in text.splitlines() if line.startswith("|")]
     assert len({line.count("|") for line in tables}) == 1
     assert text.count("no pose") == 3
-    assert "of every number the worst of the worlds" in text
+    assert "Of every number the worst of the worlds" in text
     assert "world 2: 300 m, 30 edits, 21.0 % of the Gaussians changed" in text
     assert "40 starts 2.5 m off, any heading: 39 right within 15 s (97.5 %)" in text

@@ -8,9 +8,8 @@ import pytest
 from traffic_world import result_of_study, study
 
 from studies.traffic_study.figures import spread
-from studies.traffic_study.reference import PACKET_BYTES
-from studies.traffic_study.targets import TARGETS, targets_of
-from studies.traffic_study.uploads import PARTS, raw_bytes
+from studies.traffic_study.summary import TARGETS, targets_of
+from studies.traffic_study.uploads import PACKET_BYTES, PARTS, raw_bytes
 
 Finished = tuple[Path, dict[str, Any]]
 

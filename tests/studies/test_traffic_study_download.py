@@ -21,7 +21,7 @@ from studies.traffic_study.download import (
     store_of,
     total_bytes,
 )
-from studies.traffic_study.options import TrafficOptions, street_options
+from studies.traffic_study.options import TrafficOptions, street_of
 
 LATTICE = LATTICES["standard"]
 
@@ -37,7 +37,7 @@ def some_gaussians(n: int, seed: int) -> Gaussians:
 
 @pytest.fixture(scope="module")
 def track() -> Track:
-    options = TrafficOptions(seed=5, street=street_options("usual", 150.0))
+    options = TrafficOptions(seed=5, street=street_of("usual", 150.0))
     return Track.of(street(5, options.street), options)
 
 

@@ -10,10 +10,17 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from gnd.gnd_map.tile_id import TileId
+from studies.frame.errors import ReproduceError
 from studies.traffic_study import clouds
-from studies.traffic_study.clouds import cloud_sizes, draco, laz
-from studies.traffic_study.errors import TrafficError
-from studies.traffic_study.pcd_file import lzf_compress, lzf_decompress, pcd_binary, pcd_compressed
+from studies.traffic_study.clouds import (
+    cloud_sizes,
+    draco,
+    laz,
+    lzf_compress,
+    lzf_decompress,
+    pcd_binary,
+    pcd_compressed,
+)
 
 
 def some_points(n: int = 500) -> Any:
@@ -61,7 +68,7 @@ def test_a_missing_library_leaves_a_row_that_says_so(monkeypatch: pytest.MonkeyP
     assert sizes["pcd"] == len(pcd_binary(some_points()))
     assert "laspy" in str(sizes["laz"])
     assert "DracoPy" in str(sizes["draco"])
-    with pytest.raises(TrafficError, match="peers"):
+    with pytest.raises(ReproduceError, match="peers"):
         laz(some_points())
 
 

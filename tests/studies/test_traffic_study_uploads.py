@@ -18,11 +18,10 @@ from gnd.schemas.changes import ChangeReport, TileChange
 from gnd.schemas.report_id import deterministic_report_id
 from gnd.vehicle_agent.packing import pack
 from gnd.vehicle_agent.report import on_lattice
+from studies.frame.errors import ReproduceError
 from studies.simulation.base_map import BaseMap
 from studies.simulation.result import EVIDENCE, VehicleResult
-from studies.traffic_study.cloud import Cloud
-from studies.traffic_study.errors import TrafficError
-from studies.traffic_study.uploads import upload
+from studies.traffic_study.uploads import Cloud, upload
 
 TILE = TileId(497353963154)
 DRIVE_M = 500.0
@@ -125,8 +124,8 @@ def test_a_report_that_is_refused_is_no_upload(cloud: Cloud) -> None:
     base = cloud.map()
     good = report_of(1, base)
     report = replace(good, tiles=(replace(good.tiles[0], pose_sigma_m=0.8),))
-    with pytest.raises(TrafficError, match="0 of 1 reports"):
+    with pytest.raises(ReproduceError, match="0 of 1 reports"):
         upload(result_of(report, base, packed=b""), base, cloud)
-    with pytest.raises(TrafficError, match="refused"):
+    with pytest.raises(ReproduceError, match="refused"):
         cloud.merge()
     assert base.shas == cloud.map().shas
