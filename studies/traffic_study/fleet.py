@@ -13,6 +13,7 @@ from gnd.gnd_map.codec import Lattice, snap
 from gnd.gnd_map.config import to_mapping
 from studies.frame.command import Bench
 from studies.frame.kept import SIMULATOR, key_of, sources_sha
+from studies.frame.pool import run_jobs
 from studies.simulation.base_map import BaseMap, read_base, write_base
 from studies.simulation.result import VehicleResult, read_result
 from studies.simulation.scores import Scored
@@ -102,7 +103,8 @@ class Fleet:
         path = self.files.home / f"map-{way.name}-{numbers.start:02d}.npz"
         write_base(held, path)
         tasks = [self._task(way, held, path, number) for number in numbers]
-        bench.run(f"drives {numbers.start + 1} to {numbers.stop}, {way.name}", drive_jobs(tasks))
+        title = f"drives {numbers.start + 1} to {numbers.stop}, {way.name}"
+        run_jobs(drive_jobs(tasks), bench.processes, bench.progress, title)
         return (read_result(task.result, task.key) for task in tasks)
 
     def _task(self, way: Way, held: BaseMap, path: Path, number: int) -> VehicleTask:

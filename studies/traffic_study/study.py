@@ -37,7 +37,8 @@ def traffic(options: TrafficOptions, bench: Bench) -> Report:
     if options.pcd_drives:
         jobs.append(Job("point cloud", prepare_cloud, (files, options.seed, options.world)))
     bench.run("world", jobs)
-    fleet, floats = _fleets(options, files, bench)
+    with bench.timed("drives"):
+        fleet, floats = _fleets(options, files, bench)
     jobs = [Job("download", download, (options, files, fleet)), Job("codecs", codecs_on_street, (options, files))]
     downloaded, codecs = bench.run("map and codecs", jobs)
     links = tuple(load_link(name) for name in ("3g", "4g", "5g"))
