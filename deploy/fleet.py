@@ -35,7 +35,7 @@ from gnd.tile_store.values import StoreConfig
 from gnd.vehicle_agent.agent import AgentConfig
 from gnd.vehicle_agent.detect.parameters import DetectParameters
 from gnd.vehicle_agent.features.layer_parameters import FeatureParameters
-from gnd.vehicle_agent.world_clock import Departure, WorldClock, make_clock
+from gnd.vehicle_agent.sources.world_clock import Departure, WorldClock, make_clock
 
 POLL_S = 0.2
 LOOK_S = 2.0

@@ -12,7 +12,7 @@ import gnd.cloud_merger.merger
 import gnd.deploy.roles
 import gnd.tile_store.server
 import gnd.vehicle_agent.agent
-import gnd.vehicle_agent.features.feature_work
+import gnd.vehicle_agent.features.layers
 from gnd.vehicle_agent.warm import warm_up
 
 __all__ = ["gnd"]

@@ -44,7 +44,7 @@ class RunFolder:
 
     @property
     def clock(self) -> Path:
-        """The time that the vehicles have in common, see `gnd.vehicle_agent.world_clock`."""
+        """The time that the vehicles have in common, see `gnd.vehicle_agent.sources.world_clock`."""
         return self.root / "clock.bin"
 
     def way(self, vehicle: str) -> Path:

@@ -15,12 +15,14 @@ from gnd.fleet_sim.drives import DriveConfig, DriveSimulation, simulate_drive
 from gnd.fleet_sim.street import street
 from gnd.gnd_map.arrays import F64
 from gnd.gnd_map.motion import Trajectory
-from gnd.schemas.drive import DriveItem, MotionSample
+from gnd.schemas.drive import DriveHeader, DriveItem, MotionSample
 from gnd.schemas.drive_mcap import DriveWriter, read_drive
 from gnd.vehicle_agent.local_map import LocalMap
 from gnd.vehicle_agent.localise import Localiser, PoseEstimate, localisation_error
+from gnd.vehicle_agent.sources.recording import first_fix
+from gnd.vehicle_agent.tiles_at_hand import localising_on
 from studies.figures import Figure
-from studies.localisation_scenes import MAPPING, map_of, newest_of, push, reference_of
+from studies.localisation_scenes import MAPPING, map_of, note_newest, reference_of
 
 COMMAND = "python -m studies clock"
 DRIVES = ((3, "VLP-16"), (3, "HDL-64E"), (11, "VLP-16"), (12, "VLP-16"))
@@ -33,7 +35,7 @@ class Recorded:
     """A drive, what is true of it, and the map that it is to be localised on."""
 
     items: tuple[DriveItem, ...]
-    T_vehicle_lidar: F64
+    header: DriveHeader
     reference: Trajectory
     local_map: LocalMap
 
@@ -60,17 +62,20 @@ def brisk_drive(seed: int, sensor: str, scans: int, folder: Path) -> Recorded:
         for item in drive.items():
             writer.add(item)
     _, local_map = map_of(simulate_drive(world, MAPPING, folder / "map.mcap"))
-    return Recorded(tuple(read_drive(path)), drive.header().T_vehicle_lidar, reference_of(path), local_map)
+    return Recorded(tuple(read_drive(path)), drive.header(), reference_of(path), local_map)
 
 
 def driven(recorded: Recorded, offset_s: Callable[[float], float], T_vehicle_lidar: F64 | None = None) -> Run:
     """Localise with motion samples stamped late by `offset_s` of the time since the start [s], or another mount."""
-    mount = recorded.T_vehicle_lidar if T_vehicle_lidar is None else T_vehicle_lidar
-    localiser, refined, online = Localiser(recorded.local_map, mount), list[PoseEstimate](), list[PoseEstimate]()
-    for item in _shifted(recorded.items, offset_s):
-        refined += [scan.estimate for scan in push(localiser, item)]
-        newest_of(localiser, online)
-    return Run(localiser, (*refined, *(scan.estimate for scan in localiser.flush())), tuple(online))
+    mount = recorded.header.T_vehicle_lidar if T_vehicle_lidar is None else T_vehicle_lidar
+    fix, items = first_fix(_shifted(recorded.items, offset_s), recorded.header.drive_id)
+    pipeline = localising_on(recorded.local_map, replace(recorded.header, T_vehicle_lidar=mount), fix)
+    refined, online = list[PoseEstimate](), list[PoseEstimate]()
+    for item in items:
+        output = pipeline.push(item)
+        refined += output.poses
+        note_newest(output, online)
+    return Run(pipeline.localiser, (*refined, *pipeline.finish().poses), tuple(online))
 
 
 def _shifted(items: Sequence[DriveItem], offset_s: Callable[[float], float]) -> list[DriveItem]:

@@ -68,7 +68,14 @@ def _driven_scans(scene: Street, world: World) -> Iterator[PosedScan]:
         drive = scene.drive(sensor, "before", 1, world.seed)
         found = [item for item in drive.items() if isinstance(item, Scan)]
         for scan in found[EVERY::EVERY]:
-            points = deskew(scan.points_m, scan.t_offset_ns, scan.t_ns, drive.truth, drive.T_vehicle_lidar, scan.t_ns)
+            points = deskew(
+                scan.points_m,
+                scan.t_offset_ns,
+                scan.t_ns,
+                drive.truth,
+                drive.simulation.header().T_vehicle_lidar,
+                scan.t_ns,
+            )
             yield points, drive.truth.at(scan.t_ns)
 
 

@@ -15,8 +15,9 @@ import numpy as np
 from gnd.fleet_sim.street import StreetOptions, street
 from gnd.gnd_map.arrays import F64
 from gnd.schemas.drive import MotionSample, Scan
-from gnd.vehicle_agent.localise import Localiser
+from gnd.vehicle_agent.tiles_at_hand import localising_on
 from studies.figures import Figure
+from studies.localisation_scenes import Localising
 from studies.short_drives import Drive, Street, gnss_offset_m, is_wrong
 
 COMMAND = "python -m studies first-pose"
@@ -32,7 +33,7 @@ class Start:
     first_ns: int
     last_ns: int
     offset_m: F64
-    localiser: Localiser
+    vehicle: Localising
     found_s: float = np.inf
     good_s: float = np.inf
     first_right: bool | None = None
@@ -62,8 +63,8 @@ def _starts(drive: Drive, seed: int) -> list[Start]:
     starts, held = [], drive.street.local_map()
     for _ in range(STARTS):
         first_ns = begin_ns + int(rng.uniform(0.0, latest_s) * 1e9)
-        localiser = Localiser(held, drive.T_vehicle_lidar)
-        starts.append(Start(first_ns, first_ns + int(WINDOW_S * 1e9), gnss_offset_m(rng), localiser))
+        vehicle = localising_on(held, drive.simulation.header(), drive.true_fix(first_ns))
+        starts.append(Start(first_ns, first_ns + int(WINDOW_S * 1e9), gnss_offset_m(rng), vehicle))
     for item in drive.items():
         for start in starts:
             if isinstance(item, (MotionSample, Scan)) and start.first_ns <= item.t_ns < start.last_ns:
@@ -72,22 +73,18 @@ def _starts(drive: Drive, seed: int) -> list[Start]:
 
 
 def _feed(start: Start, item: MotionSample | Scan, drive: Drive, rng: np.random.Generator) -> None:
-    localiser = start.localiser
     begin_s = process_time()
-    if isinstance(item, Scan):
-        localiser.push_scan(item)
-    else:
-        localiser.push_motion(item)
+    start.vehicle.push(item)
     start.longest_s = max(start.longest_s, process_time() - begin_s)
     if item.t_ns >= start.next_fix_ns:
-        localiser.push_gnss(drive.fix(item.t_ns, start.offset_m, rng))
+        start.vehicle.push(drive.fix(item.t_ns, start.offset_m, rng))
         start.next_fix_ns = item.t_ns + FIX_NS
     _note(start, drive)
 
 
 def _note(start: Start, drive: Drive) -> None:
     """What the newest estimate is worth."""
-    online = start.localiser.online
+    online = start.vehicle.localisation.online
     if online is None or online.t_ns <= start.seen_ns:
         return
     start.seen_ns = online.t_ns

@@ -19,10 +19,12 @@ from gnd.fleet_sim.world import STATES, State, World, WorldObject
 from gnd.gnd_map.se3 import T_from_R_t, exp_so3
 from gnd.gnd_map.tile import Tile
 from gnd.gnd_map.tile_id import TileId
-from gnd.schemas.drive import MotionSample, Scan
+from gnd.schemas.drive import Scan
 from gnd.vehicle_agent.local_map import LocalMap
-from gnd.vehicle_agent.localise import Localiser
+from gnd.vehicle_agent.localise import PoseEstimate
+from gnd.vehicle_agent.tiles_at_hand import localising_on
 from studies.figures import Figure
+from studies.localisation_scenes import Localising
 from studies.short_drives import Drive, Street, gnss_offset_m, is_wrong, local_map_of
 
 COMMAND = "python -m studies health"
@@ -108,34 +110,31 @@ def _tried(sensor: str, case: Case, place: Street) -> Told:
     drive = place.drive(sensor, case.state, 1, 7, empty=case.place != "street")
     rng, told = np.random.default_rng(SEED), Told()
     held = place.local_map()
-    localiser = Localiser(held, drive.T_vehicle_lidar)
     first_ns = int(drive.truth.t_ns[0]) + int(AT_S * 1e9)
     event_ns, end_ns = first_ns + int(EVENT_S * 1e9), first_ns + int(END_S * 1e9)
     offset_m, next_fix_ns, happened = gnss_offset_m(rng), first_ns, False
-    localiser.start_at(first_ns, drive.truth.at(first_ns), trusted=True)
+    vehicle = localising_on(held, drive.simulation.header(), drive.true_fix(first_ns))
+    vehicle.start_at(first_ns, drive.truth.at(first_ns), trusted=True)
     for item in drive.items():
         if not first_ns <= item.t_ns < end_ns:
             continue
         if item.t_ns >= event_ns and not happened:
             happened = True
-            _happens(case, localiser, held, drive, item.t_ns)
+            _happens(case, vehicle, held, drive, item.t_ns)
         if item.t_ns >= next_fix_ns:
-            localiser.push_gnss(drive.fix(item.t_ns, offset_m, rng))
+            vehicle.push(drive.fix(item.t_ns, offset_m, rng))
             next_fix_ns += FIX_NS
-        if isinstance(item, Scan):
-            localiser.push_scan(item)
-            if happened:
-                _note(told, localiser, drive, event_ns)
-        elif isinstance(item, MotionSample):
-            localiser.push_motion(item)
+        output = vehicle.push(item)
+        if isinstance(item, Scan) and happened:
+            _note(told, output.online, drive, event_ns)
     return told
 
 
-def _happens(case: Case, localiser: Localiser, held: LocalMap, drive: Drive, t_ns: int) -> None:
+def _happens(case: Case, vehicle: Localising, held: LocalMap, drive: Drive, t_ns: int) -> None:
     """The event of a case."""
     if case.is_pushed:
         push = T_from_R_t(exp_so3([0.0, 0.0, np.radians(case.turn_deg)]), [case.ahead_m, case.left_m, 0.0])
-        localiser.start_at(t_ns, drive.truth.at(t_ns) @ push, trusted=True)
+        vehicle.start_at(t_ns, drive.truth.at(t_ns) @ push, trusted=True)
     if case.tiles == "none":
         for tile_id in held.tiles:
             held.remove_tile(tile_id)
@@ -149,9 +148,8 @@ def _happens(case: Case, localiser: Localiser, held: LocalMap, drive: Drive, t_n
             held.set_tile(Tile(tile_id, 2, there[tile_id]))
 
 
-def _note(told: Told, localiser: Localiser, drive: Drive, event_ns: int) -> None:
+def _note(told: Told, online: PoseEstimate | None, drive: Drive, event_ns: int) -> None:
     """What is said now, and whether it is true."""
-    online = localiser.online
     if online is None or online.t_ns < event_ns:
         return
     after_s, off = (online.t_ns - event_ns) * 1e-9, drive.off(online.t_ns, online.T_map_vehicle)

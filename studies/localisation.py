@@ -20,14 +20,14 @@ from gnd.gnd_map.se3 import T_inverse
 from gnd.schemas.drive import Scan
 from gnd.schemas.drive_mcap import read_drive, read_header
 from gnd.vehicle_agent.local_map import LocalMap
-from gnd.vehicle_agent.localise import Localiser, PoseEstimate, localisation_error, localiser
+from gnd.vehicle_agent.localise import PoseEstimate, localisation_error, localiser
 from gnd.vehicle_agent.localise.graph import PoseGraph
 from gnd.vehicle_agent.localise.judge import Judge
 from gnd.vehicle_agent.localise.packed_scan import PackedScan
 from gnd.vehicle_agent.localise.refine import Refiner
 from gnd.vehicle_agent.localise.scan_odometry import ScanOdometry
 from studies.figures import Figure
-from studies.localisation_scenes import mapped_street, newest_of, push, reference_of, true_scans
+from studies.localisation_scenes import localising, mapped_street, note_newest, reference_of, true_scans
 from studies.odometry_alone import steps_of
 from studies.registering import registrations, rivals_of
 from studies.stopwatch import Stopwatch
@@ -95,18 +95,18 @@ def _drive(
     path: Path, local_map: LocalMap, watch: Stopwatch, scans: int = 1_000_000
 ) -> tuple[list[float], list[PoseEstimate]]:
     """Time of each online step (since the scan before, less what comes later), and the online poses."""
-    localising, estimates = Localiser(local_map, read_header(path).T_vehicle_lidar), list[PoseEstimate]()
+    vehicle, estimates = localising(path, local_map), list[PoseEstimate]()
     steps_s, before_s, spent_s = [], 0.0, 0.0
     with watch.worn(PARTS):
         for item in read_drive(path):
             begin_s = process_time()
-            push(localising, item)
+            output = vehicle.push(item)
             spent_s += process_time() - begin_s
             if isinstance(item, Scan):
                 online_s = spent_s - sum(watch.total_s[name] for name in LATER)
                 steps_s.append(online_s - before_s)
                 before_s = online_s
-            newest_of(localising, estimates)
+            note_newest(output, estimates)
             if len(steps_s) >= scans:
                 break
     return steps_s, estimates

@@ -15,11 +15,15 @@ from gnd.gnd_map.motion import Trajectory, deskew
 from gnd.gnd_map.se3 import transform
 from gnd.gnd_map.tile import Tile
 from gnd.gnd_map.tile_id import covering_corridor
-from gnd.schemas.drive import DriveItem, GnssFix, MotionSample, Scan
+from gnd.schemas.drive import Scan
 from gnd.schemas.drive_mcap import load_track, read_drive, read_header
 from gnd.vehicle_agent.local_map import LocalMap
-from gnd.vehicle_agent.localise import Localiser, PoseEstimate, RefinedScan
+from gnd.vehicle_agent.localise import LocaliserParameters, PoseEstimate
+from gnd.vehicle_agent.pipeline import Output, Pipeline
+from gnd.vehicle_agent.sources.recording import first_fix
+from gnd.vehicle_agent.tiles_at_hand import AllTilesHeld, localising_on
 
+Localising = Pipeline[AllTilesHeld]
 SEED = 1
 MAP_REACH_M = 70.0
 MAPPING = DriveConfig("map", "HDL-32E", "before", errors=PERFECT, car_share=0.0, cruise_mps=12.0)
@@ -60,19 +64,14 @@ def true_scans(path: Path) -> Iterator[tuple[F64, F64]]:
             yield points, reference.at(scan.t_ns)
 
 
-def push(localiser: Localiser, item: DriveItem) -> list[RefinedScan]:
-    """Feed one item; the scans that became final."""
-    if isinstance(item, MotionSample):
-        localiser.push_motion(item)
-    elif isinstance(item, GnssFix):
-        localiser.push_gnss(item)
-    elif isinstance(item, Scan):
-        return localiser.push_scan(item)
-    return []
+def localising(path: Path, local_map: LocalMap, parameters: LocaliserParameters | None = None) -> Localising:
+    """A vehicle that localises along a recorded drive."""
+    fix, _ = first_fix(read_drive(path), path)
+    return localising_on(local_map, read_header(path), fix, parameters)
 
 
-def newest_of(localiser: Localiser, estimates: list[PoseEstimate]) -> None:
+def note_newest(output: Output, estimates: list[PoseEstimate]) -> None:
     """Append the online pose when it is a new one that is not lost."""
-    online = localiser.online
+    online = output.online
     if online is not None and online.health != "lost" and (not estimates or online.t_ns > estimates[-1].t_ns):
         estimates.append(online)

@@ -16,11 +16,11 @@ from gnd.fleet_sim.drives import DriveConfig, simulate_drive
 from gnd.gnd_map.geodesy import LocalFrame
 from gnd.gnd_map.motion import Trajectory
 from gnd.schemas.drive import DriveItem, GnssFix, MotionSample, Scan
-from gnd.schemas.drive_mcap import read_drive, read_header
+from gnd.schemas.drive_mcap import read_drive
 from gnd.vehicle_agent.local_map import LocalMap
-from gnd.vehicle_agent.localise import Localiser, LocaliserParameters, PoseEstimate, localisation_error
+from gnd.vehicle_agent.localise import LocaliserParameters, PoseEstimate, localisation_error
 from studies.figures import Figure
-from studies.localisation_scenes import mapped_street, newest_of, push, reference_of
+from studies.localisation_scenes import localising, mapped_street, note_newest, reference_of
 
 COMMAND = "python -m studies scan-to-scan"
 SENSORS = ("VLP-16", "Scala")
@@ -79,13 +79,12 @@ def _figure(name: str, path: Path, local_map: LocalMap, trouble: Trouble, enable
 
 def online_poses(path: Path, local_map: LocalMap, trouble: Trouble, enabled: bool) -> tuple[list[PoseEstimate], int]:
     """The online poses of a drive, those that are called lost left out, and the number of its scans."""
-    localiser = Localiser(local_map, read_header(path).T_vehicle_lidar, parameters_of(enabled))
+    vehicle = localising(path, local_map, parameters_of(enabled))
     estimates: list[PoseEstimate] = []
     scans = 0
     for item in troubled(read_drive(path), trouble):
-        push(localiser, item)
         scans += isinstance(item, Scan)
-        newest_of(localiser, estimates)
+        note_newest(vehicle.push(item), estimates)
     return estimates, scans
 
 

@@ -70,11 +70,6 @@ class Drive:
     rate_hz: float
 
     @property
-    def T_vehicle_lidar(self) -> F64:
-        """The mount that the vehicle believes in."""
-        return np.asarray(self.simulation.header().T_vehicle_lidar)
-
-    @property
     def seconds(self) -> float:
         """How long it takes."""
         return self.simulation.scans / self.rate_hz
@@ -94,6 +89,11 @@ class Drive:
         """What a GNSS tells that is off by `offset_m` (3,) and some noise."""
         p = self.truth.at(t_ns)[:3, 3] + offset_m + GNSS_WHITE_M * rng.standard_normal(3)
         lat, lon, height = self.street.world.frame.geodetic_from_enu(p)
+        return GnssFix(t_ns, float(lat), float(lon), float(height), GNSS_M)
+
+    def true_fix(self, t_ns: int) -> GnssFix:
+        """Where the vehicle is, as no GNSS could tell."""
+        lat, lon, height = self.street.world.frame.geodetic_from_enu(self.truth.at(t_ns)[:3, 3])
         return GnssFix(t_ns, float(lat), float(lon), float(height), GNSS_M)
 
     def off(self, t_ns: int, T_map_vehicle: F64) -> tuple[float, float]:

@@ -1,12 +1,8 @@
-"""The vehicle on one page (GND, Figure 1): drive, download, localise, segment, detect, report, upload.
-
-Feature layers go the same way: `judge` is for them what `detect` and `report` are for voxels (SLAMCU, section 4).
-"""
+"""The agent: a recorded drive, a pipeline, and the link to the cloud. The vehicle on one page is `pipeline.py`."""
 
 import threading
 from typing import Any
 
-from gnd.schemas.drive import Scan
 from gnd.vehicle_agent.config import AgentConfig
 from gnd.vehicle_agent.memory import keep_small
 from gnd.vehicle_agent.result import write_json
@@ -33,20 +29,10 @@ def run_agent(config: AgentConfig, stop: threading.Event) -> dict[str, Any]:
         from gnd.vehicle_agent.features.mapping.mapper import run_mapper
 
         return run_mapper(config, stop)
-    with open_vehicle(config, stop) as vehicle:
-        for item in vehicle.drive():  # recording -> usable measurements in time order
-            if isinstance(item, Scan):
-                vehicle.download()  # position -> the tiles around and ahead, and what others changed
-            vehicle.look(item)  # what a camera detects waits for its pose
-            for refined in vehicle.localise(item):  # measurements + tiles -> scans with final poses
-                for scan in vehicle.segment(refined):  # rays against rays of other scans -> which points are movers
-                    vehicle.detect(scan)  # rays + tiles -> evidence and new Gaussians
-                    vehicle.report(scan)  # tiles left behind -> classes -> one report a district -> outbox
-                    vehicle.judge(scan)  # looks + feature tiles -> what exists, is gone, is new -> outbox
-        for scan in vehicle.segment_the_rest():
-            vehicle.detect(scan)
-            vehicle.judge(scan)
-        vehicle.report_the_rest()
+    with open_vehicle(config, stop) as vehicle:  # link to the cloud, tiles, outbox, and the pipeline between them
+        for item in vehicle.drive():  # recording -> measurements in time order
+            vehicle.push(item)  # download, localise, segment, detect, report: see `Pipeline.push`
+        vehicle.finish()  # what waits in the lags -> the last reports
         vehicle.upload()  # outbox -> acknowledged
         result = vehicle.result()
     result["traffic"] = vehicle.link.traffic()  # the link is closed: nothing comes after it

@@ -13,7 +13,7 @@ from gnd.vehicle_agent.errors import AgentConfigError
 from gnd.vehicle_agent.features.layer_parameters import FeatureParameters
 from gnd.vehicle_agent.localise.parameters import LocaliserParameters
 from gnd.vehicle_agent.segment.parameters import SegmentParameters
-from gnd.vehicle_agent.world_clock import Departure
+from gnd.vehicle_agent.sources.world_clock import Departure
 
 
 @dataclass(frozen=True, slots=True)
@@ -106,6 +106,17 @@ class ReportParameters:
 
 
 @dataclass(frozen=True, slots=True)
+class PipelineParameters:
+    """What a vehicle's algorithms go by."""
+
+    localise: LocaliserParameters = field(default_factory=LocaliserParameters)
+    segment: SegmentParameters = field(default_factory=SegmentParameters)
+    detect: DetectParameters = field(default_factory=DetectParameters)
+    report: ReportParameters = field(default_factory=ReportParameters)
+    features: FeatureParameters = field(default_factory=FeatureParameters)
+
+
+@dataclass(frozen=True, slots=True)
 class AgentConfig:
     """One vehicle agent.
 
@@ -156,6 +167,11 @@ class AgentConfig:
     def ledger_path(self) -> Path:
         """The traffic ledger of this vehicle."""
         return (self.ledger_dir or self.work_dir.parent / "ledger") / f"{self.vehicle}.jsonl"
+
+    @property
+    def pipeline(self) -> PipelineParameters:
+        """What the algorithms go by."""
+        return PipelineParameters(self.localise, self.segment, self.detect, self.report, self.features)
 
     @property
     def waits_for_tiles(self) -> bool:

@@ -43,8 +43,8 @@ from gnd.vehicle_agent.detect.uncertainty import PoseUncertainty
 from gnd.vehicle_agent.localise.estimates import PoseEstimate
 from gnd.vehicle_agent.localise.match_map import MatchMapCache
 from gnd.vehicle_agent.localise.parameters import RegistrationParameters
-from gnd.vehicle_agent.outbox import Outbox
 from gnd.vehicle_agent.packing import is_measured, pack
+from gnd.vehicle_agent.report_sink import ReportSink
 from gnd.vehicle_agent.segment.segmenter import SegmentedScan
 from gnd.vehicle_agent.surroundings import left_behind
 from gnd.vehicle_agent.tracks import Tracks
@@ -139,17 +139,18 @@ class Reporter:
     its recording again, makes the same ids; where it would put other tiles together than in its first life, each is
     stated once all the same. New Gaussians are moved onto the lattice that they travel on, so that the
     short form of a report and the whole one say the same, to the bit. `course` gives where the vehicle drives in its
-    own frame, as far as it knows.
+    own frame, as far as it knows; `statement` what is said of a tile, by default `statement_on_lattice`.
     """
 
     def __init__(
         self,
         detector: ChangeDetector,
-        outbox: Outbox,
+        outbox: ReportSink,
         identity: Identity,
         start_ns: int,
         parameters: ReportParameters,
         course: Callable[[], Course | None] = lambda: None,
+        statement: Callable[[Classification], TileChange] | None = None,
     ) -> None:
         self.classes: Counter[str] = Counter()
         self.counts: Counter[str] = Counter()
@@ -158,6 +159,7 @@ class Reporter:
         self.largest_shift = LargestShift()
         self._detector, self._outbox, self._who = detector, outbox, identity
         self._start_ns, self._parameters, self._course = start_ns, parameters, course
+        self._statement = statement or statement_on_lattice
         self._pending: dict[District, _Pending] = {}
         self._numbers: Counter[District] = Counter()
         self._stretch: _Stretch | None = None
@@ -181,7 +183,7 @@ class Reporter:
             self.counts["scans_uncertain"] += 1
             self._remember(segmented, "uncertain")
             return
-        if disagrees(estimate):
+        if estimate.disagrees:
             self.counts["scans_disagreeing"] += 1
             self._remember(segmented, "disagree")
         if not most.check_poses:
@@ -302,7 +304,7 @@ class Reporter:
             self.counts["voxels_beyond_map"] += int(beyond_map(found).sum())
             if found.observed.any():
                 doubt = doubt_of(found, account, day_of(self._now_ns))
-                self._take(replace(self._said(found), doubt=doubt), evidence.base, odometer_m)
+                self._take(replace(self._statement(found), doubt=doubt), evidence.base, odometer_m)
 
     def _without_pose_error(self, found: Classification, account: Account) -> Classification:
         """The classes without what a shift of the whole tile explains, although each stretch of the drive passed."""
@@ -339,10 +341,6 @@ class Reporter:
             self._report(district)  # the vehicle came back: one statement a tile and report
         pending = self._pending.setdefault(district, _Pending(odometer_m, self._here_ns))
         pending.add(change, base, odometer_m, self._here_ns)
-
-    def _said(self, found: Classification) -> TileChange:
-        """What the report says of a tile; a study may let it say something else."""
-        return on_lattice(tile_change(found))
 
     def _report(self, district: District) -> None:
         """One report of what is told, and one of what is held back: the short form would call its voxels observed."""
@@ -413,11 +411,11 @@ class Reporter:
         )
 
 
+def statement_on_lattice(found: Classification) -> TileChange:
+    """What a report says of a tile: its classes, and its new Gaussians on the lattice on which they travel."""
+    return on_lattice(tile_change(found))
+
+
 def on_lattice(change: TileChange) -> TileChange:
     """The change with its new Gaussians on the lattice "report"."""
     return replace(change, changed=snap(change.changed, REPORT))
-
-
-def disagrees(estimate: PoseEstimate) -> bool:
-    """Whether the refined pose departs from the online one beyond both their sigmas, where the localiser tells it."""
-    return estimate.disagrees

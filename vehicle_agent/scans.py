@@ -1,7 +1,6 @@
 """Scans that cannot be used are named, counted and left out; the drive goes on."""
 
 from collections import Counter
-from collections.abc import Iterable, Iterator
 
 import numpy as np
 
@@ -45,17 +44,16 @@ class Guard:
         self.last_problem = ""
         self._newest_ns: dict[type, int] = {}
 
-    def usable(self, items: Iterable[DriveItem]) -> Iterator[DriveItem]:
-        """The items that the vehicle can work with."""
-        for item in items:
-            try:
-                self._check(item)
-            except BadScan as problem:
-                self.bad[problem.state] += 1
-                self.last_problem = str(problem)
-                continue
-            self._newest_ns[type(item)] = item.t_ns
-            yield item
+    def admits(self, item: DriveItem) -> bool:
+        """Whether the vehicle can work with an item; if not, it is counted."""
+        try:
+            self._check(item)
+        except BadScan as problem:
+            self.bad[problem.state] += 1
+            self.last_problem = str(problem)
+            return False
+        self._newest_ns[type(item)] = item.t_ns
+        return True
 
     def _check(self, item: DriveItem) -> None:
         newest_ns = self._newest_ns.get(type(item), -1)

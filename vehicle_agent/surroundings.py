@@ -13,9 +13,8 @@ from gnd.gnd_map.geodesy import LocalFrame
 from gnd.gnd_map.tile import Tile
 from gnd.gnd_map.tile_id import TileId, covering_corridor
 from gnd.vehicle_agent.config import DownloadParameters
-from gnd.vehicle_agent.detect.detector import ChangeDetector
 from gnd.vehicle_agent.download import Fetched, TileFetcher
-from gnd.vehicle_agent.local_map import LocalMap
+from gnd.vehicle_agent.local_map import LocalMap, Touched
 from gnd.vehicle_agent.place import Place
 from gnd.vehicle_agent.plan import Need, in_time, needs
 
@@ -35,11 +34,11 @@ class Surroundings:
         self,
         local_map: LocalMap,
         fetcher: TileFetcher[Tile],
-        detector: ChangeDetector,
+        touched: Touched,
         parameters: DownloadParameters,
     ) -> None:
         self.counts: Counter[str] = Counter()
-        self._map, self._fetcher, self._detector = local_map, fetcher, detector
+        self._map, self._fetcher, self._touched = local_map, fetcher, touched
         self._parameters = parameters
         self._rate_byte_s = parameters.link_share * fetcher.link.rate_byte_s("down")
         self.wanted: tuple[TileId, ...] = ()
@@ -81,7 +80,7 @@ class Surroundings:
         if held is None or held.sha == tile.sha:
             self._newer.pop(tile.tile_id, None)
             return False
-        if self._detector.touched(tile.tile_id):
+        if self._touched(tile.tile_id):
             self.counts["later"] += tile.tile_id not in self._newer
             self._newer[tile.tile_id] = tile
             return False
@@ -142,7 +141,7 @@ class Surroundings:
         for tile_id in gone:
             del self._arrived[tile_id]
         for tile_id in left_behind(frame, self._map.tiles, here, limit_m):
-            if not self._detector.touched(tile_id):
+            if not self._touched(tile_id):
                 self._map.remove_tile(tile_id)
                 self._newer.pop(tile_id, None)
                 gone.append(tile_id)

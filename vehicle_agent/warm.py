@@ -137,5 +137,5 @@ def _localised(local_map: LocalMap, points_map_m: F64, frame: LocalFrame) -> lis
     for number in range(3):
         for k in range(_SWEEP_NS // _STEP_NS):
             localiser.push_motion(MotionSample(number * _SWEEP_NS + k * _STEP_NS, 0.0, 0.0))
-        refined += localiser.push_scan(Scan(number * _SWEEP_NS, seen, offset_ns))
+        refined += localiser.take_scan(Scan(number * _SWEEP_NS, seen, offset_ns))
     return [*refined, *localiser.flush()]

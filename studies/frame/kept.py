@@ -23,8 +23,8 @@ SIMULATOR: Final = ("fleet_sim", "gnd_map", "schemas")
 LOCALISER: Final = (
     *SIMULATOR,
     "vehicle_agent/localise",
-    *(f"vehicle_agent/{name}.py" for name in ("local_map", "place", "scans", "surroundings")),
-    "studies/simulation/held_tiles.py",
+    *(f"vehicle_agent/{name}.py" for name in ("local_map", "pipeline", "place", "scans", "surroundings")),
+    "vehicle_agent/tiles_at_hand.py",
 )
 _SUFFIXES: Final = (".py", ".json", ".npz", ".toml")
 _DECIDE_NOTHING: Final = ("cli.py", "pictures.py", "ellipsoids.py", "evaluate.py", "insert.py", "insert_drive.py")

@@ -9,22 +9,18 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gnd.gnd_map.arrays import F64, I64
-from gnd.gnd_map.geodesy import LocalFrame
-from gnd.gnd_map.grid import GridFrame
 from gnd.gnd_map.motion import Trajectory
 from gnd.gnd_map.se3 import T_inverse, log_so3
-from gnd.gnd_map.tile_id import TileId
-from gnd.schemas.drive import DriveHeader, DriveItem, GnssFix, MotionSample, ReferencePose, Scan
-from gnd.vehicle_agent.local_map import LocalMap
+from gnd.schemas.drive import DriveHeader, DriveItem, ReferencePose, Scan
+from gnd.vehicle_agent.config import PipelineParameters
 from gnd.vehicle_agent.localise.estimates import PoseEstimate
 from gnd.vehicle_agent.localise.localiser import Localiser
 from gnd.vehicle_agent.localise.parameters import LocaliserParameters
-from gnd.vehicle_agent.place import Place
-from gnd.vehicle_agent.scans import Guard
+from gnd.vehicle_agent.pipeline import Pipeline
+from gnd.vehicle_agent.sources.recording import first_fix
+from gnd.vehicle_agent.tiles_at_hand import TilesAtHand
 from studies.hard_cases.cases import Kidnap
 from studies.simulation.base_map import BaseMap
-from studies.simulation.held_tiles import HeldTiles
-from studies.simulation.streams import first_fix
 
 HEALTHS: Final = ("lost", "degraded", "good")
 _HEADING, _X, _Y = 2, 3, 4
@@ -115,64 +111,36 @@ def run_case(
         seed: of where that pose is.
 
     Raises:
-        ReproduceError: the drive has no GNSS fix.
+        VehicleError: the drive has no GNSS fix.
     """
-    fix, stream = first_fix(iter(items))
-    start = TileId.from_geodetic(fix.lat_rad, fix.lon_rad)
-    frame = LocalFrame.of_tile(start)
-    vehicle = _Vehicle(header, fix, base, LocalMap(GridFrame.around(frame, [start])), parameters)
-    all_items = list(stream)
-    poses = [item for item in all_items if isinstance(item, ReferencePose)]
-    T_map_anchor = frame.T_self_other(header.anchor)
-    true = Trajectory(
-        np.array([p.t_ns for p in poses], np.int64), T_map_anchor @ np.stack([p.T_map_vehicle for p in poses])
+    fix, stream = first_fix(items, header.drive_id)
+    pipeline = Pipeline(
+        header,
+        fix,
+        lambda local_map, touched: TilesAtHand(base, local_map, touched),
+        PipelineParameters(localise=parameters),
     )
+    all_items = list(stream)
+    true = _true(all_items, pipeline.place.frame.T_self_other(header.anchor))
     if kidnap is not None:
         first_ns = next(item.t_ns for item in all_items if isinstance(item, Scan))
-        vehicle.localiser.start_at(first_ns, _displaced(true.at(first_ns), kidnap, seed), trusted=True)
-    for item in Guard().usable(item for item in all_items if not isinstance(item, ReferencePose)):
-        vehicle.push(item)
-    refined = Poses.of(vehicle.finish(), true)
-    return CaseRun(refined, Poses.of(vehicle.online, true), vehicle.scans, clock_offset_of(vehicle.localiser))
+        pipeline.start_at(first_ns, _displaced(true.at(first_ns), kidnap, seed), trusted=True)
+    refined: list[PoseEstimate] = []
+    online: list[PoseEstimate] = []  # one pose a scan, those called lost too
+    for item in all_items:
+        output = pipeline.push(item)
+        refined += output.poses
+        if output.online is not None and (not online or output.online.t_ns > online[-1].t_ns):
+            online.append(output.online)
+    refined += pipeline.finish().poses
+    clock = clock_offset_of(pipeline.localiser)
+    return CaseRun(Poses.of(refined, true), Poses.of(online, true), pipeline.scans, clock)
 
 
-class _Vehicle:
-    """A localiser over held tiles; keeps its online pose of every scan.
-
-    Attributes:
-        localiser: of the vehicle.
-        online: one pose a scan, those called lost too.
-        scans: that arrived.
-    """
-
-    def __init__(
-        self, header: DriveHeader, fix: GnssFix, base: BaseMap, local_map: LocalMap, parameters: LocaliserParameters
-    ) -> None:
-        self.localiser = Localiser(local_map, header.T_vehicle_lidar, parameters)
-        self.online: list[PoseEstimate] = []
-        self.scans = 0
-        self._held = HeldTiles(base, local_map, None)
-        self._place = Place(local_map.grid_frame.frame, fix)
-        self._refined: list[PoseEstimate] = []
-
-    def push(self, item: DriveItem) -> None:
-        """Take a measurement."""
-        if isinstance(item, Scan):
-            self.scans += 1
-            self._held.follow(self._place)
-            self._refined += [refined.estimate for refined in self.localiser.push_scan(item)]
-        elif isinstance(item, MotionSample):
-            self.localiser.push_motion(item)
-        elif isinstance(item, GnssFix):
-            self.localiser.push_gnss(item)
-        online = self.localiser.online
-        if online is not None and (not self.online or online.t_ns > self.online[-1].t_ns):
-            self.online.append(online)
-        self._place.take(item, online)
-
-    def finish(self) -> list[PoseEstimate]:
-        """End the drive and give all refined poses."""
-        return [*self._refined, *(refined.estimate for refined in self.localiser.flush())]
+def _true(items: Iterable[DriveItem], T_map_anchor: F64) -> Trajectory:
+    poses = [item for item in items if isinstance(item, ReferencePose)]
+    T_anchor_vehicle = np.stack([pose.T_map_vehicle for pose in poses])
+    return Trajectory(np.array([pose.t_ns for pose in poses], np.int64), T_map_anchor @ T_anchor_vehicle)
 
 
 def _displaced(T_map_vehicle: F64, kidnap: Kidnap, seed: int) -> F64:

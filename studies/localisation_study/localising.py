@@ -5,22 +5,17 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from gnd.gnd_map.geodesy import LocalFrame
-from gnd.gnd_map.grid import GridFrame
 from gnd.gnd_map.motion import Trajectory
-from gnd.gnd_map.tile_id import TileId
 from gnd.schemas.drive import DriveHeader, DriveItem, GnssFix, ReferencePose, Scan
-from gnd.vehicle_agent.local_map import LocalMap
+from gnd.vehicle_agent.config import PipelineParameters
 from gnd.vehicle_agent.localise.estimates import PoseEstimate
 from gnd.vehicle_agent.localise.parameters import LocaliserParameters
-from gnd.vehicle_agent.place import Place
-from gnd.vehicle_agent.scans import Guard
+from gnd.vehicle_agent.pipeline import Pipeline
+from gnd.vehicle_agent.sources.recording import first_fix
+from gnd.vehicle_agent.tiles_at_hand import TilesAtHand
 from studies.localisation_study.series import PoseSeries
 from studies.localisation_study.variants import Variant
 from studies.simulation.base_map import BaseMap
-from studies.simulation.held_tiles import HeldTiles
-from studies.simulation.poses import Localising
-from studies.simulation.streams import first_fix
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -41,32 +36,29 @@ class Vehicle:
     """
 
     def __init__(self, header: DriveHeader, fix: GnssFix, base: BaseMap, parameters: LocaliserParameters) -> None:
-        start = TileId.from_geodetic(fix.lat_rad, fix.lon_rad)
-        frame = LocalFrame.of_tile(start)
-        local_map = LocalMap(GridFrame.around(frame, [start]))
+        self.pipeline = Pipeline(
+            header,
+            fix,
+            lambda local_map, touched: TilesAtHand(base, local_map, touched),
+            PipelineParameters(localise=parameters),
+        )
         self.scans = 0
         self.online: list[PoseEstimate] = []
-        self.T_map_anchor = frame.T_self_other(header.anchor)
-        self._held = HeldTiles(base, local_map, None)
-        self._place = Place(frame, fix)
-        self._localiser = Localising(header, local_map, parameters)
+        self.T_map_anchor = self.pipeline.place.frame.T_self_other(header.anchor)
         self._final: list[PoseEstimate] = []
         self._newest_ns = -1
 
     def push(self, item: DriveItem) -> None:
         """Take a measurement."""
-        if isinstance(item, Scan):
-            self._held.follow(self._place)
-        self._final += [refined.estimate for refined in self._localiser.push(item)]
-        online = self._localiser.online
-        if online is not None and online.t_ns > self._newest_ns:
-            self._newest_ns = online.t_ns
-            self.online += [online] if online.health != "lost" else []
-        self._place.take(item, online)
+        output = self.pipeline.push(item)
+        self._final += output.poses
+        if output.online is not None and output.online.t_ns > self._newest_ns:
+            self._newest_ns = output.online.t_ns
+            self.online += [output.online] if output.online.health != "lost" else []
 
     def finish(self) -> list[PoseEstimate]:
         """End the drive and give all final poses."""
-        self._final += [refined.estimate for refined in self._localiser.flush()]
+        self._final += self.pipeline.finish().poses
         return self._final
 
     def reference(self, poses: Iterable[ReferencePose]) -> Trajectory:
@@ -93,13 +85,12 @@ def localise(
         variant: what is done to the measurements.
 
     Raises:
-        ReproduceError: the drive has no GNSS fix.
+        VehicleError: the drive has no GNSS fix.
     """
-    fix, all_items = first_fix(iter(items))
+    fix, all_items = first_fix(items, header.drive_id)
     vehicle = Vehicle(variant.header(header), fix, base, parameters)
     reference: list[ReferencePose] = []
-    guard = Guard()
-    for item in guard.usable(_changed(all_items, variant, vehicle)):
+    for item in _changed(all_items, variant, vehicle):
         if isinstance(item, ReferencePose):
             reference.append(item)
         else:

@@ -11,10 +11,10 @@ from gnd.gnd_map.arrays import F64
 from gnd.gnd_map.motion import Trajectory
 from gnd.schemas.drive import DriveHeader, DriveItem, GnssFix, ReferencePose, Scan
 from gnd.vehicle_agent.localise.parameters import LocaliserParameters
+from gnd.vehicle_agent.sources.recording import first_fix
 from studies.localisation_study.localising import Vehicle
 from studies.localisation_study.series import PoseSeries
 from studies.simulation.base_map import BaseMap
-from studies.simulation.streams import first_fix
 
 GNSS_M: Final = 2.5
 WITHIN_S: Final = 15.0
@@ -74,7 +74,7 @@ def run_trial(
     part = items[bisect_left(items, begin_ns, key=_t_ns) : bisect_left(items, end_ns, key=_t_ns)]
     poses = [item for item in part if isinstance(item, ReferencePose)]
     rest = [item for item in part if not isinstance(item, ReferencePose)]
-    fix, stream = first_fix(_other_fixes(rest, header, poses, np.random.default_rng([seed, begin_ns])))
+    fix, stream = first_fix(_other_fixes(rest, header, poses, np.random.default_rng([seed, begin_ns])), header.drive_id)
     vehicle = Vehicle(header, fix, base, parameters)
     scans = _drive(vehicle, stream)
     return judged(PoseSeries.of(vehicle.online, vehicle.reference(poses)), begin_ns, scans)

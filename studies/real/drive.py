@@ -19,9 +19,11 @@ from gnd.vehicle_agent.detect.detector import ChangeDetector
 from gnd.vehicle_agent.detect.parameters import DetectParameters
 from gnd.vehicle_agent.detect.uncertainty import PoseUncertainty
 from gnd.vehicle_agent.local_map import LocalMap
-from gnd.vehicle_agent.localise import Localiser, RefinedScan
+from gnd.vehicle_agent.localise import RefinedScan
+from gnd.vehicle_agent.pipeline import Parts
 from gnd.vehicle_agent.segment.parameters import SegmentParameters
 from gnd.vehicle_agent.segment.segmenter import MotionSegmenter, SegmentedScan
+from gnd.vehicle_agent.tiles_at_hand import localising_on
 from studies.frame.errors import RealDataError
 from studies.real.scene import Scene
 from studies.real.voxels import keys_of
@@ -86,22 +88,15 @@ def refined_scans(scene: Scene, local_map: LocalMap, scans: Iterable[Scan], pose
     if poses == "reference":
         yield from map(scene.refined, scans)
         return
-    localiser = Localiser(local_map, scene.T_vehicle_lidar)
-    small: list[MotionSample | GnssFix] = sorted([*scene.motion, *scene.gnss], key=lambda item: item.t_ns)
-    for scan in scans:
-        while small and small[0].t_ns <= scan.t_ns:
-            _push(localiser, small.pop(0))
-        yield from localiser.push_scan(scan)
-    for item in small:
-        _push(localiser, item)
-    yield from localiser.flush()
-
-
-def _push(localiser: Localiser, item: MotionSample | GnssFix) -> None:
-    if isinstance(item, MotionSample):
-        localiser.push_motion(item)
-    else:
-        localiser.push_gnss(item)
+    seen: list[RefinedScan] = []
+    vehicle = localising_on(local_map, scene.header, scene.gnss[0], parts=Parts(placed=(seen.append,)))
+    items: list[MotionSample | GnssFix | Scan] = [*scene.motion, *scene.gnss, *scans]
+    for item in sorted(items, key=lambda item: (item.t_ns, isinstance(item, Scan))):
+        vehicle.push(item)
+        yield from seen
+        seen.clear()
+    vehicle.finish()
+    yield from seen
 
 
 def detect(scene: Scene, local_map: LocalMap, scans: Iterable[SegmentedScan], parameters: DetectParameters) -> Found:

@@ -12,7 +12,7 @@ from gnd.gnd_map.grid import GridFrame
 from gnd.gnd_map.motion import Trajectory, deskew
 from gnd.gnd_map.se3 import exp_so3, transform
 from gnd.gnd_map.tile_id import covering_corridor
-from gnd.schemas.drive import GnssFix, MotionSample, Scan
+from gnd.schemas.drive import DriveHeader, GnssFix, MotionSample, Scan
 from gnd.vehicle_agent.importer import fixes_of, map_track, motion_of
 from gnd.vehicle_agent.importers.cleaning import cleaned
 from gnd.vehicle_agent.importers.lidar_odometry import Progress, reference_ns
@@ -43,6 +43,11 @@ class Scene:
 
     def __len__(self) -> int:
         return len(self.scans)
+
+    @property
+    def header(self) -> DriveHeader:
+        """Of a drive in this scene, its mount taken as given."""
+        return DriveHeader("scene", "vehicle", "LiDAR", self.grid_frame.frame, self.T_vehicle_lidar)
 
     @property
     def positions_m(self) -> F64:

@@ -6,7 +6,7 @@ be searched. Its final poses are held against two references: the LiDAR track th
 GICP of each scan on the points of the mapping scans, which shares no code with ours.
 """
 
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import asdict, dataclass, replace
 from typing import Any, Final
 
@@ -20,9 +20,10 @@ from gnd.schemas.drive import GnssFix, MotionSample, Scan
 from gnd.vehicle_agent.importers.recording import GNSS_SIGMA_M
 from gnd.vehicle_agent.importers.splits import chosen_scans
 from gnd.vehicle_agent.local_map import LocalMap
-from gnd.vehicle_agent.localise import Localiser, LocaliserParameters, PoseEstimate, RefinedScan, localisation_error
+from gnd.vehicle_agent.localise import LocaliserParameters, PoseEstimate, localisation_error
 from gnd.vehicle_agent.localise.parameters import RegistrationParameters
 from gnd.vehicle_agent.localise.refine_parameters import RefineParameters
+from gnd.vehicle_agent.tiles_at_hand import localising_on
 from studies.real.drive import local_map_of
 from studies.real.scene import Scene, in_range
 
@@ -88,23 +89,14 @@ METHODS: Final = {  # the wheels stand on the road only as well as the recording
 
 def localised(half: Half, seed: int, parameters: LocaliserParameters) -> Localised:
     """The driven scans through the localiser."""
-    scene, localiser = half.scene, Localiser(half.local_map, half.scene.T_vehicle_lidar, parameters)
-    estimates = [scan.estimate for scan in _fed(localiser, half.driven, scene.motion, _off(scene, seed))]
-    return Localised(tuple(estimates), localiser.dropped_scans, localiser.initialisations)
-
-
-def _fed(
-    localiser: Localiser, scans: Sequence[Scan], motion: Sequence[MotionSample], gnss: Sequence[GnssFix]
-) -> Iterator[RefinedScan]:
-    items: list[MotionSample | GnssFix | Scan] = [*motion, *gnss, *scans]
+    scene, fixes = half.scene, _off(half.scene, seed)
+    vehicle = localising_on(half.local_map, scene.header, fixes[0], parameters)
+    items: list[MotionSample | GnssFix | Scan] = [*scene.motion, *fixes, *half.driven]
+    estimates: list[PoseEstimate] = []
     for item in sorted(items, key=lambda item: (item.t_ns, isinstance(item, Scan))):
-        if isinstance(item, MotionSample):
-            localiser.push_motion(item)
-        elif isinstance(item, GnssFix):
-            localiser.push_gnss(item)
-        else:
-            yield from localiser.push_scan(item)
-    yield from localiser.flush()
+        estimates += vehicle.push(item).poses
+    estimates += vehicle.finish().poses
+    return Localised(tuple(estimates), vehicle.localiser.dropped_scans, vehicle.localiser.initialisations)
 
 
 def _off(scene: Scene, seed: int) -> list[GnssFix]:

@@ -40,6 +40,11 @@ class BaseMap:
         """Return which version of a tile this is."""
         return self.versions.get(tile_id, 1)
 
+    def tile(self, tile_id: TileId) -> Tile | None:
+        """Return a tile; None where the map has none, or nothing in it."""
+        gaussians = self.tiles.get(tile_id)
+        return Tile(tile_id, self.version(tile_id), gaussians) if gaussians is not None and len(gaussians) else None
+
     @cached_property
     def shas(self) -> dict[TileId, bytes]:
         """Content hash of each tile."""

@@ -1,64 +1,22 @@
-"""Scans with final poses: from the reference poses with or without an error, or from the vehicle's own localiser."""
+"""Scans with final poses from the reference poses, with or without an error, in place of the vehicle's localiser."""
 
 from collections import deque
 from collections.abc import Iterator
 from math import exp
-from typing import Final, Protocol
+from typing import Final
 
 import numpy as np
 
 from gnd.gnd_map.arrays import F64
 from gnd.gnd_map.motion import Trajectory, deskew
 from gnd.gnd_map.se3 import exp_so3, transform
-from gnd.schemas.drive import DriveHeader, DriveItem, GnssFix, MotionSample, ReferencePose, Scan
+from gnd.schemas.drive import DriveHeader, DriveItem, ReferencePose, Scan
 from gnd.vehicle_agent.local_map import LocalMap
-from gnd.vehicle_agent.localise.estimates import PoseEstimate, RefinedScan
-from gnd.vehicle_agent.localise.localiser import Localiser
-from gnd.vehicle_agent.localise.parameters import LocaliserParameters
+from gnd.vehicle_agent.localise.estimates import Cause, Health, PoseEstimate, RefinedScan
 from studies.simulation.options import PoseSource
 
 TIME_CONSTANT_S: Final = 2.0
 _KEPT_NS: Final = 200_000_000
-
-
-class Localisation(Protocol):
-    """What turns measurements into scans with final poses."""
-
-    @property
-    def online(self) -> PoseEstimate | None:
-        """The newest pose."""
-
-    def push(self, item: DriveItem) -> list[RefinedScan]:
-        """Take the next measurement; give the scans whose poses became final."""
-
-    def flush(self) -> Iterator[RefinedScan]:
-        """Give the scans that are still held."""
-
-
-class Localising:
-    """The vehicle's own localiser, as the agent runs it."""
-
-    def __init__(self, header: DriveHeader, local_map: LocalMap, parameters: LocaliserParameters) -> None:
-        self._localiser = Localiser(local_map, header.T_vehicle_lidar, parameters)
-
-    @property
-    def online(self) -> PoseEstimate | None:
-        """The newest pose."""
-        return self._localiser.online
-
-    def push(self, item: DriveItem) -> list[RefinedScan]:
-        """Feed the localiser; reference poses it never sees."""
-        if isinstance(item, MotionSample):
-            self._localiser.push_motion(item)
-        elif isinstance(item, GnssFix):
-            self._localiser.push_gnss(item)
-        elif isinstance(item, Scan):
-            return self._localiser.push_scan(item)
-        return []
-
-    def flush(self) -> Iterator[RefinedScan]:
-        """Give the scans that are still held."""
-        return self._localiser.flush()
 
 
 class FromReference:
@@ -80,6 +38,11 @@ class FromReference:
         self._error = np.zeros(6)
         self._poses: deque[tuple[int, F64]] = deque()
         self._waiting: deque[Scan] = deque()
+
+    @property
+    def state(self) -> tuple[Health, Cause]:
+        """Health and cause now."""
+        return ("lost", "searching") if self.online is None else (self.online.health, self.online.cause)
 
     def push(self, item: DriveItem) -> list[RefinedScan]:
         """Take a reference pose or a scan; a scan comes out when the poses reach its end."""

@@ -1,13 +1,11 @@
 """Measurements on their way from the simulator to the vehicle."""
 
 from collections.abc import Iterable, Iterator
-from itertools import chain
 from pathlib import Path
 
 from gnd.schemas.drive import DriveHeader, DriveItem, GnssFix, ReferencePose, Scan
 from gnd.schemas.drive_mcap import DriveWriter
 from gnd.schemas.drive_messages import fix_of, gnss_of, pose_message_of, reference_of
-from studies.frame.errors import ReproduceError
 from studies.frame.pool import Tick
 
 
@@ -34,17 +32,3 @@ def recorded(items: Iterable[DriveItem], header: DriveHeader, path: Path) -> Ite
         for item in items:
             writer.add(item)
             yield item
-
-
-def first_fix(items: Iterator[DriveItem]) -> tuple[GnssFix, Iterator[DriveItem]]:
-    """Return the first position, which places the map frame, and all items again.
-
-    Raises:
-        ReproduceError: there is none.
-    """
-    before: list[DriveItem] = []
-    for item in items:
-        before.append(item)
-        if isinstance(item, GnssFix):
-            return item, chain(before, items)
-    raise ReproduceError("the drive has no GNSS fix: the vehicle would not know where it is")

@@ -1,10 +1,8 @@
 """One vehicle from measurements to uploads, in one process: localise, segment, detect, report, as the agent does."""
 
-from collections import Counter
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from tempfile import TemporaryDirectory
 from time import process_time
 from typing import Any
 
@@ -12,28 +10,26 @@ import numpy as np
 
 from gnd.fleet_sim.drives import DriveConfig, DriveSimulation
 from gnd.fleet_sim.world import read_world
-from gnd.gnd_map.geodesy import LocalFrame
-from gnd.gnd_map.grid import GridFrame
 from gnd.gnd_map.motion import Trajectory
-from gnd.gnd_map.tile_id import TileId
-from gnd.schemas.changes import TileChange
-from gnd.schemas.drive import DriveHeader, DriveItem, ReferencePose, Scan
-from gnd.vehicle_agent.detect.classify import Classification, tile_change
+from gnd.schemas.drive import DriveHeader, DriveItem, ReferencePose
+from gnd.vehicle_agent.config import PipelineParameters
+from gnd.vehicle_agent.detect.classify import tile_change
+from gnd.vehicle_agent.detect.parameters import DetectParameters
 from gnd.vehicle_agent.errors import LocaliseError
 from gnd.vehicle_agent.local_map import LocalMap
 from gnd.vehicle_agent.localise.estimates import PoseEstimate, localisation_error
-from gnd.vehicle_agent.outbox import Outbox
-from gnd.vehicle_agent.place import Place
-from gnd.vehicle_agent.report import Identity, Reporter
-from gnd.vehicle_agent.scans import Guard
-from gnd.vehicle_agent.segment import MotionSegmenter, SegmentedScan
+from gnd.vehicle_agent.pipeline import Localisation, Parts, Pipeline
+from gnd.vehicle_agent.report import Identity, statement_on_lattice
+from gnd.vehicle_agent.report_sink import ReportList
+from gnd.vehicle_agent.segment import SegmentedScan
+from gnd.vehicle_agent.sources.recording import first_fix
+from gnd.vehicle_agent.tiles_at_hand import TilesAtHand
 from studies.frame.pool import Tick
 from studies.simulation.base_map import BaseMap, read_base
 from studies.simulation.baseline import CloudVehicle, read_cloud
-from studies.simulation.held_tiles import HeldTiles
 from studies.simulation.masses import Watch, Watcher
 from studies.simulation.options import MethodParameters, PoseSource
-from studies.simulation.poses import FromReference, Localisation, Localising
+from studies.simulation.poses import FromReference
 from studies.simulation.result import (
     MoverLabels,
     RecordingDetector,
@@ -42,9 +38,7 @@ from studies.simulation.result import (
     evidence_columns,
     write_result,
 )
-from studies.simulation.streams import as_recorded, first_fix, recorded, ticking
-
-_ALL_LETTERS = 1_000_000
+from studies.simulation.streams import as_recorded, recorded, ticking
 
 
 @dataclass(frozen=True, slots=True)
@@ -80,13 +74,6 @@ class VehicleTask:
     rounded: bool = True
 
 
-class MeasuredReporter(Reporter):
-    """The reporter, without the lattice: what it says is as it was measured."""
-
-    def _said(self, found: Classification) -> TileChange:
-        return tile_change(found)
-
-
 def run_vehicle(task: VehicleTask, tick: Tick) -> None:
     """Simulate a drive, run the vehicle on it and write its result."""
     simulation = DriveSimulation(read_world(task.world), task.drive)
@@ -117,89 +104,77 @@ def drive(
         labels: which points lie on movers, for the account of how many were found; a recording has none.
 
     Raises:
-        ReproduceError: the drive has no GNSS fix.
+        VehicleError: the drive has no GNSS fix.
     """
-    started_s = process_time()
-    with TemporaryDirectory() as folder:
-        outbox = Outbox(Path(folder) / "outbox.sqlite")
-        try:
-            run = _Run(header, items, base, outbox, task, labels)
-            run.to_the_end()
-            letters = outbox.due(2**62, _ALL_LETTERS)
-        finally:
-            outbox.close()
+    started_s, outbox = process_time(), ReportList()
+    run = _Run(header, items, base, outbox, task, labels)
+    run.to_the_end()
+    reports = sorted(outbox.reports, key=lambda report: report.report_id)
     row, evidence = voxels.columns(run.detector.taken, lambda found: evidence_columns(found, task.method))
     pcd, pcd_bytes = run.pcd_report()
     stats = run.stats() | {"pcd_bytes": pcd_bytes, "cpu_s": round(process_time() - started_s, 2)}
-    reports, packed = tuple(letter.body for letter in letters), tuple(letter.packed for letter in letters)
-    return VehicleResult(task.drive.vehicle, task.sensor, reports, row, evidence, stats, run.watched(), pcd, packed)
+    bodies, packed = tuple(report.body for report in reports), tuple(report.packed for report in reports)
+    return VehicleResult(task.drive.vehicle, task.sensor, bodies, row, evidence, stats, run.watched(), pcd, packed)
 
 
 class _Run:
-    """The parts of one vehicle, put together as `gnd.vehicle_agent.vehicle` does."""
+    """A pipeline with the base map at hand, and what the study writes down beside it."""
 
     def __init__(
         self,
         header: DriveHeader,
         items: Iterable[DriveItem],
         base: BaseMap,
-        outbox: Outbox,
+        outbox: ReportList,
         task: VehicleTask,
         labels: MoverLabels | None,
     ) -> None:
-        fix, self._items = first_fix(iter(items))
-        start = TileId.from_geodetic(fix.lat_rad, fix.lon_rad)
-        frame, method = LocalFrame.of_tile(start), task.method
-        local_map = LocalMap(GridFrame.around(frame, [start]))
-        self.detector = RecordingDetector(local_map, method.detect)
-        self.detector.taken = []
-        self._held = HeldTiles(base, local_map, self.detector)
-        self._place = Place(frame, fix)
-        self._guard = Guard()
-        self._localisation = _localisation(header, local_map, task)
-        self._segmenter = MotionSegmenter(method.segment)
-        who = Identity(header.vehicle, header.drive_id, header.sensor_model, "ndt", "gnd reproduce simulation")
-        reporter = Reporter if task.rounded else MeasuredReporter
-        self._reporter = reporter(self.detector, outbox, who, fix.t_ns, method.report)
-        self._watcher = Watcher(task.watch, base, local_map.grid_frame, method.detect) if task.watch else None
-        self._cloud = CloudVehicle(read_cloud(task.cloud), frame) if task.cloud else None
+        (fix, self._items), method = first_fix(items, task.key), task.method
         self._labels = labels
+        self._watcher: Watcher | None = None
+        self._cloud: CloudVehicle | None = None
+        self.detector: RecordingDetector
+        self._pipeline = Pipeline(
+            header,
+            fix,
+            lambda local_map, touched: TilesAtHand(base, local_map, touched),
+            PipelineParameters(method.localise, method.segment, method.detect, method.report),
+            identity=Identity(header.vehicle, header.drive_id, header.sensor_model, "ndt", "gnd reproduce simulation"),
+            outbox=outbox,
+            parts=Parts(
+                localisation=_localisation(header, task),
+                detector=self._recording,
+                statement=statement_on_lattice if task.rounded else tile_change,
+                watch=(self._see,),
+            ),
+        )
+        grid_frame = self._pipeline.local_map.grid_frame
+        self._watcher = Watcher(task.watch, base, grid_frame, method.detect) if task.watch else None
+        self._cloud = CloudVehicle(read_cloud(task.cloud), grid_frame.frame) if task.cloud else None
         self._estimates: list[PoseEstimate] = []
         self._reference: list[ReferencePose] = []
-        self._T_map_anchor = frame.T_self_other(header.anchor)
-        self._counts: Counter[str] = Counter()
+        self._T_map_anchor = grid_frame.frame.T_self_other(header.anchor)
 
     def to_the_end(self) -> None:
-        """The loop of `gnd.vehicle_agent.agent`, with the base map at hand and the outbox as the end."""
-        for item in self._guard.usable(self._items):
+        """Feed the pipeline; true poses go in too, for the localisation that goes by them."""
+        for item in self._items:
             if isinstance(item, ReferencePose):
                 self._reference.append(item)
-            if isinstance(item, Scan):
-                self._counts["scans"] += 1
-                self._held.follow(self._place)
-            for refined in self._localisation.push(item):
-                for scan in self._segmenter.push(refined):
-                    self._detect(scan)
-            self._place.take(item, self._localisation.online)
-        for scan in self._rest():
-            self._detect(scan)
-        self._reporter.report_all(self._place.odometer_m)
+            self._estimates += self._pipeline.push(item).poses
+        self._estimates += self._pipeline.finish().poses
 
-    def _rest(self) -> Iterator[SegmentedScan]:
-        for refined in self._localisation.flush():
-            yield from self._segmenter.push(refined)
-        yield from self._segmenter.flush()
+    def _recording(self, local_map: LocalMap, parameters: DetectParameters) -> RecordingDetector:
+        self.detector = RecordingDetector(local_map, parameters)
+        self.detector.taken = []
+        return self.detector
 
-    def _detect(self, segmented: SegmentedScan) -> None:
-        self._estimates.append(segmented.scan.estimate)
-        self._reporter.add_scan(segmented)
+    def _see(self, segmented: SegmentedScan) -> None:
         if self._labels is not None:
             self._labels.compare(segmented)
         if self._watcher is not None:
             self._watcher.add_scan(segmented)
         if self._cloud is not None:
             self._cloud.add_scan(segmented)
-        self._reporter.leave_behind(segmented.scan.estimate, self._place.odometer_m)
 
     def watched(self) -> tuple[Any, Any]:
         """What the watcher saw, empty without one."""
@@ -213,11 +188,11 @@ class _Run:
 
     def stats(self) -> dict[str, Any]:
         """Counts of the drive and errors of its poses."""
-        counts = self._reporter.counts
+        counts = self._pipeline.reporter.counts
         names = ("scans_used", "scans_uncertain", "points", "moving_points", "rays", "changed_voxels", "reports")
-        found: dict[str, Any] = {"scans": self._counts["scans"], **{name: counts[name] for name in names}}
-        found["way_m"] = round(self._place.odometer_m, 2)
-        found["classes"] = dict(self._reporter.classes)
+        found: dict[str, Any] = {"scans": self._pipeline.scans, **{name: counts[name] for name in names}}
+        found["way_m"] = round(self._pipeline.place.odometer_m, 2)
+        found["classes"] = dict(self._pipeline.reporter.classes)
         found["poses"] = self._pose_errors()
         found["segmentation"] = dict(self._labels.counts) if self._labels else {}
         return found
@@ -231,7 +206,8 @@ class _Run:
             return None
 
 
-def _localisation(header: DriveHeader, local_map: LocalMap, task: VehicleTask) -> Localisation:
+def _localisation(header: DriveHeader, task: VehicleTask) -> Callable[[LocalMap], Localisation] | None:
+    """The poses of the reference, or None for the vehicle's own localiser."""
     if task.poses.kind == "estimated":
-        return Localising(header, local_map, task.method.localise)
-    return FromReference(header, local_map, task.poses, task.drive.seed)
+        return None
+    return lambda local_map: FromReference(header, local_map, task.poses, task.drive.seed)

@@ -21,8 +21,9 @@ from studies.simulation.vehicle import VehicleTask
 VEHICLE: Final = (
     *SIMULATOR,
     *(f"vehicle_agent/{name}" for name in ("detect", "localise", "segment", "report.py", "packing.py", "tracks.py")),
-    *(f"vehicle_agent/{name}.py" for name in ("local_map", "place", "scans", "surroundings")),
-    *(f"studies/simulation/{name}.py" for name in ("vehicle", "poses", "held_tiles", "base_map", "masses")),
+    "vehicle_agent/tiles_at_hand.py",
+    *(f"vehicle_agent/{name}.py" for name in ("local_map", "pipeline", "place", "scans", "surroundings")),
+    *(f"studies/simulation/{name}.py" for name in ("vehicle", "poses", "base_map", "masses")),
     *(f"studies/simulation/{name}.py" for name in ("streams", "result")),
 )
 """What a simulated vehicle's result depends on."""

@@ -108,7 +108,7 @@ def _posed_scans(street: Street, sensor_model: str) -> list[PosedScan]:
     drive = street.drive(sensor_model, "before", 1, street.world.seed)
     scans = [item for item in drive.items() if isinstance(item, Scan)]
     every = max(1, len(scans) // _SCANS)
-    return [_posed(drive.truth, drive.T_vehicle_lidar, scan) for scan in scans[every::every]]
+    return [_posed(drive.truth, drive.simulation.header().T_vehicle_lidar, scan) for scan in scans[every::every]]
 
 
 def _posed(truth: Trajectory, T_vehicle_lidar: F64, scan: Scan) -> PosedScan:

@@ -17,7 +17,7 @@ from gnd.deploy.map_use import read_ways
 from gnd.deploy.run_folder import RunFolder
 from gnd.gnd_map.tile import content_sha
 from gnd.tile_store.sqlite_store import SqliteStore
-from gnd.vehicle_agent.world_clock import SLACK_S
+from gnd.vehicle_agent.sources.world_clock import SLACK_S
 
 pytestmark = pytest.mark.slow
 Start = Callable[..., Run]

@@ -84,7 +84,7 @@ def replay(path: Path, local_map: LocalMap, parameters: LocaliserParameters | No
                 localiser.push_gnss(item)
             case Scan():
                 run.scans += 1
-                refined = localiser.push_scan(item)
+                refined = list(localiser.take_scan(item))
                 run.final += [scan.estimate for scan in refined]
                 run.points += sum(len(scan.points_map_m) for scan in refined)
             case ReferencePose():

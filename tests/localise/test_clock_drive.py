@@ -43,7 +43,7 @@ def test_a_clock_that_is_none_of_this_vehicle_is_said(recorded, offset_s):
 
 def turned_header(recorded, height_m=None, **angles_deg):
     """The header's mount with another height, or turned about an axis of the LiDAR."""
-    header = recorded.T_vehicle_lidar.copy()
+    header = recorded.header.T_vehicle_lidar.copy()
     axis = np.radians([angles_deg.get(name, 0.0) for name in ("roll", "pitch", "yaw")])
     header[:3, :3] = header[:3, :3] @ exp_so3(axis)
     header[2, 3] = header[2, 3] if height_m is None else height_m
@@ -62,7 +62,7 @@ def wrong_and_good(poses, reference):
 def test_a_header_that_puts_the_lidar_on_the_ground_is_put_right_before_the_first_pose(recorded):
     """Before: poses 1.9 m too low, every one of them degraded."""
     run = driven(recorded, lambda _: 0.0, turned_header(recorded, height_m=0.0))
-    calibration, told_m = run.localiser.calibration, recorded.T_vehicle_lidar[2, 3]
+    calibration, told_m = run.localiser.calibration, recorded.header.T_vehicle_lidar[2, 3]
     assert calibration.mount_doubtful == ("height",)
     assert calibration.mount.height_m == pytest.approx(told_m, abs=0.05)
     assert calibration.mount_used[2, 3] == pytest.approx(told_m, abs=0.05)
@@ -83,7 +83,7 @@ def test_a_turned_mount_is_found_and_put_right_about_the_lidar(recorded, angles_
     run = driven(recorded, lambda _: 0.0, header)
     calibration = run.localiser.calibration
     assert calibration.mount_doubtful == tuple(angles_deg)
-    off = log_so3(calibration.mount_used[:3, :3] @ recorded.T_vehicle_lidar[:3, :3].T)
+    off = log_so3(calibration.mount_used[:3, :3] @ recorded.header.T_vehicle_lidar[:3, :3].T)
     assert np.degrees(np.linalg.norm(off)) < 0.25
     assert wrong_and_good(run.online, recorded.reference) == wrong_and_good(run.refined, recorded.reference) == 0
     error = localisation_error(run.refined, recorded.reference)

@@ -69,7 +69,7 @@ def drive(sweep):
                 if gnss is not None and k % 10 == 0:
                     localiser.push_gnss(gnss(where(t_ns), t_ns))
                 if scans:
-                    final += localiser.push_scan(sweep(where, t_ns))
+                    final += localiser.take_scan(sweep(where, t_ns))
             localiser.push_motion(MotionSample(t_ns, SPEED_MPS / scale, SPEED_MPS / RADIUS_M + bias))
         return final
 
@@ -167,7 +167,7 @@ def test_scans_of_something_else_degrade_then_lose_the_pose_and_it_is_found_agai
     for k in range(100, 400):
         t_ns = k * S // 50
         if k % 5 == 0:
-            seen += localiser.push_scan(Scan(t_ns, curtain, np.zeros(len(curtain), np.uint32)))
+            seen += localiser.take_scan(Scan(t_ns, curtain, np.zeros(len(curtain), np.uint32)))
         localiser.push_motion(MotionSample(t_ns, SPEED_MPS / 1.004, SPEED_MPS / RADIUS_M + 2e-3))
         if k == 150:
             assert localiser.online.health == "degraded"
@@ -208,7 +208,7 @@ def test_memory_is_bounded_by_the_lag(localiser, drive):
 def test_a_scan_of_no_or_few_points_does_no_harm(localiser, drive, n):
     drive(localiser, 0.0, 2.0)
     empty = Scan(2 * S, np.ones((n, 3), np.float32), np.zeros(n, np.uint32))
-    localiser.push_scan(empty)
+    list(localiser.take_scan(empty))
     final = drive(localiser, 2.1, 4.0) + list(localiser.flush())
     assert_right(final)
 
@@ -217,7 +217,7 @@ def test_a_scan_from_the_past_is_dropped(localiser, drive, sweep):
     drive(localiser, 0.0, 2.0)
     dropped = localiser.dropped_scans
     for t_ns in (S, 19 * SWEEP_NS):
-        localiser.push_scan(sweep(true_pose, t_ns))
+        list(localiser.take_scan(sweep(true_pose, t_ns)))
     assert localiser.dropped_scans == dropped + 2
     final = drive(localiser, 2.0, 4.0) + list(localiser.flush())
     assert [scan.t_ns for scan in final] == sorted(scan.t_ns for scan in final)
@@ -229,7 +229,7 @@ def test_points_that_are_not_finite_are_left_out(localiser, drive, sweep):
     whole = sweep(true_pose, S)
     scan = replace(whole, points_m=whole.points_m.copy())
     scan.points_m[::3] = np.nan
-    localiser.push_scan(scan)
+    list(localiser.take_scan(scan))
     final = [s for s in drive(localiser, 1.1, 4.0) if s.t_ns // SWEEP_NS == 10]
     assert len(final) == 1
     assert len(final[0].points_map_m) == np.isfinite(scan.points_m).all(axis=1).sum()
@@ -242,7 +242,7 @@ def test_without_motion_samples_a_standing_vehicle_still_localises(yard_map, yar
     for k in range(5):
         localiser.push_gnss(fix_at(T, k * SWEEP_NS))
         points = seen_from(rng, yard_points, T @ MOUNT, 6000).astype(np.float32)
-        localiser.push_scan(Scan(k * SWEEP_NS, points, np.zeros(len(points), np.uint32)))
+        list(localiser.take_scan(Scan(k * SWEEP_NS, points, np.zeros(len(points), np.uint32))))
     final = list(localiser.flush())
     assert len(final) == 5
     assert max(offset(T, scan.estimate.T_map_vehicle)[0] for scan in final) < 0.02

@@ -71,7 +71,7 @@ class Driver:
             if k % 10 == 0 and (said := fix(t_ns)) is not None:
                 self.localiser.push_gnss(said)
             if k % 5 == 0 and (said := scan(t_ns)) is not None:
-                self.localiser.push_scan(said)
+                list(self.localiser.take_scan(said))
             if (said := motion(t_ns)) is not None:
                 self.localiser.push_motion(said)
             self._note()
@@ -139,7 +139,7 @@ def test_tiles_that_become_those_of_another_place(driver, yard_map):
 def test_time_going_backwards(driver):
     driver.go(0.0, 2.0)
     for k in range(4):  # a few late scans are dropped, and it says why it is worried
-        driver.localiser.push_scan(driver.snap(k * SWEEP_NS))
+        list(driver.localiser.take_scan(driver.snap(k * SWEEP_NS)))
     assert driver.localiser.online.health == "degraded"
     assert driver.localiser.online.cause == "bad_time"
     assert driver.go(2.0, 3.0).health == "good"
@@ -157,7 +157,7 @@ def test_a_clock_that_was_set_back_starts_anew(driver):
 def test_a_stamp_from_the_future_does_no_lasting_harm(driver):
     driver.go(0.0, 2.0)
     future = replace(driver.snap(2 * S), t_ns=3600 * S)
-    driver.localiser.push_scan(future)
+    list(driver.localiser.take_scan(future))
     online = driver.go(2.1, 6.0)
     assert online.health == "good"
     driver.assert_never_confidently_wrong()

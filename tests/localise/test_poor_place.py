@@ -27,7 +27,7 @@ def driven(wheel_scale, seconds=4.0):
         t_ns = k * S // 50
         if k % 5 == 0:
             points = seen_from(rng, few, true_pose(t_ns), 2500).astype(np.float32)
-            localiser.push_scan(Scan(t_ns, points, np.zeros(len(points), np.uint32)))
+            list(localiser.take_scan(Scan(t_ns, points, np.zeros(len(points), np.uint32))))
         localiser.push_motion(MotionSample(t_ns, SPEED_MPS * wheel_scale, 0.0))
         if localiser.online is not None:
             told.append(localiser.online)

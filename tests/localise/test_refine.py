@@ -298,7 +298,7 @@ class Drive:
                 self.localiser.push_gnss(fix_at(T, t_ns))
             seen = seen_from(np.random.default_rng(k), self.surfaces[k % 5 :: 5], T @ MOUNT, 1500, 15.0)
             scan = Scan(t_ns, seen.astype(np.float32), np.zeros(len(seen), np.uint32))
-            self.final += self.localiser.push_scan(scan)
+            self.final += self.localiser.take_scan(scan)
             if self.localiser.online is not None:
                 self.online_m.append(horizontal_m(self.localiser.online))
         return self

@@ -225,7 +225,7 @@ def localised_along(scene, off_m, seconds):
             localiser.push_gnss(GnssFix(t_ns, float(lat), float(lon), float(height), 2.5))
         if k % 4 == 0:
             seen = seen_from(rng, points, at(t_ns) @ MOUNT, 2500, REACH_M).astype(np.float32)
-            refined += [told(one.estimate) for one in localiser.push_scan(Scan(t_ns, seen, np.zeros(2500, np.uint32)))]
+            refined += [told(one.estimate) for one in localiser.take_scan(Scan(t_ns, seen, np.zeros(2500, np.uint32)))]
             if localiser.online is not None:
                 online.append(told(localiser.online))
         localiser.push_motion(MotionSample(t_ns, SPEED_MPS, 0.0))

@@ -69,7 +69,7 @@ class Car:
         self.bus, self.cache = bus, TileCache(folder / "cache.sqlite")
         self.fetcher = TileFetcher(bus, self.cache, PARAMETERS)
         local_map = LocalMap(GRID_FRAME)
-        self.surroundings = Surroundings(local_map, self.fetcher, ChangeDetector(local_map), PARAMETERS)
+        self.surroundings = Surroundings(local_map, self.fetcher, ChangeDetector(local_map).touched, PARAMETERS)
         self.updates = Updates(bus, self.cache, self.fetcher, self.surroundings.replace)
 
     def drive(self, length_m: float = 100.0, speed_mps: float = 10.0) -> None:

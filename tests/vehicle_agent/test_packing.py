@@ -29,9 +29,9 @@ from gnd.vehicle_agent.localise.odometry import MotionBuffer
 from gnd.vehicle_agent.localise.parameters import OdometryParameters
 from gnd.vehicle_agent.outbox import Letter, Outbox
 from gnd.vehicle_agent.packing import Bases, askable, asked_for, is_measured, pack, pack_measured
+from gnd.vehicle_agent.pipeline import known_course
 from gnd.vehicle_agent.report import Identity, Reporter
 from gnd.vehicle_agent.segment import SegmentedScan
-from gnd.vehicle_agent.vehicle import known_course
 
 START_NS = 1_570_838_400_000_000_000
 

@@ -51,7 +51,7 @@ class Scene:
         self.map = LocalMap(GRID_FRAME)
         self.detector = ChangeDetector(self.map)
         self.fetcher = TileFetcher(bus, TileCache(folder / "cache.sqlite"), PARAMETERS)
-        self.surroundings = Surroundings(self.map, self.fetcher, self.detector, PARAMETERS)
+        self.surroundings = Surroundings(self.map, self.fetcher, self.detector.touched, PARAMETERS)
 
 
 @pytest.fixture
@@ -116,7 +116,7 @@ def test_a_paced_drive_asks_for_what_its_link_brings_in_time(
     with open_bus(BusConfig(connect=(endpoint,), link=link)) as bus:
         fetcher = TileFetcher(bus, TileCache(tmp_path / "cache.sqlite"), replace(PARAMETERS, in_flight=1))
         local_map = LocalMap(GRID_FRAME)
-        surroundings = Surroundings(local_map, fetcher, ChangeDetector(local_map), PARAMETERS)
+        surroundings = Surroundings(local_map, fetcher, ChangeDetector(local_map).touched, PARAMETERS)
         asked: list[TileId] = []
 
         def answer(request: Request) -> bytes:
@@ -191,7 +191,7 @@ def test_without_an_answer_the_drive_goes_on_after_a_while_and_does_not_wait_aga
     impatient = DownloadParameters(near_m=30.0, ahead_m=0.0, wait_s=0.2, request_s=0.5)
     fetcher = TileFetcher(bus, TileCache(tmp_path / "cache.sqlite"), impatient)
     local_map = LocalMap(GRID_FRAME)
-    surroundings = Surroundings(local_map, fetcher, ChangeDetector(local_map), impatient)
+    surroundings = Surroundings(local_map, fetcher, ChangeDetector(local_map).touched, impatient)
     for _ in range(50):  # would be 10 s if it waited each time
         surroundings.follow(at(0.0), NEVER, wait=True)
     assert local_map.tiles == ()

@@ -10,7 +10,7 @@ import pytest
 from gnd.schemas.drive import DriveItem, MotionSample
 from gnd.schemas.errors import DriveError
 from gnd.vehicle_agent.errors import AgentConfigError
-from gnd.vehicle_agent.world_clock import SLACK_S, Departure, WorldClock, in_common_time, make_clock
+from gnd.vehicle_agent.sources.world_clock import SLACK_S, Departure, WorldClock, in_common_time, make_clock
 
 NEVER = threading.Event()
 HZ = 50

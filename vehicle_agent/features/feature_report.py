@@ -9,8 +9,8 @@ from gnd.gnd_map.tile_id import District, TileId
 from gnd.schemas.features import FeatureChange, FeatureReport
 from gnd.schemas.keys import change_key
 from gnd.schemas.report_id import deterministic_report_id
-from gnd.vehicle_agent.outbox import Outbox
 from gnd.vehicle_agent.report import Identity
+from gnd.vehicle_agent.report_sink import ReportSink
 
 _log = logging.getLogger(__name__)
 
@@ -31,13 +31,13 @@ class FeatureReporter:
     same ones, and what was sent is not sent again.
 
     Args:
-        outbox: where reports wait for their acknowledgement.
+        outbox: where reports go.
         identity: who reports, about which layer.
         start_ns: of the drive, UTC.
         longest_m: a district is reported at the latest after this much way.
     """
 
-    def __init__(self, outbox: Outbox, identity: Identity, start_ns: int, longest_m: float) -> None:
+    def __init__(self, outbox: ReportSink, identity: Identity, start_ns: int, longest_m: float) -> None:
         self.counts: Counter[str] = Counter()
         self._outbox, self._who, self._start_ns, self._longest_m = outbox, identity, start_ns, longest_m
         self._pending: dict[District, _Pending] = {}

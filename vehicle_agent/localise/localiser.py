@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from gnd.gnd_map.motion import Trajectory, deskew
 from gnd.gnd_map.se3 import T_inverse
-from gnd.schemas.drive import GnssFix, MotionSample, MountSigma, Scan
+from gnd.schemas.drive import DriveItem, GnssFix, MotionSample, MountSigma, Scan
 from gnd.schemas.sweep_distortion import DistortionSigma
 from gnd.vehicle_agent.errors import RegistrationError
 from gnd.vehicle_agent.local_map import LocalMap
@@ -130,6 +130,18 @@ class Localiser:
 
     # --- what the agent calls ------------------------------------------------------------------------------------
 
+    def push(self, item: DriveItem) -> Iterator[RefinedScan]:
+        """Take the next measurement; gives the scans whose poses became final, oldest first, each placed when it is
+        asked for: a whole lag that becomes final at once is large. What a localiser has no use for is left out.
+        """
+        if isinstance(item, Scan):
+            return self.take_scan(item)
+        if isinstance(item, MotionSample):
+            self.push_motion(item)
+        elif isinstance(item, GnssFix):
+            self.push_gnss(item)
+        return iter(())
+
     def push_motion(self, sample: MotionSample) -> None:
         """Take a sample of wheel speed and yaw rate; a scan that waited for it is matched."""
         self._motion.push(sample.t_ns, sample.speed_mps, sample.yaw_rate_radps)
@@ -141,14 +153,10 @@ class Localiser:
         if np.isfinite([fix.lat_rad, fix.lon_rad, fix.height_m, fix.sigma_m]).all() and fix.sigma_m > 0:
             self._fix = fix
 
-    def push_scan(self, scan: Scan) -> list[RefinedScan]:
-        """Take a scan; give the scans whose poses became final, oldest first. A scan that is empty, or not later than
-        the one before, is dropped and counted.
-        """
-        return list(self.take_scan(scan))
-
     def take_scan(self, scan: Scan) -> Iterator[RefinedScan]:
-        """The same, but each scan is placed when it is asked for: a whole lag that becomes final at once is large."""
+        """Take a scan; gives the scans whose poses became final. One that is empty, or not later than the one before,
+        is dropped and counted.
+        """
         if len(scan) == 0 or scan.t_ns <= self._newest_scan_ns:
             self.dropped_scans += 1
             self._see_past(scan)

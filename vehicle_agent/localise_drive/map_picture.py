@@ -18,7 +18,7 @@ from gnd.vehicle_agent.localise_drive.map_raster import COLOURS, KINDS, MapRaste
 from gnd.vehicle_agent.localise_drive.run import LocalisedDrive, trajectory_of
 from gnd.vehicle_agent.localise_drive.stretches import HEALTHS
 from gnd.vehicle_agent.localise_drive.style import DPI, FAINT, HEALTH_COLOURS, INK, MUTED, new_figure, save_figure
-from gnd.vehicle_agent.localise_drive.tiles import TileSource
+from gnd.vehicle_agent.tiles_at_hand import TileSource
 
 MARGIN_M: Final = 30.0
 _WIDTH_IN: Final = 12.6

@@ -6,7 +6,7 @@ from gnd.vehicle_agent.localise_drive.accuracy import error_series
 from gnd.vehicle_agent.localise_drive.curves import draw_errors, draw_quality
 from gnd.vehicle_agent.localise_drive.map_picture import draw_map
 from gnd.vehicle_agent.localise_drive.run import LocalisedDrive
-from gnd.vehicle_agent.localise_drive.tiles import TileSource
+from gnd.vehicle_agent.tiles_at_hand import TileSource
 
 
 def draw_pictures(drive: LocalisedDrive, tiles: TileSource, folder: Path) -> list[Path]:

@@ -10,25 +10,20 @@ from typing import Final
 import numpy as np
 
 from gnd.gnd_map.arrays import F64
-from gnd.gnd_map.geodesy import LocalFrame
-from gnd.gnd_map.grid import GridFrame
 from gnd.gnd_map.motion import Trajectory
 from gnd.gnd_map.tile_id import TileId
-from gnd.schemas.drive import DriveHeader, DriveItem, DriveTrack, GnssFix, GnssTrack, MotionSample, Scan
+from gnd.schemas.drive import DriveHeader, DriveItem, DriveTrack, GnssFix, GnssTrack
 from gnd.schemas.drive_mcap import drive_counts, load_track, read_drive, read_header
 from gnd.schemas.errors import SchemaError
-from gnd.schemas.sweep_distortion import distortion_of
-from gnd.vehicle_agent.config import DownloadParameters
+from gnd.vehicle_agent.config import DownloadParameters, PipelineParameters
 from gnd.vehicle_agent.errors import LocaliseError
-from gnd.vehicle_agent.local_map import LocalMap
 from gnd.vehicle_agent.localise.calibration import MotionCalibration
-from gnd.vehicle_agent.localise.estimates import Cause, Health, PoseEstimate, RefinedScan
-from gnd.vehicle_agent.localise.localiser import Localiser
+from gnd.vehicle_agent.localise.estimates import Cause, Health, PoseEstimate
 from gnd.vehicle_agent.localise.parameters import LocaliserParameters
-from gnd.vehicle_agent.localise.remount import header_sigma
-from gnd.vehicle_agent.localise_drive.tiles import MapAround, StoreMap
-from gnd.vehicle_agent.place import Place
-from gnd.vehicle_agent.scans import Guard
+from gnd.vehicle_agent.localise_drive.tiles import StoreMap
+from gnd.vehicle_agent.pipeline import Pipeline
+from gnd.vehicle_agent.sources.recording import first_fix
+from gnd.vehicle_agent.tiles_at_hand import TilesAtHand
 
 DRIVE_ENDING: Final = ".mcap"
 
@@ -119,8 +114,9 @@ def localise_drive(
     if not len(track.gnss.t_ns):
         raise LocaliseError(f"{path} has no GNSS fix: nothing says where on the map to begin")
     tiles.check_covers(track.gnss.lat_rad, track.gnss.lon_rad, DownloadParameters().near_m)
-    run = _Run(header, first_fix(track.gnss), tiles, parameters or LocaliserParameters())
-    run.to_the_end(read_drive(path), lambda done: progress(done, total) if progress else None, stop)
+    fix, items = first_fix(read_drive(path), path)
+    run = _Run(header, fix, tiles, parameters or LocaliserParameters())
+    run.to_the_end(items, lambda done: progress(done, total) if progress else None, stop)
     return run.result(track)
 
 
@@ -138,11 +134,6 @@ def check_is_drive(path: Path) -> None:
         )
 
 
-def first_fix(gnss: GnssTrack) -> GnssFix:
-    """The first position of a drive."""
-    return GnssFix(int(gnss.t_ns[0]), *(float(column[0]) for column in gnss[1:]))
-
-
 @dataclass(slots=True)
 class _Record:
     """What is kept of a run."""
@@ -155,22 +146,19 @@ class _Record:
 
 
 class _Run:
-    """The parts of `gnd.vehicle_agent.vehicle` that localisation needs; the map frame is that of the first tile."""
+    """A pipeline that only localises, and what is kept of it."""
 
     def __init__(self, header: DriveHeader, fix: GnssFix, tiles: StoreMap, parameters: LocaliserParameters) -> None:
-        start = TileId.from_geodetic(fix.lat_rad, fix.lon_rad)
-        frame = LocalFrame.of_tile(start)
-        local_map = LocalMap(GridFrame.around(frame, [start]))
         self._header = header
-        self._T_anchor_map = header.anchor.T_self_other(frame)
-        self._around = MapAround(tiles, local_map)
-        self._place = Place(frame, fix)
-        self._guard = Guard()
-        self._localiser = Localiser(
-            local_map, header.T_vehicle_lidar, parameters, distortion_of(header), header_sigma(header)
+        self._pipeline = Pipeline(
+            header,
+            fix,
+            lambda local_map, touched: TilesAtHand(tiles, local_map, touched),
+            PipelineParameters(localise=parameters),
         )
+        self._T_anchor_map = header.anchor.T_self_other(self._pipeline.place.frame)
         self._record = _Record()
-        self._scans, self._finished, self._damage = 0, False, ""
+        self._finished, self._damage = False, ""
         self._started_s = time.monotonic()
         self._wall_s = 0.0
 
@@ -179,46 +167,35 @@ class _Run:
     ) -> None:
         """Feed everything until the end, `stop`, or the damaged part of a recording."""
         try:
-            for item in self._guard.usable(items):
+            for item in items:
                 if stop is not None and stop.is_set():
                     break
                 self._take(item)
-                scanned(self._scans)
+                scanned(self._pipeline.scans)
             else:
                 self._finished = True
         except SchemaError as damage:
             self._damage = str(damage)
-        self._keep(self._localiser.flush())
+        self._keep(self._pipeline.finish().poses)
         self._settle()
         self._note_end()
         self._wall_s = time.monotonic() - self._started_s
 
     def _take(self, item: DriveItem) -> None:
-        if isinstance(item, MotionSample):
-            self._localiser.push_motion(item)
-        elif isinstance(item, GnssFix):
-            self._localiser.push_gnss(item)
-        elif isinstance(item, Scan):
-            self._take_scan(item)
+        scans = self._pipeline.scans
+        self._keep(self._pipeline.push(item).poses)
+        self._note_online()
+        if self._pipeline.scans > scans:
+            self._settle()
+            self._record.waiting = (item.t_ns, self._pipeline.place.odometer_m)
         self._note_online()
         self._note_change(item.t_ns)
-        self._place.take(item, self._localiser.online)
 
-    def _take_scan(self, scan: Scan) -> None:
-        self._scans += 1
-        self._around.follow(self._place)
-        self._keep(self._localiser.push_scan(scan))
-        self._note_online()
-        self._settle()
-        self._record.waiting = (scan.t_ns, self._place.odometer_m)
-
-    def _keep(self, scans: Iterable[RefinedScan]) -> None:
-        """Keep the poses; the points, which are large, go."""
-        for scan in scans:
-            self._record.refined.append(self._anchored(scan.estimate))
+    def _keep(self, poses: Iterable[PoseEstimate]) -> None:
+        self._record.refined += [self._anchored(pose) for pose in poses]
 
     def _note_online(self) -> None:
-        online, kept = self._localiser.online, self._record.online
+        online, kept = self._pipeline.localisation.online, self._record.online
         if online is not None and (not kept or online.t_ns > kept[-1].t_ns):
             kept.append(self._anchored(online))
         waiting = self._record.waiting
@@ -229,15 +206,15 @@ class _Run:
         """Note what has changed since the newest scan without another one."""
         moments = self._record.moments
         if self._record.waiting is None and moments:
-            health, cause = self._localiser.state
+            health, cause = self._pipeline.localisation.state
             if (health, cause) != (moments[-1].health, moments[-1].cause):
-                moments.append(Moment(t_ns, self._place.odometer_m, health, cause, of_scan=False))
+                moments.append(Moment(t_ns, self._pipeline.place.odometer_m, health, cause, of_scan=False))
 
     def _note_end(self) -> None:
         """A state in which no scan came lasts until the recording ends."""
         moments = self._record.moments
-        if moments and not moments[-1].of_scan and self._place.t_ns > moments[-1].t_ns:
-            moments.append(replace(moments[-1], t_ns=self._place.t_ns, way_m=self._place.odometer_m))
+        if moments and not moments[-1].of_scan and self._pipeline.place.t_ns > moments[-1].t_ns:
+            moments.append(replace(moments[-1], t_ns=self._pipeline.place.t_ns, way_m=self._pipeline.place.odometer_m))
 
     def _settle(self) -> None:
         """The newest scan was worked on, or will not be: note how it stands."""
@@ -247,7 +224,7 @@ class _Run:
         self._record.moments.append(self._moment(t_ns, way_m))
 
     def _moment(self, t_ns: int, way_m: float) -> Moment:
-        online, (health, cause) = self._localiser.online, self._localiser.state
+        online, (health, cause) = self._pipeline.localisation.online, self._pipeline.localisation.state
         matched = online is not None and online.t_ns >= t_ns
         return Moment(t_ns, way_m, health, cause, online.degenerate if online is not None and matched else ())
 
@@ -264,15 +241,15 @@ class _Run:
             moments=tuple(record.moments),
             reference=_reference(track),
             gnss=track.gnss,
-            used=dict(self._around.used),
-            absent=frozenset(self._around.absent),
+            used=dict(self._pipeline.tiles.used),
+            absent=frozenset(self._pipeline.tiles.absent),
             counts=self._counts(),
         )
 
     def _counts(self) -> Counts:
-        localiser, bad = self._localiser, dict(self._guard.bad)
+        localiser, bad = self._pipeline.localiser, dict(self._pipeline.guard.bad)
         return Counts(
-            scans=self._scans,
+            scans=self._pipeline.scans,
             bad=bad,
             dropped=localiser.dropped_scans,
             initialisations=localiser.initialisations,

@@ -1,29 +1,16 @@
-"""The map around the vehicle, from tiles at hand: `vehicle_agent.surroundings` without a bus and without evidence."""
+"""A store as the map of a drive."""
 
 from dataclasses import dataclass
-from typing import Final, Protocol
 
 import numpy as np
 
 from gnd.gnd_map.arrays import F64
-from gnd.gnd_map.errors import TileError
 from gnd.gnd_map.geodesy import LocalFrame
 from gnd.gnd_map.tile import Tile
 from gnd.gnd_map.tile_id import TileId, covering_corridor
 from gnd.tile_store.store import Store
 from gnd.tile_store.values import DEFAULT_LAYER
-from gnd.vehicle_agent.config import DownloadParameters
 from gnd.vehicle_agent.errors import LocaliseError
-from gnd.vehicle_agent.local_map import LocalMap
-from gnd.vehicle_agent.place import Place
-from gnd.vehicle_agent.surroundings import FLOORS_ABOVE, FLOORS_BELOW, STEP_M, left_behind, tiles_along
-
-
-class TileSource(Protocol):
-    """Where tiles come from."""
-
-    def tile(self, tile_id: TileId) -> Tile | None:
-        """The tile of that id, or None where the map has none."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -56,44 +43,6 @@ class StoreMap:
         if self.at_ns is not None and not any(self.store.get(self.layer, t, at_ns=self.at_ns) for t in here):
             then = np.datetime64(self.at_ns, "ns").astype("datetime64[s]")
             raise LocaliseError(f"none of the {len(here)} tiles around the drive existed at {then} UTC")
-
-
-class MapAround:
-    """Keeps a local map in step with the place: what is near is held, what is left behind is let go."""
-
-    def __init__(self, source: TileSource, local_map: LocalMap, parameters: DownloadParameters | None = None) -> None:
-        self.used: dict[TileId, int] = {}
-        """Tiles that were held at some time, and their versions."""
-        self.absent: set[TileId] = set()
-        """Tiles that were needed, and the map has not."""
-        self._source, self._map = source, local_map
-        self._parameters: Final = parameters or DownloadParameters()
-        self._looked_at: F64 | None = None
-
-    def follow(self, place: Place) -> None:
-        """Look again after every few metres of way."""
-        here, p = place.position_map_m, self._parameters
-        if self._looked_at is not None and np.linalg.norm(here - self._looked_at) <= STEP_M:
-            return
-        self._looked_at = here.copy()
-        frame = self._map.grid_frame.frame
-        floor = int(np.floor(place.height_m / FLOORS_BELOW)) * FLOORS_BELOW
-        self._map.cover_floors(floor - FLOORS_BELOW, floor + FLOORS_ABOVE)
-        for tile_id in left_behind(frame, self._map.tiles, here, p.forget_m):
-            self._map.remove_tile(tile_id)
-        for tile_id in sorted(set(tiles_along(frame, here[None], p.near_m)) - set(self._map.tiles)):
-            self._hold(tile_id, self._source.tile(tile_id))
-
-    def _hold(self, tile_id: TileId, tile: Tile | None) -> None:
-        try:
-            if tile is None:
-                self._map.set_absent(tile_id)
-                self.absent.add(tile_id)
-            else:
-                self._map.set_tile(tile)
-                self.used[tile_id] = tile.version
-        except TileError:  # of another latitude zone: this grid frame cannot hold its voxels
-            self.absent.add(tile_id)
 
 
 def _elsewhere(lat_rad: float, lon_rad: float, known: list[TileId]) -> str:

@@ -31,8 +31,8 @@ from gnd.vehicle_agent.place import Place
 from gnd.vehicle_agent.report import Identity
 from gnd.vehicle_agent.result import write_json
 from gnd.vehicle_agent.scans import Guard
+from gnd.vehicle_agent.sources.recording import first_fix, paced
 from gnd.vehicle_agent.surroundings import tiles_along
-from gnd.vehicle_agent.vehicle import first_fix, paced
 
 AHEAD_M: Final = 300.0
 BESIDE_M: Final = 100.0
@@ -74,6 +74,7 @@ class Mapper:
 
     config: AgentConfig
     header: DriveHeader
+    items: Iterator[DriveItem]
     stop: threading.Event
     link: Link
     frame: LocalFrame
@@ -91,10 +92,10 @@ class Mapper:
     def drive(self) -> Iterator[DriveItem]:
         """The recording in time order, at the pace asked for, without its reference; a damaged one ends early."""
         try:
-            for item in self.guard.usable(paced(read_drive(self.config.drive), self.config.pace, self.stop)):
+            for item in paced(self.items, self.config.pace, self.stop):
                 if self.stop.is_set():
                     return
-                if not isinstance(item, ReferencePose):
+                if self.guard.admits(item) and not isinstance(item, ReferencePose):
                     yield item
         except SchemaError as damage:
             _log.error("%s: the drive ends at %d ns: %s", self.config.vehicle, self.place.t_ns, damage)
@@ -188,7 +189,7 @@ def open_mapper(config: AgentConfig, stop: threading.Event) -> Iterator[Mapper]:
         VehicleError: it has no GNSS fix to start from, or a file cannot be opened.
     """
     names = [layer.name for layer in config.features.layers]
-    header, fix = read_header(config.drive), first_fix(config)
+    header, (fix, items) = read_header(config.drive), first_fix(read_drive(config.drive), config.drive)
     frame = LocalFrame.of_tile(TileId.from_geodetic(fix.lat_rad, fix.lon_rad))
     who = Identity(config.vehicle, header.drive_id, header.sensor_model, config.layer)
     with open_link(config) as link:
@@ -199,7 +200,9 @@ def open_mapper(config: AgentConfig, stop: threading.Event) -> Iterator[Mapper]:
             for name in names
         }
         try:
-            yield Mapper(config, header, stop, link, frame, Place(frame, fix), downloader, reporters, HeldMap(frame))
+            yield Mapper(
+                config, header, items, stop, link, frame, Place(frame, fix), downloader, reporters, HeldMap(frame)
+            )
         finally:
             link.bus.close()  # ends the questions under way
             downloader.close()

@@ -1,0 +1,1 @@
+"""Where the items come from that a `Pipeline` is fed with."""

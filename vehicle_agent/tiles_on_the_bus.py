@@ -1,0 +1,28 @@
+"""The voxel map around an agent: tiles ahead are asked for over the bus, and what others changed is applied."""
+
+import threading
+
+from gnd.gnd_map.tile import Tile
+from gnd.vehicle_agent.config import AgentConfig
+from gnd.vehicle_agent.link import Link
+from gnd.vehicle_agent.local_map import LocalMap, Touched
+from gnd.vehicle_agent.place import Place
+from gnd.vehicle_agent.surroundings import Surroundings
+from gnd.vehicle_agent.updates import Updates
+
+
+class TilesOnTheBus:
+    """Keeps the local map of a vehicle in step with its place and with the cloud."""
+
+    def __init__(
+        self, link: Link, local_map: LocalMap, touched: Touched, config: AgentConfig, stop: threading.Event
+    ) -> None:
+        self._surroundings = Surroundings(local_map, link.fetcher, touched, config.download)
+        self._stop, self._waits = stop, config.waits_for_tiles
+        self.updates: Updates[Tile] = Updates(link.bus, link.cache, link.fetcher, self._surroundings.replace)
+
+    def follow(self, place: Place) -> None:
+        """Apply what others changed, and hold the tiles around and ahead."""
+        self.updates.apply()
+        self.updates.follow(self._surroundings.look_ahead(place))  # before asking: nothing is missed in between
+        self._surroundings.follow(place, self._stop, wait=self._waits)
