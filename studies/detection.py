@@ -26,9 +26,8 @@ from gnd.vehicle_agent.detect.kernel import cast_rays, kernel_parameters, window
 from gnd.vehicle_agent.detect.parameters import DetectParameters
 from gnd.vehicle_agent.detect.records import make_records
 from gnd.vehicle_agent.local_map import LocalMap
-from studies.figures import Figure, median_s
+from studies.frame.measure import Figure, median_s
 
-COMMAND = "python -m studies detection"
 SEED, SCANS = 1, 30
 
 

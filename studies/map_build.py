@@ -21,9 +21,8 @@ from gnd.vehicle_agent.map_build.build import BuiltMap, build_recorded_map
 from gnd.vehicle_agent.map_build.quality import measure
 from gnd.vehicle_agent.map_build.refine_poses import RefineMode
 from studies.drifting_drives import Drift, drift_drive
-from studies.figures import Figure
+from studies.frame.measure import Figure
 
-COMMAND = "python -m studies map-build"
 SEED, LENGTH_M = 1101, 300.0
 PASSES: Final[tuple[tuple[Direction, int, Drift], ...]] = (
     (1, 11, Drift()),

@@ -20,7 +20,7 @@ from gnd.vehicle_agent.localise.match_map import MatchMapCache
 from gnd.vehicle_agent.localise.parameters import LocaliserParameters
 from gnd.vehicle_agent.localise.registration import Start, register
 from gnd.vehicle_agent.localise.sampling import sample_scan
-from studies.figures import Figure
+from studies.frame.measure import Figure
 
 
 class Aligner(NamedTuple):

@@ -24,9 +24,8 @@ from gnd.gnd_map.se3 import exp_so3, transform
 from gnd.schemas.drive import Scan
 from gnd.vehicle_agent.localise.estimates import PoseEstimate, RefinedScan
 from gnd.vehicle_agent.segment import MotionSegmenter, SegmentedScan, SegmentParameters
-from studies.figures import Figure
+from studies.frame.measure import Figure
 
-COMMAND = "python -m studies segmentation"
 SEEDS = (201, 202, 203)
 SECONDS = 8.0
 POSES = {"true poses": (0.0, 0.0), "4 cm, 0.08°": (0.04, radians(0.08))}

@@ -8,10 +8,8 @@ from gnd.gnd_map.codec import encode_gaussians
 from gnd.gnd_map.tile import diff
 from gnd.schemas.tiles import blob_of
 from gnd.schemas.updates import TileUpdate
-from studies.figures import Figure
 from studies.flat_tile import CHANGED, base_tile, change_report
-
-COMMAND = "python -m studies sizes"
+from studies.frame.measure import Figure
 
 
 def run() -> list[Figure]:

@@ -14,7 +14,7 @@ From it come the command line (`click_options`), the checks (`check`), and what 
 import dataclasses
 import types
 import typing
-from collections.abc import Callable, Collection, Iterator, Mapping
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, Final, Literal, TypeVar, Union
 
@@ -162,6 +162,13 @@ def _kind(hint: Any) -> Any:
 
 def _shown(default: Any) -> str:
     return ",".join(map(str, default)) if isinstance(default, tuple) else str(default)
+
+
+def of_arguments(cls: type[T], arguments: Sequence[str], **about: str) -> T:
+    """The dataclass of a script's command line; `about`: `help`, and `name` of the script."""
+    command = click.Command(about.get("name"), params=click_options(cls), help=about.get("help"))
+    with command.make_context(command.name, list(arguments)) as context:
+        return options_of(cls, context.params)
 
 
 def options_of(cls: type[T], given: Mapping[str, Any]) -> T:

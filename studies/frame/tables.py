@@ -13,12 +13,15 @@ _PLAIN_WIDTH: Final = 190
 
 @dataclass(slots=True)
 class Sheet:
-    """A table: its title, columns, rows of cells with a style ("bold", "dim", "red" or none), and lines below it."""
+    """A table: its title, columns, rows of cells with a style ("bold", "dim", "red" or none), lines below it, and
+    which columns beside the first are texts, not numbers.
+    """
 
     title: str
     columns: Sequence[str] = ()
     rows: list[tuple[tuple[str, ...], str]] = field(default_factory=list)
     notes: list[str] = field(default_factory=list)
+    texts: Sequence[str] = ()
 
     def add(self, *cells: object, style: str = "") -> None:
         """Add a row; cells that are missing stay empty."""
@@ -29,7 +32,7 @@ class Sheet:
         """The table for a terminal: its first column to the left, the others to the right."""
         table = Table(box=None, pad_edge=False)
         for number, column in enumerate(self.columns):
-            table.add_column(column, justify="right" if number else "left")
+            table.add_column(column, justify="right" if number and column not in self.texts else "left")
         for cells, style in self.rows:
             table.add_row(*map(_coloured, cells), style=style)
         return table

@@ -4,7 +4,7 @@ from types import SimpleNamespace
 
 import pytest
 
-from studies.stopwatch import Stopwatch
+from studies.frame.measure import Stopwatch
 
 
 def busy(n):
