@@ -2,7 +2,7 @@
 
 On a simulated street and on real recordings: bytes a voxel of each codec and of what others would send; for each
 lattice the median Kullback-Leibler divergence of the decoded Gaussians from the original ones, and how far apart the
-poses are that scans find on the original and on the decoded map (`studies.codec_quality`). Times are of one core,
+poses are that scans find on the original and on the decoded map (`studies.codec_scenes`). Times are of one core,
 brought to a tile of 2,500 voxels.
 """
 
@@ -17,11 +17,19 @@ import zstandard
 from gnd.gnd_map.codec import CODECS, LATTICES, Codec, Lattice, encode_gaussians, snap
 from gnd.gnd_map.gaussian import Gaussians
 from gnd.gnd_map.tile_id import TileId
-from studies.codec_quality import Tiles, kl_median, pose_shift_cm
-from studies.codec_scenes import SEED, CodecScene, recorded, simulated, stored
+from studies.codec_scenes import (
+    SEED,
+    CodecScene,
+    Tiles,
+    kl_median,
+    plain_protobuf,
+    pose_shift_cm,
+    recorded,
+    simulated,
+    stored,
+)
 from studies.frame.measure import Figure, core_s
 from studies.frame.options import option
-from studies.plain_protobuf import plain_protobuf
 
 RECORDINGS = Path(__file__).resolve().parents[2] / "shared" / "data"
 FOLDERS = ("kitti00_start16", "radiate_fog")

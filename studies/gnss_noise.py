@@ -17,8 +17,7 @@ from gnd.gnd_map.arrays import F64
 from gnd.gnd_map.geodesy import LocalFrame
 from studies.frame.measure import Figure
 from studies.frame.options import option
-from studies.real_localisation.nagoya import read_reference
-from studies.real_localisation.rtklib import read_pos
+from studies.real_localisation.nagoya import read_pos, read_reference
 
 RECORDING: Final = Path(__file__).resolve().parents[2] / "shared" / "data" / "gnss_nagoya"
 REFLECTED_M: Final = 8.0

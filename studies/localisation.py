@@ -28,8 +28,7 @@ from gnd.vehicle_agent.localise.refine import Refiner
 from gnd.vehicle_agent.localise.scan_odometry import ScanOdometry
 from studies.frame.measure import Figure, Stopwatch
 from studies.localisation_scenes import localising, mapped_street, note_newest, reference_of, true_scans
-from studies.odometry_alone import steps_of
-from studies.registering import registrations, rivals_of
+from studies.registering import registrations, rivals_of, steps_of
 
 SENSORS = ("VLP-16", "HDL-32E", "HDL-64E", "Scala")
 SCANS, EVERY = 60, 5

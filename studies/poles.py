@@ -24,10 +24,8 @@ from gnd.vehicle_agent.features.poles.detector import PoleDetector, Rays
 from gnd.vehicle_agent.features.poles.slices import PoseSigma
 from studies.frame.measure import Figure
 from studies.frame.options import check, option, seeds
-from studies.pole_pictures import draw_poles
-from studies.pole_real import poles_of, scans_of, stability
-from studies.pole_scenes import KINDS, Drive, PoleDrive, PoleScan
-from studies.pole_scores import BANDS, CHI2_2_95, SINGLE, Score
+from studies.pole_real import draw_poles, poles_of, scans_of, stability
+from studies.pole_scenes import BANDS, CHI2_2_95, KINDS, SINGLE, Drive, PoleDrive, PoleScan, Score
 
 RECORDINGS: Final = Path(__file__).resolve().parents[2] / "shared" / "data"
 FOLDERS: Final = ("kitti_raw_0060", "kitti00_start16", "radiate_fog", "apollo_ndt")

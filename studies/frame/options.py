@@ -127,7 +127,14 @@ def _single(cls: type) -> Iterator[tuple[str, Any, Any, Option]]:
             yield field.name, hints[field.name], field.default, one
         elif isinstance(one, Parts):
             for name, (default, part) in one.options.items():
-                yield name, part.of if default is None else type(default), default, part
+                yield name, _type_of(default, part), default, part
+
+
+def _type_of(default: Any, part: Option) -> Any:
+    """Type of a part of a value, which has no field of its own."""
+    if default is None:
+        return part.of
+    return tuple[str, ...] if isinstance(default, tuple) else type(default)
 
 
 def click_options(cls: type) -> list[click.Option]:
@@ -194,9 +201,11 @@ def _read(flag: str, hint: Any, value: Any, one: Option) -> Any:
         return one.read(value)
     if typing.get_origin(kind) is tuple:
         of = typing.get_args(kind)[0]
+        if one.repeated and of is str:
+            return tuple(value)  # each as it was given
         text = ",".join(value) if isinstance(value, tuple) else value
         return numbers(flag, text) if of is int else list_of(flag, text, of)
-    return tuple(value) if one.repeated else value  # each as it was given, such as --set
+    return value
 
 
 def list_of(flag: str, text: str, of: Callable[[str], T]) -> tuple[T, ...]:

@@ -7,8 +7,7 @@ from typing import Any, Final
 import numpy as np
 
 from gnd.gnd_map.arrays import F64, I64
-from studies.feature_study.honesty import Honesty
-from studies.feature_study.matching import RADIUS_M, match_one_to_one
+from studies.feature_study.truth import RADIUS_M, Honesty, match_one_to_one
 from studies.frame.averages import distances_plain
 from studies.frame.targets import Target
 

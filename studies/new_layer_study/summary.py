@@ -4,7 +4,7 @@ from collections.abc import Mapping, Sequence
 from typing import Any, Final
 
 from gnd.gnd_map.config import to_mapping
-from studies.feature_study.matching import RADIUS_M
+from studies.feature_study.truth import RADIUS_M
 from studies.frame.averages import mean_over, rounded, std_over
 from studies.frame.tables import Sheet, fixed, seeds_named, several, sheet, sheet_of, shown
 from studies.frame.targets import judged, targets_sheet

@@ -25,8 +25,7 @@ from gnd.vehicle_agent.segment.parameters import SegmentParameters
 from gnd.vehicle_agent.segment.segmenter import MotionSegmenter, SegmentedScan
 from gnd.vehicle_agent.tiles_at_hand import localising_on
 from studies.frame.errors import RealDataError
-from studies.real.scene import Scene
-from studies.real.voxels import keys_of
+from studies.real.scene import Scene, keys_of
 
 Poses = Literal["reference", "estimated"]
 Tiles = dict[TileId, Gaussians]

@@ -17,8 +17,7 @@ from gnd.fleet_sim.shapes import Block
 from gnd.gnd_map.classes import CLASS_COLOURS, ChangeClass
 from studies.frame.errors import RealDataError
 from studies.real.drive import Found
-from studies.real.places import Placed
-from studies.real.rounds import Round
+from studies.real.rounds import Placed, Round
 
 F64 = NDArray[np.float64]
 

@@ -21,8 +21,7 @@ from studies.frame.options import check, option
 from studies.real.drive import Poses
 from studies.real.rounds import Method, Round, run_round
 from studies.real.scene import load
-from studies.real.scores import summary_of
-from studies.real.tables import sheets_of
+from studies.real.scores import sheets_of, summary_of
 
 Progress = Callable[[str, int, int], None]
 

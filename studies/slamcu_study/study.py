@@ -17,9 +17,8 @@ from studies.frame.pool import Job, Tick
 from studies.slamcu_study.driving import run_slamcu, sign_truth, verdicts_of
 from studies.slamcu_study.faults import FAULTS, with_faults
 from studies.slamcu_study.merging import merged_signs, sign_reports
-from studies.slamcu_study.scores import summary_of
+from studies.slamcu_study.scores import summary_of, tables_of
 from studies.slamcu_study.signs import FULL, VARIANTS, MergedSigns, SeedOutcome, SignTruth, Verdicts
-from studies.slamcu_study.tables import tables_of
 
 SOURCES: Final = (
     *("fleet_sim/roads", "fleet_sim/drives.py", "gnd_map", "schemas", "vehicle_agent/features"),

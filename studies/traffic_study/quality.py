@@ -13,9 +13,8 @@ from gnd.gnd_map.gaussian import Gaussians
 from gnd.gnd_map.motion import Trajectory, deskew
 from gnd.gnd_map.tile_id import TileId
 from gnd.schemas.drive import Scan
-from studies.codec_quality import PosedScan, kl_median, pose_shift_cm
+from studies.codec_scenes import PosedScan, kl_median, plain_protobuf, pose_shift_cm
 from studies.frame.measure import core_s
-from studies.plain_protobuf import plain_protobuf
 from studies.short_drives import Street
 
 TILE_VOXELS: Final = 2_500

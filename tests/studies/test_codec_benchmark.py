@@ -15,11 +15,9 @@ from gnd.gnd_map.grid import GridFrame
 from gnd.gnd_map.tile import Tile
 from gnd.gnd_map.tile_id import TileId, covering_circle
 from gnd.tile_store.sqlite_store import SqliteStore
-from studies.frame.options import of_arguments
 from studies.codec import Options, decoded_on, run
-from studies.codec_quality import FLOOR_M, kl_median, kl_nats, pose_shift_cm
-from studies.codec_scenes import SEED, stored
-from studies.plain_protobuf import _tile_class, plain_protobuf
+from studies.codec_scenes import FLOOR_M, SEED, _tile_class, kl_median, kl_nats, plain_protobuf, pose_shift_cm, stored
+from studies.frame.options import of_arguments
 
 TILE = TileId(497353963154)
 

@@ -11,12 +11,10 @@ from gnd.gnd_map.se3 import transform
 from gnd.vehicle_agent.features.poles.detector import Pole, PoleDetector, Rays
 from gnd.vehicle_agent.importers.cleaning import cleaned
 from gnd.vehicle_agent.importers.kitti import open_kitti
-from studies.frame.options import of_arguments
-from studies.pole_pictures import draw_poles
-from studies.pole_real import RealScan, Stability, poles_of, stability
-from studies.pole_scenes import OBSERVABLE_LENGTH_M, OBSERVABLE_RETURNS, Drive, PoleDrive, Posts
-from studies.pole_scores import Score, matches
 from studies.frame.errors import OptionError
+from studies.frame.options import of_arguments
+from studies.pole_real import RealScan, Stability, draw_poles, poles_of, stability
+from studies.pole_scenes import OBSERVABLE_LENGTH_M, OBSERVABLE_RETURNS, Drive, PoleDrive, Posts, Score, matches
 from studies.poles import Options
 
 

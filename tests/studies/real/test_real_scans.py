@@ -15,11 +15,9 @@ from gnd.gnd_map.errors import GndError
 from gnd.vehicle_agent.detect.parameters import DetectParameters
 from gnd.vehicle_agent.importer import no_progress, open_recording
 from studies.frame.errors import RealDataError
-from studies.real.insertion import Painter, changed_by_shadow, truth_of
-from studies.real.places import KINDS, Surroundings, choose_places
-from studies.real.scene import Recorded, Scene, load, place
+from studies.real.rounds import KINDS, Painter, Surroundings, changed_by_shadow, choose_places, truth_of
+from studies.real.scene import Cells, Recorded, Scene, keys_of, load, place
 from studies.real.study import RealOptions, changed, real, reproduce_real
-from studies.real.voxels import Cells, keys_of
 
 
 @pytest.fixture(scope="session")

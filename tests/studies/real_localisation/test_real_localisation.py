@@ -18,9 +18,8 @@ from studies.real_localisation.apollo import apollo_map, gaussians_apart, on_apo
 from studies.real_localisation.convergence import convergence_of
 from studies.real_localisation.flexmap import flexmap_of, is_flexmap
 from studies.real_localisation.halves import METHODS, Half, gicp_reference, localised
-from studies.real_localisation.nagoya import dead_reckoned, is_nagoya, nagoya_of, read_reference
+from studies.real_localisation.nagoya import dead_reckoned, gps_ns, is_nagoya, nagoya_of, read_pos, read_reference
 from studies.real_localisation.odometry import compared, odometries
-from studies.real_localisation.rtklib import gps_ns, read_pos
 from studies.real_localisation.study import RealLocalisationOptions
 
 

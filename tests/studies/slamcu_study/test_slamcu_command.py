@@ -13,7 +13,7 @@ from gnd.fleet_sim.roads.drive import drive_route
 from gnd.fleet_sim.roads.motorway import motorway
 from gnd.gnd_map.errors import GndError
 from gnd.vehicle_agent.features.slamcu.parameters import SlamcuParameters
-from studies.feature_study.start import start_of
+from studies.feature_study.truth import start_of
 from studies.slamcu_study.driving import (
     occlusion_of,
     pose_errors,

@@ -3,8 +3,7 @@
 import numpy as np
 import pytest
 
-from studies.feature_study.honesty import Honesty, nees
-from studies.feature_study.matching import match_one_to_one
+from studies.feature_study.truth import Honesty, match_one_to_one, nees
 from studies.frame.averages import distances_plain, mean_over, rounded, std_over
 from studies.frame.targets import Target, judged
 
