@@ -115,7 +115,6 @@ COLOURS: Final = {"pole": "#1f77b4", "streetlight": "#ff7f0e", "traffic_sign": "
 REACH_M: Final = 42.0
 SIDE_M: Final = 2.5
 """Half the width of a side view."""
-SIDES: Final = 12
 
 
 def draw_poles(scan: RealScan, poles: Sequence[Pole], title: str, path: Path) -> Path:

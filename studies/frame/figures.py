@@ -33,8 +33,24 @@ def dress(axes: Axes, x: str, y: str, title: str = "") -> None:
     axes.grid(visible=True, color="#e6eaf0", linewidth=0.7)
     axes.set_axisbelow(True)
     axes.tick_params(colors=INK, labelsize=9)
+    spines(axes)
+
+
+def spines(axes: Axes, *shown: str) -> None:
+    """Leave of the frame only some sides, by default the left and the lower one."""
     for name, spine in axes.spines.items():
-        spine.set(visible=name in ("left", "bottom"), color="#c3ccd8")
+        spine.set(visible=name in (shown or ("left", "bottom")), color="#c3ccd8")
+
+
+def save(figure: Figure, path: Path) -> Path:
+    """Write a figure into a folder that is made if need be, and return its path.
+
+    Raises:
+        SimError: it cannot be written.
+    """
+    path.parent.mkdir(parents=True, exist_ok=True)
+    save_figure(figure, path)
+    return path
 
 
 def finish(figure: Figure, title: str, note: str, path: Path) -> Path:
@@ -46,5 +62,4 @@ def finish(figure: Figure, title: str, note: str, path: Path) -> Path:
     figure.suptitle(f"{title}\n", x=0.012, ha="left", fontsize=14, weight="bold", color=INK)
     top = 1.0 - 0.42 / figure.get_figheight()
     figure.text(0.0125, top, note, fontsize=9, color=PALE, va="center")
-    save_figure(figure, path)
-    return path
+    return save(figure, path)

@@ -137,7 +137,7 @@ def _type_of(default: Any, part: Option) -> Any:
     return tuple[str, ...] if isinstance(default, tuple) else type(default)
 
 
-def click_options(cls: type) -> list[click.Option]:
+def click_options(cls: type) -> list[click.Parameter]:
     """The options of a dataclass for a command."""
     return [_click(*single) for single in _single(cls)]
 

@@ -17,13 +17,12 @@ from scipy.spatial import cKDTree
 
 from gnd.fleet_sim.drives import DriveConfig, DriveSimulation
 from gnd.fleet_sim.ellipsoids import ellipsoids_of_truth
-from gnd.fleet_sim.pictures import save_figure
 from gnd.fleet_sim.street import street
 from gnd.fleet_sim.truth import Truth, read_truth
 from gnd.fleet_sim.world import World
 from gnd.gnd_map.arrays import F64
 from gnd.gnd_map.classes import ChangeClass
-from studies.frame.figures import INK, PALE
+from studies.frame.figures import INK, PALE, save, spines
 from studies.localisation_study.series import FORD_LOCAL, PAPER, PAPER_LIMITS, PAPER_OF_ROW, QUANTITIES, PoseSeries
 from studies.localisation_study.summary import ROW_LABELS, ROWS, SeedOutcome, SensorOutcome, StudyOutcome, sensors_of
 from studies.localisation_study.variants import LABELS
@@ -131,7 +130,7 @@ def _draw(
     _legend(figure, series)
     figure.text(0.025, 0.965, head[0], fontsize=16, weight="bold", color=INK, va="center")
     figure.text(0.025, 0.930, head[1], fontsize=10, color=PALE, va="center")
-    save_figure(figure, path)
+    save(figure, path)
 
 
 def _draw_share(axes: Axes, share: tuple[F64, F64], *, named: bool) -> None:
@@ -143,7 +142,7 @@ def _draw_share(axes: Axes, share: tuple[F64, F64], *, named: bool) -> None:
     axes.set_ylim(0, max(100 * float(changed.max(initial=0.0)) * 1.15, 10))
     axes.set_ylabel(f"changed\n≤ {NEAR_M:g} m, %" if named else "", color=INK, fontsize=8)
     axes.tick_params(labelbottom=False, colors=INK, labelsize=8)
-    _spines(axes)
+    spines(axes)
 
 
 def _draw_errors(
@@ -163,7 +162,7 @@ def _draw_errors(
     axes.axhline(0.0, color="#b9c1cc", linewidth=0.8, zorder=1)
     axes.set_ylabel(f"{name}, {unit}", color=INK)
     axes.tick_params(colors=INK, labelsize=9)
-    _spines(axes)
+    spines(axes)
 
 
 def broken(t_s: F64, error: F64) -> tuple[F64, F64]:
@@ -215,11 +214,6 @@ def _ending(one: PoseSeries) -> str:
     return "" if len(one) else " (no pose)"
 
 
-def _spines(axes: Axes) -> None:
-    for name, spine in axes.spines.items():
-        spine.set(visible=name in ("left", "bottom"), color="#c3ccd8")
-
-
 _COLOURS: Final = ("#d1282e", "#2f6fb5", "#2e8b57", "#e0a020", "#8455a8", "#76808e")
 _P95, _MAX, _FORD = "#2e8b57", "#c9a100", "#9aa4b2"
 _TITLES: Final = ("longitudinal, m", "lateral, m", "heading, °")
@@ -258,8 +252,7 @@ def draw_overview(found: Mapping[str, Any], path: Path) -> Path:
     note = f"world seed {seeds}" + (", the worst of each" if len(found["seeds"]) > 1 else "")
     figure.text(0.02, 1 - 0.58 / tall_in, note, fontsize=10, color=PALE)
     _overview_legend(figure, sensors, tall_in)
-    save_figure(figure, path)
-    return path
+    return save(figure, path)
 
 
 def _rows(found: Mapping[str, Any], sensors: list[str]) -> "list[tuple[str, str]]":
@@ -301,8 +294,7 @@ def _dress(axes: Axes, quantity: int, rows: int) -> None:
     axes.set_title(_TITLES[quantity], fontsize=11, color=INK, loc="left", weight="bold")
     axes.grid(axis="x", color="#e3e7ed", linewidth=0.8, zorder=0)
     axes.tick_params(colors=INK, labelsize=9, left=False)
-    for name, spine in axes.spines.items():
-        spine.set(visible=name == "bottom", color="#c3ccd8")
+    spines(axes, "bottom")
 
 
 def _overview_legend(figure: Figure, sensors: list[str], tall_in: float) -> None:

@@ -10,12 +10,12 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 
 from gnd.fleet_sim.ellipsoids import ellipsoids_of_maps, ellipsoids_of_truth
-from gnd.fleet_sim.pictures import View, draw_map, save_figure
+from gnd.fleet_sim.pictures import View, draw_map
 from gnd.fleet_sim.truth import LEVELS, Truth, read_truth
 from gnd.gnd_map.arrays import F64, I32, I64
 from gnd.gnd_map.classes import CLASS_COLOURS
 from gnd.gnd_map.evidence import MassParameters, masses
-from studies.frame.figures import INK, PALE, dress
+from studies.frame.figures import INK, PALE, dress, save
 from studies.simulation import scores as reference
 from studies.simulation.cloud import arrived, map_of_one, merged_map
 from studies.simulation.masses import WATCHED, Watch, choose, most_telling
@@ -95,8 +95,7 @@ def draw_curve(summary: Mapping[str, Any], path: Path) -> Path:
     axes.legend(frameon=False, fontsize=9.5, loc="lower right", labelcolor=INK, ncols=2)
     seeds = ", ".join(map(str, summary["seeds"]))
     _title(figure, "F1 by number of vehicles", f"world seed {seeds}, poses {summary['parameters']['poses']}")
-    save_figure(figure, path)
-    return path
+    return save(figure, path)
 
 
 def _curves(axes: Axes, summary: Mapping[str, Any], numbers: list[int]) -> list[float]:
@@ -159,8 +158,7 @@ def draw_masses(watch: Watch, history: tuple[I64, I32], parameters: MassParamete
     handles, labels = axes.flat[0].get_legend_handles_labels()
     figure.legend(handles, labels, loc="upper right", bbox_to_anchor=(0.99, 0.985), ncols=3, frameon=False)
     _title(figure, "Masses of single voxels", f"one drive, {sensor}; rays counted in brackets")
-    save_figure(figure, path)
-    return path
+    return save(figure, path)
 
 
 def _mass_lines(axes: Axes, t_s: F64, counters: I32, parameters: MassParameters) -> None:

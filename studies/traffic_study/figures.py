@@ -10,9 +10,8 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import FuncFormatter, MaxNLocator
 
-from gnd.fleet_sim.pictures import save_figure
 from gnd.gnd_map.arrays import F64
-from studies.frame.figures import INK, PALE
+from studies.frame.figures import INK, PALE, save, spines
 from studies.traffic_study.summary import UPLOADS
 
 _LINKS: Final = {"3g": "#2f6fb5", "4g": "#e08a1e", "5g": "#d9b310"}
@@ -48,7 +47,7 @@ def draw_figures(found: Mapping[str, Any], folder: Path) -> list[Path]:
     for name, draw in pictures:
         figure = Figure(figsize=(9.6, 5.6), dpi=130, facecolor="white", layout="constrained")
         draw(figure.add_subplot(), found)
-        save_figure(figure, folder / name)
+        save(figure, folder / name)
     return [folder / name for name, _ in pictures]
 
 
@@ -161,8 +160,7 @@ def _titled(axes: Axes, title: str, note: str) -> None:
     axes.grid(visible=True, color="#e6eaf0", linewidth=0.7)
     axes.set_axisbelow(True)
     axes.tick_params(colors=INK, labelsize=9)
-    for name, spine in axes.spines.items():
-        spine.set(visible=name in ("left", "bottom"), color="#c3ccd8")
+    spines(axes)
 
 
 def _shown(size: float) -> str:
