@@ -15,7 +15,6 @@ from gnd.gnd_map.arrays import F64
 from gnd.gnd_map.errors import ShapeError
 from gnd.gnd_map.gaussian import Gaussians, full_matrices
 from gnd.gnd_map.grid import GridFrame
-from gnd.gnd_map.motion import deskew
 from gnd.gnd_map.se3 import T_inverse, transform
 from gnd.gnd_map.tile_id import TileId
 from gnd.schemas.drive import Scan
@@ -30,8 +29,9 @@ from gnd.vehicle_agent.localise.match_map import MatchMapCache
 from gnd.vehicle_agent.localise.parameters import LocaliserParameters, RegistrationParameters
 from gnd.vehicle_agent.localise.registration import register
 from gnd.vehicle_agent.localise.sampling import sample_scan
+from studies.frame.scans import local_map_of, posed
 from studies.real.scene import Scene, load, place
-from studies.short_drives import Street, local_map_of
+from studies.short_drives import Street
 from studies.simulation.base_map import BaseMap, driven, read_base
 
 Tiles = Mapping[TileId, Gaussians]
@@ -170,15 +170,7 @@ def _driven_scans(scene: Street, world: World) -> Iterator[PosedScan]:
         drive = scene.drive(sensor, "before", 1, world.seed)
         found = [item for item in drive.items() if isinstance(item, Scan)]
         for scan in found[EVERY::EVERY]:
-            points = deskew(
-                scan.points_m,
-                scan.t_offset_ns,
-                scan.t_ns,
-                drive.truth,
-                drive.simulation.header().T_vehicle_lidar,
-                scan.t_ns,
-            )
-            yield points, drive.truth.at(scan.t_ns)
+            yield posed(scan, drive.truth, drive.simulation.header().T_vehicle_lidar)
 
 
 def recorded(folder: Path, progress: Progress = lambda *_: None) -> CodecScene:

@@ -24,8 +24,9 @@ from gnd.vehicle_agent.local_map import LocalMap
 from gnd.vehicle_agent.localise import PoseEstimate
 from gnd.vehicle_agent.tiles_at_hand import localising_on
 from studies.frame.measure import Figure
+from studies.frame.scans import local_map_of
 from studies.localisation_scenes import Localising
-from studies.short_drives import Drive, Street, gnss_offset_m, is_wrong, local_map_of
+from studies.short_drives import Drive, Street, gnss_offset_m, is_wrong
 
 SEED, LENGTH_M = 101, 300.0
 SENSORS = ("VLP-16", "Scala")

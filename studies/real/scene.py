@@ -9,8 +9,8 @@ from numpy.typing import ArrayLike, NDArray
 from gnd.gnd_map.accumulate import VoxelAccumulator
 from gnd.gnd_map.geodesy import LocalFrame
 from gnd.gnd_map.grid import GridFrame
-from gnd.gnd_map.motion import Trajectory, deskew
-from gnd.gnd_map.se3 import exp_so3, transform
+from gnd.gnd_map.motion import Trajectory
+from gnd.gnd_map.se3 import exp_so3
 from gnd.gnd_map.tile_id import covering_corridor
 from gnd.schemas.drive import DriveHeader, GnssFix, MotionSample, Scan
 from gnd.vehicle_agent.importer import fixes_of, map_track, motion_of
@@ -19,6 +19,7 @@ from gnd.vehicle_agent.importers.lidar_odometry import Progress, reference_ns
 from gnd.vehicle_agent.importers.recording import Recording
 from gnd.vehicle_agent.localise.estimates import PoseEstimate, RefinedScan
 from studies.frame.errors import RealDataError
+from studies.frame.scans import rays
 
 F64 = NDArray[np.float64]
 I64 = NDArray[np.int64]
@@ -64,12 +65,8 @@ class Scene:
     def refined(self, scan: Scan) -> RefinedScan:
         """A scan at its reference pose, as a localiser without error would give it."""
         t_ns = reference_ns(scan)
-        T = self.poses.at(t_ns)
-        points, origins = (
-            transform(T, deskew(p, scan.t_offset_ns, scan.t_ns, self.poses, self.T_vehicle_lidar, t_ns))
-            for p in (scan.points_m, np.zeros_like(scan.points_m))
-        )
-        return RefinedScan(t_ns, points, origins, PoseEstimate(t_ns, T, 0.0, 0.0, 1.0, "good"))
+        estimate = PoseEstimate(t_ns, self.poses.at(t_ns), 0.0, 0.0, 1.0, "good")
+        return RefinedScan(t_ns, *rays(scan, self.poses, self.T_vehicle_lidar, t_ns), estimate)
 
     def accumulated(self, scans: Sequence[RefinedScan] | Iterator[RefinedScan]) -> VoxelAccumulator:
         """The points of scans as a map build takes them."""

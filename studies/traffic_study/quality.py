@@ -7,14 +7,13 @@ from typing import Final
 import numpy as np
 
 from gnd.fleet_sim.world import World
-from gnd.gnd_map.arrays import F64
 from gnd.gnd_map.codec import CODECS, LATTICES, Codec, lattice_of, snap
 from gnd.gnd_map.gaussian import Gaussians
-from gnd.gnd_map.motion import Trajectory, deskew
 from gnd.gnd_map.tile_id import TileId
 from gnd.schemas.drive import Scan
 from studies.codec_scenes import PosedScan, kl_median, plain_protobuf, pose_shift_cm
 from studies.frame.measure import core_s
+from studies.frame.scans import posed
 from studies.short_drives import Street
 
 TILE_VOXELS: Final = 2_500
@@ -94,9 +93,4 @@ def _posed_scans(street: Street, sensor_model: str) -> list[PosedScan]:
     drive = street.drive(sensor_model, "before", 1, street.world.seed)
     scans = [item for item in drive.items() if isinstance(item, Scan)]
     every = max(1, len(scans) // _SCANS)
-    return [_posed(drive.truth, drive.simulation.header().T_vehicle_lidar, scan) for scan in scans[every::every]]
-
-
-def _posed(truth: Trajectory, T_vehicle_lidar: F64, scan: Scan) -> PosedScan:
-    points = deskew(scan.points_m, scan.t_offset_ns, scan.t_ns, truth, T_vehicle_lidar, scan.t_ns)
-    return points, truth.at(scan.t_ns)
+    return [posed(scan, drive.truth, drive.simulation.header().T_vehicle_lidar) for scan in scans[every::every]]
