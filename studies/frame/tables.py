@@ -9,6 +9,7 @@ from rich.table import Table
 from rich.text import Text
 
 _PLAIN_WIDTH: Final = 190
+Row = Mapping[str, Any]
 
 
 @dataclass(slots=True)
@@ -53,37 +54,44 @@ def sheet(title: str, *columns: str) -> Sheet:
     return Sheet(title, columns)
 
 
-def sheet_of(title: str, columns: Mapping[str, str], rows: Mapping[str, Mapping[str, Any]], first: str = "") -> Sheet:
+def sheet_of(title: str, columns: Mapping[str, str], rows: Mapping[str, Row] | Iterable[Row], first: str = "") -> Sheet:
     """A table from one declaration of its columns.
 
     Args:
         title: of the table.
-        columns: by their head what stands in a cell, such as "{error.p95:.2f} / {error.max:.2f}"; None is a dash.
-        rows: nested plain values by the name of the row.
+        columns: by their head what stands in a cell, such as "{error.p95:.2f} / {error.max:.2f}"; what is missing or
+            None is a dash.
+        rows: nested plain values; by the name of the row, which then stands first, or without names.
         first: head of the rows' names.
     """
-    table = Sheet(title, (first, *columns))
-    for name, row in rows.items():
-        table.add(name, *(shown(cell, row) for cell in columns.values()))
+    named = isinstance(rows, Mapping)
+    table = Sheet(title, ((first,) if named else ()) + tuple(columns))
+    for name, row in rows.items() if isinstance(rows, Mapping) else (("", row) for row in rows):
+        table.add(*((name,) if named else ()), *(shown(cell, row) for cell in columns.values()))
     return table
 
 
-def shown(cell: str, row: Mapping[str, Any]) -> str:
+def shown(cell: str, row: Row) -> str:
     """What stands in a cell: `str.format` over nested plain values."""
-    return cell.format_map({key: _Value(value) for key, value in row.items()})
+    return cell.format_map(_Values({key: _Value(value) for key, value in row.items()}))
 
 
 class _Value:
-    """A plain value for `str.format`: tables by attribute, None as a dash, floats as wide as they are told."""
+    """A plain value for `str.format`: tables by attribute, None as a dash."""
 
     def __init__(self, value: Any) -> None:
         self._value = value
 
     def __getattr__(self, name: str) -> "_Value":
-        return _Value(None if self._value is None else self._value[name])
+        return _Value(None if self._value is None else self._value.get(name))
 
     def __format__(self, spec: str) -> str:
         return "–" if self._value is None else format(self._value, spec)
+
+
+class _Values(dict[str, _Value]):
+    def __missing__(self, key: str) -> _Value:
+        return _Value(None)
 
 
 def _row(cells: Iterable[str]) -> str:

@@ -4,7 +4,7 @@ from collections.abc import Callable
 from dataclasses import MISSING, dataclass
 from pathlib import Path
 from time import perf_counter
-from typing import Any
+from typing import Any, Final
 
 from gnd.vehicle_agent.errors import ImportDriveError
 from gnd.vehicle_agent.importer import map_track, open_recording
@@ -15,7 +15,7 @@ from gnd.vehicle_agent.importers.splits import chosen_scans
 from studies.frame.command import Bench, Report, study
 from studies.frame.errors import RealDataError
 from studies.frame.options import check, option
-from studies.frame.tables import Sheet, fixed, several, sheet
+from studies.frame.tables import Sheet, sheet_of, shown
 from studies.real.scene import Recorded, load, place
 from studies.real_localisation.apollo import apollo_of
 from studies.real_localisation.convergence import convergence_of
@@ -25,7 +25,60 @@ from studies.real_localisation.nagoya import is_nagoya, nagoya_of
 from studies.real_localisation.odometry import compared, odometries
 from studies.real_localisation.pictures import draw_flexmap, draw_halves, draw_nagoya
 
-_METHODS = {"with_submap": "yes", "without_submap": "no", "without_submap_and_wheels": "no, no wheels"}
+_METHODS: Final = {"with_submap": "yes", "without_submap": "no", "without_submap_and_wheels": "no, no wheels"}
+_ODOMETRY: Final = {
+    "way m": "{way_m:.2f}",
+    "less the positions' m": "{way_less_positions_m:.2f}",
+    "from positions 50 / 95 % m": "{positions_m_p50:.2f} / {positions_m_p95:.2f}",
+    "step from ours 95 % m / °": "{step_m_p95:.3f} / {step_deg_p95:.3f}",
+    "end from ours along / across m": "{end_along_m:.2f} / {end_across_m:.2f}",
+    "ms a scan": "{ms_per_scan:.0f}",
+}
+_ERRORS: Final = {
+    "along m": "{errors.longitudinal_p95_m:.3f} ({errors.longitudinal_max_m:.3f})",
+    "across m": "{errors.lateral_p95_m:.3f} ({errors.lateral_max_m:.3f})",
+    "heading °": "{errors.heading_p95_deg:.3f} ({errors.heading_max_deg:.3f})",
+}
+_LOCALISED: Final = {"": "{half}", "submaps": "{submaps}", "good / localised / driven": "{count}", **_ERRORS,
+                     "against": "{against}"}  # fmt: skip
+_REGISTERED: Final = {
+    "from": "{off_m} m, {off_deg}°",
+    "method": "{method}",
+    "converged": "{converged:.0%}",
+    "not, and said so": "{not_and_said_so:.0%}",
+    "not, and silent": "{not_and_silent:.0%}",
+    "error 50 % m / °": "{error_m_p50:.3f} / {error_deg_p50:.3f}",
+    "ms": "{ms_p50:.1f}",
+}
+_OFF: Final = "{{{0}.longitudinal_m:.3f}}, {{{0}.lateral_m:.3f}}, {{{0}.heading_deg:.3f}}"
+_SEARCHED: Final = {
+    "searched from 2.5 m, any heading": "{name}",
+    "sure": "{sure} of {searches}",
+    "Gaussians": "{gaussians}",
+    "these off m, m, °": _OFF.format("largest_error_sure"),
+    "all off m, m, °": _OFF.format("largest_error"),
+}
+_ON_APOLLO: Final = {
+    "scan": "{scan}",
+    "from": "{off_m} m, {off_deg}°",
+    "within 10 cm": "{within_10_cm:.0%}",
+    "along m": "{longitudinal_m:.3f}",
+    "across m": "{lateral_m:.3f}",
+    "heading °": "{heading_deg:.3f}",
+}
+_THREE: Final = "{{{0}.p50:.2f}} / {{{0}.p95:.2f}} / {{{0}.max:.2f}}"
+_NAGOYA: Final = {
+    "number": "{fixes}",
+    "the fixes": _THREE.format("fixes_off_m"),
+    "track, rigid": _THREE.format("rigid_off_m"),
+    "track, bent": _THREE.format("off_m"),
+    "heading °": _THREE.format("heading_deg"),
+}
+_FLEXMAP: Final = {
+    "fixes used": _THREE.format("used"),
+    "fixes held out": _THREE.format("held_out"),
+    "of these in a lane": "{lane:.1%}",
+}
 
 
 def sheets_of(found: dict[str, Any]) -> list[Sheet]:
@@ -38,131 +91,51 @@ def sheets_of(found: dict[str, Any]) -> list[Sheet]:
 
 
 def _tables(one: dict[str, Any]) -> list[Sheet]:
+    registered = [
+        sheet_of(f"Registration, {half['name']}", _REGISTERED, half["registration"])
+        for half in one.get("halves", ())
+        if half["registration"]
+    ]
     if "odometry" in one:
-        halves = [_registration(half) for half in one["halves"] if half["registration"]]
-        return [_odometry(one["odometry"]), _localisation(one["halves"]), *halves]
+        rows = {row["name"] + (f": {row['absent']}" if row["absent"] else ""): row for row in one["odometry"]}
+        title = "Localised on the other part: poses called good, 95 % (largest)"
+        localised = sheet_of(title, _LOCALISED, [row for half in one["halves"] for row in _localised(half)])
+        return [sheet_of("Odometry", _ODOMETRY, rows), localised, *registered]
     if "on_apollos_map" in one:
-        return [_pair_sheet(one), *(_registration(half) for half in one["halves"]), _apollo(one)]
+        return [_searched(one), *registered, _apollo(one)]
+    title = f"{one['poses']} poses over {one['way_m']:.0f} m"
     if "by" in one:
-        return [_nagoya(one)]
-    return [_flexmap(one)]
+        rows = {row["name"]: row for row in one["by"]}
+        return [sheet_of(f"{title} against the reference, 50 / 95 % / largest m", _NAGOYA, rows, "fixes")]
+    of = {"used": one["used_m"], "held_out": one["held_out_m"], "lane": one["held_out_in_lanes"]}
+    rows = {name: {key: values[name] for key, values in of.items()} for name in ("rigid", "bent")}
+    return [sheet_of(f"{title}, distance of GNSS from the track, 50 / 95 % / largest m", _FLEXMAP, rows)]
 
 
-def _odometry(rows: list[dict[str, Any]]) -> Sheet:
-    table = sheet(
-        "Odometry", "", "way m", "less the positions' m", "from positions 50 / 95 % m",
-        "step from ours 95 % m / °", "end from ours along / across m", "ms a scan",
-    )  # fmt: skip
-    for row in rows:
-        if row["absent"]:
-            table.add(row["name"], row["absent"])
-            continue
-        table.add(
-            row["name"],
-            fixed(row["way_m"], 2),
-            fixed(row.get("way_less_positions_m"), 2),
-            _pair_of(row, "positions_m_p50", "positions_m_p95", 2),
-            _pair_of(row, "step_m_p95", "step_deg_p95", 3),
-            _pair_of(row, "end_along_m", "end_across_m", 2),
-            fixed(row["ms_per_scan"], 0),
-        )
-    return table
+def _localised(half: dict[str, Any]) -> list[dict[str, Any]]:
+    """Rows of a half: each way of localising against each reference, and the references against each other."""
+    rows = []
+    for method, submaps in _METHODS.items():
+        one = half[method]
+        count = f"{one['health'].get('good', 0)} / {one['localised']} / {half['driven']}"
+        head = {"half": half["name"], "submaps": submaps, "count": count}
+        rows += [head | {"errors": error, "against": name} for name, error in one["errors"].items()]
+    empty = {"half": "", "submaps": "", "count": ""}
+    return [*rows, empty | {"errors": half["gicp_less_track"], "against": "gicp less track"}]
 
 
-def _localisation(halves: list[dict[str, Any]]) -> Sheet:
-    table = sheet(
-        "Localised on the other part: poses called good, 95 % (largest)", "", "submaps", "good / localised / driven",
-        "along m", "across m", "heading °", "against",
-    )  # fmt: skip
-    for half in halves:
-        for method, submaps in _METHODS.items():
-            one = half[method]
-            count = f"{one['health'].get('good', 0)} / {one['localised']} / {half['driven']}"
-            for name, error in one["errors"].items():
-                table.add(half["name"], submaps, count, *_errors(error), name)
-        table.add("", "", "", *_errors(half["gicp_less_track"]), "gicp less track")
-    return table
-
-
-def _errors(error: dict[str, Any] | None) -> list[str]:
-    keys = (("longitudinal", "m"), ("lateral", "m"), ("heading", "deg"))
-    if error is None:
-        return ["-"] * len(keys)
-    return [f"{error[f'{key}_p95_{unit}']:.3f} ({error[f'{key}_max_{unit}']:.3f})" for key, unit in keys]
-
-
-def _registration(half: dict[str, Any]) -> Sheet:
-    table = sheet(
-        f"Registration, {half['name']}", "from", "method", "converged", "not, and said so", "not, and silent",
-        "error 50 % cm / °", "ms",
-    )  # fmt: skip
-    for row in half["registration"]:
-        error = "-" if row["error_m_p50"] is None else f"{100 * row['error_m_p50']:.1f} / {row['error_deg_p50']:.3f}"
-        shares = (f"{row[key]:.0%}" for key in ("converged", "not_and_said_so", "not_and_silent"))
-        table.add(f"{row['off_m']} m, {row['off_deg']}°", row["method"], *shares, error, fixed(row["ms_p50"], 1))
-    return table
-
-
-def _pair_sheet(one: dict[str, Any]) -> Sheet:
-    at = one["place"]
-    where = f"{at['lat_deg']:.7f}°, {at['lon_deg']:.7f}°, {at['height_m']:.2f} m"
-    title = f"Scan 2 lies at {where}, heading {at['heading_deg']:.2f}°"
-    table = sheet(
-        title, "searched from 2.5 m, any heading", "sure", "Gaussians", "these off m, m, °", "all off m, m, °"
-    )
-    for row in one["searches"]:
-        count = f"{row['sure']} of {row['searches']}"
-        off = (", ".join(_off(row[key])) for key in ("largest_error_sure", "largest_error"))
-        table.add(row["name"], count, str(row["gaussians"]), *off)
-    return table
+def _searched(one: dict[str, Any]) -> Sheet:
+    place = "Scan 2 lies at {lat_deg:.7f}°, {lon_deg:.7f}°, {height_m:.2f} m, heading {heading_deg:.2f}°"
+    return sheet_of(shown(place, one["place"]), _SEARCHED, one["searches"])
 
 
 def _apollo(one: dict[str, Any]) -> Sheet:
     apart = one["gaussians"]
-    shift = ", ".join(f"{100 * value:.1f}" for value in apart["shift_enu_m"])
-    table = sheet(
+    title = (
         f"On Apollo's own map ({apart['compared']} Gaussians, {100 * apart['along_normal_m_p50']:.1f} cm apart (50 %),"
-        f" shifted by {shift} cm east, north, up)",
-        "scan", "from", "within 10 cm", "along m", "across m", "heading °",
-    )  # fmt: skip
-    for row in one["on_apollos_map"]:
-        table.add(str(row["scan"]), f"{row['off_m']} m, {row['off_deg']}°", f"{row['within_10_cm']:.0%}", *_off(row))
-    return table
-
-
-def _off(error: dict[str, Any] | None) -> list[str]:
-    keys = ("longitudinal_m", "lateral_m", "heading_deg")
-    return ["-"] * len(keys) if error is None else [f"{error[key]:.3f}" for key in keys]
-
-
-def _nagoya(one: dict[str, Any]) -> Sheet:
-    table = sheet(
-        f"{one['poses']} poses over {one['way_m']:.0f} m against the reference, 50 / 95 % / largest m",
-        "fixes", "number", "the fixes", "track, rigid", "track, bent", "heading °",
-    )  # fmt: skip
-    for row in one["by"]:
-        cells = (_three(row[key]) for key in ("fixes_off_m", "rigid_off_m", "off_m", "heading_deg"))
-        table.add(row["name"], str(row["fixes"]), *cells)
-    return table
-
-
-def _flexmap(one: dict[str, Any]) -> Sheet:
-    table = sheet(
-        f"{one['poses']} poses over {one['way_m']:.0f} m, distance of GNSS from the track, 50 / 95 % / largest m", "",
-        "fixes used", "fixes held out", "of these in a lane",
-    )  # fmt: skip
-    for name in ("rigid", "bent"):
-        share = f"{one['held_out_in_lanes'][name]:.1%}"
-        table.add(name, _three(one["used_m"][name]), _three(one["held_out_m"][name]), share)
-    return table
-
-
-def _three(values: dict[str, float]) -> str:
-    return several(values[key] for key in ("p50", "p95", "max"))
-
-
-def _pair_of(row: dict[str, Any], first: str, second: str, digits: int) -> str:
-    return several((row[first], row[second]), digits) if first in row else "–"
+        f" shifted by {', '.join(f'{100 * value:.1f}' for value in apart['shift_enu_m'])} cm east, north, up)"
+    )
+    return sheet_of(title, _ON_APOLLO, one["on_apollos_map"])
 
 
 REGISTERED = 2

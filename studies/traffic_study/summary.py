@@ -10,7 +10,7 @@ from gnd.fleet_bus.pacer import MESSAGE_OVERHEAD_BYTES
 from gnd.gnd_map.config import to_mapping
 from gnd.gnd_map.tile_id import TileId
 from studies.frame.command import plain_options
-from studies.frame.tables import Sheet, sheet
+from studies.frame.tables import Sheet, sheet, sheet_of
 from studies.frame.targets import Target, judged, targets_sheet
 from studies.traffic_study.clouds import Written
 from studies.traffic_study.download import Question, Track, fetched_tiles, total_bytes
@@ -385,36 +385,33 @@ def _kb(size: float | None, km: float = 1.0) -> str:
 
 def _rates(found: Mapping[str, Any]) -> Sheet:
     up = found["upload"]
-    table = sheet("upload a km, by stage", "", *(label for _, label in STAGES))
-    rows = {
+    values = {
         "kB/km up: keys and payloads": (up["kB_per_km"], 3),
         "kB/km with the transport": (up["wire_kB_per_km"], 3),
         "changes a km": (up["changed_per_km"], 0),
         "Gaussians asked for a km": (up["wanted_per_km"], 0),
+        **{
+            f"B/km: {part}": ({stage: of[part] for stage, of in up["parts_bytes_per_km"].items()}, 0)
+            for part in up["parts_bytes_per_km"]["first"]
+        },
     }
-    for label, (values, digits) in rows.items():
-        table.add(label, *(f"{values[stage]:.{digits}f}" for stage, _ in STAGES))
-    parts = up["parts_bytes_per_km"]
-    for part in parts["first"]:
-        table.add(f"B/km: {part}", *(f"{parts[stage][part]:.0f}" for stage, _ in STAGES))
+    table = sheet("upload a km, by stage", "", *(label for _, label in STAGES))
+    for label, (by_stage, digits) in values.items():
+        table.add(label, *(f"{by_stage[stage]:.{digits}f}" for stage, _ in STAGES))
     return table
 
 
 def _codecs(found: Mapping[str, Any]) -> Sheet:
-    title = "codecs on this street"
-    table = sheet(title, "lattice", "B a voxel", "zstd, B", "KL, nats", "pose shift, cm", "encode, ms", "decode, ms")
+    columns = {
+        "B a voxel": "{bytes_per_voxel:.3f}",
+        "zstd, B": "{zstd_bytes_per_voxel:.3f}",
+        "KL, nats": "{kl_median:.4f}",
+        "pose shift, cm": "{pose_shift_cm_median:.3f}",
+        "encode, ms": "{encode_ms:.2f}",
+        "decode, ms": "{decode_ms:.2f}",
+    }
     codecs = {"archive": found["codec"]["archive"], "standard": found["codec"], "compact": found["codec"]["compact"]}
-    for name, one in codecs.items():
-        table.add(
-            name,
-            f"{one['bytes_per_voxel']:.3f}",
-            f"{one['zstd_bytes_per_voxel']:.3f}",
-            f"{one['kl_median']:.4f}",
-            f"{one['pose_shift_cm_median']:.3f}",
-            f"{one['encode_ms']:.2f}",
-            f"{one['decode_ms']:.2f}",
-        )
-    return table
+    return sheet_of("codecs on this street", columns, codecs, "lattice")
 
 
 def _targets(found: Mapping[str, Any]) -> Sheet:
