@@ -102,7 +102,7 @@ def test_pictures_and_markdown(studied: Studied, tmp_path: Path) -> None:
         assert (out / f"{name}.png").read_bytes().startswith(b"\x89PNG")
     text = (tmp_path / "tables.md").read_text()
     assert text.startswith("`gnd reproduce localisation --seeds 5 ")
-    assert "**vlp16**, 95 % / maximum:" in text
+    assert "**vlp16: 95 % / maximum**" in text
 
 
 @pytest.mark.parametrize(
