@@ -76,7 +76,7 @@ def test_the_second_start_drives_no_more_and_shows_the_same(
     def never(*_: object) -> None:
         raise AssertionError("a drive or a cloud was made again")
 
-    monkeypatch.setattr("studies.traffic_study.fleet.run_vehicle", never)
+    monkeypatch.setattr("studies.simulation.study.run_vehicle", never)
     monkeypatch.setattr("studies.traffic_study.clouds.street_cloud", never)
     shown = study(finished[0], "--json", str(tmp_path / "out.json"))
     assert shown.exit_code == 0, f"{shown.output}{shown.exception!r}"
