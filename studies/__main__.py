@@ -3,75 +3,62 @@
 A benchmark with options of its own takes them when it is named alone: `python -m studies codec --help`.
 """
 
-import argparse
 import importlib
 import sys
-from collections.abc import Sequence
-from types import ModuleType
+from typing import Any, Final
 
-from studies.figures import machine, print_figures
+import click
 
-NAMES = (
-    "detection",
-    "segmentation",
-    "localisation",
-    "scan-to-scan",
-    "clock",
-    "first-pose",
-    "health",
-    "ingest",
-    "short-reports",
-    "sizes",
-    "codec",
-    "return-download",
-    "gnss-noise",
-    "poles",
-    "features-merge",
-    "merging",
-    "slamcu-step",
-    "map-build",
-    "stalled",
-    "outage",
-)
-WITH_OPTIONS = ("codec", "return-download", "gnss-noise", "poles", "slamcu-step", "short-reports")
+from studies.frame.measure import machine, print_figures
+from studies.frame.options import click_options, options_of
+
+NAMES: Final = (
+    "detection", "segmentation", "localisation", "scan-to-scan", "clock", "first-pose", "health", "ingest",
+    "short-reports", "sizes", "codec", "return-download", "gnss-noise", "poles", "features-merge", "merging",
+    "slamcu-step", "map-build", "stalled", "outage",
+)  # fmt: skip
 
 
 def main() -> None:
     """Run the named benchmarks, or all."""
-    name, *own = sys.argv[1:] or [""]
-    if name in WITH_OPTIONS and not set(own) & set(NAMES):
-        _run_alone(name, own)
-    else:
-        _run_many()
+    names = [word for word in sys.argv[1:] if word in NAMES]
+    if len(names) == 1 and sys.argv[1] == names[0]:
+        alone(names[0]).main(sys.argv[2:], prog_name=f"python -m studies {names[0]}")
+    one_of_many().main(prog_name="python -m studies")
 
 
-def _run_alone(name: str, arguments: Sequence[str]) -> None:
-    """One benchmark with its own options."""
-    module, as_json = _module(name), "--json" in arguments
-    chosen = module.options([argument for argument in arguments if argument != "--json"])
+def one_of_many() -> click.Command:
+    """The command that runs several benchmarks with their usual options."""
+
+    @click.command(help=__doc__, epilog=f"Benchmarks: {', '.join(NAMES)}.")
+    @click.argument("names", nargs=-1, type=click.Choice(NAMES), metavar="[NAME]…")
+    @click.option("--json", "as_json", is_flag=True, help="One JSON object a benchmark.")
+    def run(names: tuple[str, ...], *, as_json: bool) -> None:
+        for name in names or NAMES:
+            _run(name, as_json, {})
+
+    return run
+
+
+def alone(name: str) -> click.Command:
+    """The command that runs one benchmark with options of its own (its dataclass `Options`, where it has one)."""
+    module = importlib.import_module(f"studies.{name.replace('-', '_')}")
+    flag = click.Option(["--json", "as_json"], is_flag=True, help="One JSON object.")
+    own = click_options(module.Options) if hasattr(module, "Options") else []
+
+    def run(*, as_json: bool, **given: Any) -> None:
+        _run(name, as_json, given)
+
+    return click.Command(name, callback=run, params=[*own, flag], help=module.__doc__)
+
+
+def _run(name: str, as_json: bool, given: dict[str, Any]) -> None:
+    module = importlib.import_module(f"studies.{name.replace('-', '_')}")
+    figures = module.run(options_of(module.Options, given)) if given else module.run()
     if not as_json:
         print(machine())
-    command = " ".join(["python -m studies", name, *arguments])
-    print_figures(name, command, module.run(chosen), as_json=as_json)
-
-
-def _run_many() -> None:
-    parser = argparse.ArgumentParser(prog="python -m studies", description=__doc__)
-    parser.add_argument("names", nargs="*", metavar="NAME", help=f"one or more of {', '.join(NAMES)} (default: all)")
-    parser.add_argument("--json", action="store_true", help="one JSON object a benchmark")
-    options = parser.parse_args()
-    unknown = sorted(set(options.names) - set(NAMES))
-    if unknown:
-        parser.error(f"unknown benchmark {', '.join(unknown)}; there are {', '.join(NAMES)}")
-    if not options.json:
-        print(machine())
-    for name in options.names or NAMES:
-        module = _module(name)
-        print_figures(name, module.COMMAND, module.run(), as_json=options.json)
-
-
-def _module(name: str) -> ModuleType:
-    return importlib.import_module(f"studies.{name.replace('-', '_')}")
+    command = " ".join(["python -m studies", *sys.argv[1:]]) if given else f"python -m studies {name}"
+    print_figures(name, command, figures, as_json=as_json)
 
 
 if __name__ == "__main__":

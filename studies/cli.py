@@ -8,36 +8,36 @@ from gnd.deploy.cli import LazyGroup
 
 _COMMANDS: Final[dict[str, tuple[str, str]]] = {
     "simulation": (
-        "studies.simulation.command:simulation",
+        "studies.simulation.study:simulation",
         "The GND paper's simulation: worlds, single drives, fleets.",
     ),
     "localisation": (
-        "studies.localisation_study.command:localisation",
+        "studies.localisation_study.study:localisation",
         "Localisation in a changed world, before and after the map update.",
     ),
-    "traffic": ("studies.traffic_study.command:traffic", "What a map and its changes weigh on the way (Figure 23)."),
+    "traffic": ("studies.traffic_study.study:traffic", "What a map and its changes weigh on the way (Figure 23)."),
     "steady-vehicle": (
-        "studies.traffic_study.steady_command:steady_vehicle",
+        "studies.traffic_study.steady:steady_vehicle",
         "All bytes of a vehicle that knows its street, over the real bus.",
     ),
     "slamcu": (
-        "studies.slamcu_study.command:slamcu",
+        "studies.slamcu_study.study:slamcu",
         "Signs that have gone or are new, found by single cars: the SLAMCU paper.",
     ),
     "new-feature-layer": (
-        "studies.new_layer_study.command:new_feature_layer",
+        "studies.new_layer_study.study:new_feature_layer",
         "A layer of beacons or lights mapped by many cars, and localisation with it.",
     ),
     "hard-cases": (
-        "studies.hard_cases.command:hard_cases",
+        "studies.hard_cases.study:hard_cases",
         "Cases that make localisation fail: does the vehicle say when it is wrong?",
     ),
-    "errors": ("studies.simulation.errors_command:errors", "Which voxels of a simulation cost F1, and why."),
+    "errors": ("studies.simulation.losses:errors", "Which voxels of a simulation cost F1, and why."),
     "real-localisation": (
-        "studies.real_localisation.command:real_localisation",
+        "studies.real_localisation.study:real_localisation",
         "Odometry, localisation and georeferencing on real recordings.",
     ),
-    "real": ("studies.real.command:real", "Detection on recordings of real sensors, with objects inserted."),
+    "real": ("studies.real.study:real", "Detection on recordings of real sensors, with objects inserted."),
 }
 
 

@@ -21,10 +21,9 @@ from gnd.vehicle_agent.local_map import LocalMap
 from gnd.vehicle_agent.localise import Localiser, PoseEstimate, localisation_error
 from gnd.vehicle_agent.sources.recording import first_fix
 from gnd.vehicle_agent.tiles_at_hand import localising_on
-from studies.figures import Figure
+from studies.frame.measure import Figure
 from studies.localisation_scenes import MAPPING, map_of, note_newest, reference_of
 
-COMMAND = "python -m studies clock"
 DRIVES = ((3, "VLP-16"), (3, "HDL-64E"), (11, "VLP-16"), (12, "VLP-16"))
 OFFSETS_MS = (0, -50, 50)
 SCANS = 150

@@ -2,17 +2,14 @@
 
 On a simulated street and on real recordings: bytes a voxel of each codec and of what others would send; for each
 lattice the median Kullback-Leibler divergence of the decoded Gaussians from the original ones, and how far apart the
-poses are that scans find on the original and on the decoded map (`studies.codec_quality`). Times are of one core,
+poses are that scans find on the original and on the decoded map (`studies.codec_scenes`). Times are of one core,
 brought to a tile of 2,500 voxels.
 """
 
-import argparse
-import statistics
 import zlib
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from time import process_time
 
 import numpy as np
 import zstandard
@@ -20,12 +17,20 @@ import zstandard
 from gnd.gnd_map.codec import CODECS, LATTICES, Codec, Lattice, encode_gaussians, snap
 from gnd.gnd_map.gaussian import Gaussians
 from gnd.gnd_map.tile_id import TileId
-from studies.codec_quality import Tiles, kl_median, pose_shift_cm
-from studies.codec_scenes import SEED, CodecScene, recorded, simulated, stored
-from studies.figures import Figure
-from studies.plain_protobuf import plain_protobuf
+from studies.codec_scenes import (
+    SEED,
+    CodecScene,
+    Tiles,
+    kl_median,
+    plain_protobuf,
+    pose_shift_cm,
+    recorded,
+    simulated,
+    stored,
+)
+from studies.frame.measure import Figure, core_s
+from studies.frame.options import option
 
-COMMAND = "python -m studies codec"
 RECORDINGS = Path(__file__).resolve().parents[2] / "shared" / "data"
 FOLDERS = ("kitti00_start16", "radiate_fog")
 TILE_VOXELS = 2_500
@@ -46,31 +51,18 @@ PEERS: dict[str, Write] = {
 
 
 @dataclass(frozen=True, slots=True)
-class CodecOptions:
-    """seed: of the simulated street. base: its map, None to make it. store: measure this one instead of the street.
+class Options:
+    """What is measured: a simulated street, or the tiles of a store; and real recordings."""
 
-    recordings: folder of real ones.
-    """
-
-    seed: int = SEED
-    base: Path | None = None
-    store: Path | None = None
-    recordings: Path = RECORDINGS
+    seed: int = option(SEED, "World of the simulated street.")
+    base: Path | None = option(None, "Its map, a file of a simulation's run.  [default: make it]")
+    store: Path | None = option(None, "The tiles of this store instead; sizes and times only.")
+    recordings: Path = option(RECORDINGS, f"Folder with {', '.join(FOLDERS)}.")
 
 
-def options(arguments: Sequence[str]) -> CodecOptions:
-    """The options of the command line."""
-    parser = argparse.ArgumentParser(prog=COMMAND, description=__doc__)
-    parser.add_argument("--seed", type=int, default=SEED, help=f"world of the simulated street (default {SEED})")
-    parser.add_argument("--base", type=Path, help="its map, a file of a simulation's run (default: make it)")
-    parser.add_argument("--store", type=Path, help="the tiles of this store instead; sizes and times only")
-    parser.add_argument("--recordings", type=Path, default=RECORDINGS, help=f"folder with {', '.join(FOLDERS)}")
-    return CodecOptions(**vars(parser.parse_args(arguments)))
-
-
-def run(chosen: CodecOptions | None = None) -> list[Figure]:
+def run(chosen: Options | None = None) -> list[Figure]:
     """Measure every scene that there is."""
-    chosen = chosen or CodecOptions()
+    chosen = chosen or Options()
     first = simulated(chosen.seed, chosen.base) if chosen.store is None else stored(chosen.store)
     figures = [*_measured(first), *_times(first)]
     for name in FOLDERS:
@@ -136,14 +128,3 @@ def _times(scene: CodecScene) -> Iterator[Figure]:
 def _seconds(codec: Codec, tile_id: TileId, gaussians: Gaussians) -> tuple[float, float]:
     body = codec.encode(tile_id, gaussians)
     return core_s(lambda: codec.encode(tile_id, gaussians)), core_s(lambda: codec.decode(tile_id, body))
-
-
-def core_s(work: Callable[[], object], runs: int = 15) -> float:
-    """Median time of the processor, s, of a call after one call that is not counted."""
-    work()
-    times_s = []
-    for _ in range(runs):
-        begin_s = process_time()
-        work()
-        times_s.append(process_time() - begin_s)
-    return statistics.median(times_s)

@@ -35,7 +35,7 @@ from gnd.gnd_map.gaussian import Gaussians, concat
 from gnd.gnd_map.tile_id import TileId
 from gnd.schemas.changes import ChangeReport, TileChange
 from studies.simulation.base_map import read_base
-from studies.simulation.result import read_reports
+from studies.simulation.result import read_result
 
 TRUST = {"tile": 40, "delta": 80, "flags": 60, "measured": 80, "tiles": 60, "mask": 30}
 """How many decisions what was learnt counts as: less where a stream is long and finds out for itself."""
@@ -89,7 +89,7 @@ def learn(folder: Path) -> None:
 
 
 def _reports(path: Path) -> Iterator[Report]:
-    for body in read_reports(path):
+    for body in read_result(path).reports:
         yield list(ChangeReport.decode(body).tiles)
 
 

@@ -15,9 +15,7 @@ from gnd.gnd_map.accumulate import VoxelAccumulator
 from gnd.gnd_map.arrays import F64
 from gnd.gnd_map.geodesy import LocalFrame
 from gnd.gnd_map.grid import GridFrame
-from gnd.gnd_map.motion import Trajectory, deskew
-from gnd.gnd_map.se3 import transform
-from gnd.gnd_map.tile import Tile
+from gnd.gnd_map.motion import Trajectory
 from gnd.gnd_map.tile_id import TileId
 from gnd.schemas.drive import Scan
 from gnd.schemas.drive_mcap import load_track, read_drive, read_header
@@ -26,9 +24,9 @@ from gnd.vehicle_agent.detect.kernel import cast_rays, kernel_parameters, window
 from gnd.vehicle_agent.detect.parameters import DetectParameters
 from gnd.vehicle_agent.detect.records import make_records
 from gnd.vehicle_agent.local_map import LocalMap
-from studies.figures import Figure, median_s
+from studies.frame.measure import Figure, median_s
+from studies.frame.scans import local_map_of, rays
 
-COMMAND = "python -m studies detection"
 SEED, SCANS = 1, 30
 
 
@@ -50,8 +48,8 @@ def _measure(
     n = len(scans)
     whole_s = median_s(lambda: [detector.add_scan(points, origins) for points, origins in scans]) / n
     kernel_s, voxels = _kernel_alone(scans, local_map, parameters)
-    rays = sum(len(points) for points, _ in scans) / n
-    detail = f"{rays:,.0f} rays and {voxels:,.0f} voxels a scan, {local_map.count:,} Gaussians"
+    many = sum(len(points) for points, _ in scans) / n
+    detail = f"{many:,.0f} rays and {voxels:,.0f} voxels a scan, {local_map.count:,} Gaussians"
     return [
         Figure(f"detection, {name}", 1 / whole_s, "scans/s", detail),
         Figure(f"ray kernel, {name}", kernel_s * 1e3, "ms/scan", f"{kernel_s / voxels * 1e9:.1f} ns a voxel"),
@@ -90,25 +88,15 @@ def _scans(sensor: str) -> list[tuple[F64, F64]]:
         simulate_drive(street(SEED), config, path)
         header, track = read_header(path), load_track(path)
         poses = Trajectory(track.reference.t_ns, track.reference.T_map_vehicle)
-        found = []
-        for item in read_drive(path):
-            if isinstance(item, Scan):
-                T_map_vehicle = poses.at(item.t_ns)
-                one = [
-                    deskew(p, item.t_offset_ns, item.t_ns, poses, header.T_vehicle_lidar, item.t_ns)
-                    for p in (item.points_m, np.zeros_like(item.points_m))
-                ]
-                found.append((transform(T_map_vehicle, one[0]), transform(T_map_vehicle, one[1])))
-    return found
+        scans = (item for item in read_drive(path) if isinstance(item, Scan))
+        return [rays(scan, poses, header.T_vehicle_lidar, scan.t_ns) for scan in scans]
 
 
 def _map_of(scans: list[tuple[F64, F64]]) -> LocalMap:
     world = street(SEED)
     frame = LocalFrame(world.lat_rad, world.lon_rad, world.height_m)
     grid_frame = GridFrame.around(frame, [TileId.from_geodetic(world.lat_rad, world.lon_rad)])
-    accumulator, local_map = VoxelAccumulator(grid_frame), LocalMap(grid_frame)
+    accumulator = VoxelAccumulator(grid_frame)
     for points, _ in scans:
         accumulator.add(points)
-    for tile_id, gaussians in accumulator.finish().items():
-        local_map.set_tile(Tile(tile_id, 1, gaussians))
-    return local_map
+    return local_map_of(grid_frame, accumulator.finish())

@@ -5,7 +5,7 @@ decimetres across it, as low-cost GNSS with lanes leaves them, and each light by
 """
 
 from collections import defaultdict
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from time import process_time
 from typing import Final
@@ -20,9 +20,8 @@ from gnd.gnd_map.geodesy import LocalFrame
 from gnd.gnd_map.tile_id import TileId
 from gnd.schemas.features import EVERY_CELL, FeatureChange, FeatureReport, Found
 from gnd.schemas.report_id import deterministic_report_id
-from studies.figures import Figure
+from studies.frame.measure import Figure, least_s
 
-COMMAND = "python -m studies features-merge"
 ROAD_M: Final = 3_000
 SPACING_M: Final = 40.0
 ALONG_M: Final = 3.0
@@ -42,11 +41,11 @@ Merged = dict[TileId, MergedFeatures]
 def run() -> list[Figure]:
     """Measure a road, tile by tile, and one tile that many vehicles have reported on."""
     reports = reports_of(lights(), VEHICLES, seed=SEEDS[0])
-    spent_s = processor_s(lambda: merge_layer({}, reports))
+    spent_s = least_s(lambda: merge_layer({}, reports))
     n = sum(len(change.found) for report in reports for change in report.tiles)
     busy = _busy_tile()
     (tile,) = {report.tiles[0].tile for report in busy}
-    each_s = processor_s(lambda: merge_features(tile, (), busy))
+    each_s = least_s(lambda: merge_features(tile, (), busy))
     detail = f"{VEHICLES} vehicles, {ROAD_M / 1000:g} km, {n} finds"
     return [
         Figure("whole road", n / spent_s, "finds/s", f"{detail} in {spent_s:.2f} s of one core, tiles around told"),
@@ -59,17 +58,6 @@ def run() -> list[Figure]:
         *_long_journal(),
         *_quality(),
     ]
-
-
-def processor_s(work: Callable[[], object], runs: int = 3) -> float:
-    """Return the least processor time, s, of a call after one that is not counted."""
-    work()
-    times_s = []
-    for _ in range(runs):
-        begin_s = process_time()
-        work()
-        times_s.append(process_time() - begin_s)
-    return min(times_s)
 
 
 def lights() -> F64:

@@ -16,11 +16,10 @@ from gnd.fleet_sim.street import StreetOptions, street
 from gnd.gnd_map.arrays import F64
 from gnd.schemas.drive import MotionSample, Scan
 from gnd.vehicle_agent.tiles_at_hand import localising_on
-from studies.figures import Figure
+from studies.frame.measure import Figure
 from studies.localisation_scenes import Localising
 from studies.short_drives import Drive, Street, gnss_offset_m, is_wrong
 
-COMMAND = "python -m studies first-pose"
 SEED, LENGTH_M = 101, 300.0
 SENSORS = ("VLP-16", "HDL-64E", "Scala")
 STARTS, WINDOW_S, FIX_NS = 6, 10.0, 100_000_000  # starts a drive, of which there are two a sensor

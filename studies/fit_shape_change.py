@@ -25,16 +25,13 @@ from gnd.fleet_sim.world import World
 from gnd.gnd_map.arrays import F64
 from gnd.gnd_map.classes import ChangeClass
 from gnd.gnd_map.grid import GridFrame
-from gnd.gnd_map.tile import Tile
 from gnd.vehicle_agent.detect.classify import DETECT_RESHAPED_LOG_ODDS
 from gnd.vehicle_agent.detect.detector import ChangeDetector
 from gnd.vehicle_agent.detect.evidence import TileEvidence
 from gnd.vehicle_agent.detect.parameters import MIN_CELLS
 from gnd.vehicle_agent.detect.shape_change import MONOTONE, Forest, shape_features
-from gnd.vehicle_agent.local_map import LocalMap
-from studies.simulation.fleet import fleet_configs
-from studies.simulation.options import RunOptions
-from studies.simulation.pose_source import PoseSource
+from studies.frame.scans import local_map_of
+from studies.simulation.options import PoseSource, RunOptions, fleet_configs
 from studies.simulation.poses import FromReference
 
 SEEDS = (101, 102, 103)
@@ -63,9 +60,7 @@ def examples_of_world(seed: int, vehicles: int) -> Examples:
 def examples_of_drive(world: World, truth: Truth, config: DriveConfig) -> Examples:
     """Return the examples of one drive on the map of the state before."""
     simulation = DriveSimulation(world, config)
-    local_map = LocalMap(GridFrame.around(world.frame, sorted(truth.before)))
-    for tile_id, gaussians in truth.before.items():
-        local_map.set_tile(Tile(tile_id, 1, gaussians))
+    local_map = local_map_of(GridFrame.around(world.frame, sorted(truth.before)), truth.before)
     detector = ChangeDetector(local_map)
     poses = FromReference(simulation.header(), local_map, PoseSource(), config.seed)
     for item in simulation.items():

@@ -6,8 +6,6 @@ and are left out. The autocorrelation at lags of 1 … 60 s is fitted by a * exp
 1 - a the share of the variance that is white.
 """
 
-import argparse
-from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
@@ -17,21 +15,20 @@ from scipy.optimize import curve_fit
 
 from gnd.gnd_map.arrays import F64
 from gnd.gnd_map.geodesy import LocalFrame
-from studies.figures import Figure
-from studies.real_localisation.nagoya import read_reference
-from studies.real_localisation.rtklib import read_pos
+from studies.frame.measure import Figure
+from studies.frame.options import option
+from studies.real_localisation.nagoya import read_pos, read_reference
 
-COMMAND: Final = "python -m studies gnss-noise"
 RECORDING: Final = Path(__file__).resolve().parents[2] / "shared" / "data" / "gnss_nagoya"
 REFLECTED_M: Final = 8.0
 LAGS_S: Final = 60
 
 
 @dataclass(frozen=True, slots=True)
-class GnssNoiseOptions:
+class Options:
     """Which recording."""
 
-    recording: Path = RECORDING
+    recording: Path = option(RECORDING, "Folder with rover_1Hz_spp.pos, reference.csv.")
 
 
 @dataclass(frozen=True, slots=True)
@@ -55,18 +52,9 @@ class GnssNoise:
     left_out: float
 
 
-def options(arguments: Sequence[str]) -> GnssNoiseOptions:
-    """The options of the command line."""
-    parser = argparse.ArgumentParser(prog=COMMAND, description=__doc__)
-    parser.add_argument(
-        "--recording", type=Path, default=RECORDING, help="folder with rover_1Hz_spp.pos, reference.csv"
-    )
-    return GnssNoiseOptions(**vars(parser.parse_args(arguments)))
-
-
-def run(chosen: GnssNoiseOptions | None = None) -> list[Figure]:
+def run(chosen: Options | None = None) -> list[Figure]:
     """Fit the recording, if it is there."""
-    chosen = chosen or GnssNoiseOptions()
+    chosen = chosen or Options()
     if not chosen.recording.is_dir():
         return [Figure("not measured", float("nan"), "", "no folder --recording")]
     noise = fitted(*horizontal_errors(chosen.recording))
@@ -83,7 +71,7 @@ def horizontal_errors(folder: Path) -> tuple[F64, F64]:
     """Times float64 (N,) [s] and errors east, north float64 (N, 2) [m] of the single-point fixes of a recording.
 
     Raises:
-        RealLocalisationError: a file is missing or has another form.
+        RealDataError: a file is missing or has another form.
     """
     fixes, _ = read_pos(folder / "rover_1Hz_spp.pos")
     reference = read_reference(folder / "reference.csv")

@@ -23,11 +23,11 @@ from gnd.schemas.drive import Scan
 from gnd.vehicle_agent.local_map import LocalMap
 from gnd.vehicle_agent.localise import PoseEstimate
 from gnd.vehicle_agent.tiles_at_hand import localising_on
-from studies.figures import Figure
+from studies.frame.measure import Figure
+from studies.frame.scans import local_map_of
 from studies.localisation_scenes import Localising
-from studies.short_drives import Drive, Street, gnss_offset_m, is_wrong, local_map_of
+from studies.short_drives import Drive, Street, gnss_offset_m, is_wrong
 
-COMMAND = "python -m studies health"
 SEED, LENGTH_M = 101, 300.0
 SENSORS = ("VLP-16", "Scala")
 AT_S, EVENT_S, END_S, FIX_NS = 8.0, 3.0, 10.0, 100_000_000

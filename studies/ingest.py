@@ -28,10 +28,9 @@ from gnd.schemas.changes import ChangeAck
 from gnd.schemas.report_states import ReportState
 from gnd.tile_store.sqlite_store import SqliteStore
 from gnd.vehicle_agent.packing import pack_measured
-from studies.figures import Figure
+from studies.frame.measure import Figure, spent_s
 from studies.short_corpus import Corpus, ShortReport, corpus
 
-COMMAND = "python -m studies ingest"
 CLIENTS = 100
 SESSIONS = 4
 REPORTS = 3_000
@@ -117,8 +116,8 @@ def _costs(reports: Corpus) -> list[Figure]:
         expander = Expander(store, ShardConfig("bench"), lambda _, state: told.append(state))
         many = from_many(reports.reports, CHEAP_REPORTS, "cheap")
         letters = [(one.key, one.packed.encode()) for one in many]
-        to_ack = _cpu_ms(lambda: _in_threads(lambda letter: ingest.answer(*letter), letters)) / len(letters)
-        flags = _cpu_ms(lambda: _work(expander, LOOKED_AT)) / LOOKED_AT
+        to_ack = 1e3 * spent_s(lambda: _in_threads(lambda letter: ingest.answer(*letter), letters)) / len(letters)
+        flags = 1e3 * spent_s(lambda: _work(expander, LOOKED_AT)) / LOOKED_AT
     size = f"{np.mean([len(payload) for _, payload in letters]):.0f} B each"
     return [
         Figure("CPU to the ack", to_ack, "ms/report", f"{len(letters)} first halves of {size}, 16 threads, no bus"),
@@ -143,19 +142,13 @@ def _second_halves(reports: Corpus) -> float:
         for one in asked:
             half = pack_measured(one.whole, reports.bases(), told[one.packed.report_id])
             ingest.answer(one.key, half.encode())
-        return _cpu_ms(lambda: _work(expander, len(asked))) / max(len(asked), 1)
+        return 1e3 * spent_s(lambda: _work(expander, len(asked))) / max(len(asked), 1)
 
 
 def _work(expander: Expander, least: int) -> None:
     done = 0
     while done < least:
         done += expander.work()
-
-
-def _cpu_ms(work: Callable[[], object]) -> float:
-    start_s = time.process_time()
-    work()
-    return 1e3 * (time.process_time() - start_s)
 
 
 def _in_threads(work: Callable[[tuple[str, bytes]], object], letters: Sequence[tuple[str, bytes]]) -> None:

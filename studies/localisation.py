@@ -26,13 +26,10 @@ from gnd.vehicle_agent.localise.judge import Judge
 from gnd.vehicle_agent.localise.packed_scan import PackedScan
 from gnd.vehicle_agent.localise.refine import Refiner
 from gnd.vehicle_agent.localise.scan_odometry import ScanOdometry
-from studies.figures import Figure
+from studies.frame.measure import Figure, Stopwatch
 from studies.localisation_scenes import localising, mapped_street, note_newest, reference_of, true_scans
-from studies.odometry_alone import steps_of
-from studies.registering import registrations, rivals_of
-from studies.stopwatch import Stopwatch
+from studies.registering import registrations, rivals_of, steps_of
 
-COMMAND = "python -m studies localisation"
 SENSORS = ("VLP-16", "HDL-32E", "HDL-64E", "Scala")
 SCANS, EVERY = 60, 5
 WARMING = 30

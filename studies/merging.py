@@ -4,9 +4,7 @@ A tile of walls and ground in which voxels have changed; every vehicle has measu
 noise, one in twenty of the voxels otherwise. The shift test of a report is made once, so it stands alone.
 """
 
-from collections.abc import Callable
 from functools import partial
-from time import process_time
 from typing import Final
 
 import numpy as np
@@ -25,9 +23,8 @@ from gnd.gnd_map.gaussian import Gaussians
 from gnd.gnd_map.tile import content_sha
 from gnd.gnd_map.tile_id import TileId
 from gnd.schemas.changes import TileChange
-from studies.figures import Figure
+from studies.frame.measure import Figure, least_s
 
-COMMAND = "python -m studies merging"
 TILE: Final = TileId(497353963154)
 VOXELS: Final = 2_000
 CHANGED: Final = (30, 900)
@@ -54,7 +51,7 @@ def merge_figure(base: Gaussians, reports: int, changed: int) -> Figure:
     state = TileState(base, TileMemory())
     rows = statements_of(base, said, {sha: base}).rows
     whole_ms, ours_ms, twin_ms = (
-        least_ms(work)
+        1e3 * least_s(work, 5)
         for work in (
             partial(merger.merge, state, said, None),
             partial(clusters_of, rows, rules),
@@ -70,19 +67,8 @@ def _shift_figure(base: Gaussians, changed: int) -> Figure:
     test = shift_of(report.change, base)
     detail = f"{test.gaussians} Gaussians that fit nothing, base of {len(base)}; once a report"
     return Figure(
-        f"shift test of {changed} changed voxels", least_ms(lambda: shift_of(report.change, base)), "ms", detail
+        f"shift test of {changed} changed voxels", 1e3 * least_s(lambda: shift_of(report.change, base), 5), "ms", detail
     )
-
-
-def least_ms(work: Callable[[], object], runs: int = 5) -> float:
-    """Return the least processor time, ms, of a call after one that is not counted."""
-    work()
-    times_ms = []
-    for _ in range(runs):
-        begin_s = process_time()
-        work()
-        times_ms.append(1000.0 * (process_time() - begin_s))
-    return min(times_ms)
 
 
 def base_of(voxels: int) -> Gaussians:

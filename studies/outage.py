@@ -19,11 +19,10 @@ from gnd.fleet_bus.bus import Bus, open_bus
 from gnd.fleet_bus.config import BusConfig
 from gnd.fleet_bus.errors import BusClosed, RequestFailed
 from gnd.schemas.keys import change_key, tile_key, update_keys
-from studies.figures import Figure
-from studies.flat_tile import change_report
+from studies.frame.measure import Figure
+from studies.sizes import change_report
 from studies.small_cloud import READY_S, SmallCloud, small_cloud
 
-COMMAND = "python -m studies outage"
 VICTIMS = {"router": ("tile", "report", "update"), "store": ("tile",), "merger-0": ("report", "update")}
 KILLS = 3
 BETWEEN_S = 4.0

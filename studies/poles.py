@@ -8,7 +8,6 @@ on the street. Worlds and drives were not used for tuning. Recordings have no la
 that the next scan finds again within 0.3 m.
 """
 
-import argparse
 from collections import Counter
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
@@ -23,13 +22,11 @@ from gnd.fleet_sim.sensors import SHORT_NAMES
 from gnd.gnd_map.se3 import exp_so3, transform
 from gnd.vehicle_agent.features.poles.detector import PoleDetector, Rays
 from gnd.vehicle_agent.features.poles.slices import PoseSigma
-from studies.figures import Figure
-from studies.pole_pictures import draw_poles
-from studies.pole_real import poles_of, scans_of, stability
-from studies.pole_scenes import KINDS, Drive, PoleDrive, PoleScan
-from studies.pole_scores import BANDS, CHI2_2_95, SINGLE, Score
+from studies.frame.measure import Figure
+from studies.frame.options import check, option, seeds
+from studies.pole_real import draw_poles, poles_of, scans_of, stability
+from studies.pole_scenes import BANDS, CHI2_2_95, KINDS, SINGLE, Drive, PoleDrive, PoleScan, Score
 
-COMMAND = "python -m studies poles"
 RECORDINGS: Final = Path(__file__).resolve().parents[2] / "shared" / "data"
 FOLDERS: Final = ("kitti_raw_0060", "kitti00_start16", "radiate_fog", "apollo_ndt")
 PICTURES_OF: Final = 3
@@ -42,34 +39,27 @@ SIGMA_M, SIGMA_RAD = 0.04, radians(0.08)
 
 
 @dataclass(frozen=True, slots=True)
-class PoleOptions:
-    """seeds: simulated streets. sensors: short names. recordings: folder of real ones. pictures: where to draw them."""
+class Options:
+    """Simulated streets and real recordings."""
 
-    seeds: tuple[int, ...] = SEEDS
-    sensors: tuple[str, ...] = SENSORS
-    recordings: Path = RECORDINGS
-    pictures: Path | None = None
-
-
-def options(arguments: Sequence[str]) -> PoleOptions:
-    """The options of the command line."""
-    parser = argparse.ArgumentParser(prog=COMMAND, description=__doc__)
-    parser.add_argument(
-        "--seeds", default=",".join(map(str, SEEDS)), help="worlds of the streets (default %(default)s)"
+    seeds: tuple[int, ...] = seeds(*SEEDS, text="Worlds of the streets.")
+    sensors: tuple[str, ...] = option(
+        SENSORS,
+        f"Some of {', '.join(SHORT_NAMES)}, or none.",
+        known=SHORT_NAMES,
+        some=False,
+        read=lambda text: tuple(name for name in text.split(",") if name and name != "none"),
     )
-    parser.add_argument("--sensors", default=",".join(SENSORS), help=f"some of {', '.join(SHORT_NAMES)}, or none")
-    parser.add_argument("--recordings", type=Path, default=RECORDINGS, help=f"folder with {', '.join(FOLDERS)}")
-    parser.add_argument("--pictures", type=Path, help="draw what is found in real scans into this folder")
-    chosen = parser.parse_args(arguments)
-    sensors = tuple(name for name in chosen.sensors.split(",") if name and name != "none")
-    if unknown := set(sensors) - set(SHORT_NAMES):
-        parser.error(f"unknown sensors {', '.join(sorted(unknown))}; there are {', '.join(SHORT_NAMES)}")
-    return PoleOptions(tuple(int(s) for s in chosen.seeds.split(",")), sensors, chosen.recordings, chosen.pictures)
+    recordings: Path = option(RECORDINGS, f"Folder with {', '.join(FOLDERS)}.")
+    pictures: Path | None = option(None, "Draw what is found in real scans into this folder.")
+
+    def __post_init__(self) -> None:
+        check(self)
 
 
-def run(chosen: PoleOptions | None = None) -> list[Figure]:
+def run(chosen: Options | None = None) -> list[Figure]:
     """Measure every sensor, then every recording that there is."""
-    chosen = chosen or PoleOptions()
+    chosen = chosen or Options()
     figures: list[Figure] = []
     for sensor in chosen.sensors:
         single, window = measured(sensor, chosen.seeds)

@@ -29,7 +29,7 @@ from gnd.vehicle_agent.outbox import Outbox
 from gnd.vehicle_agent.report import Identity, Reporter
 from gnd.vehicle_agent.segment.segmenter import SegmentedScan
 from studies.gated_merge import merged
-from studies.simulation.pose_source import PoseSource
+from studies.simulation.options import PoseSource
 from studies.simulation.poses import FromReference
 
 ErrorAt = Callable[[float], F64]

@@ -38,8 +38,7 @@ from gnd.vehicle_agent.segment.parameters import SegmentParameters
 from gnd.vehicle_agent.segment.segmenter import SegmentedScan
 from studies.gated_merge import Merged, merged
 from studies.real.drive import Poses, Tiles, detect, local_map_of, refined_scans, segmented
-from studies.real.scene import Scene, in_range, load, place
-from studies.real.voxels import keys_of
+from studies.real.scene import Scene, in_range, keys_of, load, place
 
 I64 = NDArray[np.int64]
 SIGMA_M, SIGMA_RAD = 0.02, 0.001

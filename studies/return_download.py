@@ -5,7 +5,6 @@ many voxels are then as they are after the changes, those nearest to one place. 
 tile server's own code, keys included; a district is one question.
 """
 
-import argparse
 import tempfile
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
@@ -28,43 +27,30 @@ from gnd.tile_store.answers import Answers
 from gnd.tile_store.sqlite_store import SqliteStore
 from gnd.tile_store.values import DEFAULT_CODEC, DEFAULT_LAYER
 from studies.codec_scenes import LENGTH_M, SEED
-from studies.figures import Figure
+from studies.frame.measure import Figure
+from studies.frame.options import check, option
 from studies.simulation.base_map import BaseMap, driven, read_base
-
-COMMAND = "python -m studies return-download"
-CHANGED = 0.02
 
 Tiles = dict[TileId, Gaussians]
 
 
 @dataclass(frozen=True, slots=True)
-class ReturnOptions:
-    """seed: of the simulated street. before, after: its maps, None to make them. codec: how finely they are rounded.
+class Options:
+    """A simulated street and how much of it has changed."""
 
-    changed: share of the voxels that has changed.
-    """
+    seed: int = option(SEED, "World of the simulated street.")
+    before: Path | None = option(None, "Its map before the changes, a file of `write_base`.  [default: make it]")
+    after: Path | None = option(None, "Its map after the changes, a file of `write_base`.  [default: make it]")
+    codec: str = option(DEFAULT_CODEC, "How finely it is rounded.", known=LATTICES)
+    changed: float = option(0.02, "Share of changed voxels.", span=(0, 1))
 
-    seed: int = SEED
-    before: Path | None = None
-    after: Path | None = None
-    codec: str = DEFAULT_CODEC
-    changed: float = CHANGED
-
-
-def options(arguments: Sequence[str]) -> ReturnOptions:
-    """The options of the command line."""
-    parser = argparse.ArgumentParser(prog=COMMAND, description=__doc__)
-    parser.add_argument("--seed", type=int, default=SEED, help=f"world of the simulated street (default {SEED})")
-    parser.add_argument("--before", type=Path, help="its map before the changes, a file of `write_base`")
-    parser.add_argument("--after", type=Path, help="its map after the changes, a file of `write_base`")
-    parser.add_argument("--codec", choices=list(LATTICES), default=DEFAULT_CODEC, help="how finely it is rounded")
-    parser.add_argument("--changed", type=float, default=CHANGED, help=f"share of changed voxels (default {CHANGED})")
-    return ReturnOptions(**vars(parser.parse_args(arguments)))
+    def __post_init__(self) -> None:
+        check(self)
 
 
-def run(chosen: ReturnOptions | None = None) -> list[Figure]:
+def run(chosen: Options | None = None) -> list[Figure]:
     """Measure the first download, the one after changes, and the one when nothing has changed."""
-    chosen = chosen or ReturnOptions()
+    chosen = chosen or Options()
     before = _map(chosen, chosen.before, "before")
     after = _map(chosen, chosen.after, "after")
     new = partly_changed(before, after, chosen.changed, np.random.default_rng(chosen.seed))
@@ -125,7 +111,7 @@ def _with_edits(before: Gaussians, after: Gaussians, voxel_ids: I32) -> Gaussian
     return concat([before.take(~np.isin(before.voxel_id, voxel_ids)), after.select(voxel_ids)])
 
 
-def _map(chosen: ReturnOptions, path: Path | None, state: State) -> Tiles:
+def _map(chosen: Options, path: Path | None, state: State) -> Tiles:
     """The street's map on the lattice; tiles without a Gaussian are left out."""
     base = _driven(chosen.seed, state) if path is None else read_base(path)
     return {tile: snap(g, LATTICES[chosen.codec]) for tile, g in sorted(base.tiles.items()) if len(g)}

@@ -19,10 +19,9 @@ from gnd.schemas.drive import DriveItem, GnssFix, MotionSample, Scan
 from gnd.schemas.drive_mcap import read_drive
 from gnd.vehicle_agent.local_map import LocalMap
 from gnd.vehicle_agent.localise import LocaliserParameters, PoseEstimate, localisation_error
-from studies.figures import Figure
+from studies.frame.measure import Figure
 from studies.localisation_scenes import localising, mapped_street, note_newest, reference_of
 
-COMMAND = "python -m studies scan-to-scan"
 SENSORS = ("VLP-16", "Scala")
 HOLE_M = 60.0
 

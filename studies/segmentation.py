@@ -19,14 +19,14 @@ from gnd.fleet_sim.drives import PERFECT, DriveConfig, DriveSimulation
 from gnd.fleet_sim.sensors import MODELS, SHORT_NAMES
 from gnd.fleet_sim.street import street
 from gnd.fleet_sim.traffic import Traffic
-from gnd.gnd_map.motion import Trajectory, deskew
+from gnd.gnd_map.motion import Trajectory
 from gnd.gnd_map.se3 import exp_so3, transform
 from gnd.schemas.drive import Scan
 from gnd.vehicle_agent.localise.estimates import PoseEstimate, RefinedScan
 from gnd.vehicle_agent.segment import MotionSegmenter, SegmentedScan, SegmentParameters
-from studies.figures import Figure
+from studies.frame.measure import Figure
+from studies.frame.scans import rays
 
-COMMAND = "python -m studies segmentation"
 SEEDS = (201, 202, 203)
 SECONDS = 8.0
 POSES = {"true poses": (0.0, 0.0), "4 cm, 0.08°": (0.04, radians(0.08))}
@@ -130,12 +130,8 @@ def labelled_scans(sensor: str, seed: int, seconds: float = SECONDS) -> Iterator
 def _refined(scan: Scan, poses: Trajectory, T_vehicle_lidar: NDArray[np.float64]) -> RefinedScan:
     """The scan as localisation would give it, were it perfect."""
     t_ns = scan.t_ns + int(scan.t_offset_ns.max(initial=0)) // 2
-    T = poses.at(t_ns)
-    points, origins = (
-        transform(T, deskew(p, scan.t_offset_ns, scan.t_ns, poses, T_vehicle_lidar, t_ns))
-        for p in (scan.points_m, np.zeros_like(scan.points_m))
-    )
-    return RefinedScan(t_ns, points, origins, PoseEstimate(t_ns, T, 0.01, 0.001, 0.9, "good"))
+    estimate = PoseEstimate(t_ns, poses.at(t_ns), 0.01, 0.001, 0.9, "good")
+    return RefinedScan(t_ns, *rays(scan, poses, T_vehicle_lidar, t_ns), estimate)
 
 
 def moved(

@@ -12,14 +12,14 @@ from gnd.schemas.changes import ChangeReport
 from gnd.schemas.keys import change_key
 from gnd.schemas.packed import PackedReport, decode_upload
 from gnd.schemas.report_id import deterministic_report_id
+from studies.frame.errors import ReproduceError
+from studies.frame.folder import RunFolder
 from studies.simulation.base_map import BaseMap, read_base, write_base
-from studies.simulation.errors import ReproduceError
-from studies.simulation.folder import RunFolder
 from studies.simulation.result import VehicleResult, read_result
 from studies.simulation.vehicle import VehicleTask, run_vehicle
 from studies.simulation.worlds import WorldFiles, prepare_world, world_files
 from studies.traffic_study.fleet import drive_config
-from studies.traffic_study.options import TrafficOptions, street_options
+from studies.traffic_study.options import TrafficOptions, street_of
 
 FOLDER: Final = Path("runs/benchmark-short-reports")
 SEED: Final = 205
@@ -79,7 +79,7 @@ def corpus(folder: Path = FOLDER, drives: int = DRIVES, length_m: float = LENGTH
     Raises:
         ReproduceError: no drive has a report in short.
     """
-    street = street_options("rebuilt", length_m)
+    street = street_of("rebuilt", length_m)
     options = TrafficOptions(seed=SEED, street=street, drives=drives, base="surveyed", pcd_drives=0, scans=scans)
     files = world_files(RunFolder.begun(folder), SEED, options.world)
     path = files.home / "map-standard.npz"

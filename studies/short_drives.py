@@ -15,12 +15,12 @@ from gnd.gnd_map.accumulate import VoxelAccumulator
 from gnd.gnd_map.arrays import F64
 from gnd.gnd_map.gaussian import Gaussians
 from gnd.gnd_map.grid import GridFrame
-from gnd.gnd_map.motion import Trajectory, deskew
+from gnd.gnd_map.motion import Trajectory
 from gnd.gnd_map.se3 import T_inverse, transform
-from gnd.gnd_map.tile import Tile
 from gnd.gnd_map.tile_id import TileId, covering_circle
 from gnd.schemas.drive import DriveItem, GnssFix, ReferencePose, Scan
 from gnd.vehicle_agent.local_map import LocalMap
+from studies.frame.scans import local_map_of, posed
 
 GNSS_M, GNSS_WHITE_M = 2.5, 0.2
 LIMIT_M, LIMIT_DEG = 0.44, 0.5
@@ -113,14 +113,6 @@ def is_wrong(off_m: float, off_deg: float) -> bool:
     return off_m > LIMIT_M or off_deg > LIMIT_DEG
 
 
-def local_map_of(grid_frame: GridFrame, tiles: Mapping[TileId, Gaussians]) -> LocalMap:
-    """Tiles of version 1, held."""
-    held = LocalMap(grid_frame)
-    for tile_id, gaussians in tiles.items():
-        held.set_tile(Tile(tile_id, 1, gaussians))
-    return held
-
-
 def _mapped(world: World, direction: Direction, reach_m: float) -> Iterator[F64]:
     """Points (N, 3) of each scan of a mapping drive, map frame."""
     config = DriveConfig("map", "HDL-32E", "before", direction, errors=PERFECT, car_share=0.0, cruise_mps=12.0)
@@ -131,6 +123,5 @@ def _mapped(world: World, direction: Direction, reach_m: float) -> Iterator[F64]
     mount = simulation.header().T_vehicle_lidar
     for scan in items:
         if isinstance(scan, Scan):
-            points = deskew(scan.points_m, scan.t_offset_ns, scan.t_ns, truth, mount, scan.t_ns)
-            near = np.linalg.norm(points, axis=1) < reach_m
-            yield transform(truth.at(scan.t_ns), points[near])
+            points, T = posed(scan, truth, mount)
+            yield transform(T, points[np.linalg.norm(points, axis=1) < reach_m])

@@ -5,9 +5,8 @@ that the vehicle truly observed, and in short. Times are processor time of the t
 numbers, tells how fast the machine was just then. Decision 0101.
 """
 
-import argparse
 import statistics
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -15,7 +14,6 @@ from time import thread_time
 
 import numpy as np
 from numpy.typing import NDArray
-from rich.progress import Progress
 
 from gnd.cloud_merger.expanding import base_versions, expand
 from gnd.cloud_merger.merge import MergeParameters
@@ -33,32 +31,30 @@ from gnd.gnd_map.track import Track, decode_track
 from gnd.gnd_map.visibility import observed_along
 from gnd.schemas.changes import ChangeReport
 from gnd.schemas.packed import PackedReport
-from studies.figures import Figure
+from studies.frame.command import Bench
+from studies.frame.folder import RunFolder
+from studies.frame.measure import Figure
+from studies.frame.options import option, seeds
 from studies.simulation.base_map import BaseMap
-from studies.simulation.cloud import merged_map
-from studies.simulation.folder import RunFolder
+from studies.simulation.cloud import arrived, merged_map
 from studies.simulation.options import RunOptions, Upload
 from studies.simulation.result import VehicleResult
-from studies.simulation.run import reproduce
-from studies.simulation.scoring import Scored, VehicleFile
-from studies.simulation.uploads import arrived
+from studies.simulation.scores import Scored, VehicleFile
+from studies.simulation.study import reproduce
 from studies.simulation.worlds import WorldFiles, read_world_base
 
-COMMAND = "python -m studies short-reports"
 SENSORS = ("vlp16", "rs32", "hdl64e")
 KINDS = ("with a Gaussian", "without", "next to a change")
 _RUNS, _PAIRS = 5, 100_000
 
 
 @dataclass(frozen=True, slots=True)
-class ShortReportOptions:
-    """seeds: of the streets. length_m: of each. run: a finished run of `gnd reproduce simulation --upload packed`
-    instead; None to drive.
-    """
+class Options:
+    """Streets to drive, or a finished run."""
 
-    seeds: tuple[int, ...] = (21,)
-    length_m: float = 200.0
-    run: Path | None = None
+    seeds: tuple[int, ...] = seeds(21, text="Of the streets.")
+    length_m: float = option(200.0, "Of a street, metres.", "--length")
+    run: Path | None = option(None, "Folder of a finished `gnd reproduce simulation --upload packed` instead.")
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -91,32 +87,22 @@ class Street:
         return ShortReport(whole, body, tuple(tiles))
 
 
-def options(arguments: Sequence[str]) -> ShortReportOptions:
-    """Options of the command line."""
-    parser = argparse.ArgumentParser(prog=COMMAND, description=__doc__)
-    parser.add_argument("--seeds", default="21", help="of the streets, with commas between (default: 21)")
-    parser.add_argument("--length", type=float, default=200.0, help="of a street, metres (default: 200)")
-    parser.add_argument("--run", type=Path, help="folder of a finished `gnd reproduce simulation --upload packed`")
-    given = parser.parse_args(arguments)
-    return ShortReportOptions(tuple(map(int, given.seeds.split(","))), given.length, given.run)
-
-
-def run(chosen: ShortReportOptions | None = None) -> list[Figure]:
+def run(chosen: Options | None = None) -> list[Figure]:
     """Measure the stages, the agreement and the merge."""
-    wanted = chosen or ShortReportOptions()
+    wanted = chosen or Options()
     if wanted.run is not None:
         return _measure(_streets(RunFolder(wanted.run), "surveyed"))
     with TemporaryDirectory() as folder:
         return _measure(_driven(wanted, Path(folder)))
 
 
-def _driven(wanted: ShortReportOptions, folder: Path) -> list[Street]:
+def _driven(wanted: Options, folder: Path) -> list[Street]:
     fleet = RunOptions(
         seeds=wanted.seeds, street=StreetOptions(wanted.length_m, "wangsimni"), vehicles=(len(SENSORS),),
         sensors=SENSORS, pcd=False, upload="packed",
     )  # fmt: skip
-    with Progress(disable=True) as progress:
-        outcome = reproduce(fleet, RunFolder.create(folder / "run"), 1, progress)
+    home = RunFolder.create(folder / "run")
+    outcome = reproduce(fleet, home, Bench(home))
     return [Street(world.files, read_world_base(world.files), world.vehicles) for world in outcome.worlds]
 
 

@@ -5,8 +5,6 @@ the gyro (50 Hz), fixes of the GNSS (1 Hz), association, existence, features, we
 of `gnd.fleet_sim.roads.motorway`, whole; beside the time stand the classes and the positions that it buys.
 """
 
-import argparse
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from math import radians
 from time import perf_counter
@@ -18,42 +16,22 @@ from gnd.fleet_sim.roads.motorway import motorway
 from gnd.gnd_map.arrays import F64
 from gnd.vehicle_agent.features.slamcu.parameters import SlamcuParameters
 from gnd.vehicle_agent.features.slamcu.slamcu import Slamcu
-from studies.figures import Figure
+from studies.frame.measure import Figure
+from studies.frame.options import option, seeds
 from studies.slamcu_study.driving import look_of, map_features, occlusion_of, sensor_view, sign_truth
 from studies.slamcu_study.scores import SignScore, accuracy_of, score
 
-COMMAND = "python -m studies slamcu-step"
 PAPER_MS = 30.39
 """Section 6.1: mean, Core i5-4670."""
 
 
 @dataclass(frozen=True, slots=True)
 class Options:
-    """What is timed.
+    """What is timed."""
 
-    Attributes:
-        seeds: of the motorways.
-        particles: numbers of particles, 0 for the shipped one.
-        km: of each motorway.
-    """
-
-    seeds: tuple[int, ...] = (11, 12)
-    particles: tuple[int, ...] = (0, 300, 3000)
-    km: float = 20.0
-
-
-def options(arguments: Sequence[str]) -> Options:
-    """Options of the command line."""
-    parser = argparse.ArgumentParser(prog=COMMAND, description=__doc__)
-    parser.add_argument("--seeds", default="11,12", help="of the motorways")
-    parser.add_argument("--particles", default="0,300,3000", help="numbers of particles; 0: the shipped one")
-    parser.add_argument("--km", type=float, default=20.0, help="length of each motorway")
-    given = parser.parse_args(list(arguments))
-    return Options(_numbers(given.seeds), _numbers(given.particles), given.km)
-
-
-def _numbers(text: str) -> tuple[int, ...]:
-    return tuple(int(word) for word in text.split(","))
+    seeds: tuple[int, ...] = seeds(11, 12, text="Of the motorways.")
+    particles: tuple[int, ...] = option((0, 300, 3000), "Numbers of particles; 0: the shipped one.")
+    km: float = option(20.0, "Length of each motorway.")
 
 
 def run(chosen: Options | None = None) -> list[Figure]:

@@ -21,7 +21,7 @@ from gnd.gnd_map.tile import Tile
 from gnd.gnd_map.tile_id import TileId
 from gnd.schemas.keys import tile_key
 from gnd.tile_store.sqlite_store import SqliteStore
-from studies.flat_tile import base_tile
+from studies.sizes import base_tile
 
 READY_S = 60.0
 SHARD_POLL_S = 0.02

@@ -20,7 +20,7 @@ from gnd.schemas.report_id import deterministic_report_id
 from gnd.vehicle_agent.features.coverage import Coverage, CoverageParameters
 from gnd.vehicle_agent.features.feature_map import place_in_tile, with_height
 from gnd.vehicle_agent.features.view import Occlusion, SensorView
-from studies.localisation_study.kept import Kept, read_arrays, write_arrays
+from studies.frame.kept import Kept
 
 SIGMA_HEIGHT_M: Final = 0.5
 COVERAGE: Final = CoverageParameters(looks=4, step_m=4.0)
@@ -172,8 +172,7 @@ def in_route_frame(frame: LocalFrame, tile: TileId, features: Sequence[Feature])
 
 def write_reports(reports: Sequence[FeatureReport], kept: Kept) -> None:
     """Keep reports as they are sent; the file appears complete or not at all."""
-    bodies = [np.frombuffer(report.encode(), np.uint8) for report in reports]
-    write_arrays(kept, {"reports": len(bodies)}, {f"report_{i}": body for i, body in enumerate(bodies)})
+    kept.write([report.encode() for report in reports])
 
 
 def read_reports(kept: Kept) -> list[FeatureReport]:
@@ -183,5 +182,4 @@ def read_reports(kept: Kept) -> list[FeatureReport]:
         FolderError: they are missing or damaged.
         SchemaError: what is there is no report.
     """
-    head, arrays = read_arrays(kept)
-    return [FeatureReport.decode(arrays[f"report_{i}"].tobytes()) for i in range(int(head["reports"]))]
+    return [FeatureReport.decode(body) for body in kept.read(list[bytes])]

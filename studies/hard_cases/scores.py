@@ -1,6 +1,7 @@
 """What poses of a hard case are worth: errors, wrong and called good, right and called bad, NEES."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass
 from math import radians
 from typing import Any, Final
 
@@ -8,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gnd.gnd_map.arrays import F64
-from studies.hard_cases.localising import HEALTHS, Poses
+from studies.hard_cases.localising import HEALTHS, CaseRun, Poses
 
 WRONG_M: Final = 0.44
 WRONG_RAD: Final = radians(0.5)
@@ -86,3 +87,63 @@ def _quadratic(error: F64, covariance: F64) -> F64:
     """Squared length (N,) of errors (N, D) in units of their covariances (N, D, D)."""
     found: F64 = np.einsum("nd,nd->n", error, np.linalg.solve(covariance, error[:, :, None])[:, :, 0])
     return found
+
+
+# --- of a case -------------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, slots=True)
+class CaseResult:
+    """What came of a task: runs with and without submaps, seconds of CPU of simulator and of both runs."""
+
+    with_submaps: CaseRun
+    without_submaps: CaseRun
+    seconds: dict[str, float]
+
+
+def sensor_figures(results: Mapping[int, CaseResult]) -> dict[str, Any]:
+    """Return the figures of one case and sensor: all seeds together, the worst, and each."""
+    whole = _rows([result.with_submaps for result in results.values()])
+    without = _rows([result.without_submaps for result in results.values()])
+    seeds = [{"seed": seed, **_seed_figures(result)} for seed, result in results.items()]
+    return {
+        **whole,
+        "without_submaps": without,
+        "submaps_worse_by": _worse_by(whole["refined"], without["refined"]),
+        "worst_seed": max(seeds, key=_badness)["seed"],
+        "seeds": seeds,
+        "cpu_s": sum(sum(result.seconds.values()) for result in results.values()) / len(results),
+    }
+
+
+def _seed_figures(result: CaseResult) -> dict[str, Any]:
+    clock = result.with_submaps.clock
+    return {
+        **_rows([result.with_submaps]),
+        "without_submaps": _rows([result.without_submaps]),
+        "time_offset": clock and asdict(clock),
+        "cpu_s": result.seconds,
+    }
+
+
+def _rows(runs: Sequence[CaseRun]) -> dict[str, Any]:
+    scans = sum(run.scans for run in runs)
+    return {
+        "refined": row_of(joined([run.refined for run in runs]), scans),
+        "online": row_of(joined([run.online for run in runs]), scans),
+    }
+
+
+def _worse_by(with_submaps: Mapping[str, Any], without: Mapping[str, Any]) -> dict[str, float] | None:
+    """By how much the 95 % error with submaps is larger than without; None where either has no pose."""
+    if with_submaps[_AXES[0]] is None or without[_AXES[0]] is None:
+        return None
+    return {name: with_submaps[name]["p95"] - without[name]["p95"] for name in _AXES}
+
+
+def _badness(row: Mapping[str, Any]) -> tuple[float, ...]:
+    """What makes a seed the worst: wrong poses called good first, then errors."""
+    wrong = row["refined"]["wrong_called_good"] + row["online"]["wrong_called_good"]
+    refined = row["refined"]
+    error = max((refined[name]["p95"] for name in _AXES if refined[name] is not None), default=float("inf"))
+    return float(wrong), float(refined["right_called_bad"]), error

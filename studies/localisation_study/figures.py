@@ -1,5 +1,5 @@
-"""The figures of a study: errors over time without and with submaps (GND, Figures 15 and 19), online on the outdated
-and the updated map (Figure 24), and all rows against the limits.
+"""Errors over time without and with submaps (GND, Figures 15 and 19), online on the outdated and the updated map
+(Figure 24), and all rows against the limits.
 """
 
 from collections.abc import Mapping, Sequence
@@ -12,20 +12,21 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
+from numpy.typing import NDArray
+from scipy.spatial import cKDTree
 
-from gnd.fleet_sim.pictures import save_figure
+from gnd.fleet_sim.drives import DriveConfig, DriveSimulation
+from gnd.fleet_sim.ellipsoids import ellipsoids_of_truth
 from gnd.fleet_sim.street import street
-from gnd.fleet_sim.truth import read_truth
+from gnd.fleet_sim.truth import Truth, read_truth
+from gnd.fleet_sim.world import World
 from gnd.gnd_map.arrays import F64
-from studies.localisation_study.changes import NEAR_M, changed_share_along
-from studies.localisation_study.plan import SensorPlan
-from studies.localisation_study.reference import PAPER_LIMITS
-from studies.localisation_study.run import SeedOutcome, SensorOutcome, StudyOutcome
-from studies.localisation_study.series import PoseSeries
-from studies.localisation_study.summary import ROWS
+from gnd.gnd_map.classes import ChangeClass
+from studies.frame.figures import INK, PALE, save, spines
+from studies.localisation_study.series import FORD_LOCAL, PAPER, PAPER_LIMITS, PAPER_OF_ROW, QUANTITIES, PoseSeries
+from studies.localisation_study.summary import ROW_LABELS, ROWS, SeedOutcome, SensorOutcome, StudyOutcome, sensors_of
+from studies.localisation_study.variants import LABELS
 
-_INK: Final = "#1c2430"
-_PALE: Final = "#5a6675"
 _GREEN: Final = "#cfeccb"
 _YELLOW: Final = "#fff1b8"
 _BROWN: Final = "#9a6a3c"
@@ -74,11 +75,11 @@ def draw_figures(outcome: StudyOutcome, folder: Path) -> list[Path]:
     paths = []
     for index, sensor in enumerate(outcome.options.sensors):
         seed = max(outcome.seeds, key=lambda one: _badness(one.sensors[index]))
-        found, plan = seed.sensors[index], seed.plan.sensors[index]
+        found, plan = seed.sensors[index], seed.sensors[index]
         share = _share(outcome, seed, plan)
         for name, title, curves in _PICTURES:
             path = folder / f"{sensor}_{name}.png"
-            head = f"{plan.drive.sensor}: {title.lower()}", f"world seed {seed.plan.seed}, {_length(outcome)}"
+            head = f"{plan.drive.sensor}: {title.lower()}", f"world seed {seed.seed}, {_length(outcome)}"
             _draw(_series(found, curves), share, plan.drive.start_ns, head, path)
             paths.append(path)
     return paths
@@ -94,9 +95,9 @@ def _badness(found: SensorOutcome) -> float:
     return float(np.max(np.abs(error) / np.array(PAPER_LIMITS.max), initial=0.0))
 
 
-def _share(outcome: StudyOutcome, seed: SeedOutcome, plan: SensorPlan) -> tuple[F64, F64]:
-    world = street(seed.plan.seed, outcome.options.street)
-    return changed_share_along(world, read_truth(seed.plan.files.truth), plan.drive)
+def _share(outcome: StudyOutcome, seed: SeedOutcome, plan: SensorOutcome) -> tuple[F64, F64]:
+    world = street(seed.seed, outcome.options.street)
+    return changed_share_along(world, read_truth(seed.truth), plan.drive)
 
 
 def _series(found: SensorOutcome, curves: Sequence[Curve]) -> dict[Curve, PoseSeries]:
@@ -118,18 +119,18 @@ def _draw(
     for column, titled in enumerate(("against the limits; numbers: 95 % / largest", "enlarged")):
         top = figure.add_subplot(grid[0, column])
         _draw_share(top, share, named=column == 0)
-        top.set_title(titled, fontsize=11, color=_INK, loc="left", weight="bold")
+        top.set_title(titled, fontsize=11, color=INK, loc="left", weight="bold")
         for quantity in range(3):
             axes = figure.add_subplot(grid[quantity + 1, column], sharex=top)
             _draw_errors(axes, series, quantity, start_ns, enlarged=column == 1)
             _mark_changes(axes, share)
             axes.tick_params(labelbottom=quantity == 2)
-        axes.set_xlabel("seconds since the drive began", color=_INK)
+        axes.set_xlabel("seconds since the drive began", color=INK)
     figure.align_ylabels()
     _legend(figure, series)
-    figure.text(0.025, 0.965, head[0], fontsize=16, weight="bold", color=_INK, va="center")
-    figure.text(0.025, 0.930, head[1], fontsize=10, color=_PALE, va="center")
-    save_figure(figure, path)
+    figure.text(0.025, 0.965, head[0], fontsize=16, weight="bold", color=INK, va="center")
+    figure.text(0.025, 0.930, head[1], fontsize=10, color=PALE, va="center")
+    save(figure, path)
 
 
 def _draw_share(axes: Axes, share: tuple[F64, F64], *, named: bool) -> None:
@@ -139,9 +140,9 @@ def _draw_share(axes: Axes, share: tuple[F64, F64], *, named: bool) -> None:
     axes.fill_between(t_s, 100 * changed, where=changed > _MUCH, color=_PURPLE, alpha=0.6, linewidth=0)
     axes.set_xlim(t_s[0], t_s[-1])
     axes.set_ylim(0, max(100 * float(changed.max(initial=0.0)) * 1.15, 10))
-    axes.set_ylabel(f"changed\n≤ {NEAR_M:g} m, %" if named else "", color=_INK, fontsize=8)
-    axes.tick_params(labelbottom=False, colors=_INK, labelsize=8)
-    _spines(axes)
+    axes.set_ylabel(f"changed\n≤ {NEAR_M:g} m, %" if named else "", color=INK, fontsize=8)
+    axes.tick_params(labelbottom=False, colors=INK, labelsize=8)
+    spines(axes)
 
 
 def _draw_errors(
@@ -159,9 +160,9 @@ def _draw_errors(
     if not enlarged:
         _write_errors(axes, series, quantity)
     axes.axhline(0.0, color="#b9c1cc", linewidth=0.8, zorder=1)
-    axes.set_ylabel(f"{name}, {unit}", color=_INK)
-    axes.tick_params(colors=_INK, labelsize=9)
-    _spines(axes)
+    axes.set_ylabel(f"{name}, {unit}", color=INK)
+    axes.tick_params(colors=INK, labelsize=9)
+    spines(axes)
 
 
 def broken(t_s: F64, error: F64) -> tuple[F64, F64]:
@@ -213,6 +214,126 @@ def _ending(one: PoseSeries) -> str:
     return "" if len(one) else " (no pose)"
 
 
-def _spines(axes: Axes) -> None:
-    for name, spine in axes.spines.items():
-        spine.set(visible=name in ("left", "bottom"), color="#c3ccd8")
+_COLOURS: Final = ("#d1282e", "#2f6fb5", "#2e8b57", "#e0a020", "#8455a8", "#76808e")
+_P95, _MAX, _FORD = "#2e8b57", "#c9a100", "#9aa4b2"
+_TITLES: Final = ("longitudinal, m", "lateral, m", "heading, °")
+_LEAST: Final = (1e-3, 1e-3, 2e-3)
+"""Left end of each axis; what is smaller is drawn there."""
+
+
+def draw_overview(found: Mapping[str, Any], path: Path) -> Path:
+    """Draw every row of every sensor.
+
+    Args:
+        found: the result.
+        path: PNG to write.
+
+    Raises:
+        SimError: it cannot be written.
+    """
+    sensors = sensors_of(found)
+    rows = list(_rows(found, sensors))
+    tall_in = 1.9 + 0.27 * len(rows) * (1 + 0.28 * len(sensors))
+    figure = Figure(figsize=(13.0, tall_in), dpi=130, facecolor="white")
+    panels = figure.subplots(1, 3, sharey=True)
+    figure.subplots_adjust(left=0.165, right=0.985, top=1 - 1.25 / tall_in, bottom=0.5 / tall_in, wspace=0.06)
+    for quantity, axes in enumerate(panels):
+        _dress(axes, quantity, len(rows))
+        for y, (name, _) in enumerate(rows):
+            for index, sensor in enumerate(sensors):
+                row = _row_of(found[sensor], name)
+                shift = (index - (len(sensors) - 1) / 2) * 0.24
+                if row is not None:
+                    _draw_row(axes, y + shift, row[QUANTITIES[quantity]], quantity, _COLOURS[index % len(_COLOURS)])
+            _draw_paper(axes, y, name, quantity)
+    panels[0].set_yticks(range(len(rows)), [label for _, label in rows])
+    seeds = ", ".join(found["seeds"])
+    figure.text(0.02, 1 - 0.32 / tall_in, "Localisation in a changed world", fontsize=16, weight="bold", color=INK)
+    note = f"world seed {seeds}" + (", the worst of each" if len(found["seeds"]) > 1 else "")
+    figure.text(0.02, 1 - 0.58 / tall_in, note, fontsize=10, color=PALE)
+    _overview_legend(figure, sensors, tall_in)
+    return save(figure, path)
+
+
+def _rows(found: Mapping[str, Any], sensors: list[str]) -> "list[tuple[str, str]]":
+    """Name and label of every row that some sensor has."""
+    variants = dict.fromkeys(name for sensor in sensors for name in found[sensor].get("variants", {}))
+    return [(name, ROW_LABELS[name]) for name in ROWS] + [(name, LABELS[name]) for name in variants]
+
+
+def _row_of(rows: Mapping[str, Any], name: str) -> Mapping[str, Any] | None:
+    row: Mapping[str, Any] | None = rows.get(name) or rows.get("variants", {}).get(name)
+    return row if row is not None and row[QUANTITIES[0]] is not None else None
+
+
+def _draw_row(axes: Axes, y: float, error: Mapping[str, float], quantity: int, colour: str) -> None:
+    """A filled dot at the 95 %, a ring at the largest error."""
+    p95, largest = (max(error[name], _LEAST[quantity]) for name in ("p95", "max"))
+    axes.plot([p95, largest], [y, y], color=colour, linewidth=1.2, alpha=0.6, zorder=2)
+    axes.plot(p95, y, "o", color=colour, markersize=5, zorder=3)
+    axes.plot(largest, y, "o", color=colour, markerfacecolor="white", markersize=4.5, zorder=3)
+
+
+def _draw_paper(axes: Axes, y: float, name: str, quantity: int) -> None:
+    """Crosses at the 95 % of the paper's simulation, or of its drives where it has no simulation."""
+    for paper in PAPER_OF_ROW.get(name, ())[:1]:
+        axes.plot(PAPER[paper].p95[quantity], y, "x", color=INK, markersize=6, zorder=4)
+
+
+def _dress(axes: Axes, quantity: int, rows: int) -> None:
+    axes.set_xscale("log")
+    axes.set_xlim(_LEAST[quantity], 3.0)
+    axes.set_ylim(rows - 0.5, -0.5)
+    axes.axvline(PAPER_LIMITS.p95[quantity], color=_P95, linewidth=1.4)
+    axes.axvline(PAPER_LIMITS.max[quantity], color=_MAX, linewidth=1.4)
+    if quantity < 2:
+        for value in (FORD_LOCAL.p95[quantity], FORD_LOCAL.max[quantity]):
+            axes.axvline(value, color=_FORD, linewidth=1.0, linestyle="--")
+    for y in range(1, rows, 2):
+        axes.axhspan(y - 0.5, y + 0.5, color="#f3f5f8", linewidth=0, zorder=0)
+    axes.set_title(_TITLES[quantity], fontsize=11, color=INK, loc="left", weight="bold")
+    axes.grid(axis="x", color="#e3e7ed", linewidth=0.8, zorder=0)
+    axes.tick_params(colors=INK, labelsize=9, left=False)
+    spines(axes, "bottom")
+
+
+def _overview_legend(figure: Figure, sensors: list[str], tall_in: float) -> None:
+    handles = [
+        Line2D([], [], color=_COLOURS[i % len(_COLOURS)], marker="o", markersize=5, linewidth=1.2, label=sensor)
+        for i, sensor in enumerate(sensors)
+    ]
+    marks = (("o", PALE, "95 %"), ("o", "white", "largest"), ("x", INK, "paper, 95 %"))
+    for marker, fill, label in marks:
+        edge = PALE if marker == "o" else INK
+        handles.append(Line2D([], [], marker=marker, color=edge, markerfacecolor=fill, linewidth=0, label=label))
+    handles.append(Line2D([], [], color=_P95, label="95 % limit"))
+    handles.append(Line2D([], [], color=_MAX, label="largest allowed"))
+    handles.append(Line2D([], [], color=_FORD, linestyle="--", label="Ford, local street"))
+    figure.legend(
+        handles=handles,
+        loc="upper left",
+        bbox_to_anchor=(0.015, 1 - 0.62 / tall_in),
+        ncols=len(handles),
+        frameon=False,
+        fontsize=9,
+    )
+
+
+NEAR_M: Final = 20.0
+STEP_S: Final = 0.25
+
+
+def changed_share_along(world: World, truth: Truth, drive: DriveConfig) -> tuple[F64, F64]:
+    """Return times (K,) [s] since the drive began and the share (K,) of Gaussians within `NEAR_M` that changed."""
+    simulation = DriveSimulation(world, drive)
+    t_s = np.arange(0.0, simulation.scans / drive.model.rate_hz, STEP_S)
+    ellipsoids = ellipsoids_of_truth(truth)
+    changed = ellipsoids.change_class != int(ChangeClass.NORMAL)
+    way_m = simulation.motion.T_map_vehicle(t_s)[:, :2, 3]
+    return t_s, share_near(ellipsoids.mean_m[:, :2], changed, way_m)
+
+
+def share_near(p_m: F64, changed: NDArray[np.bool_], way_m: F64) -> F64:
+    """Share (K,) of the points (M, 2) near each place (K, 2) that are marked; 0 where there is none."""
+    near = cKDTree(p_m).query_ball_point(way_m, NEAR_M)
+    return np.array([changed[index].mean() if index else 0.0 for index in near])

@@ -114,6 +114,11 @@ class NoDeskew(Variant):
         yield item
 
 
+WITHOUT: Final = "without_submap"
+OUTDATED: Final = "outdated"
+UPDATED: Final = "updated"
+FRESH: Final = "fresh"
+"""Runs without added errors: on the outdated map without and with submaps, and on the two newer maps."""
 VARIANTS: Final[Mapping[str, type[Variant]]] = {
     "mount_error": MountError,
     "wheel_scale": WheelScale,

@@ -26,8 +26,7 @@ from studies.feature_study.reporting import (
     in_route_frame,
     reports_of,
 )
-from studies.new_layer_study.layers import Layer, LayerTruth
-from studies.new_layer_study.outcome import DriveLayers, Localised
+from studies.new_layer_study.layers import DriveLayers, Layer, LayerTruth, Localised
 
 TRACK: Final = "track"
 MOTORWAY: Final = "motorway"

@@ -2,7 +2,7 @@
 and of localisation (12).
 """
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, Final
 
@@ -12,11 +12,16 @@ from matplotlib.patches import Ellipse
 from matplotlib.ticker import MaxNLocator
 
 from gnd.gnd_map.arrays import F64
-from studies.feature_study.drawing import BLUE, GREEN, GREY, INK, MAGENTA, ORANGE, RED, dress, finish, new_figure
-from studies.new_layer_study import reference
-from studies.new_layer_study.layers import WIDE_RADIUS_M, LayerScore
-from studies.new_layer_study.outcome import MotorwayOutcome, RouteOutcome, StudyOutcome
-from studies.new_layer_study.reference import DIRECTIONS
+from studies.frame.figures import BLUE, GREEN, GREY, INK, MAGENTA, ORANGE, RED, dress, finish, new_figure
+from studies.new_layer_study import layers as reference
+from studies.new_layer_study.layers import (
+    DIRECTIONS,
+    WIDE_RADIUS_M,
+    LayerScore,
+    MotorwayOutcome,
+    RouteOutcome,
+    SeedOutcome,
+)
 from studies.new_layer_study.summary import drive_scores, integrated_score
 
 _SENSORS: Final = {"beacon": BLUE, "lane": ORANGE}
@@ -24,24 +29,24 @@ _SIGMAS_95: Final = 2.4477
 """Half axes of the 95 % ellipse of two dimensions, in standard deviations."""
 
 
-def draw_figures(outcome: StudyOutcome, found: Mapping[str, Any], folder: Path) -> list[Path]:
+def draw_figures(outcomes: Sequence[SeedOutcome], km: float, found: Mapping[str, Any], folder: Path) -> list[Path]:
     """Draw all figures into the folder and return their paths; of single features those of the first seed.
 
     Raises:
         SimError: a file cannot be written.
     """
-    first, note = outcome.seeds[0], f"seed {outcome.seeds[0].seed}"
+    first, note = outcomes[0], f"seed {outcomes[0].seed}"
     paths = [
         draw_beacons(first.track, f"test track, {note}", folder / "new_layer_beacons.png"),
         draw_integration(found, folder / "new_layer_by_drives.png"),
     ]
-    if outcome.options.levels and outcome.options.sweep_seeds:
+    if found["nfl"]["noise"]:
         paths.append(draw_noise(found, folder / "new_layer_noise.png"))
     roads = [("motorway", first.motorway)]
     if first.straight is not None:
         roads.append(("straight", first.straight))
     for name, road in roads:
-        where = f"{outcome.options.km:g} km of {'motorway' if name == 'motorway' else 'straight motorway'}, {note}"
+        where = f"{km:g} km of {'motorway' if name == 'motorway' else 'straight motorway'}, {note}"
         paths.append(draw_lights(road.route, where, folder / f"new_layer_lights_{name}.png"))
         paths.append(draw_one_light(road.route, where, folder / f"new_layer_one_light_{name}.png"))
         paths.append(draw_localisation(road, where, folder / f"new_layer_localisation_{name}.png"))

@@ -1,15 +1,44 @@
-"""A layer as a drive or the cloud tells it, the truth, and how far they are apart."""
+"""A layer as a drive or the cloud tells it, the truth, how far they are apart, and the paper's results."""
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any, Final
 
 import numpy as np
 
 from gnd.gnd_map.arrays import F64, I64
-from studies.feature_study.averages import distances_plain
-from studies.feature_study.honesty import Honesty
-from studies.feature_study.matching import RADIUS_M, match_one_to_one
-from studies.new_layer_study.reference import DIRECTIONS
+from studies.feature_study.truth import RADIUS_M, Honesty, match_one_to_one
+from studies.frame.averages import distances_plain
+from studies.frame.targets import Target
+
+DIRECTIONS: Final = ("euclidean", "lateral", "longitudinal")
+
+PAPER_SINGLE_M: Final = {"without_map": (1.372, 0.810), "with_map": (0.647, 0.357)}
+"""Section 5.2, Figure 6: mean and standard deviation over the beacons."""
+PAPER_INTEGRATED_M: Final = {1: 0.56, 6: 0.14}
+"""Section 5.2, Figure 7: mean error by number of drives, as far as the text tells it."""
+PAPER_TABLE2: Final[Mapping[str, Mapping[str, tuple[float, float]]]] = {
+    "without_map": {"euclidean": (5.2718, 0.6877), "lateral": (0.4651, 0.2506), "longitudinal": (5.2445, 0.6944)},
+    "with_map": {"euclidean": (4.5284, 0.6418), "lateral": (0.1825, 0.1564), "longitudinal": (4.5220, 0.6418)},
+    "integration": {"euclidean": (0.5458, 0.3543), "lateral": (0.1184, 0.0939), "longitudinal": (0.5181, 0.3638)},
+}
+"""Table 2, 11 drives on a motorway: mean and standard deviation, m."""
+PAPER_TABLE3: Final = {
+    "without": {"lateral": 0.2214, "longitudinal": 5.4138},
+    "with": {"lateral": 0.2077, "longitudinal": 0.6261},
+}
+"""Table 3: root mean square errors of localisation, m."""
+
+TARGETS: Final = (
+    Target("beacons, one drive without map", "single_without_map", "m", "1.372", 1.372, 1.372),
+    Target("beacons, one drive with map", "single_with_map", "m", "0.647", 0.647, 0.4),
+    Target("beacons, 6 drives", "integrated.6", "m", "0.14", 0.14, 0.10),
+    Target("lights, integrated, Euclidean", "motorway.euclidean", "m", "0.546", 0.5458, 0.3),
+    Target("lights, integrated, lateral", "motorway.lateral", "m", "0.118", 0.1184, 0.1184),
+    Target("lights, integrated, longitudinal", "motorway.longitudinal", "m", "0.518", 0.5181, 0.3),
+    Target("localisation with layer, longitudinal", "localisation.with", "m", "0.63", 0.63, 0.4),
+)
+
 
 WIDE_RADIUS_M: Final = 15.0
 """On the motorway lights stand 35 to 50 m apart and poses may be off by several metres along it: what is farther off
@@ -93,3 +122,67 @@ def pooled(scores: list[LayerScore]) -> dict[str, Any]:
     nees = {"mean": float(np.mean([h.mean for h in told])), "within_95": float(np.mean([h.within for h in told]))}
     missed, false = (float(np.mean([getattr(one, name) for one in scores])) for name in ("missed", "false"))
     return found | {"missed": missed, "false": false, "nees": nees if told else None}
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class DriveLayers:
+    """What one drive makes without and with the lanes of the HD map, each over all its true features."""
+
+    without_map: Layer | None
+    with_map: Layer
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class RouteOutcome:
+    """What came of one route.
+
+    Attributes:
+        truth: its features.
+        drives: layers of each drive.
+        integrated: the cloud's layer by number of drives, 1 … all.
+    """
+
+    truth: LayerTruth
+    drives: tuple[DriveLayers, ...]
+    integrated: Mapping[int, Layer]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Localised:
+    """Errors of the poses of one drive: float64 (S, 2), along and across the true heading [m], and seconds (S,)."""
+
+    t_s: F64
+    error_m: F64
+
+    def rmse(self) -> tuple[float, float]:
+        """Return the root mean square errors along and across."""
+        along, across = np.sqrt(np.mean(self.error_m**2, axis=0))
+        return float(along), float(across)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class MotorwayOutcome:
+    """One motorway: its layers, and a fresh drive localised without and with the layer of all drives before."""
+
+    route: RouteOutcome
+    without: Localised
+    with_layer: Localised
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class SeedOutcome:
+    """What came of one seed.
+
+    Attributes:
+        seed: of the routes.
+        track: the test track.
+        noisy: by sensor ("beacon", "lane") and noise level.
+        motorway: with gentle curves.
+        straight: the straight one, where it ran.
+    """
+
+    seed: int
+    track: RouteOutcome
+    noisy: Mapping[str, Mapping[float, RouteOutcome]]
+    motorway: MotorwayOutcome
+    straight: MotorwayOutcome | None

@@ -1,18 +1,18 @@
-"""A study of new feature layers from options to results: drives in worker processes; what is kept stays."""
+"""`gnd reproduce new-feature-layer`: drives in worker processes; what is kept stays."""
 
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from time import perf_counter
-from typing import Any, Final
-
-import numpy as np
-from rich.progress import Progress
+from typing import Final
 
 from gnd.gnd_map.config import to_mapping
 from gnd.schemas.features import FeatureReport
 from studies.feature_study.reporting import read_reports, write_reports
-from studies.localisation_study.kept import Kept, read_arrays, write_arrays
+from studies.frame.command import Bench, Report, study
+from studies.frame.errors import OptionError
+from studies.frame.kept import Kept, key_of, sources_sha
+from studies.frame.options import check, list_of, option, seeds
+from studies.frame.pool import Job
 from studies.new_layer_study.driving import (
     MOTORWAY,
     STRAIGHT,
@@ -23,19 +23,8 @@ from studies.new_layer_study.driving import (
     localised,
     mapped,
 )
-from studies.new_layer_study.layers import Layer
-from studies.new_layer_study.options import NewLayerOptions
-from studies.new_layer_study.outcome import (
-    DriveLayers,
-    Localised,
-    MotorwayOutcome,
-    RouteOutcome,
-    SeedOutcome,
-    StudyOutcome,
-)
-from studies.simulation.folder import RunFolder
-from studies.simulation.pool import Job, run_jobs
-from studies.simulation.sources import key_of, sources_sha
+from studies.new_layer_study.layers import DriveLayers, Localised, MotorwayOutcome, RouteOutcome, SeedOutcome
+from studies.new_layer_study.summary import summary_of, tables_of
 
 SOURCES: Final = (
     "fleet_sim/roads",
@@ -49,6 +38,59 @@ SOURCES: Final = (
 """What a drive's result depends on."""
 MERGE_SOURCES: Final = (*SOURCES, "cloud_merger/features")
 """What localisation with a layer depends on."""
+
+
+@dataclass(frozen=True, slots=True)
+class NewLayerOptions:
+    """One study: everything that decides its numbers. Of several seeds the first ones run the sweep and the straight
+    motorway.
+    """
+
+    seeds: tuple[int, ...] = seeds(11, text="Seeds of routes, such as 1,2,5-9; each has its own features and drives.")
+    drives: int = option(6, "Drives on the test track.", span=(1, 60))
+    motorway_drives: int = option(11, "Drives on the motorway; one more localises.", span=(1, 60))
+    lap_m: float = option(0.0, "Way driven on the test track, metres; 0: one lap.", "--lap", span=(0, 10_000))
+    levels: tuple[float, ...] = option(
+        (0.5, 1.0, 2.0),
+        "Noise levels of Figure 8, of beacons and of lanes; none: no sweep.",
+        span=(0.1, 5),
+        read=lambda text: () if text == "none" else list_of("--levels", text, float),
+    )
+    sweep_seeds: int = option(1, "The sweep runs on so many of the seeds.", span=(0, None))
+    km: float = option(4.0, "Length of the motorway.", span=(0.5, 20))
+    gnss_bias_m: float = option(
+        0.0, "Constant error of each motorway drive's GNSS, metres (one sigma).", "--gnss-bias", span=(0, 20)
+    )
+    straight_seeds: int = option(1, "The straight motorway, on so many of the seeds.", span=(0, None))
+
+    def __post_init__(self) -> None:
+        check(self)
+        if 0 < self.lap_m < 100:
+            raise OptionError(f"--lap must be 0 or 100 … 10000 m, got {self.lap_m:g}")
+        if len(set(self.levels)) != len(self.levels):
+            raise OptionError(f"--levels must be different numbers, got {self.levels}")
+
+
+@study(NewLayerOptions, out="runs/reproduce-new-layer")
+def new_feature_layer(options: NewLayerOptions, bench: Bench) -> Report:
+    """A layer of beacons or streetlights that many cars map while driving, and localisation with it: Figures 6 to 8, 10
+    to 12 and Tables 2 and 3 of the paper on new feature layers.
+
+    A second start with the same options and folder continues where the first ended.
+    """
+    plans = [tasks_of(options, seed, bench.folder.root) for seed in options.seeds]
+    bench.run("drives", list(_drives(plans)))
+    bench.run("localisation", list(_fresh(plans)))
+    with bench.timed("merge"):
+        outcomes = [_read(options, plan) for plan in plans]
+    found = summary_of(options, outcomes, bench.spent_s)
+
+    def draw(folder: Path) -> None:
+        from studies.new_layer_study.figures import draw_figures
+
+        draw_figures(outcomes, options.km, found, folder)
+
+    return Report(found, tables_of(found), draw)
 
 
 @dataclass(frozen=True, slots=True)
@@ -116,28 +158,6 @@ class SeedTasks:
     fresh: tuple[LocalisingTask, ...]
 
 
-def study(options: NewLayerOptions, folder: RunFolder, processes: int, progress: Progress) -> StudyOutcome:
-    """Run everything that is not yet in the folder.
-
-    Args:
-        options: what to run.
-        folder: keeps the results of the drives for the next start.
-        processes: worker processes.
-        progress: gets the bars.
-
-    Raises:
-        GndError: something cannot be made as asked.
-    """
-    plans, spent = [tasks_of(options, seed, folder) for seed in options.seeds], {}
-    for title, jobs in (("drives", _drives(plans)), ("localisation", _fresh(plans))):
-        begun_s = perf_counter()
-        run_jobs(list(jobs), processes, progress, title)
-        spent[title] = perf_counter() - begun_s
-    begun_s = perf_counter()
-    outcomes = tuple(_read(options, plan) for plan in plans)
-    return StudyOutcome(options, outcomes, {**spent, "merge": perf_counter() - begun_s})
-
-
 def _drives(plans: list[SeedTasks]) -> Iterator[Job]:
     tasks = [task for plan in plans for of_route in plan.routes.values() for task in of_route]
     return (Job(_name(task), map_drive, (task,)) for task in tasks if not task.done)
@@ -152,9 +172,9 @@ def _fresh(plans: list[SeedTasks]) -> Iterator[Job]:
     return (Job(f"seed {t.route.seed}, {t.route.name}", localise_drive, (t,)) for t in tasks if not t.kept.done)
 
 
-def tasks_of(options: NewLayerOptions, seed: int, folder: RunFolder) -> SeedTasks:
+def tasks_of(options: NewLayerOptions, seed: int, root: Path) -> SeedTasks:
     """Return all drives of a seed; the noise level 1 of both sensors is the usual track's."""
-    home = folder.root / f"seed-{seed}"
+    home = root / f"seed-{seed}"
     tracks = [
         RouteTask(TRACK, seed, options.lap_m / 1e3),
         *(task for of in noisy_tracks(options, seed).values() for task in of.values()),
@@ -181,20 +201,7 @@ def map_drive(task: MappingTask) -> None:
     """Drive, map, report; runs in a worker process."""
     layers, reports = mapped(task.route, task.vehicle)
     write_reports(reports, task.reports)
-    cases = {"with_map": layers.with_map} | ({} if layers.without_map is None else {"without_map": layers.without_map})
-    arrays = {f"{case}_{column}": getattr(one, column) for case, one in cases.items() for column in ("xy_m", "cov_m2")}
-    write_arrays(task.layers, {"cases": list(cases)}, arrays)
-
-
-def read_layers(kept: Kept) -> DriveLayers:
-    """Read what a drive has made.
-
-    Raises:
-        FolderError: it is missing or damaged.
-    """
-    head, arrays = read_arrays(kept)
-    found = {case: Layer(arrays[f"{case}_xy_m"], arrays[f"{case}_cov_m2"]) for case in head["cases"]}
-    return DriveLayers(found.get("without_map"), found["with_map"])
+    task.layers.write(layers)
 
 
 def localise_drive(task: LocalisingTask) -> None:
@@ -202,10 +209,7 @@ def localise_drive(task: LocalisingTask) -> None:
     layer = integrated(task.route.route, _all_reports(task.before))
     vehicle = len(task.before) + 1
     found = {"without": localised(task.route, vehicle, None), "with_layer": localised(task.route, vehicle, layer)}
-    columns: dict[str, Any] = {
-        f"{name}_{c}": getattr(one, c) for name, one in found.items() for c in ("t_s", "error_m")
-    }
-    write_arrays(task.kept, {"vehicle": vehicle}, columns)
+    task.kept.write(found)
 
 
 def _all_reports(tasks: tuple[MappingTask, ...]) -> list[FeatureReport]:
@@ -227,7 +231,7 @@ def _read_route(task: RouteTask, drives: tuple[MappingTask, ...]) -> RouteOutcom
     """Drives of a route, and the cloud's layer after each: after the first one's its own, for one alone publishes
     nothing.
     """
-    route, layers = task.route, tuple(read_layers(one.layers) for one in drives)
+    route, layers = task.route, tuple(one.layers.read(DriveLayers) for one in drives)
     reports = [read_reports(one.reports) for one in drives]
     merged = {1: layers[0].with_map}
     numbers = range(2, len(drives) + 1) if task.is_usual else [len(drives)] if len(drives) > 1 else []
@@ -237,9 +241,4 @@ def _read_route(task: RouteTask, drives: tuple[MappingTask, ...]) -> RouteOutcom
 
 
 def _read_motorway(route: RouteOutcome, kept: Kept) -> MotorwayOutcome:
-    _, arrays = read_arrays(kept)
-    series = [
-        Localised(np.asarray(arrays[f"{name}_t_s"]), np.asarray(arrays[f"{name}_error_m"]))
-        for name in ("without", "with_layer")
-    ]
-    return MotorwayOutcome(route, series[0], series[1])
+    return MotorwayOutcome(route, **kept.read(dict[str, Localised]))

@@ -8,8 +8,7 @@ from gnd.gnd_map.errors import ShapeError
 from gnd.gnd_map.evidence import ChangeState, masses, states
 from studies.pcd.index import PcdIndex, index_of
 from studies.pcd.kernel import CELLS, EMPTY, SIDE, Counts, Rules, cast_rays, support_sums
-from studies.pcd.parameters import PcdDetectParameters
-from studies.pcd.points import PcdMap
+from studies.pcd.points import PcdDetectParameters, PcdMap
 from studies.pcd.report import PcdReport
 
 _FIRST_ROWS = 1 << 12

@@ -9,9 +9,8 @@ from numpy.typing import NDArray
 from gnd.gnd_map.accumulate import CELLS_A_SIDE
 from gnd.gnd_map.arrays import F64, I32, I64
 from gnd.gnd_map.grid import GridFrame
-from studies.pcd.errors import PcdError
 from studies.pcd.kernel import CELLS, EMPTY, SIDE, Base, surface_normals
-from studies.pcd.points import PcdMap, cell_keys, cells_of, key_cells
+from studies.pcd.points import PcdError, PcdMap, cell_keys, cells_of, key_cells
 
 MAX_BLOCKS = 200_000_000
 _REMEMBERED = 2

@@ -16,8 +16,7 @@ import zstandard
 from gnd.gnd_map.accumulate import CELLS_A_SIDE
 from gnd.gnd_map.arrays import F32, F64, I32
 from gnd.gnd_map.near_grid import grid_near
-from studies.pcd.errors import PcdCodecError, PcdError
-from studies.pcd.points import PcdMap
+from studies.pcd.points import PcdCodecError, PcdError, PcdMap
 
 Codec = Literal["points", "indexed", "compact"]
 CODECS: Final[tuple[Codec, ...]] = get_args(Codec)

@@ -24,9 +24,8 @@ from gnd.vehicle_agent.pipeline import Parts
 from gnd.vehicle_agent.segment.parameters import SegmentParameters
 from gnd.vehicle_agent.segment.segmenter import MotionSegmenter, SegmentedScan
 from gnd.vehicle_agent.tiles_at_hand import localising_on
-from studies.real.errors import RealDataError
-from studies.real.scene import Scene
-from studies.real.voxels import keys_of
+from studies.frame.errors import RealDataError
+from studies.real.scene import Scene, keys_of
 
 Poses = Literal["reference", "estimated"]
 Tiles = dict[TileId, Gaussians]

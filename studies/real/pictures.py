@@ -15,14 +15,12 @@ from numpy.typing import NDArray
 
 from gnd.fleet_sim.shapes import Block
 from gnd.gnd_map.classes import CLASS_COLOURS, ChangeClass
+from studies.frame.figures import INK, save
 from studies.real.drive import Found
-from studies.real.errors import RealDataError
-from studies.real.places import Placed
-from studies.real.rounds import Round
+from studies.real.rounds import Placed, Round
 
 F64 = NDArray[np.float64]
 
-INK: Final = "#1c2430"
 PALE: Final = {ChangeClass.NORMAL: "#b9cdf0"}
 """What did not change stays in the background."""
 HIDDEN: Final = "#c9c2b2"
@@ -35,7 +33,7 @@ def draw_round(one: Round, folder: Path) -> list[Path]:
     """Draw the untouched drive, the drive with objects (where there are some), and the segmented points; the files.
 
     Raises:
-        RealDataError: a file cannot be written.
+        SimError: a file cannot be written.
     """
     scene, name = one.scene, one.scene.name
     untouched, inserted = one.untouched, one.inserted
@@ -44,15 +42,15 @@ def draw_round(one: Round, folder: Path) -> list[Path]:
         f"{count[c]} {c.name.lower()}" for c in (ChangeClass.NEW, ChangeClass.MODIFIED, ChangeClass.DELETED)
     )
     files = [folder / f"{name}_untouched.png", folder / f"{name}_inserted.png", folder / f"{name}_segmented.png"]
-    _save(_classes(one, untouched.found, (), (), f"{name}: untouched; reported {false}"), files[0])
+    save(_classes(one, untouched.found, (), (), f"{name}: untouched; reported {false}"), files[0])
     if inserted.new or inserted.gone:
         title = f"{name}: {len(inserted.new)} objects new, {len(inserted.gone)} gone"
-        _save(_classes(one, inserted.found, inserted.new, inserted.gone, title), files[1])
+        save(_classes(one, inserted.found, inserted.new, inserted.gone, title), files[1])
     else:
         files.pop(1)
     moving = untouched.sample_moving
     title = f"{name}: {moving.mean():.1%} of the points of {len(scene.scans) // 2} scans marked as moving"
-    _save(_points(one, untouched.sample_m, moving, title), files[-1])
+    save(_points(one, untouched.sample_m, moving, title), files[-1])
     return files
 
 
@@ -131,11 +129,3 @@ def _outline(placed: Placed, colour: str) -> Patch:
 
 def _dot(colour: str, label: str) -> Line2D:
     return Line2D([], [], color=colour, marker="o", linestyle="", label=label)
-
-
-def _save(figure: Figure, path: Path) -> None:
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        figure.savefig(path)
-    except OSError as error:
-        raise RealDataError(f"{path}: cannot be written: {error.strerror or error}") from error

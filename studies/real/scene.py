@@ -4,13 +4,13 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from gnd.gnd_map.accumulate import VoxelAccumulator
 from gnd.gnd_map.geodesy import LocalFrame
 from gnd.gnd_map.grid import GridFrame
-from gnd.gnd_map.motion import Trajectory, deskew
-from gnd.gnd_map.se3 import exp_so3, transform
+from gnd.gnd_map.motion import Trajectory
+from gnd.gnd_map.se3 import exp_so3
 from gnd.gnd_map.tile_id import covering_corridor
 from gnd.schemas.drive import DriveHeader, GnssFix, MotionSample, Scan
 from gnd.vehicle_agent.importer import fixes_of, map_track, motion_of
@@ -18,7 +18,8 @@ from gnd.vehicle_agent.importers.cleaning import cleaned
 from gnd.vehicle_agent.importers.lidar_odometry import Progress, reference_ns
 from gnd.vehicle_agent.importers.recording import Recording
 from gnd.vehicle_agent.localise.estimates import PoseEstimate, RefinedScan
-from studies.real.errors import RealDataError
+from studies.frame.errors import RealDataError
+from studies.frame.scans import rays
 
 F64 = NDArray[np.float64]
 I64 = NDArray[np.int64]
@@ -64,12 +65,8 @@ class Scene:
     def refined(self, scan: Scan) -> RefinedScan:
         """A scan at its reference pose, as a localiser without error would give it."""
         t_ns = reference_ns(scan)
-        T = self.poses.at(t_ns)
-        points, origins = (
-            transform(T, deskew(p, scan.t_offset_ns, scan.t_ns, self.poses, self.T_vehicle_lidar, t_ns))
-            for p in (scan.points_m, np.zeros_like(scan.points_m))
-        )
-        return RefinedScan(t_ns, points, origins, PoseEstimate(t_ns, T, 0.0, 0.0, 1.0, "good"))
+        estimate = PoseEstimate(t_ns, self.poses.at(t_ns), 0.0, 0.0, 1.0, "good")
+        return RefinedScan(t_ns, *rays(scan, self.poses, self.T_vehicle_lidar, t_ns), estimate)
 
     def accumulated(self, scans: Sequence[RefinedScan] | Iterator[RefinedScan]) -> VoxelAccumulator:
         """The points of scans as a map build takes them."""
@@ -148,3 +145,52 @@ def place(recorded: Recorded, number: int, seed: int = 0) -> Scene:
 def _grid_frame(frame: LocalFrame, poses: Trajectory) -> GridFrame:
     lat, lon, _ = frame.geodetic_from_enu(poses.T_dst_vehicle[:, :3, 3])
     return GridFrame.around(frame, covering_corridor(lat, lon, AROUND_M))
+
+
+_BITS, _HALF = 21, 1 << 20
+
+
+def origin_of(grid_frame: GridFrame) -> I64:
+    """(3,) integer grid coordinates at the frame's origin: keys count from here."""
+    return np.asarray(np.floor(grid_frame.grid_of(np.zeros((1, 3)))[0]), np.int64)
+
+
+def keys_of(grid_frame: GridFrame, g: ArrayLike) -> I64:
+    """(N,) one integer a voxel for integer grid coordinates (N, 3), within a million voxels of the origin."""
+    offset = np.asarray(g, np.int64) - origin_of(grid_frame) + _HALF
+    return np.asarray((offset[..., 0] << 2 * _BITS) | (offset[..., 1] << _BITS) | offset[..., 2])
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Cells:
+    """Voxels with points: keys (M,) int64 increasing, occupied sub-cells (M,) and points (M,)."""
+
+    keys: I64
+    cells: I64
+    count: I64
+
+    @classmethod
+    def of(cls, accumulator: VoxelAccumulator) -> "Cells":
+        """What an accumulator has taken."""
+        g, moments = accumulator.moments()
+        keys = keys_of(accumulator.grid_frame, g)
+        order = np.argsort(keys)
+        return cls(keys[order], moments.cells[order].astype(np.int64), moments.count[order])
+
+    def cells_at(self, keys: I64) -> I64:
+        """(K,) occupied sub-cells of voxels, 0 where there is no point."""
+        return self._at(keys, self.cells)
+
+    def count_at(self, keys: I64) -> I64:
+        """(K,) points in voxels."""
+        return self._at(keys, self.count)
+
+    def dense(self, n_min_cells: int) -> I64:
+        """Keys of the voxels with at least so many sub-cells."""
+        return self.keys[self.cells >= n_min_cells]
+
+    def _at(self, keys: I64, values: I64) -> I64:
+        if not len(self.keys):
+            return np.zeros(len(keys), np.int64)
+        row = np.minimum(np.searchsorted(self.keys, keys), len(self.keys) - 1)
+        return np.where(self.keys[row] == keys, values[row], 0)

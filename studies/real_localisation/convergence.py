@@ -18,7 +18,6 @@ import numpy as np
 import small_gicp
 from numpy.typing import NDArray
 
-from gnd.gnd_map.motion import deskew
 from gnd.gnd_map.se3 import T_from_R_t, T_inverse, exp_so3, log_so3
 from gnd.schemas.drive import Scan
 from gnd.vehicle_agent.errors import RegistrationError
@@ -27,6 +26,7 @@ from gnd.vehicle_agent.localise.match_map import MatchMap, MatchMapCache
 from gnd.vehicle_agent.localise.parameters import LocaliserParameters
 from gnd.vehicle_agent.localise.registration import Start, register
 from gnd.vehicle_agent.localise.sampling import sample_scan
+from studies.frame.scans import posed
 from studies.real_localisation.halves import SOURCE_M, Half, gicp
 
 F64 = NDArray[np.float64]
@@ -75,9 +75,7 @@ def _trials(half: Half, off_m: float, off_deg: float, rng: np.random.Generator, 
 
 def vehicle_points(half: Half, scan: Scan) -> tuple[F64, F64]:
     """(N, 3) points of a scan in the vehicle frame, sweep motion removed, and its pose by the track."""
-    t_ns, scene = reference_ns(scan), half.scene
-    points = deskew(scan.points_m, scan.t_offset_ns, scan.t_ns, scene.poses, scene.T_vehicle_lidar, t_ns)
-    return points, scene.poses.at(t_ns)
+    return posed(scan, half.scene.poses, half.scene.T_vehicle_lidar, reference_ns(scan))
 
 
 def _offset(rng: np.random.Generator, off_m: float, off_deg: float) -> F64:

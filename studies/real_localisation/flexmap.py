@@ -21,7 +21,7 @@ from gnd.vehicle_agent.localise.drawn_map import read_fixes, read_track
 from gnd.vehicle_agent.localise.georeference import Georeferenced, georeference
 from gnd.vehicle_agent.localise.path_association import georeference_untimed, nearest_on_track, way_m
 from gnd.vehicle_agent.localise.track_alignment import FixTable
-from studies.real_localisation.errors import RealLocalisationError
+from studies.frame.errors import RealDataError
 
 F64 = NDArray[np.float64]
 I64 = NDArray[np.int64]
@@ -114,7 +114,7 @@ def _lanes(folder: Path) -> list[Lane]:
     document = read_osm(path.read_bytes(), path.name)
     lanelets = [one for one in document.relations.values() if one.tags.get("type") == "lanelet"]
     if not lanelets:
-        raise RealLocalisationError(f"{path}: no lanelets")
+        raise RealDataError(f"{path}: no lanelets")
     return [Lane(*(_border_m(document, one, side) for side in ("left", "right"))) for one in lanelets]
 
 

@@ -14,8 +14,8 @@ from gnd.gnd_map.motion import Trajectory
 from gnd.gnd_map.se3 import T_inverse
 from gnd.vehicle_agent.localise import PoseEstimate
 from gnd.vehicle_agent.localise.georeference import Georeferenced
+from studies.frame.figures import INK, save
 from studies.real.scene import Recorded
-from studies.real_localisation.errors import RealLocalisationError
 from studies.real_localisation.flexmap import Drawn
 from studies.real_localisation.halves import METHODS, Half, localised
 from studies.real_localisation.nagoya import read_reference, track_off
@@ -25,8 +25,6 @@ F64 = NDArray[np.float64]
 
 COLOURS: Final = ("#1f5fbf", "#d9542b", "#2c8c4a", "#8d5bb5", "#b8860b")
 MAP: Final = "#b9c3d0"
-INK: Final = "#1c2430"
-DPI: Final = 110
 
 
 def draw_halves(recorded: Recorded, tracks: Sequence[Odometry], halves: Sequence[Half], folder: Path) -> list[Path]:
@@ -47,7 +45,7 @@ def draw_halves(recorded: Recorded, tracks: Sequence[Odometry], halves: Sequence
         above.plot(p[:, 0], p[:, 1], marker, color=INK, ms=4, mfc="none", label=f"localised {method.replace('_', ' ')}")
     above.legend(loc="best", fontsize=8)
     above.set_title(f"{recorded.name}: {half.name}")
-    return [_saved(figure, folder / f"{recorded.name}_localised.png")]
+    return [save(figure, folder / f"{recorded.name}_localised.png")]
 
 
 def _map_above(axes: Axes, half: Half) -> None:
@@ -91,7 +89,7 @@ def draw_flexmap(drawn: Drawn, name: str, folder: Path) -> list[Path]:
     whole.legend(loc="best", fontsize=8)
     corner = np.array(_xy(drawn.bent)).T[int(0.3 * len(drawn.bent.track))]
     near.set(xlim=(corner[0] - 45, corner[0] + 45), ylim=(corner[1] - 45, corner[1] + 45), title="from near")
-    return [_saved(figure, folder / f"{name}_georeferenced.png")]
+    return [save(figure, folder / f"{name}_georeferenced.png")]
 
 
 def draw_nagoya(source: Path, tracks: dict[str, Georeferenced], name: str, folder: Path) -> list[Path]:
@@ -114,18 +112,9 @@ def draw_nagoya(source: Path, tracks: dict[str, Georeferenced], name: str, folde
     above.legend(fontsize=8)
     errors.set(xlabel="time s", ylabel="horizontal distance from the reference m")
     errors.legend(fontsize=8)
-    return [_saved(figure, folder / f"{name}_georeferenced.png")]
+    return [save(figure, folder / f"{name}_georeferenced.png")]
 
 
 def _xy(found: Georeferenced) -> tuple[F64, F64]:
     p = found.track.T_dst_vehicle
     return p[:, 0, 3], p[:, 1, 3]
-
-
-def _saved(figure: Figure, path: Path) -> Path:
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        figure.savefig(path, dpi=DPI)
-    except OSError as error:
-        raise RealLocalisationError(f"{path}: cannot be written: {error.strerror or error}") from error
-    return path

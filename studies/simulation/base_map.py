@@ -2,8 +2,6 @@
 
 import hashlib
 import json
-import zipfile
-import zlib
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from functools import cached_property
@@ -13,6 +11,7 @@ from typing import Any
 import numpy as np
 
 from gnd.fleet_sim.drives import DriveSimulation
+from gnd.fleet_sim.prepare import mapping_configs
 from gnd.fleet_sim.world import State, World
 from gnd.gnd_map.accumulate import VoxelAccumulator
 from gnd.gnd_map.arrays import F64
@@ -21,9 +20,9 @@ from gnd.gnd_map.grid import GridFrame
 from gnd.gnd_map.tile import Tile
 from gnd.gnd_map.tile_id import TileId, covering_circle
 from gnd.vehicle_agent.local_map import LocalMap
-from studies.simulation.errors import FolderError
-from studies.simulation.fleet import survey_configs
-from studies.simulation.pose_source import PoseSource
+from studies.frame.errors import FolderError
+from studies.frame.kept import read_npz, write_npz
+from studies.simulation.options import PoseSource
 from studies.simulation.poses import FromReference
 
 _COLUMNS = ("voxel_id", "count", "cells", "mean_m", "cov_m2")
@@ -73,7 +72,7 @@ def driven(world: World, state: State = "before") -> BaseMap:
 def mapping_points(world: World, state: State = "before") -> Iterator[F64]:
     """The points (N, 3) of each scan of the mapping vehicle that go into the map, in the world's map frame."""
     grid_frame = _mapping_grid(world)
-    for config in survey_configs(world.seed):
+    for config in mapping_configs(world.seed):
         simulation = DriveSimulation(world, replace(config, state=state))
         poses = FromReference(simulation.header(), LocalMap(grid_frame), PoseSource("true", 0.0, 0.0), 0)
         for item in simulation.items():
@@ -96,10 +95,7 @@ def write_base(base: BaseMap, path: Path) -> None:
     arrays["version"] = np.array([base.version(i) for i in ids], np.int64)
     for name in _COLUMNS:
         arrays[name] = np.concatenate([getattr(base.tiles[i], name) for i in ids])
-    partial = path.with_name(f".{path.name}.part")
-    with partial.open("wb") as file:
-        np.savez(file, **arrays)
-    partial.replace(path)
+    write_npz(path, arrays, compressed=False)
 
 
 def read_base(path: Path) -> BaseMap:
@@ -108,18 +104,16 @@ def read_base(path: Path) -> BaseMap:
     Raises:
         FolderError: it is missing or damaged.
     """
+    data = read_npz(path)
     try:
-        with np.load(path, allow_pickle=False) as file:
-            data = dict(file)
         stops = np.cumsum(data["length"])
         tiles = {}
         for code, stop, n in zip(data["morton"].tolist(), stops.tolist(), data["length"].tolist(), strict=True):
             tiles[TileId(code)] = Gaussians(*(data[name][stop - n : stop] for name in _COLUMNS))
-        base = BaseMap(
-            tiles, dict(zip(tiles, data.get("version", np.ones(len(tiles), np.int64)).tolist(), strict=True))
-        )
-        if json.loads(str(data["head"]))["sha"] != base.sha:
-            raise FolderError(f"the base map {path} is damaged: its content is not what was written")
-        return base
-    except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile, zlib.error) as error:
+        base = BaseMap(tiles, dict(zip(tiles, data["version"].tolist(), strict=True)))
+        sha = json.loads(str(data["head"]))["sha"]
+    except (ValueError, KeyError) as error:
         raise FolderError(f"cannot read the base map {path}: {error}") from error
+    if sha != base.sha:
+        raise FolderError(f"the base map {path} is damaged: its content is not what was written")
+    return base

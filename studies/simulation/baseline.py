@@ -13,9 +13,10 @@ from gnd.gnd_map.geodesy import LocalFrame
 from gnd.gnd_map.se3 import transform
 from gnd.gnd_map.tile_id import TileId
 from gnd.vehicle_agent.segment import SegmentedScan
+from studies.frame.errors import FolderError
+from studies.frame.kept import read_npz, write_npz
 from studies.pcd import PcdDetector, PcdMap, PcdReport, base_pcd, evaluate_gnd, gnd_of, merge_pcd
 from studies.pcd.report import CODECS, Codec
-from studies.simulation.errors import FolderError
 
 UPLOADED: Codec = "points"
 """What counts as the baseline's upload, as in the paper: every new and every deleted point with its coordinates."""
@@ -29,10 +30,8 @@ def write_cloud(world: World, path: Path) -> None:
 def keep_cloud(cloud: PcdMap, path: Path) -> None:
     """Write a cloud; the file appears complete or not at all."""
     frame = cloud.frame
-    partial = path.with_name(f".{path.name}.part")
-    with partial.open("wb") as file:
-        np.savez(file, points_m=cloud.points_m, anchor=np.array([frame.lat_rad, frame.lon_rad, frame.height_m]))
-    partial.replace(path)
+    anchor = np.array([frame.lat_rad, frame.lon_rad, frame.height_m])
+    write_npz(path, {"points_m": cloud.points_m, "anchor": anchor}, compressed=False)
 
 
 def read_cloud(path: Path) -> PcdMap:
@@ -41,10 +40,10 @@ def read_cloud(path: Path) -> PcdMap:
     Raises:
         FolderError: it is missing or damaged.
     """
+    data = read_npz(path)
     try:
-        with np.load(path, allow_pickle=False) as file:
-            return PcdMap(file["points_m"], LocalFrame(*file["anchor"].tolist()))
-    except (OSError, ValueError, KeyError, EOFError) as error:
+        return PcdMap(data["points_m"], LocalFrame(*data["anchor"].tolist()))
+    except (ValueError, KeyError) as error:
         raise FolderError(f"cannot read the point cloud {path}: {error}") from error
 
 

@@ -1,6 +1,6 @@
 """The figures of a reproduction: map changes (GND, Figure 16), F1 by number of vehicles (Figure 17), masses."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, Final
 
@@ -10,20 +10,18 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 
 from gnd.fleet_sim.ellipsoids import ellipsoids_of_maps, ellipsoids_of_truth
-from gnd.fleet_sim.pictures import View, draw_map, save_figure
+from gnd.fleet_sim.pictures import View, draw_map
 from gnd.fleet_sim.truth import LEVELS, Truth, read_truth
 from gnd.gnd_map.arrays import F64, I32, I64
 from gnd.gnd_map.classes import CLASS_COLOURS
 from gnd.gnd_map.evidence import MassParameters, masses
-from studies.simulation import reference
-from studies.simulation.cloud import map_of_one, merged_map
+from studies.frame.figures import INK, PALE, dress, save
+from studies.simulation import scores as reference
+from studies.simulation.cloud import arrived, map_of_one, merged_map
 from studies.simulation.masses import WATCHED, Watch, choose, most_telling
-from studies.simulation.run import Outcome, WorldOutcome
-from studies.simulation.targets import target_single
-from studies.simulation.uploads import arrived
+from studies.simulation.scores import Outcome, WorldOutcome, target_single
 from studies.simulation.worlds import read_world_base
 
-_INK: Final = "#1c2430"
 _MASSES: Final = (("m(S) sustained", "#2f6fb5"), ("m(C) changed", "#d1433f"), ("m(Ω) unknown", "#8a94a3"))
 _LEVEL_NAMES: Final = {"all": "all voxels", "marginal_excluded": "marginal excluded", "scored": "scored voxels"}
 _LEVEL_STYLE: Final = {"scored": "-", "marginal_excluded": "--", "all": ":"}
@@ -80,25 +78,24 @@ def draw_curve(summary: Mapping[str, Any], path: Path) -> Path:
     drawn = [*_curves(axes, summary, numbers), *_baseline(axes, summary)]
     stale = summary["stale"]["f1"]["scored"]
     below.axhline(stale, color="#2f6fb5", linewidth=1.8)
-    axes.plot([], [], color="#2f6fb5", linewidth=1.8, label=f"stale map: {stale:.2f} (paper {reference.STALE})")
+    axes.plot([], [], color="#2f6fb5", linewidth=1.8, label=f"stale map: {stale:.2f} (paper {reference.PAPER_STALE})")
     paper = {1: reference.SINGLE, **reference.FLEET_READ_OFF, **reference.FLEET}
     shown = [n for n in paper if n <= max(numbers)]
-    axes.plot(shown, [paper[n] for n in shown], "x", color=_INK, markersize=7, label="paper", clip_on=False, zorder=5)
+    axes.plot(shown, [paper[n] for n in shown], "x", color=INK, markersize=7, label="paper", clip_on=False, zorder=5)
     for part in (axes, below):
-        _dress(part, "", "")
+        dress(part, "", "")
         part.set_xlim(min(numbers) - 0.3, max(*numbers, 2) + 0.3)
         part.xaxis.set_major_locator(MaxNLocator(integer=True))
     axes.set_ylim(np.floor(min(*drawn, reference.SINGLE)) - 1.5, 100.5)
     axes.tick_params(labelbottom=False)
     axes.spines["bottom"].set_visible(False)
     below.set_ylim(stale - 6, stale + 6)
-    below.set_xlabel("vehicles", color=_INK)
-    axes.set_ylabel("macro F1 in percent", color=_INK)
-    axes.legend(frameon=False, fontsize=9.5, loc="lower right", labelcolor=_INK, ncols=2)
+    below.set_xlabel("vehicles", color=INK)
+    axes.set_ylabel("macro F1 in percent", color=INK)
+    axes.legend(frameon=False, fontsize=9.5, loc="lower right", labelcolor=INK, ncols=2)
     seeds = ", ".join(map(str, summary["seeds"]))
     _title(figure, "F1 by number of vehicles", f"world seed {seeds}, poses {summary['parameters']['poses']}")
-    save_figure(figure, path)
-    return path
+    return save(figure, path)
 
 
 def _curves(axes: Axes, summary: Mapping[str, Any], numbers: list[int]) -> list[float]:
@@ -148,7 +145,7 @@ def draw_masses(watch: Watch, history: tuple[I64, I32], parameters: MassParamete
     axes = figure.subplots(2, 2, sharex=True, sharey=True)
     figure.subplots_adjust(left=0.065, right=0.985, top=0.84, bottom=0.08, hspace=0.22, wspace=0.07)
     for panel, index, change_class in zip(axes.flat, most_telling(watch, counters), WATCHED, strict=True):
-        _dress(panel, "", "")
+        dress(panel, "", "")
         name = f"a {change_class.name.lower()} voxel"
         if index >= 0:
             _mass_lines(panel, (t_ns - t_ns[0]) * 1e-9, counters[:, index], parameters)
@@ -157,12 +154,11 @@ def draw_masses(watch: Watch, history: tuple[I64, I32], parameters: MassParamete
         panel.set_title(name, fontsize=11, color=CLASS_COLOURS[change_class], loc="left", weight="bold")
         panel.set_ylim(-0.03, 1.03)
     for panel in axes[1]:
-        panel.set_xlabel("seconds since the first ray", color=_INK)
+        panel.set_xlabel("seconds since the first ray", color=INK)
     handles, labels = axes.flat[0].get_legend_handles_labels()
     figure.legend(handles, labels, loc="upper right", bbox_to_anchor=(0.99, 0.985), ncols=3, frameon=False)
     _title(figure, "Masses of single voxels", f"one drive, {sensor}; rays counted in brackets")
-    save_figure(figure, path)
-    return path
+    return save(figure, path)
 
 
 def _mass_lines(axes: Axes, t_s: F64, counters: I32, parameters: MassParameters) -> None:
@@ -173,20 +169,6 @@ def _mass_lines(axes: Axes, t_s: F64, counters: I32, parameters: MassParameters)
         axes.step(t_s, values[:, column], where="post", color=colour, linewidth=1.9, label=label)
 
 
-def _dress(axes: Axes, x: str, y: str) -> None:
-    axes.set_xlabel(x, color=_INK)
-    axes.set_ylabel(y, color=_INK)
-    axes.grid(color="#e3e7ed", linewidth=0.8)
-    axes.tick_params(colors=_INK, labelsize=9)
-    for name, spine in axes.spines.items():
-        spine.set(visible=name in ("left", "bottom"), color="#c3ccd8")
-
-
 def _title(figure: Figure, title: str, note: str) -> None:
-    figure.text(0.03, 0.955, title, fontsize=16, weight="bold", color=_INK, va="center")
-    figure.text(0.03, 0.912, note, fontsize=10, color="#5a6675", va="center")
-
-
-def pictures_of(paths: Sequence[Path]) -> str:
-    """Return the names of pictures for the last line of the output."""
-    return ", ".join(path.name for path in paths)
+    figure.text(0.03, 0.955, title, fontsize=16, weight="bold", color=INK, va="center")
+    figure.text(0.03, 0.912, note, fontsize=10, color=PALE, va="center")

@@ -1,22 +1,92 @@
-"""The voxels that cost F1: by true class, predicted class and cause, with what they cost."""
+"""`gnd reproduce errors`: the voxels that cost F1, by true class, predicted class and cause, from a finished run."""
 
+import json
 from collections import Counter
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
-from typing import Any, Final
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any, Final, get_args
 
+import click
 import numpy as np
 from numpy.typing import NDArray
 
 from gnd.fleet_sim.evaluate import CLASSES, ClassArray, Score, classes_of_maps
-from gnd.fleet_sim.truth import Level, Truth
-from gnd.gnd_map.arrays import I64
+from gnd.fleet_sim.truth import LEVELS, Level, Truth, read_truth
+from gnd.gnd_map.arrays import I32, I64
 from gnd.gnd_map.classes import ChangeClass
+from gnd.gnd_map.config import from_mapping
+from gnd.vehicle_agent.detect.parameters import MIN_CELLS, DetectParameters
+from studies.frame.errors import OptionError
+from studies.frame.folder import RunFolder
+from studies.frame.options import PATH
+from studies.frame.tables import print_sheets, sheet, shown
 from studies.simulation.base_map import BaseMap
-from studies.simulation.causes import RIGHT, UNSEEN, Causes, causes, columns_at
 from studies.simulation.cloud import map_of_one, merged_map
-from studies.simulation.method import MethodParameters
-from studies.simulation.result import VehicleResult
+from studies.simulation.options import MethodParameters
+from studies.simulation.result import EVIDENCE, VehicleResult, read_result
+from studies.simulation.worlds import WorldFiles, read_world_base
+
+RIGHT: Final = "right"
+UNSEEN: Final = "never observed"
+FEW_CELLS: Final = "abstains: too few sub-cells"
+EDGE: Final = "abstains: may be the edge of a neighbour"
+FEW_RAYS: Final = "abstains: too few rays, or a tie"
+OTHER: Final = "other"
+
+Causes = NDArray[np.str_]
+N, A, M, D, E = (
+    int(c) for c in (ChangeClass.NORMAL, ChangeClass.NEW, ChangeClass.MODIFIED, ChangeClass.DELETED, ChangeClass.EMPTY)
+)
+
+
+def columns_at(result: VehicleResult, rows: I64) -> dict[str, I32]:
+    """Return the vehicle's evidence at rows (R,) of the truth: columns `EVIDENCE` and `seen` (0 or 1), int32 (R,)."""
+    at = np.searchsorted(result.row, rows)
+    at[at == len(result.row)] = 0
+    seen = result.row[at] == rows if len(result.row) else np.zeros(len(rows), np.bool_)
+    columns = {name: np.where(seen, result.evidence[name][at], 0) for name in EVIDENCE if len(result.row)}
+    columns = columns or {name: np.zeros(len(rows), np.int32) for name in EVIDENCE}
+    columns["change_class"] = np.where(seen, columns["change_class"], int(ChangeClass.UNMEASURED))
+    columns["seen"] = seen.astype(np.int32)
+    return columns
+
+
+def causes(true_class: NDArray[np.uint8], e: Mapping[str, I32], p: DetectParameters) -> Causes:
+    """Return for each voxel why the vehicle did not say what is true, or `RIGHT`.
+
+    Args:
+        true_class: uint8 (R,).
+        e: the vehicle's evidence there, of `columns_at`.
+        p: the parameters that it decided with.
+    """
+    said, t = e["change_class"], true_class
+    silent = said == int(ChangeClass.UNMEASURED)
+    weak = (e["cells"] >= p.weak_cells) & (e["cells"] < np.where(e["map_cells"] > 0, MIN_CELLS, p.new_cells))
+    many = (e["map_cells"] == 0) & (e["cells"] >= p.new_cells)
+    part = e["cells"] < 0.5 * e["map_cells"]
+    cases = (
+        (e["seen"] == 0, UNSEEN),
+        (said == t, RIGHT),
+        (silent & weak, FEW_CELLS),
+        (silent & many, EDGE),
+        (silent, FEW_RAYS),
+        ((t == A) & (said == E) & (e["cells"] > 0), "empty: too few sub-cells met"),
+        ((t == A) & (said == E), "empty: rays pass, nothing met"),
+        ((t == E) & (said == A), "new: something stood or moved there"),
+        ((t == M) & (said == N) & (e["cells"] < MIN_CELLS), "normal: too few sub-cells for a Gaussian"),
+        ((t == M) & (said == N) & part, "normal: only a part of it seen"),
+        ((t == M) & (said == N), "normal: the Gaussians are too alike"),
+        ((t == M) & (said == D), "deleted: rays pass, too few sub-cells"),
+        ((t == N) & (said == M) & part, "modified: only a part of it seen"),
+        ((t == N) & (said == M), "modified: unlike the map's Gaussian"),
+        ((t == N) & (said == D), "deleted: rays pass through what stands"),
+        ((t == D) & (said == N) & (e["cells"] >= p.weak_cells), "normal: points met where it stood"),
+        ((t == D) & (said == N), "normal: too few rays passed"),
+        ((t == D) & (said == M), "modified: something else met there"),
+    )
+    return np.select([case for case, _ in cases], [name for _, name in cases], OTHER)
+
 
 BASE_DIFFERS: Final = "the base map differs from the truth's"
 MARGINAL: Final = "marginal in the truth"
@@ -173,3 +243,92 @@ def plain(losses: Sequence[Loss]) -> list[dict[str, Any]]:
         {"true": x.true, "predicted": x.predicted, "voxels": x.voxels, "f1": x.f1, "by_cause": dict(x.by_cause)}
         for x in losses
     ]
+
+
+def analyse(
+    out: Path, stages: Sequence[str], levels: Sequence[Level], changes: Sequence[str] = (), exact: Path | None = None
+) -> dict[str, Any]:
+    """Return the losses by stage and level, means over the run's worlds (and over the vehicles of a sensor).
+
+    Args:
+        out: folder of the run.
+        stages: "single", "single.<sensor>" or a number of vehicles; by default all that the run reports.
+        levels: of the truth.
+        changes: replaced parameters of the merge.
+        exact: folder of the same run with true poses, which tells what the poses cost.
+
+    Raises:
+        FolderError: no finished run is in the folder.
+        OptionError: no such stage.
+    """
+    mark = RunFolder(out).finished()
+    cases = _cases(out, mark, changes)
+    if exact is not None:
+        cases = _beside(cases, mark, exact, changes)
+    sensors = sorted({vehicle.sensor for case in cases for vehicle in case.vehicles})
+    wanted = list(stages) or [*(f"single.{sensor}" for sensor in sensors), *map(str, mark["options"]["vehicles"])]
+    return {stage: {level: plain(_losses_at(cases, stage, level, sensors)) for level in levels} for stage in wanted}
+
+
+def _cases(out: Path, mark: dict[str, Any], changes: Sequence[str]) -> list[Case]:
+    method = from_mapping(MethodParameters, mark["options"]["method"]).with_changes(changes)
+    return [_case(out, world, mark["options"]["base"], method) for world in mark["worlds"]]
+
+
+def _beside(cases: Sequence[Case], mark: dict[str, Any], exact: Path, changes: Sequence[str]) -> list[Case]:
+    """The cases with those of the run with true poses beside them."""
+    other = RunFolder(exact).finished()
+    ignored = ("poses", "method", "pcd")
+    differ = [k for k, v in mark["options"].items() if k not in ignored and other["options"].get(k) != v]
+    if differ or other["options"]["poses"] != "true":
+        raise OptionError(f"{exact} is not the same run with --poses true: {', '.join(differ) or 'poses'} differ")
+    return [replace(a, exact=b) for a, b in zip(cases, _cases(exact, other, changes), strict=True)]
+
+
+def _case(out: Path, world: dict[str, Any], base: str, method: MethodParameters) -> Case:
+    files = WorldFiles(out / world["folder"], base)
+    vehicles = [read_result(out / v["file"], v["key"]) for v in world["vehicles"]]
+    return Case(read_truth(files.truth), read_world_base(files), vehicles, method)
+
+
+def _losses_at(cases: Sequence[Case], stage: str, level: Level, sensors: Sequence[str]) -> list[Loss]:
+    kind, _, sensor = stage.partition(".")
+    if kind == "single" and (not sensor or sensor in sensors):
+        return mean_losses([single_losses(c, v, level) for c in cases for v in c.vehicles if sensor in ("", v.sensor)])
+    most = min(len(case.vehicles) for case in cases)
+    if stage.isdecimal() and 1 <= int(stage) <= most:
+        return mean_losses([fleet_losses(case, int(stage), level) for case in cases])
+    raise OptionError(f"unknown stage {stage!r}: single, single.<{'|'.join(sensors)}>, or 1 … {most} vehicles")
+
+
+@click.command()
+@click.argument("out", type=PATH, default=Path("runs/reproduce-simulation"))
+@click.option("--stage", "stages", multiple=True, help="single, single.<sensor>, or a number of vehicles; repeatable.")
+@click.option("--level", "levels", multiple=True, type=click.Choice(get_args(Level)), help="[default: all three]")
+@click.option("--causes", default=4, show_default=True, help="Causes shown of each kind of error.")
+@click.option("--set", "changes", multiple=True, metavar="merge.FIELD=VALUE", help="Merge with other parameters.")
+@click.option("--true-poses", "exact", type=PATH, help="Folder of the same run with --poses true: what poses cost.")
+@click.option("--json", "as_json", is_flag=True, help="Print one JSON object.")
+def errors(
+    out: Path,
+    stages: tuple[str, ...],
+    levels: tuple[Level, ...],
+    causes: int,
+    changes: tuple[str, ...],
+    exact: Path | None,
+    as_json: bool,
+) -> None:
+    """Show which voxels of the finished run in OUT cost F1, by true class, predicted class and cause."""
+    found = analyse(out, stages, levels or LEVELS, changes, exact)
+    if as_json:
+        click.echo(json.dumps(found))
+        return
+    columns = {"predicted": "{predicted}", "voxels": "{voxels:g}", "F1 points": "{f1:.2f}", "causes": "{causes}"}
+    for stage, by_level in found.items():
+        for level, losses in by_level.items():
+            table = sheet(f"{stage}, {level.replace('_', ' ')}: what costs F1", "true", *columns)
+            for loss in losses:
+                parts = [f"{k:g} {cause}" for cause, k in list(loss["by_cause"].items())[:causes]]
+                row = {**loss, "causes": "\n".join(parts)}
+                table.add(loss["true"], *(shown(cell, row) for cell in columns.values()))
+            print_sheets([table])

@@ -13,7 +13,7 @@ from gnd.gnd_map.se3 import exp_so3, transform
 from gnd.schemas.drive import DriveHeader, DriveItem, ReferencePose, Scan
 from gnd.vehicle_agent.local_map import LocalMap
 from gnd.vehicle_agent.localise.estimates import Cause, Health, PoseEstimate, RefinedScan
-from studies.simulation.pose_source import PoseSource
+from studies.simulation.options import PoseSource
 
 TIME_CONSTANT_S: Final = 2.0
 _KEPT_NS: Final = 200_000_000

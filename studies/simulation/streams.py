@@ -1,14 +1,12 @@
 """Measurements on their way from the simulator to the vehicle."""
 
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Iterable, Iterator
 from pathlib import Path
 
 from gnd.schemas.drive import DriveHeader, DriveItem, GnssFix, ReferencePose, Scan
 from gnd.schemas.drive_mcap import DriveWriter
 from gnd.schemas.drive_messages import fix_of, gnss_of, pose_message_of, reference_of
-
-Tick = Callable[[int, int], None]
-"""Told (scans done, scans in all); may raise `Stopped`."""
+from studies.frame.pool import Tick
 
 
 def ticking(items: Iterable[DriveItem], tick: Tick, scans: int) -> Iterator[DriveItem]:

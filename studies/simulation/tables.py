@@ -1,118 +1,97 @@
-"""A reproduction as tables for people, the paper's figures and our targets beside ours."""
+"""A reproduction as tables, the paper's figures and our targets beside ours."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any, Final
 
-from rich.console import Console, Group
-from rich.table import Table
-from rich.text import Text
-
 from gnd.fleet_sim.truth import LEVELS
-from studies.simulation import reference
-from studies.simulation.comparison import rows_of
-from studies.simulation.targets import target_single
+from studies.frame.tables import Sheet, fixed, sheet, sheet_of
+from studies.simulation import scores as reference
+from studies.simulation.scores import rows_of, target_single
 
+Found = Mapping[str, Any]
 PCD_CODEC: Final = "points"
 """The baseline's upload as the paper counts it: every new and every deleted point with its coordinates."""
-_PLAIN_WIDTH: Final = 120
 
 
-def tables_of(found: Mapping[str, Any], asked: "list[int]") -> Group:
+def sheets_of(found: Found, asked: Sequence[int]) -> list[Sheet]:
     """Return the scores, the classes of the largest fleet, and its confusion matrix."""
-    largest = str(max(asked))
-    return Group(
-        _scores(found, asked),
-        Text(),
-        _classes("merged map", largest, found["fleet"][largest]["classes"]["scored"]),
-        Text(),
-        _confusion(found, largest),
-        Text(),
-        notes_of(found),
-    )
+    largest, classes = str(max(asked)), {name: f"{{{name}:.2f}}" for name in ("precision", "recall", "f1")}
+    title = f"Classes of the merged map, {largest} vehicles, scored voxels"
+    of_classes = sheet_of(title, classes, found["fleet"][largest]["classes"]["scored"])
+    names = found["confusion"]["classes"]
+    confusion = sheet(f"Confusion, {largest} vehicles, scored voxels (rows: truth)", "", *names)
+    for name, row in zip(names, found["confusion"]["fleet"][largest]["scored"], strict=True):
+        confusion.add(name, *(f"{value:,}" for value in row))
+    confusion.notes += notes_of(found)
+    return [_scores(found, asked), of_classes, confusion]
 
 
-def print_tables(tables: Group) -> None:
-    """Print tables on standard output."""
-    console = Console()
-    if not console.is_terminal:
-        console = Console(width=_PLAIN_WIDTH)
-    console.print(tables)
-
-
-def comparison_tables(compared: Mapping[str, Any], asked: "list[int]") -> Group:
+def comparison_sheets(compared: Found, asked: Sequence[int]) -> list[Sheet]:
     """Return the scores of runs with poses of several sources beside each other, what each loses, and its poses."""
-    parts: list[Table | Text] = []
+    sheets = []
     for name in compared["loss"]:
-        parts += [_losses(compared, name, asked), Text(), _poses(compared["poses"][name], name), Text()]
+        sheets += [_losses(compared, name, asked), _poses(compared["poses"][name], name)]
         worst = compared["worst"][name]
         verdict = "met" if worst["met"] else "missed"
         line = f"Poses {name}: at most {worst['loss']:.2f} points lost ({worst['row']}), {worst['must']:g} allowed"
-        parts += [Text(f"{line}: {verdict}.", style="bold"), Text()]
-    return Group(*parts[:-1])
+        sheets[-1].notes.append(f"{line}: {verdict}.")
+    return sheets
 
 
-def _losses(compared: Mapping[str, Any], name: str, asked: "list[int]") -> Table:
+def _losses(compared: Found, name: str, asked: Sequence[int]) -> Sheet:
     against = compared["against"]
     exact, other = rows_of(compared["poses"][against]), rows_of(compared["poses"][name])
     seeds = ", ".join(map(str, compared["poses"][name]["seeds"]))
     columns = [f"{level} {what}" for level in ("scored", "all") for what in (against, name, "loss")]
-    table = _table(f"Macro F1 in percent, world seed {seeds}: poses {against} and {name}", "", *columns)
+    table = sheet(f"Macro F1 in percent, world seed {seeds}: poses {against} and {name}", "", *columns)
     for row, loss in compared["loss"][name].items():
         kind, _, number = row.partition(".")
-        if kind == "fleet" and int(number) not in asked:
-            continue
-        values = [(exact[row][level], other[row][level], loss[level]) for level in ("scored", "all")]
-        table.add_row(_row_name(row), *(f"{value:.2f}" for three in values for value in three))
+        if kind != "fleet" or int(number) in asked:
+            values = [
+                value for level in ("scored", "all") for value in (exact[row][level], other[row][level], loss[level])
+            ]
+            table.add(_vehicles(int(number)) if kind == "fleet" else f"one drive, {number or '16/32 layers'}",
+                      *map(fixed, values))  # fmt: skip
     return table
 
 
-def _row_name(row: str) -> str:
-    kind, _, which = row.partition(".")
-    if kind == "fleet":
-        return f"{which} vehicle{'s' * (which != '1')}"
-    return f"one drive, {which or '16/32 layers'}"
+def _vehicles(n: int) -> str:
+    return f"{n} vehicle{'s' * (n > 1)}"
 
 
-def _poses(found: Mapping[str, Any], name: str) -> Table:
+def _poses(found: Found, name: str) -> Sheet:
     """What the localisation of each sensor's drives came to."""
     errors = ("longitudinal_p95_m", "lateral_p95_m", "heading_p95_deg")
-    table = _table(f"Poses {name}, mean over the drives of a sensor", "", "scans", "used", *errors)
-    for sensor, drive in found["drives"].items():
-        poses = drive.get("poses", {})
-        values = [f"{poses[key]:.4f}" if key in poses else "" for key in errors]
-        table.add_row(sensor, f"{drive['scans']:.0f}", f"{drive['scans_used']:.0f}", *values)
-    return table
+    columns = {"scans": "{scans:.0f}", "used": "{scans_used:.0f}", **{key: f"{{poses.{key}:.4f}}" for key in errors}}
+    rows = {sensor: {"poses": None} | drive for sensor, drive in found["drives"].items()}
+    return sheet_of(f"Poses {name}, mean over the drives of a sensor", columns, rows)
 
 
-def _scores(found: Mapping[str, Any], asked: "list[int]") -> Table:
-    seeds = ", ".join(map(str, found["seeds"]))
-    title = (
-        f"Macro F1 in percent, world seed {seeds}: {found['parameters']['mode']}, poses {found['parameters']['poses']}"
-    )
-    table = _table(title, "", *LEVELS, "paper", "must", "aim", "upload kB")
-    table.add_row("stale map", *_f1(found["stale"]), f"{reference.STALE}", "", "", "")
+def _scores(found: Found, asked: Sequence[int]) -> Sheet:
+    seeds, options = ", ".join(map(str, found["seeds"])), found["parameters"]
+    title = f"Macro F1 in percent, world seed {seeds}: {options['mode']}, poses {options['poses']}"
+    levels = [level.replace("_", " ") for level in LEVELS]
+    table, up = sheet(title, "", *levels, "paper", "must", "aim", "upload kB"), found["upload_bytes"]
+    must, aim = reference.MUST, reference.AIM
+    table.add("stale map", *_f1(found["stale"]), reference.PAPER_STALE)
     for sensor, stage in found["single"].items():
-        table.add_row(f"one drive, {sensor}", *_f1(stage), "", "", "", _kb(found["upload_bytes"]["single"][sensor]))
+        table.add(f"one drive, {sensor}", *_f1(stage), "", "", "", _kb(up["single"][sensor]))
     target = target_single(found)
     if target:
-        must, aim = reference.MUST["single"], reference.AIM["single"]
-        values = [f"{target[level]:.2f}" for level in LEVELS]
-        table.add_row("one drive, 16/32 layers", *values, f"{reference.SINGLE}", f"{must}", f"{aim}", "", style="bold")
+        single = (reference.SINGLE, must["single"], aim["single"])
+        table.add("one drive, 16/32 layers", *_f1({"f1": target}), *single, style="bold")
     for n in asked:
-        stage, name = found["fleet"][str(n)], f"fleet.{n}"
-        paper = {**reference.FLEET, **reference.FLEET_READ_OFF}.get(n, "")
-        row = [str(paper), str(reference.MUST.get(name, "")), str(reference.AIM.get(name, ""))]
-        size = _kb(found["upload_bytes"]["fleet"][str(n)])
-        style = "bold" if name in reference.MUST else ""
-        table.add_row(f"{n} vehicle{'s' * (n > 1)}", *_f1(stage), *row, size, style=style)
-    for n in asked:
-        if "pcd" in found:
-            size = _kb(found["pcd"]["upload_bytes"]["fleet"][str(n)][PCD_CODEC])
-            table.add_row(f"point clouds, {n}", *_f1(found["pcd"]["fleet"][str(n)]), "", "", "", size, style="dim")
+        name, paper = f"fleet.{n}", {**reference.FLEET, **reference.FLEET_READ_OFF}.get(n, "")
+        limits = (paper, must.get(name, ""), aim.get(name, ""))
+        style = "bold" if name in must else ""
+        table.add(_vehicles(n), *_f1(found["fleet"][str(n)]), *limits, _kb(up["fleet"][str(n)]), style=style)
+    for n in asked if "pcd" in found else ():
+        size = _kb(found["pcd"]["upload_bytes"]["fleet"][str(n)][PCD_CODEC])
+        table.add(f"point clouds, {n}", *_f1(found["pcd"]["fleet"][str(n)]), "", "", "", size, style="dim")
     return table
 
 
-def notes_of(found: Mapping[str, Any]) -> Text:
+def notes_of(found: Found) -> list[str]:
     """Return a line each on movers and on upload against the baseline."""
     counts = [drive["segmentation"] for drive in found["drives"].values() if drive.get("segmentation")]
     lines = []
@@ -126,33 +105,11 @@ def notes_of(found: Mapping[str, Any]) -> Text:
         ours, theirs = found["upload_bytes"]["single"], found["pcd"]["upload_bytes"]["single"]
         share = 100 * sum(ours.values()) / sum(one[PCD_CODEC] for one in theirs.values())
         lines.append(f"Upload of one drive: {share:.2f} % of the point-cloud baseline's (at most 4 %).")
-    return Text("\n".join(lines))
+    return lines
 
 
-def _classes(title: str, n: str, classes: Mapping[str, Mapping[str, float]]) -> Table:
-    table = _table(f"Classes of the {title}, {n} vehicles, scored voxels", "", "precision", "recall", "F1")
-    for name, score in classes.items():
-        table.add_row(name, *(f"{score[key]:.2f}" for key in ("precision", "recall", "f1")))
-    return table
-
-
-def _confusion(found: Mapping[str, Any], n: str) -> Table:
-    names = found["confusion"]["classes"]
-    table = _table(f"Confusion, {n} vehicles, scored voxels (rows: truth)", "", *names)
-    for name, row in zip(names, found["confusion"]["fleet"][n]["scored"], strict=True):
-        table.add_row(name, *(f"{value:,}" for value in row))
-    return table
-
-
-def _table(title: str, *columns: str) -> Table:
-    table = Table(title=title, title_justify="left", box=None, pad_edge=False)
-    for column in columns:
-        table.add_column(column.replace("_", " "), justify="right" if column else "left")
-    return table
-
-
-def _f1(stage: Mapping[str, Any]) -> list[str]:
-    return [f"{stage['f1'][level]:.2f}" for level in LEVELS]
+def _f1(stage: Found) -> list[str]:
+    return [fixed(stage["f1"][level]) for level in LEVELS]
 
 
 def _kb(size: float) -> str:

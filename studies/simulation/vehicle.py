@@ -24,17 +24,21 @@ from gnd.vehicle_agent.report_sink import ReportList
 from gnd.vehicle_agent.segment import SegmentedScan
 from gnd.vehicle_agent.sources.recording import first_fix
 from gnd.vehicle_agent.tiles_at_hand import TilesAtHand
+from studies.frame.pool import Tick
 from studies.simulation.base_map import BaseMap, read_base
 from studies.simulation.baseline import CloudVehicle, read_cloud
-from studies.simulation.kept_evidence import RecordingDetector, evidence_columns
-from studies.simulation.labels import MoverLabels
 from studies.simulation.masses import Watch, Watcher
-from studies.simulation.method import MethodParameters
-from studies.simulation.pose_source import PoseSource
+from studies.simulation.options import MethodParameters, PoseSource
 from studies.simulation.poses import FromReference
-from studies.simulation.result import VehicleResult, write_result
-from studies.simulation.streams import Tick, as_recorded, recorded, ticking
-from studies.simulation.voxel_rows import VoxelRows
+from studies.simulation.result import (
+    MoverLabels,
+    RecordingDetector,
+    VehicleResult,
+    VoxelRows,
+    evidence_columns,
+    write_result,
+)
+from studies.simulation.streams import as_recorded, recorded, ticking
 
 
 @dataclass(frozen=True, slots=True)

@@ -20,10 +20,9 @@ from gnd.vehicle_agent.features.slamcu.slamcu import Slamcu
 from gnd.vehicle_agent.features.slamcu.verdicts import KnownState, NewFeature
 from gnd.vehicle_agent.features.slamcu.watched import Lost, PoseAt, WatchedSlamcu
 from gnd.vehicle_agent.features.view import Occlusion, SensorView
-from studies.feature_study.matching import match_one_to_one
-from studies.feature_study.start import start_of
-from studies.simulation.streams import Tick
-from studies.slamcu_study.verdicts import DELETED, NEW, SignTruth, Verdicts
+from studies.feature_study.truth import match_one_to_one, start_of
+from studies.frame.pool import Tick
+from studies.slamcu_study.signs import DELETED, NEW, SignTruth, Verdicts
 
 LIDAR_SIGMA: Final = (0.04, 0.04, np.radians(0.08))
 """Errors of the LiDAR localiser's poses, m, m, rad: as `--poses noisy:4cm:0.08deg` of the other studies."""

@@ -9,7 +9,6 @@ import numpy as np
 from gnd.fleet_sim.roads.drive import RoadDrive
 from gnd.gnd_map.arrays import F64
 from gnd.schemas.drive import Detections
-from studies.simulation.errors import OptionError
 
 SIGN_RANGE: Final = 0.05
 SIGN_BEARING_RAD: Final = np.radians(1.0)
@@ -72,10 +71,3 @@ FAULTS: Final[Mapping[str, tuple[str, Fault]]] = {
     "gnss": ("reflections of 8 to 20 m, 20 to 60 s long, every two minutes", _gnss),
     "signs": ("5 % of range and 1° of bearing that stay with each sign", _signs),
 }
-
-
-def check_faults(faults: Collection[str]) -> None:
-    """Raise OptionError for a fault that there is not."""
-    for name in faults:
-        if name not in FAULTS:
-            raise OptionError(f"--faults: there is no {name!r}; there are {', '.join(FAULTS)}")

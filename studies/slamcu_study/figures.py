@@ -9,28 +9,26 @@ from matplotlib.axes import Axes
 from matplotlib.ticker import MaxNLocator
 
 from gnd.gnd_map.arrays import F64, I64
-from studies.feature_study.drawing import BLUE, GREY, INK, MAGENTA, ORANGE, RED, dress, finish, new_figure
-from studies.slamcu_study import reference
-from studies.slamcu_study.outcome import SeedOutcome, StudyOutcome
-from studies.slamcu_study.scores import SignScore, accuracy_of
-from studies.slamcu_study.summary import merged_score, scored_drive
-from studies.slamcu_study.verdicts import ABSENT, DELETED, EXIST, NEW, SignTruth, Verdicts
+from studies.frame.figures import BLUE, GREY, INK, MAGENTA, ORANGE, RED, dress, finish, new_figure
+from studies.slamcu_study import signs as reference
+from studies.slamcu_study.scores import SignScore, accuracy_of, merged_score, scored_drive
+from studies.slamcu_study.signs import ABSENT, DELETED, EXIST, NEW, SeedOutcome, SignTruth, Verdicts
 
 _MASSES: Final = (("m(∃) exists", BLUE), ("m(∄) does not", RED), ("m(Ω) unknown", GREY))
 _SHOWN_STEPS: Final = 30
 
 
-def draw_figures(outcome: StudyOutcome, folder: Path) -> list[Path]:
+def draw_figures(outcomes: Sequence[SeedOutcome], km: float, folder: Path) -> list[Path]:
     """Draw all figures into the folder and return their paths; of single signs those of the first route.
 
     Raises:
         SimError: a file cannot be written.
     """
-    first = outcome.seeds[0]
-    note = f"seed {first.seed}, {outcome.options.km:g} km of motorway"
+    first = outcomes[0]
+    note = f"seed {first.seed}, {km:g} km of motorway"
     return [
         draw_masses(first.first, first.truth, note, folder / "slamcu_masses.png"),
-        draw_confusion(outcome, folder / "slamcu_confusion.png"),
+        draw_confusion(outcomes, folder / "slamcu_confusion.png"),
         draw_positions(first, note, folder / "slamcu_position_errors.png"),
     ]
 
@@ -84,11 +82,11 @@ def most_telling(found: Verdicts, signs: I64, right: int) -> int | None:
     return None if best is None else best[1]
 
 
-def draw_confusion(outcome: StudyOutcome, path: Path) -> Path:
+def draw_confusion(outcomes: Sequence[SeedOutcome], path: Path) -> Path:
     """Draw Table 1 as a picture: ours, the mean of the seeds, beside the paper's."""
-    ours = np.mean([scored_drive(one.first, one.truth).confusion for one in outcome.seeds], axis=0)
+    ours = np.mean([scored_drive(one.first, one.truth).confusion for one in outcomes], axis=0)
     figure = new_figure(10.6, 4.0)
-    seeds = ", ".join(str(one.seed) for one in outcome.seeds)
+    seeds = ", ".join(str(one.seed) for one in outcomes)
     titles = ("ours", "the paper's Table 1")
     matrices = (ours, np.array(reference.PAPER_CONFUSION, np.float64))
     for axes, title, matrix in zip(figure.subplots(1, 2), titles, matrices, strict=True):

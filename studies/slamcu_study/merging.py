@@ -22,7 +22,7 @@ from studies.feature_study.reporting import (
     reports_of,
 )
 from studies.slamcu_study.driving import Driven, occlusion_of, said_lost, sensor_view
-from studies.slamcu_study.outcome import MergedSigns
+from studies.slamcu_study.signs import MergedSigns
 
 
 def base_layer(route: Route) -> BaseLayer:

@@ -1,43 +1,74 @@
-"""A study of SLAMCU from options to results: drives in worker processes, what is kept is not driven again."""
+"""`gnd reproduce slamcu`: drives in worker processes, what is kept is not driven again."""
 
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
-from time import perf_counter
 from typing import Final
-
-from rich.progress import Progress
 
 from gnd.fleet_sim.drives import EPOCH_NS
 from gnd.fleet_sim.roads.drive import RoadDriveOptions, drive_route
 from gnd.fleet_sim.roads.motorway import motorway
 from gnd.vehicle_agent.features.slamcu.parameters import SlamcuParameters
 from studies.feature_study.reporting import read_reports, write_reports
-from studies.localisation_study.kept import Kept
-from studies.simulation.folder import RunFolder
-from studies.simulation.pool import Job, run_jobs
-from studies.simulation.sources import key_of, sources_sha
-from studies.simulation.streams import Tick
+from studies.frame.command import Bench, Report, study
+from studies.frame.kept import Kept, key_of, sources_sha
+from studies.frame.options import check, option, seeds
+from studies.frame.pool import Job, Tick
 from studies.slamcu_study.driving import run_slamcu, sign_truth, verdicts_of
-from studies.slamcu_study.faults import with_faults
+from studies.slamcu_study.faults import FAULTS, with_faults
 from studies.slamcu_study.merging import merged_signs, sign_reports
-from studies.slamcu_study.options import FULL, SlamcuOptions
-from studies.slamcu_study.outcome import MergedSigns, SeedOutcome, StudyOutcome
-from studies.slamcu_study.verdicts import read_verdicts, write_verdicts
+from studies.slamcu_study.scores import summary_of, tables_of
+from studies.slamcu_study.signs import FULL, VARIANTS, MergedSigns, SeedOutcome, SignTruth, Verdicts
 
 SOURCES: Final = (
-    "fleet_sim/roads",
-    "fleet_sim/drives.py",
-    "gnd_map",
-    "schemas",
-    "vehicle_agent/features",
+    *("fleet_sim/roads", "fleet_sim/drives.py", "gnd_map", "schemas", "vehicle_agent/features"),
     "studies/feature_study",
-    "studies/slamcu_study/driving.py",
-    "studies/slamcu_study/faults.py",
-    "studies/slamcu_study/merging.py",
-    "studies/slamcu_study/verdicts.py",
+    *(f"studies/slamcu_study/{name}.py" for name in ("driving", "faults", "merging", "signs")),
 )
 """What a drive's result depends on."""
 _HOUR_NS: Final = 3_600 * 1_000_000_000
+
+
+@dataclass(frozen=True, slots=True)
+class SlamcuOptions:
+    """One study: everything that decides its numbers. The first vehicle's drive is the paper's one drive."""
+
+    seeds: tuple[int, ...] = seeds(11, text="Seeds of routes: 1,2,3 or 1000-1049; each has its own signs and drives.")
+    drives: int = option(10, "Vehicles whose reports are merged.", span=(1, 100))
+    km: float = option(20.0, "Length of the motorway; signs in proportion.", span=(5, 100))
+    ablations: bool = option(True, "The first drive in all variants.")
+    faults: tuple[str, ...] = option(
+        (),
+        f"What the vehicle knows nothing of, put into every drive: {', '.join(FAULTS)}.",
+        known=FAULTS,
+        some=False,
+        read=lambda text: tuple(sorted({name for part in text.split(",") if (name := part.strip())})),
+    )
+
+    def __post_init__(self) -> None:
+        check(self)
+
+
+@study(SlamcuOptions, out="runs/reproduce-slamcu", jobs=1)
+def slamcu(options: SlamcuOptions, bench: Bench) -> Report:
+    """Signs that have gone or are new, found by single cars on a motorway: Figures 8 and 9 and Table 1 of the SLAMCU
+    paper, and what ten cars make of it.
+
+    A second start with the same options and folder continues where the first ended.
+    """
+    tasks = {seed: tasks_of(options, seed, bench.folder.root) for seed in options.seeds}
+    missing = [task for of_seed in tasks.values() for task in of_seed if not task.done]
+    bench.run("drives", [Job(task.name, run_drive, (task,), ticks=True) for task in missing])
+    with bench.timed("merge"):
+        outcomes = [_read(seed, options, of_seed) for seed, of_seed in tasks.items()]
+    found = summary_of(options, outcomes, bench.spent_s)
+
+    def draw(folder: Path) -> None:
+        from studies.slamcu_study.figures import draw_figures
+
+        draw_figures(outcomes, options.km, folder)
+
+    return Report(found, tables_of(found), draw)
 
 
 @dataclass(frozen=True, slots=True)
@@ -45,13 +76,11 @@ class DriveTask:
     """One drive in one variant.
 
     Attributes:
-        seed: of the route.
-        km: its length.
+        seed, km: of the route.
         vehicle: 1, 2, 3 …; its drive has its own noise, traffic and speed.
         variant: of `VARIANTS`.
         faults: of `FAULTS`.
         home: folder of results.
-        key: hash of all that decides them.
     """
 
     seed: int
@@ -60,21 +89,21 @@ class DriveTask:
     variant: str
     faults: tuple[str, ...]
     home: Path
-    key: str
 
     @property
     def verdicts(self) -> Kept:
-        """Where what it says is kept."""
-        return Kept(self.home, f"verdicts-{self._label}", self.key)
+        """Where what it says is kept, with the truth."""
+        return self._kept("verdicts")
 
     @property
     def reports(self) -> Kept:
         """Where its reports are kept."""
-        return Kept(self.home, f"reports-{self._label}", self.key)
+        return self._kept("reports")
 
-    @property
-    def _label(self) -> str:
-        return "-".join([str(self.vehicle), self.variant, *self.faults])
+    def _kept(self, what: str) -> Kept:
+        decides = {"seed": self.seed, "km": self.km, "vehicle": self.vehicle, "variant": self.variant}
+        key = key_of(sources=sources_sha(SOURCES), faults=",".join(self.faults), **decides)
+        return Kept(self.home, "-".join([what, str(self.vehicle), self.variant, *self.faults]), key)
 
     @property
     def done(self) -> bool:
@@ -87,40 +116,12 @@ class DriveTask:
         return f"seed {self.seed}, car {self.vehicle}" + ("" if self.variant == FULL else f", {self.variant}")
 
 
-def study(options: SlamcuOptions, folder: RunFolder, processes: int, progress: Progress) -> StudyOutcome:
-    """Run everything that is not yet in the folder.
-
-    Args:
-        options: what to run.
-        folder: keeps the results of the drives for the next start.
-        processes: worker processes.
-        progress: gets the bars.
-
-    Raises:
-        GndError: something cannot be made as asked.
-    """
-    begun_s = perf_counter()
-    tasks = {seed: tasks_of(options, seed, folder) for seed in options.seeds}
-    missing = [task for of_seed in tasks.values() for task in of_seed if not task.done]
-    run_jobs([Job(task.name, run_drive, (task,), ticks=True) for task in missing], processes, progress, "drives")
-    driven_s = perf_counter()
-    outcomes = tuple(_read(seed, options, of_seed) for seed, of_seed in tasks.items())
-    return StudyOutcome(options, outcomes, {"drives": driven_s - begun_s, "merge": perf_counter() - driven_s})
-
-
-def tasks_of(options: SlamcuOptions, seed: int, folder: RunFolder) -> list[DriveTask]:
+def tasks_of(options: SlamcuOptions, seed: int, root: Path) -> list[DriveTask]:
     """Return the drives of a route: all vehicles, then the first once more in each variant."""
-    home = folder.root / f"seed-{seed}"
     vehicles = [(vehicle, FULL) for vehicle in range(1, options.drives + 1)]
-    variants = [(1, variant) for variant in options.variants if variant != FULL]
-    bare = DriveTask(seed, options.km, 0, FULL, options.faults, home, "")
-    return [_keyed(replace(bare, vehicle=vehicle, variant=variant)) for vehicle, variant in [*vehicles, *variants]]
-
-
-def _keyed(task: DriveTask) -> DriveTask:
-    what = {"seed": task.seed, "km": task.km, "vehicle": task.vehicle, "variant": task.variant}
-    what["faults"] = ",".join(task.faults)
-    return replace(task, key=key_of(sources=sources_sha(SOURCES), **what))
+    variants = [(1, variant) for variant in VARIANTS if variant != FULL and options.ablations]
+    bare = DriveTask(seed, options.km, 0, FULL, options.faults, root / f"seed-{seed}")
+    return [replace(bare, vehicle=vehicle, variant=variant) for vehicle, variant in [*vehicles, *variants]]
 
 
 def run_drive(task: DriveTask, tick: Tick) -> None:
@@ -130,27 +131,23 @@ def run_drive(task: DriveTask, tick: Tick) -> None:
     drive = with_faults(drive, task.faults, task.seed)
     driven = run_slamcu(drive, task.variant, parameters, task.vehicle, tick)
     write_reports(sign_reports(drive, driven, task.vehicle, parameters), task.reports)
-    write_verdicts(verdicts_of(drive, driven), sign_truth(route), task.verdicts)
+    task.verdicts.write((verdicts_of(drive, driven), sign_truth(route)))
 
 
 def _read(seed: int, options: SlamcuOptions, tasks: list[DriveTask]) -> SeedOutcome:
     """Results of a route from the folder, and what the cloud makes of the reports."""
+    read = {task: task.verdicts.read(tuple[Verdicts, SignTruth]) for task in tasks}
     fleet = [task for task in tasks if task.variant == FULL]
-    found = {task.variant: read_verdicts(task.verdicts)[0] for task in tasks if task.vehicle == 1}
-    drives = tuple(read_verdicts(task.verdicts)[0] for task in fleet)
-    truth = read_verdicts(fleet[0].verdicts)[1]
-    return SeedOutcome(seed, truth, found, drives, _merged(seed, options, fleet))
+    found = {task.variant: verdicts for task, (verdicts, _) in read.items() if task.vehicle == 1}
+    drives = tuple(read[task][0] for task in fleet)
+    return SeedOutcome(seed, read[fleet[0]][1], found, drives, _merged(seed, options, fleet))
 
 
-def _merged(seed: int, options: SlamcuOptions, fleet: list[DriveTask]) -> dict[int, MergedSigns]:
-    """What is published after all drives, and on the way there."""
+def _merged(seed: int, options: SlamcuOptions, fleet: list[DriveTask]) -> Mapping[int, MergedSigns]:
+    """What is published after 2, 5 and all drives."""
     route, reports = motorway(seed, 1e3 * options.km), [read_reports(task.reports) for task in fleet]
     return {
         n: merged_signs(route, [report for of_drive in reports[:n] for report in of_drive])
-        for n in merged_counts(options.drives)
+        for n in sorted({2, 5, options.drives})
+        if 2 <= n <= options.drives
     }
-
-
-def merged_counts(drives: int) -> list[int]:
-    """Return after how many vehicles the map is scored: 2, 5 and all."""
-    return [n for n in sorted({2, 5, drives}) if 2 <= n <= drives]

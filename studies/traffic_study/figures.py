@@ -10,12 +10,10 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import FuncFormatter, MaxNLocator
 
-from gnd.fleet_sim.pictures import save_figure
 from gnd.gnd_map.arrays import F64
-from studies.traffic_study.tables import UPLOADS
+from studies.frame.figures import INK, PALE, save, spines
+from studies.traffic_study.summary import UPLOADS
 
-_INK: Final = "#1c2430"
-_PALE: Final = "#5a6675"
 _LINKS: Final = {"3g": "#2f6fb5", "4g": "#e08a1e", "5g": "#d9b310"}
 """As in the paper: blue, orange, yellow."""
 _COLOURS: Final = {
@@ -49,7 +47,7 @@ def draw_figures(found: Mapping[str, Any], folder: Path) -> list[Path]:
     for name, draw in pictures:
         figure = Figure(figsize=(9.6, 5.6), dpi=130, facecolor="white", layout="constrained")
         draw(figure.add_subplot(), found)
-        save_figure(figure, folder / name)
+        save(figure, folder / name)
     return [folder / name for name, _ in pictures]
 
 
@@ -65,7 +63,7 @@ def _download(axes: Axes, found: Mapping[str, Any]) -> None:
         axes.step(x, y, where="post", color=_COLOURS[name], linewidth=2.2, zorder=4)
         notes.append(Note(y[-1], f"{_NAMES[name]}: {_shown(y[-1])}", _COLOURS[name]))
     axes.set_xlim(0, way_m)
-    axes.set_xlabel("way driven, m", color=_INK)
+    axes.set_xlabel("way driven, m", color=INK)
     density = f"{down['voxels']} voxels in {down['tiles']} tiles, {down['voxels_per_km']} voxels a km"
     _finish(axes, notes, "Download along the drive", f"world seed {found['seed']}, {density}")
 
@@ -85,9 +83,7 @@ def _single(axes: Axes, found: Mapping[str, Any]) -> None:
     shown = [bar for bar in bars if bar[1]]
     for row, (_, size, colour) in enumerate(shown):
         axes.barh(row, size, color=colour, height=0.62, zorder=3)
-        axes.text(
-            size * 1.15, row, _shown(size), va="center", color=_INK, fontsize=9, zorder=5, backgroundcolor="white"
-        )
+        axes.text(size * 1.15, row, _shown(size), va="center", color=INK, fontsize=9, zorder=5, backgroundcolor="white")
     axes.set_yticks(range(len(shown)), [label for label, *_ in shown])
     axes.set_ylim(len(shown) - 0.5, -0.9)
     for side, (name, colour) in zip(("right", "right", "left"), _LINKS.items(), strict=True):
@@ -116,7 +112,7 @@ def _fleet(axes: Axes, found: Mapping[str, Any]) -> None:
         notes.append(Note(float(y[-1]), f"{label}: {_shown(y[-1])}", _COLOURS[name]))
     axes.set_xlim(0.0, len(drives))
     axes.xaxis.set_major_locator(MaxNLocator(integer=True))
-    axes.set_xlabel("drives", color=_INK)
+    axes.set_xlabel("drives", color=INK)
     rates = found["upload"]["changed_per_km"]
     where = f"world seed {found['seed']}, {1e3 * found['km']:.0f} m each"
     note = f"changes a km: {rates['first']:.0f} on the first drive, {rates['steady']:.0f} in the merged world"
@@ -159,13 +155,12 @@ def spread(heights: Sequence[float], gap: float) -> list[float]:
 
 
 def _titled(axes: Axes, title: str, note: str) -> None:
-    axes.set_title(f"{title}\n", loc="left", color=_INK, fontsize=14, weight="bold")
-    axes.text(0.0, 1.025, note, transform=axes.transAxes, color=_PALE, fontsize=9)
+    axes.set_title(f"{title}\n", loc="left", color=INK, fontsize=14, weight="bold")
+    axes.text(0.0, 1.025, note, transform=axes.transAxes, color=PALE, fontsize=9)
     axes.grid(visible=True, color="#e6eaf0", linewidth=0.7)
     axes.set_axisbelow(True)
-    axes.tick_params(colors=_INK, labelsize=9)
-    for name, spine in axes.spines.items():
-        spine.set(visible=name in ("left", "bottom"), color="#c3ccd8")
+    axes.tick_params(colors=INK, labelsize=9)
+    spines(axes)
 
 
 def _shown(size: float) -> str:

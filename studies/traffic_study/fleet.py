@@ -5,25 +5,23 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from rich.progress import Progress
-
 from gnd.fleet_sim.drives import EPOCH_NS, DriveConfig
 from gnd.fleet_sim.evaluate import evaluate_maps
 from gnd.fleet_sim.traffic import Traffic
 from gnd.fleet_sim.truth import Level, Truth, read_truth
 from gnd.gnd_map.codec import Lattice, snap
 from gnd.gnd_map.config import to_mapping
+from studies.frame.command import Bench
+from studies.frame.kept import SIMULATOR, key_of, sources_sha
+from studies.frame.pool import run_jobs
 from studies.simulation.base_map import BaseMap, read_base, write_base
-from studies.simulation.errors import FolderError
-from studies.simulation.pool import Job, run_jobs
 from studies.simulation.result import VehicleResult, read_result
-from studies.simulation.scoring import Scored
-from studies.simulation.sources import PCD, SIMULATOR, VEHICLE, key_of, sources_sha
-from studies.simulation.vehicle import VehicleTask, run_vehicle
-from studies.simulation.worlds import WorldFiles
-from studies.traffic_study.cloud import Cloud
+from studies.simulation.scores import Scored
+from studies.simulation.study import drive_jobs
+from studies.simulation.vehicle import VehicleTask
+from studies.simulation.worlds import PCD, VEHICLE, WorldFiles
 from studies.traffic_study.options import TrafficOptions
-from studies.traffic_study.uploads import DriveUpload, upload
+from studies.traffic_study.uploads import Cloud, DriveUpload, upload
 
 _HOUR_NS = 3_600 * 1_000_000_000
 
@@ -70,14 +68,13 @@ class Fleet:
     options: TrafficOptions
     files: WorldFiles
 
-    def run(self, way: Way, drives: int, processes: int, progress: Progress) -> FleetOutcome:
+    def run(self, way: Way, drives: int, bench: Bench) -> FleetOutcome:
         """Drive and merge, `options.at_once` vehicles at a time; drives whose results are kept are not driven again.
 
         Args:
             way: how maps and reports travel.
             drives: how many.
-            processes: worker processes.
-            progress: gets the bars.
+            bench: the processes.
 
         Raises:
             GndError: something cannot be made as asked, or an upload did not get through.
@@ -92,7 +89,7 @@ class Fleet:
             for first in range(0, drives, self.options.at_once):
                 held = cloud.map()
                 numbers = range(first, min(first + self.options.at_once, drives))
-                driven = self._driven(way, held, numbers, processes, progress)
+                driven = self._driven(way, held, numbers, bench)
                 uploads += [upload(result, held, cloud) for result in driven]
                 published.append(cloud.merge())
                 scores[len(uploads)] = _f1(truth, base, cloud.map())
@@ -101,15 +98,13 @@ class Fleet:
         stale = _f1(truth, base, base)
         return FleetOutcome(tuple(uploads), base, final, stale, scores[after], scores[drives], tuple(published))
 
-    def _driven(
-        self, way: Way, held: BaseMap, numbers: range, processes: int, progress: Progress
-    ) -> Iterator[VehicleResult]:
+    def _driven(self, way: Way, held: BaseMap, numbers: range, bench: Bench) -> Iterator[VehicleResult]:
         """The results of drives that begin with the map `held`, in order."""
         path = self.files.home / f"map-{way.name}-{numbers.start:02d}.npz"
         write_base(held, path)
         tasks = [self._task(way, held, path, number) for number in numbers]
-        jobs = [Job(f"{t.drive.vehicle} {way.name}", run_vehicle, (t,), ticks=True) for t in tasks if not _is_done(t)]
-        run_jobs(jobs, processes, progress, f"drives {numbers.start + 1} to {numbers.stop}, {way.name}")
+        title = f"drives {numbers.start + 1} to {numbers.stop}, {way.name}"
+        run_jobs(drive_jobs(tasks), bench.processes, bench.progress, title)
         return (read_result(task.result, task.key) for task in tasks)
 
     def _task(self, way: Way, held: BaseMap, path: Path, number: int) -> VehicleTask:
@@ -172,14 +167,6 @@ def _published(base: BaseMap, lattice: Lattice | None) -> BaseMap:
     if lattice is None:
         return base
     return BaseMap({tile: snap(gaussians, lattice) for tile, gaussians in base.tiles.items()})
-
-
-def _is_done(task: VehicleTask) -> bool:
-    try:
-        read_result(task.result, task.key)
-        return True
-    except FolderError:
-        return False
 
 
 def _f1(truth: Truth, base: BaseMap, final: BaseMap) -> dict[Level, float]:

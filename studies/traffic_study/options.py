@@ -1,18 +1,15 @@
 """What a traffic study runs: street, drives, sensor, poses."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from types import MappingProxyType
 from typing import Final
 
 from gnd.fleet_sim.sensors import SHORT_NAMES
 from gnd.fleet_sim.street import StreetOptions
-from studies.simulation.errors import OptionError
-from studies.simulation.method import MethodParameters
-from studies.simulation.options import Base, RunOptions
-from studies.simulation.pose_source import PoseSource
-
-_MOST_DRIVES = 200
+from studies.frame.errors import OptionError
+from studies.frame.options import Option, check, option, parts
+from studies.simulation.options import SET, Base, MethodParameters, PoseSource, RunOptions, method_of
 
 
 @dataclass(frozen=True, slots=True)
@@ -37,45 +34,50 @@ STREETS: Final[Mapping[str, StreetKind]] = MappingProxyType(
 of the street has changed, as for the scores of change detection."""
 
 
+def street_of(kind: str, length_m: float | None = None, edit_share: float | None = None) -> StreetOptions:
+    """Return the street of a kind, with its own length and share of edits or others.
+
+    Raises:
+        OptionError: no such kind.
+    """
+    if kind not in STREETS:
+        raise OptionError(f"unknown street {kind!r}, use one of {', '.join(STREETS)}")
+    usual = STREETS[kind]
+    share = usual.edit_share if edit_share is None else edit_share
+    return StreetOptions(length_m or usual.length_m, "wangsimni", edit_share=share)
+
+
 @dataclass(frozen=True, slots=True)
 class TrafficOptions:
-    """One traffic study.
-
-    Attributes:
-        seed: of the world.
-        street: its length, place, and share of edits.
-        parking: share of parking slots that are taken on each drive.
-        drives: how many vehicles drive, one after the other.
-        at_once: so many are on the street at a time: they know the map as it was before they began.
-        sensor: short name; all drives have the same, as in the paper.
-        traffic: whether other cars and pedestrians move about.
-        poses: where the poses come from.
-        base: how the map before was made; see `studies.simulation.options`.
-        pcd_drives: the point-cloud baseline runs beside the first so many drives.
-        f1_drives: after so many drives the map is scored, once as it travelled and once in floats; 0: not at all.
-        scans: at most so many scans a drive, None for the whole street.
-        method: all parameters of vehicle and merge.
+    """One traffic study. Vehicles that are on the street together know the map as it was before they began; after
+    `f1_drives` the map is scored, once as it travelled and once in floats.
     """
 
-    seed: int = 201
-    street: StreetOptions = field(default_factory=lambda: street_options("usual"))
-    parking: float = STREETS["usual"].parking
-    drives: int = 38
-    at_once: int = 4
-    sensor: str = "vlp16"
-    traffic: bool = True
-    poses: PoseSource = field(default_factory=PoseSource)
-    base: Base = "driven"
-    pcd_drives: int = 4
-    f1_drives: int = 4
-    scans: int | None = None
-    method: MethodParameters = field(default_factory=MethodParameters)
+    seed: int = option(201, "Seed of the world.", "--seed", "--world-seed")
+    street: StreetOptions = parts(
+        street_of,
+        kind=("usual", Option("How much has changed: usual or rebuilt.", ("--street",))),
+        length_m=(None, Option("Length of the street, metres.  [default: the street's]", ("--length",), of=float)),
+        edit_share=(None, Option("Share of the street's edits made.  [default: the street's]", ("--edits",), of=float)),
+    )
+    parking: float = parts(
+        lambda parking, kind="usual": STREETS[kind].parking if parking is None else parking,
+        using=("kind",),
+        parking=(None, Option("Share of parking slots that are taken.  [default: the street's]", of=float)),
+    )
+    drives: int = option(38, "How many vehicles drive, one after the other, as in the paper.", span=(1, 200))
+    at_once: int = option(4, "So many are on the street at a time.", span=(1, 200))
+    sensor: str = option("vlp16", "The sensor of all vehicles, as in the paper.", known=SHORT_NAMES)
+    traffic: bool = option(True, "Moving cars and pedestrians.")
+    poses: PoseSource = option(PoseSource(), "estimated, true, or noisy:<m>:<deg>.", read=PoseSource.parse)
+    base: Base = option("driven", "How the map before was made.")
+    pcd_drives: int = option(4, "The point-cloud baseline runs beside so many drives.", span=(0, None))
+    f1_drives: int = option(4, "F1 after so many drives, also in floats; 0: not.", span=(0, None))
+    scans: int | None = option(None, "At most so many scans a drive, for a quick look.", span=(1, None))
+    method: MethodParameters = parts(method_of, changes=SET)
 
     def __post_init__(self) -> None:
-        if not 1 <= self.drives <= _MOST_DRIVES or not 1 <= self.at_once <= _MOST_DRIVES:
-            raise OptionError(f"1 … {_MOST_DRIVES} drives, some at a time; got {self.drives}, {self.at_once} at a time")
-        if not min(self.pcd_drives, self.f1_drives) >= 0:
-            raise OptionError(f"numbers of drives must not be negative, got {self.pcd_drives} and {self.f1_drives}")
+        check(self)
         _ = self.world  # which checks the rest
 
     @property
@@ -98,24 +100,3 @@ class TrafficOptions:
     def sensor_model(self) -> str:
         """Name of the sensor in recordings."""
         return SHORT_NAMES[self.sensor]
-
-
-def street_options(kind: str, length_m: float | None = None) -> StreetOptions:
-    """Return the street of a kind, of its own length or another.
-
-    Raises:
-        OptionError: no such kind.
-    """
-    found = street_kind(kind)
-    return StreetOptions(length_m or found.length_m, "wangsimni", edit_share=found.edit_share)
-
-
-def street_kind(name: str) -> StreetKind:
-    """Return a kind of street by its name.
-
-    Raises:
-        OptionError: there is none.
-    """
-    if name not in STREETS:
-        raise OptionError(f"unknown street {name!r}, use one of {', '.join(STREETS)}")
-    return STREETS[name]

@@ -1,26 +1,23 @@
 """What the lattices weigh on this street, what they do to Gaussians and poses, and how long coding takes."""
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
-from time import process_time
 from typing import Final
 
 import numpy as np
 
 from gnd.fleet_sim.world import World
-from gnd.gnd_map.arrays import F64
 from gnd.gnd_map.codec import CODECS, LATTICES, Codec, lattice_of, snap
 from gnd.gnd_map.gaussian import Gaussians
-from gnd.gnd_map.motion import Trajectory, deskew
 from gnd.gnd_map.tile_id import TileId
 from gnd.schemas.drive import Scan
-from studies.codec_quality import PosedScan, kl_median, pose_shift_cm
-from studies.plain_protobuf import plain_protobuf
+from studies.codec_scenes import PosedScan, kl_median, plain_protobuf, pose_shift_cm
+from studies.frame.measure import core_s
+from studies.frame.scans import posed
 from studies.short_drives import Street
 
 TILE_VOXELS: Final = 2_500
 _SCANS: Final = 40
-_REPEATS: Final = 15
 _MARGIN_M: Final = 100.0
 
 Tiles = Mapping[TileId, Gaussians]
@@ -87,20 +84,8 @@ def _times_ms(codec: Codec, tiles: Tiles) -> tuple[float, float]:
     """Of the largest tile, brought to `TILE_VOXELS`; the processor's time, so that other work does not count."""
     tile, gaussians = max(tiles.items(), key=lambda item: len(item[1]))
     body, scale = codec.encode(tile, gaussians), 1e3 * TILE_VOXELS / len(gaussians)
-    encode_s, decode_s = _spent_s(lambda: codec.encode(tile, gaussians)), _spent_s(lambda: codec.decode(tile, body))
+    encode_s, decode_s = core_s(lambda: codec.encode(tile, gaussians)), core_s(lambda: codec.decode(tile, body))
     return encode_s * scale, decode_s * scale
-
-
-def _spent_s(call: Callable[[], object]) -> float:
-    """Median time of the processor, after a first call that compiles."""
-    call()
-    return float(np.median([_once_s(call) for _ in range(_REPEATS)]))
-
-
-def _once_s(call: Callable[[], object]) -> float:
-    started_s = process_time()
-    call()
-    return process_time() - started_s
 
 
 def _posed_scans(street: Street, sensor_model: str) -> list[PosedScan]:
@@ -108,9 +93,4 @@ def _posed_scans(street: Street, sensor_model: str) -> list[PosedScan]:
     drive = street.drive(sensor_model, "before", 1, street.world.seed)
     scans = [item for item in drive.items() if isinstance(item, Scan)]
     every = max(1, len(scans) // _SCANS)
-    return [_posed(drive.truth, drive.simulation.header().T_vehicle_lidar, scan) for scan in scans[every::every]]
-
-
-def _posed(truth: Trajectory, T_vehicle_lidar: F64, scan: Scan) -> PosedScan:
-    points = deskew(scan.points_m, scan.t_offset_ns, scan.t_ns, truth, T_vehicle_lidar, scan.t_ns)
-    return points, truth.at(scan.t_ns)
+    return [posed(scan, drive.truth, drive.simulation.header().T_vehicle_lidar) for scan in scans[every::every]]

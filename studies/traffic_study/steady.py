@@ -31,10 +31,13 @@ from gnd.tile_store.sqlite_store import SqliteStore
 from gnd.tile_store.values import DEFAULT_LAYER
 from gnd.vehicle_agent.agent import AgentConfig
 from gnd.vehicle_agent.cache import TileCache
+from studies.frame.command import Bench, Report, study
+from studies.frame.errors import OptionError, ReproduceError
+from studies.frame.options import check, option
+from studies.frame.tables import Sheet, sheet_of, shown
 from studies.simulation.base_map import read_base
 from studies.simulation.options import RunOptions
 from studies.simulation.worlds import WorldFiles, prepare_world, world_name
-from studies.traffic_study.errors import TrafficError
 
 MUST_KB_PER_KM: Final = 2.0
 AIM_KB_PER_KM: Final = 1.0
@@ -46,35 +49,34 @@ _SETTLE_S: Final = 1.0
 
 @dataclass(frozen=True, slots=True)
 class SteadyOptions:
-    """One drive of a vehicle that knows the street.
+    """One drive of a vehicle that knows the street; nothing of it has changed since it was mapped."""
 
-    Attributes:
-        seed: of the world; nothing of it has changed since it was mapped.
-        length_m: of the street.
-        parking: share of parking slots that are taken; on the map there is no car.
-        speed_kmh: once under way.
-        sensor: short name.
-        link: profile of the vehicle's link.
-        pace: times real time; a slower pace has more keep-alives a km.
-        deadline_s: the drive is given up after this long.
-    """
-
-    seed: int = 201
-    length_m: float = 1000.0
-    parking: float = 0.0
-    speed_kmh: float = 40.0
-    sensor: str = "vlp16"
-    link: str = "4g"
-    pace: float = 1.0
-    deadline_s: float = 1800.0
+    seed: int = option(201, "Seed of the world.", "--seed", "--world-seed")
+    length_m: float = option(1000.0, "Length of the street, metres.", "--length")
+    parking: float = option(0.0, "Share of parking slots that are taken; on the map none.")
+    speed_kmh: float = option(40.0, "Of the vehicle once under way, km/h.", "--speed")
+    sensor: str = option("vlp16", "Of the vehicle.", known=SHORT_NAMES)
+    link: str = option("4g", "Profile of its link.")
+    pace: float = option(1.0, "Times real time; a slower pace has more keep-alives a km.")
+    deadline_s: float = option(1800.0, "The drive is given up after so many seconds.", "--deadline")
 
     def __post_init__(self) -> None:
+        check(self)
         if not (self.speed_kmh > 0 and self.pace > 0 and self.deadline_s > 0):
-            raise TrafficError(
+            raise OptionError(
                 f"speed, pace, deadline must be positive: {self.speed_kmh} km/h, {self.pace}, {self.deadline_s} s"
             )
-        if self.sensor not in SHORT_NAMES:
-            raise TrafficError(f"unknown sensor {self.sensor!r}, use one of {', '.join(SHORT_NAMES)}")
+
+
+@study(SteadyOptions, out="runs/reproduce-steady", jobs=1)
+def steady_vehicle(options: SteadyOptions, bench: Bench) -> Report:
+    """All bytes of a vehicle that knows its street, up and down, over the real bus.
+
+    Nothing has changed since the street was mapped, and the vehicle's cache holds the map. Counted is what the kernel
+    counted on its connection (TCP_INFO): reports, telemetry, keep-alives, acknowledgements, handshakes, everything.
+    """
+    found = steady(options, bench.folder.root)
+    return Report(found, [sheet_of_account(found)])
 
 
 def steady(options: SteadyOptions, home: Path) -> dict[str, Any]:
@@ -128,23 +130,24 @@ def account(traffic: AgentTraffic, wall_s: float) -> dict[str, Any]:
     }
 
 
-def lines_of(found: dict[str, Any]) -> list[str]:
-    """An account as lines for people."""
-    lines = [
-        f"{row['kind']:12} {row['direction']:5} {row['messages']:4} messages {row['wire_bytes']:7} B "
-        f"{row['wire_kB_per_km']:8.3f} kB/km"
-        for row in found["rows"]
-    ]
+def sheet_of_account(found: dict[str, Any]) -> Sheet:
+    """An account as a table."""
+    columns = {"messages": "{messages}", "B": "{wire_bytes}", "kB/km": "{wire_kB_per_km:.3f}"}
+    rows = {f"{row['kind']}, {row['direction']}": row for row in found["rows"]}
+    title = "{km:.3f} km in {drive_s:.0f} s of driving ({wall_s:.0f} s by the clock)"
+    table = sheet_of(shown(title, found), columns, rows)
     reached = "aim met" if found["aim_met"] else "must met" if found["met"] else "missed"
-    return [
-        *lines,
-        f"{found['km']:.3f} km in {found['drive_s']:.0f} s of driving ({found['wall_s']:.0f} s by the clock): "
-        f"all bytes {found['all_kB_per_km']:.2f} kB/km, tiles {found['tiles_kB_per_km']:.2f}",
-        f"all but tiles: {found['other_kB_per_km']:.2f} kB/km of this drive, of it once a drive (opening, declaring, "
-        f"closing) {found['once_a_drive_bytes']} B",
-        f"all but tiles, under way: {found['under_way_kB_per_km']:.2f} kB/km "
-        f"(must {MUST_KB_PER_KM:g}, aim {AIM_KB_PER_KM:g}: {reached})",
+    table.notes += [
+        shown("all bytes {all_kB_per_km:.2f} kB/km, tiles {tiles_kB_per_km:.2f}", found),
+        shown(
+            "all but tiles: {other_kB_per_km:.2f} kB/km of this drive, of it once a drive (opening, declaring, closing)"
+            " {once_a_drive_bytes} B",
+            found,
+        ),
+        f"all but tiles, under way: {found['under_way_kB_per_km']:.2f} kB/km"
+        f" (must {MUST_KB_PER_KM:g}, aim {AIM_KB_PER_KM:g}: {reached})",
     ]
+    return table
 
 
 def _prepared(options: SteadyOptions, home: Path) -> tuple[Path, WorldFiles]:
@@ -200,7 +203,7 @@ def _drive(options: SteadyOptions, folder: RunFolder, drive: Path) -> None:
         deadline_s = time.monotonic() + options.deadline_s
         while not supervisor.finished(_VEHICLE):
             if time.monotonic() > deadline_s:
-                raise TrafficError(f"the drive did not end within {options.deadline_s:g} s: read {folder.logs}")
+                raise ReproduceError(f"the drive did not end within {options.deadline_s:g} s: read {folder.logs}")
             supervisor.poll()
             time.sleep(_LOOK_S)
 

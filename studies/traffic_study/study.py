@@ -1,12 +1,8 @@
-"""A traffic study from options to results: world, drives, maps on their way, codecs; what is kept is not made again."""
+"""`gnd reproduce traffic`: what a map and its changes weigh on the way (GND paper, section 7.5 and Figure 23)."""
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping
 from pathlib import Path
-from time import perf_counter
 from typing import Any, Final
-
-from rich.progress import Progress
 
 from gnd.fleet_bus.links import LinkProfile, load_link
 from gnd.fleet_sim.street import street
@@ -14,112 +10,54 @@ from gnd.gnd_map.codec import CODEC_FLOAT32, LATTICES
 from gnd.gnd_map.gaussian import Gaussians
 from gnd.gnd_map.tile import Tile, diff
 from gnd.gnd_map.tile_id import TileId
+from studies.frame.command import Bench, Report, study
+from studies.frame.pool import Job
 from studies.pcd import PcdMap
 from studies.simulation.base_map import read_base
-from studies.simulation.folder import RunFolder
-from studies.simulation.pool import Job, run_jobs
 from studies.simulation.worlds import WorldFiles, prepare_cloud, prepare_world, world_files
-from studies.traffic_study.clouds import Written, cloud_sizes, kept_cloud, points_by_tile
-from studies.traffic_study.download import (
-    Question,
-    Server,
-    Track,
-    along_drive,
-    fetched_tiles,
-    partly_changed,
-    store_of,
-)
+from studies.traffic_study.clouds import cloud_sizes, kept_cloud, points_by_tile
+from studies.traffic_study.download import Question, Server, Track, along_drive, fetched_tiles, partly_changed, store_of
 from studies.traffic_study.fleet import Fleet, FleetOutcome, Way
 from studies.traffic_study.options import TrafficOptions
 from studies.traffic_study.quality import CodecMeasures, codec_measures, protobuf_bytes
+from studies.traffic_study.summary import PUBLISHED, RETURN_SHARE, DownloadOutcome, StudyOutcome, summary_of, tables_of
 
-PUBLISHED: Final = "standard"
-"""The lattice of published maps."""
-RETURN_SHARE: Final = 0.02
 LINK: Final = "4g"
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class DownloadOutcome:
-    """A map on its way.
+@study(TrafficOptions, out="runs/reproduce-traffic")
+def traffic(options: TrafficOptions, bench: Bench) -> Report:
+    """What a map and its changes weigh on the way: Figure 23 of the GND paper, with our codecs.
 
-    Attributes:
-        track: the drive.
-        voxels: Gaussians by tile fetched.
-        gnd, gnd_float: questions and answers in our codecs, and in float32 columns.
-        protobuf: bytes of the tiles as the paper writes them.
-        clouds: bytes of the same tiles as a point cloud, by format, or why there are none.
-        points: points of that cloud by tile.
-        returned: questions of a vehicle that holds the map before a share of it changed.
-        after_fleet: those of a vehicle that holds the map before the fleet's drives; with how many voxels have changed.
-        changed_by_fleet: voxels.
+    A second start with the same options and folder continues where the first ended.
     """
-
-    track: Track
-    voxels: Mapping[TileId, int]
-    gnd: Sequence[Question]
-    gnd_float: Sequence[Question]
-    protobuf: int
-    clouds: Mapping[str, Written]
-    points: Mapping[TileId, int]
-    returned: Sequence[Question]
-    after_fleet: Sequence[Question]
-    changed_by_fleet: int
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class StudyOutcome:
-    """A finished study."""
-
-    options: TrafficOptions
-    download: DownloadOutcome
-    fleet: FleetOutcome
-    floats: FleetOutcome | None
-    codecs: Mapping[str, CodecMeasures]
-    links: tuple[LinkProfile, ...]
-    runtime_s: Mapping[str, float]
-
-
-def study(options: TrafficOptions, folder: RunFolder, processes: int, progress: Progress) -> StudyOutcome:
-    """Run everything that is not yet in the folder.
-
-    Args:
-        options: what to run.
-        folder: keeps the world and the drives for the next start.
-        processes: worker processes.
-        progress: gets the bars.
-
-    Raises:
-        GndError: something cannot be made as asked.
-    """
-    started_s = perf_counter()
-    files = world_files(folder, options.seed, options.world)
+    files = world_files(bench.folder, options.seed, options.world)
     jobs = [Job("world", prepare_world, (files, options.seed, options.world))]
     jobs.append(Job("street as points", _cloud, (options, files)))
     if options.pcd_drives:
         jobs.append(Job("point cloud", prepare_cloud, (files, options.seed, options.world)))
-    run_jobs(jobs, processes, progress, "world")
-    world_s = perf_counter()
-    fleet, floats = _fleets(options, files, processes, progress)
-    fleet_s = perf_counter()
-    jobs = [
-        Job("download", download, (options, files, fleet)),
-        Job("codecs", codecs_on_street, (options, files)),
-    ]
-    downloaded, codecs = run_jobs(jobs, processes, progress, "map and codecs")
-    spent = {"world": world_s - started_s, "drives": fleet_s - world_s, "map and codecs": perf_counter() - fleet_s}
+    bench.run("world", jobs)
+    with bench.timed("drives"):
+        fleet, floats = _fleets(options, files, bench)
+    jobs = [Job("download", download, (options, files, fleet)), Job("codecs", codecs_on_street, (options, files))]
+    downloaded, codecs = bench.run("map and codecs", jobs)
     links = tuple(load_link(name) for name in ("3g", "4g", "5g"))
-    return StudyOutcome(options, downloaded, fleet, floats, codecs, links, spent)
+    found = summary_of(StudyOutcome(options, downloaded, fleet, floats, codecs, links, bench.spent_s))
+
+    def draw(folder: Path) -> None:
+        from studies.traffic_study.figures import draw_figures
+
+        draw_figures(found, folder)
+
+    return Report(found, tables_of(found), draw)
 
 
-def _fleets(
-    options: TrafficOptions, files: WorldFiles, processes: int, progress: Progress
-) -> tuple[FleetOutcome, FleetOutcome | None]:
+def _fleets(options: TrafficOptions, files: WorldFiles, bench: Bench) -> tuple[FleetOutcome, FleetOutcome | None]:
     """The fleet with our codecs, and its first drives once more with floats."""
     fleet = Fleet(options, files)
-    ours = fleet.run(Way(PUBLISHED, LATTICES[PUBLISHED]), options.drives, processes, progress)
+    ours = fleet.run(Way(PUBLISHED, LATTICES[PUBLISHED]), options.drives, bench)
     again = min(options.f1_drives, options.drives)
-    return ours, fleet.run(Way("float", None), again, processes, progress) if again else None
+    return ours, fleet.run(Way("float", None), again, bench) if again else None
 
 
 def codecs_on_street(options: TrafficOptions, files: WorldFiles) -> dict[str, CodecMeasures]:

@@ -1,18 +1,115 @@
-"""A finished study as plain values: the JSON of `gnd reproduce traffic`."""
+"""A finished study: plain values (the JSON of `gnd reproduce traffic`), the papers' results, our targets, tables."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict
+from dataclasses import asdict, dataclass
 from statistics import fmean
 from typing import Any, Final
 
 from gnd.fleet_bus.links import LinkProfile
 from gnd.fleet_bus.pacer import MESSAGE_OVERHEAD_BYTES
 from gnd.gnd_map.config import to_mapping
-from studies.simulation.run import plain_options
-from studies.traffic_study.download import Question, fetched_tiles, total_bytes
-from studies.traffic_study.study import PUBLISHED, RETURN_SHARE, DownloadOutcome, StudyOutcome
-from studies.traffic_study.targets import targets_of
+from gnd.gnd_map.tile_id import TileId
+from studies.frame.command import plain_options
+from studies.frame.tables import Sheet, sheet, sheet_of
+from studies.frame.targets import Target, judged, targets_sheet
+from studies.traffic_study.clouds import Written
+from studies.traffic_study.download import Question, Track, fetched_tiles, total_bytes
+from studies.traffic_study.fleet import FleetOutcome
+from studies.traffic_study.options import TrafficOptions
+from studies.traffic_study.quality import CodecMeasures
 from studies.traffic_study.uploads import PARTS, DriveUpload
+
+PAPER_KM: Final = 0.11e6 / 56.32e3
+"""Way of one drive of the GND paper, km: 0.11 MB uploaded at 56.32 kB/km (sections 7.5 and 8)."""
+PAPER_DRIVES: Final = 38
+PAPER_BYTES: Final = {
+    "download.pcd": 19.37e6,
+    "download.gnd": 3.36e6,
+    "upload.single.pcd_changes": 2.06e6,
+    "upload.single.gnd": 0.11e6,
+    "upload.fleet.raw": 1713e6,
+    "upload.fleet.pcd_changes": 89.24e6,
+    "upload.fleet.gnd": 3.511e6,
+}
+"""GND paper, section 7.5 and Figure 23."""
+
+TARGETS: Final = (
+    Target("bytes a voxel, standard", "codec.bytes_per_voxel", "B", "48 to 84", 4.6, 4.0),
+    Target("pose shift, standard", "codec.pose_shift_cm_median", "cm", "", 0.15, 0.15),
+    Target("bytes a voxel, compact", "codec.compact.bytes_per_voxel", "B", "", 3.0, 3.0),
+    Target("pose shift, compact", "codec.compact.pose_shift_cm_median", "cm", "", 0.2, 0.2),
+    Target("download, PCD to GND", "ratio.pcd", "x", "5.8", 60.0, 90.0, larger=True),
+    Target("download, LAZ to GND", "ratio.laz", "x", "", 12.0, 16.0, larger=True),
+    Target("upload, first sighting", "upload.kB_per_km.first", "kB/km", "56.32", 10.0, 3.0),
+    Target("upload, first 8 drives", "upload.kB_per_km.flags_first", "kB/km", "56.32", 10.0, 1.5),
+    Target("upload, steady state", "upload.kB_per_km.steady", "kB/km", "", 1.0, 0.3),
+    Target("return download, 2 % changed", "download.return_bytes_per_tile", "B/tile", "", 150.0, 70.0),
+    Target("F1 lost by the codec", "ratio.f1_loss", "points", "", 0.2, 0.0),
+    Target("encode a tile", "codec.encode_ms", "ms", "", 10.0, 10.0),
+    Target("decode a tile", "codec.decode_ms", "ms", "", 10.0, 10.0),
+)
+
+
+def targets_of(found: Mapping[str, Any]) -> dict[str, dict[str, Any]]:
+    """Return each row that this study can judge."""
+    return judged({**found, "ratio": _ratios(found)}, TARGETS)
+
+
+def _ratios(found: Mapping[str, Any]) -> dict[str, float | None]:
+    """How many times larger the point clouds are, and what F1 the codec costs."""
+    ours, f1 = found["download"]["gnd"]["bytes"], found["f1"]
+    ratios: dict[str, float | None] = {
+        name: found["download"][name]["bytes"] / ours if found["download"][name]["bytes"] else None
+        for name in ("pcd", "laz")
+    }
+    return ratios | {"f1_loss": None if f1["float"] is None else f1["float"] - f1["codec"]}
+
+
+PUBLISHED: Final = "standard"
+"""The lattice of published maps."""
+RETURN_SHARE: Final = 0.02
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class DownloadOutcome:
+    """A map on its way.
+
+    Attributes:
+        track: the drive.
+        voxels: Gaussians by tile fetched.
+        gnd, gnd_float: questions and answers in our codecs, and in float32 columns.
+        protobuf: bytes of the tiles as the paper writes them.
+        clouds: bytes of the same tiles as a point cloud, by format, or why there are none.
+        points: points of that cloud by tile.
+        returned: questions of a vehicle that holds the map before a share of it changed.
+        after_fleet: those of a vehicle that holds the map before the fleet's drives; with how many voxels have changed.
+        changed_by_fleet: voxels.
+    """
+
+    track: Track
+    voxels: Mapping[TileId, int]
+    gnd: Sequence[Question]
+    gnd_float: Sequence[Question]
+    protobuf: int
+    clouds: Mapping[str, Written]
+    points: Mapping[TileId, int]
+    returned: Sequence[Question]
+    after_fleet: Sequence[Question]
+    changed_by_fleet: int
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class StudyOutcome:
+    """A finished study."""
+
+    options: TrafficOptions
+    download: DownloadOutcome
+    fleet: FleetOutcome
+    floats: FleetOutcome | None
+    codecs: Mapping[str, CodecMeasures]
+    links: tuple[LinkProfile, ...]
+    runtime_s: Mapping[str, float]
+
 
 FIRST_DRIVES: Final = 8
 """`flags_first` is the mean over so many drives."""
@@ -220,3 +317,108 @@ def _parameters(outcome: StudyOutcome) -> dict[str, Any]:
 
 def _rounded(values: Mapping[str, float]) -> dict[str, float]:
     return {name: round(value, 4) for name, value in values.items()}
+
+
+MAPS = (
+    ("pcd", "PCD, 0.2 m"),
+    ("pcd_compressed", "PCD compressed"),
+    ("laz", "LAZ, 1 cm"),
+    ("draco", "Draco, 12 bits"),
+    ("gnd_protobuf", "GND, protobuf of doubles"),
+    ("gnd_float", "GND, float32 columns"),
+    ("gnd", "GND, standard"),
+)
+UPLOADS = (
+    ("raw", "all measurements"),
+    ("pcd_changes", "point-cloud changes"),
+    ("gnd_float", "GND changes in floats"),
+    ("gnd", "GND changes, flags first"),
+)
+STAGES = (("first", "first drive"), ("flags_first", "first 8 drives"), ("steady", "merged world"))
+
+
+def tables_of(found: Mapping[str, Any]) -> list[Sheet]:
+    """Return all tables."""
+    return [_maps(found), _uploads(found), _rates(found), _codecs(found), _targets(found)]
+
+
+def _maps(found: Mapping[str, Any]) -> Sheet:
+    down = found["download"]
+    title = (
+        f"download along {found['km']:.3f} km: {down['tiles']} tiles, {down['voxels']} voxels"
+        f" ({down['voxels_per_km']} a km), {down['points']} points"
+    )
+    table = sheet(title, "map", "MB", "MB/km", "B a voxel", "times GND", "paper, MB/km")
+    for name, label in MAPS:
+        size = down[name]["bytes"]
+        if size is None:
+            table.add(label, down[name]["missing"], "", "", "", "")
+            continue
+        ratio, paper = size / down["gnd"]["bytes"], PAPER_BYTES.get(f"download.{name}")
+        shown = "" if paper is None else f"{paper / 1e6 / PAPER_KM:.2f}"
+        row = (f"{size / 1e6:.3f}", f"{size / 1e6 / found['km']:.3f}", f"{size / down['voxels']:.2f}", f"{ratio:.1f}")
+        table.add(label, *row, shown)
+    return table
+
+
+def _uploads(found: Mapping[str, Any]) -> Sheet:
+    up = found["upload"]
+    rate = up["changed_per_km"]["first"]
+    title = f"upload: {up['drives']} drives of {found['km']:.3f} km; the first reports {rate:.0f} changes a km"
+    table = sheet(title, "what", "one, kB", "kB/km", "all, kB", "paper, kB/km", "of its fleet")
+    for name, label in UPLOADS:
+        one, fleet = up["single"][name]["bytes"], up["fleet"][name]["bytes"]
+        table.add(label, _kb(one), _kb(one, found["km"]), _kb(fleet), _paper("single", name), _paper("fleet", name))
+    return table
+
+
+def _paper(stage: str, name: str) -> str:
+    """What the paper's vehicles uploaded, a drive and km."""
+    size = PAPER_BYTES.get(f"upload.{stage}.{name}")
+    drives = PAPER_DRIVES if stage == "fleet" else 1
+    return "" if size is None else f"{size / 1e3 / PAPER_KM / drives:.1f}"
+
+
+def _kb(size: float | None, km: float = 1.0) -> str:
+    return "" if size is None else f"{size / 1e3 / km:.2f}"
+
+
+def _rates(found: Mapping[str, Any]) -> Sheet:
+    up = found["upload"]
+    values = {
+        "kB/km up: keys and payloads": (up["kB_per_km"], 3),
+        "kB/km with the transport": (up["wire_kB_per_km"], 3),
+        "changes a km": (up["changed_per_km"], 0),
+        "Gaussians asked for a km": (up["wanted_per_km"], 0),
+        **{
+            f"B/km: {part}": ({stage: of[part] for stage, of in up["parts_bytes_per_km"].items()}, 0)
+            for part in up["parts_bytes_per_km"]["first"]
+        },
+    }
+    table = sheet("upload a km, by stage", "", *(label for _, label in STAGES))
+    for label, (by_stage, digits) in values.items():
+        table.add(label, *(f"{by_stage[stage]:.{digits}f}" for stage, _ in STAGES))
+    return table
+
+
+def _codecs(found: Mapping[str, Any]) -> Sheet:
+    columns = {
+        "B a voxel": "{bytes_per_voxel:.3f}",
+        "zstd, B": "{zstd_bytes_per_voxel:.3f}",
+        "KL, nats": "{kl_median:.4f}",
+        "pose shift, cm": "{pose_shift_cm_median:.3f}",
+        "encode, ms": "{encode_ms:.2f}",
+        "decode, ms": "{decode_ms:.2f}",
+    }
+    codecs = {"archive": found["codec"]["archive"], "standard": found["codec"], "compact": found["codec"]["compact"]}
+    return sheet_of("codecs on this street", columns, codecs, "lattice")
+
+
+def _targets(found: Mapping[str, Any]) -> Sheet:
+    f1, density = found["f1"], found["upload"]["changed_per_km"]["first"]
+    table = targets_sheet(
+        found["targets"], f"targets, at {found['download']['voxels_per_km']} voxels and {density:.0f} changes a km"
+    )
+    if f1["float"] is not None:
+        table.notes.append(f"F1 after {f1['drives']} drives {f1['codec']:.2f}, in floats {f1['float']:.2f}")
+    return table

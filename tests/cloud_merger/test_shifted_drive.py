@@ -22,10 +22,9 @@ from gnd.tile_store.build import build_map
 from gnd.tile_store.sqlite_store import SqliteStore
 from gnd.tile_store.values import ReportRow, StoreConfig
 from studies.simulation.base_map import BaseMap
-from studies.simulation.method import MethodParameters
-from studies.simulation.pose_source import PoseSource
+from studies.simulation.options import MethodParameters, PoseSource
+from studies.simulation.result import VoxelRows
 from studies.simulation.vehicle import VehicleTask, drive
-from studies.simulation.voxel_rows import VoxelRows
 
 SEED, SCANS = 41, 60
 OFF_M = (0.1, 0.3)  # forward, left

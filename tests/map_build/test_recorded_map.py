@@ -26,7 +26,7 @@ from gnd.vehicle_agent.map_build.quality import Quality, measure
 from gnd.vehicle_agent.map_build.refine_poses import refine_poses
 from gnd.vehicle_agent.map_build.result import summary
 from gnd.vehicle_agent.map_build.survey import look_over
-from studies.drifting_drives import Drift, drift_drive, relative_errors
+from studies.map_build import Drift, drift_drive, relative_errors
 
 SEED = 103
 PASSES = ((1, 11), (-1, 12))

@@ -2,9 +2,8 @@
 
 from typing import Any
 
-from studies.localisation_study import reference
-from studies.localisation_study.summary import ROWS
-from studies.localisation_study.targets import update_ratio
+from studies.localisation_study import series as reference
+from studies.localisation_study.summary import ROWS, update_ratio
 from studies.localisation_study.variants import VARIANTS
 
 START = {"trials": 40, "right": 39, "right_share": 0.975, "never_good": 1, "wrong_called_good": 0}

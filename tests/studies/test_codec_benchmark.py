@@ -15,10 +15,9 @@ from gnd.gnd_map.grid import GridFrame
 from gnd.gnd_map.tile import Tile
 from gnd.gnd_map.tile_id import TileId, covering_circle
 from gnd.tile_store.sqlite_store import SqliteStore
-from studies.codec import CodecOptions, decoded_on, options, run
-from studies.codec_quality import FLOOR_M, kl_median, kl_nats, pose_shift_cm
-from studies.codec_scenes import SEED, stored
-from studies.plain_protobuf import _tile_class, plain_protobuf
+from studies.codec import Options, decoded_on, run
+from studies.codec_scenes import FLOOR_M, SEED, _tile_class, kl_median, kl_nats, plain_protobuf, pose_shift_cm, stored
+from studies.frame.options import of_arguments
 
 TILE = TileId(497353963154)
 
@@ -113,7 +112,7 @@ def test_a_store_is_measured_without_scans(tmp_path: Path) -> None:
     with SqliteStore(tmp_path / "map.sqlite") as store:
         store.put_tiles([Tile(TILE, 1, gaussians(7, 300))])
     assert stored(tmp_path / "map.sqlite").voxels == 300
-    figures = run(CodecOptions(store=tmp_path / "map.sqlite", recordings=tmp_path))
+    figures = run(Options(store=tmp_path / "map.sqlite", recordings=tmp_path))
     names = " | ".join(figure.name for figure in figures)
     for codec in CODECS.values():
         assert f"codec {codec.codec_id}, {codec.name}: decode" in names
@@ -124,5 +123,5 @@ def test_a_store_is_measured_without_scans(tmp_path: Path) -> None:
 
 
 def test_options_of_the_command_line() -> None:
-    assert options([]).seed == SEED
-    assert options(["--seed", "102", "--base", "base.npz"]) == CodecOptions(102, Path("base.npz"))
+    assert of_arguments(Options, []).seed == SEED
+    assert of_arguments(Options, ["--seed", "102", "--base", "base.npz"]) == Options(102, Path("base.npz"))

@@ -11,11 +11,11 @@ from gnd.gnd_map.se3 import transform
 from gnd.vehicle_agent.features.poles.detector import Pole, PoleDetector, Rays
 from gnd.vehicle_agent.importers.cleaning import cleaned
 from gnd.vehicle_agent.importers.kitti import open_kitti
-from studies.pole_pictures import draw_poles
-from studies.pole_real import RealScan, Stability, poles_of, stability
-from studies.pole_scenes import OBSERVABLE_LENGTH_M, OBSERVABLE_RETURNS, Drive, PoleDrive, Posts
-from studies.pole_scores import Score, matches
-from studies.poles import options
+from studies.frame.errors import OptionError
+from studies.frame.options import of_arguments
+from studies.pole_real import RealScan, Stability, draw_poles, poles_of, stability
+from studies.pole_scenes import OBSERVABLE_LENGTH_M, OBSERVABLE_RETURNS, Drive, PoleDrive, Posts, Score, matches
+from studies.poles import Options
 
 
 def pole(x_m: float, y_m: float, kind: str = "pole") -> Pole:
@@ -70,11 +70,10 @@ def test_the_truth_counts_returns_on_posts() -> None:
     assert score.precision()[0] > 90.0
 
 
-def test_options_refuse_unknown_sensors(capsys: pytest.CaptureFixture[str]) -> None:
-    assert options(["--sensors", "none", "--seeds", "7"]).sensors == ()
-    with pytest.raises(SystemExit):
-        options(["--sensors", "radar"])
-    assert "unknown sensors radar" in capsys.readouterr().err
+def test_options_refuse_unknown_sensors() -> None:
+    assert of_arguments(Options, ["--sensors", "none", "--seeds", "7"]).sensors == ()
+    with pytest.raises(OptionError, match="there is no radar"):
+        of_arguments(Options, ["--sensors", "radar"])
 
 
 def kitti_scans(shared_data: Path, numbers: tuple[int, ...]) -> list[RealScan]:

@@ -1,0 +1,53 @@
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from studies.frame.errors import FolderError
+from studies.frame.kept import Kept
+from studies.localisation_study.localising import Localised
+from studies.localisation_study.series import PoseSeries
+from studies.localisation_study.study import RunResult
+from studies.localisation_study.trials import Trial
+
+
+def series(n: int) -> PoseSeries:
+    rng = np.random.default_rng(n)
+    return PoseSeries(np.arange(n, dtype=np.int64), rng.normal(size=(n, 3)), rng.integers(3, size=n).astype(np.uint8))
+
+
+def test_a_run_comes_back_as_it_was(tmp_path: Path) -> None:
+    kept = Kept(tmp_path / "runs", "vlp16-fresh", "abc")
+    assert not kept.done
+    kept.write(RunResult(Localised(series(30), series(32), 33), 1.5))
+    assert kept.done
+    again = kept.read(RunResult)
+    assert (again.found.scans, again.cpu_s) == (33, 1.5)
+    for one, other in ((again.found.final, series(30)), (again.found.online, series(32))):
+        for column in ("t_ns", "error", "health"):
+            assert np.array_equal(getattr(one, column), getattr(other, column))
+    assert not Kept(kept.home, kept.name, "abd").done
+
+
+def test_plain_values_bytes_and_tables_come_back_as_they_were(tmp_path: Path) -> None:
+    kept = Kept(tmp_path, "trials", "abc")
+    trials = [Trial(1, 0.3, True, 0, 30), Trial(2, None, False, 2, 100)]
+    kept.write(trials)
+    assert kept.read(list[Trial]) == trials
+    kept.write({"a": (b"", b"xyz"), "b": ()})
+    assert kept.read(dict[str, tuple[bytes, ...]]) == {"a": (b"", b"xyz"), "b": ()}
+
+
+def test_a_damaged_result_is_named(tmp_path: Path) -> None:
+    kept = Kept(tmp_path, "vlp16-updated", "abc")
+    kept.write(RunResult(Localised(series(30), series(32), 33), 1.5))
+    kept.path.write_bytes(kept.path.read_bytes()[:100])
+    with pytest.raises(FolderError, match=r"vlp16-updated-abc.npz.*delete it and start again"):
+        kept.read(RunResult)
+
+
+def test_a_result_of_another_kind_is_named(tmp_path: Path) -> None:
+    kept = Kept(tmp_path, "vlp16-trials", "abc")
+    kept.write(Trial(1, 0.3, True, 0, 30))
+    with pytest.raises(FolderError, match="lacks"):
+        kept.read(RunResult)
