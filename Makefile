@@ -6,7 +6,7 @@ ARGS ?=
 export OPENBLAS_NUM_THREADS ?= 1
 export NUMBA_NUM_THREADS ?= 1
 
-.PHONY: help setup fleet test quick check bench schemas clean
+.PHONY: help setup fleet test quick check docs bench schemas clean
 
 help:            ## list the targets
 	@grep -hE '^[a-z]+:.*##' $(MAKEFILE_LIST) | sed 's/:.*##/\t/'
@@ -27,13 +27,17 @@ test: setup      ## run every test
 quick: setup     ## run the tests that take less than five seconds each
 	$(BIN)/pytest -m "not slow" $(ARGS)
 
-check: setup     ## what CI runs beside the tests: style, types, layers, generated code, and that all tests can be read together
+check: setup     ## what CI runs beside the tests: style, types, layers, generated code, documents, and that all tests can be read together
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
 	$(BIN)/lint-imports
 	$(BIN)/python -m gnd.schemas.generate --check
+	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --quiet --strict
 	$(BIN)/pytest --collect-only --quiet --quiet > /dev/null
+
+docs: setup      ## build the documents as a site: build/site/index.html
+	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --quiet --strict
 
 bench: setup     ## print the benchmarks with their commands
 	$(BIN)/python -m studies $(ARGS)

@@ -58,6 +58,7 @@ MAX_REPORTS_OF_QUESTION: Final = 64
 MAX_FEATURES_OF_TILE: Final = 4_096
 MAX_POINTS_OF_FEATURE: Final = 4_096
 MAX_DETECTIONS_OF_LOOK: Final = 1_024
+MAX_SECTORS_OF_LOOK: Final = 4_096
 # What a feature report holds over all its tiles: judged and found features, points of those found.
 MAX_FEATURES_OF_REPORT: Final = 16_384
 MAX_POINTS_OF_REPORT: Final = 65_536

@@ -25,6 +25,8 @@ def detections_message_of(look: Detections) -> detections_pb2.Detections:
         height_m=look.height_m.tolist(),
         sigma_range_m=look.sigma_range_m.tolist(),
         sigma_bearing_rad=look.sigma_bearing_rad.tolist(),
+        free_m=look.free_m.tolist(),
+        free_field_rad=look.free_field_rad,
     )
 
 
@@ -44,6 +46,8 @@ def detections_of(message: detections_pb2.Detections) -> Detections:
         height_m=_floats(message.height_m),
         sigma_range_m=_floats(message.sigma_range_m),
         sigma_bearing_rad=_floats(message.sigma_bearing_rad),
+        free_m=_floats(message.free_m),
+        free_field_rad=message.free_field_rad,
     )
 
 

@@ -1,7 +1,7 @@
 """What detectors of map features and a lane camera see in one look, values of a recorded drive."""
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Final, Literal, get_args
 
 import numpy as np
@@ -43,6 +43,11 @@ class Detections:
     """(N,) standard deviation of the range, > 0."""
     sigma_bearing_rad: F32
     """(N,) standard deviation of the bearing, > 0."""
+    free_m: F32 = field(default_factory=lambda: np.empty(0, np.float32))
+    """(A,) horizontal distance up to which nothing hides a feature, > 0, in A equal sectors of `free_field_rad` from
+    right to left; inf where nothing does; none where nobody knows."""
+    free_field_rad: float = 0.0
+    """Angle that the sectors cover, its middle on the vehicle's x axis, 0 ... 2 pi."""
 
     def __post_init__(self) -> None:
         check_unsigned("look time", self.t_ns, bits=_TIME_BITS)
@@ -54,6 +59,15 @@ class Detections:
             check_text("kind", kind, KIND_PATTERN)
         with refusing(f"look at {self.t_ns} ns"):
             self._check_columns()
+            self._check_free()
+
+    def _check_free(self) -> None:
+        check_length("free ranges", len(self.free_m), limits.MAX_SECTORS_OF_LOOK, "sectors")
+        check_array("free_m", np.minimum(self.free_m, np.float32(1e9)), np.float32, (None,))
+        if len(self.free_m) and not (self.free_m.min() > 0 and 0 < self.free_field_rad <= 2 * _PI32):
+            raise BadValue(
+                f"free ranges from {self.free_m.min()} m over {self.free_field_rad} rad, expected > 0 and up to 2 pi"
+            )
 
     def _check_columns(self) -> None:
         n = len(self.kinds)

@@ -25,10 +25,6 @@ def run_agent(config: AgentConfig, stop: threading.Event) -> dict[str, Any]:
         GndError: the recording, a file or the bus cannot be used; the message says which and what to do.
     """
     keep_small()
-    if config.localise_by == "graph":  # no LiDAR: features are mapped stretch by stretch
-        from gnd.vehicle_agent.features.mapping.mapper import run_mapper
-
-        return run_mapper(config, stop)
     with open_vehicle(config, stop) as vehicle:  # link to the cloud, tiles, outbox, and the pipeline between them
         for item in vehicle.drive():  # recording -> measurements in time order
             vehicle.push(item)  # download, localise, segment, detect, report: see `Pipeline.push`

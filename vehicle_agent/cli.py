@@ -24,9 +24,9 @@ from gnd.fleet_bus.config import DEFAULT_ENDPOINT
 )
 @click.option(
     "--localise-by",
-    type=click.Choice(["lidar", "graph"]),
+    type=click.Choice(["lidar", "slamcu", "graph"]),
     default="lidar",
-    help="Scans on the voxel map; or, without LiDAR, a graph of motion, GNSS, features and lanes.",
+    help="Scans on the voxel map; or, without LiDAR, a particle filter by features, or a graph of stretches.",
 )
 @click.option("--verbose", "-v", is_flag=True, help="Log every report and retry.")
 def agent(
@@ -38,7 +38,7 @@ def agent(
     pace: float,
     mode: str,
     layers: str,
-    localise_by: Literal["lidar", "graph"],
+    localise_by: Literal["lidar", "slamcu", "graph"],
     verbose: bool,
 ) -> None:
     """Drive a recording: download tiles, localise, detect changes, upload them until acknowledged."""
@@ -74,6 +74,11 @@ def summary_line(result: dict[str, object]) -> str:
     if "stretches" in result:
         return (
             f"{result['vehicle']}: {result['distance_km']} km in {result['stretches']} stretches, "
+            f"{result['reports_acknowledged']} of {result['reports_sent']} reports acknowledged"
+        )
+    if "scans" not in result:
+        return (
+            f"{result['vehicle']}: {result['distance_km']} km by features, {result['scans_refined']} poses, "
             f"{result['reports_acknowledged']} of {result['reports_sent']} reports acknowledged"
         )
     return (

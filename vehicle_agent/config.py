@@ -2,7 +2,7 @@
 
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Literal
+from typing import Literal, get_args
 
 from gnd.fleet_bus.config import DEFAULT_ENDPOINT
 from gnd.fleet_bus.links import LinkProfile
@@ -14,6 +14,10 @@ from gnd.vehicle_agent.features.layer_parameters import FeatureParameters
 from gnd.vehicle_agent.localise.parameters import LocaliserParameters
 from gnd.vehicle_agent.segment.parameters import SegmentParameters
 from gnd.vehicle_agent.sources.world_clock import Departure
+
+LocaliseBy = Literal["lidar", "slamcu", "graph"]
+"""By scans on the voxel map; or, without LiDAR, by a particle filter of motion, GNSS and the features of one layer
+(SLAMCU), or by one graph of motion, GNSS, features and lanes for each stretch (the new-feature-layer paper)."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -142,8 +146,8 @@ class AgentConfig:
     download: DownloadParameters = field(default_factory=DownloadParameters)
     report: ReportParameters = field(default_factory=ReportParameters)
     features: FeatureParameters = field(default_factory=FeatureParameters)
-    localise_by: Literal["lidar", "graph"] = "lidar"
-    """Scans on the voxel map; or, without LiDAR, one graph of motion, GNSS, features and lanes for each stretch."""
+    localise_by: LocaliseBy = "lidar"
+    """See `LocaliseBy`."""
 
     def __post_init__(self) -> None:
         """A name and a pace that can work."""
@@ -153,9 +157,9 @@ class AgentConfig:
             raise AgentConfigError(f"layer = {self.layer!r} holds features; that of the voxel map begins with ndt")
         if not 0 <= self.pace < float("inf"):
             raise AgentConfigError(f"pace = {self.pace}: 0 is as fast as possible, 1 real time")
-        if self.localise_by not in ("lidar", "graph"):
-            raise AgentConfigError(f"localise_by = {self.localise_by!r}: there are 'lidar' and 'graph'")
-        if self.localise_by == "graph" and not self.features.layers:
+        if self.localise_by not in get_args(LocaliseBy):
+            raise AgentConfigError(f"localise_by = {self.localise_by!r}: there are {', '.join(get_args(LocaliseBy))}")
+        if self.localise_by != "lidar" and not self.features.layers:
             raise AgentConfigError("a vehicle without LiDAR maps features: name at least one feature layer")
         if self.report.left_behind_m <= self.detect.range_max_m:
             raise AgentConfigError(

@@ -9,14 +9,16 @@ No file, no bus, no thread and no clock is in it: tiles come from a `Tiles`, rep
 of the items. The agent, `gnd localise`, the studies, the tests and the API drive the same object.
 """
 
+from collections import Counter
 from collections.abc import Callable, Iterable, Iterator
-from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Generic, Protocol, TypeVar
+from dataclasses import dataclass, field, replace
+from typing import TYPE_CHECKING, Any, Generic, Protocol, TypeVar
 
 from gnd.gnd_map.arrays import F64
 from gnd.gnd_map.features import FeatureTile
 from gnd.gnd_map.geodesy import LocalFrame
 from gnd.gnd_map.grid import GridFrame
+from gnd.gnd_map.tile import Tile
 from gnd.gnd_map.tile_id import TileId
 from gnd.schemas.changes import TileChange
 from gnd.schemas.course import Course
@@ -42,6 +44,12 @@ if TYPE_CHECKING:
     from gnd.vehicle_agent.features.layers import FeatureLayers
 
 KNOWN_COURSE_RAD = 2e-3
+COUNTS = (
+    "scans_used", "scans_uncertain", "scans_disagreeing", "scans_shifted", "scans_taken_back", "points",
+    "moving_points", "rays", "changed_voxels", "tiles_doubtful", "tiles_held_back", "changes_held_back",
+    "voxels_beyond_map",
+)  # fmt: skip
+"""What the reporter counts, as `account` names it."""
 
 
 class Tiles(Protocol):
@@ -111,6 +119,46 @@ class Output:
     online: PoseEstimate | None
     health: Health
     cause: Cause
+
+
+@dataclass(frozen=True, slots=True)
+class HeldBack:
+    """What is not told because a pose may be wrong, so far.
+
+    Attributes:
+        scans: taken back or shifted.
+        tiles: held back.
+        doubtful: tiles that are told with a doubt.
+        reasons: tiles by reason of doubt.
+    """
+
+    scans: int = 0
+    tiles: int = 0
+    doubtful: int = 0
+    reasons: Counter[str] = field(default_factory=Counter)
+
+
+class Fed(Protocol):
+    """What an agent feeds: a `Pipeline`, or for a vehicle without LiDAR a `CameraPipeline` or `GraphPipeline`."""
+
+    place: Place
+    guard: Guard
+
+    def push(self, item: DriveItem) -> Output:
+        """Take the next measurement."""
+
+    def finish(self) -> Output:
+        """The drive has ended."""
+
+    @property
+    def held_back(self) -> HeldBack:
+        """What is not told because a pose may be wrong."""
+
+    def tile(self, tile_id: TileId) -> Tile | None:
+        """The tile of the voxel map that is held."""
+
+    def account(self) -> dict[str, Any]:
+        """What the drive came to, as plain values."""
 
 
 TilesT = TypeVar("TilesT", bound=Tiles)
@@ -242,6 +290,34 @@ class Pipeline(Generic[TilesT]):
         if not isinstance(self.localisation, Localiser):
             return None
         return known_course(self.localisation.calibration)
+
+    @property
+    def held_back(self) -> HeldBack:
+        """What is not told because a pose may be wrong."""
+        counts, reasons = self.reporter.counts, self.reporter.doubts
+        scans = counts["scans_shifted"] + counts["scans_taken_back"]
+        return HeldBack(scans, counts["tiles_held_back"], counts["tiles_doubtful"], reasons)
+
+    def tile(self, tile_id: TileId) -> Tile | None:
+        """The tile that is held."""
+        return self.local_map.tile(tile_id)
+
+    def account(self) -> dict[str, Any]:
+        """What the drive came to, as plain values."""
+        reporter, localiser = self.reporter, self.localiser
+        return {
+            "scans": self.scans,
+            "scans_dropped": localiser.dropped_scans,
+            **{name: reporter.counts[name] for name in COUNTS},
+            "classes": dict(reporter.classes),
+            "doubts": reporter.account(),
+            "layers": {} if self.layers is None else self.layers.account(),
+            "looks": {} if self.layers is None else dict(self.layers.counts),
+            "health": self.timeline.as_json(),
+            "nis": localiser.innovations.mean,
+            "points_travelling_along": localiser.points_travelling_along,
+            "calibration": localiser.calibration.as_json(),
+        }
 
     def _follow(self) -> None:
         self.tiles.follow(self.place)

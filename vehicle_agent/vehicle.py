@@ -3,21 +3,23 @@
 import logging
 import threading
 import time
+from collections import Counter
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 from gnd.schemas.doubt import tiles_by_reason
-from gnd.schemas.drive import DriveHeader, DriveItem, ReferencePose, Scan
+from gnd.schemas.drive import DriveHeader, DriveItem, GnssFix, ReferencePose, Scan
 from gnd.schemas.drive_mcap import read_drive, read_header
 from gnd.schemas.errors import SchemaError
 from gnd.schemas.traffic import TrafficLine, TrafficSample
 from gnd.vehicle_agent.config import AgentConfig
 from gnd.vehicle_agent.features.tiles_on_the_bus import FeatureTilesOnTheBus, open_feature_tiles
 from gnd.vehicle_agent.link import Link, open_link
+from gnd.vehicle_agent.local_map import LocalMap, Touched
 from gnd.vehicle_agent.memory import MemoryMeter
-from gnd.vehicle_agent.pipeline import Pipeline
+from gnd.vehicle_agent.pipeline import Fed, Pipeline
 from gnd.vehicle_agent.report import Identity
 from gnd.vehicle_agent.result import Evaluation
 from gnd.vehicle_agent.sources.recording import first_fix, paced
@@ -26,14 +28,25 @@ from gnd.vehicle_agent.telemetry import Telemetry
 from gnd.vehicle_agent.tiles_on_the_bus import TilesOnTheBus
 from gnd.vehicle_agent.way import WAY_FILE, Way
 
-COUNTS = (
-    "scans_used", "scans_uncertain", "scans_disagreeing", "scans_shifted", "scans_taken_back", "points",
-    "moving_points", "rays", "changed_voxels", "tiles_doubtful", "tiles_held_back", "changes_held_back",
-    "voxels_beyond_map",
-)  # fmt: skip
-"""What the reporter counts, as `result.json` names it."""
-
 _log = logging.getLogger(__name__)
+
+
+@dataclass(slots=True)
+class OnTheBus:
+    """What an open link brings a vehicle."""
+
+    config: AgentConfig
+    link: Link
+    features: FeatureTilesOnTheBus | None
+    stop: threading.Event
+    updates: Counter[str] = field(default_factory=Counter)
+    """Update notices of the voxel map, by what became of them."""
+
+    def tiles(self, local_map: LocalMap, touched: Touched) -> TilesOnTheBus:
+        """Make what fills a local map."""
+        tiles = TilesOnTheBus(self.link, local_map, touched, self.config, self.stop)
+        self.updates = tiles.updates.counts
+        return tiles
 
 
 @dataclass(slots=True)
@@ -45,10 +58,10 @@ class Vehicle:
     items: Iterator[DriveItem]
     stop: threading.Event
     link: Link
-    pipeline: Pipeline[TilesOnTheBus]
+    pipeline: Fed
     evaluation: Evaluation
     way: Way
-    features: FeatureTilesOnTheBus | None
+    bus: OnTheBus
     started_s: float = field(default_factory=time.monotonic)
     memory: MemoryMeter = field(default_factory=MemoryMeter)
     damage: SchemaError | None = None
@@ -91,7 +104,7 @@ class Vehicle:
 
     def sample(self) -> TrafficSample:
         """The ledger's totals, position and health, for the bus."""
-        place, reporter = self.pipeline.place, self.pipeline.reporter
+        place, held_back = self.pipeline.place, self.pipeline.held_back
         lat, lon = place.geodetic
         wire = self.link.bus.wire()
         lines = (TrafficLine(x.kind, x.direction, x.messages, x.app_bytes) for x in self.link.ledger.totals())
@@ -107,10 +120,10 @@ class Vehicle:
             health=place.health,
             tiles=self.link.fetcher.counts["blob"],
             reports=self.link.outbox.counts().acknowledged,
-            scans_taken_back=reporter.counts["scans_shifted"] + reporter.counts["scans_taken_back"],
-            tiles_held_back=reporter.counts["tiles_held_back"],
-            tiles_doubtful=reporter.counts["tiles_doubtful"],
-            doubts=tiles_by_reason(reporter.doubts),
+            scans_taken_back=held_back.scans,
+            tiles_held_back=held_back.tiles,
+            tiles_doubtful=held_back.doubtful,
+            doubts=tiles_by_reason(held_back.reasons),
         )
 
     def result(self) -> dict[str, Any]:
@@ -122,44 +135,20 @@ class Vehicle:
             "finished": not self.stop.is_set() and self.damage is None,
             "wall_s": round(time.monotonic() - self.started_s, 3),
             "distance_km": round(self.pipeline.place.odometer_m / 1000, 5),
-            **self._scan_counts(),
+            "scans_refined": len(self.evaluation.estimates),
+            "scans_bad": dict(self.pipeline.guard.bad),
+            **self.pipeline.account(),
             **self._link_counts(),
-            "features": self._feature_counts(),
-            "health": self.pipeline.timeline.as_json(),
             "localisation": self.evaluation.errors(),
-            "nis": self.pipeline.localiser.innovations.mean,
-            "points_travelling_along": self.pipeline.localiser.points_travelling_along,
-            "calibration": self.pipeline.localiser.calibration.as_json(),
             "memory_mb": self.memory.read(),
         }
 
-    def _scan_counts(self) -> dict[str, Any]:
-        reporter = self.pipeline.reporter
-        return {
-            "scans": self.pipeline.scans,
-            "scans_bad": dict(self.pipeline.guard.bad),
-            "scans_dropped": self.pipeline.localiser.dropped_scans,
-            "scans_refined": len(self.evaluation.estimates),
-            **{name: reporter.counts[name] for name in COUNTS},
-            "classes": dict(reporter.classes),
-            "doubts": reporter.account(),
-        }
-
-    def _feature_counts(self) -> dict[str, Any]:
-        layers = self.pipeline.layers
-        if layers is None or self.features is None:
-            return {}
-        return {"layers": layers.account(), "looks": dict(layers.counts), "tiles": dict(self.features.counts)}
-
     def _link_counts(self) -> dict[str, Any]:
-        updates, reports, fetched = (
-            self.pipeline.tiles.updates.counts,
-            self.link.outbox.counts(),
-            self.link.fetcher.counts,
-        )
+        reports, fetched, updates = self.link.outbox.counts(), self.link.fetcher.counts, self.bus.updates
         return {
             "tiles_downloaded": fetched["blob"],
             "tiles": dict(fetched),
+            "feature_tiles": {} if self.bus.features is None else dict(self.bus.features.counts),
             "updates_received": updates["received"],
             "updates": dict(updates),
             "reports_sent": reports.total,
@@ -183,21 +172,32 @@ def open_vehicle(config: AgentConfig, stop: threading.Event) -> Iterator[Vehicle
         VehicleError: it has no GNSS fix to start from, or cache or outbox cannot be opened.
     """
     header, (fix, items) = read_header(config.drive), first_fix(read_drive(config.drive), config.drive)
-    with open_link(config) as link, open_feature_tiles(config, link, stop) as features:
-        pipeline = Pipeline(
-            header,
-            fix,
-            lambda local_map, touched: TilesOnTheBus(link, local_map, touched, config, stop),
-            config.pipeline,
-            identity=Identity(config.vehicle, header.drive_id, header.sensor_model, config.layer),
-            outbox=link.outbox,
-            feature_tiles=features,
-        )
+    with open_link(config) as link, open_feature_tiles(config, link, stop) as feature_tiles:
+        bus = OnTheBus(config, link, feature_tiles, stop)
+        pipeline = _pipeline(header, fix, bus)
         evaluation = Evaluation.between(pipeline.place.frame, header.anchor)
-        with Way(config.work_dir / WAY_FILE, pipeline.local_map) as way:
-            vehicle = Vehicle(config, header, items, stop, link, pipeline, evaluation, way, features)
+        with Way(config.work_dir / WAY_FILE, pipeline.tile) as way:
+            vehicle = Vehicle(config, header, items, stop, link, pipeline, evaluation, way, bus)
             telemetry = Telemetry(link.bus, config.vehicle, vehicle.sample)
             try:
                 yield vehicle
             finally:
                 telemetry.close()
+
+
+def _pipeline(header: DriveHeader, fix: GnssFix, bus: OnTheBus) -> Fed:
+    """What the configured kind of vehicle is fed to; one without LiDAR does not load the parts of one with it."""
+    config, link, features = bus.config, bus.link, bus.features
+    identity = Identity(config.vehicle, header.drive_id, header.sensor_model, config.layer)
+    if config.localise_by == "slamcu":
+        from gnd.vehicle_agent.features.slamcu.camera_pipeline import CameraPipeline
+
+        signs = replace(identity, layer=config.features.layers[0].name)
+        return CameraPipeline(fix, config.pipeline, signs, link.outbox, features)
+    if config.localise_by == "graph":
+        from gnd.vehicle_agent.features.mapping.graph_pipeline import GraphPipeline
+
+        return GraphPipeline(fix, config.pipeline, identity, link.outbox, features)
+    return Pipeline(
+        header, fix, bus.tiles, config.pipeline, identity=identity, outbox=link.outbox, feature_tiles=features
+    )

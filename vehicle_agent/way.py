@@ -6,15 +6,15 @@ below that of its earlier life.
 
 import json
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from types import TracebackType
 from typing import Final, Self
 
+from gnd.gnd_map.tile import Tile
 from gnd.gnd_map.tile_id import TileId
 from gnd.vehicle_agent.errors import VehicleError
-from gnd.vehicle_agent.local_map import LocalMap
 from gnd.vehicle_agent.place import Place
 
 WAY_FILE: Final = "way.jsonl"
@@ -48,14 +48,14 @@ class Way:
 
     Args:
         path: file to append to.
-        local_map: what the vehicle holds.
+        held: gives the tile of an id as the vehicle holds it, None where it does not.
 
     Raises:
         VehicleError: the file cannot be written.
     """
 
-    def __init__(self, path: Path, local_map: LocalMap) -> None:
-        self._map, self._last_m = local_map, -EVERY_M
+    def __init__(self, path: Path, held: Callable[[TileId], Tile | None]) -> None:
+        self._held, self._last_m = held, -EVERY_M
         try:
             path.parent.mkdir(parents=True, exist_ok=True)
             self._file = path.open("a", encoding="utf-8", buffering=1)
@@ -75,7 +75,7 @@ class Way:
         self._last_m = place.odometer_m
         lat_rad, lon_rad = place.geodetic
         tile_id = TileId.from_geodetic(lat_rad, lon_rad)
-        tile = self._map.tile(tile_id)
+        tile = self._held(tile_id)
         version = None if tile is None else tile.version
         one = Milestone(place.t_ns, time.time_ns(), place.odometer_m, lat_rad, lon_rad, tile_id.morton, version)
         print(json.dumps(asdict(one), separators=(",", ":")), file=self._file)

@@ -2,6 +2,7 @@
 
 import heapq
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 from typing import Final
 
@@ -37,13 +38,21 @@ def write_road_drive(drive: RoadDrive, vehicle: str, path: Path) -> Path:
 
 def items_of(drive: RoadDrive) -> Iterator[DriveItem]:
     """Yield what is recorded, in time order: motion, GNSS, looks, lanes, and the true poses as reference."""
-    parts = (_motion(drive), _gnss(drive), iter(drive.looks), iter(drive.lane_looks), _reference(drive))
+    parts = (_motion(drive), _gnss(drive), _looks(drive), iter(drive.lane_looks), _reference(drive))
     return heapq.merge(*parts, key=lambda item: item.t_ns)
 
 
 def _motion(drive: RoadDrive) -> Iterator[DriveItem]:
     columns = (drive.motion.t_ns, drive.motion.speed_mps, drive.motion.yaw_rate_radps)
     return (MotionSample(*row) for row in zip(*(column.tolist() for column in columns), strict=True))
+
+
+def _looks(drive: RoadDrive) -> Iterator[DriveItem]:
+    """The looks, with what was in the way of each."""
+    field_rad = float(np.float32(drive.view.width_rad))
+    for look, free_m in zip(drive.looks, drive.occluder_m, strict=True):
+        hidden = np.isfinite(free_m).any()
+        yield replace(look, free_m=free_m, free_field_rad=field_rad) if hidden else look
 
 
 def _gnss(drive: RoadDrive) -> Iterator[DriveItem]:

@@ -25,7 +25,7 @@ _sym_db = _symbol_database.Default()
 from google.protobuf import timestamp_pb2 as google_dot_protobuf_dot_timestamp__pb2
 
 
-DESCRIPTOR = _descriptor_pool.Default().AddSerializedFile(b'\n\x17gnd/v1/detections.proto\x12\x06gnd.v1\x1a\x1fgoogle/protobuf/timestamp.proto\"\xd3\x01\n\nDetections\x12-\n\ttimestamp\x18\x01 \x01(\x0b\x32\x1a.google.protobuf.Timestamp\x12\x0e\n\x06sensor\x18\x02 \x01(\t\x12\r\n\x05layer\x18\x03 \x01(\t\x12\r\n\x05kinds\x18\x04 \x03(\t\x12\x0f\n\x07range_m\x18\x05 \x03(\x02\x12\x13\n\x0b\x62\x65\x61ring_rad\x18\x06 \x03(\x02\x12\x10\n\x08height_m\x18\x07 \x03(\x02\x12\x15\n\rsigma_range_m\x18\x08 \x03(\x02\x12\x19\n\x11sigma_bearing_rad\x18\t \x03(\x02\x62\x06proto3')
+DESCRIPTOR = _descriptor_pool.Default().AddSerializedFile(b'\n\x17gnd/v1/detections.proto\x12\x06gnd.v1\x1a\x1fgoogle/protobuf/timestamp.proto\"\xfb\x01\n\nDetections\x12-\n\ttimestamp\x18\x01 \x01(\x0b\x32\x1a.google.protobuf.Timestamp\x12\x0e\n\x06sensor\x18\x02 \x01(\t\x12\r\n\x05layer\x18\x03 \x01(\t\x12\r\n\x05kinds\x18\x04 \x03(\t\x12\x0f\n\x07range_m\x18\x05 \x03(\x02\x12\x13\n\x0b\x62\x65\x61ring_rad\x18\x06 \x03(\x02\x12\x10\n\x08height_m\x18\x07 \x03(\x02\x12\x15\n\rsigma_range_m\x18\x08 \x03(\x02\x12\x19\n\x11sigma_bearing_rad\x18\t \x03(\x02\x12\x0e\n\x06\x66ree_m\x18\n \x03(\x02\x12\x16\n\x0e\x66ree_field_rad\x18\x0b \x01(\x02\x62\x06proto3')
 
 _globals = globals()
 _builder.BuildMessageAndEnumDescriptors(DESCRIPTOR, _globals)
@@ -33,5 +33,5 @@ _builder.BuildTopDescriptorsAndMessages(DESCRIPTOR, 'gnd.schemas.generated.detec
 if not _descriptor._USE_C_DESCRIPTORS:
   DESCRIPTOR._loaded_options = None
   _globals['_DETECTIONS']._serialized_start=69
-  _globals['_DETECTIONS']._serialized_end=280
+  _globals['_DETECTIONS']._serialized_end=320
 # @@protoc_insertion_point(module_scope)

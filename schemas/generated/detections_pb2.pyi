@@ -36,10 +36,14 @@ class Detections(_message.Message):
     HEIGHT_M_FIELD_NUMBER: _builtins.int
     SIGMA_RANGE_M_FIELD_NUMBER: _builtins.int
     SIGMA_BEARING_RAD_FIELD_NUMBER: _builtins.int
+    FREE_M_FIELD_NUMBER: _builtins.int
+    FREE_FIELD_RAD_FIELD_NUMBER: _builtins.int
     sensor: _builtins.str
     """What looked: "camera" or "lidar"."""
     layer: _builtins.str
     """Feature layer that the detector looks for. [1-32 of a-z 0-9 _]"""
+    free_field_rad: _builtins.float
+    """Angle that the sectors cover, its middle on the vehicle's x axis. [rad, 0 ... 2 pi]"""
     @_builtins.property
     def timestamp(self) -> _timestamp_pb2.Timestamp:
         """Time of the look, UTC."""
@@ -68,6 +72,12 @@ class Detections(_message.Message):
     def sigma_bearing_rad(self) -> _containers.RepeatedScalarFieldContainer[_builtins.float]:
         """[rad]"""
 
+    @_builtins.property
+    def free_m(self) -> _containers.RepeatedScalarFieldContainer[_builtins.float]:
+        """Horizontal distance up to which nothing hides a feature, in equal sectors of free_field_rad from right to left; inf
+        where nothing does; empty where nobody knows. [m, > 0]
+        """
+
     def __init__(
         self,
         *,
@@ -80,10 +90,12 @@ class Detections(_message.Message):
         height_m: _abc.Iterable[_builtins.float] | None = ...,
         sigma_range_m: _abc.Iterable[_builtins.float] | None = ...,
         sigma_bearing_rad: _abc.Iterable[_builtins.float] | None = ...,
+        free_m: _abc.Iterable[_builtins.float] | None = ...,
+        free_field_rad: _builtins.float = ...,
     ) -> None: ...
     _HasFieldArgType: _TypeAlias = _typing.Literal["timestamp", b"timestamp"]  # noqa: Y015
     def HasField(self, field_name: _HasFieldArgType) -> _builtins.bool: ...
-    _ClearFieldArgType: _TypeAlias = _typing.Literal["bearing_rad", b"bearing_rad", "height_m", b"height_m", "kinds", b"kinds", "layer", b"layer", "range_m", b"range_m", "sensor", b"sensor", "sigma_bearing_rad", b"sigma_bearing_rad", "sigma_range_m", b"sigma_range_m", "timestamp", b"timestamp"]  # noqa: Y015
+    _ClearFieldArgType: _TypeAlias = _typing.Literal["bearing_rad", b"bearing_rad", "free_field_rad", b"free_field_rad", "free_m", b"free_m", "height_m", b"height_m", "kinds", b"kinds", "layer", b"layer", "range_m", b"range_m", "sensor", b"sensor", "sigma_bearing_rad", b"sigma_bearing_rad", "sigma_range_m", b"sigma_range_m", "timestamp", b"timestamp"]  # noqa: Y015
     def ClearField(self, field_name: _ClearFieldArgType) -> None: ...
     def WhichOneof(self, oneof_group: _Never) -> None: ...
 

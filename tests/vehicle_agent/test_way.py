@@ -22,7 +22,7 @@ def place_at(east_m: float) -> Place:
 
 
 def drive(path: Path, local_map: LocalMap, *east_m: float) -> None:
-    with Way(path, local_map) as way:
+    with Way(path, local_map.tile) as way:
         for x_m in east_m:
             way.note(place_at(x_m))
 

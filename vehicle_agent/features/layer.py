@@ -1,6 +1,6 @@
 """One feature layer on a vehicle that knows its pose: SLAMCU with given poses, where it looked, what it reports."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from math import atan2
 from typing import Final
@@ -17,7 +17,8 @@ from gnd.vehicle_agent.features.feature_map import features_in_map, place_in_til
 from gnd.vehicle_agent.features.layer_parameters import LayerParameters
 from gnd.vehicle_agent.features.look import Look, MapFeatures
 from gnd.vehicle_agent.features.slamcu.slamcu import Slamcu
-from gnd.vehicle_agent.features.slamcu.verdicts import KnownState
+from gnd.vehicle_agent.features.slamcu.verdicts import KnownState, NewFeature
+from gnd.vehicle_agent.features.slamcu.watched import WatchedSlamcu
 from gnd.vehicle_agent.features.view import Occlusion
 from gnd.vehicle_agent.surroundings import left_behind
 
@@ -55,9 +56,15 @@ class FeatureLayer:
         frame: the map frame.
     """
 
-    def __init__(self, parameters: LayerParameters, coverage: CoverageParameters, frame: LocalFrame) -> None:
+    def __init__(
+        self,
+        parameters: LayerParameters,
+        coverage: CoverageParameters,
+        frame: LocalFrame,
+        slamcu: Slamcu | WatchedSlamcu | None = None,
+    ) -> None:
         self.parameters, self._frame = parameters, frame
-        self._slamcu = Slamcu(parameters.slamcu, MapFeatures.none(), np.zeros(3), np.eye(3) * 1e-4)
+        self._slamcu = slamcu or Slamcu(parameters.slamcu, MapFeatures.none(), np.zeros(3), np.eye(3) * 1e-4)
         self._coverage = Coverage(frame, parameters.view, parameters.height_m, coverage)
         self._held: dict[TileId, FeatureTile] = {}
         self._ids: dict[TileId, tuple[int, ...]] = {}
@@ -86,19 +93,34 @@ class FeatureLayer:
 
     def see(self, placed: PlacedLook, occlusion: Occlusion | None) -> None:
         """Take one look from a known pose."""
+        assert isinstance(self._slamcu, Slamcu), "this layer's own filter finds the poses"
         self._slamcu.set_pose(placed.pose, placed.cov, placed.z_m)
         self._slamcu.look(self._own(placed), self.parameters.view, occlusion)
-        x_m, y_m, heading_rad = placed.pose.tolist()
-        self._coverage.look(x_m, y_m, heading_rad, occlusion)
+        self.cover(placed.pose, occlusion)
         self._z_m = placed.z_m
 
+    def look(self, look: Look, occlusion: Occlusion | None) -> None:
+        """Take one look whose pose the filter finds; where it has looked is told later, by `cover`."""
+        rows = np.array([i for i, kind in enumerate(look.kinds) if kind in self.parameters.kinds], np.int64)
+        self._slamcu.look(taken(look, rows, [look.kinds[i] for i in rows]), self.parameters.view, occlusion)
+
+    def cover(self, pose: F64, occlusion: Occlusion | None) -> None:
+        """The vehicle has looked from a pose (3,): x, y [m], heading [rad] in the map frame."""
+        x_m, y_m, heading_rad = pose.tolist()
+        self._coverage.look(x_m, y_m, heading_rad, occlusion)
+
     def leave(self, p_map_m: F64, distance_m: float) -> list[FeatureChange]:
-        """What is to be said of the tiles farther away than `distance_m`; they are forgotten."""
-        return [self._decide(tile_id) for tile_id in left_behind(self._frame, self.tiles, p_map_m, distance_m)]
+        """What is to be said of the tiles farther away than `distance_m` from points (3,) or (N, 3); they are
+        forgotten.
+        """
+        left = self.tiles
+        for point in np.atleast_2d(p_map_m):
+            left = list(left_behind(self._frame, left, point, distance_m))
+        return self._decided(left)
 
     def leave_all(self) -> list[FeatureChange]:
         """The drive has ended: what is to be said of every tile."""
-        return [self._decide(tile_id) for tile_id in self.tiles]
+        return self._decided(self.tiles)
 
     # What a look means for this layer
 
@@ -133,9 +155,14 @@ class FeatureLayer:
 
     # What is said of a tile
 
-    def _decide(self, tile_id: TileId) -> FeatureChange:
+    def _decided(self, tiles: Sequence[TileId]) -> list[FeatureChange]:
+        if not tiles:
+            return []
+        states, new = {one.feature_id: one for one in self._slamcu.known_states()}, self._slamcu.new_features()
+        return [self._decide(tile_id, states, new) for tile_id in tiles]
+
+    def _decide(self, tile_id: TileId, states: Mapping[int, KnownState], new: Sequence[NewFeature]) -> FeatureChange:
         base = self._held.get(tile_id)
-        states = {state.feature_id: state for state in self._slamcu.known_states()}
         judged = [states[one] for one in sorted(self._ids.get(tile_id, ())) if one in states]
         change = FeatureChange(
             tile=tile_id,
@@ -143,7 +170,7 @@ class FeatureLayer:
             base_sha=base.sha if base else b"",
             viewed=self._coverage.viewed(tile_id),
             seen=tuple(self._seen(tile_id, state) for state in judged if state.hits + state.misses),
-            found=tuple(self._found(tile_id)),
+            found=tuple(self._found(tile_id, new)),
         )
         self._coverage.forget(tile_id)
         self._let_go(tile_id)
@@ -160,10 +187,9 @@ class FeatureLayer:
         _, point, cov = self._placed(state.position_m, state.cov_m2, state.height_m, tile_id)
         return Seen(state.feature_id, existence, state.hits, point[0], cov)
 
-    def _found(self, tile_id: TileId) -> list[Found]:
+    def _found(self, tile_id: TileId, new: Sequence[NewFeature]) -> list[Found]:
         """The new features of a tile that exist, stand alone and were not reported yet."""
         found: list[Found] = []
-        new = self._slamcu.new_features()
         places = np.array([one.position_m for one in new]).reshape(-1, 2)
         for one in new:
             tile, point, cov = self._placed(one.position_m, one.cov_m2, one.height_m)

@@ -60,10 +60,12 @@ class LayerParameters:
         )
 
 
+SIGNS: Final = ("traffic_sign", "speed_limit", "no_overtaking", "warning", "direction", "exit", "information")
+"""A sign, and what a detector may know of its type; types are never taken for each other."""
 LAYERS: Final = {
     layer.name: layer
     for layer in (
-        LayerParameters("signs", "camera", ("traffic_sign",), field_deg=40.0, range_m=80.0, rate_hz=15.0),
+        LayerParameters("signs", "camera", SIGNS, field_deg=40.0, range_m=80.0, rate_hz=15.0),
         LayerParameters("streetlights", "lidar", ("streetlight",), height_m=4.0, detection_confidence=0.6, alone_m=3.0),
         LayerParameters("poles", "lidar", ("pole", "trunk"), detection_confidence=0.6),
     )

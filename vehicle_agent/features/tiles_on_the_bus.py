@@ -10,6 +10,7 @@ from gnd.gnd_map.features import FeatureTile
 from gnd.gnd_map.tile_id import TileId
 from gnd.vehicle_agent.config import AgentConfig
 from gnd.vehicle_agent.features.download import FeatureDownloader
+from gnd.vehicle_agent.features.mapping.held_map import LANES
 from gnd.vehicle_agent.link import Link
 from gnd.vehicle_agent.place import Place
 from gnd.vehicle_agent.surroundings import tiles_along
@@ -57,7 +58,8 @@ class FeatureTilesOnTheBus:
 
 @contextmanager
 def open_feature_tiles(config: AgentConfig, link: Link, stop: threading.Event) -> Iterator[FeatureTilesOnTheBus | None]:
-    """The tiles of the configured feature layers, over an open link; None where there are none.
+    """The tiles of the configured feature layers, over an open link, and lanes where a graph is tied to them; None
+    where there are none.
 
     Raises:
         CacheError: the cache cannot be opened.
@@ -66,6 +68,8 @@ def open_feature_tiles(config: AgentConfig, link: Link, stop: threading.Event) -
     if not names:
         yield None
         return
+    if config.localise_by == "graph":
+        names = list(dict.fromkeys((*names, LANES)))
     downloader = FeatureDownloader(link.bus, config.work_dir / "features.sqlite", names, config.download)
     try:
         yield FeatureTilesOnTheBus(downloader, config, stop)

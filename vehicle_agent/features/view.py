@@ -14,6 +14,7 @@ import numpy as np
 import numpy.typing as npt
 
 from gnd.gnd_map.arrays import F64, points_3d
+from gnd.schemas.drive import Detections
 from gnd.vehicle_agent.features.errors import BadLook
 
 _TURN: Final = 2.0 * pi
@@ -105,6 +106,13 @@ class Occlusion:
     def of_ranges(cls, free_m: npt.ArrayLike, first_rad: float, width_rad: float) -> "Occlusion":
         """One band: free ranges (A,) [m] by azimuth, whatever the height."""
         return cls(np.asarray(free_m, np.float64).reshape(-1, 1), first_rad, width_rad, np.zeros(0))
+
+    @classmethod
+    def of_look(cls, look: Detections) -> "Occlusion | None":
+        """What a detector says of what is in its way; None where it does not say."""
+        if not len(look.free_m):
+            return None
+        return cls.of_ranges(look.free_m, -0.5 * look.free_field_rad, look.free_field_rad / len(look.free_m))
 
     @classmethod
     def of_scan(

@@ -167,7 +167,8 @@ def detections_of(poles: Sequence[Pole], T_map_vehicle: F64, t_ns: int) -> Detec
     bearing = np.arctan2(local[:, 1], local[:, 0])
     columns = (distance, bearing, local[:, 2], along, across / np.maximum(distance, 1e-6))
     kinds = tuple(poles[k].kind for k in order)
-    return Detections(t_ns, "lidar", LAYER, kinds, *(column[order].astype(np.float32) for column in columns))
+    ordered = [column[order].astype(np.float32) for column in columns]
+    return Detections(t_ns, "lidar", LAYER, kinds, ordered[0], ordered[1], ordered[2], ordered[3], ordered[4])
 
 
 def _judged(

@@ -7,7 +7,7 @@ the map that the fixes do not speak against is kept. When none will do, the vehi
 state that was good is undone, and the place is looked for anew where the vehicle is now.
 """
 
-from collections.abc import Iterator
+from collections.abc import Collection, Iterator
 from copy import deepcopy
 from dataclasses import dataclass, replace
 from math import radians
@@ -266,6 +266,34 @@ class WatchedSlamcu:
         self._take(_Looked(look, view, occlusion))
         self._ask()
 
+    def hold(self, known: MapFeatures) -> None:
+        """As of `Slamcu`, and for every state from which the way may be told anew."""
+        for slamcu in self._all:
+            slamcu.hold(known)
+
+    def forget(self, feature_ids: Collection[int]) -> None:
+        """As of `Slamcu`, and for every state from which the way may be told anew."""
+        for slamcu in self._all:
+            slamcu.forget(feature_ids)
+
+    @property
+    def _all(self) -> Iterator[Slamcu]:
+        yield self._slamcu
+        yield from (one.account.slamcu for one in self._kept)
+        since = self._lost_since
+        if since is not None and all(since is not one for one in self._kept):
+            yield since.account.slamcu
+
+    @property
+    def settled_m(self) -> float:
+        """Way up to which nothing will be told anew: that of the oldest state kept."""
+        return self._kept[0].odometer_m
+
+    @property
+    def odometer_m(self) -> float:
+        """Way driven."""
+        return self._slamcu.odometer_m
+
     def finish(self) -> None:
         """The drive has ended: look into what is in doubt before anything is said."""
         alarm = self._now.watch.alarm(AT_THE_END)
@@ -276,10 +304,24 @@ class WatchedSlamcu:
             self._stay_lost(self._lost_since)
         self._slamcu.decide()
         if self.path:
-            columns = _columns(self.path)
-            covs = claimed(*columns, self._hindsight.smoothed())
-            self._extra = (covs - columns[2])[:, :2, :2]
+            covs = self._claim(0, 0.0)
             self.path = [replace(one, cov=cov) for one, cov in zip(self.path, covs, strict=True)]
+
+    def claim(self) -> None:
+        """Let what is said of features be as uncertain as hindsight has the places that they were seen from: those on
+        the way that may still be told anew.
+        """
+        oldest = self._kept[0]
+        if len(self.path) > oldest.poses:
+            self._claim(oldest.poses, max(oldest.t_s - LOOK_BACK_S, 0.0))
+
+    def _claim(self, first: int, since_s: float) -> F64:
+        """(S, 3, 3) covariances of the path from one pose on, as hindsight has them by the fixes since a time."""
+        columns = _columns(self.path[first:])
+        covs = claimed(*columns, self._hindsight.smoothed(since_s))
+        self._extra = np.zeros((len(self.path), 2, 2))
+        self._extra[first:] = (covs - columns[2])[:, :2, :2]
+        return covs
 
     def pose(self) -> tuple[F64, F64]:
         """Pose (3,) x, y [m], heading [rad], and covariance (3, 3)."""
