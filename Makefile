@@ -15,7 +15,7 @@ setup: $(VENV)/.ready  ## make .venv with the pinned versions
 
 $(VENV)/.ready: pyproject.toml constraints.txt
 	$(PYTHON) -m venv $(VENV)
-	$(BIN)/pip install --quiet --disable-pip-version-check -c constraints.txt -e '.[dev]'
+	$(BIN)/pip install --quiet --disable-pip-version-check -c constraints.txt -e '.[all,dev]'
 	@touch $@
 
 fleet: setup     ## run the fleet: make fleet ARGS="--agents 4 --link 3g"

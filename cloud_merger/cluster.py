@@ -1,8 +1,8 @@
 """DBSCAN of all voxels of a tile at once (GND 5.1 clusters the uploads of one voxel; here all voxels are one graph).
 
 Points of different voxels have no pair, so the distance matrix is block-diagonal: a missing pair means "far".
-`dbscan` is exact and costs one pass over the pairs; `dbscan_sklearn` is the same clustering by the library,
-kept as its oracle (importing scikit-learn costs 1.2 s and 150 MB).
+`dbscan` is exact and costs one pass over the pairs; `dbscan_sklearn` is the same clustering by the library: that of
+"paper" mode, and the oracle of the other. The library is loaded where it is first called.
 """
 
 import numpy as np
@@ -66,7 +66,7 @@ def dbscan_sklearn(
     weight: Index, i: Index, j: Index, distance: NDArray[np.float64], *, eps: float, min_samples: int
 ) -> NDArray[np.int64]:
     """The same labels by scikit-learn: one sparse distance matrix, explicit zeros kept. Arguments as `dbscan`."""
-    from sklearn.cluster import DBSCAN  # here because the import is dear and only a comparison needs it
+    from sklearn.cluster import DBSCAN  # here because the import is dear and only "paper" mode needs it
 
     n = len(weight)
     if n == 0:

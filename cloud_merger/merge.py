@@ -11,7 +11,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from gnd.cloud_merger.cluster import Index, dbscan
+from gnd.cloud_merger.cluster import Index, dbscan, dbscan_sklearn
 from gnd.cloud_merger.merge_kernels import clusters_of
 from gnd.cloud_merger.parameters import MERGE_NOISE_M, MergeParameters
 from gnd.cloud_merger.statements import EPOCH, Kind, Rows, Statements, find, states_at
@@ -110,7 +110,8 @@ def _clusters_shown(rows: Rows, parameters: MergeParameters) -> Index:
     i, j = pairs_within(nodes["voxel_id"])
     there = (nodes["kind"][i] != Kind.NOTHING) & (nodes["kind"][j] != Kind.NOTHING)  # Eq. 14: else similarity 0
     i, j = i[there], j[there]
-    label = dbscan(
+    clustered = dbscan_sklearn if parameters.mode == "paper" else dbscan  # the paper names DBSCAN (GND 5.1)
+    label = clustered(
         np.bincount(node, minlength=len(first)).astype(np.int64),
         i,
         j,

@@ -8,6 +8,7 @@ from typing import Any, Final
 
 import click
 
+from gnd.extras import explained
 from gnd.gnd_map.errors import GndError
 
 COMMANDS: Final[dict[str, tuple[str, str]]] = {
@@ -56,7 +57,8 @@ class LazyGroup(click.Group):
         if cmd_name not in self._table:
             return None
         module, attribute = self._table[cmd_name][0].split(":")
-        command: click.Command = getattr(importlib.import_module(module), attribute)
+        with explained():
+            command: click.Command = getattr(importlib.import_module(module), attribute)
         return command
 
     def format_commands(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:  # noqa: ARG002  (click's)
@@ -78,7 +80,8 @@ def gnd() -> None:
 def main() -> None:
     """Run the command line; every error of ours becomes one line on standard error and exit code 2."""
     try:
-        gnd.main(standalone_mode=False)
+        with explained():
+            gnd.main(standalone_mode=False)
     except click.ClickException as error:
         error.show()
         sys.exit(error.exit_code)

@@ -8,8 +8,7 @@ GndError
     │   └── LabRuns        a lab of that name is running
     ├── PageError          a page cannot be written
     ├── ChaosError         a chaos run cannot start, or its street cannot be read
-    ├── NoStudies          the papers' results can be reproduced in a checkout only
-    └── RegionError        a region that is no wildcard, tile or circle
+    └── NoStudies          the papers' results can be reproduced in a checkout only
 """
 
 from gnd.gnd_map.errors import GndError
@@ -33,10 +32,6 @@ class LabError(DeployError):
 
 class LabRuns(LabError):
     """A lab of that name is running."""
-
-
-class RegionError(DeployError):
-    """A region that is neither a wildcard, nor a tile, nor a circle."""
 
 
 class PageError(DeployError):

@@ -4,11 +4,11 @@ import threading
 from pathlib import Path
 
 from gnd.cloud_merger.merger import ShardConfig, run_shard
-from gnd.deploy.region import Region
 from gnd.deploy.watch import record_updates
 from gnd.fleet_bus.bus import open_bus
 from gnd.fleet_bus.config import BusConfig
 from gnd.fleet_bus.router import run_router, wait_for_stop
+from gnd.gnd_map.region import Region
 from gnd.tile_store.server import TileServer
 from gnd.tile_store.sqlite_store import SqliteStore
 from gnd.vehicle_agent.agent import AgentConfig, run_agent

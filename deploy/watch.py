@@ -14,10 +14,10 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Final
 
-from gnd.deploy.region import Region
 from gnd.fleet_bus.bus import Bus
 from gnd.fleet_bus.errors import BusError
 from gnd.gnd_map.features import is_feature_layer
+from gnd.gnd_map.region import Region
 from gnd.gnd_map.tile_id import TileId
 from gnd.schemas.errors import SchemaError
 from gnd.schemas.keys import catalog_keys, update_keys

@@ -5,10 +5,10 @@ import threading
 
 import click
 
-from gnd.deploy.region import parse_region
 from gnd.deploy.watch import TileWatch
 from gnd.fleet_bus.bus import open_bus
 from gnd.fleet_bus.config import BusConfig
+from gnd.gnd_map.region import parse_region
 
 
 @click.command()

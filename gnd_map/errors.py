@@ -3,6 +3,7 @@
 GndError
 ├── ConfigError      a configuration value or key that cannot be used
 └── MapError
+    ├── RegionError  a region that is no wildcard, tile or circle
     ├── TileError    a tile id, path, district or voxel id that does not exist
     ├── GeodesyError a position that is no position (not finite, latitude beyond a pole, near the Earth's centre)
     ├── ShapeError   an array of the wrong shape, type or order, or with values that are not finite
@@ -28,6 +29,10 @@ class MapError(GndError):
 
 class TileError(MapError):
     """A tile id, tile path, district or voxel id that does not exist."""
+
+
+class RegionError(MapError):
+    """A region that is neither a wildcard, nor a tile, nor a circle."""
 
 
 class GeodesyError(MapError):

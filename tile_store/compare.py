@@ -1,7 +1,7 @@
 """What a map holds, and how two maps, two times or two versions differ: values that print as tables and as JSON."""
 
 from collections import Counter
-from collections.abc import Iterable, Iterator
+from collections.abc import Collection, Iterable, Iterator
 from dataclasses import asdict, dataclass, fields
 from typing import Any
 
@@ -225,6 +225,7 @@ def map_diff(
     prefix: str = "",
     old_at_ns: int | None = None,
     new_at_ns: int | None = None,
+    only: Collection[TileId] | None = None,
 ) -> MapDiff:
     """How a region differs between two stores, or between two times of one store.
 
@@ -235,8 +236,9 @@ def map_diff(
         prefix: leading chunks of a tile's path; "" = all.
         old_at_ns: the old state's time, UTC; None = its newest versions.
         new_at_ns: the new state's time, UTC; None = its newest versions.
+        only: of the tiles below the prefix these alone; None = all.
     """
-    before, after = _newest(old, layer, prefix, old_at_ns), _newest(new, layer, prefix, new_at_ns)
+    before, after = _newest(old, layer, prefix, old_at_ns, only), _newest(new, layer, prefix, new_at_ns, only)
     both = sorted(before.keys() | after.keys())
     diffs = [tile_diff(tile, before.get(tile), after.get(tile), layer) for tile in both]
     return _map_diff(layer, prefix, diffs)
@@ -295,7 +297,10 @@ def _map_diff(layer: str, prefix: str, diffs: list[TileDiff]) -> MapDiff:
     )
 
 
-def _newest(store: Store, layer: str, prefix: str, at_ns: int | None) -> dict[TileId, StoredTile]:
+def _newest(
+    store: Store, layer: str, prefix: str, at_ns: int | None, only: Collection[TileId] | None = None
+) -> dict[TileId, StoredTile]:
     """The tiles of a region as they are, or as they were at a time."""
-    stored = (store.get(layer, entry.tile, at_ns=at_ns) for entry in store.heads(layer, prefix))
+    tiles = [entry.tile for entry in store.heads(layer, prefix) if only is None or entry.tile in only]
+    stored = (store.get(layer, tile, at_ns=at_ns) for tile in tiles)
     return {one.tile: one for one in stored if one is not None}

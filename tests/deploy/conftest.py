@@ -1,6 +1,7 @@
 """A small world for whole fleet runs: a stretch of the simulated street, mapped, then driven after it changed."""
 
 import signal
+import subprocess
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -49,4 +50,9 @@ def start_run(tmp_path: Path, small_world: SmallWorld) -> Iterator[Callable[...,
     for run in runs:
         if run.process.poll() is None:
             run.process.send_signal(signal.SIGTERM)
-            run.process.communicate(timeout=30)
+            try:
+                run.process.communicate(timeout=30)
+            except subprocess.TimeoutExpired:  # the processes of a killed launcher end by themselves
+                run.process.kill()
+                run.process.communicate()
+                raise

@@ -49,7 +49,18 @@ def started(*arguments: str) -> Iterator[subprocess.Popen[str]]:
     finally:
         if process.poll() is None:
             process.send_signal(signal.SIGINT)
+        end_surely(process)
+
+
+def end_surely(process: subprocess.Popen[str]) -> None:
+    """Wait for its end; one that does not obey is killed and its lab removed, so that the next test finds none."""
+    try:
         process.communicate(timeout=DEADLINE_S)
+    except subprocess.TimeoutExpired:
+        process.kill()
+        process.communicate()
+        gnd_lab("clean").communicate(timeout=DEADLINE_S)
+        raise
 
 
 def finished(process: subprocess.Popen[str]) -> tuple[int, str, str]:

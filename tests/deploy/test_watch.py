@@ -8,12 +8,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from gnd.deploy.region import parse_region
 from gnd.deploy.watch import TileWatch, WatchEvent
 from gnd.fleet_bus.bus import Bus, open_bus
 from gnd.fleet_bus.config import BusConfig
 from gnd.fleet_bus.router import open_router
 from gnd.gnd_map.gaussian import Gaussians
+from gnd.gnd_map.region import parse_region
 from gnd.gnd_map.tile import Tile, diff
 from gnd.gnd_map.tile_id import TileId
 from gnd.schemas.keys import update_key

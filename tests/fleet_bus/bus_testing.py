@@ -138,7 +138,7 @@ class RouterProcess:
         self._running: Script | None = None
 
     def start(self) -> Script:
-        running = Script("from fleet_bus.cli import router; router()", "--listen", self.endpoint)
+        running = Script("from gnd.fleet_bus.cli import router; router()", "--listen", self.endpoint)
         self._running = running
         running.wait_line("router listens")
         return running

@@ -251,7 +251,10 @@ def start_process(path: Path, endpoint: str, first_line: str = "tile server: ") 
 
 def end(process: subprocess.Popen[str], with_signal: int) -> str:
     process.send_signal(with_signal)
-    output, _ = process.communicate(timeout=20)
+    try:
+        output, _ = process.communicate(timeout=20)
+    finally:
+        process.kill()  # one that does not obey shall not keep the port and the store of the next test
     return output
 
 

@@ -334,7 +334,7 @@ def test_tiles_set_aside_are_shown_and_taken_up_again(path: Path) -> None:
 
 AS_NOBODY = (
     "import os, sys\n"
-    "import gnd.deploy.map_cli, gnd.gnd_map.content\n"
+    "import gnd.deploy.map_cli, gnd.gnd_map.content, numba\n"
     "if os.getuid() == 0: os.setgroups([]); os.setgid(65534); os.setuid(65534)\n"
     "from gnd.deploy.cli import main\n"
     "sys.argv = ['gnd', *sys.argv[1:]]\n"

@@ -6,15 +6,13 @@ Whatever is measured in metres (distances to a Gaussian, to a plane, to the hit)
 """
 
 import math
-from collections.abc import Callable
-from typing import Any, Final, NamedTuple, TypeVar, cast
+from typing import Final, NamedTuple
 
-import numba
 import numpy as np
 from numpy.typing import NDArray
 
 from gnd.gnd_map.arrays import F32, F64, I32
-from gnd.gnd_map.jit import kernel
+from gnd.gnd_map.jit import kernel, pasted
 from gnd.vehicle_agent.detect.chi_square import quantile
 from gnd.vehicle_agent.detect.parameters import INCLUDED_M, DetectParameters
 from gnd.vehicle_agent.detect.records import N_BI, N_BO, N_PI, N_PO
@@ -36,13 +34,6 @@ _FACE_SIGMA: Final = 3.0
 CERTAIN = PoseUncertainty()
 RULES = {"ml": 0, "ahead": 1, "plane": 2}
 UNKNOWN = -(2**31)
-
-T = TypeVar("T", bound=Callable[..., Any])
-
-
-def inlined(function: T) -> T:
-    """Compile a part of a kernel into its caller."""
-    return cast("T", numba.njit(inline="always", error_model="numpy")(function))
 
 
 class KernelParameters(NamedTuple):
@@ -91,7 +82,7 @@ def kernel_parameters(p: DetectParameters, pose: PoseUncertainty = CERTAIN) -> K
     )
 
 
-@inlined
+@pasted
 def _whitened(W: F32, row: int, x: float, y: float, z: float) -> tuple[float, float, float]:
     """W d for the lower triangle in `W[row, :6]`."""
     return (
@@ -101,7 +92,7 @@ def _whitened(W: F32, row: int, x: float, y: float, z: float) -> tuple[float, fl
     )
 
 
-@inlined
+@pasted
 def _r2_on_ray(
     records: F32, row: int, dx: float, dy: float, dz: float, vx: float, vy: float, vz: float, t: float
 ) -> float:
@@ -110,7 +101,7 @@ def _r2_on_ray(
     return x * x + y * y + z * z
 
 
-@inlined
+@pasted
 def _ml_parameter(
     records: F32,
     row: int,
@@ -130,7 +121,7 @@ def _ml_parameter(
     return min(max(t, t_in), t_out)
 
 
-@inlined
+@pasted
 def _passes(
     records: F32,
     row: int,
@@ -161,14 +152,14 @@ def _passes(
     return _r2_on_ray(records, row, dx, dy, dz, vx, vy, vz, t) <= p.r2_pass  # Eq. (4)
 
 
-@inlined
+@pasted
 def _r2_block(block: F32, records: F32, row: int, px: float, py: float, pz: float) -> float:
     """Eq. (2) for a point, with the measurement noise added to Σ."""
     x, y, z = _whitened(block, row, px - records[row, 6], py - records[row, 7], pz - records[row, 8])
     return x * x + y * y + z * z
 
 
-@inlined
+@pasted
 def _neighbour_explains(
     state: I32,
     at: int,
@@ -195,7 +186,7 @@ def _neighbour_explains(
     return _r2_block(block, records, row, px, py, pz) <= p.r2_face
 
 
-@inlined
+@pasted
 def _first_face(g: float, d: float, i: int, n: int) -> tuple[float, float]:
     """Ray parameter of the first face along one axis and the step between faces; infinite when none is crossed."""
     if n == 0:
@@ -204,7 +195,7 @@ def _first_face(g: float, d: float, i: int, n: int) -> tuple[float, float]:
     return (face - g) / d, 1.0 / abs(d)
 
 
-@inlined
+@pasted
 def _clip(g: float, d: float, n: int, t0: float, t1: float) -> tuple[float, float]:
     """The part of [t0, t1] where g + t d lies inside [0, n]; empty when t0 > t1."""
     if d == 0.0:
@@ -213,7 +204,7 @@ def _clip(g: float, d: float, n: int, t0: float, t1: float) -> tuple[float, floa
     return max(t0, min(a, b)), min(t1, max(a, b))
 
 
-@inlined
+@pasted
 def _index(g: float, n: int) -> int:
     """floor(g), kept inside the window against rounding at its faces."""
     return min(max(math.floor(g), 0), n - 1)

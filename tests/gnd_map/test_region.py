@@ -2,8 +2,8 @@ import math
 
 import pytest
 
-from gnd.deploy.errors import RegionError
-from gnd.deploy.region import parse_region
+from gnd.gnd_map.errors import RegionError
+from gnd.gnd_map.region import parse_region
 from gnd.gnd_map.tile_id import TileId
 
 SEOUL = TileId(497353963154)

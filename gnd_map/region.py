@@ -4,8 +4,7 @@ import math
 import posixpath
 from dataclasses import dataclass
 
-from gnd.deploy.errors import RegionError
-from gnd.gnd_map.errors import GndError
+from gnd.gnd_map.errors import GndError, RegionError
 from gnd.gnd_map.tile_id import TileId, covering_circle
 
 MAX_RADIUS_M = 20_000.0
@@ -22,6 +21,18 @@ class Region:
 
     prefix: str
     tiles: frozenset[TileId] | None = None
+
+    @classmethod
+    def circle(cls, lat_deg: float, lon_deg: float, radius_m: float) -> "Region":
+        """The tiles within `radius_m` of a position (WGS-84, degrees).
+
+        Raises:
+            RegionError: no such position, or a radius that is not in 0 … 20 km.
+        """
+        try:
+            return _circle(float(lat_deg), float(lon_deg), float(radius_m))
+        except (ValueError, GndError) as error:
+            raise RegionError(f"no circle of {radius_m} m around {lat_deg}, {lon_deg} degrees: {error}") from error
 
     def __contains__(self, tile: TileId) -> bool:
         """Tell whether a tile belongs to the region."""
@@ -48,6 +59,19 @@ def parse_region(text: str) -> Region:
             f"cannot read the region {text!r} ({error}): give a wildcard like 13033/03021/**, a tile id, "
             "a tile path, or lat,lon,radius in degrees and metres"
         ) from error
+
+
+def as_region(region: "Region | TileId | str | None") -> Region:
+    """A region from what users give: one, a tile, the text of `parse_region`; None or "" is the whole world.
+
+    Raises:
+        RegionError: a text that is no region.
+    """
+    if isinstance(region, Region):
+        return region
+    if isinstance(region, TileId):
+        return _single(region)
+    return parse_region(region) if region else Region("")
 
 
 def _parse(text: str) -> Region:

@@ -1,0 +1,327 @@
+"""A client of the bus: the tiles of a region as they are, and every new version from now on."""
+
+import logging
+import queue
+import threading
+import time
+from collections import OrderedDict, deque
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Final, Self
+
+from gnd.fetching import TileServerClient
+from gnd.fleet_bus.bus import Bus, open_bus
+from gnd.fleet_bus.config import DEFAULT_ENDPOINT, BusConfig
+from gnd.fleet_bus.errors import BusClosed, BusError
+from gnd.gnd_map.content import AnyTile
+from gnd.gnd_map.errors import GndError
+from gnd.gnd_map.region import Region, as_region
+from gnd.gnd_map.tile_id import TileId
+from gnd.schemas.changes import ChangeAck
+from gnd.schemas.errors import SchemaError, WrongHash
+from gnd.schemas.keys import update_keys
+from gnd.schemas.tiles import CatalogEntry
+from gnd.schemas.updates import TileUpdate, updated
+
+if TYPE_CHECKING:
+    from gnd.vehicle_agent.report_sink import OutgoingReport
+
+GAUSSIANS: Final = "ndt"
+"""The layer of Gaussians; every layer whose name does not begin so holds features."""
+COMPARED_EVERY_S: Final = 10.0
+"""Notices may be lost: so often the catalog is compared with what is known."""
+MOST_HELD: Final = 4096
+"""So many tiles are held to apply deltas to; of others the whole tile is asked for."""
+_POLL_S: Final = 0.2
+_log = logging.getLogger(__name__)
+
+AnyRegion = Region | TileId | str | None
+"""A region as users give it: a wildcard `13033/03021/**`, a tile (its path or number), a circle `lat,lon,radius` in
+degrees and metres, a `Region`, a `TileId`, or None: everywhere."""
+
+
+class ReportRefused(GndError):
+    """The cloud has refused a report by name: trying again does not help."""
+
+
+@dataclass(frozen=True, slots=True)
+class MapUpdate:
+    """A new version of a tile, with its content.
+
+    Attributes:
+        layer: name of the layer.
+        tile: the content as it is now: a `Tile` of Gaussians, or a `FeatureTile`.
+        before: the content that it replaces, where the client held it; else None.
+        reason: "merged", "base" or "rollback"; "missed" where the notice did not come and the catalog told;
+            "existing" for what was there when the subscription began.
+    """
+
+    layer: str
+    tile: AnyTile
+    before: AnyTile | None
+    reason: str
+
+    @property
+    def version(self) -> int:
+        """The version of `tile`."""
+        return self.tile.version
+
+
+def connect(router: str = DEFAULT_ENDPOINT, *, timeout_s: float = 10.0) -> "Client":
+    """Join the bus as a client of a router; use it in a `with` block.
+
+    Args:
+        router: endpoint of the router.
+        timeout_s: how long a router is looked for, and how long each question is asked again, s.
+
+    Raises:
+        NoRouter: nothing answers at `router` within `timeout_s`; the message says both.
+        BusConfigError: `router` is no endpoint.
+    """
+    return Client(open_bus(BusConfig(connect=(router,), open_timeout_s=timeout_s), name="client"), timeout_s)
+
+
+class Client:
+    """Reads the map that a fleet keeps. Methods may be called from any thread. `connect` makes one."""
+
+    def __init__(self, bus: Bus, timeout_s: float) -> None:
+        self._bus, self._timeout_s = bus, timeout_s
+        self._streams: list[UpdateStream] = []
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_exception: object) -> None:
+        self.close()
+
+    @property
+    def bus(self) -> Bus:
+        """The session behind it, for what this class does not do."""
+        return self._bus
+
+    def close(self) -> None:
+        """End all subscriptions and the session. May be called again."""
+        self._bus.close()  # first: it ends what the streams wait for
+        for stream in self._streams:
+            stream.close()
+
+    def catalog(self, region: AnyRegion = None, *, layer: str = GAUSSIANS) -> list[CatalogEntry]:
+        """The newest version of each tile of a region: `tile`, `version` and `sha`, by tile; no content is sent.
+
+        Raises:
+            RegionError: `region` is none.
+            RequestFailed: no tile server answers within `timeout_s`.
+        """
+        return self._asking(layer).catalog(as_region(region))
+
+    def tiles(self, region: AnyRegion = None, *, layer: str = GAUSSIANS) -> Iterator[AnyTile]:
+        """The newest version of each tile of a region, by tile, as it arrives: `Tile` or, of features, `FeatureTile`.
+
+        Raises:
+            RegionError, RequestFailed: as `catalog`.
+            SchemaError: an answer that is none.
+        """
+        asking = self._asking(layer)
+        known = [entry.tile for entry in asking.catalog(as_region(region))]
+        return asking.fetch(known)
+
+    def fetch(self, tiles: Sequence[TileId], *, layer: str = GAUSSIANS) -> Iterator[AnyTile]:
+        """The newest versions of these tiles, by tile; those that are not there are left out.
+
+        Raises:
+            RequestFailed, SchemaError: as `tiles`.
+        """
+        return self._asking(layer).fetch(tiles)
+
+    def upload(self, report: "OutgoingReport") -> str:
+        """Hand a report of a `Vehicle` to the cloud. It may be handed over again: it counts once.
+
+        Returns:
+            "stored", or "duplicate": it was there already. Both are said only when it is on the cloud's disk; until
+            then keep it, and try again.
+
+        Raises:
+            RequestFailed: no merger answers within `timeout_s`.
+            ReportRefused: it can never be taken.
+        """
+        payload = self._bus.request(report.key, report.body, kind="change", timeout_s=self._timeout_s)
+        ack = ChangeAck.decode(payload)
+        if ack.status not in ("stored", "duplicate"):
+            raise ReportRefused(f"report {report.report_id}: {ack.status}: {ack.reason}")
+        return ack.status
+
+    def subscribe(
+        self,
+        region: AnyRegion = None,
+        on_update: Callable[[MapUpdate], object] | None = None,
+        *,
+        layers: Sequence[str] = (GAUSSIANS,),
+        existing: bool = False,
+    ) -> "UpdateStream":
+        """Follow a region: every version that is published from now on, with its content.
+
+        Args:
+            region: which tiles.
+            on_update: called with each update in a thread of its own; what it raises is logged. None: iterate over
+                what this returns.
+            layers: names of layers.
+            existing: also give, first, every tile that is there now.
+
+        Raises:
+            RegionError, RequestFailed: as `catalog`.
+        """
+        asking = {layer: self._asking(layer) for layer in layers}
+        stream = UpdateStream(self._bus, asking, as_region(region), existing=existing)
+        self._streams = [one for one in self._streams if not one.is_closed]
+        self._streams.append(stream)
+        if on_update is not None:
+            stream.call(on_update)
+        return stream
+
+    def _asking(self, layer: str) -> TileServerClient:
+        return TileServerClient(self._bus, layer, self._timeout_s)
+
+
+class UpdateStream:
+    """The updates of a region, as an iterator that ends when it, or its client, is closed. `Client.subscribe`.
+
+    A notice is worked on when the next update is asked for: its delta is applied to the tile that is held, or the new
+    tile is fetched where none is held or the delta does not fit. Of several versions that were published meanwhile the
+    newest alone may be given. What a lost notice told is found by the catalog, every ten seconds.
+    """
+
+    def __init__(self, bus: Bus, asking: dict[str, TileServerClient], region: Region, *, existing: bool) -> None:
+        self._bus, self._asking, self._region = bus, asking, region
+        self._notices: queue.SimpleQueue[bytes] = queue.SimpleQueue()
+        self._ready: deque[MapUpdate] = deque()
+        self._versions: dict[tuple[str, TileId], int] = {}
+        self._held: OrderedDict[tuple[str, TileId], AnyTile] = OrderedDict()
+        self._closed = threading.Event()
+        self._thread: threading.Thread | None = None
+        # first listen, then look what is there: nothing falls between
+        self._subscriptions = [
+            bus.subscribe(update_keys(layer, region.prefix), lambda _key, notice: self._notices.put(notice))
+            for layer in asking
+        ]
+        try:
+            self._begin(existing)
+        except BaseException:
+            self.close()
+            raise
+        self._compared_s = time.monotonic()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_exception: object) -> None:
+        self.close()
+
+    def __iter__(self) -> Self:
+        return self
+
+    def __next__(self) -> MapUpdate:
+        update = self.next()
+        if update is None:
+            raise StopIteration
+        return update
+
+    @property
+    def is_closed(self) -> bool:
+        """Whether it was closed, or its client."""
+        return self._closed.is_set() or self._bus.is_closed
+
+    def next(self, timeout_s: float | None = None) -> MapUpdate | None:
+        """The next update; None when there was none for `timeout_s`, or when it was closed."""
+        deadline_s = None if timeout_s is None else time.monotonic() + timeout_s
+        while not self.is_closed:
+            if self._ready:
+                return self._ready.popleft()
+            left_s = _POLL_S if deadline_s is None else min(_POLL_S, deadline_s - time.monotonic())
+            try:
+                self._work(max(left_s, 0.0))
+            except BusClosed:
+                break
+            except (BusError, SchemaError) as error:  # asked for again when the catalog is compared
+                _log.warning("an update could not be fetched: %s", error)
+            if not self._ready and deadline_s is not None and time.monotonic() >= deadline_s:
+                return None
+        return None
+
+    def call(self, on_update: Callable[[MapUpdate], object]) -> None:
+        """Give each update to a function, in a thread of its own, until closed."""
+
+        def run() -> None:
+            for update in self:
+                try:
+                    on_update(update)
+                except Exception:
+                    _log.exception("tile %s version %d: the callback failed", update.tile.tile_id, update.version)
+
+        self._thread = threading.Thread(target=run, name="map updates", daemon=True)
+        self._thread.start()
+
+    def wait(self, timeout_s: float | None = None) -> bool:
+        """Wait until it is closed (a main thread beside a callback); False when it was not within `timeout_s`."""
+        return self._closed.wait(timeout_s)
+
+    def close(self) -> None:
+        """End it. May be called again, and from the callback."""
+        self._closed.set()
+        for subscription in self._subscriptions:
+            subscription.close()
+        if self._thread is not None and self._thread is not threading.current_thread():
+            self._thread.join()
+
+    def _begin(self, existing: bool) -> None:
+        """Learn where the region stands."""
+        for layer, asking in self._asking.items():
+            entries = asking.catalog(self._region)
+            self._versions |= {(layer, entry.tile): entry.version for entry in entries}
+            for tile in asking.fetch([entry.tile for entry in entries]) if existing else ():
+                self._give(layer, tile, "existing")
+
+    def _work(self, wait_s: float) -> None:
+        """Work on one notice, or on the catalogs when it is time."""
+        if time.monotonic() - self._compared_s >= COMPARED_EVERY_S:
+            self._compared_s = time.monotonic()
+            self._compare()
+            return
+        try:
+            notice = self._notices.get(timeout=wait_s)
+        except queue.Empty:
+            return
+        update = TileUpdate.decode(notice)
+        if update.tile in self._region and update.version > self._versions.get((update.layer, update.tile), 0):
+            self._take(update)
+
+    def _take(self, update: TileUpdate) -> None:
+        held = self._held.get((update.layer, update.tile))
+        if held is not None and held.sha == update.previous_sha and update.has_delta:
+            try:
+                self._give(update.layer, updated(update, held), update.reason)
+                return
+            except WrongHash as error:
+                _log.info("%s", error)
+        self._fetch(update.layer, [update.tile], update.reason)
+
+    def _compare(self) -> None:
+        """Find the versions whose notices never came."""
+        for layer, asking in self._asking.items():
+            entries = asking.catalog(self._region)
+            newer = [e.tile for e in entries if e.version > self._versions.get((layer, e.tile), 0)]
+            self._fetch(layer, newer, "missed")
+
+    def _fetch(self, layer: str, tiles: Sequence[TileId], reason: str) -> None:
+        held = {tile: self._held[layer, tile] for tile in tiles if (layer, tile) in self._held}
+        for tile in self._asking[layer].fetch(tiles, held):
+            if tile.version > self._versions.get((layer, tile.tile_id), 0):
+                self._give(layer, tile, reason)
+
+    def _give(self, layer: str, tile: AnyTile, reason: str) -> None:
+        key = layer, tile.tile_id
+        self._ready.append(MapUpdate(layer, tile, self._held.get(key), reason))
+        self._versions[key] = tile.version
+        self._held[key] = tile
+        self._held.move_to_end(key)
+        if len(self._held) > MOST_HELD:
+            self._held.popitem(last=False)

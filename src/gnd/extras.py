@@ -1,0 +1,55 @@
+"""What `pip install gnd-fleet` leaves out, and which extra brings it."""
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from types import TracebackType
+from typing import Final
+
+from gnd.gnd_map.errors import GndError
+
+LEFT_OUT: Final = frozenset(("gtsam", "matplotlib", "mpl_toolkits", "psutil", "scipy", "sklearn", "small_gicp"))
+"""Modules of other projects that only extras bring; pyproject.toml has the same table by extra."""
+EXTRA_OF: Final = {
+    "gnd.vehicle_agent": "vehicle",
+    "gnd.cloud_merger": "cloud",
+    "gnd.tile_store": "cloud",
+    "gnd.fleet_sim": "sim",
+}
+"""By the package that wanted one of them; any other: all."""
+
+
+class MissingExtra(GndError):
+    """A part of this project is used whose extra is not installed; the message says which."""
+
+
+def missing_extra(error: ModuleNotFoundError) -> MissingExtra | None:
+    """The error in words of ours, where it is about a module that an extra brings; else None."""
+    module = (error.name or "").split(".")[0]
+    if module not in LEFT_OUT:
+        return None
+    packages = [".".join(name.split(".")[:2]) for name in _modules(error.__traceback__)]
+    extra = next((EXTRA_OF[package] for package in reversed(packages) if package in EXTRA_OF), "all")
+    return MissingExtra(f"{module} is not installed; it comes with: pip install 'gnd-fleet[{extra}]'")
+
+
+@contextmanager
+def explained() -> Iterator[None]:
+    """Say which extra to install where an import inside fails for want of one.
+
+    Raises:
+        MissingExtra: one is not installed.
+    """
+    try:
+        yield
+    except ModuleNotFoundError as error:
+        missing = missing_extra(error)
+        if missing is None:
+            raise
+        raise missing from error
+
+
+def _modules(trace: TracebackType | None) -> Iterator[str]:
+    """Names of the modules that an error went through, from the outermost."""
+    while trace is not None:
+        yield str(trace.tb_frame.f_globals.get("__name__", ""))
+        trace = trace.tb_next
