@@ -257,7 +257,7 @@ def test_an_upload_that_cannot_be_is_refused(bad: dict[str, str]) -> None:
 
 
 def test_the_clock_of_leases_is_one_for_all_processes_of_the_machine() -> None:
-    ask = "from tile_store import clocks; print(clocks.boot_id(), clocks.steady_ns())"
+    ask = "from gnd.tile_store import clocks; print(clocks.boot_id(), clocks.steady_ns())"
     before_ns = clocks.steady_ns()
     *boot, now_ns = subprocess.check_output([sys.executable, "-c", ask], text=True).split(" ")
     assert boot == [clocks.boot_id()]
