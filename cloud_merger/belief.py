@@ -13,7 +13,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from gnd.cloud_merger.shift import SHIFT_LEAST_GAUSSIANS, Shift, shift_of
+from gnd.cloud_merger.shift import SHIFT_LEAST_GAUSSIANS, CommonShift, shift_of
 from gnd.cloud_merger.statements import Report, is_withheld
 from gnd.gnd_map.gaussian import Gaussians
 from gnd.gnd_map.similarity import similarity
@@ -46,13 +46,13 @@ class ShiftTests:
     """Shift tests of reports against the versions that they were compared with; remembered, each is made once."""
 
     def __init__(self) -> None:
-        self._held: OrderedDict[tuple[str, int], Shift] = OrderedDict()
+        self._held: OrderedDict[tuple[str, int], CommonShift] = OrderedDict()
 
-    def of(self, report: Report, bases: Mapping[bytes, Gaussians]) -> Shift:
+    def of(self, report: Report, bases: Mapping[bytes, Gaussians]) -> CommonShift:
         """The test of one report; one whose base is not known, or that had none, cannot be tested."""
         base = bases.get(report.change.base_sha)
         if base is None:
-            return Shift(False, 0)
+            return CommonShift(False, 0)
         key = (report.report_id, report.change.tile.morton)
         if key not in self._held:
             self._held[key] = shift_of(report.change, base)
@@ -63,7 +63,7 @@ class ShiftTests:
 
 def believed(
     reports: Iterable[Report],
-    shifts: Mapping[str, Shift],
+    shifts: Mapping[str, CommonShift],
     named: frozenset[str] = frozenset(),
 ) -> Believed:
     """Sort out the reports of a tile.
@@ -105,7 +105,7 @@ def _doubts_by_shift(report: Report) -> bool:
     return doubt is not None and bool(doubt.reasons & DoubtReason.EXPLAINED_BY_SHIFT)
 
 
-def _can_tell(report: Report, shifts: Mapping[str, Shift]) -> bool:
+def _can_tell(report: Report, shifts: Mapping[str, CommonShift]) -> bool:
     return shifts[report.report_id].gaussians >= SHIFT_LEAST_GAUSSIANS or _doubts_by_shift(report)
 
 
@@ -145,7 +145,7 @@ def _claim(vehicle: str, own: list[Report]) -> Unconfirmed:
     return Unconfirmed(vehicle, tuple(one.report_id for one in own), voxels, max(seen, voxels), "shift")
 
 
-def _test_of(report: Report, shift: Shift, is_explained: bool) -> ShiftTest:
+def _test_of(report: Report, shift: CommonShift, is_explained: bool) -> ShiftTest:
     """The test's line in the account of its vehicle; along the vehicle's axes where the vehicle has told it so."""
     doubt = report.change.doubt
     if doubt is None or not _doubts_by_shift(report):

@@ -54,7 +54,7 @@ _STILL: Final = np.zeros(3)
 
 
 @dataclass(frozen=True, slots=True)
-class Shift:
+class CommonShift:
     """What the test found; the motion lays the measurements onto the base: the vehicle's poses are off by its inverse.
 
     Attributes:
@@ -144,7 +144,7 @@ _KNOWN: Final[ByObject[_Surfaces]] = ByObject(64)
 """Surfaces of the bases looked at last: the reports of a street refer to few versions."""
 
 
-def shift_of(change: TileChange, base: Gaussians) -> Shift:
+def shift_of(change: TileChange, base: Gaussians) -> CommonShift:
     """Test whether a small shift explains what a report says about a tile.
 
     Args:
@@ -153,12 +153,12 @@ def shift_of(change: TileChange, base: Gaussians) -> Shift:
     """
     n = int(change.changed.exists.sum())
     if n < SHIFT_LEAST_GAUSSIANS or len(base) < SHIFT_LEAST_GAUSSIANS:
-        return Shift(False, n)
+        return CommonShift(False, n)
     surfaces = _Surfaces.of(VoxelGrid.of(change.tile), change.changed, _thinned(change.changed))
     known = _KNOWN.of(base, lambda: _Surfaces.of(VoxelGrid.of(change.tile), base), change.tile)
     strange = surfaces.take(~_fits(surfaces, known, _STILL))
     if len(strange) < SHIFT_LEAST_GAUSSIANS:
-        return Shift(False, len(strange))
+        return CommonShift(False, len(strange))
     is_seen, is_changed = (find(ids, base.voxel_id) >= 0 for ids in (change.observed, change.changed.voxel_id))
     begin = _searched(strange, known, is_seen & ~is_changed)
     motion = _refined(begin, strange, known)
@@ -166,14 +166,14 @@ def shift_of(change: TileChange, base: Gaussians) -> Shift:
     others = [_fits(strange, known, other).mean() for other in _elsewhere(motion)]
     chance = float(np.mean(others))
     unchanged = kernels.unchanged_share(known.planes, is_seen, is_changed, motion, SHIFT_DISPLACED_M)
-    found = Shift(False, len(strange), fit, chance, unchanged, *motion.tolist())
+    found = CommonShift(False, len(strange), fit, chance, unchanged, *motion.tolist())
     upwards = found if found.meets() else _raised(strange, known, is_seen, is_changed)
     return next((replace(one, is_explained=True) for one in (found, upwards) if one.meets()), found)
 
 
-def _raised(strange: _Surfaces, known: _Surfaces, is_seen: Mask, is_changed: Mask) -> Shift:
+def _raised(strange: _Surfaces, known: _Surfaces, is_seen: Mask, is_changed: Mask) -> CommonShift:
     """The shift up or down that most level planes agree on, and what it explains; nothing where the tile refutes it."""
-    level, ground, no = strange.level, known.level, Shift(False, len(strange))
+    level, ground, no = strange.level, known.level, CommonShift(False, len(strange))
     if len(level) < SHIFT_LEAST_GAUSSIANS or not len(ground):
         return no
     steps = _axis(SHIFT_MAX_M)

@@ -21,7 +21,7 @@ from gnd.gnd_map.codec import (
 from gnd.gnd_map.gaussian import Gaussians
 from gnd.gnd_map.similarity import similarity
 from gnd.gnd_map.tile_id import TileId
-from gnd.gnd_map.track import STEPS, Piece, Track, View
+from gnd.gnd_map.track import STEPS, Track, TrackPiece, TrackView
 from gnd.gnd_map.visibility import observed_along
 from gnd.schemas.changes import TileChange
 from gnd.tile_store.warm import warm_up as warm_up_codecs
@@ -38,7 +38,7 @@ def warm_up() -> None:
     measured = encode_measured([(_TILE, base, base.take([0]))])
     decode_measured([(_TILE, base, found.voxel_id)], measured)
     decode_mask(encode_mask(np.array([True])), 1)
-    observed_along(Track(_TILE.district, View((-8, -6, -4, -2, 0, 2, 4, 6, 8)), (_place(),)), [found])
+    observed_along(Track(_TILE.district, TrackView((-8, -6, -4, -2, 0, 2, 4, 6, 8)), (_place(),)), [found])
     similarity(base.exists, base.mean_m, base.cov_m2, base.exists, base.mean_m, base.cov_m2)
     clusters_of(np.zeros(1, STATEMENT), MergeParameters())
     _test_a_shift()
@@ -54,11 +54,11 @@ def _test_a_shift() -> None:
     shift_of(TileChange(_TILE, 0, b"", ids, high, classes, evidence, 0.0, 0.0), low)
 
 
-def _place() -> Piece:
+def _place() -> TrackPiece:
     """In the middle of the tile, 2 m up."""
     corner = TileId(_TILE.district.first_morton)
     east, north = _TILE.lon_index - corner.lon_index, _TILE.lat_index - corner.lat_index
-    return Piece(np.array([[STEPS * east + STEPS // 2, STEPS * north + STEPS // 2, 4]], np.int32), 1)
+    return TrackPiece(np.array([[STEPS * east + STEPS // 2, STEPS * north + STEPS // 2, 4]], np.int32), 1)
 
 
 def _base() -> Gaussians:

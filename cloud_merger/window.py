@@ -187,7 +187,7 @@ def _observed(memory: TileMemory, window: MergedWindow, changed: I32, agrees: ND
         for ids, mine in zip(seen, own, strict=True)
     ]
     every = np.concatenate([memory.voxels["voxel_id"], *seen, np.zeros(0, np.int32)])
-    table = _Table(np.unique(every).astype(np.int32) if len(every) else np.zeros(0, np.int32))
+    table = _WindowTable(np.unique(every).astype(np.int32) if len(every) else np.zeros(0, np.int32))
     found = np.zeros(len(table.voxel_id), VOXEL)
     found["voxel_id"] = table.voxel_id
     found[table.at(memory.voxels["voxel_id"])] = memory.voxels
@@ -218,7 +218,7 @@ def _by_vehicle(reports: Sequence[Report], confirmed: Sequence[I32]) -> Iterable
         yield max((reports[k] for k in own), key=lambda one: one.turn), ids
 
 
-class _Table:
+class _WindowTable:
     """Rows of sorted voxel ids by number: a dense table where they lie close together, as those of a tile do."""
 
     def __init__(self, voxel_id: I32) -> None:

@@ -16,7 +16,7 @@ from rich.table import Table
 from gnd.deploy.errors import ChaosError
 
 if TYPE_CHECKING:
-    from gnd.deploy.chaos.run import Outcome
+    from gnd.deploy.chaos.run import ChaosOutcome
 
 PATH = click.Path(path_type=Path)
 WIDTH = 120
@@ -92,7 +92,7 @@ def _stop_on_interrupt() -> threading.Event:
     return stop
 
 
-def print_outcome(console: Console, outcome: "Outcome") -> None:
+def print_outcome(console: Console, outcome: "ChaosOutcome") -> None:
     """Tables for people: what must be 0, and what each kind of fault cost."""
     told = outcome.as_dict()
     table = Table(title=f"seed {outcome.seed}: {told['faults']} faults in {told['seconds']:.0f} s", show_header=False)

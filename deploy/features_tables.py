@@ -6,7 +6,7 @@ from rich.console import Console
 from rich.table import Table
 
 from gnd.tile_store import tables
-from gnd.tile_store.feature_io.formats import ExportResult
+from gnd.tile_store.feature_io.formats import FeaturesExported
 from gnd.tile_store.feature_io.stored import ImportResult, layer_tiles
 from gnd.tile_store.feature_io.values import MapFeature
 from gnd.tile_store.sqlite_store import SqliteStore
@@ -26,7 +26,7 @@ def print_import(console: Console, path: str, result: ImportResult) -> None:
         console.print(note, highlight=False)
 
 
-def print_export(console: Console, result: ExportResult) -> None:
+def print_export(console: Console, result: FeaturesExported) -> None:
     """What an export wrote."""
     console.print(f"{result.path}: {result.features} features, {result.size_bytes / 1e6:.2f} MB", highlight=False)
     if result.source is not None and result.changes is not None:

@@ -18,13 +18,13 @@ from gnd.cloud_merger.merger import ShardConfig
 from gnd.deploy import roles
 from gnd.deploy.errors import DeployError
 from gnd.deploy.fleet_config import FleetConfig
-from gnd.deploy.live import FleetState, View, live_view
+from gnd.deploy.live import FleetState, LiveView, live_view
 from gnd.deploy.live_traffic import LiveLedgers
 from gnd.deploy.map_use import Versions, map_use, read_ways
 from gnd.deploy.prepare import PreparedRun
 from gnd.deploy.processes import ProcessSpec, Supervisor
 from gnd.deploy.run_folder import RunFolder
-from gnd.deploy.site import Site, VehicleSite, loopback_site
+from gnd.deploy.site import SiteFrame, VehicleSite, loopback_site
 from gnd.fleet_bus.bus import open_bus
 from gnd.fleet_bus.config import BusConfig
 from gnd.fleet_bus.links import load_link
@@ -67,7 +67,7 @@ def run_fleet(
     prepared: PreparedRun,
     console: Console,
     stop: threading.Event,
-    site: Site | None = None,
+    site: SiteFrame | None = None,
 ) -> FleetOutcome:
     """Run the processes of a fleet until every drive is done and every report is merged.
 
@@ -96,7 +96,9 @@ def run_fleet(
         bus = stack.enter_context(open_bus(BusConfig(connect=(site.connect,)), name="fleet"))
         stack.enter_context(bus.subscribe(traffic_keys(), state.on_traffic))
         view = stack.enter_context(live_view(state, console))
-        run = _Run(config, folder, supervisor, opened, view, state, stop, opened.counts().versions, Versions(opened))
+        run = _FleetRun(
+            config, folder, supervisor, opened, view, state, stop, opened.counts().versions, Versions(opened)
+        )
         run.wait_until(run.watcher_ready, SETTLE_S, "the watcher did not start")
         waiting = Departures(supervisor, agent_processes(config, folder, prepared, site), folder, prepared.starts_s)
         run.wait_until(lambda: waiting.all_gone() and supervisor.finished("vehicle-"), config.deadline_s, LATE)
@@ -119,7 +121,7 @@ def supervised(folder: RunFolder, state: FleetState) -> Iterator[Supervisor]:
             supervisor.stop(tuple(name for name in names if name.startswith(group)))
 
 
-def start_cloud(supervisor: Supervisor, config: FleetConfig, folder: RunFolder, site: Site) -> None:
+def start_cloud(supervisor: Supervisor, config: FleetConfig, folder: RunFolder, site: SiteFrame) -> None:
     """Start links, router, tile server, merger shards and watcher; each connects as soon as the router listens."""
     for carrier in site.carriers:
         supervisor.start(carrier)
@@ -127,7 +129,7 @@ def start_cloud(supervisor: Supervisor, config: FleetConfig, folder: RunFolder, 
         supervisor.start(spec)
 
 
-def cloud_processes(config: FleetConfig, folder: RunFolder, site: Site) -> list[ProcessSpec]:
+def cloud_processes(config: FleetConfig, folder: RunFolder, site: SiteFrame) -> list[ProcessSpec]:
     """Return the processes of the cloud in the order of their start."""
     connect, where = site.connect, site.namespace
     shards = [shard_config(config, f"shard-{number}", folder.store, connect) for number in range(config.shards)]
@@ -139,7 +141,9 @@ def cloud_processes(config: FleetConfig, folder: RunFolder, site: Site) -> list[
     ]
 
 
-def agent_processes(config: FleetConfig, folder: RunFolder, prepared: PreparedRun, site: Site) -> list[ProcessSpec]:
+def agent_processes(
+    config: FleetConfig, folder: RunFolder, prepared: PreparedRun, site: SiteFrame
+) -> list[ProcessSpec]:
     """Return one agent process a drive, by the number of its vehicle."""
     specs = []
     for number, (drive, place) in enumerate(zip(prepared.agent_drives, site.vehicles, strict=True)):
@@ -212,14 +216,14 @@ def agent_config(config: FleetConfig, vehicle: str, drive: Path, folder: RunFold
 
 
 @dataclass(slots=True)
-class _Run:
+class _FleetRun:
     """What the waiting loops of a run look at."""
 
     config: FleetConfig
     folder: RunFolder
     supervisor: Supervisor
     store: SqliteStore
-    view: View
+    view: LiveView
     state: FleetState
     stop: threading.Event
     versions_before: int

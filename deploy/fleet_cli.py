@@ -16,7 +16,7 @@ from rich.console import Console
 from gnd.deploy.fleet_config import FleetConfig, load_fleet_config
 from gnd.deploy.ports import claim_port
 from gnd.deploy.run_folder import RunFolder, create_run_folder, default_run_path
-from gnd.deploy.site import Site
+from gnd.deploy.site import SiteFrame
 from gnd.deploy.source import Source
 from gnd.fleet_bus.links import load_link
 from gnd.fleet_bus.settings_file import write_settings
@@ -123,7 +123,7 @@ def run(
     source: Source,
     *,
     keep_drives: bool,
-    place: Callable[[], AbstractContextManager[Site | None]] = nullcontext,
+    place: Callable[[], AbstractContextManager[SiteFrame | None]] = nullcontext,
 ) -> dict[str, Any]:
     """Prepare and run a fleet and write its summary.
 

@@ -146,21 +146,21 @@ def doubts_text(sample: TrafficSample) -> str:
 
 
 @contextmanager
-def live_view(state: FleetState, console: Console) -> Iterator["View"]:
+def live_view(state: FleetState, console: Console) -> Iterator["LiveView"]:
     """Show the state while the block runs."""
     if not console.is_terminal:
-        yield View(state, console, None)
+        yield LiveView(state, console, None)
         return
     with Live(render(state, console.width), console=console, refresh_per_second=2, transient=False) as live:
         try:
-            yield View(state, console, live)
+            yield LiveView(state, console, live)
         finally:  # what stays on the screen is the account of the whole run
             state.ledgers.refresh(now=True)
             live.update(render(state, console.width))
 
 
 @dataclass(slots=True)
-class View:
+class LiveView:
     """A place to redraw the state; on a plain stream it prints a line every ten seconds."""
 
     state: FleetState

@@ -24,7 +24,7 @@ class VehicleSite:
 
 
 @dataclass(frozen=True, slots=True)
-class Site:
+class SiteFrame:
     """Where the cloud is, and each vehicle.
 
     Attributes:
@@ -42,11 +42,11 @@ class Site:
     carriers: tuple[ProcessSpec, ...] = ()
 
 
-def loopback_site(config: FleetConfig, agents: int) -> Site:
+def loopback_site(config: FleetConfig, agents: int) -> SiteFrame:
     """Return a site on the loopback interface, where the sessions themselves imitate the link.
 
     Raises:
         DeployError: the port is taken.
     """
     endpoint = f"tcp/127.0.0.1:{claim_port(config.port)}"
-    return Site(endpoint, endpoint, (VehicleSite(endpoint, config.link),) * agents)
+    return SiteFrame(endpoint, endpoint, (VehicleSite(endpoint, config.link),) * agents)

@@ -14,7 +14,7 @@ from gnd.deploy.live_traffic import traffic_lines
 from gnd.deploy.prepare import PreparedRun
 from gnd.deploy.run_folder import RunFolder
 from gnd.fleet_sim.ellipsoids import Tiles, ellipsoids_of_maps
-from gnd.fleet_sim.pictures import View, draw_healing, draw_map, draw_run
+from gnd.fleet_sim.pictures import StreetView, draw_healing, draw_map, draw_run
 from gnd.fleet_sim.truth import Truth, read_truth
 from gnd.gnd_map.geodesy import LocalFrame
 from gnd.gnd_map.settings import settings_sha256
@@ -118,7 +118,7 @@ def _draw_maps(folder: RunFolder, base: Tiles, final: Tiles) -> None:
         return
     frame = LocalFrame.of_tile(sorted(final)[len(final) // 2])
     after = ellipsoids_of_maps(frame, base, final)
-    view = View.around(after)
+    view = StreetView.around(after)
     draw_map(ellipsoids_of_maps(frame, base), folder.root / "map_before.png", "Map before", "", view)
     draw_map(after, folder.root / "map_after.png", "Map after", "coloured by what the fleet changed", view)
 

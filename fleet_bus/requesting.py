@@ -63,7 +63,7 @@ class RetryPolicy:
 
 
 @dataclass(slots=True)
-class Answers:
+class RequestAnswers:
     """What one attempt brought back."""
 
     ok: list[tuple[str, bytes]] = field(default_factory=list)
@@ -130,8 +130,8 @@ class _Asking:
     shares_of: SharesOf | None = None
 
     def until(
-        self, good: Callable[[Answers], bool], retry: RetryPolicy, timeout_s: float, *, first_only: bool
-    ) -> Answers:
+        self, good: Callable[[RequestAnswers], bool], retry: RetryPolicy, timeout_s: float, *, first_only: bool
+    ) -> RequestAnswers:
         """Sends the request again and again until the answers are good.
 
         Raises:
@@ -152,11 +152,11 @@ class _Asking:
                 raise BusClosed(f"the bus was closed while asking {self.key} for the {attempt + 1}th time")
         raise AssertionError("unreachable")
 
-    def _once(self, timeout_s: float, *, first_only: bool) -> Answers:
+    def _once(self, timeout_s: float, *, first_only: bool) -> RequestAnswers:
         connection = self.connection
         connection.check_open()
         if not connection.wait_connected(timeout_s):  # nothing would be sent, so nothing is paced nor booked
-            return Answers(errors=[f"no router at {', '.join(connection.config.connect)}"])
+            return RequestAnswers(errors=[f"no router at {', '.join(connection.config.connect)}"])
         asked_at_s = time.monotonic()
         connection.outgoing(self.payload, self.kind, self.tile, head_bytes(self.key, REQUEST_BYTES))
         inbox: queue.SimpleQueue[zenoh.Reply | None] = queue.SimpleQueue()
@@ -181,8 +181,8 @@ class _Asking:
 
     def _collect(
         self, inbox: "queue.SimpleQueue[zenoh.Reply | None]", asked_at_s: float, *, first_only: bool
-    ) -> Answers:
-        answers = Answers()
+    ) -> RequestAnswers:
+        answers = RequestAnswers()
         while (reply := self._receive(inbox)) is not None:
             if reply.ok is None:
                 if reply.err is not None:

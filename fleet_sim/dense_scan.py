@@ -21,7 +21,16 @@ from gnd.gnd_map.jit import kernel
 from gnd.gnd_map.near_grid import grid_near
 from gnd.gnd_map.tile_id import covering_corridor
 
-__all__ = ["AFTER_COME", "AFTER_KEPT", "BEFORE_GONE", "BEFORE_KEPT", "DenseScan", "ScanPlan", "Window", "dense_scans"]
+__all__ = [
+    "AFTER_COME",
+    "AFTER_KEPT",
+    "BEFORE_GONE",
+    "BEFORE_KEPT",
+    "DenseScan",
+    "DenseWindow",
+    "ScanPlan",
+    "dense_scans",
+]
 
 FloatArray = NDArray[np.float64]
 
@@ -37,7 +46,7 @@ _MARGIN_M: Final = 3.0
 _HEIGHT_M: Final = 24.0
 
 
-class Window(NamedTuple):
+class DenseWindow(NamedTuple):
     """A box of voxels in grid coordinates: lowest voxel and size."""
 
     gx: int
@@ -131,7 +140,7 @@ def dense_scan(world: World, plan: ScanPlan) -> DenseScan:
 class _Tally:
     """What shots leave in the voxels of one grid."""
 
-    def __init__(self, grid: GridFrame, window: Window) -> None:
+    def __init__(self, grid: GridFrame, window: DenseWindow) -> None:
         size = window.nx * window.ny * window.nz
         self._grid, self._window = grid, window
         self._index = np.full(size, -1, dtype=np.int32)
@@ -169,7 +178,7 @@ class _Tally:
         return DenseScan(self._grid, g, seen, row, seen_passes, changes, shell, self._before, self._after)
 
 
-def _window(world: World, plan: ScanPlan, grid: GridFrame) -> Window:
+def _window(world: World, plan: ScanPlan, grid: GridFrame) -> DenseWindow:
     """The voxels around the street that lie in the grid's zone."""
     reach = world.half_length_m + plan.range_m + _MARGIN_M
     corners = np.array([(x, y, z) for x in (-reach, reach) for y in (-reach, reach) for z in (-1, 1)], dtype=np.float64)
@@ -178,7 +187,7 @@ def _window(world: World, plan: ScanPlan, grid: GridFrame) -> Window:
     low, high = g.min(axis=0), g.max(axis=0) + 1
     first, last = grid.lat_index_range
     low[1], high[1] = max(low[1], first * grid.ny), min(high[1], (last + 1) * grid.ny)
-    return Window(*low.tolist(), *(high - low).tolist())
+    return DenseWindow(*low.tolist(), *(high - low).tolist())
 
 
 @kernel
@@ -192,7 +201,7 @@ def _counted(cells: NDArray[np.uint8], flags: int) -> NDArray[np.int32]:
 
 
 @kernel
-def _slot(window: Window, x: int, y: int, z: int) -> int:
+def _slot(window: DenseWindow, x: int, y: int, z: int) -> int:
     """Place of a voxel in the window's flat arrays, -1 outside."""
     i, j, k = x - window.gx, y - window.gy, z - window.gz
     if i < 0 or j < 0 or k < 0 or i >= window.nx or j >= window.ny or k >= window.nz:
@@ -204,7 +213,7 @@ def _slot(window: Window, x: int, y: int, z: int) -> int:
 def _mark(
     g: FloatArray,
     flags: NDArray[np.uint8],
-    window: Window,
+    window: DenseWindow,
     index: NDArray[np.int32],
     cells: NDArray[np.uint8],
     used: int,
@@ -226,7 +235,7 @@ def _mark(
 
 
 @kernel
-def _pass(origin: FloatArray, ends: FloatArray, window: Window, passes: NDArray[np.int32]) -> None:
+def _pass(origin: FloatArray, ends: FloatArray, window: DenseWindow, passes: NDArray[np.int32]) -> None:
     """Count rays from origin (3,) to ends (N, 3), grid coordinates, in every voxel but that of the end."""
     voxel, step, last = np.empty(3, np.int64), np.empty(3, np.int64), np.empty(3, np.int64)
     at, delta = np.empty(3), np.empty(3)
@@ -249,7 +258,7 @@ def _pass(origin: FloatArray, ends: FloatArray, window: Window, passes: NDArray[
 
 @kernel
 def _near(
-    window: Window, index: NDArray[np.int32], cells: NDArray[np.uint8], x: int, y: int, z: int, wanted: int
+    window: DenseWindow, index: NDArray[np.int32], cells: NDArray[np.uint8], x: int, y: int, z: int, wanted: int
 ) -> bool:
     """Whether sub-cell (x, y, z), counted from the window's corner, or a neighbour (of 26) carries a wanted flag."""
     for i in range(x - 1, x + 2):
@@ -265,7 +274,9 @@ def _near(
 
 
 @kernel
-def _unexplained(window: Window, index: NDArray[np.int32], cells: NDArray[np.uint8], used: int) -> NDArray[np.int32]:
+def _unexplained(
+    window: DenseWindow, index: NDArray[np.int32], cells: NDArray[np.uint8], used: int
+) -> NDArray[np.int32]:
     """Sub-cells of each row that are gone, come or revealed: none of the other state's within one sub-cell, (M, 3)."""
     found = np.zeros((used, 3), np.int32)
     for slot in range(len(index)):
@@ -288,7 +299,7 @@ def _unexplained(window: Window, index: NDArray[np.int32], cells: NDArray[np.uin
 
 @kernel
 def _shell(
-    window: Window, index: NDArray[np.int32], cells: NDArray[np.uint8], touched: NDArray[np.int64]
+    window: DenseWindow, index: NDArray[np.int32], cells: NDArray[np.uint8], touched: NDArray[np.int64]
 ) -> NDArray[np.int32]:
     """Sub-cells (V, 2) known before and standing after in the six layers, one sub-cell thick, around each voxel."""
     found = np.zeros((len(touched), 2), np.int32)

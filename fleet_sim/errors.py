@@ -11,7 +11,7 @@ class WorldError(SimError):
     """A world file is missing, corrupt or says something impossible."""
 
 
-class ShapeError(SimError):
+class SimShapeError(SimError):
     """A primitive with impossible dimensions."""
 
 

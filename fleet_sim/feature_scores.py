@@ -26,7 +26,7 @@ TOLERANCE_M: Final = 1.0
 
 
 @dataclass(frozen=True, slots=True)
-class ClassScore:
+class FeatureClassScore:
     """How one class was judged: right ones, wrongly found ones, missed ones."""
 
     right: int
@@ -66,7 +66,7 @@ class FeatureScore:
     """
 
     layer: str
-    classes: Mapping[FeatureClass, ClassScore]
+    classes: Mapping[FeatureClass, FeatureClassScore]
     truth: Mapping[FeatureClass, int]
     error_m: tuple[float, ...]
     normal_error_m: tuple[float, ...]
@@ -139,10 +139,10 @@ def score_features(
     normal = {f.feature_id for f in known.values() if f.state == "normal"} & counted
     deleted = {f.feature_id for f in known.values() if f.state == "deleted"} & counted
     wanted = {f.feature_id for f in new} & counted
-    classes: dict[FeatureClass, ClassScore] = {
-        "normal": ClassScore(len(normal & kept), len(deleted & kept), len(normal - kept)),
-        "deleted": ClassScore(len(deleted - kept), len(normal - kept), len(deleted & kept)),
-        "new": ClassScore(len(wanted & matched.keys()), len(wrong_new), len(wanted - matched.keys())),
+    classes: dict[FeatureClass, FeatureClassScore] = {
+        "normal": FeatureClassScore(len(normal & kept), len(deleted & kept), len(normal - kept)),
+        "deleted": FeatureClassScore(len(deleted - kept), len(normal - kept), len(deleted & kept)),
+        "new": FeatureClassScore(len(wanted & matched.keys()), len(wrong_new), len(wanted - matched.keys())),
     }
     numbers: dict[FeatureClass, int] = {"normal": len(normal), "deleted": len(deleted), "new": len(wanted)}
     errors = tuple(sorted(distance for number, distance in matched.items() if number in wanted))

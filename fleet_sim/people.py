@@ -31,7 +31,7 @@ _TRIES: Final = 60
 
 
 @dataclass(frozen=True, slots=True)
-class Stretch:
+class PathStretch:
     """A free stretch of pavement, straight along the street.
 
     Attributes:
@@ -104,7 +104,7 @@ def pedestrians(
     return found
 
 
-def free_stretches(stage: Stage) -> list[Stretch]:
+def free_stretches(stage: Stage) -> list[PathStretch]:
     """Return the stretches of pavement where somebody can walk without meeting anything that stands there."""
     boxes, world = _standing(stage.shapes), stage.world
     end, found = world.half_length_m + _BEYOND_M, []
@@ -113,7 +113,7 @@ def free_stretches(stage: Stage) -> list[Stretch]:
         x = -end
         for x0, x1 in [*sorted(near[:, [0, 2]].tolist()), (end, end)]:
             if x0 - x > _MIN_STRETCH_M + 2 * _HALF_WIDTH_M:
-                found.append(Stretch(y, x + _HALF_WIDTH_M, x0 - _HALF_WIDTH_M))
+                found.append(PathStretch(y, x + _HALF_WIDTH_M, x0 - _HALF_WIDTH_M))
             x = max(x, x1)
     return found
 
@@ -129,7 +129,7 @@ def _standing(shapes: tuple[Shape, ...]) -> FloatArray:
     return np.array(rows).reshape(len(rows), 4)
 
 
-def _strolling(stretch: Stretch, x: float, duration_s: float, rng: np.random.Generator) -> list[Leg]:
+def _strolling(stretch: PathStretch, x: float, duration_s: float, rng: np.random.Generator) -> list[Leg]:
     """Walk up and down a stretch from x on, standing for a while at its ends, and now and then in between."""
     speed = rng.uniform(0.9, 1.7)
     legs, spent = [Leg(0.0, x, stretch.y_m)], 0.0
@@ -146,8 +146,8 @@ def _strolling(stretch: Stretch, x: float, duration_s: float, rng: np.random.Gen
 
 
 def _crossing(
-    here: Stretch,
-    free: list[Stretch],
+    here: PathStretch,
+    free: list[PathStretch],
     stage: Stage,
     busy: list[tuple[FloatArray, FloatArray]],
     rng: np.random.Generator,

@@ -47,7 +47,7 @@ _ARROW: Final = {"arrowstyle": "-|>", "color": _INK, "linewidth": 1.6}
 
 
 @dataclass(frozen=True, slots=True)
-class View:
+class StreetView:
     """How the pictures look at the map: along the street, whatever its heading.
 
     Attributes:
@@ -63,10 +63,10 @@ class View:
     focus_m: float
 
     @staticmethod
-    def around(ellipsoids: Ellipsoids) -> "View":
+    def around(ellipsoids: Ellipsoids) -> "StreetView":
         """Return a view that fits a map: its longest horizontal axis is the street, the focus is on changes."""
         if not len(ellipsoids):
-            return View((0.0, 0.0, 0.0), 0.0, 50.0, 0.0)
+            return StreetView((0.0, 0.0, 0.0), 0.0, 50.0, 0.0)
         middle = np.median(ellipsoids.mean_m, axis=0)
         flat = ellipsoids.mean_m[:, :2] - middle[:2]
         axis = np.linalg.eigh(flat.T @ flat)[1][:, 1]
@@ -74,9 +74,9 @@ class View:
         reach = float(np.quantile(np.abs(flat @ axis), 0.97))
         changed = (flat @ axis)[ellipsoids.change_class != ChangeClass.NORMAL]
         focus = float(np.median(changed)) if len(changed) else 0.0
-        return View(tuple(middle.tolist()), float(np.arctan2(axis[1], axis[0])), max(reach, 20.0), focus)
+        return StreetView(tuple(middle.tolist()), float(np.arctan2(axis[1], axis[0])), max(reach, 20.0), focus)
 
-    def rows(self) -> "list[View]":
+    def rows(self) -> "list[StreetView]":
         """Return views of equal stretches, none longer than a row of the picture, in order along the street."""
         count = max(1, ceil(2 * self.half_length_m / _LONGEST_ROW_M))
         half = self.half_length_m / count
@@ -92,7 +92,7 @@ class View:
 
 
 def draw_map(
-    ellipsoids: Ellipsoids, path: Path, title: str, note: str = "", view: View | None = None, dpi: int = _DPI
+    ellipsoids: Ellipsoids, path: Path, title: str, note: str = "", view: StreetView | None = None, dpi: int = _DPI
 ) -> None:
     """Draw a map from above and in perspective, with legend and scale, as one PNG.
 
@@ -110,7 +110,7 @@ def draw_map(
     Raises:
         SimError: the file cannot be written.
     """
-    view = view or View.around(ellipsoids)
+    view = view or StreetView.around(ellipsoids)
     rows = view.rows()
     height_in = _HEAD_IN + len(rows) * (_ROW_IN + _GAP_IN) + _PERSPECTIVE_IN + _FOOT_IN
     figure = Figure(figsize=(_WIDTH_IN, height_in), dpi=dpi, facecolor=_PAPER)
@@ -146,7 +146,7 @@ def draw_run(truth: Truth, base: Tiles, final: Tiles, folder: Path) -> tuple[Pat
         SimError: a file cannot be written.
     """
     true = ellipsoids_of_truth(truth)
-    view = View.around(true)
+    view = StreetView.around(true)
     paths = folder / "map_before.png", folder / "map_after.png", folder / "truth.png"
     draw_map(ellipsoids_of_maps(truth.frame, base), paths[0], "Map before", "what every vehicle starts with", view)
     note = "what the fleet has made of it, coloured by what it changed"
@@ -168,7 +168,7 @@ def draw_healing(truth: Truth, base: Tiles, final: Tiles, path: Path) -> None:
         SimError: the file cannot be written.
     """
     true = ellipsoids_of_truth(truth)
-    view = View.around(true)
+    view = StreetView.around(true)
     panels = (
         ("Map before", ellipsoids_of_maps(truth.frame, base)),
         ("Map after", ellipsoids_of_maps(truth.frame, base, final)),
@@ -211,7 +211,7 @@ def _legend(figure: Figure, height: float, ellipsoids: Ellipsoids | None = None)
     )  # fmt: skip
 
 
-def _from_above(axes: Axes, ellipsoids: Ellipsoids, view: View) -> None:
+def _from_above(axes: Axes, ellipsoids: Ellipsoids, view: StreetView) -> None:
     R = view.R_view_map
     mean, cov = (ellipsoids.mean_m - np.array(view.origin_m)) @ R.T, R @ ellipsoids.cov_m2 @ R.T
     inside = np.flatnonzero((np.abs(mean[:, 0]) < view.half_length_m) & (np.abs(mean[:, 1]) < _HALF_WIDTH_M))
@@ -225,7 +225,7 @@ def _from_above(axes: Axes, ellipsoids: Ellipsoids, view: View) -> None:
     _north(axes, view, half_width)
 
 
-def _in_perspective(axes: Axes, ellipsoids: Ellipsoids, view: View) -> None:
+def _in_perspective(axes: Axes, ellipsoids: Ellipsoids, view: StreetView) -> None:
     """Ellipsoids seen from above one end of the street; outlines are covariances through the projection's Jacobian."""
     eye, target = np.array([view.focus_m - 66.0, -13.0, 33.0]), np.array([view.focus_m + 2.0, 1.0, 0.0])
     R = _looking(eye, target) @ view.R_view_map
@@ -287,7 +287,7 @@ def _frame(axes: Axes, background: str) -> None:
         spine.set(color="#c3ccd8", linewidth=0.8)
 
 
-def _scale_bar(axes: Axes, view: View, half_width: float) -> None:
+def _scale_bar(axes: Axes, view: StreetView, half_width: float) -> None:
     length = 20.0 if view.half_length_m > 40 else 10.0
     x, y = -view.half_length_m + 0.025 * 2 * view.half_length_m, -half_width * 0.84
     axes.plot([x, x + length], [y, y], color=_INK, linewidth=2.5, solid_capstyle="butt")
@@ -295,7 +295,7 @@ def _scale_bar(axes: Axes, view: View, half_width: float) -> None:
     axes.text(x + length / 2, y + half_width * 0.045, f"{length:.0f} m", **place)
 
 
-def _north(axes: Axes, view: View, half_width: float) -> None:
+def _north(axes: Axes, view: StreetView, half_width: float) -> None:
     size, x, y = half_width * 0.26, view.half_length_m * 0.965, -half_width * 0.72
     direction = view.R_view_map @ np.array([0.0, 1.0, 0.0])
     end = size / 2 * direction[:2]

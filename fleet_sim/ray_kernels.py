@@ -37,7 +37,7 @@ class Ray(NamedTuple):
     dz: float
 
 
-class Grid(NamedTuple):
+class RayGrid(NamedTuple):
     """The grid of a scene: corner, numbers of cells, edge of a cell (street frame, metres)."""
 
     x0: float
@@ -126,7 +126,7 @@ def _inverse(d: float) -> float:
 
 @kernel
 def cast_ray(
-    ray: Ray, range_m: float, p: FloatArray, starts: IntArray, items: IntArray, tops: FloatArray, grid: Grid
+    ray: Ray, range_m: float, p: FloatArray, starts: IntArray, items: IntArray, tops: FloatArray, grid: RayGrid
 ) -> tuple[float, int]:
     """Walk one ray over the grid: range and index of the first primitive, (inf, -1) for a miss.
 
@@ -202,7 +202,7 @@ def cast_rays(
     starts: IntArray,
     items: IntArray,
     tops: FloatArray,
-    grid: Grid,
+    grid: RayGrid,
 ) -> tuple[FloatArray, IntArray]:
     """Cast N rays from origins (N, 3) along directions (N, 3), both in the street frame: ranges and primitives (N,)."""
     ranges, index = np.empty(len(directions)), np.empty(len(directions), np.int32)
@@ -222,7 +222,7 @@ def cast_fan(
     starts: IntArray,
     items: IntArray,
     tops: FloatArray,
-    grid: Grid,
+    grid: RayGrid,
 ) -> tuple[FloatArray, IntArray]:
     """Cast rays from one origin (3,) along directions (N, 3), each with its own reach (N,): ranges and primitives."""
     ranges, index = np.empty(len(directions)), np.empty(len(directions), np.int32)
@@ -261,7 +261,7 @@ def cast_sweep(
     starts: IntArray,
     items: IntArray,
     tops: FloatArray,
-    grid: Grid,
+    grid: RayGrid,
 ) -> tuple[FloatArray, IntArray, FloatArray]:
     """Cast directions (columns, beams, 3) from poses (columns + 1, 3, 4), both towards the street frame.
 

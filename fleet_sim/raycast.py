@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gnd.fleet_sim.errors import SceneError
-from gnd.fleet_sim.ray_kernels import FloatArray, Grid, IntArray, cast_fan, cast_rays
+from gnd.fleet_sim.ray_kernels import FloatArray, IntArray, RayGrid, cast_fan, cast_rays
 from gnd.fleet_sim.shapes import Shape, pack
 
 CELL_M: Final = 2.0
@@ -119,9 +119,9 @@ class Scene:
                 f" the scene spans {low.tolist()} to {(low + size).tolist()} m"
             )
 
-    def arrays(self) -> tuple[FloatArray, IntArray, IntArray, FloatArray, Grid]:
+    def arrays(self) -> tuple[FloatArray, IntArray, IntArray, FloatArray, RayGrid]:
         """Return the scene as the compiled kernels take it: flat primitives, starts, items, tops, grid."""
-        grid = Grid(*self.origin_m, *self.shape, self.cell_m)
+        grid = RayGrid(*self.origin_m, *self.shape, self.cell_m)
         return self.packed.reshape(-1), self.starts, self.items, self.tops_m, grid
 
 

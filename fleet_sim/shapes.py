@@ -12,7 +12,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from gnd.fleet_sim.errors import ShapeError
+from gnd.fleet_sim.errors import SimShapeError
 
 BLOCK: Final = 0
 POST: Final = 1
@@ -26,12 +26,12 @@ COLUMNS: Final = 13
 
 def _check(shape: object, values: Sequence[float], positive: dict[str, float], reflectivity: float) -> None:
     if not all(isfinite(v) for v in values):
-        raise ShapeError(f"{shape}: every number must be finite")
+        raise SimShapeError(f"{shape}: every number must be finite")
     for name, value in positive.items():
         if value <= 0:
-            raise ShapeError(f"{shape}: {name} must be positive, got {value}")
+            raise SimShapeError(f"{shape}: {name} must be positive, got {value}")
     if not 0 < reflectivity <= 1:
-        raise ShapeError(f"{shape}: reflectivity must be in (0, 1], got {reflectivity}")
+        raise SimShapeError(f"{shape}: reflectivity must be in (0, 1], got {reflectivity}")
 
 
 @dataclass(frozen=True, slots=True)

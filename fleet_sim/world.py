@@ -17,7 +17,7 @@ from typing import Any, Final, Literal, get_args
 import numpy as np
 from numpy.typing import NDArray
 
-from gnd.fleet_sim.errors import ShapeError, WorldError
+from gnd.fleet_sim.errors import SimShapeError, WorldError
 from gnd.fleet_sim.shapes import Ball, Block, Post, Shape
 from gnd.fleet_sim.strict_json import arguments, items, mapping, parsed
 from gnd.gnd_map.geodesy import LocalFrame
@@ -234,7 +234,7 @@ def _decode_shape(value: object, where: str) -> Shape:
     cls = _TYPES[name]
     try:
         return cls(**arguments(cls, data, where))
-    except ShapeError as error:
+    except SimShapeError as error:
         raise WorldError(f"{where}: {error}") from error
 
 

@@ -37,7 +37,7 @@ MOST_COLUMNS: Final = 512  # that one fan crosses
 _NEW, _DELETED = int(ChangeClass.NEW), int(ChangeClass.DELETED)
 
 
-class Window(NamedTuple):
+class SightWindow(NamedTuple):
     """Where the voxels of tiles of one (nx, ny) lie. Window coordinates: voxels from its south-west corner, floors from
     sea level.
 
@@ -63,7 +63,7 @@ class Window(NamedTuple):
 
 
 @bare
-def _cell(w: Window, slot: int, column: int, floor: int) -> int:
+def _cell(w: SightWindow, slot: int, column: int, floor: int) -> int:
     """Cell of a voxel, -1 where no line comes."""
     if not w.low[slot] <= floor < w.low[slot] + w.floors[slot]:
         return -1
@@ -73,7 +73,7 @@ def _cell(w: Window, slot: int, column: int, floor: int) -> int:
 
 @bare
 def lay_out(
-    w: Window, slot: I32, voxel_id: I32, mean_m: F32, cov_m2: F32, ball_m2: float, noise_m2: float,
+    w: SightWindow, slot: I32, voxel_id: I32, mean_m: F32, cov_m2: F32, ball_m2: float, noise_m2: float,
     state: I32, filled: U64, stop: F32,
 ) -> None:  # fmt: skip
     """Put what stops lines into its cells.
@@ -122,7 +122,9 @@ def lay_out(
 
 
 @bare
-def mark(w: Window, slot: I32, voxel_id: I32, change_class: U8, state: I32, filled: U64, near: U8, seen: U64) -> None:
+def mark(
+    w: SightWindow, slot: I32, voxel_id: I32, change_class: U8, state: I32, filled: U64, near: U8, seen: U64
+) -> None:
     """What is flagged has been seen; what is gone stops no line; neighbours across a face are told.
 
     Args:
@@ -179,7 +181,7 @@ def _stops(
     return bool(ex * ex + ey * ey + ez * ez <= r2)
 
 
-class Columns(NamedTuple):
+class SightColumns(NamedTuple):
     """Columns of voxels one after the other: room for those that a fan crosses. Floors are counted from BELOW under the
     place's own.
 
@@ -198,7 +200,7 @@ class Columns(NamedTuple):
     leave_m: F64
 
     @classmethod
-    def room(cls) -> "Columns":
+    def room(cls) -> "SightColumns":
         """For the longest fan."""
         n = MOST_COLUMNS
         base, first, end = (np.empty(n, np.int64) for _ in range(3))
@@ -206,7 +208,9 @@ class Columns(NamedTuple):
 
 
 @bare
-def _cross(w: Window, filled: U64, x: float, y: float, bottom: int, d: F64, reach_m: float, crossed: Columns) -> int:
+def _cross(
+    w: SightWindow, filled: U64, x: float, y: float, bottom: int, d: F64, reach_m: float, crossed: SightColumns
+) -> int:
     """Fill in the columns that a fan crosses from (x, y) along the unit vector d (2,), from floor `bottom` on; how
     many.
     """
@@ -253,8 +257,8 @@ def _cross(w: Window, filled: U64, x: float, y: float, bottom: int, d: F64, reac
 
 @bare
 def cast_fans(  # noqa: C901  (one loop, as in the vehicle's ray kernel)
-    w: Window, place: F64, turn: F64, rays: I64, azimuth: F64, slope: F64, lines: int, stop: F32, filled: U64,
-    r2: float, range_m: float, reach_m: float, level: float, state: I32, hits: I64, columns: Columns, ahead: F64,
+    w: SightWindow, place: F64, turn: F64, rays: I64, azimuth: F64, slope: F64, lines: int, stop: F32, filled: U64,
+    r2: float, range_m: float, reach_m: float, level: float, state: I32, hits: I64, columns: SightColumns, ahead: F64,
 ) -> None:  # fmt: skip
     """From every place a fan of lines along every azimuth; counts into `state` and `hits`.
 
@@ -369,7 +373,7 @@ def _three_bits(padded: U64, j: int, i: int, bit: int) -> Any:
 
 
 @bare
-def _with_border(w: Window, slot: int, bits: U64, padded: U64, base: I64) -> None:
+def _with_border(w: SightWindow, slot: int, bits: U64, padded: U64, base: I64) -> None:
     """Bits of a slot's columns and of those around it.
 
     Args:
@@ -393,7 +397,7 @@ def _with_border(w: Window, slot: int, bits: U64, padded: U64, base: I64) -> Non
 
 
 @kernel
-def pool(w: Window, filled: U64, state: I32, hits: I64, pooled: I64) -> None:
+def pool(w: SightWindow, filled: U64, state: I32, hits: I64, pooled: I64) -> None:
     """Mean rays that ended at each Gaussian and at those across its faces and edges.
 
     Few lines stand for the many rays of a sensor, and what is seen of a surface goes on in the next voxel.
@@ -431,7 +435,7 @@ def pool(w: Window, filled: U64, state: I32, hits: I64, pooled: I64) -> None:
 
 
 @bare
-def read_out(w: Window, state: I32, pooled: I64, near: U8, least_hits: I64, least_passes: I64, seen: U64) -> None:
+def read_out(w: SightWindow, state: I32, pooled: I64, near: U8, least_hits: I64, least_passes: I64, seen: U64) -> None:
     """Which voxels enough rays have met.
 
     Args:
@@ -463,7 +467,7 @@ def read_out(w: Window, state: I32, pooled: I64, near: U8, least_hits: I64, leas
 
 
 @kernel
-def fill(w: Window, filled: U64, near: U8, seen: U64, more: U64) -> None:
+def fill(w: SightWindow, filled: U64, near: U8, seen: U64, more: U64) -> None:
     """Voxels without Gaussian, not next to a flag, that lie between seen ones: at least four of six across faces. Lines
     are fewer than rays and pass them by.
 
@@ -508,7 +512,7 @@ def fill(w: Window, filled: U64, near: U8, seen: U64, more: U64) -> None:
 
 
 @kernel
-def collect(w: Window, seen: U64, found: I32, ends: I64) -> None:
+def collect(w: SightWindow, seen: U64, found: I32, ends: I64) -> None:
     """Voxel ids of the bits, ascending, slot by slot.
 
     Args:
@@ -556,7 +560,7 @@ def _ones_of(seen: U64) -> int:
     return n
 
 
-def voxel_ids(w: Window, seen: U64) -> tuple[I32, I64]:
+def voxel_ids(w: SightWindow, seen: U64) -> tuple[I32, I64]:
     """(K,) voxel ids of the bits, ascending, slot by slot, and (T,) where each slot's end."""
     found, ends = np.empty(_ones_of(seen), np.int32), np.empty(len(w.low), np.int64)
     collect(w, seen, found, ends)

@@ -42,7 +42,7 @@ _LONGEST_UNIT_M: Final = 0.6
 
 
 @dataclass(frozen=True, slots=True)
-class View:
+class TrackView:
     """What a LiDAR looks at, as its own scans tell; so no table of sensors is needed.
 
     Attributes:
@@ -81,7 +81,7 @@ class View:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Piece:
+class TrackPiece:
     """A polyline along which scans counted.
 
     Attributes:
@@ -101,8 +101,8 @@ class Piece:
             raise TrackError(f"vertices {low} … {high} lie outside {_LOWEST} … {_HIGHEST}")
 
     def __eq__(self, other: object) -> bool:
-        same = isinstance(other, Piece) and self.scans == other.scans
-        return same and isinstance(other, Piece) and np.array_equal(self.vertices, other.vertices)
+        same = isinstance(other, TrackPiece) and self.scans == other.scans
+        return same and isinstance(other, TrackPiece) and np.array_equal(self.vertices, other.vertices)
 
     __hash__ = None  # type: ignore[assignment]
 
@@ -118,8 +118,8 @@ class Track:
     """
 
     district: District
-    view: View
-    pieces: tuple[Piece, ...]
+    view: TrackView
+    pieces: tuple[TrackPiece, ...]
 
     def __post_init__(self) -> None:
         n = sum(len(piece.vertices) for piece in self.pieces)
@@ -141,7 +141,7 @@ class Track:
         ]
         return float(sum(units)) * _LONGEST_UNIT_M
 
-    def tile_coordinates(self, piece: Piece) -> F64:
+    def tile_coordinates(self, piece: TrackPiece) -> F64:
         """(N, 3) float64 of a piece's vertices: continuous tile coordinates (u, v) of `tile_id`, height in metres.
 
         East of the date line, u runs on beyond 2^20.
@@ -190,14 +190,14 @@ def decode_track(district: District, data: bytes) -> Track:
         raise CodecError(f"a track of {len(data)} bytes is damaged: its checksum differs")
     try:
         *levels, sectors, rays_log2, range_m = _VIEW.unpack_from(body)
-        return Track(district, View(tuple(levels), sectors, rays_log2, range_m), _pieces(body[_VIEW.size :]))
+        return Track(district, TrackView(tuple(levels), sectors, rays_log2, range_m), _pieces(body[_VIEW.size :]))
     except TrackError as error:
         raise CodecError(f"a track of {len(data)} bytes: {error}") from error
     except StopIteration as error:
         raise CodecError(f"a track of {len(data)} bytes ends before its last vertex") from error
 
 
-def _pieces(body: bytes) -> tuple[Piece, ...]:
+def _pieces(body: bytes) -> tuple[TrackPiece, ...]:
     numbers = _varints(body)
     pieces, last = [], np.zeros(3, np.int64)
     for _ in range(_at_most(next(numbers), MAX_PIECES, "pieces")):
@@ -205,7 +205,7 @@ def _pieces(body: bytes) -> tuple[Piece, ...]:
         folded = np.array([next(numbers) for _ in range(3 * n)], np.int64).reshape(n, 3)
         steps = (folded >> 1) ^ -(folded & 1)
         vertices = last + np.cumsum(steps, axis=0)
-        pieces.append(Piece(vertices.clip(-(2**31), 2**31 - 1).astype(np.int32), scans))
+        pieces.append(TrackPiece(vertices.clip(-(2**31), 2**31 - 1).astype(np.int32), scans))
         last = vertices[-1]
     if next(numbers, None) is not None:
         raise CodecError("a track has bytes behind its last vertex")

@@ -10,7 +10,7 @@ from gnd.gnd_map.arrays import F64, I64
 from gnd.gnd_map.errors import TrackError
 from gnd.gnd_map.geodesy import LocalFrame, meridian_radius_m, normal_radius_m
 from gnd.gnd_map.tile_id import LON_TILES, TILE_RAD, District, TileId, tile_coordinates
-from gnd.gnd_map.track import HEIGHT_UNIT_M, LEVEL_DEG, LEVELS, SECTORS, STEPS, Piece, Track, View
+from gnd.gnd_map.track import HEIGHT_UNIT_M, LEVEL_DEG, LEVELS, SECTORS, STEPS, Track, TrackPiece, TrackView
 
 Mask: TypeAlias = npt.NDArray[np.bool_]
 
@@ -108,12 +108,12 @@ class TrackBuilder:
         east = np.remainder(u - corner.lon_index + LON_TILES // 2, LON_TILES) - LON_TILES // 2
         return np.column_stack([STEPS * east, STEPS * (v - corner.lat_index), height_m / HEIGHT_UNIT_M])
 
-    def _view(self) -> View:
+    def _view(self) -> TrackView:
         quantiles = np.linspace(_STRAY, 1.0 - _STRAY, LEVELS)
         at = np.searchsorted(np.cumsum(self._elevations), quantiles * self._elevations.sum())
         half = self._sectors > 0.5 * np.median(self._sectors[self._sectors > 0])
         reach = int(np.searchsorted(np.cumsum(self._ranges), _NEARLY_ALL * self._ranges.sum()))
-        return View(
+        return TrackView(
             levels=tuple((at - _ELEVATIONS // 2).tolist()),
             sectors=int((half * (1 << np.arange(SECTORS))).sum()),
             rays_log2=min(round(4.0 * float(np.log2(self._rays / self._scans))), 96),
@@ -148,17 +148,17 @@ def _near(position_m: F64, corners: I64, metres: F64) -> Mask:
     return near
 
 
-def _pieces(g: F64, number: I64, metres: F64) -> tuple[Piece, ...]:
+def _pieces(g: F64, number: I64, metres: F64) -> tuple[TrackPiece, ...]:
     """The polylines through positions (N, 3) in units; `number` (N,) tells which scans follow each other."""
     step_m = np.linalg.norm(np.diff(g, axis=0) * metres, axis=1)
     cut = np.flatnonzero((np.diff(number) > 1) | (step_m > GAP_M)) + 1
     return tuple(_piece(part, metres) for part in np.split(g, cut))
 
 
-def _piece(g: F64, metres: F64) -> Piece:
+def _piece(g: F64, metres: F64) -> TrackPiece:
     vertices = np.round(g[_kept(g * metres)]).astype(np.int32)
     moved = np.concatenate([[True], (np.diff(vertices, axis=0) != 0).any(axis=1)])
-    return Piece(np.ascontiguousarray(vertices[moved]), len(g))
+    return TrackPiece(np.ascontiguousarray(vertices[moved]), len(g))
 
 
 def _kept(p_m: F64) -> I64:

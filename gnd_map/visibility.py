@@ -21,9 +21,9 @@ from gnd.gnd_map.classes import ChangeClass
 from gnd.gnd_map.codec import Flags
 from gnd.gnd_map.errors import TrackError
 from gnd.gnd_map.grid import VoxelGrid, zones
-from gnd.gnd_map.sight import FACES, MOST_RAYS, NO_SLOT, NOTHING, STOP, Columns, Window
+from gnd.gnd_map.sight import FACES, MOST_RAYS, NO_SLOT, NOTHING, STOP, SightColumns, SightWindow
 from gnd.gnd_map.tile_id import LON_TILES, TileId, deinterleave
-from gnd.gnd_map.track import SECTORS, Track, View
+from gnd.gnd_map.track import SECTORS, Track, TrackView
 
 U64 = npt.NDArray[np.uint64]
 
@@ -167,7 +167,7 @@ class _Zone:
 
     def _window(
         self, told: Sequence[Flags], corner: I64, places: _Places, shown: npt.NDArray[np.bool_]
-    ) -> tuple[Window, I64]:
+    ) -> tuple[SightWindow, I64]:
         """Room for the voxels of the tiles that lines can reach, and the tile in the window's corner.
 
         Args:
@@ -196,7 +196,7 @@ class _Zone:
                 f"{offset[-1]} voxels, {words} words of floors: at most {_MOST_CELLS}, {_MOST_WORDS}"
             )
         first = ((corner - origin) * columns).astype(np.int32)
-        return Window(
+        return SightWindow(
             columns, self._metres, slot_of, first, offset, low.astype(np.int32), floors.astype(np.int32), int(low.min())
         ), origin
 
@@ -207,7 +207,7 @@ class _Zone:
         every = np.concatenate([floor, np.floor(height_m).astype(np.int64)])
         return int(every.min()), int(every.max())
 
-    def _look(self, w: Window, told: Sequence[Flags], places: _Places, g: F64) -> U64:
+    def _look(self, w: SightWindow, told: Sequence[Flags], places: _Places, g: F64) -> U64:
         """(T * nx * ny, words) a bit for each voxel seen or flagged."""
         state, near = np.full(w.offset[-1], NOTHING, np.int32), np.zeros(w.offset[-1], np.uint8)
         words = (int((w.low + w.floors).max()) - w.lowest) // 64 + 1
@@ -227,7 +227,7 @@ class _Zone:
         sight.cast_fans(
             w, np.column_stack([g, places.height_m]), places.turn, places.rays, self._azimuth, self._slope, _LINES,
             stop, filled, _R2, _RANGE_M, _REACH_M, float(_rounded(np.tan(_OPEN_RAD))), state, hits,
-            Columns.room(), np.empty(2),
+            SightColumns.room(), np.empty(2),
         )  # fmt: skip
         sight.pool(w, filled, state, hits, pooled)
         least_hits, least_passes = _least(_MIN_HITS, _HITS_NEAR), _least(_MIN_PASSES, _PASSES_NEAR)
@@ -266,7 +266,7 @@ def _along(line: F64, tile_m: F64, step_m: float) -> tuple[F64, F64]:
     return places, np.where(size[:, None] > 0.0, flat / np.maximum(size, 1e-9)[:, None], [1.0, 0.0])
 
 
-def _azimuths(view: View) -> F64:
+def _azimuths(view: TrackView) -> F64:
     """(A, 2) unit vectors, x ahead: those that the sensor looks along."""
     azimuth = (np.arange(_AZIMUTHS) + 0.5) * (2.0 * np.pi / _AZIMUTHS)
     sector = (azimuth * (SECTORS / (2.0 * np.pi))).astype(np.int64)
@@ -274,7 +274,7 @@ def _azimuths(view: View) -> F64:
     return _rounded(np.stack([np.cos(azimuth), np.sin(azimuth)], axis=1))
 
 
-def _slopes(view: View) -> F64:
+def _slopes(view: TrackView) -> F64:
     """(_SLOPES,) tangents of the elevations, shared out as the sensor's rays are."""
     share = (np.arange(_SLOPES) + 0.5) / _SLOPES
     return _rounded(np.tan(np.interp(share, np.linspace(0.0, 1.0, len(view.levels)), view.elevations_rad)))
@@ -295,7 +295,7 @@ def _slots(parts: Sequence[I32], tiles: int) -> I32:
     return np.repeat(np.arange(len(parts), dtype=np.int32) % tiles, [len(part) for part in parts])
 
 
-def _read(w: Window, told: Sequence[Flags], seen: U64) -> dict[TileId, I32]:
+def _read(w: SightWindow, told: Sequence[Flags], seen: U64) -> dict[TileId, I32]:
     """Sorted voxel ids of each tile, seen or flagged."""
     ids, ends = sight.voxel_ids(w, seen)
     columns, found = w.columns[0] * w.columns[1], {}

@@ -38,7 +38,7 @@ __all__ = [
     "ANSWER_HASH_BYTES",
     "EVERY_CODEC",
     "HASH_BYTES",
-    "HeldTile",
+    "HeldVersion",
     "TileAnswer",
     "TilesReply",
     "TilesRequest",
@@ -56,7 +56,7 @@ TILES: Final = limits.MAX_TILES_OF_DISTRICT
 
 
 @dataclass(frozen=True, slots=True)
-class HeldTile:
+class HeldVersion:
     """A tile that is wanted, and what the client holds of it."""
 
     tile: TileId
@@ -103,7 +103,7 @@ class TilesRequest:
     @classmethod
     def of(
         cls,
-        held: Iterable[HeldTile],
+        held: Iterable[HeldVersion],
         *,
         codecs: tuple[int, ...] = PREFERRED,
         max_bytes: int = limits.MAX_TILE_BODY_BYTES,

@@ -30,7 +30,7 @@ SCANS = 150
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Recorded:
+class ClockDrive:
     """A drive, what is true of it, and the map that it is to be localised on."""
 
     items: tuple[DriveItem, ...]
@@ -40,7 +40,7 @@ class Recorded:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Run:
+class ClockRun:
     """What a localiser made of a drive."""
 
     localiser: Localiser
@@ -48,7 +48,7 @@ class Run:
     online: tuple[PoseEstimate, ...]
 
 
-def brisk_drive(seed: int, sensor: str, scans: int, folder: Path) -> Recorded:
+def brisk_drive(seed: int, sensor: str, scans: int, folder: Path) -> ClockDrive:
     """A drive of 5 to 12 m/s with up to 2.1 m/s² and swerves of 0.9 m through a street, and the street's old map."""
     world = street(seed)
     config = DriveConfig("car", sensor, "after", cruise_mps=8.5, seed=2, scans=scans)
@@ -61,10 +61,10 @@ def brisk_drive(seed: int, sensor: str, scans: int, folder: Path) -> Recorded:
         for item in drive.items():
             writer.add(item)
     _, local_map = map_of(simulate_drive(world, MAPPING, folder / "map.mcap"))
-    return Recorded(tuple(read_drive(path)), drive.header(), reference_of(path), local_map)
+    return ClockDrive(tuple(read_drive(path)), drive.header(), reference_of(path), local_map)
 
 
-def driven(recorded: Recorded, offset_s: Callable[[float], float], T_vehicle_lidar: F64 | None = None) -> Run:
+def driven(recorded: ClockDrive, offset_s: Callable[[float], float], T_vehicle_lidar: F64 | None = None) -> ClockRun:
     """Localise with motion samples stamped late by `offset_s` of the time since the start [s], or another mount."""
     mount = recorded.header.T_vehicle_lidar if T_vehicle_lidar is None else T_vehicle_lidar
     fix, items = first_fix(_shifted(recorded.items, offset_s), recorded.header.drive_id)
@@ -74,7 +74,7 @@ def driven(recorded: Recorded, offset_s: Callable[[float], float], T_vehicle_lid
         output = pipeline.push(item)
         refined += output.poses
         note_newest(output, online)
-    return Run(pipeline.localiser, (*refined, *pipeline.finish().poses), tuple(online))
+    return ClockRun(pipeline.localiser, (*refined, *pipeline.finish().poses), tuple(online))
 
 
 def _shifted(items: Sequence[DriveItem], offset_s: Callable[[float], float]) -> list[DriveItem]:
@@ -99,7 +99,7 @@ def run() -> list[Figure]:
     return figures
 
 
-def _figure(name: str, recorded: Recorded, offset_ms: int) -> Figure:
+def _figure(name: str, recorded: ClockDrive, offset_ms: int) -> Figure:
     made = driven(recorded, lambda _: offset_ms * 1e-3)
     refined, online = (localisation_error(poses, recorded.reference) for poses in (made.refined, made.online))
     known = made.localiser.calibration

@@ -51,7 +51,7 @@ PEERS: dict[str, Write] = {
 
 
 @dataclass(frozen=True, slots=True)
-class Options:
+class CodecOptions:
     """What is measured: a simulated street, or the tiles of a store; and real recordings."""
 
     seed: int = option(SEED, "World of the simulated street.")
@@ -60,9 +60,9 @@ class Options:
     recordings: Path = option(RECORDINGS, f"Folder with {', '.join(FOLDERS)}.")
 
 
-def run(chosen: Options | None = None) -> list[Figure]:
+def run(chosen: CodecOptions | None = None) -> list[Figure]:
     """Measure every scene that there is."""
-    chosen = chosen or Options()
+    chosen = chosen or CodecOptions()
     first = simulated(chosen.seed, chosen.base) if chosen.store is None else stored(chosen.store)
     figures = [*_measured(first), *_times(first)]
     for name in FOLDERS:

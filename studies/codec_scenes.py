@@ -30,8 +30,8 @@ from gnd.vehicle_agent.localise.parameters import LocaliserParameters, Registrat
 from gnd.vehicle_agent.localise.registration import register
 from gnd.vehicle_agent.localise.sampling import sample_scan
 from studies.frame.scans import local_map_of, posed
-from studies.real.scene import Scene, load, place
-from studies.short_drives import Street
+from studies.real.scene import RecordedScene, load, place
+from studies.short_drives import MappedStreet
 from studies.simulation.base_map import BaseMap, driven, read_base
 
 Tiles = Mapping[TileId, Gaussians]
@@ -157,7 +157,7 @@ def simulated(seed: int = SEED, base: Path | None = None) -> CodecScene:
     """
     world = street(seed, StreetOptions(length_m=LENGTH_M, site="wangsimni"))
     base_map = driven(world) if base is None else read_base(base)
-    scene = Street(world, REACH_M)
+    scene = MappedStreet(world, REACH_M)
     return CodecScene(f"street {seed}", _filled(base_map), scene.grid_frame, list(_driven_scans(scene, world)))
 
 
@@ -165,7 +165,7 @@ def _filled(base: BaseMap) -> Tiles:
     return {tile_id: gaussians for tile_id, gaussians in base.tiles.items() if len(gaussians)}
 
 
-def _driven_scans(scene: Street, world: World) -> Iterator[PosedScan]:
+def _driven_scans(scene: MappedStreet, world: World) -> Iterator[PosedScan]:
     for sensor in SENSORS:
         drive = scene.drive(sensor, "before", 1, world.seed)
         found = [item for item in drive.items() if isinstance(item, Scan)]
@@ -187,7 +187,7 @@ def recorded(folder: Path, progress: Progress = lambda *_: None) -> CodecScene:
     return CodecScene(folder.name, filled, scene.grid_frame, [_posed(scene, scan) for scan in scene.scans])
 
 
-def _posed(scene: Scene, scan: Scan) -> PosedScan:
+def _posed(scene: RecordedScene, scan: Scan) -> PosedScan:
     refined = scene.refined(scan)
     T = refined.estimate.T_map_vehicle
     return np.ascontiguousarray(transform(T_inverse(T), refined.points_map_m)), T

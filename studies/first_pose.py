@@ -18,7 +18,7 @@ from gnd.schemas.drive import MotionSample, Scan
 from gnd.vehicle_agent.tiles_at_hand import localising_on
 from studies.frame.measure import Figure
 from studies.localisation_scenes import Localising
-from studies.short_drives import Drive, Street, gnss_offset_m, is_wrong
+from studies.short_drives import MappedStreet, ShortDrive, gnss_offset_m, is_wrong
 
 SEED, LENGTH_M = 101, 300.0
 SENSORS = ("VLP-16", "HDL-64E", "Scala")
@@ -46,7 +46,7 @@ class Start:
 
 def run() -> list[Figure]:
     """Measure every sensor."""
-    place = Street(street(SEED, StreetOptions(length_m=LENGTH_M, site="wangsimni")))
+    place = MappedStreet(street(SEED, StreetOptions(length_m=LENGTH_M, site="wangsimni")))
     figures: list[Figure] = []
     for sensor in SENSORS:
         up, down = place.drive(sensor, "after", 1, 0), place.drive(sensor, "after", -1, 1)
@@ -55,7 +55,7 @@ def run() -> list[Figure]:
     return figures
 
 
-def _starts(drive: Drive, seed: int) -> list[Start]:
+def _starts(drive: ShortDrive, seed: int) -> list[Start]:
     """The starts of one drive, all of them on one way through it."""
     rng = np.random.default_rng([SEED, seed])
     begin_ns, latest_s = int(drive.truth.t_ns[0]) + 500_000_000, drive.seconds - WINDOW_S - 1.0
@@ -71,7 +71,7 @@ def _starts(drive: Drive, seed: int) -> list[Start]:
     return starts
 
 
-def _feed(start: Start, item: MotionSample | Scan, drive: Drive, rng: np.random.Generator) -> None:
+def _feed(start: Start, item: MotionSample | Scan, drive: ShortDrive, rng: np.random.Generator) -> None:
     begin_s = process_time()
     start.vehicle.push(item)
     start.longest_s = max(start.longest_s, process_time() - begin_s)
@@ -81,7 +81,7 @@ def _feed(start: Start, item: MotionSample | Scan, drive: Drive, rng: np.random.
     _note(start, drive)
 
 
-def _note(start: Start, drive: Drive) -> None:
+def _note(start: Start, drive: ShortDrive) -> None:
     """What the newest estimate is worth."""
     online = start.vehicle.localisation.online
     if online is None or online.t_ns <= start.seen_ns:

@@ -25,14 +25,14 @@ LAGS_S: Final = 60
 
 
 @dataclass(frozen=True, slots=True)
-class Options:
+class GnssNoiseOptions:
     """Which recording."""
 
     recording: Path = option(RECORDING, "Folder with rover_1Hz_spp.pos, reference.csv.")
 
 
 @dataclass(frozen=True, slots=True)
-class GnssNoise:
+class FittedGnssNoise:
     """A Gauss-Markov process with white noise.
 
     Attributes:
@@ -52,9 +52,9 @@ class GnssNoise:
     left_out: float
 
 
-def run(chosen: Options | None = None) -> list[Figure]:
+def run(chosen: GnssNoiseOptions | None = None) -> list[Figure]:
     """Fit the recording, if it is there."""
-    chosen = chosen or Options()
+    chosen = chosen or GnssNoiseOptions()
     if not chosen.recording.is_dir():
         return [Figure("not measured", float("nan"), "", "no folder --recording")]
     noise = fitted(*horizontal_errors(chosen.recording))
@@ -81,7 +81,7 @@ def horizontal_errors(folder: Path) -> tuple[F64, F64]:
     return (fixes.t_ns - fixes.t_ns[0]) * 1e-9, found_m[:, :2] - np.stack(at, axis=1)
 
 
-def fitted(t_s: F64, error_m: F64) -> GnssNoise:
+def fitted(t_s: F64, error_m: F64) -> FittedGnssNoise:
     """The process behind errors float64 (N, 2) [m] at times (N,) [s], at least LAGS_S long."""
     middle = np.median(error_m, axis=0)
     about = error_m - middle
@@ -94,7 +94,7 @@ def fitted(t_s: F64, error_m: F64) -> GnssNoise:
     )  # fmt: skip
     cep = float(np.median(np.linalg.norm(about, axis=1)))
     constant = float(np.linalg.norm(middle))
-    return GnssNoise(sigma, float(time_s), float(share), cep, constant, 1.0 - float(kept.mean()))
+    return FittedGnssNoise(sigma, float(time_s), float(share), cep, constant, 1.0 - float(kept.mean()))
 
 
 def _autocorrelation(t_s: F64, scaled: F64) -> tuple[F64, F64, F64]:

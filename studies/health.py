@@ -26,7 +26,7 @@ from gnd.vehicle_agent.tiles_at_hand import localising_on
 from studies.frame.measure import Figure
 from studies.frame.scans import local_map_of
 from studies.localisation_scenes import Localising
-from studies.short_drives import Drive, Street, gnss_offset_m, is_wrong
+from studies.short_drives import MappedStreet, ShortDrive, gnss_offset_m, is_wrong
 
 SEED, LENGTH_M = 101, 300.0
 SENSORS = ("VLP-16", "Scala")
@@ -35,7 +35,7 @@ WALL_Y_M, WALL_M = 8.3, 5.0
 
 
 @dataclass(frozen=True, slots=True)
-class Case:
+class HealthCase:
     """What the world is like, and what happens to the pose (metres ahead, metres left, degrees) or to the tiles."""
 
     name: str
@@ -55,22 +55,22 @@ class Case:
 
 PUSHES = ((1, 0, 0), (3, 0, 0), (6, 0, 0), (0, 0.5, 0), (0, 1, 0), (0, 3, 0), (0, 0, 2), (0, 0, 5))
 CASES = (
-    Case("fresh map, right pose", "none"),
-    Case("changed map, right pose", "stale_map", "after"),
+    HealthCase("fresh map, right pose", "none"),
+    HealthCase("changed map, right pose", "stale_map", "after"),
     *(
-        Case(f"{state}: {x} m ahead, {y} m left, {turn} deg", "wrong_pose", state, x, y, turn)
+        HealthCase(f"{state}: {x} m ahead, {y} m left, {turn} deg", "wrong_pose", state, x, y, turn)
         for state in STATES
         for x, y, turn in PUSHES
     ),
-    Case("corridor", "poor_place", place="corridor"),
-    Case("open field", "poor_place", place="field"),
-    Case("tiles are taken away", "no_map", tiles="none"),
-    Case("tiles of the next place", "wrong map", tiles="shifted"),
+    HealthCase("corridor", "poor_place", place="corridor"),
+    HealthCase("open field", "poor_place", place="field"),
+    HealthCase("tiles are taken away", "no_map", tiles="none"),
+    HealthCase("tiles of the next place", "wrong map", tiles="shifted"),
 )
 
 
 @dataclass(slots=True)
-class Told:
+class ToldHealth:
     """What a localiser said after the event."""
 
     said: Counter[tuple[str, str]] = field(default_factory=Counter)
@@ -86,7 +86,11 @@ class Told:
 def run() -> list[Figure]:
     """Every case with every sensor."""
     world = street(SEED, StreetOptions(length_m=LENGTH_M, site="wangsimni"))
-    places = {"street": Street(world), "corridor": Street(_only(world, walls=True)), "field": Street(_only(world))}
+    places = {
+        "street": MappedStreet(world),
+        "corridor": MappedStreet(_only(world, walls=True)),
+        "field": MappedStreet(_only(world)),
+    }
     figures = [_figure(sensor, case, _tried(sensor, case, places[case.place])) for sensor in SENSORS for case in CASES]
     total = Figure("good while wrong, all cases", sum(f.value for f in figures), "estimates")
     return [*figures, total]
@@ -105,10 +109,10 @@ def _walls(world: World) -> tuple[WorldObject, ...]:
     return tuple(WorldObject(name, "wall", STATES, "kept", (block,)) for name, block in blocks)
 
 
-def _tried(sensor: str, case: Case, place: Street) -> Told:
+def _tried(sensor: str, case: HealthCase, place: MappedStreet) -> ToldHealth:
     """Drive one case."""
     drive = place.drive(sensor, case.state, 1, 7, empty=case.place != "street")
-    rng, told = np.random.default_rng(SEED), Told()
+    rng, told = np.random.default_rng(SEED), ToldHealth()
     held = place.local_map()
     first_ns = int(drive.truth.t_ns[0]) + int(AT_S * 1e9)
     event_ns, end_ns = first_ns + int(EVENT_S * 1e9), first_ns + int(END_S * 1e9)
@@ -130,7 +134,7 @@ def _tried(sensor: str, case: Case, place: Street) -> Told:
     return told
 
 
-def _happens(case: Case, vehicle: Localising, held: LocalMap, drive: Drive, t_ns: int) -> None:
+def _happens(case: HealthCase, vehicle: Localising, held: LocalMap, drive: ShortDrive, t_ns: int) -> None:
     """The event of a case."""
     if case.is_pushed:
         push = T_from_R_t(exp_so3([0.0, 0.0, np.radians(case.turn_deg)]), [case.ahead_m, case.left_m, 0.0])
@@ -148,7 +152,7 @@ def _happens(case: Case, vehicle: Localising, held: LocalMap, drive: Drive, t_ns
             held.set_tile(Tile(tile_id, 2, there[tile_id]))
 
 
-def _note(told: Told, online: PoseEstimate | None, drive: Drive, event_ns: int) -> None:
+def _note(told: ToldHealth, online: PoseEstimate | None, drive: ShortDrive, event_ns: int) -> None:
     """What is said now, and whether it is true."""
     if online is None or online.t_ns < event_ns:
         return
@@ -167,11 +171,11 @@ def _note(told: Told, online: PoseEstimate | None, drive: Drive, event_ns: int) 
         told.right_again_s = min(told.right_again_s, after_s)
 
 
-def _figure(sensor: str, case: Case, told: Told) -> Figure:
+def _figure(sensor: str, case: HealthCase, told: ToldHealth) -> Figure:
     return Figure(f"{sensor}: {case.name}", float(told.wrong_good), "good while wrong", " | ".join(_details(told)))
 
 
-def _details(told: Told) -> Iterator[str]:
+def _details(told: ToldHealth) -> Iterator[str]:
     for (health, cause), n in told.said.most_common(4):
         yield f"{health}/{cause} {n / max(told.estimates, 1):.0%}"
     if told.wrong_good:

@@ -29,7 +29,7 @@ from gnd.schemas.report_states import ReportState
 from gnd.tile_store.sqlite_store import SqliteStore
 from gnd.vehicle_agent.packing import pack_measured
 from studies.frame.measure import Figure, spent_s
-from studies.short_corpus import Corpus, ShortReport, corpus
+from studies.short_corpus import Corpus, CorpusReport, corpus
 
 CLIENTS = 100
 SESSIONS = 4
@@ -41,7 +41,7 @@ LOOKED_AT = 60
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Sent:
+class SentUpload:
     """What came of a run: latency of each ack, s, and how long it took altogether."""
 
     took_s: np.ndarray
@@ -55,7 +55,7 @@ def run() -> list[Figure]:
     return [*_acks(reports, 1), *_acks(reports, 2), *_costs(reports)]
 
 
-def from_many(reports: Sequence[ShortReport], count: int, name: str) -> list[ShortReport]:
+def from_many(reports: Sequence[CorpusReport], count: int, name: str) -> list[CorpusReport]:
     """The reports again and again, each time as another vehicle's."""
     return [one.of_vehicle(f"{name}-{n}", n) for n, one in enumerate(islice(cycle(reports), count))]
 
@@ -77,7 +77,7 @@ def _acks(reports: Corpus, shards: int) -> list[Figure]:
     ]
 
 
-def _send(connect: str, reports: Sequence[ShortReport], pause_s: float) -> Sent:
+def _send(connect: str, reports: Sequence[CorpusReport], pause_s: float) -> SentUpload:
     """Every client sends its share, one after the other, `pause_s` apart (0: at once)."""
     letters = [(one.key, one.packed.encode()) for one in reports]
     buses = [open_bus(BusConfig(connect=(connect,)), name=f"client-{n}") for n in range(SESSIONS)]
@@ -97,7 +97,7 @@ def _send(connect: str, reports: Sequence[ShortReport], pause_s: float) -> Sent:
     wall_s = time.perf_counter() - start_s
     for bus in buses:
         bus.close()
-    return Sent(np.array([took_s for took_s, _ in outcomes]), wall_s, sum(good for _, good in outcomes))
+    return SentUpload(np.array([took_s for took_s, _ in outcomes]), wall_s, sum(good for _, good in outcomes))
 
 
 def _one(bus: Bus, key: str, payload: bytes) -> tuple[float, bool]:

@@ -29,7 +29,7 @@ from studies.frame.measure import Figure
 
 
 @dataclass(frozen=True)
-class Drift:
+class MapDrift:
     """Errors of odometry: of scale, and of heading, pitch and height by the root of the way."""
 
     scale: float = 0.003
@@ -39,7 +39,7 @@ class Drift:
     start_deg: float = 0.0
 
 
-def drifted(poses: Trajectory, drift: Drift, seed: int) -> Trajectory:
+def drifted(poses: Trajectory, drift: MapDrift, seed: int) -> Trajectory:
     """The track as odometry would have it: it begins at the truth (or beside it) and goes astray from there."""
     rng = np.random.default_rng([91, seed])
     steps = T_inverse(poses.T_dst_vehicle[:-1]) @ poses.T_dst_vehicle[1:]
@@ -57,7 +57,7 @@ def drifted(poses: Trajectory, drift: Drift, seed: int) -> Trajectory:
     return Trajectory(poses.t_ns, np.stack(found))
 
 
-def drift_drive(world: World, config: DriveConfig, path: Path, drift: Drift) -> Trajectory:
+def drift_drive(world: World, config: DriveConfig, path: Path, drift: MapDrift) -> Trajectory:
     """Write a drive with drifting reference poses; give the true ones."""
     simulation = DriveSimulation(world, config)
     t_s = np.arange(-0.1, simulation.scans / config.model.rate_hz + 0.3, 0.1)
@@ -82,9 +82,9 @@ def relative_errors(tracks: list[Trajectory], truths: list[Trajectory]) -> np.nd
 
 
 SEED, LENGTH_M = 1101, 300.0
-PASSES: Final[tuple[tuple[Direction, int, Drift], ...]] = (
-    (1, 11, Drift()),
-    (-1, 12, Drift(start_m=0.8, start_deg=0.5)),
+PASSES: Final[tuple[tuple[Direction, int, MapDrift], ...]] = (
+    (1, 11, MapDrift()),
+    (-1, 12, MapDrift(start_m=0.8, start_deg=0.5)),
 )
 
 

@@ -49,7 +49,7 @@ _AT_ONCE: Final = 100
 """So many reports make one figure of CPU time."""
 
 
-class _Cloud:
+class _MergedCloud:
     """A store and a worker with a clock of their own."""
 
     def __init__(self, base: Path, path: Path) -> None:
@@ -139,7 +139,7 @@ def _part(change: TileChange, kind: str, numbers: np.random.Generator) -> TileCh
 def study(run: Path, n: int, seed: int, folder: Path) -> dict[str, Any]:
     """Heal, then `n` passes; see the module's head."""
     reports, truth = reports_of_run(run), read_truth(run / "world" / "truth.npz")
-    cloud = _Cloud(run / "world" / "base.sqlite", folder / "memory.sqlite")
+    cloud = _MergedCloud(run / "world" / "base.sqlite", folder / "memory.sqlite")
     base = cloud.tiles()
     healing, cpu = [], []
     for report in reports:

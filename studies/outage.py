@@ -31,7 +31,7 @@ PUBLISH_EVERY_S = 0.05
 
 
 @dataclass(slots=True)
-class Served:
+class OutageService:
     """When each service was last given, and the longest pause since `reset`, s, by the monotonic clock."""
 
     last_s: dict[str, float] = field(default_factory=dict)
@@ -75,7 +75,7 @@ def measure(kills: int, between_s: float = BETWEEN_S) -> dict[str, dict[str, flo
         return {victim: _kill(cloud, served, victim, kills, between_s) for victim in VICTIMS}
 
 
-def _kill(cloud: SmallCloud, served: Served, victim: str, kills: int, between_s: float) -> dict[str, float]:
+def _kill(cloud: SmallCloud, served: OutageService, victim: str, kills: int, between_s: float) -> dict[str, float]:
     served.reset()
     for _ in range(kills):
         os.kill(cloud.pid(victim), signal.SIGKILL)
@@ -85,9 +85,9 @@ def _kill(cloud: SmallCloud, served: Served, victim: str, kills: int, between_s:
 
 
 @contextmanager
-def _clients(cloud: SmallCloud) -> Iterator[Served]:
+def _clients(cloud: SmallCloud) -> Iterator[OutageService]:
     """Clients that ask and listen while the block runs, from when each service was given once."""
-    served = Served()
+    served = OutageService()
     tile = tile_key("ndt", cloud.base[0].tile_id)
     place = change_key("ndt", cloud.base[0].tile_id.district)
     report = change_report(0, cloud.base[0]).encode()

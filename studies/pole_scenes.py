@@ -76,7 +76,7 @@ class PoleScan:
 
 
 @dataclass(frozen=True, slots=True)
-class Drive:
+class PoleScans:
     """Which scans of which drive: those that begin at the given times."""
 
     seed: int
@@ -111,7 +111,7 @@ def posts_of(world: World, primitives: int) -> Posts:
 class PoleDrive:
     """A simulated drive whose scans come with the posts that they see; poses are true, the sensor is as it is."""
 
-    def __init__(self, drive: Drive) -> None:
+    def __init__(self, drive: PoleScans) -> None:
         world = _world(drive.seed)
         traffic = Traffic.urban() if drive.traffic else Traffic()
         self._config = DriveConfig("car", drive.sensor, seed=drive.seed, errors=PERFECT, traffic=traffic)
@@ -167,7 +167,7 @@ Mask = NDArray[np.bool_]
 
 
 @dataclass(slots=True)
-class Score:
+class PoleScore:
     """Counts over scans or windows.
 
     Attributes:

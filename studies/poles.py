@@ -25,7 +25,7 @@ from gnd.vehicle_agent.features.poles.slices import PoseSigma
 from studies.frame.measure import Figure
 from studies.frame.options import check, option, seeds
 from studies.pole_real import draw_poles, poles_of, scans_of, stability
-from studies.pole_scenes import BANDS, CHI2_2_95, KINDS, SINGLE, Drive, PoleDrive, PoleScan, Score
+from studies.pole_scenes import BANDS, CHI2_2_95, KINDS, SINGLE, PoleDrive, PoleScan, PoleScans, PoleScore
 
 RECORDINGS: Final = Path(__file__).resolve().parents[2] / "shared" / "data"
 FOLDERS: Final = ("kitti_raw_0060", "kitti00_start16", "radiate_fog", "apollo_ndt")
@@ -39,7 +39,7 @@ SIGMA_M, SIGMA_RAD = 0.04, radians(0.08)
 
 
 @dataclass(frozen=True, slots=True)
-class Options:
+class PoleOptions:
     """Simulated streets and real recordings."""
 
     seeds: tuple[int, ...] = seeds(*SEEDS, text="Worlds of the streets.")
@@ -57,9 +57,9 @@ class Options:
         check(self)
 
 
-def run(chosen: Options | None = None) -> list[Figure]:
+def run(chosen: PoleOptions | None = None) -> list[Figure]:
     """Measure every sensor, then every recording that there is."""
-    chosen = chosen or Options()
+    chosen = chosen or PoleOptions()
     figures: list[Figure] = []
     for sensor in chosen.sensors:
         single, window = measured(sensor, chosen.seeds)
@@ -69,12 +69,12 @@ def run(chosen: Options | None = None) -> list[Figure]:
     return figures
 
 
-def measured(sensor: str, seeds: Sequence[int], starts_s: Sequence[float] = STARTS_S) -> tuple[Score, Score]:
+def measured(sensor: str, seeds: Sequence[int], starts_s: Sequence[float] = STARTS_S) -> tuple[PoleScore, PoleScore]:
     """Scores of single scans and of windows."""
-    single, window = Score(), Score()
+    single, window = PoleScore(), PoleScore()
     for seed in seeds:
         times = tuple(start + WINDOW_STEP_S * k for start in starts_s for k in range(WINDOW_SCANS))
-        drive = PoleDrive(Drive(seed, SHORT_NAMES[sensor], times))
+        drive = PoleDrive(PoleScans(seed, SHORT_NAMES[sensor], times))
         rng, held = np.random.default_rng(seed), list[PoleScan]()
         for scan in drive.scans():
             held.append(scan)
@@ -86,7 +86,7 @@ def measured(sensor: str, seeds: Sequence[int], starts_s: Sequence[float] = STAR
     return single, window
 
 
-def _add(score: Score, rays: Sequence[Rays], scans: Sequence[PoleScan], drive: PoleDrive, here: PoleScan) -> None:
+def _add(score: PoleScore, rays: Sequence[Rays], scans: Sequence[PoleScan], drive: PoleDrive, here: PoleScan) -> None:
     start_s = process_time()
     poles = PoleDetector().window(rays, here.T_map_vehicle[:3, 3])
     score.spent_s.append(process_time() - start_s)
@@ -103,7 +103,7 @@ def _misplaced(scan: PoleScan, rng: np.random.Generator) -> Rays:
     return Rays(ends, starts, PoseSigma(SIGMA_M, SIGMA_RAD))
 
 
-def _by_range(name: str, score: Score) -> Iterator[Figure]:
+def _by_range(name: str, score: PoleScore) -> Iterator[Figure]:
     for band, (low, high) in enumerate(BANDS):
         recall, n = score.recall(band)
         precision, told = score.precision(band)
@@ -112,7 +112,7 @@ def _by_range(name: str, score: Score) -> Iterator[Figure]:
         yield Figure(f"right, {name}, {low} to {high} m", precision, "%", f"of {told} detections")
 
 
-def _figures(name: str, score: Score) -> Iterator[Figure]:
+def _figures(name: str, score: PoleScore) -> Iterator[Figure]:
     recall, n = score.recall()
     of_all, everything = score.recall_of_all()
     precision, told = score.precision()

@@ -38,7 +38,7 @@ from gnd.vehicle_agent.segment.parameters import SegmentParameters
 from gnd.vehicle_agent.segment.segmenter import SegmentedScan
 from studies.gated_merge import Merged, merged
 from studies.real.drive import Poses, Tiles, detect, local_map_of, refined_scans, segmented
-from studies.real.scene import Scene, in_range, keys_of, load, place
+from studies.real.scene import RecordedScene, in_range, keys_of, load, place
 
 I64 = NDArray[np.int64]
 SIGMA_M, SIGMA_RAD = 0.02, 0.001
@@ -51,7 +51,7 @@ class Halves:
     voxels of which the map's own rays make a statement.
     """
 
-    scene: Scene
+    scene: RecordedScene
     tiles: Tiles
     local_map: LocalMap
     driving: Sequence[Scan]

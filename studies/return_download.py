@@ -22,8 +22,8 @@ from gnd.gnd_map.grid import VoxelGrid
 from gnd.gnd_map.tile import Tile, diff
 from gnd.gnd_map.tile_id import TileId
 from gnd.schemas.keys import batch_key
-from gnd.schemas.tiles_batch import HeldTile, TilesRequest
-from gnd.tile_store.answers import Answers
+from gnd.schemas.tiles_batch import HeldVersion, TilesRequest
+from gnd.tile_store.answers import TileAnswers
 from gnd.tile_store.sqlite_store import SqliteStore
 from gnd.tile_store.values import DEFAULT_CODEC, DEFAULT_LAYER
 from studies.codec_scenes import LENGTH_M, SEED
@@ -35,7 +35,7 @@ Tiles = dict[TileId, Gaussians]
 
 
 @dataclass(frozen=True, slots=True)
-class Options:
+class ReturnDownloadOptions:
     """A simulated street and how much of it has changed."""
 
     seed: int = option(SEED, "World of the simulated street.")
@@ -48,9 +48,9 @@ class Options:
         check(self)
 
 
-def run(chosen: Options | None = None) -> list[Figure]:
+def run(chosen: ReturnDownloadOptions | None = None) -> list[Figure]:
     """Measure the first download, the one after changes, and the one when nothing has changed."""
-    chosen = chosen or Options()
+    chosen = chosen or ReturnDownloadOptions()
     before = _map(chosen, chosen.before, "before")
     after = _map(chosen, chosen.after, "after")
     new = partly_changed(before, after, chosen.changed, np.random.default_rng(chosen.seed))
@@ -58,7 +58,7 @@ def run(chosen: Options | None = None) -> list[Figure]:
     voxels = sum(map(len, before.values())) / len(before)
     with tempfile.TemporaryDirectory() as folder, SqliteStore(Path(folder) / "map.sqlite") as store:
         held = _put(store, before)
-        first = _exchanged(store, [HeldTile(one.tile) for one in held])
+        first = _exchanged(store, [HeldVersion(one.tile) for one in held])
         now = _put(store, new)
         returned, again = _exchanged(store, held), _exchanged(store, now)
     detail = f"{len(before)} tiles of {voxels:.0f} voxels, {chosen.codec}"
@@ -111,7 +111,7 @@ def _with_edits(before: Gaussians, after: Gaussians, voxel_ids: I32) -> Gaussian
     return concat([before.take(~np.isin(before.voxel_id, voxel_ids)), after.select(voxel_ids)])
 
 
-def _map(chosen: Options, path: Path | None, state: State) -> Tiles:
+def _map(chosen: ReturnDownloadOptions, path: Path | None, state: State) -> Tiles:
     """The street's map on the lattice; tiles without a Gaussian are left out."""
     base = _driven(chosen.seed, state) if path is None else read_base(path)
     return {tile: snap(g, LATTICES[chosen.codec]) for tile, g in sorted(base.tiles.items()) if len(g)}
@@ -121,21 +121,21 @@ def _driven(seed: int, state: State) -> BaseMap:
     return driven(street(seed, StreetOptions(length_m=LENGTH_M, site="wangsimni")), state)
 
 
-def _put(store: SqliteStore, tiles: Tiles) -> list[HeldTile]:
+def _put(store: SqliteStore, tiles: Tiles) -> list[HeldVersion]:
     """Publish the tiles; what a vehicle holds that has them."""
     made = [Tile(tile, 0, gaussians) for tile, gaussians in tiles.items()]
     results = store.put_tiles(made)
-    return [HeldTile(one.tile_id, result.version, one.sha) for one, result in zip(made, results, strict=True)]
+    return [HeldVersion(one.tile_id, result.version, one.sha) for one, result in zip(made, results, strict=True)]
 
 
-def _exchanged(store: SqliteStore, held: Sequence[HeldTile]) -> tuple[float, float]:
+def _exchanged(store: SqliteStore, held: Sequence[HeldVersion]) -> tuple[float, float]:
     """Bytes up and down a tile when a vehicle that holds this asks for all of it."""
-    sizes = np.array(list(_questions(Answers(store), held)))
+    sizes = np.array(list(_questions(TileAnswers(store), held)))
     up, down = sizes.sum(axis=0) / len(held)
     return float(up), float(down)
 
 
-def _questions(answers: Answers, held: Sequence[HeldTile]) -> Iterator[tuple[int, int]]:
+def _questions(answers: TileAnswers, held: Sequence[HeldVersion]) -> Iterator[tuple[int, int]]:
     for district, tiles in groupby(sorted(held, key=lambda one: one.tile), lambda one: one.tile.district):
         request = TilesRequest.of(tiles)
         reply = answers.many(DEFAULT_LAYER, district, request)

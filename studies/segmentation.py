@@ -36,7 +36,7 @@ Mask = NDArray[np.bool_]
 
 
 @dataclass(slots=True)
-class Score:
+class SegmentationScore:
     """Counts of points and time over scans."""
 
     movers: int = 0
@@ -79,7 +79,7 @@ def run() -> list[Figure]:
     """Measure every sensor with both kinds of poses."""
     figures: list[Figure] = []
     for short, sensor in SHORT_NAMES.items():
-        scores = {name: Score() for name in POSES}
+        scores = {name: SegmentationScore() for name in POSES}
         for seed in SEEDS:
             labelled = list(labelled_scans(sensor, seed))
             for name, (sigma_m, sigma_rad) in POSES.items():
@@ -89,7 +89,7 @@ def run() -> list[Figure]:
     return figures
 
 
-def _figures(name: str, found: Score) -> list[Figure]:
+def _figures(name: str, found: SegmentationScore) -> list[Figure]:
     detail = f"{found.movers:,} points on movers, {found.points / found.scans:,.0f} points a scan"
     return [
         Figure(f"movers that stay, {name}", found.left_percent, "%", detail),
@@ -98,7 +98,7 @@ def _figures(name: str, found: Score) -> list[Figure]:
 
 
 def score(
-    labelled: Iterator[tuple[RefinedScan, Mask]], found: Score, parameters: SegmentParameters | None = None
+    labelled: Iterator[tuple[RefinedScan, Mask]], found: SegmentationScore, parameters: SegmentParameters | None = None
 ) -> None:
     """Segment the scans of one drive and count; labels wait beside the scans, and are never shown to the segmenter."""
     segmenter, waiting = MotionSegmenter(parameters), deque[Mask]()

@@ -13,7 +13,7 @@ from gnd.schemas.keys import change_key
 from gnd.schemas.packed import PackedReport, decode_upload
 from gnd.schemas.report_id import deterministic_report_id
 from studies.frame.errors import ReproduceError
-from studies.frame.folder import RunFolder
+from studies.frame.folder import StudyFolder
 from studies.simulation.base_map import BaseMap, read_base, write_base
 from studies.simulation.result import VehicleResult, read_result
 from studies.simulation.vehicle import VehicleTask, run_vehicle
@@ -29,7 +29,7 @@ _KEY: Final = "short-reports-1"
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class ShortReport:
+class CorpusReport:
     """One report as its vehicle holds it: the first half in short, and whole."""
 
     packed: PackedReport
@@ -40,12 +40,12 @@ class ShortReport:
         """Where it is sent."""
         return change_key(self.whole.layer, self.whole.district)
 
-    def of_vehicle(self, vehicle: str, number: int) -> "ShortReport":
+    def of_vehicle(self, vehicle: str, number: int) -> "CorpusReport":
         """The same from another vehicle, under an id of its own."""
         report_id = deterministic_report_id(
             self.whole.first_ns // 1_000_000, vehicle, str(number), self.packed.report_id
         )
-        return ShortReport(
+        return CorpusReport(
             replace(self.packed, report_id=report_id, vehicle=vehicle),
             replace(self.whole, report_id=report_id, vehicle=vehicle),
         )
@@ -56,7 +56,7 @@ class Corpus:
     """The map that the vehicles drove on, and what they report."""
 
     base: BaseMap
-    reports: tuple[ShortReport, ...]
+    reports: tuple[CorpusReport, ...]
 
     def tiles(self) -> list[Tile]:
         """The map as a store takes it."""
@@ -81,7 +81,7 @@ def corpus(folder: Path = FOLDER, drives: int = DRIVES, length_m: float = LENGTH
     """
     street = street_of("rebuilt", length_m)
     options = TrafficOptions(seed=SEED, street=street, drives=drives, base="surveyed", pcd_drives=0, scans=scans)
-    files = world_files(RunFolder.begun(folder), SEED, options.world)
+    files = world_files(StudyFolder.begun(folder), SEED, options.world)
     path = files.home / "map-standard.npz"
     if not path.is_file():
         prepare_world(files, SEED, options.world)
@@ -114,8 +114,8 @@ def _driven(options: TrafficOptions, files: WorldFiles, base: Path, number: int)
     return read_result(result, key)
 
 
-def _short(result: VehicleResult) -> Iterator[ShortReport]:
+def _short(result: VehicleResult) -> Iterator[CorpusReport]:
     for body, packed in zip(result.reports, result.packed, strict=True):
         first = decode_upload(packed) if packed else None
         if isinstance(first, PackedReport):
-            yield ShortReport(first, ChangeReport.decode(body))
+            yield CorpusReport(first, ChangeReport.decode(body))

@@ -29,7 +29,7 @@ _MARGIN_S, _TRUTH_S = 0.2, 0.01
 
 
 @dataclass(frozen=True)
-class Street:
+class MappedStreet:
     """A world and the map that was made of its state before the changes, by one drive up and one down the street."""
 
     world: World
@@ -54,18 +54,18 @@ class Street:
         """All tiles, held."""
         return local_map_of(self.grid_frame, self.tiles)
 
-    def drive(self, sensor: str, state: State, direction: Direction, seed: int, *, empty: bool = False) -> "Drive":
+    def drive(self, sensor: str, state: State, direction: Direction, seed: int, *, empty: bool = False) -> "ShortDrive":
         """A drive with the default errors of its sensors, from one end of the street to the other; `empty`: of cars."""
         traffic, share = (Traffic(), 0.0) if empty else (Traffic.urban(), 0.2)
         config = DriveConfig("car", sensor, state, direction=direction, seed=seed, car_share=share, traffic=traffic)
-        return Drive(self, DriveSimulation(self.world, config), MODELS[sensor].rate_hz)
+        return ShortDrive(self, DriveSimulation(self.world, config), MODELS[sensor].rate_hz)
 
 
 @dataclass(frozen=True)
-class Drive:
+class ShortDrive:
     """A simulated drive: its truth, and what its sensors give but GNSS, which each trial draws for itself."""
 
-    street: Street
+    street: MappedStreet
     simulation: DriveSimulation
     rate_hz: float
 

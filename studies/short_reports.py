@@ -32,7 +32,7 @@ from gnd.gnd_map.visibility import observed_along
 from gnd.schemas.changes import ChangeReport
 from gnd.schemas.packed import PackedReport
 from studies.frame.command import Bench
-from studies.frame.folder import RunFolder
+from studies.frame.folder import StudyFolder
 from studies.frame.measure import Figure
 from studies.frame.options import option, seeds
 from studies.simulation.base_map import BaseMap
@@ -49,7 +49,7 @@ _RUNS, _PAIRS = 5, 100_000
 
 
 @dataclass(frozen=True, slots=True)
-class Options:
+class ShortReportOptions:
     """Streets to drive, or a finished run."""
 
     seeds: tuple[int, ...] = seeds(21, text="Of the streets.")
@@ -67,7 +67,7 @@ class ShortReport:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Street:
+class ReportStreet:
     """A world of a run with its drives."""
 
     files: WorldFiles
@@ -87,35 +87,35 @@ class Street:
         return ShortReport(whole, body, tuple(tiles))
 
 
-def run(chosen: Options | None = None) -> list[Figure]:
+def run(chosen: ShortReportOptions | None = None) -> list[Figure]:
     """Measure the stages, the agreement and the merge."""
-    wanted = chosen or Options()
+    wanted = chosen or ShortReportOptions()
     if wanted.run is not None:
-        return _measure(_streets(RunFolder(wanted.run), "surveyed"))
+        return _measure(_streets(StudyFolder(wanted.run), "surveyed"))
     with TemporaryDirectory() as folder:
         return _measure(_driven(wanted, Path(folder)))
 
 
-def _driven(wanted: Options, folder: Path) -> list[Street]:
+def _driven(wanted: ShortReportOptions, folder: Path) -> list[ReportStreet]:
     fleet = RunOptions(
         seeds=wanted.seeds, street=StreetOptions(wanted.length_m, "wangsimni"), vehicles=(len(SENSORS),),
         sensors=SENSORS, pcd=False, upload="packed",
     )  # fmt: skip
-    home = RunFolder.create(folder / "run")
+    home = StudyFolder.create(folder / "run")
     outcome = reproduce(fleet, home, Bench(home))
-    return [Street(world.files, read_world_base(world.files), world.vehicles) for world in outcome.worlds]
+    return [ReportStreet(world.files, read_world_base(world.files), world.vehicles) for world in outcome.worlds]
 
 
-def _streets(folder: RunFolder, base_kind: str) -> list[Street]:
+def _streets(folder: StudyFolder, base_kind: str) -> list[ReportStreet]:
     found = []
     for world in folder.finished()["worlds"]:
         files = WorldFiles(folder.root / world["folder"], base_kind)
         results = tuple(VehicleFile(folder.root / v["file"], v["key"]).read() for v in world["vehicles"])
-        found.append(Street(files, read_world_base(files), results))
+        found.append(ReportStreet(files, read_world_base(files), results))
     return found
 
 
-def _measure(streets: list[Street]) -> list[Figure]:
+def _measure(streets: list[ReportStreet]) -> list[Figure]:
     reports = [report for street in streets for report in street.reports()]
     return [*_stages(reports), *_tiles(reports), *_agreement(reports), *_merges(streets)]
 
@@ -230,7 +230,7 @@ def _beside(told: Flags) -> NDArray[np.int64]:
     return np.concatenate([ids + step for size in (1, grid.nx, grid.nx * grid.ny) for step in (-size, size)])
 
 
-def _merges(streets: list[Street]) -> list[Figure]:
+def _merges(streets: list[ReportStreet]) -> list[Figure]:
     """Macro F1 of the merged maps, all vehicles, with whole reports and with those in short."""
     uploads: dict[str, Upload] = {"whole": "full", "in short": "packed"}
     found = []
@@ -241,7 +241,7 @@ def _merges(streets: list[Street]) -> list[Figure]:
     return found
 
 
-def _f1(street: Street, upload: Upload) -> tuple[float, float]:
+def _f1(street: ReportStreet, upload: Upload) -> tuple[float, float]:
     merge = MergeParameters()
     held = arrived(street.base, street.results, merge, upload)
     merged = merged_map(street.base, [body for one in held for body in one.bodies], merge)

@@ -26,7 +26,7 @@ PAPER_MS = 30.39
 
 
 @dataclass(frozen=True, slots=True)
-class Options:
+class SlamcuStepOptions:
     """What is timed."""
 
     seeds: tuple[int, ...] = seeds(11, 12, text="Of the motorways.")
@@ -34,9 +34,9 @@ class Options:
     km: float = option(20.0, "Length of each motorway.")
 
 
-def run(chosen: Options | None = None) -> list[Figure]:
+def run(chosen: SlamcuStepOptions | None = None) -> list[Figure]:
     """Time whole drives."""
-    chosen = chosen or Options()
+    chosen = chosen or SlamcuStepOptions()
     drives = [drive_route(motorway(seed, 1e3 * chosen.km), seed) for seed in chosen.seeds]
     return [_figure(drives, particles) for particles in chosen.particles]
 

@@ -55,7 +55,7 @@ class Plan:
 
 
 @dataclass(frozen=True, slots=True)
-class Outcome:
+class StalledOutcome:
     """What the healthy clients saw, and what became of the stopped ones.
 
     Attributes:
@@ -97,7 +97,7 @@ def run() -> list[Figure]:
     ]
 
 
-def measure(plan: Plan) -> Outcome:
+def measure(plan: Plan) -> StalledOutcome:
     """Run the cloud and the clients, stop some, and let them go on."""
     with tempfile.TemporaryDirectory() as name, ExitStack() as stack:
         folder = Path(name)
@@ -114,7 +114,7 @@ def measure(plan: Plan) -> Outcome:
         cloud.supervisor.stop(names)
         seen = [json.loads((folder / f"{name}.json").read_text()) for name in names[plan.stopped :]]
         heard_again = sum(_heard_after(folder / f"{name}.json", back) for name in names[: plan.stopped])
-        return Outcome(
+        return StalledOutcome(
             _waits(seen, cloud, *calm), _waits(seen, cloud, *stopped), _missed(seen, cloud, *stopped),
             dropped_after_s, heard_again,
         )  # fmt: skip

@@ -45,7 +45,7 @@ class _Sent:
     body: bytes
 
 
-class Answers:
+class TileAnswers:
     """Answers about tiles from a store; remembers what it has decoded and encoded. Any thread may ask."""
 
     def __init__(self, store: Store, remembered_bytes: int = REMEMBERED_BYTES) -> None:

@@ -87,7 +87,7 @@ class BuildResult:
 
 
 @dataclass(frozen=True, slots=True)
-class Source:
+class MapSource:
     """One drive, checked, with its poses in the map frame of the build, which is that of the first drive."""
 
     path: Path
@@ -167,7 +167,7 @@ def put_map(tiles: Sequence[Tile], store: Store, layer: str, surveyed_ns: int) -
     return sum(result.status == "published" for result in results)
 
 
-def surveyed_ns(sources: Sequence[Source]) -> int:
+def surveyed_ns(sources: Sequence[MapSource]) -> int:
     """When the drives of a map ended: the oldest of them, as each tile may be of that one alone."""
     return min(int(source.poses.t_ns[-1]) for source in sources)
 
@@ -175,7 +175,7 @@ def surveyed_ns(sources: Sequence[Source]) -> int:
 class MapPoints:
     """The points of a build in their voxels, each in its zone of latitude."""
 
-    def __init__(self, sources: Sequence[Source], parameters: BuildParameters) -> None:
+    def __init__(self, sources: Sequence[MapSource], parameters: BuildParameters) -> None:
         self.accumulators = tuple(_accumulators(sources, parameters))
 
     def add(self, points_map_m: F64) -> None:
@@ -192,7 +192,7 @@ class MapPoints:
         return _tiles(self.accumulators, n_min_cells, lattice)
 
 
-def drive_sources(drives: Sequence[Path], parameters: BuildParameters) -> list[Source]:
+def drive_sources(drives: Sequence[Path], parameters: BuildParameters) -> list[MapSource]:
     """The drives with checked poses, all in the map frame of the first.
 
     Raises:
@@ -205,14 +205,14 @@ def drive_sources(drives: Sequence[Path], parameters: BuildParameters) -> list[S
     return [_source(Path(drive), anchor, parameters) for drive in drives]
 
 
-def _source(path: Path, anchor: LocalFrame, parameters: BuildParameters) -> Source:
+def _source(path: Path, anchor: LocalFrame, parameters: BuildParameters) -> MapSource:
     header, track = read_header(path), load_track(path)
     check_poses(path, track.reference)
     _check_gnss(path, header.anchor, track.reference, track.gnss, parameters)
     T_map_vehicle = anchor.T_self_other(header.anchor) @ track.reference.T_map_vehicle
     poses = Trajectory(track.reference.t_ns, T_map_vehicle)
     T_map_drive = anchor.T_self_other(header.anchor)
-    return Source(path, header, poses, drive_counts(path).scans, track.gnss, T_map_drive)
+    return MapSource(path, header, poses, drive_counts(path).scans, track.gnss, T_map_drive)
 
 
 def check_poses(path: Path, reference: ReferenceTrack) -> None:
@@ -261,14 +261,14 @@ def _check_gnss(
         )
 
 
-def _accumulators(sources: Sequence[Source], parameters: BuildParameters) -> list[VoxelAccumulator]:
+def _accumulators(sources: Sequence[MapSource], parameters: BuildParameters) -> list[VoxelAccumulator]:
     """One for each zone of latitude that points may fall into."""
     frame = sources[0].header.anchor
     groups = zones(_reachable_tiles(frame, sources, parameters.max_range_m))
     return [VoxelAccumulator(GridFrame.around(frame, tiles)) for tiles in groups.values()]
 
 
-def _reachable_tiles(frame: LocalFrame, sources: Sequence[Source], max_range_m: float) -> set[TileId]:
+def _reachable_tiles(frame: LocalFrame, sources: Sequence[MapSource], max_range_m: float) -> set[TileId]:
     found: set[TileId] = set()
     for source in sources:
         lat, lon, _ = frame.geodetic_from_enu(source.poses.T_dst_vehicle[:, :3, 3])
@@ -276,7 +276,7 @@ def _reachable_tiles(frame: LocalFrame, sources: Sequence[Source], max_range_m: 
     return found
 
 
-def _swept(source: Source, parameters: BuildParameters, progress: Progress | None) -> Iterator[F64 | None]:
+def _swept(source: MapSource, parameters: BuildParameters, progress: Progress | None) -> Iterator[F64 | None]:
     """Points (N, 3) in the map frame of each scan; None for a scan that the poses do not cover."""
     done = 0
     for item in read_drive(source.path):
@@ -287,7 +287,7 @@ def _swept(source: Source, parameters: BuildParameters, progress: Progress | Non
                 progress(source.path, done, source.scans)
 
 
-def _points_map_m(scan: Scan, source: Source, parameters: BuildParameters) -> F64 | None:
+def _points_map_m(scan: Scan, source: MapSource, parameters: BuildParameters) -> F64 | None:
     range_m = np.linalg.norm(scan.points_m, axis=1)
     kept = (range_m >= parameters.min_range_m) & (range_m <= parameters.max_range_m)
     points_m, offset_ns = scan.points_m[kept], scan.t_offset_ns[kept]

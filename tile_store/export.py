@@ -43,7 +43,7 @@ class ExportError(StoreError):
 
 
 @dataclass(frozen=True, slots=True)
-class ExportResult:
+class TilesExported:
     """What was written."""
 
     path: Path
@@ -52,7 +52,7 @@ class ExportResult:
     size_bytes: int
 
 
-def export_map(store: Store, layer: str, prefix: str, path: Path | str, format: str | None = None) -> ExportResult:  # noqa: A002
+def export_map(store: Store, layer: str, prefix: str, path: Path | str, format: str | None = None) -> TilesExported:  # noqa: A002
     """Write the newest tiles of a region; the file appears whole or not at all.
 
     Args:
@@ -71,7 +71,7 @@ def export_map(store: Store, layer: str, prefix: str, path: Path | str, format: 
         raise ExportError(f"unknown export format {name!r}; known are {', '.join(FORMATS)}")
     tiles = region_tiles(store, layer, prefix)
     _write_whole(target, lambda stream: FORMATS[name](stream, tiles))
-    return ExportResult(target, len(tiles), sum(len(tile.gaussians) for tile in tiles), target.stat().st_size)
+    return TilesExported(target, len(tiles), sum(len(tile.gaussians) for tile in tiles), target.stat().st_size)
 
 
 def region_tiles(store: Store, layer: str, prefix: str) -> list[Tile]:

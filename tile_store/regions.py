@@ -45,7 +45,7 @@ def bounds_deg(tiles: Iterable[TileId]) -> tuple[float, float, float, float]:
 
 
 @dataclass(frozen=True, slots=True)
-class Region:
+class TileRegion:
     """What a wildcard query asks for: the chunks behind its kind, `<layer>/<q5>/…`, each a name, `*` or `**`."""
 
     chunks: tuple[str, ...]

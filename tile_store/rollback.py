@@ -28,7 +28,7 @@ MEANING: Final[dict[Action, str]] = {
 
 
 @dataclass(frozen=True, slots=True)
-class Target:
+class RollbackTarget:
     """Where to: a version of one tile, or a time (int ns UTC) of all tiles of a region."""
 
     version: int | None = None
@@ -40,7 +40,7 @@ class Target:
 
 
 @dataclass(frozen=True, slots=True)
-class Step:
+class RollbackStep:
     """What becomes of one tile: from its newest version to the content of another (0: there was none)."""
 
     tile: TileId
@@ -49,7 +49,7 @@ class Step:
     action: Action
 
 
-def plan(store: SqliteStore, layer: str, region: TileId | str, to: Target) -> list[Step]:
+def plan(store: SqliteStore, layer: str, region: TileId | str, to: RollbackTarget) -> list[RollbackStep]:
     """What a rollback of a tile or a region (path prefix) would do, by tile.
 
     Raises:
@@ -59,10 +59,10 @@ def plan(store: SqliteStore, layer: str, region: TileId | str, to: Target) -> li
     return store.look(lambda c: _plan(c, layer, region, to))
 
 
-def roll_back(store: SqliteStore, layer: str, region: TileId | str, to: Target) -> list[Step]:
+def roll_back(store: SqliteStore, layer: str, region: TileId | str, to: RollbackTarget) -> list[RollbackStep]:
     """Do what `plan` says of the store as it is now, all or nothing; every tile that changes begins a new epoch."""
 
-    def work(c: apsw.Connection, now: int) -> list[Step]:
+    def work(c: apsw.Connection, now: int) -> list[RollbackStep]:
         steps = _plan(c, layer, region, to)
         for step in steps:
             if step.action == "rollback":
@@ -74,7 +74,7 @@ def roll_back(store: SqliteStore, layer: str, region: TileId | str, to: Target) 
     return store.transact(work)
 
 
-def _plan(c: apsw.Connection, layer: str, region: TileId | str, to: Target) -> list[Step]:
+def _plan(c: apsw.Connection, layer: str, region: TileId | str, to: RollbackTarget) -> list[RollbackStep]:
     heads = _heads(c, layer, region)
     if to.version is not None:
         if not isinstance(region, TileId):
@@ -93,22 +93,22 @@ def _heads(c: apsw.Connection, layer: str, region: TileId | str) -> Sequence[tup
     return [(TileId(tile), version, sha) for tile, version, sha in rows]
 
 
-def _to_version(c: apsw.Connection, layer: str, tile: TileId, head: int, sha: bytes, version: int) -> Step:
+def _to_version(c: apsw.Connection, layer: str, tile: TileId, head: int, sha: bytes, version: int) -> RollbackStep:
     rows = fetch(c, "sha_of_version", {"layer": layer, "tile": tile.morton, "version": version})
     if not rows:
         raise UnknownVersion(f"tile {tile.path} of layer {layer} has no version {version} (newest: {head})")
-    return Step(tile, head, version, "same" if rows[0][0] == sha else "rollback")
+    return RollbackStep(tile, head, version, "same" if rows[0][0] == sha else "rollback")
 
 
-def _to_time(c: apsw.Connection, layer: str, tile: TileId, head: int, sha: bytes, at_ns: int) -> Step:
+def _to_time(c: apsw.Connection, layer: str, tile: TileId, head: int, sha: bytes, at_ns: int) -> RollbackStep:
     place = {"layer": layer, "tile": tile.morton}
     found = fetch(c, "version_at", place | {"at_ns": at_ns})
     version = found[0][0] if found else 0
     following = fetch(c, "parent_of_next", place | {"version": version})
     if following and following[0][0] != version:  # others lay between them, of whose times nothing is known any more
-        return Step(tile, head, version, "unknown")
+        return RollbackStep(tile, head, version, "unknown")
     if not version:
-        return Step(tile, head, 0, "same" if sha == _empty(layer, tile).sha else "empty")
+        return RollbackStep(tile, head, 0, "same" if sha == _empty(layer, tile).sha else "empty")
     return _to_version(c, layer, tile, head, sha, version)
 
 

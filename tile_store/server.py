@@ -15,8 +15,8 @@ from gnd.schemas.errors import SchemaError
 from gnd.schemas.limits import MAX_TILES_OF_DISTRICT
 from gnd.schemas.tiles import Catalog, TileRequest
 from gnd.schemas.tiles_batch import TilesRequest
-from gnd.tile_store.answers import Answers, reads_layer
-from gnd.tile_store.regions import Region
+from gnd.tile_store.answers import TileAnswers, reads_layer
+from gnd.tile_store.regions import TileRegion
 from gnd.tile_store.store import Store
 from gnd.tile_store.warm import warm_up
 
@@ -40,7 +40,7 @@ class TileServer:
 
     def __init__(self, store: Store, bus: Bus, *, workers: int = 4) -> None:
         self._store, self._bus, self._workers = store, bus, workers
-        self._answers = Answers(store)
+        self._answers = TileAnswers(store)
         self._servings: list[Serving] = []
 
     def __enter__(self) -> Self:
@@ -75,7 +75,7 @@ class TileServer:
             if not request.is_wild:
                 layer, tile = keys.parse_tile_key(request.key)
                 return self._answers.one(self._store.get(layer, tile), wanted).encode()
-            region = Region.of_key(request.key, TILE_ROOT)
+            region = TileRegion.of_key(request.key, TILE_ROOT)
         except SchemaError as error:
             raise _refusal(request, error) from None
         found = [
@@ -106,7 +106,7 @@ class TileServer:
             if not request.is_wild:
                 layer, district = keys.parse_catalog_key(request.key)
                 return Catalog(tuple(self._store.heads(layer, district.path))).encode()
-            region = Region.of_key(request.key, CATALOG_ROOT)
+            region = TileRegion.of_key(request.key, CATALOG_ROOT)
         except SchemaError as error:
             raise _refusal(request, error) from None
         return self._catalogs(region)
@@ -115,7 +115,7 @@ class TileServer:
         for layer, tile in found:
             yield keys.tile_key(layer, tile), self._answers.one(self._store.get(layer, tile), wanted).encode()
 
-    def _catalogs(self, region: Region) -> Iterator[tuple[str, bytes]]:
+    def _catalogs(self, region: TileRegion) -> Iterator[tuple[str, bytes]]:
         for (layer, district), _ in groupby(self._tiles(region), lambda found: (found[0], found[1].district)):
             if region.matches(layer, *district.path.split("/")):
                 yield keys.catalog_key(layer, district), self._catalog(layer, district)
@@ -123,7 +123,7 @@ class TileServer:
     def _catalog(self, layer: str, district: District) -> bytes:
         return Catalog(tuple(self._store.heads(layer, district.path))).encode()
 
-    def _tiles(self, region: Region) -> Iterator[tuple[str, TileId]]:
+    def _tiles(self, region: TileRegion) -> Iterator[tuple[str, TileId]]:
         for layer in self._store.layers() if region.layer is None else [region.layer]:
             for head in self._store.heads(layer, region.prefix):
                 yield layer, head.tile

@@ -23,7 +23,7 @@ _NS_PER_S: Final = 1_000_000_000
 
 
 @dataclass(frozen=True, slots=True)
-class Entry:
+class JournalEntry:
     """Where a report goes in its tile's journal; `opens`: it is the first of its window."""
 
     seq: int
@@ -37,15 +37,15 @@ class Entry:
         return {"seq": self.seq, "window": self.window, "opened_ns": self.opened_ns}
 
 
-def next_entry(c: apsw.Connection, row: ReportRow, config: StoreConfig) -> Entry:
+def next_entry(c: apsw.Connection, row: ReportRow, config: StoreConfig) -> JournalEntry:
     """The place of a new report: in the open window, or in a new one where that is old or full."""
     place = {"layer": row.layer, "tile": row.tile.morton}
     seq, window, opened_ns = _journal(c, place)
     if opened_ns is None:
-        return Entry(seq + 1, max(window, 1), row.received_ns, opens=True)
+        return JournalEntry(seq + 1, max(window, 1), row.received_ns, opens=True)
     if _is_over(row, opened_ns, config) or _is_full(c, place, window, row.vehicle, config):
-        return Entry(seq + 1, window + 1, row.received_ns, opens=True)
-    return Entry(seq + 1, window, opened_ns, opens=False)
+        return JournalEntry(seq + 1, window + 1, row.received_ns, opens=True)
+    return JournalEntry(seq + 1, window, opened_ns, opens=False)
 
 
 def _is_over(row: ReportRow, opened_ns: int, config: StoreConfig) -> bool:
@@ -64,7 +64,7 @@ def _is_full(c: apsw.Connection, place: dict[str, Any], window: int, vehicle: st
     return reports >= config.window_reports or (vehicles >= config.window_vehicles and not is_known)
 
 
-def put(c: apsw.Connection, layer: str, tile: TileId, entry: Entry) -> None:
+def put(c: apsw.Connection, layer: str, tile: TileId, entry: JournalEntry) -> None:
     """Enter it."""
     change(c, "put_journal", {"layer": layer, "tile": tile.morton} | entry.columns)
 
@@ -178,9 +178,9 @@ def windows(c: apsw.Connection) -> list[WindowCounts]:
     return [WindowCounts(layer, TileId(tile), *rest) for layer, tile, *rest in fetch(c, "windows")]
 
 
-def newest(c: apsw.Connection, layer: str, tile: TileId) -> Entry:
+def newest(c: apsw.Connection, layer: str, tile: TileId) -> JournalEntry:
     """The newest entry."""
-    return Entry(*_journal(c, {"layer": layer, "tile": tile.morton}), opens=False)
+    return JournalEntry(*_journal(c, {"layer": layer, "tile": tile.morton}), opens=False)
 
 
 def _journal(c: apsw.Connection, place: dict[str, Any]) -> tuple[int, int, int | None]:

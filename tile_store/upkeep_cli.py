@@ -14,7 +14,7 @@ from gnd.tile_store.check import check_store
 from gnd.tile_store.errors import StoreError
 from gnd.tile_store.options import PATH, bars, existing, json_option, layer_option, show, to_read
 from gnd.tile_store.retention import retain
-from gnd.tile_store.rollback import MEANING, Step, Target, plan, roll_back
+from gnd.tile_store.rollback import MEANING, RollbackStep, RollbackTarget, plan, roll_back
 
 STORE: Final = click.argument("path", metavar="STORE", type=PATH)
 
@@ -162,11 +162,11 @@ def rollback(
     show(values, as_json, print_it)
 
 
-def _target(text: str) -> Target:
-    return Target(version=int(text)) if text.isdecimal() else Target(at_ns=parse_time_ns(text))
+def _target(text: str) -> RollbackTarget:
+    return RollbackTarget(version=int(text)) if text.isdecimal() else RollbackTarget(at_ns=parse_time_ns(text))
 
 
-def _step(step: Step, version: int) -> dict[str, Any]:
+def _step(step: RollbackStep, version: int) -> dict[str, Any]:
     return asdict(step) | {"tile": step.tile.path, "version": version}
 
 

@@ -16,7 +16,7 @@ from gnd.gnd_map.tile_id import TileId
 from gnd.vehicle_agent.cache import TileCache
 from gnd.vehicle_agent.config import DownloadParameters
 from gnd.vehicle_agent.errors import CacheError
-from gnd.vehicle_agent.exchange import Exchange, Fetched, Outcome
+from gnd.vehicle_agent.exchange import Exchange, ExchangeOutcome, Fetched
 from gnd.vehicle_agent.plan import batch_bytes
 
 DOWNLOAD_BATCH_S: Final = 0.25
@@ -196,18 +196,18 @@ class TileFetcher(Generic[TileT]):
             batch[tile_id] = expected_bytes
         return batch
 
-    def _try(self, batch: list[TileId]) -> Outcome[TileT]:
+    def _try(self, batch: list[TileId]) -> ExchangeOutcome[TileT]:
         with self._changed:
             whole = {tile_id for tile_id in batch if self._wrong[tile_id]}
         try:
             if not self._has_router():
-                return Outcome[TileT]()
+                return ExchangeOutcome[TileT]()
             return self._exchange.ask(batch, whole, self._batch_bytes)
         except BusClosed:
-            return Outcome[TileT]()
+            return ExchangeOutcome[TileT]()
         except Exception as error:  # whatever it was: a worker that ends would never fetch again
             self._note("failed", f"{len(batch)} tiles from {batch[0]} on: {error}")
-            return Outcome[TileT]()
+            return ExchangeOutcome[TileT]()
 
     def _has_router(self) -> bool:
         """Whether there is a router within a moment; else the cache has to do. Says so once."""
@@ -227,7 +227,7 @@ class TileFetcher(Generic[TileT]):
             _log.warning("nothing to do without an answer: %s", error)
             return {}
 
-    def _settle_all(self, batch: list[TileId], outcome: Outcome[TileT], instead: dict[TileId, TileT]) -> None:
+    def _settle_all(self, batch: list[TileId], outcome: ExchangeOutcome[TileT], instead: dict[TileId, TileT]) -> None:
         """Note the answers; what has none waits for its next try. The lock is held."""
         for fetched in outcome.fetched:
             self._settle(fetched)

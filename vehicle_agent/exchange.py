@@ -15,7 +15,7 @@ from gnd.schemas.errors import SchemaError, WrongHash
 from gnd.schemas.keys import batch_key
 from gnd.schemas.tile_answer import content_of_answer
 from gnd.schemas.tiles import TileBlob
-from gnd.schemas.tiles_batch import HeldTile, TileAnswer, TilesReply, TilesRequest
+from gnd.schemas.tiles_batch import HeldVersion, TileAnswer, TilesReply, TilesRequest
 from gnd.vehicle_agent.cache import TileCache
 from gnd.vehicle_agent.errors import CacheError
 
@@ -38,7 +38,7 @@ class Fetched(Generic[TileT]):
 
 
 @dataclass(slots=True)
-class Outcome(Generic[TileT]):
+class ExchangeOutcome(Generic[TileT]):
     """What one question came to."""
 
     fetched: list[Fetched[TileT]] = field(default_factory=list)
@@ -58,7 +58,7 @@ class Exchange(Generic[TileT]):
         # One attempt may take all the time there is: a second one would fetch a slow answer twice.
         self._retry = RetryPolicy(attempt_timeout_s=request_s)
 
-    def ask(self, tiles: Sequence[TileId], whole: Collection[TileId], max_bytes: int) -> Outcome[TileT]:
+    def ask(self, tiles: Sequence[TileId], whole: Collection[TileId], max_bytes: int) -> ExchangeOutcome[TileT]:
         """Ask for tiles of one district, the one needed soonest first; those in `whole` as if nothing were cached.
 
         Raises:
@@ -71,7 +71,7 @@ class Exchange(Generic[TileT]):
         unclear = [t for t in tiles if answers[t].status == "hash"]
         if unclear:
             answers |= ask(unclear, with_hashes=True)
-        outcome = Outcome[TileT]()
+        outcome = ExchangeOutcome[TileT]()
         for tile_id in tiles:
             self._take(tile_id, answers[tile_id], held.get(tile_id, NOTHING), outcome)
         return outcome
@@ -93,7 +93,7 @@ class Exchange(Generic[TileT]):
         max_bytes: int,
         with_hashes: bool,
     ) -> dict[TileId, TileAnswer]:
-        wanted = [HeldTile(t, *held.get(t, NOTHING)) for t in tiles]
+        wanted = [HeldVersion(t, *held.get(t, NOTHING)) for t in tiles]
         codecs = codecs_of_layer(self._cache.layer)
         request = TilesRequest.of(wanted, codecs=codecs, max_bytes=max_bytes, near=tiles[0], with_hashes=with_hashes)
         payload = self._bus.request(
@@ -106,7 +106,7 @@ class Exchange(Generic[TileT]):
         )
         return dict(TilesReply.decode(payload).of_request(request, district))
 
-    def _take(self, tile_id: TileId, answer: TileAnswer, held: Head, outcome: Outcome[TileT]) -> None:
+    def _take(self, tile_id: TileId, answer: TileAnswer, held: Head, outcome: ExchangeOutcome[TileT]) -> None:
         if answer.status in ("later", "hash"):
             outcome.later.append(tile_id)
             return

@@ -29,12 +29,12 @@ from gnd.vehicle_agent.importers.mounting import levelled, with_mount
 from gnd.vehicle_agent.importers.pcd import open_pcd
 from gnd.vehicle_agent.importers.planes import open_planes
 from gnd.vehicle_agent.importers.radiate import open_radiate
-from gnd.vehicle_agent.importers.recording import GNSS_SIGMA_M, Anchor, Recording
+from gnd.vehicle_agent.importers.recording import GNSS_SIGMA_M, Recording, RecordingAnchor
 from gnd.vehicle_agent.importers.splits import chosen_scans
 
 F64 = NDArray[np.float64]
 
-FORMATS: Final[dict[str, Callable[[Path, Anchor | None], Recording]]] = {
+FORMATS: Final[dict[str, Callable[[Path, RecordingAnchor | None], Recording]]] = {
     "kitti": open_kitti,
     "radiate": open_radiate,
     "pcd": open_pcd,
@@ -81,7 +81,7 @@ def import_recording(
     out: Path,
     *,
     scans: str = "all",
-    anchor: Anchor | None = None,
+    anchor: RecordingAnchor | None = None,
     vehicle: str = "recorded",
     topic: str | None = None,
     progress: Progress = no_progress,
@@ -108,7 +108,9 @@ def import_recording(
     return write_drive(recording, track, out, scans, vehicle, progress)
 
 
-def open_recording(kind: str, folder: Path, anchor: Anchor | None = None, topic: str | None = None) -> Recording:
+def open_recording(
+    kind: str, folder: Path, anchor: RecordingAnchor | None = None, topic: str | None = None
+) -> Recording:
     """A recording of a known format, or of the one that it is found to be of; ImportDriveError when it is none."""
     if kind not in (*FORMATS, AUTO):
         raise ImportDriveError(f"format {kind!r} is not known; known are {', '.join(FORMATS)} and {AUTO}")

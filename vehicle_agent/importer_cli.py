@@ -10,7 +10,7 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TaskID, TextC
 
 from gnd.vehicle_agent.errors import ImportDriveError
 from gnd.vehicle_agent.importer import AUTO, FORMATS, import_recording
-from gnd.vehicle_agent.importers.recording import Anchor
+from gnd.vehicle_agent.importers.recording import RecordingAnchor
 from gnd.vehicle_agent.importers.splits import CHOICES
 
 
@@ -52,7 +52,7 @@ def step_bars() -> Iterator[Callable[[str, int, int], None]]:
         yield show
 
 
-def _anchor(text: str | None) -> Anchor | None:
+def _anchor(text: str | None) -> RecordingAnchor | None:
     """LAT,LON,HEIGHT; ImportDriveError when it is something else."""
     if text is None:
         return None
@@ -60,4 +60,4 @@ def _anchor(text: str | None) -> Anchor | None:
         lat, lon, height = (float(part) for part in text.split(","))
     except ValueError as error:
         raise ImportDriveError(f"--anchor {text!r}: expected LAT,LON,HEIGHT, such as 37.56,127.03,30") from error
-    return Anchor(lat, lon, height)
+    return RecordingAnchor(lat, lon, height)

@@ -8,7 +8,7 @@ from gnd.gnd_map.arrays import F64
 from gnd.gnd_map.geodesy import LocalFrame
 from gnd.schemas.drive import DriveItem, GnssFix, MotionSample
 from gnd.vehicle_agent.localise.estimates import PoseEstimate
-from gnd.vehicle_agent.plan import Course
+from gnd.vehicle_agent.plan import VehicleCourse
 
 LONGEST_STEP_S = 1.0  # a gap in the wheel speed is not driven
 HEADING_BASE_M = 3.0  # satellites give a heading from fixes this far apart
@@ -42,11 +42,11 @@ class Place:
         self.health = online.health if online is not None else "lost"
 
     @property
-    def course(self) -> Course:
+    def course(self) -> VehicleCourse:
         """Where the vehicle goes; in reverse gear the way that it came."""
         x_m, y_m = self.position_map_m[:2].tolist()
         course_rad = None if self.heading_rad is None else self.heading_rad + self._back_rad
-        return Course(x_m, y_m, course_rad, abs(self.speed_mps))
+        return VehicleCourse(x_m, y_m, course_rad, abs(self.speed_mps))
 
     def ahead_map_m(self, distance_m: float) -> F64:
         """(2, 3) here and `distance_m` farther along the course; (1, 3) while the heading is not known."""

@@ -20,7 +20,7 @@ SMALLEST_BATCH_BYTES, LARGEST_BATCH_BYTES = 4_096, 131_072
 
 
 @dataclass(frozen=True, slots=True)
-class Course:
+class VehicleCourse:
     """Where the vehicle is and where it goes, horizontally in the map frame."""
 
     x_m: float
@@ -62,7 +62,7 @@ class Need:
     """When it is left behind; infinite where nobody knows."""
 
 
-def needs(frame: LocalFrame, tiles: Sequence[TileId], course: Course, near_m: float) -> list[Need]:
+def needs(frame: LocalFrame, tiles: Sequence[TileId], course: VehicleCourse, near_m: float) -> list[Need]:
     """When the vehicle comes within `near_m` of each tile and leaves it, soonest first.
 
     Near is measured to the tile's edges, each by itself: at its corners a tile is near up to 1.4 times as far.

@@ -30,7 +30,7 @@ from gnd.vehicle_agent.detect.classify import Classification, classify, tile_cha
 from gnd.vehicle_agent.detect.detector import ChangeDetector
 from gnd.vehicle_agent.detect.doubts import (
     LEAST_WITHHELD,
-    Account,
+    TileAccount,
     TileDoubts,
     changed_share_of,
     doubt_of,
@@ -74,7 +74,7 @@ class _Stretch:
 
 
 @dataclass(slots=True)
-class _Pending:
+class _PendingTiles:
     """Statements about tiles of one district that wait to be reported together.
 
     Attributes:
@@ -160,7 +160,7 @@ class Reporter:
         self._detector, self._outbox, self._who = detector, outbox, identity
         self._start_ns, self._parameters, self._course = start_ns, parameters, course
         self._statement = statement or statement_on_lattice
-        self._pending: dict[District, _Pending] = {}
+        self._pending: dict[District, _PendingTiles] = {}
         self._numbers: Counter[District] = Counter()
         self._stretch: _Stretch | None = None
         self._looked_at: F64 | None = None
@@ -306,7 +306,7 @@ class Reporter:
                 doubt = doubt_of(found, account, day_of(self._now_ns))
                 self._take(replace(self._statement(found), doubt=doubt), evidence.base, odometer_m)
 
-    def _without_pose_error(self, found: Classification, account: Account) -> Classification:
+    def _without_pose_error(self, found: Classification, account: TileAccount) -> Classification:
         """The classes without what a shift of the whole tile explains, although each stretch of the drive passed."""
         if not self._parameters.check_poses or self._T_map_vehicle is None:
             return found
@@ -323,7 +323,7 @@ class Reporter:
         abstains = np.where(error.explained, ChangeClass.UNMEASURED, found.change_class).astype(np.uint8)
         return Classification(found.evidence, abstains)
 
-    def _hold_back(self, found: Classification, account: Account, odometer_m: float) -> None:
+    def _hold_back(self, found: Classification, account: TileAccount, odometer_m: float) -> None:
         """Say of a tile only that a pose error explains it; where there is no map, nothing could be."""
         self.counts["tiles_held_back"] += 1
         self.counts["changes_held_back"] += len(account.withheld)
@@ -339,7 +339,7 @@ class Reporter:
         district = change.tile.district
         if district in self._pending and change.tile in self._pending[district].changes:
             self._report(district)  # the vehicle came back: one statement a tile and report
-        pending = self._pending.setdefault(district, _Pending(odometer_m, self._here_ns))
+        pending = self._pending.setdefault(district, _PendingTiles(odometer_m, self._here_ns))
         pending.add(change, base, odometer_m, self._here_ns)
 
     def _report(self, district: District) -> None:
@@ -351,7 +351,7 @@ class Reporter:
         for tiles in (pending.changes.keys() - held_back, held_back):
             self._put(district, tiles, pending, whole=tiles is held_back)
 
-    def _put(self, district: District, tiles: Set[TileId], pending: _Pending, *, whole: bool) -> None:
+    def _put(self, district: District, tiles: Set[TileId], pending: _PendingTiles, *, whole: bool) -> None:
         """Report these of the pending tiles; those that an earlier life of this agent has stated stand as they are."""
         while tiles := self._unstated(tiles):
             report = self._make(district, [pending.changes[t] for t in sorted(tiles)])

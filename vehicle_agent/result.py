@@ -21,7 +21,7 @@ from gnd.vehicle_agent.localise.estimates import PoseEstimate, localisation_erro
 
 
 @dataclass(slots=True)
-class Evaluation:
+class PoseEvaluation:
     """Refined poses and reference poses side by side."""
 
     T_map_anchor: F64
@@ -31,7 +31,7 @@ class Evaluation:
     reference_pose: list[F64] = field(default_factory=list)
 
     @classmethod
-    def between(cls, map_frame: LocalFrame, anchor: LocalFrame) -> "Evaluation":
+    def between(cls, map_frame: LocalFrame, anchor: LocalFrame) -> "PoseEvaluation":
         """For a map frame and the frame in which the drive's reference is given."""
         return cls(map_frame.T_self_other(anchor))
 

@@ -21,7 +21,7 @@ from gnd.vehicle_agent.local_map import LocalMap, Touched
 from gnd.vehicle_agent.memory import MemoryMeter
 from gnd.vehicle_agent.pipeline import Fed, Pipeline
 from gnd.vehicle_agent.report import Identity
-from gnd.vehicle_agent.result import Evaluation
+from gnd.vehicle_agent.result import PoseEvaluation
 from gnd.vehicle_agent.sources.recording import first_fix, paced
 from gnd.vehicle_agent.sources.world_clock import in_common_time
 from gnd.vehicle_agent.telemetry import Telemetry
@@ -50,7 +50,7 @@ class OnTheBus:
 
 
 @dataclass(slots=True)
-class Vehicle:
+class AgentVehicle:
     """Everything that one drive needs; made by `open_vehicle`, owned by the agent's main thread."""
 
     config: AgentConfig
@@ -59,7 +59,7 @@ class Vehicle:
     stop: threading.Event
     link: Link
     pipeline: Fed
-    evaluation: Evaluation
+    evaluation: PoseEvaluation
     way: Way
     bus: OnTheBus
     started_s: float = field(default_factory=time.monotonic)
@@ -164,7 +164,7 @@ class Vehicle:
 
 
 @contextmanager
-def open_vehicle(config: AgentConfig, stop: threading.Event) -> Iterator[Vehicle]:
+def open_vehicle(config: AgentConfig, stop: threading.Event) -> Iterator[AgentVehicle]:
     """Read the recording's head, join the bus and put the parts together; closes all in reverse order.
 
     Raises:
@@ -175,9 +175,9 @@ def open_vehicle(config: AgentConfig, stop: threading.Event) -> Iterator[Vehicle
     with open_link(config) as link, open_feature_tiles(config, link, stop) as feature_tiles:
         bus = OnTheBus(config, link, feature_tiles, stop)
         pipeline = _pipeline(header, fix, bus)
-        evaluation = Evaluation.between(pipeline.place.frame, header.anchor)
+        evaluation = PoseEvaluation.between(pipeline.place.frame, header.anchor)
         with Way(config.work_dir / WAY_FILE, pipeline.tile) as way:
-            vehicle = Vehicle(config, header, items, stop, link, pipeline, evaluation, way, bus)
+            vehicle = AgentVehicle(config, header, items, stop, link, pipeline, evaluation, way, bus)
             telemetry = Telemetry(link.bus, config.vehicle, vehicle.sample)
             try:
                 yield vehicle

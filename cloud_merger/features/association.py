@@ -7,7 +7,7 @@ import numpy as np
 from scipy.optimize import linear_sum_assignment
 
 from gnd.cloud_merger.features.parameters import FeatureMergeParameters
-from gnd.cloud_merger.features.rls import Place
+from gnd.cloud_merger.features.rls import PlaceEstimate
 from gnd.cloud_merger.features.shapes import across
 from gnd.gnd_map.arrays import F64
 
@@ -21,7 +21,10 @@ _LEAST_OVERLAP: Final = 0.5
 
 
 def pairs(
-    measured: Sequence[Place], known: Sequence[Place], witnesses: Sequence[int], parameters: FeatureMergeParameters
+    measured: Sequence[PlaceEstimate],
+    known: Sequence[PlaceEstimate],
+    witnesses: Sequence[int],
+    parameters: FeatureMergeParameters,
 ) -> list[tuple[int, int]]:
     """The most likely one-to-one association of measurements with features, as (measurement, feature).
 
@@ -45,7 +48,7 @@ def pairs(
     return [(int(i), int(j)) for i, j in zip(rows, columns, strict=True) if j < len(known) and possible[i, j]]
 
 
-def costs(measured: Sequence[Place], known: Sequence[Place], parameters: FeatureMergeParameters) -> F64:
+def costs(measured: Sequence[PlaceEstimate], known: Sequence[PlaceEstimate], parameters: FeatureMergeParameters) -> F64:
     """(M, N) -2 ln likelihood but for a constant; infinite outside the gates."""
     offset, reach_m = _offsets(measured, known)
     of_point = len(known[0].points_m) == 1
@@ -58,7 +61,7 @@ def costs(measured: Sequence[Place], known: Sequence[Place], parameters: Feature
     return np.where(near & (square <= gate), square + np.log(area), np.inf)
 
 
-def _offsets(measured: Sequence[Place], known: Sequence[Place]) -> tuple[F64, F64]:
+def _offsets(measured: Sequence[PlaceEstimate], known: Sequence[PlaceEstimate]) -> tuple[F64, F64]:
     """(M, N, 3) from features to measurements, and (M, N) how far apart they are horizontally."""
     if len(known[0].points_m) == 1:
         offset = np.stack([m.points_m[0] for m in measured])[:, None] - np.stack([k.points_m[0] for k in known])[None]
@@ -75,6 +78,6 @@ def _beside(line_m: F64, other_m: F64) -> tuple[F64, float]:
     return (there[0], there[1]) if there[2] >= back[2] else (-back[0], back[1])
 
 
-def fits(measured: Place, known: Place, parameters: FeatureMergeParameters) -> bool:
+def fits(measured: PlaceEstimate, known: PlaceEstimate, parameters: FeatureMergeParameters) -> bool:
     """Whether a measurement lies inside the gates of a feature."""
     return bool(np.isfinite(costs([measured], [known], parameters)[0, 0]))

@@ -8,7 +8,7 @@ import numpy as np
 
 from gnd.cloud_merger.features.memory import Vote
 from gnd.cloud_merger.features.statements import Statement
-from gnd.cloud_merger.features.tracks import Bases, Track, Tracks
+from gnd.cloud_merger.features.tracks import Bases, FeatureTrack, FeatureTracks
 from gnd.gnd_map.features import VACUOUS, Existence, miss
 from gnd.gnd_map.geodesy import LocalFrame
 from gnd.gnd_map.tile_id import TileId
@@ -45,7 +45,7 @@ def capped(existence: Existence, most: float) -> Existence:
     return existence if known <= most else existence.discounted(most / known)
 
 
-def prior_of(track: Track) -> Existence:
+def prior_of(track: FeatureTrack) -> Existence:
     """What the map itself says of a feature."""
     return VACUOUS if track.epoch is None else capped(track.epoch.existence, FEATURE_PRIOR)
 
@@ -55,7 +55,7 @@ def verdict(prior: Existence, votes: Iterable[Existence]) -> Existence:
     return capped(pooled([prior, *votes]), FEATURE_CEILING)
 
 
-def add_views(tile: TileId, tracks: Tracks, said: Sequence[Statement], bases: Bases) -> None:
+def add_views(tile: TileId, tracks: FeatureTracks, said: Sequence[Statement], bases: Bases) -> None:
     """Let those vote "absent" who looked where a feature is said to be, had it not in their map, and found nothing.
 
     Those who passed before anyone had seen it speak of another time. A report whose base is not known abstains.
@@ -72,7 +72,7 @@ def add_views(tile: TileId, tracks: Tracks, said: Sequence[Statement], bases: Ba
                 track.votes[number] = Vote(one.vehicle, absent)
 
 
-def _cells(tile: TileId, track: Track, margin_m: float) -> int:
+def _cells(tile: TileId, track: FeatureTrack, margin_m: float) -> int:
     """Mask of the cells that hold a feature, give or take its sigma; of one that lies outside, those nearest to it."""
     cov = track.state.cov_m2
     half_m = np.maximum(np.sqrt(np.diag(cov)[:2]), margin_m)

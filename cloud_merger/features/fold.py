@@ -10,9 +10,9 @@ from gnd.cloud_merger.features.memory import LayerMemory, Remembered, Vote
 from gnd.cloud_merger.features.merge import Hypotheses, MergedFeatures
 from gnd.cloud_merger.features.parameters import FeatureMergeParameters
 from gnd.cloud_merger.features.publication import FEATURE_VOTERS, Story
-from gnd.cloud_merger.features.rls import Place, estimate
+from gnd.cloud_merger.features.rls import PlaceEstimate, estimate
 from gnd.cloud_merger.features.shapes import length_of
-from gnd.cloud_merger.features.tracks import Track
+from gnd.cloud_merger.features.tracks import FeatureTrack
 
 VOTES_KEPT: Final = 16
 """Of a feature the votes of so many vehicles, the newest, or of as many as decide (`FeatureMergeParameters.voters`)."""
@@ -121,7 +121,7 @@ def _remembered(
     )  # fmt: skip
 
 
-def _known(story: Story, before: set[str]) -> Place | None:
+def _known(story: Story, before: set[str]) -> PlaceEstimate | None:
     """What was known, with what these vehicles have measured: each weighs what it weighed beside the others."""
     places = [place for vehicle, place in story.balanced().items() if vehicle in before] if before else []
     places = [*([] if story.known is None else [story.known]), *places]
@@ -137,7 +137,7 @@ def _names(what: Hypotheses, story: Story, cited: set[int]) -> tuple[int, ...]:
     return tuple(name for name in names if name in newest or name in cited)
 
 
-def _apart(tracks: Sequence[Track], reach_m: float) -> Mapping[int, frozenset[int]]:
+def _apart(tracks: Sequence[FeatureTrack], reach_m: float) -> Mapping[int, frozenset[int]]:
     """Which of them are not one although they might be by what is known of them, since a report has told them apart."""
     found: dict[int, set[int]] = defaultdict(set)
     like: dict[tuple[str, bool], list[int]] = defaultdict(list)

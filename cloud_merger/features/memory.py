@@ -15,7 +15,7 @@ import numpy as np
 import zstandard
 
 from gnd.cloud_merger.errors import MergerError
-from gnd.cloud_merger.features.rls import Place
+from gnd.cloud_merger.features.rls import PlaceEstimate
 from gnd.cloud_merger.features.statements import Attributes
 from gnd.gnd_map.arrays import F64
 from gnd.gnd_map.features import Existence, Feature
@@ -63,7 +63,7 @@ class Own:
 
     vehicle: str
     repeats: int
-    place: Place
+    place: PlaceEstimate
     attributes: Attributes = ()
     is_finder: bool = False
     earlier: int = 0
@@ -99,7 +99,7 @@ class Remembered:
     feature_id: int
     kind: str
     names: tuple[int, ...]
-    state: Place
+    state: PlaceEstimate
     epoch: Feature | None
     quoted: Feature | None
     shown: Feature | None
@@ -108,7 +108,7 @@ class Remembered:
     is_away: bool
     votes: tuple[tuple[int, Vote], ...]
     measured: tuple[Own, ...]
-    known: Place | None
+    known: PlaceEstimate | None
     vehicles_before: int
     ayes_before: int
     hits_before: int
@@ -161,7 +161,7 @@ class LayerMemory:
 
     def encode(self) -> bytes:
         """Bytes for the store: JSON, zstd. Floats come back bit for bit."""
-        features = _Table()
+        features = _MemoryTable()
         tracks = [_told(track, features) for track in self.tracks]
         said = {"format": _FORMAT, "witnesses": self.witnesses, "features": features.told, "tracks": tracks}
         return zstandard.ZstdCompressor(level=_LEVEL).compress(json.dumps(said, separators=(",", ":")).encode())
@@ -183,7 +183,7 @@ class LayerMemory:
             raise MergerError(f"a memory of {len(body)} bytes cannot be read: {error}") from error
 
 
-class _Table:
+class _MemoryTable:
     """Features, each told once: what is published is mostly what the map has."""
 
     def __init__(self) -> None:
@@ -199,7 +199,7 @@ class _Table:
         return self._number[feature]
 
 
-def _told(track: Remembered, features: _Table) -> list[Any]:
+def _told(track: Remembered, features: _MemoryTable) -> list[Any]:
     known = [features.number(one) for one in (track.epoch, track.quoted, track.shown)]
     flags = [int(one) for one in (track.is_published, track.is_settled, track.is_away)]
     counts = [track.vehicles_before, track.ayes_before, track.hits_before, track.day]
@@ -249,13 +249,13 @@ def _masses(said: Existence) -> list[float]:
     return [said.exist, said.absent, said.unknown, said.conflict]
 
 
-def _place(place: Place) -> list[Any]:
+def _place(place: PlaceEstimate) -> list[Any]:
     return [place.points_m.ravel().tolist(), place.cov_m2.ravel().tolist()]
 
 
-def _place_of(said: Sequence[Any]) -> Place:
+def _place_of(said: Sequence[Any]) -> PlaceEstimate:
     points_m, cov_m2 = said
-    return Place(_array(points_m).reshape(-1, 3), _array(cov_m2).reshape(3, 3))
+    return PlaceEstimate(_array(points_m).reshape(-1, 3), _array(cov_m2).reshape(3, 3))
 
 
 def _told_feature(one: Feature) -> list[Any]:

@@ -17,7 +17,7 @@ from gnd.cloud_merger.features.publication import Outcome, Story, story_of
 from gnd.cloud_merger.features.refuted import heard, left_out, refuted_of, tests_of
 from gnd.cloud_merger.features.spread import spread
 from gnd.cloud_merger.features.statements import Statement, contents_of, statements_of
-from gnd.cloud_merger.features.tracks import Bases, Tracks
+from gnd.cloud_merger.features.tracks import Bases, FeatureTracks
 from gnd.gnd_map.features import Feature, FeatureTile
 from gnd.gnd_map.tile_id import TileId
 from gnd.schemas.features import FeatureReport
@@ -111,8 +111,8 @@ def _tracks_of(
     contents: Bases,
     parameters: FeatureMergeParameters,
     memory: LayerMemory | None,
-) -> Tracks:
-    tracks = Tracks(epoch, contents, parameters, memory)
+) -> FeatureTracks:
+    tracks = FeatureTracks(epoch, contents, parameters, memory)
     for number, statement in enumerate(said):
         tracks.hear(number, statement)
     tracks.settle()

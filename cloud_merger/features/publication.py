@@ -12,10 +12,10 @@ from gnd.cloud_merger.features.association import HEIGHT_KNOWN_M2
 from gnd.cloud_merger.features.existence import prior_of, verdict
 from gnd.cloud_merger.features.memory import Own, Vote
 from gnd.cloud_merger.features.parameters import FeatureMergeParameters
-from gnd.cloud_merger.features.rls import Place, balanced, estimate, fused, is_even, step
+from gnd.cloud_merger.features.rls import PlaceEstimate, balanced, estimate, fused, is_even, step
 from gnd.cloud_merger.features.shapes import length_of
 from gnd.cloud_merger.features.statements import Attributes
-from gnd.cloud_merger.features.tracks import Measured, Track
+from gnd.cloud_merger.features.tracks import FeatureTrack, Measured
 from gnd.gnd_map.features import Existence, Feature, full_covariance, geodetic_in_tile
 from gnd.gnd_map.features.feature import MAX_COUNT
 from gnd.gnd_map.tile_id import TileId
@@ -49,7 +49,7 @@ class Outcome:
     is_decided: bool
 
 
-def story_of(tile: TileId, track: Track, parameters: FeatureMergeParameters) -> "Story":
+def story_of(tile: TileId, track: FeatureTrack, parameters: FeatureMergeParameters) -> "Story":
     """What becomes of a hypothesis, report by report."""
     story = Story(tile, track, parameters)
     for report in sorted(track.votes.keys() | track.measured.keys()):
@@ -70,10 +70,10 @@ class _Cast:
 class Story:
     """A hypothesis after some of its reports; see `Remembered` for the attributes."""
 
-    def __init__(self, tile: TileId, track: Track, parameters: FeatureMergeParameters) -> None:
+    def __init__(self, tile: TileId, track: FeatureTrack, parameters: FeatureMergeParameters) -> None:
         self.track, self._tile, self._parameters = track, tile, parameters
         known, before = track.epoch, track.before
-        self.known = None if known is None else Place.of(known.points_m, known.cov_m2)
+        self.known = None if known is None else PlaceEstimate.of(known.points_m, known.cov_m2)
         self.shown: Feature | None = known
         self.is_published, self.is_away = known is not None, False
         self.is_settled = track.is_of_map or not track.is_point
@@ -93,12 +93,12 @@ class Story:
         self._before = self.shown if self.is_published else None
         self._prior = prior_of(track)
         self.masses = self._prior
-        self._state: Place | None = self.known
+        self._state: PlaceEstimate | None = self.known
         self._is_stale = bool(self.measured)
         self._longest_m = max((length_of(place.points_m) for place in self._places()), default=0.0)
         self._least_m2 = {vehicle: self._fused(own).least_m2 for vehicle, own in self.measured.items()}
         self._is_even = self._even()
-        self._first_confirmed: Place | None = None
+        self._first_confirmed: PlaceEstimate | None = None
         if before is not None:
             self._recall()
 
@@ -113,7 +113,7 @@ class Story:
         self._decide()
         self._go_home()
 
-    def _places(self) -> list[Place]:
+    def _places(self) -> list[PlaceEstimate]:
         return [*([] if self.known is None else [self.known]), *(own.place for own in self.measured.values())]
 
     def take(self, report: int) -> None:
@@ -188,21 +188,21 @@ class Story:
         """What one more measurement of a vehicle weighs beside so many."""
         return self._parameters.information_of(earlier + 1) - self._parameters.information_of(earlier)
 
-    def _fused(self, own: Own) -> Place:
+    def _fused(self, own: Own) -> PlaceEstimate:
         return fused(own.place, own.repeats, self._parameters.information_of(own.repeats))
 
-    def place(self) -> Place:
+    def place(self) -> PlaceEstimate:
         """The estimate of all vehicles, each with what its measurements say together."""
         if self._is_stale or self._state is None:
             self._state, self._is_stale = self._estimate(list(self.balanced().values())), False
         return self._state
 
-    def balanced(self) -> dict[str, Place]:
+    def balanced(self) -> dict[str, PlaceEstimate]:
         """What the measurements of each vehicle say together, and weigh beside those of the others."""
         each = [self._fused(own) for own in self.measured.values()]
         return dict(zip(self.measured, balanced(each, self.known, FEATURE_MOST_WEIGHT), strict=True))
 
-    def _estimate(self, each: list[Place]) -> Place:
+    def _estimate(self, each: list[PlaceEstimate]) -> PlaceEstimate:
         known = self.known
         if not each and known is None:
             return self.track.state  # quoted from an older version, measured by nobody since

@@ -14,7 +14,7 @@ from typing import Final
 import numpy as np
 
 from gnd.cloud_merger.features.statements import Statement
-from gnd.cloud_merger.features.tracks import Track
+from gnd.cloud_merger.features.tracks import FeatureTrack
 from gnd.tile_store.values import REFUTED_SHARE, REFUTED_TESTS, ShiftTest
 
 OPPOSING: Final = 2
@@ -48,7 +48,7 @@ class Heard:
         return self.alone > self.agreed
 
 
-def heard(tracks: Sequence[Track]) -> tuple[Heard, ...]:
+def heard(tracks: Sequence[FeatureTrack]) -> tuple[Heard, ...]:
     """What of each report can be compared; after views have voted (`add_views`). One vote a vehicle: its newest."""
     agreed: Counter[int] = Counter()
     alone: Counter[int] = Counter()
@@ -109,11 +109,11 @@ def refuted_of(tests: Iterable[ShiftTest]) -> dict[str, str]:
     }
 
 
-def _ayes(track: Track) -> int:
+def _ayes(track: FeatureTrack) -> int:
     return len({vote.vehicle for vote in track.votes.values() if vote.existence.state == "exist"})
 
 
-def _twin_m(track: Track, believed: Sequence[Track]) -> float:
+def _twin_m(track: FeatureTrack, believed: Sequence[FeatureTrack]) -> float:
     """How far off the nearest feature of its kind is that others agree on; 0: there is none."""
     at = track.state.points_m[0, :2]
     far = [

@@ -19,7 +19,7 @@ _NOTHING_M2: Final = 1e12
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Place:
+class PlaceEstimate:
     """Where something is.
 
     Attributes:
@@ -31,7 +31,7 @@ class Place:
     cov_m2: F64
 
     @classmethod
-    def of(cls, points_m: F64, cov_m2: F64) -> "Place":
+    def of(cls, points_m: F64, cov_m2: F64) -> "PlaceEstimate":
         """From six values xx, xy, xz, yy, yz, zz. Of an unknown height one learns nothing, however often it is told."""
         cov = full_covariance(cov_m2)
         if cov[2, 2] > UNKNOWN_HEIGHT_M2 / 2:
@@ -51,12 +51,12 @@ class Place:
         six[5] = min(six[5], UNKNOWN_HEIGHT_M2)
         return six
 
-    def scaled(self, factor: float) -> "Place":
+    def scaled(self, factor: float) -> "PlaceEstimate":
         """The same with a covariance `factor` times as large."""
-        return Place(self.points_m, self.cov_m2 * factor) if factor != 1.0 else self
+        return PlaceEstimate(self.points_m, self.cov_m2 * factor) if factor != 1.0 else self
 
 
-def step(state: Place, measured: Place) -> Place:
+def step(state: PlaceEstimate, measured: PlaceEstimate) -> PlaceEstimate:
     """The state after one more measurement. NFL, Eq. (12) with H = I, in Joseph form.
 
     Args:
@@ -68,10 +68,10 @@ def step(state: Place, measured: Place) -> Place:
     points_m = state.points_m + (onto(state.points_m, measured.points_m) - state.points_m) @ K.T  # Eq. (12)
     J = _I3 - K
     cov = J @ P @ J.T + K @ R @ K.T  # Eq. (12), Joseph form: positive whatever the rounding
-    return Place(points_m, 0.5 * (cov + cov.T))
+    return PlaceEstimate(points_m, 0.5 * (cov + cov.T))
 
 
-def estimate(measured: Sequence[Place], known: Place | None = None) -> Place:
+def estimate(measured: Sequence[PlaceEstimate], known: PlaceEstimate | None = None) -> PlaceEstimate:
     """What all measurements say together, one after the other.
 
     Args:
@@ -84,7 +84,7 @@ def estimate(measured: Sequence[Place], known: Place | None = None) -> Place:
     return state
 
 
-def fused(together: Place, repeats: int, information: float) -> Place:
+def fused(together: PlaceEstimate, repeats: int, information: float) -> PlaceEstimate:
     """One vehicle's measurements of one feature as a single one.
 
     Its n errors have something in common. Of n equally good ones with correlation ρ each, the mean has the variance
@@ -110,7 +110,7 @@ def is_even(measured_m2: Sequence[float], known_m2: float | None, most: float) -
     return len(all_m2) < 2 or all_m2[1] <= most * min(measured_m2, default=np.inf)
 
 
-def balanced(measured: Sequence[Place], known: Place | None, most: float) -> list[Place]:
+def balanced(measured: Sequence[PlaceEstimate], known: PlaceEstimate | None, most: float) -> list[PlaceEstimate]:
     """The measurements of vehicles, none of which claims to be much surer than all others.
 
     Args:

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from gnd.cloud_merger.features.rls import Place
+from gnd.cloud_merger.features.rls import PlaceEstimate
 from gnd.cloud_merger.features.spread import around, between, near_border
 from gnd.gnd_map.arrays import F64
 from gnd.gnd_map.features import Existence, Feature, feature_id_of
@@ -32,7 +32,7 @@ class Claimed:
 
     feature_id: int
     kind: str
-    place: Place
+    place: PlaceEstimate
     existence: Existence
     hits: int
     attributes: Attributes
@@ -100,7 +100,7 @@ def _claims(tile: TileId, report_id: str, change: FeatureChange, reach_m: float)
     claims = []
     for one in found:
         name = _name(report_id, change.tile, one, names)
-        place = Place.of(_moved(tile, change.tile, one.points_m), one.cov_m2)
+        place = PlaceEstimate.of(_moved(tile, change.tile, one.points_m), one.cov_m2)
         claims.append(Claimed(name, one.kind, place, one.existence, one.hits, one.attributes))
     return claims
 

@@ -10,7 +10,7 @@ import numpy as np
 from gnd.cloud_merger.features.association import costs, fits, pairs
 from gnd.cloud_merger.features.memory import LayerMemory, Own, Remembered, Vote
 from gnd.cloud_merger.features.parameters import FeatureMergeParameters
-from gnd.cloud_merger.features.rls import Place, step
+from gnd.cloud_merger.features.rls import PlaceEstimate, step
 from gnd.cloud_merger.features.statements import Attributes, Claimed, Statement
 from gnd.gnd_map.features import Feature, feature_id_of
 from gnd.schemas.feature_change import Seen
@@ -28,13 +28,13 @@ class Measured:
     """One report's measurement of a feature; `is_found`: anew, not as one of the map's."""
 
     vehicle: str
-    place: Place
+    place: PlaceEstimate
     is_found: bool
     attributes: Attributes
 
 
 @dataclass(slots=True, eq=False)
-class Track:
+class FeatureTrack:
     """A hypothesis about one feature.
 
     Attributes:
@@ -53,7 +53,7 @@ class Track:
 
     feature_id: int
     kind: str
-    state: Place
+    state: PlaceEstimate
     epoch: Feature | None = None
     quoted: Feature | None = None
     measured: dict[int, Measured] = field(default_factory=dict)
@@ -73,7 +73,7 @@ class Track:
         """Whether the map, this or a later version of it, knows it."""
         return self.epoch is not None or self.quoted is not None
 
-    def is_apart(self, other: "Track") -> bool:
+    def is_apart(self, other: "FeatureTrack") -> bool:
         """Whether a report has told the two apart."""
         known = other.serial in self.apart or self.serial in other.apart
         return known or not self.votes.keys().isdisjoint(other.votes)
@@ -109,7 +109,7 @@ class Track:
             self.state = step(self.state, measured.place.scaled(1.0 / adds))
 
 
-class Tracks:
+class FeatureTracks:
     """All hypotheses about the features of a tile; statements are to come in the order of their report ids.
 
     Args:
@@ -123,8 +123,8 @@ class Tracks:
         self, epoch: Iterable[Feature], bases: Bases, parameters: FeatureMergeParameters, memory: LayerMemory | None
     ) -> None:
         self._parameters, self._bases = parameters, bases
-        self.all: list[Track] = []
-        self._by_id: dict[int, list[Track]] = {}
+        self.all: list[FeatureTrack] = []
+        self._by_id: dict[int, list[FeatureTrack]] = {}
         self._begun: Counter[str] = Counter()
         self._n_serials = 0
         if memory is None:
@@ -139,7 +139,7 @@ class Tracks:
         for one in memory.tracks:
             votes = {number - n: vote for number, vote in one.votes}
             self._begin(
-                Track(
+                FeatureTrack(
                     one.feature_id, one.kind, one.state, one.epoch, one.quoted,
                     votes=votes, repeats=one.repeats, before=one, apart=set(one.apart),
                 )
@@ -162,7 +162,7 @@ class Tracks:
             like = [one for one in claims if (one.kind, len(one.place.points_m) == 1) == (kind, is_point)]
             self._associate(report, said, like, judged)
 
-    def _named(self, feature_id: int, base_sha: bytes | None) -> Sequence[Track]:
+    def _named(self, feature_id: int, base_sha: bytes | None) -> Sequence[FeatureTrack]:
         """The tracks of a map feature; one that only an old version names begins anew, quoted from there."""
         known = self._by_id.get(feature_id, [])
         if known or base_sha is None:
@@ -171,13 +171,13 @@ class Tracks:
             self._begin(_of_map(feature, quoted=feature))
         return self._by_id.get(feature_id, [])
 
-    def _begin(self, track: Track) -> Track:
+    def _begin(self, track: FeatureTrack) -> FeatureTrack:
         track.serial, self._n_serials = self._n_serials, self._n_serials + 1
         self.all.append(track)
         self._by_id.setdefault(track.feature_id, []).append(track)
         return track
 
-    def _judge(self, track: Track, report: int, said: Statement, seen: Seen) -> Claimed | None:
+    def _judge(self, track: FeatureTrack, report: int, said: Statement, seen: Seen) -> Claimed | None:
         """A verdict on a map feature; a claim when it was measured where that feature cannot be.
 
         Outside the gate the map's feature is not touched: what stands elsewhere is a candidate of its own. Who is right
@@ -186,7 +186,7 @@ class Tracks:
         track.votes[report] = Vote(said.vehicle, seen.existence, seen.hits)
         if seen.position_m is None or seen.cov_m2 is None or len(track.state.points_m) > 1:
             return None
-        place = Place.of(seen.position_m[None], seen.cov_m2)
+        place = PlaceEstimate.of(seen.position_m[None], seen.cov_m2)
         if fits(place, track.state, self._parameters):
             track.measure(report, Measured(said.vehicle, place, False, ()), self._parameters)
             return None
@@ -223,13 +223,13 @@ class Tracks:
         for i, claim in enumerate(claims):
             self._take(report, said, claim, named.get(i))
 
-    def _take(self, report: int, said: Statement, claim: Claimed, track: Track | None) -> None:
+    def _take(self, report: int, said: Statement, claim: Claimed, track: FeatureTrack | None) -> None:
         measured = Measured(said.vehicle, claim.place, claim.is_found, claim.attributes)
         if track is None:
             if self._begun[said.vehicle] >= FEATURE_MAX_BEGUN:
                 return
             self._begun[said.vehicle] += 1
-            track = self._begin(Track(claim.feature_id, claim.kind, claim.place))  # NFL, Eq. (11)
+            track = self._begin(FeatureTrack(claim.feature_id, claim.kind, claim.place))  # NFL, Eq. (11)
             track.measured[report], track.repeats[said.vehicle] = measured, 1
         else:
             self._by_id.setdefault(claim.feature_id, [track])
@@ -247,7 +247,7 @@ class Tracks:
                 if any(self._confirms(other) and other is not track for other in there):
                     track.votes[report] = vote.denied
 
-    def _confirms(self, track: Track) -> bool:
+    def _confirms(self, track: FeatureTrack) -> bool:
         return track.measurers >= self._parameters.min_vehicles
 
     def names_of(self) -> dict[int, list[int]]:
@@ -269,7 +269,7 @@ class Tracks:
                     self._join(early, late)
                     changed |= {id(early), id(late)}
 
-    def _partner(self, late: Track) -> tuple[float, Track, Track] | None:
+    def _partner(self, late: FeatureTrack) -> tuple[float, FeatureTrack, FeatureTrack] | None:
         """The likeliest earlier hypothesis that may be the same as this one: (cost, earlier, this one)."""
         if late.epoch is not None:
             return None
@@ -281,7 +281,7 @@ class Tracks:
         k = int(np.argmin(cost))
         return (float(cost[k]), early[k], late) if np.isfinite(cost[k]) else None
 
-    def _join(self, early: Track, late: Track) -> None:
+    def _join(self, early: FeatureTrack, late: FeatureTrack) -> None:
         """All that was said of the later hypothesis counts for the earlier, in the order of the reports."""
         self.all.remove(late)
         early.apart |= late.apart
@@ -307,7 +307,7 @@ class Tracks:
             early.measure(number, one, self._parameters)
 
 
-def _may_be_one(a: Track, b: Track) -> bool:
+def _may_be_one(a: FeatureTrack, b: FeatureTrack) -> bool:
     return a.kind == b.kind and a.is_point == b.is_point and not a.is_apart(b)
 
 
@@ -348,9 +348,9 @@ def _together(one: Own, other: Own) -> Own:
     )
 
 
-def _of_map(feature: Feature, epoch: Feature | None = None, quoted: Feature | None = None) -> Track:
-    return Track(feature.feature_id, feature.kind, _place_of(feature), epoch, quoted)
+def _of_map(feature: Feature, epoch: Feature | None = None, quoted: Feature | None = None) -> FeatureTrack:
+    return FeatureTrack(feature.feature_id, feature.kind, _place_of(feature), epoch, quoted)
 
 
-def _place_of(feature: Feature) -> Place:
-    return Place.of(feature.points_m, feature.cov_m2)
+def _place_of(feature: Feature) -> PlaceEstimate:
+    return PlaceEstimate.of(feature.points_m, feature.cov_m2)

@@ -32,7 +32,7 @@ Mark = tuple[str, int]
 
 
 @dataclass(frozen=True, slots=True)
-class Kept:
+class KeptReports:
     """A report as its client holds it: its state in the outbox, and how often its Gaussians were acknowledged."""
 
     report: ChangeReport
@@ -128,7 +128,7 @@ def look(
     return found
 
 
-def read_outbox(path: Path) -> list[Kept]:
+def read_outbox(path: Path) -> list[KeptReports]:
     """What a vehicle holds."""
     outbox = Outbox(path)
     try:
@@ -137,10 +137,10 @@ def read_outbox(path: Path) -> list[Kept]:
         answers = outbox.answers()
     finally:
         outbox.close()
-    return [Kept(ChangeReport.decode(bodies[one]), state, answers[one]) for one, state in states.items()]
+    return [KeptReports(ChangeReport.decode(bodies[one]), state, answers[one]) for one, state in states.items()]
 
 
-def compare_reports(found: Findings, store: SqliteStore, kept: Sequence[Kept]) -> None:
+def compare_reports(found: Findings, store: SqliteStore, kept: Sequence[KeptReports]) -> None:
     """Is every acknowledged report in the journal once, and nothing else?"""
     sent = {one.mark: one for one in kept}
     acknowledged = held_by({one.report.report_id: one.state for one in kept})
@@ -167,7 +167,9 @@ def compare_reports(found: Findings, store: SqliteStore, kept: Sequence[Kept]) -
     found.unreleased += [f"{one.report.report_id}: {one.state}" for one in kept if one.state == "stored"]
 
 
-def _missing(one: Kept, rows: Counter[tuple[Mark, int, int]], said: dict[tuple[Mark, int], TileChange]) -> list[str]:
+def _missing(
+    one: KeptReports, rows: Counter[tuple[Mark, int, int]], said: dict[tuple[Mark, int], TileChange]
+) -> list[str]:
     """What of an acknowledged report is not in the journal, in one line."""
     name = f"{one.report.report_id} of {one.report.vehicle}"
     absent = [change.tile for change in one.report.tiles if not rows[one.mark, change.tile.morton, 0]]

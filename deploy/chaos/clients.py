@@ -14,7 +14,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
 
-from gnd.deploy.chaos.street import LAYER, Sent, Street, read_street
+from gnd.deploy.chaos.street import LAYER, ChaosStreet, SentReport, read_street
 from gnd.fleet_bus.bus import Bus, open_bus
 from gnd.fleet_bus.config import BusConfig
 from gnd.fleet_bus.errors import BusClosed, BusError
@@ -42,7 +42,7 @@ _QUICK: Final = RetryPolicy(longest_wait_s=0.2, attempt_timeout_s=2.0)
 
 
 @dataclass(frozen=True, slots=True)
-class VehicleTask:
+class ChaosVehicleTask:
     """A vehicle: where its router is, its name, folder, the seed of its reports, and how often it has one."""
 
     connect: str
@@ -55,7 +55,7 @@ class VehicleTask:
 class _Trips:
     """The drives of one vehicle: each under a pseudonym of its own, with an outbox of its own."""
 
-    def __init__(self, task: VehicleTask, street: Street, bus: Bus) -> None:
+    def __init__(self, task: ChaosVehicleTask, street: ChaosStreet, bus: Bus) -> None:
         self._task, self._street, self._bus = task, street, bus
         self._open: dict[str, tuple[Outbox, SenderThread]] = {}
         known = sorted(task.folder.glob(f"{task.name}-*.sqlite"))
@@ -101,12 +101,12 @@ class _Trips:
             outbox.close()
 
 
-def put(outbox: Outbox, sent: Sent) -> bool:
+def put(outbox: Outbox, sent: SentReport) -> bool:
     """A report as an agent puts it into its outbox."""
     return outbox.put(sent.whole.report_id, sent.key, sent.whole.encode(), sent.packed.encode(), sent.bases)
 
 
-def vehicle(task: VehicleTask, *, stop: threading.Event) -> None:
+def vehicle(task: ChaosVehicleTask, *, stop: threading.Event) -> None:
     """Report now and then until told that it is enough, and go on until all is released."""
     street = read_street()
     rng = random.Random(time.time_ns())

@@ -15,7 +15,7 @@ import psutil
 from gnd.cloud_merger.config import ShardConfig
 from gnd.deploy import roles
 from gnd.deploy.chaos import clients
-from gnd.deploy.chaos.street import LAYER, Street
+from gnd.deploy.chaos.street import LAYER, ChaosStreet
 from gnd.deploy.chaos.wire import Wires
 from gnd.deploy.ports import claim_port
 from gnd.deploy.processes import ProcessSpec, Supervisor, start_fork_server
@@ -47,7 +47,7 @@ _LOG: Final = logging.getLogger(__name__)
 
 
 @dataclass(slots=True)
-class Cloud:
+class ChaosCloud:
     """A running cloud with its clients.
 
     Attributes:
@@ -122,7 +122,7 @@ class Cloud:
 
 
 @contextmanager
-def running(folder: Path, street: Street, seed: int) -> Iterator[Cloud]:
+def running(folder: Path, street: ChaosStreet, seed: int) -> Iterator[ChaosCloud]:
     """Start a cloud and its clients, wait until it answers, end all with the block.
 
     Raises:
@@ -142,7 +142,7 @@ def running(folder: Path, street: Street, seed: int) -> Iterator[Cloud]:
         supervisor = Supervisor(folder / "logs", folder / "pids.json")
         stack.callback(supervisor.stop)
         wires = stack.enter_context(Wires(port))
-        cloud = Cloud(folder, connect, supervisor, wires, store, beacon)
+        cloud = ChaosCloud(folder, connect, supervisor, wires, store, beacon)
         for spec in _cloud_processes(cloud):
             supervisor.start(spec)
         with open_bus(BusConfig(connect=(connect,), open_timeout_s=READY_S), name="probe") as bus:
@@ -154,7 +154,7 @@ def running(folder: Path, street: Street, seed: int) -> Iterator[Cloud]:
         yield cloud
 
 
-def _cloud_processes(cloud: Cloud) -> list[ProcessSpec]:
+def _cloud_processes(cloud: ChaosCloud) -> list[ProcessSpec]:
     path = cloud.path
     configs = [
         ShardConfig(
@@ -169,11 +169,11 @@ def _cloud_processes(cloud: Cloud) -> list[ProcessSpec]:
     ]
 
 
-def _client_processes(cloud: Cloud, seed: int) -> list[ProcessSpec]:
+def _client_processes(cloud: ChaosCloud, seed: int) -> list[ProcessSpec]:
     specs = []
     for n in range(VEHICLES):
         name = f"vehicle-{n}"
-        task = clients.VehicleTask(cloud.wires.open(name), name, cloud.vehicles, seed, REPORT_EVERY_S)
+        task = clients.ChaosVehicleTask(cloud.wires.open(name), name, cloud.vehicles, seed, REPORT_EVERY_S)
         specs.append(ProcessSpec(name, clients.vehicle, (task,)))
     for n in range(FOLLOWERS):
         name = f"follower-{n}"
@@ -183,7 +183,7 @@ def _client_processes(cloud: Cloud, seed: int) -> list[ProcessSpec]:
     return specs
 
 
-def _poll(cloud: Cloud) -> None:
+def _poll(cloud: ChaosCloud) -> None:
     try:
         cloud.supervisor.poll()
     except GndError as error:

@@ -8,7 +8,7 @@ Group = Literal["kill", "stop", "line", "disk", "page", "clock", "message"]
 
 
 @dataclass(frozen=True, slots=True)
-class Kind:
+class FaultKind:
     """A way to hurt the cloud.
 
     Attributes:
@@ -27,27 +27,27 @@ class Kind:
 
 _STOPPED_S: Final = (0.4, 1.6)
 KINDS: Final = (
-    Kind("kill router", "kill", "router"),
-    Kind("kill store", "kill", "store"),
-    Kind("kill shard", "kill", "shard"),
-    Kind("kill worker", "kill", "worker"),
-    Kind("kill vehicle", "kill", "vehicle"),
-    Kind("kill follower", "kill", "follower"),
-    Kind("stop router", "stop", "router", _STOPPED_S),
-    Kind("stop store", "stop", "store", _STOPPED_S),
-    Kind("stop shard", "stop", "shard", (0.5, 3.0)),
-    Kind("stop worker", "stop", "worker", (0.5, 4.0)),
-    Kind("stop vehicle", "stop", "vehicle", _STOPPED_S),
-    Kind("stall follower", "stop", "follower", (2.0, 6.0)),
-    Kind("cut line", "line", "", (0.3, 2.0)),
-    Kind("late line", "line", "", (0.5, 4.0)),
-    Kind("full disk of shard", "disk", "shard", (0.5, 2.0)),
-    Kind("full disk of vehicle", "disk", "vehicle", (0.5, 2.0)),
-    Kind("damaged pages", "page", "", (0.5, 3.0)),
-    Kind("damaged pages, cold", "page", "worker", (2.0, 5.0)),
-    Kind("clock step", "clock", "", (0.5, 3.0)),
-    Kind("twice", "message", ""),
-    Kind("out of order", "message", ""),
+    FaultKind("kill router", "kill", "router"),
+    FaultKind("kill store", "kill", "store"),
+    FaultKind("kill shard", "kill", "shard"),
+    FaultKind("kill worker", "kill", "worker"),
+    FaultKind("kill vehicle", "kill", "vehicle"),
+    FaultKind("kill follower", "kill", "follower"),
+    FaultKind("stop router", "stop", "router", _STOPPED_S),
+    FaultKind("stop store", "stop", "store", _STOPPED_S),
+    FaultKind("stop shard", "stop", "shard", (0.5, 3.0)),
+    FaultKind("stop worker", "stop", "worker", (0.5, 4.0)),
+    FaultKind("stop vehicle", "stop", "vehicle", _STOPPED_S),
+    FaultKind("stall follower", "stop", "follower", (2.0, 6.0)),
+    FaultKind("cut line", "line", "", (0.3, 2.0)),
+    FaultKind("late line", "line", "", (0.5, 4.0)),
+    FaultKind("full disk of shard", "disk", "shard", (0.5, 2.0)),
+    FaultKind("full disk of vehicle", "disk", "vehicle", (0.5, 2.0)),
+    FaultKind("damaged pages", "page", "", (0.5, 3.0)),
+    FaultKind("damaged pages, cold", "page", "worker", (2.0, 5.0)),
+    FaultKind("clock step", "clock", "", (0.5, 3.0)),
+    FaultKind("twice", "message", ""),
+    FaultKind("out of order", "message", ""),
 )
 BY_NAME: Final = {kind.name: kind for kind in KINDS}
 STEP_S: Final = (1.5, 2.5)
@@ -60,7 +60,7 @@ class Fault:
 
     Attributes:
         number: from 0.
-        kind: name of a `Kind`.
+        kind: name of a `FaultKind`.
         at_s: after the first report was merged, s.
         held_s: how long it lasts; 0: until the supervisor has started again what was killed.
         draw: in [0, 1): which of several parts, lines, pages.
@@ -90,11 +90,11 @@ class Fault:
 
 
 def plan(
-    seed: int, count: int, kinds: tuple[Kind, ...] = KINDS, step_s: tuple[float, float] = STEP_S
+    seed: int, count: int, kinds: tuple[FaultKind, ...] = KINDS, step_s: tuple[float, float] = STEP_S
 ) -> tuple[Fault, ...]:
     """The faults of a run: every kind about as often, in an order drawn, `step_s` apart; long ones overlap."""
     rng = random.Random(f"chaos {seed}")
-    deck: list[Kind] = []
+    deck: list[FaultKind] = []
     faults: list[Fault] = []
     at_s = 0.0
     for number in range(count):

@@ -15,9 +15,9 @@ import numpy as np
 
 from gnd.deploy.chaos import page
 from gnd.deploy.chaos.clients import put
-from gnd.deploy.chaos.cloud import Cloud
+from gnd.deploy.chaos.cloud import ChaosCloud
 from gnd.deploy.chaos.faults import BY_NAME, Fault
-from gnd.deploy.chaos.street import LAYER, Sent, Street
+from gnd.deploy.chaos.street import LAYER, ChaosStreet, SentReport
 from gnd.fleet_bus.bus import Bus
 from gnd.fleet_bus.errors import BusError
 from gnd.gnd_map.codec import encode_mask
@@ -46,7 +46,7 @@ class Inflictor:
         bus: for messages.
     """
 
-    def __init__(self, cloud: Cloud, street: Street, seed: int, bus: Bus) -> None:
+    def __init__(self, cloud: ChaosCloud, street: ChaosStreet, seed: int, bus: Bus) -> None:
         self._cloud, self._street, self._seed, self._bus = cloud, street, seed, bus
         self._outbox = Outbox(cloud.vehicles / f"{MESSENGER}-000.sqlite")
         self._sender = SenderThread(bus, self._outbox, MESSENGER)
@@ -150,7 +150,7 @@ class Inflictor:
         for letter in letters * 2:
             self._request(sent.key, letter)
 
-    def _known(self, rng: random.Random) -> Sent | None:
+    def _known(self, rng: random.Random) -> SentReport | None:
         """A report that some vehicle has acknowledged by its outbox."""
         paths = sorted(self._cloud.vehicles.glob("vehicle-*.sqlite"))
         if not paths:
@@ -183,7 +183,7 @@ class Inflictor:
         except BusError as error:
             _LOG.info("a message came to nothing: %s", error)
 
-    def probe(self) -> Sent:
+    def probe(self) -> SentReport:
         """A report that is sent again and again by who watches for acknowledgements; the messenger answers for it."""
         sent = self._street.said(self._seed, MESSENGER, 0)
         put(self._outbox, sent)
@@ -218,7 +218,7 @@ def _limit_files(pid: int, limit: int) -> None:
         resource.prlimit(pid, resource.RLIMIT_FSIZE, (limit, hard))
 
 
-def _places_of_bodies(cloud: Cloud, rng: random.Random, damaged: set[int]) -> dict[int, str]:
+def _places_of_bodies(cloud: ChaosCloud, rng: random.Random, damaged: set[int]) -> dict[int, str]:
     """Offsets in bodies of newest versions that are in the file, not only in its log, and whole; and whose they are."""
     heads, found = cloud.store.heads(LAYER), dict[int, str]()
     for head in rng.sample(heads, len(heads)):

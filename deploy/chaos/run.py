@@ -11,7 +11,7 @@ from typing import Any, Final
 
 from gnd.deploy.chaos.checks import Findings, look
 from gnd.deploy.chaos.clients import ENOUGH, OPEN_SUFFIX
-from gnd.deploy.chaos.cloud import Cloud, running
+from gnd.deploy.chaos.cloud import ChaosCloud, running
 from gnd.deploy.chaos.faults import Fault
 from gnd.deploy.chaos.inflict import MESSENGER, End, Inflictor
 from gnd.deploy.chaos.service import SERVICES, Gaps, gaps, watched
@@ -34,7 +34,7 @@ OnStep = Callable[[str, int], None]
 
 
 @dataclass(frozen=True, slots=True)
-class Outcome:
+class ChaosOutcome:
     """A run that has ended.
 
     Attributes:
@@ -97,7 +97,7 @@ def run_chaos(
     folder: Path,
     stop: threading.Event | None = None,
     on_step: OnStep = lambda _what, _n: None,
-) -> Outcome:
+) -> ChaosOutcome:
     """Run a cloud, inflict the faults, let it settle, end it and look at what is left.
 
     Args:
@@ -131,7 +131,7 @@ def run_chaos(
         on_step("ending", len(timeline.rows))
     on_step("checking", len(timeline.rows))
     findings = look(cloud.path, sorted(cloud.vehicles.glob("*.sqlite")), sorted(cloud.receipts.glob("*.jsonl")))
-    return Outcome(
+    return ChaosOutcome(
         seed=seed,
         seconds=end_s - timeline.start_s,
         settled_s=settled_s,
@@ -145,7 +145,7 @@ def run_chaos(
     )
 
 
-def _wait_for_merges(cloud: Cloud, stop: threading.Event) -> None:
+def _wait_for_merges(cloud: ChaosCloud, stop: threading.Event) -> None:
     """Until what vehicles report is merged: before that nothing can be lost."""
     deadline_s = time.monotonic() + READY_S
     while not any(head.version > 1 for head in cloud.store.heads() if head.tile != cloud.beacon.tile_id):
@@ -201,7 +201,7 @@ class _Timeline:
         self.faults[place] = replace(self.faults[place], held_s=row["ended_s"] - self.faults[place].at_s)
 
 
-def _settle(cloud: Cloud, inflictor: Inflictor, within_s: float) -> float | None:
+def _settle(cloud: ChaosCloud, inflictor: Inflictor, within_s: float) -> float | None:
     """Let the clients finish and the cloud work off what it has; how long it took, None: it came to no end."""
     begin_s = time.monotonic()
     (cloud.vehicles / ENOUGH).touch()
@@ -218,14 +218,14 @@ def _settle(cloud: Cloud, inflictor: Inflictor, within_s: float) -> float | None
     return None
 
 
-def _clients_open(cloud: Cloud, inflictor: Inflictor) -> int:
+def _clients_open(cloud: ChaosCloud, inflictor: Inflictor) -> int:
     told = [cloud.vehicles / f"{name}{OPEN_SUFFIX}" for name in cloud.names("vehicle")]
     if not all(path.exists() for path in told):
         return 1
     return sum(int(path.read_text(encoding="utf-8")) for path in told) + inflictor.still_open()
 
 
-def _is_idle(cloud: Cloud) -> bool:
+def _is_idle(cloud: ChaosCloud) -> bool:
     store, unread = cloud.store, ("waiting", "early")
     is_read = not set(unread) & set(store.upload_counts().by_state)
     return is_read and not store.dirty_count() and not store.tiles_set_aside() and not store.notices()

@@ -14,7 +14,7 @@ from dataclasses import dataclass, field
 from typing import Final
 
 from gnd.deploy.chaos.faults import BY_NAME, Fault
-from gnd.deploy.chaos.street import LAYER, Sent
+from gnd.deploy.chaos.street import LAYER, SentReport
 from gnd.fleet_bus.bus import Bus, open_bus
 from gnd.fleet_bus.config import BusConfig
 from gnd.fleet_bus.errors import BusClosed, RequestFailed
@@ -31,7 +31,7 @@ _READY_S: Final = 60.0
 
 
 @dataclass(slots=True)
-class Served:
+class ServiceGaps:
     """When each service was given, s by the monotonic clock."""
 
     times_s: dict[str, list[float]] = field(default_factory=lambda: {service: [] for service in SERVICES})
@@ -57,7 +57,7 @@ class Gaps:
     of_kills: dict[str, float]
 
 
-def gaps(served: Served, faults: Sequence[Fault], start_s: float, end_s: float) -> Gaps:
+def gaps(served: ServiceGaps, faults: Sequence[Fault], start_s: float, end_s: float) -> Gaps:
     """What each kind of fault cost.
 
     Args:
@@ -111,7 +111,7 @@ def _overlap_s(spans: Sequence[tuple[float, float]], begin_s: float, end_s: floa
 
 
 @contextmanager
-def watched(connect: str, tile: Tile, report: Sent) -> Iterator[Served]:
+def watched(connect: str, tile: Tile, report: SentReport) -> Iterator[ServiceGaps]:
     """Clients that ask and listen while the block runs, from when each service was given once.
 
     Args:
@@ -119,7 +119,7 @@ def watched(connect: str, tile: Tile, report: Sent) -> Iterator[Served]:
         tile: that is asked for.
         report: that is sent again and again: what comes after the first time is a duplicate, and is acknowledged.
     """
-    served, config = Served(), BusConfig(connect=(connect,))
+    served, config = ServiceGaps(), BusConfig(connect=(connect,))
     with ExitStack() as stack:
         asking, sending, hearing = (stack.enter_context(open_bus(config, name=f"watch-{n}")) for n in SERVICES)
         hearing.subscribe(update_keys(LAYER, ""), lambda _key, _payload: served.note("update"))

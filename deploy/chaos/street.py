@@ -38,7 +38,7 @@ EVERY_NS: Final = 20_000_000_000
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Told:
+class ToldReport:
     """One report of the file.
 
     Attributes:
@@ -51,7 +51,7 @@ class Told:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Sent:
+class SentReport:
     """One report of one vehicle, as its outbox takes it."""
 
     whole: ChangeReport
@@ -70,11 +70,11 @@ class Sent:
 
 
 @dataclass(frozen=True)
-class Street:
+class ChaosStreet:
     """The map before the first drive, and what was found: `copies[k]` lies in the k-th district."""
 
     copies: tuple[tuple[Tile, ...], ...]
-    told: tuple[Told, ...]
+    told: tuple[ToldReport, ...]
 
     @property
     def tiles(self) -> list[Tile]:
@@ -85,7 +85,7 @@ class Street:
     def _held(self) -> tuple[dict[int, Tile], ...]:
         return tuple({_index(tile.tile_id): tile for tile in copy} for copy in self.copies)
 
-    def said(self, seed: int, vehicle: str, number: int) -> Sent:
+    def said(self, seed: int, vehicle: str, number: int) -> SentReport:
         """The `number`-th report of a vehicle: the same whenever it is asked for."""
         rng = random.Random(f"{seed}/{vehicle}/{number}")
         district, told = rng.randrange(len(self.copies)), rng.choice(self.told)
@@ -105,7 +105,7 @@ class Street:
         )
         bases = tuple(held[_index(one.tile)] for one in tiles if one.base_version)
         track = replace(told.track, district=whole.district)
-        return Sent(whole, pack(whole, {tile.sha: tile.gaussians for tile in bases}, track), bases)
+        return SentReport(whole, pack(whole, {tile.sha: tile.gaussians for tile in bases}, track), bases)
 
 
 def _index(tile: TileId) -> int:
@@ -144,7 +144,7 @@ def write_street(
         np.savez(file, key=np.array(change_key(layer, district)), **held)
 
 
-def read_street(path: Path = FILE, districts: int = DISTRICTS) -> Street:
+def read_street(path: Path = FILE, districts: int = DISTRICTS) -> ChaosStreet:
     """Read a street and lay it down in so many districts, one east of the other.
 
     Raises:
@@ -163,7 +163,7 @@ def read_street(path: Path = FILE, districts: int = DISTRICTS) -> Street:
         raise ChaosError(f"{path}: {len(base)} tiles and {count} reports, a street has both")
     told = [_told(base, arrays[f"flags-{n}"], arrays[f"gaussians-{n}"]) for n in range(count)]
     copies = tuple(tuple(_laid(tile, k) for tile in base) for k in range(districts))
-    return Street(copies, tuple(told))
+    return ChaosStreet(copies, tuple(told))
 
 
 def _laid(tile: Tile, districts_east: int) -> Tile:
@@ -171,7 +171,7 @@ def _laid(tile: Tile, districts_east: int) -> Tile:
     return Tile(at, 1, tile.gaussians)
 
 
-def _told(base: Sequence[Tile], flags: bytes, gaussians: bytes) -> Told:
+def _told(base: Sequence[Tile], flags: bytes, gaussians: bytes) -> ToldReport:
     """The whole report out of its two halves, as the cloud puts it together."""
     first, second = decode_upload(flags), decode_upload(gaussians)
     if not isinstance(first, PackedReport) or not isinstance(second, PackedGaussians):
@@ -185,4 +185,4 @@ def _told(base: Sequence[Tile], flags: bytes, gaussians: bytes) -> Told:
     bare = expand(first, LAYER, district, bases)
     every = np.ones(sum(int(is_askable(one).sum()) for one in bare.tiles), np.bool_)
     by_id = {tile.tile_id: tile.gaussians for tile in bases}
-    return Told(with_measured(bare, by_id, every, second.measured), decode_track(district, first.track))
+    return ToldReport(with_measured(bare, by_id, every, second.measured), decode_track(district, first.track))

@@ -14,7 +14,7 @@ State = Literal["whole", "cut", "held"]
 _T = TypeVar("_T")
 
 
-class _Line:
+class _WireLine:
     """One line: a listening port, and the connections that were made over it."""
 
     def __init__(self, router: int) -> None:
@@ -89,7 +89,7 @@ class Wires:
     def __init__(self, router: int) -> None:
         self._router = router
         self._loop = asyncio.new_event_loop()
-        self._lines: dict[str, _Line] = {}
+        self._lines: dict[str, _WireLine] = {}
         self._thread = threading.Thread(target=self._loop.run_forever, name="wires", daemon=True)
 
     def __enter__(self) -> "Wires":
@@ -106,7 +106,7 @@ class Wires:
 
     def open(self, name: str) -> str:
         """Lay a line; the endpoint at which its client finds the router."""
-        line = _Line(self._router)
+        line = _WireLine(self._router)
         self._lines[name] = line
         return f"tcp/{_HOST}:{self._call(line.open())}"
 

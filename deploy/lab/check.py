@@ -24,7 +24,7 @@ _log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True, slots=True)
-class Measured:
+class LinkMeasured:
     """One direction of one profile's link.
 
     Attributes:
@@ -82,14 +82,14 @@ def _wait_until_carried(link: LabLink) -> None:
             return
 
 
-def measure(link: LabLink, direction: Direction, seconds: float) -> Measured:
+def measure(link: LabLink, direction: Direction, seconds: float) -> LinkMeasured:
     """Measure one direction: a thin stream, a flood, a TCP connection, each for some seconds.
 
     Raises:
         LabError: the link passes nothing.
     """
     profile = link.profile
-    return Measured(
+    return LinkMeasured(
         profile.name,
         direction,
         profile.rate_byte_s(direction) * 8,
@@ -102,12 +102,12 @@ def measure(link: LabLink, direction: Direction, seconds: float) -> Measured:
     )
 
 
-def as_json(measured: list[Measured]) -> dict[str, Any]:
+def as_json(measured: list[LinkMeasured]) -> dict[str, Any]:
     """Return the measurements as plain values; a rate without limit is null."""
     return {"tcp_congestion_control": congestion_control(), "links": [_plain(one) for one in measured]}
 
 
-def _plain(one: Measured) -> dict[str, Any]:
+def _plain(one: LinkMeasured) -> dict[str, Any]:
     values = asdict(one)
     values["stream"]["loss"] = one.stream.loss
     if one.wanted_bit_s == float("inf"):

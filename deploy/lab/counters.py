@@ -15,7 +15,7 @@ _FIELD: Final = re.compile(r"\b(rtt|minrtt|bytes_sent|bytes_retrans):([0-9.]+)")
 
 
 @dataclass(frozen=True, slots=True)
-class Counts:
+class InterfaceCounts:
     """What one vehicle's interface has passed, in IP bytes.
 
     Attributes:
@@ -44,7 +44,7 @@ class Drops:
     netem: int
 
 
-def read_counts(link: LabLink) -> Counts:
+def read_counts(link: LabLink) -> InterfaceCounts:
     """Read the interface on the vehicle's side.
 
     Raises:
@@ -54,7 +54,7 @@ def read_counts(link: LabLink) -> Counts:
     state = json.loads(run_tool(*words))[0]
     header = ETHERNET_BYTES if state["link_type"] == "ether" else 0
     up, down = state["stats64"]["tx"], state["stats64"]["rx"]
-    return Counts(
+    return InterfaceCounts(
         up["bytes"] - header * up["packets"], down["bytes"] - header * down["packets"], up["packets"], down["packets"]
     )
 

@@ -12,7 +12,7 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any, Final
 
-from gnd.deploy.lab.counters import Counts, Drops, read_counts, read_drops
+from gnd.deploy.lab.counters import Drops, InterfaceCounts, read_counts, read_drops
 from gnd.deploy.lab.groups import Group, LabLink
 from gnd.deploy.lab.lab import Lab
 from gnd.deploy.lab.relay import LineCount
@@ -35,7 +35,7 @@ class LinkCounted:
     """
 
     link: LabLink
-    counts: Counts
+    counts: InterfaceCounts
     up_drops: Drops
     down_drops: Drops
 

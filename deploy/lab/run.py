@@ -14,7 +14,7 @@ from gnd.deploy.lab.report import Evidence, account, as_json, count_links, write
 from gnd.deploy.lab.sampler import sampling
 from gnd.deploy.processes import ProcessSpec
 from gnd.deploy.run_folder import RunFolder
-from gnd.deploy.site import Site, VehicleSite
+from gnd.deploy.site import SiteFrame, VehicleSite
 from gnd.fleet_bus.errors import LedgerError
 from gnd.fleet_bus.ledger_file import AgentLedger, read_ledger
 
@@ -22,10 +22,10 @@ RELAYS: Final = "relays"
 ACCOUNT: Final = "lab.json"
 
 
-def lab_site(lab: Lab, relays: Path) -> Site:
+def lab_site(lab: Lab, relays: Path) -> SiteFrame:
     """Return where the processes of a fleet run: the cloud in one namespace, each group in another."""
     vehicles = tuple(VehicleSite(link.endpoint, unpaced(link.profile), link.vehicle_namespace) for link in lab.links)
-    return Site(ROUTER_LISTENS, ROUTER_FROM_CLOUD, vehicles, lab.cloud_namespace, relay_processes(lab, relays))
+    return SiteFrame(ROUTER_LISTENS, ROUTER_FROM_CLOUD, vehicles, lab.cloud_namespace, relay_processes(lab, relays))
 
 
 def relay_processes(lab: Lab, relays: Path) -> tuple[ProcessSpec, ...]:
@@ -55,7 +55,7 @@ class LabRun:
     report: dict[str, Any] = field(default_factory=dict)
 
     @contextmanager
-    def place(self) -> Iterator[Site]:
+    def place(self) -> Iterator[SiteFrame]:
         """Give the site of the fleet: the launcher is in the cloud's namespace, and the links are watched.
 
         The links are accounted for when the block has ended well.

@@ -4,7 +4,7 @@ from typing import Any
 
 from rich.table import Table
 
-from gnd.deploy.lab.check import Measured
+from gnd.deploy.lab.check import LinkMeasured
 
 
 def rate_text(bit_s: float | None) -> str:
@@ -22,7 +22,7 @@ def _table(*columns: str) -> Table:
     return table
 
 
-def check_table(measured: list[Measured]) -> Table:
+def check_table(measured: list[LinkMeasured]) -> Table:
     """Return wanted and measured rate, delay and loss of each direction."""
     table = _table(
         "link", "", "rate Mbit/s", "flood", "one TCP", "sent again",

@@ -46,7 +46,7 @@ class Backlog:
 
 
 @dataclass(frozen=True, slots=True)
-class Merged:
+class MergedTiles:
     """One part of a report and the version of a tile that it was merged into.
 
     Attributes:
@@ -62,7 +62,7 @@ class Merged:
 
 
 @dataclass(frozen=True, slots=True)
-class Ledger:
+class LoadLedger:
     """What the store holds when all is over.
 
     Attributes:
@@ -78,7 +78,7 @@ class Ledger:
     journaled: frozenset[str]
     with_gaussians: frozenset[str]
     kept: Mapping[str, str] = field(repr=False)
-    merged: tuple[Merged, ...] = field(repr=False)
+    merged: tuple[MergedTiles, ...] = field(repr=False)
     unmerged: int
     aside: int
     quarantined: int
@@ -105,7 +105,7 @@ class Auditor:
         uploads, tiles, received = self._row(_BACKLOG)
         return Backlog(at_s, uploads, tiles, received)
 
-    def ledger(self) -> Ledger:
+    def ledger(self) -> LoadLedger:
         """All that the load has left behind, as it is at one moment: workers may still be busy."""
         self._connection.execute("BEGIN")  # one snapshot: an upload that is settled meanwhile would be seen nowhere
         try:
@@ -113,13 +113,13 @@ class Auditor:
         finally:
             self._connection.execute("ROLLBACK")
 
-    def _ledger(self) -> Ledger:
+    def _ledger(self) -> LoadLedger:
         parts = [(str(report_id), int(part)) for report_id, part in self._connection.execute(_JOURNALED)]
         merged = tuple(
-            Merged(int(tile), int(version), received_ns / NS_PER_S, (created_ns - received_ns) / NS_PER_S)
+            MergedTiles(int(tile), int(version), received_ns / NS_PER_S, (created_ns - received_ns) / NS_PER_S)
             for tile, version, received_ns, created_ns in self._connection.execute(_MERGED)
         )
-        return Ledger(
+        return LoadLedger(
             journaled=frozenset(report_id for report_id, _ in parts),
             with_gaussians=frozenset(report_id for report_id, part in parts if part == 1),
             kept={str(report_id): str(state) for report_id, state in self._connection.execute(_KEPT)},

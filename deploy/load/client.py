@@ -14,8 +14,8 @@ from typing import Final
 
 from gnd.deploy.load.drives import KeptRuns
 from gnd.deploy.load.plan import Due, LoadOptions, Timetable
-from gnd.deploy.load.sending import Account, Measured, Open, Sender, opened
-from gnd.deploy.load.shift import Shift
+from gnd.deploy.load.sending import Open, Sender, SenderAccount, SendingMeasured, opened
+from gnd.deploy.load.shift import DistrictShift
 from gnd.deploy.load.streets import Streets
 from gnd.fleet_bus.bus import Bus, open_bus
 from gnd.fleet_bus.config import BusConfig
@@ -105,14 +105,14 @@ def client(config: ClientConfig, *, stop: threading.Event) -> None:
             config.cpu.write_text(repr(time.process_time() - before_s), encoding="utf-8")
 
 
-def read_accounts(path: Path) -> list[Account]:
+def read_accounts(path: Path) -> list[SenderAccount]:
     """What a client has written; nothing where it was killed before."""
     if not path.exists():
         return []
-    return [Account(**json.loads(line)) for line in path.read_text(encoding="utf-8").splitlines()]
+    return [SenderAccount(**json.loads(line)) for line in path.read_text(encoding="utf-8").splitlines()]
 
 
-def _write(path: Path, accounts: list[Account]) -> None:
+def _write(path: Path, accounts: list[SenderAccount]) -> None:
     lines = "".join(json.dumps(one.as_json()) + "\n" for one in accounts)
     path.write_text(lines, encoding="utf-8")
 
@@ -130,16 +130,16 @@ class _Herd:
     """The vehicles of one client: who is on the way with what, and the threads that send."""
 
     def __init__(self, config: ClientConfig, streets: Streets, bus: Bus) -> None:
-        self.accounts: list[Account] = []
+        self.accounts: list[SenderAccount] = []
         self._config, self._streets, self._options = config, streets, config.options
-        self._shifts: dict[int, Shift] = {}
+        self._shifts: dict[int, DistrictShift] = {}
         self._open: dict[str, Open] = {}
         self._lock = threading.Lock()
         # Urgent first: a second half before new flags, as a vehicle has it in its outbox longer.
         self._work: queue.PriorityQueue[tuple[int, int, Work | None]] = queue.PriorityQueue()
         self._number = itertools.count()
         self._room = threading.Semaphore(2 * self._options.in_flight)
-        self._sender = Sender(bus, Measured(streets.bases))
+        self._sender = Sender(bus, SendingMeasured(streets.bases))
         bus.subscribe(f"{ROOT}/want/load-{config.number}-$*", self._on_notice, kind="ack")
         self._threads = [threading.Thread(target=self._run, daemon=True) for _ in range(self._options.in_flight)]
         for thread in self._threads:

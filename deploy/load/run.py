@@ -20,9 +20,9 @@ from gnd.deploy.load.client import ClientConfig, client, read_accounts, start_fi
 from gnd.deploy.load.cpu import busy_s, by_part
 from gnd.deploy.load.drives import LAYER, KeptRuns
 from gnd.deploy.load.plan import LoadOptions, shared_out
-from gnd.deploy.load.sending import Account
+from gnd.deploy.load.sending import SenderAccount
 from gnd.deploy.load.streets import Streets
-from gnd.deploy.load.verdict import Outcome
+from gnd.deploy.load.verdict import LoadOutcome
 from gnd.deploy.ports import claim_port
 from gnd.deploy.processes import ProcessSpec, Supervisor, start_fork_server
 from gnd.fleet_bus.bus import Bus, open_bus
@@ -99,7 +99,7 @@ class Running:
         return True
 
 
-def run_load(options: LoadOptions, runs: KeptRuns, folder: Path, tell: Tell, stop: threading.Event) -> Outcome:
+def run_load(options: LoadOptions, runs: KeptRuns, folder: Path, tell: Tell, stop: threading.Event) -> LoadOutcome:
     """Replay kept drives as many vehicles.
 
     Args:
@@ -201,7 +201,7 @@ def _ready(running: Running) -> int:
     return sum(int(one.ready.read_text(encoding="utf-8")) for one in running.clients)
 
 
-def _measured(running: Running, options: LoadOptions, planned: int, tell: Tell) -> Outcome:
+def _measured(running: Running, options: LoadOptions, planned: int, tell: Tell) -> LoadOutcome:
     cloud_before, own_before_s, busy_before_s = running.cloud_cpu_s(), time.process_time(), busy_s()
     measured_s = time.monotonic()
     start_s = time.monotonic() + LEAD_S
@@ -225,7 +225,7 @@ def _measured(running: Running, options: LoadOptions, planned: int, tell: Tell) 
     cloud, own_s = running.cloud_cpu_s(), time.process_time() - own_before_s
     machine_s, measured_s = busy_s() - busy_before_s, time.monotonic() - measured_s
     accounts = _ended(running)
-    return Outcome(
+    return LoadOutcome(
         options=options,
         planned=planned if math.isinf(options.seconds) or options.pace == "real" else None,
         accounts=accounts,
@@ -267,7 +267,7 @@ def _drained(running: Running, until_s: float, look: Callable[[], object]) -> fl
     return None
 
 
-def _ended(running: Running) -> list[Account]:
+def _ended(running: Running) -> list[SenderAccount]:
     """What the clients have written, after they have ended."""
     until_s = time.monotonic() + END_S
     while not running.supervisor.finished("client-") and time.monotonic() < until_s and not running.stop.is_set():

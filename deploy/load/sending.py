@@ -8,7 +8,7 @@ from typing import Any, Final
 
 from gnd.deploy.load.drives import KeptReport
 from gnd.deploy.load.plan import Due
-from gnd.deploy.load.shift import Shift, shifted_district
+from gnd.deploy.load.shift import DistrictShift, shifted_district
 from gnd.fleet_bus.bus import Bus
 from gnd.fleet_bus.errors import BusError
 from gnd.gnd_map.gaussian import Gaussians
@@ -28,7 +28,7 @@ PATIENCE: Final = 3
 
 
 @dataclass(slots=True)
-class Account:
+class SenderAccount:
     """What became of one report; times in s of the machine's monotonic clock, 0.0: it did not come to that.
 
     Attributes:
@@ -75,9 +75,9 @@ class Account:
 class Open:
     """A report on its way."""
 
-    account: Account
+    account: SenderAccount
     kept: KeptReport
-    shift: Shift
+    shift: DistrictShift
     key: str
     last_ns: int
     wanted: bytes = b""
@@ -85,7 +85,7 @@ class Open:
 
 
 @dataclass(slots=True)
-class Measured:
+class SendingMeasured:
     """Second halves, coded once for each mask: their bytes are the same on every street.
 
     Attributes:
@@ -116,7 +116,7 @@ class Sender:
         measured: makes second halves.
     """
 
-    def __init__(self, bus: Bus, measured: Measured) -> None:
+    def __init__(self, bus: Bus, measured: SendingMeasured) -> None:
         self._bus, self._measured = bus, measured
 
     def first(self, one: Open) -> None:
@@ -182,7 +182,7 @@ class Sender:
         return None
 
 
-def opened(due: Due, kept: KeptReport, shift: Shift, seed: int, vehicle: str, due_s: float) -> Open:
+def opened(due: Due, kept: KeptReport, shift: DistrictShift, seed: int, vehicle: str, due_s: float) -> Open:
     """A report as it begins, under an id of its own, stamped as if its last scan had been just now."""
     last_ns = time.time_ns()
     t_ms = (last_ns - kept.packed.length_ns) // 1_000_000
@@ -190,4 +190,4 @@ def opened(due: Due, kept: KeptReport, shift: Shift, seed: int, vehicle: str, du
         t_ms, str(seed), vehicle, str(due.passage), str(due.street), kept.packed.report_id
     )
     key = change_key(kept.whole.layer, shifted_district(kept.whole.district, shift.districts))
-    return Open(Account(report_id, vehicle, due_s), kept, shift, key, last_ns)
+    return Open(SenderAccount(report_id, vehicle, due_s), kept, shift, key, last_ns)

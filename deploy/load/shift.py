@@ -40,7 +40,7 @@ def shifted_tile(tile: Tile, districts: int) -> Tile:
 
 
 @dataclass(frozen=True, slots=True)
-class Shift:
+class DistrictShift:
     """One copy of a street.
 
     Attributes:

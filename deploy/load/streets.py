@@ -5,7 +5,7 @@ from dataclasses import dataclass
 from gnd.deploy.load.drives import KeptRuns, KeptStreet, gaussians_by_sha, read_street
 from gnd.deploy.load.errors import LoadError
 from gnd.deploy.load.plan import LoadOptions, Timetable
-from gnd.deploy.load.shift import Shift, places_of_streets, shifted_tile
+from gnd.deploy.load.shift import DistrictShift, places_of_streets, shifted_tile
 from gnd.gnd_map.gaussian import Gaussians
 from gnd.gnd_map.tile import Tile
 
@@ -52,9 +52,9 @@ class Streets:
         """What a street is."""
         return self.changed if self.options.is_changed(street) else self.settled
 
-    def shift(self, street: int) -> Shift:
+    def shift(self, street: int) -> DistrictShift:
         """Where it is."""
-        return Shift(self.places[street], self.edition(street).tiles)
+        return DistrictShift(self.places[street], self.edition(street).tiles)
 
     def tiles(self, street: int) -> list[Tile]:
         """Its map."""

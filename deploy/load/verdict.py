@@ -7,9 +7,9 @@ from typing import Any, Final
 import numpy as np
 import numpy.typing as npt
 
-from gnd.deploy.load.audit import Backlog, Ledger
+from gnd.deploy.load.audit import Backlog, LoadLedger
 from gnd.deploy.load.plan import LoadOptions
-from gnd.deploy.load.sending import Account
+from gnd.deploy.load.sending import SenderAccount
 
 F64 = npt.NDArray[np.float64]
 LATE_S: Final = 1.0
@@ -27,7 +27,7 @@ LONGEST_LAG_S: Final = 5.0
 
 
 @dataclass(frozen=True, slots=True)
-class Outcome:
+class LoadOutcome:
     """All that was measured.
 
     Attributes:
@@ -49,7 +49,7 @@ class Outcome:
 
     options: LoadOptions
     planned: int | None
-    accounts: Sequence[Account]
+    accounts: Sequence[SenderAccount]
     backlog: Sequence[Backlog]
     start_s: float
     offered_s: float
@@ -58,18 +58,18 @@ class Outcome:
     client_cpu_s: float
     machine_cpu_s: float
     capacity_s: float
-    ledger: Ledger
+    ledger: LoadLedger
     notices_s: Mapping[tuple[int, int], float] = field(repr=False)
     restarts: int = 0
     interrupted: bool = False
 
     @property
-    def sent(self) -> list[Account]:
+    def sent(self) -> list[SenderAccount]:
         """The reports that were sent, in the order of their times."""
         return sorted((one for one in self.accounts if one.sent_s), key=lambda one: one.sent_s)
 
     @property
-    def acknowledged(self) -> list[Account]:
+    def acknowledged(self) -> list[SenderAccount]:
         """Those that were acknowledged."""
         return [one for one in self.sent if one.is_acknowledged]
 
@@ -89,7 +89,7 @@ class Outcome:
         return _rounded(1e3 * used_s / len(self.acknowledged)) if done else None
 
 
-def why_not(outcome: Outcome) -> list[str]:
+def why_not(outcome: LoadOutcome) -> list[str]:
     """What speaks against the cloud having kept up; nothing: it has."""
     if outcome.interrupted:
         return ["the run was interrupted"]
@@ -97,7 +97,7 @@ def why_not(outcome: Outcome) -> list[str]:
     return [one for one in found if one]
 
 
-def _not_offered(outcome: Outcome) -> Iterable[str]:
+def _not_offered(outcome: LoadOutcome) -> Iterable[str]:
     sent = outcome.sent
     if not sent:
         return ["nothing was sent"]
@@ -111,7 +111,7 @@ def _not_offered(outcome: Outcome) -> Iterable[str]:
     return found
 
 
-def _not_done(outcome: Outcome) -> Iterable[str]:
+def _not_done(outcome: LoadOutcome) -> Iterable[str]:
     sent, ledger = outcome.sent, outcome.ledger
     missing = len(sent) - len(outcome.acknowledged)
     open_ones = sum(not one.released_s for one in outcome.acknowledged)
@@ -133,7 +133,7 @@ def _not_done(outcome: Outcome) -> Iterable[str]:
     return found
 
 
-def _growing(outcome: Outcome) -> Iterable[str]:
+def _growing(outcome: LoadOutcome) -> Iterable[str]:
     third, last = (_least_items(outcome, part) for part in ((0.5, 0.75), (0.75, 1.0)))
     if third is None or last is None:
         return ["the run was too short to see whether the queue grows"]
@@ -143,14 +143,14 @@ def _growing(outcome: Outcome) -> Iterable[str]:
     return []
 
 
-def _least_items(outcome: Outcome, part: tuple[float, float]) -> int | None:
+def _least_items(outcome: LoadOutcome, part: tuple[float, float]) -> int | None:
     """The shortest that the queue was: reports come in bursts, and one that is worked off is short between them."""
     first_s, last_s = (outcome.start_s + share * outcome.wall_s for share in part)
     items = [one.items for one in outcome.backlog if first_s <= one.at_s <= last_s]
     return min(items, default=None)
 
 
-def _lagging(outcome: Outcome) -> Iterable[str]:
+def _lagging(outcome: LoadOutcome) -> Iterable[str]:
     """How long vehicles wait for word, and tiles for their merge: at the end as at the beginning."""
     sent = outcome.sent
     n = max(1, len(sent) // 10)
@@ -169,11 +169,11 @@ def _lagging(outcome: Outcome) -> Iterable[str]:
     return found
 
 
-def _word_lag_s(one: Account) -> float:
+def _word_lag_s(one: SenderAccount) -> float:
     return one.word_s - one.sent_s if one.word_s else np.inf
 
 
-def summary(outcome: Outcome) -> dict[str, Any]:
+def summary(outcome: LoadOutcome) -> dict[str, Any]:
     """The figures as plain values; the first keys are those that the issue names."""
     sent, acknowledged = outcome.sent, outcome.acknowledged
     took_ms = 1e3 * np.array([one.acked_s - one.sent_s for one in acknowledged])
@@ -210,7 +210,7 @@ def summary(outcome: Outcome) -> dict[str, Any]:
 _LAGS: Final = {"p50": 0.5, "p95": 0.95, "max": 1.0}
 
 
-def _notice_lags_s(outcome: Outcome) -> F64:
+def _notice_lags_s(outcome: LoadOutcome) -> F64:
     """From the receipt of the last report part that a version was made of, to its notice at the subscriber."""
     decided: dict[tuple[int, int], float] = {}
     for one in outcome.ledger.merged:
@@ -220,14 +220,14 @@ def _notice_lags_s(outcome: Outcome) -> F64:
     return np.array([heard[at] - received_s for at, received_s in decided.items() if at in heard])
 
 
-def cpu_shares(outcome: Outcome) -> dict[str, float]:
+def cpu_shares(outcome: LoadOutcome) -> dict[str, float]:
     """Shares of all cores that the cloud, the clients and other programs used, from the start until all was done."""
     cloud_s, clients_s = sum(outcome.cpu_s.values()), outcome.client_cpu_s
     used_s = {"cloud": cloud_s, "clients": clients_s, "others": max(0.0, outcome.machine_cpu_s - cloud_s - clients_s)}
     return {name: round(s / outcome.capacity_s, 3) for name, s in used_s.items()}
 
 
-def limit_of(outcome: Outcome, reasons: Sequence[str]) -> str:
+def limit_of(outcome: LoadOutcome, reasons: Sequence[str]) -> str:
     """Who could not do more: "cloud", "clients", "none" where nobody was at the limit.
 
     Clients are, where the cloud has kept up with all that they sent, but they were late or sent as fast as they could.

@@ -8,13 +8,13 @@ from gnd.fleet_sim.courses.faults import Faults
 from gnd.fleet_sim.courses.foliage import Leaves
 from gnd.fleet_sim.courses.path import Path
 from gnd.fleet_sim.courses.ride import Ride
-from gnd.fleet_sim.courses.terrain import Ground
+from gnd.fleet_sim.courses.terrain import TerrainGround
 from gnd.fleet_sim.shapes import Shape
 from gnd.fleet_sim.world import State, World
 
 
 @dataclass(frozen=True, eq=False)
-class Place:
+class CoursePlace:
     """Where drives go: made from a seed, the same for all cases that use it.
 
     Attributes:
@@ -29,7 +29,7 @@ class Place:
 
     name: str
     world: World
-    ground: Ground
+    ground: TerrainGround
     lane: Path
     surveys: tuple[Path, ...]
     foliage: Mapping[State, tuple[Leaves, ...]] = field(default_factory=dict)
@@ -37,7 +37,7 @@ class Place:
 
 
 @dataclass(frozen=True, eq=False)
-class Course:
+class DrivenCourse:
     """One drive through a place in its state after.
 
     Attributes:
@@ -48,7 +48,7 @@ class Course:
         parked: cars at the kerb of this drive, street frame.
     """
 
-    place: Place
+    place: CoursePlace
     ride: Ride
     company: tuple[Companion, ...] = ()
     faults: Faults = field(default_factory=Faults)

@@ -8,7 +8,7 @@ from typing import Final
 import numpy as np
 
 from gnd.fleet_sim.courses.company import movers_of
-from gnd.fleet_sim.courses.course import Course
+from gnd.fleet_sim.courses.course import DrivenCourse
 from gnd.fleet_sim.courses.foliage import Foliage
 from gnd.fleet_sim.courses.motion import CourseMotion
 from gnd.fleet_sim.drives import EPOCH_NS, SensorErrors
@@ -70,7 +70,7 @@ class CourseDrive:
         movers: other vehicles, None if there are none.
     """
 
-    def __init__(self, course: Course, config: CourseConfig) -> None:
+    def __init__(self, course: DrivenCourse, config: CourseConfig) -> None:
         self._course, self._config = course, config
         place = course.place
         streams = np.random.default_rng([config.seed, place.world.seed, 0x4A4D]).spawn(5)

@@ -7,7 +7,7 @@ import numpy as np
 
 from gnd.fleet_sim.courses.path import Path
 from gnd.fleet_sim.courses.ride import Ride
-from gnd.fleet_sim.courses.terrain import Ground
+from gnd.fleet_sim.courses.terrain import TerrainGround
 from gnd.fleet_sim.trajectory import swaying
 from gnd.fleet_sim.world import World
 from gnd.gnd_map.arrays import F64
@@ -29,7 +29,7 @@ class CourseMotion:
     """
 
     world: World
-    ground: Ground
+    ground: TerrainGround
     path: Path
     ride: Ride
     sway_rad: tuple[float, ...]

@@ -9,10 +9,10 @@ import numpy as np
 
 from gnd.fleet_sim import parts
 from gnd.fleet_sim.courses.company import keeping, van
-from gnd.fleet_sim.courses.course import Place
+from gnd.fleet_sim.courses.course import CoursePlace
 from gnd.fleet_sim.courses.foliage import Leaves, crown, hedge
 from gnd.fleet_sim.courses.path import Path, lane, smoothed
-from gnd.fleet_sim.courses.terrain import LEVEL, Ground, Profile, raised
+from gnd.fleet_sim.courses.terrain import LEVEL, TerrainGround, TerrainProfile, raised
 from gnd.fleet_sim.parts import Lot
 from gnd.fleet_sim.shapes import Block, Post, Shape
 from gnd.fleet_sim.street import BORDER_LON_RAD, HEIGHT_M, LANE_OFFSET_M, LAT_RAD, StreetOptions, street
@@ -33,7 +33,7 @@ _OTHER_STREET: Final = 500_000_000
 """The rebuilt third comes from the street of another seed."""
 
 
-def place_of(name: str, seed: int, length_m: float = LENGTH_M) -> Place:
+def place_of(name: str, seed: int, length_m: float = LENGTH_M) -> CoursePlace:
     """Make a place.
 
     Args:
@@ -48,25 +48,27 @@ def _rng(seed: int, stream: int) -> np.random.Generator:
     return np.random.default_rng([seed, 0xC0125E, stream])
 
 
-def _on_street(name: str, world: World, profile: Profile, foliage: Mapping[State, tuple[Leaves, ...]]) -> Place:
+def _on_street(
+    name: str, world: World, profile: TerrainProfile, foliage: Mapping[State, tuple[Leaves, ...]]
+) -> CoursePlace:
     """A place whose right lane is driven along the street and that was mapped in both lanes."""
     reach = world.half_length_m - _MARGIN_M
     driven = lane(-reach, reach, -LANE_OFFSET_M, _rng(world.seed, 0))
     ends = np.linspace(-reach, reach, round(2 * reach))
     surveys = tuple(Path(np.stack([ends, np.full(len(ends), y)], axis=1)) for y in (-LANE_OFFSET_M, LANE_OFFSET_M))
-    return Place(name, world, Ground(profile, world.crown), driven, surveys, foliage)
+    return CoursePlace(name, world, TerrainGround(profile, world.crown), driven, surveys, foliage)
 
 
-def _street(seed: int, length_m: float) -> Place:
+def _street(seed: int, length_m: float) -> CoursePlace:
     return _on_street("street", street(seed, StreetOptions(length_m, edit_share=_FEW_EDITS)), LEVEL, {})
 
 
-def _followed(seed: int, length_m: float) -> Place:
+def _followed(seed: int, length_m: float) -> CoursePlace:
     """The street, mapped by a vehicle that drove behind a van and did not take it out of its scans."""
     return replace(_street(seed, length_m), name="followed", mapped_behind=(keeping(van(), _MAPPED_BEHIND_M),))
 
 
-def _rebuilt(seed: int, length_m: float) -> Place:
+def _rebuilt(seed: int, length_m: float) -> CoursePlace:
     """The street, a third of which has been torn down and built anew."""
     world = street(seed, StreetOptions(length_m, edit_share=_FEW_EDITS))
     other = street(seed + _OTHER_STREET, StreetOptions(length_m, edit_share=0.0))
@@ -96,15 +98,15 @@ def _middle_m(o: WorldObject) -> float:
     return 0.5 * float(bounds[:, 0].min() + bounds[:, 2].max())
 
 
-def _hill(seed: int, length_m: float) -> Place:
+def _hill(seed: int, length_m: float) -> CoursePlace:
     """The street over a hill: level, 8 % up, a crest, 6 % down. The street itself rises by some 2 % more."""
     world = street(seed, StreetOptions(length_m, edit_share=_FEW_EDITS))
     third = length_m / 6
-    profile = Profile((-1.7 * third, 0.6 * third), (-world.slope, 0.08 - world.slope, -0.06 - world.slope))
+    profile = TerrainProfile((-1.7 * third, 0.6 * third), (-world.slope, 0.08 - world.slope, -0.06 - world.slope))
     return _on_street("hill", raised(world, profile), profile, {})
 
 
-def _avenue(seed: int, length_m: float) -> Place:
+def _avenue(seed: int, length_m: float) -> CoursePlace:
     """A street without houses near the road: crowns in rows, hedges before them, houses far behind the leaves.
 
     In the state after, the leaves have grown and some of the trees are gone.
@@ -145,7 +147,7 @@ def _grown(leaves: Leaves, factor: float) -> Leaves:
     )
 
 
-def _field(seed: int, length_m: float) -> Place:
+def _field(seed: int, length_m: float) -> CoursePlace:
     """A road through open country: ground, delineator posts, a few trees, pieces of hedge and a barn far off."""
     rng, half = _rng(seed, 3), length_m / 2
     objects = _open_ground(half + 90.0, 90.0)
@@ -169,7 +171,7 @@ def _field(seed: int, length_m: float) -> Place:
     return _on_street("field", _world(seed, half, 0.01, objects), LEVEL, both)
 
 
-def _tunnel(seed: int, length_m: float) -> Place:
+def _tunnel(seed: int, length_m: float) -> CoursePlace:
     """A street that runs into a smooth tunnel, two thirds of the way long, and out again."""
     world = street(seed, StreetOptions(length_m, edit_share=0.0))
     inside = length_m / 3
@@ -183,7 +185,7 @@ def _tunnel(seed: int, length_m: float) -> Place:
     return _on_street("tunnel", replace(world, objects=tuple(objects)), LEVEL, {})
 
 
-def _roundabout(seed: int, length_m: float) -> Place:
+def _roundabout(seed: int, length_m: float) -> CoursePlace:
     """A ring of 13 m about an island with bushes, houses around; in from the west, three quarters round, out north."""
     rng, half = _rng(seed, 5), max(length_m / 2, 60.0)
     objects = _open_ground(half + 60.0, half + 60.0)
@@ -201,7 +203,7 @@ def _roundabout(seed: int, length_m: float) -> Place:
     around = np.linspace(0.0, tau, 90, endpoint=False)
     circle = Path(13.0 * np.stack([np.cos(around), np.sin(around)], axis=1))
     world = _world(seed, half, 0.0, objects)
-    return Place("roundabout", world, Ground(LEVEL, 0.0), driven, (driven.shifted(0.5), circle), both)
+    return CoursePlace("roundabout", world, TerrainGround(LEVEL, 0.0), driven, (driven.shifted(0.5), circle), both)
 
 
 def _bush(place_m: F64, rng: np.random.Generator) -> Leaves:
@@ -233,7 +235,7 @@ def _turned(x: float, y: float, half_x: float, half_y: float, high: float, c: fl
     return Block(float(c * x - s * y), float(s * x + c * y), float(size[0]), float(size[1]), -0.5, high)
 
 
-def _car_park(seed: int, length_m: float) -> Place:
+def _car_park(seed: int, length_m: float) -> CoursePlace:
     """Rows of parked cars, most of them others than when the map was made; few things stay."""
     rng, half = _rng(seed, 6), max(length_m / 4, 30.0)
     objects = _open_ground(half + 60.0, 80.0)
@@ -252,7 +254,7 @@ def _car_park(seed: int, length_m: float) -> Place:
     driven = smoothed(np.array([*out, *back, [-end, 14.0], [end, 14.0]]), 4.0)
     both: dict[State, tuple[Leaves, ...]] = {"before": (fence,), "after": (fence,)}
     world = _world(seed, half, 0.0, objects)
-    return Place("car_park", world, Ground(LEVEL, 0.0), driven, (driven.shifted(0.3),), both)
+    return CoursePlace("car_park", world, TerrainGround(LEVEL, 0.0), driven, (driven.shifted(0.3),), both)
 
 
 def _slot(name: str, x: float, y: float, rng: np.random.Generator) -> list[WorldObject]:
@@ -294,7 +296,7 @@ def _unit(angle_rad: float) -> F64:
     return np.array([np.cos(angle_rad), np.sin(angle_rad)])
 
 
-PLACES: Final[Mapping[str, Callable[[int, float], Place]]] = {
+PLACES: Final[Mapping[str, Callable[[int, float], CoursePlace]]] = {
     "street": _street,
     "followed": _followed,
     "rebuilt": _rebuilt,

@@ -6,7 +6,7 @@ from typing import Final
 import numpy as np
 
 from gnd.fleet_sim.courses.company import movers_of
-from gnd.fleet_sim.courses.course import Place
+from gnd.fleet_sim.courses.course import CoursePlace
 from gnd.fleet_sim.courses.foliage import Foliage
 from gnd.fleet_sim.courses.motion import CourseMotion
 from gnd.fleet_sim.courses.ride import RIDE_STEP_S, Ride
@@ -21,7 +21,7 @@ _SPEED_MPS: Final = 10.0
 _MIN_RANGE_M, _MAX_RANGE_M = 2.0, 80.0
 
 
-def survey_points(place: Place, step_m: float = STEP_M) -> Iterator[F64]:
+def survey_points(place: CoursePlace, step_m: float = STEP_M) -> Iterator[F64]:
     """Return the points (N, 3) of each sweep in the world's map frame, one every `step_m` of all surveyed paths."""
     world, rng = place.world, np.random.default_rng([place.world.seed, 0x5CA9])
     scene, lidar = Scene.build(world.shapes("before"), world.A_street_map), Lidar(HDL32E)

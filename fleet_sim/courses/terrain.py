@@ -21,7 +21,7 @@ _LAID: Final = ("road", "pavement", "wall")
 
 
 @dataclass(frozen=True)
-class Profile:
+class TerrainProfile:
     """Height of the ground over the street's reference plane, by x.
 
     Attributes:
@@ -62,11 +62,11 @@ class Profile:
         return np.asarray(self._curve(x_m))
 
 
-LEVEL: Final = Profile()
+LEVEL: Final = TerrainProfile()
 
 
 @dataclass(frozen=True, slots=True)
-class Ground:
+class TerrainGround:
     """The surface that vehicles drive on, in the street frame.
 
     Attributes:
@@ -74,7 +74,7 @@ class Ground:
         crown: fall from the middle of the road to its sides, metres a metre.
     """
 
-    profile: Profile
+    profile: TerrainProfile
     crown: float
 
     def height_m(self, place_m: F64) -> F64:
@@ -87,12 +87,12 @@ class Ground:
         return np.stack([self.profile.grade(place_m[:, 0]), across], axis=1)
 
 
-def raised(world: World, profile: Profile) -> World:
+def raised(world: World, profile: TerrainProfile) -> World:
     """Return a world whose things stand on a profile: the ground bends, walls stay upright."""
     return replace(world, objects=tuple(_raised(o, profile) for o in world.objects))
 
 
-def _raised(o: WorldObject, profile: Profile) -> WorldObject:
+def _raised(o: WorldObject, profile: TerrainProfile) -> WorldObject:
     if o.kind in _LAID:
         return replace(o, shapes=tuple(piece for shape in o.shapes for piece in _laid(shape, profile)))
     bounds = np.array([shape.bounds() for shape in o.shapes])
@@ -108,7 +108,7 @@ def _lifted(shape: Shape, rise_m: float) -> Shape:
     return replace(shape, bottom_m=shape.bottom_m + rise_m - foot, top_m=shape.top_m + rise_m)
 
 
-def _laid(shape: Shape, profile: Profile) -> list[Shape]:
+def _laid(shape: Shape, profile: TerrainProfile) -> list[Shape]:
     """Return the pieces of a block that lies along the street, each as steep as the ground under it."""
     if not isinstance(shape, Block) or shape.yaw_rad:
         x0, _, x1, _, _ = shape.bounds()

@@ -15,7 +15,7 @@ from gnd.fleet_sim.roads.curve import FloatArray
 from gnd.fleet_sim.roads.looks import DetectorNoise, detected, lane_looks
 from gnd.fleet_sim.roads.motion import Cruise, RoadMotion
 from gnd.fleet_sim.roads.route import IntArray, Route
-from gnd.fleet_sim.roads.sight import CAMERA, LIDAR, BoolArray, View, hidden, occluder_ranges, placed_boxes, polar
+from gnd.fleet_sim.roads.sight import CAMERA, LIDAR, BoolArray, CameraView, hidden, occluder_ranges, placed_boxes, polar
 from gnd.fleet_sim.roads.traffic import EMPTY, Boxes, RoadTraffic, drawn_boxes, lanes_taken
 from gnd.fleet_sim.trajectory import gauss_markov
 from gnd.schemas.drive import Detections, LaneLook, MotionTrack
@@ -65,8 +65,8 @@ class RoadDriveOptions:
     gnss_bias_m: float = 0.0
     points: DetectorNoise = field(default_factory=DetectorNoise)
     lanes: DetectorNoise = field(default_factory=lambda: DetectorNoise(false_alarms=0.0))
-    view: View | None = None
-    lane_view: View = CAMERA
+    view: CameraView | None = None
+    lane_view: CameraView = CAMERA
     traffic: RoadTraffic | None = None
     start_m: float = 0.0
     length_m: float | None = None
@@ -142,7 +142,7 @@ class RoadDrive:
     seed: int
     motion: MotionTrack
     gnss: RoadGnss
-    view: View
+    view: CameraView
     looks: tuple[Detections, ...]
     occluder_m: NDArray[np.float32]
     lane_looks: tuple[LaneLook, ...]
@@ -195,7 +195,7 @@ def drive_route(route: Route, seed: int, options: RoadDriveOptions | None = None
     )
 
 
-def _view(route: Route, options: RoadDriveOptions) -> View:
+def _view(route: Route, options: RoadDriveOptions) -> CameraView:
     return options.view or (CAMERA if route.layer == "signs" else LIDAR)
 
 

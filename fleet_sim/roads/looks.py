@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from gnd.fleet_sim.errors import RoadError
 from gnd.fleet_sim.roads.curve import FloatArray
 from gnd.fleet_sim.roads.route import Features, IntArray, Route
-from gnd.fleet_sim.roads.sight import BoolArray, View
+from gnd.fleet_sim.roads.sight import BoolArray, CameraView
 from gnd.schemas.drive import Detections, LaneLook
 
 BEARING_DEG: Final = 2.5
@@ -58,7 +58,7 @@ class DetectorNoise:
 
 
 def detected(
-    view: View,
+    view: CameraView,
     noise: DetectorNoise,
     features: Features,
     layer: str,
@@ -105,7 +105,7 @@ def detected(
 
 
 def _false_alarms(
-    count: int, view: View, words: int, rng: np.random.Generator
+    count: int, view: CameraView, words: int, rng: np.random.Generator
 ) -> tuple[FloatArray, FloatArray, IntArray]:
     """Ranges, bearings and kinds of false detections, evenly over the area of the field of view."""
     range_m = view.range_m * np.sqrt(rng.random(count))
@@ -113,7 +113,7 @@ def _false_alarms(
 
 
 def _look(
-    t_ns: int, view: View, layer: str, kinds: list[str], polar: list[FloatArray], noise: DetectorNoise
+    t_ns: int, view: CameraView, layer: str, kinds: list[str], polar: list[FloatArray], noise: DetectorNoise
 ) -> Detections:
     count = len(kinds)
     return Detections(
@@ -131,7 +131,7 @@ def _look(
 
 def lane_looks(
     route: Route,
-    view: View,
+    view: CameraView,
     noise: DetectorNoise,
     t_ns: IntArray,
     poses: FloatArray,
@@ -168,7 +168,7 @@ def _in_vehicle(route: Route, left_m: float, poses: FloatArray, way_m: FloatArra
     return np.stack([c * step[..., 0] + s * step[..., 1], -s * step[..., 0] + c * step[..., 1]], axis=2)
 
 
-def _within(view: View, points: FloatArray) -> BoolArray:
+def _within(view: CameraView, points: FloatArray) -> BoolArray:
     """Which points of markings (L, P, 2) lie in the field of view and are not the one before again, bool (L, P)."""
     distance = np.linalg.norm(points, axis=2)
     held = view.holds(distance, np.arctan2(points[..., 1], points[..., 0])) & (distance >= _NEAREST_M)

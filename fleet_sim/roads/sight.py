@@ -23,7 +23,7 @@ TALL_M: Final = 2.0
 
 
 @dataclass(frozen=True, slots=True)
-class View:
+class CameraView:
     """Field of view of a sensor at the vehicle's origin, looking ahead.
 
     Attributes:
@@ -57,9 +57,9 @@ class View:
         return np.asarray((range_m <= self.range_m) & (np.abs(bearing_rad) <= self.width_rad / 2 + 1e-12))
 
 
-CAMERA: Final = View("camera", radians(40.0), 80.0, 15, 1.3, radians(0.5))
+CAMERA: Final = CameraView("camera", radians(40.0), 80.0, 15, 1.3, radians(0.5))
 """Jo et al. 2018, section 6.1: 15 looks a second, 40° wide, 80 m far."""
-LIDAR: Final = View("lidar", 2 * pi, 50.0, 10, 1.9, radians(1.0))
+LIDAR: Final = CameraView("lidar", 2 * pi, 50.0, 10, 1.9, radians(1.0))
 """A VLP-16 on the roof as in Kim et al. 2018, section 6.1: 10 looks a second, all around."""
 
 
@@ -140,7 +140,7 @@ def hidden(
     return found
 
 
-def occluder_ranges(view: View, poses: FloatArray, placed: PlacedBoxes) -> NDArray[np.float32]:
+def occluder_ranges(view: CameraView, poses: FloatArray, placed: PlacedBoxes) -> NDArray[np.float32]:
     """Return the distance of the nearest tall box at each azimuth of each look, float32 (L, A), inf where none is."""
     found = np.full((len(poses), len(view.azimuths_rad())), np.inf, dtype=np.float32)
     tall = np.flatnonzero(placed.height_m > TALL_M)

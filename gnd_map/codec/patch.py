@@ -14,7 +14,7 @@ from gnd.gnd_map.codec.coding import Coder
 from gnd.gnd_map.codec.floats import check_number, decode_gaussians, encode_gaussians
 from gnd.gnd_map.codec.lattice import LATTICES, REPORT, Lattice, dequantise, integers_of, is_on, lattice_with
 from gnd.gnd_map.codec.priors import mask_at, number_at, priors_of
-from gnd.gnd_map.codec.volume import Box, Known, code_box, code_flags, code_voxels, floors_of, known_of
+from gnd.gnd_map.codec.volume import Box, KnownVolume, code_box, code_flags, code_voxels, floors_of, known_of
 from gnd.gnd_map.delta import TileDelta, apply, diff
 from gnd.gnd_map.errors import CodecError, ShapeError
 from gnd.gnd_map.gaussian import Gaussians
@@ -106,7 +106,7 @@ def decode_delta(tile_id: TileId, base: Gaussians, body: bytes) -> Gaussians:
     return apply(base, TileDelta(gone, dequantise(found, lattice)))
 
 
-def _known(base: Gaussians, put: I32, gone: npt.NDArray[np.integer], lattice: Lattice) -> Known:
+def _known(base: Gaussians, put: I32, gone: npt.NDArray[np.integer], lattice: Lattice) -> KnownVolume:
     return known_of(base, are_in(base.voxel_id, put), are_in(base.voxel_id, gone), lattice)
 
 
@@ -184,7 +184,7 @@ def _read_measured(coder: Coder, tile_id: TileId, base: Gaussians, voxel_id: I32
     return dequantise(found, REPORT)
 
 
-def _around(tile_id: TileId, base: Gaussians, voxel_id: I32) -> tuple[Box, I32, Known]:
+def _around(tile_id: TileId, base: Gaussians, voxel_id: I32) -> tuple[Box, I32, KnownVolume]:
     """Box, voxels and what is known around them."""
     both = np.union1d(base.voxel_id, voxel_id).astype(np.int32)
     low, high = floors_of(tile_id, both)

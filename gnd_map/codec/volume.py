@@ -118,7 +118,7 @@ _INTEGERS: Final[ByObject[Integers]] = ByObject(128)
 
 
 @dataclass(frozen=True, slots=True)
-class Known:
+class KnownVolume:
     """Gaussians that both sides hold, as integers of a lattice (nearest where they do not lie on it)."""
 
     quantised: Quantised
@@ -126,19 +126,21 @@ class Known:
     """(N,) those that will be replaced: they predict their successor, and nothing else."""
 
 
-def known_of(base: Gaussians, replaced: npt.NDArray[np.bool_], gone: npt.NDArray[np.bool_], lattice: Lattice) -> Known:
+def known_of(
+    base: Gaussians, replaced: npt.NDArray[np.bool_], gone: npt.NDArray[np.bool_], lattice: Lattice
+) -> KnownVolume:
     """What the base tells about those that come."""
     integers = _INTEGERS.of(base, lambda: Integers.of(base, lattice), lattice)
-    return Known(integers.nearest(~gone), replaced[~gone])
+    return KnownVolume(integers.nearest(~gone), replaced[~gone])
 
 
-NOTHING_KNOWN: Final = Known(
+NOTHING_KNOWN: Final = KnownVolume(
     Quantised(*(np.zeros((0, 3) if wide else 0, np.int32) for wide in (0, 0, 1, 1, 1, 0))), np.zeros(0, np.bool_)
 )
 
 
 def code_voxels(
-    coder: Coder, box: Box, voxel_id: I32, known: Known, lattice: Lattice, quantised: Quantised | None
+    coder: Coder, box: Box, voxel_id: I32, known: KnownVolume, lattice: Lattice, quantised: Quantised | None
 ) -> Quantised:
     """Write the Gaussians of these voxels, or read them (`quantised` None)."""
     n_known = len(known.quantised)

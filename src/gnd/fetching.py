@@ -14,7 +14,7 @@ from gnd.schemas.errors import WrongHash
 from gnd.schemas.keys import batch_key, catalog_keys
 from gnd.schemas.tile_answer import TileAnswer, content_of_answer
 from gnd.schemas.tiles import Catalog, CatalogEntry
-from gnd.schemas.tiles_batch import HeldTile, TilesReply, TilesRequest
+from gnd.schemas.tiles_batch import HeldVersion, TilesReply, TilesRequest
 
 BATCH_BYTES: Final = 1_000_000
 """Bodies of one answer: large enough that a district comes in a few, small enough for a slow link."""
@@ -93,7 +93,7 @@ class TileServerClient:
         self, district: District, wanted: Sequence[TileId], usable: Mapping[TileId, AnyTile], *, with_hashes: bool
     ) -> dict[TileId, TileAnswer]:
         held = [
-            HeldTile(tile, usable[tile].version, usable[tile].sha) if tile in usable else HeldTile(tile)
+            HeldVersion(tile, usable[tile].version, usable[tile].sha) if tile in usable else HeldVersion(tile)
             for tile in wanted
         ]
         codecs = codecs_of_layer(self.layer)

@@ -9,7 +9,7 @@ from scipy.stats import chi2
 
 from gnd.fleet_sim.roads.drive import RoadDrive
 from gnd.gnd_map.arrays import F64, I64
-from gnd.vehicle_agent.features.slamcu.first_pose import AFTER_S, FirstPose, first_pose_of
+from gnd.vehicle_agent.features.slamcu.first_pose import AFTER_S, FilterStart, first_pose_of
 
 RADIUS_M: Final = 5.0
 """An estimate farther than this from every free true feature is false, and the true feature missed."""
@@ -93,7 +93,7 @@ class Honesty:
         }
 
 
-def start_of(drive: RoadDrive, after_s: float = AFTER_S) -> FirstPose:
+def start_of(drive: RoadDrive, after_s: float = AFTER_S) -> FilterStart:
     """Return the pose some seconds after the start, of nothing but wheel speed, yaw rate and GNSS until then.
 
     Raises:

@@ -23,7 +23,7 @@ from rich.progress import Progress, TaskID
 
 from gnd.deploy.live import progress_bars
 from gnd.gnd_map.config import to_mapping
-from studies.frame.folder import RunFolder
+from studies.frame.folder import StudyFolder
 from studies.frame.options import PATH, click_options, options_of
 from studies.frame.pool import Job, run_jobs
 from studies.frame.tables import Sheet, markdown_of, print_sheets
@@ -45,7 +45,7 @@ class Bench:
         spent_s: seconds by the title of what was done.
     """
 
-    folder: RunFolder
+    folder: StudyFolder
     processes: int = 1
     progress: Progress = field(default_factory=lambda: Progress(disable=True))
     keep_drives: bool = False
@@ -74,7 +74,7 @@ class Bench:
 
 
 @dataclass(frozen=True, slots=True)
-class Report:
+class StudyReport:
     """What a study found: plain values, tables, and what draws the pictures into a folder; the file of the values."""
 
     found: Mapping[str, Any]
@@ -85,7 +85,7 @@ class Report:
 
 def study(
     options: type[T], *, out: str, jobs: int | None = None, keeps_drives: bool = False, marked: bool = True
-) -> Callable[[Callable[[T, Bench], Report]], click.Command]:
+) -> Callable[[Callable[[T, Bench], StudyReport]], click.Command]:
     """Make a function of options and bench the command of a study.
 
     Args:
@@ -96,7 +96,7 @@ def study(
         marked: whether the folder is marked as the study's, which another command then refuses.
     """
 
-    def command_of(work: Callable[[T, Bench], Report]) -> click.Command:
+    def command_of(work: Callable[[T, Bench], StudyReport]) -> click.Command:
         name = work.__name__.replace("_", "-")
 
         def run(**given: Any) -> None:
@@ -107,7 +107,7 @@ def study(
             if how["json_file"] == how["markdown_file"] == "-":
                 raise click.BadParameter("only one of --json and --markdown can be printed", param_hint="--markdown")
             chosen = options_of(options, given)
-            folder = RunFolder.create(how["out"], name, marked=marked)
+            folder = StudyFolder.create(how["out"], name, marked=marked)
             if marked:
                 folder.write_mark({"options": _plain(chosen)})
             with progress_bars(Console(stderr=True)) as progress:
@@ -139,7 +139,7 @@ def _plain(chosen: Any) -> dict[str, Any]:
 plain_options = _plain
 
 
-def _tell(report: Report, folder: RunFolder, how: Mapping[str, Any]) -> None:
+def _tell(report: StudyReport, folder: StudyFolder, how: Mapping[str, Any]) -> None:
     folder.write_json(report.file, report.found)
     if how["pictures"] and report.draw is not None:
         report.draw(folder.root)

@@ -12,7 +12,7 @@ _MARK: Final = "run.json"
 
 
 @dataclass(frozen=True, slots=True)
-class RunFolder:
+class StudyFolder:
     """Paths within `--out`.
 
     Attributes:
@@ -28,7 +28,7 @@ class RunFolder:
         return f"gnd.reproduce.{self.command}"
 
     @classmethod
-    def create(cls, root: Path, command: str = "simulation", *, marked: bool = True) -> "RunFolder":
+    def create(cls, root: Path, command: str = "simulation", *, marked: bool = True) -> "StudyFolder":
         """Make the folder, or continue in one that this command made; one that is not marked may hold anything.
 
         Raises:
@@ -47,7 +47,7 @@ class RunFolder:
         return folder
 
     @classmethod
-    def begun(cls, root: Path) -> "RunFolder":
+    def begun(cls, root: Path) -> "StudyFolder":
         """Make the folder, or continue in one, and mark it as one of this command at once.
 
         Raises:

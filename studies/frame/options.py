@@ -53,7 +53,7 @@ class Option:
 
 
 @dataclasses.dataclass(frozen=True, slots=True)
-class Parts:
+class OptionParts:
     """A value made of several options: `make(**parts)`, to which the values of the fields `using` are given, too."""
 
     make: Callable[..., Any]
@@ -77,7 +77,7 @@ def parts(make: Callable[..., T], using: tuple[str, ...] = (), **options: tuple[
     def default() -> T:
         return make(**{name: value for name, (value, _) in options.items()})
 
-    return dataclasses.field(default_factory=default, metadata={"option": Parts(make, options, using)})
+    return dataclasses.field(default_factory=default, metadata={"option": OptionParts(make, options, using)})
 
 
 def check(self: Any) -> None:
@@ -108,7 +108,7 @@ def _check(flag: str, one: Option, value: Any) -> None:
             raise OptionError(f"{flag}: {wrong}; known are {', '.join(one.known)}")
 
 
-def _declared(cls: type) -> Iterator[tuple[str, Option | Parts]]:
+def _declared(cls: type) -> Iterator[tuple[str, Option | OptionParts]]:
     for field in dataclasses.fields(cls):
         if "option" in field.metadata:
             yield field.name, field.metadata["option"]
@@ -125,7 +125,7 @@ def _single(cls: type) -> Iterator[tuple[str, Any, Any, Option]]:
         one = field.metadata.get("option")
         if isinstance(one, Option):
             yield field.name, hints[field.name], field.default, one
-        elif isinstance(one, Parts):
+        elif isinstance(one, OptionParts):
             for name, (default, part) in one.options.items():
                 yield name, _type_of(default, part), default, part
 
@@ -189,7 +189,7 @@ def options_of(cls: type[T], given: Mapping[str, Any]) -> T:
             if given[name] is not None and not (one.repeated and not given[name])}  # fmt: skip
     values = {name: read[name] for name, one in _declared(cls) if isinstance(one, Option) and name in read}
     for name, one in _declared(cls):
-        if isinstance(one, Parts):
+        if isinstance(one, OptionParts):
             of = {part: read.get(part, default) for part, (default, _) in one.options.items()}
             values[name] = one.make(**of, **{other: read.get(other, values.get(other)) for other in one.using})
     return cls(**values)

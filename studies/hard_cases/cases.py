@@ -9,7 +9,7 @@ import numpy as np
 
 from gnd.fleet_sim.cars import parked_cars
 from gnd.fleet_sim.courses.company import Companion, car, keeping, lagging, lorry, passing, van
-from gnd.fleet_sim.courses.course import Course, Place
+from gnd.fleet_sim.courses.course import CoursePlace, DrivenCourse
 from gnd.fleet_sim.courses.faults import Faults
 from gnd.fleet_sim.courses.places import LENGTH_M
 from gnd.fleet_sim.courses.ride import Ride, cruise, halting, lively
@@ -79,12 +79,12 @@ class HardCase:
     kidnap: Kidnap | None = None
     length_m: float = LENGTH_M
 
-    def course(self, place: Place, seed: int) -> Course:
+    def course(self, place: CoursePlace, seed: int) -> DrivenCourse:
         """Return the drive of a seed through a place that was made for this case."""
         rng = np.random.default_rng([seed, 0xCA5E])
         ride = self.ride(rng, place.lane.length_m - _END_M)
         cars = parked_cars(place.world, "after", _PARKED_SHARE, seed) if self.place in _WITH_KERBS else ()
-        return Course(place, ride, self.company(rng), self.faults(rng), cars)
+        return DrivenCourse(place, ride, self.company(rng), self.faults(rng), cars)
 
 
 _WITH_KERBS: Final = ("street", "followed", "rebuilt")

@@ -7,7 +7,7 @@ from pathlib import Path
 from time import process_time
 from typing import Any, Final
 
-from gnd.fleet_sim.courses.course import Place
+from gnd.fleet_sim.courses.course import CoursePlace
 from gnd.fleet_sim.courses.drive import CourseConfig, CourseDrive
 from gnd.fleet_sim.courses.places import place_of
 from gnd.fleet_sim.courses.survey import survey_points
@@ -18,7 +18,7 @@ from gnd.gnd_map.grid import GridFrame
 from gnd.gnd_map.tile_id import covering_circle
 from gnd.schemas.drive_mcap import DriveWriter
 from gnd.vehicle_agent.localise.parameters import LocaliserParameters
-from studies.frame.command import Bench, Report, study
+from studies.frame.command import Bench, StudyReport, study
 from studies.frame.kept import LOCALISER, SIMULATOR, Kept, key_of, sources_sha
 from studies.frame.options import check, option, parts, seeds
 from studies.frame.pool import Job
@@ -54,7 +54,7 @@ class HardOptions:
 
 
 @study(HardOptions, out="runs/hard-cases", keeps_drives=True)
-def hard_cases(options: HardOptions, bench: Bench) -> Report:
+def hard_cases(options: HardOptions, bench: Bench) -> StudyReport:
     """Localisation where it is hard: errors, wrong poses called good, honesty of the covariance, case by case.
 
     A second start with the same folder continues where the first ended, and drives again only what has changed.
@@ -69,7 +69,7 @@ def hard_cases(options: HardOptions, bench: Bench) -> Report:
     bench.run("maps", [Job(f"map {path.stem}", make_map, (task,)) for path, task in maps.items()])
     bench.run("drives", [Job(task.name, run_task, (task,)) for task in missing])
     found = figures_of(options, {which: task.kept.read(CaseResult) for which, task in tasks.items()})
-    return Report(found, [table_of(found)])
+    return StudyReport(found, [table_of(found)])
 
 
 def figures_of(options: HardOptions, results: Mapping[tuple[str, str, int], CaseResult]) -> dict[str, Any]:
@@ -120,7 +120,7 @@ class CaseTask:
         """What the task is called."""
         return f"{self.case} {self.sensor} {self.seed}"
 
-    def place(self) -> Place:
+    def place(self) -> CoursePlace:
         """Return the place, made anew."""
         case = CASES[self.case]
         return place_of(case.place, self.seed, case.length_m * self.shorter)

@@ -24,7 +24,14 @@ from gnd.gnd_map.arrays import F64
 from gnd.gnd_map.classes import ChangeClass
 from studies.frame.figures import INK, PALE, save, spines
 from studies.localisation_study.series import FORD_LOCAL, PAPER, PAPER_LIMITS, PAPER_OF_ROW, QUANTITIES, PoseSeries
-from studies.localisation_study.summary import ROW_LABELS, ROWS, SeedOutcome, SensorOutcome, StudyOutcome, sensors_of
+from studies.localisation_study.summary import (
+    ROW_LABELS,
+    ROWS,
+    LocalisationOutcome,
+    LocalisationSeed,
+    SensorOutcome,
+    sensors_of,
+)
 from studies.localisation_study.variants import LABELS
 
 _GREEN: Final = "#cfeccb"
@@ -66,7 +73,7 @@ _PICTURES: Final = (
 )
 
 
-def draw_figures(outcome: StudyOutcome, folder: Path) -> list[Path]:
+def draw_figures(outcome: LocalisationOutcome, folder: Path) -> list[Path]:
     """Draw both figures of each sensor, for the seed on which it is worst with submaps, and return their paths.
 
     Raises:
@@ -85,7 +92,7 @@ def draw_figures(outcome: StudyOutcome, folder: Path) -> list[Path]:
     return paths
 
 
-def _length(outcome: StudyOutcome) -> str:
+def _length(outcome: LocalisationOutcome) -> str:
     return f"street of {outcome.options.street.length_m:g} m, scans with motion distortion, urban traffic"
 
 
@@ -95,7 +102,7 @@ def _badness(found: SensorOutcome) -> float:
     return float(np.max(np.abs(error) / np.array(PAPER_LIMITS.max), initial=0.0))
 
 
-def _share(outcome: StudyOutcome, seed: SeedOutcome, plan: SensorOutcome) -> tuple[F64, F64]:
+def _share(outcome: LocalisationOutcome, seed: LocalisationSeed, plan: SensorOutcome) -> tuple[F64, F64]:
     world = street(seed.seed, outcome.options.street)
     return changed_share_along(world, read_truth(seed.truth), plan.drive)
 

@@ -19,7 +19,7 @@ from studies.simulation.base_map import BaseMap
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Localised:
+class LocalisedVariant:
     """What a run gave: final and online poses against the truth, and how many scans it was given."""
 
     final: PoseSeries
@@ -27,7 +27,7 @@ class Localised:
     scans: int
 
 
-class Vehicle:
+class LocalisingVehicle:
     """A localiser over held tiles; gives its online pose after every scan.
 
     Attributes:
@@ -74,7 +74,7 @@ def localise(
     base: BaseMap,
     parameters: LocaliserParameters,
     variant: Variant,
-) -> Localised:
+) -> LocalisedVariant:
     """Run the localiser over a drive.
 
     Args:
@@ -88,7 +88,7 @@ def localise(
         VehicleError: the drive has no GNSS fix.
     """
     fix, all_items = first_fix(items, header.drive_id)
-    vehicle = Vehicle(variant.header(header), fix, base, parameters)
+    vehicle = LocalisingVehicle(variant.header(header), fix, base, parameters)
     reference: list[ReferencePose] = []
     for item in _changed(all_items, variant, vehicle):
         if isinstance(item, ReferencePose):
@@ -96,10 +96,10 @@ def localise(
         else:
             vehicle.push(item)
     final, true = vehicle.finish(), vehicle.reference(reference)
-    return Localised(PoseSeries.of(final, true), PoseSeries.of(vehicle.online, true), vehicle.scans)
+    return LocalisedVariant(PoseSeries.of(final, true), PoseSeries.of(vehicle.online, true), vehicle.scans)
 
 
-def _changed(items: Iterable[DriveItem], variant: Variant, vehicle: Vehicle) -> Iterator[DriveItem]:
+def _changed(items: Iterable[DriveItem], variant: Variant, vehicle: LocalisingVehicle) -> Iterator[DriveItem]:
     for item in items:
         vehicle.scans += isinstance(item, Scan)
         variant.posed = bool(vehicle.online)

@@ -19,15 +19,21 @@ from gnd.gnd_map.config import to_mapping
 from gnd.schemas.drive import Scan
 from gnd.schemas.drive_mcap import read_drive, read_header
 from gnd.vehicle_agent.localise.parameters import LocaliserParameters
-from studies.frame.command import Bench, Report, study
+from studies.frame.command import Bench, StudyReport, study
 from studies.frame.errors import OptionError
-from studies.frame.folder import RunFolder
+from studies.frame.folder import StudyFolder
 from studies.frame.kept import LOCALISER, SIMULATOR, Kept, key_of, sources_sha
 from studies.frame.options import check, option, parts, seeds
 from studies.frame.pool import Job, Tick
-from studies.localisation_study.localising import Localised, localise, without_submaps
-from studies.localisation_study.summary import SeedOutcome, SensorOutcome, StudyOutcome, sheets_of, summary_of
-from studies.localisation_study.trials import Trial, begin_times, run_trial
+from studies.localisation_study.localising import LocalisedVariant, localise, without_submaps
+from studies.localisation_study.summary import (
+    LocalisationOutcome,
+    LocalisationSeed,
+    SensorOutcome,
+    sheets_of,
+    summary_of,
+)
+from studies.localisation_study.trials import StartTrial, begin_times, run_trial
 from studies.localisation_study.variants import FRESH, OUTDATED, UPDATED, VARIANTS, WITHOUT, variant_of
 from studies.simulation.base_map import BaseMap, driven, read_base, surveyed, write_base
 from studies.simulation.cloud import merged_map
@@ -115,7 +121,7 @@ class StudyOptions:
 
 
 @study(StudyOptions, out="runs/reproduce-localisation", keeps_drives=True)
-def localisation(options: StudyOptions, bench: Bench) -> Report:
+def localisation(options: StudyOptions, bench: Bench) -> StudyReport:
     """Localisation in a changed world: with and without submaps, before and after the map update, with added errors.
 
     Errors stand beside the GND paper's and Ford's limits. A second start with the same options and folder continues
@@ -130,7 +136,7 @@ def localisation(options: StudyOptions, bench: Bench) -> Report:
     for sensor in [one for plan in plans for one in plan.sensors] if not bench.keep_drives else ():
         sensor.recording.unlink(missing_ok=True)
     bench.spent_s["total"] = sum(bench.spent_s.values())
-    outcome = StudyOutcome(options, tuple(plan.outcome() for plan in plans), bench.spent_s)
+    outcome = LocalisationOutcome(options, tuple(plan.outcome() for plan in plans), bench.spent_s)
     found = summary_of(outcome)
 
     def draw(folder: Path) -> None:
@@ -139,7 +145,7 @@ def localisation(options: StudyOptions, bench: Bench) -> Report:
         draw_figures(outcome, folder)
         draw_overview(found, folder / "overview.png")
 
-    return Report(found, sheets_of(found), draw)
+    return StudyReport(found, sheets_of(found), draw)
 
 
 def drive_config(options: StudyOptions, seed: int, sensor: str) -> DriveConfig:
@@ -165,12 +171,12 @@ def drive_config(options: StudyOptions, seed: int, sensor: str) -> DriveConfig:
 class RunResult:
     """What a run of the localiser gave, and its seconds of CPU."""
 
-    found: Localised
+    found: LocalisedVariant
     cpu_s: float
 
 
 @dataclass(frozen=True, slots=True)
-class Run:
+class LocalisationRun:
     """One run of the localiser.
 
     Attributes:
@@ -193,13 +199,13 @@ class SensorPlan:
         drive: what is simulated.
         recording: the drive as MCAP, while it is needed.
         runs: of the localiser.
-        trials: result of the starts without a pose, a list of `Trial`; None where there are none.
+        trials: result of the starts without a pose, a list of `StartTrial`; None where there are none.
     """
 
     sensor: str
     drive: DriveConfig
     recording: Path
-    runs: tuple[Run, ...]
+    runs: tuple[LocalisationRun, ...]
     trials: Kept | None
 
     @property
@@ -210,7 +216,7 @@ class SensorPlan:
     def outcome(self) -> SensorOutcome:
         """What came of it."""
         read = {run.name: run.kept.read(RunResult) for run in self.runs}
-        trials = self.trials.read(list[Trial]) if self.trials is not None else []
+        trials = self.trials.read(list[StartTrial]) if self.trials is not None else []
         localised, cpu_s = {n: r.found for n, r in read.items()}, {n: r.cpu_s for n, r in read.items()}
         return SensorOutcome(self.sensor, self.drive, localised, cpu_s, trials)
 
@@ -228,7 +234,7 @@ class SeedPlan:
     sensors: tuple[SensorPlan, ...]
 
     @classmethod
-    def of(cls, folder: RunFolder, seed: int, options: StudyOptions) -> "SeedPlan":
+    def of(cls, folder: StudyFolder, seed: int, options: StudyOptions) -> "SeedPlan":
         """Return the plan of a seed; nothing runs here."""
         fleet = options.of_fleet(seed)
         files, world = world_files(folder, seed, fleet), world_sha(street(seed, options.street))
@@ -246,10 +252,10 @@ class SeedPlan:
         """The work of the fleet's vehicles."""
         return vehicle_tasks(options.of_fleet(self.seed), self.seed, self.files)[: options.fleet]
 
-    def outcome(self) -> SeedOutcome:
+    def outcome(self) -> LocalisationSeed:
         """What came of it."""
         maps = {"outdated": self.files.base, "updated": self.updated.path, "fresh": self.fresh.path}
-        return SeedOutcome(self.seed, self.files.truth, maps, tuple(one.outcome() for one in self.sensors))
+        return LocalisationSeed(self.seed, self.files.truth, maps, tuple(one.outcome() for one in self.sensors))
 
 
 def _sensor_plan(
@@ -262,7 +268,9 @@ def _sensor_plan(
     runs = []
     for name in (WITHOUT, OUTDATED, UPDATED, FRESH, *variants):
         path, map_key = maps.get(name, maps[OUTDATED])
-        runs.append(Run(name, path, Kept(home, f"{sensor}-{name}", key_of(map=map_key, name=name, **decides))))
+        runs.append(
+            LocalisationRun(name, path, Kept(home, f"{sensor}-{name}", key_of(map=map_key, name=name, **decides)))
+        )
     trials = Kept(home, f"{sensor}-trials", key_of(map=maps[OUTDATED][1], trials=options.trials, **decides))
     recording = files.home / "drives" / f"{sensor}-{drive_key}.mcap"
     return SensorPlan(sensor, drive, recording, tuple(runs), trials if options.trials else None)
@@ -344,7 +352,9 @@ def make_updated(base: Path, fleet: list[VehicleFile], merge: MergeParameters, k
     write_base(BaseMap({tile: tiles[tile] for tile in sorted(tiles) if len(tiles[tile])}), kept.path)
 
 
-def run_all(recording: Path, runs: list[Run], parameters: LocaliserParameters, seed: int, tick: Tick) -> None:
+def run_all(
+    recording: Path, runs: list[LocalisationRun], parameters: LocaliserParameters, seed: int, tick: Tick
+) -> None:
     """Run the localiser over a recorded drive, once for each run."""
     header, items = read_header(recording), list(read_drive(recording))
     scans = sum(isinstance(item, Scan) for item in items)
@@ -364,7 +374,12 @@ def run_trials(
     recording: Path, base: Path, n: int, parameters: LocaliserParameters, seed: int, kept: Kept, tick: Tick
 ) -> None:
     """Start the localiser n times at random in a recorded drive."""
-    header, items, tiles, trials = read_header(recording), list(read_drive(recording)), read_base(base), list[Trial]()
+    header, items, tiles, trials = (
+        read_header(recording),
+        list(read_drive(recording)),
+        read_base(base),
+        list[StartTrial](),
+    )
     for begin_ns in begin_times(items, n, seed):
         trials.append(run_trial(header, items, begin_ns, tiles, parameters, seed))
         tick(len(trials), n)

@@ -14,7 +14,7 @@ from gnd.fleet_sim.world_summary import summary
 from gnd.gnd_map.config import to_mapping
 from studies.frame.averages import rounded, worst_of
 from studies.frame.tables import Sheet, sheet
-from studies.localisation_study.localising import Localised
+from studies.localisation_study.localising import LocalisedVariant
 from studies.localisation_study.series import (
     AIM_REINITIALISED,
     AIM_TURNING,
@@ -29,9 +29,9 @@ from studies.localisation_study.series import (
     PAPER_OF_ROW,
     QUANTITIES,
     STATISTICS,
-    Limit,
+    ErrorLimit,
 )  # fmt: skip
-from studies.localisation_study.trials import WITHIN_S, Trial, trials_row
+from studies.localisation_study.trials import WITHIN_S, StartTrial, trials_row
 from studies.localisation_study.variants import FRESH, LABELS, OUTDATED, UPDATED, VARIANTS, WITHOUT
 from studies.simulation.base_map import read_base
 
@@ -42,13 +42,13 @@ class SensorOutcome:
 
     sensor: str
     drive: DriveConfig
-    runs: Mapping[str, Localised]
+    runs: Mapping[str, LocalisedVariant]
     cpu_s: Mapping[str, float]
-    trials: Sequence[Trial]
+    trials: Sequence[StartTrial]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class SeedOutcome:
+class LocalisationSeed:
     """What came of one seed: the files of its truth and of its maps (outdated, updated, fresh), and its sensors."""
 
     seed: int
@@ -58,11 +58,11 @@ class SeedOutcome:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class StudyOutcome:
+class LocalisationOutcome:
     """A finished study; `options` are those of `studies.localisation_study.study`."""
 
     options: Any
-    seeds: tuple[SeedOutcome, ...]
+    seeds: tuple[LocalisationSeed, ...]
     runtime_s: Mapping[str, float]
 
 
@@ -80,7 +80,7 @@ _DIGITS: Final = 6
 _CHANGED: Final = ("new", "modified", "deleted")
 
 
-def summary_of(outcome: StudyOutcome) -> dict[str, Any]:
+def summary_of(outcome: LocalisationOutcome) -> dict[str, Any]:
     """Return everything as plain values: a sensor's rows at the top level, of several seeds the worst; each seed below
     `seeds`.
     """
@@ -101,7 +101,7 @@ def summary_of(outcome: StudyOutcome) -> dict[str, Any]:
     return found
 
 
-def seed_summary(outcome: SeedOutcome, options: StreetOptions) -> dict[str, Any]:
+def seed_summary(outcome: LocalisationSeed, options: StreetOptions) -> dict[str, Any]:
     """Return the rows of each sensor and the facts of the world."""
     found: dict[str, Any] = {one.sensor: _sensor(one) for one in outcome.sensors}
     return found | {"world": _world(outcome, options)}
@@ -122,7 +122,7 @@ def _sensor(outcome: SensorOutcome) -> dict[str, Any]:
     return found
 
 
-def _world(outcome: SeedOutcome, options: StreetOptions) -> dict[str, Any]:
+def _world(outcome: LocalisationSeed, options: StreetOptions) -> dict[str, Any]:
     """What the world is like, and how large the three maps are."""
     facts = summary(street(outcome.seed, options))
     counts = read_truth(outcome.truth).counts("all")
@@ -145,7 +145,7 @@ def sensors_of(found: Mapping[str, Any]) -> list[str]:
     return [name for name in found if name in SHORT_NAMES]
 
 
-def within(row: Mapping[str, Any], limit: Limit, *statistics: str) -> bool:
+def within(row: Mapping[str, Any], limit: ErrorLimit, *statistics: str) -> bool:
     """Return whether a row's errors lie within a limit; a row without poses does not."""
     if row[QUANTITIES[0]] is None:
         return False

@@ -12,7 +12,7 @@ from gnd.gnd_map.motion import Trajectory
 from gnd.schemas.drive import DriveHeader, DriveItem, GnssFix, ReferencePose, Scan
 from gnd.vehicle_agent.localise.parameters import LocaliserParameters
 from gnd.vehicle_agent.sources.recording import first_fix
-from studies.localisation_study.localising import Vehicle
+from studies.localisation_study.localising import LocalisingVehicle
 from studies.localisation_study.series import PoseSeries
 from studies.simulation.base_map import BaseMap
 
@@ -26,7 +26,7 @@ _AXES: Final = (1.0, 1.0, 1.5)
 
 
 @dataclass(frozen=True, slots=True)
-class Trial:
+class StartTrial:
     """One start.
 
     Attributes:
@@ -59,7 +59,7 @@ def run_trial(
     base: BaseMap,
     parameters: LocaliserParameters,
     seed: int,
-) -> Trial:
+) -> StartTrial:
     """Start a fresh localiser at a time of the drive.
 
     Args:
@@ -75,12 +75,12 @@ def run_trial(
     poses = [item for item in part if isinstance(item, ReferencePose)]
     rest = [item for item in part if not isinstance(item, ReferencePose)]
     fix, stream = first_fix(_other_fixes(rest, header, poses, np.random.default_rng([seed, begin_ns])), header.drive_id)
-    vehicle = Vehicle(header, fix, base, parameters)
+    vehicle = LocalisingVehicle(header, fix, base, parameters)
     scans = _drive(vehicle, stream)
     return judged(PoseSeries.of(vehicle.online, vehicle.reference(poses)), begin_ns, scans)
 
 
-def _drive(vehicle: Vehicle, items: Iterator[DriveItem]) -> int:
+def _drive(vehicle: LocalisingVehicle, items: Iterator[DriveItem]) -> int:
     """Drive until a while after the first good pose; the number of scans."""
     good_ns: int | None = None
     for item in items:
@@ -93,14 +93,14 @@ def _drive(vehicle: Vehicle, items: Iterator[DriveItem]) -> int:
     return vehicle.scans
 
 
-def judged(online: PoseSeries, begin_ns: int, scans: int) -> Trial:
+def judged(online: PoseSeries, begin_ns: int, scans: int) -> StartTrial:
     """Return what the online poses of a start are worth: the first that is called good decides."""
     good = np.flatnonzero(online.good)
     wrong = int(np.count_nonzero(online.good & online.wrong))
     if not len(good):
-        return Trial(begin_ns, None, right=False, wrong_called_good=wrong, scans=scans)
+        return StartTrial(begin_ns, None, right=False, wrong_called_good=wrong, scans=scans)
     first = good[0]
-    return Trial(begin_ns, (int(online.t_ns[first]) - begin_ns) * 1e-9, not online.wrong[first], wrong, scans)
+    return StartTrial(begin_ns, (int(online.t_ns[first]) - begin_ns) * 1e-9, not online.wrong[first], wrong, scans)
 
 
 def _other_fixes(
@@ -123,7 +123,7 @@ def _t_ns(item: DriveItem) -> int:
     return item.t_ns
 
 
-def trials_row(trials: Sequence[Trial]) -> dict[str, Any]:
+def trials_row(trials: Sequence[StartTrial]) -> dict[str, Any]:
     """Return what came of all starts."""
     after_s = [t.good_after_s for t in trials if t.good_after_s is not None]
     right = sum(t.right for t in trials)

@@ -16,7 +16,7 @@ from gnd.gnd_map.arrays import F64
 from gnd.schemas.features import FeatureReport
 from gnd.vehicle_agent.features.layer import of_counts
 from gnd.vehicle_agent.features.look import MapFeatures
-from gnd.vehicle_agent.features.mapping.feature_drive import FeatureDrive, Fixes
+from gnd.vehicle_agent.features.mapping.feature_drive import FeatureDrive, GnssFixes
 from gnd.vehicle_agent.features.mapping.new_layer import NewLayer, lane_map, localise_with_features, map_new_layer
 from gnd.vehicle_agent.features.view import SensorView
 from studies.feature_study.reporting import (
@@ -26,7 +26,7 @@ from studies.feature_study.reporting import (
     in_route_frame,
     reports_of,
 )
-from studies.new_layer_study.layers import DriveLayers, Layer, LayerTruth, Localised
+from studies.new_layer_study.layers import DriveLayers, Layer, LayerLocalised, LayerTruth
 
 TRACK: Final = "track"
 MOTORWAY: Final = "motorway"
@@ -90,7 +90,7 @@ def drive_of(task: RouteTask, vehicle: int) -> RoadDrive:
 
 def feature_drive(drive: RoadDrive) -> FeatureDrive:
     """Return what the vehicle has of a drive."""
-    return FeatureDrive(drive.motion, Fixes(drive.gnss.t_ns, drive.gnss.xy_m), drive.looks, drive.lane_looks)
+    return FeatureDrive(drive.motion, GnssFixes(drive.gnss.t_ns, drive.gnss.xy_m), drive.looks, drive.lane_looks)
 
 
 def layer_truth(route: Route) -> LayerTruth:
@@ -145,7 +145,7 @@ def integrated(route: Route, reports: list[FeatureReport]) -> Layer:
     return Layer(np.concatenate(xy_m), np.concatenate(cov_m2))
 
 
-def localised(task: RouteTask, vehicle: int, layer: Layer | None) -> Localised:
+def localised(task: RouteTask, vehicle: int, layer: Layer | None) -> LayerLocalised:
     """Return the errors of a drive's poses at its looks, by motion, GNSS, lanes, and a layer where given."""
     drive = drive_of(task, vehicle)
     known = None if layer is None else _known(drive.route, layer)
@@ -153,7 +153,7 @@ def localised(task: RouteTask, vehicle: int, layer: Layer | None) -> Localised:
     times = np.array([look.t_ns for look in drive.looks], np.int64)
     times = times[(times >= found.path.t_ns[0]) & (times <= found.path.t_ns[-1])]
     rows = np.searchsorted([look.t_ns for look in drive.looks], times)
-    return Localised(
+    return LayerLocalised(
         (times - drive.motion.t_ns[0]) * 1e-9, along_and_across(found.path.at(times), drive.truth.look_poses[rows])
     )
 

@@ -19,8 +19,8 @@ from studies.new_layer_study.layers import (
     WIDE_RADIUS_M,
     LayerScore,
     MotorwayOutcome,
+    NewLayerSeed,
     RouteOutcome,
-    SeedOutcome,
 )
 from studies.new_layer_study.summary import drive_scores, integrated_score
 
@@ -29,7 +29,7 @@ _SIGMAS_95: Final = 2.4477
 """Half axes of the 95 % ellipse of two dimensions, in standard deviations."""
 
 
-def draw_figures(outcomes: Sequence[SeedOutcome], km: float, found: Mapping[str, Any], folder: Path) -> list[Path]:
+def draw_figures(outcomes: Sequence[NewLayerSeed], km: float, found: Mapping[str, Any], folder: Path) -> list[Path]:
     """Draw all figures into the folder and return their paths; of single features those of the first seed.
 
     Raises:

@@ -148,7 +148,7 @@ class RouteOutcome:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Localised:
+class LayerLocalised:
     """Errors of the poses of one drive: float64 (S, 2), along and across the true heading [m], and seconds (S,)."""
 
     t_s: F64
@@ -165,12 +165,12 @@ class MotorwayOutcome:
     """One motorway: its layers, and a fresh drive localised without and with the layer of all drives before."""
 
     route: RouteOutcome
-    without: Localised
-    with_layer: Localised
+    without: LayerLocalised
+    with_layer: LayerLocalised
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class SeedOutcome:
+class NewLayerSeed:
     """What came of one seed.
 
     Attributes:

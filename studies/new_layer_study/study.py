@@ -8,7 +8,7 @@ from typing import Final
 from gnd.gnd_map.config import to_mapping
 from gnd.schemas.features import FeatureReport
 from studies.feature_study.reporting import read_reports, write_reports
-from studies.frame.command import Bench, Report, study
+from studies.frame.command import Bench, StudyReport, study
 from studies.frame.errors import OptionError
 from studies.frame.kept import Kept, key_of, sources_sha
 from studies.frame.options import check, list_of, option, seeds
@@ -23,7 +23,7 @@ from studies.new_layer_study.driving import (
     localised,
     mapped,
 )
-from studies.new_layer_study.layers import DriveLayers, Localised, MotorwayOutcome, RouteOutcome, SeedOutcome
+from studies.new_layer_study.layers import DriveLayers, LayerLocalised, MotorwayOutcome, NewLayerSeed, RouteOutcome
 from studies.new_layer_study.summary import summary_of, tables_of
 
 SOURCES: Final = (
@@ -72,7 +72,7 @@ class NewLayerOptions:
 
 
 @study(NewLayerOptions, out="runs/reproduce-new-layer")
-def new_feature_layer(options: NewLayerOptions, bench: Bench) -> Report:
+def new_feature_layer(options: NewLayerOptions, bench: Bench) -> StudyReport:
     """A layer of beacons or streetlights that many cars map while driving, and localisation with it: Figures 6 to 8, 10
     to 12 and Tables 2 and 3 of the paper on new feature layers.
 
@@ -90,7 +90,7 @@ def new_feature_layer(options: NewLayerOptions, bench: Bench) -> Report:
 
         draw_figures(outcomes, options.km, found, folder)
 
-    return Report(found, tables_of(found), draw)
+    return StudyReport(found, tables_of(found), draw)
 
 
 @dataclass(frozen=True, slots=True)
@@ -216,7 +216,7 @@ def _all_reports(tasks: tuple[MappingTask, ...]) -> list[FeatureReport]:
     return [report for task in tasks for report in read_reports(task.reports)]
 
 
-def _read(options: NewLayerOptions, plan: SeedTasks) -> SeedOutcome:
+def _read(options: NewLayerOptions, plan: SeedTasks) -> NewLayerSeed:
     routes = {task: _read_route(task, drives) for task, drives in plan.routes.items()}
     noisy = {
         sensor: {level: routes[task] for level, task in levels.items()}
@@ -224,7 +224,7 @@ def _read(options: NewLayerOptions, plan: SeedTasks) -> SeedOutcome:
     }
     roads = {one.route.kind: _read_motorway(routes[one.route], one.kept) for one in plan.fresh}
     track = routes[RouteTask(TRACK, plan.seed, options.lap_m / 1e3)]
-    return SeedOutcome(plan.seed, track, noisy, roads[MOTORWAY], roads.get(STRAIGHT))
+    return NewLayerSeed(plan.seed, track, noisy, roads[MOTORWAY], roads.get(STRAIGHT))
 
 
 def _read_route(task: RouteTask, drives: tuple[MappingTask, ...]) -> RouteOutcome:
@@ -241,4 +241,4 @@ def _read_route(task: RouteTask, drives: tuple[MappingTask, ...]) -> RouteOutcom
 
 
 def _read_motorway(route: RouteOutcome, kept: Kept) -> MotorwayOutcome:
-    return MotorwayOutcome(route, **kept.read(dict[str, Localised]))
+    return MotorwayOutcome(route, **kept.read(dict[str, LayerLocalised]))

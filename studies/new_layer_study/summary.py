@@ -18,8 +18,8 @@ from studies.new_layer_study.layers import (
     WIDE_RADIUS_M,
     LayerScore,
     MotorwayOutcome,
+    NewLayerSeed,
     RouteOutcome,
-    SeedOutcome,
     pooled,
     score,
 )  # fmt: skip
@@ -27,7 +27,7 @@ from studies.new_layer_study.layers import (
 MAP_CASES = ("without_map", "with_map")
 
 
-def summary_of(options: Any, outcomes: Sequence[SeedOutcome], spent_s: Mapping[str, float]) -> dict[str, Any]:
+def summary_of(options: Any, outcomes: Sequence[NewLayerSeed], spent_s: Mapping[str, float]) -> dict[str, Any]:
     """Return everything as plain values: means over the seeds below `nfl`, their standard deviations below
     `std_over_seeds`, each seed below `seeds`.
     """
@@ -51,7 +51,7 @@ def summary_of(options: Any, outcomes: Sequence[SeedOutcome], spent_s: Mapping[s
     return dict(rounded(found))
 
 
-def seed_summary(outcome: SeedOutcome) -> dict[str, Any]:
+def seed_summary(outcome: NewLayerSeed) -> dict[str, Any]:
     """Return the numbers of one seed."""
     track = outcome.track
     single = {case: pooled(drive_scores(track, case)) for case in MAP_CASES}

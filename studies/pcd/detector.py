@@ -7,7 +7,7 @@ from gnd.gnd_map.arrays import F32, F64, I32, I64, points_3d
 from gnd.gnd_map.errors import ShapeError
 from gnd.gnd_map.evidence import ChangeState, masses, states
 from studies.pcd.index import PcdIndex, index_of
-from studies.pcd.kernel import CELLS, EMPTY, SIDE, Counts, Rules, cast_rays, support_sums
+from studies.pcd.kernel import CELLS, EMPTY, SIDE, PcdCounts, Rules, cast_rays, support_sums
 from studies.pcd.points import PcdDetectParameters, PcdMap
 from studies.pcd.report import PcdReport
 
@@ -101,9 +101,9 @@ class PcdDetector:
         return np.unique(np.concatenate(parts)).astype(np.int32)
 
 
-def _no_counts(index: PcdIndex) -> Counts:
+def _no_counts(index: PcdIndex) -> PcdCounts:
     rows, cells = len(index.base.start), len(index.cells)
-    return Counts(
+    return PcdCounts(
         state=index.state.copy(),
         map_hits=np.zeros(cells, np.int32),
         map_passes=np.zeros(cells, np.int32),
@@ -115,7 +115,7 @@ def _no_counts(index: PcdIndex) -> Counts:
     )
 
 
-def _grown(c: Counts) -> Counts:
+def _grown(c: PcdCounts) -> PcdCounts:
     """Room for twice as many new blocks."""
     names = ("new_hits", "new_passes", "new_sum", "new_block")
     return c._replace(**{name: np.concatenate([getattr(c, name), np.zeros_like(getattr(c, name))]) for name in names})

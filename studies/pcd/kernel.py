@@ -44,7 +44,7 @@ class Base(NamedTuple):
     shape: tuple[int, int, int]
 
 
-class Counts(NamedTuple):
+class PcdCounts(NamedTuple):
     """What a drive counts.
 
     `state` (blocks,) int32: row of a map block (0 ... R - 1), R + row of a block that only has new points, or
@@ -138,7 +138,7 @@ def _has_passed(
 
 @inlined
 def _cross_block(
-    base: Base, counts: Counts, row: int, new: int, corner: tuple[int, int, int],
+    base: Base, counts: PcdCounts, row: int, new: int, corner: tuple[int, int, int],
     g: tuple[float, float, float], d: tuple[float, float, float],
     o: tuple[float, float, float], v: tuple[float, float, float], length: float,
     t_in: float, t_end: float, rules: Rules,
@@ -224,7 +224,7 @@ def _explained_by(  # noqa: C901  (a call a block would cost more than the block
 
 @kernel
 def cast_rays(  # noqa: C901  (one loop: a call a block would cost more than the block)
-    points: F64, origins: F64, A: F64, b: F64, base: Base, counts: Counts, used: int, rules: Rules,
+    points: F64, origins: F64, A: F64, b: F64, base: Base, counts: PcdCounts, used: int, rules: Rules,
     moving: NDArray[np.bool_], start: int,
 ) -> tuple[int, int]:  # fmt: skip
     """Cast rays `start` and following of one scan.

@@ -25,14 +25,14 @@ from gnd.vehicle_agent.segment.parameters import SegmentParameters
 from gnd.vehicle_agent.segment.segmenter import MotionSegmenter, SegmentedScan
 from gnd.vehicle_agent.tiles_at_hand import localising_on
 from studies.frame.errors import RealDataError
-from studies.real.scene import Scene, keys_of
+from studies.real.scene import RecordedScene, keys_of
 
 Poses = Literal["reference", "estimated"]
 Tiles = dict[TileId, Gaussians]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Found:
+class FoundVoxels:
     """What a drive says of every voxel that it touched.
 
     keys: (K,). g: (K, 3) int64 grid coordinates. change_class: (K,) uint8. in_map: (K,) whether the map has a Gaussian
@@ -46,10 +46,10 @@ class Found:
     mean_m: NDArray[np.float64]
     scans_used: int
 
-    def within(self, keys: NDArray[np.int64]) -> "Found":
+    def within(self, keys: NDArray[np.int64]) -> "FoundVoxels":
         """What is said of these voxels only."""
         kept = np.isin(self.keys, keys)
-        return Found(
+        return FoundVoxels(
             keys=self.keys[kept],
             g=self.g[kept],
             change_class=self.change_class[kept],
@@ -63,7 +63,7 @@ class Found:
         return np.isin(self.change_class, classes)
 
 
-def local_map_of(scene: Scene, tiles: Tiles) -> LocalMap:
+def local_map_of(scene: RecordedScene, tiles: Tiles) -> LocalMap:
     """The map of all tiles around the track; tiles without Gaussians are known to be empty."""
     local_map = LocalMap(scene.grid_frame)
     for tile_id in scene.grid_frame.tiles:
@@ -82,7 +82,9 @@ def segmented(scans: Iterable[RefinedScan], parameters: SegmentParameters) -> It
     yield from segmenter.flush()
 
 
-def refined_scans(scene: Scene, local_map: LocalMap, scans: Iterable[Scan], poses: Poses) -> Iterator[RefinedScan]:
+def refined_scans(
+    scene: RecordedScene, local_map: LocalMap, scans: Iterable[Scan], poses: Poses
+) -> Iterator[RefinedScan]:
     """Scans at the poses of the track, or at those that the vehicle's localiser finds on the map."""
     if poses == "reference":
         yield from map(scene.refined, scans)
@@ -98,7 +100,9 @@ def refined_scans(scene: Scene, local_map: LocalMap, scans: Iterable[Scan], pose
     yield from seen
 
 
-def detect(scene: Scene, local_map: LocalMap, scans: Iterable[SegmentedScan], parameters: DetectParameters) -> Found:
+def detect(
+    scene: RecordedScene, local_map: LocalMap, scans: Iterable[SegmentedScan], parameters: DetectParameters
+) -> FoundVoxels:
     """Classes of all voxels that the scans touched.
 
     Raises:
@@ -116,12 +120,12 @@ def detect(scene: Scene, local_map: LocalMap, scans: Iterable[SegmentedScan], pa
     return _found(scene, {tile: classify(e, parameters) for tile, e in evidence.items()}, used)
 
 
-def _found(scene: Scene, classified: dict[TileId, Classification], used: int) -> Found:
+def _found(scene: RecordedScene, classified: dict[TileId, Classification], used: int) -> FoundVoxels:
     g = [scene.grid_frame.grid_of_voxel(tile, c.evidence.voxel_id) for tile, c in classified.items()]
     at = np.concatenate([np.empty((0, 3), np.int64), *g])
     parts = list(classified.values())
     means = [_means_map_m(scene, tile, c) for tile, c in classified.items()]
-    return Found(
+    return FoundVoxels(
         keys=keys_of(scene.grid_frame, at),
         g=at,
         change_class=np.concatenate([np.empty(0, np.uint8), *(c.change_class for c in parts)]),
@@ -131,7 +135,7 @@ def _found(scene: Scene, classified: dict[TileId, Classification], used: int) ->
     )
 
 
-def _means_map_m(scene: Scene, tile: TileId, one: Classification) -> NDArray[np.float64]:
+def _means_map_m(scene: RecordedScene, tile: TileId, one: Classification) -> NDArray[np.float64]:
     """(K, 3) map frame; a voxel without points has its mean at its centre."""
     frame = LocalFrame.of_tile(tile)
     p_tile_m = VoxelGrid.of(tile).centre_m(one.evidence.voxel_id) + one.evidence.measured.mean_m

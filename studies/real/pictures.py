@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from gnd.fleet_sim.shapes import Block
 from gnd.gnd_map.classes import CLASS_COLOURS, ChangeClass
 from studies.frame.figures import INK, save
-from studies.real.drive import Found
+from studies.real.drive import FoundVoxels
 from studies.real.rounds import Placed, Round
 
 F64 = NDArray[np.float64]
@@ -54,7 +54,7 @@ def draw_round(one: Round, folder: Path) -> list[Path]:
     return files
 
 
-def _classes(one: Round, found: Found, new: Sequence[Placed], gone: Sequence[Placed], title: str) -> Figure:
+def _classes(one: Round, found: FoundVoxels, new: Sequence[Placed], gone: Sequence[Placed], title: str) -> Figure:
     figure, axes = _sheet(one, title)
     hidden = np.isin(found.keys, one.inserted.truth.ignored) & found.where(*_CHANGED) & bool(new or gone)
     _add_voxels(axes, found.mean_m[hidden], HIDDEN)

@@ -20,8 +20,8 @@ from gnd.schemas.drive import Scan
 from gnd.vehicle_agent.detect.parameters import DetectParameters
 from gnd.vehicle_agent.segment.parameters import SegmentParameters
 from gnd.vehicle_agent.segment.segmenter import SegmentedScan
-from studies.real.drive import Found, Poses, Tiles, detect, local_map_of, refined_scans, segmented
-from studies.real.scene import Cells, Recorded, Scene, in_range, place
+from studies.real.drive import FoundVoxels, Poses, Tiles, detect, local_map_of, refined_scans, segmented
+from studies.real.scene import Cells, RecordedScans, RecordedScene, in_range, place
 
 F64 = NDArray[np.float64]
 Object = Block | Post
@@ -50,7 +50,7 @@ class Placed:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Surroundings:
+class CellSurroundings:
     """Points (N, 3) near the track, one in each cube of 20 cm, and the lowest point in cells of the ground plane."""
 
     points_m: F64
@@ -58,7 +58,7 @@ class Surroundings:
     corner_m: F64
 
     @classmethod
-    def of(cls, scene: Scene) -> "Surroundings":
+    def of(cls, scene: RecordedScene) -> "CellSurroundings":
         """From every third point of every scan."""
         parts = []
         for scan in scene.scans:
@@ -91,7 +91,7 @@ def _one_a_cube(points_m: F64) -> F64:
     return low_first[np.unique(np.ravel_multi_index(tuple(at.T), tuple(shape)), return_index=True)[1]]
 
 
-def choose_places(scene: Scene, around: Surroundings, n: int, rng: np.random.Generator) -> list[Placed]:
+def choose_places(scene: RecordedScene, around: CellSurroundings, n: int, rng: np.random.Generator) -> list[Placed]:
     """Up to `n` objects of all kinds, none in another's place or in the vehicle's way."""
     found: list[Placed] = []
     for tried in range(TRIES):
@@ -103,7 +103,7 @@ def choose_places(scene: Scene, around: Surroundings, n: int, rng: np.random.Gen
     return found
 
 
-def _candidate(scene: Scene, around: Surroundings, kind: str, rng: np.random.Generator) -> Placed | None:
+def _candidate(scene: RecordedScene, around: CellSurroundings, kind: str, rng: np.random.Generator) -> Placed | None:
     T = scene.poses.T_dst_vehicle[rng.integers(len(scene.poses))]
     aside = rng.uniform(NEAREST_M, FARTHEST_M) * rng.choice([-1.0, 1.0])
     xy = (T @ np.array([rng.uniform(-6.0, 6.0), aside, 0.0, 1.0]))[:2]
@@ -176,7 +176,7 @@ I64 = NDArray[np.int64]
 class Painter:
     """Puts objects into scans and remembers the points that then lie on them."""
 
-    def __init__(self, scene: Scene, shapes: Sequence[Shape], seed: int) -> None:
+    def __init__(self, scene: RecordedScene, shapes: Sequence[Shape], seed: int) -> None:
         self._scene, self._rng = scene, np.random.default_rng([91, seed])
         self._inserter = Inserter(shapes) if shapes else None
         self.on_objects = VoxelAccumulator(scene.grid_frame)
@@ -200,7 +200,7 @@ class Painter:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Truth:
+class RoundTruth:
     """Keys of voxels, each sorted.
 
     new, deleted: as the module says; measured: the deleted ones that the vehicle's beams crossed; ignored: neither.
@@ -212,7 +212,7 @@ class Truth:
     ignored: I64
 
 
-def truth_of(static: Cells, new: Painter, deleted: Painter, crossed: Painter, shadowed: I64) -> Truth:
+def truth_of(static: Cells, new: Painter, deleted: Painter, crossed: Painter, shadowed: I64) -> RoundTruth:
     """The truth of one round.
 
     Args:
@@ -226,7 +226,7 @@ def truth_of(static: Cells, new: Painter, deleted: Painter, crossed: Painter, sh
     pure_new, gone = _free(on_new.dense(N_MIN_CELLS), static), _free(on_gone.dense(N_MIN_CELLS), static)
     touched = np.unique(np.concatenate([on_new.keys, on_gone.keys, beams.keys, shadowed]))
     measured = gone[beams.count_at(gone) >= MIN_BEAMS]
-    return Truth(pure_new, gone, measured, np.setdiff1d(touched, np.concatenate([pure_new, gone])))
+    return RoundTruth(pure_new, gone, measured, np.setdiff1d(touched, np.concatenate([pure_new, gone])))
 
 
 def _free(keys: I64, static: Cells) -> I64:
@@ -256,7 +256,7 @@ class Method:
 class Untouched:
     """The two halves as they are: nothing changed but what moved by itself."""
 
-    found: Found
+    found: FoundVoxels
     tiles: Tiles
     seen: I64
     """Keys of the voxels that a ray of the map's half crossed or ended in: of the others the map cannot know."""
@@ -274,9 +274,9 @@ class Untouched:
 class Inserted:
     """The same with objects: those of the map's half are gone, those of the vehicle's half are new."""
 
-    found: Found
+    found: FoundVoxels
     tiles: Tiles
-    truth: Truth
+    truth: RoundTruth
     new: tuple[Placed, ...]
     gone: tuple[Placed, ...]
 
@@ -285,13 +285,13 @@ class Inserted:
 class Round:
     """All of one round."""
 
-    scene: Scene
+    scene: RecordedScene
     untouched: Untouched
     inserted: Inserted
 
 
 def run_round(
-    recorded: Recorded, halves: tuple[I64, I64], number: int, objects: int, seed: int, method: Method
+    recorded: RecordedScans, halves: tuple[I64, I64], number: int, objects: int, seed: int, method: Method
 ) -> Round:
     """Run one round.
 
@@ -307,11 +307,11 @@ def run_round(
     mapping, driving = ([scene.scans[i] for i in half] for half in halves)
     untouched = _untouched(scene, mapping, driving, method)
     rng = np.random.default_rng([seed, number])
-    placed = choose_places(scene, Surroundings.of(scene), objects, rng) if objects else []
+    placed = choose_places(scene, CellSurroundings.of(scene), objects, rng) if objects else []
     return Round(scene, untouched, _inserted(scene, mapping, driving, placed, untouched, method, number))
 
 
-def _map_of(scene: Scene, scans: Iterable[Scan], method: Method) -> VoxelAccumulator:
+def _map_of(scene: RecordedScene, scans: Iterable[Scan], method: Method) -> VoxelAccumulator:
     accumulator = VoxelAccumulator(scene.grid_frame)
     parameters = method.segment if method.segment_map else SegmentParameters(enabled=False)
     for one in segmented(map(scene.refined, scans), parameters):
@@ -319,7 +319,7 @@ def _map_of(scene: Scene, scans: Iterable[Scan], method: Method) -> VoxelAccumul
     return accumulator
 
 
-def _untouched(scene: Scene, mapping: list[Scan], driving: list[Scan], method: Method) -> Untouched:
+def _untouched(scene: RecordedScene, mapping: list[Scan], driving: list[Scan], method: Method) -> Untouched:
     points = _map_of(scene, mapping, method)
     tiles = points.finish()
     local_map = local_map_of(scene, tiles)
@@ -334,7 +334,7 @@ def _untouched(scene: Scene, mapping: list[Scan], driving: list[Scan], method: M
 class _Notes:
     """What the driven half consists of, noted while it passes."""
 
-    def __init__(self, scene: Scene) -> None:
+    def __init__(self, scene: RecordedScene) -> None:
         self.driven, self.moving = VoxelAccumulator(scene.grid_frame), VoxelAccumulator(scene.grid_frame)
         self._points: list[NDArray[np.float32]] = [np.empty((0, 3), np.float32)]
         self._marks: list[NDArray[np.bool_]] = [np.empty(0, np.bool_)]
@@ -353,9 +353,14 @@ class _Notes:
 
 
 def _inserted(
-    scene: Scene, mapping: list[Scan], driving: list[Scan], placed: list[Placed], untouched: Untouched, method: Method,
+    scene: RecordedScene,
+    mapping: list[Scan],
+    driving: list[Scan],
+    placed: list[Placed],
+    untouched: Untouched,
+    method: Method,
     number: int,
-) -> Inserted:  # fmt: skip
+) -> Inserted:
     new, gone = tuple(placed[::2]), tuple(placed[1::2])
     into_map = Painter(scene, [one.shape for one in gone], 2 * number)
     into_drive = Painter(scene, [one.shape for one in new], 2 * number + 1)

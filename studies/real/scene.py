@@ -31,7 +31,7 @@ _STEP_NS = 1_000_000
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Scene:
+class RecordedScene:
     """Scans in time order, the vehicle's poses at them, and the grid."""
 
     name: str
@@ -83,7 +83,7 @@ def in_range(scan: RefinedScan, farthest_m: float = MAP_RANGE_M) -> NDArray[np.b
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Recorded:
+class RecordedScans:
     """The scans of a recording in memory, with the track over all of them; `left_out` tells what was not used."""
 
     name: str
@@ -93,7 +93,7 @@ class Recorded:
     left_out: tuple[str, ...]
 
 
-def load(recording: Recording, at_most: int, progress: Progress) -> Recorded:
+def load(recording: Recording, at_most: int, progress: Progress) -> RecordedScans:
     """Read a recording and find its track.
 
     Args:
@@ -120,10 +120,10 @@ def load(recording: Recording, at_most: int, progress: Progress) -> Recorded:
     left_out = list(recording.notes)
     left_out += [f"{empty} scans without a usable point: left out"] if empty else []
     left_out += [f"scans after the first {n} of {whole}: left out"] if n < whole else []
-    return Recorded(recording.name, tuple(found), track, recording, tuple(left_out))
+    return RecordedScans(recording.name, tuple(found), track, recording, tuple(left_out))
 
 
-def place(recorded: Recorded, number: int, seed: int = 0) -> Scene:
+def place(recorded: RecordedScans, number: int, seed: int = 0) -> RecordedScene:
     """The recording turned about the vertical and shifted by less than a voxel, seeded; number 0 is as recorded."""
     rng, A = np.random.default_rng([77, seed, number]), np.eye(4)
     if number:
@@ -131,7 +131,7 @@ def place(recorded: Recorded, number: int, seed: int = 0) -> Scene:
         A[:3, 3] = rng.uniform(-0.5, 0.5, 3)
     poses = Trajectory(recorded.track.t_ns, A @ recorded.track.T_dst_vehicle)
     frame = recorded.recording.anchor.frame
-    return Scene(
+    return RecordedScene(
         name=recorded.name,
         scans=recorded.scans,
         poses=poses,

@@ -13,7 +13,7 @@ from gnd.gnd_map.gaussian import full_matrices
 from gnd.vehicle_agent.detect.records import planar_normals
 from gnd.vehicle_agent.local_map import LocalMap
 from studies.frame.tables import Sheet, fixed, sheet
-from studies.real.drive import Found, local_map_of
+from studies.real.drive import FoundVoxels, local_map_of
 from studies.real.rounds import Round
 
 CAUSES: Final[dict[str, str]] = {
@@ -121,7 +121,7 @@ def summary_of(rounds: Sequence[Round]) -> dict[str, Any]:
     }
 
 
-def untouched_scores(found: Sequence[Found]) -> dict[str, Any]:
+def untouched_scores(found: Sequence[FoundVoxels]) -> dict[str, Any]:
     """False changes: how many, of which class, and for how many voxels that were observed."""
     observed = sum(int((f.change_class != ChangeClass.UNMEASURED).sum()) for f in found)
     of_map = sum(int(((f.change_class != ChangeClass.UNMEASURED) & f.in_map).sum()) for f in found)

@@ -17,7 +17,7 @@ from gnd.vehicle_agent.importers.detect_format import format_of
 from gnd.vehicle_agent.importers.recording import NOMINAL, Recording
 from gnd.vehicle_agent.importers.splits import chosen_scans
 from gnd.vehicle_agent.segment.parameters import SegmentParameters
-from studies.frame.command import Bench, Report, study
+from studies.frame.command import Bench, StudyReport, study
 from studies.frame.errors import RealDataError
 from studies.frame.options import check, option
 from studies.real.drive import Poses
@@ -85,14 +85,14 @@ def changed(parameters: DetectParameters, changes: Sequence[str]) -> DetectParam
 
 
 @study(RealOptions, out="runs/reproduce-real", marked=False)
-def real(options: RealOptions, bench: Bench) -> Report:
+def real(options: RealOptions, bench: Bench) -> StudyReport:
     """Change detection on a real recording: part of the scans makes the map, the vehicle drives the others.
 
     Objects are inserted ray-accurately into the map's scans (they are gone, then) and into the vehicle's (they are
     new); the untouched scans tell how much is reported although nothing changed.
     """
     found = reproduce_real(options, bench.folder.root if bench.pictures else None, bench.step)
-    return Report(found, sheets_of(found), file=f"{found['recording']}.json")
+    return StudyReport(found, sheets_of(found), file=f"{found['recording']}.json")
 
 
 def reproduce_real(options: RealOptions, out: Path | None, progress: Progress) -> dict[str, Any]:

@@ -23,7 +23,7 @@ from gnd.vehicle_agent.localise.initialise import initialise
 from gnd.vehicle_agent.localise.match_map import MatchMap, MatchMapCache
 from gnd.vehicle_agent.localise.parameters import LocaliserParameters
 from gnd.vehicle_agent.localise.sampling import sample_scan
-from studies.real.scene import Scene
+from studies.real.scene import RecordedScene
 from studies.real_localisation.convergence import Aligner, convergence_of, on_map, pose_error, vehicle_points
 from studies.real_localisation.halves import Half
 
@@ -49,7 +49,7 @@ class ApolloMap:
     cov_m2: F64
 
 
-def apollo_map(folder: Path, scene: Scene) -> ApolloMap:
+def apollo_map(folder: Path, scene: RecordedScene) -> ApolloMap:
     """The NDT map of a recording around its first pose."""
     cells, T_utm_map = read_ndt_map(folder), _T_utm_map(folder, scene)
     near = np.linalg.norm(cells.mean_utm_m[:, :2] - T_utm_map[:2, 3], axis=1) < AROUND_M
@@ -60,7 +60,7 @@ def apollo_map(folder: Path, scene: Scene) -> ApolloMap:
     return ApolloMap(_match_map(cells, keep, mean, cov, R, t), mean, cov)
 
 
-def _T_utm_map(folder: Path, scene: Scene) -> F64:
+def _T_utm_map(folder: Path, scene: RecordedScene) -> F64:
     """(4, 4) grid coordinates of our map frame, by the convergence at its origin."""
     zone, southern = utm_zone(folder)
     frame = scene.grid_frame.frame
@@ -79,7 +79,7 @@ def _match_map(cells: NdtCells, keep: NDArray[np.int64], mean: F64, cov: F64, R:
     return MatchMap.of(index, R, t - origin, mean, six, LocaliserParameters().registration.noise_m)
 
 
-def apollo_of(folder: Path, scene: Scene) -> dict[str, Any]:
+def apollo_of(folder: Path, scene: RecordedScene) -> dict[str, Any]:
     """Everything about such a recording."""
     halves = [Half.made(f"scan {a + 1} mapped, scan {b + 1} driven", scene, [a], [b]) for a, b in ((0, 1), (1, 0))]
     theirs = apollo_map(folder, scene)
@@ -99,7 +99,7 @@ def _ours(half: Half) -> MatchMap:
     return cache.near(half.scene.positions_m[0])
 
 
-def _place(scene: Scene) -> dict[str, float]:
+def _place(scene: RecordedScene) -> dict[str, float]:
     """Of the second pose: what a navigation system would say."""
     T = scene.poses.T_dst_vehicle[-1]
     lat, lon, height = scene.grid_frame.frame.geodetic_from_enu(T[None, :3, 3])

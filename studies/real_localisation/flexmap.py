@@ -31,7 +31,7 @@ NEAR_M: Final = 15.0
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Lane:
+class FlexmapLane:
     """Left and right border, (N, 3) and (M, 3) in the SLAM's frame."""
 
     left_m: F64
@@ -39,7 +39,7 @@ class Lane:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Drawn:
+class DrawnFlexmap:
     """What a picture needs: the rigid and the bent track, the fixes (held out: (N,) bool), the lanes' outlines."""
 
     rigid: Georeferenced
@@ -54,7 +54,7 @@ def is_flexmap(folder: Path) -> bool:
     return all(len(list(folder.glob(name))) == 1 for name in ("*_pose_kitti.txt", "*_GPS.txt", "lanelet2_*.osm"))
 
 
-def flexmap_of(folder: Path) -> tuple[dict[str, Any], Drawn]:
+def flexmap_of(folder: Path) -> tuple[dict[str, Any], DrawnFlexmap]:
     """Residuals and lanes, and what a picture needs.
 
     Raises:
@@ -83,7 +83,7 @@ def flexmap_of(folder: Path) -> tuple[dict[str, Any], Drawn]:
         "held_out_in_lanes": {name: _inside(outlines[name], p[name][held_out]) for name in p},
         "origin": _origin(bent),
     }
-    return result, Drawn(rigid, bent, table, held_out, tuple(outlines["bent"]))
+    return result, DrawnFlexmap(rigid, bent, table, held_out, tuple(outlines["bent"]))
 
 
 def _origin(found: Georeferenced) -> dict[str, float]:
@@ -108,14 +108,14 @@ def _off(found: Georeferenced, fixes: FixTable, chosen: NDArray[np.bool_]) -> di
 # --- files -----------------------------------------------------------------------------------------------------------
 
 
-def _lanes(folder: Path) -> list[Lane]:
+def _lanes(folder: Path) -> list[FlexmapLane]:
     """The lanelets; their nodes carry local coordinates (their latitudes are placeholders)."""
     path = next(folder.glob("lanelet2_*.osm"))
     document = read_osm(path.read_bytes(), path.name)
     lanelets = [one for one in document.relations.values() if one.tags.get("type") == "lanelet"]
     if not lanelets:
         raise RealDataError(f"{path}: no lanelets")
-    return [Lane(*(_border_m(document, one, side) for side in ("left", "right"))) for one in lanelets]
+    return [FlexmapLane(*(_border_m(document, one, side) for side in ("left", "right"))) for one in lanelets]
 
 
 def _border_m(document: OsmDocument, lanelet: OsmRelation, side: str) -> F64:
@@ -123,7 +123,7 @@ def _border_m(document: OsmDocument, lanelet: OsmRelation, side: str) -> F64:
     return np.array([[float(node.tags[key]) for key in ("local_x", "local_y", "ele")] for node in nodes])
 
 
-def _outlines(lanes: list[Lane], track: Trajectory, found: Georeferenced | None) -> list[F64]:
+def _outlines(lanes: list[FlexmapLane], track: Trajectory, found: Georeferenced | None) -> list[F64]:
     """(K, 2) outline of each lane, moved with the track's nearest pose, or as drawn."""
     outlines = []
     for lane in lanes:
@@ -133,7 +133,7 @@ def _outlines(lanes: list[Lane], track: Trajectory, found: Georeferenced | None)
     return outlines
 
 
-def _same_way(lane: Lane) -> bool:
+def _same_way(lane: FlexmapLane) -> bool:
     """Whether both borders are drawn in the same direction."""
     straight = np.linalg.norm(lane.left_m[0] - lane.right_m[0]) + np.linalg.norm(lane.left_m[-1] - lane.right_m[-1])
     crossed = np.linalg.norm(lane.left_m[0] - lane.right_m[-1]) + np.linalg.norm(lane.left_m[-1] - lane.right_m[0])

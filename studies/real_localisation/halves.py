@@ -24,7 +24,7 @@ from gnd.vehicle_agent.localise import LocaliserParameters, PoseEstimate, locali
 from gnd.vehicle_agent.localise.parameters import RefineParameters, RegistrationParameters
 from gnd.vehicle_agent.tiles_at_hand import localising_on
 from studies.real.drive import local_map_of
-from studies.real.scene import Scene, in_range
+from studies.real.scene import RecordedScene, in_range
 
 F64 = NDArray[np.float64]
 
@@ -43,7 +43,7 @@ class Half:
     """A map and the scans driven on it; `target` and `tree`: the map's points for small_gicp."""
 
     name: str
-    scene: Scene
+    scene: RecordedScene
     local_map: LocalMap
     driven: tuple[Scan, ...]
     target: Any
@@ -51,13 +51,13 @@ class Half:
     n_points: int
 
     @classmethod
-    def of(cls, scene: Scene, map_rule: str, drive_rule: str) -> "Half":
+    def of(cls, scene: RecordedScene, map_rule: str, drive_rule: str) -> "Half":
         """Part of the scans mapped at the poses of the track, another part to be driven."""
         mapped, driven = chosen_scans(map_rule, len(scene)), chosen_scans(drive_rule, len(scene))
         return cls.made(f"{map_rule} mapped, {drive_rule} driven", scene, mapped.tolist(), driven.tolist())
 
     @classmethod
-    def made(cls, name: str, scene: Scene, mapped: Sequence[int], driven: Sequence[int]) -> "Half":
+    def made(cls, name: str, scene: RecordedScene, mapped: Sequence[int], driven: Sequence[int]) -> "Half":
         """The same from numbers of scans."""
         refined = [scene.refined(scene.scans[i]) for i in mapped]
         points = np.concatenate([scan.points_map_m[in_range(scan)] for scan in refined])
@@ -67,7 +67,7 @@ class Half:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Localised:
+class LocalisedHalf:
     """Final poses of one run, and scans that got none."""
 
     estimates: tuple[PoseEstimate, ...]
@@ -86,7 +86,7 @@ METHODS: Final = {  # the wheels stand on the road only as well as the recording
 }
 
 
-def localised(half: Half, seed: int, parameters: LocaliserParameters) -> Localised:
+def localised(half: Half, seed: int, parameters: LocaliserParameters) -> LocalisedHalf:
     """The driven scans through the localiser."""
     scene, fixes = half.scene, _off(half.scene, seed)
     vehicle = localising_on(half.local_map, scene.header, fixes[0], parameters)
@@ -95,10 +95,10 @@ def localised(half: Half, seed: int, parameters: LocaliserParameters) -> Localis
     for item in sorted(items, key=lambda item: (item.t_ns, isinstance(item, Scan))):
         estimates += vehicle.push(item).poses
     estimates += vehicle.finish().poses
-    return Localised(tuple(estimates), vehicle.localiser.dropped_scans, vehicle.localiser.initialisations)
+    return LocalisedHalf(tuple(estimates), vehicle.localiser.dropped_scans, vehicle.localiser.initialisations)
 
 
-def _off(scene: Scene, seed: int) -> list[GnssFix]:
+def _off(scene: RecordedScene, seed: int) -> list[GnssFix]:
     """The fixes with one error for the whole drive."""
     frame = scene.grid_frame.frame
     east, north = np.random.default_rng([15, seed]).normal(0.0, GNSS_SIGMA_M, 2)
@@ -146,7 +146,7 @@ def localisation_of(half: Half, seeds: Sequence[int] = SEEDS) -> dict[str, Any]:
     }
 
 
-def _pooled(found: Sequence[Localised], references: dict[str, Trajectory | None]) -> dict[str, Any]:
+def _pooled(found: Sequence[LocalisedHalf], references: dict[str, Trajectory | None]) -> dict[str, Any]:
     estimates = [estimate for one in found for estimate in one.estimates]
     good = [estimate for estimate in estimates if estimate.health == "good"]
     return {

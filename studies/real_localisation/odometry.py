@@ -22,7 +22,7 @@ from gnd.vehicle_agent.errors import ImportDriveError
 from gnd.vehicle_agent.importer import fit_heading_and_position
 from gnd.vehicle_agent.importers.lidar_odometry import RANGE_M, lidar_odometry, reference_ns
 from gnd.vehicle_agent.importers.recording import Recording
-from studies.real.scene import Recorded
+from studies.real.scene import RecordedScans
 
 F64 = NDArray[np.float64]
 
@@ -36,7 +36,7 @@ _GICP: Final = {"max_correspondence_distance": 2.0, "max_iterations": 50}
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Odometry:
+class OdometryResult:
     """A track (T_first_vehicle at the middle of each sweep) and the median time of a scan; or why there is none."""
 
     name: str
@@ -45,7 +45,7 @@ class Odometry:
     absent: str = ""
 
 
-def odometries(recorded: Recorded) -> list[Odometry]:
+def odometries(recorded: RecordedScans) -> list[OdometryResult]:
     """All of them."""
     recording = recorded.recording
     found = [_ours(OURS, recording)]
@@ -58,21 +58,21 @@ def _without_motion(recording: Recording) -> Recording:
     return replace(recording, motion=())
 
 
-def _ours(name: str, recording: Recording) -> Odometry:
+def _ours(name: str, recording: Recording) -> OdometryResult:
     stamps_s = [perf_counter()]
     try:
         track = lidar_odometry(recording, lambda *_: stamps_s.append(perf_counter()))
     except ImportDriveError as error:
-        return Odometry(name, None, None, str(error))
-    return Odometry(name, track, 1e3 * float(np.median(np.diff(stamps_s))))
+        return OdometryResult(name, None, None, str(error))
+    return OdometryResult(name, track, 1e3 * float(np.median(np.diff(stamps_s))))
 
 
-def _kiss(recorded: Recorded) -> Odometry:
+def _kiss(recorded: RecordedScans) -> OdometryResult:
     try:
         from kiss_icp.config import load_config
         from kiss_icp.kiss_icp import KissICP
     except ImportError:
-        return Odometry("KISS-ICP", None, None, "kiss-icp is not installed (extra `peers`)")
+        return OdometryResult("KISS-ICP", None, None, "kiss-icp is not installed (extra `peers`)")
     config = load_config(None)
     config.data.min_range, config.data.max_range, config.registration.max_num_threads = *RANGE_M, 1
     config.mapping.voxel_size = 1.0
@@ -154,7 +154,7 @@ def _in_range(points: F64) -> F64:
     return np.asarray(points[(range_m >= RANGE_M[0]) & (range_m <= RANGE_M[1])])
 
 
-def _rival(name: str, recorded: Recorded, step: Callable[[Scan], F64]) -> Odometry:
+def _rival(name: str, recorded: RecordedScans, step: Callable[[Scan], F64]) -> OdometryResult:
     """Poses of the LiDAR, one a scan, as poses of the vehicle."""
     T_lidar, times_s = [], []
     for number, scan in enumerate(recorded.scans):
@@ -162,11 +162,11 @@ def _rival(name: str, recorded: Recorded, step: Callable[[Scan], F64]) -> Odomet
         T_lidar.append(step(scan).copy())
         times_s.append(perf_counter() - begin_s)
         if number and not np.linalg.norm(T_lidar[-1][:3, 3] - T_lidar[-2][:3, 3]) < MAX_STEP_M:
-            return Odometry(name, None, None, f"lost at scan {number}: a step of more than {MAX_STEP_M:.0f} m")
+            return OdometryResult(name, None, None, f"lost at scan {number}: a step of more than {MAX_STEP_M:.0f} m")
     mount = recorded.recording.T_vehicle_lidar
     T = mount @ T_inverse(T_lidar[0]) @ np.stack(T_lidar) @ T_inverse(mount)
     t_ns = np.array([reference_ns(scan) for scan in recorded.scans], np.int64)
-    return Odometry(name, Trajectory(t_ns, T), 1e3 * float(np.median(times_s)))
+    return OdometryResult(name, Trajectory(t_ns, T), 1e3 * float(np.median(times_s)))
 
 
 _SMALL_GICP: Final[dict[str, type[_Predicted]]] = {
@@ -177,13 +177,13 @@ _SMALL_GICP: Final[dict[str, type[_Predicted]]] = {
 # --- what is said of them --------------------------------------------------------------------------------------------
 
 
-def compared(found: Sequence[Odometry], recorded: Recorded) -> list[dict[str, Any]]:
+def compared(found: Sequence[OdometryResult], recorded: RecordedScans) -> list[dict[str, Any]]:
     """Each beside the first one and the recording's own positions."""
     first = found[0].track
     return [_row(one, first, recorded.recording) for one in found]
 
 
-def _row(one: Odometry, first: Trajectory | None, recording: Recording) -> dict[str, Any]:
+def _row(one: OdometryResult, first: Trajectory | None, recording: Recording) -> dict[str, Any]:
     row: dict[str, Any] = {"name": one.name, "absent": one.absent}
     if one.track is None:
         return row

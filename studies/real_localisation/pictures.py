@@ -15,11 +15,11 @@ from gnd.gnd_map.se3 import T_inverse
 from gnd.vehicle_agent.localise import PoseEstimate
 from gnd.vehicle_agent.localise.georeference import Georeferenced
 from studies.frame.figures import INK, save
-from studies.real.scene import Recorded
-from studies.real_localisation.flexmap import Drawn
+from studies.real.scene import RecordedScans
+from studies.real_localisation.flexmap import DrawnFlexmap
 from studies.real_localisation.halves import METHODS, Half, localised
 from studies.real_localisation.nagoya import read_reference, track_off
-from studies.real_localisation.odometry import Odometry
+from studies.real_localisation.odometry import OdometryResult
 
 F64 = NDArray[np.float64]
 
@@ -27,7 +27,9 @@ COLOURS: Final = ("#1f5fbf", "#d9542b", "#2c8c4a", "#8d5bb5", "#b8860b")
 MAP: Final = "#b9c3d0"
 
 
-def draw_halves(recorded: Recorded, tracks: Sequence[Odometry], halves: Sequence[Half], folder: Path) -> list[Path]:
+def draw_halves(
+    recorded: RecordedScans, tracks: Sequence[OdometryResult], halves: Sequence[Half], folder: Path
+) -> list[Path]:
     """The map of the interleaved half with all odometries and the localised poses, and what these are off by."""
     half = halves[0]
     figure = Figure(figsize=(15.0, 8.0), layout="constrained")
@@ -72,7 +74,7 @@ def _errors_of(axes: Axes, estimates: Sequence[PoseEstimate], reference: Traject
     axes.legend(fontsize=8)
 
 
-def draw_flexmap(drawn: Drawn, name: str, folder: Path) -> list[Path]:
+def draw_flexmap(drawn: DrawnFlexmap, name: str, folder: Path) -> list[Path]:
     """Lanes, both tracks and the fixes, whole and from near."""
     figure = Figure(figsize=(16.0, 8.5), layout="constrained")
     whole, near = figure.subplots(1, 2)

@@ -12,11 +12,11 @@ from gnd.vehicle_agent.importers.cleaning import cleaned
 from gnd.vehicle_agent.importers.detect_format import format_of
 from gnd.vehicle_agent.importers.recording import NOMINAL, Recording
 from gnd.vehicle_agent.importers.splits import chosen_scans
-from studies.frame.command import Bench, Report, study
+from studies.frame.command import Bench, StudyReport, study
 from studies.frame.errors import RealDataError
 from studies.frame.options import check, option
 from studies.frame.tables import Sheet, sheet_of, shown
-from studies.real.scene import Recorded, load, place
+from studies.real.scene import RecordedScans, load, place
 from studies.real_localisation.apollo import apollo_of
 from studies.real_localisation.convergence import convergence_of
 from studies.real_localisation.flexmap import flexmap_of, is_flexmap
@@ -168,14 +168,14 @@ class RealLocalisationOptions:
 
 
 @study(RealLocalisationOptions, out="runs/real-localisation", marked=False)
-def real_localisation(options: RealLocalisationOptions, bench: Bench) -> Report:
+def real_localisation(options: RealLocalisationOptions, bench: Bench) -> StudyReport:
     """Odometry, localisation, registration and georeferencing on real recordings, beside KISS-ICP and small_gicp.
 
     A folder of scans (KITTI, RADIATE, PCD, MCAP) is halved: one half is the map, the other is localised on it. Two
     scans of Apollo are localised on each other and on Apollo's own map. Tracks with GNSS are put on the Earth.
     """
     found = reproduce_real_localisation(options, bench.folder.root if bench.pictures else None, bench.step)
-    return Report(found, sheets_of(found), file="real-localisation.json")
+    return StudyReport(found, sheets_of(found), file="real-localisation.json")
 
 
 def reproduce_real_localisation(
@@ -232,7 +232,7 @@ def _pair(folder: Path, recording: Recording) -> dict[str, Any]:
     usable = tuple(scan for scan in scans if scan is not None)
     if len(usable) != len(scans):
         raise ImportDriveError(f"{recording.name}: {len(usable)} of {len(scans)} scans have a usable point")
-    return apollo_of(folder, place(Recorded(recording.name, usable, map_track(recording), recording, ()), 0))
+    return apollo_of(folder, place(RecordedScans(recording.name, usable, map_track(recording), recording, ()), 0))
 
 
 def _scans(

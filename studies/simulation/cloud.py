@@ -84,11 +84,11 @@ def arrived(base: BaseMap, results: Sequence[VehicleResult], merge: MergeParamet
     """
     if upload != "packed":
         return [Arrived(result.reports, result.upload_bytes) for result in results]
-    cloud = _Cloud(base, merge)
+    cloud = _StudyCloud(base, merge)
     return [cloud.take(result) for result in results]
 
 
-class _Cloud:
+class _StudyCloud:
     """Expands reports in short and asks for Gaussians as a merger does, nothing merged in between."""
 
     def __init__(self, base: BaseMap, merge: MergeParameters) -> None:

@@ -10,7 +10,7 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 
 from gnd.fleet_sim.ellipsoids import ellipsoids_of_maps, ellipsoids_of_truth
-from gnd.fleet_sim.pictures import View, draw_map
+from gnd.fleet_sim.pictures import StreetView, draw_map
 from gnd.fleet_sim.truth import LEVELS, Truth, read_truth
 from gnd.gnd_map.arrays import F64, I32, I64
 from gnd.gnd_map.classes import CLASS_COLOURS
@@ -18,8 +18,8 @@ from gnd.gnd_map.evidence import MassParameters, masses
 from studies.frame.figures import INK, PALE, dress, save
 from studies.simulation import scores as reference
 from studies.simulation.cloud import arrived, map_of_one, merged_map
-from studies.simulation.masses import WATCHED, Watch, choose, most_telling
-from studies.simulation.scores import Outcome, WorldOutcome, target_single
+from studies.simulation.masses import WATCHED, VoxelWatch, choose, most_telling
+from studies.simulation.scores import SimulationOutcome, WorldOutcome, target_single
 from studies.simulation.worlds import read_world_base
 
 _MASSES: Final = (("m(S) sustained", "#2f6fb5"), ("m(C) changed", "#d1433f"), ("m(Ω) unknown", "#8a94a3"))
@@ -27,7 +27,7 @@ _LEVEL_NAMES: Final = {"all": "all voxels", "marginal_excluded": "marginal exclu
 _LEVEL_STYLE: Final = {"scored": "-", "marginal_excluded": "--", "all": ":"}
 
 
-def draw_figures(outcome: Outcome, summary: Mapping[str, Any], folder: Path) -> list[Path]:
+def draw_figures(outcome: SimulationOutcome, summary: Mapping[str, Any], folder: Path) -> list[Path]:
     """Draw all figures of the first world into the folder and return their paths.
 
     Raises:
@@ -45,10 +45,10 @@ def draw_figures(outcome: Outcome, summary: Mapping[str, Any], folder: Path) -> 
     return paths
 
 
-def draw_changes(outcome: Outcome, world: WorldOutcome, truth: Truth, folder: Path) -> list[Path]:
+def draw_changes(outcome: SimulationOutcome, world: WorldOutcome, truth: Truth, folder: Path) -> list[Path]:
     """Draw Figure 16: changes found by one drive, by the fleet, and the truth, in one view."""
     base, true = read_world_base(world.files), ellipsoids_of_truth(truth)
-    view, n = View.around(true), max(outcome.options.vehicles)
+    view, n = StreetView.around(true), max(outcome.options.vehicles)
     one = next((vehicle for vehicle in world.vehicles if vehicle.sensor in reference.TARGET_SENSORS), world.vehicles[0])
     merge = outcome.options.method.merge
     held = arrived(base, world.vehicles[:n], merge, outcome.options.upload)
@@ -138,7 +138,9 @@ def _baseline(axes: Axes, summary: Mapping[str, Any]) -> list[float]:
     return values
 
 
-def draw_masses(watch: Watch, history: tuple[I64, I32], parameters: MassParameters, sensor: str, path: Path) -> Path:
+def draw_masses(
+    watch: VoxelWatch, history: tuple[I64, I32], parameters: MassParameters, sensor: str, path: Path
+) -> Path:
     """Draw m(S), m(C), m(Ω) of one voxel of each class over the scans of one drive."""
     figure = Figure(figsize=(11.0, 6.8), dpi=150, facecolor="white")
     t_ns, counters = history

@@ -18,7 +18,7 @@ from gnd.gnd_map.classes import ChangeClass
 from gnd.gnd_map.config import from_mapping
 from gnd.vehicle_agent.detect.parameters import MIN_CELLS, DetectParameters
 from studies.frame.errors import OptionError
-from studies.frame.folder import RunFolder
+from studies.frame.folder import StudyFolder
 from studies.frame.options import PATH
 from studies.frame.tables import print_sheets, sheet, shown
 from studies.simulation.base_map import BaseMap
@@ -113,14 +113,14 @@ class Loss:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Case:
+class LossCase:
     """What errors are looked for in: a world with its truth, base map and vehicles."""
 
     truth: Truth
     base: BaseMap
     vehicles: Sequence[VehicleResult]
     method: MethodParameters
-    exact: "Case | None" = None
+    exact: "LossCase | None" = None
     """The same world and fleet with true poses: what is right there is wrong here because of the poses."""
 
     def in_base(self) -> NDArray[np.bool_]:
@@ -128,7 +128,7 @@ class Case:
         return np.asarray(classes_of_maps(self.truth, self.base.tiles, self.base.tiles) == ChangeClass.NORMAL)
 
 
-def single_losses(case: Case, vehicle: VehicleResult, level: Level) -> list[Loss]:
+def single_losses(case: LossCase, vehicle: VehicleResult, level: Level) -> list[Loss]:
     """Return what costs F1 in the map of one vehicle alone."""
     predicted = predicted_by(case, [vehicle])
     rows = _wrong(case.truth, predicted, level)
@@ -138,7 +138,7 @@ def single_losses(case: Case, vehicle: VehicleResult, level: Level) -> list[Loss
     return _losses(case, predicted, rows, found, level, exact)
 
 
-def fleet_losses(case: Case, n: int, level: Level) -> list[Loss]:
+def fleet_losses(case: LossCase, n: int, level: Level) -> list[Loss]:
     """Return what costs F1 in the merged map of the first n vehicles."""
     vehicles = case.vehicles[:n]
     predicted = predicted_by(case, vehicles, merge=True)
@@ -150,7 +150,7 @@ def fleet_losses(case: Case, n: int, level: Level) -> list[Loss]:
     return _losses(case, predicted, rows, _vote_causes(true, said, each, case.method.merge.xi), level, exact)
 
 
-def predicted_by(case: Case, vehicles: Sequence[VehicleResult], *, merge: bool = False) -> ClassArray:
+def predicted_by(case: LossCase, vehicles: Sequence[VehicleResult], *, merge: bool = False) -> ClassArray:
     """Return the class, uint8 (V,), of each voxel after the vehicles' reports, merged or of one vehicle alone."""
     bodies = [body for vehicle in vehicles for body in vehicle.reports]
     final = merged_map(case.base, bodies, case.method.merge) if merge else map_of_one(case.base, bodies)
@@ -184,7 +184,7 @@ def _wrong(truth: Truth, predicted: ClassArray, level: Level) -> I64:
 
 
 def _losses(
-    case: Case, predicted: ClassArray, rows: I64, found: Causes, level: Level, exact: ClassArray | None
+    case: LossCase, predicted: ClassArray, rows: I64, found: Causes, level: Level, exact: ClassArray | None
 ) -> list[Loss]:
     truth, true = case.truth, case.truth.change_class[rows]
     names = _with_circumstances(case, rows, found, exact)
@@ -201,7 +201,7 @@ def _losses(
     return sorted(groups, key=lambda loss: -loss.f1)
 
 
-def _with_circumstances(case: Case, rows: I64, found: Causes, exact: ClassArray | None) -> Causes:
+def _with_circumstances(case: LossCase, rows: I64, found: Causes, exact: ClassArray | None) -> Causes:
     """Causes with what the truth, the base map and a run with true poses say about the voxels."""
     if not len(rows):
         return found
@@ -261,7 +261,7 @@ def analyse(
         FolderError: no finished run is in the folder.
         OptionError: no such stage.
     """
-    mark = RunFolder(out).finished()
+    mark = StudyFolder(out).finished()
     cases = _cases(out, mark, changes)
     if exact is not None:
         cases = _beside(cases, mark, exact, changes)
@@ -270,14 +270,14 @@ def analyse(
     return {stage: {level: plain(_losses_at(cases, stage, level, sensors)) for level in levels} for stage in wanted}
 
 
-def _cases(out: Path, mark: dict[str, Any], changes: Sequence[str]) -> list[Case]:
+def _cases(out: Path, mark: dict[str, Any], changes: Sequence[str]) -> list[LossCase]:
     method = from_mapping(MethodParameters, mark["options"]["method"]).with_changes(changes)
     return [_case(out, world, mark["options"]["base"], method) for world in mark["worlds"]]
 
 
-def _beside(cases: Sequence[Case], mark: dict[str, Any], exact: Path, changes: Sequence[str]) -> list[Case]:
+def _beside(cases: Sequence[LossCase], mark: dict[str, Any], exact: Path, changes: Sequence[str]) -> list[LossCase]:
     """The cases with those of the run with true poses beside them."""
-    other = RunFolder(exact).finished()
+    other = StudyFolder(exact).finished()
     ignored = ("poses", "method", "pcd")
     differ = [k for k, v in mark["options"].items() if k not in ignored and other["options"].get(k) != v]
     if differ or other["options"]["poses"] != "true":
@@ -285,13 +285,13 @@ def _beside(cases: Sequence[Case], mark: dict[str, Any], exact: Path, changes: S
     return [replace(a, exact=b) for a, b in zip(cases, _cases(exact, other, changes), strict=True)]
 
 
-def _case(out: Path, world: dict[str, Any], base: str, method: MethodParameters) -> Case:
+def _case(out: Path, world: dict[str, Any], base: str, method: MethodParameters) -> LossCase:
     files = WorldFiles(out / world["folder"], base)
     vehicles = [read_result(out / v["file"], v["key"]) for v in world["vehicles"]]
-    return Case(read_truth(files.truth), read_world_base(files), vehicles, method)
+    return LossCase(read_truth(files.truth), read_world_base(files), vehicles, method)
 
 
-def _losses_at(cases: Sequence[Case], stage: str, level: Level, sensors: Sequence[str]) -> list[Loss]:
+def _losses_at(cases: Sequence[LossCase], stage: str, level: Level, sensors: Sequence[str]) -> list[Loss]:
     kind, _, sensor = stage.partition(".")
     if kind == "single" and (not sensor or sensor in sensors):
         return mean_losses([single_losses(c, v, level) for c in cases for v in c.vehicles if sensor in ("", v.sensor)])

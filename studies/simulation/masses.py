@@ -27,7 +27,7 @@ _CANDIDATES: Final = 6
 
 
 @dataclass(frozen=True, slots=True)
-class Watch:
+class VoxelWatch:
     """Voxels of one tile whose evidence is written down scan by scan.
 
     Attributes:
@@ -41,7 +41,7 @@ class Watch:
     change_class: tuple[int, ...]
 
 
-def choose(truth: Truth) -> Watch | None:
+def choose(truth: Truth) -> VoxelWatch | None:
     """Return the clearest voxels of each class in the tile where all four classes are best to be seen; None if there is
     no tile with all of them. Decided by the truth alone.
     """
@@ -54,7 +54,7 @@ def choose(truth: Truth) -> Watch | None:
     inside = rows[truth.morton[rows] == tile.morton]
     chosen = [_clearest(truth, tile, inside[truth.change_class[inside] == c]) for c in WATCHED]
     at = np.sort(np.concatenate(chosen))
-    return Watch(tile, tuple(truth.voxel_id[at].tolist()), tuple(truth.change_class[at].tolist()))
+    return VoxelWatch(tile, tuple(truth.voxel_id[at].tolist()), tuple(truth.change_class[at].tolist()))
 
 
 def _clearest(truth: Truth, tile: TileId, rows: I64) -> I64:
@@ -75,7 +75,7 @@ def _cells_at(gaussians: Gaussians, voxel_id: I32) -> I32:
 class Watcher:
     """A second detector that holds the watched tile only and is emptied after every scan; evidence adds over scans."""
 
-    def __init__(self, watch: Watch, base: BaseMap, grid_frame: GridFrame, parameters: DetectParameters) -> None:
+    def __init__(self, watch: VoxelWatch, base: BaseMap, grid_frame: GridFrame, parameters: DetectParameters) -> None:
         self._watch = watch
         local_map = LocalMap(grid_frame)
         tile = base.tiles.get(watch.tile, Gaussians.empty())
@@ -109,7 +109,7 @@ def _counters_at(found: TileEvidence, voxel_id: I32) -> I32:
     return np.where(known[:, None], found.counters[at], 0) if len(found) else np.zeros((len(voxel_id), 4), np.int32)
 
 
-def most_telling(watch: Watch, counters: I32) -> Sequence[int]:
+def most_telling(watch: VoxelWatch, counters: I32) -> Sequence[int]:
     """Return for each watched class the index of the voxel whose evidence shows its case best.
 
     Most BI for a normal one, BE for a new one, BO less BI for a modified one, PI for a deleted one; -1 for a class that

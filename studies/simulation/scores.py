@@ -169,7 +169,7 @@ class WorldOutcome:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Outcome:
+class SimulationOutcome:
     """A finished reproduction."""
 
     options: RunOptions
@@ -177,7 +177,7 @@ class Outcome:
     runtime_s: dict[str, float]
 
 
-def summary_of(outcome: Outcome) -> dict[str, Any]:
+def summary_of(outcome: SimulationOutcome) -> dict[str, Any]:
     """Return everything as plain values; of several seeds the means, and each below `by_seed`."""
     by_seed = {str(world.seed): _world_summary(world) for world in outcome.worlds}
     found = mean_of(list(by_seed.values()))
@@ -191,7 +191,7 @@ def summary_of(outcome: Outcome) -> dict[str, Any]:
     return found
 
 
-def parameters_of(outcome: Outcome) -> dict[str, Any]:
+def parameters_of(outcome: SimulationOutcome) -> dict[str, Any]:
     """Return options and method; what decides the numbers."""
     options = plain_options(outcome.options)
     method = to_mapping(outcome.options.method)

@@ -8,14 +8,14 @@ from pathlib import Path
 from time import perf_counter
 from typing import Any
 
-from studies.frame.command import Bench, Report, plain_options, study
+from studies.frame.command import Bench, StudyReport, plain_options, study
 from studies.frame.errors import FolderError
-from studies.frame.folder import RunFolder
+from studies.frame.folder import StudyFolder
 from studies.frame.pool import Job
 from studies.simulation.options import PoseSource, RunOptions
 from studies.simulation.result import read_result
 from studies.simulation.scores import (
-    Outcome,
+    SimulationOutcome,
     VehicleFile,
     WorldOutcome,
     comparison_of,
@@ -40,7 +40,7 @@ _log = logging.getLogger(__name__)
 
 
 @study(RunOptions, out="runs/reproduce-simulation", keeps_drives=True)
-def simulation(options: RunOptions, bench: Bench) -> Report:
+def simulation(options: RunOptions, bench: Bench) -> StudyReport:
     """Reproduce the simulation of the GND paper: worlds with known truth, single drives, fleets, and their scores.
 
     A second start with the same options and folder continues where the first ended.
@@ -49,20 +49,20 @@ def simulation(options: RunOptions, bench: Bench) -> Report:
     runs = {source: replace(options, poses=source) for source in sources}
     if len(sources) == 1:
         found = run_one(options, bench, bench.folder)
-        return Report(found, sheets_of(found, asked))
+        return StudyReport(found, sheets_of(found, asked))
     bench.folder.write_mark({"compared": {str(source): plain_options(run) for source, run in runs.items()}})
     results: dict[str, Any] = {}
     for source, run in runs.items():
         home = bench.folder.root / str(source).replace(":", "-")
-        RunFolder.begun(home)
+        StudyFolder.begun(home)
         if results:
             share_worlds(bench.folder.root / str(sources[0]).replace(":", "-"), home)
-        results[str(source)] = run_one(run, bench, RunFolder(home))
+        results[str(source)] = run_one(run, bench, StudyFolder(home))
     compared = comparison_of(results)
-    return Report(compared, comparison_sheets(compared, asked))
+    return StudyReport(compared, comparison_sheets(compared, asked))
 
 
-def run_one(options: RunOptions, bench: Bench, folder: RunFolder) -> dict[str, Any]:
+def run_one(options: RunOptions, bench: Bench, folder: StudyFolder) -> dict[str, Any]:
     """Run everything for poses of one source, write result and figures into the folder, and return the result."""
     folder.write_mark({"options": plain_options(options)})
     outcome = reproduce(options, folder, bench)
@@ -76,7 +76,7 @@ def run_one(options: RunOptions, bench: Bench, folder: RunFolder) -> dict[str, A
     return found
 
 
-def reproduce(options: RunOptions, folder: RunFolder, bench: Bench) -> Outcome:
+def reproduce(options: RunOptions, folder: StudyFolder, bench: Bench) -> SimulationOutcome:
     """Run everything that is not yet in the folder, merge and score.
 
     Raises:
@@ -93,7 +93,7 @@ def reproduce(options: RunOptions, folder: RunFolder, bench: Bench) -> Outcome:
     bench.run("vehicles", drive_jobs(task for of_world in tasks.values() for task in of_world))
     kept = {seed: [VehicleFile(task.result, task.key) for task in of_world] for seed, of_world in tasks.items()}
     worlds = _scores(options, files, kept, bench)
-    return Outcome(options, worlds, {**bench.spent_s, "total": perf_counter() - started_s})
+    return SimulationOutcome(options, worlds, {**bench.spent_s, "total": perf_counter() - started_s})
 
 
 def drive_jobs(tasks: Iterable[VehicleTask]) -> list[Job]:
@@ -141,7 +141,7 @@ def _scores(
     return tuple(found)
 
 
-def _plain_worlds(outcome: Outcome, folder: RunFolder) -> list[dict[str, Any]]:
+def _plain_worlds(outcome: SimulationOutcome, folder: StudyFolder) -> list[dict[str, Any]]:
     """Where the results of each world lie, relative to the folder."""
     return [
         {

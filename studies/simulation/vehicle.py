@@ -27,7 +27,7 @@ from gnd.vehicle_agent.tiles_at_hand import TilesAtHand
 from studies.frame.pool import Tick
 from studies.simulation.base_map import BaseMap, read_base
 from studies.simulation.baseline import CloudVehicle, read_cloud
-from studies.simulation.masses import Watch, Watcher
+from studies.simulation.masses import VoxelWatch, Watcher
 from studies.simulation.options import MethodParameters, PoseSource
 from studies.simulation.poses import FromReference
 from studies.simulation.result import (
@@ -68,7 +68,7 @@ class VehicleTask:
     method: MethodParameters
     result: Path
     key: str
-    watch: Watch | None = None
+    watch: VoxelWatch | None = None
     recording: Path | None = None
     cloud: Path | None = None
     rounded: bool = True
@@ -107,7 +107,7 @@ def drive(
         VehicleError: the drive has no GNSS fix.
     """
     started_s, outbox = process_time(), ReportList()
-    run = _Run(header, items, base, outbox, task, labels)
+    run = _VehicleRun(header, items, base, outbox, task, labels)
     run.to_the_end()
     reports = sorted(outbox.reports, key=lambda report: report.report_id)
     row, evidence = voxels.columns(run.detector.taken, lambda found: evidence_columns(found, task.method))
@@ -117,7 +117,7 @@ def drive(
     return VehicleResult(task.drive.vehicle, task.sensor, bodies, row, evidence, stats, run.watched(), pcd, packed)
 
 
-class _Run:
+class _VehicleRun:
     """A pipeline with the base map at hand, and what the study writes down beside it."""
 
     def __init__(

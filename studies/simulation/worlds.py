@@ -10,10 +10,10 @@ from gnd.fleet_sim.truth import Truth, load_or_make_truth, read_truth, world_sha
 from gnd.fleet_sim.world import World, write_world
 from gnd.gnd_map.config import to_mapping
 from studies.frame.errors import FolderError
-from studies.frame.folder import RunFolder
+from studies.frame.folder import StudyFolder
 from studies.frame.kept import SIMULATOR, key_of, sources_sha
 from studies.simulation.base_map import BaseMap, driven, read_base, surveyed, write_base
-from studies.simulation.masses import Watch, choose
+from studies.simulation.masses import VoxelWatch, choose
 from studies.simulation.options import RunOptions, fleet_configs, fleet_sensors
 from studies.simulation.result import VoxelRows
 from studies.simulation.vehicle import VehicleTask
@@ -70,7 +70,7 @@ def world_name(seed: int, options: StreetOptions) -> str:
     return f"seed-{seed}-{options.length_m:g}m-{place}{edits}"
 
 
-def world_files(folder: RunFolder, seed: int, options: RunOptions) -> WorldFiles:
+def world_files(folder: StudyFolder, seed: int, options: RunOptions) -> WorldFiles:
     """Return where a world's files lie."""
     return WorldFiles(folder.world(world_name(seed, options.street)), options.base)
 
@@ -164,7 +164,7 @@ def vehicle_tasks(options: RunOptions, seed: int, files: WorldFiles, keep_drives
     return tasks
 
 
-def _key(options: RunOptions, files: WorldFiles, base_sha: str, drive: DriveConfig, watched: Watch | None) -> str:
+def _key(options: RunOptions, files: WorldFiles, base_sha: str, drive: DriveConfig, watched: VoxelWatch | None) -> str:
     """A hash of everything that decides what the vehicle reports. How reports are merged is not among it."""
     method = options.method
     return key_of(

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from gnd.fleet_sim.roads.drive import RoadDrive
 from gnd.fleet_sim.roads.route import FEATURE_STATES, MAP_ERROR_M, Route
-from gnd.fleet_sim.roads.sight import View
+from gnd.fleet_sim.roads.sight import CameraView
 from gnd.fleet_sim.trajectory import gauss_markov
 from gnd.gnd_map.arrays import F64, I64
 from gnd.schemas.drive import Detections
@@ -87,7 +87,7 @@ def look_of(detections: Detections) -> Look:
     )
 
 
-def sensor_view(view: View) -> SensorView:
+def sensor_view(view: CameraView) -> SensorView:
     """Return a simulated sensor's field of view as the vehicle knows it."""
     return SensorView(view.width_rad, view.range_m, float(view.rate_hz))
 
@@ -111,7 +111,7 @@ def run_slamcu(drive: RoadDrive, variant: str, parameters: SlamcuParameters, see
         seed: of its particles.
         tick: told how many looks have been taken.
     """
-    run, start_ns = _Run(drive, variant, parameters, seed), start_of(drive).t_ns
+    run, start_ns = _SlamcuRun(drive, variant, parameters, seed), start_of(drive).t_ns
     for t_ns, what, i in drive.events():
         if t_ns > start_ns and what != "lanes":
             run.take(t_ns, what, i)
@@ -120,7 +120,7 @@ def run_slamcu(drive: RoadDrive, variant: str, parameters: SlamcuParameters, see
     return run.driven()
 
 
-class _Run:
+class _SlamcuRun:
     """SLAMCU on its way along a drive."""
 
     def __init__(self, drive: RoadDrive, variant: str, parameters: SlamcuParameters, seed: int) -> None:

@@ -12,13 +12,13 @@ from gnd.gnd_map.arrays import F64, I64
 from studies.frame.figures import BLUE, GREY, INK, MAGENTA, ORANGE, RED, dress, finish, new_figure
 from studies.slamcu_study import signs as reference
 from studies.slamcu_study.scores import SignScore, accuracy_of, merged_score, scored_drive
-from studies.slamcu_study.signs import ABSENT, DELETED, EXIST, NEW, SeedOutcome, SignTruth, Verdicts
+from studies.slamcu_study.signs import ABSENT, DELETED, EXIST, NEW, SignTruth, SlamcuSeed, Verdicts
 
 _MASSES: Final = (("m(∃) exists", BLUE), ("m(∄) does not", RED), ("m(Ω) unknown", GREY))
 _SHOWN_STEPS: Final = 30
 
 
-def draw_figures(outcomes: Sequence[SeedOutcome], km: float, folder: Path) -> list[Path]:
+def draw_figures(outcomes: Sequence[SlamcuSeed], km: float, folder: Path) -> list[Path]:
     """Draw all figures into the folder and return their paths; of single signs those of the first route.
 
     Raises:
@@ -82,7 +82,7 @@ def most_telling(found: Verdicts, signs: I64, right: int) -> int | None:
     return None if best is None else best[1]
 
 
-def draw_confusion(outcomes: Sequence[SeedOutcome], path: Path) -> Path:
+def draw_confusion(outcomes: Sequence[SlamcuSeed], path: Path) -> Path:
     """Draw Table 1 as a picture: ours, the mean of the seeds, beside the paper's."""
     ours = np.mean([scored_drive(one.first, one.truth).confusion for one in outcomes], axis=0)
     figure = new_figure(10.6, 4.0)
@@ -111,7 +111,7 @@ def _matrix(axes: Axes, matrix: F64, title: str) -> None:
         spine.set_visible(False)
 
 
-def draw_positions(outcome: SeedOutcome, note: str, path: Path) -> Path:
+def draw_positions(outcome: SlamcuSeed, note: str, path: Path) -> Path:
     """Draw Figure 9: the position error of each new sign, with mean and standard deviation; merged ones as dots."""
     truth = outcome.truth
     one, merged = scored_drive(outcome.first, truth), max(outcome.merged, default=None)

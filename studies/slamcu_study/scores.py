@@ -26,8 +26,8 @@ from studies.slamcu_study.signs import (
     U8,
     VARIANTS,
     MergedSigns,
-    SeedOutcome,
     SignTruth,
+    SlamcuSeed,
     Verdicts,
 )  # fmt: skip
 
@@ -134,7 +134,7 @@ LOST_LOOKS: Final = 75
 """Five seconds at 15 Hz."""
 
 
-def summary_of(options: Any, outcomes: Sequence[SeedOutcome], spent_s: Mapping[str, float]) -> dict[str, Any]:
+def summary_of(options: Any, outcomes: Sequence[SlamcuSeed], spent_s: Mapping[str, float]) -> dict[str, Any]:
     """Return everything as plain values: means over the seeds below `slamcu`, their standard deviations below
     `std_over_seeds`, each seed below `seeds`.
     """
@@ -161,7 +161,7 @@ def summary_of(options: Any, outcomes: Sequence[SeedOutcome], spent_s: Mapping[s
     return dict(rounded(found))
 
 
-def seed_summary(outcome: SeedOutcome) -> dict[str, Any]:
+def seed_summary(outcome: SlamcuSeed) -> dict[str, Any]:
     """Return the numbers of one route."""
     truth = outcome.truth
     found = drive_summary(outcome.first, truth)

@@ -137,7 +137,7 @@ class MergedSigns:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class SeedOutcome:
+class SlamcuSeed:
     """What came of one route.
 
     Attributes:

@@ -10,7 +10,7 @@ from gnd.fleet_sim.roads.drive import RoadDriveOptions, drive_route
 from gnd.fleet_sim.roads.motorway import motorway
 from gnd.vehicle_agent.features.slamcu.parameters import SlamcuParameters
 from studies.feature_study.reporting import read_reports, write_reports
-from studies.frame.command import Bench, Report, study
+from studies.frame.command import Bench, StudyReport, study
 from studies.frame.kept import Kept, key_of, sources_sha
 from studies.frame.options import check, option, seeds
 from studies.frame.pool import Job, Tick
@@ -18,7 +18,7 @@ from studies.slamcu_study.driving import run_slamcu, sign_truth, verdicts_of
 from studies.slamcu_study.faults import FAULTS, with_faults
 from studies.slamcu_study.merging import merged_signs, sign_reports
 from studies.slamcu_study.scores import summary_of, tables_of
-from studies.slamcu_study.signs import FULL, VARIANTS, MergedSigns, SeedOutcome, SignTruth, Verdicts
+from studies.slamcu_study.signs import FULL, VARIANTS, MergedSigns, SignTruth, SlamcuSeed, Verdicts
 
 SOURCES: Final = (
     *("fleet_sim/roads", "fleet_sim/drives.py", "gnd_map", "schemas", "vehicle_agent/features"),
@@ -50,7 +50,7 @@ class SlamcuOptions:
 
 
 @study(SlamcuOptions, out="runs/reproduce-slamcu", jobs=1)
-def slamcu(options: SlamcuOptions, bench: Bench) -> Report:
+def slamcu(options: SlamcuOptions, bench: Bench) -> StudyReport:
     """Signs that have gone or are new, found by single cars on a motorway: Figures 8 and 9 and Table 1 of the SLAMCU
     paper, and what ten cars make of it.
 
@@ -68,7 +68,7 @@ def slamcu(options: SlamcuOptions, bench: Bench) -> Report:
 
         draw_figures(outcomes, options.km, folder)
 
-    return Report(found, tables_of(found), draw)
+    return StudyReport(found, tables_of(found), draw)
 
 
 @dataclass(frozen=True, slots=True)
@@ -134,13 +134,13 @@ def run_drive(task: DriveTask, tick: Tick) -> None:
     task.verdicts.write((verdicts_of(drive, driven), sign_truth(route)))
 
 
-def _read(seed: int, options: SlamcuOptions, tasks: list[DriveTask]) -> SeedOutcome:
+def _read(seed: int, options: SlamcuOptions, tasks: list[DriveTask]) -> SlamcuSeed:
     """Results of a route from the folder, and what the cloud makes of the reports."""
     read = {task: task.verdicts.read(tuple[Verdicts, SignTruth]) for task in tasks}
     fleet = [task for task in tasks if task.variant == FULL]
     found = {task.variant: verdicts for task, (verdicts, _) in read.items() if task.vehicle == 1}
     drives = tuple(read[task][0] for task in fleet)
-    return SeedOutcome(seed, read[fleet[0]][1], found, drives, _merged(seed, options, fleet))
+    return SlamcuSeed(seed, read[fleet[0]][1], found, drives, _merged(seed, options, fleet))
 
 
 def _merged(seed: int, options: SlamcuOptions, fleet: list[DriveTask]) -> Mapping[int, MergedSigns]:

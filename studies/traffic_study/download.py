@@ -18,13 +18,13 @@ from gnd.gnd_map.geodesy import LocalFrame
 from gnd.gnd_map.tile import Tile
 from gnd.gnd_map.tile_id import District, TileId
 from gnd.schemas.keys import batch_key
-from gnd.schemas.tiles_batch import HeldTile, TilesReply, TilesRequest
-from gnd.tile_store.answers import Answers
+from gnd.schemas.tiles_batch import HeldVersion, TilesReply, TilesRequest
+from gnd.tile_store.answers import TileAnswers
 from gnd.tile_store.sqlite_store import SqliteStore
 from gnd.tile_store.values import DEFAULT_LAYER
 from gnd.vehicle_agent.config import LEAD_S, DownloadParameters
 from gnd.vehicle_agent.download import DOWNLOAD_BATCH_S
-from gnd.vehicle_agent.plan import Course, batch_bytes, needs
+from gnd.vehicle_agent.plan import VehicleCourse, batch_bytes, needs
 from gnd.vehicle_agent.surroundings import STEP_M, tiles_along
 from studies.traffic_study.fleet import drive_config
 from studies.traffic_study.options import TrafficOptions
@@ -33,7 +33,7 @@ _LOOK_S: Final = 0.1
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Track:
+class DownloadTrack:
     """A drive every `STEP_M` of way: time [s], way [m], position (N, 3) and velocity (N, 2), map frame."""
 
     frame: LocalFrame
@@ -81,7 +81,7 @@ class Server:
     """The tile server's answers from a store, without a bus."""
 
     def __init__(self, store: SqliteStore) -> None:
-        self._answers: Final = Answers(store)
+        self._answers: Final = TileAnswers(store)
 
     def ask(self, district: District, request: TilesRequest) -> tuple[int, int, TilesReply]:
         """Return the bytes up (with the key), the bytes down, and the answer as the vehicle reads it."""
@@ -91,7 +91,7 @@ class Server:
 
 
 def along_drive(
-    track: Track,
+    track: DownloadTrack,
     server: Server,
     link: LinkProfile,
     *,
@@ -117,7 +117,7 @@ def along_drive(
         waiting = _due(track, k, parameters, known)
         while waiting:
             tiles = [tile for tile in waiting if tile.district == waiting[0].district]
-            asked = [HeldTile(t, held[t].version, held[t].sha) if t in held else HeldTile(t) for t in tiles]
+            asked = [HeldVersion(t, held[t].version, held[t].sha) if t in held else HeldVersion(t) for t in tiles]
             request = TilesRequest.of(asked, codecs=codecs, max_bytes=most, near=tiles[0])
             up, down, reply = server.ask(tiles[0].district, request)
             answered = reply.of_request(request, tiles[0].district)
@@ -128,7 +128,7 @@ def along_drive(
     return questions
 
 
-def _due(track: Track, k: int, parameters: DownloadParameters, known: set[TileId]) -> list[TileId]:
+def _due(track: DownloadTrack, k: int, parameters: DownloadParameters, known: set[TileId]) -> list[TileId]:
     """The tiles to ask for now, soonest needed first; none while nothing is urgent."""
     here, velocity = track.position_m[k], track.velocity_mps[k]
     speed = float(np.hypot(*velocity))
@@ -136,7 +136,9 @@ def _due(track: Track, k: int, parameters: DownloadParameters, known: set[TileId
     ahead_m = max(parameters.ahead_m, parameters.ahead_s * speed)
     end = here + ahead_m * np.array([np.cos(heading), np.sin(heading), 0.0])
     tiles = tiles_along(track.frame, np.stack([here, end]), parameters.near_m)
-    planned = needs(track.frame, tiles, Course(float(here[0]), float(here[1]), heading, speed), parameters.near_m)
+    planned = needs(
+        track.frame, tiles, VehicleCourse(float(here[0]), float(here[1]), heading, speed), parameters.near_m
+    )
     new = [need for need in planned if need.tile_id not in known]
     return [need.tile_id for need in new] if any(need.from_s <= LEAD_S for need in new) else []
 

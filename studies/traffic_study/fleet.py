@@ -21,13 +21,13 @@ from studies.simulation.study import drive_jobs
 from studies.simulation.vehicle import VehicleTask
 from studies.simulation.worlds import PCD, VEHICLE, WorldFiles
 from studies.traffic_study.options import TrafficOptions
-from studies.traffic_study.uploads import Cloud, DriveUpload, upload
+from studies.traffic_study.uploads import DriveUpload, UploadCloud, upload
 
 _HOUR_NS = 3_600 * 1_000_000_000
 
 
 @dataclass(frozen=True, slots=True)
-class Way:
+class DrivenWay:
     """How maps and reports travel.
 
     Attributes:
@@ -40,7 +40,7 @@ class Way:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class FleetOutcome:
+class TrafficFleet:
     """What came of the drives.
 
     Attributes:
@@ -68,7 +68,7 @@ class Fleet:
     options: TrafficOptions
     files: WorldFiles
 
-    def run(self, way: Way, drives: int, bench: Bench) -> FleetOutcome:
+    def run(self, way: DrivenWay, drives: int, bench: Bench) -> TrafficFleet:
         """Drive and merge, `options.at_once` vehicles at a time; drives whose results are kept are not driven again.
 
         Args:
@@ -85,7 +85,7 @@ class Fleet:
         published: list[int] = []
         scores: dict[int, dict[Level, float]] = {}
         store, merge = self.files.home / f"cloud-{way.name}.sqlite", self.options.method.merge
-        with Cloud(store, base, merge, way.lattice.name if way.lattice else "float") as cloud:
+        with UploadCloud(store, base, merge, way.lattice.name if way.lattice else "float") as cloud:
             for first in range(0, drives, self.options.at_once):
                 held = cloud.map()
                 numbers = range(first, min(first + self.options.at_once, drives))
@@ -96,9 +96,9 @@ class Fleet:
             final = cloud.map()
         after = min((n for n in scores if n >= self.options.f1_drives), default=drives)
         stale = _f1(truth, base, base)
-        return FleetOutcome(tuple(uploads), base, final, stale, scores[after], scores[drives], tuple(published))
+        return TrafficFleet(tuple(uploads), base, final, stale, scores[after], scores[drives], tuple(published))
 
-    def _driven(self, way: Way, held: BaseMap, numbers: range, bench: Bench) -> Iterator[VehicleResult]:
+    def _driven(self, way: DrivenWay, held: BaseMap, numbers: range, bench: Bench) -> Iterator[VehicleResult]:
         """The results of drives that begin with the map `held`, in order."""
         path = self.files.home / f"map-{way.name}-{numbers.start:02d}.npz"
         write_base(held, path)
@@ -107,7 +107,7 @@ class Fleet:
         run_jobs(drive_jobs(tasks), bench.processes, bench.progress, title)
         return (read_result(task.result, task.key) for task in tasks)
 
-    def _task(self, way: Way, held: BaseMap, path: Path, number: int) -> VehicleTask:
+    def _task(self, way: DrivenWay, held: BaseMap, path: Path, number: int) -> VehicleTask:
         options, drive = self.options, drive_config(self.options, number)
         cloud = self.files.cloud if way.lattice is not None and number < options.pcd_drives else None
         key = self._key(way, held, drive, with_pcd=cloud is not None)
@@ -125,7 +125,7 @@ class Fleet:
             rounded=way.lattice is not None,
         )
 
-    def _key(self, way: Way, held: BaseMap, drive: DriveConfig, *, with_pcd: bool) -> str:
+    def _key(self, way: DrivenWay, held: BaseMap, drive: DriveConfig, *, with_pcd: bool) -> str:
         """A hash of everything that decides what the vehicle reports."""
         method: Any = to_mapping(_method(self.options, way))
         return key_of(
@@ -156,7 +156,7 @@ def drive_config(options: TrafficOptions, number: int) -> DriveConfig:
     )
 
 
-def _method(options: TrafficOptions, way: Way) -> Any:
+def _method(options: TrafficOptions, way: DrivenWay) -> Any:
     """The parameters; floats go whole."""
     if way.lattice is not None:
         return options.method

@@ -14,7 +14,7 @@ from gnd.schemas.drive import Scan
 from studies.codec_scenes import PosedScan, kl_median, plain_protobuf, pose_shift_cm
 from studies.frame.measure import core_s
 from studies.frame.scans import posed
-from studies.short_drives import Street
+from studies.short_drives import MappedStreet
 
 TILE_VOXELS: Final = 2_500
 _SCANS: Final = 40
@@ -51,7 +51,7 @@ def codec_measures(world: World, tiles: Tiles, sensor_model: str) -> dict[str, C
         tiles: its map.
         sensor_model: of the scans.
     """
-    street = Street(world, _MARGIN_M)
+    street = MappedStreet(world, _MARGIN_M)
     scans = _posed_scans(street, sensor_model)
     found = {}
     for name, lattice in LATTICES.items():
@@ -88,7 +88,7 @@ def _times_ms(codec: Codec, tiles: Tiles) -> tuple[float, float]:
     return encode_s * scale, decode_s * scale
 
 
-def _posed_scans(street: Street, sensor_model: str) -> list[PosedScan]:
+def _posed_scans(street: MappedStreet, sensor_model: str) -> list[PosedScan]:
     """Scans evenly along a drive before the changes, sweep motion removed, with their true poses."""
     drive = street.drive(sensor_model, "before", 1, street.world.seed)
     scans = [item for item in drive.items() if isinstance(item, Scan)]

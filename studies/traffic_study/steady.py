@@ -31,7 +31,7 @@ from gnd.tile_store.sqlite_store import SqliteStore
 from gnd.tile_store.values import DEFAULT_LAYER
 from gnd.vehicle_agent.agent import AgentConfig
 from gnd.vehicle_agent.cache import TileCache
-from studies.frame.command import Bench, Report, study
+from studies.frame.command import Bench, StudyReport, study
 from studies.frame.errors import OptionError, ReproduceError
 from studies.frame.options import check, option
 from studies.frame.tables import Sheet, sheet_of, shown
@@ -69,14 +69,14 @@ class SteadyOptions:
 
 
 @study(SteadyOptions, out="runs/reproduce-steady", jobs=1)
-def steady_vehicle(options: SteadyOptions, bench: Bench) -> Report:
+def steady_vehicle(options: SteadyOptions, bench: Bench) -> StudyReport:
     """All bytes of a vehicle that knows its street, up and down, over the real bus.
 
     Nothing has changed since the street was mapped, and the vehicle's cache holds the map. Counted is what the kernel
     counted on its connection (TCP_INFO): reports, telemetry, keep-alives, acknowledgements, handshakes, everything.
     """
     found = steady(options, bench.folder.root)
-    return Report(found, [sheet_of_account(found)])
+    return StudyReport(found, [sheet_of_account(found)])
 
 
 def steady(options: SteadyOptions, home: Path) -> dict[str, Any]:

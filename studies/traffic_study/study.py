@@ -10,23 +10,38 @@ from gnd.gnd_map.codec import CODEC_FLOAT32, LATTICES
 from gnd.gnd_map.gaussian import Gaussians
 from gnd.gnd_map.tile import Tile, diff
 from gnd.gnd_map.tile_id import TileId
-from studies.frame.command import Bench, Report, study
+from studies.frame.command import Bench, StudyReport, study
 from studies.frame.pool import Job
 from studies.pcd import PcdMap
 from studies.simulation.base_map import read_base
 from studies.simulation.worlds import WorldFiles, prepare_cloud, prepare_world, world_files
 from studies.traffic_study.clouds import cloud_sizes, kept_cloud, points_by_tile
-from studies.traffic_study.download import Question, Server, Track, along_drive, fetched_tiles, partly_changed, store_of
-from studies.traffic_study.fleet import Fleet, FleetOutcome, Way
+from studies.traffic_study.download import (
+    DownloadTrack,
+    Question,
+    Server,
+    along_drive,
+    fetched_tiles,
+    partly_changed,
+    store_of,
+)
+from studies.traffic_study.fleet import DrivenWay, Fleet, TrafficFleet
 from studies.traffic_study.options import TrafficOptions
 from studies.traffic_study.quality import CodecMeasures, codec_measures, protobuf_bytes
-from studies.traffic_study.summary import PUBLISHED, RETURN_SHARE, DownloadOutcome, StudyOutcome, summary_of, tables_of
+from studies.traffic_study.summary import (
+    PUBLISHED,
+    RETURN_SHARE,
+    DownloadOutcome,
+    TrafficOutcome,
+    summary_of,
+    tables_of,
+)
 
 LINK: Final = "4g"
 
 
 @study(TrafficOptions, out="runs/reproduce-traffic")
-def traffic(options: TrafficOptions, bench: Bench) -> Report:
+def traffic(options: TrafficOptions, bench: Bench) -> StudyReport:
     """What a map and its changes weigh on the way: Figure 23 of the GND paper, with our codecs.
 
     A second start with the same options and folder continues where the first ended.
@@ -42,22 +57,22 @@ def traffic(options: TrafficOptions, bench: Bench) -> Report:
     jobs = [Job("download", download, (options, files, fleet)), Job("codecs", codecs_on_street, (options, files))]
     downloaded, codecs = bench.run("map and codecs", jobs)
     links = tuple(load_link(name) for name in ("3g", "4g", "5g"))
-    found = summary_of(StudyOutcome(options, downloaded, fleet, floats, codecs, links, bench.spent_s))
+    found = summary_of(TrafficOutcome(options, downloaded, fleet, floats, codecs, links, bench.spent_s))
 
     def draw(folder: Path) -> None:
         from studies.traffic_study.figures import draw_figures
 
         draw_figures(found, folder)
 
-    return Report(found, tables_of(found), draw)
+    return StudyReport(found, tables_of(found), draw)
 
 
-def _fleets(options: TrafficOptions, files: WorldFiles, bench: Bench) -> tuple[FleetOutcome, FleetOutcome | None]:
+def _fleets(options: TrafficOptions, files: WorldFiles, bench: Bench) -> tuple[TrafficFleet, TrafficFleet | None]:
     """The fleet with our codecs, and its first drives once more with floats."""
     fleet = Fleet(options, files)
-    ours = fleet.run(Way(PUBLISHED, LATTICES[PUBLISHED]), options.drives, bench)
+    ours = fleet.run(DrivenWay(PUBLISHED, LATTICES[PUBLISHED]), options.drives, bench)
     again = min(options.f1_drives, options.drives)
-    return ours, fleet.run(Way("float", None), again, bench) if again else None
+    return ours, fleet.run(DrivenWay("float", None), again, bench) if again else None
 
 
 def codecs_on_street(options: TrafficOptions, files: WorldFiles) -> dict[str, CodecMeasures]:
@@ -65,10 +80,10 @@ def codecs_on_street(options: TrafficOptions, files: WorldFiles) -> dict[str, Co
     return codec_measures(street(options.seed, options.street), read_base(files.base).tiles, options.sensor_model)
 
 
-def download(options: TrafficOptions, files: WorldFiles, fleet: FleetOutcome) -> DownloadOutcome:
+def download(options: TrafficOptions, files: WorldFiles, fleet: TrafficFleet) -> DownloadOutcome:
     """Return what a vehicle downloads on the first drive, in all forms, and what it downloads when it comes back."""
     world, base = street(options.seed, options.street), read_base(files.base).tiles
-    track, link = Track.of(world, options), load_link(LINK)
+    track, link = DownloadTrack.of(world, options), load_link(LINK)
     published = fleet.base.tiles
     changed = partly_changed(published, RETURN_SHARE, options.seed)
     held = {tile: Tile(tile, 1, gaussians) for tile, gaussians in published.items()}
@@ -99,7 +114,7 @@ def _cloud(options: TrafficOptions, files: WorldFiles) -> PcdMap:
 
 
 def _drive(
-    track: Track, link: LinkProfile, path: Path, *states: Mapping[TileId, Gaussians], **how: Any
+    track: DownloadTrack, link: LinkProfile, path: Path, *states: Mapping[TileId, Gaussians], **how: Any
 ) -> list[Question]:
     """The questions of a drive to a tile server that holds these states, the oldest first."""
     store = store_of(path, *states)

@@ -13,8 +13,8 @@ from studies.frame.command import plain_options
 from studies.frame.tables import Sheet, sheet, sheet_of
 from studies.frame.targets import Target, judged, targets_sheet
 from studies.traffic_study.clouds import Written
-from studies.traffic_study.download import Question, Track, fetched_tiles, total_bytes
-from studies.traffic_study.fleet import FleetOutcome
+from studies.traffic_study.download import DownloadTrack, Question, fetched_tiles, total_bytes
+from studies.traffic_study.fleet import TrafficFleet
 from studies.traffic_study.options import TrafficOptions
 from studies.traffic_study.quality import CodecMeasures
 from studies.traffic_study.uploads import PARTS, DriveUpload
@@ -86,7 +86,7 @@ class DownloadOutcome:
         changed_by_fleet: voxels.
     """
 
-    track: Track
+    track: DownloadTrack
     voxels: Mapping[TileId, int]
     gnd: Sequence[Question]
     gnd_float: Sequence[Question]
@@ -99,13 +99,13 @@ class DownloadOutcome:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class StudyOutcome:
+class TrafficOutcome:
     """A finished study."""
 
     options: TrafficOptions
     download: DownloadOutcome
-    fleet: FleetOutcome
-    floats: FleetOutcome | None
+    fleet: TrafficFleet
+    floats: TrafficFleet | None
     codecs: Mapping[str, CodecMeasures]
     links: tuple[LinkProfile, ...]
     runtime_s: Mapping[str, float]
@@ -115,7 +115,7 @@ FIRST_DRIVES: Final = 8
 """`flags_first` is the mean over so many drives."""
 
 
-def summary_of(outcome: StudyOutcome) -> dict[str, Any]:
+def summary_of(outcome: TrafficOutcome) -> dict[str, Any]:
     """Return everything as plain values."""
     found: dict[str, Any] = {
         "seed": outcome.options.seed,
@@ -277,12 +277,12 @@ def _km(uploads: Sequence[DriveUpload]) -> float:
     return sum(upload.km for upload in uploads)
 
 
-def _codec(outcome: StudyOutcome) -> dict[str, Any]:
+def _codec(outcome: TrafficOutcome) -> dict[str, Any]:
     measures = {name: _rounded(asdict(one)) for name, one in outcome.codecs.items()}
     return {**measures[PUBLISHED], **{name: one for name, one in measures.items() if name != PUBLISHED}}
 
 
-def _f1(outcome: StudyOutcome) -> dict[str, Any]:
+def _f1(outcome: TrafficOutcome) -> dict[str, Any]:
     fleet, floats, drives = outcome.fleet, outcome.floats, len(outcome.fleet.uploads)
     return {
         "drives": min(outcome.options.f1_drives, drives),
@@ -306,7 +306,7 @@ def _drive(upload: DriveUpload) -> dict[str, Any]:
     return {**asdict(upload), "km": round(upload.km, 4), "bytes": upload.bytes, "wire_bytes": upload.wire_bytes}
 
 
-def _parameters(outcome: StudyOutcome) -> dict[str, Any]:
+def _parameters(outcome: TrafficOutcome) -> dict[str, Any]:
     world = plain_options(outcome.options.world)
     return {
         **{name: value for name, value in to_mapping(outcome.options).items() if name not in ("method", "poses")},

@@ -62,7 +62,7 @@ class Message:
         return not self.request
 
 
-class Cloud:
+class UploadCloud:
     """One merger and its store.
 
     Args:
@@ -205,7 +205,7 @@ class DriveUpload:
         return self.bytes - self.parts["keys"] + self.messages * MESSAGE_OVERHEAD_BYTES
 
 
-def upload(result: VehicleResult, held: BaseMap, cloud: Cloud) -> DriveUpload:
+def upload(result: VehicleResult, held: BaseMap, cloud: UploadCloud) -> DriveUpload:
     """Send everything that a drive has to say.
 
     Args:
@@ -238,7 +238,7 @@ def upload(result: VehicleResult, held: BaseMap, cloud: Cloud) -> DriveUpload:
     )
 
 
-def _send(result: VehicleResult, reports: list[ChangeReport], held: BaseMap, cloud: Cloud, path: Path) -> None:
+def _send(result: VehicleResult, reports: list[ChangeReport], held: BaseMap, cloud: UploadCloud, path: Path) -> None:
     """The vehicle's outbox and its sender; the bus is a call."""
     outbox = Outbox(path)
     try:

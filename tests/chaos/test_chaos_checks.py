@@ -15,7 +15,7 @@ from gnd.cloud_merger.ingest import Ingest
 from gnd.cloud_merger.work import Worker
 from gnd.deploy.chaos.checks import Findings, look
 from gnd.deploy.chaos.clients import Receipt, put
-from gnd.deploy.chaos.street import LAYER, Sent, Street, read_street
+from gnd.deploy.chaos.street import LAYER, ChaosStreet, SentReport, read_street
 from gnd.gnd_map.codec import encode_mask
 from gnd.schemas.report_id import deterministic_report_id
 from gnd.schemas.report_states import ReportState
@@ -29,7 +29,7 @@ SEED, VEHICLES, REPORTS = 5, ("car-0", "car-1"), 3
 
 
 @pytest.fixture(scope="module")
-def street() -> Street:
+def street() -> ChaosStreet:
     return read_street(districts=1)
 
 
@@ -38,7 +38,7 @@ class World:
     """A small cloud that has ended, and what its clients hold; the tests break it before it is looked at."""
 
     folder: Path
-    sent: list[Sent]
+    sent: list[SentReport]
 
     @property
     def store(self) -> Path:
@@ -59,7 +59,7 @@ class World:
 
 
 @pytest.fixture(scope="module")
-def whole_world(tmp_path_factory: pytest.TempPathFactory, street: Street) -> World:
+def whole_world(tmp_path_factory: pytest.TempPathFactory, street: ChaosStreet) -> World:
     """Every report acknowledged, halves asked for and sent, all merged, and received by a follower."""
     tmp_path = tmp_path_factory.mktemp("whole")
     sent = [street.said(SEED, vehicle, n) for vehicle in VEHICLES for n in range(REPORTS)]
@@ -129,7 +129,7 @@ def test_what_is_lost_is_found(world: World, what: str) -> None:
     assert any("lost" in one for one in found.failures)
 
 
-def test_a_report_that_was_changed_on_its_way_is_lost(world: World, street: Street) -> None:
+def test_a_report_that_was_changed_on_its_way_is_lost(world: World, street: ChaosStreet) -> None:
     one = next(one for one in world.sent if any(len(change.changed) for change in one.whole.tiles))
     at = next(k for k, change in enumerate(one.whole.tiles) if len(change.changed))
     tiles = list(one.whole.tiles)
@@ -183,7 +183,7 @@ def test_a_torn_tile_is_found(world: World, how: str) -> None:
     assert any("torn" in one for one in found.failures)
 
 
-def test_work_that_never_ends_is_found(world: World, street: Street) -> None:
+def test_work_that_never_ends_is_found(world: World, street: ChaosStreet) -> None:
     one = next(street.said(SEED, "car-0", n) for n in range(REPORTS, 99))
     with SqliteStore(world.store) as store:
         Ingest(store, "one").answer(one.key, one.packed.encode())
@@ -197,7 +197,7 @@ def test_work_that_never_ends_is_found(world: World, street: Street) -> None:
     assert any("in no version" in line for line in world.look().stuck_tiles)
 
 
-def test_gaussians_without_flags_are_stuck(world: World, street: Street) -> None:
+def test_gaussians_without_flags_are_stuck(world: World, street: ChaosStreet) -> None:
     one = next(one for one in (street.said(SEED, "car-9", n) for n in range(99)) if askable(one.whole))
     half = pack_measured(one.whole, one.bases_by_sha, encode_mask(np.ones(askable(one.whole), np.bool_)))
     with SqliteStore(world.store) as store:
@@ -206,7 +206,7 @@ def test_gaussians_without_flags_are_stuck(world: World, street: Street) -> None
     assert world.look().stuck_tiles == ["1 uploads are early"]
 
 
-def test_a_map_that_is_not_what_its_journal_gives_is_found(world: World, street: Street) -> None:
+def test_a_map_that_is_not_what_its_journal_gives_is_found(world: World, street: ChaosStreet) -> None:
     world.run(
         "UPDATE tile_version SET (codec_id, body, sha) = (SELECT codec_id, body, sha FROM tile_version AS old WHERE"
         " old.layer = tile_version.layer AND old.tile = tile_version.tile AND old.version = 1) WHERE kind = 'merged'"
@@ -228,7 +228,7 @@ def test_what_a_client_still_waits_for_and_a_damaged_body_are_found(world: World
     assert found.damages
 
 
-def test_a_run_in_which_nothing_happened_has_failed(tmp_path: Path, street: Street) -> None:
+def test_a_run_in_which_nothing_happened_has_failed(tmp_path: Path, street: ChaosStreet) -> None:
     with SqliteStore(tmp_path / "store.sqlite") as store:
         store.put_tiles(street.tiles)
         store.announced(store.notices())

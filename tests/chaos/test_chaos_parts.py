@@ -11,13 +11,13 @@ import pytest
 
 from gnd.deploy.chaos import page
 from gnd.deploy.chaos.faults import KINDS, Fault, plan
-from gnd.deploy.chaos.service import SERVICES, Served, gaps
+from gnd.deploy.chaos.service import SERVICES, ServiceGaps, gaps
 from gnd.deploy.chaos.street import DISTRICTS, read_street
 from gnd.deploy.chaos.wire import Wires
 from gnd.deploy.errors import ChaosError
 from gnd.gnd_map.tile import content_sha
 from gnd.schemas.tiles import TileRequest
-from gnd.tile_store.answers import Answers
+from gnd.tile_store.answers import TileAnswers
 from gnd.tile_store.check import check_store
 from gnd.tile_store.errors import StoreDamaged
 from gnd.tile_store.sqlite_store import SqliteStore
@@ -127,9 +127,9 @@ def test_a_line_that_is_held_up_delivers_late_and_loses_nothing() -> None:
 # Pauses
 
 
-def served(**times_s: list[float]) -> Served:
+def served(**times_s: list[float]) -> ServiceGaps:
     every = {service: [k / 10 for k in range(101)] for service in SERVICES}
-    return Served(every | times_s)
+    return ServiceGaps(every | times_s)
 
 
 def test_a_pause_belongs_to_the_kill_within_it_and_to_nothing_else() -> None:
@@ -184,7 +184,7 @@ def test_a_page_of_a_body_is_found_broken_and_mended(tmp_path: Path) -> None:
     damaged = [one.name for one in check_store(path).damages if one.kind == "tile"]
     assert damaged == [f"ndt {large.tile_id.path} version 1"]
     with SqliteStore(path, read_only=True) as store:
-        answers = Answers(store)
+        answers = TileAnswers(store)
         with pytest.raises(StoreDamaged, match=large.tile_id.path):
             answers.one(store.get("ndt", large.tile_id), TileRequest())
         assert page.write(path, at, was) == b"\xff" * page.SAMPLE_BYTES

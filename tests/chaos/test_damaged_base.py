@@ -9,7 +9,7 @@ from gnd.cloud_merger.config import ShardConfig
 from gnd.cloud_merger.expander import Expander
 from gnd.cloud_merger.ingest import Ingest
 from gnd.deploy.chaos.page import PAGE_BYTES
-from gnd.deploy.chaos.street import Sent, Street, read_street
+from gnd.deploy.chaos.street import ChaosStreet, SentReport, read_street
 from gnd.tile_store.errors import StoreDamaged
 from gnd.tile_store.sqlite_store import SqliteStore
 
@@ -23,7 +23,7 @@ def flip(path: Path, at: int) -> None:
     path.write_bytes(raw)
 
 
-def reports_in_two_districts(street: Street) -> tuple[Sent, Sent]:
+def reports_in_two_districts(street: ChaosStreet) -> tuple[SentReport, SentReport]:
     said = [street.said(1, "car", n) for n in range(40)]
     return next(one for one in said if one.whole.district == street.copies[0][0].tile_id.district), next(
         one for one in said if one.whole.district != street.copies[0][0].tile_id.district

@@ -14,7 +14,7 @@ from gnd.cloud_merger.shift import (
     SHIFT_LEAST_GAUSSIANS,
     SHIFT_MAX_M,
     SHIFT_MAX_RAD,
-    Shift,
+    CommonShift,
 )
 from gnd.gnd_map.gaussian import Gaussians
 from gnd.gnd_map.grid import VoxelGrid
@@ -71,7 +71,7 @@ class Surfaces:
         return Surfaces(self.place_m[index], self.cov_m2[index], self.normal[index], self.flat[index])
 
 
-def plain_shift_of(change: TileChange, base: Gaussians) -> Shift:
+def plain_shift_of(change: TileChange, base: Gaussians) -> CommonShift:
     """Test whether a small shift explains what a report says about a tile.
 
     Args:
@@ -81,12 +81,12 @@ def plain_shift_of(change: TileChange, base: Gaussians) -> Shift:
     grid = VoxelGrid.of(change.tile)
     there = change.changed.take(change.changed.exists)
     if len(there) < SHIFT_LEAST_GAUSSIANS or len(base) < SHIFT_LEAST_GAUSSIANS:
-        return Shift(False, len(there))
+        return CommonShift(False, len(there))
     surfaces, known = Surfaces.of(grid, _thinned(there)), Surfaces.of(grid, base)
     tree = cKDTree(known.place_m)
     strange = surfaces.take(~fits(surfaces, known, tree, np.zeros(3)))
     if len(strange.place_m) < SHIFT_LEAST_GAUSSIANS:
-        return Shift(False, len(strange.place_m))
+        return CommonShift(False, len(strange.place_m))
     is_seen, is_changed = (np.isin(base.voxel_id, ids) for ids in (change.observed, change.changed.voxel_id))
     begin = searched(strange, known.take(is_seen & ~is_changed), known, tree)
     motion = _refined(begin, strange, known, tree)
@@ -94,16 +94,16 @@ def plain_shift_of(change: TileChange, base: Gaussians) -> Shift:
     others = [fits(strange, known, tree, other).mean() for other in _elsewhere(motion)]
     chance = float(np.mean(others))
     unchanged = _unchanged(known.take(is_seen), is_changed[is_seen], motion)
-    found = Shift(False, len(strange.place_m), fit, chance, unchanged, *motion.tolist())
+    found = CommonShift(False, len(strange.place_m), fit, chance, unchanged, *motion.tolist())
     upwards = found if found.meets() else _raised(strange, known, tree, is_seen, is_changed)
     return next((replace(one, is_explained=True) for one in (found, upwards) if one.meets()), found)
 
 
-def _raised(strange: Surfaces, known: Surfaces, tree: cKDTree, is_seen: Mask, is_changed: Mask) -> Shift:
+def _raised(strange: Surfaces, known: Surfaces, tree: cKDTree, is_seen: Mask, is_changed: Mask) -> CommonShift:
     """The shift up or down that most level planes agree on, and what it explains."""
     level, ground = strange.take(strange.is_level), known.take(known.is_level)
     if len(level.place_m) < SHIFT_LEAST_GAUSSIANS or not len(ground.place_m):
-        return Shift(False, len(strange.place_m))
+        return CommonShift(False, len(strange.place_m))
     near = cKDTree(ground.place_m[:, :2]).query_ball_point(level.place_m[:, :2], _BESIDE_M)
     steps = np.arange(-SHIFT_MAX_M, SHIFT_MAX_M + _STEP_M / 2, _STEP_M)
     votes = np.zeros(len(steps))
@@ -114,7 +114,7 @@ def _raised(strange: Surfaces, known: Surfaces, tree: cKDTree, is_seen: Mask, is
     fit, chance = (float(fits(strange.raised(up_m), known, tree, np.zeros(3)).mean()) for up_m in (best, -best))
     displaced = is_seen & known.is_level & (abs(best) > SHIFT_DISPLACED_M)
     unchanged = float((~is_changed)[displaced].mean()) if displaced.any() else 1.0
-    return Shift(False, len(strange.place_m), fit, chance, unchanged, up_m=best)
+    return CommonShift(False, len(strange.place_m), fit, chance, unchanged, up_m=best)
 
 
 def _thinned(gaussians: Gaussians) -> Gaussians:

@@ -11,7 +11,7 @@ from gnd.gnd_map.codec import LATTICES, REPORT, snap
 from gnd.gnd_map.gaussian import Gaussians
 from gnd.gnd_map.tile import Tile, content_sha
 from gnd.gnd_map.tile_id import TileId
-from gnd.gnd_map.track import STEPS, Piece, Track, View
+from gnd.gnd_map.track import STEPS, Track, TrackPiece, TrackView
 from gnd.schemas.changes import ChangeReport, TileChange
 from gnd.schemas.keys import change_key
 from gnd.vehicle_agent.packing import pack
@@ -49,7 +49,7 @@ def track_by(tile: TileId = TILE) -> Track:
     first = TileId(tile.district.first_morton)
     x, y = STEPS * (tile.lon_index - first.lon_index), STEPS * (tile.lat_index - first.lat_index) + STEPS // 2
     vertices = np.array([[x, y, 4], [x + STEPS, y, 4]], np.int32)
-    return Track(tile.district, View((-30, -24, -18, -12, -6, 0, 6, 12, 20)), (Piece(vertices, 40),))
+    return Track(tile.district, TrackView((-30, -24, -18, -12, -6, 0, 6, 12, 20)), (TrackPiece(vertices, 40),))
 
 
 def bases_of(report: ChangeReport, base: Gaussians = BASE) -> dict[bytes, Gaussians]:

@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 from scipy.stats import chi2
 
 from gnd.cloud_merger.features import FeatureMergeParameters
-from gnd.cloud_merger.features.rls import Place, estimate, fused, step
+from gnd.cloud_merger.features.rls import PlaceEstimate, estimate, fused, step
 from gnd.cloud_merger.features.window import LayerMerger, LayerState, LayerWindow
 from gnd.gnd_map.features import full_covariance, hit, six_of
 from gnd.schemas.features import Found
@@ -22,7 +22,7 @@ def some_places(seed, n, scale=1.0):
     out = []
     for _ in range(n):
         A = rng.normal(size=(3, 3)) * scale * np.array([1.0, 1.0, rng.choice([1.0, 10.0])])
-        out.append(Place(rng.normal(size=(1, 3)) * 5.0, A @ A.T + 1e-2 * np.eye(3)))
+        out.append(PlaceEstimate(rng.normal(size=(1, 3)) * 5.0, A @ A.T + 1e-2 * np.eye(3)))
     return out
 
 
@@ -56,9 +56,9 @@ def test_what_was_known_before_is_one_more_measurement():
 
 def test_the_covariance_stays_positive_where_the_plain_form_fails():
     """A measurement far better than what was known: (I - K) P loses all digits, the Joseph form none."""
-    state = Place(np.zeros((1, 3)), np.diag([1e8, 1e8, 1e8]) + 9.9e7 * (1 - np.eye(3)))
+    state = PlaceEstimate(np.zeros((1, 3)), np.diag([1e8, 1e8, 1e8]) + 9.9e7 * (1 - np.eye(3)))
     for _ in range(20):
-        state = step(state, Place(np.ones((1, 3)), np.diag([1e-8, 1e-8, 1e4])))
+        state = step(state, PlaceEstimate(np.ones((1, 3)), np.diag([1e-8, 1e-8, 1e4])))
     assert np.linalg.eigvalsh(state.cov_m2)[0] > 0
     assert np.array_equal(state.cov_m2, state.cov_m2.T)
 
@@ -68,7 +68,7 @@ def test_repeats_of_one_vehicle_weigh_what_correlated_errors_leave(correlation):
     """Against generalised least squares with the full covariance of n equally good, equally correlated errors."""
     parameters = FeatureMergeParameters(repeat_correlation=correlation)
     (one,) = some_places(4, 1)
-    repeats = [Place(one.points_m + k, one.cov_m2) for k in range(4)]
+    repeats = [PlaceEstimate(one.points_m + k, one.cov_m2) for k in range(4)]
     got = fused(estimate(repeats), 4, parameters.information_of(4))
     joint = np.kron(np.full((4, 4), correlation) + (1 - correlation) * np.eye(4), one.cov_m2)
     H = np.vstack([np.eye(3)] * 4)

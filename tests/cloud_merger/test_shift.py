@@ -12,7 +12,7 @@ from scipy.spatial import cKDTree
 from street_corner import WALLS, displaced, mapped, seen_as, street
 
 from gnd.cloud_merger import shift_kernels
-from gnd.cloud_merger.shift import SHIFT_FITS, SHIFT_LEAST_GAUSSIANS, Shift, _fits, _Surfaces, shift_of
+from gnd.cloud_merger.shift import SHIFT_FITS, SHIFT_LEAST_GAUSSIANS, CommonShift, _fits, _Surfaces, shift_of
 from gnd.gnd_map.gaussian import Gaussians, concat
 from gnd.gnd_map.grid import VoxelGrid
 from gnd.gnd_map.similarity import similarity
@@ -73,7 +73,7 @@ def test_a_changed_street_is_no_shift(walls):
 def test_without_gaussians_or_without_a_map_nothing_is_said():
     change = seen_as(BASE, displaced(street(1), 0.3, 0.0))
     flags = replace(change, changed=Gaussians.nothing_at(change.changed.voxel_id))
-    assert shift_of(flags, BASE) == Shift(False, 0)
+    assert shift_of(flags, BASE) == CommonShift(False, 0)
     assert not shift_of(change, Gaussians.empty()).is_explained
 
 

@@ -22,7 +22,7 @@ from gnd.gnd_map.classes import ChangeClass
 from gnd.gnd_map.codec import decode_mask, encode_flags, encode_mask
 from gnd.gnd_map.gaussian import Gaussians
 from gnd.gnd_map.tile_id import District, TileId
-from gnd.gnd_map.track import Piece, encode_track
+from gnd.gnd_map.track import TrackPiece, encode_track
 from gnd.schemas.changes import ChangeAck, ChangeReport
 from gnd.schemas.keys import change_key
 from gnd.schemas.packed import PackedReport, crc_of, decode_upload
@@ -33,7 +33,7 @@ from gnd.vehicle_agent.packing import askable, pack, pack_measured
 
 # Back and forth through the district; its ends are near enough.
 LONG = dataclasses.replace(
-    track_by(), pieces=(Piece(np.tile(np.array([[0, 0, 4], [2000, 0, 4]], np.int32), (3, 1)), 100),)
+    track_by(), pieces=(TrackPiece(np.tile(np.array([[0, 0, 4], [2000, 0, 4]], np.int32), (3, 1)), 100),)
 )
 REPORT = drive_number(1, new={3: POLE, 4: BALL}, modified={1: WALL_AGAIN}, deleted=(2,))
 PACKED = packed_of(REPORT)

@@ -13,7 +13,7 @@ from gnd.gnd_map.gaussian import Gaussians
 from gnd.gnd_map.grid import VoxelGrid
 from gnd.gnd_map.tile import Tile
 from gnd.gnd_map.tile_id import TileId
-from gnd.gnd_map.track import STEPS, Piece, Track, View
+from gnd.gnd_map.track import STEPS, Track, TrackPiece, TrackView
 from gnd.schemas.changes import ChangeReport, TileChange
 from gnd.schemas.keys import change_key
 from gnd.schemas.report_id import deterministic_report_id
@@ -94,7 +94,7 @@ def track_along(tile: Tile) -> Track:
     x = STEPS * (tile.tile_id.lon_index - first.lon_index)
     y = STEPS * (tile.tile_id.lat_index - first.lat_index) + STEPS // 2
     vertices = np.array([[x, y, 4], [x + STEPS, y, 4]], np.int32)
-    return Track(tile.tile_id.district, View((-60, -48, -36, -24, -12, -6, 0, 6, 20)), (Piece(vertices, 40),))
+    return Track(tile.tile_id.district, TrackView((-60, -48, -36, -24, -12, -6, 0, 6, 20)), (TrackPiece(vertices, 40),))
 
 
 def whole_report(vehicle: str, number: int, tile: Tile) -> ChangeReport:

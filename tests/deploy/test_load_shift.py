@@ -8,7 +8,7 @@ from gnd.deploy.load.errors import LoadError
 from gnd.deploy.load.shift import (
     DISTRICT_TILES,
     DISTRICTS_ROUND,
-    Shift,
+    DistrictShift,
     places_of_streets,
     shifted_district,
     shifted_tile,
@@ -35,7 +35,7 @@ def test_lines_of_sight_of_a_shifted_report_are_the_shifted_lines_of_sight(distr
     tile = street_tiles()[1]
     whole = whole_report("v", 0, tile)
     packed = pack(whole, {tile.sha: tile.gaussians}, track_along(tile))
-    shift = Shift(districts, {tile.tile_id: tile})
+    shift = DistrictShift(districts, {tile.tile_id: tile})
     here = expand(packed, "ndt", whole.district, [tile])
     moved = shift.packed(packed, [(tile.tile_id, tile.sha)])
     there = expand(moved, "ndt", shifted_district(whole.district, districts), [shifted_tile(tile, districts)])
@@ -50,7 +50,7 @@ def test_the_gaussians_of_a_report_are_read_where_it_was_moved_to():
     tile = street_tiles()[0]
     whole = whole_report("v", 0, tile)
     packed = pack(whole, {tile.sha: tile.gaussians}, track_along(tile))
-    shift = Shift(12, {tile.tile_id: tile})
+    shift = DistrictShift(12, {tile.tile_id: tile})
     moved_tile = shifted_tile(tile, 12)
     there = expand(shift.packed(packed, [(tile.tile_id, tile.sha)]), "ndt", moved_tile.tile_id.district, [moved_tile])
     mask = np.ones(askable(whole), np.bool_)
@@ -76,7 +76,7 @@ def test_a_report_that_was_not_moved_with_its_street_is_not_understood_there():
 def test_a_report_against_another_map_is_refused():
     tile = street_tiles()[0]
     with pytest.raises(LoadError, match="which is not its map"):
-        Shift(1, {tile.tile_id: tile}).sha(tile.tile_id, b"\1" * 32)
+        DistrictShift(1, {tile.tile_id: tile}).sha(tile.tile_id, b"\1" * 32)
 
 
 def test_streets_lie_side_by_side():

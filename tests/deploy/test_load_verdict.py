@@ -4,10 +4,10 @@ from dataclasses import replace
 
 import pytest
 
-from gnd.deploy.load.audit import Backlog, Ledger, Merged
+from gnd.deploy.load.audit import Backlog, LoadLedger, MergedTiles
 from gnd.deploy.load.plan import LoadOptions
-from gnd.deploy.load.sending import Account
-from gnd.deploy.load.verdict import Outcome, summary, why_not
+from gnd.deploy.load.sending import SenderAccount
+from gnd.deploy.load.verdict import LoadOutcome, summary, why_not
 
 N, RUN_S = 200, 100.0
 
@@ -25,18 +25,18 @@ def account(number, **given):
         "released_s": at_s + 0.2,
         "status": "released",
     }
-    return Account(**known | given)
+    return SenderAccount(**known | given)
 
 
 def good(**changes):
     """A run with which nothing is wrong."""
     accounts = changes.pop("accounts", [account(n) for n in range(N)])
     ids = frozenset(one.report_id for one in accounts)
-    ledger = Ledger(
+    ledger = LoadLedger(
         journaled=ids,
         with_gaussians=frozenset(),
         kept=dict.fromkeys(ids, "released"),
-        merged=tuple(Merged(1, n + 2, RUN_S * n / N, 0.5) for n in range(N)),
+        merged=tuple(MergedTiles(1, n + 2, RUN_S * n / N, 0.5) for n in range(N)),
         unmerged=0,
         aside=0,
         quarantined=0,
@@ -56,7 +56,7 @@ def good(**changes):
         "ledger": ledger,
         "notices_s": {(1, n + 2): RUN_S * n / N + 0.6 for n in range(N)},
     }
-    return Outcome(**known | changes)
+    return LoadOutcome(**known | changes)
 
 
 def test_a_run_with_which_nothing_is_wrong():
@@ -129,12 +129,12 @@ def test_vehicles_that_wait_longer_and_longer():
 
 
 def test_tiles_that_are_merged_later_and_later():
-    merged = tuple(Merged(1, n + 2, float(n), 0.5 + 4.0 * n / N) for n in range(N))
+    merged = tuple(MergedTiles(1, n + 2, float(n), 0.5 + 4.0 * n / N) for n in range(N))
     assert "p95 of the wait for merge" in said(good(ledger=replace(good().ledger, merged=merged)))
 
 
 def test_tiles_that_always_wait_for_long():
-    merged = tuple(Merged(1, n + 2, float(n), 7.0) for n in range(N))
+    merged = tuple(MergedTiles(1, n + 2, float(n), 7.0) for n in range(N))
     assert "95 % of the report parts were merged within 7.0 s only" in said(
         good(ledger=replace(good().ledger, merged=merged))
     )

@@ -11,7 +11,7 @@ from gnd.gnd_map.features import FeatureTile
 from gnd.tile_store.feature_io import stored
 from gnd.tile_store.feature_io.errors import BadGeometry, DuplicateId, FeatureFileError
 from gnd.tile_store.feature_io.formats import export_features, read_features
-from gnd.tile_store.feature_io.sources import Source
+from gnd.tile_store.feature_io.sources import FeatureSource
 from gnd.tile_store.feature_io.stored import import_features, layer_tiles, load_features, sources_of
 from gnd.tile_store.feature_io.values import FeatureFile, ImportOptions
 from gnd.tile_store.sqlite_store import SqliteStore
@@ -131,4 +131,4 @@ def test_a_backup_keeps_the_sources(store: SqliteStore, tmp_path: Path) -> None:
 
 def test_a_source_needs_a_name() -> None:
     with pytest.raises(FeatureFileError, match="1 … 200 characters, got 0"):
-        Source("", "lanelet2", {}, {})
+        FeatureSource("", "lanelet2", {}, {})

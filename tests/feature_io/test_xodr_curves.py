@@ -7,8 +7,8 @@ from hypothesis import strategies as st
 from scipy.integrate import quad
 
 from gnd.tile_store.feature_io.xodr_curves import (
-    Piece,
-    Profile,
+    CurvePiece,
+    HeightProfile,
     ReferenceLine,
     arc,
     line,
@@ -83,8 +83,8 @@ def test_pieces_follow_each_other() -> None:
     start = np.pi / 3
     c, n = np.cos(start), np.sin(start)
     pieces = (
-        Piece(0.0, 100.0, 200.0, start, 50.0, spiral(0.0, 0.02, 50.0)),
-        Piece(50.0, 100.0 + c * x - n * y, 200.0 + n * x + c * y, start + heading, 30.0, arc(0.02, 30.0)),
+        CurvePiece(0.0, 100.0, 200.0, start, 50.0, spiral(0.0, 0.02, 50.0)),
+        CurvePiece(50.0, 100.0 + c * x - n * y, 200.0 + n * x + c * y, start + heading, 30.0, arc(0.02, 30.0)),
     )
     s = np.linspace(0.0, 80.0, 801)
     px, py, ph = ReferenceLine(pieces).at(s)
@@ -94,9 +94,9 @@ def test_pieces_follow_each_other() -> None:
 
 
 def test_profiles_begin_where_they_say() -> None:
-    profile = Profile(np.array([5.0, 10.0]), np.array([[1.0, 0.5, 0.0, 0.0], [4.0, 0.0, 0.0, 1.0]]))
+    profile = HeightProfile(np.array([5.0, 10.0]), np.array([[1.0, 0.5, 0.0, 0.0], [4.0, 0.0, 0.0, 1.0]]))
     assert profile.at(np.array([0.0, 5.0, 7.0, 10.0, 12.0])).tolist() == [0.0, 1.0, 2.0, 4.0, 12.0]
-    assert Profile(np.zeros(0), np.zeros((0, 4))).at(np.array([1.0])).tolist() == [0.0]
+    assert HeightProfile(np.zeros(0), np.zeros((0, 4))).at(np.array([1.0])).tolist() == [0.0]
 
 
 def test_a_thinned_line_stays_within_its_tolerance() -> None:

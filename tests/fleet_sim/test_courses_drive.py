@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from gnd.fleet_sim.courses.company import car, keeping, lagging, lorry, movers_of, passing, van
-from gnd.fleet_sim.courses.course import Course
+from gnd.fleet_sim.courses.course import DrivenCourse
 from gnd.fleet_sim.courses.drive import CourseConfig, CourseDrive
 from gnd.fleet_sim.courses.faults import Faults
 from gnd.fleet_sim.courses.places import PLACES, place_of
@@ -28,7 +28,7 @@ def place():
 
 
 def course(place, **what):
-    return Course(place, lively(np.random.default_rng(2), 9.0, 140.0), **what)
+    return DrivenCourse(place, lively(np.random.default_rng(2), 9.0, 140.0), **what)
 
 
 def drive(place, seed=1, scans=SCANS, sensor="VLP-16", errors=PERFECT, **what):
@@ -262,7 +262,7 @@ def test_every_place_can_be_driven_from_end_to_end_and_is_the_same_each_time(nam
     place = place_of(name, 7)
     assert place.world == place_of(name, 7).world
     ride = cruise(np.random.default_rng(0), 6.0, min(place.lane.length_m - 2.0, 90.0))
-    simulation = CourseDrive(Course(place, ride), CourseConfig("VLP-16", 1, PERFECT, 1))
+    simulation = CourseDrive(DrivenCourse(place, ride), CourseConfig("VLP-16", 1, PERFECT, 1))
     scan = of(Scan, simulation.items())[0]
     assert len(scan.points_m) > 5000
     ends = place.world.map_of_street(np.zeros((1, 3)))

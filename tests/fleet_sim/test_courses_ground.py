@@ -7,7 +7,7 @@ from gnd.fleet_sim.courses.motion import CourseMotion
 from gnd.fleet_sim.courses.path import Path, lane, smoothed
 from gnd.fleet_sim.courses.places import place_of
 from gnd.fleet_sim.courses.ride import Ride, cruise, halting, lively
-from gnd.fleet_sim.courses.terrain import LEVEL, Ground, Profile
+from gnd.fleet_sim.courses.terrain import LEVEL, TerrainGround, TerrainProfile
 from gnd.fleet_sim.errors import DriveSimError
 from gnd.fleet_sim.raycast import Scene
 from gnd.gnd_map.se3 import T_inverse, log_so3
@@ -34,7 +34,7 @@ def heights(scene, world, places):
 
 
 def test_a_profile_climbs_as_steeply_as_it_says():
-    profile = Profile((-40.0, 30.0), (0.0, 0.08, -0.06), ease_m=10.0)
+    profile = TerrainProfile((-40.0, 30.0), (0.0, 0.08, -0.06), ease_m=10.0)
     x = np.linspace(-120.0, 120.0, 481)
     slope = np.gradient(profile.height_m(x), x)
     assert slope[x < -51] == pytest.approx(0.0, abs=1e-6)
@@ -45,9 +45,9 @@ def test_a_profile_climbs_as_steeply_as_it_says():
 
 def test_changes_of_grade_that_overlap_are_refused():
     with pytest.raises(DriveSimError, match="overlap"):
-        Profile((0.0, 5.0), (0.0, 0.08, 0.0), ease_m=10.0)
+        TerrainProfile((0.0, 5.0), (0.0, 0.08, 0.0), ease_m=10.0)
     with pytest.raises(DriveSimError, match="need 3 grades"):
-        Profile((0.0, 50.0), (0.0, 0.08))
+        TerrainProfile((0.0, 50.0), (0.0, 0.08))
 
 
 def test_rays_from_above_find_the_ground_on_the_profile(hill, hill_scene):
@@ -147,7 +147,7 @@ def test_a_ride_backwards_or_too_short_is_refused():
 
 
 def test_level_ground_is_level():
-    ground = Ground(LEVEL, 0.02)
+    ground = TerrainGround(LEVEL, 0.02)
     places = np.array([[-500.0, 0.0], [0.0, 2.0], [300.0, -4.0]])
     assert ground.height_m(places) == pytest.approx([0.0, -0.04, -0.08], abs=1e-9)
     assert ground.gradient(places)[:, 0] == pytest.approx(0.0)

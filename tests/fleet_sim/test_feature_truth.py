@@ -11,7 +11,7 @@ import pytest
 from gnd.fleet_sim import parts
 from gnd.fleet_sim.errors import EvaluationError, WorldError
 from gnd.fleet_sim.feature_files import read_feature_layers, write_feature_layers
-from gnd.fleet_sim.feature_scores import ClassScore, FeatureScore, driven, score_features, tiles_of_one_drive
+from gnd.fleet_sim.feature_scores import FeatureClassScore, FeatureScore, driven, score_features, tiles_of_one_drive
 from gnd.fleet_sim.feature_truth import FeatureTruth, TrueFeature, base_features, feature_truth, holds
 from gnd.fleet_sim.shapes import Ball, Block, Post, Shape
 from gnd.fleet_sim.street import street
@@ -279,7 +279,7 @@ def test_points_inside_solids_are_told(shape: Shape, inside: tuple[float, ...], 
 
 
 def test_scores_of_nothing_are_perfect_and_bad_tolerances_refused(small: FeatureTruth) -> None:
-    empty = ClassScore(0, 0, 0)
+    empty = FeatureClassScore(0, 0, 0)
     assert (empty.precision, empty.recall, empty.f1) == (1.0, 1.0, 1.0)
     with pytest.raises(EvaluationError, match="0"):
         score_features(small, "signs", [], tolerance_m=0.0)

@@ -17,7 +17,7 @@ from gnd.fleet_sim.roads.motion import Cruise, RoadMotion
 from gnd.fleet_sim.roads.motorway import motorway
 from gnd.fleet_sim.roads.pictures import detection_places
 from gnd.fleet_sim.roads.route import Route
-from gnd.fleet_sim.roads.sight import View
+from gnd.fleet_sim.roads.sight import CameraView
 from gnd.fleet_sim.roads.streetlights import streetlight_motorway
 from gnd.fleet_sim.roads.test_track import test_track
 from gnd.fleet_sim.roads.traffic import EMPTY, RoadTraffic, drawn_boxes, lanes_taken
@@ -238,7 +238,7 @@ def test_a_stretch_of_a_road_and_several_laps_can_be_driven(road: Route) -> None
         lambda: RoadDriveOptions(gnss_bias_m=-1.0),
         lambda: RoadDriveOptions(length_m=1.0),
         lambda: RoadTraffic(truck_spacing_m=1.0),
-        lambda: View("camera", 7.0, 80.0, 15, 1.3, 0.01),
+        lambda: CameraView("camera", 7.0, 80.0, 15, 1.3, 0.01),
         lambda: drive_route(test_track(11), -1),
         lambda: drive_route(motorway(11, length_m=5000.0), 1, RoadDriveOptions(start_m=4000.0, length_m=1001.0)),
         lambda: drive_route(motorway(11, length_m=5000.0), 1, RoadDriveOptions(start_m=5000.0)),

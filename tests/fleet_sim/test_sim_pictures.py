@@ -7,7 +7,7 @@ from matplotlib.image import imread
 
 from gnd.fleet_sim.ellipsoids import Ellipsoids, ellipsoids_of_maps, ellipsoids_of_truth
 from gnd.fleet_sim.errors import SimError
-from gnd.fleet_sim.pictures import View, draw_map, draw_run
+from gnd.fleet_sim.pictures import StreetView, draw_map, draw_run
 from gnd.fleet_sim.truth import Truth
 from gnd.fleet_sim.world import World
 from gnd.gnd_map.classes import CLASS_COLOURS, ChangeClass
@@ -62,19 +62,19 @@ def test_ellipsoids_of_two_maps_carry_what_became_of_each_voxel(edited: Truth) -
 
 
 def test_a_long_street_is_drawn_in_rows_that_join(edited: Truth, tmp_path: Path) -> None:
-    view = View((3.0, -2.0, 30.0), 0.5, 200.0, 0.0)
+    view = StreetView((3.0, -2.0, 30.0), 0.5, 200.0, 0.0)
     rows = view.rows()
     assert [row.half_length_m for row in rows] == [100.0, 100.0]
     places = (np.array([row.origin_m for row in rows]) - np.array(view.origin_m)) @ view.R_view_map.T
     np.testing.assert_allclose(places, [[-100.0, 0.0, 0.0], [100.0, 0.0, 0.0]], atol=1e-9)
     draw_map(ellipsoids_of_truth(edited), tmp_path / "long.png", "Long", view=view)
     assert imread(tmp_path / "long.png").shape[:2] == (1675, 1890)
-    assert [row.half_length_m for row in View((0.0, 0.0, 0.0), 0.0, 500.0, 0.0).rows()] == [125.0] * 4
+    assert [row.half_length_m for row in StreetView((0.0, 0.0, 0.0), 0.0, 500.0, 0.0).rows()] == [125.0] * 4
 
 
 def test_an_empty_map_can_be_drawn(tmp_path: Path) -> None:
     nothing = Ellipsoids.joined([])
-    draw_map(nothing, tmp_path / "empty.png", "Nothing", view=View.around(nothing))
+    draw_map(nothing, tmp_path / "empty.png", "Nothing", view=StreetView.around(nothing))
     assert (tmp_path / "empty.png").stat().st_size > 1000
 
 

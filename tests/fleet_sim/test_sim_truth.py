@@ -19,7 +19,7 @@ from gnd.fleet_sim.dense_scan import (
     KNOWN_BEFORE,
     STANDS_AFTER,
     DenseScan,
-    Window,
+    DenseWindow,
     _mark,
     _pass,
     _shell,
@@ -180,7 +180,7 @@ def _keys(g: np.ndarray) -> np.ndarray:
 
 # Plain twins of the counting kernels, on random cells.
 
-WINDOW = Window(100, 200, -5, 4, 5, 3)
+WINDOW = DenseWindow(100, 200, -5, 4, 5, 3)
 
 
 def random_cells(seed: int) -> tuple[np.ndarray, np.ndarray, dict[tuple[int, int, int], int]]:

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from gnd.fleet_sim.cars import SLOT_M, parked_cars
-from gnd.fleet_sim.errors import DriveSimError, ShapeError, WorldError
+from gnd.fleet_sim.errors import DriveSimError, SimShapeError, WorldError
 from gnd.fleet_sim.shapes import Ball, Block, Post
 from gnd.fleet_sim.street import street
 from gnd.fleet_sim.world import World, from_json, read_world, to_json, write_world
@@ -118,7 +118,7 @@ def test_a_negative_seed_and_an_unknown_state_are_refused(street_1: World) -> No
     ],
 )
 def test_impossible_shapes_are_refused(make: object) -> None:
-    with pytest.raises(ShapeError):
+    with pytest.raises(SimShapeError):
         make()  # type: ignore[operator]
 
 

@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from gnd.gnd_map.errors import CodecError, TrackError
 from gnd.gnd_map.geodesy import LocalFrame
 from gnd.gnd_map.tile_id import LON_TILES, District, TileId
-from gnd.gnd_map.track import MAX_TRACK_BYTES, Piece, Track, View, decode_track, encode_track
+from gnd.gnd_map.track import MAX_TRACK_BYTES, Track, TrackPiece, TrackView, decode_track, encode_track
 from gnd.gnd_map.track_builder import TrackBuilder
 
 DISTRICT = TileId(497353963154).district
@@ -21,11 +21,11 @@ GOLDEN = "c4ccdcecfc0c1c2c3cffff3b32028a030380058010b8019001001f0010000101f00300
 
 
 def view(**changes):
-    return View(**{"levels": LEVELS, "rays_log2": 59, "range_m": 50, **changes})
+    return TrackView(**{"levels": LEVELS, "rays_log2": 59, "range_m": 50, **changes})
 
 
 def track_of(*pieces, district=DISTRICT):
-    return Track(district, view(), tuple(Piece(np.array(v, np.int32).reshape(-1, 3), n) for v, n in pieces))
+    return Track(district, view(), tuple(TrackPiece(np.array(v, np.int32).reshape(-1, 3), n) for v, n in pieces))
 
 
 ROAD = track_of(([(320, 1024, 92), (392, 1024, 76), (392, 1032, 76)], 394), ([(640, 1032, 76)], 1))
@@ -34,7 +34,7 @@ vertices = st.lists(
     st.tuples(st.integers(-1024, 3072), st.integers(-1024, 3072), st.integers(-2000, 20000)), min_size=1, max_size=20
 )
 views = st.builds(
-    View,
+    TrackView,
     levels=st.lists(st.integers(-128, 127), min_size=9, max_size=9).map(lambda x: tuple(sorted(x))),
     sectors=st.integers(1, 0xFFFF),
     rays_log2=st.integers(0, 96),
@@ -44,7 +44,7 @@ views = st.builds(
 
 @given(views, st.lists(st.tuples(vertices, st.integers(1, 1_000_000)), max_size=6))
 def test_what_goes_in_comes_out(seen, pieces):
-    track = Track(DISTRICT, seen, tuple(Piece(np.array(v, np.int32).reshape(-1, 3), n) for v, n in pieces))
+    track = Track(DISTRICT, seen, tuple(TrackPiece(np.array(v, np.int32).reshape(-1, 3), n) for v, n in pieces))
     assert decode_track(DISTRICT, encode_track(track)) == track
 
 

@@ -16,9 +16,20 @@ from gnd.gnd_map.codec import Flags
 from gnd.gnd_map.errors import TrackError
 from gnd.gnd_map.gaussian import Gaussians, full_matrices, six_entries
 from gnd.gnd_map.grid import VoxelGrid
-from gnd.gnd_map.sight import NO_SLOT, NOTHING, STOP, Columns, Window, cast_fans, fill, lay_out, pool, voxel_ids
+from gnd.gnd_map.sight import (
+    NO_SLOT,
+    NOTHING,
+    STOP,
+    SightColumns,
+    SightWindow,
+    cast_fans,
+    fill,
+    lay_out,
+    pool,
+    voxel_ids,
+)
 from gnd.gnd_map.tile_id import TileId
-from gnd.gnd_map.track import Piece, Track, View
+from gnd.gnd_map.track import Track, TrackPiece, TrackView
 from gnd.gnd_map.visibility import observed_along
 
 COLUMNS, TILES_ALONG, FLOORS = (4, 5), (2, 2), 6
@@ -31,7 +42,7 @@ def small_window(low):
     slot_of = np.array([[0, 1], [NO_SLOT, 2]], np.int32)
     corner = np.array([(0, 0), (0, 5), (4, 5)], np.int32)
     offset = np.arange(4) * 20 * FLOORS
-    return Window(
+    return SightWindow(
         COLUMNS, METRES, slot_of, corner, offset, np.array(low, np.int32), np.full(3, FLOORS, np.int32), min(low)
     )
 
@@ -114,7 +125,7 @@ def test_the_kernel_sees_what_the_plain_twin_sees(seed):
     plain_fans(w, place, turn, rays, azimuth, slope, 4, solid, plain_state, plain_hits)
     cast_fans(
         w, place, turn, rays, azimuth, slope, 4, stop, filled, R2, RANGE_M, REACH_M, LEVEL, state, hits,
-        Columns.room(), np.empty(2),
+        SightColumns.room(), np.empty(2),
     )  # fmt: skip
     np.testing.assert_array_equal(hits, plain_hits)
     np.testing.assert_array_equal(state, plain_state)
@@ -171,7 +182,7 @@ GRID = VoxelGrid.of(WEST)
 GROUND, WALL_ROW, HIGH = 20, 24, 5
 FLAT = (0.28, 0.28, 0.01)
 UPRIGHT = (0.42, 0.01, 0.42)  # wider than points of a voxel spread, so that no line slips through where four meet
-SEEN = View((-60, -52, -36, -20, -4, 12, 28, 44, 60), rays_log2=59, range_m=60)
+SEEN = TrackView((-60, -52, -36, -20, -4, 12, 28, 44, 60), rays_log2=59, range_m=60)
 
 
 def voxel(ix, iy, floor):
@@ -193,7 +204,7 @@ STREET = gaussians(
 )
 # 2 m over the ground, along row 12 through both tiles
 PATH = [(64 * (TILES[k].lon_index % 32) + 8 + 48 * k, 64 * (WEST.lat_index % 32) + 20, 45) for k in range(2)]
-DRIVE = Track(WEST.district, SEEN, (Piece(np.array(PATH, np.int32), 60),))
+DRIVE = Track(WEST.district, SEEN, (TrackPiece(np.array(PATH, np.int32), 60),))
 
 
 def told(*flagged, tile=WEST, base=STREET):
@@ -251,7 +262,7 @@ def test_next_to_changes_more_rays_are_needed(monkeypatch):
 
 
 def test_a_sensor_that_looks_ahead_only_does_not_see_what_it_starts_beside():
-    narrow = View(SEEN.levels, 0b1000000000000001, SEEN.rays_log2, SEEN.range_m)
+    narrow = TrackView(SEEN.levels, 0b1000000000000001, SEEN.rays_log2, SEEN.range_m)
     start = voxel(4, 20, GROUND)  # beside the start of the drive, which goes east
     assert start in seen()
     assert start not in seen(Track(WEST.district, narrow, DRIVE.pieces))
@@ -273,7 +284,7 @@ def test_what_lies_under_the_ground_is_not_observed_though_lines_slip_through_it
 
 
 def test_a_standing_vehicle_sees_and_a_track_without_scans_sees_nothing():
-    stands = Track(WEST.district, SEEN, (Piece(np.array(PATH[:1], np.int32), 60),))
+    stands = Track(WEST.district, SEEN, (TrackPiece(np.array(PATH[:1], np.int32), 60),))
     assert len(seen(stands)) > 200
     assert seen(Track(WEST.district, SEEN, ())) == set()
 
@@ -295,7 +306,7 @@ def test_tiles_of_two_latitude_zones_are_looked_at_apart():
     pair = [TileId.from_indices(WEST.lon_index, lat - 1), TileId.from_indices(WEST.lon_index, lat)]
     corner = TileId(pair[0].district.first_morton)
     path = [((pair[0].lon_index - corner.lon_index) * 64 + 20 + k, (lat - corner.lat_index) * 64, 45) for k in (0, 20)]
-    track = Track(pair[0].district, SEEN, (Piece(np.array(path, np.int32), 40),))
+    track = Track(pair[0].district, SEEN, (TrackPiece(np.array(path, np.int32), 40),))
     found = observed_along(track, [told(tile=tile, base=Gaussians.empty()) for tile in pair])
     assert min(len(found[tile]) for tile in pair) > 200
 
@@ -304,7 +315,7 @@ def test_a_track_that_jumps_by_kilometres_is_refused_before_it_takes_memory():
     corner = TileId(WEST.district.first_morton)
     tiles = [TileId.from_indices(corner.lon_index + i, corner.lat_index + j) for i in range(32) for j in range(32)]
     spots = itertools.product(range(2, 32, 4), repeat=2)
-    pieces = [Piece(np.array([[64 * i, 64 * j, 18_000 * (i % 8 == 2)]], np.int32), 9) for i, j in spots]
+    pieces = [TrackPiece(np.array([[64 * i, 64 * j, 18_000 * (i % 8 == 2)]], np.int32), 9) for i, j in spots]
     empty = [told(tile=tile, base=Gaussians.empty()) for tile in sorted(tiles)]
     with pytest.raises(TrackError, match=r"between floors -\d+ and 90\d\d cross .* at most"):
         observed_along(Track(WEST.district, SEEN, tuple(pieces)), empty)

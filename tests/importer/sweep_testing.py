@@ -11,7 +11,7 @@ from gnd.gnd_map.motion import Trajectory, deskew
 from gnd.gnd_map.se3 import T_inverse, transform
 from gnd.schemas.drive import Scan
 from gnd.schemas.drive_mcap import load_track, read_drive, read_header
-from gnd.vehicle_agent.importers.recording import Anchor, Recording
+from gnd.vehicle_agent.importers.recording import Recording, RecordingAnchor
 
 
 def drive_of(path: Path, sensor: str = "VLP-16", seed: int = 2, scans: int = 40, world: int = 1) -> Path:
@@ -31,7 +31,9 @@ def truth_of(path: Path) -> Trajectory:
 def recording_of(path: Path, change: Callable[[Scan], Scan], **said) -> Recording:
     """The scans of a drive, changed, and nothing else of it; `said` joins what the recording says."""
     header, scans = read_header(path), [change(scan) for scan in scans_of(path)]
-    anchor = Anchor(np.degrees(header.anchor.lat_rad), np.degrees(header.anchor.lon_rad), header.anchor.height_m)
+    anchor = RecordingAnchor(
+        np.degrees(header.anchor.lat_rad), np.degrees(header.anchor.lon_rad), header.anchor.height_m
+    )
     t_ns = np.array([scan.t_ns for scan in scans])
     mount = said.pop("T_vehicle_lidar", header.T_vehicle_lidar)
     return Recording(path.stem, header.sensor_model, "", mount, t_ns, scans.__getitem__, anchor, **said)

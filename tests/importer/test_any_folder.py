@@ -28,9 +28,9 @@ from gnd.vehicle_agent.importer_cli import import_drives
 from gnd.vehicle_agent.importers.detect_format import format_of
 from gnd.vehicle_agent.importers.fields import offsets_ns
 from gnd.vehicle_agent.importers.point_cloud2 import decode_cloud
-from gnd.vehicle_agent.importers.recording import Anchor
+from gnd.vehicle_agent.importers.recording import RecordingAnchor
 
-ANCHOR = Anchor(37.56, 127.03, 30.0)
+ANCHOR = RecordingAnchor(37.56, 127.03, 30.0)
 START = 1_700_000_000 * SECOND
 FEW = scan_of(0, 50).astype(np.float32)
 

@@ -14,13 +14,15 @@ from gnd.schemas.drive import Scan
 from gnd.schemas.drive_mcap import load_track, read_drive, read_header
 from gnd.vehicle_agent.importer import no_progress
 from gnd.vehicle_agent.importers.lidar_odometry import _lies_as_a_line, lidar_odometry
-from gnd.vehicle_agent.importers.recording import Anchor, Recording
+from gnd.vehicle_agent.importers.recording import Recording, RecordingAnchor
 
 
 def recording_of(path: Path) -> Recording:
     """The scans of a drive, and nothing else of it."""
     header, scans = read_header(path), [item for item in read_drive(path) if isinstance(item, Scan)]
-    anchor = Anchor(np.degrees(header.anchor.lat_rad), np.degrees(header.anchor.lon_rad), header.anchor.height_m)
+    anchor = RecordingAnchor(
+        np.degrees(header.anchor.lat_rad), np.degrees(header.anchor.lon_rad), header.anchor.height_m
+    )
     t_ns = np.array([scan.t_ns for scan in scans])
     return Recording(path.stem, header.sensor_model, "", header.T_vehicle_lidar, t_ns, scans.__getitem__, anchor)
 

@@ -16,10 +16,10 @@ from gnd.schemas.drive_mcap import drive_counts, load_track, read_drive, read_he
 from gnd.vehicle_agent.errors import ImportDriveError
 from gnd.vehicle_agent.importer import fit_heading_and_position, import_recording, open_recording
 from gnd.vehicle_agent.importer_cli import import_drives
-from gnd.vehicle_agent.importers.recording import Anchor
+from gnd.vehicle_agent.importers.recording import RecordingAnchor
 from gnd.vehicle_agent.importers.splits import chosen_scans
 
-ANCHOR = Anchor(37.56, 127.03, 30.0)
+ANCHOR = RecordingAnchor(37.56, 127.03, 30.0)
 
 
 def scans_of(path: Path) -> list[Scan]:
@@ -288,7 +288,7 @@ def test_command_line_refuses_an_anchor_that_is_none(kitti_folder, tmp_path, anc
 
 def test_real_pcd_folder(shared_data, tmp_path):
     import_recording(
-        "pcd", shared_data / "apollo_ndt" / "pcds", tmp_path / "a.mcap", anchor=Anchor(37.41, -122.0, -30.0)
+        "pcd", shared_data / "apollo_ndt" / "pcds", tmp_path / "a.mcap", anchor=RecordingAnchor(37.41, -122.0, -30.0)
     )
     reference = load_track(tmp_path / "a.mcap").reference
     assert np.linalg.norm(reference.T_map_vehicle[1, :3, 3]) == pytest.approx(0.803, abs=0.001)

@@ -11,7 +11,14 @@ from gnd.gnd_map.se3 import T_from_R_t, exp_so3, log_so3
 from gnd.schemas.drive import Scan
 from gnd.schemas.drive_mcap import read_header
 from gnd.vehicle_agent.importer import prepared
-from gnd.vehicle_agent.importers.mount import GroundSeen, Refused, YawSeen, ground_of, ground_of_scans, yaw_of_track
+from gnd.vehicle_agent.importers.mount import (
+    GroundSeen,
+    MountRefused,
+    YawSeen,
+    ground_of,
+    ground_of_scans,
+    yaw_of_track,
+)
 from gnd.vehicle_agent.importers.mounting import angles_of, levelled, with_mount
 
 
@@ -77,7 +84,7 @@ def test_yaw_is_refused_where_nothing_tells_it():
     rng = np.random.default_rng(1)
     sliding = way_of(60)
     sliding[:, 1, 3] += np.cumsum(rng.normal(0, 0.5, 60))
-    assert isinstance(yaw_of_track(sliding), Refused)
+    assert isinstance(yaw_of_track(sliding), MountRefused)
 
 
 def plane(height_m, normal, n=6000, reach_m=12.0, seed=0):
@@ -110,14 +117,14 @@ def test_ground_of_one_scan_among_roofs_and_walls():
 )
 def test_no_ground_is_refused(points, reason):
     seen = ground_of(points)
-    assert isinstance(seen, Refused)
+    assert isinstance(seen, MountRefused)
     assert reason in seen.reason
 
 
 def test_scans_that_disagree_are_refused():
     seen = [GroundSeen(height, 0.0, 0.0) for height in (1.0, 1.4, 1.8, 2.2, 2.6, 3.0)]
     assert "agree" in ground_of_scans(seen).reason
-    assert "1 of 2 scans" in ground_of_scans([seen[0], Refused("nothing")]).reason
+    assert "1 of 2 scans" in ground_of_scans([seen[0], MountRefused("nothing")]).reason
     assert ground_of_scans([GroundSeen(1.7, 0.0, 0.0)] * 5 + seen[:2]).height_m == 1.7
 
 

@@ -10,7 +10,7 @@ from gnd.schemas.drive import Scan
 from gnd.vehicle_agent.importers.deskewing import share_by_azimuth, with_times
 from gnd.vehicle_agent.importers.firing_order import firing_share
 from gnd.vehicle_agent.importers.plane_thickness import compared, thickness_of
-from gnd.vehicle_agent.importers.sweep_times import BINS, AzimuthTimes, Sweep, fit_sweep, middle_of_bins_rad
+from gnd.vehicle_agent.importers.sweep_times import BINS, AzimuthTimes, FoundSweep, fit_sweep, middle_of_bins_rad
 
 SWEEP_NS = 100_000_000
 
@@ -111,7 +111,7 @@ def test_recordings_that_give_times_keep_them(drive):
 @pytest.mark.parametrize("clockwise", [True, False])
 @pytest.mark.parametrize("begin_deg", [-180.0, -90.0, 0.0, 135.0])
 def test_a_saw_tooth_is_found_through_noise_and_gaps(begin_deg, clockwise):
-    sweep, rng = Sweep(np.radians(begin_deg), clockwise), np.random.default_rng(3)
+    sweep, rng = FoundSweep(np.radians(begin_deg), clockwise), np.random.default_rng(3)
     sigma = rng.uniform(0.02, 0.3, BINS)
     sigma[20:30] = 100.0  # nothing seen there
     tau = sweep.share(middle_of_bins_rad()) - 0.2 + sigma * rng.normal(size=BINS)
@@ -131,7 +131,7 @@ def test_no_motion_in_the_points_is_no_saw_tooth():
 def test_points_where_the_sweep_begins_have_no_time():
     azimuth = np.radians([179.0, -179.0, 170.0, 0.0]).astype(np.float32)
     points = np.column_stack([np.cos(azimuth), np.sin(azimuth), np.zeros(4)]).astype(np.float32)
-    share = share_by_azimuth(Sweep(np.pi, True))(without_times(Scan(0, points, np.zeros(4, np.uint32))))
+    share = share_by_azimuth(FoundSweep(np.pi, True))(without_times(Scan(0, points, np.zeros(4, np.uint32))))
     assert np.isnan(share[:2]).all()
     np.testing.assert_allclose(share[2:], [10 / 360, 0.5], atol=1e-3)
 

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from yard import pose
 
-from gnd.vehicle_agent.localise.arbiter import Motion, believing_neither, who_is_wrong
+from gnd.vehicle_agent.localise.arbiter import ArbitratedMotion, believing_neither, who_is_wrong
 from gnd.vehicle_agent.localise.registration import RegistrationResult
 from gnd.vehicle_agent.localise.scan_odometry import ScanStep
 
@@ -26,7 +26,9 @@ def match_at(metres, sigma_m=0.04, fit=0.95, converged=True):
 
 
 def verdict(driven_m, seen_m, *matches):
-    return who_is_wrong(BEFORE, KNOWN, Motion(forward(driven_m), SMALL), Motion(forward(seen_m), SMALL), matches)
+    return who_is_wrong(
+        BEFORE, KNOWN, ArbitratedMotion(forward(driven_m), SMALL), ArbitratedMotion(forward(seen_m), SMALL), matches
+    )
 
 
 @pytest.mark.parametrize(("driven_m", "seen_m", "wrong"), [(TRUE_M, FALSE_M, "scans"), (FALSE_M, TRUE_M, "wheels")])

@@ -5,13 +5,13 @@ import pytest
 
 from gnd.gnd_map.se3 import T_inverse, exp_so3, log_so3
 from gnd.vehicle_agent.localise import localisation_error
-from studies.clock import Recorded, brisk_drive, driven
+from studies.clock import ClockDrive, brisk_drive, driven
 
 SEED = 1207  # of no street on which anything was tuned
 
 
 @pytest.fixture(scope="module")
-def recorded(tmp_path_factory: pytest.TempPathFactory) -> Recorded:
+def recorded(tmp_path_factory: pytest.TempPathFactory) -> ClockDrive:
     return brisk_drive(SEED, "VLP-16", 130, tmp_path_factory.mktemp("clock"))
 
 

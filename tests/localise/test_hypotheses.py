@@ -5,8 +5,8 @@ import pytest
 from yard import GROUND_M, local_map_of, match_map_of, offset, pose, rectangle, seen_from
 
 from gnd.gnd_map.se3 import T_inverse, transform
-from gnd.vehicle_agent.localise.first_pose import FirstPose, Place
-from gnd.vehicle_agent.localise.hypotheses import Hypotheses
+from gnd.vehicle_agent.localise.first_pose import FirstPose, SearchPlace
+from gnd.vehicle_agent.localise.hypotheses import PoseHypotheses
 from gnd.vehicle_agent.localise.initialise import Around, probabilities, search
 from gnd.vehicle_agent.localise.match_map import MatchMapCache
 from gnd.vehicle_agent.localise.parameters import InitialiseParameters, LocaliserParameters, RegistrationParameters
@@ -44,7 +44,7 @@ def drive_on(scene, first_x_m, last_x_m, reach_m=12.0):
     for k, x in enumerate(np.arange(first_x_m, last_x_m, STEP_M)):
         T = pose(x, 0.0, 0.0)
         moved = pose(STEP_M if k else 0.0, 0.0, 0.0, z=0.0)
-        place = Place(T[:3, 3] + [1.0, -0.8, 0.0], 2.5, 4.0)
+        place = SearchPlace(T[:3, 3] + [1.0, -0.8, 0.0], 2.5, 4.0)
         seen = seen_from(rng, points, T, 2500, reach_m=reach_m)
         answer = first.see(k * 200_000_000, seen, moved, place, maps)
         if answer is not None:
@@ -74,7 +74,7 @@ def test_standing_still_adds_no_evidence(scene):
     first, rng, T = FirstPose(LocaliserParameters()), np.random.default_rng(1), pose(0.0, 0.0, 0.0)
     for k in range(8):
         seen = seen_from(rng, points, T, 2500, reach_m=12.0)
-        assert first.see(k * 200_000_000, seen, np.eye(4), Place(T[:3, 3], 2.5, 4.0), maps) is None
+        assert first.see(k * 200_000_000, seen, np.eye(4), SearchPlace(T[:3, 3], 2.5, 4.0), maps) is None
     assert max(one.views for one in first.hypotheses._held) < 1.5
 
 
@@ -112,7 +112,7 @@ def test_poses_that_run_into_each_other_become_one(yard_map, yard_points):
     T, par = pose(3.0, -2.0, 140.0), InitialiseParameters()
     m, points = match_map_of(yard_map), seen_from(np.random.default_rng(2), yard_points, T, 2500)
     found, _ = search(points, Around(T[:3, 3], 4.0), m, par, RegistrationParameters())
-    hypotheses = Hypotheses(RegistrationParameters())
+    hypotheses = PoseHypotheses(RegistrationParameters())
     hypotheses.add(found)
     hypotheses.add(found)
     assert len(hypotheses) <= len(found)

@@ -12,7 +12,15 @@ from gnd.vehicle_agent.localise.kernels import linearise, pulls
 from gnd.vehicle_agent.localise.parameters import RegistrationParameters
 from gnd.vehicle_agent.localise.refine import WINDOW, told_by_scans
 from gnd.vehicle_agent.localise.registration import REGISTRATION_GATE_PER_SCALE, linearised
-from gnd.vehicle_agent.localise.stretch import N_SHARED, Belief, Knot, Step, log_se3, shared_of, solve_stretch
+from gnd.vehicle_agent.localise.stretch import (
+    N_SHARED,
+    Knot,
+    StretchBelief,
+    StretchStep,
+    log_se3,
+    shared_of,
+    solve_stretch,
+)
 
 PAR = RegistrationParameters()
 SCALE = 2.0
@@ -83,10 +91,10 @@ def drive(rng, points, match_map, n=16):
     steps = []
     for a, b in pairwise(truth):
         T = T_inverse(a) @ b
-        steps.append([Step(T @ small(rng, SIGMAS), np.diag(SIGMAS**2), shared_of(T, 0.1))])
+        steps.append([StretchStep(T @ small(rng, SIGMAS), np.diag(SIGMAS**2), shared_of(T, 0.1))])
     knots = [Knot(seen_from(rng, points, T, 800), T @ small(rng, 2 * SIGMAS), 0.25) for T in truth]
     sigmas = np.concatenate([[0.02] * 3, [0.3] * 3, [3e-3, 0.01, 0.01, 0.01]])
-    belief = Belief(truth[0], np.array([0.0, 1.0, 0.0, 0.0]), np.diag(sigmas**-2.0), np.zeros(6 + N_SHARED))
+    belief = StretchBelief(truth[0], np.array([0.0, 1.0, 0.0, 0.0]), np.diag(sigmas**-2.0), np.zeros(6 + N_SHARED))
     solved = solve_stretch(knots, steps, belief, match_map, PAR, (2.0, 1.5))
     off = log_se3(T_inverse(truth[n // 2]) @ knots[n // 2].T_map_vehicle)[[2, 3, 4]]
     grown = np.sqrt(1.0 + (solved.seen - 1.0) * solved.matched)
@@ -126,8 +134,8 @@ def driven_and_seen(rng, worse, n=40):
     steps = []
     for k in range(n):
         T = T_inverse(through(k)) @ through(k + 1)
-        driven = Step(T @ small(rng, worse * SIGMAS), np.diag(SIGMAS**2), shared_of(T, 0.1))
-        seen = Step(T @ small(rng, 0.3 * SIGMAS), np.diag((0.3 * SIGMAS) ** 2), np.zeros((6, N_SHARED)))
+        driven = StretchStep(T @ small(rng, worse * SIGMAS), np.diag(SIGMAS**2), shared_of(T, 0.1))
+        seen = StretchStep(T @ small(rng, 0.3 * SIGMAS), np.diag((0.3 * SIGMAS) ** 2), np.zeros((6, N_SHARED)))
         steps.append([driven, seen])
     return steps
 

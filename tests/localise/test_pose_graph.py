@@ -4,7 +4,7 @@ import gtsam
 import numpy as np
 
 from gnd.gnd_map.se3 import exp_so3
-from gnd.vehicle_agent.localise.graph import GRAPH_ROBUST_K, MapMatch, Odometry, PoseGraph, Position
+from gnd.vehicle_agent.localise.graph import GRAPH_ROBUST_K, MapMatch, OdometryEdge, PoseGraph, Position
 from gnd.vehicle_agent.localise.parameters import GraphParameters
 
 STEP_NS = 100_000_000
@@ -36,7 +36,7 @@ def run(n=60, matched=lambda k: True, match=None, gnss=None, lag_s=2.0, seed=0):
     for k in range(n):
         T_match = noisy(rng, true_pose(k)) if match is None else match(k, noisy(rng, true_pose(k)))
         start = true_pose(0) if k == 0 else graph.pose(graph.newest) @ step(k)
-        odometry = None if k == 0 else Odometry(step(k), SIGMAS)
+        odometry = None if k == 0 else OdometryEdge(step(k), SIGMAS)
         found = MapMatch(T_match, MATCH_COVARIANCE) if matched(k) else None
         final += graph.add(k * STEP_NS, start, odometry, found, None if gnss is None else gnss(k))
         assert len(graph) <= lag_s * 10 + 1

@@ -16,9 +16,9 @@ from gnd.vehicle_agent.localise.stretch import (
     LEFT,
     N_SHARED,
     SCALE,
-    Belief,
     Knot,
-    Step,
+    StretchBelief,
+    StretchStep,
     log_se3,
     marginalised,
     shared_of,
@@ -53,7 +53,7 @@ def through(k, step_m=1.0):
 
 def belief_at(T, sigma_m=0.3, sigma_rad=0.02):
     sigmas = np.concatenate([[sigma_rad] * 3, [sigma_m] * 3, SHARED_SIGMAS])
-    return Belief(T, np.array([0.0, 1.0, 0.0, 0.0]), np.diag(sigmas**-2.0), np.zeros(6 + N_SHARED))
+    return StretchBelief(T, np.array([0.0, 1.0, 0.0, 0.0]), np.diag(sigmas**-2.0), np.zeros(6 + N_SHARED))
 
 
 def problem(rng, n=12, grown=1.0, shared=(0.0,) * N_SHARED, points=None):
@@ -65,7 +65,7 @@ def problem(rng, n=12, grown=1.0, shared=(0.0,) * N_SHARED, points=None):
         S = shared_of(T, 0.1)
         off = S @ np.asarray(shared)
         driven = T @ T_inverse(T_from_R_t(exp_so3(off[:3]), off[3:])) @ small(rng, grown * SIGMAS)
-        steps.append([Step(driven, np.diag(SIGMAS**2), S)])
+        steps.append([StretchStep(driven, np.diag(SIGMAS**2), S)])
     empty = np.zeros((0, 3))
     knots = [
         Knot(empty if points is None else seen_from(rng, points, T, 800), T @ small(rng, 2 * SIGMAS), 0.25)
@@ -96,8 +96,10 @@ def test_odometry_alone_is_what_gtsam_says(nothing):
     _, knots, steps = problem(rng)
     for k, measured in enumerate(steps):
         T = measured[0].T_before_now @ small(rng, (10.0 if k % 4 == 0 else 2.0) * SIGMAS)
-        measured.append(Step(T, np.diag((2.0 * SIGMAS) ** 2), np.zeros((6, N_SHARED))))
-    fixed = [[Step(s.T_before_now, s.covariance, np.zeros((6, N_SHARED))) for s in measured] for measured in steps]
+        measured.append(StretchStep(T, np.diag((2.0 * SIGMAS) ** 2), np.zeros((6, N_SHARED))))
+    fixed = [
+        [StretchStep(s.T_before_now, s.covariance, np.zeros((6, N_SHARED))) for s in measured] for measured in steps
+    ]
     belief = belief_at(through(0))
     expected = gtsam_solution(knots, fixed, belief)
     solve_stretch(knots, fixed, belief, nothing, PAR, SCALES, max_iterations=50)
@@ -141,7 +143,9 @@ def test_odometry_that_is_worse_than_it_claims_is_found_out(yard, yard_points, g
         for _ in range(3):  # at the fixed point, as the refiner does
             variance = np.ones(6) if not redundancy.any() else np.maximum(squares / redundancy, 1.0)
             scale = np.sqrt(variance)
-            told = [[Step(s.T_before_now, scale[:, None] * s.covariance * scale, s.shared) for s in m] for m in steps]
+            told = [
+                [StretchStep(s.T_before_now, scale[:, None] * s.covariance * scale, s.shared) for s in m] for m in steps
+            ]
             solved = solve_stretch(knots, told, belief_at(through(0)), yard, PAR, SCALES)
             squares, redundancy = (
                 0.7 * squares + solved.step_squares * variance,
@@ -170,7 +174,7 @@ def test_a_step_that_slipped_does_not_bend_the_stretch(yard, yard_points):
     slipped = steps[8][0]
     T = slipped.T_before_now.copy()
     T[0, 3] += 0.5
-    steps[8][0] = Step(T, slipped.covariance, slipped.shared)
+    steps[8][0] = StretchStep(T, slipped.covariance, slipped.shared)
     solve_stretch(knots, steps, belief_at(through(0)), yard, PAR, (8.0, 4.0, *SCALES))
     off = [np.linalg.norm((T_inverse(a) @ knot.T_map_vehicle)[:2, 3]) for a, knot in zip(truth, knots, strict=True)]
     assert max(off) < 0.05

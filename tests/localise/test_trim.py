@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from gnd.vehicle_agent.localise.calibration import MAX_TRIM_RAD, MotionTeacher
-from gnd.vehicle_agent.localise.drift import Drift, Slope
+from gnd.vehicle_agent.localise.drift import PoseDrift, Slope
 from gnd.vehicle_agent.localise.health import HEALTH_GNSS_COUNT, HealthMonitor
 from gnd.vehicle_agent.localise.odometry import MotionBuffer
 from gnd.vehicle_agent.localise.parameters import HealthParameters, OdometryParameters
@@ -16,7 +16,7 @@ def teacher_told(left, sigma=SURE, way_m=1000.0):
     teacher, way = MotionTeacher(MotionBuffer(), OdometryParameters()), np.eye(4)
     way[0, 3] = way_m
     teacher.see_step(0, 1, way, None)
-    teacher.correct(Drift(NOTHING, NOTHING, Slope(left, sigma), Slope(0.0, sigma)), overlap=1.0)
+    teacher.correct(PoseDrift(NOTHING, NOTHING, Slope(left, sigma), Slope(0.0, sigma)), overlap=1.0)
     return teacher
 
 

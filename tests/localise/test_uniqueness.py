@@ -7,7 +7,7 @@ from yard import FRAME, GROUND_M, corridor, local_map_of, match_map_of, pose, re
 from gnd.gnd_map.gaussian import full_matrices
 from gnd.schemas.drive import GnssFix, MotionSample, Scan
 from gnd.vehicle_agent.localise import Localiser
-from gnd.vehicle_agent.localise.first_pose import Place
+from gnd.vehicle_agent.localise.first_pose import SearchPlace
 from gnd.vehicle_agent.localise.health import HealthMonitor
 from gnd.vehicle_agent.localise.match_map import MatchMapCache
 from gnd.vehicle_agent.localise.parameters import (
@@ -18,7 +18,7 @@ from gnd.vehicle_agent.localise.parameters import (
 )
 from gnd.vehicle_agent.localise.registration import REGISTRATION_GATE_PER_SCALE
 from gnd.vehicle_agent.localise.scan_pool import standing_points
-from gnd.vehicle_agent.localise.uniqueness import Uniqueness, View, ahead, ahead_of_both, fits_at, patches_of
+from gnd.vehicle_agent.localise.uniqueness import ScanView, Uniqueness, ahead, ahead_of_both, fits_at, patches_of
 
 PERIOD_M = 5.0
 ODD_FROM_M = 40.0
@@ -58,7 +58,7 @@ def drive_beside(scene, off_m, last_x_m, parameters=None):
     for k, x in enumerate(np.arange(0.0, last_x_m, STEP_M)):
         seen = standing_points(seen_from(rng, points, pose(x, 0.0, 0.0), 2500, REACH_M), 0.4)
         moved = pose(STEP_M if k else 0.0, 0.0, 0.0, z=0.0)
-        place = Place(np.array([x + 2.0, -1.0, 0.0]), 2.5, 7.5)
+        place = SearchPlace(np.array([x + 2.0, -1.0, 0.0]), 2.5, 7.5)
         unique.see(seen, moved, pose(x + off_m, 0.0, 0.0), place, maps.near(np.array([x, 0.0, 0.0])))
         told.append((x, unique.proven, unique.margin, unique.beaten, unique.untold_m))
     return told
@@ -171,7 +171,7 @@ def plain_fit(q, m, scale2, gate_m2):
 
 
 def test_the_view_forgets_what_is_far_behind_and_keeps_height_and_tilt_of_the_track():
-    view = View(5.0, 1.0, 100)
+    view = ScanView(5.0, 1.0, 100)
     for x in range(12):
         tilted = pose(float(x), 0.0, 3.0 * (x == 11), pitch_deg=2.0, z=0.1 * x)
         view.push(np.array([[2.0, 0.0, 1.0]]), pose(1.0, 0.0, 0.0, z=0.0), tilted)
@@ -183,7 +183,7 @@ def test_the_view_forgets_what_is_far_behind_and_keeps_height_and_tilt_of_the_tr
 
 
 def test_gnss_over_the_way_rules_out_the_opposite_heading():
-    view = View(25.0, 1.0, 100)
+    view = ScanView(25.0, 1.0, 100)
     for x in range(20):
         view.push(np.zeros((1, 3)), pose(1.0, 0, 0, z=0.0), pose(float(x), 0, 0))
         view.see_position(np.array([x + 3.0, 1.0, 0.0]), 7.5)

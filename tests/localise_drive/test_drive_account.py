@@ -23,11 +23,11 @@ from gnd.vehicle_agent.localise.estimates import Health, PoseEstimate, localisat
 from gnd.vehicle_agent.localise_drive.account import health_json, print_account, summary
 from gnd.vehicle_agent.localise_drive.accuracy import error_series, error_summary
 from gnd.vehicle_agent.localise_drive.geo import geojson_text
-from gnd.vehicle_agent.localise_drive.map_picture import View, nice_m
+from gnd.vehicle_agent.localise_drive.map_picture import PictureView, nice_m
 from gnd.vehicle_agent.localise_drive.map_raster import GROUND, OTHER, WALL, MapRaster, disc, kinds_of
 from gnd.vehicle_agent.localise_drive.outputs import position_cov_m2
 from gnd.vehicle_agent.localise_drive.pictures import draw_pictures
-from gnd.vehicle_agent.localise_drive.run import Counts, LocalisedDrive, Moment
+from gnd.vehicle_agent.localise_drive.run import DriveTotals, LocalisedDrive, Moment
 from gnd.vehicle_agent.localise_drive.stretches import stretches_of
 
 T0_NS = 1_700_000_000_000_000_000
@@ -63,7 +63,7 @@ def drive(healths: list[Health], **values: Any) -> LocalisedDrive:
         "gnss": GnssTrack(t_ns, *fixes, np.full(len(true), 2.5)),
         "used": {TILE: 1},
         "absent": frozenset(),
-        "counts": Counts(len(healths), {}, healths.count("lost"), 2, 1.001, 0.002, 1.0, finished=True),
+        "counts": DriveTotals(len(healths), {}, healths.count("lost"), 2, 1.001, 0.002, 1.0, finished=True),
     }
     return LocalisedDrive(**(known | values))
 
@@ -165,7 +165,9 @@ def test_a_drive_that_never_finds_its_pose_is_told_and_drawn(tmp_path: Path) -> 
 
 
 def test_without_a_single_scan_there_is_still_an_account(tmp_path: Path) -> None:
-    made = drive(["good"], moments=(), refined=(), online=(), counts=Counts(0, {}, 0, 0, 1.0, 0.0, 0.1, finished=False))
+    made = drive(
+        ["good"], moments=(), refined=(), online=(), counts=DriveTotals(0, {}, 0, 0, 1.0, 0.0, 0.1, finished=False)
+    )
     assert summary(made)["localised_share"] == 0.0
     assert health_json(made)["stretches"] == []
     assert len(draw_pictures(made, OneTile(), tmp_path)) == 2
@@ -219,7 +221,7 @@ def test_a_disc_is_even() -> None:
 
 def test_a_view_lays_the_drive_to_the_right_and_keeps_all_of_it() -> None:
     north = np.stack([np.zeros(50), np.linspace(0, 400, 50)], axis=1)
-    view = View.around(north)
+    view = PictureView.around(north)
     at = north @ view.R_view_map.T
     assert np.ptp(at[:, 0]) == pytest.approx(400)
     assert (at >= view.low_m).all()

@@ -15,7 +15,7 @@ from gnd.schemas.drive_mcap import DriveWriter, read_drive, read_header
 from gnd.tile_store.build import build_map
 from gnd.tile_store.sqlite_store import SqliteStore
 from gnd.vehicle_agent.importer import open_recording, prepared, write_drive
-from gnd.vehicle_agent.importers.recording import Anchor, Recording
+from gnd.vehicle_agent.importers.recording import Recording, RecordingAnchor
 from gnd.vehicle_agent.localise_drive.account import print_account, summary
 from gnd.vehicle_agent.localise_drive.run import LocalisedDrive, localise_drive
 from gnd.vehicle_agent.localise_drive.tiles import StoreMap
@@ -39,7 +39,7 @@ def imported(shared_data: Path, tmp_path_factory: pytest.TempPathFactory) -> tup
     """(drive of the odd scans, store with a map of the even ones) of 40 scans of KITTI raw 0027."""
     out = tmp_path_factory.mktemp("mount")
     folder = pcd_folder(open_recording("auto", shared_data / "kitti_raw_0027"), 100, 140, out / "pcds")
-    recording, track = prepared(open_recording("pcd", folder, Anchor(49.0, 8.4, 110.0)))
+    recording, track = prepared(open_recording("pcd", folder, RecordingAnchor(49.0, 8.4, 110.0)))
     assert any("mount estimated from the scans: LiDAR 1.7" in note for note in recording.notes)
     for half in ("even", "odd"):
         write_drive(recording, track, out / f"{half}.mcap", half)

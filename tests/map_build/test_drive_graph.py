@@ -6,10 +6,10 @@ import pytest
 from gnd.gnd_map.motion import Trajectory
 from gnd.gnd_map.se3 import T_from_R_t, T_inverse, exp_so3
 from gnd.vehicle_agent.map_build.loops import Loop
-from gnd.vehicle_agent.map_build.pose_graph import Fixes, bent, solve
+from gnd.vehicle_agent.map_build.pose_graph import GnssTies, bent, solve
 from gnd.vehicle_agent.map_build.refine_poses import drift
 
-NO_FIXES = Fixes(np.empty(0, np.int64), np.empty((0, 3)), np.empty(0))
+NO_FIXES = GnssTies(np.empty(0, np.int64), np.empty((0, 3)), np.empty(0))
 N = 60  # anchors of one round of 600 m
 
 
@@ -76,7 +76,7 @@ def test_fixes_place_a_drive_and_a_jump_of_theirs_does_not() -> None:
     at = np.arange(0, 2 * N, 2)
     p = truth[at, :3, 3] + 0.5 * rng.standard_normal((len(at), 3))
     p[10:16] += [120.0, 40.0, 0.0]
-    solved = solve(drive, T, [], Fixes(at, p, np.full(len(at), 1.0)))
+    solved = solve(drive, T, [], GnssTies(at, p, np.full(len(at), 1.0)))
     assert not solved.fixes[10:16].any()
     assert solved.fixes.sum() > 0.9 * (len(at) - 6)
     assert error_m(solved.T, truth) < 0.4 * error_m(T, truth)

@@ -26,7 +26,7 @@ from gnd.vehicle_agent.map_build.quality import Quality, measure
 from gnd.vehicle_agent.map_build.refine_poses import refine_poses
 from gnd.vehicle_agent.map_build.result import summary
 from gnd.vehicle_agent.map_build.survey import look_over
-from studies.map_build import Drift, drift_drive, relative_errors
+from studies.map_build import MapDrift, drift_drive, relative_errors
 
 SEED = 103
 PASSES = ((1, 11), (-1, 12))
@@ -40,7 +40,7 @@ def passes(tmp_path_factory: pytest.TempPathFactory) -> tuple[list[Path], list[T
     for number, (direction, seed) in enumerate(PASSES):
         config = DriveConfig("car", "VLP-16", "before", seed=seed, direction=direction, cruise_mps=12.0)
         paths.append(folder / f"{number}.mcap")
-        truths.append(drift_drive(world, config, paths[-1], Drift(start_m=0.8 * number, start_deg=0.5 * number)))
+        truths.append(drift_drive(world, config, paths[-1], MapDrift(start_m=0.8 * number, start_deg=0.5 * number)))
     return paths, truths
 
 

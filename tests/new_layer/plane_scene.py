@@ -8,8 +8,13 @@ import numpy as np
 from gnd.gnd_map.arrays import F64
 from gnd.schemas.drive import Detections, LaneLook, MotionTrack
 from gnd.vehicle_agent.features.mapping.dead_reckoning import composed, relative
-from gnd.vehicle_agent.features.mapping.feature_drive import FeatureDrive, Fixes
-from gnd.vehicle_agent.features.mapping.parameters import GnssNoise, LaneParameters, MotionNoise, NewLayerParameters
+from gnd.vehicle_agent.features.mapping.feature_drive import FeatureDrive, GnssFixes
+from gnd.vehicle_agent.features.mapping.parameters import (
+    LaneParameters,
+    MappingGnssNoise,
+    MappingMotionNoise,
+    NewLayerParameters,
+)
 
 T0_NS = 1_700_000_000_000_000_000
 
@@ -109,13 +114,13 @@ def _from_means(means: F64) -> F64:
     return values
 
 
-def fixes(truth: Truth, noise: Noise, rng: np.random.Generator) -> Fixes:
+def fixes(truth: Truth, noise: Noise, rng: np.random.Generator) -> GnssFixes:
     t_ns = truth.t_ns[::50]
     phi, error = np.exp(-1.0 / noise.tau_s), np.empty((len(t_ns), 2))
     error[0] = noise.gnss * rng.standard_normal(2)
     for n in range(1, len(t_ns)):
         error[n] = phi * error[n - 1] + noise.gnss * np.sqrt(1.0 - phi**2) * rng.standard_normal(2)
-    return Fixes(t_ns, truth.pose[::50, :2] + error + noise.white * rng.standard_normal((len(t_ns), 2)))
+    return GnssFixes(t_ns, truth.pose[::50, :2] + error + noise.white * rng.standard_normal((len(t_ns), 2)))
 
 
 def looks(
@@ -165,9 +170,9 @@ def _as_seen(at: F64, lane: F64, noise: Noise, rng: np.random.Generator) -> np.n
 def parameters(noise: Noise, rounds: int = 4) -> NewLayerParameters:
     return NewLayerParameters(
         rounds=rounds,
-        motion=MotionNoise(
+        motion=MappingMotionNoise(
             noise.scale or 1e-5, noise.wheel or 1e-3, noise.bias or 1e-6, noise.gyro or 1e-4, 1e-5, 0.0
         ),
-        gnss=GnssNoise(noise.gnss or 0.01, noise.tau_s, noise.white or 0.01),
+        gnss=MappingGnssNoise(noise.gnss or 0.01, noise.tau_s, noise.white or 0.01),
         lanes=LaneParameters(map_sigma_m=0.0),
     )  # fmt: skip

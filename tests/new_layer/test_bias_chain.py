@@ -8,7 +8,7 @@ from gnd.vehicle_agent.features.mapping.bias_chain import gauss_markov_springs
 from gnd.vehicle_agent.features.mapping.dead_reckoning import Steps
 from gnd.vehicle_agent.features.mapping.graph import solve
 from gnd.vehicle_agent.features.mapping.graph_edges import FixNodes, PoseMatches, Problem, State
-from gnd.vehicle_agent.features.mapping.parameters import GnssNoise, NewLayerParameters
+from gnd.vehicle_agent.features.mapping.parameters import MappingGnssNoise, NewLayerParameters
 
 
 def precision(t_s, sigma, tau):
@@ -48,7 +48,7 @@ def test_poses_of_a_standing_vehicle_are_the_generalised_mean_of_its_fixes():
     still = Steps(np.zeros((n - 1, 3)), np.zeros((n - 1, 3, 2)), np.broadcast_to(1e-6 * np.eye(3), (n - 1, 3, 3)))
     fixes = FixNodes(np.arange(n), t_s, xy, np.full(n, white**2))
     start = State(np.zeros((n, 3)), np.empty((0, 2)), np.zeros(2))
-    noise = NewLayerParameters(gnss=GnssNoise(sigma, tau, white, robust_k=1e6))
+    noise = NewLayerParameters(gnss=MappingGnssNoise(sigma, tau, white, robust_k=1e6))
     told = _heading_told(Problem(still, np.zeros(2), fixes))
     solution = solve(told, start, noise)
     np.testing.assert_allclose(solution.state.pose[:, :2], np.broadcast_to(expected, (n, 2)), atol=3e-3)

@@ -10,10 +10,10 @@ from gnd.gnd_map.geodesy import LocalFrame
 from gnd.schemas.drive import GnssFix, MotionSample
 from gnd.vehicle_agent.features.mapping.feature_drive import FeatureDrive
 from gnd.vehicle_agent.features.mapping.parameters import (
-    GnssNoise,
     LandmarkParameters,
     LaneParameters,
-    MotionNoise,
+    MappingGnssNoise,
+    MappingMotionNoise,
     NewLayerParameters,
 )
 
@@ -47,9 +47,9 @@ def test_looks_of_another_layer_or_sensor_are_not_taken(truth):
 @pytest.mark.parametrize(
     ("kind", "field", "value"),
     [
-        (MotionNoise, "wheel_scale", 0.0),
-        (MotionNoise, "slip_rad", -1.0),
-        (GnssNoise, "correlation_s", 0.0),
+        (MappingMotionNoise, "wheel_scale", 0.0),
+        (MappingMotionNoise, "slip_rad", -1.0),
+        (MappingGnssNoise, "correlation_s", 0.0),
         (LandmarkParameters, "robust_k", 0.0),
         (LaneParameters, "map_sigma_m", -1.0),
         (NewLayerParameters, "rounds", 0),

@@ -7,7 +7,7 @@ import pytest
 from plane_scene import PAPER, Scene, drive, parameters
 
 from gnd.schemas.drive import MotionTrack
-from gnd.vehicle_agent.features.mapping.feature_drive import Fixes
+from gnd.vehicle_agent.features.mapping.feature_drive import GnssFixes
 from gnd.vehicle_agent.features.mapping.new_layer import NewLayer, lane_map, map_new_layer
 
 SCENE = Scene(seconds=40.0, features=np.array([[20.0 * n, (8.0, -7.0)[n % 2]] for n in range(1, 19)]))
@@ -29,7 +29,7 @@ def test_a_gnss_that_jumps_contradicts_the_motion() -> None:
     """30 m beside itself for the second half: no vehicle moves so."""
     honest = drive(TRUTH, PAPER, 1)
     off = np.where(honest.fixes.t_ns > honest.fixes.t_ns[len(honest.fixes.t_ns) // 2], 30.0, 0.0)
-    jumped = replace(honest, fixes=Fixes(honest.fixes.t_ns, honest.fixes.xy_m + np.column_stack([off, -off])))
+    jumped = replace(honest, fixes=GnssFixes(honest.fixes.t_ns, honest.fixes.xy_m + np.column_stack([off, -off])))
     assert "jumps of fixes" in {one.what for one in mapped(jumped).strains}
 
 

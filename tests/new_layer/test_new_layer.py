@@ -10,7 +10,7 @@ from gnd.gnd_map.errors import ShapeError
 from gnd.schemas.drive import MotionTrack
 from gnd.vehicle_agent.errors import NewLayerError
 from gnd.vehicle_agent.features.look import MapFeatures
-from gnd.vehicle_agent.features.mapping.feature_drive import FeatureDrive, Fixes, KnownPoses, Measurements
+from gnd.vehicle_agent.features.mapping.feature_drive import FeatureDrive, GnssFixes, KnownPoses, Measurements
 from gnd.vehicle_agent.features.mapping.new_layer import lane_map, localise_with_features, map_new_layer
 
 EXACT = Noise()
@@ -160,7 +160,7 @@ def test_bad_drives_are_refused(truth):
     with pytest.raises(NewLayerError, match="looks are not in order of time: row 1"):
         replace(good, looks=good.looks[::-1])
     with pytest.raises(ShapeError, match="xy_m of fixes"):
-        Fixes(good.fixes.t_ns, good.fixes.xy_m[:-1])
+        GnssFixes(good.fixes.t_ns, good.fixes.xy_m[:-1])
     with pytest.raises(ShapeError, match="not finite"):
         replace(good, motion=good.motion._replace(speed_mps=np.full(len(truth.t_ns), np.nan)))
     with pytest.raises(ShapeError, match="range_m"):
@@ -171,20 +171,22 @@ def test_a_vehicle_that_never_moved_is_refused(truth):
     t_ns = truth.t_ns
     still = MotionTrack(t_ns, np.zeros(len(t_ns)), np.zeros(len(t_ns)))
     with pytest.raises(NewLayerError, match="never moved"):
-        map_new_layer(FeatureDrive(still, Fixes(t_ns[::50], np.zeros((17, 2)))), parameters(PAPER)).solution.pose_cov(
-            np.array([0])
-        )
+        map_new_layer(
+            FeatureDrive(still, GnssFixes(t_ns[::50], np.zeros((17, 2)))), parameters(PAPER)
+        ).solution.pose_cov(np.array([0]))
 
 
 def test_what_was_measured_outside_of_the_motion_is_not_taken(truth):
     d = drive(truth, EXACT, 0)
     late = 10_000_000_000
-    fixes_ = Fixes(np.append(d.fixes.t_ns, d.fixes.t_ns[-1] + late), np.concatenate([d.fixes.xy_m, [[999.0, 999.0]]]))
+    fixes_ = GnssFixes(
+        np.append(d.fixes.t_ns, d.fixes.t_ns[-1] + late), np.concatenate([d.fixes.xy_m, [[999.0, 999.0]]])
+    )
     more = replace(d, fixes=fixes_, looks=(*d.looks, replace(d.looks[-1], t_ns=d.looks[-1].t_ns + late)))
     kept = more.within_motion()
     assert len(kept.fixes.t_ns) == len(d.fixes.t_ns)
     assert len(kept.looks) == len(d.looks)
-    outside = replace(d, fixes=Fixes(d.fixes.t_ns + 100 * late, d.fixes.xy_m))
+    outside = replace(d, fixes=GnssFixes(d.fixes.t_ns + 100 * late, d.fixes.xy_m))
     with pytest.raises(NewLayerError, match="without GNSS fixes"):
         map_new_layer(outside, parameters(EXACT))
 

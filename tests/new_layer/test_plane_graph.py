@@ -7,17 +7,17 @@ from scipy.optimize import least_squares
 
 from gnd.vehicle_agent.features.mapping.dead_reckoning import Steps, composed, relative, wrapped
 from gnd.vehicle_agent.features.mapping.graph import root_of, solve
-from gnd.vehicle_agent.features.mapping.graph_edges import Anchors, FixNodes, PoseMatches, Problem, State, Ties
+from gnd.vehicle_agent.features.mapping.graph_edges import FixNodes, GraphAnchors, PoseMatches, Problem, State, Ties
 from gnd.vehicle_agent.features.mapping.parameters import (
-    GnssNoise,
     LandmarkParameters,
     LaneParameters,
+    MappingGnssNoise,
     NewLayerParameters,
 )
 
 K, N = 6, 3
 QUIET = NewLayerParameters(  # no edge is far enough off for Huber to matter
-    gnss=GnssNoise(sigma_m=2.0, correlation_s=8.0, robust_k=1e6),
+    gnss=MappingGnssNoise(sigma_m=2.0, correlation_s=8.0, robust_k=1e6),
     landmarks=LandmarkParameters(robust_k=1e6),
     lanes=LaneParameters(robust_k=1e6),
 )
@@ -42,7 +42,7 @@ def problem():
     information = np.zeros((2, 3, 3))
     information[:, 1:, 1:] = [[25.0, 3.0], [3.0, 900.0]]
     lanes = PoseMatches(np.array([1, 4]), pose[[1, 4]], rng.normal(0.0, [0.0, 0.2, 0.02], (2, 3)), information)
-    anchors = Anchors(np.array([1]), xy[[1]] + 0.3, np.array([[[0.5, 0.1], [0.1, 0.3]]]))
+    anchors = GraphAnchors(np.array([1]), xy[[1]] + 0.3, np.array([[[0.5, 0.1], [0.1, 0.3]]]))
     start = State(
         pose + rng.normal(0.0, 0.3, pose.shape) * [1, 1, 0.1], xy + rng.normal(0.0, 0.5, xy.shape), np.zeros(2)
     )

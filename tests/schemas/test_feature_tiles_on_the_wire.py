@@ -15,7 +15,7 @@ from gnd.gnd_map.features import Existence, Feature, FeatureTile
 from gnd.schemas.errors import BadValue, SchemaError, WrongHash
 from gnd.schemas.tile_answer import content_of_answer
 from gnd.schemas.tiles import CodedDelta, TileBlob, TileReply, TileRequest, content_of, tile_after
-from gnd.schemas.tiles_batch import HeldTile, TileAnswer, TilesReply, TilesRequest
+from gnd.schemas.tiles_batch import HeldVersion, TileAnswer, TilesReply, TilesRequest
 from gnd.schemas.updates import TileUpdate, updated
 
 GOLDEN_DIR = Path(__file__).parent / "golden_feature_tiles"
@@ -37,7 +37,7 @@ DELTA = encode_content_delta(HELD, NEXT)
 
 GOLDEN: dict[str, Any] = {
     "TileRequest-features": TileRequest(3, HELD.sha, (32,)),
-    "TilesRequest-features": TilesRequest.of([HeldTile(TILE, 3, HELD.sha)], codecs=(32,)),
+    "TilesRequest-features": TilesRequest.of([HeldVersion(TILE, 3, HELD.sha)], codecs=(32,)),
     "TileReply-blob-features": TileReply("blob", BLOB),
     "TileReply-delta-features": TileReply("delta", delta=CodedDelta(TILE, 4, NEXT.sha, DELTA)),
     "TilesReply-blob_and_delta-features": TilesReply(

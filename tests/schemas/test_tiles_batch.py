@@ -17,7 +17,7 @@ from gnd.schemas.generated import tiles_reply_pb2, tiles_request_pb2
 from gnd.schemas.tiles import CodedDelta, TileReply, blob_of, tile_after, tile_of
 from gnd.schemas.tiles_batch import (
     EVERY_CODEC,
-    HeldTile,
+    HeldVersion,
     TileAnswer,
     TilesReply,
     TilesRequest,
@@ -39,7 +39,7 @@ def tile_at(index: int) -> TileId:
 
 held_pairs = st.one_of(st.just((0, b"")), st.tuples(st.integers(1, 2**31 - 1), shas))
 helds = st.dictionaries(st.integers(0, 1023), held_pairs, min_size=1, max_size=30).map(
-    lambda found: [HeldTile(tile_at(index), *pair) for index, pair in found.items()]
+    lambda found: [HeldVersion(tile_at(index), *pair) for index, pair in found.items()]
 )
 
 
@@ -54,7 +54,7 @@ def any_answer(draw: Any) -> TileAnswer:
 
 
 @given(helds, st.booleans(), st.integers(1, limits.MAX_TILE_BODY_BYTES), st.none() | st.integers(0, 1023))
-def test_any_request_survives(held: list[HeldTile], with_hashes: bool, max_bytes: int, near: int | None) -> None:
+def test_any_request_survives(held: list[HeldVersion], with_hashes: bool, max_bytes: int, near: int | None) -> None:
     around = None if near is None else tile_at(near)
     request = TilesRequest.of(held, max_bytes=max_bytes, near=around, with_hashes=with_hashes)
     again = TilesRequest.decode(request.encode())
@@ -71,14 +71,14 @@ def test_any_reply_survives(answers: list[TileAnswer]) -> None:
 
 
 def test_a_request_for_the_same_tiles_is_the_same_in_whatever_order_they_are_named() -> None:
-    held = [HeldTile(EAST, 2, OTHER_SHA), HeldTile(TILE, 3, SHA), HeldTile(tile_at(1023))]
+    held = [HeldVersion(EAST, 2, OTHER_SHA), HeldVersion(TILE, 3, SHA), HeldVersion(tile_at(1023))]
     assert TilesRequest.of(held) == TilesRequest.of(held[::-1])
     assert TilesRequest.of(held).held_digest == digest_of([SHA, OTHER_SHA])
 
 
 def test_codecs_that_everybody_reads_are_not_spelt_out() -> None:
-    asked = TilesRequest.of([HeldTile(TILE)], codecs=EVERY_CODEC).encode()
-    assert len(asked) < len(TilesRequest.of([HeldTile(TILE)], codecs=(0,)).encode())
+    asked = TilesRequest.of([HeldVersion(TILE)], codecs=EVERY_CODEC).encode()
+    assert len(asked) < len(TilesRequest.of([HeldVersion(TILE)], codecs=(0,)).encode())
     assert TilesRequest.decode(asked).codecs == EVERY_CODEC
 
 
@@ -201,9 +201,9 @@ def test_a_request_that_cannot_be_is_refused(fields: dict[str, Any], message: st
 
 def test_a_request_for_two_districts_is_refused() -> None:
     with pytest.raises(BadValue, match="tiles of 2 districts: one only"):
-        TilesRequest.of([HeldTile(TILE), HeldTile(TileId(TILE.morton + 1024))])
+        TilesRequest.of([HeldVersion(TILE), HeldVersion(TileId(TILE.morton + 1024))])
     with pytest.raises(BadValue, match="once each"):
-        TilesRequest.of([HeldTile(TILE), HeldTile(TILE)])
+        TilesRequest.of([HeldVersion(TILE), HeldVersion(TILE)])
 
 
 def request_bytes(**fields: Any) -> bytes:
@@ -289,7 +289,7 @@ def test_an_answer_that_cannot_be_is_refused(fields: dict[str, Any]) -> None:
 
 
 def test_a_reply_about_other_tiles_than_asked_for_is_refused() -> None:
-    request = TilesRequest.of([HeldTile(TILE, 3, HELD.sha), HeldTile(EAST)])
+    request = TilesRequest.of([HeldVersion(TILE, 3, HELD.sha), HeldVersion(EAST)])
     unchanged, absent = TileAnswer("unchanged"), TileAnswer("absent")
     assert TilesReply((unchanged, absent)).of_request(request, DISTRICT) == [(TILE, unchanged), (EAST, absent)]
     with pytest.raises(BadValue, match="about 3 tiles, asked for 2"):

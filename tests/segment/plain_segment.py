@@ -4,12 +4,12 @@ import math
 
 import numpy as np
 
-from gnd.vehicle_agent.segment.ground_kernels import Grid
-from gnd.vehicle_agent.segment.image_kernels import BINS, FAR_CM, GROUND_BIT, Judge, Optics
+from gnd.vehicle_agent.segment.ground_kernels import GroundGrid
+from gnd.vehicle_agent.segment.image_kernels import BINS, FAR_CM, GROUND_BIT, Optics, RangeJudge
 from gnd.vehicle_agent.segment.voxel_kernels import GROUND, LOW
 
 
-def lowest(points: np.ndarray, grid: Grid, near_m: float) -> np.ndarray:
+def lowest(points: np.ndarray, grid: GroundGrid, near_m: float) -> np.ndarray:
     """Second lowest height of each cell."""
     cell = np.floor((points[:, :2] - [grid.x0, grid.y0]) / grid.cell_m).astype(int)
     heights: dict[tuple[int, int], list[float]] = {}
@@ -41,7 +41,9 @@ def image(points: np.ndarray, origins: np.ndarray, voxel_of: np.ndarray, R: np.n
     return result
 
 
-def opinion(p: np.ndarray, ranges: np.ndarray, places: np.ndarray, R: np.ndarray, optics: Optics, judge: Judge) -> str:  # noqa: C901
+def opinion(  # noqa: C901
+    p: np.ndarray, ranges: np.ndarray, places: np.ndarray, R: np.ndarray, optics: Optics, judge: RangeJudge
+) -> str:
     """What a scan says about a point: `passed`, `met` or nothing."""
     place = places[int(angles(R @ p)[0] * BINS)]
     if np.isnan(place[0]):

@@ -10,12 +10,12 @@ from scipy.sparse.csgraph import connected_components
 
 from gnd.gnd_map.se3 import exp_so3
 from gnd.vehicle_agent.segment.evidence import WEIGHTS, belief
-from gnd.vehicle_agent.segment.ground_kernels import Grid, ground_heights, lowest_heights, remember_ground
-from gnd.vehicle_agent.segment.image_kernels import BINS, Judge, Optics, draw_image, layer_gap, vote
+from gnd.vehicle_agent.segment.ground_kernels import GroundGrid, ground_heights, lowest_heights, remember_ground
+from gnd.vehicle_agent.segment.image_kernels import BINS, Optics, RangeJudge, draw_image, layer_gap, vote
 from gnd.vehicle_agent.segment.scene import hash_table
 from gnd.vehicle_agent.segment.voxel_kernels import GROUND, LOW, OUTSIDE, components, find_objects, moving_points
 
-GRID = Grid(-20.0, -20.0, 1.0, 40, 40)
+GRID = GroundGrid(-20.0, -20.0, 1.0, 40, 40)
 LEVEL = np.array([0.0, 0.0, -1.9, 0.0, 0.0, 1.0])  # the road under the vehicle and its normal
 R_TURNED = exp_so3(np.array([0.02, -0.01, 0.7])).T
 
@@ -119,7 +119,7 @@ def test_where_start_and_end_of_a_sweep_meet_no_place_is_known() -> None:
 def test_votes_agree_with_the_plain_twin(gap_tan: float) -> None:
     points, origins = cloud(4000)
     voxel_of = np.where(points[:, 2] < -1.2, GROUND, 0).astype(np.int32)
-    optics, judge = Optics(1200, 90, -0.3, 0.007), Judge(0.15, 0.3, 0.45, 0.01, gap_tan, 255)
+    optics, judge = Optics(1200, 90, -0.3, 0.007), RangeJudge(0.15, 0.3, 0.45, 0.01, gap_tan, 255)
     image, places = draw_image(points, origins, voxel_of, R_TURNED, optics, 0.5)
     asked = (cloud(1500, seed=1)[0] + np.random.default_rng(2).normal(0, 0.3, (1500, 3))).astype(np.float32)
     offset = np.array([0.3, -0.2, 0.05])
@@ -138,7 +138,18 @@ def test_points_that_surely_stand_are_asked_no_more() -> None:
     image, places = draw_image(points, origins, np.zeros(2000, np.int32), np.eye(3), optics, 0.5)
     passed, met = np.zeros(2000, np.uint8), np.full(2000, 12, np.uint8)
     passed[:1000] = 1
-    vote(points, np.zeros(3), image, places, np.eye(3), optics, Judge(0.15, 0.3, 0.45, 0.01, 0.0, 12), 4, passed, met)
+    vote(
+        points,
+        np.zeros(3),
+        image,
+        places,
+        np.eye(3),
+        optics,
+        RangeJudge(0.15, 0.3, 0.45, 0.01, 0.0, 12),
+        4,
+        passed,
+        met,
+    )
     assert (met[1000:] == 12).all()
     assert (met[:1000] == 16).mean() > 0.9
 

@@ -15,7 +15,7 @@ from gnd.gnd_map.grid import GridFrame
 from gnd.gnd_map.tile import Tile
 from gnd.gnd_map.tile_id import TileId, covering_circle
 from gnd.tile_store.sqlite_store import SqliteStore
-from studies.codec import Options, decoded_on, run
+from studies.codec import CodecOptions, decoded_on, run
 from studies.codec_scenes import FLOOR_M, SEED, _tile_class, kl_median, kl_nats, plain_protobuf, pose_shift_cm, stored
 from studies.frame.options import of_arguments
 
@@ -112,7 +112,7 @@ def test_a_store_is_measured_without_scans(tmp_path: Path) -> None:
     with SqliteStore(tmp_path / "map.sqlite") as store:
         store.put_tiles([Tile(TILE, 1, gaussians(7, 300))])
     assert stored(tmp_path / "map.sqlite").voxels == 300
-    figures = run(Options(store=tmp_path / "map.sqlite", recordings=tmp_path))
+    figures = run(CodecOptions(store=tmp_path / "map.sqlite", recordings=tmp_path))
     names = " | ".join(figure.name for figure in figures)
     for codec in CODECS.values():
         assert f"codec {codec.codec_id}, {codec.name}: decode" in names
@@ -123,5 +123,5 @@ def test_a_store_is_measured_without_scans(tmp_path: Path) -> None:
 
 
 def test_options_of_the_command_line() -> None:
-    assert of_arguments(Options, []).seed == SEED
-    assert of_arguments(Options, ["--seed", "102", "--base", "base.npz"]) == Options(102, Path("base.npz"))
+    assert of_arguments(CodecOptions, []).seed == SEED
+    assert of_arguments(CodecOptions, ["--seed", "102", "--base", "base.npz"]) == CodecOptions(102, Path("base.npz"))

@@ -7,7 +7,7 @@ import pytest
 
 from gnd.fleet_sim.roads.drive import GNSS_CEP_M, GNSS_CORRELATION_S, GNSS_WHITE_SHARE, ROAD_ERRORS
 from gnd.fleet_sim.trajectory import gauss_markov
-from studies.gnss_noise import Options, fitted, horizontal_errors, run
+from studies.gnss_noise import GnssNoiseOptions, fitted, horizontal_errors, run
 
 
 def test_a_known_process_is_found_again() -> None:
@@ -37,4 +37,4 @@ def test_the_median_error_of_a_drive_is_the_data_sheets() -> None:
 
 
 def test_without_the_recording_nothing_is_measured(tmp_path: Path) -> None:
-    assert [figure.name for figure in run(Options(tmp_path / "none"))] == ["not measured"]
+    assert [figure.name for figure in run(GnssNoiseOptions(tmp_path / "none"))] == ["not measured"]

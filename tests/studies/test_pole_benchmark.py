@@ -14,8 +14,8 @@ from gnd.vehicle_agent.importers.kitti import open_kitti
 from studies.frame.errors import OptionError
 from studies.frame.options import of_arguments
 from studies.pole_real import RealScan, Stability, draw_poles, poles_of, stability
-from studies.pole_scenes import OBSERVABLE_LENGTH_M, OBSERVABLE_RETURNS, Drive, PoleDrive, Posts, Score, matches
-from studies.poles import Options
+from studies.pole_scenes import OBSERVABLE_LENGTH_M, OBSERVABLE_RETURNS, PoleDrive, PoleScans, PoleScore, Posts, matches
+from studies.poles import PoleOptions
 
 
 def pole(x_m: float, y_m: float, kind: str = "pole") -> Pole:
@@ -36,7 +36,7 @@ def test_matches_are_one_to_one_and_the_nearest_first() -> None:
 
 
 def test_scores_count_what_was_found_what_was_wrong_and_how_far_off() -> None:
-    score, truth = Score(), posts((5.0, 0.0), (15.0, 0.0), (16.0, 5.0), (80.0, 0.0))
+    score, truth = PoleScore(), posts((5.0, 0.0), (15.0, 0.0), (16.0, 5.0), (80.0, 0.0))
     found = [pole(5.0, 0.1, "streetlight"), pole(25.0, 0.0)]
     score.add(found, truth, np.array([True, True, False, True]), np.zeros(2))
     assert score.recall() == (50.0, 2)
@@ -51,7 +51,7 @@ def test_scores_count_what_was_found_what_was_wrong_and_how_far_off() -> None:
 
 
 def test_the_truth_counts_returns_on_posts() -> None:
-    drive = PoleDrive(Drive(101, "VLP-16", (4.0,), traffic=False))
+    drive = PoleDrive(PoleScans(101, "VLP-16", (4.0,), traffic=False))
     (scan,) = drive.scans()
     objects = street(101).in_state("after")
     assert len(drive.posts.kind) == len({
@@ -64,16 +64,16 @@ def test_the_truth_counts_returns_on_posts() -> None:
     off = scan.rays.points_m[:, :2] - drive.posts.xy_m[best]
     assert (np.hypot(*off.T) < 0.5).sum() >= scan.returns[best] > 20
     found = PoleDetector().window([scan.rays], scan.T_map_vehicle[:3, 3])
-    score = Score()
+    score = PoleScore()
     score.add(found, drive.posts, scan.observable, scan.T_map_vehicle[:2, 3])
     assert score.recall()[0] >= 50.0
     assert score.precision()[0] > 90.0
 
 
 def test_options_refuse_unknown_sensors() -> None:
-    assert of_arguments(Options, ["--sensors", "none", "--seeds", "7"]).sensors == ()
+    assert of_arguments(PoleOptions, ["--sensors", "none", "--seeds", "7"]).sensors == ()
     with pytest.raises(OptionError, match="there is no radar"):
-        of_arguments(Options, ["--sensors", "radar"])
+        of_arguments(PoleOptions, ["--sensors", "radar"])
 
 
 def kitti_scans(shared_data: Path, numbers: tuple[int, ...]) -> list[RealScan]:

@@ -9,7 +9,7 @@ from gnd.gnd_map.gaussian import Gaussians, concat
 from gnd.gnd_map.tile import diff
 from gnd.gnd_map.tile_id import TileId
 from studies.frame.options import of_arguments
-from studies.return_download import Options, partly_changed, run
+from studies.return_download import ReturnDownloadOptions, partly_changed, run
 from studies.simulation.base_map import BaseMap, write_base
 
 TILES = [TileId(497353963154 + k) for k in range(4)]
@@ -57,8 +57,8 @@ def test_a_return_costs_less_than_the_first_time_and_nothing_almost_nothing(tmp_
     for name, tiles in (("before", BEFORE), ("after", AFTER)):
         write_base(BaseMap(tiles), tmp_path / f"{name}.npz")
     arguments = ["--before", str(tmp_path / "before.npz"), "--after", str(tmp_path / "after.npz"), "--changed", "0.05"]
-    chosen = of_arguments(Options, arguments)
-    assert chosen == Options(before=tmp_path / "before.npz", after=tmp_path / "after.npz", changed=0.05)
+    chosen = of_arguments(ReturnDownloadOptions, arguments)
+    assert chosen == ReturnDownloadOptions(before=tmp_path / "before.npz", after=tmp_path / "after.npz", changed=0.05)
     figures = {figure.name: figure for figure in run(chosen)}
     down = [figures[f"{name}: download"].value for name in ("first", "return", "nothing changed")]
     assert down[0] > 2 * down[1] > 4 * down[2] > 0

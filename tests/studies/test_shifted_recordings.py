@@ -19,7 +19,7 @@ from gnd.vehicle_agent.report import Identity, Reporter
 from gnd.vehicle_agent.segment.parameters import SegmentParameters
 from gnd.vehicle_agent.segment.segmenter import SegmentedScan
 from studies.real.drive import local_map_of, segmented
-from studies.real.scene import Scene, in_range, load, place
+from studies.real.scene import RecordedScene, in_range, load, place
 
 pytestmark = pytest.mark.slow
 
@@ -42,7 +42,9 @@ def moved(one: SegmentedScan, error: np.ndarray) -> SegmentedScan:
     return SegmentedScan(refined, one.moving)
 
 
-def told(folder: Path, scene: Scene, tiles: dict, scans: list[SegmentedScan]) -> tuple[Reporter, list[TileChange]]:
+def told(
+    folder: Path, scene: RecordedScene, tiles: dict, scans: list[SegmentedScan]
+) -> tuple[Reporter, list[TileChange]]:
     folder.mkdir()
     outbox = Outbox(folder / "outbox.sqlite")
     reporter = Reporter(ChangeDetector(local_map_of(scene, tiles)), outbox, WHO, scans[0].scan.t_ns, ReportParameters())

@@ -23,9 +23,9 @@ from gnd.gnd_map.tile_id import TileId
 from gnd.schemas.errors import BadValue, SchemaError, WrongHash
 from gnd.schemas.tile_answer import content_of_answer
 from gnd.schemas.tiles import TileBlob, TileReply, TileRequest, content_of, features_of, tile_after, tile_of
-from gnd.schemas.tiles_batch import HeldTile, TileAnswer, TilesReply, TilesRequest
+from gnd.schemas.tiles_batch import HeldVersion, TileAnswer, TilesReply, TilesRequest
 from gnd.schemas.updates import TileUpdate, updated
-from gnd.tile_store.answers import Answers
+from gnd.tile_store.answers import TileAnswers
 from gnd.tile_store.build import build_map
 from gnd.tile_store.cli import map_group
 from gnd.tile_store.compare import layer_info, map_diff, version_diff
@@ -65,14 +65,14 @@ def put(store: SqliteStore, *tiles: FeatureTile, layer: str = "signs") -> list[F
     return [FeatureTile(one.tile_id, r.version, one.features) for one, r in zip(tiles, results, strict=True)]
 
 
-def many(answers: Answers, request: TilesRequest, layer: str = "signs") -> dict[TileId, TileAnswer]:
+def many(answers: TileAnswers, request: TilesRequest, layer: str = "signs") -> dict[TileId, TileAnswer]:
     """Over the wire and back."""
     reply = answers.many(layer, DISTRICT, TilesRequest.decode(request.encode()))
     return dict(TilesReply.decode(reply.encode()).of_request(request, DISTRICT))
 
 
-def held(*tiles: FeatureTile) -> list[HeldTile]:
-    return [HeldTile(one.tile_id, one.version, one.sha) for one in tiles]
+def held(*tiles: FeatureTile) -> list[HeldVersion]:
+    return [HeldVersion(one.tile_id, one.version, one.sha) for one in tiles]
 
 
 # What a layer holds
@@ -137,7 +137,7 @@ def test_a_merge_is_published_with_the_reports_of_each_feature(store: SqliteStor
 
 
 def test_one_tile_is_answered_by_blob_delta_unchanged_or_absent(store: SqliteStore) -> None:
-    old, answers = put(store, tile(TILE, *map(sign, range(1, 60))))[0], Answers(store)
+    old, answers = put(store, tile(TILE, *map(sign, range(1, 60))))[0], TileAnswers(store)
     reply = answers.one(store.get("signs", TILE), TileRequest(codecs=READS))
     assert content_of(reply.blob) == old
     new = put(store, tile(TILE, sign(1, x_m=-9.5), *map(sign, range(3, 61))))[0]
@@ -153,15 +153,15 @@ def test_one_tile_is_answered_by_blob_delta_unchanged_or_absent(store: SqliteSto
 def test_many_tiles_are_answered_together(store: SqliteStore) -> None:
     a, b = put(store, tile(TILE, *map(sign, range(1, 60))), tile(EAST, lane(4)))
     new = put(store, tile(TILE, *map(sign, range(2, 61))))[0]
-    answers, absent = Answers(store), TileId(DISTRICT.first_morton)
-    found = many(answers, TilesRequest.of([HeldTile(absent), *held(a, b)], codecs=READS))
+    answers, absent = TileAnswers(store), TileId(DISTRICT.first_morton)
+    found = many(answers, TilesRequest.of([HeldVersion(absent), *held(a, b)], codecs=READS))
     assert {t: one.status for t, one in found.items()} == {absent: "absent", TILE: "delta", EAST: "unchanged"}
     assert content_of_answer(TILE, found[TILE], FeatureTile, a) == new
-    lost = many(answers, TilesRequest.of([HeldTile(TILE, 1, bytes(32)), *held(b)], codecs=READS))
+    lost = many(answers, TilesRequest.of([HeldVersion(TILE, 1, bytes(32)), *held(b)], codecs=READS))
     assert {one.status for one in lost.values()} == {"hash"}
-    told = many(answers, TilesRequest.of([HeldTile(TILE, 9, a.sha), *held(b)], codecs=READS, with_hashes=True))
+    told = many(answers, TilesRequest.of([HeldVersion(TILE, 9, a.sha), *held(b)], codecs=READS, with_hashes=True))
     assert [one.status for one in told.values()] == ["delta", "unchanged"]
-    first = many(answers, TilesRequest.of([HeldTile(TILE), HeldTile(EAST)], codecs=READS, max_bytes=1))
+    first = many(answers, TilesRequest.of([HeldVersion(TILE), HeldVersion(EAST)], codecs=READS, max_bytes=1))
     assert [one.status for one in first.values()] == ["blob", "later"]
     with pytest.raises(BadValue, match="holds features, expected Gaussians"):
         content_of_answer(TILE, first[TILE], Tile)
@@ -169,12 +169,12 @@ def test_many_tiles_are_answered_together(store: SqliteStore) -> None:
 
 def test_who_does_not_read_features_is_told_by_name(store: SqliteStore) -> None:
     put(store, tile(TILE, sign(1)))
-    answers = Answers(store)
+    answers = TileAnswers(store)
     reason = f"tile {TILE.path} of layer signs comes in codec 32, asked for"
     with pytest.raises(Refused, match=reason):
         answers.one(store.get("signs", TILE), TileRequest(codecs=PREFERRED))
     with pytest.raises(Refused, match=reason):
-        many(answers, TilesRequest.of([HeldTile(TILE)], codecs=PREFERRED))
+        many(answers, TilesRequest.of([HeldVersion(TILE)], codecs=PREFERRED))
     store.put_tiles([tile_of_voxels(TILE, 1)])
     with pytest.raises(Refused, match=r"of layer ndt comes in codec \d, asked for \(32,\)"):
         answers.one(store.get("ndt", TILE), TileRequest(codecs=READS))
@@ -191,7 +191,7 @@ def test_a_damaged_tile_is_named_and_does_not_keep_the_others(store: SqliteStore
         connection.execute(
             "UPDATE tile_version SET body = ? WHERE version = 1 AND tile = ?", (bytes(body), TILE.morton)
         )
-    found = many(Answers(store), TilesRequest.of([*held(old), HeldTile(EAST)], codecs=READS))
+    found = many(TileAnswers(store), TilesRequest.of([*held(old), HeldVersion(EAST)], codecs=READS))
     assert [one.status for one in found.values()] == ["blob", "blob"], "its base is damaged: no delta"
     with pytest.raises(SchemaError, match="checksum"):
         store.get("signs", TILE, 1).decode()

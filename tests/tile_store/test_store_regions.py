@@ -12,7 +12,7 @@ from gnd.gnd_map.tile_id import TileId
 from gnd.schemas.errors import BadKey
 from gnd.tile_store.arguments import parse_tile, parse_time_ns, parse_versions
 from gnd.tile_store.errors import StoreError
-from gnd.tile_store.regions import ALL_TILES, Region, morton_range
+from gnd.tile_store.regions import ALL_TILES, TileRegion, morton_range
 
 ROOT = "gnd/v1/tile/"
 tiles = st.integers(0, 2**39 - 1).map(TileId)
@@ -37,7 +37,7 @@ def test_no_prefix_is_everywhere() -> None:
 def test_a_wildcard_made_from_a_key_matches_it(tile: TileId, choices: list[str]) -> None:
     names = ["ndt", *tile.path.split("/")]
     key = ROOT + "/".join(name if choice == "keep" else choice for name, choice in zip(names, choices, strict=True))
-    region = Region.of_key(key, ROOT)
+    region = TileRegion.of_key(key, ROOT)
     assert region.matches(*names)
     assert region.matches("ndt", *tile.path.split("/")) == as_regular_expression(key, names)
     first, end = morton_range(region.prefix)
@@ -47,7 +47,7 @@ def test_a_wildcard_made_from_a_key_matches_it(tile: TileId, choices: list[str])
 @given(st.lists(st.sampled_from(["00000", "11111", "*", "**"]), min_size=1, max_size=5), st.integers(0, 31))
 def test_matching_agrees_with_a_regular_expression(chunks: list[str], bits: int) -> None:
     names = ["00000" if bits >> i & 1 else "11111" for i in range(4)]
-    region = Region(("ndt", *chunks))
+    region = TileRegion(("ndt", *chunks))
     key = ROOT + "/".join(("ndt", *chunks))
     assert region.matches("ndt", *names) == as_regular_expression(key, ["ndt", *names])
 
@@ -59,17 +59,17 @@ def as_regular_expression(key: str, names: list[str]) -> bool:
 
 
 def test_what_a_region_asks_for() -> None:
-    region = Region.of_key(ROOT + "ndt/13033/03021/**", ROOT)
+    region = TileRegion.of_key(ROOT + "ndt/13033/03021/**", ROOT)
     assert (region.layer, region.prefix) == ("ndt", "13033/03021")
-    assert Region.of_key(ROOT + "*/13033/*/23031/*", ROOT).prefix == "13033"
-    assert Region.of_key(ROOT + "**", ROOT).prefix == ""
-    assert Region.of_key(ROOT + "**", ROOT).layer is None
+    assert TileRegion.of_key(ROOT + "*/13033/*/23031/*", ROOT).prefix == "13033"
+    assert TileRegion.of_key(ROOT + "**", ROOT).prefix == ""
+    assert TileRegion.of_key(ROOT + "**", ROOT).layer is None
 
 
 @pytest.mark.parametrize("bad", ["gnd/**", "gnd/v1/tile/ndt/13$*/**", "gnd/v1/tile/NDT/**", "gnd/v1/tile/ndt/1303/**"])
 def test_a_region_that_no_key_is_in_is_refused(bad: str) -> None:
     with pytest.raises(BadKey, match="region"):
-        Region.of_key(bad, ROOT)
+        TileRegion.of_key(bad, ROOT)
 
 
 def test_a_tile_can_be_typed_in_three_ways() -> None:

@@ -24,8 +24,8 @@ from gnd.gnd_map.tile import Tile
 from gnd.gnd_map.tile_id import TileId
 from gnd.schemas.errors import SchemaError, WrongHash
 from gnd.schemas.tiles import TileRequest, tile_after, tile_of
-from gnd.schemas.tiles_batch import HeldTile, TileAnswer, TilesReply, TilesRequest, tile_of_answer
-from gnd.tile_store.answers import Answers, same_lattice
+from gnd.schemas.tiles_batch import HeldVersion, TileAnswer, TilesReply, TilesRequest, tile_of_answer
+from gnd.tile_store.answers import TileAnswers, same_lattice
 from gnd.tile_store.errors import StoreDamaged
 from gnd.tile_store.memory import Memory
 from gnd.tile_store.sqlite_store import SqliteStore
@@ -57,11 +57,11 @@ def put(store: SqliteStore, *tiles: Tile) -> list[Tile]:
     return [Tile(tile.tile_id, one.version, tile.gaussians) for tile, one in zip(tiles, results, strict=True)]
 
 
-def held(*tiles: Tile | TileId) -> list[HeldTile]:
-    return [HeldTile(t) if isinstance(t, TileId) else HeldTile(t.tile_id, t.version, t.sha) for t in tiles]
+def held(*tiles: Tile | TileId) -> list[HeldVersion]:
+    return [HeldVersion(t) if isinstance(t, TileId) else HeldVersion(t.tile_id, t.version, t.sha) for t in tiles]
 
 
-def asked(answers: Answers, request: TilesRequest) -> dict[TileId, TileAnswer]:
+def asked(answers: TileAnswers, request: TilesRequest) -> dict[TileId, TileAnswer]:
     """Over the wire and back."""
     reply = TilesReply.decode(answers.many("ndt", DISTRICT, TilesRequest.decode(request.encode())).encode())
     return dict(reply.of_request(request, DISTRICT))
@@ -81,7 +81,7 @@ def damage(store: SqliteStore, version: int) -> None:
 @pytest.mark.parametrize("lattice", ["archive", "standard", "compact"])
 def test_who_holds_any_older_version_gets_a_delta_that_gives_the_newest(store: SqliteStore, lattice: str) -> None:
     versions = [put(store, street(TILE, 1, changed, lattice))[0] for changed in (0, 4, 8)]
-    newest, answers = versions[-1], Answers(store)
+    newest, answers = versions[-1], TileAnswers(store)
     for old in versions[:2]:
         reply = answers.one(store.get("ndt", TILE), TileRequest(old.version, old.sha))
         assert reply.delta is not None
@@ -93,7 +93,7 @@ def test_who_holds_any_older_version_gets_a_delta_that_gives_the_newest(store: S
 def test_a_version_that_has_gone_or_never_was_here_gets_the_whole_tile(store: SqliteStore) -> None:
     versions = [put(store, street(TILE, 1, changed))[0] for changed in (0, 4, 8)]
     store.gc(1)
-    answers, head = Answers(store), store.get("ndt", TILE)
+    answers, head = TileAnswers(store), store.get("ndt", TILE)
     for request in (TileRequest(), TileRequest(1, versions[0].sha), TileRequest(3, bytes(32))):
         reply = answers.one(head, request)
         assert reply.blob is not None
@@ -102,7 +102,7 @@ def test_a_version_that_has_gone_or_never_was_here_gets_the_whole_tile(store: Sq
 
 def test_who_cannot_read_deltas_gets_the_whole_tile(store: SqliteStore) -> None:
     old, _ = put(store, street(TILE, 1))[0], put(store, street(TILE, 1, 4))
-    answers, head = Answers(store), store.get("ndt", TILE)
+    answers, head = TileAnswers(store), store.get("ndt", TILE)
     for request in (
         TileRequest(1, old.sha, deltas=False),
         TileRequest(1, old.sha, codecs=(CODEC_FLOAT32,)),  # it does not know lattices
@@ -116,14 +116,14 @@ def test_a_client_that_reads_few_codecs_gets_the_tile_in_one_of_them(store: Sqli
     (tile,) = put(store, street(TILE, 1))
     head = store.get("ndt", TILE)
     assert head.codec_id == CODEC_STANDARD
-    reply = Answers(store).one(head, TileRequest(codecs=(99, codec_id)))
+    reply = TileAnswers(store).one(head, TileRequest(codecs=(99, codec_id)))
     assert reply.blob is not None
     assert (reply.blob.codec_id, tile_of(reply.blob)) == (codec_id, tile)
 
 
 def test_the_first_codec_that_fits_is_taken_in_the_clients_order(store: SqliteStore) -> None:
     put(store, street(TILE, 1), street(EAST, 2, lattice=None))
-    answers = Answers(store)
+    answers = TileAnswers(store)
 
     def codec_of(tile: TileId, *codecs: int) -> int:
         reply = answers.one(store.get("ndt", tile), TileRequest(codecs=codecs))
@@ -144,7 +144,7 @@ def test_an_old_store_with_plain_columns_is_served_to_old_clients_and_new(store:
         for tile in (old, new):
             row = (encode_gaussians(tile.gaussians), tile.version)
             connection.execute("UPDATE tile_version SET codec_id = 0, body = ? WHERE version = ?", row)
-    answers, head = Answers(store), store.get("ndt", TILE)
+    answers, head = TileAnswers(store), store.get("ndt", TILE)
     plain = answers.one(head, TileRequest(codecs=(CODEC_FLOAT32,))).blob
     assert plain is not None
     assert plain.body == head.body
@@ -161,7 +161,7 @@ def test_a_tile_too_large_for_a_message_in_the_clients_codec_is_refused(
 ) -> None:
     put(store, street(TILE, 1))
     monkeypatch.setattr("gnd.tile_store.answers.MAX_TILE_BODY_BYTES", 10_000)
-    answers, head = Answers(store), store.get("ndt", TILE)
+    answers, head = TileAnswers(store), store.get("ndt", TILE)
     with pytest.raises(Refused, match=r"has 14404 bytes in codec 0, a message holds 10000; it comes in codec 3"):
         answers.one(head, TileRequest(codecs=(CODEC_FLOAT32,)))
     assert answers.one(head, TileRequest()).blob is not None
@@ -170,7 +170,7 @@ def test_a_tile_too_large_for_a_message_in_the_clients_codec_is_refused(
 def test_a_delta_as_large_as_the_tile_is_not_sent(store: SqliteStore) -> None:
     (old,) = put(store, street(TILE, 1))
     (new,) = put(store, tile_of_voxels(TILE, 3))
-    reply = Answers(store).one(store.get("ndt", TILE), TileRequest(1, old.sha))
+    reply = TileAnswers(store).one(store.get("ndt", TILE), TileRequest(1, old.sha))
     assert reply.blob is not None
     assert tile_of(reply.blob) == new
 
@@ -179,7 +179,7 @@ def test_a_damaged_base_gives_the_whole_tile(store: SqliteStore, caplog: pytest.
     old, new = put(store, street(TILE, 1))[0], put(store, street(TILE, 1, 4))[0]
     damage(store, 1)
     with caplog.at_level(logging.ERROR):
-        reply = Answers(store).one(store.get("ndt", TILE), TileRequest(1, old.sha))
+        reply = TileAnswers(store).one(store.get("ndt", TILE), TileRequest(1, old.sha))
     assert reply.blob is not None
     assert tile_of(reply.blob) == new
     assert "no delta from version 1 to 2" in caplog.text
@@ -187,7 +187,7 @@ def test_a_damaged_base_gives_the_whole_tile(store: SqliteStore, caplog: pytest.
 
 def test_a_damaged_body_is_not_sent_whether_it_was_sent_before_or_not(store: SqliteStore) -> None:
     put(store, street(TILE, 1))
-    fresh, knowing = Answers(store), Answers(store)
+    fresh, knowing = TileAnswers(store), TileAnswers(store)
     assert knowing.one(store.get("ndt", TILE), TileRequest()).blob is not None
     damage(store, 1)
     for answers in (fresh, knowing):
@@ -209,7 +209,7 @@ def test_a_batch_tells_what_each_tile_is(store: SqliteStore) -> None:
     same, moved, fresh, absent = tiles_of_district(4)
     kept, old = put(store, street(same, 1), street(moved, 2))
     new = put(store, street(moved, 2, 6), street(fresh, 3))
-    found = asked(Answers(store), TilesRequest.of(held(kept, old, fresh, absent)))
+    found = asked(TileAnswers(store), TilesRequest.of(held(kept, old, fresh, absent)))
     assert [found[tile].status for tile in (same, moved, fresh, absent)] == ["unchanged", "delta", "blob", "absent"]
     assert tile_of_answer(moved, found[moved], old) == new[0]
     assert tile_of_answer(fresh, found[fresh]) == new[1]
@@ -221,7 +221,7 @@ def test_a_rollback_to_what_the_client_holds_is_unchanged(store: SqliteStore) ->
     store.rollback("ndt", TILE, 1)
     for with_hashes in (False, True):
         request = TilesRequest.of(held(old), with_hashes=with_hashes)
-        assert asked(Answers(store), request) == {TILE: TileAnswer("unchanged")}
+        assert asked(TileAnswers(store), request) == {TILE: TileAnswer("unchanged")}
 
 
 def test_who_holds_what_the_store_does_not_know_is_asked_for_hashes_and_gets_what_it_needs(store: SqliteStore) -> None:
@@ -231,7 +231,7 @@ def test_who_holds_what_the_store_does_not_know_is_asked_for_hashes_and_gets_wha
     new = put(store, street(b, 2, 6))[0]
     foreign = Tile(c, 1, street(c, 33).gaussians)
     wanted = held(kept, old, foreign, d)
-    answers = Answers(store)
+    answers = TileAnswers(store)
     first = asked(answers, TilesRequest.of(wanted))
     assert [first[tile].status for tile in (a, b, c, d)] == ["hash", "hash", "hash", "absent"]
     again = asked(answers, TilesRequest.of(wanted, with_hashes=True))
@@ -247,7 +247,7 @@ def test_who_holds_what_the_store_does_not_know_is_asked_for_hashes_and_gets_wha
 def test_a_version_is_found_by_its_hash_whatever_its_number(store: SqliteStore) -> None:
     (old,), (new,) = put(store, street(TILE, 1)), put(store, street(TILE, 1, 6))
     renumbered = Tile(TILE, 77, old.gaussians)
-    found = asked(Answers(store), TilesRequest.of(held(renumbered), with_hashes=True))[TILE]
+    found = asked(TileAnswers(store), TilesRequest.of(held(renumbered), with_hashes=True))[TILE]
     assert tile_of_answer(TILE, found, renumbered) == new
 
 
@@ -255,7 +255,7 @@ def test_what_does_not_fit_comes_later_and_the_nearest_comes_first(store: Sqlite
     tiles = tiles_of_district(12)
     made = put(store, *(street(tile, k) for k, tile in enumerate(tiles)))
     size = len(store.get("ndt", tiles[0]).body)
-    near, answers = tiles[7], Answers(store)
+    near, answers = tiles[7], TileAnswers(store)
     wanted: list[Tile | TileId] = [*tiles]
     rounds: list[set[TileId]] = []
     while any(isinstance(one, TileId) for one in wanted):
@@ -275,14 +275,14 @@ def test_what_does_not_fit_comes_later_and_the_nearest_comes_first(store: Sqlite
 def test_the_first_body_always_fits(store: SqliteStore) -> None:
     a, b = tiles_of_district(2)
     put(store, street(a, 1), street(b, 2))
-    found = asked(Answers(store), TilesRequest.of(held(a, b), max_bytes=1))
+    found = asked(TileAnswers(store), TilesRequest.of(held(a, b), max_bytes=1))
     assert [found[tile].status for tile in (a, b)] == ["blob", "later"]
 
 
 def test_unchanged_tiles_are_told_without_reading_bodies(store: SqliteStore, monkeypatch: pytest.MonkeyPatch) -> None:
     made = put(store, *(street(tile, k) for k, tile in enumerate(tiles_of_district(20))))
     monkeypatch.setattr(store, "get", lambda *_: pytest.fail("a body was read"))
-    found = asked(Answers(store), TilesRequest.of(held(*made)))
+    found = asked(TileAnswers(store), TilesRequest.of(held(*made)))
     assert {answer.status for answer in found.values()} == {"unchanged"}
 
 
@@ -293,11 +293,11 @@ def test_one_damaged_body_does_not_keep_the_others(store: SqliteStore, caplog: p
     damage(store, 2)
     put(store, street(b, 2))
     with caplog.at_level(logging.ERROR):
-        found = asked(Answers(store), TilesRequest.of(held(a, b), codecs=(CODEC_FLOAT32,)))
+        found = asked(TileAnswers(store), TilesRequest.of(held(a, b), codecs=(CODEC_FLOAT32,)))
     assert [found[tile].status for tile in (a, b)] == ["later", "blob"]
     assert f"tile {a} cannot be sent: " in caplog.text
     with caplog.at_level(logging.CRITICAL), pytest.raises(SchemaError, match=f"tile {a} version 2"):
-        asked(Answers(store), TilesRequest.of(held(a), codecs=(CODEC_FLOAT32,)))
+        asked(TileAnswers(store), TilesRequest.of(held(a), codecs=(CODEC_FLOAT32,)))
 
 
 # What is remembered
@@ -305,7 +305,7 @@ def test_one_damaged_body_does_not_keep_the_others(store: SqliteStore, caplog: p
 
 def test_equal_questions_are_worked_out_once(store: SqliteStore, monkeypatch: pytest.MonkeyPatch) -> None:
     old, _ = put(store, street(TILE, 1))[0], put(store, street(TILE, 1, 4))
-    answers = Answers(store)
+    answers = TileAnswers(store)
     requests = [TilesRequest.of(held(old)), TilesRequest.of(held(TILE), codecs=(CODEC_FLOAT32,))]
     first = [asked(answers, request) for request in requests]
     monkeypatch.setattr("gnd.tile_store.answers.encode_content_delta", lambda *_: pytest.fail("worked out again"))

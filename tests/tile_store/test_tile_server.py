@@ -23,7 +23,7 @@ from gnd.gnd_map.day import day_of
 from gnd.gnd_map.tile_id import TileId
 from gnd.schemas import keys
 from gnd.schemas.tiles import Catalog, TileReply, TileRequest, tile_of
-from gnd.schemas.tiles_batch import HeldTile, TileAnswer, TilesReply, TilesRequest, tile_of_answer
+from gnd.schemas.tiles_batch import HeldVersion, TileAnswer, TilesReply, TilesRequest, tile_of_answer
 from gnd.tile_store.errors import StoreError
 from gnd.tile_store.server import TileServer
 from gnd.tile_store.sqlite_store import SqliteStore
@@ -86,7 +86,7 @@ def test_a_tile_is_delivered_with_its_version_and_hash(client: Bus, store: Sqlit
 
 @pytest.mark.usefixtures("server")
 def test_a_client_learns_when_the_world_looked_so(client: Bus, store: SqliteStore) -> None:
-    request = TilesRequest.of([HeldTile(TILE), HeldTile(EAST)])
+    request = TilesRequest.of([HeldVersion(TILE), HeldVersion(EAST)])
 
     def days() -> list[int]:
         payload = client.request(keys.batch_key("ndt", TILE.district), request.encode(), kind="tile", timeout_s=20.0)
@@ -141,7 +141,7 @@ def test_tiles_of_a_district_in_one_query(client: Bus, store: SqliteStore) -> No
     held = ask(client, TILE).blob
     assert held is not None
     absent = TileId(TILE.district.first_morton)
-    request = TilesRequest.of([HeldTile(TILE, held.version, held.sha), HeldTile(EAST), HeldTile(absent)])
+    request = TilesRequest.of([HeldVersion(TILE, held.version, held.sha), HeldVersion(EAST), HeldVersion(absent)])
 
     def asked() -> dict[TileId, TileAnswer]:
         key = keys.batch_key("ndt", TILE.district)
@@ -160,13 +160,13 @@ def test_tiles_of_a_district_in_one_query(client: Bus, store: SqliteStore) -> No
 @pytest.mark.usefixtures("server")
 def test_a_bad_query_for_tiles_of_a_district_is_refused_by_name(client: Bus) -> None:
     key = keys.batch_key("ndt", TILE.district)
-    good = TilesRequest.of([HeldTile(TILE)]).encode()
+    good = TilesRequest.of([HeldVersion(TILE)]).encode()
     assert "WrongVersion: TilesRequest of major version 0" in refusal(client, key)
     assert "Malformed: 3 bytes are not a TilesRequest" in refusal(client, key, b"\xff\xff\xff")
     assert "TooLarge: TilesRequest of 25000 bytes exceeds the limit of 24576" in refusal(client, key, bytes(25_000))
     assert "BadKey" in refusal(client, key.replace("13033", "99999"), good)
     assert "BadKey" in refusal(client, key + "/22102", good)
-    plain = TilesRequest.of([HeldTile(TILE)], codecs=(3,)).encode()
+    plain = TilesRequest.of([HeldVersion(TILE)], codecs=(3,)).encode()
     assert "comes in codec 1, asked for (3,)" in refusal(client, key, plain)
 
 

@@ -25,7 +25,7 @@ from gnd.tile_store.check import check_store
 from gnd.tile_store.errors import StoreDamaged, StoreError, StoreUnavailable
 from gnd.tile_store.migrations import SCHEMA_VERSION
 from gnd.tile_store.retention import Retained, retain
-from gnd.tile_store.rollback import Target, plan, roll_back
+from gnd.tile_store.rollback import RollbackTarget, plan, roll_back
 from gnd.tile_store.sqlite_connection import change
 from gnd.tile_store.sqlite_store import SqliteStore
 from gnd.tile_store.values import StoreConfig
@@ -262,29 +262,29 @@ def timed(tmp_path: Path) -> Iterator[tuple[SqliteStore, list[int]]]:
 
 def test_a_region_goes_back_to_a_time_and_says_so_before(timed: tuple[SqliteStore, list[int]]) -> None:
     store, times = timed
-    steps = plan(store, "ndt", "13033", Target(at_ns=times[0]))
+    steps = plan(store, "ndt", "13033", RollbackTarget(at_ns=times[0]))
     assert [(s.tile, s.from_version, s.to_version, s.action) for s in steps] == [
         (TILE, 4, 1, "rollback"),
         (EAST, 1, 0, "empty"),
     ]
     assert [head.version for head in store.heads()] == [4, 1]  # nothing has happened
-    assert roll_back(store, "ndt", "13033", Target(at_ns=times[0])) == steps
+    assert roll_back(store, "ndt", "13033", RollbackTarget(at_ns=times[0])) == steps
     heads = {head.tile: store.get("ndt", head.tile) for head in store.heads()}
     assert [one.decode_gaussians().gaussians.voxel_id.tolist() for one in heads.values() if one] == [[0], []]
     assert {one.kind for one in heads.values() if one} == {"rollback"}
-    assert [one.action for one in plan(store, "ndt", "", Target(at_ns=times[0]))] == ["same", "same"]
-    assert [one.action for one in plan(store, "ndt", "", Target(at_ns=2**62))] == ["same", "same"]
+    assert [one.action for one in plan(store, "ndt", "", RollbackTarget(at_ns=times[0]))] == ["same", "same"]
+    assert [one.action for one in plan(store, "ndt", "", RollbackTarget(at_ns=2**62))] == ["same", "same"]
 
 
 def test_what_retention_has_removed_is_not_guessed(timed: tuple[SqliteStore, list[int]]) -> None:
     store, times = timed
     store.transact(lambda c, _now: c.execute("DELETE FROM tile_version WHERE tile = ? AND version = 2", (TILE.morton,)))
-    assert plan(store, "ndt", TILE, Target(at_ns=times[1]))[0].action == "unknown"
-    assert plan(store, "ndt", TILE, Target(at_ns=times[2]))[0].action == "rollback"
-    assert roll_back(store, "ndt", TILE, Target(at_ns=times[1]))[0].action == "unknown"
+    assert plan(store, "ndt", TILE, RollbackTarget(at_ns=times[1]))[0].action == "unknown"
+    assert plan(store, "ndt", TILE, RollbackTarget(at_ns=times[2]))[0].action == "rollback"
+    assert roll_back(store, "ndt", TILE, RollbackTarget(at_ns=times[1]))[0].action == "unknown"
     assert store.heads()[0].version == 4
     with pytest.raises(StoreError, match="has no version 2"):
-        roll_back(store, "ndt", TILE, Target(version=2))
+        roll_back(store, "ndt", TILE, RollbackTarget(version=2))
 
 
 def test_a_feature_tile_that_was_not_there_yet_becomes_empty(tmp_path: Path) -> None:
@@ -292,7 +292,7 @@ def test_a_feature_tile_that_was_not_there_yet_becomes_empty(tmp_path: Path) -> 
         cov_m2 = np.array([0.04, 0.0, 0.0, 0.04, 0.0, 1e4])
         sign = Feature(1, "traffic_sign", np.array([[1.0, -2.0, 30.25]]), cov_m2, hit(0.9))
         store.put_tiles([FeatureTile.of(TILE, 0, [sign])], layer="signs")
-        assert roll_back(store, "signs", "", Target(at_ns=1))[0].action == "empty"
+        assert roll_back(store, "signs", "", RollbackTarget(at_ns=1))[0].action == "empty"
         head = store.get("signs", TILE)
         assert head is not None
         assert head.decode_features().features == ()

@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from gnd.vehicle_agent.features.slamcu.existence_book import (
-    Entry,
+    BookEntry,
     ExistenceBook,
     FeatureClass,
     counted,
@@ -21,9 +21,9 @@ BOOK = ExistenceBook(SlamcuParameters())
 SETS = (frozenset({"yes"}), frozenset({"no"}), frozenset({"yes", "no"}))
 
 
-def entry(*, known: bool) -> Entry:
+def entry(*, known: bool) -> BookEntry:
     masses = BOOK.known_masses if known else BOOK.new_masses
-    return Entry(1, known, "sign", np.zeros(2), None, 0.0, masses)
+    return BookEntry(1, known, "sign", np.zeros(2), None, 0.0, masses)
 
 
 def by_enumeration(prior: np.ndarray, looks: list[bool]) -> np.ndarray:

@@ -15,8 +15,8 @@ from gnd.vehicle_agent.plan import (
     LARGEST_BATCH_BYTES,
     SLOWEST_MPS,
     SMALLEST_BATCH_BYTES,
-    Course,
     Need,
+    VehicleCourse,
     batch_bytes,
     in_time,
     needs,
@@ -32,7 +32,7 @@ STEP_S = 0.05
 LOW_M, HIGH_M = tile_boxes_m(FRAME, AROUND)
 
 
-def seconds_near(tile_index: int, course: Course, velocity_mps: np.ndarray) -> list[float]:
+def seconds_near(tile_index: int, course: VehicleCourse, velocity_mps: np.ndarray) -> list[float]:
     """The plain twin: drive it and look."""
     low, high = LOW_M[tile_index] - NEAR_M, HIGH_M[tile_index] + NEAR_M
     way = ((t, course.here_m + t * velocity_mps) for t in np.arange(0.0, 20.0, STEP_S))
@@ -44,7 +44,7 @@ def seconds_near(tile_index: int, course: Course, velocity_mps: np.ndarray) -> l
 def test_a_tile_is_needed_from_when_it_is_near_until_it_is_left(
     x: float, y: float, heading: float, speed: float
 ) -> None:
-    course = Course(x, y, heading, speed)
+    course = VehicleCourse(x, y, heading, speed)
     planned = {need.tile_id: need for need in needs(FRAME, AROUND, course, NEAR_M)}
     assert sorted(planned) == sorted(AROUND)
     velocity = max(speed, SLOWEST_MPS) * np.array([math.cos(heading), math.sin(heading)])
@@ -60,7 +60,7 @@ def test_a_tile_is_needed_from_when_it_is_near_until_it_is_left(
 
 
 def test_soonest_first_and_among_those_needed_now_the_nearest() -> None:
-    planned = needs(FRAME, AROUND, Course(0.0, 0.0, 0.0, 10.0), NEAR_M)
+    planned = needs(FRAME, AROUND, VehicleCourse(0.0, 0.0, 0.0, 10.0), NEAR_M)
     assert [need.from_s for need in planned] == sorted(need.from_s for need in planned)
     now = [need for need in planned if need.from_s == 0.0]
     assert [need.distance_m for need in now] == sorted(need.distance_m for need in now)
@@ -72,22 +72,22 @@ def test_soonest_first_and_among_those_needed_now_the_nearest() -> None:
 
 
 def test_of_a_vehicle_without_heading_what_is_near_is_needed_for_ever() -> None:
-    for need in needs(FRAME, AROUND, Course(0.0, 0.0, None, 0.0), 30.0):
+    for need in needs(FRAME, AROUND, VehicleCourse(0.0, 0.0, None, 0.0), 30.0):
         assert (need.from_s, need.until_s) in ((0.0, math.inf), (math.inf, math.inf))
         assert (need.from_s == 0.0) >= (need.distance_m <= 30.0)
 
 
 def test_a_vehicle_that_stands_needs_what_is_near_until_it_drives() -> None:
-    standing, slow = (needs(FRAME, AROUND, Course(0.0, 0.0, 0.3, speed), NEAR_M) for speed in (0.0, 1.0))
+    standing, slow = (needs(FRAME, AROUND, VehicleCourse(0.0, 0.0, 0.3, speed), NEAR_M) for speed in (0.0, 1.0))
     assert all(need.until_s == math.inf for need in standing)
     assert in_time(standing, lambda _: 1e9, 1.0, 1.0) == standing
-    driven = {need.tile_id: need.until_s for need in needs(FRAME, AROUND, Course(0.0, 0.0, 0.3, 3.0), NEAR_M)}
+    driven = {need.tile_id: need.until_s for need in needs(FRAME, AROUND, VehicleCourse(0.0, 0.0, 0.3, 3.0), NEAR_M)}
     for need in slow:
         assert need.until_s == pytest.approx(3.0 * driven[need.tile_id])
 
 
 def test_what_lies_behind_is_needed_last_or_not_at_all() -> None:
-    ahead = Course(0.0, 0.0, math.pi / 2, 20.0)
+    ahead = VehicleCourse(0.0, 0.0, math.pi / 2, 20.0)
     planned = {need.tile_id: need for need in needs(FRAME, AROUND, ahead, 10.0)}
     for tile_id, need in planned.items():
         if tile_distance_m(FRAME, tile_id, np.array([0.0, -1.0, 0.0])) < need.distance_m > 15.0:

@@ -20,7 +20,7 @@ from gnd.vehicle_agent.features.poles.kernels import (
     thin_slices,
 )
 from gnd.vehicle_agent.features.poles.place_kernels import (
-    Ground,
+    GroundCells,
     around,
     by_cell,
     cone_heights,
@@ -29,7 +29,7 @@ from gnd.vehicle_agent.features.poles.place_kernels import (
     rays_below,
 )
 
-GROUND = Ground(-6.0, -6.0, 1.0, 12)
+GROUND = GroundCells(-6.0, -6.0, 1.0, 12)
 ROWS = Rows(-0.6, 0.007, 172, 36)
 
 

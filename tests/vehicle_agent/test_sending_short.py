@@ -21,7 +21,7 @@ from gnd.gnd_map.classes import ChangeClass
 from gnd.gnd_map.codec import LATTICES, REPORT, decode_measured, encode_mask, snap
 from gnd.gnd_map.gaussian import Gaussians
 from gnd.gnd_map.tile import Tile
-from gnd.gnd_map.track import Piece, Track, View
+from gnd.gnd_map.track import Track, TrackPiece, TrackView
 from gnd.schemas.changes import ChangeAck, ChangeReport, TileChange
 from gnd.schemas.keys import change_key, change_keys, state_keys, want_key
 from gnd.schemas.packed import PackedGaussians, PackedReport, decode_upload
@@ -69,8 +69,8 @@ def report(tile: Tile) -> ChangeReport:
 def outbox(tmp_path: Path, tile: Tile, report: ChangeReport) -> Outbox:
     """With the report, whole and in short."""
     box = Outbox(tmp_path / "outbox.sqlite")
-    view = View((-30, -24, -18, -12, -6, 0, 6, 12, 20))
-    track = Track(report.district, view, (Piece(np.zeros((1, 3), np.int32), 5),))
+    view = TrackView((-30, -24, -18, -12, -6, 0, 6, 12, 20))
+    track = Track(report.district, view, (TrackPiece(np.zeros((1, 3), np.int32), 5),))
     packed = pack(report, {tile.sha: tile.gaussians}, track).encode()
     box.put(REPORT_ID, change_key("ndt", report.district), report.encode(), packed, [tile])
     return box

@@ -7,7 +7,7 @@ from math import exp, radians, sqrt
 import numpy as np
 import pytest
 
-from gnd.vehicle_agent.features.slamcu.blind import Belief
+from gnd.vehicle_agent.features.slamcu.blind import BlindBelief
 from gnd.vehicle_agent.features.slamcu.hindsight import (
     GATE_SURE,
     Hindsight,
@@ -39,7 +39,7 @@ def driven(seed: int, gap_s: tuple[float, float] = (0.0, 0.0)) -> Driven:
     slow_m, white_m = sqrt(1.0 - p.gnss.white_share) * SIGMA_M, sqrt(p.gnss.white_share) * SIGMA_M
     cov0 = np.diag([4.0, 4.0, radians(1.0) ** 2])
     true = np.zeros(3)
-    hindsight = Hindsight(p, Belief.first(np.sqrt(np.diag(cov0)) * rng.standard_normal(3), cov0, p))
+    hindsight = Hindsight(p, BlindBelief.first(np.sqrt(np.diag(cov0)) * rng.standard_normal(3), cov0, p))
     scale, bias = p.motion.scale * rng.standard_normal(), p.motion.bias_radps * rng.standard_normal()
     error, fade = slow_m * rng.standard_normal(2), exp(-1.0 / p.gnss.correlation_s)
     path = []

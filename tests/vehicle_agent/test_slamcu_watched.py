@@ -9,7 +9,7 @@ import pytest
 from sign_road import FEW, PERIOD_S, Road
 from sign_road import NO_SHIFT as HERE
 
-from gnd.vehicle_agent.features.slamcu.blind import Belief, BlindFilter
+from gnd.vehicle_agent.features.slamcu.blind import BlindBelief, BlindFilter
 from gnd.vehicle_agent.features.slamcu.existence_book import FeatureClass
 from gnd.vehicle_agent.features.slamcu.parameters import SlamcuParameters
 from gnd.vehicle_agent.features.slamcu.watch import Alarm, Watch
@@ -206,7 +206,7 @@ def blind_run(seed: int, bias_m: float = 0.0) -> tuple[np.ndarray, np.ndarray, f
     cov0 = np.diag([0.25, 0.25, radians(1.0) ** 2])
     true, dt_s = np.zeros(3), 0.1
     start = true + np.sqrt(np.diag(cov0)) * rng.standard_normal(3)
-    blind, watch = BlindFilter(parameters, Belief.first(start, cov0, parameters)), Watch(gnss)
+    blind, watch = BlindFilter(parameters, BlindBelief.first(start, cov0, parameters)), Watch(gnss)
     scale, bias = motion.scale * rng.standard_normal(), motion.bias_radps * rng.standard_normal()
     error, fade, most = slow_m * rng.standard_normal(2), exp(-1.0 / gnss.correlation_s), 0.0
     for i in range(801):

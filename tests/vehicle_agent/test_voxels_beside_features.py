@@ -20,7 +20,7 @@ from gnd.gnd_map.tile import Tile
 from gnd.gnd_map.tile_id import TileId
 from gnd.schemas import keys
 from gnd.schemas.tiles import TileReply, TileRequest, content_of
-from gnd.schemas.tiles_batch import HeldTile, TilesRequest
+from gnd.schemas.tiles_batch import HeldVersion, TilesRequest
 from gnd.tile_store.server import PLAIN_REQUEST, TILE_ROOT, TileServer
 from gnd.tile_store.sqlite_store import SqliteStore
 from gnd.vehicle_agent.cache import TileCache
@@ -57,7 +57,7 @@ def served(folder: Path, port: int, *, with_features: bool) -> Iterator[tuple[Sq
 
 def said_to_who_reads_voxels(config: BusConfig) -> list[object]:
     """All that an ndt-only client can ask, and the bytes of the answers."""
-    wanted = TilesRequest.of([HeldTile(t) for t in BASE if t.district == TILE.district], codecs=PREFERRED)
+    wanted = TilesRequest.of([HeldVersion(t) for t in BASE if t.district == TILE.district], codecs=PREFERRED)
     region = keys.tiles_key("ndt", TILE.district.path)
     every_layer = f"{TILE_ROOT}*/{TILE.path}"
     with open_bus(config, name="voxels") as bus:

@@ -76,7 +76,7 @@ def geodetic_of_city(points_m: F64, city: City) -> tuple[F64, F64]:
 
 
 @dataclass(slots=True)
-class _Line:
+class _LaneLine:
     """A line of the map, and what is said of it."""
 
     kind: str
@@ -123,7 +123,7 @@ def read_argoverse(
     return FeatureFile(FORMAT, tuple(features), dict(sorted(left_out.items())))
 
 
-def _feature(line: _Line, layer: str, where: str, source: str, options: ImportOptions, city: City) -> MapFeature:
+def _feature(line: _LaneLine, layer: str, where: str, source: str, options: ImportOptions, city: City) -> MapFeature:
     attributes = line.attributes | ({"lanes": " ".join(line.lanes)} if line.lanes else {})
     lat, lon = geodetic_of_city(line.points_m, city)
     return MapFeature(
@@ -133,10 +133,10 @@ def _feature(line: _Line, layer: str, where: str, source: str, options: ImportOp
     )  # fmt: skip
 
 
-def _lane_lines(told: Any, where: str, progress: Progress | None) -> list[_Line]:
+def _lane_lines(told: Any, where: str, progress: Progress | None) -> list[_LaneLine]:
     """The borders of all lanes, each once."""
     segments = member(where, told, "lane_segments", dict)
-    lines: dict[bytes, _Line] = {}
+    lines: dict[bytes, _LaneLine] = {}
     for number, (key, lane) in enumerate(segments.items()):
         lane_id = _id(where, "lane segment", key, lane)
         sides = {side: _points(lane_id, lane, f"{side}_lane_boundary") for side in ("left", "right")}
@@ -148,19 +148,19 @@ def _lane_lines(told: Any, where: str, progress: Progress | None) -> list[_Line]
     return list(lines.values())
 
 
-def _put(lines: dict[bytes, _Line], line: _Line, lane: str) -> None:
+def _put(lines: dict[bytes, _LaneLine], line: _LaneLine, lane: str) -> None:
     """One border however many lanes name it, in either direction, as long as they say the same of it."""
     said = repr(sorted(line.attributes.items())).encode()
     there = min(line.points_m.tobytes(), line.points_m[::-1].tobytes()) + said
     lines.setdefault(there, line).lanes.append(lane)
 
 
-def _border(where: str, lane: dict[str, Any], key: str, side: str, points_m: F64) -> _Line:
+def _border(where: str, lane: dict[str, Any], key: str, side: str, points_m: F64) -> _LaneLine:
     mark = member(where, lane, f"{side}_lane_mark_type", str)
     attributes = {"lane_type": as_text(lane.get("lane_type", "")), "mark": mark}
     if lane.get("is_intersection"):
         attributes["is_intersection"] = "true"
-    return _Line("lane_boundary", ("lane", key, side), points_m, attributes)
+    return _LaneLine("lane_boundary", ("lane", key, side), points_m, attributes)
 
 
 def _check_crossing(where: str, left_m: F64, right_m: F64) -> None:
@@ -173,7 +173,7 @@ def _check_crossing(where: str, left_m: F64, right_m: F64) -> None:
         )
 
 
-def _crosswalks(told: Any, where: str) -> list[_Line]:
+def _crosswalks(told: Any, where: str) -> list[_LaneLine]:
     """The outlines of crosswalks: along one edge and back along the other."""
     lines = []
     for key, crossing in member(where, told, "pedestrian_crossings", dict).items():
@@ -181,17 +181,17 @@ def _crosswalks(told: Any, where: str) -> list[_Line]:
         first, second = (_points(name, crossing, edge) for edge in ("edge1", "edge2"))
         ahead = np.linalg.norm(first[-1] - second[-1]) <= np.linalg.norm(first[-1] - second[0])
         ring = np.concatenate([first, second[::-1] if ahead else second, first[:1]])
-        lines.append(_Line("crosswalk", ("crosswalk", key), ring, {}))
+        lines.append(_LaneLine("crosswalk", ("crosswalk", key), ring, {}))
     return lines
 
 
-def _areas(told: Any, where: str) -> list[_Line]:
+def _areas(told: Any, where: str) -> list[_LaneLine]:
     """The outlines of drivable areas, closed."""
     lines = []
     for key, area in member(where, told, "drivable_areas", dict).items():
         points_m = _points(_id(where, "drivable area", key, area), area, "area_boundary")
         closed = points_m if np.array_equal(points_m[0], points_m[-1]) else np.concatenate([points_m, points_m[:1]])
-        lines.append(_Line("drivable_area", ("area", key), closed, {}))
+        lines.append(_LaneLine("drivable_area", ("area", key), closed, {}))
     return lines
 
 

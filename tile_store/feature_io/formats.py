@@ -17,7 +17,7 @@ from gnd.tile_store.feature_io.lanelet2_import import FORMAT as LANELET2
 from gnd.tile_store.feature_io.lanelet2_import import read_lanelet2
 from gnd.tile_store.feature_io.opendrive_import import read_opendrive
 from gnd.tile_store.feature_io.osm_document import MAX_FILE_BYTES, Progress
-from gnd.tile_store.feature_io.sources import Source
+from gnd.tile_store.feature_io.sources import FeatureSource
 from gnd.tile_store.feature_io.stored import load_features, sources_of
 from gnd.tile_store.feature_io.values import FeatureFile, ImportOptions, MapFeature
 from gnd.tile_store.feature_io.whole_file import write_whole
@@ -78,7 +78,7 @@ def read_features(
 
 
 @dataclass(frozen=True, slots=True)
-class ExportResult:
+class FeaturesExported:
     """What was written; changes: to the file that the features came from, None for a new one."""
 
     path: str
@@ -96,7 +96,7 @@ def export_features(
     region: str = "",
     format: str | None = None,  # noqa: A002
     source: str | None = None,
-) -> ExportResult:
+) -> FeaturesExported:
     """Write the newest features of a store to a file, which appears whole or not at all.
 
     As Lanelet2 they are written into the file that they came from, when the store has one (`source` says which of
@@ -120,10 +120,10 @@ def export_features(
     else:
         body, changes, told = _lanelet2(store, features, kept)
     write_whole(path, body)
-    return ExportResult(str(path), found, told, len(body), kept.name if kept else None, changes)
+    return FeaturesExported(str(path), found, told, len(body), kept.name if kept else None, changes)
 
 
-def _source(store: SqliteStore, said: str | None, *, chosen: bool) -> Source | None:
+def _source(store: SqliteStore, said: str | None, *, chosen: bool) -> FeatureSource | None:
     known = {name: one for name, one in sources_of(store).items() if one.format == LANELET2}
     if said == "" or (said is None and (not known or chosen)):
         return None
@@ -139,7 +139,9 @@ def _source(store: SqliteStore, said: str | None, *, chosen: bool) -> Source | N
     return known[name]
 
 
-def _lanelet2(store: SqliteStore, features: list[MapFeature], kept: Source | None) -> tuple[bytes, Changes | None, int]:
+def _lanelet2(
+    store: SqliteStore, features: list[MapFeature], kept: FeatureSource | None
+) -> tuple[bytes, Changes | None, int]:
     """The file with its own features and new ones; those of other files stay out."""
     if kept is None:
         return write_lanelet2(features, EMPTY)[0], None, len(features)

@@ -39,7 +39,7 @@ _OURS: Final = frozenset(
 
 
 @dataclass(frozen=True, slots=True)
-class _Reading:
+class _GeojsonReading:
     where: str
     source: str
     options: ImportOptions
@@ -63,7 +63,7 @@ def read_geojson(
     """
     told = read_json(data, where)
     items, ours = _items(told, where)
-    reading = _Reading(where, source, options, ours)
+    reading = _GeojsonReading(where, source, options, ours)
     left_out: Counter[str] = Counter()
     features: list[MapFeature] = []
     for number, item in enumerate(items):
@@ -104,7 +104,7 @@ def _check_crs(told: dict[str, Any], where: str) -> None:
         raise UnknownFormat(f"{where}: reference system {name!r:.80}; GeoJSON is WGS-84 (RFC 7946), transform it")
 
 
-def _features(reading: _Reading, item: Any, number: int) -> Iterator[MapFeature]:
+def _features(reading: _GeojsonReading, item: Any, number: int) -> Iterator[MapFeature]:
     where = f"{reading.where}, feature {number}"
     if member(where, item, "type", str) != "Feature":
         raise BadElement(f"{where}: type {item['type']!r:.40}, expected Feature")
@@ -151,7 +151,12 @@ def _line(where: str, line: list[Any], least: int) -> F64:
 
 
 def _feature(
-    reading: _Reading, where: str, item: dict[str, Any], properties: dict[str, Any], line: F64, at: tuple[int, int]
+    reading: _GeojsonReading,
+    where: str,
+    item: dict[str, Any],
+    properties: dict[str, Any],
+    line: F64,
+    at: tuple[int, int],
 ) -> MapFeature:
     options = reading.options
     kind = _kind(properties)

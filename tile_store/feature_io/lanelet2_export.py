@@ -13,7 +13,7 @@ import numpy as np
 
 from gnd.gnd_map.arrays import F64
 from gnd.gnd_map.geodesy import meridian_radius_m, normal_radius_m
-from gnd.tile_store.feature_io.lanelet2_import import Drawn, Places, drawn_features, places_of
+from gnd.tile_store.feature_io.lanelet2_import import DrawnLane, NodePlaces, drawn_features, places_of
 from gnd.tile_store.feature_io.osm_document import OsmDocument, OsmNode, OsmWay, read_osm
 from gnd.tile_store.feature_io.osm_edit import (
     Edits,
@@ -85,7 +85,7 @@ def write_lanelet2(
 class _Editing:
     """Collects what becomes of nodes and ways, then writes it."""
 
-    def __init__(self, document: OsmDocument, places: Places, options: ImportOptions, keep_within_m: float) -> None:
+    def __init__(self, document: OsmDocument, places: NodePlaces, options: ImportOptions, keep_within_m: float) -> None:
         self._document, self._places, self._options, self._keep_within_m = document, places, options, keep_within_m
         self._moved: dict[int, list[F64]] = defaultdict(list)
         self._tags: dict[tuple[str, int], dict[str, str | None]] = {}
@@ -98,7 +98,7 @@ class _Editing:
         self._in_ways = {ref for way in document.ways.values() for ref in way.nodes}
         self._nodes = list(document.nodes.values())
 
-    def update(self, drawn: Drawn, feature: MapFeature) -> None:
+    def update(self, drawn: DrawnLane, feature: MapFeature) -> None:
         """An element's feature as it is now."""
         tags = _changed_tags(drawn.feature.attributes, feature.attributes)
         if tags:
@@ -128,7 +128,7 @@ class _Editing:
             refs.append(way.nodes[nearest] if apart[nearest] <= KEEP_WITHIN_M else self._node(place, {}))
         self._refs[way.id] = refs
 
-    def remove(self, drawn: Drawn) -> None:
+    def remove(self, drawn: DrawnLane) -> None:
         """An element whose feature is gone; a node that is part of a line only loses its tags."""
         key = _name(drawn.element), drawn.element.id
         if key[0] == "node" and key[1] in self._in_ways:

@@ -34,7 +34,7 @@ FORMAT: Final = "lanelet2"
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Places:
+class NodePlaces:
     """Where the nodes of a document are.
 
     index: by node id the row. lat_rad, lon_rad, height_m: (N,). has_height: (N,). local_m: (N, 3) when the document's
@@ -54,7 +54,7 @@ class Places:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Drawn:
+class DrawnLane:
     """A feature and the element that draws it: a node, or a way with its nodes."""
 
     feature: MapFeature
@@ -85,7 +85,9 @@ def read_lanelet2(
     return FeatureFile(FORMAT, tuple(one.feature for one in drawn), left_out, data)
 
 
-def drawn_features(document: OsmDocument, source: str, options: ImportOptions) -> tuple[list[Drawn], dict[str, int]]:
+def drawn_features(
+    document: OsmDocument, source: str, options: ImportOptions
+) -> tuple[list[DrawnLane], dict[str, int]]:
     """The features that elements of a document draw, and how many of which kinds have no layer."""
     places, borders = places_of(document, options), _borders(document)
     left_out: Counter[str] = Counter()
@@ -112,12 +114,12 @@ def _drawn(
     document: OsmDocument,
     source: str,
     options: ImportOptions,
-    places: Places,
+    places: NodePlaces,
     kind: str,
     layer: str,
     element: OsmNode | OsmWay,
     nodes: list[OsmNode],
-) -> Drawn:
+) -> DrawnLane:
     what = "way" if isinstance(element, OsmWay) else "node"
     name = f"{document.where}, line {element.line}: {what} {element.id}"
     if not nodes:
@@ -134,7 +136,7 @@ def _drawn(
         options.cov_m2(height_known=bool(places.has_height[rows].all())), options.existence(),
         attributes_of(told_of(element.tags)), name,
     )  # fmt: skip
-    return Drawn(feature, element, tuple(nodes))
+    return DrawnLane(feature, element, tuple(nodes))
 
 
 def middle_of(line: F64) -> F64:
@@ -148,7 +150,7 @@ def _borders(document: OsmDocument) -> set[int]:
     return {ref for lanelet in lanelets for role in ("left", "right") for ref in lanelet.member("way", role)}
 
 
-def places_of(document: OsmDocument, options: ImportOptions) -> Places:
+def places_of(document: OsmDocument, options: ImportOptions) -> NodePlaces:
     """Where the nodes are: by their local coordinates when a placement is given, by latitude and longitude otherwise.
 
     Raises:
@@ -171,7 +173,7 @@ def places_of(document: OsmDocument, options: ImportOptions) -> Places:
         lat, lon = np.radians(np.array([(n.lat_deg, n.lon_deg) for n in nodes], np.float64).reshape(-1, 2)).T
     height_m = height_m + options.height_offset_m
     _check_places(document, nodes, lat, lon, height_m)
-    return Places(index, lat, lon, height_m, has_height, local_m)
+    return NodePlaces(index, lat, lon, height_m, has_height, local_m)
 
 
 def _check_places(document: OsmDocument, nodes: list[OsmNode], lat: F64, lon: F64, height_m: F64) -> None:
@@ -217,7 +219,7 @@ def _value(document: OsmDocument, node: OsmNode, key: str) -> float:
     return 0.0 if text is None else real(f"{document.where}, line {node.line}", f"{key} of node {node.id}", text)
 
 
-def check_lanelets(document: OsmDocument, places: Places) -> None:
+def check_lanelets(document: OsmDocument, places: NodePlaces) -> None:
     """BadGeometry when the borders of a lanelet cross each other."""
     for relation in document.relations.values():
         if relation.tags.get("type") != "lanelet":

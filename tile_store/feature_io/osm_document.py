@@ -94,7 +94,7 @@ def read_osm(data: bytes, where: str, *, max_nodes: int = MAX_NODES, progress: P
             position, ids that come twice, references to what is not there, more than `max_nodes` nodes.
     """
     document = OsmDocument(data, where)
-    reading = _Reading(document, max_nodes, progress)
+    reading = _OsmReading(document, max_nodes, progress)
     root = read_root(data, where, reading.child)
     _check_root(root, where)
     document.end_of_nodes = document.end_of_nodes or _inside(data, root)
@@ -116,7 +116,7 @@ def _inside(data: bytes, root: Element) -> int:
     return data.index(b">", root.start) + 1
 
 
-class _Reading:
+class _OsmReading:
     """Takes the root's children one by one."""
 
     def __init__(self, document: OsmDocument, max_nodes: int, progress: Progress | None) -> None:

@@ -22,7 +22,7 @@ _LEVEL: Final = 9
 
 
 @dataclass(frozen=True, slots=True)
-class Source:
+class FeatureSource:
     """One file that was imported.
 
     name: what its features are known by. format: "lanelet2", "geojson", ... ids: of its features by layer.
@@ -40,7 +40,7 @@ class Source:
             raise FeatureFileError(f"a source's name has 1 … 200 characters, got {len(self.name)}")
 
 
-def put_source(c: apsw.Connection, source: Source, now_ns: int) -> None:
+def put_source(c: apsw.Connection, source: FeatureSource, now_ns: int) -> None:
     """Keep a source in place of one of the same name; inside the caller's transaction."""
     ids = {layer: list(numbers) for layer, numbers in source.ids.items()}
     about = {"format": source.format, "options": dict(source.options), "ids": ids}
@@ -57,18 +57,18 @@ TABLE: Final = (
 """Made with the first import: stores without one are as they were."""
 
 
-def get_sources(c: apsw.Connection) -> list[Source]:
+def get_sources(c: apsw.Connection) -> list[FeatureSource]:
     """All sources, sorted by name."""
     if not fetch(c, "feature_source_exists"):
         return []
     return [_source(*row) for row in fetch(c, "feature_sources")]
 
 
-def _source(name: str, about: str, body: bytes) -> Source:
+def _source(name: str, about: str, body: bytes) -> FeatureSource:
     try:
         told = json.loads(about)
         document = zstandard.ZstdDecompressor().decompress(body, max_output_size=MAX_DOCUMENT_BYTES)
         ids = {layer: tuple(map(int, numbers)) for layer, numbers in told["ids"].items()}
-        return Source(name, told["format"], ids, told["options"], document)
+        return FeatureSource(name, told["format"], ids, told["options"], document)
     except (ValueError, KeyError, TypeError, AttributeError, zstandard.ZstdError) as error:
         raise StoreError(f"source {name!r:.80} of the store is damaged: {type(error).__name__}: {error}") from None

@@ -12,7 +12,7 @@ from gnd.gnd_map.tile_id import TileId
 from gnd.tile_store import sqlite_versions as versions
 from gnd.tile_store.feature_io.errors import BadGeometry, DuplicateId, FeatureFileError
 from gnd.tile_store.feature_io.osm_document import Progress
-from gnd.tile_store.feature_io.sources import Source, get_sources, put_source
+from gnd.tile_store.feature_io.sources import FeatureSource, get_sources, put_source
 from gnd.tile_store.feature_io.tiling import cut, whole
 from gnd.tile_store.feature_io.values import FeatureFile, MapFeature
 from gnd.tile_store.sqlite_connection import fetch
@@ -79,7 +79,7 @@ def import_features(
     old = known[source].ids if source in known else {}
     puts, removed = _puts(store, file, old, progress)
     ids = {layer: tuple(sorted(f.feature_id for f in file.features if f.layer == layer)) for layer in file.layers}
-    kept = _kept(Source(source, file.format, ids, options or {}, file.document or b""), known.get(source))
+    kept = _kept(FeatureSource(source, file.format, ids, options or {}, file.document or b""), known.get(source))
 
     def work(c: apsw.Connection, now: int) -> int:
         published = sum(_put(c, one, now) for one in puts)
@@ -92,11 +92,11 @@ def import_features(
     )
 
 
-def _kept(new: Source, before: Source | None) -> Source:
+def _kept(new: FeatureSource, before: FeatureSource | None) -> FeatureSource:
     """What is kept of a source: features that come back from an editor without their document keep it."""
     if before is None or new.document or not before.document:
         return new
-    return Source(new.name, before.format, new.ids, before.options, before.document)
+    return FeatureSource(new.name, before.format, new.ids, before.options, before.document)
 
 
 def _put(c: apsw.Connection, one: _Put, now: int) -> bool:
@@ -110,7 +110,7 @@ def _put(c: apsw.Connection, one: _Put, now: int) -> bool:
     return versions.put_base(c, one.layer, one.tile.tile_id, one.content, "base", now).status == "published"
 
 
-def _refuse_foreign(file: FeatureFile, source: str, known: Mapping[str, Source]) -> None:
+def _refuse_foreign(file: FeatureFile, source: str, known: Mapping[str, FeatureSource]) -> None:
     """Two files must not write one feature in turns."""
     others = (other for other in known.values() if other.name != source)
     owner = {id_: other.name for other in others for ids in other.ids.values() for id_ in ids}
@@ -167,7 +167,7 @@ def layer_tiles(store: SqliteStore, layer: str) -> list[FeatureTile]:
     return [one.decode_features() for one in stored if one is not None]
 
 
-def sources_of(store: SqliteStore) -> dict[str, Source]:
+def sources_of(store: SqliteStore) -> dict[str, FeatureSource]:
     """The files that the store's features come from, by name."""
     return {source.name: source for source in store.look(get_sources)}
 

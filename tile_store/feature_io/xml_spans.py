@@ -65,7 +65,7 @@ def read_root(data: bytes, where: str, on_child: Handler | None = None) -> Eleme
         UnknownFormat: another encoding.
         FileTooLarge: elements lie too deep.
     """
-    reading = _Reading(data, where, on_child)
+    reading = _XmlReading(data, where, on_child)
     parser = expat.ParserCreate()
     parser.buffer_text = True
     parser.XmlDeclHandler = reading.declaration
@@ -81,7 +81,7 @@ def read_root(data: bytes, where: str, on_child: Handler | None = None) -> Eleme
     return reading.root
 
 
-class _Reading:
+class _XmlReading:
     def __init__(self, data: bytes, where: str, on_child: Handler | None) -> None:
         self.root: Element | None = None
         self._data, self._where, self._on_child = data, where, on_child

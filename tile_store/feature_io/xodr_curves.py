@@ -21,7 +21,7 @@ _FINE: Final = 4096
 
 
 @dataclass(frozen=True, slots=True)
-class Piece:
+class CurvePiece:
     """One record of a reference line: from distance s_m on, start in x, y, heading, length, curve."""
 
     s_m: float
@@ -36,7 +36,7 @@ class Piece:
 class ReferenceLine:
     """The pieces of a road's reference line, by distance."""
 
-    pieces: tuple[Piece, ...]
+    pieces: tuple[CurvePiece, ...]
 
     def at(self, s_m: F64) -> tuple[F64, F64, F64]:
         """x, y and heading, each (N,), at distances (N,)."""
@@ -116,7 +116,7 @@ def _slope(k: F64, p: F64) -> F64:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Profile:
+class HeightProfile:
     """Cubics that follow each other: start_m (K,) ascending, coefficients (K, 4) of the distance from there."""
 
     start_m: F64

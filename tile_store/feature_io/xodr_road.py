@@ -13,8 +13,8 @@ from gnd.tile_store.feature_io.osm_document import real
 from gnd.tile_store.feature_io.xml_spans import Element
 from gnd.tile_store.feature_io.xodr_curves import (
     Curve,
-    Piece,
-    Profile,
+    CurvePiece,
+    HeightProfile,
     ReferenceLine,
     arc,
     line,
@@ -28,13 +28,13 @@ MAX_ROAD_M: Final = 1_000_000.0
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Lane:
+class XodrLane:
     """A lane: id (left positive), type, width or border along it, and its first mark."""
 
     id: int
     type: str
-    width: Profile
-    border: Profile | None
+    width: HeightProfile
+    border: HeightProfile | None
     mark: str
     colour: str
 
@@ -45,7 +45,7 @@ class Section:
 
     start_m: float
     end_m: float
-    lanes: dict[int, Lane]
+    lanes: dict[int, XodrLane]
 
     def border_m(self, lane_id: int, s_m: F64) -> F64:
         """(N,) lateral places, from the offset reference line, of the outer border of a lane."""
@@ -65,9 +65,9 @@ class Road:
     where: str
     length_m: float
     plan: ReferenceLine
-    elevation: Profile
-    superelevation: Profile
-    lane_offset: Profile
+    elevation: HeightProfile
+    superelevation: HeightProfile
+    lane_offset: HeightProfile
     sections: tuple[Section, ...]
     element: Element
 
@@ -110,24 +110,24 @@ def value(where: str, element: Element, key: str, default: float | None = None) 
     return real(f"{where}, line {element.line}", f"{key} of <{element.name}>", text)
 
 
-def profile(where: str, parent: Element | None, name: str, start: str = "s") -> Profile:
+def profile(where: str, parent: Element | None, name: str, start: str = "s") -> HeightProfile:
     """The cubics of a name below an element."""
     found = parent.all(name) if parent else []
     starts = np.array([value(where, one, start) for one in found], np.float64)
     rows = [[value(where, one, key) for key in _COEFFICIENTS] for one in found]
     if (np.diff(starts) < 0).any():
         raise BadElement(f"{where}: its {len(starts)} <{name}> do not ascend in {start}")
-    return Profile(starts, np.array(rows, np.float64).reshape(-1, 4))
+    return HeightProfile(starts, np.array(rows, np.float64).reshape(-1, 4))
 
 
-def _piece(where: str, element: Element) -> Piece:
+def _piece(where: str, element: Element) -> CurvePiece:
     s, x, y, heading, length = (value(where, element, key) for key in ("s", "x", "y", "hdg", "length"))
     if length <= 0:
         raise BadElement(f"{where}, line {element.line}: a geometry of length {length} m")
     shape = next((child for child in element.children if child.name in _SHAPES), None)
     if shape is None:
         raise BadElement(f"{where}, line {element.line}: a geometry that is none of {', '.join(_SHAPES)}")
-    return Piece(s, x, y, heading, length, _SHAPES[shape.name](where, shape, length))
+    return CurvePiece(s, x, y, heading, length, _SHAPES[shape.name](where, shape, length))
 
 
 def _param(where: str, shape: Element, length: float) -> Curve:
@@ -155,8 +155,8 @@ def _sections(where: str, lanes: Element | None, length_m: float) -> tuple[Secti
     return tuple(Section(a, b, _lanes(where, one)) for one, a, b in zip(found, starts, ends, strict=True))
 
 
-def _lanes(where: str, section: Element) -> dict[int, Lane]:
-    found: dict[int, Lane] = {}
+def _lanes(where: str, section: Element) -> dict[int, XodrLane]:
+    found: dict[int, XodrLane] = {}
     for side in section.children:
         for element in side.all("lane"):
             lane = _lane(where, element)
@@ -172,13 +172,13 @@ def _lanes(where: str, section: Element) -> dict[int, Lane]:
     return found
 
 
-def _lane(where: str, element: Element) -> Lane:
+def _lane(where: str, element: Element) -> XodrLane:
     number = value(where, element, "id")
     if not number.is_integer():
         raise BadElement(f"{where}, line {element.line}: lane id {number} is no whole number")
     mark = element.find("roadMark")
     said = mark.attributes if mark else {}
-    return Lane(
+    return XodrLane(
         int(number), element.attributes.get("type", "none"), profile(where, element, "width", "sOffset"),
         profile(where, element, "border", "sOffset") if element.find("border") else None,
         said.get("type", "none"), said.get("color", ""),

@@ -22,7 +22,7 @@ from gnd.vehicle_agent.local_map import EMPTY, UNKNOWN, LocalMap
 
 
 @dataclass(slots=True)
-class _Window:
+class _VoxelWindow:
     """The dense window of one generation of the local map with everything counted so far."""
 
     generation: int
@@ -46,7 +46,7 @@ class ChangeDetector:
         self.parameters = parameters or DetectParameters()
         self._points = VoxelAccumulator(local_map.grid_frame)
         self._poses = TileUncertainties(local_map.grid_frame)
-        self._window: _Window | None = None
+        self._window: _VoxelWindow | None = None
 
     def add_scan(
         self,
@@ -112,7 +112,7 @@ class ChangeDetector:
         of_passes = self._poses.mean()
         return {t: self._take(window, t, measured.get(t, Gaussians.empty()), of_passes) for t in held}
 
-    def _current(self) -> _Window:
+    def _current(self) -> _VoxelWindow:
         """The window of the map as it is now; counters move along when the map has changed."""
         if self._window is None or self._window.generation != self.local_map.generation:
             fresh = self._fresh_window()
@@ -121,10 +121,10 @@ class ChangeDetector:
             self._window = fresh
         return self._window
 
-    def _fresh_window(self) -> _Window:
+    def _fresh_window(self) -> _VoxelWindow:
         held = self.local_map
         anchor_m = held.mean_map_m.mean(axis=0) if held.count else np.zeros(3)
-        return _Window(
+        return _VoxelWindow(
             generation=held.generation,
             origin_g=held.window_origin_g,
             anchor_m=anchor_m,
@@ -134,7 +134,7 @@ class ChangeDetector:
             tiles={t: tile for t in held.tiles if (tile := held.tile(t)) is not None},
         )
 
-    def _carry_over(self, old: _Window, new: _Window) -> None:
+    def _carry_over(self, old: _VoxelWindow, new: _VoxelWindow) -> None:
         """Copy pass counters of the voxels and counters of the Gaussians that both windows hold."""
         for tile_id, tile in old.tiles.items():
             if new.tiles.get(tile_id) is tile:
@@ -147,18 +147,20 @@ class ChangeDetector:
         before, after = _overlap(old, new)
         np.copyto(after, before, where=(before < 0) & (before != UNKNOWN) & (after == EMPTY))
 
-    def _is_touched(self, window: _Window, tile_id: TileId) -> bool:
+    def _is_touched(self, window: _VoxelWindow, tile_id: TileId) -> bool:
         if window.records.words[window.rows[tile_id], N_BI:].any():
             return True
         state = self._columns(window, tile_id)
         return bool(((state < EMPTY) & (state != UNKNOWN)).any())
 
-    def _columns(self, window: _Window, tile_id: TileId) -> I32:
+    def _columns(self, window: _VoxelWindow, tile_id: TileId) -> I32:
         """(nx, ny, nz) view of the tile's part of the window."""
         x, y = self.local_map.box_of(tile_id, window.origin_g)
         return window.state[x, y]
 
-    def _take(self, window: _Window, tile_id: TileId, measured: Gaussians, of_passes: PoseUncertainty) -> TileEvidence:
+    def _take(
+        self, window: _VoxelWindow, tile_id: TileId, measured: Gaussians, of_passes: PoseUncertainty
+    ) -> TileEvidence:
         """The tile's evidence; its counters are set back to zero."""
         tile = window.tiles[tile_id]
         passes = self._take_passes(window, tile_id)
@@ -168,7 +170,7 @@ class ChangeDetector:
         found = tile_evidence(tile, counters, passes, np.union1d(seen, measured.voxel_id), measured)
         return replace(found, pose=self._poses.pop(tile_id) or of_passes)
 
-    def _take_passes(self, window: _Window, tile_id: TileId) -> tuple[I32, I32]:
+    def _take_passes(self, window: _VoxelWindow, tile_id: TileId) -> tuple[I32, I32]:
         """Voxel ids and pass counts of the tile's empty voxels that rays crossed."""
         state = self._columns(window, tile_id)
         at = np.nonzero((state < EMPTY) & (state != UNKNOWN))
@@ -180,14 +182,14 @@ class ChangeDetector:
         return voxel_id, n_pe
 
 
-def _overlap(old: _Window, new: _Window) -> tuple[I32, I32]:
+def _overlap(old: _VoxelWindow, new: _VoxelWindow) -> tuple[I32, I32]:
     """Views of the voxels that both windows hold."""
     low = np.maximum(old.origin_g, new.origin_g)
     high = np.maximum(low, np.minimum(old.origin_g + old.state.shape, new.origin_g + new.state.shape))
     return _part(old, low, high), _part(new, low, high)
 
 
-def _part(window: _Window, low: NDArray[np.int64], high: NDArray[np.int64]) -> I32:
+def _part(window: _VoxelWindow, low: NDArray[np.int64], high: NDArray[np.int64]) -> I32:
     (x0, y0, z0), (x1, y1, z1) = low - window.origin_g, high - window.origin_g
     return window.state[x0:x1, y0:y1, z0:z1]
 

@@ -43,7 +43,7 @@ _LONGEST_MM: Final = 100_000
 
 
 @dataclass(slots=True)
-class Account:
+class TileAccount:
     """Scans that saw a tile, by what became of them."""
 
     scans: dict[str, int] = field(default_factory=dict)
@@ -71,13 +71,13 @@ class TileDoubts:
 
     def __init__(self, grid_frame: GridFrame) -> None:
         self._grid_frame = grid_frame
-        self._accounts: dict[TileId, Account] = {}
+        self._accounts: dict[TileId, TileAccount] = {}
 
     def tried(self, tried: Tried, costs: F64 | None) -> None:
         """Take a segment; of one that is shifted, the cost of each of its points at the pose as it is."""
         morton, voxel = self._tiles_of(tried.points_map_m)
         for code in np.unique(morton).tolist():
-            account = self._accounts.setdefault(TileId(code), Account())
+            account = self._accounts.setdefault(TileId(code), TileAccount())
             account.add(tried.verdict, tried.scans)
             if costs is None:
                 continue
@@ -89,7 +89,7 @@ class TileDoubts:
         """Take some points (N, 3) of a scan that is no evidence ("uncertain"), or whose estimates "disagree"."""
         morton, _ = self._tiles_of(points_map_m)
         for code in np.unique(morton).tolist():
-            self._accounts.setdefault(TileId(code), Account()).add(what, 1)
+            self._accounts.setdefault(TileId(code), TileAccount()).add(what, 1)
 
     def tiles(self) -> tuple[TileId, ...]:
         """Tiles in which a pose error was found."""
@@ -104,9 +104,9 @@ class TileDoubts:
         for tile in tiles:
             self._accounts.pop(tile, None)
 
-    def take(self, tile: TileId) -> Account:
+    def take(self, tile: TileId) -> TileAccount:
         """What is known of a tile; forgotten here."""
-        return self._accounts.pop(tile, Account())
+        return self._accounts.pop(tile, TileAccount())
 
     def _tiles_of(self, points_map_m: F64) -> tuple[NDArray[np.int64], NDArray[np.int32]]:
         if not len(points_map_m):
@@ -131,7 +131,7 @@ def plausible_share(base_day: int, day: int) -> float:
     return min(BURST_SHARE + SHARE_OF_YEAR * (day - base_day) / _DAYS_OF_YEAR, IMPLAUSIBLE_SHARE)
 
 
-def doubt_of(found: Classification, account: Account, day: int = UNKNOWN_DAY) -> Doubt | None:
+def doubt_of(found: Classification, account: TileAccount, day: int = UNKNOWN_DAY) -> Doubt | None:
     """Why a tile that is told all the same is not fully believed; None where nothing speaks against it, or where
     nothing has changed. `day`: of the drive, `gnd.gnd_map.day`.
     """
@@ -159,7 +159,7 @@ def changed_share_of(found: Classification) -> float:
     return changed / holding if holding >= LEAST_OF_SHARE else 0.0
 
 
-def withheld_change(base: Tile, account: Account, changed_share: float = 0.0) -> TileChange:
+def withheld_change(base: Tile, account: TileAccount, changed_share: float = 0.0) -> TileChange:
     """A tile of which nothing is told, because a pose error explains what seems to have changed."""
     nothing = Gaussians.empty()
     return TileChange(
@@ -176,7 +176,7 @@ def withheld_change(base: Tile, account: Account, changed_share: float = 0.0) ->
     )
 
 
-def _doubt(reasons: DoubtReason, account: Account, changed_share: float, withheld: int = 0) -> Doubt:
+def _doubt(reasons: DoubtReason, account: TileAccount, changed_share: float, withheld: int = 0) -> Doubt:
     shift = account.shift or no_shift()
     mm = np.clip(np.rint(shift.shift_m * 1e3), -_LONGEST_MM, _LONGEST_MM).astype(int).tolist()
     return Doubt(

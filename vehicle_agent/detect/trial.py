@@ -39,7 +39,7 @@ _EVERY_RECENT: Final = 2
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class _Held:
+class _TrialScan:
     """A scan that waits, in a third of its memory: points to 10 µm, origins to 0.1 mm."""
 
     t_ns: int
@@ -51,7 +51,7 @@ class _Held:
     moving: NDArray[np.bool_]
 
     @classmethod
-    def of(cls, segmented: SegmentedScan) -> "_Held":
+    def of(cls, segmented: SegmentedScan) -> "_TrialScan":
         scan = segmented.scan
         centre = scan.origins_map_m.mean(axis=0) if len(scan.origins_map_m) else np.zeros(3)
         origins = (scan.origins_map_m - centre).astype(np.float32)
@@ -98,7 +98,7 @@ class _Recent:
     X: F64
 
     @classmethod
-    def of(cls, scans: list[_Held], X: F64) -> "_Recent":
+    def of(cls, scans: list[_TrialScan], X: F64) -> "_Recent":
         centre = scans[0].centre_m
         still = [
             held.points[~held.moving][::_EVERY_RECENT] + (held.centre_m - centre).astype(np.float32) for held in scans
@@ -109,7 +109,7 @@ class _Recent:
 @dataclass(slots=True)
 class _Segment:
     first_ns: int
-    scans: list[_Held] = field(default_factory=list)
+    scans: list[_TrialScan] = field(default_factory=list)
 
 
 class Trial:
@@ -124,7 +124,7 @@ class Trial:
         self.counts: Counter[str] = Counter()
         self._map, self._parameters = match_map, parameters
         self._open: _Segment | None = None
-        self._passed: list[_Held] = []
+        self._passed: list[_TrialScan] = []
         self._wrong = False  # the segment before was
         self._tried: deque[Tried] = deque()
         self._refused_until_ns = -1
@@ -140,7 +140,7 @@ class Trial:
             yield from self._close()
         if self._open is None:
             self._open = _Segment(t_ns)
-        self._open.scans.append(_Held.of(segmented))
+        self._open.scans.append(_TrialScan.of(segmented))
 
     def flush(self) -> Iterator[SegmentedScan]:
         """The drive has ended: give what has stood the test until now."""
@@ -184,7 +184,7 @@ class Trial:
             yield from self._release(before)
             self._passed = segment.scans
 
-    def _try(self, scans: list[_Held]) -> Tried:
+    def _try(self, scans: list[_TrialScan]) -> Tried:
         """Ask the base map, and where that says "shifted" what was seen just before."""
         n = max(_LEAST_POINTS_OF_SCAN, _POINTS_OF_SEGMENT // len(scans))
         points = np.concatenate([some_of(held.points[~held.moving], held.centre_m, n) for held in scans])
@@ -224,7 +224,7 @@ class Trial:
         return max(shift.z, (shift.z + z) / math.sqrt(2.0)) if min(shift.z, z) > 0.0 else 0.0
 
     @staticmethod
-    def _release(scans: list[_Held]) -> Iterator[SegmentedScan]:
+    def _release(scans: list[_TrialScan]) -> Iterator[SegmentedScan]:
         while scans:
             yield scans.pop(0).restore()
 

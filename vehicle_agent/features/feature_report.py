@@ -16,7 +16,7 @@ _log = logging.getLogger(__name__)
 
 
 @dataclass(slots=True)
-class _Pending:
+class _PendingFeatures:
     """Tiles of one district that are decided; the district's other tiles are still in sight."""
 
     since_m: float
@@ -40,7 +40,7 @@ class FeatureReporter:
     def __init__(self, outbox: ReportSink, identity: Identity, start_ns: int, longest_m: float) -> None:
         self.counts: Counter[str] = Counter()
         self._outbox, self._who, self._start_ns, self._longest_m = outbox, identity, start_ns, longest_m
-        self._pending: dict[District, _Pending] = {}
+        self._pending: dict[District, _PendingFeatures] = {}
         self._numbers: Counter[District] = Counter()
 
     def add(self, change: FeatureChange, t_ns: int, odometer_m: float) -> None:
@@ -48,7 +48,7 @@ class FeatureReporter:
         district = change.tile.district
         if district in self._pending and change.tile in self._pending[district].changes:
             self._report(district, t_ns)
-        pending = self._pending.setdefault(district, _Pending(odometer_m, t_ns))
+        pending = self._pending.setdefault(district, _PendingFeatures(odometer_m, t_ns))
         pending.changes[change.tile] = change
 
     def report(self, in_sight: Collection[TileId], t_ns: int, odometer_m: float) -> None:
@@ -74,7 +74,7 @@ class FeatureReporter:
             self.counts["reports_known"] += 1  # this agent was restarted: its first statement stands
         _log.info("report %s: %d tiles of layer %s in %s", report.report_id, len(report.tiles), report.layer, district)
 
-    def _make(self, district: District, pending: _Pending, t_ns: int) -> FeatureReport:
+    def _make(self, district: District, pending: _PendingFeatures, t_ns: int) -> FeatureReport:
         who, number = self._who, str(self._numbers[district])
         parts = who.vehicle, who.drive_id, who.layer, district.path, number
         return FeatureReport(

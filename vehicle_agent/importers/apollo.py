@@ -20,7 +20,7 @@ from gnd.gnd_map.utm import convergence_rad, geodetic_from_utm
 from gnd.vehicle_agent.errors import ImportDriveError
 from gnd.vehicle_agent.importers.files import check_folder, files_of
 from gnd.vehicle_agent.importers.pcd import read_scan, scan_number, table_of
-from gnd.vehicle_agent.importers.recording import Anchor, Recording
+from gnd.vehicle_agent.importers.recording import Recording, RecordingAnchor
 
 F64 = NDArray[np.float64]
 
@@ -40,7 +40,7 @@ def zone_folders(folder: Path) -> list[Path]:
     return sorted(path for path in folder.glob("*/map/*/*/*") if re.fullmatch(r"\d{1,2}", path.name) and path.is_dir())
 
 
-def open_apollo(folder: Path, anchor: Anchor | None) -> Recording:
+def open_apollo(folder: Path, anchor: RecordingAnchor | None) -> Recording:
     """An Apollo folder. Its poses give its place; `anchor` only moves the origin of the map frame.
 
     Raises:
@@ -77,10 +77,10 @@ def utm_zone(folder: Path) -> tuple[int, bool]:
     return found.pop()
 
 
-def anchor_of(p_utm_m: F64, zone: int, southern: bool) -> Anchor:
+def anchor_of(p_utm_m: F64, zone: int, southern: bool) -> RecordingAnchor:
     """The place of a position (easting, northing, height)."""
     lat, lon = geodetic_from_utm(p_utm_m[0], p_utm_m[1], zone, southern=southern)
-    return Anchor(float(np.degrees(lat)), float(np.degrees(lon)), float(p_utm_m[2]))
+    return RecordingAnchor(float(np.degrees(lat)), float(np.degrees(lon)), float(p_utm_m[2]))
 
 
 def poses_from_utm(T_utm: F64, zone: int, southern: bool, frame: LocalFrame) -> F64:

@@ -25,7 +25,7 @@ from gnd.vehicle_agent.importers.lidar_odometry import track_of_scans
 from gnd.vehicle_agent.importers.plane_thickness import Comparison, Thickness, compared, thickness_of
 from gnd.vehicle_agent.importers.recording import Recording
 from gnd.vehicle_agent.importers.sweep_times import (
-    Sweep,
+    FoundSweep,
     SweepFit,
     azimuth_times,
     fit_sweep,
@@ -81,7 +81,7 @@ def with_times(recording: Recording) -> tuple[Recording, Verdict]:
     if cleaned_offsets(recording):
         return replace(recording, deskew="measured"), Verdict("measured", "")
     sweep_ns = recording.sweep_ns or int(np.median(np.diff(recording.t_ns)))
-    reasons, laid = [], list[_Window]()
+    reasons, laid = [], list[_SpinWindow]()
     for numbers in windows_of(len(recording)):
         verdict, share_of = _decide(recording, numbers, sweep_ns, laid)
         if share_of is not None:
@@ -124,7 +124,7 @@ def _with_offsets(scan: RawScan | Scan, share_of: ShareOf, sweep_ns: int, early_
     return RawScan(scan.t_ns - early_ns, np.ascontiguousarray(scan.points_m[sure]), offset, ring)
 
 
-def share_by_azimuth(sweep: Sweep) -> ShareOf:
+def share_by_azimuth(sweep: FoundSweep) -> ShareOf:
     """Times from the azimuths of points, for scans whose points lie in any order."""
 
     def share_of(scan: RawScan | Scan) -> F64:
@@ -146,7 +146,7 @@ def _backwards(share_of: ShareOf) -> ShareOf:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class _Window:
+class _SpinWindow:
     """A window laid together: its scans, their track (a pose more at either end), how thick upright surfaces are."""
 
     scans: tuple[Scan, ...]
@@ -164,7 +164,7 @@ class _Window:
         return self.track.T_dst_vehicle[1:-1]
 
 
-def _laid(recording: Recording, numbers: range, rough: Trajectory | None = None) -> _Window:
+def _laid(recording: Recording, numbers: range, rough: Trajectory | None = None) -> _SpinWindow:
     """Lay a window together; `rough`: the motion to deskew with, so that the first sweeps are deskewed as well."""
     scans = [scan for i in numbers if (scan := cleaned(recording.read(i)).scan) is not None]
     track = _longer(track_of_scans(recording, scans, rough))
@@ -174,7 +174,7 @@ def _laid(recording: Recording, numbers: range, rough: Trajectory | None = None)
         points = deskew(some, scan.t_offset_ns[::EVERY], scan.t_ns, track, recording.T_vehicle_lidar, int(t_ns))
         range_m = np.linalg.norm(some, axis=1)
         clouds.append(transform(T, points[(range_m > NEAR_M) & (range_m < FAR_M)]))
-    return _Window(tuple(scans), track, thickness_of(clouds))
+    return _SpinWindow(tuple(scans), track, thickness_of(clouds))
 
 
 def _longer(track: Trajectory) -> Trajectory:
@@ -186,7 +186,7 @@ def _longer(track: Trajectory) -> Trajectory:
 
 
 def _decide(
-    recording: Recording, numbers: range, sweep_ns: int, before: list[_Window]
+    recording: Recording, numbers: range, sweep_ns: int, before: list[_SpinWindow]
 ) -> tuple[Verdict, ShareOf | None]:
     """What a window says, with those before it (it joins them); with times where they are to be reconstructed."""
     if len(numbers) < LEAST_SCANS:
@@ -214,7 +214,7 @@ class _Tried:
     certain: bool
 
 
-def _times_in(recording: Recording, laid: Sequence[_Window], sweep_ns: int) -> _Tried:
+def _times_in(recording: Recording, laid: Sequence[_SpinWindow], sweep_ns: int) -> _Tried:
     if all(firing_share(scan.points_m) is not None for scan in laid[-1].scans):
         turn = "clockwise" if _turns_clockwise(laid[-1].scans[0]) else "counter-clockwise"
         return _Tried(f"from the firing order, {turn}", share_by_order, certain=True)
@@ -240,7 +240,7 @@ def _turns_clockwise(scan: Scan) -> bool:
     return bool(azimuth[-1] < azimuth[0])
 
 
-def _fit(recording: Recording, laid: Sequence[_Window], sweep_ns: int) -> SweepFit:
+def _fit(recording: Recording, laid: Sequence[_SpinWindow], sweep_ns: int) -> SweepFit:
     """The saw tooth in some windows; surfaces are paired anew with the times found so far."""
     patches = [[patches_of(scan.points_m, recording.T_vehicle_lidar) for scan in window.scans] for window in laid]
     steps = [steps_of(window.track.t_ns[1:-1], window.poses, sweep_ns) for window in laid]

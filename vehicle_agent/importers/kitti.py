@@ -17,7 +17,7 @@ from gnd.schemas.drive import GnssFix
 from gnd.vehicle_agent.errors import ImportDriveError
 from gnd.vehicle_agent.importers.cleaning import RawScan
 from gnd.vehicle_agent.importers.files import check_folder, files_below, files_of, read_file
-from gnd.vehicle_agent.importers.recording import GNSS_SIGMA_M, NOMINAL, Anchor, Recording, mount
+from gnd.vehicle_agent.importers.recording import GNSS_SIGMA_M, NOMINAL, Recording, RecordingAnchor, mount
 
 F64 = NDArray[np.float64]
 
@@ -38,7 +38,7 @@ T_CAMERA_LIDAR_2011_10_03 = np.array(
 )
 
 
-def open_kitti(folder: Path, anchor: Anchor | None) -> Recording:
+def open_kitti(folder: Path, anchor: RecordingAnchor | None) -> Recording:
     """A KITTI folder; `anchor`: where its first pose is put, heading east.
 
     Raises:
@@ -91,7 +91,7 @@ def _times(folder: Path, n: int) -> NDArray[np.int64]:
     return START_NS + np.round(seconds[:n] * 1e9).astype(np.int64)
 
 
-def _fixes(folder: Path, t_ns: NDArray[np.int64], T_vehicle_lidar: F64, anchor: Anchor) -> tuple[GnssFix, ...]:
+def _fixes(folder: Path, t_ns: NDArray[np.int64], T_vehicle_lidar: F64, anchor: RecordingAnchor) -> tuple[GnssFix, ...]:
     """Positions of the ground truth, where there is one."""
     files = files_of(folder, "poses.txt", "*_gt.txt")
     if not files:

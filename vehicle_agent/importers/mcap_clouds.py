@@ -26,7 +26,7 @@ from gnd.vehicle_agent.importers.fields import Field, scan_of_fields, unpack
 from gnd.vehicle_agent.importers.files import files_below
 from gnd.vehicle_agent.importers.point_cloud2 import SCHEMA as POINT_CLOUD2
 from gnd.vehicle_agent.importers.point_cloud2 import decode_cloud, stamp_ns
-from gnd.vehicle_agent.importers.recording import NOMINAL, Anchor, Recording
+from gnd.vehicle_agent.importers.recording import NOMINAL, Recording, RecordingAnchor
 
 FOXGLOVE_CLOUD: Final = "foxglove.PointCloud"
 _ENCODINGS: Final = {POINT_CLOUD2: "cdr", FOXGLOVE_CLOUD: "protobuf"}
@@ -43,7 +43,7 @@ class _At:
     stamp_ns: int
 
 
-def open_mcap_clouds(place: Path, anchor: Anchor | None, topic: str | None = None) -> Recording:
+def open_mcap_clouds(place: Path, anchor: RecordingAnchor | None, topic: str | None = None) -> Recording:
     """A file, or a folder with the files of one recording.
 
     Args:
@@ -94,7 +94,7 @@ def _own_drive(path: Path) -> Recording:
         T_vehicle_lidar=header.T_vehicle_lidar,
         t_ns=t_ns,
         read=lambda i: _read(clouds[i], POINTS_TOPIC, FOXGLOVE_CLOUD),
-        anchor=Anchor(np.degrees(frame.lat_rad), np.degrees(frame.lon_rad), frame.height_m),
+        anchor=RecordingAnchor(np.degrees(frame.lat_rad), np.degrees(frame.lon_rad), frame.height_m),
         track=Trajectory(reference.t_ns, reference.T_map_vehicle) if covered else None,
         gnss=tuple(GnssFix(int(t), *map(float, row)) for t, *row in zip(*track.gnss, strict=True)),
         motion=tuple(MotionSample(int(t), float(v), float(w)) for t, v, w in zip(*track.motion, strict=True)),

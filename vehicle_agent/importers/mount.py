@@ -83,13 +83,13 @@ class YawSeen:
 
 
 @dataclass(frozen=True, slots=True)
-class Refused:
+class MountRefused:
     """Why something cannot be told."""
 
     reason: str
 
 
-def ground_of(points_lidar_m: NDArray[np.generic], course_rad: float | None = None) -> GroundSeen | Refused:
+def ground_of(points_lidar_m: NDArray[np.generic], course_rad: float | None = None) -> GroundSeen | MountRefused:
     """The ground in one scan (N, 3); z of the LiDAR must point upwards to 20°.
 
     Args:
@@ -104,16 +104,16 @@ def ground_of(points_lidar_m: NDArray[np.generic], course_rad: float | None = No
     lowest = _lowest_of_cells(near)
     candidates = lowest[lowest[:, 2] < 0.0]
     if len(candidates) < LEAST_CELLS:
-        return Refused(f"{len(candidates)} places below the LiDAR within reach, {LEAST_CELLS} needed")
+        return MountRefused(f"{len(candidates)} places below the LiDAR within reach, {LEAST_CELLS} needed")
     found = _largest_plane(candidates)
     if found is None:
-        return Refused("no plane below the LiDAR that is level to 20°")
+        return MountRefused("no plane below the LiDAR that is level to 20°")
     normal, height = _refined(near, *found)
     off = candidates @ normal + height
     ground = candidates[np.abs(off) < INLIER_M]
     spread_m = float(np.sqrt(np.linalg.eigvalsh(np.cov(ground[:, :2].T))[0])) if len(ground) > 2 else 0.0
     if spread_m < least_spread_m:
-        return Refused(f"the ground is seen over {spread_m:.1f} m only (deviation), {least_spread_m} m needed")
+        return MountRefused(f"the ground is seen over {spread_m:.1f} m only (deviation), {least_spread_m} m needed")
     return _checked(normal, height, len(ground) / len(candidates), float((near @ normal + height < -BELOW_M).mean()))
 
 
@@ -171,13 +171,17 @@ def _refined(points: F64, normal: F64, height: float) -> tuple[F64, float]:
     return normal, height
 
 
-def _checked(normal: F64, height: float, share: float, below: float) -> GroundSeen | Refused:
+def _checked(normal: F64, height: float, share: float, below: float) -> GroundSeen | MountRefused:
     if share < LEAST_SHARE:
-        return Refused(f"the largest plane holds {share:.0%} of the places below the LiDAR, {LEAST_SHARE:.0%} needed")
+        return MountRefused(
+            f"the largest plane holds {share:.0%} of the places below the LiDAR, {LEAST_SHARE:.0%} needed"
+        )
     if not HEIGHTS_M[0] <= height <= HEIGHTS_M[1]:
-        return Refused(f"the largest plane lies {height:.2f} m below the LiDAR, {HEIGHTS_M[0]} to {HEIGHTS_M[1]} m fit")
+        return MountRefused(
+            f"the largest plane lies {height:.2f} m below the LiDAR, {HEIGHTS_M[0]} to {HEIGHTS_M[1]} m fit"
+        )
     if below > MOST_BELOW:
-        return Refused(f"{below:.0%} of the points lie below the largest plane, which is no ground then")
+        return MountRefused(f"{below:.0%} of the points lie below the largest plane, which is no ground then")
     return GroundSeen(height, *tilt_of(normal))
 
 
@@ -188,7 +192,9 @@ def tilt_of(normal_lidar: F64) -> tuple[float, float]:
     return roll, pitch
 
 
-def ground_of_scans(seen: Iterable[GroundSeen | Refused], floor_rad: float = FLOOR_RAD) -> GroundSeen | Refused:
+def ground_of_scans(
+    seen: Iterable[GroundSeen | MountRefused], floor_rad: float = FLOOR_RAD
+) -> GroundSeen | MountRefused:
     """What scans say together: the median of those that agree, and a sigma from how far they do.
 
     Args:
@@ -198,13 +204,15 @@ def ground_of_scans(seen: Iterable[GroundSeen | Refused], floor_rad: float = FLO
     every = list(seen)
     found = [one for one in every if isinstance(one, GroundSeen)]
     if len(found) < max(LEAST_SCANS, (len(every) + 1) // 2):
-        reasons = [one.reason for one in every if isinstance(one, Refused)]
+        reasons = [one.reason for one in every if isinstance(one, MountRefused)]
         said = f": {reasons[0]}" if reasons else ""
-        return Refused(f"{len(found)} of {len(every)} scans show the ground{said}")
+        return MountRefused(f"{len(found)} of {len(every)} scans show the ground{said}")
     values = np.array([(one.height_m, one.roll_rad, one.pitch_rad) for one in found])
     agree = (np.abs(values - np.median(values, axis=0)) < (AGREE_M, AGREE_RAD, AGREE_RAD)).all(axis=1)
     if agree.sum() < max(LEAST_SCANS, len(found) / 2):
-        return Refused(f"{agree.sum()} of {len(found)} scans agree on the ground to {AGREE_M * 100:.0f} cm and 1.5°")
+        return MountRefused(
+            f"{agree.sum()} of {len(found)} scans agree on the ground to {AGREE_M * 100:.0f} cm and 1.5°"
+        )
     kept = values[agree]
     middle = np.median(kept, axis=0)
     deviation = 1.4826 * np.median(np.abs(kept - middle), axis=0)
@@ -214,7 +222,7 @@ def ground_of_scans(seen: Iterable[GroundSeen | Refused], floor_rad: float = FLO
     return GroundSeen(height, roll, pitch, height_sigma, roll_sigma, pitch_sigma, len(kept))
 
 
-def yaw_of_track(T: F64) -> YawSeen | Refused:
+def yaw_of_track(T: F64) -> YawSeen | MountRefused:
     """Yaw of the LiDAR from the poses (N, 4, 4) of a levelled LiDAR (z upright, origin at the LiDAR) along a drive.
 
     Chords of `CHORD_M` over which the LiDAR does not turn point along the vehicle, seen in the LiDAR's axes. Chords
@@ -223,19 +231,19 @@ def yaw_of_track(T: F64) -> YawSeen | Refused:
     chords = _straight_chords(T)
     way = float(np.linalg.norm(chords, axis=1).sum()) if len(chords) else 0.0
     if way < LEAST_WAY_M:
-        return Refused(f"{way:.0f} m driven straight, {LEAST_WAY_M:.0f} m needed")
+        return MountRefused(f"{way:.0f} m driven straight, {LEAST_WAY_M:.0f} m needed")
     pointer = chords @ np.array([1.0, 1j])
     axis = np.sqrt((pointer**2 / np.abs(pointer)).sum())  # of the line, whichever way along it
     axis *= 1.0 if (pointer * axis.conjugate()).real.sum() > 0 else -1.0
     forward = pointer * np.sign((pointer * axis.conjugate()).real)
     backwards = float(np.abs(pointer[(pointer * axis.conjugate()).real < 0]).sum())
     if backwards > way / 3.0:
-        return Refused(f"{backwards:.0f} of {way:.0f} m were driven against the rest: which way is forward?")
+        return MountRefused(f"{backwards:.0f} of {way:.0f} m were driven against the rest: which way is forward?")
     course = np.angle(forward / axis)
     middle = float(np.median(course))
     spread = float(1.4826 * np.median(np.abs(course - middle)))
     if spread > YAW_SPREAD_RAD:
-        return Refused(f"courses on straight stretches differ by {np.degrees(spread):.1f}°, 2° are allowed")
+        return MountRefused(f"courses on straight stretches differ by {np.degrees(spread):.1f}°, 2° are allowed")
     sigma = np.hypot(1.2533 * spread / np.sqrt(len(course)), YAW_FLOOR_RAD)
     return YawSeen(-float(np.angle(axis * np.exp(1j * middle))), float(sigma), way)
 

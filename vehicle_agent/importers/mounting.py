@@ -18,7 +18,7 @@ from gnd.vehicle_agent.importers.mount import (
     CROWN_RAD,
     FLOOR_RAD,
     GroundSeen,
-    Refused,
+    MountRefused,
     YawSeen,
     ground_of,
     ground_of_scans,
@@ -44,7 +44,7 @@ def levelled(recording: Recording) -> Recording:
     if recording.mount != "assumed":
         return recording
     ground = _ground(recording, None)
-    if isinstance(ground, Refused):
+    if isinstance(ground, MountRefused):
         note = f"mount not given and not found ({ground.reason}): the LiDAR is taken to sit at the vehicle's origin"
         return replace(recording, notes=(*recording.notes, note))
     sigma = MountSigma(ground.height_sigma_m, ground.roll_sigma_rad, ground.pitch_sigma_rad, float("inf"))
@@ -63,7 +63,7 @@ def with_mount(recording: Recording, track: Trajectory) -> tuple[Recording, Traj
     if recording.mount != "estimated" or recording.mount_sigma is None:
         return recording, track
     yaw = yaw_of_track(_lidar_poses(track, recording.T_vehicle_lidar))
-    if isinstance(yaw, Refused):
+    if isinstance(yaw, MountRefused):
         note = f"{_said(recording)}; yaw is not known ({yaw.reason}): the LiDAR's x is taken as forward"
         return replace(recording, notes=(*recording.notes, note)), track
     found = _turned(recording, yaw)
@@ -96,7 +96,7 @@ def _turned(recording: Recording, yaw: YawSeen) -> Recording:
     return replace(recording, T_vehicle_lidar=T, mount_sigma=sigma)
 
 
-def _ground(recording: Recording, course_rad: float | None) -> GroundSeen | Refused:
+def _ground(recording: Recording, course_rad: float | None) -> GroundSeen | MountRefused:
     """The ground as the LiDAR sees it in the vehicle's axes: tilts are what the mount lacks to stand upright."""
     numbers = np.unique(np.linspace(0, len(recording) - 1, LOOKED_AT).astype(int))
     scans = [scan for i in numbers if (scan := cleaned(recording.read(int(i))).scan) is not None]

@@ -19,7 +19,7 @@ from gnd.vehicle_agent.errors import ImportDriveError
 from gnd.vehicle_agent.importers.cleaning import RawScan
 from gnd.vehicle_agent.importers.files import check_folder, files_below, files_of
 from gnd.vehicle_agent.importers.pcd_format import read_pcd
-from gnd.vehicle_agent.importers.recording import Anchor, Recording
+from gnd.vehicle_agent.importers.recording import Recording, RecordingAnchor
 
 F64 = NDArray[np.float64]
 I64 = NDArray[np.int64]
@@ -29,7 +29,7 @@ START_NS = 1_000_000_000_000_000_000  # where no times are given
 SCAN_FOLDERS = (".", "pcds", "pcd", "scans", "velodyne")
 
 
-def open_pcd(folder: Path, anchor: Anchor | None) -> Recording:
+def open_pcd(folder: Path, anchor: RecordingAnchor | None) -> Recording:
     """A folder of PCD files; `anchor` says where on the Earth the first pose lies.
 
     Raises:

@@ -19,7 +19,7 @@ from gnd.schemas.drive import GnssFix, MotionSample
 from gnd.vehicle_agent.errors import ImportDriveError
 from gnd.vehicle_agent.importers.cleaning import RawScan
 from gnd.vehicle_agent.importers.files import check_folder, files_below, read_file
-from gnd.vehicle_agent.importers.recording import GNSS_SIGMA_M, NOMINAL, Anchor, Recording, mount
+from gnd.vehicle_agent.importers.recording import GNSS_SIGMA_M, NOMINAL, Recording, RecordingAnchor, mount
 
 F64 = NDArray[np.float64]
 I64 = NDArray[np.int64]
@@ -37,7 +37,7 @@ KITTI_LIDAR_M: Final = (0.81, -0.32, 1.73)
 KITTI_INS_HEIGHT_M: Final = 0.93
 
 
-def open_planes(folder: Path, anchor: Anchor | None) -> Recording:
+def open_planes(folder: Path, anchor: RecordingAnchor | None) -> Recording:
     """A folder of planes. Its INS gives its place, else `anchor` (or a nominal one) does.
 
     Raises:
@@ -124,10 +124,10 @@ def scan_times(stamps_ns: I64) -> tuple[I64, int]:
     return (even, off) if 0 < off <= EVEN_NS else (stamps_ns, 0)
 
 
-def _place(ins: dict[str, F64]) -> Anchor:
+def _place(ins: dict[str, F64]) -> RecordingAnchor:
     if not len(ins["lat_deg"]):
         return NOMINAL
-    return Anchor(*(float(ins[name][0]) for name in ("lat_deg", "lon_deg", "alt_m")))
+    return RecordingAnchor(*(float(ins[name][0]) for name in ("lat_deg", "lon_deg", "alt_m")))
 
 
 def _fixes(t_ns: I64, ins: dict[str, F64]) -> tuple[GnssFix, ...]:

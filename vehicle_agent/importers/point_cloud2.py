@@ -20,7 +20,7 @@ _CODES: Final = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Cloud:
+class DecodedCloud:
     """When it was stamped, in which frame, and its points (N,) with their fields."""
 
     stamp_ns: int
@@ -65,7 +65,7 @@ def stamp_ns(where: str, data: bytes) -> int:
     return cdr.number("i") * 1_000_000_000 + cdr.number("I")
 
 
-def decode_cloud(where: str, data: bytes) -> Cloud:
+def decode_cloud(where: str, data: bytes) -> DecodedCloud:
     """A cloud from the bytes of a message; `where` names it in errors.
 
     Raises:
@@ -79,7 +79,7 @@ def decode_cloud(where: str, data: bytes) -> Cloud:
     fields = [Field(name, offset, order + code, count) for name, offset, code, count in described]
     step, row_step, packed = cdr.number("I"), cdr.number("I"), cdr.array()
     rows = _without_padding(where, packed, height, width * step, row_step)
-    return Cloud(stamp, frame_id, unpack(where, fields, step, rows, height * width))
+    return DecodedCloud(stamp, frame_id, unpack(where, fields, step, rows, height * width))
 
 
 def _few(n: int, where: str) -> int:

@@ -15,7 +15,7 @@ from gnd.schemas.drive import GnssFix, MotionSample
 from gnd.vehicle_agent.errors import ImportDriveError
 from gnd.vehicle_agent.importers.cleaning import RawScan
 from gnd.vehicle_agent.importers.files import check_folder, files_of, read_file
-from gnd.vehicle_agent.importers.recording import GNSS_SIGMA_M, Anchor, Recording, mount
+from gnd.vehicle_agent.importers.recording import GNSS_SIGMA_M, Recording, RecordingAnchor, mount
 
 F64 = NDArray[np.float64]
 I64 = NDArray[np.int64]
@@ -30,7 +30,7 @@ GPS_AHEAD_NS = 65_700_000_000
 GPS_PERIOD_NS = 50_000_000
 
 
-def open_radiate(folder: Path, anchor: Anchor | None) -> Recording:
+def open_radiate(folder: Path, anchor: RecordingAnchor | None) -> Recording:
     """A RADIATE folder. Its GPS gives its place; `anchor` only moves the origin of the map frame.
 
     Raises:
@@ -49,7 +49,7 @@ def open_radiate(folder: Path, anchor: Anchor | None) -> Recording:
         T_vehicle_lidar=mount(LIDAR_YAW_DEG, LIDAR_HEIGHT_M, LIDAR_PITCH_DEG),
         t_ns=t_ns,
         read=lambda i: _scan(files[i], int(t_ns[i])),
-        anchor=anchor or Anchor(*map(float, gps[0, :3])),
+        anchor=anchor or RecordingAnchor(*map(float, gps[0, :3])),
         gnss=_fixes(gps_ns, gps),
         motion=_motion(gps_ns, gps),
         deskew="reconstructed",

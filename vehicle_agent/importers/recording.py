@@ -20,7 +20,7 @@ GNSS_SIGMA_M = 2.5
 
 
 @dataclass(frozen=True, slots=True)
-class Anchor:
+class RecordingAnchor:
     """Where on the Earth the first pose of a recording is put."""
 
     lat_deg: float
@@ -33,7 +33,7 @@ class Anchor:
         return LocalFrame(np.radians(self.lat_deg), np.radians(self.lon_deg), self.height_m)
 
 
-NOMINAL = Anchor(49.0, 8.4, 160.0)
+NOMINAL = RecordingAnchor(49.0, 8.4, 160.0)
 """For recordings that do not say where they were taken: Karlsruhe, about the city's ellipsoidal height."""
 
 
@@ -57,7 +57,7 @@ class Recording:
     T_vehicle_lidar: F64
     t_ns: NDArray[np.int64]
     read: Callable[[int], RawScan | Scan]
-    anchor: Anchor
+    anchor: RecordingAnchor
     track: Trajectory | None = None
     gnss: tuple[GnssFix, ...] = ()
     motion: tuple[MotionSample, ...] = ()

@@ -70,7 +70,7 @@ class AzimuthTimes:
 
 
 @dataclass(frozen=True, slots=True)
-class Sweep:
+class FoundSweep:
     """A saw tooth: where the sweep begins (azimuth, LiDAR frame), which way it turns, and how long it lasts."""
 
     begin_rad: float
@@ -82,9 +82,9 @@ class Sweep:
         return np.asarray(np.mod(after, 2.0 * np.pi) / (2.0 * np.pi))
 
     @property
-    def reversed(self) -> "Sweep":
+    def reversed(self) -> "FoundSweep":
         """The same beginning, turning the other way."""
-        return Sweep(self.begin_rad, not self.clockwise)
+        return FoundSweep(self.begin_rad, not self.clockwise)
 
 
 @dataclass(frozen=True, slots=True)
@@ -96,7 +96,7 @@ class SweepFit:
     still: how much worse no distortion at all fits.
     """
 
-    sweep: Sweep
+    sweep: FoundSweep
     begin_sigma_rad: float
     motion: float
     motion_sigma: float
@@ -232,19 +232,19 @@ def fit_sweep(times: AzimuthTimes) -> SweepFit:
     """The saw tooth that fits the times of azimuths best, each as good as it is known."""
     middles = middle_of_bins_rad()
     begins = np.arange(BINS) * (2 * np.pi / BINS) - np.pi
-    found = [_fit(Sweep(float(b), c), times, middles) for b in begins for c in (True, False)]
+    found = [_fit(FoundSweep(float(b), c), times, middles) for b in begins for c in (True, False)]
     cost, _, _, best = min(found, key=lambda one: one[0])
     near = [one for one in found if one[3].clockwise == best.clockwise and _apart(one[3], best) < NEAR_RAD]
     rival = min(one[0] for one in found if one not in near)
     weight = np.exp([0.5 * (cost - one[0]) for one in near])
     pointer = complex((weight @ np.exp([1j * one[3].begin_rad for one in near])) / weight.sum())
     begin_sigma_rad = float(np.sqrt(-2.0 * np.log(max(abs(pointer), 1e-9))))
-    _, motion, sigma, sweep = _fit(Sweep(float(np.angle(pointer)), best.clockwise), times, middles)
+    _, motion, sigma, sweep = _fit(FoundSweep(float(np.angle(pointer)), best.clockwise), times, middles)
     still = _cost(times, np.zeros(BINS))[0]
     return SweepFit(sweep, begin_sigma_rad, motion, sigma, rival - cost, still - cost)
 
 
-def _apart(a: Sweep, b: Sweep) -> float:
+def _apart(a: FoundSweep, b: FoundSweep) -> float:
     return float(abs(np.angle(np.exp(1j * (a.begin_rad - b.begin_rad)))))
 
 
@@ -257,7 +257,7 @@ def _cost(times: AzimuthTimes, off: F64) -> tuple[float, F64]:
     return float(left @ times.information @ left), left
 
 
-def _fit(sweep: Sweep, times: AzimuthTimes, azimuth_rad: F64) -> tuple[float, float, float, Sweep]:
+def _fit(sweep: FoundSweep, times: AzimuthTimes, azimuth_rad: F64) -> tuple[float, float, float, FoundSweep]:
     """Chi squared, height of the saw tooth (positive only), its sigma."""
     tooth = sweep.share(azimuth_rad) - 0.5
     _, tooth = _cost(AzimuthTimes(tooth, times.information), np.zeros(BINS))

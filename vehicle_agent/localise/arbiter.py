@@ -29,7 +29,7 @@ LIKE_FIT: Final = 0.05
 APART_M, APART_RAD = 0.1, np.radians(0.5)  # farther from each other they are two
 
 
-class Motion(NamedTuple):
+class ArbitratedMotion(NamedTuple):
     """A motion since the scan before: (4, 4), and its covariance (6, 6), rotation [rad] first, vehicle frame."""
 
     T_before_now: F64
@@ -37,7 +37,11 @@ class Motion(NamedTuple):
 
 
 def who_is_wrong(
-    T_map_before: F64, covariance: F64, driven: Motion, seen: Motion, matches: Iterable[RegistrationResult]
+    T_map_before: F64,
+    covariance: F64,
+    driven: ArbitratedMotion,
+    seen: ArbitratedMotion,
+    matches: Iterable[RegistrationResult],
 ) -> Wrong:
     """Say whose motion the matches contradict.
 

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from gnd.gnd_map.se3 import T_inverse, log_so3
 from gnd.vehicle_agent.importers.mounting import angles_of
 from gnd.vehicle_agent.localise.clock import ClockDoubt, ClockEstimator
-from gnd.vehicle_agent.localise.drift import Drift
+from gnd.vehicle_agent.localise.drift import PoseDrift
 from gnd.vehicle_agent.localise.estimates import Cause, Health
 from gnd.vehicle_agent.localise.first_course import FirstCourse
 from gnd.vehicle_agent.localise.mount import DOUBTFUL_RAD, SIGMAS, MountDoubt, MountResidual
@@ -320,7 +320,7 @@ class MotionTeacher:
         square = np.concatenate([log_so3(off[:3, :3]), off[:3, 3]]) ** 2
         self._excess_var += _EXCESS_GAIN * (square - 2.0 * match_var - self._excess_var)
 
-    def correct(self, drift: Drift, overlap: float) -> None:
+    def correct(self, drift: PoseDrift, overlap: float) -> None:
         """Take off what a whole stretch says, where it knows better than what was learnt so far.
 
         `overlap`: in how many of the stretch's matches each scan takes part, so that they are not independent.

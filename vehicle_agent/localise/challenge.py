@@ -6,13 +6,13 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from gnd.vehicle_agent.localise.first_pose import INITIALISE_FAIR_FIT, INITIALISE_GOOD_FIT, Place
+from gnd.vehicle_agent.localise.first_pose import INITIALISE_FAIR_FIT, INITIALISE_GOOD_FIT, SearchPlace
 from gnd.vehicle_agent.localise.hypotheses import (
     HYPOTHESIS_APART_DEG,
     HYPOTHESIS_APART_M,
     HYPOTHESIS_LEAST_SCANS,
     HYPOTHESIS_VIEW_M,
-    Hypotheses,
+    PoseHypotheses,
 )
 from gnd.vehicle_agent.localise.initialise import (
     HYPOTHESIS_GAIN,
@@ -62,14 +62,14 @@ class Challenger:
     def __init__(self, parameters: LocaliserParameters) -> None:
         self._par = parameters
         self._how = replace(parameters.initialise, n_refined=_N_REFINED, n_kept=_N_REFINED)
-        self.rivals = Hypotheses(parameters.registration, _MOST_VIEWS)
+        self.rivals = PoseHypotheses(parameters.registration, _MOST_VIEWS)
         self._searched_ns = -(2**62)
         self._T_tracked = np.eye(4)
         self._way_m = 0.0
         self._own_fits: list[tuple[float, float]] = []  # since there are rivals: fit, share of a view
 
     def see(
-        self, t_ns: int, points_m: F64, standing_m: F64, T_tracked: F64, T_before_now: F64, place: Place,
+        self, t_ns: int, points_m: F64, standing_m: F64, T_tracked: F64, T_before_now: F64, place: SearchPlace,
         match_map: MatchMap, *, doubtful: bool, new: bool, any_heading: bool = False,
     ) -> None:  # fmt: skip
         """Take a view with its tracked pose (4, 4); search when it is time, sooner when the pose is `doubtful`.
@@ -162,5 +162,5 @@ class Challenger:
         return fit_of(few, T, match_map, self._par.registration)
 
 
-def _around(place: Place, T_tracked: F64, turn_rad: float) -> Around:
+def _around(place: SearchPlace, T_tracked: F64, turn_rad: float) -> Around:
     return Around(place.p_map_m, place.reach_m, float(np.arctan2(T_tracked[1, 0], T_tracked[0, 0])), turn_rad)

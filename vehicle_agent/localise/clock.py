@@ -84,7 +84,7 @@ class ClockEstimate:
 
 
 @dataclass(frozen=True, slots=True)
-class Step:
+class ClockStep:
     """Forward way [m] and turn [rad] between two times of the LiDAR's clock, as scans say, with one sigma each."""
 
     first_ns: int
@@ -163,7 +163,7 @@ class ClockEstimator:
 
     def __init__(self, motion: MotionBuffer) -> None:
         self._motion = motion
-        self._steps: deque[Step] = deque()
+        self._steps: deque[ClockStep] = deque()
         self._solved_ns = 0
         self._old: OffsetPrior | None = None  # what left the window knew
         self._unsteady: tuple[int, ClockDoubt] = (-LAST_NS, "none")  # when the clock drifted or jumped
@@ -176,7 +176,7 @@ class ClockEstimator:
             T = seen.T_before_now
             yaw = float(np.arctan2(T[1, 0], T[0, 0]))
             if not seen.slipping:
-                self.push(Step(first_ns, last_ns, float(T[0, 3]), yaw, float(sigma[3]), float(sigma[2])))
+                self.push(ClockStep(first_ns, last_ns, float(T[0, 3]), yaw, float(sigma[3]), float(sigma[2])))
         self.update(last_ns)
 
     def see_slip(self, t_ns: int) -> None:
@@ -184,7 +184,7 @@ class ClockEstimator:
         while self._steps and self._steps[-1].last_ns > t_ns - SLIP_REACHES_NS:
             self._steps.pop()
 
-    def push(self, step: Step) -> None:
+    def push(self, step: ClockStep) -> None:
         """Take a step; one that is not later than the one before makes all begin anew."""
         if self._steps and step.first_ns < self._steps[-1].first_ns:
             self.forget()
@@ -210,7 +210,7 @@ class ClockEstimator:
         fit = fit_clock(known, signal, known[0].first_ns, self._prior(known[-1].last_ns))
         self._tell(fit, known, self._jumped(fit, known, signal))
 
-    def _covered(self) -> list[Step]:
+    def _covered(self) -> list[ClockStep]:
         """The steps that the samples reach, whatever the offset."""
         reach_ns = round(MOST_S * 1e9)
         last_ns = self._motion.last_stamp_ns - reach_ns if len(self._motion) else 0
@@ -228,21 +228,21 @@ class ClockEstimator:
         """Blocks of steps that are too old go; what they tell of the offset is kept."""
         while self._steps and self._steps[0].last_ns < before_ns - BLOCK_NS:
             end_ns = self._steps[0].first_ns + BLOCK_NS
-            block: list[Step] = []
+            block: list[ClockStep] = []
             while self._steps and self._steps[0].last_ns <= end_ns:
                 block.append(self._steps.popleft())
             if not block:
                 block.append(self._steps.popleft())
             self._keep(block)
 
-    def _keep(self, block: list[Step]) -> None:
+    def _keep(self, block: list[ClockStep]) -> None:
         if len(block) < LEAST_STEPS:
             return
         at_ns = block[-1].last_ns
         fit = fit_clock(block, self._signal(block[0].first_ns), block[0].first_ns, self._prior(at_ns))
         self._old = OffsetPrior(at_ns, fit.values[:2], fit.covariance[:2, :2])
 
-    def _jumped(self, fit: ClockFit, known: list[Step], signal: MotionSignal) -> bool:
+    def _jumped(self, fit: ClockFit, known: list[ClockStep], signal: MotionSignal) -> bool:
         """True when the last steps alone tell another offset than the whole window; the rest of it goes then."""
         last = [step for step in known if step.first_ns >= known[-1].last_ns - LAST_NS]
         if len(last) < LEAST_STEPS or len(last) == len(known):
@@ -256,7 +256,7 @@ class ClockEstimator:
         self._old = None
         return True
 
-    def _tell(self, fit: ClockFit, known: list[Step], jumped: bool) -> None:
+    def _tell(self, fit: ClockFit, known: list[ClockStep], jumped: bool) -> None:
         (offset, sigma), at_ns = fit.offset, known[-1].last_ns
         rate, rate_sigma = float(fit.values[1]), float(np.sqrt(fit.covariance[1, 1]))
         if jumped or abs(rate) > MOST_RATE:
@@ -274,7 +274,7 @@ class ClockEstimator:
         return "unsure" if sigma_s > KNOWN_S and abs(offset_s) - sigma_s > LARGE_S else "none"
 
 
-def fit_clock(steps: list[Step], signal: MotionSignal, zero_ns: int, prior: OffsetPrior) -> ClockFit:
+def fit_clock(steps: list[ClockStep], signal: MotionSignal, zero_ns: int, prior: OffsetPrior) -> ClockFit:
     """Offset, its rate, scale, slip and bias that make the samples agree with the steps.
 
     Args:

@@ -32,7 +32,7 @@ SURE: Final = 6
 SLOTS: Final = round(REACH_M / EVERY_M) + 3
 
 
-class _Kept(NamedTuple):
+class _KeptScan(NamedTuple):
     """An earlier sweep: where its image is, when, odometer and pose by odometry."""
 
     slot: int
@@ -53,7 +53,7 @@ class CoMoving:
         self._images = np.zeros((SLOTS, COLUMNS, ROWS), np.uint16)
         self._times_s = np.zeros((SLOTS, COLUMNS), np.float32)
         self._twists = np.zeros((SLOTS, 3))
-        self._kept: list[_Kept] = []
+        self._kept: list[_KeptScan] = []
         self._way_m, self._T_odom_vehicle, self._T_odom_before = 0.0, np.eye(4), np.eye(4)
         self._before_ns: int | None = None
         self._sure_m, self._sure_ns = np.empty((0, 3)), np.empty(0, np.int64)
@@ -96,7 +96,7 @@ class CoMoving:
             )  # fmt: skip
             result = self._things(t_ns, points_vehicle_m, votes)
         if not self._kept or self._way_m - self._kept[-1].way_m >= EVERY_M:
-            self._kept.append(_Kept(slot, t_ns, self._way_m, self._T_odom_vehicle))
+            self._kept.append(_KeptScan(slot, t_ns, self._way_m, self._T_odom_vehicle))
         self.left_out += int(result.sum())
         return result
 
@@ -154,9 +154,9 @@ class CoMoving:
         taken = {k.slot for k in self._kept}
         return next(slot for slot in range(SLOTS) if slot not in taken)
 
-    def _earlier(self) -> list[_Kept]:
+    def _earlier(self) -> list[_KeptScan]:
         """The sweeps that lie nearest to the ways, each once, the farthest first."""
-        found: dict[int, _Kept] = {}
+        found: dict[int, _KeptScan] = {}
         way_m = self._way_m - np.array([k.way_m for k in self._kept])
         for lag_m in reversed(LAGS_M) if len(way_m) else ():
             off_m = np.abs(way_m - lag_m)
@@ -165,7 +165,7 @@ class CoMoving:
                 found.setdefault(nearest, self._kept[nearest])
         return list(found.values())
 
-    def _motions(self, then: list[_Kept], t_ns: int) -> tuple[NDArray[np.int64], F64, F64, F64]:
+    def _motions(self, then: list[_KeptScan], t_ns: int) -> tuple[NDArray[np.int64], F64, F64, F64]:
         """Slots and ages [s] of earlier sweeps, and the motion since then and back."""
         T_now_odom = T_inverse(self._T_odom_vehicle)
         T_now_then = np.stack([T_now_odom @ k.T_odom_vehicle for k in then])

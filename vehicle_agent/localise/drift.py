@@ -12,7 +12,7 @@ class Slope(NamedTuple):
 
 
 @dataclass(frozen=True, slots=True)
-class Drift:
+class PoseDrift:
     """What the odometry adds: heading [rad/s]; forward, left and up [m per metre forward]."""
 
     yaw_radps: Slope

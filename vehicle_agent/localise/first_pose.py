@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from gnd.vehicle_agent.errors import RegistrationError
 from gnd.vehicle_agent.localise.estimates import Cause
-from gnd.vehicle_agent.localise.hypotheses import HYPOTHESIS_MOST_VIEWS, HYPOTHESIS_SURE, Hypotheses
+from gnd.vehicle_agent.localise.hypotheses import HYPOTHESIS_MOST_VIEWS, HYPOTHESIS_SURE, PoseHypotheses
 from gnd.vehicle_agent.localise.initialise import INITIALISE_MIN_FIT, Around, InitialPose, search
 from gnd.vehicle_agent.localise.match_map import MatchMap, MatchMapCache
 from gnd.vehicle_agent.localise.parameters import LocaliserParameters
@@ -26,7 +26,7 @@ F64 = NDArray[np.float64]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Place:
+class SearchPlace:
     """Where GNSS says that the vehicle is: (3,) in the map frame, one sigma of an axis, and how far it may be off."""
 
     p_map_m: F64
@@ -39,13 +39,13 @@ class FirstPose:
 
     def __init__(self, parameters: LocaliserParameters) -> None:
         self._par = parameters
-        self.hypotheses = Hypotheses(parameters.registration)
+        self.hypotheses = PoseHypotheses(parameters.registration)
         self.cause: Cause = "searching"
         self._pool = ScanPool()
         self._searched_ns = -(2**62)
 
     def see(
-        self, t_ns: int, points_m: F64, T_before_now: F64, place: Place | None, maps: MatchMapCache
+        self, t_ns: int, points_m: F64, T_before_now: F64, place: SearchPlace | None, maps: MatchMapCache
     ) -> InitialPose | None:
         """Take a scan; give the pose when it is sure.
 
@@ -72,13 +72,13 @@ class FirstPose:
             return None
         return self._with_all_points(answer, points_m, m)
 
-    def _look_around(self, t_ns: int, place: Place, match_map: MatchMap) -> None:
+    def _look_around(self, t_ns: int, place: SearchPlace, match_map: MatchMap) -> None:
         """Search, now and then; what is followed is judged by the position too."""
         if t_ns - self._searched_ns >= _RETRY_S * 1e9:
             self._search(t_ns, place, match_map)
         self.hypotheses.see_position(place.p_map_m, place.sigma_m)
 
-    def _search(self, t_ns: int, place: Place, match_map: MatchMap) -> None:
+    def _search(self, t_ns: int, place: SearchPlace, match_map: MatchMap) -> None:
         self._searched_ns = t_ns
         around = Around(place.p_map_m, place.reach_m)
         points, standing = self._pool.points_m, self._pool.standing_m
@@ -90,7 +90,7 @@ class FirstPose:
         proven = self.hypotheses.best.views >= HYPOTHESIS_MOST_VIEWS
         return found.found and (found.fit >= INITIALISE_GOOD_FIT or (proven and found.fit >= INITIALISE_FAIR_FIT))
 
-    def _why(self, answer: InitialPose | None, place: Place | None, match_map: MatchMap, points_m: F64) -> Cause:
+    def _why(self, answer: InitialPose | None, place: SearchPlace | None, match_map: MatchMap, points_m: F64) -> Cause:
         if answer is None and place is None:
             return "no_position"
         if len(points_m) < REGISTRATION_MIN_MATCHED:
@@ -110,7 +110,7 @@ class FirstPose:
         return replace(answer, registration=result)
 
 
-def _known_at(m: MatchMap, place: Place | None) -> bool:
+def _known_at(m: MatchMap, place: SearchPlace | None) -> bool:
     """True when the map holds anything within reach of a place."""
     if place is None or not len(m):
         return False

@@ -20,7 +20,7 @@ F64 = NDArray[np.float64]
 SLACK_S = 0.01
 
 
-class Odometry(NamedTuple):
+class OdometryEdge(NamedTuple):
     """Motion since the pose before: (4, 4), and (6,) sigmas, rotation [rad] first, translation [m]."""
 
     T_before_now: F64
@@ -79,7 +79,7 @@ class PoseGraph:
         self,
         t_ns: int,
         T_start: F64,
-        odometry: Odometry | None,
+        odometry: OdometryEdge | None,
         match: MapMatch | None,
         gnss: Position | None,
         scans: ScanStep | None = None,

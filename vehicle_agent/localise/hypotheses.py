@@ -65,7 +65,7 @@ class Hypothesis:
         self.scans += 1
 
 
-class Hypotheses:
+class PoseHypotheses:
     """Follows poses over consecutive scans. Which is right is told by the mean fit of what stands above the ground
     (standing still tells nothing new), by how far registration moves each from where odometry has put it, and by GNSS.
     """

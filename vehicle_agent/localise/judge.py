@@ -9,7 +9,7 @@ from gnd.gnd_map.se3 import transform
 from gnd.vehicle_agent.local_map import EMPTY
 from gnd.vehicle_agent.localise.challenge import Challenger
 from gnd.vehicle_agent.localise.estimates import Cause
-from gnd.vehicle_agent.localise.first_pose import Place
+from gnd.vehicle_agent.localise.first_pose import SearchPlace
 from gnd.vehicle_agent.localise.health import HealthMonitor
 from gnd.vehicle_agent.localise.initialise import INITIALISE_N_REFINING, INITIALISE_RADIUS_SIGMAS, ground_below, thinned
 from gnd.vehicle_agent.localise.match_map import MatchMap
@@ -68,9 +68,9 @@ class Judge:
         self._witness_ns = -(2**62)
         self._way_m = 0.0
         self._T_looked_now = np.eye(4)  # motion since the last scan that had points enough to look at
-        self._place: Place | None = None
+        self._place: SearchPlace | None = None
 
-    def begin(self, points_m: F64, T_now: F64, place: Place | None, match_map: MatchMap) -> None:
+    def begin(self, points_m: F64, T_now: F64, place: SearchPlace | None, match_map: MatchMap) -> None:
         """Take the first scan (N, 3) of the track, at its pose (4, 4), and where GNSS says that it is."""
         self._pool.push(points_m, np.eye(4))
         self.uniqueness.see(self._pool.newest_standing_m, np.eye(4), T_now, place, match_map)
@@ -79,7 +79,7 @@ class Judge:
     def see_position(self, p_map_m: F64, sigma_m: float, T_now: F64) -> None:
         """Take where GNSS says that the vehicle, tracked at `T_now` (4, 4), is now: (3,), one sigma of an axis."""
         self.monitor.see_fix(p_map_m[:2] - T_now[:2, 3], sigma_m)
-        self._place = Place(p_map_m, sigma_m, INITIALISE_RADIUS_SIGMAS * sigma_m)
+        self._place = SearchPlace(p_map_m, sigma_m, INITIALISE_RADIUS_SIGMAS * sigma_m)
 
     def see(self, scan: Matched, match_map: MatchMap) -> None:
         """Take a scan: what its rays say, how well it fits, whether another pose fits better."""
@@ -119,7 +119,7 @@ class Judge:
         self.monitor.see_testimony(witnessed(scan.points_m, self._origin_m, below_m, scan.T_now, match_map))
 
     def _challenge(self, scan: Matched, new: bool, match_map: MatchMap) -> None:
-        place = self._place or Place(scan.T_now[:3, 3], _REACH_M, _REACH_M)
+        place = self._place or SearchPlace(scan.T_now[:3, 3], _REACH_M, _REACH_M)
         self._place = None
         monitor = self.monitor
         doubtful = not scan.believed or monitor.doubtful(scan.result) or monitor.suspicious or not monitor.trusted

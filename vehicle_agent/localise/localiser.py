@@ -14,13 +14,13 @@ from gnd.schemas.drive import DriveItem, GnssFix, MotionSample, MountSigma, Scan
 from gnd.schemas.sweep_distortion import DistortionSigma
 from gnd.vehicle_agent.errors import RegistrationError
 from gnd.vehicle_agent.local_map import LocalMap
-from gnd.vehicle_agent.localise.arbiter import Motion, Wrong, believing_neither, who_is_wrong
+from gnd.vehicle_agent.localise.arbiter import ArbitratedMotion, Wrong, believing_neither, who_is_wrong
 from gnd.vehicle_agent.localise.calibration import MotionCalibration, MotionTeacher
 from gnd.vehicle_agent.localise.co_moving import CoMoving
 from gnd.vehicle_agent.localise.consistency import Innovations
 from gnd.vehicle_agent.localise.estimates import Cause, Health, PoseEstimate, RefinedScan
-from gnd.vehicle_agent.localise.first_pose import FirstPose, Place
-from gnd.vehicle_agent.localise.graph import MapMatch, Odometry, PoseGraph, Position, SmoothedPose
+from gnd.vehicle_agent.localise.first_pose import FirstPose, SearchPlace
+from gnd.vehicle_agent.localise.graph import MapMatch, OdometryEdge, PoseGraph, Position, SmoothedPose
 from gnd.vehicle_agent.localise.health import CAUSE_POOR_SIGMA_M, HealthMonitor
 from gnd.vehicle_agent.localise.held_scan import (
     POSE_SHARE,
@@ -300,7 +300,7 @@ class Localiser:
                 self._teacher.forget()
             elif result.fit >= _TEACHING_FIT and not len(result.degenerate):
                 self._teacher.learn(t_ns, result.T_map_vehicle, result.covariance)
-        odometry = Odometry(odometry.T_before_now, joint.driven_sigmas)
+        odometry = OdometryEdge(odometry.T_before_now, joint.driven_sigmas)
         gnss, T_now = self._gnss_at(track, t_ns, predicted), predicted if match is None else match.T_map_vehicle
         unknown_s = max(self._motion.unknown_s(track.held[newest].t_ns, t_ns), self._motion.age_s(t_ns))
         seen_scan = Matched(
@@ -316,7 +316,7 @@ class Localiser:
         if self.online is not None and self.online.health == "lost":
             self._lose(track, self.online.cause)
 
-    def _scan_step(self, scan: Scan, chosen: NDArray[np.int64], points: F64, odometry: Odometry) -> ScanStep | None:
+    def _scan_step(self, scan: Scan, chosen: NDArray[np.int64], points: F64, odometry: OdometryEdge) -> ScanStep | None:
         """The motion since the scan before, as the scans tell it."""
         if not self.parameters.scan_odometry.enabled:
             return None
@@ -327,7 +327,7 @@ class Localiser:
         return self._scan_odometry.step(reference_ns(scan), points, *odometry, points_going_on)
 
     def _arbitrated(
-        self, track: _Track, scan: Scan, chosen: NDArray[np.int64], points: F64, odometry: Odometry, seen: ScanStep
+        self, track: _Track, scan: Scan, chosen: NDArray[np.int64], points: F64, odometry: OdometryEdge, seen: ScanStep
     ) -> tuple[JointStep, ScanStep | None, F64]:
         """Wheels and scans contradict each other: the joint step, and the scans' own, after the map was asked, and the
         sigmas (6,) that this adds to the motion. Scans that are wrong begin anew.
@@ -338,10 +338,10 @@ class Localiser:
         going_on = points if sweep is None else self._deskewed(scan, chosen, scan.points_m[chosen], sweep)
         starts = ((points, odometry.T_before_now), (going_on, seen.T_before_now))
         matches = [self._match(some, T_before @ T, "near") for some, T in starts]
-        driven = Motion(odometry.T_before_now, np.diag(np.square(odometry.sigmas)))
+        driven = ArbitratedMotion(odometry.T_before_now, np.diag(np.square(odometry.sigmas)))
         told = [one for one in matches if one is not None]
         covariance = track.held[newest].online.covariance
-        wrong = who_is_wrong(T_before, covariance, driven, Motion(seen.T_before_now, seen.covariance), told)
+        wrong = who_is_wrong(T_before, covariance, driven, ArbitratedMotion(seen.T_before_now, seen.covariance), told)
         if wrong == "open":
             slipped = self._motion.slipped(track.held[newest].t_ns, reference_ns(scan))
             wrong = "wheels" if slipped else track.wrong
@@ -354,7 +354,7 @@ class Localiser:
         joint, unsure = believing_neither(*odometry, seen)
         return joint, unsure, joint.driven_sigmas
 
-    def _reach(self, track: _Track, odometry: Odometry) -> F64:
+    def _reach(self, track: _Track, odometry: OdometryEdge) -> F64:
         """(6,) one sigma of where a match may lie: of the motion, and of a pose that is poorly known itself."""
         covariance = track.held[track.graph.newest].online.covariance
         if np.sqrt(np.linalg.eigvalsh(covariance[3:5, 3:5])[1]) < CAUSE_POOR_SIGMA_M:
@@ -366,9 +366,9 @@ class Localiser:
         steady = self._scan_odometry.steady
         return None if steady is None else steady.trajectory(scan.t_ns, end_ns(scan))
 
-    def _odometry(self, first_ns: int, last_ns: int) -> Odometry:
+    def _odometry(self, first_ns: int, last_ns: int) -> OdometryEdge:
         delta = self._motion.delta(first_ns, last_ns)
-        return Odometry(delta, self._teacher.sigmas_between(first_ns, last_ns, delta))
+        return OdometryEdge(delta, self._teacher.sigmas_between(first_ns, last_ns, delta))
 
     def _matched(
         self, monitor: HealthMonitor, points: F64, predicted: F64, sigmas: F64, t_ns: int
@@ -533,13 +533,13 @@ class Localiser:
             return None
         return Refiner(par.refine, par.registration, self._map, self._motion, self._teacher)
 
-    def _place(self, t_ns: int) -> Place | None:
+    def _place(self, t_ns: int) -> SearchPlace | None:
         """Where the last fix says that the vehicle is; how far it has driven since is not known in which direction."""
         fix, sigmas = self._fix, INITIALISE_RADIUS_SIGMAS
         if fix is None or abs(t_ns - fix.t_ns) > MAX_GNSS_AGE_NS:
             return None
         moved_m = abs(self._motion.speed_mps * (t_ns - fix.t_ns) * 1e-9)
-        return Place(self._p_map(fix), float(np.hypot(fix.sigma_m, moved_m)), sigmas * fix.sigma_m + moved_m)
+        return SearchPlace(self._p_map(fix), float(np.hypot(fix.sigma_m, moved_m)), sigmas * fix.sigma_m + moved_m)
 
     def _lose(self, track: _Track, cause: Cause) -> None:
         """The pose is wrong: nothing held may reach the evidence. A rival that has won is where the search begins."""

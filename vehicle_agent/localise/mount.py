@@ -17,7 +17,7 @@ from gnd.vehicle_agent.importers.mount import (
     CROWN_RAD,
     LANE_WITHIN_M,
     GroundSeen,
-    Refused,
+    MountRefused,
     ground_of,
     ground_of_scans,
     upright,
@@ -103,8 +103,8 @@ class MountWatch:
         x_lidar = self._T_lidar_vehicle[:3, 0]
         self._course_rad = float(np.arctan2(x_lidar[1], x_lidar[0]))
         self._height_m = float(T_vehicle_lidar[2, 3])
-        self._lane: deque[GroundSeen | Refused] = deque(maxlen=KEPT)
-        self._around: deque[GroundSeen | Refused] = deque(maxlen=KEPT)
+        self._lane: deque[GroundSeen | MountRefused] = deque(maxlen=KEPT)
+        self._around: deque[GroundSeen | MountRefused] = deque(maxlen=KEPT)
         self._looked_ns: int | None = None
         self.residual = MountResidual()
 
@@ -126,7 +126,7 @@ class MountWatch:
         points = transform(self._T_lidar_vehicle, points_vehicle_m)
         self._lane.append(ground_of(points, self._course_rad))
         together = ground_of_scans(self._lane)
-        if isinstance(together, Refused):  # few lasers see little of the lane
+        if isinstance(together, MountRefused):  # few lasers see little of the lane
             self._around.append(ground_of(points))
             together = ground_of_scans(self._around, CROWN_RAD)
         if isinstance(together, GroundSeen):

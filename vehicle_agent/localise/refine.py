@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from gnd.gnd_map.se3 import T_from_R_t, T_inverse, exp_so3, log_so3
 from gnd.vehicle_agent.localise.calibration import ODOMETRY_BIAS_DRIFT_RADPS, ODOMETRY_SCALE_DRIFT, MotionTeacher
-from gnd.vehicle_agent.localise.drift import Drift, Slope
+from gnd.vehicle_agent.localise.drift import PoseDrift, Slope
 from gnd.vehicle_agent.localise.graph import MapMatch, SmoothedPose
 from gnd.vehicle_agent.localise.match_map import MatchMapCache
 from gnd.vehicle_agent.localise.odometry import SLIP_LASTS_NS, MotionBuffer
@@ -27,10 +27,10 @@ from gnd.vehicle_agent.localise.stretch import (
     N_SHARED,
     SCALE,
     UP,
-    Belief,
     Knot,
-    Solved,
-    Step,
+    SolvedStretch,
+    StretchBelief,
+    StretchStep,
     log_se3,
     marginalised,
     residual,
@@ -140,8 +140,8 @@ class Refiner:
         """No other place looks the same: else a good fit proves nothing."""
         self._scans: list[_Scan] = []
         self._final = 0  # how many of them are final
-        self._belief: Belief | None = None
-        self._solved: Solved | None = None
+        self._belief: StretchBelief | None = None
+        self._solved: SolvedStretch | None = None
         self._solved_way_m, self._solved_ns = 0.0, 0
         self._news = False
         self._solutions = 0
@@ -265,14 +265,14 @@ class Refiner:
     def _knots(self) -> list[_Scan]:
         return [scan for scan in self._scans if scan.knot is not None]
 
-    def _first_belief(self, T_map_vehicle: F64) -> Belief:
+    def _first_belief(self, T_map_vehicle: F64) -> StretchBelief:
         sigmas = np.array([FIRST_SIGMA_RAD] * 3 + [FIRST_SIGMA_M] * 3)
         odometry = self._teacher.parameters
         shared = np.array([odometry.bias_prior_radps, odometry.scale_prior, *[odometry.course_prior] * 2])
         information = np.diag(1.0 / np.concatenate([sigmas, shared]) ** 2)
-        return Belief(T_map_vehicle.copy(), self._motion.shared(), information, np.zeros(6 + N_SHARED))
+        return StretchBelief(T_map_vehicle.copy(), self._motion.shared(), information, np.zeros(6 + N_SHARED))
 
-    def _steps(self, knots: Sequence[_Scan]) -> list[list[Step]]:
+    def _steps(self, knots: Sequence[_Scan]) -> list[list[StretchStep]]:
         """What wheels and gyro, and the scans, say of the motion between neighbouring knots."""
         driven, seen = [], []
         for before, now in pairwise(knots):
@@ -281,7 +281,7 @@ class Refiner:
             variance = np.sum([scan.variance for scan in between_them], axis=0)
             variance[2:4] += np.square(self._teacher.clock_sigmas(before.t_ns, now.t_ns))
             variance[3] += self._teacher.slip_sigma_m(before.t_ns, now.t_ns, T) ** 2
-            driven.append(Step(T, np.diag(variance), shared_of(T, dt_s)))
+            driven.append(StretchStep(T, np.diag(variance), shared_of(T, dt_s)))
             told = [scan.seen for scan in between_them]
             whole = all(step is not None for step in told)
             seen.append(_chained([step for step in told if step is not None]) if whole else None)
@@ -291,7 +291,7 @@ class Refiner:
             for one, other in zip(driven, seen, strict=True)
         ]
 
-    def _judge_steps(self, solved: Solved, steps: Sequence[Sequence[Step]], off: F64) -> None:
+    def _judge_steps(self, solved: SolvedStretch, steps: Sequence[Sequence[StretchStep]], off: F64) -> None:
         """How much worse than assumed wheels and gyro are, axis by axis, as map and scans together see it.
 
         Where map and odometry disagree either may be worse than it claims, and the stretch that trusts one finds its
@@ -331,7 +331,7 @@ class Refiner:
         self._belief = self._shortened(scans, steps, belief, dt_s)
         self._teach()
 
-    def _scans_hold(self, scans: Sequence[_Scan], steps: Sequence[Sequence[Step]], since_ns: int) -> bool:
+    def _scans_hold(self, scans: Sequence[_Scan], steps: Sequence[Sequence[StretchStep]], since_ns: int) -> bool:
         """Whether the scans alone tell the whole way since a time, well enough to see a slip, and agree with where the
         map puts its ends: then nothing rests on the wheels.
         """
@@ -347,7 +347,9 @@ class Refiner:
         told = [scan.seen for scan in self._scans if scan.t_ns > since_ns]
         return all(step is not None and _forward_sigma_m(step) < SEEN_SIGMA_M for step in told)
 
-    def _shortened(self, scans: list[_Scan], steps: list[list[Step]], belief: Belief, dt_s: float) -> Belief:
+    def _shortened(
+        self, scans: list[_Scan], steps: list[list[StretchStep]], belief: StretchBelief, dt_s: float
+    ) -> StretchBelief:
         """Let go of the knots that are far behind; the belief about the first that stays."""
         newest, solved = self._scans[-1], self._solved
         assert solved is not None
@@ -383,7 +385,7 @@ class Refiner:
         more, variance = self._solved.shared - self._motion.shared(), np.diag(self._solved.shared_covariance)
         sigma = np.sqrt(variance * max(1.0, self._solved.misfit))
         self._teacher.correct(
-            Drift(
+            PoseDrift(
                 yaw_radps=Slope(float(more[BIAS]), float(sigma[BIAS])),
                 forward=Slope(float(-more[SCALE]), float(sigma[SCALE])),
                 left=Slope(float(-more[LEFT]), float(sigma[LEFT])),
@@ -485,7 +487,7 @@ class Refiner:
         return float(np.clip((b - a) / (c - a), 0.0, 1.0)) if c > a else 0.0
 
 
-def told_by_scans(steps: Sequence[Sequence[Step]], shared_off: F64) -> F64:
+def told_by_scans(steps: Sequence[Sequence[StretchStep]], shared_off: F64) -> F64:
     """(6,) mean square of what the motion of some steps by wheels and gyro (the first measurement of each) differs from
     what scans say (the second), in units of the variance claimed; endless where scans say too little.
     """
@@ -501,12 +503,12 @@ def told_by_scans(steps: Sequence[Sequence[Step]], shared_off: F64) -> F64:
     return np.maximum(np.mean(windows, axis=0), np.mean(single, axis=0)) if windows else np.full(6, np.inf)
 
 
-def _chained(seen: Sequence[ScanStep]) -> Step:
+def _chained(seen: Sequence[ScanStep]) -> StretchStep:
     """Steps that the scans tell, one after the other, as one; they are short, so that covariances just add."""
     T, covariance = np.eye(4), np.zeros((6, 6))
     for step in seen:
         T, covariance = T @ step.T_before_now, covariance + step.covariance
-    return Step(T, covariance, np.zeros((6, N_SHARED)))
+    return StretchStep(T, covariance, np.zeros((6, N_SHARED)))
 
 
 def _forward_sigma_m(step: ScanStep) -> float:
@@ -514,19 +516,19 @@ def _forward_sigma_m(step: ScanStep) -> float:
     return float(np.sqrt(np.linalg.inv(np.linalg.inv(step.covariance) + HELD_INFORMATION)[3, 3]))
 
 
-def _agrees(step: Step, T_before_now: F64) -> bool:
+def _agrees(step: StretchStep, T_before_now: F64) -> bool:
     """True when a motion (4, 4) is one that the step allows."""
     off = log_se3(T_inverse(step.T_before_now) @ T_before_now)[2:5]
     return float(off @ np.linalg.solve(step.covariance[2:5, 2:5] + np.diag(MAP_VARIANCE), off)) < AGREES_CHI2
 
 
-def _recentred(belief: Belief, shared: F64) -> Belief:
+def _recentred(belief: StretchBelief, shared: F64) -> StretchBelief:
     """The same belief told about other values of the shared parameters: those that the steps are made with now."""
     moved = np.concatenate([np.zeros(6), shared - belief.shared])
     return belief._replace(shared=shared, gradient=belief.gradient + belief.information @ moved)
 
 
-def _loosened(belief: Belief, variance: F64) -> Belief:
+def _loosened(belief: StretchBelief, variance: F64) -> StretchBelief:
     """The belief when the shared parameters may have changed since, by so much (N_SHARED,), its mean unchanged."""
     covariance = np.linalg.inv(belief.information)
     mean = -covariance @ belief.gradient

@@ -120,7 +120,7 @@ class _Prediction(NamedTuple):
     points_m: F64
 
 
-class _Match(NamedTuple):
+class _ScanMatch(NamedTuple):
     """Where a scan lies on the rolling map: (4, 4), covariance (6, 6), fit; and the prediction that it is near to."""
 
     T_odom_vehicle: F64
@@ -212,7 +212,7 @@ class ScanOdometry:
     def _steady_sigmas(self) -> F64:
         return np.array([_STEADY_RAD] * 3 + [_STEADY_M] * 3)
 
-    def _matched(self, driven: _Prediction, going_on: Callable[[], _Prediction] | None) -> _Match | None:
+    def _matched(self, driven: _Prediction, going_on: Callable[[], _Prediction] | None) -> _ScanMatch | None:
         """The match near to what wheels and gyro say, or near to going on as before: that comes first while the
         wheels slip.
         """
@@ -229,7 +229,7 @@ class ScanOdometry:
             return None
         return lambda: _Prediction(steady.after(dt_ns), self._steady_sigmas(), points_going_on())
 
-    def _match_near(self, prediction: _Prediction, min_fit: float) -> _Match | None:
+    def _match_near(self, prediction: _Prediction, min_fit: float) -> _ScanMatch | None:
         """The match, if it fits well enough and lies near enough to the prediction."""
         T_predicted = self._T_odom_before @ prediction.T_before_now
         chosen = prediction.points_m[:: max(1, len(prediction.points_m) // _N_POINTS)]
@@ -241,14 +241,14 @@ class ScanOdometry:
             return None
         if not self._near(_log(T_inverse(T_predicted) @ result.T_map_vehicle), prediction.sigmas):
             return None
-        return _Match(result.T_map_vehicle, result.covariance, result.fit, prediction)
+        return _ScanMatch(result.T_map_vehicle, result.covariance, result.fit, prediction)
 
     def _near(self, off: F64, sigmas: F64) -> bool:
         limit_m = _GATE_M + 3.0 * float(np.linalg.norm(sigmas[3:]))
         limit_rad = np.radians(_GATE_DEG) + 3.0 * float(np.linalg.norm(sigmas[:3]))
         return bool(np.linalg.norm(off[3:]) <= limit_m and np.linalg.norm(off[:3]) <= limit_rad)
 
-    def _advance(self, prediction: _Prediction, match: _Match | None) -> F64:
+    def _advance(self, prediction: _Prediction, match: _ScanMatch | None) -> F64:
         """Go on to the filtered pose of this scan and give the step (4, 4); a step is too short for its turn to matter
         to the covariance.
         """

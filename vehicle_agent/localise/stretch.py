@@ -39,7 +39,7 @@ STOP_M, STOP_RAD = 1e-3, 5e-5
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Step:
+class StretchStep:
     """Motion from one scan of the stretch to the next, as odometry tells it.
 
     T_before_now: (4, 4). covariance: (6, 6) of a small motion of the later vehicle, rotation [rad] first. shared: (6,
@@ -51,7 +51,7 @@ class Step:
     shared: F64
 
 
-class Belief(NamedTuple):
+class StretchBelief(NamedTuple):
     """What is known of the first pose of a stretch and the shared parameters from the time before, as a quadratic in
     their difference (6 + N_SHARED,) from where it was made: `information` (10, 10), and its gradient there (10,).
     """
@@ -76,7 +76,7 @@ class Knot:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Solved:
+class SolvedStretch:
     """What came of a stretch of N scans.
 
     shared: (N_SHARED,) estimate. covariance: (N, 6, 6) of each pose, rotation first, vehicle frame; shared_covariance.
@@ -114,13 +114,13 @@ class _System(NamedTuple):
 
 def solve_stretch(
     knots: Sequence[Knot],
-    steps: Sequence[Sequence[Step]],
-    belief: Belief,
+    steps: Sequence[Sequence[StretchStep]],
+    belief: StretchBelief,
     match_map: MatchMap,
     registration: RegistrationParameters,
     scales: Sequence[float],
     max_iterations: int = 8,
-) -> Solved:
+) -> SolvedStretch:
     """Move the poses of N knots (in place) to where map, odometry and belief agree best.
 
     Args:
@@ -150,11 +150,11 @@ def solve_stretch(
 
 def marginalised(
     knots: Sequence[Knot],
-    steps: Sequence[Sequence[Step]],
-    belief: Belief,
+    steps: Sequence[Sequence[StretchStep]],
+    belief: StretchBelief,
     shared: F64,
     registration: RegistrationParameters,
-) -> Belief:
+) -> StretchBelief:
     """What all knots but the last one tell about the last one and the shared parameters (Schur complement).
 
     The match of the last knot is not part of it: it stays with the stretch that goes on there.
@@ -166,7 +166,7 @@ def marginalised(
     through = np.linalg.solve(A[gone, gone], np.column_stack([A[gone, kept], g[gone]]))
     information = A[kept, kept] - A[kept, gone] @ through[:, :-1]
     gradient = g[kept] - A[kept, gone] @ through[:, -1]
-    return Belief(last.T_map_vehicle, shared.copy(), 0.5 * (information + information.T), gradient)
+    return StretchBelief(last.T_map_vehicle, shared.copy(), 0.5 * (information + information.T), gradient)
 
 
 def _match(knots: Sequence[Knot], match_map: MatchMap, par: RegistrationParameters, scale: float) -> None:
@@ -184,8 +184,8 @@ def _match(knots: Sequence[Knot], match_map: MatchMap, par: RegistrationParamete
 
 def _system(
     knots: Sequence[Knot],
-    steps: Sequence[Sequence[Step]],
-    belief: Belief,
+    steps: Sequence[Sequence[StretchStep]],
+    belief: StretchBelief,
     shared: F64,
     par: RegistrationParameters,
 ) -> _System:
@@ -205,14 +205,14 @@ def _system(
     return _System(A, g)
 
 
-def _add_belief(A: F64, g: F64, first: Knot, belief: Belief, shared: F64) -> None:
+def _add_belief(A: F64, g: F64, first: Knot, belief: StretchBelief, shared: F64) -> None:
     at = np.r_[0:6, len(g) - N_SHARED : len(g)]
     off = np.concatenate([log_se3(T_inverse(belief.T_map_vehicle) @ first.T_map_vehicle), shared - belief.shared])
     A[np.ix_(at, at)] += belief.information
     g[at] += belief.gradient + belief.information @ off
 
 
-def _add_step(A: F64, g: F64, k: int, relative: F64, step: Step, shared_off: F64) -> None:
+def _add_step(A: F64, g: F64, k: int, relative: F64, step: StretchStep, shared_off: F64) -> None:
     """A measured motion from knot k to k + 1, with its robust weight."""
     e, J = residual(relative, step, shared_off)
     information, weight = _weighed(e, step)
@@ -222,13 +222,13 @@ def _add_step(A: F64, g: F64, k: int, relative: F64, step: Step, shared_off: F64
     g[at] += weighted @ e
 
 
-def _weighed(e: F64, step: Step) -> tuple[F64, float]:
+def _weighed(e: F64, step: StretchStep) -> tuple[F64, float]:
     """Information (6, 6) of a step, and its Geman-McClure weight at a residual (6,)."""
     information: F64 = np.linalg.inv(step.covariance).astype(np.float64)
     return information, 1.0 / (1.0 + float(e @ information @ e) / STEP_CHI2) ** 2
 
 
-def residual(relative: F64, step: Step, shared_off: F64) -> tuple[F64, F64]:
+def residual(relative: F64, step: StretchStep, shared_off: F64) -> tuple[F64, F64]:
     """Residual e = log(Z^-1 T_k^-1 T_k+1) - S shared (6,) of a step, and its derivative (6, 12 + N_SHARED) after
     both poses and the shared parameters.
     """
@@ -251,7 +251,7 @@ def _move(knots: Sequence[Knot], step: F64) -> None:
 
 def _solved(
     knots: Sequence[Knot],
-    steps: Sequence[Sequence[Step]],
+    steps: Sequence[Sequence[StretchStep]],
     covariance: F64,
     shared_off: F64,
     shared_before: F64,
@@ -259,11 +259,11 @@ def _solved(
     scale: float,
     seen: F64,
     matched: F64,
-) -> Solved:
+) -> SolvedStretch:
     blocks = np.stack([covariance[6 * k : 6 * k + 6, 6 * k : 6 * k + 6] for k in range(len(knots))])
     matches = [(knot, knot.match) for knot in knots if knot.match is not None]
     squares, redundancy = _checked_steps(knots, steps, covariance, shared_off)
-    return Solved(
+    return SolvedStretch(
         shared=shared_before + shared_off,
         covariance=blocks,
         shared_covariance=covariance[-N_SHARED:, -N_SHARED:],
@@ -286,7 +286,7 @@ def _axle_variance(covariance: F64) -> F64:
 
 
 def _as_seen(
-    knots: Sequence[Knot], belief: Belief, covariance: F64, match_map: MatchMap, par: RegistrationParameters
+    knots: Sequence[Knot], belief: StretchBelief, covariance: F64, match_map: MatchMap, par: RegistrationParameters
 ) -> tuple[F64, F64]:
     """(3,) and (3,), of yaw, forward and left: variance that the map's errors have, as residuals show them, in units
     of what is assumed, and the share of the map in the variance of the pose in the middle. What was matched before is
@@ -306,7 +306,7 @@ def _as_seen(
     return seen, np.asarray(share)
 
 
-def _is_torn(knots: Sequence[Knot], steps: Sequence[Sequence[Step]], shared_off: F64) -> bool:
+def _is_torn(knots: Sequence[Knot], steps: Sequence[Sequence[StretchStep]], shared_off: F64) -> bool:
     for k, measured in enumerate(steps):
         relative = T_inverse(knots[k].T_map_vehicle) @ knots[k + 1].T_map_vehicle
         if max(_weighed(residual(relative, step, shared_off)[0], step)[1] for step in measured) < TORN_WEIGHT:
@@ -315,7 +315,7 @@ def _is_torn(knots: Sequence[Knot], steps: Sequence[Sequence[Step]], shared_off:
 
 
 def _checked_steps(
-    knots: Sequence[Knot], steps: Sequence[Sequence[Step]], covariance: F64, shared_off: F64
+    knots: Sequence[Knot], steps: Sequence[Sequence[StretchStep]], covariance: F64, shared_off: F64
 ) -> tuple[F64, F64]:
     squares, redundancy, n = np.zeros(6), np.zeros(6), len(covariance)
     for k, (step, *_) in enumerate(steps):

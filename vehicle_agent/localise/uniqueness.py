@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 
 from gnd.gnd_map.se3 import T_from_R_t, T_inverse, exp_so3, transform
 from gnd.vehicle_agent.errors import RegistrationError
-from gnd.vehicle_agent.localise.first_pose import Place
+from gnd.vehicle_agent.localise.first_pose import SearchPlace
 from gnd.vehicle_agent.localise.initialise import INITIALISE_N_REFINING, Around, search, thinned
 from gnd.vehicle_agent.localise.kernels import point_fits
 from gnd.vehicle_agent.localise.match_map import MatchMap
@@ -88,7 +88,7 @@ class _Fix(NamedTuple):
     reach_m: float
 
 
-class View:
+class ScanView:
     """Standing points of the last metres of way, and the GNSS fixes on it, in a frame that odometry carries on.
 
     Place and heading are odometry's; height and tilt are those of the tracked poses, which the road gives and odometry
@@ -171,7 +171,7 @@ class Uniqueness:
         self.proven = not par.enabled
         self.margin = 0.0
         """Sigmas by which the tracked pose was ahead of the best other one at the last test."""
-        self._view = View(_WAY_M, _EVERY_M, _N_POINTS)
+        self._view = ScanView(_WAY_M, _EVERY_M, _N_POINTS)
         self._beaten = self._ahead = 0  # tests in a row
         self._next_m = 0.0  # odometer of the next test
         self._tested_m = self._told_m = 0.0  # odometer of the last test, and of the last that told the place along
@@ -183,12 +183,12 @@ class Uniqueness:
         if self.proven:
             self.proven, self._ahead, self._beaten, self._next_m = False, 0, 0, self._view.way_m
         if moved:
-            self._view = View(_WAY_M, _EVERY_M, _N_POINTS)
+            self._view = ScanView(_WAY_M, _EVERY_M, _N_POINTS)
             self._next_m = _EVERY_M
             self._tested_m = self._told_m = 0.0
 
     def see(
-        self, standing_m: F64, T_before_now: F64, T_tracked: F64, place: Place | None, match_map: MatchMap,
+        self, standing_m: F64, T_before_now: F64, T_tracked: F64, place: SearchPlace | None, match_map: MatchMap,
         *, believed: bool = True,
     ) -> None:  # fmt: skip
         """Take a scan; test the pose if it is time.

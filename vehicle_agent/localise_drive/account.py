@@ -11,7 +11,7 @@ from gnd.vehicle_agent.localise.consistency import nees_of
 from gnd.vehicle_agent.localise.estimates import PoseEstimate
 from gnd.vehicle_agent.localise_drive.accuracy import LIMITS, error_series, error_summary, healthy, limits_json
 from gnd.vehicle_agent.localise_drive.run import LocalisedDrive
-from gnd.vehicle_agent.localise_drive.stretches import Stretch, health_shares, stretches_of
+from gnd.vehicle_agent.localise_drive.stretches import HealthStretch, health_shares, stretches_of
 
 SHOWN_STRETCHES: Final = 30
 STYLES: Final = {"good": "green", "degraded": "yellow", "lost": "red"}
@@ -98,7 +98,7 @@ def _errors(drive: LocalisedDrive) -> dict[str, Any] | None:
     return found | {"limits": limits_json()}
 
 
-def print_account(console: Console, values: dict[str, Any], stretches: Sequence[Stretch]) -> None:
+def print_account(console: Console, values: dict[str, Any], stretches: Sequence[HealthStretch]) -> None:
     """Print the drive in numbers, its errors and its health."""
     console.print(_fields(values))
     if values["errors"] is not None:
@@ -200,7 +200,7 @@ def _error_row(found: dict[str, Any], name: str) -> tuple[str, ...]:
     return p95, largest, f"{limit.p95 * scale:g} / {limit.largest * scale:g}{unit}", verdict
 
 
-def _health_table(stretches: Sequence[Stretch]) -> Table:
+def _health_table(stretches: Sequence[HealthStretch]) -> Table:
     table = _table("health", "", "cause", "from", "to", "from", "to", "scans")
     for one in stretches[:SHOWN_STRETCHES]:
         health = f"[{STYLES[one.health]}]{one.health}[/]"

@@ -13,7 +13,7 @@ from gnd.vehicle_agent.localise.estimates import PoseEstimate
 
 
 @dataclass(frozen=True, slots=True)
-class Limit:
+class AccuracyLimit:
     """What 95 % of the errors, and every one, must stay below."""
 
     unit: str
@@ -22,9 +22,9 @@ class Limit:
 
 
 LIMITS: Final = {
-    "longitudinal": Limit("m", 0.15, 0.44),
-    "lateral": Limit("m", 0.15, 0.44),
-    "heading": Limit("deg", 0.17, 0.5),
+    "longitudinal": AccuracyLimit("m", 0.15, 0.44),
+    "lateral": AccuracyLimit("m", 0.15, 0.44),
+    "heading": AccuracyLimit("deg", 0.17, 0.5),
 }
 """Requirement of localisation (GND, Tables 4 and 6)."""
 

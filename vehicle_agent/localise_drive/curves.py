@@ -13,9 +13,9 @@ from matplotlib.patches import Patch
 
 from gnd.gnd_map.arrays import F64, I64
 from gnd.vehicle_agent.localise.estimates import PoseEstimate
-from gnd.vehicle_agent.localise_drive.accuracy import LIMITS, ErrorSeries, Limit, error_series, healthy
+from gnd.vehicle_agent.localise_drive.accuracy import LIMITS, AccuracyLimit, ErrorSeries, error_series, healthy
 from gnd.vehicle_agent.localise_drive.run import LocalisedDrive
-from gnd.vehicle_agent.localise_drive.stretches import HEALTHS, Stretch, stretches_of
+from gnd.vehicle_agent.localise_drive.stretches import HEALTHS, HealthStretch, stretches_of
 from gnd.vehicle_agent.localise_drive.style import (
     HEALTH_COLOURS,
     INK,
@@ -100,7 +100,11 @@ _SAID: Final[Mapping[str, Callable[[PoseEstimate], float]]] = {
 
 
 def _error_row(
-    row: Sequence[Axes], name: str, limit: Limit, series: dict[str, tuple[ErrorSeries, str]], drive: LocalisedDrive
+    row: Sequence[Axes],
+    name: str,
+    limit: AccuracyLimit,
+    series: dict[str, tuple[ErrorSeries, str]],
+    drive: LocalisedDrive,
 ) -> None:
     """Both panels of one kind of error."""
     scale, unit = (100.0, "cm") if limit.unit == "m" else (1.0, "°")
@@ -127,13 +131,13 @@ def _both(drive: LocalisedDrive) -> tuple[Sequence[PoseEstimate], Sequence[PoseE
     return drive.refined, drive.online
 
 
-def _bands(panel: Axes, limit: Limit, scale: float) -> None:
+def _bands(panel: Axes, limit: AccuracyLimit, scale: float) -> None:
     """Yellow for the largest error that is allowed, green for what 95 % must keep."""
     panel.axhspan(-limit.largest * scale, limit.largest * scale, color=_MAX_BAND, alpha=0.55, linewidth=0, zorder=-2)
     panel.axhspan(-limit.p95 * scale, limit.p95 * scale, color=_P95_BAND, alpha=0.8, linewidth=0, zorder=-1)
 
 
-def _edges(panel: Axes, limit: Limit, scale: float) -> None:
+def _edges(panel: Axes, limit: AccuracyLimit, scale: float) -> None:
     """Where the limits lie, if errors reach that far."""
     for edge in (limit.p95, limit.largest):
         for side in (-edge, edge):
@@ -168,7 +172,7 @@ def _error_handles() -> list[Any]:
     ]
 
 
-def _health_handles(stretches: Sequence[Stretch]) -> list[Any]:
+def _health_handles(stretches: Sequence[HealthStretch]) -> list[Any]:
     there = {one.health for one in stretches}
     return [Patch(color=HEALTH_COLOURS[health], label=f"health: {health}") for health in HEALTHS if health in there]
 

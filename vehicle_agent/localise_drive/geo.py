@@ -10,7 +10,7 @@ from gnd.gnd_map.arrays import F64
 from gnd.vehicle_agent.localise.estimates import PoseEstimate
 from gnd.vehicle_agent.localise_drive.accuracy import ErrorSeries, error_series
 from gnd.vehicle_agent.localise_drive.run import LocalisedDrive, Moment, trajectory_of
-from gnd.vehicle_agent.localise_drive.stretches import Stretch, stretches_of
+from gnd.vehicle_agent.localise_drive.stretches import HealthStretch, stretches_of
 
 COLUMNS: Final = (
     "t_ns", "t_s", "way_m", "latitude_deg", "longitude_deg", "height_m", "heading_deg", "sigma_m", "sigma_deg",
@@ -48,7 +48,7 @@ def positions_deg(drive: LocalisedDrive, estimates: Sequence[PoseEstimate]) -> t
     return np.degrees(lat), np.degrees(lon), height
 
 
-def _feature(drive: LocalisedDrive, stretch: Stretch) -> dict[str, Any] | None:
+def _feature(drive: LocalisedDrive, stretch: HealthStretch) -> dict[str, Any] | None:
     """The line reaches the next stretch's first pose, so that the lines meet."""
     places = list(_places(drive, _poses_of(drive, stretch))) if stretch.health != "lost" else []
     if len(places) >= 2:
@@ -61,7 +61,7 @@ def _feature(drive: LocalisedDrive, stretch: Stretch) -> dict[str, Any] | None:
     return _geojson(stretch, "Point", [round(float(lon_deg), 9), round(float(lat_deg), 9)])
 
 
-def _poses_of(drive: LocalisedDrive, stretch: Stretch) -> Sequence[PoseEstimate]:
+def _poses_of(drive: LocalisedDrive, stretch: HealthStretch) -> Sequence[PoseEstimate]:
     """The refined poses of a stretch, and the one after if it follows at once."""
     t_ns = trajectory_of(drive.refined).t_ns
     last_ns = drive.start_ns + round(stretch.to_s * 1e9)
@@ -70,7 +70,7 @@ def _poses_of(drive: LocalisedDrive, stretch: Stretch) -> Sequence[PoseEstimate]
     return drive.refined[first : end + follows]
 
 
-def _geojson(stretch: Stretch, kind: str, coordinates: list[Any]) -> dict[str, Any]:
+def _geojson(stretch: HealthStretch, kind: str, coordinates: list[Any]) -> dict[str, Any]:
     return {
         "type": "Feature",
         "geometry": {"type": kind, "coordinates": coordinates},

@@ -31,7 +31,7 @@ _HALO: Final = [withStroke(linewidth=3.0, foreground="white")]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class View:
+class PictureView:
     """A rectangle of the map, turned so that the drive's longest direction lies to the right."""
 
     R_view_map: F64
@@ -42,7 +42,7 @@ class View:
     """(2,) upper right corner."""
 
     @classmethod
-    def around(cls, p_map_m: F64) -> "View":
+    def around(cls, p_map_m: F64) -> "PictureView":
         """A view of positions (N, 2) with a margin; N >= 1."""
         flat = p_map_m - p_map_m.mean(axis=0)
         axis = np.linalg.eigh(flat.T @ flat)[1][:, 1]
@@ -76,7 +76,7 @@ def draw_map(drive: LocalisedDrive, tiles: TileSource, path: Path) -> Path:
         LocaliseError: the file cannot be written.
     """
     track, lost = trajectory_of(drive.refined).T_dst_vehicle[:, :2, 3], _lost_fixes(drive)
-    view = View.around(np.concatenate([track, lost if len(track) else _fixes(drive)]))
+    view = PictureView.around(np.concatenate([track, lost if len(track) else _fixes(drive)]))
     raster = _raster(drive, tiles, view)
     figure = new_figure(_WIDTH_IN, _HEAD_IN + view.tall_in + _SIDE_IN, "The drive on the map", _note(drive, raster))
     axes = _panel(figure, view)
@@ -91,7 +91,7 @@ def draw_map(drive: LocalisedDrive, tiles: TileSource, path: Path) -> Path:
     return path
 
 
-def _raster(drive: LocalisedDrive, tiles: TileSource, view: View) -> MapRaster:
+def _raster(drive: LocalisedDrive, tiles: TileSource, view: PictureView) -> MapRaster:
     pixel_m = float(view.size_m[0] / (_PANEL_IN * DPI))
     columns, rows = (max(1, round(float(size) / pixel_m)) for size in view.size_m)
     raster = MapRaster(
@@ -112,7 +112,7 @@ def _note(drive: LocalisedDrive, raster: MapRaster) -> str:
     )
 
 
-def _panel(figure: Figure, view: View) -> Axes:
+def _panel(figure: Figure, view: PictureView) -> Axes:
     height_in = figure.get_figheight()
     axes = figure.add_axes(
         (_SIDE_IN / _WIDTH_IN, _SIDE_IN / height_in, _PANEL_IN / _WIDTH_IN, view.tall_in / height_in)
@@ -175,7 +175,7 @@ def nice_m(length_m: float) -> int:
     return min(_NICE_M, key=lambda nice: abs(np.log(nice / max(length_m, 1.0))))
 
 
-def _scale_and_north(axes: Axes, view: View) -> None:
+def _scale_and_north(axes: Axes, view: PictureView) -> None:
     width, height = view.size_m
     length = nice_m(float(width) / 12)
     x, y = view.low_m + np.array([0.02 * width, 0.06 * height])

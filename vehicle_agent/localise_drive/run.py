@@ -47,7 +47,7 @@ class Moment:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Counts:
+class DriveTotals:
     """What happened on the way."""
 
     scans: int
@@ -82,7 +82,7 @@ class LocalisedDrive:
     used: Mapping[TileId, int]
     """Tiles and their versions."""
     absent: frozenset[TileId]
-    counts: Counts
+    counts: DriveTotals
 
     @property
     def start_ns(self) -> int:
@@ -115,7 +115,7 @@ def localise_drive(
         raise LocaliseError(f"{path} has no GNSS fix: nothing says where on the map to begin")
     tiles.check_covers(track.gnss.lat_rad, track.gnss.lon_rad, DownloadParameters().near_m)
     fix, items = first_fix(read_drive(path), path)
-    run = _Run(header, fix, tiles, parameters or LocaliserParameters())
+    run = _LocaliseRun(header, fix, tiles, parameters or LocaliserParameters())
     run.to_the_end(items, lambda done: progress(done, total) if progress else None, stop)
     return run.result(track)
 
@@ -145,7 +145,7 @@ class _Record:
     """Time and way of the newest scan, whose moment is not yet known."""
 
 
-class _Run:
+class _LocaliseRun:
     """A pipeline that only localises, and what is kept of it."""
 
     def __init__(self, header: DriveHeader, fix: GnssFix, tiles: StoreMap, parameters: LocaliserParameters) -> None:
@@ -246,9 +246,9 @@ class _Run:
             counts=self._counts(),
         )
 
-    def _counts(self) -> Counts:
+    def _counts(self) -> DriveTotals:
         localiser, bad = self._pipeline.localiser, dict(self._pipeline.guard.bad)
-        return Counts(
+        return DriveTotals(
             scans=self._pipeline.scans,
             bad=bad,
             dropped=localiser.dropped_scans,

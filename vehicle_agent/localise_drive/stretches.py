@@ -12,7 +12,7 @@ HEALTHS: Final[tuple[Health, ...]] = ("good", "degraded", "lost")
 
 
 @dataclass(frozen=True, slots=True)
-class Stretch:
+class HealthStretch:
     """From its first scan (or when it changed) to the first of the next stretch (the last scan, for the last one)."""
 
     health: Health
@@ -40,16 +40,16 @@ class Stretch:
         }
 
 
-def stretches_of(moments: Sequence[Moment]) -> list[Stretch]:
+def stretches_of(moments: Sequence[Moment]) -> list[HealthStretch]:
     """The stretches in order of time."""
     groups = [list(group) for _, group in groupby(moments, key=lambda m: (m.health, m.cause))]
     ends = [group[0] for group in groups[1:]] + [group[-1] for group in groups[-1:]]
     return [_stretch(group, end, moments[0].t_ns) for group, end in zip(groups, ends, strict=True)]
 
 
-def _stretch(group: Sequence[Moment], end: Moment, start_ns: int) -> Stretch:
+def _stretch(group: Sequence[Moment], end: Moment, start_ns: int) -> HealthStretch:
     first = group[0]
-    return Stretch(
+    return HealthStretch(
         health=first.health,
         cause=first.cause,
         first_ns=first.t_ns,
@@ -61,7 +61,7 @@ def _stretch(group: Sequence[Moment], end: Moment, start_ns: int) -> Stretch:
     )
 
 
-def health_shares(stretches: Iterable[Stretch]) -> dict[str, dict[str, float]]:
+def health_shares(stretches: Iterable[HealthStretch]) -> dict[str, dict[str, float]]:
     """Seconds, metres and scans of each health."""
     found: dict[str, dict[str, float]] = {health: {"s": 0.0, "m": 0.0, "scans": 0} for health in HEALTHS}
     for stretch in stretches:

@@ -7,7 +7,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from gnd.vehicle_agent.errors import LocaliseError
-from gnd.vehicle_agent.localise_drive.stretches import Stretch
+from gnd.vehicle_agent.localise_drive.stretches import HealthStretch
 
 INK: Final = "#1c2430"
 MUTED: Final = "#5a6675"
@@ -42,7 +42,7 @@ def dress(axes: Axes, label: str) -> None:
         spine.set(visible=name in ("left", "bottom"), color=FAINT)
 
 
-def health_strip(axes: Axes, stretches: list[Stretch], *, shade: bool = True) -> None:
+def health_strip(axes: Axes, stretches: list[HealthStretch], *, shade: bool = True) -> None:
     """Colour the foot of the axes by health over time; with `shade`, the whole height faintly where it is not good."""
     for one in stretches:
         colour = HEALTH_COLOURS[one.health]
@@ -52,7 +52,7 @@ def health_strip(axes: Axes, stretches: list[Stretch], *, shade: bool = True) ->
             axes.axvspan(one.from_s, one.to_s, alpha=0.10, zorder=0, **span)
 
 
-def name_causes(axes: Axes, stretches: list[Stretch]) -> None:
+def name_causes(axes: Axes, stretches: list[HealthStretch]) -> None:
     """Write the causes of health at the head of the axes, where a stretch is long enough for the words."""
     whole_s = stretches[-1].to_s if stretches else 0.0
     for one in stretches:

@@ -30,7 +30,7 @@ _NOISE_M: Final = 0.04
 
 
 @dataclass(frozen=True, slots=True)
-class Anchor:
+class PoseAnchor:
     """A place of a drive: number of the drive, of the scan in its survey; its time and odometer."""
 
     drive: int
@@ -39,7 +39,7 @@ class Anchor:
     way_m: float
 
 
-class Anchors:
+class PoseAnchors:
     """The anchors of all drives, N in all, in the order of the drives and of time."""
 
     def __init__(self, surveys: Sequence[DriveSurvey], tracks: Sequence[Trajectory], from_m: float = 0.0) -> None:
@@ -47,7 +47,7 @@ class Anchors:
         self._surveys = surveys
         self._T_scan = [track.at(survey.t_ns) for survey, track in zip(surveys, tracks, strict=True)]
         self.all = tuple(
-            Anchor(drive, int(k), int(survey.t_ns[k]), float(survey.way_m[k]))
+            PoseAnchor(drive, int(k), int(survey.t_ns[k]), float(survey.way_m[k]))
             for drive, survey in enumerate(surveys)
             for k in _every(survey.way_m, from_m, EVERY_M)
         )

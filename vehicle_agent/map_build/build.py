@@ -21,7 +21,7 @@ from gnd.tile_store.build import (
     BuildError,
     BuildParameters,
     MapPoints,
-    Source,
+    MapSource,
     drive_sources,
     map_lattice,
     put_map,
@@ -42,7 +42,7 @@ _BODY_REACH_M: Final = float(np.linalg.norm(np.maximum(np.abs(LOW_M), np.abs(HIG
 
 
 @dataclass(slots=True)
-class DriveCounts:
+class BuiltDrive:
     """What became of the scans and points of one drive; points of scans with a pose, within range."""
 
     scans: int = 0
@@ -65,10 +65,10 @@ class BuiltMap:
     tiles: as published. measured: all points in their voxels.
     """
 
-    sources: tuple[Source, ...]
+    sources: tuple[MapSource, ...]
     surveys: tuple[DriveSurvey, ...]
     poses: PosesReport
-    counts: tuple[DriveCounts, ...]
+    counts: tuple[BuiltDrive, ...]
     tiles: tuple[Tile, ...]
     measured: MapPoints
     versions_published: int
@@ -113,9 +113,9 @@ def build_recorded_map(
     sources = drive_sources(drives, parameters)
     surveys = [look_over(source, parameters, progress) for source in sources]
     sources, poses = refine_poses(sources, surveys, refine, progress)
-    measured, counts = MapPoints(sources, parameters), list[DriveCounts]()
+    measured, counts = MapPoints(sources, parameters), list[BuiltDrive]()
     for source, survey in zip(sources, surveys, strict=True):
-        counts.append(DriveCounts())
+        counts.append(BuiltDrive())
         for points_map_m in _standing(source, survey, parameters, keep_movers, counts[-1], progress):
             measured.add(points_map_m)
     if not sum(one.scans for one in counts):
@@ -132,11 +132,11 @@ def reasons(missing: Counter[NoPose]) -> str:
 
 
 def _standing(
-    source: Source,
+    source: MapSource,
     survey: DriveSurvey,
     parameters: BuildParameters,
     keep_movers: bool,
-    counts: DriveCounts,
+    counts: BuiltDrive,
     progress: Progress,
 ) -> Iterator[F64]:
     """Points (N, 3) in the map frame of what stands still, scan after scan; `counts` is filled."""
@@ -148,17 +148,17 @@ def _standing(
         yield _still(done, counts)
 
 
-def _still(one: SegmentedScan, counts: DriveCounts) -> F64:
+def _still(one: SegmentedScan, counts: BuiltDrive) -> F64:
     counts.movers += int(one.moving.sum())
     return one.scan.points_map_m[~one.moving]
 
 
 def _scans(
-    source: Source,
+    source: MapSource,
     bodywork: Bodywork,
     parameters: BuildParameters,
     keep_bodywork: bool,
-    counts: DriveCounts,
+    counts: BuiltDrive,
     progress: Progress,
 ) -> Iterator[RefinedScan]:
     """The scans that have a pose, without the vehicle's own points."""
@@ -174,7 +174,7 @@ def _scans(
         yield one if keep_bodywork else _without(one, bodywork, counts)
 
 
-def _without(one: RefinedScan, bodywork: Bodywork, counts: DriveCounts) -> RefinedScan:
+def _without(one: RefinedScan, bodywork: Bodywork, counts: BuiltDrive) -> RefinedScan:
     if not bodywork.cells.any():
         return one
     T = one.estimate.T_map_vehicle

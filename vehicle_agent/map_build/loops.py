@@ -18,7 +18,7 @@ from gnd.vehicle_agent.localise.initialise import Around, Candidate, near_pose, 
 from gnd.vehicle_agent.localise.match_map import MatchMap
 from gnd.vehicle_agent.localise.parameters import InitialiseParameters, RegistrationParameters
 from gnd.vehicle_agent.localise.registration import register
-from gnd.vehicle_agent.map_build.anchors import Anchors
+from gnd.vehicle_agent.map_build.anchors import PoseAnchors
 
 APART_M: Final = 60.0
 """Way between two anchors of one drive from which on they are two passes: their maps share no scan."""
@@ -74,7 +74,7 @@ class LoopCounts:
     found: int
 
 
-def pairs(anchors: Anchors, T: F64) -> list[tuple[int, int]]:
+def pairs(anchors: PoseAnchors, T: F64) -> list[tuple[int, int]]:
     """(early, late) numbers of anchors of different passes that lie near each other, with the poses T (N, 4, 4)."""
     found = set[tuple[int, int]]()
     for late in range(len(anchors)):
@@ -94,14 +94,14 @@ def pairs(anchors: Anchors, T: F64) -> list[tuple[int, int]]:
     return sorted(found)
 
 
-def _reach_of(anchors: Anchors, late: int) -> F64:
+def _reach_of(anchors: PoseAnchors, late: int) -> F64:
     """(N,) how much farther than it seems each anchor may be."""
     same = anchors.drive == anchors.drive[late]
     drift = DRIFT_SHARE * np.abs(anchors.way_m - anchors.way_m[late])
     return np.asarray(np.minimum(np.where(same, drift, OTHER_DRIVE_M), MOST_REACH_M - LEAST_REACH_M))
 
 
-def sigma_between(anchors: Anchors, early: int, late: int) -> float:
+def sigma_between(anchors: PoseAnchors, early: int, late: int) -> float:
     """One sigma of how two anchors lie to each other before any loop is closed."""
     if anchors.drive[early] != anchors.drive[late]:
         return OTHER_DRIVE_M
@@ -109,7 +109,7 @@ def sigma_between(anchors: Anchors, early: int, late: int) -> float:
 
 
 def find_loops(
-    anchors: Anchors,
+    anchors: PoseAnchors,
     T: F64,
     tried: Sequence[tuple[int, int]],
     sigma_m: Callable[[int, int], float],
@@ -138,7 +138,7 @@ def find_loops(
     return believed, counts
 
 
-def _loop(anchors: Anchors, early: int, late: int, T_expected: F64, sigma_m: float) -> Loop | str:
+def _loop(anchors: PoseAnchors, early: int, late: int, T_expected: F64, sigma_m: float) -> Loop | str:
     """The loop between two anchors, or why there is none."""
     target, cloud = anchors.map_of(early), anchors.cloud_of(late)
     if target is None or abs(T_expected[2, 3]) > SAME_LEVEL_M + 3 * sigma_m:
@@ -177,7 +177,7 @@ def _off_m(T: F64, other: F64) -> float:
     return float(np.hypot(*(T[:2, 3] - other[:2, 3])))
 
 
-def _back(anchors: Anchors, early: int, late: int, T_late_early: F64) -> F64 | None:
+def _back(anchors: PoseAnchors, early: int, late: int, T_late_early: F64) -> F64 | None:
     """The match of the early cloud on the late map, from what the match of the late on the early gave."""
     target = anchors.map_of(late)
     if target is None:
@@ -188,12 +188,12 @@ def _back(anchors: Anchors, early: int, late: int, T_late_early: F64) -> F64 | N
         return None
 
 
-def _has_a_friend(loop: Loop, loops: Sequence[Loop], anchors: Anchors, T: F64) -> bool:
+def _has_a_friend(loop: Loop, loops: Sequence[Loop], anchors: PoseAnchors, T: F64) -> bool:
     """Whether another loop of neighbouring anchors says the same, carried over by the poses between neighbours."""
     return any(_agree(loop, other, anchors, T) for other in _neighbours(loop, loops, anchors))
 
 
-def _neighbours(loop: Loop, loops: Sequence[Loop], anchors: Anchors) -> Iterator[Loop]:
+def _neighbours(loop: Loop, loops: Sequence[Loop], anchors: PoseAnchors) -> Iterator[Loop]:
     for other in loops:
         ends = ((loop.early, other.early), (loop.late, other.late))
         same_drives = all(anchors.drive[a] == anchors.drive[b] for a, b in ends)
@@ -202,7 +202,7 @@ def _neighbours(loop: Loop, loops: Sequence[Loop], anchors: Anchors) -> Iterator
             yield other
 
 
-def _agree(loop: Loop, other: Loop, anchors: Anchors, T: F64) -> bool:
+def _agree(loop: Loop, other: Loop, anchors: PoseAnchors, T: F64) -> bool:
     carried = T_inverse(T[loop.early]) @ T[other.early] @ other.T_early_late @ T_inverse(T[other.late]) @ T[loop.late]
     way_m = abs(float(anchors.way_m[loop.late] - anchors.way_m[other.late]))
     way_m += abs(float(anchors.way_m[loop.early] - anchors.way_m[other.early]))

@@ -9,7 +9,7 @@ from gnd.gnd_map.motion import TOLERANCE_NS, Trajectory, deskew
 from gnd.gnd_map.se3 import transform
 from gnd.schemas.drive import Scan
 from gnd.schemas.drive_mcap import read_drive
-from gnd.tile_store.build import Source
+from gnd.tile_store.build import MapSource
 from gnd.vehicle_agent.localise.estimates import PoseEstimate, RefinedScan
 
 NoPose = Literal["before the first pose", "after the last pose", "without a point in range"]
@@ -21,7 +21,7 @@ def middle_ns(scan: Scan) -> int:
     return scan.t_ns + int(scan.t_offset_ns.max(initial=0)) // 2
 
 
-def drive_scans(source: Source) -> Iterator[Scan]:
+def drive_scans(source: MapSource) -> Iterator[Scan]:
     """The scans of a drive, in time order."""
     return (item for item in read_drive(source.path) if isinstance(item, Scan))
 

@@ -32,7 +32,7 @@ INLIER_CHI2: Final = 8.4
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Fixes:
+class GnssTies:
     """What GNSS says of anchors: numbers (G,), places (G, 3) in the map frame, one sigma (G,) of each, as if they were
     independent of each other.
     """
@@ -43,7 +43,7 @@ class Fixes:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Solved:
+class SolvedGraph:
     """T (N, 4, 4) of the anchors; which loops (L,) and fixes (G,) were believed."""
 
     T: F64
@@ -51,7 +51,7 @@ class Solved:
     fixes: NDArray[np.bool_]
 
 
-def solve(drive: I64, T: F64, loops: Sequence[Loop], fixes: Fixes) -> Solved:
+def solve(drive: I64, T: F64, loops: Sequence[Loop], fixes: GnssTies) -> SolvedGraph:
     """Place the anchors.
 
     Args:
@@ -78,7 +78,7 @@ def solve(drive: I64, T: F64, loops: Sequence[Loop], fixes: Fixes) -> Solved:
             graph.add(factor)
     values = gtsam.LevenbergMarquardtOptimizer(graph, values).optimize()
     solved = np.stack([values.atPose3(n).matrix() for n in range(len(T))])
-    return Solved(solved, believed[: len(loops)], believed[len(loops) :])
+    return SolvedGraph(solved, believed[: len(loops)], believed[len(loops) :])
 
 
 def _chains(drive: I64, T: F64, *, held: bool) -> gtsam.NonlinearFactorGraph:

@@ -13,10 +13,10 @@ import numpy as np
 from gnd.gnd_map.arrays import F64
 from gnd.gnd_map.motion import Trajectory
 from gnd.gnd_map.se3 import T_inverse, log_so3, transform
-from gnd.tile_store.build import Source
-from gnd.vehicle_agent.map_build.anchors import EVERY_M, Anchors
+from gnd.tile_store.build import MapSource
+from gnd.vehicle_agent.map_build.anchors import EVERY_M, PoseAnchors
 from gnd.vehicle_agent.map_build.loops import Loop, LoopCounts, find_loops, pairs, sigma_between
-from gnd.vehicle_agent.map_build.pose_graph import GNSS_CORRELATION_S, Fixes, bent, solve
+from gnd.vehicle_agent.map_build.pose_graph import GNSS_CORRELATION_S, GnssTies, bent, solve
 from gnd.vehicle_agent.map_build.survey import DriveSurvey, Progress
 
 RefineMode = Literal["auto", "always", "never"]
@@ -62,8 +62,8 @@ class PosesReport:
 
 
 def refine_poses(
-    sources: Sequence[Source], surveys: Sequence[DriveSurvey], mode: RefineMode, progress: Progress
-) -> tuple[list[Source], PosesReport]:
+    sources: Sequence[MapSource], surveys: Sequence[DriveSurvey], mode: RefineMode, progress: Progress
+) -> tuple[list[MapSource], PosesReport]:
     """The drives with poses that agree with each other and with GNSS, and what was done.
 
     Args:
@@ -74,7 +74,7 @@ def refine_poses(
     """
     if mode == "never":
         return list(sources), PosesReport(mode, False, "switched off")
-    first = Anchors(surveys, [source.poses for source in sources])
+    first = PoseAnchors(surveys, [source.poses for source in sources])
     if not len(first):
         return list(sources), PosesReport(mode, False, "no scan has a pose")
     T = first.poses()
@@ -90,17 +90,17 @@ def refine_poses(
 
 
 def _refined(
-    sources: Sequence[Source],
+    sources: Sequence[MapSource],
     surveys: Sequence[DriveSurvey],
-    first: Anchors,
+    first: PoseAnchors,
     loops: list[Loop],
     mode: RefineMode,
     progress: Progress,
-) -> tuple[list[Source], PosesReport]:
+) -> tuple[list[MapSource], PosesReport]:
     """Two rounds: from the solution of the first, loops are found that odometry alone was too far off for."""
     T, fixes = first.poses(), _fixes(first, sources)
     solved = solve(first.drive, T, loops, fixes)
-    second = Anchors(surveys, _bent(sources, first, T, solved.T))
+    second = PoseAnchors(surveys, _bent(sources, first, T, solved.T))
     again = pairs(second, solved.T)
     loops, counts = find_loops(second, solved.T, again, lambda _a, _b: AFTER_SIGMA_M, _told(progress, "loops again"))
     solved = solve(first.drive, T, loops, fixes)
@@ -123,18 +123,18 @@ def _refined(
 
 
 def _checked(
-    sources: Sequence[Source], surveys: Sequence[DriveSurvey], tracks: Sequence[Trajectory], progress: Progress
+    sources: Sequence[MapSource], surveys: Sequence[DriveSurvey], tracks: Sequence[Trajectory], progress: Progress
 ) -> tuple[PassDrift | None, PassDrift | None]:
     """How far passes disagreed before and after, by loops halfway between the anchors, which the graph did not use:
     its own it fits however wrong they are.
     """
-    between = Anchors(surveys, tracks, from_m=EVERY_M / 2)
+    between = PoseAnchors(surveys, tracks, from_m=EVERY_M / 2)
     if not len(between):
         return None, None
     T = between.poses()
     told = _told(progress, "checking between loops")
     loops, _ = find_loops(between, T, pairs(between, T), lambda _a, _b: AFTER_SIGMA_M, told)
-    T_before = Anchors(surveys, [source.poses for source in sources], from_m=EVERY_M / 2).poses()
+    T_before = PoseAnchors(surveys, [source.poses for source in sources], from_m=EVERY_M / 2).poses()
     return drift(T_before, loops), drift(T, loops)
 
 
@@ -177,7 +177,7 @@ def _why_not(before: PassDrift | None, counts: LoopCounts) -> str | None:
     return None
 
 
-def _bent(sources: Sequence[Source], anchors: Anchors, T_old: F64, T_new: F64) -> list[Trajectory]:
+def _bent(sources: Sequence[MapSource], anchors: PoseAnchors, T_old: F64, T_new: F64) -> list[Trajectory]:
     tracks = []
     for number, source in enumerate(sources):
         own = np.flatnonzero(anchors.drive == number)
@@ -186,7 +186,7 @@ def _bent(sources: Sequence[Source], anchors: Anchors, T_old: F64, T_new: F64) -
     return tracks
 
 
-def _fixes(anchors: Anchors, sources: Sequence[Source]) -> Fixes:
+def _fixes(anchors: PoseAnchors, sources: Sequence[MapSource]) -> GnssTies:
     """One fix an anchor, with a sigma that allows for how alike the errors of neighbours are."""
     found: list[tuple[int, F64, float]] = []
     for number, source in enumerate(sources):
@@ -208,7 +208,7 @@ def _fixes(anchors: Anchors, sources: Sequence[Source]) -> Fixes:
             if abs(int(gnss.t_ns[near]) - int(t)) * _S < step_s:
                 place = source.poses.at(int(t))[:3, 3] + offset[near]
                 found.append((int(k), place, max(float(gnss.sigma_m[near]), 0.01) * float(shared)))
-    return Fixes(
+    return GnssTies(
         np.array([one[0] for one in found], np.int64),
         np.array([one[1] for one in found], np.float64).reshape(-1, 3),
         np.array([one[2] for one in found], np.float64),

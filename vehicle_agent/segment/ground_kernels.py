@@ -17,7 +17,7 @@ REACH_CELLS = 5
 """How far the ground is carried on where something stands on it."""
 
 
-class Grid(NamedTuple):
+class GroundGrid(NamedTuple):
     """Squares of the ground, corner at (x0, y0)."""
 
     x0: float
@@ -28,7 +28,7 @@ class Grid(NamedTuple):
 
 
 @kernel
-def lowest_heights(points: F32, grid: Grid, near_m: float) -> F32:
+def lowest_heights(points: F32, grid: GroundGrid, near_m: float) -> F32:
     """(nx, ny) height of the second lowest point of each cell (the lowest is sometimes an echo), inf without two.
 
     Points nearer than `near_m` to the centre are left out: no ray reaches the ground there.
@@ -82,7 +82,7 @@ def _is_pit(memory: F32, i: int, j: int) -> bool:
 
 
 @kernel
-def ground_heights(memory: F32, grid: Grid, slope: float, road: F64, road_slope: float, near_m: float) -> F32:
+def ground_heights(memory: F32, grid: GroundGrid, slope: float, road: F64, road_slope: float, near_m: float) -> F32:
     """(nx, ny) height of the ground everywhere: no higher than what is remembered within `REACH_CELLS` and `slope`.
 
     `road` (6,): a point of the road under the vehicle and its normal; the ground lies no higher than this plane and

@@ -30,7 +30,7 @@ class Optics(NamedTuple):
     tan_step: float
 
 
-class Judge(NamedTuple):
+class RangeJudge(NamedTuple):
     """What a vote needs of the parameters."""
 
     reach_across_m: float
@@ -175,7 +175,7 @@ def vote(  # noqa: C901  (one loop over the window)
     places: F32,
     R: F64,
     optics: Optics,
-    judge: Judge,
+    judge: RangeJudge,
     weight: int,
     passed: U8,
     met: U8,

@@ -9,8 +9,8 @@ from numpy.typing import NDArray
 
 from gnd.gnd_map.arrays import F32, F64, I32
 from gnd.vehicle_agent.segment.evidence import WEIGHTS
-from gnd.vehicle_agent.segment.ground_kernels import Grid, ground_heights, lowest_heights, remember_ground
-from gnd.vehicle_agent.segment.image_kernels import Judge, Optics, draw_image, elevation_span, layer_gap, vote
+from gnd.vehicle_agent.segment.ground_kernels import GroundGrid, ground_heights, lowest_heights, remember_ground
+from gnd.vehicle_agent.segment.image_kernels import Optics, RangeJudge, draw_image, elevation_span, layer_gap, vote
 from gnd.vehicle_agent.segment.parameters import SegmentParameters
 from gnd.vehicle_agent.segment.voxel_kernels import find_objects
 
@@ -73,7 +73,7 @@ class RangeImage:
         """Usual distance of layers, as tangent."""
         return layer_gap(self.ranges, GAP_SHARE) * self.optics.tan_step
 
-    def vote(self, t_ns: int, objects: "Objects", centre_m: F64, judge: Judge) -> None:
+    def vote(self, t_ns: int, objects: "Objects", centre_m: F64, judge: RangeJudge) -> None:
         """Vote on the objects of the scan at `t_ns`, whose points are relative to `centre_m`.
 
         What moves may still cover its own place for a while: a return there says the more the longer after.
@@ -109,9 +109,9 @@ def hash_table(n: int) -> tuple[I64, I32]:
     return np.full(size, -1, np.int64), np.empty(size, np.int32)
 
 
-def judge_of(gap_tan: float) -> Judge:
+def judge_of(gap_tan: float) -> RangeJudge:
     """What a vote needs: parameters, and the distance of the sensor's layers."""
-    return Judge(_REACH_ACROSS_M, _REACH_UP_M, _MARGIN_M, _MARGIN_SHARE, 1.2 * gap_tan, ENOUGH * WEIGHTS)
+    return RangeJudge(_REACH_ACROSS_M, _REACH_UP_M, _MARGIN_M, _MARGIN_SHARE, 1.2 * gap_tan, ENOUGH * WEIGHTS)
 
 
 class GroundMap:
@@ -123,14 +123,14 @@ class GroundMap:
         self._memory = np.full((2 * self._half, 2 * self._half), np.inf, np.float32)
         self._corner = np.zeros(2, np.int64)
 
-    def around(self, points: F32, centre_m: F64, T_map_vehicle: F64, tan_low: float) -> tuple[F32, Grid]:
+    def around(self, points: F32, centre_m: F64, T_map_vehicle: F64, tan_low: float) -> tuple[F32, GroundGrid]:
         """Heights of the ground relative to `centre_m`, and their grid, with points (N, 3) relative to it just seen.
 
         `tan_low`: tangent of the lowest elevation, which tells from where on the sensor sees the ground.
         """
         self._move(np.floor(centre_m[:2] / self._cell_m).astype(np.int64) - self._half)
         x0, y0 = self._corner * self._cell_m - centre_m[:2]
-        grid = Grid(float(x0), float(y0), self._cell_m, *self._memory.shape)
+        grid = GroundGrid(float(x0), float(y0), self._cell_m, *self._memory.shape)
         height = np.float32(centre_m[2])
         mount_m = float(T_map_vehicle[:3, 2] @ (centre_m - T_map_vehicle[:3, 3]))
         near_m = VISIBLE * max(mount_m, 0.0) / max(-tan_low, 1e-3)
@@ -152,7 +152,7 @@ class GroundMap:
 
 
 def find_all_objects(
-    points: F32, origins: F32, ground: tuple[F32, Grid], gap_tan: float, p: SegmentParameters
+    points: F32, origins: F32, ground: tuple[F32, GroundGrid], gap_tan: float, p: SegmentParameters
 ) -> Objects:
     """Voxels of a scan's points (N, 3), relative to its centre; `gap_tan`: distance of its layers."""
     voxel_of, first, index = find_objects(

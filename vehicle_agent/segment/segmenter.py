@@ -55,7 +55,7 @@ class SegmentedScan:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class _Held:
+class _LaggedScan:
     """A scan that waits for later ones, in a third of its memory: points to 10 µm, origins to 0.1 mm."""
 
     t_ns: int
@@ -78,7 +78,7 @@ class MotionSegmenter:
     def __init__(self, parameters: SegmentParameters | None = None) -> None:
         self.parameters = parameters or SegmentParameters()
         self._judge = judge_of(0.0)
-        self._held: deque[_Held] = deque()
+        self._held: deque[_LaggedScan] = deque()
         self._images: deque[RangeImage] = deque()
         self._ground = GroundMap(self.parameters)
         self._gap_tan, self._tan_low = 0.0, -np.inf
@@ -115,7 +115,9 @@ class MotionSegmenter:
                 self._judge = judge_of(self._gap_tan)
         step_m = max(float(np.abs(origins).max(initial=0.0)) / 32767, 1e-4)
         self._held.append(
-            _Held(scan.t_ns, scan.estimate, centre, points, np.rint(origins / step_m).astype(np.int16), step_m, objects)
+            _LaggedScan(
+                scan.t_ns, scan.estimate, centre, points, np.rint(origins / step_m).astype(np.int16), step_m, objects
+            )
         )
 
     def _hear_the_past(self, t_ns: int, objects: Objects, centre_m: F64) -> None:
@@ -145,7 +147,7 @@ class MotionSegmenter:
             held = self._held.popleft()
             yield SegmentedScan(held.restore(), self._moving(held))
 
-    def _moving(self, held: _Held) -> Mask:
+    def _moving(self, held: _LaggedScan) -> Mask:
         objects = held.objects
         if objects is None:
             return np.zeros(len(held.points), np.bool_)

@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 
 from gnd.gnd_map.arrays import F32, I32
 from gnd.gnd_map.jit import kernel
-from gnd.vehicle_agent.segment.ground_kernels import Grid
+from gnd.vehicle_agent.segment.ground_kernels import GroundGrid
 
 I64 = NDArray[np.int64]
 U8 = NDArray[np.uint8]
@@ -36,7 +36,7 @@ def _slot(keys: I64, key: int) -> int:
 
 @kernel
 def find_objects(
-    points: F32, origins: F32, ground: F32, grid: Grid, ground_m: float, feet_m: float, voxel_m: float,
+    points: F32, origins: F32, ground: F32, grid: GroundGrid, ground_m: float, feet_m: float, voxel_m: float,
     range_min_m: float, range_max_m: float, keys: I64, values: I32,
 ) -> tuple[I32, I32, I32]:  # fmt: skip
     """Sort the points into ground, low ones and voxels of objects.

@@ -9,7 +9,7 @@ import pytest
 from click.testing import CliRunner, Result
 
 from studies.frame.averages import worst_of
-from studies.frame.command import Bench, Report, study
+from studies.frame.command import Bench, StudyReport, study
 from studies.frame.kept import Kept
 from studies.frame.options import check, option, seeds
 from studies.frame.pool import Job
@@ -29,7 +29,7 @@ class Options:
 
 
 @study(Options, out="runs/factorials", jobs=1)
-def factorials(options: Options, bench: Bench) -> Report:
+def factorials(options: Options, bench: Bench) -> StudyReport:
     """Factorials of the seeds."""
     kept = {seed: Kept(bench.folder.root / "runs", f"factorial-{seed}", "k") for seed in options.seeds}
     missing = [seed for seed in options.seeds if not kept[seed].done]
@@ -38,7 +38,9 @@ def factorials(options: Options, bench: Bench) -> Report:
     rows = {str(seed): one.read(dict[str, int]) for seed, one in kept.items()}
     targets = judged({"last": rows[max(rows)]}, (Target("last", "last.value", "", "24", 100, 200, larger=True),))
     sheets = [sheet_of("factorials", {"n!": "{value:,}"}, rows, "n"), targets_sheet(targets, "targets")]
-    return Report({"rows": rows, "targets": targets}, sheets, lambda folder: (folder / "drawn.png").write_bytes(b"-"))
+    return StudyReport(
+        {"rows": rows, "targets": targets}, sheets, lambda folder: (folder / "drawn.png").write_bytes(b"-")
+    )
 
 
 def _job(seed: int) -> Job:

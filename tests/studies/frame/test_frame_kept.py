@@ -5,10 +5,10 @@ import pytest
 
 from studies.frame.errors import FolderError
 from studies.frame.kept import Kept
-from studies.localisation_study.localising import Localised
+from studies.localisation_study.localising import LocalisedVariant
 from studies.localisation_study.series import PoseSeries
 from studies.localisation_study.study import RunResult
-from studies.localisation_study.trials import Trial
+from studies.localisation_study.trials import StartTrial
 
 
 def series(n: int) -> PoseSeries:
@@ -19,7 +19,7 @@ def series(n: int) -> PoseSeries:
 def test_a_run_comes_back_as_it_was(tmp_path: Path) -> None:
     kept = Kept(tmp_path / "runs", "vlp16-fresh", "abc")
     assert not kept.done
-    kept.write(RunResult(Localised(series(30), series(32), 33), 1.5))
+    kept.write(RunResult(LocalisedVariant(series(30), series(32), 33), 1.5))
     assert kept.done
     again = kept.read(RunResult)
     assert (again.found.scans, again.cpu_s) == (33, 1.5)
@@ -31,16 +31,16 @@ def test_a_run_comes_back_as_it_was(tmp_path: Path) -> None:
 
 def test_plain_values_bytes_and_tables_come_back_as_they_were(tmp_path: Path) -> None:
     kept = Kept(tmp_path, "trials", "abc")
-    trials = [Trial(1, 0.3, True, 0, 30), Trial(2, None, False, 2, 100)]
+    trials = [StartTrial(1, 0.3, True, 0, 30), StartTrial(2, None, False, 2, 100)]
     kept.write(trials)
-    assert kept.read(list[Trial]) == trials
+    assert kept.read(list[StartTrial]) == trials
     kept.write({"a": (b"", b"xyz"), "b": ()})
     assert kept.read(dict[str, tuple[bytes, ...]]) == {"a": (b"", b"xyz"), "b": ()}
 
 
 def test_a_damaged_result_is_named(tmp_path: Path) -> None:
     kept = Kept(tmp_path, "vlp16-updated", "abc")
-    kept.write(RunResult(Localised(series(30), series(32), 33), 1.5))
+    kept.write(RunResult(LocalisedVariant(series(30), series(32), 33), 1.5))
     kept.path.write_bytes(kept.path.read_bytes()[:100])
     with pytest.raises(FolderError, match=r"vlp16-updated-abc.npz.*delete it and start again"):
         kept.read(RunResult)
@@ -48,6 +48,6 @@ def test_a_damaged_result_is_named(tmp_path: Path) -> None:
 
 def test_a_result_of_another_kind_is_named(tmp_path: Path) -> None:
     kept = Kept(tmp_path, "vlp16-trials", "abc")
-    kept.write(Trial(1, 0.3, True, 0, 30))
+    kept.write(StartTrial(1, 0.3, True, 0, 30))
     with pytest.raises(FolderError, match="lacks"):
         kept.read(RunResult)

@@ -6,7 +6,7 @@ from gnd.gnd_map.se3 import T_from_R_t, exp_so3
 from gnd.schemas.drive import MotionSample
 from gnd.vehicle_agent.localise.estimates import Health, PoseEstimate, localisation_error
 from studies.localisation_study.series import HEALTHS, QUANTITIES, PoseSeries
-from studies.localisation_study.trials import Trial, begin_times, judged, trials_row
+from studies.localisation_study.trials import StartTrial, begin_times, judged, trials_row
 
 STEP_NS = 100_000_000
 
@@ -71,7 +71,7 @@ def test_a_heading_is_wrong_beyond_half_a_degree() -> None:
 
 def test_a_start_is_judged_by_its_first_good_pose() -> None:
     right = judged(series([(3.0, "degraded"), (0.1, "good"), (0.2, "good")]), 0, 3)
-    assert right == Trial(0, pytest.approx(0.2), right=True, wrong_called_good=0, scans=3)
+    assert right == StartTrial(0, pytest.approx(0.2), right=True, wrong_called_good=0, scans=3)
     wrong = judged(series([(3.0, "good"), (0.1, "good")]), 0, 2)
     assert (wrong.right, wrong.wrong_called_good) == (False, 1)
     later = judged(series([(0.1, "good"), (3.0, "good")]), 0, 2)

@@ -6,8 +6,8 @@ import pytest
 from studies.new_layer_study.layers import (
     DriveLayers,
     Layer,
+    LayerLocalised,
     LayerTruth,
-    Localised,
     MotorwayOutcome,
     RouteOutcome,
     pooled,
@@ -54,8 +54,8 @@ def route() -> RouteOutcome:
 
 
 def test_table_2_pools_single_drives_and_puts_the_integration_first() -> None:
-    series = Localised(np.arange(2.0), np.array([[5.0, 0.2], [-5.0, 0.2]]))
-    with_layer = Localised(np.arange(2.0), np.array([[0.3, 0.1], [-0.5, 0.1]]))
+    series = LayerLocalised(np.arange(2.0), np.array([[5.0, 0.2], [-5.0, 0.2]]))
+    with_layer = LayerLocalised(np.arange(2.0), np.array([[0.3, 0.1], [-0.5, 0.1]]))
     road = MotorwayOutcome(route(), series, with_layer)
     found = motorway_summary(road)
     assert found["lateral"] == pytest.approx(0.1)

@@ -15,8 +15,8 @@ from gnd.gnd_map.errors import GndError
 from gnd.vehicle_agent.detect.parameters import DetectParameters
 from gnd.vehicle_agent.importer import no_progress, open_recording
 from studies.frame.errors import RealDataError
-from studies.real.rounds import KINDS, Painter, Surroundings, changed_by_shadow, choose_places, truth_of
-from studies.real.scene import Cells, Recorded, Scene, keys_of, load, place
+from studies.real.rounds import KINDS, CellSurroundings, Painter, changed_by_shadow, choose_places, truth_of
+from studies.real.scene import Cells, RecordedScans, RecordedScene, keys_of, load, place
 from studies.real.study import RealOptions, changed, real, reproduce_real
 
 
@@ -30,12 +30,12 @@ def street_drive(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture(scope="session")
-def recorded(street_drive: Path) -> Recorded:
+def recorded(street_drive: Path) -> RecordedScans:
     return load(open_recording("auto", street_drive), 12, no_progress)
 
 
 @pytest.fixture(scope="session")
-def scene(recorded: Recorded) -> Scene:
+def scene(recorded: RecordedScans) -> RecordedScene:
     return place(recorded, 1)
 
 
@@ -67,7 +67,7 @@ def test_a_recording_lies_on_the_grid_in_seeded_ways(recorded):
 
 
 def test_objects_stand_on_free_ground_beside_the_track(scene):
-    around = Surroundings.of(scene)
+    around = CellSurroundings.of(scene)
     placed = choose_places(scene, around, 8, np.random.default_rng(0))
     assert [one.kind for one in placed] == [
         one.kind for one in choose_places(scene, around, 8, np.random.default_rng(0))
@@ -80,7 +80,7 @@ def test_objects_stand_on_free_ground_beside_the_track(scene):
         assert not (inside & (around.points_m[:, 2] > one.shape.bottom_m + 0.6)).any()
 
 
-def box_before(scene: Scene) -> Block:
+def box_before(scene: RecordedScene) -> Block:
     """A box 6 m to the left of the middle of the track, from the ground up."""
     T = scene.poses.at(scene.scans[6].t_ns)
     x, y, z = (T @ [0.0, 6.0, 0.0, 1.0])[:3]

@@ -13,7 +13,7 @@ from gnd.vehicle_agent.importer import map_track, no_progress, open_recording
 from gnd.vehicle_agent.importers.cleaning import cleaned
 from gnd.vehicle_agent.localise import localisation_error
 from studies.frame.errors import RealDataError
-from studies.real.scene import Recorded, Scene, load, place
+from studies.real.scene import RecordedScans, RecordedScene, load, place
 from studies.real_localisation.apollo import apollo_map, gaussians_apart, on_apollos_map
 from studies.real_localisation.convergence import convergence_of
 from studies.real_localisation.flexmap import flexmap_of, is_flexmap
@@ -24,12 +24,12 @@ from studies.real_localisation.study import RealLocalisationOptions
 
 
 @pytest.fixture(scope="module")
-def kitti(shared_data: Path) -> Recorded:
+def kitti(shared_data: Path) -> RecordedScans:
     return load(open_recording("kitti", shared_data / "kitti00_start16"), 8, no_progress)
 
 
 @pytest.mark.slow
-def test_odometries_agree_with_each_other_and_not_with_the_ground_truth(kitti: Recorded) -> None:
+def test_odometries_agree_with_each_other_and_not_with_the_ground_truth(kitti: RecordedScans) -> None:
     rows = {row["name"]: row for row in compared(odometries(kitti), kitti)}
     ours, kiss = rows["ours, growing map"], rows["KISS-ICP"]
     assert ours["way_less_positions_m"] < -0.3  # the ground truth is longer than what LiDAR sees
@@ -40,7 +40,7 @@ def test_odometries_agree_with_each_other_and_not_with_the_ground_truth(kitti: R
 
 
 @pytest.mark.slow
-def test_registration_finds_real_scans_as_small_gicp_does(kitti: Recorded) -> None:
+def test_registration_finds_real_scans_as_small_gicp_does(kitti: RecordedScans) -> None:
     half = Half.of(place(kitti, 0), "even", "odd")
     rows = {(row["off_m"], row["method"]): row for row in convergence_of(half, trials=4)}
     for off_m in (0.3, 1.0, 2.0):
@@ -54,13 +54,13 @@ def test_registration_finds_real_scans_as_small_gicp_does(kitti: Recorded) -> No
 
 
 @pytest.fixture(scope="module")
-def apollo(shared_data: Path) -> Scene:
+def apollo(shared_data: Path) -> RecordedScene:
     recording = open_recording("apollo", shared_data / "apollo_ndt")
     scans = tuple(scan for i in range(2) if (scan := cleaned(recording.read(i)).scan) is not None)
-    return place(Recorded(recording.name, scans, map_track(recording), recording, ()), 0)
+    return place(RecordedScans(recording.name, scans, map_track(recording), recording, ()), 0)
 
 
-def test_apollos_map_lies_on_the_scans(shared_data: Path, apollo: Scene) -> None:
+def test_apollos_map_lies_on_the_scans(shared_data: Path, apollo: RecordedScene) -> None:
     """Its cells, turned by the convergence, on our Gaussians of the same scans: centimetres apart along the normals."""
     theirs = apollo_map(shared_data / "apollo_ndt", apollo)
     found = gaussians_apart(theirs, Half.made("both", apollo, [0, 1], [0, 1]))
@@ -69,7 +69,7 @@ def test_apollos_map_lies_on_the_scans(shared_data: Path, apollo: Scene) -> None
     assert np.abs(found["shift_enu_m"]).max() < 0.05
 
 
-def test_registration_on_apollos_map(shared_data: Path, apollo: Scene) -> None:
+def test_registration_on_apollos_map(shared_data: Path, apollo: RecordedScene) -> None:
     rows = on_apollos_map(apollo_map(shared_data / "apollo_ndt", apollo), Half.made("both", apollo, [0, 1], [0, 1]))
     assert all(row["within_10_cm"] == 1.0 for row in rows)
     assert max(row["heading_deg"] for row in rows) < 0.05

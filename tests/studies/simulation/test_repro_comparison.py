@@ -10,7 +10,7 @@ from repro_world import copy_world, reproduce, without_times
 
 from gnd.deploy.cli import gnd
 from studies.frame.errors import OptionError
-from studies.frame.folder import RunFolder
+from studies.frame.folder import StudyFolder
 from studies.simulation.options import PoseSource
 from studies.simulation.scores import comparison_of, rows_of, worst_loss
 
@@ -60,7 +60,7 @@ def test_sources_of_poses_are_read_in_their_order_and_each_once() -> None:
 
 @pytest.mark.slow
 def test_one_command_tells_what_bad_poses_lose(finished: tuple[Path, dict[str, Any]], tmp_path: Path) -> None:
-    root = RunFolder.begun(tmp_path / "compared").root
+    root = StudyFolder.begun(tmp_path / "compared").root
     copy_world(finished[0], root / "true")
     ran = reproduce(root, "--poses", f"true,{NOISY}", "--json", "-")
     assert ran.exit_code == 0, ran.output

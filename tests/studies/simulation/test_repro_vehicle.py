@@ -17,7 +17,7 @@ from gnd.schemas.changes import ChangeReport
 from gnd.schemas.drive import DriveHeader, ReferencePose, Scan
 from gnd.schemas.drive_mcap import read_drive, read_header
 from gnd.vehicle_agent.local_map import LocalMap
-from studies.frame.folder import RunFolder
+from studies.frame.folder import StudyFolder
 from studies.simulation.base_map import read_base
 from studies.simulation.masses import WATCHED, choose, most_telling
 from studies.simulation.options import MethodParameters, PoseSource, RunOptions
@@ -34,7 +34,7 @@ Finished = tuple[Path, dict[str, Any]]
 def world(finished: Finished) -> tuple[WorldFiles, VehicleTask]:
     """The files of the world, and the first vehicle's work."""
     options = RunOptions((5,), StreetOptions(100.0, "wangsimni"), (1,), ("rs16",), traffic=False, scans=30, pcd=False)
-    files = world_files(RunFolder(finished[0]), 5, options)
+    files = world_files(StudyFolder(finished[0]), 5, options)
     return files, vehicle_tasks(options, 5, files)[0]
 
 

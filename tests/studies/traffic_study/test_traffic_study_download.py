@@ -13,8 +13,8 @@ from gnd.gnd_map.tile import Tile, diff
 from gnd.gnd_map.tile_id import TileId
 from gnd.vehicle_agent.surroundings import tiles_along
 from studies.traffic_study.download import (
+    DownloadTrack,
     Server,
-    Track,
     along_drive,
     fetched_tiles,
     partly_changed,
@@ -36,17 +36,17 @@ def some_gaussians(n: int, seed: int) -> Gaussians:
 
 
 @pytest.fixture(scope="module")
-def track() -> Track:
+def track() -> DownloadTrack:
     options = TrafficOptions(seed=5, street=street_of("usual", 150.0))
-    return Track.of(street(5, options.street), options)
+    return DownloadTrack.of(street(5, options.street), options)
 
 
 @pytest.fixture(scope="module")
-def tiles(track: Track) -> dict[TileId, Gaussians]:
+def tiles(track: DownloadTrack) -> dict[TileId, Gaussians]:
     return {tile: some_gaussians(120, k) for k, tile in enumerate(tiles_along(track.frame, track.position_m, 30.0))}
 
 
-def test_the_drive_is_looked_at_every_five_metres(track: Track) -> None:
+def test_the_drive_is_looked_at_every_five_metres(track: DownloadTrack) -> None:
     assert track.km == pytest.approx(0.15, abs=0.01)
     assert np.diff(track.way_m).max() < 6.5
     assert (np.hypot(*track.velocity_mps[5:-1].T) > 1.0).all()
@@ -54,7 +54,7 @@ def test_the_drive_is_looked_at_every_five_metres(track: Track) -> None:
 
 @pytest.mark.parametrize("link", ["3g", "5g"])
 def test_every_tile_near_the_way_comes_once_and_whole(
-    track: Track, tiles: dict[TileId, Gaussians], tmp_path: Path, link: str
+    track: DownloadTrack, tiles: dict[TileId, Gaussians], tmp_path: Path, link: str
 ) -> None:
     with store_of(tmp_path / "map.sqlite", tiles) as store:
         questions = along_drive(track, Server(store), load_link(link))
@@ -67,7 +67,9 @@ def test_every_tile_near_the_way_comes_once_and_whole(
     assert [q.way_m for q in questions] == sorted(q.way_m for q in questions)
 
 
-def test_who_comes_back_gets_what_changed_only(track: Track, tiles: dict[TileId, Gaussians], tmp_path: Path) -> None:
+def test_who_comes_back_gets_what_changed_only(
+    track: DownloadTrack, tiles: dict[TileId, Gaussians], tmp_path: Path
+) -> None:
     held = {tile: Tile(tile, 1, gaussians) for tile, gaussians in tiles.items()}
     changed = partly_changed(tiles, 0.02, 1)
     sizes = []

@@ -13,7 +13,7 @@ from gnd.gnd_map.classes import ChangeClass
 from gnd.gnd_map.codec import LATTICES, snap
 from gnd.gnd_map.gaussian import Gaussians
 from gnd.gnd_map.tile_id import TileId
-from gnd.gnd_map.track import STEPS, Piece, Track, View
+from gnd.gnd_map.track import STEPS, Track, TrackPiece, TrackView
 from gnd.schemas.changes import ChangeReport, TileChange
 from gnd.schemas.report_id import deterministic_report_id
 from gnd.vehicle_agent.packing import pack
@@ -21,7 +21,7 @@ from gnd.vehicle_agent.report import on_lattice
 from studies.frame.errors import ReproduceError
 from studies.simulation.base_map import BaseMap
 from studies.simulation.result import EVIDENCE, VehicleResult
-from studies.traffic_study.uploads import Cloud, upload
+from studies.traffic_study.uploads import UploadCloud, upload
 
 TILE = TileId(497353963154)
 DRIVE_M = 500.0
@@ -68,8 +68,8 @@ def track() -> Track:
     """Past the middle of the tile, near the ground."""
     first = TileId(TILE.district.first_morton)
     x, y = STEPS * (TILE.lon_index - first.lon_index), STEPS * (TILE.lat_index - first.lat_index) + STEPS // 2
-    piece = Piece(np.array([[x, y, 4], [x + STEPS, y, 4]], np.int32), 40)
-    return Track(TILE.district, View((-30, -24, -18, -12, -6, 0, 6, 12, 20)), (piece,))
+    piece = TrackPiece(np.array([[x, y, 4], [x + STEPS, y, 4]], np.int32), 40)
+    return Track(TILE.district, TrackView((-30, -24, -18, -12, -6, 0, 6, 12, 20)), (piece,))
 
 
 def result_of(report: ChangeReport, base: BaseMap, packed: bytes | None = None) -> VehicleResult:
@@ -81,12 +81,12 @@ def result_of(report: ChangeReport, base: BaseMap, packed: bytes | None = None) 
 
 
 @pytest.fixture
-def cloud(tmp_path: Path) -> Iterator[Cloud]:
-    with Cloud(tmp_path / "cloud.sqlite", BaseMap({TILE: BASE}), MergeParameters()) as cloud:
+def cloud(tmp_path: Path) -> Iterator[UploadCloud]:
+    with UploadCloud(tmp_path / "cloud.sqlite", BaseMap({TILE: BASE}), MergeParameters()) as cloud:
         yield cloud
 
 
-def test_flags_go_first_and_only_what_is_asked_for_follows(cloud: Cloud) -> None:
+def test_flags_go_first_and_only_what_is_asked_for_follows(cloud: UploadCloud) -> None:
     base = cloud.map()
     found = upload(result_of(report_of(1, base), base), base, cloud)
     assert (found.changed, found.tiles, found.observed) == (4, 1, 8)
@@ -98,7 +98,7 @@ def test_flags_go_first_and_only_what_is_asked_for_follows(cloud: Cloud) -> None
     assert found.bytes < 400 < found.float_bytes
 
 
-def test_what_a_fleet_agrees_on_is_merged_and_no_longer_reported(cloud: Cloud) -> None:
+def test_what_a_fleet_agrees_on_is_merged_and_no_longer_reported(cloud: UploadCloud) -> None:
     base = cloud.map()
     sizes = [upload(result_of(report_of(n, base), base), base, cloud).wanted for n in range(1, 9)]
     assert sizes[-1] == 0
@@ -110,7 +110,7 @@ def test_what_a_fleet_agrees_on_is_merged_and_no_longer_reported(cloud: Cloud) -
     assert cloud.merge() == 0
 
 
-def test_a_short_half_that_cannot_be_read_is_followed_by_the_whole_report(cloud: Cloud) -> None:
+def test_a_short_half_that_cannot_be_read_is_followed_by_the_whole_report(cloud: UploadCloud) -> None:
     base = cloud.map()
     good = result_of(report_of(1, base), base)
     other = BaseMap({TILE: grounds([0, 1, 7], 0.1)})
@@ -120,7 +120,7 @@ def test_a_short_half_that_cannot_be_read_is_followed_by_the_whole_report(cloud:
     cloud.merge()
 
 
-def test_a_report_that_is_refused_is_no_upload(cloud: Cloud) -> None:
+def test_a_report_that_is_refused_is_no_upload(cloud: UploadCloud) -> None:
     base = cloud.map()
     good = report_of(1, base)
     report = replace(good, tiles=(replace(good.tiles[0], pose_sigma_m=0.8),))

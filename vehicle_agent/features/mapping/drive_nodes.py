@@ -7,7 +7,7 @@ import numpy as np
 
 from gnd.gnd_map.arrays import F64, I64
 from gnd.vehicle_agent.features.mapping.dead_reckoning import DeadReckoning, composed, relative, rotated
-from gnd.vehicle_agent.features.mapping.feature_drive import FeatureDrive, Fixes, KnownPoses
+from gnd.vehicle_agent.features.mapping.feature_drive import FeatureDrive, GnssFixes, KnownPoses
 from gnd.vehicle_agent.features.mapping.graph import solve
 from gnd.vehicle_agent.features.mapping.graph_edges import (
     NO_FIX_NODES,
@@ -18,7 +18,7 @@ from gnd.vehicle_agent.features.mapping.graph_edges import (
     State,
 )
 from gnd.vehicle_agent.features.mapping.landmarks import Sight
-from gnd.vehicle_agent.features.mapping.parameters import GnssNoise, NewLayerParameters
+from gnd.vehicle_agent.features.mapping.parameters import MappingGnssNoise, NewLayerParameters
 
 _KEYFRAME_M: Final = 5.0
 _KEYFRAME_S: Final = 1.0
@@ -67,7 +67,7 @@ class DriveNodes:
             poses=self._told(self.drive.poses),
         )
 
-    def _fix_nodes(self, fixes: Fixes, pose: F64, noise: GnssNoise) -> FixNodes:
+    def _fix_nodes(self, fixes: GnssFixes, pose: F64, noise: MappingGnssNoise) -> FixNodes:
         """Fixes brought to keyframes and averaged: what is white in them becomes less."""
         if len(fixes.t_ns) == 0:
             return NO_FIX_NODES

@@ -44,7 +44,7 @@ class PolarLook(Protocol):
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Fixes:
+class GnssFixes:
     """Positions by GNSS in the map frame."""
 
     t_ns: I64
@@ -74,7 +74,7 @@ class KnownPoses:
         check_array("cov", self.cov, np.float64, (len(self.t_ns), 3, 3))
 
 
-NO_FIXES = Fixes(np.empty(0, np.int64), np.empty((0, 2)))
+NO_FIXES = GnssFixes(np.empty(0, np.int64), np.empty((0, 2)))
 NO_POSES = KnownPoses(np.empty(0, np.int64), np.empty((0, 3)), np.empty((0, 3, 3)))
 
 
@@ -145,7 +145,7 @@ class FeatureDrive:
     """
 
     motion: MotionTrack
-    fixes: Fixes = NO_FIXES
+    fixes: GnssFixes = NO_FIXES
     looks: tuple[PolarLook, ...] = ()
     lanes: tuple[LaneLook, ...] = ()
     poses: KnownPoses = field(default=NO_POSES)
@@ -172,7 +172,7 @@ class FeatureDrive:
         fix, pose = ((t >= first) & (t <= last) for t in (self.fixes.t_ns, self.poses.t_ns))
         return replace(
             self,
-            fixes=Fixes(self.fixes.t_ns[fix], self.fixes.xy_m[fix]),
+            fixes=GnssFixes(self.fixes.t_ns[fix], self.fixes.xy_m[fix]),
             poses=KnownPoses(self.poses.t_ns[pose], self.poses.pose[pose], self.poses.cov[pose]),
             looks=tuple(look for look in self.looks if first <= look.t_ns <= last),
             lanes=tuple(look for look in self.lanes if first <= look.t_ns <= last),
@@ -205,7 +205,7 @@ class FeatureDrive:
         xy_m = np.asarray(frame.enu_from_geodetic(g.lat_rad, g.lon_rad, g.height_m))[:, :2]
         return cls(
             track.motion,
-            Fixes(g.t_ns, np.ascontiguousarray(xy_m)),
+            GnssFixes(g.t_ns, np.ascontiguousarray(xy_m)),
             tuple(i for i in kept if isinstance(i, Detections) and i.layer == layer and sensor in (None, i.sensor)),
             tuple(i for i in kept if isinstance(i, LaneLook)),
         )

@@ -17,7 +17,7 @@ import numpy as np
 from gnd.gnd_map.arrays import F64, I64
 from gnd.vehicle_agent.errors import NewLayerError
 from gnd.vehicle_agent.features.mapping.bias_chain import gauss_markov_springs
-from gnd.vehicle_agent.features.mapping.graph_edges import Anchors, FixNodes, PoseMatches, Problem, State, Ties
+from gnd.vehicle_agent.features.mapping.graph_edges import FixNodes, GraphAnchors, PoseMatches, Problem, State, Ties
 from gnd.vehicle_agent.features.mapping.parameters import NewLayerParameters
 
 CALIBRATION = gtsam.symbol("c", 0)
@@ -222,12 +222,12 @@ def _matches(matches: PoseMatches, robust_k: float | None) -> list[Any]:
     huber = gtsam.noiseModel.mEstimator.Huber.Create(robust_k or np.inf)
     noise = unit if robust_k is None else gtsam.noiseModel.Robust.Create(huber, unit)
     return [
-        gtsam.CustomFactor(noise, [_x(int(key))], _Match(_pose2(pose), off, root_of(information)))
+        gtsam.CustomFactor(noise, [_x(int(key))], _LandmarkMatch(_pose2(pose), off, root_of(information)))
         for key, pose, off, information in zip(*matches, strict=True)
     ]
 
 
-class _Match:
+class _LandmarkMatch:
     """Eq. (8) as GTSAM asks for it. A prior at the matched pose would not do: along lanes that say little that pose
     may lie far away, and what holds near by does not hold there.
     """
@@ -251,7 +251,7 @@ def root_of(information: F64) -> F64:
     return np.asarray(np.linalg.qr(root, mode="r"))
 
 
-def _add_anchors(graph: Any, anchors: Anchors) -> None:
+def _add_anchors(graph: Any, anchors: GraphAnchors) -> None:
     for landmark, xy, cov in zip(*anchors, strict=True):
         graph.add(gtsam.PriorFactorPoint2(_l(int(landmark)), xy, gtsam.noiseModel.Gaussian.Covariance(cov)))
 

@@ -48,7 +48,7 @@ class PoseMatches(NamedTuple):
     """(P, 3, 3) of `off`; may be singular: nothing is then said along some direction."""
 
 
-class Anchors(NamedTuple):
+class GraphAnchors(NamedTuple):
     """Features whose places are known: A of them."""
 
     landmark: I64
@@ -62,7 +62,7 @@ class Anchors(NamedTuple):
 NO_FIX_NODES = FixNodes(np.empty(0, np.int64), np.empty(0), np.empty((0, 2)), np.empty(0))
 NO_TIES = Ties(np.empty(0, np.int64), np.empty(0, np.int64), np.empty((0, 2)), np.empty((0, 2, 2)))
 NO_MATCHES = PoseMatches(np.empty(0, np.int64), np.empty((0, 3)), np.empty((0, 3)), np.empty((0, 3, 3)))
-NO_ANCHORS = Anchors(np.empty(0, np.int64), np.empty((0, 2)), np.empty((0, 2, 2)))
+NO_ANCHORS = GraphAnchors(np.empty(0, np.int64), np.empty((0, 2)), np.empty((0, 2, 2)))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -75,7 +75,7 @@ class Problem:
     ties: Ties = NO_TIES
     lanes: PoseMatches = NO_MATCHES
     poses: PoseMatches = NO_MATCHES
-    anchors: Anchors = NO_ANCHORS
+    anchors: GraphAnchors = NO_ANCHORS
 
 
 class State(NamedTuple):

@@ -59,7 +59,7 @@ class _Clusters:
     hits: I64
 
 
-class Places(NamedTuple):
+class LandmarkPlaces(NamedTuple):
     """N features as they stand."""
 
     xy_m: F64
@@ -223,7 +223,7 @@ def kept(owner: I64, hits_needed: int) -> I64:
     return np.where(owner >= 0, np.append(number, NONE)[owner], NONE)
 
 
-def doubles(m: Measurements, owner: I64, at: Places) -> list[tuple[int, int]]:
+def doubles(m: Measurements, owner: I64, at: LandmarkPlaces) -> list[tuple[int, int]]:
     """Pairs of features (first, second) that are one: near each other, of one kind, and not seen side by side.
 
     Two that are in view at the same time and never seen in one look are one if a measurement could be of either. Two of
@@ -241,7 +241,7 @@ def doubles(m: Measurements, owner: I64, at: Places) -> list[tuple[int, int]]:
     return [(int(a), int(b)) for a, b in np.argwhere(near) if _same(at, looks, int(a), int(b))]
 
 
-def _same(at: Places, looks: list[I64], a: int, b: int) -> bool:
+def _same(at: LandmarkPlaces, looks: list[I64], a: int, b: int) -> bool:
     first, second = looks[a], looks[b]
     together = len(np.intersect1d(first, second))
     if together > _APART_SHARE * min(len(first), len(second)):

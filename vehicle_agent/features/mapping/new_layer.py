@@ -15,13 +15,13 @@ from gnd.vehicle_agent.features.look import MapFeatures
 from gnd.vehicle_agent.features.mapping.drive_nodes import DriveNodes
 from gnd.vehicle_agent.features.mapping.feature_drive import FeatureDrive, Measurements
 from gnd.vehicle_agent.features.mapping.graph import Solution, solve
-from gnd.vehicle_agent.features.mapping.graph_edges import Anchors, Problem, State
+from gnd.vehicle_agent.features.mapping.graph_edges import GraphAnchors, Problem, State
 from gnd.vehicle_agent.features.mapping.landmarks import (
     LANDMARK_DRIFT_M,
     LANDMARK_MIN_HITS,
     LANDMARK_REVISIT_M,
     NONE,
-    Places,
+    LandmarkPlaces,
     Sight,
     assigned,
     clustered,
@@ -212,9 +212,9 @@ class _Mapping:
         self.xy_m[seen] = solution.state.xy_m
         return solution
 
-    def _anchors(self, seen: I64, number: I64) -> Anchors:
+    def _anchors(self, seen: I64, number: I64) -> GraphAnchors:
         rows = seen[seen < len(self.known.xy_m)] if self.trust_known else np.empty(0, np.int64)
-        return Anchors(number[rows], self.known.xy_m[rows], self.known.cov[rows])
+        return GraphAnchors(number[rows], self.known.xy_m[rows], self.known.cov[rows])
 
     def _merge(self, solution: Solution) -> bool:
         """Two new features that are one become one; the older number stays."""
@@ -227,7 +227,9 @@ class _Mapping:
         number = np.full(len(self.xy_m) + 1, NONE)
         number[new] = np.arange(len(new))
         owner = number[self.owner]
-        at = Places(self.xy_m[new], cov, spread(self.m, self.sight, self.state.pose, owner, len(new)), self.kind[new])
+        at = LandmarkPlaces(
+            self.xy_m[new], cov, spread(self.m, self.sight, self.state.pose, owner, len(new)), self.kind[new]
+        )
         same = doubles(self.m, owner, at)
         for first, second in same:
             self.owner[self.owner == new[second]] = new[first]

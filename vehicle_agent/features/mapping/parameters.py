@@ -5,7 +5,7 @@ from math import log, radians, sqrt
 
 
 @dataclass(frozen=True, slots=True)
-class MotionNoise:
+class MappingMotionNoise:
     """Errors of wheel speed and yaw rate; the defaults are those of a car's series sensors.
 
     wheel_scale: sigma of the error of the wheel's radius, one for the whole drive, as a share.
@@ -33,7 +33,7 @@ class MotionNoise:
 
 
 @dataclass(frozen=True, slots=True)
-class GnssNoise:
+class MappingGnssNoise:
     """Errors of a low-cost receiver: slow and white, the slow part first-order Gauss-Markov.
 
     Defaults: half of all fixes within 2.5 m, as the data sheet of the paper's receiver says, 30 % of the variance white
@@ -95,8 +95,8 @@ class NewLayerParameters:
     """
 
     rounds: int = 6
-    motion: MotionNoise = field(default_factory=MotionNoise)
-    gnss: GnssNoise = field(default_factory=GnssNoise)
+    motion: MappingMotionNoise = field(default_factory=MappingMotionNoise)
+    gnss: MappingGnssNoise = field(default_factory=MappingGnssNoise)
     landmarks: LandmarkParameters = field(default_factory=LandmarkParameters)
     lanes: LaneParameters = field(default_factory=LaneParameters)
 

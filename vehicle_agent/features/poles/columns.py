@@ -41,7 +41,7 @@ WIDTH_SIGMA = 6.0**-0.5
 """The same for the width: 1/12 + 1/12."""
 
 
-class Columns(NamedTuple):
+class PoleColumns(NamedTuple):
     """C columns of slices.
 
     Attributes:
@@ -160,7 +160,7 @@ def _medians(values: F64, label: I64, quantile: float = 0.5) -> F64:
     return np.asarray(by_value[at + (quantile * last).astype(np.int64)])
 
 
-def columns_of(slices: Slices, label: I64) -> Columns:
+def columns_of(slices: Slices, label: I64) -> PoleColumns:
     """Axes and diameters of columns, from slices (S,) sorted by their column (S,) as `stacked` gives them."""
     at = np.flatnonzero(np.diff(label, prepend=-1))
     n = np.diff(at, append=len(label)).astype(np.int64)
@@ -174,7 +174,7 @@ def columns_of(slices: Slices, label: I64) -> Columns:
     spread = _scatter(slices, label, upright - xy[label], n)
     cov += (FRONT * 0.5 * sigma_diameter)[:, None, None] ** 2 * toward[:, :, None] * toward[:, None, :]
     cov += (spread**2 / n)[:, None, None] * np.eye(2)
-    return Columns(
+    return PoleColumns(
         xy, height, cov, lean, toward, diameter, sigma_diameter, spread,
         np.minimum.reduceat(slices.height_m, at) if len(at) else height,
         np.maximum.reduceat(slices.height_m, at) if len(at) else height,

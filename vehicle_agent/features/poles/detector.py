@@ -17,9 +17,9 @@ from numpy.typing import NDArray
 from gnd.gnd_map.arrays import F64, I64
 from gnd.schemas.drive import Detections
 from gnd.schemas.limits import MAX_DETECTIONS_OF_LOOK
-from gnd.vehicle_agent.features.poles.columns import POLE_GAP_M, POLE_LAYERS_APART, Columns, columns_of, stacked
+from gnd.vehicle_agent.features.poles.columns import POLE_GAP_M, POLE_LAYERS_APART, PoleColumns, columns_of, stacked
 from gnd.vehicle_agent.features.poles.errors import PoleInputError
-from gnd.vehicle_agent.features.poles.kinds import Surroundings, bottoms, is_free, kinds_of, look_around, tops
+from gnd.vehicle_agent.features.poles.kinds import PoleSurroundings, bottoms, is_free, kinds_of, look_around, tops
 from gnd.vehicle_agent.features.poles.place_kernels import rays_below
 from gnd.vehicle_agent.features.poles.slices import (
     EXACT,
@@ -27,7 +27,7 @@ from gnd.vehicle_agent.features.poles.slices import (
     POLE_RANGE_MAX_M,
     GroundHeights,
     PoseSigma,
-    Seen,
+    SeenSlice,
     check_rays,
     ground_around,
     joined,
@@ -191,7 +191,7 @@ def detections_of(poles: Sequence[Pole], T_map_vehicle: F64, t_ns: int) -> Detec
 
 
 def _judged(
-    columns: Columns, seen: list[Seen], rays: list[tuple[F64, F64]], ground: GroundHeights, layer_tan: float,
+    columns: PoleColumns, seen: list[SeenSlice], rays: list[tuple[F64, F64]], ground: GroundHeights, layer_tan: float,
     place: F64,
 ) -> tuple[Pole, ...]:  # fmt: skip
     """The columns that are poles."""
@@ -206,10 +206,12 @@ def _judged(
     good[good] = _stands(_take(columns, np.flatnonzero(good)), bottom[good], foot[good], gap[good], rays)
     kept = np.flatnonzero(good)
     kept = kept[np.argsort(np.hypot(*columns.xy_m[kept].T), kind="stable")]
-    return _values(_take(columns, kept), Surroundings._make(part[kept] for part in near), top[kept], foot[kept], place)
+    return _values(
+        _take(columns, kept), PoleSurroundings._make(part[kept] for part in near), top[kept], foot[kept], place
+    )
 
 
-def _straight(columns: Columns, layer_tan: float) -> Mask:
+def _straight(columns: PoleColumns, layer_tan: float) -> Mask:
     """Whether columns (C,) are straight, upright, met by enough of the layers between their ends, and no edge."""
     expected = (columns.top_m - columns.bottom_m) / np.maximum(layer_tan * columns.range_m, 1e-3) + 1.0
     met = columns.slices / np.maximum(columns.scans, 1) >= _SEEN_SHARE_MIN * expected
@@ -217,7 +219,7 @@ def _straight(columns: Columns, layer_tan: float) -> Mask:
     return np.asarray(met & (np.hypot(*columns.lean.T) <= _LEAN_MAX) & (columns.scatter_m <= _SCATTER_MAX_M))
 
 
-def _stands(columns: Columns, bottom_m: F64, foot_z: F64, gap_m: F64, rays: list[tuple[F64, F64]]) -> Mask:
+def _stands(columns: PoleColumns, bottom_m: F64, foot_z: F64, gap_m: F64, rays: list[tuple[F64, F64]]) -> Mask:
     """Whether columns (C,) begin near the ground, or what is below them is hidden rather than free."""
     stands = bottom_m <= _FOOT_M + gap_m - POLE_GAP_M
     high = np.flatnonzero(~stands)
@@ -227,7 +229,7 @@ def _stands(columns: Columns, bottom_m: F64, foot_z: F64, gap_m: F64, rays: list
     return np.asarray(stands)
 
 
-def _values(columns: Columns, near: Surroundings, top: F64, foot: F64, place: F64) -> tuple[Pole, ...]:
+def _values(columns: PoleColumns, near: PoleSurroundings, top: F64, foot: F64, place: F64) -> tuple[Pole, ...]:
     kinds = kinds_of(columns, near, top)
     return tuple(
         Pole(
@@ -249,8 +251,8 @@ def _values(columns: Columns, near: Surroundings, top: F64, foot: F64, place: F6
     )
 
 
-def _take(columns: Columns, index: I64) -> Columns:
-    return Columns._make(column[index] for column in columns)
+def _take(columns: PoleColumns, index: I64) -> PoleColumns:
+    return PoleColumns._make(column[index] for column in columns)
 
 
 def _together(parts: list[F64]) -> F64:

@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gnd.gnd_map.arrays import F64, I64
-from gnd.vehicle_agent.features.poles.columns import Columns
+from gnd.vehicle_agent.features.poles.columns import PoleColumns
 from gnd.vehicle_agent.features.poles.place_kernels import around, by_cell
 from gnd.vehicle_agent.features.poles.slices import GroundHeights
 
@@ -46,7 +46,7 @@ CROWN_HIGH_M: Final = 2.0
 CROWN_THICK_M: Final = 0.2
 
 
-class Surroundings(NamedTuple):
+class PoleSurroundings(NamedTuple):
     """C candidates by height over the ground, B bins of `BIN_M`.
 
     Attributes:
@@ -58,15 +58,15 @@ class Surroundings(NamedTuple):
     sums: F64
 
 
-def look_around(columns: Columns, points_m: F64, height_m: F64, ground: GroundHeights) -> Surroundings:
+def look_around(columns: PoleColumns, points_m: F64, height_m: F64, ground: GroundHeights) -> PoleSurroundings:
     """Count what stands around columns, of the points (N, 3) above the ground and their heights (N,)."""
     axes = np.column_stack([columns.xy_m, columns.height_m, columns.lean, 0.5 * columns.diameter_m, columns.toward])
     belts = np.array([CORE_M, RING_M, RING_END_M, PLATE_M, REACH_M])
     cells = by_cell(points_m, ground.cells)
-    return Surroundings(*around(points_m, height_m, *cells, ground.cells, axes, belts, BIN_M, BINS))
+    return PoleSurroundings(*around(points_m, height_m, *cells, ground.cells, axes, belts, BIN_M, BINS))
 
 
-def is_free(columns: Columns, seen: Surroundings) -> Mask:
+def is_free(columns: PoleColumns, seen: PoleSurroundings) -> Mask:
     """(C,) whether nothing stands in the ring around the thin part at most of its heights, and over one length."""
     core = _within(columns.bottom_m, columns.top_m) & (seen.counts[:, :, CORE] > 0)
     ring = core & (seen.counts[:, :, RING] > 0)
@@ -87,7 +87,7 @@ def _within(low_m: F64, high_m: F64) -> Mask:
     return np.asarray((bins >= first) & (bins <= last))
 
 
-def tops(columns: Columns, seen: Surroundings, gap_m: F64) -> F64:
+def tops(columns: PoleColumns, seen: PoleSurroundings, gap_m: F64) -> F64:
     """(C,) height over the ground up to which the core goes on without a gap of more than gap_m (C,)."""
     top = columns.top_m.copy()
     for b in range(BINS):
@@ -97,7 +97,7 @@ def tops(columns: Columns, seen: Surroundings, gap_m: F64) -> F64:
     return top
 
 
-def bottoms(columns: Columns, seen: Surroundings, gap_m: F64) -> F64:
+def bottoms(columns: PoleColumns, seen: PoleSurroundings, gap_m: F64) -> F64:
     """(C,) height over the ground down to which the core goes on without a gap of more than gap_m (C,).
 
     Where more lies in the ring than in the core it is a wall or a hedge that goes on, not the pole.
@@ -111,7 +111,7 @@ def bottoms(columns: Columns, seen: Surroundings, gap_m: F64) -> F64:
     return bottom
 
 
-def kinds_of(columns: Columns, seen: Surroundings, top_m: F64) -> tuple[str, ...]:
+def kinds_of(columns: PoleColumns, seen: PoleSurroundings, top_m: F64) -> tuple[str, ...]:
     """The kind of each column: "trunk", "traffic_sign", "streetlight" or "pole".
 
     Args:
@@ -135,7 +135,7 @@ def kinds_of(columns: Columns, seen: Surroundings, top_m: F64) -> tuple[str, ...
     return tuple(np.select([mast, crown | tall, plate, leaves], kinds, "pole").tolist())
 
 
-def _beside_it(columns: Columns, seen: Surroundings, bins: Mask) -> Mask:
+def _beside_it(columns: PoleColumns, seen: PoleSurroundings, bins: Mask) -> Mask:
     """(C,) whether what lies in the plate's reach, in some bins (C, B), lies on one side or behind: another's crown."""
     n = np.maximum((seen.counts[:, :, NEAR] * bins).sum(axis=1), 1)
     off = (seen.sums[:, :, :2] * bins[:, :, None]).sum(axis=1) / n[:, None]
@@ -144,7 +144,7 @@ def _beside_it(columns: Columns, seen: Surroundings, bins: Mask) -> Mask:
     return np.asarray((behind > BESIDE_M) | (np.abs(aside) > BESIDE_M))
 
 
-def _spread(seen: Surroundings, bins: Mask) -> tuple[I64, F64, F64]:
+def _spread(seen: PoleSurroundings, bins: Mask) -> tuple[I64, F64, F64]:
     """Points in the plate's reach in the bins (C, B), and their standard deviations across and along."""
     n = (seen.counts[:, :, NEAR] * bins).sum(axis=1)
     total = (seen.sums * bins[:, :, None]).sum(axis=1) / np.maximum(n, 1)[:, None]

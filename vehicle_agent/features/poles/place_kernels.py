@@ -12,7 +12,7 @@ from gnd.gnd_map.arrays import F64, I64
 from gnd.gnd_map.jit import kernel
 
 
-class Ground(NamedTuple):
+class GroundCells(NamedTuple):
     """Squares of the ground, corner at (x0, y0), `n` by `n`."""
 
     x0: float
@@ -22,7 +22,7 @@ class Ground(NamedTuple):
 
 
 @kernel
-def lowest_heights(points: F64, ground: Ground, plane_z: float, slope: float, pit_m: float) -> F64:
+def lowest_heights(points: F64, ground: GroundCells, plane_z: float, slope: float, pit_m: float) -> F64:
     """(n, n) height of the second lowest point of each cell (the lowest is sometimes an echo), inf without two.
 
     Points (N, 3) lower than `pit_m` and `slope` times the distance under the height of the middle count as echoes.
@@ -64,7 +64,7 @@ def cone_heights(low: F64, rise: float) -> F64:
 
 
 @kernel
-def heights_over(points: F64, z: F64, ground: Ground) -> F64:
+def heights_over(points: F64, z: F64, ground: GroundCells) -> F64:
     """(N,) height of the points (N, 3) over the ground's cells `z` (n, n); inf outside."""
     out = np.full(points.shape[0], np.inf)
     for k in range(points.shape[0]):
@@ -76,7 +76,7 @@ def heights_over(points: F64, z: F64, ground: Ground) -> F64:
 
 
 @kernel
-def by_cell(points: F64, ground: Ground) -> tuple[I64, I64]:
+def by_cell(points: F64, ground: GroundCells) -> tuple[I64, I64]:
     """Order, int64 (M,), of the points (N, 3) that lie in a cell of the ground, and its start (n * n + 1,) in it."""
     cell, begin = np.full(points.shape[0], -1, np.int64), np.zeros(ground.n * ground.n + 1, np.int64)
     for k in range(points.shape[0]):
@@ -97,7 +97,15 @@ def by_cell(points: F64, ground: Ground) -> tuple[I64, I64]:
 
 @kernel
 def around(
-    points: F64, height: F64, order: I64, start: I64, ground: Ground, axes: F64, belts: F64, bin_m: float, bins: int
+    points: F64,
+    height: F64,
+    order: I64,
+    start: I64,
+    ground: GroundCells,
+    axes: F64,
+    belts: F64,
+    bin_m: float,
+    bins: int,
 ) -> tuple[I64, F64]:
     """What stands around candidates, by height over the ground.
 
@@ -148,7 +156,7 @@ def around(
 
 
 @kernel
-def _cells(middle_m: float, far_m: float, ground: Ground) -> tuple[int, int]:
+def _cells(middle_m: float, far_m: float, ground: GroundCells) -> tuple[int, int]:
     """First cell, and the one after the last, along an axis of the grid, within `far_m` of its coordinate."""
     first = min(max(math.floor((middle_m - far_m) / ground.cell_m), 0), ground.n)
     return first, max(first, min(math.floor((middle_m + far_m) / ground.cell_m) + 1, ground.n))

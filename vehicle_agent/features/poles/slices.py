@@ -18,7 +18,7 @@ from gnd.vehicle_agent.features.poles.kernels import (
     row_order,
     thin_slices,
 )
-from gnd.vehicle_agent.features.poles.place_kernels import Ground, cone_heights, heights_over, lowest_heights
+from gnd.vehicle_agent.features.poles.place_kernels import GroundCells, cone_heights, heights_over, lowest_heights
 
 _RANGE_MIN_M: Final = 2.0
 """Nearer points are the vehicle itself."""
@@ -98,7 +98,7 @@ class GroundHeights:
         seen_m: (n, n) heights where the ground is seen, else inf.
     """
 
-    cells: Ground
+    cells: GroundCells
     z_m: F64
     seen_m: F64
 
@@ -127,7 +127,7 @@ class PoseSigma(NamedTuple):
 EXACT = PoseSigma(0.0, 0.0)
 
 
-class Seen(NamedTuple):
+class SeenSlice(NamedTuple):
     """A scan after its slices are found.
 
     Attributes:
@@ -170,7 +170,7 @@ def ground_around(points_m: F64, centre_m: F64) -> GroundHeights:
     """
     half = ceil((POLE_RANGE_MAX_M + 3.0) / _GROUND_CELL_M)
     side = half * _GROUND_CELL_M
-    cells = Ground(float(centre_m[0]) - side, float(centre_m[1]) - side, _GROUND_CELL_M, 2 * half)
+    cells = GroundCells(float(centre_m[0]) - side, float(centre_m[1]) - side, _GROUND_CELL_M, 2 * half)
     low = lowest_heights(points_m, cells, float(centre_m[2]), _GROUND_SLOPE, PIT_M)
     low[half - 1 : half + 1, half - 1 : half + 1] = centre_m[2]
     z = cone_heights(low, _GROUND_SLOPE * _GROUND_CELL_M)
@@ -180,7 +180,7 @@ def ground_around(points_m: F64, centre_m: F64) -> GroundHeights:
 def slices_of(
     points_m: F64, origins_m: F64, ground: GroundHeights, number: int = 0,
     pose: PoseSigma = EXACT,
-) -> Seen:  # fmt: skip
+) -> SeenSlice:  # fmt: skip
     """The slices of one scan.
 
     Args:
@@ -209,7 +209,7 @@ def slices_of(
         slices = slices._replace(
             sigma_along_m=np.full(len(slices.z_m), pose.m), sigma_across_m=np.hypot(pose.m, pose.rad * slices.range_m)
         )
-    return Seen(slices, points, height, layer_tan)
+    return SeenSlice(slices, points, height, layer_tan)
 
 
 def _layer_gap(gaps: I64) -> int:

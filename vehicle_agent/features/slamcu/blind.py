@@ -25,7 +25,7 @@ STANDING_MPS: Final = 0.02
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Belief:
+class BlindBelief:
     """Gaussian over x, y [m], heading [rad], wheel scale, gyro bias [rad/s] and the GNSS's slow error x, y [m].
 
     Attributes:
@@ -37,7 +37,7 @@ class Belief:
     cov: F64
 
     @classmethod
-    def first(cls, pose: F64, cov: F64, parameters: SlamcuParameters, gnss_sigma_m: float = 0.0) -> "Belief":
+    def first(cls, pose: F64, cov: F64, parameters: SlamcuParameters, gnss_sigma_m: float = 0.0) -> "BlindBelief":
         """The belief at the start.
 
         Args:
@@ -70,7 +70,7 @@ class BlindFilter:
         has_fixes: whether a fix has been seen, or the first pose was made of some.
     """
 
-    def __init__(self, parameters: SlamcuParameters, belief: Belief) -> None:
+    def __init__(self, parameters: SlamcuParameters, belief: BlindBelief) -> None:
         self._p = parameters
         self._mean, self._cov = belief.mean.copy(), belief.cov.copy()
         self.has_fixes = float(belief.cov[GNSS_X, GNSS_X]) > 0.0
@@ -81,15 +81,15 @@ class BlindFilter:
         self._expected = belief, np.eye(7)
 
     @property
-    def expected(self) -> tuple[Belief, F64]:
+    def expected(self) -> tuple[BlindBelief, F64]:
         """What was believed right before the last fix, and the transition (7, 7) from right after the one before."""
         return self._expected
 
     @property
-    def belief(self) -> Belief:
+    def belief(self) -> BlindBelief:
         """What is believed now."""
         self._propagate()
-        return Belief(self._mean.copy(), self._cov.copy())
+        return BlindBelief(self._mean.copy(), self._cov.copy())
 
     def predict(self, dt_s: float, speed_mps: float, yaw_rate_radps: float) -> None:
         """The vehicle drove on."""
@@ -136,7 +136,7 @@ class BlindFilter:
         F = np.diag([1.0, 1.0, 1.0, 1.0, 1.0, fade, fade])
         self._mean, self._cov = F @ self._mean, F @ self._cov @ F
         self._cov[[GNSS_X, GNSS_Y], [GNSS_X, GNSS_Y]] += (1.0 - fade**2) * slow
-        self._expected, self._F = (Belief(self._mean.copy(), self._cov.copy()), F @ self._F), np.eye(7)
+        self._expected, self._F = (BlindBelief(self._mean.copy(), self._cov.copy()), F @ self._F), np.eye(7)
         H = np.zeros((2, 7))
         H[0, [X, GNSS_X]] = H[1, [Y, GNSS_Y]] = 1.0
         nu, S = xy_m - H @ self._mean, H @ self._cov @ H.T + white * np.eye(2)
@@ -150,7 +150,7 @@ class BlindFilter:
         return True
 
 
-def apart(pose: F64, cov: F64, belief: Belief) -> float:
+def apart(pose: F64, cov: F64, belief: BlindBelief) -> float:
     """Squared Mahalanobis distance of a pose (3,) with its covariance (3, 3) from a belief's."""
     off = pose - belief.mean[:3]
     off[2] = float(wrapped(off[2]))

@@ -13,7 +13,7 @@ from typing import Final
 import numpy as np
 
 from gnd.gnd_map.arrays import F64
-from gnd.vehicle_agent.features.slamcu.existence_book import Entry, ExistenceBook
+from gnd.vehicle_agent.features.slamcu.existence_book import BookEntry, ExistenceBook
 from gnd.vehicle_agent.features.slamcu.rbpf import Rbpf
 from gnd.vehicle_agent.features.slamcu.tracked import Tracked
 
@@ -27,7 +27,7 @@ LOOSE_RAD: Final = radians(1.0)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Step:
+class DoubtStep:
     """A feature of the map that was called moved.
 
     Attributes:
@@ -38,14 +38,14 @@ class Step:
         odometer_m: when.
     """
 
-    known: Entry
-    found: Entry
+    known: BookEntry
+    found: BookEntry
     hits: int
     off_m: F64
     odometer_m: float
 
 
-class Doubt:
+class PlaceDoubt:
     """Remembers the last feature that moved.
 
     Args:
@@ -56,14 +56,14 @@ class Doubt:
 
     def __init__(self, tracked: Tracked, rbpf: Rbpf, book: ExistenceBook) -> None:
         self._tracked, self._rbpf, self._book = tracked, rbpf, book
-        self._last: Step | None = None
+        self._last: DoubtStep | None = None
         self._sure_m = 0.0
 
     def found_in_place(self, odometer_m: float) -> None:
         """A feature of the map was measured where it should be."""
         self._last, self._sure_m = None, odometer_m
 
-    def moved(self, step: Step) -> None:
+    def moved(self, step: DoubtStep) -> None:
         """A feature of the map was called moved."""
         self._last = step
 

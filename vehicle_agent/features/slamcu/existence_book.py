@@ -40,7 +40,7 @@ class MassesAt:
 
 
 @dataclass(slots=True, eq=False)
-class Entry:
+class BookEntry:
     """One feature: the map's, or found here.
 
     Attributes:
@@ -79,7 +79,7 @@ class Entry:
     together: Counter[int] = field(default_factory=Counter)
     history: deque[tuple[int, F64]] = field(default_factory=lambda: deque(maxlen=HISTORY))
 
-    def __deepcopy__(self, memo: dict[int, Any]) -> "Entry":
+    def __deepcopy__(self, memo: dict[int, Any]) -> "BookEntry":
         """A copy that goes its own way: arrays are only ever replaced, never written into, and may be shared."""
         copied = replace(self, heights=self.heights.copy(), history=self.history.copy(), together=self.together.copy())
         memo[id(self)] = copied
@@ -110,7 +110,7 @@ class ExistenceBook:
         self.known_masses = row(prior(parameters.map_confidence))  # Eq. (3)
         self.new_masses = row(VACUOUS)  # Eq. (4)
 
-    def evidence(self, detected: Sequence[Entry], missed: Sequence[Entry], t_ns: int) -> None:
+    def evidence(self, detected: Sequence[BookEntry], missed: Sequence[BookEntry], t_ns: int) -> None:
         """Detected features get Eq. (1), those in view that were not detected Eq. (2), all by Eq. (5)."""
         touched = [*detected, *missed]
         if not touched:
@@ -126,14 +126,14 @@ class ExistenceBook:
             entry.misses += 1
             entry.pass_misses += 1
 
-    def recount(self, entry: Entry, hits: int, misses: int, t_ns: int) -> None:
+    def recount(self, entry: BookEntry, hits: int, misses: int, t_ns: int) -> None:
         """Masses from counts, whose order does not matter: hits turned out to be misses, or another feature's."""
         entry.hits, entry.misses = max(hits, 0), max(misses, 0)
         masses = self.known_masses if entry.known else self.new_masses
         entry.masses = doubted(counted(masses, entry.hits, entry.misses, self._p.detection_confidence)[None])[0]
         entry.history.append((t_ns, entry.masses))
 
-    def classify(self, entry: Entry) -> FeatureClass:
+    def classify(self, entry: BookEntry) -> FeatureClass:
         """The class by the largest mass (section 4.3.3); a new one must have been measured `min_hits` times."""
         state = existence_of(entry.masses).state
         if entry.known:
@@ -142,7 +142,7 @@ class ExistenceBook:
         enough = entry.hits >= _MIN_HITS
         return FeatureClass.NEW if state == "exist" and enough else FeatureClass.UNCLASSIFIED
 
-    def usable(self, entry: Entry) -> bool:
+    def usable(self, entry: BookEntry) -> bool:
         """Whether it may tell where the vehicle is: only what exists, by its masses (section 4.3.4)."""
         return bool(entry.masses[0] > max(entry.masses[1], entry.masses[2]))
 

@@ -15,7 +15,7 @@ LEAST_WAY_M: Final = 5.0
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class FirstPose:
+class FilterStart:
     """A first pose.
 
     Attributes:
@@ -31,7 +31,7 @@ class FirstPose:
 
 def first_pose_of(
     motion_ns: I64, speed_mps: F64, yaw_rate_radps: F64, fix_ns: I64, fix_m: F64, sigma_m: float
-) -> FirstPose:
+) -> FilterStart:
     """Return the pose at the last of some motion samples, of nothing but these and the fixes until then.
 
     Args:
@@ -58,7 +58,7 @@ def first_pose_of(
     x, y, last_rad = track[-1]
     pose = np.array([c * x - s * y + shift[0], s * x + c * y + shift[1], last_rad + turn])
     sigma_rad = 2.0 * sigma_m / moved_m
-    return FirstPose(int(motion_ns[-1]), pose, np.diag([sigma_m**2, sigma_m**2, sigma_rad**2]))
+    return FilterStart(int(motion_ns[-1]), pose, np.diag([sigma_m**2, sigma_m**2, sigma_rad**2]))
 
 
 def _laid_onto(points: F64, onto: F64) -> tuple[float, F64]:

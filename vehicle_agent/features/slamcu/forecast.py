@@ -7,7 +7,7 @@ import numpy as np
 
 from gnd.gnd_map.arrays import F64
 from gnd.vehicle_agent.features.slamcu.blind import HEADING
-from gnd.vehicle_agent.features.slamcu.existence_book import Entry
+from gnd.vehicle_agent.features.slamcu.existence_book import BookEntry
 from gnd.vehicle_agent.features.slamcu.rbpf import Rbpf
 from gnd.vehicle_agent.features.view import wrapped
 
@@ -30,7 +30,7 @@ class Forecast:
         return np.sqrt(np.stack([self.cov[:, 0, 0], self.cov[:, 1, 1]], axis=1))
 
 
-def forecast(rbpf: Rbpf, weights: F64, entries: Sequence[Entry]) -> Forecast:
+def forecast(rbpf: Rbpf, weights: F64, entries: Sequence[BookEntry]) -> Forecast:
     """Predict range and bearing of features.
 
     A feature that is estimated in the particles is predicted from each one's own position of it, so that errors of the
@@ -53,7 +53,7 @@ def forecast(rbpf: Rbpf, weights: F64, entries: Sequence[Entry]) -> Forecast:
     return Forecast(np.stack([mean[0], wrapped(mean[1])], axis=1), cov)
 
 
-def _place(rbpf: Rbpf, weights: F64, entry: Entry) -> tuple[F64, F64]:
+def _place(rbpf: Rbpf, weights: F64, entry: BookEntry) -> tuple[F64, F64]:
     """Positions (2, M) or (2, 1), and the covariance (3,) within each particle."""
     if entry.slot is not None:
         return rbpf.mu[entry.slot].T, weights @ rbpf.sigma[entry.slot]

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gnd.gnd_map.arrays import F64
-from gnd.vehicle_agent.features.slamcu.blind import Belief, BlindFilter
+from gnd.vehicle_agent.features.slamcu.blind import BlindBelief, BlindFilter
 from gnd.vehicle_agent.features.slamcu.parameters import SlamcuParameters
 
 LASTING_M: Final = 0.5
@@ -65,8 +65,8 @@ class _Step:
 
     t_s: float
     F: F64
-    expected: Belief
-    believed: Belief
+    expected: BlindBelief
+    believed: BlindBelief
 
 
 class Hindsight:
@@ -77,7 +77,7 @@ class Hindsight:
         first: the belief at the start.
     """
 
-    def __init__(self, parameters: SlamcuParameters, first: Belief) -> None:
+    def __init__(self, parameters: SlamcuParameters, first: BlindBelief) -> None:
         self._p = parameters
         self._blind = BlindFilter(parameters, first)
         self._steps: list[_Step] = []
@@ -195,7 +195,7 @@ def held(cov: F64) -> F64:
     return wide
 
 
-def claimed_now(pose: F64, cov: F64, blind: Belief) -> F64:
+def claimed_now(pose: F64, cov: F64, blind: BlindBelief) -> F64:
     """(3, 3) the covariance of a pose (3,) while nothing of what comes is known: held against the blind filter."""
     wide = held(cov[None])
     total = wide[:, :2, :2] + blind.cov[None, :2, :2] + LASTING_M**2 * np.eye(2)

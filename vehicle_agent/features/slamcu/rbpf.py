@@ -19,7 +19,7 @@ import numpy as np
 
 from gnd.gnd_map.arrays import F64, I64
 from gnd.vehicle_agent.features.slamcu import measurement
-from gnd.vehicle_agent.features.slamcu.blind import BIAS, GNSS_X, HEADING, SCALE, STANDING_MPS, Belief, X, Y
+from gnd.vehicle_agent.features.slamcu.blind import BIAS, GNSS_X, HEADING, SCALE, STANDING_MPS, BlindBelief, X, Y
 from gnd.vehicle_agent.features.slamcu.parameters import SlamcuParameters
 from gnd.vehicle_agent.features.view import wrapped
 
@@ -73,7 +73,7 @@ class Rbpf:
         root = vectors * np.sqrt(np.maximum(values, 0.0))
         self.state[:3] = pose[:, None] + root @ self.offsets
 
-    def seed(self, belief: Belief) -> None:
+    def seed(self, belief: BlindBelief) -> None:
         """Draw the particles anew from a belief; the GNSS's error stays a Kalman filter in each of them."""
         if self.m == 1:
             self.place(belief.mean[:3], belief.cov[:3, :3])

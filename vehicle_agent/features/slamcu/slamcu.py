@@ -16,8 +16,8 @@ from gnd.gnd_map.arrays import F64, I64
 from gnd.vehicle_agent.features.errors import BadPose
 from gnd.vehicle_agent.features.look import Look, MapFeatures
 from gnd.vehicle_agent.features.slamcu.association import Association, associate, pair_costs
-from gnd.vehicle_agent.features.slamcu.blind import STANDING_MPS, Belief, BlindFilter
-from gnd.vehicle_agent.features.slamcu.existence_book import Entry, ExistenceBook, FeatureClass, existence_of
+from gnd.vehicle_agent.features.slamcu.blind import STANDING_MPS, BlindBelief, BlindFilter
+from gnd.vehicle_agent.features.slamcu.existence_book import BookEntry, ExistenceBook, FeatureClass, existence_of
 from gnd.vehicle_agent.features.slamcu.forecast import Forecast, forecast
 from gnd.vehicle_agent.features.slamcu.identities import LN_NONE, LN_NONE_DOUBTED
 from gnd.vehicle_agent.features.slamcu.parameters import SlamcuParameters
@@ -100,7 +100,7 @@ class Slamcu:
         self._p = self.parameters = parameters
         pose0, cov0 = checked_pose(pose0, cov0)
         self._rbpf = Rbpf(parameters, pose0, cov0, np.random.default_rng(seed))
-        belief = Belief.first(pose0, cov0, parameters, gnss_sigma_m)
+        belief = BlindBelief.first(pose0, cov0, parameters, gnss_sigma_m)
         self._blind = BlindFilter(parameters, belief)
         if gnss_sigma_m > 0.0:
             self._rbpf.seed(belief)
@@ -184,7 +184,7 @@ class Slamcu:
         return self._rbpf.pose(self._rbpf.weights())
 
     @property
-    def blind(self) -> Belief:
+    def blind(self) -> BlindBelief:
         """Where the vehicle is by wheels, gyro and GNSS alone."""
         return self._blind.belief
 
@@ -229,7 +229,7 @@ class Slamcu:
         """The drive has ended: decide what was left open for further signs to tell."""
         self._tidying.decide(self._looked_ns)
 
-    def _decided(self, entry: Entry) -> bool:
+    def _decided(self, entry: BookEntry) -> bool:
         return entry.slot is None or self._rbpf.provisional[entry.slot]
 
     def told(self) -> list[Innovation]:
@@ -293,7 +293,7 @@ class Slamcu:
         found = [self._new_feature(entry, weights) for entry in self._tracked.new]
         return tuple(one for one in found if unclassified or one.feature_class == FeatureClass.NEW)
 
-    def _associate(self, look: Look, near: list[Entry], ahead: Forecast) -> Association:
+    def _associate(self, look: Look, near: list[BookEntry], ahead: Forecast) -> Association:
         """Section 4.3.1, by the likelihood of range and bearing and by how plausible the feature's existence is."""
         z = np.stack([look.range_m, look.bearing_rad], axis=1)
         innovation = z[:, None] - ahead.z[None]
@@ -308,8 +308,8 @@ class Slamcu:
         return associate(cost - np.log(plausible), -np.log(_NEW_DENSITY))
 
     def _missed(
-        self, near: list[Entry], ahead: Forecast, measured: I64, view: SensorView, occlusion: Occlusion | None
-    ) -> list[Entry]:
+        self, near: list[BookEntry], ahead: Forecast, measured: I64, view: SensorView, occlusion: Occlusion | None
+    ) -> list[BookEntry]:
         """Features well in view that nothing hides and that were not measured: they get Eq. (2)."""
         if not near:
             return []
@@ -328,7 +328,7 @@ class Slamcu:
             rows = rows[clear]
         return [near[i] for i in rows]
 
-    def _measure(self, look: Look, rows: I64, detected: list[Entry], weights: F64) -> None:
+    def _measure(self, look: Look, rows: I64, detected: list[BookEntry], weights: F64) -> None:
         """Section 4.3.4: features that exist are measured; Eq. (16) to (19)."""
         for row, entry in zip(rows, detected, strict=True):
             z, variance = np.array([look.range_m[row], look.bearing_rad[row]]), look.variance[row]
@@ -348,7 +348,7 @@ class Slamcu:
             entry.history.append((look.t_ns, entry.masses))
             self._noted(entry, look, int(row), weights)
 
-    def _noted(self, entry: Entry, look: Look, row: int, weights: F64) -> None:
+    def _noted(self, entry: BookEntry, look: Look, row: int, weights: F64) -> None:
         entry.in_view_s, entry.odometer_m = self.now_s, self.odometer_m
         entry.pass_hits += 1
         if look.height_m is not None and isfinite(look.height_m[row]):
@@ -356,7 +356,7 @@ class Slamcu:
         if entry.slot is not None and not entry.known:
             entry.xy_m = weights @ self._rbpf.mu[entry.slot] if entry.cov is None else entry.xy_m
 
-    def _known_state(self, entry: Entry) -> KnownState:
+    def _known_state(self, entry: BookEntry) -> KnownState:
         seen = entry.seen
         if seen is None and entry.slot is not None and self._rbpf.priors[entry.slot] is not None:
             seen = self._rbpf.moments(entry.slot, self._rbpf.weights(without=(entry.slot,)))
@@ -366,7 +366,7 @@ class Slamcu:
             xy_m, cov, entry.height_m, entry.masses_over_time(),
         )  # fmt: skip
 
-    def _new_feature(self, entry: Entry, weights: F64) -> NewFeature:
+    def _new_feature(self, entry: BookEntry, weights: F64) -> NewFeature:
         if entry.slot is not None:
             xy_m, cov = self._rbpf.moments(entry.slot, weights)
         else:

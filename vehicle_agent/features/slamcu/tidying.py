@@ -7,8 +7,8 @@ import numpy as np
 
 from gnd.gnd_map.arrays import F64
 from gnd.vehicle_agent.features.slamcu.blind import BlindFilter
-from gnd.vehicle_agent.features.slamcu.doubt import Doubt, Step
-from gnd.vehicle_agent.features.slamcu.existence_book import Entry, ExistenceBook, FeatureClass
+from gnd.vehicle_agent.features.slamcu.doubt import DoubtStep, PlaceDoubt
+from gnd.vehicle_agent.features.slamcu.existence_book import BookEntry, ExistenceBook, FeatureClass
 from gnd.vehicle_agent.features.slamcu.identities import LN_NONE, LN_NONE_DOUBTED, NONE, best_identities
 from gnd.vehicle_agent.features.slamcu.parameters import SlamcuParameters
 from gnd.vehicle_agent.features.slamcu.rbpf import Rbpf
@@ -78,19 +78,19 @@ class Tidying:
         self, parameters: SlamcuParameters, tracked: Tracked, rbpf: Rbpf, book: ExistenceBook, blind: BlindFilter
     ) -> None:
         self._p, self._tracked, self._rbpf, self._book, self._blind = parameters, tracked, rbpf, book, blind
-        self._doubt = Doubt(tracked, rbpf, book)
+        self._doubt = PlaceDoubt(tracked, rbpf, book)
         self.ln_none = LN_NONE
         self.told: list[Innovation] = []
         self._odometer_m = self._asked_s = 0.0
 
-    def measured_together(self, detected: list[Entry]) -> None:
+    def measured_together(self, detected: list[BookEntry]) -> None:
         """Remember which features were measured in one look."""
         for entry in detected:
             for other in detected:
                 if other is not entry:
                     entry.together[other.key] += 1
 
-    def tidy(self, now_s: float, odometer_m: float, t_ns: int, near: list[Entry]) -> None:
+    def tidy(self, now_s: float, odometer_m: float, t_ns: int, near: list[BookEntry]) -> None:
         """Everything that is due.
 
         Args:
@@ -135,7 +135,7 @@ class Tidying:
                 self._tracked.leave(entry)
         self._doubt.forget()
 
-    def _settle(self, entry: Entry, t_ns: int) -> None:
+    def _settle(self, entry: BookEntry, t_ns: int) -> None:
         """Compare with the position known otherwise, and take that in."""
         if (entry.known and not self._identify(entry, t_ns)) or entry.slot is None:
             return
@@ -156,7 +156,7 @@ class Tidying:
             entry.seen = (xy_m, cov) if entry.seen is None else fused_moments(entry.seen, (xy_m, cov))
             self._rbpf.settle(entry.slot)
 
-    def _is_it_me(self, entry: Entry, off_m: F64) -> bool:
+    def _is_it_me(self, entry: BookEntry, off_m: F64) -> bool:
         """Whether it is the vehicle that is off by (2,): others say so too, and GNSS, wheels and gyro allow it."""
         if not self._doubt.is_it_me(off_m, self._others_off(entry), entry.odometer_m):
             return False
@@ -166,7 +166,7 @@ class Tidying:
         squared = float(there @ np.linalg.solve((cov + belief.cov[:3, :3])[:2, :2], there))
         return squared < ALLOWED or not self._blind.has_fixes
 
-    def _others_off(self, entry: Entry) -> list[F64]:
+    def _others_off(self, entry: BookEntry) -> list[F64]:
         """How far off (2,) other features of the map are that are not where they should be, of those not settled."""
         found = []
         for one in self._tracked.live:
@@ -176,7 +176,7 @@ class Tidying:
                     found.append(xy_m - one.xy_m)
         return found
 
-    def _take(self, entry: Entry, *, agrees: bool) -> None:
+    def _take(self, entry: BookEntry, *, agrees: bool) -> None:
         """A new feature that was found on an earlier passage already, and settled."""
         assert entry.slot is not None
         if agrees:
@@ -185,7 +185,7 @@ class Tidying:
             self._rbpf.priors[entry.slot] = None
         entry.cov = None
 
-    def _identify(self, entry: Entry, t_ns: int) -> bool:
+    def _identify(self, entry: BookEntry, t_ns: int) -> bool:
         """Give the estimates of features that stand close together to those of the map that they are; False: nobody can
         tell yet, and until then they tell nothing of where the vehicle is.
         """
@@ -210,7 +210,7 @@ class Tidying:
                 self._exchange(feature, other, t_ns)
         return True
 
-    def _group(self, entry: Entry) -> list[Entry]:
+    def _group(self, entry: BookEntry) -> list[BookEntry]:
         """Features like this one around it that are being estimated, those of the map that are not settled first."""
         alike = [one for one in self._tracked.live if one.kind == entry.kind and self._together(one, entry)]
         unsettled = [one for one in alike if one.known and one.slot is not None and self._rbpf.priors[one.slot]]
@@ -218,21 +218,21 @@ class Tidying:
         found = [one for one in alike if not one.known and one.cov is None]
         return unsettled + [one for one in found if one.pass_hits >= RIVAL_SHARE * most]
 
-    def _together(self, one: Entry, other: Entry) -> bool:
+    def _together(self, one: BookEntry, other: BookEntry) -> bool:
         places = [self._rbpf.mu[each.slot].mean(axis=0) for each in (one, other)]
         return float(np.hypot(*(places[0] - places[1]))) < GROUP_M
 
-    def _exchange(self, one: Entry, other: Entry, t_ns: int) -> None:
+    def _exchange(self, one: BookEntry, other: BookEntry, t_ns: int) -> None:
         rest = [(each.hits - each.pass_hits, each.misses - each.pass_misses) for each in (one, other)]
         self._tracked.exchange(one, other)
         for each, (hits, misses) in zip((one, other), rest, strict=True):
             self._book.recount(each, hits + each.pass_hits, misses + each.pass_misses, t_ns)
 
-    def _moved(self, entry: Entry, xy_m: F64, cov: F64) -> bool:
+    def _moved(self, entry: BookEntry, xy_m: F64, cov: F64) -> bool:
         far = float(np.hypot(*(xy_m - entry.xy_m))) > _MOVED_M
         return far and innovation_of(entry, xy_m, cov).squared > _MOVED_GATE
 
-    def _split(self, entry: Entry, t_ns: int) -> None:
+    def _split(self, entry: BookEntry, t_ns: int) -> None:
         """A moved feature is a deleted one and a new one (section 2.3)."""
         assert entry.slot is not None
         xy_m, _ = self._rbpf.moments(entry.slot, self._rbpf.weights(without=(entry.slot,)))
@@ -240,11 +240,11 @@ class Tidying:
         found.xy_m, found.in_view_s, found.odometer_m = xy_m, entry.in_view_s, entry.odometer_m
         found.heights, entry.heights = entry.heights, found.heights
         self._tracked.hand_over(entry, found)
-        self._doubt.moved(Step(entry, found, hits, xy_m - entry.xy_m, entry.odometer_m))
+        self._doubt.moved(DoubtStep(entry, found, hits, xy_m - entry.xy_m, entry.odometer_m))
         self._book.recount(found, hits, 0, t_ns)
         self._book.recount(entry, entry.hits - hits, entry.misses + hits, t_ns)
 
-    def _leave(self, entry: Entry, odometer_m: float) -> None:
+    def _leave(self, entry: BookEntry, odometer_m: float) -> None:
         """Out of view: the map's features at once, new ones when they can learn little more."""
         if entry.known:
             self._tracked.leave(entry)
@@ -253,7 +253,7 @@ class Tidying:
         elif odometer_m - entry.odometer_m > self._p.filter.horizon_m:
             self._freeze(entry)
 
-    def _freeze(self, entry: Entry) -> None:
+    def _freeze(self, entry: BookEntry) -> None:
         assert entry.slot is not None
         entry.xy_m, cov = self._rbpf.moments(entry.slot, self._rbpf.weights())
         entry.cov = np.array([cov[0, 0], cov[0, 1], cov[1, 1]])
@@ -267,7 +267,7 @@ class Tidying:
             else:
                 self._freeze(oldest)
 
-    def _give_up_or_unite(self, entry: Entry, near: list[Entry], t_ns: int) -> None:
+    def _give_up_or_unite(self, entry: BookEntry, near: list[BookEntry], t_ns: int) -> None:
         if entry.masses[1] > GIVEN_UP:
             self._tracked.drop(entry)
             return
@@ -276,7 +276,7 @@ class Tidying:
                 self._unite(other, entry, t_ns)
                 return
 
-    def _same(self, other: Entry, entry: Entry) -> bool:
+    def _same(self, other: BookEntry, entry: BookEntry) -> bool:
         """Whether a new feature is another one: at one place, and never measured at once."""
         if entry.slot is None or (not other.known and (other.slot is None or other.number > entry.number)):
             return False
@@ -287,7 +287,7 @@ class Tidying:
         off, cov = self._apart(other, entry, weights)
         return float(np.hypot(*off)) < SAME_M and float(off @ np.linalg.solve(cov, off)) < SAME_GATE
 
-    def _apart(self, other: Entry, entry: Entry, weights: F64) -> tuple[F64, F64]:
+    def _apart(self, other: BookEntry, entry: BookEntry, weights: F64) -> tuple[F64, F64]:
         """Mean (2,) and covariance (2, 2) of how far apart two features are."""
         assert entry.slot is not None
         mu, sigma = self._rbpf.mu[entry.slot], self._rbpf.sigma[entry.slot]
@@ -299,7 +299,7 @@ class Tidying:
         off = off - mean
         return mean, (off * weights[:, None]).T @ off + within[[0, 1, 1, 2]].reshape(2, 2)
 
-    def _unite(self, kept: Entry, other: Entry, t_ns: int) -> None:
+    def _unite(self, kept: BookEntry, other: BookEntry, t_ns: int) -> None:
         """Each look that measured one of them measured the feature, though the other was missed."""
         hits = kept.hits + other.hits
         self._tracked.unite(kept, other)
@@ -310,7 +310,7 @@ class Tidying:
         self._tracked.drop(other)
 
 
-def innovation_of(entry: Entry, xy_m: F64, cov: F64) -> Innovation:
+def innovation_of(entry: BookEntry, xy_m: F64, cov: F64) -> Innovation:
     """What a measured position (2,) with covariance (2, 2) says of a feature whose position is known otherwise."""
     assert entry.cov is not None
     off, total = xy_m - entry.xy_m, cov + entry.cov[[0, 1, 1, 2]].reshape(2, 2)

@@ -8,7 +8,7 @@ import numpy as np
 from gnd.gnd_map.arrays import F64
 from gnd.vehicle_agent.features.errors import BadMapFeatures
 from gnd.vehicle_agent.features.look import MapFeatures
-from gnd.vehicle_agent.features.slamcu.existence_book import Entry, ExistenceBook
+from gnd.vehicle_agent.features.slamcu.existence_book import BookEntry, ExistenceBook
 from gnd.vehicle_agent.features.slamcu.parameters import SlamcuParameters
 from gnd.vehicle_agent.features.slamcu.rbpf import Prior, Rbpf
 
@@ -24,10 +24,10 @@ class Tracked:
 
     def __init__(self, parameters: SlamcuParameters, known: MapFeatures, rbpf: Rbpf, book: ExistenceBook) -> None:
         self._p, self._rbpf, self._book = parameters, rbpf, book
-        self.known: list[Entry] = []
+        self.known: list[BookEntry] = []
         self._known_xy_m = np.zeros((0, 2))
-        self.new: list[Entry] = []
-        self.live: list[Entry] = []
+        self.new: list[BookEntry] = []
+        self.live: list[BookEntry] = []
         self._numbers = 0
         self.hold(known)
 
@@ -55,38 +55,38 @@ class Tracked:
     def _index(self) -> None:
         self._known_xy_m = np.array([entry.xy_m for entry in self.known]).reshape(-1, 2)
 
-    def within(self, xy_m: F64, radius_m: float) -> list[Entry]:
+    def within(self, xy_m: F64, radius_m: float) -> list[BookEntry]:
         """Entries whose position lies within a radius of a place (2,)."""
         off = self._known_xy_m - xy_m
         known = np.flatnonzero(np.einsum("ni,ni->n", off, off) <= radius_m**2)
         new = [entry for entry in self.new if float(np.hypot(*(entry.xy_m - xy_m))) <= radius_m]
         return [self.known[i] for i in known] + new
 
-    def register(self, kind: str) -> Entry:
+    def register(self, kind: str) -> BookEntry:
         """A feature that nobody knew, without evidence so far; Eq. (4)."""
         self._numbers += 1
-        entry = Entry(self._numbers, False, kind, np.zeros(2), None, nan, self._book.new_masses)
+        entry = BookEntry(self._numbers, False, kind, np.zeros(2), None, nan, self._book.new_masses)
         self.new.append(entry)
         return entry
 
-    def enter(self, entry: Entry, z: F64, variance: F64) -> None:
+    def enter(self, entry: BookEntry, z: F64, variance: F64) -> None:
         """Estimate a feature in the particles from this first measurement on."""
         self._rbpf.add(z, variance, prior_of_entry(entry))
         entry.slot, entry.pass_hits, entry.pass_misses = len(self.live), 0, 0
         self.live.append(entry)
 
-    def leave(self, entry: Entry) -> None:
+    def leave(self, entry: BookEntry) -> None:
         """Estimate it no longer."""
         if entry.slot is not None:
             self._rbpf.remove(entry.slot)
             self._forget_slot(entry)
 
-    def drop(self, entry: Entry) -> None:
+    def drop(self, entry: BookEntry) -> None:
         """A new feature that was none."""
         self.leave(entry)
         self.new.remove(entry)
 
-    def unite(self, kept: Entry, other: Entry) -> None:
+    def unite(self, kept: BookEntry, other: BookEntry) -> None:
         """The particles' estimates of two features become one, that of `kept`."""
         if other.slot is None:
             return
@@ -99,14 +99,14 @@ class Tracked:
             self._rbpf.merge(kept.slot, other.slot)
             self._forget_slot(other)
 
-    def hand_over(self, giver: Entry, taker: Entry) -> None:
+    def hand_over(self, giver: BookEntry, taker: BookEntry) -> None:
         """What was estimated for one feature turned out to be another."""
         assert giver.slot is not None
         self.live[giver.slot] = taker
         taker.slot, taker.pass_hits, taker.cov, giver.slot = giver.slot, giver.pass_hits, None, None
         self._rbpf.priors[taker.slot] = None
 
-    def hand_back(self, giver: Entry, taker: Entry) -> None:
+    def hand_back(self, giver: BookEntry, taker: BookEntry) -> None:
         """The new feature was the map's after all; it is given up."""
         if giver.slot is not None:
             self.live[giver.slot] = taker
@@ -114,7 +114,7 @@ class Tracked:
             self._rbpf.priors[taker.slot], giver.slot = prior_of_entry(taker), None
         self.drop(giver)
 
-    def exchange(self, one: Entry, other: Entry) -> None:
+    def exchange(self, one: BookEntry, other: BookEntry) -> None:
         """The estimates of two features are each other's."""
         mine, others = one.slot, other.slot
         assert mine is not None
@@ -127,19 +127,19 @@ class Tracked:
             setattr(one, name, getattr(other, name))
             setattr(other, name, before)
 
-    def _forget_slot(self, entry: Entry) -> None:
+    def _forget_slot(self, entry: BookEntry) -> None:
         assert entry.slot is not None
         del self.live[entry.slot]
         entry.slot = None
         for slot, one in enumerate(self.live):
             one.slot = slot
 
-    def _of_map(self, known: MapFeatures, i: int, cov: F64) -> Entry:
+    def _of_map(self, known: MapFeatures, i: int, cov: F64) -> BookEntry:
         packed = np.array([cov[0, 0], cov[0, 1], cov[1, 1]])
         number, kind, z_m = int(known.feature_id[i]), known.kind[i], float(known.z_m[i])
-        return Entry(number, True, kind, known.xy_m[i].copy(), packed, z_m, self._book.known_masses)
+        return BookEntry(number, True, kind, known.xy_m[i].copy(), packed, z_m, self._book.known_masses)
 
 
-def prior_of_entry(entry: Entry) -> Prior | None:
+def prior_of_entry(entry: BookEntry) -> Prior | None:
     """Its position known otherwise, if there is one."""
     return None if entry.cov is None else (entry.xy_m, entry.cov)

@@ -19,7 +19,7 @@ from typing import Final
 import numpy as np
 
 from gnd.gnd_map.arrays import F64
-from gnd.vehicle_agent.features.slamcu.blind import Belief, apart
+from gnd.vehicle_agent.features.slamcu.blind import BlindBelief, apart
 from gnd.vehicle_agent.features.slamcu.existence_book import FeatureClass
 from gnd.vehicle_agent.features.slamcu.parameters import GnssNoise
 from gnd.vehicle_agent.features.slamcu.slamcu import Passed
@@ -92,7 +92,7 @@ class Watch:
         self.run = 0.0
         self._sign = 0.0
 
-    def fix(self, off_m: F64, sigma_m: float, dt_s: float, pose: tuple[F64, F64], blind: Belief) -> None:
+    def fix(self, off_m: F64, sigma_m: float, dt_s: float, pose: tuple[F64, F64], blind: BlindBelief) -> None:
         """Take a fix that was used.
 
         Args:

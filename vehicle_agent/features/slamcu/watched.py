@@ -17,7 +17,7 @@ import numpy as np
 
 from gnd.gnd_map.arrays import F64
 from gnd.vehicle_agent.features.look import Look, MapFeatures
-from gnd.vehicle_agent.features.slamcu.blind import Belief
+from gnd.vehicle_agent.features.slamcu.blind import BlindBelief
 from gnd.vehicle_agent.features.slamcu.existence_book import FeatureClass
 from gnd.vehicle_agent.features.slamcu.hindsight import (
     GATE,
@@ -193,7 +193,7 @@ class _Account:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class _Kept:
+class _KeptState:
     """A state on the way: what had been told, and how many events and poses there were."""
 
     account: _Account
@@ -244,12 +244,12 @@ class WatchedSlamcu:
         self.lost: list[Lost] = []
         self.doubts = 0
         self._events: list[_Event] = []
-        self._kept: list[_Kept] = [self._state()]
+        self._kept: list[_KeptState] = [self._state()]
         self._asked_s, self._patience_s = 0.0, PATIENCE_S
-        self._hindsight = Hindsight(parameters, Belief.first(pose0, cov0, parameters, gnss_sigma_m))
+        self._hindsight = Hindsight(parameters, BlindBelief.first(pose0, cov0, parameters, gnss_sigma_m))
         self._back_s = self._known_s = 0.0  # when hindsight was asked last, and until when its answer has been heard
         self._clock_ns = 0
-        self._lost_since: _Kept | None = None
+        self._lost_since: _KeptState | None = None
         self._extra = np.zeros((0, 2, 2))  # of each pose of the path, once the drive has ended
 
     def predict(self, dt_s: float, speed_mps: float, yaw_rate_radps: float) -> None:
@@ -391,9 +391,9 @@ class WatchedSlamcu:
 
     # States on the way
 
-    def _state(self) -> _Kept:
+    def _state(self) -> _KeptState:
         self._seed += 1
-        return _Kept(self._now.fork(self._seed), len(self._events), len(self.path))
+        return _KeptState(self._now.fork(self._seed), len(self._events), len(self.path))
 
     def _keep(self) -> None:
         way_m = self._slamcu.odometer_m - self._kept[-1].odometer_m
@@ -406,9 +406,9 @@ class WatchedSlamcu:
 
     def _forget_events(self, count: int) -> None:
         del self._events[:count]
-        self._kept = [_Kept(one.account, one.events - count, one.poses) for one in self._kept]
+        self._kept = [_KeptState(one.account, one.events - count, one.poses) for one in self._kept]
 
-    def _back(self) -> Iterator[_Kept]:
+    def _back(self) -> Iterator[_KeptState]:
         """States so far back, each once; the oldest when the drive has just begun."""
         told: set[int] = set()
         for back_m in BACK_M:
@@ -423,7 +423,7 @@ class WatchedSlamcu:
     def _look_into(self, alarm: Alarm) -> None:
         """Tell the way anew, and keep the best account of it."""
         self.doubts += 1
-        tried: list[tuple[_Kept, _Account]] = []
+        tried: list[tuple[_KeptState, _Account]] = []
         for one in self._back():
             tried += [(one, account) for account in self._tellings(one)]
             if any(self._will_do(account) for _, account in tried):
@@ -450,7 +450,7 @@ class WatchedSlamcu:
     def _smoothed(self) -> Smoothed:
         return self._hindsight.smoothed(self._slamcu.now_s - LOOK_BACK_S)
 
-    def _denied(self, kept: _Kept, path: list[PoseAt], smoothed: Smoothed) -> float:
+    def _denied(self, kept: _KeptState, path: list[PoseAt], smoothed: Smoothed) -> float:
         """What hindsight says against the way since the first state that is kept, with another path from one on."""
         first = min(one.poses for one in self._kept)
         return speaks_against(*_columns([*self.path[first : kept.poses], *path]), smoothed)
@@ -495,7 +495,7 @@ class WatchedSlamcu:
         )
         self._replace(kept, account)
 
-    def _replace(self, kept: _Kept, account: _Account) -> None:
+    def _replace(self, kept: _KeptState, account: _Account) -> None:
         self.path[kept.poses :] = account.path
         account.path.clear()
         self._now = account
@@ -505,7 +505,7 @@ class WatchedSlamcu:
         """Whether an account is so much better, and so free of doubt, that none from farther back is needed."""
         return account.watch.alarm() is None and _against(account) < _against(self._now) - 2.0 * BETTER
 
-    def _tellings(self, kept: _Kept) -> Iterator[_Account]:
+    def _tellings(self, kept: _KeptState) -> Iterator[_Account]:
         """From a state by particles around the blind pose, and by those that were there, which doubt the map."""
         for anew in (True, False):
             self._seed += 1
@@ -518,7 +518,7 @@ class WatchedSlamcu:
                 account.take(event)
             yield account
 
-    def _adopt(self, kept: _Kept, account: _Account, alarm: Alarm) -> None:
+    def _adopt(self, kept: _KeptState, account: _Account, alarm: Alarm) -> None:
         """The account of the way since a state was wrong; here is another."""
         old = self.path[kept.poses :]
         off_m = max(
@@ -558,7 +558,7 @@ class WatchedSlamcu:
         if there >= FOUND_AGAIN and there > sum(one.feature_class == FeatureClass.DELETED for one in seen):
             self._lost_since = None
 
-    def _stay_lost(self, since: _Kept) -> None:
+    def _stay_lost(self, since: _KeptState) -> None:
         """The place was not found again: nothing of what was concluded since is told."""
         off_m = float(np.hypot(*(self._slamcu.pose()[0] - self._slamcu.blind.mean[:3])[:2]))
         taken = _differences(self._slamcu, since.account.slamcu)
