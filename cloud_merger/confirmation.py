@@ -10,21 +10,22 @@ A pure function of the merged tile and the reports, as the merge itself: every n
 
 from collections import Counter, defaultdict
 from collections.abc import Collection, Iterable, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
-from scipy.sparse import coo_array
-from scipy.sparse.csgraph import connected_components
-from scipy.spatial import cKDTree
+from numpy.typing import NDArray
 
 from gnd.cloud_merger.errors import MergerError
 from gnd.cloud_merger.merge import MergedTile
-from gnd.cloud_merger.statements import Report, Witness
+from gnd.cloud_merger.statements import REMEMBERED, Report, Witness
+from gnd.gnd_map.arrays import I32, I64, are_in, unique
+from gnd.gnd_map.by_object import ByObject
 from gnd.gnd_map.gaussian import Gaussians
 from gnd.gnd_map.grid import VoxelGrid
+from gnd.gnd_map.jit import kernel
 from gnd.gnd_map.settings import check_settings, setting
-from gnd.gnd_map.tile import TileDelta, apply
+from gnd.schemas.changes import TileChange
 from gnd.tile_store.values import Unconfirmed, WaitingReason
 
 CONFIRMATION_VOUCHED_SHARE: Final = 0.5
@@ -129,7 +130,7 @@ def gate(
         waits |= {voxel: (vehicle, reason) for voxel, reason in reasons.items()}
     if not waits:
         return GatedTile(merged)
-    return GatedTile(_without(epoch, merged, waits), _told(waits, merged, epoch, by_report.values()))
+    return GatedTile(merged.without(waits), _told(waits, merged, epoch, by_report.values()))
 
 
 def _witnesses(merged: MergedTile, by_id: Mapping[str, Who], named: frozenset[str]) -> dict[str, _Witness]:
@@ -169,13 +170,35 @@ def _isolated(epoch: Gaussians, merged: MergedTile, reports: Iterable[Report], t
     if tile is None or not merged.provenance:
         return frozenset()
     voxels = np.array(sorted(merged.provenance), np.int32)
-    there, was = (np.isin(voxels, gaussians.voxel_id) for gaussians in (merged.gaussians, epoch))
-    at = np.stack(VoxelGrid.of(tile).unravel(voxels), axis=1)
-    pairs = cKDTree(at).query_pairs(1.5, p=np.inf, output_type="ndarray")
-    links = coo_array((np.ones(len(pairs)), (pairs[:, 0], pairs[:, 1])), shape=(len(voxels), len(voxels)))
-    n_groups, group = connected_components(links, directed=False)
-    size = np.bincount(group, there != was, n_groups)
-    return frozenset(voxels[size[group] < together_voxels].tolist())
+    there, was = (are_in(voxels, ids) for ids in (merged.delta.put.voxel_id, epoch.voxel_id))
+    together = changes_together(*VoxelGrid.of(tile).unravel(voxels), there != was)
+    return frozenset(voxels[together < together_voxels].tolist())
+
+
+@kernel
+def changes_together(x: I64, y: I64, floor: I64, counts: NDArray[np.bool_]) -> I64:
+    """(N,) how many of those that count are in the group of each voxel, voxel beside voxel; `floor` ascends."""
+    n = len(x)
+    group = np.arange(n)
+    for i in range(n):
+        for j in range(i + 1, n):
+            if floor[j] - floor[i] > 1:
+                break
+            if abs(x[i] - x[j]) <= 1 and abs(y[i] - y[j]) <= 1:
+                a, b = _root(group, i), _root(group, j)
+                group[max(a, b)] = min(a, b)
+    size = np.zeros(n, np.int64)
+    for i in range(n):
+        size[_root(group, i)] += 1 if counts[i] else 0
+    return np.array([size[_root(group, i)] for i in range(n)])
+
+
+@kernel
+def _root(group: I64, i: int) -> int:
+    while group[i] != i:
+        group[i] = group[group[i]]
+        i = group[i]
+    return i
 
 
 def _waiting_of(
@@ -202,24 +225,23 @@ def _waiting_of(
 
 def _seen(vehicle: str, epoch: Gaussians, reports: Iterable[Report]) -> int:
     """Voxels of the tile that a vehicle observed and that hold something, before or by its word."""
-    own = [report.change for report in reports if report.vehicle == vehicle]
+    own = [_seen_by(report.change, epoch) for report in reports if report.vehicle == vehicle]
     if not own:
         return 0  # it spoke in an earlier window
-    before = [np.intersect1d(change.observed, epoch.voxel_id) for change in own]
-    return len(np.unique(np.concatenate([*before, *(change.changed.voxel_id for change in own)])))
+    return len(own[0]) if len(own) == 1 else len(unique(np.concatenate(own)))
 
 
-def _without(epoch: Gaussians, merged: MergedTile, waits: Mapping[int, object]) -> MergedTile:
-    """The merged tile with the voxels that wait as they are in the epoch."""
-    held = np.array(sorted(waits), np.int32)
-    now, was = merged.gaussians.select(held), epoch.select(held)
-    back = TileDelta(np.setdiff1d(now.voxel_id, was.voxel_id), was)
-    return replace(
-        merged,
-        gaussians=apply(merged.gaussians, back),
-        changed=np.setdiff1d(merged.changed, held),
-        provenance={voxel: ids for voxel, ids in merged.provenance.items() if voxel not in waits},
-    )
+_SEEN: Final[ByObject[tuple[Gaussians, I32]]] = ByObject(REMEMBERED)
+
+
+def _seen_by(change: TileChange, epoch: Gaussians) -> I32:
+    """The same of one report, sorted ids; found once for each epoch, which is held so that no other gets its id."""
+
+    def made() -> tuple[Gaussians, I32]:
+        before = change.observed[are_in(change.observed, epoch.voxel_id)]
+        return epoch, np.asarray(unique(np.concatenate([before, change.changed.voxel_id])))
+
+    return _SEEN.of(change, made, id(epoch))[1]
 
 
 def _told(

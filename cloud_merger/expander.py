@@ -21,10 +21,10 @@ from gnd.cloud_merger.features.kept import FeatureInbox
 from gnd.cloud_merger.ingest import one_line
 from gnd.cloud_merger.short_reports import FirstSaid, ShortReports
 from gnd.cloud_merger.states import STATUS
-from gnd.cloud_merger.stored import Bases
+from gnd.cloud_merger.stored import Bases, encoded_parts
 from gnd.cloud_merger.wants import asked_voxels
 from gnd.gnd_map.errors import GndError
-from gnd.schemas.changes import ChangeReport, split
+from gnd.schemas.changes import ChangeReport
 from gnd.schemas.errors import SchemaError
 from gnd.schemas.features import FeatureReport
 from gnd.schemas.packed import PackedGaussians, PackedReport, crc_of, decode_upload
@@ -250,7 +250,7 @@ def rows_of(report: ChangeReport, received_ns: int, part: int = 0) -> tuple[Repo
             report.report_id, report.layer, tile, report.vehicle, received_ns, body, change.base_sha, part,
             is_quiet=not len(change.changed),
         )
-        for change, (tile, body) in zip(report.tiles, split(report), strict=True)
+        for change, (tile, body) in zip(report.tiles, encoded_parts(report), strict=True)
     )  # fmt: skip
 
 

@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gnd.cloud_merger.errors import BadReport, MissingBase
+from gnd.gnd_map.arrays import are_in
 from gnd.gnd_map.classes import ChangeClass
 from gnd.gnd_map.codec import Flags, decode_flags, decode_measured
 from gnd.gnd_map.errors import CodecError, ConfigError, GndError, ShapeError, TrackError
@@ -176,5 +177,5 @@ def _rows_wanted(report: ChangeReport, wanted: NDArray[np.bool_]) -> list[NDArra
 def _filled(change: TileChange, measured: Gaussians | None) -> TileChange:
     if measured is None:
         return change
-    kept = change.changed.take(~np.isin(change.changed.voxel_id, measured.voxel_id))
+    kept = change.changed.take(~are_in(change.changed.voxel_id, measured.voxel_id))
     return replace(change, changed=concat([kept, measured]))

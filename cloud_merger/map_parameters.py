@@ -21,8 +21,15 @@ from gnd.cloud_merger.features.existence import FEATURE_ABSENCE, FEATURE_CEILING
 from gnd.cloud_merger.features.parameters import FeatureMergeParameters
 from gnd.cloud_merger.features.publication import FEATURE_MOST_WEIGHT, FEATURE_RENEWAL_MASS, FEATURE_VOTERS
 from gnd.cloud_merger.features.tracks import FEATURE_MAX_BEGUN, FEATURE_MOVED_M
-from gnd.cloud_merger.merge import MERGE_D_DENIED, MERGE_D_RENEWED, MERGE_D_UPDATE, MERGE_XI_RESHAPED
-from gnd.cloud_merger.parameters import MERGE_NOISE_M, MERGE_POSE_LEVER_M, MergeParameters
+from gnd.cloud_merger.parameters import (
+    MERGE_D_DENIED,
+    MERGE_D_RENEWED,
+    MERGE_D_UPDATE,
+    MERGE_NOISE_M,
+    MERGE_POSE_LEVER_M,
+    MERGE_XI_RESHAPED,
+    MergeParameters,
+)
 from gnd.cloud_merger.shift import (
     SHIFT_BEYOND_CHANCE,
     SHIFT_DISPLACED_M,

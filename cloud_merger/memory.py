@@ -20,7 +20,7 @@ import zstandard
 from numpy.typing import NDArray
 
 from gnd.cloud_merger.errors import MergerError
-from gnd.cloud_merger.statements import EPOCH, STATEMENT, Kind, Report, Rows, Witness, find, states_at
+from gnd.cloud_merger.statements import EPOCH, STATEMENT, Kind, Report, Rows, Witness, find, stacked, states_at
 from gnd.gnd_map.gaussian import Gaussians
 
 I32 = NDArray[np.int32]
@@ -85,7 +85,7 @@ class TileMemory:
         said["was"] = np.where(said["kind"] == Kind.QUOTED, EPOCH, 0)
         said["report"] = -1
         turns = [np.clip(support - turn, 0.0, 1.0) for turn in range(int(SUPPORT[-1]))]
-        rows = np.concatenate([said] * len(turns)) if turns else said[:0]
+        rows = stacked([said] * len(turns))
         rows["weight"] = np.concatenate(turns) if turns else 0.0
         spoken: Rows = rows[rows["weight"] > 0.0]
         return spoken

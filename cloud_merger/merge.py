@@ -4,30 +4,30 @@ The merged tile depends on the epoch tile and on the set of all reports since th
 on nothing else: in whatever batches and retries they came, the same reports give the same tile, bit for bit.
 """
 
+from collections.abc import Collection
 from dataclasses import dataclass, field, replace
 from itertools import pairwise
-from typing import Final
+from typing import cast
 
 import numpy as np
 from numpy.typing import NDArray
 
 from gnd.cloud_merger.cluster import Index, dbscan, dbscan_sklearn
+from gnd.cloud_merger.decide_kernels import Found, decided
 from gnd.cloud_merger.merge_kernels import clusters_of
-from gnd.cloud_merger.parameters import MERGE_NOISE_M, MergeParameters
+from gnd.cloud_merger.parameters import (
+    MERGE_D_DENIED,
+    MERGE_D_RENEWED,
+    MERGE_D_UPDATE,
+    MERGE_NOISE_M,
+    MERGE_XI_RESHAPED,
+    MergeParameters,
+)
 from gnd.cloud_merger.statements import EPOCH, Kind, Rows, Statements, find, states_at
+from gnd.gnd_map.arrays import are_in
 from gnd.gnd_map.gaussian import Gaussians
 from gnd.gnd_map.similarity import pairs_within, similarity
 from gnd.gnd_map.tile import TileDelta, apply
-
-MERGE_XI_RESHAPED: Final = 0.5
-"""The same for a cluster most of which denies the epoch's own Gaussian ("modified"). Lower, because a shape is judged
-less surely than a presence, and a parked car seldom touches what the map holds."""
-MERGE_D_UPDATE: Final = 0.5
-"""Published when the candidate's similarity to the epoch's voxel is smaller than this."""
-MERGE_D_DENIED: Final = 0.95
-"""The same where most of the candidate's statements were compared with that voxel and deny it."""
-MERGE_D_RENEWED: Final = 0.9
-"""A representative of more measurements takes the place of an earlier one that is less like it."""
 
 __all__ = ["MergeParameters", "MergedTile", "merge_tile"]
 
@@ -39,18 +39,38 @@ class MergedTile:
     """A merged tile.
 
     Attributes:
-        gaussians: the epoch's with the decided changes applied.
-        changed: int32 (C,) sorted ids of the voxels that differ from the epoch by decision.
+        epoch: what the statements were merged into.
+        delta: the decided changes.
         provenance: for each changed voxel the ids of the reports in the cluster that won it.
         for_change: (M,) which statements are in the cluster that changes their voxel.
         for_epoch: (M,) which are in one that says it is as in the epoch.
     """
 
-    gaussians: Gaussians
-    changed: NDArray[np.int32]
+    epoch: Gaussians
+    delta: TileDelta
     provenance: dict[int, tuple[str, ...]] = field(default_factory=dict)
     for_change: NDArray[np.bool_] = field(default_factory=lambda: np.zeros(0, np.bool_))
     for_epoch: NDArray[np.bool_] = field(default_factory=lambda: np.zeros(0, np.bool_))
+
+    @property
+    def changed(self) -> NDArray[np.int32]:
+        """(C,) sorted ids of the voxels that differ from the epoch by decision."""
+        return np.sort(np.concatenate([self.delta.removed, self.delta.put.voxel_id]))
+
+    @property
+    def gaussians(self) -> Gaussians:
+        """The epoch's with the decided changes applied."""
+        return apply(self.epoch, self.delta)
+
+    def without(self, voxels: Collection[int]) -> "MergedTile":
+        """The same with these voxels as they are in the epoch."""
+        held = np.array(sorted(voxels), np.int32)
+        gone, put = self.delta.removed, self.delta.put
+        return replace(
+            self,
+            delta=TileDelta(gone[~are_in(gone, held)], put.take(~are_in(put.voxel_id, held))),
+            provenance={voxel: ids for voxel, ids in self.provenance.items() if voxel not in voxels},
+        )
 
 
 def merge_tile(epoch: Gaussians, statements: Statements, parameters: MergeParameters | None = None) -> MergedTile:
@@ -64,19 +84,32 @@ def merge_tile(epoch: Gaussians, statements: Statements, parameters: MergeParame
     parameters = parameters or MergeParameters()
     rows = statements.rows
     if len(rows) == 0:
-        return MergedTile(epoch, np.zeros(0, np.int32))
+        return MergedTile(epoch, TileDelta(np.zeros(0, np.int32), Gaussians.empty()))
+    decide = decided if parameters.mode == "default" else plain_decisions
+    for_change, for_epoch, voxel_id, count, cells, mean_m, cov_m2 = decide(rows, epoch, parameters)
+    there = count > 0
+    put = Gaussians(voxel_id[there], count[there], cells[there], mean_m[there], cov_m2[there])
+    return MergedTile(
+        epoch,
+        TileDelta(voxel_id[~there], put),
+        _said_by(voxel_id, statements, rows["voxel_id"][for_change], rows["report"][for_change]),
+        for_change,
+        for_epoch,
+    )
+
+
+def plain_decisions(rows: Rows, epoch: Gaussians, parameters: MergeParameters) -> Found:
+    """What `decided` gives, over arrays of rows: for "paper" mode, and the twin of the kernel."""
     of_statement = _joined(rows, _clusters(rows, parameters))
     winner = _winners(rows, of_statement, parameters)
-    rows, cluster = _members(rows, of_statement, winner)
-    candidate = _representatives(rows, cluster, parameters)
-    decided = _differs(epoch, candidate, _share(rows["denies"], cluster), parameters)
-    decided &= ~_confirmed(rows, cluster)
-    merged = _merged(epoch, candidate[decided], statements, rows[decided[cluster]])
-    return replace(
-        merged,
-        for_change=np.isin(of_statement, winner[decided]),
-        for_epoch=_says_epoch(statements.rows, of_statement, epoch),
-    )
+    members, cluster = _members(rows, of_statement, winner)
+    candidate = _representatives(members, cluster, parameters)
+    differs = _differs(epoch, candidate, _share(members["denies"], cluster), parameters)
+    differs &= ~_confirmed(members, cluster)
+    changes = candidate[differs]
+    columns = (np.ascontiguousarray(changes[name]) for name in ("voxel_id", "count", "cells", "mean_m", "cov_m2"))
+    for_change = np.isin(of_statement, winner[differs])
+    return cast("Found", (for_change, _says_epoch(rows, of_statement, epoch), *columns))
 
 
 def _says_epoch(rows: Rows, cluster: Index, epoch: Gaussians) -> NDArray[np.bool_]:
@@ -305,23 +338,13 @@ def _share(mark: NDArray[np.bool_], cluster: Index) -> NDArray[np.float64]:
     return np.asarray(np.bincount(cluster, weights=mark) / np.bincount(cluster))
 
 
-def _merged(epoch: Gaussians, changes: Rows, statements: Statements, members: Rows) -> MergedTile:
-    """The epoch with the changes applied, and who said so."""
-    there = changes[changes["count"] > 0]
-    put = Gaussians(*(np.ascontiguousarray(there[name]) for name in ("voxel_id", "count", "cells", "mean_m", "cov_m2")))
-    gone = np.ascontiguousarray(changes["voxel_id"][changes["count"] == 0])
-    return MergedTile(
-        gaussians=apply(epoch, TileDelta(gone, put)),
-        changed=np.ascontiguousarray(changes["voxel_id"]),
-        provenance=_said_by(changes["voxel_id"], statements, members),
-    )
-
-
-def _said_by(voxel_id: NDArray[np.int32], statements: Statements, members: Rows) -> dict[int, tuple[str, ...]]:
-    """Of each changed voxel the ids of the reports in the cluster that won; members come voxel by voxel."""
+def _said_by(
+    voxel_id: NDArray[np.int32], statements: Statements, voxel: NDArray[np.int32], report: NDArray[np.int32]
+) -> dict[int, tuple[str, ...]]:
+    """Of each changed voxel the ids of the reports in the cluster that won; voxel and report of its statements."""
     ids = statements.report_ids
-    spoken = members[members["report"] >= 0]  # the support of what was published is nobody's report
-    voxel, report = spoken["voxel_id"].copy(), spoken["report"].copy()
+    spoken = report >= 0  # the support of what was published is nobody's report
+    voxel, report = voxel[spoken], report[spoken]
     first = np.append(np.flatnonzero(np.append(True, voxel[1:] != voxel[:-1])[: len(voxel)]), len(voxel)).tolist()
     told: dict[bytes, tuple[str, ...]] = {}  # most voxels were told by the same reports
     found: dict[int, tuple[str, ...]] = dict.fromkeys(voxel_id.tolist(), ())

@@ -32,12 +32,12 @@ def clusters_of(rows: Rows, parameters: MergeParameters) -> I64:
     label = np.full(len(rows), NOISE, np.int64)
     columns = {name: rows[name].copy() for name in _COLUMNS}  # aligned, as the fields of a record are not
     noise_m2, eps, min_samples = MERGE_NOISE_M**2, parameters.eps, parameters.min_samples
-    _label_voxels(**columns, noise_m2=noise_m2, eps=eps, min_samples=min_samples, label=label)
+    label_voxels(**columns, noise_m2=noise_m2, eps=eps, min_samples=min_samples, label=label)
     return label
 
 
 @kernel
-def _label_voxels(
+def label_voxels(
     voxel_id: I32,
     kind: U8,
     was: I64,
@@ -51,7 +51,7 @@ def _label_voxels(
     label: I64,
 ) -> None:
     """Label the statements (M,) of one voxel after the other; scratch is as long as the voxel with most of them."""
-    most = _most_in_a_voxel(voxel_id)
+    most = most_in_a_voxel(voxel_id)
     node, row, weight = np.empty(most, np.int64), np.empty(most, np.int64), np.empty(most, np.int64)
     found, queue, rest = np.empty(most, np.int64), np.empty(most, np.int64), np.empty(most, np.int64)
     begin, number, far = 0, 0, far_at(1.0 - eps)
@@ -71,7 +71,8 @@ def _label_voxels(
 
 
 @kernel
-def _most_in_a_voxel(voxel_id: I32) -> int:
+def most_in_a_voxel(voxel_id: I32) -> int:
+    """The largest number of statements about one voxel; they are sorted by voxel."""
     most, n = 0, 0
     for k in range(len(voxel_id)):
         n = n + 1 if k > 0 and voxel_id[k] == voxel_id[k - 1] else 1

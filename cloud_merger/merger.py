@@ -2,6 +2,7 @@
 
 import logging
 import threading
+from collections.abc import Sequence
 from contextlib import ExitStack
 from typing import Final
 
@@ -17,7 +18,7 @@ from gnd.cloud_merger.reception import Reception
 from gnd.cloud_merger.states import States
 from gnd.cloud_merger.stored import Bases
 from gnd.cloud_merger.warm import warm_up
-from gnd.cloud_merger.work import Worker
+from gnd.cloud_merger.work import Worker, in_turn
 from gnd.cloud_merger.worker_process import Address, worker_process
 from gnd.fleet_bus.bus import open_bus
 from gnd.fleet_bus.config import BusConfig
@@ -91,7 +92,9 @@ def run_worker(
 
         # Expand: what was acknowledged becomes reports of tiles, and vehicles hear what is wanted; in threads.
         bases = Bases(store)  # what one has decoded or made, the others need next
-        expander = Expander(store, config, States(store, bus).tell, on_journaled=wake.set, bases=bases)
+        # tiles that wait for longer than the pause between two looks are found in time without being woken for
+        on_journaled = wake.set if config.store.merge_delay_s <= config.poll_s else lambda: None
+        expander = Expander(store, config, States(store, bus).tell, on_journaled=on_journaled, bases=bases)
         stack.enter_context(working(expander.work, arrived, config.expanders, config.poll_s))
 
         worker, announcer = Worker(store, config, bases), Announcer(store, bus, members, bases)
@@ -101,12 +104,11 @@ def run_worker(
                 claims = store.claim(config.shard_id, config.tiles_at_once, config.lease_s, prefer=expander.districts)
                 leases.hold(claims)
                 worker.begin(claims)
-                for claim in claims:
+                for some in in_turn(claims):
                     if not stop.is_set():
-                        with metrics.merging():  # load, fold, merge, decide, publish by compare-and-swap
-                            result = worker.settle(claim)
-                        metrics.settled(result)
-                    leases.drop(claim)
+                        _settle(worker, some, metrics)
+                    for claim in some:
+                        leases.drop(claim)
                     # after the commit; tiles of one batch are announced together
                     metrics.announced(announcer.announce(config.announce_at_once, every_s=ANNOUNCE_EVERY_S))
                 n_announced = announcer.announce(config.announce_at_once)
@@ -122,3 +124,11 @@ def run_worker(
                 for claim in claims:
                     leases.drop(claim)  # they run out, and whoever can work then has them
                 stop.wait(STORE_RETRY_S)
+
+
+def _settle(worker: Worker, claims: Sequence[Claim], metrics: ShardMetrics) -> None:
+    """Load, fold, merge, decide, publish by compare-and-swap."""
+    with metrics.merging(len(claims)):
+        results = worker.settle_some(claims)
+    for result in results:
+        metrics.settled(result)

@@ -33,11 +33,12 @@ class ShardMetrics:
         )
 
     @contextmanager
-    def merging(self) -> Iterator[None]:
-        """Times one merge."""
+    def merging(self, tiles: int) -> Iterator[None]:
+        """Times the merges of tiles that share a commit."""
         begin_s = time.monotonic()
         yield
-        self._seconds.observe(time.monotonic() - begin_s)
+        for _ in range(tiles):
+            self._seconds.observe(time.monotonic() - begin_s)
 
     def settled(self, result: PublishResult | None) -> None:
         """Counts one merge; None: it has failed or its lease was gone."""

@@ -12,6 +12,15 @@ from gnd.schemas.changes import TileChange
 MERGE_NOISE_M: Final = 0.05
 """Added (squared) to the covariances that the default similarity compares. It stands for poses known to so much; what a
 report's poses are worse than that is added for this report."""
+MERGE_XI_RESHAPED: Final = 0.5
+"""ξ of a cluster most of which denies the epoch's own Gaussian ("modified"). Lower, because a shape is judged
+less surely than a presence, and a parked car seldom touches what the map holds."""
+MERGE_D_UPDATE: Final = 0.5
+"""Published when the candidate's similarity to the epoch's voxel is smaller than this."""
+MERGE_D_DENIED: Final = 0.95
+"""The same where most of the candidate's statements were compared with that voxel and deny it."""
+MERGE_D_RENEWED: Final = 0.9
+"""A representative of more measurements takes the place of an earlier one that is less like it."""
 MERGE_POSE_LEVER_M: Final = 20.0
 """At this range the heading of a report's poses is counted as a position."""
 

@@ -140,7 +140,7 @@ class _Surfaces:
         return _Surfaces(self.place_m[index], self.cov_m2[index], self.normal[index], self.flat[index])
 
 
-_KNOWN: Final[ByObject[_Surfaces]] = ByObject(64)
+_KNOWN: Final[ByObject[_Surfaces]] = ByObject(256)
 """Surfaces of the bases looked at last: the reports of a street refer to few versions."""
 
 

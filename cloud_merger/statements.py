@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gnd.gnd_map.accumulate import N_MIN_CELLS
+from gnd.gnd_map.arrays import unique
 from gnd.gnd_map.by_object import ByObject
 from gnd.gnd_map.classes import ChangeClass
 from gnd.gnd_map.day import day_of
@@ -63,6 +64,8 @@ STATEMENT = np.dtype(
     ]
 )
 Rows = NDArray[Any]  # of dtype STATEMENT
+_BYTES: Final = np.dtype((np.void, STATEMENT.itemsize))
+_NO_ROWS: Final = np.zeros(0, _BYTES)
 
 
 @dataclass(frozen=True, slots=True)
@@ -154,14 +157,16 @@ def statements_of(
     ordered = sorted({report.report_id: report for report in reports}.values(), key=lambda r: r.report_id)
     known = {NO_BASE: Gaussians.empty(), **bases} if mode == "default" else {}
     claims = np.zeros(0, STATEMENT) if memory is None else memory.claims_beside(ordered)
-    voxels = np.union1d(_disputed(epoch, ordered, known), claims["voxel_id"]).astype(np.int32)
+    voxels = _disputed(epoch, ordered, known)
+    if len(claims):
+        voxels = unique(np.concatenate([voxels, claims["voxel_id"]]))
     quoted = _numbered_states(voxels, epoch, known)
     rows = _one_vote_a_vehicle(_spoken(voxels, ordered, quoted), ordered)
     if memory is not None and len(memory.voxels) + len(claims):
         claims = claims.copy()
         claims["report"] += len(ordered)
         day = max((day_of(one.last_ns) for one in ordered), default=0)
-        rows = np.concatenate([rows, claims, memory.support_rows(voxels, epoch, day)])
+        rows = stacked([rows, claims, memory.support_rows(voxels, epoch, day)])
         rows = rows[np.argsort(rows["voxel_id"], kind="stable")]
     return Statements(tuple(ordered), rows, () if memory is None else memory.witnesses)
 
@@ -193,10 +198,21 @@ def _disputed(epoch: Gaussians, reports: Sequence[Report], known: Mapping[bytes,
     """Sorted ids of voxels that a report changes, or whose quoted base differs from the epoch."""
     ids = [np.zeros(0, np.int32)]
     ids += [report.change.changed.voxel_id for report in reports]
-    for sha in {report.change.base_sha for report in reports} & set(known):
-        delta = diff(epoch, known[sha])
-        ids += [delta.removed, delta.put.voxel_id]
-    return np.unique(np.concatenate(ids)).astype(np.int32)
+    ids += [_differing(epoch, known[sha]) for sha in {report.change.base_sha for report in reports} & set(known)]
+    return np.asarray(unique(np.concatenate(ids)))
+
+
+_DIFFERING: Final[ByObject[tuple[Gaussians, NDArray[np.int32]]]] = ByObject(512)
+
+
+def _differing(epoch: Gaussians, base: Gaussians) -> NDArray[np.int32]:
+    """Ids of the voxels in which two versions differ; the base is held, so that no other object gets its id."""
+
+    def made() -> tuple[Gaussians, NDArray[np.int32]]:
+        delta = diff(epoch, base)
+        return base, np.concatenate([delta.removed, delta.put.voxel_id])
+
+    return np.zeros(0, np.int32) if base is epoch else _DIFFERING.of(epoch, made, id(base))[1]
 
 
 def _numbered_states(
@@ -206,6 +222,10 @@ def _numbered_states(
     of_epoch = states_at(epoch, voxels, Kind.QUOTED)
     found: dict[bytes, Rows] = {}
     for number, (sha, base) in enumerate(sorted(known.items()), start=2):
+        if base is epoch:  # the usual case
+            found[sha] = of_epoch.copy()
+            found[sha]["was"] = np.where(of_epoch["count"] > 0, EPOCH, 0)
+            continue
         rows = states_at(base, voxels, Kind.QUOTED)
         rows["was"] = np.where(rows["count"] > 0, number, 0)
         for earlier in (of_epoch, *found.values()):
@@ -226,7 +246,7 @@ def _spoken(voxels: NDArray[np.int32], reports: Sequence[Report], quoted: Mappin
     without a base only its changes speak.
     """
     laid_out = [changed_of(one.change) for one in reports]
-    changed = np.concatenate([np.zeros(0, STATEMENT), *(one.rows for one in laid_out)])
+    changed = stacked([one.rows for one in laid_out])
     number = {sha: k for k, sha in enumerate(quoted)}
     base = np.array([number.get(one.change.base_sha, -1) for one in reports], np.int64)
     seat, report, at = _who_speaks(
@@ -236,9 +256,9 @@ def _spoken(voxels: NDArray[np.int32], reports: Sequence[Report], quoted: Mappin
         *_end_to_end([one.rows["voxel_id"] for one in laid_out], np.int32),
         _end_to_end([one.speaks for one in laid_out], np.bool_)[0],
     )
-    held = np.concatenate([np.zeros(0, STATEMENT), *quoted.values()])
+    held = stacked(list(quoted.values()))
     here = np.where(base[report] >= 0, base[report] * len(voxels) + seat, -1)
-    rows = np.concatenate([held, changed])[np.where(at >= 0, len(held) + at, here)]
+    rows = stacked([held, changed])[np.where(at >= 0, len(held) + at, here)]
     mine = np.flatnonzero(at >= 0)
     was = np.append(held["was"], 0)[here[mine]]
     denies = _end_to_end([one.denies for one in laid_out], np.bool_)[0]
@@ -250,6 +270,11 @@ def _spoken(voxels: NDArray[np.int32], reports: Sequence[Report], quoted: Mappin
     pose_m2 = np.array([one.pose_m2 for one in reports])[report]
     rows["pose_m2"] = np.where(rows["kind"] == Kind.MEASURED, pose_m2, 0.0)
     return rows
+
+
+def stacked(parts: Sequence[Rows]) -> Rows:
+    """STATEMENT rows one behind the other. As bytes: numpy compares the fields of records one by one."""
+    return np.concatenate([_NO_ROWS, *(part.view(_BYTES) for part in parts)]).view(STATEMENT)
 
 
 def _end_to_end(parts: Sequence[NDArray[Any]], dtype: type[np.generic]) -> tuple[NDArray[Any], NDArray[np.int64]]:

@@ -20,6 +20,7 @@ from gnd.gnd_map.features import FeatureTile, is_feature_layer
 from gnd.gnd_map.gaussian import Gaussians
 from gnd.gnd_map.tile import Tile
 from gnd.gnd_map.tile_id import TileId
+from gnd.schemas.errors import SchemaError
 from gnd.tile_store.store import Store
 from gnd.tile_store.values import Basis, ClosedWindow, ReportRow, StoredTile, VersionInfo
 
@@ -206,7 +207,8 @@ class Verifier:
 
         def said(window: int) -> list[Report]:
             rows = [row for row in journal.rows if row.window == window]
-            return reports_by_window(rows, self._with(journal.how(window).parameters)[0].merge).get(window, [])
+            rules = self._with(journal.how(window).parameters)[0].merge
+            return reports_by_window(rows, rules, _left_out).get(window, [])
 
         def merged(window: int, reports: Sequence[Report]) -> MergedWindow:
             how = journal.how(window)
@@ -236,6 +238,10 @@ class Verifier:
                 state = merger(window).fold(state, merger(window).merge(state, said), said)
         open_window = journal.basis.window
         return FeatureTile(tile, journal.version, merger(open_window).merge(state, by_window.get(open_window)).features)
+
+
+def _left_out(_row: ReportRow, _error: SchemaError) -> None:
+    """The merge has told of it."""
 
 
 def _epoch_of(history: Iterable[VersionInfo], version: int) -> VersionInfo | None:

@@ -14,8 +14,7 @@ from numpy.typing import NDArray
 from gnd.cloud_merger.errors import MergerError
 from gnd.cloud_merger.expanding import is_askable
 from gnd.cloud_merger.memory import TileMemory
-from gnd.cloud_merger.merge import MERGE_XI_RESHAPED
-from gnd.cloud_merger.parameters import MergeParameters
+from gnd.cloud_merger.parameters import MERGE_XI_RESHAPED, MergeParameters
 from gnd.cloud_merger.statements import (
     EPOCH,
     Kind,

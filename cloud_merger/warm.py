@@ -2,6 +2,8 @@
 
 import numpy as np
 
+from gnd.cloud_merger.confirmation import changes_together
+from gnd.cloud_merger.decide_kernels import decided
 from gnd.cloud_merger.merge_kernels import clusters_of
 from gnd.cloud_merger.parameters import MergeParameters
 from gnd.cloud_merger.shift import SHIFT_LEAST_GAUSSIANS, shift_of
@@ -41,6 +43,9 @@ def warm_up() -> None:
     observed_along(Track(_TILE.district, TrackView((-8, -6, -4, -2, 0, 2, 4, 6, 8)), (_place(),)), [found])
     similarity(base.exists, base.mean_m, base.cov_m2, base.exists, base.mean_m, base.cov_m2)
     clusters_of(np.zeros(1, STATEMENT), MergeParameters())
+    decided(np.zeros(1, STATEMENT), base, MergeParameters())
+    place = np.zeros(1, np.int64)
+    changes_together(place, place, place, np.ones(1, np.bool_))
     _test_a_shift()
 
 

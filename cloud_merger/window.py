@@ -5,7 +5,7 @@ of shards end in the same map, bit for bit, and `gnd.cloud_merger.verify` comput
 """
 
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any, Final
 from zlib import crc32
 
@@ -22,7 +22,8 @@ from gnd.cloud_merger.memory import (
     VOXEL,
     TileMemory,
 )
-from gnd.cloud_merger.merge import MergeParameters, merge_tile
+from gnd.cloud_merger.merge import MergedTile, MergeParameters, merge_tile
+from gnd.cloud_merger.snapping import Snapping
 from gnd.cloud_merger.statements import EPOCH, Report, Rows, Statements, Witness, find, statements_of
 from gnd.gnd_map.codec import Lattice, snap
 from gnd.gnd_map.day import day_of
@@ -71,6 +72,7 @@ class WindowMerger:
         shifts: tests of reports, each made once.
         bases: Gaussians by content hash of the versions that the reports refer to.
         named: vehicles whose reports are shifted again and again.
+        snapping: what the last merges have given, on their lattices.
     """
 
     rules: MergeParameters
@@ -78,6 +80,7 @@ class WindowMerger:
     shifts: ShiftTests
     bases: Mapping[bytes, Gaussians]
     named: frozenset[str]
+    snapping: Snapping = field(default_factory=Snapping)
 
     def merge(self, state: TileState, reports: Sequence[Report], lattice: Lattice | None) -> MergedWindow:
         """Merge the reports of a window, in any order, into what the windows before it have come to.
@@ -97,8 +100,14 @@ class WindowMerger:
             by, seen = statements.witnesses, in_play.reports
             found = gate(state.gaussians, merged, seen, self.confirmation, named, witnesses=by)
             gated = GatedTile(found.merged, (*found.waiting, *in_play.set_aside))
-        gaussians = gated.merged.gaussians
-        return MergedWindow(in_play, statements, gated, gaussians if lattice is None else snap(gaussians, lattice))
+        return MergedWindow(in_play, statements, gated, self._on_lattice(gated.merged, reports, lattice))
+
+    def _on_lattice(self, merged: MergedTile, reports: Sequence[Report], lattice: Lattice | None) -> Gaussians:
+        if lattice is None:
+            return merged.gaussians
+        if not reports:
+            return snap(merged.gaussians, lattice)
+        return self.snapping.of(reports[0].change.tile, merged, lattice)
 
 
 def provenance_of(windows: Iterable[MergedWindow]) -> dict[int, tuple[str, ...]]:

@@ -1,16 +1,18 @@
 """From claimed tiles to publications: load, decode, merge; a tile whose merge fails does not stop the others."""
 
 import logging
-from collections.abc import Callable, Sequence
-from typing import TypeVar
+from collections.abc import Callable, Iterator, Sequence
+from typing import Final, TypeVar
 
 from gnd.cloud_merger.belief import ShiftTests, courses_of
 from gnd.cloud_merger.config import ShardConfig
 from gnd.cloud_merger.features.kept import FeatureContents, said_of
 from gnd.cloud_merger.features.window import LayerMerger, LayerState, names_of, refuted_of, windows_of
 from gnd.cloud_merger.map_parameters import text_of
-from gnd.cloud_merger.stored import Bases, encode_state, lattice_of_tile, reports_by_window, said
+from gnd.cloud_merger.snapping import REMEMBERED_TILES, Snapping
+from gnd.cloud_merger.stored import Bases, encode_state, lattice_of_tile, reports_by_window
 from gnd.cloud_merger.window import WindowMerger, fold, provenance_of
+from gnd.gnd_map.by_object import ByObject
 from gnd.gnd_map.features import Feature, FeatureTile, is_feature_layer
 from gnd.gnd_map.gaussian import Gaussians
 from gnd.gnd_map.tile import Tile
@@ -21,6 +23,8 @@ from gnd.tile_store.values import Basis, Claim, Publication, PublishResult, Repo
 
 _LOG = logging.getLogger(__name__)
 T = TypeVar("T")
+SETTLED_TOGETHER: Final = 4
+"""Tiles; more would wait too long for each other."""
 
 
 class Worker:
@@ -36,6 +40,7 @@ class Worker:
         self._store, self._config = store, config
         self._contents, self._features = bases or Bases(store), FeatureContents(store)
         self._shifts, self._parameters = ShiftTests(), text_of(config)
+        self._snapping, self._made = Snapping(), ByObject[Tile](REMEMBERED_TILES)
         self._begun: dict[Claim, bool] = {}  # whether the lease was still held
 
     def merge(self, claims: Sequence[Claim]) -> list[Publication]:
@@ -53,13 +58,26 @@ class Worker:
 
     def settle(self, claim: Claim) -> PublishResult | None:
         """Merge one claimed tile and publish it; None: it is postponed or set aside, or its lease is gone."""
-        publication = self._attempt(claim)
-        if publication is None:
-            return None
+        (result,) = self.settle_some([claim])
+        return result
+
+    def settle_some(self, claims: Sequence[Claim]) -> list[PublishResult | None]:
+        """Merge claimed tiles and publish them in one transaction, as `settle` does with each. `in_turn` says which may
+        be settled together.
+        """
+        attempted = [self._attempt(claim) for claim in claims]
+        publications = [one for one in attempted if one is not None]
+        try:
+            results = iter(self._store.publish(publications))
+        except (StoreDamaged, UnknownReports):  # one of them is to blame; any other is the store's failure
+            return [None if one is None else self._published(one) for one in attempted]
+        return [None if one is None else next(results) for one in attempted]
+
+    def _published(self, publication: Publication) -> PublishResult | None:
         try:
             (result,) = self._store.publish([publication])
-        except (StoreDamaged, UnknownReports) as error:  # any other is the store's failure, not the tile's
-            self._failed(claim, error)
+        except (StoreDamaged, UnknownReports) as error:
+            self._failed(publication.claim, error)
             return None
         return result
 
@@ -104,17 +122,18 @@ class Worker:
         epoch = Gaussians.empty() if work.epoch is None else self._contents.decoded(work.epoch)
         state = self._contents.state(tile, journal)
         named = self._store.shifted_vehicles()
-        merger = WindowMerger(config.merge, config.confirmation, self._shifts, self._bases(work), named)
+        merger = WindowMerger(config.merge, config.confirmation, self._shifts, self._bases(work), named, self._snapping)
         lattice = lattice_of_tile(work.epoch, epoch, config.codec)
-        rows = [row for row in work.reports if self._readable(row, said) is not None]
-        by_window = reports_by_window(rows, config.merge)
+        by_window = reports_by_window(work.reports, config.merge, self._unreadable)
         closed = [window for window in sorted(by_window) if window < journal.window]
         folded = []
         for window in closed:
             folded.append(merger.merge(state, by_window[window], lattice))
             state = fold(state, folded[-1])
         now = merger.merge(state, by_window.get(journal.window, []), lattice)
-        new = Tile(tile, work.base_version + 1, now.gaussians)
+        version = work.base_version + 1
+        # the very object where nothing was decided otherwise: its hash is known
+        new = self._made.of(now.gaussians, lambda: Tile(tile, version, now.gaussians), (tile, version))
         is_new = new.sha != work.head.sha if work.head else len(new.gaussians) > 0
         self._contents.keep(new)
         return Publication(
@@ -172,10 +191,13 @@ class Worker:
         try:
             return read(row.body)
         except SchemaError as error:
-            reason = f"report {row.report_id} on tile {row.tile} cannot be read any more and is left out: {error}"
-            _LOG.error("%s", reason)
-            self._store.quarantine(row.body, reason, source="merge")
+            self._unreadable(row, error)
             return None
+
+    def _unreadable(self, row: ReportRow, error: SchemaError) -> None:
+        reason = f"report {row.report_id} on tile {row.tile} cannot be read any more and is left out: {error}"
+        _LOG.error("%s", reason)
+        self._store.quarantine(row.body, reason, source="merge")
 
     def _bases(self, work: TileWork) -> dict[bytes, Gaussians]:
         """The versions that the reports refer to, by hash; those that the store has lost are missing."""
@@ -187,6 +209,23 @@ class Worker:
         """Leave the tile as it is, by name; its reports go on waiting."""
         if self._store.set_aside(claim, reason):
             _LOG.error("tile %s is set aside after %d attempts to merge it: %s", claim.tile, claim.attempts, reason)
+
+
+def in_turn(claims: Sequence[Claim]) -> Iterator[Sequence[Claim]]:
+    """The claims as they are settled: a few first attempts share a synced write. A tile that was tried before goes
+    alone: what kills a shard shall take no other tile with it again.
+    """
+    first: list[Claim] = []
+    for claim in claims:
+        if claim.attempts > 1 or claim.is_retry:
+            yield [claim]
+            continue
+        first.append(claim)
+        if len(first) == SETTLED_TOGETHER:
+            yield first
+            first = []
+    if first:
+        yield first
 
 
 def _ids(work: TileWork) -> tuple[str, ...]:

@@ -22,14 +22,22 @@ def check_array(name: str, array: object, dtype: type[np.generic], shape: tuple[
     """
     if not isinstance(array, np.ndarray):
         raise ShapeError(f"{name}: expected a numpy array, got {type(array).__name__}")
-    if array.dtype != np.dtype(dtype):
+    if array.dtype != dtype:
         raise ShapeError(f"{name}: expected dtype {np.dtype(dtype)}, got {array.dtype}")
-    if array.ndim != len(shape) or any(
-        want is not None and want != n for want, n in zip(shape, array.shape, strict=True)
-    ):
+    if array.shape != shape and not _fits(array.shape, shape):
         raise ShapeError(f"{name}: expected shape {shown_shape(shape)}, got {array.shape}")
     if array.dtype.kind == "f" and not np.isfinite(array).all():
         raise ShapeError(f"{name}: {int((~np.isfinite(array)).sum())} of {array.size} values are not finite")
+
+
+def _fits(found: tuple[int, ...], shape: tuple[int | None, ...]) -> bool:
+    return len(found) == len(shape) and all(want is None or want == n for want, n in zip(shape, found, strict=True))
+
+
+def unique(ids: Array) -> Array:
+    """The values of (N,) ids, ascending, each once. As `np.unique`, which takes longer on a few thousand."""
+    ordered = np.sort(ids)
+    return np.asarray(ordered[np.append(True, ordered[1:] != ordered[:-1])[: len(ordered)]])
 
 
 def are_in(sorted_values: Array, among: Array) -> npt.NDArray[np.bool_]:

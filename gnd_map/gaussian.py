@@ -7,11 +7,12 @@ Gaussians are what is published.
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import cast
 
 import numpy as np
 import numpy.typing as npt
 
-from gnd.gnd_map.arrays import F32, F64, I32, I64, check_array
+from gnd.gnd_map.arrays import F32, F64, I32, I64, Array, check_array
 from gnd.gnd_map.errors import ShapeError
 
 MAX_MEAN_M = 2.0
@@ -47,6 +48,8 @@ class Gaussians:
     """(N, 6) xx, xy, xz, yy, yz, zz, tile ENU axes, diagonal >= 0."""
 
     def __post_init__(self) -> None:
+        if _are_plain(self.columns) and _is_sound(*self.columns):
+            return
         n = len(self.voxel_id) if isinstance(self.voxel_id, np.ndarray) and self.voxel_id.ndim == 1 else None
         check_array("voxel_id", self.voxel_id, np.int32, (n,))
         check_array("count", self.count, np.int32, (n,))
@@ -55,18 +58,7 @@ class Gaussians:
         check_array("cov_m2", self.cov_m2, np.float32, (n, 6))
         self._check_values()
 
-    def _is_sound(self) -> bool:
-        """Whether all values are as they must be: the quick answer, without saying which are not."""
-        if not (self.voxel_id[1:] > self.voxel_id[:-1]).all():
-            return False
-        if not self.count.any():
-            return not (self.cells.any() or self.mean_m.any() or self.cov_m2.any())
-        is_filled = self.count.min() > 0 and self.cells.min() >= 0
-        return bool(is_filled and np.abs(self.mean_m).max() <= MAX_MEAN_M and self.cov_m2[:, _DIAGONAL].min() >= 0)
-
     def _check_values(self) -> None:
-        if self._is_sound():
-            return
         _refuse(
             "voxel ids are not strictly increasing",
             self.voxel_id,
@@ -105,7 +97,7 @@ class Gaussians:
     @classmethod
     def empty(cls) -> "Gaussians":
         """No voxels."""
-        return cls.nothing_at(np.empty(0, np.int32))
+        return _EMPTY
 
     @classmethod
     def nothing_at(cls, voxel_id: npt.ArrayLike) -> "Gaussians":
@@ -136,6 +128,43 @@ class Gaussians:
         return full_matrices(self.cov_m2)
 
 
+_KINDS = tuple(np.dtype(kind) for kind in (np.int32, np.int32, np.int32, np.float32, np.float32))
+
+
+def _are_plain(columns: Sequence[object]) -> bool:
+    """Whether the columns are of the right kinds, with as many rows each."""
+    if not all(isinstance(one, np.ndarray) for one in columns):
+        return False
+    arrays = cast("Sequence[Array]", columns)
+    rows = arrays[0].shape
+    return (
+        tuple(one.dtype for one in arrays) == _KINDS
+        and len(rows) == 1
+        and rows == arrays[1].shape == arrays[2].shape
+        and (*rows, 3) == arrays[3].shape
+        and (*rows, 6) == arrays[4].shape
+    )
+
+
+def _is_sound(voxel_id: I32, count: I32, cells: I32, mean_m: F32, cov_m2: F32) -> bool:
+    """Whether all values are as they must be: the quick answer, without saying which are not. No kernel: who only reads
+    a map need not load the compiler.
+    """
+    if not len(voxel_id):
+        return True
+    if not (voxel_id[1:] > voxel_id[:-1]).all():
+        return False
+    if not count.any():
+        return not (cells.any() or mean_m.any() or cov_m2.any())
+    return bool(
+        count.min() > 0
+        and cells.min() >= 0
+        and np.abs(mean_m).max() <= MAX_MEAN_M  # nor is NaN
+        and np.isfinite(cov_m2).all()
+        and min(cov_m2[:, 0].min(), cov_m2[:, 3].min(), cov_m2[:, 5].min()) >= 0
+    )
+
+
 def concat(parts: Sequence[Gaussians]) -> Gaussians:
     """The voxels of all parts, sorted by id.
 
@@ -153,6 +182,9 @@ def concat(parts: Sequence[Gaussians]) -> Gaussians:
 def _refuse(what: str, voxel_id: I32, rows: I64) -> None:
     if len(rows):
         raise ShapeError(f"Gaussians: {what} in {len(rows)} of {len(voxel_id)} voxels, first voxel {voxel_id[rows[0]]}")
+
+
+_EMPTY = Gaussians.nothing_at(np.empty(0, np.int32))
 
 
 @dataclass(frozen=True, slots=True, eq=False)

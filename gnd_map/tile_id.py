@@ -10,6 +10,7 @@ bit, most significant first) in four chunks of five, a prefix is a region: about
 import re
 from collections.abc import Iterator
 from dataclasses import dataclass
+from functools import lru_cache
 
 import numpy as np
 import numpy.typing as npt
@@ -143,8 +144,7 @@ class TileId:
     @property
     def path(self) -> str:
         """Four chunks of five base-4 digits."""
-        digits = np.base_repr(self.morton, 4).zfill(20)
-        return "/".join(digits[i : i + 5] for i in range(0, 20, 5))
+        return _path_of(self.morton)
 
     @property
     def district(self) -> "District":
@@ -178,6 +178,12 @@ class TileId:
 
     def __str__(self) -> str:
         return self.path
+
+
+@lru_cache(maxsize=1 << 15)
+def _path_of(morton: int) -> str:
+    digits = np.base_repr(morton, 4).zfill(20)
+    return "/".join(digits[i : i + 5] for i in range(0, 20, 5))
 
 
 @dataclass(frozen=True, slots=True, order=True)

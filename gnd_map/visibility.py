@@ -16,7 +16,7 @@ import numpy as np
 import numpy.typing as npt
 
 from gnd.gnd_map import sight
-from gnd.gnd_map.arrays import F64, I32, I64
+from gnd.gnd_map.arrays import F64, I32, I64, unique
 from gnd.gnd_map.classes import ChangeClass
 from gnd.gnd_map.codec import Flags
 from gnd.gnd_map.errors import TrackError
@@ -302,7 +302,7 @@ def _read(w: SightWindow, told: Sequence[Flags], seen: U64) -> dict[TileId, I32]
     for slot, (flags, mine) in enumerate(zip(told, np.split(ids, ends[:-1]), strict=True)):
         lowest = int(w.low[slot]) * columns - columns // 2
         whole = _is_within(flags.voxel_id, lowest, lowest + int(w.floors[slot]) * columns)
-        found[flags.tile_id] = mine if whole else np.union1d(mine, flags.voxel_id).astype(np.int32)
+        found[flags.tile_id] = mine if whole else unique(np.concatenate([mine, flags.voxel_id])).astype(np.int32)
     return found
 
 

@@ -9,6 +9,9 @@ them were made against the stale base map:
 
 They come from vehicles of their own, seconds to minutes apart by the clock of the cloud, through the real store and the
 real worker. Printed: F1 before and after, versions published, and the CPU time of a report by its number.
+
+With `--drives N` whole drives follow on the healing instead: those of the run again, each as another vehicle's, ten
+minutes after the one before. Printed: bytes of notices of each, and of the last ones over those of the first.
 """
 
 import json
@@ -27,6 +30,7 @@ import click
 import numpy as np
 from rich.progress import track
 
+from gnd.cloud_merger.announce import encoded, update_of
 from gnd.cloud_merger.config import ShardConfig
 from gnd.cloud_merger.verify import Verifier
 from gnd.cloud_merger.work import Worker
@@ -74,6 +78,17 @@ class _MergedCloud:
             for one in self._worker.merge(claims):
                 published += sum(result.status == "published" for result in self.store.publish([one]))
         return published
+
+    def notices(self) -> int:
+        """Bytes of the notices of what has been published since the last call."""
+        found, waiting = 0, self.store.notices()
+        for one in waiting:
+            stored = self.store.get(one.layer, one.tile, one.version)
+            assert stored is not None
+            parent = self.store.get(one.layer, one.tile, stored.parent) if stored.parent else None
+            found += len(encoded(update_of(stored, parent)))
+        self.store.announced(waiting)
+        return found
 
     def tiles(self, version: int | None = None) -> dict[TileId, Gaussians]:
         """Every tile as it is, or as it was in one version."""
@@ -180,6 +195,55 @@ def study(run: Path, n: int, seed: int, folder: Path) -> dict[str, Any]:
     }
 
 
+def drives(run: Path, n: int, folder: Path, base_path: Path) -> dict[str, Any]:
+    """Heal the map at `base_path`, then `n` of the run's own drives again; bytes of notices of each."""
+    reports, truth_path = reports_of_run(run), run / "world" / "truth.npz"
+    truth = read_truth(truth_path) if truth_path.exists() else None  # drives that were given have none
+    by_vehicle: dict[str, list[ChangeReport]] = {}
+    for report in reports:
+        by_vehicle.setdefault(report.vehicle, []).append(report)
+    own = list(by_vehicle.values())
+    cloud = _MergedCloud(base_path, folder / "memory.sqlite")
+    base, healing = cloud.tiles(), []
+    for drive in own:
+        for report in drive:
+            cloud.now_ns += 20 * _NS_PER_S
+            cloud.hear(report)
+        healing.append(cloud.notices())
+    healed, told = truth and _f1(truth, base, cloud.tiles()), []
+    for k in range(n):
+        cloud.now_ns += 600 * _NS_PER_S
+        for report in _as_another(own[k % len(own)], f"again-{k}", cloud.now_ns):
+            cloud.hear(report)
+        told.append(cloud.notices())
+    after = truth and _f1(truth, base, cloud.tiles())
+    cloud.store.close()
+    some = min(len(own), n // 2)
+    return {
+        "run": str(run),
+        "drives": len(own),
+        "bytes of notices, healing": healing,
+        "f1_healed": healed,
+        "bytes of notices, again": told,
+        "f1_after": after,
+        f"last {some} / first {some} again": round(sum(told[-some:]) / max(sum(told[:some]), 1), 4),
+        f"last {some} again / first {some} of all": round(sum(told[-some:]) / max(sum(healing[:some]), 1), 4),
+    }
+
+
+def _as_another(drive: Sequence[ChangeReport], vehicle: str, begin_ns: int) -> Iterator[ChangeReport]:
+    """The reports of a drive as those of another vehicle that begins now."""
+    first_ns = min(report.first_ns for report in drive)
+    for number, report in enumerate(drive):
+        yield replace(
+            report,
+            report_id=deterministic_report_id(begin_ns // 1_000_000, vehicle, str(number)),
+            vehicle=vehicle,
+            first_ns=begin_ns + report.first_ns - first_ns,
+            last_ns=begin_ns + report.last_ns - first_ns,
+        )
+
+
 def _f1(truth: Truth, base: dict[TileId, Gaussians], tiles: dict[TileId, Gaussians]) -> dict[str, float]:
     scores = evaluate_maps(truth, base, tiles)
     return {level: round(scores.f1(level), 2) for level in LEVELS}
@@ -189,11 +253,16 @@ def _f1(truth: Truth, base: dict[TileId, Gaussians], tiles: dict[TileId, Gaussia
 @click.argument("run", type=click.Path(exists=True, file_okay=False, path_type=Path))
 @click.option("--passes", "n", default=1000, show_default=True, help="Partial passes after the run's reports.")
 @click.option("--seed", default=1, show_default=True)
+@click.option("--drives", "n_drives", default=0, show_default=True, help="Whole drives in place of partial passes.")
+@click.option("--base", type=click.Path(path_type=Path), help="Map that --drives begin on; default: the run's own.")
 @click.option("--json", "json_path", type=click.Path(path_type=Path), help="Write the result there.")
-def memory(run: Path, n: int, seed: int, json_path: Path | None) -> None:
+def memory(run: Path, n: int, seed: int, n_drives: int, base: Path | None, json_path: Path | None) -> None:
     """Thousands of partial passes over the healed map of RUN (a folder of `gnd fleet`): F1, versions, CPU a report."""
     with tempfile.TemporaryDirectory() as folder:
-        found = study(run, n, seed, Path(folder))
+        if n_drives:
+            found = drives(run, n_drives, Path(folder), base or run / "world" / "base.sqlite")
+        else:
+            found = study(run, n, seed, Path(folder))
     if json_path is not None:
         json_path.write_text(json.dumps(found, indent=1))
     for name, value in found.items():

@@ -1,5 +1,6 @@
 """The accounts of vehicles in SQLite: each function runs inside the caller's transaction."""
 
+import json
 from collections.abc import Iterable, Sequence
 from math import radians
 from statistics import fmean, pstdev
@@ -26,23 +27,33 @@ TURNED_SIGMAS: Final = 4.0
 
 def put_courses(c: apsw.Connection, layer: str, tile: TileId, courses: Iterable[CourseSaid]) -> None:
     """Enter what the reports of a tile say of their vehicles' courses."""
-    for said in courses:
+    all_said, place = list(courses), {"layer": layer, "tile": tile.morton}
+    wanted = place | _ids(said.report_id for said in all_said)
+    before = {report_id for (report_id,) in fetch(c, "courses_of_tile", wanted)}
+    for said in all_said:
+        if said.report_id in before:
+            continue
         told = {name: getattr(said, name) for name in CourseSaid.__slots__}
-        change(c, "put_course", told | {"layer": layer, "tile": tile.morton})
+        change(c, "put_course", told | place)
 
 
 def put_tests(c: apsw.Connection, layer: str, tile: TileId, tests: Iterable[ShiftTest], timing: dict[str, Any]) -> None:
     """Enter the tests of a tile into the accounts of their vehicles. Where that puts a vehicle
     among the shifted ones, or takes it out, all tiles that it has reported about are merged again.
     """
-    vehicles = set()
-    for test in tests:
+    made, vehicles = list(tests), set()
+    place = {"layer": layer, "tile": tile.morton}
+    before: dict[str, int] = dict(fetch(c, "shift_tests_of_tile", place | _ids(one.report_id for one in made)))
+    for test in made:
+        if before.get(test.report_id) == int(test.is_explained):
+            continue  # a tile's tests come with each of its merges
         told = {name: getattr(test, name) for name in ShiftTest.__slots__ if name != "is_explained"}
-        change(c, "put_shift_test", told | {"layer": layer, "tile": tile.morton, "explained": int(test.is_explained)})
+        change(c, "put_shift_test", told | place | {"explained": int(test.is_explained)})
         vehicles.add(test.vehicle)
-    known = shifted_vehicles(c)
+    known = shifted_vehicles(c) if vehicles else frozenset()
     for vehicle in sorted(vehicles):
-        if account(c, vehicle).is_shifted != (vehicle in known):
+        explained = [row[0] for row in fetch(c, "shift_tests_of_vehicle", {"vehicle": vehicle, "n": NEWEST_TESTS})]
+        if _is_shifted(sum(map(bool, explained)), len(explained)) != (vehicle in known):
             what = "trust_vehicle" if vehicle in known else "distrust_vehicle"
             change(c, what, {"vehicle": vehicle, "since_ns": timing["now"]})
             for one_layer, one_tile in fetch(c, "tiles_of_vehicle", {"vehicle": vehicle}):
@@ -78,8 +89,17 @@ def account(c: apsw.Connection, vehicle: str) -> VehicleAccount:
         course_rad=_mean(courses, 0) or 0.0,
         course_sigma_rad=_mean(courses, 1) or 0.0,
         is_turned=_is_turned(courses),
-        is_shifted=len(shifts) >= NAMED_TESTS and len(shifts) >= NAMED_SHARE * len(rows),
+        is_shifted=_is_shifted(len(shifts), len(rows)),
     )
+
+
+def _ids(report_ids: Iterable[str]) -> dict[str, str]:
+    """Some report ids as a statement takes them."""
+    return {"ids": json.dumps(list(report_ids))}
+
+
+def _is_shifted(explained: int, tested: int) -> bool:
+    return explained >= NAMED_TESTS and explained >= NAMED_SHARE * tested
 
 
 def _is_turned(courses: Sequence[Row]) -> bool:

@@ -1,7 +1,9 @@
 """The inbox and the queue in SQLite: each function runs inside the caller's transaction."""
 
+import json
 import secrets
 from collections.abc import Iterable, Sequence
+from functools import partial
 from typing import Any, Final
 
 import apsw
@@ -9,6 +11,7 @@ import apsw
 from gnd.gnd_map.tile_id import TileId
 from gnd.tile_store import sqlite_journal as journal
 from gnd.tile_store.regions import morton_range
+from gnd.tile_store.rows_kept import RowsKept
 from gnd.tile_store.sqlite_connection import Row, change, fetch
 from gnd.tile_store.values import Claim, JournalMark, PutStatus, ReportRow, StoreConfig
 
@@ -168,20 +171,32 @@ def consume(c: apsw.Connection, claim: Claim, seq: int, version: int, timing: di
 
 def unknown_reports(c: apsw.Connection, claim: Claim, report_ids: Iterable[str]) -> list[str]:
     """Those of the report ids that the inbox does not hold for the claim's tile."""
-    place: dict[str, Any] = {"layer": claim.layer, "tile": claim.tile.morton}
-    return [one for one in report_ids if not fetch(c, "report_exists", place | {"report_id": one})]
+    wanted = {"layer": claim.layer, "tile": claim.tile.morton, "ids": json.dumps(list(report_ids))}
+    return [report_id for (report_id,) in fetch(c, "unknown_reports", wanted)]
 
 
-def in_play(c: apsw.Connection, layer: str, tile: TileId, epoch: int, first: int, last: int) -> tuple[ReportRow, ...]:
+def in_play(
+    c: apsw.Connection, kept: RowsKept, layer: str, tile: TileId, epoch: int, first: int, last: int
+) -> tuple[ReportRow, ...]:
     """The reports of the windows `first` to `last` that count since the epoch, by report id and part."""
     wanted = {"layer": layer, "tile": tile.morton, "epoch": epoch, "folded": first - 1, "last": last}
-    return tuple(_row(*values) for values in fetch(c, "reports_in_play", wanted))
+    places = fetch(c, "places_in_play", wanted)
+    return kept.ordered((layer, tile), places, lambda new: _rows_at(c, kept, layer, tile, new))
 
 
-def since(c: apsw.Connection, layer: str, tile: TileId, mark: JournalMark) -> list[ReportRow]:
+def since(c: apsw.Connection, kept: RowsKept, layer: str, tile: TileId, mark: JournalMark) -> list[ReportRow]:
     """The reports in play with numbers beyond the mark, by number."""
     wanted = {"layer": layer, "tile": tile.morton, "epoch": mark.epoch, "folded": mark.folded, "seq": mark.seq}
-    return [_row(*values) for values in fetch(c, "reports_since", wanted)]
+    return _rows_at(c, kept, layer, tile, fetch(c, "places_since", wanted))
+
+
+def _rows_at(c: apsw.Connection, kept: RowsKept, layer: str, tile: TileId, places: Iterable[Row]) -> list[ReportRow]:
+    """The rows at (arrival, window, seq): only those that are not in memory are read."""
+
+    def read(arrival: int) -> ReportRow:
+        return _row(*fetch(c, "report_at", {"arrival": arrival})[0])
+
+    return [kept.row((layer, tile, arrival, seq), window, partial(read, arrival)) for arrival, window, seq in places]
 
 
 def of_windows(c: apsw.Connection, layer: str, tile: TileId, first: int, last: int, seq: int) -> tuple[ReportRow, ...]:

@@ -25,6 +25,7 @@ from gnd.tile_store.errors import StoreDamaged, StoreError, UnknownVersion
 from gnd.tile_store.provenance import Provenance, decode_provenance
 from gnd.tile_store.regions import morton_range
 from gnd.tile_store.retention import trim_quarantine
+from gnd.tile_store.rows_kept import RowsKept
 from gnd.tile_store.sqlite_connection import ReaderPool, change, fetch, open_writer, require_current
 from gnd.tile_store.uploads import FirstHalf, Settled, Upload, UploadClaim, UploadCounts, UploadStatus
 from gnd.tile_store.values import (
@@ -100,6 +101,7 @@ class SqliteStore:
         self._config = config or StoreConfig()
         self._now_ns, self._steady_ns = now_ns, steady_ns
         self._readers = ReaderPool(self.path)
+        self._rows = RowsKept()
         self._writer: GroupWriter | NoWriter
         if read_only:
             require_current(self.path)
@@ -213,7 +215,7 @@ class SqliteStore:
         epoch = versions.stored(c, "stored_version", layer, tile, version=version) if version else None
         first = journal.folded(c, layer, tile, version) + 1
         last = first + WINDOWS_AT_ONCE - 1
-        rows = inbox.in_play(c, layer, tile, version, first, last)
+        rows = inbox.in_play(c, self._rows, layer, tile, version, first, last)
         memory = journal.memory_of(c, layer, tile, version)
         newest = journal.newest(c, layer, tile)
         if newest.window <= last:
@@ -228,7 +230,7 @@ class SqliteStore:
             now = JournalMark(epoch, journal.folded(c, layer, tile, epoch), journal.newest(c, layer, tile).seq)
             if (now.epoch, now.folded) != (mark.epoch, mark.folded):
                 return None
-            return now, inbox.since(c, layer, tile, mark) if now.seq > mark.seq else []
+            return now, inbox.since(c, self._rows, layer, tile, mark) if now.seq > mark.seq else []
 
     def quarantine(self, body: bytes, reason: str, source: str = "") -> None:
         """See `Store.quarantine`."""

@@ -45,9 +45,10 @@ def publish(
     if head.version != publication.base_version:
         inbox.postpone(c, claim, timing["steady"])  # ready at once, against the head as it is now
         return PublishResult("stale", head.version)
-    provenance = _provenance(c, publication)
+    _check_reports(c, publication)
     result = PublishResult("unchanged", head.version)
     if content is not None and content.sha != head.sha:
+        provenance = Provenance.of(publication.report_ids, publication.voxel_reports)
         origin = _Origin(publication.reason, claim.owner, provenance)
         result = PublishResult("published", _append(c, claim.layer, claim.tile, content, origin, timing["now"]))
     basis = publication.basis
@@ -168,12 +169,10 @@ def _after_newest(c: apsw.Connection, layer: str, tile: TileId, now: int) -> int
     return max(now, newest[0][0] + 1) if newest else now
 
 
-def _provenance(c: apsw.Connection, publication: Publication) -> Provenance:
-    provenance = Provenance.of(publication.report_ids, publication.voxel_reports)
+def _check_reports(c: apsw.Connection, publication: Publication) -> None:
     unknown = inbox.unknown_reports(c, publication.claim, publication.report_ids)
     if unknown:  # what is remembered of earlier windows may rest on reports that retention has removed
         raise UnknownReports(
             f"tile {publication.claim.tile.path} of layer {publication.claim.layer}: {len(unknown)} of"
             f" {len(publication.report_ids)} report ids are not in the store, first {unknown[0]}; nothing was published"
         )
-    return provenance

@@ -1,11 +1,13 @@
-"""One write connection in one thread: calls that come while it commits share the next commit (group commit)."""
+"""One write connection for all threads: calls that come while one commits share the next commit (group commit).
+
+Who finds nobody writing writes for all that wait, in its own thread: no thread is woken for a call that comes alone,
+which on a busy machine costs more than the call.
+"""
 
 import logging
-import queue
 import threading
+from collections import deque
 from collections.abc import Callable
-from concurrent.futures import Future
-from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -18,10 +20,28 @@ T = TypeVar("T")
 _log = logging.getLogger(__name__)
 
 
-@dataclass(frozen=True, slots=True)
 class _Job:
-    work: Callable[[apsw.Connection], Any]
-    future: "Future[Any]" = field(default_factory=Future)
+    """A function to run, and what came of it. `wait` returns once it is done, or has to lead."""
+
+    __slots__ = ("_signal", "failed", "is_done", "result", "work")
+
+    def __init__(self, work: Callable[[apsw.Connection], Any]) -> None:
+        self.work = work
+        self.result: Any = None
+        self.failed: Exception | None = None
+        self.is_done = False
+        self._signal = threading.Lock()
+        self._signal.acquire()
+
+    def wait(self) -> None:
+        self._signal.acquire()
+
+    def wake(self) -> None:
+        self._signal.release()
+
+    def settle(self, result: Any, failed: Exception | None) -> None:
+        self.result, self.failed, self.is_done = result, failed, True
+        self.wake()
 
 
 class NoWriter:
@@ -41,17 +61,18 @@ class NoWriter:
 class GroupWriter:
     """Runs functions inside write transactions, many in one commit, each in its own savepoint.
 
-    A function that raises is undone alone; the others of its group commit.
+    A function that raises is undone alone; the others of its group commit. At any time one of the calling threads
+    leads: it commits what waits, until its own call is done, and then gives the lead to whoever waits longest.
     """
 
     def __init__(self, connection: apsw.Connection, *, group_max: int) -> None:
         self._connection = connection
         self._group_max = group_max
-        self._jobs: queue.SimpleQueue[_Job | None] = queue.SimpleQueue()
         self._lock = threading.Lock()
+        self._idle = threading.Condition(self._lock)
+        self._waiting: deque[_Job] = deque()
+        self._is_led = False
         self._closed = False
-        self._thread = threading.Thread(target=self._loop, name="store-writer", daemon=True)
-        self._thread.start()
 
     def run(self, work: Callable[[apsw.Connection], T]) -> T:
         """Run `work` in a transaction and return its result once that is durable."""
@@ -59,38 +80,41 @@ class GroupWriter:
         with self._lock:
             if self._closed:
                 raise StoreClosed("the store is closed")
-            self._jobs.put(job)
-        result: T = job.future.result()
+            self._waiting.append(job)
+            leads, self._is_led = not self._is_led, True
+        if not leads:
+            job.wait()
+        if not job.is_done:
+            self._lead(job)
+        if job.failed is not None:
+            raise job.failed
+        result: T = job.result
         return result
 
     def close(self) -> None:
         """Commit what is queued, then close the connection."""
         with self._lock:
-            if not self._closed:
-                self._closed = True
-                self._jobs.put(None)
-        self._thread.join()
-
-    def _loop(self) -> None:
-        closing = False
-        while not closing:
-            jobs, closing = self._next_group()
-            if jobs:
-                self._commit(jobs)
+            self._closed = True
+            self._idle.wait_for(lambda: not self._is_led)
         self._connection.close()
 
-    def _next_group(self) -> tuple[list[_Job], bool]:
-        job = self._jobs.get()
+    def _lead(self, own: _Job) -> None:
         jobs: list[_Job] = []
-        while job is not None:
-            jobs.append(job)
-            if len(jobs) == self._group_max:
-                return jobs, False
-            try:
-                job = self._jobs.get_nowait()
-            except queue.Empty:
-                return jobs, False
-        return jobs, True
+        try:
+            while not own.is_done:
+                with self._lock:
+                    jobs = [self._waiting.popleft() for _ in range(min(len(self._waiting), self._group_max))]
+                self._commit(jobs)
+        finally:
+            for job in jobs:
+                if not job.is_done:  # the leader was interrupted
+                    job.settle(None, StoreUnavailable(f"{self._connection.filename}: interrupted while it was written"))
+            with self._lock:
+                if self._waiting:
+                    self._waiting[0].wake()
+                else:
+                    self._is_led = False
+                    self._idle.notify_all()
 
     def _commit(self, jobs: list[_Job]) -> None:
         try:
@@ -101,13 +125,13 @@ class GroupWriter:
             self._undo()
             failure = as_store_error(error, self._connection.filename)
             for job in jobs:
-                job.future.set_exception(failure)
+                job.settle(None, failure)
             return
+        except BaseException:
+            self._undo()
+            raise
         for job, (result, failed) in zip(jobs, outcomes, strict=True):
-            if failed is None:
-                job.future.set_result(result)
-            else:
-                job.future.set_exception(failed)
+            job.settle(result, failed)
 
     def _attempt(self, job: _Job) -> tuple[Any, Exception | None]:
         self._connection.execute("SAVEPOINT job")

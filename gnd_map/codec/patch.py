@@ -7,7 +7,7 @@ from typing import Final
 import numpy as np
 import numpy.typing as npt
 
-from gnd.gnd_map.arrays import I32, are_in, check_array
+from gnd.gnd_map.arrays import I32, are_in, check_array, unique
 from gnd.gnd_map.classes import ChangeClass
 from gnd.gnd_map.codec import kernels as k
 from gnd.gnd_map.codec.coding import Coder
@@ -69,7 +69,7 @@ def encode_delta(tile_id: TileId, base: Gaussians, new: Gaussians) -> bytes:
     changes = diff(base, new)
     put, gone = changes.put, changes.removed
     coder = Coder.writing(priors_of(f"delta-{lattice.name}"), 4096 + 48 * (len(put) + len(gone)))
-    flagged = np.union1d(put.voxel_id, gone).astype(np.int32)
+    flagged = unique(np.concatenate([put.voxel_id, gone]))
     box = code_box(coder, tile_id, base.voxel_id, flagged)
     if box is not None:
         flag = np.asarray(box.empty(np.uint8, k.NONE), np.uint8)
@@ -186,7 +186,7 @@ def _read_measured(coder: Coder, tile_id: TileId, base: Gaussians, voxel_id: I32
 
 def _around(tile_id: TileId, base: Gaussians, voxel_id: I32) -> tuple[Box, I32, KnownVolume]:
     """Box, voxels and what is known around them."""
-    both = np.union1d(base.voxel_id, voxel_id).astype(np.int32)
+    both = unique(np.concatenate([base.voxel_id, voxel_id]))
     low, high = floors_of(tile_id, both)
     box = Box(VoxelGrid.of(tile_id), low, high - low + 1)
     return box, voxel_id, _known(base, voxel_id, np.empty(0, np.int32), REPORT)

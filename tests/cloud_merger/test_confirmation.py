@@ -7,9 +7,11 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from merger_world import GROUND, POLE, TILE, WALL, change_of, gaussians_of, report_of, sha_of
+from scipy.sparse import csr_array
+from scipy.sparse.csgraph import connected_components
 
 from gnd.cloud_merger.config import ShardConfig
-from gnd.cloud_merger.confirmation import ConfirmationParameters, gate
+from gnd.cloud_merger.confirmation import ConfirmationParameters, changes_together, gate
 from gnd.cloud_merger.errors import MergerError
 from gnd.cloud_merger.merge import MergeParameters, merge_tile
 from gnd.cloud_merger.statements import Report, statements_of
@@ -308,3 +310,14 @@ def test_any_batching_ends_in_the_same_tile_and_the_same_waiting(tmp_path_factor
                 first = end
             ends.append((store.get("ndt", TILE).sha, store.waiting_changes()))
     assert ends[0] == ends[1]
+
+
+@settings(max_examples=100, deadline=None)
+@given(st.sets(st.tuples(*[st.integers(0, 5)] * 3), max_size=60), st.integers(0, 2**32 - 1))
+def test_groups_of_changes_are_those_of_the_graph(cells, seed):
+    at = np.array(sorted(cells, key=lambda cell: cell[::-1]), np.int64).reshape(-1, 3)
+    counts = np.random.default_rng(seed).random(len(at)) < 0.5
+    beside = np.abs(at[:, None] - at[None]).max(axis=2, initial=0) <= 1
+    _, group = connected_components(csr_array(beside), directed=False)
+    expected = np.bincount(group, counts, max(len(at), 1))[group]
+    np.testing.assert_array_equal(changes_together(*np.ascontiguousarray(at.T), counts), expected)

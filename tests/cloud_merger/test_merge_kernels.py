@@ -1,13 +1,17 @@
 """The clusters of the kernel against those over arrays of all pairs."""
 
 import numpy as np
+import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from gnd.cloud_merger.merge import plain_clusters
+from gnd.cloud_merger import decide_kernels, merge
+from gnd.cloud_merger.decide_kernels import decided
+from gnd.cloud_merger.merge import plain_clusters, plain_decisions
 from gnd.cloud_merger.merge_kernels import NOISE, clusters_of
 from gnd.cloud_merger.parameters import MergeParameters
-from gnd.cloud_merger.statements import STATEMENT, Kind
+from gnd.cloud_merger.statements import EPOCH, STATEMENT, Kind
+from gnd.gnd_map.gaussian import Gaussians
 
 KINDS = [Kind.NOTHING, Kind.QUOTED, Kind.MEASURED, Kind.MEASURED, Kind.MEASURED, Kind.WITHHELD]
 
@@ -78,3 +82,36 @@ def test_a_measurement_that_denies_what_another_quotes_is_not_its_neighbour():
     assert clusters_of(rows, MergeParameters()).tolist() == [0, 1]
     rows["was"][1] = 2
     assert clusters_of(rows, MergeParameters()).tolist() == [0, 0]
+
+
+@st.composite
+def votes(draw):
+    """Statements with votes, counts of their own and denials, and an epoch that holds some of their voxels."""
+    rows = draw(statements())
+    rng = np.random.default_rng(draw(st.integers(0, 2**32 - 1)))
+    n = len(rows)
+    rows["weight"] = rng.choice([1.0, 0.5, 0.3], n)
+    rows["denies"] = (rows["was"] == EPOCH) & np.isin(rows["kind"], (Kind.MEASURED, Kind.WITHHELD))
+    rows["report"] = rng.integers(-1, 5, n)
+    there = rows["count"] > 0
+    rows["count"] = np.where(there, rng.choice([20, 700, 2**31 - 1], n), 0)
+    rows["cells"] = np.where(there, rng.integers(10, 60, n), 0)
+    ids = np.unique(rows["voxel_id"])
+    held = np.array([*ids[rng.random(len(ids)) < 0.6], 77], np.int32)
+    m = len(held)
+    mean_m = rng.normal(0.0, 0.1, (m, 3)).astype(np.float32)
+    return rows, Gaussians(held, np.full(m, 40, np.int32), np.full(m, 20, np.int32), mean_m, covariances(rng, m))
+
+
+@settings(max_examples=400, deadline=None)
+@given(votes(), st.sampled_from([0.3, 0.7]), st.integers(1, 3), st.sampled_from([0.0, 0.5, 0.9]))
+def test_decisions_are_those_over_arrays_of_rows_to_the_bit(given_, eps, min_samples, share):
+    rows, epoch = given_
+    parameters = MergeParameters(eps=eps, min_samples=min_samples, xi=share)
+    with pytest.MonkeyPatch.context() as patch:
+        for module in (merge, decide_kernels):
+            patch.setattr(module, "MERGE_XI_RESHAPED", share / 2)
+            patch.setattr(module, "MERGE_D_RENEWED", 0.99)
+        for mine, plain in zip(decided(rows, epoch, parameters), plain_decisions(rows, epoch, parameters), strict=True):
+            assert mine.dtype == plain.dtype
+            np.testing.assert_array_equal(mine, plain)

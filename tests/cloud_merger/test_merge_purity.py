@@ -22,15 +22,14 @@ from merger_world import (
 from sklearn.cluster import DBSCAN
 
 from gnd.cloud_merger.config import ShardConfig
-from gnd.cloud_merger.merge import (
+from gnd.cloud_merger.merge import MergeParameters, merge_tile
+from gnd.cloud_merger.parameters import (
     MERGE_D_DENIED,
     MERGE_D_RENEWED,
     MERGE_D_UPDATE,
+    MERGE_NOISE_M,
     MERGE_XI_RESHAPED,
-    MergeParameters,
-    merge_tile,
 )
-from gnd.cloud_merger.parameters import MERGE_NOISE_M
 from gnd.cloud_merger.statements import Report, statements_of
 from gnd.cloud_merger.work import Worker
 from gnd.gnd_map.classes import ChangeClass

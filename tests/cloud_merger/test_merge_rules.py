@@ -17,7 +17,7 @@ from merger_world import (
     sha_of,
 )
 
-from gnd.cloud_merger import merge
+from gnd.cloud_merger import decide_kernels, merge
 from gnd.cloud_merger.errors import MergerError
 from gnd.cloud_merger.merge import MergeParameters, merge_tile
 from gnd.cloud_merger.statements import Report, statements_of
@@ -76,6 +76,12 @@ def test_who_did_not_observe_the_voxel_has_no_vote():
     assert merged([sees_car, elsewhere, elsewhere]).changed.tolist() == [2]
 
 
+def put(patch: pytest.MonkeyPatch, name: str, value: float) -> None:
+    """Another value of a rule, for the kernel and for its twin."""
+    for module in (merge, decide_kernels):
+        patch.setattr(module, name, value)
+
+
 def test_the_share_must_exceed_xi_not_only_reach_it():
     yes, no = change_of(EPOCH, [2], {2: BALL}), change_of(EPOCH, [2], {})
     assert merged([yes, yes, yes, no, no], xi=0.6).changed.tolist() == []
@@ -83,7 +89,7 @@ def test_the_share_must_exceed_xi_not_only_reach_it():
 
 
 def test_the_biggest_cluster_wins_and_is_represented_by_its_moments(monkeypatch):
-    monkeypatch.setattr(merge, "MERGE_D_RENEWED", 1.0)
+    put(monkeypatch, "MERGE_D_RENEWED", 1.0)
     one = gaussians_of({1: POLE}, count=100, cells=40)
     two = gaussians_of({1: (*POLE[:2], 0.05, *POLE[3:])}, count=300, cells=55)
     result = merged([change_of(EPOCH, [1], g) for g in (one, gaussians_of({1: BALL}), two)], xi=0.5)
@@ -98,7 +104,7 @@ def test_the_biggest_cluster_wins_and_is_represented_by_its_moments(monkeypatch)
 def test_a_representative_is_looked_at_anew_when_its_measurements_have_doubled(monkeypatch):
     poles = [change_of(EPOCH, [2], {2: (-0.3, 0.2, 0.01 * k, *POLE[3:])}) for k in range(9)]
     with monkeypatch.context() as patch:
-        patch.setattr(merge, "MERGE_D_RENEWED", 1.0)
+        put(patch, "MERGE_D_RENEWED", 1.0)
         counts = [merged(poles[:n]).gaussians.select([2]).count[0] // 200 for n in range(1, 10)]
     assert counts == [1, 2, 2, 4, 4, 4, 4, 8, 8]
     assert merged(poles[:4]).gaussians == merged(poles[:7]).gaussians
@@ -336,7 +342,7 @@ def test_lengths_of_poses_out_of_range_are_refused(bad):
 def test_a_denied_voxel_needs_the_lower_share(monkeypatch):
     denies, quotes = change_of(EPOCH, [0, 1], {1: POLE}), change_of(EPOCH, [0, 1], {})
     assert merged([denies] * 5 + [quotes] * 4).changed.tolist() == [1]
-    monkeypatch.setattr(merge, "MERGE_XI_RESHAPED", 0.6)
+    put(monkeypatch, "MERGE_XI_RESHAPED", 0.6)
     assert merged([denies] * 5 + [quotes] * 4).gaussians == EPOCH
 
 

@@ -7,7 +7,8 @@ from merger_world import POLE, TILE, WALL_AGAIN
 from short_world import bases_of, drive_number, packed_of, tile_at
 from street_corner import displaced, mapped, seen_as, street
 
-from gnd.cloud_merger import merge_kernels, shift_kernels
+from gnd.cloud_merger import confirmation, decide_kernels, merge_kernels, shift_kernels
+from gnd.cloud_merger.decide_kernels import decided
 from gnd.cloud_merger.expanding import expand, with_measured
 from gnd.cloud_merger.merge_kernels import clusters_of
 from gnd.cloud_merger.parameters import MergeParameters
@@ -22,10 +23,13 @@ from gnd.vehicle_agent.packing import askable, pack_measured
 CORNER = mapped(street(0))
 
 
+KERNELS = (sight, kernels, lattice_kernels, similarity, confirmation, decide_kernels, merge_kernels, shift_kernels)
+
+
 def signatures():
     return {
         f"{module.__name__}.{name}": len(value.signatures)
-        for module in (sight, kernels, lattice_kernels, similarity, merge_kernels, shift_kernels)
+        for module in KERNELS
         for name, value in vars(module).items()
         if hasattr(value, "signatures")
     }
@@ -35,7 +39,7 @@ def test_warming_leaves_nothing_to_compile_for_the_first_report():
     threads = threading.active_count()
     warm_up()
     warm = signatures()
-    assert warm["gnd.cloud_merger.shift_kernels.votes_up"] == warm["gnd.cloud_merger.merge_kernels._label_voxels"] == 1
+    assert warm["gnd.cloud_merger.shift_kernels.votes_up"] == warm["gnd.cloud_merger.merge_kernels.label_voxels"] == 1
     assert warm["gnd.gnd_map.sight.cast_fans"] == 1
     report = drive_number(1, new={3: POLE}, modified={1: WALL_AGAIN}, deleted=(2,))
     packed = PackedReport.decode(packed_of(report))
@@ -46,6 +50,7 @@ def test_warming_leaves_nothing_to_compile_for_the_first_report():
     yes = found.exists
     similarity.similarity(yes, found.mean_m, found.cov_m2, yes, found.mean_m, found.cov_m2)
     clusters_of(np.zeros(5, STATEMENT), MergeParameters())
+    decided(np.zeros(5, STATEMENT), found, MergeParameters())
     assert shift_of(seen_as(CORNER, displaced(street(1), 0.2, 0.3)), CORNER).is_explained
     assert signatures() == warm
     assert threading.active_count() == threads

@@ -1,6 +1,7 @@
 """Merging claimed tiles: what is published, and what happens to a tile whose merge fails."""
 
 import logging
+from dataclasses import replace
 
 import apsw
 import numpy as np
@@ -20,13 +21,13 @@ from merger_world import (
 from upload_desk import Desk
 
 from gnd.cloud_merger.config import ShardConfig
-from gnd.cloud_merger.work import Worker
+from gnd.cloud_merger.work import SETTLED_TOGETHER, Worker, in_turn
 from gnd.gnd_map.gaussian import Gaussians
 from gnd.gnd_map.tile import Tile
 from gnd.gnd_map.tile_id import TileId
 from gnd.schemas.keys import change_key
 from gnd.tile_store.sqlite_store import SqliteStore
-from gnd.tile_store.values import ReportRow, StoreConfig
+from gnd.tile_store.values import Claim, ReportRow, StoreConfig
 
 STATES = {0: GROUND, 1: WALL}
 BASE = gaussians_of(STATES)
@@ -147,12 +148,40 @@ def test_a_damaged_page_stops_its_own_tile_only(tmp_path, caplog):
         worker = Worker(store, config)
         results = []
         while claims := store.claim("one", 16, 30.0):
-            results += [worker.settle(claim) for claim in claims]
+            for some in in_turn(claims):
+                results += worker.settle_some(some)
         assert [r.status for r in results if r] == ["published"]
         (aside,) = store.tiles_set_aside()
         assert (aside.tile, aside.attempts) == (NEIGHBOUR, 2)
         assert "StoreDamaged" in aside.reason
         assert [row.report_id for row in store.reports() if row.tile == NEIGHBOUR] == [failing]
+
+
+def test_first_attempts_share_a_commit_and_whoever_was_tried_before_goes_alone():
+    first = [Claim("ndt", TILE, number, "one", number) for number in range(SETTLED_TOGETHER + 1)]
+    again, aside = replace(first[0], attempts=2), replace(first[1], is_retry=True)
+    groups = list(in_turn([first[0], again, *first[1:], aside]))
+    assert [claim for some in groups for claim in some if claim.attempts == 1 and not claim.is_retry] == first
+    assert [again] in groups
+    assert [aside] in groups
+    assert max(map(len, groups)) == SETTLED_TOGETHER
+
+
+def test_a_publication_that_is_refused_takes_no_other_with_it(store, worker, monkeypatch):
+    for number, tile in enumerate((TILE, NEIGHBOUR)):
+        put(store, number, tile=tile)
+    attempt = worker._attempt
+
+    def with_a_stranger(claim):
+        publication = attempt(claim)
+        return replace(publication, report_ids=("0" * 26,)) if claim.tile == NEIGHBOUR else publication
+
+    monkeypatch.setattr(worker, "_attempt", with_a_stranger)
+    claims = store.claim("one", 16, 30.0)
+    assert len(claims) == 2
+    results = {claim.tile: result for claim, result in zip(claims, worker.settle_some(claims), strict=True)}
+    assert results[NEIGHBOUR] is None
+    assert results[TILE].status == "published"
 
 
 def large_tile(tile):

@@ -9,8 +9,7 @@ from merger_world import TILE, change_of, gaussians_of
 
 from gnd.cloud_merger.expanding import is_askable
 from gnd.cloud_merger.memory import VOXEL, TileMemory
-from gnd.cloud_merger.merge import MERGE_XI_RESHAPED
-from gnd.cloud_merger.parameters import MergeParameters
+from gnd.cloud_merger.parameters import MERGE_XI_RESHAPED, MergeParameters
 from gnd.cloud_merger.statements import Kind, Report, statements_of
 from gnd.cloud_merger.votes import TileVotes
 from gnd.cloud_merger.wants import Known, WantParameters, _promised, _sample, _wanted_of_tile

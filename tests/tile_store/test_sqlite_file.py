@@ -5,6 +5,8 @@ import subprocess
 import sys
 import threading
 import time
+from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import apsw
@@ -103,8 +105,8 @@ def test_a_folder_without_write_access(tmp_path: Path) -> None:
             parent.chmod(0o755)
     script = (
         "import os, sys\n"
-        "from gnd.tile_store.errors import StoreError\n"
-        "from gnd.tile_store.sqlite_store import SqliteStore\n"
+        "from tile_store.errors import StoreError\n"
+        "from tile_store.sqlite_store import SqliteStore\n"
         "if os.getuid() == 0: os.setuid(65534)\n"
         "for name in sys.argv[1:]:\n"
         "    try: SqliteStore(name)\n"
@@ -265,7 +267,7 @@ def test_calls_that_wait_together_share_one_commit(tmp_path: Path) -> None:
         for thread in threads:
             thread.start()
         deadline = time.monotonic() + 20
-        while store._writer._jobs.qsize() < 50:
+        while len(store._writer._waiting) < 50:
             assert time.monotonic() < deadline
             time.sleep(0.001)
         go.set()
@@ -273,3 +275,61 @@ def test_calls_that_wait_together_share_one_commit(tmp_path: Path) -> None:
             thread.join()
         assert len(commits) == 2  # the holder, then all the others
         assert store.counts().reports == 50
+
+
+def test_who_is_interrupted_while_it_writes_for_others_leaves_nobody_waiting(tmp_path: Path) -> None:
+    with SqliteStore(tmp_path / "s.db", EAGER) as store:
+        entered, go, outcomes = threading.Event(), threading.Event(), {}
+
+        def hold(_connection: apsw.Connection) -> None:
+            entered.set()
+            assert go.wait(20)
+
+        def interrupt(connection: apsw.Connection) -> None:
+            connection.execute("DELETE FROM report")
+            raise KeyboardInterrupt
+
+        def call(name: str, work: Callable[[], object]) -> None:
+            try:
+                outcomes[name] = work()
+            except BaseException as error:
+                outcomes[name] = type(error).__name__
+
+        store.put_reports([report(0)])
+        calls = [
+            ("holder", lambda: store._writer.run(hold)),
+            ("interrupted", lambda: store._writer.run(interrupt)),
+            ("behind it", lambda: store.put_reports([report(1)])),
+        ]
+        threads = [threading.Thread(target=call, args=one, daemon=True) for one in calls]
+        threads[0].start()
+        assert entered.wait(20)
+        for number, thread in enumerate(threads[1:], start=1):
+            thread.start()
+            while len(store._writer._waiting) < number:
+                time.sleep(0.001)
+        go.set()
+        for thread in threads:
+            thread.join(20)
+        assert outcomes == {"holder": None, "interrupted": "KeyboardInterrupt", "behind it": "StoreUnavailable"}
+        assert store.put_reports([report(2)]) == ["stored"]  # and the next one writes again
+        assert store.counts().reports == 2  # nothing was deleted, nothing half written
+
+
+def test_many_threads_take_turns_at_writing(tmp_path: Path) -> None:
+    config = replace(EAGER, group_max=3)
+    with SqliteStore(tmp_path / "s.db", config) as store:
+
+        def work(first: int) -> None:
+            for number in range(first, first + 40):
+                assert store.put_reports([report(number)]) == ["stored"]
+
+        threads = [threading.Thread(target=work, args=(40 * k,)) for k in range(8)]
+        for thread in threads:
+            thread.start()
+        for thread in threads:
+            thread.join(60)
+        assert not any(thread.is_alive() for thread in threads)
+        assert store.counts().reports == 320
+    with pytest.raises(StoreClosed):
+        store.put_reports([report(999)])

@@ -303,10 +303,18 @@ FROM journal AS j ORDER BY layer, tile
 INSERT INTO survey (layer, tile, version, surveyed_ns) VALUES (:layer, :tile, :version, :surveyed_ns)
 ON CONFLICT (layer, tile, version) DO UPDATE SET surveyed_ns = MAX(surveyed_ns, excluded.surveyed_ns)
 
+-- name: shift_tests_of_tile
+SELECT report_id, explained FROM shift_test
+WHERE layer = :layer AND tile = :tile AND report_id IN (SELECT value FROM json_each(:ids))
+
 -- name: put_shift_test
 INSERT INTO shift_test (layer, tile, report_id, vehicle, at_ns, explained, length_m, turn_rad, forward_m, left_m)
 VALUES (:layer, :tile, :report_id, :vehicle, :at_ns, :explained, :length_m, :turn_rad, :forward_m, :left_m)
 ON CONFLICT (layer, tile, report_id) DO UPDATE SET explained = excluded.explained
+
+-- name: courses_of_tile
+SELECT report_id FROM course_said
+WHERE layer = :layer AND tile = :tile AND report_id IN (SELECT value FROM json_each(:ids))
 
 -- name: put_course
 INSERT INTO course_said (layer, tile, report_id, vehicle, at_ns, turn_rad, sigma_rad)
@@ -409,8 +417,9 @@ SELECT seq, token FROM dirty WHERE layer = :layer AND tile = :tile
 UPDATE report SET merged_in = :version
 WHERE layer = :layer AND tile = :tile AND merged_in IS NULL AND seq <= :seq
 
--- name: report_exists
-SELECT 1 FROM report WHERE layer = :layer AND tile = :tile AND report_id = :report_id
+-- name: unknown_reports
+SELECT value FROM json_each(:ids)
+WHERE NOT EXISTS (SELECT 1 FROM report WHERE layer = :layer AND tile = :tile AND report_id = value)
 
 -- name: clean
 DELETE FROM dirty WHERE layer = :layer AND tile = :tile AND seq <= :seq
@@ -486,17 +495,20 @@ WHERE layer = :layer AND tile = :tile ORDER BY version
 -- name: provenance
 SELECT provenance FROM tile_version WHERE layer = :layer AND tile = :tile AND version = :version
 
--- name: reports_in_play
-SELECT report_id, layer, tile, vehicle, received_ns, body, base_sha, part, window, seq FROM report
+-- name: places_in_play
+SELECT arrival, window, seq FROM report
 WHERE layer = :layer AND tile = :tile AND window > :folded AND window <= :last
   AND (window > 0 OR merged_in IS NULL OR merged_in >= :epoch)
-ORDER BY report_id, part
 
--- name: reports_since
-SELECT report_id, layer, tile, vehicle, received_ns, body, base_sha, part, window, seq FROM report
+-- name: places_since
+SELECT arrival, window, seq FROM report
 WHERE layer = :layer AND tile = :tile AND window > :folded AND seq > :seq
   AND (window > 0 OR merged_in IS NULL OR merged_in >= :epoch)
 ORDER BY seq
+
+-- name: report_at
+SELECT report_id, layer, tile, vehicle, received_ns, body, base_sha, part, window, seq FROM report
+WHERE arrival = :arrival
 
 -- name: reports_page
 SELECT arrival, report_id, layer, tile, vehicle, received_ns, body, base_sha, part, window, seq FROM report
