@@ -8,8 +8,10 @@ from typing import Any, Final
 
 import click
 
+from gnd.deploy.compiling import say_once
 from gnd.extras import explained
 from gnd.gnd_map.errors import GndError
+from gnd.gnd_map.jit import tell_compiling
 
 COMMANDS: Final[dict[str, tuple[str, str]]] = {
     "fleet": ("gnd.deploy.fleet_cli:fleet", "Run a whole fleet on this machine and watch the map heal."),
@@ -79,6 +81,7 @@ def gnd() -> None:
 
 def main() -> None:
     """Run the command line; every error of ours becomes one line on standard error and exit code 2."""
+    tell_compiling(say_once())
     try:
         with explained():
             gnd.main(standalone_mode=False)

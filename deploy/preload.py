@@ -13,6 +13,8 @@ import gnd.deploy.roles
 import gnd.tile_store.server
 import gnd.vehicle_agent.agent
 import gnd.vehicle_agent.features.layers
+from gnd.deploy.compiling import say_once
+from gnd.gnd_map.jit import tell_compiling
 from gnd.vehicle_agent.warm import warm_up
 
 __all__ = ["gnd"]
@@ -25,6 +27,7 @@ def _compile_in_a_child() -> None:
         os.waitpid(child, 0)
         return
     try:
+        tell_compiling(say_once())
         warm_up()
     finally:
         os._exit(0)

@@ -11,6 +11,32 @@ _PLAIN: Final[dict[str, Any]] = {"cache": True, "error_model": "numpy", "nogil":
 # numba's own name for it. A version without it would refuse it at the first call, not go on slower.
 _BARE: Final[dict[str, Any]] = {**_PLAIN, "_nrt": False}
 _MAKING: Final = Lock()
+_TELL: Final[list[Callable[[str], None]]] = []
+_listening: Final[list[bool]] = []
+
+
+def tell_compiling(tell: Callable[[str], None]) -> None:
+    """Have `tell` called with the name of each kernel that is compiled in this process, before it is: the disk holds no
+    machine code of it yet, and the first of them take seconds. Loads nothing.
+    """
+    _TELL.append(tell)
+
+
+def _listen() -> None:
+    """Register what is to be told with numba, which has just been loaded."""
+    from numba.core import event
+
+    class Compiling(event.Listener):
+        """Passes on which kernel is about to be compiled."""
+
+        def on_start(self, begun: Any) -> None:
+            for tell in _TELL:
+                tell(begun.data["dispatcher"].__name__)
+
+        def on_end(self, ended: Any) -> None:
+            """Nothing is told of the end."""
+
+    event.register("numba:compile", Compiling())  # type: ignore[no-untyped-call]  # numba has no types
 
 
 class LazyKernel:
@@ -39,6 +65,9 @@ class LazyKernel:
 
             with _MAKING:
                 if self._dispatcher is None:
+                    if _TELL and not _listening:
+                        _listening.append(True)
+                        _listen()
                     self._dispatcher = numba.njit(**self._options)(self._function)
                     home = self._function.__globals__
                     if home.get(self._function.__name__) is self:
