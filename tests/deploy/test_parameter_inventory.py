@@ -6,7 +6,7 @@ from parameter_inventory import inventory
 
 MOST = 215
 """There were 547 before docs/decisions/0122-settings.md; more than now need a reason."""
-SENSOR_ERRORS = {"MotionNoise", "GnssNoise"}
+SENSOR_ERRORS = {"MotionNoise", "GnssNoise", "MappingMotionNoise", "MappingGnssNoise"}
 """Of a vehicle's own sensors: each vehicle has its own, and nobody in this repository has another."""
 OF_A_SESSION = {"BusConfig"}
 OF_THE_FILTER = ("FilterParameters.floor", "FilterParameters.resample_below")

@@ -105,8 +105,8 @@ def test_a_folder_without_write_access(tmp_path: Path) -> None:
             parent.chmod(0o755)
     script = (
         "import os, sys\n"
-        "from tile_store.errors import StoreError\n"
-        "from tile_store.sqlite_store import SqliteStore\n"
+        "from gnd.tile_store.errors import StoreError\n"
+        "from gnd.tile_store.sqlite_store import SqliteStore\n"
         "if os.getuid() == 0: os.setuid(65534)\n"
         "for name in sys.argv[1:]:\n"
         "    try: SqliteStore(name)\n"
