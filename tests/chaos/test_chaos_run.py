@@ -33,7 +33,8 @@ def test_a_cloud_keeps_its_word_through_one_fault_of_every_kind(tmp_path: Path) 
     assert told["versions"] > 20
     assert set(told["max_gap_s"]) == set(SERVICES)
     assert Counter(row["kind"] for row in told["list"]) == {kind.name: 1 for kind in kinds}
-    assert all(row["ended_s"] >= row["began_s"] + row["held_s"] for row in told["list"])
+    # each of the three is told to a few milliseconds
+    assert all(row["ended_s"] >= row["began_s"] + row["held_s"] - 0.01 for row in told["list"])
     assert set(told["restarts"]) >= {"router", "store"}, "they were killed"
 
 
