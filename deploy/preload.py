@@ -13,6 +13,7 @@ import gnd.deploy.roles
 import gnd.tile_store.server
 import gnd.vehicle_agent.agent
 import gnd.vehicle_agent.features.layers
+from gnd.cloud_merger.warm import warm_up as warm_up_cloud
 from gnd.deploy.compiling import say_once
 from gnd.gnd_map.jit import tell_compiling
 from gnd.vehicle_agent.warm import warm_up
@@ -29,6 +30,7 @@ def _compile_in_a_child() -> None:
     try:
         tell_compiling(say_once())
         warm_up()
+        warm_up_cloud()  # for its workers, processes of their own: they shall not compile while vehicles drive
     finally:
         os._exit(0)
 
