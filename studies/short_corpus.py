@@ -25,7 +25,7 @@ FOLDER: Final = Path("runs/benchmark-short-reports")
 SEED: Final = 205
 LENGTH_M: Final = 100.0
 DRIVES: Final = 2
-_KEY: Final = "short-reports-1"
+_KEY: Final = "short-reports-2"
 
 
 @dataclass(frozen=True, slots=True, eq=False)
