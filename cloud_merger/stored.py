@@ -128,8 +128,7 @@ def report_of_row(row: ReportRow, parameters: MergeParameters) -> Report:
     Raises:
         SchemaError: it can no longer be read.
     """
-    made = lambda: (parameters, report_of(row.body, parameters, row.received_ns))  # noqa: E731
-    return _OF_ROWS.of(row, made, id(parameters))[1]
+    return _OF_ROWS.of(row, lambda: (parameters, report_of(row.body, parameters, row.received_ns)), id(parameters))[1]
 
 
 def reports_by_window(

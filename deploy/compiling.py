@@ -8,11 +8,11 @@ LINE: Final = "gnd: compiling kernels for this machine; this happens once and ta
 
 
 def say_once() -> Callable[[str], None]:
-    """Return what says so on standard error, at the first kernel."""
+    """Return what says so at the first kernel: on a terminal only, since programs read the lines of errors."""
     said: list[str] = []
 
     def say(kernel: str) -> None:
-        if not said:
+        if not said and sys.stderr.isatty():
             print(LINE, file=sys.stderr, flush=True)
         said.append(kernel)
 

@@ -7,16 +7,13 @@ tests.
 
 from dataclasses import dataclass
 from functools import lru_cache
-from typing import TYPE_CHECKING
+from typing import Protocol
 
 import numpy as np
 import numpy.typing as npt
 
 from gnd.gnd_map.arrays import F64
 from gnd.gnd_map.errors import GeodesyError
-
-if TYPE_CHECKING:
-    from gnd.gnd_map.tile_id import TileId
 
 WGS84_A_M = 6378137.0  # semi-major axis, defining constant
 WGS84_F = 1.0 / 298.257223563  # flattening, defining constant
@@ -99,6 +96,14 @@ def enu_axes(lat_rad: npt.ArrayLike, lon_rad: npt.ArrayLike) -> F64:
     return np.stack([east, north, up], axis=-1)
 
 
+class HasCentre(Protocol):
+    """A part of the Earth that has a centre: a tile."""
+
+    @property
+    def centre_rad(self) -> tuple[float, float]:
+        """(latitude, longitude) of the centre."""
+
+
 @dataclass(frozen=True, slots=True)
 class LocalFrame:
     """A right-handed east-north-up frame with its origin on or above the ellipsoid."""
@@ -116,7 +121,7 @@ class LocalFrame:
             raise GeodesyError(f"height {self.height_m} m is not finite")
 
     @classmethod
-    def of_tile(cls, tile: "TileId") -> "LocalFrame":
+    def of_tile(cls, tile: HasCentre) -> "LocalFrame":
         """The tile's own frame: ENU at its centre on the ellipsoid."""
         return cls(*tile.centre_rad, 0.0)
 

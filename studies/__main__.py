@@ -15,7 +15,7 @@ from studies.frame.options import click_options, options_of
 NAMES: Final = (
     "detection", "segmentation", "localisation", "scan-to-scan", "clock", "first-pose", "health", "ingest",
     "short-reports", "sizes", "codec", "return-download", "gnss-noise", "poles", "features-merge", "merging",
-    "slamcu-step", "map-build", "stalled", "outage",
+    "slamcu-step", "camera-pipeline", "map-build", "stalled", "outage",
 )  # fmt: skip
 
 
@@ -41,10 +41,10 @@ def one_of_many() -> click.Command:
 
 
 def alone(name: str) -> click.Command:
-    """The command that runs one benchmark with options of its own (its dataclass `Options`, where it has one)."""
+    """The command that runs one benchmark with options of its own: those of its `OPTIONS`, where it has any."""
     module = importlib.import_module(f"studies.{name.replace('-', '_')}")
     flag = click.Option(["--json", "as_json"], is_flag=True, help="One JSON object.")
-    own = click_options(module.Options) if hasattr(module, "Options") else []
+    own = click_options(module.OPTIONS) if hasattr(module, "OPTIONS") else []
 
     def run(*, as_json: bool, **given: Any) -> None:
         _run(name, as_json, given)
@@ -54,7 +54,7 @@ def alone(name: str) -> click.Command:
 
 def _run(name: str, as_json: bool, given: dict[str, Any]) -> None:
     module = importlib.import_module(f"studies.{name.replace('-', '_')}")
-    figures = module.run(options_of(module.Options, given)) if given else module.run()
+    figures = module.run(options_of(module.OPTIONS, given)) if given else module.run()
     if not as_json:
         print(machine())
     command = " ".join(["python -m studies", *sys.argv[1:]]) if given else f"python -m studies {name}"

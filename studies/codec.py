@@ -10,6 +10,7 @@ import zlib
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Final
 
 import numpy as np
 import zstandard
@@ -58,6 +59,9 @@ class CodecOptions:
     base: Path | None = option(None, "Its map, a file of a simulation's run.  [default: make it]")
     store: Path | None = option(None, "The tiles of this store instead; sizes and times only.")
     recordings: Path = option(RECORDINGS, f"Folder with {', '.join(FOLDERS)}.")
+
+
+OPTIONS: Final = CodecOptions
 
 
 def run(chosen: CodecOptions | None = None) -> list[Figure]:

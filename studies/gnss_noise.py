@@ -31,6 +31,9 @@ class GnssNoiseOptions:
     recording: Path = option(RECORDING, "Folder with rover_1Hz_spp.pos, reference.csv.")
 
 
+OPTIONS: Final = GnssNoiseOptions
+
+
 @dataclass(frozen=True, slots=True)
 class FittedGnssNoise:
     """A Gauss-Markov process with white noise.

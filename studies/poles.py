@@ -57,6 +57,9 @@ class PoleOptions:
         check(self)
 
 
+OPTIONS: Final = PoleOptions
+
+
 def run(chosen: PoleOptions | None = None) -> list[Figure]:
     """Measure every sensor, then every recording that there is."""
     chosen = chosen or PoleOptions()

@@ -10,6 +10,7 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from itertools import groupby
 from pathlib import Path
+from typing import Final
 
 import numpy as np
 
@@ -46,6 +47,9 @@ class ReturnDownloadOptions:
 
     def __post_init__(self) -> None:
         check(self)
+
+
+OPTIONS: Final = ReturnDownloadOptions
 
 
 def run(chosen: ReturnDownloadOptions | None = None) -> list[Figure]:

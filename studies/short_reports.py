@@ -11,6 +11,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from time import thread_time
+from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -55,6 +56,9 @@ class ShortReportOptions:
     seeds: tuple[int, ...] = seeds(21, text="Of the streets.")
     length_m: float = option(200.0, "Of a street, metres.", "--length")
     run: Path | None = option(None, "Folder of a finished `gnd reproduce simulation --upload packed` instead.")
+
+
+OPTIONS: Final = ShortReportOptions
 
 
 @dataclass(frozen=True, slots=True, eq=False)

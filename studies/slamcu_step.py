@@ -8,6 +8,7 @@ of `gnd.fleet_sim.roads.motorway`, whole; beside the time stand the classes and 
 from dataclasses import dataclass, replace
 from math import radians
 from time import perf_counter
+from typing import Final
 
 import numpy as np
 
@@ -32,6 +33,9 @@ class SlamcuStepOptions:
     seeds: tuple[int, ...] = seeds(11, 12, text="Of the motorways.")
     particles: tuple[int, ...] = option((0, 300, 3000), "Numbers of particles; 0: the shipped one.")
     km: float = option(20.0, "Length of each motorway.")
+
+
+OPTIONS: Final = SlamcuStepOptions
 
 
 def run(chosen: SlamcuStepOptions | None = None) -> list[Figure]:

@@ -138,7 +138,7 @@ class HeldBack:
     reasons: Counter[str] = field(default_factory=Counter)
 
 
-class Fed(Protocol):
+class VehiclePipeline(Protocol):
     """What an agent feeds: a `Pipeline`, or for a vehicle without LiDAR a `CameraPipeline` or `GraphPipeline`."""
 
     place: Place

@@ -19,7 +19,7 @@ from gnd.vehicle_agent.features.tiles_on_the_bus import FeatureTilesOnTheBus, op
 from gnd.vehicle_agent.link import Link, open_link
 from gnd.vehicle_agent.local_map import LocalMap, Touched
 from gnd.vehicle_agent.memory import MemoryMeter
-from gnd.vehicle_agent.pipeline import Fed, Pipeline
+from gnd.vehicle_agent.pipeline import Pipeline, VehiclePipeline
 from gnd.vehicle_agent.report import Identity
 from gnd.vehicle_agent.result import PoseEvaluation
 from gnd.vehicle_agent.sources.recording import first_fix, paced
@@ -58,7 +58,7 @@ class AgentVehicle:
     items: Iterator[DriveItem]
     stop: threading.Event
     link: Link
-    pipeline: Fed
+    pipeline: VehiclePipeline
     evaluation: PoseEvaluation
     way: Way
     bus: OnTheBus
@@ -185,7 +185,7 @@ def open_vehicle(config: AgentConfig, stop: threading.Event) -> Iterator[AgentVe
                 telemetry.close()
 
 
-def _pipeline(header: DriveHeader, fix: GnssFix, bus: OnTheBus) -> Fed:
+def _pipeline(header: DriveHeader, fix: GnssFix, bus: OnTheBus) -> VehiclePipeline:
     """What the configured kind of vehicle is fed to; one without LiDAR does not load the parts of one with it."""
     config, link, features = bus.config, bus.link, bus.features
     identity = Identity(config.vehicle, header.drive_id, header.sensor_model, config.layer)

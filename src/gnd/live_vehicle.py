@@ -1,5 +1,6 @@
 """A vehicle that is fed measurement by measurement: it localises on a map, finds what changed, and reports it."""
 
+import importlib
 from collections import deque
 from contextlib import ExitStack
 from dataclasses import dataclass
@@ -76,7 +77,7 @@ class Vehicle:
         parameters: "PipelineParameters | None" = None,
     ) -> None:
         with explained():
-            pass  # now, not at the first position
+            importlib.import_module("gnd.vehicle_agent.pipeline")  # now, not at the first position
         T_vehicle_lidar = np.ascontiguousarray(mount, np.float64)
         self._header = DriveHeader(
             drive_id or name, name, sensor_model, _ANYWHERE, T_vehicle_lidar, deskew=deskew, sweep_ns=sweep_ns

@@ -140,6 +140,12 @@ def test_localise_without_its_extra_says_which(bare: Callable[..., Program]) -> 
     assert "comes with: pip install 'gnd-fleet[vehicle]'" in program.lines[-1]
 
 
+def test_a_vehicle_without_its_extra_says_so_when_it_is_made(bare: Callable[..., Program]) -> None:
+    program = bare("import gnd\ntry: gnd.Vehicle('m.sqlite', None)\nexcept gnd.MissingExtra as error: print(error)")
+    assert program.end() == 0, program.lines
+    assert "comes with: pip install 'gnd-fleet[vehicle]'" in program.lines[-1]
+
+
 def test_the_table_of_what_is_left_out_is_that_of_pyproject() -> None:
     base = with_dependencies(PROJECT["dependencies"])
     brought = {name_of(one) for requirements in EXTRAS.values() for one in requirements} - base

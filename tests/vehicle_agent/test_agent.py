@@ -16,7 +16,6 @@ from waiting import wait_until
 from gnd.cloud_merger.config import ShardConfig
 from gnd.cloud_merger.merger import run_shard
 from gnd.fleet_bus.bus import Bus
-from gnd.fleet_sim.drives import PERFECT, DriveConfig, simulate_drive
 from gnd.fleet_sim.street import street
 from gnd.gnd_map.tile_id import TileId
 from gnd.schemas.changes import ChangeReport
@@ -25,7 +24,6 @@ from gnd.schemas.drive_mcap import DriveWriter, read_drive, read_header
 from gnd.schemas.errors import DriveError
 from gnd.schemas.keys import traffic_key
 from gnd.schemas.traffic import TrafficSample
-from gnd.tile_store.build import build_map
 from gnd.tile_store.server import TileServer
 from gnd.tile_store.sqlite_store import SqliteStore
 from gnd.vehicle_agent.agent import AgentConfig, run_agent
@@ -34,18 +32,6 @@ from gnd.vehicle_agent.errors import VehicleError
 
 SEED = 101
 NEVER = threading.Event()
-
-
-@pytest.fixture(scope="module")
-def recordings(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A map of the first part of a street, and a later drive through it."""
-    folder, world = tmp_path_factory.mktemp("street"), street(SEED)
-    mapper = DriveConfig("mapper", "HDL-32E", state="before", errors=PERFECT, car_share=0.0, scans=60)
-    simulate_drive(world, mapper, folder / "mapper.mcap")
-    simulate_drive(world, DriveConfig("probe", "VLP-16", seed=4, scans=55), folder / "probe.mcap")
-    with SqliteStore(folder / "map.sqlite") as store:
-        build_map([folder / "mapper.mcap"], store)
-    return folder
 
 
 class Cloud:

@@ -1,7 +1,6 @@
 """A vehicle without LiDAR that localises by signs (SLAMCU): the pipeline, and the agent over a real router."""
 
 import threading
-from collections.abc import Iterator
 from dataclasses import replace
 from functools import lru_cache
 from pathlib import Path
@@ -13,9 +12,7 @@ from gnd.fleet_bus.bus import Bus
 from gnd.fleet_sim.roads.drive import RoadDrive, RoadDriveOptions, drive_route
 from gnd.fleet_sim.roads.motorway import motorway
 from gnd.fleet_sim.roads.recording import items_of, write_road_drive
-from gnd.fleet_sim.roads.route import MAP_ERROR_M, Route
-from gnd.gnd_map.features import FeatureTile
-from gnd.gnd_map.tile_id import TileId
+from gnd.fleet_sim.roads.route import Route
 from gnd.schemas.drive import GnssFix, MotionSample
 from gnd.schemas.features import FeatureReport
 from gnd.tile_store.server import TileServer
@@ -25,10 +22,9 @@ from gnd.vehicle_agent.config import AgentConfig, PipelineParameters
 from gnd.vehicle_agent.errors import AgentConfigError
 from gnd.vehicle_agent.features.layer_parameters import FeatureParameters
 from gnd.vehicle_agent.features.slamcu.camera_pipeline import CameraPipeline
-from gnd.vehicle_agent.place import Place
 from gnd.vehicle_agent.report import Identity
 from gnd.vehicle_agent.sources.recording import first_fix
-from studies.feature_study.reporting import BaseLayer
+from studies.camera_pipeline import WholeLayer
 
 SEED, LENGTH_M = 31, 6000.0
 WHO = Identity("car", "drive", "none", "signs")
@@ -45,26 +41,9 @@ def driven() -> RoadDrive:
     return drive_route(route(), 0, RoadDriveOptions())
 
 
-def map_tiles() -> dict[TileId, FeatureTile]:
-    mapped = route().features.mapped
-    layer = BaseLayer.of(route().frame, mapped.feature_id, mapped.kinds, mapped.mapped_xy_m, MAP_ERROR_M)
-    return dict(layer.tiles)
-
-
-class AllAtOnce:
-    """The whole map with the first question."""
-
-    def __init__(self) -> None:
-        self._tiles = map_tiles()
-
-    def follow(self, place: Place) -> Iterator[tuple[str, FeatureTile]]:
-        tiles, self._tiles = self._tiles, {}
-        yield from (("signs", tile) for tile in tiles.values())
-
-
 def reports_of(drive: RoadDrive) -> tuple[CameraPipeline, list[FeatureReport]]:
     fix, items = first_fix(items_of(drive), "drive")
-    pipeline, reports = CameraPipeline(fix, SIGNS, WHO, feature_tiles=AllAtOnce()), []
+    pipeline, reports = CameraPipeline(fix, SIGNS, WHO, feature_tiles=WholeLayer(drive)), []
     for item in items:
         reports += pipeline.push(item).reports
     reports += pipeline.finish().reports
@@ -120,6 +99,21 @@ def test_before_the_first_pose_nothing_is_judged_and_a_vehicle_that_stands_waits
     assert pipeline.finish().reports == ()
 
 
+def test_a_fix_of_which_nobody_says_what_it_is_worth_is_counted_and_moves_nothing() -> None:
+    fix = GnssFix(0, 0.85, 0.15, 100.0, 1.0)
+    pipeline = CameraPipeline(fix, SIGNS, WHO)
+    for k in range(500):
+        t_ns = k * 20_000_000
+        pipeline.push(MotionSample(1 + t_ns, 10.0, 0.0))
+        if k % 25 == 0:
+            pipeline.push(replace(fix, t_ns=2 + t_ns, lat_rad=0.85 + k * 0.2 / 6.37e6))
+    assert pipeline.slamcu is not None
+    before, _ = pipeline.slamcu.pose()
+    pipeline.push(replace(fix, t_ns=600 * 20_000_000, lat_rad=0.851, sigma_m=0.0))
+    assert pipeline.guard.bad["no-sigma"] == 1
+    np.testing.assert_array_equal(pipeline.slamcu.pose()[0], before)
+
+
 def test_it_needs_one_layer_that_a_camera_looks_for() -> None:
     for names in (("streetlights",), ("signs", "poles")):
         parameters = PipelineParameters(features=FeatureParameters.of(*names))
@@ -131,7 +125,7 @@ def test_it_needs_one_layer_that_a_camera_looks_for() -> None:
 def test_the_agent_drives_it_over_the_bus(bus: Bus, endpoint: str, tmp_path: Path) -> None:
     path = write_road_drive(driven(), "camera-car", tmp_path / "drive.mcap")
     with SqliteStore(tmp_path / "store.sqlite") as store, TileServer(store, bus):
-        store.put_tiles(list(map_tiles().values()), layer="signs")
+        store.put_tiles([tile for _, tile in WholeLayer(driven()).follow(None)], layer="signs")
         config = AgentConfig(
             vehicle="camera-car",
             drive=path,

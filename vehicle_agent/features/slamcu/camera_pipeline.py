@@ -40,8 +40,9 @@ STEP_M: Final = 100.0
 """Tiles left behind are looked for after this much way."""
 EVERY_LOOK: Final = 50
 """Of the poses that may still be told anew, so many are passed over: a tile near one of them is not left."""
-MOST_WAITING: Final = 100_000
-"""Measurements before the first pose."""
+WINDOW_NS: Final = 10_000_000_000
+"""The first pose is made of the measurements of this time: a vehicle that stands for long has turned in it only."""
+TRY_EVERY_NS: Final = 500_000_000
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -97,10 +98,11 @@ class CameraPipeline:
         self._feature_tiles = feature_tiles
         self._new_reports = NewReports(ReportList() if outbox is None else outbox)
         self._reporter = FeatureReporter(self._new_reports, identity, fix.t_ns, parameters.report.unchanged_m)
-        self._before: deque[MotionSample | GnssFix] = deque(maxlen=MOST_WAITING)
+        self._before: deque[MotionSample | GnssFix] = deque()
+        self._tried_ns = 0
         self._motion_ns = 0
-        self._looks: list[_Taken] = []
-        self._settled = 0  # looks whose poses are final
+        self._looks: deque[_Taken] = deque()  # whose poses are not final
+        self._settled = 0  # looks before these
         self._left_m = 0.0
         self._online: PoseEstimate | None = None
 
@@ -108,15 +110,13 @@ class CameraPipeline:
         """Take the next measurement; items come in time order. One that cannot be used is counted and left out."""
         if isinstance(item, ReferencePose) or not self.guard.admits(item):
             return self._output(())
+        if isinstance(item, GnssFix) and not item.sigma_m > 0:
+            self.guard.bad["no-sigma"] += 1  # nothing says what it is worth
+            return self._output(())
         if self.slamcu is None:
             self._begin(item)
-        elif isinstance(item, MotionSample):
-            self.slamcu.predict((item.t_ns - self._motion_ns) * 1e-9, item.speed_mps, item.yaw_rate_radps)
-            self._motion_ns = item.t_ns
-        elif isinstance(item, GnssFix):
-            self.slamcu.gnss(*self._enu_m(item), item.sigma_m)
-        elif isinstance(item, Detections) and item.layer == self._layer_parameters.name:
-            self._look(item, self.slamcu)
+        else:
+            self._take(item, self.slamcu)
         self.place.take(item, self._online)
         self.timeline.note(item.t_ns, self.place.health)
         return self._output(self._settle())
@@ -126,7 +126,7 @@ class CameraPipeline:
         if self.slamcu is None or self._layer is None:
             return self._output(())
         self.slamcu.finish()
-        poses = self._cover(len(self._looks))
+        poses = self._cover(self._settled + len(self._looks))
         for change in self._layer.leave_all():
             self._reporter.add(change, self.place.t_ns, self.place.odometer_m)
         self._reporter.report_all(self.place.t_ns)
@@ -161,9 +161,14 @@ class CameraPipeline:
         if not isinstance(item, MotionSample | GnssFix):
             return
         self._before.append(item)
-        motion = [one for one in self._before if isinstance(one, MotionSample)]
-        if not isinstance(item, MotionSample) or item.t_ns - motion[0].t_ns < AFTER_S * 1e9:
+        while item.t_ns - self._before[0].t_ns > WINDOW_NS:
+            self._before.popleft()
+        if not isinstance(item, MotionSample) or item.t_ns - self._tried_ns < TRY_EVERY_NS:
             return
+        motion = [one for one in self._before if isinstance(one, MotionSample)]
+        if item.t_ns - motion[0].t_ns < AFTER_S * 1e9:
+            return
+        self._tried_ns = item.t_ns
         fixes = [one for one in self._before if isinstance(one, GnssFix)]
         sigma_m = float(np.median([fix.sigma_m for fix in fixes])) if fixes else 0.0
         try:
@@ -190,7 +195,17 @@ class CameraPipeline:
         enu = np.asarray(self.place.frame.enu_from_geodetic(fix.lat_rad, fix.lon_rad, fix.height_m)).reshape(3)
         return float(enu[0]), float(enu[1])
 
-    # --- looks ------------------------------------------------------------------------------------------------------
+    # --- measurements ----------------------------------------------------------------------------------------------
+
+    def _take(self, item: DriveItem, slamcu: WatchedSlamcu) -> None:
+        """Feed the filter."""
+        if isinstance(item, MotionSample):
+            slamcu.predict((item.t_ns - self._motion_ns) * 1e-9, item.speed_mps, item.yaw_rate_radps)
+            self._motion_ns = item.t_ns
+        elif isinstance(item, GnssFix):
+            slamcu.gnss(*self._enu_m(item), item.sigma_m)
+        elif isinstance(item, Detections) and item.layer == self._layer_parameters.name:
+            self._look(item, slamcu)
 
     def _look(self, item: Detections, slamcu: WatchedSlamcu) -> None:
         assert self._layer is not None
@@ -224,9 +239,7 @@ class CameraPipeline:
         if slamcu is None or layer is None or slamcu.odometer_m - self._left_m < STEP_M:
             return ()
         self._left_m = slamcu.odometer_m
-        until = self._settled
-        while until < len(self._looks) and self._looks[until].odometer_m < slamcu.settled_m:
-            until += 1
+        until = self._settled + sum(look.odometer_m < slamcu.settled_m for look in self._looks)
         poses = self._cover(until)
         here = [one.pose for one in slamcu.path[max(until - 1, 0) :: EVERY_LOOK]]
         if poses and here:
@@ -234,8 +247,8 @@ class CameraPipeline:
             reach_m = self._layer_parameters.range_m + MARGIN_M
             points = np.array([(x, y, 0.0) for x, y, _ in here])
             for change in layer.leave(points, reach_m):
-                self._reporter.add(change, self._looks[until - 1].t_ns, self.place.odometer_m)
-            self._reporter.report(layer.tiles, self._looks[until - 1].t_ns, self.place.odometer_m)
+                self._reporter.add(change, poses[-1].t_ns, self.place.odometer_m)
+            self._reporter.report(layer.tiles, poses[-1].t_ns, self.place.odometer_m)
         return poses
 
     def _cover(self, until: int) -> tuple[PoseEstimate, ...]:
@@ -245,7 +258,7 @@ class CameraPipeline:
         assert layer is not None
         poses = []
         for number in range(self._settled, until):
-            taken, at = self._looks[number], slamcu.path[number]
+            taken, at = self._looks.popleft(), slamcu.path[number]
             given_up = self._given_up(at, slamcu)
             if not given_up:
                 layer.cover(at.pose, taken.occlusion)
