@@ -1,9 +1,9 @@
 """From a packed report back to an ordinary one: flags and track against the base tiles, then the Gaussians asked for.
 
-Pure functions, the counterpart of `gnd.vehicle_agent.packing`. What comes out is a `ChangeReport` as if the vehicle had
-sent it whole, but for four things: observed voxels are those that the track predicts, rays are not counted (evidence
-0), poses are as uncertain as those of the report's worst tile, and a voxel that is new or modified whose Gaussian was
-not asked for has count 0 ("withheld"; its class tells it from one that is deleted).
+Pure functions, the counterpart of `gnd.vehicle_agent.report.packing`. What comes out is a `ChangeReport` as if the
+vehicle had sent it whole, but for four things: observed voxels are those that the track predicts, rays are not counted
+(evidence 0), poses are as uncertain as those of the report's worst tile, and a voxel that is new or modified whose
+Gaussian was not asked for has count 0 ("withheld"; its class tells it from one that is deleted).
 """
 
 from collections.abc import Mapping, Sequence

@@ -19,7 +19,7 @@ from gnd.gnd_map.gaussian import Gaussians
 from gnd.gnd_map.tile import diff
 from gnd.tile_store.sqlite_store import SqliteStore
 from gnd.tile_store.values import DEFAULT_LAYER, StoredTile
-from gnd.vehicle_agent.outbox import Outbox
+from gnd.vehicle_agent.link.outbox import Outbox
 
 P95 = 0.95
 _SIZES = ("drive_km", "down_bytes", "up_bytes", "down_wire_bytes", "up_wire_bytes", "estimated_wire_bytes")

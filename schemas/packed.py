@@ -2,8 +2,8 @@
 `decode_upload` reads whatever comes on the key of change reports.
 
 Both travel in the message ChangeReport on the key of change reports. What they hold is coded against the versions of
-the tiles that vehicle and cloud both have, so these values only carry the bytes: `vehicle_agent.packing` makes them,
-`gnd.cloud_merger.expanding` understands them.
+the tiles that vehicle and cloud both have, so these values only carry the bytes: `vehicle_agent.report.packing` makes
+them, `gnd.cloud_merger.expanding` understands them.
 """
 
 import hashlib

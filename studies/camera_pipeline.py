@@ -22,7 +22,7 @@ from gnd.vehicle_agent.features.slamcu.camera_pipeline import CameraPipeline
 from gnd.vehicle_agent.features.slamcu.existence_book import FeatureClass
 from gnd.vehicle_agent.features.slamcu.parameters import SlamcuParameters
 from gnd.vehicle_agent.place import Place
-from gnd.vehicle_agent.report import Identity
+from gnd.vehicle_agent.report.reporter import Identity
 from gnd.vehicle_agent.sources.recording import first_fix
 from studies.feature_study.reporting import BaseLayer
 from studies.frame.measure import Figure

@@ -7,7 +7,7 @@ import numpy as np
 
 from gnd.deploy.chaos.street import FILE, write_street
 from gnd.gnd_map.codec import encode_mask
-from gnd.vehicle_agent.packing import askable, pack_measured
+from gnd.vehicle_agent.report.packing import askable, pack_measured
 from studies.short_corpus import Corpus, corpus
 
 

@@ -27,7 +27,7 @@ from gnd.fleet_bus.router import open_router
 from gnd.schemas.changes import ChangeAck
 from gnd.schemas.report_states import ReportState
 from gnd.tile_store.sqlite_store import SqliteStore
-from gnd.vehicle_agent.packing import pack_measured
+from gnd.vehicle_agent.report.packing import pack_measured
 from studies.frame.measure import Figure, spent_s
 from studies.short_corpus import Corpus, CorpusReport, corpus
 

@@ -23,10 +23,10 @@ from gnd.gnd_map.tile import Tile
 from gnd.schemas.changes import ChangeReport
 from gnd.vehicle_agent.config import ReportParameters
 from gnd.vehicle_agent.detect.detector import ChangeDetector
+from gnd.vehicle_agent.link.outbox import Outbox
 from gnd.vehicle_agent.local_map import LocalMap
 from gnd.vehicle_agent.localise.estimates import RefinedScan
-from gnd.vehicle_agent.outbox import Outbox
-from gnd.vehicle_agent.report import Identity, Reporter
+from gnd.vehicle_agent.report.reporter import Identity, Reporter
 from gnd.vehicle_agent.segment.segmenter import SegmentedScan
 from studies.gated_merge import merged
 from studies.simulation.options import PoseSource

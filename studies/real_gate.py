@@ -31,9 +31,9 @@ from gnd.vehicle_agent.importer import no_progress, open_recording
 from gnd.vehicle_agent.importers.detect_format import format_of
 from gnd.vehicle_agent.importers.recording import NOMINAL
 from gnd.vehicle_agent.importers.splits import chosen_scans
+from gnd.vehicle_agent.link.outbox import Outbox
 from gnd.vehicle_agent.local_map import LocalMap
-from gnd.vehicle_agent.outbox import Outbox
-from gnd.vehicle_agent.report import Identity, Reporter
+from gnd.vehicle_agent.report.reporter import Identity, Reporter
 from gnd.vehicle_agent.segment.parameters import SegmentParameters
 from gnd.vehicle_agent.segment.segmenter import SegmentedScan
 from studies.gated_merge import Merged, merged

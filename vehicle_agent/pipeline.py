@@ -34,8 +34,8 @@ from gnd.vehicle_agent.localise.estimates import Cause, Health, PoseEstimate, Re
 from gnd.vehicle_agent.localise.localiser import Localiser
 from gnd.vehicle_agent.localise.remount import header_sigma
 from gnd.vehicle_agent.place import Place
-from gnd.vehicle_agent.report import Identity, Reporter, statement_on_lattice
-from gnd.vehicle_agent.report_sink import NewReports, OutgoingReport, ReportList, ReportSink
+from gnd.vehicle_agent.report.reporter import Identity, Reporter, statement_on_lattice
+from gnd.vehicle_agent.report.sink import NewReports, OutgoingReport, ReportList, ReportSink
 from gnd.vehicle_agent.result import HealthTimeline
 from gnd.vehicle_agent.scans import Guard
 from gnd.vehicle_agent.segment.segmenter import MotionSegmenter, SegmentedScan
@@ -363,8 +363,8 @@ class Pipeline(Generic[TilesT]):
         """The feature layers' part; a vehicle that knows voxels only does not even load it."""
         if identity is None or not self.parameters.features.layers:
             return None
-        from gnd.vehicle_agent.features.feature_report import FeatureReporter
         from gnd.vehicle_agent.features.layers import FeatureLayers
+        from gnd.vehicle_agent.report.feature_report import FeatureReporter
 
         longest_m = self.parameters.report.unchanged_m
         reporters = [

@@ -7,8 +7,8 @@ import numpy as np
 from gnd.gnd_map.arrays import F64
 from gnd.gnd_map.geodesy import LocalFrame
 from gnd.schemas.drive import DriveItem, GnssFix, MotionSample
+from gnd.vehicle_agent.link.plan import VehicleCourse
 from gnd.vehicle_agent.localise.estimates import PoseEstimate
-from gnd.vehicle_agent.plan import VehicleCourse
 
 LONGEST_STEP_S = 1.0  # a gap in the wheel speed is not driven
 HEADING_BASE_M = 3.0  # satellites give a heading from fixes this far apart

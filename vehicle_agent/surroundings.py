@@ -13,10 +13,10 @@ from gnd.gnd_map.geodesy import LocalFrame
 from gnd.gnd_map.tile import Tile
 from gnd.gnd_map.tile_id import TileId, covering_corridor
 from gnd.vehicle_agent.config import LEAD_S, DownloadParameters
-from gnd.vehicle_agent.download import Fetched, TileFetcher
+from gnd.vehicle_agent.link.download import Fetched, TileFetcher
+from gnd.vehicle_agent.link.plan import Need, in_time, needs
 from gnd.vehicle_agent.local_map import LocalMap, Touched
 from gnd.vehicle_agent.place import Place
-from gnd.vehicle_agent.plan import Need, in_time, needs
 
 STEP_M = 5.0  # the wanted tiles are looked at again after this much way
 AHEAD_STEP_M = 20.0  # every small change of speed would be a reason to look again

@@ -15,17 +15,17 @@ from gnd.schemas.drive_mcap import read_drive, read_header
 from gnd.schemas.errors import SchemaError
 from gnd.schemas.traffic import TrafficLine, TrafficSample
 from gnd.vehicle_agent.config import AgentConfig
-from gnd.vehicle_agent.features.tiles_on_the_bus import FeatureTilesOnTheBus, open_feature_tiles
-from gnd.vehicle_agent.link import Link, open_link
+from gnd.vehicle_agent.link.feature_tiles_on_the_bus import FeatureTilesOnTheBus, open_feature_tiles
+from gnd.vehicle_agent.link.link import Link, open_link
+from gnd.vehicle_agent.link.telemetry import Telemetry
+from gnd.vehicle_agent.link.tiles_on_the_bus import TilesOnTheBus
 from gnd.vehicle_agent.local_map import LocalMap, Touched
 from gnd.vehicle_agent.memory import MemoryMeter
 from gnd.vehicle_agent.pipeline import Pipeline, VehiclePipeline
-from gnd.vehicle_agent.report import Identity
+from gnd.vehicle_agent.report.reporter import Identity
 from gnd.vehicle_agent.result import PoseEvaluation
 from gnd.vehicle_agent.sources.recording import first_fix, paced
 from gnd.vehicle_agent.sources.world_clock import in_common_time
-from gnd.vehicle_agent.telemetry import Telemetry
-from gnd.vehicle_agent.tiles_on_the_bus import TilesOnTheBus
 from gnd.vehicle_agent.way import WAY_FILE, Way
 
 _log = logging.getLogger(__name__)

@@ -27,8 +27,8 @@ from gnd.vehicle_agent.localise.localiser import Localiser
 from gnd.vehicle_agent.localise.match_map import MatchMapCache
 from gnd.vehicle_agent.localise.parameters import NOISE_M, RegistrationParameters
 from gnd.vehicle_agent.localise.rolling_map import ROLLING_MOVE_M, RollingMap
-from gnd.vehicle_agent.packing import pack, pack_measured
-from gnd.vehicle_agent.report import on_lattice
+from gnd.vehicle_agent.report.packing import pack, pack_measured
+from gnd.vehicle_agent.report.reporter import on_lattice
 from gnd.vehicle_agent.segment import MotionSegmenter, SegmentedScan
 
 _LIDAR_HEIGHT_M = 2.0

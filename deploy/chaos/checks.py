@@ -22,7 +22,7 @@ from gnd.gnd_map.tile_id import TileId
 from gnd.schemas.changes import ChangeReport, TileChange
 from gnd.tile_store.check import check_store
 from gnd.tile_store.sqlite_store import SqliteStore
-from gnd.vehicle_agent.outbox import Outbox
+from gnd.vehicle_agent.link.outbox import Outbox
 
 MOST_NAMED: Final = 20
 _UNREAD: Final = ("waiting", "early")

@@ -27,8 +27,8 @@ from gnd.schemas.keys import tile_key, update_keys
 from gnd.schemas.tiles import CodedDelta, TileBlob, TileReply, TileRequest, tile_after, tile_of
 from gnd.schemas.updates import TileUpdate, updated
 from gnd.vehicle_agent.errors import OutboxError
-from gnd.vehicle_agent.outbox import Outbox
-from gnd.vehicle_agent.sending import SenderThread
+from gnd.vehicle_agent.link.outbox import Outbox
+from gnd.vehicle_agent.link.sending import SenderThread
 
 REPORTS_OF_TRIP: Final = 6
 ENOUGH: Final = "enough"

@@ -23,9 +23,9 @@ from gnd.fleet_bus.errors import BusError
 from gnd.gnd_map.codec import encode_mask
 from gnd.gnd_map.errors import GndError
 from gnd.tile_store.errors import StoreError
-from gnd.vehicle_agent.outbox import Outbox
-from gnd.vehicle_agent.packing import askable, pack_measured
-from gnd.vehicle_agent.sending import SenderThread
+from gnd.vehicle_agent.link.outbox import Outbox
+from gnd.vehicle_agent.link.sending import SenderThread
+from gnd.vehicle_agent.report.packing import askable, pack_measured
 
 SMALL_BYTES: Final = 4_096
 MESSENGER: Final = "messenger"

@@ -25,7 +25,7 @@ from gnd.schemas.changes import ChangeReport, TileChange
 from gnd.schemas.keys import change_key
 from gnd.schemas.packed import PackedGaussians, PackedReport, decode_upload
 from gnd.schemas.report_id import deterministic_report_id
-from gnd.vehicle_agent.packing import pack
+from gnd.vehicle_agent.report.packing import pack
 
 FILE: Final = Path(__file__).with_name("street.bin")
 LAYER: Final = "ndt"

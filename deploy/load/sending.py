@@ -18,9 +18,9 @@ from gnd.schemas.keys import change_key, state_key
 from gnd.schemas.packed import PackedGaussians
 from gnd.schemas.report_id import deterministic_report_id
 from gnd.schemas.report_states import ReportQuestion, ReportState, ReportStates
-from gnd.vehicle_agent.outbox import FIRST_ASK_S, LONGEST_ASK_S
-from gnd.vehicle_agent.packing import pack_measured
-from gnd.vehicle_agent.sending import QUESTION_S, REQUEST_S
+from gnd.vehicle_agent.link.outbox import FIRST_ASK_S, LONGEST_ASK_S
+from gnd.vehicle_agent.link.sending import QUESTION_S, REQUEST_S
+from gnd.vehicle_agent.report.packing import pack_measured
 
 NS_PER_S: Final = 1_000_000_000
 PATIENCE: Final = 3

@@ -24,7 +24,7 @@ from gnd.schemas.tiles import CatalogEntry
 from gnd.schemas.updates import TileUpdate, updated
 
 if TYPE_CHECKING:
-    from gnd.vehicle_agent.report_sink import OutgoingReport
+    from gnd.vehicle_agent.report.sink import OutgoingReport
 
 GAUSSIANS: Final = "ndt"
 """The layer of Gaussians; every layer whose name does not begin so holds features."""

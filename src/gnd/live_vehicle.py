@@ -196,7 +196,7 @@ class Vehicle:
 
     def _begin(self, fix: GnssFix) -> "Pipeline[TilesAtHand]":
         from gnd.vehicle_agent.pipeline import Pipeline
-        from gnd.vehicle_agent.report import Identity
+        from gnd.vehicle_agent.report.reporter import Identity
         from gnd.vehicle_agent.tiles_at_hand import TilesAtHand
 
         header, source = self._header, self._source

@@ -18,7 +18,7 @@ from gnd.gnd_map.tile import Tile, TileDelta, apply
 from gnd.gnd_map.tile_id import TileId
 from gnd.schemas.changes import ChangeReport, TileChange
 from gnd.schemas.packed import PackedReport
-from gnd.vehicle_agent.packing import pack_measured
+from gnd.vehicle_agent.report.packing import pack_measured
 from studies.simulation.base_map import BaseMap
 from studies.simulation.options import Upload
 from studies.simulation.result import VehicleResult

@@ -19,8 +19,8 @@ from gnd.vehicle_agent.errors import LocaliseError
 from gnd.vehicle_agent.local_map import LocalMap
 from gnd.vehicle_agent.localise.estimates import PoseEstimate, localisation_error
 from gnd.vehicle_agent.pipeline import Localisation, Parts, Pipeline
-from gnd.vehicle_agent.report import Identity, statement_on_lattice
-from gnd.vehicle_agent.report_sink import ReportList
+from gnd.vehicle_agent.report.reporter import Identity, statement_on_lattice
+from gnd.vehicle_agent.report.sink import ReportList
 from gnd.vehicle_agent.segment import SegmentedScan
 from gnd.vehicle_agent.sources.recording import first_fix
 from gnd.vehicle_agent.tiles_at_hand import TilesAtHand

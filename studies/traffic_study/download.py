@@ -23,8 +23,8 @@ from gnd.tile_store.answers import TileAnswers
 from gnd.tile_store.sqlite_store import SqliteStore
 from gnd.tile_store.values import DEFAULT_LAYER
 from gnd.vehicle_agent.config import LEAD_S, DownloadParameters
-from gnd.vehicle_agent.download import DOWNLOAD_BATCH_S
-from gnd.vehicle_agent.plan import VehicleCourse, batch_bytes, needs
+from gnd.vehicle_agent.link.download import DOWNLOAD_BATCH_S
+from gnd.vehicle_agent.link.plan import VehicleCourse, batch_bytes, needs
 from gnd.vehicle_agent.surroundings import STEP_M, tiles_along
 from studies.traffic_study.fleet import drive_config
 from studies.traffic_study.options import TrafficOptions

@@ -30,7 +30,7 @@ from gnd.gnd_map.tile import Tile
 from gnd.tile_store.sqlite_store import SqliteStore
 from gnd.tile_store.values import DEFAULT_LAYER
 from gnd.vehicle_agent.agent import AgentConfig
-from gnd.vehicle_agent.cache import TileCache
+from gnd.vehicle_agent.link.cache import TileCache
 from studies.frame.command import Bench, StudyReport, study
 from studies.frame.errors import OptionError, ReproduceError
 from studies.frame.options import check, option

@@ -34,9 +34,9 @@ from gnd.schemas.packed import PackedGaussians, PackedReport, decode_upload
 from gnd.schemas.report_states import ReportState, ReportStates
 from gnd.tile_store.sqlite_store import SqliteStore
 from gnd.tile_store.values import DEFAULT_CODEC, DEFAULT_LAYER, StoreConfig
-from gnd.vehicle_agent.outbox import Outbox
-from gnd.vehicle_agent.packing import askable, is_measured
-from gnd.vehicle_agent.sending import SenderThread
+from gnd.vehicle_agent.link.outbox import Outbox
+from gnd.vehicle_agent.link.sending import SenderThread
+from gnd.vehicle_agent.report.packing import askable, is_measured
 from studies.frame.errors import ReproduceError
 from studies.simulation.base_map import BaseMap
 from studies.simulation.result import VehicleResult

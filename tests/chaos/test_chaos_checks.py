@@ -21,8 +21,8 @@ from gnd.schemas.report_id import deterministic_report_id
 from gnd.schemas.report_states import ReportState
 from gnd.tile_store.sqlite_store import SqliteStore
 from gnd.tile_store.values import StoreConfig
-from gnd.vehicle_agent.outbox import Outbox
-from gnd.vehicle_agent.packing import askable, pack_measured
+from gnd.vehicle_agent.link.outbox import Outbox
+from gnd.vehicle_agent.report.packing import askable, pack_measured
 
 Verify = Callable[[Path], tuple[dict[str, int], bool]]
 SEED, VEHICLES, REPORTS = 5, ("car-0", "car-1"), 3

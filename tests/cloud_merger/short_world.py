@@ -14,7 +14,7 @@ from gnd.gnd_map.tile_id import TileId
 from gnd.gnd_map.track import STEPS, Track, TrackPiece, TrackView
 from gnd.schemas.changes import ChangeReport, TileChange
 from gnd.schemas.keys import change_key
-from gnd.vehicle_agent.packing import pack
+from gnd.vehicle_agent.report.packing import pack
 
 KEY = change_key("ndt", TILE.district)
 BASE = snap(gaussians_of({0: GROUND, 1: WALL, 2: GROUND}), LATTICES["standard"])

@@ -18,7 +18,7 @@ from gnd.cloud_merger.warm import warm_up
 from gnd.gnd_map import sight, similarity
 from gnd.gnd_map.codec import encode_mask, kernels, lattice_kernels
 from gnd.schemas.packed import PackedReport
-from gnd.vehicle_agent.packing import askable, pack_measured
+from gnd.vehicle_agent.report.packing import askable, pack_measured
 
 CORNER = mapped(street(0))
 

@@ -13,7 +13,7 @@ from gnd.gnd_map.codec import LATTICES, REPORT, decode_mask, encode_mask, snap
 from gnd.gnd_map.gaussian import Gaussians, concat
 from gnd.gnd_map.tile import Tile
 from gnd.schemas.packed import PackedGaussians, PackedReport, crc_of
-from gnd.vehicle_agent.packing import askable, pack, pack_measured
+from gnd.vehicle_agent.report.packing import askable, pack, pack_measured
 
 VOXELS = np.arange(-700, 2400, 7)
 

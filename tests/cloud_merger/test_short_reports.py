@@ -29,7 +29,7 @@ from gnd.schemas.packed import PackedReport, crc_of, decode_upload
 from gnd.tile_store.errors import StoreClosed
 from gnd.tile_store.sqlite_store import SqliteStore
 from gnd.tile_store.values import StoreConfig
-from gnd.vehicle_agent.packing import askable, pack, pack_measured
+from gnd.vehicle_agent.report.packing import askable, pack, pack_measured
 
 # Back and forth through the district; its ends are near enough.
 LONG = dataclasses.replace(

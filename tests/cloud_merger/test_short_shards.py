@@ -22,9 +22,9 @@ from gnd.schemas.keys import change_key, state_key
 from gnd.schemas.report_states import ReportQuestion, ReportState, ReportStates
 from gnd.tile_store.sqlite_store import SqliteStore
 from gnd.tile_store.values import StoreConfig
-from gnd.vehicle_agent.outbox import Outbox
-from gnd.vehicle_agent.packing import pack_measured
-from gnd.vehicle_agent.sending import SenderThread
+from gnd.vehicle_agent.link.outbox import Outbox
+from gnd.vehicle_agent.link.sending import SenderThread
+from gnd.vehicle_agent.report.packing import pack_measured
 
 SHARDS = ("left", "right")
 FIRST = [TileId((TILE.morton & ~1023) + k * 1024 + 5) for k in range(8)]

@@ -19,8 +19,8 @@ from gnd.schemas.keys import change_key
 from gnd.schemas.report_id import deterministic_report_id
 from gnd.schemas.report_states import ReportState
 from gnd.tile_store.sqlite_store import SqliteStore
-from gnd.vehicle_agent.outbox import Outbox
-from gnd.vehicle_agent.packing import pack
+from gnd.vehicle_agent.link.outbox import Outbox
+from gnd.vehicle_agent.report.packing import pack
 
 FIRST = TileId(497353963154)
 T0_NS = 1_700_000_000_000_000_000

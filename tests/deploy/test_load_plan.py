@@ -9,7 +9,7 @@ from gnd.deploy.load.streets import Streets
 from gnd.deploy.run_folder import RunFolder
 from gnd.schemas.keys import change_key
 from gnd.schemas.packed import PackedReport
-from gnd.vehicle_agent.outbox import Outbox
+from gnd.vehicle_agent.link.outbox import Outbox
 
 
 def table(**options):

@@ -16,7 +16,7 @@ from gnd.deploy.load.shift import (
 )
 from gnd.gnd_map.codec import encode_mask
 from gnd.gnd_map.tile_id import LON_TILES, TileId
-from gnd.vehicle_agent.packing import askable, pack, pack_measured
+from gnd.vehicle_agent.report.packing import askable, pack, pack_measured
 
 
 @pytest.mark.parametrize("districts", [0, 1, -1, 7, -1000, 20_000])

@@ -22,7 +22,7 @@ from gnd.vehicle_agent.config import AgentConfig, PipelineParameters
 from gnd.vehicle_agent.errors import AgentConfigError
 from gnd.vehicle_agent.features.layer_parameters import FeatureParameters
 from gnd.vehicle_agent.features.slamcu.camera_pipeline import CameraPipeline
-from gnd.vehicle_agent.report import Identity
+from gnd.vehicle_agent.report.reporter import Identity
 from gnd.vehicle_agent.sources.recording import first_fix
 from studies.camera_pipeline import WholeLayer
 

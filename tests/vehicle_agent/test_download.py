@@ -20,9 +20,9 @@ from gnd.schemas.tiles import blob_of
 from gnd.schemas.tiles_batch import TileAnswer, TilesReply, TilesRequest
 from gnd.tile_store.server import TileServer
 from gnd.tile_store.sqlite_store import SqliteStore
-from gnd.vehicle_agent.cache import TileCache
 from gnd.vehicle_agent.config import DownloadParameters
-from gnd.vehicle_agent.download import TileFetcher
+from gnd.vehicle_agent.link.cache import TileCache
+from gnd.vehicle_agent.link.download import TileFetcher
 
 QUICK = DownloadParameters(request_s=0.6, retry_s=0.1, in_flight=3)
 NEVER = threading.Event()

@@ -28,14 +28,14 @@ from gnd.schemas.tiles_batch import ANSWER_HASH_BYTES
 from gnd.schemas.updates import TileUpdate
 from gnd.tile_store.server import TileServer
 from gnd.tile_store.sqlite_store import SqliteStore
-from gnd.vehicle_agent.cache import TileCache
 from gnd.vehicle_agent.config import DownloadParameters
 from gnd.vehicle_agent.detect.detector import ChangeDetector
-from gnd.vehicle_agent.download import TileFetcher
+from gnd.vehicle_agent.link.cache import TileCache
+from gnd.vehicle_agent.link.download import TileFetcher
+from gnd.vehicle_agent.link.updates import Updates
 from gnd.vehicle_agent.local_map import LocalMap
 from gnd.vehicle_agent.place import Place
 from gnd.vehicle_agent.surroundings import Surroundings
-from gnd.vehicle_agent.updates import Updates
 
 NEVER = threading.Event()
 PARAMETERS = DownloadParameters(near_m=30.0, ahead_m=60.0, forget_m=60.0, retry_s=0.1)
@@ -187,9 +187,9 @@ from gnd.fleet_bus.config import BusConfig
 from gnd.fleet_bus.ledger import Ledger
 from gnd.fleet_bus.links import LinkProfile
 from gnd.gnd_map.tile_id import TileId
-from gnd.vehicle_agent.cache import TileCache
+from gnd.vehicle_agent.link.cache import TileCache
 from gnd.vehicle_agent.config import DownloadParameters
-from gnd.vehicle_agent.download import TileFetcher
+from gnd.vehicle_agent.link.download import TileFetcher
 
 folder, tiles = Path(sys.argv[2]), [TileId(int(morton)) for morton in sys.argv[3:]]
 thin = LinkProfile("thin", down_bit_s=2.2e5, up_bit_s=2.2e5, delay_ms=5.0, burst_bytes=0)

@@ -20,10 +20,10 @@ from gnd.schemas.keys import update_key
 from gnd.schemas.tiles import TileBlob
 from gnd.tile_store.server import TileServer
 from gnd.tile_store.sqlite_store import SqliteStore
-from gnd.vehicle_agent.cache import TileCache
 from gnd.vehicle_agent.config import AgentConfig, DownloadParameters
 from gnd.vehicle_agent.errors import AgentConfigError
-from gnd.vehicle_agent.features.download import FeatureDownloader
+from gnd.vehicle_agent.link.cache import TileCache
+from gnd.vehicle_agent.link.feature_download import FeatureDownloader
 
 TILE, EAST = TileId(497353963154), TileId(497353963155)
 COV_M2 = np.array([0.04, 0.0, 0.0, 0.04, 0.0, 1e4])

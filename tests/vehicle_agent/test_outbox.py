@@ -16,7 +16,7 @@ from gnd.gnd_map.tile import Tile
 from gnd.gnd_map.tile_id import TileId
 from gnd.schemas.report_states import ReportState, ReportStatus
 from gnd.vehicle_agent.errors import OutboxError
-from gnd.vehicle_agent.outbox import MAX_ANSWERS, Outbox, OutboxCounts
+from gnd.vehicle_agent.link.outbox import MAX_ANSWERS, Outbox, OutboxCounts
 
 A, B = "01DTEXKZZZ0000000000000000", "01DTEXKZZZ0000000000000001"
 SECOND = 1_000_000_000
@@ -255,7 +255,7 @@ def test_what_was_put_survives_kill_9(tmp_path: Path) -> None:
         f"""
         import sys, time
         from pathlib import Path
-        from gnd.vehicle_agent.outbox import Outbox
+        from gnd.vehicle_agent.link.outbox import Outbox
         outbox = Outbox(Path({str(path)!r}))
         outbox.put({A!r}, "key/a", b"body" * 1000)
         print("durable", flush=True)

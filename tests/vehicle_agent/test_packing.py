@@ -22,15 +22,15 @@ from gnd.schemas.packed import PackedReport, decode_upload, digest_of
 from gnd.vehicle_agent.config import ReportParameters
 from gnd.vehicle_agent.detect.detector import ChangeDetector
 from gnd.vehicle_agent.errors import AgentConfigError, PackingError
+from gnd.vehicle_agent.link.outbox import Letter, Outbox
 from gnd.vehicle_agent.local_map import LocalMap
 from gnd.vehicle_agent.localise.calibration import MotionTeacher
 from gnd.vehicle_agent.localise.estimates import PoseEstimate, RefinedScan
 from gnd.vehicle_agent.localise.odometry import MotionBuffer
 from gnd.vehicle_agent.localise.parameters import OdometryParameters
-from gnd.vehicle_agent.outbox import Letter, Outbox
-from gnd.vehicle_agent.packing import Bases, askable, asked_for, is_measured, pack, pack_measured
 from gnd.vehicle_agent.pipeline import known_course
-from gnd.vehicle_agent.report import Identity, Reporter
+from gnd.vehicle_agent.report.packing import Bases, askable, asked_for, is_measured, pack, pack_measured
+from gnd.vehicle_agent.report.reporter import Identity, Reporter
 from gnd.vehicle_agent.segment import SegmentedScan
 
 START_NS = 1_570_838_400_000_000_000

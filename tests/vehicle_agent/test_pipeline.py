@@ -17,11 +17,11 @@ from gnd.tile_store.sqlite_store import SqliteStore
 from gnd.vehicle_agent.agent import run_agent
 from gnd.vehicle_agent.config import AgentConfig
 from gnd.vehicle_agent.errors import VehicleError
+from gnd.vehicle_agent.link.outbox import Outbox
 from gnd.vehicle_agent.localise_drive.tiles import StoreMap
-from gnd.vehicle_agent.outbox import Outbox
 from gnd.vehicle_agent.pipeline import Output, Parts, Pipeline
-from gnd.vehicle_agent.report import Identity
-from gnd.vehicle_agent.report_sink import ReportList
+from gnd.vehicle_agent.report.reporter import Identity
+from gnd.vehicle_agent.report.sink import ReportList
 from gnd.vehicle_agent.segment import SegmentedScan
 from gnd.vehicle_agent.sources.recording import first_fix
 from gnd.vehicle_agent.tiles_at_hand import TilesAtHand

@@ -11,7 +11,7 @@ from vehicle_scene import FIGURE_2, FRAME
 from gnd.gnd_map.tile_id import TileId, covering_circle
 from gnd.vehicle_agent.config import DownloadParameters
 from gnd.vehicle_agent.errors import AgentConfigError
-from gnd.vehicle_agent.plan import (
+from gnd.vehicle_agent.link.plan import (
     LARGEST_BATCH_BYTES,
     SLOWEST_MPS,
     SMALLEST_BATCH_BYTES,

@@ -13,9 +13,9 @@ from gnd.schemas.changes import ChangeReport, TileChange
 from gnd.schemas.doubt import DoubtReason
 from gnd.vehicle_agent.config import ReportParameters
 from gnd.vehicle_agent.detect.detector import ChangeDetector
+from gnd.vehicle_agent.link.outbox import Outbox
 from gnd.vehicle_agent.local_map import LocalMap
-from gnd.vehicle_agent.outbox import Outbox
-from gnd.vehicle_agent.report import Identity, Reporter
+from gnd.vehicle_agent.report.reporter import Identity, Reporter
 from gnd.vehicle_agent.result import HealthTimeline
 from gnd.vehicle_agent.segment import SegmentedScan
 

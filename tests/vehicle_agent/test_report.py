@@ -14,10 +14,10 @@ from gnd.schemas.keys import change_key
 from gnd.vehicle_agent.config import ReportParameters
 from gnd.vehicle_agent.detect.detector import ChangeDetector
 from gnd.vehicle_agent.errors import AgentConfigError
+from gnd.vehicle_agent.link.outbox import Outbox
 from gnd.vehicle_agent.local_map import LocalMap
 from gnd.vehicle_agent.localise.estimates import PoseEstimate, RefinedScan
-from gnd.vehicle_agent.outbox import Outbox
-from gnd.vehicle_agent.report import Identity, Reporter
+from gnd.vehicle_agent.report.reporter import Identity, Reporter
 from gnd.vehicle_agent.segment import SegmentedScan
 
 START_NS = 1_570_838_400_000_000_000

@@ -17,8 +17,8 @@ from gnd.schemas.keys import change_key, change_keys, state_key, state_keys, wan
 from gnd.schemas.report_id import deterministic_report_id
 from gnd.schemas.report_states import ReportQuestion, ReportState, ReportStates
 from gnd.vehicle_agent.errors import OutboxError
-from gnd.vehicle_agent.outbox import Outbox
-from gnd.vehicle_agent.sending import SenderThread
+from gnd.vehicle_agent.link.outbox import Outbox
+from gnd.vehicle_agent.link.sending import SenderThread
 
 DISTRICT = District("13033/03021/23031")
 KEY = change_key("ndt", DISTRICT)
@@ -180,7 +180,7 @@ def test_a_cloud_that_has_forgotten_a_report_gets_it_again(start: Opener, outbox
 def test_a_full_disk_under_the_outbox_does_not_end_the_sender(
     start: Opener, outbox: Outbox, cloud: Bus, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("gnd.vehicle_agent.sending.STORE_PAUSE_S", 0.05)
+    monkeypatch.setattr("gnd.vehicle_agent.link.sending.STORE_PAUSE_S", 0.05)
     fails = {"due": 2, "answered": 1, "failed": 1}
 
     def failing(name: str) -> Callable[..., object]:

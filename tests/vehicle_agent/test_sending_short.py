@@ -27,9 +27,9 @@ from gnd.schemas.keys import change_key, change_keys, state_keys, want_key
 from gnd.schemas.packed import PackedGaussians, PackedReport, decode_upload
 from gnd.schemas.report_id import deterministic_report_id
 from gnd.schemas.report_states import ReportState, ReportStates, ReportStatus
-from gnd.vehicle_agent.outbox import Outbox, OutboxCounts
-from gnd.vehicle_agent.packing import pack
-from gnd.vehicle_agent.sending import SenderThread
+from gnd.vehicle_agent.link.outbox import Outbox, OutboxCounts
+from gnd.vehicle_agent.link.sending import SenderThread
+from gnd.vehicle_agent.report.packing import pack
 
 NEVER = threading.Event()
 REPORT_ID = deterministic_report_id(1_570_838_400_000, "vehicle", "1")
@@ -237,8 +237,8 @@ def test_an_agent_killed_after_the_ack_of_its_flags_asks_what_is_wanted_and_send
         from pathlib import Path
         from gnd.fleet_bus.bus import open_bus
         from gnd.fleet_bus.config import BusConfig
-        from gnd.vehicle_agent.outbox import Outbox
-        from gnd.vehicle_agent.sending import SenderThread
+        from gnd.vehicle_agent.link.outbox import Outbox
+        from gnd.vehicle_agent.link.sending import SenderThread
         with open_bus(BusConfig(connect=({endpoint!r},)), name="first") as bus:
             SenderThread(bus, Outbox(Path({str(tmp_path / "outbox.sqlite")!r})), "vehicle")
             threading.Event().wait(60)

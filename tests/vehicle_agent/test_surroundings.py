@@ -24,10 +24,10 @@ from gnd.schemas.keys import batch_keys, parse_batch_key
 from gnd.schemas.tiles_batch import TileAnswer, TilesReply, TilesRequest
 from gnd.tile_store.server import TileServer
 from gnd.tile_store.sqlite_store import SqliteStore
-from gnd.vehicle_agent.cache import TileCache
 from gnd.vehicle_agent.config import DownloadParameters
 from gnd.vehicle_agent.detect.detector import ChangeDetector
-from gnd.vehicle_agent.download import TileFetcher
+from gnd.vehicle_agent.link.cache import TileCache
+from gnd.vehicle_agent.link.download import TileFetcher
 from gnd.vehicle_agent.local_map import LocalMap
 from gnd.vehicle_agent.place import Place
 from gnd.vehicle_agent.surroundings import LEAD_S, Surroundings, left_behind, tile_distance_m, tiles_along

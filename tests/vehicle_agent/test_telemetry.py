@@ -9,7 +9,7 @@ from gnd.fleet_bus.config import BusConfig
 from gnd.fleet_bus.ledger import Ledger
 from gnd.schemas.keys import traffic_key
 from gnd.schemas.traffic import TrafficLine, TrafficSample
-from gnd.vehicle_agent.telemetry import EVERY_M, EVERY_S, HEALTH_S, Telemetry
+from gnd.vehicle_agent.link.telemetry import EVERY_M, EVERY_S, HEALTH_S, Telemetry
 
 LINES = (TrafficLine("tile", "down", 3, 999), TrafficLine("change", "up", 1, 70))
 START = TrafficSample("v", 1, 0.0, LINES, 0, 0, 0.65, 2.2, "lost", 0, 0)

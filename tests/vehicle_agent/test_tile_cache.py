@@ -13,8 +13,8 @@ from gnd.gnd_map.day import UNKNOWN_DAY
 from gnd.gnd_map.tile import Tile
 from gnd.gnd_map.tile_id import TileId
 from gnd.schemas.tiles import blob_of
-from gnd.vehicle_agent.cache import TileCache
 from gnd.vehicle_agent.errors import CacheError
+from gnd.vehicle_agent.link.cache import TileCache
 
 
 @pytest.fixture(scope="module")

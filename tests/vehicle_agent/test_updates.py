@@ -15,10 +15,10 @@ from gnd.schemas.keys import update_key
 from gnd.schemas.updates import TileUpdate
 from gnd.tile_store.server import TileServer
 from gnd.tile_store.sqlite_store import SqliteStore
-from gnd.vehicle_agent.cache import TileCache
 from gnd.vehicle_agent.config import DownloadParameters
-from gnd.vehicle_agent.download import TileFetcher
-from gnd.vehicle_agent.updates import Updates
+from gnd.vehicle_agent.link.cache import TileCache
+from gnd.vehicle_agent.link.download import TileFetcher
+from gnd.vehicle_agent.link.updates import Updates
 
 
 class World:
@@ -103,15 +103,15 @@ def test_a_lost_notice_is_made_up_for_without_another(world: World, monkeypatch:
     world.next_version(cut=5)
     world.updates.apply()
     assert world.fetcher.is_known(world.tile_id)
-    monkeypatch.setattr("gnd.vehicle_agent.updates.RECHECK_S", 0.1)
-    monkeypatch.setattr("gnd.vehicle_agent.updates.RECHECK_LOOK_S", 0.05)
+    monkeypatch.setattr("gnd.vehicle_agent.link.updates.RECHECK_S", 0.1)
+    monkeypatch.setattr("gnd.vehicle_agent.link.updates.RECHECK_LOOK_S", 0.05)
     wait_until(lambda: world.updates.apply() or cached(world) == 2)
     assert world.updates.counts["received"] == 0
 
 
 def test_what_was_just_answered_is_not_asked_for_again(world: World, monkeypatch: pytest.MonkeyPatch) -> None:
     download(world)
-    monkeypatch.setattr("gnd.vehicle_agent.updates.RECHECK_LOOK_S", 0.0)
+    monkeypatch.setattr("gnd.vehicle_agent.link.updates.RECHECK_LOOK_S", 0.0)
     for _ in range(20):
         world.updates.apply()
     assert world.fetcher.is_known(world.tile_id)

@@ -23,11 +23,11 @@ from gnd.schemas.tiles import TileReply, TileRequest, content_of
 from gnd.schemas.tiles_batch import HeldVersion, TilesRequest
 from gnd.tile_store.server import PLAIN_REQUEST, TILE_ROOT, TileServer
 from gnd.tile_store.sqlite_store import SqliteStore
-from gnd.vehicle_agent.cache import TileCache
 from gnd.vehicle_agent.config import DownloadParameters
-from gnd.vehicle_agent.download import TileFetcher
-from gnd.vehicle_agent.features.download import FeatureDownloader
-from gnd.vehicle_agent.updates import Updates
+from gnd.vehicle_agent.link.cache import TileCache
+from gnd.vehicle_agent.link.download import TileFetcher
+from gnd.vehicle_agent.link.feature_download import FeatureDownloader
+from gnd.vehicle_agent.link.updates import Updates
 
 BASE = published(ground(12.0))
 TILE = max(BASE, key=lambda t: len(BASE[t].gaussians))

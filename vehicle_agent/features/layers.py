@@ -20,15 +20,15 @@ from gnd.schemas.features import FeatureChange
 from gnd.vehicle_agent.config import ReportParameters
 from gnd.vehicle_agent.detect.uncertainty import PoseUncertainty
 from gnd.vehicle_agent.features.coverage import CoverageParameters
-from gnd.vehicle_agent.features.feature_report import FeatureReporter
 from gnd.vehicle_agent.features.layer import FeatureLayer, PlacedLook, pose_of
 from gnd.vehicle_agent.features.layer_parameters import MARGIN_M, FeatureParameters
 from gnd.vehicle_agent.features.look import MAX_RANGE_M, Look
 from gnd.vehicle_agent.features.poles.detector import PoleDetector, Rays, detections_of
 from gnd.vehicle_agent.features.poles.slices import PoseSigma
-from gnd.vehicle_agent.features.pose_doubts import GOOD, POOR, WRONG, PoseDoubts
 from gnd.vehicle_agent.features.view import Occlusion
 from gnd.vehicle_agent.localise.estimates import RefinedScan
+from gnd.vehicle_agent.report.feature_report import FeatureReporter
+from gnd.vehicle_agent.report.pose_doubts import GOOD, POOR, WRONG, PoseDoubts
 from gnd.vehicle_agent.segment.segmenter import SegmentedScan
 
 SCANS_TOGETHER: Final = 5

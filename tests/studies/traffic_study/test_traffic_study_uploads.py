@@ -16,8 +16,8 @@ from gnd.gnd_map.tile_id import TileId
 from gnd.gnd_map.track import STEPS, Track, TrackPiece, TrackView
 from gnd.schemas.changes import ChangeReport, TileChange
 from gnd.schemas.report_id import deterministic_report_id
-from gnd.vehicle_agent.packing import pack
-from gnd.vehicle_agent.report import on_lattice
+from gnd.vehicle_agent.report.packing import pack
+from gnd.vehicle_agent.report.reporter import on_lattice
 from studies.frame.errors import ReproduceError
 from studies.simulation.base_map import BaseMap
 from studies.simulation.result import EVIDENCE, VehicleResult

@@ -16,7 +16,6 @@ from gnd.schemas.drive import DriveItem, GnssFix, MotionSample, ReferencePose
 from gnd.vehicle_agent.config import PipelineParameters
 from gnd.vehicle_agent.errors import NewLayerError
 from gnd.vehicle_agent.features.coverage import CoverageParameters
-from gnd.vehicle_agent.features.feature_report import FeatureReporter
 from gnd.vehicle_agent.features.layer_parameters import LayerParameters
 from gnd.vehicle_agent.features.mapping.feature_drive import FeatureDrive
 from gnd.vehicle_agent.features.mapping.held_map import HeldMap
@@ -24,8 +23,9 @@ from gnd.vehicle_agent.features.mapping.mapped import changes_of
 from gnd.vehicle_agent.features.mapping.new_layer import map_new_layer
 from gnd.vehicle_agent.pipeline import FeatureTiles, HeldBack, Output
 from gnd.vehicle_agent.place import Place
-from gnd.vehicle_agent.report import Identity
-from gnd.vehicle_agent.report_sink import NewReports, ReportList, ReportSink
+from gnd.vehicle_agent.report.feature_report import FeatureReporter
+from gnd.vehicle_agent.report.reporter import Identity
+from gnd.vehicle_agent.report.sink import NewReports, ReportList, ReportSink
 from gnd.vehicle_agent.scans import Guard
 
 STILL_MPS: Final = 0.1

@@ -19,7 +19,6 @@ from gnd.vehicle_agent.config import PipelineParameters
 from gnd.vehicle_agent.errors import AgentConfigError
 from gnd.vehicle_agent.features.coverage import CoverageParameters
 from gnd.vehicle_agent.features.errors import BadPose
-from gnd.vehicle_agent.features.feature_report import FeatureReporter
 from gnd.vehicle_agent.features.layer import FeatureLayer
 from gnd.vehicle_agent.features.layer_parameters import MARGIN_M
 from gnd.vehicle_agent.features.layers import look_of
@@ -31,8 +30,9 @@ from gnd.vehicle_agent.features.view import Occlusion
 from gnd.vehicle_agent.localise.estimates import Cause, Health, PoseEstimate
 from gnd.vehicle_agent.pipeline import FeatureTiles, HeldBack, Output
 from gnd.vehicle_agent.place import Place
-from gnd.vehicle_agent.report import Identity
-from gnd.vehicle_agent.report_sink import NewReports, ReportList, ReportSink
+from gnd.vehicle_agent.report.feature_report import FeatureReporter
+from gnd.vehicle_agent.report.reporter import Identity
+from gnd.vehicle_agent.report.sink import NewReports, ReportList, ReportSink
 from gnd.vehicle_agent.result import HealthTimeline
 from gnd.vehicle_agent.scans import Guard
 

@@ -43,8 +43,8 @@ from gnd.vehicle_agent.detect.uncertainty import PoseUncertainty
 from gnd.vehicle_agent.localise.estimates import PoseEstimate
 from gnd.vehicle_agent.localise.match_map import MatchMapCache
 from gnd.vehicle_agent.localise.parameters import RegistrationParameters
-from gnd.vehicle_agent.packing import is_measured, pack
-from gnd.vehicle_agent.report_sink import ReportSink
+from gnd.vehicle_agent.report.packing import is_measured, pack
+from gnd.vehicle_agent.report.sink import ReportSink
 from gnd.vehicle_agent.segment.segmenter import SegmentedScan
 from gnd.vehicle_agent.surroundings import left_behind
 from gnd.vehicle_agent.tracks import Tracks

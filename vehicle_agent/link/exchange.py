@@ -16,8 +16,8 @@ from gnd.schemas.keys import batch_key
 from gnd.schemas.tile_answer import content_of_answer
 from gnd.schemas.tiles import TileBlob
 from gnd.schemas.tiles_batch import HeldVersion, TileAnswer, TilesReply, TilesRequest
-from gnd.vehicle_agent.cache import TileCache
 from gnd.vehicle_agent.errors import CacheError
+from gnd.vehicle_agent.link.cache import TileCache
 
 Head = tuple[int, bytes]
 """Version and sha of what is held."""

@@ -4,11 +4,11 @@ import threading
 
 from gnd.gnd_map.tile import Tile
 from gnd.vehicle_agent.config import AgentConfig
-from gnd.vehicle_agent.link import Link
+from gnd.vehicle_agent.link.link import Link
+from gnd.vehicle_agent.link.updates import Updates
 from gnd.vehicle_agent.local_map import LocalMap, Touched
 from gnd.vehicle_agent.place import Place
 from gnd.vehicle_agent.surroundings import Surroundings
-from gnd.vehicle_agent.updates import Updates
 
 
 class TilesOnTheBus:

@@ -9,8 +9,8 @@ from gnd.gnd_map.tile_id import District, TileId
 from gnd.schemas.features import FeatureChange, FeatureReport
 from gnd.schemas.keys import change_key
 from gnd.schemas.report_id import deterministic_report_id
-from gnd.vehicle_agent.report import Identity
-from gnd.vehicle_agent.report_sink import ReportSink
+from gnd.vehicle_agent.report.reporter import Identity
+from gnd.vehicle_agent.report.sink import ReportSink
 
 _log = logging.getLogger(__name__)
 

@@ -15,8 +15,8 @@ from gnd.gnd_map.tile_id import District, TileId
 from gnd.schemas.errors import WrongHash
 from gnd.schemas.keys import parse_update_key, update_keys
 from gnd.schemas.updates import TileUpdate, updated
-from gnd.vehicle_agent.cache import TileCache
-from gnd.vehicle_agent.download import TileFetcher
+from gnd.vehicle_agent.link.cache import TileCache
+from gnd.vehicle_agent.link.download import TileFetcher
 
 RECHECK_S = 120.0
 """A notice may be lost: what is held for so long is asked about again. Who drives has left it behind before."""

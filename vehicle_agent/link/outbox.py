@@ -23,7 +23,7 @@ from gnd.gnd_map.tile import Tile, content_sha
 from gnd.gnd_map.tile_id import TileId
 from gnd.schemas.report_states import ReportState
 from gnd.vehicle_agent.errors import OutboxError
-from gnd.vehicle_agent.sqlite import Database
+from gnd.vehicle_agent.link.sqlite import Database
 
 _COLUMNS = """
     report_id TEXT PRIMARY KEY,

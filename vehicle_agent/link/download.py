@@ -13,11 +13,11 @@ from gnd.fleet_bus.errors import BusClosed
 from gnd.fleet_bus.links import LinkProfile
 from gnd.gnd_map.content import TileT
 from gnd.gnd_map.tile_id import TileId
-from gnd.vehicle_agent.cache import TileCache
 from gnd.vehicle_agent.config import DownloadParameters
 from gnd.vehicle_agent.errors import CacheError
-from gnd.vehicle_agent.exchange import Exchange, ExchangeOutcome, Fetched
-from gnd.vehicle_agent.plan import batch_bytes
+from gnd.vehicle_agent.link.cache import TileCache
+from gnd.vehicle_agent.link.exchange import Exchange, ExchangeOutcome, Fetched
+from gnd.vehicle_agent.link.plan import batch_bytes
 
 DOWNLOAD_BATCH_S: Final = 0.25
 """One answer holds what the link carries in this time (4 to 128 kB): something more urgent waits no longer."""

@@ -10,11 +10,11 @@ from gnd.fleet_bus.config import BusConfig
 from gnd.fleet_bus.ledger import Ledger
 from gnd.gnd_map.tile import Tile
 from gnd.schemas.keys import alive_key
-from gnd.vehicle_agent.cache import TileCache
 from gnd.vehicle_agent.config import AgentConfig
-from gnd.vehicle_agent.download import TileFetcher
-from gnd.vehicle_agent.outbox import Outbox
-from gnd.vehicle_agent.sending import SenderThread
+from gnd.vehicle_agent.link.cache import TileCache
+from gnd.vehicle_agent.link.download import TileFetcher
+from gnd.vehicle_agent.link.outbox import Outbox
+from gnd.vehicle_agent.link.sending import SenderThread
 
 _log = logging.getLogger(__name__)
 

@@ -19,8 +19,8 @@ from gnd.schemas.errors import SchemaError
 from gnd.schemas.keys import state_key, want_key
 from gnd.schemas.report_states import ReportQuestion, ReportState, ReportStates
 from gnd.vehicle_agent.errors import PackingError
-from gnd.vehicle_agent.outbox import ANSWERS, Letter, Outbox
-from gnd.vehicle_agent.packing import pack_measured
+from gnd.vehicle_agent.link.outbox import ANSWERS, Letter, Outbox
+from gnd.vehicle_agent.report.packing import pack_measured
 
 POLL_S = 0.2
 REQUEST_S = 20.0

@@ -14,7 +14,7 @@ from gnd.gnd_map.errors import GndError
 from gnd.gnd_map.tile_id import TileId
 from gnd.schemas.tiles import TileBlob, as_kind, content_of
 from gnd.vehicle_agent.errors import CacheError
-from gnd.vehicle_agent.sqlite import Database
+from gnd.vehicle_agent.link.sqlite import Database
 
 SCHEMA = """
 CREATE TABLE IF NOT EXISTS tile (

@@ -1,0 +1,1 @@
+"""What leaves the vehicle: decided tiles and features become reports, packed in two halves."""
