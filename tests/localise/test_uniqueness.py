@@ -151,7 +151,7 @@ def test_the_kernel_agrees_with_its_plain_twin():
     points = yard(rng)
     m, par, T = match_map_of(local_map_of(points)), RegistrationParameters(), pose(1.0, -2.0, 10.0)
     seen = np.concatenate([seen_from(rng, points, T, 300), rng.uniform(-80, 80, (100, 3))])
-    scale2 = par.scales[-1] ** 2
+    scale2 = par.rules.scales[-1] ** 2
     expected = [plain_fit(T[:3, :3] @ p + T[:3, 3], m, scale2, REGISTRATION_GATE_PER_SCALE**2 * scale2) for p in seen]
     fits = fits_at(seen, T, m, par)
     assert fits == pytest.approx(expected, abs=1e-12)

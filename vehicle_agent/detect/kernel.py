@@ -64,21 +64,21 @@ def kernel_parameters(p: DetectParameters, pose: PoseUncertainty = CERTAIN) -> K
         pose: of the scan whose rays are cast.
     """
     return KernelParameters(
-        rule=RULES[p.passing_rule],
+        rule=RULES[p.rules.passing_rule],
         r2_block=quantile(_ETA_BLOCK),
-        r2_pass=quantile(p.eta_pass),
+        r2_pass=quantile(p.rules.eta_pass),
         r2_plane=quantile(_ETA_PLANE),
         r2_face=_FACE_SIGMA**2,
         ahead_m=_AHEAD_M,
         beyond_m=_BEYOND_M,
-        face_m=p.face_m,
+        face_m=p.rules.face_m,
         range_min_m=p.range_min_m,
         range_max_m=p.range_max_m,
         pose_m2=float(pose.sigma_m**2),
         pose_rad2=float(pose.sigma_rad**2),
         included_m2=INCLUDED_M**2,
-        block_gain=1.0 / p.block_noise_m**2 if p.soft else 0.0,
-        beyond_gain=_BEYOND_SIGMAS**2 if p.soft else 0.0,
+        block_gain=1.0 / p.rules.block_noise_m**2 if p.rules.soft else 0.0,
+        beyond_gain=_BEYOND_SIGMAS**2 if p.rules.soft else 0.0,
     )
 
 

@@ -14,10 +14,14 @@ from gnd.vehicle_agent.localise.estimates import Cause, Health
 from gnd.vehicle_agent.localise.first_course import FirstCourse
 from gnd.vehicle_agent.localise.mount import DOUBTFUL_RAD, SIGMAS, MountDoubt, MountResidual
 from gnd.vehicle_agent.localise.odometry import MotionBuffer
-from gnd.vehicle_agent.localise.parameters import OdometryParameters
 from gnd.vehicle_agent.localise.remount import Mounting, left_over, left_sigma
 from gnd.vehicle_agent.localise.scan_odometry import ScanStep
 
+SCALE_PRIOR: Final = 0.02
+BIAS_PRIOR_RADPS: Final = 0.005
+COURSE_PRIOR: Final = 0.02
+"""One sigma before anything is learnt: of the wheel scale (a share), of the gyro's bias, and of the motion sideways and
+upwards per metre forward (the LiDAR's mount is not aligned with the wheels)."""
 _LONGITUDINAL_M: Final = 0.003
 _LATERAL_M: Final = 0.003
 _VERTICAL_M: Final = 0.01
@@ -127,15 +131,14 @@ class MotionCalibration:
 class MotionTeacher:
     """Learns wheel scale, gyro bias and course of a `MotionBuffer` from map matches: scalar Kalman filters."""
 
-    def __init__(self, motion: MotionBuffer, parameters: OdometryParameters, mount: Mounting | None = None) -> None:
-        self.parameters = parameters
+    def __init__(self, motion: MotionBuffer, mount: Mounting | None = None) -> None:
         self.mount = mount or Mounting(np.eye(4))
         self.first_course = FirstCourse()
         self.clock = ClockEstimator(motion)
         self._motion = motion
-        self._scale_var = parameters.scale_prior**2
-        self._bias_var = parameters.bias_prior_radps**2
-        self._course_var = parameters.course_prior**2
+        self._scale_var = SCALE_PRIOR**2
+        self._bias_var = BIAS_PRIOR_RADPS**2
+        self._course_var = COURSE_PRIOR**2
         self._way_m = 0.0
         self._excess_var = np.zeros(6)
         self._anchor: Stamped | None = None

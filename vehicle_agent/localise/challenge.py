@@ -15,6 +15,7 @@ from gnd.vehicle_agent.localise.hypotheses import (
     PoseHypotheses,
 )
 from gnd.vehicle_agent.localise.initialise import (
+    AROUND_POSITION,
     HYPOTHESIS_GAIN,
     INITIALISE_MIN_FIT,
     INITIALISE_N_REFINING,
@@ -61,7 +62,7 @@ class Challenger:
 
     def __init__(self, parameters: LocaliserParameters) -> None:
         self._par = parameters
-        self._how = replace(parameters.initialise, n_refined=_N_REFINED, n_kept=_N_REFINED)
+        self._how = replace(AROUND_POSITION, n_refined=_N_REFINED, n_kept=_N_REFINED)
         self.rivals = PoseHypotheses(parameters.registration, _MOST_VIEWS)
         self._searched_ns = -(2**62)
         self._T_tracked = np.eye(4)

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from gnd.vehicle_agent.errors import RegistrationError
 from gnd.vehicle_agent.localise.estimates import Cause
 from gnd.vehicle_agent.localise.hypotheses import HYPOTHESIS_MOST_VIEWS, HYPOTHESIS_SURE, PoseHypotheses
-from gnd.vehicle_agent.localise.initialise import INITIALISE_MIN_FIT, Around, InitialPose, search
+from gnd.vehicle_agent.localise.initialise import AROUND_POSITION, INITIALISE_MIN_FIT, Around, InitialPose, search
 from gnd.vehicle_agent.localise.match_map import MatchMap, MatchMapCache
 from gnd.vehicle_agent.localise.parameters import LocaliserParameters
 from gnd.vehicle_agent.localise.registration import REGISTRATION_MIN_MATCHED, register
@@ -82,7 +82,7 @@ class FirstPose:
         self._searched_ns = t_ns
         around = Around(place.p_map_m, place.reach_m)
         points, standing = self._pool.points_m, self._pool.standing_m
-        found, _ = search(points, around, match_map, self._par.initialise, self._par.registration, standing)
+        found, _ = search(points, around, match_map, AROUND_POSITION, self._par.registration, standing)
         self.hypotheses.add(found)
 
     def _good_enough(self, found: InitialPose) -> bool:

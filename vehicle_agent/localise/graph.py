@@ -10,6 +10,8 @@ from numpy.typing import NDArray
 from gnd.vehicle_agent.localise.parameters import GraphParameters
 from gnd.vehicle_agent.localise.scan_odometry import ScanStep
 
+_GNSS_INFLATION: Final = 5.0
+"""GNSS errors last for tens of seconds, so a fix's sigma is taken this many times."""
 _GNSS_VERTICAL: Final = 2.0
 """Its vertical sigma in horizontal ones."""
 GRAPH_ROBUST_K: Final = 2.0
@@ -146,7 +148,7 @@ class PoseGraph:
 
     def _gnss_noise(self, sigma_m: float) -> gtsam.noiseModel.Base:
         axes = np.array([1.0, 1.0, _GNSS_VERTICAL])
-        return self._robust(gtsam.noiseModel.Diagonal.Sigmas(sigma_m * self.parameters.gnss_inflation * axes))
+        return self._robust(gtsam.noiseModel.Diagonal.Sigmas(sigma_m * _GNSS_INFLATION * axes))
 
     def _robust(self, noise: gtsam.noiseModel.Base) -> gtsam.noiseModel.Base:
         cauchy = gtsam.noiseModel.mEstimator.Cauchy.Create(GRAPH_ROBUST_K)

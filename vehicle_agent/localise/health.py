@@ -38,6 +38,8 @@ _POOR_SIGMA_RAD: Final = 0.003
 _LEAST_STANDING: Final = 25
 """Fewer standing points among the witness's rays are next to nothing."""
 _LONGEST_S: Final = 15.0
+_MIN_MATCHING_RATIO: Final = 0.5
+"""Least share of the points with a Gaussian nearby, for a match to be believed."""
 _PARTLY_MATCHED: Final = 0.3
 """Matching ratio from which on a scan that is not believed still speaks for a pose that submaps hold to be certain:
 what is missing is what has changed."""
@@ -101,7 +103,7 @@ class HealthMonitor:
 
         `sigmas` (6,) of the prediction since the pose before: rotation [rad], translation [m].
         """
-        if result is None or not result.converged or result.matching_ratio < self.parameters.min_matching_ratio:
+        if result is None or not result.converged or result.matching_ratio < _MIN_MATCHING_RATIO:
             return False
         if not self._within_gate(T_inverse(T_predicted) @ result.T_map_vehicle, sigmas, self._gap_s(t_ns)):
             return False

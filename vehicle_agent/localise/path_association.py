@@ -17,7 +17,7 @@ from gnd.gnd_map.geodesy import LocalFrame
 from gnd.gnd_map.motion import Trajectory
 from gnd.vehicle_agent.errors import LocaliseError
 from gnd.vehicle_agent.localise.georeference import Georeferenced, georeference
-from gnd.vehicle_agent.localise.track_alignment import FixTable, GeoreferenceParameters
+from gnd.vehicle_agent.localise.track_alignment import FixTable
 
 F64 = NDArray[np.float64]
 I64 = NDArray[np.int64]
@@ -74,7 +74,6 @@ class Untimed:
 def georeference_untimed(
     track: Trajectory,
     fixes: Untimed,
-    parameters: GeoreferenceParameters | None = None,
 ) -> tuple[Georeferenced, FixTable]:
     """As `georeference` for fixes without times; also the fixes with the times they were found to have.
 
@@ -88,11 +87,11 @@ def georeference_untimed(
     way = way_m(track.T_dst_vehicle[:, :3, 3])
     at = matched_way_m(track.T_dst_vehicle[:, :2, 3], p[:, :2])
     table = fixes.at(time_at(track, way, at), chosen)
-    found = georeference(track, table, parameters)
+    found = georeference(track, table)
     for window_m in NEAR_M:
         at = nearest_on_track(found.track.T_dst_vehicle[:, :3, 3], way, _enu(found.frame, fixes, chosen), at, window_m)
         table = fixes.at(time_at(track, way, at), chosen)
-        found = georeference(track, table, parameters)
+        found = georeference(track, table)
     return found, table
 
 

@@ -14,7 +14,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gnd.gnd_map.se3 import T_from_R_t, T_inverse, exp_so3, log_so3
-from gnd.vehicle_agent.localise.calibration import ODOMETRY_BIAS_DRIFT_RADPS, ODOMETRY_SCALE_DRIFT, MotionTeacher
+from gnd.vehicle_agent.localise.calibration import (
+    BIAS_PRIOR_RADPS,
+    COURSE_PRIOR,
+    ODOMETRY_BIAS_DRIFT_RADPS,
+    ODOMETRY_SCALE_DRIFT,
+    SCALE_PRIOR,
+    MotionTeacher,
+)
 from gnd.vehicle_agent.localise.drift import PoseDrift, Slope
 from gnd.vehicle_agent.localise.graph import MapMatch, SmoothedPose
 from gnd.vehicle_agent.localise.match_map import MatchMapCache
@@ -38,6 +45,10 @@ from gnd.vehicle_agent.localise.stretch import (
     solve_stretch,
 )
 
+_EVERY_S: Final = 1.0
+"""The stretch is solved at the latest after this time."""
+UNLEARNT_S: Final = 8.0
+"""Until the gyro's bias is known scans may wait so long to be final."""
 _KNOT_M: Final = 0.7
 _KNOT_S: Final = 0.5
 """A scan takes part when the vehicle has moved so far, or so much time has passed, since the last."""
@@ -174,7 +185,7 @@ class Refiner:
         if self._belief is None:
             self._belief = self._first_belief(T_map_vehicle)
             self._solved_way_m, self._solved_ns = newest.way_m, t_ns
-        due = newest.way_m - self._solved_way_m >= par.every_m or t_ns - self._solved_ns >= par.every_s * 1e9
+        due = newest.way_m - self._solved_way_m >= par.every_m or t_ns - self._solved_ns >= _EVERY_S * 1e9
         if newest.knot is not None and due:
             self._solve()
             return self._leaving(newest)
@@ -267,8 +278,7 @@ class Refiner:
 
     def _first_belief(self, T_map_vehicle: F64) -> StretchBelief:
         sigmas = np.array([FIRST_SIGMA_RAD] * 3 + [FIRST_SIGMA_M] * 3)
-        odometry = self._teacher.parameters
-        shared = np.array([odometry.bias_prior_radps, odometry.scale_prior, *[odometry.course_prior] * 2])
+        shared = np.array([BIAS_PRIOR_RADPS, SCALE_PRIOR, COURSE_PRIOR, COURSE_PRIOR])
         information = np.diag(1.0 / np.concatenate([sigmas, shared]) ** 2)
         return StretchBelief(T_map_vehicle.copy(), self._motion.shared(), information, np.zeros(6 + N_SHARED))
 
@@ -408,7 +418,7 @@ class Refiner:
         """The poses of scans that lie `lag_m` behind the newest knot, or are too old to wait."""
         par = self.parameters
         learnt = self._teacher.uncertainty[1] < np.radians(REFINE_LEARNT_DEGPS)
-        longest_s, n = (par.longest_s if learnt else par.unlearnt_s), self._final
+        longest_s, n = (par.longest_s if learnt else UNLEARNT_S), self._final
         while n < len(self._scans):
             scan = self._scans[n]
             overdue = newest.t_ns - scan.t_ns > longest_s * 1e9

@@ -103,7 +103,7 @@ def register(
     T = np.array(T_map_vehicle, dtype=np.float64)
     state = _State(T[:3, :3].copy(), T[:3, 3].copy(), np.zeros((6, 6)), np.zeros(6), wheels_m)
     points = np.ascontiguousarray(points_m, dtype=np.float64)
-    scales = {"near": par.scales, "wide": _WIDE_SCALES, "capture": _CAPTURE_SCALES}[start]
+    scales = {"near": par.rules.scales, "wide": _WIDE_SCALES, "capture": _CAPTURE_SCALES}[start]
     iterations, converged = 0, False
     for stage, scale in enumerate(scales):
         coarse = 1.0 if stage == len(scales) - 1 else 10.0
@@ -185,7 +185,7 @@ def fit_of(points_m: F64, T_map_vehicle: F64, match_map: MatchMap, parameters: R
     if not len(points_m):
         return 0.0
     R, t = np.ascontiguousarray(T_map_vehicle[:3, :3]), np.ascontiguousarray(T_map_vehicle[:3, 3])
-    m, scale = match_map, parameters.scales[-1]
+    m, scale = match_map, parameters.rules.scales[-1]
     cost, _, inside = linearise(
         np.ascontiguousarray(points_m), R, t, m.index, m.A, m.b, m.mean_m, m.information, scale**2,
         (REGISTRATION_GATE_PER_SCALE * scale) ** 2, np.empty((6, 6)), np.empty(6),
@@ -239,7 +239,7 @@ def _add_wheels(s: _State, m: MatchMap, par: RegistrationParameters, scale: floa
     how many do. They tell height, roll and pitch only: of a road of which the map holds single rings, its Gaussians
     would tell where the rings lie.
     """
-    if par.wheel_sigma_m <= 0:
+    if par.rules.wheel_sigma_m <= 0:
         return 0
     scale = max(scale, WHEEL_SCALE)
     H, g = np.empty((6, 6)), np.empty(6)
@@ -247,7 +247,7 @@ def _add_wheels(s: _State, m: MatchMap, par: RegistrationParameters, scale: floa
     _, on_ground, _ = linearise(
         s.wheels_m, s.R, s.t, m.index, m.A, m.b, m.mean_m, m.information, scale**2, gate_m2, H, g
     )
-    weight = par.correlation * (par.noise_m / par.wheel_sigma_m) ** 2
+    weight = par.rules.correlation * (par.noise_m / par.rules.wheel_sigma_m) ** 2
     s.H += weight * H * WHEELS_TELL * WHEELS_TELL[:, None]
     s.g += weight * g * WHEELS_TELL
     return on_ground
@@ -257,20 +257,20 @@ def _descend(
     points: F64, s: _State, m: MatchMap, par: RegistrationParameters, scale: float, coarse: float
 ) -> tuple[int, bool]:
     """Gauss-Newton steps at one robust scale until they are small; (steps, converged)."""
-    for n in range(1, par.max_iterations + 1):
+    for n in range(1, par.rules.max_iterations + 1):
         _linearise(points, s, m, par, scale)
         step = _solve(s.H, s.g, par)
         s.R = exp_so3(step[:3]) @ s.R
         s.t = s.t + step[3:]
-        if np.abs(step[:3]).max() < coarse * par.stop_rad and np.abs(step[3:]).max() < coarse * par.stop_m:
+        if np.abs(step[:3]).max() < coarse * par.rules.stop_rad and np.abs(step[3:]).max() < coarse * par.rules.stop_m:
             return n, True
-    return par.max_iterations, False
+    return par.rules.max_iterations, False
 
 
 def _solve(H: F64, g: F64, par: RegistrationParameters) -> F64:
     """-H^-1 g, leaving out the directions that are degenerate (solution remapping, Zhang et al. 2016)."""
     values, vectors, scale = _principal(H)
-    strong = values > par.correlation / par.degenerate_m**2
+    strong = values > par.rules.correlation / par.rules.degenerate_m**2
     along = vectors[:, strong]
     return np.asarray(-(along @ ((along.T @ (g * scale)) / values[strong])) * scale)
 
@@ -287,7 +287,7 @@ def _strong(values: F64, vectors: F64, par: RegistrationParameters) -> NDArray[n
     the noise of a map says along an even wall.
     """
     horizontal = vectors[3] ** 2 + vectors[4] ** 2 > 0.5
-    least = par.correlation / par.degenerate_m**2
+    least = par.rules.correlation / par.rules.degenerate_m**2
     strongest = float(values[horizontal].max(initial=0.0))  # not the vertical, which wheels on the road hold firmly
     return np.asarray(values > np.where(horizontal, max(least, _DEGENERATE_SHARE * strongest), least))
 
@@ -295,7 +295,7 @@ def _strong(values: F64, vectors: F64, par: RegistrationParameters) -> NDArray[n
 def _unmoved(s: _State, T_start: F64, par: RegistrationParameters) -> bool:
     """Take back what was moved along horizontal directions that the scan does not constrain; True if there were any."""
     values, vectors, _ = _principal(s.H)
-    weak = vectors[3:, ~_strong(values, vectors, par) & (values > par.correlation / par.degenerate_m**2)]
+    weak = vectors[3:, ~_strong(values, vectors, par) & (values > par.rules.correlation / par.rules.degenerate_m**2)]
     if not weak.size:
         return False
     weak = weak / np.linalg.norm(weak, axis=0)
@@ -333,6 +333,6 @@ def _covariance(values: F64, vectors: F64, par: RegistrationParameters) -> F64:
     """Inverse Hessian, enlarged because points share errors, plus the floor; a free direction gets 10 m."""
     scale = np.array([1.0 / LEVER_M] * 3 + [1.0] * 3)
     free = 1e2
-    shared = vectors @ (np.minimum(par.correlation / np.maximum(values, 1e-9), free)[:, None] * vectors.T)
-    floor = np.diag([par.floor_rad**2] * 3 + [par.floor_m**2] * 3)
+    shared = vectors @ (np.minimum(par.rules.correlation / np.maximum(values, 1e-9), free)[:, None] * vectors.T)
+    floor = np.diag([par.rules.floor_rad**2] * 3 + [par.rules.floor_m**2] * 3)
     return np.asarray(shared * scale * scale[:, None] + floor)

@@ -6,7 +6,7 @@ here too: voxels that hold one or two rings of a scan say where the rings are, n
 """
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Final, NamedTuple
 
 import numpy as np
@@ -15,19 +15,19 @@ from numpy.typing import NDArray
 from gnd.gnd_map.motion import Trajectory
 from gnd.gnd_map.se3 import T_from_R_t, T_inverse, exp_so3, log_so3, transform
 from gnd.vehicle_agent.errors import RegistrationError
-from gnd.vehicle_agent.localise.parameters import NOISE_M, RegistrationParameters, ScanOdometryParameters
+from gnd.vehicle_agent.localise.parameters import NOISE_M, ON_MAP, RegistrationParameters
 from gnd.vehicle_agent.localise.registration import register
 from gnd.vehicle_agent.localise.rolling_map import RollingMap
 from gnd.vehicle_agent.localise.scan_pool import standing_points
 
 _N_POINTS: Final = 1250
 """So many of a scan's sampled points are matched."""
-_SCALES: Final = (4.0, 2.0)
-_CORRELATION: Final = 3.0
-_FLOOR_M: Final = 0.005
-_FLOOR_RAD: Final = 0.0001
-_DEGENERATE_M: Final = 0.05
-"""As in `RegistrationParameters`."""
+_BETWEEN_SCANS: Final = replace(
+    ON_MAP, scales=(4.0, 2.0), correlation=3.0, floor_m=0.005, floor_rad=0.0001, degenerate_m=0.05
+)
+_MIN_STANDING_SHARE: Final = 0.25
+"""So many of a scan's points must stand above the ground. Rings on open ground keep their place relative to the
+vehicle: they fit best where it stood before, and it seems to be slower than it is."""
 _STEP_SHARE: Final = 0.2
 """A step's variance in that of a match: the matches of a stretch of road share most of their errors."""
 _STEADY_M: Final = 0.03
@@ -136,9 +136,9 @@ class ScanOdometry:
     with every match. A step is what two filtered poses differ by.
     """
 
-    def __init__(self, parameters: ScanOdometryParameters, noise_m: float = NOISE_M) -> None:
-        self.parameters = parameters
-        self._registration = _registration(noise_m)
+    def __init__(self, noise_m: float = NOISE_M, min_standing_share: float = _MIN_STANDING_SHARE) -> None:
+        self._registration = RegistrationParameters(noise_m, _BETWEEN_SCANS)
+        self._min_standing_share = min_standing_share
         self._map = RollingMap(noise_m)
         self._before_ns: int | None = None
         self._T_odom_before = np.eye(4)
@@ -184,7 +184,7 @@ class ScanOdometry:
         dt_ns, self._before_ns = t_ns - self._before_ns, t_ns
         driven = _Prediction(T_before_now_predicted, sigmas, points_vehicle_m)
         standing = len(standing_points(points_vehicle_m, OFF_GROUND_M, OFF_GROUND_SLOPE))
-        sees = standing >= self.parameters.min_standing_share * len(points_vehicle_m)
+        sees = standing >= self._min_standing_share * len(points_vehicle_m)
         match = self._matched(driven, self._going_on(dt_ns, points_going_on)) if sees else None
         if sees and match is None and self._slipping and self._steady is not None:
             coasted = self._coast(self._steady, dt_ns, points_vehicle_m)
@@ -269,13 +269,6 @@ class ScanOdometry:
         if far or self._map.scans < _FIRST_SCANS:
             self._T_odom_added = T
             self._map.add(transform(T, points_m), T[:3, 3])
-
-
-def _registration(noise_m: float) -> RegistrationParameters:
-    return RegistrationParameters(
-        noise_m=noise_m, scales=_SCALES, correlation=_CORRELATION, floor_m=_FLOOR_M,
-        floor_rad=_FLOOR_RAD, degenerate_m=_DEGENERATE_M,
-    )  # fmt: skip
 
 
 def _gain(prior: F64, measured: F64) -> F64:

@@ -194,7 +194,7 @@ def _system(
     _add_belief(A, g, knots[0], belief, shared)
     for k, knot in enumerate(knots):
         if knot.match is not None:
-            at, weight = slice(6 * k, 6 * k + 6), knot.weight / par.correlation
+            at, weight = slice(6 * k, 6 * k + 6), knot.weight / par.rules.correlation
             moved = log_se3(T_inverse(knot.match.T_map_vehicle) @ knot.T_map_vehicle)
             A[at, at] += weight * knot.match.H
             g[at] += weight * (knot.match.g + knot.match.H @ moved)
@@ -296,7 +296,7 @@ def _as_seen(
     answers, matched, scans = covariance[rows], np.zeros(3), []
     for k, knot in enumerate(knots):
         if knot.match is not None:
-            v, weight = answers[:, 6 * k : 6 * k + 6], knot.weight / par.correlation
+            v, weight = answers[:, 6 * k : 6 * k + 6], knot.weight / par.rules.correlation
             matched += weight * np.einsum("di,ij,dj->d", v, knot.match.H, v)
             scans.append(SeenScan(knot.points_m, knot.match, weight * v))
     first = np.r_[0:6, len(covariance) - N_SHARED : len(covariance)]
@@ -337,9 +337,9 @@ def _misfit(knots: Sequence[Knot], par: RegistrationParameters) -> float:
             continue
         off = log_se3(T_inverse(knot.match.T_map_vehicle) @ knot.T_map_vehicle)
         values, vectors = np.linalg.eigh(knot.match.H * scale * scale[:, None])
-        strong = values > par.correlation / par.degenerate_m**2
+        strong = values > par.rules.correlation / par.rules.degenerate_m**2
         pull = vectors[:, strong].T @ ((knot.match.g + knot.match.H @ off) * scale)
-        total += float((pull**2 / values[strong]).sum()) / par.correlation
+        total += float((pull**2 / values[strong]).sum()) / par.rules.correlation
         n += int(strong.sum())
     return total / max(n, 1)
 

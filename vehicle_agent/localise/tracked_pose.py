@@ -64,8 +64,8 @@ class DriveState:
         noise_m = parameters.registration.noise_m
         self.local_map, self.parameters, self.mounting = local_map, parameters, mounting
         self.motion = MotionBuffer()
-        self.teacher = MotionTeacher(self.motion, parameters.odometry, mounting)
-        self.scan_odometry = ScanOdometry(parameters.scan_odometry, noise_m)
+        self.teacher = MotionTeacher(self.motion, mounting)
+        self.scan_odometry = ScanOdometry(noise_m)
         self.co_moving = CoMoving(mounting.T_used)
         self.matcher = MapMatcher(MatchMapCache(local_map, noise_m), parameters.registration, mounting)
         self.sweeps = Sweeps(self.motion, mounting, distortion)

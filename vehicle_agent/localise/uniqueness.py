@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 from gnd.gnd_map.se3 import T_from_R_t, T_inverse, exp_so3, transform
 from gnd.vehicle_agent.errors import RegistrationError
 from gnd.vehicle_agent.localise.first_pose import SearchPlace
-from gnd.vehicle_agent.localise.initialise import INITIALISE_N_REFINING, Around, search, thinned
+from gnd.vehicle_agent.localise.initialise import AROUND_POSITION, INITIALISE_N_REFINING, Around, search, thinned
 from gnd.vehicle_agent.localise.kernels import point_fits
 from gnd.vehicle_agent.localise.match_map import MatchMap
 from gnd.vehicle_agent.localise.parameters import LocaliserParameters, RegistrationParameters
@@ -162,7 +162,7 @@ class Uniqueness:
         self._par, self._registration = parameters.uniqueness, parameters.registration
         par = self._par
         self._how = replace(
-            parameters.initialise,
+            AROUND_POSITION,
             n_refined=_N_REFINED,
             n_kept=_N_KEPT,
             same_m=_APART_M,
@@ -293,7 +293,7 @@ def fits_at(points_m: F64, T_map_vehicle: F64, m: MatchMap, parameters: Registra
     """(N,) how well each of points (N, 3) lies on the map at a pose (4, 4): 1 - robust cost, 0 ... 1; 0 where it is
     not known.
     """
-    fits, scale = np.empty(len(points_m)), parameters.scales[-1]
+    fits, scale = np.empty(len(points_m)), parameters.rules.scales[-1]
     R, t = np.ascontiguousarray(T_map_vehicle[:3, :3]), np.ascontiguousarray(T_map_vehicle[:3, 3])
     gate_m2 = (REGISTRATION_GATE_PER_SCALE * scale) ** 2
     point_fits(

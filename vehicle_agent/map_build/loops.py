@@ -14,9 +14,9 @@ import numpy as np
 from gnd.gnd_map.arrays import F64
 from gnd.gnd_map.se3 import T_inverse, log_so3
 from gnd.vehicle_agent.errors import RegistrationError
-from gnd.vehicle_agent.localise.initialise import Around, Candidate, near_pose, search
+from gnd.vehicle_agent.localise.initialise import AROUND_POSITION, Around, Candidate, near_pose, search
 from gnd.vehicle_agent.localise.match_map import MatchMap
-from gnd.vehicle_agent.localise.parameters import InitialiseParameters, RegistrationParameters
+from gnd.vehicle_agent.localise.parameters import WITHOUT_WHEELS, RegistrationParameters
 from gnd.vehicle_agent.localise.registration import register
 from gnd.vehicle_agent.map_build.anchors import PoseAnchors
 
@@ -41,8 +41,8 @@ AGREE_M, AGREE_SHARE, AGREE_DEG = 0.2, 0.01, 1.0
 """How far a neighbouring loop may disagree: at least, of the way between, and in angle."""
 FLOOR_M, FLOOR_RAD = 0.02, 1e-3
 
-_REGISTRATION: Final = RegistrationParameters(wheel_sigma_m=0.0)
-_SEARCH: Final = InitialiseParameters(step_m=1.5, step_deg=3.0, n_refined=12, n_kept=4)
+_REGISTRATION: Final = RegistrationParameters(rules=WITHOUT_WHEELS)
+_SEARCH: Final = replace(AROUND_POSITION, step_m=1.5, step_deg=3.0, n_refined=12, n_kept=4)
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -9,7 +9,7 @@ from collections import Counter
 from collections.abc import Callable, Collection, Mapping, Set
 from dataclasses import dataclass, field, replace
 from importlib.metadata import version
-from typing import Any
+from typing import Any, Final
 
 import numpy as np
 
@@ -36,7 +36,7 @@ from gnd.vehicle_agent.detect.doubts import (
     doubt_of,
     withheld_change,
 )
-from gnd.vehicle_agent.detect.shift import Shift, ShiftParameters, costs_at
+from gnd.vehicle_agent.detect.shift import Shift, costs_at
 from gnd.vehicle_agent.detect.tile_shift import pose_error_of_tile
 from gnd.vehicle_agent.detect.trial import POINTS_OF_POOR_SCAN, Trial, some_of
 from gnd.vehicle_agent.detect.uncertainty import PoseUncertainty
@@ -50,6 +50,11 @@ from gnd.vehicle_agent.surroundings import left_behind
 from gnd.vehicle_agent.tracks import Tracks
 
 STEP_M = 2.0  # tiles left behind are looked for after this much way
+_LEAVE_M: Final = 4.0
+"""A tile this much farther away than detection reaches gets no more evidence: its classes are decided. It holds how far
+the LiDAR stands from the vehicle's origin, and what the vehicle drives during a scan."""
+_SOON_S: Final = 0.3
+"""Where much has changed, a report waits this long for tiles that are left together with the first."""
 
 _log = logging.getLogger(__name__)
 
@@ -113,7 +118,7 @@ class _PendingTiles:
             return True
         apart = reported_ns is None or t_ns - reported_ns > most.apart_s * 1e9
         many = max(len(change.changed) for change in self.changes.values()) >= most.soon_voxels
-        return many and apart and t_ns - self.changed_ns > most.soon_s * 1e9
+        return many and apart and t_ns - self.changed_ns > _SOON_S * 1e9
 
 
 @dataclass(slots=True)
@@ -170,7 +175,8 @@ class Reporter:
         self._stated_before: Counter[TileId] = Counter()  # in reports of an earlier life that have the same ids
         self._tracks = Tracks(detector.local_map.grid_frame.frame)
         self._match_map = MatchMapCache(detector.local_map, RegistrationParameters().noise_m)
-        self._trial = Trial(self._match_map, ShiftParameters())
+        self._trial = Trial(self._match_map)
+        self._left_behind_m = detector.parameters.range_max_m + _LEAVE_M
         self._doubts = TileDoubts(detector.local_map.grid_frame)
         self._T_map_vehicle: F64 | None = None  # of the newest scan that counted
         self._shifted = 0
@@ -257,9 +263,9 @@ class Reporter:
         touched = self._detector.touched_tiles()
         self._tracks.touched(touched)
         open_tiles = set(touched) | set(self._doubts.tiles())
-        left = left_behind(frame, open_tiles, p_map, self._parameters.left_behind_m)
+        left = left_behind(frame, open_tiles, p_map, self._left_behind_m)
         self._decide(left, odometer_m)
-        self._doubts.forget(left_behind(frame, self._doubts.all_tiles(), p_map, self._parameters.left_behind_m))
+        self._doubts.forget(left_behind(frame, self._doubts.all_tiles(), p_map, self._left_behind_m))
         self._open_districts = {t.district for t in open_tiles - set(left)}
 
     def report_all(self, odometer_m: float) -> None:

@@ -11,7 +11,7 @@ from gnd.gnd_map.arrays import F32, F64, I32
 from gnd.vehicle_agent.segment.evidence import WEIGHTS
 from gnd.vehicle_agent.segment.ground_kernels import GroundGrid, ground_heights, lowest_heights, remember_ground
 from gnd.vehicle_agent.segment.image_kernels import Optics, RangeJudge, draw_image, elevation_span, layer_gap, vote
-from gnd.vehicle_agent.segment.parameters import SegmentParameters
+from gnd.vehicle_agent.segment.parameters import RANGE_MIN_M, SegmentParameters
 from gnd.vehicle_agent.segment.voxel_kernels import find_objects
 
 _SETTLED_S: Final = 1.0
@@ -156,7 +156,7 @@ def find_all_objects(
 ) -> Objects:
     """Voxels of a scan's points (N, 3), relative to its centre; `gap_tan`: distance of its layers."""
     voxel_of, first, index = find_objects(
-        points, origins, *ground, _GROUND_M, _FEET_M, SEGMENT_VOXEL_M, p.range_min_m, p.range_max_m,
+        points, origins, *ground, _GROUND_M, _FEET_M, SEGMENT_VOXEL_M, RANGE_MIN_M, p.range_max_m,
         *hash_table(len(points)),
     )  # fmt: skip
     votes = np.zeros((2, len(first)), np.uint8)

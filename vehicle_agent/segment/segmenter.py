@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from gnd.gnd_map.arrays import F32, F64
 from gnd.vehicle_agent.localise.estimates import PoseEstimate, RefinedScan
 from gnd.vehicle_agent.segment.evidence import belief
-from gnd.vehicle_agent.segment.parameters import SegmentParameters
+from gnd.vehicle_agent.segment.parameters import PAST_S, SegmentParameters
 from gnd.vehicle_agent.segment.scene import (
     SEGMENT_VOXEL_M,
     GroundMap,
@@ -132,7 +132,7 @@ class MotionSegmenter:
         for image in self._images:
             age_ns, last_ns = t_ns - image.t_ns, kept[-1].t_ns if kept else -(2**62)
             young = age_ns <= p.future_s * _S
-            if age_ns <= p.past_s * _S and (young or image.t_ns - last_ns >= OLD_STEP * _EVERY_S * _S - _S // 50):
+            if age_ns <= PAST_S * _S and (young or image.t_ns - last_ns >= OLD_STEP * _EVERY_S * _S - _S // 50):
                 kept.append(image)
         self._images = kept
 
