@@ -10,14 +10,12 @@ from dataclasses import replace
 from typing import Final, Literal, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
+from gnd.gnd_map.arrays import F64
 from gnd.gnd_map.se3 import T_inverse
 from gnd.vehicle_agent.localise.registration import RegistrationResult
 from gnd.vehicle_agent.localise.scan_odometry import JointStep, ScanStep, joint_step
 from gnd.vehicle_agent.localise.stretch import log_se3
-
-F64 = NDArray[np.float64]
 
 Wrong = Literal["wheels", "scans", "open"]
 

@@ -4,18 +4,18 @@ from dataclasses import dataclass
 from typing import Any, Final, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
+from gnd.gnd_map.arrays import F64
 from gnd.gnd_map.se3 import T_inverse, log_so3
 from gnd.vehicle_agent.importers.mounting import angles_of
 from gnd.vehicle_agent.localise.clock import ClockDoubt, ClockEstimator
-from gnd.vehicle_agent.localise.drift import PoseDrift
 from gnd.vehicle_agent.localise.estimates import Cause, Health
 from gnd.vehicle_agent.localise.first_course import FirstCourse
 from gnd.vehicle_agent.localise.mount import DOUBTFUL_RAD, SIGMAS, MountDoubt, MountResidual
 from gnd.vehicle_agent.localise.odometry import MotionBuffer
 from gnd.vehicle_agent.localise.remount import Mounting, left_over, left_sigma
 from gnd.vehicle_agent.localise.scan_odometry import ScanStep
+from gnd.vehicle_agent.localise.stretch import BIAS, LEFT, SCALE, UP
 
 SCALE_PRIOR: Final = 0.02
 BIAS_PRIOR_RADPS: Final = 0.005
@@ -40,8 +40,6 @@ _LEAST_BIAS_RADPS: Final = 7e-05
 """The least sigma of what a stretch of submaps tells about scale and bias."""
 _EXCESS_GAIN: Final = 0.2
 """Weight of the newest step in the running judgement of how much worse than all this the odometry is."""
-
-F64 = NDArray[np.float64]
 
 STEP_S, STRETCH_S = 0.5, 1.0
 IN_DOUBT = 2.5
@@ -323,23 +321,23 @@ class MotionTeacher:
         square = np.concatenate([log_so3(off[:3, :3]), off[:3, 3]]) ** 2
         self._excess_var += _EXCESS_GAIN * (square - 2.0 * match_var - self._excess_var)
 
-    def correct(self, drift: PoseDrift, overlap: float) -> None:
-        """Take off what a whole stretch says, where it knows better than what was learnt so far.
+    def correct(self, change: F64, sigmas: F64) -> None:
+        """Take over what a whole stretch found, where it knows better than what was learnt so far.
 
-        `overlap`: in how many of the stretch's matches each scan takes part, so that they are not independent.
+        Args:
+            change: (N_SHARED,) of the stretch's shared parameters.
+            sigmas: (N_SHARED,) one sigma each.
         """
-        grown = float(np.sqrt(overlap))
-        bias = max(drift.yaw_radps.sigma * grown, _LEAST_BIAS_RADPS)
+        least = [_LEAST_BIAS_RADPS, _LEAST_SCALE, _LEAST_SCALE]
+        bias, scale, course = np.maximum(sigmas[[BIAS, SCALE, LEFT]], least).tolist()
         if bias**2 < KEEPS * self._bias_var:
-            self._motion.yaw_bias_radps += drift.yaw_radps.value
+            self._motion.yaw_bias_radps += float(change[BIAS])
             self._bias_var = bias**2
-        scale = max(drift.forward.sigma * grown, _LEAST_SCALE)
         if scale**2 < KEEPS * self._scale_var:
-            self._motion.speed_scale *= 1.0 - drift.forward.value
+            self._motion.speed_scale *= 1.0 + float(change[SCALE])
             self._scale_var = scale**2
-        course = max(drift.left.sigma * grown, _LEAST_SCALE)
         if course**2 < KEEPS * self._course_var:
-            self._motion.course -= [drift.left.value, drift.up.value]
+            self._motion.course += change[[LEFT, UP]]
             self._course_var = course**2
 
     def _compare(self, first: Stamped, last: Stamped) -> None:

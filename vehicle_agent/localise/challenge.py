@@ -4,8 +4,8 @@ from dataclasses import replace
 from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 
+from gnd.gnd_map.arrays import F64
 from gnd.vehicle_agent.localise.first_pose import INITIALISE_FAIR_FIT, INITIALISE_GOOD_FIT, SearchPlace
 from gnd.vehicle_agent.localise.hypotheses import (
     HYPOTHESIS_APART_DEG,
@@ -49,8 +49,6 @@ are logarithms."""
 _NEAR_M: Final = 1.0
 _NEAR_DEG: Final = 3.0
 """A rival nearer than this must fit well to win."""
-
-F64 = NDArray[np.float64]
 
 
 class Challenger:

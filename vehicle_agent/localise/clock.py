@@ -18,10 +18,10 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import cho_solve_banded, cholesky_banded
 
+from gnd.gnd_map.arrays import F64
 from gnd.vehicle_agent.localise.odometry import ClockModel, MotionBuffer
 from gnd.vehicle_agent.localise.scan_odometry import ScanStep
 
-F64 = NDArray[np.float64]
 ClockDoubt = Literal["none", "large", "unsure", "drifting", "jumped"]
 
 PRIOR_S: Final = 0.04

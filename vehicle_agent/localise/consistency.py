@@ -6,13 +6,11 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from gnd.gnd_map.arrays import F64
 from gnd.gnd_map.motion import Trajectory
 from gnd.gnd_map.se3 import T_inverse, log_so3
 from gnd.vehicle_agent.localise.estimates import PoseEstimate
-
-F64 = NDArray[np.float64]
 
 HEADING, PLACE = [2], [3, 4]
 """Rows of a pose's covariance, rotation before position."""

@@ -7,11 +7,8 @@ them is good to some tenths of a degree after two or three. Only a turned header
 from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 
 from gnd.vehicle_agent.localise.scan_odometry import ScanStep
-
-F64 = NDArray[np.float64]
 
 GROWN: Final = 1.0
 """Steps of scans are taken to be so much less sure than they say."""

@@ -4,8 +4,8 @@ from dataclasses import dataclass, replace
 from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 
+from gnd.gnd_map.arrays import F64
 from gnd.vehicle_agent.errors import RegistrationError
 from gnd.vehicle_agent.localise.estimates import Cause
 from gnd.vehicle_agent.localise.hypotheses import HYPOTHESIS_MOST_VIEWS, HYPOTHESIS_SURE, PoseHypotheses
@@ -21,8 +21,6 @@ INITIALISE_FAIR_FIT: Final = 0.48
 a pose decimetres off can fit best, and a vehicle that moves soon sees something else."""
 _RETRY_S: Final = 0.8
 """Pause between two searches for the first pose."""
-
-F64 = NDArray[np.float64]
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -10,8 +10,8 @@ from typing import Final
 
 import gtsam
 import numpy as np
-from numpy.typing import NDArray
 
+from gnd.gnd_map.arrays import F64, I64
 from gnd.gnd_map.geodesy import LocalFrame
 from gnd.gnd_map.motion import Trajectory
 from gnd.gnd_map.se3 import T_inverse
@@ -30,9 +30,6 @@ from gnd.vehicle_agent.localise.track_alignment import (
     FixTable,
     align,
 )
-
-F64 = NDArray[np.float64]
-I64 = NDArray[np.int64]
 
 MIN_FIXES: Final = 3
 _COSTS: Final = (

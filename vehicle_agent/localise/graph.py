@@ -5,8 +5,8 @@ from typing import Final, NamedTuple
 
 import gtsam
 import numpy as np
-from numpy.typing import NDArray
 
+from gnd.gnd_map.arrays import F64
 from gnd.vehicle_agent.localise.parameters import GraphParameters
 from gnd.vehicle_agent.localise.scan_odometry import ScanStep
 
@@ -16,8 +16,6 @@ _GNSS_VERTICAL: Final = 2.0
 """Its vertical sigma in horizontal ones."""
 GRAPH_ROBUST_K: Final = 2.0
 """Cauchy scale of map matches and GNSS, in sigmas."""
-
-F64 = NDArray[np.float64]
 
 SLACK_S = 0.01
 

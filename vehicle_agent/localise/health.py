@@ -11,8 +11,8 @@ from collections import deque
 from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 
+from gnd.gnd_map.arrays import F64
 from gnd.gnd_map.se3 import T_inverse, log_so3
 from gnd.vehicle_agent.localise.estimates import Cause, Health
 from gnd.vehicle_agent.localise.parameters import HealthParameters
@@ -61,8 +61,6 @@ _GNSS_SIGMAS: Final = 5.0
 HEALTH_GNSS_COUNT: Final = 5
 """This many fixes in a row farther than this from the pose mean that the pose is wrong, however well the scan seems to
 fit."""
-
-F64 = NDArray[np.float64]
 
 DIRECTIONS = ("roll", "pitch", "heading", "longitudinal", "lateral", "vertical")  # as in `degenerate`
 DISPUTED, MOST_DISPUTES = 2, 4  # matches that fit and lie elsewhere, less those that were believed since

@@ -4,16 +4,14 @@ from dataclasses import dataclass, replace
 from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 
+from gnd.gnd_map.arrays import F64
 from gnd.gnd_map.motion import Trajectory
 from gnd.gnd_map.se3 import T_inverse
 from gnd.vehicle_agent.localise.estimates import Cause, Health, PoseEstimate
 from gnd.vehicle_agent.localise.graph import SmoothedPose
 from gnd.vehicle_agent.localise.packed_scan import PackedScan
 from gnd.vehicle_agent.localise.stretch import log_se3
-
-F64 = NDArray[np.float64]
 
 OVERRULED: Final[tuple[Cause, ...]] = ("wrong_pose", "stale_map", "poor_place", "no_match", "unconfirmed")
 """Causes found by single scans that a pose which submaps make certain overrules."""

@@ -6,6 +6,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
+from gnd.gnd_map.arrays import F64
 from gnd.gnd_map.se3 import T_inverse, log_so3
 from gnd.vehicle_agent.errors import RegistrationError
 from gnd.vehicle_agent.localise.initialise import Candidate, InitialPose, near_pose, probabilities, thinned
@@ -38,8 +39,6 @@ _ALONE: Final = 0.75
 """A fit so good, with a runner-up of less than this share of it, wins at the first."""
 _DROPPED: Final = 1e-06
 """A hypothesis this much less probable than the best is given up."""
-
-F64 = NDArray[np.float64]
 
 
 @dataclass(slots=True, eq=False)

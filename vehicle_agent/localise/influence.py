@@ -16,11 +16,10 @@ from typing import Final, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from gnd.gnd_map.arrays import F64
 from gnd.vehicle_agent.localise.kernels import pulls
 from gnd.vehicle_agent.localise.match_map import MatchMap
 from gnd.vehicle_agent.localise.registration import REGISTRATION_GATE_PER_SCALE, Linearised
-
-F64 = NDArray[np.float64]
 
 PIECE_M: Final = 2.0
 """Side of a piece of the map: neighbouring Gaussians of a wall share what its survey and its voxels are wrong by."""

@@ -12,6 +12,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
+from gnd.gnd_map.arrays import F64
 from gnd.gnd_map.jit import kernel
 from gnd.gnd_map.se3 import T_from_R_t, exp_so3
 from gnd.vehicle_agent.errors import RegistrationError
@@ -39,7 +40,6 @@ _APART_DEG: Final = 5.0
 STANDING_ABOVE_M: Final = 0.4
 """Points that stand are higher than this above the ground, which fits everywhere."""
 
-F64 = NDArray[np.float64]
 U8 = NDArray[np.uint8]
 
 GROUND_RADIUS_M = 12.0  # map columns around the position that say how high and how steep the ground is

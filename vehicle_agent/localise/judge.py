@@ -3,8 +3,8 @@
 from typing import Final, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
+from gnd.gnd_map.arrays import F64
 from gnd.gnd_map.se3 import transform
 from gnd.vehicle_agent.local_map import EMPTY
 from gnd.vehicle_agent.localise.challenge import Challenger
@@ -28,8 +28,6 @@ _LEAST_KNOWN: Final = 0.3
 _MOTION_GAP_S: Final = 0.3
 _GAP_S: Final = 2.0
 """After so long without motion samples, or without a believed match, the pose must prove itself again."""
-
-F64 = NDArray[np.float64]
 
 FEWEST_POINTS: Final = 20
 """Of a scan that a sensor in order gives: in an open field four layers see a few dozen points that matter."""

@@ -9,8 +9,8 @@ from dataclasses import dataclass, replace
 from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 
+from gnd.gnd_map.arrays import F64
 from gnd.schemas.drive import DriveItem, GnssFix, MotionSample, MountSigma, Scan
 from gnd.vehicle_agent.local_map import LocalMap
 from gnd.vehicle_agent.localise.calibration import MotionCalibration
@@ -34,8 +34,6 @@ _OUTSIDE_RAD: Final = 0.01
 _PAST_NS: Final = 1_000_000_000
 _MOST_FROM_PAST: Final = 5
 """So many scans in a row that are older than the newest by more: the clock was wrong before."""
-
-F64 = NDArray[np.float64]
 
 
 @dataclass(frozen=True, slots=True, eq=False)

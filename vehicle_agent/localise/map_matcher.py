@@ -1,8 +1,6 @@
 """Matches of scans with the local map, for the mount in use."""
 
-import numpy as np
-from numpy.typing import NDArray
-
+from gnd.gnd_map.arrays import F64
 from gnd.vehicle_agent.errors import RegistrationError
 from gnd.vehicle_agent.localise import level
 from gnd.vehicle_agent.localise.graph import MapMatch, SmoothedPose
@@ -12,8 +10,6 @@ from gnd.vehicle_agent.localise.neighbours import FAR_M, UNSURE_M, hedged, weake
 from gnd.vehicle_agent.localise.parameters import RegistrationParameters
 from gnd.vehicle_agent.localise.registration import RegistrationResult, Start, register
 from gnd.vehicle_agent.localise.remount import Mounting
-
-F64 = NDArray[np.float64]
 
 
 class MapMatcher:

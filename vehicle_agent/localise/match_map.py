@@ -5,10 +5,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from gnd.gnd_map.arrays import F64
 from gnd.vehicle_agent.local_map import LocalMap
 from gnd.vehicle_agent.localise.kernels import tapered_information
-
-F64 = NDArray[np.float64]
 
 # Variance along an axis of a voxel that a surface fills: 1/12 m² for a whole metre filled evenly, less because voxels
 # are smaller than that and points never lie quite evenly. 0.035 ... 0.083 m² measured the same on KITTI, RADIATE and

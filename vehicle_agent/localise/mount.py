@@ -12,6 +12,7 @@ from typing import Final, Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from gnd.gnd_map.arrays import F64
 from gnd.gnd_map.se3 import T_inverse, transform
 from gnd.vehicle_agent.importers.mount import (
     CROWN_RAD,
@@ -23,7 +24,6 @@ from gnd.vehicle_agent.importers.mount import (
     upright,
 )
 
-F64 = NDArray[np.float64]
 MountDoubt = Literal["height", "roll", "pitch", "yaw"]
 AXES: Final[tuple[MountDoubt, ...]] = ("height", "roll", "pitch")
 """What the ground tells."""

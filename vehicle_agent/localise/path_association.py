@@ -10,17 +10,14 @@ from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.linalg import solveh_banded
 
+from gnd.gnd_map.arrays import F64, I64
 from gnd.gnd_map.geodesy import LocalFrame
 from gnd.gnd_map.motion import Trajectory
 from gnd.vehicle_agent.errors import LocaliseError
 from gnd.vehicle_agent.localise.georeference import Georeferenced, georeference
 from gnd.vehicle_agent.localise.track_alignment import FixTable
-
-F64 = NDArray[np.float64]
-I64 = NDArray[np.int64]
 
 STEP_M: Final = 1.0
 """Of the way, in the search."""

@@ -6,8 +6,8 @@ from dataclasses import replace
 from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 
+from gnd.gnd_map.arrays import F64
 from gnd.gnd_map.se3 import T_inverse
 from gnd.vehicle_agent.localise.calibration import MotionTeacher
 from gnd.vehicle_agent.localise.estimates import Cause, Health, PoseEstimate, RefinedScan
@@ -27,8 +27,6 @@ the road) once that gives the yaw. All scans share it.
 """
 _COURSE_RAD: Final = np.radians(0.012)
 """One sigma of the course where a pose's own covariance does not hold it: that of online poses."""
-
-F64 = NDArray[np.float64]
 
 
 class PoseOutput:

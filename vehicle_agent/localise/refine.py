@@ -11,8 +11,8 @@ from itertools import pairwise
 from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 
+from gnd.gnd_map.arrays import F64
 from gnd.gnd_map.se3 import T_from_R_t, T_inverse, exp_so3, log_so3
 from gnd.vehicle_agent.localise.calibration import (
     BIAS_PRIOR_RADPS,
@@ -22,25 +22,20 @@ from gnd.vehicle_agent.localise.calibration import (
     SCALE_PRIOR,
     MotionTeacher,
 )
-from gnd.vehicle_agent.localise.drift import PoseDrift, Slope
 from gnd.vehicle_agent.localise.graph import MapMatch, SmoothedPose
 from gnd.vehicle_agent.localise.match_map import MatchMapCache
 from gnd.vehicle_agent.localise.odometry import SLIP_LASTS_NS, MotionBuffer
 from gnd.vehicle_agent.localise.parameters import RefineParameters, RegistrationParameters
 from gnd.vehicle_agent.localise.scan_odometry import ScanStep
+from gnd.vehicle_agent.localise.step_noise import StepNoise
 from gnd.vehicle_agent.localise.stretch import (
-    BIAS,
-    LEFT,
     N_SHARED,
-    SCALE,
-    UP,
     Knot,
     SolvedStretch,
     StretchBelief,
     StretchStep,
     log_se3,
     marginalised,
-    residual,
     shared_of,
     solve_stretch,
 )
@@ -89,19 +84,11 @@ _CORRECT_M: Final = 0.06
 _CORRECT_DEG: Final = 0.12
 """An online pose farther off than this from what the stretch says begins anew from there."""
 
-F64 = NDArray[np.float64]
-
 SUPPORTED: Final = 3
 """Solutions before one tells the online pose where it is."""
 FIRM: Final = 4
 """Solutions that fit well, before anything is certain."""
 FIRST_SIGMA_M, FIRST_SIGMA_RAD = 0.5, 0.02  # of the online pose that the first scan starts from
-FORGETTING: Final = 0.7
-"""Weight of what was seen of the odometry until the last solution."""
-WORST_VARIANCE: Final = 1e4
-LEAST_VARIANCE: Final = 0.1
-WINDOW: Final = 8
-"""Steps over which wheels and gyro are compared with scans: the error of the latter does not grow with the way."""
 FIRM_AFTER_SLIP: Final = 2
 """As if so many had fitted well so far: rivals of single scans have a say for some metres."""
 SEEN_SIGMA_M: Final = 0.025
@@ -156,8 +143,7 @@ class Refiner:
         self._solved_way_m, self._solved_ns = 0.0, 0
         self._news = False
         self._solutions = 0
-        self._step_variance = np.ones(6)  # of wheels and gyro, in units of what is assumed
-        self._squares, self._redundancy = np.full(6, 3.0), np.full(6, 3.0)
+        self._noise = StepNoise()
         self._firm = 0  # solutions in a row that fitted well
 
     def push(
@@ -245,7 +231,7 @@ class Refiner:
         """(6,) of a motion (4, 4) by wheels and gyro beside what all steps share.
 
         A single step that is far off counts less (`STEP_CHI2`); odometry that is worse all along is found out by
-        `_judge_steps`. Single scans are not asked what it is off by: they follow walls that were moved.
+        `StepNoise`. Single scans are not asked what it is off by: they follow walls that were moved.
         """
         grown = np.sqrt(max(float(np.linalg.norm(driven[:3, 3])), dt_ns * 1e-9) / NOISE_WAY_M)
         roll_pitch = np.radians(_ROLL_PITCH_DEG)
@@ -295,23 +281,10 @@ class Refiner:
             told = [scan.seen for scan in between_them]
             whole = all(step is not None for step in told)
             seen.append(_chained([step for step in told if step is not None]) if whole else None)
-        grown = np.sqrt(self._step_variance)
         return [
-            [replace(one, covariance=grown[:, None] * one.covariance * grown), *([] if other is None else [other])]
+            [self._noise.grown(one), *([] if other is None else [other])]
             for one, other in zip(driven, seen, strict=True)
         ]
-
-    def _judge_steps(self, solved: SolvedStretch, steps: Sequence[Sequence[StretchStep]], off: F64) -> None:
-        """How much worse than assumed wheels and gyro are, axis by axis, as map and scans together see it.
-
-        Where map and odometry disagree either may be worse than it claims, and the stretch that trusts one finds its
-        fault with the other. Steps from scan to scan know no map: wheels and gyro are no worse than they say.
-        `off`: (N_SHARED,) what the shared parameters differ by from those that the steps were made with.
-        """
-        self._squares = FORGETTING * self._squares + solved.step_squares * self._step_variance
-        self._redundancy = FORGETTING * self._redundancy + solved.step_redundancy
-        worst = np.minimum(WORST_VARIANCE, np.maximum(told_by_scans(steps, off) * self._step_variance, 1.0))
-        self._step_variance = np.clip(self._squares / self._redundancy, 1.0, worst)
 
     def _solve(self) -> None:
         """Place all scans of the stretch anew, let wheels and gyro learn from it, and let go of its old scans."""
@@ -326,7 +299,7 @@ class Refiner:
         self._solved = solve_stretch(
             knots, steps, belief, match_map, self.registration, _SCALES if known else _FIRST_SCALES
         )
-        self._judge_steps(self._solved, steps, self._solved.shared - belief.shared)
+        self._noise.learn(self._solved, steps, self._solved.shared - belief.shared)
         self._news, self._solutions = True, self._solutions + 1
         newest = self._scans[-1]
         before_ns = self._solved_ns
@@ -394,15 +367,7 @@ class Refiner:
             return
         more, variance = self._solved.shared - self._motion.shared(), np.diag(self._solved.shared_covariance)
         sigma = np.sqrt(variance * max(1.0, self._solved.misfit))
-        self._teacher.correct(
-            PoseDrift(
-                yaw_radps=Slope(float(more[BIAS]), float(sigma[BIAS])),
-                forward=Slope(float(-more[SCALE]), float(sigma[SCALE])),
-                left=Slope(float(-more[LEFT]), float(sigma[LEFT])),
-                up=Slope(float(-more[UP]), float(sigma[UP])),
-            ),
-            overlap=1.0,
-        )
+        self._teacher.correct(more, sigma)
 
     def _fit(self) -> float:
         """How well the newest `fit_m` of the stretch fit the map, 0 ... 1; points in unknown voxels count as off."""
@@ -467,7 +432,7 @@ class Refiner:
         """
         assert self._solved is not None
         grown, matched = np.full(6, max(1.0, self._solved.misfit)), self._solved.matched
-        odometry = np.clip(self._squares / self._redundancy / self._step_variance, LEAST_VARIANCE, 1.0)
+        odometry = self._noise.against_claimed()
         odometry[3:5] = 1.0  # along a tunnel the steps agree with each other and drift together
         grown[2:5] *= self._solved.seen * matched + odometry[2:5] * (1.0 - matched)
         return grown
@@ -495,22 +460,6 @@ class Refiner:
         t = [self._scans[k].t_ns for k in (low, i, high)]
         a, b, c = way if way[2] - way[0] > 1e-3 else t
         return float(np.clip((b - a) / (c - a), 0.0, 1.0)) if c > a else 0.0
-
-
-def told_by_scans(steps: Sequence[Sequence[StretchStep]], shared_off: F64) -> F64:
-    """(6,) mean square of what the motion of some steps by wheels and gyro (the first measurement of each) differs from
-    what scans say (the second), in units of the variance claimed; endless where scans say too little.
-    """
-    windows, single = [], []
-    for i in range(0, len(steps) - WINDOW + 1, WINDOW // 2):
-        window = steps[i : i + WINDOW]
-        if all(len(measured) > 1 for measured in window):
-            off = np.array([residual(seen.T_before_now, driven, shared_off)[0] for driven, seen, *_ in window])
-            variance = np.array([np.diag(driven.covariance) for driven, *_ in window])
-            by_scans = np.array([np.diag(seen.covariance) for _, seen, *_ in window])
-            windows.append(off.sum(axis=0) ** 2 / variance.sum(axis=0))
-            single.append((off**2 - by_scans).sum(axis=0) / variance.sum(axis=0))
-    return np.maximum(np.mean(windows, axis=0), np.mean(single, axis=0)) if windows else np.full(6, np.inf)
 
 
 def _chained(seen: Sequence[ScanStep]) -> StretchStep:

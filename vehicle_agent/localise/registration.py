@@ -6,6 +6,7 @@ from typing import Final, Literal
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from gnd.gnd_map.arrays import F64
 from gnd.gnd_map.se3 import exp_so3
 from gnd.vehicle_agent.errors import RegistrationError
 from gnd.vehicle_agent.localise.kernels import linearise
@@ -22,7 +23,6 @@ REGISTRATION_MIN_MATCHED: Final = 60
 _DEGENERATE_SHARE: Final = 0.01
 """So is a horizontal one with less than this share of the strongest direction's information."""
 
-F64 = NDArray[np.float64]
 
 Start = Literal["near", "wide", "capture"]
 

@@ -8,15 +8,13 @@ its wheels are: both are taken through `T_used_vehicle`. Between tracks the axes
 from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 
+from gnd.gnd_map.arrays import F64
 from gnd.gnd_map.se3 import T_inverse, exp_so3, transform
 from gnd.schemas.drive import DriveHeader, MountSigma
 from gnd.vehicle_agent.importers.mount import HEIGHTS_M
 from gnd.vehicle_agent.localise.mount import AXES, SIGMAS, TOLERANCE, WRONG, MountResidual, MountWatch
 from gnd.vehicle_agent.localise.registration import WHEELS_M
-
-F64 = NDArray[np.float64]
 
 TRUSTED_RAD: Final = float(np.radians(0.3))
 TRUSTED: Final = MountSigma(0.05, TRUSTED_RAD, TRUSTED_RAD, TRUSTED_RAD)

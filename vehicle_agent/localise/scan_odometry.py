@@ -10,8 +10,8 @@ from dataclasses import dataclass, replace
 from typing import Final, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
+from gnd.gnd_map.arrays import F64
 from gnd.gnd_map.motion import Trajectory
 from gnd.gnd_map.se3 import T_from_R_t, T_inverse, exp_so3, log_so3, transform
 from gnd.vehicle_agent.errors import RegistrationError
@@ -50,8 +50,6 @@ case."""
 _FIRST_SCANS: Final = 3
 _MAX_GAP_S: Final = 1.0
 """After a longer time without a scan the map begins anew."""
-
-F64 = NDArray[np.float64]
 
 CONTRADICTED, STILL_CONTRADICTED = 3.0, 1.5  # sigmas at which wheels begin to slip, and above which they still do
 OFF_GROUND_M, OFF_GROUND_SLOPE = 0.3, 0.02  # what stands higher, and so much for each metre of distance, is no ground

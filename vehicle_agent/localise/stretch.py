@@ -14,15 +14,13 @@ from dataclasses import dataclass, field
 from typing import Final, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
+from gnd.gnd_map.arrays import F64
 from gnd.gnd_map.se3 import T_inverse, exp_so3, log_so3
 from gnd.vehicle_agent.localise.influence import SeenScan, influence
 from gnd.vehicle_agent.localise.match_map import MatchMap
 from gnd.vehicle_agent.localise.parameters import RegistrationParameters
 from gnd.vehicle_agent.localise.registration import LEVER_M, WHEELS_M, Linearised, linearised
-
-F64 = NDArray[np.float64]
 
 N_SHARED: Final = 4
 """What all steps share: gyro bias [rad/s], wheel scale [1], motion to the left and upwards per metre forward [1]."""

@@ -7,6 +7,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
+from gnd.gnd_map.arrays import F64
 from gnd.gnd_map.motion import Trajectory, deskew
 from gnd.gnd_map.se3 import T_inverse
 from gnd.schemas.drive import Scan
@@ -16,7 +17,6 @@ from gnd.vehicle_agent.localise.remount import Mounting
 from gnd.vehicle_agent.localise.scan_odometry import ScanStep
 from gnd.vehicle_agent.localise.stretch import log_se3
 
-F64 = NDArray[np.float64]
 Distortion = Callable[[float, float], DistortionSigma]
 """Sigma of a pose from speed [m/s] and yaw rate [rad/s], by the motion that is left in the points of a sweep."""
 

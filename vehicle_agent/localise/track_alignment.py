@@ -11,6 +11,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
+from gnd.gnd_map.arrays import F64, I64
 from gnd.gnd_map.geodesy import LocalFrame
 from gnd.gnd_map.se3 import T_from_R_t, exp_so3, transform
 from gnd.schemas.drive import GnssFix
@@ -26,9 +27,6 @@ TRACK_STEP_RAD: Final = 0.0005
 """One sigma of a step of the track, whatever its length."""
 TRACK_STEP_RAD_PER_ROOT_M: Final = 0.001
 """Of its turn, with it."""
-
-F64 = NDArray[np.float64]
-I64 = NDArray[np.int64]
 
 _ROUNDS: Final = 40
 _SHRINK: Final = 1.4

@@ -4,8 +4,8 @@ from dataclasses import dataclass, replace
 from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 
+from gnd.gnd_map.arrays import F64
 from gnd.gnd_map.motion import Trajectory
 from gnd.schemas.drive import GnssFix
 from gnd.vehicle_agent.local_map import LocalMap
@@ -44,7 +44,6 @@ _TEACHING_FIT: Final = 0.75
 """Least fit of a match from which odometry is learnt: where much has changed, matches are off together."""
 MAX_GNSS_AGE_NS: Final = 2_000_000_000
 
-F64 = NDArray[np.float64]
 FinalScan = tuple[HeldScan, SmoothedPose]
 """A scan and its final pose, in the axes of the mount in use."""
 

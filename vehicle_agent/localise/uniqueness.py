@@ -19,6 +19,7 @@ from typing import Final, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from gnd.gnd_map.arrays import F64, I64
 from gnd.gnd_map.se3 import T_from_R_t, T_inverse, exp_so3, transform
 from gnd.vehicle_agent.errors import RegistrationError
 from gnd.vehicle_agent.localise.first_pose import SearchPlace
@@ -60,9 +61,6 @@ _WON_AT_ONCE: Final = 5.0
 """By how many sigmas the pose must beat each other one to be proven: three times in a row, or at once."""
 _LOST: Final = 3.0
 """By how many it must be beaten, twice in a row, to be no longer so."""
-
-F64 = NDArray[np.float64]
-I64 = NDArray[np.int64]
 
 FARTHEST_M: Final = 60.0  # a far point is moved by more than a patch when odometry turns by a degree or two
 WON_IN_A_ROW: Final = 3

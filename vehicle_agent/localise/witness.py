@@ -11,6 +11,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
+from gnd.gnd_map.arrays import F64, I32, I64
 from gnd.gnd_map.jit import kernel
 from gnd.vehicle_agent.localise.initialise import STANDING_ABOVE_M
 from gnd.vehicle_agent.localise.match_map import MatchMap
@@ -29,10 +30,6 @@ _LEAST_ALONG_PER_M2: Final = 50.0
 """Least information of the Gaussian along the ray, so that grazing rays say nothing."""
 _MAX_WAY_M: Final = 60.0
 """A ray is followed no farther than this."""
-
-F64 = NDArray[np.float64]
-I32 = NDArray[np.int32]
-I64 = NDArray[np.int64]
 
 KNOWN, HIT, NEW, CROSSED, GONE = range(5)  # columns of the counts
 

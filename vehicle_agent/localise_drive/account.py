@@ -8,8 +8,8 @@ from rich.console import Console
 from rich.table import Table
 
 from gnd.vehicle_agent.localise.consistency import nees_of
-from gnd.vehicle_agent.localise.estimates import PoseEstimate
-from gnd.vehicle_agent.localise_drive.accuracy import LIMITS, error_series, error_summary, healthy, limits_json
+from gnd.vehicle_agent.localise.estimates import PoseEstimate, error_series
+from gnd.vehicle_agent.localise_drive.accuracy import LIMITS, error_summary, healthy, limits_json
 from gnd.vehicle_agent.localise_drive.run import LocalisedDrive
 from gnd.vehicle_agent.localise_drive.stretches import HealthStretch, health_shares, stretches_of
 

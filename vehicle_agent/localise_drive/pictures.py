@@ -2,7 +2,7 @@
 
 from pathlib import Path
 
-from gnd.vehicle_agent.localise_drive.accuracy import error_series
+from gnd.vehicle_agent.localise.estimates import error_series
 from gnd.vehicle_agent.localise_drive.curves import draw_errors, draw_quality
 from gnd.vehicle_agent.localise_drive.map_picture import draw_map
 from gnd.vehicle_agent.localise_drive.run import LocalisedDrive

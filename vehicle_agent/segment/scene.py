@@ -7,7 +7,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from gnd.gnd_map.arrays import F32, F64, I32
+from gnd.gnd_map.arrays import F32, F64, I32, I64
 from gnd.vehicle_agent.segment.evidence import WEIGHTS
 from gnd.vehicle_agent.segment.ground_kernels import GroundGrid, ground_heights, lowest_heights, remember_ground
 from gnd.vehicle_agent.segment.image_kernels import Optics, RangeJudge, draw_image, elevation_span, layer_gap, vote
@@ -42,7 +42,6 @@ SEGMENT_VOXEL_M: Final = 0.3
 
 U8 = NDArray[np.uint8]
 U16 = NDArray[np.uint16]
-I64 = NDArray[np.int64]
 
 GAP_SHARE = 0.8  # of layers that are at most so far apart
 MOST_REACH = 8  # voxels
