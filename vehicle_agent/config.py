@@ -87,7 +87,7 @@ class ReportParameters:
     )
     unchanged_m: float = setting(
         1000.0,
-        "Ground that is as the map says: at the latest after this much way (at least `longest_m`) ...",
+        "Ground that is unchanged: reported at the latest after this much way (at least `longest_m`) ...",
         unit="m",
         least=0,
     )

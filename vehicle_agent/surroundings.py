@@ -20,13 +20,13 @@ from gnd.vehicle_agent.place import Place
 
 STEP_M = 5.0  # the wanted tiles are looked at again after this much way
 AHEAD_STEP_M = 20.0  # every small change of speed would be a reason to look again
-FLOORS_BELOW, FLOORS_ABOVE = 8, 16  # of the vehicle, where the map alone does not say how high the world is
+FLOORS_BELOW, FLOORS_ABOVE = 8, 16  # of the vehicle, where the map alone does not show how high the world is
 
 
 class Surroundings:
     """Keeps `local_map` in step with the place and the cache; the agent's main thread owns it.
 
-    A tile about which there is evidence keeps its map until it is finished: what rays said about one version is never
+    A tile about which there is evidence keeps its map until it is finished: evidence about one version is never
     counted for another. A newer version waits until then, and is what the next pass is compared with.
     """
 

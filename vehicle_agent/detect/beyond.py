@@ -1,6 +1,6 @@
-"""New voxels where the map knows nothing at all: they extend it, and say nothing against the pose or the map.
+"""New voxels where the map knows nothing at all: they extend it, and are no evidence against the pose or the map.
 
-A tile tells what its survey met, not where it looked. But a survey that saw a place met something there, the ground at
+A tile holds what its survey met, not where it looked. But a survey that saw a place met something there, the ground at
 least. So where the map holds nothing above, below or beside a column of voxels, it has not been surveyed: ground behind
 the last house, behind what has gone since, beyond the end of the survey's road.
 """

@@ -1,4 +1,4 @@
-"""What speaks against believing a tile: counted scan by scan while it is seen, said when it is decided."""
+"""Reasons to doubt a tile: counted scan by scan while it is seen, reported when it is decided."""
 
 from collections.abc import Collection
 from dataclasses import dataclass, field
@@ -35,9 +35,9 @@ SHARE_OF_YEAR: Final = 0.3
 convention (docs/decisions/0093-gates-told-and-measured.md)."""
 _DAYS_OF_YEAR: Final = 365.25
 LEAST_OF_SHARE: Final = 50
-"""So many voxels must hold something before their share says anything."""
+"""So many voxels must hold something before their share counts."""
 LEAST_WITHHELD: Final = 5
-"""A tile of which so few voxels were seen from a wrong pose is not worth a word."""
+"""A tile of which so few voxels were seen from a wrong pose is not mentioned."""
 _PERMILLE: Final = 1000
 _LONGEST_MM: Final = 100_000
 
@@ -132,7 +132,7 @@ def plausible_share(base_day: int, day: int) -> float:
 
 
 def doubt_of(found: Classification, account: TileAccount, day: int = UNKNOWN_DAY) -> Doubt | None:
-    """Why a tile that is told all the same is not fully believed; None where nothing speaks against it, or where
+    """Why a tile that is reported is doubtful nevertheless; None where nothing is against it, or where
     nothing has changed. `day`: of the drive, `gnd.gnd_map.day`.
     """
     reasons, changed_share = DoubtReason.NONE, changed_share_of(found)
@@ -160,7 +160,7 @@ def changed_share_of(found: Classification) -> float:
 
 
 def withheld_change(base: Tile, account: TileAccount, changed_share: float = 0.0) -> TileChange:
-    """A tile of which nothing is told, because a pose error explains what seems to have changed."""
+    """A tile that is not reported, because a pose error explains what seems to have changed."""
     nothing = Gaussians.empty()
     return TileChange(
         tile=base.tile_id,

@@ -238,7 +238,7 @@ def cast_rays(  # noqa: C901  (one loop: a call a voxel would cost more than the
         records: the same memory as float32.
         block: (M, 6) float32 whitening for blocked points.
         p: KernelParameters.
-        moving: (N,) bool, points of moving objects: the ray passes what lies before, its end says nothing.
+        moving: (N,) bool, points of moving objects: the ray passes what lies before, its end is no evidence.
         kept: (N,) uint8, set to 1 for the points that count (BI, BO, BE), 0 for the others.
 
     Returns:

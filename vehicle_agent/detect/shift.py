@@ -2,9 +2,9 @@
 
 A building site does not vanish under any shift of the whole scan, and what still stands around it gets worse. A pose
 error does vanish: what did not fit fits then, and what fitted stays. So two hypotheses are compared voxel by voxel, at
-the pose as it is and at the best pose nearby: a paired test, in which voxels are the samples. What a shift cannot tell
-(ground under a shift along it, walls along a street) fits equally well under both and has no say; changed voxels fit
-badly under both and have none either.
+the pose as it is and at the best pose nearby: a paired test, in which voxels are the samples. What a shift does not
+change (ground under a shift along it, walls along a street) fits equally well under both and does not count; changed
+voxels fit badly under both and do not count either.
 """
 
 from dataclasses import dataclass
@@ -25,9 +25,9 @@ from gnd.vehicle_agent.localise.registration import RegistrationResult, Start, r
 _GRID_M: Final = 1.0
 """Voxels are told apart on a plain grid of the map frame: which of them a point is in matters little here."""
 _LEAST_POINTS: Final = 2
-"""Of a voxel, before it has a say."""
+"""Of a voxel, before it counts."""
 _LEAST_VOXELS: Final = 30
-"""With a say, before a shift could be found."""
+"""That count, before a shift could be found."""
 _SCALE2: Final = 2.0**2
 """Of the robust cost, squared sigmas of a point."""
 _MISFIT: Final = 0.5
@@ -76,7 +76,7 @@ class Shift:
 
     Attributes:
         T: (4, 4) correction of the pose in the vehicle's axes: T_map_vehicle -> T_map_vehicle @ T.
-        voxels: how many voxels had a say.
+        voxels: how many voxels counted.
         misfits: how many of them do not fit the map at the pose as it is.
         explained: how many of those fit after the shift.
         spoiled: how many that fitted do not fit after the shift.
@@ -134,7 +134,7 @@ def find_shift(points_vehicle_m: F64, T_map_vehicle: F64, match_map: MatchMap, *
             stretch (those of other moments moved there as the poses say).
         T_map_vehicle: (4, 4) the pose that is asked about.
         match_map: the map there.
-        planar: look for shifts in place and heading only: what a few layers see does not tell height and tilt.
+        planar: look for shifts in place and heading only: what a few layers see does not constrain height and tilt.
 
     Returns:
         The shift; the identity where nothing nearby fits better, or too little of the map is known.

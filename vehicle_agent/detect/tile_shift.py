@@ -21,9 +21,9 @@ from gnd.vehicle_agent.detect.shift import OF_SCANS, Shift, costs_at, find_shift
 from gnd.vehicle_agent.localise.match_map import MatchMapCache
 
 _LEAST_CHANGES: Final = 5
-"""A tile with fewer is told as it is."""
+"""A tile with fewer is reported as it is."""
 _MOST: Final = 0.5
-"""Where a shift explains so large a share of what changed, nothing of the tile is told."""
+"""Where a shift explains so large a share of what changed, the tile is not reported."""
 _FALLS: Final = 0.05
 """A voxel whose cost falls by this, to `_FITS`, is explained."""
 _FITS: Final = 0.3

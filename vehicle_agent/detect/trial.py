@@ -76,7 +76,7 @@ class Tried:
         points_map_m: (N, 3) sampled points that stand still.
         T_map_vehicle: (4, 4) a pose in its middle.
         scans: how many.
-        pose: how well the poses were said to be known, the worst of them.
+        pose: uncertainty of the poses as estimated, the worst of them.
     """
 
     shift: Shift
@@ -184,7 +184,7 @@ class Trial:
             self._passed = segment.scans
 
     def _try(self, scans: list[_TrialScan]) -> Tried:
-        """Ask the base map, and where that says "shifted" what was seen just before."""
+        """Test against the base map, and where that finds a shift against what was seen just before."""
         n = max(_LEAST_POINTS_OF_SCAN, _POINTS_OF_SEGMENT // len(scans))
         points = np.concatenate([some_of(held.points[~held.moving], held.centre_m, n) for held in scans])
         T = scans[len(scans) // 2].estimate.T_map_vehicle

@@ -1,4 +1,4 @@
-"""What the map teaches about the vehicle's own motion sensors, and how far to trust them until it has."""
+"""Calibration of the vehicle's own motion sensors by the map, and their uncertainty until then."""
 
 from dataclasses import dataclass
 from typing import Any, Final, NamedTuple
@@ -34,10 +34,10 @@ ODOMETRY_BIAS_DRIFT_RADPS: Final = 1e-05
 """Their change in a root second."""
 _STRETCH_M: Final = 0.03
 _STRETCH_RAD: Final = 0.002
-"""Of the motion over a second that two map matches tell."""
+"""Of the motion over a second by two map matches."""
 _LEAST_SCALE: Final = 0.0005
 _LEAST_BIAS_RADPS: Final = 7e-05
-"""The least sigma of what a stretch of submaps tells about scale and bias."""
+"""The least sigma of scale and bias as a stretch of submaps estimates them."""
 _EXCESS_GAIN: Final = 0.2
 """Weight of the newest step in the running judgement of how much worse than all this the odometry is."""
 
@@ -48,7 +48,7 @@ MAX_TRIM_RAD, KNOWN_COURSE_RAD = 1.05e-3, 6e-4
 WRONG_HEADING_RAD = float(np.radians(0.5))
 """Until the mount's yaw is known to be off by less, by two sigmas, no pose is called good."""
 OBSERVED_RAD, DISPUTABLE_RAD = float(np.radians(0.2)), float(np.radians(0.6))
-"""Once the course was observed so well, one sigma and the larger limit will do: recordings tell mounts, or mean axes,
+"""Once the course was observed so well, one sigma and the larger limit will do: recordings have mounts, or axes,
 that are turned by half a degree (KITTI 00: 0.5°, KITTI raw 0027: 0.2°)."""
 PATIENT_M = 5.0
 """Where no course is seen on so much of way, as in an open field, one sigma will do."""
@@ -103,7 +103,7 @@ class MotionCalibration:
 
     @property
     def mount_doubtful(self) -> tuple[MountDoubt, ...]:
-        """What the header says wrongly of the mount for certain: by more than 10 cm or 0.3°."""
+        """Axes in which the header's mount is certainly wrong: by more than 10 cm or 0.3°."""
         turned = abs(self.course_rad) - SIGMAS * self.course_sigma_rad > DOUBTFUL_RAD
         return (*self.mount.doubtful, "yaw") if turned else self.mount.doubtful
 
@@ -179,7 +179,7 @@ class MotionTeacher:
 
     @property
     def cause(self) -> Cause:
-        """What is wrong with the sensors whose errors are learnt, if anything."""
+        """Which of the sensors whose errors are learnt is wrong, if any."""
         return "mount" if self.mount_in_doubt else self.clock_cause
 
     @property
@@ -251,7 +251,7 @@ class MotionTeacher:
 
     @property
     def _course_known(self) -> bool:
-        """True when the matches of a whole stretch tell it."""
+        """True when the matches of a whole stretch have estimated it."""
         return bool(self._course_var < KNOWN_COURSE_RAD**2)
 
     def yaw_sigma_rad(self, trim_rad: float, least_rad: float) -> float:
@@ -272,7 +272,7 @@ class MotionTeacher:
 
     @property
     def yaw_in_doubt(self) -> bool:
-        """True while the course says that the mount's yaw is likely wrong and not yet by how much."""
+        """True while the course shows that the mount's yaw is likely wrong, but not yet by how much."""
         course_rad, sigma_rad = abs(self._course[0]), self._course[1]
         likely = course_rad > max(2.0 * DOUBTFUL_RAD, IN_DOUBT * sigma_rad)  # where the heading would be called wrong
         return likely and course_rad - SIGMAS * sigma_rad <= DOUBTFUL_RAD
@@ -290,8 +290,8 @@ class MotionTeacher:
     def see_step(
         self, first_ns: int, last_ns: int, T_driven: F64, seen: ScanStep | None, *, slipped: bool = False
     ) -> None:
-        """Take the motion between two scans: (4, 4) by wheels and gyro, and as the scans tell it, if they do. Wheels
-        that slip, or that the scans contradict (`slipped`), tell nothing of the clock.
+        """Take the motion between two scans: (4, 4) by wheels and gyro, and by the scans, if known. Wheels that
+        slip, or that the scans contradict (`slipped`), are no observation of the clock.
         """
         self._way_m += float(np.linalg.norm(T_driven[:3, 3]))
         slipped |= self._motion.slipped(first_ns, last_ns)
@@ -301,8 +301,8 @@ class MotionTeacher:
         self.first_course.see(seen)
 
     def learn(self, t_ns: int, T_map_vehicle: F64, covariance: F64) -> None:
-        """Take a trusted match and its covariance (6, 6): each step tells how good the odometry is, each stretch of
-        `STRETCH_S` what it is wrong by.
+        """Take a trusted match and its covariance (6, 6): each step shows how good the odometry is, each stretch of
+        `STRETCH_S` what its errors are.
         """
         now = Stamped(t_ns, T_map_vehicle)
         if self._last is not None and t_ns - self._last.t_ns < STEP_S * 1e9:

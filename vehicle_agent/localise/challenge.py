@@ -40,7 +40,7 @@ _LEAD: Final = 0.03
 _PRIOR: Final = 6.0
 """How much likelier the tracked pose is before anything is seen."""
 _MOST_VIEWS: Final = 8.0
-"""How many views may speak against it."""
+"""How many views may be against it."""
 _CONTESTED: Final = -2.0
 _BEATEN: Final = 4.0
 _DROPPED: Final = -12.0

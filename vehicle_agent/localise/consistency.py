@@ -1,4 +1,4 @@
-"""Whether an estimator's errors are as large as it says: NEES against a reference, NIS against its own prediction
+"""Whether an estimator's errors are as large as it claims: NEES against a reference, NIS against its own prediction
 (Bar-Shalom, Li and Kirubarajan 2001, section 5.4). Both are means over degrees of freedom: 1 is honest, more too sure.
 """
 
@@ -36,7 +36,7 @@ class Nees:
 
 
 def nees_of(estimates: Sequence[PoseEstimate], reference: Trajectory) -> Nees | None:
-    """Of the estimates that tell a covariance and lie within the reference's time; None without any."""
+    """Of the estimates that have a covariance and lie within the reference's time; None without any."""
     first, last = int(reference.t_ns[0]), int(reference.t_ns[-1])
     told = [(e, e.covariance) for e in estimates if e.covariance is not None and first <= e.t_ns <= last]
     if not told:

@@ -1,4 +1,4 @@
-"""From no pose to the first: search where GNSS says, follow what was found, answer when one pose has won."""
+"""The first pose: search around the GNSS position, follow the candidates, answer when one of them has won."""
 
 from dataclasses import dataclass, replace
 from typing import Final
@@ -25,7 +25,7 @@ _RETRY_S: Final = 0.8
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SearchPlace:
-    """Where GNSS says that the vehicle is: (3,) in the map frame, one sigma of an axis, and how far it may be off."""
+    """GNSS position of the vehicle: (3,) in the map frame, one sigma of an axis, and how far it may be off."""
 
     p_map_m: F64
     sigma_m: float
@@ -33,7 +33,7 @@ class SearchPlace:
 
 
 class FirstPose:
-    """The search for a pose while there is none; `cause` says why there is none yet."""
+    """The search for a pose while there is none; `cause`: why there is none yet."""
 
     def __init__(self, parameters: LocaliserParameters) -> None:
         self._par = parameters
@@ -51,7 +51,7 @@ class FirstPose:
             t_ns: of the scan.
             points_m: (N, 3) sampled points, vehicle frame, sweep motion removed.
             T_before_now: (4, 4) the motion since the scan before.
-            place: where GNSS says that the vehicle is now, None if it does not.
+            place: the vehicle's GNSS position now, None without one.
             maps: the map, linearised where it is needed.
         """
         new = self._pool.push(points_m, T_before_now)

@@ -5,8 +5,8 @@ the matches is no covariance: it takes points as independent. Here the pull of e
 its points, and the squares of these sums are the variance (cluster-robust "sandwich" covariance, Liang and Zeger 1986).
 Nothing is assumed of how large the errors are or how many points share one.
 
-A piece that decides alone fits itself: its pull is nought, and says nothing. So the squares of few pieces count for
-less than what all directions together say (`FEW`), and each piece is asked how it disagrees with the others
+A piece that decides alone fits itself: its pull is zero and shows nothing. So the squares of few pieces count for
+less than those of all directions together (`FEW`), and each piece is asked how it disagrees with the others
 (leave-one-out, `MOST_LEVERAGE`).
 """
 
@@ -24,7 +24,7 @@ from gnd.vehicle_agent.localise.registration import REGISTRATION_GATE_PER_SCALE,
 PIECE_M: Final = 2.0
 """Side of a piece of the map: neighbouring Gaussians of a wall share what its survey and its voxels are wrong by."""
 FEW: Final = 10.0
-"""Pieces whose squares count as much as what all directions together say."""
+"""Pieces whose squares count as much as those of all directions together."""
 MOST_LEVERAGE: Final = 0.5
 
 

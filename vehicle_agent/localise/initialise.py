@@ -42,7 +42,7 @@ STANDING_ABOVE_M: Final = 0.4
 
 U8 = NDArray[np.uint8]
 
-GROUND_RADIUS_M = 12.0  # map columns around the position that say how high and how steep the ground is
+GROUND_RADIUS_M = 12.0  # map columns around the position for height and slope of the ground
 HIGHEST_GROUND_M = 0.2  # above the origin of the vehicle frame
 HIT, NEXT_TO = 3, 1  # score of a point in a voxel with a Gaussian, in a neighbour of one
 SUPPRESS_M, SUPPRESS_DEG = 1.5, 8.0  # coarse hypotheses nearer than this converge to the same pose
@@ -335,7 +335,7 @@ def _answer(candidates: list[Candidate], n: int) -> InitialPose | None:
 def probabilities(fits: F64, views: float, penalties: F64 | float = 0.0) -> F64:
     """(K,) probabilities of poses with mean fits (K,) over so many views, beside that of being none of them.
 
-    `penalties` (K,) are logarithms taken off: what odometry and GNSS say against a pose.
+    `penalties` (K,) are logarithms taken off: from odometry and GNSS.
     """
     log = HYPOTHESIS_GAIN * views * (np.concatenate([fits, [_NONE_FIT]])) - np.append(penalties + 0.0 * fits, 0.0)
     weight = np.exp(log - log.max())

@@ -69,18 +69,18 @@ class Judge:
         self._place: SearchPlace | None = None
 
     def begin(self, points_m: F64, T_now: F64, place: SearchPlace | None, match_map: MatchMap) -> None:
-        """Take the first scan (N, 3) of the track, at its pose (4, 4), and where GNSS says that it is."""
+        """Take the first scan (N, 3) of the track, at its pose (4, 4), and its GNSS position."""
         self._pool.push(points_m, np.eye(4))
         self.uniqueness.see(self._pool.newest_standing_m, np.eye(4), T_now, place, match_map)
         self.monitor.unique = self.uniqueness.proven
 
     def see_position(self, p_map_m: F64, sigma_m: float, T_now: F64) -> None:
-        """Take where GNSS says that the vehicle, tracked at `T_now` (4, 4), is now: (3,), one sigma of an axis."""
+        """Take the GNSS position (3,) of the vehicle, tracked at `T_now` (4, 4), with one sigma of an axis."""
         self.monitor.see_fix(p_map_m[:2] - T_now[:2, 3], sigma_m)
         self._place = SearchPlace(p_map_m, sigma_m, INITIALISE_RADIUS_SIGMAS * sigma_m)
 
     def see(self, scan: Matched, match_map: MatchMap) -> None:
-        """Take a scan: what its rays say, how well it fits, whether another pose fits better."""
+        """Take a scan: evidence of its rays, how well it fits, whether another pose fits better."""
         if scan.motion_gap_s > _MOTION_GAP_S or self.monitor.gap_s(scan.t_ns) > _GAP_S:
             self.monitor.distrust()
             self.uniqueness.distrust(moved=scan.motion_gap_s > _MOTION_GAP_S)

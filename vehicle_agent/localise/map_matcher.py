@@ -69,7 +69,7 @@ class MapMatcher:
         return known.covariance, contested or weakest(result)[0] > UNSURE_M
 
     def by_wheels(self, T_map_vehicle: F64) -> MapMatch | None:
-        """Return what the wheels alone tell of a pose (4, 4): height and tilt; None where the map has no ground."""
+        """Return a pose (4, 4) with height and tilt by the wheels alone; None where the map has no ground."""
         m = self.maps.near(T_map_vehicle[:3, 3])
         return level.settled(T_map_vehicle, m, self._par, self._mounting.wheels_m)
 

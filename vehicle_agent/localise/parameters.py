@@ -34,7 +34,7 @@ class MatchRules:
         scales: Geman-McClure scales in sigmas, one a stage, wide to narrow, for a start that is known to some 10 cm:
             where the world has changed, a narrow kernel stays with what has not.
         correlation: so many points share one error (of the map, of the mount); multiplies the covariance.
-        floor_m, floor_rad: the least sigma claimed along an axis, whatever the Hessian says.
+        floor_m, floor_rad: the least sigma claimed along an axis, whatever the Hessian gives.
         degenerate_m: a direction whose sigma exceeds this (turns taken at 10 m) is reported and not moved along.
         max_iterations: of a stage.
         stop_m, stop_rad: a stage ends with a shorter step.

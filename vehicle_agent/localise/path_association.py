@@ -24,7 +24,7 @@ STEP_M: Final = 1.0
 LEVER_M: Final = 4.0
 """A heading is that between two places so far before and behind."""
 REACH_M: Final = 120.0
-"""The fixes may lie so much farther or less far along than their own way tells, at most."""
+"""The fixes may lie so much farther or less far along than by their own way, at most."""
 SLIP_COST: Final = 0.1
 """Of a slip by a metre, in squared radians of one place; headings differ by at most `MAX_TURN_RAD`."""
 MAX_TURN_RAD: Final = 0.7

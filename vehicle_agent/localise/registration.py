@@ -121,7 +121,7 @@ class Linearised:
 
     T_map_vehicle: (4, 4) where. scale: robust scale in sigmas. H, g: (6, 6) and (6,) of a small motion of the vehicle
     in its own frame, rotation [rad] first; points count as independent. cost: sum of robust costs; matched, inside:
-    points near a Gaussian, and in known voxels. told: (6, 6), the part of a motion that it tells.
+    points near a Gaussian, and in known voxels. told: (6, 6), projects a motion on the directions that are constrained.
     """
 
     T_map_vehicle: F64
@@ -148,8 +148,8 @@ def linearised(
 ) -> Linearised:
     """Points (N, 3) and the wheels (W, 3) on the map at a pose (4, 4); nothing is moved.
 
-    Horizontal directions about which the scan says next to nothing beside the others tell nothing: along an even wall
-    it is the noise of the map that speaks, and with many scans it would sum up.
+    Horizontal directions that the scan hardly constrains beside the others are left out: along an even wall it is the
+    noise of the map that fits, and with many scans that would add up.
     """
     T = np.asarray(T_map_vehicle, dtype=np.float64)
     state = _State(T[:3, :3].copy(), T[:3, 3].copy(), np.zeros((6, 6)), np.zeros(6), wheels_m)
@@ -236,8 +236,8 @@ def _linearise(points: F64, s: _State, m: MatchMap, par: RegistrationParameters,
 
 def _add_wheels(s: _State, m: MatchMap, par: RegistrationParameters, scale: float) -> int:
     """The wheels stand on the map's ground: points of their own weight, as uncertain as springs and tyres are; gives
-    how many do. They tell height, roll and pitch only: of a road of which the map holds single rings, its Gaussians
-    would tell where the rings lie.
+    how many do. They constrain height, roll and pitch only: of a road of which the map holds single rings, its
+    Gaussians would give where the rings lie.
     """
     if par.rules.wheel_sigma_m <= 0:
         return 0
@@ -284,7 +284,7 @@ def _principal(H: F64) -> tuple[F64, F64, F64]:
 
 def _strong(values: F64, vectors: F64, par: RegistrationParameters) -> NDArray[np.bool_]:
     """(6,) which principal directions are constrained: by enough information, and a horizontal one by more than what
-    the noise of a map says along an even wall.
+    the noise of a map gives along an even wall.
     """
     horizontal = vectors[3] ** 2 + vectors[4] ** 2 > 0.5
     least = par.rules.correlation / par.rules.degenerate_m**2

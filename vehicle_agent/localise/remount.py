@@ -1,4 +1,4 @@
-"""The mount as it is used: the header's, put right where the ground says that it is certainly wrong.
+"""The mount as it is used: the header's, corrected where the ground shows that it is certainly wrong.
 
 While a pose is tracked, points and poses stay in the axes that they were matched in, so that no track is torn: the
 LiDAR's place on the map does not depend on the mount. What depends on it is where the vehicle is from there, and where
@@ -18,11 +18,11 @@ from gnd.vehicle_agent.localise.registration import WHEELS_M
 
 TRUSTED_RAD: Final = float(np.radians(0.3))
 TRUSTED: Final = MountSigma(0.05, TRUSTED_RAD, TRUSTED_RAD, TRUSTED_RAD)
-"""One sigma of a header that does not say how well its mount is known."""
+"""One sigma of a header without uncertainty of its mount."""
 BROKEN_SHARE: Final = 0.05
 BROKEN_RAD: Final = float(np.radians(1.0))
 MEANT_RAD: Final = float(np.radians(0.15))
-"""Of headers that do not say how well they are known, one in twenty is wrong by a degree (one sigma); axes of the
+"""Of headers without an uncertainty, one in twenty is wrong by a degree (one sigma); axes of the
 others may mean something else than the axle's by so much, and are right by what they mean."""
 UNKNOWN_RAD: Final = float(np.radians(5.0))
 """One sigma of an angle that nobody knows."""
@@ -92,7 +92,7 @@ def _density(value: float, sigma: float) -> float:
 
 
 class Mounting:
-    """The header's mount, what the ground says against it, and what is used."""
+    """The header's mount, its error as observed on the ground, and the mount that is used."""
 
     def __init__(self, T_vehicle_lidar: F64, sigma: MountSigma = TRUSTED) -> None:
         """`sigma`: how far the header's mount is known."""
@@ -107,7 +107,7 @@ class Mounting:
 
     @property
     def residual(self) -> MountResidual:
-        """What the ground says, true minus header."""
+        """The error observed on the ground, true minus header."""
         return self.watch.residual
 
     def see(self, t_ns: int, points_m: F64) -> None:

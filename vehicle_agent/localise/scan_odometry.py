@@ -2,7 +2,7 @@
 
 The scans before are kept as Gaussians in a rolling map (some 20 m of way). A step that lies far from the prediction,
 or that rests on too few points, is not given. Experience with odometry of recordings (`importers.lidar_odometry`) holds
-here too: voxels that hold one or two rings of a scan say where the rings are, not where the ground is.
+here too: voxels that hold one or two rings of a scan show where the rings are, not where the ground is.
 """
 
 from collections.abc import Callable
@@ -72,7 +72,7 @@ class SteadyMotion(NamedTuple):
 
 
 class ScanStep(NamedTuple):
-    """The motion between two scans as the scans tell it.
+    """The motion between two scans by the scans.
 
     T_before_now: (4, 4). covariance: (6, 6) of a small motion of the vehicle at its later end, rotation [rad] first,
     then position [m], along its own axes (as GTSAM's BetweenFactorPose3 takes it); directions that the scans do not
@@ -87,7 +87,7 @@ class ScanStep(NamedTuple):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class JointStep:
-    """What wheels, gyro and scans say together.
+    """The motion by wheels, gyro and scans together.
 
     T_before_now: (4, 4), each believed by its covariance. driven_sigmas: (6,) sigmas of wheels and gyro, grown where
     the scans contradict them. slipped: they do.
@@ -99,7 +99,7 @@ class JointStep:
 
 
 def joint_step(T_driven: F64, sigmas: F64, step: ScanStep | None) -> JointStep:
-    """Put together the motion (4, 4) with `sigmas` (6,) that wheels and gyro tell, and what scans tell, if anything."""
+    """Put together the motion (4, 4) with `sigmas` (6,) by wheels and gyro, and that by scans, if known."""
     if step is None:
         return JointStep(T_driven, sigmas, False)
     off = _log(T_inverse(T_driven) @ step.T_before_now)
@@ -174,7 +174,7 @@ class ScanOdometry:
             points_vehicle_m: (N, 3) float64 sampled points, sweep motion removed.
             T_before_now_predicted: (4, 4) motion since the scan before by wheel speed and yaw rate.
             sigmas: (6,) its sigmas, rotation [rad] first, then position [m].
-            points_going_on: gives the points with the motion removed that `steady` says; asked when the wheels slip.
+            points_going_on: gives the points with the motion `steady` removed; called when the wheels slip.
         """
         if self._before_ns is None or not 0 < t_ns - self._before_ns <= _MAX_GAP_S * 1e9:
             self.begin(t_ns, points_vehicle_m)
@@ -211,7 +211,7 @@ class ScanOdometry:
         return np.array([_STEADY_RAD] * 3 + [_STEADY_M] * 3)
 
     def _matched(self, driven: _Prediction, going_on: Callable[[], _Prediction] | None) -> _ScanMatch | None:
-        """The match near to what wheels and gyro say, or near to going on as before: that comes first while the
+        """The match near the motion by wheels and gyro, or near that of going on as before: that comes first while the
         wheels slip.
         """
         if going_on is None:

@@ -19,7 +19,7 @@ STANDING_M = 0.02  # between two scans
 
 
 class ScanPool:
-    """Points of the newest scan and of some before it, moved along by odometry: a four-layer scan alone says little.
+    """Points of the newest scan and of some before it, moved along by odometry: a four-layer scan alone holds little.
 
     Scans enter every so many metres, and leave after so many; a standing vehicle's pool is its newest scan.
     """

@@ -28,7 +28,7 @@ BIAS, SCALE, LEFT, UP = range(N_SHARED)
 STEP_CHI2: Final = 12.6
 """Of a step's six residuals, from where on it counts less: 95 % of right ones lie below."""
 MOST_SQUARE: Final = 9.0
-"""Of a residual in sigmas, as far as one step may say that all are worse: a slip does not, many of 3 sigmas do."""
+"""Of a residual in sigmas, as far as one step may raise the noise of all: a slip does not, many of 3 sigmas do."""
 TORN_WEIGHT: Final = 0.1
 """Robust weight below which a measured motion ties nothing."""
 SMALL_M, SMALL_RAD = 2e-3, 2e-4
@@ -38,10 +38,10 @@ STOP_M, STOP_RAD = 1e-3, 5e-5
 
 @dataclass(frozen=True, slots=True, eq=False)
 class StretchStep:
-    """Motion from one scan of the stretch to the next, as odometry tells it.
+    """Motion from one scan of the stretch to the next, by odometry.
 
     T_before_now: (4, 4). covariance: (6, 6) of a small motion of the later vehicle, rotation [rad] first. shared: (6,
-    N_SHARED) how this motion would differ if the shared parameters were larger by one; zeros for what scans tell.
+    N_SHARED) how this motion would differ if the shared parameters were larger by one; zeros for steps between scans.
     """
 
     T_before_now: F64
@@ -153,7 +153,7 @@ def marginalised(
     shared: F64,
     registration: RegistrationParameters,
 ) -> StretchBelief:
-    """What all knots but the last one tell about the last one and the shared parameters (Schur complement).
+    """The belief about the last knot and the shared parameters by all knots before it (Schur complement).
 
     The match of the last knot is not part of it: it stays with the stretch that goes on there.
     """

@@ -75,7 +75,7 @@ def left_in_sweep(variance: F64) -> F64:
 
 
 class Sweeps:
-    """Removes the motion of sweeps from their points, and tells what of it is left.
+    """Removes the motion of sweeps from their points, and gives the uncertainty that is left of it.
 
     Args:
         motion: of wheels and gyro.

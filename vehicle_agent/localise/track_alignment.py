@@ -1,4 +1,4 @@
-"""Fixes, and the rigid pose that lays a local track over them whatever a minority of them says.
+"""Fixes, and the rigid pose that lays a local track over them, robust to a minority of them.
 
 Iterated weights, the scale of the robust cost lowered step by step, so that a third of the fixes may be wild (graduated
 non-convexity, Yang et al., RA-L 2020, with the Geman-McClure cost); never below what the track's own drift asks for.

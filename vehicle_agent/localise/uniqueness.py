@@ -44,7 +44,7 @@ _UNPROVEN_M: Final = 3.0
 _PROVEN_M: Final = 20.0
 """Way between two tests."""
 _REACH_M: Final = 7.5
-"""Around the tracked pose where GNSS tells nothing."""
+"""Around the tracked pose without GNSS."""
 _TURN_DEG: Final = 10.0
 """Headings within this of the tracked one, all as long as less than `course_m` have been driven."""
 _COURSE_M: Final = 8.0
@@ -64,8 +64,10 @@ _LOST: Final = 3.0
 
 FARTHEST_M: Final = 60.0  # a far point is moved by more than a patch when odometry turns by a degree or two
 WON_IN_A_ROW: Final = 3
-LEAST_SQUARES: Final = 0.25  # added to sum(d^2): where next to nothing differs, nothing is told
-TOLD: Final = 1.0  # sigmas by which poses a little before and behind must fit worse for the map to tell the place along
+LEAST_SQUARES: Final = 0.25  # added to sum(d^2): where next to nothing differs, nothing is decided
+TOLD: Final = (
+    1.0  # sigmas by which poses a little before and behind must fit worse: the map constrains the place along
+)
 SEEN_BY: Final = 0.3  # least way between two fixes that are remembered, as share of the view
 
 
@@ -116,7 +118,7 @@ class ScanView:
             self._fixes.popleft()
 
     def see_position(self, p_map_m: F64, reach_m: float) -> None:
-        """Take where GNSS says that the vehicle is now: (3,) in the map, and how far it may be off."""
+        """Take the GNSS position now: (3,) in the map, and how far it may be off."""
         if self._T is None:
             return
         if len(self._fixes) > 1 and self._fixes[-1].way_m - self._fixes[-2].way_m < SEEN_BY * self._reach_m:
@@ -135,14 +137,14 @@ class ScanView:
 
     @property
     def place(self) -> tuple[F64, float] | None:
-        """Where the newest fix says that the vehicle is now, (3,), odometry since then added as a reach; or None."""
+        """The newest GNSS position moved on to now, (3,), odometry since then added as a reach; or None."""
         if not self._fixes or self._T is None:
             return None
         fix = self._fixes[-1]
         return fix.p_map_m, fix.reach_m + float(np.hypot(*(self._T[:2, 3] - fix.p_odom_m[:2])))
 
     def allowed(self, T_map_vehicle: F64, T_tracked: F64) -> bool:
-        """True when GNSS allows the pose (4, 4), or speaks no more against it than against the tracked one."""
+        """True when GNSS allows the pose (4, 4), or is no farther from it than from the tracked one."""
         if self._T is None:
             return True
         for fix in self._fixes:
@@ -195,7 +197,7 @@ class Uniqueness:
             standing_m: (K, 3) points that stand above the ground, vehicle frame.
             T_before_now: (4, 4) motion since the one before.
             T_tracked: (4, 4) the tracked pose.
-            place: where a new fix says that the vehicle is now.
+            place: a new GNSS position.
             match_map: the map window.
             believed: whether the scan's match is; what is not matched is not compared.
         """
@@ -211,7 +213,7 @@ class Uniqueness:
 
     @property
     def untold_m(self) -> float:
-        """Way since the map last told the place along it: in a smooth tunnel odometry alone knows it."""
+        """Way since the map last constrained the place along it: in a smooth tunnel odometry alone knows it."""
         return self._view.way_m - self._told_m if self._told_m < self._tested_m else 0.0
 
     @property
@@ -253,7 +255,7 @@ class Uniqueness:
         return least(others) if others else ahead(fits, patches, _FULL_POINTS)
 
     def _elsewhere(self, points: F64, own: F64, match_map: MatchMap) -> list[F64]:
-        """Other poses (4, 4) about where GNSS says, as good as registration can make them."""
+        """Other poses (4, 4) around the GNSS position, as good as registration can make them."""
         place = self._view.place
         turn_rad = np.radians(_TURN_DEG) if self._view.way_m >= _COURSE_M else np.pi
         p_m, reach_m = (own[:3, 3], _REACH_M) if place is None else place
@@ -264,7 +266,7 @@ class Uniqueness:
 
     def _beside(self, points: F64, own: F64, match_map: MatchMap, axis: int) -> list[F64]:
         """The same from a little before and behind (axis 0), or to the left and right (1): a search may leave them out,
-        and where the map does not tell the place along that axis, they stay there.
+        and where the map does not constrain the place along that axis, they stay there.
         """
         poses = []
         for side_m in (_BESIDE_M, -_BESIDE_M):
@@ -322,7 +324,7 @@ def ahead(difference: F64, patches: I64, full_points: int) -> float:
 
 
 def ahead_of_both(difference: F64, patches: I64, high: NDArray[np.bool_], full_points: int) -> float:
-    """By how many sigmas a pose is ahead of another, by all points or by the `high` (N,) ones, whichever say more.
+    """By how many sigmas a pose is ahead of another, by all points or by the `high` (N,) ones, whichever are clearer.
 
     What stands higher than a car stays where it is: where many cars have left, they only add noise to what a few lamps
     know.

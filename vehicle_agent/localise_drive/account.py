@@ -1,4 +1,4 @@
-"""What a localised drive came to, as plain values and as tables for people."""
+"""The results of a localised drive, as plain values and as tables for people."""
 
 from collections.abc import Sequence
 from typing import Any, Final
@@ -67,7 +67,7 @@ def _initialisation_s(drive: LocalisedDrive) -> float | None:
 
 
 def _sigma(estimates: Sequence[PoseEstimate]) -> dict[str, float] | None:
-    """What the localiser itself says: median and largest one-sigma."""
+    """The localiser's own uncertainty: median and largest one-sigma."""
     if not estimates:
         return None
     m, deg = np.array([(e.sigma_m, np.degrees(e.sigma_rad)) for e in estimates]).T
@@ -155,7 +155,7 @@ def _clock(values: dict[str, Any]) -> str:
 
 
 def _mount_used(values: dict[str, Any]) -> str:
-    """The mount that the header tells, and the one that is used where that is another."""
+    """The mount of the header, and the one that is used where that is another."""
     told, used = values["mount_told"], values["mount_used"]
     form = "LiDAR {height_m:.2f} m above the road, roll {roll_deg:.2f}°, pitch {pitch_deg:.2f}°, yaw {yaw_deg:.2f}°"
     said = [form.format(**mount) for mount in (told, used)]

@@ -122,7 +122,7 @@ def find_loops(
         T: (N, 4, 4) where they are thought to be.
         tried: of `pairs`.
         sigma_m: one sigma of how a pair lies to each other.
-        progress: told how many pairs are done, of how many.
+        progress: called with how many pairs are done, of how many.
     """
     found: list[Loop] = []
     fate = {"poor": 0, "ambiguous": 0, "one_way": 0}
@@ -189,7 +189,7 @@ def _back(anchors: PoseAnchors, early: int, late: int, T_late_early: F64) -> F64
 
 
 def _has_a_friend(loop: Loop, loops: Sequence[Loop], anchors: PoseAnchors, T: F64) -> bool:
-    """Whether another loop of neighbouring anchors says the same, carried over by the poses between neighbours."""
+    """Whether another loop of neighbouring anchors agrees, carried over by the poses between neighbours."""
     return any(_agree(loop, other, anchors, T) for other in _neighbours(loop, loops, anchors))
 
 

@@ -1,4 +1,4 @@
-"""Poses of all drives made one: loops found, the graph solved, found again from there, solved again, and told.
+"""Poses of all drives made one: loops found, the graph solved, found again from there, solved again, and reported.
 
 Where passes agree already (poses from a survey, or from this very refinement), nothing is changed: a graph can only add
 the error of its loops to poses that are better.
@@ -20,7 +20,6 @@ from gnd.vehicle_agent.map_build.pose_graph import GNSS_CORRELATION_S, GnssTies,
 from gnd.vehicle_agent.map_build.survey import DriveSurvey, Progress
 
 RefineMode = Literal["auto", "always", "never"]
-MODES: Final[tuple[RefineMode, ...]] = ("auto", "always", "never")
 
 AGREE_M, AGREE_UP_M, AGREE_DEG = 0.05, 0.10, 0.15
 """Median disagreement of passes below which poses are left alone: what the match of two clouds itself is off by."""
@@ -34,7 +33,7 @@ _S: Final = 1e-9
 
 @dataclass(frozen=True, slots=True)
 class PassDrift:
-    """Disagreement of passes with what their loops say: medians and 95 % quantiles over `loops` loops."""
+    """Disagreement of passes with their loops: medians and 95 % quantiles over `loops` loops."""
 
     loops: int
     horizontal_m: float
@@ -143,7 +142,7 @@ def _told(progress: Progress, what: str) -> Callable[[int, int], None]:
 
 
 def drift(T: F64, loops: Sequence[Loop]) -> PassDrift | None:
-    """How far poses T (N, 4, 4) are from what loops say; None without loops."""
+    """How far poses T (N, 4, 4) are from their loops; None without loops."""
     if not loops:
         return None
     seen = np.stack([loop.T_early_late for loop in loops])

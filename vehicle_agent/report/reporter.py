@@ -1,7 +1,7 @@
 """From evidence to the outbox: tiles that the vehicle has left are decided, and reported soon where they have changed.
 
-A report costs some 160 B beside what it says. So a tile in which much has changed waits a moment for those that are
-left with it, scattered voxels for others, and ground that is as the map says for the end of the district, or for long.
+A report costs some 160 B beside its content. So a tile in which much has changed waits a moment for those that are
+left with it, scattered voxels for others, and unchanged ground for the end of the district, or for long.
 """
 
 import logging
@@ -61,7 +61,7 @@ _log = logging.getLogger(__name__)
 
 @dataclass(frozen=True, slots=True)
 class Identity:
-    """What every report of a drive says about who made it."""
+    """Who made a report: the same in every report of a drive."""
 
     vehicle: str
     drive_id: str
@@ -143,8 +143,8 @@ class Reporter:
     Report ids are made of vehicle, drive, district and the report's number in it, so a restarted agent, which drives
     its recording again, makes the same ids; where it would put other tiles together than in its first life, each is
     stated once all the same. New Gaussians are moved onto the lattice that they travel on, so that the
-    short form of a report and the whole one say the same, to the bit. `course` gives where the vehicle drives in its
-    own frame, as far as it knows; `statement` what is said of a tile, by default `statement_on_lattice`.
+    short form of a report and the whole one are equal to the bit. `course` gives where the vehicle drives in its
+    own frame, as far as it knows; `statement` makes the content of a tile, by default `statement_on_lattice`.
     """
 
     def __init__(
@@ -182,7 +182,7 @@ class Reporter:
         self._shifted = 0
 
     def add_scan(self, segmented: SegmentedScan) -> None:
-        """Count the scan's rays, if its pose is good enough to speak about the world and has stood the shift test."""
+        """Count the scan's rays, if its pose is good enough for evidence and has stood the shift test."""
         estimate = segmented.scan.estimate
         pose, most = PoseUncertainty.of(estimate), self._parameters
         if estimate.health != "good" or pose.sigma_m > most.max_sigma_m or pose.sigma_rad > most.max_sigma_rad:
@@ -214,7 +214,7 @@ class Reporter:
         return shifted
 
     def _remember(self, segmented: SegmentedScan, what: str) -> None:
-        """Which tiles a scan saw of whose pose something is to be said."""
+        """Tiles seen by a scan whose pose is to be noted."""
         scan = segmented.scan
         if len(scan.points_map_m):
             centre = scan.origins_map_m[0]
@@ -349,7 +349,7 @@ class Reporter:
         pending.add(change, base, odometer_m, self._here_ns)
 
     def _report(self, district: District) -> None:
-        """One report of what is told, and one of what is held back: the short form would call its voxels observed."""
+        """One report of what is sent, and one of what is held back: the short form would call its voxels observed."""
         pending = self._pending.pop(district)
         if pending.changed_ns is not None:
             self._reported_ns = self._here_ns
@@ -418,7 +418,7 @@ class Reporter:
 
 
 def statement_on_lattice(found: Classification) -> TileChange:
-    """What a report says of a tile: its classes, and its new Gaussians on the lattice on which they travel."""
+    """The content of a report about a tile: its classes, and its new Gaussians on the lattice on which they travel."""
     return on_lattice(tile_change(found))
 
 

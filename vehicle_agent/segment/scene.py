@@ -21,7 +21,7 @@ _COLUMN_DEG: Final = 0.3
 _ROW_DEG: Final = 0.4
 """Height of their rows at the horizon; rows are even in the tangent of the elevation."""
 _REACH_ACROSS_M: Final = 0.15
-"""How far from a point a ray may pass at its side and still speak about it."""
+"""How far from a point a ray may pass at its side and still be evidence about it."""
 _REACH_UP_M: Final = 0.3
 """The same above and below: layers are far apart."""
 _MARGIN_M: Final = 0.45
@@ -75,7 +75,7 @@ class RangeImage:
     def vote(self, t_ns: int, objects: "Objects", centre_m: F64, judge: RangeJudge) -> None:
         """Vote on the objects of the scan at `t_ns`, whose points are relative to `centre_m`.
 
-        What moves may still cover its own place for a while: a return there says the more the longer after.
+        What moves may still cover its own place for a while: a return there counts the more the longer after.
         """
         share = min(1.0, abs(t_ns - self.t_ns) / (_SETTLED_S * NS))
         weight = max(1, round(share * WEIGHTS))
@@ -125,7 +125,7 @@ class GroundMap:
     def around(self, points: F32, centre_m: F64, T_map_vehicle: F64, tan_low: float) -> tuple[F32, GroundGrid]:
         """Heights of the ground relative to `centre_m`, and their grid, with points (N, 3) relative to it just seen.
 
-        `tan_low`: tangent of the lowest elevation, which tells from where on the sensor sees the ground.
+        `tan_low`: tangent of the lowest elevation, from which follows where the sensor begins to see the ground.
         """
         self._move(np.floor(centre_m[:2] / self._cell_m).astype(np.int64) - self._half)
         x0, y0 = self._corner * self._cell_m - centre_m[:2]

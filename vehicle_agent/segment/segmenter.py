@@ -84,7 +84,7 @@ class MotionSegmenter:
         self._gap_tan, self._tan_low = 0.0, -np.inf
 
     def push(self, scan: RefinedScan) -> list[SegmentedScan]:
-        """Take a scan; give those that no later scan will say anything about any more, oldest first."""
+        """Take a scan; give those that no later scan is compared with any more, oldest first."""
         if not self.parameters.enabled:
             return [SegmentedScan(scan, np.zeros(len(scan.points_map_m), np.bool_))]
         p = self.parameters
