@@ -65,9 +65,7 @@ _LOST: Final = 3.0
 FARTHEST_M: Final = 60.0  # a far point is moved by more than a patch when odometry turns by a degree or two
 WON_IN_A_ROW: Final = 3
 LEAST_SQUARES: Final = 0.25  # added to sum(d^2): where next to nothing differs, nothing is decided
-TOLD: Final = (
-    1.0  # sigmas by which poses a little before and behind must fit worse: the map constrains the place along
-)
+TOLD: Final = 1.0  # sigmas by which poses a little before and behind must fit worse: the map constrains the place along
 SEEN_BY: Final = 0.3  # least way between two fixes that are remembered, as share of the view
 
 
