@@ -60,7 +60,7 @@ def drive_beside(scene, off_m, last_x_m, parameters=None):
         moved = pose(STEP_M if k else 0.0, 0.0, 0.0, z=0.0)
         place = SearchPlace(np.array([x + 2.0, -1.0, 0.0]), 2.5, 7.5)
         unique.see(seen, moved, pose(x + off_m, 0.0, 0.0), place, maps.near(np.array([x, 0.0, 0.0])))
-        told.append((x, unique.proven, unique.margin, unique.beaten, unique.untold_m))
+        told.append((x, unique.proven, unique.margin, unique.beaten, unique.unconstrained_m))
     return told
 
 
@@ -113,7 +113,7 @@ def test_a_smooth_corridor_proves_nothing_but_does_not_take_a_proof_away():
         see(float(x))
     assert unique.proven
     assert abs(unique.margin) < 2.0
-    assert unique.untold_m > 30.0  # odometry alone knows the place along
+    assert unique.unconstrained_m > 30.0  # odometry alone knows the place along
     unique.distrust(moved=True)
     assert not unique.proven
 

@@ -86,7 +86,7 @@ class MotionCalibration:
     course_rad: float
     course_sigma_rad: float
     mount: MountResidual
-    mount_told: F64 | None = None
+    mount_header: F64 | None = None
     """(4, 4) the header's T_vehicle_lidar."""
     mount_used: F64 | None = None
     """(4, 4) what it is taken to be: the header's where that is not certainly wrong."""
@@ -111,17 +111,17 @@ class MotionCalibration:
         """Plain values, angles in degrees; None where nothing is known."""
         mount = self.mount
         return {
-            "time_offset_s": _told(self.time_offset_s, self.time_offset_sigma_s),
+            "time_offset_s": _with_sigma(self.time_offset_s, self.time_offset_sigma_s),
             "time_offset_rate": round(self.time_offset_rate, 7),
             "clock_doubt": self.clock_doubt,
-            "wheel_scale": _told(self.wheel_scale, self.wheel_scale_sigma),
-            "yaw_bias_degps": _told(np.degrees(self.gyro_bias_radps), np.degrees(self.gyro_bias_sigma_radps)),
-            "mount_height_m": _told(mount.height_m, mount.height_sigma_m),
-            "mount_roll_deg": _told(np.degrees(mount.roll_rad), np.degrees(mount.roll_sigma_rad)),
-            "mount_pitch_deg": _told(np.degrees(mount.pitch_rad), np.degrees(mount.pitch_sigma_rad)),
-            "mount_yaw_deg": _told(np.degrees(self.mount_yaw_rad), np.degrees(self.course_sigma_rad)),
+            "wheel_scale": _with_sigma(self.wheel_scale, self.wheel_scale_sigma),
+            "yaw_bias_degps": _with_sigma(np.degrees(self.gyro_bias_radps), np.degrees(self.gyro_bias_sigma_radps)),
+            "mount_height_m": _with_sigma(mount.height_m, mount.height_sigma_m),
+            "mount_roll_deg": _with_sigma(np.degrees(mount.roll_rad), np.degrees(mount.roll_sigma_rad)),
+            "mount_pitch_deg": _with_sigma(np.degrees(mount.pitch_rad), np.degrees(mount.pitch_sigma_rad)),
+            "mount_yaw_deg": _with_sigma(np.degrees(self.mount_yaw_rad), np.degrees(self.course_sigma_rad)),
             "mount_doubtful": list(self.mount_doubtful),
-            "mount_told": _mount_json(self.mount_told),
+            "mount_told": _mount_json(self.mount_header),
             "mount_used": _mount_json(self.mount_used),
         }
 
@@ -224,7 +224,7 @@ class MotionTeacher:
             course_rad=float(motion.course[0]),
             course_sigma_rad=self._course[1],
             mount=self.mount.residual,
-            mount_told=self.mount.T_header,
+            mount_header=self.mount.T_header,
             mount_used=self.mount.T_vehicle_lidar(-self.header_trim_rad),
         )
 
@@ -367,7 +367,7 @@ class MotionTeacher:
         self._bias_var *= 1.0 - gain * dt_s
 
 
-def _told(value: float, sigma: float) -> dict[str, float] | None:
+def _with_sigma(value: float, sigma: float) -> dict[str, float] | None:
     return {"value": round(float(value), 6), "sigma": round(float(sigma), 6)} if np.isfinite(sigma) else None
 
 

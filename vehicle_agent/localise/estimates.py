@@ -23,14 +23,16 @@ Cause = Literal[
 class PoseEstimate:
     """The vehicle's pose at `t_ns` in the map frame.
 
-    sigma_m: larger one of the two horizontal one-sigma axes; sigma_rad: one sigma of the heading; matching_ratio: share
-    of the scan's points that met a Gaussian of the map (0 when the scan was not matched).
-    cause: why the health is what it is; "stale_map" also goes with good health, all else with degraded or lost.
-    degenerate: directions that neither the scan nor the map constrains and the pose is dead reckoned along, of
-    "longitudinal", "lateral", "vertical", "roll", "pitch", "heading".
-    covariance: (6, 6) of the pose in the vehicle frame, rotation (rad) before position (m); None where only the sigmas
-    are known.
-    disagrees: the refined pose lay farther from the online one than both are uncertain.
+    Attributes:
+        sigma_m: larger one of the two horizontal one-sigma axes.
+        sigma_rad: one sigma of the heading.
+        matching_ratio: share of the scan's points that met a Gaussian of the map (0 when the scan was not matched).
+        cause: why the health is what it is; "stale_map" also goes with good health, all else with degraded or lost.
+        degenerate: directions that neither the scan nor the map constrains and the pose is dead reckoned along, of
+            "longitudinal", "lateral", "vertical", "roll", "pitch", "heading".
+        covariance: (6, 6) of the pose in the vehicle frame, rotation (rad) before position (m); None where only the
+            sigmas are known.
+        disagrees: the refined pose lay farther from the online one than both are uncertain.
     """
 
     t_ns: int

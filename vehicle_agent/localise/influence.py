@@ -80,7 +80,7 @@ def _of_pieces(pull: F64, weight: F64) -> Influence:
 
 def _add(pull: F64, weight: F64, scan: SeenScan, match_map: MatchMap) -> None:
     R, t = scan.match.T_map_vehicle[:3, :3], scan.match.T_map_vehicle[:3, 3]
-    v = scan.v @ scan.match.told.T
+    v = scan.v @ scan.match.constrained.T
     along_map = np.concatenate([v[:, :3] @ R.T, v[:, 3:] @ R.T], axis=1)
     m, scale = match_map, scan.match.scale
     pulls(

@@ -38,10 +38,16 @@ LEVER_M = 10.0  # a turn moves the points that constrain it by about this times 
 class RegistrationResult:
     """A pose and how far to believe it.
 
-    T_map_vehicle: (4, 4). covariance: (6, 6) of a small motion of the vehicle in its own frame, rotation [rad] first,
-    then position [m] (GTSAM's order). matching_ratio: matched share of the points in known voxels. fit: 1 - mean robust
-    cost, 0 ... 1. known_ratio: share of the points that fell into known voxels. degenerate: (K, 6) unit directions
-    (rotation at 10 m, position; vehicle frame) that the scan does not constrain and along which nothing was moved.
+    Attributes:
+        T_map_vehicle: (4, 4).
+        covariance: (6, 6) of a small motion of the vehicle in its own frame, rotation [rad] first, then position [m]
+            (GTSAM's order).
+        matching_ratio: matched share of the points in known voxels.
+        fit: 1 - mean robust cost, 0 ... 1.
+        known_ratio: share of the points that fell into known voxels.
+        iterations: 0: a pose from outside, not of a match.
+        degenerate: (K, 6) unit directions (rotation at 10 m, position; vehicle frame) that the scan does not constrain
+            and along which nothing was moved.
     """
 
     T_map_vehicle: F64
@@ -119,9 +125,14 @@ def register(
 class Linearised:
     """The cost of points on the map around one pose, to second order.
 
-    T_map_vehicle: (4, 4) where. scale: robust scale in sigmas. H, g: (6, 6) and (6,) of a small motion of the vehicle
-    in its own frame, rotation [rad] first; points count as independent. cost: sum of robust costs; matched, inside:
-    points near a Gaussian, and in known voxels. told: (6, 6), projects a motion on the directions that are constrained.
+    Attributes:
+        T_map_vehicle: (4, 4) the pose.
+        scale: robust scale in sigmas.
+        H, g: (6, 6) and (6,) of a small motion of the vehicle in its own frame, rotation [rad] first; points count as
+            independent.
+        cost: sum of robust costs.
+        matched, inside: points near a Gaussian, and in known voxels.
+        constrained: (6, 6), projects a motion on the directions that the points constrain.
     """
 
     T_map_vehicle: F64
@@ -131,7 +142,7 @@ class Linearised:
     cost: float
     matched: int
     inside: int
-    told: F64
+    constrained: F64
 
     def fit(self, scale: float) -> float:
         """1 - mean robust cost of the points in known voxels, 0 ... 1."""
@@ -162,8 +173,17 @@ def linearised(
     turn = np.zeros((6, 6))
     turn[:3, :3] = turn[3:, 3:] = state.R
     H, g = turn.T @ state.H @ turn, turn.T @ state.g
-    told = _without_hints(H)
-    return Linearised(T.copy(), scale, told.T @ H @ told, told.T @ g, state.cost, state.matched, state.inside, told)
+    constrained = _without_hints(H)
+    return Linearised(
+        T.copy(),
+        scale,
+        constrained.T @ H @ constrained,
+        constrained.T @ g,
+        state.cost,
+        state.matched,
+        state.inside,
+        constrained,
+    )
 
 
 def _without_hints(H: F64) -> F64:
@@ -173,9 +193,9 @@ def _without_hints(H: F64) -> F64:
     values, vectors, scale = _principal(H)
     horizontal = vectors[3] ** 2 + vectors[4] ** 2 > 0.5
     strongest = float(values[horizontal].max(initial=0.0))
-    told = ~horizontal | (values > _DEGENERATE_SHARE * strongest)
-    along = vectors[:, told]
-    return np.eye(6) if told.all() else np.asarray((along @ along.T) * scale[:, None] / scale)
+    constrained = ~horizontal | (values > _DEGENERATE_SHARE * strongest)
+    along = vectors[:, constrained]
+    return np.eye(6) if constrained.all() else np.asarray((along @ along.T) * scale[:, None] / scale)
 
 
 def fit_of(points_m: F64, T_map_vehicle: F64, match_map: MatchMap, parameters: RegistrationParameters) -> float:

@@ -102,7 +102,7 @@ class Mounting:
         self.sigma = MountSigma(sigma.height_m, *(min(angle, UNKNOWN_RAD) for angle in sigma[1:]))
         """Of the header."""
         self.watch = MountWatch(self.T_header)
-        self._looks = 0
+        self._watched = 0
         self._put_right = np.zeros(3, np.bool_)
 
     @property
@@ -112,7 +112,7 @@ class Mounting:
 
     def see(self, t_ns: int, points_m: F64) -> None:
         """Take a scan that is due: points (N, 3) in the axes of `T_used`, sweep motion removed."""
-        self._looks += 1
+        self._watched += 1
         self.watch.see(t_ns, transform(self.T_header @ T_inverse(self.T_used), points_m))
         values, sigmas = np.abs(self.residual.values), self.residual.sigmas
         certain = values - SIGMAS * sigmas > TOLERANCE
@@ -139,8 +139,8 @@ class Mounting:
         the ground is about to tell.
         """
         unknown = self.T_header[2, 3] < HEIGHTS_M[0] or np.isinf(self.sigma.height_m)
-        told = bool(np.isfinite(self.residual.height_sigma_m))
-        return bool(unknown and not told and self._looks < MOST_WAIT and self.watch.seen == self._looks)
+        observed = bool(np.isfinite(self.residual.height_sigma_m))
+        return bool(unknown and not observed and self._watched < MOST_WAIT and self.watch.seen == self._watched)
 
     @property
     def torn(self) -> bool:

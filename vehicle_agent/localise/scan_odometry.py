@@ -74,10 +74,12 @@ class SteadyMotion(NamedTuple):
 class ScanStep(NamedTuple):
     """The motion between two scans by the scans.
 
-    T_before_now: (4, 4). covariance: (6, 6) of a small motion of the vehicle at its later end, rotation [rad] first,
-    then position [m], along its own axes (as GTSAM's BetweenFactorPose3 takes it); directions that the scans do not
-    constrain have a sigma of metres, and T_before_now follows the prediction there. slipping: the wheels slipped in the
-    step before, so that less is needed to contradict them in this one.
+    Attributes:
+        T_before_now: (4, 4).
+        covariance: (6, 6) of a small motion of the vehicle at its later end, rotation [rad] first, then position [m],
+            along its own axes (as GTSAM's BetweenFactorPose3 takes it); directions that the scans do not constrain have
+            a sigma of metres, and T_before_now follows the prediction there.
+        slipping: the wheels slipped in the step before, so that less is needed to contradict them in this one.
     """
 
     T_before_now: F64

@@ -294,7 +294,7 @@ class TrackedPose:
         graph takes the errors of wheels for independent from step to step; that of the scale is not.
         """
         along = np.zeros(6)
-        along[3] = (self._drive.teacher.uncertainty[0] * self.judge.uniqueness.untold_m) ** 2
+        along[3] = (self._drive.teacher.uncertainty[0] * self.judge.uniqueness.unconstrained_m) ** 2
         return replace(pose, covariance=pose.covariance + np.diag(along))
 
     def _refine(

@@ -65,11 +65,13 @@ _LOST: Final = 3.0
 FARTHEST_M: Final = 60.0  # a far point is moved by more than a patch when odometry turns by a degree or two
 WON_IN_A_ROW: Final = 3
 LEAST_SQUARES: Final = 0.25  # added to sum(d^2): where next to nothing differs, nothing is decided
-TOLD: Final = 1.0  # sigmas by which poses a little before and behind must fit worse: the map constrains the place along
+CONSTRAINED: Final = (
+    1.0  # sigmas by which poses a little before and behind must fit worse: the map constrains the place along
+)
 SEEN_BY: Final = 0.3  # least way between two fixes that are remembered, as share of the view
 
 
-class _Look(NamedTuple):
+class _SeenScan(NamedTuple):
     """What one scan saw: odometer [m], pose (4, 4) and standing points (K, 3) in its own frame."""
 
     way_m: float
@@ -97,7 +99,7 @@ class ScanView:
         self._reach_m, self._every_m, self._n_points = way_m, every_m, n_points
         self.way_m = 0.0
         self._T: F64 | None = None  # newest, odometry's frame
-        self._looks: deque[_Look] = deque()
+        self._seen: deque[_SeenScan] = deque()
         self._fixes: deque[_Fix] = deque()
 
     def push(self, standing_m: F64, T_before_now: F64, T_tracked: F64) -> None:
@@ -108,10 +110,10 @@ class ScanView:
         turn = _yaw(moved) - _yaw(T_tracked)
         self._T = T_from_R_t(exp_so3(np.array([0.0, 0.0, turn])) @ T_tracked[:3, :3], [*moved[:2, 3], T_tracked[2, 3]])
         self.way_m += float(np.hypot(*T_before_now[:2, 3]))
-        if not self._looks or self.way_m - self._looks[-1].way_m >= self._every_m:
-            self._looks.append(_Look(self.way_m, self._T, thinned(standing_m, self._n_points)))
-        while self.way_m - self._looks[0].way_m > self._reach_m:
-            self._looks.popleft()
+        if not self._seen or self.way_m - self._seen[-1].way_m >= self._every_m:
+            self._seen.append(_SeenScan(self.way_m, self._T, thinned(standing_m, self._n_points)))
+        while self.way_m - self._seen[0].way_m > self._reach_m:
+            self._seen.popleft()
         while self._fixes and self.way_m - self._fixes[0].way_m > self._reach_m:
             self._fixes.popleft()
 
@@ -129,7 +131,7 @@ class ScanView:
         if self._T is None:
             return np.empty((0, 3))
         T_now_odom = T_inverse(self._T)
-        seen = [transform(T_now_odom @ look.T_odom_vehicle, look.points_m) for look in reversed(self._looks)]
+        seen = [transform(T_now_odom @ one.T_odom_vehicle, one.points_m) for one in reversed(self._seen)]
         points = np.concatenate(seen)
         return points[np.hypot(points[:, 0], points[:, 1]) < FARTHEST_M]
 
@@ -172,7 +174,9 @@ class Uniqueness:
         self._view = ScanView(_WAY_M, _EVERY_M, _N_POINTS)
         self._beaten = self._ahead = 0  # tests in a row
         self._next_m = 0.0  # odometer of the next test
-        self._tested_m = self._told_m = 0.0  # odometer of the last test, and of the last that told the place along
+        self._tested_m = self._constrained_m = (
+            0.0  # odometer of the last test, and of the last that told the place along
+        )
 
     def distrust(self, *, moved: bool) -> None:
         """The pose must be proven again; `moved`: odometry does not know either how it has come here."""
@@ -183,7 +187,7 @@ class Uniqueness:
         if moved:
             self._view = ScanView(_WAY_M, _EVERY_M, _N_POINTS)
             self._next_m = _EVERY_M
-            self._tested_m = self._told_m = 0.0
+            self._tested_m = self._constrained_m = 0.0
 
     def see(
         self, standing_m: F64, T_before_now: F64, T_tracked: F64, place: SearchPlace | None, match_map: MatchMap,
@@ -210,9 +214,9 @@ class Uniqueness:
             self._conclude()
 
     @property
-    def untold_m(self) -> float:
+    def unconstrained_m(self) -> float:
         """Way since the map last constrained the place along it: in a smooth tunnel odometry alone knows it."""
-        return self._view.way_m - self._told_m if self._told_m < self._tested_m else 0.0
+        return self._view.way_m - self._constrained_m if self._constrained_m < self._tested_m else 0.0
 
     @property
     def beaten(self) -> bool:
@@ -227,7 +231,7 @@ class Uniqueness:
         self._ahead = self._ahead + 1 if self.margin >= _WON else 0
         won = self._ahead >= WON_IN_A_ROW or self.margin >= _WON_AT_ONCE
         whole = self._view.way_m >= _WAY_M
-        self.proven = (self.proven or won) and not self.beaten and (whole or self.margin >= -TOLD)
+        self.proven = (self.proven or won) and not self.beaten and (whole or self.margin >= -CONSTRAINED)
         steady = self.proven and whole and not self._beaten
         self._next_m = self._view.way_m + (_PROVEN_M if steady else _UNPROVEN_M)
 
@@ -247,8 +251,8 @@ class Uniqueness:
             return min((ahead_of_both(fits - fit, patches, high, _FULL_POINTS) for fit in against), default=np.inf)
 
         along, across = (self._beside(points, own, match_map, axis) for axis in (0, 1))
-        if least(along) >= TOLD:
-            self._told_m = self._view.way_m
+        if least(along) >= CONSTRAINED:
+            self._constrained_m = self._view.way_m
         others = [T for T in [*self._elsewhere(points, own, match_map), *along, *across] if self._view.allowed(T, own)]
         return least(others) if others else ahead(fits, patches, _FULL_POINTS)
 

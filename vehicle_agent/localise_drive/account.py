@@ -122,7 +122,7 @@ def _fields(values: dict[str, Any]) -> Table:
         *_calibration(values["calibration"]),
         ("own estimate of error", "none" if sigma is None else
             f"{sigma['median_m'] * 100:.1f} cm, {sigma['median_deg']:.3f}° (one sigma, median)"),
-        ("are errors as large as told", _consistency(values)),
+        ("errors against their sigmas", _consistency(values)),
         ("tiles", f"{len(values['tiles_used'])} used; {values['tiles_absent']} nearby are not in the map"),
         ("time", f"{values['wall_s']:.1f} s, {values['wall_s'] / max(values['scans'], 1) * 1000:.1f} ms a scan"),
     )  # fmt: skip
@@ -150,16 +150,16 @@ def _calibration(values: dict[str, Any] | None) -> tuple[tuple[str, str], ...]:
 def _clock(values: dict[str, Any]) -> str:
     """The time offset between LiDAR and motion."""
     offset, doubt = values["time_offset_s"], values["clock_doubt"]
-    said = f"wheels and gyro {offset['value'] * 1e3:+.1f} ms against the LiDAR, ±{offset['sigma'] * 1e3:.1f}"
-    return said if doubt == "none" else f"{said}; {doubt}"
+    text = f"wheels and gyro {offset['value'] * 1e3:+.1f} ms against the LiDAR, ±{offset['sigma'] * 1e3:.1f}"
+    return text if doubt == "none" else f"{text}; {doubt}"
 
 
 def _mount_used(values: dict[str, Any]) -> str:
     """The mount of the header, and the one that is used where that is another."""
-    told, used = values["mount_told"], values["mount_used"]
+    header, used = values["mount_told"], values["mount_used"]
     form = "LiDAR {height_m:.2f} m above the road, roll {roll_deg:.2f}°, pitch {pitch_deg:.2f}°, yaw {yaw_deg:.2f}°"
-    said = [form.format(**mount) for mount in (told, used)]
-    return f"{said[0]}, as told" if told == used else f"{said[1]}; told: {said[0]}"
+    by_header, in_use = form.format(**header), form.format(**used)
+    return f"{by_header}, as in the header" if header == used else f"{in_use}; header: {by_header}"
 
 
 def _mount(values: dict[str, Any]) -> str:

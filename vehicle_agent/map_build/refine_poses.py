@@ -80,7 +80,7 @@ def refine_poses(
     tried = pairs(first, T)
     if not tried and mode == "auto":
         return list(sources), PosesReport(mode, False, "no place was passed twice")
-    loops, counts = find_loops(first, T, tried, lambda a, b: sigma_between(first, a, b), _told(progress, "loops"))
+    loops, counts = find_loops(first, T, tried, lambda a, b: sigma_between(first, a, b), _counted(progress, "loops"))
     before = drift(T, loops)
     reason = _why_not(before, counts)
     if reason is not None and mode == "auto":
@@ -101,7 +101,7 @@ def _refined(
     solved = solve(first.drive, T, loops, fixes)
     second = PoseAnchors(surveys, _bent(sources, first, T, solved.T))
     again = pairs(second, solved.T)
-    loops, counts = find_loops(second, solved.T, again, lambda _a, _b: AFTER_SIGMA_M, _told(progress, "loops again"))
+    loops, counts = find_loops(second, solved.T, again, lambda _a, _b: AFTER_SIGMA_M, _counted(progress, "loops again"))
     solved = solve(first.drive, T, loops, fixes)
     believed = [loop for loop, taken in zip(loops, solved.loops, strict=True) if taken]
     tracks = _bent(sources, first, T, solved.T)
@@ -131,13 +131,13 @@ def _checked(
     if not len(between):
         return None, None
     T = between.poses()
-    told = _told(progress, "checking between loops")
-    loops, _ = find_loops(between, T, pairs(between, T), lambda _a, _b: AFTER_SIGMA_M, told)
+    counted = _counted(progress, "checking between loops")
+    loops, _ = find_loops(between, T, pairs(between, T), lambda _a, _b: AFTER_SIGMA_M, counted)
     T_before = PoseAnchors(surveys, [source.poses for source in sources], from_m=EVERY_M / 2).poses()
     return drift(T_before, loops), drift(T, loops)
 
 
-def _told(progress: Progress, what: str) -> Callable[[int, int], None]:
+def _counted(progress: Progress, what: str) -> Callable[[int, int], None]:
     return lambda done, total: progress(what, done, total)
 
 
