@@ -7,8 +7,13 @@ import pytest
 import scipy.stats
 from plain_rays import PlainDetector, PlainMap
 
-from gnd.vehicle_agent.detect.chi_square import confidence, quantile
-from gnd.vehicle_agent.detect.kernel import cast_rays, kernel_parameters, window_affine
+from gnd.vehicle_agent.detect.kernel import (
+    cast_rays,
+    confidence,
+    kernel_parameters,
+    quantile,
+    window_affine,
+)
 from gnd.vehicle_agent.detect.parameters import MEASURED_RULES, DetectParameterError, DetectParameters
 from gnd.vehicle_agent.detect.records import N_BI, N_BO, N_PI, N_PO, make_records
 from gnd.vehicle_agent.detect.uncertainty import PoseUncertainty

@@ -6,17 +6,17 @@ from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.ndimage import binary_dilation
 
 from gnd.gnd_map.arrays import F64
 from gnd.gnd_map.classes import ChangeClass
 from gnd.gnd_map.day import UNKNOWN_DAY
 from gnd.gnd_map.gaussian import Gaussians
-from gnd.gnd_map.grid import GridFrame
+from gnd.gnd_map.grid import GridFrame, VoxelGrid
 from gnd.gnd_map.tile import Tile
 from gnd.gnd_map.tile_id import TileId
 from gnd.schemas.changes import TileChange
 from gnd.schemas.doubt import Doubt, DoubtReason
-from gnd.vehicle_agent.detect.beyond import beyond_map
 from gnd.vehicle_agent.detect.classify import Classification
 from gnd.vehicle_agent.detect.shift import Shift, no_shift
 from gnd.vehicle_agent.detect.trial import Tried
@@ -190,3 +190,20 @@ def _doubt(reasons: DoubtReason, account: TileAccount, changed_share: float, wit
         up_mm=mm[2],
         turn_10urad=round(float(shift.turn_rad[2]) * 1e5),
     )
+
+
+def beyond_map(found: Classification) -> NDArray[np.bool_]:
+    """(K,) the new voxels in whose column, and in the eight around it, the map of the tile holds nothing.
+
+    They extend the map, and are no evidence against the pose or the map. A survey that saw a place met something there,
+    the ground at least: where the map holds nothing above, below or beside, it has not been surveyed (ground behind the
+    last house, behind what has gone since, beyond the end of the survey's road).
+    """
+    base = found.evidence.base
+    grid = VoxelGrid.of(base.tile_id)
+    known = np.zeros((grid.nx, grid.ny), np.bool_)
+    x, y, _ = grid.unravel(base.gaussians.voxel_id)
+    known[x, y] = True
+    beside = binary_dilation(known, np.ones((3, 3), np.bool_))
+    x, y, _ = grid.unravel(found.evidence.voxel_id)
+    return np.asarray((found.change_class == ChangeClass.NEW) & ~beside[x, y])

@@ -6,6 +6,7 @@ Whatever is measured in metres (distances to a Gaussian, to a plane, to the hit)
 """
 
 import math
+from functools import lru_cache
 from typing import Final, NamedTuple
 
 import numpy as np
@@ -13,7 +14,6 @@ from numpy.typing import NDArray
 
 from gnd.gnd_map.arrays import F32, F64, I32
 from gnd.gnd_map.jit import kernel, pasted
-from gnd.vehicle_agent.detect.chi_square import quantile
 from gnd.vehicle_agent.detect.parameters import INCLUDED_M, DetectParameters
 from gnd.vehicle_agent.detect.records import N_BI, N_BO, N_PI, N_PO
 from gnd.vehicle_agent.detect.uncertainty import PoseUncertainty
@@ -54,6 +54,23 @@ class KernelParameters(NamedTuple):
     included_m2: float
     block_gain: float
     beyond_gain: float
+
+
+def confidence(r2: float) -> float:
+    """Probability mass inside the ellipsoid of squared Mahalanobis distance `r2`, GND Eq. (3) with k = 3: chi-square in
+    closed form (scipy.stats would cost a second at every start).
+    """
+    return math.erf(math.sqrt(r2 / 2)) - math.sqrt(2 * r2 / math.pi) * math.exp(-r2 / 2)  # Eq. (3)
+
+
+@lru_cache(maxsize=64)
+def quantile(eta: float) -> float:
+    """The r² whose `confidence` is `eta` (0 < eta < 1): "inside" becomes one comparison, computed once."""
+    low, high = 0.0, 60.0
+    while high - low > 1e-12:
+        middle = (low + high) / 2
+        low, high = (middle, high) if confidence(middle) < eta else (low, middle)
+    return (low + high) / 2
 
 
 def kernel_parameters(p: DetectParameters, pose: PoseUncertainty = CERTAIN) -> KernelParameters:

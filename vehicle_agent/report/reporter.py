@@ -25,13 +25,13 @@ from gnd.schemas.course import Course
 from gnd.schemas.keys import change_key
 from gnd.schemas.report_id import deterministic_report_id
 from gnd.vehicle_agent.config import ReportParameters
-from gnd.vehicle_agent.detect.beyond import beyond_map
 from gnd.vehicle_agent.detect.classify import Classification, classify, tile_change
 from gnd.vehicle_agent.detect.detector import ChangeDetector
 from gnd.vehicle_agent.detect.doubts import (
     LEAST_WITHHELD,
     TileAccount,
     TileDoubts,
+    beyond_map,
     changed_share_of,
     doubt_of,
     withheld_change,

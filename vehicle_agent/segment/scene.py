@@ -8,12 +8,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gnd.gnd_map.arrays import F32, F64, I32, I64
-from gnd.vehicle_agent.segment.evidence import WEIGHTS
 from gnd.vehicle_agent.segment.ground_kernels import GroundGrid, ground_heights, lowest_heights, remember_ground
 from gnd.vehicle_agent.segment.image_kernels import Optics, RangeJudge, draw_image, elevation_span, layer_gap, vote
 from gnd.vehicle_agent.segment.parameters import RANGE_MIN_M, SegmentParameters
 from gnd.vehicle_agent.segment.voxel_kernels import find_objects
 
+U8 = NDArray[np.uint8]
+
+WEIGHTS: Final = 4
+"""Weight of a full vote for "static"; others have less."""
 _SETTLED_S: Final = 1.0
 """A return at the same place counts the less the nearer in time below this: what moves still covers its place."""
 _COLUMN_DEG: Final = 0.3
@@ -40,7 +43,6 @@ _FEET_M: Final = 0.1
 SEGMENT_VOXEL_M: Final = 0.3
 """Points this near to each other are judged together, and objects farther apart are two."""
 
-U8 = NDArray[np.uint8]
 U16 = NDArray[np.uint16]
 
 GAP_SHARE = 0.8  # of layers that are at most so far apart
@@ -170,3 +172,20 @@ def image_of(t_ns: int, centre_m: F64, R: F64, points: F32, origins: F32, voxel_
     rows = int((high - low) / step) + 1 if high >= low else 1
     optics = Optics(round(360.0 / _COLUMN_DEG), rows, float(low), step)
     return RangeImage(t_ns, centre_m, R, optics, *draw_image(points, origins, voxel_of, R, optics, SPREAD_M))
+
+
+def belief(passed: U8, met: U8, mass_moving: float, mass_static: float) -> tuple[F64, F64]:
+    """Return the masses of "moving" and of "static", float64 (V,) each.
+
+    Votes are combined by Dempster's rule in closed form: `passed` votes for "moving", votes of `met` weights together
+    for "static".
+
+    A vote of weight w has the mass 1 - (1 - mass_static)^(w / WEIGHTS). Every vote is a simple support function; equal
+    ones combine to 1 - (1 - m)^n, and Dempster's rule joins the two (Shafer 1976, chapter 4). The rest is "not known".
+    """
+    doubt_moving = (1.0 - mass_moving) ** passed.astype(np.float64)
+    doubt_static = (1.0 - mass_static) ** (met / WEIGHTS)
+    conflict = (1.0 - doubt_moving) * (1.0 - doubt_static)
+    moving = (1.0 - doubt_moving) * doubt_static / (1.0 - conflict)
+    static = (1.0 - doubt_static) * doubt_moving / (1.0 - conflict)
+    return moving, static

@@ -10,13 +10,13 @@ from numpy.typing import NDArray
 
 from gnd.gnd_map.arrays import F32, F64
 from gnd.vehicle_agent.localise.estimates import PoseEstimate, RefinedScan
-from gnd.vehicle_agent.segment.evidence import belief
 from gnd.vehicle_agent.segment.parameters import PAST_S, SegmentParameters
 from gnd.vehicle_agent.segment.scene import (
     SEGMENT_VOXEL_M,
     GroundMap,
     Objects,
     RangeImage,
+    belief,
     find_all_objects,
     hash_table,
     image_of,
