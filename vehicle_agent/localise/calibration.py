@@ -67,12 +67,18 @@ class Stamped(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class MotionCalibration:
-    """What a localiser knows of its vehicle's sensors, each with one sigma.
+    """Calibration of a vehicle's sensors, each value with one sigma.
 
-    time_offset_s: stamps of wheels and gyro are so much later than those of the LiDAR, growing by `time_offset_rate`;
-    clock_doubt: why that is not to be relied on. wheel_scale: what the wheel speed is multiplied with. gyro_bias_radps:
-    what is taken off the yaw rate. course_rad: direction of driving straight, left of the vehicle's x axis as the
-    header's mount puts it. mount: height, roll and pitch against the header, from the ground.
+    Attributes:
+        time_offset_s: stamps of wheels and gyro are so much later than those of the LiDAR, growing by
+            `time_offset_rate`.
+        clock_doubt: why that is not to be relied on.
+        wheel_scale: factor of the wheel speed.
+        gyro_bias_radps: bias of the yaw rate.
+        course_rad: direction of driving straight, left of the vehicle's x axis as the header's mount puts it.
+        mount: height, roll and pitch against the header, from the ground.
+        mount_header: (4, 4) the header's T_vehicle_lidar.
+        mount_used: (4, 4) the one in use: the header's where that is not certainly wrong.
     """
 
     time_offset_s: float
@@ -87,9 +93,7 @@ class MotionCalibration:
     course_sigma_rad: float
     mount: MountResidual
     mount_header: F64 | None = None
-    """(4, 4) the header's T_vehicle_lidar."""
     mount_used: F64 | None = None
-    """(4, 4) what it is taken to be: the header's where that is not certainly wrong."""
 
     def __post_init__(self) -> None:
         sigmas = (self.time_offset_sigma_s, self.wheel_scale_sigma, self.gyro_bias_sigma_radps, self.course_sigma_rad)

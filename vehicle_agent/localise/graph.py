@@ -43,9 +43,15 @@ class Position(NamedTuple):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SmoothedPose:
-    """A pose of the graph: number, time, (4, 4) T_map_vehicle and (6, 6) covariance (rotation first, vehicle frame);
-    certain: submaps leave no doubt about it; axle_variance: of the direction in which the rear axle drives [rad²],
-    where it is known better than that of the LiDAR.
+    """A pose of the graph.
+
+    Attributes:
+        number, t_ns: of its scan.
+        T_map_vehicle: (4, 4).
+        covariance: (6, 6), rotation first, vehicle frame.
+        certain: submaps leave no doubt about it.
+        axle_variance: of the direction in which the rear axle drives [rad²], where it is known better than that of the
+            LiDAR.
     """
 
     number: int

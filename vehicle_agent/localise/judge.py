@@ -36,10 +36,16 @@ FEWEST_POINTS: Final = 20
 class Matched(NamedTuple):
     """One scan after its match.
 
-    t_ns: reference time; points_m: (N, 3) vehicle frame; T_before_now: (4, 4) motion since the scan before; T_now: (4,
-    4) the tracked pose; result: the match that was made there; believed: whether it counts; motion_gap_s: how much of
-    the way since the scan before was driven without motion samples; cause: what is known to be wrong besides;
-    repeated: it is the scan before to the bit, which no sensor measures.
+    Attributes:
+        t_ns: reference time.
+        points_m: (N, 3) vehicle frame.
+        T_before_now: (4, 4) motion since the scan before.
+        T_now: (4, 4) the tracked pose.
+        result: the match that was made there.
+        believed: whether it counts.
+        motion_gap_s: seconds since the scan before without motion samples.
+        cause: what is known to be wrong besides.
+        repeated: equal to the scan before bit for bit, which no sensor measures.
     """
 
     t_ns: int

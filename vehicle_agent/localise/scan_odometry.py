@@ -91,8 +91,10 @@ class ScanStep(NamedTuple):
 class JointStep:
     """The motion by wheels, gyro and scans together.
 
-    T_before_now: (4, 4), each believed by its covariance. driven_sigmas: (6,) sigmas of wheels and gyro, grown where
-    the scans contradict them. slipped: they do.
+    Attributes:
+        T_before_now: (4, 4), each weighted by its covariance.
+        driven_sigmas: (6,) sigmas of wheels and gyro, grown where the scans contradict them.
+        slipped: whether they do.
     """
 
     T_before_now: F64

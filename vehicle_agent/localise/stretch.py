@@ -40,8 +40,11 @@ STOP_M, STOP_RAD = 1e-3, 5e-5
 class StretchStep:
     """Motion from one scan of the stretch to the next, by odometry.
 
-    T_before_now: (4, 4). covariance: (6, 6) of a small motion of the later vehicle, rotation [rad] first. shared: (6,
-    N_SHARED) how this motion would differ if the shared parameters were larger by one; zeros for steps between scans.
+    Attributes:
+        T_before_now: (4, 4).
+        covariance: (6, 6) of a small motion of the later vehicle, rotation [rad] first.
+        shared: (6, N_SHARED) how this motion would differ if the shared parameters were larger by one; zeros for steps
+            between scans.
     """
 
     T_before_now: F64
@@ -75,18 +78,22 @@ class Knot:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SolvedStretch:
-    """What came of a stretch of N scans.
+    """The solution of a stretch of N scans.
 
-    shared: (N_SHARED,) estimate. covariance: (N, 6, 6) of each pose, rotation first, vehicle frame; shared_covariance.
-    fit: (N,) 1 - mean robust cost of each scan's points, 0 ... 1, at the last scale; known: (N,) share of them in known
-    voxels. misfit: mean square of what each scan's own match disagrees with its pose, in sigmas (1 = as expected).
-    step_squares, step_redundancy: (6,) sums over the first measurement of each step: squared residual in sigmas, and
-        how much of each the others can check (0: nothing else knows, 1: all is known otherwise). Their ratio is the
-        variance of these measurements in units of what they claim (variance components, Förstner 1979).
-    seen: (3,) of yaw, forward and left: by what the errors that residuals show differ from those that are assumed, in
-        variance (`influence`); matched: (3,) share of the map in these variances of the poses, the rest is odometry's.
-    axle_variance: (N,) of the direction in which the rear axle drives, yaw and course together [rad²].
-    torn: somewhere no measured motion fits its two poses, so that nothing ties what lies before to what lies behind.
+    Attributes:
+        shared, shared_covariance: (N_SHARED,) estimate, and (N_SHARED, N_SHARED).
+        covariance: (N, 6, 6) of each pose, rotation first, vehicle frame.
+        fit: (N,) 1 - mean robust cost of each scan's points, 0 ... 1, at the last scale.
+        known: (N,) share of them in known voxels.
+        misfit: mean square of the innovation of each scan's own match, in sigmas (1 = as expected).
+        step_squares, step_redundancy: (6,) sums over the first measurement of each step: squared residual in sigmas,
+            and how much of each the others can check (0: nothing else knows, 1: all is known otherwise). Their ratio is
+            the variance of these measurements in units of what they claim (variance components, Förstner 1979).
+        seen: (3,) of yaw, forward and left: variance of the errors that residuals show, in units of those that are
+            assumed (`influence`).
+        matched: (3,) share of the map in these variances of the poses; the rest is odometry's.
+        axle_variance: (N,) of the direction in which the rear axle drives, yaw and course together [rad²].
+        torn: somewhere no measured motion fits its two poses, so that nothing ties what lies before to what follows.
     """
 
     shared: F64
