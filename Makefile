@@ -3,6 +3,9 @@ PYTHON ?= python3.11
 VENV := .venv
 BIN := $(VENV)/bin
 ARGS ?=
+# Tests run in two processes: many of them start fleets of their own, more would only wait for each other.
+TESTERS ?= $(shell [ "$$(nproc)" -gt 1 ] && echo 2 || echo 0)
+SIDE_BY_SIDE = -n $(TESTERS) --dist loadgroup --no-loadscope-reorder
 export OPENBLAS_NUM_THREADS ?= 1
 export NUMBA_NUM_THREADS ?= 1
 
@@ -22,10 +25,10 @@ fleet: setup     ## run the fleet: make fleet ARGS="--agents 4 --link 3g"
 	$(BIN)/gnd fleet $(ARGS)
 
 test: setup      ## run every test
-	$(BIN)/pytest $(ARGS)
+	$(BIN)/pytest $(SIDE_BY_SIDE) $(ARGS)
 
 quick: setup     ## run the tests that take less than five seconds each
-	$(BIN)/pytest -m "not slow" $(ARGS)
+	$(BIN)/pytest $(SIDE_BY_SIDE) -m "not slow" $(ARGS)
 
 check: setup     ## what CI runs beside the tests: style, types, layers, generated code, documents, and that all tests can be read together
 	$(BIN)/ruff check .

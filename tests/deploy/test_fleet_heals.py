@@ -9,7 +9,7 @@ from fleet_testing import Run
 
 from gnd.fleet_sim.truth import LEVELS
 
-pytestmark = [pytest.mark.slow, pytest.mark.timeout(600)]
+pytestmark = [pytest.mark.slow, pytest.mark.timeout(600), pytest.mark.xdist_group("fleets")]
 
 SEED = 301  # never used for tuning
 LAYERS = ("ndt", "signs", "streetlights")
