@@ -9,7 +9,7 @@ SIDE_BY_SIDE = -n $(TESTERS) --dist loadgroup --no-loadscope-reorder
 export OPENBLAS_NUM_THREADS ?= 1
 export NUMBA_NUM_THREADS ?= 1
 
-.PHONY: help setup fleet test quick check docs bench schemas clean
+.PHONY: help setup fleet test quick check docs bench studies schemas clean
 
 help:            ## list the targets
 	@grep -hE '^[a-z]+:.*##' $(MAKEFILE_LIST) | sed 's/:.*##/\t/'
@@ -43,7 +43,11 @@ check: setup     ## what CI runs beside the tests: style, types, layers, generat
 docs: setup      ## build the documents as a site: build/site/index.html
 	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --quiet --strict
 
-bench: setup     ## print the benchmarks with their commands
+bench: setup     ## measure speed beside others who do the same work, on this machine: docs/benchmarks.md
+	$(BIN)/pip install --quiet --disable-pip-version-check -c constraints.txt -e '.[peers]'
+	$(BIN)/python -m studies.speed --out docs/benchmarks.md $(ARGS)
+
+studies: setup   ## print the studies' small benchmarks with their commands: make studies ARGS="codec --json"
 	$(BIN)/python -m studies $(ARGS)
 
 schemas: setup   ## generate Python from schemas/*.proto
