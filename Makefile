@@ -5,7 +5,7 @@ BIN := $(VENV)/bin
 ARGS ?=
 # Tests run in two processes: many of them start fleets of their own, more would only wait for each other.
 TESTERS ?= $(shell [ "$$(nproc)" -gt 1 ] && echo 2 || echo 0)
-SIDE_BY_SIDE = -n $(TESTERS) --dist loadgroup --no-loadscope-reorder
+SIDE_BY_SIDE = -n $(TESTERS) --dist loadscope
 export OPENBLAS_NUM_THREADS ?= 1
 export NUMBA_NUM_THREADS ?= 1
 

@@ -1,4 +1,4 @@
-"""Fixtures that every test may use, and how the suite is dealt out to processes (`pytest -n 2 --dist loadgroup`)."""
+"""Fixtures that every test may use, and how the suite is dealt out to processes (`pytest -n 2 --dist loadscope`)."""
 
 import os
 import signal
@@ -7,8 +7,15 @@ import sys
 from pathlib import Path
 
 import pytest
-from suite_groups import groups_of
+from suite_groups import (
+    pytest_collection_modifyitems,
+    pytest_configure_node,
+    pytest_xdist_make_scheduler,
+)
 from suite_ports import new_port
+
+# Hooks that pytest finds here.
+__all__ = ["pytest_collection_modifyitems", "pytest_configure_node", "pytest_xdist_make_scheduler"]
 
 ROOT = Path(__file__).resolve().parents[1]
 SHARED_DATA = ROOT.parent / "shared" / "data"
@@ -34,26 +41,6 @@ def pytest_xdist_setupnodes() -> None:
     files.
     """
     subprocess.run([sys.executable, "-c", WARM_UP], check=True, env={**os.environ, "PYTHONPATH": str(ROOT / "src")})
-
-
-@pytest.hookimpl(tryfirst=True)  # xdist reads the marks in this hook too
-def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
-    """Several processes: give each test its group, and begin with the groups that take longest."""
-    if config.getoption("dist", "no") != "loadgroup":
-        return
-    groups = groups_of(items)
-    items[:] = [item for group in groups for item in group.items]
-    for group in groups:
-        for item in group.items:
-            item.own_markers[:] = [mark for mark in item.own_markers if mark.name != "xdist_group"]
-            item.add_marker(pytest.mark.xdist_group(group.name))
-
-
-@pytest.hookimpl(tryfirst=True)
-def pytest_runtest_logreport(report: pytest.TestReport) -> None:
-    """Name a test as one may call it: xdist hangs the group on its name."""
-    if getattr(report, "node", None) is not None:
-        report.nodeid = report.nodeid.rpartition("@")[0] or report.nodeid
 
 
 @pytest.fixture(scope="session")

@@ -20,8 +20,8 @@ from studies.localisation_scenes import MAPPING, map_of, reference_of, true_scan
 class SpeedOptions:
     """What decides the figures, but for the machine."""
 
-    rounds: int = option(11, "Rounds of each contest.", span=(1, 1000))
-    scans: int = option(20, "Scans for rays and matching, taken evenly from the drives.", span=(2, 100))
+    rounds: int = option(7, "Rounds of each contest.", span=(1, 1000))
+    scans: int = option(10, "Scans for rays and matching, taken evenly from the drives.", span=(2, 100))
     length_m: float = option(200.0, "Length of the street.", span=(100.0, 1000.0))
     seed: int = option(1, "World of the street.")
 
