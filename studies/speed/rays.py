@@ -116,7 +116,7 @@ def scan_contest(scene: Scene) -> Contest:
         f"The same scans and true poses, voxels of {voxel_m:.2f} m, one thread, one map for all scans of a call. Ours"
         " compares every ray with a map and collects the points of new Gaussians; the others hold no map of before.",
         f"Result: of the centres of voxels that at least {CLEARLY} of our rays passed, the share that they call free."
-        " DUFOMap shrinks its voids by a voxel on purpose (d_p 1, d_s 0.2 m, its defaults).",
+        " DUFOMap shrinks its voids by a voxel on purpose (d_p 1, d_s 0.2 m).",
     )
     others = [*_octomap(scans, voxel_m, free_m), *_dufomap(scans, voxel_m, free_m)]
     return Contest("Whole scans counted", "ms/scan", len(scans), entrant, others, notes)
