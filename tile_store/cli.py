@@ -25,7 +25,6 @@ from gnd.tile_store import tables, upkeep_cli
 from gnd.tile_store.arguments import parse_tile, parse_time_ns, parse_versions
 from gnd.tile_store.compare import MapDiff, layer_info, layer_totals, map_diff, version_diff
 from gnd.tile_store.errors import StoreError
-from gnd.tile_store.export import FORMATS, export_map
 from gnd.tile_store.metrics import StoreCollector, store_checks
 from gnd.tile_store.options import PATH, existing, json_option, layer_option, region_option, show, to_read
 from gnd.tile_store.server import TileServer
@@ -116,22 +115,6 @@ def info(path: Path, deep: bool, region: str, layer: str, as_json: bool) -> None
         values = {"layers": opened.layers()} | totals.as_dict()
         values["store"] = asdict(opened.counts())
     show(values, as_json, lambda console: console.print(tables.info(str(path), values)))
-
-
-@map_group.command(short_help="Write a map as PCD, PLY or GeoJSON.")
-@click.argument("path", metavar="STORE", type=PATH)
-@click.argument("out", metavar="FILE", type=PATH)
-@region_option
-@layer_option
-@click.option("--format", "kind", type=click.Choice(list(FORMATS)), help="  [default: by the file's ending]")
-@json_option
-def export(path: Path, out: Path, region: str, layer: str, kind: str | None, as_json: bool) -> None:
-    """Write the newest tiles of STORE to FILE: Gaussians as PCD or PLY, tiles as GeoJSON."""
-    with to_read(path) as opened:
-        result = export_map(opened, layer, region, out, kind)
-    values = asdict(result) | {"path": str(result.path)}
-    line = f"{out}: {result.gaussians} Gaussians of {result.tiles} tiles, {result.size_bytes / 1e6:.2f} MB"
-    show(values, as_json, lambda console: console.print(line, highlight=False))
 
 
 @map_group.command(short_help="Where two maps, times or versions differ.")

@@ -70,7 +70,7 @@ def export_map(store: Store, layer: str, prefix: str, path: Path | str, format: 
     if name not in FORMATS:
         raise ExportError(f"unknown export format {name!r}; known are {', '.join(FORMATS)}")
     tiles = region_tiles(store, layer, prefix)
-    _write_whole(target, lambda stream: FORMATS[name](stream, tiles))
+    write_whole(target, lambda stream: FORMATS[name](stream, tiles))
     return TilesExported(target, len(tiles), sum(len(tile.gaussians) for tile in tiles), target.stat().st_size)
 
 
@@ -203,7 +203,7 @@ FORMATS: Final[Mapping[str, Callable[[IO[bytes], list[Tile]], None]]] = {
 }
 
 
-def _write_whole(target: Path, write: Callable[[IO[bytes]], None]) -> None:
+def write_whole(target: Path, write: Callable[[IO[bytes]], object]) -> None:
     """Write beside the target and rename at the end, so that no half file ever has its name."""
     partial = target.with_name(f".{target.name}.{os.getpid()}.partial")
     try:
