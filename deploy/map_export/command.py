@@ -1,6 +1,5 @@
 """`gnd map export`: a map for the programs of others, and `gnd map diff`, whose changes go to a GIS."""
 
-from collections.abc import Callable
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any, Final
@@ -8,6 +7,7 @@ from typing import Any, Final
 import click
 
 from gnd.deploy.map_export.autoware import export_autoware
+from gnd.deploy.map_export.las import export_las
 from gnd.deploy.map_export.projection import PROJECTORS
 from gnd.tile_store.export import FORMATS, ExportError, export_map
 from gnd.tile_store.options import PATH, json_option, layer_option, region_option, show, to_read
@@ -16,7 +16,7 @@ from gnd.tile_store.store import Store
 TO_HELP: Final = "What to write.  [default: by the file's ending]"
 PROJECTOR_HELP: Final = "Of --to autoware.  [default: that of the export before, else TransverseMercator]"
 POINTS_HELP: Final = "Of --to autoware: points 0.2 m apart that have the Gaussians' moments, or the means alone."
-OUTPUTS: Final = (*FORMATS, "autoware")
+OUTPUTS: Final = (*FORMATS, "autoware", "las", "laz")
 Written = tuple[dict[str, Any], str]
 """What was written as JSON, and as a line."""
 
@@ -49,12 +49,12 @@ def export(
         if name == "autoware":
             values, line = _autoware(opened, layer, region, out, projector, points)
         else:
-            values, line = _WRITERS.get(name, _plain)(opened, layer, region, out, name)
+            values, line = _plain(opened, layer, region, out, name)
     show(values, as_json, lambda console: console.print(line, highlight=False, soft_wrap=True))
 
 
 def _plain(store: Store, layer: str, region: str, out: Path, name: str) -> Written:
-    result = export_map(store, layer, region, out, name)
+    result = export_las(store, layer, region, out) if name in ("las", "laz") else export_map(store, layer, region, out, name)
     line = f"{out}: {result.gaussians} Gaussians of {result.tiles} tiles, {result.size_bytes / 1e6:.2f} MB"
     return asdict(result) | {"path": str(result.path)}, line
 
@@ -69,5 +69,3 @@ def _autoware(store: Store, layer: str, region: str, out: Path, projector: str |
     )
     return asdict(result) | {"folder": str(result.folder)}, line
 
-
-_WRITERS: Final[dict[str, Callable[[Store, str, str, Path, str], Written]]] = {}
