@@ -19,7 +19,7 @@ from gnd.schemas.features import FeatureReport
 from gnd.vehicle_agent.config import PipelineParameters
 from gnd.vehicle_agent.features.layer_parameters import FeatureParameters
 from gnd.vehicle_agent.features.slamcu.camera_pipeline import CameraPipeline
-from gnd.vehicle_agent.features.slamcu.existence_book import FeatureClass
+from gnd.vehicle_agent.features.slamcu.tracked_feature import FeatureClass
 from gnd.vehicle_agent.features.slamcu.parameters import SlamcuParameters
 from gnd.vehicle_agent.place import Place
 from gnd.vehicle_agent.report.reporter import Identity

@@ -17,6 +17,7 @@ from gnd.schemas.drive import Detections
 from gnd.vehicle_agent.features.look import Look, MapFeatures
 from gnd.vehicle_agent.features.slamcu.parameters import SlamcuParameters
 from gnd.vehicle_agent.features.slamcu.slamcu import Slamcu
+from gnd.vehicle_agent.features.slamcu.tracked_feature import MAP_CONFIDENCE
 from gnd.vehicle_agent.features.slamcu.verdicts import KnownState, NewFeature
 from gnd.vehicle_agent.features.slamcu.watched import Lost, PoseAt, WatchedSlamcu
 from gnd.vehicle_agent.features.view import Occlusion, SensorView
@@ -234,9 +235,7 @@ class _Poses:
         return filtered.pose() if what == "look" else None
 
 
-def verdicts_of(
-    drive: RoadDrive, driven: Driven, map_confidence: float = SlamcuParameters().map_confidence
-) -> Verdicts:
+def verdicts_of(drive: RoadDrive, driven: Driven, map_confidence: float = MAP_CONFIDENCE) -> Verdicts:
     """Return what a drive says of its signs, with what the truth tells of how it came about."""
     truth = sign_truth(drive.route)
     sign, t_s, masses = _traces(drive, driven, truth, map_confidence)

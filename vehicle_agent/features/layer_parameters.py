@@ -7,7 +7,7 @@ from typing import Final, Literal
 from gnd.gnd_map.settings import check_settings, setting
 from gnd.schemas.wire import LAYER_PATTERN
 from gnd.vehicle_agent.features.errors import FeatureLayerError
-from gnd.vehicle_agent.features.slamcu.parameters import FilterParameters, SlamcuParameters
+from gnd.vehicle_agent.features.slamcu.parameters import SlamcuParameters
 from gnd.vehicle_agent.features.view import SensorView
 
 MARGIN_M: Final = 10.0
@@ -59,9 +59,7 @@ class LayerParameters:
     @property
     def slamcu(self) -> SlamcuParameters:
         """SLAMCU with given poses: few particles, which carry the uncertainty of the pose into the features' places."""
-        return SlamcuParameters(
-            detection_confidence=self.detection_confidence, filter=FilterParameters(particles=16, jitter=0.0)
-        )
+        return SlamcuParameters(particles=16, detection_confidence=self.detection_confidence)
 
 
 SIGNS: Final = ("traffic_sign", "speed_limit", "no_overtaking", "warning", "direction", "exit", "information")

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from gnd.gnd_map.arrays import F64
 from gnd.vehicle_agent.features.slamcu.blind import BlindBelief, BlindFilter
-from gnd.vehicle_agent.features.slamcu.parameters import SlamcuParameters
+from gnd.vehicle_agent.features.slamcu.noise import GNSS_INTERVAL_S
 
 LASTING_M: Final = 0.5
 """What a GNSS may be off by all the while (ionosphere, the antenna's place), each axis."""
@@ -73,13 +73,11 @@ class Hindsight:
     """A blind filter that remembers.
 
     Args:
-        parameters: of motion and GNSS.
         first: the belief at the start.
     """
 
-    def __init__(self, parameters: SlamcuParameters, first: BlindBelief) -> None:
-        self._p = parameters
-        self._blind = BlindFilter(parameters, first)
+    def __init__(self, first: BlindBelief) -> None:
+        self._blind = BlindFilter(first)
         self._steps: list[_Step] = []
         self.now_s = 0.0
         self._fix_s: float | None = None
@@ -91,9 +89,8 @@ class Hindsight:
 
     def fix(self, xy_m: F64, sigma_m: float) -> None:
         """Take a fix (2,); as `Slamcu.gnss`, not more often than fixes tell something new."""
-        interval_s = self._p.gnss.interval_s
-        since_s = interval_s if self._fix_s is None else self.now_s - self._fix_s
-        if since_s + 1e-6 < interval_s:
+        since_s = GNSS_INTERVAL_S if self._fix_s is None else self.now_s - self._fix_s
+        if since_s + 1e-6 < GNSS_INTERVAL_S:
             return
         self._fix_s = self.now_s
         self._blind.fix(xy_m, sigma_m, since_s)

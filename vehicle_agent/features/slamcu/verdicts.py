@@ -4,7 +4,7 @@ from dataclasses import dataclass, field
 
 from gnd.gnd_map.arrays import F64
 from gnd.gnd_map.features import Existence
-from gnd.vehicle_agent.features.slamcu.existence_book import FeatureClass, MassesAt
+from gnd.vehicle_agent.features.slamcu.tracked_feature import FeatureClass, MassesAt
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -19,11 +19,11 @@ from typing import Final
 import numpy as np
 
 from gnd.gnd_map.arrays import F64
+from gnd.vehicle_agent.features.slamcu import noise
 from gnd.vehicle_agent.features.slamcu.blind import BlindBelief, apart
-from gnd.vehicle_agent.features.slamcu.existence_book import FeatureClass
-from gnd.vehicle_agent.features.slamcu.parameters import GnssNoise
+from gnd.vehicle_agent.features.slamcu.map_comparison import MapInnovation
 from gnd.vehicle_agent.features.slamcu.slamcu import Passed
-from gnd.vehicle_agent.features.slamcu.tidying import Innovation
+from gnd.vehicle_agent.features.slamcu.tracked_feature import FeatureClass
 
 WINDOWS_S: Final = (40.0, 160.0)
 """Over these times offsets are averaged: three and twelve time constants of the slow error."""
@@ -75,16 +75,12 @@ class Alarm:
 class Watch:
     """The four tests along one account of a drive.
 
-    Args:
-        noise: of the GNSS.
-
     Attributes:
         cost: what fixes and signs say against this account (natural logarithm).
         run: of the map's test, >= 0.
     """
 
-    def __init__(self, noise: GnssNoise) -> None:
-        self._noise = noise
+    def __init__(self) -> None:
         self._error, self._of_one, self._var = np.zeros(2), 0.0, 0.0
         self._sums = np.zeros((len(WINDOWS_S), 4))  # A (2), B, and B of the squared weights
         self._offset = self._blind = 0.0
@@ -102,8 +98,8 @@ class Watch:
             pose: (3,) and covariance (3, 3).
             blind: of wheels, gyro and GNSS alone.
         """
-        white, slow = self._noise.white_share * sigma_m**2, (1.0 - self._noise.white_share) * sigma_m**2
-        fade = exp(-dt_s / self._noise.correlation_s) if self._var else 1.0
+        white, slow = noise.gnss_variances_m2(sigma_m)
+        fade = exp(-dt_s / noise.GNSS_CORRELATION_S) if self._var else 1.0
         var = self._var * fade**2 + (1.0 - fade**2) * slow if self._var else slow
         total, place = var + white, pose[1][:2, :2]
         nu, one = off_m - fade * self._error, 1.0 - fade * self._of_one  # the answer to an offset of one metre
@@ -126,10 +122,10 @@ class Watch:
             if one.known:
                 self.run = max(self.run + _told(one, beside), 0.0)
 
-    def sign(self, told: Innovation) -> None:
+    def sign(self, innovation: MapInnovation) -> None:
         """A feature of the map was measured, and compared with its place."""
-        self._sign = max(self._sign, told.squared)
-        self.cost -= max(told.ln_density, LEAST_LN_DENSITY)
+        self._sign = max(self._sign, innovation.squared)
+        self.cost -= max(innovation.ln_density, LEAST_LN_DENSITY)
 
     def settled(self) -> None:
         """The doubt has been looked into, and this account is the best there is: one more such sign, and it is asked

@@ -18,7 +18,6 @@ import numpy as np
 from gnd.gnd_map.arrays import F64
 from gnd.vehicle_agent.features.look import Look, MapFeatures
 from gnd.vehicle_agent.features.slamcu.blind import BlindBelief
-from gnd.vehicle_agent.features.slamcu.existence_book import FeatureClass
 from gnd.vehicle_agent.features.slamcu.hindsight import (
     GATE,
     GATE_SURE,
@@ -33,6 +32,7 @@ from gnd.vehicle_agent.features.slamcu.hindsight import (
 )
 from gnd.vehicle_agent.features.slamcu.parameters import SlamcuParameters
 from gnd.vehicle_agent.features.slamcu.slamcu import Slamcu
+from gnd.vehicle_agent.features.slamcu.tracked_feature import FeatureClass
 from gnd.vehicle_agent.features.slamcu.verdicts import KnownState, NewFeature
 from gnd.vehicle_agent.features.slamcu.watch import DELETED_COST, NEW_COST, Alarm, Watch
 from gnd.vehicle_agent.features.view import Occlusion, SensorView
@@ -178,8 +178,8 @@ class _Account:
 
     def _passed(self) -> None:
         slamcu = self.slamcu
-        for told in slamcu.told():
-            self.watch.sign(told)
+        for innovation in slamcu.take_innovations():
+            self.watch.sign(innovation)
         until_s = slamcu.now_s - CLEAR_S
         if seen := slamcu.last_seen(self._seen_s, until_s):
             self.watch.passed(seen, slamcu.last_seen(self._seen_s - 2.0 * PATIENCE_S, slamcu.now_s))
@@ -239,14 +239,14 @@ class WatchedSlamcu:
         gnss_sigma_m: float = 0.0,
     ) -> None:
         slamcu = Slamcu(parameters, known, pose0, cov0, seed, gnss_sigma_m)
-        self._now, self._seed = _Account(slamcu, Watch(parameters.gnss)), seed
+        self._now, self._seed = _Account(slamcu, Watch()), seed
         self.path: list[PoseAt] = []
         self.lost: list[Lost] = []
         self.doubts = 0
         self._events: list[_Event] = []
         self._kept: list[_KeptState] = [self._state()]
         self._asked_s, self._patience_s = 0.0, PATIENCE_S
-        self._hindsight = Hindsight(parameters, BlindBelief.first(pose0, cov0, parameters, gnss_sigma_m))
+        self._hindsight = Hindsight(BlindBelief.first(pose0, cov0, gnss_sigma_m))
         self._back_s = self._known_s = 0.0  # when hindsight was asked last, and until when its answer has been heard
         self._clock_ns = 0
         self._lost_since: _KeptState | None = None
@@ -540,7 +540,7 @@ class WatchedSlamcu:
             if not isinstance(event, _Looked):
                 account.take(event)
         account.slamcu.look_anew()
-        account.watch = Watch(believed.parameters.gnss)
+        account.watch = Watch()
         off_m = float(np.hypot(*(believed.pose()[0] - account.slamcu.blind.mean[:3])[:2]))
         taken = _differences(believed, account.slamcu)
         self.lost.append(Lost(kept.t_s, lost_s, off_m, alarm.test, alarm.value, taken, False))
