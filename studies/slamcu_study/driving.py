@@ -90,7 +90,7 @@ def look_of(detections: Detections) -> Look:
 
 def sensor_view(view: CameraView) -> SensorView:
     """Return a simulated sensor's field of view as the vehicle knows it."""
-    return SensorView(view.width_rad, view.range_m, float(view.rate_hz))
+    return SensorView(view.width_rad, view.range_m)
 
 
 def occlusion_of(drive: RoadDrive, look: int) -> Occlusion | None:

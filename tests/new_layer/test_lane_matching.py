@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from plane_scene import Noise, Scene, drive, parameters
+from plane_scene import Noise, Scene, drive, sensors
 
 from gnd.gnd_map.errors import ShapeError
 from gnd.vehicle_agent.errors import NewLayerError
@@ -60,7 +60,7 @@ def test_gicp_says_nothing_where_there_is_no_lane():
 
 def matches(bend, noise=SHARP, start=(0.0, 0.0, 0.0), search=False, polish=False, seed=1):
     truth = Scene(bend=bend).truth()
-    p = parameters(noise)
+    p = sensors(noise)
     nodes = DriveNodes.of(drive(truth, noise, seed), p)
     matcher = LaneMatcher(LaneMap.of(truth.lanes), nodes.drive.lanes, nodes, p.lanes)
     matcher._searched = not search

@@ -11,10 +11,11 @@ from gnd.gnd_map.arrays import F64, I64
 from gnd.gnd_map.features import Existence, FeatureTile
 from gnd.gnd_map.geodesy import LocalFrame
 from gnd.gnd_map.tile_id import TileId
+from gnd.schemas.feature_layer import LayerParameters
 from gnd.schemas.features import FeatureChange, Found, Seen
-from gnd.vehicle_agent.features.coverage import Coverage, CoverageParameters
+from gnd.vehicle_agent.features.coverage import Coverage
 from gnd.vehicle_agent.features.feature_map import features_in_map, place_in_tile, with_height
-from gnd.vehicle_agent.features.layer_parameters import LayerParameters
+from gnd.vehicle_agent.features.layer_parameters import slamcu_of, view_of
 from gnd.vehicle_agent.features.look import Look, MapFeatures
 from gnd.vehicle_agent.features.slamcu.slamcu import Slamcu
 from gnd.vehicle_agent.features.slamcu.verdicts import KnownState, NewFeature
@@ -52,20 +53,18 @@ class FeatureLayer:
 
     Args:
         parameters: the layer, its sensor.
-        coverage: when a place counts as looked at.
         frame: the map frame.
     """
 
     def __init__(
         self,
         parameters: LayerParameters,
-        coverage: CoverageParameters,
         frame: LocalFrame,
         slamcu: Slamcu | WatchedSlamcu | None = None,
     ) -> None:
-        self.parameters, self._frame = parameters, frame
-        self._slamcu = slamcu or Slamcu(parameters.slamcu, MapFeatures.none(), np.zeros(3), np.eye(3) * 1e-4)
-        self._coverage = Coverage(frame, parameters.view, parameters.height_m, coverage)
+        self.parameters, self._frame, self._view = parameters, frame, view_of(parameters)
+        self._slamcu = slamcu or Slamcu(slamcu_of(parameters), MapFeatures.none(), np.zeros(3), np.eye(3) * 1e-4)
+        self._coverage = Coverage(frame, self._view, parameters.height_m)
         self._held: dict[TileId, FeatureTile] = {}
         self._ids: dict[TileId, tuple[int, ...]] = {}
         self._told: set[int] = set()
@@ -95,14 +94,14 @@ class FeatureLayer:
         """Take one look from a known pose."""
         assert isinstance(self._slamcu, Slamcu), "this layer's own filter finds the poses"
         self._slamcu.set_pose(placed.pose, placed.cov, placed.z_m)
-        self._slamcu.look(self._own(placed), self.parameters.view, occlusion)
+        self._slamcu.look(self._own(placed), self._view, occlusion)
         self.cover(placed.pose, occlusion)
         self._z_m = placed.z_m
 
     def look(self, look: Look, occlusion: Occlusion | None) -> None:
         """Take one look whose pose the filter finds; where it has looked is told later, by `cover`."""
         rows = np.array([i for i, kind in enumerate(look.kinds) if kind in self.parameters.kinds], np.int64)
-        self._slamcu.look(taken(look, rows, [look.kinds[i] for i in rows]), self.parameters.view, occlusion)
+        self._slamcu.look(taken(look, rows, [look.kinds[i] for i in rows]), self._view, occlusion)
 
     def cover(self, pose: F64, occlusion: Occlusion | None) -> None:
         """The vehicle has looked from a pose (3,): x, y [m], heading [rad] in the map frame."""

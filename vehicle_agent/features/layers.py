@@ -19,7 +19,6 @@ from gnd.schemas.drive import Detections
 from gnd.schemas.features import FeatureChange
 from gnd.vehicle_agent.config import ReportParameters
 from gnd.vehicle_agent.detect.uncertainty import PoseUncertainty
-from gnd.vehicle_agent.features.coverage import CoverageParameters
 from gnd.vehicle_agent.features.layer import FeatureLayer, PlacedLook, pose_of
 from gnd.vehicle_agent.features.layer_parameters import MARGIN_M, FeatureParameters
 from gnd.vehicle_agent.features.look import MAX_RANGE_M, Look
@@ -64,7 +63,7 @@ class FeatureLayers:
     ) -> None:
         self.counts: Counter[str] = Counter()
         self._parameters, self._report = parameters, report
-        self.layers = {one.name: FeatureLayer(one, CoverageParameters(), frame) for one in parameters.layers}
+        self.layers = {one.name: FeatureLayer(one, frame) for one in parameters.layers}
         self._reporters = dict(zip(self.layers, reporters, strict=True))
         self._detector = PoleDetector()
         self._looks: deque[Detections] = deque(maxlen=MOST_WAITING)

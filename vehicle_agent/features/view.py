@@ -31,21 +31,19 @@ class SensorView:
     Attributes:
         field_rad: its whole angle; 2π all around.
         range_m: its farthest range.
-        rate_hz: looks a second.
         nearest_m: its nearest range.
         towards_rad: direction of its middle, counter-clockwise from the vehicle's x axis.
     """
 
     field_rad: float
     range_m: float
-    rate_hz: float = 15.0
     nearest_m: float = 0.0
     towards_rad: float = 0.0
 
     def __post_init__(self) -> None:
-        values = (self.field_rad, self.range_m, self.rate_hz, self.nearest_m, self.towards_rad)
-        if not (all(map(isfinite, values)) and 0 < self.field_rad <= _TURN + 1e-9 and self.rate_hz > 0):
-            raise BadLook(f"view of {self.field_rad} rad, {self.range_m} m, {self.rate_hz} Hz")
+        values = (self.field_rad, self.range_m, self.nearest_m, self.towards_rad)
+        if not (all(map(isfinite, values)) and 0 < self.field_rad <= _TURN + 1e-9):
+            raise BadLook(f"view of {self.field_rad} rad, {self.range_m} m")
         if not 0.0 <= self.nearest_m < self.range_m:
             raise BadLook(f"view from {self.nearest_m} to {self.range_m} m")
 
@@ -66,9 +64,9 @@ class SensorView:
         return np.asarray(in_range & (off <= 0.5 * self.field_rad - np.asarray(bearing_edge_rad)))
 
 
-CAMERA: Final = SensorView(radians(40.0), 80.0, 15.0)
+CAMERA: Final = SensorView(radians(40.0), 80.0)
 """The camera of the SLAMCU paper, section 6.1."""
-LIDAR: Final = SensorView(_TURN, 50.0, 10.0)
+LIDAR: Final = SensorView(_TURN, 50.0)
 """Poles are found reliably so far around."""
 
 

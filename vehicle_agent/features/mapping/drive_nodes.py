@@ -18,11 +18,14 @@ from gnd.vehicle_agent.features.mapping.graph_edges import (
     State,
 )
 from gnd.vehicle_agent.features.mapping.landmarks import Sight
-from gnd.vehicle_agent.features.mapping.parameters import MappingGnssNoise, NewLayerParameters
+from gnd.vehicle_agent.features.mapping.sensors import DriveSensors, GnssReceiver
 
 _KEYFRAME_M: Final = 5.0
 _KEYFRAME_S: Final = 1.0
 """A pose of the graph every so many metres, and every so many seconds."""
+
+_FIX_NODE_S: Final = 1.0
+"""A state of the GNSS's slow error at least this far from the next."""
 
 SMOOTHINGS = 2  # of motion and fixes, each with the wheel scale and gyro bias of the one before
 CHORD_M = 60.0  # GNSS tells a direction over so long a way
@@ -33,22 +36,22 @@ class DriveNodes:
     """A drive and its keyframes. t_ns: (K,)."""
 
     drive: FeatureDrive
-    parameters: NewLayerParameters
+    sensors: DriveSensors
     t_ns: I64
     reckoning: DeadReckoning
     calibration: F64
 
     @classmethod
-    def of(cls, drive: FeatureDrive, parameters: NewLayerParameters) -> "DriveNodes":
+    def of(cls, drive: FeatureDrive, sensors: DriveSensors) -> "DriveNodes":
         """Keyframes by the way driven; no wheel scale and gyro bias known yet."""
-        reckoning = DeadReckoning.of(drive.motion, parameters.motion, 0.0, 0.0)
+        reckoning = DeadReckoning.of(drive.motion, sensors.motion, 0.0, 0.0)
         t_ns = reckoning.keyframes(_KEYFRAME_M, _KEYFRAME_S)
-        return cls(drive, parameters, t_ns, reckoning, np.zeros(2))
+        return cls(drive, sensors, t_ns, reckoning, np.zeros(2))
 
     def calibrated(self, calibration: F64) -> "DriveNodes":
         """The same keyframes, dead reckoning with wheel scale and gyro bias (2,)."""
         scale, bias = calibration.tolist()
-        reckoning = DeadReckoning.of(self.drive.motion, self.parameters.motion, scale, bias)
+        reckoning = DeadReckoning.of(self.drive.motion, self.sensors.motion, scale, bias)
         return replace(self, reckoning=reckoning, calibration=calibration)
 
     def sight(self, t_ns: I64) -> Sight:
@@ -63,15 +66,15 @@ class DriveNodes:
         return Problem(
             self.reckoning.steps(self.t_ns),
             self.calibration,
-            self._fix_nodes(self.drive.fixes, pose, self.parameters.gnss),
+            self._fix_nodes(self.drive.fixes, pose, self.sensors.gnss),
             poses=self._told(self.drive.poses),
         )
 
-    def _fix_nodes(self, fixes: GnssFixes, pose: F64, noise: MappingGnssNoise) -> FixNodes:
+    def _fix_nodes(self, fixes: GnssFixes, pose: F64, noise: GnssReceiver) -> FixNodes:
         """Fixes brought to keyframes and averaged: what is white in them becomes less."""
         if len(fixes.t_ns) == 0:
             return NO_FIX_NODES
-        base = _apart(self.t_ns, round(noise.every_s * 1e9))
+        base = _apart(self.t_ns, round(_FIX_NODE_S * 1e9))
         node = base[nearest(self.t_ns[base], fixes.t_ns)]
         driven = relative(self.reckoning.at(self.t_ns[node]), self.reckoning.at(fixes.t_ns))
         xy = fixes.xy_m - rotated(pose[node, 2], driven[:, :2])
@@ -102,7 +105,7 @@ class DriveNodes:
         state = State(nodes._laid_out(), np.empty((0, 2)), nodes.calibration)
         for _ in range(SMOOTHINGS):
             nodes = nodes.calibrated(state.calibration)
-            state = solve(nodes.problem(state.pose), state, self.parameters).state
+            state = solve(nodes.problem(state.pose), state, self.sensors).state
         return nodes, state
 
     def _places(self) -> tuple[I64, F64]:
@@ -125,7 +128,7 @@ class DriveNodes:
         off = np.unwrap(np.arctan2(b[:, 0] * a[:, 1] - b[:, 1] * a[:, 0], (a * b).sum(axis=1)))
         t_s = (t_ns[first] - t_ns[0]) * 1e-9
         slope = float(np.polyfit(t_s, off, 1)[0]) if np.ptp(t_s) > 0 else 0.0
-        limit = 4.0 * self.parameters.motion.gyro_bias_radps
+        limit = 4.0 * self.sensors.motion.gyro_bias_radps
         return float(np.clip(-slope, -limit, limit))
 
     def _laid_out(self) -> F64:

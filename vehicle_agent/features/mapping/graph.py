@@ -18,11 +18,12 @@ from gnd.gnd_map.arrays import F64, I64
 from gnd.vehicle_agent.errors import NewLayerError
 from gnd.vehicle_agent.features.mapping.bias_chain import gauss_markov_springs
 from gnd.vehicle_agent.features.mapping.graph_edges import FixNodes, GraphAnchors, PoseMatches, Problem, State, Ties
-from gnd.vehicle_agent.features.mapping.parameters import NewLayerParameters
+from gnd.vehicle_agent.features.mapping.sensors import DriveSensors
 
 CALIBRATION = gtsam.symbol("c", 0)
 PINNED_RAD = 1e-3  # sigma of the rotation of what has none
 FREE_RAD = 1e4  # sigma of a rotation of which nothing is said
+ROBUST_K = 3.0  # Huber's k of fixes, measurements and matches with lanes, in sigmas
 ITERATIONS = 30
 LINEARISATIONS = 10
 STAYS = 1e-4  # root mean square step of all numbers (m, rad) below which the optimum has been found
@@ -67,7 +68,7 @@ def _determined(n_poses: int) -> Iterator[None]:
         raise NewLayerError(f"{what}: {str(error).strip().splitlines()[0]}") from error
 
 
-def solve(problem: Problem, start: State, parameters: NewLayerParameters) -> Solution:
+def solve(problem: Problem, start: State, sensors: DriveSensors) -> Solution:
     """Minimise Eq. (6), or with matches Eq. (10), by Levenberg-Marquardt from `start`.
 
     Raises:
@@ -75,11 +76,11 @@ def solve(problem: Problem, start: State, parameters: NewLayerParameters) -> Sol
     """
     graph, values = gtsam.NonlinearFactorGraph(), gtsam.Values()
     _add_poses(values, start)
-    _add_calibration(graph, parameters)
-    _add_fixes(graph, values, problem.fixes, start, parameters)
-    _add_ties(graph, problem.ties, parameters.landmarks.robust_k)
+    _add_calibration(graph, sensors)
+    _add_fixes(graph, values, problem.fixes, start, sensors)
+    _add_ties(graph, problem.ties)
     _add_anchors(graph, problem.anchors)
-    own = _motion(problem) + _matches(problem.lanes, parameters.lanes.robust_k) + _matches(problem.poses, None)
+    own = _motion(problem) + _matches(problem.lanes, robust=True) + _matches(problem.poses, robust=False)
     with _determined(len(start.pose)):
         linear, optimum = _optimised(graph, own, values)
     cost = 2.0 * (graph.error(optimum) + sum(factor.error(optimum) for factor in own))  # Eq. (6), (10)
@@ -180,17 +181,17 @@ class _Motion:
         )
 
 
-def _add_calibration(graph: Any, parameters: NewLayerParameters) -> None:
-    sigmas = np.array([parameters.motion.wheel_scale, parameters.motion.gyro_bias_radps])
+def _add_calibration(graph: Any, sensors: DriveSensors) -> None:
+    sigmas = np.array([sensors.motion.wheel_scale, sensors.motion.gyro_bias_radps])
     graph.add(gtsam.PriorFactorPoint2(CALIBRATION, np.zeros(2), gtsam.noiseModel.Diagonal.Sigmas(sigmas)))
 
 
-def _add_fixes(graph: Any, values: Any, fixes: FixNodes, start: State, parameters: NewLayerParameters) -> None:
+def _add_fixes(graph: Any, values: Any, fixes: FixNodes, start: State, sensors: DriveSensors) -> None:
     """Fixes hang on poses through the receiver's slow error: pose = error + fix (docs/decisions/0069)."""
     if len(fixes.key) == 0:
         return
-    springs = gauss_markov_springs(fixes.t_s, parameters.gnss.sigma_m, parameters.gnss.correlation_s)
-    huber = gtsam.noiseModel.mEstimator.Huber.Create(parameters.gnss.robust_k)
+    springs = gauss_markov_springs(fixes.t_s, sensors.gnss.sigma_m, sensors.gnss.correlation_s)
+    huber = gtsam.noiseModel.mEstimator.Huber.Create(ROBUST_K)
     for n, (key, xy, variance) in enumerate(zip(fixes.key, fixes.xy_m, fixes.variance_m2, strict=True)):
         values.insert(_b(n), _pose2(np.array([*(start.pose[key, :2] - xy), 0.0])))
         graph.add(gtsam.PriorFactorPose2(_b(n), gtsam.Pose2(), _spring(springs.prior[n], PINNED_RAD)))
@@ -207,20 +208,20 @@ def _spring(information: float, sigma_rad: float) -> Any:
     return gtsam.noiseModel.Diagonal.Sigmas(np.array([sigma_m, sigma_m, sigma_rad]))
 
 
-def _add_ties(graph: Any, ties: Ties, robust_k: float) -> None:
+def _add_ties(graph: Any, ties: Ties) -> None:
     """Eq. (4)-(5): bearing and range of a feature from a keyframe."""
-    huber = gtsam.noiseModel.mEstimator.Huber.Create(robust_k)
+    huber = gtsam.noiseModel.mEstimator.Huber.Create(ROBUST_K)
     for key, landmark, (bearing, distance), cov in zip(*ties, strict=True):
         noise = gtsam.noiseModel.Robust.Create(huber, gtsam.noiseModel.Gaussian.Covariance(cov))
         seen = gtsam.Rot2.fromAngle(bearing)
         graph.add(gtsam.BearingRangeFactor2D(_x(int(key)), _l(int(landmark)), seen, distance, noise))
 
 
-def _matches(matches: PoseMatches, robust_k: float | None) -> list[Any]:
+def _matches(matches: PoseMatches, *, robust: bool) -> list[Any]:
     """Eq. (8)-(9); the information may be singular: nothing is then said along that direction."""
     unit = gtsam.noiseModel.Unit.Create(3)
-    huber = gtsam.noiseModel.mEstimator.Huber.Create(robust_k or np.inf)
-    noise = unit if robust_k is None else gtsam.noiseModel.Robust.Create(huber, unit)
+    huber = gtsam.noiseModel.mEstimator.Huber.Create(ROBUST_K)
+    noise = gtsam.noiseModel.Robust.Create(huber, unit) if robust else unit
     return [
         gtsam.CustomFactor(noise, [_x(int(key))], _LandmarkMatch(_pose2(pose), off, root_of(information)))
         for key, pose, off, information in zip(*matches, strict=True)

@@ -1,37 +1,46 @@
 """A vehicle that maps features without a LiDAR map: by motion, a low-cost GNSS, a detector, and the lanes of the map.
 
 The route of NFL, section 3: gather while driving; when the vehicle has stopped, one graph of the whole stretch gives
-the features and how certain they are; they are reported, and gathering begins anew.
+the features and how certain they are; they are reported, and gathering begins anew. Until then the place is known as
+the GNSS has it: degraded, with the cause "hindsight".
 """
 
 import logging
+import math
 from collections import Counter
 from dataclasses import replace
 from typing import Any, Final
+
+import numpy as np
 
 from gnd.gnd_map.geodesy import LocalFrame
 from gnd.gnd_map.tile import Tile
 from gnd.gnd_map.tile_id import TileId
 from gnd.schemas.drive import DriveItem, GnssFix, MotionSample, ReferencePose
+from gnd.schemas.feature_layer import LayerParameters
 from gnd.vehicle_agent.config import PipelineParameters
 from gnd.vehicle_agent.errors import NewLayerError
-from gnd.vehicle_agent.features.coverage import CoverageParameters
-from gnd.vehicle_agent.features.layer_parameters import LayerParameters
 from gnd.vehicle_agent.features.mapping.feature_drive import FeatureDrive
 from gnd.vehicle_agent.features.mapping.held_map import HeldMap
 from gnd.vehicle_agent.features.mapping.mapped import changes_of
 from gnd.vehicle_agent.features.mapping.new_layer import map_new_layer
+from gnd.vehicle_agent.localise.estimates import Cause, Health, PoseEstimate
 from gnd.vehicle_agent.pipeline import FeatureTiles, HeldBack, Output
-from gnd.vehicle_agent.place import Place
+from gnd.vehicle_agent.place import HEADING_BASE_M, Place
 from gnd.vehicle_agent.report.feature_report import FeatureReporter
 from gnd.vehicle_agent.report.reporter import Identity
 from gnd.vehicle_agent.report.sink import NewReports, ReportList, ReportSink
+from gnd.vehicle_agent.result import HealthTimeline
 from gnd.vehicle_agent.scans import Guard
 
 STILL_MPS: Final = 0.1
 STILL_S: Final = 3.0
 LEAST_WAY_M: Final = 200.0
 """A stop after less way than this does not end a stretch: queues of cars stop often."""
+OUTAGE_S: Final = 5.0
+"""So long after the last fix the place is not known."""
+ANY_HEADING_RAD: Final = math.pi / math.sqrt(3.0)
+"""Standard deviation of a heading that may be any."""
 
 _log = logging.getLogger(__name__)
 
@@ -47,7 +56,7 @@ class GraphPipeline:
         feature_tiles: what the map says of the layers and of lanes; None: nothing.
 
     Attributes:
-        place, guard: as of `Pipeline`.
+        place, guard, timeline: as of `Pipeline`.
         counts: stretches mapped, refused and contradicting.
     """
 
@@ -60,7 +69,7 @@ class GraphPipeline:
         feature_tiles: FeatureTiles | None = None,
     ) -> None:
         frame = LocalFrame.of_tile(TileId.from_geodetic(fix.lat_rad, fix.lon_rad))
-        self.place, self.guard = Place(frame, fix), Guard()
+        self.place, self.guard, self.timeline = Place(frame, fix), Guard(), HealthTimeline()
         self.counts: Counter[str] = Counter()
         self._parameters, self._feature_tiles = parameters, feature_tiles
         self._new_reports = NewReports(ReportList() if outbox is None else outbox)
@@ -72,7 +81,10 @@ class GraphPipeline:
         self._held = HeldMap(frame)
         self._gathered: list[DriveItem] = []
         self._since_m = 0.0
+        self._fix: GnssFix | None = None  # the last one that says what it is worth
+        self._fix_m = 0.0
         self._still_since_ns: int | None = None
+        self._online: PoseEstimate | None = None
 
     def push(self, item: DriveItem) -> Output:
         """Take the next measurement; items come in time order. Where the vehicle has stopped, its stretch is mapped."""
@@ -83,6 +95,9 @@ class GraphPipeline:
                 self._held.put(layer, tile.tile_id, tile)
         self._gathered.append(item)
         self.place.take(item, None)
+        if isinstance(item, GnssFix) and item.sigma_m > 0:
+            self._fix, self._fix_m = item, self.place.odometer_m
+        self._note_health(item.t_ns)
         if isinstance(item, MotionSample):
             moves = abs(item.speed_mps) > STILL_MPS
             self._still_since_ns = None if moves else (self._still_since_ns or item.t_ns)
@@ -109,6 +124,7 @@ class GraphPipeline:
         names = ("stretches", "stretches_refused", "stretches_contradicting")
         return {
             **{name: self.counts[name] for name in names},
+            "health": self.timeline.as_json(),
             "layers": {name: dict(reporter.counts) for name, reporter in self._reporters.items()},
         }
 
@@ -139,10 +155,32 @@ class GraphPipeline:
             self.counts["stretches_contradicting"] += 1
             raise NewLayerError("the graph contradicts itself: " + "; ".join(map(str, found.strains)))
         self.counts["stretches"] += 1
-        reporter, coverage = self._reporters[layer.name], CoverageParameters()
-        for change in changes_of(found, drive, self._held, layer, coverage, self.place.height_m):
+        reporter = self._reporters[layer.name]
+        for change in changes_of(found, drive, self._held, layer, self.place.height_m):
             reporter.add(change, drive.looks[0].t_ns, self.place.odometer_m)
         reporter.report_all(drive.looks[-1].t_ns)
 
+    def _note_health(self, t_ns: int) -> None:
+        self._online = self._gnss_pose(t_ns)
+        self.place.health = "lost" if self._online is None else self._online.health
+        self.timeline.note(t_ns, self.place.health)
+
+    def _gnss_pose(self, t_ns: int) -> PoseEstimate | None:
+        """The pose of the last fix, as uncertain as that and the way since; None: there is none of late."""
+        fix = self._fix
+        if fix is None or t_ns - fix.t_ns > OUTAGE_S * 1e9:
+            return None
+        place, T = self.place, np.eye(4)
+        T[:3, 3] = place.position_map_m
+        sigma_rad = ANY_HEADING_RAD
+        if place.heading_rad is not None:
+            c, s = math.cos(place.heading_rad), math.sin(place.heading_rad)
+            T[:2, :2] = [[c, -s], [s, c]]
+            sigma_rad = min(math.sqrt(2.0) * fix.sigma_m / HEADING_BASE_M, ANY_HEADING_RAD)  # of two fixes
+        sigma_m = math.hypot(fix.sigma_m, place.odometer_m - self._fix_m)
+        return PoseEstimate(t_ns, T, sigma_m, sigma_rad, 0.0, "degraded", "hindsight")
+
     def _output(self) -> Output:
-        return Output((), self._new_reports.take(), None, "lost", "searching")
+        online = self._online
+        state: tuple[Health, Cause] = ("lost", "no_position") if online is None else (online.health, online.cause)
+        return Output((), self._new_reports.take(), online, *state)

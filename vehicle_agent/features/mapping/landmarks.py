@@ -150,7 +150,6 @@ def assigned(m: Measurements, sight: Sight, pose: F64, xy_m: F64, kind: I64, sla
         xy_m: (N, 2) features.
         kind: (N,) theirs.
         slack_m: (N,) sigma of where a feature is as seen from the poses around, beside the sensor's noise.
-        parameters: the gate.
     """
     owner = np.full(len(m), NONE, np.int64)
     at = composed(pose[sight.key], sight.offset)
@@ -233,7 +232,6 @@ def doubles(m: Measurements, owner: I64, at: LandmarkPlaces) -> list[tuple[int, 
         m: M measurements.
         owner: (M,) features of them, of N.
         at: N features.
-        parameters: how near, and what is side by side.
     """
     looks = [np.unique(m.look[owner == n]) for n in range(len(at.xy_m))]
     distance = np.hypot(*np.moveaxis(at.xy_m[:, None] - at.xy_m[None], 2, 0))

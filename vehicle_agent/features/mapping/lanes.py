@@ -19,8 +19,9 @@ from gnd.vehicle_agent.features.mapping.drive_nodes import DriveNodes, nearest
 from gnd.vehicle_agent.features.mapping.graph_edges import NO_MATCHES, PoseMatches
 from gnd.vehicle_agent.features.mapping.lane_looks import LANE_GATE, Offsets, Polylines, choices, offsets
 from gnd.vehicle_agent.features.mapping.lane_map import LaneMap, gicp
-from gnd.vehicle_agent.features.mapping.parameters import LaneParameters
 
+_MAP_SIGMA_M: Final = 0.01
+"""Of the lines of the HD map."""
 _WINDOW_M: Final = 20.0
 """Looks of so long a way are put together."""
 _SEARCH_M: Final = 4.0
@@ -73,10 +74,8 @@ class _Chosen(NamedTuple):
 class LaneMatcher:
     """Matches the lane looks of a drive, again and again as its poses become better."""
 
-    def __init__(
-        self, lanes: LaneMap, looks: tuple[LaneLook, ...], nodes: DriveNodes, parameters: LaneParameters
-    ) -> None:
-        self.lanes, self.parameters = lanes, parameters
+    def __init__(self, lanes: LaneMap, looks: tuple[LaneLook, ...], nodes: DriveNodes) -> None:
+        self.lanes = lanes
         self.lines = Polylines.of(looks)
         self.t_ns = np.array([look.t_ns for look in looks], np.int64)
         self.keys = _spaced(nodes.sight(nodes.t_ns).way_m, _WINDOW_M)
@@ -120,7 +119,7 @@ class LaneMatcher:
         group = window * len(self.lanes) + np.maximum(lane, 0)
         count = np.bincount(group, good, minlength=len(self.keys) * len(self.lanes))
         variance = self.lines.sigma**2
-        variance[:, 0] += count[group] * self.parameters.map_sigma_m**2
+        variance[:, 0] += count[group] * _MAP_SIGMA_M**2
         return np.asarray(variance)
 
     def _search(self, o: Offsets, n_looks: int) -> F64:

@@ -17,7 +17,6 @@ from gnd.gnd_map.tile_id import TileId
 from gnd.schemas.drive import Detections, DriveItem, GnssFix, MotionSample, ReferencePose
 from gnd.vehicle_agent.config import PipelineParameters
 from gnd.vehicle_agent.errors import AgentConfigError
-from gnd.vehicle_agent.features.coverage import CoverageParameters
 from gnd.vehicle_agent.features.errors import BadPose
 from gnd.vehicle_agent.features.layer import FeatureLayer
 from gnd.vehicle_agent.features.layer_parameters import MARGIN_M
@@ -186,7 +185,7 @@ class CameraPipeline:
         layer = self._layer_parameters
         parameters = SlamcuParameters(detection_confidence=layer.detection_confidence)
         self.slamcu = WatchedSlamcu(parameters, MapFeatures.none(), first.pose, first.cov, self._seed, sigma_m)
-        self._layer = FeatureLayer(layer, CoverageParameters(), self.place.frame, self.slamcu)
+        self._layer = FeatureLayer(layer, self.place.frame, self.slamcu)
         self._motion_ns = first.t_ns
         self._before.clear()
 
