@@ -54,7 +54,7 @@ def watched(road: Road, trouble: Trouble, seed: int = 0, parameters: SlamcuParam
         if i:
             slamcu.predict(PERIOD_S, road.speed_mps * trouble.wheel, 0.0)
         if i == round(trouble.kidnapped_s / PERIOD_S):
-            slamcu._now.slamcu._particles.state[:2] += np.array(trouble.kidnapped_m)[:, None]
+            slamcu._run.slamcu._particles.state[:2] += np.array(trouble.kidnapped_m)[:, None]
         slamcu.look(road.look(i, pose, rng), CAMERA)
         true.append(pose[:2])
         if i % 15 == 0:
@@ -108,7 +108,7 @@ def test_a_map_whose_signs_all_stand_elsewhere_is_not_followed_silently() -> Non
     t_s = np.array([one.t_s for one in told.slamcu.path])
     given_up = np.zeros(len(t_s), bool)
     for one in told.slamcu.lost:
-        given_up |= (t_s >= one.from_s) & (t_s <= one.until_s) & (not one.told_anew)
+        given_up |= (t_s >= one.from_s) & (t_s <= one.until_s) & (not one.replayed)
     assert not (far & ~given_up).any()
     assert told.slamcu.doubts or told.slamcu.lost
 
@@ -117,7 +117,7 @@ def given_up(told: Told) -> np.ndarray:
     """(S,) looks of stretches of which the vehicle says nothing."""
     t_s, lost = np.array([one.t_s for one in told.slamcu.path]), np.zeros(len(told.slamcu.path), bool)
     for one in told.slamcu.lost:
-        lost |= (t_s >= one.from_s) & (t_s <= one.until_s) & (not one.told_anew)
+        lost |= (t_s >= one.from_s) & (t_s <= one.until_s) & (not one.replayed)
     return lost
 
 
@@ -133,7 +133,7 @@ def test_fixes_that_go_wrong_for_good_end_in_giving_up_and_nothing_concluded_the
     told = watched(road, Trouble(gnss_m=lambda t_s: np.array([0.0, 14.0]) if t_s > 40.0 else HERE), 0)
     assert told.slamcu.is_lost
     assert np.sqrt(told.slamcu.pose()[1][1, 1]) > 8.0
-    assert any(not one.told_anew for one in told.slamcu.lost)
+    assert any(not one.replayed for one in told.slamcu.lost)
     assert classes(told.slamcu) == [NORMAL] * len(SIGNS)
     assert told.slamcu.new_features() == ()
     wrong = (np.hypot(*told.off_m.T) > 5.0) & ~given_up(told)
@@ -172,7 +172,7 @@ def test_a_stretch_that_is_given_up_is_forgotten() -> None:
     assert wrong >= 5
     slamcu._give_up(Alarm("blind", 99.0, 21.1))
     (lost,) = slamcu.lost
-    assert not lost.told_anew
+    assert not lost.replayed
     assert lost.from_s < 41.0 < lost.until_s
     assert lost.taken_back >= 5
     assert classes(slamcu) == [NORMAL] * len(SIGNS)
@@ -182,7 +182,7 @@ def test_a_stretch_that_is_given_up_is_forgotten() -> None:
 
 
 def test_a_fork_goes_its_own_way() -> None:
-    slamcu = watched(replace(LONG, end_m=400.0), Trouble()).slamcu._now.slamcu
+    slamcu = watched(replace(LONG, end_m=400.0), Trouble()).slamcu._run.slamcu
     before = slamcu.pose()[0], classes_of(slamcu)
     other = slamcu.fork(9)
     other.look_anew()

@@ -24,7 +24,8 @@ from gnd.vehicle_agent.features.layers import look_of
 from gnd.vehicle_agent.features.look import MAX_RANGE_M, MapFeatures
 from gnd.vehicle_agent.features.slamcu.first_pose import AFTER_S, first_pose_of
 from gnd.vehicle_agent.features.slamcu.parameters import SlamcuParameters
-from gnd.vehicle_agent.features.slamcu.watched import PoseAt, WatchedSlamcu
+from gnd.vehicle_agent.features.slamcu.replay import PoseAt
+from gnd.vehicle_agent.features.slamcu.watched import WatchedSlamcu
 from gnd.vehicle_agent.features.view import Occlusion
 from gnd.vehicle_agent.localise.estimates import Cause, Health, PoseEstimate
 from gnd.vehicle_agent.pipeline import FeatureTiles, HeldBack, Output
@@ -267,7 +268,7 @@ class CameraPipeline:
         return tuple(poses)
 
     def _given_up(self, at: PoseAt, slamcu: WatchedSlamcu) -> bool:
-        return any(not lost.told_anew and lost.from_s <= at.t_s <= lost.until_s for lost in slamcu.lost)
+        return any(not lost.replayed and lost.from_s <= at.t_s <= lost.until_s for lost in slamcu.lost)
 
     def _output(self, poses: tuple[PoseEstimate, ...]) -> Output:
         online = self._online

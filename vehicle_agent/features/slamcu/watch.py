@@ -52,6 +52,8 @@ that was not while a new one like it stands near by. Here: 0.86, 0.09 and 0.05 o
 GATE_MAP: Final = 4.0
 """Two signs in a row that stand elsewhere."""
 BESIDE_M: Final = 30.0
+PASSED_AROUND_S: Final = 40.0
+"""A feature that stands near by was in view at most so long before."""
 DELETED_COST: Final = 3.0
 NEW_COST: Final = 2.0
 """What a change costs an account of a drive (natural logarithm): few features of a map have gone, few are new."""
