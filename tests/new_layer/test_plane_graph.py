@@ -7,10 +7,11 @@ import pytest
 from scipy.optimize import least_squares
 
 from gnd.vehicle_agent.features.mapping import graph
-from gnd.vehicle_agent.features.mapping.dead_reckoning import Steps, composed, relative, wrapped
+from gnd.vehicle_agent.features.mapping.dead_reckoning import Steps, composed, relative
 from gnd.vehicle_agent.features.mapping.graph import root_of, solve
 from gnd.vehicle_agent.features.mapping.graph_edges import FixNodes, GraphAnchors, PoseMatches, Problem, State, Ties
 from gnd.vehicle_agent.features.mapping.sensors import SERIES_CAR, GnssReceiver
+from gnd.vehicle_agent.features.view import wrapped
 
 K, N = 6, 3
 QUIET = replace(SERIES_CAR, gnss=GnssReceiver(2.0, 8.0, 1.0))

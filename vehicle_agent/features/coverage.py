@@ -1,7 +1,7 @@
 """Where a drive has looked: the cells of each tile in which it would have confirmed a feature had there been one.
 
-A fleet can only forget a feature, or a false one never come to be, when vehicles say where they looked and saw nothing.
-Each tile has 8 x 8 cells of some 4 m (`gnd.schemas.feature_change.cell_of`): eight bytes say it.
+A fleet can forget a feature, and reject a false one, only when vehicles report where they looked and saw nothing.
+Each tile has 8 x 8 cells of some 4 m (`gnd.schemas.feature_change.cell_of`): eight bytes.
 """
 
 from math import cos, hypot, sin

@@ -98,14 +98,14 @@ class FeatureLayers:
         self._leave_behind(scan.estimate.T_map_vehicle[:3, 3], odometer_m)
 
     def finish(self) -> None:
-        """The drive has ended: say everything."""
+        """The drive has ended: report everything."""
         for name, layer in self.layers.items():
             for change in layer.leave_all():
                 self._say(name, change, 0.0)
             self._reporters[name].report_all(self._t_ns)
 
     def take_back(self) -> None:
-        """The pose was wrong, and it is not known since when: nothing is said of the tiles that are in sight."""
+        """The pose was wrong, and it is not known since when: nothing is reported of the tiles in sight."""
         self._doubts.count(self._open(), WRONG)
         self._scans.clear()
         self._before = None

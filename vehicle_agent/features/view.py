@@ -107,7 +107,7 @@ class Occlusion:
 
     @classmethod
     def of_look(cls, look: Detections) -> "Occlusion | None":
-        """What a detector says of what is in its way; None where it does not say."""
+        """The free ranges that come with a look; None where it brings none."""
         if not len(look.free_m):
             return None
         return cls.of_ranges(look.free_m, -0.5 * look.free_field_rad, look.free_field_rad / len(look.free_m))

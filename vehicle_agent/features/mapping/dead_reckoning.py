@@ -11,6 +11,7 @@ import numpy as np
 from gnd.gnd_map.arrays import F64, I64
 from gnd.schemas.drive import MotionTrack
 from gnd.vehicle_agent.features.mapping.sensors import WheelsAndGyro
+from gnd.vehicle_agent.features.view import wrapped
 
 GAP_S = 0.1  # samples farther apart leave something unknown between them
 _GAP_MPS2, _GAP_RADPS2 = 2.0, 0.3  # so much may speed and yaw rate change in a gap, unseen
@@ -32,11 +33,6 @@ def rotated(yaw_rad: F64, xy_m: F64) -> F64:
     """(..., 2) turned counter-clockwise by (...,) yaw."""
     c, s = np.cos(yaw_rad), np.sin(yaw_rad)
     return np.stack([c * xy_m[..., 0] - s * xy_m[..., 1], s * xy_m[..., 0] + c * xy_m[..., 1]], axis=-1)
-
-
-def wrapped(angle_rad: F64) -> F64:
-    """(...,) the same angles in -pi … pi."""
-    return np.asarray((angle_rad + np.pi) % (2.0 * np.pi) - np.pi)
 
 
 def relative(base: F64, pose: F64) -> F64:

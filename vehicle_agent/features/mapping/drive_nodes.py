@@ -28,7 +28,7 @@ _FIX_NODE_S: Final = 1.0
 """A state of the GNSS's slow error at least this far from the next."""
 
 SMOOTHINGS = 2  # of motion and fixes, each with the wheel scale and gyro bias of the one before
-CHORD_M = 60.0  # GNSS tells a direction over so long a way
+CHORD_M = 60.0  # GNSS gives a direction over so long a way
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -62,19 +62,19 @@ class DriveNodes:
         return Sight(key, relative(base, here), way)
 
     def problem(self, pose: F64) -> Problem:
-        """Motion, fixes and told poses as edges; pose: (K, 3) as known so far."""
+        """Motion, fixes and poses of another localiser as edges; pose: (K, 3) as known so far."""
         return Problem(
             self.reckoning.steps(self.t_ns),
             self.calibration,
             self._fix_nodes(self.drive.fixes, pose, self.sensors.gnss),
-            poses=self._told(self.drive.poses),
+            poses=self._pose_matches(self.drive.poses),
         )
 
     def _fix_nodes(self, fixes: GnssFixes, pose: F64, noise: GnssReceiver) -> FixNodes:
         """Fixes brought to keyframes and averaged: what is white in them becomes less."""
         if len(fixes.t_ns) == 0:
             return NO_FIX_NODES
-        base = _apart(self.t_ns, round(_FIX_NODE_S * 1e9))
+        base = spaced(self.t_ns, round(_FIX_NODE_S * 1e9))
         node = base[nearest(self.t_ns[base], fixes.t_ns)]
         driven = relative(self.reckoning.at(self.t_ns[node]), self.reckoning.at(fixes.t_ns))
         xy = fixes.xy_m - rotated(pose[node, 2], driven[:, :2])
@@ -85,7 +85,7 @@ class DriveNodes:
         slow = noise.sigma_m**2 * span_s / (6.0 * noise.correlation_s)
         return FixNodes(key, (self.t_ns[key] - self.t_ns[0]) * 1e-9, mean, noise.white_m**2 / count + slow)
 
-    def _told(self, poses: KnownPoses) -> PoseMatches:
+    def _pose_matches(self, poses: KnownPoses) -> PoseMatches:
         """Poses of another localiser brought to the nearest keyframes."""
         if len(poses.t_ns) == 0:
             return NO_MATCHES
@@ -100,7 +100,7 @@ class DriveNodes:
         return PoseMatches(key, composed(poses.pose, back), np.zeros_like(back), information)
 
     def first_state(self) -> tuple["DriveNodes", State]:
-        """Poses (K, 3) by smoothing motion, fixes and told poses: no features yet, no map."""
+        """Poses (K, 3) by smoothing motion, fixes and known poses: no features yet, no map."""
         nodes = self.calibrated(np.array([0.0, self._first_bias()]))
         state = State(nodes._laid_out(), np.empty((0, 2)), nodes.calibration)
         for _ in range(SMOOTHINGS):
@@ -109,7 +109,7 @@ class DriveNodes:
         return nodes, state
 
     def _places(self) -> tuple[I64, F64]:
-        """(P,) times and (P, 2) places that fixes and told poses give."""
+        """(P,) times and (P, 2) places of fixes and known poses."""
         t_ns = np.concatenate([self.drive.fixes.t_ns, self.drive.poses.t_ns])
         xy = np.concatenate([self.drive.fixes.xy_m, self.drive.poses.pose[:, :2]])
         order = np.argsort(t_ns, kind="stable")
@@ -161,10 +161,10 @@ def nearest(base: I64, values: I64) -> I64:
     return np.asarray(np.where(values - base[after - 1] <= base[after] - values, after - 1, after))
 
 
-def _apart(t_ns: I64, least_ns: int) -> I64:
-    """Rows of increasing times (K,) of which each is at least `least_ns` after the one before."""
+def spaced(values: I64 | F64, least: float) -> I64:
+    """Rows of increasing values (K,) of which each is larger than the one before by `least` or more."""
     kept = [0]
-    for row in range(1, len(t_ns)):
-        if t_ns[row] - t_ns[kept[-1]] >= least_ns:
+    for row in range(1, len(values)):
+        if values[row] - values[kept[-1]] >= least:
             kept.append(row)
     return np.array(kept, np.int64)

@@ -95,7 +95,7 @@ class Measurements:
     sigma_bearing_rad: F64
     """(M,)"""
     height_m: F64
-    """(M,) above the vehicle's origin, nan = not told."""
+    """(M,) above the vehicle's origin, nan = unknown."""
     kind: I64
     """(M,) row of `kinds`."""
     kinds: tuple[str, ...]

@@ -22,7 +22,7 @@ from gnd.vehicle_agent.features.mapping.sensors import DriveSensors
 
 CALIBRATION = gtsam.symbol("c", 0)
 PINNED_RAD = 1e-3  # sigma of the rotation of what has none
-FREE_RAD = 1e4  # sigma of a rotation of which nothing is said
+FREE_RAD = 1e4  # sigma of a rotation that is not constrained
 ROBUST_K = 3.0  # Huber's k of fixes, measurements and matches with lanes, in sigmas
 ITERATIONS = 30
 LINEARISATIONS = 10
@@ -60,7 +60,7 @@ class Solution:
 
 @contextmanager
 def _determined(n_poses: int) -> Iterator[None]:
-    """What GTSAM says of a graph that leaves something open, by its name."""
+    """GTSAM's error for a graph that is not determined, under our name."""
     try:
         yield
     except RuntimeError as error:
@@ -87,7 +87,8 @@ def solve(problem: Problem, start: State, sensors: DriveSensors) -> Solution:
     return Solution(_state(optimum, len(start.pose), len(start.xy_m)), cost, linear, optimum)
 
 
-def _pose2(pose: F64) -> Any:
+def pose2(pose: F64) -> Any:
+    """A pose (3,) as GTSAM has it."""
     return gtsam.Pose2(float(pose[0]), float(pose[1]), float(pose[2]))
 
 
@@ -136,7 +137,7 @@ def _state(values: Any, n_poses: int, n_landmarks: int) -> State:
 
 def _add_poses(values: Any, start: State) -> None:
     for k, pose in enumerate(start.pose):
-        values.insert(_x(k), _pose2(pose))
+        values.insert(_x(k), pose2(pose))
     for n, xy in enumerate(start.xy_m):
         values.insert(_l(n), xy)
     values.insert(CALIBRATION, start.calibration)
@@ -154,7 +155,7 @@ def _motion(problem: Problem) -> list[Any]:
 
 
 class _Motion:
-    """Eq. (1) as GTSAM asks for it: how far the motion between two poses is from what wheels and gyro say."""
+    """Eq. (1) as GTSAM asks for it: the residual of the motion between two poses."""
 
     __slots__ = ("at", "by_calibration", "delta", "keys")
 
@@ -193,10 +194,10 @@ def _add_fixes(graph: Any, values: Any, fixes: FixNodes, start: State, sensors: 
     springs = gauss_markov_springs(fixes.t_s, sensors.gnss.sigma_m, sensors.gnss.correlation_s)
     huber = gtsam.noiseModel.mEstimator.Huber.Create(ROBUST_K)
     for n, (key, xy, variance) in enumerate(zip(fixes.key, fixes.xy_m, fixes.variance_m2, strict=True)):
-        values.insert(_b(n), _pose2(np.array([*(start.pose[key, :2] - xy), 0.0])))
+        values.insert(_b(n), pose2(np.array([*(start.pose[key, :2] - xy), 0.0])))
         graph.add(gtsam.PriorFactorPose2(_b(n), gtsam.Pose2(), _spring(springs.prior[n], PINNED_RAD)))
         noise = gtsam.noiseModel.Robust.Create(huber, _spring(1.0 / variance, FREE_RAD))
-        # The rotation says nothing; that it is about right keeps GTSAM's error in metres of the map's axes.
+        # The rotation is not constrained; that it is about right keeps GTSAM's error in metres of the map's axes.
         measured = gtsam.Pose2(xy[0], xy[1], start.pose[key, 2])
         graph.add(gtsam.BetweenFactorPose2(_b(n), _x(int(key)), measured, noise))
     for n, weight in enumerate(springs.between):
@@ -218,19 +219,19 @@ def _add_ties(graph: Any, ties: Ties) -> None:
 
 
 def _matches(matches: PoseMatches, *, robust: bool) -> list[Any]:
-    """Eq. (8)-(9); the information may be singular: nothing is then said along that direction."""
+    """Eq. (8)-(9); the information may be singular: a direction is then not constrained."""
     unit = gtsam.noiseModel.Unit.Create(3)
     huber = gtsam.noiseModel.mEstimator.Huber.Create(ROBUST_K)
     noise = gtsam.noiseModel.Robust.Create(huber, unit) if robust else unit
     return [
-        gtsam.CustomFactor(noise, [_x(int(key))], _LandmarkMatch(_pose2(pose), off, root_of(information)))
+        gtsam.CustomFactor(noise, [_x(int(key))], _LandmarkMatch(pose2(pose), off, root_of(information)))
         for key, pose, off, information in zip(*matches, strict=True)
     ]
 
 
 class _LandmarkMatch:
-    """Eq. (8) as GTSAM asks for it. A prior at the matched pose would not do: along lanes that say little that pose
-    may lie far away, and what holds near by does not hold there.
+    """Eq. (8) as GTSAM asks for it. A prior at the matched pose would not do: along lanes that constrain little that
+    pose may lie far away, and what holds near by does not hold there.
     """
 
     __slots__ = ("off", "pose", "root")

@@ -53,7 +53,7 @@ class GraphPipeline:
         parameters: of the feature layers.
         identity: who reports; the layers are put in here.
         outbox: where reports go; None: nowhere but into the `Output`.
-        feature_tiles: what the map says of the layers and of lanes; None: nothing.
+        feature_tiles: the map's tiles of the layers and of lanes; None: no map.
 
     Attributes:
         place, guard, timeline: as of `Pipeline`.
@@ -81,7 +81,7 @@ class GraphPipeline:
         self._held = HeldMap(frame)
         self._gathered: list[DriveItem] = []
         self._since_m = 0.0
-        self._fix: GnssFix | None = None  # the last one that says what it is worth
+        self._fix: GnssFix | None = None  # the last one with a sigma
         self._fix_m = 0.0
         self._still_since_ns: int | None = None
         self._online: PoseEstimate | None = None
@@ -112,7 +112,7 @@ class GraphPipeline:
 
     @property
     def held_back(self) -> HeldBack:
-        """Nothing of voxels is told."""
+        """There are no voxels to hold back."""
         return HeldBack()
 
     def tile(self, tile_id: TileId) -> Tile | None:  # noqa: ARG002  (a vehicle without a voxel map holds no tile of it)

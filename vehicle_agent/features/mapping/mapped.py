@@ -1,4 +1,4 @@
-"""What a mapped stretch says of each tile: features found, map features judged, and where was looked."""
+"""What is reported of a mapped stretch, tile by tile: features found, map features judged, cells looked at."""
 
 from collections import defaultdict
 from math import nan
@@ -31,9 +31,9 @@ def changes_of(
     Args:
         found: the graph's result.
         drive: the stretch.
-        held: what the map says.
+        held: the map's tiles.
         layer: whose features they are.
-        height_m: stands in for heights, which the plane does not tell; map frame.
+        height_m: stands in for heights, which a plane does not have; map frame.
     """
     times = np.array([look.t_ns for look in drive.looks], np.int64)
     poses = found.path.at(times[(times >= found.path.t_ns[0]) & (times <= found.path.t_ns[-1])])

@@ -46,7 +46,7 @@ class MappedFeatures:
 
     known_id: (N,) id of the known feature that it is, 0 = a new one. kinds: N.
     xy_m: (N, 2). cov_m2: (N, 2, 2), of the place in the map frame: the drive's own errors are in it.
-    height_m: (N,) above the vehicle's origin, nan = not told. hits: (N,) measurements.
+    height_m: (N,) above the vehicle's origin, nan = unknown. hits: (N,) measurements.
     first_ns, last_ns: (N,) of the measurements.
     """
 
@@ -95,7 +95,7 @@ def map_new_layer(
         sensors: how exact the vehicle's own are.
         lanes: the HD map's; None = map without HD map (section 3.1).
         known: features of the layer that the map has already.
-        trust_known: known features help to say where the vehicle is (with their covariances). False: they are only
+        trust_known: known features constrain the poses (with their covariances). False: they are only
             recognised, and where the drive has measured them does not depend on where the map has them.
         rounds: measurements are given to features anew, and the graph is solved, at most so often.
 
@@ -261,8 +261,8 @@ _COLUMNS = ("look", "t_ns", "range_m", "bearing_rad", "sigma_range_m", "sigma_be
 
 
 def _height(height_m: F64) -> float:
-    told = height_m[np.isfinite(height_m)]
-    return float(told.mean()) if len(told) else float("nan")
+    known = height_m[np.isfinite(height_m)]
+    return float(known.mean()) if len(known) else float("nan")
 
 
 def localise_with_features(

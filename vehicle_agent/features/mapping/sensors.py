@@ -53,7 +53,7 @@ class GnssReceiver:
 
 @dataclass(frozen=True, slots=True)
 class DriveSensors:
-    """The sensors of a vehicle but for its detector, whose looks say how exact they are."""
+    """The sensors of a vehicle but for its detector, whose looks bring their sigmas."""
 
     motion: WheelsAndGyro
     gnss: GnssReceiver

@@ -12,9 +12,10 @@ import numpy as np
 from scipy.stats import binom, chi2
 
 from gnd.gnd_map.arrays import F64, I64
-from gnd.vehicle_agent.features.mapping.dead_reckoning import relative, wrapped
+from gnd.vehicle_agent.features.mapping.dead_reckoning import relative
 from gnd.vehicle_agent.features.mapping.graph_edges import FixNodes, Problem, State
 from gnd.vehicle_agent.features.mapping.sensors import DriveSensors
+from gnd.vehicle_agent.features.view import wrapped
 
 WINDOW_S: Final = 120.0
 """Stretches of this length are asked: nine time constants of the GNSS's slow error."""

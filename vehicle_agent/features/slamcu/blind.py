@@ -1,6 +1,6 @@
 """Where the vehicle is by wheels, gyro and GNSS alone: a Kalman filter that has never seen a feature of the map.
 
-It is what the particles are held against, and where they are looked for when they are lost. What it says can be coarse;
+The particles are compared with it, and drawn around it when they are lost. Its place can be coarse;
 it cannot be led astray by a sign that was taken for its neighbour. Its state is that of a particle (`ParticleFilter`).
 """
 
@@ -16,8 +16,8 @@ from gnd.vehicle_agent.features.view import wrapped
 
 X, Y, HEADING, SCALE, BIAS, GNSS_X, GNSS_Y = range(7)
 JUMP: Final = 30.0
-"""Squared Mahalanobis distance of a fix from where it was expected, beyond which it is another reflection and tells
-nothing: χ² of 2 degrees of freedom, one of three million. Without fixes the place grows uncertain, until one fits."""
+"""Squared Mahalanobis distance of a fix from where it was expected, beyond which it is another reflection and is
+left out: χ² of 2 degrees of freedom, one of three million. Without fixes the place grows uncertain, until one fits."""
 MOST_SHARED: Final = 0.95
 """A first pose made of fixes has at most this share of its variance from their slow error."""
 STANDING_MPS: Final = 0.02
@@ -122,7 +122,7 @@ class BlindFilter:
         self._driven_s = 0.0
 
     def fix(self, xy_m: F64, sigma_m: float, dt_s: float) -> bool:
-        """Take a fix (2,), `dt_s` after the last one; False: it lies so far off that it tells nothing."""
+        """Take a fix (2,), `dt_s` after the last one; False: it lies so far off that it was left out."""
         self._propagate()
         white, slow = noise.gnss_variances_m2(sigma_m)
         fade = exp(-dt_s / noise.GNSS_CORRELATION_S)

@@ -24,7 +24,6 @@ from gnd.vehicle_agent.features.layers import look_of
 from gnd.vehicle_agent.features.look import MAX_RANGE_M, MapFeatures
 from gnd.vehicle_agent.features.slamcu.first_pose import AFTER_S, first_pose_of
 from gnd.vehicle_agent.features.slamcu.parameters import SlamcuParameters
-from gnd.vehicle_agent.features.slamcu.replay import PoseAt
 from gnd.vehicle_agent.features.slamcu.watched import WatchedSlamcu
 from gnd.vehicle_agent.features.view import Occlusion
 from gnd.vehicle_agent.localise.estimates import Cause, Health, PoseEstimate
@@ -39,7 +38,7 @@ from gnd.vehicle_agent.scans import Guard
 STEP_M: Final = 100.0
 """Tiles left behind are looked for after this much way."""
 EVERY_LOOK: Final = 50
-"""Of the poses that may still be told anew, so many are passed over: a tile near one of them is not left."""
+"""Of the poses that may still change, so many are passed over: a tile near one of them is not left."""
 WINDOW_NS: Final = 10_000_000_000
 """The first pose is made of the measurements of this time: a vehicle that stands for long has turned in it only."""
 TRY_EVERY_NS: Final = 500_000_000
@@ -62,7 +61,7 @@ class CameraPipeline:
         parameters: of the feature layer and its reports.
         identity: who reports.
         outbox: where reports go; None: nowhere but into the `Output`.
-        feature_tiles: what the map says of the layer; None: nothing.
+        feature_tiles: the map's tiles of the layer; None: no map.
         seed: of the particles.
 
     Attributes:
@@ -111,7 +110,7 @@ class CameraPipeline:
         if isinstance(item, ReferencePose) or not self.guard.admits(item):
             return self._output(())
         if isinstance(item, GnssFix) and not item.sigma_m > 0:
-            self.guard.bad["no-sigma"] += 1  # nothing says what it is worth
+            self.guard.bad["no-sigma"] += 1  # its noise is not known
             return self._output(())
         if self.slamcu is None:
             self._begin(item)
@@ -134,7 +133,7 @@ class CameraPipeline:
 
     @property
     def held_back(self) -> HeldBack:
-        """Nothing of voxels is told."""
+        """There are no voxels to hold back."""
         return HeldBack()
 
     def tile(self, tile_id: TileId) -> Tile | None:  # noqa: ARG002  (a vehicle without a voxel map holds no tile of it)
@@ -157,7 +156,7 @@ class CameraPipeline:
     # --- the first pose ---------------------------------------------------------------------------------------------
 
     def _begin(self, item: DriveItem) -> None:
-        """Gather motion and fixes until they tell a first pose."""
+        """Gather motion and fixes until they give a first pose."""
         if not isinstance(item, MotionSample | GnssFix):
             return
         self._before.append(item)
@@ -252,23 +251,20 @@ class CameraPipeline:
         return poses
 
     def _cover(self, until: int) -> tuple[PoseEstimate, ...]:
-        """Take the looks up to one as they were at final poses; those of stretches that were given up say nothing."""
+        """Take the looks up to one as they were at final poses; those of stretches that were given up do not count."""
         slamcu, layer = self.slamcu, self._layer
         assert slamcu is not None
         assert layer is not None
         poses = []
         for number in range(self._settled, until):
             taken, at = self._looks.popleft(), slamcu.path[number]
-            given_up = self._given_up(at, slamcu)
+            given_up = any(lost.gives_up(at.t_s, at.t_s) for lost in slamcu.lost)
             if not given_up:
                 layer.cover(at.pose, taken.occlusion)
             health: Health = "lost" if given_up else "good"
             poses.append(self._estimate(taken.t_ns, at.pose, at.cov, health, "wrong_pose" if given_up else "none"))
         self._settled = until
         return tuple(poses)
-
-    def _given_up(self, at: PoseAt, slamcu: WatchedSlamcu) -> bool:
-        return any(not lost.replayed and lost.from_s <= at.t_s <= lost.until_s for lost in slamcu.lost)
 
     def _output(self, poses: tuple[PoseEstimate, ...]) -> Output:
         online = self._online

@@ -1,7 +1,7 @@
 """Which estimate is which feature of the map, decided when all of its measurements are in.
 
-The panels of a gantry stand a lane apart, and one look at 80 m cannot tell them from one another: what is measured at
-first may be taken for its neighbour, and everything after it follows. An estimate gathered over a passage can tell. So
+The panels of a gantry stand a lane apart, and one look at 80 m cannot distinguish them: what is measured at
+first may be taken for its neighbour, and everything after it follows. An estimate gathered over a passage can. So
 before the map's features are settled, all ways to give the estimates at hand to them are compared, by the likelihood of
 the whole in each particle: the pose is the same for all of them.
 """
@@ -49,9 +49,9 @@ def best_identities(particles: ParticleFilter, slots: list[int], owned: int, ln_
     fit = agreements(particles, slots, owned)
     log_weight = np.log(np.maximum(particles.weights(without=set(slots)), 1e-300))
     ways = _ways(fit, log_weight)
-    told = np.array([likelihood(fit, log_weight, way, ln_none) for way in ways])
-    best = int(np.argmax(told))
-    lead = float(told[best] - np.delete(told, best).max(initial=-np.inf))
+    likelihoods = np.array([likelihood(fit, log_weight, way, ln_none) for way in ways])
+    best = int(np.argmax(likelihoods))
+    lead = float(likelihoods[best] - np.delete(likelihoods, best).max(initial=-np.inf))
     return Identities([NONE if i == NONE else slots[i] for i in ways[best]], lead)
 
 

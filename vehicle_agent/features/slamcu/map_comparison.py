@@ -1,7 +1,7 @@
 """Features of the map against what was measured of them: found in place, taken for their neighbour, or moved.
 
 A feature is estimated while it is in sight, and compared with its map position when it has left the view. The panels of
-a gantry are told apart first (`identities.py`). What then lies elsewhere has moved: deleted there, new here (SLAMCU,
+a gantry are distinguished first (`identities.py`). What then lies elsewhere has moved: deleted there, new here (SLAMCU,
 section 2.3).
 
 Or it is the vehicle that is not where it believes to be. A vehicle that starts with a GNSS fix may take a new sign for
@@ -29,7 +29,7 @@ MOVED_M: Final = 2.0
 SETTLE_HITS: Final = 60
 """A feature in view is compared after so many measurements: at a red light nothing leaves the view."""
 ENOUGH_HITS: Final = 6
-"""So many measurements tell where a feature is, and whether it is ever measured together with another."""
+"""So many measurements show where a feature is, and whether it is ever measured together with another."""
 GROUP_M: Final = 12.0
 """Features within this distance may be taken for each other: three lanes."""
 RIVAL_SHARE: Final = 0.25
@@ -38,7 +38,7 @@ SURE: Final = 3.0
 """Identities are decided when they are so much likelier than any others (natural logarithm), whichever of the two
 prices a sign has that is gone while another stands in its place."""
 UNDECIDED_M: Final = 600.0
-"""Or after so much way, in which further signs may have told where the vehicle was."""
+"""Or after so much way, in which further signs may have shown where the vehicle was."""
 ASK_EVERY_S: Final = 1.0
 """What is undecided is looked at so often."""
 ALLOWED: Final = 18.4
@@ -46,7 +46,7 @@ ALLOWED: Final = 18.4
 ALIKE: Final = 0.5
 """Cosine of the angle between two steps that may be one, and the least ratio of their lengths."""
 RECENT_M: Final = 1500.0
-"""A sign that moved longer ago says nothing about the place now."""
+"""A sign that moved longer ago is no evidence about the place now."""
 LOOSE_M: Final = 4.0
 LOOSE_RAD: Final = radians(1.0)
 """Sigmas of the place that is searched for anew: a lane, and what two signs a lane off turn the vehicle by."""
@@ -121,7 +121,7 @@ class MapComparison:
                 self._compare(feature, t_ns)
 
     def forget_moves(self) -> None:
-        """The place is searched for anew: steps from before say nothing."""
+        """The place is searched for anew: steps from before do not count."""
         self._last_moved = None
 
     def _compare(self, feature: TrackedFeature, t_ns: int) -> None:
@@ -167,8 +167,8 @@ class MapComparison:
     # Which estimate is which feature of the map
 
     def _identify(self, feature: TrackedFeature, t_ns: int) -> bool:
-        """Give the estimates of features that stand close together to those of the map that they are; False: nobody can
-        tell yet, and until then they tell nothing of where the vehicle is.
+        """Give the estimates of features that stand close together to those of the map that they are; False: that is
+        open, and until it is decided they do not weigh the particles.
         """
         group = self._group(feature)
         owned = sum(one.known for one in group)

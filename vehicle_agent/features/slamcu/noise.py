@@ -2,7 +2,7 @@
 
 Noise of wheels and gyro is per square root of a second, so that it does not depend on their rate: twice the white noise
 that `gnd.fleet_sim.drives.SensorErrors` gives its sensors at 50 Hz, for wheels also slip. The error of the GNSS is slow
-(Gauss-Markov) and white, both together of the sigma that a fix tells, as `python -m studies gnss-noise` finds in a
+(Gauss-Markov) and white, both together of the sigma of the fix, as `python -m studies gnss-noise` finds in a
 car's single-point fixes.
 """
 
@@ -27,7 +27,7 @@ GNSS_WHITE_SHARE: Final = 0.30
 GNSS_CORRELATION_S: Final = 13.4
 """Time constant of the slow error."""
 GNSS_INTERVAL_S: Final = 0.5
-"""At most one fix in this time is used: those between tell the same error once more."""
+"""At most one fix in this time is used: those between have the same error."""
 
 
 def gnss_variances_m2(sigma_m: float) -> tuple[float, float]:

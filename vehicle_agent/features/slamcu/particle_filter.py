@@ -73,7 +73,6 @@ class ParticleFilter:
         self.priors: list[Prior | None] = []
         self.provisional: list[bool] = []
         self.weighing = True
-        self.resampled = 0
 
     @property
     def m(self) -> int:
@@ -279,7 +278,6 @@ class ParticleFilter:
         index = systematic(weights, float(self.rng.random()))
         self.log_weight = np.zeros(self.m)
         self.state, self.mu, self.sigma = self.state[:, index], self.mu[:, index], self.sigma[:, index]
-        self.resampled += 1
         if _JITTER > 0.0:
             one, other = self.rng.permutation(self.m), self.rng.permutation(self.m)
             self.state[HEADING] = self.state[HEADING, 0] + wrapped(self.state[HEADING] - self.state[HEADING, 0])

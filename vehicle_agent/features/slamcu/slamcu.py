@@ -1,7 +1,7 @@
 """Simultaneous localisation and map change update: SLAMCU (Jo, Kim and Sunwoo 2018), on one vehicle.
 
 Each look: associate measurements with features, one to one (section 4.3.1); those in view that were not measured lose
-existence, those measured gain it (4.3.2); what is new is registered; what exists tells where the vehicle is (4.3.4, 5).
+existence, those measured gain it (4.3.2); what is new is registered; what exists localises the vehicle (4.3.4, 5).
 """
 
 from collections.abc import Collection
@@ -70,7 +70,7 @@ class Passed:
 
 
 class Slamcu:
-    """One drive: the particles, the features in them, and what wheels, gyro and GNSS alone say of the place.
+    """One drive: the particles, the features in them, and the place by wheels, gyro and GNSS alone.
 
     Args:
         parameters: of existence and filter.
@@ -192,7 +192,7 @@ class Slamcu:
 
     @property
     def has_fixes(self) -> bool:
-        """Whether the GNSS has told anything yet."""
+        """Whether a fix has been used yet."""
         return self._blind.has_fixes
 
     def look_anew(self) -> None:
@@ -206,7 +206,7 @@ class Slamcu:
         self._particles.seed(self._blind.belief)
 
     def widen(self, position_m: float, heading_rad: float) -> None:
-        """The place is in doubt, and nobody can tell a better one: be as uncertain as that from now on."""
+        """The place is in doubt, and no better one is known: be as uncertain as that from now on."""
         self._move()
         self._particles.loosen((), position_m, heading_rad)
 
@@ -229,7 +229,7 @@ class Slamcu:
         ]
 
     def decide(self) -> None:
-        """The drive has ended: decide what was left open for further signs to tell."""
+        """The drive has ended: decide what was left open for further signs."""
         self._comparison.decide_all(self._looked_ns)
 
     def _decided(self, feature: TrackedFeature) -> bool:

@@ -133,7 +133,7 @@ class TrackedFeature:
 
     @property
     def exists(self) -> bool:
-        """Whether it may tell where the vehicle is: only what exists, by its masses (section 4.3.4)."""
+        """Whether it may weigh the particles: only what exists, by its masses (section 4.3.4)."""
         return bool(self.masses[0] > max(self.masses[1], self.masses[2]))
 
     def masses_over_time(self) -> tuple[MassesAt, ...]:
@@ -171,13 +171,6 @@ def recount(feature: TrackedFeature, hits: int, misses: int, confidence: float, 
 def existence_of(masses: F64) -> Existence:
     """Masses (4,) as a value."""
     return Existence(*(float(mass) for mass in masses))
-
-
-def repeated(evidence: F64, count: int) -> F64:
-    """The same one-sided evidence `count` times: its unknown mass to that power, as Dempster's rule has it."""
-    unknown = evidence[2] ** count
-    side = (1.0 - unknown) * (evidence[:2] > 0.0)
-    return np.array([side[0], side[1], unknown, 0.0])
 
 
 def counted(masses: F64, hits: int, misses: int, confidence: float) -> F64:

@@ -1,4 +1,4 @@
-"""What a drive with SLAMCU says of features."""
+"""Verdicts of a drive with SLAMCU on features."""
 
 from dataclasses import dataclass, field
 
@@ -9,7 +9,7 @@ from gnd.vehicle_agent.features.slamcu.tracked_feature import FeatureClass, Mass
 
 @dataclass(frozen=True, slots=True, eq=False)
 class KnownState:
-    """What the drive says of a feature of its map.
+    """Verdict on a feature of the map.
 
     Attributes:
         feature_id: the map's.

@@ -2,9 +2,9 @@
 
 Four tests:
 
-- **offset**: the mean of fix minus pose, weighed by how far its neighbours tell the same error once more (the fixes'
+- **offset**: the mean of fix minus pose, weighed by how far its neighbours have the same error (the fixes'
   slow error is a Gauss-Markov process: generalised least squares by its Kalman filter), over two windows;
-- **blind**: the pose against that of wheels, gyro and GNSS alone (`blind.py`), which tells the heading too;
+- **blind**: the pose against that of wheels, gyro and GNSS alone (`blind.py`), which has the heading too;
 - **map**: features of the map that have gone, while one like it stands near by, against those found in place: a
   sequential test (CUSUM) of "lost" against "here";
 - **sign**: how far from its place in the map a feature was measured, in units of what pose and measurement may be off
@@ -75,10 +75,10 @@ class Alarm:
 
 
 class Watch:
-    """The four tests along one account of a drive.
+    """The four tests along one run of a drive.
 
     Attributes:
-        cost: what fixes and signs say against this account (natural logarithm).
+        cost: of fixes and signs against this run (natural logarithm).
         run: of the map's test, >= 0.
     """
 
@@ -122,7 +122,7 @@ class Watch:
         """Features that have just left the view, and those (new ones among them) that stand around."""
         for one in seen:
             if one.known:
-                self.run = max(self.run + _told(one, beside), 0.0)
+                self.run = max(self.run + _evidence(one, beside), 0.0)
 
     def sign(self, innovation: MapInnovation) -> None:
         """A feature of the map was measured, and compared with its place."""
@@ -130,7 +130,7 @@ class Watch:
         self.cost -= max(innovation.ln_density, LEAST_LN_DENSITY)
 
     def settled(self) -> None:
-        """The doubt has been looked into, and this account is the best there is: one more such sign, and it is asked
+        """The doubt has been looked into, and this run is the best there is: one more such sign, and it is asked
         again.
         """
         self.run = min(self.run, 0.5 * GATE_MAP)
@@ -160,8 +160,8 @@ def _offset(sums: F64, place: F64) -> float:
     return float(off @ np.linalg.solve(cov, off))
 
 
-def _told(one: Passed, around: Sequence[Passed]) -> float:
-    """What a feature of the map says of being lost."""
+def _evidence(one: Passed, around: Sequence[Passed]) -> float:
+    """Log likelihood ratio of lost against here, of a feature of the map."""
     if one.feature_class == FeatureClass.NORMAL:
         return FOUND
     if one.feature_class != FeatureClass.DELETED:

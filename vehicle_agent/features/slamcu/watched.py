@@ -59,14 +59,14 @@ WIDE_RAD: Final = radians(0.5)
 """What a place is made less certain by that fixes speak against, when no run is better: most of a lane."""
 CONTRADICTS: Final = 15.0
 """Where the run that GNSS, wheels and gyro allow is so much worse (natural logarithm; five signs gone) than one that
-they deny, map and GNSS contradict, and nobody can tell which is right."""
+they deny, map and GNSS contradict, and it is open which is right."""
 FOUND_AGAIN: Final = 2
 """A vehicle that has given up knows its place again when so many signs of the map are there, and more than are not."""
 LOST_M: Final = 10.0
 """Sigma of each axis of the place until then."""
 LOOK_BACK_EVERY_S: Final = 10.0
 LOOK_BACK_S: Final = 240.0
-"""Hindsight is asked so often, of so much: fixes from farther back say nothing of the place."""
+"""Hindsight is asked so often, of so much: fixes from farther back do not constrain the place."""
 AT_THE_END: Final = 0.5
 """When the drive ends a doubt need be only so large: nothing more will come."""
 
@@ -342,7 +342,7 @@ class WatchedSlamcu:
         return self._hindsight.smoothed(self._slamcu.now_s - LOOK_BACK_S)
 
     def _denied(self, checkpoint: Checkpoint, path: list[PoseAt], smoothed: Smoothed) -> float:
-        """What hindsight says against the way since the oldest checkpoint, with another path from one on."""
+        """Cost by hindsight of the way since the oldest checkpoint, with another path from one on."""
         first = self._log.checkpoints[0].poses
         return speaks_against(*_columns([*self.path[first : checkpoint.poses], *path]), smoothed)
 
