@@ -60,4 +60,4 @@ def test_poses_of_a_standing_vehicle_are_the_generalised_mean_of_its_fixes(monke
 
 def _heading_told(problem):
     heading = PoseMatches(np.array([0]), np.zeros((1, 3)), np.zeros((1, 3)), np.diag([0.0, 0.0, 1e8])[None])
-    return replace(problem, poses=heading)
+    return replace(problem, lanes=heading)

@@ -32,8 +32,7 @@ def truth():
 def test_looks_of_another_layer_or_sensor_are_not_taken(truth):
     items = items_of(drive(truth, Noise(), 0))
     assert FeatureDrive.of_items(items, FRAME, "signs").looks == ()
-    assert FeatureDrive.of_items(items, FRAME, "streetlights", "camera").looks == ()
-    both = FeatureDrive.of_items(items, FRAME, "streetlights", "lidar")
+    both = FeatureDrive.of_items(items, FRAME, "streetlights")
     assert len(both.looks) == 81
     assert len(both.lanes) == 81
     np.testing.assert_allclose(both.fixes.xy_m, truth.pose[::50, :2], atol=1e-3)

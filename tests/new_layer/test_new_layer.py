@@ -10,7 +10,7 @@ from gnd.gnd_map.errors import ShapeError
 from gnd.schemas.drive import MotionTrack
 from gnd.vehicle_agent.errors import NewLayerError
 from gnd.vehicle_agent.features.look import MapFeatures
-from gnd.vehicle_agent.features.mapping.feature_drive import FeatureDrive, GnssFixes, KnownPoses, Measurements
+from gnd.vehicle_agent.features.mapping.feature_drive import FeatureDrive, GnssFixes, Measurements
 from gnd.vehicle_agent.features.mapping.new_layer import lane_map, localise_with_features, map_new_layer
 
 EXACT = Noise()
@@ -121,17 +121,6 @@ def test_known_features_make_localisation_better_and_add_none(truth):
     assert np.mean(off[True]) < 0.6 * np.mean(off[False])
 
 
-def test_poses_of_another_localiser_take_the_place_of_gnss(truth):
-    rng = np.random.default_rng(6)
-    d, t_ns = drive(truth, replace(PAPER, range_m=0.1, bearing=0.005), 2), truth.t_ns[::25]
-    sigma = np.array([0.05, 0.05, 0.002])
-    pose = truth.at(t_ns) + sigma * rng.standard_normal((len(t_ns), 3))
-    told = KnownPoses(t_ns, pose, np.tile(np.diag(sigma**2), (len(t_ns), 1, 1)))
-    layer = map_new_layer(FeatureDrive(d.motion, looks=d.looks, poses=told), sensors(PAPER))
-    np.testing.assert_allclose(layer.features.xy_m[ordered(layer, truth)], truth.features, atol=0.1)
-    assert np.sqrt(layer.features.cov_m2[:, 0, 0]).max() < 0.05
-
-
 def test_a_drive_that_saw_nothing_has_an_empty_layer(truth):
     d = drive(truth, PAPER, 1)
     layer = map_new_layer(replace(d, looks=()), sensors(PAPER), lane_map(truth.lanes))
@@ -156,7 +145,7 @@ def test_bad_drives_are_refused(truth):
     with pytest.raises(NewLayerError, match="1 motion samples"):
         replace(good, motion=MotionTrack(*(column[:1] for column in good.motion)))
     with pytest.raises(NewLayerError, match="without GNSS fixes"):
-        FeatureDrive(good.motion)
+        FeatureDrive(good.motion, GnssFixes(np.empty(0, np.int64), np.empty((0, 2))))
     with pytest.raises(NewLayerError, match="looks are not in order of time: row 1"):
         replace(good, looks=good.looks[::-1])
     with pytest.raises(ShapeError, match="xy_m of fixes"):

@@ -7,13 +7,11 @@ import numpy as np
 
 from gnd.gnd_map.arrays import F64, I64
 from gnd.vehicle_agent.features.mapping.dead_reckoning import DeadReckoning, composed, relative, rotated
-from gnd.vehicle_agent.features.mapping.feature_drive import FeatureDrive, GnssFixes, KnownPoses
+from gnd.vehicle_agent.features.mapping.feature_drive import FeatureDrive, GnssFixes
 from gnd.vehicle_agent.features.mapping.graph import solve
 from gnd.vehicle_agent.features.mapping.graph_edges import (
     NO_FIX_NODES,
-    NO_MATCHES,
     FixNodes,
-    PoseMatches,
     Problem,
     State,
 )
@@ -62,12 +60,11 @@ class DriveNodes:
         return Sight(key, relative(base, here), way)
 
     def problem(self, pose: F64) -> Problem:
-        """Motion, fixes and poses of another localiser as edges; pose: (K, 3) as known so far."""
+        """Motion and fixes as edges; pose: (K, 3) as known so far."""
         return Problem(
             self.reckoning.steps(self.t_ns),
             self.calibration,
             self._fix_nodes(self.drive.fixes, pose, self.sensors.gnss),
-            poses=self._pose_matches(self.drive.poses),
         )
 
     def _fix_nodes(self, fixes: GnssFixes, pose: F64, noise: GnssReceiver) -> FixNodes:
@@ -85,22 +82,8 @@ class DriveNodes:
         slow = noise.sigma_m**2 * span_s / (6.0 * noise.correlation_s)
         return FixNodes(key, (self.t_ns[key] - self.t_ns[0]) * 1e-9, mean, noise.white_m**2 / count + slow)
 
-    def _pose_matches(self, poses: KnownPoses) -> PoseMatches:
-        """Poses of another localiser brought to the nearest keyframes."""
-        if len(poses.t_ns) == 0:
-            return NO_MATCHES
-        key, offset, _ = self.sight(poses.t_ns)
-        back = relative(offset, np.zeros_like(offset))
-        c, s = np.cos(poses.pose[:, 2]), np.sin(poses.pose[:, 2])
-        R = np.zeros((len(key), 3, 3))
-        R[:, 0, 0], R[:, 0, 1], R[:, 1, 0], R[:, 1, 1], R[:, 2, 2] = c, -s, s, c, 1.0
-        own = R.transpose(0, 2, 1) @ poses.cov @ R
-        adjoint = _adjoint(back)
-        information = np.asarray(np.linalg.inv(adjoint @ own @ adjoint.transpose(0, 2, 1)), np.float64)
-        return PoseMatches(key, composed(poses.pose, back), np.zeros_like(back), information)
-
     def first_state(self) -> tuple["DriveNodes", State]:
-        """Poses (K, 3) by smoothing motion, fixes and known poses: no features yet, no map."""
+        """Poses (K, 3) by smoothing motion and fixes: no features yet, no map."""
         nodes = self.calibrated(np.array([0.0, self._first_bias()]))
         state = State(nodes._laid_out(), np.empty((0, 2)), nodes.calibration)
         for _ in range(SMOOTHINGS):
@@ -108,16 +91,9 @@ class DriveNodes:
             state = solve(nodes.problem(state.pose), state, self.sensors).state
         return nodes, state
 
-    def _places(self) -> tuple[I64, F64]:
-        """(P,) times and (P, 2) places of fixes and known poses."""
-        t_ns = np.concatenate([self.drive.fixes.t_ns, self.drive.poses.t_ns])
-        xy = np.concatenate([self.drive.fixes.xy_m, self.drive.poses.pose[:, :2]])
-        order = np.argsort(t_ns, kind="stable")
-        return t_ns[order], xy[order]
-
     def _first_bias(self) -> float:
         """Gyro bias [rad/s] roughly: how directions by GNSS turn against those of dead reckoning."""
-        t_ns, xy = self._places()
+        t_ns, xy = self.drive.fixes.t_ns, self.drive.fixes.xy_m
         way = np.interp(t_ns - self.t_ns[0], self.reckoning.t_ns - self.t_ns[0], self.reckoning.way_m)
         last = np.searchsorted(way, way + CHORD_M)
         first = np.flatnonzero(last < len(way))
@@ -133,24 +109,12 @@ class DriveNodes:
 
     def _laid_out(self) -> F64:
         """(K, 3) dead reckoning laid onto the fixes as a whole: turned and shifted, least squares."""
-        t_ns, xy = self._places()
+        t_ns, xy = self.drive.fixes.t_ns, self.drive.fixes.xy_m
         driven, base = self.reckoning.at(t_ns)[:, :2], self.reckoning.at(self.t_ns)
         a, b = driven - driven.mean(axis=0), xy - xy.mean(axis=0)
         yaw = float(np.arctan2((a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0]).sum(), (a * b).sum()))
-        if len(self.drive.poses.t_ns) and np.ptp(driven, axis=0).max() < CHORD_M:
-            yaw = float(self.drive.poses.pose[0, 2] - self.reckoning.at(self.drive.poses.t_ns[:1])[0, 2])
         shift = xy.mean(axis=0) - rotated(np.array(yaw), driven.mean(axis=0))
         return composed(np.broadcast_to(np.array([*shift, yaw]), base.shape), base)
-
-
-def _adjoint(pose: F64) -> F64:
-    """(P, 3, 3) that carries a pose's covariance, in its own frame, to what is `pose` (P, 3) in that frame."""
-    inverse = relative(pose, np.zeros_like(pose))
-    A = np.zeros((len(pose), 3, 3))
-    c, s = np.cos(inverse[:, 2]), np.sin(inverse[:, 2])
-    A[:, 0, 0], A[:, 0, 1], A[:, 1, 0], A[:, 1, 1], A[:, 2, 2] = c, -s, s, c, 1.0
-    A[:, 0, 2], A[:, 1, 2] = inverse[:, 1], -inverse[:, 0]
-    return A
 
 
 def nearest(base: I64, values: I64) -> I64:

@@ -80,7 +80,7 @@ def solve(problem: Problem, start: State, sensors: DriveSensors) -> Solution:
     _add_fixes(graph, values, problem.fixes, start, sensors)
     _add_ties(graph, problem.ties)
     _add_anchors(graph, problem.anchors)
-    own = _motion(problem) + _matches(problem.lanes, robust=True) + _matches(problem.poses, robust=False)
+    own = _motion(problem) + _matches(problem.lanes)
     with _determined(len(start.pose)):
         linear, optimum = _optimised(graph, own, values)
     cost = 2.0 * (graph.error(optimum) + sum(factor.error(optimum) for factor in own))  # Eq. (6), (10)
@@ -218,11 +218,10 @@ def _add_ties(graph: Any, ties: Ties) -> None:
         graph.add(gtsam.BearingRangeFactor2D(_x(int(key)), _l(int(landmark)), seen, distance, noise))
 
 
-def _matches(matches: PoseMatches, *, robust: bool) -> list[Any]:
+def _matches(matches: PoseMatches) -> list[Any]:
     """Eq. (8)-(9); the information may be singular: a direction is then not constrained."""
-    unit = gtsam.noiseModel.Unit.Create(3)
     huber = gtsam.noiseModel.mEstimator.Huber.Create(ROBUST_K)
-    noise = gtsam.noiseModel.Robust.Create(huber, unit) if robust else unit
+    noise = gtsam.noiseModel.Robust.Create(huber, gtsam.noiseModel.Unit.Create(3))
     return [
         gtsam.CustomFactor(noise, [_x(int(key))], _LandmarkMatch(pose2(pose), off, root_of(information)))
         for key, pose, off, information in zip(*matches, strict=True)

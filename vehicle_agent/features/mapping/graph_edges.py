@@ -36,7 +36,7 @@ class Ties(NamedTuple):
 
 
 class PoseMatches(NamedTuple):
-    """Poses of keyframes by lanes (Eq. 8), or by another localiser."""
+    """Poses of keyframes by lanes (Eq. 8)."""
 
     key: I64
     """(P,)"""
@@ -74,7 +74,6 @@ class Problem:
     fixes: FixNodes = NO_FIX_NODES
     ties: Ties = NO_TIES
     lanes: PoseMatches = NO_MATCHES
-    poses: PoseMatches = NO_MATCHES
     anchors: GraphAnchors = NO_ANCHORS
 
 

@@ -47,7 +47,6 @@ class MappedFeatures:
     known_id: (N,) id of the known feature that it is, 0 = a new one. kinds: N.
     xy_m: (N, 2). cov_m2: (N, 2, 2), of the place in the map frame: the drive's own errors are in it.
     height_m: (N,) above the vehicle's origin, nan = unknown. hits: (N,) measurements.
-    first_ns, last_ns: (N,) of the measurements.
     """
 
     known_id: I64
@@ -56,8 +55,6 @@ class MappedFeatures:
     cov_m2: F64
     height_m: F64
     hits: I64
-    first_ns: I64
-    last_ns: I64
 
     def __len__(self) -> int:
         return len(self.xy_m)
@@ -250,8 +247,6 @@ class _Mapping:
             solution.landmark_cov(),
             np.array([_height(self.m.height_m[r]) for r in rows]),
             np.array([len(r) for r in rows], np.int64),
-            np.array([self.m.t_ns[r].min() for r in rows], np.int64),
-            np.array([self.m.t_ns[r].max() for r in rows], np.int64),
         )
         path = SmoothedPath(self.nodes.t_ns, solution.state.pose, self.nodes.reckoning)
         return NewLayer(features, path, solution.state.calibration, solution.cost, solution, self.strains)
