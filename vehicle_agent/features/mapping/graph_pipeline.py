@@ -7,15 +7,11 @@ the GNSS has it: degraded, with the cause "hindsight".
 
 import logging
 import math
-from collections import Counter
 from dataclasses import replace
 from typing import Any, Final
 
 import numpy as np
 
-from gnd.gnd_map.geodesy import LocalFrame
-from gnd.gnd_map.tile import Tile
-from gnd.gnd_map.tile_id import TileId
 from gnd.schemas.drive import DriveItem, GnssFix, MotionSample, ReferencePose
 from gnd.schemas.feature_layer import LayerParameters
 from gnd.vehicle_agent.config import PipelineParameters
@@ -24,14 +20,13 @@ from gnd.vehicle_agent.features.mapping.feature_drive import FeatureDrive
 from gnd.vehicle_agent.features.mapping.held_map import HeldMap
 from gnd.vehicle_agent.features.mapping.mapped import changes_of
 from gnd.vehicle_agent.features.mapping.new_layer import map_new_layer
-from gnd.vehicle_agent.localise.estimates import Cause, Health, PoseEstimate
-from gnd.vehicle_agent.pipeline import FeatureTiles, HeldBack, Output
-from gnd.vehicle_agent.place import HEADING_BASE_M, Place
+from gnd.vehicle_agent.features.without_lidar import VehicleWithoutLidar
+from gnd.vehicle_agent.localise.estimates import PoseEstimate
+from gnd.vehicle_agent.pipeline import FeatureTiles, Output
+from gnd.vehicle_agent.place import HEADING_BASE_M
 from gnd.vehicle_agent.report.feature_report import FeatureReporter
 from gnd.vehicle_agent.report.reporter import Identity
-from gnd.vehicle_agent.report.sink import NewReports, ReportList, ReportSink
-from gnd.vehicle_agent.result import HealthTimeline
-from gnd.vehicle_agent.scans import Guard
+from gnd.vehicle_agent.report.sink import ReportSink
 
 STILL_MPS: Final = 0.1
 STILL_S: Final = 3.0
@@ -45,7 +40,7 @@ ANY_HEADING_RAD: Final = math.pi / math.sqrt(3.0)
 _log = logging.getLogger(__name__)
 
 
-class GraphPipeline:
+class GraphPipeline(VehicleWithoutLidar):
     """One drive of one vehicle without LiDAR that maps feature layers stretch by stretch.
 
     Args:
@@ -56,7 +51,6 @@ class GraphPipeline:
         feature_tiles: the map's tiles of the layers and of lanes; None: no map.
 
     Attributes:
-        place, guard, timeline: as of `Pipeline`.
         counts: stretches mapped, refused and contradicting.
     """
 
@@ -68,23 +62,19 @@ class GraphPipeline:
         outbox: ReportSink | None = None,
         feature_tiles: FeatureTiles | None = None,
     ) -> None:
-        frame = LocalFrame.of_tile(TileId.from_geodetic(fix.lat_rad, fix.lon_rad))
-        self.place, self.guard, self.timeline = Place(frame, fix), Guard(), HealthTimeline()
-        self.counts: Counter[str] = Counter()
+        super().__init__(fix, outbox, "no_position")
         self._parameters, self._feature_tiles = parameters, feature_tiles
-        self._new_reports = NewReports(ReportList() if outbox is None else outbox)
         longest_m = parameters.report.unchanged_m
         self._reporters = {
             layer.name: FeatureReporter(self._new_reports, replace(identity, layer=layer.name), fix.t_ns, longest_m)
             for layer in parameters.features.layers
         }
-        self._held = HeldMap(frame)
+        self._held = HeldMap(self.place.frame)
         self._gathered: list[DriveItem] = []
         self._since_m = 0.0
         self._fix: GnssFix | None = None  # the last one with a sigma
         self._fix_m = 0.0
         self._still_since_ns: int | None = None
-        self._online: PoseEstimate | None = None
 
     def push(self, item: DriveItem) -> Output:
         """Take the next measurement; items come in time order. Where the vehicle has stopped, its stretch is mapped."""
@@ -109,15 +99,6 @@ class GraphPipeline:
         """The drive has ended: map the last stretch."""
         self._map_stretch()
         return self._output()
-
-    @property
-    def held_back(self) -> HeldBack:
-        """There are no voxels to hold back."""
-        return HeldBack()
-
-    def tile(self, tile_id: TileId) -> Tile | None:  # noqa: ARG002  (a vehicle without a voxel map holds no tile of it)
-        """None: there is no voxel map."""
-        return None
 
     def account(self) -> dict[str, Any]:
         """What the drive came to, as plain values."""
@@ -179,8 +160,3 @@ class GraphPipeline:
             sigma_rad = min(math.sqrt(2.0) * fix.sigma_m / HEADING_BASE_M, ANY_HEADING_RAD)  # of two fixes
         sigma_m = math.hypot(fix.sigma_m, place.odometer_m - self._fix_m)
         return PoseEstimate(t_ns, T, sigma_m, sigma_rad, 0.0, "degraded", "hindsight")
-
-    def _output(self) -> Output:
-        online = self._online
-        state: tuple[Health, Cause] = ("lost", "no_position") if online is None else (online.health, online.cause)
-        return Output((), self._new_reports.take(), online, *state)

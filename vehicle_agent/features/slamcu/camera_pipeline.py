@@ -4,16 +4,13 @@ The particle filter of wheels, gyro, GNSS and a camera finds the poses (`watched
 some kilometres. So a tile is decided once nothing can change what was concluded about it, or at the end.
 """
 
-from collections import Counter, deque
+from collections import deque
 from dataclasses import dataclass
 from typing import Any, Final
 
 import numpy as np
 
 from gnd.gnd_map.arrays import F64
-from gnd.gnd_map.geodesy import LocalFrame
-from gnd.gnd_map.tile import Tile
-from gnd.gnd_map.tile_id import TileId
 from gnd.schemas.drive import Detections, DriveItem, GnssFix, MotionSample, ReferencePose
 from gnd.vehicle_agent.config import PipelineParameters
 from gnd.vehicle_agent.errors import AgentConfigError
@@ -26,14 +23,12 @@ from gnd.vehicle_agent.features.slamcu.first_pose import AFTER_S, first_pose_of
 from gnd.vehicle_agent.features.slamcu.parameters import SlamcuParameters
 from gnd.vehicle_agent.features.slamcu.watched import WatchedSlamcu
 from gnd.vehicle_agent.features.view import Occlusion
+from gnd.vehicle_agent.features.without_lidar import VehicleWithoutLidar
 from gnd.vehicle_agent.localise.estimates import Cause, Health, PoseEstimate
-from gnd.vehicle_agent.pipeline import FeatureTiles, HeldBack, Output
-from gnd.vehicle_agent.place import Place
+from gnd.vehicle_agent.pipeline import FeatureTiles, Output
 from gnd.vehicle_agent.report.feature_report import FeatureReporter
 from gnd.vehicle_agent.report.reporter import Identity
-from gnd.vehicle_agent.report.sink import NewReports, ReportList, ReportSink
-from gnd.vehicle_agent.result import HealthTimeline
-from gnd.vehicle_agent.scans import Guard
+from gnd.vehicle_agent.report.sink import ReportSink
 
 STEP_M: Final = 100.0
 """Tiles left behind are looked for after this much way."""
@@ -53,8 +48,8 @@ class _Taken:
     occlusion: Occlusion | None
 
 
-class CameraPipeline:
-    """One drive of one vehicle without LiDAR. Poses are in the map frame: ENU at the tile of the first position.
+class CameraPipeline(VehicleWithoutLidar):
+    """One drive of one vehicle without LiDAR that localises by features.
 
     Args:
         fix: the first position, which lays the map frame.
@@ -65,7 +60,6 @@ class CameraPipeline:
         seed: of the particles.
 
     Attributes:
-        place, guard, timeline: as of `Pipeline`.
         slamcu: the filter; None until the first pose is known.
 
     Raises:
@@ -87,15 +81,11 @@ class CameraPipeline:
                 "a vehicle that localises by features needs one layer that its camera looks for, not"
                 f" {', '.join(layer.name for layer in layers) or 'none'}"
             )
-        self._parameters, self._layer_parameters, self._seed = parameters, layers[0], seed
-        frame = LocalFrame.of_tile(TileId.from_geodetic(fix.lat_rad, fix.lon_rad))
-        self.place = Place(frame, fix)
-        self.guard, self.timeline = Guard(), HealthTimeline()
-        self.counts: Counter[str] = Counter()
+        super().__init__(fix, outbox, "searching")
+        self._layer_parameters, self._seed = layers[0], seed
         self.slamcu: WatchedSlamcu | None = None
         self._layer: FeatureLayer | None = None
         self._feature_tiles = feature_tiles
-        self._new_reports = NewReports(ReportList() if outbox is None else outbox)
         self._reporter = FeatureReporter(self._new_reports, identity, fix.t_ns, parameters.report.unchanged_m)
         self._before: deque[MotionSample | GnssFix] = deque()
         self._tried_ns = 0
@@ -103,15 +93,14 @@ class CameraPipeline:
         self._looks: deque[_Taken] = deque()  # whose poses are not final
         self._settled = 0  # looks before these
         self._left_m = 0.0
-        self._online: PoseEstimate | None = None
 
     def push(self, item: DriveItem) -> Output:
         """Take the next measurement; items come in time order. One that cannot be used is counted and left out."""
         if isinstance(item, ReferencePose) or not self.guard.admits(item):
-            return self._output(())
+            return self._output()
         if isinstance(item, GnssFix) and not item.sigma_m > 0:
             self.guard.bad["no-sigma"] += 1  # its noise is not known
-            return self._output(())
+            return self._output()
         if self.slamcu is None:
             self._begin(item)
         else:
@@ -123,22 +112,13 @@ class CameraPipeline:
     def finish(self) -> Output:
         """The drive has ended: look into what is in doubt, then decide and report everything."""
         if self.slamcu is None or self._layer is None:
-            return self._output(())
+            return self._output()
         self.slamcu.finish()
         poses = self._cover(self._settled + len(self._looks))
         for change in self._layer.leave_all():
             self._reporter.add(change, self.place.t_ns, self.place.odometer_m)
         self._reporter.report_all(self.place.t_ns)
         return self._output(poses)
-
-    @property
-    def held_back(self) -> HeldBack:
-        """There are no voxels to hold back."""
-        return HeldBack()
-
-    def tile(self, tile_id: TileId) -> Tile | None:  # noqa: ARG002  (a vehicle without a voxel map holds no tile of it)
-        """None: there is no voxel map."""
-        return None
 
     def account(self) -> dict[str, Any]:
         """What the drive came to, as plain values."""
@@ -265,8 +245,3 @@ class CameraPipeline:
             poses.append(self._estimate(taken.t_ns, at.pose, at.cov, health, "wrong_pose" if given_up else "none"))
         self._settled = until
         return tuple(poses)
-
-    def _output(self, poses: tuple[PoseEstimate, ...]) -> Output:
-        online = self._online
-        state: tuple[Health, Cause] = ("lost", "searching") if online is None else (online.health, online.cause)
-        return Output(poses, self._new_reports.take(), online, *state)
