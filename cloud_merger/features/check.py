@@ -78,7 +78,7 @@ def _check_verdicts(report: FeatureReport) -> None:
     gone = judged.count("absent")
     if len(judged) >= _MIN_VERDICTS and gone > _MAX_DELETED_SHARE * len(judged):
         raise BadReport(
-            f"{gone} of {len(judged)} judged features are said to be deleted, the limit is "
+            f"{gone} of {len(judged)} judged features are called deleted, the limit is "
             f"{_MAX_DELETED_SHARE:g} of {_MIN_VERDICTS} or more: so much does not go at once"
         )
 

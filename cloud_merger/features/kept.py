@@ -1,4 +1,4 @@
-"""Reports about feature layers between bus and store: checked against the map, told to the tiles around, read again."""
+"""Reports about feature layers between bus and store: checked against the map, spread to the tiles around."""
 
 from collections import OrderedDict
 from collections.abc import Iterable
