@@ -50,7 +50,7 @@ def test_a_good_report_passes():
 
 def test_a_drive_that_finds_every_sign_gone_is_not_believed():
     every = [seen(one.feature_id, ABSENT) for one in MAP]
-    assert "9 of 9 judged features are said to be deleted, the limit is 0.5 of 5" in refusal(change(*every, base=MAP))
+    assert "9 of 9 judged features are called deleted, the limit is 0.5 of 5" in refusal(change(*every, base=MAP))
     some = [seen(n, ABSENT if n < 5 else EXIST) for n in range(1, 10)]
     check(change(*some, base=MAP))
     check(change(*every[:4], base=MAP))  # too few to tell; one vehicle changes nothing anyway
