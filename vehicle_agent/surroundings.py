@@ -12,8 +12,9 @@ from gnd.gnd_map.errors import TileError
 from gnd.gnd_map.geodesy import LocalFrame
 from gnd.gnd_map.tile import Tile
 from gnd.gnd_map.tile_id import TileId, covering_corridor
+from gnd.tile_client.exchange import Fetched
 from gnd.vehicle_agent.config import LEAD_S, DownloadParameters
-from gnd.vehicle_agent.link.download import Fetched, TileFetcher
+from gnd.vehicle_agent.link.download import TileFetcher
 from gnd.vehicle_agent.link.plan import Need, in_time, needs
 from gnd.vehicle_agent.local_map import LocalMap, Touched
 from gnd.vehicle_agent.place import Place
