@@ -55,7 +55,7 @@ class TileServerClient:
             RequestFailed: no answer, or one that is wrong twice.
             SchemaError: an answer that is none.
         """
-        exchange = Exchange(self.bus, TilesInMemory(self.layer, held), self.timeout_s)
+        exchange: Exchange[AnyTile] = Exchange(self.bus, TilesInMemory(self.layer, held), self.timeout_s)
         for _, group in groupby(sorted(tiles), key=lambda tile: tile.district):
             wanted, whole = list(group), {tile for tile in tiles if tile not in held}
             while wanted:

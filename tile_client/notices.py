@@ -44,7 +44,8 @@ class Notices:
     def follow(self, keys: Collection[str]) -> None:
         """Listen to these key expressions; of others to the few that were followed last."""
         for key in keys:
-            self._followed[key] = self._followed.pop(key, None) or self._subscribe(key)
+            followed = self._followed.pop(key, None)
+            self._followed[key] = followed or self._subscribe(key)
         for key in list(self._followed)[: -max(MOST_KEYS, len(keys))]:
             self._followed.pop(key).close()
 
