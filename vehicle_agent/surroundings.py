@@ -20,6 +20,8 @@ from gnd.vehicle_agent.local_map import LocalMap, Touched
 from gnd.vehicle_agent.place import Place
 
 STEP_M = 5.0  # the wanted tiles are looked at again after this much way
+AHEAD_S = 15.0  # tiles are asked for so long in advance, and at least `ahead_m`; longer than `LEAD_S`
+LINK_SHARE = 0.8  # part of the link's rate that the plan counts on
 AHEAD_STEP_M = 20.0  # every small change of speed would be a reason to look again
 FLOORS_BELOW, FLOORS_ABOVE = 8, 16  # of the vehicle, where the map alone does not say how high the world is
 
@@ -41,7 +43,7 @@ class Surroundings:
         self.counts: Counter[str] = Counter()
         self._map, self._fetcher, self._touched = local_map, fetcher, touched
         self._parameters = parameters
-        self._rate_byte_s = parameters.link_share * fetcher.link.rate_byte_s("down")
+        self._rate_byte_s = LINK_SHARE * fetcher.link.rate_byte_s("down")
         self.wanted: tuple[TileId, ...] = ()
         self._looked_at: F64 | None = None
         self._asked: set[TileId] = set()
@@ -98,7 +100,7 @@ class Surroundings:
         return True
 
     def _ahead_m(self, place: Place) -> float:
-        by_speed_m = self._parameters.ahead_s * abs(place.speed_mps)
+        by_speed_m = AHEAD_S * abs(place.speed_mps)
         return max(self._parameters.ahead_m, AHEAD_STEP_M * math.ceil(by_speed_m / AHEAD_STEP_M))
 
     def _look(self, place: Place) -> None:

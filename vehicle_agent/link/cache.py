@@ -53,7 +53,7 @@ class TileCache(Generic[TileT]):
         self.layer = layer
         self.kind = cast("type[TileT]", kind_of_layer(layer))
         self.refused = 0
-        self._db = Database(path, SCHEMA, synchronous="NORMAL", error=CacheError)
+        self._db = Database(path, SCHEMA, synchronous="normal", error=CacheError)
         if not self._db.run(HAS_DAYS):
             self._db.run(ADD_DAYS)
 
