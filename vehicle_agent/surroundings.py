@@ -23,13 +23,13 @@ STEP_M = 5.0  # the wanted tiles are looked at again after this much way
 AHEAD_S = 15.0  # tiles are asked for so long in advance, and at least `ahead_m`; longer than `LEAD_S`
 LINK_SHARE = 0.8  # part of the link's rate that the plan counts on
 AHEAD_STEP_M = 20.0  # every small change of speed would be a reason to look again
-FLOORS_BELOW, FLOORS_ABOVE = 8, 16  # of the vehicle, where the map alone does not say how high the world is
+FLOORS_BELOW, FLOORS_ABOVE = 8, 16  # of the vehicle, where the map alone does not show how high the world is
 
 
 class Surroundings:
     """Keeps `local_map` in step with the place and the cache; the agent's main thread owns it.
 
-    A tile about which there is evidence keeps its map until it is finished: what rays said about one version is never
+    A tile about which there is evidence keeps its map until it is finished: evidence about one version is never
     counted for another. A newer version waits until then, and is what the next pass is compared with.
     """
 
