@@ -8,7 +8,7 @@ from typing import Any, Final
 
 import click
 
-from gnd.deploy.compiling import say_once
+from gnd.deploy.compiling import say_progress
 from gnd.extras import explained
 from gnd.gnd_map.errors import GndError
 from gnd.gnd_map.jit import tell_compiling
@@ -81,7 +81,7 @@ def gnd() -> None:
 
 def main() -> None:
     """Run the command line; every error of ours becomes one line on standard error and exit code 2."""
-    tell_compiling(say_once())
+    tell_compiling(say_progress())
     try:
         with explained():
             gnd.main(standalone_mode=False)

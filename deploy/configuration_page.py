@@ -1,5 +1,6 @@
 """`python -m gnd.deploy.configuration_page`: docs/configuration.md from the code; --check says whether it is so."""
 
+import importlib
 import sys
 from collections.abc import Iterator
 from pathlib import Path
@@ -54,26 +55,27 @@ with `merge.`. What nobody turns is no setting but a constant beside its use.
 """
 
 
-def programs() -> dict[str, tuple[type[Any], str]]:
-    """The programs that take settings: the class of the settings, and what the program does."""
-    from gnd.cloud_merger.config import ShardConfig
-    from gnd.deploy.fleet_config import FleetConfig
-    from gnd.tile_store.cli import TileServerConfig
-    from gnd.vehicle_agent.config import AgentConfig
+PROGRAMS: Final = {
+    "agent": ("gnd.vehicle_agent.config:AgentConfig", "one vehicle"),
+    "fleet": ("gnd.deploy.fleet_config:FleetConfig", "a whole fleet on one machine"),
+    "merger": ("gnd.cloud_merger.config:ShardConfig", "one merger shard"),
+    "store": ("gnd.tile_store.cli:TileServerConfig", "the tile server"),
+}
+"""The programs that take settings: the class of the settings, and what the program does."""
 
-    return {
-        "agent": (AgentConfig, "one vehicle"),
-        "fleet": (FleetConfig, "a whole fleet on one machine"),
-        "merger": (ShardConfig, "one merger shard"),
-        "store": (TileServerConfig, "the tile server"),
-    }
+
+def settings_class(program: str) -> type[Any]:
+    """The settings of a program; only its own packages are imported, so that it needs only its own extra."""
+    module, name = PROGRAMS[program][0].split(":")
+    found: type[Any] = getattr(importlib.import_module(module), name)
+    return found
 
 
 def page() -> str:
     """The page as Markdown."""
     parts = [_HEAD]
-    for name, (cls, what) in programs().items():
-        rows = list(described(cls))
+    for name, (_, what) in PROGRAMS.items():
+        rows = list(described(settings_class(name)))
         parts.append(f"## gnd {name}\n\nSettings of {what}: {len(rows)}.\n\n" + "".join(_table(rows)))
     return "\n".join(parts)
 

@@ -18,6 +18,7 @@ from gnd.deploy.ports import claim_port
 from gnd.deploy.run_folder import RunFolder, create_run_folder, default_run_path
 from gnd.deploy.site import SiteFrame
 from gnd.deploy.source import Source
+from gnd.extras import need_all
 from gnd.fleet_bus.links import load_link
 from gnd.fleet_bus.settings_file import write_settings
 from gnd.fleet_bus.settings_options import settings_options
@@ -107,6 +108,7 @@ def fleet(
     if dump_config:
         click.echo(settings_text(config), nl=False)
         return
+    need_all()
     source = Source(drives, base_map, worlds, options["agents"])
     load_link(config.link)  # what cannot work is refused before anything is written
     claim_port(config.port)
@@ -139,6 +141,7 @@ def run(
     """
     # The heavy imports wait until the options have been found good.
     from gnd.deploy import prepare, summary
+    from gnd.deploy.compiling import watched_elsewhere
     from gnd.deploy.fleet import run_fleet
     from gnd.deploy.live import progress_bars
     from gnd.deploy.processes import start_fork_server
@@ -146,10 +149,17 @@ def run(
     console = Console(stderr=True)
     stop, started_s = _stop_on_sigterm(), time.monotonic()
     with progress_bars(console) as progress:
+        compiling = progress.add_task("compiling kernels for this machine (once)", visible=False, total=None)
+
+        def show(ready: int, known: int) -> None:
+            progress.update(compiling, visible=True, completed=ready, total=known)
+
         warm = threading.Thread(target=start_fork_server, name="fork-server")
-        warm.start()  # the kernels are loaded while the world is made
-        prepared = prepare.prepare(config, folder, source, progress)
-        warm.join()
+        with watched_elsewhere(show):
+            warm.start()  # the kernels are loaded while the world is made
+            prepared = prepare.prepare(config, folder, source, progress)
+            warm.join()
+        progress.update(compiling, visible=False)
     prepare_s = time.monotonic() - started_s
     with place() as site:
         outcome = run_fleet(config, folder, prepared, console, stop, site)

@@ -13,7 +13,7 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 from rich.table import Table
 from rich.text import Text
 
-from gnd.deploy.live_traffic import LiveLedgers, kinds_table, link_of, plain_traffic, rate_cell
+from gnd.deploy.live_traffic import LiveLedgers, kinds_table, link_of, plain_traffic, rate_cell, size_text
 from gnd.deploy.map_use import MapUse
 from gnd.fleet_bus.links import LinkProfile
 from gnd.schemas.errors import SchemaError
@@ -74,13 +74,6 @@ class FleetState:
         """Remember an event; the last three are shown."""
         with self.lock:
             self.events = [*self.events[-2:], f"{time.strftime('%H:%M:%S')} {text}"]
-
-
-def size_text(size: float) -> str:
-    """Return a number of bytes for people: 812 B, 4.1 kB, 2.35 MB."""
-    if size < 1000:
-        return f"{size:.0f} B"
-    return f"{size / 1e3:.1f} kB" if size < 1e6 else f"{size / 1e6:.2f} MB"
 
 
 def render(state: FleetState, width: int = WIDE) -> Group:

@@ -5,7 +5,7 @@ import math
 from collections.abc import Iterable, Sequence
 from html import escape
 
-from gnd.deploy.live import size_text
+from gnd.deploy.live_traffic import size_text
 from gnd.fleet_bus.links import LinkProfile
 from gnd.fleet_bus.traffic import AgentTraffic, KindTraffic, fleet_lines, fleet_totals, is_of_tiles, per_km
 

@@ -22,6 +22,7 @@ from gnd.deploy.lab.tables import check_table, run_table, run_verdict
 from gnd.deploy.lab.tools import check_rights
 from gnd.deploy.run_folder import create_run_folder, default_run_path
 from gnd.deploy.source import Source
+from gnd.extras import need_all
 from gnd.fleet_bus.settings_file import write_settings
 from gnd.gnd_map.settings import settings_text
 
@@ -67,6 +68,7 @@ def lab(
     if dump_config:
         click.echo(settings_text(config), nl=False)
         return
+    need_all()
     source = Source(drives, base_map, worlds, config.agents)
     check_rights()
     end_on_sigterm()

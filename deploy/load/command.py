@@ -21,6 +21,7 @@ from gnd.deploy.load.making import kept_runs
 from gnd.deploy.load.plan import LoadOptions
 from gnd.deploy.load.run import Tell, run_load
 from gnd.deploy.load.verdict import summary
+from gnd.extras import need_all
 
 PATH: Final = click.Path(path_type=Path)
 
@@ -66,6 +67,7 @@ def load(drives: Path | None, settled: Path | None, keep: Path | None, json_file
     Router, tile server and merger shards run as processes of their own. Each street is a copy of the kept one at
     another place, with its map and the reports that were made on it.
     """
+    need_all()
     options = LoadOptions(**given)
     if json_file is not None and str(json_file) != "-" and not json_file.absolute().parent.is_dir():
         raise click.BadParameter(f"there is no folder {json_file.absolute().parent}", param_hint="--json")
