@@ -64,8 +64,10 @@ RUN_OPTIONS = (
     click.option("--worlds", type=PATH, help="Folder that keeps simulated worlds by seed for further runs."),
     click.option("--out", type=PATH, help="Folder of the run.  [default: runs/<UTC time>]"),
     click.option("--overwrite", is_flag=True, help="Replace an earlier run in that folder."),
-    click.option("--merge-mode", type=click.Choice(["default", "paper"]), help="Rules of merging."),
-    click.option("--detect-mode", type=click.Choice(["default", "paper"]), help="Rules of detection."),
+    click.option("--merge-mode", type=click.Choice(["default", "paper"]), help="Rules of merging (merger.merge.mode)."),
+    click.option(
+        "--detect-mode", type=click.Choice(["default", "paper"]), help="Rules of detection (agent.detect.mode)."
+    ),
     settings_options,
     click.option("--keep-drives", is_flag=True, help="Keep the simulated drives (some hundred MB) after the run."),
     click.option("--json", "as_json", is_flag=True, help="Print the summary as JSON."),
@@ -104,7 +106,7 @@ def fleet(
     truth. The folder of the run holds the logs, the traffic ledger and its page,
     the store, three pictures and summary.json.
     """
-    config = load_fleet_config(config_file, options, changes)
+    config = load_fleet_config(config_file, by_part(options), changes)
     if dump_config:
         click.echo(settings_text(config), nl=False)
         return
@@ -117,6 +119,13 @@ def fleet(
     folder.write_mark({"config": dataclasses.asdict(config), "drives": [str(path) for path in drives]})
     summary = run(config, folder, source, keep_drives=keep_drives)
     click.echo(json.dumps(summary, indent=2) if as_json else summary_text(summary, folder))
+
+
+def by_part(options: dict[str, Any]) -> dict[str, Any]:
+    """Options of the command as settings of a fleet: the two modes are settings of its agents and its shards."""
+    own = dict(options)
+    detect, merge = ({"mode": own.pop(name)} for name in ("detect_mode", "merge_mode"))
+    return own | {"agent": {"detect": detect}, "merger": {"merge": merge}}
 
 
 def run(

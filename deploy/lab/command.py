@@ -10,7 +10,7 @@ from typing import Any
 import click
 from rich.console import Console
 
-from gnd.deploy.fleet_cli import run, run_options, summary_text
+from gnd.deploy.fleet_cli import by_part, run, run_options, summary_text
 from gnd.deploy.fleet_config import load_fleet_config
 from gnd.deploy.lab.check import DIRECTIONS, carried, congestion_control, measure
 from gnd.deploy.lab.check import as_json as check_as_json
@@ -64,7 +64,8 @@ def lab(
     if context.invoked_subcommand is not None:
         return
     parsed = parse_groups(groups)
-    config = load_fleet_config(config_file, options | {"agents": sum(g.count for g in parsed), "link": groups}, changes)
+    counts = {"agents": sum(group.count for group in parsed), "link": groups}
+    config = load_fleet_config(config_file, by_part(options) | counts, changes)
     if dump_config:
         click.echo(settings_text(config), nl=False)
         return

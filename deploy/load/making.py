@@ -57,8 +57,7 @@ def _drive(root: Path, source: Source) -> None:
         headway_s=0.0,
         link="none",
         world_seed=WORLD_SEED,
-        merge_delay_s=MERGE_DELAY_S,
-        merge_after_reports=1000,
+        merger={"store": {"merge_delay_s": MERGE_DELAY_S, "merge_after_reports": 1000}},
     )
     folder = create_run_folder(root, overwrite=True)
     folder.write_mark({"made_by": "gnd load"})

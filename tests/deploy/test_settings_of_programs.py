@@ -29,7 +29,7 @@ BARE: dict[str, Any] = {
 }
 WORDS = {
     "shard_id": "merger-7", "codec": "float", "link": "3g", "layer": "ndt2", "vehicle": "w", "localise_by": "lidar",
-    "wrong_mounts": ("3:0.5",), "detect_mode": "paper", "merge_mode": "paper", "connect": ("tcp/10.0.0.1:7448",),
+    "wrong_mounts": ("3:0.5",), "connect": ("tcp/10.0.0.1:7448",),
     "layers": ("ndt", "signs"), "passing_rule": "ahead", "protocol": "full", "mode": "paper",
 }  # fmt: skip
 
