@@ -1,4 +1,4 @@
-"""`python -m gnd.deploy.configuration_page`: docs/configuration.md from the code; --check says whether it is so."""
+"""`python -m gnd.deploy.configuration_page` writes docs/configuration.md from the code; --check compares them."""
 
 import importlib
 import sys
@@ -25,7 +25,7 @@ three options:
 | `--set NAME=VALUE` | replaces one setting, such as `report.longest_s=30`; values as in JSON; repeatable |
 | `--dump-config` | prints the effective settings, exactly as `--config` takes them, and ends |
 
-Where a setting is said more than once, the later one wins:
+If a setting is given more than once, the later one in this list applies:
 
 1. the defaults of this page,
 2. the file,
@@ -34,10 +34,10 @@ Where a setting is said more than once, the later one wins:
 4. `--set`,
 5. the program's own options, such as `--link 4g`.
 
-A name that no setting has is an error that names near ones; a value outside its range is an error with value and
-range. `gnd config check PROGRAM FILE` looks at a file and runs nothing. The effective settings are written beside every
+An unknown name is an error that lists similar names; a value outside its range is an error with value and
+range. `gnd config check PROGRAM FILE` checks a file without running anything. The effective settings are written beside every
 result: `settings.toml` in the folder of an agent and of a fleet run, and their SHA-256 as `settings_sha256` in
-`result.json` and `summary.json`. A file of the fleet holds those of its agents and shards in the tables `[agent]` and
+`result.json` and `summary.json`. A file of the fleet contains those of its agents and shards in the tables `[agent]` and
 `[merger]` (in the environment: `GND_FLEET__AGENT__REPORT__LONGEST_S`; its agents do not read `GND_AGENT__...`):
 
 ```toml
@@ -50,8 +50,8 @@ longest_s = 30.0
 poll_s = 0.5
 ```
 
-The studies' `--set` (`gnd reproduce simulation --set detect.new_cells=35`) has the same names; those of the merge begin
-with `merge.`. What nobody turns is no setting but a constant beside its use.
+The studies' `--set` (`gnd reproduce simulation --set detect.new_cells=35`) uses the same names; those of the merge begin
+with `merge.`. Values that nobody needs to change are constants in the code.
 """
 
 
@@ -83,14 +83,14 @@ def page() -> str:
 def _table(rows: list[Described]) -> Iterator[str]:
     yield "| name | default | unit | range | effect |\n|---|---|---|---|---|\n"
     for row in rows:
-        told = row.setting
+        setting = row.setting
         default = f"`{row.default}`" if row.default else ""
-        cells = (f"`{row.path}`", default, told.unit, told.range or row.kind, told.effect)
+        cells = (f"`{row.path}`", default, setting.unit, setting.range or row.kind, setting.effect)
         yield "| " + " | ".join(cell.replace("|", "\\|") for cell in cells) + " |\n"
 
 
 @click.command()
-@click.option("--check", is_flag=True, help="Write nothing; end with 1 where the page is not what the code says.")
+@click.option("--check", is_flag=True, help="Write nothing; exit code 1 if the page differs from the code.")
 @click.option("--out", type=click.Path(path_type=Path), default=PAGE, show_default=True, help="The page.")
 def main(check: bool, out: Path) -> None:
     """Write the page of settings from the code."""
@@ -98,7 +98,7 @@ def main(check: bool, out: Path) -> None:
     if not check:
         out.write_text(text, encoding="utf-8")
     elif not out.exists() or out.read_text(encoding="utf-8") != text:
-        click.echo(f"{out} is not what the code says: run python -m gnd.deploy.configuration_page", err=True)
+        click.echo(f"{out} differs from the code: run python -m gnd.deploy.configuration_page", err=True)
         sys.exit(1)
 
 

@@ -31,8 +31,8 @@ class FleetConfig:
     link: str = setting("4g", "Link profile of every vehicle: 3g, 4g, 5g, none, or a TOML file.")
     headway_s: float = setting(
         4.0,
-        "Time of the drives between the starts of two vehicles, so that those behind drive on what those "
-        "ahead have found; 0: all start at once, and drive as fast as they can.",
+        "Time (of the drives) between the starts of two vehicles, so that later vehicles use the updates of "
+        "earlier ones; 0: all start at once, and drive as fast as they can.",
         unit="s",
         least=0,
         most=MAX_HEADWAY_S,
@@ -42,8 +42,8 @@ class FleetConfig:
     deadline_s: float = setting(1800.0, "A run that takes longer is ended with an error.", unit="s", above=0)
     wrong_mounts: tuple[str, ...] = setting(
         (),
-        'Vehicles whose drives tell a wrong mount, such as "3:0.5": that of vehicle 3 is turned by 0.5 '
-        "degrees (counter-clockwise seen from above) against the one that it was driven with.",
+        'Vehicles whose drives contain a wrong mount, such as "3:0.5": the mount of vehicle 3 is turned by 0.5 '
+        "degrees (counter-clockwise seen from above) against the true one.",
     )
     layers: tuple[str, ...] = setting(
         (VOXEL_LAYER,),
