@@ -1,12 +1,9 @@
 """`gnd chaos`: hurt a whole cloud of real processes in every way that a seed draws, and see if it keeps its word."""
 
 import json
-import signal
+import shutil
 import tempfile
-import threading
-from contextlib import ExitStack
 from pathlib import Path
-from types import FrameType
 from typing import TYPE_CHECKING
 
 import click
@@ -14,6 +11,7 @@ from rich.console import Console
 from rich.table import Table
 
 from gnd.deploy.errors import ChaosError
+from gnd.deploy.interruption import ending_in_order
 
 if TYPE_CHECKING:
     from gnd.deploy.chaos.run import ChaosOutcome
@@ -40,23 +38,19 @@ def chaos(kills: int, seed: int, json_file: Path | None, out: Path | None) -> No
 
     console = Console(stderr=True)
     folder = _folder(out)
-    stop = _stop_on_interrupt()
-    with ExitStack() as stack:
-        progress = stack.enter_context(progress_bars(console))
+    with ending_in_order() as stop, progress_bars(console) as progress:
         task = progress.add_task("starting", total=kills)
         outcome = run_chaos(
             seed, plan(seed, kills), folder, stop,
             lambda what, n: progress.update(task, description=what, completed=n),
         )  # fmt: skip
-    told = json.dumps(outcome.as_dict(), indent=2)
-    if json_file is not None and str(json_file) != "-":
-        json_file.write_text(told + "\n", encoding="utf-8")
-    if str(json_file) == "-":
-        click.echo(told)
-    else:
+    if json_file is not None:
+        with click.open_file(str(json_file), "w", encoding="utf-8") as file:
+            file.write(json.dumps(outcome.as_dict(), indent=2) + "\n")
+    if str(json_file) != "-":
         print_outcome(Console(width=WIDTH), outcome)
     if out is None and not outcome.failures:
-        _remove(folder)
+        shutil.rmtree(folder)
     else:
         console.print(f"everything else: {folder}", highlight=False, soft_wrap=True)
     if outcome.failures:
@@ -70,26 +64,6 @@ def _folder(out: Path | None) -> Path:
         raise ChaosError(f"{out}: exists and is not empty; choose another folder for --out")
     out.mkdir(parents=True, exist_ok=True)
     return out.resolve()
-
-
-def _remove(folder: Path) -> None:
-    for path in sorted(folder.rglob("*"), reverse=True):
-        path.rmdir() if path.is_dir() else path.unlink()
-    folder.rmdir()
-
-
-def _stop_on_interrupt() -> threading.Event:
-    """An event that Ctrl-C or SIGTERM sets; the second Ctrl-C ends at once."""
-    stop = threading.Event()
-
-    def end(_signal: int, _frame: FrameType | None) -> None:
-        if stop.is_set():
-            raise KeyboardInterrupt
-        stop.set()
-
-    signal.signal(signal.SIGINT, end)
-    signal.signal(signal.SIGTERM, end)
-    return stop
 
 
 def print_outcome(console: Console, outcome: "ChaosOutcome") -> None:

@@ -35,10 +35,10 @@ If a setting is given more than once, the later one in this list applies:
 5. the program's own options, such as `--link 4g`.
 
 An unknown name is an error that lists similar names; a value outside its range is an error with value and
-range. `gnd config check PROGRAM FILE` checks a file without running anything. The effective settings are written beside every
-result: `settings.toml` in the folder of an agent and of a fleet run, and their SHA-256 as `settings_sha256` in
-`result.json` and `summary.json`. A file of the fleet contains those of its agents and shards in the tables `[agent]` and
-`[merger]` (in the environment: `GND_FLEET__AGENT__REPORT__LONGEST_S`; its agents do not read `GND_AGENT__...`):
+range. `gnd config check PROGRAM FILE` checks a file without running anything. The effective settings are written beside
+every result: `settings.toml` in the folder of an agent and of a fleet run, and their SHA-256 as `settings_sha256` in
+`result.json` and `summary.json`. A file of the fleet contains those of its agents and shards in the tables `[agent]`
+and `[merger]` (in the environment: `GND_FLEET__AGENT__REPORT__LONGEST_S`; its agents do not read `GND_AGENT__...`):
 
 ```toml
 agents = 4
@@ -50,8 +50,8 @@ longest_s = 30.0
 poll_s = 0.5
 ```
 
-The studies' `--set` (`gnd reproduce simulation --set detect.new_cells=35`) uses the same names; those of the merge begin
-with `merge.`. Values that nobody needs to change are constants in the code.
+The studies' `--set` (`gnd reproduce simulation --set detect.new_cells=35`) uses the same names; those of the merge
+begin with `merge.`. Values that nobody needs to change are constants in the code.
 """
 
 

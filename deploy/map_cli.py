@@ -47,7 +47,8 @@ def build(
     poses from odometry do, loops are closed first; several drives become one map. What is out of bounds is said.
     """
     # loaded here: they load numba, gtsam and matplotlib, which the other commands do without
-    from gnd.deploy.map_page import check_writable, write_map_page
+    from gnd.deploy.html_page import check_writable
+    from gnd.deploy.map_page import write_map_page
     from gnd.vehicle_agent.map_build.build import build_recorded_map
     from gnd.vehicle_agent.map_build.quality import measure
     from gnd.vehicle_agent.map_build.result import summary

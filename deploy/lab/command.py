@@ -2,9 +2,7 @@
 
 import dataclasses
 import json
-import signal
 from pathlib import Path
-from types import FrameType
 from typing import Any
 
 import click
@@ -12,6 +10,7 @@ from rich.console import Console
 
 from gnd.deploy.fleet_cli import by_part, run, run_options, summary_text
 from gnd.deploy.fleet_config import load_fleet_config
+from gnd.deploy.interruption import end_on_sigterm
 from gnd.deploy.lab.check import DIRECTIONS, carried, congestion_control, measure
 from gnd.deploy.lab.check import as_json as check_as_json
 from gnd.deploy.lab.groups import DEFAULT_GROUPS, parse_groups
@@ -116,12 +115,3 @@ def clean() -> None:
         click.echo(f"{name}: {len(removed)} namespaces removed" if removed else f"{name} runs: left alone")
     if not done:
         click.echo("nothing to remove")
-
-
-def end_on_sigterm() -> None:
-    """Make SIGTERM end the command as Ctrl-C does, so that a lab is removed; `gnd fleet` later sets its own."""
-
-    def end(_signal: int, _frame: FrameType | None) -> None:
-        raise KeyboardInterrupt
-
-    signal.signal(signal.SIGTERM, end)

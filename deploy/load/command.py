@@ -2,21 +2,19 @@
 
 import json
 import math
-import signal
 import sys
 import tempfile
-import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from types import FrameType
 from typing import Any, Final
 
 import click
 from rich.console import Console
-from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 from rich.table import Table
 
+from gnd.deploy.interruption import ending_in_order
+from gnd.deploy.live import progress_bars
 from gnd.deploy.load.making import kept_runs
 from gnd.deploy.load.plan import LoadOptions
 from gnd.deploy.load.run import Tell, run_load
@@ -72,17 +70,14 @@ def load(drives: Path | None, settled: Path | None, keep: Path | None, json_file
     if json_file is not None and str(json_file) != "-" and not json_file.absolute().parent.is_dir():
         raise click.BadParameter(f"there is no folder {json_file.absolute().parent}", param_hint="--json")
     console = Console(stderr=True)
-    runs, stop = kept_runs(drives, settled, console), threading.Event()
-    with _ending(stop), _folder(keep) as folder, _bar(console) as tell:
+    runs = kept_runs(drives, settled, console)
+    with ending_in_order() as stop, _folder(keep) as folder, _bar(console) as tell:
         figures = summary(run_load(options, runs, folder, tell, stop))
-    text = json.dumps(figures, indent=2)
-    if json_file is not None and str(json_file) != "-":
-        json_file.write_text(text + "\n", encoding="utf-8")
-    if json_file is not None and str(json_file) == "-":
-        click.echo(text)
-    else:
+    if json_file is not None:
+        with click.open_file(str(json_file), "w", encoding="utf-8") as file:
+            file.write(json.dumps(figures, indent=2) + "\n")
+    if str(json_file) != "-":
         Console(width=110).print(table_of(figures))
-
     if figures["why_not"] == ["the run was interrupted"]:
         sys.exit(130)
 
@@ -127,24 +122,6 @@ def _spread(values: dict[str, float | None], unit: str) -> str:
 
 
 @contextmanager
-def _ending(stop: threading.Event) -> Iterator[None]:
-    """Ctrl-C and SIGTERM end the run in order: what was measured until then is told. A second one ends it at once."""
-
-    def end(number: int, _frame: FrameType | None) -> None:
-        if stop.is_set():
-            raise KeyboardInterrupt
-        stop.set()
-        signal.signal(number, signal.default_int_handler)
-
-    before = {number: signal.signal(number, end) for number in (signal.SIGINT, signal.SIGTERM)}
-    try:
-        yield
-    finally:
-        for number, handler in before.items():
-            signal.signal(number, handler)
-
-
-@contextmanager
 def _folder(keep: Path | None) -> Iterator[Path]:
     if keep is not None:
         keep.mkdir(parents=True, exist_ok=True)
@@ -158,13 +135,7 @@ def _folder(keep: Path | None) -> Iterator[Path]:
 
 @contextmanager
 def _bar(console: Console) -> Iterator[Tell]:
-    columns = (
-        TextColumn("{task.description}"),
-        BarColumn(),
-        TextColumn("{task.completed:.0f}/{task.total:.0f}"),
-        TimeElapsedColumn(),
-    )
-    with Progress(*columns, console=console) as progress:
+    with progress_bars(console) as progress:
         task = progress.add_task("drives", total=1)
 
         def tell(what: str, done: float, total: float) -> None:
