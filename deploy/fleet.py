@@ -137,9 +137,7 @@ def cloud_processes(config: FleetConfig, folder: RunFolder, site: SiteFrame) -> 
     connect, where = site.connect, site.namespace
     shards = [shard_config(config, f"shard-{number}", folder.store, connect) for number in range(config.shards)]
     return [
-        ProcessSpec("router", roles.router, (site.listen,), namespace=where),
-        ProcessSpec("store", roles.store, (folder.store, connect), namespace=where),
-        *(ProcessSpec(f"merger-{n}", roles.merger, (shard,), namespace=where) for n, shard in enumerate(shards)),
+        *roles.of_cloud(site.listen, connect, folder.store, shards, where),
         ProcessSpec("watcher", roles.watcher, (connect, folder.updates, config.layers), namespace=where),
     ]
 
