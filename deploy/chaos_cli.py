@@ -1,4 +1,4 @@
-"""`gnd chaos`: hurt a whole cloud of real processes in every way that a seed draws, and see if it keeps its word."""
+"""`gnd chaos`: inject seeded faults into a whole cloud of real processes, and check its guarantees."""
 
 import json
 import shutil
@@ -26,10 +26,10 @@ WIDTH = 120
 @click.option("--json", "json_file", type=PATH, help="Write the outcome to this file; - prints it.")
 @click.option("--out", type=PATH, help="Keep store, outboxes and logs in this folder.  [default: only if it failed]")
 def chaos(kills: int, seed: int, json_file: Path | None, out: Path | None) -> None:
-    """Kill, stop, cut off and mislead the parts of a cloud and its clients while they work; then check what is left.
+    """Inject faults into the parts of a cloud and its clients while they work; then check what is left.
 
-    Ends with 1 where a report was lost or doubled, a tile torn or stuck, or the map is not what its journal gives.
-    Ctrl-C ends the faults; what was found until then is checked and printed.
+    The exit code is 1 if a report was lost or duplicated, a tile is torn or stuck, or the map differs from its journal.
+    Ctrl-C ends the faults; everything up to then is checked and printed.
     """
     # The heavy imports wait until the options have been found good.
     from gnd.deploy.chaos.faults import plan
@@ -77,9 +77,9 @@ def print_outcome(console: Console, outcome: "ChaosOutcome") -> None:
         "tiles received / torn": f"{told['received_tiles']} / {told['torn_tiles']}",
         "versions merged": told["versions"],
         "stuck": told["stuck_tiles"],
-        "map as its journal gives it": "yes" if told["identical_map"] else f"NO: {told['verify']}",
-        "parts that died by themselves": told["deaths"] or "none",
-        "settled after": "not at all" if told["settled_s"] is None else f"{told['settled_s']:.1f} s",
+        "map agrees with its journal": "yes" if told["identical_map"] else f"NO: {told['verify']}",
+        "parts that ended without a fault": told["deaths"] or "none",
+        "settled after": "never" if told["settled_s"] is None else f"{told['settled_s']:.1f} s",
     }
     for name, value in rows.items():
         table.add_row(name, str(value))

@@ -21,7 +21,7 @@ def config() -> None:
 @_PROGRAM
 @click.argument("part", default="")
 def show(program: str, part: str) -> None:
-    """The settings of PROGRAM whose names hold PART."""
+    """The settings of PROGRAM whose names contain PART."""
     rows = [row for row in described(settings_class(program)) if part in row.path]
     if not rows:
         raise DeployError(f"no setting of gnd {program} holds {part!r}")
@@ -33,11 +33,11 @@ def show(program: str, part: str) -> None:
         )
 
 
-@config.command(short_help="Whether a file of settings can be used.")
+@config.command(short_help="Check a file of settings.")
 @_PROGRAM
 @click.argument("file", type=click.Path(path_type=Path))
 def check(program: str, file: Path) -> None:
-    """Look at FILE as `gnd PROGRAM --config FILE` would, and print the settings that come of it."""
+    """Check FILE as `gnd PROGRAM --config FILE` would, and print the effective settings."""
     click.echo(settings_text(_loaded(program, file)), nl=False)
 
 

@@ -31,12 +31,12 @@ _Command = TypeVar("_Command", bound=Callable[..., Any])
 
 
 def listed(_context: click.Context, _option: click.Parameter, value: str | None) -> list[str] | None:
-    """Give the words of a comma-separated list."""
+    """Return the items of a comma-separated list."""
     return None if value is None else [word.strip() for word in value.split(",") if word.strip()]
 
 
 def given(_context: click.Context, _option: click.Parameter, values: tuple[str, ...]) -> list[str] | None:
-    """Give what was given of an option that may be repeated; None: nothing."""
+    """Return the values of a repeatable option, or None where it was not given."""
     return list(values) or None
 
 
@@ -57,7 +57,7 @@ RUN_OPTIONS = (
         "wrong_mounts",
         multiple=True,
         callback=given,
-        help="VEHICLE:DEGREES, such as 3:0.5: its drive tells a LiDAR mount turned by so much; may be repeated.",
+        help="VEHICLE:DEGREES, such as 3:0.5: its drive contains a LiDAR mount turned by this angle; repeatable.",
     ),
     click.option("--drives", type=PATH, multiple=True, help="Recorded drives (MCAP, folders), not simulated ones."),
     click.option("--map", "base_map", type=PATH, help="Store with the base map for --drives (`gnd map build`)."),
@@ -100,7 +100,7 @@ def fleet(
     as_json: bool,
     **options: Any,
 ) -> None:
-    """Run a fleet: vehicles download the map, drive, detect changes and upload them; the cloud heals the map.
+    """Run a fleet: vehicles download the map, drive, detect changes and upload them; the cloud updates the map.
 
     Without --drives a street that has changed since it was mapped is simulated, and the result is compared with the
     truth. The folder of the run holds the logs, the traffic ledger and its page,

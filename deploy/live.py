@@ -1,4 +1,4 @@
-"""What a person sees while a fleet runs: a table of the agents, or plain lines where there is no terminal."""
+"""The display of a running fleet: a table of the agents, or plain lines where there is no terminal."""
 
 import math
 import threading
@@ -124,7 +124,7 @@ def _row(state: FleetState, sample: TrafficSample) -> tuple[str | Text, ...]:
 
 
 def renewed_text(use: MapUse | None) -> str:
-    """What others found of the map under a vehicle's wheels: "80 %, 12 s old"; nothing where that is not known."""
+    """Share of the map under a vehicle that others have updated: "80 %, 12 s old"; empty where unknown."""
     if use is None:
         return ""
     age = f", {use.newest_age_s:.0f} s old" if use.newest_age_s is not None else ""
@@ -132,7 +132,7 @@ def renewed_text(use: MapUse | None) -> str:
 
 
 def doubts_text(sample: TrafficSample) -> str:
-    """What a vehicle takes back or doubts: "4 (2 held back)", and the scans; nothing where it believes itself."""
+    """Tiles in doubt ("4 tiles (2 held back)") and scans taken back; empty where there are none."""
     parts = [f"{sample.tiles_doubtful} tiles ({sample.tiles_held_back} held back)"] if sample.tiles_doubtful else []
     parts += [f"{sample.scans_taken_back} scans"] if sample.scans_taken_back else []
     return ", ".join(parts)
@@ -178,7 +178,7 @@ class LiveView:
             held_back = sum(sample.tiles_held_back for sample in self.state.samples.values())
             doubts = f"{doubtful} tiles doubtful ({held_back} held back); " if doubtful else ""
             on_found = sum(use.renewed_share > 0 for use in self.state.maps.values())
-            found = f"{on_found} on what others found; " if on_found else ""
+            found = f"{on_found} use updates of others; " if on_found else ""
             return (
                 f"{len(self.state.samples)} agents, {driven_m:.0f} m driven, {self.state.reports} reports, "
                 f"{self.state.waiting} tiles waiting, {self.state.published} versions, {self.state.updates} updates; "

@@ -1,4 +1,4 @@
-"""What each process of a fleet run does: one module-level function a role, so that a fork server can call it."""
+"""The roles of the processes of a fleet run: module-level functions, so that a fork server can call them."""
 
 import threading
 from collections.abc import Sequence

@@ -32,8 +32,8 @@ WIDTH = 170
 @click.option(
     "--groups", default=DEFAULT_GROUPS, show_default=True, help="Vehicles by link: profile (or TOML file):number, ..."
 )
-@click.option("--name", default="lab", show_default=True, help="Name of the lab: one of a name runs at a time.")
-@click.option("--relay", "relay_all", is_flag=True, help="Delay and lose by a relay even where the kernel has netem.")
+@click.option("--name", default="lab", show_default=True, help="Name of the lab; only one lab of a name can run.")
+@click.option("--relay", "relay_all", is_flag=True, help="A relay process even where the kernel has netem.")
 @run_options
 @click.pass_context
 def lab(
@@ -89,7 +89,7 @@ def lab(
 @lab.command()
 @click.option("--links", default="3g,4g,5g", show_default=True, help="Profiles or TOML files, with commas.")
 @click.option("--name", default="check", show_default=True, help="Name of the lab.")
-@click.option("--relay", "relay_all", is_flag=True, help="Delay and lose by a relay even where the kernel has netem.")
+@click.option("--relay", "relay_all", is_flag=True, help="A relay process even where the kernel has netem.")
 @click.option("--seconds", type=click.FloatRange(0.5, 60), default=3.0, show_default=True, help="Of each transfer.")
 @click.option("--json", "as_json_", is_flag=True, help="Print the measurements as JSON.")
 def check(links: str, name: str, relay_all: bool, seconds: float, as_json_: bool) -> None:

@@ -24,15 +24,15 @@ from gnd.extras import need_all
 PATH: Final = click.Path(path_type=Path)
 
 
-@click.command(short_help="Replay kept drives as many vehicles and see whether the cloud keeps up.")
+@click.command(short_help="Replay recorded reports as those of many vehicles and see whether the cloud keeps up.")
 @click.option("--vehicles", type=int, default=100, show_default=True, help="How many.")
-@click.option("--km", type=float, default=1.0, show_default=True, help="Way of each.")
+@click.option("--km", type=float, default=1.0, show_default=True, help="Distance that each drives.")
 @click.option(
     "--pace",
     type=click.Choice(["real", "max"]),
     default="real",
     show_default=True,
-    help="Real driving, or as fast as it goes.",
+    help="At the speed of real driving, or as fast as possible.",
 )
 @click.option("--kmh", type=float, default=30.0, show_default=True, help="Speed, for --pace real.")
 @click.option("--seconds", type=float, default=math.inf, help="Send nothing later than this after the start.")
@@ -40,7 +40,7 @@ PATH: Final = click.Path(path_type=Path)
     "--drives", type=PATH, help="A finished run of `gnd fleet`.  [default: runs/load-drives, made where it is missing]"
 )
 @click.option("--settled", type=PATH, help="A run of the same street on its healed map, for --changed-share.")
-@click.option("--seed", type=int, default=1, show_default=True, help="Of starting places and report ids.")
+@click.option("--seed", type=int, default=1, show_default=True, help="Seed of starting places and report ids.")
 @click.option("--per-street", type=int, default=4, show_default=True, help="Vehicles on a street at the same time.")
 @click.option(
     "--changed-share",
@@ -50,17 +50,17 @@ PATH: Final = click.Path(path_type=Path)
     help="Share of streets whose map is older than their changes.",
 )
 @click.option("--shards", type=int, default=2, show_default=True, help="Merger shards.")
-@click.option("--clients", type=int, default=2, show_default=True, help="Processes that are the vehicles.")
-@click.option("--in-flight", type=int, default=50, show_default=True, help="Requests under way, of each client.")
+@click.option("--clients", type=int, default=2, show_default=True, help="Processes, each of many vehicles.")
+@click.option("--in-flight", type=int, default=50, show_default=True, help="Concurrent requests of each client.")
 @click.option(
     "--drain", "drain_s", type=float, default=10.0, show_default=True, help="Seconds after which all must be merged."
 )
-@click.option("--keep", type=PATH, help="Empty folder for store, logs and accounts, to look at afterwards.")
+@click.option("--keep", type=PATH, help="Empty folder in which store, logs and accounts are kept.")
 @click.option(
     "--json", "json_file", type=click.Path(path_type=Path, allow_dash=True), help="Write the figures; `-`: print them."
 )
 def load(drives: Path | None, settled: Path | None, keep: Path | None, json_file: Path | None, **given: Any) -> None:
-    """Send the reports of a few kept drives again, as those of many vehicles on many streets, and measure the cloud.
+    """Replay the reports of a few drives as those of many vehicles on many streets, and measure the cloud.
 
     Router, tile server and merger shards run as processes of their own. Each street is a copy of the kept one at
     another place, with its map and the reports that were made on it.

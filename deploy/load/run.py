@@ -33,7 +33,7 @@ from gnd.tile_store.sqlite_store import SqliteStore
 LOOK_S: Final = 0.5
 READY_S: Final = 120.0
 LEAD_S: Final = 1.0
-"""Between the word to start and the first report."""
+"""Time between the start signal and the first report."""
 END_S: Final = 30.0
 """Clients that have not ended so long after their time are ended."""
 
@@ -89,7 +89,7 @@ class Running:
         return sum(float(file.read_text(encoding="utf-8")) for file in files)
 
     def wait_until(self, done: Callable[[], bool], until_s: float, each: Callable[[], object]) -> bool:
-        """Look again and again until something holds; False: the time is over, or the run was told to stop."""
+        """Poll until a condition holds; False: the time is over, or `stop` is set."""
         while not done():
             if self.stop.is_set() or time.monotonic() > until_s:
                 return False
