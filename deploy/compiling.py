@@ -64,6 +64,11 @@ def watched_elsewhere(show: Callable[[int, int], object]) -> Iterator[None]:
 
 def tell_watcher() -> None:
     """Report each kernel that this process compiles to the process that watches it, if there is one."""
-    if _FILE in os.environ:
-        file = Path(os.environ[_FILE])
-        tell_compiling(lambda _kernel: file.write_text("{} {}".format(*kernels_ready()), encoding="ascii"))
+    if _FILE not in os.environ:
+        return
+    file = Path(os.environ[_FILE])
+
+    def tell(_kernel: str) -> None:
+        file.write_text("{} {}".format(*kernels_ready()), encoding="ascii")
+
+    tell_compiling(tell)
