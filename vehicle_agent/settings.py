@@ -44,7 +44,7 @@ def agent_of(said: Mapping[str, Any], *, where: str = "agent") -> AgentConfig:
     Raises:
         ConfigError: as of `load_agent`.
     """
-    values = merged({"vehicle": "vehicle"}, _defaults_of_mode(said), said)
+    values = merged({"vehicle": "vehicle", "drive": None}, _defaults_of_mode(said), said)
     values.setdefault("work_dir", f"runs/{values['vehicle']}")
     features = values.get("features")
     if isinstance(features, Mapping) and isinstance(layers := features.get("layers"), list | tuple):

@@ -1,0 +1,127 @@
+"""A vehicle that drives now, on topics of ROS 2 over a real router, against the same drive from its file."""
+
+import threading
+from dataclasses import astuple, replace
+from itertools import pairwise
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from gnd.deploy.play import messages_of, play
+from gnd.fleet_bus.bus import Bus, open_bus
+from gnd.fleet_bus.config import BusConfig
+from gnd.fleet_bus.ros2 import LATCHED_QOS, RosMessage, RosNode, RosQos, RosTopic
+from gnd.gnd_map.arrays import F64
+from gnd.schemas.drive import GnssFix, MotionSample, Scan
+from gnd.schemas.drive_mcap import read_drive, read_header
+from gnd.tile_store.server import TileServer
+from gnd.tile_store.sqlite_store import SqliteStore
+from gnd.vehicle_agent.config import AgentConfig, LiveParameters
+from gnd.vehicle_agent.sources.ros2 import open_ros2
+from gnd.vehicle_agent.sources.ros2_messages import CLOUD, DIAGNOSTICS, FIX, POSE, decode
+from gnd.vehicle_agent.vehicle import open_vehicle
+
+NEVER = threading.Event()
+
+
+def node(endpoint: str, name: str) -> RosNode:
+    return RosNode(open_bus(BusConfig(connect=(endpoint,)), name=name), 0, name)
+
+
+def driven(config: AgentConfig) -> tuple[dict[str, Any], dict[int, F64]]:
+    """What a drive came to, and its refined poses by time."""
+    with open_vehicle(config, NEVER) as vehicle:
+        for item in vehicle.drive():
+            vehicle.push(item)
+        vehicle.finish()
+        return vehicle.result(), {one.t_ns: one.T_map_vehicle for one in vehicle.evaluation.estimates}
+
+
+def played(endpoint: str, recording: Path) -> threading.Thread:
+    def run() -> None:
+        with node(endpoint, "play") as player:
+            play(player, messages_of(recording), 1.0, NEVER, listener_s=30.0)
+
+    thread = threading.Thread(target=run)
+    thread.start()
+    return thread
+
+
+def test_what_arrives_is_what_was_recorded(endpoint: str, recordings: Path) -> None:
+    """Every scan, motion sample and fix, in the order of time; angles go through degrees and back."""
+    recording, live = recordings / "probe.mcap", LiveParameters(source="ros2", connect=(endpoint,))
+    playing = played(endpoint, recording)
+    with open_ros2(live, "car-1", NEVER) as source:
+        arrived = list(source.drive(NEVER, silent_s=1.0))
+        account = source.account()
+    playing.join()
+    kept = [item for item in read_drive(recording) if isinstance(item, Scan | MotionSample | GnssFix)]
+    assert all(a.t_ns <= b.t_ns for a, b in pairwise(arrived))
+    arrived, kept = (sorted(items, key=lambda item: (item.t_ns, type(item).__name__)) for items in (arrived, kept))
+    assert [(type(item), item.t_ns) for item in arrived] == [(type(item), item.t_ns) for item in kept]
+    for got, item in zip(arrived, kept, strict=True):
+        if isinstance(item, Scan) and isinstance(got, Scan):
+            assert np.array_equal(got.points_m, item.points_m)
+            assert np.array_equal(got.t_offset_ns, item.t_offset_ns)
+        elif isinstance(item, GnssFix):
+            assert astuple(got) == pytest.approx(astuple(item), rel=1e-12)
+        else:
+            assert got == item
+    assert np.allclose(source.T_vehicle_lidar, read_header(recording).T_vehicle_lidar, atol=1e-12)
+    assert source.has_times
+    assert account["scans_left_out"] == 0
+    assert account["late"] == account["unreadable"] == account["lost_on_the_way"] == {}
+
+
+@pytest.mark.slow
+def test_a_vehicle_that_drives_now_finds_the_way_of_the_recording_and_tells_ros_of_it(
+    cloud: Bus, endpoint: str, recordings: Path, tmp_path: Path
+) -> None:
+    quick = replace(AgentConfig("v", recordings, tmp_path).report, drain_s=0.2)  # nobody acknowledges here
+    from_file = AgentConfig("probe", recordings / "probe.mcap", tmp_path / "file", connect=(endpoint,), report=quick)
+    live = LiveParameters(source="ros2", connect=(endpoint,), silent_s=2.0)
+    heard: dict[str, list[RosMessage]] = {}
+    with (
+        SqliteStore(recordings / "map.sqlite") as store,
+        TileServer(store, cloud),
+        node(endpoint, "listener") as listener,
+    ):
+        expected, expected_poses = driven(from_file)
+        for name, kind in (
+            ("pose", POSE),
+            ("health", DIAGNOSTICS),
+            ("map", CLOUD),
+            ("changes", CLOUD),
+            ("origin", FIX),
+        ):
+            qos = LATCHED_QOS if name in ("map", "origin") else RosQos(depth=0)
+            listener.subscribe(RosTopic(f"/gnd/{name}", kind), heard.setdefault(name, []).append, qos)
+        playing = played(endpoint, recordings / "probe.mcap")
+        result, poses = driven(replace(from_file, drive=None, work_dir=tmp_path / "live", live=live))
+        playing.join()
+
+    left_out = result["live"]["scans_left_out"]  # on a busy machine, while the first tiles come
+    assert result["scans"] + left_out == expected["scans"] == 55
+    assert set(poses) <= set(expected_poses)
+    assert len(poses) >= 55 - left_out
+    apart_m = [float(np.linalg.norm(poses[t][:3, 3] - expected_poses[t][:3, 3])) for t in poses]
+    assert max(apart_m) < (0.03 if left_out else 1e-6)
+    assert_told(heard, result)
+
+
+def assert_told(heard: dict[str, list[RosMessage]], result: dict[str, Any]) -> None:
+    poses = [decode(POSE, message.payload) for message in heard["pose"]]
+    assert len(poses) >= 40
+    assert {pose.header.frame_id for pose in poses} == {"gnd_map"}
+    x_m = np.array([(pose.pose.pose.position.x, pose.pose.pose.position.y) for pose in poses])
+    assert 0.6 < np.linalg.norm(np.diff(x_m, axis=0), axis=1).sum() / (1000 * result["distance_km"]) < 1.1
+    assert all(0 < pose.pose.covariance[0] < 1 for pose in poses)
+    told = [decode(DIAGNOSTICS, message.payload).status[0] for message in heard["health"]]
+    assert told[-1].message == "good"
+    assert told[-1].level == 0
+    assert len(heard["origin"]) == 1
+    assert decode(CLOUD, heard["map"][-1].payload).width > 1000
+    changes = [decode(CLOUD, message.payload) for message in heard["changes"]]
+    assert sum(cloud.width for cloud in changes) == result["changed_voxels"]

@@ -1,0 +1,77 @@
+"""What a vehicle drives on: a recording, or the sensors that are there now."""
+
+import threading
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack, contextmanager
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, Final
+
+from gnd.gnd_map.geodesy import LocalFrame
+from gnd.schemas.drive import DriveHeader, DriveItem, GnssFix
+from gnd.schemas.drive_mcap import read_drive, read_header
+from gnd.vehicle_agent.config import AgentConfig
+from gnd.vehicle_agent.sources.recording import first_fix, paced
+from gnd.vehicle_agent.sources.world_clock import in_common_time
+
+if TYPE_CHECKING:
+    from gnd.vehicle_agent.sources.ros2 import RosSource
+
+WAITED_NS: Final = 10_000_000_000
+"""Before the first position, live measurements of the last so many nanoseconds are kept."""
+
+
+@dataclass(frozen=True, slots=True)
+class Source:
+    """Measurements of one drive, and what is known of it beforehand.
+
+    Attributes:
+        header: sensor, mount, what is known of the sweeps.
+        fix: the first position.
+        items: all measurements in the order of their times, that position among them.
+        account: what came and what did not, as plain values; {} for a recording.
+        ros2: the graph that the vehicle is a node of; None: of none.
+    """
+
+    header: DriveHeader
+    fix: GnssFix
+    items: Iterator[DriveItem]
+    account: Callable[[], dict[str, Any]] = dict
+    ros2: "RosSource | None" = None
+
+
+@contextmanager
+def open_source(config: AgentConfig, stop: threading.Event) -> Iterator[Source]:
+    """Open the recording, or listen to the sensors until the first position has come.
+
+    Raises:
+        DriveError: the recording cannot be read.
+        VehicleError: it has no position to start from; or nobody measures what a vehicle needs (`LiveError`).
+    """
+    with ExitStack() as open_things:
+        if config.drive is not None:
+            header, (fix, items) = read_header(config.drive), first_fix(read_drive(config.drive), config.drive)
+            items = paced(items, config.pace, stop)
+            yield Source(header, fix, in_common_time(items, config.departure, stop))
+        else:
+            yield _live(config, stop, open_things)
+
+
+def _live(config: AgentConfig, stop: threading.Event, open_things: ExitStack) -> Source:
+    if config.live.source == "ros2":
+        from gnd.vehicle_agent.sources.ros2 import open_ros2
+
+        source = open_things.enter_context(open_ros2(config.live, config.vehicle, stop))
+        where, ros2 = f"ROS 2, {source.topics.points}", source
+    items = source.drive(stop, config.live.silent_s)
+    fix, items = first_fix(items, where, most_ns=WAITED_NS)
+    header = DriveHeader(
+        drive_id=f"{config.vehicle[:40]}-{fix.t_ns}",
+        vehicle=config.vehicle,
+        sensor_model="unknown",
+        anchor=LocalFrame(fix.lat_rad, fix.lon_rad, fix.height_m),
+        T_vehicle_lidar=source.T_vehicle_lidar,
+        source=where,
+        deskew="measured" if source.has_times else "none",
+        mount="given",
+    )
+    return Source(header, fix, items, source.account, ros2)
