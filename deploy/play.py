@@ -14,13 +14,17 @@ from typing import Final
 
 import click
 
-from gnd.fleet_bus.bus import open_bus
+from gnd.fleet_bus.bus import Bus, open_bus
 from gnd.fleet_bus.config import DEFAULT_ENDPOINT, BusConfig
 from gnd.fleet_bus.ros2 import LATCHED_QOS, MAX_DOMAIN, NO_HASH, SENSOR_QOS, RosNode, RosQos, RosTopic
+from gnd.fleet_bus.serving import Request
 from gnd.schemas.drive import DriveHeader, DriveItem, GnssFix, MotionSample, Scan
-from gnd.schemas.drive_mcap import read_drive, read_header
+from gnd.schemas.drive_mcap import REFERENCE_TOPIC, message_of, read_drive, read_header, topics_of
 from gnd.schemas.errors import DriveError
+from gnd.schemas.keys import live_key
 from gnd.vehicle_agent.errors import ImportDriveError
+from gnd.vehicle_agent.sources.plain_keys import header_message
+from gnd.vehicle_agent.sources.recording import paced
 from gnd.vehicle_agent.sources.ros2_messages import (
     CLOUD,
     FIX,
@@ -143,31 +147,74 @@ def messages_of_bag(path: Path) -> Iterator[Played]:
         raise ImportDriveError(f"{path}: neither a drive nor a bag of ROS 2: {error}") from error
 
 
+def play_plain(
+    bus: Bus, vehicle: str, recording: Path, pace: float, stop: threading.Event, listener_s: float = 0.0
+) -> Counter[str]:
+    """Put the messages of a drive of ours on the plain keys of a vehicle, each when it was measured.
+
+    Args:
+        bus: open.
+        vehicle: pseudonym, part of the keys.
+        recording: the drive.
+        pace: 1 in real time, 0 as fast as they can be sent.
+        stop: ends it.
+        listener_s: so long somebody is waited for who asks for the header.
+
+    Returns:
+        How many, by topic.
+
+    Raises:
+        DriveError: it is no drive, or damaged.
+    """
+    header, asked = read_header(recording), threading.Event()
+    topics = [topic for topic in topics_of(recording) if topic != REFERENCE_TOPIC]  # which no vehicle has
+
+    def answer(_: Request) -> bytes:
+        asked.set()
+        return header_message(header, topics)
+
+    sent: Counter[str] = Counter()
+    with bus.serve(live_key(vehicle, "header"), answer):
+        asked.wait(listener_s)
+        stop.wait(START_S)  # who has asked listens a moment later
+        for item in paced(read_drive(recording), pace, stop):
+            topic, message = message_of(item)
+            if stop.is_set():
+                break
+            if topic in topics:
+                bus.publish(live_key(vehicle, topic), message, kind="control")
+                sent[topic] += 1
+        stop.wait(START_S)
+    return sent
+
+
 @click.command(name="play")
 @click.argument("recording", type=click.Path(exists=True, path_type=Path))
-@click.option("--ros2", is_flag=True, required=True, help="On topics of ROS 2 over rmw_zenoh.")
+@click.option("--ros2", "on", flag_value="ros2", help="On topics of ROS 2 over rmw_zenoh.")
+@click.option("--zenoh", "on", flag_value="zenoh", help="On plain keys: a drive of ours with all that it holds.")
 @click.option("--connect", multiple=True, default=(DEFAULT_ENDPOINT,), show_default=True, help="Router; repeatable.")
 @click.option("--domain", type=click.IntRange(0, MAX_DOMAIN), default=0, show_default=True, help="ROS_DOMAIN_ID.")
+@click.option("--vehicle", default="vehicle", show_default=True, help="Pseudonym, part of plain keys.")
 @click.option("--pace", type=click.FloatRange(min=0), default=1.0, show_default=True, help="1 = real time.")
-@click.option("--wait", type=click.FloatRange(min=0), default=0.0, help="Seconds to wait for who listens to clouds.")
+@click.option("--wait", type=click.FloatRange(min=0), default=0.0, help="Seconds to wait for somebody who listens.")
 def play_command(
-    recording: Path,
-    ros2: bool,  # noqa: ARG001  (the only way there is)
-    connect: tuple[str, ...],
-    domain: int,
-    pace: float,
-    wait: float,
+    recording: Path, on: str | None, connect: tuple[str, ...], domain: int, vehicle: str, pace: float, wait: float
 ) -> None:
-    """Publish RECORDING as a vehicle's drivers would: a drive of ours, or a bag of ROS 2 byte for byte.
+    """Publish RECORDING as a vehicle's sensors would: a drive of ours, or a bag of ROS 2 byte for byte.
 
-    `gnd agent --live ros2` drives on it, and so does whatever else listens to these topics.
+    `gnd agent --live ros2` (or zenoh) drives on it, and so does whatever else listens to these topics.
     """
+    if on is None:
+        raise click.UsageError("on what: --ros2 or --zenoh?")
     logging.basicConfig(level=logging.ERROR, format="%(asctime)s %(name)s %(message)s")
     stop = threading.Event()
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, lambda *_: stop.set())
-    with RosNode(open_bus(BusConfig(connect=connect), name="play"), domain, "gnd_play") as node:
-        sent = play(node, messages_of(recording), pace, stop, wait)
+    with open_bus(BusConfig(connect=connect), name="play") as bus:
+        if on == "zenoh":
+            sent = play_plain(bus, vehicle, recording, pace, stop, wait)
+        else:
+            sent = play(RosNode(bus, domain, "gnd_play"), messages_of(recording), pace, stop, wait)
     for topic, count in sorted(sent.items()):
         click.echo(f"{count:7d}  {topic}")
 

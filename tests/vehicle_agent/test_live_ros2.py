@@ -1,29 +1,46 @@
 """A vehicle that drives now, on topics of ROS 2 over a real router, against the same drive from its file."""
 
 import threading
+import time
 from dataclasses import astuple, replace
-from itertools import pairwise
+from itertools import islice, pairwise
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
+from rosbags.rosbag2 import Writer
+from rosbags.typesys import Stores, get_typestore
 
-from gnd.deploy.play import messages_of, play
+from gnd.deploy.play import messages_of, play, play_plain
 from gnd.fleet_bus.bus import Bus, open_bus
 from gnd.fleet_bus.config import BusConfig
 from gnd.fleet_bus.ros2 import LATCHED_QOS, RosMessage, RosNode, RosQos, RosTopic
 from gnd.gnd_map.arrays import F64
 from gnd.schemas.drive import GnssFix, MotionSample, Scan
 from gnd.schemas.drive_mcap import read_drive, read_header
+from gnd.schemas.errors import SchemaError
 from gnd.tile_store.server import TileServer
 from gnd.tile_store.sqlite_store import SqliteStore
 from gnd.vehicle_agent.config import AgentConfig, LiveParameters
+from gnd.vehicle_agent.errors import ImportDriveError
+from gnd.vehicle_agent.sources.live import LiveError
+from gnd.vehicle_agent.sources.plain_keys import open_plain, read_header_message
 from gnd.vehicle_agent.sources.ros2 import open_ros2
-from gnd.vehicle_agent.sources.ros2_messages import CLOUD, DIAGNOSTICS, FIX, POSE, decode
+from gnd.vehicle_agent.sources.ros2_messages import (
+    CLOUD,
+    DIAGNOSTICS,
+    FIX,
+    ODOMETRY,
+    POSE,
+    TRANSFORMS,
+    decode,
+    type_hash,
+)
 from gnd.vehicle_agent.vehicle import open_vehicle
 
 NEVER = threading.Event()
+STORE = get_typestore(Stores.ROS2_JAZZY)
 
 
 def node(endpoint: str, name: str) -> RosNode:
@@ -125,3 +142,99 @@ def assert_told(heard: dict[str, list[RosMessage]], result: dict[str, Any]) -> N
     assert decode(CLOUD, heard["map"][-1].payload).width > 1000
     changes = [decode(CLOUD, message.payload) for message in heard["changes"]]
     assert sum(cloud.width for cloud in changes) == result["changed_voxels"]
+
+
+def test_a_bag_is_played_byte_for_byte(endpoint: str, recordings: Path, tmp_path: Path) -> None:
+    """A bag of ROS 2 in SQLite: what is heard is what is in it."""
+    bag = tmp_path / "bag"
+    written: list[tuple[str, bytes]] = []
+    with Writer(bag, version=9) as writer:
+        connections: dict[str, Any] = {}
+        for message in islice(messages_of(recordings / "probe.mcap"), 40):
+            name = message.topic.name
+            if name not in connections:
+                connections[name] = writer.add_connection(name, message.topic.type_name, typestore=STORE)
+            writer.write(connections[name], message.sent_ns, message.payload)
+            written.append((name, message.payload))
+    heard: list[tuple[str, bytes]] = []
+    with node(endpoint, "listener") as listener, node(endpoint, "play") as player:
+        for name, kind in (("/points", CLOUD), ("/odometry", ODOMETRY), ("/gnss", FIX), ("/tf_static", TRANSFORMS)):
+            qos = LATCHED_QOS if name == "/tf_static" else RosQos(depth=0)
+            listener.subscribe(RosTopic(name, kind), lambda m: heard.append((m.topic, m.payload)), qos)
+        sent = play(player, messages_of(bag), 0.0, NEVER, listener_s=10.0)
+        deadline_s = time.monotonic() + 10
+        while len(heard) < len(written) and time.monotonic() < deadline_s:
+            time.sleep(0.02)
+    assert sorted(heard) == sorted(written)
+    assert sum(sent.values()) == len(written)
+
+
+def test_what_is_neither_drive_nor_bag_is_refused(tmp_path: Path) -> None:
+    (tmp_path / "x.mcap").write_bytes(b"nothing")
+    with pytest.raises(ImportDriveError, match="neither a drive nor a bag"):
+        list(messages_of(tmp_path / "x.mcap"))
+
+
+def test_several_topics_of_a_kind_must_be_told_apart(endpoint: str) -> None:
+    with node(endpoint, "drivers") as drivers:
+        for name, kind in (("/left", CLOUD), ("/right", CLOUD), ("/gnss", FIX), ("/odometry", ODOMETRY)):
+            drivers.publisher(RosTopic(name, kind, type_hash(kind)))
+        with pytest.raises(LiveError, match=r"2 topics could be meant \(/left, /right\): .*live\.points"):
+            enter(LiveParameters(source="ros2", connect=(endpoint,)))
+
+
+def test_a_mount_that_nobody_tells_is_asked_for(
+    endpoint: str, recordings: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("gnd.vehicle_agent.sources.ros2.MOUNT_WAIT_S", 0.2)
+    playing = played(endpoint, recordings / "probe.mcap")
+    with pytest.raises(LiveError, match=r"does not lead from 'vehicle' to the LiDAR's frame 'lidar' .*live\.mount"):
+        enter(LiveParameters(source="ros2", connect=(endpoint,), vehicle_frame="vehicle"))
+    told = LiveParameters(source="ros2", connect=(endpoint,), mount=(1.0, 0.0, 2.0, 0.0, 0.0, 90.0))
+    with open_ros2(told, "car-1", NEVER) as source:
+        assert source.T_vehicle_lidar[:3, 3].tolist() == [1.0, 0.0, 2.0]
+        assert source.T_vehicle_lidar[:3, 0] == pytest.approx([0.0, 1.0, 0.0])
+    playing.join()
+
+
+def test_without_a_router_or_a_vehicle_it_says_what_is_missing(endpoint: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("gnd.vehicle_agent.sources.ros2.ROUTER_WAIT_S", 0.2)
+    with pytest.raises(LiveError, match=r"rmw_zenohd"):
+        enter(LiveParameters(source="ros2", connect=("tcp/127.0.0.1:9",)))
+    stop = threading.Event()
+    threading.Timer(0.5, stop.set).start()
+    with pytest.raises(LiveError, match=r"stopped before anybody published sensor_msgs/msg/PointCloud2 and"):
+        enter(LiveParameters(source="ros2", connect=(endpoint,)), stop)
+
+
+def enter(live: LiveParameters, stop: threading.Event = NEVER) -> None:
+    with open_ros2(live, "car-1", stop):
+        pass
+
+
+def test_plain_keys_carry_a_drive_as_it_is(endpoint: str, recordings: Path) -> None:
+    recording, live = recordings / "probe.mcap", LiveParameters(source="zenoh", connect=(endpoint,))
+
+    def run() -> None:
+        with open_bus(BusConfig(connect=(endpoint,)), name="sensors") as bus:
+            play_plain(bus, "car-1", recording, 1.0, NEVER, listener_s=30.0)
+
+    playing = threading.Thread(target=run)
+    playing.start()
+    with open_plain(live, "car-1", NEVER) as source:
+        arrived = list(source.drive(NEVER, silent_s=1.0))
+        account = source.account()
+    playing.join()
+    kept = [item for item in read_drive(recording) if isinstance(item, Scan | MotionSample | GnssFix)]
+    assert source.header == read_header(recording)
+    assert sorted((item.t_ns, type(item).__name__) for item in arrived) == sorted(
+        (item.t_ns, type(item).__name__) for item in kept
+    )
+    assert account["scans_left_out"] == 0
+    assert account["late"] == account["unreadable"] == account["lost_on_the_way"] == {}
+
+
+@pytest.mark.parametrize("body", [b"", b"{}", b"[1]", b'{"metadata": {}, "T_vehicle_lidar": [], "topics": []}'])
+def test_a_header_that_is_none_is_refused(body: bytes) -> None:
+    with pytest.raises(SchemaError):
+        read_header_message(body)

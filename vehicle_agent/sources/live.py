@@ -18,6 +18,8 @@ from gnd.vehicle_agent.errors import ImportDriveError, VehicleError
 from gnd.vehicle_agent.sources.ros2_messages import BadRosMessage
 from gnd.vehicle_agent.sources.stamp_order import StampOrder
 
+ROUTER_WAIT_S: Final = 30.0
+"""A vehicle and its sensors start together: so long their router is waited for."""
 SCANS: Final = "scans"
 """The stream of which the oldest are left out."""
 MOST_SCANS: Final = 20
@@ -85,6 +87,11 @@ class LiveItems:
             self._ripen(now_s)
             self._changed.notify()
 
+    def refuse(self, stream: str, error: Exception) -> None:
+        """Count a message that cannot be read, and say so once for each stream."""
+        self.unreadable[stream] += 1
+        self._warn(f"unreadable {stream}", f"{stream}: left out: {error}")
+
     def drive(self, stop: threading.Event, silent_s: float = 0.0) -> Iterator[DriveItem]:
         """Measurements in the order of their stamps, until `stop`.
 
@@ -136,8 +143,7 @@ class LiveItems:
         try:
             return waiting.read()
         except (BadRosMessage, ImportDriveError, BadValue) as error:
-            self.unreadable[waiting.stream] += 1
-            self._warn(f"unreadable {waiting.stream}", f"{waiting.stream}: left out: {error}")
+            self.refuse(waiting.stream, error)
             return None
 
     def _check_time(self, stream: str, t_ns: int) -> None:

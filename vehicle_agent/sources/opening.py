@@ -3,7 +3,7 @@
 import threading
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any, Final
 
 from gnd.gnd_map.geodesy import LocalFrame
@@ -57,21 +57,29 @@ def open_source(config: AgentConfig, stop: threading.Event) -> Iterator[Source]:
 
 
 def _live(config: AgentConfig, stop: threading.Event, open_things: ExitStack) -> Source:
-    if config.live.source == "ros2":
-        from gnd.vehicle_agent.sources.ros2 import open_ros2
+    if config.live.source == "zenoh":
+        from gnd.vehicle_agent.sources.plain_keys import open_plain
 
-        source = open_things.enter_context(open_ros2(config.live, config.vehicle, stop))
-        where, ros2 = f"ROS 2, {source.topics.points}", source
-    items = source.drive(stop, config.live.silent_s)
-    fix, items = first_fix(items, where, most_ns=WAITED_NS)
+        plain = open_things.enter_context(open_plain(config.live, config.vehicle, stop))
+        fix, items = first_fix(plain.drive(stop, config.live.silent_s), "zenoh", most_ns=WAITED_NS)
+        return Source(_of_this_drive(plain.header, config.vehicle, fix), fix, items, plain.account)
+    from gnd.vehicle_agent.sources.ros2 import open_ros2
+
+    ros2 = open_things.enter_context(open_ros2(config.live, config.vehicle, stop))
+    fix, items = first_fix(ros2.drive(stop, config.live.silent_s), f"ROS 2, {ros2.topics.gnss}", most_ns=WAITED_NS)
     header = DriveHeader(
-        drive_id=f"{config.vehicle[:40]}-{fix.t_ns}",
+        drive_id="live",
         vehicle=config.vehicle,
         sensor_model="unknown",
         anchor=LocalFrame(fix.lat_rad, fix.lon_rad, fix.height_m),
-        T_vehicle_lidar=source.T_vehicle_lidar,
-        source=where,
-        deskew="measured" if source.has_times else "none",
+        T_vehicle_lidar=ros2.T_vehicle_lidar,
+        source=f"ROS 2, {ros2.topics.points}",
+        deskew="measured" if ros2.has_times else "none",
         mount="given",
     )
-    return Source(header, fix, items, source.account, ros2)
+    return Source(_of_this_drive(header, config.vehicle, fix), fix, items, ros2.account, ros2)
+
+
+def _of_this_drive(header: DriveHeader, vehicle: str, fix: GnssFix) -> DriveHeader:
+    """A header whose drive is named after the vehicle and its first position."""
+    return replace(header, drive_id=f"{vehicle[:40]}-{fix.t_ns}", vehicle=vehicle)

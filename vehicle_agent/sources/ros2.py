@@ -19,7 +19,7 @@ from gnd.gnd_map.se3 import exp_so3
 from gnd.schemas.drive import DriveItem
 from gnd.vehicle_agent.config import LiveParameters
 from gnd.vehicle_agent.importers.point_cloud2 import decode_cloud, stamp_ns
-from gnd.vehicle_agent.sources.live import SCANS, LiveError, LiveItems
+from gnd.vehicle_agent.sources.live import ROUTER_WAIT_S, SCANS, LiveError, LiveItems
 from gnd.vehicle_agent.sources.ros2_items import (
     RosMotion,
     T_between,
@@ -162,7 +162,7 @@ def open_ros2(live: LiveParameters, vehicle: str, stop: threading.Event) -> Iter
         LiveError: no router, several topics of a kind, or no mount; stopped before.
     """
     try:
-        bus = open_bus(BusConfig(connect=live.connect), name=f"{vehicle} ros2")
+        bus = open_bus(BusConfig(connect=live.connect, open_timeout_s=ROUTER_WAIT_S), name=f"{vehicle} ros2")
     except NoRouter as error:
         raise LiveError(f"{error}, or with `ros2 run rmw_zenoh_cpp rmw_zenohd`") from error
     name = "gnd_" + "".join(c if c.isascii() and c.isalnum() else "_" for c in vehicle)
