@@ -172,6 +172,7 @@ def open_vehicle(config: AgentConfig, stop: threading.Event) -> Iterator[AgentVe
         VehicleError: it has no GNSS fix to start from, or cache or outbox cannot be opened.
     """
     header, (fix, items) = read_header(config.drive), first_fix(read_drive(config.drive), config.drive)
+    header.check_placed()
     with open_link(config) as link, open_feature_tiles(config, link, stop) as feature_tiles:
         bus = OnTheBus(config, link, feature_tiles, stop)
         pipeline = _pipeline(header, fix, bus)

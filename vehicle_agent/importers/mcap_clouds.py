@@ -72,6 +72,7 @@ def open_mcap_clouds(place: Path, anchor: RecordingAnchor | None, topic: str | N
         anchor=anchor or NOMINAL,
         notes=notes,
         mount="assumed",
+        placed=anchor is not None,
     )
 
 
@@ -103,6 +104,7 @@ def _own_drive(path: Path) -> Recording:
         sweep_ns=header.sweep_ns,
         mount=header.mount,
         mount_sigma=header.mount_sigma,
+        placed=not header.nowhere,
     )
 
 
