@@ -30,7 +30,7 @@ from gnd.vehicle_agent.importers.detect_format import format_of
 from gnd.vehicle_agent.importers.fitting import fit_heading_and_position as fit_heading_and_position
 from gnd.vehicle_agent.importers.kitti import open_kitti
 from gnd.vehicle_agent.importers.lidar_odometry import Progress, lidar_odometry
-from gnd.vehicle_agent.importers.mcap_clouds import open_mcap_clouds
+from gnd.vehicle_agent.importers.mcap_clouds import is_foxglove_or_own, open_mcap_clouds
 from gnd.vehicle_agent.importers.mounting import levelled, with_mount
 from gnd.vehicle_agent.importers.output import check_output
 from gnd.vehicle_agent.importers.overrides import BadScans, as_chosen, passing_over
@@ -39,6 +39,7 @@ from gnd.vehicle_agent.importers.planes import open_planes
 from gnd.vehicle_agent.importers.quality import Quality, fixes_within, quality_of
 from gnd.vehicle_agent.importers.radiate import open_radiate
 from gnd.vehicle_agent.importers.recording import GNSS_SIGMA_M, Entry, Recording, RecordingAnchor
+from gnd.vehicle_agent.importers.ros.reader import open_ros
 from gnd.vehicle_agent.importers.splits import chosen_scans
 from gnd.vehicle_agent.importers.suspicions import check_track, suspicious_scans
 
@@ -51,7 +52,12 @@ FORMATS: Final[dict[str, Callable[[Path, RecordingAnchor | None], Recording]]] =
     "mcap": open_mcap_clouds,
     "planes": open_planes,
     "apollo": open_apollo,
+    "ros": open_ros,
 }
+CHOOSING: Final[dict[str, Callable[[Path, RecordingAnchor | None, Choices | None], Recording]]] = {
+    "ros": open_ros,
+}
+"""Formats whose readers heed choices themselves: topics, fields."""
 AUTO: Final = "auto"
 AROUND_NS = 300_000_000  # motion and fixes kept before the first and after the last chosen scan
 DEFAULTS: Final = Choices()
@@ -167,8 +173,10 @@ def open_recording(
         raise ImportDriveError(f"format {kind!r} is not known; known are {', '.join(FORMATS)} and {AUTO}")
     found = format_of(folder) if kind == AUTO else kind
     choices = replace(choices, anchor=anchor or choices.anchor, topic=topic or choices.topic)
-    if found == "mcap":
+    if found == "mcap" and is_foxglove_or_own(folder):
         recording = open_mcap_clouds(folder, choices.anchor, choices.topic)
+    elif found in CHOOSING or found == "mcap":
+        recording = CHOOSING.get(found, open_ros)(folder, choices.anchor, choices)
     else:
         recording = FORMATS[found](folder, choices.anchor)
     return as_chosen(_with_entries(recording, found, folder), folder, choices)
@@ -201,7 +209,8 @@ def write_drive(
     stand_ins: where the recording has no fixes or no motion, compute them from the track; the header says so.
     """
     chosen, read = chosen_scans(scans, len(recording)), list[Cleaned]()
-    missing: list[StandIn] = [*(["gnss"] if not recording.gnss else []), *(["motion"] if not recording.motion else [])]
+    held: dict[StandIn, bool] = {"gnss": bool(recording.gnss), "motion": bool(recording.motion)}
+    missing = [one for one, measured in held.items() if not measured]
     computed = tuple(missing) if stand_ins else ()
     header = _header(recording, f"{recording.name}-{scans}".replace(":", "-"), vehicle)
     with DriveWriter(out, replace(header, stand_ins=computed)) as writer:

@@ -21,7 +21,6 @@ from recording_testing import scan_of, true_pose, write_bin
 
 from gnd.schemas.drive import Scan
 from gnd.schemas.drive_mcap import load_track, read_drive, read_header
-from gnd.schemas.errors import DriveError
 from gnd.vehicle_agent.errors import ImportDriveError
 from gnd.vehicle_agent.importer import import_recording, open_recording
 from gnd.vehicle_agent.importer_cli import import_drives
@@ -172,7 +171,7 @@ def test_a_cloud_with_a_wrong_byte_never_breaks_the_reader(at, value):
 
 def test_stamps_out_of_order_and_twice_are_put_right_and_told(tmp_path):
     recording = open_recording("auto", ros(tmp_path / "a.mcap", (0.0, 0.2, 0.1, 0.2, 0.3)))
-    assert ((recording.t_ns - START) / SECOND).round(3).tolist() == [0.0, 0.1, 0.2, 0.3]
+    assert ((recording.t_ns - START) / SECOND).round(3).tolist() == [-0.05, 0.05, 0.15, 0.25]  # stamps are the middle
     np.testing.assert_allclose(recording.read(1).points_m, FEW + np.float32(2), rtol=1e-6)
     assert recording.notes == (
         "1 clouds were not in the order of their stamps: sorted",
@@ -279,8 +278,8 @@ def broken(tmp_path: Path, what: str) -> Path:
         ("no xz", "1.bin.xz: 16 bytes that are not xz"),
         ("pcd", "1.pcd: 591 bytes of points, 600 announced"),
         ("mixed", "files 1 of kitti and 3 of pcd: name the format"),
-        ("file", "a single file must be an .mcap"),
-        ("empty", "no scans (.bin, .bin.xz, .pcd, .pcd.xz, .mcap, .xyz_mm, .xyz_mm.xz) below it"),
+        ("file", "no single file of a kind that is read"),
+        ("empty", "no scans (.bin, .bin.xz, .pcd, .pcd.xz, "),
         ("nothing", "no such file or folder"),
     ],
 )
@@ -294,7 +293,7 @@ def test_what_is_wrong_is_told_with_the_file(tmp_path, what, message):
 
 
 def test_a_damaged_mcap_and_one_without_clouds(tmp_path):
-    with pytest.raises(DriveError, match="cut off"):
+    with pytest.raises(ImportDriveError, match=r"no readable bag: passed over: a\.mcap: .*`mcap recover`"):
         open_recording("auto", cut(ros(tmp_path / "a.mcap"), 50))
     with pytest.raises(ImportDriveError, match="topics with clouds: none"):
         open_recording("auto", write_ros(tmp_path / "b.mcap", []))

@@ -19,7 +19,9 @@ from gnd.schemas.drive import GnssFix, Scan
 from gnd.vehicle_agent.errors import ImportDriveError
 from gnd.vehicle_agent.importers.choices import Choices
 from gnd.vehicle_agent.importers.cleaning import RawScan
+from gnd.vehicle_agent.importers.fitting import fit_heading_and_position
 from gnd.vehicle_agent.importers.kitti import calibration_of
+from gnd.vehicle_agent.importers.quality import antenna_m
 from gnd.vehicle_agent.importers.recording import GNSS_SIGMA_M, Entry, Recording, RecordingAnchor
 from gnd.vehicle_agent.importers.trajectories.frames import ecef_poses, in_map, with_frame, without_camera
 from gnd.vehicle_agent.importers.trajectories.pose_file import read_poses
@@ -42,7 +44,9 @@ def with_poses(recording: Recording, folder: Path, choices: Choices) -> Recordin
         ImportDriveError: no such file, no trajectory, a frame that is not known, times other than the scans'.
     """
     assert choices.poses is not None
-    table = read_poses(Path(choices.poses))
+    path = Path(choices.poses)
+    of_topic = recording.poses_on is not None and not path.exists()
+    table = recording.poses_on(choices.poses) if recording.poses_on is not None and of_topic else read_poses(path)
     return with_table(recording, folder, choices, table)
 
 
@@ -59,6 +63,8 @@ def with_table(recording: Recording, folder: Path, choices: Choices, table: Pose
         return _with_fixes(recording, table, p_ecef)
     recording, t_ns = _at_one_time(recording, table)
     T = in_map(p_ecef, R_ecef, anchor.frame)
+    if table.coordinates == "local" and choices.anchor is None and recording.gnss:
+        recording, T = _over_fixes(recording, table, Trajectory(t_ns, T))
     whose = choices.poses_of or ("lidar" if recording.mount == "assumed" else "vehicle")
     if whose == "lidar":
         T = T @ T_inverse(recording.T_vehicle_lidar)
@@ -71,8 +77,18 @@ def _somewhere(recording: Recording, choices: Choices) -> RecordingAnchor | None
 
 
 def _local_place(recording: Recording, table: PoseTable, choices: Choices) -> RecordingAnchor | None:
-    """Where the origin of a local frame is put when nobody says: nowhere in particular, if that is what was asked."""
-    return recording.anchor if choices.nowhere and table.coordinates == "local" else None
+    """Where the origin of a local frame is put when nobody says: nowhere in particular, or where the fixes lay it."""
+    return recording.anchor if table.coordinates == "local" and (choices.nowhere or len(recording.gnss) > 1) else None
+
+
+def _over_fixes(recording: Recording, table: PoseTable, track: Trajectory) -> tuple[Recording, F64]:
+    """Poses of a local frame whose place nobody gave, laid over the recording's fixes; their shape stays."""
+    by_track, measured = antenna_m(recording, track)
+    if len(by_track) < 2:
+        raise ImportDriveError(f"{table.source}: {len(by_track)} fixes at the times of its poses: give --anchor")
+    T = fit_heading_and_position(by_track, measured)
+    note = f"{table.source}: local frame laid over {len(by_track)} fixes (heading and position)"
+    return _noted(recording, note), np.asarray(T @ track.T_dst_vehicle)
 
 
 def _anchor(recording: Recording, choices: Choices, table: PoseTable, p_ecef: F64) -> tuple[RecordingAnchor, bool]:

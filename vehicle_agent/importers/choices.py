@@ -89,7 +89,8 @@ def mount_of_text(text: str) -> F64:
         R = exp_so3([0.0, 0.0, yaw]) @ exp_so3([0.0, pitch, 0.0]) @ exp_so3([roll, 0.0, 0.0])
         return T_from_R_t(R, values[:3])
     if len(values) in (12, 16) and path.is_file():
-        return orthonormal(values.reshape(-1, 4)[None, :3], f"--mount {text}")[0][0]
+        T, _ = orthonormal(values.reshape(-1, 4)[None, :3], f"--mount {text}")
+        return np.asarray(T[0])
     raise ImportDriveError(
         f"--mount {text!r}: expected X,Y,Z,ROLL,PITCH,YAW in metres and degrees, such as 1.2,0,1.9,0,0,0, or a file"
         " with the 12 or 16 numbers of T_vehicle_lidar"

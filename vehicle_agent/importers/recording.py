@@ -13,6 +13,7 @@ from gnd.gnd_map.se3 import exp_so3
 from gnd.schemas.drive import Deskew, GnssFix, MotionSample, MountSigma, MountSource, Scan
 from gnd.vehicle_agent.errors import ImportDriveError
 from gnd.vehicle_agent.importers.cleaning import RawScan
+from gnd.vehicle_agent.importers.trajectories.pose_table import PoseTable
 
 F64 = NDArray[np.float64]
 
@@ -80,7 +81,8 @@ class Recording:
     placed: whether the recording or whoever imports it says where on the Earth it was taken; else `anchor` stands for
     no place. lever_m: of the GNSS antenna in the vehicle frame. posed: share of the
     scans as recorded that have a pose. timed: whether the
-    recording itself tells when the scans were taken. entries: what the recording holds.
+    recording itself tells when the scans were taken. poses_on: poses on a topic
+    of it. entries: what the recording holds.
     """
 
     name: str
@@ -103,6 +105,7 @@ class Recording:
     lever_m: tuple[float, float, float] = (0.0, 0.0, 0.0)
     posed: float = 1.0
     timed: bool = True
+    poses_on: Callable[[str], PoseTable] | None = None
     entries: tuple[Entry, ...] = ()
 
     def __post_init__(self) -> None:

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from gnd.gnd_map.motion import Trajectory
 from gnd.gnd_map.se3 import T_inverse, log_so3
+from gnd.schemas.drive import Scan
 from gnd.schemas.limits import MAX_POINTS_OF_SCAN
 from gnd.vehicle_agent.errors import ImportDriveError
 from gnd.vehicle_agent.importers.choices import METRES_OF
@@ -67,7 +68,7 @@ def suspicious_scans(recording: Recording) -> tuple[str, ...]:
     return tuple(notes)
 
 
-def _check_upright(recording: Recording, scans: list[object]) -> None:
+def _check_upright(recording: Recording, scans: list[Scan]) -> None:
     """Refuse clouds whose ground is seen only when z is turned round."""
     R = recording.T_vehicle_lidar[:3, :3]
     clouds = [np.asarray(scan.points_m, np.float64) @ R.T for scan in scans]
