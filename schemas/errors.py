@@ -8,6 +8,7 @@ SchemaError
 ├── BadValue        a field whose value cannot be
 ├── WrongHash       content that does not have the hash it claims
 ├── DriveError      a recorded drive that cannot be read or written
+├── NoPlace         a drive whose place on the Earth is not known, where one is needed
 └── TrajectoryError a file of poses that cannot be read or written
 """
 
@@ -44,6 +45,10 @@ class WrongHash(SchemaError):
 
 class DriveError(SchemaError):
     """A recorded drive that cannot be read or written."""
+
+
+class NoPlace(SchemaError):
+    """A drive whose place on the Earth is not known, where one is needed."""
 
 
 class TrajectoryError(SchemaError):

@@ -150,9 +150,9 @@ class LiveParameters:
     domain: int = setting(0, "ROS_DOMAIN_ID.", least=0, most=232)
     points: str = setting("", "Topic of the LiDAR's sweeps; the only one of its type where it is not named.")
     gnss: str = setting("", "Topic of positions; likewise.")
-    odometry: str = setting("", 'Topic whose twist gives speed (and yaw rate); likewise, "none": none.')
-    imu: str = setting("", 'Topic whose gyro gives the yaw rate; likewise, "none": none.')
-    vehicle_frame: str = setting("base_link", "Frame of the vehicle: x forward, z up, on the ground.")
+    speed: str = setting("", "Topic whose twist gives speed and yaw rate: Odometry or TwistStamped; likewise.")
+    imu: str = setting("", "Topic of a gyro that gives the yaw rate instead; empty: none.")
+    vehicle_frame: str = setting("", "Frame of the vehicle, x forward; empty: base_footprint, base_link, ...")
     mount: tuple[float, ...] = setting(
         (), "x, y, z (m), roll, pitch, yaw (deg) of the LiDAR in the vehicle; empty: /tf_static tells."
     )

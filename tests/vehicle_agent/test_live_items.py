@@ -10,27 +10,21 @@ from hypothesis import strategies as st
 
 from gnd.schemas.drive import GnssFix, MotionSample, Scan
 from gnd.vehicle_agent.errors import ImportDriveError
+from gnd.vehicle_agent.importers.recording import GNSS_SIGMA_M
+from gnd.vehicle_agent.importers.ros.small_messages import TWIST, TWIST_COVARIANCE
 from gnd.vehicle_agent.sources.live import BACK_NS, MOST_SCANS, SCANS, LiveError, LiveItems
-from gnd.vehicle_agent.sources.ros2_items import (
-    RosMotion,
-    T_between,
-    fix_of_message,
-    has_point_times,
-    scan_of_message,
-    stamped_transforms,
-)
+from gnd.vehicle_agent.sources.ros2_items import RosMotion, RosScans, fix_of_message
 from gnd.vehicle_agent.sources.ros2_messages import (
     FIX,
     IMU,
-    TRANSFORMS,
+    ODOMETRY,
     BadRosMessage,
-    decode,
+    cloud_message,
     encode,
     fix_message,
     header,
     motion_message,
     scan_message,
-    transform_message,
 )
 from gnd.vehicle_agent.sources.stamp_order import HOLD_S, StampOrder
 
@@ -91,7 +85,7 @@ def test_the_newest_scans_count_and_the_others_are_counted() -> None:
 def test_a_message_that_is_none_is_named_and_left_out(caplog: pytest.LogCaptureFixture) -> None:
     items, now_ns = LiveItems([SCANS, "gnss"]), time.time_ns()
     cloud, fix = scan_message(scan(now_ns), "lidar"), fix_message(GnssFix(now_ns, 0.8, 0.1, 5.0, 1.0))
-    items.put(SCANS, now_ns, lambda: scan_of_message("/points", cloud[: len(cloud) // 2]))
+    items.put(SCANS, now_ns, lambda: RosScans("/points", cloud).scan(cloud[: len(cloud) // 2]))
     items.put("gnss", now_ns, lambda: fix_of_message(fix[:30]))
     items.put("gnss", now_ns + 1, lambda: fix_of_message(fix))
     got = list(items.drive(NEVER, silent_s=0.01))
@@ -128,15 +122,28 @@ def test_clocks_that_differ_are_told_once(caplog: pytest.LogCaptureFixture) -> N
 
 def test_scans_survive_as_they_are() -> None:
     one = scan(17 * S + 5)
-    cloud = scan_message(one, "lidar")
-    back = scan_of_message("here", cloud)
+    cloud = scan_message(one, "/lidar")
+    scans = RosScans("/points", cloud)
+    back = scans.scan(cloud)
     assert back is not None
     assert back.t_ns == one.t_ns
     for name in ("points_m", "t_offset_ns", "ring"):
         assert np.array_equal(getattr(back, name), getattr(one, name))
-    assert has_point_times("here", cloud)
+    assert (scans.frame, scans.rule.field, scans.shift_ns) == ("lidar", "t", 0)
     with pytest.raises(ImportDriveError):
-        scan_of_message("here", motion_message(MotionSample(1, 0.0, 0.0), "base_link"))
+        scans.scan(motion_message(MotionSample(1, 0.0, 0.0), "base_link"))
+
+
+def test_a_cloud_stamped_at_its_end_begins_before_its_stamp() -> None:
+    """A driver that counts back from the end, as Velodyne's does when it is told to."""
+    points = np.zeros(100, [("x", "<f4"), ("y", "<f4"), ("z", "<f4"), ("time", "<f4")])
+    points["x"], points["time"] = np.arange(1, 101), np.linspace(-0.1, 0.0, 100)
+    cloud = cloud_message(5 * S, "lidar", points)
+    scans = RosScans("/points", cloud)
+    back = scans.scan(cloud)
+    assert back is not None
+    assert scans.shift_ns == pytest.approx(-0.1 * S, abs=10)
+    assert back.t_ns == 5 * S + scans.shift_ns
 
 
 def test_positions_have_the_receivers_sigma() -> None:
@@ -145,45 +152,44 @@ def test_positions_have_the_receivers_sigma() -> None:
     assert back is not None
     assert (back.t_ns, back.sigma_m, back.height_m) == (fix.t_ns, fix.sigma_m, fix.height_m)
     assert back.lat_rad == pytest.approx(fix.lat_rad, rel=1e-14)
-    none = {"status": {"status": -1}, "latitude": 35.0, "longitude": 139.0}
-    assert fix_of_message(encode(FIX, none)) is None
-    unknown = fix_of_message(encode(FIX, {"latitude": 35.0, "longitude": 139.0}))
+    here = {"header": header(3 * S, "gnss"), "latitude": 35.0, "longitude": 139.0}
+    assert fix_of_message(encode(FIX, here | {"status": {"status": -1}})) is None
+    unknown = fix_of_message(encode(FIX, here))
     assert unknown is not None
-    assert unknown.sigma_m == 10.0
+    assert unknown.sigma_m == GNSS_SIGMA_M
 
 
 def test_a_gyro_that_is_turned_gives_the_rate_about_the_vehicles_vertical() -> None:
-    upside_down = np.diag([1.0, -1.0, -1.0])
-    motion = RosMotion(gyro=True, R_vehicle_imu=upside_down)
-    rate = encode(IMU, {"header": header(2 * S, "imu"), "angular_velocity": {"x": 0.5, "z": -0.25}})
-    assert motion.imu(rate) is None  # no speed yet
-    assert motion.odometry(motion_message(MotionSample(S, 7.0, 9.9), "base_link")) is None
-    assert motion.imu(rate) == MotionSample(2 * S, 7.0, 0.25)
-    assert RosMotion(gyro=False).odometry(motion_message(MotionSample(S, 7.0, 0.1), "base_link")) == MotionSample(
-        S, 7.0, 0.1
-    )
+    motion = RosMotion(ODOMETRY, np.diag([1.0, -1.0, -1.0]))  # upside down
+
+    def rate(t_ns: int, z: float) -> bytes:
+        return encode(IMU, {"header": header(t_ns, "imu"), "angular_velocity": {"x": 0.5, "z": z}})
+
+    def speed(t_ns: int) -> bytes:
+        return motion_message(MotionSample(t_ns, 7.0, 9.9), "base_link")
+
+    ms = S // 1000
+    assert motion.twist(speed(S)) is None
+    assert motion.gyro(rate(S + 10 * ms, -0.25)) is None  # no rate is known before the speed's time
+    assert motion.twist(speed(S + 15 * ms)) is None
+    sample = motion.gyro(rate(S + 20 * ms, -0.35))
+    assert sample is not None
+    assert (sample.t_ns, sample.speed_mps) == (S + 15 * ms, 7.0)
+    assert sample.yaw_rate_radps == pytest.approx(0.3)
+    assert motion.twist(speed(S + 25 * ms)) is None
+    assert motion.gyro(rate(S + 900 * ms, -0.35)) is None  # a gap
+    plain = RosMotion(ODOMETRY)
+    assert plain.twist(speed(S)) == MotionSample(S, 7.0, 9.9)
 
 
-def test_mounts_are_found_along_the_tree_of_frames() -> None:
-    T = np.eye(4)
-    T[:3, 3] = 1.0, 0.0, 0.5
-    tree = {"sensors": ("base_link", T), "lidar": ("sensors", T), "imu": ("base_link", T)}
-    found = T_between(tree, "base_link", "lidar")
-    assert found is not None
-    assert found[:3, 3].tolist() == [2.0, 0.0, 1.0]
-    sideways = T_between(tree, "imu", "lidar")
-    assert sideways is not None
-    assert sideways[:3, 3].tolist() == [1.0, 0.0, 0.5]
-    assert T_between(tree, "base_link", "camera") is None
-    with pytest.raises(BadRosMessage, match="circle"):
-        T_between({"a": ("b", T), "b": ("a", T)}, "c", "a")
-
-
-def test_a_transform_without_rotation_is_refused() -> None:
-    message = decode(TRANSFORMS, transform_message(1, "a", "b", np.eye(4)))
-    message.transforms[0].transform.rotation.w = 0.0
-    with pytest.raises(BadRosMessage, match="length 0"):
-        list(stamped_transforms(message))
+@pytest.mark.parametrize(
+    ("kind", "twist"),
+    [(TWIST, {"linear": {"x": 3.0}, "angular": {"z": 0.5}}),
+     (TWIST_COVARIANCE, {"twist": {"linear": {"x": 3.0}, "angular": {"z": 0.5}}})],
+)  # fmt: skip
+def test_twists_are_motion_too(kind: str, twist: dict[str, object]) -> None:
+    message = encode(kind, {"header": header(S, "base_link"), "twist": twist})
+    assert RosMotion(kind).twist(message) == MotionSample(S, 3.0, 0.5)
 
 
 def test_an_unknown_field_is_refused() -> None:

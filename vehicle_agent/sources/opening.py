@@ -45,11 +45,13 @@ def open_source(config: AgentConfig, stop: threading.Event) -> Iterator[Source]:
 
     Raises:
         DriveError: the recording cannot be read.
+        NoPlace: it does not tell where on the Earth it was recorded.
         VehicleError: it has no position to start from; or nobody measures what a vehicle needs (`LiveError`).
     """
     with ExitStack() as open_things:
         if config.drive is not None:
             header, (fix, items) = read_header(config.drive), first_fix(read_drive(config.drive), config.drive)
+            header.check_placed()
             items = paced(items, config.pace, stop)
             yield Source(header, fix, in_common_time(items, config.departure, stop))
         else:

@@ -3,9 +3,10 @@
 import logging
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
+from functools import partial
 from typing import Any, Final
 
 import numpy as np
@@ -13,36 +14,24 @@ import numpy as np
 from gnd.fleet_bus.bus import open_bus
 from gnd.fleet_bus.config import BusConfig
 from gnd.fleet_bus.errors import NoRouter
-from gnd.fleet_bus.ros2 import LATCHED_QOS, RosMessage, RosNode, RosQos, RosTopic, publishers_of
+from gnd.fleet_bus.ros2 import LATCHED_QOS, RosEndpoint, RosMessage, RosNode, RosQos, RosTopic, publishers_of
 from gnd.gnd_map.arrays import F64
 from gnd.gnd_map.se3 import exp_so3
 from gnd.schemas.drive import DriveItem
 from gnd.vehicle_agent.config import LiveParameters
-from gnd.vehicle_agent.importers.point_cloud2 import decode_cloud, stamp_ns
+from gnd.vehicle_agent.importers.point_cloud2 import head_of
+from gnd.vehicle_agent.importers.ros.small_messages import SPEEDS
+from gnd.vehicle_agent.importers.ros.transforms import StaticTransforms
 from gnd.vehicle_agent.sources.live import ROUTER_WAIT_S, SCANS, LiveError, LiveItems
-from gnd.vehicle_agent.sources.ros2_items import (
-    RosMotion,
-    T_between,
-    fix_of_message,
-    has_point_times,
-    scan_of_message,
-    stamped_transforms,
-)
-from gnd.vehicle_agent.sources.ros2_messages import (
-    CLOUD,
-    FIX,
-    IMU,
-    ODOMETRY,
-    TRANSFORMS,
-    decode,
-    type_hash,
-)
+from gnd.vehicle_agent.sources.ros2_items import RosMotion, RosScans, fix_of_message
+from gnd.vehicle_agent.sources.ros2_messages import CLOUD, FIX, IMU, ODOMETRY, TRANSFORMS, decode, type_hash
 
-NO_TOPIC: Final = "none"
-"""For a topic in the settings: nobody gives it."""
 EVERYTHING: Final = RosQos(reliable=True, depth=0)
 """Small measurements are never left out."""
 CLOUDS: Final = RosQos(reliable=False, depth=10)
+NEEDED: Final[dict[str, tuple[str, ...]]] = {"points": (CLOUD,), "gnss": (FIX,), "speed": SPEEDS}
+"""Settings of topics, and the types that will do, the best first."""
+SPEED, GYRO, GNSS = "speed", "gyro", "gnss"
 SETTLE_S: Final = 1.0
 """Publishers that start together are all there by then."""
 MOUNT_WAIT_S: Final = 5.0
@@ -58,41 +47,47 @@ class RosTopics:
 
     points: str
     gnss: str
-    odometry: str
+    speed: str
+    speed_kind: str
     imu: str
 
 
 class RosSource:
-    """The topics of one vehicle, listened to; made by `open_ros2`.
+    """The topics of one vehicle, listened to; made by `open_ros2`, and driven once `wait_ready` has come back.
 
     Attributes:
         node: of this agent in the graph.
         topics: what is listened to.
         T_vehicle_lidar: (4, 4) the mount.
-        has_times: whether the clouds tell the times of their points.
     """
 
     def __init__(self, node: RosNode, topics: RosTopics) -> None:
         self.node, self.topics = node, topics
-        self.T_vehicle_lidar, self.has_times = np.eye(4), False
+        self.T_vehicle_lidar = np.eye(4)
         self._first: dict[str, bytes] = {}
-        self._frames: dict[str, tuple[str, F64]] = {}
-        self._motion = RosMotion(gyro=bool(topics.imu))
-        streams: dict[str, tuple[str, str, Callable[[RosMessage], DriveItem | None]]] = {
-            "odometry": (topics.odometry, ODOMETRY, lambda message: self._motion.odometry(message.payload)),
-            "imu": (topics.imu, IMU, lambda message: self._motion.imu(message.payload)),
-            "gnss": (topics.gnss, FIX, lambda message: fix_of_message(message.payload)),
-            SCANS: (topics.points, CLOUD, lambda message: scan_of_message(message.topic, message.payload)),
+        self._frames = StaticTransforms()
+        self._scans: RosScans | None = None
+        self._motion = RosMotion(topics.speed_kind)
+        streams = {
+            SPEED: (topics.speed, topics.speed_kind),
+            GYRO: (topics.imu, IMU),
+            GNSS: (topics.gnss, FIX),
+            SCANS: (topics.points, CLOUD),
         }
-        streams = {stream: what for stream, what in streams.items() if what[0]}
+        streams = {stream: (topic, kind) for stream, (topic, kind) in streams.items() if topic}
         self.items = LiveItems(list(streams))
         static = RosTopic("/tf_static", TRANSFORMS, type_hash(TRANSFORMS))
         node.subscribe(static, self._take_frames, LATCHED_QOS)
         self._subscriptions = []
-        for stream, (topic, kind, read) in streams.items():
+        for stream, (topic, kind) in streams.items():
             qos = CLOUDS if stream == SCANS else EVERYTHING
-            taken = node.subscribe(RosTopic(topic, kind, type_hash(kind)), self._putting(stream, read), qos)
+            taken = node.subscribe(RosTopic(topic, kind, type_hash(kind)), partial(self._put, stream), qos)
             self._subscriptions.append(taken)
+
+    @property
+    def has_times(self) -> bool:
+        """Whether the clouds tell the times of their points."""
+        return self._scans is not None and self._scans.rule.field is not None
 
     def drive(self, stop: threading.Event, silent_s: float) -> Iterator[DriveItem]:
         """Measurements in the order of their stamps; see `LiveItems.drive`."""
@@ -107,46 +102,56 @@ class RosSource:
         """Wait for the first sweep, and find out how LiDAR and gyro are mounted.
 
         Raises:
-            LiveError: stopped before, or nobody tells the mount.
+            LiveError: stopped before, or nobody tells a mount.
             ImportDriveError: a cloud that is none.
         """
-        while SCANS not in self._first or (self.topics.imu and "imu" not in self._first):
+        needed = {SCANS, SPEED} | ({GYRO} if self.topics.imu else set())
+        while missing := needed - self._first.keys():
             if stop.wait(_LOOK_S):
-                raise LiveError(f"stopped before {self.topics.points} and {self.topics.imu or 'no gyro'} gave anything")
-        cloud = decode_cloud(self.topics.points, self._first[SCANS])
-        self.has_times = has_point_times(self.topics.points, self._first[SCANS])
-        if live.mount:
-            self.T_vehicle_lidar = mount_of(live.mount)
-        else:
-            self.T_vehicle_lidar = self._wait_frame(live.vehicle_frame, cloud.frame_id, stop)
+                raise LiveError(f"stopped before anything came of {', '.join(sorted(missing))}")
+        self._scans = RosScans(self.topics.points, self._first[SCANS])
+        self.T_vehicle_lidar = mount_of(live.mount) if live.mount else self._wait_frame(live, self._scans.frame, stop)
         if self.topics.imu:
-            imu = decode(IMU, self._first["imu"]).header.frame_id
-            T_vehicle_imu = T_between(self._frames, live.vehicle_frame, imu.lstrip("/"))
-            self._motion = RosMotion(gyro=True, R_vehicle_imu=None if T_vehicle_imu is None else T_vehicle_imu[:3, :3])
+            imu = decode(IMU, self._first[GYRO]).header.frame_id
+            self._motion = RosMotion(self.topics.speed_kind, self._wait_frame(live, imu, stop)[:3, :3])
 
-    def _putting(self, stream: str, read: Callable[[RosMessage], DriveItem | None]) -> Callable[[RosMessage], None]:
-        def put(message: RosMessage) -> None:
-            self._first.setdefault(stream, message.payload)
-            t_ns = stamp_ns(message.topic, message.payload)
-            self.items.put(stream, t_ns, lambda: read(message))
+    def _put(self, stream: str, message: RosMessage) -> None:
+        self._first.setdefault(stream, message.payload)
+        t_ns, _ = head_of(message.topic, message.payload)
+        if stream == SCANS and self._scans is not None:
+            t_ns += self._scans.shift_ns
+        self.items.put(stream, t_ns, lambda: self._read(stream, message.payload))
 
-        return put
+    def _read(self, stream: str, data: bytes) -> DriveItem | None:
+        """The measurement of a message; called once `wait_ready` has come back."""
+        if stream == SCANS:
+            return None if self._scans is None else self._scans.scan(data)
+        if stream == GNSS:
+            return fix_of_message(data)
+        return self._motion.twist(data) if stream == SPEED else self._motion.gyro(data)
 
     def _take_frames(self, message: RosMessage) -> None:
-        for parent, child, T_parent_child in stamped_transforms(decode(TRANSFORMS, message.payload)):
-            self._frames[child] = parent, T_parent_child
+        self._frames.add(decode(TRANSFORMS, message.payload).transforms)
 
-    def _wait_frame(self, vehicle_frame: str, lidar_frame: str, stop: threading.Event) -> F64:
+    def _wait_frame(self, live: LiveParameters, frame: str, stop: threading.Event) -> F64:
+        """T_vehicle_frame from /tf_static."""
         deadline_s = time.monotonic() + MOUNT_WAIT_S
-        while (T := T_between(dict(self._frames), vehicle_frame, lidar_frame.lstrip("/"))) is None:
+        while True:
+            base = live.vehicle_frame or self._frames.base(self._odometry_frames())
+            if base is not None and (T := self._frames.between(base, frame)) is not None:
+                return T
             if time.monotonic() >= deadline_s or stop.wait(_LOOK_S):
-                known = ", ".join(sorted(self._frames)) or "none"
+                known = ", ".join(sorted(self._frames.frames)) or "none"
                 raise LiveError(
-                    f"/tf_static does not lead from {vehicle_frame!r} to the LiDAR's frame {lidar_frame!r} (frames:"
-                    f" {known}): give --set live.vehicle_frame=NAME, or the mount in m and degrees:"
+                    f"/tf_static does not lead from the vehicle's frame {base!r} to {frame!r} (frames: {known}): give"
+                    " --set live.vehicle_frame=NAME, or the LiDAR's mount in m and degrees:"
                     " --set live.mount=[x,y,z,roll,pitch,yaw]"
                 )
-        return T
+
+    def _odometry_frames(self) -> list[str]:
+        if self.topics.speed_kind != ODOMETRY:
+            return []
+        return [decode(ODOMETRY, self._first[SPEED]).child_frame_id]
 
 
 @contextmanager
@@ -173,15 +178,15 @@ def open_ros2(live: LiveParameters, vehicle: str, stop: threading.Event) -> Iter
 
 
 def find_topics(node: RosNode, live: LiveParameters, stop: threading.Event) -> RosTopics:
-    """The topics that are named, else the only ones of their type that somebody publishes.
+    """The topics that are named, else the only ones of their types that somebody publishes.
 
-    Clouds, positions and odometry are waited for as long as it takes; a gyro is used where there is one by then.
+    They are waited for as long as it takes. A gyro is used where it is named.
 
     Raises:
         LiveError: several topics could be meant; stopped before.
     """
     began_s, told = time.monotonic(), False
-    while missing := _missing(node, live):
+    while missing := _missing(live, node.endpoints()):
         if not told and time.monotonic() - began_s >= TELL_S:
             told = True
             _log.warning("domain %d: waiting for somebody who publishes %s", live.domain, " and ".join(missing))
@@ -189,27 +194,32 @@ def find_topics(node: RosNode, live: LiveParameters, stop: threading.Event) -> R
             raise LiveError(f"domain {live.domain}: stopped before anybody published {' and '.join(missing)}")
     stop.wait(SETTLE_S)
     found = node.endpoints()
-    return RosTopics(
-        points=_only(live.points, publishers_of(found, CLOUD), "points"),
-        gnss=_only(live.gnss, publishers_of(found, FIX), "gnss"),
-        odometry=_only(live.odometry, publishers_of(found, ODOMETRY), "odometry"),
-        imu=_only(live.imu, publishers_of(found, IMU), "imu"),
-    )
+    points, gnss, speed = (_only(live, name, kinds, found) for name, kinds in NEEDED.items())
+    kinds = {one.topic.name: one.topic.type_name for one in found if one.kind == "MP"}
+    if kinds.get(speed) not in SPEEDS:
+        raise LiveError(f"{speed}: {kinds.get(speed, 'nobody')} gives no speed; {', '.join(SPEEDS)} do")
+    return RosTopics(points, gnss, speed, kinds[speed], live.imu)
 
 
-def _missing(node: RosNode, live: LiveParameters) -> list[str]:
-    found = node.endpoints()
-    needed = (live.points, CLOUD), (live.gnss, FIX), (live.odometry, ODOMETRY)
-    return [kind for named, kind in needed if not named and not publishers_of(found, kind)]
+def _missing(live: LiveParameters, found: list[RosEndpoint]) -> list[str]:
+    """What nobody publishes yet."""
+    published = {one.topic.name for one in found if one.kind == "MP"}
+    missing = []
+    for name, kinds in NEEDED.items():
+        named = getattr(live, name)
+        if named not in published and (named or not any(publishers_of(found, kind) for kind in kinds)):
+            missing.append(named or kinds[0])
+    return missing
 
 
-def _only(named: str, found: list[str], setting: str) -> str:
-    if named:
-        return "" if named == NO_TOPIC else named
-    if len(found) > 1:
-        topics = ", ".join(found)
-        raise LiveError(f"{len(found)} topics could be meant ({topics}): choose with --set live.{setting}=/TOPIC")
-    return found[0] if found else ""
+def _only(live: LiveParameters, name: str, kinds: tuple[str, ...], found: list[RosEndpoint]) -> str:
+    named: str = getattr(live, name)
+    topics = next((topics for kind in kinds if (topics := publishers_of(found, kind))), [])
+    if not named and len(topics) > 1:
+        raise LiveError(
+            f"{len(topics)} topics could be meant ({', '.join(topics)}): choose with --set live.{name}=/TOPIC"
+        )
+    return named or topics[0]
 
 
 def mount_of(mount: tuple[float, ...]) -> F64:

@@ -8,15 +8,15 @@ from typing import Any, Final
 import numpy as np
 
 from gnd.gnd_map.arrays import F64
-from gnd.gnd_map.se3 import R_from_quaternion_xyzw, quaternion_xyzw_from_R
+from gnd.gnd_map.se3 import quaternion_xyzw_from_R
 from gnd.schemas.drive import GnssFix, MotionSample, Scan
 from gnd.vehicle_agent.errors import VehicleError
+from gnd.vehicle_agent.importers.optional import library
 
 CLOUD: Final = "sensor_msgs/msg/PointCloud2"
 IMU: Final = "sensor_msgs/msg/Imu"
 FIX: Final = "sensor_msgs/msg/NavSatFix"
 ODOMETRY: Final = "nav_msgs/msg/Odometry"
-TWIST: Final = "geometry_msgs/msg/TwistStamped"
 TRANSFORMS: Final = "tf2_msgs/msg/TFMessage"
 POSE: Final = "geometry_msgs/msg/PoseWithCovarianceStamped"
 DIAGNOSTICS: Final = "diagnostic_msgs/msg/DiagnosticArray"
@@ -31,9 +31,8 @@ class BadRosMessage(VehicleError):
 
 @cache
 def _store() -> Any:
-    from rosbags.typesys import Stores, get_typestore
-
-    return get_typestore(Stores.ROS2_JAZZY)
+    types = library("rosbags.typesys", "ros")
+    return types.get_typestore(types.Stores.ROS2_JAZZY)
 
 
 def type_hash(type_name: str) -> str:
@@ -177,19 +176,3 @@ def _transform(T: F64) -> dict[str, dict[str, float]]:
         "translation": dict(zip("xyz", map(float, T[:3, 3]), strict=True)),
         "rotation": dict(zip("xyzw", map(float, turned), strict=True)),
     }
-
-
-def T_of_transform(transform: Any) -> F64:
-    """(4, 4) T_parent_child of a geometry_msgs/Transform.
-
-    Raises:
-        BadRosMessage: its rotation is none.
-    """
-    q = np.array([getattr(transform.rotation, axis) for axis in "xyzw"], np.float64)
-    length = float(np.linalg.norm(q))
-    if not 0.9 < length < 1.1:
-        raise BadRosMessage(f"a transform's quaternion has length {length:.3g}")
-    T = np.eye(4)
-    T[:3, :3] = R_from_quaternion_xyzw(q / length)
-    T[:3, 3] = [getattr(transform.translation, axis) for axis in "xyz"]
-    return T
