@@ -67,6 +67,11 @@ class Bus:
         return self._connection.config
 
     @property
+    def connection(self) -> Connection:
+        """The session, for other parts of this package."""
+        return self._connection
+
+    @property
     def ledger(self) -> Ledger | None:
         """The account of this session."""
         return self._connection.ledger
@@ -158,7 +163,7 @@ class Bus:
         serving = Serving(
             self._connection, keyexpr, handler, complete=complete, workers=workers, kind=kind, beside=beside
         )
-        return self._keep(serving)
+        return self.keep(serving)
 
     def publish(
         self, key: str, payload: bytes, *, kind: str, tile: TileId | str | None = None, wait_s: float = PUBLISH_WAIT_S
@@ -183,7 +188,7 @@ class Bus:
     def advanced_publisher(self, key: str, *, kind: str = "update", remember: int = 1) -> RecallingPublisher:
         """A publisher of one key that repeats its last `remember` notices to late or interrupted subscribers."""
         self._connection.check_open()
-        return self._keep(RecallingPublisher(self._connection, key, kind=kind, remember=remember))
+        return self.keep(RecallingPublisher(self._connection, key, kind=kind, remember=remember))
 
     def subscribe(
         self,
@@ -206,14 +211,12 @@ class Bus:
             tile_of: tile of a key, for the ledger.
         """
         self._connection.check_open()
-        return self._keep(
-            Subscription(self._connection, keyexpr, callback, history=history, kind=kind, tile_of=tile_of)
-        )
+        return self.keep(Subscription(self._connection, keyexpr, callback, history=history, kind=kind, tile_of=tile_of))
 
     def declare_alive(self, key: str) -> AliveToken:
         """Shows that this process lives, until closed, killed or cut off for longer than the lease."""
         self._connection.check_open()
-        return self._keep(AliveToken(self._connection, key))
+        return self.keep(AliveToken(self._connection, key))
 
     def watch_alive(self, keyexpr: str, callback: OnAlive) -> AliveWatch:
         """Calls back with (key, True) for each token present or new and (key, False) for each that goes.
@@ -221,7 +224,7 @@ class Bus:
         All go when the own connection is lost, and come again with it.
         """
         self._connection.check_open()
-        return self._keep(AliveWatch(self._connection, keyexpr, callback))
+        return self.keep(AliveWatch(self._connection, keyexpr, callback))
 
     def wire(self) -> WireBytes:
         """Bytes on the wire of this session so far, over all its connections; also noted in the ledger."""
@@ -268,7 +271,8 @@ class Bus:
             self.wire()
             self.ledger.flush()
 
-    def _keep(self, part: _P) -> _P:
+    def keep(self, part: _P) -> _P:
+        """Close a part of this session with it."""
         with self._lock:
             self._parts = [other for other in self._parts if not other.is_closed]
             self._parts.append(part)

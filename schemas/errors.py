@@ -9,6 +9,7 @@ SchemaError
 ├── WrongHash       content that does not have the hash it claims
 ├── LayerError      a declaration of a feature layer that cannot be, or is missing
 ├── DriveError      a recorded drive that cannot be read or written
+├── NoPlace         a drive whose place on the Earth is not known, where one is needed
 └── TrajectoryError a file of poses that cannot be read or written
 """
 
@@ -49,6 +50,10 @@ class LayerError(SchemaError):
 
 class DriveError(SchemaError):
     """A recorded drive that cannot be read or written."""
+
+
+class NoPlace(SchemaError):
+    """A drive whose place on the Earth is not known, where one is needed."""
 
 
 class TrajectoryError(SchemaError):

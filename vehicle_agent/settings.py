@@ -45,7 +45,7 @@ def agent_of(given: Mapping[str, Any], *, where: str = "agent") -> AgentConfig:
         ConfigError: as of `load_agent`.
         LayerError: a layer that nobody has declared.
     """
-    values = merged({"vehicle": "vehicle"}, _defaults_of_mode(given), given)
+    values = merged({"vehicle": "vehicle", "drive": None}, _defaults_of_mode(given), given)
     values.setdefault("work_dir", f"runs/{values['vehicle']}")
     features = values.get("features")
     if isinstance(features, Mapping) and isinstance(layers := features.get("layers"), list | tuple):

@@ -12,7 +12,14 @@ ENDINGS: Final = {
     "pcd": (".pcd", ".pcd.xz"),
     "mcap": (".mcap",),
     "planes": (".xyz_mm", ".xyz_mm.xz"),
+    "ros": (".db3", ".db3.zstd", ".mcap.zstd"),
 }
+MAGIC: Final = {b"\x89MCAP0\r\n": "mcap", b"SQLite format 3\0": "ros"}
+REFUSED: Final = {
+    b"#ROSBAG V2.0": "a bag of ROS 1; make a bag of ROS 2 of it: rosbags-convert --src FILE.bag --dst FOLDER",
+    b"\x28\xb5\x2f\xfd": "compressed with zstd; give the bag's folder with its metadata.yaml, or unzstd it",
+}
+"""First bytes of files that are known but not read, and what to do."""
 
 
 def format_of(place: Path) -> str:
@@ -25,6 +32,8 @@ def format_of(place: Path) -> str:
         raise ImportDriveError(f"{place}: no such file or folder")
     if place.is_file():
         return _format_of_file(place)
+    if files_of(place, "metadata.yaml") and "rosbag2" in (place / "metadata.yaml").read_text(errors="replace"):
+        return "ros"
     if files_of(place, "GPS_IMU_Twist.txt", "velo_lidar*"):
         return "radiate"
     if is_apollo(place):
@@ -40,6 +49,16 @@ def format_of(place: Path) -> str:
 
 
 def _format_of_file(place: Path) -> str:
-    if place.suffix == ".mcap":
-        return "mcap"
-    raise ImportDriveError(f"{place}: a single file must be an .mcap; give the folder that holds the scans")
+    """By its first bytes, whatever its name."""
+    with place.open("rb") as stream:
+        head = stream.read(64)
+    for magic, kind in MAGIC.items():
+        if head.startswith(magic):
+            return kind
+    for magic, what in REFUSED.items():
+        if head.startswith(magic):
+            raise ImportDriveError(f"{place}: {what}")
+    kinds = ", ".join(dict.fromkeys(MAGIC.values()))
+    raise ImportDriveError(
+        f"{place}: no single file of a kind that is read ({kinds}); give the folder that holds the scans"
+    )

@@ -19,7 +19,7 @@ from gnd.vehicle_agent.errors import ImportDriveError
 from gnd.vehicle_agent.importers.cleaning import RawScan
 from gnd.vehicle_agent.importers.files import check_folder, files_below, files_of
 from gnd.vehicle_agent.importers.pcd_format import read_pcd
-from gnd.vehicle_agent.importers.recording import Recording, RecordingAnchor
+from gnd.vehicle_agent.importers.recording import NOMINAL, Recording, RecordingAnchor
 
 F64 = NDArray[np.float64]
 I64 = NDArray[np.int64]
@@ -33,12 +33,10 @@ def open_pcd(folder: Path, anchor: RecordingAnchor | None) -> Recording:
     """A folder of PCD files; `anchor` says where on the Earth the first pose lies.
 
     Raises:
-        ImportDriveError: no scans, no anchor, poses that do not fit the scans.
+        ImportDriveError: no scans, poses that do not fit the scans.
     """
     check_folder(folder)
     files = _scan_files(folder)
-    if anchor is None:
-        raise ImportDriveError(f"{folder}: PCD files do not say where they were taken; give --anchor LAT,LON,HEIGHT")
     t_ns, track = _track(files[0].parent, len(files))
     return Recording(
         name=folder.name,
@@ -47,9 +45,11 @@ def open_pcd(folder: Path, anchor: RecordingAnchor | None) -> Recording:
         T_vehicle_lidar=np.eye(4),
         t_ns=t_ns,
         read=lambda i: read_scan(files[i], int(t_ns[i])),
-        anchor=anchor,
+        anchor=anchor or NOMINAL,
         track=track,
         mount="assumed",
+        placed=anchor is not None,
+        timed=track is not None,
     )
 
 
