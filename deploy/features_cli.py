@@ -51,6 +51,7 @@ def features() -> None:
 @click.option("--height-offset", default=0.0, metavar="METRES", help="Added to heights, which makes them ellipsoidal.")
 @click.option("--sigma", default=SIGMA_M, show_default=True, metavar="METRES", help="Of positions, each axis.")
 @click.option("--exist", default=SURE, show_default=True, help="Mass of existence of what a map holds.")
+@click.option("--strict", is_flag=True, help="Refuse a file with lines or borders that cross; else they are reported.")
 @click.option("--city", help="Of an Argoverse 2 map: PIT, ...  [default: by the file's name]")
 @json_option
 def import_(
@@ -66,6 +67,7 @@ def import_(
     height_offset: float,
     sigma: float,
     exist: float,
+    strict: bool,
     city: str | None,
     as_json: bool,
 ) -> None:
@@ -77,7 +79,7 @@ def import_(
     format_of(file, kind)  # a wrong name is told before a track is computed
     options = ImportOptions(
         _layers(layers), other, _placement(georeference, poses, fixes), georeference == "latlon", height_offset, sigma,
-        sigma, exist,
+        sigma, exist, strict,
     )  # fmt: skip
     name = source or default_source(file)
     with _Bars() as bars:

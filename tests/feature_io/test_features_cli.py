@@ -91,7 +91,7 @@ def test_list_and_show(at: Path) -> None:
 def test_export(at: Path, tmp_path: Path) -> None:
     told = as_json("export", at, tmp_path / "back.osm")
     assert (told["source"], told["features"]) == ("street.osm", 4)
-    assert told["changes"] == {"moved": 0, "retagged": 0, "removed": 0, "added": 0}
+    assert set(told["changes"].values()) == {0}
     assert (tmp_path / "back.osm").read_bytes() == STREET
     assert "into street.osm: 0 nodes and lines moved" in gnd_features("export", at, tmp_path / "back.osm")
     part = as_json("export", at, tmp_path / "signs.geojson", "--layer", "signs")

@@ -1,7 +1,7 @@
 """Files of features by their names: which format, and how it is read and written."""
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import Final, Literal, get_args
@@ -12,6 +12,7 @@ from gnd.tile_store.feature_io.errors import FeatureFileError, UnknownFormat
 from gnd.tile_store.feature_io.geojson_export import write_geojson
 from gnd.tile_store.feature_io.geojson_import import read_geojson
 from gnd.tile_store.feature_io.json_file import MAX_JSON_BYTES
+from gnd.tile_store.feature_io.lane_network import MapLane
 from gnd.tile_store.feature_io.lanelet2_export import EMPTY, Changes, write_lanelet2
 from gnd.tile_store.feature_io.lanelet2_import import FORMAT as LANELET2
 from gnd.tile_store.feature_io.lanelet2_import import read_lanelet2
@@ -123,6 +124,17 @@ def export_features(
     return FeaturesExported(str(path), found, told, len(body), kept.name if kept else None, changes)
 
 
+def _all_lanes(store: SqliteStore) -> list[MapLane]:
+    """The lanes of all sources; their keys are made different, because two files may use one."""
+    found = []
+    for name, source in sources_of(store).items():
+        known = {lane.key for lane in source.lanes}
+        for lane in source.lanes:
+            following = tuple(f"{name} {key}" for key in lane.successors if key in known)
+            found.append(replace(lane, key=f"{name} {lane.key}", successors=following))
+    return found
+
+
 def _source(store: SqliteStore, said: str | None, *, chosen: bool) -> FeatureSource | None:
     known = {name: one for name, one in sources_of(store).items() if one.format == LANELET2}
     if said == "" or (said is None and (not known or chosen)):
@@ -144,7 +156,8 @@ def _lanelet2(
 ) -> tuple[bytes, Changes | None, int]:
     """The file with its own features and new ones; those of other files stay out."""
     if kept is None:
-        return write_lanelet2(features, EMPTY)[0], None, len(features)
+        body, changes = write_lanelet2(features, EMPTY, lanes=_all_lanes(store))
+        return body, changes, len(features)
     others = (one for name, one in sources_of(store).items() if name != kept.name)
     foreign = {id_ for other in others for ids in other.ids.values() for id_ in ids}
     mine = [feature for feature in features if feature.feature_id not in foreign]

@@ -7,26 +7,38 @@ elements and all else that is no feature stay in the document, which is kept bes
 Format: github.com/fzi-forschungszentrum-informatik/Lanelet2, lanelet2_core/doc/*.md.
 """
 
-from collections import Counter
+from collections import Counter, defaultdict
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
+from math import isnan
 from typing import Final
 
 import numpy as np
 
 from gnd.gnd_map.arrays import F64
 from gnd.gnd_map.features import feature_id_of
+from gnd.gnd_map.geodesy import LocalFrame
 from gnd.tile_store.feature_io.errors import BadGeometry, NeedsGeoreference
 from gnd.tile_store.feature_io.lane_crossing import crossing_of
-from gnd.tile_store.feature_io.osm_document import OsmDocument, OsmNode, OsmWay, Progress, read_osm, real
+from gnd.tile_store.feature_io.lane_network import Border, MapLane
+from gnd.tile_store.feature_io.osm_document import (
+    OsmDocument,
+    OsmNode,
+    OsmRelation,
+    OsmWay,
+    Progress,
+    read_osm,
+    real,
+)
 from gnd.tile_store.feature_io.osm_kinds import POINT_KINDS, kind_of, told_of
 from gnd.tile_store.feature_io.values import (
     LEFT_OUT,
     FeatureFile,
+    Findings,
     ImportOptions,
     MapFeature,
     attributes_of,
     check_positions,
-    check_simple,
     check_vertices,
 )
 
@@ -79,10 +91,17 @@ def read_lanelet2(
     """
     document = read_osm(data, where, progress=progress)
     drawn, left_out = drawn_features(document, source, options)
+    findings = Findings(options.strict)
     for one in drawn:
-        check_simple(one.feature)
-    check_lanelets(document, places_of(document, options))
-    return FeatureFile(FORMAT, tuple(one.feature for one in drawn), left_out, data)
+        findings.check_simple(one.feature)
+    borders = lanelet_borders(document, places_of(document, options))
+    check_lanelets(document, borders, findings)
+    features = tuple(one.feature for one in drawn)
+    ways = {one.element.id: one.feature.feature_id for one in drawn if isinstance(one.element, OsmWay)}
+    kept = Counter(one.tags.get("type", "untyped relation") for one in document.relations.values())
+    return FeatureFile(
+        FORMAT, features, left_out, data, findings.told(), _lanes(borders, ways), dict(sorted(kept.items()))
+    )
 
 
 def drawn_features(
@@ -94,7 +113,9 @@ def drawn_features(
     found: list[tuple[str, OsmNode | OsmWay, list[OsmNode]]] = []
     for way in document.ways.values():
         kind = kind_of(way.tags, border=way.id in borders)
-        if kind is not None:
+        if kind is None:
+            left_out["untyped_way"] += 1
+        else:
             found.append((kind, way, document.nodes_of(way)))
     for node in document.nodes.values():
         kind = kind_of(node.tags)
@@ -141,7 +162,10 @@ def _drawn(
 
 def middle_of(line: F64) -> F64:
     """(3,) the middle of what the vertices (N, 3) span: a plate drawn by its edges hangs there."""
-    return np.asarray((line.min(axis=0) + line.max(axis=0)) / 2.0)
+    turn = np.array([0.0, 2.0 * np.pi, 0.0])
+    line = line - turn * np.round((line - line[0]) / (2.0 * np.pi))  # a plate at 180 degrees does not span the Earth
+    middle = (line.min(axis=0) + line.max(axis=0)) / 2.0
+    return np.asarray(middle - turn * np.round(middle / (2.0 * np.pi)))
 
 
 def _borders(document: OsmDocument) -> set[int]:
@@ -168,7 +192,7 @@ def places_of(document: OsmDocument, options: ImportOptions) -> NodePlaces:
         lat, lon, height_m = options.placement.geodetic(local_m) if nodes else (np.zeros(0),) * 3
         has_height &= options.placement.height_known or options.height_offset_m != 0.0
     else:
-        _refuse_placeholders(document, has_local, options)
+        _refuse_placeholders(document, nodes, has_local, options)
         local_m = None
         lat, lon = np.radians(np.array([(n.lat_deg, n.lon_deg) for n in nodes], np.float64).reshape(-1, 2)).T
     height_m = height_m + options.height_offset_m
@@ -188,13 +212,22 @@ def _check_places(document: OsmDocument, nodes: list[OsmNode], lat: F64, lon: F6
 
 
 def _refuse_placeholders(
-    document: OsmDocument, has_local: "np.ndarray[tuple[int], np.dtype[np.bool_]]", options: ImportOptions
+    document: OsmDocument,
+    nodes: list[OsmNode],
+    has_local: "np.ndarray[tuple[int], np.dtype[np.bool_]]",
+    options: ImportOptions,
 ) -> None:
     if has_local.any() and not options.trust_latlon:
         raise NeedsGeoreference(
             f"{document.where}: {has_local.sum()} of {len(has_local)} nodes have local_x and local_y, so that their "
             "lat and lon may be placeholders; say --georeference latlon if they hold, an anchor "
             "(LAT,LON[,HEIGHT[,BEARING]]) or track if they do not"
+        )
+    empty = [node for node in nodes if isnan(node.lat_deg) or isnan(node.lon_deg)]
+    if empty:
+        raise NeedsGeoreference(
+            f"{document.where}, line {empty[0].line}: {len(empty)} of {len(nodes)} nodes have no lat or lon, first "
+            f"node {empty[0].id}; say --georeference with an anchor (LAT,LON[,HEIGHT[,BEARING]]) or track"
         )
 
 
@@ -219,25 +252,101 @@ def _value(document: OsmDocument, node: OsmNode, key: str) -> float:
     return 0.0 if text is None else real(f"{document.where}, line {node.line}", f"{key} of node {node.id}", text)
 
 
-def check_lanelets(document: OsmDocument, places: NodePlaces) -> None:
-    """BadGeometry when the borders of a lanelet cross each other."""
-    for relation in document.relations.values():
-        if relation.tags.get("type") != "lanelet":
-            continue
-        sides = []
-        for role in ("left", "right"):
-            nodes = [n for ref in relation.member("way", role) for n in document.nodes_of(document.ways[ref])]
-            check_vertices(
-                f"{document.where}, line {relation.line}: {role} border of lanelet {relation.id}", len(nodes)
-            )
-            rows = places.rows(nodes)
-            sides.append(
-                np.column_stack([places.lon_rad[rows] * np.cos(places.lat_rad[rows[:1]]), places.lat_rad[rows]])
-            )
-        met = crossing_of(sides[0], sides[1])
+@dataclass(frozen=True, slots=True, eq=False)
+class LaneletBorders:
+    """The two borders of a lanelet, each way in the lanelet's direction.
+
+    Attributes:
+        relation: the lanelet.
+        left: the way on the left and whether its nodes are in the direction of the lanelet.
+        right: the way on the right, likewise.
+        left_m: (N, 2) vertices in an ENU frame at the lanelet, one scale for both borders.
+        right_m: (M, 2).
+    """
+
+    relation: OsmRelation
+    left: tuple[OsmWay, bool]
+    right: tuple[OsmWay, bool]
+    left_m: F64
+    right_m: F64
+
+
+def lanelet_borders(document: OsmDocument, places: NodePlaces) -> list[LaneletBorders]:
+    """The borders of each lanelet, brought into one direction as the official library does (`geometry::align`).
+
+    Raises:
+        FileTooLarge: a border has too many vertices to be held against the other.
+    """
+    return [
+        _aligned(document, places, relation)
+        for relation in document.relations.values()
+        if relation.tags.get("type") == "lanelet"
+    ]
+
+
+def _aligned(document: OsmDocument, places: NodePlaces, relation: OsmRelation) -> LaneletBorders:
+    ways = [document.ways[relation.member("way", role)[0]] for role in ("left", "right")]
+    rows = [places.rows(document.nodes_of(way)) for way in ways]
+    for role, of_way in zip(("left", "right"), rows, strict=True):
+        name = f"{document.where}, line {relation.line}: {role} border of lanelet {relation.id}"
+        check_vertices(name, len(of_way))
+        if not of_way:
+            raise BadGeometry(f"{name} has no nodes, so no position")
+    first = rows[0][0]
+    frame = LocalFrame(float(places.lat_rad[first]), float(places.lon_rad[first]), 0.0)
+    left_m, right_m = (
+        frame.enu_from_geodetic(places.lat_rad[r], places.lon_rad[r], np.zeros(len(r)))[:, :2] for r in rows
+    )
+    left_ahead, right_ahead = directions(left_m, right_m)
+    return LaneletBorders(relation, (ways[0], left_ahead), (ways[1], right_ahead), left_m, right_m)
+
+
+def directions(left_m: F64, right_m: F64) -> tuple[bool, bool]:
+    """Whether the vertices of borders (N, 2) and (M, 2) come in the direction of their lane.
+
+    The borders run side by side when their ends are nearer to each other than crosswise; the lane's direction is the
+    one in which the area between them, from the left border round to the right, is turned to the right.
+    """
+    along = np.linalg.norm(left_m[0] - right_m[0]) + np.linalg.norm(left_m[-1] - right_m[-1])
+    across = np.linalg.norm(left_m[0] - right_m[-1]) + np.linalg.norm(left_m[-1] - right_m[0])
+    same = bool(along <= across)
+    ring = np.concatenate([left_m, (right_m if same else right_m[::-1])[::-1]])
+    x, y = (ring - ring[0]).T
+    ahead = bool(np.sum(x * np.roll(y, -1) - np.roll(x, -1) * y) <= 0.0)
+    return ahead, ahead == same
+
+
+def check_lanelets(document: OsmDocument, borders: Iterable[LaneletBorders], findings: Findings) -> None:
+    """A finding for each lanelet whose borders cross each other."""
+    for lane in borders:
+        met = crossing_of(lane.left_m, lane.right_m)
         if met is not None:
-            raise BadGeometry(
-                f"{document.where}, line {relation.line}: the borders of lanelet {relation.id} cross each other "
-                f"(segment {met[0] + 1} of {len(sides[0]) - 1} on the left, {met[1] + 1} of {len(sides[1]) - 1} on the "
-                "right)"
+            findings.add(
+                f"{document.where}, line {lane.relation.line}: the borders of lanelet {lane.relation.id} cross each "
+                f"other (segment {met[0] + 1} of {len(lane.left_m) - 1} on the left, {met[1] + 1} of "
+                f"{len(lane.right_m) - 1} on the right)"
             )
+
+
+def _lanes(borders: Iterable[LaneletBorders], feature_of_way: Mapping[int, int]) -> tuple[MapLane, ...]:
+    """The lanelets whose borders are features; the one that begins with both last nodes of another follows it."""
+    known = [one for one in borders if one.left[0].id in feature_of_way and one.right[0].id in feature_of_way]
+    starts: dict[tuple[int, int], list[str]] = defaultdict(list)
+    for one in known:
+        starts[_ends(one, 0)].append(str(one.relation.id))
+    return tuple(
+        MapLane(
+            str(one.relation.id),
+            Border(feature_of_way[one.left[0].id], one.left[1]),
+            Border(feature_of_way[one.right[0].id], one.right[1]),
+            tuple(starts[_ends(one, -1)]) if _ends(one, -1) in starts else (),
+            tuple(sorted(one.relation.tags.items())),
+        )
+        for one in known
+    )
+
+
+def _ends(lane: LaneletBorders, which: int) -> tuple[int, int]:
+    """The nodes that both borders begin (0) or end (-1) with."""
+    left, right = (way.nodes[which if ahead else -1 - which] for way, ahead in (lane.left, lane.right))
+    return left, right

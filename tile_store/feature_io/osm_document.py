@@ -6,7 +6,7 @@ version in the root). Only what features need is read; the bytes keep the rest.
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
-from math import isfinite
+from math import isfinite, nan
 from typing import Final, TypeVar
 
 from gnd.tile_store.feature_io.errors import BadElement, DuplicateId, FileTooLarge, MissingReference, UnknownFormat
@@ -39,7 +39,7 @@ _T = TypeVar("_T", bound=OsmElement)
 
 @dataclass(frozen=True, slots=True)
 class OsmNode(OsmElement):
-    """A node: degrees."""
+    """A node: degrees; NaN where only local coordinates are given."""
 
     lat_deg: float
     lon_deg: float
@@ -180,6 +180,8 @@ def number(where: str, element: Element, name: str) -> int:
 
 def _degrees(where: str, element: Element, name: str) -> float:
     text = element.attributes.get(name)
+    if not text and {"local_x", "local_y"} <= {tag.attributes.get("k") for tag in element.all("tag")}:
+        return nan  # editors of local maps leave the attribute empty
     if text is None:
         raise BadElement(f"{where}: node {element.attributes.get('id')} has no {name}, so no position")
     return real(where, f"{name} of node {element.attributes.get('id')}", text)
