@@ -54,7 +54,6 @@ OSM = [
     ('<?xml version="1.0" encoding="ISO-8859-1"?>' + osm(NODES), errors.UnknownFormat, "encoding 'ISO-8859-1'"),
     ("<gpx/>", errors.UnknownFormat, "root element <gpx>"),
     (osm(NODES, 'version="0.5"'), errors.UnknownFormat, "OSM version '0.5', known is 0.6"),
-    (osm('<MetaInfo format_version="2"/>'), errors.UnknownFormat, "map format '2'"),
     (osm('<node id="1" lat="49"/>'), errors.BadElement, "node 1 has no lon, so no position"),
     (osm('<node lat="49" lon="8"/>'), errors.BadElement, "<node> without id"),
     (osm('<node id="x" lat="49" lon="8"/>'), errors.BadElement, "id='x' of <node> is no whole number"),

@@ -16,7 +16,6 @@ MAX_FILE_BYTES: Final = 1_000_000_000
 MAX_NODES: Final = 1_000_000
 MAX_ID: Final = 2**63 - 1
 VERSIONS: Final = ("0.6",)
-META_VERSIONS: Final = ("1",)
 _EVERY: Final = 10_000
 
 Progress = Callable[[str, int, int], None]
@@ -126,9 +125,7 @@ class _OsmReading:
         self._count += 1
         if self._progress and self._count % _EVERY == 0:
             self._progress("reading", element.end, len(self._to.data))
-        if element.name == "MetaInfo":
-            self._check_meta(element)
-        elif element.name in ("node", "way", "relation"):
+        if element.name in ("node", "way", "relation"):
             if element.name == "node":
                 self._to.end_of_nodes = element.end
             elif element.name == "way":
@@ -148,14 +145,6 @@ class _OsmReading:
             _put(where, self._to.ways, OsmWay(*common, refs))
         else:
             _put(where, self._to.relations, OsmRelation(*common, _members(where, element)))
-
-    def _check_meta(self, element: Element) -> None:
-        version = element.attributes.get("format_version")
-        if version is not None and version not in META_VERSIONS:
-            raise UnknownFormat(
-                f"{self._to.where}, line {element.line}: map format {version!r:.20}, "
-                f"known is {', '.join(META_VERSIONS)}"
-            )
 
 
 def _put(where: str, table: dict[int, _T], element: _T) -> None:
