@@ -31,7 +31,7 @@ GEOREFERENCE_HELP: Final = (
 def features() -> None:
     """Import, export and list the feature layers of a store: signs, poles, streetlights, lanes, ...
 
-    Files: Lanelet2 (.osm), OpenDRIVE (.xodr, read only), GeoJSON (.geojson), Argoverse 2 maps (log_map_archive_*.json,
+    Files: Lanelet2 (.osm), OpenDRIVE (.xodr), GeoJSON (.geojson), Argoverse 2 maps (log_map_archive_*.json,
     read only).
     """
 
@@ -127,16 +127,15 @@ def _anchor(said: str) -> Placement:
 @click.option("--layer", "layers", multiple=True, help="A layer, or several.  [default: all]")
 @region_option
 @click.option("--format", "kind", type=click.Choice(WRITTEN), help="  [default: by the file's name]")
-@click.option(
-    "--source", help="Write into the Lanelet2 file imported as this; '': a new file.  [default: the only one]"
-)
+@click.option("--source", help="Write into the file imported as this; '': a new file.  [default: the only one]")
 @json_option
 def export(
     path: Path, out: Path, layers: tuple[str, ...], region: str, kind: str | None, source: str | None, as_json: bool
 ) -> None:
-    """Write the newest features of STORE to FILE: GeoJSON, or Lanelet2 (.osm).
+    """Write the newest features of STORE to FILE: GeoJSON, Lanelet2 (.osm) or OpenDRIVE (.xodr).
 
-    A Lanelet2 file that was imported comes back with all that is no feature; only what has changed is written anew.
+    A Lanelet2 or OpenDRIVE file that was imported comes back with all that is no feature; only what has changed is
+    written anew. A new Lanelet2 file has the lanes of every source as lanelets.
     """
     with SqliteStore(path, create=False) as store:
         result = export_features(store, out, layers, region, kind, source)

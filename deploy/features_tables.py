@@ -51,7 +51,8 @@ def print_export(console: Console, result: FeaturesExported) -> None:
     if result.source is not None and changes is not None:
         console.print(
             f"into {result.source}: {changes.moved} nodes and lines moved, {changes.retagged} elements with "
-            f"other tags, {changes.removed} elements removed, {changes.added} features new",
+            f"other tags, {changes.removed} elements removed, {changes.added} features new"
+            + (f", {changes.unwritten} changes that the format cannot say" if changes.unwritten else ""),
             highlight=False,
         )
 

@@ -111,7 +111,7 @@ def test_features_are_found_by_layer_and_region(store: SqliteStore, tmp_path: Pa
     put(store, tmp_path / "street.osm", source="a")
     with pytest.raises(FeatureFileError, match=r"features come from a, street\.osm; say which"):
         export_features(store, tmp_path / "x.osm")
-    with pytest.raises(FeatureFileError, match=r"no Lanelet2 file 'c'; it has a, street\.osm"):
+    with pytest.raises(FeatureFileError, match=r"no lanelet2 file 'c'; it has a, street\.osm"):
         export_features(store, tmp_path / "x.osm", source="c")
     with pytest.raises(FeatureFileError, match="all layers and regions are written"):
         export_features(store, tmp_path / "x.osm", ["lanes"], source="a")

@@ -130,10 +130,11 @@ def test_all_lanes_of_opendrive_are_routable_wherever_they_lie(place: str, store
 
 def test_a_lane_drawn_apart_from_its_successor_is_not_routable_and_said(store: SqliteStore, tmp_path: Path) -> None:
     """Road 5 lies 2 m higher in y than the road that it goes on from."""
-    told = (MAPS / "town.xodr").read_text()
+    head, start, rest = (MAPS / "town.xodr").read_text().partition('<road id="5"')
     for y, higher in (("9.90997271378681460e-2", "2.099"), ("3.94645202137400730e-1", "2.395")):
-        assert told.count(f'y="{y}"') == 1
-        told = told.replace(f'y="{y}"', f'y="{higher}"')
+        assert f'y="{y}"' in rest
+        rest = rest.replace(f'y="{y}"', f'y="{higher}"', 1)
+    told = head + start + rest
     (tmp_path / "town.xodr").write_text(told)
     put(store, tmp_path / "town.xodr")
     result = export_features(store, tmp_path / "new.osm")

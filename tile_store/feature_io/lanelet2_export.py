@@ -45,7 +45,8 @@ class Changes:
     """What an export changed in the file: elements.
 
     lanelets: added with the lines; apart: successors of lanes whose borders end too far from each other to be joined;
-    unbounded: lanes that were left out because a border of theirs has gone.
+    unbounded: lanes that were left out because a border of theirs has gone; unwritten: features that have changed in a
+    way that the format cannot say, so that they are as they were.
     """
 
     moved: int
@@ -55,6 +56,7 @@ class Changes:
     lanelets: int = 0
     apart: int = 0
     unbounded: int = 0
+    unwritten: int = 0
 
 
 def write_lanelet2(
@@ -130,14 +132,14 @@ class _Editing:
 
     def _move(self, nodes: tuple[OsmNode, ...], new: F64, old: F64) -> None:
         for node, place, was in zip(nodes, new, old, strict=True):
-            if _apart_m(place, was) > self._keep_within_m:
+            if apart_m(place, was) > self._keep_within_m:
                 self._moved[node.id].append(place)
 
     def _redraw(self, way: OsmWay, new: F64, old: F64) -> None:
         """A line with other vertices: nodes that are where one was are kept, the others are new."""
         refs = []
         for place in new:
-            apart = [_apart_m(place, was) for was in old]
+            apart = [apart_m(place, was) for was in old]
             nearest = int(np.argmin(apart))
             refs.append(way.nodes[nearest] if apart[nearest] <= KEEP_WITHIN_M else self._node(place, {}))
         self._refs[way.id] = refs
@@ -323,8 +325,8 @@ def _line(feature: MapFeature) -> F64:
     return np.column_stack([feature.lat_rad, feature.lon_rad, feature.height_m])
 
 
-def _apart_m(a: F64, b: F64) -> float:
-    """Distance of two near positions."""
+def apart_m(a: F64, b: F64) -> float:
+    """Distance of two near positions: latitude, longitude (radians), height."""
     lat = float(a[0])
     north, east = meridian_radius_m(lat) * (a[0] - b[0]), normal_radius_m(lat) * np.cos(lat) * (a[1] - b[1])
     return float(np.sqrt(north**2 + east**2 + (a[2] - b[2]) ** 2))

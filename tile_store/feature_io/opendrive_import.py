@@ -5,20 +5,18 @@ any that pyproj understands (an optional library: extra `opendrive`); files with
 """
 
 from collections import Counter
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
+from dataclasses import dataclass
 from functools import partial
-from typing import Final, TypeAlias
+from typing import Final
 
 import numpy as np
 
-from gnd.gnd_map.arrays import F64
 from gnd.gnd_map.features import feature_id_of
 from gnd.tile_store.feature_io.errors import (
     BadElement,
     DuplicateId,
     FileTooLarge,
-    MissingLibrary,
-    NeedsGeoreference,
     UnknownFormat,
 )
 from gnd.tile_store.feature_io.lane_network import MapLane
@@ -33,16 +31,15 @@ from gnd.tile_store.feature_io.values import (
 )
 from gnd.tile_store.feature_io.xml_spans import Element, read_root
 from gnd.tile_store.feature_io.xodr_curves import simplified
+from gnd.tile_store.feature_io.xodr_georeference import Georeference, georeference_of
 from gnd.tile_store.feature_io.xodr_lanes import LaneId, lanes_of
-from gnd.tile_store.feature_io.xodr_road import Road, road_of, value
+from gnd.tile_store.feature_io.xodr_road import Road, road_of
 from gnd.tile_store.feature_io.xodr_things import Thing, things_of
 
 FORMAT: Final = "opendrive"
 STEP_M: Final = 0.5
 TOLERANCE_M: Final = 0.005
 MAX_SAMPLES: Final = 50_000_000
-ToEarth: TypeAlias = Callable[[F64], tuple[F64, F64, F64]]
-"""From points (N, 3) of the file to latitude, longitude (radians) and height, each (N,)."""
 
 
 def read_opendrive(
@@ -60,31 +57,61 @@ def read_opendrive(
     Raises:
         FeatureFileError: one of its family says what is wrong and where.
     """
-    root = read_root(data, where)
-    to_earth = _to_earth(_header(root, where), where, options)
-    roads = _roads(root, where)
-    known = options.placement.height_known if options.placement else True
+    file = read_xodr(data, where, options)
     left_out: Counter[str] = Counter()
     features: list[MapFeature] = []
     findings = Findings(options.strict)
-    for number, road in enumerate(roads.values()):
-        for thing in (*_borders(road), *things_of(road, roads)):
-            layer = options.layer_of(thing.kind)
-            if layer == LEFT_OUT:
+    for number, road in enumerate(file.roads.values()):
+        for thing, feature in drawn_things(file, road, source, options):
+            if feature is None:
                 left_out[thing.kind] += 1
                 continue
-            feature = _feature(thing, layer, road, source, options, to_earth, height_known=known)
             findings.check_simple(feature)
             features.append(feature)
         if progress:
-            progress("reading roads", number, len(roads))
+            progress("reading roads", number, len(file.roads))
     lanes: tuple[MapLane, ...] = ()
+    junctions = file.root.all("junction")
     if options.layer_of("lane_boundary") != LEFT_OUT:
-        lanes = lanes_of(roads, root.all("junction"), partial(_border_id, source))
+        lanes = lanes_of(file.roads, junctions, partial(_border_id, source))
     return FeatureFile(
         FORMAT, tuple(features), dict(sorted(left_out.items())), data, findings.told(), lanes,
-        {"road": len(roads), "junction": len(root.all("junction"))},
+        {"road": len(file.roads), "junction": len(junctions)},
     )  # fmt: skip
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class XodrFile:
+    """An OpenDRIVE file: its root, its roads by id, and where its coordinates lie on the Earth."""
+
+    root: Element
+    roads: dict[str, Road]
+    georeference: Georeference
+
+
+def read_xodr(data: bytes, where: str, options: ImportOptions) -> XodrFile:
+    """The roads of a file; errors as `read_opendrive`."""
+    root = read_root(data, where)
+    header = _header(root, where)
+    return XodrFile(root, _roads(root, where), georeference_of(header, where, options))
+
+
+def drawn_things(
+    file: XodrFile, road: Road, source: str, options: ImportOptions
+) -> Iterator[tuple[Thing, MapFeature | None]]:
+    """What a road has, each with its feature; None: its kind has no layer."""
+    known = options.placement.height_known if options.placement else True
+    for thing in (*_borders(road), *things_of(road, file.roads)):
+        layer = options.layer_of(thing.kind)
+        if layer == LEFT_OUT:
+            yield thing, None
+            continue
+        lat, lon, height = file.georeference.to_earth(thing.points_m)
+        yield thing, MapFeature(
+            feature_id_of(FORMAT, source, road.id, *thing.key), thing.kind, layer, lat, lon,
+            height + options.height_offset_m, options.cov_m2(height_known=known), options.existence(),
+            attributes_of({"road": road.id} | thing.attributes), f"{road.where}, {' '.join(map(str, thing.key))}",
+        )  # fmt: skip
 
 
 def _border_id(source: str, lane: LaneId) -> int:
@@ -121,61 +148,6 @@ def _roads(root: Element, where: str) -> dict[str, Road]:
             f"{where}: lanes of {samples * STEP_M / 1e3:.0f} km, the limit is {MAX_SAMPLES * STEP_M / 1e3:.0f}"
         )
     return roads
-
-
-def _feature(
-    thing: Thing,
-    layer: str,
-    road: Road,
-    source: str,
-    options: ImportOptions,
-    to_earth: ToEarth,
-    *,
-    height_known: bool,
-) -> MapFeature:
-    lat, lon, height = to_earth(thing.points_m)
-    return MapFeature(
-        feature_id_of(FORMAT, source, road.id, *thing.key), thing.kind, layer, lat, lon,
-        height + options.height_offset_m, options.cov_m2(height_known=height_known), options.existence(),
-        attributes_of({"road": road.id} | thing.attributes), f"{road.where}, {' '.join(map(str, thing.key))}",
-    )  # fmt: skip
-
-
-def _to_earth(header: Element, where: str, options: ImportOptions) -> ToEarth:
-    if options.placement is not None:
-        return options.placement.geodetic
-    reference = header.find("geoReference")
-    text = reference.text.strip() if reference else ""
-    if not text:
-        raise NeedsGeoreference(
-            f"{where}: its header has no geoReference; say --georeference LAT,LON[,HEIGHT[,BEARING]]"
-        )
-    return _by_projection(text, header.find("offset"), where)
-
-
-def _by_projection(text: str, offset: Element | None, where: str) -> ToEarth:
-    try:
-        from pyproj import CRS, Transformer
-        from pyproj.exceptions import ProjError
-    except ImportError:
-        raise MissingLibrary(
-            f"{where}: its geoReference {text!r:.80} needs pyproj (pip install 'gnd-fleet[opendrive]'); or say "
-            "--georeference"
-        ) from None
-    try:
-        transformer = Transformer.from_crs(CRS.from_user_input(text), CRS.from_epsg(4326), always_xy=True)
-    except ProjError as error:
-        raise BadElement(f"{where}: geoReference {text!r:.80}: {error}") from None
-    shift = np.array([value(where, offset, key, 0.0) if offset else 0.0 for key in ("x", "y", "z")])
-    turn = value(where, offset, "hdg", 0.0) if offset else 0.0
-    R = np.array([[np.cos(turn), -np.sin(turn), 0.0], [np.sin(turn), np.cos(turn), 0.0], [0.0, 0.0, 1.0]])
-
-    def to_earth(points_m: F64) -> tuple[F64, F64, F64]:
-        east, north, height = (points_m @ R.T + shift).T
-        lon_deg, lat_deg = transformer.transform(east, north)
-        return np.radians(lat_deg), np.radians(lon_deg), height.copy()
-
-    return to_earth
 
 
 def _borders(road: Road) -> Iterator[Thing]:

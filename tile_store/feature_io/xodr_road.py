@@ -25,6 +25,9 @@ from gnd.tile_store.feature_io.xodr_curves import (
 
 _COEFFICIENTS: Final = ("a", "b", "c", "d")
 MAX_ROAD_M: Final = 1_000_000.0
+_SAMPLE_M: Final = 0.5
+_ROUNDS: Final = 20
+"""Of stepping along the road to the foot of a perpendicular: each takes off the curvature times the distance."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -84,6 +87,23 @@ class Road:
         across, up = t_m * np.cos(roll) - up_m * np.sin(roll), t_m * np.sin(roll) + up_m * np.cos(roll)
         z = self.elevation.at(s_m) + up
         return np.column_stack([x - across * np.sin(heading), y + across * np.cos(heading), z])
+
+    def place_of(self, point_m: F64) -> tuple[float, float, float]:
+        """s, t and height above the surface of a point (3,): the inverse of `points_m`, at the nearest place."""
+        samples = np.linspace(0.0, self.length_m, max(2, int(self.length_m / _SAMPLE_M) + 2))
+        x, y, _ = self.plan.at(samples)
+        s = float(samples[np.hypot(x - point_m[0], y - point_m[1]).argmin()])
+        for _ in range(_ROUNDS):
+            off, heading = self._off(s, point_m)
+            s = float(np.clip(s + off @ [np.cos(heading), np.sin(heading)], 0.0, self.length_m))
+        off, heading = self._off(s, point_m)
+        across, at = float(off @ [-np.sin(heading), np.cos(heading)]), np.array([s])
+        up, roll = float(point_m[2] - self.elevation.at(at)[0]), float(self.superelevation.at(at)[0])
+        return s, across * np.cos(roll) + up * np.sin(roll), up * np.cos(roll) - across * np.sin(roll)
+
+    def _off(self, s_m: float, point_m: F64) -> tuple[F64, float]:
+        x, y, heading = self.plan.at(np.array([s_m]))
+        return np.array([point_m[0] - x[0], point_m[1] - y[0]]), float(heading[0])
 
     def heading_rad(self, s_m: float) -> float:
         """Direction of the reference line at a distance."""

@@ -39,7 +39,7 @@ class Thing:
         key: what makes its id.
         points_m: (N, 3) in the file's coordinates.
         attributes: what the file says of it.
-        element: the element that places it alone, when there is one.
+        element: the element that it alone is drawn by; None: one of several copies, or part of the road.
     """
 
     kind: str
@@ -66,7 +66,7 @@ def _signals(road: Road, roads: Mapping[str, Road]) -> Iterator[Thing]:
         key, told = ("signal", _id(road, signal)), _told(signal)
         mark = _MARKS.get(told.get("type", "")) if told.get("country", "").upper() in _MARK_COUNTRIES else None
         if mark == "stop_line":
-            yield Thing(mark, key, _across_m(road, signal), told)
+            yield Thing(mark, key, _across_m(road, signal), told, signal)
         else:
             kind = mark or ("traffic_light" if told.get("dynamic") == "yes" else "traffic_sign")
             yield Thing(kind, key, _signal_m(road, roads, signal), told, signal)
@@ -134,7 +134,7 @@ def _objects(road: Road) -> Iterator[Thing]:
         if not repeats:
             lies = kind in ("crosswalk", "stop_line")
             points_m = _shape_m(road, element, kind) if lies else _place_m(road, element)
-            yield Thing(kind, ("object", name), points_m, _told(element), element if len(points_m) == 1 else None)
+            yield Thing(kind, ("object", name), points_m, _told(element), element)
         for number, repeat in enumerate(repeats):
             for k, (s, t) in enumerate(_repeated(road, repeat)):
                 yield Thing(kind, ("object", name, number, k), _place_m(road, element, s, t), _told(element))
