@@ -115,7 +115,7 @@ def test_features_are_found_by_layer_and_region(store: SqliteStore, tmp_path: Pa
         export_features(store, tmp_path / "x.osm", source="c")
     with pytest.raises(FeatureFileError, match="all layers and regions are written"):
         export_features(store, tmp_path / "x.osm", ["lanes"], source="a")
-    with pytest.raises(FeatureFileError, match="opendrive is read only"):
+    with pytest.raises(FeatureFileError, match="OpenDRIVE is written into the file"):
         export_features(store, tmp_path / "x.xodr")
     with pytest.raises(FeatureFileError, match=r"cannot write: No such file"):
         export_features(store, tmp_path / "none" / "x.geojson")
