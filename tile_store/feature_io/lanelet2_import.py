@@ -90,8 +90,8 @@ def read_lanelet2(
         FeatureFileError: one of its family says what is wrong and where.
     """
     document = read_osm(data, where, progress=progress)
-    drawn, left_out = drawn_features(document, source, options)
     findings = Findings(options.strict)
+    drawn, left_out = drawn_features(document, source, options, findings)
     for one in drawn:
         findings.check_simple(one.feature)
     borders = lanelet_borders(document, places_of(document, options))
@@ -105,9 +105,12 @@ def read_lanelet2(
 
 
 def drawn_features(
-    document: OsmDocument, source: str, options: ImportOptions
+    document: OsmDocument, source: str, options: ImportOptions, findings: Findings | None = None
 ) -> tuple[list[DrawnLane], dict[str, int]]:
-    """The features that elements of a document draw, and how many of which kinds have no layer."""
+    """The features that elements of a document draw, and how many of which kinds have no layer.
+
+    A way without two nodes draws no line: it is left out, and a finding when these are collected.
+    """
     places, borders = places_of(document, options), _borders(document)
     left_out: Counter[str] = Counter()
     found: list[tuple[str, OsmNode | OsmWay, list[OsmNode]]] = []
@@ -119,13 +122,22 @@ def drawn_features(
             found.append((kind, way, document.nodes_of(way)))
     for node in document.nodes.values():
         kind = kind_of(node.tags)
-        if kind is not None:
+        if kind == "lane_boundary":
+            left_out["lane_boundary_node"] += 1  # a vertex that bears the type of its line
+        elif kind is not None:
             found.append((kind, node, [node]))
     drawn = []
     for kind, element, nodes in found:
         layer = options.layer_of(kind)
         if layer == LEFT_OUT:
             left_out[kind] += 1
+        elif len(nodes) < least_nodes(kind, element):
+            left_out["short_way"] += 1
+            if findings:
+                findings.add(
+                    f"{document.where}, line {element.line}: way {element.id} ({kind}) has {len(nodes)} nodes; a line "
+                    f"needs {least_nodes(kind, element)}"
+                )
         else:
             drawn.append(_drawn(document, source, options, places, kind, layer, element, nodes))
     return drawn, dict(sorted(left_out.items()))
@@ -143,14 +155,10 @@ def _drawn(
 ) -> DrawnLane:
     what = "way" if isinstance(element, OsmWay) else "node"
     name = f"{document.where}, line {element.line}: {what} {element.id}"
-    if not nodes:
-        raise BadGeometry(f"{name} ({kind}) has no nodes, so no position")
     rows = places.rows(nodes)
     line = np.column_stack([places.lat_rad[rows], places.lon_rad[rows], places.height_m[rows]])
     if kind in POINT_KINDS:
         line = middle_of(line)[None]
-    elif len(line) < 2:
-        raise BadGeometry(f"{name} ({kind}) has {len(line)} node; a line needs 2")
     feature = MapFeature(
         feature_id_of(FORMAT, source, what, element.id), kind, layer,
         line[:, 0].copy(), line[:, 1].copy(), line[:, 2].copy(),
@@ -158,6 +166,11 @@ def _drawn(
         attributes_of(told_of(element.tags)), name,
     )  # fmt: skip
     return DrawnLane(feature, element, tuple(nodes))
+
+
+def least_nodes(kind: str, element: OsmNode | OsmWay) -> int:
+    """So many nodes draw a feature of a kind."""
+    return 1 if kind in POINT_KINDS or isinstance(element, OsmNode) else 2
 
 
 def middle_of(line: F64) -> F64:

@@ -19,7 +19,7 @@ from gnd.tile_store.feature_io.xodr_road import Road, value
 
 MAX_REPEATS: Final = 100_000
 _PLACE: Final = frozenset({"s", "t", "zOffset", "id"})
-_LAMP: Final = r"(?<!traffic_)(street|road)_?(lamp|light)|lamp_?post|light_?(pole|post|mast)|lantern|^lamp"
+_LAMP: Final = r"(street|road)_?(lamp|light)|lamp_?post|(?<!traffic_)light_?(pole|post|mast)|lantern|^lamp"
 _NAMED: Final = (
     (re.compile(r"stop_?line|halteline|haltlinie"), "stop_line"),
     (re.compile(r"crosswalk|zebra|pedestrian_?crossing|fussgaengerueberweg"), "crosswalk"),
