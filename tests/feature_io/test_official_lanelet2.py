@@ -128,6 +128,28 @@ def test_all_lanes_of_opendrive_are_routable_wherever_they_lie(place: str, store
     assert sum(graph.left(one) is not None or graph.adjacentLeft(one) is not None for one in driven) == 2
 
 
+@pytest.mark.parametrize(
+    ("name", "lanes", "successors"), [("highway_exit", 13, 7), ("lane_sections", 15, 12), ("four_arms", 26, 28)]
+)
+def test_all_lanes_of_another_writer_are_routable(
+    name: str, lanes: int, successors: int, store: SqliteStore, tmp_path: Path
+) -> None:
+    """Of the exit by hand: three lanes each way go on, and the rightmost one forks."""
+    put(store, MAPS / f"{name}.xodr", ANCHOR)
+    exported(store, tmp_path / "new.osm")
+    theirs = official.load(tmp_path / "new.osm", 35.9, 139.9)
+    left, right = neighbours(sources_of(store)[f"{name}.xodr"].lanes)
+    expected = {
+        one.key: official.Expected(frozenset(one.successors), left.get(one.key), right.get(one.key))
+        for one in sources_of(store)[f"{name}.xodr"].lanes
+    }
+    assert (len(expected), sum(len(one.successors) for one in expected.values())) == (lanes, successors)
+    assert theirs.errors == []
+    assert official.not_routable(theirs, expected) == []
+    graph = theirs.graphs["Vehicle"][1]
+    assert sum(len(graph.following(one)) for one in theirs.map.laneletLayer) == successors
+
+
 def test_a_lane_drawn_apart_from_its_successor_is_not_routable_and_said(store: SqliteStore, tmp_path: Path) -> None:
     """Road 5 lies 2 m higher in y than the road that it goes on from."""
     head, start, rest = (MAPS / "town.xodr").read_text().partition('<road id="5"')

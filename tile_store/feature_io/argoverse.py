@@ -202,7 +202,7 @@ def _lanes(told: Any, where: str, source: str, borders: _Borders) -> tuple[MapLa
         subtype = _SUBTYPES.get(as_text(lane.get("lane_type", "")), "road")
         place = {"location": "urban", "one_way": "yes", "source_lane": key, "subtype": subtype}
         turn = {"intersection": "yes"} if lane.get("is_intersection") else {}
-        lanes.append(MapLane(key, *sides, successors, tuple(sorted((place | turn).items()))))
+        lanes.append(MapLane(key, sides[0], sides[1], successors, tuple(sorted((place | turn).items()))))
     return tuple(lanes)
 
 

@@ -122,7 +122,7 @@ def _apart_m(a: F64, b: F64) -> float:
 def _middle(places: F64) -> F64:
     """(3,) the mean of near positions (N, 3); the position itself when all are one."""
     if (places == places[0]).all():
-        return places[0]
+        return np.asarray(places[0])
     frame = _frame(places[0])
     mean = frame.enu_from_geodetic(*places.T).mean(axis=0)
     return np.array([column[0] for column in frame.geodetic_from_enu(mean[None])])

@@ -157,8 +157,9 @@ class _XodrEditing:
         """The file's new bytes."""
         for (road_id, name), lines in self._new.items():
             self._append(self._file.roads[road_id].element, name, b"".join(b"\n" + line for line in lines))
-        counts = (self._counts[key] for key in ("moved", "retagged", "removed", "added"))
-        return self._edits.applied(self._data), Changes(*counts, unwritten=self._counts["unwritten"])
+        n = self._counts
+        changes = Changes(n["moved"], n["retagged"], n["removed"], n["added"], unwritten=n["unwritten"])
+        return self._edits.applied(self._data), changes
 
     def _append(self, road: Element, name: str, lines: bytes) -> None:
         """Elements at the end of a road's <objects> or <signals>, which are made when missing."""

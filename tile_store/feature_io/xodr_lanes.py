@@ -79,13 +79,13 @@ def _lane(
     road: Road, key: LaneId, lane: XodrLane, border_id: Callable[[LaneId], int], following: list[LaneId], *, ahead: bool
 ) -> MapLane:
     inner = lane.id - (1 if lane.id > 0 else -1)
-    left, right = sorted((lane.id, inner), reverse=ahead)  # greater ids lie to the left of smaller ones along s
-    borders = (Border(border_id((*key[:2], id_)), ahead) for id_ in (left, right))
+    ids = sorted((lane.id, inner), reverse=ahead)  # greater ids lie to the left of smaller ones along s
+    left, right = (Border(border_id((*key[:2], id_)), ahead) for id_ in ids)
     tags = {"location": "urban", "source_lane": _name(key), "subtype": SUBTYPE_OF_TYPE[lane.type]}
     tags["one_way"] = "no" if lane.type in ("bidirectional", "sidewalk", "walking") else "yes"
     speed = lane.speed or next(filter(None, (speed_of(road.where, one) for one in road.element.all("type"))), "")
     tags |= {"speed_limit": speed} if speed else {}
-    return MapLane(_name(key), *borders, tuple(map(_name, following)), tuple(sorted(tags.items())))
+    return MapLane(_name(key), left, right, tuple(map(_name, following)), tuple(sorted(tags.items())))
 
 
 def _name(key: LaneId) -> str:
