@@ -7,7 +7,8 @@ from hypothesis import strategies as st
 
 from gnd.gnd_map.geodesy import LocalFrame
 from gnd.tile_store.feature_io.lane_crossing import crossing_of
-from gnd.tile_store.feature_io.lanelet2_import import directions, middle_of, read_lanelet2
+from gnd.tile_store.feature_io.lanelet2_borders import directions
+from gnd.tile_store.feature_io.lanelet2_import import middle_of, read_lanelet2
 from gnd.tile_store.feature_io.values import FeatureFile, ImportOptions
 
 PLACES = [(37.77, -122.42), (35.68, 139.76), (-33.86, 151.2), (-16.8, 180.0), (64.1, -21.9), (0.0, 0.0)]

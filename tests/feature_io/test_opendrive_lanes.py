@@ -174,6 +174,9 @@ FURNITURE = """<objects>
 <object id="2" type="pole" name="Street Light 04" s="6" t="-5"/>
 <object id="3" type="pole" name="lamp_post" s="7" t="-5"/>
 <object id="4" type="pole" name="traffic_light_pole" s="8" t="-5"/>
+<object id="10" type="pole" name="PoleLamp" s="9" t="-5"/>
+<object id="11" type="none" name="Straßenlaterne" s="10" t="-5"/>
+<object id="12" type="pole" name="SignalLight" s="11" t="-5"/>
 <object id="5" type="none" name="Crosswalk" s="50" t="0" hdg="1.5707963267948966" length="7" width="3"/>
 <object id="6" type="crosswalk" s="60" t="0"><outline><cornerLocal u="-2" v="-3"/><cornerLocal u="2" v="-3"/>
 <cornerLocal u="2" v="3"/><cornerLocal u="-2" v="3"/></outline></object>
@@ -196,7 +199,8 @@ def test_lamps_crosswalks_and_stop_lines_however_they_are_written() -> None:
     assert kinds == {
         "object 1": "streetlight", "object 2": "streetlight", "object 3": "streetlight", "object 4": "pole",
         "object 5": "crosswalk", "object 6": "crosswalk", "object 7": "crosswalk", "object 8": "stop_line",
-        "object 9": "stop_line", "signal 20": "stop_line", "signal 21": "stop_line", "signal 22": "stop_line",
+        "object 9": "stop_line", "object 10": "streetlight", "object 11": "streetlight", "object 12": "pole",
+        "signal 20": "stop_line", "signal 21": "stop_line", "signal 22": "stop_line",
         "signal 23": "traffic_sign",
     }  # fmt: skip
     assert found.left_out == {}

@@ -14,8 +14,9 @@ import numpy as np
 from gnd.gnd_map.arrays import F64
 from gnd.gnd_map.geodesy import meridian_radius_m, normal_radius_m
 from gnd.tile_store.feature_io.lane_network import MapLane
-from gnd.tile_store.feature_io.lanelet2_import import DrawnLane, NodePlaces, drawn_features, places_of
+from gnd.tile_store.feature_io.lanelet2_import import DrawnLane, drawn_features
 from gnd.tile_store.feature_io.lanelet2_lanes import JoinedEnds, joined_ends, line_tags
+from gnd.tile_store.feature_io.lanelet2_places import NodePlaces, places_of
 from gnd.tile_store.feature_io.osm_document import OsmDocument, OsmNode, OsmWay, read_osm
 from gnd.tile_store.feature_io.osm_edit import (
     Edits,

@@ -155,7 +155,7 @@ class _XodrEditing:
 
     def finish(self) -> tuple[bytes, Changes]:
         """The file's new bytes."""
-        for (road_id, name), lines in self._new.items():
+        for (road_id, name), lines in sorted(self._new.items()):  # objects come before signals
             self._append(self._file.roads[road_id].element, name, b"".join(b"\n" + line for line in lines))
         n = self._counts
         changes = Changes(n["moved"], n["retagged"], n["removed"], n["added"], unwritten=n["unwritten"])
@@ -165,8 +165,8 @@ class _XodrEditing:
         """Elements at the end of a road's <objects> or <signals>, which are made when missing."""
         parent = road.find(name)
         if parent is None:
-            order = ("lanes", "objects") if name == "signals" else ("lanes",)
-            after = next(found for one in reversed(order) if (found := road.find(one)) is not None)
+            before = ("planView", "lanes", "objects") if name == "signals" else ("planView", "lanes")
+            after = [found for one in before if (found := road.find(one)) is not None][-1]
             whole = b"\n<%s>%s\n</%s>" % (name.encode(), lines, name.encode())
             self._edits.replace(after.end, after.end, whole)
         elif self._data[parent.end - 2 : parent.end] == b"/>":

@@ -19,13 +19,19 @@ from gnd.tile_store.feature_io.xodr_road import Road, value
 
 MAX_REPEATS: Final = 100_000
 _PLACE: Final = frozenset({"s", "t", "zOffset", "id"})
-_LAMP: Final = r"(street|road)_?(lamp|light)|lamp_?post|(?<!traffic_)light_?(pole|post|mast)|lantern|^lamp"
 _NAMED: Final = (
-    (re.compile(r"stop_?line|halteline|haltlinie"), "stop_line"),
-    (re.compile(r"crosswalk|zebra|pedestrian_?crossing|fussgaengerueberweg"), "crosswalk"),
-    (re.compile(_LAMP), "streetlight"),
+    (re.compile(r"stop_?line|halte?linie"), "stop_line"),
+    (re.compile(r"cross_?walk|zebra|pedestrian_?crossing|fu(ß|ss)g(ä|ae)nger(ü|ue)berweg"), "crosswalk"),
+    (
+        re.compile(
+            r"(^|_|street|road)lamp|(street|road|pole)_?light|light_?(pole|post|mast)|^lights?(_?\d+)?$|lantern|luminaire"
+            r"|laterne|leuchte"
+        ),
+        "streetlight",
+    ),
 )
 """Words in type, subtype and name that say what an object is, whatever its type."""
+_TRAFFIC: Final = re.compile(r"traffic|signal")
 _MARKS: Final = {"294": "stop_line", "293": "crosswalk"}
 _MARK_COUNTRIES: Final = frozenset({"", "-1", "DE", "DEU", "OPENDRIVE"})
 
@@ -144,7 +150,7 @@ def object_kind(element: Element) -> str:
     """What an object is: by its type, or by words of its subtype or name."""
     words = [_snake(element.attributes.get(key, "")) for key in ("type", "subtype", "name")]
     for pattern, kind in _NAMED:
-        if any(pattern.search(word) for word in words):
+        if any(pattern.search(word) and not _TRAFFIC.search(word) for word in words):
             return kind
     return words[0] if KIND_PATTERN.fullmatch(words[0]) else "unknown"
 
