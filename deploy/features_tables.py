@@ -44,8 +44,8 @@ def print_export(console: Console, result: FeaturesExported) -> None:
     changes = result.changes
     if changes is not None and changes.lanelets:
         console.print(
-            f"{changes.lanelets} lanelets; {changes.apart} successors too far apart to be joined, {changes.unbounded} "
-            "lanes left out without a border",
+            f"{changes.lanelets} lanelets; ends joined over {changes.joined_m:.3f} m at most, {changes.apart} "
+            f"successors too far apart, {changes.unbounded} lanes left out without a border",
             highlight=False,
         )
     if result.source is not None and changes is not None:

@@ -4,11 +4,15 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from scipy.sparse import coo_matrix
+from scipy.sparse.csgraph import connected_components
 
 from gnd.gnd_map.geodesy import LocalFrame
 from gnd.tile_store.feature_io.lane_crossing import crossing_of
+from gnd.tile_store.feature_io.lane_network import Border, MapLane
 from gnd.tile_store.feature_io.lanelet2_borders import directions
 from gnd.tile_store.feature_io.lanelet2_import import middle_of, read_lanelet2
+from gnd.tile_store.feature_io.lanelet2_lanes import JOIN_M, joined_ends
 from gnd.tile_store.feature_io.values import FeatureFile, ImportOptions
 
 PLACES = [(37.77, -122.42), (35.68, 139.76), (-33.86, 151.2), (-16.8, 180.0), (64.1, -21.9), (0.0, 0.0)]
@@ -133,3 +137,52 @@ def test_direction_of_a_turn_back() -> None:
     left, right = (r * np.column_stack([np.sin(angle), 1 - np.cos(angle)]) for r in (1.0, 6.0))
     assert directions(left, right - [0, 5]) == (True, True)
     assert directions(left[::-1], right - [0, 5]) == (False, True)
+
+
+@st.composite
+def networks(draw: st.DrawFn) -> tuple[list[MapLane], dict[int, np.ndarray]]:
+    """Lanes whose borders begin and end near the points of a lattice, and who follows whom, near or not."""
+    n = draw(st.integers(1, 6))
+    places = st.tuples(st.integers(0, 2), st.floats(-0.3, 0.3))
+    lines, lanes = {}, []
+    for lane_id in range(n):
+        sides = []
+        for side in (0, 1):
+            ends = [draw(places) for _ in range(2)]
+            m = np.array([[10.0 * at + off, 3.0 * side] for at, off in ends])
+            lines[2 * lane_id + side] = np.column_stack([0.5 + m[:, 1] / 6.4e6, 0.2 + m[:, 0] / 5.6e6, np.zeros(2)])
+            sides.append(Border(2 * lane_id + side, draw(st.booleans())))
+        following = draw(st.lists(st.integers(0, n - 1), max_size=2, unique=True))
+        lanes.append(MapLane(str(lane_id), sides[0], sides[1], tuple(map(str, following)), ()))
+    return lanes, lines
+
+
+@settings(max_examples=200, deadline=None)
+@given(networks())
+def test_ends_are_one_node_when_a_chain_of_near_successors_joins_them(
+    network: tuple[list[MapLane], dict[int, np.ndarray]],
+) -> None:
+    """Against the connected components of scipy."""
+    lanes, lines = network
+    found = joined_ends(lanes, lines)
+    number = {(line, which): 2 * k + (which == -1) for k, line in enumerate(lines) for which in (0, -1)}
+    rows, apart = [], 0
+    for lane in lanes:
+        for key in lane.successors:
+            pairs, far = [], 0.0
+            for before, after in ((lane.left, lanes[int(key)].left), (lane.right, lanes[int(key)].right)):
+                a = before.feature_id, -1 if before.ahead else 0
+                b = after.feature_id, 0 if after.ahead else -1
+                pairs.append((number[a], number[b]))
+                frame = LocalFrame(*lines[a[0]][a[1]])
+                far = max(far, float(np.linalg.norm(frame.enu_from_geodetic(*lines[b[0]][b[1]]).reshape(3)[:2])))
+            rows += pairs if far <= JOIN_M else []
+            apart += far > JOIN_M
+    edges = np.array(rows or [(0, 0)]).T
+    _, label = connected_components(coo_matrix((np.ones(edges.shape[1]), edges), (len(number), len(number))), False)
+    assert (len(found.apart), found.joined) == (apart, len(rows) // 2)
+    used = {k for pair in rows for k in pair}
+    assert {number[end] for end in found.group} == used
+    for one, a in found.group.items():
+        for other, b in found.group.items():
+            assert (a == b) == (label[number[one]] == label[number[other]])

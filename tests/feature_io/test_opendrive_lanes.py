@@ -236,6 +236,18 @@ def test_a_new_lanelet2_file_is_read_back_with_the_same_kinds(store: SqliteStore
     assert (len(back.lanes), back.kept) == (3, {"lanelet": 3})
 
 
+def test_a_section_without_a_centre_lane_has_one() -> None:
+    lanes = section(0, lane(1), lane(-1)).replace('<center><lane id="0" type="none"/></center>', "")
+    found = read(xodr(road("", lanes=lanes)))
+    assert (found.layers, len(found.lanes)) == ({"lanes": 3}, 2)
+
+
+def test_a_stop_line_for_more_lanes_than_there_are_ends_at_the_last() -> None:
+    signal = '<signal id="1" s="30" t="-2" type="294"><validity fromLane="-9" toLane="-1"/></signal>'
+    found = read(xodr(road(f"<signals>{signal}</signals>", lanes=section(0, lane(1), lane(-1)))))
+    np.testing.assert_allclose(in_file(found, "stop_line")[:, :2], [[30, -3.5], [30, 0]], atol=1e-6)
+
+
 def test_lanes_that_name_what_is_not_there_are_refused() -> None:
     one = MapLane("a", Border(1, True), Border(2, True), (), ())
     check_lanes([one], [1, 2])

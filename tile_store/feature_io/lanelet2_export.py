@@ -13,11 +13,12 @@ import numpy as np
 
 from gnd.gnd_map.arrays import F64
 from gnd.gnd_map.geodesy import meridian_radius_m, normal_radius_m
+from gnd.tile_store.feature_io.errors import FeatureFileError
 from gnd.tile_store.feature_io.lane_network import MapLane
 from gnd.tile_store.feature_io.lanelet2_import import DrawnLane, drawn_features
 from gnd.tile_store.feature_io.lanelet2_lanes import JoinedEnds, joined_ends, line_tags
 from gnd.tile_store.feature_io.lanelet2_places import NodePlaces, places_of
-from gnd.tile_store.feature_io.osm_document import OsmDocument, OsmNode, OsmWay, read_osm
+from gnd.tile_store.feature_io.osm_document import MAX_ID, OsmDocument, OsmNode, OsmWay, read_osm
 from gnd.tile_store.feature_io.osm_edit import (
     Edits,
     degrees,
@@ -43,11 +44,18 @@ KEEP_WITHIN_M: Final = 0.002
 
 @dataclass(frozen=True, slots=True)
 class Changes:
-    """What an export changed in the file: elements.
+    """What an export changed in the file.
 
-    lanelets: added with the lines; apart: successors of lanes whose borders end too far from each other to be joined;
-    unbounded: lanes that were left out because a border of theirs has gone; unwritten: features that have changed in a
-    way that the format cannot say, so that they are as they were.
+    Attributes:
+        moved: elements that lie elsewhere.
+        retagged: elements with other attributes or tags.
+        removed: elements that are gone.
+        added: features that are new.
+        lanelets: added with the lines between which they run.
+        joined_m: the farthest that an end of a border was moved to meet the next one.
+        apart: successors of lanes whose borders end too far from each other to be joined.
+        unbounded: lanes that were left out because a border of theirs is not among the features.
+        unwritten: features that have changed in a way that the format cannot say, so that they are as they were.
     """
 
     moved: int
@@ -55,6 +63,7 @@ class Changes:
     removed: int
     added: int
     lanelets: int = 0
+    joined_m: float = 0.0
     apart: int = 0
     unbounded: int = 0
     unwritten: int = 0
@@ -110,6 +119,7 @@ class _Editing:
         self._new_ways: list[bytes] = []
         self._new_relations: list[bytes] = []
         self._apart = self._unbounded = 0
+        self._joined_m = 0.0
         self._next_id = document.highest_id + 1
         self._added = 0
         self._in_ways = {ref for way in document.ways.values() for ref in way.nodes}
@@ -166,7 +176,7 @@ class _Editing:
             members = (("way", ways[lane.left.feature_id], "left"), ("way", ways[lane.right.feature_id], "right"))
             tags = {"type": "lanelet"} | dict(lane.tags)
             self._new_relations.append(relation_lines(self._new_id(), members, tags))
-        self._apart, self._unbounded = len(ends.apart), len(lanes) - len(bounded)
+        self._apart, self._unbounded, self._joined_m = len(ends.apart), len(lanes) - len(bounded), ends.moved_m
 
     def _add(self, feature: MapFeature, ends: JoinedEnds, shared: Mapping[int, int]) -> int:
         """The id of the new element; ends of borders that meet are one node."""
@@ -185,6 +195,8 @@ class _Editing:
 
     def _new_id(self) -> int:
         self._next_id += 1
+        if self._next_id > MAX_ID:
+            raise FeatureFileError(f"{self._document.where}: its ids leave none for new elements below 2^63")
         return self._next_id - 1
 
     def _node(self, place: F64, tags: Mapping[str, str]) -> int:
@@ -219,8 +231,9 @@ class _Editing:
                 edits.replace(self._document.end_of_ways, self._document.end_of_ways, b"".join(new))
         moved = len(self._moved) + len(self._refs)
         return edits.applied(data), Changes(
-            moved, len(self._tags), removed, self._added, len(self._new_relations), self._apart, self._unbounded
-        )
+            moved, len(self._tags), removed, self._added,
+            len(self._new_relations), round(self._joined_m, 4), self._apart, self._unbounded,
+        )  # fmt: skip
 
     def _values(self) -> dict[tuple[str, int], tuple[dict[str, str], dict[str, str | None]]]:
         """Attributes and tags to write, by element."""

@@ -44,12 +44,14 @@ class JoinedEnds:
         group: of every joined end the number of its node.
         place: of every number latitude, longitude (radians) and height, (3,).
         joined: successors that are drawn together.
+        moved_m: the farthest that an end lies from its node.
         apart: (lane, successor, distance in metres) of those that are too far apart.
     """
 
     group: dict[End, int] = field(default_factory=dict)
     place: dict[int, F64] = field(default_factory=dict)
     joined: int = 0
+    moved_m: float = 0.0
     apart: list[tuple[str, str, float]] = field(default_factory=list)
 
 
@@ -79,7 +81,9 @@ def joined_ends(lanes: Iterable[MapLane], lines: Mapping[int, F64]) -> JoinedEnd
                 parent.unite(a, b)
     for number, members in enumerate(parent.groups()):
         found.group.update(dict.fromkeys(members, number))
-        found.place[number] = _middle(np.array([lines[feature_id][which] for feature_id, which in members]))
+        places = [lines[feature_id][which] for feature_id, which in members]
+        found.place[number] = _middle(np.array(places))
+        found.moved_m = max(found.moved_m, *(_apart_m(found.place[number], place) for place in places))
     return found
 
 

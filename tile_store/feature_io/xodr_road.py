@@ -110,10 +110,16 @@ class Road:
         return float(self.plan.at(np.array([s_m]))[2][0])
 
     def lane_t_m(self, s_m: float, lane_id: int) -> float:
-        """Lateral place of the outer border of a lane (0: of the lane reference) at a distance."""
+        """Lateral place of the outer border of a lane (0: of the lane reference) at a distance; of the last lane there
+        is on that side when there are fewer.
+        """
         section = next((one for one in reversed(self.sections) if one.start_m <= s_m), None)
         offset_m = float(self.lane_offset.at(np.array([s_m]))[0])
-        return offset_m if section is None else offset_m + float(section.border_m(lane_id, np.array([s_m]))[0])
+        if section is None:
+            return offset_m
+        while lane_id not in section.lanes and lane_id:
+            lane_id -= 1 if lane_id > 0 else -1
+        return offset_m + float(section.border_m(lane_id, np.array([s_m]))[0])
 
 
 def road_of(element: Element, where: str) -> Road:
@@ -199,6 +205,9 @@ def _lanes(where: str, section: Element) -> dict[int, XodrLane]:
             if lane.id in found:
                 raise BadElement(f"{where}, line {element.line}: lane {lane.id} comes twice in a section")
             found[lane.id] = lane
+    if found and 0 not in found:  # required by the standard, and left out by some writers
+        empty = profile(where, None, "width", "sOffset")
+        found[0] = XodrLane(0, "none", empty, None, "none", "", "", False, (), ())
     for sign in (1, -1):
         ids = sorted(abs(id_) for id_ in found if id_ * sign > 0)
         if ids != list(range(1, len(ids) + 1)):
