@@ -52,13 +52,13 @@ class MapLane:
         return [self.key, *sides, list(self.successors), dict(self.tags)]
 
 
-def lane_of(told: Sequence[Any]) -> MapLane:
+def lane_of(values: Sequence[Any]) -> MapLane:
     """The lane that `MapLane.as_list` gave; FeatureFileError when it is none."""
     try:
-        key, left, right, successors, tags = told
+        key, left, right, successors, tags = values
         borders = [Border(int(side[0]), bool(side[1])) for side in (left, right)]
-        following, told_tags = tuple(map(str, successors)), tuple(sorted(tags.items()))
-        return MapLane(str(key), borders[0], borders[1], following, told_tags)
+        keys, pairs = tuple(map(str, successors)), tuple(sorted(tags.items()))
+        return MapLane(str(key), borders[0], borders[1], keys, pairs)
     except (TypeError, ValueError, AttributeError, IndexError) as error:
         raise FeatureFileError(f"no lane: {type(error).__name__}: {error}") from None
 

@@ -131,11 +131,11 @@ class _XodrEditing:
             return
         road = self._road_near(points_m.mean(axis=0))
         self._counts["added"] += 1
-        told = dict(feature.attributes)
+        own = dict(feature.attributes)
         attributes = {"id": f"gnd{feature.feature_id}", **_placed(road.place_of(points_m[0]))}
         if feature.kind in _SIGNALS:
             attributes |= {"dynamic": _SIGNALS[feature.kind], "orientation": "none"}
-            attributes |= {key: told.get(key, "-1") for key in ("type", "subtype", "country")}
+            attributes |= {key: own.get(key, "-1") for key in ("type", "subtype", "country")}
             self._new[(road.id, "signals")].append(b"<signal%s/>" % _attributes(attributes))
             return
         attributes |= {"name": feature.kind} | _OBJECTS.get(feature.kind, {"type": feature.kind})

@@ -93,7 +93,7 @@ def _name(key: LaneId) -> str:
 
 
 def _joints(roads: Mapping[str, Road], junctions: list[Element]) -> Iterator[tuple[LaneEnd, LaneEnd]]:
-    """Ends of lanes that meet, as lanes, roads and junctions say it; most are said twice."""
+    """Ends of lanes that meet, as lanes, roads and junctions state it; most are stated twice."""
     for road in roads.values():
         for number, section in enumerate(road.sections):
             for lane in section.lanes.values():
@@ -113,7 +113,7 @@ def _beyond(roads: Mapping[str, Road], road: Road, number: int, end: str) -> tup
         return (road.id, beside), _OTHER[end]
     link = _road_link(road, end)
     if link is None or link.attributes.get("elementType", "road") != "road":
-        return None  # a junction says itself which lanes meet
+        return None  # which lanes meet at a junction is listed there
     other = roads.get(link.attributes.get("elementId", ""))
     contact = link.attributes.get("contactPoint", "")
     return None if other is None or not other.sections or contact not in _OTHER else _at(other, contact)
@@ -130,10 +130,10 @@ def _road_link(road: Road, end: str) -> Element | None:
 
 def _junction_joints(roads: Mapping[str, Road], junction: Element) -> Iterator[tuple[LaneEnd, LaneEnd]]:
     for connection in junction.all("connection"):
-        told = connection.attributes
-        incoming = roads.get(told.get("incomingRoad", ""))
-        other = roads.get(told.get("connectingRoad", told.get("linkedRoad", "")))
-        contact = told.get("contactPoint", "start")
+        attributes = connection.attributes
+        incoming = roads.get(attributes.get("incomingRoad", ""))
+        other = roads.get(attributes.get("connectingRoad", attributes.get("linkedRoad", "")))
+        contact = attributes.get("contactPoint", "start")
         if incoming is None or other is None or contact not in _OTHER or not (incoming.sections and other.sections):
             continue
         end = _end_at_junction(incoming, other, contact, junction.attributes.get("id", ""))
@@ -147,12 +147,12 @@ def _junction_joints(roads: Mapping[str, Road], junction: Element) -> Iterator[t
 
 
 def _end_at_junction(incoming: Road, other: Road, contact: str, junction: str) -> str | None:
-    """Which end of the incoming road the connection leaves: as the connecting road says, or the road itself."""
+    """Which end of the incoming road the connection leaves: by the link of the connecting road, or by its own."""
     link = _road_link(other, contact)
     if link is not None and link.attributes.get("elementId") == incoming.id:
-        said = link.attributes.get("contactPoint", "")
-        if said in _OTHER:
-            return said
+        end = link.attributes.get("contactPoint", "")
+        if end in _OTHER:
+            return end
     ends = [
         end
         for end in _OTHER

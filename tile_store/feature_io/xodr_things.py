@@ -44,7 +44,7 @@ class Thing:
         kind: of feature.
         key: what makes its id.
         points_m: (N, 3) in the file's coordinates.
-        attributes: what the file says of it.
+        attributes: the element's own, without those of its place.
         element: the element that it alone is drawn by; None: one of several copies, or part of the road.
     """
 
@@ -69,13 +69,15 @@ def things_of(road: Road, roads: Mapping[str, Road]) -> Iterator[Thing]:
 def _signals(road: Road, roads: Mapping[str, Road]) -> Iterator[Thing]:
     parent = road.element.find("signals")
     for signal in parent.all("signal") if parent else ():
-        key, told = ("signal", _id(road, signal)), _told(signal)
-        mark = _MARKS.get(told.get("type", "")) if told.get("country", "").upper() in _MARK_COUNTRIES else None
+        key, attributes = ("signal", _id(road, signal)), _attributes(signal)
+        mark = (
+            _MARKS.get(attributes.get("type", "")) if attributes.get("country", "").upper() in _MARK_COUNTRIES else None
+        )
         if mark == "stop_line":
-            yield Thing(mark, key, _across_m(road, signal), told, signal)
+            yield Thing(mark, key, _across_m(road, signal), attributes, signal)
         else:
-            kind = mark or ("traffic_light" if told.get("dynamic") == "yes" else "traffic_sign")
-            yield Thing(kind, key, _signal_m(road, roads, signal), told, signal)
+            kind = mark or ("traffic_light" if attributes.get("dynamic") == "yes" else "traffic_sign")
+            yield Thing(kind, key, _signal_m(road, roads, signal), attributes, signal)
 
 
 def _signal_m(road: Road, roads: Mapping[str, Road], signal: Element) -> F64:
@@ -84,15 +86,17 @@ def _signal_m(road: Road, roads: Mapping[str, Road], signal: Element) -> F64:
     if inertial is not None:
         return np.array([[value(road.where, inertial, key) for key in "xyz"]])
     if other is not None:
-        told = other.attributes.get("roadId", "")
-        if told not in roads:
-            raise BadElement(f"{road.where}, line {other.line}: stands at road {told!r:.40}, which is not in the file")
-        return _place_m(roads[told], other)
+        road_id = other.attributes.get("roadId", "")
+        if road_id not in roads:
+            raise BadElement(
+                f"{road.where}, line {other.line}: stands at road {road_id!r:.40}, which is not in the file"
+            )
+        return _place_m(roads[road_id], other)
     return _place_m(road, signal)
 
 
 def _across_m(road: Road, signal: Element) -> F64:
-    """(2, 3) a stop line that is told as a signal: across the lanes that it holds for."""
+    """(2, 3) a stop line that is written as a signal: across the lanes that it holds for."""
     s = value(road.where, signal, "s")
     _place_m(road, signal)  # it is on its road
     validity = signal.find("validity")
@@ -140,10 +144,10 @@ def _objects(road: Road) -> Iterator[Thing]:
         if not repeats:
             lies = kind in ("crosswalk", "stop_line")
             points_m = _shape_m(road, element, kind) if lies else _place_m(road, element)
-            yield Thing(kind, ("object", name), points_m, _told(element), element)
+            yield Thing(kind, ("object", name), points_m, _attributes(element), element)
         for number, repeat in enumerate(repeats):
             for k, (s, t) in enumerate(_repeated(road, repeat)):
-                yield Thing(kind, ("object", name, number, k), _place_m(road, element, s, t), _told(element))
+                yield Thing(kind, ("object", name, number, k), _place_m(road, element, s, t), _attributes(element))
 
 
 def object_kind(element: Element) -> str:
@@ -236,5 +240,5 @@ def _id(road: Road, element: Element) -> str:
     return found
 
 
-def _told(element: Element) -> dict[str, str]:
+def _attributes(element: Element) -> dict[str, str]:
     return {key: text for key, text in element.attributes.items() if key not in _PLACE}
