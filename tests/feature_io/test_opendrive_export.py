@@ -14,9 +14,10 @@ from test_opendrive_import import ARC, HEADER, OBJECTS, SECOND, SIGNALS, SPIRAL,
 from gnd.gnd_map.geodesy import LocalFrame
 from gnd.tile_store.feature_io.errors import FeatureFileError
 from gnd.tile_store.feature_io.formats import export_features
+from gnd.tile_store.feature_io.geojson_export import write_geojson
 from gnd.tile_store.feature_io.opendrive_export import write_opendrive
 from gnd.tile_store.feature_io.opendrive_import import read_opendrive
-from gnd.tile_store.feature_io.stored import load_features
+from gnd.tile_store.feature_io.stored import load_features, sources_of
 from gnd.tile_store.feature_io.values import ImportOptions, MapFeature
 from gnd.tile_store.feature_io.xml_spans import read_root
 from gnd.tile_store.feature_io.xodr_road import road_of
@@ -116,6 +117,31 @@ def test_new_features_stand_at_the_nearest_road() -> None:
         assert np.abs(back[key].enu_m(FRAME) - new.enu_m(FRAME)).max() < 1e-3
 
 
+LYING = """<objects>
+<object id="1" type="crosswalk" s="20" t="0" hdg="0.3" length="3" width="7"/>
+<object id="2" type="crosswalk" s="30" t="1"><outline><cornerLocal u="-2" v="-3"/><cornerLocal u="2" v="-3"/>
+<cornerLocal u="2" v="3"/></outline></object>
+<object id="3" type="crosswalk" s="40" t="0"><outlines><outline><cornerRoad s="40" t="-3"/><cornerRoad s="44" t="-3"/>
+<cornerRoad s="44" t="3"/></outline></outlines></object>
+<object id="4" type="roadMark" subtype="stopLine" s="50" t="-1.75" length="0.4" width="3.5"/>
+</objects><signals><signal id="5" s="60" t="-2" type="294" width="3"/></signals>"""
+
+
+def test_what_lies_on_a_bend_moves_without_turning() -> None:
+    """Outlines in the object's own frame and on the road; a stop line that is a signal lies across its lanes only."""
+    data = xodr(road(LYING, ARC, length=78.5398))
+    was = read(data)
+    lying = {key: one for key, one in was.items() if key[1] in ("object", "signal")}
+    features = [moved(one, 2.0, 3.0) if key in lying else one for key, one in was.items()]
+    back, changes = write_opendrive(features, data, "r", ImportOptions())
+    assert (changes.moved, changes.unwritten, changes.removed, changes.added) == (4, 1, 0, 0)
+    again = read(back)
+    for key, one in lying.items():
+        step = again[key].enu_m(FRAME) - one.enu_m(FRAME)
+        expected = [2.0, 3.0] if key[1] == "object" else [0.0, 0.0]
+        assert np.abs(step[:, :2] - expected).max() < 2e-3
+
+
 def test_a_store_without_an_opendrive_file_has_no_road_network_to_write(store: SqliteStore, tmp_path: Path) -> None:
     put(store, write(tmp_path, "s.osm", '<osm><node id="1" lat="48" lon="8"><tag k="type" v="pole"/></node></osm>'))
     assert len(load_features(store)) == 1
@@ -138,3 +164,32 @@ def test_a_place_on_a_road_is_found_again(plan: str, share: float, t: float, up:
     point = one.points_m(np.array([share * length]), np.array([t]), up)[0]
     s_t_up = one.place_of(point)
     np.testing.assert_allclose(s_t_up, [share * length, t, up], atol=1e-5)
+
+
+def test_lanes_follow_features_that_an_editor_has_moved_or_removed(store: SqliteStore, tmp_path: Path) -> None:
+    """The town as GeoJSON with all of it moved by 1 m and a border taken out, imported under the town's name."""
+    put(store, write(tmp_path, "town.xodr", (MAPS / "town.xodr").read_bytes()))
+    gone = next(one for one in load_features(store, ["lanes"]) if dict(one.attributes).get("lane") == "0")
+    features = [one for one in load_features(store) if one.feature_id != gone.feature_id]
+    frame = LocalFrame(np.radians(37.77), np.radians(-122.42), 0.0)
+    shifted = []
+    for one in features:
+        lat, lon, height = frame.geodetic_from_enu(one.enu_m(frame) + np.array([1.0, 0.0, 0.0]))
+        shifted.append(replace(one, lat_rad=lat, lon_rad=lon, height_m=height))
+    put(store, write(tmp_path, "edited.geojson", write_geojson(shifted)), source="town.xodr")
+    lanes = sources_of(store)["town.xodr"].lanes
+    used = [one for one in lanes if gone.feature_id in (one.left.feature_id, one.right.feature_id)]
+    changes = export_features(store, tmp_path / "new.osm").changes
+    assert changes is not None
+    assert len(used) in (1, 2)
+    assert (changes.lanelets, changes.unbounded) == (32 - len(used), len(used))
+    assert changes.joined_m < 2e-3
+    back = export_features(store, tmp_path / "back.xodr").changes
+    assert back is not None
+    things = sum(one.kind != "lane_boundary" for one in features)
+    assert (back.moved, back.removed, back.added, back.unwritten) == (things, 0, 0, 58 - things)
+    again = read_opendrive((tmp_path / "back.xodr").read_bytes(), "b", "town.xodr", ImportOptions()).features
+    by_id = {one.feature_id: one for one in again}
+    for one in shifted:
+        if one.kind != "lane_boundary":
+            assert np.abs(by_id[one.feature_id].enu_m(frame) - one.enu_m(frame))[:, :2].max() < 2e-3

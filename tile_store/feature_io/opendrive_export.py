@@ -29,6 +29,7 @@ _OBJECTS: Final = {
 }
 _LIE: Final = ("stop_line", "crosswalk")
 _STEP_M: Final = 2.0
+_STRAIGHT: Final = 1e-9
 
 
 def write_opendrive(
@@ -79,7 +80,7 @@ class _XodrEditing:
             return
         tags = {key: value for key, value in now.attributes if dict(was.attributes).get(key) != value}
         moved = self._step_m(was, now)
-        if element is None or moved is None:
+        if element is None or moved is None or (element.name == "signal" and len(was) > 1 and moved.any()):
             self._counts["unwritten"] += bool(tags) or moved is None or bool(moved.any())
             return
         self._counts["moved"] += bool(moved.any())
@@ -115,9 +116,23 @@ class _XodrEditing:
         else:
             own = {key: float(element.attributes.get(key, 0.0)) for key in ("s", "t", "zOffset")}
             origin_m = road.points_m(np.array([own["s"]]), np.array([own["t"]]), own["zOffset"])[0]
-            tags = dict(tags) | _placed(road.place_of(origin_m + step_m))
+            place = road.place_of(origin_m + step_m)
+            tags = dict(tags) | _placed(place)
+            turn = road.heading_rad(own["s"]) - road.heading_rad(place[0])
+            if len(thing.points_m) > 1 and abs(turn) > _STRAIGHT:  # what lies there keeps its direction in a bend
+                tags["hdg"] = f"{float(element.attributes.get('hdg', 0.0)) + turn:.9f}"
+            self._move_corners(road, element, step_m)
         if tags:
             self._retag(element, tags)
+
+    def _move_corners(self, road: Road, element: Element, step_m: F64) -> None:
+        """Corners that are given on the road do not move with the object."""
+        for outline in (element.find("outlines") or element).all("outline"):
+            for corner in outline.all("cornerRoad"):
+                own = {key: float(corner.attributes.get(key, 0.0)) for key in ("s", "t", "dz")}
+                corner_m = road.points_m(np.array([own["s"]]), np.array([own["t"]]), own["dz"])[0]
+                values = map(_metres, road.place_of(corner_m + step_m))
+                self._retag(corner, dict(zip(("s", "t", "dz"), values, strict=True)))
 
     def _retag(self, element: Element, values: Mapping[str, str]) -> None:
         tag = tag_of(self._data, element)
