@@ -30,6 +30,6 @@ def test_commands_print_what_the_page_shows(
     for command in re.findall(r"^\$ gnd features (.*)$", block, re.MULTILINE):
         result = CliRunner().invoke(features, shlex.split(command), catch_exceptions=False)
         shown += f"$ gnd features {command}\n{result.stdout}"
-    assert shown == block
+    assert [line.rstrip() for line in shown.splitlines()] == block.splitlines()  # a table's title has blanks after it
     for back, file in (("back.xodr", "town.xodr"), ("back.osm", "bus_stop_area.osm")):
         assert not Path(back).exists() or Path(back).read_bytes() == Path(file).read_bytes()
