@@ -71,6 +71,28 @@ def test_all_lanes_of_argoverse_2_are_routable(log: str, shared_data: Path, stor
     }
 
 
+def test_lanes_are_changed_over_dashes_and_not_over_solid_lines(
+    shared_data: Path, store: SqliteStore, tmp_path: Path
+) -> None:
+    folder = shared_data / "av2_pit_overlap" / "3bffdcff" / "map"
+    if not folder.is_dir():
+        pytest.skip("real recording not found: ../shared/data/av2_pit_overlap")
+    (file,) = folder.glob("log_map_archive_*.json")
+    put(store, file)
+    exported(store, tmp_path / "new.osm")
+    theirs, told = official.load(tmp_path / "new.osm", 40.46, -79.95), json.loads(file.read_text())
+    lanes, graph = told["lane_segments"], theirs.graphs["Vehicle"][1]
+    changes = {"DASHED": 0, "SOLID": 0}
+    for key, one in argoverse_says(told).items():
+        vehicles = [one.left, key] if one.left and lanes[one.left]["lane_type"] == "VEHICLE" else []
+        mark = lanes[key]["left_lane_mark_type"].partition("_")[0]
+        if vehicles and lanes[key]["lane_type"] == "VEHICLE" and mark in changes:
+            changes[mark] += 1
+            assert (graph.left(theirs.lanelets[key]) is not None) == (mark == "DASHED")
+            assert (graph.adjacentLeft(theirs.lanelets[key]) is not None) == (mark == "SOLID")
+    assert min(changes.values()) > 0, changes
+
+
 def argoverse_says(told: dict[str, dict[str, dict]]) -> dict[str, "official.Expected"]:  # type: ignore[type-arg]
     """By lane; neighbours in the other direction are none, nor are successors that the log's map does not hold."""
     lanes = told["lane_segments"]
