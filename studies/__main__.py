@@ -15,7 +15,7 @@ from studies.frame.options import click_options, options_of
 NAMES: Final = (
     "detection", "segmentation", "localisation", "scan-to-scan", "clock", "first-pose", "health", "ingest",
     "short-reports", "sizes", "codec", "return-download", "gnss-noise", "poles", "features-merge", "merging",
-    "slamcu-step", "camera-pipeline", "map-build", "stalled", "outage",
+    "map-build", "stalled", "outage",
 )  # fmt: skip
 
 

@@ -181,7 +181,7 @@ def drive_summary(found: Verdicts, truth: SignTruth) -> dict[str, Any]:
         "accuracy": accuracy_of(scored.confusion),
         "accuracy_visible": accuracy_of(scored_drive(found, truth.take(found.visible > 0)).confusion),
         "confusion": scored.confusion.tolist(),
-        "position_error_m": scored.plain_errors() | parts_of_errors(scored, found) | {"nees": _nees(scored)},
+        "position_error_m": scored.plain_errors() | {"nees": _nees(scored)},
         "false_new": {"all": len(scored.false_new), "near_a_sign_of_the_map": scored.near_known},
         "step_ms_median": float(np.median(found.step_ms)),
         "step_ms_p95": float(np.quantile(found.step_ms, 0.95)),
@@ -190,25 +190,18 @@ def drive_summary(found: Verdicts, truth: SignTruth) -> dict[str, Any]:
         "pose_nees": float(found.pose_chi2.mean()),
         "lost": _lost(found),
         "lost_without_knowing": lost_without_knowing(found),
-        "conflict": _conflict(found),
         "looks": {
             "visible": int(found.visible.sum()),
             "occluded": int(found.occluded.sum()),
-            "no_evidence": int(found.no_evidence),
             "signs_never_visible": int(np.count_nonzero(found.visible == 0)),
             "new_signs_never_visible": int(np.count_nonzero(found.visible[truth.of(NEW)] == 0)),
         },
     }
 
 
-def scored_new(found: Verdicts) -> tuple[F64, F64]:
-    """Return positions and covariances of the new features that a drive says exist."""
-    return found.new_xy_m[found.new_exists], found.new_cov_m2[found.new_exists]
-
-
 def scored_drive(found: Verdicts, truth: SignTruth) -> SignScore:
     """Return how well a drive tells the signs."""
-    return score(truth, (found.known_id, found.known_predicted), scored_new(found))
+    return score(truth, (found.known_id, found.known_predicted), (found.new_xy_m, found.new_cov_m2))
 
 
 def merged_score(merged: MergedSigns, truth: SignTruth) -> SignScore:
@@ -216,18 +209,6 @@ def merged_score(merged: MergedSigns, truth: SignTruth) -> SignScore:
     ids = truth.feature_id[truth.true_class != NEW]
     said = np.where(np.isin(ids, merged.known_id), NORMAL, DELETED).astype(np.uint8)
     return score(truth, (ids, said), (merged.new_xy_m, merged.new_cov_m2))
-
-
-def parts_of_errors(scored: SignScore, found: Verdicts) -> dict[str, Any]:
-    """Return mean lengths of what the pose moved each new sign by, and of the rest, which is the measurements'."""
-    pose = found.pose_part_m[scored.sign]
-    rest = scored.error_m - pose
-    seen = np.isfinite(pose).all(axis=1)
-    return {f"{name}_part": _mean_length(part[seen]) for name, part in (("pose", pose), ("measurement", rest))}
-
-
-def _mean_length(vectors: F64) -> float | None:
-    return float(np.linalg.norm(vectors, axis=1).mean()) if len(vectors) else None
 
 
 def _nees(scored: SignScore) -> dict[str, Any] | None:
@@ -274,19 +255,6 @@ def worst_of(seeds: Mapping[str, Mapping[str, Any]]) -> dict[str, Any]:
     }
 
 
-def _conflict(found: Verdicts) -> dict[str, float]:
-    """How much was thrown away by Dempster's normalisation, over the signs of the map and the new features."""
-    conflict = np.concatenate([found.known_conflict, found.new_conflict])
-    if not len(conflict):
-        return {}
-    return {
-        "mean": float(conflict.mean()),
-        "p95": float(np.quantile(conflict, 0.95)),
-        "max": float(conflict.max()),
-        "share_above_half": float(np.mean(conflict > 0.5)),
-    }
-
-
 def _of_all(scores: Sequence[SignScore]) -> dict[str, Any]:
     """Return the numbers of all drives together."""
     confusion = np.sum([one.confusion for one in scores], axis=0)
@@ -309,7 +277,6 @@ _ERRORS: Final = {
 _ABLATION: Final = {
     **{f"{name} %": f"{{accuracy.{name}:.2f}}" for name in (*TRUE_CLASSES, "overall")},
     "new signs, m": "{position_error_m.mean:.3f}",
-    "of the pose": "{position_error_m.pose_part:.3f}",
     "missed": "{position_error_m.missed:.4g}",
     "false": "{position_error_m.false:.4g}",
     "pose along / across, m": "{pose_rmse.longitudinal_m:.2f} / {pose_rmse.lateral_m:.2f}",
@@ -319,9 +286,7 @@ _FACTS: Final = {
     "NEES of the place (2 expected)": "{pose_nees:.2f}",
     "one step: median / 95 %": "{step_ms_median:.2f} / {step_ms_p95:.2f} ms",
     "looks at signs: visible / hidden": "{looks.visible:.0f} / {looks.occluded:.0f}",
-    "looks at signs of the map that gave no evidence": "{looks.no_evidence:.0f}",
     "signs never visible / new ones of them": "{looks.signs_never_visible:.4g} / {looks.new_signs_never_visible:.4g}",
-    "conflict: mean / 95 % / largest": "{conflict.mean:.3f} / {conflict.p95:.3f} / {conflict.max:.3f}",
     "NEES of new signs (2 expected) / within their 95 %": (
         "{position_error_m.nees.mean:.2f} / {position_error_m.nees.within_95:.0%}"
     ),
@@ -365,6 +330,5 @@ def _facts(found: Found, ours: Found) -> Sheet:
     table.add("drives that found they had been lost", shown("{lost} of {drives}", found))
     table.add("drives lost without knowing", shown("{lost_without_knowing} of {drives}", found))
     for name, cell in _FACTS.items():
-        if not (name.startswith("conflict") and not ours["conflict"]):
-            table.add(name, shown(cell, ours))
+        table.add(name, shown(cell, ours))
     return table
