@@ -12,11 +12,7 @@ import click
 from studies.frame.measure import machine, print_figures
 from studies.frame.options import click_options, options_of
 
-NAMES: Final = (
-    "detection", "segmentation", "localisation", "scan-to-scan", "clock", "first-pose", "health", "ingest",
-    "short-reports", "sizes", "codec", "return-download", "gnss-noise", "poles", "features-merge", "merging",
-    "map-build", "stalled", "outage",
-)  # fmt: skip
+NAMES: Final = ("ingest", "poles", "stalled", "outage")
 
 
 def main() -> None:

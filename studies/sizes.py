@@ -1,18 +1,12 @@
-"""Bytes: what a tile, a change report and a notice of one change weigh with codec 0 (float32 columns)."""
-
-import zlib
+"""A tile and a report that no vehicle made: for studies of service, where their content does not matter."""
 
 import numpy as np
 
-from gnd.gnd_map.codec import encode_gaussians
 from gnd.gnd_map.gaussian import Gaussians
-from gnd.gnd_map.tile import Tile, diff
+from gnd.gnd_map.tile import Tile
 from gnd.gnd_map.tile_id import TileId
 from gnd.schemas.changes import ChangeReport, TileChange
 from gnd.schemas.report_id import deterministic_report_id
-from gnd.schemas.tiles import blob_of
-from gnd.schemas.updates import TileUpdate
-from studies.frame.measure import Figure
 
 TILE = TileId(497353963154)
 VOXELS = 2_000
@@ -53,19 +47,3 @@ def change_report(number: int, base: Tile) -> ChangeReport:
         last_ns=_T0_MS * 1_000_000 + 1,
         tiles=(change,),
     )
-
-
-def run() -> list[Figure]:
-    """Measure encoded sizes on a synthetic tile; the codec has no entropy stage, so the content does not matter."""
-    base = base_tile()
-    voxels = len(base.gaussians)
-    blob, report = blob_of(base).encode(), change_report(0, base).encode()
-    after = base.gaussians.take(np.arange(CHANGED, voxels))
-    update = TileUpdate(base.tile_id, "ndt", 2, 1, base.sha, base.sha, "merged", diff(base.gaussians, after)).encode()
-    return [
-        Figure("tile download", len(blob) / voxels, "B/voxel", f"{voxels} voxels, {len(blob)} B"),
-        Figure("codec 0 alone", len(encode_gaussians(base.gaussians)) / voxels, "B/voxel"),
-        Figure("the same, deflated", len(zlib.compress(blob)) / voxels, "B/voxel", "synthetic content: a lower bound"),
-        Figure("change report", len(report) / CHANGED, "B/change", f"{CHANGED} changes, 500 observed, {len(report)} B"),
-        Figure("update notice", len(update), "B", f"{CHANGED} voxels removed"),
-    ]

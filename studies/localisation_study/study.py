@@ -140,10 +140,9 @@ def localisation(options: StudyOptions, bench: Bench) -> StudyReport:
     found = summary_of(outcome)
 
     def draw(folder: Path) -> None:
-        from studies.localisation_study.figures import draw_figures, draw_overview
+        from studies.localisation_study.figures import draw_figures
 
         draw_figures(outcome, folder)
-        draw_overview(found, folder / "overview.png")
 
     return StudyReport(found, sheets_of(found), draw)
 

@@ -2,7 +2,7 @@
 
 from collections import Counter
 from collections.abc import Callable, Collection, Iterable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final
 
@@ -35,7 +35,6 @@ class VehicleResult:
         row: int32 (K,) rows of the truth about which there is evidence, ascending.
         evidence: int32 columns (K,), see `EVIDENCE`.
         stats: counts, localisation errors; plain values.
-        watched: times int64 (S,) and counters int32 (S, W, 4) of the watched voxels; empty for most vehicles.
         pcd: the baseline's encoded report; empty without it.
         packed: the first half of each report in short, as the vehicle's outbox holds it; empty where it has none.
     """
@@ -46,9 +45,6 @@ class VehicleResult:
     row: NDArray[np.int32]
     evidence: Mapping[str, NDArray[np.int32]]
     stats: Mapping[str, Any]
-    watched: tuple[NDArray[np.int64], NDArray[np.int32]] = field(
-        default_factory=lambda: (np.zeros(0, np.int64), np.zeros((0, 0, 4), np.int32))
-    )
     pcd: bytes = b""
     packed: tuple[bytes, ...] = ()
 

@@ -78,11 +78,8 @@ def test_a_second_start_drives_no_more_shows_tables_and_draws(
         assert text in shown.stdout
     names = {path.name for path in finished[0].glob("*.png")}
     assert names == {
-        "new_layer_beacons.png",
         "new_layer_by_drives.png",
         "new_layer_lights_motorway.png",
-        "new_layer_one_light_motorway.png",
-        "new_layer_localisation_motorway.png",
     }
     assert json.loads((finished[0] / "result.json").read_text())["nfl"] == finished[1]["nfl"]
 

@@ -83,7 +83,7 @@ def test_a_second_start_drives_no_more_shows_tables_and_draws(
         assert text in shown.stdout
     assert "**what matters: the first drive once more**" in (tmp_path / "tables.md").read_text()
     names = sorted(path.name for path in finished[0].glob("*.png"))
-    assert names == ["slamcu_confusion.png", "slamcu_masses.png", "slamcu_position_errors.png"]
+    assert names == ["slamcu_masses.png", "slamcu_position_errors.png"]
     again = json.loads((finished[0] / "result.json").read_text())
     assert again["slamcu"] == finished[1]["slamcu"]
 
