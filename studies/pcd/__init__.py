@@ -3,7 +3,6 @@
 from studies.pcd.detector import PcdDetector
 from studies.pcd.merge import evaluate_gnd, merge_pcd, settled
 from studies.pcd.points import (
-    PcdCodecError,
     PcdDetectParameters,
     PcdError,
     PcdMap,
@@ -14,7 +13,6 @@ from studies.pcd.points import (
 from studies.pcd.report import PcdReport
 
 __all__ = [
-    "PcdCodecError",
     "PcdDetectParameters",
     "PcdDetector",
     "PcdError",

@@ -25,10 +25,6 @@ class PcdError(GndError):
     """Base of the point-cloud baseline's errors; also a parameter, cloud or report that cannot be used."""
 
 
-class PcdCodecError(PcdError):
-    """Bytes are truncated, too long, or do not decode to a valid report."""
-
-
 @dataclass(frozen=True, slots=True)
 class PcdDetectParameters:
     """How rays become evidence about single points."""

@@ -18,6 +18,7 @@ from gnd.vehicle_agent.detect.evidence import TileEvidence
 from gnd.vehicle_agent.segment import SegmentedScan
 from studies.frame.errors import FolderError
 from studies.frame.kept import read_value, write_value
+from studies.pcd import PcdReport
 from studies.simulation.options import MethodParameters
 
 EVIDENCE: Final = ("n_bi", "n_bo", "n_pi", "n_po", "n_be", "n_pe", "cells", "map_cells", "change_class")
@@ -35,7 +36,7 @@ class VehicleResult:
         row: int32 (K,) rows of the truth about which there is evidence, ascending.
         evidence: int32 columns (K,), see `EVIDENCE`.
         stats: counts, localisation errors; plain values.
-        pcd: the baseline's encoded report; empty without it.
+        pcd: the baseline's report; None without it.
         packed: the first half of each report in short, as the vehicle's outbox holds it; empty where it has none.
     """
 
@@ -45,7 +46,7 @@ class VehicleResult:
     row: NDArray[np.int32]
     evidence: Mapping[str, NDArray[np.int32]]
     stats: Mapping[str, Any]
-    pcd: bytes = b""
+    pcd: PcdReport | None = None
     packed: tuple[bytes, ...] = ()
 
     @property

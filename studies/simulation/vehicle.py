@@ -25,6 +25,7 @@ from gnd.vehicle_agent.segment import SegmentedScan
 from gnd.vehicle_agent.sources.recording import first_fix
 from gnd.vehicle_agent.tiles_at_hand import TilesAtHand
 from studies.frame.pool import Tick
+from studies.pcd import PcdReport
 from studies.simulation.base_map import BaseMap, read_base
 from studies.simulation.baseline import CloudVehicle, read_cloud
 from studies.simulation.options import MethodParameters, PoseSource
@@ -169,9 +170,9 @@ class _VehicleRun:
         if self._cloud is not None:
             self._cloud.add_scan(segmented)
 
-    def pcd_report(self) -> tuple[bytes, Mapping[str, int]]:
+    def pcd_report(self) -> tuple[PcdReport | None, Mapping[str, int]]:
         """What the point-cloud baseline uploads, and its size by codec; nothing without it."""
-        return (b"", {}) if self._cloud is None else self._cloud.report()
+        return (None, {}) if self._cloud is None else self._cloud.report()
 
     def stats(self) -> dict[str, Any]:
         """Counts of the drive and errors of its poses."""
