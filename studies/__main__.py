@@ -1,6 +1,6 @@
 """`python -m studies [NAME …] [--json]`: run the benchmarks and print their figures with their commands.
 
-A benchmark with options of its own takes them when it is named alone: `python -m studies codec --help`.
+A benchmark with options of its own takes them when it is named alone: `python -m studies poles --help`.
 """
 
 import importlib

@@ -27,6 +27,7 @@ from gnd.vehicle_agent.features.slamcu.camera_pipeline import CameraPipeline
 from gnd.vehicle_agent.features.slamcu.verdicts import KnownState, NewFeature
 from gnd.vehicle_agent.features.slamcu.watched import Lost, PoseAt
 from gnd.vehicle_agent.features.view import Occlusion
+from gnd.vehicle_agent.pipeline import Output
 from gnd.vehicle_agent.report.reporter import Identity
 from gnd.vehicle_agent.sources.recording import first_fix
 from studies.feature_study.pipelines import TilesAtOnce, found_in, in_route_frame, joined, reports_of, tiles_of
@@ -121,7 +122,8 @@ class _CameraDrive:
 
     def run(self, items: Iterator[DriveItem], tick: Tick) -> Driven:
         """Drive to the end."""
-        pipeline, outputs, step_ms, look, seen, spent_s = self.pipeline, [], [], [], 0, 0.0
+        pipeline, outputs, seen, spent_s = self.pipeline, list[Output](), 0, 0.0
+        step_ms, look = list[float](), list[int]()
         for item in items:
             begun_s = perf_counter()
             outputs.append(pipeline.push(item))
@@ -194,8 +196,9 @@ def _seeing_nothing(item: DriveItem) -> DriveItem:
     if not isinstance(item, Detections):
         return item
     none = item.range_m[:0]
-    columns = dict.fromkeys(("range_m", "bearing_rad", "height_m", "sigma_range_m", "sigma_bearing_rad"), none)
-    return replace(item, kinds=(), **columns)
+    return replace(
+        item, kinds=(), range_m=none, bearing_rad=none, height_m=none, sigma_range_m=none, sigma_bearing_rad=none
+    )
 
 
 def verdicts_of(drive: RoadDrive, driven: Driven) -> Verdicts:

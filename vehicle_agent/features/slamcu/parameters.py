@@ -35,7 +35,7 @@ class MotionNoise:
 class GnssNoise:
     """Errors of a low-cost GNSS: a slow one (Gauss-Markov) and a white one, together of the sigma that the fix tells.
 
-    As `python -m studies gnss-noise` finds them in a car's single-point fixes.
+    As `python -m studies gnss-noise` at 9b4197d finds them in a car's single-point fixes.
     """
 
     white_share: float = 0.30
