@@ -16,8 +16,6 @@ from gnd.gnd_map.tile_id import covering_corridor
 from gnd.schemas.drive import Scan
 from gnd.schemas.drive_mcap import load_track, read_drive, read_header
 from gnd.vehicle_agent.local_map import LocalMap
-from gnd.vehicle_agent.localise import PoseEstimate
-from gnd.vehicle_agent.pipeline import Output
 
 MAP_REACH_M = 70.0
 MAPPING = DriveConfig("map", "HDL-32E", "before", errors=PERFECT, car_share=0.0, cruise_mps=12.0)
@@ -50,10 +48,3 @@ def true_scans(path: Path) -> Iterator[tuple[F64, F64]]:
         if isinstance(scan, Scan):
             points = deskew(scan.points_m, scan.t_offset_ns, scan.t_ns, reference, T_vehicle_lidar, scan.t_ns)
             yield points, reference.at(scan.t_ns)
-
-
-def note_newest(output: Output, estimates: list[PoseEstimate]) -> None:
-    """Append the online pose when it is a new one that is not lost."""
-    online = output.online
-    if online is not None and online.health != "lost" and (not estimates or online.t_ns > estimates[-1].t_ns):
-        estimates.append(online)

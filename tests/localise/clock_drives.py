@@ -12,9 +12,10 @@ from gnd.schemas.drive import DriveHeader, DriveItem, MotionSample
 from gnd.schemas.drive_mcap import DriveWriter, read_drive
 from gnd.vehicle_agent.local_map import LocalMap
 from gnd.vehicle_agent.localise import Localiser, PoseEstimate
+from gnd.vehicle_agent.pipeline import Output
 from gnd.vehicle_agent.sources.recording import first_fix
 from gnd.vehicle_agent.tiles_at_hand import localising_on
-from studies.localisation_scenes import MAPPING, map_of, note_newest, reference_of
+from studies.localisation_scenes import MAPPING, map_of, reference_of
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -75,3 +76,10 @@ def _shifted(items: Sequence[DriveItem], offset_s: Callable[[float], float]) -> 
         for item in items
     ]
     return sorted(shifted, key=lambda item: item.t_ns)
+
+
+def note_newest(output: Output, estimates: list[PoseEstimate]) -> None:
+    """Append the online pose when it is a new one that is not lost."""
+    online = output.online
+    if online is not None and online.health != "lost" and (not estimates or online.t_ns > estimates[-1].t_ns):
+        estimates.append(online)
