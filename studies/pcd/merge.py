@@ -72,9 +72,9 @@ def _new(index: PcdIndex, seen: _Observers, reports: Sequence[PcdReport], p: Pcd
     cells = [cells_of(cloud, index.grid_frame) for cloud in clouds]
     key, which = np.unique(cell_keys(np.concatenate(cells), index.grid_frame), return_inverse=True)
     owner = np.repeat(np.arange(len(reports)), [len(c) for c in cells])
-    said = np.zeros((len(key), -(-len(reports) // 64)), np.uint64)
-    np.bitwise_or.at(said, (which, owner // 64), np.uint64(1) << (owner % 64).astype(np.uint64))
-    votes = count_votes(key, said, p.reach_cells)
+    reported = np.zeros((len(key), -(-len(reports) // 64)), np.uint64)
+    np.bitwise_or.at(reported, (which, owner // 64), np.uint64(1) << (owner % 64).astype(np.uint64))
+    votes = count_votes(key, reported, p.reach_cells)
     blocks = index.blocks_of(key_cells(key, index.grid_frame) - index.origin_c)
     accepted = votes > p.xi * np.maximum(seen.of(blocks), votes)
     return _means(np.concatenate(clouds), which, len(key))[accepted]
@@ -88,13 +88,13 @@ def _means(points: F64, which: I64, n: int) -> F32:
 
 
 @kernel
-def count_votes(keys: I64, said: NDArray[np.uint64], reach: int) -> I32:
+def count_votes(keys: I64, reported: NDArray[np.uint64], reach: int) -> I32:
     """(C,) int32: how many reports have a point within `reach` cells of each cell.
 
-    `keys` (C,) sorted cell keys; `said` (C, W): bit r of word w is set where report 64 w + r has a point.
+    `keys` (C,) sorted cell keys; `reported` (C, W): bit r of word w is set where report 64 w + r has a point.
     """
     votes = np.zeros(len(keys), np.int32)
-    word = np.empty(said.shape[1], np.uint64)
+    word = np.empty(reported.shape[1], np.uint64)
     for c in range(len(keys)):
         word[:] = 0
         for dx in range(-reach, reach + 1):
@@ -103,7 +103,7 @@ def count_votes(keys: I64, said: NDArray[np.uint64], reach: int) -> I32:
                 at = np.searchsorted(keys, middle - reach)
                 while at < len(keys) and keys[at] <= middle + reach:
                     for w in range(len(word)):
-                        word[w] |= said[at, w]
+                        word[w] |= reported[at, w]
                     at += 1
         for w in range(len(word)):
             bits = word[w]

@@ -51,7 +51,7 @@ class Driven:
 
     Attributes:
         reports: as the vehicle sends them; none of a variant that no vehicle drives.
-        changes: what is said of each tile.
+        changes: the reported change of each tile.
         known: the newest that was observed of each sign of the map, with the masses over time.
         new: features that the map has not, at the end of the drive.
         step_ms: float64 (S,), time of each look with the motion since the one before.
@@ -90,7 +90,7 @@ def driven_by(drive: RoadDrive, variant: str, vehicle: int, tick: Tick) -> Drive
         drive: along a motorway.
         variant: of `VARIANTS`.
         vehicle: its number, and the seed of its particles.
-        tick: told how many looks have been taken.
+        tick: called with the number of looks taken.
     """
     if variant in GIVEN_POSES:
         return _with_given_poses(drive, variant, vehicle)
@@ -202,7 +202,7 @@ def _seeing_nothing(item: DriveItem) -> DriveItem:
 
 
 def verdicts_of(drive: RoadDrive, driven: Driven) -> Verdicts:
-    """Return what a drive's reports say of the signs, with what the truth tells of how it came about.
+    """Return a drive's verdicts on the signs by its reports, and what the truth adds to them.
 
     A sign of the map that no report mentions stays on the map: it counts as normal.
     """
@@ -223,7 +223,7 @@ def verdicts_of(drive: RoadDrive, driven: Driven) -> Verdicts:
         step_ms=driven.step_ms,
         pose_error=pose_errors(pose, true),
         pose_chi2=pose_chi2(pose, cov, true),
-        pose_said_lost=said_lost(driven),
+        pose_given_up=given_up(driven),
         lost=np.array(
             [(one.from_s, one.until_s, one.off_m, one.value, one.taken_back, one.told_anew) for one in driven.lost]
         ).reshape(-1, 6),
@@ -248,8 +248,8 @@ def pose_chi2(pose: F64, cov: F64, true: F64) -> F64:
     return np.asarray(np.einsum("si,si->s", off, np.linalg.solve(cov[:, :2, :2], off[..., None])[..., 0]))
 
 
-def said_lost(driven: Driven) -> NDArray[np.bool_]:
-    """Return bool (S,), the looks of stretches of which the vehicle says nothing."""
+def given_up(driven: Driven) -> NDArray[np.bool_]:
+    """Return bool (S,), the looks of stretches that the vehicle has given up."""
     t_s, lost = np.array([one.t_s for one in driven.path]), np.zeros(len(driven.path), np.bool_)
     for one in driven.lost:
         lost |= (t_s >= one.from_s) & (t_s <= one.until_s) & (not one.told_anew)

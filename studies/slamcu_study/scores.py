@@ -77,13 +77,13 @@ def score(
     new: tuple[F64, F64],
     radius_m: float = RADIUS_M,
 ) -> SignScore:
-    """Return how well a drive, or a map, tells the signs.
+    """Return how well a drive, or a map, classifies and places the signs.
 
     Args:
         truth: all signs of the route.
         known: feature ids (K,) of the signs of the map that was driven with, and their classes (K,), indices of
             `PREDICTED`.
-        new: positions (J, 2) [m] and covariances (J, 2, 2) [m^2] of those new features that are said to exist.
+        new: positions (J, 2) [m] and covariances (J, 2, 2) [m^2] of the new features that are reported.
         radius_m: the farthest an estimate may lie from its sign.
     """
     confusion = np.zeros((len(TRUE_CLASSES), len(PREDICTED)), np.int64)
@@ -109,9 +109,9 @@ def _placed(
 
 
 def _predicted(feature_ids: I64, known_id: I64, predicted: U8) -> I64:
-    """(N,) what the drive says of signs of the map; unclassified what it does not mention."""
-    said = dict(zip(known_id.tolist(), predicted.tolist(), strict=True))
-    return np.array([said.get(one, UNCLASSIFIED) for one in feature_ids.tolist()], np.int64)
+    """(N,) the class of signs of the map by the drive; unclassified what it does not mention."""
+    by_id = dict(zip(known_id.tolist(), predicted.tolist(), strict=True))
+    return np.array([by_id.get(one, UNCLASSIFIED) for one in feature_ids.tolist()], np.int64)
 
 
 def _near(xy_m: F64, others_m: F64, radius_m: float) -> int:
@@ -200,15 +200,15 @@ def drive_summary(found: Verdicts, truth: SignTruth) -> dict[str, Any]:
 
 
 def scored_drive(found: Verdicts, truth: SignTruth) -> SignScore:
-    """Return how well a drive tells the signs."""
+    """Return how well a drive classifies and places the signs."""
     return score(truth, (found.known_id, found.known_predicted), (found.new_xy_m, found.new_cov_m2))
 
 
 def merged_score(merged: MergedSigns, truth: SignTruth) -> SignScore:
-    """Return how well a published layer tells the signs: what it holds exists, what it no longer holds is deleted."""
+    """Return how well a published layer has the signs: what it holds exists, what it no longer holds is deleted."""
     ids = truth.feature_id[truth.true_class != NEW]
-    said = np.where(np.isin(ids, merged.known_id), NORMAL, DELETED).astype(np.uint8)
-    return score(truth, (ids, said), (merged.new_xy_m, merged.new_cov_m2))
+    predicted = np.where(np.isin(ids, merged.known_id), NORMAL, DELETED).astype(np.uint8)
+    return score(truth, (ids, predicted), (merged.new_xy_m, merged.new_cov_m2))
 
 
 def _nees(scored: SignScore) -> dict[str, Any] | None:
@@ -222,24 +222,24 @@ def _pose_rmse(found: Verdicts) -> dict[str, float]:
 
 def lost_without_knowing(found: Verdicts) -> int:
     """Return on how many stretches of `LOST_LOOKS` looks or more the vehicle was `LOST_M` off, far beyond what it
-    claims (χ² of 2 degrees of freedom, 99.9 %), and does not say that it was lost.
+    claims (χ² of 2 degrees of freedom, 99.9 %), and has not given the stretch up.
 
     Poses are those that it believes in at the end, which its reports rest on.
     """
     off = np.hypot(*found.pose_error[:, :2].T) > LOST_M
-    wrong = off & (found.pose_chi2 > LOST_CHI2) & ~found.pose_said_lost
+    wrong = off & (found.pose_chi2 > LOST_CHI2) & ~found.pose_given_up
     edges = np.flatnonzero(np.diff(np.concatenate([[False], wrong, [False]]).astype(np.int8)))
     return int(np.count_nonzero(edges[1::2] - edges[::2] >= LOST_LOOKS))
 
 
 def _lost(found: Verdicts) -> dict[str, float]:
-    """What the vehicle itself says of where it was lost: stretches, of these told anew, and what it took back."""
+    """Stretches on which the vehicle found itself lost, how many of them it estimated anew, and verdicts taken back."""
     stretches = {"stretches": len(found.lost), "told_anew": float(found.lost[:, 5].sum())}
     return stretches | {
         "off_m_max": float(found.lost[:, 2].max(initial=0.0)),
         "seconds": float((found.lost[:, 1] - found.lost[:, 0]).sum()),
         "taken_back": float(found.lost[:, 4].sum()),
-        "share_given_up": float(found.pose_said_lost.mean()),
+        "share_given_up": float(found.pose_given_up.mean()),
     }
 
 

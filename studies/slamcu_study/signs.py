@@ -85,9 +85,9 @@ class Verdicts:
         step_ms: float64 (S,), time of each step.
         pose_error: float64 (S, 3), along and across the true heading [m], heading [rad].
         pose_chi2: float64 (S,), squared Mahalanobis distance of the place from the true one, 2 degrees of freedom.
-        pose_said_lost: bool (S,), looks of a stretch of which the vehicle says nothing, for it was lost.
-        lost: float64 (L, 6), stretches that it found to have told wrong: from, until [s], off [m], statistic of the
-            test that failed, verdicts taken back, whether it told the stretch anew.
+        pose_given_up: bool (S,), looks of stretches that the vehicle has given up.
+        lost: float64 (L, 6), stretches on which it found itself lost: from, until [s], off [m], statistic of the
+            test that failed, verdicts taken back, whether the stretch was estimated anew.
         visible, occluded: int64 (N,), looks at each sign that was in view, free and hidden.
         trace_sign: int64 (Q,), index of the true sign whose masses these are; only of deleted and new signs.
         trace_masses: float64 (Q, 3), exist, absent, unknown.
@@ -100,7 +100,7 @@ class Verdicts:
     step_ms: F64
     pose_error: F64
     pose_chi2: F64
-    pose_said_lost: NDArray[np.bool_]
+    pose_given_up: NDArray[np.bool_]
     lost: F64
     visible: I64
     occluded: I64
@@ -130,8 +130,8 @@ class SlamcuSeed:
     Attributes:
         seed: of the route.
         truth: its signs.
-        variants: what the first vehicle says, by variant.
-        drives: what each vehicle says; the first as in `variants`.
+        variants: verdicts of the first vehicle, by variant.
+        drives: verdicts of each vehicle; the first as in `variants`.
         merged: by number of vehicles.
     """
 

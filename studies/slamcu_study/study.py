@@ -90,7 +90,7 @@ class DriveTask:
 
     @property
     def verdicts(self) -> Kept:
-        """Where what it says is kept, with the truth."""
+        """Where its verdicts are kept, with the truth."""
         return self._kept("verdicts")
 
     @property
@@ -110,7 +110,7 @@ class DriveTask:
 
     @property
     def name(self) -> str:
-        """What the progress bar says."""
+        """Its name in the progress bar."""
         return f"seed {self.seed}, car {self.vehicle}" + ("" if self.variant == FULL else f", {self.variant}")
 
 

@@ -52,7 +52,7 @@ def verdicts(**changes: object) -> Verdicts:
         "step_ms": np.array([1.0, 2.0, 9.0]),
         "pose_error": STEPS,
         "pose_chi2": np.array([1.0, 2.0, 3.0]),
-        "pose_said_lost": np.zeros(3, np.bool_),
+        "pose_given_up": np.zeros(3, np.bool_),
         "lost": np.array([[10.0, 40.0, 7.5, 5.6, 3.0, 1.0]]),
         "visible": np.array([9, 9, 9, 0, 9, 9, 0]),
         "occluded": np.array([1, 0, 0, 4, 0, 0, 2]),
@@ -155,7 +155,7 @@ def off_by(metres: float, looks: int, chi2: float, **changes: object) -> Verdict
     error = np.zeros((400, 3))
     error[50 : 50 + looks, 0] = metres
     squared = np.where(error[:, 0] > 0.0, chi2, 1.0)
-    columns = {"pose_error": error, "pose_chi2": squared, "pose_said_lost": np.zeros(400, np.bool_)}
+    columns = {"pose_error": error, "pose_chi2": squared, "pose_given_up": np.zeros(400, np.bool_)}
     return verdicts(**{**columns, **changes})
 
 
@@ -166,7 +166,7 @@ def test_lost_without_knowing_is_far_off_for_long_and_beyond_what_is_claimed() -
     assert lost_without_knowing(off_by(20.0, 200, 9.0)) == 0  # it says that it does not know
     given_up = np.zeros(400, np.bool_)
     given_up[40:260] = True
-    assert lost_without_knowing(off_by(20.0, 200, 99.0, pose_said_lost=given_up)) == 0
+    assert lost_without_knowing(off_by(20.0, 200, 99.0, pose_given_up=given_up)) == 0
 
 
 def test_the_worst_drive_and_the_lost_ones_are_told() -> None:
