@@ -145,9 +145,9 @@ def fleet_losses(case: LossCase, n: int, level: Level) -> list[Loss]:
     rows = _wrong(case.truth, predicted, level)
     true = case.truth.change_class[rows]
     each = np.stack([causes(true, columns_at(vehicle, rows), case.method.detect) for vehicle in vehicles])
-    predicted = np.stack([columns_at(vehicle, rows)["change_class"] for vehicle in vehicles])
+    reported = np.stack([columns_at(vehicle, rows)["change_class"] for vehicle in vehicles])
     exact = predicted_by(case.exact, case.exact.vehicles[:n], merge=True) if case.exact else None
-    return _losses(case, predicted, rows, _vote_causes(true, predicted, each, case.method.merge.xi), level, exact)
+    return _losses(case, predicted, rows, _vote_causes(true, reported, each, case.method.merge.xi), level, exact)
 
 
 def predicted_by(case: LossCase, vehicles: Sequence[VehicleResult], *, merge: bool = False) -> ClassArray:
@@ -157,10 +157,10 @@ def predicted_by(case: LossCase, vehicles: Sequence[VehicleResult], *, merge: bo
     return classes_of_maps(case.truth, case.base.tiles, final)
 
 
-def _vote_causes(true: NDArray[np.uint8], predicted: NDArray[np.int32], each: Causes, xi: float) -> Causes:
+def _vote_causes(true: NDArray[np.uint8], reported: NDArray[np.int32], each: Causes, xi: float) -> Causes:
     """How the votes (vehicles, R) fell, with the commonest cause among those that did not say what is true."""
-    spoke = predicted != int(ChangeClass.UNMEASURED)
-    right, votes = (predicted == true).sum(axis=0), spoke.sum(axis=0)
+    spoke = reported != int(ChangeClass.UNMEASURED)
+    right, votes = (reported == true).sum(axis=0), spoke.sum(axis=0)
     found = []
     for r in range(len(true)):
         why = Counter(c for c in each[:, r].tolist() if c not in (RIGHT, UNSEEN)).most_common(1)
