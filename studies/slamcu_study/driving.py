@@ -33,7 +33,7 @@ from gnd.vehicle_agent.sources.recording import first_fix
 from studies.feature_study.pipelines import TilesAtOnce, found_in, in_route_frame, joined, reports_of, tiles_of
 from studies.feature_study.truth import match_one_to_one
 from studies.frame.pool import Tick
-from studies.slamcu_study.signs import DELETED, NEW, NORMAL, MergedSigns, SignTruth, Verdicts
+from studies.slamcu_study.signs import DELETED, NEW, NORMAL, PAPER_LAMBDA_HD, MergedSigns, SignTruth, Verdicts
 
 LIDAR_SIGMA: Final = (0.04, 0.04, np.radians(0.08))
 """Errors of the LiDAR localiser's poses, m, m, rad: as `--poses noisy:4cm:0.08deg` of the other studies."""
@@ -41,7 +41,6 @@ _LIDAR_TAU_S: Final = 2.0
 GIVEN_POSES: Final = ("no_rbpf", "lidar")
 _OBSERVE_EVERY: Final = 50
 """Looks: so often the masses of the signs are observed, long before a tile is decided and they are forgotten."""
-_MAP_CONFIDENCE: Final = 0.95
 _SIGNS: Final = LAYERS["signs"]
 
 
@@ -261,7 +260,7 @@ def _traces(driven: Driven, truth: SignTruth) -> tuple[I64, F64]:
     rows = []
     for sign, one in _observed(driven, truth):
         if isinstance(one, KnownState) and one.history:
-            rows.append((sign, _MAP_CONFIDENCE, 0.0, 1.0 - _MAP_CONFIDENCE))
+            rows.append((sign, PAPER_LAMBDA_HD, 0.0, 1.0 - PAPER_LAMBDA_HD))
         rows += [(sign, at.existence.exist, at.existence.absent, at.existence.unknown) for at in one.history]
     columns = np.array(rows, np.float64).reshape(-1, 4)
     return columns[:, 0].astype(np.int64), columns[:, 1:]
