@@ -37,7 +37,6 @@ class DownloadParameters:
         120.0, "How far along the heading tiles are asked for in advance, at least.", unit="m", least=0
     )
     ahead_s: float = setting(15.0, "The same in time: a faster vehicle looks farther.", unit="s", least=LEAD_S)
-    link_share: float = setting(0.8, "Part of the link's rate that the plan counts on.", above=0, most=1)
     in_flight: int = setting(8, "Requests at a time; one at a time leaves a 5G link at 15 %.", least=1, most=64)
     request_s: float = setting(20.0, "Time for one request, its retries included.", unit="s", above=0)
     retry_s: float = setting(1.0, "Pause after a request that failed.", unit="s", least=0)
@@ -65,27 +64,15 @@ class DownloadParameters:
 class ReportParameters:
     """When a tile is left, when a report is sent, which poses may make statements."""
 
-    left_behind_m: float = setting(
-        54.0,
-        "A tile farther from the vehicle gets no more evidence: its classes are decided. More than the range of"
-        " detection by what the LiDAR stands from the vehicle's origin and what it drives during a scan.",
-        unit="m",
-        above=0,
-    )
-    soon_s: float = setting(
-        0.3,
-        "Where much has changed, the report waits this long for tiles that are left together with the first ...",
-        unit="s",
-        least=0,
-    )
     soon_voxels: int = setting(
         48,
-        "... much: so many voxels of one tile. On ground that has not changed, detection errs in up to some 30.",
+        "Where so many voxels of one tile have changed, a report is due at once. On ground that has not changed,"
+        " detection errs in up to some 30.",
         least=1,
     )
     apart_s: float = setting(
         3.0,
-        "Such reports follow each other no faster than this; at least `soon_s`.",
+        "Such reports follow each other no faster than this.",
         unit="s",
         least=0,
     )
@@ -99,7 +86,7 @@ class ReportParameters:
     )
     unchanged_m: float = setting(
         1000.0,
-        "Ground that is as the map says: at the latest after this much way (at least `longest_m`) ...",
+        "Ground that is unchanged: reported at the latest after this much way (at least `longest_m`) ...",
         unit="m",
         least=0,
     )
@@ -130,9 +117,9 @@ class ReportParameters:
     def __post_init__(self) -> None:
         """A protocol that there is, and waiting times in order."""
         check_settings(self, AgentConfigError)
-        waits_s = (self.soon_s, self.apart_s, self.longest_s, self.unchanged_s)
+        waits_s = (self.apart_s, self.longest_s, self.unchanged_s)
         if sorted(waits_s) != list(waits_s):
-            raise AgentConfigError(f"soon_s, apart_s, longest_s and unchanged_s = {waits_s} s must rise")
+            raise AgentConfigError(f"apart_s, longest_s and unchanged_s = {waits_s} s must rise")
         if self.longest_m > self.unchanged_m:
             raise AgentConfigError(f"longest_m = {self.longest_m}, unchanged_m = {self.unchanged_m} m must rise")
         if self.protocol not in ("packed", "full"):
@@ -198,11 +185,6 @@ class AgentConfig:
             raise AgentConfigError(f"localise_by = {self.localise_by!r}: there are {', '.join(get_args(LocaliseBy))}")
         if self.localise_by != "lidar" and not self.features.layers:
             raise AgentConfigError("a vehicle without LiDAR maps features: name at least one feature layer")
-        if self.report.left_behind_m <= self.detect.range_max_m:
-            raise AgentConfigError(
-                f"left_behind_m = {self.report.left_behind_m} must exceed the range of detection,"
-                f" {self.detect.range_max_m} m: a tile would be left while rays still reach it"
-            )
 
     @property
     def ledger_path(self) -> Path:

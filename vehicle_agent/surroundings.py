@@ -20,13 +20,14 @@ from gnd.vehicle_agent.place import Place
 
 STEP_M = 5.0  # the wanted tiles are looked at again after this much way
 AHEAD_STEP_M = 20.0  # every small change of speed would be a reason to look again
-FLOORS_BELOW, FLOORS_ABOVE = 8, 16  # of the vehicle, where the map alone does not say how high the world is
+LINK_SHARE = 0.8  # part of the link's rate that the plan counts on
+FLOORS_BELOW, FLOORS_ABOVE = 8, 16  # of the vehicle, where the map alone does not show how high the world is
 
 
 class Surroundings:
     """Keeps `local_map` in step with the place and the cache; the agent's main thread owns it.
 
-    A tile about which there is evidence keeps its map until it is finished: what rays said about one version is never
+    A tile about which there is evidence keeps its map until it is finished: evidence about one version is never
     counted for another. A newer version waits until then, and is what the next pass is compared with.
     """
 
@@ -40,7 +41,7 @@ class Surroundings:
         self.counts: Counter[str] = Counter()
         self._map, self._fetcher, self._touched = local_map, fetcher, touched
         self._parameters = parameters
-        self._rate_byte_s = parameters.link_share * fetcher.link.rate_byte_s("down")
+        self._rate_byte_s = LINK_SHARE * fetcher.link.rate_byte_s("down")
         self.wanted: tuple[TileId, ...] = ()
         self._looked_at: F64 | None = None
         self._asked: set[TileId] = set()

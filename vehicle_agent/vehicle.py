@@ -127,7 +127,7 @@ class AgentVehicle:
         )
 
     def result(self) -> dict[str, Any]:
-        """What the drive came to, as plain values."""
+        """The results of the drive, as plain values."""
         return {
             "vehicle": self.config.vehicle,
             "drive_id": self.header.drive_id,

@@ -123,8 +123,8 @@ def test_precedence(tmp_path: Path) -> None:
 
 def test_the_mode_of_detection_chooses_its_defaults_and_a_setting_still_wins() -> None:
     paper = agent_of({"drive": "d", "detect": {"mode": "paper", "new_cells": 25}})
-    assert (paper.detect.passing_rule, paper.detect.soft, paper.detect.new_cells) == ("ml", False, 25)
-    assert agent_of({"drive": "d"}).detect.passing_rule == "plane"
+    assert (paper.detect.rules.passing_rule, paper.detect.rules.soft, paper.detect.new_cells) == ("ml", False, 25)
+    assert agent_of({"drive": "d"}).detect.rules.passing_rule == "plane"
 
 
 def test_layers_are_named_or_described() -> None:
