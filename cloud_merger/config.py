@@ -9,7 +9,6 @@ from typing import Any, Final
 from gnd.cloud_merger.checking import IngestLimits
 from gnd.cloud_merger.confirmation import ConfirmationParameters
 from gnd.cloud_merger.errors import MergerError
-from gnd.cloud_merger.features.check import FeatureLimits
 from gnd.cloud_merger.features.parameters import FeatureMergeParameters
 from gnd.cloud_merger.merge import MergeParameters
 from gnd.cloud_merger.waiting import WaitingLimits
@@ -17,6 +16,7 @@ from gnd.cloud_merger.wants import WantParameters
 from gnd.fleet_bus.config import DEFAULT_ENDPOINT
 from gnd.gnd_map.config import from_mapping
 from gnd.gnd_map.settings import check_settings, setting
+from gnd.schemas.feature_layer import LayerParameters, checked_layers
 from gnd.tile_store.values import DEFAULT_CODEC, StoreConfig, lattice_named
 
 _SHARD_ID: Final = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,63}")
@@ -37,7 +37,11 @@ class ShardConfig:
         "How statements become changes in feature layers.",
     )
     ingest: IngestLimits = setting(IngestLimits, "Which reports are refused.")
-    feature_limits: FeatureLimits = setting(FeatureLimits, "Which reports about features are refused.")
+    feature_layer: tuple[LayerParameters, ...] = setting(
+        (),
+        "Feature layers that the user declares: reports of other kinds or another geometry are refused there, and"
+        " `reach_m` is the layer's own. Undeclared layers take what vehicles report.",
+    )
     want: WantParameters = setting(WantParameters, "Which Gaussians of reports in short are asked for.")
     waiting: WaitingLimits = setting(
         WaitingLimits,
@@ -82,6 +86,11 @@ class ShardConfig:
             raise MergerError(f"shard id {self.shard_id!r} must be 1 to 64 of letters, digits, '.', '_', '-'")
         lattice_named(self.codec)
         check_settings(self, MergerError)
+        checked_layers(self.feature_layer)
+
+    def merge_of(self, layer: str) -> FeatureMergeParameters:
+        """How statements about a feature layer become changes."""
+        return self.features.of_layer(checked_layers(self.feature_layer).get(layer))
 
     @classmethod
     def from_mapping(cls, mapping: Mapping[str, Any]) -> "ShardConfig":

@@ -72,7 +72,7 @@ class Expander:
     ) -> None:
         self._store, self._config, self._tell, self._on_journaled = store, config, tell, on_journaled
         self._short = ShortReports(store, config.merge, config.want, config.waiting, bases or Bases(store))
-        self._features = FeatureInbox(store, config.feature_limits, config.features.reach_m, config.ingest.reach_tiles)
+        self._features = FeatureInbox(store, config.features, config.feature_layer, config.ingest.reach_tiles)
         self._map = MapCheck(store, config.ingest)
         self._lock = Lock()
         self._districts: OrderedDict[str, None] = OrderedDict()  # newest last

@@ -157,7 +157,7 @@ class Worker:
         state = LayerState.stored(epoch, journal.memory)
         rows = [row for row in work.reports if self._readable(row, said_of) is not None]
         named = names_of(self._store.refuted_reports(layer, {row.vehicle for row in rows}), rows)
-        merger = LayerMerger(tile, self._config.features, self._feature_bases(work), refuted_of(named))
+        merger = LayerMerger(tile, self._config.merge_of(layer), self._feature_bases(work), refuted_of(named))
         by_window = windows_of(rows)
         closed = [window for window in by_window if window < journal.window]
         merges = []

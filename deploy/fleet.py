@@ -196,6 +196,7 @@ def shard_config(config: FleetConfig, shard_id: str, store: Path, connect: str) 
     """Return the configuration of one merger shard."""
     of_fleet = {
         "merge": {"mode": config.merge_mode},
+        "feature_layer": list(config.feature_layer),
         "store": {"merge_delay_s": config.merge_delay_s, "merge_after_reports": config.merge_after_reports},
     }
     own = {"shard_id": shard_id, "store_path": str(store), "connect": [connect]}
@@ -204,7 +205,11 @@ def shard_config(config: FleetConfig, shard_id: str, store: Path, connect: str) 
 
 def agent_config(config: FleetConfig, vehicle: str, drive: Path, folder: RunFolder, place: VehicleSite) -> AgentConfig:
     """Return the configuration of one vehicle agent."""
-    of_fleet = {"detect": {"mode": config.detect_mode}, "features": {"layers": list(config.feature_layers)}}
+    of_fleet = {
+        "detect": {"mode": config.detect_mode},
+        "features": {"layers": list(config.feature_layers)},
+        "feature_layer": list(config.feature_layer),
+    }
     own = {
         "vehicle": vehicle,
         "drive": str(drive),

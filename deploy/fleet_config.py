@@ -12,6 +12,7 @@ from typing import Any
 from gnd.deploy.errors import DeployError
 from gnd.fleet_bus.settings_file import layers_of
 from gnd.gnd_map.settings import check_settings, from_settings, merged, setting
+from gnd.schemas.feature_layer import LayerParameters, checked_layers
 
 MAX_AGENTS = 200
 MAX_SHARDS = 32
@@ -59,6 +60,9 @@ class FleetConfig:
         'Layers of the map that vehicles keep up to date; "ndt", on which they localise, is always among them.',
     )
 
+    feature_layer: tuple[LayerParameters, ...] = setting(
+        (), "Feature layers that the user declares, for agents and shards alike."
+    )
     agent: Mapping[str, Any] = setting({}, "Settings of every agent, as `gnd agent --config` takes them.")
     merger: Mapping[str, Any] = setting({}, "Settings of every shard, as `gnd merger --config` takes them.")
 
@@ -72,9 +76,11 @@ class FleetConfig:
         self._check_layers()
 
     def _check_layers(self) -> None:
-        unfit = [layer for layer in self.layers if layer != VOXEL_LAYER and layer not in FEATURE_LAYERS]
-        known = ", ".join((VOXEL_LAYER, *FEATURE_LAYERS))
-        _require(not unfit, f"no vehicle of the fleet detects the layers {', '.join(unfit)}; it knows {known}")
+        known = (VOXEL_LAYER, *FEATURE_LAYERS, *checked_layers(self.feature_layer))
+        unfit = [layer for layer in self.layers if layer not in known]
+        _require(
+            not unfit, f"no vehicle of the fleet detects the layers {', '.join(unfit)}; it knows {', '.join(known)}"
+        )
         _require(VOXEL_LAYER in self.layers, f"layers must hold {VOXEL_LAYER!r}, on which vehicles localise")
         _require(len(set(self.layers)) == len(self.layers), f"layers {', '.join(self.layers)}: one comes twice")
 

@@ -21,7 +21,10 @@ from gnd.gnd_map.settings import settings_text
 @click.option("--work-dir", type=click.Path(path_type=Path), help="Cache, outbox and result.  [default: runs/VEHICLE]")
 @click.option("--pace", type=float, help="1 = real time, 0 = as fast as possible.  [default: 0]")
 @click.option("--mode", type=click.Choice(["default", "paper"]), help="Rules of change detection.")
-@click.option("--layers", help="Layers to keep up to date: ndt,signs,streetlights,poles.  [default: ndt]")
+@click.option(
+    "--layers",
+    help="Such as ndt,signs,streetlights,poles, or declared ones.  [default: ndt]",
+)
 @click.option(
     "--localise-by",
     type=click.Choice(["lidar", "slamcu", "graph"]),

@@ -8,6 +8,7 @@ from gnd.fleet_bus.config import DEFAULT_ENDPOINT
 from gnd.fleet_bus.links import LinkProfile
 from gnd.gnd_map.features import is_feature_layer
 from gnd.gnd_map.settings import check_settings, setting
+from gnd.schemas.feature_layer import LayerParameters
 from gnd.vehicle_agent.detect.parameters import DetectParameters
 from gnd.vehicle_agent.errors import AgentConfigError
 from gnd.vehicle_agent.features.layer_parameters import FeatureParameters
@@ -168,6 +169,11 @@ class AgentConfig:
     download: DownloadParameters = setting(DownloadParameters, "Download of tiles.")
     report: ReportParameters = setting(ReportParameters, "Reports.")
     features: FeatureParameters = setting(FeatureParameters, "Feature layers.")
+    feature_layer: tuple[LayerParameters, ...] = setting(
+        (),
+        "Feature layers that the user declares, beside signs, streetlights and poles; agents, shards and the tile"
+        " server read the same tables.",
+    )
     localise_by: LocaliseBy = setting(
         "lidar",
         "Scans on the voxel map; or, without LiDAR, a particle filter of motion, GNSS and the features of one layer"

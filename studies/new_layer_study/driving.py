@@ -19,10 +19,11 @@ from gnd.gnd_map.arrays import F64
 from gnd.gnd_map.features import Feature, FeatureTile, feature_id_of, pieces_of, prior
 from gnd.gnd_map.tile_id import TileId
 from gnd.schemas.drive import Detections, DriveItem, GnssFix
+from gnd.schemas.feature_layer import LayerParameters
 from gnd.schemas.features import FeatureReport
 from gnd.vehicle_agent.config import PipelineParameters
 from gnd.vehicle_agent.features.layer import pose_of
-from gnd.vehicle_agent.features.layer_parameters import FeatureParameters, LayerParameters
+from gnd.vehicle_agent.features.layer_parameters import FeatureParameters
 from gnd.vehicle_agent.features.mapping.graph_pipeline import GraphPipeline
 from gnd.vehicle_agent.features.slamcu.camera_pipeline import CameraPipeline
 from gnd.vehicle_agent.report.reporter import Identity
@@ -140,7 +141,6 @@ def _vehicle(drive: RoadDrive, vehicle: int) -> tuple[GnssFix, PipelineParameter
         tuple(sorted(set(route.features.kinds))),
         field_deg=float(np.degrees(view.width_rad)),
         range_m=view.range_m,
-        rate_hz=float(view.rate_hz),
         detection_confidence=CONFIDENCE,
     )
     fix, items = first_fix(items_of(drive), route.name)

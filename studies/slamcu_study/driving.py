@@ -17,15 +17,16 @@ from gnd.gnd_map.arrays import F64, I64
 from gnd.gnd_map.features import FeatureTile
 from gnd.gnd_map.tile_id import TileId
 from gnd.schemas.drive import Detections, DriveItem
+from gnd.schemas.feature_layer import LAYERS
 from gnd.schemas.features import FeatureChange, FeatureReport
 from gnd.vehicle_agent.config import PipelineParameters
-from gnd.vehicle_agent.features.coverage import CoverageParameters
 from gnd.vehicle_agent.features.layer import FeatureLayer, PlacedLook
-from gnd.vehicle_agent.features.layer_parameters import LAYERS, FeatureParameters
+from gnd.vehicle_agent.features.layer_parameters import FeatureParameters
 from gnd.vehicle_agent.features.layers import look_of
 from gnd.vehicle_agent.features.slamcu.camera_pipeline import CameraPipeline
+from gnd.vehicle_agent.features.slamcu.replay import PoseAt
 from gnd.vehicle_agent.features.slamcu.verdicts import KnownState, NewFeature
-from gnd.vehicle_agent.features.slamcu.watched import Lost, PoseAt
+from gnd.vehicle_agent.features.slamcu.watched import Lost
 from gnd.vehicle_agent.features.view import Occlusion
 from gnd.vehicle_agent.pipeline import Output
 from gnd.vehicle_agent.report.reporter import Identity
@@ -162,7 +163,7 @@ def _moved(one: PoseAt, T: F64) -> PoseAt:
 
 def _with_given_poses(drive: RoadDrive, variant: str, vehicle: int) -> Driven:
     """The signs as a vehicle judges them whose poses come from elsewhere: `FeatureLayer`, as behind the LiDAR."""
-    layer, route = FeatureLayer(_SIGNS, CoverageParameters(), drive.route.frame), drive.route
+    layer, route = FeatureLayer(_SIGNS, drive.route.frame), drive.route
     for tile in sign_tiles(route).values():
         layer.hold(tile)
     poses = _lidar_poses(drive, vehicle) if variant == "lidar" else _blind_poses(drive, vehicle)
@@ -224,7 +225,7 @@ def verdicts_of(drive: RoadDrive, driven: Driven) -> Verdicts:
         pose_chi2=pose_chi2(pose, cov, true),
         pose_given_up=given_up(driven),
         lost=np.array(
-            [(one.from_s, one.until_s, one.off_m, one.value, one.taken_back, one.told_anew) for one in driven.lost]
+            [(one.from_s, one.until_s, one.off_m, one.value, one.taken_back, one.replayed) for one in driven.lost]
         ).reshape(-1, 6),
         visible=(in_view & ~hidden).sum(axis=0).astype(np.int64),
         occluded=(in_view & hidden).sum(axis=0).astype(np.int64),
@@ -251,7 +252,7 @@ def given_up(driven: Driven) -> NDArray[np.bool_]:
     """Return bool (S,), the looks of stretches that the vehicle has given up."""
     t_s, lost = np.array([one.t_s for one in driven.path]), np.zeros(len(driven.path), np.bool_)
     for one in driven.lost:
-        lost |= (t_s >= one.from_s) & (t_s <= one.until_s) & (not one.told_anew)
+        lost |= (t_s >= one.from_s) & (t_s <= one.until_s) & (not one.replayed)
     return lost
 
 

@@ -18,20 +18,34 @@ from typing import Final
 import numpy as np
 
 from gnd.gnd_map.arrays import F64, I64
-from gnd.vehicle_agent.features.slamcu import measurement
+from gnd.vehicle_agent.features.slamcu import measurement, noise
 from gnd.vehicle_agent.features.slamcu.blind import BIAS, GNSS_X, HEADING, SCALE, STANDING_MPS, BlindBelief, X, Y
-from gnd.vehicle_agent.features.slamcu.parameters import SlamcuParameters
 from gnd.vehicle_agent.features.view import wrapped
 
 Prior = tuple[F64, F64]
 """Position (2,) and covariance (3,) xx, xy, yy."""
 FLOOR_PER_M2: Final = 1e-5
 """Density of a map feature's measured position if it is none: one chance in a thousand, somewhere within 100 m^2."""
+_RESAMPLE_BELOW: Final = 0.5
+"""α of Eq. (20): particles are resampled when their effective number falls below this share of M."""
+_JITTER: Final = 0.45
+"""h: a resampled particle keeps √(1-h²) of its distance from the mean; h of that of another pair makes up for it.
+0 is plain resampling."""
+_FLOOR: Final = 4e-4
+"""Density, 1/(m·rad), of a measurement that belongs to something else although it was associated: about one false
+alarm in fifty looks over 80 m x 40°. It keeps a wrong association from deciding about the particles."""
 _MOST_STAGES: Final = 20
+"""A likelihood is taken in at most so many steps."""
 
 
-class Rbpf:
-    """M particles.
+class ParticleFilter:
+    """M particles, each a pose with an EKF of every feature that is being estimated.
+
+    Args:
+        particles: M.
+        pose0: (3,) x, y [m], heading [rad] at the start.
+        cov0: (3, 3) its covariance.
+        rng: where chance comes from.
 
     Attributes:
         state: (7, M) x, y [m], heading [rad], wheel scale, gyro bias [rad/s], slow GNSS error [m].
@@ -44,15 +58,14 @@ class Rbpf:
         weighing: whether measurements weigh particles; not where poses are given.
     """
 
-    def __init__(self, parameters: SlamcuParameters, pose0: F64, cov0: F64, rng: np.random.Generator) -> None:
-        self._p, self.rng = parameters, rng
-        m = parameters.filter.particles
+    def __init__(self, particles: int, pose0: F64, cov0: F64, rng: np.random.Generator) -> None:
+        self.rng, m = rng, particles
         self.offsets = _standard(rng, m)
         self.state = np.zeros((7, m))
         self.place(pose0, cov0)
         if m > 1:
-            self.state[SCALE] = parameters.motion.scale * rng.standard_normal(m)
-            self.state[BIAS] = parameters.motion.bias_radps * rng.standard_normal(m)
+            self.state[SCALE] = noise.SCALE * rng.standard_normal(m)
+            self.state[BIAS] = noise.BIAS_RADPS * rng.standard_normal(m)
         self._gnss_var: float | None = None
         self.log_weight = np.zeros(m)
         self.mu = np.zeros((0, m, 2))
@@ -60,7 +73,6 @@ class Rbpf:
         self.priors: list[Prior | None] = []
         self.provisional: list[bool] = []
         self.weighing = True
-        self.resampled = 0
 
     @property
     def m(self) -> int:
@@ -92,12 +104,12 @@ class Rbpf:
         """Move every particle as the vehicle moved, with what wheels and gyro may be wrong by. Eq. (12)."""
         if abs(speed_mps) < STANDING_MPS:  # what a standing vehicle's gyro shows is its bias
             return
-        noise, root, s = self._p.motion, np.sqrt(dt_s), self.state
+        root, s = np.sqrt(dt_s), self.state
         if self.m > 1:
             e = self.rng.standard_normal((4, self.m)) * root
-            s[SCALE] += noise.scale_walk * e[2]
-            s[BIAS] += noise.bias_walk_radps * e[3]
-            way, turn = noise.speed_m * e[0], noise.yaw_rad * e[1]
+            s[SCALE] += noise.SCALE_WALK * e[2]
+            s[BIAS] += noise.BIAS_WALK_RADPS * e[3]
+            way, turn = noise.SPEED_M * e[0], noise.YAW_RAD * e[1]
         else:
             way, turn = np.zeros(1), np.zeros(1)
         way = way + speed_mps * dt_s * (1.0 + s[SCALE])
@@ -115,9 +127,8 @@ class Rbpf:
             sigma_m: of each axis, both together.
             dt_s: since the last fix.
         """
-        noise, s = self._p.gnss, self.state
-        fade = np.exp(-dt_s / noise.correlation_s)
-        white, slow = noise.white_share * sigma_m**2, (1.0 - noise.white_share) * sigma_m**2
+        s, fade = self.state, np.exp(-dt_s / noise.GNSS_CORRELATION_S)
+        white, slow = noise.gnss_variances_m2(sigma_m)
         before = slow if self._gnss_var is None else self._gnss_var
         var = before * fade**2 + (1.0 - fade**2) * slow
         s[GNSS_X:] *= fade
@@ -191,7 +202,7 @@ class Rbpf:
     def resample_if_needed(self) -> None:
         """Systematic resampling when the effective number of particles is small. Eq. (20), with squared weights."""
         weights = _normalised(self.log_weight)
-        if self.m > 1 and effective(weights) < self._p.filter.resample_below * self.m:
+        if self.m > 1 and effective(weights) < _RESAMPLE_BELOW * self.m:
             self._resample(weights)
 
     def moments(self, slot: int, weights: F64) -> tuple[F64, F64]:
@@ -218,7 +229,7 @@ class Rbpf:
         return measurement.update(self.state[:3], self.mu[slot], self.sigma[slot], z, variance)
 
     def _floored(self, log_likelihood: F64) -> F64:
-        return np.asarray(np.logaddexp(log_likelihood, np.log(max(self._p.filter.floor, 1e-300))))
+        return np.asarray(np.logaddexp(log_likelihood, np.log(max(_FLOOR, 1e-300))))
 
     def _off(self, xy_m: F64) -> F64:
         """(M,) squared distances of a fix from where each particle expects it."""
@@ -250,7 +261,7 @@ class Rbpf:
 
     def _bearable(self, log: F64, most: float) -> float:
         """The largest share of a log likelihood that leaves enough effective particles."""
-        enough = 0.9 * self._p.filter.resample_below * self.m
+        enough = 0.9 * _RESAMPLE_BELOW * self.m
 
         def bears(share: float) -> bool:
             return effective(_normalised(self.log_weight + share * log)) >= enough
@@ -267,13 +278,11 @@ class Rbpf:
         index = systematic(weights, float(self.rng.random()))
         self.log_weight = np.zeros(self.m)
         self.state, self.mu, self.sigma = self.state[:, index], self.mu[:, index], self.sigma[:, index]
-        self.resampled += 1
-        h = self._p.filter.jitter
-        if h > 0.0:
+        if _JITTER > 0.0:
             one, other = self.rng.permutation(self.m), self.rng.permutation(self.m)
             self.state[HEADING] = self.state[HEADING, 0] + wrapped(self.state[HEADING] - self.state[HEADING, 0])
-            self.state = _spread(self.state, 1, one, other, h)
-            self.mu = _spread(self.mu, 1, one, other, h)
+            self.state = _spread(self.state, 1, one, other, _JITTER)
+            self.mu = _spread(self.mu, 1, one, other, _JITTER)
 
 
 def _spread(values: F64, axis: int, one: I64, other: I64, h: float) -> F64:

@@ -7,23 +7,25 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from gnd.vehicle_agent.features.slamcu.existence_book import (
-    BookEntry,
-    ExistenceBook,
+from gnd.vehicle_agent.features.slamcu.tracked_feature import (
+    KNOWN_MASSES,
+    NEW_MASSES,
     FeatureClass,
+    TrackedFeature,
+    add_evidence,
+    bounded_below,
     counted,
-    doubted,
     existence_of,
+    recount,
 )
-from gnd.vehicle_agent.features.slamcu.parameters import SlamcuParameters
 
-BOOK = ExistenceBook(SlamcuParameters())
+CONFIDENCE = 0.9
 SETS = (frozenset({"yes"}), frozenset({"no"}), frozenset({"yes", "no"}))
 
 
-def entry(*, known: bool) -> BookEntry:
-    masses = BOOK.known_masses if known else BOOK.new_masses
-    return BookEntry(1, known, "sign", np.zeros(2), None, 0.0, masses)
+def entry(*, known: bool) -> TrackedFeature:
+    masses = KNOWN_MASSES if known else NEW_MASSES
+    return TrackedFeature(1, known, "sign", np.zeros(2), None, 0.0, masses)
 
 
 def by_enumeration(prior: np.ndarray, looks: list[bool]) -> np.ndarray:
@@ -46,7 +48,7 @@ def test_masses_after_a_sequence_of_looks(looks: list[bool], known: bool) -> Non
     one = entry(known=known)
     prior = one.masses
     for t, measured in enumerate(looks):
-        BOOK.evidence([one] if measured else [], [] if measured else [one], t)
+        add_evidence([one] if measured else [], [] if measured else [one], CONFIDENCE, t)
     want = by_enumeration(prior, looks)
     assert np.allclose(one.masses, want, atol=1e-9)
     assert np.allclose(counted(prior, sum(looks), len(looks) - sum(looks), 0.9), want, atol=1e-9)
@@ -56,7 +58,7 @@ def test_masses_after_a_sequence_of_looks(looks: list[bool], known: bool) -> Non
 @given(st.integers(0, 5000), st.integers(0, 5000), st.booleans())
 def test_any_number_of_looks_gives_masses(hits: int, misses: int, known: bool) -> None:
     one = entry(known=known)
-    BOOK.recount(one, hits, misses, 0)
+    recount(one, hits, misses, CONFIDENCE, 0)
     assert one.masses[:3].sum() == pytest.approx(1.0)
     assert (one.masses[:3] >= 0.0).all()
     assert 0.0 <= one.masses[3] <= 1.0
@@ -67,36 +69,36 @@ def test_any_number_of_looks_gives_masses(hits: int, misses: int, known: bool) -
 def test_no_mass_vanishes() -> None:
     one = entry(known=True)
     for t in range(500):
-        BOOK.evidence([one], [], t)
+        add_evidence([one], [], CONFIDENCE, t)
     assert one.masses[1] > 0.0
     for t in range(40):
-        BOOK.evidence([], [one], t)
+        add_evidence([], [one], CONFIDENCE, t)
     assert existence_of(one.masses).state == "absent"
 
 
 def test_history_is_bounded() -> None:
     one = entry(known=False)
     for t in range(3000):
-        BOOK.evidence([one], [], t)
+        add_evidence([one], [], CONFIDENCE, t)
     assert len(one.masses_over_time()) == 1024
     assert one.masses_over_time()[-1].t_ns == 2999
 
 
 def test_classes() -> None:
     known, new = entry(known=True), entry(known=False)
-    assert BOOK.classify(known) == FeatureClass.NORMAL
-    assert BOOK.classify(new) == FeatureClass.UNCLASSIFIED
-    BOOK.evidence([new], [known], 0)
-    BOOK.evidence([new], [known], 1)
-    assert BOOK.classify(known) == FeatureClass.DELETED
-    assert BOOK.classify(new) == FeatureClass.UNCLASSIFIED  # two false alarms at one place happen
-    BOOK.evidence([new], [], 2)
-    assert BOOK.classify(new) == FeatureClass.NEW
-    assert not BOOK.usable(known)
-    assert BOOK.usable(new)
+    assert known.feature_class == FeatureClass.NORMAL
+    assert new.feature_class == FeatureClass.UNCLASSIFIED
+    add_evidence([new], [known], CONFIDENCE, 0)
+    add_evidence([new], [known], CONFIDENCE, 1)
+    assert known.feature_class == FeatureClass.DELETED
+    assert new.feature_class == FeatureClass.UNCLASSIFIED  # two false alarms at one place happen
+    add_evidence([new], [], CONFIDENCE, 2)
+    assert new.feature_class == FeatureClass.NEW
+    assert not known.exists
+    assert new.exists
 
 
-def test_doubt_keeps_the_sum() -> None:
-    masses = doubted(np.array([[1.0, 0.0, 0.0, 0.5]]))
+def test_the_bound_keeps_the_sum() -> None:
+    masses = bounded_below(np.array([[1.0, 0.0, 0.0, 0.5]]))
     assert masses[0, :3].sum() == pytest.approx(1.0)
     assert masses[0, 1] > 0.0
