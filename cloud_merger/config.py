@@ -11,7 +11,6 @@ from gnd.cloud_merger.confirmation import ConfirmationParameters
 from gnd.cloud_merger.errors import MergerError
 from gnd.cloud_merger.features.parameters import FeatureMergeParameters
 from gnd.cloud_merger.merge import MergeParameters
-from gnd.cloud_merger.waiting import WaitingLimits
 from gnd.cloud_merger.wants import WantParameters
 from gnd.fleet_bus.config import DEFAULT_ENDPOINT
 from gnd.gnd_map.config import from_mapping
@@ -43,19 +42,13 @@ class ShardConfig:
         " `reach_m` is the layer's own. Undeclared layers take what vehicles report.",
     )
     want: WantParameters = setting(WantParameters, "Which Gaussians of reports in short are asked for.")
-    waiting: WaitingLimits = setting(
-        WaitingLimits,
-        "For how many reports, and how long, Gaussians that were asked for are not asked of others.",
-    )
     store: StoreConfig = setting(StoreConfig, "Batching of the store.")
     codec: str = setting(
         DEFAULT_CODEC,
         'How finely the Gaussians of tiles are rounded that no base map holds ("float": not at all); all '
         "shards of a store use the same. Other tiles stay as fine as their base.",
     )
-    tiles_at_once: int = setting(16, "Tiles claimed together; each is published as soon as it is merged.", least=1)
     expanders: int = setting(2, "Threads that look at what was acknowledged.", least=1)
-    uploads_at_once: int = setting(8, "Uploads that such a thread claims together.", least=1)
     lease_s: float = setting(
         10.0,
         "How long a claim holds that nobody renews: its shard has died or hangs.",
@@ -79,7 +72,6 @@ class ShardConfig:
         unit="s",
         least=0,
     )
-    announce_at_once: int = setting(256, "Publish a notice for at most so many versions in one round.", least=1)
 
     def __post_init__(self) -> None:
         if not _SHARD_ID.fullmatch(self.shard_id):

@@ -1,7 +1,7 @@
 """The bus as the rest of the project sees it: the only door to zenoh."""
 
 import threading
-from typing import Self, TypeVar
+from typing import Final, Self, TypeVar
 
 from gnd.fleet_bus import leftovers, requesting, subscribing
 from gnd.fleet_bus.config import BusConfig
@@ -23,6 +23,8 @@ from gnd.fleet_bus.wire import WireBytes
 from gnd.gnd_map.tile_id import TileId
 
 _DEFAULT_RETRY = RetryPolicy()
+PUBLISH_WAIT_S: Final = 10.0
+"""So long a notice waits for a lost router to come back."""
 
 
 _P = TypeVar("_P", bound=Part)
@@ -159,7 +161,7 @@ class Bus:
         return self._keep(serving)
 
     def publish(
-        self, key: str, payload: bytes, *, kind: str, tile: TileId | str | None = None, wait_s: float | None = None
+        self, key: str, payload: bytes, *, kind: str, tile: TileId | str | None = None, wait_s: float = PUBLISH_WAIT_S
     ) -> None:
         """Publishes a notice that its receivers can also read again: delivery is not confirmed.
 
@@ -170,13 +172,12 @@ class Bus:
             payload: encoded message.
             kind: ledger kind.
             tile: the tile it is about, for the ledger.
-            wait_s: how long to wait for a router, s; by default `BusConfig.publish_wait_s`.
+            wait_s: how long to wait for a router, s.
 
         Raises:
             NoRouter: there was none, so nothing was published.
             MessageTooLarge, BusClosed.
         """
-        wait_s = self.config.publish_wait_s if wait_s is None else wait_s
         subscribing.publish(self._connection, key, payload, kind=kind, tile=tile, wait_s=wait_s)
 
     def advanced_publisher(self, key: str, *, kind: str = "update", remember: int = 1) -> RecallingPublisher:

@@ -37,7 +37,6 @@ class DownloadParameters:
     ahead_m: float = setting(
         120.0, "How far along the heading tiles are asked for in advance, at least.", unit="m", least=0
     )
-    ahead_s: float = setting(15.0, "The same in time: a faster vehicle looks farther.", unit="s", least=LEAD_S)
     in_flight: int = setting(8, "Requests at a time; one at a time leaves a 5G link at 15 %.", least=1, most=64)
     request_s: float = setting(20.0, "Time for one request, its retries included.", unit="s", above=0)
     retry_s: float = setting(1.0, "Pause after a request that failed.", unit="s", least=0)

@@ -11,7 +11,7 @@ from click.testing import CliRunner
 
 from gnd.cloud_merger.config import ShardConfig
 from gnd.deploy.cli import gnd
-from gnd.deploy.configuration_page import page, programs
+from gnd.deploy.configuration_page import page, settings_class
 from gnd.deploy.fleet_config import FleetConfig, load_fleet_config
 from gnd.fleet_bus.settings_file import layers_of, load_settings, read_toml, write_settings
 from gnd.gnd_map.errors import ConfigError, GndError
@@ -29,7 +29,7 @@ BARE: dict[str, Any] = {
 }
 WORDS = {
     "shard_id": "merger-7", "codec": "float", "link": "3g", "layer": "ndt2", "vehicle": "w", "localise_by": "lidar",
-    "wrong_mounts": ("3:0.5",), "detect_mode": "paper", "merge_mode": "paper", "connect": ("tcp/10.0.0.1:7448",),
+    "wrong_mounts": ("3:0.5",), "connect": ("tcp/10.0.0.1:7448",),
     "layers": ("ndt", "signs"), "passing_rule": "ahead", "protocol": "full", "mode": "paper",
 }  # fmt: skip
 
@@ -97,7 +97,7 @@ def test_every_value_changed_means_every_value(program: str) -> None:
 
 @pytest.mark.parametrize("program", list(BARE))
 def test_every_setting_is_explained(program: str) -> None:
-    for row in described(programs()[program][0]):
+    for row in described(settings_class(program)):
         assert row.setting.effect[:1].isupper() or row.setting.effect.startswith(("...", "…", "`", '"', "λ", "η")), row
         assert row.setting.effect.rstrip().endswith((".", "...", "…")), row
         lengths = {"_m": "m", "_s": "s", "_rad": "rad", "_deg": "deg", "_ms": "ms"}

@@ -1,6 +1,12 @@
-"""The style sheet of the traffic page."""
+"""Pages as one HTML file: no script, nothing from elsewhere, readable on a phone, light and dark."""
 
+import contextlib
+import os
+from collections.abc import Iterable
+from pathlib import Path
 from typing import Final
+
+from gnd.deploy.errors import PageError
 
 STYLE: Final = """
 :root{--paper:#fcfcfb;--ink:#1b1f24;--soft:#5d6670;--rule:#d9dde1;--card:#f2f4f5;--down:#1f7a4d;--up:#7a4fb0;
@@ -47,3 +53,52 @@ dt{font-weight:600}dd{margin:0 0 .6rem;color:var(--soft);font-size:.9rem;overflo
 th{white-space:normal}h2{margin-top:1.5rem}}
 @media print{details{display:block}}
 """
+_HEAD: Final = """<meta charset="utf-8"><meta name="viewport" content="width=device-width, initial-scale=1">
+<meta name="color-scheme" content="light dark">"""
+
+
+def document(title: str, body: Iterable[str], more_style: str = "") -> str:
+    """A whole page; title, and the pieces of the body one after the other, are HTML already."""
+    content = "\n".join(body)
+    head = f"{_HEAD}<title>{title}</title><style>{STYLE}{more_style}</style>"
+    return f'<!doctype html>\n<html lang="en"><head>{head}</head>\n<body><main>\n{content}\n</main></body></html>\n'
+
+
+def section(title: str, content: str) -> str:
+    """A part of a page; without a title it belongs to the part before."""
+    head = f"<h2>{title}</h2>\n" if title else ""
+    return f"<section>{head}{content}</section>"
+
+
+def card_list(items: Iterable[tuple[str, str]]) -> str:
+    """Large values, each with what it is."""
+    return f'<ul class="cards">{"".join(f"<li><b>{value}</b><span>{what}</span></li>" for value, what in items)}</ul>'
+
+
+def check_writable(path: Path) -> None:
+    """Refuse a place that cannot hold a page.
+
+    Raises:
+        PageError: it is a folder, or lies in none.
+    """
+    if path.is_dir():
+        raise PageError(f"cannot write the page {path}: that is a folder, name a file in it")
+    if not path.parent.is_dir():
+        raise PageError(f"cannot write the page {path}: the folder {path.parent} does not exist")
+
+
+def write_html(path: Path, text: str) -> None:
+    """Write a page; an earlier one is replaced at once.
+
+    Raises:
+        PageError: the file cannot be written.
+    """
+    check_writable(path)
+    partial = path.with_name(f"{path.name}.{os.getpid()}.partial")
+    try:
+        partial.write_text(text, encoding="utf-8")
+        partial.replace(path)
+    except OSError as error:
+        with contextlib.suppress(OSError):  # where nothing can be written nothing is left
+            partial.unlink()
+        raise PageError(f"cannot write the page {path}: {error.strerror}") from error
