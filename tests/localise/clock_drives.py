@@ -1,15 +1,8 @@
-"""What a clock of wheels and gyro that differs from the LiDAR's does to poses, and how well its offset is found.
-
-Drives that brake, accelerate and swerve through streets that have changed since their map; the stamps of the motion
-samples are shifted by so many milliseconds before the localiser sees them. Decision 0086.
-"""
+"""Drives that brake, accelerate and swerve, with the stamps of the motion samples shifted against the scans'."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from tempfile import TemporaryDirectory
-
-import numpy as np
 
 from gnd.fleet_sim.drives import DriveConfig, DriveSimulation, simulate_drive
 from gnd.fleet_sim.street import street
@@ -18,15 +11,11 @@ from gnd.gnd_map.motion import Trajectory
 from gnd.schemas.drive import DriveHeader, DriveItem, MotionSample
 from gnd.schemas.drive_mcap import DriveWriter, read_drive
 from gnd.vehicle_agent.local_map import LocalMap
-from gnd.vehicle_agent.localise import Localiser, PoseEstimate, localisation_error
+from gnd.vehicle_agent.localise import Localiser, PoseEstimate
+from gnd.vehicle_agent.pipeline import Output
 from gnd.vehicle_agent.sources.recording import first_fix
 from gnd.vehicle_agent.tiles_at_hand import localising_on
-from studies.frame.measure import Figure
-from studies.localisation_scenes import MAPPING, map_of, note_newest, reference_of
-
-DRIVES = ((3, "VLP-16"), (3, "HDL-64E"), (11, "VLP-16"), (12, "VLP-16"))
-OFFSETS_MS = (0, -50, 50)
-SCANS = 150
+from studies.localisation_scenes import MAPPING, map_of, reference_of
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -89,26 +78,8 @@ def _shifted(items: Sequence[DriveItem], offset_s: Callable[[float], float]) -> 
     return sorted(shifted, key=lambda item: item.t_ns)
 
 
-def run() -> list[Figure]:
-    """Measure the drives at each offset."""
-    figures: list[Figure] = []
-    with TemporaryDirectory() as folder:
-        for seed, sensor in DRIVES:
-            recorded = brisk_drive(seed, sensor, SCANS, Path(folder))
-            figures += [_figure(f"street {seed}, {sensor}", recorded, ms) for ms in OFFSETS_MS]
-    return figures
-
-
-def _figure(name: str, recorded: ClockDrive, offset_ms: int) -> Figure:
-    made = driven(recorded, lambda _: offset_ms * 1e-3)
-    refined, online = (localisation_error(poses, recorded.reference) for poses in (made.refined, made.online))
-    known = made.localiser.calibration
-    good = float(np.mean([pose.health == "good" for pose in made.refined]))
-    return Figure(
-        f"refined along, 95 %, {offset_ms:+d} ms, {name}",
-        100.0 * refined.longitudinal_p95_m,
-        "cm",
-        f"found {known.time_offset_s * 1e3:+.1f} ± {known.time_offset_sigma_s * 1e3:.1f} ms; across"
-        f" {refined.lateral_p95_m * 100:.1f} cm, {refined.heading_p95_deg:.3f}°; online"
-        f" {online.longitudinal_p95_m * 100:.1f} cm, {online.lateral_p95_m * 100:.1f} cm; {good:.0%} good",
-    )
+def note_newest(output: Output, estimates: list[PoseEstimate]) -> None:
+    """Append the online pose when it is a new one that is not lost."""
+    online = output.online
+    if online is not None and online.health != "lost" and (not estimates or online.t_ns > estimates[-1].t_ns):
+        estimates.append(online)

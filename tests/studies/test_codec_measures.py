@@ -1,23 +1,17 @@
-"""The measures of `python -m studies codec`: divergence, pose shift, peers."""
-
-from pathlib import Path
+"""What codecs are measured by: divergence, pose shift, the plain message beside."""
 
 import numpy as np
 import pytest
 from scipy.stats import multivariate_normal
 
 from gnd.gnd_map.accumulate import VoxelAccumulator
-from gnd.gnd_map.codec import CODECS, LATTICES
+from gnd.gnd_map.codec import LATTICES, snap
 from gnd.gnd_map.errors import ShapeError
 from gnd.gnd_map.gaussian import Gaussians, full_matrices
 from gnd.gnd_map.geodesy import LocalFrame
 from gnd.gnd_map.grid import GridFrame
-from gnd.gnd_map.tile import Tile
 from gnd.gnd_map.tile_id import TileId, covering_circle
-from gnd.tile_store.sqlite_store import SqliteStore
-from studies.codec import CodecOptions, decoded_on, run
-from studies.codec_scenes import FLOOR_M, SEED, _tile_class, kl_median, kl_nats, plain_protobuf, pose_shift_cm, stored
-from studies.frame.options import of_arguments
+from studies.codec_scenes import FLOOR_M, _tile_class, kl_median, kl_nats, plain_protobuf, pose_shift_cm
 
 TILE = TileId(497353963154)
 
@@ -85,7 +79,7 @@ def test_poses_move_as_the_map_does(room: tuple[GridFrame, dict[TileId, Gaussian
     assert pose_shift_cm(grid_frame, tiles, tiles, scans) == pytest.approx(np.zeros(7), abs=1e-9)
     off = {tile_id: moved(g, (0.01, -0.02, 0.0)) for tile_id, g in tiles.items()}
     assert np.median(pose_shift_cm(grid_frame, tiles, off, scans)) == pytest.approx(np.sqrt(5.0), rel=0.1)
-    snapped = decoded_on(tiles, LATTICES["archive"])
+    snapped = {tile_id: snap(g, LATTICES["archive"]) for tile_id, g in tiles.items()}
     assert np.median(pose_shift_cm(grid_frame, tiles, snapped, scans)) < 0.5
 
 
@@ -106,22 +100,3 @@ def test_the_papers_way_to_write_a_tile(number: str, least: int, most: int) -> N
     assert [voxel.id for voxel in tile.voxels] == g.voxel_id.tolist()
     assert np.array_equal([voxel.mean for voxel in tile.voxels], g.mean_m)
     assert np.array_equal([voxel.covariance for voxel in tile.voxels], g.cov_m2)
-
-
-def test_a_store_is_measured_without_scans(tmp_path: Path) -> None:
-    with SqliteStore(tmp_path / "map.sqlite") as store:
-        store.put_tiles([Tile(TILE, 1, gaussians(7, 300))])
-    assert stored(tmp_path / "map.sqlite").voxels == 300
-    figures = run(CodecOptions(store=tmp_path / "map.sqlite", recordings=tmp_path))
-    names = " | ".join(figure.name for figure in figures)
-    for codec in CODECS.values():
-        assert f"codec {codec.codec_id}, {codec.name}: decode" in names
-    assert "pose shift" not in names
-    assert "kitti00_start16: not measured" in names
-    sizes = {figure.name: figure.value for figure in figures if figure.unit == "B/voxel"}
-    assert sizes["map.sqlite: codec 0, float32 columns"] == pytest.approx(48 + 4 / 300)
-
-
-def test_options_of_the_command_line() -> None:
-    assert of_arguments(CodecOptions, []).seed == SEED
-    assert of_arguments(CodecOptions, ["--seed", "102", "--base", "base.npz"]) == CodecOptions(102, Path("base.npz"))
