@@ -3,10 +3,13 @@ PYTHON ?= python3.11
 VENV := .venv
 BIN := $(VENV)/bin
 ARGS ?=
+# Tests run in two processes: many of them start fleets of their own, more would only wait for each other.
+TESTERS ?= $(shell [ "$$(nproc)" -gt 1 ] && echo 2 || echo 0)
+SIDE_BY_SIDE = -n $(TESTERS) --dist loadscope
 export OPENBLAS_NUM_THREADS ?= 1
 export NUMBA_NUM_THREADS ?= 1
 
-.PHONY: help setup fleet test quick check docs bench schemas clean
+.PHONY: help setup fleet test quick check docs extras bench studies schemas clean
 
 help:            ## list the targets
 	@grep -hE '^[a-z]+:.*##' $(MAKEFILE_LIST) | sed 's/:.*##/\t/'
@@ -22,10 +25,10 @@ fleet: setup     ## run the fleet: make fleet ARGS="--agents 4 --link 3g"
 	$(BIN)/gnd fleet $(ARGS)
 
 test: setup      ## run every test
-	$(BIN)/pytest $(ARGS)
+	$(BIN)/pytest $(SIDE_BY_SIDE) $(ARGS)
 
 quick: setup     ## run the tests that take less than five seconds each
-	$(BIN)/pytest -m "not slow" $(ARGS)
+	$(BIN)/pytest $(SIDE_BY_SIDE) -m "not slow" $(ARGS)
 
 check: setup     ## what CI runs beside the tests: style, types, layers, generated code, documents, and that all tests can be read together
 	$(BIN)/ruff check .
@@ -40,7 +43,22 @@ check: setup     ## what CI runs beside the tests: style, types, layers, generat
 docs: setup      ## build the documents as a site: build/site/index.html
 	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --quiet --strict
 
-bench: setup     ## print the benchmarks with their commands
+extras:          ## install each extra alone into an environment of its own, and run what it is for (some three minutes)
+	rm -rf build/extras && mkdir -p build/extras
+	set -e; for extra in sim vehicle cloud client; do $(PYTHON) -m venv build/extras/$$extra; \
+	  build/extras/$$extra/bin/pip install --quiet --disable-pip-version-check -c constraints.txt $$(test $$extra = client && echo . || echo ".[$$extra]"); done
+	cd build/extras && sim/bin/gnd sim world write street.json --seed 11 --length 100
+	cd build/extras && sim/bin/gnd sim drive street.json drive.mcap --sensor vlp16 --cars 0
+	cd build/extras && vehicle/bin/gnd map build -o map.sqlite drive.mcap
+	cd build/extras && vehicle/bin/gnd localise drive.mcap --map map.sqlite --out poses
+	cd build/extras && cloud/bin/gnd merger --help > merger.txt && cloud/bin/gnd map verify map.sqlite
+	cd build/extras && client/bin/gnd map info map.sqlite && client/bin/python -c "import gnd; print(len(gnd.Map('map.sqlite').gaussians()))"
+
+bench: setup     ## measure speed beside others who do the same work, on this machine: docs/benchmarks.md
+	$(BIN)/pip install --quiet --disable-pip-version-check -c constraints.txt -e '.[peers]'
+	$(BIN)/python -m studies.speed --out docs/benchmarks.md $(ARGS)
+
+studies: setup   ## print the studies' small benchmarks with their commands: make studies ARGS="codec --json"
 	$(BIN)/python -m studies $(ARGS)
 
 schemas: setup   ## generate Python from schemas/*.proto

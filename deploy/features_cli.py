@@ -44,13 +44,13 @@ def features() -> None:
     "--layer", "layers", multiple=True, metavar="KIND=LAYER", help=f"Layer of a kind; {LEFT_OUT}: leave it out."
 )
 @click.option("--other", metavar="LAYER", help="Layer of all kinds without one.  [default: they are left out]")
-@click.option("--source", help="What the file is known by; imported again, it replaces itself.  [default: its name]")
+@click.option("--source", help="Name of the source; importing it again replaces its features.  [default: file name]")
 @click.option("--georeference", metavar="WHERE", help=GEOREFERENCE_HELP)
 @click.option("--poses", type=PATH, help="Track in the local coordinates: 3 x 4 matrices (KITTI).")
 @click.option("--fixes", type=PATH, help="GNSS of that track: lines of LAT LON in degrees.")
 @click.option("--height-offset", default=0.0, metavar="METRES", help="Added to heights, which makes them ellipsoidal.")
 @click.option("--sigma", default=SIGMA_M, show_default=True, metavar="METRES", help="Of positions, each axis.")
-@click.option("--exist", default=SURE, show_default=True, help="Mass of existence of what a map holds.")
+@click.option("--exist", default=SURE, show_default=True, help="Mass of existence of the features of the file.")
 @click.option("--city", help="Of an Argoverse 2 map: PIT, ...  [default: by the file's name]")
 @json_option
 def import_(
@@ -191,7 +191,7 @@ def _row(feature: MapFeature) -> dict[str, Any]:
 @click.argument("feature_id", metavar="ID", type=int)
 @json_option
 def show_(path: Path, feature_id: int, as_json: bool) -> None:
-    """All that STORE says of the feature ID: as GeoJSON, its tiles, and the reports that it comes from."""
+    """One feature of STORE: as GeoJSON, with its tiles and the reports that it comes from."""
     with SqliteStore(path, create=False) as store:
         found = [one for one in load_features(store) if one.feature_id == feature_id]
         if not found:

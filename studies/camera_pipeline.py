@@ -19,8 +19,8 @@ from gnd.schemas.features import FeatureReport
 from gnd.vehicle_agent.config import PipelineParameters
 from gnd.vehicle_agent.features.layer_parameters import FeatureParameters
 from gnd.vehicle_agent.features.slamcu.camera_pipeline import CameraPipeline
-from gnd.vehicle_agent.features.slamcu.existence_book import FeatureClass
 from gnd.vehicle_agent.features.slamcu.parameters import SlamcuParameters
+from gnd.vehicle_agent.features.slamcu.tracked_feature import FeatureClass
 from gnd.vehicle_agent.place import Place
 from gnd.vehicle_agent.report.reporter import Identity
 from gnd.vehicle_agent.sources.recording import first_fix
@@ -89,5 +89,5 @@ def reported(drive: RoadDrive) -> tuple[dict[int, bool], int, int]:
     bodies += [report.body for report in pipeline.finish().reports]
     tiles = [change for body in bodies for change in FeatureReport.decode(body).tiles]
     there = {one.feature_id: one.existence.exist > one.existence.absent for tile in tiles for one in tile.seen}
-    given_up = 0 if pipeline.slamcu is None else sum(not one.told_anew for one in pipeline.slamcu.lost)
+    given_up = 0 if pipeline.slamcu is None else sum(not one.replayed for one in pipeline.slamcu.lost)
     return there, int(np.sum([len(tile.found) for tile in tiles])), given_up

@@ -26,7 +26,7 @@ from gnd.vehicle_agent.importers.lidar_odometry import Progress
 from gnd.vehicle_agent.importers.recording import NOMINAL
 from gnd.vehicle_agent.local_map import LocalMap
 from gnd.vehicle_agent.localise.match_map import MatchMapCache
-from gnd.vehicle_agent.localise.parameters import LocaliserParameters, RegistrationParameters
+from gnd.vehicle_agent.localise.parameters import ON_MAP, LocaliserParameters, RegistrationParameters
 from gnd.vehicle_agent.localise.registration import register
 from gnd.vehicle_agent.localise.sampling import sample_scan
 from studies.frame.scans import local_map_of, posed
@@ -40,7 +40,7 @@ PosedScan = tuple[F64, F64]
 
 FLOOR_M = 0.001
 """Added to every axis of both Gaussians, so that a plane without thickness has a finite divergence from itself."""
-EXACT = replace(RegistrationParameters(), stop_m=1e-6, stop_rad=1e-7, max_iterations=60)
+EXACT = RegistrationParameters(rules=replace(ON_MAP, stop_m=1e-6, stop_rad=1e-7, max_iterations=60))
 """To the optimum: the vehicle's own steps stop at 0.05 cm, about what is measured here."""
 
 

@@ -152,8 +152,8 @@ def steps_of(path: Path) -> tuple[Trajectory, float]:
             motion.push(item.t_ns, item.speed_mps, item.yaw_rate_radps)
         elif isinstance(item, Scan):
             scans.append(item)
-    teacher = MotionTeacher(motion, parameters.odometry)
-    odometry = ScanOdometry(parameters.scan_odometry, parameters.registration.noise_m)
+    teacher = MotionTeacher(motion)
+    odometry = ScanOdometry(parameters.registration.noise_m)
     T_vehicle_lidar, T = read_header(path).T_vehicle_lidar, np.eye(4)
     times_ns: list[int] = []
     poses: list[F64] = []

@@ -22,6 +22,7 @@ from gnd.cloud_merger.announce import encoded, update_of
 from gnd.cloud_merger.config import ShardConfig
 from gnd.cloud_merger.expander import Expander
 from gnd.cloud_merger.ingest import Ingest
+from gnd.cloud_merger.merger import TILES_AT_ONCE
 from gnd.cloud_merger.stored import Bases
 from gnd.cloud_merger.verify import Verifier
 from gnd.cloud_merger.warm import warm_up
@@ -95,7 +96,7 @@ class _Cloud:
     def _merge(self) -> None:
         config = self.config
         with self.costs.of("merges"):
-            claims = self.store.claim(config.shard_id, config.tiles_at_once, config.lease_s, self._expander.districts)
+            claims = self.store.claim(config.shard_id, TILES_AT_ONCE, config.lease_s, self._expander.districts)
             self._worker.begin(claims)
             results = [one for some in in_turn(claims) for one in self._worker.settle_some(some)]
         self.costs.count["merges"] += len(results)

@@ -5,7 +5,7 @@ the gyro (50 Hz), fixes of the GNSS (1 Hz), association, existence, features, we
 of `gnd.fleet_sim.roads.motorway`, whole; beside the time stand the classes and the positions that it buys.
 """
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from math import radians
 from time import perf_counter
 from typing import Final
@@ -46,9 +46,8 @@ def run(chosen: SlamcuStepOptions | None = None) -> list[Figure]:
 
 
 def _figure(drives: list[RoadDrive], particles: int) -> Figure:
-    shipped = SlamcuParameters()
-    number = particles or shipped.filter.particles
-    parameters = replace(shipped, filter=replace(shipped.filter, particles=number))
+    number = particles or SlamcuParameters().particles
+    parameters = SlamcuParameters(particles=number)
     timed = [timed_drive(drive, parameters) for drive in drives]
     steps_ms = np.concatenate([steps for _, steps in timed])
     scores = [scored(drive, slamcu) for drive, (slamcu, _) in zip(drives, timed, strict=True)]

@@ -1,12 +1,25 @@
-"""Fixtures that every test may use."""
+"""Fixtures that every test may use, and how the suite is dealt out to processes (`pytest -n 2 --dist loadscope`)."""
 
+import os
 import signal
-import socket
+import subprocess
+import sys
 from pathlib import Path
 
 import pytest
+from suite_groups import (
+    pytest_collection_modifyitems,
+    pytest_configure_node,
+    pytest_xdist_make_scheduler,
+)
+from suite_ports import new_port
 
-SHARED_DATA = Path(__file__).resolve().parents[2] / "shared" / "data"
+# Hooks that pytest finds here.
+__all__ = ["pytest_collection_modifyitems", "pytest_configure_node", "pytest_xdist_make_scheduler"]
+
+ROOT = Path(__file__).resolve().parents[1]
+SHARED_DATA = ROOT.parent / "shared" / "data"
+WARM_UP = "from gnd.vehicle_agent import warm as v; from gnd.cloud_merger import warm as c; v.warm_up(); c.warm_up()"
 
 
 def pytest_configure() -> None:
@@ -20,6 +33,16 @@ def pytest_configure() -> None:
         signal.signal(signal.SIGINT, signal.default_int_handler)
 
 
+@pytest.hookimpl(optionalhook=True)
+def pytest_xdist_setupnodes() -> None:
+    """Compile the kernels of vehicle and cloud before the processes start: on a new machine each would compile them.
+
+    And numba takes no lock on its index of a kernel: of two signatures written at the same moment it may mix up the
+    files.
+    """
+    subprocess.run([sys.executable, "-c", WARM_UP], check=True, env={**os.environ, "PYTHONPATH": str(ROOT / "src")})
+
+
 @pytest.fixture(scope="session")
 def shared_data() -> Path:
     """The folder of real recordings; a test that needs it skips where it is missing."""
@@ -31,6 +54,4 @@ def shared_data() -> Path:
 @pytest.fixture
 def free_port() -> int:
     """A TCP port on the loopback interface that was free a moment ago."""
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        return int(probe.getsockname()[1])
+    return new_port()

@@ -8,6 +8,7 @@ from gnd.fleet_bus.config import DEFAULT_ENDPOINT
 from gnd.fleet_bus.links import LinkProfile
 from gnd.gnd_map.features import is_feature_layer
 from gnd.gnd_map.settings import check_settings, setting
+from gnd.schemas.feature_layer import LayerParameters
 from gnd.vehicle_agent.detect.parameters import DetectParameters
 from gnd.vehicle_agent.errors import AgentConfigError
 from gnd.vehicle_agent.features.layer_parameters import FeatureParameters
@@ -36,8 +37,6 @@ class DownloadParameters:
     ahead_m: float = setting(
         120.0, "How far along the heading tiles are asked for in advance, at least.", unit="m", least=0
     )
-    ahead_s: float = setting(15.0, "The same in time: a faster vehicle looks farther.", unit="s", least=LEAD_S)
-    link_share: float = setting(0.8, "Part of the link's rate that the plan counts on.", above=0, most=1)
     in_flight: int = setting(8, "Requests at a time; one at a time leaves a 5G link at 15 %.", least=1, most=64)
     request_s: float = setting(20.0, "Time for one request, its retries included.", unit="s", above=0)
     retry_s: float = setting(1.0, "Pause after a request that failed.", unit="s", least=0)
@@ -65,27 +64,15 @@ class DownloadParameters:
 class ReportParameters:
     """When a tile is left, when a report is sent, which poses may make statements."""
 
-    left_behind_m: float = setting(
-        54.0,
-        "A tile farther from the vehicle gets no more evidence: its classes are decided. More than the range of"
-        " detection by what the LiDAR stands from the vehicle's origin and what it drives during a scan.",
-        unit="m",
-        above=0,
-    )
-    soon_s: float = setting(
-        0.3,
-        "Where much has changed, the report waits this long for tiles that are left together with the first ...",
-        unit="s",
-        least=0,
-    )
     soon_voxels: int = setting(
         48,
-        "... much: so many voxels of one tile. On ground that has not changed, detection errs in up to some 30.",
+        "Where so many voxels of one tile have changed, a report is due at once. On ground that has not changed,"
+        " detection errs in up to some 30.",
         least=1,
     )
     apart_s: float = setting(
         3.0,
-        "Such reports follow each other no faster than this; at least `soon_s`.",
+        "Such reports follow each other no faster than this.",
         unit="s",
         least=0,
     )
@@ -99,7 +86,7 @@ class ReportParameters:
     )
     unchanged_m: float = setting(
         1000.0,
-        "Ground that is as the map says: at the latest after this much way (at least `longest_m`) ...",
+        "Ground that is unchanged: reported at the latest after this much way (at least `longest_m`) ...",
         unit="m",
         least=0,
     )
@@ -130,13 +117,39 @@ class ReportParameters:
     def __post_init__(self) -> None:
         """A protocol that there is, and waiting times in order."""
         check_settings(self, AgentConfigError)
-        waits_s = (self.soon_s, self.apart_s, self.longest_s, self.unchanged_s)
+        waits_s = (self.apart_s, self.longest_s, self.unchanged_s)
         if sorted(waits_s) != list(waits_s):
-            raise AgentConfigError(f"soon_s, apart_s, longest_s and unchanged_s = {waits_s} s must rise")
+            raise AgentConfigError(f"apart_s, longest_s and unchanged_s = {waits_s} s must rise")
         if self.longest_m > self.unchanged_m:
             raise AgentConfigError(f"longest_m = {self.longest_m}, unchanged_m = {self.unchanged_m} m must rise")
         if self.protocol not in ("packed", "full"):
             raise AgentConfigError(f"protocol = {self.protocol!r}: there are 'packed' and 'full'")
+
+
+@dataclass(frozen=True, slots=True)
+class LiveParameters:
+    """Where a vehicle that drives now gets its measurements (`--live`)."""
+
+    source: Literal["", "ros2", "zenoh"] = setting(
+        "", "Topics of ROS 2 over rmw_zenoh, or the plain keys of `gnd play --zenoh`; empty: a recording is driven."
+    )
+    connect: tuple[str, ...] = setting((DEFAULT_ENDPOINT,), "Endpoints of the router of the vehicle's own sensors.")
+    domain: int = setting(0, "ROS_DOMAIN_ID.", least=0, most=232)
+    points: str = setting("", "Topic of the LiDAR's sweeps; the only one of its type where it is not named.")
+    gnss: str = setting("", "Topic of positions; likewise.")
+    speed: str = setting("", "Topic whose twist gives speed and yaw rate: Odometry or TwistStamped; likewise.")
+    imu: str = setting("", "Topic of a gyro that gives the yaw rate instead; empty: none.")
+    vehicle_frame: str = setting("", "Frame of the vehicle, x forward; empty: base_footprint, base_link, ...")
+    mount: tuple[float, ...] = setting(
+        (), "x, y, z (m), roll, pitch, yaw (deg) of the LiDAR in the vehicle; empty: /tf_static tells."
+    )
+    silent_s: float = setting(0.0, "The drive ends once nothing has come for so long; 0: never.", unit="s", least=0)
+
+    def __post_init__(self) -> None:
+        """Numbers that can be."""
+        check_settings(self, AgentConfigError)
+        if len(self.mount) not in (0, 6):
+            raise AgentConfigError(f"live.mount = {list(self.mount)}: x, y, z, roll, pitch, yaw are needed")
 
 
 @dataclass(frozen=True, slots=True)
@@ -159,7 +172,7 @@ class AgentConfig:
     """
 
     vehicle: str = setting(..., "Pseudonym of the vehicle.")
-    drive: Path = setting(..., "Recording (MCAP) to drive.")
+    drive: Path | None = setting(..., "Recording (MCAP) to drive; none where the vehicle drives now.")
     work_dir: Path = setting(..., "Folder of cache, outbox and result.")
     connect: tuple[str, ...] = setting((DEFAULT_ENDPOINT,), "Endpoints of routers, tried in order.")
     link: str | LinkProfile = setting("none", "Mobile link to feel: 3g, 4g, 5g, none or a TOML file.")
@@ -175,12 +188,18 @@ class AgentConfig:
     )
     departure: Departure | None = None
     ledger_dir: Path | None = setting(None, "Folder of the traffic ledger; by default `ledger` beside `work_dir`.")
+    live: LiveParameters = setting(LiveParameters, "Topics of a vehicle that drives now.")
     localise: LocaliserParameters = setting(LocaliserParameters, "Localisation.")
     segment: SegmentParameters = setting(SegmentParameters, "Segmentation of what moves.")
     detect: DetectParameters = setting(DetectParameters, "Detection of changes.")
     download: DownloadParameters = setting(DownloadParameters, "Download of tiles.")
     report: ReportParameters = setting(ReportParameters, "Reports.")
     features: FeatureParameters = setting(FeatureParameters, "Feature layers.")
+    feature_layer: tuple[LayerParameters, ...] = setting(
+        (),
+        "Feature layers that the user declares, beside signs, streetlights and poles; agents, shards and the tile"
+        " server read the same tables.",
+    )
     localise_by: LocaliseBy = setting(
         "lidar",
         "Scans on the voxel map; or, without LiDAR, a particle filter of motion, GNSS and the features of one layer"
@@ -190,6 +209,8 @@ class AgentConfig:
     def __post_init__(self) -> None:
         """A name and a pace that can work."""
         check_settings(self, AgentConfigError)
+        if (self.drive is None) == (not self.live.source):
+            raise AgentConfigError("one of the two is needed: a recording (--drive FILE), or --live ros2|zenoh")
         if not self.vehicle:
             raise AgentConfigError("the vehicle needs a name (its pseudonym)")
         if is_feature_layer(self.layer):
@@ -198,11 +219,6 @@ class AgentConfig:
             raise AgentConfigError(f"localise_by = {self.localise_by!r}: there are {', '.join(get_args(LocaliseBy))}")
         if self.localise_by != "lidar" and not self.features.layers:
             raise AgentConfigError("a vehicle without LiDAR maps features: name at least one feature layer")
-        if self.report.left_behind_m <= self.detect.range_max_m:
-            raise AgentConfigError(
-                f"left_behind_m = {self.report.left_behind_m} must exceed the range of detection,"
-                f" {self.detect.range_max_m} m: a tile would be left while rays still reach it"
-            )
 
     @property
     def ledger_path(self) -> Path:
@@ -217,4 +233,4 @@ class AgentConfig:
     @property
     def waits_for_tiles(self) -> bool:
         """A drive that is not paced would otherwise outrun any link."""
-        return self.pace == 0
+        return self.pace == 0 and not self.live.source

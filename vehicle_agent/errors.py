@@ -33,7 +33,7 @@ class OutboxError(VehicleError):
 
 
 class PackingError(VehicleError):
-    """A report that cannot be said in short: a base tile is missing, or it says more than flags can."""
+    """A report that has no short form: a base tile is missing, or it holds more than flags can."""
 
 
 class AgentConfigError(VehicleError):

@@ -70,7 +70,7 @@ class LocalMap:
             self.generation += 1
 
     def cover_floors(self, low: int, high: int) -> None:
-        """Make the window reach at least the floors `low` ... `high` (where the map alone says too little)."""
+        """Make the window reach at least the floors `low` ... `high` (where the map alone shows too little)."""
         floors = (low, high) if self._floors is None else (min(low, self._floors[0]), max(high, self._floors[1]))
         if floors != self._floors:
             self._floors = floors

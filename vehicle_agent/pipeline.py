@@ -91,7 +91,7 @@ class Parts:
     Attributes:
         localisation: made for a local map; None: the localiser of this vehicle.
         detector: made for a local map.
-        statement: what a report says of a tile.
+        statement: makes the content of a report about a tile.
         placed: each is called with every scan whose pose has become final.
         watch: each is called with every scan that is judged.
     """
@@ -105,7 +105,7 @@ class Parts:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Output:
-    """What a measurement came to.
+    """The results of one measurement.
 
     Attributes:
         poses: that have become final, T_map_vehicle, oldest first; some seconds behind the scans.
@@ -123,12 +123,12 @@ class Output:
 
 @dataclass(frozen=True, slots=True)
 class HeldBack:
-    """What is not told because a pose may be wrong, so far.
+    """What is not reported because a pose may be wrong, so far.
 
     Attributes:
         scans: taken back or shifted.
         tiles: held back.
-        doubtful: tiles that are told with a doubt.
+        doubtful: tiles that are reported as doubtful.
         reasons: tiles by reason of doubt.
     """
 
@@ -152,13 +152,13 @@ class VehiclePipeline(Protocol):
 
     @property
     def held_back(self) -> HeldBack:
-        """What is not told because a pose may be wrong."""
+        """What is not reported because a pose may be wrong."""
 
     def tile(self, tile_id: TileId) -> Tile | None:
         """The tile of the voxel map that is held."""
 
     def account(self) -> dict[str, Any]:
-        """What the drive came to, as plain values."""
+        """The results of the drive, as plain values."""
 
 
 TilesT = TypeVar("TilesT", bound=Tiles)
@@ -174,7 +174,7 @@ class Pipeline(Generic[TilesT]):
         parameters: of localisation, segmentation, detection, reports and feature layers.
         identity: who reports; None: the vehicle only localises.
         outbox: where reports go; None: nowhere but into the `Output`.
-        feature_tiles: what the map says of the feature layers; None: nothing.
+        feature_tiles: brings the map's feature layers; None: there are none.
         local_map: one that is filled already; its frame is the map frame then.
         parts: what a study replaces.
 
@@ -242,7 +242,7 @@ class Pipeline(Generic[TilesT]):
                 for scan in self.change.segmenter.push(refined):  # rays against rays of other scans -> which move
                     self.change.detect(scan)  # rays + tiles -> evidence and new Gaussians
                     self.change.report(scan, self.place.odometer_m)  # tiles left behind -> classes -> reports
-                    self._judge(scan)  # looks + feature tiles -> what exists, is gone, is new -> reports
+                    self._judge(scan)  # observations + feature tiles -> what exists, is gone, is new -> reports
         self._note(item)
         return self._output(poses)
 
@@ -286,14 +286,14 @@ class Pipeline(Generic[TilesT]):
         self.localiser.start_at(t_ns, T_map_vehicle, trusted=trusted)
 
     def course(self) -> Course | None:
-        """Where the vehicle drives in its own frame, as a report tells it; None while it is not known well."""
+        """Where the vehicle drives in its own frame, for reports; None while it is not known well."""
         if not isinstance(self.localisation, Localiser):
             return None
         return known_course(self.localisation.calibration)
 
     @property
     def held_back(self) -> HeldBack:
-        """What is not told because a pose may be wrong."""
+        """What is not reported because a pose may be wrong."""
         counts, reasons = self.reporter.counts, self.reporter.doubts
         scans = counts["scans_shifted"] + counts["scans_taken_back"]
         return HeldBack(scans, counts["tiles_held_back"], counts["tiles_doubtful"], reasons)
@@ -303,7 +303,7 @@ class Pipeline(Generic[TilesT]):
         return self.local_map.tile(tile_id)
 
     def account(self) -> dict[str, Any]:
-        """What the drive came to, as plain values."""
+        """The results of the drive, as plain values."""
         reporter, localiser = self.reporter, self.localiser
         return {
             "scans": self.scans,
@@ -376,7 +376,7 @@ class Pipeline(Generic[TilesT]):
 
 @dataclass(frozen=True, slots=True)
 class ChangeDetection:
-    """What follows localisation where a vehicle reports: which points move, which voxels have changed, what is said."""
+    """What follows localisation where a vehicle reports: points that move, voxels that have changed, reports."""
 
     segmenter: MotionSegmenter
     detector: ChangeDetector
@@ -411,5 +411,5 @@ class ChangeDetection:
 
 
 def known_course(known: MotionCalibration) -> Course | None:
-    """The course as a report tells it; None while it is not known well."""
+    """The course for reports; None while it is not known well."""
     return Course.of(known.course_rad, known.course_sigma_rad) if known.course_sigma_rad < KNOWN_COURSE_RAD else None

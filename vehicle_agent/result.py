@@ -1,4 +1,4 @@
-"""What one drive of an agent came to: counts, traffic, health, and errors against the recording's reference.
+"""Results of one drive of an agent: counts, traffic, health, and errors against the recording's reference.
 
 The reference poses of a recording are read here, and nowhere else in the vehicle.
 """
@@ -13,11 +13,10 @@ import numpy as np
 from gnd.gnd_map.arrays import F64
 from gnd.gnd_map.geodesy import LocalFrame
 from gnd.gnd_map.motion import Trajectory
-from gnd.gnd_map.se3 import T_inverse
 from gnd.schemas.drive import ReferencePose
 from gnd.vehicle_agent.errors import LocaliseError
 from gnd.vehicle_agent.localise.consistency import nees_of
-from gnd.vehicle_agent.localise.estimates import PoseEstimate, localisation_error
+from gnd.vehicle_agent.localise.estimates import PoseEstimate, error_series, localisation_error
 
 
 @dataclass(slots=True)
@@ -54,16 +53,12 @@ class PoseEvaluation:
 
     def _single(self, reference: Trajectory) -> dict[str, Any]:
         """Signed errors along, across (m) and about (deg) the reference's heading, one a refined scan."""
-        first, last = int(reference.t_ns[0]), int(reference.t_ns[-1])
-        within = [e for e in self.estimates if first <= e.t_ns <= last]
-        t_ns = np.array([e.t_ns for e in within], np.int64)
-        error = T_inverse(reference.at(t_ns)) @ np.stack([e.T_map_vehicle for e in within])
-        heading_deg = np.degrees(np.arctan2(error[:, 1, 0], error[:, 0, 0]))
+        series = error_series(self.estimates, reference)
         return {
-            "t_ns": t_ns.tolist(),
-            "longitudinal_m": np.round(error[:, 0, 3], 4).tolist(),
-            "lateral_m": np.round(error[:, 1, 3], 4).tolist(),
-            "heading_deg": np.round(heading_deg, 4).tolist(),
+            "t_ns": series.t_ns.tolist(),
+            "longitudinal_m": np.round(series.longitudinal, 4).tolist(),
+            "lateral_m": np.round(series.lateral, 4).tolist(),
+            "heading_deg": np.round(series.heading, 4).tolist(),
         }
 
 

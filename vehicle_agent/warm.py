@@ -18,7 +18,6 @@ from gnd.schemas.drive import GnssFix, MotionSample, Scan
 from gnd.schemas.report_id import deterministic_report_id
 from gnd.vehicle_agent.detect.classify import classify, tile_change
 from gnd.vehicle_agent.detect.detector import ChangeDetector
-from gnd.vehicle_agent.detect.shift import ShiftParameters
 from gnd.vehicle_agent.detect.trial import Trial
 from gnd.vehicle_agent.features.poles.detector import PoleDetector
 from gnd.vehicle_agent.local_map import LocalMap
@@ -71,7 +70,7 @@ def _pack(change: TileChange, base: Tile, points_map_m: F64, frame: LocalFrame) 
 
 def _try(local_map: LocalMap, scans: list[RefinedScan]) -> None:
     """Ask whether a shift explains what the scans see."""
-    trial = Trial(MatchMapCache(local_map, RegistrationParameters().noise_m), ShiftParameters())
+    trial = Trial(MatchMapCache(local_map, RegistrationParameters().noise_m))
     for scan in scans:
         for _ in trial.push(SegmentedScan(scan, np.zeros(len(scan.points_map_m), np.bool_))):
             pass

@@ -17,13 +17,13 @@ from gnd.gnd_map.geodesy import LocalFrame
 from gnd.gnd_map.tile_id import District, TileId
 from gnd.schemas.features import FeatureChange, FeatureReport, Found, Seen
 from gnd.schemas.report_id import deterministic_report_id
-from gnd.vehicle_agent.features.coverage import Coverage, CoverageParameters
+from gnd.vehicle_agent.features.coverage import Coverage
 from gnd.vehicle_agent.features.feature_map import place_in_tile, with_height
 from gnd.vehicle_agent.features.view import Occlusion, SensorView
 from studies.frame.kept import Kept
 
 SIGMA_HEIGHT_M: Final = 0.5
-COVERAGE: Final = CoverageParameters(looks=4, step_m=4.0)
+STEP_M: Final = 4.0
 _SENSOR: Final = "study"
 _SOFTWARE: Final = "gnd reproduce"
 
@@ -89,7 +89,7 @@ def coverage_along(
     frame: LocalFrame, view: SensorView, poses: F64, occlusions: Iterable[Occlusion | None], height_m: float
 ) -> Coverage:
     """Return where a drive with poses (S, 3) and what was in the way at each has looked."""
-    coverage = Coverage(frame, view, height_m, COVERAGE)
+    coverage = Coverage(frame, view, height_m, step_m=STEP_M)
     for (x, y, heading), occlusion in zip(poses.tolist(), occlusions, strict=True):
         coverage.look(x, y, heading, occlusion)
     return coverage

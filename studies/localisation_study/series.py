@@ -9,8 +9,7 @@ from numpy.typing import NDArray
 
 from gnd.gnd_map.arrays import F64, I64
 from gnd.gnd_map.motion import Trajectory
-from gnd.vehicle_agent.localise.estimates import PoseEstimate
-from gnd.vehicle_agent.localise_drive.accuracy import error_series
+from gnd.vehicle_agent.localise.estimates import PoseEstimate, error_series
 
 QUANTITIES: Final = ("longitudinal_m", "lateral_m", "heading_deg")
 STATISTICS: Final = ("p95", "max")

@@ -121,7 +121,7 @@ def _layer(found: NewLayer) -> Layer:
 
 def _reports(drive: RoadDrive, found: NewLayer, vehicle: int) -> list[FeatureReport]:
     features, times = found.features, np.array([look.t_ns for look in drive.looks], np.int64)
-    view = SensorView(drive.view.width_rad, drive.view.range_m, float(drive.view.rate_hz))
+    view = SensorView(drive.view.width_rad, drive.view.range_m)
     poses = found.path.at(times)
     coverage = coverage_along(drive.route.frame, view, poses, [None] * len(poses), float(drive.view.eye_m))
     discovered = [

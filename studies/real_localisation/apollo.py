@@ -119,7 +119,7 @@ def _searched(name: str, half: Half, m: MatchMap) -> dict[str, Any]:
     for seed in range(SEARCHES):
         east, north = np.random.default_rng([15, seed]).normal(0.0, GNSS_SIGMA_M, 2)
         place = T_true[:3, 3] + np.array([east, north, 0.0])
-        found = initialise(chosen, place, GNSS_SIGMA_M, m, par.initialise, par.registration)
+        found = initialise(chosen, place, GNSS_SIGMA_M, m, registration=par.registration)
         if found is not None:
             best.append(found.registration.T_map_vehicle)
             sure += best[-1:] if found.found else []

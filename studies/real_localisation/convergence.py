@@ -23,7 +23,7 @@ from gnd.schemas.drive import Scan
 from gnd.vehicle_agent.errors import RegistrationError
 from gnd.vehicle_agent.importers.lidar_odometry import reference_ns
 from gnd.vehicle_agent.localise.match_map import MatchMap, MatchMapCache
-from gnd.vehicle_agent.localise.parameters import LocaliserParameters
+from gnd.vehicle_agent.localise.parameters import WITHOUT_WHEELS, LocaliserParameters
 from gnd.vehicle_agent.localise.registration import Start, register
 from gnd.vehicle_agent.localise.sampling import sample_scan
 from studies.frame.scans import posed
@@ -60,7 +60,7 @@ def convergence_of(half: Half, seed: int = 0, trials: int = TRIALS) -> list[dict
 
 def _aligners(half: Half, start: Start) -> dict[str, Aligner]:
     plain = LocaliserParameters()
-    free = replace(plain, registration=replace(plain.registration, wheel_sigma_m=0.0))
+    free = replace(plain, registration=replace(plain.registration, rules=WITHOUT_WHEELS))
     ours = {"ours": _ours(half, start, plain), "ours, without wheels": _ours(half, start, free)}
     return ours | {"small_gicp VGICP": _vgicp(half), "small_gicp GICP": _gicp(half)}
 

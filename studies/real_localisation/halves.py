@@ -21,7 +21,7 @@ from gnd.vehicle_agent.importers.recording import GNSS_SIGMA_M
 from gnd.vehicle_agent.importers.splits import chosen_scans
 from gnd.vehicle_agent.local_map import LocalMap
 from gnd.vehicle_agent.localise import LocaliserParameters, PoseEstimate, localisation_error
-from gnd.vehicle_agent.localise.parameters import RefineParameters, RegistrationParameters
+from gnd.vehicle_agent.localise.parameters import WITHOUT_WHEELS, RefineParameters, RegistrationParameters
 from gnd.vehicle_agent.tiles_at_hand import localising_on
 from studies.real.drive import local_map_of
 from studies.real.scene import RecordedScene, in_range
@@ -81,7 +81,7 @@ METHODS: Final = {  # the wheels stand on the road only as well as the recording
     "with_submap": LocaliserParameters(),
     "without_submap": LocaliserParameters(refine=RefineParameters(enabled=False)),
     "without_submap_and_wheels": LocaliserParameters(
-        registration=RegistrationParameters(wheel_sigma_m=0.0), refine=RefineParameters(enabled=False)
+        registration=RegistrationParameters(rules=WITHOUT_WHEELS), refine=RefineParameters(enabled=False)
     ),
 }
 

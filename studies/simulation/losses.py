@@ -62,7 +62,7 @@ def causes(true_class: NDArray[np.uint8], e: Mapping[str, I32], p: DetectParamet
     """
     said, t = e["change_class"], true_class
     silent = said == int(ChangeClass.UNMEASURED)
-    weak = (e["cells"] >= p.weak_cells) & (e["cells"] < np.where(e["map_cells"] > 0, MIN_CELLS, p.new_cells))
+    weak = (e["cells"] >= p.rules.weak_cells) & (e["cells"] < np.where(e["map_cells"] > 0, MIN_CELLS, p.new_cells))
     many = (e["map_cells"] == 0) & (e["cells"] >= p.new_cells)
     part = e["cells"] < 0.5 * e["map_cells"]
     cases = (
@@ -81,7 +81,7 @@ def causes(true_class: NDArray[np.uint8], e: Mapping[str, I32], p: DetectParamet
         ((t == N) & (said == M) & part, "modified: only a part of it seen"),
         ((t == N) & (said == M), "modified: unlike the map's Gaussian"),
         ((t == N) & (said == D), "deleted: rays pass through what stands"),
-        ((t == D) & (said == N) & (e["cells"] >= p.weak_cells), "normal: points met where it stood"),
+        ((t == D) & (said == N) & (e["cells"] >= p.rules.weak_cells), "normal: points met where it stood"),
         ((t == D) & (said == N), "normal: too few rays passed"),
         ((t == D) & (said == M), "modified: something else met there"),
     )

@@ -16,9 +16,11 @@ from gnd.gnd_map.arrays import F64, I64
 from gnd.schemas.drive import Detections
 from gnd.vehicle_agent.features.look import Look, MapFeatures
 from gnd.vehicle_agent.features.slamcu.parameters import SlamcuParameters
+from gnd.vehicle_agent.features.slamcu.replay import PoseAt
 from gnd.vehicle_agent.features.slamcu.slamcu import Slamcu
+from gnd.vehicle_agent.features.slamcu.tracked_feature import MAP_CONFIDENCE
 from gnd.vehicle_agent.features.slamcu.verdicts import KnownState, NewFeature
-from gnd.vehicle_agent.features.slamcu.watched import Lost, PoseAt, WatchedSlamcu
+from gnd.vehicle_agent.features.slamcu.watched import Lost, WatchedSlamcu
 from gnd.vehicle_agent.features.view import Occlusion, SensorView
 from studies.feature_study.truth import match_one_to_one, start_of
 from studies.frame.pool import Tick
@@ -89,7 +91,7 @@ def look_of(detections: Detections) -> Look:
 
 def sensor_view(view: CameraView) -> SensorView:
     """Return a simulated sensor's field of view as the vehicle knows it."""
-    return SensorView(view.width_rad, view.range_m, float(view.rate_hz))
+    return SensorView(view.width_rad, view.range_m)
 
 
 def occlusion_of(drive: RoadDrive, look: int) -> Occlusion | None:
@@ -234,9 +236,7 @@ class _Poses:
         return filtered.pose() if what == "look" else None
 
 
-def verdicts_of(
-    drive: RoadDrive, driven: Driven, map_confidence: float = SlamcuParameters().map_confidence
-) -> Verdicts:
+def verdicts_of(drive: RoadDrive, driven: Driven, map_confidence: float = MAP_CONFIDENCE) -> Verdicts:
     """Return what a drive says of its signs, with what the truth tells of how it came about."""
     truth = sign_truth(drive.route)
     sign, t_s, masses = _traces(drive, driven, truth, map_confidence)
@@ -255,7 +255,7 @@ def verdicts_of(
         pose_chi2=pose_chi2(driven.pose, driven.pose_cov, drive.truth.look_poses[driven.look]),
         pose_said_lost=said_lost(driven),
         lost=np.array(
-            [(one.from_s, one.until_s, one.off_m, one.value, one.taken_back, one.told_anew) for one in driven.lost]
+            [(one.from_s, one.until_s, one.off_m, one.value, one.taken_back, one.replayed) for one in driven.lost]
         ).reshape(-1, 6),
         pose_part_m=pose_parts(driven.pose, drive.truth.look_poses[driven.look], truth.xy_m, in_view & ~hidden),
         visible=(in_view & ~hidden).sum(axis=0).astype(np.int64),
@@ -285,7 +285,7 @@ def said_lost(driven: Driven) -> NDArray[np.bool_]:
     """Return bool (S,), the looks of stretches of which the vehicle says nothing."""
     lost = np.zeros(len(driven.look), np.bool_)
     for one in driven.lost:
-        lost |= (driven.t_s >= one.from_s) & (driven.t_s <= one.until_s) & (not one.told_anew)
+        lost |= (driven.t_s >= one.from_s) & (driven.t_s <= one.until_s) & (not one.replayed)
     return lost
 
 

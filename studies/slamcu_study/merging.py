@@ -10,8 +10,8 @@ from gnd.fleet_sim.roads.route import MAP_ERROR_M, Route
 from gnd.gnd_map.arrays import F64
 from gnd.schemas.features import FeatureReport
 from gnd.vehicle_agent.features.layer import bounded, of_counts
-from gnd.vehicle_agent.features.slamcu.existence_book import FeatureClass
 from gnd.vehicle_agent.features.slamcu.parameters import SlamcuParameters
+from gnd.vehicle_agent.features.slamcu.tracked_feature import FeatureClass
 from gnd.vehicle_agent.features.view import TYPICAL_HEIGHT_M
 from studies.feature_study.reporting import (
     BaseLayer,

@@ -14,6 +14,8 @@ from gnd.deploy.chaos.faults import KINDS, plan
 from gnd.deploy.chaos.run import run_chaos
 from gnd.deploy.chaos.service import SERVICES
 
+pytestmark = pytest.mark.xdist_group("fleets")
+
 SEED = 1_003
 APART_S = (0.3, 0.5)
 

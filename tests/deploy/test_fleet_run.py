@@ -19,7 +19,7 @@ from gnd.gnd_map.tile import content_sha
 from gnd.tile_store.sqlite_store import SqliteStore
 from gnd.vehicle_agent.sources.world_clock import SLACK_S
 
-pytestmark = pytest.mark.slow
+pytestmark = [pytest.mark.slow, pytest.mark.xdist_group("fleets")]
 Start = Callable[..., Run]
 
 

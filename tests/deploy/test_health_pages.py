@@ -1,7 +1,6 @@
 """/metrics and /healthz of real processes, over real HTTP."""
 
 import json
-import socket
 import subprocess
 import sys
 import threading
@@ -16,6 +15,7 @@ import numpy as np
 import pytest
 from prometheus_client import CollectorRegistry
 from prometheus_client.parser import text_string_to_metric_families
+from suite_ports import new_port
 
 from gnd.fleet_bus.errors import PortInUse
 from gnd.fleet_bus.health import CHECK_S, HealthServer
@@ -25,12 +25,6 @@ from gnd.gnd_map.tile_id import TileId
 from gnd.tile_store.sqlite_store import SqliteStore
 
 TILE = TileId(497353963154)
-
-
-def new_port() -> int:
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        return int(probe.getsockname()[1])
 
 
 def get(port: int, page: str) -> tuple[int, str]:

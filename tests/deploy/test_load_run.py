@@ -18,6 +18,8 @@ from gnd.deploy.load.plan import LoadOptions
 from gnd.deploy.load.run import run_load
 from gnd.deploy.load.verdict import summary
 
+pytestmark = pytest.mark.xdist_group("fleets")
+
 OPTIONS = LoadOptions(vehicles=4, km=0.25, kmh=180.0, per_street=2, shards=1, clients=1, in_flight=8)
 
 

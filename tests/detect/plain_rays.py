@@ -97,26 +97,26 @@ class PlainDetector:
         v, mean = point - origin, self.world.mean[row]
         cov = self.world.cov[row] + np.eye(3) * records._PASS_NOISE_M**2
         values, vectors = np.linalg.eigh(cov)
-        if self.p.passing_rule == "plane" and values[1] >= records._PLANAR_RATIO * values[0]:
+        if self.p.rules.passing_rule == "plane" and values[1] >= records._PLANAR_RATIO * values[0]:
             normal = vectors[:, 0]
             t = normal @ (mean - origin) / (normal @ v)
-            behind = math.hypot(kernel._BEYOND_M, kernel._BEYOND_SIGMAS * math.sqrt(s2) if self.p.soft else 0.0)
+            behind = math.hypot(kernel._BEYOND_M, kernel._BEYOND_SIGMAS * math.sqrt(s2) if self.p.rules.soft else 0.0)
             if not t_in <= t <= t_out or (1 - t) * abs(normal @ v) <= behind:
                 return False
             return self.world.r2(row, origin + t * v, records._PASS_NOISE_M) <= self.quantile(kernel._ETA_PLANE)
         information = np.linalg.inv(cov)
         t = min(max(v @ information @ (mean - origin) / (v @ information @ v), t_in), t_out)
-        if self.p.passing_rule != "ml" and (1 - t) * length < kernel._AHEAD_M:
+        if self.p.rules.passing_rule != "ml" and (1 - t) * length < kernel._AHEAD_M:
             return False
-        return self.world.r2(row, origin + t * v, records._PASS_NOISE_M) <= self.quantile(self.p.eta_pass)
+        return self.world.r2(row, origin + t * v, records._PASS_NOISE_M) <= self.quantile(self.p.rules.eta_pass)
 
     def _block(self, voxel, point, g, s2) -> None:
         row = self.world.index[voxel]
         if row < -1:
             return
-        noise2 = self.p.block_noise_m**2
-        limit = self.quantile(kernel._ETA_BLOCK) * (noise2 + (s2 if self.p.soft else 0.0)) / noise2
-        if row >= 0 and self.world.r2(row, point, self.p.block_noise_m) <= limit:
+        noise2 = self.p.rules.block_noise_m**2
+        limit = self.quantile(kernel._ETA_BLOCK) * (noise2 + (s2 if self.p.rules.soft else 0.0)) / noise2
+        if row >= 0 and self.world.r2(row, point, self.p.rules.block_noise_m) <= limit:
             self.bi[row] += 1
         elif self._explained(voxel, point, g):
             return
@@ -126,7 +126,7 @@ class PlainDetector:
 
     def _explained(self, voxel, point, g) -> bool:
         for axis in range(3):
-            face = self.p.face_m * np.linalg.norm(self.A[axis])
+            face = self.p.rules.face_m * np.linalg.norm(self.A[axis])
             fraction = g[axis] - voxel[axis]
             step = -1 if fraction < face else 1 if fraction > 1 - face else 0
             beside = list(voxel)
@@ -134,6 +134,6 @@ class PlainDetector:
             if step == 0 or not is_inside_window(tuple(beside), self.world.shape):
                 continue
             row = self.world.index[tuple(beside)]
-            if row >= 0 and self.world.r2(row, point, self.p.block_noise_m) <= kernel._FACE_SIGMA**2:
+            if row >= 0 and self.world.r2(row, point, self.p.rules.block_noise_m) <= kernel._FACE_SIGMA**2:
                 return True
         return False

@@ -7,10 +7,9 @@ from gnd.gnd_map.classes import ChangeClass
 from gnd.gnd_map.gaussian import Gaussians
 from gnd.gnd_map.grid import VoxelGrid
 from gnd.gnd_map.tile import Tile
-from gnd.vehicle_agent.detect.beyond import beyond_map
 from gnd.vehicle_agent.detect.classify import Classification
 from gnd.vehicle_agent.detect.detector import tile_evidence
-from gnd.vehicle_agent.detect.doubts import changed_share_of
+from gnd.vehicle_agent.detect.doubts import beyond_map, changed_share_of
 
 TILE = FIGURE_2[0]
 GRID = VoxelGrid.of(TILE)

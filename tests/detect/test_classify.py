@@ -12,7 +12,7 @@ from gnd.gnd_map.tile import Tile
 from gnd.schemas.changes import TileChange
 from gnd.vehicle_agent.detect.classify import Classification, classify, tile_change
 from gnd.vehicle_agent.detect.evidence import TileEvidence
-from gnd.vehicle_agent.detect.parameters import DetectParameters
+from gnd.vehicle_agent.detect.parameters import MEASURED_RULES, DetectParameters
 from gnd.vehicle_agent.detect.uncertainty import PoseUncertainty
 
 PLANE = (0.0008, 0.0, 0.0, 0.08, 0.0, 0.08)  # upright, facing x
@@ -86,7 +86,7 @@ def test_the_class_follows_from_the_counters(evidence: TileEvidence, default: st
 
 
 def test_deletion_needs_rays_that_passed_whatever_the_other_evidence() -> None:
-    p = replace(DetectParameters(), min_pass_inside=1)
+    p = DetectParameters(own_rules=replace(MEASURED_RULES, min_pass_inside=1))
     assert said(one(in_map=True, bo=100, cells=0), p) == "UNMEASURED"
     assert said(one(in_map=True, bo=100, pi=1, cells=0), p) == "DELETED"
 

@@ -14,7 +14,7 @@ from gnd.gnd_map.tile_id import TileId
 from gnd.vehicle_agent.detect.classify import classify
 from gnd.vehicle_agent.detect.detector import ChangeDetector
 from gnd.vehicle_agent.detect.evidence import TileEvidence
-from gnd.vehicle_agent.detect.parameters import DetectParameters
+from gnd.vehicle_agent.detect.parameters import MEASURED_RULES, DetectParameters
 from gnd.vehicle_agent.errors import MapChanged
 from gnd.vehicle_agent.local_map import LocalMap
 
@@ -79,7 +79,7 @@ def test_an_unchanged_place_stays_normal(tiles: dict[TileId, Tile], mode: str) -
 def test_a_wall_that_is_gone_is_deleted_and_what_stood_behind_it_is_new(
     tiles: dict[TileId, Tile], mode: str, rule: str
 ) -> None:
-    p = replace(MODES[mode], passing_rule=rule)
+    p = replace(MODES[mode], own_rules=replace(MODES[mode].rules, passing_rule=rule))
     found = classes(detect(hold(tiles), scans([FAR]), p), p)
     assert shares(found, voxels_of(wall(9.3, -5, 5, 2.4)))["DELETED"] > 0.8
     assert shares(found, voxels_of(wall(14.3, -6, 6, 2.4)))["NEW"] > 0.9
@@ -172,7 +172,7 @@ def test_points_beside_a_face_do_not_make_the_neighbour_voxel_new(tiles: dict[Ti
     on_face = tiles_of(np.concatenate([ground(), wall(face_x - 0.02)]))
     hits = scans([(face_x + 0.03, -8.0, 8.0, 4.0)])
     beyond = voxels_of(wall(face_x + 0.03, -5, 5, 2.4))
-    with_rule, without = DetectParameters(), DetectParameters(face_m=0.0)
+    with_rule, without = DetectParameters(), DetectParameters(own_rules=replace(MEASURED_RULES, face_m=0.0))
     assert shares(classes(detect(hold(on_face), hits, with_rule), with_rule), beyond).get("NEW", 0.0) < 0.05
     assert shares(classes(detect(hold(on_face), hits, without), without), beyond)["NEW"] > 0.9
 

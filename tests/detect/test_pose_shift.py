@@ -7,12 +7,12 @@ from numpy.typing import NDArray
 
 from gnd.gnd_map.se3 import T_inverse, transform
 from gnd.vehicle_agent.detect.fit_kernel import UNKNOWN_COST
-from gnd.vehicle_agent.detect.shift import Shift, ShiftError, ShiftParameters, costs_at, find_shift
+from gnd.vehicle_agent.detect.shift import OF_SCANS, Shift, costs_at, find_shift
 from gnd.vehicle_agent.detect.uncertainty import PoseUncertainty
 from gnd.vehicle_agent.local_map import LocalMap
 from gnd.vehicle_agent.localise.match_map import MatchMap
 
-PARAMETERS, SURE = ShiftParameters(), PoseUncertainty(0.01, 0.0005)
+PARAMETERS, SURE = OF_SCANS, PoseUncertainty(0.01, 0.0005)
 ERRORS = {
     "10 cm ahead": shift(0.1),
     "20 cm left": shift(0.0, 0.2),
@@ -133,11 +133,3 @@ def test_heights_and_tilts_are_no_question_to_a_few_layers(yard: LocalMap) -> No
     flat = find_shift(points, POSE @ shift(0.2, z_m=0.2), match_maps(yard).near(POSE[:3, 3]), planar=True)
     assert flat.shift_m[2] == 0.0
     assert np.abs(flat.turn_rad[:2]).max() == 0.0
-
-
-@pytest.mark.parametrize(
-    "values", [{"least_m": 0.0}, {"loosest_m": 0.05}, {"most_m": 0.1}, {"z": 0.0}, {"sigmas": -1.0}]
-)
-def test_limits_that_cannot_be_are_refused(values: dict[str, float]) -> None:
-    with pytest.raises(ShiftError, match="required"):
-        ShiftParameters(**values)

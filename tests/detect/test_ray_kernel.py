@@ -7,9 +7,14 @@ import pytest
 import scipy.stats
 from plain_rays import PlainDetector, PlainMap
 
-from gnd.vehicle_agent.detect.chi_square import confidence, quantile
-from gnd.vehicle_agent.detect.kernel import cast_rays, kernel_parameters, window_affine
-from gnd.vehicle_agent.detect.parameters import DetectParameterError, DetectParameters
+from gnd.vehicle_agent.detect.kernel import (
+    cast_rays,
+    confidence,
+    kernel_parameters,
+    quantile,
+    window_affine,
+)
+from gnd.vehicle_agent.detect.parameters import MEASURED_RULES, DetectParameterError, DetectParameters
 from gnd.vehicle_agent.detect.records import N_BI, N_BO, N_PI, N_PO, make_records
 from gnd.vehicle_agent.detect.uncertainty import PoseUncertainty
 from gnd.vehicle_agent.local_map import EMPTY, UNKNOWN
@@ -52,7 +57,7 @@ def kernel_run(
 def test_kernel_counts_what_the_plain_twin_counts(rule: str, seed: int, pose: PoseUncertainty) -> None:
     rng = np.random.default_rng(seed)
     world = random_world(rng)
-    p = replace(DetectParameters(), passing_rule=rule, range_min_m=1.0, range_max_m=11.0)
+    p = DetectParameters(range_min_m=1.0, range_max_m=11.0, own_rules=replace(MEASURED_RULES, passing_rule=rule))
     n = 500
     inside = rng.uniform([1, 1, 1], np.array(SHAPE) - 1, (n, 3))
     origins = np.linalg.solve(A_GRID, (np.array([7.0, 6.0, 4.0]) + rng.uniform(-0.5, 0.5, (n, 3))).T).T
@@ -142,7 +147,7 @@ def test_quantile_is_scipys_chi_square_with_three_degrees_of_freedom(eta: float)
     assert confidence(quantile(eta)) == pytest.approx(eta, abs=1e-12)
 
 
-@pytest.mark.parametrize("bad", [{"eta_pass": 1.0}, {"face_m": -0.1}, {"range_max_m": 1.0}, {"weak_cells": 30}])
+@pytest.mark.parametrize("bad", [{"range_min_m": -0.1}, {"range_max_m": 1.0}, {"new_cells": 10}])
 def test_parameters_out_of_range_are_refused_with_their_value(bad: dict[str, float]) -> None:
     (name, value) = next(iter(bad.items()))
     with pytest.raises(DetectParameterError, match=f"{name} = {value}"):

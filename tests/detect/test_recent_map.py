@@ -6,7 +6,7 @@ from gate_scene import POSE, START_NS, WALLS, map_of, match_maps, scan, seen, sh
 
 from gnd.gnd_map.se3 import T_inverse, transform
 from gnd.vehicle_agent.detect.recent_map import recent_map
-from gnd.vehicle_agent.detect.shift import ShiftParameters, costs_at, find_shift, gain
+from gnd.vehicle_agent.detect.shift import OF_SCANS, costs_at, find_shift, gain
 from gnd.vehicle_agent.detect.trial import Trial
 from gnd.vehicle_agent.detect.uncertainty import PoseUncertainty
 
@@ -46,15 +46,15 @@ def test_a_rebuilt_stretch_of_a_drive_is_no_jump_of_the_pose() -> None:
     """The base map would like another place; what was seen just before says that nothing jumped."""
     yard = map_of()
     alone = find_shift(transform(T_inverse(POSE), seen(REBUILT, 5)), POSE, match_maps(yard).near(POSE[:3, 3]))
-    assert alone.is_pose_error(ShiftParameters(), PoseUncertainty(0.01, 0.0005))
+    assert alone.is_pose_error(OF_SCANS, PoseUncertainty(0.01, 0.0005))
     both = [*WALLS, *REBUILT]  # old and new stand side by side for a while, then only the new
     drive = [scan(seen(both if k < 20 else REBUILT, k % 5, 2.0), k) for k in range(40)]
-    one = Trial(match_maps(yard), ShiftParameters())
+    one = Trial(match_maps(yard))
     assert numbers(one, drive) == list(range(40))
     assert "unchecked" in {tried.verdict for tried in one.take_tried()}
 
 
 def test_the_same_shift_as_a_jump_of_the_pose_is_held_back() -> None:
     drive = [scan(seen(WALLS, k % 5, 2.0), k, shift(-0.4) if k >= 20 else None) for k in range(40)]
-    one = Trial(match_maps(map_of()), ShiftParameters())
+    one = Trial(match_maps(map_of()))
     assert max(numbers(one, drive)) < 20

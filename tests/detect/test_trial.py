@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 from gate_scene import CORRIDOR, START_NS, WALLS, map_of, match_maps, scan, seen, shift
 
-from gnd.vehicle_agent.detect.shift import ShiftParameters
 from gnd.vehicle_agent.detect.trial import Trial
 from gnd.vehicle_agent.local_map import LocalMap
 
@@ -24,7 +23,7 @@ def points() -> list[np.ndarray]:
 
 
 def trial(local_map: LocalMap) -> Trial:
-    return Trial(match_maps(local_map), ShiftParameters())
+    return Trial(match_maps(local_map))
 
 
 def numbers(found: Iterable[object]) -> list[int]:

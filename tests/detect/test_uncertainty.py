@@ -12,7 +12,7 @@ from gnd.gnd_map.tile import Tile
 from gnd.gnd_map.tile_id import TileId
 from gnd.vehicle_agent.detect.classify import classify
 from gnd.vehicle_agent.detect.detector import ChangeDetector
-from gnd.vehicle_agent.detect.parameters import DetectParameters
+from gnd.vehicle_agent.detect.parameters import MEASURED_RULES, DetectParameters
 from gnd.vehicle_agent.detect.uncertainty import PoseUncertainty, TileUncertainties, UncertaintyError
 from gnd.vehicle_agent.local_map import LocalMap
 from gnd.vehicle_agent.localise.estimates import PoseEstimate
@@ -143,7 +143,7 @@ def test_good_poses_change_nothing(tiles: Tiles, sigma_m: float) -> None:
 def changes_called(tiles: Tiles, walls: list[tuple[float, float, float, float]], soft: bool) -> dict[str, int]:
     """Classes that ten scans give whose poses are off by 10 cm along each axis, known to 10 cm and 0.15 degrees."""
     rng, classes = np.random.default_rng(5), np.zeros(6, np.int64)
-    detector = detector_of(tiles, replace(DetectParameters(), soft=soft))
+    detector = detector_of(tiles, DetectParameters(own_rules=replace(MEASURED_RULES, soft=soft)))
     for _ in range(10):
         off = rng.normal(0.0, 0.1, 3) * [1.0, 1.0, 0.5]
         detector.add_scan(look(walls, rng) + off, SENSOR + off, None, PoseUncertainty(0.10, 0.0026))
@@ -171,5 +171,5 @@ def test_what_has_gone_and_what_is_new_is_found_all_the_same(tiles: Tiles) -> No
 
 def test_paper_mode_takes_every_pose_for_exact(tiles: Tiles) -> None:
     paper = DetectParameters.paper()
-    assert not paper.soft
+    assert not paper.rules.soft
     assert counted(tiles, PoseUncertainty(0.12), paper) == counted(tiles, PoseUncertainty(), paper)

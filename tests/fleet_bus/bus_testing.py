@@ -2,7 +2,6 @@
 
 import os
 import signal
-import socket
 import subprocess
 import sys
 import threading
@@ -12,6 +11,7 @@ from contextlib import contextmanager
 from pathlib import Path
 
 import psutil
+from suite_ports import new_port
 
 from gnd.fleet_bus.bus import Bus
 
@@ -37,9 +37,7 @@ def stays(condition: Callable[[], object], what: str, for_s: float = 0.3) -> Non
 
 def new_endpoint() -> str:
     """An endpoint at which nobody listened a moment ago."""
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        return f"tcp/127.0.0.1:{probe.getsockname()[1]}"
+    return f"tcp/127.0.0.1:{new_port()}"
 
 
 PROBE = b"is anybody there?"

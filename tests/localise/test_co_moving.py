@@ -22,7 +22,6 @@ from gnd.vehicle_agent.localise.scan_odometry import (
     OFF_GROUND_M,
     OFF_GROUND_SLOPE,
     ScanOdometry,
-    ScanOdometryParameters,
 )
 from gnd.vehicle_agent.localise.scan_pool import standing_points
 
@@ -234,7 +233,7 @@ def test_rings_on_open_ground_are_no_odometry():
     """On bare ground a scan fits where the one before stood: better nothing is said than that the vehicle stands."""
 
     def steps(standing):
-        rng, odometry, told = np.random.default_rng(5), ScanOdometry(ScanOdometryParameters()), []
+        rng, odometry, told = np.random.default_rng(5), ScanOdometry(), []
         for n in range(6):
             raw, offset_ns, _ = sweep(standing, [], 0.9 * n, 9.0, rng)
             chosen = sample_scan(raw, SamplingParameters())

@@ -6,7 +6,6 @@ import pytest
 from gnd.gnd_map.se3 import T_inverse
 from gnd.vehicle_agent.localise.calibration import MotionTeacher
 from gnd.vehicle_agent.localise.odometry import MotionBuffer
-from gnd.vehicle_agent.localise.parameters import OdometryParameters
 
 S = 1_000_000_000
 
@@ -87,7 +86,7 @@ def test_wheel_scale_gyro_bias_and_course_are_learnt():
     rng = np.random.default_rng(0)
     speed, yaw_rate, course = 9.0, 0.05, np.tan(np.radians(1.0))
     buffer = driven(speed / 1.015, yaw_rate + np.radians(0.2), seconds=30.0)
-    teacher = MotionTeacher(buffer, OdometryParameters())
+    teacher = MotionTeacher(buffer)
     unsure = teacher.sigmas(buffer.delta(0, S // 10), 0.1)
     truth = MotionBuffer()
     truth.course[:] = course, 0.0
@@ -105,7 +104,7 @@ def test_wheel_scale_gyro_bias_and_course_are_learnt():
 
 def test_odometry_that_jumps_is_trusted_less():
     buffer = driven(9.0, 0.0)
-    teacher = MotionTeacher(buffer, OdometryParameters())
+    teacher = MotionTeacher(buffer)
     before = teacher.sigmas(buffer.delta(0, S // 10), 0.1)
     rng = np.random.default_rng(0)
     for k in range(60):
@@ -119,7 +118,7 @@ def test_odometry_that_jumps_is_trusted_less():
 
 def test_a_gap_starts_a_new_stretch():
     buffer = driven(9.0, 0.0, seconds=20.0)
-    teacher = MotionTeacher(buffer, OdometryParameters())
+    teacher = MotionTeacher(buffer)
     far = np.eye(4)
     far[0, 3] = 500.0
     teacher.learn(0, np.eye(4), np.eye(6) * 1e-4)

@@ -12,7 +12,7 @@ from gnd.schemas.drive import GnssFix
 from gnd.vehicle_agent.errors import LocaliseError
 from gnd.vehicle_agent.localise.georeference import Georeferenced, georeference
 from gnd.vehicle_agent.localise.path_association import Untimed, _viterbi, georeference_untimed, matched_way_m
-from gnd.vehicle_agent.localise.track_alignment import FixTable, GeoreferenceParameters
+from gnd.vehicle_agent.localise.track_alignment import FixTable
 
 PLACE = (np.radians(48.2644), np.radians(11.669))
 FRAME = LocalFrame.of_tile(TileId.from_geodetic(*PLACE))
@@ -60,7 +60,7 @@ def off_m(found: Georeferenced, true: Trajectory) -> np.ndarray:
 
 def test_without_noise_the_track_lies_where_it_was() -> None:
     true = truth()
-    found = georeference(local(true), fixes_of(true, 1e-4), GeoreferenceParameters(inflation=1.0))
+    found = georeference(local(true), fixes_of(true, 1e-4), inflation=1.0)
     assert off_m(found, true).max() < 1e-3
     turn = log_so3(T_inverse(poses(found))[:, :3, :3] @ true.T_dst_vehicle[:, :3, :3])
     assert np.abs(turn).max() < 1e-4
@@ -99,9 +99,7 @@ def test_a_drifting_track_is_bent_onto_the_fixes() -> None:
 def test_tilt_is_found_when_asked_for() -> None:
     true = truth()
     track, fixes = local(true, tilt_rad=0.2), fixes_of(true, 0.02)
-    upright, tilted = (
-        georeference(track, fixes, GeoreferenceParameters(tilt=tilt), drift=False) for tilt in (False, True)
-    )
+    upright, tilted = (georeference(track, fixes, tilt=tilt, drift=False) for tilt in (False, True))
     assert off_m(upright, true).max() > 3.0
     assert off_m(tilted, true).max() < 0.05
 
@@ -113,7 +111,7 @@ def test_heights_that_are_not_known_leave_the_track_at_the_frames() -> None:
     assert np.linalg.norm(across, axis=1).max() < 0.15
     assert np.isnan(found.residuals_m(fixes_of(true, 0.1, height=False))[:, 2]).all()
     with pytest.raises(LocaliseError, match="400 of 400 fixes have no height"):
-        georeference(local(true), fixes_of(true, 0.1, height=False), GeoreferenceParameters(tilt=True, spacing_m=0.0))
+        georeference(local(true), fixes_of(true, 0.1, height=False), tilt=True, spacing_m=0.0)
 
 
 def test_fixes_without_times_find_theirs_by_the_turns() -> None:
@@ -160,7 +158,7 @@ def test_a_standing_vehicle_has_no_heading() -> None:
     true = truth()
     still = Trajectory(true.t_ns, np.tile(true.T_dst_vehicle[:1], (N, 1, 1)))
     with pytest.raises(LocaliseError, match="no heading"):
-        georeference(still, fixes_of(true, 1.0), GeoreferenceParameters(spacing_m=0.0))
+        georeference(still, fixes_of(true, 1.0), spacing_m=0.0)
 
 
 def test_fixes_outside_the_track_are_left_out_or_told() -> None:
@@ -177,5 +175,3 @@ def test_values_are_checked() -> None:
     assert table.sigma_up_m.tolist() == [5.0, 5.0]
     with pytest.raises(LocaliseError, match="sigma must be positive"):
         FixTable(table.t_ns, table.lat_rad, table.lon_rad, table.height_m, np.zeros(2), table.sigma_up_m)
-    with pytest.raises(ValueError, match="inflation"):
-        GeoreferenceParameters(inflation=0.0)

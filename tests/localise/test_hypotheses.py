@@ -7,9 +7,9 @@ from yard import GROUND_M, local_map_of, match_map_of, offset, pose, rectangle, 
 from gnd.gnd_map.se3 import T_inverse, transform
 from gnd.vehicle_agent.localise.first_pose import FirstPose, SearchPlace
 from gnd.vehicle_agent.localise.hypotheses import PoseHypotheses
-from gnd.vehicle_agent.localise.initialise import Around, probabilities, search
+from gnd.vehicle_agent.localise.initialise import AROUND_POSITION, Around, probabilities, search
 from gnd.vehicle_agent.localise.match_map import MatchMapCache
-from gnd.vehicle_agent.localise.parameters import InitialiseParameters, LocaliserParameters, RegistrationParameters
+from gnd.vehicle_agent.localise.parameters import LocaliserParameters, RegistrationParameters
 from gnd.vehicle_agent.localise.scan_pool import ScanPool
 
 STEP_M = 1.0
@@ -87,7 +87,7 @@ def test_without_a_position_nothing_is_searched(scene):
 
 
 def test_candidates_of_a_search_are_distinct_and_sorted(yard_map, yard_points):
-    T, rng, par = pose(3.0, -2.0, 140.0), np.random.default_rng(2), InitialiseParameters()
+    T, rng, par = pose(3.0, -2.0, 140.0), np.random.default_rng(2), AROUND_POSITION
     m, points = match_map_of(yard_map), seen_from(np.random.default_rng(2), yard_points, T, 2500)
     found, n = search(points, Around(T[:3, 3] + rng.uniform(-2, 2, 3), 6.0), m, par, RegistrationParameters())
     assert n > 5000
@@ -103,13 +103,13 @@ def test_headings_can_be_limited(yard_map, yard_points):
     T = pose(3.0, -2.0, 140.0)
     m, points = match_map_of(yard_map), seen_from(np.random.default_rng(2), yard_points, T, 2500)
     around = Around(T[:3, 3], 4.0, np.radians(137.0), np.radians(12.0))
-    found, n = search(points, around, m, InitialiseParameters(), RegistrationParameters())
+    found, n = search(points, around, m, AROUND_POSITION, RegistrationParameters())
     assert n < 600
     assert offset(T, found[0].registration.T_map_vehicle)[0] < 0.02
 
 
 def test_poses_that_run_into_each_other_become_one(yard_map, yard_points):
-    T, par = pose(3.0, -2.0, 140.0), InitialiseParameters()
+    T, par = pose(3.0, -2.0, 140.0), AROUND_POSITION
     m, points = match_map_of(yard_map), seen_from(np.random.default_rng(2), yard_points, T, 2500)
     found, _ = search(points, Around(T[:3, 3], 4.0), m, par, RegistrationParameters())
     hypotheses = PoseHypotheses(RegistrationParameters())

@@ -10,8 +10,8 @@ from gnd.gnd_map.se3 import T_from_R_t, T_inverse, exp_so3
 from gnd.vehicle_agent.localise.influence import FEW, SeenScan, _of_pieces, influence
 from gnd.vehicle_agent.localise.kernels import linearise, pulls
 from gnd.vehicle_agent.localise.parameters import RegistrationParameters
-from gnd.vehicle_agent.localise.refine import WINDOW, told_by_scans
 from gnd.vehicle_agent.localise.registration import REGISTRATION_GATE_PER_SCALE, linearised
+from gnd.vehicle_agent.localise.step_noise import WINDOW, variance_by_scans
 from gnd.vehicle_agent.localise.stretch import (
     N_SHARED,
     Knot,
@@ -142,7 +142,7 @@ def driven_and_seen(rng, worse, n=40):
 
 @pytest.mark.parametrize("worse", [1.0, 5.0])
 def test_odometry_that_is_too_sure_is_found_out_by_scans_and_right_one_is_not_blamed(worse):
-    told = told_by_scans(driven_and_seen(np.random.default_rng(8), worse), np.zeros(N_SHARED))
+    told = variance_by_scans(driven_and_seen(np.random.default_rng(8), worse), np.zeros(N_SHARED))
     assert (told[2:5] > 0.3 * worse**2).all()
     assert (told[2:5] < 3.0 * worse**2).all()
 
@@ -151,4 +151,4 @@ def test_where_scans_say_too_little_nobody_is_spared():
     steps = driven_and_seen(np.random.default_rng(9), 5.0)
     for k in range(WINDOW // 2, len(steps), WINDOW // 2):
         steps[k] = steps[k][:1]
-    assert np.isinf(told_by_scans(steps, np.zeros(N_SHARED))).all()
+    assert np.isinf(variance_by_scans(steps, np.zeros(N_SHARED))).all()

@@ -1,11 +1,12 @@
 """The first pose: any heading, a position wrong by metres; and honesty where two answers fit."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from yard import GROUND_M, local_map_of, match_map_of, offset, pose, rectangle, seen_from
 
-from gnd.vehicle_agent.localise.initialise import initialise
-from gnd.vehicle_agent.localise.parameters import InitialiseParameters
+from gnd.vehicle_agent.localise.initialise import AROUND_POSITION, initialise
 
 
 @pytest.mark.parametrize("seed", range(8))
@@ -55,7 +56,7 @@ def test_a_place_that_is_not_in_the_map_is_not_found(yard_map):
 def test_the_number_of_hypotheses_grows_with_the_circle(yard_map, yard_points):
     T, rng = pose(0.0, 0.0, 0.0), np.random.default_rng(0)
     points, m = seen_from(rng, yard_points, T, 2500), match_map_of(yard_map)
-    near, far = (initialise(points, T[:3, 3], sigma, m, InitialiseParameters(n_refined=4)) for sigma in (0.5, 2.0))
+    near, far = (initialise(points, T[:3, 3], sigma, m, replace(AROUND_POSITION, n_refined=4)) for sigma in (0.5, 2.0))
     assert near is not None
     assert far is not None
     assert far.hypotheses > 6 * near.hypotheses

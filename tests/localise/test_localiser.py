@@ -200,7 +200,7 @@ def test_memory_is_bounded_by_the_lag(localiser, drive):
     few = len(localiser._track.held)
     drive(localiser, 3.0, 6.0)
     assert len(localiser._track.held) <= few + 3 <= 25
-    assert len(localiser._motion) < 2100
+    assert len(localiser._drive.motion) < 2100
 
 
 @pytest.mark.parametrize("n", [0, 3])

@@ -15,11 +15,10 @@ from gnd.vehicle_agent.localise.match_map import MatchMapCache
 from gnd.vehicle_agent.localise.odometry import MotionBuffer
 from gnd.vehicle_agent.localise.parameters import (
     GraphParameters,
-    OdometryParameters,
     RefineParameters,
     RegistrationParameters,
 )
-from gnd.vehicle_agent.localise.refine import REFINE_LEARNT_DEGPS, Refiner, between
+from gnd.vehicle_agent.localise.refine import REFINE_LEARNT_DEGPS, UNLEARNT_S, Refiner, between
 
 S = 1_000_000_000
 EVERY_NS = S // 10
@@ -99,7 +98,7 @@ class Bench:
 def bench(yard_map, yard_points):
     def make(parameters=SHORT, where=circle, local_map=yard_map):
         motion = MotionBuffer()
-        teacher = MotionTeacher(motion, OdometryParameters())
+        teacher = MotionTeacher(motion)
         cache = MatchMapCache(local_map, 0.04)
         refiner = Refiner(parameters, RegistrationParameters(), cache, motion, teacher)
         return Bench(refiner, motion, teacher, yard_points, where)
@@ -111,7 +110,7 @@ def bench(yard_map, yard_points):
 def whole(yard_map, yard_points):
     """Nine seconds on the circle, with what came out on the way; do not push more."""
     motion = MotionBuffer()
-    teacher = MotionTeacher(motion, OdometryParameters())
+    teacher = MotionTeacher(motion)
     refiner = Refiner(SHORT, RegistrationParameters(), MatchMapCache(yard_map, 0.04), motion, teacher)
     return Bench(refiner, motion, teacher, yard_points).drive(90)
 
@@ -168,7 +167,7 @@ def test_poses_become_certain_and_say_so(whole):
 def test_no_scan_waits_for_longer_than_it_may(whole):
     """As long as the gyro is not known, longer; a scan after its time comes out with the next scan."""
     par, period_s = SHORT, EVERY_NS / S
-    assert max(whole.waiting_s) <= par.unlearnt_s + period_s
+    assert max(whole.waiting_s) <= UNLEARNT_S + period_s
     known = whole.learnt.index(True) + 1
     assert known < 60
     between_s = par.every_m / SPEED_MPS
@@ -176,7 +175,7 @@ def test_no_scan_waits_for_longer_than_it_may(whole):
 
 
 def test_a_scan_is_not_final_before_what_comes_after_it_is_matched(bench):
-    par = replace(SHORT, longest_s=30.0, unlearnt_s=30.0, lag_m=4.0)
+    par = replace(SHORT, longest_s=30.0, lag_m=4.0)
     run = bench(par).drive(90)
     behind_m = (89 - run.final[-1].number) * SPEED_MPS * EVERY_NS / S
     assert par.lag_m - 0.51 <= behind_m <= par.lag_m + 2 * par.every_m
@@ -184,10 +183,9 @@ def test_a_scan_is_not_final_before_what_comes_after_it_is_matched(bench):
 
 def test_a_standing_vehicle_does_not_wait_for_way(bench):
     """Nor for the gyro to be known, which nothing tells while it stands."""
-    par = replace(SHORT, every_s=0.5, unlearnt_s=3.0)
-    run = bench(par, where=standing).drive(70, online_m=0.02)
-    assert max(run.waiting_s) <= par.unlearnt_s + par.every_s + EVERY_NS / S
-    assert [p.number for p in run.final + run.refiner.flush()] == list(range(70))
+    run = bench(where=standing).drive(110, online_m=0.02)
+    assert max(run.waiting_s) <= UNLEARNT_S + 1.0 + EVERY_NS / S
+    assert [p.number for p in run.final + run.refiner.flush()] == list(range(110))
     assert max(offset(standing(0), p.T_map_vehicle)[0] for p in run.final) < 0.04
 
 
@@ -220,7 +218,7 @@ def test_what_old_scans_knew_is_remembered(bench, yard_points):
 
 
 def test_without_a_map_poses_are_dead_reckoned_and_never_certain(bench):
-    run = bench(replace(SHORT, unlearnt_s=2.0), local_map=local_map_of(np.empty((0, 3)))).drive(60)
+    run = bench(local_map=local_map_of(np.empty((0, 3)))).drive(60)
     final = run.final + run.refiner.flush()
     assert [p.number for p in final] == list(range(60))
     assert not any(p.certain for p in final)

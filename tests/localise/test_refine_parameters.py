@@ -10,7 +10,7 @@ from gnd.vehicle_agent.localise import LocaliserParameters
 from gnd.vehicle_agent.localise.parameters import RefineParameters
 
 
-@pytest.mark.parametrize("name", ["every_m", "every_s", "length_m", "longest_s", "unlearnt_s"])
+@pytest.mark.parametrize("name", ["every_m", "length_m", "longest_s"])
 @pytest.mark.parametrize("value", [0.0, -1.0, float("inf")])
 def test_lengths_and_times_must_be_positive(name, value):
     with pytest.raises(ValueError, match=rf"{name} = {value} lies outside > 0"):

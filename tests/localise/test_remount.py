@@ -9,7 +9,6 @@ from gnd.vehicle_agent.localise.calibration import MotionTeacher
 from gnd.vehicle_agent.localise.first_course import FirstCourse
 from gnd.vehicle_agent.localise.mount import MountResidual
 from gnd.vehicle_agent.localise.odometry import MotionBuffer
-from gnd.vehicle_agent.localise.parameters import OdometryParameters
 from gnd.vehicle_agent.localise.registration import WHEELS_M
 from gnd.vehicle_agent.localise.remount import (
     TRUSTED,
@@ -136,7 +135,7 @@ def step(course_rad, forward_m=0.9, yaw_rad=0.0, across_m=0.005):
 
 
 def teacher_after(steps):
-    teacher = MotionTeacher(MotionBuffer(), OdometryParameters(), Mounting(header()))
+    teacher = MotionTeacher(MotionBuffer(), Mounting(header()))
     for k, one in enumerate(steps):
         teacher.see_step(k * S, (k + 1) * S, one.T_before_now, one)
     return teacher
@@ -164,7 +163,7 @@ def test_a_mount_that_drives_askew_is_not_called_good():
 
 def test_a_mount_that_is_known_well_need_not_be_seen():
     mounting = Mounting(header(), MountSigma(0.01, 1e-3, 1e-3, 1e-3))
-    teacher = MotionTeacher(MotionBuffer(), OdometryParameters(), mounting)
+    teacher = MotionTeacher(MotionBuffer(), mounting)
     assert teacher.doubted("good", "none", trimmed=True) == ("good", "none")
 
 

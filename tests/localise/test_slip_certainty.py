@@ -9,7 +9,7 @@ from gnd.gnd_map.se3 import T_inverse
 from gnd.vehicle_agent.localise.calibration import MotionTeacher
 from gnd.vehicle_agent.localise.match_map import MatchMapCache
 from gnd.vehicle_agent.localise.odometry import MotionBuffer
-from gnd.vehicle_agent.localise.parameters import OdometryParameters, RegistrationParameters
+from gnd.vehicle_agent.localise.parameters import RegistrationParameters
 from gnd.vehicle_agent.localise.refine import Refiner
 from gnd.vehicle_agent.localise.scan_odometry import ScanStep
 
@@ -44,7 +44,7 @@ def certain_after(yard_map, surfaces, told, slip_mps):
         RegistrationParameters(),
         MatchMapCache(yard_map, 0.04),
         motion,
-        MotionTeacher(motion, OdometryParameters()),
+        MotionTeacher(motion),
     )
     said = []
     for k in range(SLIP + 14):
@@ -77,7 +77,7 @@ def test_without_a_slip_nothing_is_asked(yard_map, yard_points):
 
 def test_steps_beside_a_slip_do_not_reach_the_clock():
     motion = MotionBuffer()
-    clock = MotionTeacher(motion, OdometryParameters()).clock
+    clock = MotionTeacher(motion).clock
     for k in range(20):
         clock.see(k * S // 10, (k + 1) * S // 10, right(np.eye(4)))
     clock.see_slip(2 * S)

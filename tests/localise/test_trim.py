@@ -4,24 +4,23 @@ import numpy as np
 import pytest
 
 from gnd.vehicle_agent.localise.calibration import MAX_TRIM_RAD, MotionTeacher
-from gnd.vehicle_agent.localise.drift import PoseDrift, Slope
 from gnd.vehicle_agent.localise.health import HEALTH_GNSS_COUNT, HealthMonitor
 from gnd.vehicle_agent.localise.odometry import MotionBuffer
-from gnd.vehicle_agent.localise.parameters import HealthParameters, OdometryParameters
+from gnd.vehicle_agent.localise.parameters import HealthParameters
 
-SURE, NOTHING = 1e-5, Slope(0.0, np.inf)
+SURE = 1e-5
 
 
 def teacher_told(left, sigma=SURE, way_m=1000.0):
-    teacher, way = MotionTeacher(MotionBuffer(), OdometryParameters()), np.eye(4)
+    teacher, way = MotionTeacher(MotionBuffer()), np.eye(4)
     way[0, 3] = way_m
     teacher.see_step(0, 1, way, None)
-    teacher.correct(PoseDrift(NOTHING, NOTHING, Slope(left, sigma), Slope(0.0, sigma)), overlap=1.0)
+    teacher.correct(np.array([0.0, 0.0, -left, 0.0]), np.array([np.inf, np.inf, sigma, sigma]))
     return teacher
 
 
 def test_the_heading_is_not_turned_before_the_course_is_known():
-    assert MotionTeacher(MotionBuffer(), OdometryParameters()).trim_rad == 0.0
+    assert MotionTeacher(MotionBuffer()).trim_rad == 0.0
     assert teacher_told(5e-4, sigma=5e-3).trim_rad == 0.0
 
 

@@ -60,7 +60,7 @@ def drive_beside(scene, off_m, last_x_m, parameters=None):
         moved = pose(STEP_M if k else 0.0, 0.0, 0.0, z=0.0)
         place = SearchPlace(np.array([x + 2.0, -1.0, 0.0]), 2.5, 7.5)
         unique.see(seen, moved, pose(x + off_m, 0.0, 0.0), place, maps.near(np.array([x, 0.0, 0.0])))
-        told.append((x, unique.proven, unique.margin, unique.beaten, unique.untold_m))
+        told.append((x, unique.proven, unique.margin, unique.beaten, unique.unconstrained_m))
     return told
 
 
@@ -113,7 +113,7 @@ def test_a_smooth_corridor_proves_nothing_but_does_not_take_a_proof_away():
         see(float(x))
     assert unique.proven
     assert abs(unique.margin) < 2.0
-    assert unique.untold_m > 30.0  # odometry alone knows the place along
+    assert unique.unconstrained_m > 30.0  # odometry alone knows the place along
     unique.distrust(moved=True)
     assert not unique.proven
 
@@ -151,7 +151,7 @@ def test_the_kernel_agrees_with_its_plain_twin():
     points = yard(rng)
     m, par, T = match_map_of(local_map_of(points)), RegistrationParameters(), pose(1.0, -2.0, 10.0)
     seen = np.concatenate([seen_from(rng, points, T, 300), rng.uniform(-80, 80, (100, 3))])
-    scale2 = par.scales[-1] ** 2
+    scale2 = par.rules.scales[-1] ** 2
     expected = [plain_fit(T[:3, :3] @ p + T[:3, 3], m, scale2, REGISTRATION_GATE_PER_SCALE**2 * scale2) for p in seen]
     fits = fits_at(seen, T, m, par)
     assert fits == pytest.approx(expected, abs=1e-12)

@@ -19,14 +19,13 @@ from gnd.gnd_map.tile import Tile
 from gnd.gnd_map.tile_id import TileId
 from gnd.schemas.drive import DriveHeader, GnssTrack
 from gnd.vehicle_agent.errors import LocaliseError
-from gnd.vehicle_agent.localise.estimates import Health, PoseEstimate, localisation_error
+from gnd.vehicle_agent.localise.estimates import Health, PoseEstimate, error_series, localisation_error
 from gnd.vehicle_agent.localise_drive.account import health_json, print_account, summary
-from gnd.vehicle_agent.localise_drive.accuracy import error_series, error_summary
+from gnd.vehicle_agent.localise_drive.accuracy import error_summary
 from gnd.vehicle_agent.localise_drive.geo import geojson_text
-from gnd.vehicle_agent.localise_drive.map_picture import PictureView, nice_m
+from gnd.vehicle_agent.localise_drive.map_picture import PictureView, draw_pictures, nice_m
 from gnd.vehicle_agent.localise_drive.map_raster import GROUND, OTHER, WALL, MapRaster, disc, kinds_of
 from gnd.vehicle_agent.localise_drive.outputs import position_cov_m2
-from gnd.vehicle_agent.localise_drive.pictures import draw_pictures
 from gnd.vehicle_agent.localise_drive.run import DriveTotals, LocalisedDrive, Moment
 from gnd.vehicle_agent.localise_drive.stretches import stretches_of
 

@@ -105,4 +105,4 @@ def test_a_lidar_on_the_road_is_set_where_it_is_before_the_first_pose(
     assert np.hypot(off[:, 0, 3], off[:, 1, 3]).max() < 0.15
     console = Console(file=io.StringIO(), width=200)
     print_account(console, summary(found), [])
-    assert "told: LiDAR 0.00 m above the road" in " ".join(console.file.getvalue().split())
+    assert "header: LiDAR 0.00 m above the road" in " ".join(console.file.getvalue().split())

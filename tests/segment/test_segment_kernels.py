@@ -9,10 +9,9 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
 from gnd.gnd_map.se3 import exp_so3
-from gnd.vehicle_agent.segment.evidence import WEIGHTS, belief
 from gnd.vehicle_agent.segment.ground_kernels import GroundGrid, ground_heights, lowest_heights, remember_ground
 from gnd.vehicle_agent.segment.image_kernels import BINS, Optics, RangeJudge, draw_image, layer_gap, vote
-from gnd.vehicle_agent.segment.scene import hash_table
+from gnd.vehicle_agent.segment.scene import WEIGHTS, belief, hash_table
 from gnd.vehicle_agent.segment.voxel_kernels import GROUND, LOW, OUTSIDE, components, find_objects, moving_points
 
 GRID = GroundGrid(-20.0, -20.0, 1.0, 40, 40)

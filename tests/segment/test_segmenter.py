@@ -150,7 +150,7 @@ def test_what_waits_takes_less_than_half_of_the_memory() -> None:
     assert held < 0.5 * came
 
 
-@pytest.mark.parametrize("bad", [{"past_s": -1.0}, {"future_s": 101.0}, {"range_max_m": 1.0}, {"range_max_m": 301.0}])
+@pytest.mark.parametrize("bad", [{"future_s": -1.0}, {"future_s": 101.0}, {"range_max_m": 1.0}, {"range_max_m": 301.0}])
 def test_parameters_that_cannot_work_are_refused(bad: dict[str, float]) -> None:
     with pytest.raises(SegmentParameterError, match=next(iter(bad))):
         SegmentParameters(**bad)  # type: ignore[arg-type]

@@ -4,6 +4,8 @@ import pytest
 
 from studies import outage, stalled
 
+pytestmark = pytest.mark.xdist_group("fleets")
+
 
 @pytest.mark.slow
 def test_stopped_clients_hold_up_nobody() -> None:

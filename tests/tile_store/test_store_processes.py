@@ -15,6 +15,8 @@ from store_process import HURRY, TILES, merged_tile, publication_of
 
 from gnd.tile_store.sqlite_store import SqliteStore
 
+pytestmark = pytest.mark.xdist_group("fleets")
+
 SCRIPT = Path(__file__).with_name("store_process.py")
 KILLS = 20
 

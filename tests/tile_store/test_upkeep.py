@@ -353,7 +353,7 @@ def lock_folder(folder: Path) -> None:
         one.chmod(0o444)
     folder.chmod(0o555)
     for parent in folder.parents:
-        if parent.stat().st_uid == os.getuid() and parent.name.startswith(("pytest-", "test_")):
+        if parent.stat().st_uid == os.getuid() and parent.name.startswith(("pytest-", "popen-", "test_")):
             parent.chmod(0o755)
 
 

@@ -68,7 +68,7 @@ def test_signs_are_judged_and_found_by_the_filters_own_poses() -> None:
     assert len(wrong) <= 1
     assert abs(found - sum(state == "new" for state in truth.values())) <= 2
     assert pipeline.slamcu is not None
-    assert not [lost for lost in pipeline.slamcu.lost if not lost.told_anew]
+    assert not [lost for lost in pipeline.slamcu.lost if not lost.replayed]
 
 
 @pytest.mark.slow
@@ -84,7 +84,7 @@ def test_a_gnss_that_is_beside_itself_takes_back_and_calls_no_map_wrong() -> Non
     called_gone = [one for one, there in seen.items() if not there and truth[one] != "deleted"]
     assert len(called_gone) <= 1
     assert pipeline.slamcu is not None
-    said_lost = any(not lost.told_anew for lost in pipeline.slamcu.lost)
+    said_lost = any(not lost.replayed for lost in pipeline.slamcu.lost)
     assert said_lost or pipeline.slamcu.fixes_refused > 100
 
 

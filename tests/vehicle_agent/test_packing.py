@@ -27,7 +27,6 @@ from gnd.vehicle_agent.local_map import LocalMap
 from gnd.vehicle_agent.localise.calibration import MotionTeacher
 from gnd.vehicle_agent.localise.estimates import PoseEstimate, RefinedScan
 from gnd.vehicle_agent.localise.odometry import MotionBuffer
-from gnd.vehicle_agent.localise.parameters import OdometryParameters
 from gnd.vehicle_agent.pipeline import known_course
 from gnd.vehicle_agent.report.packing import Bases, askable, asked_for, is_measured, pack, pack_measured
 from gnd.vehicle_agent.report.reporter import Identity, Reporter
@@ -210,7 +209,7 @@ def test_the_course_of_the_vehicle_goes_with_both_forms(tmp_path: Path, tiles: d
 
 
 def test_a_course_that_is_not_known_well_is_not_told() -> None:
-    known = MotionTeacher(MotionBuffer(), OdometryParameters()).calibration
+    known = MotionTeacher(MotionBuffer()).calibration
     assert known_course(known) is None
     assert known_course(dataclasses.replace(known, course_rad=0.0087, course_sigma_rad=2e-4)) == Course(870, 20)
     assert known_course(dataclasses.replace(known, course_rad=0.0087, course_sigma_rad=2.1e-3)) is None

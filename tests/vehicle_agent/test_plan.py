@@ -130,8 +130,6 @@ def test_batches_suit_the_link() -> None:
     [
         ({"near_m": 100.0}, "near_m = 100.0"),
         ({"ahead_m": -1.0}, "ahead_m = -1.0"),
-        ({"ahead_s": 5.0}, "ahead_s = 5.0"),
-        ({"link_share": 1.5}, "link_share = 1.5"),
         ({"in_flight": 65}, "in_flight = 65"),
     ],
 )

@@ -83,7 +83,7 @@ def _decide_of_map(e: TileEvidence, p: DetectParameters) -> NDArray[np.int64]:
     has_gaussian = e.measured.cells >= MIN_CELLS
     sustained, changed = state == ChangeState.SUSTAINED, state == ChangeState.CHANGED
     reshaped = has_gaussian & ~_same_shape(e, p)
-    gone = changed & (e.measured.cells < p.weak_cells) & (e.n_pi >= p.min_pass_inside)
+    gone = changed & (e.measured.cells < p.rules.weak_cells) & (e.n_pi >= p.rules.min_pass_inside)
     return np.select(
         [reshaped & (sustained | changed), sustained | (changed & has_gaussian), gone],
         [ChangeClass.MODIFIED, ChangeClass.NORMAL, ChangeClass.DELETED],
@@ -94,8 +94,8 @@ def _decide_of_map(e: TileEvidence, p: DetectParameters) -> NDArray[np.int64]:
 def _decide_of_empty(e: TileEvidence, p: DetectParameters) -> NDArray[np.int64]:
     """Voxels in which the map has none: new or empty; few passes abstain, and weak hits unless many rays looked."""
     new = e.measured.cells >= _least_cells_of_new(e, p)
-    weak = (e.measured.cells >= p.weak_cells) & (e.n_pe + e.n_be < _MANY_RAYS)
-    empty = ~weak & (e.measured.cells < _EMPTY_CELLS) & (e.n_pe >= p.min_passes)
+    weak = (e.measured.cells >= p.rules.weak_cells) & (e.n_pe + e.n_be < _MANY_RAYS)
+    empty = ~weak & (e.measured.cells < _EMPTY_CELLS) & (e.n_pe >= p.rules.min_passes)
     return np.select([new, empty], [ChangeClass.NEW, ChangeClass.EMPTY], ChangeClass.UNMEASURED)
 
 

@@ -37,7 +37,7 @@ class _VoxelWindow:
 class ChangeDetector:
     """Counts the six cases of GND section 4.2 over scans; order of scans does not matter.
 
-    The map of a tile may not change while there is evidence about it: `touched` says whether there is, `finish` takes
+    The map of a tile may not change while there is evidence about it: `touched` is true then, `finish` takes
     it out.
     """
 
@@ -61,7 +61,7 @@ class ChangeDetector:
             points_map_m: (N, 3) float64 hits, map frame, in firing order (shuffled points cost 1.5 times the time).
             origins_map_m: (N, 3) the sensor at each point, or (3,) for all.
             moving: (N,) bool, points on moving objects ([50] in GND): their rays pass, their ends count for nothing.
-            pose: how well the scan's pose is known; it softens what its rays say.
+            pose: how well the scan's pose is known; it softens the evidence of its rays.
 
         Returns:
             How many rays were cast.
@@ -95,7 +95,7 @@ class ChangeDetector:
         return cast
 
     def touched(self, tile_id: TileId) -> bool:
-        """Whether a ray has said anything about a voxel of this tile."""
+        """Whether there is evidence about a voxel of this tile."""
         window = self._current()
         return tile_id in window.tiles and self._is_touched(window, tile_id)
 

@@ -1,4 +1,4 @@
-"""What speaks against believing a tile: counted scan by scan while it is seen, said when it is decided."""
+"""Reasons to doubt a tile: counted scan by scan while it is seen, reported when it is decided."""
 
 from collections.abc import Collection
 from dataclasses import dataclass, field
@@ -6,17 +6,17 @@ from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.ndimage import binary_dilation
 
 from gnd.gnd_map.arrays import F64
 from gnd.gnd_map.classes import ChangeClass
 from gnd.gnd_map.day import UNKNOWN_DAY
 from gnd.gnd_map.gaussian import Gaussians
-from gnd.gnd_map.grid import GridFrame
+from gnd.gnd_map.grid import GridFrame, VoxelGrid
 from gnd.gnd_map.tile import Tile
 from gnd.gnd_map.tile_id import TileId
 from gnd.schemas.changes import TileChange
 from gnd.schemas.doubt import Doubt, DoubtReason
-from gnd.vehicle_agent.detect.beyond import beyond_map
 from gnd.vehicle_agent.detect.classify import Classification
 from gnd.vehicle_agent.detect.shift import Shift, no_shift
 from gnd.vehicle_agent.detect.trial import Tried
@@ -35,9 +35,9 @@ SHARE_OF_YEAR: Final = 0.3
 convention (docs/decisions/0093-gates-told-and-measured.md)."""
 _DAYS_OF_YEAR: Final = 365.25
 LEAST_OF_SHARE: Final = 50
-"""So many voxels must hold something before their share says anything."""
+"""So many voxels must hold something before their share counts."""
 LEAST_WITHHELD: Final = 5
-"""A tile of which so few voxels were seen from a wrong pose is not worth a word."""
+"""A tile of which so few voxels were seen from a wrong pose is not mentioned."""
 _PERMILLE: Final = 1000
 _LONGEST_MM: Final = 100_000
 
@@ -132,7 +132,7 @@ def plausible_share(base_day: int, day: int) -> float:
 
 
 def doubt_of(found: Classification, account: TileAccount, day: int = UNKNOWN_DAY) -> Doubt | None:
-    """Why a tile that is told all the same is not fully believed; None where nothing speaks against it, or where
+    """Why a tile that is reported is doubtful nevertheless; None where nothing is against it, or where
     nothing has changed. `day`: of the drive, `gnd.gnd_map.day`.
     """
     reasons, changed_share = DoubtReason.NONE, changed_share_of(found)
@@ -160,7 +160,7 @@ def changed_share_of(found: Classification) -> float:
 
 
 def withheld_change(base: Tile, account: TileAccount, changed_share: float = 0.0) -> TileChange:
-    """A tile of which nothing is told, because a pose error explains what seems to have changed."""
+    """A tile that is not reported, because a pose error explains what seems to have changed."""
     nothing = Gaussians.empty()
     return TileChange(
         tile=base.tile_id,
@@ -190,3 +190,20 @@ def _doubt(reasons: DoubtReason, account: TileAccount, changed_share: float, wit
         up_mm=mm[2],
         turn_10urad=round(float(shift.turn_rad[2]) * 1e5),
     )
+
+
+def beyond_map(found: Classification) -> NDArray[np.bool_]:
+    """(K,) the new voxels in whose column, and in the eight around it, the map of the tile holds nothing.
+
+    They extend the map, and are no evidence against the pose or the map. A survey that saw a place met something there,
+    the ground at least: where the map holds nothing above, below or beside, it has not been surveyed (ground behind the
+    last house, behind what has gone since, beyond the end of the survey's road).
+    """
+    base = found.evidence.base
+    grid = VoxelGrid.of(base.tile_id)
+    known = np.zeros((grid.nx, grid.ny), np.bool_)
+    x, y, _ = grid.unravel(base.gaussians.voxel_id)
+    known[x, y] = True
+    beside = binary_dilation(known, np.ones((3, 3), np.bool_))
+    x, y, _ = grid.unravel(found.evidence.voxel_id)
+    return np.asarray((found.change_class == ChangeClass.NEW) & ~beside[x, y])

@@ -1,4 +1,4 @@
-"""What the rays of one drive said about the voxels of one tile."""
+"""Evidence of the rays of one drive about the voxels of one tile."""
 
 from dataclasses import dataclass, field
 

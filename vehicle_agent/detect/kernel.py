@@ -6,6 +6,7 @@ Whatever is measured in metres (distances to a Gaussian, to a plane, to the hit)
 """
 
 import math
+from functools import lru_cache
 from typing import Final, NamedTuple
 
 import numpy as np
@@ -13,7 +14,6 @@ from numpy.typing import NDArray
 
 from gnd.gnd_map.arrays import F32, F64, I32
 from gnd.gnd_map.jit import kernel, pasted
-from gnd.vehicle_agent.detect.chi_square import quantile
 from gnd.vehicle_agent.detect.parameters import INCLUDED_M, DetectParameters
 from gnd.vehicle_agent.detect.records import N_BI, N_BO, N_PI, N_PO
 from gnd.vehicle_agent.detect.uncertainty import PoseUncertainty
@@ -56,6 +56,23 @@ class KernelParameters(NamedTuple):
     beyond_gain: float
 
 
+def confidence(r2: float) -> float:
+    """Probability mass inside the ellipsoid of squared Mahalanobis distance `r2`, GND Eq. (3) with k = 3: chi-square in
+    closed form (scipy.stats would cost a second at every start).
+    """
+    return math.erf(math.sqrt(r2 / 2)) - math.sqrt(2 * r2 / math.pi) * math.exp(-r2 / 2)  # Eq. (3)
+
+
+@lru_cache(maxsize=64)
+def quantile(eta: float) -> float:
+    """The r² whose `confidence` is `eta` (0 < eta < 1): "inside" becomes one comparison, computed once."""
+    low, high = 0.0, 60.0
+    while high - low > 1e-12:
+        middle = (low + high) / 2
+        low, high = (middle, high) if confidence(middle) < eta else (low, middle)
+    return (low + high) / 2
+
+
 def kernel_parameters(p: DetectParameters, pose: PoseUncertainty = CERTAIN) -> KernelParameters:
     """Eq. (1) and (4) compare confidences; r² against their quantiles is the same test.
 
@@ -64,21 +81,21 @@ def kernel_parameters(p: DetectParameters, pose: PoseUncertainty = CERTAIN) -> K
         pose: of the scan whose rays are cast.
     """
     return KernelParameters(
-        rule=RULES[p.passing_rule],
+        rule=RULES[p.rules.passing_rule],
         r2_block=quantile(_ETA_BLOCK),
-        r2_pass=quantile(p.eta_pass),
+        r2_pass=quantile(p.rules.eta_pass),
         r2_plane=quantile(_ETA_PLANE),
         r2_face=_FACE_SIGMA**2,
         ahead_m=_AHEAD_M,
         beyond_m=_BEYOND_M,
-        face_m=p.face_m,
+        face_m=p.rules.face_m,
         range_min_m=p.range_min_m,
         range_max_m=p.range_max_m,
         pose_m2=float(pose.sigma_m**2),
         pose_rad2=float(pose.sigma_rad**2),
         included_m2=INCLUDED_M**2,
-        block_gain=1.0 / p.block_noise_m**2 if p.soft else 0.0,
-        beyond_gain=_BEYOND_SIGMAS**2 if p.soft else 0.0,
+        block_gain=1.0 / p.rules.block_noise_m**2 if p.rules.soft else 0.0,
+        beyond_gain=_BEYOND_SIGMAS**2 if p.rules.soft else 0.0,
     )
 
 
@@ -238,7 +255,7 @@ def cast_rays(  # noqa: C901  (one loop: a call a voxel would cost more than the
         records: the same memory as float32.
         block: (M, 6) float32 whitening for blocked points.
         p: KernelParameters.
-        moving: (N,) bool, points of moving objects: the ray passes what lies before, its end says nothing.
+        moving: (N,) bool, points of moving objects: the ray passes what lies before, its end is no evidence.
         kept: (N,) uint8, set to 1 for the points that count (BI, BO, BE), 0 for the others.
 
     Returns:

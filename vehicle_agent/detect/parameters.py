@@ -22,10 +22,49 @@ class DetectParameterError(VehicleError):
 
 
 @dataclass(frozen=True, slots=True)
-class DetectParameters:
-    """How rays become evidence and evidence becomes classes.
+class DetectRules:
+    """How rays become evidence and evidence becomes classes, by a mode's rules.
 
-    Paper mode is `DetectParameters.paper()`: Eq. (1) to (12) taken plainly. The defaults add what was measured to help.
+    Attributes:
+        block_noise_m: standard deviation added to the map's Gaussian for BI and BO.
+        passing_rule: `ml`: Eq. (4) plainly; `ahead`: the same, only where the crossing lies 1 m before the hit;
+            `plane`: a planar Gaussian counts as passed only where the ray crosses its plane and ends 15 cm behind it.
+        eta_pass: η_bound of Eq. (4) for rays that pass.
+        face_m: a blocked point this close to a face is ignored where the neighbour's Gaussian explains it; 0: none is.
+        weak_cells: from here on a voxel has hits, but too few for a Gaussian: it abstains.
+        min_passes: rays through an empty voxel before it counts as observed empty.
+        min_pass_inside: rays through a Gaussian (PI) that a deletion needs.
+        soft: whether the uncertainty of the poses softens the evidence.
+    """
+
+    block_noise_m: float
+    passing_rule: PassRule
+    eta_pass: float
+    face_m: float
+    weak_cells: int
+    min_passes: int
+    min_pass_inside: int
+    soft: bool
+
+
+PAPER_RULES: Final = DetectRules(
+    block_noise_m=0.01, passing_rule="ml", eta_pass=0.95, face_m=0.0, weak_cells=1, min_passes=1, min_pass_inside=1,
+    soft=False,
+)  # fmt: skip
+"""Eq. (1) to (12) plainly: 1 cm keeps Σ invertible, every hit counts, evidence alone decides."""
+MEASURED_RULES: Final = DetectRules(
+    block_noise_m=0.05, passing_rule="plane", eta_pass=0.9, face_m=0.10, weak_cells=5, min_passes=3, min_pass_inside=3,
+    soft=True,
+)  # fmt: skip
+"""What was measured to help: thin covariances turn 3 cm of noise into outside (`block_noise_m`)."""
+
+
+@dataclass(frozen=True, slots=True)
+class DetectParameters:
+    """Settings of change detection; the mode chooses the rules. Paper mode is `DetectParameters.paper()`.
+
+    Attributes:
+        own_rules: in place of the mode's, for a study of single rules; no setting.
     """
 
     mode: Mode = setting(
@@ -34,28 +73,8 @@ class DetectParameters:
     )
     masses: MassParameters = setting(
         MassParameters(lambda_c_pass=0.05),
-        "The evidence model. λcp is larger than the paper's 0.01 because `plane` lets few rays pass that have not: 14"
+        "The evidence model. λcp is larger than the paper's 0.01 because few rays are taken to pass that have not: 14"
         " of them delete.",
-    )
-    block_noise_m: float = setting(
-        0.05,
-        "Standard deviation added to the map's Gaussian for BI/BO: thin covariances turn 3 cm of noise into outside.",
-        unit="m",
-        least=1e-4,
-        most=1,
-    )
-    passing_rule: PassRule = setting(
-        "plane",
-        "`ml`: Eq. (4) plainly; `ahead`: the same, only where the crossing lies 1 m before the hit; `plane`: a planar"
-        " Gaussian counts as passed only where the ray crosses its plane and ends 15 cm behind it.",
-    )
-    eta_pass: float = setting(0.9, "η_bound of Eq. (4) for rays that pass.", above=0, below=1)
-    face_m: float = setting(
-        0.10,
-        "A blocked point this close to a face is ignored where the neighbour's Gaussian explains it; 0 switches off.",
-        unit="m",
-        least=0,
-        most=0.4,
     )
     range_min_m: float = setting(2.0, "Nearer points are the vehicle itself.", unit="m", least=0)
     range_max_m: float = setting(
@@ -67,57 +86,35 @@ class DetectParameters:
     )
     new_cells: int = setting(
         30,
-        "Occupied 10 cm sub-cells that make a Gaussian where the map has none: noise and the error of poses thicken a"
-        " surface, on real scans nine in ten false new voxels had fewer than 38.",
+        "Occupied 10 cm sub-cells that make a Gaussian where the map has none, 1.5 times as many at the edge of a known"
+        " surface: noise and the error of poses thicken a surface, on real scans nine in ten false new voxels had fewer"
+        " than 38.",
         least=MIN_CELLS,
         most=1000,
     )
-    new_cells_at_edge: int = setting(
-        45,
-        "The same at the edge of a known surface: within 15 cm of the plane of a planar Gaussian of the map next door;"
-        " at least `new_cells`.",
-        least=MIN_CELLS,
-        most=1000,
-    )
-    weak_cells: int = setting(
-        5, "From here on a voxel has hits, but too few for a Gaussian: it abstains.", least=1, most=MIN_CELLS
-    )
-    min_passes: int = setting(3, "Rays through an empty voxel before it counts as observed empty.", least=1)
-    min_pass_inside: int = setting(3, "Rays through a Gaussian (PI) that a deletion needs.", least=0)
-    soft: bool = setting(True, "Whether the uncertainty of the poses softens the evidence.")
+    own_rules: DetectRules | None = None
 
     def __post_init__(self) -> None:
         """Each value within its range, or `DetectParameterError` with the value."""
         check_settings(self, DetectParameterError)
-        if self.new_cells_at_edge < self.new_cells:
-            raise DetectParameterError(
-                f"new_cells_at_edge = {self.new_cells_at_edge} must be at least new_cells = {self.new_cells}"
-            )
         if self.range_max_m <= self.range_min_m:
             raise DetectParameterError(f"range_max_m = {self.range_max_m} must exceed range_min_m = {self.range_min_m}")
 
+    @property
+    def rules(self) -> DetectRules:
+        """Those of the mode, or `own_rules`."""
+        return self.own_rules or (PAPER_RULES if self.mode == "paper" else MEASURED_RULES)
+
+    @property
+    def new_cells_at_edge(self) -> int:
+        """`new_cells` at the edge of a known surface: within 15 cm of the plane of a planar Gaussian next door."""
+        return self.new_cells * 3 // 2
+
     def excess_m2(self, pose: PoseUncertainty) -> float:
         """Variance of points at the pose's range beyond what `block_noise_m` and the others stand for."""
-        return max(pose.of_points_m**2 - INCLUDED_M**2, 0.0) if self.soft else 0.0
-
-    @classmethod
-    def of_mode(cls, mode: Mode) -> "DetectParameters":
-        """The defaults of a mode."""
-        return cls.paper() if mode == "paper" else cls()
+        return max(pose.of_points_m**2 - INCLUDED_M**2, 0.0) if self.rules.soft else 0.0
 
     @classmethod
     def paper(cls) -> "DetectParameters":
-        """Eq. (1) to (12) plainly: 1 cm keeps Σ invertible, every hit counts, evidence alone decides."""
-        return cls(
-            mode="paper",
-            masses=MassParameters(lambda_s_block=0.2, lambda_c_block=0.05, lambda_c_pass=0.01),
-            eta_pass=0.95,
-            block_noise_m=0.01,
-            passing_rule="ml",
-            face_m=0.0,
-            new_cells=20,
-            weak_cells=1,
-            min_passes=1,
-            min_pass_inside=1,
-            soft=False,
-        )
+        """The defaults of paper mode."""
+        return cls(mode="paper", masses=MassParameters(0.2, 0.05, 0.01), new_cells=20)

@@ -54,7 +54,7 @@ def make_records(
     floats[:, :6] = whitening(cov + np.eye(3) * _PASS_NOISE_M**2)
     floats[:, MEAN] = mean_map_m - anchor_map_m
     floats[:, NORMAL] = planar_normals(cov)
-    return Records(words, whitening(cov + np.eye(3) * parameters.block_noise_m**2).astype(np.float32))
+    return Records(words, whitening(cov + np.eye(3) * parameters.rules.block_noise_m**2).astype(np.float32))
 
 
 def whitening(cov: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -1,7 +1,7 @@
 """Whether the surface in a voxel has changed its shape: the log-odds of a measured Gaussian against the map's.
 
 The similarity of GND Eq. (13) judges two Gaussians alone: a thick one resembles almost anything, a thin one almost
-nothing, and what the rays said is left out. Here ten figures of the two Gaussians and the counters are weighed
+nothing, and the counts of the rays are left out. Here ten figures of the two Gaussians and the counters are weighed
 together by boosted regression trees, each monotone in what must only speak for or against a change. They were fitted on
 simulated worlds that no figure of merit is reported on (`python -m studies.fit_shape_change`); the vehicle
 evaluates them alone, without the library that fitted them.

@@ -2,9 +2,9 @@
 
 A building site does not vanish under any shift of the whole scan, and what still stands around it gets worse. A pose
 error does vanish: what did not fit fits then, and what fitted stays. So two hypotheses are compared voxel by voxel, at
-the pose as it is and at the best pose nearby: a paired test, in which voxels are the samples. What a shift cannot tell
-(ground under a shift along it, walls along a street) fits equally well under both and has no say; changed voxels fit
-badly under both and have none either.
+the pose as it is and at the best pose nearby: a paired test, in which voxels are the samples. What a shift does not
+change (ground under a shift along it, walls along a street) fits equally well under both and does not count; changed
+voxels fit badly under both and do not count either.
 """
 
 from dataclasses import dataclass
@@ -17,17 +17,17 @@ from gnd.gnd_map.arrays import F64
 from gnd.gnd_map.se3 import T_from_R_t, T_inverse, exp_so3, log_so3
 from gnd.vehicle_agent.detect.fit_kernel import point_costs
 from gnd.vehicle_agent.detect.uncertainty import PoseUncertainty
-from gnd.vehicle_agent.errors import RegistrationError, VehicleError
+from gnd.vehicle_agent.errors import RegistrationError
 from gnd.vehicle_agent.localise.match_map import MatchMap
-from gnd.vehicle_agent.localise.parameters import RegistrationParameters
+from gnd.vehicle_agent.localise.parameters import WITHOUT_WHEELS, RegistrationParameters
 from gnd.vehicle_agent.localise.registration import RegistrationResult, Start, register
 
 _GRID_M: Final = 1.0
 """Voxels are told apart on a plain grid of the map frame: which of them a point is in matters little here."""
 _LEAST_POINTS: Final = 2
-"""Of a voxel, before it has a say."""
+"""Of a voxel, before it counts."""
 _LEAST_VOXELS: Final = 30
-"""With a say, before a shift could be found."""
+"""That count, before a shift could be found."""
 _SCALE2: Final = 2.0**2
 """Of the robust cost, squared sigmas of a point."""
 _MISFIT: Final = 0.5
@@ -38,15 +38,11 @@ _AROUND_M: Final = ((0.6, 0.0), (-0.6, 0.0), (0.0, 0.6), (0.0, -0.6))
 """Forward and left of the pose."""
 LEVER_M: Final = 25.0
 """Distance at which turns are measured: 0.2 degrees move a point there by 9 cm."""
-_REGISTRATION: Final = RegistrationParameters(wheel_sigma_m=0.0)  # wheels are no witness: a mount's height may be wrong
-
-
-class ShiftError(VehicleError):
-    """A parameter of the shift test lies outside its range."""
+_REGISTRATION: Final = RegistrationParameters(rules=WITHOUT_WHEELS)
 
 
 @dataclass(frozen=True, slots=True)
-class ShiftParameters:
+class ShiftTest:
     """When a shift counts as one.
 
     Attributes:
@@ -58,22 +54,20 @@ class ShiftParameters:
         z: how sure it must be that the map fits better after the shift, in sigmas of the paired test.
     """
 
-    least_m: float = 0.08
-    sigmas: float = 3.0
-    loosest_m: float = 0.15
-    most_m: float = 5.0
-    z: float = 3.0
-
-    def __post_init__(self) -> None:
-        if not 0 < self.least_m <= self.loosest_m < self.most_m:
-            raise ShiftError(f"0 < least_m <= loosest_m < most_m is required, got {self}")
-        if self.z <= 0 or self.sigmas < 0:
-            raise ShiftError(f"z > 0 and sigmas >= 0 are required, got {self}")
+    least_m: float
+    sigmas: float
+    loosest_m: float
+    most_m: float
+    z: float
 
     def limit_m(self, pose: PoseUncertainty) -> float:
         """How far a pose that is known so well may be off."""
         sigma_m = max(pose.sigma_m, LEVER_M * pose.sigma_rad)
         return float(np.clip(self.sigmas * sigma_m, self.least_m, self.loosest_m))
+
+
+OF_SCANS: Final = ShiftTest(least_m=0.08, sigmas=3.0, loosest_m=0.15, most_m=5.0, z=3.0)
+"""Of a stretch of scans, while driving."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -82,7 +76,7 @@ class Shift:
 
     Attributes:
         T: (4, 4) correction of the pose in the vehicle's axes: T_map_vehicle -> T_map_vehicle @ T.
-        voxels: how many voxels had a say.
+        voxels: how many voxels counted.
         misfits: how many of them do not fit the map at the pose as it is.
         explained: how many of those fit after the shift.
         spoiled: how many that fitted do not fit after the shift.
@@ -118,13 +112,13 @@ class Shift:
         """Of what does not fit, less what the shift spoils, 0 ... 1."""
         return max(self.explained - self.spoiled, 0) / max(self.misfits, 1)
 
-    def is_far(self, parameters: ShiftParameters, pose: PoseUncertainty) -> bool:
+    def is_far(self, test: ShiftTest, pose: PoseUncertainty) -> bool:
         """Whether the best pose nearby is farther off than a pose known so well may be, surely better or not."""
-        return parameters.limit_m(pose) <= self.size_m <= parameters.most_m
+        return test.limit_m(pose) <= self.size_m <= test.most_m
 
-    def is_pose_error(self, parameters: ShiftParameters, pose: PoseUncertainty) -> bool:
+    def is_pose_error(self, test: ShiftTest, pose: PoseUncertainty) -> bool:
         """Whether the pose is off by more than a pose known so well may be, and surely so."""
-        return self.is_far(parameters, pose) and self.z >= parameters.z
+        return self.is_far(test, pose) and self.z >= test.z
 
 
 def no_shift(voxels: int = 0, misfits: int = 0, *, checked: bool = False) -> Shift:
@@ -140,7 +134,7 @@ def find_shift(points_vehicle_m: F64, T_map_vehicle: F64, match_map: MatchMap, *
             stretch (those of other moments moved there as the poses say).
         T_map_vehicle: (4, 4) the pose that is asked about.
         match_map: the map there.
-        planar: look for shifts in place and heading only: what a few layers see does not tell height and tilt.
+        planar: look for shifts in place and heading only: what a few layers see does not constrain height and tilt.
 
     Returns:
         The shift; the identity where nothing nearby fits better, or too little of the map is known.

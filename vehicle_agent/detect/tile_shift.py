@@ -4,7 +4,7 @@ Each stretch of the drive has passed the same test with limits that its poses al
 known better: an error of a few centimetres that all of them share shows only here.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Final
 
 import numpy as np
@@ -17,17 +17,17 @@ from gnd.gnd_map.geodesy import LocalFrame
 from gnd.gnd_map.grid import VoxelGrid
 from gnd.gnd_map.se3 import T_inverse, transform
 from gnd.vehicle_agent.detect.classify import Classification
-from gnd.vehicle_agent.detect.shift import Shift, ShiftParameters, costs_at, find_shift
+from gnd.vehicle_agent.detect.shift import OF_SCANS, Shift, costs_at, find_shift
 from gnd.vehicle_agent.localise.match_map import MatchMapCache
 
 _LEAST_CHANGES: Final = 5
-"""A tile with fewer is told as it is."""
+"""A tile with fewer is reported as it is."""
 _MOST: Final = 0.5
-"""Where a shift explains so large a share of what changed, nothing of the tile is told."""
+"""Where a shift explains so large a share of what changed, the tile is not reported."""
 _FALLS: Final = 0.05
 """A voxel whose cost falls by this, to `_FITS`, is explained."""
 _FITS: Final = 0.3
-_PARAMETERS: Final = ShiftParameters(least_m=0.05, sigmas=0.0, most_m=0.2, z=6.0)
+_TEST: Final = replace(OF_SCANS, least_m=0.05, sigmas=0.0, most_m=0.2, z=6.0)
 """Larger shifts would have been found while driving; in a single tile that was rebuilt they are found by chance."""
 _SPREAD: Final = 1.2
 """Points of a Gaussian that stand for it: its mean, and so many sigmas to either side along each axis."""
@@ -64,7 +64,7 @@ def pose_error_of_tile(found: Classification, match_map: MatchMapCache, T_map_ve
     T[:3, 3] = points_map_m.mean(axis=0)  # a turn about the tile, not about a vehicle far away
     points_m, near = transform(T_inverse(T), points_map_m), match_map.near(T[:3, 3])
     shift = find_shift(points_m, T, near, planar=True)
-    if not shift.checked or not shift.is_pose_error(_PARAMETERS, found.evidence.pose):
+    if not shift.checked or not shift.is_pose_error(_TEST, found.evidence.pose):
         return None
     was, now = (costs_at(points_m, pose, near).reshape(len(rows), -1).mean(axis=1) for pose in (T, T @ shift.T))
     measured = np.isin(found.change_class[rows], (ChangeClass.NEW, ChangeClass.MODIFIED))

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from gnd.gnd_map.arrays import F32, F64
 from gnd.gnd_map.se3 import T_inverse, transform
 from gnd.vehicle_agent.detect.recent_map import recent_map
-from gnd.vehicle_agent.detect.shift import Shift, ShiftParameters, find_shift, gain
+from gnd.vehicle_agent.detect.shift import OF_SCANS, Shift, find_shift, gain
 from gnd.vehicle_agent.detect.uncertainty import PoseUncertainty
 from gnd.vehicle_agent.localise.estimates import PoseEstimate, RefinedScan
 from gnd.vehicle_agent.localise.level import sees_tilt
@@ -76,7 +76,7 @@ class Tried:
         points_map_m: (N, 3) sampled points that stand still.
         T_map_vehicle: (4, 4) a pose in its middle.
         scans: how many.
-        pose: how well the poses were said to be known, the worst of them.
+        pose: uncertainty of the poses as estimated, the worst of them.
     """
 
     shift: Shift
@@ -117,12 +117,11 @@ class Trial:
 
     Args:
         match_map: the base map that is compared with.
-        parameters: of the shift test.
     """
 
-    def __init__(self, match_map: MatchMapCache, parameters: ShiftParameters) -> None:
+    def __init__(self, match_map: MatchMapCache) -> None:
         self.counts: Counter[str] = Counter()
-        self._map, self._parameters = match_map, parameters
+        self._map = match_map
         self._open: _Segment | None = None
         self._passed: list[_TrialScan] = []
         self._wrong = False  # the segment before was
@@ -185,7 +184,7 @@ class Trial:
             self._passed = segment.scans
 
     def _try(self, scans: list[_TrialScan]) -> Tried:
-        """Ask the base map, and where that says "shifted" what was seen just before."""
+        """Test against the base map, and where that finds a shift against what was seen just before."""
         n = max(_LEAST_POINTS_OF_SCAN, _POINTS_OF_SEGMENT // len(scans))
         points = np.concatenate([some_of(held.points[~held.moving], held.centre_m, n) for held in scans])
         T = scans[len(scans) // 2].estimate.T_map_vehicle
@@ -194,9 +193,9 @@ class Trial:
         shift = find_shift(points_m, T, self._map.near(T[:3, 3]), planar=not sees_tilt(seen))
         poses = [PoseUncertainty.of(held.estimate) for held in scans]
         worst = PoseUncertainty(max(p.sigma_m for p in poses), max(p.sigma_rad for p in poses))
-        far = shift.is_far(self._parameters, worst)
+        far = shift.is_far(OF_SCANS, worst)
         verdict: Verdict = "good" if shift.checked and not far else "unchecked"
-        if far and self._sureness(points_m, T, shift) >= self._parameters.z:
+        if far and self._sureness(points_m, T, shift) >= OF_SCANS.z:
             verdict = "shifted"
         if verdict == "good":
             self._recent = _Recent.of(scans, T @ shift.T @ T_inverse(T))
@@ -214,7 +213,7 @@ class Trial:
         if self._recent is None:
             return shift.z
         X_step = T @ shift.T @ T_inverse(T) @ T_inverse(self._recent.X)
-        if replace(shift, T=T_inverse(T) @ X_step @ T).size_m < self._parameters.least_m:
+        if replace(shift, T=T_inverse(T) @ X_step @ T).size_m < OF_SCANS.least_m:
             return shift.z
         then = self._recent.points_m + self._recent.centre_m
         near = then[np.linalg.norm(then - T[:3, 3], axis=1) < _MAX_RANGE_M]

@@ -1,8 +1,8 @@
-"""Wheels and scans tell different motions: the map is asked which of the two is wrong.
+"""Wheels and scans disagree on the motion: the map decides which of the two is wrong.
 
 Wheels slip. Scan-to-scan odometry goes wrong where little stands: the rings on the ground move along with the vehicle,
 and a step that is wrong once is predicted again. Neither knows it of itself. The match with the map is independent of
-both: it lies where one of the two motions leads to and not the other, or it cannot tell.
+both: it lies where one of the two motions leads to and not the other, or it decides nothing.
 """
 
 from collections.abc import Iterable
@@ -10,14 +10,12 @@ from dataclasses import replace
 from typing import Final, Literal, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
+from gnd.gnd_map.arrays import F64
 from gnd.gnd_map.se3 import T_inverse
 from gnd.vehicle_agent.localise.registration import RegistrationResult
 from gnd.vehicle_agent.localise.scan_odometry import JointStep, ScanStep, joint_step
 from gnd.vehicle_agent.localise.stretch import log_se3
-
-F64 = NDArray[np.float64]
 
 Wrong = Literal["wheels", "scans", "open"]
 

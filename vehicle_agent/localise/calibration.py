@@ -1,23 +1,27 @@
-"""What the map teaches about the vehicle's own motion sensors, and how far to trust them until it has."""
+"""Calibration of the vehicle's own motion sensors by the map, and their uncertainty until then."""
 
 from dataclasses import dataclass
 from typing import Any, Final, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
+from gnd.gnd_map.arrays import F64
 from gnd.gnd_map.se3 import T_inverse, log_so3
 from gnd.vehicle_agent.importers.mounting import angles_of
 from gnd.vehicle_agent.localise.clock import ClockDoubt, ClockEstimator
-from gnd.vehicle_agent.localise.drift import PoseDrift
 from gnd.vehicle_agent.localise.estimates import Cause, Health
 from gnd.vehicle_agent.localise.first_course import FirstCourse
 from gnd.vehicle_agent.localise.mount import DOUBTFUL_RAD, SIGMAS, MountDoubt, MountResidual
 from gnd.vehicle_agent.localise.odometry import MotionBuffer
-from gnd.vehicle_agent.localise.parameters import OdometryParameters
 from gnd.vehicle_agent.localise.remount import Mounting, left_over, left_sigma
 from gnd.vehicle_agent.localise.scan_odometry import ScanStep
+from gnd.vehicle_agent.localise.stretch import BIAS, LEFT, SCALE, UP
 
+SCALE_PRIOR: Final = 0.02
+BIAS_PRIOR_RADPS: Final = 0.005
+COURSE_PRIOR: Final = 0.02
+"""One sigma before anything is learnt: of the wheel scale (a share), of the gyro's bias, and of the motion sideways and
+upwards per metre forward (the LiDAR's mount is not aligned with the wheels)."""
 _LONGITUDINAL_M: Final = 0.003
 _LATERAL_M: Final = 0.003
 _VERTICAL_M: Final = 0.01
@@ -30,14 +34,12 @@ ODOMETRY_BIAS_DRIFT_RADPS: Final = 1e-05
 """Their change in a root second."""
 _STRETCH_M: Final = 0.03
 _STRETCH_RAD: Final = 0.002
-"""Of the motion over a second that two map matches tell."""
+"""Of the motion over a second by two map matches."""
 _LEAST_SCALE: Final = 0.0005
 _LEAST_BIAS_RADPS: Final = 7e-05
-"""The least sigma of what a stretch of submaps tells about scale and bias."""
+"""The least sigma of scale and bias as a stretch of submaps estimates them."""
 _EXCESS_GAIN: Final = 0.2
 """Weight of the newest step in the running judgement of how much worse than all this the odometry is."""
-
-F64 = NDArray[np.float64]
 
 STEP_S, STRETCH_S = 0.5, 1.0
 IN_DOUBT = 2.5
@@ -46,7 +48,7 @@ MAX_TRIM_RAD, KNOWN_COURSE_RAD = 1.05e-3, 6e-4
 WRONG_HEADING_RAD = float(np.radians(0.5))
 """Until the mount's yaw is known to be off by less, by two sigmas, no pose is called good."""
 OBSERVED_RAD, DISPUTABLE_RAD = float(np.radians(0.2)), float(np.radians(0.6))
-"""Once the course was observed so well, one sigma and the larger limit will do: recordings tell mounts, or mean axes,
+"""Once the course was observed so well, one sigma and the larger limit will do: recordings have mounts, or axes,
 that are turned by half a degree (KITTI 00: 0.5°, KITTI raw 0027: 0.2°)."""
 PATIENT_M = 5.0
 """Where no course is seen on so much of way, as in an open field, one sigma will do."""
@@ -65,12 +67,18 @@ class Stamped(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class MotionCalibration:
-    """What a localiser knows of its vehicle's sensors, each with one sigma.
+    """Calibration of a vehicle's sensors, each value with one sigma.
 
-    time_offset_s: stamps of wheels and gyro are so much later than those of the LiDAR, growing by `time_offset_rate`;
-    clock_doubt: why that is not to be relied on. wheel_scale: what the wheel speed is multiplied with. gyro_bias_radps:
-    what is taken off the yaw rate. course_rad: direction of driving straight, left of the vehicle's x axis as the
-    header's mount puts it. mount: height, roll and pitch against the header, from the ground.
+    Attributes:
+        time_offset_s: stamps of wheels and gyro are so much later than those of the LiDAR, growing by
+            `time_offset_rate`.
+        clock_doubt: why that is not to be relied on.
+        wheel_scale: factor of the wheel speed.
+        gyro_bias_radps: bias of the yaw rate.
+        course_rad: direction of driving straight, left of the vehicle's x axis as the header's mount puts it.
+        mount: height, roll and pitch against the header, from the ground.
+        mount_header: (4, 4) the header's T_vehicle_lidar.
+        mount_used: (4, 4) the one in use: the header's where that is not certainly wrong.
     """
 
     time_offset_s: float
@@ -84,10 +92,8 @@ class MotionCalibration:
     course_rad: float
     course_sigma_rad: float
     mount: MountResidual
-    mount_told: F64 | None = None
-    """(4, 4) the header's T_vehicle_lidar."""
+    mount_header: F64 | None = None
     mount_used: F64 | None = None
-    """(4, 4) what it is taken to be: the header's where that is not certainly wrong."""
 
     def __post_init__(self) -> None:
         sigmas = (self.time_offset_sigma_s, self.wheel_scale_sigma, self.gyro_bias_sigma_radps, self.course_sigma_rad)
@@ -101,7 +107,7 @@ class MotionCalibration:
 
     @property
     def mount_doubtful(self) -> tuple[MountDoubt, ...]:
-        """What the header says wrongly of the mount for certain: by more than 10 cm or 0.3°."""
+        """Axes in which the header's mount is certainly wrong: by more than 10 cm or 0.3°."""
         turned = abs(self.course_rad) - SIGMAS * self.course_sigma_rad > DOUBTFUL_RAD
         return (*self.mount.doubtful, "yaw") if turned else self.mount.doubtful
 
@@ -109,17 +115,17 @@ class MotionCalibration:
         """Plain values, angles in degrees; None where nothing is known."""
         mount = self.mount
         return {
-            "time_offset_s": _told(self.time_offset_s, self.time_offset_sigma_s),
+            "time_offset_s": _with_sigma(self.time_offset_s, self.time_offset_sigma_s),
             "time_offset_rate": round(self.time_offset_rate, 7),
             "clock_doubt": self.clock_doubt,
-            "wheel_scale": _told(self.wheel_scale, self.wheel_scale_sigma),
-            "yaw_bias_degps": _told(np.degrees(self.gyro_bias_radps), np.degrees(self.gyro_bias_sigma_radps)),
-            "mount_height_m": _told(mount.height_m, mount.height_sigma_m),
-            "mount_roll_deg": _told(np.degrees(mount.roll_rad), np.degrees(mount.roll_sigma_rad)),
-            "mount_pitch_deg": _told(np.degrees(mount.pitch_rad), np.degrees(mount.pitch_sigma_rad)),
-            "mount_yaw_deg": _told(np.degrees(self.mount_yaw_rad), np.degrees(self.course_sigma_rad)),
+            "wheel_scale": _with_sigma(self.wheel_scale, self.wheel_scale_sigma),
+            "yaw_bias_degps": _with_sigma(np.degrees(self.gyro_bias_radps), np.degrees(self.gyro_bias_sigma_radps)),
+            "mount_height_m": _with_sigma(mount.height_m, mount.height_sigma_m),
+            "mount_roll_deg": _with_sigma(np.degrees(mount.roll_rad), np.degrees(mount.roll_sigma_rad)),
+            "mount_pitch_deg": _with_sigma(np.degrees(mount.pitch_rad), np.degrees(mount.pitch_sigma_rad)),
+            "mount_yaw_deg": _with_sigma(np.degrees(self.mount_yaw_rad), np.degrees(self.course_sigma_rad)),
             "mount_doubtful": list(self.mount_doubtful),
-            "mount_told": _mount_json(self.mount_told),
+            "mount_told": _mount_json(self.mount_header),
             "mount_used": _mount_json(self.mount_used),
         }
 
@@ -127,15 +133,14 @@ class MotionCalibration:
 class MotionTeacher:
     """Learns wheel scale, gyro bias and course of a `MotionBuffer` from map matches: scalar Kalman filters."""
 
-    def __init__(self, motion: MotionBuffer, parameters: OdometryParameters, mount: Mounting | None = None) -> None:
-        self.parameters = parameters
+    def __init__(self, motion: MotionBuffer, mount: Mounting | None = None) -> None:
         self.mount = mount or Mounting(np.eye(4))
         self.first_course = FirstCourse()
         self.clock = ClockEstimator(motion)
         self._motion = motion
-        self._scale_var = parameters.scale_prior**2
-        self._bias_var = parameters.bias_prior_radps**2
-        self._course_var = parameters.course_prior**2
+        self._scale_var = SCALE_PRIOR**2
+        self._bias_var = BIAS_PRIOR_RADPS**2
+        self._course_var = COURSE_PRIOR**2
         self._way_m = 0.0
         self._excess_var = np.zeros(6)
         self._anchor: Stamped | None = None
@@ -178,7 +183,7 @@ class MotionTeacher:
 
     @property
     def cause(self) -> Cause:
-        """What is wrong with the sensors whose errors are learnt, if anything."""
+        """Which of the sensors whose errors are learnt is wrong, if any."""
         return "mount" if self.mount_in_doubt else self.clock_cause
 
     @property
@@ -223,7 +228,7 @@ class MotionTeacher:
             course_rad=float(motion.course[0]),
             course_sigma_rad=self._course[1],
             mount=self.mount.residual,
-            mount_told=self.mount.T_header,
+            mount_header=self.mount.T_header,
             mount_used=self.mount.T_vehicle_lidar(-self.header_trim_rad),
         )
 
@@ -250,7 +255,7 @@ class MotionTeacher:
 
     @property
     def _course_known(self) -> bool:
-        """True when the matches of a whole stretch tell it."""
+        """True when the matches of a whole stretch have estimated it."""
         return bool(self._course_var < KNOWN_COURSE_RAD**2)
 
     def yaw_sigma_rad(self, trim_rad: float, least_rad: float) -> float:
@@ -271,7 +276,7 @@ class MotionTeacher:
 
     @property
     def yaw_in_doubt(self) -> bool:
-        """True while the course says that the mount's yaw is likely wrong and not yet by how much."""
+        """True while the course shows that the mount's yaw is likely wrong, but not yet by how much."""
         course_rad, sigma_rad = abs(self._course[0]), self._course[1]
         likely = course_rad > max(2.0 * DOUBTFUL_RAD, IN_DOUBT * sigma_rad)  # where the heading would be called wrong
         return likely and course_rad - SIGMAS * sigma_rad <= DOUBTFUL_RAD
@@ -289,8 +294,8 @@ class MotionTeacher:
     def see_step(
         self, first_ns: int, last_ns: int, T_driven: F64, seen: ScanStep | None, *, slipped: bool = False
     ) -> None:
-        """Take the motion between two scans: (4, 4) by wheels and gyro, and as the scans tell it, if they do. Wheels
-        that slip, or that the scans contradict (`slipped`), tell nothing of the clock.
+        """Take the motion between two scans: (4, 4) by wheels and gyro, and by the scans, if known. Wheels that
+        slip, or that the scans contradict (`slipped`), are no observation of the clock.
         """
         self._way_m += float(np.linalg.norm(T_driven[:3, 3]))
         slipped |= self._motion.slipped(first_ns, last_ns)
@@ -300,8 +305,8 @@ class MotionTeacher:
         self.first_course.see(seen)
 
     def learn(self, t_ns: int, T_map_vehicle: F64, covariance: F64) -> None:
-        """Take a trusted match and its covariance (6, 6): each step tells how good the odometry is, each stretch of
-        `STRETCH_S` what it is wrong by.
+        """Take a trusted match and its covariance (6, 6): each step shows how good the odometry is, each stretch of
+        `STRETCH_S` what its errors are.
         """
         now = Stamped(t_ns, T_map_vehicle)
         if self._last is not None and t_ns - self._last.t_ns < STEP_S * 1e9:
@@ -320,23 +325,23 @@ class MotionTeacher:
         square = np.concatenate([log_so3(off[:3, :3]), off[:3, 3]]) ** 2
         self._excess_var += _EXCESS_GAIN * (square - 2.0 * match_var - self._excess_var)
 
-    def correct(self, drift: PoseDrift, overlap: float) -> None:
-        """Take off what a whole stretch says, where it knows better than what was learnt so far.
+    def correct(self, change: F64, sigmas: F64) -> None:
+        """Take over what a whole stretch found, where it knows better than what was learnt so far.
 
-        `overlap`: in how many of the stretch's matches each scan takes part, so that they are not independent.
+        Args:
+            change: (N_SHARED,) of the stretch's shared parameters.
+            sigmas: (N_SHARED,) one sigma each.
         """
-        grown = float(np.sqrt(overlap))
-        bias = max(drift.yaw_radps.sigma * grown, _LEAST_BIAS_RADPS)
+        least = [_LEAST_BIAS_RADPS, _LEAST_SCALE, _LEAST_SCALE]
+        bias, scale, course = np.maximum(sigmas[[BIAS, SCALE, LEFT]], least).tolist()
         if bias**2 < KEEPS * self._bias_var:
-            self._motion.yaw_bias_radps += drift.yaw_radps.value
+            self._motion.yaw_bias_radps += float(change[BIAS])
             self._bias_var = bias**2
-        scale = max(drift.forward.sigma * grown, _LEAST_SCALE)
         if scale**2 < KEEPS * self._scale_var:
-            self._motion.speed_scale *= 1.0 - drift.forward.value
+            self._motion.speed_scale *= 1.0 + float(change[SCALE])
             self._scale_var = scale**2
-        course = max(drift.left.sigma * grown, _LEAST_SCALE)
         if course**2 < KEEPS * self._course_var:
-            self._motion.course -= [drift.left.value, drift.up.value]
+            self._motion.course += change[[LEFT, UP]]
             self._course_var = course**2
 
     def _compare(self, first: Stamped, last: Stamped) -> None:
@@ -366,7 +371,7 @@ class MotionTeacher:
         self._bias_var *= 1.0 - gain * dt_s
 
 
-def _told(value: float, sigma: float) -> dict[str, float] | None:
+def _with_sigma(value: float, sigma: float) -> dict[str, float] | None:
     return {"value": round(float(value), 6), "sigma": round(float(sigma), 6)} if np.isfinite(sigma) else None
 
 

@@ -4,8 +4,8 @@ from dataclasses import replace
 from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 
+from gnd.gnd_map.arrays import F64
 from gnd.vehicle_agent.localise.first_pose import INITIALISE_FAIR_FIT, INITIALISE_GOOD_FIT, SearchPlace
 from gnd.vehicle_agent.localise.hypotheses import (
     HYPOTHESIS_APART_DEG,
@@ -15,6 +15,7 @@ from gnd.vehicle_agent.localise.hypotheses import (
     PoseHypotheses,
 )
 from gnd.vehicle_agent.localise.initialise import (
+    AROUND_POSITION,
     HYPOTHESIS_GAIN,
     INITIALISE_MIN_FIT,
     INITIALISE_N_REFINING,
@@ -39,7 +40,7 @@ _LEAD: Final = 0.03
 _PRIOR: Final = 6.0
 """How much likelier the tracked pose is before anything is seen."""
 _MOST_VIEWS: Final = 8.0
-"""How many views may speak against it."""
+"""How many views may be against it."""
 _CONTESTED: Final = -2.0
 _BEATEN: Final = 4.0
 _DROPPED: Final = -12.0
@@ -48,8 +49,6 @@ are logarithms."""
 _NEAR_M: Final = 1.0
 _NEAR_DEG: Final = 3.0
 """A rival nearer than this must fit well to win."""
-
-F64 = NDArray[np.float64]
 
 
 class Challenger:
@@ -61,7 +60,7 @@ class Challenger:
 
     def __init__(self, parameters: LocaliserParameters) -> None:
         self._par = parameters
-        self._how = replace(parameters.initialise, n_refined=_N_REFINED, n_kept=_N_REFINED)
+        self._how = replace(AROUND_POSITION, n_refined=_N_REFINED, n_kept=_N_REFINED)
         self.rivals = PoseHypotheses(parameters.registration, _MOST_VIEWS)
         self._searched_ns = -(2**62)
         self._T_tracked = np.eye(4)

@@ -1,9 +1,8 @@
 """The time offset between the LiDAR's clock and that of wheels and gyro, found while driving.
 
-What a scan-to-scan step says of the way and the turn between two scans needs no motion sensor. Wheel speed and yaw
-rate, integrated between the same two times, differ from it by the offset times what speed and yaw rate changed by. So a
-vehicle that brakes, accelerates or turns tells the offset; one that drives on evenly does not, and then it does no
-harm.
+Way and turn of a scan-to-scan step need no motion sensor. Wheel speed and yaw rate, integrated between the same two
+times, differ from them by the offset times what speed and yaw rate changed by. So a vehicle that brakes, accelerates or
+turns makes the offset observable; one that drives on evenly does not, and then it does no harm.
 
 A window of steps is fitted at once, by Gauss and Newton, for offset, its rate, and what else such differences could
 come from: wheel scale, the tyres' slip under acceleration, gyro bias. Neighbouring steps share the error of the scan
@@ -18,10 +17,10 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import cho_solve_banded, cholesky_banded
 
+from gnd.gnd_map.arrays import F64
 from gnd.vehicle_agent.localise.odometry import ClockModel, MotionBuffer
 from gnd.vehicle_agent.localise.scan_odometry import ScanStep
 
-F64 = NDArray[np.float64]
 ClockDoubt = Literal["none", "large", "unsure", "drifting", "jumped"]
 
 PRIOR_S: Final = 0.04
@@ -85,7 +84,7 @@ class ClockEstimate:
 
 @dataclass(frozen=True, slots=True)
 class ClockStep:
-    """Forward way [m] and turn [rad] between two times of the LiDAR's clock, as scans say, with one sigma each."""
+    """Forward way [m] and turn [rad] between two times of the LiDAR's clock, by scans, with one sigma each."""
 
     first_ns: int
     last_ns: int
@@ -170,7 +169,7 @@ class ClockEstimator:
         self.estimate = ClockEstimate(0)
 
     def see(self, first_ns: int, last_ns: int, seen: ScanStep | None) -> None:
-        """Take the motion between two scans as the scans tell it, if they do; now and then, set the clock."""
+        """Take the motion between two scans by the scans, if it is known; now and then, set the clock."""
         if seen is not None and last_ns > first_ns:
             sigma = np.sqrt(np.diag(seen.covariance))
             T = seen.T_before_now
@@ -180,7 +179,7 @@ class ClockEstimator:
         self.update(last_ns)
 
     def see_slip(self, t_ns: int) -> None:
-        """The wheels slip at a time: steps that such samples could belong to, whatever the offset, tell nothing."""
+        """The wheels slip at a time: steps that such samples could belong to, whatever the offset, are left out."""
         while self._steps and self._steps[-1].last_ns > t_ns - SLIP_REACHES_NS:
             self._steps.pop()
 
@@ -225,7 +224,7 @@ class ClockEstimator:
         return nothing_known(at_ns) if known is None or known.covariance[0, 0] > PRIOR_S**2 else known
 
     def _leave(self, before_ns: int) -> None:
-        """Blocks of steps that are too old go; what they tell of the offset is kept."""
+        """Blocks of steps that are too old go; their estimate of the offset is kept."""
         while self._steps and self._steps[0].last_ns < before_ns - BLOCK_NS:
             end_ns = self._steps[0].first_ns + BLOCK_NS
             block: list[ClockStep] = []
@@ -243,7 +242,7 @@ class ClockEstimator:
         self._old = OffsetPrior(at_ns, fit.values[:2], fit.covariance[:2, :2])
 
     def _jumped(self, fit: ClockFit, known: list[ClockStep], signal: MotionSignal) -> bool:
-        """True when the last steps alone tell another offset than the whole window; the rest of it goes then."""
+        """True when the last steps alone give another offset than the whole window; the rest of it goes then."""
         last = [step for step in known if step.first_ns >= known[-1].last_ns - LAST_NS]
         if len(last) < LEAST_STEPS or len(last) == len(known):
             return False
@@ -327,15 +326,15 @@ def _residuals(values: F64, first: F64, last: F64, seen: F64, signal: MotionSign
 
 
 def _believed(changes: F64, false_changes: F64) -> F64:
-    """(2,) what to multiply the changes (N, 2) of speed and yaw rate by: noise makes some, and they tell nothing. None
-    are believed where most are noise.
+    """(2,) what to multiply the changes (N, 2) of speed and yaw rate by: noise makes some, which do not count. None are
+    believed where most are noise.
     """
     share = 1.0 - false_changes / np.maximum(np.mean(changes**2, axis=0), 1e-12)
     return np.asarray(np.sqrt(np.where(share > LEAST_TRUE, share, 0.0)))
 
 
 def _noise_factor(rest: F64, sigma: F64, used: NDArray[np.bool_]) -> F64:
-    """(2,) by how much ways and turns are noisier than said, from the middle of what is left over; at least 0.7."""
+    """(2,) by how much ways and turns are noisier than claimed, from the middle of what is left over; at least 0.7."""
     ratio = np.abs(rest) / sigma
     middle = [np.median(ratio[used[:, k], k]) if used[:, k].any() else np.inf for k in range(2)]
     return np.maximum(1.4826 * np.array(middle), 0.7)

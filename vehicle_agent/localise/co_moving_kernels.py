@@ -1,4 +1,4 @@
-"""Range images of single sweeps in the frame of the turning LiDAR, and what they say of what may travel along."""
+"""Range images of single sweeps in the frame of the turning LiDAR, and whether an object in them may travel along."""
 
 import math
 from typing import Final
@@ -26,7 +26,7 @@ GROUND_SLOPE: Final = 0.015
 ENOUGH_RAYS: Final = 40_000
 """Of a sweep with many more points every third, fifth … is drawn; an odd stride meets every layer."""
 SPREAD_S: Final = 0.02
-"""A column of a longer time is one where start and end of the sweep meet: it says nothing."""
+"""A column of a longer time is one where start and end of the sweep meet: it is no evidence."""
 LAYERS_ROWS: Final = 6
 """How far above and below the next layer may be: 2.5 degrees."""
 MARGIN_M: Final = 0.5
@@ -128,7 +128,7 @@ def _in_sweep(p: F64, column_s: F32, twist: F64, T_lidar_vehicle: F64, out: F64)
 @kernel
 def _verdict(seen: int, range_m: float, below: bool) -> int:
     """Whether a ray ends before a place (`HIDDEN`), at it (`MET`) or well behind it (`PASSED`). Of a layer below the
-    place, ground that is not before it says that nothing stood in between.
+    place, ground that is not before it shows that nothing stood in between.
     """
     behind_m, margin_m = (seen & FAR_CM) / CM - range_m, MARGIN_M + MARGIN_SHARE * range_m
     if behind_m < -margin_m:
@@ -140,7 +140,7 @@ def _verdict(seen: int, range_m: float, below: bool) -> int:
 
 @kernel
 def look(image: U16, column: int, row: int, range_m: float) -> int:
-    """What the rays around a direction say of a place there: `PASSED` when the next ones above and below, in three
+    """What the rays around a direction show of a place there: `PASSED` when the next ones above and below, in three
     columns, all end well behind it, `MET` when one ends there, else `UNKNOWN`.
     """
     above, below, hidden = False, False, False
@@ -165,7 +165,7 @@ def look(image: U16, column: int, row: int, range_m: float) -> int:
 
 @kernel
 def _look_at(p: F64, image: U16, column_s: F32, twist: F64, T_lidar_vehicle: F64, at: F64) -> int:
-    """What a sweep says of a place (3,) in its vehicle frame; `at` is room for three numbers."""
+    """Evidence of a sweep about a place (3,) in its vehicle frame; `at` is room for three numbers."""
     column = _in_sweep(p, column_s, twist, T_lidar_vehicle, at)
     flat = math.hypot(at[0], at[1])
     if column < 0 or flat < 1.0:
@@ -215,7 +215,7 @@ def compare(
         raw: (K, 3) float32 points of the newest sweep, LiDAR frame, as measured.
         points: (K, 3) the same in the vehicle frame at its reference time.
         newest: slot of the newest sweep.
-        then: (L,) slots of earlier ones, the farthest first: they tell most.
+        then: (L,) slots of earlier ones, the farthest first: they are the best evidence.
         ages_s: (L,) how long ago they were.
         T_now_then: (L, 4, 4) motion of the vehicle since then.
         T_then_now: (L, 4, 4) and back.

@@ -1,4 +1,4 @@
-"""Whether an estimator's errors are as large as it says: NEES against a reference, NIS against its own prediction
+"""Whether an estimator's errors are as large as it claims: NEES against a reference, NIS against its own prediction
 (Bar-Shalom, Li and Kirubarajan 2001, section 5.4). Both are means over degrees of freedom: 1 is honest, more too sure.
 """
 
@@ -6,13 +6,11 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from gnd.gnd_map.arrays import F64
 from gnd.gnd_map.motion import Trajectory
 from gnd.gnd_map.se3 import T_inverse, log_so3
 from gnd.vehicle_agent.localise.estimates import PoseEstimate
-
-F64 = NDArray[np.float64]
 
 HEADING, PLACE = [2], [3, 4]
 """Rows of a pose's covariance, rotation before position."""
@@ -38,17 +36,17 @@ class Nees:
 
 
 def nees_of(estimates: Sequence[PoseEstimate], reference: Trajectory) -> Nees | None:
-    """Of the estimates that tell a covariance and lie within the reference's time; None without any."""
+    """Of the estimates that have a covariance and lie within the reference's time; None without any."""
     first, last = int(reference.t_ns[0]), int(reference.t_ns[-1])
-    told = [(e, e.covariance) for e in estimates if e.covariance is not None and first <= e.t_ns <= last]
-    if not told:
+    known = [(e, e.covariance) for e in estimates if e.covariance is not None and first <= e.t_ns <= last]
+    if not known:
         return None
-    true = reference.at(np.array([e.t_ns for e, _ in told], np.int64))
-    off = T_inverse(true) @ np.stack([e.T_map_vehicle for e, _ in told])
+    true = reference.at(np.array([e.t_ns for e, _ in known], np.int64))
+    off = T_inverse(true) @ np.stack([e.T_map_vehicle for e, _ in known])
     error = np.concatenate([log_so3(off[:, :3, :3]), off[:, :3, 3]], axis=1)
-    covariance = np.stack([c for _, c in told])
+    covariance = np.stack([c for _, c in known])
     place, heading, joint = (_mean_square(error, covariance, rows) for rows in (PLACE, HEADING, HEADING + PLACE))
-    return Nees(len(told), place, heading, joint)
+    return Nees(len(known), place, heading, joint)
 
 
 def _mean_square(error: F64, covariance: F64, rows: list[int]) -> float:

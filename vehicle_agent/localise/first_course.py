@@ -1,20 +1,17 @@
 """Which way the vehicle drives in its own axes, from its first metres: is the mount turned by more than a heading may?
 
-The course that matches with the map teach takes some ten metres to be known; what scans tell of the motion between
-them is good to some tenths of a degree after two or three. Only a turned header is found out by it, none put right.
+The course that matches with the map teach takes some ten metres to be known; the motion between scans
+is good to some tenths of a degree after two or three. Only a turned header is found out by it, none put right.
 """
 
 from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 
 from gnd.vehicle_agent.localise.scan_odometry import ScanStep
 
-F64 = NDArray[np.float64]
-
 GROWN: Final = 1.0
-"""Steps of scans are taken to be so much less sure than they say."""
+"""Factor on the sigmas of the steps between scans."""
 LEVER_M: Final = 1.0
 """How far ahead of the rear axle the vehicle's origin may lie: it moves sideways then where the vehicle turns."""
 LEAST_STEP_M: Final = 0.05
@@ -30,7 +27,7 @@ class FirstCourse:
         self._sum = 0.0
 
     def see(self, seen: ScanStep | None) -> None:
-        """Take the motion between two scans as the scans tell it, if they do."""
+        """Take the motion between two scans by the scans, if it is known."""
         if seen is None or seen.slipping or self.sigma_rad < ENOUGH_RAD:
             return
         forward_m, left_m = float(seen.T_before_now[0, 3]), float(seen.T_before_now[1, 3])

@@ -1,15 +1,15 @@
-"""From no pose to the first: search where GNSS says, follow what was found, answer when one pose has won."""
+"""The first pose: search around the GNSS position, follow the candidates, answer when one of them has won."""
 
 from dataclasses import dataclass, replace
 from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 
+from gnd.gnd_map.arrays import F64
 from gnd.vehicle_agent.errors import RegistrationError
 from gnd.vehicle_agent.localise.estimates import Cause
 from gnd.vehicle_agent.localise.hypotheses import HYPOTHESIS_MOST_VIEWS, HYPOTHESIS_SURE, PoseHypotheses
-from gnd.vehicle_agent.localise.initialise import INITIALISE_MIN_FIT, Around, InitialPose, search
+from gnd.vehicle_agent.localise.initialise import AROUND_POSITION, INITIALISE_MIN_FIT, Around, InitialPose, search
 from gnd.vehicle_agent.localise.match_map import MatchMap, MatchMapCache
 from gnd.vehicle_agent.localise.parameters import LocaliserParameters
 from gnd.vehicle_agent.localise.registration import REGISTRATION_MIN_MATCHED, register
@@ -22,12 +22,10 @@ a pose decimetres off can fit best, and a vehicle that moves soon sees something
 _RETRY_S: Final = 0.8
 """Pause between two searches for the first pose."""
 
-F64 = NDArray[np.float64]
-
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SearchPlace:
-    """Where GNSS says that the vehicle is: (3,) in the map frame, one sigma of an axis, and how far it may be off."""
+    """GNSS position of the vehicle: (3,) in the map frame, one sigma of an axis, and how far it may be off."""
 
     p_map_m: F64
     sigma_m: float
@@ -35,7 +33,7 @@ class SearchPlace:
 
 
 class FirstPose:
-    """The search for a pose while there is none; `cause` says why there is none yet."""
+    """The search for a pose while there is none; `cause`: why there is none yet."""
 
     def __init__(self, parameters: LocaliserParameters) -> None:
         self._par = parameters
@@ -53,7 +51,7 @@ class FirstPose:
             t_ns: of the scan.
             points_m: (N, 3) sampled points, vehicle frame, sweep motion removed.
             T_before_now: (4, 4) the motion since the scan before.
-            place: where GNSS says that the vehicle is now, None if it does not.
+            place: the vehicle's GNSS position now, None without one.
             maps: the map, linearised where it is needed.
         """
         new = self._pool.push(points_m, T_before_now)
@@ -82,7 +80,7 @@ class FirstPose:
         self._searched_ns = t_ns
         around = Around(place.p_map_m, place.reach_m)
         points, standing = self._pool.points_m, self._pool.standing_m
-        found, _ = search(points, around, match_map, self._par.initialise, self._par.registration, standing)
+        found, _ = search(points, around, match_map, AROUND_POSITION, self._par.registration, standing)
         self.hypotheses.add(found)
 
     def _good_enough(self, found: InitialPose) -> bool:

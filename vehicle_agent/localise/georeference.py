@@ -10,14 +10,16 @@ from typing import Final
 
 import gtsam
 import numpy as np
-from numpy.typing import NDArray
 
+from gnd.gnd_map.arrays import F64, I64
 from gnd.gnd_map.geodesy import LocalFrame
 from gnd.gnd_map.motion import Trajectory
 from gnd.gnd_map.se3 import T_inverse
 from gnd.gnd_map.tile_id import TileId
 from gnd.vehicle_agent.errors import LocaliseError
 from gnd.vehicle_agent.localise.track_alignment import (
+    FIX_INFLATION,
+    FIX_SPACING_M,
     TRACK_LASTING_M,
     TRACK_ROBUST_K,
     TRACK_STEP_M,
@@ -26,12 +28,8 @@ from gnd.vehicle_agent.localise.track_alignment import (
     TRACK_STEP_SHARE,
     Alignment,
     FixTable,
-    GeoreferenceParameters,
     align,
 )
-
-F64 = NDArray[np.float64]
-I64 = NDArray[np.int64]
 
 MIN_FIXES: Final = 3
 _COSTS: Final = (
@@ -81,32 +79,39 @@ class Georeferenced:
 
 
 def georeference(
-    track: Trajectory, fixes: FixTable, parameters: GeoreferenceParameters | None = None, *, drift: bool = True
+    track: Trajectory,
+    fixes: FixTable,
+    *,
+    tilt: bool = False,
+    drift: bool = True,
+    inflation: float = FIX_INFLATION,
+    spacing_m: float = FIX_SPACING_M,
 ) -> Georeferenced:
     """Put a track on the Earth.
 
     Args:
-        track: T_local_vehicle in any local frame; the z axis about upwards unless `parameters.tilt`.
+        track: T_local_vehicle in any local frame; the z axis about upwards unless `tilt`.
         fixes: of the vehicle's origin, by the same clock; those outside the track's time are left out.
-        parameters: defaults if None.
+        tilt: find roll and pitch as well (a SLAM frame that does not know the vertical); needs heights.
         drift: False leaves it at the rigid alignment.
+        inflation: of the fixes' sigmas: GNSS errors last for tens of seconds.
+        spacing_m: of the fixes along the track, at least: a standing vehicle's do not add up.
 
     Raises:
         LocaliseError: fewer than three usable fixes, or none that lie apart.
     """
-    par = parameters or GeoreferenceParameters()
-    used = _usable(track, fixes, par.spacing_m)
+    used = _usable(track, fixes, spacing_m)
     chosen = fixes.take(used)
     if len(chosen) < MIN_FIXES:
         raise LocaliseError(f"{len(chosen)} of {len(fixes)} fixes lie apart and in the track's time; 3 are needed")
     middle = float(np.median(chosen.lat_rad)), float(np.median(chosen.lon_rad))
     frame = LocalFrame.of_tile(TileId.from_geodetic(*middle))
     p_local, p_frame = track.at(chosen.t_ns)[:, :3, 3], chosen.enu_m(frame)
-    alignment = align(p_local, p_frame, chosen, par)
+    alignment = align(p_local, p_frame, chosen, tilt=tilt)
     T = alignment.T_frame_local @ track.T_dst_vehicle
     if not drift or len(track) < 2:
         return Georeferenced(frame, Trajectory(track.t_ns, T), alignment, alignment.weights, used)
-    T, weights = _bent(Trajectory(track.t_ns, T), p_frame, chosen, par)
+    T, weights = _bent(Trajectory(track.t_ns, T), p_frame, chosen, inflation)
     return Georeferenced(frame, Trajectory(track.t_ns, T), alignment, weights, used)
 
 
@@ -123,7 +128,7 @@ def _usable(track: Trajectory, fixes: FixTable, spacing_m: float) -> I64:
     return np.array(chosen, np.int64)
 
 
-def _bent(track: Trajectory, p_frame_m: F64, fixes: FixTable, par: GeoreferenceParameters) -> tuple[F64, F64]:
+def _bent(track: Trajectory, p_frame_m: F64, fixes: FixTable, inflation: float) -> tuple[F64, F64]:
     """Poses (P, 4, 4) that follow both the track's steps and the fixes, and the fixes' weights in the end.
 
     A convex cost first, so that fixes far off a drifted track still pull; then one that lets wild ones go.
@@ -134,19 +139,19 @@ def _bent(track: Trajectory, p_frame_m: F64, fixes: FixTable, par: GeoreferenceP
     T = track.T_dst_vehicle
     for kind, k in _COSTS:
         graph = gtsam.NonlinearFactorGraph(steps)
-        for number, p, arm, sigmas in zip(near.tolist(), p_frame_m, arms, _sigmas(fixes, par), strict=True):
+        for number, p, arm, sigmas in zip(near.tolist(), p_frame_m, arms, _sigmas(fixes, inflation), strict=True):
             noise = gtsam.noiseModel.Robust.Create(
                 kind.Create(k * TRACK_ROBUST_K), gtsam.noiseModel.Diagonal.Sigmas(sigmas)
             )
             graph.add(gtsam.GPSFactorArm(number, p, arm, noise))
         T = _optimised(graph, T)
-    off = (p_frame_m - transform_each(T[near], arms)) / _sigmas(fixes, par)
+    off = (p_frame_m - transform_each(T[near], arms)) / _sigmas(fixes, inflation)
     return T, (1.0 + (off**2).sum(axis=1) / TRACK_ROBUST_K**2) ** -2
 
 
-def _sigmas(fixes: FixTable, par: GeoreferenceParameters) -> F64:
-    up = np.where(fixes.has_height, par.inflation * fixes.sigma_up_m, _UNKNOWN_UP_M)
-    return np.column_stack([par.inflation * fixes.sigma_m, par.inflation * fixes.sigma_m, up])
+def _sigmas(fixes: FixTable, inflation: float) -> F64:
+    up = np.where(fixes.has_height, inflation * fixes.sigma_up_m, _UNKNOWN_UP_M)
+    return np.column_stack([inflation * fixes.sigma_m, inflation * fixes.sigma_m, up])
 
 
 def _steps(T: F64) -> gtsam.NonlinearFactorGraph:

@@ -5,17 +5,17 @@ from typing import Final, NamedTuple
 
 import gtsam
 import numpy as np
-from numpy.typing import NDArray
 
+from gnd.gnd_map.arrays import F64
 from gnd.vehicle_agent.localise.parameters import GraphParameters
 from gnd.vehicle_agent.localise.scan_odometry import ScanStep
 
+_GNSS_INFLATION: Final = 5.0
+"""GNSS errors last for tens of seconds, so a fix's sigma is taken this many times."""
 _GNSS_VERTICAL: Final = 2.0
 """Its vertical sigma in horizontal ones."""
 GRAPH_ROBUST_K: Final = 2.0
 """Cauchy scale of map matches and GNSS, in sigmas."""
-
-F64 = NDArray[np.float64]
 
 SLACK_S = 0.01
 
@@ -43,9 +43,15 @@ class Position(NamedTuple):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SmoothedPose:
-    """A pose of the graph: number, time, (4, 4) T_map_vehicle and (6, 6) covariance (rotation first, vehicle frame);
-    certain: submaps leave no doubt about it; axle_variance: of the direction in which the rear axle drives [rad²],
-    where it is known better than that of the LiDAR.
+    """A pose of the graph.
+
+    Attributes:
+        number, t_ns: of its scan.
+        T_map_vehicle: (4, 4).
+        covariance: (6, 6), rotation first, vehicle frame.
+        certain: submaps leave no doubt about it.
+        axle_variance: of the direction in which the rear axle drives [rad²], where it is known better than that of the
+            LiDAR.
     """
 
     number: int
@@ -146,7 +152,7 @@ class PoseGraph:
 
     def _gnss_noise(self, sigma_m: float) -> gtsam.noiseModel.Base:
         axes = np.array([1.0, 1.0, _GNSS_VERTICAL])
-        return self._robust(gtsam.noiseModel.Diagonal.Sigmas(sigma_m * self.parameters.gnss_inflation * axes))
+        return self._robust(gtsam.noiseModel.Diagonal.Sigmas(sigma_m * _GNSS_INFLATION * axes))
 
     def _robust(self, noise: gtsam.noiseModel.Base) -> gtsam.noiseModel.Base:
         cauchy = gtsam.noiseModel.mEstimator.Cauchy.Create(GRAPH_ROBUST_K)

@@ -1,4 +1,4 @@
-"""Whether to believe a match, whether to believe the pose, and why not: tells a wrong pose from a stale map from a poor
+"""Gating of matches, and the health of the pose with its cause: a wrong pose is distinguished from a stale map, a poor
 place.
 
 A *wrong pose* has a rival: another pose that fits better for longer (challenge.py), or GNSS against it from the start,
@@ -11,8 +11,8 @@ from collections import deque
 from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 
+from gnd.gnd_map.arrays import F64
 from gnd.gnd_map.se3 import T_inverse, log_so3
 from gnd.vehicle_agent.localise.estimates import Cause, Health
 from gnd.vehicle_agent.localise.parameters import HealthParameters
@@ -38,8 +38,10 @@ _POOR_SIGMA_RAD: Final = 0.003
 _LEAST_STANDING: Final = 25
 """Fewer standing points among the witness's rays are next to nothing."""
 _LONGEST_S: Final = 15.0
+_MIN_MATCHING_RATIO: Final = 0.5
+"""Least share of the points with a Gaussian nearby, for a match to be believed."""
 _PARTLY_MATCHED: Final = 0.3
-"""Matching ratio from which on a scan that is not believed still speaks for a pose that submaps hold to be certain:
+"""Matching ratio from which on a scan that is not believed still supports a pose that submaps hold to be certain:
 what is missing is what has changed."""
 _LOST_SIGMA_M: Final = 1.0
 """Where the map is stale or the place is poor, it is lost after so long without a believed match, or with so large a
@@ -59,8 +61,6 @@ _GNSS_SIGMAS: Final = 5.0
 HEALTH_GNSS_COUNT: Final = 5
 """This many fixes in a row farther than this from the pose mean that the pose is wrong, however well the scan seems to
 fit."""
-
-F64 = NDArray[np.float64]
 
 DIRECTIONS = ("roll", "pitch", "heading", "longitudinal", "lateral", "vertical")  # as in `degenerate`
 DISPUTED, MOST_DISPUTES = 2, 4  # matches that fit and lie elsewhere, less those that were believed since
@@ -94,14 +94,14 @@ class HealthMonitor:
         self._sigma = (0.0, 0.0)
         self._disputes, self._full = 0, False
 
-    # --- what is told to it ------------------------------------------------------------------------------------------
+    # --- observations ------------------------------------------------------------------------------------------------
 
     def believe(self, result: RegistrationResult | None, T_predicted: F64, sigmas: F64, t_ns: int) -> bool:
         """True when the match converged, covers enough of the scan and lies near the prediction; remembered then.
 
         `sigmas` (6,) of the prediction since the pose before: rotation [rad], translation [m].
         """
-        if result is None or not result.converged or result.matching_ratio < self.parameters.min_matching_ratio:
+        if result is None or not result.converged or result.matching_ratio < _MIN_MATCHING_RATIO:
             return False
         if not self._within_gate(T_inverse(T_predicted) @ result.T_map_vehicle, sigmas, self._gap_s(t_ns)):
             return False
@@ -109,7 +109,7 @@ class HealthMonitor:
         return True
 
     def doubtful(self, result: RegistrationResult | None) -> bool:
-        """True when a wider search is worth its time."""
+        """True when a wider search is needed."""
         return result is None or not result.converged or result.fit < _TRUSTED_FIT
 
     def see_wider(self, near: RegistrationResult | None, wide: RegistrationResult | None) -> None:
@@ -119,7 +119,7 @@ class HealthMonitor:
         self._better_elsewhere = self._better_elsewhere + 1 if better else 0
 
     def see_verdict(self, result: RegistrationResult | None, believed: bool) -> None:
-        """Take whether the scan's match was believed. One that fits well and lies elsewhere speaks against the pose:
+        """Take whether the scan's match was believed. One that fits well and lies elsewhere counts against the pose:
         odometry that goes wrong in small steps looks like that, and so does a first pose at a neighbouring minimum.
         """
         if believed:
@@ -161,7 +161,7 @@ class HealthMonitor:
         self._trusted |= enough and not self.contested
 
     def see_testimony(self, testimony: Testimony) -> None:
-        """Take what the rays of a scan say."""
+        """Take the evidence of a scan's rays."""
         self._testimonies.append(testimony)
 
     def see_scan(self, cause: Cause) -> None:
@@ -177,10 +177,10 @@ class HealthMonitor:
         self._trusted = False
         self._testimonies.clear()
 
-    # --- what it says ---------------------------------------------------------------------------------------------
+    # --- the verdict ----------------------------------------------------------------------------------------------
 
     def judge(self, t_ns: int) -> tuple[Health, Cause]:
-        """`lost`: the pose is worth nothing; `degraded`: not to be relied on; else `good`; and why."""
+        """`lost`: the pose must not be used; `degraded`: not to be relied on; else `good`; and why."""
         gap_s, par = self._gap_s(t_ns), self.parameters
         if (self.beaten and not self.certain) or self._gnss_contradicts(gap_s):
             return "lost", "wrong_pose"
@@ -208,7 +208,7 @@ class HealthMonitor:
 
     @property
     def suspicious(self) -> bool:
-        """True when it is worth to look for a better pose soon: a wider match fits better, or the rays contradict the
+        """True when a better pose is to be searched soon: a wider match fits better, or the rays contradict the
         map more than a current map would be.
         """
         hits, gone = self._mean("best_hits"), self._mean("gone_share")
@@ -248,7 +248,7 @@ class HealthMonitor:
         return "stale_map" if self._mean("best_hits") >= _FITTING_HITS else "wrong_pose"
 
     def _patience_s(self, cause: Cause) -> float:
-        """How long dead reckoning is worth something: where the map or the place is to blame, the pose was right."""
+        """How long dead reckoning may go on: where the map or the place is to blame, the pose was right."""
         known = self._sigma[0] < _LOST_SIGMA_M
         partly = self.certain and self.matching_ratio >= _PARTLY_MATCHED
         blameless = known and (partly or cause in ("stale_map", "poor_place"))

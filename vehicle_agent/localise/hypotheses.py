@@ -6,6 +6,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
+from gnd.gnd_map.arrays import F64
 from gnd.gnd_map.se3 import T_inverse, log_so3
 from gnd.vehicle_agent.errors import RegistrationError
 from gnd.vehicle_agent.localise.initialise import Candidate, InitialPose, near_pose, probabilities, thinned
@@ -39,12 +40,10 @@ _ALONE: Final = 0.75
 _DROPPED: Final = 1e-06
 """A hypothesis this much less probable than the best is given up."""
 
-F64 = NDArray[np.float64]
-
 
 @dataclass(slots=True, eq=False)
 class Hypothesis:
-    """A pose that may be the right one: mean fit over so many views; what odometry and GNSS say against it."""
+    """A pose that may be the right one: mean fit over so many views; penalties by odometry and GNSS."""
 
     registration: RegistrationResult
     T_map_vehicle: F64
@@ -66,7 +65,7 @@ class Hypothesis:
 
 
 class PoseHypotheses:
-    """Follows poses over consecutive scans. Which is right is told by the mean fit of what stands above the ground
+    """Follows poses over consecutive scans. Which is right shows in the mean fit of what stands above the ground
     (standing still tells nothing new), by how far registration moves each from where odometry has put it, and by GNSS.
     """
 
@@ -88,7 +87,7 @@ class PoseHypotheses:
         self._prune()
 
     def see_position(self, p_map_m: F64, sigma_m: float) -> None:
-        """Take where GNSS says that the vehicle is now: (3,), of which the height is not used; one sigma of an axis."""
+        """Take the GNSS position now: (3,), of which the height is not used; one sigma of an axis."""
         for one in self._held:
             one.far = 0.5 * float(np.sum((one.T_map_vehicle[:2, 3] - p_map_m[:2]) ** 2)) / sigma_m**2
 

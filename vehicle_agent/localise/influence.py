@@ -5,8 +5,8 @@ the matches is no covariance: it takes points as independent. Here the pull of e
 its points, and the squares of these sums are the variance (cluster-robust "sandwich" covariance, Liang and Zeger 1986).
 Nothing is assumed of how large the errors are or how many points share one.
 
-A piece that decides alone fits itself: its pull is nought, and says nothing. So the squares of few pieces count for
-less than what all directions together say (`FEW`), and each piece is asked how it disagrees with the others
+A piece that decides alone fits itself: its pull is zero and shows nothing. So the squares of few pieces count for
+less than those of all directions together (`FEW`), and each piece is asked how it disagrees with the others
 (leave-one-out, `MOST_LEVERAGE`).
 """
 
@@ -16,16 +16,15 @@ from typing import Final, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from gnd.gnd_map.arrays import F64
 from gnd.vehicle_agent.localise.kernels import pulls
 from gnd.vehicle_agent.localise.match_map import MatchMap
 from gnd.vehicle_agent.localise.registration import REGISTRATION_GATE_PER_SCALE, Linearised
 
-F64 = NDArray[np.float64]
-
 PIECE_M: Final = 2.0
 """Side of a piece of the map: neighbouring Gaussians of a wall share what its survey and its voxels are wrong by."""
 FEW: Final = 10.0
-"""Pieces whose squares count as much as what all directions together say."""
+"""Pieces whose squares count as much as those of all directions together."""
 MOST_LEVERAGE: Final = 0.5
 
 
@@ -81,7 +80,7 @@ def _of_pieces(pull: F64, weight: F64) -> Influence:
 
 def _add(pull: F64, weight: F64, scan: SeenScan, match_map: MatchMap) -> None:
     R, t = scan.match.T_map_vehicle[:3, :3], scan.match.T_map_vehicle[:3, 3]
-    v = scan.v @ scan.match.told.T
+    v = scan.v @ scan.match.constrained.T
     along_map = np.concatenate([v[:, :3] @ R.T, v[:, 3:] @ R.T], axis=1)
     m, scale = match_map, scan.match.scale
     pulls(

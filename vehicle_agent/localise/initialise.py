@@ -12,11 +12,12 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
+from gnd.gnd_map.arrays import F64
 from gnd.gnd_map.jit import kernel
 from gnd.gnd_map.se3 import T_from_R_t, exp_so3
 from gnd.vehicle_agent.errors import RegistrationError
 from gnd.vehicle_agent.localise.match_map import MatchMap
-from gnd.vehicle_agent.localise.parameters import InitialiseParameters, RegistrationParameters
+from gnd.vehicle_agent.localise.parameters import RegistrationParameters
 from gnd.vehicle_agent.localise.registration import RegistrationResult, Start, fit_of, register
 
 HYPOTHESIS_GAIN: Final = 50.0
@@ -39,14 +40,36 @@ _APART_DEG: Final = 5.0
 STANDING_ABOVE_M: Final = 0.4
 """Points that stand are higher than this above the ground, which fits everywhere."""
 
-F64 = NDArray[np.float64]
 U8 = NDArray[np.uint8]
 
-GROUND_RADIUS_M = 12.0  # map columns around the position that say how high and how steep the ground is
+GROUND_RADIUS_M = 12.0  # map columns around the position for height and slope of the ground
 HIGHEST_GROUND_M = 0.2  # above the origin of the vehicle frame
 HIT, NEXT_TO = 3, 1  # score of a point in a voxel with a Gaussian, in a neighbour of one
 SUPPRESS_M, SUPPRESS_DEG = 1.5, 8.0  # coarse hypotheses nearer than this converge to the same pose
 LOOKED_AT = 1500  # of the best coarse hypotheses, for distinct ones
+
+
+@dataclass(frozen=True, slots=True)
+class SearchGrid:
+    """How a search for poses goes about it.
+
+    Attributes:
+        step_m, step_deg: spacing of the coarse hypotheses.
+        n_refined: how many of the best are refined by registration.
+        n_kept: how many of these are refined to the end.
+        same_m, same_deg: refined poses nearer than this are one.
+    """
+
+    step_m: float
+    step_deg: float
+    n_refined: int
+    n_kept: int
+    same_m: float
+    same_deg: float
+
+
+AROUND_POSITION: Final = SearchGrid(step_m=1.0, step_deg=5.0, n_refined=24, n_kept=8, same_m=0.2, same_deg=1.0)
+"""Around a GNSS position."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -91,7 +114,7 @@ def initialise(
     p_gnss_m: F64,
     sigma_m: float,
     match_map: MatchMap,
-    parameters: InitialiseParameters | None = None,
+    grid: SearchGrid | None = None,
     registration: RegistrationParameters | None = None,
 ) -> InitialPose | None:
     """Find the vehicle's pose around a GNSS position; None when the map there matches nothing.
@@ -101,12 +124,12 @@ def initialise(
         p_gnss_m: (3,) position in the map frame; its height is not used.
         sigma_m: one sigma of the horizontal position.
         match_map: the map window, linearised near the position.
-        parameters: of the search.
+        grid: of the search; `AROUND_POSITION` if None.
         registration: of the refinement.
     """
-    par, registration = parameters or InitialiseParameters(), registration or RegistrationParameters()
+    grid, registration = grid or AROUND_POSITION, registration or RegistrationParameters()
     around = Around(np.asarray(p_gnss_m, np.float64), INITIALISE_RADIUS_SIGMAS * sigma_m)
-    candidates, n = search(points_m, around, match_map, par, registration)
+    candidates, n = search(points_m, around, match_map, grid, registration)
     answer = _answer(candidates, n)
     return _with_all_points(answer, points_m, match_map, registration)
 
@@ -115,7 +138,7 @@ def search(
     points_m: F64,
     around: Around,
     match_map: MatchMap,
-    par: InitialiseParameters,
+    grid: SearchGrid,
     registration: RegistrationParameters,
     standing_m: F64 | None = None,
 ) -> tuple[list[Candidate], int]:
@@ -132,21 +155,21 @@ def search(
     if standing_m is None:
         standing_m = points_m[points_m[:, 2] > ground_below_m + STANDING_ABOVE_M]  # ground fits everywhere
     standing = standing_m
-    hypotheses = _hypotheses(around, ground, ground_below_m, par)
+    hypotheses = _hypotheses(around, ground, ground_below_m, grid)
     scores = _score(thinned(standing, _N_POINTS), hypotheses, match_map)
-    poses = hypotheses[_distinct_best(hypotheses, scores, par.n_refined)]
+    poses = hypotheses[_distinct_best(hypotheses, scores, grid.n_refined)]
     checked = _refined(thinned(points_m, _N_CHECKED), standing, poses, match_map, registration, "capture")
-    best = [c.registration.T_map_vehicle for c in _distinct(checked, par)[: par.n_kept]]
+    best = [c.registration.T_map_vehicle for c in _distinct(checked, grid)[: grid.n_kept]]
     few = thinned(points_m, INITIALISE_N_REFINING)
-    return _distinct(_refined(few, standing, best, match_map, registration, "near"), par), len(hypotheses)
+    return _distinct(_refined(few, standing, best, match_map, registration, "near"), grid), len(hypotheses)
 
 
-def _distinct(candidates: list[Candidate], par: InitialiseParameters) -> list[Candidate]:
+def _distinct(candidates: list[Candidate], grid: SearchGrid) -> list[Candidate]:
     """Best fit first, those left out that ended in the same pose as a better one."""
     kept: list[Candidate] = []
     for one in sorted(candidates, key=lambda c: -c.fit):
         T = np.stack([k.registration.T_map_vehicle for k in kept]) if kept else np.empty((0, 4, 4))
-        if not near_pose(T, one.registration.T_map_vehicle, par.same_m, par.same_deg).any():
+        if not near_pose(T, one.registration.T_map_vehicle, grid.same_m, grid.same_deg).any():
             kept.append(one)
     return kept
 
@@ -191,16 +214,16 @@ def ground_below(points_m: F64) -> float:
     return found if found < HIGHEST_GROUND_M else 0.0
 
 
-def _hypotheses(around: Around, ground: F64, ground_below_m: float, par: InitialiseParameters) -> F64:
+def _hypotheses(around: Around, ground: F64, ground_below_m: float, grid: SearchGrid) -> F64:
     """(K, 4, 4) poses on a grid of positions in the circle and headings, standing on the ground plane."""
     p, reach = around.p_map_m, around.reach_m
-    steps = np.arange(-np.ceil(reach / par.step_m), np.ceil(reach / par.step_m) + 1) * par.step_m
+    steps = np.arange(-np.ceil(reach / grid.step_m), np.ceil(reach / grid.step_m) + 1) * grid.step_m
     dx, dy = (a.ravel() for a in np.meshgrid(steps, steps))
-    inside = np.hypot(dx, dy) <= max(reach, par.step_m)
+    inside = np.hypot(dx, dy) <= max(reach, grid.step_m)
     dx, dy = dx[inside], dy[inside]
     z = ground[0] + ground[1] * dx + ground[2] * dy - ground_below_m
     t = np.column_stack([p[0] + dx, p[1] + dy, z])
-    yaw = _headings(around, np.radians(par.step_deg))
+    yaw = _headings(around, np.radians(grid.step_deg))
     R = _tilt(ground) @ exp_so3(np.column_stack([np.zeros((len(yaw), 2)), yaw]))
     return T_from_R_t(np.tile(R, (len(t), 1, 1)), np.repeat(t, len(yaw), axis=0))
 
@@ -312,7 +335,7 @@ def _answer(candidates: list[Candidate], n: int) -> InitialPose | None:
 def probabilities(fits: F64, views: float, penalties: F64 | float = 0.0) -> F64:
     """(K,) probabilities of poses with mean fits (K,) over so many views, beside that of being none of them.
 
-    `penalties` (K,) are logarithms taken off: what odometry and GNSS say against a pose.
+    `penalties` (K,) are logarithms taken off: from odometry and GNSS.
     """
     log = HYPOTHESIS_GAIN * views * (np.concatenate([fits, [_NONE_FIT]])) - np.append(penalties + 0.0 * fits, 0.0)
     weight = np.exp(log - log.max())

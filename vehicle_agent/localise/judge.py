@@ -3,8 +3,8 @@
 from typing import Final, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
+from gnd.gnd_map.arrays import F64
 from gnd.gnd_map.se3 import transform
 from gnd.vehicle_agent.local_map import EMPTY
 from gnd.vehicle_agent.localise.challenge import Challenger
@@ -29,8 +29,6 @@ _MOTION_GAP_S: Final = 0.3
 _GAP_S: Final = 2.0
 """After so long without motion samples, or without a believed match, the pose must prove itself again."""
 
-F64 = NDArray[np.float64]
-
 FEWEST_POINTS: Final = 20
 """Of a scan that a sensor in order gives: in an open field four layers see a few dozen points that matter."""
 
@@ -38,10 +36,16 @@ FEWEST_POINTS: Final = 20
 class Matched(NamedTuple):
     """One scan after its match.
 
-    t_ns: reference time; points_m: (N, 3) vehicle frame; T_before_now: (4, 4) motion since the scan before; T_now: (4,
-    4) the tracked pose; result: the match that was made there; believed: whether it counts; motion_gap_s: how much of
-    the way since the scan before was driven without motion samples; cause: what is known to be wrong besides;
-    repeated: it is the scan before to the bit, which no sensor measures.
+    Attributes:
+        t_ns: reference time.
+        points_m: (N, 3) vehicle frame.
+        T_before_now: (4, 4) motion since the scan before.
+        T_now: (4, 4) the tracked pose.
+        result: the match that was made there.
+        believed: whether it counts.
+        motion_gap_s: seconds since the scan before without motion samples.
+        cause: what is known to be wrong besides.
+        repeated: equal to the scan before bit for bit, which no sensor measures.
     """
 
     t_ns: int
@@ -71,18 +75,18 @@ class Judge:
         self._place: SearchPlace | None = None
 
     def begin(self, points_m: F64, T_now: F64, place: SearchPlace | None, match_map: MatchMap) -> None:
-        """Take the first scan (N, 3) of the track, at its pose (4, 4), and where GNSS says that it is."""
+        """Take the first scan (N, 3) of the track, at its pose (4, 4), and its GNSS position."""
         self._pool.push(points_m, np.eye(4))
         self.uniqueness.see(self._pool.newest_standing_m, np.eye(4), T_now, place, match_map)
         self.monitor.unique = self.uniqueness.proven
 
     def see_position(self, p_map_m: F64, sigma_m: float, T_now: F64) -> None:
-        """Take where GNSS says that the vehicle, tracked at `T_now` (4, 4), is now: (3,), one sigma of an axis."""
+        """Take the GNSS position (3,) of the vehicle, tracked at `T_now` (4, 4), with one sigma of an axis."""
         self.monitor.see_fix(p_map_m[:2] - T_now[:2, 3], sigma_m)
         self._place = SearchPlace(p_map_m, sigma_m, INITIALISE_RADIUS_SIGMAS * sigma_m)
 
     def see(self, scan: Matched, match_map: MatchMap) -> None:
-        """Take a scan: what its rays say, how well it fits, whether another pose fits better."""
+        """Take a scan: evidence of its rays, how well it fits, whether another pose fits better."""
         if scan.motion_gap_s > _MOTION_GAP_S or self.monitor.gap_s(scan.t_ns) > _GAP_S:
             self.monitor.distrust()
             self.uniqueness.distrust(moved=scan.motion_gap_s > _MOTION_GAP_S)

@@ -1,12 +1,9 @@
 """Numba kernels of the point-to-Gaussian registration (DESIGN 8): plain loops over flat arrays, no allocation."""
 
 import numpy as np
-from numpy.typing import NDArray
 
+from gnd.gnd_map.arrays import F64, I32
 from gnd.gnd_map.jit import kernel
-
-F64 = NDArray[np.float64]
-I32 = NDArray[np.int32]
 
 JACOBI_SWEEPS = 6  # a symmetric 3x3 matrix is diagonal to 1e-15 after five
 

@@ -44,7 +44,7 @@ def settled(
     parameters: RegistrationParameters,
     wheels_m: npt.NDArray[np.float64] = WHEELS_M,
 ) -> MapMatch | None:
-    """Return what wheels (W, 3) alone say of a pose (4, 4): height and tilt; None where the map has no ground there."""
+    """Return a pose (4, 4) with height and tilt by the wheels (W, 3) alone; None where the map has no ground there."""
     try:
         found = settle(T_map_vehicle, match_map, parameters, wheels_m)
     except RegistrationError:

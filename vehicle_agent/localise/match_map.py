@@ -5,14 +5,13 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from gnd.gnd_map.arrays import F64
 from gnd.vehicle_agent.local_map import LocalMap
 from gnd.vehicle_agent.localise.kernels import tapered_information
 
-F64 = NDArray[np.float64]
-
 # Variance along an axis of a voxel that a surface fills: 1/12 m² for a whole metre filled evenly, less because voxels
 # are smaller than that and points never lie quite evenly. 0.035 ... 0.083 m² measured the same on KITTI, RADIATE and
-# simulated streets; at 0.083 a corridor's evenness seemed to tell where along it one is.
+# simulated streets; at 0.083 a corridor's evenness seemed to constrain the place along it.
 UNIFORM_VOXEL_M2 = 0.06
 LINEAR_M = 60.0  # the grid is taken as affine this far around a point (error below a millimetre)
 
@@ -24,7 +23,7 @@ class MatchMap:
     index: (nx, ny, nz) int32: row of a Gaussian, -1 where the map is empty, below -1 where it is not known.
     A, b: (3, 3), (3,): window coordinates of a map point p are A @ p + b; its voxel is their floor.
     mean_m: (M, 3). information: (M, 6) xx,xy,xz,yy,yz,zz, 1/m². In a direction in which a surface fills its voxel, a
-    Gaussian says where the voxel is, not where the surface is; hence only the information beyond that of an evenly
+    Gaussian shows where the voxel is, not where the surface is; hence only the information beyond that of an evenly
     filled voxel counts (docs/decisions/0030-localisation.md).
     """
 

@@ -1,4 +1,4 @@
-"""Whether the LiDAR is mounted as the drive's header says, from the ground around the vehicle while it drives.
+"""Whether the LiDAR is mounted as the drive's header has it, from the ground around the vehicle while it drives.
 
 The vehicle stands on the ground, so a ground that lies above or below the wheels or is tilted in the vehicle's frame is
 a mount that the header has wrong. Single scans see kerbs, ramps and the vehicle's own nodding; many of them agree on
@@ -12,6 +12,7 @@ from typing import Final, Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from gnd.gnd_map.arrays import F64
 from gnd.gnd_map.se3 import T_inverse, transform
 from gnd.vehicle_agent.importers.mount import (
     CROWN_RAD,
@@ -23,10 +24,9 @@ from gnd.vehicle_agent.importers.mount import (
     upright,
 )
 
-F64 = NDArray[np.float64]
 MountDoubt = Literal["height", "roll", "pitch", "yaw"]
 AXES: Final[tuple[MountDoubt, ...]] = ("height", "roll", "pitch")
-"""What the ground tells."""
+"""The mount's error as observed on the ground."""
 
 EVERY_NS: Final = 1_000_000_000
 FIRST_NS: Final = 200_000_000
@@ -75,7 +75,7 @@ class MountResidual:
 
     @property
     def doubtful(self) -> tuple[MountDoubt, ...]:
-        """What the header says wrongly for certain, by more than 10 cm or 0.3°."""
+        """Axes in which the header is certainly wrong, by more than 10 cm or 0.3°."""
         return self._beyond(TOLERANCE)
 
     @property

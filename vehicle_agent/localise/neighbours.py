@@ -8,16 +8,14 @@ from dataclasses import replace
 from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 
+from gnd.gnd_map.arrays import F64
 from gnd.gnd_map.se3 import T_inverse
 from gnd.vehicle_agent.errors import RegistrationError
 from gnd.vehicle_agent.localise.match_map import MatchMap
 from gnd.vehicle_agent.localise.parameters import RegistrationParameters
 from gnd.vehicle_agent.localise.registration import WHEELS_M, RegistrationResult, register
 from gnd.vehicle_agent.localise.stretch import log_se3
-
-F64 = NDArray[np.float64]
 
 WEAK_M: Final = 0.05
 """One sigma of the weakest horizontal direction from which on its neighbours are tried beside a tracked pose."""

@@ -7,12 +7,11 @@ from itertools import pairwise
 import numpy as np
 from numpy.typing import NDArray
 
+from gnd.gnd_map.arrays import F64
 from gnd.gnd_map.motion import Trajectory
 from gnd.gnd_map.se3 import T_inverse
 
-F64 = NDArray[np.float64]
-
-KEEP_NS = 45_000_000_000  # more than any lag, and than the steps that tell the clock
+KEEP_NS = 45_000_000_000  # more than any lag, and than the steps that the clock is estimated from
 MAX_ACCELERATION_MPS2 = 15.0  # tyres on dry tarmac hold about 10
 SLIP_MPS = 0.5  # beyond what is possible, before it is a slip and no noise
 SLIP_LASTS_NS = 1_000_000_000

@@ -10,12 +10,12 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from gnd.gnd_map.arrays import F64
 from gnd.gnd_map.jit import kernel
 from gnd.gnd_map.motion import Trajectory
 from gnd.gnd_map.se3 import T_inverse
 from gnd.schemas.drive import Scan
 
-F64 = NDArray[np.float64]
 Points = NDArray[np.int16] | NDArray[np.float32]
 Ticks = NDArray[np.uint16] | NDArray[np.uint32]
 

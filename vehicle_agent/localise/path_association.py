@@ -10,24 +10,21 @@ from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.linalg import solveh_banded
 
+from gnd.gnd_map.arrays import F64, I64
 from gnd.gnd_map.geodesy import LocalFrame
 from gnd.gnd_map.motion import Trajectory
 from gnd.vehicle_agent.errors import LocaliseError
 from gnd.vehicle_agent.localise.georeference import Georeferenced, georeference
-from gnd.vehicle_agent.localise.track_alignment import FixTable, GeoreferenceParameters
-
-F64 = NDArray[np.float64]
-I64 = NDArray[np.int64]
+from gnd.vehicle_agent.localise.track_alignment import FixTable
 
 STEP_M: Final = 1.0
 """Of the way, in the search."""
 LEVER_M: Final = 4.0
 """A heading is that between two places so far before and behind."""
 REACH_M: Final = 120.0
-"""The fixes may lie so much farther or less far along than their own way tells, at most."""
+"""The fixes may lie so much farther or less far along than by their own way, at most."""
 SLIP_COST: Final = 0.1
 """Of a slip by a metre, in squared radians of one place; headings differ by at most `MAX_TURN_RAD`."""
 MAX_TURN_RAD: Final = 0.7
@@ -74,7 +71,6 @@ class Untimed:
 def georeference_untimed(
     track: Trajectory,
     fixes: Untimed,
-    parameters: GeoreferenceParameters | None = None,
 ) -> tuple[Georeferenced, FixTable]:
     """As `georeference` for fixes without times; also the fixes with the times they were found to have.
 
@@ -88,11 +84,11 @@ def georeference_untimed(
     way = way_m(track.T_dst_vehicle[:, :3, 3])
     at = matched_way_m(track.T_dst_vehicle[:, :2, 3], p[:, :2])
     table = fixes.at(time_at(track, way, at), chosen)
-    found = georeference(track, table, parameters)
+    found = georeference(track, table)
     for window_m in NEAR_M:
         at = nearest_on_track(found.track.T_dst_vehicle[:, :3, 3], way, _enu(found.frame, fixes, chosen), at, window_m)
         table = fixes.at(time_at(track, way, at), chosen)
-        found = georeference(track, table, parameters)
+        found = georeference(track, table)
     return found, table
 
 

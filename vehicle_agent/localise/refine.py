@@ -6,54 +6,45 @@ Only these poses are evidence of change.
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from itertools import pairwise
 from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 
+from gnd.gnd_map.arrays import F64
 from gnd.gnd_map.se3 import T_from_R_t, T_inverse, exp_so3, log_so3
-from gnd.vehicle_agent.localise.calibration import ODOMETRY_BIAS_DRIFT_RADPS, ODOMETRY_SCALE_DRIFT, MotionTeacher
-from gnd.vehicle_agent.localise.drift import PoseDrift, Slope
+from gnd.vehicle_agent.localise.calibration import (
+    BIAS_PRIOR_RADPS,
+    COURSE_PRIOR,
+    ODOMETRY_BIAS_DRIFT_RADPS,
+    ODOMETRY_SCALE_DRIFT,
+    SCALE_PRIOR,
+    MotionTeacher,
+)
 from gnd.vehicle_agent.localise.graph import MapMatch, SmoothedPose
 from gnd.vehicle_agent.localise.match_map import MatchMapCache
 from gnd.vehicle_agent.localise.odometry import SLIP_LASTS_NS, MotionBuffer
 from gnd.vehicle_agent.localise.parameters import RefineParameters, RegistrationParameters
 from gnd.vehicle_agent.localise.scan_odometry import ScanStep
+from gnd.vehicle_agent.localise.step_noise import StepNoise
 from gnd.vehicle_agent.localise.stretch import (
-    BIAS,
-    LEFT,
     N_SHARED,
-    SCALE,
-    UP,
-    Knot,
     SolvedStretch,
     StretchBelief,
     StretchStep,
     log_se3,
     marginalised,
-    residual,
-    shared_of,
     solve_stretch,
 )
+from gnd.vehicle_agent.localise.stretch_scans import StretchScan, StretchScans
 
-_KNOT_M: Final = 0.7
-_KNOT_S: Final = 0.5
-"""A scan takes part when the vehicle has moved so far, or so much time has passed, since the last."""
-_N_POINTS: Final = 2500
-"""Of a scan."""
-_CORRELATED_M: Final = 2.0
-"""Scans nearer to each other see the same surfaces of the map, wrong by the same: they share one say."""
+_EVERY_S: Final = 1.0
+"""The stretch is solved at the latest after this time."""
+UNLEARNT_S: Final = 8.0
+"""Until the gyro's bias is known scans may wait so long to be final."""
 _LENGTH_S: Final = 15.0
 """Of the stretch; what is older is remembered as a belief about its first scan."""
-_YAW_DEG: Final = 0.02
-_LONGITUDINAL_M: Final = 0.01
-_LATERAL_M: Final = 0.003
-"""One sigma of the odometry over 5 m beside what all steps share, growing with the root of the way."""
-_ROLL_PITCH_DEG: Final = 0.2
-_VERTICAL_M: Final = 0.01
-"""Of attitude and height from scan to scan, which no wheel tells."""
 _SCALES: Final = (2.0, 1.5)
 """Geman-McClure scales of the match."""
 _FIRST_SCALES: Final = (4.0, 2.0, 1.5)
@@ -62,37 +53,29 @@ _NEAR_M: Final = 0.04
 REFINE_LEARNT_DEGPS: Final = 0.06
 """Sigma of the gyro's bias below which it is known; until then scans may wait so long."""
 _FIT_M: Final = 20.0
-"""The newest part of the stretch that says how well all fits."""
+"""The newest part of the stretch, by which its fit is judged."""
 _FIRM_FIT: Final = 0.35
 """Fit of a stretch that is beyond doubt."""
 _LEAST_FIT: Final = 0.15
-"""Below, it tells nothing."""
+"""Below, it is no information."""
 _MOST_MISFIT: Final = 4.0
 """Of a firm one."""
 _CERTAIN_M: Final = 0.1
 """One sigma of a pose that no rival can question."""
 _FLOOR_M: Final = 0.002
 _FLOOR_DEG: Final = 0.004
-"""The least sigma of a final pose: what map and mount are wrong by, no match can tell."""
+"""The least sigma of a final pose: errors of map and mount that no match shows."""
 _CORRECT_M: Final = 0.06
 _CORRECT_DEG: Final = 0.12
-"""An online pose farther off than this from what the stretch says begins anew from there."""
-
-F64 = NDArray[np.float64]
+"""An online pose farther off than this from the solution of the stretch begins anew from there."""
 
 SUPPORTED: Final = 3
-"""Solutions before one tells the online pose where it is."""
+"""Solutions before one corrects the online pose."""
 FIRM: Final = 4
 """Solutions that fit well, before anything is certain."""
 FIRST_SIGMA_M, FIRST_SIGMA_RAD = 0.5, 0.02  # of the online pose that the first scan starts from
-FORGETTING: Final = 0.7
-"""Weight of what was seen of the odometry until the last solution."""
-WORST_VARIANCE: Final = 1e4
-LEAST_VARIANCE: Final = 0.1
-WINDOW: Final = 8
-"""Steps over which wheels and gyro are compared with scans: the error of the latter does not grow with the way."""
 FIRM_AFTER_SLIP: Final = 2
-"""As if so many had fitted well so far: rivals of single scans have a say for some metres."""
+"""As if so many had fitted well so far: rivals of single scans count for some metres."""
 SEEN_SIGMA_M: Final = 0.025
 """Of a step forward that scans have seen: less than that of one that is only taken to go on as before."""
 HELD_INFORMATION: Final = np.diag([3e-3**-2, 3e-3**-2, 6e-4**-2, 0.0, 0.01**-2, 0.01**-2])
@@ -100,30 +83,10 @@ HELD_INFORMATION: Final = np.diag([3e-3**-2, 3e-3**-2, 6e-4**-2, 0.0, 0.01**-2, 
 AGREES_CHI2: Final = 16.3
 """Of heading and place, three degrees of freedom: 99.9 %."""
 MAP_VARIANCE: Final = np.array([np.radians(0.05), 0.01, 0.01]) ** 2  # of heading and place between two knots
-LEAST_WEIGHT: Final = 0.05
-NOISE_WAY_M: Final = 5.0  # for which the sigmas of the odometry are given; a second counts as a metre
-
-
-@dataclass(slots=True, eq=False)
-class _Scan:
-    """A scan since the first of the stretch.
-
-    way_m: odometer. T_before_now: (4, 4) motion since the scan before, as all odometry tells. variance: (6,) of wheels
-    and gyro in that motion, less what all steps share. seen: that motion as scans tell it. knot: its part in the
-    stretch, None between knots.
-    """
-
-    number: int
-    t_ns: int
-    way_m: float
-    T_before_now: F64
-    variance: F64
-    seen: ScanStep | None
-    knot: Knot | None
 
 
 class Refiner:
-    """Feeds on scans with online poses in time order; gives poses that are final, oldest first."""
+    """Takes scans with online poses in time order; returns poses that are final, oldest first."""
 
     def __init__(
         self,
@@ -138,15 +101,14 @@ class Refiner:
         self._map, self._motion, self._teacher = match_map, motion, teacher
         self.unique = True
         """No other place looks the same: else a good fit proves nothing."""
-        self._scans: list[_Scan] = []
+        self._scans = StretchScans(motion, teacher)
         self._final = 0  # how many of them are final
         self._belief: StretchBelief | None = None
         self._solved: SolvedStretch | None = None
         self._solved_way_m, self._solved_ns = 0.0, 0
         self._news = False
         self._solutions = 0
-        self._step_variance = np.ones(6)  # of wheels and gyro, in units of what is assumed
-        self._squares, self._redundancy = np.full(6, 3.0), np.full(6, 3.0)
+        self._noise = StepNoise()
         self._firm = 0  # solutions in a row that fitted well
 
     def push(
@@ -169,12 +131,11 @@ class Refiner:
             seen: that motion as the scans tell it.
         """
         self._news = False
-        self._scans.append(self._scan(number, t_ns, points_m, T_map_vehicle, T_before_now, seen))
-        newest, par = self._scans[-1], self.parameters
+        newest, par = self._scans.take(number, t_ns, points_m, T_map_vehicle, T_before_now, seen), self.parameters
         if self._belief is None:
             self._belief = self._first_belief(T_map_vehicle)
             self._solved_way_m, self._solved_ns = newest.way_m, t_ns
-        due = newest.way_m - self._solved_way_m >= par.every_m or t_ns - self._solved_ns >= par.every_s * 1e9
+        due = newest.way_m - self._solved_way_m >= par.every_m or t_ns - self._solved_ns >= _EVERY_S * 1e9
         if newest.knot is not None and due:
             self._solve()
             return self._leaving(newest)
@@ -211,112 +172,26 @@ class Refiner:
 
     # --- the stretch -----------------------------------------------------------------------------------------------
 
-    def _scan(
-        self, number: int, t_ns: int, points_m: F64, T_online: F64, T_before_now: F64 | None, seen: ScanStep | None
-    ) -> _Scan:
-        """The scan as the stretch takes it: a knot, if the vehicle has moved on or time has passed since the last."""
-        if not self._scans:
-            knot = Knot(self._thinned(points_m), T_online.copy(), LEAST_WEIGHT, wheels_m=self._teacher.mount.wheels_m)
-            return _Scan(number, t_ns, 0.0, np.eye(4), np.zeros(6), None, knot)
-        last, before = self._scans[-1], self._last_knot()
-        driven = self._motion.delta(last.t_ns, t_ns)
-        T = driven if T_before_now is None else T_before_now
-        way_m = last.way_m + float(np.linalg.norm(driven[:3, 3]))
-        scan = _Scan(number, t_ns, way_m, T, self._variance(driven, t_ns - last.t_ns), seen, None)
-        since_m, since_ns = way_m - before.way_m, t_ns - before.t_ns
-        if since_m >= _KNOT_M or since_ns >= _KNOT_S * 1e9:
-            weight = float(np.clip(since_m / _CORRELATED_M, LEAST_WEIGHT, 1.0))
-            T_carried, wheels_m = self._carried(before, scan), self._teacher.mount.wheels_m
-            scan.knot = Knot(self._thinned(points_m), T_carried, weight, wheels_m=wheels_m)
-        return scan
-
-    def _variance(self, driven: F64, dt_ns: int) -> F64:
-        """(6,) of a motion (4, 4) by wheels and gyro beside what all steps share.
-
-        A single step that is far off counts less (`STEP_CHI2`); odometry that is worse all along is found out by
-        `_judge_steps`. Single scans are not asked what it is off by: they follow walls that were moved.
-        """
-        grown = np.sqrt(max(float(np.linalg.norm(driven[:3, 3])), dt_ns * 1e-9) / NOISE_WAY_M)
-        roll_pitch = np.radians(_ROLL_PITCH_DEG)
-        sigmas = np.array([
-            roll_pitch, roll_pitch, grown * np.radians(_YAW_DEG),
-            grown * _LONGITUDINAL_M, grown * _LATERAL_M, _VERTICAL_M,
-        ])  # fmt: skip
-        return sigmas**2
-
-    def _thinned(self, points_m: F64) -> F64:
-        every = max(1, len(points_m) // _N_POINTS)
-        return np.ascontiguousarray(points_m[::every], dtype=np.float64)
-
-    def _last_knot(self) -> _Scan:
-        return next(scan for scan in reversed(self._scans) if scan.knot is not None)
-
-    def _carried(self, knot: _Scan, scan: _Scan) -> F64:
-        """The pose of the newest scan, not yet among the others, from that of the last knot."""
-        assert knot.knot is not None
-        T = knot.knot.T_map_vehicle
-        for between_them in self._scans[self._index(knot) + 1 :]:
-            T = T @ between_them.T_before_now
-        return np.asarray(T @ scan.T_before_now)
-
-    def _index(self, scan: _Scan) -> int:
-        return scan.number - self._scans[0].number
-
-    def _knots(self) -> list[_Scan]:
-        return [scan for scan in self._scans if scan.knot is not None]
-
     def _first_belief(self, T_map_vehicle: F64) -> StretchBelief:
         sigmas = np.array([FIRST_SIGMA_RAD] * 3 + [FIRST_SIGMA_M] * 3)
-        odometry = self._teacher.parameters
-        shared = np.array([odometry.bias_prior_radps, odometry.scale_prior, *[odometry.course_prior] * 2])
+        shared = np.array([BIAS_PRIOR_RADPS, SCALE_PRIOR, COURSE_PRIOR, COURSE_PRIOR])
         information = np.diag(1.0 / np.concatenate([sigmas, shared]) ** 2)
         return StretchBelief(T_map_vehicle.copy(), self._motion.shared(), information, np.zeros(6 + N_SHARED))
 
-    def _steps(self, knots: Sequence[_Scan]) -> list[list[StretchStep]]:
-        """What wheels and gyro, and the scans, say of the motion between neighbouring knots."""
-        driven, seen = [], []
-        for before, now in pairwise(knots):
-            T, dt_s = self._motion.delta(before.t_ns, now.t_ns), (now.t_ns - before.t_ns) * 1e-9
-            between_them = self._scans[self._index(before) + 1 : self._index(now) + 1]
-            variance = np.sum([scan.variance for scan in between_them], axis=0)
-            variance[2:4] += np.square(self._teacher.clock_sigmas(before.t_ns, now.t_ns))
-            variance[3] += self._teacher.slip_sigma_m(before.t_ns, now.t_ns, T) ** 2
-            driven.append(StretchStep(T, np.diag(variance), shared_of(T, dt_s)))
-            told = [scan.seen for scan in between_them]
-            whole = all(step is not None for step in told)
-            seen.append(_chained([step for step in told if step is not None]) if whole else None)
-        grown = np.sqrt(self._step_variance)
-        return [
-            [replace(one, covariance=grown[:, None] * one.covariance * grown), *([] if other is None else [other])]
-            for one, other in zip(driven, seen, strict=True)
-        ]
-
-    def _judge_steps(self, solved: SolvedStretch, steps: Sequence[Sequence[StretchStep]], off: F64) -> None:
-        """How much worse than assumed wheels and gyro are, axis by axis, as map and scans together see it.
-
-        Where map and odometry disagree either may be worse than it claims, and the stretch that trusts one finds its
-        fault with the other. Steps from scan to scan know no map: wheels and gyro are no worse than they say.
-        `off`: (N_SHARED,) what the shared parameters differ by from those that the steps were made with.
-        """
-        self._squares = FORGETTING * self._squares + solved.step_squares * self._step_variance
-        self._redundancy = FORGETTING * self._redundancy + solved.step_redundancy
-        worst = np.minimum(WORST_VARIANCE, np.maximum(told_by_scans(steps, off) * self._step_variance, 1.0))
-        self._step_variance = np.clip(self._squares / self._redundancy, 1.0, worst)
-
     def _solve(self) -> None:
         """Place all scans of the stretch anew, let wheels and gyro learn from it, and let go of its old scans."""
-        scans = self._knots()
+        scans = self._scans.knots()
         knots = [scan.knot for scan in scans if scan.knot is not None]
         assert self._belief is not None
         current = self._motion.shared()
         known = self._solved is not None and np.sqrt(np.diag(self._covariance(-1))[3:5]).max() < _NEAR_M
         belief = _recentred(self._belief, current)
         match_map = self._map.near(knots[len(knots) // 2].T_map_vehicle[:3, 3])
-        steps = self._steps(scans)
+        steps = self._scans.steps(self._noise)
         self._solved = solve_stretch(
             knots, steps, belief, match_map, self.registration, _SCALES if known else _FIRST_SCALES
         )
-        self._judge_steps(self._solved, steps, self._solved.shared - belief.shared)
+        self._noise.learn(self._solved, steps, self._solved.shared - belief.shared)
         self._news, self._solutions = True, self._solutions + 1
         newest = self._scans[-1]
         before_ns = self._solved_ns
@@ -331,9 +206,9 @@ class Refiner:
         self._belief = self._shortened(scans, steps, belief, dt_s)
         self._teach()
 
-    def _scans_hold(self, scans: Sequence[_Scan], steps: Sequence[Sequence[StretchStep]], since_ns: int) -> bool:
-        """Whether the scans alone tell the whole way since a time, well enough to see a slip, and agree with where the
-        map puts its ends: then nothing rests on the wheels.
+    def _scans_hold(self, scans: Sequence[StretchScan], steps: Sequence[Sequence[StretchStep]], since_ns: int) -> bool:
+        """Whether the scans alone measure the whole way since a time, well enough to see a slip, and agree with the map
+        on its ends: then nothing rests on the wheels.
         """
         since_ns -= SLIP_LASTS_NS
         for (before, now), measured in zip(pairwise(scans), steps, strict=True):
@@ -344,11 +219,11 @@ class Refiner:
             relative = T_inverse(before.knot.T_map_vehicle) @ now.knot.T_map_vehicle
             if len(measured) < 2 or not _agrees(measured[-1], relative):
                 return False
-        told = [scan.seen for scan in self._scans if scan.t_ns > since_ns]
-        return all(step is not None and _forward_sigma_m(step) < SEEN_SIGMA_M for step in told)
+        seen = self._scans.seen_since(since_ns)
+        return all(step is not None and _forward_sigma_m(step) < SEEN_SIGMA_M for step in seen)
 
     def _shortened(
-        self, scans: list[_Scan], steps: list[list[StretchStep]], belief: StretchBelief, dt_s: float
+        self, scans: list[StretchScan], steps: list[list[StretchStep]], belief: StretchBelief, dt_s: float
     ) -> StretchBelief:
         """Let go of the knots that are far behind; the belief about the first that stays."""
         newest, solved = self._scans[-1], self._solved
@@ -367,15 +242,14 @@ class Refiner:
             fit=solved.fit[first:],
             known=solved.known[first:],
         )
-        gone = self._index(scans[first])
-        self._scans, self._final = self._scans[gone:], self._final - gone
+        self._final -= self._scans.drop_before(scans[first])
         drift = np.array([ODOMETRY_BIAS_DRIFT_RADPS, ODOMETRY_SCALE_DRIFT, ODOMETRY_SCALE_DRIFT, ODOMETRY_SCALE_DRIFT])
         return _loosened(kept, drift**2 * dt_s)
 
-    def _is_done_with(self, scan: _Scan, newest: _Scan) -> bool:
+    def _is_done_with(self, scan: StretchScan, newest: StretchScan) -> bool:
         par = self.parameters
         old = newest.way_m - scan.way_m > par.length_m or newest.t_ns - scan.t_ns > _LENGTH_S * 1e9
-        return old and self._index(scan) <= self._final
+        return old and self._scans.index(scan) <= self._final
 
     def _teach(self) -> None:
         """Wheels and gyro learn from the stretch: single scans of a sparse sensor seldom fit well enough to teach."""
@@ -384,31 +258,23 @@ class Refiner:
             return
         more, variance = self._solved.shared - self._motion.shared(), np.diag(self._solved.shared_covariance)
         sigma = np.sqrt(variance * max(1.0, self._solved.misfit))
-        self._teacher.correct(
-            PoseDrift(
-                yaw_radps=Slope(float(more[BIAS]), float(sigma[BIAS])),
-                forward=Slope(float(-more[SCALE]), float(sigma[SCALE])),
-                left=Slope(float(-more[LEFT]), float(sigma[LEFT])),
-                up=Slope(float(-more[UP]), float(sigma[UP])),
-            ),
-            overlap=1.0,
-        )
+        self._teacher.correct(more, sigma)
 
     def _fit(self) -> float:
         """How well the newest `fit_m` of the stretch fit the map, 0 ... 1; points in unknown voxels count as off."""
         if self._solved is None:
             return 0.0
-        knots = self._knots()[-len(self._solved.fit) :]
+        knots = self._scans.knots()[-len(self._solved.fit) :]
         near = np.array([self._scans[-1].way_m - scan.way_m <= _FIT_M for scan in knots])
         return float((self._solved.fit * self._solved.known)[: len(near)][near].mean()) if near.any() else 0.0
 
     # --- scans -----------------------------------------------------------------------------------------------------
 
-    def _leaving(self, newest: _Scan) -> list[SmoothedPose]:
+    def _leaving(self, newest: StretchScan) -> list[SmoothedPose]:
         """The poses of scans that lie `lag_m` behind the newest knot, or are too old to wait."""
         par = self.parameters
         learnt = self._teacher.uncertainty[1] < np.radians(REFINE_LEARNT_DEGPS)
-        longest_s, n = (par.longest_s if learnt else par.unlearnt_s), self._final
+        longest_s, n = (par.longest_s if learnt else UNLEARNT_S), self._final
         while n < len(self._scans):
             scan = self._scans[n]
             overdue = newest.t_ns - scan.t_ns > longest_s * 1e9
@@ -422,7 +288,7 @@ class Refiner:
         first, self._final = self._final, end
         if end == first or self._solved is None:
             return []
-        at = [i for i, scan in enumerate(self._scans) if scan.knot is not None]
+        at = [self._scans.index(scan) for scan in self._scans.knots()]
         return [self._pose(i, at) for i in range(first, end)]
 
     def _pose(self, i: int, at: list[int]) -> SmoothedPose:
@@ -430,18 +296,13 @@ class Refiner:
         scan = self._scans[i]
         after = min(int(np.searchsorted(at, i)), len(at) - 1)
         low = after if at[after] <= i else after - 1
-        by_low, by_high = self._from_knot(at[low], i), self._from_knot(at[after], i)
-        share = self._share(i, at[low], at[after])
+        by_low, by_high = self._scans.from_knot(at[low], i), self._scans.from_knot(at[after], i)
+        share = self._scans.share(i, at[low], at[after])
         covariance = (1.0 - share) * self._covariance(low) + share * self._covariance(after)
         T = between(by_low, by_high, share)
         axle = (1.0 - share) * self._axle_variance(low) + share * self._axle_variance(after)
         certain = self.unique and self._is_certain(covariance)
         return SmoothedPose(scan.number, scan.t_ns, T, covariance, certain, axle)
-
-    def _from_knot(self, knot: int, i: int) -> F64:
-        first, scan = self._scans[knot], self._scans[i]
-        assert first.knot is not None
-        return np.asarray(first.knot.T_map_vehicle @ self._motion.delta(first.t_ns, scan.t_ns))
 
     def _covariance(self, knot: int) -> F64:
         """(6, 6) of a knot's pose: what the stretch leaves open, more where it disagrees with itself, and the least."""
@@ -457,7 +318,7 @@ class Refiner:
         """
         assert self._solved is not None
         grown, matched = np.full(6, max(1.0, self._solved.misfit)), self._solved.matched
-        odometry = np.clip(self._squares / self._redundancy / self._step_variance, LEAST_VARIANCE, 1.0)
+        odometry = self._noise.against_claimed()
         odometry[3:5] = 1.0  # along a tunnel the steps agree with each other and drift together
         grown[2:5] *= self._solved.seen * matched + odometry[2:5] * (1.0 - matched)
         return grown
@@ -479,40 +340,9 @@ class Refiner:
         sigma_m = float(np.sqrt(np.diag(covariance)[3:5]).max())
         return self._firm >= FIRM and sigma_m < _CERTAIN_M
 
-    def _share(self, i: int, low: int, high: int) -> float:
-        """How far along the way from one knot to the next a scan is, 0 ... 1."""
-        way = [self._scans[k].way_m for k in (low, i, high)]
-        t = [self._scans[k].t_ns for k in (low, i, high)]
-        a, b, c = way if way[2] - way[0] > 1e-3 else t
-        return float(np.clip((b - a) / (c - a), 0.0, 1.0)) if c > a else 0.0
-
-
-def told_by_scans(steps: Sequence[Sequence[StretchStep]], shared_off: F64) -> F64:
-    """(6,) mean square of what the motion of some steps by wheels and gyro (the first measurement of each) differs from
-    what scans say (the second), in units of the variance claimed; endless where scans say too little.
-    """
-    windows, single = [], []
-    for i in range(0, len(steps) - WINDOW + 1, WINDOW // 2):
-        window = steps[i : i + WINDOW]
-        if all(len(measured) > 1 for measured in window):
-            off = np.array([residual(seen.T_before_now, driven, shared_off)[0] for driven, seen, *_ in window])
-            variance = np.array([np.diag(driven.covariance) for driven, *_ in window])
-            by_scans = np.array([np.diag(seen.covariance) for _, seen, *_ in window])
-            windows.append(off.sum(axis=0) ** 2 / variance.sum(axis=0))
-            single.append((off**2 - by_scans).sum(axis=0) / variance.sum(axis=0))
-    return np.maximum(np.mean(windows, axis=0), np.mean(single, axis=0)) if windows else np.full(6, np.inf)
-
-
-def _chained(seen: Sequence[ScanStep]) -> StretchStep:
-    """Steps that the scans tell, one after the other, as one; they are short, so that covariances just add."""
-    T, covariance = np.eye(4), np.zeros((6, 6))
-    for step in seen:
-        T, covariance = T @ step.T_before_now, covariance + step.covariance
-    return StretchStep(T, covariance, np.zeros((6, N_SHARED)))
-
 
 def _forward_sigma_m(step: ScanStep) -> float:
-    """One sigma of how far forward a step went, the rest told by gyro and road too: a car that slips still rolls on."""
+    """One sigma of how far forward a step went, the rest held by gyro and road too: a car that slips still rolls on."""
     return float(np.sqrt(np.linalg.inv(np.linalg.inv(step.covariance) + HELD_INFORMATION)[3, 3]))
 
 
@@ -523,7 +353,7 @@ def _agrees(step: StretchStep, T_before_now: F64) -> bool:
 
 
 def _recentred(belief: StretchBelief, shared: F64) -> StretchBelief:
-    """The same belief told about other values of the shared parameters: those that the steps are made with now."""
+    """The same belief about other values of the shared parameters: those that the steps are made with now."""
     moved = np.concatenate([np.zeros(6), shared - belief.shared])
     return belief._replace(shared=shared, gradient=belief.gradient + belief.information @ moved)
 

@@ -6,6 +6,7 @@ from typing import Final, Literal
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from gnd.gnd_map.arrays import F64
 from gnd.gnd_map.se3 import exp_so3
 from gnd.vehicle_agent.errors import RegistrationError
 from gnd.vehicle_agent.localise.kernels import linearise
@@ -22,7 +23,6 @@ REGISTRATION_MIN_MATCHED: Final = 60
 _DEGENERATE_SHARE: Final = 0.01
 """So is a horizontal one with less than this share of the strongest direction's information."""
 
-F64 = NDArray[np.float64]
 
 Start = Literal["near", "wide", "capture"]
 
@@ -38,10 +38,16 @@ LEVER_M = 10.0  # a turn moves the points that constrain it by about this times 
 class RegistrationResult:
     """A pose and how far to believe it.
 
-    T_map_vehicle: (4, 4). covariance: (6, 6) of a small motion of the vehicle in its own frame, rotation [rad] first,
-    then position [m] (GTSAM's order). matching_ratio: matched share of the points in known voxels. fit: 1 - mean robust
-    cost, 0 ... 1. known_ratio: share of the points that fell into known voxels. degenerate: (K, 6) unit directions
-    (rotation at 10 m, position; vehicle frame) that the scan does not constrain and along which nothing was moved.
+    Attributes:
+        T_map_vehicle: (4, 4).
+        covariance: (6, 6) of a small motion of the vehicle in its own frame, rotation [rad] first, then position [m]
+            (GTSAM's order).
+        matching_ratio: matched share of the points in known voxels.
+        fit: 1 - mean robust cost, 0 ... 1.
+        known_ratio: share of the points that fell into known voxels.
+        iterations: 0: a pose from outside, not of a match.
+        degenerate: (K, 6) unit directions (rotation at 10 m, position; vehicle frame) that the scan does not constrain
+            and along which nothing was moved.
     """
 
     T_map_vehicle: F64
@@ -103,7 +109,7 @@ def register(
     T = np.array(T_map_vehicle, dtype=np.float64)
     state = _State(T[:3, :3].copy(), T[:3, 3].copy(), np.zeros((6, 6)), np.zeros(6), wheels_m)
     points = np.ascontiguousarray(points_m, dtype=np.float64)
-    scales = {"near": par.scales, "wide": _WIDE_SCALES, "capture": _CAPTURE_SCALES}[start]
+    scales = {"near": par.rules.scales, "wide": _WIDE_SCALES, "capture": _CAPTURE_SCALES}[start]
     iterations, converged = 0, False
     for stage, scale in enumerate(scales):
         coarse = 1.0 if stage == len(scales) - 1 else 10.0
@@ -119,9 +125,14 @@ def register(
 class Linearised:
     """The cost of points on the map around one pose, to second order.
 
-    T_map_vehicle: (4, 4) where. scale: robust scale in sigmas. H, g: (6, 6) and (6,) of a small motion of the vehicle
-    in its own frame, rotation [rad] first; points count as independent. cost: sum of robust costs; matched, inside:
-    points near a Gaussian, and in known voxels. told: (6, 6), the part of a motion that it tells.
+    Attributes:
+        T_map_vehicle: (4, 4) the pose.
+        scale: robust scale in sigmas.
+        H, g: (6, 6) and (6,) of a small motion of the vehicle in its own frame, rotation [rad] first; points count as
+            independent.
+        cost: sum of robust costs.
+        matched, inside: points near a Gaussian, and in known voxels.
+        constrained: (6, 6), projects a motion on the directions that the points constrain.
     """
 
     T_map_vehicle: F64
@@ -131,7 +142,7 @@ class Linearised:
     cost: float
     matched: int
     inside: int
-    told: F64
+    constrained: F64
 
     def fit(self, scale: float) -> float:
         """1 - mean robust cost of the points in known voxels, 0 ... 1."""
@@ -148,8 +159,8 @@ def linearised(
 ) -> Linearised:
     """Points (N, 3) and the wheels (W, 3) on the map at a pose (4, 4); nothing is moved.
 
-    Horizontal directions about which the scan says next to nothing beside the others tell nothing: along an even wall
-    it is the noise of the map that speaks, and with many scans it would sum up.
+    Horizontal directions that the scan hardly constrains beside the others are left out: along an even wall it is the
+    noise of the map that fits, and with many scans that would add up.
     """
     T = np.asarray(T_map_vehicle, dtype=np.float64)
     state = _State(T[:3, :3].copy(), T[:3, 3].copy(), np.zeros((6, 6)), np.zeros(6), wheels_m)
@@ -162,8 +173,17 @@ def linearised(
     turn = np.zeros((6, 6))
     turn[:3, :3] = turn[3:, 3:] = state.R
     H, g = turn.T @ state.H @ turn, turn.T @ state.g
-    told = _without_hints(H)
-    return Linearised(T.copy(), scale, told.T @ H @ told, told.T @ g, state.cost, state.matched, state.inside, told)
+    constrained = _without_hints(H)
+    return Linearised(
+        T.copy(),
+        scale,
+        constrained.T @ H @ constrained,
+        constrained.T @ g,
+        state.cost,
+        state.matched,
+        state.inside,
+        constrained,
+    )
 
 
 def _without_hints(H: F64) -> F64:
@@ -173,9 +193,9 @@ def _without_hints(H: F64) -> F64:
     values, vectors, scale = _principal(H)
     horizontal = vectors[3] ** 2 + vectors[4] ** 2 > 0.5
     strongest = float(values[horizontal].max(initial=0.0))
-    told = ~horizontal | (values > _DEGENERATE_SHARE * strongest)
-    along = vectors[:, told]
-    return np.eye(6) if told.all() else np.asarray((along @ along.T) * scale[:, None] / scale)
+    constrained = ~horizontal | (values > _DEGENERATE_SHARE * strongest)
+    along = vectors[:, constrained]
+    return np.eye(6) if constrained.all() else np.asarray((along @ along.T) * scale[:, None] / scale)
 
 
 def fit_of(points_m: F64, T_map_vehicle: F64, match_map: MatchMap, parameters: RegistrationParameters) -> float:
@@ -185,7 +205,7 @@ def fit_of(points_m: F64, T_map_vehicle: F64, match_map: MatchMap, parameters: R
     if not len(points_m):
         return 0.0
     R, t = np.ascontiguousarray(T_map_vehicle[:3, :3]), np.ascontiguousarray(T_map_vehicle[:3, 3])
-    m, scale = match_map, parameters.scales[-1]
+    m, scale = match_map, parameters.rules.scales[-1]
     cost, _, inside = linearise(
         np.ascontiguousarray(points_m), R, t, m.index, m.A, m.b, m.mean_m, m.information, scale**2,
         (REGISTRATION_GATE_PER_SCALE * scale) ** 2, np.empty((6, 6)), np.empty(6),
@@ -236,10 +256,10 @@ def _linearise(points: F64, s: _State, m: MatchMap, par: RegistrationParameters,
 
 def _add_wheels(s: _State, m: MatchMap, par: RegistrationParameters, scale: float) -> int:
     """The wheels stand on the map's ground: points of their own weight, as uncertain as springs and tyres are; gives
-    how many do. They tell height, roll and pitch only: of a road of which the map holds single rings, its Gaussians
-    would tell where the rings lie.
+    how many do. They constrain height, roll and pitch only: of a road of which the map holds single rings, its
+    Gaussians would give where the rings lie.
     """
-    if par.wheel_sigma_m <= 0:
+    if par.rules.wheel_sigma_m <= 0:
         return 0
     scale = max(scale, WHEEL_SCALE)
     H, g = np.empty((6, 6)), np.empty(6)
@@ -247,7 +267,7 @@ def _add_wheels(s: _State, m: MatchMap, par: RegistrationParameters, scale: floa
     _, on_ground, _ = linearise(
         s.wheels_m, s.R, s.t, m.index, m.A, m.b, m.mean_m, m.information, scale**2, gate_m2, H, g
     )
-    weight = par.correlation * (par.noise_m / par.wheel_sigma_m) ** 2
+    weight = par.rules.correlation * (par.noise_m / par.rules.wheel_sigma_m) ** 2
     s.H += weight * H * WHEELS_TELL * WHEELS_TELL[:, None]
     s.g += weight * g * WHEELS_TELL
     return on_ground
@@ -257,20 +277,20 @@ def _descend(
     points: F64, s: _State, m: MatchMap, par: RegistrationParameters, scale: float, coarse: float
 ) -> tuple[int, bool]:
     """Gauss-Newton steps at one robust scale until they are small; (steps, converged)."""
-    for n in range(1, par.max_iterations + 1):
+    for n in range(1, par.rules.max_iterations + 1):
         _linearise(points, s, m, par, scale)
         step = _solve(s.H, s.g, par)
         s.R = exp_so3(step[:3]) @ s.R
         s.t = s.t + step[3:]
-        if np.abs(step[:3]).max() < coarse * par.stop_rad and np.abs(step[3:]).max() < coarse * par.stop_m:
+        if np.abs(step[:3]).max() < coarse * par.rules.stop_rad and np.abs(step[3:]).max() < coarse * par.rules.stop_m:
             return n, True
-    return par.max_iterations, False
+    return par.rules.max_iterations, False
 
 
 def _solve(H: F64, g: F64, par: RegistrationParameters) -> F64:
     """-H^-1 g, leaving out the directions that are degenerate (solution remapping, Zhang et al. 2016)."""
     values, vectors, scale = _principal(H)
-    strong = values > par.correlation / par.degenerate_m**2
+    strong = values > par.rules.correlation / par.rules.degenerate_m**2
     along = vectors[:, strong]
     return np.asarray(-(along @ ((along.T @ (g * scale)) / values[strong])) * scale)
 
@@ -284,10 +304,10 @@ def _principal(H: F64) -> tuple[F64, F64, F64]:
 
 def _strong(values: F64, vectors: F64, par: RegistrationParameters) -> NDArray[np.bool_]:
     """(6,) which principal directions are constrained: by enough information, and a horizontal one by more than what
-    the noise of a map says along an even wall.
+    the noise of a map gives along an even wall.
     """
     horizontal = vectors[3] ** 2 + vectors[4] ** 2 > 0.5
-    least = par.correlation / par.degenerate_m**2
+    least = par.rules.correlation / par.rules.degenerate_m**2
     strongest = float(values[horizontal].max(initial=0.0))  # not the vertical, which wheels on the road hold firmly
     return np.asarray(values > np.where(horizontal, max(least, _DEGENERATE_SHARE * strongest), least))
 
@@ -295,7 +315,7 @@ def _strong(values: F64, vectors: F64, par: RegistrationParameters) -> NDArray[n
 def _unmoved(s: _State, T_start: F64, par: RegistrationParameters) -> bool:
     """Take back what was moved along horizontal directions that the scan does not constrain; True if there were any."""
     values, vectors, _ = _principal(s.H)
-    weak = vectors[3:, ~_strong(values, vectors, par) & (values > par.correlation / par.degenerate_m**2)]
+    weak = vectors[3:, ~_strong(values, vectors, par) & (values > par.rules.correlation / par.rules.degenerate_m**2)]
     if not weak.size:
         return False
     weak = weak / np.linalg.norm(weak, axis=0)
@@ -333,6 +353,6 @@ def _covariance(values: F64, vectors: F64, par: RegistrationParameters) -> F64:
     """Inverse Hessian, enlarged because points share errors, plus the floor; a free direction gets 10 m."""
     scale = np.array([1.0 / LEVER_M] * 3 + [1.0] * 3)
     free = 1e2
-    shared = vectors @ (np.minimum(par.correlation / np.maximum(values, 1e-9), free)[:, None] * vectors.T)
-    floor = np.diag([par.floor_rad**2] * 3 + [par.floor_m**2] * 3)
+    shared = vectors @ (np.minimum(par.rules.correlation / np.maximum(values, 1e-9), free)[:, None] * vectors.T)
+    floor = np.diag([par.rules.floor_rad**2] * 3 + [par.rules.floor_m**2] * 3)
     return np.asarray(shared * scale * scale[:, None] + floor)

@@ -1,4 +1,4 @@
-"""The mount as it is used: the header's, put right where the ground says that it is certainly wrong.
+"""The mount as it is used: the header's, corrected where the ground shows that it is certainly wrong.
 
 While a pose is tracked, points and poses stay in the axes that they were matched in, so that no track is torn: the
 LiDAR's place on the map does not depend on the mount. What depends on it is where the vehicle is from there, and where
@@ -8,23 +8,21 @@ its wheels are: both are taken through `T_used_vehicle`. Between tracks the axes
 from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 
+from gnd.gnd_map.arrays import F64
 from gnd.gnd_map.se3 import T_inverse, exp_so3, transform
 from gnd.schemas.drive import DriveHeader, MountSigma
 from gnd.vehicle_agent.importers.mount import HEIGHTS_M
 from gnd.vehicle_agent.localise.mount import AXES, SIGMAS, TOLERANCE, WRONG, MountResidual, MountWatch
 from gnd.vehicle_agent.localise.registration import WHEELS_M
 
-F64 = NDArray[np.float64]
-
 TRUSTED_RAD: Final = float(np.radians(0.3))
 TRUSTED: Final = MountSigma(0.05, TRUSTED_RAD, TRUSTED_RAD, TRUSTED_RAD)
-"""One sigma of a header that does not say how well its mount is known."""
+"""One sigma of a header without uncertainty of its mount."""
 BROKEN_SHARE: Final = 0.05
 BROKEN_RAD: Final = float(np.radians(1.0))
 MEANT_RAD: Final = float(np.radians(0.15))
-"""Of headers that do not say how well they are known, one in twenty is wrong by a degree (one sigma); axes of the
+"""Of headers without an uncertainty, one in twenty is wrong by a degree (one sigma); axes of the
 others may mean something else than the axle's by so much, and are right by what they mean."""
 UNKNOWN_RAD: Final = float(np.radians(5.0))
 """One sigma of an angle that nobody knows."""
@@ -94,7 +92,7 @@ def _density(value: float, sigma: float) -> float:
 
 
 class Mounting:
-    """The header's mount, what the ground says against it, and what is used."""
+    """The header's mount, its error as observed on the ground, and the mount that is used."""
 
     def __init__(self, T_vehicle_lidar: F64, sigma: MountSigma = TRUSTED) -> None:
         """`sigma`: how far the header's mount is known."""
@@ -104,17 +102,17 @@ class Mounting:
         self.sigma = MountSigma(sigma.height_m, *(min(angle, UNKNOWN_RAD) for angle in sigma[1:]))
         """Of the header."""
         self.watch = MountWatch(self.T_header)
-        self._looks = 0
+        self._watched = 0
         self._put_right = np.zeros(3, np.bool_)
 
     @property
     def residual(self) -> MountResidual:
-        """What the ground says, true minus header."""
+        """The error observed on the ground, true minus header."""
         return self.watch.residual
 
     def see(self, t_ns: int, points_m: F64) -> None:
         """Take a scan that is due: points (N, 3) in the axes of `T_used`, sweep motion removed."""
-        self._looks += 1
+        self._watched += 1
         self.watch.see(t_ns, transform(self.T_header @ T_inverse(self.T_used), points_m))
         values, sigmas = np.abs(self.residual.values), self.residual.sigmas
         certain = values - SIGMAS * sigmas > TOLERANCE
@@ -141,8 +139,8 @@ class Mounting:
         the ground is about to tell.
         """
         unknown = self.T_header[2, 3] < HEIGHTS_M[0] or np.isinf(self.sigma.height_m)
-        told = bool(np.isfinite(self.residual.height_sigma_m))
-        return bool(unknown and not told and self._looks < MOST_WAIT and self.watch.seen == self._looks)
+        observed = bool(np.isfinite(self.residual.height_sigma_m))
+        return bool(unknown and not observed and self._watched < MOST_WAIT and self.watch.seen == self._watched)
 
     @property
     def torn(self) -> bool:

@@ -7,11 +7,9 @@ that is hidden: it holds too little yet. Registration takes hidden voxels as not
 import numpy as np
 from numpy.typing import NDArray
 
+from gnd.gnd_map.arrays import F64, I32, I64
 from gnd.gnd_map.jit import kernel
 
-F64 = NDArray[np.float64]
-I32 = NDArray[np.int32]
-I64 = NDArray[np.int64]
 U64 = NDArray[np.uint64]
 
 SUMS = 10  # weight, x, y, z, xx, xy, xz, yy, yz, zz about the voxel's centre

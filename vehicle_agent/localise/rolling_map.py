@@ -5,6 +5,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
+from gnd.gnd_map.arrays import F64
 from gnd.vehicle_agent.localise.kernels import tapered_information
 from gnd.vehicle_agent.localise.match_map import UNIFORM_VOXEL_M2, MatchMap
 from gnd.vehicle_agent.localise.rolling_kernels import SUMS, add_points, move_window, refresh
@@ -28,8 +29,6 @@ _LINE_RATIO: Final = 0.1
 _UPRIGHT: Final = 0.7
 """A Gaussian whose second variance is less than this share of the first is one ring, unless it is a post (cosine to the
 vertical)."""
-
-F64 = NDArray[np.float64]
 
 VOXEL_M = 1.0  # what UNIFORM_VOXEL_M2 and the registration's scales are measured for
 

@@ -4,25 +4,33 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gnd.gnd_map.jit import kernel
-from gnd.vehicle_agent.localise.parameters import SamplingParameters
+from gnd.vehicle_agent.localise.parameters import MIN_RANGE_M, SamplingParameters
 
 TABLE_BITS = 16
-CANDIDATES_PER_POINT = 12  # points looked at for each one kept
+CANDIDATES_PER_POINT = 12  # points tried for each one kept
+LEAF_M = 0.3
 
 
-def sample_scan(points_m: NDArray[np.floating], parameters: SamplingParameters) -> NDArray[np.int64]:
+def sample_scan(
+    points_m: NDArray[np.floating],
+    parameters: SamplingParameters,
+    leaf_m: float = LEAF_M,
+    min_range_m: float = MIN_RANGE_M,
+) -> NDArray[np.int64]:
     """Indices (K,) of about `n_points` points, ascending, at most one in a cube of `leaf_m`.
 
     Args:
         points_m: (N, 3) in the LiDAR's frame, firing order; points that are not finite are left out.
-        parameters: range limits (metres from the LiDAR), leaf and number.
+        parameters: number, and largest range from the LiDAR.
+        leaf_m: side of the cube.
+        min_range_m: smallest range.
     """
     n = len(points_m)
     # An odd stride meets every ring of a sensor with 16, 32, 64 or 128 of them.
     stride = max(1, n // (CANDIDATES_PER_POINT * parameters.n_points)) | 1
     chosen = np.empty(n // stride + 1, np.int64)
-    limits = (parameters.min_range_m**2, parameters.max_range_m**2)
-    kept = _first_in_cubes(np.ascontiguousarray(points_m), stride, 1.0 / parameters.leaf_m, *limits, chosen)
+    limits = (min_range_m**2, parameters.max_range_m**2)
+    kept = _first_in_cubes(np.ascontiguousarray(points_m), stride, 1.0 / leaf_m, *limits, chosen)
     every = max(1.0, kept / parameters.n_points)
     # Counted, not stepped: stepping a float up to `kept` may give one more, at `kept` itself.
     return chosen[(np.arange(min(kept, parameters.n_points)) * every).astype(np.int64)]

@@ -2,32 +2,32 @@
 
 The scans before are kept as Gaussians in a rolling map (some 20 m of way). A step that lies far from the prediction,
 or that rests on too few points, is not given. Experience with odometry of recordings (`importers.lidar_odometry`) holds
-here too: voxels that hold one or two rings of a scan say where the rings are, not where the ground is.
+here too: voxels that hold one or two rings of a scan show where the rings are, not where the ground is.
 """
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Final, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
+from gnd.gnd_map.arrays import F64
 from gnd.gnd_map.motion import Trajectory
 from gnd.gnd_map.se3 import T_from_R_t, T_inverse, exp_so3, log_so3, transform
 from gnd.vehicle_agent.errors import RegistrationError
-from gnd.vehicle_agent.localise.parameters import NOISE_M, RegistrationParameters, ScanOdometryParameters
+from gnd.vehicle_agent.localise.parameters import NOISE_M, ON_MAP, RegistrationParameters
 from gnd.vehicle_agent.localise.registration import register
 from gnd.vehicle_agent.localise.rolling_map import RollingMap
 from gnd.vehicle_agent.localise.scan_pool import standing_points
 
 _N_POINTS: Final = 1250
 """So many of a scan's sampled points are matched."""
-_SCALES: Final = (4.0, 2.0)
-_CORRELATION: Final = 3.0
-_FLOOR_M: Final = 0.005
-_FLOOR_RAD: Final = 0.0001
-_DEGENERATE_M: Final = 0.05
-"""As in `RegistrationParameters`."""
+_BETWEEN_SCANS: Final = replace(
+    ON_MAP, scales=(4.0, 2.0), correlation=3.0, floor_m=0.005, floor_rad=0.0001, degenerate_m=0.05
+)
+_MIN_STANDING_SHARE: Final = 0.25
+"""So many of a scan's points must stand above the ground. Rings on open ground keep their place relative to the
+vehicle: they fit best where it stood before, and it seems to be slower than it is."""
 _STEP_SHARE: Final = 0.2
 """A step's variance in that of a match: the matches of a stretch of road share most of their errors."""
 _STEADY_M: Final = 0.03
@@ -51,8 +51,6 @@ _FIRST_SCANS: Final = 3
 _MAX_GAP_S: Final = 1.0
 """After a longer time without a scan the map begins anew."""
 
-F64 = NDArray[np.float64]
-
 CONTRADICTED, STILL_CONTRADICTED = 3.0, 1.5  # sigmas at which wheels begin to slip, and above which they still do
 OFF_GROUND_M, OFF_GROUND_SLOPE = 0.3, 0.02  # what stands higher, and so much for each metre of distance, is no ground
 
@@ -74,12 +72,14 @@ class SteadyMotion(NamedTuple):
 
 
 class ScanStep(NamedTuple):
-    """The motion between two scans as the scans tell it.
+    """The motion between two scans by the scans.
 
-    T_before_now: (4, 4). covariance: (6, 6) of a small motion of the vehicle at its later end, rotation [rad] first,
-    then position [m], along its own axes (as GTSAM's BetweenFactorPose3 takes it); directions that the scans do not
-    constrain have a sigma of metres, and T_before_now follows the prediction there. slipping: the wheels slipped in the
-    step before, so that less is needed to contradict them in this one.
+    Attributes:
+        T_before_now: (4, 4).
+        covariance: (6, 6) of a small motion of the vehicle at its later end, rotation [rad] first, then position [m],
+            along its own axes (as GTSAM's BetweenFactorPose3 takes it); directions that the scans do not constrain have
+            a sigma of metres, and T_before_now follows the prediction there.
+        slipping: the wheels slipped in the step before, so that less is needed to contradict them in this one.
     """
 
     T_before_now: F64
@@ -89,10 +89,12 @@ class ScanStep(NamedTuple):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class JointStep:
-    """What wheels, gyro and scans say together.
+    """The motion by wheels, gyro and scans together.
 
-    T_before_now: (4, 4), each believed by its covariance. driven_sigmas: (6,) sigmas of wheels and gyro, grown where
-    the scans contradict them. slipped: they do.
+    Attributes:
+        T_before_now: (4, 4), each weighted by its covariance.
+        driven_sigmas: (6,) sigmas of wheels and gyro, grown where the scans contradict them.
+        slipped: whether they do.
     """
 
     T_before_now: F64
@@ -101,7 +103,7 @@ class JointStep:
 
 
 def joint_step(T_driven: F64, sigmas: F64, step: ScanStep | None) -> JointStep:
-    """Put together the motion (4, 4) with `sigmas` (6,) that wheels and gyro tell, and what scans tell, if anything."""
+    """Put together the motion (4, 4) with `sigmas` (6,) by wheels and gyro, and that by scans, if known."""
     if step is None:
         return JointStep(T_driven, sigmas, False)
     off = _log(T_inverse(T_driven) @ step.T_before_now)
@@ -136,9 +138,9 @@ class ScanOdometry:
     with every match. A step is what two filtered poses differ by.
     """
 
-    def __init__(self, parameters: ScanOdometryParameters, noise_m: float = NOISE_M) -> None:
-        self.parameters = parameters
-        self._registration = _registration(noise_m)
+    def __init__(self, noise_m: float = NOISE_M, min_standing_share: float = _MIN_STANDING_SHARE) -> None:
+        self._registration = RegistrationParameters(noise_m, _BETWEEN_SCANS)
+        self._min_standing_share = min_standing_share
         self._map = RollingMap(noise_m)
         self._before_ns: int | None = None
         self._T_odom_before = np.eye(4)
@@ -176,7 +178,7 @@ class ScanOdometry:
             points_vehicle_m: (N, 3) float64 sampled points, sweep motion removed.
             T_before_now_predicted: (4, 4) motion since the scan before by wheel speed and yaw rate.
             sigmas: (6,) its sigmas, rotation [rad] first, then position [m].
-            points_going_on: gives the points with the motion removed that `steady` says; asked when the wheels slip.
+            points_going_on: gives the points with the motion `steady` removed; called when the wheels slip.
         """
         if self._before_ns is None or not 0 < t_ns - self._before_ns <= _MAX_GAP_S * 1e9:
             self.begin(t_ns, points_vehicle_m)
@@ -184,7 +186,7 @@ class ScanOdometry:
         dt_ns, self._before_ns = t_ns - self._before_ns, t_ns
         driven = _Prediction(T_before_now_predicted, sigmas, points_vehicle_m)
         standing = len(standing_points(points_vehicle_m, OFF_GROUND_M, OFF_GROUND_SLOPE))
-        sees = standing >= self.parameters.min_standing_share * len(points_vehicle_m)
+        sees = standing >= self._min_standing_share * len(points_vehicle_m)
         match = self._matched(driven, self._going_on(dt_ns, points_going_on)) if sees else None
         if sees and match is None and self._slipping and self._steady is not None:
             coasted = self._coast(self._steady, dt_ns, points_vehicle_m)
@@ -213,7 +215,7 @@ class ScanOdometry:
         return np.array([_STEADY_RAD] * 3 + [_STEADY_M] * 3)
 
     def _matched(self, driven: _Prediction, going_on: Callable[[], _Prediction] | None) -> _ScanMatch | None:
-        """The match near to what wheels and gyro say, or near to going on as before: that comes first while the
+        """The match near the motion by wheels and gyro, or near that of going on as before: that comes first while the
         wheels slip.
         """
         if going_on is None:
@@ -269,13 +271,6 @@ class ScanOdometry:
         if far or self._map.scans < _FIRST_SCANS:
             self._T_odom_added = T
             self._map.add(transform(T, points_m), T[:3, 3])
-
-
-def _registration(noise_m: float) -> RegistrationParameters:
-    return RegistrationParameters(
-        noise_m=noise_m, scales=_SCALES, correlation=_CORRELATION, floor_m=_FLOOR_M,
-        floor_rad=_FLOOR_RAD, degenerate_m=_DEGENERATE_M,
-    )  # fmt: skip
 
 
 def _gain(prior: F64, measured: F64) -> F64:

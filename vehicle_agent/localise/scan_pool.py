@@ -4,8 +4,8 @@ from collections import deque
 from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 
+from gnd.gnd_map.arrays import F64
 from gnd.gnd_map.se3 import T_inverse, transform
 from gnd.vehicle_agent.localise.initialise import STANDING_ABOVE_M, ground_below, thinned
 
@@ -15,13 +15,11 @@ _REACH_M: Final = 10.0
 """... for so much way."""
 _N_POINTS: Final = 400
 
-F64 = NDArray[np.float64]
-
 STANDING_M = 0.02  # between two scans
 
 
 class ScanPool:
-    """Points of the newest scan and of some before it, moved along by odometry: a four-layer scan alone says little.
+    """Points of the newest scan and of some before it, moved along by odometry: a four-layer scan alone holds little.
 
     Scans enter every so many metres, and leave after so many; a standing vehicle's pool is its newest scan.
     """

@@ -14,15 +14,13 @@ from dataclasses import dataclass, field
 from typing import Final, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
+from gnd.gnd_map.arrays import F64
 from gnd.gnd_map.se3 import T_inverse, exp_so3, log_so3
 from gnd.vehicle_agent.localise.influence import SeenScan, influence
 from gnd.vehicle_agent.localise.match_map import MatchMap
 from gnd.vehicle_agent.localise.parameters import RegistrationParameters
 from gnd.vehicle_agent.localise.registration import LEVER_M, WHEELS_M, Linearised, linearised
-
-F64 = NDArray[np.float64]
 
 N_SHARED: Final = 4
 """What all steps share: gyro bias [rad/s], wheel scale [1], motion to the left and upwards per metre forward [1]."""
@@ -30,7 +28,7 @@ BIAS, SCALE, LEFT, UP = range(N_SHARED)
 STEP_CHI2: Final = 12.6
 """Of a step's six residuals, from where on it counts less: 95 % of right ones lie below."""
 MOST_SQUARE: Final = 9.0
-"""Of a residual in sigmas, as far as one step may say that all are worse: a slip does not, many of 3 sigmas do."""
+"""Of a residual in sigmas, as far as one step may raise the noise of all: a slip does not, many of 3 sigmas do."""
 TORN_WEIGHT: Final = 0.1
 """Robust weight below which a measured motion ties nothing."""
 SMALL_M, SMALL_RAD = 2e-3, 2e-4
@@ -40,10 +38,13 @@ STOP_M, STOP_RAD = 1e-3, 5e-5
 
 @dataclass(frozen=True, slots=True, eq=False)
 class StretchStep:
-    """Motion from one scan of the stretch to the next, as odometry tells it.
+    """Motion from one scan of the stretch to the next, by odometry.
 
-    T_before_now: (4, 4). covariance: (6, 6) of a small motion of the later vehicle, rotation [rad] first. shared: (6,
-    N_SHARED) how this motion would differ if the shared parameters were larger by one; zeros for what scans tell.
+    Attributes:
+        T_before_now: (4, 4).
+        covariance: (6, 6) of a small motion of the later vehicle, rotation [rad] first.
+        shared: (6, N_SHARED) how this motion would differ if the shared parameters were larger by one; zeros for steps
+            between scans.
     """
 
     T_before_now: F64
@@ -77,18 +78,22 @@ class Knot:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SolvedStretch:
-    """What came of a stretch of N scans.
+    """The solution of a stretch of N scans.
 
-    shared: (N_SHARED,) estimate. covariance: (N, 6, 6) of each pose, rotation first, vehicle frame; shared_covariance.
-    fit: (N,) 1 - mean robust cost of each scan's points, 0 ... 1, at the last scale; known: (N,) share of them in known
-    voxels. misfit: mean square of what each scan's own match disagrees with its pose, in sigmas (1 = as expected).
-    step_squares, step_redundancy: (6,) sums over the first measurement of each step: squared residual in sigmas, and
-        how much of each the others can check (0: nothing else knows, 1: all is known otherwise). Their ratio is the
-        variance of these measurements in units of what they claim (variance components, Förstner 1979).
-    seen: (3,) of yaw, forward and left: by what the errors that residuals show differ from those that are assumed, in
-        variance (`influence`); matched: (3,) share of the map in these variances of the poses, the rest is odometry's.
-    axle_variance: (N,) of the direction in which the rear axle drives, yaw and course together [rad²].
-    torn: somewhere no measured motion fits its two poses, so that nothing ties what lies before to what lies behind.
+    Attributes:
+        shared, shared_covariance: (N_SHARED,) estimate, and (N_SHARED, N_SHARED).
+        covariance: (N, 6, 6) of each pose, rotation first, vehicle frame.
+        fit: (N,) 1 - mean robust cost of each scan's points, 0 ... 1, at the last scale.
+        known: (N,) share of them in known voxels.
+        misfit: mean square of the innovation of each scan's own match, in sigmas (1 = as expected).
+        step_squares, step_redundancy: (6,) sums over the first measurement of each step: squared residual in sigmas,
+            and how much of each the others can check (0: nothing else knows, 1: all is known otherwise). Their ratio is
+            the variance of these measurements in units of what they claim (variance components, Förstner 1979).
+        seen: (3,) of yaw, forward and left: variance of the errors that residuals show, in units of those that are
+            assumed (`influence`).
+        matched: (3,) share of the map in these variances of the poses; the rest is odometry's.
+        axle_variance: (N,) of the direction in which the rear axle drives, yaw and course together [rad²].
+        torn: somewhere no measured motion fits its two poses, so that nothing ties what lies before to what follows.
     """
 
     shared: F64
@@ -155,7 +160,7 @@ def marginalised(
     shared: F64,
     registration: RegistrationParameters,
 ) -> StretchBelief:
-    """What all knots but the last one tell about the last one and the shared parameters (Schur complement).
+    """The belief about the last knot and the shared parameters by all knots before it (Schur complement).
 
     The match of the last knot is not part of it: it stays with the stretch that goes on there.
     """
@@ -194,7 +199,7 @@ def _system(
     _add_belief(A, g, knots[0], belief, shared)
     for k, knot in enumerate(knots):
         if knot.match is not None:
-            at, weight = slice(6 * k, 6 * k + 6), knot.weight / par.correlation
+            at, weight = slice(6 * k, 6 * k + 6), knot.weight / par.rules.correlation
             moved = log_se3(T_inverse(knot.match.T_map_vehicle) @ knot.T_map_vehicle)
             A[at, at] += weight * knot.match.H
             g[at] += weight * (knot.match.g + knot.match.H @ moved)
@@ -296,7 +301,7 @@ def _as_seen(
     answers, matched, scans = covariance[rows], np.zeros(3), []
     for k, knot in enumerate(knots):
         if knot.match is not None:
-            v, weight = answers[:, 6 * k : 6 * k + 6], knot.weight / par.correlation
+            v, weight = answers[:, 6 * k : 6 * k + 6], knot.weight / par.rules.correlation
             matched += weight * np.einsum("di,ij,dj->d", v, knot.match.H, v)
             scans.append(SeenScan(knot.points_m, knot.match, weight * v))
     first = np.r_[0:6, len(covariance) - N_SHARED : len(covariance)]
@@ -337,9 +342,9 @@ def _misfit(knots: Sequence[Knot], par: RegistrationParameters) -> float:
             continue
         off = log_se3(T_inverse(knot.match.T_map_vehicle) @ knot.T_map_vehicle)
         values, vectors = np.linalg.eigh(knot.match.H * scale * scale[:, None])
-        strong = values > par.correlation / par.degenerate_m**2
+        strong = values > par.rules.correlation / par.rules.degenerate_m**2
         pull = vectors[:, strong].T @ ((knot.match.g + knot.match.H @ off) * scale)
-        total += float((pull**2 / values[strong]).sum()) / par.correlation
+        total += float((pull**2 / values[strong]).sum()) / par.rules.correlation
         n += int(strong.sum())
     return total / max(n, 1)
 

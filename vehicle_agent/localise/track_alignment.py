@@ -1,4 +1,4 @@
-"""Fixes, and the rigid pose that lays a local track over them whatever a minority of them says.
+"""Fixes, and the rigid pose that lays a local track over them, robust to a minority of them.
 
 Iterated weights, the scale of the robust cost lowered step by step, so that a third of the fixes may be wild (graduated
 non-convexity, Yang et al., RA-L 2020, with the Geman-McClure cost); never below what the track's own drift asks for.
@@ -11,6 +11,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
+from gnd.gnd_map.arrays import F64, I64
 from gnd.gnd_map.geodesy import LocalFrame
 from gnd.gnd_map.se3 import T_from_R_t, exp_so3, transform
 from gnd.schemas.drive import GnssFix
@@ -27,30 +28,11 @@ TRACK_STEP_RAD: Final = 0.0005
 TRACK_STEP_RAD_PER_ROOT_M: Final = 0.001
 """Of its turn, with it."""
 
-F64 = NDArray[np.float64]
-I64 = NDArray[np.int64]
-
 _ROUNDS: Final = 40
 _SHRINK: Final = 1.4
 """Of the robust scale, a round."""
-
-
-@dataclass(frozen=True, slots=True)
-class GeoreferenceParameters:
-    """How far to trust the track and the fixes.
-
-    tilt: find roll and pitch as well (a SLAM frame that does not know the vertical); needs heights.
-    inflation: GNSS errors last for tens of seconds, so that fixes count for less than their number says.
-    spacing_m: of the fixes along the track, at least: a standing vehicle's do not add up.
-    """
-
-    tilt: bool = False
-    inflation: float = 3.0
-    spacing_m: float = 1.0
-
-    def __post_init__(self) -> None:
-        if self.inflation <= 0 or self.spacing_m < 0:
-            raise ValueError(f"inflation > 0 and spacing_m >= 0 are required, got {self}")
+FIX_INFLATION: Final = 3.0
+FIX_SPACING_M: Final = 1.0
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -110,21 +92,21 @@ class Alignment:
     off_m: F64
 
 
-def align(p_local_m: F64, p_frame_m: F64, fixes: FixTable, parameters: GeoreferenceParameters) -> Alignment:
+def align(p_local_m: F64, p_frame_m: F64, fixes: FixTable, *, tilt: bool) -> Alignment:
     """The pose that lays local points (N, 3) over the fixes' positions (N, 3).
 
     Raises:
         LocaliseError: the points do not lie apart, or heights are missing for a full rotation.
     """
-    if parameters.tilt and not fixes.has_height.all():
+    if tilt and not fixes.has_height.all():
         raise LocaliseError(f"{(~fixes.has_height).sum()} of {len(fixes)} fixes have no height, which tilt needs")
     span_m, sigma_m = float(np.ptp(p_local_m[:, :2], axis=0).max()), float(np.median(fixes.sigma_m))
     if span_m < 4.0 * sigma_m:
         raise LocaliseError(f"the track spans {span_m:.1f} m, which gives no heading with fixes of {sigma_m:.1f} m")
     variance, robust, scale = fixes.sigma_m**2, np.ones(len(fixes)), np.inf
     for _ in range(_ROUNDS):
-        T = _rigid(p_local_m, p_frame_m, robust / variance, fixes, tilt=parameters.tilt)
-        off_m = np.linalg.norm((p_frame_m - transform(T, p_local_m))[:, : 3 if parameters.tilt else 2], axis=1)
+        T = _rigid(p_local_m, p_frame_m, robust / variance, fixes, tilt=tilt)
+        off_m = np.linalg.norm((p_frame_m - transform(T, p_local_m))[:, : 3 if tilt else 2], axis=1)
         variance = fixes.sigma_m**2 + float(np.median(off_m)) ** 2
         ratio = off_m / np.sqrt(variance)
         scale = max(TRACK_ROBUST_K, min(scale, float(ratio.max())) / _SHRINK)

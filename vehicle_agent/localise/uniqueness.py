@@ -19,10 +19,11 @@ from typing import Final, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from gnd.gnd_map.arrays import F64, I64
 from gnd.gnd_map.se3 import T_from_R_t, T_inverse, exp_so3, transform
 from gnd.vehicle_agent.errors import RegistrationError
 from gnd.vehicle_agent.localise.first_pose import SearchPlace
-from gnd.vehicle_agent.localise.initialise import INITIALISE_N_REFINING, Around, search, thinned
+from gnd.vehicle_agent.localise.initialise import AROUND_POSITION, INITIALISE_N_REFINING, Around, search, thinned
 from gnd.vehicle_agent.localise.kernels import point_fits
 from gnd.vehicle_agent.localise.match_map import MatchMap
 from gnd.vehicle_agent.localise.parameters import LocaliserParameters, RegistrationParameters
@@ -43,7 +44,7 @@ _UNPROVEN_M: Final = 3.0
 _PROVEN_M: Final = 20.0
 """Way between two tests."""
 _REACH_M: Final = 7.5
-"""Around the tracked pose where GNSS tells nothing."""
+"""Around the tracked pose without GNSS."""
 _TURN_DEG: Final = 10.0
 """Headings within this of the tracked one, all as long as less than `course_m` have been driven."""
 _COURSE_M: Final = 8.0
@@ -61,17 +62,16 @@ _WON_AT_ONCE: Final = 5.0
 _LOST: Final = 3.0
 """By how many it must be beaten, twice in a row, to be no longer so."""
 
-F64 = NDArray[np.float64]
-I64 = NDArray[np.int64]
-
 FARTHEST_M: Final = 60.0  # a far point is moved by more than a patch when odometry turns by a degree or two
 WON_IN_A_ROW: Final = 3
-LEAST_SQUARES: Final = 0.25  # added to sum(d^2): where next to nothing differs, nothing is told
-TOLD: Final = 1.0  # sigmas by which poses a little before and behind must fit worse for the map to tell the place along
+LEAST_SQUARES: Final = 0.25  # added to sum(d^2): where next to nothing differs, nothing is decided
+CONSTRAINED: Final = (
+    1.0  # sigmas by which poses a little before and behind must fit worse: the map constrains the place along
+)
 SEEN_BY: Final = 0.3  # least way between two fixes that are remembered, as share of the view
 
 
-class _Look(NamedTuple):
+class _SeenScan(NamedTuple):
     """What one scan saw: odometer [m], pose (4, 4) and standing points (K, 3) in its own frame."""
 
     way_m: float
@@ -99,7 +99,7 @@ class ScanView:
         self._reach_m, self._every_m, self._n_points = way_m, every_m, n_points
         self.way_m = 0.0
         self._T: F64 | None = None  # newest, odometry's frame
-        self._looks: deque[_Look] = deque()
+        self._seen: deque[_SeenScan] = deque()
         self._fixes: deque[_Fix] = deque()
 
     def push(self, standing_m: F64, T_before_now: F64, T_tracked: F64) -> None:
@@ -110,15 +110,15 @@ class ScanView:
         turn = _yaw(moved) - _yaw(T_tracked)
         self._T = T_from_R_t(exp_so3(np.array([0.0, 0.0, turn])) @ T_tracked[:3, :3], [*moved[:2, 3], T_tracked[2, 3]])
         self.way_m += float(np.hypot(*T_before_now[:2, 3]))
-        if not self._looks or self.way_m - self._looks[-1].way_m >= self._every_m:
-            self._looks.append(_Look(self.way_m, self._T, thinned(standing_m, self._n_points)))
-        while self.way_m - self._looks[0].way_m > self._reach_m:
-            self._looks.popleft()
+        if not self._seen or self.way_m - self._seen[-1].way_m >= self._every_m:
+            self._seen.append(_SeenScan(self.way_m, self._T, thinned(standing_m, self._n_points)))
+        while self.way_m - self._seen[0].way_m > self._reach_m:
+            self._seen.popleft()
         while self._fixes and self.way_m - self._fixes[0].way_m > self._reach_m:
             self._fixes.popleft()
 
     def see_position(self, p_map_m: F64, reach_m: float) -> None:
-        """Take where GNSS says that the vehicle is now: (3,) in the map, and how far it may be off."""
+        """Take the GNSS position now: (3,) in the map, and how far it may be off."""
         if self._T is None:
             return
         if len(self._fixes) > 1 and self._fixes[-1].way_m - self._fixes[-2].way_m < SEEN_BY * self._reach_m:
@@ -131,20 +131,20 @@ class ScanView:
         if self._T is None:
             return np.empty((0, 3))
         T_now_odom = T_inverse(self._T)
-        seen = [transform(T_now_odom @ look.T_odom_vehicle, look.points_m) for look in reversed(self._looks)]
+        seen = [transform(T_now_odom @ one.T_odom_vehicle, one.points_m) for one in reversed(self._seen)]
         points = np.concatenate(seen)
         return points[np.hypot(points[:, 0], points[:, 1]) < FARTHEST_M]
 
     @property
     def place(self) -> tuple[F64, float] | None:
-        """Where the newest fix says that the vehicle is now, (3,), odometry since then added as a reach; or None."""
+        """The newest GNSS position moved on to now, (3,), odometry since then added as a reach; or None."""
         if not self._fixes or self._T is None:
             return None
         fix = self._fixes[-1]
         return fix.p_map_m, fix.reach_m + float(np.hypot(*(self._T[:2, 3] - fix.p_odom_m[:2])))
 
     def allowed(self, T_map_vehicle: F64, T_tracked: F64) -> bool:
-        """True when GNSS allows the pose (4, 4), or speaks no more against it than against the tracked one."""
+        """True when GNSS allows the pose (4, 4), or is no farther from it than from the tracked one."""
         if self._T is None:
             return True
         for fix in self._fixes:
@@ -162,7 +162,7 @@ class Uniqueness:
         self._par, self._registration = parameters.uniqueness, parameters.registration
         par = self._par
         self._how = replace(
-            parameters.initialise,
+            AROUND_POSITION,
             n_refined=_N_REFINED,
             n_kept=_N_KEPT,
             same_m=_APART_M,
@@ -174,7 +174,9 @@ class Uniqueness:
         self._view = ScanView(_WAY_M, _EVERY_M, _N_POINTS)
         self._beaten = self._ahead = 0  # tests in a row
         self._next_m = 0.0  # odometer of the next test
-        self._tested_m = self._told_m = 0.0  # odometer of the last test, and of the last that told the place along
+        self._tested_m = self._constrained_m = (
+            0.0  # odometer of the last test, and of the last that told the place along
+        )
 
     def distrust(self, *, moved: bool) -> None:
         """The pose must be proven again; `moved`: odometry does not know either how it has come here."""
@@ -185,7 +187,7 @@ class Uniqueness:
         if moved:
             self._view = ScanView(_WAY_M, _EVERY_M, _N_POINTS)
             self._next_m = _EVERY_M
-            self._tested_m = self._told_m = 0.0
+            self._tested_m = self._constrained_m = 0.0
 
     def see(
         self, standing_m: F64, T_before_now: F64, T_tracked: F64, place: SearchPlace | None, match_map: MatchMap,
@@ -197,7 +199,7 @@ class Uniqueness:
             standing_m: (K, 3) points that stand above the ground, vehicle frame.
             T_before_now: (4, 4) motion since the one before.
             T_tracked: (4, 4) the tracked pose.
-            place: where a new fix says that the vehicle is now.
+            place: a new GNSS position.
             match_map: the map window.
             believed: whether the scan's match is; what is not matched is not compared.
         """
@@ -212,9 +214,9 @@ class Uniqueness:
             self._conclude()
 
     @property
-    def untold_m(self) -> float:
-        """Way since the map last told the place along it: in a smooth tunnel odometry alone knows it."""
-        return self._view.way_m - self._told_m if self._told_m < self._tested_m else 0.0
+    def unconstrained_m(self) -> float:
+        """Way since the map last constrained the place along it: in a smooth tunnel odometry alone knows it."""
+        return self._view.way_m - self._constrained_m if self._constrained_m < self._tested_m else 0.0
 
     @property
     def beaten(self) -> bool:
@@ -229,7 +231,7 @@ class Uniqueness:
         self._ahead = self._ahead + 1 if self.margin >= _WON else 0
         won = self._ahead >= WON_IN_A_ROW or self.margin >= _WON_AT_ONCE
         whole = self._view.way_m >= _WAY_M
-        self.proven = (self.proven or won) and not self.beaten and (whole or self.margin >= -TOLD)
+        self.proven = (self.proven or won) and not self.beaten and (whole or self.margin >= -CONSTRAINED)
         steady = self.proven and whole and not self._beaten
         self._next_m = self._view.way_m + (_PROVEN_M if steady else _UNPROVEN_M)
 
@@ -249,13 +251,13 @@ class Uniqueness:
             return min((ahead_of_both(fits - fit, patches, high, _FULL_POINTS) for fit in against), default=np.inf)
 
         along, across = (self._beside(points, own, match_map, axis) for axis in (0, 1))
-        if least(along) >= TOLD:
-            self._told_m = self._view.way_m
+        if least(along) >= CONSTRAINED:
+            self._constrained_m = self._view.way_m
         others = [T for T in [*self._elsewhere(points, own, match_map), *along, *across] if self._view.allowed(T, own)]
         return least(others) if others else ahead(fits, patches, _FULL_POINTS)
 
     def _elsewhere(self, points: F64, own: F64, match_map: MatchMap) -> list[F64]:
-        """Other poses (4, 4) about where GNSS says, as good as registration can make them."""
+        """Other poses (4, 4) around the GNSS position, as good as registration can make them."""
         place = self._view.place
         turn_rad = np.radians(_TURN_DEG) if self._view.way_m >= _COURSE_M else np.pi
         p_m, reach_m = (own[:3, 3], _REACH_M) if place is None else place
@@ -266,7 +268,7 @@ class Uniqueness:
 
     def _beside(self, points: F64, own: F64, match_map: MatchMap, axis: int) -> list[F64]:
         """The same from a little before and behind (axis 0), or to the left and right (1): a search may leave them out,
-        and where the map does not tell the place along that axis, they stay there.
+        and where the map does not constrain the place along that axis, they stay there.
         """
         poses = []
         for side_m in (_BESIDE_M, -_BESIDE_M):
@@ -293,7 +295,7 @@ def fits_at(points_m: F64, T_map_vehicle: F64, m: MatchMap, parameters: Registra
     """(N,) how well each of points (N, 3) lies on the map at a pose (4, 4): 1 - robust cost, 0 ... 1; 0 where it is
     not known.
     """
-    fits, scale = np.empty(len(points_m)), parameters.scales[-1]
+    fits, scale = np.empty(len(points_m)), parameters.rules.scales[-1]
     R, t = np.ascontiguousarray(T_map_vehicle[:3, :3]), np.ascontiguousarray(T_map_vehicle[:3, 3])
     gate_m2 = (REGISTRATION_GATE_PER_SCALE * scale) ** 2
     point_fits(
@@ -324,7 +326,7 @@ def ahead(difference: F64, patches: I64, full_points: int) -> float:
 
 
 def ahead_of_both(difference: F64, patches: I64, high: NDArray[np.bool_], full_points: int) -> float:
-    """By how many sigmas a pose is ahead of another, by all points or by the `high` (N,) ones, whichever say more.
+    """By how many sigmas a pose is ahead of another, by all points or by the `high` (N,) ones, whichever are clearer.
 
     What stands higher than a car stays where it is: where many cars have left, they only add noise to what a few lamps
     know.

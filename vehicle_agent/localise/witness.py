@@ -1,4 +1,4 @@
-"""A light witness of the pose: what a scan's rays say about the map, and how that is spread around the vehicle.
+"""A light witness of the pose: how a scan's rays agree with the map, and how that is spread around the vehicle.
 
 Three things are counted by sector: standing points that lie on a Gaussian (hits), standing points that lie far from
 every Gaussian where the map is known (new), and Gaussians that rays passed well before they ended (gone). A stale map
@@ -11,6 +11,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
+from gnd.gnd_map.arrays import F64, I32, I64
 from gnd.gnd_map.jit import kernel
 from gnd.vehicle_agent.localise.initialise import STANDING_ABOVE_M
 from gnd.vehicle_agent.localise.match_map import MatchMap
@@ -26,20 +27,16 @@ _FAR_SIGMAS: Final = 8.0
 _BEHIND_M: Final = 1.0
 """A Gaussian is gone when a ray went on for so long behind it."""
 _LEAST_ALONG_PER_M2: Final = 50.0
-"""Least information of the Gaussian along the ray, so that grazing rays say nothing."""
+"""Least information of the Gaussian along the ray, so that grazing rays do not count."""
 _MAX_WAY_M: Final = 60.0
 """A ray is followed no farther than this."""
-
-F64 = NDArray[np.float64]
-I32 = NDArray[np.int32]
-I64 = NDArray[np.int64]
 
 KNOWN, HIT, NEW, CROSSED, GONE = range(5)  # columns of the counts
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Testimony:
-    """What one scan's rays said.
+    """Evidence of one scan's rays.
 
     counts: (sectors, 5) int64: standing points in known voxels, of these on a Gaussian, of these far from every one;
     Gaussians that rays met or crossed, of these crossed well before the ray's end. Sector 0 begins straight ahead,

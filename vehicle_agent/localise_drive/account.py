@@ -1,4 +1,4 @@
-"""What a localised drive came to, as plain values and as tables for people."""
+"""The results of a localised drive, as plain values and as tables for people."""
 
 from collections.abc import Sequence
 from typing import Any, Final
@@ -8,8 +8,8 @@ from rich.console import Console
 from rich.table import Table
 
 from gnd.vehicle_agent.localise.consistency import nees_of
-from gnd.vehicle_agent.localise.estimates import PoseEstimate
-from gnd.vehicle_agent.localise_drive.accuracy import LIMITS, error_series, error_summary, healthy, limits_json
+from gnd.vehicle_agent.localise.estimates import PoseEstimate, error_series
+from gnd.vehicle_agent.localise_drive.accuracy import LIMITS, error_summary, healthy, limits_json
 from gnd.vehicle_agent.localise_drive.run import LocalisedDrive
 from gnd.vehicle_agent.localise_drive.stretches import HealthStretch, health_shares, stretches_of
 
@@ -67,7 +67,7 @@ def _initialisation_s(drive: LocalisedDrive) -> float | None:
 
 
 def _sigma(estimates: Sequence[PoseEstimate]) -> dict[str, float] | None:
-    """What the localiser itself says: median and largest one-sigma."""
+    """The localiser's own uncertainty: median and largest one-sigma."""
     if not estimates:
         return None
     m, deg = np.array([(e.sigma_m, np.degrees(e.sigma_rad)) for e in estimates]).T
@@ -122,7 +122,7 @@ def _fields(values: dict[str, Any]) -> Table:
         *_calibration(values["calibration"]),
         ("own estimate of error", "none" if sigma is None else
             f"{sigma['median_m'] * 100:.1f} cm, {sigma['median_deg']:.3f}° (one sigma, median)"),
-        ("are errors as large as told", _consistency(values)),
+        ("errors against their sigmas", _consistency(values)),
         ("tiles", f"{len(values['tiles_used'])} used; {values['tiles_absent']} nearby are not in the map"),
         ("time", f"{values['wall_s']:.1f} s, {values['wall_s'] / max(values['scans'], 1) * 1000:.1f} ms a scan"),
     )  # fmt: skip
@@ -150,16 +150,16 @@ def _calibration(values: dict[str, Any] | None) -> tuple[tuple[str, str], ...]:
 def _clock(values: dict[str, Any]) -> str:
     """The time offset between LiDAR and motion."""
     offset, doubt = values["time_offset_s"], values["clock_doubt"]
-    said = f"wheels and gyro {offset['value'] * 1e3:+.1f} ms against the LiDAR, ±{offset['sigma'] * 1e3:.1f}"
-    return said if doubt == "none" else f"{said}; {doubt}"
+    text = f"wheels and gyro {offset['value'] * 1e3:+.1f} ms against the LiDAR, ±{offset['sigma'] * 1e3:.1f}"
+    return text if doubt == "none" else f"{text}; {doubt}"
 
 
 def _mount_used(values: dict[str, Any]) -> str:
-    """The mount that the header tells, and the one that is used where that is another."""
-    told, used = values["mount_told"], values["mount_used"]
+    """The mount of the header, and the one that is used where that is another."""
+    header, used = values["mount_told"], values["mount_used"]
     form = "LiDAR {height_m:.2f} m above the road, roll {roll_deg:.2f}°, pitch {pitch_deg:.2f}°, yaw {yaw_deg:.2f}°"
-    said = [form.format(**mount) for mount in (told, used)]
-    return f"{said[0]}, as told" if told == used else f"{said[1]}; told: {said[0]}"
+    by_header, in_use = form.format(**header), form.format(**used)
+    return f"{by_header}, as in the header" if header == used else f"{in_use}; header: {by_header}"
 
 
 def _mount(values: dict[str, Any]) -> str:

@@ -6,10 +6,7 @@ from typing import Any, Final
 
 import numpy as np
 
-from gnd.gnd_map.arrays import F64, I64
-from gnd.gnd_map.motion import Trajectory
-from gnd.gnd_map.se3 import T_inverse
-from gnd.vehicle_agent.localise.estimates import PoseEstimate
+from gnd.vehicle_agent.localise.estimates import ErrorSeries, PoseEstimate
 
 
 @dataclass(frozen=True, slots=True)
@@ -27,39 +24,6 @@ LIMITS: Final = {
     "heading": AccuracyLimit("deg", 0.17, 0.5),
 }
 """Requirement of localisation (GND, Tables 4 and 6)."""
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class ErrorSeries:
-    """Signed errors along, across and about the reference's heading, left and counter-clockwise positive; (N,) each."""
-
-    t_ns: I64
-    longitudinal: F64
-    """[m]"""
-    lateral: F64
-    """[m]"""
-    heading: F64
-    """[deg]"""
-
-    def __len__(self) -> int:
-        return len(self.t_ns)
-
-    def of(self, name: str) -> F64:
-        """The errors of that name of `LIMITS`."""
-        errors: F64 = getattr(self, name)
-        return errors
-
-
-def error_series(estimates: Sequence[PoseEstimate], reference: Trajectory | None) -> ErrorSeries:
-    """Errors of the estimates (T_map_vehicle) that lie within the reference's time, interpolated; none without one."""
-    known = () if reference is None else (int(reference.t_ns[0]), int(reference.t_ns[-1]))
-    within = [e for e in estimates if known and known[0] <= e.t_ns <= known[1]]
-    t_ns = np.array([e.t_ns for e in within], np.int64)
-    if reference is None or not within:
-        return ErrorSeries(t_ns, *np.empty((3, 0)))
-    error = T_inverse(reference.at(t_ns)) @ np.stack([e.T_map_vehicle for e in within])
-    heading_deg = np.degrees(np.arctan2(error[:, 1, 0], error[:, 0, 0]))
-    return ErrorSeries(t_ns, error[:, 0, 3], error[:, 1, 3], heading_deg)
 
 
 def healthy(estimates: Sequence[PoseEstimate]) -> list[PoseEstimate]:

@@ -58,7 +58,7 @@ def localise(
         values = {"map": str(store), "layer": layer, "at": at, "submaps": not without_submaps} | summary(found)
         written = write_outputs(found, values, folder, chosen)
         if not no_plots:
-            from gnd.vehicle_agent.localise_drive.pictures import draw_pictures  # it loads matplotlib
+            from gnd.vehicle_agent.localise_drive.map_picture import draw_pictures  # it loads matplotlib
 
             written += draw_pictures(found, tiles, folder)
         interrupted = stop.is_set()

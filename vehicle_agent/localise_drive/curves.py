@@ -1,4 +1,4 @@
-"""Curves over time: errors beside the limits (GND, Figures 15, 19 and 24), and what the localiser says of itself."""
+"""Curves over time: errors beside the limits (GND, Figures 15, 19 and 24), and the localiser's own uncertainty."""
 
 import math
 from collections.abc import Callable, Mapping, Sequence
@@ -12,8 +12,8 @@ from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 
 from gnd.gnd_map.arrays import F64, I64
-from gnd.vehicle_agent.localise.estimates import PoseEstimate
-from gnd.vehicle_agent.localise_drive.accuracy import LIMITS, AccuracyLimit, ErrorSeries, error_series, healthy
+from gnd.vehicle_agent.localise.estimates import ErrorSeries, PoseEstimate, error_series
+from gnd.vehicle_agent.localise_drive.accuracy import LIMITS, AccuracyLimit, healthy
 from gnd.vehicle_agent.localise_drive.run import LocalisedDrive
 from gnd.vehicle_agent.localise_drive.stretches import HEALTHS, HealthStretch, stretches_of
 from gnd.vehicle_agent.localise_drive.style import (
@@ -65,12 +65,12 @@ def draw_errors(drive: LocalisedDrive, path: Path) -> Path:
 
 
 def draw_quality(drive: LocalisedDrive, path: Path) -> Path:
-    """What the localiser says of itself over time: one-sigma of place and heading, matching ratio, health.
+    """The localiser's own estimate over time: one-sigma of place and heading, matching ratio, health.
 
     Raises:
         LocaliseError: the file cannot be written.
     """
-    figure = new_figure(*_SIZE_IN, "What the localiser says of itself", _heading(drive))
+    figure = new_figure(*_SIZE_IN, "The localiser's own estimate of its errors", _heading(drive))
     axes = figure.subplots(3, 1, sharex=True)
     figure.subplots_adjust(**_GRID)
     stretches = stretches_of(drive.moments)

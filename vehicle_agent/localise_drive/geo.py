@@ -7,8 +7,7 @@ from typing import Any, Final
 import numpy as np
 
 from gnd.gnd_map.arrays import F64
-from gnd.vehicle_agent.localise.estimates import PoseEstimate
-from gnd.vehicle_agent.localise_drive.accuracy import ErrorSeries, error_series
+from gnd.vehicle_agent.localise.estimates import ErrorSeries, PoseEstimate, error_series
 from gnd.vehicle_agent.localise_drive.run import LocalisedDrive, Moment, trajectory_of
 from gnd.vehicle_agent.localise_drive.stretches import HealthStretch, stretches_of
 

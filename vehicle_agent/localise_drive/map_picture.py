@@ -1,4 +1,4 @@
-"""The map from above with the track on it, coloured by health."""
+"""The pictures of a localised drive; the map from above with the track on it, coloured by health."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -13,7 +13,8 @@ from matplotlib.patches import Patch
 from matplotlib.patheffects import withStroke
 
 from gnd.gnd_map.arrays import F64
-from gnd.vehicle_agent.localise_drive.curves import GAP_NS
+from gnd.vehicle_agent.localise.estimates import error_series
+from gnd.vehicle_agent.localise_drive.curves import GAP_NS, draw_errors, draw_quality
 from gnd.vehicle_agent.localise_drive.map_raster import COLOURS, KINDS, MapRaster
 from gnd.vehicle_agent.localise_drive.run import LocalisedDrive, trajectory_of
 from gnd.vehicle_agent.localise_drive.stretches import HEALTHS
@@ -67,6 +68,19 @@ def _tall_enough(low: F64, high: F64) -> tuple[F64, F64]:
     width, height = high - low
     grow = np.maximum(0.0, [height * _PANEL_IN / _TALL_IN[1] - width, width * _TALL_IN[0] / _PANEL_IN - height])
     return low - grow / 2, high + grow / 2
+
+
+def draw_pictures(drive: LocalisedDrive, tiles: TileSource, folder: Path) -> list[Path]:
+    """Draw map.png, quality.png, and errors.png where there are poses and a reference; give the paths.
+
+    Raises:
+        LocaliseError: a file cannot be written.
+        StoreError: a tile cannot be read again.
+    """
+    drawn = [draw_map(drive, tiles, folder / "map.png"), draw_quality(drive, folder / "quality.png")]
+    if len(error_series(drive.online, drive.reference)):
+        drawn.append(draw_errors(drive, folder / "errors.png"))
+    return drawn
 
 
 def draw_map(drive: LocalisedDrive, tiles: TileSource, path: Path) -> Path:

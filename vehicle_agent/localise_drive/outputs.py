@@ -8,7 +8,7 @@
 | poses.mcap | refined, online, reference: for Foxglove |
 | track.csv, track.geojson | the refined poses on the Earth: for QGIS |
 | health.json, summary.json | always |
-| map.png, quality.png, errors.png | see `pictures` |
+| map.png, quality.png, errors.png | see `map_picture` |
 
 Files of these names that an earlier run has left in the folder are removed, so that all belong together.
 """

@@ -1,1 +1,1 @@
-"""Maps from recorded drives: movers and bodywork left out, poses closed in loops, and what the result is worth."""
+"""Maps from recorded drives: movers and bodywork left out, poses closed in loops, and the result's quality."""

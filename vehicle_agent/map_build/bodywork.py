@@ -23,7 +23,7 @@ ABOVE_ROAD_M: Final = (0.35, 3.2)
 """Of the road itself, which keeps its place too, nothing is taken; of bridges and wires neither."""
 EVERY_M: Final = 1.0
 MIN_SCANS: Final = 25
-"""So many scans, each a metre further, before anything is said."""
+"""So many scans, each a metre further, before anything is decided."""
 MIN_SHARE: Final = 0.6
 """Of these scans have a point in a cell of the bodywork."""
 

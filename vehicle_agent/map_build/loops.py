@@ -14,9 +14,9 @@ import numpy as np
 from gnd.gnd_map.arrays import F64
 from gnd.gnd_map.se3 import T_inverse, log_so3
 from gnd.vehicle_agent.errors import RegistrationError
-from gnd.vehicle_agent.localise.initialise import Around, Candidate, near_pose, search
+from gnd.vehicle_agent.localise.initialise import AROUND_POSITION, Around, Candidate, near_pose, search
 from gnd.vehicle_agent.localise.match_map import MatchMap
-from gnd.vehicle_agent.localise.parameters import InitialiseParameters, RegistrationParameters
+from gnd.vehicle_agent.localise.parameters import WITHOUT_WHEELS, RegistrationParameters
 from gnd.vehicle_agent.localise.registration import register
 from gnd.vehicle_agent.map_build.anchors import PoseAnchors
 
@@ -41,8 +41,8 @@ AGREE_M, AGREE_SHARE, AGREE_DEG = 0.2, 0.01, 1.0
 """How far a neighbouring loop may disagree: at least, of the way between, and in angle."""
 FLOOR_M, FLOOR_RAD = 0.02, 1e-3
 
-_REGISTRATION: Final = RegistrationParameters(wheel_sigma_m=0.0)
-_SEARCH: Final = InitialiseParameters(step_m=1.5, step_deg=3.0, n_refined=12, n_kept=4)
+_REGISTRATION: Final = RegistrationParameters(rules=WITHOUT_WHEELS)
+_SEARCH: Final = replace(AROUND_POSITION, step_m=1.5, step_deg=3.0, n_refined=12, n_kept=4)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -122,7 +122,7 @@ def find_loops(
         T: (N, 4, 4) where they are thought to be.
         tried: of `pairs`.
         sigma_m: one sigma of how a pair lies to each other.
-        progress: told how many pairs are done, of how many.
+        progress: called with how many pairs are done, of how many.
     """
     found: list[Loop] = []
     fate = {"poor": 0, "ambiguous": 0, "one_way": 0}
@@ -189,7 +189,7 @@ def _back(anchors: PoseAnchors, early: int, late: int, T_late_early: F64) -> F64
 
 
 def _has_a_friend(loop: Loop, loops: Sequence[Loop], anchors: PoseAnchors, T: F64) -> bool:
-    """Whether another loop of neighbouring anchors says the same, carried over by the poses between neighbours."""
+    """Whether another loop of neighbouring anchors agrees, carried over by the poses between neighbours."""
     return any(_agree(loop, other, anchors, T) for other in _neighbours(loop, loops, anchors))
 
 

@@ -1,7 +1,7 @@
 """The scans of a drive with known poses, as localisation would give them; and why a scan has none."""
 
 from collections.abc import Iterator
-from typing import Final, Literal
+from typing import Literal
 
 import numpy as np
 
@@ -13,7 +13,6 @@ from gnd.tile_store.build import MapSource
 from gnd.vehicle_agent.localise.estimates import PoseEstimate, RefinedScan
 
 NoPose = Literal["before the first pose", "after the last pose", "without a point in range"]
-REASONS: Final[tuple[NoPose, ...]] = ("before the first pose", "after the last pose", "without a point in range")
 
 
 def middle_ns(scan: Scan) -> int:

@@ -24,16 +24,16 @@ TURN_DEG_ROOT_M: Final = 0.03
 FIRST_M, FIRST_DEG = 10.0, 3.0
 """One sigma of where each drive begins, before anything else is known."""
 HELD: Final = 1e-3
-"""... of the first drive where no fix says better: it carries the frame."""
+"""... of the first drive where no fix is better: it carries the frame."""
 GNSS_CORRELATION_S: Final = 40.0
-"""Errors of fixes (multipath, ionosphere) live so long: fixes nearer in time tell less each."""
+"""Errors of fixes (multipath, ionosphere) live so long: fixes nearer in time count less each."""
 INLIER_CHI2: Final = 8.4
 """Half of chi-square with 6 degrees of freedom at 99 %."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class GnssTies:
-    """What GNSS says of anchors: numbers (G,), places (G, 3) in the map frame, one sigma (G,) of each, as if they were
+    """GNSS positions of anchors: numbers (G,), places (G, 3) in the map frame, one sigma (G,) of each, as if they were
     independent of each other.
     """
 

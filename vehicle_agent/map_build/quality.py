@@ -1,4 +1,4 @@
-"""What a map is worth, measured on itself: doubled surfaces, thickness of planes, coverage, and what was left out."""
+"""Quality of a map, measured on itself: doubled surfaces, thickness of planes, coverage, and what was left out."""
 
 from collections import Counter
 from collections.abc import Sequence
@@ -38,7 +38,7 @@ FEW_SIGHTS: Final = 0.3
 
 @dataclass(frozen=True, slots=True)
 class MountHeight:
-    """How high the LiDAR of a drive stands over the road, and how high its header says.
+    """How high the LiDAR of a drive stands over the road, and how high by its header.
 
     `road_m` is where the road lies in the vehicle frame; wheels stand on 0. Quantiles over the way.
     """

@@ -1,4 +1,4 @@
-"""Poses of all drives made one: loops found, the graph solved, found again from there, solved again, and told.
+"""Poses of all drives made one: loops found, the graph solved, found again from there, solved again, and reported.
 
 Where passes agree already (poses from a survey, or from this very refinement), nothing is changed: a graph can only add
 the error of its loops to poses that are better.
@@ -20,7 +20,6 @@ from gnd.vehicle_agent.map_build.pose_graph import GNSS_CORRELATION_S, GnssTies,
 from gnd.vehicle_agent.map_build.survey import DriveSurvey, Progress
 
 RefineMode = Literal["auto", "always", "never"]
-MODES: Final[tuple[RefineMode, ...]] = ("auto", "always", "never")
 
 AGREE_M, AGREE_UP_M, AGREE_DEG = 0.05, 0.10, 0.15
 """Median disagreement of passes below which poses are left alone: what the match of two clouds itself is off by."""
@@ -34,7 +33,7 @@ _S: Final = 1e-9
 
 @dataclass(frozen=True, slots=True)
 class PassDrift:
-    """Disagreement of passes with what their loops say: medians and 95 % quantiles over `loops` loops."""
+    """Disagreement of passes with their loops: medians and 95 % quantiles over `loops` loops."""
 
     loops: int
     horizontal_m: float
@@ -81,7 +80,7 @@ def refine_poses(
     tried = pairs(first, T)
     if not tried and mode == "auto":
         return list(sources), PosesReport(mode, False, "no place was passed twice")
-    loops, counts = find_loops(first, T, tried, lambda a, b: sigma_between(first, a, b), _told(progress, "loops"))
+    loops, counts = find_loops(first, T, tried, lambda a, b: sigma_between(first, a, b), _counted(progress, "loops"))
     before = drift(T, loops)
     reason = _why_not(before, counts)
     if reason is not None and mode == "auto":
@@ -102,7 +101,7 @@ def _refined(
     solved = solve(first.drive, T, loops, fixes)
     second = PoseAnchors(surveys, _bent(sources, first, T, solved.T))
     again = pairs(second, solved.T)
-    loops, counts = find_loops(second, solved.T, again, lambda _a, _b: AFTER_SIGMA_M, _told(progress, "loops again"))
+    loops, counts = find_loops(second, solved.T, again, lambda _a, _b: AFTER_SIGMA_M, _counted(progress, "loops again"))
     solved = solve(first.drive, T, loops, fixes)
     believed = [loop for loop, taken in zip(loops, solved.loops, strict=True) if taken]
     tracks = _bent(sources, first, T, solved.T)
@@ -132,18 +131,18 @@ def _checked(
     if not len(between):
         return None, None
     T = between.poses()
-    told = _told(progress, "checking between loops")
-    loops, _ = find_loops(between, T, pairs(between, T), lambda _a, _b: AFTER_SIGMA_M, told)
+    counted = _counted(progress, "checking between loops")
+    loops, _ = find_loops(between, T, pairs(between, T), lambda _a, _b: AFTER_SIGMA_M, counted)
     T_before = PoseAnchors(surveys, [source.poses for source in sources], from_m=EVERY_M / 2).poses()
     return drift(T_before, loops), drift(T, loops)
 
 
-def _told(progress: Progress, what: str) -> Callable[[int, int], None]:
+def _counted(progress: Progress, what: str) -> Callable[[int, int], None]:
     return lambda done, total: progress(what, done, total)
 
 
 def drift(T: F64, loops: Sequence[Loop]) -> PassDrift | None:
-    """How far poses T (N, 4, 4) are from what loops say; None without loops."""
+    """How far poses T (N, 4, 4) are from their loops; None without loops."""
     if not loops:
         return None
     seen = np.stack([loop.T_early_late for loop in loops])

@@ -1,4 +1,4 @@
-"""What a build says about itself, as plain values for JSON and tables."""
+"""The report of a build, as plain values for JSON and tables."""
 
 from collections import Counter
 from dataclasses import asdict

@@ -20,7 +20,7 @@ from gnd.vehicle_agent.map_build.road import road_below
 Progress = Callable[[str, int, int], None]
 """Called with what is done, how much of it is, and of how much."""
 
-SAMPLED: Final = SamplingParameters(n_points=1500, leaf_m=0.3, max_range_m=50.0)
+SAMPLED: Final = SamplingParameters(n_points=1500, max_range_m=50.0)
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -32,7 +32,7 @@ def pack(report: ChangeReport, bases: Bases, track: Track) -> PackedReport:
     """The first half of `report`: which voxels it flags, and where the vehicle was.
 
     Args:
-        report: as the detector makes it; what it does not flag as new, modified or deleted is not told.
+        report: as the detector makes it; what it does not flag as new, modified or deleted is not sent.
         bases: at least those that the report's tiles name.
         track: where the vehicle was while the scans counted that the report rests on.
 

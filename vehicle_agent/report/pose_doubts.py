@@ -1,7 +1,7 @@
 """Which tiles of feature layers are held back because poses were wrong, or may have been, while they were looked at.
 
 Looks from a pose that is not good are no evidence. But a localiser that loses its place, a refined pose that
-contradicts the online one, or a stretch that a shift lays better onto the map, says something of the poses just before
+contradicts the online one, or a stretch that a shift lays better onto the map, is evidence about the poses just before
 and after, too. So a tile of which much of the time was spent in such poses is not reported at all.
 """
 

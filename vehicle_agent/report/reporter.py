@@ -1,7 +1,7 @@
 """From evidence to the outbox: tiles that the vehicle has left are decided, and reported soon where they have changed.
 
-A report costs some 160 B beside what it says. So a tile in which much has changed waits a moment for those that are
-left with it, scattered voxels for others, and ground that is as the map says for the end of the district, or for long.
+A report costs some 160 B beside its content. So a tile in which much has changed waits a moment for those that are
+left with it, scattered voxels for others, and unchanged ground for the end of the district, or for long.
 """
 
 import logging
@@ -9,7 +9,7 @@ from collections import Counter
 from collections.abc import Callable, Collection, Mapping, Set
 from dataclasses import dataclass, field, replace
 from importlib.metadata import version
-from typing import Any
+from typing import Any, Final
 
 import numpy as np
 
@@ -25,18 +25,18 @@ from gnd.schemas.course import Course
 from gnd.schemas.keys import change_key
 from gnd.schemas.report_id import deterministic_report_id
 from gnd.vehicle_agent.config import ReportParameters
-from gnd.vehicle_agent.detect.beyond import beyond_map
 from gnd.vehicle_agent.detect.classify import Classification, classify, tile_change
 from gnd.vehicle_agent.detect.detector import ChangeDetector
 from gnd.vehicle_agent.detect.doubts import (
     LEAST_WITHHELD,
     TileAccount,
     TileDoubts,
+    beyond_map,
     changed_share_of,
     doubt_of,
     withheld_change,
 )
-from gnd.vehicle_agent.detect.shift import Shift, ShiftParameters, costs_at
+from gnd.vehicle_agent.detect.shift import Shift, costs_at
 from gnd.vehicle_agent.detect.tile_shift import pose_error_of_tile
 from gnd.vehicle_agent.detect.trial import POINTS_OF_POOR_SCAN, Trial, some_of
 from gnd.vehicle_agent.detect.uncertainty import PoseUncertainty
@@ -50,13 +50,18 @@ from gnd.vehicle_agent.surroundings import left_behind
 from gnd.vehicle_agent.tracks import Tracks
 
 STEP_M = 2.0  # tiles left behind are looked for after this much way
+_LEAVE_M: Final = 4.0
+"""A tile this much farther away than detection reaches gets no more evidence: its classes are decided. It holds how far
+the LiDAR stands from the vehicle's origin, and what the vehicle drives during a scan."""
+_SOON_S: Final = 0.3
+"""Where much has changed, a report waits this long for tiles that are left together with the first."""
 
 _log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True, slots=True)
 class Identity:
-    """What every report of a drive says about who made it."""
+    """Who made a report: the same in every report of a drive."""
 
     vehicle: str
     drive_id: str
@@ -113,7 +118,7 @@ class _PendingTiles:
             return True
         apart = reported_ns is None or t_ns - reported_ns > most.apart_s * 1e9
         many = max(len(change.changed) for change in self.changes.values()) >= most.soon_voxels
-        return many and apart and t_ns - self.changed_ns > most.soon_s * 1e9
+        return many and apart and t_ns - self.changed_ns > _SOON_S * 1e9
 
 
 @dataclass(slots=True)
@@ -138,8 +143,8 @@ class Reporter:
     Report ids are made of vehicle, drive, district and the report's number in it, so a restarted agent, which drives
     its recording again, makes the same ids; where it would put other tiles together than in its first life, each is
     stated once all the same. New Gaussians are moved onto the lattice that they travel on, so that the
-    short form of a report and the whole one say the same, to the bit. `course` gives where the vehicle drives in its
-    own frame, as far as it knows; `statement` what is said of a tile, by default `statement_on_lattice`.
+    short form of a report and the whole one are equal to the bit. `course` gives where the vehicle drives in its
+    own frame, as far as it knows; `statement` makes the content of a tile, by default `statement_on_lattice`.
     """
 
     def __init__(
@@ -170,13 +175,14 @@ class Reporter:
         self._stated_before: Counter[TileId] = Counter()  # in reports of an earlier life that have the same ids
         self._tracks = Tracks(detector.local_map.grid_frame.frame)
         self._match_map = MatchMapCache(detector.local_map, RegistrationParameters().noise_m)
-        self._trial = Trial(self._match_map, ShiftParameters())
+        self._trial = Trial(self._match_map)
+        self._left_behind_m = detector.parameters.range_max_m + _LEAVE_M
         self._doubts = TileDoubts(detector.local_map.grid_frame)
         self._T_map_vehicle: F64 | None = None  # of the newest scan that counted
         self._shifted = 0
 
     def add_scan(self, segmented: SegmentedScan) -> None:
-        """Count the scan's rays, if its pose is good enough to speak about the world and has stood the shift test."""
+        """Count the scan's rays, if its pose is good enough for evidence and has stood the shift test."""
         estimate = segmented.scan.estimate
         pose, most = PoseUncertainty.of(estimate), self._parameters
         if estimate.health != "good" or pose.sigma_m > most.max_sigma_m or pose.sigma_rad > most.max_sigma_rad:
@@ -208,7 +214,7 @@ class Reporter:
         return shifted
 
     def _remember(self, segmented: SegmentedScan, what: str) -> None:
-        """Which tiles a scan saw of whose pose something is to be said."""
+        """Tiles seen by a scan whose pose is to be noted."""
         scan = segmented.scan
         if len(scan.points_map_m):
             centre = scan.origins_map_m[0]
@@ -257,9 +263,9 @@ class Reporter:
         touched = self._detector.touched_tiles()
         self._tracks.touched(touched)
         open_tiles = set(touched) | set(self._doubts.tiles())
-        left = left_behind(frame, open_tiles, p_map, self._parameters.left_behind_m)
+        left = left_behind(frame, open_tiles, p_map, self._left_behind_m)
         self._decide(left, odometer_m)
-        self._doubts.forget(left_behind(frame, self._doubts.all_tiles(), p_map, self._parameters.left_behind_m))
+        self._doubts.forget(left_behind(frame, self._doubts.all_tiles(), p_map, self._left_behind_m))
         self._open_districts = {t.district for t in open_tiles - set(left)}
 
     def report_all(self, odometer_m: float) -> None:
@@ -343,7 +349,7 @@ class Reporter:
         pending.add(change, base, odometer_m, self._here_ns)
 
     def _report(self, district: District) -> None:
-        """One report of what is told, and one of what is held back: the short form would call its voxels observed."""
+        """One report of what is sent, and one of what is held back: the short form would call its voxels observed."""
         pending = self._pending.pop(district)
         if pending.changed_ns is not None:
             self._reported_ns = self._here_ns
@@ -412,7 +418,7 @@ class Reporter:
 
 
 def statement_on_lattice(found: Classification) -> TileChange:
-    """What a report says of a tile: its classes, and its new Gaussians on the lattice on which they travel."""
+    """The content of a report about a tile: its classes, and its new Gaussians on the lattice on which they travel."""
     return on_lattice(tile_change(found))
 
 

@@ -82,7 +82,7 @@ def draw_image(points: F32, origins: F32, voxel_of: I32, R: F64, optics: Optics,
     Args:
         points: (N, 3) float32 ends of the rays.
         origins: (N, 3) float32 their starts.
-        voxel_of: (N,) int32 of `find_objects`; tells the ground.
+        voxel_of: (N,) int32 of `find_objects`; marks the ground.
         R: (3, 3) map axes to the sensor's.
         optics: the image's scale.
         spread_m: a bin of azimuth where the sensor moved farther (start and end of a sweep meet) gets no origin.
@@ -190,7 +190,7 @@ def vote(  # noqa: C901  (one loop over the window)
         R: (3, 3) map axes to its sensor's.
         optics: its scale.
         judge: distances that decide.
-        weight: how much a return at the same place says.
+        weight: weight of a return at the same place.
         passed: (V,) uint8, changed: number of votes for "moving".
         met: (V,) uint8, changed: weights of the votes for "static".
     """

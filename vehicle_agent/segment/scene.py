@@ -7,13 +7,16 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from gnd.gnd_map.arrays import F32, F64, I32
-from gnd.vehicle_agent.segment.evidence import WEIGHTS
+from gnd.gnd_map.arrays import F32, F64, I32, I64
 from gnd.vehicle_agent.segment.ground_kernels import GroundGrid, ground_heights, lowest_heights, remember_ground
 from gnd.vehicle_agent.segment.image_kernels import Optics, RangeJudge, draw_image, elevation_span, layer_gap, vote
-from gnd.vehicle_agent.segment.parameters import SegmentParameters
+from gnd.vehicle_agent.segment.parameters import RANGE_MIN_M, SegmentParameters
 from gnd.vehicle_agent.segment.voxel_kernels import find_objects
 
+U8 = NDArray[np.uint8]
+
+WEIGHTS: Final = 4
+"""Weight of a full vote for "static"; others have less."""
 _SETTLED_S: Final = 1.0
 """A return at the same place counts the less the nearer in time below this: what moves still covers its place."""
 _COLUMN_DEG: Final = 0.3
@@ -21,7 +24,7 @@ _COLUMN_DEG: Final = 0.3
 _ROW_DEG: Final = 0.4
 """Height of their rows at the horizon; rows are even in the tangent of the elevation."""
 _REACH_ACROSS_M: Final = 0.15
-"""How far from a point a ray may pass at its side and still speak about it."""
+"""How far from a point a ray may pass at its side and still be evidence about it."""
 _REACH_UP_M: Final = 0.3
 """The same above and below: layers are far apart."""
 _MARGIN_M: Final = 0.45
@@ -40,9 +43,7 @@ _FEET_M: Final = 0.1
 SEGMENT_VOXEL_M: Final = 0.3
 """Points this near to each other are judged together, and objects farther apart are two."""
 
-U8 = NDArray[np.uint8]
 U16 = NDArray[np.uint16]
-I64 = NDArray[np.int64]
 
 GAP_SHARE = 0.8  # of layers that are at most so far apart
 MOST_REACH = 8  # voxels
@@ -76,7 +77,7 @@ class RangeImage:
     def vote(self, t_ns: int, objects: "Objects", centre_m: F64, judge: RangeJudge) -> None:
         """Vote on the objects of the scan at `t_ns`, whose points are relative to `centre_m`.
 
-        What moves may still cover its own place for a while: a return there says the more the longer after.
+        What moves may still cover its own place for a while: a return there counts the more the longer after.
         """
         share = min(1.0, abs(t_ns - self.t_ns) / (_SETTLED_S * NS))
         weight = max(1, round(share * WEIGHTS))
@@ -126,7 +127,7 @@ class GroundMap:
     def around(self, points: F32, centre_m: F64, T_map_vehicle: F64, tan_low: float) -> tuple[F32, GroundGrid]:
         """Heights of the ground relative to `centre_m`, and their grid, with points (N, 3) relative to it just seen.
 
-        `tan_low`: tangent of the lowest elevation, which tells from where on the sensor sees the ground.
+        `tan_low`: tangent of the lowest elevation, from which follows where the sensor begins to see the ground.
         """
         self._move(np.floor(centre_m[:2] / self._cell_m).astype(np.int64) - self._half)
         x0, y0 = self._corner * self._cell_m - centre_m[:2]
@@ -156,7 +157,7 @@ def find_all_objects(
 ) -> Objects:
     """Voxels of a scan's points (N, 3), relative to its centre; `gap_tan`: distance of its layers."""
     voxel_of, first, index = find_objects(
-        points, origins, *ground, _GROUND_M, _FEET_M, SEGMENT_VOXEL_M, p.range_min_m, p.range_max_m,
+        points, origins, *ground, _GROUND_M, _FEET_M, SEGMENT_VOXEL_M, RANGE_MIN_M, p.range_max_m,
         *hash_table(len(points)),
     )  # fmt: skip
     votes = np.zeros((2, len(first)), np.uint8)
@@ -171,3 +172,20 @@ def image_of(t_ns: int, centre_m: F64, R: F64, points: F32, origins: F32, voxel_
     rows = int((high - low) / step) + 1 if high >= low else 1
     optics = Optics(round(360.0 / _COLUMN_DEG), rows, float(low), step)
     return RangeImage(t_ns, centre_m, R, optics, *draw_image(points, origins, voxel_of, R, optics, SPREAD_M))
+
+
+def belief(passed: U8, met: U8, mass_moving: float, mass_static: float) -> tuple[F64, F64]:
+    """Return the masses of "moving" and of "static", float64 (V,) each.
+
+    Votes are combined by Dempster's rule in closed form: `passed` votes for "moving", votes of `met` weights together
+    for "static".
+
+    A vote of weight w has the mass 1 - (1 - mass_static)^(w / WEIGHTS). Every vote is a simple support function; equal
+    ones combine to 1 - (1 - m)^n, and Dempster's rule joins the two (Shafer 1976, chapter 4). The rest is "not known".
+    """
+    doubt_moving = (1.0 - mass_moving) ** passed.astype(np.float64)
+    doubt_static = (1.0 - mass_static) ** (met / WEIGHTS)
+    conflict = (1.0 - doubt_moving) * (1.0 - doubt_static)
+    moving = (1.0 - doubt_moving) * doubt_static / (1.0 - conflict)
+    static = (1.0 - doubt_static) * doubt_moving / (1.0 - conflict)
+    return moving, static

@@ -10,13 +10,13 @@ from numpy.typing import NDArray
 
 from gnd.gnd_map.arrays import F32, F64
 from gnd.vehicle_agent.localise.estimates import PoseEstimate, RefinedScan
-from gnd.vehicle_agent.segment.evidence import belief
-from gnd.vehicle_agent.segment.parameters import SegmentParameters
+from gnd.vehicle_agent.segment.parameters import PAST_S, SegmentParameters
 from gnd.vehicle_agent.segment.scene import (
     SEGMENT_VOXEL_M,
     GroundMap,
     Objects,
     RangeImage,
+    belief,
     find_all_objects,
     hash_table,
     image_of,
@@ -84,7 +84,7 @@ class MotionSegmenter:
         self._gap_tan, self._tan_low = 0.0, -np.inf
 
     def push(self, scan: RefinedScan) -> list[SegmentedScan]:
-        """Take a scan; give those that no later scan will say anything about any more, oldest first."""
+        """Take a scan; give those that no later scan is compared with any more, oldest first."""
         if not self.parameters.enabled:
             return [SegmentedScan(scan, np.zeros(len(scan.points_map_m), np.bool_))]
         p = self.parameters
@@ -132,7 +132,7 @@ class MotionSegmenter:
         for image in self._images:
             age_ns, last_ns = t_ns - image.t_ns, kept[-1].t_ns if kept else -(2**62)
             young = age_ns <= p.future_s * _S
-            if age_ns <= p.past_s * _S and (young or image.t_ns - last_ns >= OLD_STEP * _EVERY_S * _S - _S // 50):
+            if age_ns <= PAST_S * _S and (young or image.t_ns - last_ns >= OLD_STEP * _EVERY_S * _S - _S // 50):
                 kept.append(image)
         self._images = kept
 

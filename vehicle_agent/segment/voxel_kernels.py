@@ -5,11 +5,10 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from gnd.gnd_map.arrays import F32, I32
+from gnd.gnd_map.arrays import F32, I32, I64
 from gnd.gnd_map.jit import kernel
 from gnd.vehicle_agent.segment.ground_kernels import GroundGrid
 
-I64 = NDArray[np.int64]
 U8 = NDArray[np.uint8]
 
 GROUND, LOW, OUTSIDE = -1, -2, -3

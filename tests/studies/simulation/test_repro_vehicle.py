@@ -71,7 +71,7 @@ def test_reports_are_what_a_vehicle_uploads(world: tuple[WorldFiles, VehicleTask
 
 
 def test_parameters_reach_the_detector(world: tuple[WorldFiles, VehicleTask]) -> None:
-    strict = MethodParameters().with_changes(["detect.new_cells=200", "detect.new_cells_at_edge=200"])
+    strict = MethodParameters().with_changes(["detect.new_cells=200"])
     new = [simulated(replace(world[1], method=m)).stats["classes"]["new"] for m in (MethodParameters(), strict)]
     assert new[1] < new[0] / 2
 
