@@ -54,7 +54,9 @@ def export(
 
 
 def _plain(store: Store, layer: str, region: str, out: Path, name: str) -> Written:
-    result = export_las(store, layer, region, out) if name in ("las", "laz") else export_map(store, layer, region, out, name)
+    result = (
+        export_las(store, layer, region, out) if name in ("las", "laz") else export_map(store, layer, region, out, name)
+    )
     line = f"{out}: {result.gaussians} Gaussians of {result.tiles} tiles, {result.size_bytes / 1e6:.2f} MB"
     return asdict(result) | {"path": str(result.path)}, line
 
@@ -68,4 +70,3 @@ def _autoware(store: Store, layer: str, region: str, out: Path, projector: str |
         f"{result.projector}, {grid}; heights are ellipsoidal (vertical_datum WGS84)"
     )
     return asdict(result) | {"folder": str(result.folder)}, line
-

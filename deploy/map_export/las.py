@@ -8,8 +8,8 @@ from typing import Final
 
 import numpy as np
 
+from gnd.deploy.map_export.libraries import library
 from gnd.deploy.map_export.projection import utm_zone
-from gnd.extras import explained
 from gnd.gnd_map.arrays import F64
 from gnd.gnd_map.geodesy import LocalFrame
 from gnd.gnd_map.utm import SCALE, convergence_rad, utm_from_geodetic
@@ -37,10 +37,7 @@ def export_las(store: Store, layer: str, prefix: str, path: Path) -> TilesExport
         ProjectionError: it lies beyond UTM's latitudes.
         MissingExtra: laspy or pyproj is not installed.
     """
-    with explained():
-        import laspy
-        import pyproj
-
+    laspy, pyproj = library("laspy"), library("pyproj")
     tiles = region_tiles(store, layer, prefix)
     frame = region_frame(tiles)
     points = np.concatenate([points_of(tile, frame) for tile in tiles])

@@ -8,12 +8,9 @@ from typing import Final
 
 from gnd.gnd_map.errors import GndError
 
-LEFT_OUT: Final = frozenset(
-    ("gtsam", "laspy", "matplotlib", "mpl_toolkits", "psutil", "pyproj", "rerun", "scipy", "sklearn", "small_gicp")
-)
+LEFT_OUT: Final = frozenset(("gtsam", "matplotlib", "mpl_toolkits", "psutil", "scipy", "sklearn", "small_gicp"))
 """Modules of other projects that only extras bring; pyproject.toml has the same table by extra."""
 EXTRA_OF: Final = {
-    "gnd.deploy.map_export": "export",
     "gnd.vehicle_agent": "vehicle",
     "gnd.cloud_merger": "cloud",
     "gnd.tile_store": "cloud",
