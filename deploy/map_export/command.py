@@ -12,8 +12,10 @@ from rich.console import Console
 from gnd.deploy.map_export.autoware import export_autoware
 from gnd.deploy.map_export.change_files import WRITERS, write_changes
 from gnd.deploy.map_export.changes import Changes, map_changes
+from gnd.deploy.map_export.foxglove import write_mcap
 from gnd.deploy.map_export.las import export_las
 from gnd.deploy.map_export.projection import PROJECTORS
+from gnd.deploy.map_export.scene import read_scene, store_of
 from gnd.gnd_map.tile_id import TileId
 from gnd.tile_store import tables
 from gnd.tile_store.arguments import parse_tile, parse_time_ns, parse_versions
@@ -26,7 +28,7 @@ from gnd.tile_store.store import Store
 TO_HELP: Final = "What to write.  [default: by the file's ending]"
 PROJECTOR_HELP: Final = "Of --to autoware.  [default: that of the export before, else TransverseMercator]"
 POINTS_HELP: Final = "Of --to autoware: points 0.2 m apart that have the Gaussians' moments, or the means alone."
-OUTPUTS: Final = (*FORMATS, "autoware", "las", "laz")
+OUTPUTS: Final = (*FORMATS, "autoware", "las", "laz", "mcap")
 CHANGES_HELP: Final = "Write what differs as objects, for a GIS: FILE.gpkg or FILE.geojson (layers of Gaussians)."
 Written = tuple[dict[str, Any], str]
 """What was written as JSON, and as a line."""
@@ -46,19 +48,22 @@ Written = tuple[dict[str, Any], str]
 def export(
     path: Path, out: Path, kind: str | None, projector: str | None, points: Any, region: str, layer: str, as_json: bool
 ) -> None:
-    """Write the newest tiles of STORE to FILE; with --to autoware FILE is the folder of the map.
+    """Write the newest tiles of STORE (or of the folder of a run) to FILE; of --to autoware FILE is the map's folder.
 
     Gaussians go as points with covariances into PCD or PLY, tiles as polygons into GeoJSON. Autoware gets cells
-    of 20 m with metadata and projection; heights are ellipsoidal.
+    of 20 m with metadata and projection; heights are ellipsoidal. MCAP, for Foxglove, has the versions and, of a
+    run, the ways of its vehicles as well.
     """
     name = kind or out.suffix.removeprefix(".").lower()
     if name not in OUTPUTS:
         raise ExportError(f"unknown export format {name!r}; known are {', '.join(OUTPUTS)}: say which with --to")
     if projector is not None and name != "autoware":
         raise ExportError(f"--projector is for --to autoware, not for {name}")
-    with to_read(path) as opened:
+    with to_read(store_of(path)) as opened:
         if name == "autoware":
             values, line = _autoware(opened, layer, region, out, projector, points)
+        elif name == "mcap":
+            values, line = _mcap(opened, layer, region, out, path)
         else:
             values, line = _plain(opened, layer, region, out, name)
     show(values, as_json, lambda console: console.print(line, highlight=False, soft_wrap=True))
@@ -70,6 +75,22 @@ def _plain(store: Store, layer: str, region: str, out: Path, name: str) -> Writt
     )
     line = f"{out}: {result.gaussians} Gaussians of {result.tiles} tiles, {result.size_bytes / 1e6:.2f} MB"
     return asdict(result) | {"path": str(result.path)}, line
+
+
+def _mcap(store: Store, layer: str, region: str, out: Path, path: Path) -> Written:
+    scene = read_scene(store, layer, region, path if path.is_dir() else None)
+    write_mcap(scene, out)
+    values = {
+        "path": str(out),
+        "gaussians": len(scene.points_m),
+        "updates": len(scene.updates),
+        "vehicles": sorted(scene.ways),
+        "size_bytes": out.stat().st_size,
+    }
+    return values, (
+        f"{out}: {len(scene.points_m)} Gaussians, {len(scene.updates)} updates, {len(scene.ways)} vehicles,"
+        f" {values['size_bytes'] / 1e6:.2f} MB"
+    )
 
 
 def _autoware(store: Store, layer: str, region: str, out: Path, projector: str | None, points: Any) -> Written:
