@@ -80,16 +80,17 @@ def _plain(store: Store, layer: str, region: str, out: Path, name: str) -> Writt
 def _mcap(store: Store, layer: str, region: str, out: Path, path: Path) -> Written:
     scene = read_scene(store, layer, region, path if path.is_dir() else None)
     write_mcap(scene, out)
+    size_bytes = out.stat().st_size
     values = {
         "path": str(out),
         "gaussians": len(scene.points_m),
         "updates": len(scene.updates),
         "vehicles": sorted(scene.ways),
-        "size_bytes": out.stat().st_size,
+        "size_bytes": size_bytes,
     }
     return values, (
         f"{out}: {len(scene.points_m)} Gaussians, {len(scene.updates)} updates, {len(scene.ways)} vehicles,"
-        f" {values['size_bytes'] / 1e6:.2f} MB"
+        f" {size_bytes / 1e6:.2f} MB"
     )
 
 

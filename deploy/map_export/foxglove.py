@@ -9,7 +9,7 @@
 """
 
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -68,7 +68,7 @@ def _cloud(t_ns: int, points_m: "np.ndarray[Any, Any]", name: str, values: "np.n
     for axis, column in zip("xyz", points_m.T, strict=True):
         rows[axis] = column
     rows[name] = values
-    offsets = rows.dtype.fields or {}
+    offsets: Mapping[str, Any] = rows.dtype.fields or {}
     fields = [PackedElementField(name=key, offset=offsets[key][1], type=_TYPES[kind]) for key, kind in columns]
     cloud = PointCloud(timestamp=_stamp(t_ns), frame_id="map", point_stride=rows.itemsize, fields=fields)
     cloud.pose.orientation.w = 1.0

@@ -64,7 +64,7 @@ def _numbers(sd_m: F64, spacing_m: float) -> I64:
     numbers[:, :2] = 2 * np.maximum(np.rint(length_m[:, :2] / (2.0 * spacing_m)).astype(np.int64), 1)
     numbers[:, :2] = np.minimum(numbers[:, :2], _MOST)
     numbers[sd_m[:, 0] < _POINT_SD_M] = 1
-    return numbers
+    return np.asarray(numbers)
 
 
 @lru_cache(maxsize=1024)

@@ -70,4 +70,4 @@ def _shades(points_m: "np.ndarray[Any, Any]") -> "np.ndarray[Any, Any]":
     """(N, 3) blue greys, the higher the lighter."""
     low, high = np.percentile(points_m[:, 2], (2, 98)) if len(points_m) else (0.0, 1.0)
     part = np.clip((points_m[:, 2] - low) / max(high - low, 1e-3), 0.0, 1.0)
-    return (np.array([60, 80, 110]) + part[:, None] * np.array([160, 150, 130])).astype(np.uint8)
+    return np.asarray(np.array([60, 80, 110]) + part[:, None] * np.array([160, 150, 130]), np.uint8)

@@ -41,7 +41,7 @@ def test_a_client_follows_its_way_and_the_updates(tmp_path: Path) -> None:
 
 
 def test_what_it_cannot_answer_it_refuses(tmp_path: Path) -> None:
-    with pytest.raises(ExportError, match="no pointcloud_map_metadata.yaml"):
+    with pytest.raises(ExportError, match=r"no pointcloud_map_metadata\.yaml"):
         differential_map(tmp_path / "none", Area(0.0, 0.0, 10.0), ())
     for values in ((0.0, 0.0, -1.0), (float("nan"), 0.0, 1.0)):
         with pytest.raises(ExportError, match="an area needs"):
