@@ -195,8 +195,8 @@ def test_a_bad_file_is_one_clear_error(said: str, message: str, tmp_path: Path) 
 def test_the_fleet_hands_settings_to_agents_and_shards(tmp_path: Path) -> None:
     file = tmp_path / "fleet.toml"
     file.write_text("agents = 2\n[agent.report]\nlongest_s = 30.0\n[merger]\npoll_s = 0.5\n")
-    config = load_fleet_config(file, {"shards": 1}, ["agent.report.apart_s=4", "merger.store.window_s=60"], {})
-    assert config.agent == {"report": {"longest_s": 30.0, "apart_s": 4}}
+    config = load_fleet_config(file, {"shards": 1}, ["agent.report.longest_m=300", "merger.store.window_s=60"], {})
+    assert config.agent == {"report": {"longest_s": 30.0, "longest_m": 300}}
     assert config.merger == {"poll_s": 0.5, "store": {"window_s": 60}}
     assert (config.agents, config.shards) == (2, 1)
     for change, message in (

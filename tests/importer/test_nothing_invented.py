@@ -13,7 +13,7 @@ from recording_testing import scan_of, write_bin
 from gnd.deploy.prepare import Source
 from gnd.schemas.drive_mcap import drive_counts, read_header
 from gnd.schemas.errors import NoPlace
-from gnd.tile_store.build import BuildParameters, drive_sources
+from gnd.tile_store.build import drive_sources
 from gnd.vehicle_agent.errors import ImportDriveError
 from gnd.vehicle_agent.importer import import_recording
 from gnd.vehicle_agent.importer_cli import import_drives
@@ -39,7 +39,7 @@ def test_a_drive_from_nowhere_is_marked_and_no_shared_map_takes_it(kitti_folder,
     import_recording("auto", kitti_folder, tmp_path / "a.mcap", choices=NOWHERE)
     assert read_header(tmp_path / "a.mcap").nowhere
     with pytest.raises(NoPlace, match="imported with --nowhere"):
-        drive_sources([tmp_path / "a.mcap"], BuildParameters())
+        drive_sources([tmp_path / "a.mcap"])
     again = import_recording("auto", tmp_path / "a.mcap", tmp_path / "b.mcap", choices=NOWHERE)
     assert again.scans == 8
     assert read_header(tmp_path / "b.mcap").nowhere  # importing it again gives it no place
