@@ -23,17 +23,23 @@ from gnd.schemas.drive import DriveHeader, DriveItem, GnssFix, MotionSample, Ref
 from gnd.schemas.drive_mcap import DriveWriter
 from gnd.vehicle_agent.errors import ImportDriveError
 from gnd.vehicle_agent.importers.apollo import open_apollo
+from gnd.vehicle_agent.importers.argoverse_logs import open_argoverse
+from gnd.vehicle_agent.importers.bins import open_bins
 from gnd.vehicle_agent.importers.choices import Choices
 from gnd.vehicle_agent.importers.cleaning import MAX_RANGE_M, Cleaned, cleaned
 from gnd.vehicle_agent.importers.deskewing import with_times
 from gnd.vehicle_agent.importers.detect_format import format_of
 from gnd.vehicle_agent.importers.fitting import fit_heading_and_position as fit_heading_and_position
 from gnd.vehicle_agent.importers.kitti import open_kitti
+from gnd.vehicle_agent.importers.kitti_raw import open_kitti_raw
+from gnd.vehicle_agent.importers.las import open_las
 from gnd.vehicle_agent.importers.lidar_odometry import Progress, lidar_odometry
 from gnd.vehicle_agent.importers.mcap_clouds import is_foxglove_or_own, open_mcap_clouds
 from gnd.vehicle_agent.importers.mounting import levelled, with_mount
+from gnd.vehicle_agent.importers.nuscenes import open_nuscenes
 from gnd.vehicle_agent.importers.output import check_output
 from gnd.vehicle_agent.importers.overrides import BadScans, as_chosen, passing_over
+from gnd.vehicle_agent.importers.pcap import open_pcap
 from gnd.vehicle_agent.importers.pcd import open_pcd
 from gnd.vehicle_agent.importers.planes import open_planes
 from gnd.vehicle_agent.importers.quality import Quality, fixes_within, quality_of
@@ -53,9 +59,20 @@ FORMATS: Final[dict[str, Callable[[Path, RecordingAnchor | None], Recording]]] =
     "planes": open_planes,
     "apollo": open_apollo,
     "ros": open_ros,
+    "bin": open_bins,
+    "kitti-raw": open_kitti_raw,
+    "nuscenes": open_nuscenes,
+    "argoverse": open_argoverse,
+    "las": open_las,
+    "pcap": open_pcap,
 }
 CHOOSING: Final[dict[str, Callable[[Path, RecordingAnchor | None, Choices | None], Recording]]] = {
     "ros": open_ros,
+    "pcd": open_pcd,
+    "nuscenes": open_nuscenes,
+    "argoverse": open_argoverse,
+    "las": open_las,
+    "pcap": open_pcap,
 }
 """Formats whose readers heed choices themselves: topics, fields."""
 AUTO: Final = "auto"

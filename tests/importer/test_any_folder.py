@@ -277,7 +277,7 @@ def broken(tmp_path: Path, what: str) -> Path:
         ("xz", "1.bin.xz: cut off after"),
         ("no xz", "1.bin.xz: 16 bytes that are not xz"),
         ("pcd", "1.pcd: 591 bytes of points, 600 announced"),
-        ("mixed", "files 1 of kitti and 3 of pcd: name the format"),
+        ("mixed", "files 1 of bin and 3 of pcd: name the format"),
         ("file", "no single file of a kind that is read"),
         ("empty", "no scans (.bin, .bin.xz, .pcd, .pcd.xz, "),
         ("nothing", "no such file or folder"),

@@ -143,8 +143,10 @@ def scan_of_fields(points: NDArray[np.void], t_ns: int, rule: TimeRule | None = 
 
 
 def times_of(values: NDArray[np.generic], t_ns: int, rule: TimeRule) -> tuple[int, NDArray[np.uint32]]:
-    """When the earliest point was measured, and (N,) times after it in ns; the stamp and zeros where they make no
-    sense: a sweep of more than `LONGEST_SWEEP_NS`, or values that are no numbers.
+    """When the earliest point was measured, and (N,) times after it in ns.
+
+    The stamp where the points count by another clock; zeros where the times make no sense: a sweep of more than
+    `LONGEST_SWEEP_NS`, or values that are no numbers.
     """
     zeros = np.zeros(len(values), np.uint32)
     if values.ndim != 1 or not len(values) or not np.isfinite(values.astype(np.float64)).all():
@@ -154,7 +156,8 @@ def times_of(values: NDArray[np.generic], t_ns: int, rule: TimeRule) -> tuple[in
     if after.max() > LONGEST_SWEEP_NS:
         return t_ns, zeros
     if rule.absolute:  # as integers: a double holds times since 1970 to 0.2 us, nanoseconds as float not at all
-        return int(first) * int(rule.ns) + round((float(first) - int(first)) * rule.ns), after.astype(np.uint32)
+        begin_ns = int(first) * int(rule.ns) + round((float(first) - int(first)) * rule.ns)
+        return (begin_ns if abs(begin_ns - t_ns) <= LONGEST_SWEEP_NS else t_ns), after.astype(np.uint32)
     begin_ns = round(float(first) * rule.ns)
     return t_ns + (begin_ns if abs(begin_ns) <= LONGEST_SWEEP_NS else 0), after.astype(np.uint32)
 

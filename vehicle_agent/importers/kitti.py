@@ -108,7 +108,7 @@ def _fixes(folder: Path, t_ns: NDArray[np.int64], T_vehicle_lidar: F64, anchor: 
     T_camera_lidar = T_CAMERA_LIDAR_2011_10_03 if calibrated is None else calibrated
     T_camera_vehicle = T_camera_lidar @ T_inverse(T_vehicle_lidar)
     p_map = (T_inverse(T_camera_vehicle) @ T_inverse(T_camera[0]) @ T_camera @ T_camera_vehicle)[:, :3, 3]
-    lat, lon, height = anchor.frame.geodetic_from_enu(p_map)
+    lat, lon, height = anchor.frame.geodetic_from_enu(p_map @ anchor.T_map_start[:3, :3].T)
     return tuple(
         GnssFix(int(t), float(a), float(o), float(h), GNSS_SIGMA_M)
         for t, a, o, h in zip(t_ns, lat, lon, height, strict=True)

@@ -98,17 +98,22 @@ def check_track(recording: Recording, track: Trajectory) -> tuple[str, ...]:
         return ()
     sigma_m = float(np.median([fix.sigma_m for fix in recording.gnss]))
     spread_m = float(np.sqrt(measured[:, :2].var(axis=0).sum()))
+    off_m = float(np.median(np.linalg.norm(residual[:, :2], axis=1)))
+    far = off_m > max(FAR_M, FAR_SIGMAS * sigma_m)
+    if far and recording.track is not None and (hint := _clock_hint(recording, track)):
+        raise _elsewhere(recording, off_m, sigma_m, hint)
     if spread_m > SIGMAS * sigma_m:
         _check_scale(recording, by_track, measured)
         _check_mirrored(recording, by_track, measured, sigma_m)
-    off_m = float(np.median(np.linalg.norm(residual[:, :2], axis=1)))
-    if off_m <= max(FAR_M, FAR_SIGMAS * sigma_m):
-        return ()
-    if recording.track is None:
-        return (f"warning: the track lies {off_m:.1f} m from the fixes (sigma {sigma_m:.1f} m)",)
-    raise ImportDriveError(
+    if far and recording.track is not None:
+        raise _elsewhere(recording, off_m, sigma_m, "another UTM zone, anchor, axes or place")
+    return (f"warning: the track lies {off_m:.1f} m from the fixes (sigma {sigma_m:.1f} m)",) if far else ()
+
+
+def _elsewhere(recording: Recording, off_m: float, sigma_m: float, why: str) -> ImportDriveError:
+    return ImportDriveError(
         f"{recording.name}: the poses lie {off_m:,.1f} m (median) from the GNSS fixes, which say they are off by"
-        f" {sigma_m:.1f} m: {_clock_hint(recording, track) or 'another UTM zone, anchor, axes or place'}"
+        f" {sigma_m:.1f} m: {why}"
     )
 
 
@@ -130,7 +135,7 @@ def _check_scale(recording: Recording, by_track: F64, measured: F64) -> None:
 
 def _check_mirrored(recording: Recording, by_track: F64, measured: F64, sigma_m: float) -> None:
     off = [_rms_m(by_track * axes, measured) for axes in ([1.0, 1.0, 1.0], [1.0, -1.0, 1.0])]
-    if off[1] < MIRRORED * off[0] and off[0] > 3.0 * sigma_m:
+    if off[1] < MIRRORED * off[0] and off[1] < 3.0 * sigma_m < off[0]:
         raise ImportDriveError(
             f"{recording.name}: the track lies {off[0]:.1f} m from the fixes, mirrored only {off[1]:.1f} m: one of the"
             " axes of the points or poses has the wrong sign"
