@@ -31,6 +31,9 @@ WORDS = {
     "shard_id": "merger-7", "codec": "float", "link": "3g", "layer": "ndt2", "vehicle": "w", "localise_by": "lidar",
     "wrong_mounts": ("3:0.5",), "connect": ("tcp/10.0.0.1:7448",),
     "layers": ("ndt", "signs"), "passing_rule": "ahead", "protocol": "full", "mode": "paper",
+    "source": "",  # another needs that there is no recording
+    "points": "/a/points", "gnss": "/a/fix", "speed": "/a/odometry", "imu": "/a/imu", "vehicle_frame": "base",
+    "mount": (0.5, 0.0, 1.5, 0.0, 0.0, 90.0),
 }  # fmt: skip
 
 
