@@ -126,7 +126,7 @@ class LiveParameters:
     imu: str = setting("", "Topic of a gyro that gives the yaw rate instead; empty: none.")
     vehicle_frame: str = setting("", "Frame of the vehicle, x forward; empty: base_footprint, base_link, ...")
     mount: tuple[float, ...] = setting(
-        (), "x, y, z (m), roll, pitch, yaw (deg) of the LiDAR in the vehicle; empty: /tf_static tells."
+        (), "Of the LiDAR in the vehicle: x, y, z (m), roll, pitch, yaw (deg); empty: as /tf_static gives it."
     )
     silent_s: float = setting(0.0, "The drive ends once nothing has come for so long; 0: never.", unit="s", least=0)
 
