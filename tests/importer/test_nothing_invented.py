@@ -47,7 +47,7 @@ def test_a_drive_from_nowhere_is_marked_and_no_shared_map_takes_it(kitti_folder,
     assert not read_header(tmp_path / "c.mcap").nowhere
 
 
-def test_a_fleet_and_a_vehicle_refuse_a_drive_from_nowhere(kitti_folder, tmp_path):
+def test_a_fleet_refuses_a_drive_from_nowhere(kitti_folder, tmp_path):
     from gnd.deploy.fleet_config import FleetConfig
     from gnd.deploy.prepare import prepare_recorded
     from gnd.deploy.run_folder import RunFolder
@@ -141,6 +141,7 @@ def test_sensor_mount_and_heading_are_what_was_given(kitti_folder, tmp_path):
     assert result.exit_code == 0, result.output
     header = read_header(out)
     assert (header.sensor_model, header.mount) == ("OS1-64", "given")
+    assert f"next: gnd map build {out} -o map.sqlite" in result.output
     np.testing.assert_allclose(header.T_vehicle_lidar[:3, 3], [1.5, 0.1, 1.73])
 
 
