@@ -3,6 +3,7 @@
 import json
 import os
 import shutil
+import threading
 from pathlib import Path
 
 import numpy as np
@@ -14,12 +15,14 @@ from gnd.deploy.prepare import Source
 from gnd.schemas.drive_mcap import drive_counts, read_header
 from gnd.schemas.errors import NoPlace
 from gnd.tile_store.build import BuildParameters, drive_sources
+from gnd.vehicle_agent.config import AgentConfig
 from gnd.vehicle_agent.errors import ImportDriveError
 from gnd.vehicle_agent.importer import import_recording
 from gnd.vehicle_agent.importer_cli import import_drives
 from gnd.vehicle_agent.importers.choices import Choices, mount_of_text
 from gnd.vehicle_agent.importers.output import check_output
 from gnd.vehicle_agent.importers.recording import RecordingAnchor
+from gnd.vehicle_agent.vehicle import open_vehicle
 
 ANCHOR = RecordingAnchor(35.6586, 139.7454, 40.0)
 NOWHERE = Choices(nowhere=True)
@@ -55,6 +58,14 @@ def test_a_fleet_refuses_a_drive_from_nowhere(kitti_folder, tmp_path):
     import_recording("auto", kitti_folder, tmp_path / "a.mcap", choices=NOWHERE)
     with pytest.raises(NoPlace, match="no shared map may take it"):
         prepare_recorded(FleetConfig(), RunFolder(tmp_path / "run"), Source(drives=(tmp_path / "a.mcap",)))
+
+
+def test_a_vehicle_refuses_a_drive_from_nowhere(kitti_folder, tmp_path):
+    choices = Choices(nowhere=True, stand_ins=True)
+    import_recording("auto", kitti_folder, tmp_path / "a.mcap", choices=choices)
+    config = AgentConfig("probe", tmp_path / "a.mcap", tmp_path / "work")
+    with pytest.raises(NoPlace, match="no shared map may take it"), open_vehicle(config, threading.Event()):
+        pass
 
 
 def same(path: Path) -> Path:
