@@ -197,8 +197,13 @@ def test_feet_are_found_against_the_fixes_and_taken_when_told(kitti_folder, tmp_
 
 def test_z_downwards_is_found_against_the_ground(kitti_folder, tmp_path):
     flipped = with_points(kitti_folder, lambda points: points * [1.0, 1.0, -1.0])
+    import_recording("auto", kitti_folder, tmp_path / "right.mcap", anchor=ANCHOR)
+    notes = import_recording("auto", flipped, tmp_path / "a.mcap", anchor=ANCHOR).notes  # KITTI's mount is given
+    assert any(note.startswith("warning: the ground lies 1.7") for note in notes)
+    for path in (flipped / "calib.txt", flipped / "poses.txt"):
+        path.unlink()
     with pytest.raises(ImportDriveError, match=r"ground lies 1\.7\d m \*above\* the LiDAR"):
-        import_recording("auto", flipped, tmp_path / "a.mcap", anchor=ANCHOR)
+        import_recording("auto", flipped / "velodyne", tmp_path / "b.mcap", anchor=ANCHOR)
 
 
 def test_millimetres_are_found_by_their_size(kitti_folder, tmp_path):
