@@ -31,7 +31,7 @@ GEOREFERENCE_HELP: Final = (
 def features() -> None:
     """Import, export and list the feature layers of a store: signs, poles, streetlights, lanes, ...
 
-    Files: Lanelet2 (.osm), OpenDRIVE (.xodr, read only), GeoJSON (.geojson), Argoverse 2 maps (log_map_archive_*.json,
+    Files: Lanelet2 (.osm), OpenDRIVE (.xodr), GeoJSON (.geojson), Argoverse 2 maps (log_map_archive_*.json,
     read only).
     """
 
@@ -51,6 +51,7 @@ def features() -> None:
 @click.option("--height-offset", default=0.0, metavar="METRES", help="Added to heights, which makes them ellipsoidal.")
 @click.option("--sigma", default=SIGMA_M, show_default=True, metavar="METRES", help="Of positions, each axis.")
 @click.option("--exist", default=SURE, show_default=True, help="Mass of existence of the features of the file.")
+@click.option("--strict", is_flag=True, help="Refuse a file with lines or borders that cross; else they are reported.")
 @click.option("--city", help="Of an Argoverse 2 map: PIT, ...  [default: by the file's name]")
 @json_option
 def import_(
@@ -66,6 +67,7 @@ def import_(
     height_offset: float,
     sigma: float,
     exist: float,
+    strict: bool,
     city: str | None,
     as_json: bool,
 ) -> None:
@@ -77,7 +79,7 @@ def import_(
     format_of(file, kind)  # a wrong name is told before a track is computed
     options = ImportOptions(
         _layers(layers), other, _placement(georeference, poses, fixes), georeference == "latlon", height_offset, sigma,
-        sigma, exist,
+        sigma, exist, strict,
     )  # fmt: skip
     name = source or default_source(file)
     with _Bars() as bars:
@@ -125,16 +127,15 @@ def _anchor(said: str) -> Placement:
 @click.option("--layer", "layers", multiple=True, help="A layer, or several.  [default: all]")
 @region_option
 @click.option("--format", "kind", type=click.Choice(WRITTEN), help="  [default: by the file's name]")
-@click.option(
-    "--source", help="Write into the Lanelet2 file imported as this; '': a new file.  [default: the only one]"
-)
+@click.option("--source", help="Write into the file imported as this; '': a new file.  [default: the only one]")
 @json_option
 def export(
     path: Path, out: Path, layers: tuple[str, ...], region: str, kind: str | None, source: str | None, as_json: bool
 ) -> None:
-    """Write the newest features of STORE to FILE: GeoJSON, or Lanelet2 (.osm).
+    """Write the newest features of STORE to FILE: GeoJSON, Lanelet2 (.osm) or OpenDRIVE (.xodr).
 
-    A Lanelet2 file that was imported comes back with all that is no feature; only what has changed is written anew.
+    A Lanelet2 or OpenDRIVE file that was imported comes back with all that is no feature; only what has changed is
+    written anew. A new Lanelet2 file has the lanes of every source as lanelets.
     """
     with SqliteStore(path, create=False) as store:
         result = export_features(store, out, layers, region, kind, source)

@@ -1,6 +1,7 @@
 """Where the contexts start: probabilities, how much they count, and mixing weights, learnt once and frozen.
 
-`priors.bin` was made by `python -m studies.codec_priors`; its hash is part of what the codecs mean, a test holds it.
+`priors.bin` was made by `python -m studies.codec_priors` at 9b4197d; its hash is part of what the codecs mean, a test
+holds it.
 """
 
 import zlib

@@ -69,6 +69,7 @@ class FeatureLayer:
         self._ids: dict[TileId, tuple[int, ...]] = {}
         self._reported: set[int] = set()
         self._z_m = 0.0
+        self._before: PlacedLook | None = None
 
     @property
     def tiles(self) -> list[TileId]:
@@ -93,10 +94,18 @@ class FeatureLayer:
     def see(self, placed: PlacedLook, occlusion: Occlusion | None) -> None:
         """Take one look from a known pose."""
         assert isinstance(self._slamcu, Slamcu), "this layer's own filter finds the poses"
+        self._drive_on(placed, self._slamcu)
         self._slamcu.set_pose(placed.pose, placed.cov, placed.z_m)
         self._slamcu.look(self._own(placed), self._view, occlusion)
         self.cover(placed.pose, occlusion)
         self._z_m = placed.z_m
+
+    def _drive_on(self, placed: PlacedLook, slamcu: Slamcu) -> None:
+        """Time and way since the look before: features settle once they are out of view and left behind."""
+        before, self._before = self._before, placed
+        dt_s = 0.0 if before is None else (placed.look.t_ns - before.look.t_ns) * 1e-9
+        if before is not None and dt_s > 0.0:
+            slamcu.predict(dt_s, float(np.hypot(*(placed.pose - before.pose)[:2])) / dt_s, 0.0)
 
     def look(self, look: Look, occlusion: Occlusion | None) -> None:
         """Take one look whose pose the filter finds; where it has looked comes later, by `cover`."""

@@ -62,7 +62,7 @@ class DriveSensors:
 _CEP_M: Final = 2.5
 """Half of all fixes lie within this, as the data sheet of the paper's receiver says."""
 _WHITE_SHARE: Final = 0.3
-"""Of the variance of a fix, as a recorded drive of such a receiver gives (`python -m studies gnss-noise`)."""
+"""Of the variance of a fix, as recorded with such a receiver (`python -m studies gnss-noise` at 9b4197d)."""
 SERIES_CAR: Final = DriveSensors(
     WheelsAndGyro(0.005, 0.02, radians(0.1), radians(0.1), 0.001, radians(0.002)),
     GnssReceiver(

@@ -242,7 +242,7 @@ class WatchedSlamcu:
         """(2, 2) by how much less certain than the particles have it a feature is: as the places it was seen from."""
         if not len(self._extra) or not one.history:
             return np.zeros((2, 2))
-        at_s = np.array([pose.t_s for pose in self.path])
+        at_s = np.array([pose.t_s for pose in self.path[: len(self._extra)]])  # as of the last claim
         seen_s = (one.history[-1].t_ns - self._clock_ns) * 1e-9
         return np.asarray(self._extra[min(int(np.searchsorted(at_s, seen_s)), len(at_s) - 1)])
 
