@@ -72,8 +72,13 @@ def agent(
         click.echo(settings_text(config), nl=False)
         return
     stop = threading.Event()
+
+    def end(number: int, _frame: object) -> None:
+        stop.set()
+        signal.signal(number, signal.SIG_DFL)  # a second one ends at once: reports wait in the outbox
+
     for number in (signal.SIGINT, signal.SIGTERM):
-        signal.signal(number, lambda *_: stop.set())
+        signal.signal(number, end)
     click.echo(summary_line(run_agent(config, stop)))
 
 

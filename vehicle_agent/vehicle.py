@@ -105,8 +105,12 @@ class AgentVehicle:
         self.show(output, self.pipeline.place)
 
     def upload(self) -> None:
-        """Wait until the cloud has all that it wants of the reports, for a bounded time."""
-        if not self.link.sender.drain(self.config.report.drain_s, self.stop):
+        """Wait until the cloud has all that it wants of the reports, for a bounded time.
+
+        A live drive is ended by `stop`, so it is waited for all the same.
+        """
+        stop = threading.Event() if self.config.live.source else self.stop
+        if not self.link.sender.drain(self.config.report.drain_s, stop):
             _log.warning("%s: %d reports are not released", self.config.vehicle, self.link.outbox.counts().open)
 
     def sample(self) -> TrafficSample:
@@ -139,7 +143,7 @@ class AgentVehicle:
             "vehicle": self.config.vehicle,
             "drive_id": self.source.header.drive_id,
             "sensor_model": self.source.header.sensor_model,
-            "finished": not self.stop.is_set() and self.damage is None,
+            "finished": self.damage is None and (bool(self.config.live.source) or not self.stop.is_set()),
             "wall_s": round(time.monotonic() - self.started_s, 3),
             "distance_km": round(self.pipeline.place.odometer_m / 1000, 5),
             "scans_refined": len(self.evaluation.estimates),

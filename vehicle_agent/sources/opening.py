@@ -12,6 +12,7 @@ from gnd.schemas.drive_mcap import read_drive, read_header
 from gnd.vehicle_agent.config import AgentConfig
 from gnd.vehicle_agent.sources.recording import first_fix, paced
 from gnd.vehicle_agent.sources.world_clock import in_common_time
+from gnd.vehicle_agent.warm import warm_up
 
 if TYPE_CHECKING:
     from gnd.vehicle_agent.sources.ros2 import RosSource
@@ -59,6 +60,7 @@ def open_source(config: AgentConfig, stop: threading.Event) -> Iterator[Source]:
 
 
 def _live(config: AgentConfig, stop: threading.Event, open_things: ExitStack) -> Source:
+    warm_up()  # on a fresh machine kernels are compiled for a minute, in which a vehicle that drives would be blind
     if config.live.source == "zenoh":
         from gnd.vehicle_agent.sources.plain_keys import open_plain
 
