@@ -14,7 +14,7 @@ from gnd.gnd_map.arrays import F64
 from gnd.gnd_map.se3 import T_inverse, log_so3, transform
 from gnd.vehicle_agent.map_align.candidates import Reach, candidates
 from gnd.vehicle_agent.map_align.cloud import GaussianCloud
-from gnd.vehicle_agent.map_align.fit import NOISE_M, Fit, Score, gains, lay_onto, local_shift, residuals_m, score_of
+from gnd.vehicle_agent.map_align.fit import NOISE_M, Fit, Score, gains, lay_onto, local_motion, residuals_m, score_of
 
 Progress = Callable[[str, int, int], None]
 
@@ -33,8 +33,10 @@ _DECISIVE: Final = 0.5
 """A surface says something about a direction when at least so much of its information is along it."""
 _DECISIVE_WORTH: Final = 20.0
 """Fewer of them tell nothing: the direction is open."""
-_BLOCK_M: Final = 25.0
-_BLOCK_PAIRS: Final = 60
+_SEEN_SHARE: Final = 0.3
+"""Of a place where A knows fewer of them nothing can be said."""
+_BLOCK_M: Final = 15.0
+_BLOCK_PAIRS: Final = 50
 _BEND_SHARE: Final = 0.97
 _BETTER: Final = 1.1
 """A block lies better elsewhere when the surfaces that can tell are worth so much more there: 5 cm make 1.15."""
@@ -45,7 +47,7 @@ MIN_UPRIGHT: Final = 150
 MIN_SHARE: Final = 0.6
 """Of them have their surface in A."""
 MIN_LEVEL_SHARE: Final = 0.5
-MAX_SECOND: Final = 0.75
+MAX_SECOND: Final = 0.85
 """The second place may be worth so much of the best."""
 MAX_BEND_M: Final = 0.12
 """Residual shift of blocks that may not be exceeded by more than 3 % of the surfaces."""
@@ -238,9 +240,13 @@ def _second(
         if np.linalg.norm(off[:2]) > _APART_M:
             unit = np.append(off[:2] / np.linalg.norm(off[:2]), 0.0)
             decisive = decisive & (core.moved(best).information_along(unit, NOISE_M) > _DECISIVE)
-        worth = float(there[decisive].sum())
-        other = float(gains(a, core.moved(T))[decisive].sum())
-        compared.append((1.0 if worth < _DECISIVE_WORTH else other / worth, off))
+        moved = core.moved(T)
+        shared = decisive & _within(a, moved, 2.0)
+        worth, all_of_it = float(there[shared].sum()), float(there[decisive].sum())
+        if all_of_it < _DECISIVE_WORTH:
+            compared.append((1.0, off))
+        elif worth > _SEEN_SHARE * all_of_it:  # what A does not reach there does not speak against the place
+            compared.append((float(gains(a, moved)[shared].sum()) / worth, off))
     return max(compared, key=lambda one: one[0], default=(0.0, np.full(3, np.nan)))
 
 
@@ -265,9 +271,10 @@ def _weakest(fit: Fit) -> F64:
 
 def _beside(a: GaussianCloud, b: GaussianCloud, T: F64, along: F64) -> F64:
     """The pose near T that fits best without going back along a direction: height and what is across may settle."""
-    shift = local_shift(a, b.moved(T))
+    motion = local_motion(a, b.moved(T), turns=False)
     settled = T.copy()
-    if shift is not None:
+    if motion is not None:
+        shift = motion[:3, 3]
         step = shift - along * float(along @ shift)
         settled[:3, 3] += np.clip(step, -1.0, 1.0)
     return settled
@@ -299,7 +306,7 @@ def _judged(
 
 
 def _blocks(a: GaussianCloud, moved: GaussianCloud, row: F64, across_m: F64, matched: F64) -> tuple[Block, ...]:
-    """The overlap in squares of 25 m, those in which enough surfaces meet."""
+    """The overlap in squares of 15 m, those in which enough surfaces meet."""
     cell = np.floor(moved.mean_m[row, :2] / _BLOCK_M).astype(np.int64)
     found = list[Block]()
     names, number = np.unique(cell, axis=0, return_inverse=True)
@@ -314,14 +321,20 @@ def _blocks(a: GaussianCloud, moved: GaussianCloud, row: F64, across_m: F64, mat
 
 
 def _residual_shift(a: GaussianCloud, part: GaussianCloud) -> F64:
-    """(3,) by how much a part of B lies better elsewhere; 0 unless clearly more of it is matched there."""
-    shift = local_shift(a, part)
-    if shift is None:
+    """(3,) by how much a part of B lies better elsewhere; 0 unless clearly more of it is matched there.
+
+    The part may turn as well: where B is bent, its neighbouring parts lie at angles to each other.
+    """
+    T = local_motion(a, part)
+    if T is None:
         return np.zeros(3)
-    T = np.eye(4)
-    T[:3, 3] = shift
-    decisive = part.information_along(shift / max(float(np.linalg.norm(shift)), 1e-9), NOISE_M) > _DECISIVE
-    here, there = float(gains(a, part)[decisive].sum()), float(gains(a, part.moved(T))[decisive].sum())
+    moved = part.moved(T)
+    steps = moved.mean_m - part.mean_m
+    shift = np.asarray(steps.mean(axis=0))
+    largest = steps[np.linalg.norm(steps, axis=1).argmax()]
+    unit = largest / max(float(np.linalg.norm(largest)), 1e-9)
+    decisive = part.information_along(unit, NOISE_M) > _DECISIVE
+    here, there = float(gains(a, part)[decisive].sum()), float(gains(a, moved)[decisive].sum())
     return shift if there > _BETTER * here + 3.0 else np.zeros(3)
 
 

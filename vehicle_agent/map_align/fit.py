@@ -31,6 +31,8 @@ _COVER_M: Final = 2.0
 _SHARED: Final = 20.0
 """Pairs of neighbouring voxels share the errors of the passes that measured them: so many count as one."""
 _STOP: Final = 2e-5
+_PART_M: Final = 5.0
+"""A turn moves the surfaces of a part by about this times its angle."""
 _FIRM: Final = 0.03
 """A direction with less of the strongest one's information is held by chance."""
 
@@ -229,23 +231,24 @@ def residuals_m(a: GaussianCloud, b_moved: GaussianCloud) -> tuple[I64, F64, NDA
     return pairs.row, pairs.across_m, pairs.squared < MATCHED_SIGMA**2
 
 
-def local_shift(a: GaussianCloud, part: GaussianCloud) -> F64 | None:
-    """By how much (3,) a part of B, which was moved, would lie better on A; None: too few pairs. Directions that its
-    surfaces do not hold firmly are left at 0.
+def local_motion(a: GaussianCloud, part: GaussianCloud, *, turns: bool = True) -> F64 | None:
+    """(4, 4) by which a part of B, which was moved, would lie better on A; None: too few pairs.
 
-    Pairs up to a metre apart count: a part of a bent map lies farther off than a matched surface does.
+    Shift, and heading where asked for; what its surfaces do not hold firmly is left as it is. Pairs up to a metre
+    apart count: a part of a bent map lies farther off than a matched surface does.
     """
-    shift = np.zeros(3)
+    T, free = np.eye(4), slice(2, 6) if turns else slice(3, 6)
+    lever = np.array([1.0 / _PART_M, 1.0, 1.0, 1.0])[-(free.stop - free.start) :]
     for scale_m in (0.4, 0.4, 0.4, 0.15, 0.15, 0.15):
-        T = np.eye(4)
-        T[:3, 3] = shift
         moved = part.moved(T)
         pairs = pairs_of(a, moved, scale_m)
         if len(pairs.row) < 20:
             return None
-        H, g = _normal_equations(np.zeros((len(pairs.row), 3)), pairs, scale_m)
-        information = H[3:, 3:]
-        values, axes = np.linalg.eigh(information)
+        centre = moved.mean_m[pairs.row].mean(axis=0)
+        H, g = _normal_equations(moved.mean_m[pairs.row] - centre, pairs, scale_m)
+        values, axes = np.linalg.eigh(H[free, free] * lever * lever[:, None])
         firm = values > _FIRM * values[-1]
-        shift = shift - axes[:, firm] @ ((axes[:, firm].T @ g[3:]) / values[firm])
-    return shift
+        step = np.zeros(6)
+        step[free] = -(axes[:, firm] @ ((axes[:, firm].T @ (g[free] * lever)) / values[firm])) * lever
+        T = _stepped(T, step, centre)
+    return T
