@@ -19,8 +19,9 @@ from gnd.gnd_map.tile import Tile
 _THIN_M2: Final = 0.02
 """Along an axis with less variance (14 cm) a voxel's Gaussian says where a surface lies. Along the others it only says
 where the voxel is cut off, which is the same grid in both maps and would draw every shift to zero."""
-_OPEN_M2: Final = 1e4
-"""Variance of such an axis."""
+_OPEN_M2: Final = 1.0
+"""Variance of such an axis. Not more: where the normals of a pair differ by 2 degrees, a thousandth of it goes across
+the surface; with 1e4 m2 walls 30 cm apart counted as the same."""
 _UPRIGHT: Final = 0.5
 """A surface whose normal rises less than this (30 degrees) constrains the horizontal place."""
 
