@@ -37,9 +37,11 @@ _SEEN_SHARE: Final = 0.3
 """Of a place where A knows fewer of them nothing can be said."""
 _BLOCK_M: Final = 15.0
 _BLOCK_PAIRS: Final = 50
-_BEND_SHARE: Final = 0.97
-_BETTER: Final = 1.1
-"""A block lies better elsewhere when the surfaces that can tell are worth so much more there: 5 cm make 1.15."""
+_FIRM_SHARE: Final = 0.97
+_BETTER: Final = 1.5
+"""A block lies better elsewhere when the surfaces that can tell are worth so much more there: 9 cm make 1.5."""
+_MOST: Final = 0.6
+"""And when most of them are matched there. What was rebuilt is matched nowhere, and what stands beside it here."""
 
 MIN_AREA_M2: Final = 600.0
 MIN_UPRIGHT: Final = 150
@@ -50,7 +52,8 @@ MIN_LEVEL_SHARE: Final = 0.5
 MAX_SECOND: Final = 0.85
 """The second place may be worth so much of the best."""
 MAX_BEND_M: Final = 0.12
-"""Residual shift of blocks that may not be exceeded by more than 3 % of the surfaces."""
+"""Residual shift of blocks that may not be exceeded by more than 15 % of the surfaces: what was rebuilt a little beside its
+old place looks the same."""
 MAX_TILT_RAD: Final = float(np.radians(2.0))
 
 
@@ -84,7 +87,7 @@ class Alignment:
         median_m, p90_m: distance across the surfaces of the overlap that have a partner.
         blocks: the overlap by parts.
         area_m2: of the overlap, seen from above.
-        bend_m: 97 % of the surfaces lie in blocks whose residual shift is at most this.
+        bend_m: 85 % of the surfaces lie in blocks whose residual shift is at most this.
         scale: of B against A in the horizontal, less 1, by the blocks' shifts; NaN where they are too few.
         reasons: why it is refused; empty: it fits.
     """
@@ -335,17 +338,18 @@ def _residual_shift(a: GaussianCloud, part: GaussianCloud) -> F64:
     unit = largest / max(float(np.linalg.norm(largest)), 1e-9)
     decisive = part.information_along(unit, NOISE_M) > _DECISIVE
     here, there = float(gains(a, part)[decisive].sum()), float(gains(a, moved)[decisive].sum())
-    return shift if there > _BETTER * here + 3.0 else np.zeros(3)
+    is_elsewhere = there > _BETTER * here + 3.0 and there > _MOST * float(decisive.sum())
+    return shift if is_elsewhere else np.zeros(3)
 
 
 def _bend_m(blocks: tuple[Block, ...]) -> float:
-    """So far off, or less, lie 97 % of the surfaces, each with its block; NaN without blocks."""
+    """So far off, or less, lie 85 % of the surfaces, each with its block; NaN without blocks."""
     if not blocks:
         return float("nan")
     shifts, pairs = np.array([(np.linalg.norm(one.shift_m), one.pairs) for one in blocks]).T
     order = np.argsort(shifts)
     below = np.cumsum(pairs[order]) / pairs.sum()
-    return float(shifts[order][np.searchsorted(below, _BEND_SHARE)])
+    return float(shifts[order][np.searchsorted(below, _FIRM_SHARE)])
 
 
 def _scale(blocks: tuple[Block, ...]) -> float:
